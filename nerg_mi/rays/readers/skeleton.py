@@ -1,4 +1,4 @@
-"""Skeletons: files of joints, bodies with named keypoints, and the heads and gaze that follow from them."""
+"""Skeletons: files of keypoints, skeleton conventions, and head poses from keypoints."""
 
 from __future__ import annotations
 
@@ -20,28 +20,27 @@ from nerg_mi.files.atomic import replace_atomically
 from nerg_mi.files.safe_read import BadLineCallback, read_line_blocks
 from nerg_mi.ranges import ELEVATIONS
 
-from .base import DESCRIPTION, UNITS, RaysBuilder, Signature, TickOption, TrackingFrame, option
-from .poses import fill_values
+from .base import GENERATED_FILES, UNITS, RaysBuilder, Signature, TickOption, TrackingFrame, option
+from .poses import find_fill_values
 
-# ---- The skeleton file: one pose a line, ``id|time|[numbers]`` ----
+# ---- Skeleton files: one pose per line, ``id|time|[numbers]`` ----
 #
-# The tracking format of the NeRG paper (Section 5.1): a person's id, an integer time or frame number, and keypoints
-# (there 22) of three coordinates each, or of three and a confidence. A keypoint that was not seen is ``nan``, lies at
-# exactly 0, 0, 0 or another fill value, or has no confidence. What the keypoints mean is the business of
-# :mod:`nerg_mi.rays.readers.skeleton`.
+# The tracking format of the NeRG paper (Section 5.1): the id of a person, an integer time or frame number, and
+# keypoints (22 in the paper) with three coordinates each, optionally with a confidence. A missing keypoint is ``nan``,
+# is at exactly 0, 0, 0 or another fill value, or has no confidence.
 
-KEYPOINTS = 22
-_SNIFFED = 1000  # lines, of which the first one that is whole says how many numbers there are
+NUM_KEYPOINTS = 22
+_SNIFFED_LINES = 1000  # lines among which the first complete one determines the number of values
 
 
 class Layout(NamedTuple):
-    """How the numbers of a line are divided."""
+    """Layout of the numbers of a line."""
 
-    keypoints: int = KEYPOINTS
-    width: int = 3  # x, y, z; or 4, with a confidence
+    keypoints: int = NUM_KEYPOINTS
+    width: int = 3  # 3: x, y, z; 4: with a confidence
 
     @property
-    def values(self) -> int:
+    def num_values(self) -> int:
         return self.keypoints * self.width
 
     def __str__(self) -> str:
@@ -52,24 +51,39 @@ PAPER_LAYOUT = Layout()
 
 
 class SkeletonRows(NamedTuple):
-    """A run of N poses of K keypoints."""
+    """N poses of K keypoints."""
 
     ids: np.ndarray  # (N,) str
     times: np.ndarray  # (N,) int64, in the file's unit
-    keypoints: np.ndarray  # (N, K, 3) float64, NaN where unseen
-    lines: np.ndarray  # (N,) int64, the 1-based line of the file that each stands on
-    confidence: np.ndarray  # (N, K) float64, of the keypoints that are wanted; one where the file has none
+    keypoints: np.ndarray  # (N, K, 3) float64, NaN if missing
+    lines: np.ndarray  # (N,) int64, line number in the file, from 1
+    confidence: np.ndarray  # (N, K) float64, of the requested keypoints; 1 if the file has none
 
 
 def write_skeleton(
     path: str | os.PathLike, ids: Sequence[str], times: np.ndarray, keypoints: np.ndarray, *, decimals: int = 6
 ) -> None:
-    """Write poses in the order given; a name ending in ``.gz`` is compressed.
+    """Write poses in the given order; files with a name ending in ``.gz`` are compressed.
 
-    ``ids``: N names without ``|`` or line breaks. ``times``: (N,) integers. ``keypoints``: (N, K, 3), NaN where unseen,
-    or (N, K, 4) with confidences. ``decimals``: digits after the point; 6 (a micrometre) turns a head by at most 1e-5
-    rad. Equal input gives equal bytes. Raises ``ValueError`` for wrong shapes, times that are not integers, or an id
-    that the format cannot hold.
+    Equal input gives equal bytes.
+
+    Parameters
+    ----------
+    ids
+        N names without ``|`` or line breaks.
+    times
+        (N,) integers.
+    keypoints
+        (N, K, 3), NaN if missing, or (N, K, 4) with confidences.
+    decimals
+        Digits after the point; 6 (a micrometre) rotates a head by at most 1e-5 rad.
+
+    Raises
+    ------
+    ValueError
+        For wrong shapes or times that are not integers.
+    NergError
+        For an id that the format cannot represent.
     """
     keypoints = np.asarray(keypoints, dtype=np.float64)
     times = np.asarray(times)
@@ -83,18 +97,18 @@ def write_skeleton(
         )
     for i, name in enumerate(ids):
         if not str(name).strip() or any(c in str(name) for c in "|\r\n"):
-            raise NergError(f"id {name!r} of pose {i} is empty or holds '|' or a line break; rename the person")
+            raise NergError(f"id {name!r} of pose {i} is empty or contains '|' or a line break; rename the person")
 
     flat = keypoints.reshape(n, -1)
-    form = ", ".join([f"%.{decimals}f"] * flat.shape[1])
-    with replace_atomically(path) as temporary, _written(temporary, Path(path).name) as out:
+    line_format = ", ".join([f"%.{decimals}f"] * flat.shape[1])
+    with replace_atomically(path) as temporary, _open_text(temporary, Path(path).name) as out:
         for name, time, values in zip(ids, times, flat):
-            out.write(f"{name}|{int(time)}|[{form % tuple(values)}]\n")
+            out.write(f"{name}|{int(time)}|[{line_format % tuple(values)}]\n")
 
 
 def count_values(path: str | os.PathLike) -> int | None:
-    """How many numbers the first line has that follows the format; None where none of the first lines does."""
-    for block in read_line_blocks(path, "skeleton file", _SNIFFED):
+    """Number of values of the first line in the format; None if none of the first lines is."""
+    for block in read_line_blocks(path, "skeleton file", _SNIFFED_LINES):
         bodies = [fields[2].strip() for line in block if len(fields := line.split("|")) == 3]
         return next((body.count(",") + 1 for body in bodies if body[:1] == "[" and body[-1:] == "]"), None)
     return None
@@ -102,22 +116,30 @@ def count_values(path: str | os.PathLike) -> int | None:
 
 def iterate_skeleton(
     path: str | os.PathLike,
-    chunk: int = 8192,
+    block_lines: int = 8192,
     keypoints: Sequence[int] | None = None,
-    on_bad: BadLineCallback | None = None,
+    on_bad_line: BadLineCallback | None = None,
     layout: Layout = PAPER_LAYOUT,
 ) -> Iterator[SkeletonRows]:
-    """Yield the poses of a file in runs of at most ``chunk`` lines, so that
-    memory stays bounded (a day of a store is some 2.6 million lines).
+    """Iterate over the poses of a file in blocks of at most ``block_lines`` lines, to bound memory (a day of a shop has
+    about 2.6 million lines). Empty lines are skipped.
 
-    ``keypoints``: which of those of the ``layout`` are wanted; the others are counted but not converted, and come out
-    NaN. Empty lines are skipped. Raises `NergError` for a damaged file and, naming file and line, for a line that does
-    not follow the format; where ``on_bad`` is given, that is told of such lines, which are left out.
+    Parameters
+    ----------
+    keypoints
+        Indices of the requested keypoints of the ``layout``; the others are not converted and are NaN.
+    on_bad_line
+        Called with lines that are not in the format, which are skipped. Without it such a line is an error.
+
+    Raises
+    ------
+    NergError
+        For a damaged file and, naming file and line, for a line that is not in the format.
     """
     wanted = range(layout.keypoints) if keypoints is None else sorted(set(keypoints))
     columns = [layout.width * k + i for k in wanted for i in range(layout.width)]
     before = 0
-    for block in read_line_blocks(path, "skeleton file", chunk):
+    for block in read_line_blocks(path, "skeleton file", block_lines):
         ids: list[str] = []
         times: list[int] = []
         texts: list[str] = []
@@ -126,31 +148,31 @@ def iterate_skeleton(
             line = line.strip()
             if not line:
                 continue
-            found = _fields(line, layout)
-            if isinstance(found, str):
-                _refuse(path, number, found, on_bad)
+            fields = _parse_line(line, layout)
+            if isinstance(fields, str):
+                _report_bad_line(path, number, fields, on_bad_line)
                 continue
-            ids.append(found[0])
-            times.append(found[1])
-            texts.append(found[2])
+            ids.append(fields[0])
+            times.append(fields[1])
+            texts.append(fields[2])
             lines.append(number)
         before += len(block)
         if ids:
-            rows = _rows(path, ids, times, texts, lines, columns, on_bad, layout)
+            rows = _parse_rows(path, ids, times, texts, lines, columns, on_bad_line, layout)
             if len(rows.ids):
                 yield rows
 
 
-def _fields(line: str, layout: Layout) -> tuple[str, int, str] | str:
-    """Id, time and the text of the numbers of a line; or what is wrong with it."""
+def _parse_line(line: str, layout: Layout) -> tuple[str, int, str] | str:
+    """Parse a line to the id, the time and the text of the numbers; or return a description of the error."""
     fields = line.split("|")
     if len(fields) != 3:
-        return f": {len(fields)} fields separated by '|', expected id|time|[{layout.values} numbers]"
+        return f": {len(fields)} fields separated by '|', expected id|time|[{layout.num_values} numbers]"
     body = fields[2].strip()
     if not (body.startswith("[") and body.endswith("]")):
         return ": the keypoints are not enclosed in '[' and ']'"
-    if body.count(",") != layout.values - 1:
-        return f": {body.count(',') + 1} numbers, expected {layout.values} ({layout})"
+    if body.count(",") != layout.num_values - 1:
+        return f": {body.count(',') + 1} numbers, expected {layout.num_values} ({layout})"
     try:
         time = int(fields[1])
     except ValueError:
@@ -160,61 +182,61 @@ def _fields(line: str, layout: Layout) -> tuple[str, int, str] | str:
     return fields[0].strip(), time, body[1:-1]
 
 
-def _refuse(path: str | os.PathLike, line: int, why: str, on_bad: BadLineCallback | None) -> None:
-    if on_bad is None:
+def _report_bad_line(path: str | os.PathLike, line: int, reason: str, on_bad_line: BadLineCallback | None) -> None:
+    if on_bad_line is None:
         raise NergError(
-            f"{path}, line {line}{why}; mend or remove the line, or leave such lines out with --skip-bad-lines"
+            f"{path}, line {line}{reason}; correct or remove the line, or skip such lines with --skip-bad-lines"
         )
-    on_bad(line, why)
+    on_bad_line(line, reason)
 
 
 def read_skeleton(path: str | os.PathLike, layout: Layout = PAPER_LAYOUT) -> SkeletonRows:
-    """All poses of a file at once; see :func:`iterate_skeleton` for the errors."""
+    """Read all poses of a file; raises as :func:`iterate_skeleton` does."""
     runs = list(iterate_skeleton(path, layout=layout))
     if not runs:
-        raise NergError(f"{path} holds no poses; expected lines id|time|[{layout.values} numbers]")
+        raise NergError(f"{path} has no poses; expected lines id|time|[{layout.num_values} numbers]")
     return SkeletonRows(*(np.concatenate(column) for column in zip(*runs)))
 
 
-def _rows(
+def _parse_rows(
     path: str | os.PathLike,
     ids: list[str],
     times: list[int],
     texts: list[str],
     lines: list[int],
     columns: list[int],
-    on_bad: BadLineCallback | None,
+    on_bad_line: BadLineCallback | None,
     layout: Layout,
 ) -> SkeletonRows:
-    # One conversion for the whole run; only when it fails is the line searched for.
+    # Convert all lines at once, and search for the bad line only if that fails.
     pick = operator.itemgetter(*columns)
     try:
-        found = _numbers(texts, columns, pick, fast=len(columns) == layout.values)
+        numbers = _parse_numbers(texts, columns, pick, has_all=len(columns) == layout.num_values)
     except ValueError:
-        kept = []
+        good_rows = []
         for i, (line, text) in enumerate(zip(lines, texts)):
             word = next((w for w in pick(text.split(",")) if not _is_number(w)), None)
             if word is None:
-                kept.append(i)
+                good_rows.append(i)
             else:
-                _refuse(path, line, f": {sanitize(word.strip(), 60)!r} is not a number", on_bad)
-        ids, times, texts, lines = ([column[i] for i in kept] for column in (ids, times, texts, lines))
-        # NumPy knows fewer spellings than Python.
-        found = _numbers(texts, columns, pick, fast=False)
-    values = np.full((len(ids), layout.values), np.nan)
-    values[:, columns] = found
+                _report_bad_line(path, line, f": {sanitize(word.strip(), 60)!r} is not a number", on_bad_line)
+        ids, times, texts, lines = ([column[i] for i in good_rows] for column in (ids, times, texts, lines))
+        # NumPy accepts fewer notations than Python.
+        numbers = _parse_numbers(texts, columns, pick, has_all=False)
+    values = np.full((len(ids), layout.num_values), np.nan)
+    values[:, columns] = numbers
     values = values.reshape(len(ids), *layout)
     points, confidence = values[:, :, :3], values[:, :, 3] if layout.width == 4 else np.ones(values.shape[:2])
-    points[np.isfinite(fill_values(points)) | ~(confidence > 0)] = np.nan
+    points[np.isfinite(find_fill_values(points)) | ~(confidence > 0)] = np.nan
     return SkeletonRows(
         np.array(ids, dtype=str), np.array(times, dtype=np.int64), points, np.array(lines, dtype=np.int64), confidence
     )
 
 
-def _numbers(texts: list[str], columns: list[int], pick: operator.itemgetter, fast: bool) -> np.ndarray:
-    if fast:
+def _parse_numbers(texts: list[str], columns: list[int], pick: operator.itemgetter, has_all: bool) -> np.ndarray:
+    if has_all:
         return np.loadtxt(texts, delimiter=",", comments=None, dtype=np.float64, ndmin=2)
-    # Faster than loadtxt's usecols, which converts what it leaves out.
+    # Faster than loadtxt's usecols, which also converts the other columns.
     words = itertools.chain.from_iterable(pick(text.split(",")) for text in texts)
     return np.fromiter(map(float, words), dtype=np.float64, count=len(texts) * len(columns)).reshape(-1, len(columns))
 
@@ -228,57 +250,57 @@ def _is_number(word: str) -> bool:
 
 
 @contextmanager
-def _written(path: Path, name: str) -> Iterator[IO[str]]:
-    """A text file to write, compressed where ``name``, that which it will have, ends in ``.gz``."""
+def _open_text(path: Path, name: str) -> Iterator[IO[str]]:
+    """Open a text file for writing; compressed if its final ``name`` ends in ``.gz``."""
     with path.open("wb") as raw:
         if not name.endswith(".gz"):
             with io.TextIOWrapper(raw, encoding="utf-8", newline="\n") as out:
                 yield out
             return
-        # With its later name in it and no time: equal poses give equal bytes, whenever they are written.
+        # With its final name and without a time, so that equal poses give equal bytes.
         with io.TextIOWrapper(gzip.GzipFile(name, "wb", fileobj=raw, mtime=0), encoding="utf-8", newline="\n") as out:
             yield out
 
 
-# ---- Skeletons by the names of their keypoints, the head poses that they give, and bodies for given head poses ----
+# ---- Skeleton conventions, head poses from keypoints, and bodies for given head poses ----
 #
 # The paper's proxy for gaze (Section 5.1): a ray from the midpoint of the ears through the nose.
 
-# Of the paper's skeleton these are documented: columns 6:9, 39:42 and 33:36 of the file.
+# These are documented in the paper: columns 6:9, 39:42 and 33:36 of the file.
 LEFT_EAR, RIGHT_EAR, NOSE = 2, 13, 11
 
 
 @dataclass(frozen=True)
 class Skeleton:
-    """A convention of keypoints: how many there are, and the numbers, from 0, of those by which a body is oriented.
+    """A convention of keypoints: their number, and the indices (from 0) of those that define the pose of a body.
 
-    Left and right are the person's. ``sure``: the confidence from which a keypoint was seen for certain.
+    Left and right are those of the person. ``full_confidence`` is the confidence of a reliably detected keypoint.
     """
 
     title: str
     keypoints: int
     joints: Mapping[str, int]
-    sure: float = 1.0
+    full_confidence: float = 1.0
 
-    def numbers(self, place: int | str) -> list[int]:
-        """The keypoints of which ``place`` is the mean: a number, a name, or several of either, joined by "+".
+    def find_keypoints(self, name: int | str) -> list[int]:
+        """Indices of the keypoints of which ``name`` is the mean: an index, a name, or several of these, joined by "+".
 
-        Raises `NergError` naming those there are.
+        Raises `NergError` listing the available keypoints.
         """
-        words = [self.joints.get(word.strip(), word.strip()) for word in str(place).split("+")]
+        words = [self.joints.get(word.strip(), word.strip()) for word in str(name).split("+")]
         numbers = [int(k) if str(k).isdecimal() and len(str(k)) < 9 else self.keypoints for k in words]
         if max(numbers) >= self.keypoints:
             raise NergError(
-                f'there is no keypoint "{place}" in {self.title}; name them by their numbers, 0 to '
-                f"{self.keypoints - 1}, or as {', '.join(self.joints)} (--keypoints)"
+                f'there is no keypoint "{name}" in {self.title}; use indices from 0 to '
+                f"{self.keypoints - 1}, or the names {', '.join(self.joints)} (--keypoints)"
             )
         return numbers
 
 
-PAPER = "nerg22"
+PAPER_SKELETON = "nerg22"
 SKELETONS = {
-    PAPER: Skeleton(
-        "the NeRG paper's skeleton", KEYPOINTS, {"left_ear": LEFT_EAR, "right_ear": RIGHT_EAR, "nose": NOSE}
+    PAPER_SKELETON: Skeleton(
+        "the NeRG paper's skeleton", NUM_KEYPOINTS, {"left_ear": LEFT_EAR, "right_ear": RIGHT_EAR, "nose": NOSE}
     ),
     "coco17": Skeleton(
         "COCO-17",
@@ -303,23 +325,23 @@ SKELETONS = {
         32,
         {"nose": 27, "left_eye": 28, "left_ear": 29, "right_eye": 30, "right_ear": 31, "head": 26, "pelvis": 0}
         | {"left_shoulder": 5, "right_shoulder": 12, "left_hip": 18, "right_hip": 22},
-        sure=2.0,
+        full_confidence=2.0,
     ),
     "kinect25": Skeleton(
         "Kinect v2",
         25,
         {"head": 3, "pelvis": 0, "left_shoulder": 4, "right_shoulder": 8, "left_hip": 12, "right_hip": 16},
-        sure=2.0,
+        full_confidence=2.0,
     ),
 }
-"""By name. Of several with as many keypoints, the first is the one that is meant without a name."""
+"""Conventions by name. Of several with the same number of keypoints, the first is the default."""
 
 EAR_DISTANCE = 0.15  # metres between the ears of an adult
 NOSE_DISTANCE = 0.12  # metres from the midpoint of the ears to the tip of the nose
-EAR_HEIGHT = 1.58  # metres: the height for which _BODY is written
+EAR_HEIGHT = 1.58  # metres; height of the ears in _BODY
 
-# The other nineteen keypoints are unnamed in the published code. Bodies made
-# here fill them as a standing adult: (to the left, forward, height) in metres.
+# The other nineteen keypoints are unnamed in the published code. Bodies made here use a standing adult:
+# (to the left, forward, height) in metres.
 _BODY = {
     0: (0.10, 0.00, 0.08),
     1: (0.12, 0.17, 0.02),
@@ -345,32 +367,46 @@ _LEFT_EYE, _RIGHT_EYE = 4, 15
 def head_poses(
     left: np.ndarray, right: np.ndarray, front: np.ndarray, *, pitch: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rays of the heads: from midway between their sides, which are the ears, through their front, the nose.
+    """Compute head poses as rays from midway between the sides of the head (ears) through its front (nose).
 
-    ``left``, ``right``, ``front``: (N, 3). ``pitch``: degrees by which a ray is turned up about the line through the
-    sides, since a nose lies below the ears and a level head then seems to look down. Returns ``origin`` (N, 3) in the
-    unit given and ``direction`` (N, 3), unit; where a side or the front is NaN or the front lies midway between the
-    sides, the direction is NaN. NeRG, Section 5.1.
+    Parameters
+    ----------
+    left, right, front
+        (N, 3) each.
+    pitch
+        Degrees by which the direction is rotated upwards about the line through the sides. A nose is below the ears, so
+        that a level head otherwise points down.
+
+    Returns
+    -------
+    origin
+        (N, 3) in the unit of the input.
+    direction
+        (N, 3) unit; NaN if a point is NaN, or the front is midway between the sides.
+
+    References
+    ----------
+    NeRG, Section 5.1.
     """
     left, right, front = (np.asarray(v, dtype=np.float64) for v in (left, right, front))
     origin = 0.5 * (left + right)
-    direction = _unit(front - origin)
+    direction = _normalise(front - origin)
     if pitch:
-        # Only the part across the sides turns; their line need not be square to the front.
-        side = _unit(left - right)
+        # Only the component perpendicular to the line through the sides is rotated.
+        side = _normalise(left - right)
         along = np.sum(direction * side, axis=1, keepdims=True) * side
         angle = np.radians(pitch)
         direction = along + np.cos(angle) * (direction - along) + np.sin(angle) * np.cross(direction, side)
     return origin, direction
 
 
-def trunk_directions(left: np.ndarray, right: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """Where trunks face, (N, 3) unit: square to the line of the shoulders ``left``, ``right`` (N, 3) and to ``up``
-    (N, 3), along the spine; NaN where that is nowhere."""
-    return _unit(np.cross(left - right, up))
+def compute_trunk_directions(left: np.ndarray, right: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Facing directions of trunks, (N, 3) unit: perpendicular to the line of the shoulders ``left``, ``right`` (N, 3)
+    and to ``up`` (N, 3) along the spine; NaN if undefined."""
+    return _normalise(np.cross(left - right, up))
 
 
-def _unit(v: np.ndarray) -> np.ndarray:
+def _normalise(v: np.ndarray) -> np.ndarray:
     length = np.linalg.norm(v, axis=1, keepdims=True)
     return np.divide(v, length, out=np.full_like(v, np.nan), where=length > 0)
 
@@ -383,12 +419,30 @@ def keypoints_from_head(
     ear_distance: float = EAR_DISTANCE,
     nose_distance: float = NOSE_DISTANCE,
 ) -> np.ndarray:
-    """Standing bodies whose ears and nose give exactly these head poses.
+    """Make standing bodies whose ears and nose have exactly the given head poses.
 
-    ``origin``: (N, 3) metres, z up, the midpoint of the ears. ``direction``: (N, 3), need not be unit. ``floor``:
-    height of the floor in metres. Returns keypoints (N, 22, 3) with :func:`head_poses` of them equal to the input to
-    rounding. The head is not tilted sideways; the body faces where the head faces and is scaled to its height. Raises
-    ``ValueError`` for a zero or non-finite direction.
+    The head has no roll; the body faces in the direction of the head, and is scaled to its height.
+
+    Parameters
+    ----------
+    origin
+        (N, 3) metres, z up: midpoint of the ears.
+    direction
+        (N, 3) of any length.
+    floor
+        Height of the floor in metres.
+    ear_distance, nose_distance
+        Metres between the ears, and from their midpoint to the nose.
+
+    Returns
+    -------
+    numpy.ndarray
+        Keypoints (N, 22, 3), of which :func:`head_poses` equals the input up to rounding.
+
+    Raises
+    ------
+    ValueError
+        For a zero or non-finite direction or origin.
     """
     origin = np.atleast_2d(np.asarray(origin, dtype=np.float64))
     direction = np.atleast_2d(np.asarray(direction, dtype=np.float64))
@@ -398,20 +452,20 @@ def keypoints_from_head(
         raise ValueError(f"head pose {bad[0]} has a zero or non-finite direction or origin; drop it first")
     forward = direction / length
 
-    # Left is horizontal; a head that looks straight up or down has no heading of its own, and faces +x.
+    # The left direction is horizontal; a head that looks straight up or down is assumed to face +x.
     flat = forward * (1.0, 1.0, 0.0)
     flat_length = np.linalg.norm(flat, axis=1, keepdims=True)
     heading = np.where(flat_length > 1e-9, flat / np.maximum(flat_length, 1e-9), (1.0, 0.0, 0.0))
     left = np.stack([-heading[:, 1], heading[:, 0], np.zeros(len(heading))], axis=1)
     crown = np.cross(forward, left)
 
-    out = np.empty((len(origin), KEYPOINTS, 3))
+    out = np.empty((len(origin), NUM_KEYPOINTS, 3))
     out[:, LEFT_EAR] = origin + 0.5 * ear_distance * left
     out[:, RIGHT_EAR] = origin - 0.5 * ear_distance * left
     out[:, NOSE] = origin + nose_distance * forward
-    eyes = origin + 0.75 * nose_distance * forward + 0.25 * nose_distance * crown
-    out[:, _LEFT_EYE] = eyes + 0.2 * ear_distance * left
-    out[:, _RIGHT_EYE] = eyes - 0.2 * ear_distance * left
+    eye_centre = origin + 0.75 * nose_distance * forward + 0.25 * nose_distance * crown
+    out[:, _LEFT_EYE] = eye_centre + 0.2 * ear_distance * left
+    out[:, _RIGHT_EYE] = eye_centre - 0.2 * ear_distance * left
 
     scale = (origin[:, 2:] - floor) / EAR_HEIGHT
     foot = np.concatenate([origin[:, :2], np.full((len(origin), 1), float(floor))], axis=1)
@@ -420,53 +474,56 @@ def keypoints_from_head(
     return out
 
 
-# ---- Tracked bodies as skeletons of keypoints: their heads' rays, from between the ears through the nose ----
+# ---- Tracked bodies: rays of their heads from skeletons ----
 
-Places = tuple[int | str, int | str, int | str]
-"""The left and the right side of a head, and its front: keypoints or markers, or means of some, joined by "+"."""
+HeadKeypoints = tuple[int | str, int | str, int | str]
+"""Left side, right side and front of a head: keypoints or markers, or means of several, joined by "+"."""
 
-FACE: Places = ("left_ear", "right_ear", "nose")
-PITCH = "Degrees by which rays are turned up, since a nose lies below the ears."
-MISSING = "a keypoint of the head is missing"
-"""Why a pose is dropped, whose keypoint is NaN, lies at exactly 0, 0, 0 or has no confidence."""
+FACE_KEYPOINTS: HeadKeypoints = ("left_ear", "right_ear", "nose")
+PITCH_HELP = "Degrees by which rays are rotated upwards, since a nose is below the ears."
+MISSING_KEYPOINT = "a keypoint of the head is missing"
+"""Reason for dropping a pose with a keypoint that is NaN, at exactly 0, 0, 0 or without confidence."""
 
-_TRUNK = ("left_shoulder", "right_shoulder", "head", "pelvis")
-_EARS = (0.08, 0.3)  # metres: sides of a head are not nearer to each other, nor farther apart
-_AT_THE_HIPS = 1e-3  # metres from the origin to between the hips: positions are relative to them
+_TRUNK_KEYPOINTS = ("left_shoulder", "right_shoulder", "head", "pelvis")
+_EAR_DISTANCES = (0.08, 0.3)  # metres; plausible distances between the sides of a head
+_MAX_HIP_OFFSET = 1e-3  # metres from the origin to the hips, if positions are relative to them
 
 
-def parse_keypoints(text: str) -> Places:
-    """``"2,13,11"`` or ``"left_ear,right_ear,left_eye+right_eye"`` as three places. Raises `NergError` for others."""
+def parse_keypoints(text: str) -> HeadKeypoints:
+    """Parse ``"2,13,11"`` or ``"left_ear,right_ear,left_eye+right_eye"``. Raises `NergError` for other text."""
     words = [word.strip() for word in text.split(",")]
     if len(words) != 3 or not all(words):
-        raise NergError(f"--keypoints is three places: left ear, right ear, nose; got {text!r}")
+        raise NergError(f"--keypoints needs three keypoints: left ear, right ear, nose; got {text!r}")
     left, right, front = (int(word) if word.isdecimal() else word for word in words)
     return left, right, front
 
 
 @dataclass(frozen=True, kw_only=True)
 class SkeletonOptions(TickOption):
-    """Which skeleton the keypoints are of, which of them are a head, and how it is held."""
+    """Options for the convention of the skeleton, the keypoints of the head, and the frame."""
 
     skeleton: str | None = option(
-        None, f"Convention of the keypoints: {', '.join(SKELETONS)}.", shown="by their number", recorded=False
-    )
-    keypoints: Places | None = option(
         None,
-        "Left ear, right ear, nose: numbers from 0 or names, or means of some, as left_eye+right_eye.",
-        shown=",".join(map(str, FACE)),
-        parse=parse_keypoints,
-        recorded=False,
+        f"Convention of the keypoints: {', '.join(SKELETONS)}.",
+        default_text="by the number of keypoints",
+        is_recorded=False,
     )
-    pitch: float = option(0.0, PITCH, within=ELEVATIONS)
-    units: str = option("m", "Unit of length: m, cm or mm.", recorded=False)
-    up: str = option("z", "Up axis: x, y, z, -x, -y or -z.", recorded=False)
-    handedness: str = option("right", "Handedness: right or left.", flag="--hand", recorded=False)
+    keypoints: HeadKeypoints | None = option(
+        None,
+        "Left ear, right ear, nose: indices from 0 or names, or means of several, as left_eye+right_eye.",
+        default_text=",".join(map(str, FACE_KEYPOINTS)),
+        parse=parse_keypoints,
+        is_recorded=False,
+    )
+    pitch: float = option(0.0, PITCH_HELP, within=ELEVATIONS)
+    units: str = option("m", "Unit of length: m, cm or mm.", is_recorded=False)
+    up: str = option("z", "Up axis: x, y, z, -x, -y or -z.", is_recorded=False)
+    handedness: str = option("right", "Handedness: right or left.", flag="--hand", is_recorded=False)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.skeleton is not None and self.skeleton not in SKELETONS:
-            raise NergError(f'there is no skeleton "{self.skeleton}"; --skeleton is one of {", ".join(SKELETONS)}')
+            raise NergError(f'there is no skeleton "{self.skeleton}"; use one of {", ".join(SKELETONS)} (--skeleton)')
 
 
 def _recognize(line: str) -> str | None:
@@ -475,23 +532,24 @@ def _recognize(line: str) -> str | None:
 
 
 class SkeletonFile:
-    """One ray a pose: from the midpoint of the ears through the nose (NeRG, Section 5.1).
+    """One ray per pose: from the midpoint of the ears through the nose (NeRG, Section 5.1).
 
-    The file's integer time is multiplied by ``tick``; `head_poses` says how ``pitch`` turns. Poses in which one
-    of these keypoints is missing are dropped. A skeleton without a face (Kinect v2) gives the trunk's direction, which
-    is said, as is a skeleton that was taken by the number of its keypoints.
+    The file's integer time is multiplied by ``tick``; see `head_poses` for ``pitch``. Poses with one of these keypoints
+    missing are dropped. A skeleton without a face (Kinect v2) gives the direction of the trunk, with a warning. A
+    skeleton that was selected by its number of keypoints gives a warning as well.
     """
 
     name = "skeleton"
     files = (
-        "`id|time|[numbers]`, a pose a line, x, y, z (or x, y, z, confidence) of each keypoint: the 22 of the NeRG "
-        "paper's tracking, COCO-17, BODY_25 of OpenPose, MediaPipe's 33, Azure Kinect's 32 or Kinect v2's 25; from the "
-        "midpoint of the ears through the nose"
+        "`id|time|[numbers]`, one pose per line, x, y, z (or x, y, z, confidence) of each keypoint: the 22 of the NeRG "
+        "paper's tracking, COCO-17, BODY_25 of OpenPose, MediaPipe's 33, Azure Kinect's 32 or Kinect v2's 25; rays go "
+        "from the midpoint of the ears through the nose"
     )
-    world = "declared: `--up`, `--hand`, `--units`"
-    checked_on = DESCRIPTION
+    frame_description = "declared: `--up`, `--hand`, `--units`"
+    validated_on = GENERATED_FILES
     signature = Signature(
-        line=_recognize, question="the unit of the time (--tick); the card tells which would give a device's rate"
+        line=_recognize,
+        question="the unit of the time (--tick); the quality report suggests one for the sampling rate of a device",
     )
     Options = SkeletonOptions
 
@@ -500,29 +558,35 @@ class SkeletonFile:
 
     def read(self, files: Sequence[Path], options: SkeletonOptions, builder: RaysBuilder) -> None:
         for path in files:
-            builder.source(path)
-            name, layout = _skeleton_of(path, options, builder)
+            builder.begin_source(path)
+            name, layout = _find_skeleton(path, options, builder)
             skeleton = SKELETONS[name]
-            places: tuple[int | str, ...] = options.keypoints or (FACE if "nose" in skeleton.joints else _TRUNK)
-            groups = [skeleton.numbers(place) for place in places]
+            keypoints: tuple[int | str, ...] = options.keypoints or (
+                FACE_KEYPOINTS if "nose" in skeleton.joints else _TRUNK_KEYPOINTS
+            )
+            groups = [skeleton.find_keypoints(place) for place in keypoints]
             if len({tuple(sorted(group)) for group in groups}) < len(groups):
-                raise NergError(f"the places {', '.join(map(str, places))} are not all different (--keypoints)")
+                raise NergError(f"the keypoints {', '.join(map(str, keypoints))} are not all different (--keypoints)")
             head = [k for group in groups for k in group]
             hips = [skeleton.joints[hip] for hip in ("left_hip", "right_hip") if hip in skeleton.joints]
-            builder.note(skeleton=name, keypoints=list(places))
+            builder.add_metadata(skeleton=name, keypoints=list(keypoints))
             names = {k: joint for joint, k in skeleton.joints.items()}
-            builder.note_unused(names.get(k, f"keypoint {k}") for k in range(skeleton.keypoints) if k not in head)
-            if places == _TRUNK:
-                builder.complain(
-                    f"{skeleton.title} has no keypoints of the face: rays point where the trunk faces, square to the "
-                    "shoulders and the spine, and the head may be turned"
+            builder.add_unused_columns(
+                names.get(k, f"keypoint {k}") for k in range(skeleton.keypoints) if k not in head
+            )
+            if keypoints == _TRUNK_KEYPOINTS:
+                builder.add_warning(
+                    f"{skeleton.title} has no keypoints of the face: rays have the facing direction of the trunk, "
+                    "which may differ from that of the head"
                 )
-            checks = PlaceChecks(path.name, UNITS[options.units], builder)
-            for rows in iterate_skeleton(path, keypoints=[*head, *hips], on_bad=builder.on_bad, layout=layout):
+            checks = GeometryChecks(path.name, UNITS[options.units], builder)
+            for rows in iterate_skeleton(
+                path, keypoints=[*head, *hips], on_bad_line=builder.on_bad_line, layout=layout
+            ):
                 left, right, front = (rows.keypoints[:, group].mean(axis=1) for group in groups[:3])
-                if places == _TRUNK:
+                if keypoints == _TRUNK_KEYPOINTS:
                     origin = front
-                    direction = trunk_directions(left, right, front - rows.keypoints[:, groups[3]].mean(axis=1))
+                    direction = compute_trunk_directions(left, right, front - rows.keypoints[:, groups[3]].mean(axis=1))
                 else:
                     origin, direction = head_poses(left, right, front, pitch=options.pitch)
                     checks.add_sides(left, right)
@@ -530,16 +594,18 @@ class SkeletonFile:
                     checks.add_hips(rows.keypoints[:, hips].mean(axis=1))
                 missing = np.asarray(np.isnan(rows.keypoints[:, head]).any(axis=(1, 2)))
                 confidence = rows.confidence[:, head].min(axis=1)
-                # Kinect has levels, of which the first ones are guesses.
-                sure = np.minimum(confidence / skeleton.sure, 1) if skeleton.sure > 1 else confidence
+                # Kinect has confidence levels, the first of which are guesses.
+                scaled_confidence = (
+                    np.minimum(confidence / skeleton.full_confidence, 1) if skeleton.full_confidence > 1 else confidence
+                )
                 builder.add(
                     rows.times * options.tick,
                     rows.ids,
                     origin,
                     direction,
                     rows=rows.lines,
-                    confidence=sure,
-                    drop={MISSING: missing},
+                    confidence=scaled_confidence,
+                    drop={MISSING_KEYPOINT: missing},
                 )
             checks.finish()
 
@@ -547,8 +613,8 @@ class SkeletonFile:
 READERS = (SkeletonFile(),)
 
 
-class PlaceChecks:
-    """Whether the heads of a file are as wide as heads, and its bodies in a place: both in ``unit`` metres."""
+class GeometryChecks:
+    """Checks of the width of heads, and of the position of bodies in the environment; ``unit`` is in metres."""
 
     def __init__(self, file: str, unit: float, builder: RaysBuilder) -> None:
         self._file, self._unit, self._builder = file, unit, builder
@@ -556,58 +622,58 @@ class PlaceChecks:
         self._hips: list[np.ndarray] = []
 
     def add_sides(self, left: np.ndarray, right: np.ndarray) -> None:
-        """Add the sides of heads, (n, 3) each."""
+        """Add the positions of the sides of heads, (n, 3) each."""
         self._widths.append(self._unit * np.linalg.norm(left - right, axis=1))
 
     def add_hips(self, between: np.ndarray) -> None:
-        """Add the points between the hips of bodies, (n, 3)."""
+        """Add the midpoints of the hips of bodies, (n, 3)."""
         self._hips.append(self._unit * np.linalg.norm(between, axis=1))
 
     def finish(self) -> None:
-        """Say on the card what no heads or bodies in a place can be."""
-        width, distance = (median_of(values) for values in (self._widths, self._hips))
-        if not np.isnan(width) and not _EARS[0] < width < _EARS[1]:
-            self._builder.complain(
-                f'the sides of the heads in "{sanitize(self._file, 60)}" are {width:.3g} m apart (median), which no ears '
-                "are: are the skeleton, the keypoints and the units those of the file?"
+        """Add warnings about implausible heads or bodies."""
+        width, distance = (finite_median(values) for values in (self._widths, self._hips))
+        if not np.isnan(width) and not _EAR_DISTANCES[0] < width < _EAR_DISTANCES[1]:
+            self._builder.add_warning(
+                f'the sides of the heads in "{sanitize(self._file, 60)}" are {width:.3g} m apart (median), which is '
+                "not plausible: are the skeleton, the keypoints and the units those of the file?"
             )
-        if distance < _AT_THE_HIPS:
-            self._builder.complain(
-                f'the bodies in "{sanitize(self._file, 60)}" stand with their hips at the origin: positions are relative '
-                "to them, and where people were is not in the file"
+        if distance < _MAX_HIP_OFFSET:
+            self._builder.add_warning(
+                f'the bodies in "{sanitize(self._file, 60)}" have their hips at the origin: positions are relative to '
+                "the hips, and the file does not contain where people were"
             )
 
 
-def median_of(values: list[np.ndarray]) -> float:
-    """The median of those that are not NaN; NaN where there are none."""
+def finite_median(values: list[np.ndarray]) -> float:
+    """Median of the finite values; NaN if there are none."""
     finite = np.concatenate([v[np.isfinite(v)] for v in values] or [np.empty(0)])
     return float(np.median(finite)) if finite.size else np.nan
 
 
-def _skeleton_of(path: Path, options: SkeletonOptions, builder: RaysBuilder) -> tuple[str, Layout]:
-    """The name of the skeleton whose keypoints the lines of ``path`` hold, and how these lines are divided."""
+def _find_skeleton(path: Path, options: SkeletonOptions, builder: RaysBuilder) -> tuple[str, Layout]:
+    """Find the name of the skeleton by the number of values per line of ``path``, and the layout of its lines."""
     values = count_values(path)
     if values is None:
-        # The lines themselves are refused, one by one.
-        return options.skeleton or PAPER, Layout(SKELETONS[options.skeleton or PAPER].keypoints)
+        # The lines are reported as bad when they are read.
+        return options.skeleton or PAPER_SKELETON, Layout(SKELETONS[options.skeleton or PAPER_SKELETON].keypoints)
     names = [options.skeleton] if options.skeleton else list(SKELETONS)
-    fits = [
+    matches = [
         (name, layout)
         for name in names
         for layout in (Layout(SKELETONS[name].keypoints, width) for width in (3, 4))
-        if layout.values == values
+        if layout.num_values == values
     ]
-    if not fits:
-        there = ", ".join(f"{name} ({SKELETONS[name].keypoints})" for name in names)
+    if not matches:
+        available = ", ".join(f"{name} ({SKELETONS[name].keypoints})" for name in names)
         raise NergError(
-            f'the lines of "{path}" have {values} numbers, which are the keypoints of no skeleton that is read: '
-            f"{there}, each with 3 numbers (x, y, z) or 4 (and a confidence)"
+            f'the lines of "{path}" have {values} numbers, which matches no known skeleton: '
+            f"{available}, each with 3 numbers (x, y, z) or 4 (with a confidence)"
         )
-    name, layout = fits[0]
-    if options.skeleton is None and name != PAPER:
-        others = "".join(f" (or {other}, with as many)" for other, _ in fits[1:])
-        builder.complain(
-            f'"{sanitize(path.name, 60)}" has {layout.keypoints} keypoints and was taken for {SKELETONS[name].title}'
-            f"{others}: say which it is with --skeleton"
+    name, layout = matches[0]
+    if options.skeleton is None and name != PAPER_SKELETON:
+        alternatives = "".join(f" (or {other}, with the same number)" for other, _ in matches[1:])
+        builder.add_warning(
+            f'"{sanitize(path.name, 60)}" has {layout.keypoints} keypoints; {SKELETONS[name].title} is assumed'
+            f"{alternatives}: set it with --skeleton"
         )
     return name, layout

@@ -20,8 +20,8 @@ QTM_NAMES = "X Pos\tY Pos\tZ Pos\tX Vec\tY Vec\tZ Vec\n"
 
 
 def look(k: int, side: int = 0) -> tuple[list[float], list[float]]:
-    """Who walks along x at 1 m/s, 1.6 m high, and turns 2 degrees a sample from x to the left, 10 degrees down; the
-    eyes are 60 mm apart, and ``side`` is 1 for the left one, -1 for the right."""
+    """A person who walks along x at 1 m/s, 1.6 m high, and turns 2 degrees per sample from x to the left, 10 degrees
+    down; the eyes are 60 mm apart, and ``side`` is 1 for the left one, -1 for the right one."""
     turn, down = math.radians(2 * k), math.radians(10)
     ahead = [math.cos(down) * math.cos(turn), math.cos(down) * math.sin(turn), -math.sin(down)]
     return [20 * k - side * 30 * math.sin(turn), side * 30 * math.cos(turn), 1600], ahead
@@ -40,7 +40,7 @@ def write_qtm(path, *, header=QTM_HEADER, names=QTM_NAMES, before=lambda k: (), 
     return path
 
 
-def assert_looks(rays, samples, start=-0.04):
+def assert_direction(rays, samples, start=-0.04):
     assert np.allclose(rays.t, [start + 0.02 * k for k in samples])
     origin, ahead = zip(*(look(k) for k in samples))
     assert np.allclose(rays.origin, np.array(origin) / 1000) and np.allclose(rays.direction, ahead)
@@ -48,19 +48,19 @@ def assert_looks(rays, samples, start=-0.04):
 
 @pytest.mark.parametrize("names", [QTM_NAMES, ""])
 @pytest.mark.parametrize("timed", [True, False])
-def test_columns_and_times_that_may_be_missing(tmp_path, names, timed):
+def test_optional_columns_and_times(tmp_path, names, timed):
     before = (lambda k: (k + 1, 3 + 0.02 * k)) if timed else (lambda k: ())
     named = "Sample\tTime\t" + names if names and timed else names
     rays = read("qualisys", write_qtm(tmp_path / "ann_g.tsv", names=named, before=before, lost=(2,)))
-    assert_looks(rays, [0, 1, 3, 4], 3 if timed else -0.04)
+    assert_direction(rays, [0, 1, 3, 4], 3 if timed else -0.04)
     assert rays.persons == ("ann",)
     assert dropped(rays) == {"no eye was seen": [[9 + bool(names) + 2] * 2]}
-    # Nothing is said of the time.
+    # Without any information about time.
     bare = write_qtm(tmp_path / "bo_g.tsv", header="", names=named, before=before)
     if timed:
         assert len(read("qualisys", bare)) == 5
     else:
-        with pytest.raises(NergError, match="bo_g.tsv tells no time"):
+        with pytest.raises(NergError, match="bo_g.tsv has no times"):
             read("qualisys", bare)
 
 
@@ -70,28 +70,28 @@ def test_two_eyes_are_one_ray(tmp_path):
     rays = read("qualisys", tmp_path)
     assert rays.persons == ("ann",) and np.allclose(rays.t, [-0.04, -0.02, 0.0, 0.04])
     assert rays.metadata["rows_read"] == 5
-    # Midway between both; where one was not seen, the other.
+    # Midway between both eyes; if one was not tracked, the other.
     for at, (k, side) in enumerate(((0, 0), (1, -1), (2, 0), (4, 1))):
         assert np.allclose(1000 * rays.origin[at], look(k, side)[0]) and np.allclose(rays.direction[at], look(k)[1])
     assert dropped(rays) == {"no eye was seen": [[13, 13]]}
     assert [s["file"] for s in rays.metadata["sources"]] == ["ann_g_2.tsv", "ann_g_1.tsv"]
-    # An eye that is given alone is read alone, and other files are other people.
+    # A single eye is read alone, and other files belong to other participants.
     assert np.allclose(1000 * read("qualisys", right).origin[0], look(0, -1)[0])
     assert read("qualisys", left, write_qtm(tmp_path / "bo_g.tsv")).persons == ("ann", "bo")
     assert len(read("qualisys", write_qtm(tmp_path / "other.tsv"))) == 5
 
 
-def test_a_line_that_is_cut_off(tmp_path):
+def test_truncated_line(tmp_path):
     path = write_qtm(tmp_path / "ann_g.tsv", count=300)
     text = path.read_text().split("\n")
     text[20] = text[20][:20]
     path.write_text("\n".join(text))
     with pytest.raises(NergError, match="ann_g.tsv.*21"):
         read("qualisys", path)
-    assert_looks(read("qualisys", path, skip_bad_lines=True), [k for k in range(300) if k != 11])
+    assert_direction(read("qualisys", path, skip_bad_lines=True), [k for k in range(300) if k != 11])
 
 
-def test_up_and_what_is_refused(tmp_path):
+def test_up_axis_and_invalid_input(tmp_path):
     rays = read("qualisys", write_qtm(tmp_path / "ann_g.tsv"), up="y")
     assert np.allclose(rays.origin[0], [0, -1.6, 0])
     (tmp_path / "bo_g.tsv").write_text("MARKER_NAMES\ta\n1\t2\t3\n")
@@ -108,7 +108,7 @@ NEON_NAMES = (
 
 
 def test_neon_in_motion_capture(tmp_path):
-    """As the tool writes it: pandas' index first, markers beside the gaze, empty where the glasses were not found."""
+    """As the tool writes it: pandas' index first, markers next to the gaze, empty if the glasses were not located."""
     path = tmp_path / "ann" / "gaze_in_mocap_space.csv"
     path.parent.mkdir()
     rows = [[k, 1_700_000_000_000_000_000 + 5_000_000 * k, 7, *look(k)[0], *look(k)[1], 1] for k in range(4)]
@@ -119,11 +119,11 @@ def test_neon_in_motion_capture(tmp_path):
     origin, ahead = zip(*(look(k) for k in (0, 1, 3)))
     assert np.allclose(rays.origin, np.array(origin) / 1000) and np.allclose(rays.direction, ahead)
     assert dropped(rays) == {"the glasses' markers were not seen": [[4, 4]]}
-    # Another name is the person's; metres with y up.
+    # Another file name is that of the participant; metres with y up.
     other = path.rename(path.with_name("bo.csv"))
     metres = read("neon_mocap", other, up="y", units="m")
     assert metres.persons == ("bo",) and np.allclose(metres.origin[1], np.array(origin[1])[[0, 2, 1]] * (1, -1, 1))
-    with pytest.raises(NergError, match="say it .--up z"):
+    with pytest.raises(NergError, match="specify it .--up z"):
         read("neon_mocap", other)
     for old, new, message in (
         ("timestamp [ns]", "time", '"timestamp .ns.".*LF_X'),
@@ -134,7 +134,7 @@ def test_neon_in_motion_capture(tmp_path):
             read("neon_mocap", other, up="z")
 
 
-# ---- Heads that Motive tracked ----
+# ---- Heads tracked with Motive ----
 
 MOTIVE_N = 12
 MOTIVE_T = 0.01 * np.arange(MOTIVE_N)
@@ -142,8 +142,8 @@ PLACE = np.c_[0.1 * np.arange(MOTIVE_N), np.full(MOTIVE_N, 1.6), -2 + 0.05 * np.
 TURN = Rotation.from_euler("YX", np.c_[10.0 * np.arange(MOTIVE_N), np.full(MOTIVE_N, -20.0)], degrees=True)
 
 
-def write_motive(path, **more):
-    path.write_text(motive(MOTIVE_T, **{"bodies": {"Head": (PLACE, TURN)}, **more}))
+def write_motive(path, **extra):
+    path.write_text(motive(MOTIVE_T, **{"bodies": {"Head": (PLACE, TURN)}, **extra}))
     return path
 
 
@@ -167,9 +167,9 @@ def test_units_up_and_lost_samples(tmp_path):
     turn = Rotation.from_matrix(np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]) @ TURN.as_matrix())
     path = write_motive(tmp_path / "ann.csv", bodies={"Head": (place, turn)}, units="Millimeters")
     rays = read("motive", path, up="z")
-    kept = np.r_[0:3, 5:MOTIVE_N]
-    assert np.allclose(rays.origin, in_rays(PLACE)[kept])
-    assert np.allclose(rays.direction, in_rays(TURN.apply([0, 0, -1]))[kept])
+    selected = np.r_[0:3, 5:MOTIVE_N]
+    assert np.allclose(rays.origin, in_rays(PLACE)[selected])
+    assert np.allclose(rays.direction, in_rays(TURN.apply([0, 0, -1]))[selected])
     assert dropped(rays) == {"the rigid body was not tracked": [[11, 12]]}
 
 
@@ -182,7 +182,7 @@ def test_which_body_is_the_head(tmp_path):
     for options in ({}, {"rigid_body": "C"}):
         with pytest.raises(NergError, match="rigid bodies A, B"):
             read("motive", unclear, **options)
-    # The same name twice is one body whose columns repeat.
+    # A repeated name is one body with repeated columns.
     path = tmp_path / "c.csv"
     path.write_text(motive(MOTIVE_T, {"Head": other, "head": other}).replace("head", "Head"))
     with pytest.raises(NergError, match="several columns called 'Head Rigid Body"):
@@ -203,8 +203,8 @@ def test_other_readers_name_it(tmp_path, name, options):
         ("Rotation Type,Quaternion", "Rotation Type,XYZ", "rotation type 'XYZ'; export it again with Quaternion"),
         ("Space,Global", "Space,Local", "coordinate space 'Local'"),
         ("Units,Meters", "Units,Inches", "length units 'Inches'"),
-        ("Format Version,1.23,", "", "no export of Motive"),
-        ("Frame,Time", "Frames,Time", "no export of Motive"),
+        ("Format Version,1.23,", "", "not an export of Motive"),
+        ("Frame,Time", "Frames,Time", "not an export of Motive"),
         (",Type,", ",Kind,", "no lines of types"),
         ("0,0.0,", "0,0.0,9,", "line 8: 17 cells, the header has 16|line 8: 14 cells, the header has 13"),
     ],
@@ -216,11 +216,11 @@ def test_other_exports_are_refused(tmp_path, old, new, message):
         read("motive", path)
 
 
-# ---- C3D files: heads by their markers ----
+# ---- C3D files: heads from markers ----
 
 needs_c3d = pytest.mark.skipif(find_spec("c3d") is None, reason="c3d is not installed")
 
-# A head that looks along x, with y to its left, in metres: ears, nose, and the band of Plug-in Gait.
+# A head that looks along x, with y to its left, in metres: ears, nose, and the headband of Plug-in Gait.
 HEAD = {
     "Left_Ear": (0, 0.075, 0),
     "Right_Ear": (0, -0.075, 0),
@@ -236,7 +236,7 @@ HEAD |= {f"{name[0]}_HD{name[1]}": HEAD[name] for name in BAND}  # as Qualisys c
 
 
 def turned(n=12, seed=0):
-    """Heads (n) in all directions: turns, and where they are."""
+    """Heads (n) in all directions: rotations and positions."""
     rng = np.random.default_rng(seed)
     return Rotation.from_quat(rng.normal(size=(n, 4))), rng.uniform([-4, -4, 1.2], [4, 4, 1.9], (n, 3))
 
@@ -273,8 +273,8 @@ def test_heads_in_all_directions(tmp_path, names, keypoints, centre, unused, uni
 
 @needs_c3d
 @pytest.mark.parametrize("up", ["+Y", "-Y"])
-def test_people_axes_and_markers_that_were_not_seen(tmp_path, up):
-    """Two people in one file whose y points up; markers that were lost, at exactly zero and at a fill value."""
+def test_participants_axes_and_missing_markers(tmp_path, up):
+    """Two participants in one file with y up; missing markers at exactly zero and at a fill value."""
     turn, place = turned()
     names = ["LFHD", "RFHD", "LBHD", "RBHD"]
     ann = positions(names, turn, place)
@@ -289,17 +289,17 @@ def test_people_axes_and_markers_that_were_not_seen(tmp_path, up):
     assert rays.persons == ("Ann", "Bo") and rays.metadata["source_frame"]["up"] == "y"
     assert dropped(rays) == {"a keypoint of the head is missing": [[4, 4], [6, 6], [8, 8]]}
     mine = rays.person == 1
-    there = ~np.isin(np.arange(12), [5, 7])
-    assert np.abs(rays.direction[mine] - turn.inv().apply([1, 0, 0])[there]).max() < 1e-5
-    assert np.allclose(rays.t[mine], np.arange(12)[there] / 50)
+    present = ~np.isin(np.arange(12), [5, 7])
+    assert np.abs(rays.direction[mine] - turn.inv().apply([1, 0, 0])[present]).max() < 1e-5
+    assert np.allclose(rays.t[mine], np.arange(12)[present] / 50)
 
 
 @needs_c3d
-def test_what_a_file_does_not_say(tmp_path):
-    path, there = tmp_path / "ann.c3d", positions(BAND, *turned())
-    write_c3d(path, BAND, there, units=None, up=None, frames=40)
+def test_files_without_unit_axis_or_rate(tmp_path):
+    path, present = tmp_path / "ann.c3d", positions(BAND, *turned())
+    write_c3d(path, BAND, present, units=None, up=None, frames=40)
     said = read("c3d", path, units="m").metadata["complaints"]
-    assert "which axis points up; z was taken" in said[0] and "ends after 12 of the 40 frames" in said[1]
+    assert "the up axis; z is assumed" in said[0] and "ends after 12 of the 40 frames" in said[1]
     wide = read("c3d", path, units="mm", up="z").metadata["complaints"]
     assert "0.00012 m apart" in wide[1]
 
@@ -309,36 +309,36 @@ def test_what_a_file_does_not_say(tmp_path):
     "labels, units, options, message",
     [
         (BAND, None, {}, "--units"),
-        (BAND, "in", {}, 'is in "in"'),
-        (["A", "B"], "mm", {}, "whose markers are A, B; name those"),
-        ([], "mm", {}, "holds no markers"),
-        (["A", "B"], "mm", {"keypoints": ("A", "B", "C")}, "markers of a head"),
+        (BAND, "in", {}, 'has the unit "in"'),
+        (["A", "B"], "mm", {}, "its markers are A, B; name those"),
+        ([], "mm", {}, "has no markers"),
+        (["A", "B"], "mm", {"keypoints": ("A", "B", "C")}, "no known head markers"),
     ],
 )
-def test_markers_that_are_no_head(tmp_path, labels, units, options, message):
-    there = positions(BAND, *turned())[:, : len(labels)]
-    write_c3d(tmp_path / "ann.c3d", labels or ["A"], there, units=units)
+def test_files_without_head_markers_are_refused(tmp_path, labels, units, options, message):
+    present = positions(BAND, *turned())[:, : len(labels)]
+    write_c3d(tmp_path / "ann.c3d", labels or ["A"], present, units=units)
     with pytest.raises(NergError, match=message):
         read("c3d", tmp_path / "ann.c3d", **options)
 
 
 @needs_c3d
 @pytest.mark.parametrize("tilt", [10, 40, -25])
-def test_headbands_that_are_not_level(tmp_path, tilt):
-    """A walker who looks ahead, whose headband points up; levelled by the pitch that is proposed."""
+def test_tilted_headbands_give_a_warning(tmp_path, tilt):
+    """A walker who looks ahead with a tilted headband, corrected by the proposed pitch."""
     names, path = ["LFHD", "RFHD", "LBHD", "RBHD"], tmp_path / "ann.c3d"
     turn = Rotation.from_euler("z", np.linspace(0, 300, 30)[:, None], degrees=True)
     band = turn * Rotation.from_euler("y", -tilt, degrees=True)
     write_c3d(path, names, 1000 * positions(names, band, np.full((30, 3), 1.6)), units="mm  mm  mm", frames=31)
     said = read("c3d", path).metadata.get("complaints", [])
     assert said == [] if tilt == 10 else f"point {tilt} degrees up (median)" in said[0]
-    assert tilt == 10 or f"--pitch {-tilt} levels" in said[0]
+    assert tilt == 10 or f"--pitch {-tilt} makes them level" in said[0]
     assert np.abs(read("c3d", path, pitch=-tilt).direction - turn.apply([1, 0, 0])).max() < 1e-5
 
 
 @needs_c3d
 @pytest.mark.parametrize("length", [1, 100, 600, 700])
-def test_files_that_are_cut_off(tmp_path, length):
+def test_truncated_files(tmp_path, length):
     write_heads(tmp_path / "ann.c3d")
     data = (tmp_path / "ann.c3d").read_bytes()
     (tmp_path / "ann.c3d").write_bytes(data[:length])

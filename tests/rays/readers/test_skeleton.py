@@ -17,7 +17,7 @@ from nerg_mi.rays.readers.skeleton import (
 )
 from tests.rays.readers.examples import dropped, read
 
-# ---- Head poses of skeletons, and bodies for given ones ----
+# ---- Head poses from skeletons, and bodies for given head poses ----
 
 
 def heads(n=200, seed=0):
@@ -31,20 +31,20 @@ def poses_of(body, ears=(skeleton.LEFT_EAR, skeleton.RIGHT_EAR), nose=skeleton.N
     return skeleton.head_poses(*(body[:, k] for k in (*ears, nose)), pitch=pitch)
 
 
-def test_body_gives_exactly_its_head_pose():
+def test_body_has_exactly_its_head_pose():
     origin, direction = heads()
     body = skeleton.keypoints_from_head(origin, direction)
     o, d = poses_of(body)
     assert np.abs(o - origin).max() < 1e-6 and np.abs(d - direction).max() < 1e-6
     assert np.isfinite(body).all() and body[..., 2].min() > -0.05
-    # The left ear is on the left of where the head looks.
+    # The left ear is on the left of the direction of the head.
     side = body[2:, skeleton.LEFT_EAR] - body[2:, skeleton.RIGHT_EAR]
     left = np.cross([0, 0, 1.0], direction[2:])
     assert np.all(np.sum(side * left, axis=1) > 0)
     assert np.allclose(np.linalg.norm(side, axis=1), skeleton.EAR_DISTANCE)
 
 
-def test_unseen_keypoints_and_bad_heads():
+def test_missing_keypoints_and_invalid_heads():
     origin, direction = heads(3)
     body = skeleton.keypoints_from_head(origin, direction)
     body[0, skeleton.NOSE] = np.nan
@@ -55,27 +55,27 @@ def test_unseen_keypoints_and_bad_heads():
         skeleton.keypoints_from_head(origin, direction * [[1], [0], [1]])
 
 
-def test_a_body_is_the_same_on_both_sides():
+def test_body_is_symmetric():
     origin, heading = np.array([[2.0, 3.0, 1.58], [0.0, -1.0, 0.79], [0.5, 0.0, 1.7]]), np.array([0.3, 2.0, -1.1])
     direction = np.stack([np.cos(heading), np.sin(heading), np.zeros(3)], axis=1)
     body = skeleton.keypoints_from_head(origin, direction)
     left = np.cross([0, 0, 1.0], direction)
-    eyes, ears = (4, 15), (skeleton.LEFT_EAR, skeleton.RIGHT_EAR)
-    pairs = np.array([ears, eyes, (0, 12), (3, 14), (5, 16), (6, 17), (7, 18), (8, 19), (9, 20)])
-    # Mirrored in the plane through the middle of the ears in which the head looks.
+    both_eyes, ears = (4, 15), (skeleton.LEFT_EAR, skeleton.RIGHT_EAR)
+    pairs = np.array([ears, both_eyes, (0, 12), (3, 14), (5, 16), (6, 17), (7, 18), (8, 19), (9, 20)])
+    # Mirrored in the plane through the midpoint of the ears and the direction of the head.
     aside = np.einsum("nkj,nj->nk", body - origin[:, None], left)[..., None]
     mirrored = body - 2 * aside * left[:, None]
     assert np.allclose(body[:, pairs[:, 0]], mirrored[:, pairs[:, 1]], atol=1e-12)
     assert (aside[:, pairs[:, 0], 0] > 0.01).all()
     assert np.allclose(aside[:, [10, skeleton.NOSE, 21]], 0)
-    # The eyes lie between the ears; heels, knees, hips and shoulders one above the other, in proportion to the height.
-    between_eyes, between_ears = (np.linalg.norm(body[:, i] - body[:, j], axis=1) for i, j in (eyes, ears))
+    # The eyes are between the ears; heels, knees, hips and shoulders are above each other, in proportion to the height.
+    between_eyes, between_ears = (np.linalg.norm(body[:, i] - body[:, j], axis=1) for i, j in (both_eyes, ears))
     assert (between_eyes < 0.6 * between_ears).all()
     heights = body[:, [5, 7, 6, 8], 2] / origin[:, 2:]
     assert (np.diff(heights, axis=1) > 0.1).all() and np.allclose(heights, heights[0])
 
 
-def test_a_head_may_be_at_zero_but_not_nowhere():
+def test_head_may_be_at_the_origin():
     for origin in ((0, 0, 1.6), (1, 0, 0)):
         assert np.allclose(poses_of(skeleton.keypoints_from_head([origin], [(1, 0, 0)]))[0], [origin])
     for origin in ((np.nan, 1, 1.6), (1, 1, np.inf)):
@@ -104,7 +104,7 @@ def test_round_trip(tmp_path, poses, name):
     first = path.read_bytes()
     write_skeleton(path, ids, times, keypoints)
     assert path.read_bytes() == first  # no clock in the file
-    assert [len(run.ids) for run in iterate_skeleton(path, chunk=3)] == [3, 3, 1]
+    assert [len(run.ids) for run in iterate_skeleton(path, block_lines=3)] == [3, 3, 1]
 
 
 def test_reads_the_published_layout(tmp_path):
@@ -117,7 +117,7 @@ def test_reads_the_published_layout(tmp_path):
     assert np.array_equal(rows.keypoints[0, 11], [33, 34, 35]) and np.isnan(rows.keypoints[0, 1, 1])
 
 
-def test_writer_refuses(tmp_path, poses):
+def test_writer_refuses_invalid_input(tmp_path, poses):
     ids, times, keypoints = poses
     path = tmp_path / "day.csv"
     for wrong, message in (
@@ -133,8 +133,8 @@ def test_writer_refuses(tmp_path, poses):
 
 
 @pytest.mark.parametrize("keypoints", [None, (21, 2, 13)])
-def test_bad_lines_are_told_and_left_out(tmp_path, poses, keypoints):
-    path, told = tmp_path / "day.csv", {}
+def test_bad_lines_are_reported_and_skipped(tmp_path, poses, keypoints):
+    path, reported = tmp_path / "day.csv", {}
     write_skeleton(path, *poses)
     good, zeros = path.read_text().splitlines(keepends=True), ", ".join(["0"] * 65)
     bad = {
@@ -147,16 +147,16 @@ def test_bad_lines_are_told_and_left_out(tmp_path, poses, keypoints):
         good[0][:300]: "not enclosed",
     }
     path.write_text("".join(line for pair in zip(good, bad) for line in pair))
-    (rows,) = iterate_skeleton(path, keypoints=keypoints, on_bad=told.__setitem__)
+    (rows,) = iterate_skeleton(path, keypoints=keypoints, on_bad_line=reported.__setitem__)
     assert list(rows.ids) == poses[0] and rows.lines.tolist() == [1, 3, 5, 7, 9, 11, 13]
-    assert sorted(told) == [2, 4, 6, 8, 10, 12, 14]
-    assert all(why in told[line] for line, why in zip(sorted(told), bad.values()))
+    assert sorted(reported) == [2, 4, 6, 8, 10, 12, 14]
+    assert all(why in reported[line] for line, why in zip(sorted(reported), bad.values()))
     with pytest.raises(NergError, match="4.*2.*--skip-bad-lines"):
         read_skeleton(path)
 
 
 @pytest.mark.parametrize("keypoints", [None, (0, 1, 2)])
-def test_numbers_that_only_python_spells_so(tmp_path, keypoints):
+def test_numbers_in_python_notation(tmp_path, keypoints):
     path = tmp_path / "day.csv"
     path.write_text("a|1|[" + ", ".join(["1_0"] * 66) + "]\n")
     (rows,) = iterate_skeleton(path, keypoints=keypoints)
@@ -165,7 +165,7 @@ def test_numbers_that_only_python_spells_so(tmp_path, keypoints):
 
 # ---- Skeleton files as rays ----
 
-# A head that looks along x, with y to its left and z up, in metres from between the ears; and its trunk.
+# A head that looks along x, with y to its left and z up, in metres relative to the midpoint of the ears; and its trunk.
 FORWARD = np.array([1.0, 0, 0])
 HEAD = {
     "left_ear": (0, 0.075, 0),
@@ -180,7 +180,7 @@ HEAD = {
     "left_hip": (0.02, 0.1, -0.7),
     "right_hip": (0.02, -0.1, -0.7),
 }
-# Written out of the conventions' own lists: nose, left and right eye, left and right ear.
+# From the conventions' documentation: nose, left and right eye, left and right ear.
 FACES = {
     "coco17": (0, 1, 2, 3, 4),
     "body25": (0, 16, 15, 18, 17),
@@ -190,8 +190,8 @@ FACES = {
 
 
 def bodies_of(name, n=20, seed=0):
-    """Bodies (n, K, 3) turned in all directions, of which the joints that are not oriented by lie anywhere; and how
-    they are turned, and where the heads are."""
+    """Bodies (n, K, 3) in all directions, with random positions of the joints that do not define the pose; and their
+    rotations and head positions."""
     rng = np.random.default_rng(seed)
     turn, place = Rotation.from_quat(rng.normal(size=(n, 4))), rng.uniform([-4, -4, 1.2], [4, 4, 1.9], (n, 3))
     keypoints = place[:, None] + rng.normal(0, 0.5, (n, SKELETONS[name].keypoints, 3))
@@ -212,7 +212,7 @@ def test_heads_in_all_directions(tmp_path, name):
     assert np.abs(rays.direction - turn.apply(FORWARD)).max() < 3e-5 and np.abs(rays.origin - place).max() < 1e-5
     assert rays.metadata["skeleton"] == name
     (complaint,) = rays.metadata["complaints"]  # the skeleton was taken by its number of keypoints, or has no face
-    assert ("where the trunk faces" if said else f"taken for {SKELETONS[name].title}") in complaint
+    assert ("facing direction of the trunk" if said else f"{SKELETONS[name].title}") in complaint
     if not said:
         by_eyes = read("skeleton", path, skeleton=name, keypoints=("left_ear", "right_ear", "left_eye+right_eye"))
         assert np.abs(by_eyes.direction - turn.apply(FORWARD)).max() < 3e-5
@@ -235,8 +235,8 @@ def test_units_and_axes(tmp_path):
 
 
 @pytest.mark.parametrize("name, sure", [("coco17", 1.0), ("mediapipe33", 1.0), ("kinect32", 2.0)])
-def test_keypoints_that_were_not_seen(tmp_path, name, sure):
-    """NaN, exact zeros and a confidence of 0 are missing; what is not of the head may be."""
+def test_missing_keypoints(tmp_path, name, sure):
+    """NaN, exact zeros and a confidence of 0 are missing; keypoints outside the head may be missing."""
     nose, _, _, left_ear, right_ear = FACES[name]
     keypoints, turn, _ = bodies_of(name)
     rows = np.concatenate([keypoints, np.full((*keypoints.shape[:2], 1), sure)], axis=2)
@@ -245,16 +245,16 @@ def test_keypoints_that_were_not_seen(tmp_path, name, sure):
     rows[5, right_ear, 3] = 0
     rows[6, 6] = 0
     rows[7, nose, 3] = 0.5 * sure
-    rows[8, right_ear, :2] = 0  # beside the camera, not at it
+    rows[8, right_ear, :2] = 0  # next to the camera, not at it
     path = tmp_path / "day.csv"
     write_skeleton(path, ["ann"] * 20, np.arange(20), rows)
     rays = read("skeleton", path)
     assert dropped(rays) == {"a keypoint of the head is missing": [[4, 6]]}
-    there = ~np.isin(np.arange(20), [3, 4, 5])
-    assert rays.confidence.tolist() == np.where(np.arange(20) == 7, 0.5, 1.0)[there].tolist()
-    there[8] = False
-    assert np.abs(rays.direction[np.isin(rays.t, np.flatnonzero(there))] - turn.apply(FORWARD)[there]).max() < 3e-5
-    # Without confidences the same, but for what only they say.
+    present = ~np.isin(np.arange(20), [3, 4, 5])
+    assert rays.confidence.tolist() == np.where(np.arange(20) == 7, 0.5, 1.0)[present].tolist()
+    present[8] = False
+    assert np.abs(rays.direction[np.isin(rays.t, np.flatnonzero(present))] - turn.apply(FORWARD)[present]).max() < 3e-5
+    # The same without confidences, except for keypoints that only these mark as missing.
     write_skeleton(path, ["ann"] * 20, np.arange(20), rows[..., :3])
     assert dropped(read("skeleton", path)) == {"a keypoint of the head is missing": [[4, 5]]}
 
@@ -270,21 +270,21 @@ def test_keypoints_that_are_fill_values(tmp_path, fill):
     assert np.abs(rays.direction - turn.apply(FORWARD)[np.isin(np.arange(20), rays.t)]).max() < 3e-5
 
 
-def test_bodies_that_are_in_no_place(tmp_path):
+def test_bodies_relative_to_their_hips_give_a_warning(tmp_path):
     keypoints, _, _ = bodies_of("mediapipe33")
     path = tmp_path / "day.csv"
     write_skeleton(path, ["ann"] * 20, np.arange(20), keypoints - keypoints[:, 23:25].mean(axis=1, keepdims=True))
     assert "with their hips at the origin" in read("skeleton", path).metadata["complaints"][1]
 
 
-def test_skeletons_that_are_none(tmp_path):
+def test_unknown_skeletons_are_refused(tmp_path):
     path = tmp_path / "day.csv"
     write_skeleton(path, ["ann"] * 2, np.arange(2), np.ones((2, 19, 3)))
     with pytest.raises(NergError, match="57.*nerg22.*22.*coco17.*17.*kinect25.*25"):
         read("skeleton", path)
     with pytest.raises(NergError, match="57.*coco17.*17"):
         read("skeleton", path, skeleton="coco17")
-    with pytest.raises(NergError, match="--skeleton.*nerg22.*coco17"):
+    with pytest.raises(NergError, match="nerg22.*coco17.*--skeleton"):
         read("skeleton", path, skeleton="coco18")
     write_skeleton(path, ["ann"] * 2, np.arange(2), np.ones((2, 17, 3)))
     for place in (17, "chin", "left_ear+", "-1"):
@@ -303,7 +303,7 @@ def test_rays_of_the_papers_tracking(tmp_path):
     body[7, RIGHT_EAR] = np.nan
     path = tmp_path / "day.csv.gz"
     write_skeleton(path, [f"p{i % 3}" for i in range(50)], np.arange(50), body)
-    rays = read("skeleton22", path, tick=0.1)  # as it was called
+    rays = read("skeleton22", path, tick=0.1)  # its former name
     keep = np.arange(50) != 7
     assert len(rays) == 49 and rays.persons == ("p0", "p1", "p2") and rays.hit is None
     assert np.allclose(rays.t, np.arange(50)[keep] * 0.1)
@@ -333,5 +333,5 @@ def test_keypoints_of_the_command_line():
     assert parse_keypoints("19,8,10") == (19, 8, 10)
     assert parse_keypoints("left_ear, 4,left_eye+right_eye") == ("left_ear", 4, "left_eye+right_eye")
     for text in ("1,2", "1,2,3,4", "a,,c"):
-        with pytest.raises(NergError, match="--keypoints is three places"):
+        with pytest.raises(NergError, match="--keypoints needs three keypoints"):
             parse_keypoints(text)
