@@ -315,7 +315,7 @@ class Proposal:
     columns: ColumnMap | None = None
     options: dict[str, str] = field(default_factory=dict)
     certain: list[str] = field(default_factory=list)
-    guesses: list[str] = field(default_factory=list)
+    assumptions: list[str] = field(default_factory=list)
     questions: list[str] = field(default_factory=list)
 
     @property

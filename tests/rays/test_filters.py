@@ -451,7 +451,7 @@ def test_split_by_time_with_a_gap(rays_splits):
     for p in range(5):
         mine = single.person == p
         assert single.t[test & mine].min() - single.t[train & mine].max() >= 10 and 0.24 < test[mine].mean() < 0.26
-    for wrong, message in (({"gap": 1e6}, "smaller gap"), ({"of": "day"}, '"all" or "person"')):
+    for wrong, message in (({"gap": 1e6}, "smaller gap"), ({"clock": "day"}, '"all" or "person"')):
         with pytest.raises(NergError, match=message):
             split_by_time(rays_splits, **wrong)
 

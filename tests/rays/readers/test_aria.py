@@ -291,7 +291,7 @@ def test_invalid_input_is_refused(tmp_path):
         (gaze, "only has an open loop trajectory, which drifts"),
         (poses, "contains no gaze"),
         (tmp_path / "ann/slam", "no gaze file"),
-        (tmp_path / "missing.csv", "there is no .*missing.csv"),
+        (tmp_path / "missing.csv", "missing.csv does not exist"),
     ):
         with pytest.raises(NergError, match=message):
             read("aria", cases)

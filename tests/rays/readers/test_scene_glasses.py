@@ -326,7 +326,7 @@ def test_quaternions_and_rotation_vectors_are_equal(tmp_path):
     b.write_text(json.dumps([dict(zip(keys, row)) for row in ([0, 1, 2, 3, 0, 0, 0], [0.1, 4, 5, 6, 0, 0, np.pi / 2])]))
     (one, of_one), (two, of_two) = read_timed_poses(a), read_timed_poses(b)
     assert (of_one, of_two) == (4, 2) and np.array_equal(one.times, [0, 0.1])
-    for field in ("times", "vectors", "places"):
+    for field in ("times", "rotation_vectors", "positions"):
         assert np.allclose(getattr(one, field), getattr(two, field))
 
 

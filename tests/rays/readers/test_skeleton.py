@@ -274,7 +274,7 @@ def test_bodies_relative_to_their_hips_give_a_warning(tmp_path):
     keypoints, _, _ = bodies_of("mediapipe33")
     path = tmp_path / "day.csv"
     write_skeleton(path, ["ann"] * 20, np.arange(20), keypoints - keypoints[:, 23:25].mean(axis=1, keepdims=True))
-    assert "with their hips at the origin" in read("skeleton", path).metadata["complaints"][1]
+    assert "have their hips at the origin" in read("skeleton", path).metadata["complaints"][1]
 
 
 def test_unknown_skeletons_are_refused(tmp_path):
