@@ -5,17 +5,17 @@
     scene = nerg.make_scene("store.safetensors", "shoppers.safetensors", camera=nerg.Camera((7, 3, 2), (5, 4, 1)))
     pictures = nerg.render(scene, observers=[(4.4, 2.8, 1.6)])
 
-`docs/reference/python.md` leads through what can be done; every name of `__all__` has an example in its docstring. A Mitsuba
-variant that is set stays set; where none is, the first call that needs one sets ``cuda_ad_rgb`` if it works and
-``llvm_ad_rgb`` otherwise.
+`docs/python.md` introduces the interface; each name of `__all__` has an example in its docstring. A Mitsuba variant
+that is already set is kept. Otherwise the first call that needs a variant sets ``cuda_ad_rgb`` if it works, and
+``llvm_ad_rgb`` if not.
 
 Importing this package makes its plugins available to Mitsuba: before or after `import mitsuba`, before or after
-`mi.set_variant`, and again after every change of variant. Neither Mitsuba nor NumPy is imported, and a name of the API
-only once it is used, so that this stays cheap.
+`mi.set_variant`, and after each change of variant. The import is cheap: it loads neither Mitsuba nor NumPy, and each
+name of the API is loaded on first use.
 
-Where the libLLVM that Dr.Jit would load is one on which it aborts the process, importing Dr.Jit or Mitsuba after this
-package raises `nerg_mi.errors.UnusableLLVM`, an `ImportError`; where Dr.Jit is loaded already, importing this package
-does. Everything else works there, the command `nerg doctor` first of all.
+If Dr.Jit would load a libLLVM on which it aborts the process, importing Dr.Jit or Mitsuba after this package raises
+`nerg_mi.errors.UnusableLLVM`, an `ImportError`. If Dr.Jit is already loaded, importing this package raises it.
+Everything else works without LLVM, including the command `nerg doctor`.
 """
 
 from pathlib import Path as _Path
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-_WHERE = {
+_MODULES = {
     "Camera": "nerg_mi.api.arrays",
     "NergError": "nerg_mi.errors",
     "Rays": "nerg_mi.rays.rays",
@@ -80,7 +80,7 @@ _WHERE = {
     "train_prior": "nerg_mi.api.workflows",
     "train_radiance": "nerg_mi.api.workflows",
 }
-"""The public names, and the module of each."""
+"""The public names, and the module that defines each."""
 
 __all__ = [
     "Camera",
@@ -114,14 +114,14 @@ __all__ = [
 
 
 def __getattr__(name: str) -> object:
-    """A public name, whose module is imported when it is first asked for."""
-    if name not in _WHERE:
+    """Import the module of a public name on first access."""
+    if name not in _MODULES:
         import sys
 
         raise AttributeError(f'module "{__name__}" has no attribute "{name}"', name=name, obj=sys.modules[__name__])
     from importlib import import_module
 
-    value = getattr(import_module(_WHERE[name]), name)
+    value = getattr(import_module(_MODULES[name]), name)
     globals()[name] = value
     return value
 
@@ -132,7 +132,7 @@ def __dir__() -> list[str]:
 
 _root = _Path(__file__).resolve().parents[1]
 if not (_root / "nerg_mi" / "plugins").is_dir() and (_root / "plugins" / "__init__.py").is_file():
-    # In a checkout the plugins and the scenes lie beside the package, and an installation maps them into it.
+    # In a checkout, the plugins and the scenes are next to the package; an installation contains them.
     __path__.append(str(_root))
 _llvm.select_library()
 _registration.install()

@@ -1,6 +1,7 @@
-"""What works on this machine: variants, libLLVM, CUDA, threads, extras; each trouble with its remedy.
+"""Checks of the installation for `nerg doctor`: variants, libLLVM, CUDA, threads and extras, each with a fix.
 
-Backends are tried in processes of their own, since a bad one may end its process. Nothing here imports Mitsuba.
+Each backend is tested in its own process because a broken backend may terminate the process. This module does not
+import Mitsuba.
 """
 
 from __future__ import annotations
@@ -16,20 +17,21 @@ from . import __version__, llvm
 from .errors import format_error
 
 EXTRAS = {
-    "torch": 'checkpoints of torch-ngp, fields as torch modules: pip install "nerg-mi[torch]"',
-    "scikit-image": 'meshes of radiance fields: pip install "nerg-mi[mesh]"',
-    "xatlas": 'textures of baked gaze: pip install "nerg-mi[bake]"',
-    "pyarrow": 'ray tables in Parquet: pip install "nerg-mi[parquet]"',
-    "pycolmap": 'poses of photos: pip install "nerg-mi[poses]"',
-    "c3d": 'C3D files of motion capture: pip install "nerg-mi[mocap]"',
+    "torch": 'for torch-ngp checkpoints and fields as torch modules: pip install "nerg-mi[torch]"',
+    "scikit-image": 'for meshes of radiance fields: pip install "nerg-mi[mesh]"',
+    "xatlas": 'for textures of baked gaze: pip install "nerg-mi[bake]"',
+    "pyarrow": 'for gaze samples in Parquet tables: pip install "nerg-mi[parquet]"',
+    "pycolmap": 'for camera poses of photos: pip install "nerg-mi[poses]"',
+    "c3d": 'for C3D motion-capture files: pip install "nerg-mi[mocap]"',
 }
-"""Optional distributions, each with what it is for and how to get it."""
+"""Optional distributions, each with its purpose and the command that installs it."""
 
 MIN_CUDA_VERSION = (12, 8)
 """CUDA version of the oldest NVIDIA driver (R570) on which drjit.nn works."""
 
-# dr.maximum is the operation on which libLLVM 15 and 16 abort; the rest of a kernel tells nothing more.
-_TRIAL = """
+
+# The kernel uses dr.maximum because libLLVM 15 and 16 abort on it.
+_TEST_SCRIPT = """
 import json, sys
 import drjit as dr, mitsuba as mi
 backend, found = sys.argv[1], {"variants": [], "failed": {}}
@@ -54,7 +56,17 @@ print("\\n" + json.dumps(found))
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of the report. `trouble` says what is wrong and what to do; empty where all is well."""
+    """One line of the report.
+
+    Attributes
+    ----------
+    topic
+        What was checked.
+    text
+        The result of the check.
+    problem
+        What is wrong and how to fix it; empty if the check passed.
+    """
 
     topic: str
     text: str
@@ -63,66 +75,74 @@ class Finding:
 
 @dataclass
 class Diagnosis:
-    """All findings, and whether the machine can render at all (`usable`: some compiled variant works)."""
+    """All findings. ``is_usable`` is true if at least one compiled variant works, so that the machine can render."""
 
     findings: list[Finding] = field(default_factory=list)
     is_usable: bool = False
 
     def __str__(self) -> str:
-        wide = max(len(f.topic) for f in self.findings)
+        width = max(len(f.topic) for f in self.findings)
         lines = []
         for f in self.findings:
-            lines.append(f"{f.topic:<{wide}}  {f.text}".rstrip())
+            lines.append(f"{f.topic:<{width}}  {f.text}".rstrip())
             if f.problem:
-                lines.append(f"{'':<{wide}}  -> {f.problem}")
+                lines.append(f"{'':<{width}}  -> {f.problem}")
         return "\n".join(lines)
 
 
 def try_backend(backend: str) -> dict:
-    """Run a small kernel in every variant of `backend` ("scalar", "llvm" or "cuda"), in a process of its own.
+    """Run a small kernel in each variant of ``backend`` ("scalar", "llvm" or "cuda") in a separate process.
 
-    Gives `variants` (those that worked), `failed` (message of each that did not), and where one worked `threads` and
-    the `version` of the backend. A process that died gives no variants and, as `failed[backend]`, its last words.
+    Returns
+    -------
+    dict
+        ``variants`` (names of the variants that work) and ``failed`` (error message of each variant that does not). If
+        a variant works, also ``threads`` and the ``version`` of the backend. If the process dies, ``variants`` is empty
+        and ``failed[backend]`` is the last line of its error output.
     """
-    trial = subprocess.run([sys.executable, "-c", _TRIAL, backend], capture_output=True, text=True)
-    if trial.returncode == 0:
-        return json.loads(trial.stdout.splitlines()[-1])
-    words = (trial.stderr.strip() or f"its process ended with code {trial.returncode}").splitlines()[-1]
-    return {"variants": [], "failed": {backend: words}}
+    process = subprocess.run([sys.executable, "-c", _TEST_SCRIPT, backend], capture_output=True, text=True)
+    if process.returncode == 0:
+        return json.loads(process.stdout.splitlines()[-1])
+    last_line = (process.stderr.strip() or f"its process exited with code {process.returncode}").splitlines()[-1]
+    return {"variants": [], "failed": {backend: last_line}}
 
 
 def run_diagnosis() -> Diagnosis:
-    """Try everything and report it; takes a few seconds."""
+    """Run all checks and return the report. Takes a few seconds."""
     diagnosis = Diagnosis()
     add = diagnosis.findings.append
     core = (f"{name} {_version(name) or 'not installed'}" for name in ("mitsuba", "drjit"))
     add(Finding("versions", ", ".join((f"nerg {__version__}", f"Python {platform.python_version()}", *core))))
 
-    library, trouble = llvm.find_current(), llvm.find_problem()
-    add(Finding("libLLVM", str(library) if library else "none", trouble or ""))
-    # Mitsuba itself may be what is broken, so the variants without a backend come first.
+    library, llvm_problem = llvm.find_current(), llvm.find_problem()
+    add(Finding("libLLVM", str(library) if library else "none", llvm_problem or ""))
+    # The scalar variants need no backend. They are tested first because Mitsuba itself may be broken.
     results = {"scalar": try_backend("scalar")}
-    results["llvm"] = try_backend("llvm") if trouble is None else {"variants": [], "failed": {}}
-    driver = llvm.has_cuda()
-    results["cuda"] = try_backend("cuda") if driver else {"variants": [], "failed": {}}
+    results["llvm"] = try_backend("llvm") if llvm_problem is None else {"variants": [], "failed": {}}
+    has_driver = llvm.has_cuda()
+    results["cuda"] = try_backend("cuda") if has_driver else {"variants": [], "failed": {}}
 
     cuda = results["cuda"]
-    if not driver:
-        add(Finding("CUDA", "no NVIDIA driver (not needed: the llvm variants run on the CPU)"))
+    if not has_driver:
+        add(Finding("CUDA", "no NVIDIA driver found (optional: the llvm variants run on the CPU)"))
     elif not cuda["variants"]:
-        said = next(iter(cuda["failed"].values()), "no reason was given")
-        add(Finding("CUDA", "does not work", f"install an NVIDIA driver R570 or newer; Dr.Jit said: {_one_line(said)}"))
+        problem = next(iter(cuda["failed"].values()), "no error message")
+        add(
+            Finding(
+                "CUDA", "does not work", f"install NVIDIA driver R570 or newer; Dr.Jit reports: {_one_line(problem)}"
+            )
+        )
     else:
-        old = tuple(cuda["version"]) < MIN_CUDA_VERSION
-        said = "neural fields need an NVIDIA driver R570 or newer: update it." if old else ""
-        add(Finding("CUDA", ".".join(map(str, cuda["version"])), said))
+        is_outdated = tuple(cuda["version"]) < MIN_CUDA_VERSION
+        problem = "neural fields need NVIDIA driver R570 or newer: update the driver." if is_outdated else ""
+        add(Finding("CUDA", ".".join(map(str, cuda["version"])), problem))
 
     for backend, result in results.items():
-        text, said = " ".join(result["variants"]) or "none", ""
+        text, problem = " ".join(result["variants"]) or "none", ""
         if result["failed"] and (backend != "cuda" or result["variants"]):
-            name, words = next(iter(result["failed"].items()))
-            said = f"{name} failed ({_one_line(words)}); reinstall with: pip install --force-reinstall mitsuba"
-        add(Finding(f"{backend} variants", text, said))
+            name, message = next(iter(result["failed"].items()))
+            problem = f"{name} failed ({_one_line(message)}); reinstall with: pip install --force-reinstall mitsuba"
+        add(Finding(f"{backend} variants", text, problem))
 
     threads = results["llvm"].get("threads")
     if threads:
@@ -132,8 +152,8 @@ def run_diagnosis() -> Diagnosis:
 
     diagnosis.is_usable = any(not v.startswith("scalar") for result in results.values() for v in result["variants"])
     if not diagnosis.is_usable:
-        said = "mend libLLVM or CUDA as said above."
-        add(Finding("verdict", "nothing can be rendered: no llvm and no cuda variant works", said))
+        problem = "fix libLLVM or CUDA as described above."
+        add(Finding("verdict", "cannot render: no llvm or cuda variant works", problem))
     else:
         add(Finding("verdict", "ready to render"))
     return diagnosis

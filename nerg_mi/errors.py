@@ -1,4 +1,4 @@
-"""The errors that a user is expected to meet, told in one sentence."""
+"""Errors that a user can fix, and their one-sentence messages."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from typing import Any
 
 
 class NergError(ValueError):
-    """Something the user can put right. The message is one sentence: the thing that is wrong, and the remedy.
+    """An error that the user can fix. The message is one sentence: what is wrong, and the remedy.
 
-    The command `nerg` prints it without a traceback and ends with exit code 1.
+    The command `nerg` prints the message without a traceback and exits with code 1.
 
     >>> import nerg_mi as nerg
     >>> try:
@@ -27,7 +27,7 @@ class NergError(ValueError):
 
 
 class MissingFile(NergError, FileNotFoundError):
-    """A file that is not there; the message names it."""
+    """A file that does not exist. The message names the file."""
 
 
 class UnusableLLVM(ImportError):
@@ -36,10 +36,9 @@ class UnusableLLVM(ImportError):
 
 @contextmanager
 def blame_options(options: str) -> Iterator[None]:
-    """A block whose values a user gave by ``options`` ("--aabb"): a `ValueError` of it is theirs to mend, as a
-    `NergError`.
+    """Attribute each `ValueError` of the block to the command-line ``options`` ("--aabb"), as a `NergError`.
 
-    Functions among themselves refuse wrong values by `ValueError`, since they do not know who gave them.
+    Internal functions raise `ValueError` for invalid values because they do not know which option supplied them.
     """
     try:
         yield
@@ -50,8 +49,22 @@ def blame_options(options: str) -> Iterator[None]:
 
 
 def import_extra(module: str, reason: str, extra: str) -> Any:
-    """The module ``name`` of a library that an ``extra`` installs. Raises `ImportError`, which begins with the ``need``
-    ("a mesh needs scikit-image"), where it is not installed."""
+    """Import an optional module.
+
+    Parameters
+    ----------
+    module
+        Name of the module.
+    reason
+        Beginning of the error message ("a mesh needs scikit-image").
+    extra
+        Extra of this package that installs the module (``pip install "nerg-mi[extra]"``).
+
+    Raises
+    ------
+    ImportError
+        If the module is not installed.
+    """
     try:
         return importlib.import_module(module)
     except ImportError:
@@ -59,14 +72,14 @@ def import_extra(module: str, reason: str, extra: str) -> Any:
 
 
 def is_user_error(error: BaseException) -> bool:
-    """Whether ``error`` is one that the user can mend, or the machine's, and not a mistake in the program.
+    """Return whether the user can fix ``error``; otherwise it is a bug in this package.
 
-    The former are `NergError`, a library that is missing or cannot be used, what the system says of files and devices,
-    and memory that does not suffice. The rest is the program's: a `ValueError`, too, says that one function of it
-    called another one with wrong values.
+    The user can fix a `NergError`, a missing or unusable library, an error that the operating system reports for a file
+    or device, and a lack of memory. Everything else is a bug. This includes `ValueError`, which means that one internal
+    function called another one with invalid values.
     """
     if isinstance(error, ImportError):
-        # Modules of our own are always there.
+        # The modules of this package are always installed.
         return not (error.name or "").startswith("nerg_mi")
     if isinstance(error, OSError):
         return error.errno is not None or error.filename is not None or isinstance(error, NergError)
@@ -74,7 +87,7 @@ def is_user_error(error: BaseException) -> bool:
 
 
 _TRACEBACK = "Traceback (most recent call last):"
-_MENDABLE = (
+USER_ERRORS = (
     "NergError",
     "MissingFile",
     "UnusableLLVM",
@@ -91,62 +104,70 @@ _MENDABLE = (
 
 @contextmanager
 def translate_mitsuba_errors(file: str | PathLike[str] | None = None) -> Iterator[None]:
-    """A block whose `RuntimeError`s are Mitsuba's, about a scene or about ``file``, as `NergError` that names it.
+    """Convert each `RuntimeError` that Mitsuba raises in the block to a `NergError` that names ``file``.
 
-    It makes one of whatever a plugin's constructor raises, with the traceback as text. Where that ends in an exception
-    that only a mistake of the program raises (a `TypeError`, say), the error is left as it is.
+    Mitsuba wraps every exception of a plugin's constructor in a `RuntimeError` whose text contains the traceback. If
+    that traceback ends in an exception that only a bug raises (such as a `TypeError`), the error is not converted.
+
+    Parameters
+    ----------
+    file
+        File that Mitsuba loads in the block; None for a scene.
     """
     try:
         yield
     except RuntimeError as error:
         _, marker, trace = str(error).partition(_TRACEBACK)
-        kind = _raised(trace).partition(":")[0].strip().rpartition(".")[2] if marker else None
-        if kind is not None and kind not in _MENDABLE:
+        error_type = _read_last_exception(trace).partition(":")[0].strip().rpartition(".")[2] if marker else None
+        if error_type is not None and error_type not in USER_ERRORS:
             raise
-        # Mitsuba quotes most files that it cannot read, but none whose content it gets as arrays.
-        said = format_error(error)
-        if file is not None and Path(file).name not in said:
-            said = f'"{file}" cannot be used by Mitsuba: {said}'
-        raise NergError(sanitize(said, 1000)) from error
+        # Mitsuba names most files that it cannot read, but not those whose content it receives as arrays.
+        message = format_error(error)
+        if file is not None and Path(file).name not in message:
+            message = f'"{file}" cannot be loaded by Mitsuba: {message}'
+        raise NergError(sanitize(message, 1000)) from error
     except UnicodeDecodeError as error:
-        # And what it quotes may be no text.
+        # Mitsuba may quote bytes of the file that are not valid UTF-8.
         raise NergError(
-            "a mesh or another file of the scene is damaged: it holds what is no text; make it anew"
+            "a mesh or another file of the scene is damaged: it contains bytes that are not valid text; create it again"
         ) from error
 
 
 def format_error(error: BaseException) -> str:
-    """What `error` says, on one line.
+    """Return the message of ``error`` on one line.
 
-    Mitsuba embeds the whole Python traceback of a plugin's constructor in its message. Kept are where in the scene it
-    happened (before the traceback) and what was said there (its last line).
+    Mitsuba embeds the complete Python traceback of a plugin's constructor in its message. The returned line keeps the
+    location in the scene (the text before the traceback) and the message of the exception (its last line).
     """
     text = str(error).strip()
     if isinstance(error, MemoryError):
-        text = f"there is not enough memory{': ' + text if text else ''}; ask for less, or close other programs"
+        text = f"not enough memory{': ' + text if text else ''}; reduce the size of the job, or close other programs"
     elif isinstance(error, OSError) and error.strerror:
-        said = f"{error.strerror[:1].lower()}{error.strerror[1:]}"
+        message = f"{error.strerror[:1].lower()}{error.strerror[1:]}"
         if error.filename is not None:
-            said = (
-                f'there is no file "{error.filename}"' if error.errno == errno.ENOENT else f'"{error.filename}": {said}'
+            message = (
+                f'there is no file "{error.filename}"'
+                if error.errno == errno.ENOENT
+                else f'"{error.filename}": {message}'
             )
-        text = said
-    before, marker, trace = text.partition(_TRACEBACK)
+        text = message
+    location, marker, trace = text.partition(_TRACEBACK)
     if marker:
-        text = before.rstrip() + " " + re.sub(r"^[A-Za-z_][\w.]*:\s+", "", _raised(trace))
+        text = location.rstrip() + " " + re.sub(r"^[A-Za-z_][\w.]*:\s+", "", _read_last_exception(trace))
     text = re.sub(r"^\[[\w.]+\.(cpp|h):\d+\]\s*", "", text)
     return " ".join(text.split()) or type(error).__name__
 
 
 def sanitize(text: object, max_length: int = 300) -> str:
-    """``text`` from a file, fit for one line of a message: control characters and what lies beyond ``most`` left
-    out.
+    """Return ``text`` from a file for use in a one-line message.
+
+    Control characters are replaced by "?", and text beyond ``max_length`` characters is truncated.
     """
-    kept = "".join(c if c.isprintable() else "?" for c in str(text)[: max_length + 1])
-    return kept if len(kept) <= max_length else kept[:max_length] + "..."
+    text_out = "".join(c if c.isprintable() else "?" for c in str(text)[: max_length + 1])
+    return text_out if len(text_out) <= max_length else text_out[:max_length] + "..."
 
 
-def _raised(trace: str) -> str:
-    """The end of a traceback: the exception's class and what it says."""
-    # It starts at the left margin and may run on over several lines; frames are indented.
+def _read_last_exception(trace: str) -> str:
+    """Return the last exception of a traceback: its class and message."""
+    # The exception starts at the left margin and may span several lines; stack frames are indented.
     return re.split(r"\n(?=[A-Za-z_][\w.]*(?::\s|$))", trace)[-1].strip()

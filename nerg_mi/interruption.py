@@ -1,4 +1,4 @@
-"""Ctrl-C between the steps of long work, so that what is being computed stays consistent."""
+"""Deferred handling of Ctrl-C, so that long computations stop in a consistent state."""
 
 from __future__ import annotations
 
@@ -7,44 +7,45 @@ import threading
 
 
 class Interruption:
-    """A context in which Ctrl-C is noted, and raised by ``check``.
+    """A context that records Ctrl-C; ``check`` raises `KeyboardInterrupt`.
 
-    In the middle of a step it would leave weights and random numbers of different steps, and Mitsuba and Dr.Jit would
-    carry on with what they have begun. Whoever works inside calls ``check`` after every step. The second Ctrl-C is
-    raised at once.
+    An interrupt in the middle of a step would mix weights and random states of different steps, and kernels of Mitsuba
+    and Dr.Jit would keep running. Code inside the context calls ``check`` after each step. A second Ctrl-C raises
+    immediately.
     """
 
     def __enter__(self) -> Interruption:
         self.is_requested = False
-        # Signals can only be dealt with in the main thread; a handler that is not Python's could not be put back; and
-        # where the signal is ignored, as for what a script runs in the background, it is meant for somebody else.
-        main = threading.current_thread() is threading.main_thread()
-        self._mine = main and signal.getsignal(signal.SIGINT) not in (None, signal.SIG_IGN)
-        if self._mine:
-            self._before = signal.signal(signal.SIGINT, self._note)
+        # Python handles signals in the main thread only. A handler that was not installed by Python cannot be restored.
+        # An ignored signal, as in a background job of a shell, must stay ignored.
+        is_main_thread = threading.current_thread() is threading.main_thread()
+        self._is_installed = is_main_thread and signal.getsignal(signal.SIGINT) not in (None, signal.SIG_IGN)
+        if self._is_installed:
+            self._previous = signal.signal(signal.SIGINT, self._on_signal)
         return self
 
-    def _note(self, *_) -> None:
+    def _on_signal(self, *_) -> None:
         if self.is_requested:
             raise KeyboardInterrupt
         self.is_requested = True
 
     def check(self) -> None:
-        """Raise ``KeyboardInterrupt`` if there was one."""
+        """Raise ``KeyboardInterrupt`` if Ctrl-C was pressed."""
         if self.is_requested:
             raise KeyboardInterrupt
 
     def __exit__(self, *error) -> None:
-        if self._mine:
-            signal.signal(signal.SIGINT, self._before)
+        if self._is_installed:
+            signal.signal(signal.SIGINT, self._previous)
 
 
 def restore_interrupt_handler() -> None:
-    """Let Python hear Ctrl-C again, where Mitsuba has taken it.
+    """Reinstall Python's handler of Ctrl-C after Mitsuba has replaced it.
 
-    Mitsuba takes the signal while a picture is rendered and remembers one handler to put back. An integrator in Python
-    that calls the render of its base class makes it do so twice, and the second time it remembers its own: from the
-    first picture on nobody would hear Ctrl-C. Called between the two, this makes the second one remember Python's.
+    Mitsuba replaces the handler while it renders, and restores one saved handler afterwards. A Python integrator that
+    calls ``render`` of its base class makes Mitsuba do this twice. The second call then saves Mitsuba's own handler,
+    and Ctrl-C has no effect after the first image. A call of this function between the two makes the second one save
+    Python's handler.
     """
     handler = signal.getsignal(signal.SIGINT)
     if handler is not None and threading.current_thread() is threading.main_thread():

@@ -1,10 +1,11 @@
-"""Which libLLVM Dr.Jit will load, and whether its kernels can run on it.
+"""Selection of the libLLVM that Dr.Jit loads, and a check that its kernels can run on it.
 
-Dr.Jit accepts LLVM 15 and newer, but its kernels use `llvm.maximum`, which LLVM 15 and 16 cannot translate on x86: they
-end the whole process, without a Python exception. Dr.Jit looks for a library once, when it is imported, and takes what
-the machine's default search yields. So the choice is made here before that, and a bad one is refused with a sentence.
+Dr.Jit accepts LLVM 15 and newer, but its kernels use `llvm.maximum`, which LLVM 15 and 16 cannot compile on x86: they
+terminate the process without a Python exception. Dr.Jit searches for the library once, when it is imported, and uses
+the first result of the system's default search. This module therefore selects a library before that import, and raises
+an error for an unusable one.
 
-Nothing here imports drjit, mitsuba or NumPy.
+This module does not import drjit, mitsuba or NumPy.
 """
 
 from __future__ import annotations
@@ -19,10 +20,10 @@ from typing import NamedTuple
 from .errors import UnusableLLVM
 
 MIN_VERSION = 17
-"""Oldest major version of LLVM whose code generator knows every operation that Dr.Jit emits."""
+"""Oldest major version of LLVM whose code generator supports all operations that Dr.Jit emits."""
 
 PATH_VARIABLE = "DRJIT_LIBLLVM_PATH"
-"""Environment variable that names the library to Dr.Jit; a value set by the user is never replaced."""
+"""Environment variable with the path of the library for Dr.Jit. A value set by the user is never replaced."""
 
 _FOLDERS = {
     "linux": (
@@ -52,8 +53,15 @@ print(*(n.value for n in numbers))
 
 
 class Library(NamedTuple):
-    """A libLLVM: `path` as found ("" if Dr.Jit chose it by itself), `version` a tuple starting with the major
-    number."""
+    """A libLLVM.
+
+    Attributes
+    ----------
+    path
+        Path of the file; "" if Dr.Jit selected the library itself.
+    version
+        Version numbers, starting with the major version.
+    """
 
     path: str
     version: tuple[int, ...]
@@ -68,10 +76,10 @@ class Library(NamedTuple):
 
 
 def suggest_fix() -> str:
-    """How to get a usable library on this machine: the end of a sentence."""
-    best = next(iter(find_installed()), None)
-    if PATH_VARIABLE in os.environ and best is not None and best.is_usable:
-        return f"unset {PATH_VARIABLE}, since {best} is installed"
+    """Return how to install a usable library on this machine, as the end of a sentence."""
+    newest = next(iter(find_installed()), None)
+    if PATH_VARIABLE in os.environ and newest is not None and newest.is_usable:
+        return f"unset {PATH_VARIABLE}, since {newest} is installed"
     if sys.platform == "darwin":
         return f'"brew install llvm", or set {PATH_VARIABLE} to a libLLVM.dylib of version {MIN_VERSION} or newer'
     if sys.platform == "win32":
@@ -80,10 +88,10 @@ def suggest_fix() -> str:
 
 
 def find_version(path: str) -> tuple[int, ...] | None:
-    """Version of the libLLVM at `path`, or None if it is none.
+    """Return the version of the libLLVM at ``path``, or None if the file is not a libLLVM.
 
-    Distributions write it into the file's name. Only where they do not, the library is asked, in a process of its own:
-    a second LLVM in this one could be the one whose symbols Dr.Jit then finds.
+    Distributions include the version in the file name. Only if it is missing, the library is loaded and queried in a
+    separate process: a second LLVM in this process could provide the symbols that Dr.Jit resolves.
     """
     for name in (os.path.realpath(path), path):
         match = re.search(r"libLLVM(?:-|\.so\.|\.)(\d+(?:\.\d+)*)", os.path.basename(name))
@@ -93,30 +101,32 @@ def find_version(path: str) -> tuple[int, ...] | None:
         return None
     import subprocess
 
-    answer = subprocess.run([sys.executable, "-c", _VERSION_PROBE, path], capture_output=True, text=True)
-    if answer.returncode != 0:  # not a library, of another machine, or older than LLVM 16, which has no such function
+    process = subprocess.run([sys.executable, "-c", _VERSION_PROBE, path], capture_output=True, text=True)
+    if (
+        process.returncode != 0
+    ):  # not a library, built for another machine, or older than LLVM 16, which lacks this function
         return None
-    return tuple(map(int, answer.stdout.split()))
+    return tuple(map(int, process.stdout.split()))
 
 
 def find_installed() -> list[Library]:
-    """Every libLLVM in the places where systems keep them, newest first, each file once."""
+    """Return each libLLVM in the usual library folders, newest first, without duplicates."""
     folders = [*_FOLDERS.get(sys.platform, ()), os.path.join(sys.prefix, "lib")]
     suffix = "*.dylib" if sys.platform == "darwin" else "*.so*"
-    found: dict[str, Library] = {}
+    libraries: dict[str, Library] = {}
     for folder in folders:
         for path in sorted(glob.glob(os.path.join(folder, "libLLVM" + suffix))):
             real = os.path.realpath(path)
-            if real in found or not os.path.isfile(real):
+            if real in libraries or not os.path.isfile(real):
                 continue
             version = find_version(real)
             if version is not None:
-                found[real] = Library(path, version)
-    return sorted(found.values(), key=lambda library: library.version, reverse=True)
+                libraries[real] = Library(path, version)
+    return sorted(libraries.values(), key=lambda library: library.version, reverse=True)
 
 
 def has_cuda() -> bool:
-    """Whether an NVIDIA driver is installed. Nothing is initialised."""
+    """Return whether an NVIDIA driver is installed. Does not initialise CUDA."""
     names = {"win32": ["nvcuda.dll"], "darwin": []}.get(sys.platform, ["libcuda.so.1", "libcuda.so"])
     for name in filter(None, [os.environ.get("DRJIT_LIBCUDA_PATH"), *names]):
         try:
@@ -128,61 +138,71 @@ def has_cuda() -> bool:
 
 
 def select_library() -> None:
-    """Point Dr.Jit to the newest usable libLLVM, unless the user has named one or Dr.Jit is loaded already."""
+    """Set the environment so that Dr.Jit loads the newest usable libLLVM.
+
+    Does nothing if the user has set the variable or Dr.Jit is already loaded.
+    """
     if PATH_VARIABLE in os.environ or "drjit" in sys.modules:
         return
-    best = next(iter(find_installed()), None)
-    if best is not None and best.is_usable:
-        os.environ[PATH_VARIABLE] = best.path
+    newest = next(iter(find_installed()), None)
+    if newest is not None and newest.is_usable:
+        os.environ[PATH_VARIABLE] = newest.path
 
 
-def _loaded() -> Library | None:
-    """The libLLVM inside a Dr.Jit that is loaded already; None if drjit is not loaded or found none it accepts."""
+def _find_loaded() -> Library | None:
+    """Return the libLLVM of a loaded Dr.Jit; None if drjit is not loaded or has found no suitable library."""
     detail = getattr(sys.modules.get("drjit"), "max_edge", None)
-    ask = getattr(detail, "llvm_version", None)
-    version = ask() if ask else (-1,)
+    get_version = getattr(detail, "llvm_version", None)
+    version = get_version() if get_version else (-1,)
     return Library(os.environ.get(PATH_VARIABLE, ""), tuple(version)) if version[0] > 0 else None
 
 
 def find_current() -> Library | None:
-    """The libLLVM that Dr.Jit has loaded or will load; None if there is none."""
-    loaded = _loaded()
+    """Return the libLLVM that Dr.Jit has loaded or will load; None if there is none."""
+    loaded = _find_loaded()
     if loaded is not None:
         return loaded
-    named = os.environ.get(PATH_VARIABLE)
-    if named is not None:
-        version = find_version(named) if os.path.isfile(named) else None
-        return Library(named, version) if version else None
+    user_path = os.environ.get(PATH_VARIABLE)
+    if user_path is not None:
+        version = find_version(user_path) if os.path.isfile(user_path) else None
+        return Library(user_path, version) if version else None
     return next(iter(find_installed()), None)
 
 
 def find_problem() -> str | None:
-    """What is wrong with the libLLVM that Dr.Jit has or will have, as one sentence with the remedy; None if nothing."""
+    """Return what is wrong with the libLLVM of Dr.Jit, as one sentence with the remedy; None if it is usable."""
     library = find_current()
     if library is not None and not library.is_usable:
         return f"{library} cannot run the kernels of Dr.Jit, which need LLVM {MIN_VERSION} or newer: {suggest_fix()}."
     if library is not None:
         return None
-    named = os.environ.get(PATH_VARIABLE)
-    if named is not None and not os.path.isfile(named):
-        return f'{PATH_VARIABLE} names "{named}", which is no file, and LLVM {MIN_VERSION} or newer is needed: {suggest_fix()}.'
-    if named is not None:
-        return f'{PATH_VARIABLE} names "{named}", which is no libLLVM that can be used: {suggest_fix()}.'
+    user_path = os.environ.get(PATH_VARIABLE)
+    if user_path is not None and not os.path.isfile(user_path):
+        return (
+            f'{PATH_VARIABLE} names "{user_path}", which is not a file, and LLVM {MIN_VERSION} or newer is needed: '
+            f"{suggest_fix()}."
+        )
+    if user_path is not None:
+        return f'{PATH_VARIABLE} names "{user_path}", which is not a usable libLLVM: {suggest_fix()}.'
     return f"No libLLVM was found, and the llvm variants need version {MIN_VERSION} or newer: {suggest_fix()}."
 
 
 def require_usable(variant: str | None = None) -> None:
-    """Raise `UnusableLLVM` (an ImportError) where going on would abort the process or could not work.
+    """Raise `UnusableLLVM` (an ImportError) if rendering would abort the process or could not work.
 
-    Without a `variant`, a machine without any libLLVM passes (what needs no kernels works there), and so does one with
-    an NVIDIA driver, whose cuda variants do not need LLVM; a library that the user named must be usable everywhere.
-    With a `variant`, only an `llvm_*` one is refused, and then whatever is wrong counts.
+    Parameters
+    ----------
+    variant
+        Mitsuba variant that is about to be used. Only an ``llvm_*`` variant can fail, and then any problem with libLLVM
+        is an error. With None, a machine without libLLVM passes, because features without kernels work there. A machine
+        with an NVIDIA driver passes too, because its cuda variants do not need LLVM. A library that the user has
+        selected must be usable in all cases.
     """
     if variant is not None and not variant.startswith("llvm"):
         return
-    trouble = find_problem()
-    if trouble is None:
+    problem = find_problem()
+    if problem is None:
         return
     if variant is None and PATH_VARIABLE not in os.environ and (find_current() is None or has_cuda()):
         return
-    raise UnusableLLVM(trouble)
+    raise UnusableLLVM(problem)

@@ -1,4 +1,4 @@
-"""Ranges of numbers, declared where a value is declared and checked by one function wherever it enters."""
+"""Ranges of numeric values: declared with a field or option, and validated by one function."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from typing import Any
 from .errors import NergError, sanitize
 
 RANGE, FLAG = "nerg_mi.range", "nerg_mi.flag"
-"""Keys in the metadata of a dataclass's field: the `Range` of its value, and its spelling on the command line, "" for
-that of its name; without one, it is none of the command line."""
+"""Keys in the metadata of a dataclass field: the `Range` of its value, and its spelling on the command line. An empty
+spelling means that the option is spelled as the field. A field without the key is not a command-line option."""
 
 CHANGES_RESULT = "nerg_mi.changes_result"
-"""Key in the same metadata: False for a field that says where or by whom something is computed, never what."""
+"""Key in the same metadata: False for a field that affects where or how a result is computed, but not the result."""
 
 
 @dataclass(frozen=True)
 class Range:
-    """The numbers from ``low`` to ``high``, both included. Both are finite, so that neither NaN nor infinity is in."""
+    """The numbers from ``low`` to ``high``, both included. Both ends are finite, which excludes NaN and infinity."""
 
     low: float
     high: float
@@ -35,24 +35,24 @@ class Range:
 
 
 MAX_COORDINATE = 1e7
-"""No coordinate is farther from 0, in scene units or metres. Single precision, in which rays are traced, resolves about
-one unit there; a room in millimetres and UTM coordinates in metres are nearer."""
+"""Largest absolute coordinate, in scene units or metres. Rays are traced in single precision, which resolves about one
+unit at this distance. A room in millimetres and UTM coordinates in metres are within the limit."""
 
 COORDINATES = Range(-MAX_COORDINATE, MAX_COORDINATE)
 SEEDS = Range(0, 2**31 - 1)
 BASE_SEEDS = Range(0, 2 * 10**9)
-"""Seeds that others follow."""
+"""Base seeds, from which further seeds are derived by addition."""
 THREADS = Range(1, 1024)
 TIMES = Range(-1e20, 1e20)
-"""Seconds on a clock of any origin."""
+"""Timestamps in seconds; the origin of the clock is arbitrary."""
 LENGTHS = Range(1e-6, 1e6)
-"""Lengths that are not 0, and factors between units of length."""
+"""Positive lengths, and conversion factors between units of length."""
 KAPPAS = Range(1e-6, 1e8)
-"""Concentrations of von Mises-Fisher kernels; beyond, single precision cannot resolve a kernel's width."""
+"""Concentrations of von Mises-Fisher kernels. Single precision cannot resolve the width of narrower kernels."""
 POSITIVE_VALUES = Range(1e-30, 1e30)
-"""Positive values, such as densities and the ends of colour scales, whose products single precision can hold."""
+"""Positive values, such as densities and the limits of colour scales, whose products fit into single precision."""
 TEST_FRACTIONS = Range(0, 0.99)
-"""Shares held out, of which something is left to train on."""
+"""Fractions of the data that are held out; at least 1 % remains for training."""
 SECONDS = Range(0, 1e9)
 MINUTES = Range(1e-6, 1e6)
 STEPS = Range(1, 10**9)
@@ -60,86 +60,99 @@ RAYS = Range(1, 2**31 - 1)
 LOSS_WEIGHTS = Range(0, 1e6)
 DIRECTIONS = Range(16, 1 << 20)
 SPP = Range(1, 1 << 24)
-"""Samples a pixel."""
+"""Samples per pixel."""
 LOG_DECADES = Range(0, 30)
-"""Powers of ten of a colour scale."""
+"""Powers of ten that a logarithmic colour scale spans."""
 RATES = Range(1e-3, 1e5)
-"""Pictures, or samples, a second."""
+"""Frames or samples per second."""
 FIELDS_OF_VIEW = Range(1e-4, 179.9)
 ELEVATIONS = Range(-90, 90)
-"""Degrees above and below the horizon."""
+"""Elevation angles in degrees; 0 is the horizon."""
 TIME_UNITS = Range(1e-12, 1e12)
-"""Seconds in a unit of time."""
+"""Duration of one unit of time, in seconds."""
 LEARNING_RATES = Range(0, 1)
 WEIGHT_DECAYS = Range(0, 1000)
 
 
 def check_number(value: Any, allowed: Range, name: str, is_integer: bool = False) -> None:
-    """Raise `NergError`, which calls it ``name``, unless ``value`` is a number in a range, and an integer if it is to
-    be ``whole``."""
-    kind, noun = (Integral, "a whole number") if is_integer else (Real, "a number")
-    if isinstance(value, bool) or not isinstance(value, kind):
+    """Raise `NergError` unless ``value`` is a number in the range ``allowed``.
+
+    Parameters
+    ----------
+    value
+        The value to check.
+    allowed
+        The valid range.
+    name
+        Name of the value in the error message.
+    is_integer
+        Whether the value must be an integer.
+    """
+    number_type, noun = (Integral, "a whole number") if is_integer else (Real, "a number")
+    if isinstance(value, bool) or not isinstance(value, number_type):
         raise NergError(f"{name} must be {noun}, got {sanitize(repr(value), 60)}")
-    number: Any = value
-    if number not in allowed:
-        raise NergError(f"{name} must lie in {allowed}, got {_shown(value)}")
+    numeric: Any = value
+    if numeric not in allowed:
+        raise NergError(f"{name} must lie in {allowed}, got {_format_value(value)}")
 
 
 def range_field(default: Any, allowed: Range) -> Any:
-    """A field of a `Checked` dataclass whose numbers lie ``within`` a range."""
+    """Declare a field of a `ValidatedDataclass` whose numbers must be in the range ``allowed``."""
     return dataclasses.field(default=default, metadata={RANGE: allowed})
 
 
 def setting(default: Any, help: str, *names: str, allowed: Range | None = None, option: str = "") -> Any:
-    """A field of a dataclass of settings, a `Checked` one, that is an option of what uses these settings, too.
+    """Declare a field of a settings dataclass (a `ValidatedDataclass`) that is also a command-line option.
 
     Parameters
     ----------
     default
-        Its value where none is set.
+        Default value.
     help
-        What it means, in one line.
+        One-line description of the value.
     names
-        How the command line spells it, where that is not ``--`` and the option's name.
-    within
-        The range of its numbers.
+        Spellings on the command line, if they differ from ``--`` and the option's name.
+    allowed
+        Range of the number.
     option
-        The option's name, where that is not the field's.
+        Name of the option, if it differs from the field's name.
     """
     return dataclasses.field(default=default, metadata={RANGE: allowed, "help": help, "names": names, "option": option})
 
 
 class ValidatedDataclass:
-    """Base of dataclasses that check their numbers on construction.
+    """Base class of dataclasses that validate their numbers on construction.
 
-    A field with a `Range` in its metadata holds a number in it, or several of them; None where its type allows that.
-    Raises `NergError` for others.
+    A field with a `Range` in its metadata holds one number or several numbers in that range, or None if its type allows
+    None. Other values raise `NergError`.
     """
 
     def __post_init__(self) -> None:
         assert dataclasses.is_dataclass(self)
         for field in dataclasses.fields(self):
-            within, kind = field.metadata.get(RANGE), str(field.type)
+            allowed, annotation = field.metadata.get(RANGE), str(field.type)
             value: Any = getattr(self, field.name)
-            if within is None or (value is None and "None" in kind):
+            if allowed is None or (value is None and "None" in annotation):
                 continue
             numbers = (value,)
-            if "tuple" in kind:
+            if "tuple" in annotation:
                 if not isinstance(value, Iterable):
-                    raise NergError(f"{_name(field)} must be several numbers, got {sanitize(repr(value), 60)}")
+                    raise NergError(
+                        f"{_describe_field(field)} must be a sequence of numbers, got {sanitize(repr(value), 60)}"
+                    )
                 numbers = tuple(value)
             for number in numbers:
-                check_number(number, within, _name(field), bool(re.search(r"\bint\b", kind)))
+                check_number(number, allowed, _describe_field(field), bool(re.search(r"\bint\b", annotation)))
 
 
-def _name(field: dataclasses.Field) -> str:
-    """What a message calls ``field``."""
+def _describe_field(field: dataclasses.Field) -> str:
+    """Return the name of ``field`` in error messages."""
     flag = field.metadata.get(FLAG)
     return field.name if flag is None else flag or "--" + field.name.replace("_", "-")
 
 
-def _shown(value: Any) -> str:
-    """``value`` in a few characters: an integer may have more digits than Python prints."""
+def _format_value(value: Any) -> str:
+    """Return ``value`` as a short string; an integer may have more digits than Python prints."""
     if isinstance(value, int) and abs(value) >= 10**20:
         return f"an integer of {int(math.log10(abs(value))) + 1} digits"
     return str(value)

@@ -1,9 +1,9 @@
-"""Makes the plugins of this package known to Mitsuba, for every variant that is switched to.
+"""Registration of the plugins of this package with Mitsuba, for each variant that becomes active.
 
-A Mitsuba plugin written in Python is bound to the variant that was active when its class was made, and is registered
-for that variant alone. So each plugin module is imported again after every change of variant. Mitsuba itself is not
-imported from here: where it is not loaded yet, registration waits until somebody imports it. Likewise the libLLVM that
-Dr.Jit would load is looked at when Dr.Jit is imported, which is when an unusable one begins to matter.
+A Mitsuba plugin in Python is bound to the variant that is active when its class is created, and is registered for that
+variant only. Each plugin module is therefore imported again after every change of variant. This module does not import
+Mitsuba: if it is not loaded yet, registration is delayed until it is imported. In the same way, the libLLVM of Dr.Jit
+is checked when Dr.Jit is imported, because an unusable library has no effect before.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ PLUGINS = (
     ("splats", "volume"),
     ("nerg", "integrator"),
 )
-"""Name and kind of each plugin; the module `nerg_mi.plugins.<name>` registers it. Order: a plugin follows those it
-uses."""
+"""Name and kind of each plugin; the module `nerg_mi.plugins.<name>` registers it. A plugin comes after the plugins that
+it uses."""
 
-# Mitsuba 3.9 has no register_volume. It checks the type of the object that is made, not where its maker is registered.
+# Mitsuba 3.9 has no register_volume. It checks the type of the created object, not the registry of its constructor.
 _REGISTRY = {"volume": "texture"}
 
 
@@ -36,55 +36,64 @@ _classes: dict[str, type] = {}
 
 
 def get_plugin_class(name: str) -> Any:
-    """The class of the plugin ``name`` for the active variant, which must not be a scalar one."""
+    """Return the class of the plugin ``name`` for the active variant, which must not be a scalar variant."""
     return _classes[name]
 
 
 def register(kind: str, name: str, cls: type) -> None:
-    """Register the plugin class `cls` under `name` for the active variant; the last line of every plugin module.
+    """Register the plugin class ``cls`` under ``name`` for the active variant. Each plugin module ends with this call.
 
-    `kind`: "integrator", "sensor", "volume", "texture", "film", ... In a scalar variant a refusal is registered in its
-    place, so that the user reads what to do instead of that there is no such plugin. Volumes get none: what scalar_rgb
-    knows of a name decides what dict scenes of every later variant expect, and that would be a texture.
+    In a scalar variant, a constructor that raises an error is registered instead. The user then reads what to do,
+    instead of a message that the plugin does not exist. Volumes are skipped: the type that scalar_rgb registers for a
+    name is the type that dict scenes expect in all later variants, and that would be a texture.
+
+    Parameters
+    ----------
+    kind
+        "integrator", "sensor", "volume", "texture", "film", ...
+    name
+        Name of the plugin in scenes.
+    cls
+        The class.
     """
     import mitsuba as mi
 
     variant = str(mi.variant())
-    put = getattr(mi, f"register_{_REGISTRY.get(kind, kind)}")
+    register_class = getattr(mi, f"register_{_REGISTRY.get(kind, kind)}")
     if variant.startswith("scalar"):
         if kind not in _REGISTRY:
-            put(name, _refusal(name, variant))
+            register_class(name, _make_refusal(name, variant))
     else:
         _classes[name] = cls
-        put(name, cls)
+        register_class(name, cls)
 
 
-def _excuse(variant: str, what: str) -> str:
+def _explain_variant(variant: str, subject: str) -> str:
     return (
-        f'{what} needs a variant that compiles its kernels, and "{variant}" is active: '
+        f'{subject} needs a variant with compiled kernels, but "{variant}" is active: '
         f'call mi.set_variant("llvm_ad_rgb") (or "cuda_ad_rgb") before loading the scene.'
     )
 
 
-def _refusal(name: str, variant: str):
+def _make_refusal(name: str, variant: str):
     def refuse(props):
-        raise NergError(_excuse(variant, f'"{name}"'))
+        raise NergError(_explain_variant(variant, f'"{name}"'))
 
     return refuse
 
 
 def _on_variant(old: str | None, new: str | None) -> None:
-    """Called by Mitsuba after each change of variant."""
+    """Callback of Mitsuba after each change of variant."""
     if new is None:
         return
     llvm.require_usable(new)
     if new.startswith("scalar"):
         mi = sys.modules["mitsuba"]
         names = ", ".join(f'"{name}"' for name, _ in PLUGINS)
-        mi.Log(mi.LogLevel.Warn, _excuse(new, f"each of nerg_mi's plugins ({names})"))
+        mi.Log(mi.LogLevel.Warn, _explain_variant(new, f"each plugin of nerg_mi ({names})"))
     for name, kind in PLUGINS:
         if new.startswith("scalar"):
-            # The classes are not even made: arrays of scalar variants lack what their bodies use.
+            # The classes are not created: arrays of scalar variants lack attributes that the class bodies use.
             register(kind, name, object)
             continue
         module = sys.modules.get(f"{__package__}.plugins.{name}")
@@ -94,17 +103,19 @@ def _on_variant(old: str | None, new: str | None) -> None:
             importlib.reload(module)
 
 
-def _attach() -> None:
-    """Follow the variants of the Mitsuba that is loaded, starting with the active one."""
+def _attach_to_mitsuba() -> None:
+    """Register the plugins for the active variant of the loaded Mitsuba, and for each later variant."""
     llvm.require_usable()
     mi = sys.modules["mitsuba"]
     mi.detail.add_variant_callback(_on_variant)
     _on_variant(None, mi.variant())
 
 
-class _Watcher:
-    """An entry of `sys.meta_path` that lets Dr.Jit and Mitsuba be found as ever: the one is loaded only after its
-    libLLVM was checked, and the plugins are attached to the other once it is loaded."""
+class _ImportHook:
+    """An entry of `sys.meta_path` that delegates the imports of Dr.Jit and Mitsuba.
+
+    It checks libLLVM before Dr.Jit is loaded, and registers the plugins after Mitsuba is loaded.
+    """
 
     def find_spec(self, fullname, path=None, target=None):
         if fullname not in ("drjit", "mitsuba"):
@@ -116,31 +127,31 @@ class _Watcher:
             sys.meta_path.insert(0, self)
         if spec is None or spec.loader is None:
             return spec
-        execute = spec.loader.exec_module
+        original_exec = spec.loader.exec_module
 
         def exec_module(module):
             if fullname == "drjit":
                 llvm.require_usable()
-                execute(module)
+                original_exec(module)
                 return
-            execute(module)
+            original_exec(module)
             if self in sys.meta_path:
                 sys.meta_path.remove(self)
-            _attach()
+            _attach_to_mitsuba()
 
         spec.loader.exec_module = exec_module
         return spec
 
 
 def install() -> None:
-    """Register the plugins now if Mitsuba is loaded, else as soon as it is. Calling it again does nothing new.
+    """Register the plugins now if Mitsuba is loaded, otherwise when it is imported. Repeated calls have no effect.
 
-    Raises `nerg_mi.errors.UnusableLLVM` where Dr.Jit is loaded with a libLLVM on which its kernels cannot run; where it
-    is not loaded yet, importing it does.
+    Raises `nerg_mi.errors.UnusableLLVM` if Dr.Jit is loaded with a libLLVM on which its kernels cannot run. If Dr.Jit
+    is not loaded yet, its import raises that error.
     """
     if "drjit" in sys.modules:
         llvm.require_usable()
     if "mitsuba" in sys.modules:
-        _attach()
-    elif not any(isinstance(entry, _Watcher) for entry in sys.meta_path):
-        sys.meta_path.insert(0, _Watcher())
+        _attach_to_mitsuba()
+    elif not any(isinstance(entry, _ImportHook) for entry in sys.meta_path):
+        sys.meta_path.insert(0, _ImportHook())

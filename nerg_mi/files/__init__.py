@@ -1,1 +1,1 @@
-"""Files in and out, whole or absent, within bounds; knows nothing of what they are for."""
+"""Reading and writing of files: atomic output, size limits on input. Independent of what the files contain."""

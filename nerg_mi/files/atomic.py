@@ -1,4 +1,4 @@
-"""Files written whole or not at all, locks of outputs, and checksums."""
+"""Atomic writing of files and folders, locks on outputs, and checksums."""
 
 from __future__ import annotations
 
@@ -17,37 +17,34 @@ from nerg_mi.errors import NergError
 
 from .safe_read import open_file
 
-# ---- Atomic ----
+# ---- Atomic output ----
 #
-# Output files that are whole or absent: every writer of this package goes through here.
-#
-# A file is written under another name in the folder of its target, brought to the disk, and then moved into place in
-# one step (POSIX rename), so that a reader, a killed process, a full disk or a power cut meets the old file or the new
-# one.
+# All writers of this package use these functions. A file is written under a temporary name in the folder of its target,
+# flushed to the disk, and renamed in one step (POSIX rename). After a crash, a full disk or a power failure, either the
+# complete old file or the complete new file exists.
 
 _REMEDIES = {
     errno.ENOSPC: "the disk is full; free some space or choose another folder",
-    errno.EDQUOT: "your quota is used up; free some space or choose another folder",
-    errno.EFBIG: (
-        "the file would exceed the largest size that is allowed here; raise the limit or choose a smaller output"
-    ),
-    errno.EACCES: "you may not write there; choose another folder or change its permissions",
-    errno.EPERM: "you may not write there; choose another folder or change its permissions",
+    errno.EDQUOT: "the disk quota is exceeded; free some space or choose another folder",
+    errno.EFBIG: ("the file would exceed the maximum file size; raise the limit or choose a smaller output"),
+    errno.EACCES: "permission denied; choose another folder or change its permissions",
+    errno.EPERM: "permission denied; choose another folder or change its permissions",
     errno.EROFS: "the file system is read-only; choose another folder",
-    errno.EISDIR: "it is a folder; choose the name of a file",
+    errno.EISDIR: "it is a folder; specify a file name",
     errno.EEXIST: "one of its parents is a file; choose another folder",
     errno.ENOTDIR: "one of its parents is a file; choose another folder",
-    errno.ENAMETOOLONG: "the name is too long; choose a shorter one",
+    errno.ENAMETOOLONG: "the name is too long; choose a shorter name",
 }
 
 
 @contextmanager
 def replace_atomically(path: str | os.PathLike) -> Iterator[Path]:
-    """The name of a new, empty file to be written, which takes the place of ``path`` when the block ends.
+    """Write a file atomically: yield the path of a new empty file, which replaces ``path`` at the end of the block.
 
-    The name keeps the suffix of ``path``, by which many writers choose a format. Parent folders are made. A link is
-    followed, and the permissions of a file that is replaced are kept. If the block raises, the new file is removed and
-    the old one is as it was; an `OSError` of the block comes out as a `NergError` that names ``path`` and the remedy.
+    The temporary name keeps the suffix of ``path``, because many writers derive the format from it. Parent folders are
+    created. A symbolic link is followed, and a replaced file keeps its permissions. If the block raises, the new file
+    is removed and the old one is unchanged. An `OSError` in the block becomes a `NergError` with ``path`` and the
+    remedy.
     """
     with translate_write_errors(path):
         target = Path(os.path.realpath(path))
@@ -55,18 +52,18 @@ def replace_atomically(path: str | os.PathLike) -> Iterator[Path]:
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
         _check_unprotected(target)
         if os.path.exists(path) and not os.path.isfile(path):
-            # A pipe or a device, such as /dev/stdout, has nothing to be kept, and must not become a file.
+            # A pipe or a device, such as /dev/stdout, has no content to protect and must not be replaced by a file.
             with tempfile.TemporaryDirectory() as folder:
                 temporary = Path(folder, target.name)
                 temporary.touch()
                 yield temporary
-                with temporary.open("rb") as made, open(path, "wb") as out:
-                    shutil.copyfileobj(made, out)
+                with temporary.open("rb") as source, open(path, "wb") as out:
+                    shutil.copyfileobj(source, out)
             return
         target.parent.mkdir(parents=True, exist_ok=True)
-        # In the same folder, since only there a move is one step; hidden, since it is nobody's result.
+        # In the same folder, because a rename is atomic only within a file system. Hidden, because it is not an output.
         temporary = target.with_name(f".{target.stem[:32]}.{os.getpid()}-{secrets.token_hex(4)}.part{target.suffix}")
-        # Opened here and not by the writer, so that the permissions are those that the umask gives any other file.
+        # Created here and not by the writer, so that the umask determines the permissions.
         os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
         try:
             yield temporary
@@ -82,11 +79,11 @@ def replace_atomically(path: str | os.PathLike) -> Iterator[Path]:
 
 @contextmanager
 def create_folder_atomically(path: str | os.PathLike) -> Iterator[Path]:
-    """The name of a new, empty folder to be filled, which becomes the folder ``path`` when the block ends.
+    """Create a folder atomically: yield the path of a new empty folder, which becomes ``path`` at the end of the block.
 
-    ``path`` must be absent or an empty folder, see `check_new_folder`. Parent folders are made. If the block raises,
-    the new folder is removed with all that is in it; an `OSError` of the block comes out as a `NergError` that names
-    ``path`` and the remedy.
+    ``path`` must not exist or must be an empty folder, see `check_new_folder`. Parent folders are created. If the block
+    raises, the new folder is removed with its contents. An `OSError` in the block becomes a `NergError` with ``path``
+    and the remedy.
     """
     check_new_folder(path)
     with translate_write_errors(path):
@@ -96,8 +93,8 @@ def create_folder_atomically(path: str | os.PathLike) -> Iterator[Path]:
         temporary.mkdir()
         try:
             yield temporary
-            for found in (*temporary.rglob("*"), temporary):
-                _flush(found)
+            for entry in (*temporary.rglob("*"), temporary):
+                _flush(entry)
             os.replace(temporary, target)
         except BaseException:
             shutil.rmtree(temporary, ignore_errors=True)
@@ -106,34 +103,38 @@ def create_folder_atomically(path: str | os.PathLike) -> Iterator[Path]:
 
 
 def check_new_folder(path: str | os.PathLike) -> None:
-    """Raise `NergError` where no folder ``path`` can be made, or where it is there and holds something: to be asked
-    before long work."""
+    """Raise `NergError` if the folder ``path`` cannot be created, or exists and is not empty. Call this before
+    long work.
+    """
     check_folder(path)
     with translate_write_errors(path):
         if os.path.isdir(path) and any(os.scandir(path)):
-            raise NergError(f'the folder "{path}" is there and not empty: choose another name, or remove it first')
+            raise NergError(f'the folder "{path}" exists and is not empty: choose another name, or remove it first')
 
 
 def write_bytes(path: str | os.PathLike, *parts: bytes | memoryview) -> None:
-    """Write ``parts``, one after the other, to ``path``, whole or not at all; see `replacing`."""
+    """Write the concatenation of ``parts`` to ``path`` atomically; see `replace_atomically`."""
     with replace_atomically(path) as temporary, temporary.open("wb") as out:
         for part in parts:
             out.write(part)
 
 
 def write_text(path: str | os.PathLike, text: str) -> None:
-    """Write ``text`` as UTF-8 to ``path``, whole or not at all; line ends are written as they are. See `replacing`."""
+    """Write ``text`` as UTF-8 to ``path`` atomically, without converting line ends; see `replace_atomically`."""
     write_bytes(path, text.encode("utf-8"))
 
 
 def check_writable(path: str | os.PathLike, *suffixes: str) -> None:
-    """Raise `NergError` where it is plain that no file can be written to ``path``: to be asked before long work.
+    """Raise `NergError` if the file ``path`` evidently cannot be written. Call this before long work.
 
-    A folder in its place, a file in place of a parent, no permission, a suffix that is none of ``suffixes`` (where
-    there are any). Nothing is made. A disk that fills meanwhile, or permissions that change, are found by `replacing`.
+    Detects a folder at ``path``, a file at the path of a parent folder, missing permissions, and a suffix that is not
+    one of ``suffixes`` (if any are specified). Creates nothing. A disk that fills up later, or permissions that change
+    later, are reported by `replace_atomically`.
     """
     if suffixes and Path(path).suffix.lower() not in suffixes:
-        raise NergError(f'"{path}" has no format that is written here: let its name end in {" or ".join(suffixes)}')
+        raise NergError(
+            f'the format of "{path}" is not supported: choose a file name that ends in {" or ".join(suffixes)}'
+        )
     with translate_write_errors(path):
         target = Path(os.path.realpath(path))
         if target.is_dir():
@@ -143,14 +144,13 @@ def check_writable(path: str | os.PathLike, *suffixes: str) -> None:
 
 
 def check_folder(path: str | os.PathLike) -> None:
-    """Raise `NergError` where it is plain that no files can be written into the folder ``path``, which need not be
-    there yet."""
+    """Raise `NergError` if files evidently cannot be written into the folder ``path``, which may not exist yet."""
     with translate_write_errors(path):
         _check_parents(Path(os.path.realpath(path)) / "file")
 
 
 def make_folder(path: str | os.PathLike) -> Path:
-    """Make the folder ``path`` with its parents, if it is not there; raises `NergError` where that cannot be done."""
+    """Create the folder ``path`` and its parents if they do not exist. Raises `NergError` if that fails."""
     with translate_write_errors(path):
         Path(path).mkdir(parents=True, exist_ok=True)
     return Path(path)
@@ -158,9 +158,10 @@ def make_folder(path: str | os.PathLike) -> Path:
 
 @contextmanager
 def lock_file(path: str | os.PathLike, busy_message: str) -> Iterator[None]:
-    """A block in which nobody else has the lock on the file ``path``, which is made if it is not there.
+    """Hold an exclusive lock on the file ``path`` for the duration of the block. Creates the file if it does not exist.
 
-    Raises `NergError`, which says ``busy``, where somebody has it. The system takes it from a process that is killed.
+    Raises `NergError` with the text ``busy_message`` if another process holds the lock. The operating system releases
+    the lock of a process that is killed.
     """
     with translate_write_errors(path):
         handle = os.open(path, os.O_RDONLY | os.O_CREAT, 0o666)
@@ -168,7 +169,7 @@ def lock_file(path: str | os.PathLike, busy_message: str) -> Iterator[None]:
         with translate_write_errors(path):
             try:
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                # Its last owner may have removed it since it was opened.
+                # The previous owner may have removed the file after it was opened here.
                 if not os.path.exists(path) or not os.path.samestat(os.fstat(handle), os.stat(path)):
                     raise BlockingIOError
             except BlockingIOError as error:
@@ -180,10 +181,10 @@ def lock_file(path: str | os.PathLike, busy_message: str) -> Iterator[None]:
 
 @contextmanager
 def reserve_output(path: str | os.PathLike | None) -> Iterator[None]:
-    """A block, of long work, in which no other process writes the output ``path``; None: no output.
+    """Prevent other processes from writing the output ``path`` for the duration of the block. None: no output.
 
-    Raises `NergError` where one does. A hidden file beside ``path`` is locked meanwhile; a process that is killed
-    leaves it, without a lock.
+    Raises `NergError` if another process writes it. The lock is a hidden file next to ``path``; a killed process leaves
+    the file, but without the lock.
     """
     if path is None:
         yield
@@ -192,7 +193,7 @@ def reserve_output(path: str | os.PathLike | None) -> Iterator[None]:
     lock = target.with_name(f".{target.name}.lock")
     with remove_empty_new_parents(lock):
         make_folder(lock.parent)
-        busy = f'"{path}" is being made by another process: wait for its end, or choose another name'
+        busy = f'another process is writing "{path}": wait until it has finished, or choose another name'
         with lock_file(lock, busy):
             try:
                 yield
@@ -202,7 +203,7 @@ def reserve_output(path: str | os.PathLike | None) -> Iterator[None]:
 
 @contextmanager
 def remove_empty_new_parents(path: str | os.PathLike) -> Iterator[None]:
-    """A block after which those parents of ``path`` are removed that were not there before, and are empty."""
+    """Remove the parents of ``path`` after the block if the block created them and left them empty."""
     missing = [parent for parent in Path(os.path.realpath(path)).parents if not parent.exists()]
     try:
         yield
@@ -216,7 +217,7 @@ def remove_empty_new_parents(path: str | os.PathLike) -> Iterator[None]:
 
 @contextmanager
 def translate_write_errors(path: str | os.PathLike) -> Iterator[None]:
-    """An `OSError` of the block as a `NergError` that names ``path`` and says what to do."""
+    """Convert an `OSError` of the block to a `NergError` that names ``path`` and the remedy."""
     try:
         yield
     except OSError as error:
@@ -225,45 +226,47 @@ def translate_write_errors(path: str | os.PathLike) -> Iterator[None]:
 
 
 def _check_unprotected(target: Path) -> None:
-    """Raise `PermissionError` for a file that may not be written: the folder would let it be replaced all the same."""
+    """Raise `PermissionError` for a write-protected file, because a rename in its folder would replace it anyway."""
     if target.exists() and not os.access(target, os.W_OK):
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(target))
 
 
 def _check_parents(target: Path) -> None:
-    """Raise `OSError` unless ``target``, or first its missing parents, can be made."""
+    """Raise `OSError` unless ``target`` and its missing parents can be created."""
     try:
-        os.lstat(target)  # finds a name that is too long, a parent that is a file, or one that may not be entered
+        os.lstat(
+            target
+        )  # detects a name that is too long, a parent that is a file, and a parent without search permission
     except FileNotFoundError:
         pass
-    there = next(p for p in target.parents if p.exists())
-    if not there.is_dir():
-        raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(there))
-    if not os.access(there, os.W_OK | os.X_OK):
-        why = errno.EROFS if os.statvfs(there).f_flag & os.ST_RDONLY else errno.EACCES
-        raise OSError(why, os.strerror(why), str(there))
+    existing = next(p for p in target.parents if p.exists())
+    if not existing.is_dir():
+        raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(existing))
+    if not os.access(existing, os.W_OK | os.X_OK):
+        code = errno.EROFS if os.statvfs(existing).f_flag & os.ST_RDONLY else errno.EACCES
+        raise OSError(code, os.strerror(code), str(existing))
 
 
 def _flush(path: Path) -> None:
-    """Bring a file, or the entries of a folder, to the disk."""
+    """Flush a file, or the entries of a folder, to the disk."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
     except OSError as error:
-        # Some file systems have no such thing for folders.
+        # Some file systems do not support this for folders.
         if error.errno not in (errno.EINVAL, errno.ENOTSUP):
             raise
     finally:
         os.close(handle)
 
 
-# ---- Checksums of files, by which a result says what it was made from ----
+# ---- Checksums of files, recorded in the provenance of results ----
 
 _BLOCK = 1 << 20
 
 
 def file_sha256(path: str | os.PathLike) -> str:
-    """Hex digest of a file's bytes. Raises `NergError` for what is no ordinary file, or cannot be read."""
+    """Return the SHA-256 (hex) of a file's bytes. Raises `NergError` if it is not a regular file or cannot be read."""
     digest = hashlib.sha256()
     with open_file(path) as source:
         while block := source.read(_BLOCK):

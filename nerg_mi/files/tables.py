@@ -1,4 +1,4 @@
-"""Tables and documents of results: CSV and JSON files, whole or absent, and Markdown."""
+"""Output of results as CSV, JSON and Markdown; files are written atomically."""
 
 from __future__ import annotations
 
@@ -14,11 +14,24 @@ from .atomic import replace_atomically, write_text
 
 
 def write_csv(path: str | os.PathLike, rows: Iterable[Mapping[str, Any]], columns: Sequence[str] | None = None) -> None:
-    """Write ``rows`` as CSV with a line of names first; what a row lacks, and NaN, stays empty, and text that a
-    spreadsheet would run as a formula gets an apostrophe before it (`without_formula`).
+    """Write ``rows`` as CSV with a header line.
 
-    ``columns``: default, all keys in the order in which they appear; where they are given, rows are taken one by one.
-    Raises ``ValueError`` for a row with others.
+    Missing values and NaN become empty cells. Text that a spreadsheet would evaluate as a formula is prefixed with an
+    apostrophe (`escape_formula`).
+
+    Parameters
+    ----------
+    path
+        The file.
+    rows
+        One mapping from column name to value per row.
+    columns
+        Column names. Default: all keys in order of appearance. With ``columns``, rows are consumed one by one.
+
+    Raises
+    ------
+    ValueError
+        If a row has a key that is not in ``columns``.
     """
     if not columns:
         rows = list(rows)
@@ -26,67 +39,87 @@ def write_csv(path: str | os.PathLike, rows: Iterable[Mapping[str, Any]], column
     with replace_atomically(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, columns, restval="")
         csv.writer(file).writerow(map(escape_formula, columns))
-        # NaN alone is no equal of itself.
+        # Only NaN differs from itself.
         writer.writerows({k: escape_formula(v) for k, v in row.items() if v == v} for row in rows)
 
 
-# Also the wide forms that spreadsheets take for the same in some languages.
+# Includes the full-width forms, which spreadsheets treat alike in some languages.
 _FORMULA = re.compile(r"'*[=+\-@\t\r\uff1d\uff0b\uff0d\uff20].", re.DOTALL)
 
 
 def escape_formula(value: Any) -> Any:
-    """``value`` as a cell of CSV: text that begins with ``=``, ``+``, ``-``, ``@``, a tab or a carriage return has an
-    apostrophe before it, by which spreadsheets know text. Numbers, and several of them ("-1, 2, 3"), stay as they are.
-    `with_formula` gives the text back."""
-    return f"'{value}" if isinstance(value, str) and _FORMULA.match(value) and not _is_numbers(value) else value
+    """Return ``value`` as a CSV cell that a spreadsheet does not evaluate.
+
+    Text that begins with ``=``, ``+``, ``-``, ``@``, a tab or a carriage return gets an apostrophe as a prefix, which
+    marks text in spreadsheets. Numbers and lists of numbers ("-1, 2, 3") are unchanged. `unescape_formula` is the
+    inverse.
+    """
+    return f"'{value}" if isinstance(value, str) and _FORMULA.match(value) and not _is_number_list(value) else value
 
 
 def unescape_formula(cell: str) -> str:
-    """The text that `without_formula` made the ``cell`` of."""
+    """Return the text from which `escape_formula` made the ``cell``."""
     return cell[1:] if cell.startswith("'") and _FORMULA.match(cell) else cell
 
 
-def _is_numbers(text: str) -> bool:
+def _is_number_list(text: str) -> bool:
     try:
         return bool([float(part) for part in text.split(",")])
     except ValueError:
         return False
 
 
-def format_markdown_table(header: Sequence[str], rows: Iterable[Sequence[Any]], right_aligned: Collection[str] = ()) -> str:
-    """A Markdown table of cells as ``str`` shows them, without a line end; bars, line breaks, HTML and images in
-    cells are escaped, but for code spans.
+def format_markdown_table(
+    header: Sequence[str], rows: Iterable[Sequence[Any]], right_aligned: Collection[str] = ()
+) -> str:
+    """Format a Markdown table, without a line end.
 
-    ``right``: those columns of ``head`` that are aligned to the right.
+    Vertical bars, line breaks, HTML and images in cells are escaped, except in code spans.
+
+    Parameters
+    ----------
+    header
+        Names of the columns.
+    rows
+        Cells, formatted by ``str``.
+    right_aligned
+        Names of the columns that are aligned to the right.
     """
-    cells = [[_markdown_cell(str(cell)) for cell in row] for row in (header, *rows)]
+    cells = [[_escape_markdown_cell(str(cell)) for cell in row] for row in (header, *rows)]
     rule = ["---:" if name in right_aligned else "---" for name in header]
     return "\n".join("| " + " | ".join(line) + " |" for line in (cells[0], rule, *cells[1:]))
 
 
-# Code spans, in which nothing runs; else the start of a tag or an image, unless it is escaped already.
+# Matches code spans, whose content is not interpreted, and the start of a tag or an image that is not yet escaped.
 _MARKUP = re.compile(r"(?<![\\`])(`+)(?!`).+?(?<!`)\1(?!`)|(?<!\\)((?:\\\\)*)(<(?=[A-Za-z/!?])|!(?=\[))")
 
 
-def _markdown_cell(text: str) -> str:
+def _escape_markdown_cell(text: str) -> str:
     text = re.sub(r"[\r\n]+", " ", text.replace("|", "\\|"))
     return _MARKUP.sub(lambda match: match[0] if match[1] else f"{match[2]}\\{match[3]}", text)
 
 
 def write_json(path: str | os.PathLike, value: Any, allow_nan: bool | None = None) -> None:
-    """Write ``value`` as JSON, indented, with a line end.
+    """Write ``value`` as indented JSON with a line end.
 
-    NaN and infinities, which JSON does not know, become null. ``allow_nan``: True leaves them as they are, for files
-    that only this program reads; with False they are a ``ValueError``.
+    Parameters
+    ----------
+    path
+        The file.
+    value
+        The document.
+    allow_nan
+        None: NaN and infinities, which JSON lacks, become null. True: they are written as Python writes them, for files
+        that only this package reads. False: they raise ``ValueError``.
     """
-    value = _with_null(value) if allow_nan is None else value
+    value = _replace_non_finite(value) if allow_nan is None else value
     write_text(path, json.dumps(value, indent=1, allow_nan=bool(allow_nan)) + "\n")
 
 
-def _with_null(value: Any) -> Any:
-    """``value`` with None in place of each number that is not finite."""
+def _replace_non_finite(value: Any) -> Any:
+    """Return ``value`` with None in place of each number that is not finite."""
     if isinstance(value, Mapping):
-        return {key: _with_null(v) for key, v in value.items()}
+        return {key: _replace_non_finite(v) for key, v in value.items()}
     if isinstance(value, list | tuple):
-        return [_with_null(v) for v in value]
+        return [_replace_non_finite(v) for v in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value

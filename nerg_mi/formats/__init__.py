@@ -1,2 +1,1 @@
-"""File formats of fields, meshes, splats and areas of interest. Each reader refuses what it can not read, and runs
-nothing."""
+"""File formats of fields, meshes, splats and areas of interest. Readers refuse unsupported files and never run code."""

@@ -1,5 +1,6 @@
-"""Areas of interest in JSON files: boxes, parts of meshes, shapes of a scene, groups, and objects of Aria Digital
-Twin."""
+"""Areas of interest (AOIs) in JSON files: boxes, parts of meshes, shapes of a scene, groups, and objects of Aria
+Digital Twin.
+"""
 
 from __future__ import annotations
 
@@ -20,24 +21,24 @@ from nerg_mi.fields.splats import quaternions_to_matrices
 from nerg_mi.files.safe_read import is_count, is_regular_file, read_bytes, read_json, translate_read_errors
 from nerg_mi.ranges import MAX_COORDINATE
 
-# ---- Regions ----
+# ---- Boxes ----
 #
-# Areas of interest that are boxes with names, as JSON: drawn in the viewer, counted by a report, written by hand.
-#
-# What else may stand in such a file (parts of meshes, shapes of a scene, groups, the objects of a recording) is read by
-# `nerg_mi.formats.areas`.
+# Named boxes in JSON files, which are drawn in the viewer, used in reports, or written by hand. The other kinds of
+# areas follow below.
 
-MAX_BYTES = 4 << 20  # a file of areas may have so many bytes
-MAX_AREAS = 1000  # and so many areas
+MAX_BYTES = 4 << 20  # maximum size of a file of areas in bytes
+MAX_AREAS = 1000  # maximum number of areas
 Quaternion = tuple[float, float, float, float]  # x, y, z, w
-NON_BOX_KEYS = ("mesh", "shape", "parts", "adt")  # keys of which an area has one that is no box
-_LETTERS = 80
+NON_BOX_KEYS = ("mesh", "shape", "parts", "adt")  # an area with one of these keys is not a box
+_MAX_NAME_LENGTH = 80
 _EXAMPLE = '{"shelf": [[0, 0, 0], [1, 2, 3]]}'
 
 
 @dataclass(frozen=True)
 class Region:
-    """A box between two corners, in scene units; turned about its middle by the unit quaternion ``turn``, if any."""
+    """A box between two corners, in scene units, optionally rotated about its centre by the unit quaternion
+    ``rotation``.
+    """
 
     name: str
     lower: tuple[float, float, float]
@@ -48,70 +49,87 @@ class Region:
         corners = np.array([self.lower, self.upper], float)
         if corners.shape == (2, 3) and not (np.abs(corners) <= MAX_COORDINATE).all():
             raise NergError(
-                f'the area "{sanitize(self.name, 40)}" reaches to {np.abs(corners).max():g}; its corners must be finite, '
+                f'the area "{sanitize(self.name, 40)}" has a coordinate of {np.abs(corners).max():g}; the corners '
+                "must be finite, "
                 f"and at most {MAX_COORDINATE:g}"
             )
         if corners.shape != (2, 3) or not (corners[0] < corners[1]).all():
             raise NergError(
-                f'the area "{sanitize(self.name, 40)}" needs a lower and an upper corner of three numbers, each '
-                "less in the lower one"
+                f'the area "{sanitize(self.name, 40)}" needs a lower and an upper corner of three numbers; each '
+                "number of the lower corner must be the smaller one"
             )
         check_area_name(self.name)
         if self.rotation is not None:
-            size = math.hypot(*self.rotation) if len(self.rotation) == 4 else math.nan
-            if not abs(size - 1) < 1e-3:
-                raise NergError(f'the turn of the area "{sanitize(self.name, 40)}" is no rotation; give a unit quaternion')
+            norm = math.hypot(*self.rotation) if len(self.rotation) == 4 else math.nan
+            if not abs(norm - 1) < 1e-3:
+                raise NergError(f'the rotation of the area "{sanitize(self.name, 40)}" is not a unit quaternion')
 
     @classmethod
     def create(
         cls, name: str, lower: Iterable[float], upper: Iterable[float], rotation: Iterable[float] | float | None = None
     ) -> Region:
-        """The same of any numbers. ``turn``: a quaternion (x, y, z, w) of any length but zero, or degrees about z,
-        counter-clockwise seen from above. Raises `NergError` where they are not three each, or no rotation."""
+        """Create a box from any sequences of numbers.
+
+        Parameters
+        ----------
+        name
+            Name of the area.
+        lower, upper
+            Corners (3,) in scene units.
+        rotation
+            Quaternion (x, y, z, w) of any non-zero length, or degrees about z, counter-clockwise seen from above.
+
+        Raises
+        ------
+        NergError
+            If a corner does not have three numbers, or the rotation is invalid.
+        """
         low, high = [float(v) for v in lower], [float(v) for v in upper]
         if len(low) != 3 or len(high) != 3:
             raise NergError(f'the area "{sanitize(name, 40)}" needs a lower and an upper corner of three numbers')
-        return cls(name, (low[0], low[1], low[2]), (high[0], high[1], high[2]), _turn(rotation, name))
+        return cls(name, (low[0], low[1], low[2]), (high[0], high[1], high[2]), _parse_rotation(rotation, name))
 
     @property
     def corners(self) -> np.ndarray:
-        """(2, 3)."""
+        """Lower and upper corner (2, 3)."""
         return np.array([self.lower, self.upper], float)
 
     @property
     def center(self) -> np.ndarray:
-        """(3,)."""
+        """Centre (3,)."""
         return self.corners.mean(axis=0)
 
     @property
     def rotation_matrix(self) -> np.ndarray:
-        """Rotation (3, 3) whose columns are the box's own axes."""
+        """Rotation matrix (3, 3) whose columns are the axes of the box."""
         if self.rotation is None:
             return np.eye(3)
         x, y, z, w = np.array(self.rotation, float) / math.hypot(*self.rotation)
         return quaternions_to_matrices(np.array([[w, x, y, z]]))[0]
 
     def to_local(self, points: np.ndarray) -> np.ndarray:
-        """``points`` (..., 3) turned back about the middle, where this is the box between `corners`."""
+        """Rotate ``points`` (..., 3) into the frame in which the box is axis-aligned between `corners`."""
         return points if self.rotation is None else (points - self.center) @ self.rotation_matrix + self.center
 
     def to_world(self, points: np.ndarray) -> np.ndarray:
-        """The inverse of `to_own`."""
+        """Rotate ``points`` (..., 3) from the frame of the box to the scene; the inverse of `to_local`."""
         return points if self.rotation is None else (points - self.center) @ self.rotation_matrix.T + self.center
 
     @property
     def vertices(self) -> np.ndarray:
-        """The box's own eight corners (8, 3); bit k of a row's number chooses the upper one along axis k."""
+        """The eight vertices (8, 3); bit k of the row index selects the upper corner along axis k."""
         upper = (np.arange(8)[:, None] >> np.arange(3) & 1).astype(bool)
         return self.to_world(np.where(upper, self.corners[1], self.corners[0]))
 
     @property
     def bounds(self) -> np.ndarray:
-        """Corners (2, 3) of the smallest upright box around it."""
-        return self.corners if self.rotation is None else np.array([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+        """Corners (2, 3) of the axis-aligned bounding box."""
+        return (
+            self.corners if self.rotation is None else np.array([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+        )
 
     def contains(self, points: np.ndarray, margin: float = 0.0) -> np.ndarray:
-        """Whether ``points`` (..., 3) lie in it, or no farther than ``margin`` from it along each of its axes."""
+        """Return whether ``points`` (..., 3) are inside the box, or within ``margin`` of it along each of its axes."""
         lower, upper = self.corners
         with np.errstate(invalid="ignore"):
             points = self.to_local(np.asarray(points, float))
@@ -119,44 +137,48 @@ class Region:
 
 
 def check_area_name(name: str) -> None:
-    """Raise `NergError` for a name that no area may have."""
-    if not name.strip() or len(name) > _LETTERS or not name.isprintable():
-        raise NergError(f'an area needs a name of 1 to {_LETTERS} printable characters, got "{sanitize(name, 40)}"')
+    """Raise `NergError` for an invalid name of an area."""
+    if not name.strip() or len(name) > _MAX_NAME_LENGTH or not name.isprintable():
+        raise NergError(
+            f'an area needs a name of 1 to {_MAX_NAME_LENGTH} printable characters, got "{sanitize(name, 40)}"'
+        )
 
 
-def _turn(turn: Iterable[float] | float | None, name: str) -> Quaternion | None:
-    if turn is None:
+def _parse_rotation(rotation: Iterable[float] | float | None, name: str) -> Quaternion | None:
+    if rotation is None:
         return None
-    if isinstance(turn, (int, float)):
-        half = math.radians(float(turn)) / 2 if math.isfinite(turn) else math.nan
-        numbers = [0.0, 0.0, math.sin(half), math.cos(half)]
+    if isinstance(rotation, (int, float)):
+        half_angle = math.radians(float(rotation)) / 2 if math.isfinite(rotation) else math.nan
+        numbers = [0.0, 0.0, math.sin(half_angle), math.cos(half_angle)]
     else:
-        numbers = [float(v) for v in turn]
-    size = math.hypot(*numbers)
-    if len(numbers) != 4 or not 1e-6 < size < 1e6:
-        raise NergError(f'the turn of the area "{sanitize(name, 40)}" is degrees about z, or four numbers x, y, z, w')
-    x, y, z, w = numbers if isinstance(turn, (int, float)) else (v / size for v in numbers)
+        numbers = [float(v) for v in rotation]
+    norm = math.hypot(*numbers)
+    if len(numbers) != 4 or not 1e-6 < norm < 1e6:
+        raise NergError(
+            f'the rotation of the area "{sanitize(name, 40)}" must be degrees about z, or a quaternion x, y, z, w'
+        )
+    x, y, z, w = numbers if isinstance(rotation, (int, float)) else (v / norm for v in numbers)
     return (x, y, z, w)
 
 
 def read_regions(path: str | Path) -> list[Region]:
-    """The areas of a JSON file that are boxes, in its order; others are passed over (`nerg_mi.formats.areas`).
+    """Read the boxes of a JSON file in its order. Other kinds of areas are ignored; `read_areas` reads them.
 
-    Either as `to_json` writes them, ``{"regions": [{"name": "shelf", "min": [x, y, z], "max": [x, y, z]}]}`` with
-    anything beside, or names and boxes alone: ``{"shelf": [[x, y, z], [x, y, z]]}``, or ``{"shelf": {"min": [...],
-    "max": [...]}}``. A box may have a ``turn`` about its middle: degrees about z, or a quaternion x, y, z, w. Raises
-    `NergError` for what is neither, and where none is a box.
+    The file has the form that `format_areas` writes, ``{"regions": [{"name": "shelf", "min": [x, y, z], "max": [x, y,
+    z]}]}``, possibly with further keys. Or it maps names to boxes: ``{"shelf": [[x, y, z], [x, y, z]]}`` or ``{"shelf":
+    {"min": [...], "max": [...]}}``. A box may have a rotation ``turn`` about its centre: degrees about z, or a
+    quaternion x, y, z, w. Raises `NergError` for a file of another form, and for a file without boxes.
     """
     entries = read_area_entries(path)
     boxes = [parse_box(e) for e in entries if e.is_box]
     if not boxes:
-        raise NergError(f'"{path}" has no area that is a box; draw one in the viewer, or write {_EXAMPLE}')
+        raise NergError(f'"{path}" contains no box; draw one in the viewer, or write {_EXAMPLE}')
     return boxes
 
 
 @dataclass(frozen=True)
 class AreaEntry:
-    """What a file says of an area: its ``name`` and what it is ``given`` as; ``where``: for errors."""
+    """An unparsed area of a file: its ``name``, its JSON ``definition``, and its ``location`` for error messages."""
 
     name: object
     definition: Any
@@ -164,92 +186,100 @@ class AreaEntry:
 
     @property
     def is_box(self) -> bool:
-        """Whether it is a box, or nothing that is known."""
+        """Whether the entry is a box, which is the default if no key of another kind is present."""
         return not (isinstance(self.definition, dict) and any(key in self.definition for key in NON_BOX_KEYS))
 
 
 def read_area_entries(path: str | Path) -> list[AreaEntry]:
-    """What a file of areas has, not looked at yet. Raises `NergError` for what is no such file, and for names that come
-    twice."""
-    found = read_json(path, "file of areas", MAX_BYTES)
-    if isinstance(found, dict) and isinstance(found.get("regions"), list):
-        listed = [(one.get("name"), one) if isinstance(one, dict) else (None, one) for one in found["regions"]]
-    elif isinstance(found, dict):
-        listed = list(found.items())
+    """Read the entries of a file of areas without parsing them. Raises `NergError` for another file, and for
+    duplicate names.
+    """
+    document = read_json(path, "file of areas", MAX_BYTES)
+    if isinstance(document, dict) and isinstance(document.get("regions"), list):
+        pairs = [(item.get("name"), item) if isinstance(item, dict) else (None, item) for item in document["regions"]]
+    elif isinstance(document, dict):
+        pairs = list(document.items())
     else:
-        raise NergError(f'"{path}" names no areas; write {_EXAMPLE} in the coordinates of the place')
-    if not 0 < len(listed) <= MAX_AREAS:
-        raise NergError(f'"{path}" has {len(listed)} areas, and 1 to {MAX_AREAS} are read; write {_EXAMPLE}')
-    names = [name for name, _ in listed if isinstance(name, str)]
+        raise NergError(f'"{path}" contains no areas; write {_EXAMPLE} in the coordinates of the scene')
+    if not 0 < len(pairs) <= MAX_AREAS:
+        raise NergError(f'"{path}" has {len(pairs)} areas; 1 to {MAX_AREAS} are supported; write {_EXAMPLE}')
+    names = [name for name, _ in pairs if isinstance(name, str)]
     if len(set(names)) < len(names):
-        raise NergError(f'"{path}" has two areas of one name; rename one of them')
-    return [AreaEntry(name, given, f'"{path}", area {k + 1}') for k, (name, given) in enumerate(listed)]
+        raise NergError(f'"{path}" has two areas with the same name; rename one of them')
+    return [AreaEntry(name, definition, f'"{path}", area {k + 1}') for k, (name, definition) in enumerate(pairs)]
 
 
 def parse_box(entry: AreaEntry) -> Region:
-    """The box of an entry. Raises `NergError` for what is none."""
-    name, given, where = entry.name, entry.definition, entry.location
-    corners: Any = (given.get("min"), given.get("max")) if isinstance(given, dict) else given
-    turn: Any = given.get("turn") if isinstance(given, dict) else None
+    """Parse an entry as a box. Raises `NergError` for an invalid box."""
+    name, definition, location = entry.name, entry.definition, entry.location
+    corners: Any = (definition.get("min"), definition.get("max")) if isinstance(definition, dict) else definition
+    rotation: Any = definition.get("turn") if isinstance(definition, dict) else None
     try:
         lower, upper = (list(corner) for corner in corners)
-        numbers = [*lower, *upper, *(turn if isinstance(turn, list) else [] if turn is None else [turn])]
+        numbers = [
+            *lower,
+            *upper,
+            *(rotation if isinstance(rotation, list) else [] if rotation is None else [rotation]),
+        ]
         if not isinstance(name, str) or not all(is_number(v) for v in numbers):
             raise ValueError
     except (TypeError, ValueError) as error:
-        raise NergError(f"{where} needs a name, and two corners of three numbers each, as in {_EXAMPLE}") from error
+        raise NergError(f"{location} needs a name, and two corners of three numbers each, as in {_EXAMPLE}") from error
     try:
-        return Region.create(name, lower, upper, turn)
+        return Region.create(name, lower, upper, rotation)
     except (NergError, OverflowError) as error:
-        raise NergError(f"{where}: {error}") from error
+        raise NergError(f"{location}: {error}") from error
 
 
 def is_number(value: object) -> bool:
-    """Whether a value of a JSON file is one."""
+    """Return whether a JSON value is a number."""
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
 def format_areas(regions: Sequence[Region], other_areas: Sequence[dict[str, Any]] = ()) -> str:
-    """``regions`` as the text of a JSON file, with ``others`` as they stood in one after them."""
+    """Format ``regions`` as JSON text, followed by the JSON objects ``other_areas``."""
     return json.dumps({"regions": [*map(box_to_json, regions), *other_areas]}, indent=1) + "\n"
 
 
 def box_to_json(region: Region) -> dict[str, Any]:
-    """A box as it stands in a file."""
-    turn = {} if region.rotation is None else {"turn": list(region.rotation)}
-    return {"name": region.name, "min": list(region.lower), "max": list(region.upper), **turn}
+    """Convert a box to a JSON object."""
+    rotation = {} if region.rotation is None else {"turn": list(region.rotation)}
+    return {"name": region.name, "min": list(region.lower), "max": list(region.upper), **rotation}
 
 
-# ---- What an area of interest can be, besides a box (`nerg_mi.formats.areas.Region`) ----
+# ---- Other kinds of areas of interest ----
 
-MAX_GROUP_DEPTH = 100  # so deep may groups be nested that stand before their parts
+MAX_GROUP_DEPTH = 100  # maximum nesting depth of groups
 
 
 @dataclass(frozen=True)
 class MeshPart:
-    """The mesh in ``file``, or those of its faces whose numbers lie in one of the ranges ``faces``, ends included."""
+    """The mesh in ``file``, or its faces whose indices are in one of the inclusive ranges ``faces``."""
 
     name: str
     file: Path
     faces: tuple[tuple[int, int], ...] | None = None
 
     def select_faces(self, count: int) -> np.ndarray:
-        """Which of ``count`` faces are of it, (count,) bool. Raises `NergError` for ranges beyond them."""
+        """Return a mask (count,) of the faces that belong to the area. Raises `NergError` for face indices beyond
+        ``count``.
+        """
         if self.faces is None:
             return np.ones(count, bool)
-        found = np.zeros(count, bool)
+        mask = np.zeros(count, bool)
         for first, last in self.faces:
             if last >= count:
                 raise NergError(
-                    f'the area "{self.name}" asks for face {last} of "{self.file}", which has {count:,} (from 0 on)'
+                    f'the area "{self.name}" uses face {last} of "{self.file}", which has {count:,} faces (indices '
+                    "start at 0)"
                 )
-            found[first : last + 1] = True
-        return found
+            mask[first : last + 1] = True
+        return mask
 
 
 @dataclass(frozen=True)
 class SceneShape:
-    """The shape of the scene whose id is ``shape``."""
+    """The shape of the scene with the id ``shape``."""
 
     name: str
     shape: str
@@ -257,7 +287,7 @@ class SceneShape:
 
 @dataclass(frozen=True)
 class AreaGroup:
-    """Several others, by their names: whoever looks at one of its ``parts`` looks at it."""
+    """A group of areas: a gaze sample on one of its ``parts`` counts for the group."""
 
     name: str
     parts: tuple[str, ...]
@@ -268,10 +298,10 @@ Area = Region | MeshPart | SceneShape | AreaGroup
 
 @dataclass(frozen=True)
 class AreaSet:
-    """The areas of a file, in its order, whose names are different.
+    """The areas of a file, in its order, with unique names.
 
-    ``others``: those that are no boxes, as they stand in the file. Raises `NergError` for groups of what there is not,
-    and for groups that hold themselves.
+    ``non_boxes`` are the JSON objects of the areas that are not boxes. Raises `NergError` for a group with an unknown
+    part, and for a group that contains itself.
     """
 
     areas: tuple[Area, ...]
@@ -279,139 +309,163 @@ class AreaSet:
 
     def __post_init__(self) -> None:
         names = [a.name for a in self.areas]
-        twice = next((n for n in names if names.count(n) > 1), None) if len(set(names)) < len(names) else None
-        if twice is not None:
-            raise NergError(f'two areas are called "{twice}"; rename one of them')
+        duplicate = next((n for n in names if names.count(n) > 1), None) if len(set(names)) < len(names) else None
+        if duplicate is not None:
+            raise NergError(f'two areas have the name "{duplicate}"; rename one of them')
         for area in self.areas:
             if not isinstance(area, AreaGroup):
                 continue
             unknown = next((p for p in area.parts if p not in names), None)
             if unknown is not None:
-                raise NergError(f'the group "{area.name}" has a part "{unknown}", and there is no such area')
+                raise NergError(f'the group "{area.name}" has the part "{unknown}", but there is no such area')
         self.element_indices()
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of all."""
+        """Names of all areas."""
         return tuple(a.name for a in self.areas)
 
     @property
     def boxes(self) -> list[Region]:
-        """Those that are boxes."""
+        """The areas that are boxes."""
         return [a for a in self.areas if isinstance(a, Region)]
 
     @property
     def elements(self) -> tuple[Region | MeshPart | SceneShape, ...]:
-        """Those that are no groups."""
+        """The areas that are not groups."""
         return tuple(a for a in self.areas if not isinstance(a, AreaGroup))
 
     @property
     def meshes(self) -> list[Path]:
-        """Files of those that are parts of meshes."""
+        """Files of the areas that are parts of meshes."""
         return [a.file for a in self.areas if isinstance(a, MeshPart)]
 
     @property
     def box_indices(self) -> dict[str, tuple[int, ...]]:
-        """Those that are boxes, or groups of boxes alone, by name: the numbers of the `boxes` that each consists of."""
-        number = {k: n for n, k in enumerate(k for k, thing in enumerate(self.elements) if isinstance(thing, Region))}
-        every = self.element_indices().items()
-        return {name: tuple(number[k] for k in of) for name, of in every if all(k in number for k in of)}
+        """For each area that is a box or a group of boxes only, by name: the indices into `boxes` of its boxes."""
+        number = {
+            k: n for n, k in enumerate(k for k, element in enumerate(self.elements) if isinstance(element, Region))
+        }
+        memberships = self.element_indices().items()
+        return {
+            name: tuple(number[k] for k in members)
+            for name, members in memberships
+            if all(k in number for k in members)
+        }
 
     def element_indices(self) -> dict[str, tuple[int, ...]]:
-        """Of each area, which of the `things` it consists of, by their numbers."""
+        """Return, for each area by name, the indices into `elements` of its elements."""
         by_name = {a.name: a for a in self.areas}
-        known = {a.name: frozenset([k]) for k, a in enumerate(self.elements)}
+        resolved = {a.name: frozenset([k]) for k, a in enumerate(self.elements)}
         for area in self.areas:
-            _resolve(area, by_name, known, ())
-        return {a.name: tuple(sorted(known[a.name])) for a in self.areas}
+            _resolve_group(area, by_name, resolved, ())
+        return {a.name: tuple(sorted(resolved[a.name])) for a in self.areas}
 
 
-def _resolve(area: Area, by_name: dict[str, Area], known: dict[str, frozenset[int]], above: tuple[str, ...]) -> None:
-    """Add to what is ``known`` of which things areas consist those of ``area`` and of its parts, each looked at once.
-    Raises `NergError` for a group that holds itself."""
-    if area.name in above or len(above) > MAX_GROUP_DEPTH:
-        raise NergError(f'the group "{area.name}" holds itself, or groups are nested deeper than {MAX_GROUP_DEPTH}')
-    if area.name in known or not isinstance(area, AreaGroup):
+def _resolve_group(
+    area: Area, by_name: dict[str, Area], resolved: dict[str, frozenset[int]], ancestors: tuple[str, ...]
+) -> None:
+    """Add the elements of ``area`` and its parts to ``resolved``; each area is visited once.
+
+    Raises `NergError` for a group that contains itself.
+    """
+    if area.name in ancestors or len(ancestors) > MAX_GROUP_DEPTH:
+        raise NergError(f'the group "{area.name}" contains itself, or groups are nested deeper than {MAX_GROUP_DEPTH}')
+    if area.name in resolved or not isinstance(area, AreaGroup):
         return
     for part in area.parts:
-        _resolve(by_name[part], by_name, known, (*above, area.name))
-    known[area.name] = frozenset().union(*(known[part] for part in area.parts))
+        _resolve_group(by_name[part], by_name, resolved, (*ancestors, area.name))
+    resolved[area.name] = frozenset().union(*(resolved[part] for part in area.parts))
 
 
-# ---- Twin objects ----
+# ---- Objects of Aria Digital Twin ----
 #
-# The objects of a recording of Aria Digital Twin: a turned box each, in the frame of rays.
-#
-# ``3d_bounding_box.csv`` has the boxes in the objects' own frames, ``scene_objects.csv`` where these are, and
-# ``instances.json`` what they are called (the format of facebookresearch/projectaria_tools, ADT's data format). The
-# twin's world has y up; that of rays z: (x, y, z) becomes (x, -z, y), as `nerg rays import --preset aria` does for its
-# recordings. Poses with a time are those of objects that were carried about: these have no one place, and are left out.
+# Each object of a recording is a rotated box in the coordinate system of the gaze samples. ``3d_bounding_box.csv``
+# contains the boxes in object coordinates, ``scene_objects.csv`` the poses of the objects, and ``instances.json`` their
+# names (data format of ADT, facebookresearch/projectaria_tools). The world of the twin has y up and that of the gaze
+# samples has z up: (x, y, z) becomes (x, -z, y), as in `nerg rays import --preset aria`. Poses with a timestamp belong
+# to objects that were moved. They have no single position and are left out.
 
 ADT_BOXES_FILE, ADT_POSES_FILE, ADT_NAMES_FILE = "3d_bounding_box.csv", "scene_objects.csv", "instances.json"
-MAX_TABLE_BYTES = 256 << 20  # a table may have so many bytes
-_THIN = 1e-3  # metres: a box that is thinner is made so thick
+MAX_TABLE_BYTES = 256 << 20  # maximum size of a table in bytes
+_MIN_THICKNESS = 1e-3  # minimum thickness of a box in metres
 _UID, _TIME = "object_uid", "timestamp[ns]"
-_SIDES = [f"p_local_obj_{axis}{end}[m]" for end in ("min", "max") for axis in "xyz"]
-_PLACE = [f"t_wo_{axis}[m]" for axis in "xyz"]
-_TURN = [f"q_wo_{axis}" for axis in "xyzw"]
-# From the twin's world, whose y is up, to that of rays.
-_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+_BOX_COLUMNS = [f"p_local_obj_{axis}{end}[m]" for end in ("min", "max") for axis in "xyz"]
+_POSITION_COLUMNS = [f"t_wo_{axis}[m]" for axis in "xyz"]
+_QUATERNION_COLUMNS = [f"q_wo_{axis}" for axis in "xyzw"]
+# Rotation from the world of the twin (y up) to that of the gaze samples (z up).
+_Z_UP_FROM_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
 def list_twin_files(folder: Path) -> list[Path]:
-    """Those files that `read_twin_objects` reads of a recording's ``folder`` and that are there."""
+    """Return the existing files of ``folder`` that `read_twin_objects` reads."""
     return [folder / name for name in (ADT_BOXES_FILE, ADT_POSES_FILE, ADT_NAMES_FILE) if (folder / name).is_file()]
 
 
 def read_twin_objects(folder: Path, categories: Collection[str] | None = None) -> list[Region]:
-    """The objects that stand still, sorted by name; of ``categories`` alone, if any. Equal names are numbered.
+    """Read the static objects of a recording as boxes, sorted by name. Equal names are numbered.
 
-    Raises `NergError` for a folder without these files, damaged ones, and where no object is left.
+    Parameters
+    ----------
+    folder
+        Folder of the recording.
+    categories
+        Categories to read; None for all.
+
+    Raises
+    ------
+    NergError
+        For missing or damaged files, and if no object remains.
     """
-    sides, places = _rows(folder / ADT_BOXES_FILE, _SIDES), _rows(folder / ADT_POSES_FILE, [*_PLACE, *_TURN])
-    about = _names(folder / ADT_NAMES_FILE)
+    boxes, poses = (
+        _read_rows(folder / ADT_BOXES_FILE, _BOX_COLUMNS),
+        _read_rows(folder / ADT_POSES_FILE, [*_POSITION_COLUMNS, *_QUATERNION_COLUMNS]),
+    )
+    labels = _read_names(folder / ADT_NAMES_FILE)
     if categories is not None:
-        known = sorted({category for _, category in about.values()})
-        unknown = next((c for c in categories if c not in known), None)
+        existing = sorted({category for _, category in labels.values()})
+        unknown = next((c for c in categories if c not in existing), None)
         if unknown is not None:
-            listed = ", ".join(sanitize(k, 40) for k in known[:30])
-            raise NergError(f'"{folder}" has no objects of the category "{sanitize(unknown, 40)}"; there are {listed}')
-    found = []
-    for uid in sides:
-        name, category = about.get(uid, (uid, ""))
-        if uid in places and (categories is None or category in categories):
-            found.append((name, uid))
-    if not found:
-        raise NergError(f'"{folder}" has no object that stands still with a box and a place; name other areas')
-    if len(found) > MAX_AREAS:
+            listed = ", ".join(sanitize(k, 40) for k in existing[:30])
+            raise NergError(
+                f'"{folder}" has no objects of the category "{sanitize(unknown, 40)}"; existing categories: {listed}'
+            )
+    objects = []
+    for uid in boxes:
+        name, category = labels.get(uid, (uid, ""))
+        if uid in poses and (categories is None or category in categories):
+            objects.append((name, uid))
+    if not objects:
+        raise NergError(f'"{folder}" has no static object with a box and a pose; use other areas')
+    if len(objects) > MAX_AREAS:
         raise NergError(
-            f'"{folder}" has {len(found):,} objects, and {MAX_AREAS} areas are read; choose some by "categories"'
+            f'"{folder}" has {len(objects):,} objects; the limit is {MAX_AREAS}; select some with "categories"'
         )
-    found.sort()
-    count = {name: sum(n == name for n, _ in found) for name, _ in found}
+    objects.sort()
+    count = {name: sum(n == name for n, _ in objects) for name, _ in objects}
     seen: dict[str, int] = {}
     regions = []
-    for name, uid in found:
+    for name, uid in objects:
         seen[name] = seen.get(name, 0) + 1
-        shown = name if count[name] == 1 else f"{name} {seen[name]}"
-        regions.append(_box(shown[:80], sides[uid], places[uid]))
+        unique_name = name if count[name] == 1 else f"{name} {seen[name]}"
+        regions.append(_make_region(unique_name[:80], boxes[uid], poses[uid]))
     return regions
 
 
-def _box(name: str, sides: np.ndarray, place: np.ndarray) -> Region:
+def _make_region(name: str, box: np.ndarray, pose: np.ndarray) -> Region:
     from scipy.spatial.transform import Rotation
 
-    lower, upper = sides[:3], np.maximum(sides[3:], sides[:3] + _THIN)
-    turn = Rotation.from_matrix(_UP) * Rotation.from_quat(place[3:])
-    middle = _UP @ place[:3] + turn.apply((lower + upper) / 2)
+    lower, upper = box[:3], np.maximum(box[3:], box[:3] + _MIN_THICKNESS)
+    rotation = Rotation.from_matrix(_Z_UP_FROM_Y_UP) * Rotation.from_quat(pose[3:])
+    center = _Z_UP_FROM_Y_UP @ pose[:3] + rotation.apply((lower + upper) / 2)
     half = (upper - lower) / 2
-    return Region.create(name, middle - half, middle + half, turn.as_quat())
+    return Region.create(name, center - half, center + half, rotation.as_quat())
 
 
-def _rows(path: Path, columns: list[str]) -> dict[str, np.ndarray]:
-    """Numbers of the rows without a time, by object."""
+def _read_rows(path: Path, columns: list[str]) -> dict[str, np.ndarray]:
+    """Read the numbers of the rows without a timestamp, by object."""
     raw = read_bytes(path, "table of objects", MAX_TABLE_BYTES)
-    found: dict[str, np.ndarray] = {}
+    rows: dict[str, np.ndarray] = {}
     moving: set[str] = set()
     with translate_read_errors(path, "table of objects", "download it again", extra_errors=(csv.Error,)):
         table = csv.reader(io.StringIO(raw.decode()))
@@ -419,7 +473,7 @@ def _rows(path: Path, columns: list[str]) -> dict[str, np.ndarray]:
         missing = [c for c in (_UID, _TIME, *columns) if c not in head]
         if missing:
             raise ValueError(f'it has no column "{missing[0]}"')
-        uid, time, where = head.index(_UID), head.index(_TIME), [head.index(c) for c in columns]
+        uid, time, columns_at = head.index(_UID), head.index(_TIME), [head.index(c) for c in columns]
         for row in table:
             if not row:
                 continue
@@ -428,39 +482,41 @@ def _rows(path: Path, columns: list[str]) -> dict[str, np.ndarray]:
             if int(row[time]) >= 0:
                 moving.add(row[uid])
                 continue
-            values = np.array([float(row[k]) for k in where])
+            values = np.array([float(row[k]) for k in columns_at])
             if not (np.abs(values) < 1e6).all():
-                raise ValueError(f"the object {sanitize(row[uid], 40)} has numbers that are none")
-            if columns == _SIDES and not (values[:3] <= values[3:]).all():
-                raise ValueError(f"the box of the object {sanitize(row[uid], 40)} ends before it begins")
-            if columns != _SIDES and not 0.5 < np.linalg.norm(values[3:]) < 2:
-                raise ValueError(f"the turn of the object {sanitize(row[uid], 40)} is no rotation")
-            found[row[uid]] = values
-    return {key: values for key, values in found.items() if key not in moving}
+                raise ValueError(f"the object {sanitize(row[uid], 40)} has invalid numbers")
+            if columns == _BOX_COLUMNS and not (values[:3] <= values[3:]).all():
+                raise ValueError(f"the box of the object {sanitize(row[uid], 40)} has a maximum below its minimum")
+            if columns != _BOX_COLUMNS and not 0.5 < np.linalg.norm(values[3:]) < 2:
+                raise ValueError(f"the rotation of the object {sanitize(row[uid], 40)} is not a unit quaternion")
+            rows[row[uid]] = values
+    return {key: values for key, values in rows.items() if key not in moving}
 
 
-def _names(path: Path) -> dict[str, tuple[str, str]]:
-    """Name and category of objects; none where there is no such file."""
+def _read_names(path: Path) -> dict[str, tuple[str, str]]:
+    """Read the name and category of each object; empty if the file does not exist."""
     if not is_regular_file(path, "file of instances"):
         return {}
-    found = read_json(path, "file of instances")
-    if not isinstance(found, dict):
-        raise NergError(f'"{path}" names no objects; download it again')
+    document = read_json(path, "file of instances")
+    if not isinstance(document, dict):
+        raise NergError(f'"{path}" contains no objects; download it again')
     names = {}
-    for uid, about in found.items():
-        told = about if isinstance(about, dict) else {}
-        name, category = told.get("instance_name", uid), told.get("category", "")
+    for uid, entry in document.items():
+        fields = entry if isinstance(entry, dict) else {}
+        name, category = fields.get("instance_name", uid), fields.get("category", "")
         if not isinstance(name, str) or not isinstance(category, str):
-            raise NergError(f'"{path}" has a name of the object {sanitize(uid, 40)} that is no text; download it again')
+            raise NergError(
+                f'"{path}" has a name of the object {sanitize(uid, 40)} that is not a string; download it again'
+            )
         clean = "".join(c if c.isprintable() else "?" for c in name).strip() or uid
         names[uid] = clean[:70], category
     return names
 
 
-# ---- Reading areas of interest from a JSON file, or from the folder of a recording of Aria Digital Twin ----
+# ---- Files of areas ----
 
-MESH_SUFFIXES = (".ply", ".obj")  # suffixes of meshes that an area can be a part of
-MAX_PARTS = 1000  # so many ranges of faces, parts of a group, or categories may an area name
+MESH_SUFFIXES = (".ply", ".obj")  # suffixes of meshes with areas
+MAX_PARTS = 1000  # maximum number of face ranges, parts of a group, or categories of an area
 
 _READING_EXAMPLE = (
     '{"name": "a", "min": [0, 0, 0], "max": [1, 2, 3]}, {"name": "b", "mesh": "sign.ply", "faces": [0, [4, 9]]}, '
@@ -469,111 +525,126 @@ _READING_EXAMPLE = (
 
 
 def read_areas(path: str | Path) -> AreaSet:
-    """The areas of a JSON file, or the objects in the folder of a recording of Aria Digital Twin.
+    """Read the areas of a JSON file, or the objects in the folder of a recording of Aria Digital Twin.
 
-    Beside boxes (`nerg_mi.formats.areas.read_regions`) an area is a mesh or some of its faces (``mesh``: a .ply or
-    .obj in the file's folder or below it, ``faces``: numbers from 0 on, or pairs of a first and a last one), a shape of
-    the scene (``shape``: its id), a group of others (``parts``: names), or the objects of a recording (``adt``: its
-    folder, ``categories``: those that are taken; with a name they are a group, too). Raises `NergError`.
+    Besides boxes (`read_regions`), a file may contain:
+
+    - a mesh or some of its faces. ``mesh``: a .ply or .obj in the folder of the file or below it; ``faces``: indices,
+      or pairs of a first and a last index.
+    - a shape of the scene. ``shape``: its id.
+    - a group of other areas. ``parts``: their names.
+    - the objects of a recording. ``adt``: its folder; ``categories``: the categories to read. With a name, the objects
+      also form a group.
+
+    Raises `NergError` for an invalid file.
     """
     path = Path(path)
     if path.is_dir():
         return AreaSet(tuple(read_twin_objects(path)))
-    found: list[Area] = []
-    others: list[dict[str, Any]] = []
+    areas: list[Area] = []
+    non_boxes: list[dict[str, Any]] = []
     for entry in read_area_entries(path):
         if entry.is_box:
-            found.append(parse_box(entry))
+            areas.append(parse_box(entry))
             continue
-        named = {"name": entry.name} if isinstance(entry.name, str) else {}
-        others.append({**named, **entry.definition})
+        name = {"name": entry.name} if isinstance(entry.name, str) else {}
+        non_boxes.append({**name, **entry.definition})
         try:
-            found += _other(entry, path)
+            areas += _parse_non_box(entry, path)
         except NergError as error:
             raise NergError(f"{entry.location}: {error}") from error
-        if len(found) > MAX_AREAS:
-            raise NergError(f'"{path}" has more than {MAX_AREAS} areas; choose some of the objects by "categories"')
+        if len(areas) > MAX_AREAS:
+            raise NergError(f'"{path}" has more than {MAX_AREAS} areas; select some of the objects with "categories"')
     try:
-        return AreaSet(tuple(found), tuple(others))
+        return AreaSet(tuple(areas), tuple(non_boxes))
     except NergError as error:
         raise NergError(f'"{path}": {error}') from error
 
 
 def list_area_files(path: str | Path, areas: AreaSet) -> list[Path]:
-    """The files that `read_areas` and whoever loads the meshes of its ``areas`` read of ``path``."""
+    """Return the files that are read for ``areas``, which were read from ``path``, including meshes."""
     path = Path(path)
     if path.is_dir():
         return list_twin_files(path)
-    twins = [file for given in areas.non_boxes if "adt" in given for file in list_twin_files(path.parent / given["adt"])]
+    twins = [
+        file
+        for definition in areas.non_boxes
+        if "adt" in definition
+        for file in list_twin_files(path.parent / definition["adt"])
+    ]
     return list(dict.fromkeys([path, *areas.meshes, *twins]))
 
 
-def _other(entry: AreaEntry, path: Path) -> list[Area]:
-    """The areas of an entry that is no box."""
-    given = entry.definition
-    if "adt" in given:
-        return _objects(entry, path)
+def _parse_non_box(entry: AreaEntry, path: Path) -> list[Area]:
+    """Parse an entry that is not a box into areas."""
+    definition = entry.definition
+    if "adt" in definition:
+        return _read_objects(entry, path)
     name = entry.name
     if not isinstance(name, str):
         raise NergError(f"an area needs a name, as in {_READING_EXAMPLE}")
     check_area_name(name)
-    if "mesh" in given:
-        file = resolve_mesh_path(given["mesh"], path)
-        return [MeshPart(name, file, None if given.get("faces") is None else _ranges(given["faces"]))]
-    if "shape" in given:
-        if not isinstance(given["shape"], str) or not given["shape"]:
+    if "mesh" in definition:
+        file = resolve_mesh_path(definition["mesh"], path)
+        return [MeshPart(name, file, None if definition.get("faces") is None else _parse_ranges(definition["faces"]))]
+    if "shape" in definition:
+        if not isinstance(definition["shape"], str) or not definition["shape"]:
             raise NergError('"shape" must be the id of a shape of the scene')
-        return [SceneShape(name, given["shape"])]
-    return [AreaGroup(name, _words(given["parts"], "parts"))]
+        return [SceneShape(name, definition["shape"])]
+    return [AreaGroup(name, _parse_names(definition["parts"], "parts"))]
 
 
-def _objects(entry: AreaEntry, path: Path) -> list[Area]:
+def _read_objects(entry: AreaEntry, path: Path) -> list[Area]:
     categories = entry.definition.get("categories")
-    chosen = None if categories is None else _words(categories, "categories")
-    objects: list[Area] = list(read_twin_objects(_inside(entry.definition["adt"], path), chosen))
+    selected = None if categories is None else _parse_names(categories, "categories")
+    objects: list[Area] = list(read_twin_objects(_resolve_inside(entry.definition["adt"], path), selected))
     if entry.name is None or entry.name == "":
         return objects
     if not isinstance(entry.name, str):
-        raise NergError("a name must be a text")
+        raise NergError("the name must be a string")
     check_area_name(entry.name)
     return [*objects, AreaGroup(entry.name, tuple(a.name for a in objects))]
 
 
 def resolve_mesh_path(name: object, path: Path, file_kind: str = "areas") -> Path:
-    """The mesh ``name`` (.ply, .obj) beside the file ``path`` of ``what``, or below. Raises `NergError` for other
-    names."""
-    file = _inside(name, path, file_kind)
+    """Return the path of the mesh ``name`` (.ply, .obj), relative to the folder of the file ``path``.
+
+    Raises `NergError` for another suffix, and for a path outside of that folder. ``file_kind`` names the file ``path``
+    in messages.
+    """
+    file = _resolve_inside(name, path, file_kind)
     if file.suffix.lower() not in MESH_SUFFIXES:
         raise NergError(
-            f'the mesh "{sanitize(file.name, 60)}" is no .ply or .obj; convert it to one of {", ".join(MESH_SUFFIXES)}'
+            f'the mesh "{sanitize(file.name, 60)}" is not a .ply or .obj file; convert it to one of '
+            f"{', '.join(MESH_SUFFIXES)}"
         )
     return file
 
 
-def _inside(name: object, path: Path, what: str = "areas") -> Path:
-    """The file or folder ``name`` beside the file ``path`` of ``what``, or below."""
+def _resolve_inside(name: object, path: Path, file_kind: str = "areas") -> Path:
+    """Return the path of the file or folder ``name`` inside the folder of the file ``path``."""
     if not isinstance(name, str) or not 0 < len(name) <= 1000 or "\0" in name:
-        raise NergError('a file is named by a text, as in {"name": "a", "mesh": "sign.ply"}')
+        raise NergError('a file name must be a string, as in {"name": "a", "mesh": "sign.ply"}')
     folder = os.path.realpath(path.parent)
-    found = os.path.realpath(os.path.join(folder, name))
-    if os.path.isabs(name) or os.path.commonpath([folder, found]) != folder:
-        raise NergError(f'"{sanitize(name, 80)}" lies outside of the folder of the {what}; put it, or a copy, there')
+    resolved = os.path.realpath(os.path.join(folder, name))
+    if os.path.isabs(name) or os.path.commonpath([folder, resolved]) != folder:
+        raise NergError(f'"{sanitize(name, 80)}" is outside of the folder of the {file_kind}; move or copy it there')
     return path.parent / name
 
 
-def _ranges(given: object) -> tuple[tuple[int, int], ...]:
-    """Numbers of faces, or pairs of a first and a last one."""
-    listed = given if isinstance(given, list) else [None]
-    found = []
-    for one in listed if 0 < len(listed) <= MAX_PARTS else [None]:
-        ends: list[Any] = one if isinstance(one, list) else [one, one]
+def _parse_ranges(value: object) -> tuple[tuple[int, int], ...]:
+    """Parse face indices, or pairs of a first and a last index."""
+    items = value if isinstance(value, list) else [None]
+    ranges = []
+    for item in items if 0 < len(items) <= MAX_PARTS else [None]:
+        ends: list[Any] = item if isinstance(item, list) else [item, item]
         if len(ends) != 2 or not all(is_count(v) for v in ends) or ends[0] > ends[1]:
-            raise NergError('"faces" are numbers from 0 on, or pairs of a first and a last one, as in [0, [4, 9]]')
-        found.append((int(ends[0]), int(ends[1])))
-    return tuple(found)
+            raise NergError('"faces" must be indices from 0, or pairs of a first and a last index, as in [0, [4, 9]]')
+        ranges.append((int(ends[0]), int(ends[1])))
+    return tuple(ranges)
 
 
-def _words(given: object, what: str) -> tuple[str, ...]:
-    if not isinstance(given, list) or not 0 < len(given) <= MAX_PARTS or not all(isinstance(w, str) for w in given):
-        raise NergError(f'"{what}" must be 1 to {MAX_PARTS} names')
-    return tuple(dict.fromkeys(given))
+def _parse_names(value: object, key: str) -> tuple[str, ...]:
+    if not isinstance(value, list) or not 0 < len(value) <= MAX_PARTS or not all(isinstance(w, str) for w in value):
+        raise NergError(f'"{key}" must be 1 to {MAX_PARTS} names')
+    return tuple(dict.fromkeys(value))

@@ -1,8 +1,8 @@
-"""Binary glTF 2.0 (.glb): the container, and the triangles of a file that somebody else wrote.
+"""Binary glTF 2.0 (.glb): the container format, and the triangles of files from other programs.
 
-Not trimesh's (5.2). Its writer has colours of 8 bits, which are too few for linear ones: the darkest step above black
-is 5 % of sRGB. Its reader ignores what a file requires: it takes quantised positions for whole numbers, leaves out fans
-and the copies of EXT_mesh_gpu_instancing, and ends circles of nodes without a word.
+This module does not use trimesh (5.2). Its writer supports only 8-bit colours, which are too coarse for linear values:
+the darkest level above black is 5 % of sRGB. Its reader ignores required extensions: it reads quantised positions as
+integers, omits triangle fans and the instances of EXT_mesh_gpu_instancing, and does not report cycles of nodes.
 """
 
 from __future__ import annotations
@@ -20,25 +20,25 @@ from nerg_mi.errors import sanitize
 from nerg_mi.fields.splats import quaternions_to_matrices
 from nerg_mi.files.safe_read import is_count, parse_json, translate_read_errors
 
-GLTF_MAGIC = b"glTF"  # beginning of a file
-MAX_GLTF_BYTES = 1 << 30  # maximum bytes of a file
-MAX_NODE_DEPTH = 64  # nodes may be nested so deep
-MAX_INSTANCES = 100_000  # so many meshes may stand in a scene
-MAX_TRIANGLES = 20_000_000  # so many triangles may be in all of them
+GLTF_MAGIC = b"glTF"  # first bytes of a file
+MAX_GLTF_BYTES = 1 << 30  # maximum size of a file in bytes
+MAX_NODE_DEPTH = 64  # maximum nesting depth of nodes
+MAX_INSTANCES = 100_000  # maximum number of mesh instances in a scene
+MAX_TRIANGLES = 20_000_000  # maximum number of triangles of all instances
 _JSON, _BINARY = 0x4E4F534A, 0x004E4942
 _INDICES = {5121: "u1", 5123: "<u2", 5125: "<u4"}
 _FLOATS = {5126: "<f4"}
-_SHARES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2"}
-_QUANTIZED = _FLOATS | _SHARES
+_NORMALIZED = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2"}
+_QUANTIZED = _FLOATS | _NORMALIZED
 _QUANTIZATION, _INSTANCING = "KHR_mesh_quantization", "EXT_mesh_gpu_instancing"
-# Beginnings of extensions that change how triangles look, and not where they are.
-_LOOKS = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_", "EXT_lights_", "KHR_xmp")
+# Prefixes of extensions that change the appearance of triangles, but not their positions.
+_APPEARANCE_PREFIXES = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_", "EXT_lights_", "KHR_xmp")
 _TRIANGLES = 4
 
 Attribute = tuple[str, np.ndarray, bool]
-"""Name of a vertex attribute, its values (V,) or (V, components), and whether integers stand for 0 to 1."""
+"""Name of a vertex attribute, its values (V,) or (V, components), and whether integers are normalised to 0..1."""
 
-_KINDS = {"float32": 5126, "uint16": 5123, "uint32": 5125}
+_COMPONENT_TYPES = {"float32": 5126, "uint16": 5123, "uint32": 5125}
 _SHAPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 _WIDTHS = {name: width for width, name in _SHAPES.items()}
 
@@ -50,27 +50,41 @@ def encode_unlit_glb(
     extras: Mapping[str, Any] | None = None,
     image: bytes | None = None,
 ) -> tuple[bytes, ...]:
-    """The bytes of a file, in parts, of one mesh (without ``faces`` of points) whose colours are shown as they are.
+    """Encode one mesh, or points without ``faces``, with unlit colours. Returns the bytes of the file in parts.
 
-    ``attributes``: POSITION first; float32 or uint16. ``up``: axis that is up, z or y; glTF's is y, and the node is
-    turned for z. ``extras``: what the file says of itself. ``image``: a PNG, of which TEXCOORD_0 takes the colours.
+    Parameters
+    ----------
+    attributes
+        Vertex attributes, float32 or uint16; POSITION first.
+    faces
+        Vertex indices (F, 3); None for points.
+    up
+        Axis that points up, "z" or "y". The up axis of glTF is y; for z, the node is rotated.
+    extras
+        JSON metadata of the file.
+    image
+        A PNG image; its colours are sampled at TEXCOORD_0.
     """
     arrays = [(name, np.ascontiguousarray(values), shared, 34962) for name, values, shared in attributes]
     if faces is not None:
         arrays.append(("indices", np.asarray(faces, "<u4").ravel(), False, 34963))
     views, accessors, data = [], [], b""
-    for _, values, shared, target in arrays:
+    for _, values, is_normalized, target in arrays:
         views.append({"buffer": 0, "byteOffset": len(data), "byteLength": values.nbytes, "target": target})
-        kind, shape = _KINDS[values.dtype.name], _SHAPES[1 if values.ndim == 1 else values.shape[1]]
+        kind, shape = _COMPONENT_TYPES[values.dtype.name], _SHAPES[1 if values.ndim == 1 else values.shape[1]]
         accessors.append({"bufferView": len(views) - 1, "componentType": kind, "count": len(values), "type": shape})
-        if shared:
+        if is_normalized:
             accessors[-1]["normalized"] = True
         data += values.tobytes()
         data += b"\0" * (-len(data) % 4)
     position = arrays[0][1]
     accessors[0] |= {"min": position.min(0).tolist(), "max": position.max(0).tolist()}
-    named = {name: number for number, (name, *_) in enumerate(arrays) if name != "indices"}
-    primitive: dict[str, Any] = {"attributes": named, "mode": 0 if faces is None else _TRIANGLES, "material": 0}
+    attribute_accessors = {name: number for number, (name, *_) in enumerate(arrays) if name != "indices"}
+    primitive: dict[str, Any] = {
+        "attributes": attribute_accessors,
+        "mode": 0 if faces is None else _TRIANGLES,
+        "material": 0,
+    }
     if faces is not None:
         primitive["indices"] = len(arrays) - 1
     surface: dict[str, Any] = {"metallicFactor": 0}
@@ -100,7 +114,7 @@ def encode_unlit_glb(
 
 
 def pack_glb(document: dict[str, Any], data: bytes) -> tuple[bytes, ...]:
-    """The bytes of a file, in parts, of the ``document`` and of its only buffer ``data``."""
+    """Encode a ``document`` and its only buffer ``data``. Returns the bytes of the file in parts."""
     text = json.dumps(document).encode()
     text += b" " * (-len(text) % 4)
     data += b"\0" * (-len(data) % 4)
@@ -110,8 +124,19 @@ def pack_glb(document: dict[str, Any], data: bytes) -> tuple[bytes, ...]:
 
 @dataclass(frozen=True, eq=False)
 class GltfTriangles:
-    """``vertices`` (V, 3) and ``faces`` (F, 3) of all triangles of a file's scene, its nodes applied, in glTF's frame:
-    right-handed, y up. ``colors`` (V, 3), linear in 0..1, of vertices, or None; ``notes`` on what is not used."""
+    """All triangles of the scene of a file, with node transforms applied, in the frame of glTF: right-handed, y up.
+
+    Attributes
+    ----------
+    vertices
+        Positions (V, 3).
+    faces
+        Vertex indices (F, 3).
+    colors
+        Linear vertex colours (V, 3) in 0..1, or None.
+    notes
+        Sentences about parts of the file that are not used.
+    """
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -120,57 +145,60 @@ class GltfTriangles:
 
 
 def parse_glb(raw: bytes | memoryview, path: str | os.PathLike) -> GltfTriangles:
-    """The triangles in the bytes ``raw`` of the file ``path``.
+    """Parse the triangles in the bytes ``raw`` of the file ``path``.
 
-    Raises `NergError` for what is damaged, compressed, quantised without saying so or beyond this module's limits,
-    for extensions that it requires and that are not read, and where there is no triangle.
+    Raises `NergError` for a file that is damaged, compressed, quantised without declaring it, or beyond the limits of
+    this module, for required extensions that are not supported, and for a file without triangles.
     """
-    # Whatever stands where another kind of value belongs is the file's mistake.
+    # A value of a wrong JSON type is an error of the file.
     with translate_read_errors(path, "mesh", "export it again", extra_errors=(TypeError, AttributeError)):
         document, data = read_glb_chunks(raw, path)
         _check_extensions(document)
         quantized = _QUANTIZATION in document.get("extensionsUsed", [])
-        found = list(iter_instances(document, *_CORNERS_OF))
+        primitives = list(iter_instances(document, *_TRIANGLE_INDEXERS))
         vertices: list[np.ndarray] = []
         colors: list[np.ndarray | None] = []
         faces: list[np.ndarray] = []
         count = triangles = 0
-        known: dict[tuple, tuple[np.ndarray, np.ndarray]] = {}
-        for primitive, matrix in found:
+        cached: dict[tuple, tuple[np.ndarray, np.ndarray]] = {}
+        for primitive, matrix in primitives:
             if "KHR_draco_mesh_compression" in primitive.get("extensions", {}):
                 raise ValueError("its triangles are compressed (Draco); export it without compression")
             key = primitive["attributes"]["POSITION"], primitive.get("indices"), primitive.get("mode", _TRIANGLES)
-            if key not in known:
-                known[key] = _triangles(document, data, *key, _QUANTIZED if quantized else _FLOATS)
-            corners, index = known[key]
+            if key not in cached:
+                cached[key] = _read_triangles(document, data, *key, _QUANTIZED if quantized else _FLOATS)
+            corners, index = cached[key]
             triangles += len(index)
             if triangles > MAX_TRIANGLES:
-                raise ValueError(f"it has more than the {MAX_TRIANGLES:,} triangles that are read")
+                raise ValueError(f"it has more than the {MAX_TRIANGLES:,} triangles, the limit")
             vertices.append(corners @ matrix[:3, :3].T + matrix[:3, 3])
-            colors.append(_vertex_colors(document, data, primitive["attributes"], len(corners)))
-            # A mirrored instance is seen from its other side.
+            colors.append(_read_vertex_colors(document, data, primitive["attributes"], len(corners)))
+            # A mirrored instance has the opposite winding order.
             faces.append(count + (index if np.linalg.det(matrix[:3, :3]) >= 0 else index[:, ::-1]))
             count += len(corners)
         if not triangles:
             raise ValueError("its scene has no triangles")
-        whole = None
+        vertex_colors = None
         if any(part is not None for part in colors):
-            whole = np.concatenate([np.ones((len(v), 3)) if c is None else c for v, c in zip(vertices, colors)])
-        notes = _unused(document, [primitive for primitive, _ in found])
-        return GltfTriangles(np.concatenate(vertices), np.concatenate(faces), whole, notes)
+            vertex_colors = np.concatenate([np.ones((len(v), 3)) if c is None else c for v, c in zip(vertices, colors)])
+        notes = _describe_unused(document, [primitive for primitive, _ in primitives])
+        return GltfTriangles(np.concatenate(vertices), np.concatenate(faces), vertex_colors, notes)
 
 
 def _check_extensions(document: dict[str, Any]) -> None:
-    """Raise `ValueError` for extensions without which the triangles are others."""
+    """Raise `ValueError` for extensions that change the triangles."""
     for name in document.get("extensionsRequired", []):
-        if name != _QUANTIZATION and not str(name).startswith(_LOOKS):
-            raise ValueError(f'it requires the extension "{sanitize(name, 60)}", which is not read; export it without it')
+        if name != _QUANTIZATION and not str(name).startswith(_APPEARANCE_PREFIXES):
+            raise ValueError(
+                f'it requires the extension "{sanitize(name, 60)}", which is not supported; export it without this '
+                "extension"
+            )
     if any(_INSTANCING in node.get("extensions", {}) for node in document.get("nodes", [])):
-        raise ValueError(f"it has copies of meshes by {_INSTANCING}, which is not read; export it without it")
+        raise ValueError(f"it has instances of {_INSTANCING}, which is not supported; export it without this extension")
 
 
-def _unused(document: dict[str, Any], primitives: list[dict[str, Any]]) -> tuple[str, ...]:
-    """A sentence on what there is besides the triangles."""
+def _describe_unused(document: dict[str, Any], primitives: list[dict[str, Any]]) -> tuple[str, ...]:
+    """Return a sentence about the parts of the file besides the triangles."""
     modes = {p.get("mode", _TRIANGLES) for m in document.get("meshes", []) for p in m["primitives"]}
     parts = (["points"] if 0 in modes else []) + (["lines"] if modes & {1, 2, 3} else [])
     parts += [name for name in ("materials", "skins", "animations", "cameras") if document.get(name)]
@@ -180,65 +208,65 @@ def _unused(document: dict[str, Any], primitives: list[dict[str, Any]]) -> tuple
     return (f"parts that are not used: {sanitize(', '.join(parts))}",) if parts else ()
 
 
-def _vertex_colors(
+def _read_vertex_colors(
     document: dict[str, Any], data: bytes | memoryview, attributes: dict[str, Any], count: int
 ) -> np.ndarray | None:
     if "COLOR_0" not in attributes:
         return None
-    shape = document["accessors"][_index(attributes["COLOR_0"])]["type"]
+    shape = document["accessors"][_check_index(attributes["COLOR_0"])]["type"]
     if shape not in ("VEC3", "VEC4"):
-        raise ValueError(f'its colours are of the type "{sanitize(shape, 40)}"')
+        raise ValueError(f'its colours have the type "{sanitize(shape, 40)}"')
     colors = read_accessor(document, data, attributes["COLOR_0"], shape)[:, :3].astype(np.float64)
     if len(colors) != count or not np.isfinite(colors).all():
-        raise ValueError("its colours are not as many as its vertices, or not finite")
+        raise ValueError("its colours are not finite, or their number differs from that of the vertices")
     return np.clip(colors, 0, 1)
 
 
 def read_glb_chunks(
     raw: bytes | memoryview, path: str | os.PathLike, file_kind: str = "mesh"
 ) -> tuple[dict[str, Any], bytes | memoryview]:
-    """The document and the binary chunk of the bytes ``raw`` of the file ``path``, a kind of file called ``what``."""
+    """Parse the JSON document and the binary chunk of the bytes ``raw`` of the file ``path``."""
     magic, version, _ = struct.unpack_from("<4sII", raw)
     if magic != GLTF_MAGIC or version != 2:
-        raise ValueError("it is no binary glTF of version 2")
-    at, document, data = 12, None, b""
-    while at + 8 <= len(raw):
-        length, kind = struct.unpack_from("<II", raw, at)
-        part = raw[at + 8 : at + 8 + length]
+        raise ValueError("it is not binary glTF, version 2")
+    offset, document, data = 12, None, b""
+    while offset + 8 <= len(raw):
+        length, kind = struct.unpack_from("<II", raw, offset)
+        part = raw[offset + 8 : offset + 8 + length]
         if len(part) < length:
-            raise ValueError("it ends within one of its chunks")
+            raise ValueError("it is truncated within a chunk")
         if kind == _JSON and document is None:
             document = parse_json(part, path, file_kind)
         elif kind == _BINARY and not data:
             data = part
-        at += 8 + length
+        offset += 8 + length
     if not isinstance(document, dict):
-        raise ValueError("it has no document")
+        raise ValueError("it has no JSON document")
     return document, data
 
 
 def iter_instances(document: dict[str, Any], *modes: int) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
-    """Primitives of ``modes``, and where each stands: the matrix (4, 4) of its node in the scene."""
+    """Iterate over the primitives of the scene with one of these ``modes``, each with the matrix (4, 4) of its node."""
     nodes = document.get("nodes", [])
     scenes = document.get("scenes")
-    roots = scenes[_index(document.get("scene", 0))]["nodes"] if scenes else range(len(nodes))
-    waiting = [(_index(k), np.eye(4), 0) for k in roots]
-    seen = 0
-    while waiting:
-        number, above, depth = waiting.pop()
-        seen += 1
-        if depth > MAX_NODE_DEPTH or seen > MAX_INSTANCES:
-            raise ValueError("its nodes are nested too deep, or in a circle")
+    roots = scenes[_check_index(document.get("scene", 0))]["nodes"] if scenes else range(len(nodes))
+    pending = [(_check_index(k), np.eye(4), 0) for k in roots]
+    visited = 0
+    while pending:
+        number, parent, depth = pending.pop()
+        visited += 1
+        if depth > MAX_NODE_DEPTH or visited > MAX_INSTANCES:
+            raise ValueError("its nodes are nested too deeply, or form a cycle")
         node = nodes[number]
-        here = above @ _matrix(node)
-        waiting += [(_index(k), here, depth + 1) for k in reversed(node.get("children", []))]
+        to_scene = parent @ _read_node_matrix(node)
+        pending += [(_check_index(k), to_scene, depth + 1) for k in reversed(node.get("children", []))]
         if "mesh" in node:
-            for primitive in document["meshes"][_index(node["mesh"])]["primitives"]:
+            for primitive in document["meshes"][_check_index(node["mesh"])]["primitives"]:
                 if primitive.get("mode", _TRIANGLES) in modes:
-                    yield primitive, here
+                    yield primitive, to_scene
 
 
-def _matrix(node: dict[str, Any]) -> np.ndarray:
+def _read_node_matrix(node: dict[str, Any]) -> np.ndarray:
     if "matrix" in node:
         out = np.array(node["matrix"], np.float64).reshape(4, 4).T
     else:
@@ -248,11 +276,11 @@ def _matrix(node: dict[str, Any]) -> np.ndarray:
         out[:3, :3] = rotation * np.array(node.get("scale", (1, 1, 1)), np.float64).reshape(3)
         out[:3, 3] = np.array(node.get("translation", (0, 0, 0)), np.float64).reshape(3)
     if not np.isfinite(out).all():
-        raise ValueError("one of its nodes stands nowhere")
+        raise ValueError("the transform of a node is not finite")
     return out
 
 
-def _triangles(
+def _read_triangles(
     document: dict[str, Any],
     data: bytes | memoryview,
     position: object,
@@ -266,58 +294,72 @@ def _triangles(
     else:
         index = read_accessor(document, data, indices, "SCALAR", _INDICES).reshape(-1).astype(np.int64)
     if len(index) and index.max() >= len(corners):
-        raise ValueError("its triangles have corners that are none of its vertices")
-    return corners, index[_CORNERS_OF[mode](len(index))]
+        raise ValueError("its triangles refer to vertices that do not exist")
+    return corners, index[_TRIANGLE_INDEXERS[mode](len(index))]
 
 
-def _separate(count: int) -> np.ndarray:
+def _index_triangles(count: int) -> np.ndarray:
     if count % 3:
-        raise ValueError(f"its triangles have {count:,} corners, no multiple of three")
+        raise ValueError(f"its triangles have {count:,} corners, which is not a multiple of three")
     return np.arange(count).reshape(-1, 3)
 
 
-def _strip(count: int) -> np.ndarray:
+def _index_strip(count: int) -> np.ndarray:
     first = np.arange(max(count - 2, 0))
-    # Every other triangle of a strip is turned around.
+    # Every second triangle of a strip has the opposite winding order.
     return np.stack([first, first + 1 + first % 2, first + 2 - first % 2], axis=1)
 
 
-def _fan(count: int) -> np.ndarray:
+def _index_fan(count: int) -> np.ndarray:
     second = np.arange(1, max(count - 1, 1))
     return np.stack([0 * second, second, second + 1], axis=1)
 
 
-_CORNERS_OF = {_TRIANGLES: _separate, 5: _strip, 6: _fan}
-"""How the corners of a primitive, by its mode, make triangles."""
+_TRIANGLE_INDEXERS = {_TRIANGLES: _index_triangles, 5: _index_strip, 6: _index_fan}
+"""Functions that convert the corners of a primitive to triangles, by mode."""
 
 
 def read_accessor(
     document: dict[str, Any], data: bytes | memoryview, number: object, shape: str, kinds: Mapping[int, str] = _FLOATS
 ) -> np.ndarray:
-    """An accessor's values (N, components), as far as the bytes that are there hold them. ``kinds``: NumPy's type of
-    each component type that is read. Integers that stand for 0 to 1, or for -1 to 1, become floats."""
-    accessor = document["accessors"][_index(number)]
-    shared = bool(accessor.get("normalized")) and kinds is not _INDICES
-    known = _SHARES if shared else kinds
-    if accessor["type"] != shape or accessor["componentType"] not in known or "sparse" in accessor:
-        raise ValueError(
-            "its positions or indices are of a kind that is not read; export it again, without compression"
-        )
-    view = document["bufferViews"][_index(accessor["bufferView"])]
-    if _index(view.get("buffer", 0)) != 0 or "uri" in document["buffers"][0]:
+    """Read the values (N, components) of an accessor.
+
+    Parameters
+    ----------
+    document, data
+        The file, from `read_glb_chunks`.
+    number
+        Index of the accessor.
+    shape
+        Required type, such as "VEC3".
+    kinds
+        NumPy type of each supported component type. Normalised integers become floats.
+
+    Raises
+    ------
+    ValueError
+        For another type, and if the buffer is too short.
+    """
+    accessor = document["accessors"][_check_index(number)]
+    is_normalized = bool(accessor.get("normalized")) and kinds is not _INDICES
+    component_types = _NORMALIZED if is_normalized else kinds
+    if accessor["type"] != shape or accessor["componentType"] not in component_types or "sparse" in accessor:
+        raise ValueError("its positions or indices have an unsupported type; export it again without compression")
+    view = document["bufferViews"][_check_index(accessor["bufferView"])]
+    if _check_index(view.get("buffer", 0)) != 0 or "uri" in document["buffers"][0]:
         raise ValueError("its triangles are in another file; export it as one .glb")
-    dtype, width = np.dtype(known[accessor["componentType"]]), _WIDTHS[shape]
-    count, step = _index(accessor["count"]), _index(view.get("byteStride", 0)) or dtype.itemsize * width
-    start = _index(view.get("byteOffset", 0)) + _index(accessor.get("byteOffset", 0))
+    dtype, width = np.dtype(component_types[accessor["componentType"]]), _WIDTHS[shape]
+    count, step = _check_index(accessor["count"]), _check_index(view.get("byteStride", 0)) or dtype.itemsize * width
+    start = _check_index(view.get("byteOffset", 0)) + _check_index(accessor.get("byteOffset", 0))
     if step < dtype.itemsize * width or (count and start + (count - 1) * step + dtype.itemsize * width > len(data)):
-        raise ValueError("it ends before the values that it announces")
+        raise ValueError("it is truncated: it has fewer values than it claims")
     if not count:
         return np.zeros((0, width), dtype)
     values = np.ndarray((count, width), dtype, data, start, (step, dtype.itemsize)).copy()
-    return np.maximum(values / np.float32(np.iinfo(dtype).max), -1) if shared else values
+    return np.maximum(values / np.float32(np.iinfo(dtype).max), -1) if is_normalized else values
 
 
-def _index(value: object) -> int:
+def _check_index(value: object) -> int:
     if not is_count(value):
-        raise ValueError("it numbers its parts by what is no whole number")
+        raise ValueError("an index is not a whole number")
     return int(value)  # pyright: ignore[reportArgumentType] is_count has looked

@@ -1,9 +1,9 @@
-"""PLY files: their tables, whatever the columns, and binary files of triangles or points with columns of their own.
+"""PLY files: reading of all tables and columns, and writing of binary files with custom columns.
 
-Not trimesh's (5.2). Its reader refuses files of triangles and quadrilaterals whose faces have colours, and passes on
-corners that are none of the vertices. Its writer has no comments, which hold units and provenance, drops the columns of
-points or gives them an empty list of faces, and adds an alpha to colours, of which Mitsuba makes an attribute of four
-channels that none of its textures shows.
+This module does not use trimesh (5.2). Its reader rejects files that mix triangles and quadrilaterals with face
+colours, and does not check vertex indices. Its writer does not support comments, which contain units and provenance. It
+drops the columns of point clouds or adds an empty list of faces, and adds an alpha channel to colours, which Mitsuba
+reads as an attribute with four channels that its textures do not support.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ import numpy as np
 
 from nerg_mi.files.atomic import write_bytes
 
-PLY_MAGIC = b"ply"  # beginning of a file
-MAX_HEADER_BYTES = 1 << 20  # the header of a file may be so long
-MAX_TEXT_BYTES = 256 << 20  # and the rows, where their numbers are text
-_TYPES = {"<f4": "float", "|u1": "uchar"}
-_KINDS = {
+PLY_MAGIC = b"ply"  # first bytes of a file
+MAX_HEADER_BYTES = 1 << 20  # maximum size of the header in bytes
+MAX_TEXT_BYTES = 256 << 20  # maximum size of the rows of a text file in bytes
+_PLY_TYPES = {"<f4": "float", "|u1": "uchar"}
+_DTYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
     **dict.fromkeys(("uchar", "uint8"), "u1"),
     **dict.fromkeys(("short", "int16"), "i2"),
@@ -38,9 +38,19 @@ _KINDS = {
 
 @dataclass(frozen=True, eq=False)
 class PlyTable:
-    """An element of ``count`` rows. ``columns``: of each property with one value a row, what gives the values (count,);
-    ``lists``: of each with several, what gives how many they are (count,), and all of them, row after row; ``kinds``:
-    NumPy's types of the values."""
+    """An element of a file.
+
+    Attributes
+    ----------
+    count
+        Number of rows.
+    columns
+        By name of a scalar property: function that returns the values (count,).
+    lists
+        By name of a list property: function that returns the lengths (count,) and the concatenated values.
+    dtypes
+        NumPy type of each property.
+    """
 
     count: int
     columns: dict[str, Callable[[], np.ndarray]] = field(default_factory=dict)
@@ -50,8 +60,7 @@ class PlyTable:
 
 @dataclass(frozen=True, eq=False)
 class Ply:
-    """``tables`` by the names of their elements, in the order of the file; ``comments``; ``trailing``: whether more
-    follows the rows."""
+    """Parsed file: ``tables`` by element name in file order, ``comments``, and whether data follows the last row."""
 
     tables: dict[str, PlyTable]
     comments: tuple[str, ...]
@@ -59,41 +68,41 @@ class Ply:
 
 
 def parse_ply(raw: np.ndarray) -> Ply:
-    """The file with the bytes ``raw`` (uint8, of a file that is mapped or read).
+    """Parse the bytes ``raw`` (uint8) of a file, read or memory-mapped.
 
-    Raises `ValueError` for what is no such file or ends before its rows; nothing is allocated by counts that the bytes
-    do not hold. Values of text are float64.
+    Raises `ValueError` for another kind of file, and for a file that ends before its rows. No memory is allocated for
+    counts that exceed the file. Values of text files are float64.
     """
     head = bytes(raw[:MAX_HEADER_BYTES])
     end = re.search(rb"(?:^|\n)end_header[ \t]*\r?\n", head)
     if not head.startswith(PLY_MAGIC) or end is None:
-        raise ValueError("it has no header of a PLY file")
-    order, elements, comments = _elements(head[: end.start()].decode("latin-1"))
-    source: _Bytes | _Words = _Bytes(raw[end.end() :], order) if order else _Words(raw[end.end() :])
+        raise ValueError("it has no PLY header")
+    order, elements, comments = _parse_header(head[: end.start()].decode("latin-1"))
+    source: _BinaryRows | _TextRows = _BinaryRows(raw[end.end() :], order) if order else _TextRows(raw[end.end() :])
     tables, at = {}, 0
     for name, count, properties in elements:
         if name in tables:
-            raise ValueError(f'it has two elements "{name}"')
-        tables[name], at = source.table(at, name, count, properties)
+            raise ValueError(f'it has two elements named "{name}"')
+        tables[name], at = source.read_table(at, name, count, properties)
     return Ply(tables, comments, at < source.length)
 
 
 def parse_numbers(text: bytes, dtype: type = np.float64) -> np.ndarray:
-    """The numbers in ``text``, between spaces and ends of lines. Raises `ValueError` for what is none."""
+    """Parse the numbers in ``text``, separated by white space. Raises `ValueError` for anything else."""
     with warnings.catch_warnings():
         warnings.simplefilter("error", DeprecationWarning)
         try:
             return np.fromstring(text, dtype, sep=" ") if text.strip() else np.zeros(0, dtype)
         except (DeprecationWarning, ValueError) as error:
-            raise ValueError("it has words where numbers belong") from error
+            raise ValueError("it has text in place of numbers") from error
 
 
-# Name, NumPy's type of the values, and of how many they are, in a list.
+# Name, NumPy type of the values, and NumPy type of the length of a list.
 _Property = tuple[str, str, str | None]
 
 
-def _elements(head: str) -> tuple[str, list[tuple[str, int, list[_Property]]], tuple[str, ...]]:
-    """Byte order ("" for text), elements and comments."""
+def _parse_header(head: str) -> tuple[str, list[tuple[str, int, list[_Property]]], tuple[str, ...]]:
+    """Return the byte order ("" for text), the elements and the comments."""
     order, elements, comments = None, [], []
     for line in head.splitlines()[1:]:
         words = line.split()
@@ -106,75 +115,79 @@ def _elements(head: str) -> tuple[str, list[tuple[str, int, list[_Property]]], t
         elif words[0] == "element":
             elements.append((words[1], int(words[2]), []))
             if elements[-1][1] < 0:
-                raise ValueError(f"it has {elements[-1][1]} rows of {words[1]}")
+                raise ValueError(f'its element "{words[1][:40]}" has {elements[-1][1]} rows')
         elif words[0] == "property":
             listed = words[1] == "list"
             name, kind, count = (words[4], words[3], words[2]) if listed else (words[2], words[1], None)
             for used in (kind, *([count] if count else [])):
-                if used not in _KINDS:
+                if used not in _DTYPES:
                     raise ValueError(f'its property {name[:40]} has the type "{used[:40]}"')
             if any(name == other for other, *_ in elements[-1][2]):
-                raise ValueError(f'it has two properties of the name "{name[:40]}"')
-            elements[-1][2].append((name, _KINDS[kind], _KINDS[count] if count else None))
+                raise ValueError(f'it has two properties named "{name[:40]}"')
+            elements[-1][2].append((name, _DTYPES[kind], _DTYPES[count] if count else None))
         else:
             raise ValueError(f'its header has a line that begins with "{words[0][:40]}"')
     if order is None:
-        raise ValueError("its header names no format")
+        raise ValueError("its header has no format")
     return order, elements, tuple(c for c in comments if c)
 
 
 class _RowSource:
-    """Where values are in a file: in bytes, or in words."""
+    """Access to the values of a file by position. Positions count bytes in binary files and words in text files."""
 
     length: int
 
     def size(self, kind: str) -> int:
-        """How much a value takes."""
+        """Size of a value in positions."""
         raise NotImplementedError
 
     def take(self, positions: np.ndarray, kind: str) -> np.ndarray:
-        """The values at ``positions``."""
+        """Return the values at ``positions``."""
         raise NotImplementedError
 
     def number(self, position: int, kind: str) -> int:
-        """The whole number at ``position``, of which -1 is nothing that a file can mean."""
+        """Return the integer at ``position``; -1 if it is invalid."""
         raise NotImplementedError
 
-    def even(self, at: int, count: int, widths: list[tuple[str, int]]) -> Callable[[int], np.ndarray]:
-        """What gives field k of ``count`` rows from ``at`` on, which all have fields of these kinds and widths."""
+    def read_fixed_rows(self, at: int, count: int, widths: list[tuple[str, int]]) -> Callable[[int], np.ndarray]:
+        """Return a function of k that reads field k of ``count`` rows from ``at``; all rows have fields of these
+        ``widths``.
+        """
         raise NotImplementedError
 
-    def table(self, at: int, name: str, count: int, properties: list[_Property]) -> tuple[PlyTable, int]:
-        """The element whose rows begin at ``at``, and where they end."""
-        least = sum(self.size(c or k) for _, k, c in properties)
-        if count * least > self.length - at:
-            raise ValueError(f"it ends before the {count:,} rows of {name} that it announces")
+    def read_table(self, at: int, name: str, count: int, properties: list[_Property]) -> tuple[PlyTable, int]:
+        """Return the element whose rows start at ``at``, and the position after its rows."""
+        min_size = sum(self.size(c or k) for _, k, c in properties)
+        if count * min_size > self.length - at:
+            raise ValueError(f"it is truncated: it claims {count:,} rows of {name}")
         kinds = {name: np.dtype(kind) for name, kind, _ in properties}
         if not (properties and count):
-            none = lambda: np.zeros(0)
-            columns = {n: none for n, _, c in properties if c is None}
-            return PlyTable(count, columns, {n: lambda: (none(), none()) for n, _, c in properties if c}, kinds), at
-        # Most lists are of one length in all rows.
-        lengths, place = [], at
+            make_empty = lambda: np.zeros(0)
+            columns = {n: make_empty for n, _, c in properties if c is None}
+            return PlyTable(
+                count, columns, {n: lambda: (make_empty(), make_empty()) for n, _, c in properties if c}, kinds
+            ), at
+        # Most lists have the same length in all rows.
+        lengths, position = [], at
         for _, kind, counted in properties:
-            lengths.append(self.number(place, counted) if counted and place < self.length else -1)
-            place += self.size(counted or kind) + (max(lengths[-1], 0) * self.size(kind) if counted else 0)
-        if at + count * (place - at) <= self.length and all(n > 0 for n, p in zip(lengths, properties) if p[2]):
+            lengths.append(self.number(position, counted) if counted and position < self.length else -1)
+            position += self.size(counted or kind) + (max(lengths[-1], 0) * self.size(kind) if counted else 0)
+        if at + count * (position - at) <= self.length and all(n > 0 for n, p in zip(lengths, properties) if p[2]):
             widths = [w for (_, k, c), n in zip(properties, lengths) for w in ([(c, 1), (k, n)] if c else [(k, 1)])]
-            values = self.even(at, count, widths)
-            columns, lists, even, k = {}, {}, True, 0
+            values = self.read_fixed_rows(at, count, widths)
+            columns, lists, is_uniform, k = {}, {}, True, 0
             for (name, _, counted), n in zip(properties, lengths):
                 if counted is None:
                     columns[name] = partial(values, k)
                 else:
-                    even = even and bool((values(k) == n).all())
+                    is_uniform = is_uniform and bool((values(k) == n).all())
                     lists[name] = lambda k=k: (values(k).astype(np.int64), values(k + 1).reshape(-1))
                 k += 2 if counted else 1
-            if even:
-                return PlyTable(count, columns, lists, kinds), at + count * (place - at)
-        return self._uneven(at, name, count, properties, kinds)
+            if is_uniform:
+                return PlyTable(count, columns, lists, kinds), at + count * (position - at)
+        return self._read_varying_rows(at, name, count, properties, kinds)
 
-    def _uneven(self, at, name, count, properties: list[_Property], kinds) -> tuple[PlyTable, int]:
+    def _read_varying_rows(self, at, name, count, properties: list[_Property], kinds) -> tuple[PlyTable, int]:
         starts = np.zeros((len(properties), count), np.int64)
         counts = np.zeros((len(properties), count), np.int64)
         sizes: list[Any] = [
@@ -184,17 +197,17 @@ class _RowSource:
             for k, (size, head, counted) in enumerate(sizes):
                 if counted:
                     if at + head > self.length:
-                        raise ValueError(f"it ends before row {row + 1:,} of {name}")
+                        raise ValueError(f"it is truncated before row {row + 1:,} of {name}")
                     n = self.number(at, counted)
                     if n < 0:
-                        raise ValueError(f"row {row + 1:,} of {name} has a list of less than nothing")
+                        raise ValueError(f"row {row + 1:,} of {name} has a list with a negative length")
                     starts[k, row], counts[k, row] = at + head, n
                     at += head + n * size
                 else:
                     starts[k, row] = at
                     at += size
             if at > self.length:
-                raise ValueError(f"it ends before row {row + 1:,} of {name}")
+                raise ValueError(f"it is truncated before row {row + 1:,} of {name}")
 
         def listed(k: int) -> tuple[np.ndarray, np.ndarray]:
             kind, total = properties[k][1], np.cumsum(counts[k])
@@ -206,7 +219,7 @@ class _RowSource:
         return PlyTable(count, columns, lists, kinds), at
 
 
-class _Bytes(_RowSource):
+class _BinaryRows(_RowSource):
     def __init__(self, raw: np.ndarray, order: str):
         self._raw, self._order, self.length = raw, order, len(raw)
 
@@ -228,16 +241,16 @@ class _Bytes(_RowSource):
             signed=dtype.kind == "i",
         )
 
-    def even(self, at: int, count: int, widths: list[tuple[str, int]]) -> Callable[[int], np.ndarray]:
+    def read_fixed_rows(self, at: int, count: int, widths: list[tuple[str, int]]) -> Callable[[int], np.ndarray]:
         dtype = np.dtype([(f"{k}", self._order + kind, n) for k, (kind, n) in enumerate(widths)])
         rows = np.ndarray((count,), dtype, self._raw, at)
         return lambda k: rows[f"{k}"].reshape(count, -1).squeeze(1 if widths[k][1] == 1 else ()).astype(widths[k][0])
 
 
-class _Words(_RowSource):
+class _TextRows(_RowSource):
     def __init__(self, raw: np.ndarray):
         if len(raw) > MAX_TEXT_BYTES:
-            raise ValueError(f"it is text of more than {MAX_TEXT_BYTES:,} bytes, and larger files are read as binary")
+            raise ValueError(f"it is a text file of more than {MAX_TEXT_BYTES:,} bytes, the limit; save it as binary")
         self._words = parse_numbers(raw.tobytes())
         self.length = len(self._words)
 
@@ -251,7 +264,7 @@ class _Words(_RowSource):
         value = self._words[position]
         return int(value) if np.isfinite(value) and value == np.floor(value) else -1
 
-    def even(self, at: int, count: int, widths: list[tuple[str, int]]) -> Callable[[int], np.ndarray]:
+    def read_fixed_rows(self, at: int, count: int, widths: list[tuple[str, int]]) -> Callable[[int], np.ndarray]:
         ends = np.cumsum([0, *(n for _, n in widths)])
         rows = self._words[at : at + count * ends[-1]].reshape(count, ends[-1])
         return lambda k: rows[:, ends[k]] if widths[k][1] == 1 else rows[:, ends[k] : ends[k + 1]]
@@ -264,28 +277,38 @@ def write_columns(
     face_columns: Mapping[str, np.ndarray] | None = None,
     comments: Sequence[str] = (),
 ) -> None:
-    """Write ``vertices``, columns (V,) by the names of their properties, and ``faces`` (F, 3), with columns (F,)
-    ``of_faces``.
+    """Write a binary file of vertices and, optionally, triangles.
 
-    Columns are float32, or uint8; ``comments``: lines of the header.
-    Of properties ``NAME_0``, ``NAME_1``, ... Mitsuba makes an attribute ``NAME``.
+    Parameters
+    ----------
+    path
+        The file.
+    vertices
+        Vertex columns (V,) by property name; float32 or uint8. Mitsuba combines properties ``NAME_0``, ``NAME_1``, ...
+        into an attribute ``NAME``.
+    faces
+        Vertex indices (F, 3).
+    face_columns
+        Face columns (F,) by property name.
+    comments
+        Comment lines of the header.
     """
-    table, head = _table(vertices), ["ply", "format binary_little_endian 1.0"]
+    table, head = _make_table(vertices), ["ply", "format binary_little_endian 1.0"]
     head += [f"comment {line}" for line in comments]
-    head += [f"element vertex {len(table)}", *_properties(table)]
+    head += [f"element vertex {len(table)}", *_format_properties(table)]
     data = table.tobytes()
     if faces is not None:
-        more = _table(face_columns or {}, len(faces))
-        rows = np.zeros(len(faces), [("n", "u1"), ("v", "<i4", 3), *more.dtype.descr])
+        face_table = _make_table(face_columns or {}, len(faces))
+        rows = np.zeros(len(faces), [("n", "u1"), ("v", "<i4", 3), *face_table.dtype.descr])
         rows["n"], rows["v"] = 3, faces
-        for name in more.dtype.names or ():
-            rows[name] = more[name]
-        head += [f"element face {len(rows)}", "property list uchar int vertex_indices", *_properties(more)]
+        for name in face_table.dtype.names or ():
+            rows[name] = face_table[name]
+        head += [f"element face {len(rows)}", "property list uchar int vertex_indices", *_format_properties(face_table)]
         data += rows.tobytes()
     write_bytes(path, "\n".join([*head, "end_header", ""]).encode(), data)
 
 
-def _table(columns: Mapping[str, np.ndarray], rows: int | None = None) -> np.ndarray:
+def _make_table(columns: Mapping[str, np.ndarray], rows: int | None = None) -> np.ndarray:
     types = [(name, "u1" if np.asarray(c).dtype == np.uint8 else "<f4") for name, c in columns.items()]
     out = np.zeros(len(next(iter(columns.values()))) if rows is None else rows, types)
     for name, column in columns.items():
@@ -293,5 +316,5 @@ def _table(columns: Mapping[str, np.ndarray], rows: int | None = None) -> np.nda
     return out
 
 
-def _properties(table: np.ndarray) -> list[str]:
-    return [f"property {_TYPES[table.dtype[name].str]} {name}" for name in table.dtype.names or ()]
+def _format_properties(table: np.ndarray) -> list[str]:
+    return [f"property {_PLY_TYPES[table.dtype[name].str]} {name}" for name in table.dtype.names or ()]

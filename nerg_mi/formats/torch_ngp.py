@@ -1,4 +1,4 @@
-"""Checkpoints of torch-ngp and of the NeRG paper's authors: networks, grids and occupancy, in and out."""
+"""Import and export of checkpoints of torch-ngp and of the authors of the NeRG paper: networks, grids and occupancy."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid, count_cascade_l
 from nerg_mi.fields.radiance import Background, BackgroundConfig, RadianceConfig, RadianceField
 from nerg_mi.maths.geometry import Box
 
-from .fields import translate_build_errors, check_sizes
+from .fields import check_sizes, translate_build_errors
 from .torch_files import EnumStandIn, is_tensor, read_torch, to_numpy, write_torch
 
-# ---- The state dictionary of a torch checkpoint, and the parts of fields in it ----
+# ---- State dictionaries, and the parts of fields in them ----
 #
-# torch-ngp stores no sizes: those are read off the shapes, and a hash grid's resolutions follow from what is given.
+# torch-ngp does not store sizes. They are inferred from the shapes; the resolutions of a hash grid follow from the
+# bound.
 
-
-# More of either than any network has that is trained.
-_LEVELS, _LAYERS = 64, 64
+# Limits above those of any trained network.
+_MAX_LEVELS, _MAX_LAYERS = 64, 64
 
 
 class StateDict:
-    """The tensors of a checkpoint by name, below ``prefix``; ``averaged`` replaces some of them."""
+    """The tensors of a checkpoint whose names start with ``prefix``; ``averaged`` replaces some of them."""
 
     def __init__(self, path: Path, tensors: dict, prefix: str = "", averaged: dict | None = None):
         self.path, self.prefix, self._averaged = path, prefix, averaged or {}
@@ -51,16 +51,16 @@ class StateDict:
         return to_numpy(self._averaged.get(name, self._tensors[name]), self.path)
 
     def shape(self, name: str) -> tuple[int, ...]:
-        """The shape of ``self[name]``, which is not read."""
+        """Return the shape of ``self[name]`` without reading it."""
         if name not in self._tensors:
             raise NergError(
-                f'"{self.path}" lacks "{self.prefix}{name}", which its kind of checkpoint holds; copy it again'
+                f'"{self.path}" lacks "{self.prefix}{name}", which this kind of checkpoint contains; copy it again'
             )
         return tuple(self._tensors[name].shape)
 
     def get_weights(self, name: str) -> np.ndarray:
-        """``self[name]`` in fp32. Raises `NergError` when it is not finite."""
-        with np.errstate(over="ignore"):  # what fp32 cannot hold is not finite
+        """Return ``self[name]`` as fp32. Raises `NergError` if it is not finite."""
+        with np.errstate(over="ignore"):  # values beyond fp32 become infinite
             value = self[name].astype(np.float32)
         if not np.all(np.isfinite(value)):
             raise NergError(f'"{self.prefix}{name}" in "{self.path}" is not finite: its training has diverged')
@@ -71,35 +71,35 @@ class StateDict:
 
 
 def open_checkpoint(path: str | Path) -> tuple[dict, dict]:
-    """``(whole file, state dictionary)`` of a checkpoint, or of a bare state dictionary."""
-    whole = read_torch(path)
-    if not isinstance(whole, dict):
-        raise NergError(f'"{path}" holds a {type(whole).__name__}, not a checkpoint')
-    model = whole.get("model", whole)
+    """Return ``(complete file, state dictionary)`` of a checkpoint, or of a bare state dictionary."""
+    checkpoint = read_torch(path)
+    if not isinstance(checkpoint, dict):
+        raise NergError(f'"{path}" contains a {type(checkpoint).__name__}, not a checkpoint')
+    model = checkpoint.get("model", checkpoint)
     if not isinstance(model, dict) or not any(is_tensor(v) for v in model.values()):
-        raise NergError(f'"{path}" holds no weights: neither a state dictionary nor one under "model"')
-    return whole, model
+        raise NergError(f'"{path}" contains no weights: neither a state dictionary nor one under "model"')
+    return checkpoint, model
 
 
 def find_averages(path: str | Path, checkpoint: dict, model: dict, use_averages: bool | None) -> dict:
-    """Moving averages by name, those of ``ema["shadow_params"]``; {} for the raw weights.
+    """Return the moving averages ``ema["shadow_params"]`` by name; {} to use the raw weights.
 
-    ``wanted``: True, False, or None for averages where the file has them. torch-ngp's best checkpoint (``ngp.pth``)
-    keeps its averages as the weights themselves.
+    ``use_averages``: True, False, or None to use averages if the file contains them. torch-ngp's best checkpoint
+    (``ngp.pth``) stores its averages in place of the weights.
     """
     ema = checkpoint.get("ema")
     shadow = ema.get("shadow_params") if isinstance(ema, dict) else None
     shadow = shadow if isinstance(shadow, list) else []
     if (not use_averages and use_averages is not None) or not shadow:
         if use_averages and not shadow:
-            raise NergError(f'"{path}" holds no moving averages: import its weights with --no-ema')
+            raise NergError(f'"{path}" contains no moving averages: import its weights with --no-ema')
         return {}
-    # Buffers are not averaged; parameters come in the order of the state dictionary.
+    # Buffers are not averaged; parameters are in the order of the state dictionary.
     names = [k for k in model if k.endswith((".embeddings", ".weight", ".bias"))]
     if [tuple(model[k].shape) for k in names] != [tuple(v.shape) for v in shadow]:
         raise NergError(
-            f'the {len(shadow)} moving averages of "{path}" do not fit its {len(names)} weights: '
-            "import these with --no-ema"
+            f'the {len(shadow)} moving averages of "{path}" do not match its {len(names)} weights: '
+            "import the weights with --no-ema"
         )
     return dict(zip(names, shadow))
 
@@ -115,7 +115,9 @@ def describe_origin(path: str | Path, checkpoint: dict, program: str, averaged: 
 
 
 def shorten_floats(values: np.ndarray) -> np.ndarray:
-    """The numbers that were typed: a bound of 2.7 stands in the file as the float32 next to it."""
+    """Return the shortest decimals that round to the float32 ``values``: a bound of 2.7 is stored as the nearest
+    float32.
+    """
     return np.array([float(str(v)) for v in values.astype(np.float32).ravel()])
 
 
@@ -127,30 +129,35 @@ def infer_sh_degree(state: StateDict, inputs: int) -> int:
     degree = math.isqrt(max(inputs, 0))
     if degree < 1 or degree**2 != inputs:
         raise NergError(
-            f'the direction encoding of "{state.path}" has {inputs} numbers, so it is not spherical harmonics'
+            f'the direction encoding of "{state.path}" has {inputs} numbers, which does not match spherical harmonics'
         )
     return degree
 
 
 def infer_grid_config(state: StateDict, name: str, finest: float, dimensions: int = 3) -> HashGridConfig:
-    """Configuration of the hash grid ``name``, whose level sizes are compared with those stored."""
+    """Infer the configuration of the hash grid ``name``, and compare its level sizes with the stored ones."""
     offsets, table = (
-        state[f"{name}.offsets"].astype(int).ravel()[: _LEVELS + 2].tolist(),
+        state[f"{name}.offsets"].astype(int).ravel()[: _MAX_LEVELS + 2].tolist(),
         state.shape(f"{name}.embeddings"),
     )
     levels, largest = len(offsets) - 1, max(np.diff(offsets), default=0)
-    if not 1 <= levels <= _LEVELS or largest < 8 or len(table) != 2:
+    if not 1 <= levels <= _MAX_LEVELS or largest < 8 or len(table) != 2:
         raise NergError(
-            f'the hash grid "{state.prefix}{name}" of "{state.path}" has no levels, or more than {_LEVELS}; '
+            f'the hash grid "{state.prefix}{name}" of "{state.path}" has no levels, or more than {_MAX_LEVELS}; '
             "copy it again"
         )
     config = HashGridConfig(
-        levels, table[1], max(int(largest) - 1, 1).bit_length(), finest=to_integer_if_whole(finest), dimensions=dimensions
+        levels,
+        table[1],
+        max(int(largest) - 1, 1).bit_length(),
+        finest=to_integer_if_whole(finest),
+        dimensions=dimensions,
     )
     if config.offsets() != offsets:
         raise NergError(
-            f'the levels of "{state.prefix}{name}" in "{state.path}" begin at rows {offsets}, which is not a grid '
-            f"from 16 to {finest:g}: give its finest resolution with --finest"
+            f'the levels of "{state.prefix}{name}" in "{state.path}" start at rows {offsets}, which does not match a '
+            "grid "
+            f"from 16 to {finest:g}: set its finest resolution with --finest"
         )
     return config
 
@@ -160,42 +167,42 @@ def build_grid(state: StateDict, name: str, config: HashGridConfig, ns: ModuleTy
 
 
 def build_network(state: StateDict, name: str, ns: ModuleType) -> MLP:
-    """A network of layers ``name.0.weight``, ``name.1.weight``, ... without biases."""
-    found = [k for k in state.names() if k.startswith(f"{name}.")]
-    names = [f"{name}.{i}.weight" for i in range(max(len(found), 1))]
-    if found and set(found) != set(names):
-        raise NergError(f'"{name}" in "{state.path}" has {", ".join(found)}, where layers without biases are expected')
-    if len(names) > _LAYERS:
-        raise NergError(f'"{name}" in "{state.path}" has {len(names)} layers, and at most {_LAYERS} are read')
+    """Build a network from layers ``name.0.weight``, ``name.1.weight``, ... without biases."""
+    stored_names = [k for k in state.names() if k.startswith(f"{name}.")]
+    names = [f"{name}.{i}.weight" for i in range(max(len(stored_names), 1))]
+    if stored_names and set(stored_names) != set(names):
+        raise NergError(
+            f'"{name}" in "{state.path}" has {", ".join(stored_names)}, but only layers without biases are supported'
+        )
+    if len(names) > _MAX_LAYERS:
+        raise NergError(f'"{name}" in "{state.path}" has {len(names)} layers; the limit is {_MAX_LAYERS}')
     return MLP([ns.TensorXf(state.get_weights(k)) for k in names])
 
 
-# ---- Occupancy ----
-#
-# Occupancy as torch-ngp keeps it: bits of 128^3 cells in Morton order, a cube a cascade.
+# ---- Occupancy in torch-ngp: bits of 128^3 cells in Morton order, one cube per cascade ----
 
 _CELLS = 128
 
 
 def read_occupancy(state: StateDict, bound: float, ns: ModuleType, mean_density) -> OccupancyGrid | CascadeGrid | None:
-    """From the bitfield, or else from the density grid; None for a field that was trained without either."""
+    """Read the occupancy from the bitfield, or otherwise from the density grid; None if the field has neither."""
     levels = count_cascade_levels(bound)
     density = state["density_grid"].reshape(levels, -1) if "density_grid" in state else None
     if "density_bitfield" in state:
         bits = np.unpackbits(state["density_bitfield"], bitorder="little").astype(bool)
     elif density is not None:
-        # torch-ngp's own rule, with the threshold of its command line.
+        # The rule of torch-ngp with its default threshold.
         bits = density.ravel() > min(float(np.maximum(density, 0).mean()), 10)
     else:
         return None
     if bits.size != levels * _CELLS**3:
         raise NergError(
-            f'"{state.path}" has {bits.size} density bits where a bound of {bound:g} has {levels} x 128^3; '
-            "take another checkpoint of its training"
+            f'"{state.path}" has {bits.size} density bits, but a bound of {bound:g} needs {levels} x 128^3; '
+            "use another checkpoint of the training"
         )
     bits = bits.reshape(levels, -1)
     if density is not None and not bits.all():
-        # The largest density that the grid calls empty: cells never seen hold -1.
+        # The largest density of an empty cell; cells that were never seen contain -1.
         threshold = max(float(density[~bits].max()), 0.0)
     else:
         threshold = min(float(mean_density), 10.0) if isinstance(mean_density, (int, float)) else 0.0
@@ -206,7 +213,9 @@ def read_occupancy(state: StateDict, bound: float, ns: ModuleType, mean_density)
 
 
 def morton_order(cells: int = _CELLS) -> np.ndarray:
-    """Morton index of every cell of a cube, listed x fastest, then y, then z; bits of x lowest, (cells^3,)."""
+    """Return the Morton index of each cell of a cube, (cells^3,), with x varying fastest, then y, then z; x has
+    the lowest bits.
+    """
     spread = np.zeros(cells, np.int64)
     for bit in range(cells.bit_length() - 1):
         spread |= (np.arange(cells) >> bit & 1) << 3 * bit
@@ -214,27 +223,27 @@ def morton_order(cells: int = _CELLS) -> np.ndarray:
 
 
 def pack_bitfield(occupancy, bound: float) -> np.ndarray:
-    """Bits of all cascades in Morton order, packed; every bit is set where nothing is known."""
+    """Pack the bits of all cascades in Morton order. All bits are set if there is no occupancy."""
     levels = count_cascade_levels(bound)
     if occupancy is None:
         bits = np.ones((levels, _CELLS, _CELLS, _CELLS), bool)
     elif isinstance(occupancy, CascadeGrid) and (occupancy.bound, occupancy.resolution) == (bound, _CELLS):
         bits = occupancy.bits
     elif isinstance(occupancy, OccupancyGrid):
-        bits = np.stack([_overlapped(occupancy.bits, min(2.0**k, bound) / bound) for k in range(levels)])
+        bits = np.stack([_overlap_cells(occupancy.bits, min(2.0**k, bound) / bound) for k in range(levels)])
     else:
         raise NergError(
-            f"cascades of {occupancy.resolution}^3 cells to a bound of {occupancy.bound:g} have no torch-ngp form"
+            f"torch-ngp cannot represent cascades of {occupancy.resolution}^3 cells with a bound of {occupancy.bound:g}"
         )
     packed = np.zeros((levels, _CELLS**3), bool)
     packed[:, morton_order()] = bits.reshape(levels, -1)
     return np.packbits(packed.ravel(), bitorder="little")
 
 
-def _overlapped(bits: np.ndarray, share: float) -> np.ndarray:
-    """Which cells of 128^3 over the middle ``share`` of the cube overlap an occupied cell of ``bits``."""
+def _overlap_cells(bits: np.ndarray, fraction: float) -> np.ndarray:
+    """Return which of 128^3 cells over the central ``fraction`` of the cube overlap an occupied cell of ``bits``."""
     n = len(bits)
-    edges = (np.linspace(-share, share, _CELLS + 1) + 1) / 2 * n
+    edges = (np.linspace(-fraction, fraction, _CELLS + 1) + 1) / 2 * n
     first = np.clip(np.floor(edges[:-1] + 1e-9).astype(int), 0, n - 1)
     last = np.clip(np.ceil(edges[1:] - 1e-9).astype(int), 1, n)
     for axis in range(3):
@@ -243,48 +252,55 @@ def _overlapped(bits: np.ndarray, share: float) -> np.ndarray:
     return bits
 
 
-# ---- Checkpoints of torch-ngp (github.com/ashawkey/torch-ngp), in and out ----
+# ---- Checkpoints of torch-ngp (github.com/ashawkey/torch-ngp) ----
 #
-# They hold a state dictionary and no sizes: those are read off the shapes, and the hash grid's resolutions
-# follow from ``aabb_train``. What is not in the file is an argument here.
+# They contain a state dictionary, but no sizes. These are inferred from the shapes, and the resolutions of the hash
+# grid from ``aabb_train``. Other values that the file lacks are parameters.
 
-MARCH_STEP = 2 * math.sqrt(3) / 1024  # torch-ngp's shortest step, at its default of 1,024 steps
+MARCH_STEP = 2 * math.sqrt(3) / 1024  # minimum step of torch-ngp with its default of 1,024 steps
 
 
 @dataclass(frozen=True)
 class ImportOptions:
-    """What the user says of a checkpoint because the file does not."""
+    """Values that a checkpoint does not contain."""
 
-    # The space that colours were trained in.
+    # Colour space of the training.
     color_space: str = "srgb"
-    # Resolution of the finest level where it is not 2048 (of gaze fields: 256) x bound.
+    # Resolution of the finest level, if it is not 2048 x bound (gaze fields: 256 x bound).
     finest: int | None = None
-    # Of the background network's sphere, in the field's units; 0 leaves the network out.
+    # Radius of the sphere of the background network, in the units of the field; 0 ignores the network.
     background_radius: float | None = None
 
 
-DEFAULT_IMPORT_OPTIONS = ImportOptions()  # what holds for a checkpoint that torch-ngp's own defaults have trained
+DEFAULT_IMPORT_OPTIONS = ImportOptions()  # for checkpoints that were trained with the defaults of torch-ngp
 
 
 def read_torch_ngp(
     path: str | Path, ns: ModuleType, ema: bool | None = None, options: ImportOptions = DEFAULT_IMPORT_OPTIONS
 ) -> tuple[RadianceField, dict]:
-    """The radiance field in a torch-ngp checkpoint on backend ``ns``, and what to say about its origin (JSON)."""
-    whole, model = open_checkpoint(path)
+    """Read the radiance field in a torch-ngp checkpoint on the backend ``ns``, and its provenance (JSON).
+
+    ``ema``: whether to use moving averages; None uses them if the file contains them.
+    """
+    checkpoint, model = open_checkpoint(path)
     with translate_build_errors(path):
-        averaged = find_averages(path, whole, model, ema)
-        field = build_radiance_field(StateDict(Path(path), model, averaged=averaged), ns, options, whole.get("mean_density"))
-    return field, describe_origin(path, whole, "torch-ngp", bool(averaged))
+        averaged = find_averages(path, checkpoint, model, ema)
+        field = build_radiance_field(
+            StateDict(Path(path), model, averaged=averaged), ns, options, checkpoint.get("mean_density")
+        )
+    return field, describe_origin(path, checkpoint, "torch-ngp", bool(averaged))
 
 
-def build_radiance_field(state: StateDict, ns: ModuleType, options: ImportOptions, mean_density: float | None = None) -> RadianceField:
-    """The field that a torch-ngp state dictionary describes."""
+def build_radiance_field(
+    state: StateDict, ns: ModuleType, options: ImportOptions, mean_density: float | None = None
+) -> RadianceField:
+    """Build the field of a torch-ngp state dictionary."""
     for name in state.names():
         if name in ("encoder.params", "sigma_net.params", "color_net.params"):
             raise NergError(
-                f'"{state.path}" was trained with --tcnn or --ff, whose layout is not read: retrain without'
+                f'"{state.path}" was trained with --tcnn or --ff, whose layout is not supported: train it without them'
             )
-    box, bound = _box(state)
+    box, bound = _read_box(state)
     density, color = build_network(state, "sigma_net", ns), build_network(state, "color_net", ns)
     width, geometry = density.weights[0].shape[0], density.outputs - 1
     sizes = infer_grid_config(state, "encoder", options.finest or 2048 * bound)
@@ -306,53 +322,57 @@ def build_radiance_field(state: StateDict, ns: ModuleType, options: ImportOption
         read_occupancy(state, bound, ns, mean_density),
         options.color_space,
         MARCH_STEP,
-        _background(state, ns, options, config.sh_degree),
+        _build_background(state, ns, options, config.sh_degree),
     )
 
 
-def _box(state: StateDict) -> tuple[Box, float]:
+def _read_box(state: StateDict) -> tuple[Box, float]:
     train = shorten_floats(state["aabb_train"])
     aabb = shorten_floats(state["aabb_infer"]) if "aabb_infer" in state else train
     bound = float(np.abs(train).max())
     if train.shape != (6,) or aabb.shape != (6,) or not bound >= 1:
         boxes = " and ".join(sanitize(repr(box.tolist()), 80) for box in (train, aabb))
-        raise NergError(f'the boxes of "{state.path}", {boxes}, are not those of a bound of at least 1')
+        raise NergError(f'the boxes of "{state.path}", {boxes}, do not match a bound of at least 1')
     return Box(tuple(aabb[:3].tolist()), tuple(aabb[3:].tolist()), bound), bound
 
 
-def _background(state: StateDict, ns: ModuleType, given: ImportOptions, degree: int) -> Background | None:
+def _build_background(state: StateDict, ns: ModuleType, options: ImportOptions, degree: int) -> Background | None:
     if "bg_net.0.weight" not in state:
         return None
-    if given.background_radius is None:
+    if options.background_radius is None:
         raise NergError(
             f'"{state.path}" has a background network, and torch-ngp does not store its radius: '
-            "give what it was trained with, --bg-radius 32 (say), or --bg-radius 0 to leave it out"
+            "set the radius of the training, such as --bg-radius 32, or --bg-radius 0 to ignore the background"
         )
-    if given.background_radius == 0:
+    if options.background_radius == 0:
         return None
     net, sizes = build_network(state, "bg_net", ns), infer_grid_config(state, "encoder_bg", 2048, 2)
     config = BackgroundConfig(
-        float(given.background_radius), sizes, net.weights[0].shape[0], len(net.weights) - 1, degree
+        float(options.background_radius), sizes, net.weights[0].shape[0], len(net.weights) - 1, degree
     )
     return Background(config, build_grid(state, "encoder_bg", sizes, ns), net)
 
 
 def make_state_dict(field: RadianceField) -> dict[str, np.ndarray]:
-    """State dictionary with which torch-ngp's ``NeRFNetwork(bound)`` renders ``field``.
+    """Make a state dictionary with which torch-ngp's ``NeRFNetwork(bound)`` renders ``field``.
 
-    Raises `NergError` naming what does not fit: torch-ngp fixes the sizes of its networks and grid by the bound.
+    Raises `NergError` with the reasons if torch-ngp cannot represent the field: the bound determines the sizes of its
+    networks and its grid.
     """
     c, box = field.config, field.box
     if not isinstance(c.grid, HashGridConfig):
-        raise NergError(f'this field has no torch-ngp form: its positions go through "{c.grid.kind}", not a hash grid')
+        raise NergError(f'torch-ngp cannot represent this field: its encoding is "{c.grid.kind}", not a hash grid')
     bound = box.side / 2
     expected = HashGridConfig(
-        levels=c.grid.levels, features=c.grid.features, log2_rows=c.grid.log2_rows, finest=max(to_integer_if_whole(2048 * bound), 16)
+        levels=c.grid.levels,
+        features=c.grid.features,
+        log2_rows=c.grid.log2_rows,
+        finest=max(to_integer_if_whole(2048 * bound), 16),
     )
-    wrong = [
-        words
-        for fits, words in (
-            (not box.is_contracted, "torch-ngp knows no contraction of what is around a box"),
+    mismatches = [
+        reason
+        for is_supported, reason in (
+            (not box.is_contracted, "torch-ngp does not support contraction outside of the box"),
             (
                 box.center == (0, 0, 0) and bound >= 1,
                 f"its unit cube must be [-b, b]^3 with b >= 1, not {box.lower} to {box.upper}",
@@ -369,13 +389,13 @@ def make_state_dict(field: RadianceField) -> dict[str, np.ndarray]:
                 (c.width, c.density_hidden, c.color_hidden, c.geometry, c.sh_degree) == (64, 1, 2, 15, 4),
                 "its networks must be 64 wide (paper size)",
             ),
-            (not c.deferred, "torch-ngp asks the colour network at every sample, and its own once a ray"),
+            (not c.deferred, "torch-ngp evaluates the colour network at each sample, this field once per ray"),
             (c.density_scale == 1, f"its density scale must be 1, not {c.density_scale:g}"),
         )
-        if not fits
+        if not is_supported
     ]
-    if wrong:
-        raise NergError(f"this field has no torch-ngp form: {'; '.join(wrong)}")
+    if mismatches:
+        raise NergError(f"torch-ngp cannot represent this field: {'; '.join(mismatches)}")
     cube = np.array([-bound] * 3 + [bound] * 3, np.float32)
     state = {
         "aabb_train": cube,
@@ -383,26 +403,26 @@ def make_state_dict(field: RadianceField) -> dict[str, np.ndarray]:
         "density_bitfield": pack_bitfield(field.occupancy and field.occupancy.coarse, bound),
         "step_counter": np.zeros((16, 2), np.int32),
     }
-    _put_grid(state, "encoder", field.grid)
-    _put_layers(state, "sigma_net", field.density_net)
-    _put_layers(state, "color_net", field.color_net)
+    _store_grid(state, "encoder", field.grid)
+    _store_layers(state, "sigma_net", field.density_net)
+    _store_layers(state, "color_net", field.color_net)
     if field.background is not None:
-        _put_grid(state, "encoder_bg", field.background.grid)
-        _put_layers(state, "bg_net", field.background.net)
+        _store_grid(state, "encoder_bg", field.background.grid)
+        _store_layers(state, "bg_net", field.background.net)
     return state
 
 
-def _put_grid(state: dict, name: str, grid: Encoding) -> None:
+def _store_grid(state: dict, name: str, grid: Encoding) -> None:
     state[f"{name}.embeddings"] = grid.named()["table"].numpy().reshape(-1, grid.config.features)
     state[f"{name}.offsets"] = np.array(grid.config.offsets(), np.int32)
 
 
-def _put_layers(state: dict, name: str, net: MLP) -> None:
+def _store_layers(state: dict, name: str, net: MLP) -> None:
     state |= {f"{name}.{i}.weight": w.numpy() for i, w in enumerate(net.weights)}
 
 
 def write_torch_ngp(field: RadianceField, path: str | Path) -> None:
-    """Write ``field`` as a torch-ngp checkpoint, of the form of its ``ngp.pth``: no density grid, no optimiser."""
+    """Write ``field`` as a torch-ngp checkpoint in the form of its ``ngp.pth``, without density grid and optimiser."""
     stats = {"loss": [], "valid_loss": [], "results": [], "checkpoints": [], "best_result": None}
     threshold = 0.0 if field.occupancy is None else field.occupancy.coarse.threshold
     write_torch(
@@ -418,10 +438,7 @@ def write_torch_ngp(field: RadianceField, path: str | Path) -> None:
     )
 
 
-# ---- Nerg ----
-#
-# Checkpoints of the paper's authors (github.com/ch-andrei/nerg-neural-gaze): a gaze field, and the NeRF it looks
-# at.
+# ---- Checkpoints of the NeRG authors (github.com/ch-andrei/nerg-neural-gaze): a gaze field and its NeRF ----
 
 _VARIANTS = {"Emit": "emit", "Capture": "capture", "EmitCapture": "emit_capture"}
 _HEADS = {
@@ -431,66 +448,67 @@ _HEADS = {
 
 
 def is_nerg_checkpoint(model: dict) -> bool:
-    """Whether a state dictionary is one of a gaze field."""
+    """Return whether a state dictionary is that of a gaze field."""
     return "net1.lin0.weight" in model or "net1.0.weight" in model
 
 
 def read_nerg(
     path: str | Path, ns: ModuleType, ema: bool | None = None, options: ImportOptions = DEFAULT_IMPORT_OPTIONS
 ) -> tuple[RadianceField | None, GazeField, dict]:
-    """Radiance field (None where the file holds none), gaze field and origin (JSON) of a NeRG checkpoint.
+    """Read a NeRG checkpoint: radiance field (None if the file has none), gaze field, and provenance (JSON).
 
-    The gaze field's finest resolution is 256 x bound, whatever ``given`` says of the NeRF's. Raises `NergError`
-    for the variants that read other features than the gaze field's own.
+    The finest resolution of the gaze field is always 256 x bound; ``options`` apply to the NeRF. Raises `NergError` for
+    the variants that use features of other networks.
     """
-    whole, model = open_checkpoint(path)
-    averaged = isinstance(whole.get("ema"), dict) and bool(whole["ema"])
+    checkpoint, model = open_checkpoint(path)
+    averaged = isinstance(checkpoint.get("ema"), dict) and bool(checkpoint["ema"])
     if ema is False and averaged:
-        raise NergError(
-            f'"{path}" keeps its moving averages as its weights and nothing else: import it without --no-ema'
-        )
+        raise NergError(f'"{path}" stores only the moving averages: import it without --no-ema')
     if ema and not averaged:
-        raise NergError(f'"{path}" holds no moving averages: import its weights with --no-ema')
+        raise NergError(f'"{path}" contains no moving averages: import its weights with --no-ema')
     state = StateDict(Path(path), model)
     with translate_build_errors(path):
-        gaze = build_gaze_field(state, _variant(state, whole.get("variant")), ns)
+        gaze = build_gaze_field(state, _read_variant(state, checkpoint.get("variant")), ns)
         nerf = state.select("model_nerf.")
         field = build_radiance_field(nerf, ns, options) if nerf.names() else None
-    return field, gaze, describe_origin(path, whole, "NeRG", averaged)
+    return field, gaze, describe_origin(path, checkpoint, "NeRG", averaged)
 
 
-def _variant(state: StateDict, stored) -> str:
+def _read_variant(state: StateDict, stored) -> str:
     emit, capture = (any(n in state for n in names) for names in _HEADS.values())
     name = stored.value if isinstance(stored, EnumStandIn) else stored
     if name is None:
         name = {(True, True): "EmitCapture", (True, False): "Emit", (False, True): "Capture"}.get((emit, capture))
     if not isinstance(name, str) or name not in _VARIANTS or any(n.startswith("attend_head.") for n in state.names()):
-        said = sanitize(name, 40) if isinstance(name, str) else "unknown"
+        shown = sanitize(name, 40) if isinstance(name, str) else "unknown"
         raise NergError(
-            f'"{state.path}" is of the variant {said}; {", ".join(_VARIANTS)} are read, '
-            "the others need the NeRF's features along the ray or an attention block"
+            f'"{state.path}" has the variant {shown}; {", ".join(_VARIANTS)} are supported, '
+            "the others need features of the NeRF along the ray or an attention block"
         )
     if any(n.startswith("capture_head.") and n != "capture_head.weight" for n in state.names()):
         raise NergError(
-            f'"{state.path}" captures gaze by a mixture of von Mises-Fisher lobes; only a linear head is read'
+            f'"{state.path}" has a capture head with a mixture of von Mises-Fisher lobes; only a linear head is '
+            "supported"
         )
     if ("Emit" in name and not emit) or ("Capture" in name and not capture):
         raise NergError(
-            f'"{state.path}" is of the variant {name} and lacks one of its heads; '
-            "take another checkpoint of its training"
+            f'"{state.path}" has the variant {name} but lacks one of its heads; use another checkpoint of the training'
         )
     return _VARIANTS[name]
 
 
 def build_gaze_field(state: StateDict, variant: str, ns: ModuleType) -> GazeField:
-    """The gaze field that the authors' state dictionary describes."""
+    """Build the gaze field of a state dictionary of the authors."""
     bound = float(np.abs(shorten_floats(state["aabb_train"])).max())
     normalized = "net1.lin0.weight" in state
-    read = _normalized if normalized else _plain
-    position, direction = read(state, "net1", ns), read(state, "net2", ns)
+    build = _build_normalized_network if normalized else _build_plain_network
+    position, direction = build(state, "net1", ns), build(state, "net2", ns)
     width, geometry = direction.outputs, position.outputs
     if position.weights[0].shape[0] != width or direction.weights[0].shape[0] != width:
-        raise NergError(f'the networks of "{state.path}" are not all {width} wide; networks of one width are read')
+        raise NergError(
+            f'the networks of "{state.path}" do not all have the width {width}; networks of different widths are not '
+            "supported"
+        )
     sizes = infer_grid_config(state, "encoder", 256 * bound)
     config = GazeConfig(
         sizes,
@@ -502,18 +520,18 @@ def build_gaze_field(state: StateDict, variant: str, ns: ModuleType) -> GazeFiel
         trunk="layernorm" if normalized else "linear",
     )
     check_sizes(config.to_dict(), "networks")
-    heads = [_head(state, names, width, ns) for names in _HEADS.values()]
+    heads = [_build_head(state, names, width, ns) for names in _HEADS.values()]
     box, table = Box((-bound,) * 3, (bound,) * 3, bound), build_grid(state, "encoder", sizes, ns)
     return GazeField(config, box, table, position, direction, *heads)
 
 
-def _head(state: StateDict, names: tuple, width: int, ns: ModuleType) -> MLP:
-    found = [n for n in names if n in state]
-    # A head that the variant lacks is never evaluated.
-    return MLP([ns.TensorXf(state.get_weights(found[0]) if found else np.zeros((1, width), np.float32))])
+def _build_head(state: StateDict, names: tuple, width: int, ns: ModuleType) -> MLP:
+    present = [n for n in names if n in state]
+    # A head that the variant lacks is not evaluated.
+    return MLP([ns.TensorXf(state.get_weights(present[0]) if present else np.zeros((1, width), np.float32))])
 
 
-def _normalized(state: StateDict, name: str, ns: ModuleType) -> MLP:
+def _build_normalized_network(state: StateDict, name: str, ns: ModuleType) -> MLP:
     array = lambda key: ns.TensorXf(state.get_weights(f"{name}.{key}"))
     norms = [
         {"gain": array(f"layernorm{i}.weight"), "shift": array(f"layernorm{i}.bias"), "bias": array(f"lin{i}.bias")}
@@ -522,6 +540,6 @@ def _normalized(state: StateDict, name: str, ns: ModuleType) -> MLP:
     return MLP([array(f"lin{i}.weight") for i in range(2)], norms)
 
 
-def _plain(state: StateDict, name: str, ns: ModuleType) -> MLP:
-    # ReLU and Dropout lie between the two layers of these Sequentials.
+def _build_plain_network(state: StateDict, name: str, ns: ModuleType) -> MLP:
+    # ReLU and Dropout are between the two layers of these Sequentials.
     return MLP([ns.TensorXf(state.get_weights(f"{name}.{i}.weight")) for i in (0, 3)])

@@ -1,2 +1,1 @@
-"""Views of fields in other array frameworks; each module imports its framework, and nothing else of the package
-does."""
+"""Interfaces between fields and other array frameworks. Each module imports its framework."""

@@ -1,4 +1,4 @@
-"""Fields as ``torch.nn.Module``: forward and backward through Dr.Jit, weights as torch parameters.
+"""Fields as ``torch.nn.Module``: evaluation and gradients through Dr.Jit, with weights as torch parameters.
 
 ::
 
@@ -8,8 +8,8 @@
     ...
     save_radiance(module.field(), "trained.safetensors", {})
 
-First derivatives only, with respect to the weights and to positions and directions. Tensors are float32, on the CPU for
-a field of the LLVM backend and on the GPU for one of the CUDA backend.
+Only first derivatives are supported, with respect to the weights and to positions and directions. Tensors are float32,
+on the CPU for a field of the LLVM backend and on the GPU for a field of the CUDA backend.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from nerg_mi.fields.radiance import RadianceField
 
 
 class _FieldModule(torch.nn.Module):
-    """The parameters of a field, by the field's names with "__" for "."; ``fixed`` ones have no gradients."""
+    """The parameters of a field by name, with "__" for "."; parameters in ``fixed`` have no gradients."""
 
     def __init__(self, field, fixed: Sequence[str] = ()):
         super().__init__()
@@ -47,117 +47,140 @@ class _FieldModule(torch.nn.Module):
                 name.replace(".", "__"), torch.nn.Parameter(tensor, requires_grad=name not in fixed)
             )
 
-    def _values(self) -> dict:
+    def _get_parameters(self) -> dict:
         return {name: self.get_parameter(name.replace(".", "__")) for name in self._field.parameters()}
 
     def field(self):
-        """A field of its own with the weights as they are now."""
-        out = _with(self._field, {})
-        out.set_parameters({k: self._array(k, v.detach().cpu().numpy()) for k, v in self._values().items()})
+        """Return a copy of the field with the current weights."""
+        out = _copy_with_parameters(self._field, {})
+        out.set_parameters({k: self._to_drjit(k, v.detach().cpu().numpy()) for k, v in self._get_parameters().items()})
         return out
 
-    def _array(self, name: str, value: np.ndarray):
+    def _to_drjit(self, name: str, value: np.ndarray):
         kind = type(self._field.parameters()[name])
         return kind(value) if dr.is_tensor_v(kind) else kind(value.ravel())
 
-    def _rows(self, **tensors) -> list:
-        """Inputs (N, 3), checked."""
+    def _check_rows(self, **tensors) -> list:
+        """Check that the inputs are tensors (N, 3) of equal length."""
         count = {len(t) for t in tensors.values() if t.ndim == 2 and t.shape[1] == 3}
         for name, t in tensors.items():
             rows = t.ndim == 2 and t.shape[1] == 3 and len(count) == 1
             if not rows or t.dtype != torch.float32 or t.device.type != self.device_type:
                 raise ValueError(
-                    f"{name} must be a float32 tensor (N, 3) on {self.device_type}, of one N with the others, got "
+                    f"{name} must be a float32 tensor (N, 3) on {self.device_type} with the same N for all inputs, got "
                     f"{t.dtype} {tuple(t.shape)} on {t.device.type}"
                 )
         return [t.contiguous() for t in tensors.values()]
 
     def _evaluate(self, function, *inputs):
-        """``function(field, *arrays)``, a list of rows, at torch ``inputs``, (N, 3) as Array3f and others as lists of
-        their columns: a torch tensor (rows, N)."""
+        """Evaluate ``function(field, *arrays)``, which returns a list of rows, as a torch tensor (rows, N).
+
+        Torch ``inputs`` (N, 3) are passed as Array3f, others as lists of their columns.
+        """
         ns, field = self._ns, self._field
         tensors = {k for k, v in field.parameters().items() if dr.is_tensor_v(v)}
 
         @dr.wrap(source="torch", target="drjit")
         def evaluate(values, *points):
             arrays = {k: ns.TensorXf(v) if k in tensors else ns.Float(v.array) for k, v in values.items()}
-            here = _with(field, arrays)
-            columns = [_columns(ns, p) for p in points]
-            out = function(here, *columns)
+            attached_field = _copy_with_parameters(field, arrays)
+            columns = [_to_columns(ns, p) for p in points]
+            out = function(attached_field, *columns)
             return ns.TensorXf(
                 dr.ravel(ns.ArrayXf([ns.Float(c) for c in out]), order="C"), (len(out), dr.width(columns[0][0]))
             )
 
-        # dr.wrap knows tensors, and passes by their subclass for parameters.
-        return evaluate({k: v.view_as(v) for k, v in self._values().items()}, *inputs)
+        # dr.wrap accepts tensors but ignores torch.nn.Parameter; a view is a plain tensor.
+        return evaluate({k: v.view_as(v) for k, v in self._get_parameters().items()}, *inputs)
 
 
 class RadianceModule(_FieldModule):
-    """Density and colour of a radiance field. Its occupancy grid is not applied: training in torch may fill empty
-    cells."""
+    """Density and colour of a radiance field. The occupancy grid is not applied, so that training in torch can fill
+    empty cells.
+    """
 
     def __init__(self, field: RadianceField):
         super().__init__(field)
 
     def forward(self, p: torch.Tensor, d: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Density (N,) in 1/unit and colour (N, 3) in the field's colour space at ``p`` (N, 3) seen along unit ``d``
-        (N, 3). Of a deferred field this is the colour of matter that is opaque there; a ray's is that of its mean
-        features (`density_features`, `color`)."""
+        """Evaluate density and colour.
 
-        def both(field, p, d):
+        For a deferred field, the colour is that of opaque matter at the point. The colour of a ray is that of its mean
+        features (`density_features`, `color`).
+
+        Parameters
+        ----------
+        p
+            Positions (N, 3) in the units of the field.
+        d
+            Unit viewing directions (N, 3).
+
+        Returns
+        -------
+        sigma
+            Density (N,) in 1/unit.
+        color
+            Colour (N, 3) in the colour space of the field.
+        """
+
+        def evaluate(field, p, d):
             sigma, features = field.density_features(p)
             return [sigma, *field.color(features, d)]
 
-        out = self._evaluate(both, *self._rows(p=p, d=d))
+        out = self._evaluate(evaluate, *self._check_rows(p=p, d=d))
         return out[0], out[1:].T
 
     def density(self, p: torch.Tensor) -> torch.Tensor:
-        """Density (N,) in 1/unit at ``p`` (N, 3); 0 outside of the box."""
-        return self._evaluate(lambda field, p: [field.density(p)], *self._rows(p=p))[0]
+        """Evaluate the density (N,) in 1/unit at positions ``p`` (N, 3); 0 outside of the box."""
+        return self._evaluate(lambda field, p: [field.density(p)], *self._check_rows(p=p))[0]
 
     def density_features(self, p: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Density (N,) in 1/unit at ``p`` (N, 3), and the features (N, G) of which `color` makes colours."""
+        """Evaluate the density (N,) in 1/unit and the features (N, G), from which `color` computes colours, at
+        ``p`` (N, 3).
+        """
 
-        def both(field, p):
+        def evaluate(field, p):
             sigma, features = field.density_features(p)
             return [sigma, *features]
 
-        out = self._evaluate(both, *self._rows(p=p))
+        out = self._evaluate(evaluate, *self._check_rows(p=p))
         return out[0], out[1:].T
 
     def color(self, features: torch.Tensor, d: torch.Tensor) -> torch.Tensor:
-        """Colour (N, 3) in the field's colour space of ``features`` (N, G) seen along unit ``d`` (N, 3); of a deferred
-        field also that of rays with these mean features, Σ w g / Σ w, times whose opacity, Σ w, it is to be taken."""
+        """Evaluate the colour (N, 3) of ``features`` (N, G) seen along unit directions ``d`` (N, 3).
+
+        For a deferred field, pass the mean features of a ray, Σ w g / Σ w, and multiply the colour by its opacity Σ w.
+        """
         count = self._field.config.geometry
         if features.shape[1:] != (count,):
-            raise ValueError(f"features have shape {tuple(features.shape)}, and must have shape (N, {count})")
-        (d,) = self._rows(d=d)
+            raise ValueError(f"features must have shape (N, {count}), got {tuple(features.shape)}")
+        (d,) = self._check_rows(d=d)
         return self._evaluate(lambda field, f, d: list(field.color(list(f), d)), features.contiguous(), d).T
 
     def background(self, o: torch.Tensor, d: torch.Tensor) -> torch.Tensor:
-        """Colour (N, 3) behind the field of rays from ``o`` (N, 3) along unit ``d`` (N, 3)."""
+        """Evaluate the background colour (N, 3) of rays from ``o`` (N, 3) along unit directions ``d`` (N, 3)."""
         if self._field.background is None:
             raise ValueError("this field was trained without a background network")
-        return self._evaluate(lambda field, o, d: list(field.background(o, d)), *self._rows(o=o, d=d)).T
+        return self._evaluate(lambda field, o, d: list(field.background(o, d)), *self._check_rows(o=o, d=d)).T
 
 
 class GazeModule(_FieldModule):
-    """The gaze density of a gaze field, be it normalised over the observer's sphere or not.
+    """The gaze density of a gaze field, normalised over the observer's sphere or not.
 
-    A normalised field's integral is found once an observer, over directions of equal area::
+    The integral of a normalised field is computed once per observer, over directions of equal solid angle::
 
-        around = ObserverTracer(field, Similarity(), place, eye, settings).trace()  # directions, their depths, what escapes
+        around = Outlook(field, Similarity(), place, eye, settings).trace()  # directions, their depths, misses
 
-        Z = module.integral(p_od, p_o, r_o, escaped)  # everywhere around the observer
+        Z = module.integral(p_od, p_o, r_o, misses)  # everywhere around the observer
         gaze = module(p_od, p_o, r_o, Z)  # anywhere
 
-    Raises `NergError` for an ensemble, which is a `GazeEnsembleModule`.
+    Raises `NergError` for an ensemble; use a `GazeEnsembleModule` for it.
     """
 
     def __init__(self, field: AnyGazeField):
         if len(field.members) > 1:
             raise NergError(
-                f"an ensemble of {len(field.members)} gaze fields is no GazeModule; make a GazeEnsembleModule of it"
+                f"GazeModule does not support an ensemble of {len(field.members)} gaze fields; use GazeEnsembleModule"
             )
         super().__init__(field, field.fixed)
 
@@ -169,67 +192,83 @@ class GazeModule(_FieldModule):
         integral: torch.Tensor | float | None = None,
         misses: torch.Tensor | None = None,
     ) -> torch.Tensor:
-        """Gaze (N,) in 1/sr of observers ``p_o`` (N, 3) who see ``p_od`` (N, 3) along unit ``r_o`` (N, 3).
+        """Evaluate the gaze density (N,) in 1/sr.
 
-        ``integral``: of a normalised field over the sphere around each observer, (N,) or one number for all (see
-        ``integral``); ``escaped`` (N,) bool: where no surface is met (default: nowhere). Raises ``ValueError`` for a
-        normalised field without its integral, and for tensors that do not fit.
+        Parameters
+        ----------
+        p_od
+            Positions (N, 3) that are looked at.
+        p_o
+            Positions (N, 3) of the observers.
+        r_o
+            Unit directions (N, 3) from ``p_o`` to ``p_od``.
+        integral
+            Integral of a normalised field over the sphere of each observer, (N,) or one number for all; see `integral`.
+        misses
+            Boolean mask (N,) of the directions that hit no surface. Default: none.
+
+        Raises
+        ------
+        ValueError
+            For a normalised field without its integral, and for tensors of the wrong shape.
         """
         if self._field.config.normalized and integral is None:
             raise ValueError(
-                'this gaze field is normalised over the observer\'s sphere: give its "integral" there, which the '
-                "method integral finds"
+                'this gaze field is normalised over the observer\'s sphere: pass "integral", which the method '
+                "integral computes"
             )
-        extra = self._extra(len(p_od), 1.0 if integral is None else integral, misses)
+        extra = self._make_extra_rows(len(p_od), 1.0 if integral is None else integral, misses)
         evaluate = lambda field, p, o, r, e: [field.evaluate(p, o, r, integral=e.x, escaped=e.y > 0.5)[0]]
-        return self._evaluate(evaluate, *self._rows(p_od=p_od, p_o=p_o, r_o=r_o), extra)[0]
+        return self._evaluate(evaluate, *self._check_rows(p_od=p_od, p_o=p_o, r_o=r_o), extra)[0]
 
     def evaluate_unnormalized(
         self, p_od: torch.Tensor, p_o: torch.Tensor, r_o: torch.Tensor, misses: torch.Tensor | None = None
     ) -> torch.Tensor:
-        """Emit times capture (N,) before any division: what the integral is one of. Arguments as for ``forward``."""
+        """Evaluate emit times capture (N,), before the division by the integral. Arguments as for `forward`."""
 
         def product(field, p, o, r, e):
             emit, capture = field.unnormalized(p, o, r, escaped=e.y > 0.5)
             return [emit * capture + dr.zeros(type(e.x), dr.width(e))]
 
-        return self._evaluate(product, *self._rows(p_od=p_od, p_o=p_o, r_o=r_o), self._extra(len(p_od), 1.0, misses))[
-            0
-        ]
+        return self._evaluate(
+            product, *self._check_rows(p_od=p_od, p_o=p_o, r_o=r_o), self._make_extra_rows(len(p_od), 1.0, misses)
+        )[0]
 
     def integral(
         self, p_od: torch.Tensor, p_o: torch.Tensor, r_o: torch.Tensor, misses: torch.Tensor | None = None
     ) -> torch.Tensor:
-        """The integral over the sphere (one number) of one observer, who is ``p_o`` in every row, from N directions
-        ``r_o`` of equal area that lead to ``p_od``. Of the integrator's many directions it is the integrator's
-        (``transport.observer_gaze``)."""
+        """Compute the integral over the sphere of one observer, whose position is ``p_o`` in each row.
+
+        The N directions ``r_o`` must have equal solid angles. With the directions of the integrator, the result equals
+        the integrator's (``transport.observer_gaze``).
+        """
         return 4 * torch.pi * self.evaluate_unnormalized(p_od, p_o, r_o, misses).mean()
 
-    def _extra(self, count: int, integral, escaped) -> torch.Tensor:
-        """Integrals and what escapes as rows (N, 3)."""
-        number = torch.as_tensor(integral, dtype=torch.float32, device=self.device_type)
-        gone = (
+    def _make_extra_rows(self, count: int, integral, misses) -> torch.Tensor:
+        """Pack integrals and misses into rows (N, 3)."""
+        integrals = torch.as_tensor(integral, dtype=torch.float32, device=self.device_type)
+        miss_values = (
             torch.zeros(count, dtype=torch.float32, device=self.device_type)
-            if escaped is None
-            else escaped.to(torch.float32)
+            if misses is None
+            else misses.to(torch.float32)
         )
-        for name, t in (("integral", number), ("escaped", gone)):
+        for name, t in (("integral", integrals), ("escaped", miss_values)):
             if t.numel() != 1 and tuple(t.shape) != (count,):
                 raise ValueError(
-                    f"{name} must be one number or a tensor of {count}, one for each row, got {tuple(t.shape)}"
+                    f"{name} must be one number or a tensor of length {count}, one value per row, got {tuple(t.shape)}"
                 )
-        columns = [number.reshape(-1).expand(count), gone.reshape(-1).expand(count)]
+        columns = [integrals.reshape(-1).expand(count), miss_values.reshape(-1).expand(count)]
         return torch.stack([*columns, torch.zeros_like(columns[0])], 1).contiguous()
 
 
 class GazeEnsembleModule(torch.nn.Module):
-    """The mean of the gaze densities of an ensemble's members, of which ``members`` are modules (`GazeModule`).
+    """The mean gaze density of the members of an ensemble. ``members`` are modules (`GazeModule`).
 
-    Each member of a normalised ensemble has an integral of its own::
+    Each member of a normalised ensemble has its own integral::
 
-        Z = module.integral(p_od, p_o, r_o, escaped)  # everywhere around the observer: (members,)
+        Z = module.integral(p_od, p_o, r_o, misses)  # everywhere around the observer: (members,)
         gaze = module(p_od, p_o, r_o, Z)  # anywhere
-        spread = module.each(p_od, p_o, r_o, Z).std(0)
+        spread = module.forward_members(p_od, p_o, r_o, Z).std(0)
     """
 
     def __init__(self, field: GazeEnsemble):
@@ -238,12 +277,12 @@ class GazeEnsembleModule(torch.nn.Module):
         self.members = torch.nn.ModuleList(GazeModule(member) for member in field.members)
 
     def field(self) -> GazeEnsemble:
-        """An ensemble of its own with the weights as they are now."""
-        ensemble = GazeEnsemble([member.field() for member in self._densities()], self._field.support)
+        """Return a copy of the ensemble with the current weights."""
+        ensemble = GazeEnsemble([member.field() for member in self._get_members()], self._field.support)
         ensemble.basis = self._field.basis
         return ensemble
 
-    def _densities(self) -> list[GazeModule]:
+    def _get_members(self) -> list[GazeModule]:
         return cast("list[GazeModule]", list(self.members))
 
     def forward_members(
@@ -254,12 +293,17 @@ class GazeEnsembleModule(torch.nn.Module):
         integral: torch.Tensor | None = None,
         misses: torch.Tensor | None = None,
     ) -> torch.Tensor:
-        """Gaze (members, N) of every member. ``integral``: of a normalised ensemble, (members,) or (members, N); the
-        other arguments, and what is raised, as for `GazeModule`."""
+        """Evaluate the gaze density (members, N) of each member.
+
+        ``integral`` of a normalised ensemble: (members,) or (members, N). The other arguments and the exceptions are
+        those of `GazeModule`.
+        """
         if integral is not None and len(integral) != len(self.members):
-            raise ValueError(f"give the integral of each of the {len(self.members)} members, got {len(integral)}")
+            raise ValueError(
+                f"integral must have one entry for each of the {len(self.members)} members, got {len(integral)}"
+            )
         integrals = [None] * len(self.members) if integral is None else integral
-        return torch.stack([member(p_od, p_o, r_o, z, misses) for member, z in zip(self._densities(), integrals)])
+        return torch.stack([member(p_od, p_o, r_o, z, misses) for member, z in zip(self._get_members(), integrals)])
 
     def forward(
         self,
@@ -269,27 +313,27 @@ class GazeEnsembleModule(torch.nn.Module):
         integral: torch.Tensor | None = None,
         misses: torch.Tensor | None = None,
     ) -> torch.Tensor:
-        """Gaze (N,) in 1/sr, the mean of ``each``."""
+        """Evaluate the gaze density (N,) in 1/sr, the mean over the members."""
         return self.forward_members(p_od, p_o, r_o, integral, misses).mean(0)
 
     def integral(
         self, p_od: torch.Tensor, p_o: torch.Tensor, r_o: torch.Tensor, misses: torch.Tensor | None = None
     ) -> torch.Tensor:
-        """The integrals of the members (members,) over the sphere of one observer; see ``GazeModule.integral``."""
-        return torch.stack([member.integral(p_od, p_o, r_o, misses) for member in self._densities()])
+        """Compute the integral of each member (members,) over the sphere of one observer; see `GazeModule.integral`."""
+        return torch.stack([member.integral(p_od, p_o, r_o, misses) for member in self._get_members()])
 
 
-def _columns(ns, p):
+def _to_columns(ns, p):
     rows, count = p.shape
     index = count * dr.arange(ns.UInt32, rows)
-    # No two points share a number, so that derivatives need no atomic additions.
+    # Each value is read by one point only, so that gradients need no atomic additions.
     columns = [dr.gather(ns.Float, p.array, index + k, mode=dr.ReduceMode.Permute) for k in range(count)]
     return ns.Array3f(*columns) if count == 3 else columns
 
 
-def _with(field, values: dict):
-    """A copy of ``field`` whose parameters of these names are ``values``, attached to them."""
-    out = _copied(field)
+def _copy_with_parameters(field, values: dict):
+    """Return a copy of ``field`` whose parameters are replaced by ``values``, including their gradients."""
+    out = _copy_structure(field)
     for owner in {name.partition(".")[0] for name in field.parameters()}:
         if owner.endswith("grid"):
             getattr(out, owner).mode = dr.ReduceMode.Expand
@@ -297,16 +341,16 @@ def _with(field, values: dict):
     return out
 
 
-def _copied(part: Any) -> Any:
-    """A copy of a field's part down to its arrays, which both share, and what ``pack`` makes of them."""
+def _copy_structure(part: Any) -> Any:
+    """Return a copy of a part of a field. The copy shares the arrays and the data that ``pack`` derives from them."""
     if isinstance(part, list):
-        return [_copied(p) for p in part]
+        return [_copy_structure(p) for p in part]
     if isinstance(part, dict):
-        return {k: _copied(p) for k, p in part.items()}
+        return {k: _copy_structure(p) for k, p in part.items()}
     if not hasattr(part, "DRJIT_STRUCT"):
         return part
     out = copy.copy(part)
     for name in part.DRJIT_STRUCT:
         if not name.startswith("_"):
-            setattr(out, name, _copied(getattr(part, name)))
+            setattr(out, name, _copy_structure(getattr(part, name)))
     return out

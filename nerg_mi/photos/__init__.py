@@ -1,2 +1,1 @@
-"""What was photographed: posed image sets, cameras, structure from motion (package pycolmap, extra ``poses``),
-salience."""
+"""Posed image sets, cameras, structure from motion (package pycolmap, extra ``poses``) and saliency maps."""

@@ -1,4 +1,4 @@
-"""Cameras: rays of posed ones, OpenCV's lens models and their inverses, intrinsics, and pictures at another size.
+"""Camera models: OpenCV lenses and their inverses, intrinsics, rays of posed cameras, and resizing of images.
 
 Frames: image x right, y down, pixel centres at half-integers.
 """
@@ -11,19 +11,29 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 
-# ---- Intrinsics ----
-#
-# How a photo's lens maps directions to pixels: OpenCV's pinhole and fisheye models.
+# ---- Intrinsics: OpenCV's pinhole and fisheye models ----
 
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """A lens, for an image of ``width`` x ``height`` pixels.
+    """Intrinsics of a camera with an image of ``width`` x ``height`` pixels.
 
-    ``fx, fy, cx, cy``: pixels, the centre of the first pixel being (0.5, 0.5). The coefficients act on normalised
-    coordinates and do not depend on the size of the image. Pinhole lenses: ``k1 .. k3`` radial, ``k4 .. k6`` the
-    denominator of OpenCV's rational model, ``p1, p2`` tangential. ``fisheye``: OpenCV's equidistant model, whose
-    ``k1 .. k4`` are the coefficients of θ³, θ⁵, θ⁷ and θ⁹; the others are not used.
+    The coefficients act on normalised coordinates and do not depend on the image size.
+
+    Attributes
+    ----------
+    width, height
+        Image size in pixels.
+    fx, fy, cx, cy
+        Focal lengths and principal point in pixels; the centre of the first pixel is (0.5, 0.5).
+    k1, k2, k3
+        Radial coefficients. For a fisheye lens, k1 to k4 are the coefficients of θ³, θ⁵, θ⁷ and θ⁹.
+    k4, k5, k6
+        Denominator of OpenCV's rational model.
+    p1, p2
+        Tangential coefficients.
+    fisheye
+        Whether the lens follows OpenCV's equidistant fisheye model, which uses only k1 to k4.
     """
 
     width: int
@@ -44,16 +54,16 @@ class Intrinsics:
 
     @property
     def distortion(self) -> tuple[float, ...]:
-        """k1, k2, p1, p2, k3, k4, k5, k6: the order of OpenCV."""
+        """The coefficients k1, k2, p1, p2, k3, k4, k5, k6, in the order of OpenCV."""
         return self.k1, self.k2, self.p1, self.p2, self.k3, self.k4, self.k5, self.k6
 
     @property
     def is_distorted(self) -> bool:
-        """Whether the picture is another than a pinhole's."""
+        """Whether the image differs from that of a pinhole camera."""
         return self.fisheye or any(self.distortion)
 
     def resized(self, width: int, height: int) -> Intrinsics:
-        """The same lens on an image of another size."""
+        """Return the intrinsics of the same lens for another image size."""
         sx, sy = width / self.width, height / self.height
         return replace(
             self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
@@ -62,21 +72,21 @@ class Intrinsics:
 
 # ---- OpenCV's lens models and their inverses, in float64 ----
 #
-# Camera frame here as in OpenCV: x right, y down, z forward. Image coordinates are normalised: pixels less the
-# principal point, over the focal length. Pinhole model: OpenCV's ``projectPoints`` with up to eight coefficients
-# (radial over radial, tangential); fisheye: ``cv::fisheye``, image radius θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸)
-# at the angle θ from the axis.
+# The camera frame is that of OpenCV: x right, y down, z forward. Image coordinates are normalised: (pixel - principal
+# point) / focal length. Pinhole model: OpenCV's ``projectPoints`` with up to eight coefficients (rational radial and
+# tangential). Fisheye model: ``cv::fisheye``, with image radius θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸) at the angle θ
+# from the axis.
 
-_NEWTON = 20
-# Samples of the angle that decide how far a fisheye's polynomial rises.
+_NEWTON_STEPS = 20
+# Angles at which the monotonicity of the fisheye polynomial is checked.
 _ANGLES = np.linspace(0, np.pi, 4097)
 
 
 def distort(xy: np.ndarray, lens: Intrinsics) -> np.ndarray:
-    """Image coordinates (..., 2) of the directions (x, y, 1) of a pinhole lens."""
+    """Return the distorted image coordinates (..., 2) of undistorted ones, for a pinhole lens."""
     x, y = xy[..., 0], xy[..., 1]
     r2 = x * x + y * y
-    radial = _ratio(r2, lens)[0]
+    radial = _radial_factor(r2, lens)[0]
     return np.stack(
         [
             x * radial + 2 * lens.p1 * x * y + lens.p2 * (r2 + 2 * x * x),
@@ -87,34 +97,35 @@ def distort(xy: np.ndarray, lens: Intrinsics) -> np.ndarray:
 
 
 def undistort(xy: np.ndarray, lens: Intrinsics) -> np.ndarray:
-    """The inverse of `distort`, by Newton's iteration.
+    """Invert `distort` by Newton's method.
 
-    Raises `NergError` where the model folds over inside the image, so that no inverse exists.
+    Raises `NergError` if the lens model is not injective within the image.
     """
-    u, good = undistort_with_mask(xy, lens)
-    if not good.all():
+    u, is_valid = undistort_with_mask(xy, lens)
+    if not is_valid.all():
         names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
         listed = ", ".join(f"{k}={v:g}" for k, v in zip(names, lens.distortion) if v)
         raise NergError(
-            f"the distortion {listed} cannot be inverted over the whole image; undistort the images beforehand, "
-            "or crop them"
+            f"the distortion {listed} cannot be inverted over the whole image; undistort or crop the images first"
         )
     return u
 
 
 def undistort_with_mask(xy: np.ndarray, lens: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
-    """As `undistort`, (..., 2), and a mask (...) of the coordinates that have an inverse; elsewhere it is none."""
-    goal = np.asarray(xy, np.float64)
+    """Invert `distort`. Returns the coordinates (..., 2) and a mask (...) of the valid ones, for which an inverse
+    exists.
+    """
+    target = np.asarray(xy, np.float64)
     if not any(lens.distortion):
-        return goal.copy(), np.asarray(np.isfinite(goal).all(axis=-1))
-    u = goal.copy()
-    # Beside the fold a step may overflow; what comes of it is found out below.
+        return target.copy(), np.asarray(np.isfinite(target).all(axis=-1))
+    u = target.copy()
+    # Near the fold of the lens model, a step may overflow; such results are masked below.
     with np.errstate(over="ignore", invalid="ignore"):
-        for _ in range(_NEWTON):
-            residual = distort(u, lens) - goal
+        for _ in range(_NEWTON_STEPS):
+            residual = distort(u, lens) - target
             if np.abs(residual).max(initial=0.0) < 1e-13:
                 break
-            a, b, d = _jacobian(u, lens)
+            a, b, d = _distortion_jacobian(u, lens)
             det = a * d - b * b
             det = np.where(np.abs(det) > 1e-6, det, 1e-6)
             u = (
@@ -124,14 +135,14 @@ def undistort_with_mask(xy: np.ndarray, lens: Intrinsics) -> tuple[np.ndarray, n
                 )
                 / det[..., None]
             )
-        a, b, d = _jacobian(u, lens)
-        # Past the fold the picture runs backwards: another point with the same image, that the lens does not show.
-        good = np.all(np.abs(distort(u, lens) - goal) < 1e-6, axis=-1) & (a * d - b * b > 0) & (a + d > 0)
-    return u, good
+        a, b, d = _distortion_jacobian(u, lens)
+        # Beyond the fold, the model maps other directions to the same image point, which the lens does not show.
+        is_valid = np.all(np.abs(distort(u, lens) - target) < 1e-6, axis=-1) & (a * d - b * b > 0) & (a + d > 0)
+    return u, is_valid
 
 
-def _ratio(r2, lens: Intrinsics):
-    """The radial factor at the squared radius, and its derivative."""
+def _radial_factor(r2, lens: Intrinsics):
+    """Return the radial factor at the squared radius, and its derivative."""
     over = 1 + r2 * (lens.k1 + r2 * (lens.k2 + r2 * lens.k3))
     slope = lens.k1 + r2 * (2 * lens.k2 + r2 * 3 * lens.k3)
     if not (lens.k4 or lens.k5 or lens.k6):
@@ -142,8 +153,11 @@ def _ratio(r2, lens: Intrinsics):
 
 
 def find_pinhole_limit(lens: Intrinsics) -> float:
-    """Squared tangent of the angle at which a pinhole lens folds over: what lies beyond is not in the photo, though the
-    model gives it a pixel. The radial part alone; infinite where it never does."""
+    """Return the squared tangent of the angle at which the radial part of a pinhole model folds over; infinite without
+    a fold.
+
+    The model also assigns pixels to directions beyond this angle, but the photo does not show them.
+    """
     # With t = r², the image radius is r N(t)/D(t); its slope has the sign of N D + 2 t (N' D - N D').
     over = np.polynomial.Polynomial([1, lens.k1, lens.k2, lens.k3])
     under = np.polynomial.Polynomial([1, lens.k4, lens.k5, lens.k6])
@@ -153,10 +167,10 @@ def find_pinhole_limit(lens: Intrinsics) -> float:
     return float(min(real[real > 0], default=np.inf))
 
 
-def _jacobian(xy, lens: Intrinsics):
-    """∂x'/∂x, ∂x'/∂y = ∂y'/∂x and ∂y'/∂y of `distort`."""
+def _distortion_jacobian(xy, lens: Intrinsics):
+    """Return ∂x'/∂x, ∂x'/∂y = ∂y'/∂x and ∂y'/∂y of `distort`."""
     x, y = xy[..., 0], xy[..., 1]
-    radial, slope = _ratio(x * x + y * y, lens)
+    radial, slope = _radial_factor(x * x + y * y, lens)
     return (
         radial + 2 * x * x * slope + 2 * lens.p1 * y + 6 * lens.p2 * x,
         2 * x * y * slope + 2 * lens.p1 * x + 2 * lens.p2 * y,
@@ -165,7 +179,7 @@ def _jacobian(xy, lens: Intrinsics):
 
 
 def _fisheye_radius(theta, lens: Intrinsics):
-    """Image radius at the angle θ, and its derivative."""
+    """Return the image radius at the angle θ, and its derivative."""
     t = theta * theta
     return (
         theta * (1 + t * (lens.k1 + t * (lens.k2 + t * (lens.k3 + t * lens.k4)))),
@@ -174,32 +188,32 @@ def _fisheye_radius(theta, lens: Intrinsics):
 
 
 def find_fisheye_limit(lens: Intrinsics) -> tuple[float, float]:
-    """The largest angle that a fisheye lens shows, at most π, and its image radius: no pixel beyond has a direction."""
+    """Return the largest angle that a fisheye lens shows, at most π, and its image radius."""
     radius, slope = _fisheye_radius(_ANGLES, lens)
-    falls = np.flatnonzero(slope <= 0)
-    last = falls[0] - 1 if len(falls) else len(_ANGLES) - 1
+    decreasing = np.flatnonzero(slope <= 0)
+    last = decreasing[0] - 1 if len(decreasing) else len(_ANGLES) - 1
     return float(_ANGLES[last]), float(radius[last])
 
 
 def image_to_directions(xy: np.ndarray, lens: Intrinsics) -> np.ndarray:
-    """Unit directions (..., 3) that image coordinates ``xy`` (..., 2) show; a fisheye's last one beyond its limit.
+    """Return the unit directions (..., 3) of image coordinates ``xy`` (..., 2).
 
-    Raises `NergError` as `undistort` does.
+    Beyond the limit of a fisheye lens, the direction at the limit is returned. Raises the error of `undistort`.
     """
     if not lens.fisheye:
         u = undistort(xy, lens)
         d = np.concatenate([u, np.ones_like(u[..., :1])], axis=-1)
         return d / np.linalg.norm(d, axis=-1, keepdims=True)
-    most, end = find_fisheye_limit(lens)
+    max_angle, max_radius = find_fisheye_limit(lens)
     r = np.linalg.norm(xy, axis=-1)
-    goal = np.minimum(r, end)
-    # The polynomial rises from 0 to the limit: a table finds the place, Newton's iteration the digits.
-    angles = _ANGLES[_ANGLES <= most]
-    theta = np.interp(goal, _fisheye_radius(angles, lens)[0], angles)
-    for _ in range(_NEWTON):
+    target = np.minimum(r, max_radius)
+    # The polynomial increases from 0 to the limit. A table gives the initial value of Newton's method.
+    angles = _ANGLES[_ANGLES <= max_angle]
+    theta = np.interp(target, _fisheye_radius(angles, lens)[0], angles)
+    for _ in range(_NEWTON_STEPS):
         radius, slope = _fisheye_radius(theta, lens)
-        step = (radius - goal) / np.maximum(slope, 1e-9)
-        theta = np.clip(theta - step, 0, most)
+        step = (radius - target) / np.maximum(slope, 1e-9)
+        theta = np.clip(theta - step, 0, max_angle)
         if np.abs(step).max() < 1e-14:
             break
     across = np.where(r > 0, np.sin(theta) / np.where(r > 0, r, 1), 1.0)
@@ -207,14 +221,15 @@ def image_to_directions(xy: np.ndarray, lens: Intrinsics) -> np.ndarray:
 
 
 def directions_to_image(d: np.ndarray, lens: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
-    """Image coordinates (..., 2) of directions ``d`` (..., 3) of any length, and a mask of those that the lens can
-    show."""
+    """Return the image coordinates (..., 2) of directions ``d`` (..., 3) of any length, and a mask of the visible
+    ones.
+    """
     d = np.asarray(d, np.float64)
     if not lens.fisheye:
-        front = d[..., 2] > 1e-9
-        xy = d[..., :2] / np.where(front, d[..., 2], 1.0)[..., None]
-        front &= np.sum(xy * xy, axis=-1) < find_pinhole_limit(lens)
-        return distort(np.where(front[..., None], xy, 0.0), lens), front
+        is_visible = d[..., 2] > 1e-9
+        xy = d[..., :2] / np.where(is_visible, d[..., 2], 1.0)[..., None]
+        is_visible &= np.sum(xy * xy, axis=-1) < find_pinhole_limit(lens)
+        return distort(np.where(is_visible[..., None], xy, 0.0), lens), is_visible
     r = np.linalg.norm(d[..., :2], axis=-1)
     theta = np.arctan2(r, d[..., 2])
     radius, _ = _fisheye_radius(theta, lens)
@@ -224,20 +239,19 @@ def directions_to_image(d: np.ndarray, lens: Intrinsics) -> tuple[np.ndarray, np
 
 # ---- Rays of posed cameras ----
 #
-# Frames: image x right, y down, pixel centres at half-integers; camera OpenGL (x right,
-# y up, looking along -z); world the data set's own.
+# Camera frame: OpenGL (x right, y up, viewing direction -z). World frame: that of the data set.
 
 
-# OpenGL cameras look along -z with x to the right, Mitsuba's along +z with x to the left.
+# OpenGL cameras look along -z with x to the right, Mitsuba cameras along +z with x to the left.
 OPENGL_FROM_MITSUBA = np.diag([-1.0, 1.0, -1.0, 1.0])
-# OpenCV's cameras look along +z with y down.
+# OpenCV cameras look along +z with y down.
 _OPENGL_FROM_OPENCV = np.array([1.0, -1.0, -1.0])
-_WIDEST = float(np.tan(np.radians(85)))
+_MAX_TANGENT = float(np.tan(np.radians(85)))
 
 
 @dataclass(frozen=True)
 class PosedCamera:
-    """A posed camera. ``to_world``: (4, 4) rigid OpenGL camera-to-world."""
+    """A camera with a pose. ``to_world``: rigid OpenGL camera-to-world transform (4, 4)."""
 
     intrinsics: Intrinsics
     to_world: np.ndarray
@@ -248,26 +262,26 @@ class PosedCamera:
 
     @property
     def axis(self) -> np.ndarray:
-        """Unit viewing direction."""
+        """Unit viewing direction (3,)."""
         return -self.to_world[:3, 2]
 
 
 def pixel_grid(intrinsics: Intrinsics) -> np.ndarray:
-    """Normalised image coordinates (height, width, 2) of the pixels' centres."""
+    """Return the normalised image coordinates (height, width, 2) of the pixel centres."""
     i = intrinsics
     x, y = np.meshgrid((np.arange(i.width) + 0.5 - i.cx) / i.fx, (np.arange(i.height) + 0.5 - i.cy) / i.fy)
     return np.stack([x, y], axis=-1)
 
 
 def pixel_directions(intrinsics: Intrinsics) -> np.ndarray:
-    """Unit directions (height, width, 3), float64, of the pixels' centres in the OpenGL camera frame."""
+    """Return the unit directions (height, width, 3), float64, of the pixel centres in the OpenGL camera frame."""
     return image_to_directions(pixel_grid(intrinsics), intrinsics) * _OPENGL_FROM_OPENCV
 
 
 def find_view_tangents(intrinsics: Intrinsics) -> tuple[float, float, float, float]:
-    """How far a picture reaches left, right, up and down: tangents of the angles from its axis, lens included.
+    """Return the field of view as tangents of the angles to the left, right, top and bottom, including distortion.
 
-    At most tan 85°: what a fisheye sees beyond that no frustum holds.
+    The tangents are at most tan 85°, because a frustum cannot contain larger angles of a fisheye lens.
     """
     i = intrinsics
     x = np.linspace(0, i.width, 33)
@@ -275,26 +289,26 @@ def find_view_tangents(intrinsics: Intrinsics) -> tuple[float, float, float, flo
     border = [(u, v) for u in x for v in (0, i.height)] + [(u, v) for v in y for u in (0, i.width)]
     xy = (np.array(border) - [i.cx, i.cy]) / [i.fx, i.fy]
     d = image_to_directions(xy, i)
-    ahead = np.maximum(d[:, 2], 1e-9)
-    tangent = np.clip(d[:, :2] / ahead[:, None], -_WIDEST, _WIDEST)
+    depth = np.maximum(d[:, 2], 1e-9)
+    tangent = np.clip(d[:, :2] / depth[:, None], -_MAX_TANGENT, _MAX_TANGENT)
     left, up = -tangent.min(axis=0)
     right, down = tangent.max(axis=0)
     return float(left), float(right), float(up), float(down)
 
 
 def project(points: np.ndarray, camera: PosedCamera) -> tuple[np.ndarray, np.ndarray]:
-    """Pixel coordinates (N, 2) of world ``points`` (N, 3), and a mask (N,) of those that the lens can show."""
+    """Project world ``points`` (N, 3) to pixel coordinates (N, 2). Also returns a mask (N,) of the visible points."""
     i = camera.intrinsics
     local = (np.asarray(points) - camera.center) @ camera.to_world[:3, :3]
-    xy, shown = directions_to_image(local * _OPENGL_FROM_OPENCV, i)
-    return xy * [i.fx, i.fy] + [i.cx, i.cy], shown
+    xy, is_visible = directions_to_image(local * _OPENGL_FROM_OPENCV, i)
+    return xy * [i.fx, i.fy] + [i.cx, i.cy], is_visible
 
 
 def make_sensor_dict(camera: PosedCamera) -> dict:
-    """A Mitsuba ``perspective`` sensor (dict for ``mi.load_dict``) that takes this camera's picture.
+    """Make a Mitsuba ``perspective`` sensor (dict for ``mi.load_dict``) for this camera.
 
-    Box filter, float32 RGB, one ray through each pixel's footprint. Raises `NergError` for what
-    that sensor cannot express: distortion, and pixels that are not square to 0.1 %.
+    The sensor has a box filter and a float32 RGB film. Raises `NergError` for what it cannot represent: distortion, and
+    pixels that are not square to 0.1 %.
     """
     import mitsuba as mi
 
@@ -314,7 +328,7 @@ def make_sensor_dict(camera: PosedCamera) -> dict:
         "to_world": mi.ScalarTransform4f((camera.to_world @ OPENGL_FROM_MITSUBA).tolist()),
         "fov": float(np.degrees(2 * np.arctan(i.width / (2 * i.fx)))),
         "fov_axis": "x",
-        # Mitsuba counts the offset from the principal point to the film's centre.
+        # Mitsuba's offset points from the principal point to the centre of the film.
         "principal_point_offset_x": float(0.5 - i.cx / i.width),
         "principal_point_offset_y": float(0.5 - i.cy / i.height),
         "near_clip": 1e-3,
@@ -331,11 +345,13 @@ def make_sensor_dict(camera: PosedCamera) -> dict:
     }
 
 
-# ---- Pictures, masks and depth at another size ----
+# ---- Resizing of images, masks and depth ----
 
 
 def resize_by_area(image: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Area average of ``image`` (h, w, c), float32 in 0..1; of four channels the first three count by the fourth."""
+    """Resize ``image`` (h, w, c), float32 in 0..1, by area averaging. With four channels, colours are weighted by
+    alpha.
+    """
     h, w, c = image.shape
     if c == 4:
         image = np.concatenate([image[..., :3] * image[..., 3:], image[..., 3:]], axis=2)
@@ -350,20 +366,20 @@ def resize_by_area(image: np.ndarray, width: int, height: int) -> np.ndarray:
 
 
 def make_area_weights(old: int, new: int):
-    """Sparse matrix (new, old): the share that each old pixel has in each new one."""
+    """Return the sparse matrix (new, old) of the overlap of old pixels with new pixels; each row sums to 1."""
     from scipy.sparse import csr_array
 
     edges = np.arange(new + 1) * (old / new)
-    reach = int(np.ceil(old / new)) + 1
-    pixel = np.floor(edges[:-1, None] + 1e-9).astype(int) + np.arange(reach)
-    share = np.minimum(edges[1:, None], pixel + 1) - np.maximum(edges[:-1, None], pixel)
-    share = np.clip(share, 0, None) * (pixel < old) * (new / old)
-    rows = np.repeat(np.arange(new), reach)
-    return csr_array((share.ravel().astype(np.float32), (rows, np.minimum(pixel, old - 1).ravel())), shape=(new, old))
+    window = int(np.ceil(old / new)) + 1
+    pixel = np.floor(edges[:-1, None] + 1e-9).astype(int) + np.arange(window)
+    weight = np.minimum(edges[1:, None], pixel + 1) - np.maximum(edges[:-1, None], pixel)
+    weight = np.clip(weight, 0, None) * (pixel < old) * (new / old)
+    rows = np.repeat(np.arange(new), window)
+    return csr_array((weight.ravel().astype(np.float32), (rows, np.minimum(pixel, old - 1).ravel())), shape=(new, old))
 
 
 def resize_nearest(values: np.ndarray, width: int, height: int) -> np.ndarray:
-    """The value of ``values`` (h, w) at each new pixel's centre."""
+    """Return the value of ``values`` (h, w) at the centre of each new pixel."""
     h, w = values.shape
     y = ((np.arange(height) + 0.5) * h / height).astype(int)
     x = ((np.arange(width) + 0.5) * w / width).astype(int)
@@ -371,7 +387,7 @@ def resize_nearest(values: np.ndarray, width: int, height: int) -> np.ndarray:
 
 
 def resize_mask(mask: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Where all that a new pixel covers is on in ``mask`` (h, w, bool)."""
+    """Resize ``mask`` (h, w, bool). A new pixel is set if all pixels that it covers are set."""
     if mask.shape == (height, width):
         return mask
     return resize_by_area(mask[..., None].astype(np.float32), width, height)[..., 0] > 0.9999

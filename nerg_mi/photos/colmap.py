@@ -1,4 +1,4 @@
-"""COLMAP's sparse models, which way is up in them, and the poses of a set by the names of its images."""
+"""COLMAP sparse models, estimation of the up direction, and camera poses by image name."""
 
 from __future__ import annotations
 
@@ -15,27 +15,25 @@ from typing import BinaryIO
 
 import numpy as np
 
-from nerg_mi.errors import MissingFile, NergError, sanitize, format_error
+from nerg_mi.errors import MissingFile, NergError, format_error, sanitize
 from nerg_mi.files.atomic import file_sha256
-from nerg_mi.files.safe_read import is_regular_file, open_file, resolve_path, check_regular_file
+from nerg_mi.files.safe_read import check_regular_file, is_regular_file, open_file, resolve_path
 
 from .posed import MAX_POSITION, FileFinder, MaskFile, PosedFrame, PosedImages, UnusedFrame, format_names, sort_frames
 from .transforms import read_frame_poses
 
-# ---- Colmap ----
+# ---- COLMAP sparse models: ``cameras``, ``images`` and ``points3D``, as ``.bin`` or ``.txt`` ----
 #
-# COLMAP's sparse models: ``cameras``, ``images`` and ``points3D``, as ``.bin`` or as ``.txt``.
-#
-# The layout of both is COLMAP's (src/colmap/scene/reconstruction_io): little-endian; world-to-camera poses as a
+# The layout is defined in src/colmap/scene/reconstruction_io of COLMAP: little-endian; world-to-camera poses as a
 # quaternion (w, x, y, z) and a translation; cameras look along +z with y down; the first pixel's centre is (0.5, 0.5).
 
 MAX_BYTES = 8 << 30
-"""A file of a model may have so many bytes: ``images.bin`` of some 30,000 photos, most of it observations."""
+"""Maximum size of a file of a model in bytes: ``images.bin`` of about 30,000 photos, mostly observations."""
 
-MAX_IMAGES = 1 << 18  # a model may have so many images, and as many cameras
-MAX_POINTS = 12_000_000  # and so many points
+MAX_IMAGES = 1 << 18  # maximum number of images, and of cameras, of a model
+MAX_POINTS = 12_000_000  # maximum number of points of a model
 
-# COLMAP's numbers of its camera models, and how many parameters each has.
+# Camera models by COLMAP's model number, with their numbers of parameters.
 _MODELS = {
     0: ("SIMPLE_PINHOLE", 3),
     1: ("PINHOLE", 4),
@@ -50,7 +48,7 @@ _MODELS = {
     10: ("THIN_PRISM_FISHEYE", 12),
     11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
 }
-# Their parameters in COLMAP's order, as far as the mapping is known here; "f" is both focal lengths.
+# Parameters of the supported models in COLMAP's order; "f" sets both focal lengths.
 _PARAMETERS = {
     "SIMPLE_PINHOLE": "f cx cy",
     "PINHOLE": "fl_x fl_y cx cy",
@@ -63,32 +61,41 @@ _PARAMETERS = {
     "RADIAL_FISHEYE": "f cx cy k1 k2",
 }
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-# Points that fewer images hold, or that project worse than so many pixels, are no evidence of a surface.
+# Points with fewer observations, or with a larger reprojection error in pixels, are not used as surface points.
 _MIN_TRACK, _MAX_ERROR = 3, 4.0
-# Characters of a line that is split into words; those of observations, which are longer, are skipped.
-_LONGEST = 1 << 20
-# Characters of a line that are read at once.
-_PIECE = 1 << 26
-# Bytes of a text file in which its comments state how many records it has.
-_HEADER = 1 << 12
-# Bytes of the name of an image, with the zero after it.
-_NAME = 1 << 12
-# Points that are judged at once.
+# Maximum length of a line that is parsed; longer lines of observations are skipped.
+_MAX_LINE = 1 << 20
+# Characters of a line that are read at a time.
+_READ_CHARACTERS = 1 << 26
+# Bytes of a text file that contain the header comments, which state the number of records.
+_HEADER_BYTES = 1 << 12
+# Maximum size of an image name in bytes, including the terminating zero.
+_MAX_NAME_BYTES = 1 << 12
+# Points per chunk.
 _BLOCK = 1 << 16
 
 
 @dataclass(frozen=True)
 class _Camera:
-    """A record of ``cameras``: the ``model``'s name, the size of its pictures in pixels, and the model's parameters in
-    COLMAP's order."""
+    """A record of ``cameras``.
+
+    Attributes
+    ----------
+    model
+        Name of the camera model.
+    width, height
+        Image size in pixels.
+    parameters
+        Parameters in COLMAP's order.
+    """
 
     model: str
     width: int
     height: int
     parameters: tuple
 
-    def lens(self) -> dict[str, float]:
-        """The same by the keys of `posed.LENS_KEYS`; `NergError` for a model that no lens here is."""
+    def to_lens(self) -> dict[str, float]:
+        """Convert to the keys of `posed.LENS_KEYS`. Raises `NergError` for an unsupported model."""
         names = _PARAMETERS.get(self.model)
         if names is None:
             raise NergError(
@@ -107,8 +114,9 @@ class _Camera:
 
 
 def find_model_files(folder: str | Path) -> dict[str, Path] | None:
-    """The files "cameras", "images" and, where it exists, "points3D" of a model in ``folder``; None if there is
-    none."""
+    """Return the files "cameras", "images" and, if it exists, "points3D" of a model in ``folder``; None if there
+    is no model.
+    """
     folder = Path(folder)
     for suffix in (".bin", ".txt"):
         files = {name: folder / (name + suffix) for name in ("cameras", "images", "points3D")}
@@ -121,106 +129,142 @@ def find_model_files(folder: str | Path) -> dict[str, Path] | None:
 def read_colmap(
     folder: str | Path, images: str | Path, masks: str | Path | None = None, allow_outside: bool = False
 ) -> PosedImages:
-    """Read the model in ``folder``; its image names are relative to ``images``, its masks' to ``masks`` (``NAME.png``).
+    """Read the COLMAP model in ``folder``, in its own world coordinates.
 
-    Images and masks that lie outside of the capture, the folder that holds ``images``, links followed, are not used
-    unless ``allow_outside``. In COLMAP's own world. Frames that cannot be used are listed; a text file that states
-    another number of records than it has is noted. `NergError` names file and record for what cannot be parsed, and
-    when no frame can be used.
+    Parameters
+    ----------
+    folder
+        Folder of the model.
+    images
+        Folder of the images, to which the image names are relative.
+    masks
+        Folder of the masks (``NAME.png``).
+    allow_outside
+        Whether images and masks outside of the data set may be used. The data set is the parent folder of ``images``;
+        links are resolved.
+
+    Returns
+    -------
+    PosedImages
+        The frames. Frames that cannot be used are listed. A note reports a text file whose stated number of records
+        differs from the actual one.
+
+    Raises
+    ------
+    NergError
+        For a file that cannot be parsed, with the file and the record, and if no frame can be used.
     """
     folder, images = Path(folder), Path(images)
     files = _require_model(folder)
     binary = files["cameras"].suffix == ".bin"
-    cameras = (_cameras_bin if binary else _cameras_txt)(files["cameras"])
-    poses = (_images_bin if binary else _images_txt)(files["images"])
+    cameras = (_read_cameras_bin if binary else _read_cameras_txt)(files["cameras"])
+    poses = (_read_images_bin if binary else _read_images_txt)(files["images"])
     frames, unused = [], []
     limit = None if allow_outside else images.parent
     finder, mask_finder = FileFinder(images, limit), None if masks is None else FileFinder(Path(masks), limit)
-    listed = set()
+    listed_images = set()
     for name, camera, q, t in poses:
         try:
             image = finder.find(name, "image")
-            listed.add(image)
-            frames.append(_frame(name, cameras.get(camera), camera, q, t, image, mask_finder))
+            listed_images.add(image)
+            frames.append(_make_frame(name, cameras.get(camera), camera, q, t, image, mask_finder))
         except (ValueError, OverflowError, OSError) as e:
-            # A name may be longer than the system allows, or hold what no name can.
+            # A name may be too long for the system, or contain invalid characters.
             unused.append(UnusedFrame(name, format_error(e)))
     frames, unused = sort_frames(files["images"], frames, unused)
     counts, points = {"cameras": len(cameras), "images": len(poses)}, None
     if "points3D" in files:
-        counts["points3D"], points = _trusted((_points_bin if binary else _points_txt)(files["points3D"]))
-    notes = [] if binary else [n for k, c in counts.items() for n in _count_notes(files[k], c)]
-    digest = _digest(files)
+        counts["points3D"], points = _select_surface_points(
+            (_read_points_bin if binary else _read_points_txt)(files["points3D"])
+        )
+    notes = [] if binary else [n for k, c in counts.items() for n in _check_stated_count(files[k], c)]
+    digest = _compute_digest(files)
     folders = frozenset([images, *(p for p in images.rglob("*") if p.is_dir())])
     return PosedImages(
-        files["images"], frames, unused, None, digest, notes, points, images.parent, folders, frozenset(listed)
+        files["images"], frames, unused, None, digest, notes, points, images.parent, folders, frozenset(listed_images)
     )
 
 
 def count_images(folder: Path) -> int:
-    """Number of images of the model in ``folder``, as a binary file states it."""
+    """Return the number of images of the model in ``folder``; for a binary file, the number in its header."""
     path = _require_model(folder)["images"]
     if path.suffix == ".txt":
-        return len(_images_txt(path))
-    with _open(path) as file:
+        return len(_read_images_txt(path))
+    with _open_model_file(path) as file:
         return int.from_bytes(file.read(8), "little")
 
 
 def read_image_poses(folder: str | Path) -> tuple[Path, str, list[tuple[str, np.ndarray]], list[str]]:
-    """Of the model in ``folder``, whose images need not be there: its file of images, the model's SHA-256 as
-    `PosedImages` has it, of each image its name and its OpenGL camera-to-world pose (4, 4), and a sentence where a text
-    file states another number of images.
+    """Read the poses of the model in ``folder``, whose images may be missing.
 
-    `NergError` names file and record for what cannot be parsed.
+    Returns
+    -------
+    path
+        The file of images.
+    sha256
+        Digest of the model, as in `PosedImages`.
+    poses
+        Name and OpenGL camera-to-world pose (4, 4) of each image.
+    notes
+        A note if a text file states another number of images.
+
+    Raises
+    ------
+    NergError
+        For a file that cannot be parsed, with the file and the record.
     """
     files = _require_model(Path(folder))
-    path, found = files["images"], []
-    for name, _, q, t in (_images_bin if path.suffix == ".bin" else _images_txt)(path):
+    path, poses = files["images"], []
+    for name, _, q, t in (_read_images_bin if path.suffix == ".bin" else _read_images_txt)(path):
         try:
-            found.append((name, _to_world(q, t)))
+            poses.append((name, _make_pose(q, t)))
         except NergError as error:
             raise NergError(f'image "{sanitize(name)}" of "{path}": {error}; copy the model again') from error
-    notes = _count_notes(path, len(found)) if path.suffix == ".txt" else []
-    return path, _digest(files), found, notes
+    notes = _check_stated_count(path, len(poses)) if path.suffix == ".txt" else []
+    return path, _compute_digest(files), poses, notes
 
 
 def _require_model(folder: Path) -> dict[str, Path]:
     files = find_model_files(folder)
     if files is None:
-        raise MissingFile(f'"{folder}" holds no COLMAP model: neither cameras.bin and images.bin nor their .txt')
+        raise MissingFile(f'"{folder}" contains no COLMAP model: neither cameras.bin and images.bin nor the .txt files')
     return files
 
 
 @contextmanager
-def _open(path: Path) -> Iterator[BinaryIO]:
-    """A file of a model; what it holds is read in pieces, since observations may be gigabytes."""
+def _open_model_file(path: Path) -> Iterator[BinaryIO]:
+    """Open a file of a model. It is read in pieces, because observations may take gigabytes."""
     with open_file(path, "COLMAP file", max_bytes=MAX_BYTES) as file:
         yield file
 
 
-def _digest(files: dict[str, Path]) -> str:
-    """Of the files of cameras and images. Both are read to their ends: to be computed after they were parsed."""
+def _compute_digest(files: dict[str, Path]) -> str:
+    """Compute the digest of the files of cameras and images. Both are read completely, so call this after parsing
+    them.
+    """
     digests = (bytes.fromhex(file_sha256(files[name])) for name in ("cameras", "images"))
     return hashlib.sha256(b"".join(digests)).hexdigest()
 
 
-def _frame(name: str, camera: _Camera | None, number: int, q, t, image: Path, masks: FileFinder | None) -> PosedFrame:
+def _make_frame(
+    name: str, camera: _Camera | None, number: int, q, t, image: Path, masks: FileFinder | None
+) -> PosedFrame:
     if camera is None:
         raise NergError(f"the model has no camera {number}")
     if not image.is_file():
         raise NergError(f'its image "{sanitize(image)}" does not exist')
-    lens, mask = camera.lens(), None
+    lens, mask = camera.to_lens(), None
     if masks is not None:
-        # COLMAP appends the suffix; others replace it.
+        # COLMAP appends the suffix; other programs replace it.
         paths = [masks.find(n, "mask") for n in (f"{name}.png", str(Path(name).with_suffix(".png")))]
         existing = [p for p in paths if p.is_file()]
         if not existing:
             raise NergError(f'its mask "{sanitize(paths[0])}" does not exist')
         mask = MaskFile(existing[0])
-    return PosedFrame(name, image, _to_world(q, t), lens, mask=mask, ignores_exif=True)
+    return PosedFrame(name, image, _make_pose(q, t), lens, mask=mask, ignores_exif=True)
 
 
-def _to_world(q, t) -> np.ndarray:
+def _make_pose(q, t) -> np.ndarray:
     from scipy.spatial.transform import Rotation
 
     norm = float(np.linalg.norm(q))
@@ -233,144 +277,147 @@ def _to_world(q, t) -> np.ndarray:
 
 
 _Point = tuple[float, float, float, float, int]
-"""Position, reprojection error and length of the track of a point."""
+"""Position (x, y, z), reprojection error and track length of a point."""
 
 
-class _Reader:
-    """Little-endian records of an open file; an end that comes too early is told with its place."""
+class _RecordReader:
+    """Reader of little-endian records. A truncated file raises an error with the position."""
 
     def __init__(self, path: Path, file: BinaryIO):
-        self.path, self.file, self.at, self.size = path, file, 0, check_regular_file(path, "COLMAP file")
+        self.path, self.file, self.offset, self.size = path, file, 0, check_regular_file(path, "COLMAP file")
 
-    def count(self, most: int, what: str) -> int:
-        """The number of records, which begins the file."""
-        count = self.take("Q", "its header")[0]
-        _check_count(self.path, count, most, what)
+    def read_count(self, limit: int, records: str) -> int:
+        """Read the number of records at the start of the file."""
+        count = self.read_values("Q", "its header")[0]
+        _check_count(self.path, count, limit, records)
         return count
 
-    def take(self, form: str, what: str) -> tuple:
+    def read_values(self, form: str, record: str) -> tuple:
         size = struct.calcsize("<" + form)
-        self.need(size, what)
-        self.at += size
+        self.check_remaining(size, record)
+        self.offset += size
         return struct.unpack("<" + form, self.file.read(size))
 
-    def need(self, size: int, what: str) -> None:
-        if self.at + size > self.size:
-            raise NergError(
-                f'"{self.path}" ends in the middle of {what} (byte {self.at} of {self.size}); copy it again'
-            )
+    def check_remaining(self, size: int, record: str) -> None:
+        if self.offset + size > self.size:
+            raise NergError(f'"{self.path}" ends within {record} (byte {self.offset} of {self.size}); copy it again')
 
-    def skip(self, size: int, what: str) -> None:
-        self.need(size, what)
-        self.at += size
-        self.file.seek(self.at)
+    def skip(self, size: int, record: str) -> None:
+        self.check_remaining(size, record)
+        self.offset += size
+        self.file.seek(self.offset)
 
-    def end(self, count: int) -> None:
-        """`NergError` where anything follows the ``count`` records that the header states."""
-        if self.at < self.size:
+    def check_end(self, count: int) -> None:
+        """Raise `NergError` if data follows the ``count`` records of the header."""
+        if self.offset < self.size:
             raise NergError(
-                f'"{self.path}" has {self.size - self.at:,} more bytes than the {count:,} records that its header '
+                f'"{self.path}" has {self.size - self.offset:,} bytes after the {count:,} records that its header '
                 "states; copy it again"
             )
 
-    def name(self, what: str) -> str:
-        raw = self.file.read(_NAME)
+    def read_name(self, record: str) -> str:
+        raw = self.file.read(_MAX_NAME_BYTES)
         end = raw.find(b"\0")
-        if end < 0 and len(raw) == _NAME:
-            raise NergError(f'the name of {what} of "{self.path}" has more than {_NAME - 1:,} bytes; copy it again')
+        if end < 0 and len(raw) == _MAX_NAME_BYTES:
+            raise NergError(
+                f'the name of {record} of "{self.path}" has more than {_MAX_NAME_BYTES - 1:,} bytes; copy it again'
+            )
         if end < 0:
-            raise NergError(f'"{self.path}" ends in the middle of the name of {what}; copy it again')
-        self.skip(end + 1, what)
+            raise NergError(f'"{self.path}" ends within the name of {record}; copy it again')
+        self.skip(end + 1, record)
         return raw[:end].decode("utf-8", errors="surrogateescape")
 
 
-def _check_count(path: Path, count: int, most: int, what: str) -> None:
-    if count > most:
-        raise NergError(f'"{path}" has {count:,} {what}, more than the {most:,} that are read; give a smaller model')
+def _check_count(path: Path, count: int, limit: int, records: str) -> None:
+    if count > limit:
+        raise NergError(f'"{path}" has {count:,} {records}, the limit is {limit:,}; use a smaller model')
 
 
-def _cameras_bin(path: Path) -> dict[int, _Camera]:
+def _read_cameras_bin(path: Path) -> dict[int, _Camera]:
     out = {}
-    with _open(path) as file:
-        r = _Reader(path, file)
-        for k in range(r.count(MAX_IMAGES, "cameras")):
-            number, model, width, height = r.take("iiQQ", f"camera record {k + 1}")
+    with _open_model_file(path) as file:
+        r = _RecordReader(path, file)
+        for k in range(r.read_count(MAX_IMAGES, "cameras")):
+            number, model, width, height = r.read_values("iiQQ", f"camera record {k + 1}")
             if model not in _MODELS:
                 raise NergError(
-                    f'camera {number} of "{path}" has the unknown model number {model}, so that the file cannot be '
-                    'read on; convert it with "colmap model_converter --output_type TXT"'
+                    f'camera {number} of "{path}" has the unknown model number {model}, so the rest of the file '
+                    "cannot be "
+                    'read; convert it with "colmap model_converter --output_type TXT"'
                 )
             name, count = _MODELS[model]
-            out[number] = _Camera(name, width, height, r.take(f"{count}d", f"camera record {k + 1}"))
-        r.end(len(out))
+            out[number] = _Camera(name, width, height, r.read_values(f"{count}d", f"camera record {k + 1}"))
+        r.check_end(len(out))
     return out
 
 
-def _images_bin(path: Path) -> list[tuple]:
+def _read_images_bin(path: Path) -> list[tuple]:
     out = []
-    with _open(path) as file:
-        r = _Reader(path, file)
-        for k in range(r.count(MAX_IMAGES, "images")):
-            what = f"image record {k + 1}"
-            values = r.take("i7di", what)
-            name = r.name(what)
-            # Per observation: x, y as doubles and the number of its point.
-            r.skip(24 * r.take("Q", what)[0], what)
+    with _open_model_file(path) as file:
+        r = _RecordReader(path, file)
+        for k in range(r.read_count(MAX_IMAGES, "images")):
+            record = f"image record {k + 1}"
+            values = r.read_values("i7di", record)
+            name = r.read_name(record)
+            # Each observation has x and y as doubles, and the index of its point.
+            r.skip(24 * r.read_values("Q", record)[0], record)
             out.append((name, values[8], values[1:5], values[5:8]))
-        r.end(len(out))
+        r.check_end(len(out))
     return out
 
 
-def _points_bin(path: Path) -> Iterator[_Point]:
-    with _open(path) as file:
-        r = _Reader(path, file)
-        count = r.count(MAX_POINTS, "points")
+def _read_points_bin(path: Path) -> Iterator[_Point]:
+    with _open_model_file(path) as file:
+        r = _RecordReader(path, file)
+        count = r.read_count(MAX_POINTS, "points")
         for k in range(count):
-            what = f"point record {k + 1}"
-            values = r.take("Q3d3BdQ", what)
-            r.skip(8 * values[8], what)
+            record = f"point record {k + 1}"
+            values = r.read_values("Q3d3BdQ", record)
+            r.skip(8 * values[8], record)
             yield *values[1:4], values[7], values[8]
-        r.end(count)
+        r.check_end(count)
 
 
-def _lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Line numbers and lines; comments left out."""
-    with _open(path) as file:
-        # Names of images may be in any encoding.
+def _iter_lines(path: Path) -> Iterator[tuple[int, str]]:
+    """Iterate over line numbers and lines, without comments."""
+    with _open_model_file(path) as file:
+        # Image names may have any encoding.
         text = io.TextIOWrapper(file, encoding="utf-8", errors="surrogateescape")
-        # A file without line ends must not become one line of gigabytes.
-        for number, line in enumerate(iter(lambda: text.readline(_PIECE), ""), 1):
+        # A file without line ends must not be read as one line of gigabytes.
+        for number, line in enumerate(iter(lambda: text.readline(_READ_CHARACTERS), ""), 1):
             if not line.startswith("#"):
                 yield number, line.rstrip("\n")
 
 
-def _rows(path: Path, most: int, what: str) -> Iterator[tuple[int, list[str]]]:
-    """Numbers and words of the lines that are not empty, of which there may be ``most``."""
+def _iter_rows(path: Path, limit: int, records: str) -> Iterator[tuple[int, list[str]]]:
+    """Iterate over the numbers and words of non-empty lines, of which there may be at most ``limit``."""
     count = 0
-    for number, line in _lines(path):
-        if len(line) > _LONGEST:
+    for number, line in _iter_lines(path):
+        if len(line) > _MAX_LINE:
             raise NergError(
-                f'line {number} of "{path}" has {len(line):,} characters, and at most {_LONGEST:,} are read; '
+                f'line {number} of "{path}" has {len(line):,} characters; the limit is {_MAX_LINE:,}; '
                 "is it a COLMAP file?"
             )
         if line.strip():
             count += 1
-            _check_count(path, count, most, what)
+            _check_count(path, count, limit, records)
             yield number, line.split()
 
 
-def _count_notes(path: Path, count: int) -> list[str]:
-    """A sentence, where the header of a text file states another number than the ``count`` of its records."""
-    with _open(path) as file:
-        stated = re.search(rb"^#\s*Number of [a-z]+: *(\d+)", file.read(_HEADER), re.MULTILINE)
+def _check_stated_count(path: Path, count: int) -> list[str]:
+    """Return a note if the header of a text file states another number than the ``count`` of its records."""
+    with _open_model_file(path) as file:
+        stated = re.search(rb"^#\s*Number of [a-z]+: *(\d+)", file.read(_HEADER_BYTES), re.MULTILINE)
     if stated is None or int(stated[1]) == count:
         return []
-    return [f'"{path}" has {count:,} records, but its header states {int(stated[1]):,}; copy it again if it was cut']
+    return [
+        f'"{path}" has {count:,} records, but its header states {int(stated[1]):,}; copy it again if it was truncated'
+    ]
 
 
-def _cameras_txt(path: Path) -> dict[int, _Camera]:
+def _read_cameras_txt(path: Path) -> dict[int, _Camera]:
     out = {}
-    for number, words in _rows(path, MAX_IMAGES, "cameras"):
+    for number, words in _iter_rows(path, MAX_IMAGES, "cameras"):
         try:
             out[int(words[0])] = _Camera(words[1], int(words[2]), int(words[3]), tuple(map(float, words[4:])))
         except (ValueError, IndexError) as e:
@@ -378,13 +425,13 @@ def _cameras_txt(path: Path) -> dict[int, _Camera]:
     return out
 
 
-def _images_txt(path: Path) -> list[tuple]:
-    out, after_image = [], False
-    for number, line in _lines(path):
-        words = line[:_LONGEST].split()
-        # The line after an image's lists its observations; it may be empty, and some writers leave it out.
-        if not words or (after_image and (len(line) > _LONGEST or _are_observations(words))):
-            after_image = False
+def _read_images_txt(path: Path) -> list[tuple]:
+    out, follows_image = [], False
+    for number, line in _iter_lines(path):
+        words = line[:_MAX_LINE].split()
+        # The line after an image lists its observations. It may be empty, and some writers omit it.
+        if not words or (follows_image and (len(line) > _MAX_LINE or _are_observations(words))):
+            follows_image = False
             continue
         try:
             q, t = tuple(map(float, words[1:5])), tuple(map(float, words[5:8]))
@@ -394,40 +441,40 @@ def _images_txt(path: Path) -> list[tuple]:
         except (ValueError, IndexError) as e:
             raise NergError(f'line {number} of "{path}" is not "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"') from e
         _check_count(path, len(out), MAX_IMAGES, "images")
-        after_image = True
+        follows_image = True
     return out
 
 
 def _are_observations(words: list[str]) -> bool:
-    """Whether ``words`` are triples of X, Y and POINT3D_ID; an image's line ends with its name."""
+    """Return whether ``words`` are triples of X, Y and POINT3D_ID. The line of an image ends with its name instead."""
     try:
         return len(words) % 3 == 0 and int(words[-1]) >= -1
     except ValueError:
         return False
 
 
-def _points_txt(path: Path) -> Iterator[_Point]:
-    for number, words in _rows(path, MAX_POINTS, "points"):
+def _read_points_txt(path: Path) -> Iterator[_Point]:
+    for number, words in _iter_rows(path, MAX_POINTS, "points"):
         try:
             yield float(words[1]), float(words[2]), float(words[3]), float(words[7]), (len(words) - 8) // 2
         except (ValueError, IndexError) as e:
             raise NergError(f'line {number} of "{path}" is not "POINT3D_ID X Y Z R G B ERROR TRACK"') from e
 
 
-def _trusted(points: Iterator[_Point]) -> tuple[int, np.ndarray]:
-    """How many ``points`` there are, and the positions (N, 3) of those that are evidence of a surface."""
-    count, trusted = 0, [np.empty((0, 3))]
+def _select_surface_points(points: Iterator[_Point]) -> tuple[int, np.ndarray]:
+    """Return the number of ``points``, and the positions (N, 3) of the reliable ones."""
+    count, selected = 0, [np.empty((0, 3))]
     while block := list(itertools.islice(points, _BLOCK)):
         table = np.array(block, np.float64)
-        good = np.all(np.abs(table) <= MAX_POSITION, axis=1) & (table[:, 3] <= _MAX_ERROR) & (table[:, 4] >= _MIN_TRACK)
-        trusted.append(table[good, :3])
+        is_reliable = (
+            np.all(np.abs(table) <= MAX_POSITION, axis=1) & (table[:, 3] <= _MAX_ERROR) & (table[:, 4] >= _MIN_TRACK)
+        )
+        selected.append(table[is_reliable, :3])
         count += len(block)
-    return count, np.concatenate(trusted)
+    return count, np.concatenate(selected)
 
 
-# ---- Named poses ----
-#
-# Which file describes a posed image set, and its poses by the names of its images, whether or not they are there.
+# ---- Poses by image name; the images may be missing ----
 
 _MODEL_FOLDERS = ("", "sparse", "colmap/sparse")
 
@@ -436,20 +483,23 @@ _MODEL_FOLDERS = ("", "sparse", "colmap/sparse")
 class NamedPoses:
     """The N images of a posed image set, in its own coordinates."""
 
-    path: Path  # the file that lists them
-    sha256: str  # of the set, as the provenance of what is trained on it has it
+    path: Path  # the file that lists the images
+    sha256: str  # digest of the set, which is also in the provenance of fields that are trained on it
     names: list[str]
     to_world: np.ndarray  # (N, 4, 4) rigid OpenGL camera-to-world: x right, y up, z back
-    notes: list[str]  # sentences on what of a COLMAP model contradicts itself, and on models that are not used
+    notes: list[str]  # notes on contradictions within a COLMAP model, and on models that are not used
 
 
 def find_pose_source(dataset: str | Path) -> Path:
-    """The transforms file of ``dataset``, or the folder of its COLMAP model, of several the one with the most images.
-    ``dataset``: a folder, or that file itself."""
+    """Return the transforms file of ``dataset``, or the folder of its COLMAP model; of several models, the one with
+    most images.
+
+    ``dataset``: a folder, or the file itself.
+    """
     dataset = Path(dataset)
     if dataset.exists() and not dataset.is_dir():
         check_regular_file(dataset, "posed image set")
-        # A file of a COLMAP model stands for the model.
+        # A file of a COLMAP model selects the model.
         return dataset.parent if dataset.suffix in (".bin", ".txt") else dataset
     for name in ("transforms.json", "transforms_train.json"):
         if is_regular_file(dataset / name, "transforms file"):
@@ -459,70 +509,82 @@ def find_pose_source(dataset: str | Path) -> Path:
         if models:
             return models[0] if len(models) == 1 else max(models, key=count_images)
     raise MissingFile(
-        f'"{dataset}" holds neither transforms.json nor transforms_train.json nor a COLMAP model '
-        "(sparse/0/cameras.bin); name the folder of a posed image set"
+        f'"{dataset}" contains neither transforms.json nor transforms_train.json nor a COLMAP model '
+        "(sparse/0/cameras.bin); specify the folder of a posed image set"
     )
 
 
 def _list_models(folder: Path) -> list[Path]:
-    """COLMAP's models of one reconstruction: in the numbered folders of ``folder``, and ``folder`` itself."""
+    """List the models of one reconstruction: in the numbered subfolders of ``folder``, and in ``folder`` itself."""
     numbered = sorted((p for p in folder.glob("*") if p.name.isdecimal()), key=lambda p: int(p.name))
     return [p for p in (*numbered, folder) if find_model_files(p) is not None]
 
 
 def describe_other_models(model: Path) -> list[str]:
-    """A sentence on the models of the same reconstruction that are not used where the COLMAP ``model`` is."""
+    """Return a note on the other models of the reconstruction that contains the COLMAP ``model``."""
     models = _list_models(model.parent if model.name.isdecimal() else model)
-    others = [p for p in models if resolve_path(p) != resolve_path(model)]
-    if not others:
+    other_models = [p for p in models if resolve_path(p) != resolve_path(model)]
+    if not other_models:
         return []
     describe = lambda p: f'"{p.name}" ({count_images(p):,} images)'
     return [
-        f"of {len(models)} COLMAP models {describe(model)} is used, and not {format_names(describe(p) for p in others)}"
+        f"of {len(models)} COLMAP models, {describe(model)} is used, but not "
+        f"{format_names(describe(p) for p in other_models)}"
     ]
 
 
 def read_named_poses(source: str | Path) -> NamedPoses:
-    """Of a transforms file, or of the folder of a COLMAP model; `find_source` finds either.
+    """Read the poses of a transforms file, or of the folder of a COLMAP model; `find_pose_source` finds either.
 
-    Raises `NergError` for what cannot be parsed, and for a file that lists nothing.
+    Raises `NergError` for a file that cannot be parsed, and for a file without images.
     """
     source = Path(source)
     if source.is_dir() and find_model_files(source) is not None:
-        path, sha256, listed, notes = read_image_poses(source)
+        path, sha256, frames, notes = read_image_poses(source)
         notes += describe_other_models(source)
     else:
-        path, (sha256, listed), notes = source, read_frame_poses(source), []
-    if not listed:
-        raise NergError(f'"{path}" lists no images; name the file of a posed image set')
-    return NamedPoses(path, sha256, [name for name, _ in listed], np.stack([pose for _, pose in listed]), notes)
+        path, (sha256, frames), notes = source, read_frame_poses(source), []
+    if not frames:
+        raise NergError(f'"{path}" lists no images; specify the file of a posed image set')
+    return NamedPoses(path, sha256, [name for name, _ in frames], np.stack([pose for _, pose in frames]), notes)
 
 
-# ---- Which way is up, by what photographers do and what places have ----
+# ---- Estimation of the up direction ----
 #
-# People hold cameras level: the horizontal axes of their pictures lie in one plane, whose normal is the vertical,
-# however far a camera looks down. Places have a floor, or a table, which most things stand on: a plane of many points,
-# below the cameras, whose normal is the vertical too, and by far the more exact one.
+# Photographers hold cameras level: the horizontal axes of the images are in one plane, whose normal is the vertical, no
+# matter how far the cameras look down. Most environments also have a floor or a table: a plane of many points below the
+# cameras. Its normal is a much more precise estimate of the vertical.
 
 
-# How much the mean of the pictures' own up counts where their horizontal axes leave the vertical open.
-_MEAN = 0.005
-# Rolls beyond this sine count less and less (an L1 fit).
-_LEVEL = 0.02
-# A plane is looked for by so many triples of points; its normal may be so far from the cameras' up.
-_TRIPLES, _TILT = 20_000, np.cos(np.radians(20.0))
-# So thick is a plane, as a share of the points' median distance from their median; so many of the points it must hold.
-_THICK, _SHARE = 0.02, 0.10
-_POINTS = 4000
-# Cameras that are held at larger angles than this, at the median, do not tell what is up.
-_SURE = 10.0
+# Weight of the mean up axis of the images, which decides if the horizontal axes leave the vertical undetermined.
+_TOP_WEIGHT = 0.005
+# Sine of the roll angle above which the fit is an L1 fit.
+_ROLL_SCALE = 0.02
+# Number of random point triples of the plane search, and the maximum angle between the normal and the cameras' up.
+_NUM_TRIPLES, _MIN_COSINE = 20_000, np.cos(np.radians(20.0))
+# Thickness of a plane relative to the median distance of the points from their median, and the minimum fraction of the
+# points on it.
+_PLANE_THICKNESS, _MIN_PLANE_FRACTION = 0.02, 0.10
+_MAX_PLANE_POINTS = 4000
+# Maximum median roll in degrees of a reliable estimate from the cameras.
+_MAX_ROLL = 10.0
 
 
 @dataclass(frozen=True)
 class UpEstimate:
-    """``direction``: (3,) unit vector. ``roll``: median angle in degrees by which the horizontal axes of the pictures
-    are off the horizon; ``plane``: share of the points on a plane that is level, None where there is none;
-    ``between``: degrees between the plane's normal and what the cameras say."""
+    """Estimate of the up direction.
+
+    Attributes
+    ----------
+    direction
+        Unit vector (3,).
+    median_roll
+        Median angle in degrees between the horizontal axes of the images and the horizon.
+    plane_fraction
+        Fraction of the points on a level plane; None without a plane.
+    plane_angle
+        Angle in degrees between the normal of the plane and the estimate from the cameras.
+    """
 
     direction: np.ndarray
     median_roll: float
@@ -532,30 +594,33 @@ class UpEstimate:
     @property
     def is_reliable(self) -> bool:
         """Whether the cameras agree."""
-        return self.median_roll <= _SURE
+        return self.median_roll <= _MAX_ROLL
 
     def __str__(self) -> str:
         cameras = f"the cameras are held level to {self.median_roll:.1f} degrees (median)"
         if self.plane_fraction is None:
-            return f"{cameras}; no plane of the points is level"
-        return f"{cameras}, and a plane of {self.plane_fraction:.0%} of the points is {self.plane_angle:.1f} degrees from their up"
+            return f"{cameras}; the points contain no level plane"
+        return (
+            f"{cameras}, and a plane of {self.plane_fraction:.0%} of the points is {self.plane_angle:.1f} degrees from "
+            "the up direction of the cameras"
+        )
 
 
 def estimate_up(to_world: np.ndarray, points: np.ndarray) -> UpEstimate:
-    """Up in the coordinates of OpenGL camera-to-world poses (N, 4, 4) and of ``points`` (M, 3) on surfaces."""
+    """Estimate the up direction from OpenGL camera-to-world poses (N, 4, 4) and surface ``points`` (M, 3)."""
     rights, tops, centers = to_world[:, :3, 0], to_world[:, :3, 1], to_world[:, :3, 3]
-    by_cameras = _level(rights, tops)
-    roll = float(np.degrees(np.median(np.arcsin(np.clip(np.abs(rights @ by_cameras), 0, 1)))))
-    found = _plane(points, centers, by_cameras) if len(points) >= 100 else None
-    if found is None:
-        return UpEstimate(by_cameras, roll)
-    normal, share = found
-    between = float(np.degrees(np.arccos(np.clip(normal @ by_cameras, -1, 1))))
-    return UpEstimate(normal, roll, share, between)
+    camera_up = _estimate_camera_up(rights, tops)
+    roll = float(np.degrees(np.median(np.arcsin(np.clip(np.abs(rights @ camera_up), 0, 1)))))
+    plane = _fit_level_plane(points, centers, camera_up) if len(points) >= 100 else None
+    if plane is None:
+        return UpEstimate(camera_up, roll)
+    normal, fraction = plane
+    angle = float(np.degrees(np.arccos(np.clip(normal @ camera_up, -1, 1))))
+    return UpEstimate(normal, roll, fraction, angle)
 
 
 def rotation_to_z(up: np.ndarray) -> np.ndarray:
-    """The smallest rotation (3, 3) that takes the unit vector ``up`` to +z."""
+    """Return the smallest rotation (3, 3) that maps the unit vector ``up`` to +z."""
     from scipy.spatial.transform import Rotation
 
     axis = np.cross(up, [0.0, 0.0, 1.0])
@@ -565,52 +630,54 @@ def rotation_to_z(up: np.ndarray) -> np.ndarray:
     return Rotation.from_rotvec(axis / sine * np.arctan2(sine, up[2])).as_matrix()
 
 
-def _level(rights: np.ndarray, tops: np.ndarray) -> np.ndarray:
-    """The direction to which most horizontal axes are perpendicular, on the side of the pictures' tops."""
+def _estimate_camera_up(rights: np.ndarray, tops: np.ndarray) -> np.ndarray:
+    """Estimate the direction that is perpendicular to most horizontal axes, on the side of the tops of the images."""
     mean = tops[0] * 0.0
     weights = np.ones(len(tops))
     for _ in range(20):
         mean = weights @ tops
         mean = mean / max(float(np.linalg.norm(mean)), 1e-12)
-        weights = 1 / np.maximum(np.linalg.norm(tops - mean, axis=1), _LEVEL)
+        weights = 1 / np.maximum(np.linalg.norm(tops - mean, axis=1), _ROLL_SCALE)
     up = mean
     for _ in range(20):
-        weights = 1 / np.maximum(np.abs(rights @ up), _LEVEL)
+        weights = 1 / np.maximum(np.abs(rights @ up), _ROLL_SCALE)
         spread = (rights * weights[:, None]).T @ rights / weights.sum()
-        vectors = np.linalg.eigh(spread + _MEAN * (np.eye(3) - np.outer(mean, mean)))[1]
+        vectors = np.linalg.eigh(spread + _TOP_WEIGHT * (np.eye(3) - np.outer(mean, mean)))[1]
         up = vectors[:, 0] if vectors[:, 0] @ mean >= 0 else -vectors[:, 0]
     return up
 
 
-def _plane(points: np.ndarray, centers: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, float] | None:
-    """Normal of the level plane below the cameras with most points, and their share; None where none has enough."""
+def _fit_level_plane(points: np.ndarray, centers: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, float] | None:
+    """Fit the level plane below the cameras with most points. Returns its normal and the fraction of the points
+    on it, or None.
+    """
     rng = np.random.default_rng(0)
-    points = points if len(points) <= _POINTS else rng.choice(points, _POINTS, replace=False)
-    middle = np.median(points, axis=0)
-    thick = _THICK * float(np.median(np.linalg.norm(points - middle, axis=1)))
-    a, b, c = points[rng.integers(0, len(points), (3, _TRIPLES))]
+    points = points if len(points) <= _MAX_PLANE_POINTS else rng.choice(points, _MAX_PLANE_POINTS, replace=False)
+    center = np.median(points, axis=0)
+    thickness = _PLANE_THICKNESS * float(np.median(np.linalg.norm(points - center, axis=1)))
+    a, b, c = points[rng.integers(0, len(points), (3, _NUM_TRIPLES))]
     normals = np.cross(b - a, c - a)
     length = np.linalg.norm(normals, axis=1)
     normals = normals / np.maximum(length, 1e-300)[:, None]
     normals *= np.where(normals @ up < 0, -1.0, 1.0)[:, None]
-    level = (length > 0) & (normals @ up > _TILT)
+    level = (length > 0) & (normals @ up > _MIN_COSINE)
     best: tuple[int, np.ndarray, float] | None = None
     for normal, offset in zip(normals[level], np.sum(normals * a, axis=1)[level]):
         if np.mean(centers @ normal > offset) < 0.9:
             continue
-        held = int(np.count_nonzero(np.abs(points @ normal - offset) < thick))
-        if best is None or held > best[0]:
-            best = held, normal, offset
-    if best is None or best[0] < _SHARE * len(points):
+        count = int(np.count_nonzero(np.abs(points @ normal - offset) < thickness))
+        if best is None or count > best[0]:
+            best = count, normal, offset
+    if best is None or best[0] < _MIN_PLANE_FRACTION * len(points):
         return None
     _, normal, offset = best
     for _ in range(3):
-        on = points[np.abs(points @ normal - offset) < thick]
-        _, spread, axes = np.linalg.svd(on - on.mean(axis=0), full_matrices=False)
+        inliers = points[np.abs(points @ normal - offset) < thickness]
+        _, spread, axes = np.linalg.svd(inliers - inliers.mean(axis=0), full_matrices=False)
         if spread[1] < 0.2 * spread[0]:
-            return None  # an edge, through which many planes go
+            return None  # points on a line, which many planes contain
         normal = axes[2] if axes[2] @ up > 0 else -axes[2]
-        offset = float(on.mean(axis=0) @ normal)
-    if normal @ up < _TILT:
+        offset = float(inliers.mean(axis=0) @ normal)
+    if normal @ up < _MIN_COSINE:
         return None
-    return normal, float(np.mean(np.abs(points @ normal - offset) < thick))
+    return normal, float(np.mean(np.abs(points @ normal - offset) < thickness))

@@ -1,4 +1,4 @@
-"""A posed image set made ready: training views, held-out views and the box of the scene."""
+"""Preparation of a posed image set for training: training views, held-out views and the bounding box of the scene."""
 
 from __future__ import annotations
 
@@ -14,46 +14,57 @@ from nerg_mi.maths.geometry import AnyBox, Box, ContractedBox, intersect_box_num
 from . import cameras
 from .cameras import PosedCamera, pixel_directions, project
 from .colmap import UpEstimate
-from .images import PhotoView, load_usable_views, read_split, estimate_photo_up
+from .images import PhotoView, estimate_photo_up, load_usable_views, read_split
 from .posed import PosedImages, UnusedFrame
 
-# ---- Bounds ----
+# ---- Bounding box of a scene ----
 #
-# What cameras looked at: the box around it, from points on its surfaces or from the cameras alone, whether the
-# place ends there, and whether depth fits the cameras.
+# The box is estimated from surface points or from the cameras alone, and the scene is classified as bounded or
+# unbounded. Depth is checked against the cameras.
 
 
-# Cameras whose axes miss their common point by less than this look at one thing.
-_CONVERGING = np.radians(30)
-# So few points, or so many beyond either end of an axis, are no evidence of where a place ends.
-_MIN_POINTS, _OUTLIERS = 100, 0.005
-# Points within this share of the longest edge beyond the box of nearly all still count, as plain parts of a place have
-# few; all but this share of them at either end, which may be strays as well.
-_NEAR_BY, _FEWEST = 0.5, 0.0005
-# Of the points' longest edge, for what lies between them and the wall that they are on.
+# Cameras look at a common point if the median angle between their axes and the point is below this.
+_MAX_CONVERGENCE_ANGLE = np.radians(30)
+# Minimum number of points for an estimate, and the fraction of outliers at either end of an axis.
+_MIN_POINTS, _OUTLIER_FRACTION = 100, 0.005
+# Points within this fraction of the longest edge outside of the outlier-free box still count, because plain surfaces
+# have few points, except for this fraction at either end of an axis.
+_NEAR_MARGIN, _MIN_TAIL_FRACTION = 0.5, 0.0005
+# Margin around the points, relative to their longest edge.
 _MARGIN = 0.05
 
-# Of the points: so many beyond the box are strays, more are part of the place.
-_BEYOND = 0.02
-# Of the points, how many the core of an unbounded place holds, and how many times larger than the box that the cameras
-# bound, or smaller than the one that holds all but strays, it may then be.
-_CORE, _MOST_LARGER, _LEAST_SMALLER = 0.9, 4.0, 2.5
-# So many times larger may a box get that is to hold the cameras as well as the points.
-_FAR_OUTSIDE = 2.0
-# Of the cameras' extent, so many times as far may the median depth be.
-_FARTHEST_DEPTH = 100
-# Factors by which wrong units put depth too far or too near: of millimetres, centimetres, fifths of a millimetre.
-_WRONG_UNITS = (1e-3, 1e-2, 0.1, 0.2, 5.0, 10.0, 100.0, 1e3)
-# Views that are compared, and points of each.
-_COMPARED, _COMPARED_POINTS = 16, 100
-# Points agree where their distances differ by at most this; another unit is right where so many more of them agree.
-_AGREEING, _MORE = 0.05, 0.2
+# Maximum fraction of points outside of the box that are considered strays; more points belong to the scene.
+_MAX_STRAY_FRACTION = 0.02
+# Fraction of the points in the core of an unbounded scene, the maximum size of the core relative to the box of the
+# cameras, and the minimum size of the box of all points relative to the core.
+_CORE_FRACTION, _MAX_CORE_GROWTH, _MIN_CORE_SHRINKAGE = 0.9, 4.0, 2.5
+# Maximum growth of the box of the points when the cameras are included.
+_MAX_CAMERA_GROWTH = 2.0
+# Maximum median depth relative to the extent of the cameras.
+_MAX_DEPTH_RATIO = 100
+# Factors of common unit errors: millimetres, centimetres, fifths of a millimetre.
+_UNIT_FACTORS = (1e-3, 1e-2, 0.1, 0.2, 5.0, 10.0, 100.0, 1e3)
+# Number of compared views, and points per view.
+_COMPARED_VIEWS, _COMPARED_POINTS = 16, 100
+# Maximum relative difference of matching distances, and the increase in matches that confirms another unit.
+_DEPTH_TOLERANCE, _MIN_AGREEMENT_GAIN = 0.05, 0.2
 
 
 @dataclass(frozen=True)
 class SceneExtent:
-    """Where a place may hold density: ``box``, contracted where the place does not end there; ``how`` the box was
-    found, the end of a sentence; ``kind`` of the place, "object", "room" or "unbounded", and ``why``, a clause."""
+    """Region that may contain density.
+
+    Attributes
+    ----------
+    box
+        The box; contracted if the scene extends beyond it.
+    source
+        How the box was determined, as the end of a sentence.
+    kind
+        "object", "room" or "unbounded".
+    reason
+        Why the scene is of this kind, as a clause.
+    """
 
     box: AnyBox
     source: str
@@ -62,107 +73,136 @@ class SceneExtent:
 
 
 def estimate_extent(
-    cameras: list[PosedCamera], object_only: bool = False, points: np.ndarray | None = None, are_points_complete: bool = False
+    cameras: list[PosedCamera],
+    object_only: bool = False,
+    points: np.ndarray | None = None,
+    are_points_complete: bool = False,
 ) -> SceneExtent:
-    """The box around what ``cameras`` looked at, as `scene_box` finds it, and whether the place ends there.
+    """Estimate the box of the scene with `estimate_box`, and whether the scene ends there.
 
-    An object before nothing, ``object_only``, ends at its box, and so does a place without ``points`` (N, 3), on
-    surfaces, and one whose points lie within its box but for a few strays. Every other is unbounded: its box is the
-    core of a contracted one. So is a place whose box is over 2.5 times as large as what holds nine of ten points: a
-    few of them are far away. The core holds nine tenths of the points, but is at most four times as large as the box
-    that the cameras bound.
+    The scene ends at its box if it is an object (``object_only``), if there are no ``points``, or if all points except
+    a few strays are in the box. Otherwise it is unbounded, and its box is the core of a contracted one. A scene is also
+    unbounded if its box is over 2.5 times as large as the box of nine tenths of the points, which means that some
+    points are far away. The core contains nine tenths of the points, but is at most four times as large as the box from
+    the cameras.
 
-    A place that ends at its box holds its cameras too, or is contracted around its points where that would more than
-    double the box. Not so where the points are ``complete``, of all that the cameras see: nothing stands before them.
+    A bounded box also contains the cameras, or is contracted around the points if that would more than double its size.
+    This does not apply if ``are_points_complete``, because then nothing is between the cameras and the points.
+
+    Parameters
+    ----------
+    cameras
+        Cameras of the views.
+    object_only
+        Whether the images show an object without background.
+    points
+        Surface points (N, 3).
+    are_points_complete
+        Whether the points cover everything that the cameras see.
     """
-    box, how = estimate_box(cameras, object_only, points)
+    box, source = estimate_box(cameras, object_only, points)
     if object_only:
-        return SceneExtent(box, how, "object", "the photos show nothing behind it")
+        return SceneExtent(box, source, "object", "the photos show no background")
     if points is None or len(points) < _MIN_POINTS:
-        return SceneExtent(box, how, "room", "no points on surfaces tell whether there is more than its box")
-    beyond = float(np.mean(np.any((points < box.lower) | (points > box.upper), axis=1)))
-    why = f"{100 * beyond:.1f} % of the points on surfaces lie beyond its box"
-    if beyond > _BEYOND:
-        # What the cameras bound has cut points off.
-        away = float(np.quantile(np.abs(points - box.center).max(axis=1), _CORE))
-        half = float(np.clip(away, 0.5 * box.side, 0.5 * _MOST_LARGER * box.side))
-        core = Box(tuple(np.subtract(box.center, half)), tuple(np.add(box.center, half)))
-        return SceneExtent(ContractedBox(core), f"{how}, nine tenths of them", "unbounded", why)
-    lower, upper = np.quantile(points, [0.5 - 0.5 * _CORE, 0.5 + 0.5 * _CORE], axis=0)
-    if box.side > _LEAST_SMALLER * float(np.max(upper - lower)):
+        return SceneExtent(
+            box, source, "room", "there are no surface points to show whether the scene extends beyond its box"
+        )
+    outside_fraction = float(np.mean(np.any((points < box.lower) | (points > box.upper), axis=1)))
+    reason = f"{100 * outside_fraction:.1f} % of the surface points are outside of its box"
+    if outside_fraction > _MAX_STRAY_FRACTION:
+        # The box from the cameras excludes some points.
+        core_distance = float(np.quantile(np.abs(points - box.center).max(axis=1), _CORE_FRACTION))
+        half_side = float(np.clip(core_distance, 0.5 * box.side, 0.5 * _MAX_CORE_GROWTH * box.side))
+        core = Box(tuple(np.subtract(box.center, half_side)), tuple(np.add(box.center, half_side)))
+        return SceneExtent(ContractedBox(core), f"{source}, nine tenths of the points", "unbounded", reason)
+    lower, upper = np.quantile(points, [0.5 - 0.5 * _CORE_FRACTION, 0.5 + 0.5 * _CORE_FRACTION], axis=0)
+    if box.side > _MIN_CORE_SHRINKAGE * float(np.max(upper - lower)):
         margin = _MARGIN * float(np.max(upper - lower))
-        why = f"a box two fifths as large as one around all {len(points)} points holds nine tenths of them"
+        reason = f"a box of two fifths of the size of the box of all {len(points)} points contains nine tenths of them"
         core = Box(tuple(lower - margin), tuple(upper + margin))
-        return SceneExtent(ContractedBox(core), f"around nine tenths of {len(points)} points on surfaces", "unbounded", why)
-    return SceneExtent(box, how, "room", why) if are_points_complete else _with_cameras(box, cameras, how, why)
+        return SceneExtent(
+            ContractedBox(core), f"around nine tenths of {len(points)} surface points", "unbounded", reason
+        )
+    return (
+        SceneExtent(box, source, "room", reason)
+        if are_points_complete
+        else _include_cameras(box, cameras, source, reason)
+    )
 
 
-def _with_cameras(box: Box, cameras: list[PosedCamera], how: str, why: str) -> SceneExtent:
-    """A place whose points lie within ``box``, and its ``cameras``: what stands between them and the points may have
-    none, and is seen."""
+def _include_cameras(box: Box, cameras: list[PosedCamera], source: str, reason: str) -> SceneExtent:
+    """Extend ``box``, which contains the points, to the cameras. Visible matter between them may have no points."""
     centers = np.array([c.center for c in cameras])
     lower, upper = np.minimum(box.lower, centers.min(axis=0)), np.maximum(box.upper, centers.max(axis=0))
-    whole = Box(tuple(lower), tuple(upper))
-    if whole.side > _FAR_OUTSIDE * box.side:
-        why = f"{why}, but the cameras stand far outside of it"
-        return SceneExtent(ContractedBox(box), how, "unbounded", why)
-    grown = np.any(lower < box.lower) or np.any(upper > box.upper)
-    return SceneExtent(whole, f"{how} and the cameras" if grown else how, "room", why)
+    union = Box(tuple(lower), tuple(upper))
+    if union.side > _MAX_CAMERA_GROWTH * box.side:
+        reason = f"{reason}, but the cameras are far outside of it"
+        return SceneExtent(ContractedBox(box), source, "unbounded", reason)
+    is_grown = np.any(lower < box.lower) or np.any(upper > box.upper)
+    return SceneExtent(union, f"{source} and the cameras" if is_grown else source, "room", reason)
 
 
 def estimate_box(
     cameras: list[PosedCamera], object_only: bool = False, points: np.ndarray | None = None
 ) -> tuple[Box, str]:
-    """A box in the cameras' coordinates, and a sentence saying how it was found.
+    """Estimate the bounding box in the coordinates of the cameras. Returns the box and its source, as the end of a
+    sentence.
 
-    ``points`` (N, 3) on surfaces: the box that holds them but for strays, with a margin; cameras that stand around
-    something also bound it, as below, because points may lie far behind it. Without points, cameras that look at a
-    common point: a cube around that point, which holds the cameras and as much again behind the point as they stand
-    away from it, or, with ``object_only`` (pictures with alpha, without background), the region that the frusta share.
-    Other cameras stand inside of what they see: the box of their centres, grown on every side by half of its longest
+    With surface ``points`` (N, 3), the box contains them except for strays, with a margin. Cameras that look at a
+    common point also bound it, as follows, because points may be far behind it.
+
+    Without points, and with cameras that look at a common point, the box is a cube around that point. It contains the
+    cameras, and as much space behind the point. With ``object_only`` (images with alpha, without background), it is the
+    region that all frusta share.
+
+    Other cameras are inside the scene: the box is that of their centres, extended on each side by half of its longest
     edge.
     """
     centers = np.array([c.center for c in cameras])
     axes = np.array([c.axis for c in cameras])
-    focus, angle = _focus(centers, axes)
-    around = None
-    if len(cameras) >= 2 and np.median(angle) < _CONVERGING:
+    focus, angle = _find_focus(centers, axes)
+    bounds = None
+    if len(cameras) >= 2 and np.median(angle) < _MAX_CONVERGENCE_ANGLE:
         distance = np.linalg.norm(centers - focus, axis=1)
         if object_only:
-            half = float(np.max(distance * [_half_angle_tangent(c) for c in cameras]))
-            around = focus - half, focus + half, "the region that the views share"
+            half_side = float(np.max(distance * [_half_angle_tangent(c) for c in cameras]))
+            bounds = focus - half_side, focus + half_side, "the region that all views share"
         else:
-            half = 1.25 * float(distance.max())
-            around = focus - half, focus + half, "around the point that the cameras look at"
+            half_side = 1.25 * float(distance.max())
+            bounds = focus - half_side, focus + half_side, "around the point that the cameras look at"
     if points is not None and len(points) >= _MIN_POINTS:
-        lower, upper = _without_strays(points)
+        lower, upper = _bound_without_strays(points)
         margin = _MARGIN * float(np.max(upper - lower))
         lower, upper = lower - margin, upper + margin
-        if around is not None:
-            lower, upper = np.maximum(lower, around[0]), np.minimum(upper, around[1])
+        if bounds is not None:
+            lower, upper = np.maximum(lower, bounds[0]), np.minimum(upper, bounds[1])
         if np.all(upper > lower):
-            return Box(tuple(lower), tuple(upper)), f"around {len(points)} points on surfaces"
-    if around is not None:
-        return Box(tuple(around[0]), tuple(around[1])), around[2]
+            return Box(tuple(lower), tuple(upper)), f"around {len(points)} surface points"
+    if bounds is not None:
+        return Box(tuple(bounds[0]), tuple(bounds[1])), bounds[2]
     lower, upper = centers.min(axis=0), centers.max(axis=0)
     margin = 0.5 * float(np.max(upper - lower))
     if margin == 0:
-        raise NergError("all cameras stand at one point, so that no scene box can be guessed; give one with --aabb")
+        raise NergError(
+            "all cameras are at the same position, so the scene box cannot be estimated; set it with --aabb"
+        )
     return Box(tuple(lower - margin), tuple(upper + margin)), "around the cameras"
 
 
-def _without_strays(points: np.ndarray) -> np.ndarray:
-    """Lower and upper corner (2, 3) of the box around ``points``, but for those far beyond what nearly all lie in."""
-    lower, upper = np.quantile(points, [_OUTLIERS, 1 - _OUTLIERS], axis=0)
-    around = _NEAR_BY * float(np.max(upper - lower))
-    near = points[np.all((points >= lower - around) & (points <= upper + around), axis=1)]
-    return np.quantile(near, [_FEWEST, 1 - _FEWEST], axis=0)
+def _bound_without_strays(points: np.ndarray) -> np.ndarray:
+    """Return the corners (2, 3) of the box of ``points``, without points far outside of the box of nearly all of
+    them.
+    """
+    lower, upper = np.quantile(points, [_OUTLIER_FRACTION, 1 - _OUTLIER_FRACTION], axis=0)
+    margin = _NEAR_MARGIN * float(np.max(upper - lower))
+    near = points[np.all((points >= lower - margin) & (points <= upper + margin), axis=1)]
+    return np.quantile(near, [_MIN_TAIL_FRACTION, 1 - _MIN_TAIL_FRACTION], axis=0)
 
 
-def _focus(centers: np.ndarray, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Point nearest to all viewing axes (least squares), and each camera's angle to it in radians."""
+def _find_focus(centers: np.ndarray, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the point nearest to all viewing axes (least squares), and the angle of each camera to it in radians."""
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    # Parallel axes have no nearest point; lstsq then returns the one of least norm, at large angles.
+    # Parallel axes have no unique nearest point; lstsq then returns the one with minimum norm, at large angles.
     focus = np.linalg.lstsq(across.sum(axis=0), np.einsum("nij,nj->i", across, centers), rcond=1e-6)[0]
     to = focus - centers
     length = np.maximum(np.linalg.norm(to, axis=1), 1e-12)
@@ -175,27 +215,31 @@ def _half_angle_tangent(camera: PosedCamera) -> float:
 
 
 def find_unmatched(cameras: list[PosedCamera], box: AnyBox, grid: int = 4, depths: int = 12) -> list[int]:
-    """Cameras that share nothing within ``box`` with any other: no sample point of their pictures is in another's.
+    """Return the indices of cameras whose images share no point within ``box`` with any other image.
 
-    ``grid`` by ``grid`` pixels of each are followed through the box and looked for at ``depths`` places.
+    ``grid`` by ``grid`` pixels of each image are sampled at ``depths`` distances within the box.
     """
     centers = np.array([c.center for c in cameras])
     order = np.arange(len(cameras))
-    out = []
+    unmatched = []
     for k, camera in enumerate(cameras):
-        p = _samples(camera, box, grid, depths)
-        # Neighbours first: one that sees a point ends the search.
-        others = order[np.argsort(np.linalg.norm(centers - centers[k], axis=1), kind="stable")]
-        if not any(_sees(cameras[j], p) for j in others if j != k):
-            out.append(k)
-    return out
+        p = _sample_rays(camera, box, grid, depths)
+        # Nearest cameras first: the search ends at the first camera that sees a point.
+        neighbors = order[np.argsort(np.linalg.norm(centers - centers[k], axis=1), kind="stable")]
+        if not any(_sees_any(cameras[j], p) for j in neighbors if j != k):
+            unmatched.append(k)
+    return unmatched
 
 
-def _samples(camera: PosedCamera, box: AnyBox, grid: int, depths: int) -> np.ndarray:
-    """Points (N, 3) within the box on rays of the picture."""
+def _sample_rays(camera: PosedCamera, box: AnyBox, grid: int, depths: int) -> np.ndarray:
+    """Sample points (N, 3) within the box along rays of the camera."""
     i = camera.intrinsics
     u, v = np.meshgrid((np.arange(grid) + 0.5) / grid * i.width, (np.arange(grid) + 0.5) / grid * i.height)
-    d = cameras.image_to_directions(np.stack([(u.ravel() - i.cx) / i.fx, (v.ravel() - i.cy) / i.fy], axis=-1), i) * [1, -1, -1]
+    d = cameras.image_to_directions(np.stack([(u.ravel() - i.cx) / i.fx, (v.ravel() - i.cy) / i.fy], axis=-1), i) * [
+        1,
+        -1,
+        -1,
+    ]
     d = d @ camera.to_world[:3, :3].T
     near, far = intersect_box_numpy(camera.center, d, box.lower, box.upper)
     near = np.maximum(near, 0)
@@ -204,105 +248,106 @@ def _samples(camera: PosedCamera, box: AnyBox, grid: int, depths: int) -> np.nda
     return (camera.center + t[..., None] * d[hit, None]).reshape(-1, 3)
 
 
-def _sees(camera: PosedCamera, points: np.ndarray) -> bool:
+def _sees_any(camera: PosedCamera, points: np.ndarray) -> bool:
     if not len(points):
         return False
-    at, shown = project(points, camera)
+    pixels, is_visible = project(points, camera)
     i = camera.intrinsics
-    return bool(np.any(shown & np.all((at >= 0) & (at <= [i.width, i.height]), axis=1)))
+    return bool(np.any(is_visible & np.all((pixels >= 0) & (pixels <= [i.width, i.height]), axis=1)))
 
 
 def explain_wrong_depth(views: list[tuple[PosedCamera, np.ndarray]]) -> str | None:
-    """Why depth is in other units than its camera; None where it may be in the same. ``seen``: cameras, each with its
-    depth (h, w), distances along its rays.
+    """Return why the depth does not match the units of the cameras; None if it may match.
 
-    In the right unit views agree on where a point is. In much too large a unit all of them are at one place, compared
-    with their depth, so that what merely looks alike agrees in every larger unit as well: that is no evidence.
+    ``views``: cameras, each with its depth (h, w) as distances along its rays. In the correct unit, views agree on the
+    positions of points. In a much too large unit, all cameras are at nearly one position relative to the depth. Similar
+    views then agree in each larger unit too, which is no evidence.
     """
-    picked = [views[k] for k in np.unique(np.linspace(0, len(views) - 1, _COMPARED).astype(int))]
-    views = [(c, d, depth_points(c, d, _COMPARED_POINTS) - c.center) for c, d in picked]
-    now = _agreement(views, 1.0)
-    if now <= 1 - _MORE:
-        best, factor = max((_agreement(views, f), f) for f in _WRONG_UNITS)
-        if best >= _MORE + max(now, _agreement(views, 10 * factor)):
+    selected = [views[k] for k in np.unique(np.linspace(0, len(views) - 1, _COMPARED_VIEWS).astype(int))]
+    views = [(c, d, depth_points(c, d, _COMPARED_POINTS) - c.center) for c, d in selected]
+    agreement = _compute_agreement(views, 1.0)
+    if agreement <= 1 - _MIN_AGREEMENT_GAIN:
+        best, factor = max((_compute_agreement(views, f), f) for f in _UNIT_FACTORS)
+        if best >= _MIN_AGREEMENT_GAIN + max(agreement, _compute_agreement(views, 10 * factor)):
             return (
-                f"{best:.0%} of its points agree with the depth of other views if it is multiplied by {factor:g}, and "
-                f"{now:.0%} as it is"
+                f"{best:.0%} of its points agree with the depth of other views after multiplication by {factor:g}, but "
+                f"{agreement:.0%} without it"
             )
     extent = float(np.linalg.norm(np.ptp([c.center for c, _ in views], axis=0)))
     median = float(np.median([np.median(d[d > 0]) for _, d in views if (d > 0).any()] or [0.0]))
-    if extent > 0 and median > _FARTHEST_DEPTH * extent:
-        return f"its median is {median:.3g} units, and the cameras spread over {extent:.3g}"
+    if extent > 0 and median > _MAX_DEPTH_RATIO * extent:
+        return f"its median is {median:.3g} units, but the cameras span {extent:.3g}"
     return None
 
 
-def _agreement(views: list[tuple[PosedCamera, np.ndarray, np.ndarray]], factor: float) -> float:
-    """Of the points that one of ``views`` sees by its depth times ``factor``, and that are within the picture of
-    another, the fraction that lies where this sees something by its own. Of each view: camera, depth (h, w), and
-    points (N, 3) that it sees, from its centre."""
+def _compute_agreement(views: list[tuple[PosedCamera, np.ndarray, np.ndarray]], factor: float) -> float:
+    """Return the fraction of depth points, scaled by ``factor``, that agree with the depth of other views that see
+    them.
+
+    Each view: camera, depth (h, w), and points (N, 3) from its depth relative to its centre.
+    """
     points = [camera.center + factor * offset for camera, _, offset in views]
     count = agreeing = 0
     for k, (camera, depth, _) in enumerate(views):
-        others = np.concatenate([np.zeros((0, 3)), *points[:k], *points[k + 1 :]])
-        at, shown = project(others, camera)
-        shown &= np.all((at >= 0) & (at < depth.shape[::-1]), axis=1)
-        x, y = at[shown].astype(int).T
-        seen, expected = factor * depth[y, x], np.linalg.norm(others[shown] - camera.center, axis=1)
-        count += int((seen > 0).sum())
-        agreeing += int(np.sum((seen > 0) & (np.abs(seen - expected) <= _AGREEING * expected)))
+        other_points = np.concatenate([np.zeros((0, 3)), *points[:k], *points[k + 1 :]])
+        pixels, is_visible = project(other_points, camera)
+        is_visible &= np.all((pixels >= 0) & (pixels < depth.shape[::-1]), axis=1)
+        x, y = pixels[is_visible].astype(int).T
+        measured, expected = factor * depth[y, x], np.linalg.norm(other_points[is_visible] - camera.center, axis=1)
+        count += int((measured > 0).sum())
+        agreeing += int(np.sum((measured > 0) & (np.abs(measured - expected) <= _DEPTH_TOLERANCE * expected)))
     return agreeing / count if count else 0.0
 
 
 def depth_points(camera: PosedCamera, depth: np.ndarray, max_points: int) -> np.ndarray:
-    """World points (N, 3) that ``camera`` sees by its ``depth`` (h, w), some ``most`` evenly over its pixels."""
+    """Return about ``max_points`` world points (N, 3) from the ``depth`` (h, w) of ``camera``, evenly spaced in
+    the image.
+    """
     step = max(1, int(np.sqrt(depth.size / max_points)))
     t = depth[::step, ::step]
     d = pixel_directions(camera.intrinsics)[::step, ::step][t > 0] @ camera.to_world[:3, :3].T
     return camera.center + d * t[t > 0][:, None]
 
 
-# ---- Dataset ----
-#
-# A posed image set made ready: training views, held-out views and the scene box.
+# ---- Data set ----
 
-
-# A surface on a face of the box needs cells behind it: rays end at the box, and a half step before it nothing can
-# absorb.
-_PAD = 1 / 80
-# Of each view's depth, at most so many points help to find the box.
-_DEPTH_POINTS = 2000
-# Up by how cameras are held, where no floor helps, is not better known than to so many degrees.
-_LEVEL = 10.0
+# Padding of a specified box, relative to its size. Rays end at the box, and a surface on its face needs cells behind
+# it.
+_RELATIVE_PADDING = 1 / 80
+# Maximum number of depth points per view for the estimate of the box.
+_DEPTH_POINTS_PER_VIEW = 2000
+# Deviation from +z in degrees that is within the precision of the up estimate.
+_MAX_TILT = 10.0
 _KINDS = {
-    "object": "an object before nothing",
-    "room": "a bounded place",
-    "unbounded": "a place without an end, resolved best within its box and contracted around it",
+    "object": "an object without background",
+    "room": "a bounded scene",
+    "unbounded": "an unbounded scene, with full resolution within its box and contracted outside of it",
 }
 
 
 @dataclass(frozen=True)
 class Dataset:
-    """Views in the coordinates asked for, and what is known of the place that they show."""
+    """Views in the requested coordinates, and information about the scene."""
 
-    # To train on.
+    # Training views.
     train: list[PhotoView]
-    # To score on, never to learn from.
+    # Views for evaluation, which are not used in training.
     held_out: list[PhotoView]
-    # Where density may be, contracted where the place does not end at the box that was found.
+    # Box that may contain density; contracted if the scene is unbounded.
     box: AnyBox
-    # How the box was found, the end of a sentence.
+    # How the box was determined, as the end of a sentence.
     box_source: str
-    # Frames that were left out, each with its reason.
+    # Unused frames with reasons.
     unused: list[UnusedFrame]
-    # For provenance (JSON).
+    # Provenance (JSON).
     source: dict
-    # Sentences about frames that are used with something missing.
+    # Sentences about frames that are used with missing data.
     notes: list[str] | tuple = ()
-    # A sentence on the length of a unit.
+    # A sentence about the length of a unit.
     unit_note: str = ""
-    # What kind of place it was taken for, and why, a sentence.
+    # A sentence about the kind of scene, with the reason.
     kind_note: str = ""
-    # Which way is up, a sentence.
+    # A sentence about the up direction.
     up_note: str = ""
 
 
@@ -318,40 +363,58 @@ def open_dataset(
     allow_outside: bool = False,
     unbounded: bool | None = None,
 ) -> Dataset:
-    """Read the data set ``path``: a folder with a transforms file or a COLMAP model, or one of these itself.
+    """Read a posed image set and prepare it for training.
 
-    ``holdout``, ``coordinates``, ``scale``, ``allow_outside``: as `read_split` has them. ``width``, ``downscale``: size
-    of the pictures. ``aabb``: six numbers x0, y0, z0, x1, y1, z1 bounding what is seen, in the coordinates asked for;
-    else "aabb" of the file, else a guess from points on surfaces (COLMAP's, or from depth) or from the cameras.
-    ``unbounded``: whether there is anything to be seen beyond that box; None: what the points tell, and no where there
-    are none, for a box that is given, by hand or by the file, and for pictures with alpha. ``depth``: read the depth
-    files that the frames name.
+    Parameters
+    ----------
+    path
+        Folder with a transforms file or a COLMAP model, or one of these.
+    holdout, coordinates, scale, allow_outside
+        As in `read_split`.
+    width, downscale
+        Image size: width in pixels, or a divisor.
+    aabb
+        Bounding box x0, y0, z0, x1, y1, z1 in the requested coordinates. Default: "aabb" of the file, or an estimate
+        from surface points (of COLMAP, or from depth) or from the cameras.
+    depth
+        Whether to read depth files.
+    unbounded
+        Whether the scene extends beyond the box. None: estimated from surface points; false without points, for a
+        specified box, and for images with alpha.
 
-    Frames that cannot be used are left out and listed; `NergError`, naming file and frame, when none can.
+    Returns
+    -------
+    Dataset
+        The data set. Frames that cannot be used are listed.
+
+    Raises
+    ------
+    NergError
+        With file and frame, if no frame can be used.
     """
     split = read_split(path, holdout, coordinates, scale, allow_outside)
-    train, bad = load_usable_views(split.posed.frames, width, downscale, depth)
+    train, unusable = load_usable_views(split.posed.frames, width, downscale, depth)
     if not train:
         raise NergError(
-            f'none of the {len(bad)} training frames of "{split.posed.path}" can be used; the first, '
-            f'"{bad[0].name}": {bad[0].reason}'
+            f'none of the {len(unusable)} training frames of "{split.posed.path}" can be used; the first, '
+            f'"{unusable[0].name}": {unusable[0].reason}'
         )
     _check_depth(split.posed, train)
-    held_out, bad_held = load_usable_views(split.held_out, width, downscale, depth)
+    held_out, unusable_held_out = load_usable_views(split.held_out, width, downscale, depth)
     masks = _describe_masks([*train, *held_out])
-    extent = _extent(split.posed, train, aabb, unbounded)
-    alone = find_unmatched([v.camera for v in train], extent.box) if len(train) > 1 else []
-    if len(alone) == len(train):
+    extent = _choose_extent(split.posed, train, aabb, unbounded)
+    unmatched = find_unmatched([v.camera for v in train], extent.box) if len(train) > 1 else []
+    if len(unmatched) == len(train):
         raise NergError(
-            f'no two of the {len(train)} training frames of "{split.posed.path}" (the first: "{train[0].name}") look '
-            f"at the same place within the box {_corners(extent.box)}; check the poses, or give a box that holds what "
-            "they show with --aabb"
+            f'no two of the {len(train)} training frames of "{split.posed.path}" (the first: "{train[0].name}") show '
+            f"the same part of the box {_format_corners(extent.box)}; check the poses, or set a box that contains the "
+            "scene with --aabb"
         )
-    if alone:
-        bad += [UnusedFrame(train[k].name, "no other frame looks at what it shows") for k in alone]
-        train = [v for k, v in enumerate(train) if k not in set(alone)]
-        extent = _extent(split.posed, train, aabb, unbounded)
-    unused = [*split.posed.unused, *bad, *bad_held]
+    if unmatched:
+        unusable += [UnusedFrame(train[k].name, "no other frame shows the same part of the scene") for k in unmatched]
+        train = [v for k, v in enumerate(train) if k not in set(unmatched)]
+        extent = _choose_extent(split.posed, train, aabb, unbounded)
+    unused = [*split.posed.unused, *unusable, *unusable_held_out]
     source = {
         "dataset": resolve_path(split.posed.path).parent.name,
         "transforms": split.posed.path.name,
@@ -367,95 +430,111 @@ def open_dataset(
     if up.is_reliable:
         source["up"] = [round(float(x), 6) for x in up.direction]
     kind = f"{_KINDS[extent.kind]}: {extent.reason}"
-    unit = _unit(split.posed, train, extent.box.core, scale)
+    unit = _describe_unit(split.posed, train, extent.box.core, scale)
     return Dataset(
-        train, held_out, extent.box, extent.source, unused, source, [*split.posed.notes, *masks], unit, kind, _up(up)
+        train,
+        held_out,
+        extent.box,
+        extent.source,
+        unused,
+        source,
+        [*split.posed.notes, *masks],
+        unit,
+        kind,
+        _describe_up(up),
     )
 
 
 def _check_depth(posed: PosedImages, views: list[PhotoView]) -> None:
-    """Raise `NergError` for depth in other units than the cameras'."""
-    seen = [(v.camera, v.depth) for v in views if v.depth is not None]
-    reason = explain_wrong_depth(seen) if seen else None
+    """Raise `NergError` if the unit of the depth differs from that of the cameras."""
+    views_with_depth = [(v.camera, v.depth) for v in views if v.depth is not None]
+    reason = explain_wrong_depth(views_with_depth) if views_with_depth else None
     if reason is not None:
         raise NergError(
-            f'the depth of "{posed.path}" does not fit its cameras: {reason}; correct "depth_unit_scale_factor", the '
-            "metres of one step of its depth files (default: 0.001, of EXR 1), or leave depth out with --no-depth"
+            f'the depth of "{posed.path}" does not match its cameras: {reason}; correct "depth_unit_scale_factor", the '
+            "length of a unit of the depth files in metres (default: 0.001, for EXR 1), or disable depth with "
+            "--no-depth"
         )
 
 
 def _describe_masks(views: list[PhotoView]) -> list[str]:
-    """A sentence on what the masks of ``views`` leave out, where there are any."""
+    """Return a sentence about the pixels that masks exclude, if there are any masks."""
     fractions = [v.masked_fraction for v in views if v.masked_fraction is not None]
     if not fractions:
         return []
     if not any(fractions):
-        return [f"the masks of all {len(fractions)} frames that have one leave out nothing: are black and white right?"]
-    return [f"masks leave out {np.mean(fractions):.1%} of the pixels of {len(fractions)} frames"]
+        return [f"the {len(fractions)} masks exclude no pixels: are black and white swapped?"]
+    return [f"masks exclude {np.mean(fractions):.1%} of the pixels of {len(fractions)} frames"]
 
 
-def _extent(posed: PosedImages, views: list[PhotoView], aabb, unbounded: bool | None) -> SceneExtent:
-    """Where density may be: the box that is given, or the one that is found; contracted as asked for, or as found."""
-    extent = _found(posed, views, aabb)
+def _choose_extent(posed: PosedImages, views: list[PhotoView], aabb, unbounded: bool | None) -> SceneExtent:
+    """Return the specified or estimated box, contracted as requested or estimated."""
+    extent = _find_extent(posed, views, aabb)
     if unbounded is None or unbounded == extent.box.is_contracted:
         return extent
     core = extent.box.core
     if unbounded:
-        return SceneExtent(ContractedBox(core), extent.source, "unbounded", "as asked for")
-    return SceneExtent(core, extent.source, "room", "it is to end at its box, as asked for")
+        return SceneExtent(ContractedBox(core), extent.source, "unbounded", "as requested")
+    return SceneExtent(core, extent.source, "room", "it ends at its box, as requested")
 
 
-def _found(posed: PosedImages, views: list[PhotoView], aabb) -> SceneExtent:
+def _find_extent(posed: PosedImages, views: list[PhotoView], aabb) -> SceneExtent:
     if aabb is not None:
         if len(aabb) != 6:
             raise NergError(f"aabb needs the six numbers x0,y0,z0,x1,y1,z1, got {len(aabb)}")
-        given, source = np.reshape(np.asarray(aabb, float), (2, 3)), "as given"
+        corners, source = np.reshape(np.asarray(aabb, float), (2, 3)), "as specified"
     elif posed.aabb is not None:
-        given, source = posed.aabb, f'"aabb" of {posed.path.name}'
+        corners, source = posed.aabb, f'"aabb" of {posed.path.name}'
     else:
-        seen = None if posed.points is not None else _depth_points(views)
-        points, cutout = posed.points if seen is None else seen, all(v.has_alpha for v in views)
-        return estimate_extent([v.camera for v in views], cutout, points, are_points_complete=seen is not None)
-    tight = Box(tuple(given[0]), tuple(given[1]))
-    pad = _PAD * tight.side
-    box, how = Box(tuple(given[0] - pad), tuple(given[1] + pad)), f"{source}, grown by {pad:.3g} on every side"
+        depth_points_all = None if posed.points is not None else _collect_depth_points(views)
+        points, is_object_only = (
+            posed.points if depth_points_all is None else depth_points_all,
+            all(v.has_alpha for v in views),
+        )
+        return estimate_extent(
+            [v.camera for v in views], is_object_only, points, are_points_complete=depth_points_all is not None
+        )
+    box_unpadded = Box(tuple(corners[0]), tuple(corners[1]))
+    pad = _RELATIVE_PADDING * box_unpadded.side
+    box, how = Box(tuple(corners[0] - pad), tuple(corners[1] + pad)), f"{source}, padded by {pad:.3g} on each side"
     return SceneExtent(box, how, "room", "it ends at its box")
 
 
-def _depth_points(views: list[PhotoView]) -> np.ndarray | None:
-    """World points that views with depth see, evenly over their pixels; None where a view has no depth."""
+def _collect_depth_points(views: list[PhotoView]) -> np.ndarray | None:
+    """Return world points from the depth of all views; None if a view has no depth."""
     depths = [v.depth for v in views if v.depth is not None]
     if len(depths) < len(views):
         return None
-    return np.concatenate([depth_points(v.camera, t, _DEPTH_POINTS) for v, t in zip(views, depths)])
+    return np.concatenate([depth_points(v.camera, t, _DEPTH_POINTS_PER_VIEW) for v, t in zip(views, depths)])
 
 
-def _corners(box: AnyBox) -> str:
+def _format_corners(box: AnyBox) -> str:
     return " to ".join("(" + ", ".join(f"{x:.3g}" for x in c) + ")" for c in (box.lower, box.upper))
 
 
-def _up(up: UpEstimate) -> str:
-    """What is known of up, and what to do where it is not +z."""
+def _describe_up(up: UpEstimate) -> str:
+    """Describe the up direction, and what to do if it is not +z."""
     if not up.is_reliable:
-        return f"the cameras do not agree on what is up (rolled by {up.median_roll:.0f} degrees, median)"
+        return f"the cameras do not agree on the up direction (median roll {up.median_roll:.0f} degrees)"
     off = float(np.degrees(np.arccos(np.clip(up.direction[2], -1, 1))))
-    if off <= _LEVEL:
+    if off <= _MAX_TILT:
         return f"up is +z to {off:.1f} degrees ({up})"
     direction = ", ".join(f"{x:.2f}" for x in up.direction)
     return (
-        f"up is ({direction}), {off:.0f} degrees from +z, which it is for tracking ({up}); --coordinates upright turns "
-        "the place"
+        f"up is ({direction}), {off:.0f} degrees from +z, which tracking data requires ({up}); --coordinates upright "
+        "rotates "
+        "the scene"
     )
 
 
-def _unit(posed: PosedImages, views: list[PhotoView], box: AnyBox, scale: float) -> str:
-    """What is known of the length of a unit."""
+def _describe_unit(posed: PosedImages, views: list[PhotoView], box: AnyBox, scale: float) -> str:
+    """Describe the length of a unit."""
     centers = np.array([v.camera.center for v in views])
     size = " x ".join(f"{u - l:.3g}" for l, u in zip(box.lower, box.upper))
     spread = " x ".join(f"{x:.3g}" for x in np.ptp(centers, axis=0))
-    extent = f"the box measures {size} units, the cameras spread over {spread}"
+    extent = f"the box measures {size} units, the cameras span {spread}"
     if scale != 1:
-        return f"{extent}; a unit of the data set counts {scale:g}"
+        return f"{extent}; a unit of the data set is scaled to {scale:g}"
     if any(f.depth is not None for f in posed.frames):
-        return f"{extent}; a unit is a metre if the depth files, by their scale factor, are in metres"
-    return f"{extent}; if a unit is not a metre, give its length in metres with --scale"
+        return f"{extent}; a unit is a metre if the scale factor of the depth files is in metres"
+    return f"{extent}; if a unit is not a metre, set its length in metres with --scale"

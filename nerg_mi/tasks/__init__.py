@@ -1,6 +1,6 @@
-"""Long work in parts: `task` names them by all that they depend on, `store` keeps their outputs, and `engines` run them
-here, in processes of this machine or on a Dask cluster.
+"""Parallel and resumable jobs: `task` defines the parts and their keys, `store` keeps their outputs, and `engines` run
+them in this process, in processes of this machine, or on a Dask cluster.
 
-A job makes a `task.Plan` and takes the outputs of its parts, in its order, from `engines.run_plan`; what the store
-holds already is not made again. An engine decides where a part runs, and never what comes of it.
+A job creates a `task.Plan` and receives the outputs of its parts in order from `engines.run_plan`. Outputs that are
+already in the store are reused. The choice of the engine does not affect the results.
 """

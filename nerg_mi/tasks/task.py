@@ -1,9 +1,9 @@
-"""Parts of long work: what each of them depends on, and the key by which its output is found again.
+"""Parts of a job and the keys under which their outputs are stored.
 
-A part is ``work(common, value, output)``, where ``common`` is the same for all parts of a job. Both are plain values:
-frozen dataclasses of options or settings, tuples, numbers, texts, arrays and paths. The key is the digest of all of it,
-of paths by the bytes that lie there; options that are declared with ``changes_result=False`` are reset to their
-defaults before, so that the work cannot depend on what its key leaves out.
+A part is a call ``work(common, value, output)``, where ``common`` is the same for all parts of the job. Both values are
+plain data: frozen dataclasses of options or settings, tuples, numbers, strings, arrays and paths. The key is a digest
+of all of it; a path contributes the bytes of its file. Options that are declared with ``changes_result=False`` are
+reset to their defaults before the call, so that the output cannot depend on values that are not in the key.
 """
 
 from __future__ import annotations
@@ -29,22 +29,22 @@ from nerg_mi.files.atomic import file_sha256
 from nerg_mi.ranges import CHANGES_RESULT
 
 FORMAT = 2
-"""Version of what a key is made of, and of the files in a store."""
+"""Version of the contents of a key, and of the files in a store."""
 
 FOLDER_SUFFIX = "/"
-"""The suffix of outputs that are folders."""
+"""Suffix of outputs that are folders."""
 
 RENDER_LIBRARIES = ("mitsuba", "drjit", "numpy")
-"""Distributions on whose versions pictures and trainings depend."""
+"""Distributions whose versions affect images and trainings."""
 
 MAX_PARTS = 500_000
-"""So many parts a job may have; each should last a second or more, so that this is a week of work."""
+"""Maximum number of parts of a job. A part should take a second or more, so that this is about a week of work."""
 
 TaskFunction = Callable[[Any, Any, Path], Mapping[str, Any] | None]
-"""What runs a part: ``work(common, value, output)`` writes the file ``output``, or fills that folder, which is there
-and empty. It may return notes, a few values as JSON has them. A function of a module, since processes find it by its
-name. Output and notes are the same for the same arguments, in any process and in any order; an error that the user can
-correct is a `NergError`."""
+"""Function that computes a part: ``work(common, value, output)`` writes the file ``output``, or fills that folder,
+which exists and is empty. It may return notes: a few JSON values. It must be a module-level function, because processes
+import it by name. It must be deterministic, in any process and in any order. Errors that the user can fix are
+`NergError`."""
 
 
 # ---- Files ----
@@ -52,8 +52,10 @@ correct is a `NergError`."""
 
 @dataclass(frozen=True)
 class FileGroup:
-    """A file, or folder, ``path``, with ``all`` files that are read because of it: they are named by where they lie to
-    each other, and laid out alike where a worker has to be sent them."""
+    """A file or folder ``path`` with all files ``members`` that are read with it.
+
+    The members are named by their relative positions, and are written in the same layout on a worker that lacks them.
+    """
 
     path: Path
     members: tuple[Path, ...]
@@ -61,9 +63,19 @@ class FileGroup:
 
 @dataclass(frozen=True)
 class InputFile:
-    """A file that parts read: its ``name`` in the key and in a layout elsewhere, a relative path with slashes; the
-    ``sha256`` (hex) and number (``size``) of its bytes; and the ``path`` where it was when the job was planned, which
-    is not in the key."""
+    """An input file of parts.
+
+    Attributes
+    ----------
+    name
+        Relative path with slashes; the name in the key and in the layout on another machine.
+    sha256
+        Checksum (hex).
+    size
+        Size in bytes.
+    path
+        Path when the job was planned; not part of the key.
+    """
 
     name: str
     sha256: str
@@ -73,60 +85,65 @@ class InputFile:
     def __post_init__(self) -> None:
         parts = PurePosixPath(self.name).parts
         if not parts or ".." in parts or PurePosixPath(self.name).is_absolute() or "\\" in self.name:
-            raise ValueError(f'an input is called "{self.name}", and it needs a relative path that goes down only')
+            raise ValueError(f'the input name "{self.name}" is not a relative path without ".."')
 
 
 class Checksums:
-    """SHA-256 of files, each computed once while device, inode, size and time of change stay what they are."""
+    """Cache of SHA-256 checksums of files. An entry is valid while device, inode, size and modification time are
+    unchanged.
+    """
 
     def __init__(self) -> None:
-        self._before: dict[str, tuple[tuple[int, ...], str]] = {}
+        self._known_digests: dict[str, tuple[tuple[int, ...], str]] = {}
 
     def compute(self, path: str | os.PathLike) -> str:
-        """Hex digest of the file ``path``. Raises `NergError` for what cannot be read."""
+        """Return the SHA-256 (hex) of the file ``path``. Raises `NergError` if it cannot be read."""
         name = os.path.abspath(path)
-        signature = _signature(name)
-        before = self._before.get(name)
-        if before is not None and before[0] == signature:
-            return before[1]
+        signature = _read_signature(name)
+        previous = self._known_digests.get(name)
+        if previous is not None and previous[0] == signature:
+            return previous[1]
         digest = file_sha256(name)
-        # A file that changes meanwhile is read again next time.
-        if signature is not None and _signature(name) == signature:
-            self._before[name] = (signature, digest)
+        # A file that changed during the read is not cached.
+        if signature is not None and _read_signature(name) == signature:
+            self._known_digests[name] = (signature, digest)
         return digest
 
     def is_unchanged(self, file: InputFile) -> bool:
-        """Whether the file lies where it was planned, with the same bytes."""
+        """Return whether the file exists at its planned path with the same bytes."""
         try:
             return os.path.getsize(file.path) == file.size and self.compute(file.path) == file.sha256
         except (OSError, NergError):
             return False
 
 
-def _signature(path: str) -> tuple[int, ...] | None:
+def _read_signature(path: str) -> tuple[int, ...] | None:
     try:
-        at = os.stat(path)
+        status = os.stat(path)
     except OSError:
         return None
-    return at.st_dev, at.st_ino, at.st_size, at.st_mtime_ns
+    return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns
 
 
 # ---- Values ----
 
 
 def rebuild_value(value: Any, change: Callable[[Any], Any] = lambda leaf: leaf) -> Any:
-    """``value`` with each of its paths and texts through ``change``, and with options that do not change a result at
-    their defaults; itself where nothing of it differs."""
+    """Return ``value`` with ``change`` applied to each path and string, and with options that do not affect results
+    reset.
+
+    Returns the same object if nothing changes.
+    """
     if isinstance(value, (str, Path)):
         return change(value)
     if is_dataclass(value) and not isinstance(value, type):
-        new = {}
+        changes = {}
         for f in fields(value):
             old = getattr(value, f.name)
-            one = rebuild_value(old, change) if f.metadata.get(CHANGES_RESULT, True) else f.default
-            if one is not old:
-                new[f.name] = one
-        return replace(value, **new) if new else value
+            new_value = rebuild_value(old, change) if f.metadata.get(CHANGES_RESULT, True) else f.default
+            if new_value is not old:
+                changes[f.name] = new_value
+        return replace(value, **changes) if changes else value
     if isinstance(value, Mapping):
         table = {k: rebuild_value(v, change) for k, v in value.items()}
         return table if any(table[k] is not v for k, v in value.items()) else value
@@ -137,7 +154,7 @@ def rebuild_value(value: Any, change: Callable[[Any], Any] = lambda leaf: leaf) 
 
 
 def relocate_paths(value: Any, files: Iterable[InputFile], folder: Path) -> Any:
-    """``value`` with the paths of ``files`` where they are laid out by their names, in ``folder``."""
+    """Return ``value`` with the paths of ``files`` replaced by their layout in ``folder``."""
     inputs = {file.path: file for file in files}
 
     def change(leaf: Any) -> Any:
@@ -149,8 +166,8 @@ def relocate_paths(value: Any, files: Iterable[InputFile], folder: Path) -> Any:
     return rebuild_value(value, change)
 
 
-def _members(value: Any) -> Iterator[tuple[str, Any]]:
-    """The values in a value, by their names."""
+def _iter_members(value: Any) -> Iterator[tuple[str, Any]]:
+    """Iterate over the direct members of a value by name."""
     if is_dataclass(value) and not isinstance(value, type):
         yield from ((f.name, getattr(value, f.name)) for f in fields(value))
     elif isinstance(value, Mapping):
@@ -160,18 +177,21 @@ def _members(value: Any) -> Iterator[tuple[str, Any]]:
 
 
 def find_inputs(value: Any, checksums: Checksums, prefix: str = "value") -> dict[str, InputFile]:
-    """The files of all paths in ``value``, by their whole paths. One that a `Files` lists has its name there; each
-    other one is a file of its inside. Raises `NergError` for a file that cannot be read."""
+    """Find the files of all paths in ``value``, by absolute path.
+
+    Members of a `FileGroup` get names relative to the group; another file is named by its position in the value. Raises
+    `NergError` for a file that cannot be read.
+    """
     groups: list[tuple[str, FileGroup]] = []
-    alone: list[tuple[str, Path]] = []
+    single_paths: list[tuple[str, Path]] = []
 
     def visit(part: Any, trail: str) -> None:
         if isinstance(part, FileGroup):
             groups.append((trail, part))
         elif isinstance(part, Path):
-            alone.append((trail, part))
+            single_paths.append((trail, part))
         elif not isinstance(part, (str, np.ndarray)):
-            for name, one in _members(part):
+            for name, one in _iter_members(part):
                 visit(one, f"{trail}/{re.sub('[^A-Za-z0-9_]', '_', name)}")
 
     visit(value, prefix)
@@ -182,37 +202,41 @@ def find_inputs(value: Any, checksums: Checksums, prefix: str = "value") -> dict
             inputs[path] = InputFile(name, checksums.compute(path), os.path.getsize(path), path)
 
     for trail, group in groups:
-        every, whole = [os.path.abspath(path) for path in group.members], os.path.abspath(group.path)
-        # A layout begins at the folder that all have in common.
-        above = os.path.commonpath([*map(os.path.dirname, every), *([] if whole in every else [whole])])
-        for path in every:
-            add(f"{trail}/{Path(path).relative_to(above).as_posix()}", path)
-    for trail, path in alone:
+        members, group_path = [os.path.abspath(path) for path in group.members], os.path.abspath(group.path)
+        # The layout starts at the common parent folder.
+        base = os.path.commonpath([*map(os.path.dirname, members), *([] if group_path in members else [group_path])])
+        for path in members:
+            add(f"{trail}/{Path(path).relative_to(base).as_posix()}", path)
+    for trail, path in single_paths:
         if find_input_name(path, inputs) is None:
             add(f"{trail}/{path.name}", os.path.abspath(path))
     return inputs
 
 
 def find_input_name(path: str | os.PathLike, inputs: Mapping[str, InputFile]) -> str | None:
-    """What the file, or folder, ``path`` is called among ``inputs``, by whole paths; None where it is not there."""
-    whole = os.path.abspath(path)
-    if whole in inputs:
-        return inputs[whole].name
+    """Return the name of the file or folder ``path`` among ``inputs``, by absolute path; None if it is not among
+    them.
+    """
+    absolute = os.path.abspath(path)
+    if absolute in inputs:
+        return inputs[absolute].name
     for file in inputs.values():
-        below = file.path[len(whole) :]
-        if file.path.startswith(whole + os.sep) and file.name.endswith(below):
-            return file.name.removesuffix(below)
+        relative = file.path[len(absolute) :]
+        if file.path.startswith(absolute + os.sep) and file.name.endswith(relative):
+            return file.name.removesuffix(relative)
     return None
 
 
 def compute_value_digest(value: Any, inputs: Mapping[str, InputFile] = MappingProxyType({})) -> str:
-    """SHA-256 (hex) of ``value``, of which paths are the names and bytes of ``inputs``. Raises ``TypeError`` for what
-    has no digest."""
-    return hashlib.sha256(json.dumps(_plain(value, inputs), sort_keys=True).encode()).hexdigest()
+    """Return the SHA-256 (hex) of ``value``. Paths are represented by the names and checksums of ``inputs``.
+
+    Raises ``TypeError`` for a value of an unsupported type.
+    """
+    return hashlib.sha256(json.dumps(_to_plain(value, inputs), sort_keys=True).encode()).hexdigest()
 
 
-def _plain(value: Any, inputs: Mapping[str, InputFile]) -> Any:
-    """``value`` as JSON, equal for equal values only."""
+def _to_plain(value: Any, inputs: Mapping[str, InputFile]) -> Any:
+    """Convert ``value`` to JSON values that are equal only for equal values."""
     if value is None or isinstance(value, (bool, int, float)):
         return value
     if isinstance(value, Path) or (isinstance(value, str) and value in inputs):
@@ -226,52 +250,60 @@ def _plain(value: Any, inputs: Mapping[str, InputFile]) -> Any:
         digest = hashlib.sha256(np.ascontiguousarray(value).data).hexdigest()
         return {"array": [value.dtype.str, list(value.shape), digest]}
     if is_dataclass(value) and not isinstance(value, type):
-        return {"class": type(value).__qualname__, "fields": {k: _plain(v, inputs) for k, v in _members(value)}}
+        return {"class": type(value).__qualname__, "fields": {k: _to_plain(v, inputs) for k, v in _iter_members(value)}}
     if isinstance(value, Mapping):
-        return {"mapping": {str(k): _plain(v, inputs) for k, v in value.items()}}
+        return {"mapping": {str(k): _to_plain(v, inputs) for k, v in value.items()}}
     if isinstance(value, (tuple, list)):
-        return [_plain(v, inputs) for v in value]
+        return [_to_plain(v, inputs) for v in value]
     raise TypeError(f"a {type(value).__name__} cannot be part of a key")
 
 
 # ---- Code ----
 
-_ROOMS = ("nerg_mi", "nerg_mi.plugins", "nerg_mi.scenes")
-_LEAVE_OUT = ("cli", "viewer", "tasks")
-"""Packages without influence on what a part computes."""
+_CODE_PACKAGES = ("nerg_mi", "nerg_mi.plugins", "nerg_mi.scenes")
+_EXCLUDED_PACKAGES = ("cli", "viewer", "tasks")
+"""Packages that do not affect the results of parts."""
 
 
 @cache
 def compute_code_digest() -> str:
-    """Hex digest (16 digits) of the sources that outputs are made by: a version number alone stays what it is while a
-    checkout changes."""
+    """Return a digest (16 hex digits) of the source files that affect outputs.
+
+    The version number is not sufficient: it does not change when a checkout is edited.
+    """
     folders = []
-    for room in _ROOMS:
-        spec = importlib.util.find_spec(room)
-        folders += [(room, Path(place)) for place in (spec and spec.submodule_search_locations) or ()]
+    for package in _CODE_PACKAGES:
+        spec = importlib.util.find_spec(package)
+        folders += [(package, Path(location)) for location in (spec and spec.submodule_search_locations) or ()]
     return compute_sources_digest(folders)
 
 
 def compute_sources_digest(folders: Iterable[tuple[str, Path]]) -> str:
-    """Hex digest (16 digits) of all Python files in packages, each a name and its folder, except `_LEAVE_OUT`."""
+    """Return a digest (16 hex digits) of all Python files of packages, except `_EXCLUDED_PACKAGES`.
+
+    Parameters
+    ----------
+    folders
+        Name and folder of each package.
+    """
     digest = hashlib.sha256()
-    for room, folder in folders:
+    for package, folder in folders:
         for file in sorted(folder.rglob("*.py")):
             name = file.relative_to(folder).as_posix()
-            if name.split("/")[0] not in _LEAVE_OUT:
-                digest.update(f"{room}/{name}\0".encode() + hashlib.sha256(file.read_bytes()).digest())
+            if name.split("/")[0] not in _EXCLUDED_PACKAGES:
+                digest.update(f"{package}/{name}\0".encode() + hashlib.sha256(file.read_bytes()).digest())
     return digest.hexdigest()[:16]
 
 
 @cache
 def read_processor_name() -> str:
-    """What this machine calls its processor, or its kind where it does not say."""
+    """Return the name of the processor, or the machine type if the name is unknown."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
         lines = []
-    named = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    return next(named, platform.processor() or platform.machine())[:120]
+    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return next(names, platform.processor() or platform.machine())[:120]
 
 
 # ---- Jobs ----
@@ -279,7 +311,7 @@ def read_processor_name() -> str:
 
 @dataclass(frozen=True)
 class Part:
-    """A part's inside ``value``, and what people call it (``label``), which is not in its key."""
+    """Input ``value`` of a part, and its ``label`` for messages, which is not part of the key."""
 
     value: Any
     label: str = "a part"
@@ -287,7 +319,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Task:
-    """A part as it is sent to who runs it: ``files`` are those in its ``value``."""
+    """A part as it is sent to a worker. ``files`` are the input files in its ``value``."""
 
     key: str
     value: Any
@@ -298,8 +330,19 @@ class Task:
 
 @dataclass(frozen=True)
 class SharedContext:
-    """What all tasks of a job have in common, sent once to each process: ``files`` are those in ``common``; ``code``:
-    the `code_digest` of who planned."""
+    """What all tasks of a job share; sent once to each process.
+
+    Attributes
+    ----------
+    work
+        Function that computes a part.
+    common
+        Common input of all parts.
+    files
+        Input files in ``common``.
+    code_digest
+        Digest of the source code of the process that planned the job.
+    """
 
     work: TaskFunction
     common: Any
@@ -309,10 +352,26 @@ class SharedContext:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """The ``parts`` of a job in the order in which their outputs are taken, and their ``work`` with what they have in
-    ``common``. ``what`` the job is, as its user calls it, which stays the same when the job is started again: another
-    plan of that name replaces this one in a store. ``suffix``: of the outputs (".png"), `FOLDER` for folders;
-    ``libraries``: distributions on whose versions the output depends."""
+    """The parts of a job and the function that computes them.
+
+    Attributes
+    ----------
+    name
+        Name of the job for the user. It stays the same when the job is started again: a plan replaces an earlier plan
+        of the same name in a store.
+    work
+        Function that computes a part.
+    common
+        Common input of all parts.
+    parts
+        The parts, in the order in which their outputs are consumed.
+    suffix
+        Suffix of the outputs (".png"); `FOLDER_SUFFIX` for folders.
+    libraries
+        Distributions whose versions affect the outputs.
+    checksums
+        Cache of checksums of input files.
+    """
 
     name: str
     work: TaskFunction
@@ -324,28 +383,28 @@ class Plan:
 
     def __post_init__(self) -> None:
         if len(self.parts) > MAX_PARTS:
-            raise NergError(f"{self.name} has {len(self.parts):,} parts, and at most {MAX_PARTS:,} are planned; divide it")
+            raise NergError(f"{self.name} has {len(self.parts):,} parts; the limit is {MAX_PARTS:,}; split the job")
         if "<" in self.work.__qualname__:
-            raise ValueError(f'"{self.work.__qualname__}" is not a function of a module')
+            raise ValueError(f'"{self.work.__qualname__}" is not a module-level function')
         if not re.fullmatch(r"|/|(\.[A-Za-z0-9]+){1,2}", self.suffix):
-            raise ValueError(f'"{self.suffix}" is not the suffix of an output')
+            raise ValueError(f'"{self.suffix}" is not a valid output suffix')
 
     @cached_property
-    def _common(self) -> tuple[Any, dict[str, InputFile]]:
+    def _common_inputs(self) -> tuple[Any, dict[str, InputFile]]:
         common = rebuild_value(self.common)
         return common, find_inputs(common, self.checksums, "common")
 
     @cached_property
     def shared(self) -> SharedContext:
-        """What is sent once to each process."""
-        common, inputs = self._common
+        """Context that is sent once to each process."""
+        common, inputs = self._common_inputs
         return SharedContext(self.work, common, tuple(inputs.values()), compute_code_digest())
 
     @cached_property
     def tasks(self) -> list[Task]:
-        """A task for each part. Raises `NergError` for files that cannot be read."""
-        common, inputs = self._common
-        basis = {
+        """One task for each part. Raises `NergError` for files that cannot be read."""
+        common, inputs = self._common_inputs
+        job_key = {
             "format": FORMAT,
             "work": f"{self.work.__module__}:{self.work.__qualname__}",
             "common": compute_value_digest(common, inputs),
@@ -356,7 +415,7 @@ class Plan:
         tasks = []
         for part in self.parts:
             value = rebuild_value(part.value)
-            inside = find_inputs(value, self.checksums, "part")
-            key = compute_value_digest({**basis, "part": compute_value_digest(value, inside)})
-            tasks.append(Task(key, value, tuple(inside.values()), self.suffix, part.label))
+            part_inputs = find_inputs(value, self.checksums, "part")
+            key = compute_value_digest({**job_key, "part": compute_value_digest(value, part_inputs)})
+            tasks.append(Task(key, value, tuple(part_inputs.values()), self.suffix, part.label))
         return tasks

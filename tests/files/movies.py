@@ -1,4 +1,4 @@
-"""Boxes of MP4 files, for tests of what reads their tables: files without pictures."""
+"""MP4 files without images, for tests of the readers of their tables."""
 
 from __future__ import annotations
 
@@ -23,13 +23,23 @@ def make_size_table(same: int, count: int, entries: bytes = b"") -> bytes:
 
 
 def make_clock(kind: bytes, ticks: int, version: int = 0) -> bytes:
-    """The header of a movie (mvhd) or of a track (mdhd) of so many ``ticks`` a second."""
+    """Make the header of a movie (mvhd) or a track (mdhd) with ``ticks`` per second."""
     return make_box(kind, bytes([version, 0, 0, 0]), bytes(16 if version else 8), struct.pack(">I", ticks), bytes(8))
 
 
-def make_movie(scale: int, ticks: int, *tables: bytes, edits: bytes = b"", kind: bytes = b"vide", version: int = 0) -> bytes:
-    """A file of one track of ``kind``, whose edits count ``scale`` ticks a second, and its ``tables`` ``ticks``."""
+def make_movie(
+    scale: int, ticks: int, *tables: bytes, edits: bytes = b"", kind: bytes = b"vide", version: int = 0
+) -> bytes:
+    """Make a file with one track of ``kind``, whose edits have ``scale`` ticks per second, and its ``tables``
+    ``ticks``.
+    """
     handler = make_box(b"hdlr", bytes(8), kind, bytes(13))
-    media = make_box(b"mdia", make_clock(b"mdhd", ticks, version), handler, make_box(b"minf", make_box(b"stbl", *tables)))
-    whole = make_box(b"trak", make_box(b"edts", edits), media)
-    return make_box(b"ftyp", b"isom") + make_box(b"mdat", bytes(1000)) + make_box(b"moov", make_clock(b"mvhd", scale, version), whole)
+    media = make_box(
+        b"mdia", make_clock(b"mdhd", ticks, version), handler, make_box(b"minf", make_box(b"stbl", *tables))
+    )
+    content = make_box(b"trak", make_box(b"edts", edits), media)
+    return (
+        make_box(b"ftyp", b"isom")
+        + make_box(b"mdat", bytes(1000))
+        + make_box(b"moov", make_clock(b"mvhd", scale, version), content)
+    )

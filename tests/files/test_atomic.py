@@ -17,25 +17,25 @@ from nerg_mi.files.atomic import (
     check_folder,
     check_new_folder,
     check_writable,
+    create_folder_atomically,
     make_folder,
     replace_atomically,
-    create_folder_atomically,
     reserve_output,
     write_bytes,
     write_text,
 )
 
-# ---- Output files are whole or absent, and errors say what to do ----
+# ---- Output files are written atomically, and errors contain a remedy ----
 
 
-def test_parents_are_made_and_nothing_else_is_left(tmp_path):
+def test_parents_are_created_without_leftovers(tmp_path):
     path = tmp_path / "a" / "b" / "c.txt"
     write_text(path, "é\n")
     assert path.read_bytes() == "é\n".encode()
     assert os.listdir(path.parent) == ["c.txt"]
 
 
-def test_a_failing_writer_leaves_the_old_file(tmp_path):
+def test_failing_writer_keeps_old_file(tmp_path):
     path = tmp_path / "a.npz"
     path.write_bytes(b"old")
     with pytest.raises(ZeroDivisionError), replace_atomically(path) as temporary:
@@ -45,7 +45,7 @@ def test_a_failing_writer_leaves_the_old_file(tmp_path):
     assert path.read_bytes() == b"old" and os.listdir(tmp_path) == ["a.npz"]
 
 
-def test_permissions_are_those_of_any_other_file(tmp_path):
+def test_permissions_follow_umask(tmp_path):
     before = os.umask(0o027)
     try:
         write_bytes(tmp_path / "new", b"")
@@ -57,11 +57,11 @@ def test_permissions_are_those_of_any_other_file(tmp_path):
     assert (tmp_path / "new").stat().st_mode & 0o777 == 0o604
 
 
-def test_a_file_that_is_protected_is_not_replaced(tmp_path, monkeypatch):
+def test_write_protected_file_is_not_replaced(tmp_path, monkeypatch):
     path = tmp_path / "kept"
     path.write_bytes(b"old")
     path.chmod(0o444)
-    # Root may write everything.
+    # Root may write to all files.
     monkeypatch.setattr(os, "access", lambda p, mode: mode & os.W_OK == 0 or os.stat(p).st_mode & 0o200 != 0)
     for write in (lambda: write_bytes(path, b"new"), lambda: check_writable(path)):
         with pytest.raises(NergError, match="you may not write there"):
@@ -69,14 +69,14 @@ def test_a_file_that_is_protected_is_not_replaced(tmp_path, monkeypatch):
     assert path.read_bytes() == b"old" and os.listdir(tmp_path) == ["kept"]
 
 
-def test_a_link_is_followed(tmp_path):
+def test_link_is_followed(tmp_path):
     (tmp_path / "real").write_bytes(b"old")
     (tmp_path / "link").symlink_to("real")
     write_bytes(tmp_path / "link", b"new")
     assert (tmp_path / "link").is_symlink() and (tmp_path / "real").read_bytes() == b"new"
 
 
-def test_what_cannot_be_written_is_told_with_its_remedy(tmp_path):
+def test_write_errors_name_file_and_remedy(tmp_path):
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(NergError, match="folder; choose the name"):
         write_bytes(tmp_path, b"")
@@ -88,7 +88,7 @@ def test_what_cannot_be_written_is_told_with_its_remedy(tmp_path):
         write_bytes(tmp_path / ("x" * 300), b"")
 
 
-def test_a_pipe_is_written_to_and_stays_one(tmp_path):
+def test_pipe_is_written_to_and_remains(tmp_path):
     path = tmp_path / "pipe"
     os.mkfifo(path)
     reader = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
@@ -97,7 +97,7 @@ def test_a_pipe_is_written_to_and_stays_one(tmp_path):
     os.close(reader)
 
 
-def test_what_cannot_be_written_is_found_before_and_nothing_is_made(tmp_path, monkeypatch):
+def test_unwritable_paths_are_detected_early_without_side_effects(tmp_path, monkeypatch):
     (tmp_path / "file").write_bytes(b"")
     check_writable(tmp_path / "file")
     check_writable(tmp_path / "a" / "b.NPZ", ".npz", ".parquet")
@@ -117,7 +117,7 @@ def test_what_cannot_be_written_is_found_before_and_nothing_is_made(tmp_path, mo
     with pytest.raises(NergError, match="parents is a file"):
         check_folder(tmp_path / "file" / "x")
     assert os.listdir(tmp_path) == ["file"]
-    # A superuser may write everywhere: what the system says of others.
+    # Root may write everywhere, so the answer of the system for other users is simulated.
     monkeypatch.setattr(os, "access", lambda path, mode: False)
     for check in (check_writable, check_folder):
         with pytest.raises(NergError, match="you may not write there"):
@@ -132,7 +132,7 @@ write_bytes(sys.argv[1], b"x" * 5000)
 """
 
 
-def test_a_file_that_does_not_fit_leaves_the_old_one(tmp_path):
+def test_full_disk_keeps_old_file(tmp_path):
     path = tmp_path / "a"
     path.write_bytes(b"old")
     done = subprocess.run([sys.executable, "-c", _LIMITED, str(path)], capture_output=True, text=True)
@@ -148,7 +148,7 @@ for k in range(10**6):
 """
 
 
-def test_a_killed_writer_leaves_a_whole_file(tmp_path):
+def test_killed_writer_leaves_complete_file(tmp_path):
     for k in range(5):
         path = tmp_path / str(k) / "a"
         child = subprocess.Popen([sys.executable, "-c", _ENDLESS, str(path)])
@@ -161,7 +161,7 @@ def test_a_killed_writer_leaves_a_whole_file(tmp_path):
         assert len(data) == 100_000 and len(set(data)) == 1
 
 
-def test_a_folder_is_whole_or_absent(tmp_path):
+def test_folder_is_created_atomically(tmp_path):
     out = tmp_path / "new" / "capture"
     with create_folder_atomically(out) as folder:
         assert folder.parent == out.parent and not out.exists()
@@ -176,7 +176,7 @@ def test_a_folder_is_whole_or_absent(tmp_path):
     assert os.listdir(tmp_path) == ["new"]
 
 
-def test_a_folder_with_something_in_it_is_left_alone(tmp_path):
+def test_non_empty_folder_is_refused(tmp_path):
     (tmp_path / "empty").mkdir()
     with create_folder_atomically(tmp_path / "empty") as folder:
         write_text(folder / "a", "1")
@@ -200,7 +200,7 @@ with reserving(sys.argv[1]):
 """
 
 
-def test_an_output_is_made_by_one_process_at_a_time(tmp_path):
+def test_output_has_one_writer_at_a_time(tmp_path):
     path = tmp_path / "new" / "a.bin"
     with reserve_output(path), pytest.raises(NergError, match='a.bin" is being made by another process'):
         with reserve_output(tmp_path / "new" / ".." / "new" / "a.bin"):
@@ -213,7 +213,7 @@ def test_an_output_is_made_by_one_process_at_a_time(tmp_path):
         pass
 
 
-def test_a_killed_process_reserves_nothing(tmp_path):
+def test_killed_process_releases_reservation(tmp_path):
     path = tmp_path / "a.bin"
     with subprocess.Popen([sys.executable, "-c", HOLD, path], stdout=subprocess.PIPE) as process:
         process.stdout.readline()
@@ -229,7 +229,7 @@ def test_a_killed_process_reserves_nothing(tmp_path):
 # ---- Checksums of files ----
 
 
-def test_of_a_file_larger_than_a_block(tmp_path, monkeypatch):
+def test_checksum_of_file_larger_than_block(tmp_path, monkeypatch):
     monkeypatch.setattr(atomic, "_BLOCK", 7)
     data = bytes(range(256)) * 3
     (tmp_path / "a").write_bytes(data)
@@ -238,7 +238,7 @@ def test_of_a_file_larger_than_a_block(tmp_path, monkeypatch):
     assert atomic.file_sha256(tmp_path / "empty") == hashlib.sha256(b"").hexdigest()
 
 
-def test_what_is_no_file(tmp_path):
+def test_checksum_of_non_file_is_refused(tmp_path):
     for path in (tmp_path / "absent", tmp_path):
         with pytest.raises(NergError, match=path.name):
             atomic.file_sha256(path)

@@ -14,13 +14,13 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.files import images
-from nerg_mi.files.images import check_image, read_exr, ensure_two_threads, write_bitmap_exr, write_exr, write_png
+from nerg_mi.files.images import check_image, ensure_two_threads, read_exr, write_bitmap_exr, write_exr, write_png
 from tests.pictures import mitsuba_bitmap
 
-# ---- EXR files hold the channels that they were given, also where Dr.Jit has one thread ----
+# ---- EXR files contain the written channels, also if Dr.Jit has one thread ----
 
 
-def test_channels_come_back_in_another_reader(tmp_path, rgb):
+def test_channels_round_trip_in_another_reader(tmp_path, rgb):
     random = np.random.default_rng(1)
     names = ("R", "G", "B", "depth.T", "position.X", "position.Y", "position.Z", "n.R", "n.G", "n.B", "gaze.Y")
     channels = {name: random.normal(size=(7, 5)).astype(np.float32) for name in names}
@@ -33,7 +33,7 @@ def test_channels_come_back_in_another_reader(tmp_path, rgb):
     assert bitmap.metadata()["seed"] == "3"
 
 
-def test_a_bitmap_is_written_as_mitsuba_writes_it(tmp_path, rgb):
+def test_bitmap_equals_file_of_mitsuba(tmp_path, rgb):
     pixels = np.random.default_rng(2).random((6, 4, 3)).astype(np.float32)
     with ensure_two_threads():
         rgb.Bitmap(pixels).write(str(tmp_path / "theirs.exr"))
@@ -43,32 +43,32 @@ def test_a_bitmap_is_written_as_mitsuba_writes_it(tmp_path, rgb):
     assert ours.pixel_format() == theirs.pixel_format() == rgb.Bitmap.PixelFormat.RGB
 
 
-def test_an_attribute_of_the_format_is_refused(tmp_path):
+def test_reserved_attribute_is_refused(tmp_path):
     with pytest.raises(ValueError, match="dataWindow"):
         write_exr(tmp_path / "a.exr", {"R": np.zeros((2, 2), np.float32)}, {"dataWindow": "x"})
 
 
 @pytest.mark.parametrize("shape", [(1, 3), (16, 5), (50, 40)])
-def test_a_file_that_is_cut_off_is_not_taken_for_a_picture(tmp_path, shape):
-    """OpenEXR says nothing where the end does not fit, which is all of a small picture."""
+def test_truncated_exr_is_refused(tmp_path, shape):
+    """OpenEXR does not report a truncated last block, which is the complete data of a small image."""
     random = np.random.default_rng(3)
     channels = {"R": random.random(shape, np.float32), "A": random.random(shape).astype(np.float16)}
     path = tmp_path / "a.exr"
     write_exr(path, channels, {"seed": "3"})
-    whole = path.stat().st_size
+    content = path.stat().st_size
     hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
-    for size in (0, 7, whole // 2, whole - 1, whole):
+    for size in (0, 7, content // 2, content - 1, content):
         path.write_bytes(b"old")
         resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
         try:
-            if size < whole:
+            if size < content:
                 with pytest.raises(NergError, match="largest size"):
                     write_exr(path, channels, {"seed": "3"})
             else:
                 write_exr(path, channels, {"seed": "3"})
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
-        assert path.stat().st_size == (3 if size < whole else whole) and [p.name for p in tmp_path.iterdir()] == [
+        assert path.stat().st_size == (3 if size < content else content) and [p.name for p in tmp_path.iterdir()] == [
             "a.exr"
         ]
 
@@ -94,7 +94,7 @@ assert dr.thread_count() == 1
 
 
 def test_a_scene_with_an_exr_file_is_read_with_one_thread(tmp_path):
-    # Nor does its reader.
+    # Mitsuba's reader does not return either.
     write_exr(tmp_path / "sky.exr", {c: np.ones((8, 16), np.float32) for c in "RGB"})
     sky = '<emitter type="envmap"><string name="filename" value="sky.exr"/></emitter>'
     (tmp_path / "scene.xml").write_text(f'<scene version="3.0.0">{sky}<sensor type="perspective"/></scene>')
@@ -102,7 +102,7 @@ def test_a_scene_with_an_exr_file_is_read_with_one_thread(tmp_path):
 
 
 def test_one_thread_is_enough(tmp_path):
-    # Mitsuba's writer never returns here.
+    # Mitsuba's writer does not return here.
     subprocess.run([sys.executable, "-c", _ONE_THREAD, str(tmp_path / "a.exr")], check=True, timeout=120)
     assert (tmp_path / "a.exr").stat().st_size > 0
 
@@ -128,7 +128,7 @@ def test_one_thread_is_enough(tmp_path):
         "left.R right.R left.G B",
     ],
 )
-def test_pictures_are_read_as_mitsuba_reads_them(rgb, tmp_path, names, kind):
+def test_images_equal_those_of_mitsuba(rgb, tmp_path, names, kind):
     from nerg_mi.photos.images import open_bitmap
 
     values = np.random.default_rng(0).random((len(names.split()), 4, 3)).astype(kind)
@@ -142,7 +142,7 @@ def test_pictures_are_read_as_mitsuba_reads_them(rgb, tmp_path, names, kind):
         assert getattr(mine, ask)() == getattr(theirs, ask)(), ask
 
 
-def test_damaged_exr_files_are_told_with_their_name(tmp_path):
+def test_damaged_exr_error_names_file(tmp_path):
     write_exr(tmp_path / "a.exr", {c: np.random.default_rng(0).random((8, 8)).astype(np.float32) for c in "RGB"})
     raw = (tmp_path / "a.exr").read_bytes()
     for cut in (0, 3, 20, 200, len(raw) - 5):
@@ -154,17 +154,17 @@ def test_damaged_exr_files_are_told_with_their_name(tmp_path):
         read_exr(tmp_path / "c.exr")
 
 
-# ---- Sizes of pictures, read from their headers ----
+# ---- Image sizes in headers ----
 
 
-def png(width: int, height: int, bits: int = 8, color: int = 2, data: bytes = b"") -> bytes:
+def make_png(width: int, height: int, bits: int = 8, color: int = 2, data: bytes = b"") -> bytes:
     chunk = lambda kind, body: struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
     head = struct.pack(">IIBBBBB", width, height, bits, color, 0, 0, 0)
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(data)) + chunk(b"IEND", b"")
 
 
 @pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.exr", "a.bmp", "a.ppm", "a.pfm", "a.hdr"])
-def test_sizes_of_what_mitsuba_writes(rgb, tmp_path, name):
+def test_header_sizes_of_mitsuba_files(rgb, tmp_path, name):
     values = np.full((5, 7, 3), 0.5, np.float32)
     bitmap = rgb.Bitmap(values)
     if name in ("a.png", "a.jpg", "a.bmp", "a.ppm"):
@@ -181,7 +181,7 @@ def test_sizes_of_what_mitsuba_writes(rgb, tmp_path, name):
     assert list(mitsuba_bitmap(tmp_path / name).size()) == [7, 5]
 
 
-def test_exr_counts_the_bytes_of_all_channels(tmp_path):
+def test_exr_size_includes_all_channels(tmp_path):
     write_exr(
         tmp_path / "a.exr", {"R": np.zeros((2, 3), np.float32), "depth.T": np.zeros((2, 3), np.float16)}, {"note": "x"}
     )
@@ -189,29 +189,29 @@ def test_exr_counts_the_bytes_of_all_channels(tmp_path):
 
 
 @pytest.mark.parametrize("size, bits, color", [((30000, 30000), 1, 0), ((1 << 31, 1), 8, 2), ((16000, 8000), 16, 6)])
-def test_large_pictures_in_small_files_are_refused(tmp_path, size, bits, color):
-    (tmp_path / "a.png").write_bytes(png(*size, bits, color))
+def test_large_images_in_small_files_are_refused(tmp_path, size, bits, color):
+    (tmp_path / "a.png").write_bytes(make_png(*size, bits, color))
     with pytest.raises(NergError, match='the mask ".*a.png" has .* make it smaller'):
         check_image(tmp_path / "a.png", "mask")
 
 
-def test_a_large_picture_in_a_large_file_is_read(tmp_path):
-    raw = png(16384, 12288)
+def test_large_image_in_large_file_is_accepted(tmp_path):
+    raw = make_png(16384, 12288)
     (tmp_path / "a.png").write_bytes(raw)
     with pytest.raises(NergError, match="make it smaller"):
         check_image(tmp_path / "a.png")
-    with open(tmp_path / "a.png", "ab") as file:  # as many bytes as there may be, without room on the disk
+    with open(tmp_path / "a.png", "ab") as file:  # the maximum size, as a sparse file
         file.truncate(3 * 16384 * 12288 // images.MAX_EXPANSION)
     assert check_image(tmp_path / "a.png").size == (16384, 12288)
 
 
-def test_a_picture_of_the_largest_size_is_read(tmp_path):
-    (tmp_path / "a.png").write_bytes(png(16384, 8192))
+def test_image_of_maximum_size_is_accepted(tmp_path):
+    (tmp_path / "a.png").write_bytes(make_png(16384, 8192))
     assert check_image(tmp_path / "a.png").decoded_bytes == images.MAX_DECODED_BYTES
 
 
 @pytest.mark.parametrize("window", [(0, 0, 1 << 20, 1 << 20), (-(1 << 31), 0, (1 << 31) - 1, 0), (5, 0, 4, 1)])
-def test_data_windows_of_exr_are_bounded(tmp_path, window):
+def test_exr_data_windows_are_bounded(tmp_path, window):
     write_exr(tmp_path / "a.exr", {"Y": np.zeros((2, 3), np.float32)})
     raw = (tmp_path / "a.exr").read_bytes()
     at = raw.index(b"dataWindow\0box2i\0") + 21
@@ -220,16 +220,16 @@ def test_data_windows_of_exr_are_bounded(tmp_path, window):
         check_image(tmp_path / "a.exr")
 
 
-def test_what_a_photo_carries_besides_its_pixels_is_not_taken_for_scans(rgb, tmp_path):
+def test_metadata_of_jpeg_is_not_counted_as_scans(rgb, tmp_path):
     rgb.Bitmap(np.zeros((5, 7, 3), np.uint8)).write(str(tmp_path / "a.jpg"))
     raw = (tmp_path / "a.jpg").read_bytes()
-    # A note, and, as telephones append it, a film: any bytes.
+    # EXIF data, and a video that a telephone has appended: any bytes.
     noted = raw[:2] + b"\xff\xe5" + struct.pack(">H", 2 + 600) + b"\xff\xda\0\2\0\0" * 100 + raw[2:]
     (tmp_path / "b.jpg").write_bytes(noted + b"\xff\xda\0\2" * 1000)
     assert check_image(tmp_path / "b.jpg").size == (7, 5)
 
 
-def test_scans_of_a_jpeg_are_counted(rgb, tmp_path):
+def test_jpeg_scans_are_limited(rgb, tmp_path):
     rgb.Bitmap(np.zeros((5, 7, 3), np.uint8)).write(str(tmp_path / "a.jpg"))
     raw = (tmp_path / "a.jpg").read_bytes()
     at = raw.index(b"\xff\xda")
@@ -253,25 +253,25 @@ def test_scans_of_a_jpeg_are_counted(rgb, tmp_path):
         b"BM",
         b"P6 x y",
         b"#?RADIANCE\n",
-        png(0, 3),
+        make_png(0, 3),
     ],
 )
-def test_damaged_headers_are_told_with_the_file(tmp_path, raw):
+def test_damaged_header_error_names_file(tmp_path, raw):
     (tmp_path / "picture").write_bytes(raw)
     with pytest.raises(NergError, match="picture"):
         check_image(tmp_path / "picture")
 
 
-# ---- PNG files are whole or absent; Mitsuba's own writer ends well on a full disk ----
+# ---- PNG files are written atomically; Mitsuba's writer does not report a full disk ----
 
 
-def picture(rgb):
+def make_bitmap(rgb):
     return rgb.Bitmap(np.random.default_rng(1).integers(0, 256, (40, 50, 3)).astype(np.uint8))
 
 
-def test_a_file_is_what_mitsuba_writes(tmp_path, rgb):
-    picture(rgb).write(str(tmp_path / "theirs.png"))
-    write_png(tmp_path / "new" / "ours.png", picture(rgb))
+def test_png_equals_file_of_mitsuba(tmp_path, rgb):
+    make_bitmap(rgb).write(str(tmp_path / "theirs.png"))
+    write_png(tmp_path / "new" / "ours.png", make_bitmap(rgb))
     assert (tmp_path / "new" / "ours.png").read_bytes() == (tmp_path / "theirs.png").read_bytes()
 
 
@@ -286,7 +286,7 @@ write_png(sys.argv[1], picture(mi))
 """
 
 
-def test_a_picture_that_does_not_fit_leaves_the_old_one(tmp_path):
+def test_full_disk_keeps_old_image(tmp_path):
     path = tmp_path / "a.png"
     path.write_bytes(b"old")
     env = {**os.environ, "PYTHONPATH": os.getcwd()}
@@ -295,12 +295,12 @@ def test_a_picture_that_does_not_fit_leaves_the_old_one(tmp_path):
     assert path.read_bytes() == b"old" and os.listdir(tmp_path) == ["a.png"]
 
 
-def test_text_by_another_library(tmp_path, rgb):
+def test_png_text_is_read_by_another_library(tmp_path, rgb):
     image = pytest.importorskip("PIL.Image", reason="Pillow is not installed")
     text = {"Comment": '{"a": "b"}', "Title": "Läden", "Author": "Łukasz 店"}
-    write_png(tmp_path / "a.png", picture(rgb), text)
-    with image.open(tmp_path / "a.png") as found:
-        found.load()
+    write_png(tmp_path / "a.png", make_bitmap(rgb), text)
+    with image.open(tmp_path / "a.png") as texts:
+        texts.load()
         # Mitsuba adds its version.
-        assert {k: v for k, v in found.text.items() if k != "generated_by"} == text
-        np.testing.assert_array_equal(np.asarray(found), np.array(picture(rgb)))
+        assert {k: v for k, v in texts.text.items() if k != "generated_by"} == text
+        np.testing.assert_array_equal(np.asarray(texts), np.array(make_bitmap(rgb)))

@@ -17,25 +17,25 @@ from nerg_mi.errors import MissingFile, NergError
 from nerg_mi.files import safe_read
 from nerg_mi.files import safe_read as module
 from nerg_mi.files.safe_read import (
+    check_regular_file,
     compute_inflation_limit,
-    read_line_blocks,
     map_bytes,
     open_gzip,
     open_npz,
     open_zip,
     parse_json,
-    sanitize,
     read_bytes,
     read_json,
+    read_line_blocks,
     read_member,
     read_npy,
     read_npz,
+    sanitize,
     translate_read_errors,
-    check_regular_file,
 )
 from nerg_mi.formats.areas import Region
 
-# ---- Damaged and hostile files get one sentence, before anything is allocated for what they claim ----
+# ---- Damaged and malicious files are refused before memory is allocated ----
 
 
 @pytest.mark.parametrize(
@@ -53,15 +53,15 @@ from nerg_mi.formats.areas import Region
         ValueError("two\nlines \x1b[31m"),
     ],
 )
-def test_what_a_damaged_file_raises_becomes_one_sentence(error):
-    with pytest.raises(NergError) as told, translate_read_errors("a.bin", "depth file", "copy it again"):
+def test_errors_of_damaged_files_are_translated(error):
+    with pytest.raises(NergError) as message, translate_read_errors("a.bin", "depth file", "copy it again"):
         raise error
-    said = str(told.value)
+    said = str(message.value)
     assert 'the depth file "a.bin" cannot be read: ' in said and said.endswith("; copy it again")
-    assert said.isprintable() and told.value.__cause__ is error
+    assert said.isprintable() and message.value.__cause__ is error
 
 
-def test_programming_errors_and_finished_sentences_pass():
+def test_bugs_and_nerg_errors_pass():
     with pytest.raises(TypeError), translate_read_errors("a.bin"):
         _ = None + 1
     with pytest.raises(NergError, match="^as it is$"), translate_read_errors("a.bin"):
@@ -72,19 +72,19 @@ def test_programming_errors_and_finished_sentences_pass():
         _ = None.shape
 
 
-def test_the_safetensors_library_is_known_by_name(tmp_path):
+def test_safetensors_error_is_recognized_by_name(tmp_path):
     safetensors = pytest.importorskip("safetensors")
     with pytest.raises(NergError, match="a.safetensors"), translate_read_errors("a.safetensors"):
         raise safetensors.SafetensorError("header too large")
 
 
-def test_a_missing_file_is_both_kinds_of_error(tmp_path):
+def test_missing_file_is_nerg_error_and_file_not_found(tmp_path):
     for kind in (MissingFile, FileNotFoundError, NergError):
         with pytest.raises(kind, match=r'there is no checkpoint ".*a\.bin"'):
             read_bytes(tmp_path / "a.bin", "checkpoint", 9)
 
 
-def test_only_ordinary_files_of_bounded_size_are_read(tmp_path):
+def test_only_regular_files_of_bounded_size_are_read(tmp_path):
     (tmp_path / "a").write_bytes(b"12345")
     assert read_bytes(tmp_path / "a", "file", 5) == b"12345" and check_regular_file(tmp_path / "a") == 5
     with pytest.raises(NergError, match="5 bytes, more than the 4"):
@@ -100,7 +100,7 @@ def test_only_ordinary_files_of_bounded_size_are_read(tmp_path):
         read_bytes("a\0b", "file", 9)
 
 
-def test_mapped_files_begin_as_they_should(tmp_path):
+def test_mapped_files_need_magic(tmp_path):
     (tmp_path / "a").write_bytes(b"ply 345")
     assert bytes(map_bytes(tmp_path / "a", "mesh", 7, b"ply")) == b"ply 345"
     with pytest.raises(NergError, match="7 bytes, more than the 6"):
@@ -112,7 +112,7 @@ def test_mapped_files_begin_as_they_should(tmp_path):
                 map_bytes(tmp_path / "a", "mesh", 1 << 40, b"ply", "export it again")
 
 
-def test_json_is_read_as_before(tmp_path):
+def test_json_equals_json_module(tmp_path):
     path = tmp_path / "a.json"
     path.write_bytes('{"a": [1, 2.5, "é"], "a": 3}'.encode("utf-16"))
     assert read_json(path) == {"a": 3}
@@ -123,14 +123,14 @@ def test_json_is_read_as_before(tmp_path):
 
 
 @pytest.mark.parametrize("raw", [b"[" * 200_000, b'{"a":' * 70 + b"1" + b"}" * 70, b"[" * 65 + b"]" * 65])
-def test_deep_json_is_refused_before_it_is_parsed(tmp_path, raw, monkeypatch):
+def test_deep_json_is_refused_before_parsing(tmp_path, raw, monkeypatch):
     monkeypatch.setattr(safe_read.json, "loads", lambda text: pytest.fail("it was parsed"))
     (tmp_path / "a.json").write_bytes(raw)
     with pytest.raises(NergError, match="nested"):
         read_json(tmp_path / "a.json")
 
 
-def test_json_of_very_many_values_is_refused(tmp_path, monkeypatch):
+def test_json_with_too_many_values_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(safe_read, "MAX_JSON_VALUES", 100)
     assert len(parse_json("[" + "[]," * 40 + "1]", "a.json")) == 41
     with pytest.raises(NergError, match="more than the 100 values"):
@@ -138,20 +138,20 @@ def test_json_of_very_many_values_is_refused(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("raw", [b"", b"{", b"\xff\xfe\xfa", b'{"a": NaNN}', b'"' + b'\\"' * 50_000])
-def test_what_is_no_json_is_told_with_the_file(tmp_path, raw):
+def test_invalid_json_error_names_file(tmp_path, raw):
     (tmp_path / "a.json").write_bytes(raw)
     with pytest.raises(NergError, match=r"a\.json"):
         read_json(tmp_path / "a.json")
 
 
-def test_words_of_a_file_are_made_fit_for_a_message():
+def test_text_of_files_is_sanitized():
     assert sanitize("a\x1b[2J\nb") == "a?[2J?b" and sanitize("x" * 400) == "x" * 300 + "..."
 
 
-def test_limits_themselves_are_within(tmp_path, monkeypatch):
+def test_json_limits_are_inclusive(tmp_path, monkeypatch):
     monkeypatch.setattr(safe_read, "MAX_JSON_VALUES", 100)
     monkeypatch.setattr(safe_read, "MAX_JSON_DEPTH", 3)
-    # As many values as brackets are opened and commas stand there.
+    # The number of values is that of opening brackets and commas.
     assert parse_json("[[[" + "1," * 97 + "1]]]", "a.json") == [[[1] * 98]]
     for beyond in ("[[[" + "1," * 98 + "1]]]", "[[[[1]]]]"):
         with pytest.raises(NergError, match="more than the 100 values|nested 4 deep"):
@@ -161,18 +161,18 @@ def test_limits_themselves_are_within(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("digits", [309, 400, 5000])
 def test_integers_that_no_float_holds_are_infinite(digits):
-    found = parse_json(f"[{digits * '9'}, -{digits * '9'}, {'9' * 20}]", "a.json")
-    assert found == [math.inf, -math.inf, 10**20 - 1]
+    value = parse_json(f"[{digits * '9'}, -{digits * '9'}, {'9' * 20}]", "a.json")
+    assert value == [math.inf, -math.inf, 10**20 - 1]
     with pytest.raises(NergError, match="reaches to inf; its corners must be finite, and at most 1e.07"):
-        Region("shelf", (0, 0, 0), (1, 1, found[0]))
+        Region("shelf", (0, 0, 0), (1, 1, value[0]))
 
 
-def test_documents_within_other_files_have_the_same_limit():
+def test_embedded_json_has_same_limit():
     with pytest.raises(NergError, match="12 bytes, more than the 11"):
         parse_json(b'{"a": [1,2]}', "a.glb", max_bytes=11)
 
 
-# ---- Compressed files are inflated no further than their size warrants ----
+# ---- The inflated size of compressed files is limited ----
 
 
 def _zip(path, **members):
@@ -182,17 +182,19 @@ def _zip(path, **members):
     return path
 
 
-def test_what_is_sound_is_read(tmp_path):
+def test_valid_archives_are_read(tmp_path):
     path = tmp_path / "a.csv.gz"
     path.write_bytes(gzip.compress(b"x,y\n1,2\n" * 1000))
     with open_gzip(path) as stream:
         assert io.TextIOWrapper(stream).read() == "x,y\n1,2\n" * 1000
     with open_zip(_zip(tmp_path / "a.zip", a=b"1" * 3_000_000, b=b"")) as archive:
         assert read_member(archive, "a", "a.zip") == b"1" * 3_000_000 and read_member(archive, "b", "a.zip") == b""
-    assert compute_inflation_limit(10) == safe_read.MIN_INFLATION_LIMIT and compute_inflation_limit(1 << 30) == 100 << 30
+    assert (
+        compute_inflation_limit(10) == safe_read.MIN_INFLATION_LIMIT and compute_inflation_limit(1 << 30) == 100 << 30
+    )
 
 
-def test_inflation_stops_at_the_limit(tmp_path, monkeypatch):
+def test_inflation_stops_at_limit(tmp_path, monkeypatch):
     monkeypatch.setattr(safe_read, "MIN_INFLATION_LIMIT", 1 << 20)
     path = tmp_path / "a.gz"
     path.write_bytes(gzip.compress(bytes(20 << 20)))
@@ -205,8 +207,10 @@ def test_inflation_stops_at_the_limit(tmp_path, monkeypatch):
         pytest.fail("it was opened")
 
 
-def test_a_member_that_is_larger_than_it_claims_is_cut(tmp_path):
-    """Both the claim in the list and that before the member say 10; asked for all at once, zlib would make 50 MB."""
+def test_member_larger_than_claimed_is_truncated(tmp_path):
+    """Both the member list and the header of the member claim 10 bytes; with one large read, zlib would allocate
+    50 MB.
+    """
     path = _zip(tmp_path / "a.zip", a=bytes(50 << 20))
     raw = path.read_bytes().replace(struct.pack("<I", 50 << 20), struct.pack("<I", 10))
     path.write_bytes(raw)
@@ -220,7 +224,7 @@ def test_a_member_that_is_larger_than_it_claims_is_cut(tmp_path):
 
 
 @pytest.mark.parametrize("claim", [1 << 27, (1 << 32) - 2])
-def test_a_member_that_claims_more_than_it_can_hold_is_refused(tmp_path, claim):
+def test_member_with_impossible_claim_is_refused(tmp_path, claim):
     path = _zip(tmp_path / "a.zip", a=b"123")
     raw = bytearray(path.read_bytes())
     at = raw.rindex(b"PK\1\2")
@@ -231,7 +235,7 @@ def test_a_member_that_claims_more_than_it_can_hold_is_refused(tmp_path, claim):
 
 
 @pytest.mark.parametrize("cut", [0, 1, 30, 60, 99])
-def test_damaged_archives_are_told_with_their_name(tmp_path, cut):
+def test_damaged_archive_error_names_file(tmp_path, cut):
     path = _zip(tmp_path / "a.zip", a=b"1234567890" * 20)
     path.write_bytes(path.read_bytes()[:cut])
     with pytest.raises(NergError, match="a.zip"), open_zip(path) as archive:
@@ -241,7 +245,7 @@ def test_damaged_archives_are_told_with_their_name(tmp_path, cut):
         stream.read()
 
 
-def test_a_changed_byte_is_found_by_its_checksum(tmp_path):
+def test_changed_byte_is_detected_by_checksum(tmp_path):
     path = tmp_path / "a.zip"
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("a", b"1234567890")
@@ -250,7 +254,7 @@ def test_a_changed_byte_is_found_by_its_checksum(tmp_path):
         read_member(archive, "a", path)
 
 
-def test_encrypted_doubled_and_missing_members_are_refused(tmp_path):
+def test_encrypted_duplicate_and_missing_members_are_refused(tmp_path):
     path = _zip(tmp_path / "a.zip", a=b"1", b=b"2")
     raw = path.read_bytes()
     path.write_bytes(raw.replace(b"PK\1\2\x14\x03\x14\0\0\0", b"PK\1\2\x14\x03\x14\0\1\0"))
@@ -265,7 +269,7 @@ def test_encrypted_doubled_and_missing_members_are_refused(tmp_path):
         read_member(archive, "c", path)
 
 
-def test_a_long_list_of_members_is_refused_before_it_is_read(tmp_path, monkeypatch):
+def test_long_member_list_is_refused_before_reading(tmp_path, monkeypatch):
     path = _zip(tmp_path / "a.zip", **{f"member{k}": b"" for k in range(50)})
     monkeypatch.setattr(safe_read, "MAX_DIRECTORY_BYTES", 1000)
     monkeypatch.setattr(zipfile, "ZipFile", lambda path: pytest.fail("it was read"))
@@ -273,16 +277,16 @@ def test_a_long_list_of_members_is_refused_before_it_is_read(tmp_path, monkeypat
         pass
 
 
-def test_an_archive_with_two_lists_of_members_is_refused(tmp_path):
-    """Readers differ in which list they take where the end of the archive and its records disagree."""
+def test_archive_with_two_member_lists_is_refused(tmp_path):
+    """Readers choose different lists if the end of the archive and its records disagree."""
     first, second = (_zip(tmp_path / f"{name}.zip", **{name: b"1"}).read_bytes() for name in "ab")
     at = len(second) - 22
     count, size, start = struct.unpack_from("<2xHII", second, at + 8)
     wide = struct.pack("<4sQHHIIQQQQ", b"PK\6\6", 44, 45, 45, 0, 0, count, count, size, start)
     locate = lambda place: struct.pack("<4sIQI", b"PK\6\7", 0, place, 1)
-    whole = second[:at] + wide + locate(at) + second[at:]
+    content = second[:at] + wide + locate(at) + second[at:]
     elsewhere = second[:at] + wide + wide + locate(at) + second[at:]
-    for data, is_whole in ((second, True), (whole, True), (first + second, False), (elsewhere, False)):
+    for data, is_whole in ((second, True), (content, True), (first + second, False), (elsewhere, False)):
         (tmp_path / "c.zip").write_bytes(data)
         if is_whole:
             with open_zip(tmp_path / "c.zip") as archive:
@@ -292,13 +296,13 @@ def test_an_archive_with_two_lists_of_members_is_refused(tmp_path):
                 pass
 
 
-def test_errors_of_the_block_are_its_own(tmp_path):
+def test_errors_in_block_pass_unchanged(tmp_path):
     path = _zip(tmp_path / "a.zip", a=b"1")
     with pytest.raises(KeyError), open_zip(path):
         raise KeyError("mine")
 
 
-def test_inflating_limits_themselves_are_within(tmp_path, monkeypatch):
+def test_inflation_limits_are_inclusive(tmp_path, monkeypatch):
     path = tmp_path / "a.gz"
     path.write_bytes(gzip.compress(bytes(1000)))
     with open_gzip(path, max_bytes=1000) as stream:
@@ -306,21 +310,21 @@ def test_inflating_limits_themselves_are_within(tmp_path, monkeypatch):
     with open_gzip(path, max_bytes=999) as stream, pytest.raises(NergError, match="inflates to more than 999"):
         stream.read()
     archive = _zip(tmp_path / "a.zip", a=b"1", b=b"23")
-    with open_zip(archive, max_bytes=3) as found:
-        assert found.read("b") == b"23"
+    with open_zip(archive, max_bytes=3) as data:
+        assert data.read("b") == b"23"
     with pytest.raises(NergError, match="inflates to more than 2 bytes"), open_zip(archive, max_bytes=2):
         pass
     listed = safe_read._directory_bytes(archive, archive.stat().st_size)
     monkeypatch.setattr(safe_read, "MAX_DIRECTORY_BYTES", listed)
-    with open_zip(archive) as found:
-        assert found.namelist() == ["a", "b"]
+    with open_zip(archive) as data:
+        assert data.namelist() == ["a", "b"]
     monkeypatch.setattr(safe_read, "MAX_DIRECTORY_BYTES", listed - 1)
     with pytest.raises(NergError, match="fewer members"), open_zip(archive):
         pass
 
 
-def test_what_nothing_comes_out_of_is_bounded(tmp_path, monkeypatch):
-    """Zeros may follow each member, and names may be long; not for gigabytes."""
+def test_gzip_without_output_is_bounded(tmp_path, monkeypatch):
+    """Zeros may follow each member, and names may be long, but not gigabytes."""
     path, member = tmp_path / "a.gz", gzip.compress(b"1")
     for idle in (0, 1, 5000):
         path.write_bytes(member + bytes(idle) + member + bytes(idle))
@@ -341,23 +345,23 @@ def test_what_nothing_comes_out_of_is_bounded(tmp_path, monkeypatch):
 # ---- Lines of large text files in blocks ----
 
 
-def lines(path, most=1000):
-    return [line for block in read_line_blocks(path, "table", most) for line in block]
+def read_lines(path, max_lines=1000):
+    return [line for block in read_line_blocks(path, "table", max_lines) for line in block]
 
 
 @pytest.mark.parametrize("chunk", [1, 2, 3, 7, 1 << 20])
 @pytest.mark.parametrize(
     "text", ["", "a", "a\nb", "a\r\nb\r\n", "\n\n", "a\rb\r", "\u20ac\r\n\u2028x\x0by\n", "a\n\r\nb"]
 )
-def test_lines_are_those_of_python(tmp_path, monkeypatch, text, chunk):
-    """Wherever the file is cut into pieces: within characters, and between the two that end a line."""
+def test_lines_equal_those_of_python(tmp_path, monkeypatch, text, chunk):
+    r"""Independent of the chunk boundaries: within characters, and between \r and \n."""
     monkeypatch.setattr(module, "_LINE_BLOCKS_CHUNK", chunk)
     (tmp_path / "t.csv").write_bytes(text.encode())
     with open(tmp_path / "t.csv", encoding="utf-8", newline="") as source:
         want = list(source)
-    assert lines(tmp_path / "t.csv") == want
+    assert read_lines(tmp_path / "t.csv") == want
     (tmp_path / "t.csv.gz").write_bytes(gzip.compress(text.encode()))
-    assert lines(tmp_path / "t.csv.gz", most=1) == want
+    assert read_lines(tmp_path / "t.csv.gz", max_lines=1) == want
 
 
 def test_blocks_are_bounded_by_lines_and_characters(tmp_path, monkeypatch):
@@ -370,40 +374,40 @@ def test_blocks_are_bounded_by_lines_and_characters(tmp_path, monkeypatch):
     assert sum(sizes) == 100 and max(sizes) <= 14
 
 
-def test_what_is_no_text(tmp_path, monkeypatch):
+def test_binary_file_is_refused(tmp_path, monkeypatch):
     path = tmp_path / "t.csv"
     path.write_bytes("name\n".encode("utf-16"))
     with pytest.raises(NergError, match='"[^"]*t.csv" is no UTF-8 text'):
-        lines(path)
+        read_lines(path)
     path.write_bytes(b"a\xe2\x82")
     with pytest.raises(NergError, match="UTF-8"):
-        lines(path)
+        read_lines(path)
     monkeypatch.setattr(module, "MAX_LINE_LENGTH", 100)
     monkeypatch.setattr(module, "_LINE_BLOCKS_CHUNK", 64)
     path.write_text("a\n" + "x" * 300)
     with pytest.raises(NergError, match="line 2 .* more than the 100 characters"):
-        lines(path)
-    monkeypatch.setattr(module, "_LINE_BLOCKS_CHUNK", 4096)  # the line ends within what is read at once
+        read_lines(path)
+    monkeypatch.setattr(module, "_LINE_BLOCKS_CHUNK", 4096)  # the line ends within one chunk
     path.write_text("a\n" + "x" * 300 + "\nb\n")
     with pytest.raises(NergError, match="line 2 .* more than the 100 characters"):
-        lines(path)
+        read_lines(path)
     with pytest.raises(NergError, match="no table"):
-        lines(tmp_path / "absent.csv")
+        read_lines(tmp_path / "absent.csv")
     with pytest.raises(NergError, match="folder"):
-        lines(tmp_path)
+        read_lines(tmp_path)
 
 
-def test_line_blocks_limits_themselves_are_within(tmp_path, monkeypatch):
+def test_line_limits_are_inclusive(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "MAX_LINE_LENGTH", 4)
     path = tmp_path / "t.csv"
     path.write_text("abc\n" * 4)
     assert [len(b) for b in read_line_blocks(path, "table", 2)] == [2, 2]
     path.write_text("abcd\n")
     with pytest.raises(NergError, match="line 1 of the table"):
-        lines(path)
+        read_lines(path)
 
 
-# ---- Arrays are made only of bytes that are there ----
+# ---- Arrays are allocated only for available bytes ----
 
 _ARRAYS = [
     np.arange(12.0).reshape(3, 4),
@@ -418,28 +422,28 @@ _ARRAYS = [
 ]
 
 
-def npy(shape, descr="<f8", data=b"", version=(1, 0)) -> bytes:
+def make_npy(shape, descr="<f8", data=b"", version=(1, 0)) -> bytes:
     head = f"{{'descr': {descr!r}, 'fortran_order': False, 'shape': {shape}, }}".encode() + b"\n"
     return b"\x93NUMPY" + bytes(version) + struct.pack("<H" if version == (1, 0) else "<I", len(head)) + head + data
 
 
 @pytest.mark.parametrize("array", _ARRAYS, ids=lambda a: f"{a.dtype}-{a.shape}")
-def test_arrays_come_back_as_numpy_reads_them(tmp_path, array):
+def test_arrays_equal_those_of_numpy(tmp_path, array):
     np.save(tmp_path / "a.npy", array)
     np.savez(tmp_path / "a.npz", a=array, b=array)
     np.savez_compressed(tmp_path / "c.npz", a=array)
-    found = [
+    arrays = [
         read_npy(tmp_path / "a.npy"),
         *read_npz(tmp_path / "a.npz").values(),
         *read_npz(tmp_path / "c.npz").values(),
     ]
-    assert len(found) == 4
-    for value in found:
+    assert len(arrays) == 4
+    for value in arrays:
         assert value.dtype == array.dtype and value.shape == array.shape and np.array_equal(value, array)
         assert value.flags.f_contiguous == array.flags.f_contiguous and value.flags.writeable
 
 
-def test_an_archive_tells_of_its_arrays_without_reading_them(tmp_path):
+def test_array_headers_are_read_without_data(tmp_path):
     np.savez(tmp_path / "a.npz", rays=np.zeros((5, 3), np.float32), names=np.array(["a"]))
     with open_npz(tmp_path / "a.npz") as archive:
         assert archive.names == ["rays", "names"] and "rays" in archive and "others" not in archive
@@ -465,8 +469,8 @@ def test_an_archive_tells_of_its_arrays_without_reading_them(tmp_path):
         "(" * 500,
     ],
 )
-def test_shapes_that_the_bytes_do_not_hold_are_refused(tmp_path, shape):
-    data = npy(shape, data=bytes(24))
+def test_shapes_larger_than_the_file_are_refused(tmp_path, shape):
+    data = make_npy(shape, data=bytes(24))
     (tmp_path / "a.npy").write_bytes(data)
     with pytest.raises(NergError, match="a.npy"):
         read_npy(tmp_path / "a.npy")
@@ -477,13 +481,13 @@ def test_shapes_that_the_bytes_do_not_hold_are_refused(tmp_path, shape):
 
 
 @pytest.mark.parametrize("descr", ["|O", "|S0", "<U0", "|V0", "<f99", "", "x" * 2000, [("a", "|O")], None, 7])
-def test_types_that_are_no_numbers_are_refused(tmp_path, descr):
-    (tmp_path / "a.npy").write_bytes(npy("(1000000000000,)", descr, bytes(24)))
+def test_non_numeric_dtypes_are_refused(tmp_path, descr):
+    (tmp_path / "a.npy").write_bytes(make_npy("(1000000000000,)", descr, bytes(24)))
     with pytest.raises(NergError, match="a.npy"):
         read_npy(tmp_path / "a.npy")
 
 
-def test_objects_are_never_unpickled(tmp_path):
+def test_objects_are_not_unpickled(tmp_path):
     stream = io.BytesIO()
     np.save(stream, np.array([print], dtype=object), allow_pickle=True)
     (tmp_path / "a.npy").write_bytes(stream.getvalue())
@@ -492,7 +496,7 @@ def test_objects_are_never_unpickled(tmp_path):
 
 
 @pytest.mark.parametrize("cut", [0, 3, 8, 9, 20, 60, 127, 130])
-def test_what_is_cut_off_is_told_with_its_name(tmp_path, cut):
+def test_truncated_array_error_names_file(tmp_path, cut):
     np.save(tmp_path / "a.npy", np.arange(3.0))
     (tmp_path / "a.npy").write_bytes((tmp_path / "a.npy").read_bytes()[:cut])
     with pytest.raises(NergError, match="a.npy"):
@@ -500,16 +504,16 @@ def test_what_is_cut_off_is_told_with_its_name(tmp_path, cut):
 
 
 def test_headers_and_versions_are_bounded(tmp_path):
-    (tmp_path / "a.npy").write_bytes(npy("(1,)" + " " * 20_000, data=bytes(8), version=(2, 0)))
+    (tmp_path / "a.npy").write_bytes(make_npy("(1,)" + " " * 20_000, data=bytes(8), version=(2, 0)))
     with pytest.raises(NergError, match="a.npy"):
         read_npy(tmp_path / "a.npy")
-    (tmp_path / "a.npy").write_bytes(npy("(1,)", data=bytes(8), version=(3, 0)))
+    (tmp_path / "a.npy").write_bytes(make_npy("(1,)", data=bytes(8), version=(3, 0)))
     with pytest.raises(NergError, match="version 3.0"):
         read_npy(tmp_path / "a.npy")
 
 
 @pytest.mark.parametrize("axes, good", [(32, True), (33, False)])
-def test_arrays_have_so_many_axes(tmp_path, axes, good):
+def test_number_of_axes_is_limited(tmp_path, axes, good):
     header = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {(1,) * axes}, }}".encode()
     header += b" " * (-(len(header) + 11) % 64) + b"\n"
     (tmp_path / "a.npy").write_bytes(b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + bytes(8))

@@ -11,7 +11,7 @@ import pytest
 from nerg_mi.files.tables import format_markdown_table, unescape_formula, write_csv, write_json
 
 
-def test_rows_come_back_and_what_they_lack_is_empty(tmp_path):
+def test_rows_round_trip_with_empty_cells(tmp_path):
     path = tmp_path / "new" / "a.csv"
     write_csv(path, [{"a": 1, "b": 'é, "x"'}, {"a": 2.5, "c": "2\n3"}])
     with path.open(encoding="utf-8", newline="") as file:
@@ -20,7 +20,7 @@ def test_rows_come_back_and_what_they_lack_is_empty(tmp_path):
     assert path.read_bytes() == b"b,a\r\n,1\r\n"
 
 
-def test_a_table_that_cannot_be_made_leaves_the_old_one(tmp_path):
+def test_failing_table_keeps_old_file(tmp_path):
     for name, write in (
         ("a.csv", lambda p: write_csv(p, [{"a": 1}, {"b": 1}], ("a",))),
         ("a.json", lambda p: write_json(p, math.nan, allow_nan=False)),
@@ -32,7 +32,7 @@ def test_a_table_that_cannot_be_made_leaves_the_old_one(tmp_path):
     assert sorted(os.listdir(tmp_path)) == ["a.csv", "a.json"]
 
 
-def test_json_has_null_for_what_is_no_number(tmp_path):
+def test_json_has_null_for_non_finite_numbers(tmp_path):
     value = {"a": [1, math.nan], "b": {"c": (np.float64("inf"), "nan")}}
     write_json(tmp_path / "a.json", value)
     assert json.loads((tmp_path / "a.json").read_text()) == {"a": [1, None], "b": {"c": [None, "nan"]}}
@@ -45,7 +45,7 @@ HARMLESS = ["a=b", "-1", "+1e-3", "-inf", "-1, 2.5, -3", "'a", "-", "", "Ada", 1
 
 
 @pytest.mark.parametrize("name", [*FORMULAS, *HARMLESS])
-def test_no_cell_is_a_formula(tmp_path, name):
+def test_cells_are_escaped_formulas(tmp_path, name):
     write_csv(tmp_path / "a.csv", [{"person": name, "b": 1}])
     with (tmp_path / "a.csv").open(encoding="utf-8", newline="") as file:
         (cell, _) = list(csv.reader(file))[1]
@@ -53,7 +53,7 @@ def test_no_cell_is_a_formula(tmp_path, name):
     assert unescape_formula(cell) == ("" if name is None else str(name))
 
 
-def test_no_column_is_a_formula(tmp_path):
+def test_columns_are_escaped_formulas(tmp_path):
     write_csv(tmp_path / "a.csv", [{"=a": 1}])
     assert (tmp_path / "a.csv").read_bytes() == b"'=a\r\n1\r\n"
 
@@ -71,11 +71,11 @@ def test_no_column_is_a_formula(tmp_path):
         ("a\r\nb", "a b"),
     ],
 )
-def test_no_cell_of_markdown_is_html(text, cell):
+def test_markdown_cells_are_escaped(text, cell):
     assert format_markdown_table(["a"], [[text]]).splitlines()[-1] == f"| {cell} |"
 
 
-def test_a_markdown_table():
+def test_markdown_table():
     text = format_markdown_table(["what", "a|b"], [["x", 1.5], ["two\nlines", None]], right_aligned=["a|b"])
     assert text == "| what | a\\|b |\n| --- | ---: |\n| x | 1.5 |\n| two lines | None |"
     assert format_markdown_table(["a"], []) == "| a |\n| --- |"

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.files.video import check_video_tables, check_video_output, read_frame_times, open_video_writer
+from nerg_mi.files.video import check_video_output, check_video_tables, open_video_writer, read_frame_times
 from tests.files.movies import make_box, make_box_table, make_movie, make_size_table, make_track
 
-# ---- Times of frames, and MP4 files whose tables claim more samples than their bytes warrant ----
+# ---- Frame times, and MP4 files whose tables claim too many samples ----
 
 
-def checked(path: Path, *boxes: bytes) -> None:
+def check_tables(path: Path, *boxes: bytes) -> None:
     path.write_bytes(b"".join(boxes))
     check_video_tables(path)
 
@@ -26,16 +26,26 @@ DATA = make_box(b"mdat", bytes(1000))
 FILE = "film.mp4"
 
 
-def test_sound_tables_pass(tmp_path):
+def test_valid_tables_pass(tmp_path):
     edits = make_box_table(b"elst", 2, bytes(40), flags=1 << 24)
-    whole = make_track(make_size_table(0, 3, bytes(12)), make_box_table(b"stts", 1, bytes(8)), make_box_table(b"stco", 1, bytes(4)), edits=edits)
-    checked(tmp_path / FILE, make_box(b"ftyp", b"isom"), DATA, make_box(b"moov", whole, make_track(make_size_table(2, 500))))
-    # Of a size that takes eight bytes, and one that runs to the end.
+    content = make_track(
+        make_size_table(0, 3, bytes(12)),
+        make_box_table(b"stts", 1, bytes(8)),
+        make_box_table(b"stco", 1, bytes(4)),
+        edits=edits,
+    )
+    check_tables(
+        tmp_path / FILE,
+        make_box(b"ftyp", b"isom"),
+        DATA,
+        make_box(b"moov", content, make_track(make_size_table(2, 500))),
+    )
+    # A box with a 64-bit size, and a box that extends to the end.
     large = struct.pack(">I4sQ", 1, b"mdat", 16 + 1000) + bytes(1000)
-    checked(tmp_path / FILE, large, struct.pack(">I4s", 0, b"moov") + whole)
+    check_tables(tmp_path / FILE, large, struct.pack(">I4s", 0, b"moov") + content)
 
 
-def test_other_kinds_of_files_pass(tmp_path):
+def test_other_formats_pass(tmp_path):
     for data in (
         b"",
         b"RIFF",
@@ -45,94 +55,99 @@ def test_other_kinds_of_files_pass(tmp_path):
         make_box(b"stsz", b"1"),
         b"\0\0\0\5moov",
     ):
-        checked(tmp_path / FILE, data)
+        check_tables(tmp_path / FILE, data)
 
 
 @pytest.mark.parametrize("within", [b"moov", b"free", b"udta", b"meta"])
 def test_samples_need_bytes(within, tmp_path):
     head = {b"free": make_box(b"mvhd", bytes(100)), b"meta": bytes(4)}.get(within, b"")
     with pytest.raises(ValueError, match=r"claims 30,000,000 samples in [\d,]+ bytes"):
-        checked(tmp_path / FILE, DATA, make_box(within, head, make_track(make_size_table(1, 30_000_000))))
+        check_tables(tmp_path / FILE, DATA, make_box(within, head, make_track(make_size_table(1, 30_000_000))))
 
 
-def test_samples_of_parts_count_together(tmp_path):
+def test_samples_of_fragments_are_summed(tmp_path):
     parts = [make_box(b"moof", make_box(b"traf", make_box_table(b"trun", 400))) for _ in range(3)]
-    checked(tmp_path / FILE, DATA, parts[0], make_box(b"free", bytes(100)))
+    check_tables(tmp_path / FILE, DATA, parts[0], make_box(b"free", bytes(100)))
     with pytest.raises(ValueError, match="claims 1,200 samples"):
-        checked(tmp_path / FILE, DATA, *parts)
+        check_tables(tmp_path / FILE, DATA, *parts)
 
 
-def test_tables_that_are_too_short_run_on(tmp_path):
-    """FFmpeg reads their beginning from what follows."""
+def test_short_tables_are_read_like_ffmpeg(tmp_path):
+    """FFmpeg reads the missing part of the header from the following bytes."""
     with pytest.raises(ValueError, match=r"claims 16,777,215 samples"):
-        checked(tmp_path / FILE, make_box(b"moof", make_box(b"traf", make_box(b"trun", bytes(2)))) + b"\0\0\0\xff\xff\xff" + bytes(9))
+        check_tables(
+            tmp_path / FILE,
+            make_box(b"moof", make_box(b"traf", make_box(b"trun", bytes(2)))) + b"\0\0\0\xff\xff\xff" + bytes(9),
+        )
 
 
 def test_edits_multiply_samples(tmp_path):
     for edits, passes in ((2, True), (40, False)):
-        whole = make_box(b"moov", make_track(make_size_table(1, 900), edits=make_box_table(b"elst", edits, bytes(12 * edits))))
+        content = make_box(
+            b"moov", make_track(make_size_table(1, 900), edits=make_box_table(b"elst", edits, bytes(12 * edits)))
+        )
         if passes:
-            checked(tmp_path / FILE, DATA, whole)
+            check_tables(tmp_path / FILE, DATA, content)
             continue
         with pytest.raises(ValueError, match="900.*40"):
-            checked(tmp_path / FILE, DATA, whole)
+            check_tables(tmp_path / FILE, DATA, content)
 
 
 @pytest.mark.parametrize("kind, size", [(b"stts", 8), (b"ctts", 8), (b"stsc", 12), (b"stss", 4), (b"stco", 4)])
-def test_tables_hold_their_entries(kind, size, tmp_path):
-    checked(tmp_path / FILE, DATA, make_box(b"moov", make_track(make_box_table(kind, 3, bytes(3 * size)))))
+def test_tables_contain_their_entries(kind, size, tmp_path):
+    check_tables(tmp_path / FILE, DATA, make_box(b"moov", make_track(make_box_table(kind, 3, bytes(3 * size)))))
     with pytest.raises(ValueError, match=f'"{kind.decode()}" claims 4 entries, and holds 3'):
-        checked(tmp_path / FILE, DATA, make_box(b"moov", make_track(make_box_table(kind, 4, bytes(3 * size)))))
+        check_tables(tmp_path / FILE, DATA, make_box(b"moov", make_track(make_box_table(kind, 4, bytes(3 * size)))))
     with pytest.raises(ValueError, match='"stsz".*268,435,456.*3'):
-        checked(tmp_path / FILE, DATA, make_box(b"moov", make_track(make_size_table(0, 1 << 28, bytes(12)))))
+        check_tables(tmp_path / FILE, DATA, make_box(b"moov", make_track(make_size_table(0, 1 << 28, bytes(12)))))
 
 
-def test_what_cannot_be_looked_into_is_refused(tmp_path, monkeypatch):
+def test_compressed_headers_are_refused(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="is compressed"):
-        checked(tmp_path / FILE, make_box(b"moov", make_box(b"cmov", bytes(20))))
+        check_tables(tmp_path / FILE, make_box(b"moov", make_box(b"cmov", bytes(20))))
     monkeypatch.setattr("nerg_mi.files.video._BOXES", 5)
     with pytest.raises(ValueError, match="more than 5 boxes"):
-        checked(tmp_path / FILE, *[make_box(b"free")] * 6)
+        check_tables(tmp_path / FILE, *[make_box(b"free")] * 6)
 
 
-def runs(kind: bytes, *pairs: tuple[int, int], version: int = 0) -> bytes:
+def make_runs(kind: bytes, *pairs: tuple[int, int], version: int = 0) -> bytes:
     entries = b"".join(struct.pack(">Ii", *pair) for pair in pairs)
     return make_box_table(kind, len(pairs), entries, version << 24)
 
 
-def edits(*entries: tuple[int, int, int], long: bool = False) -> bytes:
+def make_edits(*entries: tuple[int, int, int], long: bool = False) -> bytes:
     form = ">QqI" if long else ">IiI"
     return make_box_table(b"elst", len(entries), b"".join(struct.pack(form, *e) for e in entries), long << 24)
 
 
-STEADY = runs(b"stts", (6, 1000))
-ONCE = 1 << 16  # the speed of an edit
+STEADY = make_runs(b"stts", (6, 1000))
+ONCE = 1 << 16  # the playback speed of an edit
 
 
 @pytest.mark.parametrize(
     "tables, edited, seconds",
     [
         ([STEADY], b"", np.arange(6) / 24.95),
-        # A rate that varies, with two frames lost.
+        # A variable frame rate with two missing frames.
         (
-            [runs(b"stts", (2, 1000), (1, 3000), (1, 900), (1, 1000))],
+            [make_runs(b"stts", (2, 1000), (1, 3000), (1, 900), (1, 1000))],
             b"",
             [0, 1 / 24.95, 2 / 24.95, 5 / 24.95, 5.9 / 24.95],
         ),
-        # Frames that are decoded before those that they are shown after: offsets of both signs.
-        ([runs(b"stts", (4, 1000)), runs(b"ctts", (1, 0), (1, 2000), (2, -1000))], b"", np.arange(4) / 24.95),
-        # 0.08 s of nothing, then the track from its third frame on.
-        ([STEADY], edits((80, -1, ONCE), (400, 2000, ONCE)), 0.08 + np.arange(4) / 24.95),
-        # The first 0.1 s, and again what follows 0.12 s; an edit of no duration runs to the end.
+        # Decoding order differs from presentation order: offsets of both signs.
+        ([make_runs(b"stts", (4, 1000)), make_runs(b"ctts", (1, 0), (1, 2000), (2, -1000))], b"", np.arange(4) / 24.95),
+        # An empty edit of 0.08 s, then the track from its third frame.
+        ([STEADY], make_edits((80, -1, ONCE), (400, 2000, ONCE)), 0.08 + np.arange(4) / 24.95),
+        # The first 0.1 s, and the track from 0.12 s on; an edit with duration 0 extends to the end.
         (
             [STEADY],
-            edits((100, 0, ONCE), (0, 3000, ONCE), long=True),
+            make_edits((100, 0, ONCE), (0, 3000, ONCE), long=True),
             [*np.arange(3) / 24.95, *(0.1 + np.arange(3) / 24.95)],
         ),
     ],
 )
 @pytest.mark.parametrize("version", [0, 1])
-def test_times_of_frames(tables, edited, seconds, version, tmp_path):
+def test_frame_times(tables, edited, seconds, version, tmp_path):
     path = tmp_path / FILE
     path.write_bytes(make_movie(1000, 24_950, *tables, edits=edited, version=version))
     assert np.allclose(read_frame_times(path), seconds, rtol=0, atol=1e-12)
@@ -144,23 +159,26 @@ def test_times_of_frames(tables, edited, seconds, version, tmp_path):
         (b"RIFF" + bytes(100), "no track of pictures, or is no MP4"),
         (make_movie(1000, 48_000, STEADY, kind=b"soun"), "no track of pictures"),
         (make_movie(1000, 0, STEADY), "no ticks"),
-        (make_movie(1000, 24_950, STEADY, edits=edits((100, 0, ONCE // 2))), "changes its speed"),
-        (make_movie(1000, 24_950, STEADY, runs(b"ctts", (5, 0))), "tell of 6 and of 5 frames"),
-        (make_movie(1000, 24_950, runs(b"stts", (1 << 30, 1))), "more than 16,777,216 frames"),
-        (make_movie(1000, 24_950, STEADY, edits=edits((100, 9000, ONCE))), "has no frames"),
-        (make_movie(1000, 24_950, STEADY, edits=edits((100, 0, ONCE))).replace(b"mvhd", b"free"), "a clock that it lacks"),
+        (make_movie(1000, 24_950, STEADY, edits=make_edits((100, 0, ONCE // 2))), "changes its speed"),
+        (make_movie(1000, 24_950, STEADY, make_runs(b"ctts", (5, 0))), "tell of 6 and of 5 frames"),
+        (make_movie(1000, 24_950, make_runs(b"stts", (1 << 30, 1))), "more than 16,777,216 frames"),
+        (make_movie(1000, 24_950, STEADY, edits=make_edits((100, 9000, ONCE))), "has no frames"),
+        (
+            make_movie(1000, 24_950, STEADY, edits=make_edits((100, 0, ONCE))).replace(b"mvhd", b"free"),
+            "a clock that it lacks",
+        ),
         (make_movie(1000, 24_950, STEADY) + make_box(b"moof"), "in fragments.*ffmpeg -i VIDEO -c copy"),
         (make_movie(1000, 24_950, make_box(b"stts", bytes(5))), "cannot be read"),
     ],
 )
-def test_times_that_cannot_be_read(data, message, tmp_path):
+def test_unreadable_frame_times_are_refused(data, message, tmp_path):
     (tmp_path / FILE).write_bytes(data)
     with pytest.raises(NergError, match=f"film.mp4.*{message}"):
         read_frame_times(tmp_path / FILE)
 
 
-def test_times_are_those_that_ffmpeg_shows(tmp_path):
-    """A steady video of another rate, coded with frames that are decoded out of order, which starts after 0.28 s."""
+def test_frame_times_equal_ffmpeg(tmp_path):
+    """A video with constant frame rate and reordered frames that starts after 0.28 s."""
     av = pytest.importorskip("av")
     path, base = tmp_path / FILE, Fraction(1, 24_950)
     with av.open(str(path), "w") as out:
@@ -178,7 +196,7 @@ def test_times_are_those_that_ffmpeg_shows(tmp_path):
     assert shown[0] > 0.2 and np.allclose(read_frame_times(path), shown, rtol=0, atol=2e-5)
 
 
-# ---- Videos read back by FFmpeg: every frame, its colours, the rate and what the header says ----
+# ---- Videos decoded by FFmpeg: frames, colours, rate and header ----
 
 HEIGHT, WIDTH = 48, 80
 
@@ -188,8 +206,8 @@ def av():
     return pytest.importorskip("av", reason='PyAV is not installed (pip install "nerg-mi[video]")')
 
 
-def frames(count):
-    """A bar that moves by 4 pixels a frame, over coloured halves."""
+def make_frames(count):
+    """A bar over coloured halves that moves by 4 pixels per frame."""
     for k in range(count):
         frame = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
         frame[:, : WIDTH // 2], frame[:, WIDTH // 2 :] = (200, 30, 40), (20, 160, 220)
@@ -197,29 +215,29 @@ def frames(count):
         yield frame
 
 
-def write(path, count=12, fps=25.0, **more):
-    with open_video_writer(path, fps, **more) as add:
-        for frame in frames(count):
+def write_video(path, count=12, fps=25.0, **options):
+    with open_video_writer(path, fps, **options) as add:
+        for frame in make_frames(count):
             add(frame)
 
 
 @pytest.mark.parametrize("fps, rate", [(25.0, Fraction(25)), (12.5, Fraction(25, 2)), (29.97, Fraction(2997, 100))])
-def test_read_back(av, tmp_path, fps, rate):
-    write(tmp_path / "a.mp4", fps=fps, metadata={"Comment": '{"seed": 1, "ü": 2}', "Software": "nerg_mi 1"})
-    with av.open(str(tmp_path / "a.mp4")) as found:
-        (stream,) = found.streams
+def test_video_round_trip(av, tmp_path, fps, rate):
+    write_video(tmp_path / "a.mp4", fps=fps, metadata={"Comment": '{"seed": 1, "ü": 2}', "Software": "nerg_mi 1"})
+    with av.open(str(tmp_path / "a.mp4")) as decoded:
+        (stream,) = decoded.streams
         assert (stream.codec_context.name, stream.pix_fmt) == ("h264", "yuv420p")
         assert (stream.width, stream.height, stream.frames) == (WIDTH, HEIGHT, 12)
         assert float(stream.average_rate) == pytest.approx(float(rate), rel=1e-4)
-        assert found.metadata["comment"] == '{"seed": 1, "ü": 2}' and "nerg_mi 1" in found.metadata.values()
-        # BT.709, as is written, and as players of high resolution assume.
+        assert decoded.metadata["comment"] == '{"seed": 1, "ü": 2}' and "nerg_mi 1" in decoded.metadata.values()
+        # BT.709, as written, and as players assume for high resolutions.
         assert (stream.codec_context.colorspace, stream.codec_context.color_range) == (1, 1)
         shown = [
-            f.reformat(format="rgb24", src_colorspace="ITU709").to_ndarray().astype(int) for f in found.decode(stream)
+            f.reformat(format="rgb24", src_colorspace="ITU709").to_ndarray().astype(int) for f in decoded.decode(stream)
         ]
     assert len(shown) == 12
-    for k, (frame, wanted) in enumerate(zip(shown, frames(12))):
-        # Where neighbours have one colour, since colours have half the resolution.
+    for k, (frame, wanted) in enumerate(zip(shown, make_frames(12))):
+        # Pixels whose neighbours have the same colour, because colours have half the resolution.
         inside = np.array([x for x in range(2, WIDTH - 2) if np.ptp(wanted[0, x - 2 : x + 3], axis=0).max() == 0])
         assert len(inside) > 40 and np.abs(frame[:, inside] - wanted[:, inside]).mean() < 3
         assert np.abs(frame[:, inside] - wanted[:, inside]).max() < 16
@@ -227,18 +245,18 @@ def test_read_back(av, tmp_path, fps, rate):
         assert abs(bright.mean() - (4 * k + 3.5)) < 0.75
 
 
-def test_equal_frames_are_equal_videos(av, tmp_path):
-    """Picture by picture; the encoder now and then takes another byte or two for the first one."""
+def test_equal_frames_give_equal_files(av, tmp_path):
+    """Compared by packets; the encoder occasionally uses one or two more bytes for the first packet."""
     pictures = []
     for k in "ab":
-        write(tmp_path / f"{k}.mp4", text={"Comment": "x"})
+        write_video(tmp_path / f"{k}.mp4", text={"Comment": "x"})
         with av.open(tmp_path / f"{k}.mp4") as container:
             pictures.append(np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]))
     assert pictures[0].shape == pictures[1].shape and np.abs(pictures[0].astype(int) - pictures[1]).max() <= 2
     data = (tmp_path / "a.mp4").read_bytes()
-    # No time of making.
+    # No creation time.
     assert data[data.index(b"mvhd") + 8 :][:8] == bytes(8)
-    # The box of the estimated bit rate, which depends on how the encoder's threads were scheduled.
+    # The box with the estimated bit rate, which depends on the scheduling of the encoder's threads.
     assert b"btrt" not in data and b"mdat" in data
 
 
@@ -246,20 +264,20 @@ def test_equal_frames_are_equal_videos(av, tmp_path):
     "shape, said",
     [((49, 80), "even sides"), ((48, 81), "even sides"), ((8, 80), "16 to 8192"), ((48, 9000), "16 to 8192")],
 )
-def test_sizes_that_players_do_not_show(av, tmp_path, shape, said):
+def test_unsupported_sizes_are_refused(av, tmp_path, shape, said):
     with pytest.raises(NergError, match=said), open_video_writer(tmp_path / "a.mp4") as add:
         add(np.zeros((*shape, 3), np.uint8))
     assert not list(tmp_path.iterdir())
 
 
-def test_frames_of_one_size(av, tmp_path):
+def test_frames_must_have_same_size(av, tmp_path):
     with pytest.raises(NergError, match="80.*48.*40.*48"), open_video_writer(tmp_path / "a.mp4") as add:
         add(np.zeros((48, 80, 3), np.uint8))
         add(np.zeros((48, 40, 3), np.uint8))
     assert not list(tmp_path.iterdir())
 
 
-def test_no_frames_and_no_rate(av, tmp_path):
+def test_missing_frames_and_invalid_rate_are_refused(av, tmp_path):
     with pytest.raises(NergError, match="a video without pictures"), open_video_writer(tmp_path / "a.mp4"):
         pass
     for fps in (0.0, -1.0, float("nan"), 1e9):
@@ -268,15 +286,15 @@ def test_no_frames_and_no_rate(av, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_what_interrupts_leaves_nothing(av, tmp_path):
+def test_interrupted_video_leaves_no_file(av, tmp_path):
     (tmp_path / "a.mp4").write_bytes(b"old")
     with pytest.raises(KeyboardInterrupt), open_video_writer(tmp_path / "a.mp4") as add:
-        add(next(frames(1)))
+        add(next(make_frames(1)))
         raise KeyboardInterrupt
     assert [p.name for p in tmp_path.iterdir()] == ["a.mp4"] and (tmp_path / "a.mp4").read_bytes() == b"old"
 
 
-def test_without_pyav(tmp_path, monkeypatch):
+def test_missing_pyav_names_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(ImportError, match=r'"nerg-mi\[video\]\"'):
         check_video_output(25.0)

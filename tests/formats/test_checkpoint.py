@@ -1,4 +1,4 @@
-"""Checkpoint files: round trips, atomic writes, and a sentence for every kind of wrong file."""
+"""Checkpoint files: round trips, atomic writes, and errors for all kinds of invalid files."""
 
 import os
 import subprocess
@@ -37,7 +37,7 @@ def test04_missing_file(tmp_path):
         read_checkpoint(tmp_path, "radiance")
 
 
-WHOLE = save({"x": np.ones(2, np.float32)}, metadata={"nerg": '{"kind": "radiance", "format": 1}'})
+VALID = save({"x": np.ones(2, np.float32)}, metadata={"nerg": '{"kind": "radiance", "format": 1}'})
 ALIEN = "is not a readable safetensors file"
 
 
@@ -52,7 +52,7 @@ def header(length, text=b""):
         (b"abc", ALIEN),
         (b"\x80\x02pickle" * 9, ALIEN),
         (b"\xff" * 64, ALIEN),
-        (WHOLE[:-5], ALIEN),
+        (VALID[:-5], ALIEN),
         (header(10**12, b"{}"), ALIEN),
         (header(2, b"[]"), ALIEN),
         (header(1 << 63), ALIEN),
@@ -60,7 +60,7 @@ def header(length, text=b""):
         (header(17 << 20, b" " * (17 << 20)), "more than the 16,777,216 that are read"),
     ],
 )
-def test_what_is_no_safetensors_file(tmp_path, raw, said):
+def test_invalid_safetensors_is_refused(tmp_path, raw, said):
     (tmp_path / "f.safetensors").write_bytes(raw)
     with pytest.raises(NergError, match=f"f.safetensors.*{said}"):
         read_checkpoint(tmp_path / "f.safetensors", "radiance")
@@ -76,15 +76,15 @@ def test_what_is_no_safetensors_file(tmp_path, raw, said):
         ('{"kind": "radiance", "format": 1, "deep": ' + "[" * 100_000 + "]" * 100_000 + "}", "nested"),
     ],
 )
-def test_metadata_that_are_not_read(tmp_path, metadata, said):
-    about = None if metadata is None else {"nerg": metadata}
-    (tmp_path / "f.safetensors").write_bytes(save({"x": np.ones(2)}, metadata=about))
+def test_invalid_metadata_is_refused(tmp_path, metadata, said):
+    entries = None if metadata is None else {"nerg": metadata}
+    (tmp_path / "f.safetensors").write_bytes(save({"x": np.ones(2)}, metadata=entries))
     with pytest.raises(NergError, match=f"f.safetensors.*{said}") as error:
         read_checkpoint(tmp_path / "f.safetensors", "radiance")
     assert "\n" not in str(error.value)
 
 
-def test_what_is_no_json_leaves_the_old_file(tmp_path):
+def test_invalid_metadata_keeps_old_file(tmp_path):
     path = tmp_path / "f.safetensors"
     write_checkpoint(path, "radiance", TENSORS, {"n": 1})
     with pytest.raises(ValueError):
@@ -105,7 +105,7 @@ def test10_torch_is_not_imported(tmp_path):
 
 
 @pytest.mark.parametrize("size", [3 << 30, 64 << 30])
-def test_what_is_no_checkpoint_is_refused_before_it_is_mapped(tmp_path, monkeypatch, size):
+def test_other_files_are_refused_before_mapping(tmp_path, monkeypatch, size):
     with (tmp_path / "f.safetensors").open("wb") as out:
         out.truncate(size)
     monkeypatch.setattr("safetensors.safe_open", lambda *_, **__: pytest.fail("it was mapped"))

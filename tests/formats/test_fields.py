@@ -18,10 +18,9 @@ from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid, cascades_from_c
 from nerg_mi.fields.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import (
     MAX_GRID_RESOLUTION,
-    MAX_WEIGHT,
     MAX_OCCUPANCY_CELLS,
+    MAX_WEIGHT,
     StoredArrays,
-    translate_build_errors,
     check_occupancy,
     check_sizes,
     load_gaze,
@@ -30,30 +29,35 @@ from nerg_mi.formats.fields import (
     save_gaze,
     save_radiance,
     to_stored_arrays,
+    translate_build_errors,
 )
 from nerg_mi.maths.geometry import Box, ContractedBox
 from nerg_mi.rays.rays import Rays
 from tests.conftest import ROOT
 
-# ---- Sizes that checkpoints claim: in bounds, or said in a sentence that names the file ----
+# ---- Sizes in checkpoints: within limits, or an error that names the file ----
 
 GRID = {"levels": 2, "features": 2, "log2_rows": 8, "base": 4, "finest": 16, "dimensions": 3}
 
 
-def test_sizes_in_bounds_pass_as_they_are():
-    about = {"grid": GRID, "width": 4096, "density_hidden": 1, "geometry": 15, "other": "kept"}
-    assert check_sizes(about) is about
+def test_valid_sizes_pass_unchanged():
+    config = {"grid": GRID, "width": 4096, "density_hidden": 1, "geometry": 15, "other": "kept"}
+    assert check_sizes(config) is config
     assert check_sizes({"grid": {"kind": "hashgrid", **GRID}})
 
 
 def test_each_kind_of_gaze_field_has_its_own_bounds():
-    """The word "geometry" of a log density is no size."""
+    """The entry "geometry" of a log density is not a size."""
     product, log = {"geometry": "surface"}, {"kind": "log_density", "geometry": "surface", "layers": 2}
     assert check_sizes(log, limits=max_sizes_of(log)) is log
-    for about, name in ((product, "geometry"), ({**log, "layers": 65}, "layers"), ({**log, "prior": 0}, "prior")):
+    for config, name in ((product, "geometry"), ({**log, "layers": 65}, "layers"), ({**log, "prior": 0}, "prior")):
         with pytest.raises(ValueError, match=f'"{name}" of its architecture must be a whole number'):
-            check_sizes(about, limits=max_sizes_of(about))
-    assert not max_sizes_of({"kind": "wavelet"}) and not max_sizes_of({"kind": ["product"]}) and not max_sizes_of("product")
+            check_sizes(config, limits=max_sizes_of(config))
+    assert (
+        not max_sizes_of({"kind": "wavelet"})
+        and not max_sizes_of({"kind": ["product"]})
+        and not max_sizes_of("product")
+    )
 
 
 @pytest.mark.parametrize(
@@ -71,53 +75,53 @@ def test_each_kind_of_gaze_field_has_its_own_bounds():
         ({"grid": {**GRID, "kind": "octree"}}, "'octree'"),
     ],
 )
-def test_sizes_out_of_bounds_are_named(about, words):
+def test_sizes_out_of_bounds_are_named(config, words):
     with pytest.raises(ValueError, match=words):
-        check_sizes(about)
+        check_sizes(config)
 
 
-def test_numbers_are_finite_and_no_booleans():
+def test_numbers_must_be_finite_and_not_boolean():
     assert read_number({"a": 2}, "a", "thing") == 2
     for wrong in ({"a": True}, {"a": "2"}, {"a": float("inf")}, {"a": None}, [2]):
         with pytest.raises(ValueError, match='"a"'):
             read_number(wrong, "a", "thing")
 
 
-def test_occupancy_has_a_largest_size():
-    about = {"resolution": 400, "threshold": 0.5}
-    assert check_occupancy(about) is about
-    check_occupancy({**about, "resolution": 128, "bound": 16.0})
+def test_occupancy_size_is_limited():
+    config = {"resolution": 400, "threshold": 0.5}
+    assert check_occupancy(config) is config
+    check_occupancy({**config, "resolution": 128, "bound": 16.0})
     for wrong in ({"resolution": 407}, {"resolution": 2.0}, {"resolution": 128, "bound": 2.0**40}):
         with pytest.raises(ValueError, match=f"{MAX_OCCUPANCY_CELLS:,} cells at most"):
-            check_occupancy({**about, **wrong})
+            check_occupancy({**config, **wrong})
 
 
 @pytest.mark.parametrize("error", [KeyError("box"), ValueError("x"), TypeError("x"), OverflowError("x")])
-def test_what_building_raises_names_the_file(error):
+def test_build_errors_name_file(error):
     with pytest.raises(NergError, match='the checkpoint "a.safetensors" (lacks .box.|holds no usable field: x)') as e:
         with translate_build_errors("a.safetensors"):
             raise error
     assert e.value.__cause__ is error
 
 
-def test_finished_sentences_and_faults_of_the_program_pass():
-    own = NergError("as it is")
+def test_nerg_errors_and_bugs_pass():
+    error = NergError("as it is")
     with pytest.raises(NergError) as e, translate_build_errors("a"):
-        raise own
-    assert e.value is own
+        raise error
+    assert e.value is error
     with pytest.raises(ZeroDivisionError), translate_build_errors("a"):
         _ = 1 / 0
 
 
-# ---- Arrays of checkpoints as parts of fields, and the other way ----
+# ---- Conversion between arrays of checkpoints and parts of fields ----
 
 ARRAYS_GRID = HashGridConfig(levels=1, log2_rows=3, base=1, finest=1)
 
 
-def test_arrays_are_float32_of_the_shape_that_is_asked_for():
+def test_arrays_are_float32_with_required_shape():
     arrays = StoredArrays({"a": np.ones((2, 3), np.float16), "n": np.array([1, np.nan]), "big": np.array([1e300])}, ns)
-    found = arrays.get_array("a", 2, None)
-    assert found.dtype == np.float32 and found.ctypes.data % 64 == 0
+    array = arrays.get_array("a", 2, None)
+    assert array.dtype == np.float32 and array.ctypes.data % 64 == 0
     assert arrays.get_raw("a").dtype == np.float16
     for shape in ((3, 2), (2,), (2, 3, 1)):
         with pytest.raises(ValueError, match='"a".*2.*3'):
@@ -150,15 +154,15 @@ def test_networks_and_encodings():
         arrays.build_grid(HashGridConfig(levels=2, log2_rows=3, base=1, finest=2))
 
 
-def test_members_have_names_of_their_own():
+def test_members_have_own_names():
     arrays = StoredArrays({"0.a": np.zeros(1), "1.a": np.ones(1), "10.a": np.full(1, 10)}, ns)
-    about, own = arrays.get_member(1, {"width": 4})
-    assert about == {"width": 4} and own.get_array("a", 1).tolist() == [1]
+    architecture, member = arrays.get_member(1, {"width": 4})
+    assert architecture == {"width": 4} and member.get_array("a", 1).tolist() == [1]
     with pytest.raises(ValueError, match="width"):
         arrays.get_member(0, {"width": 0})
 
 
-def test_what_is_stored_is_finite():
+def test_stored_weights_are_finite():
     values = {"a": ns.Float([1.0, 70000.0])}
     assert to_stored_arrays(values, False)["a"].dtype == np.float32
     with pytest.raises(NergError, match='"a".*fp16.*--half'):
@@ -170,13 +174,13 @@ def test_what_is_stored_is_finite():
     assert to_stored_arrays({"a": ns.TensorXf(np.ones((2, 2), np.float32))}, True)["a"].dtype == np.float16
 
 
-# ---- Fields in and out of files: exact in fp32, rounded in fp16, and a sentence for what does not fit ----
+# ---- Fields in files: exact in fp32, rounded in fp16, and errors for invalid files ----
 
 FIELDS_GRID = HashGridConfig(levels=2, log2_rows=8, base=4, finest=16)
 BOX = Box((-1, 0, 2), (3, 2, 4))
 
 
-def radiance(resolution=5):
+def make_radiance(resolution=5):
     bits = np.random.default_rng(0).random((resolution,) * 3) < 0.2
     return RadianceField.random(
         RadianceConfig(FIELDS_GRID, width=16, color_hidden=1, geometry=3, sh_degree=2, density_scale=7.0),
@@ -189,7 +193,7 @@ def radiance(resolution=5):
     )
 
 
-def gaze():
+def make_gaze():
     return GazeField.random(GazeConfig(FIELDS_GRID, "capture", "exp", width=16, geometry=3, sh_degree=3), BOX, ns, 2)
 
 
@@ -206,10 +210,10 @@ def rewrite(path, change):
 
 
 @pytest.mark.parametrize("half", [False, True])
-def test01_fields_come_back(tmp_path, half):
+def test01_fields_round_trip(tmp_path, half):
     path, provenance = tmp_path / "f.safetensors", {"dataset": "fox", "seconds": 12.5}
     rounded = lambda v: v.astype(np.float16).astype(np.float32) if half else v
-    for made, save, load in ((radiance(), save_radiance, load_radiance), (gaze(), save_gaze, load_gaze)):
+    for made, save, load in ((make_radiance(), save_radiance, load_radiance), (make_gaze(), save_gaze, load_gaze)):
         save(made, path, provenance, half=half)
         again, meta = load(path, ns)
         assert again.config == made.config and again.box == made.box and meta["provenance"] == provenance
@@ -219,8 +223,8 @@ def test01_fields_come_back(tmp_path, half):
         assert unit.items() <= meta["units"].items()
 
 
-def test02_what_a_radiance_field_has_besides(tmp_path):
-    field = radiance()
+def test02_optional_parts_of_radiance_fields(tmp_path):
+    field = make_radiance()
     save_radiance(field, tmp_path / "f", {})
     again, meta = load_radiance(tmp_path / "f", ns)
     assert (again.color_space, again.march_step) == ("linear", 0.01) and "deferred" not in meta["architecture"]
@@ -235,10 +239,10 @@ def test02_what_a_radiance_field_has_besides(tmp_path):
     assert again.config.deferred
 
 
-def test02b_what_a_gaze_field_rests_on(tmp_path):
-    """Read of what its training says of itself, and of nothing where that says nothing."""
-    for about, words in (({"rays": 300, "people": 7}, "300 rays of 7 people"), ({"rays": -3}, None), ({}, None)):
-        save_gaze(gaze(), tmp_path / "g.safetensors", about)
+def test02b_support_and_provenance_of_gaze_fields(tmp_path):
+    """Read from the provenance of the training; None without it."""
+    for metadata, words in (({"rays": 300, "people": 7}, "300 rays of 7 people"), ({"rays": -3}, None), ({}, None)):
+        save_gaze(make_gaze(), tmp_path / "g.safetensors", metadata)
         basis = load_gaze(tmp_path / "g.safetensors", ns)[0].basis
         assert (None if basis is None else basis.words()) == words
 
@@ -257,8 +261,8 @@ def array(name, shape):
 
 def metadata(value, *path):
     def change(tensors, meta):
-        *way, last = path
-        for key in way:
+        *keys, last = path
+        for key in keys:
             meta = meta[key]
         meta[last] = value
 
@@ -304,7 +308,7 @@ DAMAGE = [
 
 @pytest.mark.parametrize("change, said", DAMAGE)
 def test_damaged_radiance_fields_are_refused_before_anything_is_built(tmp_path, change, said):
-    save_radiance(radiance(), tmp_path / "f.safetensors", {})
+    save_radiance(make_radiance(), tmp_path / "f.safetensors", {})
     rewrite(tmp_path / "f.safetensors", change)
     with pytest.raises(NergError, match=f"f.safetensors.*{said}"):
         load_radiance(tmp_path / "f.safetensors", ns)
@@ -318,7 +322,7 @@ def test_damaged_radiance_fields_are_refused_before_anything_is_built(tmp_path, 
     ],
 )
 def test_damaged_gaze_fields_are_refused(tmp_path, change, said):
-    save_gaze(gaze(), tmp_path / "g.safetensors", {})
+    save_gaze(make_gaze(), tmp_path / "g.safetensors", {})
     rewrite(tmp_path / "g.safetensors", change)
     with pytest.raises(NergError, match=f"g.safetensors.*{said}"):
         load_gaze(tmp_path / "g.safetensors", ns)
@@ -329,7 +333,7 @@ def test_cascades_that_float32_cannot_address_are_refused():
         CascadeGrid(np.zeros((25, 2, 2, 2), bool), 2.0**24, ns, 0.0)
 
 
-def test_a_place_without_an_end(tmp_path):
+def test_contracted_box_round_trips(tmp_path):
     box, r = ContractedBox(Box((-1, 0, 2), (3, 2, 4)), 8), 8
     field = RadianceField.random(
         RadianceConfig(FIELDS_GRID, width=16, color_hidden=1, geometry=3, sh_degree=2),
@@ -361,10 +365,10 @@ def test_a_blind_density_that_single_precision_cannot_hold_is_refused(tmp_path, 
         load_gaze(tmp_path / "g.safetensors", ns)
 
 
-# ---- Files that earlier versions wrote ----
+# ---- Files of earlier versions ----
 #
-# ``files/`` holds one of each kind of the first format, written by version 0.1, and ``expected.json``, what the fields
-# in them returned then. Files of a further format are added, never put in the place of these.
+# ``files/`` contains one file of each kind in the first format, written by version 0.1, and ``expected.json``, the
+# values of these fields in that version. Files of later formats are added and do not replace these.
 
 
 FILES = ROOT / "tests" / "formats" / "files"
@@ -388,7 +392,9 @@ def test_radiance_fields(name, occupancy):
     assert np.allclose(sigma.numpy(), expected["density"], rtol=1e-4) and np.max(expected["density"]) > 0.1
     color = np.stack([c.numpy() for c in field.color(features, DIRECTIONS)], 1)
     assert np.allclose(color, expected["color"], atol=1e-4)
-    assert isinstance(field.occupancy, occupancy) and field.occupancy.occupied_fraction == pytest.approx(expected["occupied"])
+    assert isinstance(field.occupancy, occupancy) and field.occupancy.occupied_fraction == pytest.approx(
+        expected["occupied"]
+    )
     if name == "radiance":
         behind = np.stack([c.numpy() for c in field.background(OBSERVERS, DIRECTIONS)], 1)
         assert np.allclose(behind, expected["background"], atol=1e-4)
@@ -403,10 +409,10 @@ def test_gaze_fields(name):
         emit, capture = member.unnormalized(POINTS, OBSERVERS, DIRECTIONS)
         assert np.allclose((emit * capture).numpy(), expected, rtol=1e-4, atol=1e-6)
     if "support" in EXPECTED[name]:
-        # Kernels reached no farther than the radius then.
+        # In that version, kernels ended at the radius.
         field.support.cutoff = field.support.radius
-        found = [field.support.evaluate(ns.Array3f(*p))[0] for p in EXPECTED["observers"]]
-        assert np.allclose(found, EXPECTED[name]["support"], rtol=1e-4) and max(found) >= 1
+        loaded = [field.support.evaluate(ns.Array3f(*p))[0] for p in EXPECTED["observers"]]
+        assert np.allclose(loaded, EXPECTED[name]["support"], rtol=1e-4) and max(loaded) >= 1
     else:
         assert field.support is None
 
@@ -422,20 +428,20 @@ def test_rays(suffix):
     assert np.allclose(rays.direction, EXPECTED["directions"], atol=1e-6)
 
 
-def test_the_fields_of_the_store():
-    field, about = load_radiance(ROOT / "scenes" / "store" / "store.safetensors", ns)
-    assert about["format"] == 1 and field.occupancy is not None and np.isfinite(field.density(POINTS).numpy()).all()
-    gaze, about = load_gaze(ROOT / "scenes" / "store" / "shoppers.safetensors", ns)
-    assert about["format"] == 1 and np.isfinite(gaze.unnormalized(POINTS, OBSERVERS, DIRECTIONS)[0].numpy()).all()
+def test_fields_of_store():
+    field, metadata = load_radiance(ROOT / "scenes" / "store" / "store.safetensors", ns)
+    assert metadata["format"] == 1 and field.occupancy is not None and np.isfinite(field.density(POINTS).numpy()).all()
+    gaze, metadata = load_gaze(ROOT / "scenes" / "store" / "shoppers.safetensors", ns)
+    assert metadata["format"] == 1 and np.isfinite(gaze.unnormalized(POINTS, OBSERVERS, DIRECTIONS)[0].numpy()).all()
 
 
 @pytest.mark.parametrize("name", ["radiance", "cascades", *GAZE])
-def test_a_field_is_stored_as_it_was(tmp_path, name):
-    """Metadata and arrays of a file that is loaded and saved: who has an older version can read the new file."""
+def test_field_is_stored_unchanged(tmp_path, name):
+    """Metadata and arrays survive loading and saving, so that earlier versions can read the new file."""
     old, new = FILES / f"{name}.safetensors", tmp_path / "new.safetensors"
     load, save = (load_gaze, save_gaze) if name in GAZE else (load_radiance, save_radiance)
-    field, about = load(old, ns)
-    save(field, new, about["provenance"], half=name in ("cascades", "layernorm", "ensemble"))
+    field, metadata = load(old, ns)
+    save(field, new, metadata["provenance"], half=name in ("cascades", "layernorm", "ensemble"))
     assert metadata_of(new) == metadata_of(old)
     with safe_open(old, framework="numpy") as a, safe_open(new, framework="numpy") as b:
         assert list(a.keys()) == list(b.keys())

@@ -1,4 +1,4 @@
-"""Meshes of files: what others write is read as it is meant, or refused in a sentence with the file's name."""
+"""Mesh files: files of other programs are read correctly, or refused with an error that names the file."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import trimesh
 
 from nerg_mi.errors import MissingFile, NergError
 from nerg_mi.formats import meshes
-from nerg_mi.formats.gltf import pack_glb, parse_glb, read_glb_chunks, encode_unlit_glb
+from nerg_mi.formats.gltf import encode_unlit_glb, pack_glb, parse_glb, read_glb_chunks
 from nerg_mi.formats.meshes import read_mesh_file
 from nerg_mi.formats.ply import write_columns
 from tests.surfaces.meshes import box
@@ -21,17 +21,19 @@ QUAD = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 TRIANGLES = [[0, 1, 2], [0, 2, 3]]
 
 
-def ply(
-    order: str, vertex: dict[str, str], faces: str, rows: list[tuple], after: list[tuple], more: bytes = b""
+def write_ply_text(
+    order: str, vertex: dict[str, str], faces: str, rows: list[tuple], after: list[tuple], options: bytes = b""
 ) -> bytes:
-    """A file of ``rows`` (vertices) and ``after`` (faces, lists as tuples), binary in ``order``, or text (""), with the
-    types by name ``vertex``, and ``faces``, lines of the properties of faces."""
+    """Write ``rows`` (vertices) and ``after`` (faces; lists as tuples), binary in ``order``, or text for "".
+
+    ``vertex`` maps property names to types, and ``faces`` contains the property lines of faces.
+    """
     style = {"": "ascii", "<": "binary_little_endian", ">": "binary_big_endian"}[order]
     names = "".join(f"property {kind} {name}\n" for name, kind in vertex.items())
     head = f"ply\nformat {style} 1.0\nelement vertex {len(rows)}\n{names}element face {len(after)}\n{faces}end_header\n"
     if not order:
         flat = lambda row: [w for v in row for w in ((len(v), *v) if isinstance(v, tuple) else (v,))]
-        return (head + "\n".join(" ".join(map(str, flat(row))) for row in [*rows, *after]) + "\n").encode() + more
+        return (head + "\n".join(" ".join(map(str, flat(row))) for row in [*rows, *after]) + "\n").encode() + options
     codes = {"float": "f", "uchar": "B", "ushort": "H"}
     data = b"".join(struct.pack(order + "".join(codes[k] for k in vertex.values()), *row) for row in rows)
     for row in after:
@@ -41,7 +43,7 @@ def ply(
                 if isinstance(value, tuple)
                 else bytes([value])
             )
-    return head.encode() + data + more
+    return head.encode() + data + options
 
 
 XYZ = dict.fromkeys("xyz", "float")
@@ -63,7 +65,7 @@ LIST = "property list uchar int vertex_indices\n"
     ],
 )
 def test_polygons_become_triangles(tmp_path, order, faces, triangles, polygons):
-    (tmp_path / "a.ply").write_bytes(ply(order, XYZ, LIST, CORNERS, faces))
+    (tmp_path / "a.ply").write_bytes(write_ply_text(order, XYZ, LIST, CORNERS, faces))
     mesh = read_mesh_file(tmp_path / "a.ply")
     assert mesh.vertices.tolist() == np.array(CORNERS).tolist() and mesh.faces.tolist() == triangles
     assert mesh.polygons.tolist() == polygons and mesh.is_readable_by_mitsuba == (len(triangles) == len(faces))
@@ -90,7 +92,9 @@ DARK = 1 / 255 / 12.92, 2 / 255 / 12.92
 def test_colours_of_vertices(tmp_path, order, kind, values, expected, alpha):
     names = ("red", "green", "blue", *(("alpha",) if alpha else ()))
     rows = [(*corner, *values, *((values[0],) if alpha else ())) for corner in CORNERS]
-    (tmp_path / "a.ply").write_bytes(ply(order, XYZ | dict.fromkeys(names, kind), LIST, rows, [((0, 1, 2),)]))
+    (tmp_path / "a.ply").write_bytes(
+        write_ply_text(order, XYZ | dict.fromkeys(names, kind), LIST, rows, [((0, 1, 2),)])
+    )
     mesh = read_mesh_file(tmp_path / "a.ply")
     assert np.allclose(mesh.colors, expected) and mesh.encodes_colors == (FIFTH in expected)
     assert mesh.is_readable_by_mitsuba == (not alpha and FIFTH not in expected)
@@ -100,16 +104,16 @@ def test_colours_of_vertices(tmp_path, order, kind, values, expected, alpha):
 def test_colours_of_faces_go_with_their_triangles(tmp_path):
     tints = "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
     faces = [((1, 4, 2), 255, 0, 0), ((0, 1, 2, 3), 0, 255, 51)]
-    (tmp_path / "a.ply").write_bytes(ply("<", XYZ, LIST + tints, CORNERS, faces))
+    (tmp_path / "a.ply").write_bytes(write_ply_text("<", XYZ, LIST + tints, CORNERS, faces))
     assert np.allclose(read_mesh_file(tmp_path / "a.ply").face_colors, [(1, 0, 0), (0, 1, FIFTH), (0, 1, FIFTH)])
 
 
 @pytest.mark.parametrize("normal", [(0, 0, 0), (float("nan"), 0, 1)])
-def test_what_is_not_used_is_named(tmp_path, normal):
+def test_unused_data_is_noted(tmp_path, normal):
     vertex = XYZ | dict.fromkeys(("nx", "ny", "nz", "quality"), "float")
     rows = [(*corner, *normal, 1) for corner in CORNERS]
     texture = LIST + "property list uchar int texnumbers\n"
-    (tmp_path / "a.ply").write_bytes(ply("", vertex, texture, rows, [((0, 1, 2), (1, 2))], b"\n7 7\n"))
+    (tmp_path / "a.ply").write_bytes(write_ply_text("", vertex, texture, rows, [((0, 1, 2), (1, 2))], b"\n7 7\n"))
     mesh = read_mesh_file(tmp_path / "a.ply")
     for said in ("normals are not used", "vertex that are not used: quality", "face that are not used: texnumbers"):
         assert said in "; ".join(mesh.notes)
@@ -128,7 +132,7 @@ def test_what_is_not_used_is_named(tmp_path, normal):
         "# \xe4\no a\nusemtl red\n" + QUAD.replace("0\n", "0 1 0 0\n") + "f 1 2 3 4\r\n",
     ],
 )
-def test_legal_obj(tmp_path, text):
+def test_valid_obj(tmp_path, text):
     (tmp_path / "a.obj").write_text(text, encoding="latin-1")
     mesh = read_mesh_file(tmp_path / "a.obj")
     assert mesh.vertices.tolist() == [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]] and mesh.faces.tolist() == TRIANGLES
@@ -154,14 +158,14 @@ def test_concave_polygons_are_covered(tmp_path, outline, area, beyond, suffix, o
         text = "".join(f"v {x} {y} {z}\n" for x, y, z in rows) + "f " + " ".join(map(str, range(1, n + 1)))
         (tmp_path / "a.obj").write_text(text)
     else:
-        (tmp_path / "a.ply").write_bytes(ply("<", XYZ, LIST, rows, [(tuple(range(n)),)]))
+        (tmp_path / "a.ply").write_bytes(write_ply_text("<", XYZ, LIST, rows, [(tuple(range(n)),)]))
     mesh = read_mesh_file(tmp_path / f"a{suffix}")
     a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
     normals = np.cross(b - a, c - a) / 2
     assert np.isclose(normals[:, 2].sum(), order * area) and len(mesh.faces) == n - 2
     assert np.isclose(np.abs(normals[:, 2]).sum(), area) == (not beyond)
     assert ("reach beyond" in "".join(mesh.notes)) == beyond
-    # Mitsuba takes fans from the first corner on.
+    # Mitsuba triangulates as a fan from the first corner.
     x, y = (np.array(outline) - outline[0])[1:].T
     fan = order * (x[:-1] * y[1:] - x[1:] * y[:-1])
     assert suffix == ".ply" or bool(mesh.unreadable_reason) == (fan.min() < 0)
@@ -228,22 +232,22 @@ def test_bytes_in_wider_numbers_are_colours_of_8_bits(tmp_path, kind, values, ex
         ("", "no vertices"),
     ],
 )
-def test_other_obj_is_a_sentence(tmp_path, text, said):
+def test_invalid_obj_is_refused(tmp_path, text, said):
     (tmp_path / "a.obj").write_text(text)
     with pytest.raises(NergError, match=said) as error:
         read_mesh_file(tmp_path / "a.obj")
     assert "a.obj" in str(error.value) and "\n" not in str(error.value)
 
 
-def test_files_that_are_none(tmp_path):
+def test_non_mesh_files_are_refused(tmp_path):
     with pytest.raises(NergError, match=r"ends in \.ply, \.obj"):
         read_mesh_file(tmp_path / "a.stl")
     with pytest.raises(MissingFile, match="there is no mesh"):
         read_mesh_file(tmp_path / "a.glb")
 
 
-def glb(path, attributes, document=None, primitive=None, faces=F):
-    """A file of ``attributes``, whose JSON has other values."""
+def write_glb_file(path, attributes, document=None, primitive=None, faces=F):
+    """Write a file with ``attributes`` and modified JSON values."""
     raw = b"".join(encode_unlit_glb([("POSITION", V.astype("<f4"), False), *attributes], faces, up="y"))
     changed, data = read_glb_chunks(raw, path)
     changed["meshes"][0]["primitives"][0] |= primitive or {}
@@ -284,7 +288,7 @@ def test_quantised_positions(tmp_path, kind, code, normalized):
 def test_colours_and_unused_parts_of_gltf(tmp_path):
     colors = np.full((8, 4), 65535, "<u2")
     colors[:, 1] = 13107
-    mesh = glb(tmp_path / "a.glb", [("COLOR_0", colors, True), ("_MARK", V[:, 0].astype("<f4"), False)])
+    mesh = write_glb_file(tmp_path / "a.glb", [("COLOR_0", colors, True), ("_MARK", V[:, 0].astype("<f4"), False)])
     assert np.allclose(mesh.colors, (1, 0.2, 1), atol=1e-4)
     assert mesh.notes == ("parts that are not used: materials, _MARK, KHR_materials_unlit",)
 
@@ -294,7 +298,7 @@ def test_colours_and_unused_parts_of_gltf(tmp_path):
 )
 def test_strips_and_fans(tmp_path, mode, expected):
     indices = np.array([[0, 1, 2, 3, 7]])
-    assert glb(tmp_path / "a.glb", [], primitive={"mode": mode}, faces=indices).faces.tolist() == expected
+    assert write_glb_file(tmp_path / "a.glb", [], primitive={"mode": mode}, faces=indices).faces.tolist() == expected
 
 
 @pytest.mark.parametrize(
@@ -307,11 +311,11 @@ def test_strips_and_fans(tmp_path, mode, expected):
 )
 def test_extensions_that_move_triangles_are_refused(tmp_path, document):
     with pytest.raises(NergError, match="a.glb.*(EXT|KHR)_.*export it without"):
-        glb(tmp_path / "a.glb", [], document)
+        write_glb_file(tmp_path / "a.glb", [], document)
 
 
 @pytest.mark.parametrize("offset", [(500_000, 5_600_000, 0), (4_027_000, 307_000, 4_919_000), (0, 0, -30_000)])
-def test_coordinates_of_surveys_are_refused(tmp_path, offset):
+def test_survey_coordinates_are_refused(tmp_path, offset):
     rows = "".join(f"v {x} {y} {z}\n" for x, y, z in V + offset)
     (tmp_path / "a.obj").write_text(rows + "f 1 2 3\n")
     with pytest.raises(
@@ -343,7 +347,7 @@ def test_a_line_of_gigabytes_is_refused_in_bounded_memory(tmp_path, monkeypatch)
         read_mesh_file(tmp_path / "a.obj")
 
 
-def test_what_of_a_gltf_is_not_used_takes_no_memory(tmp_path):
+def test_unused_gltf_data_takes_no_memory(tmp_path):
     corners = [("POSITION", np.eye(3, dtype="<f4"), False)]
     raw, spare = b"".join(encode_unlit_glb(corners, np.array([[0, 1, 2]]))), 512 << 20
     at = 20 + struct.unpack_from("<I", raw, 12)[0]
@@ -357,7 +361,7 @@ def test_what_of_a_gltf_is_not_used_takes_no_memory(tmp_path):
     tracemalloc.stop()
 
 
-# ---- PLY files with columns of their own, as trimesh and Mitsuba read them ----
+# ---- PLY files with custom columns, read by trimesh and Mitsuba ----
 
 TETRAHEDRON = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], float)
 TWO_FACES = np.array([[0, 1, 2], [0, 3, 1]])
@@ -387,24 +391,24 @@ def test_columns_of_faces_are_an_attribute_in_mitsuba(rgb, tmp_path):
     assert np.allclose(np.array(rgb.traverse(mesh)["face_color"]).reshape(-1, 3), tints)
 
 
-# ---- Binary glTF: what is written opens elsewhere, and what others write is read within limits ----
+# ---- Binary glTF: other programs read written files, and files of other programs are read within limits ----
 
 
-def test_glb_trimesh_reads_what_is_written(tmp_path):
+def test_trimesh_reads_written_glb(tmp_path):
     colors = np.full((8, 4), 65535, "<u2")
     colors[:, 0] = np.linspace(0, 65535, 8)
     parts = [("POSITION", V.astype("<f4"), False), ("COLOR_0", colors, True), ("_VALUE", V[:, 0].astype("<f4"), False)]
     path = tmp_path / "a.glb"
     path.write_bytes(b"".join(encode_unlit_glb(parts, F, up="y", extras={"unit": "1/m²"})))
-    found = trimesh.load(path, process=False, force="mesh")
-    assert np.allclose(found.vertices, V) and np.array_equal(found.faces, F)
+    mesh = trimesh.load(path, process=False, force="mesh")
+    assert np.allclose(mesh.vertices, V) and np.array_equal(mesh.faces, F)
     assert read_glb_chunks(path.read_bytes(), path)[0]["asset"]["extras"] == {"unit": "1/m²"}
-    # All that is bound to a multiple of four bytes is.
+    # Data that must be aligned to four bytes is aligned.
     document, _ = read_glb_chunks(path.read_bytes(), path)
     assert all(view["byteOffset"] % 4 == 0 for view in document["bufferViews"])
 
 
-def test_glb_what_trimesh_writes_is_read_with_its_nodes(tmp_path):
+def test_glb_of_trimesh_is_read_with_nodes(tmp_path):
     scene = trimesh.Scene()
     ball = trimesh.creation.icosphere(1)
     for k in range(2):
@@ -413,11 +417,11 @@ def test_glb_what_trimesh_writes_is_read_with_its_nodes(tmp_path):
     (tmp_path / "a.glb").write_bytes(scene.export(file_type="glb"))
     read = parse_glb((tmp_path / "a.glb").read_bytes(), tmp_path / "a.glb")
     vertices, faces = read.vertices, read.faces
-    whole = trimesh.util.concatenate(scene.dump())
-    assert len(faces) == len(whole.faces) == 160
+    expected = trimesh.util.concatenate(scene.dump())
+    assert len(faces) == len(expected.faces) == 160
     order = lambda t: t[np.lexsort(np.round(t.reshape(len(t), -1), 4).T)]
-    assert np.allclose(order(vertices[faces].mean(1)), order(whole.triangles.mean(1)), atol=1e-5)
-    assert np.isclose(trimesh.Trimesh(vertices, faces).volume, whole.volume, rtol=1e-5)
+    assert np.allclose(order(vertices[faces].mean(1)), order(expected.triangles.mean(1)), atol=1e-5)
+    assert np.isclose(trimesh.Trimesh(vertices, faces).volume, expected.volume, rtol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -440,22 +444,22 @@ def test_glb_what_trimesh_writes_is_read_with_its_nodes(tmp_path):
         ),
     ],
 )
-def test_glb_damaged_files_are_a_sentence(tmp_path, values, said):
+def test_damaged_glb_is_refused(tmp_path, values, said):
     with pytest.raises(NergError, match=said):
-        glb(tmp_path / "a.glb", [], values)
+        write_glb_file(tmp_path / "a.glb", [], values)
 
 
-def test_glb_mirrored_nodes_turn_their_triangles(tmp_path):
-    read = glb(tmp_path / "a.glb", [], {"nodes": [{"mesh": 0, "scale": [-1, 1, 1]}]})
+def test_mirrored_nodes_flip_triangles(tmp_path):
+    read = write_glb_file(tmp_path / "a.glb", [], {"nodes": [{"mesh": 0, "scale": [-1, 1, 1]}]})
     plain = trimesh.Trimesh(V, F).volume
     assert np.isclose(trimesh.Trimesh(read.vertices, read.faces).volume, plain)
 
 
 @pytest.mark.parametrize("cut", [3, 15, 40, 300])
-def test_glb_what_ends_early(tmp_path, cut):
-    glb(tmp_path / "a.glb", [])
-    whole = (tmp_path / "a.glb").read_bytes()
-    (tmp_path / "b.glb").write_bytes(whole[: min(cut, len(whole) - 5)])
+def test_truncated_glb_is_refused(tmp_path, cut):
+    write_glb_file(tmp_path / "a.glb", [])
+    content = (tmp_path / "a.glb").read_bytes()
+    (tmp_path / "b.glb").write_bytes(content[: min(cut, len(content) - 5)])
     with pytest.raises(NergError, match="cannot be read"):
         read_mesh_file(tmp_path / "b.glb")
 
@@ -466,8 +470,8 @@ _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 
 @pytest.mark.parametrize("image", [None, b"\x89PNG\r\n\x1a\n odd"])
 @pytest.mark.parametrize("faces", [F, None])
-def test_glb_what_is_written_keeps_the_rules_of_the_format(image, faces):
-    """Of glTF 2.0, sections 3.6 and 4.4: lengths, alignment, bounds and kinds."""
+def test_written_glb_follows_specification(image, faces):
+    """Sections 3.6 and 4.4 of glTF 2.0: lengths, alignment, bounds and types."""
     parts = [("POSITION", V.astype("<f4"), False), ("NORMAL", V.astype("<f4"), False)]
     parts += [("TEXCOORD_0", V[:, :2].astype("<f4"), False), ("COLOR_0", np.full((8, 4), 9, "<u2"), True)]
     raw = b"".join(encode_unlit_glb([*parts, ("_VALUE", V[:, 0].astype("<f4"), False)], faces, image=image))
@@ -477,7 +481,7 @@ def test_glb_what_is_written_keeps_the_rules_of_the_format(image, faces):
     assert (kind, binary) == (0x4E4F534A, 0x004E4942) and length % 4 == rest % 4 == 0
     assert len(raw) == 28 + length + rest
     document, data = read_glb_chunks(raw, "a.glb")
-    # The chunk is as long as the buffer, but for what fills it up to four bytes.
+    # The chunk has the length of the buffer, padded to four bytes.
     assert 0 <= len(data) - document["buffers"][0]["byteLength"] < 4
     end = 0
     for view in document["bufferViews"]:
@@ -493,7 +497,7 @@ def test_glb_what_is_written_keeps_the_rules_of_the_format(image, faces):
         step = _SIZES[accessor["componentType"]] * _WIDTHS[accessor["type"]]
         assert accessor["count"] * step == view["byteLength"] and view["byteOffset"] % 4 == 0
         assert view["target"] == (34963 if name == "indices" else 34962)
-        # Elements of vertices begin at multiples of four bytes; colours of integers are parts of the whole.
+        # Vertex attributes are aligned to four bytes; integer colours are normalised.
         assert name == "indices" or step % 4 == 0
         assert accessor.get("normalized", False) == (name == "COLOR_0")
         if name == "POSITION":

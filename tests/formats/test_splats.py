@@ -13,19 +13,19 @@ from nerg_mi.errors import MissingFile, NergError
 from nerg_mi.fields.splats import Splats
 from nerg_mi.formats import ply as ply_tables
 from nerg_mi.formats.fields import load_radiance
-from nerg_mi.formats.gltf import pack_glb, read_glb_chunks, encode_unlit_glb
+from nerg_mi.formats.gltf import encode_unlit_glb, pack_glb, read_glb_chunks
 from nerg_mi.formats.ply import parse_ply, write_columns
 from nerg_mi.formats.splats import (
     READERS,
-    is_splat_file,
     choose_plugin,
+    is_splat_file,
+    make_splats,
     read_gltf_splats,
     read_ply_splats,
     read_splat,
     read_splats,
     read_spz,
     refuse_unsupported_splats,
-    make_splats,
     write_ply_splats,
 )
 from nerg_mi.maths.sphere import SH_C0
@@ -37,10 +37,10 @@ from nerg_mi.workflows.scene_places import detect_kind
 from tests.conftest import ROOT
 from tests.formats.splats.writers import random_splats, write_antimatter, write_inria, write_khronos, write_spz
 
-# ---- Antimatter ----
+# ---- .splat ----
 
 
-def test_a_file_is_read_to_its_bytes(tmp_path):
+def test_splat_file_is_decoded_exactly(tmp_path):
     splats = random_splats(degree=1)
     write_antimatter(tmp_path / "a.splat", splats)
     read = read_splat(tmp_path / "a.splat")
@@ -49,11 +49,11 @@ def test_a_file_is_read_to_its_bytes(tmp_path):
     assert np.abs(read.opacities - splats.opacities).max() < 1 / 255
     seen = np.clip(0.5 + SH_C0 * splats.harmonics[:, 0], 0, 1)
     assert np.abs(0.5 + SH_C0 * read.harmonics[:, 0] - seen).max() < 1 / 255
-    # Up to its sign a quaternion is its rotation.
+    # A rotation determines its quaternion up to the sign.
     assert np.abs(np.abs((read.rotations * splats.rotations).sum(axis=1)) - 1).max() < 1e-3
 
 
-def test_what_is_no_such_file_is_refused(tmp_path):
+def test_invalid_splat_file_is_refused(tmp_path):
     (tmp_path / "a.splat").write_bytes(b"x" * 33)
     with pytest.raises(NergError, match=r"a\.splat.*multiple of 32"):
         read_splat(tmp_path / "a.splat")
@@ -77,30 +77,30 @@ def test_memory_is_a_small_multiple_of_the_file(tmp_path):
 WRITERS = {".ply": write_inria, ".splat": write_antimatter, ".spz": write_spz, ".glb": write_khronos}
 
 
-def test_the_ending_of_the_name_says_the_format(tmp_path):
+def test_suffix_selects_format(tmp_path):
     assert set(WRITERS) == set(READERS)
     for suffix, write in WRITERS.items():
         write(tmp_path / f"a{suffix.upper()}", random_splats(7, degree=0))
         assert len(read_splats(tmp_path / f"a{suffix.upper()}")) == 7
 
 
-def test_other_formats_name_the_converter(tmp_path):
+def test_unsupported_formats_name_converter(tmp_path):
     with pytest.raises(NergError, match=r"splat-transform.*out\.ply"):
         read_splats(tmp_path / "a.sog")
     with pytest.raises(NergError, match=r"are read from \.ply"):
         read_splats(tmp_path / "a.txt")
 
 
-def test_other_splats_are_refused_wherever_a_place_is_given(tmp_path):
+def test_unsupported_splats_are_refused_by_all_commands(tmp_path):
     (tmp_path / "a.sog").write_bytes(b"PK")
-    for asked in (refuse_unsupported_splats, detect_kind, lambda path: load_field_geometry(path, None)):
+    for commands in (refuse_unsupported_splats, detect_kind, lambda path: load_field_geometry(path, None)):
         with pytest.raises(NergError, match=r'splat-transform "a\.sog" out\.ply'):
-            asked(tmp_path / "a.sog")
+            commands(tmp_path / "a.sog")
     refuse_unsupported_splats(tmp_path / "a.obj")
     assert choose_plugin(tmp_path / "a.splat") == "splats" and choose_plugin("a.safetensors") == "nerf"
 
 
-def test_a_mesh_is_told_by_its_header(tmp_path):
+def test_mesh_is_recognized_by_header(tmp_path):
     write_inria(tmp_path / "a.ply", random_splats(3))
     assert is_splat_file(tmp_path / "a.ply") and is_splat_file("b.spz") and not is_splat_file("b.obj")
     (tmp_path / "a.ply").write_text("ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n")
@@ -120,7 +120,7 @@ def test_missing_files(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".splat", ".glb"])
-def test_a_reader_names_its_file(tmp_path, suffix):
+def test_reader_errors_name_file(tmp_path, suffix):
     splats = random_splats(degree=0)
     splats.centers[3] = np.nan
     WRITERS[suffix](tmp_path / f"a{suffix}", splats)
@@ -133,35 +133,35 @@ def test_a_reader_names_its_file(tmp_path, suffix):
 NAMES = ("centers", "scales", "rotations", "opacities", "harmonics")
 
 
-def equal(a: Splats, b: Splats, tolerance: float = 2e-6) -> bool:
+def assert_equal(a: Splats, b: Splats, tolerance: float = 2e-6) -> bool:
     return all(np.allclose(getattr(a, n), getattr(b, n), rtol=tolerance, atol=tolerance) for n in NAMES)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
 @pytest.mark.parametrize("style", ["binary_little_endian", "ascii"])
-def test_a_model_of_the_reference_training_is_read(tmp_path, degree, style):
+def test_ply_of_3dgs_is_read(tmp_path, degree, style):
     splats = random_splats(degree=degree)
     write_inria(tmp_path / "a.ply", splats, style)
     read = read_ply_splats(tmp_path / "a.ply")
-    assert equal(read, splats) and not read.extra
+    assert assert_equal(read, splats) and not read.extra
 
 
-def test_columns_are_found_by_name_and_others_kept(tmp_path):
+def test_columns_are_read_by_name_and_others_preserved(tmp_path):
     splats = random_splats()
     write_inria(tmp_path / "a.ply", splats, shuffled=True)
     read = read_ply_splats(tmp_path / "a.ply")
-    assert equal(read, splats) and list(read.extra) == ["label"]
+    assert assert_equal(read, splats) and list(read.extra) == ["label"]
     assert np.array_equal(read.extra["label"], np.arange(len(splats)))
 
 
-def test_what_is_written_is_read_again(tmp_path):
+def test_written_splats_round_trip(tmp_path):
     splats = random_splats(degree=2)
     attention = np.linspace(0, 1, len(splats), dtype=np.float32)
     splats.opacities[:2] = 0, 1
     splats = Splats(*(getattr(splats, n) for n in NAMES), extra={"attention": attention})
     write_ply_splats(tmp_path / "a.ply", splats, comments=("by nerg_mi",))
     read = read_ply_splats(tmp_path / "a.ply")
-    assert equal(read, splats) and np.array_equal(read.extra["attention"], attention)
+    assert assert_equal(read, splats) and np.array_equal(read.extra["attention"], attention)
 
 
 def test_surfels_without_a_third_scale_are_thin(tmp_path):
@@ -190,7 +190,7 @@ BAD = [
 
 
 @pytest.mark.parametrize(("old", "new", "said"), BAD, ids=[said for *_, said in BAD])
-def test_a_damaged_file_is_one_sentence(tmp_path, old, new, said):
+def test_damaged_ply_is_refused(tmp_path, old, new, said):
     write_inria(tmp_path / "a.ply", random_splats())
     (tmp_path / "a.ply").write_bytes((tmp_path / "a.ply").read_bytes().replace(old, new, 1))
     with pytest.raises(NergError, match=said) as error:
@@ -198,7 +198,7 @@ def test_a_damaged_file_is_one_sentence(tmp_path, old, new, said):
     assert "a.ply" in str(error.value)
 
 
-def test_text_has_a_limit_of_its_own(tmp_path, monkeypatch):
+def test_text_ply_is_limited(tmp_path, monkeypatch):
     write_inria(tmp_path / "a.ply", random_splats(), "ascii")
     monkeypatch.setattr(ply_tables, "MAX_TEXT_BYTES", 100)
     with pytest.raises(NergError, match="more than 100 bytes"):
@@ -210,7 +210,7 @@ def test_text_has_a_limit_of_its_own(tmp_path, monkeypatch):
 
 
 def write_columns_of(path, splats, **columns):
-    """The file of ``splats`` with other ``columns``."""
+    """Write ``splats`` with modified ``columns``."""
     write_ply_splats(path, splats)
     table = {name: values() for name, values in parse_ply(np.fromfile(path, np.uint8)).tables["vertex"].columns.items()}
     write_columns(path, table | columns)
@@ -222,15 +222,15 @@ def test_lengths_in_place_of_logarithms_are_recognised(tmp_path, size, room):
     splats = replace(splats, centers=splats.centers * np.float32([room, room, 0.01 * room]))
     write_columns_of(tmp_path / "a.ply", splats, **{f"scale_{i}": splats.scales[:, i] for i in range(3)})
     read = read_ply_splats(tmp_path / "a.ply")
-    assert equal(read, splats) and "lengths" in read.assumptions[0]
+    assert assert_equal(read, splats) and "lengths" in read.assumptions[0]
 
 
 @pytest.mark.parametrize("low, high", [(0.001, 0.99), (0, 1), (0.5, 0.7)])
-def test_shares_in_place_of_logits_are_recognised(tmp_path, low, high):
+def test_plain_opacities_are_recognised(tmp_path, low, high):
     splats = replace(random_splats(100, 1), opacities=np.linspace(low, high, 100, dtype=np.float32))
     write_columns_of(tmp_path / "a.ply", splats, opacity=splats.opacities)
     read = read_ply_splats(tmp_path / "a.ply")
-    assert equal(read, splats) and "logits" in read.assumptions[0]
+    assert assert_equal(read, splats) and "logits" in read.assumptions[0]
 
 
 @pytest.mark.parametrize("low, high", [(0, 255), (10, 200), (0, 40)])
@@ -239,7 +239,7 @@ def test_bytes_in_place_of_logits_are_recognised(tmp_path, low, high):
     splats = replace(random_splats(100, 1), opacities=stored / np.float32(255))
     write_columns_of(tmp_path / "a.ply", splats, opacity=stored)
     read = read_ply_splats(tmp_path / "a.ply")
-    assert equal(read, splats) and "255ths" in read.assumptions[0]
+    assert assert_equal(read, splats) and "255ths" in read.assumptions[0]
 
 
 @pytest.mark.parametrize(
@@ -253,11 +253,11 @@ def test_bytes_in_place_of_logits_are_recognised(tmp_path, low, high):
     ],
     ids=["millimetres", "large and alike", "of one opacity", "faint", "pruned"],
 )
-def test_what_trainings_write_is_not_taken_for_anything_else(tmp_path, change):
+def test_encodings_of_trainings_are_not_misinterpreted(tmp_path, change):
     splats = change(random_splats(300, 0))
     write_ply_splats(tmp_path / "a.ply", splats)
     read = read_ply_splats(tmp_path / "a.ply")
-    assert equal(read, splats) and not read.assumptions
+    assert assert_equal(read, splats) and not read.assumptions
 
 
 @pytest.mark.parametrize(
@@ -265,8 +265,8 @@ def test_what_trainings_write_is_not_taken_for_anything_else(tmp_path, change):
     [(2, {}), (0, {"nx": np.ones(50)}), (1, {"label": np.ones(50)}), (3, {"lengths": True}), (0, {"shares": True})],
     ids=["degree 2", "normals", "further columns", "lengths", "opacities as they are"],
 )
-def test_the_3d_filter_widens_and_keeps_the_mass(tmp_path, degree, change):
-    """Of what trainings write, and of activated values."""
+def test_3d_filter_widens_and_preserves_mass(tmp_path, degree, change):
+    """For files of trainings, and for decoded values."""
     splats = random_splats(100, degree, size=0.02)
     widths, change = np.linspace(0, 0.05, 100, dtype=np.float32), dict(change)
     columns = {name: np.resize(values, 100) for name, values in change.items() if values is not True}
@@ -279,13 +279,13 @@ def test_the_3d_filter_widens_and_keeps_the_mass(tmp_path, degree, change):
     assert np.allclose(read.scales**2 - splats.scales**2, widths[:, None] ** 2, atol=1e-5)
     assert np.allclose(read.opacities * read.scales.prod(axis=1), splats.opacities * splats.scales.prod(axis=1))
     assert len(read.assumptions) == len({"lengths", "shares"} & change.keys())
-    # What is written again has the filter in it, and not twice.
+    # Written values include the filter, so it is not applied twice.
     write_ply_splats(tmp_path / "b.ply", read)
     again = read_ply_splats(tmp_path / "b.ply")
-    assert equal(again, read, 1e-5) and set(again.extra) == {"label"} & change.keys()
+    assert assert_equal(again, read, 1e-5) and set(again.extra) == {"label"} & change.keys()
 
 
-def test_columns_that_are_not_used_are_named(tmp_path):
+def test_unused_columns_are_noted(tmp_path):
     write_columns_of(tmp_path / "a.ply", random_splats(), motion_0=np.zeros(40), t=np.ones(40))
     assert read_ply_splats(tmp_path / "a.ply").notes == ("columns that are not used: motion_0, t",)
 
@@ -297,10 +297,10 @@ def test_columns_that_are_not_used_are_named(tmp_path):
 def test_a_primitive_is_read(tmp_path, degree):
     splats = random_splats(degree=degree)
     write_khronos(tmp_path / "a.glb", splats)
-    assert equal(read_gltf_splats(tmp_path / "a.glb"), splats)
+    assert assert_equal(read_gltf_splats(tmp_path / "a.glb"), splats)
 
 
-def test_nodes_are_applied_and_integers_are_shares(tmp_path):
+def test_nodes_are_applied_and_integers_normalised(tmp_path):
     splats = random_splats(degree=0)
     node = {"rotation": [0, 0, 0.5**0.5, 0.5**0.5], "scale": [2, 2, 2], "translation": [1, 0, 0]}
     write_khronos(tmp_path / "a.glb", splats, node, shares=True)
@@ -324,7 +324,7 @@ def test_nodes_are_applied_and_integers_are_shares(tmp_path):
         (b'"nodes": [{"mesh": 0', b'"nodes": [{"scale": [1, 2, 1], "mesh": 0', "uniform scale"),
     ],
 )
-def test_what_is_not_read_is_one_sentence(tmp_path, old, new, said):
+def test_unsupported_glb_splats_are_refused(tmp_path, old, new, said):
     write_khronos(tmp_path / "a.glb", random_splats(degree=0))
     raw = (tmp_path / "a.glb").read_bytes()
     length = int.from_bytes(raw[12:16], "little")
@@ -357,7 +357,7 @@ def test_two_degrees_are_refused(tmp_path):
         ("rotations", lambda v: 3 * v, "not normalised"),
     ],
 )
-def test_values_beyond_the_specification_are_refused(tmp_path, name, change, said):
+def test_values_outside_specification_are_refused(tmp_path, name, change, said):
     splats = random_splats(degree=0)
     object.__setattr__(splats, name, change(getattr(splats, name)))
     write_khronos(tmp_path / "a.glb", splats)
@@ -365,7 +365,7 @@ def test_values_beyond_the_specification_are_refused(tmp_path, name, change, sai
         read_gltf_splats(tmp_path / "a.glb")
 
 
-def test_the_colour_space_is_the_files_and_other_attributes_are_named(tmp_path):
+def test_colour_space_is_read_and_other_attributes_noted(tmp_path):
     write_khronos(tmp_path / "a.glb", random_splats(degree=0))
     document, data = read_glb_chunks((tmp_path / "a.glb").read_bytes(), "a.glb")
     primitive = document["meshes"][0]["primitives"][0]
@@ -380,7 +380,7 @@ def test_the_colour_space_is_the_files_and_other_attributes_are_named(tmp_path):
 
 
 @pytest.mark.parametrize("version", [1, 2, 3])
-def test_a_file_is_read_to_its_bits(tmp_path, version):
+def test_spz_is_decoded_exactly(tmp_path, version):
     splats = random_splats(degree=version)
     write_spz(tmp_path / "a.spz", splats, version)
     read = read_spz(tmp_path / "a.spz")
@@ -389,9 +389,9 @@ def test_a_file_is_read_to_its_bits(tmp_path, version):
     assert np.abs(read.opacities - splats.opacities).max() <= 0.5 / 255 + 1e-6
     assert np.abs(read.harmonics[:, 0] - splats.harmonics[:, 0]).max() <= 0.5 / 255 / 0.15 + 1e-5
     assert np.abs(read.harmonics[:, 1:] - np.clip(splats.harmonics[:, 1:], -1, 127 / 128)).max() <= 0.5 / 128 + 1e-6
-    apart = np.abs((read.rotations * splats.rotations).sum(axis=1))
-    # Version 3 was made because w was found badly from the rest where it is small.
-    assert apart.min() > (1 - 1e-5 if version == 3 else 1 - 5e-3)
+    differences = np.abs((read.rotations * splats.rotations).sum(axis=1))
+    # Version 3 exists because a small w is imprecise if it is computed from the other components.
+    assert differences.min() > (1 - 1e-5 if version == 3 else 1 - 5e-3)
 
 
 def packed(magic=0x5053474E, version=3, count=40, degree=3, fraction=12):
@@ -415,7 +415,7 @@ def squeezed(**header):
     ],
     ids=["later", "other", "degree", "count", "short", "zstd", "no gzip"],
 )
-def test_spz_a_damaged_file_is_one_sentence(tmp_path, raw, said):
+def test_damaged_spz_is_refused(tmp_path, raw, said):
     (tmp_path / "a.spz").write_bytes(raw)
     with pytest.raises(NergError, match=said) as error:
         read_spz(tmp_path / "a.spz")
@@ -430,7 +430,7 @@ def store():
     return load_radiance(ROOT / "scenes" / "store" / "store.safetensors", ns)[0]
 
 
-def test_depths_are_the_fields(store):
+def test_surfel_depths_equal_field(store):
     splats, done = make_splats(store, 56)
     assert len(splats) > 5_000 and done["moved"] < 0.5 * done["cell"]
     rng = np.random.default_rng(0)

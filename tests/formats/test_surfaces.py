@@ -11,10 +11,17 @@ import numpy as np
 import pytest
 import trimesh
 
-from nerg_mi.fields.extraction import Lattice, FieldSampler, surface_density
+from nerg_mi.fields.extraction import FieldSampler, Lattice, surface_density
 from nerg_mi.fields.occupancy import OccupancyGrid
 from nerg_mi.formats import surfaces
-from nerg_mi.formats.surfaces import sample_density_and_color, extract_mesh, extract_points, write_glb, write_ply, write_volume
+from nerg_mi.formats.surfaces import (
+    extract_mesh,
+    extract_points,
+    sample_density_and_color,
+    write_glb,
+    write_ply,
+    write_volume,
+)
 from nerg_mi.maths.geometry import Box
 
 # ---- The ball ----
@@ -23,7 +30,9 @@ CENTER, RADIUS = np.array([1.2, 1.0, 0.9]), 0.6
 
 
 class Ball:
-    """Stands in for a radiance field: density in a ball, a speck beside it, and colour from position and direction."""
+    """Replacement for a radiance field: density in a ball with a speck next to it, and colour from position and
+    direction.
+    """
 
     def __init__(self, occupancy=None, speck=False, hole=False, color_space="srgb", sharp=200.0):
         self.box, self.occupancy, self.color_space = Box((0, 0, 0), (2.4, 2, 1.8)), occupancy, color_space
@@ -36,7 +45,7 @@ class Ball:
         if self.speck:
             sigma += 1e3 * dr.exp(200 * (0.1 - to([0.2, 0.2, 0.2])))
         if self.hole:
-            # A shaft along z about one line of lattice points.
+            # A shaft along z around one line of lattice points.
             sigma = dr.select(dr.sqrt((p.x - 1.225) ** 2 + (p.y - 1.025) ** 2) < 0.02, 0, sigma)
         return dr.select(active & self.box.contains(p), dr.minimum(sigma, 1e4), 0)
 
@@ -49,28 +58,28 @@ class Ball:
 
 # ---- Surfaces ----
 #
-# Meshes, points and voxels of a field whose surface is known: a ball, in front of what nobody has looked at.
+# Meshes, points and voxels of a field with a known surface: a ball in front of an unobserved region.
 
 
 def expected_radius(ball, threshold):
     return RADIUS - math.log(threshold / ball.sharp) / 60
 
 
-def test01_a_mesh_lies_on_the_surface():
+def test01_mesh_is_on_surface():
     pytest.importorskip("skimage")
     ball = Ball()
     m = extract_mesh(ball, 48)
     threshold = math.log(2) / (2.4 / 48)
     assert m.report["threshold"] == pytest.approx(threshold) == surface_density(Lattice.for_field(ball, 48))
     r = np.linalg.norm(m.vertices - CENTER, axis=1)
-    # Bisection of an edge: a 2^9th of a cell.
+    # Precision of the bisection of an edge: a 2^9th of a cell.
     assert np.abs(r - expected_radius(ball, threshold)).max() < 2.4 / 48 / 300
     body = trimesh.Trimesh(m.vertices, m.faces, process=False)
     assert body.is_watertight and body.volume > 0
     assert np.isclose(body.volume, 4 / 3 * math.pi * expected_radius(ball, threshold) ** 3, rtol=0.01)
     assert ((m.vertices - CENTER) / r[:, None] * m.normals).sum(1).min() > 0.95
     assert m.report["edges_of_holes"] == m.report["edges_at_the_box"] == 0
-    # Seen head on and at 45 degrees all around, the part that depends on direction is the mean of its cosines.
+    # The direction-dependent part is the mean of the cosines over the normal and views at 45 degrees.
     share = (1 + 4 / math.sqrt(2)) / 5
     assert np.allclose(m.colors[:, 0], m.vertices[:, 0] / 2.4, atol=1e-5)
     assert np.allclose(m.colors[:, 1], 0.5 - 0.1 * share * m.normals[:, 2], atol=1e-5)
@@ -78,18 +87,21 @@ def test01_a_mesh_lies_on_the_surface():
 
 def test02_floaters_and_holes():
     pytest.importorskip("skimage")
-    both, alone = extract_mesh(Ball(speck=True), 48, min_piece_fraction=0), extract_mesh(Ball(speck=True), 48, min_piece_fraction=0.05)
+    both, alone = (
+        extract_mesh(Ball(speck=True), 48, min_piece_fraction=0),
+        extract_mesh(Ball(speck=True), 48, min_piece_fraction=0.05),
+    )
     assert both.report["pieces"] == both.report["pieces_kept"] == 2 and alone.report["pieces_kept"] == 1
     assert np.linalg.norm(alone.vertices - CENTER, axis=1).min() > 0.5
     assert alone.face_count == len(alone.faces)
     assert alone.report["floater_faces"] == len(both.faces) - len(alone.faces) > 0
-    pierced, whole = extract_mesh(Ball(hole=True), 48, fill_cells=0), extract_mesh(Ball(hole=True), 48, fill_cells=1)
+    pierced, complete = extract_mesh(Ball(hole=True), 48, fill_cells=0), extract_mesh(Ball(hole=True), 48, fill_cells=1)
     euler = lambda m: trimesh.Trimesh(m.vertices, m.faces, process=False).euler_number
-    assert (euler(pierced), euler(whole)) == (0, 2) and whole.report["cells_filled"] > 10
+    assert (euler(pierced), euler(complete)) == (0, 2) and complete.report["cells_filled"] > 10
 
 
-def test03_what_nobody_has_looked_at():
-    # Cells beyond the middle of the ball were never looked at: there is no surface where they begin.
+def test03_unseen_faces_are_removed():
+    # Cells beyond the centre of the ball were never observed, so there is no surface at their border.
     pytest.importorskip("skimage")
     bits = np.zeros((24, 24, 24), bool)
     bits[:, :, :12] = True
@@ -141,17 +153,17 @@ def test05_files(tmp_path):
     document = json.loads(raw[20 : 20 + size])
     view = document["bufferViews"][2]
     rgba = np.frombuffer(raw, "<u2", view["byteLength"] // 2, 28 + size + view["byteOffset"]).reshape(-1, 4) / 65535
-    # The stand-in's colours are linear; glTF's are too.
+    # The colours of the ball are linear, as in glTF.
     assert (
         np.allclose(rgba[:, 0], triangles.vertices[:, 0] / 2.4, atol=1e-4)
         and len(raw) == struct.unpack("<I", raw[8:12])[0]
     )
 
 
-# ---- Voxels of a field: what they hold, and that Mitsuba shows them where they belong ----
+# ---- Voxels of a field: values, and position in Mitsuba ----
 
 
-def test_voxels_render_as_the_field(rgb, tmp_path):
+def test_voxels_render_like_field(rgb, tmp_path):
     ball = Ball()
     density, color, lower, upper = sample_density_and_color(ball, 24, samples=3)
     assert density.shape == (18, 20, 24) and np.allclose(lower, 0) and np.allclose(upper, ball.box.upper)
@@ -162,7 +174,7 @@ def test_voxels_render_as_the_field(rgb, tmp_path):
     for x, y, z in ((6, 9, 8), (5, 9, 8), (5, 8, 8), (8, 9, 8)):
         share = np.mean(-np.expm1(-FieldSampler(ball).density(points_of(x, y, z)) * cell))
         assert np.isclose(density[z, y, x], min(-math.log(max(1 - share, 1e-9)), 5) / cell, rtol=1e-3)
-    # On the surface, from the side that the surface faces: its green depends on z of the direction alone.
+    # On the surface, seen along the normal: green depends only on z of the direction.
     assert np.allclose(color[8, 9, 6, 0], ((1.2 - 0.6) / 2.4 / 1.055 + 0.055 / 1.055) ** 2.4, atol=0.01)
     assert np.allclose(color[8, 9, 6, 1], ((0.5 + 0.055) / 1.055) ** 2.4, atol=0.01)
     assert np.array_equal(color[8, 9, 3], color[8, 9, 4]) and not color[0, 0, 0].any()
@@ -179,11 +191,11 @@ def test_voxels_render_as_the_field(rgb, tmp_path):
         assert np.allclose(got, data[8, 9, 6], rtol=1e-4)
 
 
-def test_a_full_field_takes_a_few_bytes_a_voxel(monkeypatch):
-    """Every voxel of it has a colour: they are looked for in blocks, as if all at once."""
+def test_dense_field_takes_few_bytes_per_voxel(monkeypatch):
+    """All voxels have a colour. They are computed in blocks, with the same result as at once."""
     fog = Ball()
     fog.density = lambda p, active=True: dr.select(active, 1 + p.x, 0)
-    whole = sample_density_and_color(fog, 48, samples=1)
+    field_bytes = sample_density_and_color(fog, 48, samples=1)
     monkeypatch.setattr(surfaces, "_BLOCK", 2500)
     tracemalloc.start()
     try:
@@ -191,8 +203,8 @@ def test_a_full_field_takes_a_few_bytes_a_voxel(monkeypatch):
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
-    assert all(np.array_equal(a, b) for a, b in zip(whole, blocks)) and blocks[1].min() > 0
-    # Of them 16 are the result's own, and 12 tell which surface is nearest.
+    assert all(np.array_equal(a, b) for a, b in zip(field_bytes, blocks)) and blocks[1].min() > 0
+    # The result takes 16 of them, and the nearest surface indices take 12.
     assert peak < 60 * blocks[0].size
 
 

@@ -1,4 +1,4 @@
-"""Files of torch.save: exact both ways, unable to run anything, and no more than their bytes warrant."""
+"""Files of torch.save: exact round trips, no code execution, and memory limited by the file size."""
 
 import io
 import os
@@ -28,18 +28,18 @@ def archive(path, pickled: bytes, compression=zipfile.ZIP_STORED, **records):
 
 
 def tensor(shape, stride, offset=0, state=b"", stored=4):
-    """A pickle of one tensor on a storage of 4 floats, and of a state set on it afterwards."""
-    whole = lambda value: b"\x8a\x08" + struct.pack("<q", value)
-    numbers = lambda values: b"(" + b"".join(map(whole, values)) + b"t"
+    """A pickle of one tensor on a storage of 4 floats, with a state that is set afterwards."""
+    storage = lambda value: b"\x8a\x08" + struct.pack("<q", value)
+    numbers = lambda values: b"(" + b"".join(map(storage, values)) + b"t"
     out = b"\x80\x02ctorch._utils\n_rebuild_tensor_v2\n((X\x07\x00\x00\x00storagectorch\nFloatStorage\n"
-    out += b"X\x01\x00\x00\x000X\x03\x00\x00\x00cpu" + whole(stored) + b"tQ"
+    out += b"X\x01\x00\x00\x000X\x03\x00\x00\x00cpu" + storage(stored) + b"tQ"
     return (
-        out + whole(offset) + numbers(shape) + numbers(stride) + b"\x89ccollections\nOrderedDict\n)RtR" + state + b"."
+        out + storage(offset) + numbers(shape) + numbers(stride) + b"\x89ccollections\nOrderedDict\n)RtR" + state + b"."
     )
 
 
 class Calls:
-    """Pickles as a call of ``function``."""
+    """Pickled as a call of ``function``."""
 
     def __init__(self, function, *arguments):
         self.call = function, arguments
@@ -48,7 +48,7 @@ class Calls:
         return self.call
 
 
-def test_what_torch_writes(tmp_path, torch):
+def test_files_of_torch_are_read(tmp_path, torch):
     x, path = torch.arange(24.0).reshape(2, 3, 4), tmp_path / "x.pth"
     values = {
         "plain": x,
@@ -71,13 +71,13 @@ def test_what_torch_writes(tmp_path, torch):
     for name, value in values.items():
         if isinstance(value, torch.Tensor):
             expected = value.detach().float().numpy() if name == "bf" else value.detach().numpy()
-            found = to_numpy(got[name], path)
-            assert np.array_equal(found, expected) and found.dtype == expected.dtype, name
+            loaded = to_numpy(got[name], path)
+            assert np.array_equal(loaded, expected) and loaded.dtype == expected.dtype, name
         else:
             assert got[name] == value, name
 
 
-def test_what_is_written_torch_reads(tmp_path, torch):
+def test_torch_reads_written_files(tmp_path, torch):
     values = {
         "a": np.arange(6, dtype=np.float32).reshape(2, 3).T,
         "b": {"c": np.arange(5, dtype=np.uint8), "n": -3, "big": 2**40},
@@ -93,7 +93,7 @@ def test_what_is_written_torch_reads(tmp_path, torch):
     first = (tmp_path / "w.pth").read_bytes()
     write_torch(tmp_path / "w.pth", values)
     assert (tmp_path / "w.pth").read_bytes() == first
-    with pytest.raises(AttributeError):  # a function has no pickle
+    with pytest.raises(AttributeError):  # functions cannot be pickled
         write_torch(tmp_path / "x.pth", {"a": lambda: 0})
     assert not (tmp_path / "x.pth").exists()
 
@@ -106,7 +106,7 @@ def test_without_torch_the_extra_is_named(tmp_path):
         assert done.stderr.endswith('which is not installed: pip install "nerg-mi[torch]"\n')
 
 
-def test_a_torch_that_could_be_led_to_run_code_is_not_used(tmp_path, torch, monkeypatch):
+def test_vulnerable_torch_version_is_refused(tmp_path, torch, monkeypatch):
     path = archive(tmp_path / "x.pth", b"\x80\x02N.")
     for version, is_used in (("2.5.1+cpu", False), ("2.6.0", True), ("2.13.0a0+git1", True)):
         monkeypatch.setattr(torch, "__version__", version)
@@ -125,28 +125,28 @@ def test_a_torch_that_could_be_led_to_run_code_is_not_used(tmp_path, torch, monk
         (Calls(io.open, "/etc/passwd"), "open"),
         (Calls(os.system, "true"), "system"),
         (np.zeros(3), "_reconstruct"),
-        # What torch itself would read.
+        # Names that torch itself would accept.
         (bytearray(3), "bytearray"),
         ({1, 2}, "set"),
         (Calls(complex, 1), "complex"),
     ],
 )
-def test_nothing_else_is_called(tmp_path, torch, thing, name):
-    path = archive(tmp_path / "evil.pth", pickle.dumps({"model": thing}, 2))
+def test_other_callables_are_refused(tmp_path, torch, target, name):
+    path = archive(tmp_path / "evil.pth", pickle.dumps({"model": target}, 2))
     with pytest.raises(NergError, match=f'evil.pth" .* asks for ".*{name}"'):
         read_torch(path)
     with pytest.raises(NergError, match="evil.pth"):
-        read_torch(archive(tmp_path / "evil.pth", pickle.dumps({"model": thing}, 4)))
+        read_torch(archive(tmp_path / "evil.pth", pickle.dumps({"model": target}, 4)))
     assert not hasattr(sys, "pwned")
 
 
-def test_an_array_of_terabytes_is_not_made(tmp_path, torch):
+def test_huge_array_is_not_allocated(tmp_path, torch):
     for call in (b"cbuiltins\nbytearray\n", b"c__builtin__\nbytearray\n"):
         with pytest.raises(NergError, match="bytearray"):
             read_torch(archive(tmp_path / "b.pth", b"\x80\x02" + call + b"\x8a\x06" + b"\x7f" * 6 + b"\x85R."))
 
 
-# A tuple of two that are one, fifty times over, has 2^50 leaves to hash.
+# Fifty nested tuples of two identical elements have 2^50 leaves to hash.
 _DOUBLED = b"K\x01q\x00" + b"".join(b"h%ch%c\x86q%c" % (k, k, k + 1) for k in range(50))
 _LONG = b"X" + (1 << 20).to_bytes(4, "little") + b"x" * (1 << 20) + b"q\x00"
 _NUMBERS = b"](" + b"K\x01" * 100_000 + b"eq\x00"
@@ -175,20 +175,20 @@ _NUMBERS = b"](" + b"K\x01" * 100_000 + b"eq\x00"
         (b"", ""),
     ],
 )
-def test_pickles_that_no_checkpoint_has(tmp_path, torch, monkeypatch, pickled, words):
+def test_invalid_pickles_are_refused(tmp_path, torch, monkeypatch, pickled, words):
     monkeypatch.setattr(module, "MAX_OPERATIONS", 200_000)
     with pytest.raises(NergError, match=f"p.pth.*{words}") as error:
         read_torch(archive(tmp_path / "p.pth", b"\x80\x02" + pickled))
     assert str(error.value).isprintable()
 
 
-def test_a_huge_memo_index_makes_no_room(tmp_path, torch):
+def test_huge_memo_index_allocates_nothing(tmp_path, torch):
     for put in (b"r\xff\xff\xff\xff", b"r\xff\xff\xff\x7f"):
         assert read_torch(archive(tmp_path / "m.pth", b"\x80\x02K\x01" + put + b".")) == 1
 
 
-def test_much_of_it_is_no_attack(tmp_path, torch):
-    """Records of 100,000 steps as NumPy's numbers, a list that is shared, and one that holds itself."""
+def test_large_valid_pickle_is_accepted(tmp_path, torch):
+    """Records of 100,000 steps as NumPy numbers, a shared list, and a list that contains itself."""
     torch.save(
         {"loss": [np.float64(0.5)] * 20_000 + [0.25] * 80_000, "shared": [betas := (0.9, 0.99)] * 1000},
         tmp_path / "x.pth",
@@ -201,7 +201,7 @@ def test_much_of_it_is_no_attack(tmp_path, torch):
     assert read_torch(tmp_path / "x.pth")[0][0] is not None
 
 
-def test_what_is_made_cannot_be_changed(tmp_path, torch):
+def test_stand_ins_are_immutable(tmp_path, torch):
     path = archive(tmp_path / "t.pth", tensor((2, 2), (2, 1)), **{"0": ONE})
     assert np.array_equal(to_numpy(read_torch(path), path), [[0, 1], [2, 3]])
     onto_function = b"\x80\x02ctorch._utils\n_rebuild_tensor_v2\n}X\x01\x00\x00\x00aX\x01\x00\x00\x00xsb."
@@ -271,7 +271,7 @@ def test_archives_that_inflate_are_refused(tmp_path, torch):
         read_torch(archive(tmp_path / "z.pth", pickled, **{"constants.pkl": b"."}))
 
 
-def test_a_pickle_has_a_largest_size(tmp_path, torch, monkeypatch):
+def test_pickle_size_is_limited(tmp_path, torch, monkeypatch):
     path = archive(tmp_path / "t.pth", b"\x80\x02N.")
     monkeypatch.setattr(module, "MAX_PICKLE_BYTES", 4)
     assert read_torch(path) is None
@@ -280,7 +280,7 @@ def test_a_pickle_has_a_largest_size(tmp_path, torch, monkeypatch):
         read_torch(path)
 
 
-def test_bytes_in_the_other_order_are_turned(tmp_path, torch):
+def test_big_endian_is_converted(tmp_path, torch):
     big = np.arange(4, dtype=">f4").tobytes()
     path = archive(tmp_path / "b.pth", tensor((4,), (1,)), **{"0": big, "byteorder": b"big"})
     assert np.array_equal(to_numpy(read_torch(path), path), np.arange(4))

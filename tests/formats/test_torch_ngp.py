@@ -1,4 +1,4 @@
-"""torch-ngp checkpoints of the real sizes against a restatement of its kernels in NumPy float32, and back again."""
+"""torch-ngp checkpoints of realistic size, compared with a reference implementation of its kernels in NumPy float32."""
 
 import sys
 import types
@@ -19,16 +19,16 @@ from nerg_mi.formats.torch_files import write_torch
 from nerg_mi.formats.torch_ngp import (
     ImportOptions,
     StateDict,
-    pack_bitfield,
-    shorten_floats,
-    infer_grid_config,
     build_network,
+    describe_origin,
+    infer_grid_config,
+    infer_sh_degree,
     morton_order,
     open_checkpoint,
-    describe_origin,
+    pack_bitfield,
     read_nerg,
     read_torch_ngp,
-    infer_sh_degree,
+    shorten_floats,
     write_torch_ngp,
 )
 from nerg_mi.maths.geometry import Box
@@ -39,13 +39,13 @@ pytestmark = pytest.mark.usefixtures("torch")
 PARITY = 1e-6
 
 
-def save(path, state, **more):
-    write_torch(path, {"epoch": 7, "global_step": 99, "stats": {}, "model": state, **more})
+def save(path, state, **entries):
+    write_torch(path, {"epoch": 7, "global_step": 99, "stats": {}, "model": state, **entries})
     return path
 
 
 def points(bound, n=4000, seed=3):
-    """Inside, on the faces and edges, and a little outside."""
+    """Points inside, on the faces and edges, and slightly outside."""
     rng = np.random.default_rng(seed)
     p = rng.uniform(-1.02 * bound, 1.02 * bound, (n, 3)).astype(np.float32)
     p[: n // 10] = np.clip(p[: n // 10] * 3, -bound, bound)
@@ -55,54 +55,53 @@ def points(bound, n=4000, seed=3):
 
 def columns(values):
     values = list(values)
-    dr.eval(values)  # one kernel, not one a column
+    dr.eval(values)  # one kernel for all columns
     return np.stack([v.numpy() for v in values], -1)
 
 
-def worst(got, expected):
-    """Largest difference, as a share of the largest value."""
+def max_error(got, expected):
+    """Largest difference relative to the largest value."""
     return np.abs(np.asarray(got, np.float64) - expected).max() / np.abs(expected).max()
 
 
 @pytest.mark.parametrize("bound, behind", [(1, False), (2, True), (5, True)])
-def test01_equals_the_restatement(tmp_path, bound, behind):
+def test01_equals_reference_implementation(tmp_path, bound, behind):
     state = reference.nerf_state(bound, np.random.default_rng(bound), behind)
-    given = ImportOptions(background_radius=3.0 * bound if behind else None)
-    field, origin = read_torch_ngp(save(tmp_path / "ngp.pth", state), ns, options=given)
+    options = ImportOptions(background_radius=3.0 * bound if behind else None)
+    field, origin = read_torch_ngp(save(tmp_path / "ngp.pth", state), ns, options=options)
     p, d = points(bound)
     at, along = ns.Array3f(p.T), ns.Array3f(d.T)
 
-    # One kernel has the grid in it once; the sizes of bound 5 are those that show the last bit of a coordinate.
+    # A kernel contains the grid only once; with a bound of 5, the last bit of a coordinate affects the result.
     ours = field.grid(field.box.to_unit(at)) if bound == 5 else []
     density, geometry = field.density_features(at)
     painted = field.color(geometry, along)
     dr.eval(ours, density, painted)
     if bound == 5:
         features = reference.encode(p, state["encoder.embeddings"], state["encoder.offsets"], 2048 * bound, bound)
-        assert worst(columns(ours), features) <= PARITY
+        assert max_error(columns(ours), features) <= PARITY
     sigma, color, _ = reference.nerf(state, bound, p, d)
     inside = np.all(np.abs(p) <= bound, axis=1)
     assert 0 < (~inside).sum() < len(p)
     got = density.numpy()
-    # An exponential turns an absolute error of its argument, which is of size 8 here, into a relative one.
+    # The exponential converts an absolute error of its argument, here about 8, to a relative error.
     assert np.abs(got[inside] / sigma[inside] - 1).max() <= 2 * np.abs(np.log(sigma)).max() * PARITY
     assert not got[~inside].any()
     assert np.abs(columns(painted) - color).max() <= PARITY
     if behind:
         o = np.clip(p, -bound, bound)
         shown = columns(field.background(ns.Array3f(o.T), along))
-        # The last bit of an angle is 4e-4 cells of the finest level, so that this much differs by the machine's atan2
-        # too.
+        # The last bit of an angle is 4e-4 cells of the finest level, which also depends on the machine's atan2.
         assert np.abs(shown - reference.background(state, 3.0 * bound, o, d)).max() <= 1e-3
         angles = columns(field.background.coordinates(ns.Array3f(o.T), along))
         features = reference.encode(angles, state["encoder_bg.embeddings"], state["encoder_bg.offsets"], 2048, 1)
         square = ns.Array2f(*[0.5 * ns.Float(a) + 0.5 for a in angles.T])
-        assert worst(columns(field.background.grid(square)), features) <= PARITY
+        assert max_error(columns(field.background.grid(square)), features) <= PARITY
     assert origin["epoch"] == 7 and origin["weights"] == "raw"
     assert field.march_step == pytest.approx(2 * 3**0.5 / 1024)
 
 
-def test05_there_and_back_is_exact(tmp_path, torch):
+def test05_export_and_import_is_exact(tmp_path, torch):
     for bound, behind in ((1, False), (2.7, True)):
         state = reference.nerf_state(bound, np.random.default_rng(6), behind)
         first = save(tmp_path / "ngp.pth", state)
@@ -118,7 +117,7 @@ def test05_there_and_back_is_exact(tmp_path, torch):
             assert back["model"][name].numpy().dtype == value.dtype
 
 
-def test08_a_bare_state_dictionary_and_a_smaller_box(tmp_path):
+def test08_bare_state_dict_and_smaller_box(tmp_path):
     state = reference.nerf_state(2, np.random.default_rng(9))
     state["aabb_infer"] = np.array([-1, -2, -0.5, 2, 1.5, 2], np.float32)
     write_torch(tmp_path / "bare.pth", state)
@@ -146,7 +145,7 @@ def test08_a_bare_state_dictionary_and_a_smaller_box(tmp_path):
         (lambda s: s.update({"bg_net.0.weight": np.zeros((64, 24), np.float32)}), "--bg-radius"),
     ],
 )
-def test09_what_does_not_fit_is_said(tmp_path, change, words):
+def test09_invalid_checkpoints_are_refused(tmp_path, change, words):
     state = small_state()
     change(state)
     with pytest.raises(ValueError, match=words) as e:
@@ -155,7 +154,7 @@ def test09_what_does_not_fit_is_said(tmp_path, change, words):
 
 
 def small_state():
-    """A state dictionary of the right names, with a grid of two levels only."""
+    """A state dictionary with the required names and a grid of only two levels."""
     rng = np.random.default_rng(0)
     where = reference.offsets(2, 2048)
     return {
@@ -170,11 +169,11 @@ def small_state():
     }
 
 
-def test10_a_grid_of_another_resolution(tmp_path):
+def test10_grid_of_other_resolution(tmp_path):
     state = small_state()
     where = reference.offsets(2, 4096)
     state["encoder.offsets"] = where
-    # 2 levels: 17^3 and a hashed one, whatever the finest resolution is.
+    # Two levels: 17^3 and a hashed one, regardless of the finest resolution.
     field, _ = read_torch_ngp(save(tmp_path / "a.pth", state), ns, options=ImportOptions(finest=4096))
     assert field.config.grid == HashGridConfig(levels=2, finest=4096)
 
@@ -190,19 +189,19 @@ def test10_a_grid_of_another_resolution(tmp_path):
         (RadianceConfig(HashGridConfig(), deferred=True), Box((-1,) * 3, (1,) * 3), "torch-ngp asks"),
     ],
 )
-def test11_fields_without_a_torch_ngp_form(tmp_path, config, box, said):
+def test11_unrepresentable_fields_are_refused(tmp_path, config, box, said):
     field = RadianceField.random(config, box, ns)
     with pytest.raises(ValueError, match=f"torch-ngp form: {said}"):
         write_torch_ngp(field, tmp_path / "x.pth")
     assert not list(tmp_path.iterdir())
 
 
-# ---- The paper's authors ----
+# ---- NeRG checkpoints ----
 
 
-def save_nerg(path, state, variant="EmitCapture", nerf=None, **more):
+def save_nerg(path, state, variant="EmitCapture", nerf=None, **entries):
     state = {**state, **{f"model_nerf.{k}": v for k, v in (nerf or {}).items()}}
-    write_torch(path, {"epoch": 2, "global_step": 5, "stats": {}, "variant": variant, "model": state, **more})
+    write_torch(path, {"epoch": 2, "global_step": 5, "stats": {}, "variant": variant, "model": state, **entries})
     return path
 
 
@@ -214,7 +213,7 @@ def queries(bound, n=2000):
 
 
 def small_gaze(layernorm=True, variant="EmitCapture"):
-    """A gaze field of the authors' networks on a grid of two levels."""
+    """A gaze field with the networks of the authors on a grid of two levels."""
     rng = np.random.default_rng(3)
     state = reference.gaze_state(1, rng, variant, layernorm)
     where = reference.offsets(2, 256)
@@ -235,7 +234,7 @@ def compare(gaze, state, bound, variant="EmitCapture"):
 
 
 @pytest.mark.parametrize("bound", [2, 5])
-def test01_equals_the_restatement_in_the_authors_sizes(tmp_path, bound):
+def test01_nerg_equals_reference_implementation(tmp_path, bound):
     state = reference.gaze_state(bound, np.random.default_rng(bound))
     field, gaze, origin = read_nerg(save_nerg(tmp_path / "nerg_ep0002.pth", state), ns)
     assert field is None and origin["format"] == "NeRG" and origin["epoch"] == 2
@@ -248,7 +247,7 @@ def test01_equals_the_restatement_in_the_authors_sizes(tmp_path, bound):
 
 @pytest.mark.parametrize("layernorm", [True, False])
 @pytest.mark.parametrize("variant", ["Emit", "Capture", "EmitCapture"])
-def test02_variants_and_both_kinds_of_networks(tmp_path, layernorm, variant):
+def test02_variants_and_network_types(tmp_path, layernorm, variant):
     state = small_gaze(layernorm, variant)
     _, gaze, _ = read_nerg(save_nerg(tmp_path / "n.pth", state, variant), ns)
     assert gaze.config.trunk == ("layernorm" if layernorm else "linear")
@@ -257,7 +256,7 @@ def test02_variants_and_both_kinds_of_networks(tmp_path, layernorm, variant):
     assert unnamed.config == gaze.config
 
 
-def test03_older_names_of_the_heads(tmp_path):
+def test03_older_head_names(tmp_path):
     state = small_gaze()
     for head in ("emit", "capture"):
         state[f"lin_{head}.weight"] = state.pop(f"{head}_head.weight")
@@ -266,7 +265,7 @@ def test03_older_names_of_the_heads(tmp_path):
     assert np.array_equal(gaze.capture_head.weights[0].numpy(), state["lin_capture.weight"])
 
 
-def test04_as_torch_writes_it_with_an_enum_of_its_own(tmp_path, torch, monkeypatch):
+def test04_checkpoint_with_custom_enum(tmp_path, torch, monkeypatch):
     class NeRGVariant(Enum):
         EmitCapture = "EmitCapture"
 
@@ -299,12 +298,12 @@ def test04_as_torch_writes_it_with_an_enum_of_its_own(tmp_path, torch, monkeypat
 
 
 @pytest.mark.parametrize("variant", ["EmitCaptureSemantic", "EmitSemanticFinetune", "EmitCaptureAttend"])
-def test05_variants_that_are_not_read(tmp_path, variant):
+def test05_unsupported_variants_are_refused(tmp_path, variant):
     with pytest.raises(ValueError, match=f"of the variant {variant}; Emit, Capture, EmitCapture are read"):
         read_nerg(save_nerg(tmp_path / "n.pth", small_gaze(), variant), ns)
 
 
-def test06_a_mixture_head_and_missing_heads(tmp_path):
+def test06_mixture_head_and_missing_heads_are_refused(tmp_path):
     state = small_gaze()
     state["capture_head.mu.weight"] = state.pop("capture_head.weight")
     with pytest.raises(ValueError, match="von Mises-Fisher"):
@@ -314,7 +313,7 @@ def test06_a_mixture_head_and_missing_heads(tmp_path):
         read_nerg(save_nerg(tmp_path / "n.pth", state), ns)
 
 
-def test07_averages_are_the_weights(tmp_path):
+def test07_averages_replace_weights(tmp_path):
     path = save_nerg(tmp_path / "n.pth", small_gaze(), ema={"shadow_params": [np.zeros(3, np.float32)]})
     assert read_nerg(path, ns)[2]["weights"] == "moving averages"
     with pytest.raises(ValueError, match="without --no-ema"):
@@ -327,13 +326,13 @@ def test07_averages_are_the_weights(tmp_path):
 
 
 @pytest.mark.parametrize("bound", [1, 2, 5, 2.7])
-def test_marching_sees_the_kernels_bits(tmp_path, bound):
+def test_marching_uses_bits_of_reference_kernel(tmp_path, bound):
     rng = np.random.default_rng(4)
     state = reference.nerf_state(bound, rng, filled=0.02)
     field, _ = read_torch_ngp(save(tmp_path / "ngp.pth", state), ns)
     p = rng.uniform(-bound, bound, (20000, 3)).astype(np.float32)
     k = field.occupancy.distance_to_occupied(field.box.to_unit(ns.Array3f(p.T))).numpy()
-    # Points within rounding of a cell's face may fall on either side of it: 128 is the finest, 0.5 b the largest cell.
+    # Rounding may place points near a cell face on either side; 128 is the resolution, 0.5 b the largest cell.
     cells = (p[:, :, None] / np.minimum(2.0 ** np.arange(4), bound) + 1) * 64
     clear = np.abs(cells - np.round(cells)).min((1, 2)) > 1e-4
     assert clear.mean() > 0.95
@@ -342,8 +341,8 @@ def test_marching_sees_the_kernels_bits(tmp_path, bound):
 
 
 @pytest.mark.parametrize("bound", [2, 5])
-def test_what_may_be_leapt_over_is_empty(tmp_path, bound):
-    # Cells less than k away, of the grid that marching sees, hold nothing.
+def test_skipped_cells_are_empty(tmp_path, bound):
+    # Cells of the marching grid within a distance of k are empty.
     rng = np.random.default_rng(5)
     state = reference.nerf_state(bound, rng, filled=2e-6)
     grid = read_torch_ngp(save(tmp_path / "ngp.pth", state), ns)[0].occupancy
@@ -364,7 +363,7 @@ def test_morton_order():
     assert np.array_equal(morton_order(), reference.morton(x, y, z))
 
 
-def test_a_density_grid_without_its_bits(tmp_path):
+def test_density_grid_without_bitfield(tmp_path):
     rng = np.random.default_rng(8)
     state = reference.nerf_state(1, rng)
     bits = np.unpackbits(state["density_bitfield"], bitorder="little").astype(bool)
@@ -375,14 +374,14 @@ def test_a_density_grid_without_its_bits(tmp_path):
     assert 0.49 < expected.threshold <= 0.5
     del state["density_bitfield"]
     got = read_torch_ngp(save(tmp_path / "b.pth", state), ns)[0].occupancy
-    # min(mean, 10): the mean of the grid, which lies between both kinds of cells here.
+    # min(mean, 10): the mean of the grid, which is between the two values of the cells here.
     assert np.array_equal(got.bits, expected.bits)
     del state["density_grid"]
     assert read_torch_ngp(save(tmp_path / "c.pth", state), ns)[0].occupancy is None
 
 
-def test_a_plain_grid_becomes_cascades(tmp_path):
-    # Every cell of a cascade that overlaps an occupied one is set, and no other.
+def test_single_grid_becomes_cascades(tmp_path):
+    # Exactly the cells of a cascade that overlap an occupied cell are set.
     bits = np.zeros((6, 6, 6), bool)
     bits[1, 2, 3] = bits[5, 5, 0] = True
     packed = pack_bitfield(OccupancyGrid(bits, ns, 0.1), 2.0)
@@ -393,7 +392,7 @@ def test_a_plain_grid_becomes_cascades(tmp_path):
     assert np.all(got[true]) and true.any() and (got & ~true).mean() < 0.02
 
 
-def test_cascades_are_packed_as_they_are():
+def test_cascades_are_packed_unchanged():
     bits = np.random.default_rng(2).random((2, 128, 128, 128)) < 0.01
     packed = pack_bitfield(CascadeGrid(bits, 2.0, ns, 0.1), 2.0)
     assert packed.dtype == np.uint8 and packed.size * 8 == bits.size
@@ -409,7 +408,7 @@ def test_cascades_are_packed_as_they_are():
 
 @pytest.fixture
 def state(tmp_path):
-    """A checkpoint of a net below a prefix and one that has diverged, as a state dictionary."""
+    """A checkpoint of a network with a prefix and a diverged one, as a state dictionary."""
     path = tmp_path / "s.pth"
     tensors = {
         "model.net.0.weight": np.ones((3, 2), np.float32),
@@ -418,12 +417,12 @@ def state(tmp_path):
         "other": np.zeros(1, np.float32),
     }
     write_torch(path, {"model": tensors, "epoch": 3, "global_step": "many"})
-    whole, model = open_checkpoint(path)
-    return path, whole, StateDict(Path(path), model)
+    complete, model = open_checkpoint(path)
+    return path, complete, StateDict(Path(path), model)
 
 
-def test_a_state_dictionary(state):
-    path, whole, tensors = state
+def test_state_dict(state):
+    path, checkpoint, tensors = state
     below = tensors.below("model.net.")
     assert below.names() == ["0.weight", "1.weight"] and "0.weight" in below and "other" not in below
     assert below.shape("0.weight") == (3, 2) and below["0.weight"].tolist() == [[1, 1]] * 3
@@ -434,11 +433,11 @@ def test_a_state_dictionary(state):
         tensors.weights("model.far.0.weight")
     net = build_network(tensors.below("model."), "net", ns)
     assert [w.shape for w in net.weights] == [(3, 2), (1, 3)]
-    about = {"imported_from": "s.pth", "format": "torch-ngp", "weights": "moving averages", "epoch": 3}
-    assert describe_origin(path, whole, "torch-ngp", True) == about
+    entries = {"imported_from": "s.pth", "format": "torch-ngp", "weights": "moving averages", "epoch": 3}
+    assert describe_origin(path, checkpoint, "torch-ngp", True) == entries
 
 
-def test_what_is_no_checkpoint(tmp_path):
+def test_other_files_are_refused(tmp_path):
     write_torch(tmp_path / "x.pth", {"model": {"a": 1}})
     with pytest.raises(NergError, match="holds no weights"):
         open_checkpoint(tmp_path / "x.pth")
@@ -447,7 +446,7 @@ def test_what_is_no_checkpoint(tmp_path):
         open_checkpoint(tmp_path / "l.pth")
 
 
-def test_numbers_that_were_typed(state):
+def test_shortest_decimals(state):
     assert shorten_floats(np.float32([2.7, -0.1])).tolist() == [2.7, -0.1]
     _, _, tensors = state
     assert infer_sh_degree(tensors, 16) == 4
@@ -456,7 +455,7 @@ def test_numbers_that_were_typed(state):
             infer_sh_degree(tensors, wrong)
 
 
-def test_a_grid_is_read_off_its_levels(tmp_path):
+def test_grid_config_is_inferred_from_levels(tmp_path):
     where = reference.offsets(4, 512)
     tensors = {"e.embeddings": np.zeros((where[-1], 2), np.float32), "e.offsets": where}
     write_torch(tmp_path / "g.pth", {"model": tensors})
@@ -468,7 +467,7 @@ def test_a_grid_is_read_off_its_levels(tmp_path):
 
 
 def test_moving_averages(tmp_path, torch):
-    # As torch itself writes it: with an optimiser, parameters, half-precision and numpy numbers in the statistics.
+    # As torch writes it: with an optimiser, parameters, half precision and NumPy numbers in the statistics.
     state = reference.nerf_state(1, np.random.default_rng(7))
     weights = [k for k in state if k.endswith(("embeddings", "weight"))]
     shadow = [torch.tensor(state[k]) * 2 for k in weights]

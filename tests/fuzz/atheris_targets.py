@@ -1,9 +1,9 @@
-"""Readers of binary files under atheris, which is led by the branches that an input reaches (extra ``fuzz``).
+"""Readers of binary files under atheris, a coverage-guided fuzzer (extra ``fuzz``).
 
 Usage: python tests/fuzz/atheris_targets.py TARGET SECONDS [options of libFuzzer]
 
-Begins with a valid input. Whatever is neither a result nor one `NergError` ends the run, and libFuzzer writes the input
-into the working directory.
+The run starts with a valid input. It ends at an outcome that is neither a result nor a `NergError`, and libFuzzer
+writes the input into the working directory.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ sys.path.insert(0, str(ROOT))
 
 import atheris  # noqa: E402
 
-# Libraries are instrumented as they are imported, so that these come first and what is tried afterwards.
+# Libraries are instrumented on import. These libraries are imported first, to exclude them.
 import mitsuba as mi  # noqa: E402
 import numpy as np  # noqa: E402, F401
 
@@ -45,7 +45,7 @@ def _namespace():
 
 
 def _pickle(path: Path) -> object:
-    # What is wrong in a pickle is told by whoever reads the archive.
+    # Errors in a pickle are translated by the reader of the archive.
     try:
         return check_pickle(path.read_bytes())
     except (ValueError, IndexError, KeyError, OverflowError) as error:
@@ -54,7 +54,11 @@ def _pickle(path: Path) -> object:
 
 TARGETS = {
     "checkpoint": ("radiance checkpoint", "field.safetensors", lambda p: load_radiance(p, _namespace())),
-    "torch": ("torch-ngp checkpoint", "ngp.pth", lambda p: read_torch_ngp(p, _namespace(), options=ImportOptions(finest=32))),
+    "torch": (
+        "torch-ngp checkpoint",
+        "ngp.pth",
+        lambda p: read_torch_ngp(p, _namespace(), options=ImportOptions(finest=32)),
+    ),
     "pickle": ("torch-ngp checkpoint", "pickle", _pickle),
     "npy": ("picture a.npy", "a.npy", read_npy),
     "npz": ("rays rays.npz", "rays.npz", read_npz),
@@ -88,7 +92,7 @@ def main() -> None:
         nonlocal runs
         if time.monotonic() - start > seconds:
             print(f"{name}: {runs} inputs in {seconds:.0f} s, each a result or one sentence", flush=True)
-            # At libFuzzer's own end the threads of Dr.Jit would abort the process.
+            # At the regular exit of libFuzzer, the threads of Dr.Jit would abort the process.
             os._exit(0)
         runs += 1
         file.write_bytes(data)

@@ -1,4 +1,4 @@
-"""Readers of posed image sets, pictures, depth, masks and salience."""
+"""Readers of posed image sets, images, depth, masks and saliency maps."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def _read_dataset(folder: Path) -> object:
 
 
 def _make_place(folder: Path) -> None:
-    """With points enough to tell a place from what is around it."""
+    """A data set with enough points to distinguish the scene from its surroundings."""
     _make_colmap("bin")(folder)
     p = np.random.default_rng(0).normal(size=(130, 3)) * np.where(np.arange(130) % 5, 1, 50)[:, None]
     points = [struct.pack("<Q3d3BdQ6i", k, *xyz, 1, 2, 3, 0.5, 3, *range(6)) for k, xyz in enumerate(p)]
@@ -78,7 +78,7 @@ def _make_place(folder: Path) -> None:
 def _read_place(folder: Path) -> object:
     from nerg_mi.photos.dataset import open_dataset
 
-    return [open_dataset(folder, holdout=0, scale=0.5, unbounded=given) for given in (None, True, False)]
+    return [open_dataset(folder, holdout=0, scale=0.5, unbounded=arguments) for arguments in (None, True, False)]
 
 
 def _read_salience_set(folder: Path) -> object:
@@ -152,17 +152,17 @@ def _read_picture(name: str):
         from nerg_mi.photos.salience import read_salience
 
         path, out = folder / name, []
-        ways = [
+        readers = [
             lambda: read_image(path),
             lambda: read_depth(DepthFile(path)),
             lambda: read_mask(MaskFile(path), _SIZE[::-1]),
             lambda: read_salience(path),
         ]
         refused = None
-        for way in ways:
-            # What one of them refuses the next may read.
+        for reader in readers:
+            # If one reader refuses the input, the next one may accept it.
             try:
-                out.append(way())
+                out.append(reader())
             except NergError as error:
                 refused = error
         if not out:

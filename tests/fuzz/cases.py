@@ -1,4 +1,4 @@
-"""Cases of all readers, the same in every run."""
+"""Cases of all readers, identical in each run."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from pathlib import Path
 
 from hypothesis import HealthCheck, Phase, given, seed, settings
 
-from tests.fuzz.mutations import mutated
+from tests.fuzz.mutations import mutate
 from tests.fuzz.watch import Case, Reader
 
 
 def make_inputs(readers: list[Reader], folder: Path) -> Path:
-    """The valid inputs of ``readers``, each in a folder of its name below ``folder``."""
+    """Write the valid inputs of ``readers``, each into a subfolder of ``folder`` with the name of the reader."""
     for reader in readers:
         (folder / reader.name).mkdir(parents=True)
         reader.make(folder / reader.name)
@@ -21,17 +21,17 @@ def make_inputs(readers: list[Reader], folder: Path) -> Path:
 
 
 def draw_cases(readers: list[Reader], inputs: Path, count: int, start: int = 0) -> Iterator[Case]:
-    """``count`` cases, as many for each reader and each of its targets; ``start``: another gives others."""
+    """Draw ``count`` cases, equally many for each reader and each of its targets; ``start`` selects other cases."""
     targets = [(r, t, kinds) for r in readers for t, kinds in r.targets.items()]
     for k, (reader, target, kinds) in enumerate(targets):
         share = count * (k + 1) // len(targets) - count * k // len(targets)
         data = (inputs / reader.name / target).read_bytes()
-        for damaged in _drawn(data, kinds, share, f"{start} {reader.name} {target}"):
+        for damaged in _draw(data, kinds, share, f"{start} {reader.name} {target}"):
             yield Case(reader.name, target, damaged)
 
 
-def _drawn(data: bytes, kinds: tuple[str, ...], count: int, name: str) -> list[bytes]:
-    found: list[bytes] = []
+def _draw(data: bytes, kinds: tuple[str, ...], count: int, name: str) -> list[bytes]:
+    cases: list[bytes] = []
 
     @seed(name)
     @settings(
@@ -41,12 +41,12 @@ def _drawn(data: bytes, kinds: tuple[str, ...], count: int, name: str) -> list[b
         phases=[Phase.generate],
         suppress_health_check=list(HealthCheck),
     )
-    @given(mutated(data, kinds))
+    @given(mutate(data, kinds))
     def collect(changed: bytes) -> None:
-        if len(found) < count:
-            found.append(changed)
+        if len(cases) < count:
+            cases.append(changed)
 
     state = random.getstate()
     collect()
     random.setstate(state)
-    return found
+    return cases

@@ -1,4 +1,4 @@
-"""Readers of fields and of the states of trainings."""
+"""Readers of fields and of training states."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from tests.fuzz.watch import Reader
 
-_ABOUT = {"sha": 1, "width": 24}
+_METADATA = {"sha": 1, "width": 24}
 
 
 def _parts():
@@ -77,7 +77,8 @@ def _read_gaze(folder: Path) -> object:
     return load_gaze(folder / "gaze.safetensors", _parts()[0])
 
 
-# --- states of trainings ----------------------------------------------------------------------------------------------
+# --- training states
+# ----------------------------------------------------------------------------------------------------
 
 
 class _Grid:
@@ -95,7 +96,7 @@ class _Grid:
 
 
 def _trainer(kind):
-    """A trainer of ``kind`` that has no more than what its state consists of."""
+    """A trainer of ``kind`` with only the members of its state."""
     import mitsuba as mi
 
     from nerg_mi.train.trainer import StepClock
@@ -128,14 +129,14 @@ def _make_radiance_run(folder: Path) -> None:
     from nerg_mi.train.radiance_run import save_run
     from nerg_mi.train.radiance_trainer import RadianceTrainer
 
-    save_run(_trainer(RadianceTrainer), folder / "field.run", _ABOUT, [{"psnr": 20.0}])
+    save_run(_trainer(RadianceTrainer), folder / "field.run", _METADATA, [{"psnr": 20.0}])
 
 
 def _read_radiance_run(folder: Path) -> object:
     from nerg_mi.train.radiance_run import load_run
     from nerg_mi.train.radiance_trainer import RadianceTrainer
 
-    return load_run(_trainer(RadianceTrainer), folder / "field.run", _ABOUT)
+    return load_run(_trainer(RadianceTrainer), folder / "field.run", _METADATA)
 
 
 def _make_gaze_run(folder: Path) -> None:
@@ -143,18 +144,18 @@ def _make_gaze_run(folder: Path) -> None:
     from nerg_mi.train.trainer import Trainer
 
     trainer = _trainer(Trainer)
-    GazeRunFile(folder / "gaze.run", _ABOUT).save("fit", trainer, {"best": 1.5}, trainer.averaged, force=True)
+    GazeRunFile(folder / "gaze.run", _METADATA).save("fit", trainer, {"best": 1.5}, trainer.averaged, force=True)
 
 
 def _read_gaze_run(folder: Path) -> object:
     from nerg_mi.train.gaze_trainer import GazeRunFile
     from nerg_mi.train.trainer import Trainer
 
-    file = GazeRunFile(folder / "gaze.run", _ABOUT, resume=True)
+    file = GazeRunFile(folder / "gaze.run", _METADATA, resume=True)
     return file.restore("fit", _trainer(Trainer))
 
 
-# --- torch's ----------------------------------------------------------------------------------------------------------
+# --- torch ------------------------------------------------------------------------------------------------------------
 
 
 def _table(levels: int) -> dict:

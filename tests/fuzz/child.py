@@ -1,7 +1,7 @@
-"""The process in which damaged files are read: started by `watch`, one line of JSON in for a case, one out for its
-outcome.
+"""The process that reads damaged files. It is started by `watch`, reads one JSON line per case, and writes one line
+with the outcome.
 
-Each case is watched by an audit hook: nothing may be run, opened for writing, removed, or sent.
+An audit hook watches each case: nothing may be run, opened for writing, removed, or sent.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ _FORBIDDEN = (
     "smtplib.",
     "tempfile.",
 )
-# What may be imported late, besides the standard library.
+# Modules that may be imported late, besides the standard library.
 _LIBRARIES = frozenset(
     (
         "nerg_mi",
@@ -73,7 +73,7 @@ _LIBRARIES = frozenset(
     )
 )
 
-# Bytes of a function that returns nothing, in any version of Python.
+# Bytecode of a function that returns None, in any version of Python.
 _EMPTY = 32
 
 watched = False
@@ -81,12 +81,12 @@ violations: list[str] = []
 
 
 def audit(event: str, arguments: tuple) -> None:
-    """Note what no reader does, and keep it from happening."""
+    """Record and block operations that a reader must not perform."""
     if not watched:
         return
     bad = event.startswith(_FORBIDDEN)
     if event == "code.__new__":
-        # A library that is compiled by Cython makes an empty function for the traceback of each exception.
+        # Libraries compiled with Cython create an empty function for the traceback of each exception.
         code, name, *_ = arguments
         bad = not (str(name).startswith("av/") and len(code) <= _EMPTY)
     elif event == "open":
@@ -97,8 +97,8 @@ def audit(event: str, arguments: tuple) -> None:
         )
     elif event == "exec":
         name = getattr(arguments[0], "co_filename", "<unknown>")
-        # Modules that are imported late are run too, from files; the frozen ones are Python's own, dataclasses among
-        # what is not.
+        # Late imports also run code from files. Frozen modules belong to Python; dataclasses generate code that has no
+        # file.
         bad = name.startswith("<") and not name.startswith("<frozen")
     elif event == "import":
         root = str(arguments[0]).partition(".")[0]
@@ -120,14 +120,14 @@ def _files(folder: Path) -> set:
 
 
 def attempt(reader, folder: Path) -> dict:
-    """What comes of reading ``folder``: ``outcome`` is result, refusal, or one of the breaches of the contract."""
-    global watched  # noqa: PLW0603 (an audit hook stays for good, and looks at this to know when it counts)
+    """Read ``folder`` and return the outcome: result, refusal, or one of the breaches of the contract."""
+    global watched  # noqa: PLW0603 (an audit hook cannot be removed, and checks this variable)
     from nerg_mi.errors import NergError
 
     violations.clear()
     before = _files(folder)
     Path("/proc/self/clear_refs").write_text("5")
-    # A command computes in threads of its own.
+    # A command may compute in other threads.
     clock = time.process_time if reader.is_command else time.thread_time
     memory, start, outcome, said = _memory("VmRSS"), clock(), "result", ""
     watched = not reader.is_command
@@ -154,7 +154,7 @@ def attempt(reader, folder: Path) -> dict:
 
 
 def place(file: Path, special: str, data: bytes) -> None:
-    """Put ``data`` at ``file``, or what is no regular file (see `watch.SPECIAL`)."""
+    """Write ``data`` to ``file``, or create something that is not a regular file (see `watch.SPECIAL`)."""
     match special:
         case "":
             file.write_bytes(data)
@@ -183,7 +183,7 @@ def main() -> None:
     sys.addaudithook(audit)
     for name in names:
         shutil.copytree(home / name, room / name)
-        # Once whole, so that all is imported, and to see that the input is valid.
+        # First with the valid input, to import all modules and to check the input.
         readers[name].read(room / name)
     limit = _memory("VmSize") + 2 * ROOM
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
@@ -192,12 +192,12 @@ def main() -> None:
         case = json.loads(line)
         folder = room / case["reader"]
         file = folder / case["target"]
-        whole = file.read_bytes()
+        request = file.read_bytes()
         file.unlink()
         place(file, case["special"], base64.b64decode(case["data"]))
         report = attempt(readers[case["reader"]], folder)
         file.rmdir() if file.is_dir() and not file.is_symlink() else file.unlink()
-        file.write_bytes(whole)
+        file.write_bytes(request)
         print(json.dumps(report), file=out)
 
 

@@ -1,9 +1,8 @@
-"""Command lines with pairs of options and values that one seldom tries together; each must end with a result or one
-sentence.
+"""Command lines with pairs of options and unusual values; each must end with a result or one sentence.
 
-Most values are allowed by the option's own check, since it is beyond those checks that options meet. To the fuzzer a
-line is a file of JSON (its words). Inputs are those of `tests.cli.outputs`, so small that a command takes about a
-second.
+Most values pass the check of their own option, because options interact only after these checks. For the fuzzer, a
+command line is a JSON file of its words. Inputs are those of `tests.cli.outputs`, which are small enough that a command
+takes about a second.
 """
 
 from __future__ import annotations
@@ -67,7 +66,7 @@ _TEXTS |= dict(observers=("0,0,1.6", "1,1,1.6"), begin=("random", "field"))
 _POINTS = ("0.5,1.2,1.6", f"{COORDINATES.low},0,{COORDINATES.high}", "1e-7,0,0", "-2,-2,-2", "0,0,1")
 _SPANS = ("0,2", "0,0", f"{TIMES.low},{TIMES.high}", "1.5,1.5000001")
 _BOXES = {"x0,x1": "-2,2,-2,2,-1,3", "x0,y0": "-2,-2,-1,2,2,3"}
-# How a help text enumerates choices: "data, grid or blue", "all (one clock), or person", "both: ...; pos: ...".
+# Forms in which help texts list choices: "data, grid or blue", "all (one clock), or person", "both: ...; pos: ...".
 _WORD = r"[A-Za-z][\w-]*(?: \([^)]*\))?"
 _ROW = re.compile(rf"\b{_WORD}(?:, {_WORD})*,? or {_WORD}|\b{_WORD}(?:, {_WORD}){{2,}}")
 _ENTRY = re.compile(r"(?<!\S)([a-z]+): ")
@@ -76,7 +75,7 @@ _NO_NUMBER = re.compile(r"(?<![\w.\-/])[-+]?(?:nan|inf|infinity)(?![\w\-])", re.
 
 @functools.lru_cache
 def _inputs() -> Path:
-    """The inputs of all commands, made once in this process."""
+    """Create the inputs of all commands, once per process."""
     import mitsuba as mi
 
     import nerg_mi.cli
@@ -107,17 +106,17 @@ def _reader(name: str, case: outputs.Case) -> Reader:
 
 
 def run(folder: Path, words: list[str], is_work: bool = False) -> None:
-    """Run the command line ``words`` on the inputs in ``folder``; ``is_work``: a long time of it was asked for.
+    """Run the command line ``words`` on the inputs in ``folder``. ``is_work``: whether a long run was requested.
 
-    Raises `NergError` with its sentence where it refuses, ``RuntimeError`` where it ends with an internal error, takes
-    too long, or is done without a result.
+    Raises `NergError` with the message if the command refuses, and ``RuntimeError`` if it ends with an internal error,
+    takes too long, or has no result.
     """
     import nerg_mi.cli
     from nerg_mi.cli.ending import INTERNAL_ERROR, INTERRUPTED
     from nerg_mi.errors import NergError
 
     output, printed, said = Path(tempfile.mkdtemp(prefix="nerg-out-")), io.StringIO(), io.StringIO()
-    # It is ignored in what a shell runs in the background.
+    # The signal is ignored in background jobs of a shell.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     ended: list[bool] = []
     signal.signal(signal.SIGPROF, lambda *_: None if ended else signal.raise_signal(signal.SIGINT))
@@ -126,7 +125,7 @@ def run(folder: Path, words: list[str], is_work: bool = False) -> None:
         with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(said):
             nerg_mi.cli.main([word.replace("{i}", str(folder)).replace("{o}", str(output)) for word in words])
     except SystemExit as end:
-        # What is done just now needs no Ctrl-C.
+        # The command has just finished, and needs no Ctrl-C.
         ended.append(True)
         last = " ".join(said.getvalue().split())[-900:]
         if end.code == INTERNAL_ERROR or "Traceback" in said.getvalue():
@@ -143,8 +142,7 @@ def run(folder: Path, words: list[str], is_work: bool = False) -> None:
 
 
 def check_outputs(folder: Path, printed: str) -> None:
-    """Raise ``RuntimeError`` where a command that was done ``printed``, or wrote into ``folder``, nothing, or no number
-    where one is due."""
+    """Raise ``RuntimeError`` if a successful command printed or wrote nothing, or wrote NaN in place of a number."""
     import mitsuba as mi
     from safetensors.numpy import load_file
 
@@ -169,34 +167,34 @@ def check_outputs(folder: Path, printed: str) -> None:
 
 
 def draw_cases(readers: list[Reader], inputs: Path, count: int, start: int = 0) -> Iterator[Case]:
-    """``count`` lines, as many for each command, each with two or three options more, of those that there are."""
+    """Draw ``count`` command lines, equally many for each command, each with two or three additional options."""
     for k, reader in enumerate(readers):
         words = json.loads((inputs / reader.name / "line.json").read_text())
         rng = np.random.default_rng([start, k])
         command, options = reader.name.rpartition(" ")[0], _options(words)
         for _ in range(count * (k + 1) // len(readers) - count * k // len(readers)):
-            more: list[str] = []
+            extra: list[str] = []
             for option in rng.choice(len(options), min(len(options), int(rng.integers(2, 4))), replace=False):
-                more += _drawn(options[option], command, rng)
-            yield Case(reader.name, "line.json", json.dumps([*words, *more]).encode())
+                extra += _draw_options(options[option], command, rng)
+            yield Case(reader.name, "line.json", json.dumps([*words, *extra]).encode())
 
 
 @functools.lru_cache
 def _commands() -> dict[str, Any]:
-    """The parser of each command, by its words."""
+    """Return the parser of each command, by its words."""
     from tools.command_pages import iter_commands
 
     return {path.removeprefix("nerg "): command for path, command, _ in iter_commands()}
 
 
 def _options(words: list[str]) -> list[TyperOption]:
-    """The options of the command that the line ``words`` calls."""
+    """Return the options of the command that the line ``words`` calls."""
     command = _commands().get(" ".join(words[:2])) or _commands()[words[0]]
     return [p for p in command.params if isinstance(p, TyperOption) and FIXED.isdisjoint(p.opts)]
 
 
-def _drawn(option: TyperOption, command: str, rng: np.random.Generator) -> list[str]:
-    """``option`` with a value, as words of a command line."""
+def _draw_options(option: TyperOption, command: str, rng: np.random.Generator) -> list[str]:
+    """Draw ``option`` with a value, as words of a command line."""
     if option.is_flag:
         return [str(rng.choice([*option.opts, *option.secondary_opts]))]
     kind = option.type_descriptor.annotation
@@ -210,7 +208,7 @@ def _drawn(option: TyperOption, command: str, rng: np.random.Generator) -> list[
 
 
 def _allowed(option: TyperOption) -> list[str]:
-    """Values in the range of ``option``: its ends, what is next to them, and usual ones; or its choices."""
+    """Return values in the range of ``option``: its ends, values next to them, and usual values; or its choices."""
     kind = option.type_descriptor.annotation
     if kind is Path:
         return ["{i}/" + _FILES.get(option.name, "rays.npz")]
@@ -220,13 +218,13 @@ def _allowed(option: TyperOption) -> list[str]:
         next_to = (low + 1, high - 1) if kind is int else np.nextafter((low, high), (high, low)).tolist()
         usual = [v for v in (option.default, 0, 0.1, 0.5, 1, 2, 3, 8, 16) if v is not None and low <= v <= high]
         return [str(v) for v in (*usual, *usual, low, *next_to, high) if kind(v) == v]
-    about = re.sub(r"\[.*?\]", "", option.help or "")
-    if "A,B" in about:
+    parameter = re.sub(r"\[.*?\]", "", option.help or "")
+    if "A,B" in parameter:
         return [*_SPANS]
-    if coordinates := re.search(r"\b[a-z]\d?(?:,[a-z]\d?){2,}", about):
+    if coordinates := re.search(r"\b[a-z]\d?(?:,[a-z]\d?){2,}", parameter):
         return [_BOXES.get(coordinates[0][:5], "")] if coordinates[0].count(",") > 2 else [*_POINTS]
-    rows = ", ".join(_ROW.findall(re.sub(r" \([^)]*\)", "", about)))
-    entries = _ENTRY.findall(about)
+    rows = ", ".join(_ROW.findall(re.sub(r" \([^)]*\)", "", parameter)))
+    entries = _ENTRY.findall(parameter)
     words = re.split(r",? or |, ", rows) if rows and len(entries) < 2 else entries
     return [*_TEXTS.get(option.name, words or ("a",)), *([option.default] if option.default else [])]
 

@@ -1,4 +1,4 @@
-"""Readers that break the contract, each called as its breach, to see that the watch sees it."""
+"""Readers that break the contract, each named by its breach, to test that breaches are detected."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def _raise(error: Exception):
 
 
 def _swallowed(what) -> None:
-    """What a careless reader does: try, and say nothing."""
+    """Ignore an exception, as a careless reader does."""
     try:
         what()
     except Exception:

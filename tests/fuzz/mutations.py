@@ -1,4 +1,4 @@
-"""Damage to files, drawn by hypothesis: to their bytes, and to the structure that they have."""
+"""Damage to files, drawn by hypothesis: to their bytes, and to their structure."""
 
 from __future__ import annotations
 
@@ -80,10 +80,10 @@ _WORDS = (
 )
 
 
-def mutated(data: bytes, kinds: tuple[str, ...]) -> st.SearchStrategy[bytes]:
-    """``data`` damaged: one to three times in its bytes, or, as often for each of ``kinds``, in its structure."""
-    ways = [_bytes, *(_STRUCTURES[k] for k in kinds for _ in range(2))]
-    return st.sampled_from(ways).flatmap(lambda way: way(data))
+def mutate(data: bytes, kinds: tuple[str, ...]) -> st.SearchStrategy[bytes]:
+    """Damage ``data``: one to three times in its bytes, or equally often for each of ``kinds``, in its structure."""
+    mutations = [_bytes, *(_STRUCTURES[k] for k in kinds for _ in range(2))]
+    return st.sampled_from(mutations).flatmap(lambda way: way(data))
 
 
 @st.composite
@@ -93,47 +93,49 @@ def _bytes(draw, data: bytes) -> bytes:
     return data
 
 
-def _at(draw, data: bytes) -> int:
-    """A place in ``data``: often near its start, where headers are, or its end, where archives list what they hold."""
-    most = len(data)
-    near = min(most, 200)
-    at = draw(st.integers(0, 2 * near + min(most, 2 * near)))
+def _choose_position(draw, data: bytes) -> int:
+    """Draw a position in ``data``: often near its start, where headers are, or its end, where archives list their
+    members.
+    """
+    limit = len(data)
+    near = min(limit, 200)
+    at = draw(st.integers(0, 2 * near + min(limit, 2 * near)))
     if at <= near:
         return at
-    return most - (at - near) if at <= 2 * near else (at - 2 * near) * most // max(min(most, 2 * near), 1)
+    return limit - (at - near) if at <= 2 * near else (at - 2 * near) * limit // max(min(limit, 2 * near), 1)
 
 
-def _flipped(draw, data: bytes) -> bytes:
+def _flip_bits(draw, data: bytes) -> bytes:
     out = bytearray(data)
     for _ in range(draw(_ONE_TO_THREE)):
         if out:
-            out[min(_at(draw, data), len(out) - 1)] ^= 1 << draw(_BIT)
+            out[min(_choose_position(draw, data), len(out) - 1)] ^= 1 << draw(_BIT)
     return bytes(out)
 
 
-def _truncated(draw, data: bytes) -> bytes:
-    return data[: _at(draw, data)]
+def _truncate(draw, data: bytes) -> bytes:
+    return data[: _choose_position(draw, data)]
 
 
-def _inserted(draw, data: bytes) -> bytes:
-    at = _at(draw, data)
+def _insert_bytes(draw, data: bytes) -> bytes:
+    at = _choose_position(draw, data)
     return data[:at] + draw(_SOME_BYTES) * draw(_REPEATS) + data[at:]
 
 
-def _overwritten(draw, data: bytes) -> bytes:
-    """An integer of one to eight bytes is given an extreme value, where one might stand."""
-    at, size = _at(draw, data), draw(_SIZES)
+def _overwrite(draw, data: bytes) -> bytes:
+    """Set an integer of one to eight bytes to an extreme value."""
+    at, size = _choose_position(draw, data), draw(_SIZES)
     value = draw(_EXTREME) % (1 << 8 * size)
     return data[:at] + value.to_bytes(size, draw(_ORDER)) + data[at + size :]
 
 
-def _moved(draw, data: bytes) -> bytes:
-    """A piece is left out, or stands twice."""
-    a, b = sorted((_at(draw, data), _at(draw, data)))
+def _move_block(draw, data: bytes) -> bytes:
+    """Remove or duplicate a piece."""
+    a, b = sorted((_choose_position(draw, data), _choose_position(draw, data)))
     return data[:a] + data[b:] if draw(_COIN) else data[:b] + data[a:]
 
 
-# Made once: making a strategy takes longer than drawing from it.
+# Created once, because creating a strategy takes longer than drawing from it.
 _ONE_TO_THREE, _BIT, _COIN, _SOME_BYTES = (
     st.integers(1, 3),
     st.integers(0, 7),
@@ -142,7 +144,7 @@ _ONE_TO_THREE, _BIT, _COIN, _SOME_BYTES = (
 )
 _REPEATS, _SIZES = st.sampled_from([1, 1, 1, 10, 1000]), st.sampled_from([1, 2, 4, 8])
 _ORDER, _EXTREME = st.sampled_from(["little", "big"]), st.sampled_from(EXTREMES)
-_DAMAGES = st.sampled_from([_flipped, _truncated, _inserted, _overwritten, _moved])
+_DAMAGES = st.sampled_from([_flip_bits, _truncate, _insert_bytes, _overwrite, _move_block])
 _TENTH, _EIGHTH, _VALUE = st.integers(0, 9), st.integers(0, 7), st.sampled_from(_VALUES)
 
 
@@ -151,22 +153,22 @@ _TENTH, _EIGHTH, _VALUE = st.integers(0, 9), st.integers(0, 7), st.sampled_from(
 
 @st.composite
 def _json(draw, data: bytes) -> bytes:
-    return _changed_json(draw, json.loads(data))
+    return _change_json(draw, json.loads(data))
 
 
-def _changed_json(draw, value) -> bytes:
+def _change_json(draw, value) -> bytes:
     deep = draw(st.integers(0, 30))
     if deep == 0:
         count = draw(st.sampled_from([100, 5000, 200_000]))
         return draw(st.sampled_from([b"[" * count, b"[" * count + b"]" * count, b'{"a":' * count]))
     for _ in range(draw(_ONE_TO_THREE)):
-        value = _changed(draw, value)
+        value = _change_value(draw, value)
     text = json.dumps(value)
     return text.encode()
 
 
-def _changed(draw, value):
-    """``value`` with one of its parts exchanged, left out, or named otherwise."""
+def _change_value(draw, value):
+    """Replace, remove or rename a part of ``value``."""
     if isinstance(value, dict) and value and draw(_EIGHTH):
         key = draw(st.sampled_from(sorted(value)))
         what, rest = draw(_TENTH), {k: v for k, v in value.items() if k != key}
@@ -174,7 +176,7 @@ def _changed(draw, value):
             return rest
         if what == 1:
             return {**rest, key + "x": value[key]}
-        return {**rest, key: _changed(draw, value[key])}
+        return {**rest, key: _change_value(draw, value[key])}
     if isinstance(value, list) and value and draw(_EIGHTH):
         k = draw(st.integers(0, len(value) - 1))
         what = draw(_TENTH)
@@ -182,7 +184,7 @@ def _changed(draw, value):
             return value[:k] + value[k + 1 :]
         if what == 1:
             return value[:k] + [value[k]] * 2 + value[k:]
-        return [*value[:k], _changed(draw, value[k]), *value[k + 1 :]]
+        return [*value[:k], _change_value(draw, value[k]), *value[k + 1 :]]
     return draw(_VALUE)
 
 
@@ -202,14 +204,14 @@ def _text(draw, data: bytes) -> bytes:
 
 @st.composite
 def _npy(draw, data: bytes) -> bytes:
-    """The header of an array says something else."""
+    """Change the header of an array."""
     size = struct.unpack_from("<H", data, 8)[0]
     head = data[10 : 10 + size].decode("latin1")
     number, values = (
         str(draw(_EXTREME)),
         ("'|O'", "'<U0'", "'<f8'", "'<i1'", "'|V100000'", "[('a', '<f4')]", "1", "''"),
     )
-    ways = [
+    mutations = [
         lambda: re.sub(r"\d+", number, head, count=draw(_ONE_TO_THREE)),
         lambda: re.sub(r"'descr': '[^']*'", f"'descr': {draw(st.sampled_from(values))}", head),
         lambda: re.sub(
@@ -222,7 +224,7 @@ def _npy(draw, data: bytes) -> bytes:
             )
         ),
     ]
-    head = draw(st.sampled_from(ways))()
+    head = draw(st.sampled_from(mutations))()
     return data[:8] + struct.pack("<H", len(head) % 65536) + head.encode("latin1") + data[10 + size :]
 
 
@@ -236,11 +238,11 @@ def _gzip(draw, data: bytes) -> bytes:
 
 @st.composite
 def _zip(draw, data: bytes) -> bytes:
-    """A member is damaged, renamed, left out, or grown; or the list of members says something else."""
+    """Damage, rename, remove or extend a member, or change the member list."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         members = {n: archive.read(n) for n in archive.namelist()}
     names = sorted(members)
-    # What describes the others is the more rewarding.
+    # Members that describe others are damaged more often.
     likely = [n for n in names if n.endswith((".pkl", ".json")) for _ in range(2 * len(names))]
     name, what = draw(st.sampled_from([*names, *likely])), draw(st.integers(0, 11))
     if what == 0:
@@ -271,21 +273,21 @@ def _zip(draw, data: bytes) -> bytes:
 
 @st.composite
 def _safetensors(draw, data: bytes) -> bytes:
-    """The header, or the metadata within, says something else."""
+    """Change the header, or the metadata in it."""
     size = struct.unpack_from("<Q", data)[0]
     header = json.loads(data[8 : 8 + size])
     if "__metadata__" in header and draw(st.integers(0, 4)):
-        about = header["__metadata__"]
-        header["__metadata__"] = {**about, "nerg": _changed_json(draw, json.loads(about["nerg"])).decode()}
+        entries = header["__metadata__"]
+        header["__metadata__"] = {**entries, "nerg": _change_json(draw, json.loads(entries["nerg"])).decode()}
         raw = json.dumps(header).encode()
     else:
-        raw = _changed_json(draw, header)
+        raw = _change_json(draw, header)
     return struct.pack("<Q", len(raw)) + raw + data[8 + size :]
 
 
 @st.composite
 def _png(draw, data: bytes) -> bytes:
-    """A chunk is damaged, left out, or stands twice, and its checksum is right."""
+    """Damage, remove or duplicate a chunk, with a valid checksum."""
     chunks, at = [], 8
     while at < len(data):
         size = int.from_bytes(data[at : at + 4], "big")
@@ -307,11 +309,11 @@ _NESTED = (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"edts", b"moof", b"traf
 
 @st.composite
 def _boxes(draw, data: bytes) -> bytes:
-    """A box of an MP4 file is damaged, left out, renamed, or stands twice, and those around it fit."""
-    return _changed_boxes(draw, data)
+    """Damage, remove, rename or duplicate a box of an MP4 file, and adjust the sizes of its parents."""
+    return _change_boxes(draw, data)
 
 
-def _changed_boxes(draw, data: bytes) -> bytes:
+def _change_boxes(draw, data: bytes) -> bytes:
     boxes, at = [], 0
     while at + 8 <= len(data):
         size = max(8, int.from_bytes(data[at : at + 4], "big"))
@@ -319,16 +321,16 @@ def _changed_boxes(draw, data: bytes) -> bytes:
         at += size
     if not boxes:
         return draw(_bytes(data))
-    # Most of it is in what describes the rest.
+    # Boxes that describe the others are damaged more often.
     likely = [k for k, (kind, _) in enumerate(boxes) if kind in _NESTED for _ in range(4)]
     k, what = draw(st.sampled_from([*range(len(boxes)), *likely])), draw(st.integers(0, 11))
     kind, content = boxes[k]
     if kind in _NESTED and what > 1:
-        content = _changed_boxes(draw, content)
+        content = _change_boxes(draw, content)
     elif what == 2:
         kind = draw(st.sampled_from([b"free", b"stsz", b"trun", b"cmov", b"meta", b"wide", bytes(4), *_NESTED]))
     elif what > 7 and len(content) >= 8:
-        # Of most, numbers stand at multiples of four.
+        # In most boxes, numbers are aligned to four bytes.
         at = 4 * draw(st.integers(0, len(content) // 4 - 1))
         content = content[:at] + (draw(_EXTREME) % (1 << 32)).to_bytes(4, "big") + content[at + 4 :]
     elif what > 2:

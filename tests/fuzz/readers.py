@@ -1,4 +1,4 @@
-"""Every reader of the package, as the fuzzer sees it: one entry each, see `watch.Reader`."""
+"""All readers of the package for the fuzzer, one entry each; see `watch.Reader`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.fuzz.checkpoint_readers import CHECKPOINTS
 from tests.fuzz.tracking_readers import TRACKING
 from tests.fuzz.watch import Reader
 
-# ---- Scene files and what they name ----
+# ---- Scene files and the files that they refer to ----
 
 
 _SCENE = """<scene version="3.0.0">
@@ -73,7 +73,7 @@ def _read(folder: Path) -> object:
 
 def _nest(folder: Path) -> object:
     from nerg_mi.rendering.nested_scene import nest_scene
-    from nerg_mi.rendering.scene_writer import LookAt, GazeFiles, SceneText
+    from nerg_mi.rendering.scene_writer import GazeFiles, LookAt, SceneText
 
     place = nest_scene(folder / "theirs.xml", folder / "ours")
     camera = LookAt(np.zeros(3), np.ones(3))
@@ -118,10 +118,10 @@ def _make_glb(folder: Path) -> None:
     from nerg_mi.formats.gltf import encode_unlit_glb
 
     corners = [("POSITION", np.array(_CORNERS, "<f4"), False)]
-    whole = b"".join(encode_unlit_glb(corners, np.array([[0, 1, 2]])))
-    (folder / "a.glb").write_bytes(whole)
-    # Its document by itself, of which damage may keep the structure.
-    (folder / "document.json").write_bytes(whole[20 : 20 + struct.unpack_from("<I", whole, 12)[0]])
+    content = b"".join(encode_unlit_glb(corners, np.array([[0, 1, 2]])))
+    (folder / "a.glb").write_bytes(content)
+    # The JSON document alone, so that damage can preserve its structure.
+    (folder / "document.json").write_bytes(content[20 : 20 + struct.unpack_from("<I", content, 12)[0]])
 
 
 def _read_glb(folder: Path) -> object:
@@ -164,7 +164,7 @@ SCENES = [
 ]
 
 
-# ---- Readers of what statistics are asked about ----
+# ---- Inputs of statistics ----
 
 
 def _make_areas(folder: Path) -> None:
@@ -183,7 +183,7 @@ def _read_areas(folder: Path) -> object:
     from nerg_mi.formats.areas import read_areas
 
     areas = read_areas(folder / "areas.json")
-    assert all(of for of in areas.box_indices.values())
+    assert all(elements for elements in areas.box_indices.values())
     for box in areas.boxes:
         box.contains(areas.boxes[0].vertices if areas.boxes else [[0.0, 0, 0]])
     return areas.element_indices()
@@ -217,7 +217,9 @@ def _read_changes(folder: Path) -> object:
     from nerg_mi.aoi.scene import apply_to_areas, read_changes
     from nerg_mi.formats.areas import AreaSet, Region
 
-    return apply_to_areas(AreaSet((Region.create("shelf", [0, 0, 0], [1, 1, 1]),)), read_changes(folder / "changes.json"))
+    return apply_to_areas(
+        AreaSet((Region.create("shelf", [0, 0, 0], [1, 1, 1]),)), read_changes(folder / "changes.json")
+    )
 
 
 def _make_cohorts(folder: Path) -> None:
@@ -243,7 +245,7 @@ AREAS = [
 ]
 
 
-# ---- Readers of what a report is made of: evaluations, and boxes of objects ----
+# ---- Inputs of reports: evaluations, and boxes of objects ----
 
 
 def _make_results(folder: Path) -> None:
@@ -251,7 +253,7 @@ def _make_results(folder: Path) -> None:
     from tests.evaluation.test_gaze_report import scored
 
     person = {"method": "gaze field", "person": "Ada", "rays": 9, "bits": 0.1, "CC": 0.5, "KLD": 0.2}
-    about = {
+    metadata = {
         "gaze": "g.safetensors",
         "split": "both",
         "kappa": 20.0,
@@ -259,7 +261,7 @@ def _make_results(folder: Path) -> None:
         "people": 30,
         "gaze_sha256": "ab",
     }
-    write_report(folder, scored((0.9, 0.85, 0.3), reach=0.02), [person], about, "# notes")
+    write_report(folder, scored((0.9, 0.85, 0.3), reach=0.02), [person], metadata, "# notes")
 
 
 def _read_results(folder: Path) -> None:
@@ -267,8 +269,8 @@ def _read_results(folder: Path) -> None:
     from nerg_mi.report.data import Run
     from nerg_mi.report.sections import render_page
 
-    found = read_results(folder / "gaze.json")
-    render_page(Run("Gaze", {}, "A place.", "none", results=(found,)))
+    results = read_results(folder / "gaze.json")
+    render_page(Run("Gaze", {}, "A place.", "none", results=(results,)))
 
 
 def _make_boxes(folder: Path) -> None:
@@ -289,7 +291,7 @@ REPORTS = [
 ]
 
 
-# ---- Files of Gaussian splats, each as another program writes it ----
+# ---- Files of Gaussian splats of other programs ----
 
 
 def _make_splats(name: str, **how):
@@ -326,11 +328,11 @@ SPLATS = [
 ]
 
 
-# ---- Readers of photos as telephones leave them, and of videos ----
+# ---- Photos of telephones, and videos ----
 
 
 _SIZE = 64, 48
-# Containers and what is in them: whether boxes, by which damage may be led; the codec; options of the writer.
+# Containers with: whether they consist of boxes, which guide the damage; the codec; options of the writer.
 _FILMS = {
     "film.mp4": (("boxes",), "mpeg4", {}),
     "parts.mp4": (("boxes",), "mpeg4", {"movflags": "frag_keyframe+empty_moov"}),
@@ -363,11 +365,14 @@ def _make_photo(name: str):
 
 def _read_photo(name: str):
     def read(folder: Path) -> object:
-        from nerg_mi.photos.structure import encode_image, read_photo, encode_small_image, fit_size
+        from nerg_mi.photos.structure import encode_image, encode_small_image, fit_size, read_photo
 
         photo = read_photo(folder / name)
-        # What is done with it where it is turned, and in any case.
-        return [*(encode_image(photo.image, kind) for kind in (".jpg", ".png")), encode_small_image(photo.image, fit_size(_SIZE, 24))]
+        # Operations for rotated photos, and for all photos.
+        return [
+            *(encode_image(photo.image, kind) for kind in (".jpg", ".png")),
+            encode_small_image(photo.image, fit_size(_SIZE, 24)),
+        ]
 
     return read
 
@@ -378,8 +383,8 @@ def _make_film(name: str):
     def make(folder: Path) -> None:
         import av
 
-        given = {"mts": "mpegts", "wmv": "asf"}.get(name.rpartition(".")[2])
-        with av.open(str(folder / name), "w", format=given, options=options) as out:
+        parameters = {"mts": "mpegts", "wmv": "asf"}.get(name.rpartition(".")[2])
+        with av.open(str(folder / name), "w", format=parameters, options=options) as out:
             stream = out.add_stream(codec, rate=25)
             stream.width, stream.height = _SIZE
             stream.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
@@ -399,7 +404,7 @@ def _read_film(name: str):
         from nerg_mi.photos.structure import encode_image, encode_small_image, fit_size
         from nerg_mi.photos.video_frames import select_sharpest_frames
 
-        # By itself the decoder starts as many threads as there are cores.
+        # By default, the decoder starts one thread per core.
         frames = [Image.fromarray(frame.pixels) for frame in select_sharpest_frames(folder / name, 3, threads=2)]
         return [(encode_image(f, ".jpg"), encode_small_image(f, fit_size(f.size, 24))) for f in frames]
 
@@ -418,7 +423,7 @@ STRUCTURE = [
 ]
 
 
-# ---- Readers of what stores of tasks remember: plans, and receipts of outputs ----
+# ---- Files in stores of tasks: plans, and manifests of outputs ----
 
 
 def _make_plan(folder: Path) -> None:

@@ -1,8 +1,8 @@
-"""Files that parse and contradict themselves, and paths that lead to no regular file.
+"""Files that parse but contradict themselves, and paths to things that are not regular files.
 
-Where `mutations` damages bytes and structure, these changes keep the structure and change the meaning: counts that
-differ from what follows, swapped axes, other units, repeated names, mirrored poses. They are drawn by NumPy and share
-no code with the other generator.
+`mutations` damages bytes and structure. These changes preserve the structure and change the meaning: wrong counts,
+swapped axes, other units, repeated names, mirrored poses. They are drawn with NumPy and share no code with the other
+generator.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ Rng = np.random.Generator
 
 
 def draw_cases(readers: list[Reader], inputs: Path, count: int, start: int = 0) -> Iterator[Case]:
-    """``count`` cases, as many for each target of ``readers``; another ``start`` gives others."""
+    """Draw ``count`` cases, equally many for each target of ``readers``; ``start`` selects other cases."""
     targets = [(reader, target) for reader in readers for target in reader.targets]
     for k, (reader, target) in enumerate(targets):
         data = (inputs / reader.name / target).read_bytes()
@@ -52,7 +52,7 @@ def draw_cases(readers: list[Reader], inputs: Path, count: int, start: int = 0) 
 
 
 def change(data: bytes, rng: Rng) -> bytes:
-    """``data`` with one change of meaning, by the format that its first bytes show."""
+    """Apply one change of meaning to ``data``, depending on the format that its first bytes show."""
     if data[:2] == b"\x1f\x8b":
         return gzip.compress(change(gzip.decompress(data), rng), 1, mtime=0)
     if data[:2] == b"PK":
@@ -82,14 +82,14 @@ def _pick(rng: Rng, items: Any) -> Any:
 
 
 def _change_array(values: np.ndarray, rng: Rng) -> np.ndarray:
-    """Another array of numbers: scaled, swapped, mirrored, constant, cut, or partly missing."""
+    """Change an array of numbers: scaled, swapped, mirrored, constant, truncated, or partly missing."""
     values = np.array(values)
-    ways = ["cut", "repeat", "constant", "reverse"]
-    ways += ["axes", "transpose"] if values.ndim > 1 and values.shape[-1] > 1 else []
-    ways += {"f": ["scale", "missing", "mirror"], "i": ["count"], "u": ["count"]}.get(values.dtype.kind, [])
-    way = _pick(rng, ways)
+    changes = ["cut", "repeat", "constant", "reverse"]
+    changes += ["axes", "transpose"] if values.ndim > 1 and values.shape[-1] > 1 else []
+    changes += {"f": ["scale", "missing", "mirror"], "i": ["count"], "u": ["count"]}.get(values.dtype.kind, [])
+    change = _pick(rng, changes)
     with np.errstate(over="ignore", invalid="ignore"):
-        match way:
+        match change:
             case "cut":
                 return values[: len(values) // 2] if values.ndim else values
             case "repeat":
@@ -142,7 +142,7 @@ def _change_archive(data: bytes, rng: Rng) -> bytes:
 
 
 def _change_words(data: bytes, rng: Rng) -> bytes:
-    """A number of a binary file, where its bytes are a plausible count or length."""
+    """Change a number of a binary file at a position with a plausible count or length."""
     out = bytearray(data)
     for _ in range(int(rng.integers(1, 4))):
         kind = np.dtype(_pick(rng, ("<i4", "<u8", "<f4", "<f8")))
@@ -167,7 +167,7 @@ def _change_words(data: bytes, rng: Rng) -> bytes:
 
 
 def _change_json(value: Any, rng: Rng) -> Any:
-    """``value`` with one of its arrays, numbers, names or texts changed, or two of its entries exchanged."""
+    """Change one of the arrays, numbers, names or texts of ``value``, or exchange two of its entries."""
     if isinstance(value, dict) and value:
         names = sorted(value)
         a, b = _pick(rng, names), _pick(rng, names)
@@ -203,7 +203,7 @@ def _change_json(value: Any, rng: Rng) -> Any:
 
 
 def _change_numbers(text: str, rng: Rng) -> str:
-    """A text in which one or two numbers are others, or two change places."""
+    """Change one or two numbers of a text, or exchange two."""
     spots = [match.span() for match in _NUMBER.finditer(text)]
     if not spots:
         return text
@@ -220,7 +220,7 @@ def _change_numbers(text: str, rng: Rng) -> str:
 
 
 def _change_ply(data: bytes, rng: Rng) -> bytes:
-    """Counts, types, names and order in the header, or the numbers behind it."""
+    """Change counts, types, names and order in the header, or the numbers after it."""
     head, mark, body = data.partition(b"end_header\n")
     if rng.random() < 0.4:
         changed = _change_table(body.decode(), rng).encode() if b"format ascii" in head else _change_words(body, rng)
@@ -248,7 +248,7 @@ def _change_ply(data: bytes, rng: Rng) -> bytes:
 
 
 def _change_table(text: str, rng: Rng) -> str:
-    """Columns, rows, names, units or separators of a text table."""
+    """Change columns, rows, names, units or separators of a text table."""
     lines = text.splitlines()
     counts = {mark: sum(line.count(mark) for line in lines[:20]) for mark in ",;\t "}
     mark = max(counts, key=counts.__getitem__)

@@ -1,4 +1,4 @@
-"""Readers of tracking data: rays files, tables, skeletons and the recordings of headsets."""
+"""Readers of tracking data: files of gaze samples, tables, skeletons and recordings of headsets."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def _rays():
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     origin = rng.random((40, 3)) + [0, 0, 1.4]
     cohort = np.arange(40) % 2
-    # A wide character: what shows it is imported before anything is damaged.
+    # A wide character, so that the module that formats it is imported before the first damaged case.
     rays = Rays(
         np.arange(40) * 0.02,
         np.arange(40) % 3,
@@ -33,7 +33,7 @@ def _rays():
         cohort=cohort,
         cohorts=("x", "y"),
     )
-    about = {
+    metadata = {
         "transform": np.eye(4).tolist(),
         "sources": [{"file": "a.csv", "sha256": "00" * 32}],
         "rows_read": 42,
@@ -41,7 +41,7 @@ def _rays():
         "dropped": [{"reason": "blink", "file": "a.csv", "count": 2, "rows": [[3, 4]]}],
         "source_frame": {"up": "y", "handedness": "left", "units": "m"},
     }
-    rays.metadata.update(about)
+    rays.metadata.update(metadata)
     where = {"position": {"radius": 0.25, "zones": 1, "zone_radius": 0.2, "test_centres": [[0.0, 0.0, 1.5]]}}
     return rays.with_step(step="filter", kept=40, of=41, persons=["a"]).with_step(
         step="split", side="test", kept=40, of=40, by=where
@@ -49,7 +49,7 @@ def _rays():
 
 
 def _shown(rays) -> None:
-    """What the commands ask of rays: the card, a selection, pseudonyms."""
+    """Use gaze samples as the commands do: quality report, selection, pseudonyms."""
 
     from nerg_mi.rays.filters import select_mask
     from nerg_mi.rays.pseudonyms import pseudonymise
@@ -70,14 +70,14 @@ def _rays_file(name: str, *kinds: str) -> Reader:
 
 
 def _needed(name: str) -> str | None:
-    """The package without which files of that name are not read."""
+    """Return the package that is required to read files with that name."""
     return "pyarrow" if name.endswith(".parquet") else None
 
 
 def _make_metadata(folder: Path) -> None:
     rays = _rays()
-    about = {"version": 1, **rays.metadata, "persons": list(rays.persons), "cohorts": list(rays.cohorts)}
-    (folder / "metadata.json").write_text(json.dumps(about))
+    metadata = {"version": 1, **rays.metadata, "persons": list(rays.persons), "cohorts": list(rays.cohorts)}
+    (folder / "metadata.json").write_text(json.dumps(metadata))
 
 
 def _read_metadata(folder: Path) -> None:
@@ -87,13 +87,13 @@ def _read_metadata(folder: Path) -> None:
     from nerg_mi.rays.rays import read_metadata
 
     raw = read_bytes(folder / "metadata.json", "rays file", MAX_JSON_BYTES)
-    about = read_metadata(raw, folder / "metadata.json")
-    persons, cohorts = about.pop("persons"), about.pop("cohorts", [])
-    _shown(replace(_rays(), metadata=about, persons=persons, cohorts=cohorts))
+    metadata = read_metadata(raw, folder / "metadata.json")
+    persons, cohorts = metadata.pop("persons"), metadata.pop("cohorts", [])
+    _shown(replace(_rays(), metadata=metadata, persons=persons, cohorts=cohorts))
 
 
 def _recording(name: str, example: Example, kind: str = "") -> Reader:
-    """The reader ``name`` on an example, of which any file may be damaged."""
+    """Make a reader ``name`` of an example, of which any file may be damaged."""
     skip = kind == " skipping"
 
     def make(folder: Path) -> None:
@@ -105,13 +105,13 @@ def _recording(name: str, example: Example, kind: str = "") -> Reader:
         options = make_options(name, example.options_in(folder))
         _shown(read_rays(name, example.given(folder), options, skip_bad_lines=skip))
 
-    known = {".gz": ("gzip",), ".json": ("json",), ".g3": ("json",), ".mp4": ("boxes",), ".c3d": ()}
-    kinds = {file: known.get(Path(file).suffix, ("text",)) for file in example.files}
+    columns = {".gz": ("gzip",), ".json": ("json",), ".g3": ("json",), ".mp4": ("boxes",), ".c3d": ()}
+    kinds = {file: columns.get(Path(file).suffix, ("text",)) for file in example.files}
     return Reader(f"preset {name}{kind}", make, kinds, read, "c3d" if name == "c3d" else None)
 
 
 def _tables(name: str, make, *kinds: str) -> Reader:
-    """The reader of tables on other files than that of its example."""
+    """Make a reader of tables for files other than its example."""
 
     def read(folder: Path) -> None:
         from nerg_mi.rays.readers.registry import make_options, read_rays
@@ -122,7 +122,7 @@ def _tables(name: str, make, *kinds: str) -> Reader:
 
 
 def _guess(name: str, make, *kinds: str) -> Reader:
-    """What is proposed of a damaged table; nothing of it is applied."""
+    """Read the proposal for a damaged table without applying it."""
 
     def read(folder: Path) -> None:
         from nerg_mi.rays.guess import propose_import

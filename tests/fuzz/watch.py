@@ -1,4 +1,4 @@
-"""Readers as the fuzzer sees them, cases in a warm child process that may crash or hang, and the corpus."""
+"""Readers for the fuzzer, cases in a warm child process that may crash or hang, and the corpus."""
 
 from __future__ import annotations
 
@@ -15,17 +15,18 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-# ---- What a reader is to the fuzzer ----
+# ---- Readers ----
 
 
 @dataclass(frozen=True)
 class Reader:
-    """``make`` writes a small valid input into an empty folder; ``read`` reads that folder and uses what it gets.
+    """A reader. ``make`` writes a small valid input into an empty folder; ``read`` reads that folder and uses the
+    result.
 
-    ``targets``: the files in it that are damaged, by name, each with the kinds of structure that damage may keep, of
-    "json", "text", "zip", "gzip", "npy", "safetensors", "png", "boxes" (of MP4); bytes are damaged in any case. Both
-    functions import what they need themselves. ``needs``: a package that may be missing, without which there is no
-    such reader. ``is_command``: it runs a command, which may write files and load what it needs.
+    ``targets``: names of the files that are damaged, each with the kinds of structure that damage may preserve: "json",
+    "text", "zip", "gzip", "npy", "safetensors", "png", "boxes" (of MP4). Bytes are always damaged, too. Both functions
+    import their modules themselves. ``needs``: an optional package; without it, the reader is skipped. ``is_command``:
+    it runs a command, which may write files and import modules.
     """
 
     name: str
@@ -40,12 +41,12 @@ class Reader:
         return self.needs is None or importlib.util.find_spec(self.needs) is not None
 
 
-# ---- Runs cases in a warm child process, and sees it crash or hang ----
+# ---- Cases run in a warm child process; crashes and hangs are detected ----
 
 
 ROOT = Path(__file__).resolve().parents[2]
 BREACHES = ("other exception", "crash", "hang", "executed", "left a file", "memory", "slow", "no sentence")
-# A case has 5 s of the processor's time; the machine may be busy, and a hang is a hang.
+# A case has 5 s of processor time. The wall-clock limit is longer, because the machine may be busy.
 _PATIENCE = 60.0
 SPECIAL = ("fifo", "/dev/zero", "/dev/null", "folder", "missing", "loop", "sparse")
 """What may stand at a path in place of a regular file: itself, or a link to it."""
@@ -53,8 +54,9 @@ SPECIAL = ("fifo", "/dev/zero", "/dev/null", "folder", "missing", "loop", "spars
 
 @dataclass(frozen=True)
 class Case:
-    """``data``: the bytes of the file ``target`` of the reader ``reader``, or ``special``: one of `SPECIAL` instead, of
-    which "sparse" begins with ``data`` and goes on with zeros."""
+    """A case. ``data``: the bytes of the file ``target`` of the reader ``reader``. ``special``: one of `SPECIAL`
+    instead; for "sparse", the file starts with ``data`` and continues with zeros.
+    """
 
     reader: str
     target: str
@@ -64,8 +66,9 @@ class Case:
 
 @dataclass(frozen=True)
 class Report:
-    """``outcome``: result, refusal, or one of `BREACHES`; ``said``: the sentence, or what went wrong; ``seconds``: of
-    the processor; ``memory``: bytes more at the peak than before."""
+    """Outcome of a case. ``outcome``: result, refusal, or one of `BREACHES`; ``said``: the message, or what went wrong;
+    ``seconds``: processor time; ``memory``: increase of the peak memory in bytes.
+    """
 
     outcome: str
     said: str = ""
@@ -74,9 +77,7 @@ class Report:
 
 
 class Child:
-    """One process; ``inputs``: folder of the valid inputs by reader; ``names``: of the readers that it will be asked
-    for.
-    """
+    """A child process. ``inputs``: folder of the valid inputs by reader; ``names``: names of its readers."""
 
     def __init__(self, inputs: Path, names: list[str], module: str):
         self._room = tempfile.TemporaryDirectory(prefix="nerg-fuzz-")
@@ -95,8 +96,8 @@ class Child:
             raise RuntimeError(f"the child did not start: {self.last_words()}")
 
     def _line(self) -> bytes | None:
-        """The next line; None when none comes, "" when the process has ended."""
-        # Twice: where the machine stood still, the first wait is over before the child has had its time.
+        """Return the next line; None if none arrives in time, "" if the process has ended."""
+        # Waits twice: if the machine was suspended, the first wait ends before the child has had its time.
         for _ in range(2):
             if select.select([self._process.stdout], [], [], _PATIENCE)[0]:
                 return self._process.stdout.readline()
@@ -107,7 +108,7 @@ class Child:
         return self._errors.read().decode(errors="replace")[-2000:]
 
     def run(self, case: Case) -> Report:
-        """The outcome of ``case``; after a crash or a hang the child is of no more use."""
+        """Run ``case`` and return its outcome. After a crash or a hang, the child cannot be used again."""
         document = {"reader": case.reader, "target": case.target, "special": case.special}
         document["data"] = base64.b64encode(case.data).decode()
         try:
@@ -133,7 +134,7 @@ class Child:
 def run_cases(
     cases: Iterable[Case], inputs: Path, names: list[str], module: str = "tests.fuzz.readers"
 ) -> Iterator[tuple[Case, Report]]:
-    """Each case with its report; ``names``: of the readers, which the module's ``READERS`` holds."""
+    """Run the cases and yield each with its report. ``names``: names of readers in the module's ``READERS``."""
     child = None
     try:
         for case in cases:
@@ -148,14 +149,16 @@ def run_cases(
             child.close()
 
 
-# ---- The corpus: cases that once broke the contract, and some made by hand, which the tests replay ----
+# ---- The corpus: cases that once broke the contract, and handmade ones; the tests replay them ----
 
 
 CORPUS = Path(__file__).with_name("corpus")
 
 
-def kept(case: Case) -> str:
-    """Name of the file in the corpus that holds ``case``; of one without data, what stands in its place."""
+def is_kept(case: Case) -> str:
+    """Return the name of the file in the corpus that contains ``case``; for a case without data, the content of
+    the file.
+    """
     return f"{_prefix(case.reader, case.target)}-{case.special or hashlib.sha256(case.data).hexdigest()[:12]}"
 
 
@@ -164,6 +167,6 @@ def _prefix(reader: str, target: str) -> str:
 
 
 def corpus(readers: list[Reader]) -> list[Case]:
-    """All cases that are kept. Raises `KeyError` for a file of a reader that there is not."""
-    known = {_prefix(r.name, t): (r.name, t) for r in readers for t in r.targets}
-    return [Case(*known[p.name.rsplit("-", 1)[0]], p.read_bytes()) for p in sorted(CORPUS.iterdir())]
+    """Return all cases of the corpus. Raises `KeyError` for a file of an unknown reader."""
+    names = {_prefix(r.name, t): (r.name, t) for r in readers for t in r.targets}
+    return [Case(*names[p.name.rsplit("-", 1)[0]], p.read_bytes()) for p in sorted(CORPUS.iterdir())]

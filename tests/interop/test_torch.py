@@ -1,4 +1,4 @@
-"""Fields as modules of torch: values, derivatives, training."""
+"""Fields as torch modules: values, derivatives, training."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from nerg_mi.transport.march_primal import MarchSettings
 from nerg_mi.transport.observer import ObserverSettings
 from nerg_mi.transport.observer_gaze import GazeFieldInstance
 
-# ---- Fields of random weights, and rays, that are asked through torch ----
+# ---- Fields with random weights, and rays, evaluated through torch ----
 
 
 GRID = HashGridConfig(levels=2, log2_rows=10, base=4, finest=16)
@@ -31,7 +31,7 @@ BOX = Box((-1, -1, -1), (1, 1, 1))
 RNG = np.random.default_rng(0)
 
 
-def varied(field):
+def vary_field(field):
     field.set_parameters({"grid.table": ns.Float(RNG.normal(size=len(field.grid.table)).astype(np.float32))})
     return field
 
@@ -40,7 +40,7 @@ def radiance(background=False, deferred=False):
     behind = Background.random(
         BackgroundConfig(3.0, HashGridConfig(levels=2, log2_rows=8, base=4, finest=16, dimensions=2), 16), ns
     )
-    return varied(
+    return vary_field(
         RadianceField.random(
             RadianceConfig(GRID, width=16, geometry=7, deferred=deferred),
             BOX,
@@ -64,7 +64,9 @@ _BEGINNING = RNG.bit_generator.state
 
 @pytest.fixture(autouse=True)
 def same_numbers():
-    """The same random numbers in every test, whichever are run: central differences may fall on the kink of a ReLU."""
+    """Use the same random numbers in each test, in any order: central differences may otherwise hit the kink of a
+    ReLU.
+    """
     RNG.bit_generator.state = _BEGINNING
 
 
@@ -92,7 +94,7 @@ def test01_values_of_the_field(torch, interop):
 
 @pytest.mark.parametrize("deferred", [False, True])
 def test01b_colours_of_features(torch, interop, deferred):
-    """Those of the field, with derivatives that agree with central differences."""
+    """Equal to those of the field, with derivatives that agree with central differences."""
     field = radiance(deferred=deferred)
     module, (p, d) = interop.RadianceModule(field), rays(torch)
     sigma, features = module.density_features(p)
@@ -105,15 +107,15 @@ def test01b_colours_of_features(torch, interop, deferred):
     f, d = features.detach().requires_grad_(), d.requires_grad_()
     loss(f, d).backward()
     for value, ends in ((f, lambda v: loss(v, d)), (d, lambda v: loss(f, v))):
-        way = torch.tensor(np.random.default_rng(1).normal(size=value.shape).astype(np.float32))
-        slope = (ends(value + 2e-4 * way) - ends(value - 2e-4 * way)).item() / 4e-4
-        assert np.isclose(float((value.grad * way).sum()), slope, rtol=0.03, atol=0.02)
+        name = torch.tensor(np.random.default_rng(1).normal(size=value.shape).astype(np.float32))
+        slope = (ends(value + 2e-4 * name) - ends(value - 2e-4 * name)).item() / 4e-4
+        assert np.isclose(float((value.grad * name).sum()), slope, rtol=0.03, atol=0.02)
     with pytest.raises(ValueError, match=r"must have shape \(N, 7\)"):
         module.color(features[:, :3], d)
 
 
-def test02_gradients_of_a_restatement_in_torch(torch, interop):
-    # The same networks in torch behind the same features, so that its autograd shares nothing with ours.
+def test02_gradients_equal_torch_reference(torch, interop):
+    # The same networks in torch on the same features, as an independent reference for the gradients.
     from nerg_mi.fields.encoding import encode_direction
 
     field = radiance()
@@ -141,7 +143,7 @@ def test02_gradients_of_a_restatement_in_torch(torch, interop):
         ours = module.get_parameter(name.replace(".", "__")).grad
         assert torch.allclose(ours, value.grad, rtol=1e-3, atol=1e-4), name
     table = module.grid__table.grad
-    # Interpolation weights of a point sum to one in each level and feature.
+    # The interpolation weights of a point sum to one for each level and feature.
     assert torch.isclose(table.sum(), features.grad[inside].sum(), rtol=1e-3, atol=1e-3) and (table != 0).sum() > 100
 
 
@@ -152,7 +154,7 @@ def test03_gradients_equal_central_differences(torch, interop):
 
     def loss(p, d):
         sigma, color = module(p, d)
-        # Sums in float64, for the differences' sake.
+        # Sums in float64, for precise differences.
         parts = sigma * 0.1, color * torch.tensor([1.0, 2.0, 3.0]), module.background(p, d)
         return sum(part.double().sum() for part in parts)
 
@@ -179,7 +181,7 @@ def test03_gradients_equal_central_differences(torch, interop):
 
 @pytest.mark.parametrize("trunk", ["relu", "layernorm", "linear"])
 def test04_a_gaze_field(torch, interop, trunk):
-    field = varied(GazeField.random(GazeConfig(GRID, width=16, geometry=7, sh_degree=2, trunk=trunk), BOX, ns))
+    field = vary_field(GazeField.random(GazeConfig(GRID, width=16, geometry=7, sh_degree=2, trunk=trunk), BOX, ns))
     module = interop.GazeModule(field)
     (p_od, r_o), (p_o, _) = rays(torch, 60), rays(torch, 60)
     gaze = module(p_od, p_o, r_o)
@@ -195,7 +197,7 @@ def test04_a_gaze_field(torch, interop, trunk):
 
 
 def own_gradients(module, field, loss):
-    """The module's gradients are those that Dr.Jit finds of the same ``loss`` (called with derivatives enabled)."""
+    """Check that the gradients of the module equal Dr.Jit's gradients of the same ``loss``."""
     values = {k: type(v)(v) for k, v in field.parameters().items()}
     dr.enable_grad(values)
     field.set_parameters(values)
@@ -209,7 +211,7 @@ def own_gradients(module, field, loss):
 
 
 def central_differences(torch, module, loss, names):
-    """The module's gradients of the parameters ``names``, behind which no ReLU has a kink."""
+    """Compare the gradients of the parameters ``names``, which no ReLU follows, with central differences."""
     for name in names:
         value = module.get_parameter(name)
         direction = torch.tensor(np.random.default_rng(2).normal(size=value.shape).astype(np.float32))
@@ -229,7 +231,9 @@ HEADS = ((-0.8, -0.8, -0.8), (0.8, 0.8, 0.8))
 
 def normalised(kind):
     if kind == "product":
-        field = varied(GazeField.random(GazeConfig(GRID, width=16, geometry=7, sh_degree=2, normalized=True), BOX, ns))
+        field = vary_field(
+            GazeField.random(GazeConfig(GRID, width=16, geometry=7, sh_degree=2, normalized=True), BOX, ns)
+        )
         field.set_parameters({"emit_head.0": 20 * field.emit_head.weights[0]})
         return field
     config = LogGazeConfig(
@@ -240,7 +244,7 @@ def normalised(kind):
         mix=0.2 if kind == "mixed" else 0.0,
         variant="capture" if kind == "capture" else "emit_capture",
     )
-    field = varied(LogGazeField.random(config, BOX, ns, 3, RNG.normal(size=(16, 32)) - 2.5))
+    field = vary_field(LogGazeField.random(config, BOX, ns, 3, RNG.normal(size=(16, 32)) - 2.5))
     field.set_parameters(
         {"escaped": ns.Float(0.6)}
         | {k: 6 * v for k, v in field.parameters().items() if k in ("emit_net.2", "capture_net.2")}
@@ -250,7 +254,7 @@ def normalised(kind):
 
 @pytest.mark.parametrize("kind", ["product", "log", "mixed", "capture"])
 def test04b_a_normalised_gaze_field(torch, interop, rgb, kind, tmp_path):
-    """The default recipe's fields: integral and density of Dr.Jit's own marching, in a place of which half is open."""
+    """Fields of the default recipe: integral and density of Dr.Jit's marching, in an environment that is half open."""
     field = normalised(kind)
     shape = {"type": "rectangle", "to_world": rgb.ScalarTransform4f().translate([0, 0, 0.6]).scale(5)}
     place, eye = SceneGeometry(None, rgb.load_dict({"type": "scene", "s": shape})), rgb.Point3f(0.1, -0.2, 0.3)
@@ -271,7 +275,7 @@ def test04b_a_normalised_gaze_field(torch, interop, rgb, kind, tmp_path):
     np.testing.assert_allclose(gaze.detach().numpy(), expected, rtol=2e-5)
     if kind != "mixed":
         assert 4 * np.pi * float(gaze.mean()) == pytest.approx(1, rel=1e-5)
-    # An integral a row is as good as one for all.
+    # One integral per row is equivalent to one integral for all rows.
     assert torch.allclose(module(p_od, p_o, r_o, Z.expand(len(r_o)), escaped), gaze)
     trained = module.field()
     assert {k: v.numpy().tolist() for k, v in trained.parameters().items()} == {
@@ -286,8 +290,9 @@ def test04b_a_normalised_gaze_field(torch, interop, rgb, kind, tmp_path):
 
 @pytest.mark.parametrize("kind", ["product", "mixed"])
 def test04c_gradients_pass_the_integral(torch, interop, kind):
-    """Those of Dr.Jit's own derivatives, and central differences where no ReLU has a kink, of a loss in which every
-    weight also moves the integral."""
+    """Compared with Dr.Jit's gradients, and with central differences where there is no ReLU, for a loss in which each
+    weight also changes the integral.
+    """
     field = normalised(kind)
     module = interop.GazeModule(field)
     (p_od, r_o), (p_o, _) = rays(torch, 60), rays(torch, 60)
@@ -365,7 +370,7 @@ def test06_wrong_tensors(torch, interop, change):
         module(change(p), d)
 
 
-def test_without_torch_the_remedy_is_told():
+def test_missing_torch_names_extra():
     program = "import sys; sys.modules['torch'] = None; import nerg_mi.interop.torch"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert done.returncode == 1

@@ -1,4 +1,4 @@
-"""Data sets that several files of tests read."""
+"""Data sets for several test modules."""
 
 import json
 
@@ -9,14 +9,14 @@ from tests.photos.written_sets import OPENCV, instant_ngp
 
 @pytest.fixture
 def ring(tmp_path, rgb):
-    """The folder of a set of nine photos in a ring, as instant-ngp writes it."""
+    """Folder of a set of nine photos in a ring, as instant-ngp writes it."""
     instant_ngp(tmp_path, rgb, OPENCV)
     return tmp_path
 
 
 @pytest.fixture
 def write(tmp_path):
-    """`write(content, images)`: a transforms file beside empty files of the names given; its path."""
+    """`write(content, images)`: write a transforms file next to empty image files and return its path."""
 
     def make(content, images=("b.png", "a.png"), name="transforms.json"):
         for image in images:

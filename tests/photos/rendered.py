@@ -1,4 +1,4 @@
-"""Photos of a place that is known: a textured floor with a textured box on it, cast with NumPy."""
+"""Photos of a known scene: a textured floor with a textured box on it, ray-cast with NumPy."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ BOX = np.array([[-0.5, -0.4, 0.0], [0.5, 0.4, 0.7]])
 
 
 def poses(count: int = 8) -> np.ndarray:
-    """OpenGL camera-to-world poses (count, 4, 4) on an arc of 100 degrees that look at the box; up is +z."""
+    """Return OpenGL camera-to-world poses (count, 4, 4) on an arc of 100 degrees, facing the box; up is +z."""
     out = []
     for k, a in enumerate(np.radians(np.linspace(20, 120, count))):
         center = np.array([2.4 * np.cos(a), 2.4 * np.sin(a), 1.3 + 0.1 * np.sin(3.0 * k)])
@@ -28,7 +28,7 @@ def poses(count: int = 8) -> np.ndarray:
 
 
 def textures() -> list[np.ndarray]:
-    """One for each axis, (512, 512), with details of every size."""
+    """Return one texture for each axis, (512, 512), with details at all scales."""
     rng = np.random.default_rng(7)
     out = []
     for _ in range(3):
@@ -38,7 +38,7 @@ def textures() -> list[np.ndarray]:
 
 
 def picture(pose: np.ndarray, painted: list[np.ndarray]) -> np.ndarray:
-    """What a camera at ``pose`` sees, (HEIGHT, WIDTH, 3) uint8."""
+    """Render the image (HEIGHT, WIDTH, 3) uint8 of a camera at ``pose``."""
     x, y = np.meshgrid(np.arange(WIDTH) + 0.5 - WIDTH / 2, np.arange(HEIGHT) + 0.5 - HEIGHT / 2)
     d = np.stack([x, -y, np.full_like(x, -FOCAL)], axis=-1) / FOCAL @ pose[:3, :3].T
     o = pose[:3, 3]
@@ -53,7 +53,7 @@ def picture(pose: np.ndarray, painted: list[np.ndarray]) -> np.ndarray:
     p = o + d * distance[..., None]
     gray = np.zeros((HEIGHT, WIDTH))
     for k in range(3):
-        # Faces of the box are painted from other places of their texture than the floor.
+        # Faces of the box use other parts of the texture than the floor.
         uv = [160 * p[..., j] + 90 * (k + 1) + 217 * hit for j in range(3) if j != k]
         gray = np.where(axis == k, map_coordinates(painted[k], uv, order=1, mode="grid-wrap"), gray)
     return np.repeat(gray[..., None], 3, axis=2).astype(np.uint8)

@@ -9,19 +9,19 @@ from nerg_mi.photos import cameras
 from nerg_mi.photos.cameras import (
     Intrinsics,
     PosedCamera,
-    resize_mask,
-    resize_by_area,
-    resize_nearest,
+    find_view_tangents,
     make_area_weights,
+    make_sensor_dict,
     pixel_directions,
     pixel_grid,
     project,
-    make_sensor_dict,
-    find_view_tangents,
+    resize_by_area,
+    resize_mask,
+    resize_nearest,
 )
 from tests.reference import opencv
 
-# ---- Rays of cameras: distortion, projection, and agreement with Mitsuba's own camera ----
+# ---- Camera rays: distortion, projection, and agreement with Mitsuba's camera ----
 
 FOX = Intrinsics(135, 240, 171.94, 171.81, 69.3, 120.7, 0.0578421, -0.0805099, -0.000980296, 0.00015575)
 
@@ -47,12 +47,12 @@ def test_pixel_rays_project_back_to_their_pixels():
 
 
 @pytest.mark.parametrize("fisheye", [False, True])
-def test_view_tangents_hold_every_pixel(fisheye):
+def test_view_tangents_contain_every_pixel(fisheye):
     i = replace(FOX, fisheye=True, p1=0.0, p2=0.0) if fisheye else FOX
     d = pixel_directions(i)
     x, y = d[..., 0] / -d[..., 2], d[..., 1] / d[..., 2]
     left, right, up, down = find_view_tangents(i)
-    # The outermost centres lie half a pixel inside.
+    # The outermost pixel centres are half a pixel inside.
     for limit, reached in ((left, -x.min()), (right, x.max()), (up, -y.min()), (down, y.max())):
         assert reached < limit < reached + 0.01
     assert find_view_tangents(Intrinsics(10, 20, 10.0, 10.0, 4.0, 9.0)) == pytest.approx((0.4, 0.6, 0.9, 1.1))
@@ -73,8 +73,8 @@ def test_a_fisheye_shows_points_behind_its_plane():
     assert shown[0] and np.allclose(pixel, [[32 + 16 * np.arctan2(1, -0.1), 32]])
 
 
-def test_mitsuba_sensor_sends_the_same_rays(rgb):
-    """Principal point off the centre, no square picture."""
+def test_mitsuba_sensor_has_same_rays(rgb):
+    """With an off-centre principal point and a non-square image."""
     i = Intrinsics(32, 20, 25.0, 25.0, 14.0, 11.5)
     camera = PosedCamera(i, pose(np.random.default_rng(3)))
     sensor = rgb.load_dict(make_sensor_dict(camera))
@@ -84,7 +84,7 @@ def test_mitsuba_sensor_sends_the_same_rays(rgb):
     assert np.allclose(ray.d.numpy().T, expected, atol=2e-5)
 
 
-def test_sensor_refuses_what_it_cannot_express():
+def test_sensor_refuses_unsupported_cameras():
     with pytest.raises(ValueError, match="distortion"):
         make_sensor_dict(PosedCamera(FOX, np.eye(4)))
     with pytest.raises(ValueError, match="fisheye"):
@@ -93,24 +93,24 @@ def test_sensor_refuses_what_it_cannot_express():
         make_sensor_dict(PosedCamera(Intrinsics(8, 8, 10.0, 11.0, 4.0, 4.0), np.eye(4)))
 
 
-# ---- A lens on images of other sizes ----
+# ---- Lenses for other image sizes ----
 
 
-def test_a_resized_image_is_seen_through_the_same_lens():
+def test_resized_image_has_same_lens():
     lens = Intrinsics(40, 20, 30.0, 31.0, 19.0, 11.0, 0.1, p2=0.01)
     half = lens.resized(20, 5)
     assert (half.width, half.height, half.fx, half.fy, half.cx, half.cy) == (20, 5, 15.0, 7.75, 9.5, 2.75)
     assert half.distortion == lens.distortion and half.resized(40, 20) == lens
 
 
-def test_what_bends_the_picture():
+def test_is_distorted():
     plain = Intrinsics(4, 4, 3.0, 3.0, 2.0, 2.0)
     assert not plain.is_distorted and plain.distortion == (0.0,) * 8
     assert Intrinsics(4, 4, 3.0, 3.0, 2.0, 2.0, k6=1e-3).is_distorted
     assert Intrinsics(4, 4, 3.0, 3.0, 2.0, 2.0, fisheye=True).is_distorted
 
 
-# ---- Lens models against OpenCV's, restated; and their inverses ----
+# ---- Lens models compared with a reference implementation of OpenCV, and their inverses ----
 
 LENSES = {
     "fox": FOX,
@@ -124,13 +124,13 @@ LENSES = {
 
 
 def arguments(i):
-    """Of the restated model, which counts pixels from the first one's centre."""
+    """Arguments of the reference implementation, which counts pixels from the centre of the first pixel."""
     k = (i.k1, i.k2, i.k3, i.k4) if i.fisheye else i.distortion
     return i.fx, i.fy, i.cx - 0.5, i.cy - 0.5, k
 
 
 @pytest.mark.parametrize("name", LENSES)
-def test_rays_of_pixels_equal_opencvs(name):
+def test_directions_equal_opencv(name):
     i = LENSES[name]
     inverse = opencv.fisheye_undistort if i.fisheye else opencv.undistort
     ours = pixel_directions(i) * [1, -1, -1]
@@ -141,7 +141,7 @@ def test_rays_of_pixels_equal_opencvs(name):
 
 
 @pytest.mark.parametrize("name", LENSES)
-def test_images_of_directions_equal_opencvs(name):
+def test_image_coordinates_equal_opencv(name):
     i = LENSES[name]
     rng = np.random.default_rng(0)
     d = np.concatenate([rng.uniform(-0.5, 0.5, (50, 2)), np.ones((50, 1))], axis=1) * rng.uniform(0.3, 3, (50, 1))
@@ -162,7 +162,7 @@ def test_rays_project_back_to_their_pixels(name):
 
 
 def test_folding_distortion_is_refused():
-    """Also where Newton's iteration finds a point: past the fold, with the same image."""
+    """Also if Newton's method finds a solution beyond the fold."""
     folds = Intrinsics(10, 10, 5.0, 5.0, 5.0, 5.0, -0.5)
     with pytest.raises(ValueError, match="k1=-0.5 cannot be inverted"):
         cameras.undistort(np.array([[1.5, 1.5]]), folds)
@@ -170,7 +170,7 @@ def test_folding_distortion_is_refused():
         pixel_directions(folds)
 
 
-def test_a_fisheye_ends_where_its_polynomial_turns():
+def test_fisheye_ends_at_maximum_of_polynomial():
     """1 - 3 k θ² = 0 at θ = 1: radius 2/3."""
     i = Intrinsics(10, 10, 5.0, 5.0, 5.0, 5.0, -1 / 3, fisheye=True)
     angle, radius = cameras.find_fisheye_limit(i)
@@ -179,8 +179,8 @@ def test_a_fisheye_ends_where_its_polynomial_turns():
     assert not cameras.directions_to_image(np.array([1.0, 0, -1.0]), i)[1]
 
 
-def test_what_lies_beyond_the_fold_of_a_pinhole_lens_is_not_shown():
-    """r (1 - r²/3) turns at r = 1; the model alone would put a point at r = 1.7 near the centre."""
+def test_directions_beyond_fold_are_invisible():
+    """r (1 - r²/3) turns at r = 1; without the limit, the model would map r = 1.7 near the centre."""
     i = Intrinsics(10, 10, 5.0, 5.0, 5.0, 5.0, -1 / 3)
     assert cameras.find_pinhole_limit(i) == pytest.approx(1)
     assert np.array_equal(
@@ -191,11 +191,11 @@ def test_what_lies_beyond_the_fold_of_a_pinhole_lens_is_not_shown():
     assert cameras.find_pinhole_limit(replace(i, k1=0.0, k4=-0.25)) == pytest.approx(4)
 
 
-# ---- Pictures at another size, against sums over the pixels that each new one covers ----
+# ---- Resized images, compared with sums over the pixels that each new pixel covers ----
 
 
-def averaged(image, width, height):
-    """The same by a picture of every sub-pixel, of which old and new pixels both have a whole number."""
+def average_reference(image, width, height):
+    """Average over an image of sub-pixels that divide both old and new pixels."""
     h, w, c = image.shape
     fine = image.repeat(height, axis=0).repeat(width, axis=1)
     return fine.reshape(height, h, width, w, c).mean(axis=(1, 3))
@@ -204,27 +204,29 @@ def averaged(image, width, height):
 @pytest.mark.parametrize("size", [(3, 2), (5, 4), (7, 6), (1, 1)])
 def test_areas_are_averaged(size):
     image = np.random.default_rng(0).random((6, 7, 3)).astype(np.float32)
-    assert np.allclose(resize_by_area(image, *size), averaged(image, *size), atol=1e-6)
+    assert np.allclose(resize_by_area(image, *size), average_reference(image, *size), atol=1e-6)
 
 
-def test_colours_count_by_their_alpha():
+def test_colours_are_weighted_by_alpha():
     image = np.zeros((1, 2, 4), np.float32)
     image[0, 0], image[0, 1] = (1, 0.5, 0, 0.25), (0, 0, 1, 0.75)
     assert np.allclose(resize_by_area(image, 1, 1)[0, 0], [0.25, 0.125, 0.75, 0.5])
     assert np.all(resize_by_area(image * [1, 1, 1, 0], 1, 1) == 0)
 
 
-def test_every_old_pixel_is_shared_out():
+def test_area_weights_preserve_total():
     shares = make_area_weights(7, 3).toarray()
     assert np.allclose(shares.sum(axis=1), 1) and np.allclose(shares.sum(axis=0), 3 / 7)
 
 
-def test_the_nearest_value_is_that_of_the_centre():
+def test_nearest_value_is_at_centre():
     values = np.arange(12.0).reshape(3, 4)
-    assert np.array_equal(resize_nearest(values, 2, 1), [[5, 7]]) and np.array_equal(resize_nearest(values, 4, 3), values)
+    assert np.array_equal(resize_nearest(values, 2, 1), [[5, 7]]) and np.array_equal(
+        resize_nearest(values, 4, 3), values
+    )
 
 
-def test_a_pixel_counts_where_all_of_it_does():
+def test_resized_mask_needs_all_pixels():
     mask = np.ones((4, 4), bool)
     mask[1, 2] = False
     assert np.array_equal(resize_mask(mask, 2, 2), [[True, False], [True, True]])

@@ -16,9 +16,9 @@ from nerg_mi.errors import NergError
 from nerg_mi.photos import colmap
 from nerg_mi.photos.colmap import (
     describe_other_models,
-    find_pose_source,
     estimate_up,
     find_model_files,
+    find_pose_source,
     read_colmap,
     read_image_poses,
     read_named_poses,
@@ -26,9 +26,7 @@ from nerg_mi.photos.colmap import (
 )
 from nerg_mi.photos.transforms import read_transforms
 
-# ---- Colmap ----
-#
-# COLMAP models, built byte by byte and line by line here: cameras, poses, points, and what cannot be read.
+# ---- COLMAP models, written byte by byte and line by line: cameras, poses, points, and invalid files ----
 
 
 # COLMAP's camera models: number, name, parameters.
@@ -86,7 +84,7 @@ def write_bin(folder, names, cameras=CAMERAS):
     for k, name in enumerate(names):
         out += struct.pack("<i", k + 1) + struct.pack("<7d", *quaternion(rotations[k]), *translations[k])
         out += struct.pack("<i", k + 1) + name.encode() + b"\0"
-        # Observations, as many as the image's number: x, y, point.
+        # Observations (x, y, point); their number is the index of the image.
         out += struct.pack("<Q", k) + b"".join(struct.pack("<ddq", 1.5, 2.5, -1) for _ in range(k))
     (folder / "images.bin").write_bytes(out)
     out = struct.pack("<Q", len(POINTS))
@@ -119,7 +117,7 @@ NAMES = [f"room {k}/photo {k}.png" for k in range(1, 11)]
 
 @pytest.fixture(params=["bin", "txt"])
 def model(request, tmp_path):
-    """A model of ten images, each with its own camera, beside empty image files."""
+    """A model of ten images, each with its own camera, next to empty image files."""
     for name in NAMES:
         (tmp_path / "images" / name).parent.mkdir(parents=True)
         (tmp_path / "images" / name).write_bytes(b"")
@@ -139,7 +137,8 @@ def test_cameras_poses_and_points(model):
         i = frame.intrinsics(40, 30)
         assert (i.fx, i.fy, *i.distortion, i.fisheye) == EXPECTED[k + 1], CAMERAS[k + 1][1]
         assert (i.cx, i.cy, i.width, i.height) == (20.5, 14.5, 40, 30)
-        # A point before COLMAP's camera (z forward, y down) is at the same place seen from ours (z back, y up).
+        # A point has the same position for COLMAP's camera (z forward, y down) and for the OpenGL camera (z back, y
+        # up).
         local = np.array([0.3, -0.2, 2.0])
         world = rotations[k].T @ (local - translations[k])
         ours = np.linalg.inv(frame.to_world) @ [*world, 1]
@@ -149,7 +148,7 @@ def test_cameras_poses_and_points(model):
     assert np.array_equal(posed.points, POINTS[TRUSTED])
 
 
-def test_an_unsupported_camera_model_costs_its_images_only(model):
+def test_unsupported_camera_model_excludes_its_images(model):
     posed = read_colmap(model, model.parents[1] / "images")
     assert [u.name for u in posed.unused] == [NAMES[9]] and '"FOV"' in posed.unused[0].reason
     assert "image_undistorter" in posed.unused[0].reason
@@ -169,7 +168,7 @@ def test_missing_images_and_masks_are_listed(model):
 
 
 @pytest.mark.parametrize("name", ["images/a.png", "masks/a.png.png", "0/images.bin", "0/points3D.bin"])
-def test_a_pipe_is_no_missing_file(tmp_path, name):
+def test_pipe_is_refused(tmp_path, name):
     for folder in ("0", "images", "masks"):
         (tmp_path / folder).mkdir()
     write_bin(tmp_path / "0", ["a.png", "b.png"])
@@ -183,11 +182,11 @@ def test_a_pipe_is_no_missing_file(tmp_path, name):
         with pytest.raises(NergError, match=f'{name}" is a pipe'):
             read()
     else:
-        found = read()
-        assert [f.name for f in found.frames] == ["b.png"] and f'{name}" is a pipe' in found.unused[0].reason
+        error = read()
+        assert [f.name for f in error.frames] == ["b.png"] and f'{name}" is a pipe' in error.unused[0].reason
 
 
-def test_a_zero_quaternion_is_listed(tmp_path):
+def test_zero_quaternion_is_listed(tmp_path):
     for name in ("a.png", "b.png"):
         (tmp_path / name).write_bytes(b"")
     write_txt(tmp_path, ["a.png", "b.png"])
@@ -201,7 +200,7 @@ def test_a_zero_quaternion_is_listed(tmp_path):
         read_named_poses(tmp_path)
 
 
-def test_an_unknown_model_number_ends_a_binary_file(tmp_path):
+def test_unknown_model_number_is_refused(tmp_path):
     write_bin(tmp_path, ["a.png"], {1: (99, "NEW", 40, 30, (1.0,))})
     with pytest.raises(ValueError, match="99.*model_converter"):
         read_colmap(tmp_path, tmp_path)
@@ -225,7 +224,7 @@ def test_a_folder_without_a_model(tmp_path):
 
 @pytest.mark.parametrize("write", [write_bin, write_txt])
 def test_images_outside_of_the_capture_are_used_only_if_allowed(tmp_path, write):
-    """The capture is the folder that holds ``images``, however deep the model lies beside them."""
+    """The capture is the folder that contains ``images``, even if the model is deeper next to it."""
     home, out = tmp_path / "capture", tmp_path / "out"
     model = home / "colmap" / "sparse" / "0"
     for folder in (model, home / "images", out):
@@ -237,7 +236,7 @@ def test_images_outside_of_the_capture_are_used_only_if_allowed(tmp_path, write)
     posed = read_colmap(model, home / "images")
     assert [f.name for f in posed.frames] == ["a.png"] and len(posed.unused) == 3
     assert all("outside of the data set's folder" in u.reason and "--allow-outside" in u.reason for u in posed.unused)
-    # They all lead to one file, which counts once.
+    # All links refer to one file, which counts once.
     assert len(read_colmap(model, home / "images", allow_outside=True).frames) == 2
 
 
@@ -254,7 +253,7 @@ def test_masks_outside_of_the_capture_are_used_only_if_allowed(tmp_path):
     assert read_colmap(*where, allow_outside=True).frames[0].mask is not None
 
 
-def claiming(count):
+def write_claimed_count(count):
     return lambda raw: struct.pack("<Q", count) + raw[8:]
 
 
@@ -263,11 +262,11 @@ def claiming(count):
     "change, said",
     [
         (lambda raw: raw[:-4], "ends in the middle of {record} record"),
-        *((claiming(count), "") for count in (2**63, 2**64 - 1, 10**9)),
-        (lambda raw: claiming(struct.unpack("<Q", raw[:8])[0] - 1)(raw), "more bytes than the"),
+        *((write_claimed_count(count), "") for count in (2**63, 2**64 - 1, 10**9)),
+        (lambda raw: write_claimed_count(struct.unpack("<Q", raw[:8])[0] - 1)(raw), "more bytes than the"),
     ],
 )
-def test_binary_files_that_their_headers_do_not_fit_are_refused(tmp_path, name, record, change, said):
+def test_binary_files_with_wrong_counts_are_refused(tmp_path, name, record, change, said):
     for photo in ("a.png", "b.png"):
         (tmp_path / photo).write_bytes(b"")
     write_bin(tmp_path, ["a.png", "b.png"])
@@ -277,7 +276,7 @@ def test_binary_files_that_their_headers_do_not_fit_are_refused(tmp_path, name, 
         read_colmap(tmp_path, tmp_path)
 
 
-def test_observations_may_stand_on_a_long_line_and_nothing_else(tmp_path):
+def test_only_observations_may_have_long_lines(tmp_path):
     (tmp_path / "images").mkdir()
     (tmp_path / "images" / "a.png").write_bytes(b"")
     write_txt(tmp_path, ["a.png"])
@@ -299,7 +298,7 @@ def test_a_file_without_line_ends_is_read_in_pieces(tmp_path, monkeypatch):
 
 
 def images_text(observations):
-    """Ten images; ``observations(k)``: what follows the line of the k-th, a list of lines."""
+    """Ten images; ``observations(k)``: the lines after that of image k."""
     rotations, translations = poses(len(NAMES))
     show = lambda values: " ".join(repr(float(v)) for v in values)
     lines = []
@@ -328,14 +327,14 @@ def test_text_with_and_without_lines_of_observations(tmp_path, observations):
     assert np.array_equal([p for _, p in listed], [p for _, p in expected])
 
 
-def test_names_that_are_numbers_are_no_observations(tmp_path):
+def test_numeric_names_are_not_observations(tmp_path):
     write_txt(tmp_path, ["0001", "0002", "0003"])
     text = (tmp_path / "images.txt").read_text().splitlines()
     (tmp_path / "images.txt").write_text("\n".join(line for line in text if "-1" not in line or "000" in line))
     assert [name for name, _ in read_image_poses(tmp_path)[2]] == ["0001", "0002", "0003"]
 
 
-def test_a_line_that_is_neither_is_refused(tmp_path):
+def test_invalid_line_is_refused(tmp_path):
     write_txt(tmp_path, NAMES)
     (tmp_path / "images.txt").write_text(images_text(lambda k: ["1.5 2.5 -1 3.5"]))
     with pytest.raises(NergError, match="line 2 of"):
@@ -343,7 +342,7 @@ def test_a_line_that_is_neither_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("name, what", [("cameras", "cameras"), ("images", "images"), ("points3D", "points")])
-def test_a_text_file_with_another_count_than_its_header_is_noted(tmp_path, name, what):
+def test_different_count_in_header_is_noted(tmp_path, name, what):
     (tmp_path / "a.png").write_bytes(b"")
     write_txt(tmp_path, ["a.png"], {1: CAMERAS[1]})
     path, counts = tmp_path / f"{name}.txt", {"cameras": 1, "images": 1, "points3D": len(POINTS)}
@@ -376,7 +375,7 @@ def test_gigabytes_of_observations_are_skipped(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
 @pytest.mark.parametrize("write", [write_bin, write_txt])
-def test_more_than_is_read_is_refused_before_it_is_read(tmp_path, monkeypatch, write, name):
+def test_limits_are_checked_before_reading(tmp_path, monkeypatch, write, name):
     (tmp_path / NAMES[0]).parent.mkdir()
     (tmp_path / NAMES[0]).write_bytes(b"")
     monkeypatch.setattr(colmap, "file_sha256", lambda path: pytest.fail("it was read to its end"))
@@ -391,7 +390,7 @@ def test_more_than_is_read_is_refused_before_it_is_read(tmp_path, monkeypatch, w
         read_colmap(tmp_path, tmp_path)
 
 
-# ---- Poses by names, without images ----
+# ---- Poses by image name, without images ----
 
 
 def write_transforms(path, poses):
@@ -401,7 +400,9 @@ def write_transforms(path, poses):
 
 
 def write_colmap(folder, poses):
-    """A text model of OpenGL camera-to-world poses: COLMAP's are world-to-camera, y down and z forward."""
+    """Write a text model from OpenGL camera-to-world poses. COLMAP's poses are world-to-camera, y down and z
+    forward.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "cameras.txt").write_text("1 PINHOLE 640 480 500 500 320 240\n")
     text = "# images\n"
@@ -413,7 +414,7 @@ def write_colmap(folder, poses):
     return folder
 
 
-def some_poses(n=4):
+def make_poses(n=4):
     rng = np.random.default_rng(1)
     poses = {}
     for k in range(n):
@@ -423,17 +424,17 @@ def some_poses(n=4):
     return poses
 
 
-def test_both_kinds_give_the_same_poses(tmp_path):
-    poses = some_poses()
+def test_transforms_and_colmap_give_same_poses(tmp_path):
+    poses = make_poses()
     a = read_named_poses(write_transforms(tmp_path / "transforms.json", poses))
     b = read_named_poses(write_colmap(tmp_path / "sparse", poses))
-    for found in (a, b):
-        assert found.names == list(poses) and np.allclose(found.to_world, list(poses.values()), atol=1e-12)
+    for loaded in (a, b):
+        assert loaded.names == list(poses) and np.allclose(loaded.to_world, list(poses.values()), atol=1e-12)
     assert a.path.name == "transforms.json" and b.path.name == "images.txt" and a.sha256 != b.sha256
 
 
-def test_the_checksum_is_that_of_a_training(tmp_path):
-    poses = some_poses(2)
+def test_checksum_equals_that_of_training(tmp_path):
+    poses = make_poses(2)
     path = write_transforms(tmp_path / "transforms.json", poses)
     (tmp_path / "images").mkdir()
     for name in poses:
@@ -449,7 +450,7 @@ def test_the_checksum_is_that_of_a_training(tmp_path):
         ([{"file_path": "a.jpg", "transform_matrix": [[1]]}], '"a.jpg".*4.*4'),
     ],
 )
-def test_what_is_no_pose(tmp_path, frames, message):
+def test_invalid_pose_is_refused(tmp_path, frames, message):
     (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
     with pytest.raises(NergError, match=message):
         read_named_poses(tmp_path / "transforms.json")
@@ -457,9 +458,9 @@ def test_what_is_no_pose(tmp_path, frames, message):
 
 @pytest.mark.parametrize("base", ["sparse", "colmap/sparse", "."])
 @pytest.mark.parametrize("counts", [{"0": 2, "1": 5}, {"0": 5, "1": 2}, {"0": 1, "2": 3, "10": 4}, {"0": 3, ".": 3}])
-def test_of_several_models_the_largest_is_taken(tmp_path, base, counts):
+def test_largest_model_is_selected(tmp_path, base, counts):
     for name, count in counts.items():
-        write_colmap(tmp_path / base / name, some_poses(count))
+        write_colmap(tmp_path / base / name, make_poses(count))
     best = max(counts, key=lambda name: counts[name])
     assert find_pose_source(tmp_path).resolve() == (tmp_path / base / best).resolve()
     (note,) = describe_other_models(tmp_path / base / best)
@@ -467,7 +468,7 @@ def test_of_several_models_the_largest_is_taken(tmp_path, base, counts):
 
 
 def test_binary_models_are_counted_by_their_header(tmp_path):
-    assert describe_other_models(write_colmap(tmp_path / "other/sparse/0", some_poses(2))) == []
+    assert describe_other_models(write_colmap(tmp_path / "other/sparse/0", make_poses(2))) == []
     for name, count in (("0", 2), ("1", 24)):
         (tmp_path / "sparse" / name).mkdir(parents=True)
         for file in ("cameras.bin", "images.bin"):
@@ -478,20 +479,22 @@ def test_binary_models_are_counted_by_their_header(tmp_path):
 
 def test_notes_on_a_model_come_with_its_poses(tmp_path):
     for name, count in (("0", 2), ("1", 4)):
-        write_colmap(tmp_path / "sparse" / name, some_poses(count))
+        write_colmap(tmp_path / "sparse" / name, make_poses(count))
     images = tmp_path / "sparse/1/images.txt"
     images.write_text("# Number of images: 24, mean observations per image: 0\n" + images.read_text())
     few, other = read_named_poses(find_pose_source(tmp_path)).notes
     assert "has 4 records, but its header states 24" in few and '"1" (4 images) is used' in other
 
 
-# ---- Up, of cameras and points whose up is known ----
+# ---- Up direction of cameras and points with known ground truth ----
 
 SOME = Rotation.from_euler("xyz", [40, -70, 110], degrees=True).as_matrix()
 
 
-def around(count: int = 24, arc: float = 2 * np.pi, down: float = 30.0, roll: float = 0.0, seed: int = 0) -> np.ndarray:
-    """Cameras on an arc about the z axis, looking ``down`` by so many degrees, rolled by up to ``roll``."""
+def make_ring(
+    count: int = 24, arc: float = 2 * np.pi, down: float = 30.0, roll: float = 0.0, seed: int = 0
+) -> np.ndarray:
+    """Cameras on an arc around the z axis, pitched ``down`` by an angle in degrees and rolled by up to ``roll``."""
     rng, out = np.random.default_rng(seed), []
     for a in np.linspace(0, arc, count, endpoint=False):
         back = np.array([np.cos(a) * np.cos(np.radians(down)), np.sin(a) * np.cos(np.radians(down)), 0])
@@ -505,7 +508,7 @@ def around(count: int = 24, arc: float = 2 * np.pi, down: float = 30.0, roll: fl
     return np.array(out)
 
 
-def turned(poses: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def rotate(poses: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     out = poses.copy()
     out[:, :3] = SOME @ poses[:, :3]
     return out, points @ SOME.T
@@ -515,26 +518,28 @@ def angle(up: np.ndarray) -> float:
     return float(np.degrees(np.arccos(np.clip(up @ SOME[:, 2], -1, 1))))
 
 
-NOTHING = np.zeros((0, 3))
+EMPTY = np.zeros((0, 3))
 
 
 @pytest.mark.parametrize("arc, most", [(2 * np.pi, 0.01), (np.pi, 1.0), (np.pi / 2, 4.0)])
-def test_level_cameras_tell_it_wherever_they_look_down(arc, most):
-    up = estimate_up(*turned(around(arc=arc), NOTHING))
-    assert angle(up.direction) < most and up.median_roll < most and up.plane_fraction is None and up.is_reliable
+def test_level_cameras_determine_up_at_any_pitch(arc, max_pitch):
+    up = estimate_up(*rotate(make_ring(arc=arc), EMPTY))
+    assert (
+        angle(up.direction) < max_pitch and up.median_roll < max_pitch and up.plane_fraction is None and up.is_reliable
+    )
 
 
-def test_cameras_that_all_look_ahead_tell_it_by_their_pictures():
-    """Their horizontal axes agree, and leave open how far they look down."""
-    up = estimate_up(*turned(np.repeat(around(1, down=10), 8, axis=0), NOTHING))
+def test_parallel_cameras_determine_up_by_image_tops():
+    """Their horizontal axes agree, and leave the pitch undetermined."""
+    up = estimate_up(*rotate(np.repeat(make_ring(1, down=10), 8, axis=0), EMPTY))
     assert angle(up.direction) == pytest.approx(10, abs=0.01)
 
 
-def test_a_few_that_are_held_on_end_do_not_matter():
-    poses = around(30)
+def test_few_rolled_cameras_do_not_matter():
+    poses = make_ring(30)
     quarter = Rotation.from_rotvec([0, 0, np.pi / 2]).as_matrix()
     poses[::6, :3, :3] = poses[::6, :3, :3] @ quarter
-    up = estimate_up(*turned(poses, NOTHING))
+    up = estimate_up(*rotate(poses, EMPTY))
     assert angle(up.direction) < 1 and up.is_reliable
 
 
@@ -545,25 +550,25 @@ def floor(count: int = 900, walls: int = 900) -> np.ndarray:
     return np.concatenate([ground, wall, rng.uniform(-2, 2, (300, 3))])
 
 
-def test_a_floor_is_more_exact_than_hands():
-    poses, points = turned(around(roll=20, seed=1), floor())
-    by_hands, up = estimate_up(poses, NOTHING), estimate_up(poses, points)
+def test_floor_is_more_precise_than_cameras():
+    poses, points = rotate(make_ring(roll=20, seed=1), floor())
+    by_hands, up = estimate_up(poses, EMPTY), estimate_up(poses, points)
     assert angle(up.direction) < 0.3 < angle(by_hands.direction)
     assert 0.35 < up.plane_fraction < 0.55 and up.plane_angle == pytest.approx(angle(by_hands.direction), abs=0.4)
     assert "plane of" in str(up) and "no plane" in str(by_hands)
 
 
-def test_walls_ceilings_and_lines_are_no_floor():
-    poses = around()
+def test_walls_ceilings_and_lines_are_not_floors():
+    poses = make_ring()
     walls = floor(count=0)
     ceiling = floor(walls=0) + [0, 0, 6]
     edge = np.random.default_rng(0).uniform(-2, 2, (900, 3)) * [1, 0.003, 0.003]
     for points in (walls, ceiling, edge):
-        assert estimate_up(*turned(poses, points)).plane_fraction is None
+        assert estimate_up(*rotate(poses, points)).plane_fraction is None
 
 
-def test_cameras_that_do_not_agree_say_so():
-    assert not estimate_up(*turned(around(roll=180), NOTHING)).is_reliable
+def test_disagreeing_cameras_are_unreliable():
+    assert not estimate_up(*rotate(make_ring(roll=180), EMPTY)).is_reliable
 
 
 @pytest.mark.parametrize("up", [[0, 0, 1], [0, 0, -1], [1, 0, 0], [0.6, 0, -0.8]])

@@ -9,7 +9,7 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.maths.geometry import Box
 from nerg_mi.photos.cameras import Intrinsics, PosedCamera, pixel_directions
-from nerg_mi.photos.dataset import explain_wrong_depth, open_dataset, estimate_extent, estimate_box, find_unmatched
+from nerg_mi.photos.dataset import estimate_box, estimate_extent, explain_wrong_depth, find_unmatched, open_dataset
 from tests.photos.written_sets import (
     COUNT,
     FISHEYE,
@@ -30,14 +30,12 @@ from tests.photos.written_sets import (
 from tests.photos.written_sets import cameras as cameras_
 from tests.reference import opencv
 
-# ---- Bounds ----
-#
-# The scene box around an object, in a room and around points; and cameras that see what no other does.
+# ---- Scene box around an object, in a room and around points; cameras without overlap ----
 
 LENS = Intrinsics(10, 10, 10.0, 10.0, 5.0, 5.0)
 
 
-def looking(center, at):
+def make_camera_looking_at(center, at):
     z = np.subtract(center, at) / np.linalg.norm(np.subtract(center, at))
     x = np.cross([0, 0.3, 1.0], z)
     x /= np.linalg.norm(x)
@@ -51,8 +49,10 @@ def directions(count, seed=4):
     return d / np.linalg.norm(d, axis=1, keepdims=True)
 
 
-AROUND = [looking(np.array([1, 2, 3]) + 4 * d, [1, 2, 3]) for d in directions(20)]
-INSIDE = [looking(c, c + d) for c, d in zip(np.random.default_rng(4).uniform(0, 4, (20, 3)), directions(20))]
+AROUND = [make_camera_looking_at(np.array([1, 2, 3]) + 4 * d, [1, 2, 3]) for d in directions(20)]
+INSIDE = [
+    make_camera_looking_at(c, c + d) for c, d in zip(np.random.default_rng(4).uniform(0, 4, (20, 3)), directions(20))
+]
 
 
 def test_around_an_object():
@@ -69,7 +69,7 @@ def test_in_a_room():
 
 def test_at_one_point():
     with pytest.raises(ValueError, match="--aabb"):
-        estimate_box([looking(np.zeros(3), d) for d in directions(5)])
+        estimate_box([make_camera_looking_at(np.zeros(3), d) for d in directions(5)])
 
 
 def walls(count=4000):
@@ -81,7 +81,7 @@ def walls(count=4000):
 
 
 def test_points_on_the_walls_of_a_room_give_its_box():
-    """Stray points behind mirrors and windows do not widen it; the walls lie inside by a few percent."""
+    """Stray points behind mirrors and windows do not extend it; the walls are inside of it by a few percent."""
     strays = np.random.default_rng(7).uniform(-60, 60, (12, 3))
     box, how = estimate_box(INSIDE, points=np.concatenate([walls(), strays]))
     assert "points" in how
@@ -97,44 +97,49 @@ def test_points_far_behind_an_object_do_not_count():
     assert estimate_box(AROUND, points=near)[0].side == pytest.approx(2.2, rel=0.02)
 
 
-def test_few_points_are_no_evidence():
+def test_few_points_are_ignored():
     assert "cameras" in estimate_box(INSIDE, points=walls(50))[1]
 
 
-def test_a_camera_that_sees_what_no_other_does_is_found():
+def test_camera_without_overlap_is_detected():
     box = Box((-3, -3, -3), (5, 7, 9))
     assert find_unmatched(AROUND, box) == []
-    away = looking(np.array([1, 2, 8.9]), [1, 2, 30])
-    ring = [looking(np.array([1 + 4 * np.cos(a), 2 + 4 * np.sin(a), 3]), [1, 2, 3]) for a in np.arange(0, 6, 0.5)]
+    away = make_camera_looking_at(np.array([1, 2, 8.9]), [1, 2, 30])
+    ring = [
+        make_camera_looking_at(np.array([1 + 4 * np.cos(a), 2 + 4 * np.sin(a), 3]), [1, 2, 3])
+        for a in np.arange(0, 6, 0.5)
+    ]
     assert find_unmatched([*ring[:4], away, *ring[4:]], Box((-3, -3, -3), (5, 7, 40))) == [4]
-    outside = looking(np.array([100.0, 0, 0]), [200, 0, 0])
+    outside = make_camera_looking_at(np.array([100.0, 0, 0]), [200, 0, 0])
     assert find_unmatched([*AROUND, outside], box) == [20]
 
 
-def test_an_object_before_nothing_ends_at_its_box():
+def test_object_without_background_ends_at_box():
     extent = estimate_extent(AROUND, object_only=True)
     assert extent.kind == "object" and not extent.box.is_contracted and extent.box == estimate_box(AROUND, True)[0]
 
 
-def test_a_room_ends_at_its_walls_in_spite_of_strays():
+def test_room_ends_at_walls_despite_strays():
     strays = np.random.default_rng(7).uniform(-60, 60, (12, 3))
     extent = estimate_extent(INSIDE, points=np.concatenate([walls(), strays]))
     assert extent.kind == "room" and not extent.box.is_contracted and "0.3 % of the points" in extent.reason
 
 
-def test_a_place_whose_points_lie_beyond_its_box_has_no_end():
+def test_scene_with_points_outside_of_box_is_unbounded():
     near, far = (
         1 + np.random.default_rng(8).uniform(0, 2, (900, 3)),
         np.random.default_rng(9).uniform(-90, 90, (100, 3)),
     )
     extent = estimate_extent(AROUND, points=np.concatenate([near, far]))
-    assert extent.kind == "unbounded" and extent.box.is_contracted and "% of the points on surfaces lie" in extent.reason
-    # Nine tenths of the points lie within the box that the cameras bound, whose longest edge is the core's.
+    assert (
+        extent.kind == "unbounded" and extent.box.is_contracted and "% of the points on surfaces lie" in extent.reason
+    )
+    # Nine tenths of the points are in the box from the cameras, whose longest edge is that of the core.
     box = estimate_box(AROUND, points=np.concatenate([near, far]))[0]
     assert extent.box.side == pytest.approx(box.side) and np.allclose(extent.box.center, box.center)
 
 
-def test_the_core_holds_nine_tenths_of_the_points_within_reason():
+def test_core_contains_nine_tenths_of_points():
     points = np.random.default_rng(9).uniform(-20, 20, (4000, 3)) + [1, 2, 3]
     extent = estimate_extent(AROUND, points=points)
     inside = np.all((points > extent.box.core.lower) & (points < extent.box.core.upper), axis=1)
@@ -142,65 +147,67 @@ def test_the_core_holds_nine_tenths_of_the_points_within_reason():
     assert estimate_extent(AROUND, points=points * 100).box.side == pytest.approx(4 * 10)
 
 
-def test_a_few_points_far_away_do_not_make_a_room_of_a_street():
+def test_distant_points_make_scene_unbounded():
     far = np.random.default_rng(10).uniform(-400, 400, (200, 3))
     extent = estimate_extent(INSIDE, points=np.concatenate([walls(3800), far]))
     assert extent.kind == "unbounded" and "nine tenths" in extent.source and extent.box.side < 12
 
 
-def test_where_nothing_tells_a_place_ends_at_its_box():
+def test_scene_without_points_ends_at_box():
     for cameras in (AROUND, INSIDE):
         extent = estimate_extent(cameras)
         assert extent.kind == "room" and extent.box == estimate_box(cameras)[0] and "no points" in extent.reason
 
 
 def facing(distance):
-    """Cameras side by side before a wall with points, in the plane y = 0."""
-    cameras = [looking(np.array([x, -distance, 1.0]), np.array([x, 0.0, 1.0])) for x in np.linspace(-1, 1, 9)]
+    """Cameras side by side in front of a wall with points, in the plane y = 0."""
+    cameras = [
+        make_camera_looking_at(np.array([x, -distance, 1.0]), np.array([x, 0.0, 1.0])) for x in np.linspace(-1, 1, 9)
+    ]
     points = np.random.default_rng(0).uniform([-2, -0.1, 0], [2, 0.1, 2], (2000, 3))
     return cameras, points
 
 
-def test_what_stands_between_cameras_and_points_is_within_the_box():
-    """It may have no points: a plain wall, a blurred frame at the border of a photo."""
+def test_box_includes_cameras():
+    """Visible matter may have no points: a plain wall, or a blurred frame at the border of a photo."""
     cameras, points = facing(2)
     centers = np.array([c.center for c in cameras])
     extent = estimate_extent(cameras, points=points)
     assert extent.kind == "room" and extent.source.endswith("and the cameras") and not extent.box.is_contracted
     for p in np.concatenate([centers, 0.5 * (centers + [0, 0, 1])]):
         assert np.all(p >= np.subtract(extent.box.lower, 1e-9)) and np.all(p <= extent.box.upper)
-    # The wall itself ends where its points do.
+    # The wall ends at its points.
     assert extent.box.upper[1] < 0.4
 
 
-def test_cameras_far_outside_of_the_points_make_a_place_without_an_end():
+def test_distant_cameras_make_scene_unbounded():
     cameras, points = facing(30)
     extent = estimate_extent(cameras, points=points)
     assert extent.kind == "unbounded" and extent.box.is_contracted and "far outside" in extent.reason
     assert extent.box.core.side < 6
 
 
-def test_nothing_stands_before_what_depth_shows():
+def test_complete_points_exclude_cameras():
     cameras, points = facing(2)
     box = estimate_extent(cameras, points=points, are_points_complete=True).box
     assert box == estimate_box(cameras, points=points)[0] and box.lower[1] > -1
 
 
-def test_cameras_within_leave_a_box_as_it_is():
+def test_cameras_inside_do_not_change_box():
     centers = np.random.default_rng(4).uniform(0, 1.5, (20, 3))
-    cameras = [looking(c, c + d) for c, d in zip(centers, directions(20))]
+    cameras = [make_camera_looking_at(c, c + d) for c, d in zip(centers, directions(20))]
     extent = estimate_extent(cameras, points=walls())
     assert extent.box == estimate_box(cameras, points=walls())[0] and "cameras" not in extent.source
 
 
-def test_points_just_beyond_the_others_are_within_the_box_and_strays_are_not():
-    """Plain parts of a place have few points, which are no strays for that."""
+def test_near_outliers_are_included_and_strays_are_not():
+    """Plain surfaces have few points, which are not strays."""
     few, strays = np.tile([[8.0, 2, 0.5]], (12, 1)), np.full((3, 3), 40.0)
     box, _ = estimate_box(INSIDE, points=np.concatenate([walls(), few, strays]))
     assert 8 < box.upper[0] < 9 and box.upper[1] < 5 and box.upper[2] < 3
 
 
-# ---- One set of known cameras and pictures, written in every format and read back ray by ray ----
+# ---- One set of known cameras and images, written in each format and compared ray by ray ----
 
 
 @pytest.mark.parametrize("lens", [OPENCV, FISHEYE], ids=["opencv", "fisheye"])
@@ -216,7 +223,7 @@ def test_every_format_gives_the_same_rays_and_pixels(tmp_path, rgb, write, lens)
         assert np.array_equal(view.pixels, picture(k))
 
 
-def test_frames_that_cannot_be_used_are_left_out_and_listed(ring, rgb):
+def test_unusable_frames_are_listed(ring, rgb):
     def change(content):
         frames = {f["file_path"]: f for f in content["frames"]}
         frames["./images/1.png"]["transform_matrix"][0] = [0, 0, 0, 0]
@@ -265,9 +272,10 @@ def test_a_set_without_a_usable_picture_is_refused(ring):
         open_dataset(ring, holdout=0)
 
 
-def test_masks_and_depth_arrive_at_the_chosen_size(ring, rgb):
-    """A mask's border leaves out every pixel that it touches; millimetres along the axis become distances along
-    rays."""
+def test_masks_and_depth_are_resized(ring, rgb):
+    """The border of a mask excludes all pixels that it touches; millimetres along the axis become distances along
+    rays.
+    """
     mask = np.full((H, W), 255, np.uint8)
     mask[:, 5:] = 0
     rgb.Bitmap(mask).write(str(ring / "mask.png"))
@@ -299,15 +307,15 @@ def test_box_unit_and_scale(ring):
     assert "counts 0.5" in data.unit_note and np.allclose(data.source["to_file"], np.diag([2, 2, 2, 1]))
     centers = np.array([v.camera.center for v in open_dataset(ring, holdout=0).train])
     assert np.allclose([v.camera.center for v in open_dataset(ring, holdout=0, scale=0.5).train], centers / 2)
-    given = open_dataset(ring, aabb=(0, 0, 0, 1, 1, 1))
-    assert np.allclose(given.box.side, 1.025)
+    corners = open_dataset(ring, aabb=(0, 0, 0, 1, 1, 1))
+    assert np.allclose(corners.box.side, 1.025)
     for wrong in ({"aabb": (0, 0, 0)}, {"scale": 0.0}, {"coordinates": "elsewhere"}, {"coordinates": "original"}):
         with pytest.raises(ValueError):
             open_dataset(ring, **wrong)
 
 
-def test_depth_finds_the_box(ring):
-    """A wall 2 units from every camera along each ray: the points are where the depth says."""
+def test_box_is_estimated_from_depth(ring):
+    """A wall at a distance of 2 units from each camera along each ray; the points follow from the depth."""
     np.save(ring / "d.npy", np.full((H, W), 2.0, np.float32))
     rewrite(ring, lambda c: [f.update(METRES_ALONG_RAYS, depth_file_path="d.npy") for f in c["frames"]])
     data = open_dataset(ring, holdout=0)
@@ -318,8 +326,8 @@ def test_depth_finds_the_box(ring):
     assert data.train[0].depth.dtype == np.float32 and "box" not in open_dataset(ring, depth=False).box_source
 
 
-def test_the_fox_has_the_rays_that_it_always_had(recorded):
-    """OpenCV's model, restated, at some pixels of some frames."""
+def test_rays_of_fox_are_unchanged(recorded):
+    """Compared with a reference implementation of OpenCV's model at some pixels of some frames."""
     folder = recorded("fox")
     data = open_dataset(folder, width=135)
     assert (len(data.train), len(data.held_out), len(data.unused)) == (43, 7, 17)
@@ -329,7 +337,7 @@ def test_the_fox_has_the_rays_that_it_always_had(recorded):
     for view in data.train[::10]:
         d = pixel_directions(view.camera.intrinsics) @ view.camera.to_world[:3, :3].T
         for column, row in ((0, 0), (134, 239), (60, 100)):
-            # Pixel centres of the picture at an eighth of the size, in the large one.
+            # Pixel centres of the image at an eighth of the size, in pixels of the large one.
             u, v = (column + 0.5) * 8 - 0.5, (row + 0.5) * 8 - 0.5
             ray = opencv.undistort(u, v, content["fl_x"], content["fl_y"], content["cx"] - 0.5, content["cy"] - 0.5, k)
             ray = frames[view.name][:3, :3] @ (ray * [1, -1, -1])
@@ -337,8 +345,8 @@ def test_the_fox_has_the_rays_that_it_always_had(recorded):
 
 
 @pytest.fixture(scope="module")
-def seen_by_depth():
-    """Cameras and depth (distances along rays, metres) of a room of 4 x 3 x 2.5 m that they walk about in."""
+def depth_views():
+    """Cameras inside a room of 4 x 3 x 2.5 m, with depth (distances along rays, metres)."""
     seen = []
     for k in range(12):
         a = 2 * np.pi * k / 12
@@ -356,20 +364,20 @@ def seen_by_depth():
 
 
 @pytest.mark.parametrize("factor", [1.0, 1.05, 1.5, 0.7])
-def test_depth_that_fits_its_cameras(seen_by_depth, factor):
-    assert explain_wrong_depth([(c, factor * d) for c, d in seen_by_depth]) is None
+def test_consistent_depth_passes(depth_views, factor):
+    assert explain_wrong_depth([(c, factor * d) for c, d in depth_views]) is None
 
 
 @pytest.mark.parametrize("factor", [1e-3, 1e-2, 0.1, 0.2, 5.0, 100.0, 1e3])
-def test_depth_in_other_units_than_the_cameras_is_explained(seen_by_depth, factor):
-    reason = explain_wrong_depth([(c, factor * d) for c, d in seen_by_depth])
+def test_depth_in_other_units_is_explained(depth_views, factor):
+    reason = explain_wrong_depth([(c, factor * d) for c, d in depth_views])
     assert reason is not None and f"multiplied by {1 / factor:g}, " in reason
 
 
-def test_depth_that_all_views_have_alike_is_no_evidence(seen_by_depth):
-    """It agrees in any unit that makes the cameras' distances small."""
-    assert explain_wrong_depth([(c, np.full_like(d, 0.1)) for c, d in seen_by_depth]) is None
-    assert "median is 1e+03 units" in explain_wrong_depth([(c, np.full_like(d, 1000.0)) for c, d in seen_by_depth])
+def test_constant_depth_is_no_evidence(depth_views):
+    """It agrees in any unit in which the distances between cameras are small."""
+    assert explain_wrong_depth([(c, np.full_like(d, 0.1)) for c, d in depth_views]) is None
+    assert "median is 1e+03 units" in explain_wrong_depth([(c, np.full_like(d, 1000.0)) for c, d in depth_views])
 
 
 def test_depth_far_outside_of_the_cameras_is_refused(ring):
@@ -383,8 +391,8 @@ def test_depth_far_outside_of_the_cameras_is_refused(ring):
 
 
 @pytest.mark.parametrize("lens", [OPENCV, FISHEYE], ids=["opencv", "fisheye"])
-def test_what_masks_leave_out_is_said(tmp_path, rgb, lens):
-    """Where it is nothing as well, which a fisheye's dark corners do not hide."""
+def test_masked_fraction_is_noted(tmp_path, rgb, lens):
+    """Also if it is zero, which the dark corners of a fisheye must not hide."""
     instant_ngp(tmp_path, rgb, lens)
     rewrite(tmp_path, lambda c: [f.update(mask_path="mask.png") for f in c["frames"]])
     mask = np.full((H, W), 255, np.uint8)
@@ -395,8 +403,8 @@ def test_what_masks_leave_out_is_said(tmp_path, rgb, lens):
     assert open_dataset(tmp_path).notes[-1] == f"masks leave out 50.0% of the pixels of {COUNT} frames"
 
 
-def test_a_turned_photo_costs_its_frame_by_that_reason(ring, rgb):
-    """Swapping width and height would train on turned rays."""
+def test_rotated_photo_excludes_frame_with_reason(ring, rgb):
+    """Exchanging width and height would train on rotated rays."""
     rgb.Bitmap(np.ascontiguousarray(np.rot90(picture(0)))).write(str(ring / "images/0.png"))
     data = open_dataset(ring, holdout=0)
     assert len(data.train) == COUNT - 1 and "turn the pixels as the camera was held" in data.unused[0].reason

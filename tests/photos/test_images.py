@@ -14,6 +14,7 @@ from nerg_mi.photos.cameras import Intrinsics, PosedCamera, pixel_directions
 from nerg_mi.photos.dataset import open_dataset
 from nerg_mi.photos.images import (
     PhotoView,
+    apply_lens,
     load_usable_views,
     load_view,
     make_pinhole_camera,
@@ -23,7 +24,6 @@ from nerg_mi.photos.images import (
     read_photo,
     read_split,
     split_holdout,
-    apply_lens,
     undistort_photo,
 )
 from nerg_mi.photos.posed import DepthFile, MaskFile, PosedFrame
@@ -44,7 +44,7 @@ from tests.photos.written_sets import (
     rewrite,
 )
 
-# ---- Loading pictures, masks and depth at a size, and splitting them ----
+# ---- Loading of images, masks and depth at a size, and the split ----
 
 
 @pytest.fixture
@@ -74,7 +74,7 @@ def dataset(tmp_path, rgb):
     return tmp_path, np.array(pictures)
 
 
-def test_pixels_are_kept_as_stored(dataset):
+def test_pixels_are_unchanged(dataset):
     folder, pictures = dataset
     views, unused = load_usable_views(read_transforms(folder / "transforms.json").frames, depth=True)
     assert not unused and all(v.pixels.dtype == np.uint8 for v in views)
@@ -85,7 +85,7 @@ def test_pixels_are_kept_as_stored(dataset):
 
 @pytest.mark.parametrize("width, height", [(6, 4), (3, 2), (5, 3), (12, 8), (7, 5)])
 def test_downscaling_averages_areas(dataset, width, height):
-    """Against an average over a fine oversampling, colours weighted by alpha."""
+    """Compared with the average of a fine oversampling, with colours weighted by alpha."""
     folder, pictures = dataset
     view = load_view(read_transforms(folder / "transforms.json").frames[0], width=width)
     rgba = pictures[0] / 255.0
@@ -106,7 +106,7 @@ def test_downscale_and_width_errors(dataset):
             load_view(frames[0], **arguments)
 
 
-def test_wrong_depth_is_named(dataset):
+def test_invalid_depth_error_names_file(dataset):
     folder, _ = dataset
     np.save(folder / "00.npy", np.zeros((3, 3), np.float32))
     views, unused = load_usable_views(read_transforms(folder / "transforms.json").frames, depth=True)
@@ -123,7 +123,7 @@ def test_every_kth_of_the_sorted_frames_is_held_out(dataset):
         split_holdout(frames, 1)
 
 
-# ---- Pictures, depth and masks of every kind of file, written here with known numbers ----
+# ---- Images, depth and masks in all file formats, with known values ----
 
 
 def to_srgb(x):
@@ -132,7 +132,7 @@ def to_srgb(x):
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 @pytest.mark.parametrize("channels", [1, 3, 4])
-def test_png_is_kept_as_stored(tmp_path, rgb, dtype, channels):
+def test_png_is_unchanged(tmp_path, rgb, dtype, channels):
     values = np.random.default_rng(0).integers(0, np.iinfo(dtype).max, (5, 7, channels)).astype(dtype)
     formats = {1: rgb.Bitmap.PixelFormat.Y, 3: rgb.Bitmap.PixelFormat.RGB, 4: rgb.Bitmap.PixelFormat.RGBA}
     rgb.Bitmap(values, formats[channels]).write(str(tmp_path / "a.png"))
@@ -161,7 +161,7 @@ def test_exr_with_alpha_is_premultiplied(tmp_path, rgb):
     assert np.allclose(read_image(tmp_path / "a.exr"), expected, atol=1e-3)
 
 
-def test_colour_of_an_exr_with_more_layers(tmp_path):
+def test_colour_of_multilayer_exr(tmp_path):
     import OpenEXR
 
     values = {k: np.full((2, 3), v, np.float32) for k, v in {"R": 0.1, "G": 0.2, "B": 0.3, "depth.T": 7.0}.items()}
@@ -174,7 +174,7 @@ def test_colour_of_an_exr_with_more_layers(tmp_path):
         read_image(tmp_path / "b.exr")
 
 
-def test_unreadable_and_broken_images_are_named(tmp_path, rgb):
+def test_unreadable_image_errors_name_file(tmp_path, rgb):
     (tmp_path / "a.png").write_bytes(b"no image")
     with pytest.raises(ValueError, match="a.png"):
         read_image(tmp_path / "a.png")
@@ -195,7 +195,7 @@ def test_depth_of_every_kind(tmp_path, rgb):
 
 
 @pytest.mark.parametrize("names", [["V"], ["A", "B", "G", "R", "ViewLayer.Depth.Z"], ["R", "G", "B", "depth.T"], "RGB"])
-def test_depth_of_an_exr_is_the_channel_of_that_name(tmp_path, names):
+def test_depth_channel_of_exr_is_selected_by_name(tmp_path, names):
     rng, depth = np.random.default_rng(0), np.full((2, 3), 2.5, np.float32)
     grey = list(names) == ["R", "G", "B"]
     channels = {n: depth if grey or n == names[-1] else rng.random((2, 3)).astype(np.float32) for n in names}
@@ -206,7 +206,7 @@ def test_depth_of_an_exr_is_the_channel_of_that_name(tmp_path, names):
         read_depth(DepthFile(tmp_path / "b.exr"))
 
 
-def test_depth_that_cannot_be_read_is_named(tmp_path, rgb):
+def test_unreadable_depth_error_names_file(tmp_path, rgb):
     rgb.Bitmap(np.zeros((2, 2), np.uint8)).write(str(tmp_path / "a.png"))
     np.save(tmp_path / "b.npy", np.zeros((2, 2, 2)))
     (tmp_path / "c.tif").write_bytes(b"")
@@ -247,7 +247,7 @@ def test_a_mask_stored_as_jpeg(tmp_path, rgb):
 
 @pytest.mark.parametrize("color", [255, 0])
 @pytest.mark.parametrize("channels", [2, 4])
-def test_alpha_of_a_mask_of_one_colour_is_the_mask(tmp_path, rgb, color, channels):
+def test_alpha_of_uniform_mask_is_mask(tmp_path, rgb, color, channels):
     alpha = np.array([[0, 255, 3], [0, 100, 200]], np.uint8)
     values = np.dstack([*(channels - 1) * [np.full_like(alpha, color)], alpha])
     formats = {2: rgb.Bitmap.PixelFormat.YA, 4: rgb.Bitmap.PixelFormat.RGBA}
@@ -256,14 +256,13 @@ def test_alpha_of_a_mask_of_one_colour_is_the_mask(tmp_path, rgb, color, channel
     with pytest.raises(ValueError, match="3 x 2 pixels.*4 x 4"):
         read_mask(MaskFile(tmp_path / "a.png"), (4, 4))
     if channels == 4 and color:
-        # Transparent white is left out, as is opaque black.
+        # Transparent white is excluded, as is opaque black.
         mixed = np.array([[[255, 255, 255, 255], [255, 255, 255, 0], [0, 0, 0, 255]]], np.uint8)
         rgb.Bitmap(mixed, formats[4]).write(str(tmp_path / "b.png"))
         assert np.array_equal(read_mask(MaskFile(tmp_path / "b.png"), (1, 3)), [[True, False, False]])
 
 
-# EXIF orientation (where the first row and column of the stored pixels are shown) -> the stored pixel, its row and
-# column, that each upright one is, for stored pixels of 2 rows and 3 columns.
+# EXIF orientation -> row and column of the stored pixel for each upright pixel, with 2 rows and 3 columns stored.
 UPRIGHT = {
     1: [[(0, 0), (0, 1), (0, 2)], [(1, 0), (1, 1), (1, 2)]],
     2: [[(0, 2), (0, 1), (0, 0)], [(1, 2), (1, 1), (1, 0)]],
@@ -276,8 +275,8 @@ UPRIGHT = {
 }
 
 
-def save_turned(path, values, orientation):
-    """A photo whose EXIF notes say that it is to be turned."""
+def save_with_orientation(path, values, orientation):
+    """Save a photo with an EXIF orientation."""
     image = pytest.importorskip("PIL.Image")
     notes = image.Exif()
     notes[0x0112] = orientation
@@ -289,10 +288,10 @@ def camera(path, shape, ignores_exif=False):
 
 
 @pytest.mark.parametrize("orientation", range(5, 9))
-def test_a_turned_photo_has_the_pixels_that_its_camera_describes(tmp_path, rgb, orientation):
-    """As stored, or upright, by the camera's width and height, at any size."""
+def test_rotated_photo_matches_its_camera(tmp_path, rgb, orientation):
+    """As stored, or upright, depending on the camera's width and height, at any size."""
     path, stored = tmp_path / "a.png", np.random.default_rng(0).integers(0, 256, (2, 3, 3)).astype(np.uint8)
-    save_turned(path, stored, orientation)
+    save_with_orientation(path, stored, orientation)
     upright = np.array([[stored[at] for at in row] for row in UPRIGHT[orientation]])
     assert np.array_equal(read_photo(camera(path, (2, 3))), stored)
     assert np.array_equal(read_photo(camera(path, (3, 2))), upright)
@@ -300,10 +299,12 @@ def test_a_turned_photo_has_the_pixels_that_its_camera_describes(tmp_path, rgb, 
 
 
 @pytest.mark.parametrize("orientation, shape", [(2, (2, 3)), (3, (2, 3)), (4, (2, 3)), (6, (4, 4)), (8, (4, 4))])
-def test_a_turned_photo_of_which_nothing_tells_is_refused(tmp_path, rgb, orientation, shape):
-    """Square, or turned by half, where width and height are equal: poses of COLMAP are of the stored pixels."""
+def test_ambiguous_orientation_is_refused(tmp_path, rgb, orientation, shape):
+    """Square photos, or rotations by 180 degrees, where the shape does not change. COLMAP poses refer to the
+    stored pixels.
+    """
     path, stored = tmp_path / "a.png", np.random.default_rng(0).integers(0, 256, (*shape, 3)).astype(np.uint8)
-    save_turned(path, stored, orientation)
+    save_with_orientation(path, stored, orientation)
     with pytest.raises(NergError, match=f"a.png.*EXIF orientation .{orientation}.*nothing tells"):
         read_photo(camera(path, shape))
     with pytest.raises(NergError, match="nothing tells"):
@@ -311,24 +312,24 @@ def test_a_turned_photo_of_which_nothing_tells_is_refused(tmp_path, rgb, orienta
     assert np.array_equal(read_photo(camera(path, shape, ignores_exif=True)), stored)
 
 
-def test_photos_that_are_not_to_be_turned(tmp_path, rgb):
-    """No notes, notes of an upright photo, an orientation that there is not, damaged notes."""
+def test_photos_without_rotation(tmp_path, rgb):
+    """No EXIF data, an upright photo, an invalid orientation, damaged EXIF data."""
     stored = np.random.default_rng(0).integers(0, 256, (4, 4, 3)).astype(np.uint8)
     rgb.Bitmap(stored).write(str(tmp_path / "a.png"))
     assert np.array_equal(read_photo(camera(tmp_path / "a.png", (4, 4))), stored)
     for orientation in (1, 0, 9):
-        save_turned(tmp_path / "a.jpg", stored, orientation)
+        save_with_orientation(tmp_path / "a.jpg", stored, orientation)
         assert read_photo(camera(tmp_path / "a.jpg", (4, 4))).shape == (4, 4, 3)
     raw = (tmp_path / "a.jpg").read_bytes()
     (tmp_path / "a.jpg").write_bytes(raw.replace(b"MM\0*", b"XX\0*").replace(b"II*\0", b"XX*\0"))
     assert read_photo(camera(tmp_path / "a.jpg", (4, 4))).shape == (4, 4, 3)
 
 
-# ---- Which frames of a data set are held out, and the coordinates that are asked for ----
+# ---- Held-out frames of a data set, and coordinates ----
 
 
 def test_blender_style_folders_keep_their_split(tmp_path, rgb):
-    """Suffixes left out, RGBA, an angle for a lens, and three files that name the parts."""
+    """Omitted suffixes, RGBA, the lens as an angle, and one file per subset."""
     parts = {"train": range(5), "val": range(5, 6), "test": range(6, 9)}
     angle = 0.9
     for part, numbers in parts.items():
@@ -345,7 +346,8 @@ def test_blender_style_folders_keep_their_split(tmp_path, rgb):
     assert [v.name for v in data.train] == [f"./train/r_{k}" for k in range(5)]
     assert [v.name for v in data.held_out] == [f"./test/r_{k}" for k in range(6, 9)]
     assert (
-        data.source["held_out"]["how"] == "transforms_test.json" and data.box_source == "the region that the views share"
+        data.source["held_out"]["how"] == "transforms_test.json"
+        and data.box_source == "the region that the views share"
     )
     plain = Intrinsics(W, H, *2 * [W / 2 / np.tan(angle / 2)], W / 2, H / 2)
     for view, k in zip(data.train, parts["train"]):
@@ -357,7 +359,7 @@ def test_blender_style_folders_keep_their_split(tmp_path, rgb):
 
 
 def test_frames_held_out_are_never_trained_on(ring):
-    """A test file that repeats frames of the training file takes them away from it."""
+    """Frames that a test file shares with the training file are removed from the latter."""
     content = json.loads((ring / "transforms.json").read_text())
     (ring / "transforms_test.json").write_text(json.dumps({**content, "frames": content["frames"][:2]}))
     data = open_dataset(ring)
@@ -377,7 +379,7 @@ def test_lists_of_file_names_split(ring):
 
 
 def test_coordinates_of_a_nerfstudio_training(tmp_path, rgb):
-    """dataparser_transforms.json goes from the original coordinates, not from those of transforms.json."""
+    """dataparser_transforms.json starts from the original coordinates, not from those of transforms.json."""
     nerfstudio(tmp_path, rgb, OPENCV)
     turn = Rotation.from_euler("z", 30, degrees=True).as_matrix()
     path = tmp_path / "dataparser_transforms.json"
@@ -388,8 +390,8 @@ def test_coordinates_of_a_nerfstudio_training(tmp_path, rgb):
         assert np.allclose(view.camera.to_world[:3, :3], turn @ opengl(pose)[:3, :3])
 
 
-def tip(content, turn):
-    """Turn all frames of a transforms file by the rotation ``turn``."""
+def tilt(content, turn):
+    """Rotate all frames of a transforms file by the rotation ``turn``."""
     for frame in content["frames"]:
         pose = np.array(frame["transform_matrix"])
         pose[:3] = turn @ pose[:3]
@@ -400,7 +402,7 @@ def test_upright_coordinates_have_up_along_z(ring):
     level = open_dataset(ring, holdout=0)
     assert level.up_note.startswith("up is +z") and np.allclose(level.source["up"], [0, 0, 1], atol=0.02)
     turn = Rotation.from_euler("xyz", [100, -30, 70], degrees=True).as_matrix()
-    rewrite(ring, lambda c: tip(c, turn))
+    rewrite(ring, lambda c: tilt(c, turn))
     tipped = open_dataset(ring, holdout=0)
     assert "--coordinates upright" in tipped.up_note and "degrees from +z" in tipped.up_note
     assert np.allclose(tipped.source["up"], turn[:, 2], atol=0.02)
@@ -412,12 +414,12 @@ def test_upright_coordinates_have_up_along_z(ring):
         assert np.allclose(a.camera.to_world[2], c.camera.to_world[2], atol=0.02)
 
 
-def test_cameras_that_do_not_agree_on_up_say_so(ring):
+def test_disagreeing_cameras_are_refused(ring):
     def roll(content):
         for k, frame in enumerate(content["frames"]):
-            about = np.eye(4)
-            about[:3, :3] = Rotation.from_euler("z", 80 * (-1) ** k * (k % 3), degrees=True).as_matrix()
-            frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ about).tolist()
+            axis = np.eye(4)
+            axis[:3, :3] = Rotation.from_euler("z", 80 * (-1) ** k * (k % 3), degrees=True).as_matrix()
+            frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ axis).tolist()
 
     rewrite(ring, roll)
     data = open_dataset(ring, holdout=0)
@@ -426,43 +428,43 @@ def test_cameras_that_do_not_agree_on_up_say_so(ring):
         open_dataset(ring, holdout=0, coordinates="upright")
 
 
-def test_held_out_frames_of_a_file_of_their_own_are_turned_alike(ring):
+def test_separate_held_out_frames_are_rotated_too(ring):
     turn = Rotation.from_euler("x", 90, degrees=True).as_matrix()
-    rewrite(ring, lambda c: tip(c, turn))
+    rewrite(ring, lambda c: tilt(c, turn))
     content = json.loads((ring / "transforms.json").read_text())
     test = {**content, "frames": content["frames"][6:]}
     (ring / "transforms_test.json").write_text(json.dumps(test))
     data = open_dataset(ring, coordinates="upright")
-    whole = open_dataset(ring, holdout=0, coordinates="upright")
-    everywhere = {v.name: v.camera.to_world for v in whole.train}
+    split = open_dataset(ring, holdout=0, coordinates="upright")
+    everywhere = {v.name: v.camera.to_world for v in split.train}
     assert len(data.held_out) == 3
     for view in [*data.train, *data.held_out]:
         assert np.allclose(view.camera.to_world, everywhere[view.name], atol=1e-6)
 
 
 @pytest.mark.parametrize("write", [instant_ngp, colmap_bin, colmap_txt])
-def test_what_a_capture_holds_and_is_not_used_is_named_once(tmp_path, rgb, monkeypatch, write):
-    """Photos without a pose, counted; other files and folders of the capture; not those that are used."""
+def test_unused_files_are_noted_once(tmp_path, rgb, monkeypatch, write):
+    """The number of photos without a pose, and other files and folders of the capture, but not used ones."""
     write(tmp_path, rgb, OPENCV)
     assert read_split(tmp_path).posed.notes == []
     for name in ("images/new.png", "images/other.JPG", "images/notes.txt", "images/.hidden.png", "mesh.ply", ".cache"):
         (tmp_path / name).write_bytes(b"")
     (tmp_path / "images_2").mkdir()
     if write is colmap_bin:
-        # COLMAP keeps the photos of each camera in a folder of its own, and models that were not merged apart.
+        # COLMAP uses one folder of photos per camera, and separate folders for models that were not merged.
         (tmp_path / "images/right").mkdir()
         (tmp_path / "images/right/z.jpg").write_bytes(b"")
         shutil.copytree(tmp_path / "sparse/0", tmp_path / "sparse/1")
     monkeypatch.chdir(tmp_path.parent)
     assert read_split(tmp_path.name).posed.notes == read_split(tmp_path).posed.notes
     *models, stray, rest = read_split(tmp_path).posed.notes
-    more, names = (1, "new.png, other.JPG, z.jpg") if write is colmap_bin else (0, "new.png, other.JPG")
-    assert stray.startswith(f"{2 + more} of {11 + more} photos have no pose") and stray.endswith(names)
-    assert ["of 2 COLMAP models" in note for note in models] == [True] * more
+    extra, names = (1, "new.png, other.JPG, z.jpg") if write is colmap_bin else (0, "new.png, other.JPG")
+    assert stray.startswith(f"{2 + extra} of {11 + extra} photos have no pose") and stray.endswith(names)
+    assert ["of 2 COLMAP models" in note for note in models] == [True] * extra
     assert rest == f'not used of "{tmp_path.name}": images_2, mesh.ply'
 
 
-def test_files_of_frames_and_of_held_out_frames_are_no_leftovers(ring):
+def test_used_files_are_not_noted(ring):
     content = json.loads((ring / "transforms.json").read_text())
     frames = content["frames"]
     for k, f in enumerate(frames):
@@ -475,16 +477,14 @@ def test_files_of_frames_and_of_held_out_frames_are_no_leftovers(ring):
 
 
 @pytest.mark.parametrize("name", [".", "..", "images", "images/.", "images/..", "", "/", "no/../1.png"])
-def test_a_folder_in_the_place_of_a_photo_is_no_photo(ring, name):
+def test_folder_is_not_a_photo(ring, name):
     content = json.loads((ring / "transforms.json").read_text())
     content["frames"][0]["file_path"] = name
     (ring / "transforms.json").write_text(json.dumps(content))
     assert len(read_split(ring).posed.unused) == 1
 
 
-# ---- Undistort ----
-#
-# Photos made pinhole and renderings bent to a lens, against a smooth picture of the sky known in every direction.
+# ---- Undistorted photos and distorted renderings, compared with a smooth sky that is known in all directions ----
 
 PLAIN = Intrinsics(90, 70, 80.0, 80.0, 44.0, 36.5)
 
@@ -515,8 +515,8 @@ def picture_undistort(intrinsics):
 
 
 @pytest.mark.parametrize("name", LENSES)
-def test_an_undistorted_photo_shows_what_its_sensor_renders(name, rgb):
-    """The directions are those of the sensor's own rays, not of this module's idea of them."""
+def test_undistorted_photo_matches_its_sensor(name, rgb):
+    """The directions are those of the sensor, not computed by the tested module."""
     i = LENSES[name]
     image, mask, sensor = undistort_photo(PhotoView("a", PosedCamera(i, POSE), picture_undistort(i)))
     rays = rgb.load_dict(sensor)
@@ -528,14 +528,14 @@ def test_an_undistorted_photo_shows_what_its_sensor_renders(name, rgb):
     assert np.all(image[~mask] == 0)
 
 
-def test_an_undistorted_photo_of_a_plain_lens_is_the_photo():
+def test_photo_without_distortion_is_unchanged():
     photo = picture_undistort(PLAIN)
     image, mask, sensor = undistort_photo(PhotoView("a", PosedCamera(PLAIN, POSE), photo))
     assert np.array_equal(image, photo) and mask.all() and sensor["film"]["width"] == 90
 
 
-def test_what_the_photo_does_not_show_is_masked():
-    """A pincushion photo holds less than the pinhole picture of its size; the mask says so pixel by pixel."""
+def test_invisible_pixels_are_masked():
+    """A pincushion photo shows less than a pinhole image of its size; the mask is compared pixel by pixel."""
     i = replace(PLAIN, k1=0.3)
     _, mask, _ = undistort_photo(PhotoView("a", PosedCamera(i, POSE), picture_undistort(i)))
     d = pixel_directions(PLAIN)
@@ -546,7 +546,7 @@ def test_what_the_photo_does_not_show_is_masked():
     assert np.array_equal(mask, expected) and 0.5 < mask.mean() < 0.95
 
 
-def test_transparent_pixels_lend_no_colour():
+def test_transparent_pixels_do_not_bleed():
     i = LENSES["barrel"]
     color = np.concatenate([picture_undistort(i), np.ones((70, 90, 1), np.float32)], axis=2)
     color[:, 45:] = [1, 0, 1, 0]
@@ -558,7 +558,7 @@ def test_transparent_pixels_lend_no_colour():
 
 
 @pytest.mark.parametrize("name", LENSES)
-def test_a_rendering_bent_to_the_lens_equals_the_photo(name):
+def test_distorted_rendering_equals_photo(name):
     i = LENSES[name]
     camera = PosedCamera(i, POSE)
     source = make_pinhole_camera(camera, oversample=2.0)
@@ -567,7 +567,7 @@ def test_a_rendering_bent_to_the_lens_equals_the_photo(name):
     assert np.abs(bent - picture_undistort(i)).max() < 1e-3
 
 
-def test_a_wide_fisheye_is_covered_as_far_as_a_pinhole_reaches():
+def test_wide_fisheye_is_covered_up_to_pinhole_limit():
     i = Intrinsics(80, 80, 26.0, 26.0, 40.0, 40.0, fisheye=True)
     camera = PosedCamera(i, POSE)
     source = make_pinhole_camera(camera)
@@ -577,7 +577,7 @@ def test_a_wide_fisheye_is_covered_as_far_as_a_pinhole_reaches():
     assert np.abs(bent - picture_undistort(i))[angle < 75].max() < 5e-3
 
 
-def test_errors_of_through_lens():
+def test_apply_lens_errors():
     camera = PosedCamera(LENSES["barrel"], POSE)
     source = make_pinhole_camera(camera)
     with pytest.raises(ValueError, match="pixels"):

@@ -12,10 +12,10 @@ from nerg_mi.photos.posed import PosedFrame, drop_duplicates, read_semidense, ri
 from nerg_mi.photos.transforms import read_transforms
 from tests.photos.written_sets import frame
 
-# ---- Frames as files describe them: lenses, poses and changes of coordinates ----
+# ---- Frames in files: lenses, poses and coordinate transforms ----
 
 
-def test_shared_intrinsics_prefer_the_focal_length(write):
+def test_focal_length_takes_precedence(write):
     t = read_transforms(
         write(
             {
@@ -45,20 +45,20 @@ def test_bad_intrinsics_name_the_frame(write):
         t.frames[0].intrinsics(8, 8)
 
 
-def test_a_scale_within_a_pose_is_taken_out(write):
+def test_scale_in_pose_is_removed(write):
     scaled = np.diag([2.0, 2, 2, 1])
     scaled[:3, 3] = 5
     f = read_transforms(write({"fl_x": 1.0, "frames": [frame("a.png", transform_matrix=scaled.tolist())]})).frames[0]
     assert np.allclose(f.to_world[:3, :3], np.eye(3)) and np.allclose(f.to_world[:3, 3], 5)
 
 
-def test_a_mirroring_change_of_coordinates_is_refused(write):
+def test_mirroring_transform_is_refused(write):
     t = read_transforms(write({"fl_x": 1.0, "frames": [frame("a.png")]}))
     with pytest.raises(ValueError, match="mirroring"):
         t.transform(np.diag([1.0, 1, -1, 1]))
 
 
-def test_the_nearest_rotation_is_what_a_rounded_pose_means():
+def test_rounded_pose_becomes_nearest_rotation():
     turned = np.array([[0.0, -1.001, 0.0, 1], [1.0, 0.0, 0.0, 2], [0.0, 0.0, 1.0, 3]])
     pose = rigid_pose(turned.tolist())
     assert np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12) and np.allclose(pose[:3, 3], [1, 2, 3])
@@ -75,21 +75,21 @@ def test_the_nearest_rotation_is_what_a_rounded_pose_means():
         (np.full((4, 4), np.nan), "finite"),
     ],
 )
-def test_what_is_no_pose(matrix, reason):
+def test_invalid_poses_are_refused(matrix, reason):
     with pytest.raises(NergError, match=reason):
         rigid_pose(matrix)
 
 
-def test_an_image_that_is_listed_again_counts_once(tmp_path):
+def test_duplicate_image_counts_once(tmp_path):
     (tmp_path / "a.png").touch()
     (tmp_path / "b.png").symlink_to(tmp_path / "a.png")
     first = PosedFrame("a.png", tmp_path / "a.png", np.eye(4), {})
     again = PosedFrame("b.png", tmp_path / "b.png", np.diag([1.0, -1, -1, 1]), {})
-    kept, unused = drop_duplicates([first, again])
-    assert kept == [first] and "another pose" in unused[0].reason
+    unique, unused = drop_duplicates([first, again])
+    assert unique == [first] and "another pose" in unused[0].reason
 
 
-# ---- Semi-dense points of Aria's glasses ----
+# ---- Semi-dense points of Project Aria ----
 
 HEAD = "uid,graph_uid,px_world,py_world,pz_world,inv_dist_std,dist_std"
 
@@ -99,7 +99,7 @@ def write(path, *rows):
     return path
 
 
-def test_points_of_one_world_that_are_known_well(tmp_path, monkeypatch):
+def test_precise_points_of_one_world(tmp_path, monkeypatch):
     monkeypatch.setattr(posed, "_BLOCK", 2)
     path = write(
         tmp_path / "semidense_points.csv.gz",
@@ -119,7 +119,7 @@ def test_points_of_one_world_that_are_known_well(tmp_path, monkeypatch):
         read_semidense(path)
 
 
-def test_what_is_no_file_of_points(tmp_path):
+def test_other_files_are_refused(tmp_path):
     for row, why in (
         ("1,a,1,2", "line 2: 4 cells, the header has 7"),
         ("1,a,1,2,3,0,0,0,0", "line 2: 9 cells, the header has 7"),

@@ -12,9 +12,7 @@ from nerg_mi.photos import cameras
 from nerg_mi.photos.cameras import Intrinsics, pixel_directions
 from nerg_mi.photos.salience import open_salience, pixel_solid_angles, read_salience, spectral_residual
 
-# ---- Solid angle ----
-#
-# Solid angles of pixels against closed forms of whole pictures, and against the Jacobian of each lens.
+# ---- Solid angles of pixels, compared with closed forms for images, and with the Jacobian of each lens ----
 
 PLAIN = Intrinsics(96, 64, 60.0, 55.0, 44.0, 30.5)
 BARREL = replace(PLAIN, k1=-0.15, k2=0.03, p1=0.002, p2=-0.001)
@@ -30,7 +28,7 @@ def test_a_pinholes_pixels_sum_to_its_frustum():
     x, y = (np.array([0, i.width]) - i.cx) / i.fx, (np.array([0, i.height]) - i.cy) / i.fy
     expected = corner(x[1], y[1]) - corner(x[0], y[1]) - corner(x[1], y[0]) + corner(x[0], y[0])
     assert pixel_solid_angles(i).sum() == pytest.approx(expected, rel=1e-12)
-    # And pixel by pixel.
+    # Pixel by pixel.
     x, y = np.meshgrid((np.arange(97) - i.cx) / i.fx, (np.arange(65) - i.cy) / i.fy)
     f = corner(x, y)
     assert np.allclose(pixel_solid_angles(i), f[1:, 1:] - f[1:, :-1] - f[:-1, 1:] + f[:-1, :-1], rtol=1e-9)
@@ -38,7 +36,7 @@ def test_a_pinholes_pixels_sum_to_its_frustum():
 
 @pytest.mark.parametrize("i", [PLAIN, BARREL, FISHEYE], ids=["pinhole", "barrel", "fisheye"])
 def test_the_sum_is_that_of_the_border(i):
-    """Between the axis and the border at azimuth φ lie 1 - cos θ(φ) of area for each radian."""
+    """Between the axis and the border at azimuth φ, the solid angle per radian is 1 - cos θ(φ)."""
     n = 20000
     u, v = np.linspace(0, i.width, n, endpoint=False), np.linspace(0, i.height, n, endpoint=False)
     edge = np.concatenate(
@@ -56,7 +54,7 @@ def test_the_sum_is_that_of_the_border(i):
 
 @pytest.mark.parametrize("widest", [np.radians(100), np.pi])
 def test_a_fisheye_that_ends_within_the_picture_covers_a_cap(widest):
-    # θ + k1 θ³ rises as far as θ = (-3 k1)^-1/2; without k1 the whole sphere is in the picture.
+    # θ + k1 θ³ increases up to θ = (-3 k1)^-1/2; without k1, the complete sphere is in the image.
     i = Intrinsics(200, 200, 30.0, 30.0, 100.0, 100.0, 0.0 if widest == np.pi else -1 / (3 * widest**2), fisheye=True)
     solid = pixel_solid_angles(i)
     assert solid.sum() == pytest.approx(2 * np.pi * (1 - np.cos(widest)), rel=2e-3)
@@ -79,10 +77,10 @@ def test_a_pixel_has_the_jacobian_of_its_lens(i):
         assert np.allclose(jacobian, cos**3 / (fine.fx * fine.fy), rtol=1e-6)
 
 
-# ---- The spectral residual against the authors' steps, written out with a plain Fourier sum ----
+# ---- Spectral residual, compared with the published algorithm, implemented with a plain Fourier sum ----
 
 
-def restated(grey):
+def compute_reference(grey):
     h, w = grey.shape
     F = lambda n: np.exp(-2j * np.pi * np.outer(np.arange(n), np.arange(n)) / n)
     spectrum = F(h) @ grey @ F(w)
@@ -96,25 +94,25 @@ def restated(grey):
     return sum(kernel[a, b] * sharp[a : a + h, b : b + w] for a in range(11) for b in range(11))
 
 
-def test_the_authors_steps():
+def test_equals_published_algorithm():
     grey = np.random.default_rng(0).uniform(0.2, 0.8, (20, 32))
     grey[5:9, 20:25] = 1
-    found, expected = spectral_residual(np.repeat(grey[..., None], 3, axis=2)), restated(grey)
-    assert found.shape == (20, 32) and found.max() == 1
-    assert np.allclose(found, expected / expected.max(), atol=1e-4)
+    salience, expected = spectral_residual(np.repeat(grey[..., None], 3, axis=2)), compute_reference(grey)
+    assert salience.shape == (20, 32) and salience.max() == 1
+    assert np.allclose(salience, expected / expected.max(), atol=1e-4)
 
 
-def test_the_odd_one_out_is_salient():
+def test_odd_element_is_salient():
     x, y = np.meshgrid(np.arange(128), np.arange(96))
     photo = np.where((x // 8) % 2, 0.4, 0.6) * np.ones((96, 128))
     photo[40:48, 64:96] = np.where((y[40:48, 64:96] // 2) % 2, 0.4, 0.6)
-    found = spectral_residual(np.repeat(photo[..., None], 3, axis=2))
-    assert found.shape == (48, 64)
-    v, u = np.unravel_index(np.argmax(found), found.shape)
+    salience = spectral_residual(np.repeat(photo[..., None], 3, axis=2))
+    assert salience.shape == (48, 64)
+    v, u = np.unravel_index(np.argmax(salience), salience.shape)
     assert 17 <= v <= 27 and 28 <= u <= 52
 
 
-# ---- Salience images: what is read and refused, whose they are, and the densities they mean ----
+# ---- Saliency maps: accepted and refused files, their frames, and their densities ----
 
 LENSES = {
     "pinhole": {"fl_x": 40.0, "fl_y": 40.0},
@@ -157,7 +155,7 @@ def posed(tmp_path):
 # ---- Files ----
 
 
-def test_every_kind_of_file_says_the_same(tmp_path, rgb):
+def test_all_formats_give_same_map(tmp_path, rgb):
     values = np.arange(12).reshape(3, 4) * 5
     grey, byte = np.float32(values), values.astype(np.uint8)
     kinds = {
@@ -173,9 +171,9 @@ def test_every_kind_of_file_says_the_same(tmp_path, rgb):
         "flags.npy": values > 20,
     }
     for name, array in kinds.items():
-        found = read_salience(write(tmp_path / name, array))
+        maps = read_salience(write(tmp_path / name, array))
         expected = (values > 20) if name == "flags.npy" else values
-        assert np.allclose(found / found.sum(), expected / expected.sum(), atol=1e-7), name
+        assert np.allclose(maps / maps.sum(), expected / expected.sum(), atol=1e-7), name
 
 
 @pytest.mark.parametrize(
@@ -192,7 +190,7 @@ def test_every_kind_of_file_says_the_same(tmp_path, rgb):
         *((name, None, f"{name}.*cannot be read") for name in ("a.png", "a.exr", "a.npy")),
     ],
 )
-def test_what_is_no_salience_is_refused_by_name(name, values, said, tmp_path, rgb):
+def test_invalid_maps_are_refused(name, values, said, tmp_path, rgb):
     path = tmp_path / name
     if values is None:
         path.write_bytes(b"nonsense")
@@ -208,19 +206,21 @@ def test_maps_belong_to_frames_by_name(posed):
     write(folder / "maps" / "a.npy", np.ones((48, 64)))
     write(folder / "maps" / "c.png", np.ones((24, 32), np.uint8))
     write(folder / "maps" / "d.png", np.ones((24, 32), np.uint8))
-    found = open_salience(folder, folder / "maps")
+    views = open_salience(folder, folder / "maps")
     assert (
-        [v.name for v in found.views] == ["a.png", "c.png"] and found.frames_without_map == ["b.png"] and found.unmatched_files == ["d.png"]
+        [v.name for v in views.views] == ["a.png", "c.png"]
+        and views.frames_without_map == ["b.png"]
+        and views.unmatched_files == ["d.png"]
     )
-    assert found.views[1].gaze_fraction.shape == (24, 32) and np.allclose(found.views[1].camera.center, [2, 0, 0])
-    assert found.provenance["used"] == 2 and found.provenance["missing"] == 1
+    assert views.views[1].gaze_fraction.shape == (24, 32) and np.allclose(views.views[1].camera.center, [2, 0, 0])
+    assert views.provenance["used"] == 2 and views.provenance["missing"] == 1
 
     write(folder / "maps" / "a.png", np.ones((48, 64), np.uint8))
     with pytest.raises(ValueError, match='"a.npy" and "a.png"'):
         open_salience(folder, folder / "maps")
 
 
-def test_a_map_of_another_shape_or_of_nobody_is_refused(posed):
+def test_map_of_wrong_shape_or_without_frame_is_refused(posed):
     folder = posed()
     with pytest.raises(ValueError, match='no image in .* would be "a"'):
         open_salience(folder, folder / "maps")
@@ -233,7 +233,7 @@ def test_a_map_of_another_shape_or_of_nobody_is_refused(posed):
         open_salience(folder, folder / "maps", per="radian")
 
 
-def test_one_map_of_two_photos_is_refused(posed):
+def test_map_of_two_photos_is_refused(posed):
     folder = posed(("one", "two"))
     for k in ("one", "two"):
         (folder / k).mkdir()
@@ -250,7 +250,7 @@ def test_one_map_of_two_photos_is_refused(posed):
 # ---- Densities ----
 
 
-def lens_of(keys):
+def make_lens(keys):
     named = {k: v for k, v in keys.items() if k[0] in "kp"}
     return Intrinsics(
         64, 48, keys["fl_x"], keys["fl_y"], keys.get("cx", 32.0), 24.0, **named, fisheye="camera_model" in keys
@@ -259,8 +259,8 @@ def lens_of(keys):
 
 @pytest.mark.parametrize("name", LENSES)
 def test_uniform_gaze_has_a_constant_density(name, posed):
-    """Whatever the lens: as an image of ones per steradian, and as one of solid angles per pixel."""
-    folder, solid = posed(("a",), **LENSES[name]), pixel_solid_angles(lens_of(LENSES[name]))
+    """For any lens: a map of ones per steradian, and a map of solid angles per pixel."""
+    folder, solid = posed(("a",), **LENSES[name]), pixel_solid_angles(make_lens(LENSES[name]))
     for per, image in (("steradian", np.ones((48, 64))), ("pixel", solid)):
         write(folder / "maps" / "a.npy", image)
         view = open_salience(folder, folder / "maps", per).views[0]
@@ -269,8 +269,8 @@ def test_uniform_gaze_has_a_constant_density(name, posed):
 
 
 @pytest.mark.parametrize("name", LENSES)
-def test_draws_stand_for_equal_areas(name, posed):
-    """The mean of any function over the draws is its integral over the picture; here of a lobe, by fine quadrature."""
+def test_samples_represent_equal_areas(name, posed):
+    """The mean of a function over the samples is its mean over the image; here for a lobe, by fine quadrature."""
     folder = posed(("a",), **LENSES[name])
     write(folder / "maps" / "a.npy", np.ones((12, 16)))
     view = open_salience(folder, folder / "maps").views[0]
@@ -281,7 +281,7 @@ def test_draws_stand_for_equal_areas(name, posed):
     assert np.all(np.abs(counts - due) <= 1.01)
     axis = np.array([-0.95, 0.2, -0.1]) / np.linalg.norm([-0.95, 0.2, -0.1])
     lobe = lambda d: np.exp(8 * (d @ axis - 1))
-    fine = lens_of(LENSES[name]).resized(256, 192)
+    fine = make_lens(LENSES[name]).resized(256, 192)
     from nerg_mi.photos.cameras import pixel_directions
 
     world = pixel_directions(fine) @ view.camera.to_world[:3, :3].T
@@ -289,19 +289,19 @@ def test_draws_stand_for_equal_areas(name, posed):
     assert view.total_solid_angle * lobe(directions).mean() == pytest.approx(expected, rel=0.01)
 
 
-def test_a_view_is_looked_up_where_it_looks(posed):
+def test_density_is_evaluated_in_view(posed):
     folder = posed(("a",), **LENSES["barrel"])
     image = np.random.default_rng(3).uniform(0.1, 1, (48, 64))
     write(folder / "maps" / "a.npy", image)
     view = open_salience(folder, folder / "maps").views[0]
     directions, which = view.sample(500, np.random.default_rng(1))
-    density, known = view.evaluate(directions)
-    assert known.all() and np.allclose(density, view.density.ravel()[which], rtol=1e-5)
+    density, is_known = view.evaluate(directions)
+    assert is_known.all() and np.allclose(density, view.density.ravel()[which], rtol=1e-5)
     # The camera looks along -x.
     assert not view.evaluate(np.array([[1.0, 0, 0], [0, 1, 0]]))[1].any()
 
 
-def test_fewer_pixels_hold_the_same_gaze(posed):
+def test_reduced_view_preserves_gaze(posed):
     folder = posed(("a",))
     image = np.random.default_rng(3).uniform(0, 1, (48, 64))
     write(folder / "maps" / "a.npy", image)
@@ -339,7 +339,7 @@ def test_masked_pixels_are_unknown(posed):
         open_salience(folder, folder / "maps")
 
 
-def test_views_move_with_their_coordinates(posed):
+def test_views_are_transformed(posed):
     folder = posed()
     write(folder / "maps" / "b.npy", np.ones((48, 64)))
     turn = np.diag([2.0, 2.0, 2.0, 1.0])
@@ -348,7 +348,7 @@ def test_views_move_with_their_coordinates(posed):
     assert np.allclose(view.camera.center, [3, 2, 3]) and np.allclose(view.camera.axis, [-1, 0, 0])
 
 
-def test_a_model_makes_the_maps(posed, rgb):
+def test_model_computes_maps(posed, rgb):
     folder = posed(("a",))
     photo = np.random.default_rng(0).integers(90, 110, (48, 64, 3)).astype(np.uint8)
     photo[20:28, 40:48] = 250

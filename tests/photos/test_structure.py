@@ -25,50 +25,50 @@ from nerg_mi.photos.colmap import read_colmap
 from nerg_mi.photos.images import read_image
 from nerg_mi.photos.structure import (
     MAX_EXHAUSTIVE,
-    PhotoFolders,
     PhotoCopy,
+    PhotoFolders,
     StructureSettings,
     assign_cameras,
     check_installed,
-    select_pairs,
     copy_photos,
     encode_image,
+    encode_small_image,
+    fit_size,
     list_photos,
     reconstruct,
-    encode_small_image,
+    select_pairs,
     small_file_name,
-    fit_size,
 )
 from tests.photos import rendered
 
-# ---- Which pictures are compared ----
+# ---- Image pairs ----
 
 
-def test_few_are_all_compared():
+def test_few_images_are_all_matched():
     assert select_pairs(4) == [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
     assert len(select_pairs(MAX_EXHAUSTIVE)) == MAX_EXHAUSTIVE * (MAX_EXHAUSTIVE - 1) // 2
     assert select_pairs(4, "exhaustive") == select_pairs(4) and select_pairs(0) == []
 
 
-def test_many_are_compared_with_neighbours_and_landmarks():
+def test_many_images_are_matched_with_neighbours_and_landmarks():
     pairs = select_pairs(600)
     assert pairs == sorted(set(pairs)) and all(0 <= i < j < 600 for i, j in pairs)
     assert {(5, 6), (5, 15), (5, 21), (5, 37), (0, 590)} <= set(pairs) and (5, 16) not in pairs
-    # The work grows with their number, and not with its square.
+    # The work grows with the number of images, and not with its square.
     assert len(pairs) < 600 * 16 + 60 * 60 and len(select_pairs(4000)) < 4000 * 19 + 60 * 60
 
 
-def test_all_of_many_where_it_is_asked_for():
+def test_exhaustive_matching_can_be_requested():
     assert len(select_pairs(150, "exhaustive")) == 150 * 149 // 2 > len(select_pairs(150, "sequential"))
     with pytest.raises(NergError, match="matching must be auto"):
         select_pairs(4, "vocabulary")
 
 
-# ---- Photos of a folder: turned as they are to be looked at, and what is wrong with others named ----
+# ---- Photos of a folder: upright copies, and reasons for unusable files ----
 
 
 def ramp(width: int = 48, height: int = 32, seed: int = 0) -> Image.Image:
-    """A smooth picture, red to the right and green downwards; the seed is in its blue."""
+    """A smooth image, red towards the right and green towards the bottom; the seed determines its blue."""
     x, y = np.meshgrid(np.linspace(0, 255, width), np.linspace(0, 255, height))
     return Image.fromarray(np.stack([x, y, np.full_like(x, 20 * seed)], axis=-1).astype(np.uint8))
 
@@ -81,7 +81,7 @@ def folders(tmp_path) -> PhotoFolders:
     return made
 
 
-def copied(folder: Path, folders: PhotoFolders, longest: int = 24):
+def copy_all(folder: Path, folders: PhotoFolders, longest: int = 24):
     steps = []
     pictures, unused = copy_photos(list_photos(folder)[0], folders, longest, lambda *now: steps.append(now))
     assert steps and steps[-1][0] == steps[-1][1] == len(steps)
@@ -95,10 +95,10 @@ def folder(tmp_path) -> Path:
     return out
 
 
-def test_what_stands_upright_is_copied_byte_for_byte(folder, folders):
+def test_upright_photo_is_copied_byte_by_byte(folder, folders):
     ramp().save(folder / "b.JPG", quality=90)
     ramp(seed=2).convert("L").save(folder / "a c.png")
-    pictures, unused = copied(folder, folders)
+    pictures, unused = copy_all(folder, folders)
     assert [p.name for p in pictures] == ["a c.png", "b.JPG"] and not unused
     for k, p in enumerate(pictures):
         assert (folders.images / p.name).read_bytes() == (folder / p.name).read_bytes()
@@ -106,10 +106,10 @@ def test_what_stands_upright_is_copied_byte_for_byte(folder, folders):
         assert p.focal is None
 
 
-# Where red and green grow in the file, so that after turning red grows to the right and green downwards.
+# Directions of red and green in the file, so that after rotation red increases to the right and green downwards.
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_a_photo_is_turned_as_its_notes_say(orientation, folder, folders):
-    """EXIF, tag 0x0112: the file of an upright picture is made by the inverse of what viewers do."""
+def test_photo_is_rotated_by_exif(orientation, folder, folders):
+    """EXIF tag 0x0112: the file of an upright image is created with the inverse of the viewer's transform."""
     undo = {
         2: Image.Transpose.FLIP_LEFT_RIGHT,
         3: Image.Transpose.ROTATE_180,
@@ -123,27 +123,27 @@ def test_a_photo_is_turned_as_its_notes_say(orientation, folder, folders):
     notes = Image.Exif()
     notes[0x0112] = orientation
     stored.save(folder / "a.jpg", quality=98, exif=notes)
-    (picture,), unused = copied(folder, folders)
+    (picture,), unused = copy_all(folder, folders)
     assert picture.size == (48, 32) and not unused
-    # As the trainer sees it, which passes over such notes.
+    # As the trainer reads it, which ignores the orientation.
     seen = read_image(folders.images / "a.jpg").astype(int)
     assert np.abs(seen - np.asarray(ramp())).mean() < 3
     assert Image.open(folders.images / "a.jpg").getexif().get(0x0112, 1) == 1
 
 
-def test_notes_tell_focal_length_and_camera(folder, folders):
+def test_exif_has_focal_length_and_camera(folder, folders):
     notes = Image.Exif()
     notes[0x010F], notes[0x0110] = "Maker", "Model"
     notes.get_ifd(0x8769)[0xA405] = 26
     notes.get_ifd(0x8769)[0x920A] = 4.25
     ramp(360, 240).save(folder / "a.jpg", exif=notes)
-    (picture,), _ = copied(folder, folders)
-    # A picture of the shape of film, on which 36 mm are 360 pixels.
+    (picture,), _ = copy_all(folder, folders)
+    # An image with the aspect ratio of film, on which 36 mm are 360 pixels.
     assert picture.focal == pytest.approx(260, rel=1e-4) and picture.camera_key[:2] == ("Maker", "Model")
     assert float(picture.camera_key[2]) == 4.25
 
 
-def test_what_cannot_be_used_is_named(folder, folders):
+def test_unusable_photos_are_listed(folder, folders):
     ramp().save(folder / "a.jpg", quality=95)
     ramp().save(folder / "b.jpg", quality=95)
     ramp(seed=5).save(folder / "good.jpg")
@@ -156,7 +156,7 @@ def test_what_cannot_be_used_is_named(folder, folders):
     ramp(seed=1).save(folder / "png.jpg", "png")
     (folder / "heic.jpg").write_bytes(b"\0\0\0\x18ftypheic" + bytes(100))
     ramp().quantize(16).save(folder / "palette.png")
-    pictures, unused = copied(folder, folders)
+    pictures, unused = copy_all(folder, folders)
     used = ["a.jpg", "good.jpg", "palette.png", "png.jpg"]
     assert [p.name for p in pictures] == used and {p.name for p in folders.images.iterdir()} == set(used)
     assert Image.open(folders.images / "palette.png").mode == "RGB"
@@ -170,19 +170,19 @@ def test_links_out_of_the_folder_are_followed_only_if_allowed(folder, folders, t
     ramp(seed=1).save(folder / "a.jpg")
     (folder / "b.jpg").symlink_to(tmp_path / "private.jpg")
     (folder / "c.jpg").symlink_to("a.jpg")
-    pictures, unused = copied(folder, folders)
+    pictures, unused = copy_all(folder, folders)
     assert [p.name for p in pictures] == ["a.jpg"] and "same file" in unused["c.jpg"]
     assert "outside of" in unused["b.jpg"] and "--allow-outside" in unused["b.jpg"]
-    found, _ = copy_photos(list_photos(folder)[0], folders, 24, lambda *now: None, allow_outside=True)
-    assert [p.name for p in found] == ["a.jpg", "b.jpg"]
+    names, _ = copy_photos(list_photos(folder)[0], folders, 24, lambda *now: None, allow_outside=True)
+    assert [p.name for p in names] == ["a.jpg", "b.jpg"]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="names of files are bytes on Linux alone")
-def test_names_that_cannot_be_stored_are_told(folder, folders):
+def test_invalid_names_are_listed(folder, folders):
     ramp().save(folder / "good.jpg")
     for k, name in enumerate((b"caf\xe9.jpg", b"two\nlines.jpg", b"\x1b[31m.jpg")):
         ramp(seed=k + 1).save(folder / os.fsdecode(name))
-    pictures, unused = copied(folder, folders)
+    pictures, unused = copy_all(folder, folders)
     assert [p.name for p in pictures] == ["good.jpg"]
     assert len(unused) == 3 and all("rename it" in reason for reason in unused.values())
 
@@ -194,20 +194,20 @@ def test_photos_are_as_large_as_their_bytes_warrant(folder, folders, monkeypatch
     (folder / "b.png").write_bytes(raw[:12] + claim + zlib.crc32(claim).to_bytes(4, "big") + raw[33:])
     with (folder / "c.jpg").open("wb") as file:
         file.truncate((1 << 28) + 1)
-    pictures, unused = copied(folder, folders)
+    pictures, unused = copy_all(folder, folders)
     assert [p.name for p in pictures] == ["a.png"]
     assert "8,193 x 8,193 pixels" in unused["b.png"] and "make it smaller" in unused["b.png"]
     assert "268,435,457 bytes" in unused["c.jpg"]
-    # JPEG, in which it is stored where it is turned, has no longer sides.
+    # Rotated photos are stored as JPEG, which does not support longer sides.
     Image.new("L", (65_501, 1)).save(folder / "d.png")
-    assert "a side of 65,501 pixels" in copied(folder, folders)[1]["d.png"]
-    # Pillow's own limit is lower than what telephones take by now.
+    assert "a side of 65,501 pixels" in copy_all(folder, folders)[1]["d.png"]
+    # Pillow's limit is below the size of current telephone photos.
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 100)
-    assert [p.name for p in copied(folder, folders)[0]] == ["a.png"]
+    assert [p.name for p in copy_all(folder, folders)[0]] == ["a.png"]
 
 
-def test_odd_notes_leave_a_photo_as_it_is(folder, folders):
-    """Of each kind and size: Pillow's own turning writes the notes anew, and fails on some."""
+def test_unusual_exif_is_ignored(folder, folders):
+    """Of each type and size. Pillow's own rotation writes the EXIF data again, and fails for some."""
     entry = lambda *numbers: struct.pack(">HHII", *numbers)
     notes = [
         entry(0x0112, 3, 0xFFFFFFFF, 8) + entry(0x8769, 4, 1 << 30, 8),
@@ -215,34 +215,34 @@ def test_odd_notes_leave_a_photo_as_it_is(folder, folders):
         entry(0x0112, 2, 4, 0x36363636),
         entry(0x8769, 4, 1, 8) + entry(0x0112, 5, 1, 8),
     ]
-    for k, found in enumerate(notes):
-        head = b"Exif\0\0MM\0*\0\0\0\x08" + struct.pack(">H", len(found) // 12)
-        # What follows are the same notes again.
-        ramp(seed=k).save(folder / f"{k}.jpg", exif=head + found + struct.pack(">I", 8))
+    for k, photo in enumerate(notes):
+        head = b"Exif\0\0MM\0*\0\0\0\x08" + struct.pack(">H", len(photo) // 12)
+        # The following bytes are the same EXIF data again.
+        ramp(seed=k).save(folder / f"{k}.jpg", exif=head + photo + struct.pack(">I", 8))
     damaged = b"Exif\0\0MM\0*\xff\xff\xff\xff" + bytes(range(256))
     ramp(seed=4).save(folder / "4.jpg", exif=damaged)
-    pictures, unused = copied(folder, folders)
+    pictures, unused = copy_all(folder, folders)
     assert [p.size for p in pictures] == [(48, 32)] * 5 and not unused
     assert pictures[4].camera_key in ((), ("", "", ""))
 
 
-def test_others_are_named_and_hidden_ones_are_not(folder):
+def test_unsupported_images_are_listed(folder):
     ramp().save(folder / "a.jpg")
     for name in ("b.HEIC", ".c.jpg", "notes.txt"):
         (folder / name).write_bytes(b"x")
-    photos, others = list_photos(folder)
-    assert [p.name for p in photos] == ["a.jpg"] and [o.name for o in others] == ["b.HEIC"]
-    assert "JPEG and PNG" in others[0].reason
+    photos, unsupported = list_photos(folder)
+    assert [p.name for p in photos] == ["a.jpg"] and [o.name for o in unsupported] == ["b.HEIC"]
+    assert "JPEG and PNG" in unsupported[0].reason
 
 
-def test_a_pipe_is_no_photo(folder, folders):
+def test_pipe_is_refused(folder, folders):
     ramp().save(folder / "a.jpg")
     os.mkfifo(folder / "b.jpg")
-    pictures, unused = copied(folder, folders)
+    pictures, unused = copy_all(folder, folders)
     assert [p.name for p in pictures] == ["a.jpg"] and 'b.jpg" is a pipe' in unused["b.jpg"]
 
 
-def test_a_folder_without_photos_is_told(folder, tmp_path):
+def test_folder_without_photos_is_refused(folder, tmp_path):
     with pytest.raises(NergError, match="name the folder"):
         list_photos(folder)
     (folder / "images").mkdir()
@@ -255,7 +255,7 @@ def test_a_folder_without_photos_is_told(folder, tmp_path):
         list_photos(tmp_path / "nowhere")
 
 
-# ---- Copies of pictures, and which of them share a camera ----
+# ---- Copies of images, and shared cameras ----
 
 
 def test_the_longer_side_is_bounded():
@@ -269,11 +269,13 @@ def test_small_copies_are_averages():
     pixels[:, ::2] = 200
     small = np.asarray(Image.open(io.BytesIO(encode_small_image(Image.fromarray(pixels), (15, 10)))))
     assert small.shape == (10, 15, 3) and abs(small.astype(int) - 100).max() <= 12
-    assert np.array_equal(np.asarray(Image.open(io.BytesIO(encode_small_image(Image.fromarray(pixels), (60, 40))))), pixels)
+    assert np.array_equal(
+        np.asarray(Image.open(io.BytesIO(encode_small_image(Image.fromarray(pixels), (60, 40))))), pixels
+    )
 
 
 @pytest.mark.parametrize("suffix, kind", [(".png", "PNG"), (".JPG", "JPEG"), (".jpeg", "JPEG")])
-def test_files_are_of_their_names_kind(suffix, kind):
+def test_encoding_follows_suffix(suffix, kind):
     image = Image.fromarray(np.full((8, 9), 77, np.uint8))
     opened = Image.open(io.BytesIO(encode_image(image, suffix)))
     assert opened.format == kind and opened.mode == "RGB" and opened.size == (9, 8)
@@ -288,7 +290,7 @@ def test_pictures_of_one_size_share_a_camera():
     assert assign_cameras(made) == [0, 0, 1]
 
 
-# ---- The process that finds poses, from outside: what it is given, and how its end is told ----
+# ---- The subprocess: its input, and explanations of failures ----
 
 PICTURES = [PhotoCopy(f"{k}.jpg", (400, 300), (200, 150), focal=380.0 if k else None) for k in range(4)]
 
@@ -299,7 +301,7 @@ def installed(monkeypatch):
 
 
 def ending(monkeypatch, program: str) -> None:
-    """A process of ours in place of the worker."""
+    """Replace the worker by another process."""
     started = structure.subprocess.Popen
     monkeypatch.setattr(
         structure.subprocess,
@@ -308,7 +310,7 @@ def ending(monkeypatch, program: str) -> None:
     )
 
 
-def told(tmp_path: Path) -> str:
+def settings_passed(tmp_path: Path) -> str:
     with pytest.raises(NergError) as said:
         reconstruct(PICTURES, tmp_path, StructureSettings(), lambda *now: None)
     return str(said.value)
@@ -321,17 +323,18 @@ def test_without_pycolmap(monkeypatch, tmp_path):
             call()
 
 
-def test_what_is_asked_for(installed, monkeypatch, tmp_path):
+def test_settings_are_passed_to_colmap(installed, monkeypatch, tmp_path):
     ending(monkeypatch, "import os; os._exit(3)")
-    told(tmp_path)
+    settings_passed(tmp_path)
     job = json.loads((tmp_path / "job.json").read_text())
-    # The focal length is that of the small pictures; the median of what photos say counts for their camera.
+    # The focal length is that of the small images, the median over the photos of the camera.
     assert job["cameras"] == [{"size": [400, 300], "small": [200, 150], "focal": 190.0, "pictures": 4}]
     assert [p["camera"] for p in job["pictures"]] == [0] * 4 and job["lens"] is None and job["threads"] == -1
 
 
 @pytest.mark.parametrize(
-    "settings, said", [(StructureSettings(lens="fish"), "lens must be auto"), (StructureSettings(matching="a"), "matching must be auto")]
+    "settings, said",
+    [(StructureSettings(lens="fish"), "lens must be auto"), (StructureSettings(matching="a"), "matching must be auto")],
 )
 def test_wrong_settings(installed, settings, said, tmp_path):
     with pytest.raises(NergError, match=said):
@@ -347,29 +350,29 @@ def test_wrong_settings(installed, settings, said, tmp_path):
         ("import os; os.abort()", f"with code {-signal.SIGABRT}"),
     ],
 )
-def test_an_end_of_its_own_is_told_in_a_sentence(installed, program, said, monkeypatch, tmp_path):
+def test_failures_of_colmap_are_explained(installed, program, said, monkeypatch, tmp_path):
     ending(monkeypatch, program)
-    words = told(tmp_path)
+    words = settings_passed(tmp_path)
     assert re.search(said, words) and "\n" not in words
 
 
-def test_it_ends_with_whoever_started_it(installed, monkeypatch, tmp_path):
-    """Ctrl-C comes while its lines are read."""
+def test_subprocess_ends_with_parent(installed, monkeypatch, tmp_path):
+    """Ctrl-C arrives while its lines are read."""
     program = "import os, sys, time; print([os.getpid(), 0, 1], flush=True); time.sleep(600)"
     ending(monkeypatch, program)
-    found = []
+    processes = []
 
-    def progress(pid, done, of):
-        found.append(pid)
+    def progress(pid, done, total):
+        processes.append(pid)
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         reconstruct(PICTURES, tmp_path, StructureSettings(), progress)
     with pytest.raises(ProcessLookupError):
-        os.kill(found[0], 0)
+        os.kill(processes[0], 0)
 
 
-# ---- Reconstruction of photos whose poses are known, in the process in which it runs ----
+# ---- Reconstruction of photos with known poses, in the subprocess ----
 
 
 @pytest.fixture(scope="module")
@@ -378,8 +381,8 @@ def photos(tmp_path_factory):
     return rendered.write_photos(tmp_path_factory.mktemp("photos"))
 
 
-def found(photos, work):
-    """A reconstruction, its model as it is read, and what was told on the way."""
+def find_poses(photos, work):
+    """Return a reconstruction, its model as it is read, and the progress reports."""
     folders, steps = PhotoFolders(work / "images", work / "small"), []
     folders.images.mkdir()
     folders.small_images.mkdir()
@@ -389,35 +392,36 @@ def found(photos, work):
 
 
 def pose_errors(poses, reference):
-    """Degrees between rotations, distances of centres in units of the extent of those of the reference, and the
-    similarity that was taken out of both."""
+    """Return the rotation errors in degrees, the distances of centres relative to the extent of the reference, and the
+    similarity that aligns both.
+    """
     similarity = fit_similarity(poses[:, :3, 3], reference[:, :3, 3])
     turn = similarity[:3, :3] / np.cbrt(np.linalg.det(similarity[:3, :3]))
-    apart = np.swapaxes(reference[:, :3, :3], 1, 2) @ turn @ poses[:, :3, :3]
+    distances = np.swapaxes(reference[:, :3, :3], 1, 2) @ turn @ poses[:, :3, :3]
     centers = reference[:, :3, 3]
     away = poses[:, :3, 3] @ similarity[:3, :3].T + similarity[:3, 3] - centers
     extent = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
-    angles = np.degrees(Rotation.from_matrix(apart).magnitude())
+    angles = np.degrees(Rotation.from_matrix(distances).magnitude())
     return angles, np.linalg.norm(away, axis=1) / extent, similarity
 
 
 @pytest.fixture(scope="module")
 def first(photos, tmp_path_factory):
-    """A folder, and what was found of the photos in it."""
+    """A folder, and the reconstruction of the photos in it."""
     work = tmp_path_factory.mktemp("first")
-    return work, found(photos, work)
+    return work, find_poses(photos, work)
 
 
-def test_poses_and_lens_are_found(first):
+def test_poses_and_lens_are_estimated(first):
     made, model, steps = first[1]
     assert made.parts == [[f"{k}.png" for k in range(8)]] and 0 < made.error < 0.5 and made.points > 300
     assert list(dict.fromkeys(stage for stage, _, _ in steps)) == ["features", "matching", "mapping"]
     assert steps[-1] == ("mapping", 8, 8)
     poses = np.array([f.to_world for f in model.frames])
     assert np.allclose(poses, made.to_world)
-    angles, apart, similarity = pose_errors(poses, rendered.poses())
-    assert angles.max() < 1 and apart.max() < 0.01
-    # The model stands upright, and its points are those of a floor and a box on it.
+    angles, distances, similarity = pose_errors(poses, rendered.poses())
+    assert angles.max() < 1 and distances.max() < 0.01
+    # The model is upright, and its points are on a floor and a box on it.
     truth = similarity[:3, :3] / np.cbrt(np.linalg.det(similarity[:3, :3]))
     assert np.degrees(np.arccos(truth[2, 2])) < 1 and made.up.sure and made.up.plane_fraction > 0.3
     points = model.points @ similarity[:3, :3].T + similarity[:3, 3]
@@ -430,7 +434,7 @@ def test_poses_and_lens_are_found(first):
 
 @pytest.mark.nightly
 def test_equal_photos_give_equal_poses_whatever_their_size(photos, first, tmp_path):
-    """The second time with small copies of the same pixels, of photos that are larger: of the same place."""
+    """The second run uses larger photos of the same scene, whose small copies have the same pixels."""
     from PIL import Image
 
     (tmp_path / "large").mkdir()
@@ -439,27 +443,27 @@ def test_equal_photos_give_equal_poses_whatever_their_size(photos, first, tmp_pa
     work, models = [first[0], tmp_path / "b", tmp_path / "c"], [first[1][1]]
     for at, folder in zip(work[1:], (photos, tmp_path / "large")):
         at.mkdir()
-        models.append(found(folder, at)[1])
+        models.append(find_poses(folder, at)[1])
     files = [[(at / "sparse" / "0" / f"{k}.bin").read_bytes() for k in ("images", "points3D")] for at in work[:2]]
     assert files[0] == files[1]
     large, small = models[2].frames[0].intrinsics(960, 720), models[0].frames[0].intrinsics(320, 240)
     assert large.fx == pytest.approx(3 * small.fx, rel=0.02) and large.cx == 480
-    angles, apart, _ = pose_errors(*(np.array([f.to_world for f in m.frames]) for m in (models[2], models[0])))
-    assert angles.max() < 0.5 and apart.max() < 0.01
+    angles, distances, _ = pose_errors(*(np.array([f.to_world for f in m.frames]) for m in (models[2], models[0])))
+    assert angles.max() < 0.5 and distances.max() < 0.01
 
 
-def test_nothing_that_fits_together(tmp_path):
+def test_unrelated_photos_give_no_model(tmp_path):
     pytest.importorskip("pycolmap")
     from PIL import Image
 
     (tmp_path / "photos").mkdir()
     for k in range(3):
         Image.fromarray(np.full((60, 80, 3), 80 * k, np.uint8)).save(tmp_path / "photos" / f"{k}.png")
-    assert found(tmp_path / "photos", tmp_path)[0] is None
+    assert find_poses(tmp_path / "photos", tmp_path)[0] is None
 
 
-def test_it_speaks_lines_of_json_alone(photos, tmp_path):
-    """What libraries print, and why it ends, goes to the standard error."""
+def test_standard_output_is_json_lines(photos, tmp_path):
+    """The output and errors of libraries go to the standard error."""
     command = [sys.executable, "-m", "nerg_mi.photos.structure_worker", str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 1 and done.stdout == "" and "job.json" in done.stderr

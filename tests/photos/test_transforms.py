@@ -1,4 +1,4 @@
-"""Reading transforms files: what is understood, what is listed, what is refused."""
+"""Transforms files: accepted, listed and refused content."""
 
 import json
 import os
@@ -13,7 +13,7 @@ from nerg_mi.photos.transforms import read_dataparser, read_frame_poses, read_tr
 from tests.photos.written_sets import POSE, frame
 
 
-def test_intrinsics_of_a_frame_overrule_shared_ones(write):
+def test_frame_intrinsics_override_shared_ones(write):
     t = read_transforms(write({"fl_x": 30.0, "k1": 0.1, "frames": [frame("a.png", fl_x=40.0, k1=0.0), frame("b.png")]}))
     assert [f.intrinsics(8, 8).fx for f in t.frames] == [40.0, 30.0]
     assert [f.intrinsics(8, 8).k1 for f in t.frames] == [0.0, 0.1]
@@ -25,7 +25,7 @@ def test_intrinsics_of_a_frame_overrule_shared_ones(write):
         ({"fl_x": 3.0, "k1": 0.1, "k4": 0.01, "camera_model": "OPENCV_FISHEYE"}, {"fisheye": 1, "k1": 0.1, "k4": 0.01}),
         ({"fl_x": 3.0, "k1": 0.1, "k4": 0.01, "is_fisheye": True}, {"fisheye": 1, "k1": 0.1, "k4": 0.01}),
         ({"fl_x": 3.0, "k4": 0.2, "camera_model": "FULL_OPENCV"}, {"fx": 3, "fy": 3, "k4": 0.2}),
-        # Angles in degrees are instant-ngp's, a list of coefficients is nerfstudio's.
+        # instant-ngp uses angles in degrees, nerfstudio a list of coefficients.
         ({"x_fov": 90.0}, {"fx": 4, "fy": 4}),
         (
             {"fl_x": 3.0, "k1": 9.0, "distortion_params": [0.1, 0.2, 0.3, 0, 0.5, 0.6]},
@@ -40,7 +40,7 @@ def test_spellings_of_a_lens(write, keys, expected):
 
 
 @pytest.mark.parametrize("keys", [{"fl_x": 1e-300}, {"fl_x": 1e300}, {"cx": 1e300}, {"cy": -1e9}, {"k2": 1e200}])
-def test_lenses_that_no_camera_has_are_refused(write, keys):
+def test_invalid_lenses_are_refused(write, keys):
     t = read_transforms(write({"fl_x": 30.0, **keys, "frames": [frame("a.png")]}))
     with pytest.raises(NergError, match="a.png"):
         t.frames[0].intrinsics(8, 8)
@@ -79,7 +79,7 @@ def test_units_and_kinds_of_depth(write):
     assert depth("d.png") == DepthFile(folder / "d.png", 1e-3, True)
     assert depth("d.png", "depth_path", integer_depth_scale=0.01) == DepthFile(folder / "d.png", 0.01, True)
     assert depth("d.png", depth_unit_scale_factor=0.5, applied_scale=2.0).unit == pytest.approx(1.0)
-    # As nerfstudio reads them: steps of a millimetre along the axis, whatever the kind of file; EXR as Record3D's.
+    # As in nerfstudio: millimetres along the axis for all file formats, except EXR, which is that of Record3D.
     assert depth("d.npy") == DepthFile(folder / "d.npy", 1e-3, True)
     assert depth("d.npy", depth_unit_scale_factor=1.0) == DepthFile(folder / "d.npy", 1.0, True)
     assert depth("d.npy", depth_unit_scale_factor=0.5, applied_scale=2.0).unit == pytest.approx(1.0)
@@ -89,7 +89,7 @@ def test_units_and_kinds_of_depth(write):
     assert depth("d.png", enable_depth_loading=False) is None
 
 
-def test_frames_that_cannot_be_used_are_listed_with_reasons(write):
+def test_unusable_frames_are_listed_with_reasons(write):
     names = [f"{c}.png" for c in "abfghijk"]
     path = write(
         {
@@ -112,7 +112,7 @@ def test_frames_that_cannot_be_used_are_listed_with_reasons(write):
         names,
     )
     t = read_transforms(path)
-    # The name that sorts first of the two spellings of one file is the one kept.
+    # Of two spellings of one file, the one that sorts first is used.
     assert [f.name for f in t.frames] == ["./a.png"]
     reasons = {u.name: u.reason for u in t.unused}
     for name, part in {
@@ -132,13 +132,13 @@ def test_frames_that_cannot_be_used_are_listed_with_reasons(write):
     assert not reasons
 
 
-def test_a_missing_depth_file_costs_the_depth_only(write):
+def test_missing_depth_file_disables_depth(write):
     t = read_transforms(write({"fl_x": 1.0, "frames": [frame("a.png", depth_file_path="d.npy")]}))
     assert t.frames[0].depth is None and "a.png" in t.notes[0] and "d.npy" in t.notes[0]
 
 
 @pytest.mark.parametrize("name", ["a.png", "A.png", "mask.png", "depth.png", "dynamic_mask_a.png"])
-def test_a_pipe_is_no_missing_file(write, name):
+def test_pipe_is_refused(write, name):
     keys = {"mask_path": "mask.png"} if name == "mask.png" else {}
     entry = frame("A.png" if name == "a.png" else "a.png", depth_file_path="depth.png", **keys)
     path = write({"fl_x": 1.0, "frames": [entry, frame("b.png")]}, {"a.png", "b.png", "depth.png"} - {name.lower()})
@@ -173,15 +173,15 @@ def test_a_pipe_is_no_missing_file(write, name):
         ),
     ],
 )
-def test_bad_files_are_named(write, content, message):
+def test_invalid_file_errors_name_file(write, content, message):
     path = write({})
     path.write_text(content if isinstance(content, str) else json.dumps(content))
     with pytest.raises(NergError, match=message):
         read_transforms(path)
 
 
-def test_original_coordinates_undo_what_was_applied(write):
-    """x_file = s (A x + t): a pose of the original goes there and comes back."""
+def test_original_coordinates_invert_applied_transform(write):
+    """x_file = s (A x + t): a pose in original coordinates is transformed forth and back."""
     turn, shift, s = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]]), np.array([1.0, 2, 3]), 2.5
     pose = np.eye(4)
     pose[:3, 3] = [4, 5, 6]
@@ -213,7 +213,7 @@ def test_dataparser_transforms(tmp_path):
         read_dataparser(path)
 
 
-def test_nerfstudios_lists_of_files_split(write):
+def test_nerfstudio_file_lists_define_split(write):
     names = ["a.png", "b.png", "c.png", "d.png"]
     t = read_transforms(
         write(
@@ -274,12 +274,12 @@ def test_links_within_the_folder_are_followed(tmp_path, write):
     assert len(read_transforms(path).frames) == len(read_transforms(outer / "transforms.json").frames) == 1
 
 
-def test_an_absolute_path_of_another_place_is_not_even_looked_for(tmp_path, write, monkeypatch):
+def test_absolute_path_outside_is_not_accessed(tmp_path, write, monkeypatch):
     path = write({"fl_x": 30.0, "frames": [frame("a.png"), frame("/etc/passwd"), frame("../../etc/hostname")]})
-    asked = []
-    monkeypatch.setattr("pathlib.Path.is_file", lambda self: asked.append(self) or True)
+    accessed = []
+    monkeypatch.setattr("pathlib.Path.is_file", lambda self: accessed.append(self) or True)
     t = read_transforms(path)
-    assert len(t.unused) == 2 and not [p for p in asked if "etc" in str(p)]
+    assert len(t.unused) == 2 and not [p for p in accessed if "etc" in str(p)]
 
 
 @pytest.mark.parametrize(
@@ -297,7 +297,7 @@ def test_an_absolute_path_of_another_place_is_not_even_looked_for(tmp_path, writ
         {"depth_file_path": "a.png", "depth_unit_scale_factor": float("inf")},
     ],
 )
-def test_numbers_and_names_that_nothing_can_hold_cost_their_frame(write, keys):
+def test_invalid_numbers_and_names_exclude_frame(write, keys):
     t = read_transforms(write({"fl_x": 30.0, "frames": [frame("b.png"), {**frame("a.png"), **keys}]}))
     assert len(t.frames) == len(t.unused) == 1 and str(t.unused[0]).isprintable()
 
@@ -312,8 +312,8 @@ def test_numbers_and_names_that_nothing_can_hold_cost_their_frame(write, keys):
         *((keys, [1, 1, 1, 1]) for keys in ({}, {"from_mitsuba": False}, {"from_mitsuba": None}, {"from_na": False})),
     ],
 )
-def test_cameras_of_mitsuba_are_turned(write, keys, turns):
-    """They look along +z with x to the left; positions stay, as in instant-ngp's nerf_matrix_to_ngp."""
+def test_mitsuba_cameras_are_converted(write, keys, turns):
+    """They look along +z with x to the left; positions do not change, as in instant-ngp's nerf_matrix_to_ngp."""
     pose = np.array([[0.0, 0, 1, 3], [1, 0, 0, 4], [0, 1, 0, 5], [0, 0, 0, 1]])
     path = write({"fl_x": 1.0, **keys, "frames": [frame("a.png", transform_matrix=pose.tolist())]})
     expected = pose * turns
@@ -345,7 +345,7 @@ CHANGES = [
 
 @pytest.mark.parametrize("keys", CHANGES, ids=lambda k: next(iter(k)))
 def test_an_unknown_key_that_changes_meaning_is_refused(write, keys):
-    """With the file's name where it stands for all frames, and costing the frame where it stands in one."""
+    """A key of the file is an error with the file name; a key of a frame excludes the frame."""
     key = next(iter(keys))
     path = write({"fl_x": 1.0, **keys, "frames": [frame("a.png")]})
     with pytest.raises(NergError, match=f'transforms.json.*"{key}"'):
@@ -372,18 +372,18 @@ def test_an_unknown_key_that_changes_meaning_is_refused(write, keys):
         {"aabb_scale": 16, "scale": 0.3, "offset": [0, 0, 0], "sharpness": 9.0, "colmap_im_id": 7, "rotation": 0.1},
     ],
 )
-def test_keys_that_change_nothing_are_read_over(write, keys):
+def test_harmless_keys_are_ignored(write, keys):
     t = read_transforms(write({"fl_x": 1.0, "frames": [frame("a.png", **keys)]}))
     assert np.array_equal(t.frames[0].to_world, np.eye(4)) and "a.png" in t.frames[0].name
 
 
-def test_unknown_keys_of_depth_are_refused_where_there_is_depth(write):
+def test_unknown_depth_keys_are_refused_with_depth(write):
     content = {"fl_x": 1.0, "depth_scale": 4000, "frames": [frame("a.png", depth_file_path="b.png")]}
     with pytest.raises(NergError, match='"depth_scale".*depth_unit_scale_factor'):
         read_transforms(write(content))
 
 
-def test_keys_that_are_not_used_are_named_once(write):
+def test_unused_keys_are_noted_once(write):
     frames = [frame(n, time=0.5, sharpness=3.0) for n in ("a.png", "b.png")]
     t = read_transforms(write({"fl_x": 1.0, "aabb_scale": 4, "ply_file_path": "sparse_pc.ply", "frames": frames}))
     assert t.notes == ["keys of transforms.json that are not used: ply_file_path, time"]
@@ -409,17 +409,17 @@ def test_flags_are_true_or_false(write, key):
         ("IMAGES\\K\u00dcCHE", "images/Ku\u0308che.png"),
     ],
 )
-def test_names_spelled_by_another_system_are_found(write, listed, stored):
-    """Of images, masks, depth files and lists of names."""
+def test_names_of_other_systems_are_matched(write, listed, stored):
+    """Names of images, masks and depth files, and lists of names."""
     keys = {"mask_path": listed, "depth_file_path": listed} if Path(listed).suffix else {}
     frames = [frame(listed, **keys), frame("b.png")]
     t = read_transforms(write({"fl_x": 1.0, "frames": frames, "test_filenames": [stored]}, [stored, "b.png"]))
-    found = next(f for f in t.frames if f.name == listed)
-    assert found.image.samefile(found.image.parent / Path(stored).name) and found.image.name == Path(stored).name
+    path = next(f for f in t.frames if f.name == listed)
+    assert path.image.samefile(path.image.parent / Path(stored).name) and path.image.name == Path(stored).name
     if keys:
-        assert found.mask.path == found.depth.path == found.image and t.held_out == [listed]
+        assert path.mask.path == path.depth.path == path.image and t.held_out == [listed]
 
 
-def test_names_that_two_files_fit_are_refused(write):
+def test_ambiguous_names_are_refused(write):
     t = read_transforms(write({"fl_x": 1.0, "frames": [frame("A.png"), frame("b.png")]}, ["a.png", "a.PNG", "b.png"]))
     assert "a.PNG, a.png" in t.unused[0].reason

@@ -1,4 +1,4 @@
-"""Frames of a video that is made here: sharp ones among blurred ones, turned as they are to be shown."""
+"""Frames of a synthetic video: sharp frames among blurred ones, in upright orientation."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from scipy.ndimage import gaussian_filter
 from nerg_mi.errors import NergError
 from nerg_mi.photos import video_frames as module
 from nerg_mi.photos.structure import PhotoFolders
-from nerg_mi.photos.video_frames import copy_frames, select_sharpest_frames, compute_sharpness
+from nerg_mi.photos.video_frames import compute_sharpness, copy_frames, select_sharpest_frames
 
 SHARP = (3, 8, 11)
 
 
-def texture() -> np.ndarray:
+def make_texture() -> np.ndarray:
     return np.kron(np.random.default_rng(0).uniform(30, 220, (12, 16)), np.ones((4, 4)))
 
 
@@ -32,13 +32,13 @@ def av():
 
 @pytest.fixture
 def film(av, tmp_path) -> Path:
-    """15 frames of 64 x 48 pixels at 10 a second; all but those of `SHARP` are blurred, and each has its own grey."""
+    """15 frames of 64 x 48 pixels at 10 per second; all except `SHARP` are blurred, and each has its own grey."""
     path = tmp_path / "film.mp4"
     with av.open(str(path), "w") as out:
         stream = out.add_stream("mpeg4", rate=10)
         stream.width, stream.height, stream.pix_fmt, stream.bit_rate = 64, 48, "yuv420p", 4_000_000
         for k in range(15):
-            gray = texture() if k in SHARP else gaussian_filter(texture(), 2)
+            gray = make_texture() if k in SHARP else gaussian_filter(make_texture(), 2)
             frame = av.VideoFrame.from_ndarray(np.repeat(gray[..., None], 3, axis=2).astype(np.uint8), format="rgb24")
             out.mux(stream.encode(frame))
         out.mux(stream.encode())
@@ -46,30 +46,30 @@ def film(av, tmp_path) -> Path:
 
 
 def remux(av, film, path, **metadata):
-    """The pictures of ``film`` in another container, as they are coded."""
-    with av.open(str(film)) as given, av.open(str(path), "w") as out:
+    """Copy the encoded frames of ``film`` to another container."""
+    with av.open(str(film)) as source, av.open(str(path), "w") as out:
         out.metadata.update(metadata)
-        stream = out.add_stream_from_template(given.streams.video[0])
-        for packet in given.demux(video=0):
+        stream = out.add_stream_from_template(source.streams.video[0])
+        for packet in source.demux(video=0):
             if packet.dts is not None:
                 packet.stream = stream
                 out.mux(packet)
 
 
-def test_blur_takes_sharpness():
-    assert compute_sharpness(texture()) > 10 * compute_sharpness(gaussian_filter(texture(), 2))
+def test_blur_reduces_sharpness():
+    assert compute_sharpness(make_texture()) > 10 * compute_sharpness(gaussian_filter(make_texture(), 2))
     assert compute_sharpness(np.full((5, 5), 7)) == 0
 
 
-def test_the_sharpest_of_each_stretch(film):
-    found = list(select_sharpest_frames(film, 3))
-    assert [round(10 * frame.seconds) for frame in found] == list(SHARP)
-    for *_, pixels in found:
+def test_sharpest_frame_of_each_segment(film):
+    frames = list(select_sharpest_frames(film, 3))
+    assert [round(10 * frame.seconds) for frame in frames] == list(SHARP)
+    for *_, pixels in frames:
         assert pixels.shape == (48, 64, 3) and pixels.dtype == np.uint8
-        assert np.corrcoef(pixels[..., 1].ravel(), texture().ravel())[0, 1] > 0.97
+        assert np.corrcoef(pixels[..., 1].ravel(), make_texture().ravel())[0, 1] > 0.97
 
 
-def test_more_stretches_than_frames(film):
+def test_more_segments_than_frames(film):
     times = [frame.seconds for frame in select_sharpest_frames(film, 100, threads=1)]
     assert len(times) == 15 and times == sorted(times)
 
@@ -85,8 +85,8 @@ def test_frames_are_copied(film, tmp_path):
 
 @pytest.mark.parametrize("name, codec", [("a.mkv", "mpeg4"), ("a.ts", "mpeg2video"), ("a.mp4", "mpeg4")])
 @pytest.mark.parametrize("times", [range(6), [0, 1, 2, 5, 6, 9], [4, 7, 8, 9, 11, 12]])
-def test_frames_are_numbered_as_they_are_shown(av, tmp_path, name, codec, times):
-    """With frames that come in another order, frames that were lost and a first one that is late."""
+def test_frames_are_numbered_in_presentation_order(av, tmp_path, name, codec, times):
+    """With reordered frames, missing frames and a late first frame."""
     with av.open(str(tmp_path / name), "w") as out:
         stream = out.add_stream(codec, rate=25, options={"bf": "2"})
         stream.width, stream.height, stream.pix_fmt, stream.bit_rate = 64, 48, "yuv420p", 4_000_000
@@ -101,8 +101,8 @@ def test_frames_are_numbered_as_they_are_shown(av, tmp_path, name, codec, times)
 
 
 @pytest.mark.parametrize("rotation, corner", [(0, (0, 0)), (90, (1, 0)), (-90, (0, 1)), (180, (1, 1)), (-180, (1, 1))])
-def test_frames_are_turned_as_they_are_shown(rotation, corner, av):
-    """The display matrix says by how much a frame is turned, counterclockwise."""
+def test_frames_are_rotated_upright(rotation, corner, av):
+    """The display matrix contains the counterclockwise rotation of a frame."""
     pixels = np.zeros((4, 6, 3), np.uint8)
     pixels[0, 0] = 255
     frame = SimpleNamespace(to_ndarray=lambda format: pixels, rotation=rotation)
@@ -111,7 +111,7 @@ def test_frames_are_turned_as_they_are_shown(rotation, corner, av):
     assert out[-1 * corner[0], -1 * corner[1], 0] == 255
 
 
-def test_what_is_no_video_is_told(av, tmp_path, film):
+def test_other_files_are_refused(av, tmp_path, film):
     (tmp_path / "a.mp4").write_text("not a film")
     Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(tmp_path / "one.jpg")
     raw = film.read_bytes()
@@ -126,7 +126,7 @@ def test_what_is_no_video_is_told(av, tmp_path, film):
             list(select_sharpest_frames(tmp_path / name, 3))
 
 
-def test_sound_alone_is_no_video(av, tmp_path):
+def test_audio_file_is_refused(av, tmp_path):
     with av.open(str(tmp_path / "a.mp4"), "w") as out:
         stream = out.add_stream("aac", rate=8000)
         stream.layout = "mono"
@@ -137,7 +137,7 @@ def test_sound_alone_is_no_video(av, tmp_path):
         list(select_sharpest_frames(tmp_path / "a.mp4", 3))
 
 
-def test_frames_may_not_be_too_large(film, monkeypatch):
+def test_frame_size_is_limited(film, monkeypatch):
     monkeypatch.setattr(module, "MAX_PIXELS", 64 * 48 - 1)
     with pytest.raises(NergError, match="no frame that can be decoded, of 3,071 pixels at most"):
         list(select_sharpest_frames(film, 3))
@@ -157,7 +157,7 @@ LISTS = {
 
 @pytest.mark.parametrize("name", LISTS)
 def test_nothing_but_the_file_is_opened(name, av, film, tmp_path):
-    """FFmpeg would follow lists to other files and addresses."""
+    """FFmpeg would follow playlists to other files and addresses."""
     remux(av, film, tmp_path / "film.ts")
     with socket.create_server(("127.0.0.1", 0)) as server:
         server.settimeout(0)
@@ -168,8 +168,8 @@ def test_nothing_but_the_file_is_opened(name, av, film, tmp_path):
             server.accept()
 
 
-def test_what_a_file_refers_to_is_refused(film, tmp_path, monkeypatch):
-    """A second time: by whatever is opened."""
+def test_referenced_files_are_refused(film, tmp_path, monkeypatch):
+    """Also by the check of opened files."""
     (tmp_path / "a.mp4").write_text(LISTS["a.mp4"])
     monkeypatch.setattr(module, "FORMATS", (*module.FORMATS, "concat"))
     with pytest.raises(NergError, match="cannot be read"):
@@ -183,7 +183,7 @@ def test_a_name_is_no_address(name, film, tmp_path, monkeypatch):
     assert len(list(select_sharpest_frames(name, 3))) == 3
 
 
-def test_titles_need_not_be_utf8(av, film, tmp_path):
+def test_titles_may_have_any_encoding(av, film, tmp_path):
     remux(av, film, tmp_path / "a.avi", title="XXXXXXXX")
     raw = (tmp_path / "a.avi").read_bytes()
     assert b"XXXXXXXX" in raw
@@ -191,15 +191,15 @@ def test_titles_need_not_be_utf8(av, film, tmp_path):
     assert len(list(select_sharpest_frames(tmp_path / "a.avi", 3))) == 3
 
 
-def test_unknown_codecs_are_told(film, tmp_path, av):
+def test_unknown_codecs_are_refused(film, tmp_path, av):
     raw = film.read_bytes()
-    # Both what the track says, and what its description does.
+    # Both in the track and in its sample description.
     (tmp_path / "a.mp4").write_bytes(raw.replace(b"mp4v", b"xyzw").replace(b"esds", b"free"))
     with pytest.raises(NergError, match="coded in a way"):
         list(select_sharpest_frames(tmp_path / "a.mp4", 3))
 
 
-def test_tables_that_claim_too_much_are_told(film, tmp_path):
+def test_tables_with_excessive_claims_are_refused(film, tmp_path):
     raw = bytearray(film.read_bytes())
     at = raw.index(b"stsz") + 8
     raw[at : at + 8] = (1).to_bytes(4, "big") + (30_000_000).to_bytes(4, "big")
@@ -220,14 +220,14 @@ def test_ffmpeg_prints_nothing(film, tmp_path, capfd):
     assert capfd.readouterr() == ("", "")
 
 
-def test_a_video_that_is_mostly_destroyed_is_told(film, monkeypatch):
+def test_mostly_damaged_video_is_refused(film, monkeypatch):
     monkeypatch.setattr(module, "_LOST", 2)
     monkeypatch.setattr(module, "_LOST_EACH", -1)
     with pytest.raises(NergError, match="most of the video"):
         list(select_sharpest_frames(film, 3))
 
 
-def test_a_damaged_stretch_is_passed_over(film, tmp_path):
+def test_damaged_segment_is_skipped(film, tmp_path):
     raw = bytearray(film.read_bytes())
     at = raw.index(b"mdat") + 4
     middle = at + (len(raw) - at) // 3
@@ -236,14 +236,14 @@ def test_a_damaged_stretch_is_passed_over(film, tmp_path):
     assert len(list(select_sharpest_frames(tmp_path / "b.mp4", 3))) == 3
 
 
-def test_frames_that_are_hardly_wide_are_compared():
+def test_narrow_frames_are_compared():
     frame = lambda w, h: SimpleNamespace(width=w, height=h, to_ndarray=lambda **given: given)
-    for size, found in (((1, 9), (3, 27)), ((2, 2), (3, 3)), ((3840, 2160), (480, 270)), ((64, 90_000), (64, 1920))):
-        given = module._gray(frame(*size))
-        assert (given["width"], given["height"]) == found
+    for size, frames in (((1, 9), (3, 27)), ((2, 2), (3, 3)), ((3840, 2160), (480, 270)), ((64, 90_000), (64, 1920))):
+        sizes = module._gray(frame(*size))
+        assert (sizes["width"], sizes["height"]) == frames
 
 
-def test_without_pyav(tmp_path, monkeypatch):
+def test_missing_pyav_names_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
     (tmp_path / "a.mp4").write_bytes(b"film")
     with pytest.raises(ImportError, match=r'"nerg-mi\[poses\]\"'):

@@ -1,4 +1,4 @@
-"""One set of known cameras and pictures, and its writers in every format."""
+"""One set of known cameras and images, and its writers for all formats."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ W, H = 14, 10
 OPENCV = Intrinsics(W, H, 12.0, 12.5, 6.6, 5.3, 0.05, -0.02, 0.003, -0.002)
 FISHEYE = Intrinsics(W, H, 9.0, 9.5, 6.6, 5.3, 0.03, -0.01, k3=0.002, k4=-3e-4, fisheye=True)
 COUNT = 9
-# Keys of a transforms file, without which NPY counts millimetres along the axis.
+# Keys of a transforms file; without them, NPY depth is in millimetres along the axis.
 METRES_ALONG_RAYS = {"depth_unit_scale_factor": 1.0, "is_euclidean_depth": True}
 
 
 def cameras():
-    """World poses (OpenCV: z forward, y down) on a ring that looks inwards at a tilt, and random pictures."""
+    """World poses (OpenCV: z forward, y down) on a ring, facing inwards at a tilt, and random images."""
     poses = []
     for k in range(COUNT):
         a = 2 * np.pi * k / COUNT
@@ -37,7 +37,7 @@ def picture(k):
 
 
 def expected_rays(lens, pose):
-    """Origin and unit directions (H, W, 3) by the restated models."""
+    """Return origin and unit directions (H, W, 3) of the reference lens models."""
     inverse = opencv.fisheye_undistort if lens.fisheye else opencv.undistort
     k = (lens.k1, lens.k2, lens.k3, lens.k4) if lens.fisheye else lens.distortion
     d = np.array(
@@ -72,7 +72,7 @@ def save_pictures(folder, mi, names):
 
 
 def nerfstudio(folder, mi, lens):
-    """Turned and scaled by the writer; lens once for all."""
+    """Write a set that is rotated and scaled by the writer, with one lens for all frames."""
     save_pictures(folder, mi, [f"images/{k}.png" for k in range(COUNT)])
     turn, s = Rotation.from_euler("xyz", [90, 20, 0], degrees=True).as_matrix(), 2.0
     applied = np.vstack([np.column_stack([turn, [0.1, 0.2, 0.3]]), [0, 0, 0, 1]])
@@ -94,7 +94,7 @@ def nerfstudio(folder, mi, lens):
 
 
 def instant_ngp(folder, mi, lens):
-    """Lens in every frame, frames in no order."""
+    """Write a set with a lens in each frame, and unordered frames."""
     save_pictures(folder, mi, [f"images/{k}.png" for k in range(COUNT)])
     frames = [
         {"file_path": f"./images/{k}.png", "transform_matrix": opengl(p).tolist(), "sharpness": 3.0, **lens_keys(lens)}

@@ -1,4 +1,4 @@
-"""Clusters of real processes on this machine, for tests: a scheduler and workers that are killed and started again."""
+"""Clusters of real processes on this machine: a scheduler and workers that tests kill and restart."""
 
 from __future__ import annotations
 
@@ -17,14 +17,16 @@ DEADLINE = 90.0
 
 
 def free_port() -> int:
-    """A port of 127.0.0.1 that nobody listens on."""
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        return found.getsockname()[1]
+    """Return a port of 127.0.0.1 on which no process listens."""
+    with socket.socket() as port:
+        port.bind(("127.0.0.1", 0))
+        return port.getsockname()[1]
 
 
 class ClusterOfProcesses:
-    """A context with a scheduler at ``address`` and workers, all of which end with it. ``folder``: for their logs."""
+    """A context with a scheduler at ``address`` and workers, which are terminated at its end. ``folder``: for
+    their logs.
+    """
 
     def __init__(self, folder: Path):
         self.folder, self.port = folder, free_port()
@@ -49,7 +51,7 @@ class ClusterOfProcesses:
         raise TimeoutError("the scheduler did not start")
 
     def start_worker(self) -> subprocess.Popen:
-        """Another worker, as the command `nerg worker` is; it need not be there yet when this returns."""
+        """Start another worker with `nerg worker`; it may not be connected yet when this returns."""
         code = "from nerg_mi.cli import main; main()"
         number = len(self.workers)
         line = ("-c", code, "worker", self.address, "--threads", "1", "--name", f"w{number}")
@@ -62,7 +64,7 @@ class ClusterOfProcesses:
         self.scheduler.wait()
 
     def log(self, name: str) -> str:
-        """What the scheduler or a worker has said."""
+        """Return the log of the scheduler or a worker."""
         return (self.folder / f"{name}.log").read_text()
 
     def _start(self, name: str, *line: str) -> subprocess.Popen:
@@ -85,7 +87,7 @@ class ClusterOfProcesses:
 
 
 def wait_until(condition, what: str) -> None:
-    """Until ``condition()`` holds; fails the test after `DEADLINE`."""
+    """Wait until ``condition()`` is true; fail the test after `DEADLINE`."""
     until = time.monotonic() + DEADLINE
     while not condition():
         assert time.monotonic() < until, what

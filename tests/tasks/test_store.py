@@ -1,4 +1,4 @@
-"""Parts and their keys, and the store that keeps what they gave."""
+"""Parts and their keys, and the store of their outputs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.tasks import task as module
 from nerg_mi.tasks.engines import LocalEngine, run_plan
-from nerg_mi.tasks.store import Store, read_contents, list_files, read_status, read_plan, remove_stale
+from nerg_mi.tasks.store import Store, list_files, read_contents, read_plan, read_status, remove_stale
 from nerg_mi.tasks.task import (
     RENDER_LIBRARIES,
     Checksums,
@@ -33,7 +33,7 @@ from nerg_mi.tasks.task import (
 )
 from tests.tasks import works
 
-# ---- Keys of parts: what changes them, and what does not; and files wherever they are laid out ----
+# ---- Keys of parts, and layouts of files ----
 
 
 @dataclass(frozen=True)
@@ -53,11 +53,18 @@ def key(value=1, common=None, work=works.write_mixture, suffix=".txt", label="",
     return task.key
 
 
-def test_what_changes_a_key_and_what_does_not(monkeypatch):
+def test_key_depends_on_results_only(monkeypatch):
     assert key() == key(label="called otherwise") == key(1)
-    others = [key(2), key(common=1), key(work=works.write_folder), key(suffix=".csv"), key(libraries=("numpy",)), key("1")]
+    other_keys = [
+        key(2),
+        key(common=1),
+        key(work=works.write_folder),
+        key(suffix=".csv"),
+        key(libraries=("numpy",)),
+        key("1"),
+    ]
     monkeypatch.setattr(module, "compute_code_digest", lambda: "other")
-    assert len({key(), *others}) == 7
+    assert len({key(), *other_keys}) == 7
 
 
 @pytest.mark.parametrize(
@@ -78,20 +85,20 @@ def test_what_changes_a_key_and_what_does_not(monkeypatch):
         (np.array([0.0]), np.array([-0.0])),
     ],
 )
-def test_values_that_differ_have_other_digests(one, other):
+def test_different_values_have_different_digests(one, other):
     assert compute_value_digest(one) != compute_value_digest(other)
 
 
 def test_equal_values_have_equal_digests():
     assert compute_value_digest({"b": 1, "a": [2]}) == compute_value_digest({"a": (2,), "b": np.int64(1)})
-    whole = np.arange(6.0).reshape(2, 3)
-    assert compute_value_digest(whole[:, ::2]) == compute_value_digest(whole[:, ::2].copy())
+    complete = np.arange(6.0).reshape(2, 3)
+    assert compute_value_digest(complete[:, ::2]) == compute_value_digest(complete[:, ::2].copy())
     for value in (object(), np.array([object()]), {1, 2}):
         with pytest.raises(TypeError, match="cannot be part of a key"):
             compute_value_digest(value)
 
 
-def test_a_plan_has_bounds_and_works_that_processes_find(monkeypatch):
+def test_plan_limits(monkeypatch):
     monkeypatch.setattr(module, "MAX_PARTS", 3)
     with pytest.raises(NergError, match="has 4 parts"):
         works.make_plan(4)
@@ -106,7 +113,7 @@ def test_a_plan_has_bounds_and_works_that_processes_find(monkeypatch):
 
 
 @pytest.fixture
-def place(tmp_path):
+def scene_folder(tmp_path):
     (tmp_path / "scene" / "meshes").mkdir(parents=True)
     (tmp_path / "scene" / "scene.xml").write_text("<scene/>")
     (tmp_path / "scene" / "meshes" / "a.ply").write_text("ply")
@@ -114,74 +121,82 @@ def place(tmp_path):
     return tmp_path
 
 
-def scene_of(place):
-    return FileGroup(place / "scene" / "scene.xml", (place / "scene" / "scene.xml", place / "scene" / "meshes" / "a.ply"))
+def make_scene_value(scene_folder):
+    return FileGroup(
+        scene_folder / "scene" / "scene.xml",
+        (scene_folder / "scene" / "scene.xml", scene_folder / "scene" / "meshes" / "a.ply"),
+    )
 
 
-def test_names_tell_how_files_lie_to_each_other_and_nothing_of_the_machine(place, tmp_path):
-    value = {"scene": scene_of(place), "again": place / "scene" / "scene.xml", "gaze": place / "gaze.safetensors"}
+def test_names_are_relative_and_independent_of_machine(scene_folder, tmp_path):
+    value = {
+        "scene": make_scene_value(scene_folder),
+        "again": scene_folder / "scene" / "scene.xml",
+        "gaze": scene_folder / "gaze.safetensors",
+    }
     names = [file.name for file in find_inputs(value, Checksums()).values()]
     assert names == ["value/scene/scene.xml", "value/scene/meshes/a.ply", "value/gaze/gaze.safetensors"]
     before = key(value)
-    place.joinpath("scene").rename(place / "moved")
-    path = place / "moved" / "scene.xml"
-    moved = FileGroup(path, (path, place / "moved" / "meshes" / "a.ply"))
-    assert key({"scene": moved, "again": moved.path, "gaze": place / "gaze.safetensors"}) == before
-    (place / "moved" / "meshes" / "a.ply").write_text("plx")
-    assert key({"scene": moved, "again": moved.path, "gaze": place / "gaze.safetensors"}) != before
+    scene_folder.joinpath("scene").rename(scene_folder / "moved")
+    path = scene_folder / "moved" / "scene.xml"
+    moved = FileGroup(path, (path, scene_folder / "moved" / "meshes" / "a.ply"))
+    assert key({"scene": moved, "again": moved.path, "gaze": scene_folder / "gaze.safetensors"}) == before
+    (scene_folder / "moved" / "meshes" / "a.ply").write_text("plx")
+    assert key({"scene": moved, "again": moved.path, "gaze": scene_folder / "gaze.safetensors"}) != before
 
 
-def test_a_file_that_a_text_names_by_its_whole_path_is_its_bytes(place):
-    scene = scene_of(place)
+def test_absolute_path_in_text_is_replaced_by_bytes(scene_folder):
+    scene = make_scene_value(scene_folder)
     texts = {"mesh": str(scene.members[1]), "level": "0.5"}
     before = key(Pair(scene, texts))
     assert key(Pair(scene, {**texts, "level": "0.6"})) != before
-    laid = works.lay_out(Pair(scene, texts), place / "there")
-    assert Path(laid.second["mesh"]).read_text() == "ply" and str(place / "there") in laid.second["mesh"]
+    laid = works.lay_out(Pair(scene, texts), scene_folder / "there")
+    assert Path(laid.second["mesh"]).read_text() == "ply" and str(scene_folder / "there") in laid.second["mesh"]
     assert laid.second["level"] == "0.5" and key(laid) == before
 
 
-def test_a_folder_is_the_files_that_are_read_in_it(place):
-    files = FileGroup(place / "scene", (place / "scene" / "meshes" / "a.ply",))
-    laid = works.lay_out(files, place / "there")
+def test_folder_is_represented_by_its_files(scene_folder):
+    files = FileGroup(scene_folder / "scene", (scene_folder / "scene" / "meshes" / "a.ply",))
+    laid = works.lay_out(files, scene_folder / "there")
     assert laid.path.is_dir() and (laid.path / "meshes" / "a.ply").read_text() == "ply" and key(laid) == key(files)
-    (place / "scene" / "scene.xml").write_text("of no account")
+    (scene_folder / "scene" / "scene.xml").write_text("of no account")
     assert key(files) == key(laid)
 
 
-def test_what_is_laid_out_replaces_paths_of_its_inputs_alone(place):
-    value = Pair(place / "gaze.safetensors", ("text", 1, np.zeros(2)))
+def test_relocation_replaces_only_input_paths(scene_folder):
+    value = Pair(scene_folder / "gaze.safetensors", ("text", 1, np.zeros(2)))
     inputs = tuple(find_inputs(value, Checksums()).values())
-    there = relocate_paths(value, inputs, place / "there")
-    assert there.first == place / "there" / inputs[0].name and there.second is value.second
-    assert relocate_paths(value, (), place) is value
+    relocated = relocate_paths(value, inputs, scene_folder / "there")
+    assert relocated.first == scene_folder / "there" / inputs[0].name and relocated.second is value.second
+    assert relocate_paths(value, (), scene_folder) is value
 
 
 @pytest.mark.parametrize("name", ["", "/etc/passwd", "../a", "a/../../b", "a\\b"])
-def test_names_lead_nowhere_else(name):
+def test_names_must_not_leave_folder(name):
     with pytest.raises(ValueError, match="relative path that goes down"):
         InputFile(name, "", 0, "")
 
 
-def test_a_file_that_is_missing_is_named(place):
+def test_missing_file_is_named(scene_folder):
     with pytest.raises(NergError, match=r"none\.xml"):
-        key(place / "none.xml")
+        key(scene_folder / "none.xml")
 
 
-def test_a_file_is_read_once_while_it_stays(place, monkeypatch):
+def test_unchanged_file_is_read_once(scene_folder, monkeypatch):
     read, checksums, original = [], Checksums(), module.file_sha256
     monkeypatch.setattr(module, "file_sha256", lambda path: read.append(path) or original(path))
-    file = place / "gaze.safetensors"
+    file = scene_folder / "gaze.safetensors"
     first = checksums.compute(file)
     assert checksums.compute(file) == first and len(read) == 1
     file.write_text("longer than before")
     assert checksums.compute(file) != first and len(read) == 2
 
 
-def test_a_file_that_changes_while_it_is_read_is_not_remembered(place, monkeypatch):
-    """Bytes that were there for the length of a reading are not those of the file that was there before, though its
-    time of change is put back with its bytes."""
-    file, checksums, original = place / "gaze.safetensors", Checksums(), module.file_sha256
+def test_file_that_changes_while_read_is_not_cached(scene_folder, monkeypatch):
+    """Bytes that exist only during a read must not be cached for the original file, even if its modification time is
+    restored with its bytes.
+    """
+    file, checksums, original = scene_folder / "gaze.safetensors", Checksums(), module.file_sha256
     before = os.stat(file)
 
     def change_and_read(path):
@@ -200,11 +215,15 @@ def test_a_file_that_changes_while_it_is_read_is_not_remembered(place, monkeypat
 # ---- Code ----
 
 
-def test_keys_name_code_and_programs():
-    assert len(compute_code_digest()) == 16 and int(compute_code_digest(), 16) >= 0 and all(version(name) for name in RENDER_LIBRARIES)
+def test_keys_include_code_and_libraries():
+    assert (
+        len(compute_code_digest()) == 16
+        and int(compute_code_digest(), 16) >= 0
+        and all(version(name) for name in RENDER_LIBRARIES)
+    )
 
 
-def test_the_digest_follows_the_sources_that_compute(tmp_path):
+def test_code_digest_covers_computing_sources(tmp_path):
     sources = ("maths/vmf.py", "workflows/render.py", "cli/render.py", "tasks/store.py", "notes.txt")
     for name in sources:
         (tmp_path / name).parent.mkdir(exist_ok=True)
@@ -217,7 +236,7 @@ def test_the_digest_follows_the_sources_that_compute(tmp_path):
         before = changed
 
 
-# ---- Stores: outputs whole or absent, verified before they are used; and what is done, left and stale ----
+# ---- Stores: atomic outputs, verification, and status ----
 
 
 @pytest.fixture
@@ -225,13 +244,13 @@ def store(tmp_path):
     return Store(tmp_path / "store")
 
 
-def made(store, plan):
+def make_output(store, plan):
     return list(run_plan(plan, store, LocalEngine()))
 
 
-def test_an_output_is_named_by_its_key_and_signed_for(store):
+def test_output_has_manifest(store):
     plan = works.make_plan(1)
-    made(store, plan)
+    make_output(store, plan)
     (task,), (receipt,) = plan.tasks, store.iter_manifests()
     output = store.output_path(task.key, ".txt")
     assert output == store.folder / task.key[:2] / f"{task.key}.txt" and output.read_bytes() == works.expected(0)
@@ -239,15 +258,15 @@ def test_an_output_is_named_by_its_key_and_signed_for(store):
     assert store.find_valid(task.key, ".txt") == store.read_manifest(task.key) == receipt and receipt.label == "part 0"
 
 
-def test_nothing_is_there_before(store):
+def test_store_is_initially_empty(store):
     assert store.find_valid(works.make_plan(1).tasks[0].key, ".txt") is None and not store.folder.exists()
 
 
 @pytest.mark.parametrize("harm", ["flip", "shorten", "remove", "receipt", "empty receipt", "another's", "version 1"])
-def test_what_is_damaged_or_of_another_version_counts_as_not_made(store, harm):
+def test_damaged_outputs_are_invalid(store, harm):
     plan = works.make_plan(2)
     task, other = plan.tasks
-    made(store, plan)
+    make_output(store, plan)
     output, receipt = store.output_path(task.key, ".txt"), store.manifest_path(task.key)
     if harm == "flip":
         raw = bytearray(output.read_bytes())
@@ -266,30 +285,30 @@ def test_what_is_damaged_or_of_another_version_counts_as_not_made(store, harm):
     else:
         shutil.copy(store.manifest_path(other.key), receipt)
     assert store.find_valid(task.key, ".txt") is None and store.find_valid(other.key, ".txt") is not None
-    made(store, plan)
+    make_output(store, plan)
     assert store.find_valid(task.key, ".txt") is not None and output.read_bytes() == works.expected(0)
 
 
-def test_a_folder_is_an_output_too(store):
+def test_output_may_be_a_folder(store):
     plan = works.folders(3)
-    made(store, plan)
+    make_output(store, plan)
     (task,) = plan.tasks
     output = store.output_path(task.key, "/")
     assert [f.relative_to(output).as_posix() for f in list_files(output)] == ["a.txt", "below/b.txt"]
     (output / "below" / "b.txt").write_text("c\n")
     assert store.find_valid(task.key, "/") is None
-    made(store, plan)
+    make_output(store, plan)
     assert (output / "below" / "b.txt").read_text() == "b\n" and store.find_valid(task.key, "/") is not None
     store.remove(task.key, "/")
     assert not output.exists() and list(store.iter_manifests()) == []
 
 
-def test_what_arrives_is_compared_with_its_receipt(store, tmp_path):
-    there = Store(tmp_path / "elsewhere")
+def test_imported_output_is_verified(store, tmp_path):
+    imported = Store(tmp_path / "elsewhere")
     for plan in (works.make_plan(1), works.folders(3)):
-        (output,) = made(there, plan)
+        (output,) = make_output(imported, plan)
         (task,) = plan.tasks
-        receipt = there.read_manifest(task.key)
+        receipt = imported.read_manifest(task.key)
         with pytest.raises(NergError, match="arrived with other bytes"):
             store.import_output(task, receipt, [("a" if task.suffix == "/" else "", b"something else")])
         assert store.find_valid(task.key, task.suffix) is None and not store.output_path(task.key, task.suffix).exists()
@@ -297,8 +316,8 @@ def test_what_arrives_is_compared_with_its_receipt(store, tmp_path):
         assert store.find_valid(task.key, task.suffix) == receipt
 
 
-def test_a_full_disk_leaves_no_half(store):
-    """As if no file could grow beyond some hundred bytes, which a plan needs."""
+def test_full_disk_leaves_no_partial_output(store):
+    """The size of files is limited to some hundred bytes, which a plan exceeds."""
     plan = works.make_plan(1)
     store.save_plan(plan)
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -311,13 +330,13 @@ def test_a_full_disk_leaves_no_half(store):
     assert not [p for p in store.folder.glob("??/*") if p.is_file()]
 
 
-def test_where_nothing_can_be_written(tmp_path):
+def test_unwritable_store_is_refused(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(NergError, match="parents is a file"):
         Store(tmp_path / "file" / "store")
 
 
-def test_scratch_goes_with_the_block_and_is_left_over_otherwise(store):
+def test_scratch_folder_is_removed(store):
     with store.make_scratch_folder() as folder:
         (folder / "rays.npz").write_text("12345")
         assert store.find_leftovers(3600) == [] and store.find_leftovers(-1) == [folder]
@@ -327,16 +346,16 @@ def test_scratch_goes_with_the_block_and_is_left_over_otherwise(store):
 # ---- Plans ----
 
 
-def test_a_plan_is_remembered_and_replaced_by_its_name(store, tmp_path):
+def test_plan_is_saved_and_replaced_by_name(store, tmp_path):
     (tmp_path / "a").write_text("x")
     (store.folder / "b").parent.mkdir()
     (store.folder / "b").write_text("made by a part")
     plan = works.make_plan(2, (tmp_path / "a", store.folder / "b"))
     path = store.save_plan(plan)
-    found = read_plan(path)
+    plans = read_plan(path)
     sha256 = hashlib.sha256(b"x").hexdigest()
-    assert (found.name, found.keys) == ("p", {t.key: ".txt" for t in plan.tasks})
-    assert found.inputs == {str(tmp_path / "a"): sha256} and found.common == {sha256}
+    assert (plans.name, plans.keys) == ("p", {t.key: ".txt" for t in plan.tasks})
+    assert plans.inputs == {str(tmp_path / "a"): sha256} and plans.common == {sha256}
     assert store.save_plan(works.make_plan(1)) == path
     store.save_plan(works.make_plan(3, what="a film"))
     assert [(p.name, len(p.keys)) for p in store.read_plans()] == [("a film", 3), ("p", 1)]
@@ -359,7 +378,7 @@ GOOD = {"format": 2, "what": "p", "inputs": {}, "common": [], "keys": {"a" * 64:
         {"keys": {"a" * 64: "/../x"}},
     ],
 )
-def test_what_is_no_plan_is_refused(tmp_path, change):
+def test_invalid_plan_is_refused(tmp_path, change):
     path = tmp_path / "plan.json"
     path.write_text(json.dumps(GOOD))
     assert read_plan(path).name == "p"
@@ -368,10 +387,10 @@ def test_what_is_no_plan_is_refused(tmp_path, change):
         read_plan(path)
 
 
-# ---- What is done, left and stale ----
+# ---- Status ----
 
 
-def test_a_job_that_was_interrupted(store):
+def test_status_of_interrupted_job(store):
     arriving = run_plan(works.make_plan(5), store, LocalEngine())
     next(arriving), next(arriving)
     arriving.close()
@@ -381,8 +400,12 @@ def test_a_job_that_was_interrupted(store):
     assert account.stale == () and account.leftovers == () and account.bytes == 130 and job.seconds >= 0
 
 
-def test_what_no_job_asks_for_is_stale(store):
-    made(store, works.make_plan(4)), made(store, works.make_plan(2, what="another")), made(store, works.make_plan(1))
+def test_outputs_without_job_are_stale(store):
+    (
+        make_output(store, works.make_plan(4)),
+        make_output(store, works.make_plan(2, what="another")),
+        make_output(store, works.make_plan(1)),
+    )
     account = read_status(store)
     assert sorted(r.label for r in account.stale) == ["part 2", "part 3"]
     assert account.stale_bytes == 130 == remove_stale(store, account)
@@ -390,12 +413,12 @@ def test_what_no_job_asks_for_is_stale(store):
     assert left.stale == () and [job.done for job in left.jobs] == [2, 1] and left.bytes == 130
 
 
-def test_what_was_made_of_a_file_that_has_changed_is_stale(store, tmp_path):
-    """A file of all parts, one of a single part, and one that is gone."""
+def test_outputs_of_changed_files_are_stale(store, tmp_path):
+    """A file of all parts, a file of a single part, and a missing file."""
     for name in "abc":
         (tmp_path / name).write_text(f"{name} before")
-    made(store, works.make_plan(2, (tmp_path / "a",), what="all"))
-    made(store, works.read_one(tmp_path / "b", tmp_path / "c"))
+    make_output(store, works.make_plan(2, (tmp_path / "a",), what="all"))
+    make_output(store, works.read_one(tmp_path / "b", tmp_path / "c"))
     for name in "ab":
         (tmp_path / name).write_text("after")
     (tmp_path / "c").unlink()
@@ -408,17 +431,17 @@ def test_what_was_made_of_a_file_that_has_changed_is_stale(store, tmp_path):
     assert [r.label for r in store.iter_manifests()] == ["of c"]
 
 
-def test_bytes_that_another_file_still_has_are_not_out_of_date(store, tmp_path):
+def test_bytes_in_another_file_are_not_outdated(store, tmp_path):
     for name in "ab":
         (tmp_path / name).write_text("alike")
-    made(store, works.read_one(tmp_path / "a", tmp_path / "b"))
+    make_output(store, works.read_one(tmp_path / "a", tmp_path / "b"))
     (tmp_path / "a").write_text("other")
     account = read_status(store)
     assert account.jobs[0].changed == (str(tmp_path / "a"),) and account.jobs[0].outdated == 0 and account.stale == ()
 
 
-def test_leftovers_are_removed_when_they_are_old(store):
-    made(store, works.make_plan(2))
+def test_old_leftovers_are_removed(store):
+    make_output(store, works.make_plan(2))
     hidden = next(store.folder.glob("??")) / ".abc.part.txt"
     hidden.write_text("half")
     folder = hidden.with_name(".abd.part")
@@ -434,13 +457,13 @@ def test_leftovers_are_removed_when_they_are_old(store):
     assert not hidden.exists() and not folder.exists() and read_status(store).jobs[0].done == 1
 
 
-def test_a_folder_that_is_no_store(tmp_path):
+def test_other_folder_is_refused(tmp_path):
     with pytest.raises(NergError, match="holds no parts of jobs"):
         read_status(Store(tmp_path))
 
 
-def test_receipts_of_others_are_no_receipts(store):
-    made(store, works.make_plan(1))
+def test_manifests_of_other_keys_are_ignored(store):
+    make_output(store, works.make_plan(1))
     (receipt,) = store.iter_manifests()
     store.add_manifest(replace(receipt, key="f" * 64))
     assert store.find_valid("f" * 64, ".txt") is None and Path(store.manifest_path("f" * 64)).exists()

@@ -1,4 +1,4 @@
-"""Small parts that the tests of the engines run, in processes of their own as well."""
+"""Small parts for the tests of the engines, which also run in other processes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from nerg_mi.workflows.options import PartOptions, option
 
 @dataclass(frozen=True, kw_only=True)
 class Settings(PartOptions):
-    """Of `hashed`: what it reads, and how it is run."""
+    """Settings of `write_hash`: its input files, and how it runs."""
 
     files: tuple[Path, ...] = ()
     seconds: float = option(0.0, "Seconds that a part takes.", changes_result=False)
@@ -28,8 +28,10 @@ class Settings(PartOptions):
 
 @dataclass(frozen=True)
 class Run:
-    """What a part does besides: note its run in the folder ``runs``, and end its process where the file ``die`` is,
-    which it removes. Texts, since paths are inputs."""
+    """Side effects of a part: record the run in the folder ``runs``, and kill its process if the file ``die`` exists.
+
+    The file is removed. The paths are strings, because paths would be inputs.
+    """
 
     number: int
     seconds: float = 0.0
@@ -38,7 +40,7 @@ class Run:
 
 
 def write_hash(common: Settings, value: Run, output: Path) -> None:
-    """A line of the number and of what is read."""
+    """Write a line with the number and the content of the inputs."""
     if value.runs:
         Path(value.runs, f"{value.number}-{os.getpid()}-{time.time_ns()}").touch()
     if value.die and Path(value.die).exists():
@@ -50,7 +52,7 @@ def write_hash(common: Settings, value: Run, output: Path) -> None:
 
 
 def write_mixture(common: Any, value: str, output: Path) -> dict[str, Any] | None:
-    """What is called by ``value``."""
+    """Write the result selected by ``value``."""
     if value == "fault":
         raise TypeError("a mistake of the program")
     if value == "refused":
@@ -64,7 +66,7 @@ def write_mixture(common: Any, value: str, output: Path) -> dict[str, Any] | Non
         write_text(output, "")
         return {"threads": dr.thread_count()}
     if value.startswith("term "):
-        # Terms whose sum depends on their order.
+        # The sum of the terms depends on their order.
         number = int(value.removeprefix("term "))
         write_text(output, "")
         return {"term": 10.0 ** (number % 17) / 3 * (-1) ** number}
@@ -73,7 +75,7 @@ def write_mixture(common: Any, value: str, output: Path) -> dict[str, Any] | Non
 
 
 def change_input(common: Path, value: Any, output: Path) -> None:
-    """Reads a file that changes meanwhile."""
+    """Read a file that changes during the read."""
     write_text(output, common.read_text())
     common.write_text("in between")
 
@@ -83,29 +85,29 @@ def read_input(common: None, value: Path, output: Path) -> None:
 
 
 def write_folder(common: Any, value: int, output: Path) -> None:
-    """Two files, one of them in a folder."""
+    """Write two files, one of them in a subfolder."""
     write_text(output / "a.txt", f"{value}\n")
     write_text(output / "below" / "b.txt", "b\n")
 
 
-def make_plan(count: int, files: tuple[Path, ...] = (), what: str = "p", seconds: float = 0.0, **more: Any) -> Plan:
-    """So many parts of `hashed`, of which each reads all ``files``."""
-    parts = [Part(Run(k, seconds, **{k: str(v) for k, v in more.items()}), f"part {k}") for k in range(count)]
+def make_plan(count: int, files: tuple[Path, ...] = (), what: str = "p", seconds: float = 0.0, **options: Any) -> Plan:
+    """Make ``count`` parts of `write_hash`, each of which reads all ``files``."""
+    parts = [Part(Run(k, seconds, **{k: str(v) for k, v in options.items()}), f"part {k}") for k in range(count)]
     return Plan(what, write_hash, Settings(files=files), parts, ".txt")
 
 
 def make_small_plan(*values: str, what: str = "p") -> Plan:
-    """Parts of `mixed`, each called by its value."""
+    """Make parts of `write_mixture`, one for each value."""
     return Plan(what, write_mixture, None, [Part(value, f"the part {value}") for value in values], ".txt")
 
 
 def read_one(*files: Path) -> Plan:
-    """A part for each of ``files``, which it reads."""
+    """Make a part for each of ``files``, which reads the file."""
     return Plan("p", read_input, None, [Part(file, f"of {file.name}") for file in files], ".txt")
 
 
 def change_one(file: Path) -> Plan:
-    """A part that changes the file that it reads."""
+    """Make a part that changes the file that it reads."""
     return Plan("p", change_input, file, [Part(None)], ".txt")
 
 
@@ -114,13 +116,13 @@ def folders(*numbers: int) -> Plan:
 
 
 def expected(number: int, files: tuple[Path, ...] = ()) -> bytes:
-    """What `hashed` writes."""
+    """Return the output of `write_hash`."""
     text = "".join(path.read_text() for path in files)
     return (hashlib.sha256(f"{number} {text}".encode()).hexdigest() + "\n").encode()
 
 
 def lay_out(value: Any, folder: Path) -> Any:
-    """``value`` on a machine that has none of its files, and was sent them into ``folder``."""
+    """Return ``value`` as on a machine that lacks its files and has received them in ``folder``."""
     inputs = tuple(find_inputs(value, Checksums()).values())
     for file in inputs:
         (folder / file.name).parent.mkdir(parents=True, exist_ok=True)
@@ -129,7 +131,7 @@ def lay_out(value: Any, folder: Path) -> Any:
 
 
 def count_runs(folder: Path) -> dict[int, int]:
-    """How often each part was run."""
+    """Return how often each part was run."""
     counts: dict[int, int] = {}
     for path in folder.iterdir():
         number = int(path.name.partition("-")[0])

@@ -1,4 +1,4 @@
-"""Files of Gaussian splats as other programs write them, byte by byte after their sources: what the readers read."""
+"""Writers of Gaussian splat files, byte by byte after the sources of other programs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ C0 = 0.28209479177387814
 
 
 def random_splats(count: int = 40, degree: int = 3, seed: int = 0, size: float = 0.2) -> Splats:
-    """Gaussians of all kinds in the unit cube around the origin."""
+    """Random Gaussians in the unit cube around the origin."""
     rng = np.random.default_rng(seed)
     return Splats(
         rng.uniform(-1, 1, (count, 3)),
@@ -27,8 +27,9 @@ def random_splats(count: int = 40, degree: int = 3, seed: int = 0, size: float =
 
 
 def write_inria(path: Path, splats: Splats, style: str = "binary_little_endian", shuffled: bool = False) -> None:
-    """As graphdeco-inria/gaussian-splatting saves a model; ``shuffled``: columns in another order, one more of them,
-    and no normals, as other trainings do."""
+    """Write a model as graphdeco-inria/gaussian-splatting does. ``shuffled``: columns in another order, an extra
+    column, and no normals, as in other trainings.
+    """
     rest = splats.harmonics[:, 1:].transpose(0, 2, 1).reshape(len(splats), -1)
     p = splats.opacities.astype(np.float64)
     columns = {name: splats.centers[:, i] for i, name in enumerate("xyz")}
@@ -50,7 +51,7 @@ def write_inria(path: Path, splats: Splats, style: str = "binary_little_endian",
 
 
 def write_antimatter(path: Path, splats: Splats) -> None:
-    """As antimatter15/splat's ``processPlyBuffer``."""
+    """Write a file as ``processPlyBuffer`` of antimatter15/splat does."""
     rows = bytearray()
     for c, s, q, a, h in zip(splats.centers, splats.scales, splats.rotations, splats.opacities, splats.harmonics):
         color = np.clip([*((0.5 + C0 * h[0]) * 255), a * 255], 0, 255).astype(np.uint8)
@@ -60,7 +61,7 @@ def write_antimatter(path: Path, splats: Splats) -> None:
 
 
 def write_spz(path: Path, splats: Splats, version: int = 3, fraction: int = 12) -> None:
-    """As nianticlabs/spz packs a cloud, with all bits of its bytes."""
+    """Write a cloud as nianticlabs/spz packs it."""
     n, degree = len(splats), splats.degree
     if version == 1:
         positions = splats.centers.astype("<f2").tobytes()
@@ -95,18 +96,18 @@ def _smallest_three(q: np.ndarray) -> int:
 
 
 def write_khronos(path: Path, splats: Splats, node: dict | None = None, shares: bool = False) -> None:
-    """A primitive of KHR_gaussian_splatting; ``node``: of its node; ``shares``: opacities as normalised bytes."""
-    own = "KHR_gaussian_splatting:"
+    """Write a primitive of KHR_gaussian_splatting. ``node``: its node; ``shares``: opacities as normalised bytes."""
+    prefixed = "KHR_gaussian_splatting:"
     arrays = {
         "POSITION": splats.centers,
-        own + "ROTATION": splats.rotations[:, [1, 2, 3, 0]],
-        own + "SCALE": splats.scales,
-        own + "OPACITY": np.round(splats.opacities * 255).astype(np.uint8) if shares else splats.opacities,
+        prefixed + "ROTATION": splats.rotations[:, [1, 2, 3, 0]],
+        prefixed + "SCALE": splats.scales,
+        prefixed + "OPACITY": np.round(splats.opacities * 255).astype(np.uint8) if shares else splats.opacities,
     }
     k = 0
     for degree in range(splats.degree + 1):
         for n in range(2 * degree + 1):
-            arrays[f"{own}SH_DEGREE_{degree}_COEF_{n}"] = splats.harmonics[:, k]
+            arrays[f"{prefixed}SH_DEGREE_{degree}_COEF_{n}"] = splats.harmonics[:, k]
             k += 1
     views, accessors, data = [], [], b""
     for values in arrays.values():
