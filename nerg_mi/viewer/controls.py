@@ -21,22 +21,22 @@ from nerg_mi.rendering.scene import list_scene_files
 from . import layers
 from .layers import Scale
 from .page import BrowserWindow, Page
-from .points import PinholeView, heading_of
-from .scene import copied_view
+from .points import PinholeView, make_heading
+from .scene import copy_view
 
 # ---- Controls ----
 #
 # The panel: what is shown and how, the observer's own view, the numbers, and the camera.
 
-INSET = 240
+INSET_WIDTH = 240
 """Width of the observer's own view, in pixels."""
 
-_ROWS = 12
-_USUAL = "as usual"
-_AGAIN = 0.4
+_MAX_ROWS = 12
+_DEFAULT_COLORS = "as usual"
+_INSET_INTERVAL = 0.4
 
 
-def tell(event_or_client: Any, title: str, text: str) -> None:
+def notify(event_or_client: Any, title: str, text: str) -> None:
     """A note in the corner of one page."""
     client = getattr(event_or_client, "client", event_or_client)
     if client is not None:
@@ -44,28 +44,28 @@ def tell(event_or_client: Any, title: str, text: str) -> None:
 
 
 @contextmanager
-def telling(event_or_client: Any, title: str) -> Iterator[None]:
+def notify_errors(event_or_client: Any, title: str) -> Iterator[None]:
     """Tell one page of what is refused within the block, which ends there."""
     try:
         yield
     except NergError as error:
-        tell(event_or_client, title, format_error(error))
+        notify(event_or_client, title, format_error(error))
 
 
 class Inset:
     """A small picture of the panel, ``title``, which is greyed while another one is made."""
 
     def __init__(self, gui: Any, title: str, height: int):
-        self._title, self._colors = title, np.zeros((height, INSET, 3), np.uint8)
+        self._title, self._colors = title, np.zeros((height, INSET_WIDTH, 3), np.uint8)
         self._handle = gui.add_image(self._colors, label=title)
         self._stale = False
-        self.set_stale()
+        self.mark_stale()
 
-    def set_stale(self) -> None:
+    def mark_stale(self) -> None:
         """What it shows is out of date."""
         if not self._stale:
             self._stale = True
-            self._handle.image = layers.greyed(self._colors)
+            self._handle.image = layers.grey_out(self._colors)
             self._handle.label = f"{self._title} (grey: out of date)"
 
     def show(self, colors: np.ndarray) -> None:
@@ -75,7 +75,7 @@ class Inset:
         self._handle.label = self._title
 
 
-def slider_end(value: float) -> float:
+def slider_max(value: float) -> float:
     """The upper end of a slider from 0 on which ``value`` lies: a power of ten, at least three times as large."""
     return 10.0 ** math.ceil(math.log10(3 * value)) if value > 0 else 1.0
 
@@ -85,181 +85,186 @@ class Controls:
 
     def __init__(self, page: Page):
         self.page, self.session, self.gui = page, page.session, page.server.gui
-        self._insets_at, self._insets_late = 0.0, False
-        self._insets_of: tuple[Any, ...] = ()
-        self._lock, self._scaling = threading.Lock(), threading.Lock()
+        self._last_inset_time, self._is_inset_scheduled = 0.0, False
+        self._inset_inputs: tuple[Any, ...] = ()
+        self._lock, self._legend_lock = threading.Lock(), threading.Lock()
         with self.gui.add_folder("Show"):
-            self._show()
+            self._build_display()
         with self.gui.add_folder("Observer"):
-            self._observer()
+            self._build_observer()
         if self.session.scene.has_gaze:
             with self.gui.add_folder("Attention"):
                 self._table = self.gui.add_html("")
         with self.gui.add_folder("Camera", expand_by_default=False):
-            self._camera()
-        page.on_moved.append(self.refresh)
-        page.on_marked.append(self.refresh)
+            self._build_camera()
+        page.update_callbacks.append(self.refresh)
+        page.scale_callbacks.append(self.refresh)
 
     # What is shown
 
-    def _show(self) -> None:
+    def _build_display(self) -> None:
         session, gui = self.session, self.gui
-        names = list(session.place.variants)
+        names = list(session.source.variants)
         variant = gui.add_dropdown("Gaze field", names, initial_value=session.gaze_name) if len(names) > 1 else None
         titles = [layer.title for layer in session.layers]
-        layer = gui.add_dropdown("Layer", titles, initial_value=session.shade.layer.title)
-        self._legend = gui.add_html(layers.format_legend(session.shade.layer, session.scale(), self.page.stale))
-        basis = gui.add_html(basis_note(session))
-        colors = gui.add_dropdown("Colours", _maps_of(session.shade.layer), initial_value=_USUAL)
+        layer = gui.add_dropdown("Layer", titles, initial_value=session.display.layer.title)
+        self._legend = gui.add_html(layers.format_legend(session.display.layer, session.scale(), self.page.stale_scale_reason))
+        basis = gui.add_html(format_basis(session))
+        colors = gui.add_dropdown("Colours", _colormap_names(session.display.layer), initial_value=_DEFAULT_COLORS)
         automatic = gui.add_checkbox("Automatic range", True)
-        ends = gui.add_vector2("Range", (0.0, 1.0), step=0.01, disabled=True)
+        range_input = gui.add_vector2("Range", (0.0, 1.0), step=0.01, disabled=True)
         # As Mitsuba has it, in single precision, it would be written with all its digits.
-        top = slider_end(session.falloff)
-        falloff = gui.add_slider("Fall-off", 0.0, top, 0.01 * top, float(f"{session.falloff:.4g}"))
+        max_falloff = slider_max(session.falloff)
+        falloff = gui.add_slider("Fall-off", 0.0, max_falloff, 0.01 * max_falloff, float(f"{session.falloff:.4g}"))
 
         def change(event: Any) -> None:
             if event.client is None:
                 # Written by the program, which has set all else.
                 return
-            chosen = next(la for la in session.layers if la.title == layer.value)
-            if tuple(colors.options) != _maps_of(chosen):
-                colors.options = _maps_of(chosen)
-            if chosen != session.shade.layer and not automatic.value:
+            selected = next(la for la in session.layers if la.title == layer.value)
+            if tuple(colors.options) != _colormap_names(selected):
+                colors.options = _colormap_names(selected)
+            if selected != session.display.layer and not automatic.value:
                 # A range in 1/sr says nothing of metres.
                 automatic.value = True
-            ends.disabled = automatic.value
+            range_input.disabled = automatic.value
             if event.target is automatic and not automatic.value:
                 scale = session.scale()
-                ends.value = (float(f"{scale.low:.3g}"), float(f"{scale.high:.3g}"))
-            fixed = None if automatic.value else ends.value
-            with telling(event, "Range"):
-                if fixed is not None:
-                    Scale(fixed[0], fixed[1])
-                session.set_shade(layer=chosen, colors=None if colors.value == _USUAL else colors.value, fixed=fixed)
-                self._shown_anew()
+                range_input.value = (float(f"{scale.low:.3g}"), float(f"{scale.high:.3g}"))
+            limits = None if automatic.value else range_input.value
+            with notify_errors(event, "Range"):
+                if limits is not None:
+                    Scale(limits[0], limits[1])
+                session.set_display(
+                    layer=selected, colors=None if colors.value == _DEFAULT_COLORS else colors.value, limits=limits
+                )
+                self._update_display()
 
-        for handle in (layer, colors, automatic, ends):
+        for handle in (layer, colors, automatic, range_input):
             handle.on_update(change)
 
         def change_gaze(event: Any) -> None:
             if event.client is None:
                 return
             try:
-                session.set_gaze(event.target.value)
+                session.select_gaze(event.target.value)
             except NergError as error:
-                tell(event, "Gaze field", format_error(error))
+                notify(event, "Gaze field", format_error(error))
                 event.target.value = session.gaze_name
                 return
             layer.options = tuple(la.title for la in session.layers)
-            layer.value = session.shade.layer.title
-            basis.content = basis_note(session)
-            self.page.follow()
-            self._shown_anew()
+            layer.value = session.display.layer.title
+            basis.content = format_basis(session)
+            self.page.request_points()
+            self._update_display()
 
         if variant is not None:
             variant.on_update(change_gaze)
 
         @falloff.on_update
         def _(event: Any) -> None:
-            with telling(event, "Fall-off"):
+            with notify_errors(event, "Fall-off"):
                 session.set_falloff(falloff.value)
-                self.page.follow()
-                self._shown_anew()
+                self.page.request_points()
+                self._update_display()
 
-    def _shown_anew(self) -> None:
-        self.page.recolor()
-        self.page.renew()
+    def _update_display(self) -> None:
+        self.page.redraw_points()
+        self.page.restart_pictures()
         self.refresh()
 
     # The observer
 
-    def _observer(self) -> None:
+    def _build_observer(self) -> None:
         session, gui = self.session, self.gui
-        self._at = gui.add_vector3("At", rounded(session.observer), step=0.05)
+        self._position = gui.add_vector3("At", round_position(session.observer), step=0.05)
         to_camera = gui.add_button("Observer to the camera")
         to_observer = gui.add_button("Camera to the observer")
-        self._own, self._sphere = Inset(gui, "Own view", INSET * 2 // 3), Inset(gui, "All around", INSET // 2)
+        self._own_view, self._panorama = (
+            Inset(gui, "Own view", INSET_WIDTH * 2 // 3),
+            Inset(gui, "All around", INSET_WIDTH // 2),
+        )
 
-        @self._at.on_update
+        @self._position.on_update
         def _(event: Any) -> None:
-            if event.client is not None and not np.allclose(self._at.value, session.observer, atol=1e-3):
+            if event.client is not None and not np.allclose(self._position.value, session.observer, atol=1e-3):
                 try:
-                    self.page.place_observer(np.array(self._at.value))
+                    self.page.place_observer(np.array(self._position.value))
                 except NergError as error:
-                    tell(event, "Observer", format_error(error))
-                    self._at.value = rounded(session.observer)
+                    notify(event, "Observer", format_error(error))
+                    self._position.value = round_position(session.observer)
 
         @to_camera.on_click
         def _(event: Any) -> None:
-            view = PinholeView.of_page(event.client.camera)
-            self.page.place_observer(view.origin, heading_of(view.ahead, session.place.up))
+            view = PinholeView.from_page(event.client.camera)
+            self.page.place_observer(view.origin, make_heading(view.forward, session.source.up))
 
         @to_observer.on_click
         def _(event: Any) -> None:
-            look(event.client, session.observer, session.observer + 2 * session.heading[:, 0], session.place.up)
+            set_camera(event.client, session.observer, session.observer + 2 * session.heading[:, 0], session.source.up)
 
     def refresh(self) -> None:
         """Numbers, scale and insets as they are now; insets not more often than they can be looked at."""
         session = self.session
-        self._rescale()
-        at = rounded(session.observer)
-        if not np.allclose(self._at.value, at, atol=1e-3):
-            self._at.value = at
+        self._update_legend()
+        at = round_position(session.observer)
+        if not np.allclose(self._position.value, at, atol=1e-3):
+            self._position.value = at
         with self._lock:
-            if self._inset_key() == self._insets_of:
+            if self._get_inset_inputs() == self._inset_inputs:
                 return
-            self._own.set_stale()
-            self._sphere.set_stale()
-            if time.monotonic() - self._insets_at < _AGAIN:
-                if not self._insets_late:
-                    self._insets_late = True
-                    timer = threading.Timer(_AGAIN, self._insets_later)
+            self._own_view.mark_stale()
+            self._panorama.mark_stale()
+            if time.monotonic() - self._last_inset_time < _INSET_INTERVAL:
+                if not self._is_inset_scheduled:
+                    self._is_inset_scheduled = True
+                    timer = threading.Timer(_INSET_INTERVAL, self._run_scheduled_insets)
                     timer.daemon = True
                     timer.start()
                 return
-            self._insets_at = time.monotonic()
-        self._insets()
+            self._last_inset_time = time.monotonic()
+        self._start_insets()
 
-    def _rescale(self) -> None:
+    def _update_legend(self) -> None:
         # Several threads come here, and the last to write should be the last to have looked.
-        with self._scaling:
+        with self._legend_lock:
             session = self.session
-            self._legend.content = layers.format_legend(session.shade.layer, session.scale(), self.page.stale)
+            self._legend.content = layers.format_legend(session.display.layer, session.scale(), self.page.stale_scale_reason)
             if session.scene.has_gaze:
-                self._table.content = table(session.shares, session.stale_shares)
+                self._table.content = format_shares(session.shares, session.are_shares_stale)
 
-    def _inset_key(self) -> tuple[Any, ...]:
+    def _get_inset_inputs(self) -> tuple[Any, ...]:
         """What the insets depend on."""
         session = self.session
         at = session.observer.tolist(), session.heading.tolist()
-        return *at, session.shade, session.scale(), session.version, session.ceiling
+        return *at, session.display, session.scale(), session.settings_version, session.ceiling
 
-    def _insets_later(self) -> None:
+    def _run_scheduled_insets(self) -> None:
         with self._lock:
-            self._insets_late, self._insets_at = False, time.monotonic()
-        self._insets()
+            self._is_inset_scheduled, self._last_inset_time = False, time.monotonic()
+        self._start_insets()
 
-    def _insets(self) -> None:
+    def _start_insets(self) -> None:
         session = self.session
-        key = self._insets_of = self._inset_key()
+        inputs = self._inset_inputs = self._get_inset_inputs()
 
-        def own(picture: Any, colors: np.ndarray) -> None:
-            if picture.whole and key == self._inset_key():
-                self._own.show(colors)
+        def show_own_view(picture: Any, colors: np.ndarray) -> None:
+            if picture.is_final and inputs == self._get_inset_inputs():
+                self._own_view.show(colors)
 
-        def sphere(colors: np.ndarray) -> None:
-            if key == self._inset_key():
-                self._sphere.show(colors)
+        def show_panorama(colors: np.ndarray) -> None:
+            if inputs == self._get_inset_inputs():
+                self._panorama.show(colors)
 
-        ahead, up = session.heading[:, 0], session.heading[:, 2]
-        view = PinholeView.of(session.observer, session.observer + ahead, up, np.radians(60), 1.5)
-        session.inset("own", view, own, INSET)
-        session.sphere(sphere, INSET)
+        forward, up = session.heading[:, 0], session.heading[:, 2]
+        view = PinholeView.look_at(session.observer, session.observer + forward, up, np.radians(60), 1.5)
+        session.refine_inset("own", view, show_own_view, INSET_WIDTH)
+        session.render_panorama(show_panorama, INSET_WIDTH)
 
     # The camera
 
-    def _camera(self) -> None:
-        session, gui, place = self.session, self.gui, self.session.place
+    def _build_camera(self) -> None:
+        session, gui, place = self.session, self.gui, self.session.source
         home = gui.add_button("First view")
         above = gui.add_button("From above")
         cut = gui.add_checkbox("Cut the ceiling off", session.ceiling is not None)
@@ -269,13 +274,13 @@ class Controls:
 
         @home.on_click
         def _(event: Any) -> None:
-            view = session.home
-            look(event.client, view.origin, view.origin + 3 * view.ahead, place.up)
+            view = session.home_view
+            set_camera(event.client, view.origin, view.origin + 3 * view.forward, place.up)
 
         def change_cut(event: Any) -> None:
-            lower, upper = self._heights()
+            lower, upper = self._height_range()
             session.ceiling = lower + height.value * (upper - lower) if cut.value else None
-            self._shown_anew()
+            self._update_display()
 
         cut.on_update(change_cut)
         height.on_update(change_cut)
@@ -290,49 +295,49 @@ class Controls:
             middle, size = (lower + upper) / 2, float(np.linalg.norm(upper - lower))
             # Straight down there is no up: a little to the side keeps the picture the right way round.
             side = session.heading[:, 0] * 0.02 * size
-            look(event.client, middle + 0.95 * size * place.up - side, middle, place.up)
+            set_camera(event.client, middle + 0.95 * size * place.up - side, middle, place.up)
 
         @shot.on_click
         def _(event: Any) -> None:
-            window = self._window(event)
-            if window is None or window.last is None:
-                tell(event, "Picture", "There is no picture yet: wait until the view rests.")
+            window = self._find_window(event)
+            if window is None or window.last_picture is None:
+                notify(event, "Picture", "There is no picture yet: wait until the view rests.")
                 return
-            with telling(event, "Picture"):
-                data = png_bytes(session, window.last[1], about_picture(session, window).text())
+            with notify_errors(event, "Picture"):
+                data = encode_picture(session, window.last_picture[1], picture_provenance(session, window).text())
                 event.client.send_file_download("view.png", data, save_immediately=True)
 
         @copy.on_click
         def _(event: Any) -> None:
-            window = self._window(event)
+            window = self._find_window(event)
             if window is None or window.view is None:
                 return
-            with telling(event, "Scene"):
-                text = copied_view(session, window.view)
+            with notify_errors(event, "Scene"):
+                text = copy_view(session, window.view)
                 event.client.send_file_download("view.xml", text.encode(), save_immediately=True)
 
-    def _window(self, event: Any) -> BrowserWindow | None:
+    def _find_window(self, event: Any) -> BrowserWindow | None:
         return None if event.client is None else self.page.windows.get(event.client.client_id)
 
-    def _heights(self) -> tuple[float, float]:
+    def _height_range(self) -> tuple[float, float]:
         """Lowest and highest of the points along up."""
         proxy = self.session.proxy
         if proxy is None:
             return 0.0, 1.0
-        along = proxy.points @ self.session.cut_up
+        along = proxy.points @ self.session.ceiling_up
         return float(np.percentile(along, 0.5)), float(np.percentile(along, 99.5))
 
 
-def _maps_of(layer: layers.Layer) -> tuple[str, ...]:
-    return _USUAL, *layers.MAPS[layers.color_kind(layer)]
+def _colormap_names(layer: layers.Layer) -> tuple[str, ...]:
+    return _DEFAULT_COLORS, *layers.COLORMAPS[layers.colormap_kind(layer)]
 
 
-def basis_note(session: Any) -> str:
+def format_basis(session: Any) -> str:
     """How many rays of how many people the gaze is made of, as HTML; "" where that is not known."""
-    return layers.note(f"gaze {session.basis}") if session.basis else ""
+    return layers.format_note(f"gaze {session.basis}") if session.basis else ""
 
 
-def look(client: Any, origin: np.ndarray, target: np.ndarray, up: np.ndarray) -> None:
+def set_camera(client: Any, origin: np.ndarray, target: np.ndarray, up: np.ndarray) -> None:
     """Turn one page's camera."""
     if client is None:
         return
@@ -342,47 +347,47 @@ def look(client: Any, origin: np.ndarray, target: np.ndarray, up: np.ndarray) ->
         client.camera.look_at = tuple(target)
 
 
-def table(shares: dict[str, float], stale: bool = False) -> str:
+def format_shares(shares: dict[str, float], stale: bool = False) -> str:
     """Shares of attention as HTML, the largest first; ``stale``: they are out of date."""
     if not shares:
-        return layers.note("Computing." if stale else "Name areas to see their share of attention.")
+        return layers.format_note("Computing." if stale else "Name areas to see their share of attention.")
     rows = sorted(shares.items(), key=lambda item: -item[1])
-    rest = sum(share for _, share in rows[_ROWS:])
-    shown = [*rows[:_ROWS], *([(f"{len(rows) - _ROWS} more", rest)] if len(rows) > _ROWS else [])]
+    remainder = sum(share for _, share in rows[_MAX_ROWS:])
+    shown = [*rows[:_MAX_ROWS], *([(f"{len(rows) - _MAX_ROWS} more", remainder)] if len(rows) > _MAX_ROWS else [])]
     cells = "".join(
         f"<tr><td>{escape(name)}</td><td style='text-align:right'>{100 * share:.1f} %</td></tr>"
         for name, share in shown
     )
-    style = f"font-size:0.85em;margin:0 1em;{layers.STALE if stale else ''}"
+    style = f"font-size:0.85em;margin:0 1em;{layers.STALE_STYLE if stale else ''}"
     text = f"<table style='{style}'><tr><th>area</th><th>share</th></tr>{cells}</table>"
-    return text + (layers.note("Out of date: computing.") if stale else "")
+    return text + (layers.format_note("Out of date: computing.") if stale else "")
 
 
-def rounded(at: np.ndarray) -> tuple[float, float, float]:
+def round_position(position: np.ndarray) -> tuple[float, float, float]:
     """A position as the panel shows it: to a thousandth of a unit."""
-    x, y, z = (float(round(float(v), 3)) for v in at)
+    x, y, z = (float(round(float(v), 3)) for v in position)
     return x, y, z
 
 
-def about_picture(session: Any, window: BrowserWindow) -> Provenance:
+def picture_provenance(session: Any, window: BrowserWindow) -> Provenance:
     """What the last picture of ``window`` was made of. Raises `NergError` for files of the scene that are gone."""
-    assert window.last is not None and window.view is not None
-    view, shade, scale = window.view, session.shade, session.scale()
+    assert window.last_picture is not None and window.view is not None
+    view, shade, scale = window.view, session.display, session.scale()
     settings = {
         "layer": shade.layer.title,
         "colors": scale.colors,
         "range": [scale.low, scale.high],
         "observer": session.observer.tolist(),
         "falloff": session.falloff,
-        "camera": {"origin": view.origin.tolist(), "ahead": view.ahead.tolist(), "up": view.up.tolist()},
-        "degrees": view.across,
-        "samples": window.last[0].samples,
+        "camera": {"origin": view.origin.tolist(), "ahead": view.forward.tolist(), "up": view.up.tolist()},
+        "degrees": view.fov_x_degrees,
+        "samples": window.last_picture[0].samples,
         "ceiling": session.ceiling,
     }
     return make_provenance("nerg view", list_scene_files(session.scene_file), 0, settings, session.checksums)
 
 
-def png_bytes(session: Any, colors: np.ndarray, text: dict[str, str] | None = None) -> bytes:
+def encode_picture(session: Any, colors: np.ndarray, text: dict[str, str] | None = None) -> bytes:
     """The bytes of a PNG of ``colors`` (height, width, 3) uint8 with ``text`` in its header, made on the render
     thread."""
 
@@ -398,11 +403,11 @@ def png_bytes(session: Any, colors: np.ndarray, text: dict[str, str] | None = No
 #
 # Areas of interest in the page: boxes that are drawn, moved, named, and saved as JSON.
 
-COLOR = (90, 200, 255)
-_CHOSEN = (255, 210, 60)
+AREA_COLOR = (90, 200, 255)
+_SELECTED_COLOR = (255, 210, 60)
 _NONE = "(none)"
-_LEAST = 0.05
-_FEW = 8
+_MIN_SIZE = 0.05
+_MAX_LABELS = 8
 
 
 class AreasPanel:
@@ -416,23 +421,23 @@ class AreasPanel:
         with gui.add_folder("Areas of interest", expand_by_default=False):
             self._name = gui.add_text("Name", "area 1")
             draw = gui.add_button("Draw a box in the view")
-            self._chosen = gui.add_dropdown("Change", self._names(), initial_value=_NONE)
-            self._size = gui.add_vector3("Size", (1.0, 1.0, 1.0), min=(_LEAST,) * 3, step=0.05)
+            self._selected = gui.add_dropdown("Change", self._dropdown_options(), initial_value=_NONE)
+            self._size = gui.add_vector3("Size", (1.0, 1.0, 1.0), min=(_MIN_SIZE,) * 3, step=0.05)
             remove = gui.add_button("Remove")
-            self._visible = gui.add_checkbox("Show boxes", len(self.session.regions) <= _FEW)
+            self._visible = gui.add_checkbox("Show boxes", len(self.session.regions) <= _MAX_LABELS)
             save = gui.add_button("Save (JSON)")
-        draw.on_click(self._draw)
+        draw.on_click(self._start_drawing)
         remove.on_click(self._remove)
-        self._chosen.on_update(lambda event: self._choose())
+        self._selected.on_update(lambda event: self._update_selection())
         self._size.on_update(self._resize)
-        self._visible.on_update(lambda event: self._show_all())
+        self._visible.on_update(lambda event: self._draw_boxes())
 
         @save.on_click
         def _(event: Any) -> None:
             text = format_areas(self.session.regions, self.session.other_areas).encode()
             event.client.send_file_download("areas.json", text, save_immediately=True)
 
-        self._show_all()
+        self._draw_boxes()
 
     def add(self, region: Region) -> None:
         """One more area. Raises `NergError` for a name that there is already, and for too many."""
@@ -441,9 +446,9 @@ class AreasPanel:
         if len(self.session.regions) >= MAX_AREAS:
             raise NergError(f"there are {MAX_AREAS} areas already; remove one of them")
         self.session.regions = [*self.session.regions, region]
-        self._changed(region.name)
+        self._on_regions_changed(region.name)
 
-    def _draw(self, event: Any) -> None:
+    def _start_drawing(self, event: Any) -> None:
         client, name = event.client, self._name.value
         if client is None:
             return
@@ -452,36 +457,36 @@ class AreasPanel:
         @scene.on_rect_select()
         def _(drawn: Any) -> None:
             scene.remove_rect_select_callback()
-            proxy, view = self.session.proxy, PinholeView.of_page(client.camera)
-            with telling(client, "Areas"):
+            proxy, view = self.session.proxy, PinholeView.from_page(client.camera)
+            with notify_errors(client, "Areas"):
                 if proxy is None:
                     raise NergError("there are no points to lay a box around yet; wait a moment")
-                lower, upper = box_around(proxy.points, proxy.size, view, drawn.screen_min, drawn.screen_max)
+                lower, upper = fit_box(proxy.points, proxy.size, view, drawn.screen_min, drawn.screen_max)
                 self.add(Region.create(name, lower, upper))
                 self._name.value = f"area {len(self.session.regions) + 1}"
 
         # Messages arrive in order: whoever reads this can draw, and does not turn the camera instead.
-        tell(client, "Areas", "Draw a rectangle around a thing: a box is laid around what is in it.")
+        notify(client, "Areas", "Draw a rectangle around a thing: a box is laid around what is in it.")
 
     def _remove(self, event: Any) -> None:
-        self.session.regions = [r for r in self.session.regions if r.name != self._chosen.value]
-        self._changed(_NONE)
+        self.session.regions = [r for r in self.session.regions if r.name != self._selected.value]
+        self._on_regions_changed(_NONE)
 
-    def _names(self) -> list[str]:
+    def _dropdown_options(self) -> list[str]:
         return [_NONE, *(region.name for region in self.session.regions)]
 
-    def _changed(self, chosen: str) -> None:
-        self._chosen.options = self._names()
-        self._chosen.value = chosen
-        self._choose()
-        self.page.count()
+    def _on_regions_changed(self, selected: str) -> None:
+        self._selected.options = self._dropdown_options()
+        self._selected.value = selected
+        self._update_selection()
+        self.page.request_shares()
 
-    def _choose(self) -> None:
+    def _update_selection(self) -> None:
         """A gizmo for the area that is chosen."""
         if self._gizmo is not None:
             self._gizmo.remove()
             self._gizmo = None
-        region = next((r for r in self.session.regions if r.name == self._chosen.value), None)
+        region = next((r for r in self.session.regions if r.name == self._selected.value), None)
         if region is not None:
             corners = region.corners
             self._size.value = tuple(corners[1] - corners[0])
@@ -496,29 +501,29 @@ class AreasPanel:
 
             @self._gizmo.on_update
             def _(event: Any) -> None:
-                self._replace(np.asarray(self._gizmo.position), np.asarray(self._size.value))
+                self._update_selected(np.asarray(self._gizmo.position), np.asarray(self._size.value))
 
-        self._show_all()
+        self._draw_boxes()
 
     def _resize(self, event: Any) -> None:
         if self._gizmo is not None and event.client is not None:
-            self._replace(np.asarray(self._gizmo.position), np.asarray(self._size.value))
+            self._update_selected(np.asarray(self._gizmo.position), np.asarray(self._size.value))
 
-    def _replace(self, middle: np.ndarray, size: np.ndarray) -> None:
-        name = self._chosen.value
-        lower, upper = middle - size / 2, middle + size / 2
+    def _update_selected(self, center: np.ndarray, size: np.ndarray) -> None:
+        name = self._selected.value
+        lower, upper = center - size / 2, center + size / 2
         turn = next((r.rotation for r in self.session.regions if r.name == name), None)
         try:
             new = Region.create(name, lower, upper, turn)
         except NergError:
             # Nothing that a hand can drag: the gizmo goes back to where the area is.
-            self._choose()
+            self._update_selection()
             return
         self.session.regions = [new if r.name == name else r for r in self.session.regions]
-        self._show_all()
-        self.page.count()
+        self._draw_boxes()
+        self.page.request_shares()
 
-    def _show_all(self) -> None:
+    def _draw_boxes(self) -> None:
         for handles in self._boxes.values():
             for handle in handles:
                 handle.remove()
@@ -527,26 +532,26 @@ class AreasPanel:
             return
         scene = self.page.server.scene
         for k, region in enumerate(self.session.regions):
-            chosen = region.name == self._chosen.value
-            color = _CHOSEN if chosen else COLOR
+            is_selected = region.name == self._selected.value
+            color = _SELECTED_COLOR if is_selected else AREA_COLOR
             box = scene.add_line_segments(
-                f"/areas/{k}", edges(region), np.array(color, np.uint8), thickness=2.0, thickness_units="screen"
+                f"/areas/{k}", box_edges(region), np.array(color, np.uint8), thickness=2.0, thickness_units="screen"
             )
             handles = [box]
-            if chosen or len(self.session.regions) <= _FEW:
+            if is_selected or len(self.session.regions) <= _MAX_LABELS:
                 top = (*region.center[:2], region.bounds[1, 2])
                 handles.append(scene.add_label(f"/areas/{k}_name", region.name, position=top, anchor="bottom-center"))
             self._boxes[region.name] = handles
 
 
-def edges(region: Region) -> np.ndarray:
+def box_edges(region: Region) -> np.ndarray:
     """The twelve edges (12, 2, 3) of a box, along one axis after the other."""
     corners = region.vertices
-    ends = [(k, k | 1 << axis) for axis in range(3) for k in range(8) if not k >> axis & 1]
-    return corners[np.array(ends)].astype(np.float32)
+    vertex_pairs = [(k, k | 1 << axis) for axis in range(3) for k in range(8) if not k >> axis & 1]
+    return corners[np.array(vertex_pairs)].astype(np.float32)
 
 
-def box_around(
+def fit_box(
     points: np.ndarray, margin: float, view: PinholeView, low: tuple[float, float], high: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Corners of a box around those of ``points`` (N, 3) that are seen within a rectangle of the picture (0..1 from its
@@ -555,17 +560,17 @@ def box_around(
 
     Raises `NergError` where there are none.
     """
-    away = np.asarray(points, float) - view.origin
-    depth = away @ view.ahead
-    right = np.cross(view.ahead, view.up)
-    rise = np.tan(view.fov / 2)
+    offsets = np.asarray(points, float) - view.origin
+    depth = offsets @ view.forward
+    right = np.cross(view.forward, view.up)
+    tan_half_fov = np.tan(view.fov / 2)
     with np.errstate(divide="ignore", invalid="ignore"):
-        x = 0.5 + (away @ right) / (depth * rise * view.aspect) / 2
-        y = 0.5 - (away @ view.up) / (depth * rise) / 2
+        x = 0.5 + (offsets @ right) / (depth * tan_half_fov * view.aspect) / 2
+        y = 0.5 - (offsets @ view.up) / (depth * tan_half_fov) / 2
     inside = (depth > 1e-3) & (x >= low[0]) & (x <= high[0]) & (y >= low[1]) & (y <= high[1])
     if inside.sum() < 8:
         raise NergError("there is nothing within that rectangle; draw one around a thing")
-    foremost = float(np.percentile(depth[inside], 5))
-    wide = 2 * foremost * rise * max((high[0] - low[0]) * view.aspect, high[1] - low[1])
-    near = np.asarray(points, float)[inside & (depth <= foremost + wide)]
-    return np.percentile(near, 1, axis=0) - margin, np.percentile(near, 99, axis=0) + margin
+    nearest_depth = float(np.percentile(depth[inside], 5))
+    max_thickness = 2 * nearest_depth * tan_half_fov * max((high[0] - low[0]) * view.aspect, high[1] - low[1])
+    nearest = np.asarray(points, float)[inside & (depth <= nearest_depth + max_thickness)]
+    return np.percentile(nearest, 1, axis=0) - margin, np.percentile(nearest, 99, axis=0) + margin

@@ -14,7 +14,7 @@ from nerg_mi.figures.overlay import Overlay, OverlayLayers, Style, map_colors, f
 from nerg_mi.figures.style import CATEGORICAL, DIVERGING, SEQUENTIAL, find_colormap, hatch
 from nerg_mi.transport.aovs import AOVS
 
-MAPS = {"sequential": SEQUENTIAL, "diverging": DIVERGING, "categorical": CATEGORICAL}
+COLORMAPS = {"sequential": SEQUENTIAL, "diverging": DIVERGING, "categorical": CATEGORICAL}
 """Colour maps to choose from, by the kind of what is shown."""
 
 
@@ -41,11 +41,11 @@ class Layer:
         return "color" if self.overlay is None else self.overlay.display.kind
 
     @property
-    def is_per_observer(self) -> bool:
+    def depends_on_observer(self) -> bool:
         """Whether it depends on the observer."""
         return self.overlay is not None and AOVS[self.quantity].is_per_observer
 
-    def values(self, by_quantity: Mapping[str, np.ndarray]) -> np.ndarray | None:
+    def select_values(self, by_quantity: Mapping[str, np.ndarray]) -> np.ndarray | None:
         """Its values (...) among those of each quantity, (...) or, of several channels, (..., channels)."""
         values = by_quantity.get(self.quantity)
         if values is None or self.overlay is None or self.overlay.name == self.quantity:
@@ -56,23 +56,23 @@ class Layer:
 
 
 @dataclass(frozen=True)
-class Shade:
+class DisplaySettings:
     """How a layer is coloured: ``layer``, ``colors`` (None: its usual ones), and a range (low, high) (None: that of
     what is seen)."""
 
     layer: Layer
     colors: str | None = None
-    fixed: tuple[float, float] | None = None
+    limits: tuple[float, float] | None = None
 
 
-def layer_of(name: str) -> Layer:
+def get_layer(name: str) -> Layer:
     """The layer of the AOV, or the channel of one, ``name``; of colour alone for "color"."""
     return Layer(None if name == COLOR else find_overlay(name))
 
 
 def list_layers(scene: Scene) -> list[Layer]:
     """The layers that ``scene`` can show: colour, and every AOV that varies in it."""
-    found = [Layer()]
+    layers = [Layer()]
     for aov in AOVS.values():
         try:
             scene.integrator.make_context([aov.name], False)
@@ -80,16 +80,16 @@ def list_layers(scene: Scene) -> list[Layer]:
             # That is how the integrator says what it lacks.
             continue
         if not aov.is_constant(scene.integrator):
-            found += [Layer(overlay) for overlay in list_overlays(aov, aov.channel_suffixes(scene.integrator.medium))]
-    return found
+            layers += [Layer(overlay) for overlay in list_overlays(aov, aov.channel_suffixes(scene.integrator.medium))]
+    return layers
 
 
-def quantities(layer: Layer) -> list[str]:
+def required_quantities(layer: Layer) -> list[str]:
     """What has to be computed to show ``layer``."""
     return list(dict.fromkeys([COLOR, "depth", "opacity", *([layer.quantity] if layer.quantity else [])]))
 
 
-def color_kind(layer: Layer) -> str:
+def colormap_kind(layer: Layer) -> str:
     """The kind of the colour maps that ``layer`` may have."""
     return "sequential" if layer.overlay is None else layer.overlay.colormap_kind
 
@@ -101,8 +101,8 @@ def choose_scale(layer: Layer, limits: tuple[float, float] | None, colors: str |
         return Scale()
     low, high = limits or overlay.display.limits or (0.0, 1.0)
     # What was chosen for a layer before may be a map of another kind.
-    chosen = colors if colors is not None and colors in MAPS[overlay.colormap_kind] else overlay.default_colormap
-    return Scale(low, high, chosen, overlay.colormap_kind)
+    colormap = colors if colors is not None and colors in COLORMAPS[overlay.colormap_kind] else overlay.default_colormap
+    return Scale(low, high, colormap, overlay.colormap_kind)
 
 
 @dataclass(frozen=True)
@@ -137,26 +137,26 @@ def colorize(
     rows = shape if len(shape) == 2 else (1, shape[0])
     color, mask = np.asarray(color).reshape(*rows, 3), np.asarray(mask, bool).reshape(rows)
     if layer.overlay is None or values is None:
-        shown = srgb(color)
+        pixels = srgb(color)
     else:
-        of = OverlayLayers(color, np.asarray(values).reshape(rows), mask)
-        shown = layer.overlay.paint(of, (scale.low, scale.high), Style(scale.colors))
+        inputs = OverlayLayers(color, np.asarray(values).reshape(rows), mask)
+        pixels = layer.overlay.paint(inputs, (scale.low, scale.high), Style(scale.colors))
     if hatched and len(shape) == 2 and layer.overlay is not None:
-        shown = hatch(shown, ~mask)
-    return to_bytes(shown).reshape(*shape, 3)
+        pixels = hatch(pixels, ~mask)
+    return to_bytes(pixels).reshape(*shape, 3)
 
 
-def greyed(colors: np.ndarray) -> np.ndarray:
+def grey_out(colors: np.ndarray) -> np.ndarray:
     """uint8 ``colors`` (..., 3) as what is out of date is shown: in grey, and with little contrast."""
     grey = 80 + 0.45 * (colors @ np.array([0.2126, 0.7152, 0.0722]))
     return np.repeat(grey[..., None], 3, axis=-1).astype(np.uint8)
 
 
-STALE = "opacity:0.35;filter:grayscale(1)"
+STALE_STYLE = "opacity:0.35;filter:grayscale(1)"
 """The style of what is out of date, in HTML."""
 
 
-def note(text: str) -> str:
+def format_note(text: str) -> str:
     """``text`` in small letters, as HTML."""
     return f"<div style='font-size:0.85em;padding:0 1em'>{escape(text)}</div>"
 
@@ -164,16 +164,16 @@ def note(text: str) -> str:
 def format_legend(layer: Layer, scale: Scale, stale: str = "") -> str:
     """The scale as HTML; empty where there is none. ``stale``: why it is not that of what is shown; "": it is."""
     if stale:
-        return f"<div style='{STALE}'>{format_legend(layer, scale)}</div>{note(stale)}"
+        return f"<div style='{STALE_STYLE}'>{format_legend(layer, scale)}</div>{format_note(stale)}"
     from matplotlib.colors import to_hex
 
     overlay = layer.overlay
     if overlay is None:
-        return note("")
+        return format_note("")
     if overlay.display.kind in ("shade", "categorical"):
-        return note(overlay.quantity.label)
-    places = np.linspace(scale.low, scale.high, 9)
-    stops = ",".join(to_hex(c) for c in map_colors(places, (scale.low, scale.high), scale.colors, scale.kind))
+        return format_note(overlay.quantity.label)
+    samples = np.linspace(scale.low, scale.high, 9)
+    stops = ",".join(to_hex(c) for c in map_colors(samples, (scale.low, scale.high), scale.colors, scale.kind))
     unit = overlay.quantity.unit or overlay.quantity.label
     ends = f"<span>{scale.low:.3g}</span><span>{escape(unit)}</span><span>{scale.high:.3g}</span>"
     return (

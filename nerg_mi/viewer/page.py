@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from nerg_mi.errors import NergError, is_user_error, format_error
 
 from . import layers
-from .points import LEVELS, PinholeView, StagePicture
+from .points import NUM_LEVELS, PinholeView, StagePicture
 from .server import stop_server
 from .session import Session
 
@@ -21,16 +21,16 @@ from .session import Session
 #
 # One browser that looks: its view, what it is shown, and how quickly it draws.
 
-SLOW, QUICK = 1 / 20, 1 / 40
+SLOW_FRAME, FAST_FRAME = 1 / 20, 1 / 40
 """Seconds a frame above which a browser is given fewer points, and below which more."""
 
-_FRAMES = 8
+_MIN_FRAMES = 8
 """It is judged by so many frames."""
 
-REST = 0.12
+REST_SECONDS = 0.12
 """Seconds without movement after which a picture is refined."""
 
-_LONGEST_REST = 0.8
+_MAX_REST_SECONDS = 0.8
 
 
 @dataclass(eq=False)
@@ -45,39 +45,39 @@ class BrowserWindow:
     status: Any
     cloud: Any = None
     view: PinholeView | None = None
-    moved: float = 0.0
-    looked: float = 0.0
-    noticed: bool = False
+    change_time: float = 0.0
+    last_view_time: float = 0.0
+    is_handled: bool = False
     version: int = 0
-    picture: bool = False
-    stale: str = ""
-    note: str = ""
-    free: np.ndarray | None = None
-    last: tuple[StagePicture, np.ndarray] | None = None
-    lines: list[str] = field(default_factory=list)
-    level: int = LEVELS - 2
-    frames: list[float] = field(default_factory=list)
+    shows_picture: bool = False
+    stale_reason: str = ""
+    message: str = ""
+    free_position: np.ndarray | None = None
+    last_picture: tuple[StagePicture, np.ndarray] | None = None
+    timings: list[str] = field(default_factory=list)
+    level: int = NUM_LEVELS - 2
+    frame_times: list[float] = field(default_factory=list)
 
-    def learn_pace(self, seconds: float) -> None:
+    def record_frame(self, seconds: float) -> None:
         """The view before was told ``seconds`` ago: a browser tells of each frame, while its camera moves."""
         if seconds < 1:
-            self.frames.append(seconds)
+            self.frame_times.append(seconds)
 
     @property
-    def rest(self) -> float:
+    def rest_seconds(self) -> float:
         """Seconds without a new view after which its camera rests: a browser that draws slowly tells of it seldom, and
         pictures that are refined meanwhile would make it slower still."""
-        return float(np.clip(3 * np.median(self.frames[-_FRAMES:] or [0.0]), REST, _LONGEST_REST))
+        return float(np.clip(3 * np.median(self.frame_times[-_MIN_FRAMES:] or [0.0]), REST_SECONDS, _MAX_REST_SECONDS))
 
-    def level_for_pace(self, at_rest: bool) -> int:
+    def choose_level(self, is_at_rest: bool) -> int:
         """The level that its frames ask for; more points only ``at_rest``."""
-        if len(self.frames) < _FRAMES:
+        if len(self.frame_times) < _MIN_FRAMES:
             return self.level
         # The quickest quarter: a mouse that pauses is no slow browser.
-        frame = float(np.percentile(self.frames, 25))
-        if frame > SLOW:
-            return min(self.level + 1, LEVELS - 1)
-        return max(self.level - 1, 0) if at_rest and frame < QUICK else self.level
+        frame = float(np.percentile(self.frame_times, 25))
+        if frame > SLOW_FRAME:
+            return min(self.level + 1, NUM_LEVELS - 1)
+        return max(self.level - 1, 0) if is_at_rest and frame < FAST_FRAME else self.level
 
 
 # ---- Page ----
@@ -87,11 +87,11 @@ class BrowserWindow:
 # While a camera moves its browser draws points by itself; when it rests a picture of the integrator stands in their
 # place, first small, then fine. Nothing here waits for rendering: a clock looks what is to be done.
 
-TICK = 0.04
+TICK_SECONDS = 0.04
 """Seconds between two looks of the clock."""
 
-_NEAR = 0.4
-_POINT = 1.15
+_GIZMO_DISTANCE = 0.4
+_POINT_SCALE = 1.15
 """Width of a drawn point, in cells of the grid that points lie in."""
 
 
@@ -104,47 +104,47 @@ class Page:
         self.windows: dict[int, BrowserWindow] = {}
         self.problem = ""
         self._lock = threading.RLock()
-        self._follow = self._count = False
-        self._stop = threading.Event()
+        self._is_points_update_pending = self._is_shares_update_pending = False
+        self._stopped = threading.Event()
         self._observer: Any = None
-        self._clock = threading.Thread(target=self._tick, name="nerg-view-clock", daemon=True)
-        self.on_moved: list[Any] = []
+        self._clock = threading.Thread(target=self._run_clock, name="nerg-view-clock", daemon=True)
+        self.update_callbacks: list[Any] = []
         # The scale, or what is out of date, is another one.
-        self.on_marked: list[Any] = []
-        self._marked: tuple[Any, ...] = ()
-        self._free: np.ndarray
+        self.scale_callbacks: list[Any] = []
+        self._stale_state: tuple[Any, ...] = ()
+        self._free_position: np.ndarray
 
     def open(self, session: Session) -> None:
         """Show ``session``, which has started."""
-        self.session, self._free = session, session.observer
-        scene, home = self.server.scene, session.home
-        scene.set_up_direction(tuple(session.place.up))
+        self.session, self._free_position = session, session.observer
+        scene, home = self.server.scene, session.home_view
+        scene.set_up_direction(tuple(session.source.up))
         camera = self.server.initial_camera
-        camera.position, camera.look_at = tuple(home.origin), tuple(home.origin + self._reach() * home.ahead)
-        camera.up, camera.fov = tuple(session.place.up), home.fov
+        camera.position, camera.look_at = tuple(home.origin), tuple(home.origin + self._orbit_distance() * home.forward)
+        camera.up, camera.fov = tuple(session.source.up), home.fov
         self._observer = scene.add_transform_controls(
             "/observer",
             scale=0.45,
             line_width=3.0,
             depth_test=False,
             position=tuple(session.observer),
-            wxyz=self._turn(),
+            wxyz=self._observer_quaternion(),
         )
         scene.add_icosphere("/observer/eye", radius=0.08, color=(40, 160, 255))
         scene.add_label("/observer/name", "observer", position=(0.0, 0.0, 0.25), anchor="bottom-center")
 
         @self._observer.on_update
         async def _(event: Any) -> None:
-            self._dragged(event.phase)
+            self._on_drag(event.phase)
 
-        self.server.on_client_connect(self._connected)
-        self.server.on_client_disconnect(self._disconnected)
-        self._follow = self._count = True
+        self.server.on_client_connect(self._on_connect)
+        self.server.on_client_disconnect(self._on_disconnect)
+        self._is_points_update_pending = self._is_shares_update_pending = True
         self._clock.start()
 
     def close(self) -> None:
         """End the clock, the session's thread and the server."""
-        self._stop.set()
+        self._stopped.set()
         if self._clock.is_alive():
             self._clock.join(5)
         if hasattr(self, "session"):
@@ -157,201 +157,205 @@ class Page:
         """Let the observer stand at ``at`` (3,), as if dragged there. Raises `NergError` for what is no position."""
         self.session.place_observer(at, heading)
         # Who was put somewhere on purpose is dragged from there.
-        self._free = self.session.observer
+        self._free_position = self.session.observer
         self._observer.position = tuple(np.asarray(at, float))
-        self._observer.wxyz = self._turn()
-        self._observer_moved(True)
+        self._observer.wxyz = self._observer_quaternion()
+        self._on_observer_moved(True)
 
-    def _dragged(self, phase: str) -> None:
+    def _on_drag(self, phase: str) -> None:
         session, (w, x, y, z) = self.session, np.asarray(self._observer.wxyz, float)
         try:
             if not 0 < np.linalg.norm([w, x, y, z]) < np.inf:
                 raise NergError("the page sent no rotation of the observer; drag them again")
             session.place_observer(self._observer.position, Rotation.from_quat([x, y, z, w]).as_matrix())
         except NergError as error:
-            self._observer.position, self._observer.wxyz = tuple(session.observer), self._turn()
+            self._observer.position, self._observer.wxyz = tuple(session.observer), self._observer_quaternion()
             self.on_error(error)
             return
-        self._observer_moved(phase == "end")
+        self._on_observer_moved(phase == "end")
         if phase == "end":
             at = session.observer
-            session.clear_way("observer", at, self._free, lambda found: self._put_out(at, found))
+            session.keep_in_free_space(
+                "observer", at, self._free_position, lambda found: self._move_observer_out(at, found)
+            )
 
-    def _put_out(self, at: np.ndarray, found: np.ndarray) -> None:
+    def _move_observer_out(self, at: np.ndarray, position: np.ndarray) -> None:
         """The observer, who was dragged to ``at`` (3,), stands at ``found`` (3,): elsewhere if that is in something."""
         if self.session.observer is not at:
             return
-        if found is at:
-            self._free = at
+        if position is at:
+            self._free_position = at
         else:
-            self.place_observer(found)
+            self.place_observer(position)
 
-    def _observer_moved(self, at_rest: bool) -> None:
+    def _on_observer_moved(self, is_at_rest: bool) -> None:
         self.problem = ""
         with self._lock:
-            self._follow, self._count = True, True
-            if self.session.shade.layer.is_per_observer:
-                self.renew(REST if not at_rest else 0.0)
-        for told in self.on_moved:
-            told()
+            self._is_points_update_pending, self._is_shares_update_pending = True, True
+            if self.session.display.layer.depends_on_observer:
+                self.restart_pictures(REST_SECONDS if not is_at_rest else 0.0)
+        for callback in self.update_callbacks:
+            callback()
 
-    def _show_gizmo(self) -> None:
+    def _update_gizmo_visibility(self) -> None:
         """The gizmo, but not to somebody alone who looks out of the observer's eye: it would fill the view."""
         views = [w.view for w in self.windows.values() if w.view is not None]
-        away = [float(np.linalg.norm(view.origin - self.session.observer)) for view in views]
-        visible = len(away) != 1 or away[0] > _NEAR
+        distances = [float(np.linalg.norm(view.origin - self.session.observer)) for view in views]
+        visible = len(distances) != 1 or distances[0] > _GIZMO_DISTANCE
         if self._observer.visible != visible:
             self._observer.visible = visible
 
-    def _turn(self) -> tuple[float, ...]:
+    def _observer_quaternion(self) -> tuple[float, ...]:
         x, y, z, w = Rotation.from_matrix(self.session.heading).as_quat()
         return w, x, y, z
 
     # Pictures
 
-    def follow(self) -> None:
+    def request_points(self) -> None:
         """Have the gaze on the points, and the shares, computed anew."""
-        self._follow = self._count = True
+        self._is_points_update_pending = self._is_shares_update_pending = True
 
-    def count(self) -> None:
+    def request_shares(self) -> None:
         """Have the shares of attention counted, since there are other areas."""
-        self._count = True
+        self._is_shares_update_pending = True
 
-    def renew(self, wait: float = 0.0) -> None:
+    def restart_pictures(self, delay: float = 0.0) -> None:
         """Make all pictures anew, ``wait`` seconds from now, since what they show has changed."""
         with self._lock:
             for window in self.windows.values():
-                self._moving(window, time.monotonic() - window.rest + wait)
+                self._hide_picture(window, time.monotonic() - window.rest_seconds + delay)
 
-    def recolor(self) -> None:
+    def redraw_points(self) -> None:
         """Colour the points anew, which are other ones where the ceiling is cut off."""
         with self._lock:
             for window in self.windows.values():
                 self._draw_points(window)
 
-    def _moving(self, window: BrowserWindow, when: float) -> None:
+    def _hide_picture(self, window: BrowserWindow, change_time: float) -> None:
         """The view of ``window``, or what it shows, is another one now: its points take the picture's place."""
         window.version += 1
-        window.moved, window.noticed = when, False
+        window.change_time, window.is_handled = change_time, False
         self.session.cancel(window.client.client_id)
-        if window.picture:
-            window.picture = False
+        if window.shows_picture:
+            window.shows_picture = False
             with window.client.atomic():
                 if window.cloud is not None:
                     window.cloud.visible = True
                     window.client.scene.set_background_image(None)
-                elif window.last is not None:
+                elif window.last_picture is not None:
                     # There is nothing to take its place yet.
-                    window.client.scene.set_background_image(layers.greyed(window.last[1]), format="jpeg")
+                    window.client.scene.set_background_image(layers.grey_out(window.last_picture[1]), format="jpeg")
 
-    def _refine(self, window: BrowserWindow) -> None:
-        version, began = window.version, time.monotonic()
-        window.lines = []
+    def _start_refinement(self, window: BrowserWindow) -> None:
+        version, start = window.version, time.monotonic()
+        window.timings = []
         client = window.client
 
         def deliver(picture: StagePicture, colors: np.ndarray) -> None:
             with self._lock:
                 if window.version != version or client.client_id not in self.windows:
                     return
-                window.last = picture, colors
-                window.picture = True
+                window.last_picture = picture, colors
+                window.shows_picture = True
                 with client.atomic():
                     client.scene.set_background_image(colors, format="jpeg", jpeg_quality=92)
                     if window.cloud is not None:
                         window.cloud.visible = False
                 height, width = colors.shape[:2]
-                took = time.monotonic() - began
-                window.lines.append(f"{width} × {height}, {picture.samples} a pixel: {took:.2f} s")
+                seconds = time.monotonic() - start
+                window.timings.append(f"{width} × {height}, {picture.samples} a pixel: {seconds:.2f} s")
 
         assert window.view is not None
-        session, at = self.session, window.view.origin
-        session.picture(client.client_id, window.view, deliver, session.options.width, session.spp)
-        free = session.home.origin if window.free is None else window.free
-        session.clear_way(client.client_id, at, free, lambda found: self._move_out(window, at, found))
+        session, origin = self.session, window.view.origin
+        session.refine_picture(client.client_id, window.view, deliver, session.options.width, session.spp)
+        free_position = session.home_view.origin if window.free_position is None else window.free_position
+        session.keep_in_free_space(
+            client.client_id, origin, free_position, lambda found: self._move_camera_out(window, origin, found)
+        )
 
-    def _move_out(self, window: BrowserWindow, at: np.ndarray, found: np.ndarray) -> None:
+    def _move_camera_out(self, window: BrowserWindow, at: np.ndarray, position: np.ndarray) -> None:
         """The camera of ``window``, which was moved to ``at`` (3,), stands at ``found`` (3,)."""
         with self._lock:
             if window.view is not None and window.view.origin is at:
-                window.free = found
-                if found is not at:
-                    window.note = "The camera was inside of something; it stands before it now."
-                    window.client.camera.position = tuple(found)
+                window.free_position = position
+                if position is not at:
+                    window.message = "The camera was inside of something; it stands before it now."
+                    window.client.camera.position = tuple(position)
 
-    def _mark(self, window: BrowserWindow) -> None:
+    def _update_status(self, window: BrowserWindow) -> None:
         """Say what ``window`` shows, what of it is out of date, and what is computed; grey the points that are."""
-        stale = self.session.stale_points
-        if stale != window.stale:
-            window.stale = stale
+        stale = self.session.stale_points_reason
+        if stale != window.stale_reason:
+            window.stale_reason = stale
             self._draw_points(window)
-        if window.picture:
-            whole = window.last is not None and window.last[0].whole
-            text = (window.lines[-1] if window.lines else "picture") + (" — done" if whole else " …")
-        elif window.cloud is None and window.last is not None:
+        if window.shows_picture:
+            is_final = window.last_picture is not None and window.last_picture[0].is_final
+            text = (window.timings[-1] if window.timings else "picture") + (" — done" if is_final else " …")
+        elif window.cloud is None and window.last_picture is not None:
             text = "**Grey: an earlier picture**"
         else:
             text = f"**Grey: {stale}**" if stale else "points"
-        computing = self.session.computing
-        parts = [text, *([f"Computing: {', '.join(computing)}"] if computing else []), window.note]
+        computing = self.session.running_tasks
+        parts = [text, *([f"Computing: {', '.join(computing)}"] if computing else []), window.message]
         parts += [f"**{self.problem}**"] if self.problem else []
         content = "\n\n".join(part for part in parts if part)
         if window.status.content != content:
             window.status.content = content
 
     @property
-    def stale(self) -> str:
+    def stale_scale_reason(self) -> str:
         """Why the scale is that of nothing that is shown; "" where it is of a picture, or of the points."""
         if not self.session.has_scale:
             return "No scale yet: it is being computed."
-        why = self.session.stale_points
-        if not why or any(window.picture for window in list(self.windows.values())):
+        reason = self.session.stale_points_reason
+        if not reason or any(window.shows_picture for window in list(self.windows.values())):
             return ""
-        return f"Out of date: {why}."
+        return f"Out of date: {reason}."
 
     def _draw_points(self, window: BrowserWindow) -> None:
-        shown = self.session.points(window.level)
-        if shown is None:
+        points = self.session.points(window.level)
+        if points is None:
             return
-        if window.cloud is not None and np.array_equal(window.cloud.points, shown.points):
-            window.cloud.colors = shown.colors
+        if window.cloud is not None and np.array_equal(window.cloud.points, points.points):
+            window.cloud.colors = points.colors
             return
         if window.cloud is not None:
             window.cloud.remove()
         window.cloud = window.client.scene.add_point_cloud(
             "/points",
-            shown.points,
-            shown.colors,
-            point_size=_POINT * shown.size,
+            points.points,
+            points.colors,
+            point_size=_POINT_SCALE * points.size,
             point_shape="square",
             point_shading="flat",
             precision="float32",
-            visible=not window.picture,
+            visible=not window.shows_picture,
         )
-        if not window.picture:
+        if not window.shows_picture:
             window.client.scene.set_background_image(None)
 
     # The session's listener
 
     def on_proxy(self) -> None:
         """Show the points."""
-        self._follow = True
-        self.recolor()
+        self._is_points_update_pending = True
+        self.redraw_points()
 
     def on_baked(self) -> None:
         """Show the gaze on the points."""
-        self.recolor()
-        for told in self.on_moved:
-            told()
+        self.redraw_points()
+        for callback in self.update_callbacks:
+            callback()
 
     def on_shares(self) -> None:
         """Nothing to be done here: whoever shows them has asked to be told."""
-        for told in self.on_moved:
-            told()
+        for callback in self.update_callbacks:
+            callback()
 
     def on_range(self) -> None:
         """Have the scale beside the picture be that of the picture."""
-        for told in self.on_marked:
-            told()
+        for callback in self.scale_callbacks:
+            callback()
 
     def on_error(self, error: BaseException) -> None:
         """Show what went wrong; a mistake of the program by its name as well."""
@@ -360,87 +364,87 @@ class Page:
 
     # Browsers
 
-    def _connected(self, client: Any) -> None:
+    def _on_connect(self, client: Any) -> None:
         status = client.gui.add_markdown("points …", order=-10)
         window = BrowserWindow(client, status)
         with self._lock:
             self.windows[client.client_id] = window
-            self._look(window)
+            self._update_view(window)
 
         @client.camera.on_update
         async def _(camera: Any) -> None:
             with self._lock:
-                self._look(window)
+                self._update_view(window)
 
         with self._lock:
             self._draw_points(window)
 
-    def _look(self, window: BrowserWindow) -> None:
-        view, old = PinholeView.of_page(window.client.camera), window.view
-        if not np.isfinite([*view.origin, *view.ahead, *view.up, view.fov, view.aspect]).all():
+    def _update_view(self, window: BrowserWindow) -> None:
+        view, old = PinholeView.from_page(window.client.camera), window.view
+        if not np.isfinite([*view.origin, *view.forward, *view.up, view.fov, view.aspect]).all():
             self.on_error(NergError("the page sent a camera without a position; reload it"))
             return
         # The browser tells its camera again where nothing has changed.
-        names = ("origin", "ahead", "up", "fov", "aspect")
+        names = ("origin", "forward", "up", "fov", "aspect")
         if old is not None and all(np.allclose(getattr(view, n), getattr(old, n), atol=1e-6) for n in names):
             return
         now = time.monotonic()
         if old is not None:
             # Also after what seemed to be a rest: of a browser that is slow, each frame does.
-            window.learn_pace(now - window.looked)
-            self._keep_pace(window, at_rest=False)
-            if window.free is None or not np.allclose(view.origin, window.free):
-                window.note = ""
-        window.looked = now
+            window.record_frame(now - window.last_view_time)
+            self._adapt_level(window, is_at_rest=False)
+            if window.free_position is None or not np.allclose(view.origin, window.free_position):
+                window.message = ""
+        window.last_view_time = now
         window.view = view
-        self._moving(window, now)
+        self._hide_picture(window, now)
 
-    def _keep_pace(self, window: BrowserWindow, at_rest: bool) -> None:
+    def _adapt_level(self, window: BrowserWindow, is_at_rest: bool) -> None:
         """Give the browser of ``window`` as many points as it draws quickly."""
-        level = window.level_for_pace(at_rest)
+        level = window.choose_level(is_at_rest)
         if level != window.level:
-            window.frames.clear()
-        del window.frames[:-100]
+            window.frame_times.clear()
+        del window.frame_times[:-100]
         if level != window.level:
             window.level = level
             self._draw_points(window)
 
-    def _disconnected(self, client: Any) -> None:
+    def _on_disconnect(self, client: Any) -> None:
         with self._lock:
             self.windows.pop(client.client_id, None)
             self.session.cancel(client.client_id)
 
-    def _tick(self) -> None:
-        while not self._stop.wait(TICK):
+    def _run_clock(self) -> None:
+        while not self._stopped.wait(TICK_SECONDS):
             try:
-                self._turn_of_clock()
+                self._tick()
             except Exception as error:
                 self.on_error(error)
 
-    def _turn_of_clock(self) -> None:
+    def _tick(self) -> None:
         now = time.monotonic()
         with self._lock:
-            waiting = [w for w in self.windows.values() if not w.noticed and now - w.moved >= w.rest]
+            waiting = [w for w in self.windows.values() if not w.is_handled and now - w.change_time >= w.rest_seconds]
             if waiting:
-                self._show_gizmo()
+                self._update_gizmo_visibility()
             for window in waiting:
-                window.noticed = True
-                self._keep_pace(window, at_rest=True)
-                self._refine(window)
-            if self._follow:
-                self._follow = not self.session.follow_observer()
-            if self._count:
-                self._count = not self.session.follow_shares()
+                window.is_handled = True
+                self._adapt_level(window, is_at_rest=True)
+                self._start_refinement(window)
+            if self._is_points_update_pending:
+                self._is_points_update_pending = not self.session.update_points()
+            if self._is_shares_update_pending:
+                self._is_shares_update_pending = not self.session.update_shares()
             for window in self.windows.values():
-                self._mark(window)
-        marked = self.stale, self.session.stale_shares
-        if marked != self._marked:
-            self._marked = marked
-            for told in self.on_marked:
-                told()
+                self._update_status(window)
+        stale_state = self.stale_scale_reason, self.session.are_shares_stale
+        if stale_state != self._stale_state:
+            self._stale_state = stale_state
+            for callback in self.scale_callbacks:
+                callback()
 
-    def _reach(self) -> float:
+    def _orbit_distance(self) -> float:
         """How far ahead of the first camera its centre of rotation is: where the place's middle is level with it."""
         session = self.session
-        away = float((session.observer - session.home.origin) @ session.home.ahead)
+        away = float((session.observer - session.home_view.origin) @ session.home_view.forward)
         return max(away, 1.0)

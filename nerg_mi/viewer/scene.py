@@ -20,23 +20,23 @@ from nerg_mi.rendering.scene_writer import Comment, format_document, element, fo
 
 from . import layers
 from .page import Page
-from .points import PinholeView, heading_of
-from .session import ALL, RAYS, UNHURRIED, Tracks
+from .points import PinholeView, make_heading
+from .session import ALL_PARTICIPANTS, LOW_PRIORITY, MAX_RAYS, Tracks
 
 # ---- What a page shows as a scene file, which `nerg render` renders alike ----
 
-CAMERA, TARGET, OBSERVER = "view_camera", "view_target", "view_observer"
+CAMERA_DEFAULT, TARGET_DEFAULT, OBSERVER_DEFAULT = "view_camera", "view_target", "view_observer"
 """`<default>`s of a copied scene."""
 
-CLIP = {"near_clip": 1e-6, "far_clip": 1e12}
+CLIP_DISTANCES = {"near_clip": 1e-6, "far_clip": 1e12}
 """Distances at which its camera begins and ends to see: a page's rays have no limits."""
 
-SENSOR = "view"
+SENSOR_ID = "view"
 """The name of its camera."""
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
+class ViewSettings:
     """What a page shows: its ``view``, the ``observer`` (3,) or None where the camera is it, AOVs, the ``width`` of the
     picture in pixels, samples ``spp`` a pixel, the integrator's ``falloff``, and the height and up (3,) of a
     ``ceiling`` that is cut off, or None."""
@@ -50,94 +50,100 @@ class Shown:
     ceiling: tuple[float, np.ndarray] | None = None
 
 
-def copied(path: Path, shown: Shown) -> str:
+def copy_scene(path: Path, settings: ViewSettings) -> str:
     """The scene file ``path`` as text, with the camera, the observer and the settings of what is ``shown``; names of
     files are absolute, so that it may be saved anywhere.
 
     Raises `NergError` for a scene whose integrator is not written in the file.
     """
     version, children = scene_elements(path)
-    eye = [] if shown.observer is None else [element("default", name=OBSERVER, value=format_numbers(shown.observer))]
+    observer_defaults = (
+        []
+        if settings.observer is None
+        else [element("default", name=OBSERVER_DEFAULT, value=format_numbers(settings.observer))]
+    )
     # What a copy that is viewed itself has of its own is said anew.
-    ours = {("sensor", SENSOR), ("default", CAMERA), ("default", TARGET)} | {("default", OBSERVER) for _ in eye}
-    named = lambda child: (child.tag, child.get("id" if child.tag == "sensor" else "name"))
-    own = [deepcopy(child) for child in children if child.tag != "path" and named(child) not in ours]
-    integrators = [child for child in own if child.tag == "integrator"]
+    replaced = {("sensor", SENSOR_ID), ("default", CAMERA_DEFAULT), ("default", TARGET_DEFAULT)} | {
+        ("default", OBSERVER_DEFAULT) for _ in observer_defaults
+    }
+    key = lambda child: (child.tag, child.get("id" if child.tag == "sensor" else "name"))
+    copies = [deepcopy(child) for child in children if child.tag != "path" and key(child) not in replaced]
+    integrators = [child for child in copies if child.tag == "integrator"]
     if len(integrators) != 1:
         raise NergError(f'"{path}" has {len(integrators)} integrators, and a copy needs one; leave one of them')
-    name_files(own, path, children)
-    _observe(integrators[0], shown)
+    name_files(copies, path, children)
+    _update_integrator(integrators[0], settings)
     nodes = [
-        element("default", name=CAMERA, value=format_numbers(shown.view.origin)),
-        element("default", name=TARGET, value=format_numbers(shown.view.target)),
-        *eye,
-        _sensor(shown),
+        element("default", name=CAMERA_DEFAULT, value=format_numbers(settings.view.origin)),
+        element("default", name=TARGET_DEFAULT, value=format_numbers(settings.view.target)),
+        *observer_defaults,
+        _make_sensor(settings),
         Comment("What follows is from the scene that was viewed; its sensors are counted after ours."),
-        *map(verbatim, own),
+        *map(verbatim, copies),
     ]
     return format_document(nodes, f"A view of {path.name}, copied from the viewer.", version)
 
 
-def _observe(integrator: Element, shown: Shown) -> None:
+def _update_integrator(integrator: Element, settings: ViewSettings) -> None:
     """Put observer, fall-off, ceiling and AOVs into the ``integrator``."""
-    names = {"falloff", "aovs", "ceiling", "up"} | ({"observer"} if shown.observer is not None else set())
+    names = {"falloff", "aovs", "ceiling", "up"} | ({"observer"} if settings.observer is not None else set())
     for child in [c for c in integrator if c.get("name") in names]:
         integrator.remove(child)
-    if shown.observer is not None:
+    if settings.observer is not None:
         sensor = SubElement(integrator, "sensor", name="observer", type="perspective")
-        SubElement(SubElement(sensor, "transform", name="to_world"), "translate", value=f"${OBSERVER}")
-    SubElement(integrator, "float", name="falloff", value=f"{shown.falloff:.9g}")
-    if shown.ceiling is not None:
-        height, up = shown.ceiling
+        SubElement(SubElement(sensor, "transform", name="to_world"), "translate", value=f"${OBSERVER_DEFAULT}")
+    SubElement(integrator, "float", name="falloff", value=f"{settings.falloff:.9g}")
+    if settings.ceiling is not None:
+        height, up = settings.ceiling
         SubElement(integrator, "float", name="ceiling", value=f"{height:.9g}")
         SubElement(integrator, "vector", name="up", value=format_numbers(up))
-    SubElement(integrator, "string", name="aovs", value=",".join(shown.aovs))
+    SubElement(integrator, "string", name="aovs", value=",".join(settings.aovs))
 
 
-def _sensor(shown: Shown):
-    view = shown.view
+def _make_sensor(settings: ViewSettings):
+    view = settings.view
     up = format_numbers(view.up)
     film = element(
         "film",
-        prop("integer", "width", shown.width),
-        prop("integer", "height", view.height(shown.width)),
+        prop("integer", "width", settings.width),
+        prop("integer", "height", view.picture_height(settings.width)),
         element("rfilter", type="box"),
         prop("string", "component_format", "float32"),
         prop("string", "pixel_format", "rgb"),
         type="hdrfilm",
     )
     # The angle between the left and the right border, which a picture's whole pixels may differ from by a trifle.
-    across = math.degrees(2 * math.atan(math.tan(view.fov / 2) * view.aspect))
-    look = element("lookat", origin=f"${CAMERA}", target=f"${TARGET}", up=up)
+    fov_x = math.degrees(2 * math.atan(math.tan(view.fov / 2) * view.aspect))
+    look = element("lookat", origin=f"${CAMERA_DEFAULT}", target=f"${TARGET_DEFAULT}", up=up)
     return element(
         "sensor",
-        prop("float", "fov", f"{across:.9g}"),
+        prop("float", "fov", f"{fov_x:.9g}"),
         prop("string", "fov_axis", "x"),
-        *(prop("float", name, f"{distance:g}") for name, distance in CLIP.items()),
+        *(prop("float", name, f"{distance:g}") for name, distance in CLIP_DISTANCES.items()),
         element("transform", look, name="to_world"),
-        element("sampler", prop("integer", "sample_count", shown.spp), type="independent"),
+        element("sampler", prop("integer", "sample_count", settings.spp), type="independent"),
         film,
         type="perspective",
-        id=SENSOR,
+        id=SENSOR_ID,
     )
 
 
-def copied_view(session: Any, view: PinholeView) -> str:
+def copy_view(session: Any, view: PinholeView) -> str:
     """A scene file of ``view`` with the observer, the layer and the settings of ``session``."""
-    check_copied(session)
-    asked = tuple(name for name in layers.quantities(session.shade.layer) if name != "color")
-    settings = session.options.width, session.spp, session.falloff, ceiling_of(session)
-    return copied(session.scene_file, Shown(view, session.observer, asked, *settings))
+    check_can_copy(session)
+    aovs = tuple(name for name in layers.required_quantities(session.display.layer) if name != "color")
+    settings = session.options.width, session.spp, session.falloff, get_ceiling(session)
+    return copy_scene(session.scene_file, ViewSettings(view, session.observer, aovs, *settings))
 
 
-def ceiling_of(session: Any) -> tuple[float, np.ndarray] | None:
+def get_ceiling(session: Any) -> tuple[float, np.ndarray] | None:
     """The height and the up of what ``session`` leaves out of views from above."""
-    return None if session.ceiling is None else (session.ceiling, session.cut_up)
+    return None if session.ceiling is None else (session.ceiling, session.ceiling_up)
 
 
-def check_copied(session: Any) -> None:
+def check_can_copy(session: Any) -> None:
     """Raise `NergError` for a place that ends with the viewer, so that no copy of it could be rendered."""
-    if session.place.made and session.scene_file.with_suffix(".vol").exists():
+    if session.source.made and session.scene_file.with_suffix(".vol").exists():
         raise NergError('the place was made of rays for this viewer; "nerg scene" writes it as a scene of its own')
 
 
@@ -145,117 +151,119 @@ def check_copied(session: Any) -> None:
 #
 # People in the page: their paths, rays and probes, where they are at a moment, and whose eye the observer is.
 
-NOBODY = "(nobody)"
-_STEPS = 2000
-_NOTHING = 1.0  # length of a ray that meets no surface, in scene units
+NO_PARTICIPANT = "(nobody)"
+_SLIDER_STEPS = 2000
+_MISS_LENGTH = 1.0  # length of a ray that meets no surface, in scene units
 
 
-class PeoplePanel:
+class ParticipantsPanel:
     """The part of a page's panel for rays, and their paths."""
 
     def __init__(self, page: Page, tracks: Tracks):
         self.page, self._tracks = page, tracks
-        self._shown: list[Any] = []
-        self._paths: Any = None
-        self._recorded: dict[str, Any] = {}
+        self._pose_handles: list[Any] = []
+        self._path_handle: Any = None
+        self._recording_handles: dict[str, Any] = {}
         gui = page.server.gui
-        first, last = tracks.times
+        first, last = tracks.time_range
         with gui.add_folder("People"):
-            self._group = gui.add_dropdown("Who", tracks.groups, initial_value=ALL)
-            self._drawn = gui.add_checkbox("Paths", False)
-            self._rays = gui.add_checkbox("Rays", False)
-            self._probes = gui.add_checkbox("Probes", False)
-            step = max((last - first) / _STEPS, 1e-3)
+            self._group = gui.add_dropdown("Who", tracks.groups, initial_value=ALL_PARTICIPANTS)
+            self._show_paths = gui.add_checkbox("Paths", False)
+            self._rays_checkbox = gui.add_checkbox("Rays", False)
+            self._probes_checkbox = gui.add_checkbox("Probes", False)
+            step = max((last - first) / _SLIDER_STEPS, 1e-3)
             self._time = gui.add_slider("Time (s)", first, max(last, first + step), step, first)
-            self._eye = gui.add_dropdown("Observer follows", [NOBODY, *tracks.people], initial_value=NOBODY)
-        self._group.on_update(lambda event: self._changed())
-        self._drawn.on_update(lambda event: self._changed())
-        self._rays.on_update(lambda event: self._show_rays())
-        self._probes.on_update(lambda event: self._show_probes())
-        self._time.on_update(lambda event: self._moment())
-        self._eye.on_update(lambda event: self._moment())
-        self._changed()
+            self._followed = gui.add_dropdown(
+                "Observer follows", [NO_PARTICIPANT, *tracks.participants], initial_value=NO_PARTICIPANT
+            )
+        self._group.on_update(lambda event: self._draw_all())
+        self._show_paths.on_update(lambda event: self._draw_all())
+        self._rays_checkbox.on_update(lambda event: self._draw_rays())
+        self._probes_checkbox.on_update(lambda event: self._draw_probes())
+        self._time.on_update(lambda event: self._draw_poses())
+        self._followed.on_update(lambda event: self._draw_poses())
+        self._draw_all()
 
-    def _changed(self) -> None:
-        if self._paths is not None:
-            self._paths.remove()
-            self._paths = None
+    def _draw_all(self) -> None:
+        if self._path_handle is not None:
+            self._path_handle.remove()
+            self._path_handle = None
         segments, person = self._tracks.segments(self._group.value)
-        if self._drawn.value and len(segments):
-            colors = np.repeat(color_of(person)[:, None], 2, axis=1)
-            self._paths = self.page.server.scene.add_line_segments(
+        if self._show_paths.value and len(segments):
+            colors = np.repeat(participant_colors(person)[:, None], 2, axis=1)
+            self._path_handle = self.page.server.scene.add_line_segments(
                 "/people/paths", segments, colors, thickness=1.5, thickness_units="screen"
             )
-        self._moment()
-        self._show_rays()
-        self._show_probes()
+        self._draw_poses()
+        self._draw_rays()
+        self._draw_probes()
 
-    def _show_rays(self) -> None:
+    def _draw_rays(self) -> None:
         """Lines from eyes to what they looked at, where rays are wanted."""
-        self._renew("rays", self._trace_rays if self._rays.value else None)
+        self._submit_drawing("rays", self._trace_rays if self._rays_checkbox.value else None)
 
-    def _show_probes(self) -> None:
+    def _draw_probes(self) -> None:
         """Balls where a density of the rays would be said to hold, where probes are wanted."""
-        self._renew("probes", self._place_probes if self._probes.value else None)
+        self._submit_drawing("probes", self._place_probes if self._probes_checkbox.value else None)
 
-    def _renew(self, name: str, draw: Callable[[], Any] | None) -> None:
+    def _submit_drawing(self, name: str, draw: Callable[[], Any] | None) -> None:
         """What is drawn as ``name``, by ``draw`` on the thread that renders; None: nothing."""
 
         def steps() -> Iterator[None]:
-            old = self._recorded.pop(name, None)
+            old = self._recording_handles.pop(name, None)
             if old is not None:
                 old.remove()
             if draw is not None:
-                self._recorded[name] = draw()
+                self._recording_handles[name] = draw()
             yield
 
-        self.page.session.worker.submit(("people", name), UNHURRIED, steps())
+        self.page.session.worker.submit(("people", name), LOW_PRIORITY, steps())
 
     def _trace_rays(self) -> Any:
-        eyes, ahead, person = self._tracks.sample(self._group.value)
-        if not len(eyes):
+        origins, directions, person = self._tracks.sample(self._group.value)
+        if not len(origins):
             return self.page.server.scene.add_frame("/people/rays", show_axes=False)
         # Kernels are compiled for a number of rays.
-        fill = RAYS - len(eyes)
-        o, d = (np.concatenate([v, np.repeat(v[-1:], fill, axis=0)]) for v in (eyes, ahead))
-        found = trace(self.page.session.scene, o, d, ["depth"], observers=o[:1])
-        depth = np.asarray(found.depth[0], float)[: len(eyes)]
-        length = np.where((depth > 0) & np.isfinite(depth), depth, _NOTHING)
-        lines = np.stack([eyes, eyes + length[:, None] * ahead], axis=1).astype(np.float32)
-        colors = np.repeat(color_of(person)[:, None], 2, axis=1)
+        padding = MAX_RAYS - len(origins)
+        o, d = (np.concatenate([v, np.repeat(v[-1:], padding, axis=0)]) for v in (origins, directions))
+        traced = trace(self.page.session.scene, o, d, ["depth"], observers=o[:1])
+        depth = np.asarray(traced.depth[0], float)[: len(origins)]
+        length = np.where((depth > 0) & np.isfinite(depth), depth, _MISS_LENGTH)
+        lines = np.stack([origins, origins + length[:, None] * directions], axis=1).astype(np.float32)
+        colors = np.repeat(participant_colors(person)[:, None], 2, axis=1)
         return self.page.server.scene.add_line_segments(
             "/people/rays", lines, colors, thickness=1.0, thickness_units="screen"
         )
 
     def _place_probes(self) -> Any:
-        positions, counts = self._tracks.probes(self._group.value)
-        share = np.log(counts) / max(np.log(counts.max()), 1e-9)
-        colors = (255 * matplotlib.colormaps["viridis"](share)[:, :3]).astype(np.uint8)
+        positions, counts = self._tracks.place_probes(self._group.value)
+        fraction = np.log(counts) / max(np.log(counts.max()), 1e-9)
+        colors = (255 * matplotlib.colormaps["viridis"](fraction)[:, :3]).astype(np.uint8)
         return self.page.server.scene.add_point_cloud(
             "/people/probes", positions.astype(np.float32), colors, point_size=0.12, point_shape="circle"
         )
 
-    def _moment(self) -> None:
-        for handle in self._shown:
+    def _draw_poses(self) -> None:
+        for handle in self._pose_handles:
             handle.remove()
-        self._shown = []
-        poses = self._tracks.at_time(self._time.value, self._group.value)
-        scene, names = self.page.server.scene, self._tracks.people
+        self._pose_handles = []
+        poses = self._tracks.poses_at(self._time.value, self._group.value)
+        scene, names = self.page.server.scene, self._tracks.participants
         for k, pose in enumerate(poses[:200]):
-            color = tuple(int(c) for c in color_of(np.array([names.index(pose.person)]))[0])
-            self._shown.append(
-                scene.add_icosphere(f"/people/at/{k}", radius=0.07, color=color, position=tuple(pose.at))
+            color = tuple(int(c) for c in participant_colors(np.array([names.index(pose.participant)]))[0])
+            self._pose_handles.append(
+                scene.add_icosphere(f"/people/at/{k}", radius=0.07, color=color, position=tuple(pose.position))
             )
-            arrow = np.stack([pose.at, pose.at + 0.6 * pose.ahead])[None].astype(np.float32)
-            self._shown.append(
+            arrow = np.stack([pose.position, pose.position + 0.6 * pose.direction])[None].astype(np.float32)
+            self._pose_handles.append(
                 scene.add_arrows(f"/people/ahead/{k}", arrow, color, shaft_radius=0.012, head_radius=0.035)
             )
-        followed = next((p for p in poses if p.person == self._eye.value), None)
+        followed = next((p for p in poses if p.participant == self._followed.value), None)
         if followed is not None:
-            self.page.place_observer(followed.at, heading_of(followed.ahead, self.page.session.place.up))
+            self.page.place_observer(followed.position, make_heading(followed.direction, self.page.session.source.up))
 
 
-def color_of(person: np.ndarray) -> np.ndarray:
+def participant_colors(person: np.ndarray) -> np.ndarray:
     """A colour (N, 3) uint8 for each person's number (N,)."""
-    found = matplotlib.colormaps["tab10"](np.asarray(person) % 10)[:, :3]
-    return (255 * found).astype(np.uint8)
+    colors = matplotlib.colormaps["tab10"](np.asarray(person) % 10)[:, :3]
+    return (255 * colors).astype(np.uint8)

@@ -15,15 +15,15 @@ from nerg_mi.workflows.scene_commands import ViewOptions
 from nerg_mi.workflows.view import make_viewer_scene
 
 from .controls import AreasPanel, Controls
-from .flights import Flying
+from .flights import FlightPanel
 from .page import Page
-from .scene import PeoplePanel
-from .server import Guard, is_loopback, new_token, require_viser, start_server
+from .scene import ParticipantsPanel
+from .server import RequestGuard, is_loopback, make_token, require_viser, start_server
 from .session import Session
 
 
 @dataclass(frozen=True)
-class Viewing:
+class RunningViewer:
     """A running viewer: ``address`` to open, and its ``page``."""
 
     address: str
@@ -31,9 +31,9 @@ class Viewing:
 
 
 @contextmanager
-def viewer(
+def open_viewer(
     files: Sequence[str | Path], options: ViewOptions | None = None, reporter: Reporter = SILENT
-) -> Iterator[Viewing]:
+) -> Iterator[RunningViewer]:
     """Serve ``files`` as a page for as long as the block lasts: what `workflows.view.place_to_view` takes.
 
     Bound to this machine alone by default; at another host the address has a token. Raises `NergError` for files that
@@ -41,8 +41,8 @@ def viewer(
     """
     options = options or ViewOptions()
     require_viser()
-    token = None if is_loopback(options.host) else new_token()
-    guard = Guard(options.host, token, options.hostnames)
+    token = None if is_loopback(options.host) else make_token()
+    guard = RequestGuard(options.host, token, options.hostnames)
     with tempfile.TemporaryDirectory() as folder:
         server = start_server(guard, options.port, "nerg view")
         page = Page(server)
@@ -52,15 +52,15 @@ def viewer(
             session.start()
             page.open(session)
             Controls(page)
-            Flying(page)
+            FlightPanel(page)
             if session.tracks is not None:
-                PeoplePanel(page, session.tracks)
+                ParticipantsPanel(page, session.tracks)
             if session.scene.has_gaze:
                 AreasPanel(page)
-            shown = "localhost" if options.host in ("0.0.0.0", "::") else options.host
-            shown = f"[{shown}]" if ":" in shown else shown
+            host = "localhost" if options.host in ("0.0.0.0", "::") else options.host
+            host = f"[{host}]" if ":" in host else host
             query = "" if token is None else f"?token={token}"
-            yield Viewing(f"http://{shown}:{server.get_port()}/{query}", page)
+            yield RunningViewer(f"http://{host}:{server.get_port()}/{query}", page)
         finally:
             page.close()
 
@@ -69,8 +69,8 @@ def view_files(files: Sequence[str | Path], options: ViewOptions | None = None, 
     """Serve ``files`` until Ctrl-C, which is the way to end it. Raises as `viewer`."""
     options = options or ViewOptions()
     if is_loopback(options.host):
-        yield_to_browser()
-    with viewer(files, options, reporter) as running:
+        lower_priority()
+    with open_viewer(files, options, reporter) as running:
         if not is_loopback(options.host):
             reporter.warn("whoever has the address sees the place, and moves its observer; it is not encrypted")
         reporter.message(f"open {running.address}")
@@ -85,7 +85,7 @@ def view_files(files: Sequence[str | Path], options: ViewOptions | None = None, 
             reporter.message("the viewer has ended")
 
 
-def yield_to_browser() -> None:
+def lower_priority() -> None:
     """Let the browser, which draws on this machine as well, go before this thread and those that it begins, where the
     system knows of such a thing: without a graphics card a page would stand still while pictures are refined."""
     if hasattr(os, "nice"):

@@ -29,22 +29,22 @@ from nerg_mi.workflows.scene_commands import ViewOptions
 from nerg_mi.workflows.view import ViewerScene
 
 from . import layers
-from .layers import Layer, Scale, Shade
+from .layers import DisplaySettings, Layer, Scale
 from .points import (
-    SIZES,
+    BAND_SIZES,
     BandPace,
     PinholeView,
     PointProxy,
     Points,
     StagePicture,
-    ahead_of,
-    bake,
-    filled,
-    gather,
-    heading_of,
+    compute_point_gaze,
+    find_free_position,
+    gather_points,
+    get_observer_forward,
+    make_heading,
+    pad_directions,
     refine,
     rough_integrals,
-    way_out,
 )
 
 # ---- What a session tells of what it finds ----
@@ -76,30 +76,30 @@ class Listener(Protocol):
 
 # ---- Shares of attention of named areas and shapes, in steps between which other work is done ----
 
-FACES = 1 << 17
+MAX_FACES_PER_STEP = 1 << 17
 """Faces of shapes whose shares are counted in one step, but for a shape that has more."""
 
 
 def iter_attention_shares(
-    scene: Scene, at: np.ndarray, regions: Sequence[Region], shapes: Sequence[str]
+    scene: Scene, observer: np.ndarray, regions: Sequence[Region], shapes: Sequence[str]
 ) -> Iterator[dict[str, float]]:
     """The share of the observer at ``at`` (3,) of each of ``regions``, together, then of the meshes whose ids are
     ``shapes``, so many at a time as a step can count."""
     if regions:
-        boxes = compute_box_shares(scene, regions, np.asarray(at, np.float32)[None], rule=COARSE).share[0]
+        boxes = compute_box_shares(scene, regions, np.asarray(observer, np.float32)[None], rule=COARSE).share[0]
         yield dict(zip([region.name for region in regions], boxes.tolist()))
-    for names in shape_groups(scene, shapes):
+    for names in group_shapes(scene, shapes):
         with rough_integrals(scene):
-            meshes = compute_mesh_shares(scene, names, at, divisions=1, two_sided=True)
+            meshes = compute_mesh_shares(scene, names, observer, divisions=1, two_sided=True)
         yield dict(zip(names, meshes.tolist()))
 
 
-def shape_groups(scene: Scene, shapes: Sequence[str]) -> Iterator[list[str]]:
+def group_shapes(scene: Scene, shapes: Sequence[str]) -> Iterator[list[str]]:
     """The ids ``shapes`` in groups of `FACES` faces at most, but for a shape that has more by itself."""
     faces = {shape.id(): shape.face_count() for shape in scene.mitsuba.shapes() if shape.is_mesh()}
     group: list[str] = []
     for name in shapes:
-        if group and sum(faces[n] for n in [*group, name]) > FACES:
+        if group and sum(faces[n] for n in [*group, name]) > MAX_FACES_PER_STEP:
             yield group
             group = []
         group.append(name)
@@ -111,28 +111,28 @@ def shape_groups(scene: Scene, shapes: Sequence[str]) -> Iterator[list[str]]:
 #
 # People of the rays: their paths, and where they are at a moment.
 
-VERTICES = 20_000
+MAX_VERTICES = 20_000
 """Points of all paths together, at most: what a browser draws without effort."""
 
-GAP = 1.0
+MAX_GAP = 1.0
 """Seconds without a ray that end a path, and that a person is still shown after the last one."""
 
-RAYS = 1 << 11
+MAX_RAYS = 1 << 11
 """Rays that are drawn at most."""
 
-PROBES = 512
+MAX_PROBES = 512
 """Probes that are drawn at most."""
 
-ALL = "everybody"
+ALL_PARTICIPANTS = "everybody"
 
 
 @dataclass(frozen=True, eq=False)
-class PersonPose:
+class ParticipantPose:
     """``person``, their eye ``at`` (3,) and ``ahead`` (3,), a unit vector, both in the place."""
 
-    person: str
-    at: np.ndarray
-    ahead: np.ndarray
+    participant: str
+    position: np.ndarray
+    direction: np.ndarray
 
 
 class Tracks:
@@ -142,64 +142,66 @@ class Tracks:
         order = np.lexsort((rays.t, rays.person))
         self._rays = rays.select(order)
         matrix = self._matrix = np.asarray(align.matrix, float)
-        turn = matrix[:3, :3] / align.scale
-        self.at = self._rays.origin @ matrix[:3, :3].T + matrix[:3, 3]
-        self.ahead = self._rays.direction @ turn.T
+        rotation = matrix[:3, :3] / align.scale
+        self.origins = self._rays.origin @ matrix[:3, :3].T + matrix[:3, 3]
+        self.directions = self._rays.direction @ rotation.T
 
     @property
-    def times(self) -> tuple[float, float]:
+    def time_range(self) -> tuple[float, float]:
         """When the first ray and the last one are, in seconds."""
         return (float(self._rays.t.min()), float(self._rays.t.max())) if len(self._rays) else (0.0, 0.0)
 
     @property
     def groups(self) -> list[str]:
         """Everybody, and the cohorts."""
-        return [ALL, *self._rays.cohorts]
+        return [ALL_PARTICIPANTS, *self._rays.cohorts]
 
     @property
-    def people(self) -> list[str]:
+    def participants(self) -> list[str]:
         """Names of those who have rays."""
         return [self._rays.persons[k] for k in np.unique(self._rays.person)]
 
-    def segments(self, group: str = ALL) -> tuple[np.ndarray, np.ndarray]:
+    def segments(self, group: str = ALL_PARTICIPANTS) -> tuple[np.ndarray, np.ndarray]:
         """Line segments (S, 2, 3) of the paths of a cohort, and the person's number (S,) of each."""
-        rows = np.flatnonzero(self._of(group))
-        rows = rows[:: max(len(rows) // VERTICES, 1)]
+        rows = np.flatnonzero(self._group_mask(group))
+        rows = rows[:: max(len(rows) // MAX_VERTICES, 1)]
         person, t = self._rays.person[rows], self._rays.t[rows]
         step = max(np.median(np.diff(t)) if len(t) > 1 else 0.0, 0.0)
         if len(rows) < 2:
             return np.zeros((0, 2, 3), np.float32), person[:0]
-        joined = (np.diff(person) == 0) & (np.diff(t) <= max(GAP, 4 * step))
-        pairs = np.stack([self.at[rows[:-1]], self.at[rows[1:]]], axis=1)[joined]
-        return pairs.astype(np.float32), person[:-1][joined]
+        is_joined = (np.diff(person) == 0) & (np.diff(t) <= max(MAX_GAP, 4 * step))
+        pairs = np.stack([self.origins[rows[:-1]], self.origins[rows[1:]]], axis=1)[is_joined]
+        return pairs.astype(np.float32), person[:-1][is_joined]
 
-    def at_time(self, time: float, group: str = ALL) -> list[PersonPose]:
+    def poses_at(self, time: float, group: str = ALL_PARTICIPANTS) -> list[ParticipantPose]:
         """Where those of a cohort are whose nearest ray is within `GAP` of ``time``."""
-        near = np.flatnonzero(self._of(group) & (np.abs(self._rays.t - time) <= GAP))
-        found = []
+        near = np.flatnonzero(self._group_mask(group) & (np.abs(self._rays.t - time) <= MAX_GAP))
+        poses = []
         for person in np.unique(self._rays.person[near]):
-            own = near[self._rays.person[near] == person]
-            k = own[np.argmin(np.abs(self._rays.t[own] - time))]
-            found.append(PersonPose(self._rays.persons[person], self.at[k], self.ahead[k]))
-        return found
+            rows = near[self._rays.person[near] == person]
+            k = rows[np.argmin(np.abs(self._rays.t[rows] - time))]
+            poses.append(ParticipantPose(self._rays.persons[person], self.origins[k], self.directions[k]))
+        return poses
 
-    def sample(self, group: str = ALL, most: int = RAYS) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def sample(
+        self, group: str = ALL_PARTICIPANTS, max_rays: int = MAX_RAYS
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Eyes (K, 3) and unit directions (K, 3) of ``most`` rays of a cohort at most, evenly through each person's
         time, and the person's number (K,)."""
-        rows = np.flatnonzero(self._of(group))
-        rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), most)).astype(int)] if len(rows) else rows
-        return self.at[rows], self.ahead[rows], self._rays.person[rows]
+        rows = np.flatnonzero(self._group_mask(group))
+        rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), max_rays)).astype(int)] if len(rows) else rows
+        return self.origins[rows], self.directions[rows], self._rays.person[rows]
 
-    def probes(self, group: str = ALL) -> tuple[np.ndarray, np.ndarray]:
+    def place_probes(self, group: str = ALL_PARTICIPANTS) -> tuple[np.ndarray, np.ndarray]:
         """Positions (P, 3) in the place of the probes that a density of a cohort's rays would have by default, and how
         many rays each holds (P,). Raises `NergError` where nobody stayed long enough for one."""
-        rows = np.flatnonzero(self._of(group))
-        found = place_probes(self._rays.select(rows), count=PROBES)
-        turn, shift = self._matrix[:3, :3], self._matrix[:3, 3]
-        return found.positions @ turn.T + shift, found.counts
+        rows = np.flatnonzero(self._group_mask(group))
+        probes = place_probes(self._rays.select(rows), count=MAX_PROBES)
+        linear, shift = self._matrix[:3, :3], self._matrix[:3, 3]
+        return probes.positions @ linear.T + shift, probes.counts
 
-    def _of(self, group: str) -> np.ndarray:
-        if group == ALL or self._rays.cohort is None:
+    def _group_mask(self, group: str) -> np.ndarray:
+        if group == ALL_PARTICIPANTS or self._rays.cohort is None:
             return np.ones(len(self._rays), bool)
         return self._rays.cohort == self._rays.cohorts.index(group)
 
@@ -221,17 +223,17 @@ class Worker:
         self._on_error = on_error
         self._tasks: dict[Hashable, tuple[int, int, Task]] = {}
         self._changed = threading.Condition()
-        self._turn = itertools.count()
-        self._stopped = False
+        self._counter = itertools.count()
+        self._is_stopped = False
         self._thread = threading.Thread(target=self._run, name="nerg-view-render", daemon=True)
         self._thread.start()
 
-    def submit(self, name: Hashable, urgency: int, task: Task) -> None:
+    def submit(self, name: Hashable, priority: int, task: Task) -> None:
         """Run ``task`` from now on, in place of one of the same ``name``; smaller ``urgency`` first, tasks of one
         urgency in turns."""
         with self._changed:
-            if not self._stopped:
-                self._tasks[name] = urgency, next(self._turn), task
+            if not self._is_stopped:
+                self._tasks[name] = priority, next(self._counter), task
                 self._changed.notify_all()
 
     def cancel(self, name: Hashable) -> None:
@@ -255,13 +257,13 @@ class Worker:
         return future
 
     @property
-    def names(self) -> list[Hashable]:
+    def task_names(self) -> list[Hashable]:
         """The tasks that are not done yet."""
         with self._changed:
             return list(self._tasks)
 
     @property
-    def idle(self) -> bool:
+    def is_idle(self) -> bool:
         """Whether nothing is left to do."""
         with self._changed:
             return not self._tasks
@@ -274,7 +276,7 @@ class Worker:
     def stop(self, timeout: float = 30.0) -> None:
         """End the thread after the step that it is in."""
         with self._changed:
-            self._stopped = True
+            self._is_stopped = True
             self._tasks.clear()
             self._changed.notify_all()
         self._thread.join(timeout)
@@ -282,19 +284,19 @@ class Worker:
     def _run(self) -> None:
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._stopped or self._tasks)
-                if self._stopped:
+                self._changed.wait_for(lambda: self._is_stopped or self._tasks)
+                if self._is_stopped:
                     return
                 name = min(self._tasks, key=lambda n: self._tasks[n][:2])
                 entry = self._tasks[name]
-            over = self._step(entry[2])
+            is_done = self._step(entry[2])
             with self._changed:
                 # It may have been replaced in the meantime.
                 if self._tasks.get(name) is entry:
-                    if over:
+                    if is_done:
                         del self._tasks[name]
                     else:
-                        self._tasks[name] = entry[0], next(self._turn), entry[2]
+                        self._tasks[name] = entry[0], next(self._counter), entry[2]
                 self._changed.notify_all()
 
     def _step(self, task: Task) -> bool:
@@ -316,13 +318,13 @@ class Worker:
 # All of Mitsuba and Dr.Jit is used on the thread of the `Worker`. What is found is told to a `Listener`, on that
 # thread.
 
-URGENCY = 1
+NORMAL_PRIORITY = 1
 """Of tasks that take turns: the first picture is coarse, and nobody waits long for numbers."""
 
-UNHURRIED = 2
+LOW_PRIORITY = 2
 """Of small pictures, which nobody waits for."""
 
-_COMPUTED = {
+_TASK_NAMES = {
     "proxy": "points on surfaces",
     "picture": "picture",
     "gaze": "gaze on the points",
@@ -333,101 +335,103 @@ _COMPUTED = {
 }
 """Tasks of the worker, in words."""
 
-_MOST_SPP = 256
-_SHAPES = 60
+_MAX_SPP = 256
+_MAX_SHAPES = 60
 
 
 class Session:
     """A place that is viewed. ``start`` loads it; until then there is nothing to see."""
 
-    def __init__(self, place: Callable[[], ViewerScene], options: ViewOptions, listener: Listener):
+    def __init__(self, load_source: Callable[[], ViewerScene], options: ViewOptions, listener: Listener):
         self.options, self.listener = options, listener
-        self._place = place
+        self._load_source = load_source
         self.worker = Worker(listener.on_error)
         self.lock = threading.RLock()
         self.proxy: PointProxy | None = None
-        self.baked: dict[str, np.ndarray] = {}
-        self.baked_for: np.ndarray | None = None
+        self.point_values: dict[str, np.ndarray] = {}
+        self.finished_observer: np.ndarray | None = None
         # Whose values `baked` and `shares` are: an observer's, with areas or without, of a `version`.
-        self._baked_of: tuple[np.ndarray, int] | None = None
-        self._shares_of: tuple[np.ndarray, tuple[Region, ...], int] | None = None
+        self._point_inputs: tuple[np.ndarray, int] | None = None
+        self._share_inputs: tuple[np.ndarray, tuple[Region, ...], int] | None = None
         self.shares: dict[str, float] = {}
         self.ceiling: float | None = None
         self.regions: list[Region] = []
         self.other_areas: list[dict[str, Any]] = []
-        self.pace = BandPace()
+        self.band_pace = BandPace()
         self.checksums: dict[Path, str] = {}
         self._ranges: dict[str, tuple[float, float]] = {}
         self._busy: set[str] = set()
-        self._shares_for: tuple[np.ndarray, tuple[Region, ...], int] | None = None
+        self._finished_share_inputs: tuple[np.ndarray, tuple[Region, ...], int] | None = None
         # Of the gaze field and its settings: what was begun with others is not kept.
-        self.version = 0
+        self.settings_version = 0
 
     def start(self) -> None:
         """Load the place, and begin to gather its points. Raises `NergError` for what cannot be shown."""
         self.worker.call(self._load).result()
-        self.worker.submit("proxy", URGENCY, self._gather())
+        self.worker.submit("proxy", NORMAL_PRIORITY, self._gather())
 
     def stop(self) -> None:
         """End the render thread."""
         self.worker.stop()
 
     def _load(self) -> None:
-        self.place = self._place()
-        self.mode = activate_mitsuba().variant()
-        self.gaze_name = next(iter(self.place.variants), "")
-        self._use(self.place.scene)
-        self.shade = Shade(self._first_layer())
+        self.source = self._load_source()
+        self.variant = activate_mitsuba().variant()
+        self.gaze_name = next(iter(self.source.variants), "")
+        self._load_scene(self.source.scene)
+        self.display = DisplaySettings(self._default_layer())
         sensors = self.scene.mitsuba.sensors()
         if not sensors:
-            raise NergError(f'"{self.place.scene}" has no sensor to begin with; give it one')
-        self.home = PinholeView.of_sensor(sensors[0])
-        self.spp = min(self.options.spp or int(sensors[0].sampler().sample_count()), _MOST_SPP)
-        given = check_point(self.options.observer, "--observer")
-        own = self.scene.observer
-        if given is None:
-            given = self._ahead_of_home() if own is None else np.asarray(own, float)
-        ahead = self.home.ahead if own is None else ahead_of(self.scene)
-        self.place_observer(np.asarray(given, float), heading_of(ahead, self.place.up))
+            raise NergError(f'"{self.source.scene}" has no sensor to begin with; give it one')
+        self.home_view = PinholeView.from_sensor(sensors[0])
+        self.spp = min(self.options.spp or int(sensors[0].sampler().sample_count()), _MAX_SPP)
+        observer = check_point(self.options.observer, "--observer")
+        scene_observer = self.scene.observer
+        if observer is None:
+            observer = self._default_observer() if scene_observer is None else np.asarray(scene_observer, float)
+        forward = self.home_view.forward if scene_observer is None else get_observer_forward(self.scene)
+        self.place_observer(np.asarray(observer, float), make_heading(forward, self.source.up))
         self.falloff = float(np.ravel(np.array(self.scene.integrator.falloff))[0])
-        cut = self.scene.integrator.ceiling
-        self.cut_up, self.ceiling = (self.place.up, None) if cut is None else (cut.up, cut.height)
-        self.tracks = None if self.place.rays is None else Tracks(self.place.rays, self.place.align)
+        ceiling = self.scene.integrator.ceiling
+        self.ceiling_up, self.ceiling = (self.source.up, None) if ceiling is None else (ceiling.up, ceiling.height)
+        self.tracks = None if self.source.rays is None else Tracks(self.source.rays, self.source.align)
         areas = read_areas(self.options.aois) if self.options.aois is not None else AreaSet(())
         # What is no box is not shown, and is saved again with what is.
         self.regions, self.other_areas = areas.boxes, list(areas.non_boxes)
         shapes = [shape.id() for shape in self.scene.mitsuba.shapes() if shape.is_mesh()]
-        self.shapes = [name for name in shapes if name and not name.startswith("__")][:_SHAPES]
+        self.shapes = [name for name in shapes if name and not name.startswith("__")][:_MAX_SHAPES]
 
-    def _use(self, scene_file: Path) -> None:
+    def _load_scene(self, scene_file: Path) -> None:
         """Show the scene of that file from now on."""
         self.scene_file, self.scene = scene_file, Scene(load_scene(scene_file))
         self.layers = layers.list_layers(self.scene)
         self.basis = describe_basis(self.scene.mitsuba)
 
-    def _first_layer(self) -> Layer:
+    def _default_layer(self) -> Layer:
         return next((la for la in self.layers if la.quantity in ("gaze", "kde")), self.layers[0])
 
-    def _ahead_of_home(self) -> np.ndarray:
+    def _default_observer(self) -> np.ndarray:
         """Where the observer stands of a scene whose camera it is: half way to what that looks at, so as to be seen."""
-        seen = trace(self.scene, self.home.origin, filled(self.home.ahead[None], SIZES[0]), ["depth"])
-        depth = float(seen.depth[0])
-        return self.home.origin + (0.5 * depth if np.isfinite(depth) else 0.0) * self.home.ahead
+        traced = trace(
+            self.scene, self.home_view.origin, pad_directions(self.home_view.forward[None], BAND_SIZES[0]), ["depth"]
+        )
+        depth = float(traced.depth[0])
+        return self.home_view.origin + (0.5 * depth if np.isfinite(depth) else 0.0) * self.home_view.forward
 
     # What changes
 
-    def place_observer(self, at: np.ndarray, heading: np.ndarray | None = None) -> None:
+    def place_observer(self, position: np.ndarray, heading: np.ndarray | None = None) -> None:
         """The observer stands at ``at`` (3,), turned by ``heading`` (3, 3): columns ahead, left and up.
 
         Raises `NergError` for what is no position.
         """
-        position = np.asarray(at, float)
-        within = position.shape == (3,) and (np.abs(position) <= MAX_COORDINATE).all()
-        if not within or not (heading is None or np.isfinite(heading).all()):
-            text = ", ".join(f"{v:g}" for v in position.ravel()[:3])
+        array = np.asarray(position, float)
+        is_valid = array.shape == (3,) and (np.abs(array) <= MAX_COORDINATE).all()
+        if not is_valid or not (heading is None or np.isfinite(heading).all()):
+            text = ", ".join(f"{v:g}" for v in array.ravel()[:3])
             raise NergError(f"an observer cannot stand at ({text}); give three numbers in scene units")
         with self.lock:
-            self.observer = np.array(at, float)
+            self.observer = np.array(position, float)
             if heading is not None:
                 self.heading = np.array(heading, float)
 
@@ -439,7 +443,7 @@ class Session:
         def change() -> None:
             self.falloff = float(value)
             self._set_falloff()
-            self._forget()
+            self._invalidate()
 
         self.worker.call(change).result()
 
@@ -451,104 +455,104 @@ class Session:
             params["falloff"] = self.falloff
             params.update()
 
-    def set_gaze(self, name: str) -> None:
+    def select_gaze(self, name: str) -> None:
         """Show the gaze field ``name`` of the place's variants; where it lacks the layer that is shown, its gaze.
         Raises `NergError` for a file that is no longer there."""
 
         def change() -> None:
-            self._use(self.place.variants[name])
+            self._load_scene(self.source.variants[name])
             self.gaze_name = name
             self._set_falloff()
-            self._forget()
+            self._invalidate()
             with self.lock:
-                self.baked, self._ranges = {}, {}
-                if self.shade.layer not in self.layers:
-                    self.shade = Shade(self._first_layer())
+                self.point_values, self._ranges = {}, {}
+                if self.display.layer not in self.layers:
+                    self.display = DisplaySettings(self._default_layer())
 
         self.worker.call(change).result()
 
-    def _forget(self) -> None:
+    def _invalidate(self) -> None:
         """Have the gaze on the points, and the shares, computed anew."""
         with self.lock:
-            self.version += 1
-            self.baked_for = self._shares_for = None
+            self.settings_version += 1
+            self.finished_observer = self._finished_share_inputs = None
 
-    def set_shade(self, **changes: Any) -> None:
+    def set_display(self, **changes: Any) -> None:
         """Another layer, other colours, or another range."""
         with self.lock:
-            self.shade = replace(self.shade, **changes)
+            self.display = replace(self.display, **changes)
 
     # What is computed, and what is out of date
 
     @property
-    def stale_points(self) -> str:
+    def stale_points_reason(self) -> str:
         """Why the points do not show the layer as it is for the observer as they stand now; "" where they do."""
         # Without the lock, which the thread that is told of a new range may hold: what was read a moment too early is
         # read again.
-        layer, of = self.shade.layer, self._baked_of
+        layer, inputs = self.display.layer, self._point_inputs
         if not layer.quantity:
             return ""
-        if layer.quantity not in self.baked:
+        if layer.quantity not in self.point_values:
             return f"the points do not show {layer.title}"
-        if of is None or not np.array_equal(of[0], self.observer):
+        if inputs is None or not np.array_equal(inputs[0], self.observer):
             return f"{layer.title} of an earlier observer"
-        return "" if of[1] == self.version else f"{layer.title} of earlier settings"
+        return "" if inputs[1] == self.settings_version else f"{layer.title} of earlier settings"
 
     @property
-    def stale_shares(self) -> bool:
+    def are_shares_stale(self) -> bool:
         """Whether the shares of attention are not those of the observer, the areas and the settings of now."""
-        of = self._shares_of
-        return of is None or not _same(of, self._asked_shares())
+        inputs = self._share_inputs
+        return inputs is None or not _same_inputs(inputs, self._current_share_inputs())
 
     @property
     def has_scale(self) -> bool:
         """Whether the scale of the layer is known: until then it goes from 0 to 1."""
-        shade = self.shade
-        overlay = shade.layer.overlay
-        unscaled = overlay is None or not overlay.needs_limits
-        return unscaled or shade.fixed is not None or shade.layer.title in self._ranges
+        display = self.display
+        overlay = display.layer.overlay
+        needs_no_scale = overlay is None or not overlay.needs_limits
+        return needs_no_scale or display.limits is not None or display.layer.title in self._ranges
 
     @property
-    def computing(self) -> list[str]:
+    def running_tasks(self) -> list[str]:
         """What is being computed, in words."""
-        names = {name[0] if isinstance(name, tuple) else name for name in self.worker.names}
-        words = _COMPUTED | {"gaze": f"{'gaze' if self.scene.has_gaze else 'visibility'} on the points"}
-        return [text for name, text in words.items() if name in names]
+        names = {name[0] if isinstance(name, tuple) else name for name in self.worker.task_names}
+        descriptions = _TASK_NAMES | {"gaze": f"{'gaze' if self.scene.has_gaze else 'visibility'} on the points"}
+        return [text for name, text in descriptions.items() if name in names]
 
-    def clear_way(
-        self, name: Hashable, at: np.ndarray, free: np.ndarray, deliver: Callable[[np.ndarray], None]
+    def keep_in_free_space(
+        self, name: Hashable, position: np.ndarray, free_position: np.ndarray, deliver: Callable[[np.ndarray], None]
     ) -> None:
         """Call ``deliver`` with ``at`` (3,), or, where that lies within something, with a position before the surface
         that hides it from the ``free`` one (3,)."""
-        self.worker.submit(("way", name), URGENCY, self._way(at, free, deliver))
+        self.worker.submit(("way", name), NORMAL_PRIORITY, self._find_free_position(position, free_position, deliver))
 
-    def _asked_shares(self) -> tuple[np.ndarray, tuple[Region, ...], int]:
-        return self.observer, tuple(self.regions), self.version
+    def _current_share_inputs(self) -> tuple[np.ndarray, tuple[Region, ...], int]:
+        return self.observer, tuple(self.regions), self.settings_version
 
-    def follow_observer(self) -> bool:
+    def update_points(self) -> bool:
         """Begin to compute the gaze on the points, and the shares of attention, of the observer as they stand now,
         where that is not being done yet; whether there is nothing left to begin."""
         with self.lock:
-            at = self.observer
-            fresh = self.baked_for is not None and np.array_equal(self.baked_for, at)
-            if not fresh and self.proxy is not None and "gaze" not in self._busy:
+            observer = self.observer
+            is_current = self.finished_observer is not None and np.array_equal(self.finished_observer, observer)
+            if not is_current and self.proxy is not None and "gaze" not in self._busy:
                 self._busy.add("gaze")
-                self.worker.submit("gaze", URGENCY, self._bake(at))
-            return fresh
+                self.worker.submit("gaze", NORMAL_PRIORITY, self._bake(observer))
+            return is_current
 
-    def follow_shares(self) -> bool:
+    def update_shares(self) -> bool:
         """The same for the shares of attention of named areas and shapes."""
         with self.lock:
             if not self.scene.has_gaze:
                 return True
-            asked = self._asked_shares()
-            fresh = self._shares_for is not None and _same(self._shares_for, asked)
-            if not fresh and "shares" not in self._busy:
+            inputs = self._current_share_inputs()
+            is_current = self._finished_share_inputs is not None and _same_inputs(self._finished_share_inputs, inputs)
+            if not is_current and "shares" not in self._busy:
                 self._busy.add("shares")
-                self.worker.submit("shares", URGENCY, self._shares(asked))
-            return fresh
+                self.worker.submit("shares", NORMAL_PRIORITY, self._compute_shares(inputs))
+            return is_current
 
-    def picture(
+    def refine_picture(
         self,
         name: Hashable,
         view: PinholeView,
@@ -558,17 +562,17 @@ class Session:
     ) -> None:
         """Refine the picture of ``view`` from now on, in place of one of the same ``name``; ``deliver`` is given each
         with its colours (height, width, 3) uint8."""
-        self.worker.submit(("picture", name), URGENCY, self._refined(view, deliver, width, spp))
+        self.worker.submit(("picture", name), NORMAL_PRIORITY, self._refine(view, deliver, width, spp))
 
-    def inset(
+    def refine_inset(
         self, name: Hashable, view: PinholeView, deliver: Callable[[StagePicture, np.ndarray], None], width: int
     ) -> None:
         """The same for a small picture that nobody waits for."""
-        self.worker.submit(("inset", name), UNHURRIED, self._refined(view, deliver, width, 1, False))
+        self.worker.submit(("inset", name), LOW_PRIORITY, self._refine(view, deliver, width, 1, False))
 
-    def sphere(self, deliver: Callable[[np.ndarray], None], width: int) -> None:
+    def render_panorama(self, deliver: Callable[[np.ndarray], None], width: int) -> None:
         """All that the observer could turn to, as an equirectangular picture whose middle is ahead of them."""
-        self.worker.submit(("inset", "sphere"), UNHURRIED, self._sphere(deliver, width))
+        self.worker.submit(("inset", "sphere"), LOW_PRIORITY, self._render_panorama(deliver, width))
 
     def cancel(self, name: Hashable) -> None:
         """Refine the picture ``name`` no further."""
@@ -576,149 +580,161 @@ class Session:
 
     def scale(self) -> Scale:
         """The scale of the layer that is shown."""
-        shade = self.shade
-        return layers.choose_scale(shade.layer, shade.fixed or self._ranges.get(shade.layer.title), shade.colors)
+        display = self.display
+        return layers.choose_scale(
+            display.layer, display.limits or self._ranges.get(display.layer.title), display.colors
+        )
 
     def points(self, level: int = 0) -> Points | None:
         """The points below the ceiling, coloured as the layer shows them, so many as the proxy has at ``level``; None
         where there are no points yet."""
         with self.lock:
-            proxy, baked, shade, ceiling = self.proxy, self.baked, self.shade, self.ceiling
+            proxy, point_values, display, ceiling = self.proxy, self.point_values, self.display, self.ceiling
         if proxy is None:
             return None
         count, size = proxy.levels[level]
         points, color = proxy.points[:count], proxy.color[:count]
-        values = shade.layer.values(baked)
+        values = display.layer.select_values(point_values)
         if values is not None and len(values) == len(proxy.points):
-            layer, values = shade.layer, values[:count]
+            layer, values = display.layer, values[:count]
         else:
-            layer, values = layers.layer_of(COLOR), None
+            layer, values = layers.get_layer(COLOR), None
         colors = layers.colorize(
             layer, color, values, np.ones(count, bool), self.scale() if values is not None else Scale()
         )
-        if self.stale_points:
-            colors = layers.greyed(colors)
+        if self.stale_points_reason:
+            colors = layers.grey_out(colors)
         if ceiling is not None:
-            below = points @ self.cut_up <= ceiling
+            below = points @ self.ceiling_up <= ceiling
             points, colors = points[below], colors[below]
         return Points(points, colors, size)
 
     def _gather(self) -> Iterator[None]:
-        for proxy in gather(self.scene, [self.observer, self.home.origin]):
+        for proxy in gather_points(self.scene, [self.observer, self.home_view.origin]):
             if proxy is not None:
                 with self.lock:
-                    self.proxy, self.baked, self.baked_for = proxy, {}, None
+                    self.proxy, self.point_values, self.finished_observer = proxy, {}, None
                 self.listener.on_proxy()
             yield None
 
-    def _bake(self, at: np.ndarray) -> Iterator[None]:
+    def _bake(self, observer: np.ndarray) -> Iterator[None]:
         try:
-            proxy, version = self.proxy, self.version
+            proxy, version = self.proxy, self.settings_version
             assert proxy is not None
-            for step, found in enumerate(bake(self.scene, proxy, at)):
+            for step, values in enumerate(compute_point_gaze(self.scene, proxy, observer)):
                 with self.lock:
-                    if self.proxy is not proxy or self.version != version:
+                    if self.proxy is not proxy or self.settings_version != version:
                         return
-                    self.baked, self._baked_of = found, (at, version)
-                    gone = not np.array_equal(self.observer, at)
+                    self.point_values, self._point_inputs = values, (observer, version)
+                    has_moved = not np.array_equal(self.observer, observer)
                     if step == 0:
-                        for name in found:
-                            self._learn(name, found, found["visibility"] > 0.5)
+                        for name in values:
+                            self._update_range(name, values, values["visibility"] > 0.5)
                 self.listener.on_baked()
-                if gone:
+                if has_moved:
                     # Roughly is enough while the observer is dragged on.
                     return
                 yield None
             with self.lock:
-                if self.version == version:
-                    self.baked_for = at
+                if self.settings_version == version:
+                    self.finished_observer = observer
         except NergError:
-            self.baked_for = at
+            self.finished_observer = observer
             raise
         finally:
             self._busy.discard("gaze")
 
-    def _shares(self, asked: tuple[np.ndarray, tuple[Region, ...], int]) -> Iterator[None]:
+    def _compute_shares(self, inputs: tuple[np.ndarray, tuple[Region, ...], int]) -> Iterator[None]:
         try:
-            at, regions, version = asked
-            found: dict[str, float] = {}
-            for more in iter_attention_shares(self.scene, at, regions, self.shapes):
-                found |= more
+            observer, regions, version = inputs
+            shares: dict[str, float] = {}
+            for part in iter_attention_shares(self.scene, observer, regions, self.shapes):
+                shares |= part
                 yield None
-                if version != self.version:
+                if version != self.settings_version:
                     return
             with self.lock:
-                self.shares, self._shares_for, self._shares_of = found, asked, asked
+                self.shares, self._finished_share_inputs, self._share_inputs = shares, inputs, inputs
             self.listener.on_shares()
         except NergError:
             # What cannot be counted is told once, not at each tick of a clock.
-            self._shares_for = asked
+            self._finished_share_inputs = inputs
             raise
         finally:
             self._busy.discard("shares")
 
-    def _way(self, at: np.ndarray, free: np.ndarray, deliver: Callable[[np.ndarray], None]) -> Iterator[None]:
+    def _find_free_position(
+        self, position: np.ndarray, free_position: np.ndarray, deliver: Callable[[np.ndarray], None]
+    ) -> Iterator[None]:
         with self.lock:
             proxy, height = self.proxy, self.ceiling
-        found = None
-        if proxy is not None and (height is None or at @ self.cut_up <= height):
-            found = way_out(self.scene, proxy, at, free)
-        deliver(at if found is None else found)
+        corrected = None
+        if proxy is not None and (height is None or position @ self.ceiling_up <= height):
+            corrected = find_free_position(self.scene, proxy, position, free_position)
+        deliver(position if corrected is None else corrected)
         yield None
 
-    def _refined(
+    def _refine(
         self,
         view: PinholeView,
         deliver: Callable[[StagePicture, np.ndarray], None],
         width: int,
         spp: int,
-        leads: bool = True,
+        sets_range: bool = True,
     ) -> Iterator[None]:
         """``leads``: whether the automatic range is taken from it."""
         with self.lock:
-            shade, at, height = self.shade, self.observer, self.ceiling
-        ceiling = None if height is None else Ceiling(height, self.cut_up)
-        layer, asked = shade.layer, layers.quantities(shade.layer)
-        for found in refine(self.scene, view, at, asked, width, spp, self.pace, ceiling=ceiling):
-            if found is not None:
-                mask = found.values["opacity"] > 0.5
-                values = layer.values(found.values)
-                if leads and values is not None and layer.quantity not in self.baked:
+            display, observer, height = self.display, self.observer, self.ceiling
+        ceiling = None if height is None else Ceiling(height, self.ceiling_up)
+        layer, quantities = display.layer, layers.required_quantities(display.layer)
+        for picture in refine(self.scene, view, observer, quantities, width, spp, self.band_pace, ceiling=ceiling):
+            if picture is not None:
+                mask = picture.values["opacity"] > 0.5
+                values = layer.select_values(picture.values)
+                if sets_range and values is not None and layer.quantity not in self.point_values:
                     with self.lock:
-                        self._learn(layer.quantity, found.values, mask)
-                deliver(found, layers.colorize(layer, found.values["color"], values, mask, self.scale()))
+                        self._update_range(layer.quantity, picture.values, mask)
+                deliver(picture, layers.colorize(layer, picture.values["color"], values, mask, self.scale()))
             yield None
 
-    def _sphere(self, deliver: Callable[[np.ndarray], None], width: int) -> Iterator[None]:
+    def _render_panorama(self, deliver: Callable[[np.ndarray], None], width: int) -> Iterator[None]:
         with self.lock:
-            at, heading, layer = self.observer, self.heading, self.shade.layer
+            observer, heading, layer = self.observer, self.heading, self.display.layer
         height = width // 2
-        across = (0.5 - (np.arange(width) + 0.5) / width) * 2 * np.pi
-        rise = (0.5 - (np.arange(height) + 0.5) / height) * np.pi
-        across, rise = np.meshgrid(across, rise)
-        local = np.stack([np.cos(rise) * np.cos(across), np.cos(rise) * np.sin(across), np.sin(rise)], axis=-1)
+        longitude = (0.5 - (np.arange(width) + 0.5) / width) * 2 * np.pi
+        latitude = (0.5 - (np.arange(height) + 0.5) / height) * np.pi
+        longitude, latitude = np.meshgrid(longitude, latitude)
+        local = np.stack(
+            [np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)], axis=-1
+        )
         directions = local.reshape(-1, 3) @ heading.T
-        asked = layers.quantities(layer)
-        seen = trace(self.scene, at, filled(directions, self.pace.rays), asked, observers=at[None])
+        quantities = layers.required_quantities(layer)
+        traced = trace(
+            self.scene,
+            observer,
+            pad_directions(directions, self.band_pace.num_rays),
+            quantities,
+            observers=observer[None],
+        )
         count = len(directions)
-        values = {k: np.asarray(seen[k][0])[:count].reshape(height, width, *seen[k].shape[2:]) for k in asked}
+        values = {k: np.asarray(traced[k][0])[:count].reshape(height, width, *traced[k].shape[2:]) for k in quantities}
         yield None
         mask = values["opacity"] > 0.5
-        deliver(layers.colorize(layer, values["color"], layer.values(values), mask, self.scale()))
+        deliver(layers.colorize(layer, values["color"], layer.select_values(values), mask, self.scale()))
 
-    def _learn(self, quantity: str, by_quantity: Mapping[str, np.ndarray], mask: np.ndarray) -> None:
+    def _update_range(self, quantity: str, by_quantity: Mapping[str, np.ndarray], mask: np.ndarray) -> None:
         """Take the automatic range of the layers of ``quantity`` from its values."""
         for layer in self.layers:
-            values = layer.values(by_quantity)
+            values = layer.select_values(by_quantity)
             if layer.quantity == quantity and values is not None:
-                found = layers.choose_range(layer, values, mask)
-                if found is None:
+                limits = layers.choose_range(layer, values, mask)
+                if limits is None:
                     self._ranges.setdefault(layer.title, (0.0, 1.0))
-                elif found != self._ranges.get(layer.title):
-                    self._ranges[layer.title] = found
-                    if layer == self.shade.layer and self.shade.fixed is None:
+                elif limits != self._ranges.get(layer.title):
+                    self._ranges[layer.title] = limits
+                    if layer == self.display.layer and self.display.limits is None:
                         self.listener.on_range()
 
 
-def _same(one: tuple, other: tuple) -> bool:
+def _same_inputs(one: tuple, other: tuple) -> bool:
     return np.array_equal(one[0], other[0]) and one[1:] == other[1:]

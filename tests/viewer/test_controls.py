@@ -15,10 +15,10 @@ from nerg_mi.figures.style import LINE, hatch_lines
 from nerg_mi.formats.areas import Region
 from nerg_mi.rendering.nested_scene import replace_gaze
 from nerg_mi.viewer import layers
-from nerg_mi.viewer.controls import Inset, box_around, edges, png_bytes, slider_end, table
-from nerg_mi.viewer.layers import STALE, Scale, Shade, layer_of
+from nerg_mi.viewer.controls import Inset, box_edges, encode_picture, fit_box, format_shares, slider_max
+from nerg_mi.viewer.layers import STALE_STYLE, DisplaySettings, Scale, get_layer
 from nerg_mi.viewer.points import PinholeView
-from nerg_mi.viewer.scene import copied_view
+from nerg_mi.viewer.scene import copy_view
 from nerg_mi.viewer.session import Worker
 
 # ---- Boxes that are laid around what is seen within a rectangle ----
@@ -28,23 +28,23 @@ def test01_around_the_foremost():
     rng = np.random.default_rng(4)
     thing = np.array([2.0, 0, 1]) + 0.2 * (rng.random((500, 3)) - 0.5)
     wall = np.stack([np.full(500, 9.0), *(4 * rng.random((2, 500)) - 2)], axis=1)
-    view = PinholeView.of((0, 0, 1), (2, 0, 1), (0, 0, 1), 1.0, 1.5)
-    lower, upper = box_around(np.concatenate([thing, wall]), 0.01, view, (0.4, 0.35), (0.6, 0.65))
+    view = PinholeView.look_at((0, 0, 1), (2, 0, 1), (0, 0, 1), 1.0, 1.5)
+    lower, upper = fit_box(np.concatenate([thing, wall]), 0.01, view, (0.4, 0.35), (0.6, 0.65))
     assert np.allclose(lower, [1.9, -0.1, 0.9], atol=0.03) and np.allclose(upper, [2.1, 0.1, 1.1], atol=0.03)
     with pytest.raises(NergError, match="nothing within"):
-        box_around(thing, 0.01, view, (0.8, 0.8), (0.9, 0.9))
+        fit_box(thing, 0.01, view, (0.8, 0.8), (0.9, 0.9))
 
 
 def test02_a_rectangle_to_the_right_and_above():
-    view = PinholeView.of((0, 0, 0), (1, 0, 0), (0, 0, 1), 1.0, 1.0)
+    view = PinholeView.look_at((0, 0, 0), (1, 0, 0), (0, 0, 1), 1.0, 1.0)
     right, left = np.array([2, -0.5, 0.5]), np.array([2, 0.5, -0.5])
     points = np.concatenate([np.tile(p, (20, 1)) for p in (right, left)])
-    lower, upper = box_around(points, 0.1, view, (0.55, 0.05), (0.95, 0.45))
+    lower, upper = fit_box(points, 0.1, view, (0.55, 0.05), (0.95, 0.45))
     assert np.allclose((lower + upper) / 2, right)
 
 
 def test03_a_box_has_twelve_edges():
-    found = edges(Region.create("a", [0, 0, 0], [1, 2, 3]))
+    found = box_edges(Region.create("a", [0, 0, 0], [1, 2, 3]))
     lengths = np.sort(np.abs(found[:, 1] - found[:, 0]).sum(axis=1))
     assert found.shape == (12, 2, 3) and np.allclose(lengths, [1] * 4 + [2] * 4 + [3] * 4)
     assert len(np.unique(found.reshape(12, -1), axis=0)) == 12 and len(np.unique(found.reshape(-1, 3), axis=0)) == 8
@@ -55,14 +55,14 @@ def test03_a_box_has_twelve_edges():
 
 def test01_the_largest_share_first():
     cells = lambda text: re.findall(r"<td[^>]*>(.*?)</td>", text)
-    text = table({"a": 0.1, "b|<b>": 0.25, "c": 0.0})
+    text = format_shares({"a": 0.1, "b|<b>": 0.25, "c": 0.0})
     assert cells(text) == ["b|&lt;b&gt;", "25.0 %", "a", "10.0 %", "c", "0.0 %"]
-    many = cells(table({f"n{k}": 0.01 for k in range(20)}))
+    many = cells(format_shares({f"n{k}": 0.01 for k in range(20)}))
     assert len(many) == 26 and many[-2:] == ["8 more", "8.0 %"]
-    assert "Name areas" in table({}) and "Computing" in table({}, True)
+    assert "Name areas" in format_shares({}) and "Computing" in format_shares({}, True)
     # Out of date, they are pale, and it is said.
-    assert "Out of date" not in text and STALE not in text
-    assert "Out of date" in (old := table({"a": 0.1}, True)) and STALE in old
+    assert "Out of date" not in text and STALE_STYLE not in text
+    assert "Out of date" in (old := format_shares({"a": 0.1}, True)) and STALE_STYLE in old
 
 
 def test01_a_small_picture_is_greyed_while_another_is_made():
@@ -75,10 +75,10 @@ def test01_a_small_picture_is_greyed_while_another_is_made():
     red = np.full((8, 6, 3), (250, 10, 10), np.uint8)
     inset.show(red)
     assert np.array_equal(shown[0].image, red) and shown[0].label == "Own view"
-    inset.set_stale()
+    inset.mark_stale()
     grey = shown[0].image.astype(int)
     assert np.ptp(grey, axis=-1).max() == 0 and "out of date" in shown[0].label
-    inset.set_stale()
+    inset.mark_stale()
     assert np.array_equal(shown[0].image, grey), "not twice"
     inset.show(red)
     assert np.array_equal(shown[0].image, red) and shown[0].label == "Own view"
@@ -86,38 +86,38 @@ def test01_a_small_picture_is_greyed_while_another_is_made():
 
 @pytest.mark.parametrize("value, end", [(0, 1), (0.05, 1), (0.4, 10), (40, 1000), (300, 1000), (2e-5, 1e-4)])
 def test01_a_slider_holds_its_value_in_any_unit(value, end):
-    assert slider_end(value) == pytest.approx(end)
+    assert slider_max(value) == pytest.approx(end)
 
 
 def test02_a_scene_of_what_is_shown(store, tmp_path):
     place = SimpleNamespace(made=False)
     options = SimpleNamespace(width=48)
-    view = PinholeView.of((7, 3, 2), (5, 4, 1), (0, 0, 1), 0.9, 1.5)
+    view = PinholeView.look_at((7, 3, 2), (5, 4, 1), (0, 0, 1), 0.9, 1.5)
     shown = SimpleNamespace(
-        place=place,
+        source=place,
         scene_file=store,
-        shade=Shade(layer_of("gaze")),
+        display=DisplaySettings(get_layer("gaze")),
         observer=np.array([5, 3, 1.6]),
         options=options,
         spp=1,
         falloff=0.1,
         ceiling=None,
     )
-    (tmp_path / "view.xml").write_text(copied_view(shown, view))
+    (tmp_path / "view.xml").write_text(copy_view(shown, view))
     scene = nerg.Scene.load(tmp_path / "view.xml")
     assert scene.integrator.aov_names() == ["depth.T", "opacity.Y", "gaze.Y"] and np.allclose(
         scene.observer, [5, 3, 1.6]
     )
-    shown.place, shown.scene_file = SimpleNamespace(made=True), tmp_path / "scene.xml"
+    shown.source, shown.scene_file = SimpleNamespace(made=True), tmp_path / "scene.xml"
     (tmp_path / "scene.vol").touch()
     with pytest.raises(NergError, match="nerg scene"):
-        copied_view(shown, view)
+        copy_view(shown, view)
 
 
 def test03_a_png(rgb):
     worker = Worker(lambda error: None)
     try:
-        data = png_bytes(SimpleNamespace(worker=worker), np.zeros((4, 6, 3), np.uint8), {"Comment": "a shelf"})
+        data = encode_picture(SimpleNamespace(worker=worker), np.zeros((4, 6, 3), np.uint8), {"Comment": "a shelf"})
     finally:
         worker.stop()
     assert data.startswith(b"\x89PNG") and int.from_bytes(data[16:20], "big") == 6
@@ -148,25 +148,25 @@ def test01_a_factor_that_a_variant_lacks_is_no_layer(room, gaze_fields, tmp_path
 def test01_a_channel_is_a_layer():
     found = dict(position=np.arange(12.0).reshape(2, 2, 3), depth=np.ones((2, 2)), features=np.ones((2, 5)) * range(5))
     for name, expected in (("position.Y", [[1, 4], [7, 10]]), ("depth", np.ones((2, 2))), ("features.3", [3, 3])):
-        assert np.array_equal(layer_of(name).values(found), expected), name
-    assert layer_of("gaze").values(found) is None and layer_of("color").values(found) is None
-    assert layer_of("position.Y").quantity == "position" and layer_of("position.Y").title == "position Y"
+        assert np.array_equal(get_layer(name).select_values(found), expected), name
+    assert get_layer("gaze").select_values(found) is None and get_layer("color").select_values(found) is None
+    assert get_layer("position.Y").quantity == "position" and get_layer("position.Y").title == "position Y"
 
 
 def test02_heat_is_that_of_pictures():
     rng = np.random.default_rng(2)
     color, gaze, mask = rng.random((8, 9, 3)), rng.random((8, 9)), np.ones((8, 9), bool)
-    found = layers.colorize(layer_of("gaze"), color, gaze, mask, Scale(0, 0.7, "magma"))
+    found = layers.colorize(get_layer("gaze"), color, gaze, mask, Scale(0, 0.7, "magma"))
     assert np.array_equal(found, to_bytes(overlay(color, gaze, Heat(0.7, "magma"), mask)))
     # Points are coloured as pixels are.
-    points = layers.colorize(layer_of("gaze"), color.reshape(-1, 3), gaze.ravel(), mask.ravel(), Scale(0, 0.7, "magma"))
+    points = layers.colorize(get_layer("gaze"), color.reshape(-1, 3), gaze.ravel(), mask.ravel(), Scale(0, 0.7, "magma"))
     assert np.array_equal(points, found.reshape(-1, 3))
 
 
 def test03_no_data_is_hatched():
     mask = np.ones((24, 24), bool)
     mask[:12] = False
-    given = layer_of("depth"), np.zeros((24, 24, 3)), np.full((24, 24), 0.5), mask, Scale(0, 1)
+    given = get_layer("depth"), np.zeros((24, 24, 3)), np.full((24, 24), 0.5), mask, Scale(0, 1)
     shown, plain = layers.colorize(*given), layers.colorize(*given, hatched=False)
     assert np.array_equal(shown[12:], plain[12:]) and len(np.unique(shown[12:].reshape(-1, 3), axis=0)) == 1
     # As pictures are: lines over paled colours.
@@ -177,12 +177,12 @@ def test03_no_data_is_hatched():
 
 def test04_ranges_are_those_of_the_values():
     values, mask = np.linspace(1, 3, 1000), np.ones(1000, bool)
-    low, high = layers.choose_range(layer_of("depth"), values, mask)
+    low, high = layers.choose_range(get_layer("depth"), values, mask)
     assert low == pytest.approx(1.01) and high == pytest.approx(2.99)
-    assert layers.choose_range(layer_of("gaze"), values, mask) == (0.0, pytest.approx(2.99))
-    assert layers.choose_range(layer_of("gaze"), 0 * values, mask) is None
-    assert layers.choose_range(layer_of("depth"), values, ~mask) is None
-    low, high = layers.choose_range(layer_of("depth"), np.ones(5), np.ones(5, bool))
+    assert layers.choose_range(get_layer("gaze"), values, mask) == (0.0, pytest.approx(2.99))
+    assert layers.choose_range(get_layer("gaze"), 0 * values, mask) is None
+    assert layers.choose_range(get_layer("depth"), values, ~mask) is None
+    low, high = layers.choose_range(get_layer("depth"), np.ones(5), np.ones(5, bool))
     assert low < high
 
 
@@ -196,11 +196,11 @@ def test05_wrong_ranges_are_told(given):
 
 def test06_hidden_is_dark():
     color, mask = np.full((1, 2, 3), 0.5), np.ones((1, 2), bool)
-    seen, hidden = layers.colorize(layer_of("visibility"), color, np.array([[1.0, 0.0]]), mask, Scale())[0].astype(int)
+    seen, hidden = layers.colorize(get_layer("visibility"), color, np.array([[1.0, 0.0]]), mask, Scale())[0].astype(int)
     assert seen.sum() > 2 * hidden.sum() and hidden[2] > hidden[0]
 
 
 def test07_the_legend_has_both_ends():
-    text = layers.format_legend(layer_of("gaze"), Scale(0.0, 0.1234))
+    text = layers.format_legend(get_layer("gaze"), Scale(0.0, 0.1234))
     assert ">0<" in text and ">0.123<" in text and ">1/sr<" in text
-    assert "hidden" in layers.format_legend(layer_of("visibility"), Scale())
+    assert "hidden" in layers.format_legend(get_layer("visibility"), Scale())

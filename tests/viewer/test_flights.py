@@ -11,18 +11,26 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.rendering.files import read_frames
-from nerg_mi.viewer.flights import Film, Flying, even, film_options, flight, frames_csv, shown_of_flight
-from nerg_mi.viewer.layers import Scale, layer_of
+from nerg_mi.viewer.flights import (
+    FlightPanel,
+    FlightVideo,
+    format_frames,
+    interpolate_views,
+    make_even,
+    make_video_options,
+    prepare_flight,
+)
+from nerg_mi.viewer.layers import Scale, get_layer
 from nerg_mi.viewer.points import PinholeView
-from nerg_mi.viewer.scene import copied
-from nerg_mi.viewer.serve import viewer
+from nerg_mi.viewer.scene import copy_scene
+from nerg_mi.viewer.serve import open_viewer
 from nerg_mi.viewer.session import Worker
 from nerg_mi.workflows.scene_commands import ViewOptions
 from tests.viewer.browser import require
 
 # ---- A flight as a video: in turns with other tasks, cancelled, and with what is shown ----
 
-HOME = PinholeView.of((-2, 0, 1), (2, 0, 0), (0, 0, 1), 0.8, 1.37)
+HOME = PinholeView.look_at((-2, 0, 1), (2, 0, 0), (0, 0, 1), 0.8, 1.37)
 
 
 @pytest.fixture
@@ -30,14 +38,14 @@ def film_of(room, tmp_path):
     """A function that makes a film of a few frames of the room, and the list of what it told."""
 
     def make(seconds=0.5):
-        further = PinholeView.of((-1, 0, 1), (2, 0, 0), (0, 0, 1), 0.8, 1.37)
-        kept = flight([HOME, further], seconds, 10)
-        views, shown = shown_of_flight(kept, 49, observer=None, aovs=("depth",), spp=1, falloff=0.05)
-        (tmp_path / "view.xml").write_text(copied(room, shown))
-        (tmp_path / "view.frames.csv").write_text(frames_csv(views), newline="")
+        further = PinholeView.look_at((-1, 0, 1), (2, 0, 0), (0, 0, 1), 0.8, 1.37)
+        kept = interpolate_views([HOME, further], seconds, 10)
+        views, shown = prepare_flight(kept, 49, observer=None, aovs=("depth",), spp=1, falloff=0.05)
+        (tmp_path / "view.xml").write_text(copy_scene(room, shown))
+        (tmp_path / "view.frames.csv").write_text(format_frames(views), newline="")
         told, ended = [], []
-        options = film_options(layer_of("color"), Scale(), tmp_path / "view.frames.csv", 10, "llvm_ad_rgb")
-        film = Film(
+        options = make_video_options(get_layer("color"), Scale(), tmp_path / "view.frames.csv", 10, "llvm_ad_rgb")
+        film = FlightVideo(
             tmp_path / "view.xml", tmp_path / "f.mp4", options, lambda share, text: told.append(share), ended.append
         )
         return film, told, ended
@@ -101,17 +109,17 @@ def test04_without_pyav_it_says_so(film_of, monkeypatch):
 
 @pytest.mark.parametrize("aspect, width", [(1.5, 720), (1.783, 481), (0.6, 33), (3.0, 2)])
 def test05_sides_are_even(aspect, width):
-    view, wide = even(PinholeView.of((0, 0, 0), (1, 0, 0), (0, 0, 1), 0.8, aspect), width)
-    assert wide % 2 == 0 and view.height(wide) % 2 == 0 and min(wide, view.height(wide)) >= 16
+    view, wide = make_even(PinholeView.look_at((0, 0, 0), (1, 0, 0), (0, 0, 1), 0.8, aspect), width)
+    assert wide % 2 == 0 and view.picture_height(wide) % 2 == 0 and min(wide, view.picture_height(wide)) >= 16
 
 
 def test06_it_is_drawn_as_the_layer_is():
     frames = Path("frames.csv")
-    gaze = film_options(layer_of("gaze"), Scale(0, 0.4, "magma"), frames, 25, "llvm_ad_rgb")
+    gaze = make_video_options(get_layer("gaze"), Scale(0, 0.4, "magma"), frames, 25, "llvm_ad_rgb")
     assert (gaze.overlay, gaze.vmax, gaze.cmap) == ("gaze", 0.4, "magma")
-    assert film_options(layer_of("visibility"), Scale(), frames, 25, "llvm_ad_rgb").vmax is None
-    assert film_options(layer_of("color"), Scale(), frames, 25, "llvm_ad_rgb").overlay is None
-    depth = film_options(layer_of("depth"), Scale(1, 7), frames, 25, "llvm_ad_rgb")
+    assert make_video_options(get_layer("visibility"), Scale(), frames, 25, "llvm_ad_rgb").vmax is None
+    assert make_video_options(get_layer("color"), Scale(), frames, 25, "llvm_ad_rgb").overlay is None
+    depth = make_video_options(get_layer("depth"), Scale(1, 7), frames, 25, "llvm_ad_rgb")
     assert (depth.overlay, depth.vmax, depth.cmap) == ("depth", 7, "inferno")
 
 
@@ -119,31 +127,31 @@ def test06_it_is_drawn_as_the_layer_is():
 
 
 def view(x, ahead=(0, 1, 0)):
-    return PinholeView.of((x, 0, 1), np.add((x, 0, 1), ahead), (0, 0, 1), 0.9, 1.5)
+    return PinholeView.look_at((x, 0, 1), np.add((x, 0, 1), ahead), (0, 0, 1), 0.9, 1.5)
 
 
 def test01_it_passes_the_views():
     kept = [view(0), view(1), view(3, (1, 0, 0))]
-    found = flight(kept, 2.0, 10)
+    found = interpolate_views(kept, 2.0, 10)
     assert len(found) == 21
     for at, one in zip((0, 10, 20), kept):
-        assert np.allclose(found[at].origin, one.origin) and np.allclose(found[at].ahead, one.ahead, atol=1e-9)
+        assert np.allclose(found[at].origin, one.origin) and np.allclose(found[at].forward, one.forward, atol=1e-9)
     steps = np.diff([v.origin[0] for v in found])
     assert (steps > 0).all() and steps[0] < steps[5], "it starts from rest"
 
 
 def test02_frames_are_read_again(tmp_path):
-    (tmp_path / "f.csv").write_text(frames_csv(flight([view(0), view(1)], 1.0, 4)), newline="")
+    (tmp_path / "f.csv").write_text(format_frames(interpolate_views([view(0), view(1)], 1.0, 4)), newline="")
     frames = read_frames(tmp_path / "f.csv")
     assert len(frames) == 5 and list(frames[0]) == ["view_camera", "view_target"]
     origin, target = (np.array([float(v) for v in frames[-1][name].split(",")]) for name in frames[-1])
-    assert np.allclose((target - origin) / np.linalg.norm(target - origin), view(1).ahead, atol=1e-8)
+    assert np.allclose((target - origin) / np.linalg.norm(target - origin), view(1).forward, atol=1e-8)
 
 
 @pytest.mark.parametrize("views, seconds, fps", [([], 1, 25), ([view(0)], 1, 25), ([view(0), view(1)], 1e6, 120)])
 def test03_what_is_no_flight(views, seconds, fps):
     with pytest.raises(NergError, match="a flight"):
-        flight(views, seconds, fps)
+        interpolate_views(views, seconds, fps)
 
 
 # ---- The panel's part for flights: what is refused is said, and a video is sent to the page that asked ----
@@ -164,14 +172,17 @@ def test01_a_video_is_sent(room):
     require("viser")
     pytest.importorskip("av")
     client = Client()
-    with viewer([room], ViewOptions(port=0, width=32, spp=1)) as running:
-        part = Flying(running.page)
-        part._begin(SimpleNamespace(client=client))
-        assert "two views" in client.notes[-1] and part._film is None
-        home = running.page.session.home
-        part._kept = [home, PinholeView.of(home.origin + 0.3, home.origin + home.ahead, home.up, home.fov, home.aspect)]
+    with open_viewer([room], ViewOptions(port=0, width=32, spp=1)) as running:
+        part = FlightPanel(running.page)
+        part._start_video(SimpleNamespace(client=client))
+        assert "two views" in client.notes[-1] and part._video is None
+        home = running.page.session.home_view
+        part._views = [
+            home,
+            PinholeView.look_at(home.origin + 0.3, home.origin + home.forward, home.up, home.fov, home.aspect),
+        ]
         part._seconds.value, part._fps.value = 0.2, 10
-        part._begin(SimpleNamespace(client=client))
+        part._start_video(SimpleNamespace(client=client))
         assert running.page.session.worker.wait_idle(120)
-        assert running.page.problem == "" and part._film is None and not part._cancel.visible
+        assert running.page.problem == "" and part._video is None and not part._cancel_button.visible
     assert client.files["flight.mp4"][4:8] == b"ftyp"

@@ -11,9 +11,9 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 
-from nerg_mi.viewer.layers import layer_of
+from nerg_mi.viewer.layers import get_layer
 from nerg_mi.viewer.points import PinholeView
-from nerg_mi.viewer.serve import viewer
+from nerg_mi.viewer.serve import open_viewer
 from nerg_mi.workflows.scene_commands import ViewOptions
 from tests.viewer.browser import chromium, require
 
@@ -45,8 +45,8 @@ def pixels(driver):
 def on_screen(driver, view: PinholeView, point) -> tuple[int, int]:
     """Where ``point`` is in the window, in pixels."""
     away = np.asarray(point, float) - view.origin
-    depth, rise = away @ view.ahead, np.tan(view.fov / 2)
-    right = np.cross(view.ahead, view.up)
+    depth, rise = away @ view.forward, np.tan(view.fov / 2)
+    right = np.cross(view.forward, view.up)
     x = 0.5 + away @ right / (depth * rise * view.aspect) / 2
     y = 0.5 - away @ view.up / (depth * rise) / 2
     width, height = driver.execute_script("return [window.innerWidth, window.innerHeight]")
@@ -77,7 +77,7 @@ def running():
     path = demo.find_store_scene()
     if not all((path.parent / name).is_file() for name in demo.CHECKPOINTS.values()):
         pytest.skip("the store's fields are not here: python -m nerg_mi.scenes.store.make")
-    with viewer([path], ViewOptions(port=0, width=160, spp=1)) as found:
+    with open_viewer([path], ViewOptions(port=0, width=160, spp=1)) as found:
         yield found
 
 
@@ -94,10 +94,10 @@ def window_of(running):
 
 def refined(running, window):
     """The window's picture, once it is whole, and the browser has had time to show it."""
-    until(lambda: window.picture and window.last is not None and window.last[0].whole)
-    until(lambda: running.page.session.worker.idle)
+    until(lambda: window.shows_picture and window.last_picture is not None and window.last_picture[0].is_final)
+    until(lambda: running.page.session.worker.is_idle)
     time.sleep(0.7)
-    return window.last
+    return window.last_picture
 
 
 def drawn(driver):
@@ -113,7 +113,7 @@ def test01_it_loads_and_is_refined(running, driver):
     shown = drawn(driver)
     assert running.page.problem == ""
     # It is the picture that was rendered: its mean colours, cell by cell.
-    colors = window.last[1].astype(float)
+    colors = window.last_picture[1].astype(float)
     height, width = shown.shape[:2]
     rows, columns = np.linspace(0, 1, 24)[14:22], np.linspace(0, 1, 24)[1:14]
     own = np.array([[colors[int(r * colors.shape[0]), int(c * colors.shape[1])] for c in columns] for r in rows])
@@ -125,16 +125,16 @@ def test02_the_observer_is_dragged_and_the_picture_changes(running, driver):
     session, window = running.page.session, window_of(running)
     running.page.place_observer(np.array([5.6, 3.6, 1.6]), np.eye(3))
     refined(running, window)
-    before, numbers, at = pixels(driver), window.last[0].values["gaze"].copy(), session.observer.copy()
+    before, numbers, at = pixels(driver), window.last_picture[0].values["gaze"].copy(), session.observer.copy()
     start = on_screen(driver, window.view, at + np.array([0.3, 0, 0]))
     drag(driver, start, (start[0] + 90, start[1] + 30))
     until(lambda: not np.array_equal(session.observer, at), 10)
     assert np.abs(session.observer - at)[1:].max() < 1e-3 and abs(session.observer[0] - at[0]) > 0.05, "along its arrow"
     refined(running, window)
     assert np.abs(pixels(driver) - before)[250:600, :800].mean() > 1
-    gaze = window.last[0].values["gaze"]
+    gaze = window.last_picture[0].values["gaze"]
     assert np.abs(gaze - numbers).max() > 0.05 * numbers.max()
-    assert session.baked_for is not None and np.array_equal(session.baked_for, session.observer)
+    assert session.finished_observer is not None and np.array_equal(session.finished_observer, session.observer)
     assert np.allclose(running.page._observer.position, session.observer)
 
 
@@ -164,7 +164,7 @@ def test04_two_browsers_have_one_observer_and_cameras_of_their_own(running, driv
         running.page.place_observer(np.array([4.4, 2.8, 1.6]))
         for window in (first, second):
             refined(running, window)
-        assert not np.array_equal(first.last[1], second.last[1])
+        assert not np.array_equal(first.last_picture[1], second.last_picture[1])
     until(lambda: len(running.page.windows) == 1, 20)
 
 
@@ -183,7 +183,7 @@ def test05b_what_is_out_of_date_is_grey_and_named(running, driver):
     """While the render thread has something else to do, the heat of the observer before is not that of this one."""
     session, window = running.page.session, window_of(running)
     refined(running, window)
-    until(lambda: not session.stale_points and not session.stale_shares, 120)
+    until(lambda: not session.stale_points_reason and not session.are_shares_stale, 120)
     colorful = lambda: np.ptp(pixels(driver)[250:600, :800], axis=-1).mean()
     text = lambda: driver.find_element("tag name", "body").text
     fresh, go = colorful(), threading.Event()
@@ -196,7 +196,7 @@ def test05b_what_is_out_of_date_is_grey_and_named(running, driver):
     def held(change, words):
         go.clear()
         session.worker.submit("film", 0, wait())
-        until(lambda: session.computing == ["video"])
+        until(lambda: session.running_tasks == ["video"])
         change()
         until(lambda: words in text() and colorful() < 0.5 * fresh, 20)
         assert "Own view (grey: out of date)" in text() and "Computing: picture" in text()
@@ -207,11 +207,11 @@ def test05b_what_is_out_of_date_is_grey_and_named(running, driver):
     held(lambda: running.page.place_observer(np.array([4.4, 2.8, 1.6])), "Grey: gaze of an earlier observer")
 
     def show(title):
-        session.set_shade(layer=layer_of(title))
-        running.page.recolor()
-        running.page.renew()
-        for told in running.page.on_marked:
-            told()
+        session.set_display(layer=get_layer(title))
+        running.page.redraw_points()
+        running.page.restart_pictures()
+        for callback in running.page.scale_callbacks:
+            callback()
 
     held(lambda: show("depth"), "Grey: the points do not show depth")
     show("gaze")
@@ -225,14 +225,14 @@ def test05c_nobody_is_left_in_a_shelf(running, driver):
     shelf = np.array([5.4, 3.6, 0.8])
     window.client.camera.position = tuple(shelf)
     # A browser under load tells its old camera once more before it follows.
-    until(lambda: window.note and np.linalg.norm(window.view.origin - shelf) > 0.2, 60)
+    until(lambda: window.message and np.linalg.norm(window.view.origin - shelf) > 0.2, 60)
     refined(running, window)
     until(lambda: "stands before it now" in window.status.content)
     # Who was put somewhere is dragged from there.
     running.page.place_observer(session.observer + (0, 0, 0.5))
     before = session.observer.copy()
     running.page._observer.position = tuple(shelf)
-    running.page._dragged("end")
+    running.page._on_drag("end")
     assert np.allclose(session.observer, shelf)
     until(lambda: not np.allclose(session.observer, shelf), 30)
     refined(running, window)
@@ -249,7 +249,7 @@ def test05d_what_is_no_position_is_refused(running, driver, monkeypatch):
         sent = SimpleNamespace(position=position, wxyz=turn)
         with monkeypatch.context() as patched:
             patched.setattr(page, "_observer", sent)
-            page._dragged("end")
+            page._on_drag("end")
         assert np.array_equal(session.observer, before) and page.problem
         # The gizmo goes back to where they stand.
         assert np.allclose(sent.position, before) and np.isfinite(sent.wxyz).all()
@@ -287,7 +287,7 @@ def test08_nothing_is_left_running(rgb, room):
 
     require("viser")
     before = threading.active_count()
-    with viewer([room], ViewOptions(port=0)) as found:
+    with open_viewer([room], ViewOptions(port=0)) as found:
         port = urlsplit(found.address).port
     until(lambda: threading.active_count() <= before, 10)
     import socket

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import nerg_mi as nerg
-from nerg_mi.viewer.serve import viewer
+from nerg_mi.viewer.serve import open_viewer
 from nerg_mi.workflows.scene_commands import ViewOptions
 from tests.viewer.browser import chromium, require
 from tests.viewer.conftest import ROOM, write_gaze_fields
@@ -161,7 +161,7 @@ def running(tmp_path_factory):
         pytest.skip("the store's fields are not here: python -m nerg_mi.scenes.store.make")
     rays = tmp_path_factory.mktemp("rays") / "rays.npz"
     two_people().save(rays)
-    with viewer([path, rays], ViewOptions(port=0, width=48, spp=1)) as found:
+    with open_viewer([path, rays], ViewOptions(port=0, width=48, spp=1)) as found:
         yield found
 
 
@@ -170,7 +170,7 @@ def panel(running, tmp_path_factory):
     with chromium(900, 700) as driver:
         driver.get(running.address)
         window = until(lambda: next(iter(running.page.windows.values()), None))
-        until(lambda: window.picture)
+        until(lambda: window.shows_picture)
         found = Panel(driver, tmp_path_factory.mktemp("saved"))
         found.close_notes()
         yield found
@@ -183,17 +183,17 @@ def window_of(running):
 def test01_layers_and_their_scale(running, panel):
     session, window = running.page.session, window_of(running)
     panel.choose("Layer", "depth")
-    until(lambda: session.shade.layer.title == "depth")
-    until(lambda: window.picture and "depth" in window.last[0].values and session._ranges.get("depth"))
+    until(lambda: session.display.layer.title == "depth")
+    until(lambda: window.shows_picture and "depth" in window.last_picture[0].values and session._ranges.get("depth"))
     # The scale beside the picture has the range that was taken from it.
     until(lambda: f"{session.scale().high:.3g}" in panel.texts() and "units" in panel.texts())
     panel.choose("Layer", "gaze")
-    until(lambda: session.shade.layer.title == "gaze")
+    until(lambda: session.display.layer.title == "gaze")
     panel.tick("Automatic range")
-    until(lambda: session.shade.fixed is not None)
+    until(lambda: session.display.limits is not None)
     # A range of 1/sr says nothing of metres.
     panel.choose("Layer", "depth")
-    until(lambda: session.shade.layer.title == "depth" and session.shade.fixed is None)
+    until(lambda: session.display.layer.title == "depth" and session.display.limits is None)
     panel.choose("Colours", "magma")
     until(lambda: session.scale().colors == "magma")
     panel.choose("Colours", "as usual")
@@ -221,14 +221,14 @@ def test03_from_above_and_what_is_saved(running, panel):
     panel.open("Camera", "From above")
     panel.press("Keep this view")
     panel.press("From above")
-    until(lambda: window.view.ahead @ session.place.up < -0.95)
+    until(lambda: window.view.forward @ session.source.up < -0.95)
     assert session.ceiling is not None and window.view.origin[2] > session.ceiling
     panel.press("Keep this view")
     panel.press("Save the frames (CSV)")
     rows = list(csv.reader(io.StringIO(panel.saved("view.frames.csv").decode())))
     assert rows[0] == ["view_camera", "view_target"] and len(rows) == 152
     assert np.allclose([float(v) for v in rows[-1][0].split(",")], window.view.origin, atol=1e-3)
-    until(lambda: window.picture)
+    until(lambda: window.shows_picture)
     panel.press("Save the picture (PNG)")
     data = panel.saved("view.png")
     assert data.startswith(b"\x89PNG") and int.from_bytes(data[16:20], "big") in (12, 24, 48)
@@ -242,7 +242,7 @@ def test03_from_above_and_what_is_saved(running, panel):
     assert np.allclose([float(v) for v in eye.get("value").split(",")], session.observer, atol=1e-5)
     panel.tick("Cut the ceiling off")
     panel.press("First view")
-    until(lambda: np.allclose(window.view.origin, session.home.origin, atol=1e-3) and session.ceiling is None)
+    until(lambda: np.allclose(window.view.origin, session.home_view.origin, atol=1e-3) and session.ceiling is None)
 
 
 def test04_a_flight_becomes_a_video(running, panel):
@@ -295,21 +295,29 @@ def test06_an_area_is_drawn_named_and_saved(running, panel):
 def test07_gaze_fields_to_choose_among(running, tmp_path):
     """Two of them, of which one lacks a factor: other layers, and the pictures are made anew."""
     (tmp_path / "room.xml").write_text(ROOM)
-    with viewer([tmp_path / "room.xml", *write_gaze_fields(tmp_path)], ViewOptions(port=0, width=48, spp=1)) as found:
+    with open_viewer(
+        [tmp_path / "room.xml", *write_gaze_fields(tmp_path)], ViewOptions(port=0, width=48, spp=1)
+    ) as found:
         session = found.page.session
         with chromium(900, 700) as driver:
             driver.get(found.address)
             window = until(lambda: next(iter(found.page.windows.values()), None))
-            until(lambda: window.picture)
+            until(lambda: window.shows_picture)
             panel = Panel(driver, tmp_path)
             panel.close_notes()
             panel.choose("Layer", "what the observer gives")
-            until(lambda: session.shade.layer.title == "what the observer gives")
+            until(lambda: session.display.layer.title == "what the observer gives")
             panel.choose("Gaze field", "emit")
-            until(lambda: session.gaze_name == "emit" and session.shade.layer.title == "gaze")
-            until(lambda: window.picture and "gaze" in window.last[0].values)
+            until(lambda: session.gaze_name == "emit" and session.display.layer.title == "gaze")
+            until(lambda: window.shows_picture and "gaze" in window.last_picture[0].values)
             until(lambda: panel.input("Layer").get_attribute("value") == "gaze")
-            one = window.last[1]
+            one = window.last_picture[1]
             panel.choose("Gaze field", "emit_capture")
             until(lambda: session.gaze_name == "emit_capture")
-            until(lambda: window.picture and window.last[0].whole and not np.array_equal(window.last[1], one))
+            until(
+                lambda: (
+                    window.shows_picture
+                    and window.last_picture[0].is_final
+                    and not np.array_equal(window.last_picture[1], one)
+                )
+            )

@@ -15,20 +15,20 @@ import nerg_mi as nerg
 from nerg_mi.fields.splats import Splats
 from nerg_mi.transport.geometry import Ceiling
 from nerg_mi.viewer.points import (
-    BATCH,
-    DIRECTIONS,
-    LEVELS,
-    SIZES,
+    BAND_SIZES,
+    BATCH_SIZE,
+    NUM_LEVELS,
+    ROUGH_DIRECTIONS,
     BandPace,
     PinholeView,
-    bake,
-    gather,
-    heading_of,
-    ordered,
+    compute_point_gaze,
+    downsample_points,
+    find_free_position,
+    gather_points,
+    make_heading,
+    order_points,
     refine,
     rough_integrals,
-    thin,
-    way_out,
 )
 
 # ---- Proxy ----
@@ -41,7 +41,7 @@ def last(steps):
 
 
 def test01_points_lie_on_the_surfaces(room_scene):
-    proxies = [p for p in gather(room_scene, [np.array([0, 0, 0.5])], places=3) if p is not None]
+    proxies = [p for p in gather_points(room_scene, [np.array([0, 0, 0.5])], max_positions=3) if p is not None]
     assert len(proxies) == 2 and len(proxies[0].points) < len(proxies[1].points)
     x, y, z = proxies[-1].points.T.astype(float)
     off = np.maximum(np.maximum(np.abs(x - 1.5), np.abs(y)), np.abs(z - 0.5)) - 0.5
@@ -56,19 +56,21 @@ def test01_and_on_a_floor_of_splats(rgb):
     n = len(x)
     centers, turns = np.stack([x, y, 0 * x], axis=1), np.tile([1.0, 0, 0, 0], (n, 1))
     floor = Splats(centers, np.tile([0.15, 0.15, 0.01], (n, 1)), turns, np.full(n, 0.95), np.ones((n, 1, 3)))
-    points = last(gather(nerg.make_scene(floor), [np.array([0, 0, 1.5])], places=2)).points
+    points = last(gather_points(nerg.make_scene(floor), [np.array([0, 0, 1.5])], max_positions=2)).points
     inside = np.abs(points[:, :2]).max(axis=1) < 2
     assert inside.sum() > 1000 and np.abs(points[inside, 2]).max() < 0.03
 
 
 def test02_one_point_in_a_cell():
     points = np.random.default_rng(1).random((200_000, 3))
-    proxy = thin([(points[:100_000], points[:100_000]), (points[100_000:], points[100_000:])], most=5000)
+    proxy = downsample_points(
+        [(points[:100_000], points[:100_000]), (points[100_000:], points[100_000:])], max_points=5000
+    )
     cells = np.floor((proxy.points - np.percentile(points, 0.5, axis=0)) / proxy.size)
     assert 1000 < len(proxy.points) <= 5000 and len(np.unique(cells, axis=0)) >= 0.999 * len(cells)
     assert np.array_equal(proxy.points, proxy.color)
-    nothing = thin([(np.zeros((0, 3)), np.zeros((0, 3)))])
-    assert len(nothing.points) == 0 and [count for count, _ in nothing.levels] == [0] * LEVELS
+    nothing = downsample_points([(np.zeros((0, 3)), np.zeros((0, 3)))])
+    assert len(nothing.points) == 0 and [count for count, _ in nothing.levels] == [0] * NUM_LEVELS
 
 
 def test03_gaze_on_points_is_that_of_the_integrator(store):
@@ -76,8 +78,8 @@ def test03_gaze_on_points_is_that_of_the_integrator(store):
     eye = np.array([4.4, 2.8, 1.6])
     seen = nerg.render(scene, observers=eye, quantities=["position", "gaze", "opacity"], spp=1)
     points = seen.position[0].reshape(-1, 3)
-    proxy = ordered(points, np.arange(3 * len(points)).reshape(-1, 3), 0.1)
-    baked = last(bake(scene, proxy, eye))
+    proxy = order_points(points, np.arange(3 * len(points)).reshape(-1, 3), 0.1)
+    baked = last(compute_point_gaze(scene, proxy, eye))
     order = proxy.color[:, 0].astype(int) // 3
     true, met = seen.gaze[0].ravel()[order], seen.opacity[0].ravel()[order] > 0.9
     assert set(baked) == {"gaze", "visibility"} and baked["gaze"].shape == true.shape
@@ -90,15 +92,15 @@ def test03_gaze_on_points_is_that_of_the_integrator(store):
 def test04_what_is_hidden_is_known(room_scene):
     # Behind the box, in front of it, and beside it.
     points = np.array([[2.5, 0, 0.01], [0.5, 0, 0.01], [1.5, 1.5, 0.01]], np.float32)
-    proxy = ordered(points, points, 0.1)
-    baked = last(bake(room_scene, proxy, np.array([0, 0, 0.5])))
+    proxy = order_points(points, points, 0.1)
+    baked = last(compute_point_gaze(room_scene, proxy, np.array([0, 0, 0.5])))
     hidden = (proxy.points[:, 0] > 2) & (proxy.points[:, 1] == 0)
     assert np.allclose(baked["visibility"], ~hidden, atol=1e-3) and "gaze" not in baked
 
 
 def test05_the_first_points_are_spread_as_all():
     points = np.random.default_rng(1).random((200_000, 3)) * [8, 6, 0.01]
-    proxy = thin([(points, points)], most=40_000)
+    proxy = downsample_points([(points, points)], max_points=40_000)
     counts = [count for count, _ in proxy.levels]
     assert counts[0] == len(proxy.points) and all(1.4 < a / b < 2.9 for a, b in zip(counts, counts[1:]))
     for count, size in proxy.levels:
@@ -107,17 +109,17 @@ def test05_the_first_points_are_spread_as_all():
         assert size == proxy.size or len(np.unique(cells, axis=0)) > 0.97 * count
         away = KDTree(proxy.points[:count]).query(proxy.points)[0]
         assert away.max() < 3 * size
-    nearest = KDTree(proxy.points[:BATCH]).query(proxy.points)[1]
-    assert np.array_equal(proxy.near, nearest)
+    nearest = KDTree(proxy.points[:BATCH_SIZE]).query(proxy.points)[1]
+    assert np.array_equal(proxy.nearest, nearest)
 
 
 def test06_each_step_of_the_gaze_is_better(store):
     scene = nerg.Scene.load(store, width=96, height=64)
     eye, home = np.array([4.4, 2.8, 1.6]), np.array([6.3, 3.0, 1.6])
-    proxy = last(gather(scene, [eye, home], places=4))
-    assert len(proxy.points) > BATCH
-    steps = list(bake(scene, proxy, eye))
-    assert len(steps) == -(-len(proxy.points) // BATCH)
+    proxy = last(gather_points(scene, [eye, home], max_positions=4))
+    assert len(proxy.points) > BATCH_SIZE
+    steps = list(compute_point_gaze(scene, proxy, eye))
+    assert len(steps) == -(-len(proxy.points) // BATCH_SIZE)
     final = steps[-1]["gaze"]
     off = [np.abs(step["gaze"] - final).mean() / final.mean() for step in steps]
     assert off[0] < 0.35 and sorted(off, reverse=True) == off and off[-1] == 0
@@ -126,21 +128,21 @@ def test06_each_step_of_the_gaze_is_better(store):
 def test07_who_is_put_into_something_is_put_out_before_it(room_scene):
     """The box reaches from 1 to 2 along x."""
     eyes = [np.array([0, 0, 0.5]), np.array([-2, 0, 1.0])]
-    proxy = last(gather(room_scene, eyes, places=4))
-    assert len(proxy.free) > 50 and (proxy.free[:, 2] > 0).all()
+    proxy = last(gather_points(room_scene, eyes, max_positions=4))
+    assert len(proxy.free_positions) > 50 and (proxy.free_positions[:, 2] > 0).all()
     inside = lambda p: np.abs(np.asarray(p) - (1.5, 0, 0.5)).max() < 0.5
-    assert not any(map(inside, proxy.free))
+    assert not any(map(inside, proxy.free_positions))
     for at, free in (
         ((1.5, 0, 0.5), eyes[0]),
         ((1.02, 0.3, 0.2), eyes[1]),
         ((1.9, -0.4, 0.9), np.array([2.6, -1, 0.5])),
     ):
-        out = way_out(room_scene, proxy, np.array(at), free)
+        out = find_free_position(room_scene, proxy, np.array(at), free)
         assert not inside(out) and np.abs(out - (1.5, 0, 0.5)).max() < 0.6
         # On the way that was taken.
         assert np.cross(out - free, np.array(at) - free) == pytest.approx(0, abs=1e-6)
     for at in ((0.5, 0, 0.5), (2.5, 0, 0.3), (1.5, 0, 1.4), (1.5, 1.2, 0.1), (9, 9, 9)):
-        assert way_out(room_scene, proxy, np.array(at, float), eyes[0]) is None, at
+        assert find_free_position(room_scene, proxy, np.array(at, float), eyes[0]) is None, at
 
 
 # ---- Pictures in steps: those of `nerg.render`, in bands that can be left off ----
@@ -149,13 +151,21 @@ QUANTITIES = ["color", "depth", "opacity", "visibility"]
 
 
 def test01_the_last_picture_is_that_of_the_integrator(room_scene):
-    view = PinholeView.of_sensor(room_scene.sensor(0))
+    view = PinholeView.from_sensor(room_scene.sensor(0))
     steps = list(refine(room_scene, view, np.array([0, 0, 0.5]), QUANTITIES, 48, 64, BandPace()))
     pictures = [p for p in steps if p is not None]
-    assert [p.share for p in pictures[:2]] == [4, 2] and [p.samples for p in pictures[2:]] == [1, 2, 4, 8, 16, 32, 64]
+    assert [p.downsampling for p in pictures[:2]] == [4, 2] and [p.samples for p in pictures[2:]] == [
+        1,
+        2,
+        4,
+        8,
+        16,
+        32,
+        64,
+    ]
     assert pictures[0].values["depth"].shape == (8, 12) and pictures[-1].values["color"].shape == (32, 48, 3)
-    assert [p.whole for p in pictures] == [False] * (len(pictures) - 1) + [True]
-    true = nerg.render(room_scene, quantities=QUANTITIES, camera=view.camera(48), spp=256)
+    assert [p.is_final for p in pictures] == [False] * (len(pictures) - 1) + [True]
+    true = nerg.render(room_scene, quantities=QUANTITIES, camera=view.to_camera(48), spp=256)
     for name, most in (("color", 0.02), ("depth", 0.02), ("visibility", 0.02)):
         assert np.abs(pictures[-1].values[name] - true[name][0]).mean() < most, name
     # Each is nearer to the truth than the first one of its size.
@@ -164,10 +174,10 @@ def test01_the_last_picture_is_that_of_the_integrator(room_scene):
 
 
 def test02_equal_seeds_give_equal_pictures_whatever_the_bands(room_scene):
-    view = PinholeView.of_sensor(room_scene.resolve_sensor(0))
+    view = PinholeView.from_sensor(room_scene.resolve_sensor(0))
     names = ["depth", "opacity"]
     one, other = BandPace(), BandPace()
-    other._at = 2
+    other._index = 2
     first, second = (list(refine(room_scene, view, None, names, 150, 2, pace))[-1] for pace in (one, other))
     assert first is not None and second is not None
     assert np.allclose(first.values["depth"], second.values["depth"], atol=1e-5)
@@ -179,28 +189,28 @@ def test03_a_picture_that_is_left_off_is_not_gone_on_with(room_scene, monkeypatc
     traced = []
     original = module.trace
     monkeypatch.setattr(module, "trace", lambda *a, **k: traced.append(len(a[2])) or original(*a, **k))
-    view = PinholeView.of_sensor(room_scene.resolve_sensor(0))
+    view = PinholeView.from_sensor(room_scene.resolve_sensor(0))
     steps = refine(room_scene, view, None, ["depth", "opacity"], 400, 4, BandPace())
     next(steps)
     steps.close()
-    assert traced == [SIZES[0]]
+    assert traced == [BAND_SIZES[0]]
 
 
 def test04_the_pace_follows_the_time(monkeypatch):
     pace = BandPace()
     for _ in range(10):
-        pace.learn(0.01)
-    assert pace.rays == SIZES[-1]
-    pace.learn(20.0)  # a kernel was compiled
-    assert pace.rays == SIZES[-1]
+        pace.record(0.01)
+    assert pace.num_rays == BAND_SIZES[-1]
+    pace.record(20.0)  # a kernel was compiled
+    assert pace.num_rays == BAND_SIZES[-1]
     for _ in range(20):
-        pace.learn(20.0)
-    assert pace.rays == SIZES[0]
+        pace.record(20.0)
+    assert pace.num_rays == BAND_SIZES[0]
 
 
 def test05_from_above_the_ceiling_is_cut_off(room_scene):
     up = np.array([0.0, 0, 1])
-    view = PinholeView.of((1.5, 0, 5), (1.5, 0.01, 0), up, 0.3, 1.0)
+    view = PinholeView.look_at((1.5, 0, 5), (1.5, 0.01, 0), up, 0.3, 1.0)
     whole = list(refine(room_scene, view, None, ["depth", "opacity"], 32, 1, BandPace()))[-1]
     cut = list(refine(room_scene, view, None, ["depth", "opacity"], 32, 1, BandPace(), ceiling=Ceiling(0.5, up)))[-1]
     assert whole is not None and cut is not None
@@ -214,7 +224,7 @@ def test_integrals_are_rough_until_the_last_picture(store):
     scene = nerg.Scene.load(store)
     own = scene.integrator.observer_settings
     with rough_integrals(scene):
-        assert scene.integrator.observer_settings == replace(own, directions=DIRECTIONS)
+        assert scene.integrator.observer_settings == replace(own, directions=ROUGH_DIRECTIONS)
     with rough_integrals(scene, False):
         assert scene.integrator.observer_settings is own
     with pytest.raises(ZeroDivisionError), rough_integrals(scene):
@@ -232,39 +242,39 @@ def test01_the_frame_of_a_page():
     camera = SimpleNamespace(
         wxyz=(w, x, y, z), position=(1.0, 2.0, 3.0), fov=0.8, image_width=600, image_height=400, aspect=1.5
     )
-    view = PinholeView.of_page(camera)
-    assert np.allclose(view.ahead, [0, 1, 0]) and np.allclose(view.up, [0, 0, 1])
+    view = PinholeView.from_page(camera)
+    assert np.allclose(view.forward, [0, 1, 0]) and np.allclose(view.up, [0, 0, 1])
     assert view.aspect == 1.5 and view.fov == 0.8 and np.allclose(view.origin, [1, 2, 3])
 
 
 def test02_rays_are_those_of_the_same_mitsuba_sensor(rgb):
-    view = PinholeView.of((1, 2, 3), (4, 3, 1), (0, 0, 1), 0.9, 1.5)
-    sensor = rgb.load_dict(view.camera(30).to_dict())
-    height = view.height(30)
+    view = PinholeView.look_at((1, 2, 3), (4, 3, 1), (0, 0, 1), 0.9, 1.5)
+    sensor = rgb.load_dict(view.to_camera(30).to_dict())
+    height = view.picture_height(30)
     assert height == 20
     columns, rows = np.meshgrid((np.arange(30) + 0.5) / 30, (np.arange(20) + 0.5) / 20)
     at = rgb.Point2f(columns.ravel().astype(np.float32), rows.ravel().astype(np.float32))
     ray, _ = sensor.sample_ray(0.0, 0.5, at, rgb.Point2f(0.5))
-    own = view.rays(30, height, np.full((600, 2), 0.5))
+    own = view.ray_directions(30, height, np.full((600, 2), 0.5))
     assert np.allclose(own, np.array(ray.d).T, atol=1e-5)
 
 
 def test03_a_sensor_and_back(rgb):
-    view = PinholeView.of((1, 2, 3), (4, 3, 1), (0, 0, 1), 0.9, 1.5)
-    found = PinholeView.of_sensor(rgb.load_dict(view.camera(300).to_dict()))
-    for name in ("origin", "ahead", "up", "fov", "aspect"):
+    view = PinholeView.look_at((1, 2, 3), (4, 3, 1), (0, 0, 1), 0.9, 1.5)
+    found = PinholeView.from_sensor(rgb.load_dict(view.to_camera(300).to_dict()))
+    for name in ("origin", "forward", "up", "fov", "aspect"):
         assert np.allclose(getattr(found, name), getattr(view, name), atol=1e-5), name
-    assert math.isclose(view.across, math.degrees(2 * math.atan(math.tan(0.45) * 1.5)))
+    assert math.isclose(view.fov_x_degrees, math.degrees(2 * math.atan(math.tan(0.45) * 1.5)))
 
 
 @pytest.mark.parametrize("up", [(0, 0, 1), (0, 0, -1)])
 def test04_straight_down_there_is_an_up_all_the_same(up):
-    view = PinholeView.of((0, 0, 5), (0, 0, 0), up, 0.9, 1.0)
-    assert math.isclose(np.linalg.norm(view.up), 1) and abs(view.up @ view.ahead) < 1e-9
+    view = PinholeView.look_at((0, 0, 5), (0, 0, 0), up, 0.9, 1.0)
+    assert math.isclose(np.linalg.norm(view.up), 1) and abs(view.up @ view.forward) < 1e-9
 
 
 def test05_a_heading_is_level():
     for ahead in ((1, 2, -0.7), (0, 0, -1), (0, 0, 1)):
-        turn = heading_of(np.array(ahead, float) / np.linalg.norm(ahead), np.array([0.0, 0, 1]))
+        turn = make_heading(np.array(ahead, float) / np.linalg.norm(ahead), np.array([0.0, 0, 1]))
         assert np.allclose(turn.T @ turn, np.eye(3)) and np.linalg.det(turn) == pytest.approx(1)
         assert np.allclose(turn[:, 2], [0, 0, 1])

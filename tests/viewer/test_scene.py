@@ -10,23 +10,23 @@ from nerg_mi.errors import NergError
 from nerg_mi.transport.geometry import Ceiling
 from nerg_mi.viewer.page import Page
 from nerg_mi.viewer.points import BandPace, PinholeView, refine
-from nerg_mi.viewer.scene import PeoplePanel, Shown, copied
-from nerg_mi.viewer.serve import viewer
+from nerg_mi.viewer.scene import ParticipantsPanel, ViewSettings, copy_scene
+from nerg_mi.viewer.serve import open_viewer
 from nerg_mi.workflows.scene_commands import ViewOptions
 from tests.viewer.browser import require
 
 # ---- A copied scene renders as what was viewed ----
 
-VIEW = PinholeView.of((6.9, 3.0, 2.0), (4.8, 4.2, 1.0), (0, 0, 1), 0.9, 1.5)
+VIEW = PinholeView.look_at((6.9, 3.0, 2.0), (4.8, 4.2, 1.0), (0, 0, 1), 0.9, 1.5)
 EYE = np.array([4.6, 3.1, 1.6])
 
 
 @pytest.mark.nightly
 def test01_pictures_are_alike(store, tmp_path):
-    shown = Shown(VIEW, EYE, ("depth", "opacity", "gaze"), 96, 16, 0.05)
+    shown = ViewSettings(VIEW, EYE, ("depth", "opacity", "gaze"), 96, 16, 0.05)
     path = tmp_path / "elsewhere" / "view.xml"
     path.parent.mkdir()
-    path.write_text(copied(store, shown))
+    path.write_text(copy_scene(store, shown))
     copy = nerg.Scene.load(path)
     rendered = nerg.render(copy, quantities=["color", "gaze", "depth"])
     assert np.allclose(copy.observer, EYE) and rendered.color.shape == (1, 64, 96, 3)
@@ -38,33 +38,33 @@ def test01_pictures_are_alike(store, tmp_path):
         assert off < 0.05, name
     # And not of any view: another one is off by far.
     other = nerg.render(
-        copy, quantities=["color"], camera=PinholeView.of((4, 3, 2), (2, 3, 1), (0, 0, 1), 0.9, 1.5).camera(96)
+        copy, quantities=["color"], camera=PinholeView.look_at((4, 3, 2), (2, 3, 1), (0, 0, 1), 0.9, 1.5).to_camera(96)
     )
     assert np.abs(other.color[0] - viewed["color"]).mean() / viewed["color"].mean() > 0.2
 
 
 def test02_the_settings_are_those_that_were_viewed(store, tmp_path):
     path = tmp_path / "view.xml"
-    path.write_text(copied(store, Shown(VIEW, EYE, ("depth",), 48, 3, 0.25)))
+    path.write_text(copy_scene(store, ViewSettings(VIEW, EYE, ("depth",), 48, 3, 0.25)))
     scene = nerg.Scene.load(path, view_camera="1, 2, 1.5", view_observer="2, 2, 1.7")
     assert float(np.ravel(np.array(scene.integrator.falloff))[0]) == pytest.approx(0.25)
     assert scene.resolve_sensor(0).sampler().sample_count() == 3 and len(scene.mitsuba.sensors()) == 4
     assert np.allclose(scene.observer, [2, 2, 1.7])
-    assert np.allclose(PinholeView.of_sensor(scene.resolve_sensor(0)).origin, [1, 2, 1.5])
+    assert np.allclose(PinholeView.from_sensor(scene.resolve_sensor(0)).origin, [1, 2, 1.5])
 
 
 def test03_shapes_and_no_observer(room, tmp_path):
     path = tmp_path / "view.xml"
-    path.write_text(copied(room, Shown(VIEW, None, ("depth", "visibility"), 48, 1, 0.0)))
+    path.write_text(copy_scene(room, ViewSettings(VIEW, None, ("depth", "visibility"), 48, 1, 0.0)))
     scene = nerg.Scene.load(path)
     assert len(scene.mitsuba.shapes()) == 2 and np.allclose(scene.observer, [0, 0, 0.5])
 
 
 @pytest.mark.parametrize("up", [(0, 0, 1), (0.1, -0.2, 2)])
 def test04_what_is_cut_off_from_above(room, tmp_path, up):
-    view, up = PinholeView.of((1.5, 0, 5), (1.5, 0.01, 0), (0, 0, 1), 0.3, 1.0), np.array(up, float)
+    view, up = PinholeView.look_at((1.5, 0, 5), (1.5, 0.01, 0), (0, 0, 1), 0.3, 1.0), np.array(up, float)
     path = tmp_path / "view.xml"
-    path.write_text(copied(room, Shown(view, None, ("depth",), 32, 1, 0.0, (0.5, up))))
+    path.write_text(copy_scene(room, ViewSettings(view, None, ("depth",), 32, 1, 0.0, (0.5, up))))
     rendered = nerg.render(nerg.Scene.load(path), quantities=["depth"]).depth[0]
     steps = refine(nerg.Scene.load(room), view, None, ["depth"], 32, 1, BandPace(), ceiling=Ceiling(0.5, up))
     viewed = [p for p in steps if p is not None][-1].values["depth"]
@@ -73,7 +73,7 @@ def test04_what_is_cut_off_from_above(room, tmp_path, up):
     assert (np.abs(rendered - viewed) < 0.03).mean() > 0.8 and rendered[16, 16] == pytest.approx(5, abs=0.02)
     # A copy of the copy that cuts nothing off shows the top again.
     again = tmp_path / "again.xml"
-    again.write_text(copied(path, Shown(view, None, ("depth",), 32, 1, 0.0)))
+    again.write_text(copy_scene(path, ViewSettings(view, None, ("depth",), 32, 1, 0.0)))
     assert nerg.render(nerg.Scene.load(again), quantities=["depth"]).depth[0, 16, 16] == pytest.approx(4, abs=0.02)
 
 
@@ -81,7 +81,7 @@ def test05_without_an_integrator_there_is_nothing_to_copy(tmp_path, rgb):
     path = tmp_path / "a.xml"
     path.write_text('<scene version="3.0.0"><shape type="sphere"/></scene>')
     with pytest.raises(NergError, match="0 integrators"):
-        copied(path, Shown(VIEW, None, ("depth",), 48, 1, 0.0))
+        copy_scene(path, ViewSettings(VIEW, None, ("depth",), 48, 1, 0.0))
 
 
 # ---- People in a page: their paths, a moment, and whose eye the observer follows ----
@@ -94,36 +94,36 @@ def running(room, tmp_path):
     origin = np.stack([-2 + 0 * t, -1 + 0.5 * t, np.full(400, 1.6)], axis=1)
     rays = nerg.Rays(t, np.zeros(400, int), ("Ada",), origin, np.tile([0.0, 1, 0], (400, 1)), np.ones(400))
     rays.save(tmp_path / "rays.npz")
-    with viewer([room, tmp_path / "rays.npz"], ViewOptions(port=0)) as found:
+    with open_viewer([room, tmp_path / "rays.npz"], ViewOptions(port=0)) as found:
         yield found
 
 
 def test02_the_observer_follows_somebody(running):
     page: Page = running.page
-    people = PeoplePanel(page, page.session.tracks)
+    people = ParticipantsPanel(page, page.session.tracks)
     # Paths of all are drawn where they are wanted: many people's hide the place.
-    assert len(people._shown) == 2 and people._paths is None
-    people._drawn.value = True
-    people._changed()
-    assert people._paths is not None
+    assert len(people._pose_handles) == 2 and people._path_handle is None
+    people._show_paths.value = True
+    people._draw_all()
+    assert people._path_handle is not None
     people._time.value = 2.0
-    people._eye.value = "Ada"
-    people._moment()
+    people._followed.value = "Ada"
+    people._draw_poses()
     assert np.allclose(page.session.observer, [-2, 0, 1.6], atol=0.03)
     assert np.allclose(page.session.heading[:, 0], [0, 1, 0], atol=1e-6)
-    people._rays.value = people._probes.value = True
-    people._changed()
+    people._rays_checkbox.value = people._probes_checkbox.value = True
+    people._draw_all()
     page.session.worker.wait_idle(60)
-    lines, probes = people._recorded["rays"].points, people._recorded["probes"].points
+    lines, probes = people._recording_handles["rays"].points, people._recording_handles["probes"].points
     # The room's end is ahead of her, which the integrator knows.
-    assert lines.shape == (400, 2, 3) and np.allclose(lines[:, 0], page.session.tracks.at, atol=1e-5)
+    assert lines.shape == (400, 2, 3) and np.allclose(lines[:, 0], page.session.tracks.origins, atol=1e-5)
     seen = nerg.trace(page.session.scene, lines[:, 0], [0.0, 1, 0], ["depth"]).depth
     assert np.allclose(lines[:, 1, 1] - lines[:, 0, 1], np.where(np.isfinite(seen) & (seen > 0), seen, 1), atol=1e-4)
     assert len(probes) and (np.abs(probes[:, 0] + 2) < 1e-3).all() and page.problem == ""
-    people._rays.value = people._probes.value = False
-    people._changed()
+    people._rays_checkbox.value = people._probes_checkbox.value = False
+    people._draw_all()
     page.session.worker.wait_idle(60)
-    assert not people._recorded
-    people._drawn.value = False
-    people._changed()
-    assert people._paths is None
+    assert not people._recording_handles
+    people._show_paths.value = False
+    people._draw_all()
+    assert people._path_handle is None

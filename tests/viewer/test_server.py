@@ -14,9 +14,9 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.viewer import serve
 from nerg_mi.viewer.page import BrowserWindow
-from nerg_mi.viewer.points import LEVELS
-from nerg_mi.viewer.serve import view_files, viewer
-from nerg_mi.viewer.server import CLIENTS, MESSAGE_BYTES, Guard, is_loopback, new_token, start_server
+from nerg_mi.viewer.points import NUM_LEVELS
+from nerg_mi.viewer.serve import open_viewer, view_files
+from nerg_mi.viewer.server import MAX_CLIENTS, MAX_MESSAGE_BYTES, RequestGuard, is_loopback, make_token, start_server
 from nerg_mi.workflows.view import ViewOptions
 from tests.viewer import browser
 from tests.viewer.browser import require
@@ -24,11 +24,11 @@ from tests.workflows.recorder import Recorder
 
 # ---- Who is refused: other names, other sites, and whoever has no token ----
 
-LOCAL = Guard("127.0.0.1")
+LOCAL = RequestGuard("127.0.0.1")
 
 
 def status(guard, path="/", port=8080, clients=0, **headers):
-    found = guard.refusal(headers, path, port, clients)
+    found = guard.check(headers, path, port, clients)
     return 200 if found is None else found.status
 
 
@@ -86,7 +86,7 @@ def test05_the_page_itself_is_let_in():
 
 
 def test06_a_token_is_asked_for_elsewhere():
-    guard = Guard("0.0.0.0", "a-token")
+    guard = RequestGuard("0.0.0.0", "a-token")
     assert status(guard, Host="192.168.1.7:8080") == 403
     assert status(guard, "/?token=wrong", Host="192.168.1.7:8080") == 403
     assert status(guard, "/?token=", Host="192.168.1.7:8080") == 403
@@ -97,12 +97,12 @@ def test06_a_token_is_asked_for_elsewhere():
     # Right as it is, it opens no door to another site, nor by a name that leads here.
     assert status(guard, "/?token=a-token", Host="192.168.1.7:8080", Origin="http://evil.example") == 403
     assert status(guard, "/?token=a-token", Host="evil.example") == 403
-    assert status(Guard("0.0.0.0", "a-token", ("lab",)), "/?token=a-token", Host="lab:8080") == 200
+    assert status(RequestGuard("0.0.0.0", "a-token", ("lab",)), "/?token=a-token", Host="lab:8080") == 200
     assert "a-token" not in repr(guard)
 
 
 def test07_the_browser_keeps_the_token_and_stays_here():
-    guard = Guard("0.0.0.0", "a-token")
+    guard = RequestGuard("0.0.0.0", "a-token")
     headers = guard.response_headers("/?token=a-token", "192.168.1.7:8080", 8080)
     assert headers["Set-Cookie"].startswith("nerg_view_8080=a-token; HttpOnly; SameSite=Strict")
     assert "ws://192.168.1.7:8080" in headers["Content-Security-Policy"]
@@ -113,15 +113,15 @@ def test07_the_browser_keeps_the_token_and_stays_here():
 
 def test08_so_many_pages_and_no_more():
     open_one = dict(Host="localhost:8080", Upgrade="WebSocket")
-    assert status(LOCAL, clients=CLIENTS - 1, **open_one) == 200
-    assert status(LOCAL, clients=CLIENTS, **open_one) == 503
-    assert status(LOCAL, clients=CLIENTS, Host="localhost:8080") == 200
+    assert status(LOCAL, clients=MAX_CLIENTS - 1, **open_one) == 200
+    assert status(LOCAL, clients=MAX_CLIENTS, **open_one) == 503
+    assert status(LOCAL, clients=MAX_CLIENTS, Host="localhost:8080") == 200
 
 
 def test09_loopback():
     assert all(map(is_loopback, ["127.0.0.1", "localhost", "::1", "127.1.2.3", "[::1]"]))
     assert not any(map(is_loopback, ["0.0.0.0", "::", "192.168.1.7", "example.org", "localhost.example.org"]))
-    assert len({new_token() for _ in range(8)}) == 8 and len(new_token()) == 32
+    assert len({make_token() for _ in range(8)}) == 8 and len(make_token()) == 32
 
 
 # ---- A running server refuses what its guard refuses, over HTTP and before a websocket opens ----
@@ -141,7 +141,7 @@ def viser():
 
 @pytest.fixture(scope="module")
 def local(viser):
-    server = start_server(Guard("127.0.0.1"), 0, "test")
+    server = start_server(RequestGuard("127.0.0.1"), 0, "test")
     yield server
     server.stop()
 
@@ -205,7 +205,7 @@ def test03_two_headers_of_a_kind_are_refused(local, lines):
 
 
 def test04_a_token_where_others_reach_it(viser):
-    server = start_server(Guard("0.0.0.0", "secret"), 0, "test")
+    server = start_server(RequestGuard("0.0.0.0", "secret"), 0, "test")
     try:
         host = f"127.0.0.1:{server.get_port()}"
         assert ask(server, Host=host)[0] == 403 and opening(server) == 403
@@ -227,7 +227,7 @@ def test05_messages_are_capped(local, viser):
     address = f"ws://127.0.0.1:{local.get_port()}"
     with connect(address, subprotocols=[f"viser-v{viser.__version__}"], max_size=None, compression=None) as page:
         with pytest.raises(ConnectionClosed) as closed:
-            page.send(bytes(MESSAGE_BYTES + 1))
+            page.send(bytes(MAX_MESSAGE_BYTES + 1))
             while True:
                 page.recv(timeout=10)
         assert closed.value.rcvd is not None and closed.value.rcvd.code == 1009
@@ -245,7 +245,7 @@ def test06_no_link_is_shared(local, monkeypatch):
 
 def test07_a_port_that_is_taken_is_told(local):
     with pytest.raises(NergError, match="choose another with --port"):
-        start_server(Guard("127.0.0.1"), local.get_port(), "test")
+        start_server(RequestGuard("127.0.0.1"), local.get_port(), "test")
 
 
 def test08_a_viser_that_serves_otherwise_is_not_used(viser, monkeypatch):
@@ -254,10 +254,10 @@ def test08_a_viser_that_serves_otherwise_is_not_used(viser, monkeypatch):
     import nerg_mi.viewer.server as module
 
     stopped = []
-    monkeypatch.setattr(module, "_guarding", lambda guard: contextlib.nullcontext([]))
+    monkeypatch.setattr(module, "_guard_websockets", lambda guard: contextlib.nullcontext([]))
     monkeypatch.setattr(viser.ViserServer, "stop", lambda self: stopped.append(self._websock_server.stop()))
     with pytest.raises(NergError, match="cannot be guarded"):
-        start_server(Guard("127.0.0.1"), 0, "test")
+        start_server(RequestGuard("127.0.0.1"), 0, "test")
     assert stopped
 
 
@@ -266,7 +266,7 @@ def test09_without_the_extra_a_sentence(monkeypatch):
 
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(NergError, match=r'pip install "nerg-mi\[viewer\]"'):
-        start_server(Guard("127.0.0.1"), 0, "test")
+        start_server(RequestGuard("127.0.0.1"), 0, "test")
 
 
 # ---- A viewer from files to an address ----
@@ -286,7 +286,7 @@ def answer_of(address: str) -> int:
 
 @pytest.mark.usefixtures("_viser")
 def test01_an_address_that_answers_for_as_long_as_the_block(room):
-    with viewer([room], ViewOptions(port=0)) as running:
+    with open_viewer([room], ViewOptions(port=0)) as running:
         assert answer_of(running.address) == 200 and urlsplit(running.address).hostname == "127.0.0.1"
         address = running.address
     with pytest.raises(ConnectionError):
@@ -295,19 +295,19 @@ def test01_an_address_that_answers_for_as_long_as_the_block(room):
 
 @pytest.mark.usefixtures("_viser")
 def test02_elsewhere_there_is_a_token(room):
-    with viewer([room], ViewOptions(host="0.0.0.0", port=0)) as running:
+    with open_viewer([room], ViewOptions(host="0.0.0.0", port=0)) as running:
         assert answer_of(running.address) == 200
         assert answer_of(running.address.partition("?")[0]) == 403
 
 
 @pytest.mark.usefixtures("_viser")
 def test03_a_moved_observer_is_seen_by_all(room):
-    with viewer([room], ViewOptions(port=0)) as running:
+    with open_viewer([room], ViewOptions(port=0)) as running:
         page, session = running.page, running.page.session
         page.place_observer(np.array([3.0, 0, 0.5]), np.eye(3))
         assert np.allclose(page._observer.position, [3, 0, 0.5]) and np.allclose(page._observer.wxyz, [1, 0, 0, 0])
         end = time.monotonic() + 60
-        while session.baked_for is None or not np.array_equal(session.baked_for, session.observer):
+        while session.finished_observer is None or not np.array_equal(session.finished_observer, session.observer):
             assert time.monotonic() < end
             time.sleep(0.05)
         assert page.problem == ""
@@ -331,7 +331,7 @@ def test04_until_ctrl_c(room, monkeypatch):
 @pytest.mark.usefixtures("_viser")
 def test05_files_that_are_not_there(tmp_path):
     with pytest.raises(NergError, match="no file"):
-        with viewer([tmp_path / "a.xml"], ViewOptions(port=0)):
+        with open_viewer([tmp_path / "a.xml"], ViewOptions(port=0)):
             pass
 
 
@@ -346,38 +346,38 @@ def test01_points_follow_the_pace(seconds, at_rest, change):
     window = BrowserWindow(None, None)
     before = window.level
     for _ in range(20):
-        window.learn_pace(seconds)
+        window.record_frame(seconds)
     # The mouse rests now and then, and the page was left for a while.
     for pause in (0.4, 0.9, 60.0):
-        window.learn_pace(pause)
-    assert window.level_for_pace(at_rest) == before + change
+        window.record_frame(pause)
+    assert window.choose_level(at_rest) == before + change
 
 
 def test02_a_few_frames_say_nothing_and_levels_have_an_end():
     window = BrowserWindow(None, None)
-    window.learn_pace(0.9)
-    assert window.level_for_pace(True) == window.level
-    for pace, end in ((0.5, LEVELS - 1), (0.01, 0)):
-        window.frames[:] = [pace] * 20
-        for _ in range(2 * LEVELS):
-            window.level = window.level_for_pace(True)
+    window.record_frame(0.9)
+    assert window.choose_level(True) == window.level
+    for pace, end in ((0.5, NUM_LEVELS - 1), (0.01, 0)):
+        window.frame_times[:] = [pace] * 20
+        for _ in range(2 * NUM_LEVELS):
+            window.level = window.choose_level(True)
         assert window.level == end
 
 
 def test03_slow_frames_are_no_rest():
     window = BrowserWindow(None, None)
-    assert window.rest == pytest.approx(0.12)
+    assert window.rest_seconds == pytest.approx(0.12)
     for _ in range(10):
-        window.learn_pace(0.02)
-    assert window.rest == pytest.approx(0.12)
-    window.learn_pace(0.9)
-    assert window.rest == pytest.approx(0.12)
+        window.record_frame(0.02)
+    assert window.rest_seconds == pytest.approx(0.12)
+    window.record_frame(0.9)
+    assert window.rest_seconds == pytest.approx(0.12)
     for _ in range(8):
-        window.learn_pace(0.2)
-    assert window.rest == pytest.approx(0.6)
+        window.record_frame(0.2)
+    assert window.rest_seconds == pytest.approx(0.6)
     for _ in range(10):
-        window.learn_pace(0.9)
-    assert window.rest == pytest.approx(0.8)
+        window.record_frame(0.9)
+    assert window.rest_seconds == pytest.approx(0.8)
 
 
 # ---- What is missing skips a test, or fails it where that was asked for ----

@@ -16,9 +16,9 @@ from nerg_mi.maths.geometry import Similarity
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.nested_scene import replace_gaze
 from nerg_mi.viewer import session as module
-from nerg_mi.viewer.layers import layer_of
+from nerg_mi.viewer.layers import get_layer
 from nerg_mi.viewer.page import Page
-from nerg_mi.viewer.session import ALL, GAP, Listener, Session, Tracks, Worker
+from nerg_mi.viewer.session import ALL_PARTICIPANTS, MAX_GAP, Listener, Session, Tracks, Worker
 from nerg_mi.workflows.scene_commands import ViewOptions
 from nerg_mi.workflows.view import make_viewer_scene
 
@@ -71,7 +71,7 @@ def session_of(tmp_path):
 
 def settle(session):
     assert session.worker.wait_idle(120)
-    while not (session.follow_observer() and session.follow_shares()):
+    while not (session.update_points() and session.update_shares()):
         assert session.worker.wait_idle(120)
         assert not session.listener.errors
     assert not session.listener.errors
@@ -81,28 +81,37 @@ def test01_points_and_what_is_seen_of_them(session_of, room):
     session = session_of(room)
     settle(session)
     assert session.listener.proxies == 2 and session.listener.baked >= 1
-    hidden = session.baked["visibility"] < 0.5
+    hidden = session.point_values["visibility"] < 0.5
     behind = (session.proxy.points[:, 0] > 2.2) & (np.abs(session.proxy.points[:, 1]) < 0.2)
     assert hidden[behind].all() and 0.5 < (~hidden).mean() < 1
-    before = session.baked["visibility"]
+    before = session.point_values["visibility"]
     session.place_observer(np.array([3.0, 0, 0.5]))
-    assert not session.follow_observer()
+    assert not session.update_points()
     settle(session)
     assert (
-        not np.array_equal(before, session.baked["visibility"])
-        and not (session.baked["visibility"] < 0.5)[behind].any()
+        not np.array_equal(before, session.point_values["visibility"])
+        and not (session.point_values["visibility"] < 0.5)[behind].any()
     )
 
 
 def test01_what_is_out_of_date_is_known(session_of, room, gaze_fields):
     session = session_of(room, gaze_fields[0])
-    assert session.stale_points == "the points do not show gaze" and session.stale_shares and not session.has_scale
-    assert "points on surfaces" in session.computing
+    assert (
+        session.stale_points_reason == "the points do not show gaze"
+        and session.are_shares_stale
+        and not session.has_scale
+    )
+    assert "points on surfaces" in session.running_tasks
     settle(session)
-    assert session.stale_points == "" and not session.stale_shares and session.has_scale and session.computing == []
+    assert (
+        session.stale_points_reason == ""
+        and not session.are_shares_stale
+        and session.has_scale
+        and session.running_tasks == []
+    )
     fresh = session.points().colors.astype(int)
     session.place_observer(np.array([3.0, 0, 0.5]))
-    assert session.stale_points == "gaze of an earlier observer" and session.stale_shares
+    assert session.stale_points_reason == "gaze of an earlier observer" and session.are_shares_stale
     grey = session.points().colors.astype(int)
     assert np.ptp(grey, axis=1).max() == 0 < np.ptp(fresh, axis=1).max()
     started, finish = threading.Event(), threading.Event()
@@ -114,23 +123,23 @@ def test01_what_is_out_of_date_is_known(session_of, room, gaze_fields):
 
     session.worker.submit("film", 0, wait())
     assert started.wait(60)
-    session.follow_observer()
-    session.follow_shares()
-    assert session.computing == ["gaze on the points", "shares of attention", "video"]
+    session.update_points()
+    session.update_shares()
+    assert session.running_tasks == ["gaze on the points", "shares of attention", "video"]
     finish.set()
     settle(session)
-    assert session.stale_points == "" and not session.stale_shares
+    assert session.stale_points_reason == "" and not session.are_shares_stale
     # Colours under the scale of a depth are no depth.
-    session.set_shade(layer=layer_of("depth"))
-    assert session.stale_points == "the points do not show depth" and not session.has_scale
-    session.set_shade(layer=layer_of("color"))
-    assert session.stale_points == "" and session.has_scale
-    session.set_shade(layer=layer_of("gaze"))
+    session.set_display(layer=get_layer("depth"))
+    assert session.stale_points_reason == "the points do not show depth" and not session.has_scale
+    session.set_display(layer=get_layer("color"))
+    assert session.stale_points_reason == "" and session.has_scale
+    session.set_display(layer=get_layer("gaze"))
     session.set_falloff(0.2)
-    assert session.stale_points == "gaze of earlier settings" and session.stale_shares
+    assert session.stale_points_reason == "gaze of earlier settings" and session.are_shares_stale
     settle(session)
     session.regions = [Region.create("a", (1, -1, 0), (2, 1, 1))]
-    assert session.stale_points == "" and session.stale_shares
+    assert session.stale_points_reason == "" and session.are_shares_stale
 
 
 @pytest.mark.parametrize(
@@ -156,29 +165,29 @@ def test02_a_picture_is_replaced_by_the_next(session_of, room):
     session = session_of(room, spp=4)
     settle(session)
     first, second = [], []
-    session.picture("a", session.home, lambda p, c: first.append(p), 400, 256)
-    session.picture("a", session.home, lambda p, c: second.append((p, c)), 48, 4)
+    session.refine_picture("a", session.home_view, lambda p, c: first.append(p), 400, 256)
+    session.refine_picture("a", session.home_view, lambda p, c: second.append((p, c)), 48, 4)
     settle(session)
-    assert not first or not first[-1].whole
+    assert not first or not first[-1].is_final
     picture, colors = second[-1]
-    assert picture.whole and picture.samples == 4 and colors.shape == (32, 48, 3) and colors.dtype == np.uint8
-    session.picture("a", session.home, lambda p, c: first.append(p), 400, 256)
+    assert picture.is_final and picture.samples == 4 and colors.shape == (32, 48, 3) and colors.dtype == np.uint8
+    session.refine_picture("a", session.home_view, lambda p, c: first.append(p), 400, 256)
     session.cancel("a")
-    assert session.worker.wait_idle(60) and not any(p.whole for p in first)
+    assert session.worker.wait_idle(60) and not any(p.is_final for p in first)
 
 
 def test03_layers_have_ranges_of_their_own(session_of, room):
     cut = '<float name="ceiling" value="9"/><vector name="up" value="0, 0.1, 1"/><string name="aovs"'
     room.write_text(room.read_text().replace('<string name="aovs"', cut))
     session = session_of(room)
-    assert session.ceiling == 9 and np.allclose(session.cut_up, np.array([0, 0.1, 1]) / np.hypot(0.1, 1))
+    assert session.ceiling == 9 and np.allclose(session.ceiling_up, np.array([0, 0.1, 1]) / np.hypot(0.1, 1))
     settle(session)
-    session.set_shade(layer=layer_of("depth"))
-    session.picture("a", session.home, lambda p, c: None, 48, 1)
+    session.set_display(layer=get_layer("depth"))
+    session.refine_picture("a", session.home_view, lambda p, c: None, 48, 1)
     settle(session)
     scale = session.scale()
     assert 0.5 < scale.low < 2 and 2 < scale.high < 10
-    session.set_shade(fixed=(1.0, 4.0))
+    session.set_display(limits=(1.0, 4.0))
     assert (session.scale().low, session.scale().high) == (1.0, 4.0)
     session.set_falloff(0.25)
     assert float(np.ravel(np.array(session.scene.integrator.falloff))[0]) == pytest.approx(0.25)
@@ -208,9 +217,9 @@ def test04_shares_are_those_of_the_library(session_of, store):
     assert 0 < len(session.points().points) < len(shown.points) and session.points().points[:, 2].max() <= 1.0
     session.ceiling = None
     counted = session.listener.shares
-    assert session.follow_shares() and session.listener.shares == counted
+    assert session.update_shares() and session.listener.shares == counted
     session.regions = session.regions[:1]
-    assert not session.follow_shares()
+    assert not session.update_shares()
     settle(session)
     assert set(session.shares) == {"drinks"}
 
@@ -218,9 +227,9 @@ def test04_shares_are_those_of_the_library(session_of, store):
 def test05_the_sphere_is_level_and_ahead_in_its_middle(session_of, room):
     session = session_of(room)
     settle(session)
-    session.set_shade(layer=layer_of("visibility"))
+    session.set_display(layer=get_layer("visibility"))
     shown = []
-    session.sphere(shown.append, 64)
+    session.render_panorama(shown.append, 64)
     settle(session)
     (sphere,) = shown
     assert sphere.shape == (32, 64, 3)
@@ -243,25 +252,30 @@ def test06_what_cannot_be_shown_is_told(session_of, room, tmp_path):
 
 def test07_variants_are_shown_in_turn(session_of, room, gaze_fields):
     session = session_of(room, *gaze_fields, observer=(0.5, 0.0, 1.0))
-    assert session.gaze_name == "emit_capture" and session.shade.layer.title == "gaze"
+    assert session.gaze_name == "emit_capture" and session.display.layer.title == "gaze"
     settle(session)
-    first, points, shared, falloff = session.baked["gaze"], session.proxy.points, dict(session.shares), session.falloff
+    first, points, shared, falloff = (
+        session.point_values["gaze"],
+        session.proxy.points,
+        dict(session.shares),
+        session.falloff,
+    )
     assert first.max() > 0 and shared
     session.set_falloff(0.25)
-    session.set_shade(layer=layer_of("capture"))
+    session.set_display(layer=get_layer("capture"))
     # Even while the gaze of the other is being computed.
-    session.follow_observer()
-    session.set_gaze("emit")
-    assert session.shade.layer.title == "gaze", "a layer that this one has not"
+    session.update_points()
+    session.select_gaze("emit")
+    assert session.display.layer.title == "gaze", "a layer that this one has not"
     assert float(np.ravel(np.array(session.scene.integrator.falloff))[0]) == pytest.approx(0.25)
     settle(session)
-    assert session.proxy.points is points and not np.allclose(session.baked["gaze"], first, rtol=0.1)
+    assert session.proxy.points is points and not np.allclose(session.point_values["gaze"], first, rtol=0.1)
     assert session.shares != shared
     # It is that of the file by itself.
-    session.set_gaze("emit_capture")
+    session.select_gaze("emit_capture")
     session.set_falloff(falloff)
     settle(session)
-    assert np.allclose(session.baked["gaze"], first, rtol=1e-4, atol=1e-6)
+    assert np.allclose(session.point_values["gaze"], first, rtol=1e-4, atol=1e-6)
 
 
 def test08_what_cannot_be_counted_is_told_once(session_of, room, gaze_fields, monkeypatch):
@@ -272,11 +286,11 @@ def test08_what_cannot_be_counted_is_told_once(session_of, room, gaze_fields, mo
     monkeypatch.setattr(module, "iter_attention_shares", refuse)
     session = session_of(room, gaze_fields[0])
     assert session.worker.wait_idle(120)
-    while not session.follow_shares():
+    while not session.update_shares():
         assert session.worker.wait_idle(120)
     assert [str(e) for e in session.listener.errors] == ["no"]
     session.place_observer(np.array([0.0, 1, 1]))
-    assert not session.follow_shares()
+    assert not session.update_shares()
 
 
 # ---- Shares of attention in steps: those of the library, whichever are counted together ----
@@ -299,8 +313,8 @@ def test01_areas_in_one_step_and_meshes_in_groups(scene, monkeypatch):
     assert [sorted(step) for step in steps] == [["left", "right"], sorted(shapes)]
     one = nerg.attention(scene, regions[0].corners, observers=AT[None]).share[0]
     assert steps[0]["left"] == pytest.approx(float(one), rel=0.03) and steps[0]["left"] > 0
-    monkeypatch.setattr(module, "FACES", 1)
-    assert list(module.shape_groups(scene, shapes)) == [[name] for name in shapes]
+    monkeypatch.setattr(module, "MAX_FACES_PER_STEP", 1)
+    assert list(module.group_shapes(scene, shapes)) == [[name] for name in shapes]
 
 
 def test02_without_areas_and_shapes_there_is_nothing(scene):
@@ -334,28 +348,28 @@ def test01_a_gap_ends_a_path():
 
 def test02_a_moment():
     tracks = walk()
-    assert tracks.times == (0.0, pytest.approx(9.9)) and tracks.people == ["Ada", "Ben"]
-    poses = {p.person: p for p in tracks.at_time(1.0)}
-    assert set(poses) == {"Ada", "Ben"} and np.allclose(poses["Ada"].at, [1, 0, 1.6], atol=1e-6)
-    assert np.allclose(poses["Ada"].ahead, [0, 1, 0])
-    assert [p.person for p in tracks.at_time(8.0)] == ["Ada"]
-    assert tracks.at_time(5.45 + 0 * GAP) == [] and tracks.at_time(99.0) == []
+    assert tracks.time_range == (0.0, pytest.approx(9.9)) and tracks.participants == ["Ada", "Ben"]
+    poses = {p.participant: p for p in tracks.poses_at(1.0)}
+    assert set(poses) == {"Ada", "Ben"} and np.allclose(poses["Ada"].position, [1, 0, 1.6], atol=1e-6)
+    assert np.allclose(poses["Ada"].direction, [0, 1, 0])
+    assert [p.participant for p in tracks.poses_at(8.0)] == ["Ada"]
+    assert tracks.poses_at(5.45 + 0 * MAX_GAP) == [] and tracks.poses_at(99.0) == []
 
 
 def test03_cohorts():
     tracks = walk()
-    assert tracks.groups == [ALL, "grown", "small"]
-    assert [p.person for p in tracks.at_time(1.0, "small")] == ["Ben"]
+    assert tracks.groups == [ALL_PARTICIPANTS, "grown", "small"]
+    assert [p.participant for p in tracks.poses_at(1.0, "small")] == ["Ben"]
     assert len(tracks.segments("small")[0]) == 19
-    assert walk(cohorts=False).groups == [ALL]
+    assert walk(cohorts=False).groups == [ALL_PARTICIPANTS]
 
 
 def test04_in_the_place():
     turn = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = 2 * turn, [10, 0, 0]
-    (ada,) = walk(Similarity(matrix)).at_time(8.0)
-    assert np.allclose(ada.at, [10, 16, 3.2], atol=1e-6) and np.allclose(ada.ahead, [-1, 0, 0], atol=1e-6)
+    (ada,) = walk(Similarity(matrix)).poses_at(8.0)
+    assert np.allclose(ada.position, [10, 16, 3.2], atol=1e-6) and np.allclose(ada.direction, [-1, 0, 0], atol=1e-6)
 
 
 # ---- The render thread: the most urgent first, and what is replaced is not gone on with ----
@@ -429,7 +443,7 @@ def test04_cancelled_tasks_end(worker, held):
     log, go_on = held("picture", 3, 100)
     worker.cancel("picture")
     go_on()
-    assert worker.wait_idle(10) and worker.idle
+    assert worker.wait_idle(10) and worker.is_idle
     assert worker.call(lambda: 7).result(10) == 7
     assert log == [("picture", 0)]
 
@@ -462,4 +476,4 @@ def test07_after_the_end_nothing_is_begun():
     worker = Worker(lambda error: None)
     worker.stop()
     worker.submit("late", 0, iter([1]))
-    assert worker.idle
+    assert worker.is_idle
