@@ -1,4 +1,4 @@
-"""What `import nerg_mi as nerg` offers: scenes, pictures, queries and trainings, as a notebook wants them.
+"""The public Python API behind `import nerg_mi as nerg`: scenes, images, queries and training.
 
-The names are those of `nerg_mi.__all__`; each is imported when it is first used.
+`nerg_mi.__all__` lists the public names; each is imported on first use.
 """

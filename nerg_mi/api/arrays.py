@@ -1,4 +1,4 @@
-"""Arrays that users give and get, and cameras."""
+"""Conversion and validation of arrays, labelled results, and the camera."""
 
 from __future__ import annotations
 
@@ -13,21 +13,39 @@ from nerg_mi.errors import NergError, sanitize
 from nerg_mi.maths.coordinates import check_coordinates
 from nerg_mi.ranges import MAX_COORDINATE, FIELDS_OF_VIEW, Range, check_number
 
-# ---- What comes in from NumPy, checked, and what goes out to it, labelled ----
+# ---- Input arrays and labelled results ----
 
 Floats: TypeAlias = NDArray[np.float32]
 
 
 def as_points(values: ArrayLike, name: str) -> Floats:
-    """``values`` as (N, 3) float32; one point (3,) is one row. Raises `NergError`, which calls it ``name``."""
+    """Convert points to an array (N, 3) of float32.
+
+    Parameters
+    ----------
+    values : array_like of shape (3,) or (N, 3)
+        One point or several, in scene units.
+    name : str
+        Name of the argument, for messages.
+
+    Returns
+    -------
+    ndarray of shape (N, 3), float32
+        The points.
+
+    Raises
+    ------
+    NergError
+        The values are not numbers, are not finite, are too large, or have another shape.
+    """
     try:
         array = np.asarray(values, np.float64)
     except OverflowError as error:
         raise NergError(
-            f"{name} must have coordinates from {-MAX_COORDINATE:g} to {MAX_COORDINATE:g}, and one is beyond"
+            f"{name} must have coordinates from {-MAX_COORDINATE:g} to {MAX_COORDINATE:g}, but one is out of range"
         ) from error
     except (TypeError, ValueError) as error:
-        raise NergError(f"{name} must be numbers x, y, z, or rows of them, got {sanitize(repr(values), 60)}") from error
+        raise NergError(f"{name} must be x, y, z or rows of these, got {sanitize(repr(values), 60)}") from error
     array = array[None] if array.shape == (3,) else array
     if array.ndim != 2 or array.shape[1] != 3 or len(array) == 0:
         raise NergError(f"{name} must have the shape (3,) or (N, 3), got {array.shape}")
@@ -36,24 +54,51 @@ def as_points(values: ArrayLike, name: str) -> Floats:
 
 
 def as_unit_vectors(values: ArrayLike, count: int, name: str) -> Floats:
-    """``values`` as ``count`` unit vectors (N, 3); one direction serves all. Raises `NergError`."""
+    """Convert directions to unit vectors.
+
+    Parameters
+    ----------
+    values : array_like of shape (3,) or (count, 3)
+        Directions of any length except zero; a single one is repeated.
+    count : int
+        Number of directions.
+    name : str
+        Name of the argument, for messages.
+
+    Returns
+    -------
+    ndarray of shape (count, 3), float32
+        Unit vectors.
+
+    Raises
+    ------
+    NergError
+        The number of directions is neither 1 nor ``count``, or a direction is zero.
+    """
     array = as_points(values, name).astype(np.float64)
     if len(array) not in (1, count):
-        raise NergError(f"{name} must be one or as many as the origins, {count}, got {len(array)}")
+        raise NergError(f"the number of {name} must be 1 or that of the origins ({count}), got {len(array)}")
     length = np.linalg.norm(array, axis=1, keepdims=True)
     if not np.all(length > 0):
-        raise NergError(f"{name} must not be zero, and row {int(np.flatnonzero(length == 0)[0])} is")
+        raise NergError(f"{name} must not be zero, but row {int(np.flatnonzero(length == 0)[0])} is")
     return np.ascontiguousarray(np.broadcast_to(array / length, (count, 3)), np.float32)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LabelledArrays:
-    """Arrays by name: ``result["gaze"]`` and ``result.gaze`` are the same array.
+    """Arrays by name: ``result["gaze"]`` and ``result.gaze`` return the same array.
 
-    ``values``: the arrays, of which the first axes are those that ``axes`` names and a last one, where there is one
-    more, the channels. ``observers`` (M, 3): the positions that the rows of the axis ``observer`` belong to; None where
-    every element has an observer of its own. ``names``: those of the arrays. An array that does not depend on the
-    observer is the same for all of them and cannot be written to.
+    Attributes
+    ----------
+    values : mapping of str to ndarray
+        The arrays. Their first axes are ``axes``; an additional last axis contains channels. An array that does not
+        depend on the observer is broadcast along the observer axis and is read-only.
+    axes : tuple of str
+        Names of the axes, such as ``observer``, ``row`` and ``column``.
+    observers : ndarray of shape (M, 3) or None
+        Positions along the axis ``observer``, in scene units. None: each element has its own observer.
+    names : tuple of str
+        Names of the arrays.
     """
 
     values: Mapping[str, Floats]
@@ -68,10 +113,12 @@ class LabelledArrays:
         try:
             return self.values[name]
         except KeyError:
-            raise KeyError(f'there is no "{name}" here, but {join_names(self.names)}; ask for it by quantities=') from None
+            raise KeyError(
+                f'the result has no "{name}", only {join_names(self.names)}; request it with quantities='
+            ) from None
 
     def __getattr__(self, name: str) -> Floats:
-        # Asked while an object is copied or unpickled, when there are no values yet.
+        # Copying and unpickling look up attributes before `values` exists.
         if name.startswith("_") or name == "values":
             raise AttributeError(name)
         try:
@@ -92,38 +139,55 @@ class LabelledArrays:
         return name in self.values
 
     def __repr__(self) -> str:
-        some = next(iter(self.values.values()))
-        size = ", ".join(f"{axis} {length}" for axis, length in zip(self.axes, some.shape))
+        first = next(iter(self.values.values()))
+        size = ", ".join(f"{axis} {length}" for axis, length in zip(self.axes, first.shape))
         width = max(map(len, self.names))
         lines = [f"  {name:<{width}}  {value.shape}, {value.dtype}" for name, value in self.values.items()]
         return "\n".join([f"{type(self).__name__}({size})", *lines])
 
 
 def broadcast_to_observers(value: Floats, observers: int) -> Floats:
-    """``value`` with an axis of ``observers`` in front, read-only, without a copy."""
+    """Broadcast ``value`` along a new first axis of length ``observers``; the result is a read-only view."""
     return np.broadcast_to(value, (observers, *value.shape))
 
 
 def join_names(names: Sequence[str]) -> str:
-    """Names for a sentence."""
+    """Join names with commas."""
     return ", ".join(names)
 
 
-# ---- A camera in a few numbers ----
+# ---- Camera ----
 
 MAX_PIXELS = 1 << 28
-"""A picture may have so many pixels, as for the command `nerg render`."""
+"""Maximum number of pixels of an image, as for `nerg render`."""
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera at ``origin`` that looks at ``target``.
+    """A pinhole camera.
 
-    Positions are in scene units (metres, as a rule), and so is nothing else: ``fov`` is the angle, in degrees, between
-    the left and the right border of the picture, ``up`` points to its upper border, ``width`` and ``height`` count
-    pixels. Pixels are squares whose colours and other values are plain means (a box filter). Raises `NergError` for
-    numbers of which no camera can be made.
+    Pixels are square and are averaged with a box filter.
 
+    Parameters
+    ----------
+    origin : sequence of float
+        Position (3,) in scene units.
+    target : sequence of float
+        Point (3,) in the centre of the image, in scene units.
+    up : sequence of float
+        Direction (3,) of the upper border of the image.
+    fov : float
+        Horizontal field of view in degrees.
+    width, height : int
+        Size of the image in pixels.
+
+    Raises
+    ------
+    NergError
+        A value is out of range, ``target`` equals ``origin``, or ``up`` is parallel to the viewing direction.
+
+    Examples
+    --------
     >>> import nerg_mi as nerg
     >>> nerg.Camera(origin=(7.4, 3.4, 2.2), target=(4.8, 4.2, 1.0), fov=78, width=48, height=32)
     Camera(origin=(7.4, 3.4, 2.2), target=(4.8, 4.2, 1.0), up=(0.0, 0.0, 1.0), fov=78, width=48, height=32)
@@ -141,11 +205,11 @@ class Camera:
             if len(as_points(value := getattr(self, name), f"{name} of a camera")) != 1 or np.ndim(value) != 1:
                 raise NergError(f"{name} of a camera must be x, y, z, got {value!r}")
             object.__setattr__(self, name, tuple(float(x) for x in value))
-        ahead = np.subtract(self.target, self.origin)
-        if not np.any(ahead):
-            raise NergError(f"a camera at {self.origin} cannot look at the same point; give it another target")
-        if np.linalg.norm(np.cross(ahead, self.up)) <= 1e-6 * np.linalg.norm(ahead) * np.linalg.norm(self.up):
-            raise NergError(f"a camera cannot look along its own up {self.up}; give it another up")
+        forward = np.subtract(self.target, self.origin)
+        if not np.any(forward):
+            raise NergError(f"the target of a camera must differ from its origin {self.origin}")
+        if np.linalg.norm(np.cross(forward, self.up)) <= 1e-6 * np.linalg.norm(forward) * np.linalg.norm(self.up):
+            raise NergError(f"the up direction {self.up} of a camera must not be parallel to its viewing direction")
         check_number(self.fov, FIELDS_OF_VIEW, "the fov of a camera")
         for name in ("width", "height"):
             check_number(getattr(self, name), Range(1, MAX_PIXELS), f"the {name} of a picture", is_integer=True)
@@ -153,14 +217,15 @@ class Camera:
             raise NergError(f"a picture has at most {MAX_PIXELS:,} pixels, got {self.width:,} x {self.height:,}")
 
     def to_dict(self, spp: int = 16) -> dict:
-        """The camera as Mitsuba takes it (`mi.load_dict`), with ``spp`` samples a pixel; a variant must be set."""
+        """Return the camera as a dict for `mi.load_dict`, with ``spp`` samples per pixel. A Mitsuba variant must be
+        active."""
         import mitsuba as mi
 
         return {
             "type": "perspective",
             "fov": float(self.fov),
             "fov_axis": "x",
-            # Positions in double precision until Mitsuba rounds them, as in scene files.
+            # In double precision until Mitsuba rounds, as in scene files.
             "to_world": mi.ScalarTransform4d().look_at(list(self.origin), list(self.target), list(self.up)),
             "sampler": {"type": "independent", "sample_count": int(spp)},
             "film": {

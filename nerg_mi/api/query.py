@@ -1,4 +1,4 @@
-"""Values of fields without pictures: along rays, at points, of observers, and attention on surfaces and boxes."""
+"""Queries: quantities along rays, at points, and the attention on surfaces and boxes."""
 
 from __future__ import annotations
 
@@ -25,14 +25,21 @@ from . import arrays
 from .arrays import Floats, LabelledArrays, broadcast_to_observers
 from .scene import COLOR, FilePath, Scene, activate_mitsuba, resolve_quantities, make_aov_context, load_mesh_child
 
-# ---- One observer of a scene: what they see of points, and the density of their gaze ----
+# ---- One observer of a scene ----
 
 
 class SceneObserver:
-    """The observer of ``scene`` at ``position`` (3,), in scene units.
+    """An observer in a scene.
 
-    The settings of the march, of depths and of visibility are those of the scene's integrator. What a normalised gaze
-    field has to know of the observer is computed once.
+    Ray marching, depth and visibility use the settings of the scene's integrator. Values that a normalised gaze field
+    needs for this observer are computed once.
+
+    Parameters
+    ----------
+    scene : Scene
+        The scene.
+    position : ndarray of shape (3,)
+        Position of the observer in scene units.
     """
 
     def __init__(self, scene: Scene, position: Floats):
@@ -41,7 +48,7 @@ class SceneObserver:
 
         self.scene, self.geometry, self.integrator = scene, scene.geometry, scene.integrator
         self.center: Any = mi.Point3f(position.tolist())
-        # A position that is a constant of the kernel would be compiled anew for every observer.
+        # A literal position would be compiled into the kernel, which would be recompiled for each observer.
         dr.make_opaque(self.center)
         self.gaze = None
         if scene.has_gaze:
@@ -49,14 +56,45 @@ class SceneObserver:
             self.gaze = i.gaze.for_observers([self.center], self.geometry, i.observer_settings, i.cache)
 
     def eval_gaze(self, p_od: Any, p_o: Any, r_o: Any, active: Any) -> Any:
-        """Gaze (Float, 1/sr) along the unit direction ``r_o``, in which the observer, who is at ``p_o`` in all lanes,
-        sees the surface ``p_od``; as `nerg_mi.probes.surface_attention` wants it."""
+        """Evaluate the gaze density.
+
+        The signature is that of `nerg_mi.probes.surface_attention`.
+
+        Parameters
+        ----------
+        p_od : Point3f
+            Point on the surface that the observer sees in direction ``r_o``.
+        p_o : Point3f
+            Position of the observer in all lanes.
+        r_o : Vector3f
+            Unit direction.
+        active : Bool
+            Mask.
+
+        Returns
+        -------
+        Float
+            Gaze density in 1/sr.
+        """
         if self.gaze is None:
             raise ValueError("a scene without a gaze field has no gaze")
         return self.gaze.evaluate(p_od, p_o, r_o, active)[0]
 
-    def observe(self, p: Any, with_gaze: bool) -> dict[str, Any]:
-        """Of points ``p`` (Point3f): ``distance``, ``depth`` and ``visibility``, and ``gaze`` where wanted (Floats)."""
+    def observe(self, points: Any, with_gaze: bool) -> dict[str, Any]:
+        """Compute what the observer sees of points.
+
+        Parameters
+        ----------
+        points : Point3f
+            Points in scene units.
+        with_gaze : bool
+            Whether to compute the gaze.
+
+        Returns
+        -------
+        dict of str to Float
+            ``distance``, ``depth``, ``visibility`` and, if requested, ``gaze`` (1/sr).
+        """
         import drjit as dr
 
         mi = variant_types()
@@ -64,38 +102,43 @@ class SceneObserver:
         from nerg_mi.transport.occlusion import trace_from_observer
 
         i = self.integrator
-        distance, r_o = distance_and_direction(self.center, p)
-        active = dr.full(mi.Bool, True, dr.width(p))
+        distance, r_o = distance_and_direction(self.center, points)
+        active = dr.full(mi.Bool, True, dr.width(points))
         ray = mi.Ray3f(self.center, r_o)
-        sight = trace_from_observer(self.geometry, ray, p, self.center, 0, active, i.falloff, i.observer_settings, cache=i.cache)
-        values = {"distance": distance, "depth": sight.depth, "visibility": sight.visibility}
+        hit = trace_from_observer(
+            self.geometry, ray, points, self.center, 0, active, i.falloff, i.observer_settings, cache=i.cache
+        )
+        values = {"distance": distance, "depth": hit.depth, "visibility": hit.visibility}
         if with_gaze:
-            seen = active & (sight.visibility > 0)
-            p_o = self.center + dr.zeros(mi.Point3f, dr.width(p))
-            gaze = self.eval_gaze(sight.p_od, p_o, r_o, seen)
-            values["gaze"] = dr.select(seen, gaze * sight.visibility, 0)
+            is_visible = active & (hit.visibility > 0)
+            p_o = self.center + dr.zeros(mi.Point3f, dr.width(points))
+            gaze = self.eval_gaze(hit.p_od, p_o, r_o, is_visible)
+            values["gaze"] = dr.select(is_visible, gaze * hit.visibility, 0)
         return values
 
 
-# ---- Questions to a scene that are no pictures: what rays meet, and what observers see of points ----
+# ---- Queries along rays and at points ----
 
 
 BATCH_SIZE = 1 << 18
-"""So many rays or points are computed at once."""
+"""Number of rays or points computed at once."""
 
 POINT_QUANTITIES = ("gaze", "visibility", "distance", "depth")
-"""What `observe` answers."""
+"""The quantities of `observe`."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class TraceResult(LabelledArrays):
-    """Quantities of `trace`, each (rays,) or, with channels, (rays, channels); for given observers with an axis
-    ``observer`` in front."""
+    """Result of `trace`.
+
+    The arrays have the shape (rays,) or (rays, channels); if positions of observers were passed, an axis ``observer``
+    precedes.
+    """
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ObserveResult(LabelledArrays):
-    """Quantities of `observe`, each (observers, points)."""
+    """Result of `observe`; the arrays have the shape (observers, points)."""
 
 
 def trace(
@@ -108,117 +151,151 @@ def trace(
     seed: int = 0,
     reporter: Reporter = SILENT,
 ) -> TraceResult:
-    """What rays meet in a scene: the surface, its colour, and the gaze that it attracts.
+    """Compute quantities along rays: the surface that they hit, its colour, and its gaze.
 
-    ``origins`` (N, 3) in scene units, or one (3,) for all; ``directions`` (N, 3), of any length but zero, or one.
-    ``quantities``: as for `render`; depths count from the origins. ``observers``: positions (M, 3) of those whose gaze
-    is shown, so that arrays are (M, N); None: whoever stands at a ray's origin looks along it, and arrays are (N,).
-    ``seed``: of what is random (the light on shapes). Raises `NergError`.
+    Parameters
+    ----------
+    scene : Scene or path
+        The scene, or a scene file.
+    origins : array_like of shape (N, 3) or (3,)
+        Origins of the rays in scene units.
+    directions : array_like of shape (N, 3) or (3,)
+        Directions of any length except zero, in the frame of the scene.
+    quantities : str or sequence of str, optional
+        Names of quantities as for `render`. Depths are measured from the origins.
+    observers : array_like of shape (M, 3), optional
+        Positions of the observers whose gaze is computed, in scene units. Default: the observer of each ray is at its
+        origin.
+    seed : int
+        Seed of random quantities, such as the light on shapes.
+    reporter : Reporter
+        Receives the progress.
 
-    Without ``observers`` a normalised gaze field is integrated over the sphere around every other origin, over some
-    8,000 directions or more: 30 to 40 ms of a processor's time each in the demo store, or half a minute for 1,000.
-    ``reporter`` is told the progress. A scene with a wider ``integral_tolerance`` (``make_scene(...,
-    integral_tolerance=0.02)``: gaze that errs by 2 % at most) takes half of that; ``quantities`` without gaze take
-    none of it.
+    Returns
+    -------
+    TraceResult
+        Arrays (M, N, ...), or (N, ...) without ``observers``.
 
+    Raises
+    ------
+    NergError
+        An argument is invalid, or the scene cannot compute a quantity.
+
+    Notes
+    -----
+    Without ``observers``, a normalised gaze field is integrated over the sphere around each distinct origin, with about
+    8,000 directions or more. In the demo store this takes 30 to 40 ms of CPU time per origin, or half a minute for
+    1,000 origins. A larger ``integral_tolerance`` of the scene (``make_scene(..., integral_tolerance=0.02)``: a
+    relative error of at most 2 %) halves this time. Quantities other than gaze do not need the integral.
+
+    Examples
+    --------
     >>> import nerg_mi as nerg
     >>> from importlib.resources import files
     >>> store = files("nerg_mi.scenes.store")
     >>> scene = nerg.make_scene(store / "store.safetensors", store / "shoppers.safetensors")
-    >>> seen = nerg.trace(scene, origins=(4.4, 2.8, 1.6), directions=[(0, 0, -1), (0.2, 1, -0.2)])
-    >>> seen.depth.shape, seen.color.shape, bool(abs(seen.depth[0] - 1.6) < 0.1)
+    >>> result = nerg.trace(scene, origins=(4.4, 2.8, 1.6), directions=[(0, 0, -1), (0.2, 1, -0.2)])
+    >>> result.depth.shape, result.color.shape, bool(abs(result.depth[0] - 1.6) < 0.1)
     ((2,), (2, 3), True)
     """
     scene = Scene.coerce(scene)
     activate_mitsuba()
-    asked = resolve_quantities(scene, quantities)
-    o, d = _rays(origins, directions)
+    requested = resolve_quantities(scene, quantities)
+    o, d = _as_rays(origins, directions)
     with translate_mitsuba_errors():
-        tracer = _Tracer(scene, asked, seed, reporter)
+        tracer = _Tracer(scene, requested, seed, reporter)
         if observers is None:
-            return TraceResult(tracer.of_origins(o, d), ("ray",), None)
-        eyes = arrays.as_points(observers, "observers")
-        return TraceResult(tracer.of_observers(o, d, eyes), ("observer", "ray"), eyes)
+            return TraceResult(tracer.trace_for_origins(o, d), ("ray",), None)
+        positions = arrays.as_points(observers, "observers")
+        return TraceResult(tracer.trace_for_observers(o, d, positions), ("observer", "ray"), positions)
 
 
 class _Tracer:
-    """Rays through a scene that are ``asked`` for quantities."""
+    """Traces rays through a scene to compute the ``requested`` quantities."""
 
-    def __init__(self, scene: Scene, asked: Sequence[str], seed: int, reporter: Reporter):
-        self.scene, self.asked, self.seed, self.reporter = scene, asked, seed, reporter
-        self.context = make_aov_context(scene, asked)
-        self.shared, self.own = self.context.shared_aovs, self.context.observer_aovs
+    def __init__(self, scene: Scene, requested: Sequence[str], seed: int, reporter: Reporter):
+        self.scene, self.requested, self.seed, self.reporter = scene, requested, seed, reporter
+        self.context = make_aov_context(scene, requested)
+        self.shared, self.per_observer = self.context.shared_aovs, self.context.observer_aovs
 
-    def of_observers(self, o: Floats, d: Floats, eyes: Floats) -> dict[str, Floats]:
-        """Quantities (M, N, ...) of rays as observers at ``eyes`` (M, 3) have them."""
-        observers = [self.context.make_observer(eye, len(eyes) == 1) for eye in eyes] if self.own else []
-        parts = [self._part(o, d, a, lambda camera: map(camera.make_pixel, observers)) for a in _starts(o)]
+    def trace_for_observers(self, o: Floats, d: Floats, positions: Floats) -> dict[str, Floats]:
+        """Compute quantities (M, N, ...) of rays for observers at ``positions`` (M, 3)."""
+        observers = (
+            [self.context.make_observer(eye, len(positions) == 1) for eye in positions] if self.per_observer else []
+        )
+        parts = [
+            self._trace_batch(o, d, a, lambda camera: map(camera.make_pixel, observers)) for a in _batch_starts(o)
+        ]
         values = {}
-        for name in self.asked:
-            value = np.concatenate([part[name] for part in parts], axis=-1 if name in self.own else 0)
-            values[name] = value if name in self.own else broadcast_to_observers(value, len(eyes))
+        for name in self.requested:
+            value = np.concatenate([part[name] for part in parts], axis=-1 if name in self.per_observer else 0)
+            values[name] = value if name in self.per_observer else broadcast_to_observers(value, len(positions))
         return values
 
-    def of_origins(self, o: Floats, d: Floats) -> dict[str, Floats]:
-        """Quantities (N, ...) of rays as whoever stands at their origins has them."""
-        if not self.own:
-            parts = [self._part(o, d, a, lambda camera: ()) for a in _starts(o)]
-            return {name: np.concatenate([part[name] for part in parts]) for name in self.asked}
+    def trace_for_origins(self, o: Floats, d: Floats) -> dict[str, Floats]:
+        """Compute quantities (N, ...) of rays for observers at their origins."""
+        if not self.per_observer:
+            parts = [self._trace_batch(o, d, a, lambda camera: ()) for a in _batch_starts(o)]
+            return {name: np.concatenate([part[name] for part in parts]) for name in self.requested}
         gaze = self.context.gaze
         if self.context.views or (gaze is not None and gaze.field.config.normalized):
-            return self._of_each_origin(o, d)
-        parts = [self._part(o, d, a, lambda camera: (camera.make_pixel_per_origin(),)) for a in _starts(o)]
-        first = lambda name, value: value[0] if name in self.own else value
-        return {name: np.concatenate([first(name, part[name]) for part in parts]) for name in self.asked}
+            return self._trace_each_origin(o, d)
+        parts = [self._trace_batch(o, d, a, lambda camera: (camera.make_pixel_per_origin(),)) for a in _batch_starts(o)]
+        first = lambda name, value: value[0] if name in self.per_observer else value
+        return {name: np.concatenate([first(name, part[name]) for part in parts]) for name in self.requested}
 
-    def _of_each_origin(self, o: Floats, d: Floats) -> dict[str, Floats]:
-        """The same, origin by origin: what is known of an observer is made for one position."""
-        origins, of_ray = np.unique(o, axis=0, return_inverse=True)
-        order = np.argsort(of_ray.ravel(), kind="stable")
-        groups = np.split(order, np.cumsum(np.bincount(of_ray.ravel()))[:-1])
+    def _trace_each_origin(self, o: Floats, d: Floats) -> dict[str, Floats]:
+        """Compute the same one origin after the other, since the observer context belongs to one position."""
+        origins, origin_of_ray = np.unique(o, axis=0, return_inverse=True)
+        order = np.argsort(origin_of_ray.ravel(), kind="stable")
+        groups = np.split(order, np.cumsum(np.bincount(origin_of_ray.ravel()))[:-1])
         parts = []
         for number, (origin, rows) in enumerate(zip(origins, groups), 1):
-            who = self.context.make_observer(origin)
-            for a in _starts(rows):
-                part = self._part(o[rows], d[rows], a, lambda camera, who=who: (camera.make_pixel(who, True),))
-                parts.append({name: v[0] if name in self.own else v for name, v in part.items()})
+            observer = self.context.make_observer(origin)
+            for a in _batch_starts(rows):
+                part = self._trace_batch(
+                    o[rows], d[rows], a, lambda camera, who=observer: (camera.make_pixel(who, True),)
+                )
+                parts.append({name: v[0] if name in self.per_observer else v for name, v in part.items()})
             self.reporter.progress(number / len(origins), f"origin {number:,} of {len(origins):,}")
-        back = np.argsort(order)
-        return {name: np.concatenate([part[name] for part in parts])[back] for name in self.asked}
+        inverse = np.argsort(order)
+        return {name: np.concatenate([part[name] for part in parts])[inverse] for name in self.requested}
 
-    def _part(self, o: Floats, d: Floats, first: int, observed: Callable[[Any], Iterable[Any]]) -> dict[str, Floats]:
-        """Of the `BATCH` rays from ``first`` on; ``observed``: the pixels of their observers."""
+    def _trace_batch(
+        self, o: Floats, d: Floats, start: int, make_pixels: Callable[[Any], Iterable[Any]]
+    ) -> dict[str, Floats]:
+        """Trace `BATCH_SIZE` rays from index ``start``; ``make_pixels`` returns the pixels of each observer."""
         import drjit as dr
         import mitsuba as mi
 
-        o, d = o[first : first + BATCH_SIZE], d[first : first + BATCH_SIZE]
+        o, d = o[start : start + BATCH_SIZE], d[start : start + BATCH_SIZE]
         ray = mi.RayDifferential3f(to_vector(mi.Point3f, o), to_vector(mi.Vector3f, d))
         sampler = mi.load_dict({"type": "independent"})
-        sampler.seed(self.seed + first, len(o))
+        sampler.seed(self.seed + start, len(o))
         with dr.suspend_grad():
             camera = self.context.trace(self.scene.mitsuba, [], sampler, ray, mi.Bool(True))
             shared = camera.compute_channels(self.shared)
             color = camera.compute_radiance(self.scene.mitsuba, sampler, None)[0]
             camera.eval_shared(color, shared)
             each = []
-            for mine in observed(camera) if self.own else ():
-                channels = mine.compute_channels(self.own)
+            for pixels in make_pixels(camera) if self.per_observer else ():
+                channels = pixels.compute_channels(self.per_observer)
                 dr.eval(channels)
-                each.append(self._named(self.own, channels, len(o)))
-        values = self._named(self.shared, shared, len(o))
-        if COLOR in self.asked:
-            values[COLOR] = np.stack([_lanes(channel, len(o)) for channel in color], axis=-1)
-        return values | {name: np.stack([one[name] for one in each]) for name in self.own}
+                each.append(self._group_channels(self.per_observer, channels, len(o)))
+        values = self._group_channels(self.shared, shared, len(o))
+        if COLOR in self.requested:
+            values[COLOR] = np.stack([_to_array(channel, len(o)) for channel in color], axis=-1)
+        return values | {name: np.stack([one[name] for one in each]) for name in self.per_observer}
 
-    def _named(self, names: Sequence[str], channels: Sequence[Any], count: int) -> dict[str, Floats]:
-        """Channels as arrays (N,), or (N, C) where a quantity has several, by quantity."""
+    def _group_channels(self, names: Sequence[str], channels: Sequence[Any], count: int) -> dict[str, Floats]:
+        """Return channels by quantity, as arrays (N,), or (N, C) for several channels."""
         columns: dict[str, list[Floats]] = {}
         for name, value in zip(self.context.channel_names(names), channels):
-            columns.setdefault(name.rpartition(".")[0], []).append(_lanes(value, count))
+            columns.setdefault(name.rpartition(".")[0], []).append(_to_array(value, count))
         return {name: c[0] if len(c) == 1 else np.stack(c, axis=-1) for name, c in columns.items()}
 
 
-def _starts(rows: Any) -> range:
+def _batch_starts(rows: Any) -> range:
     return range(0, len(rows), BATCH_SIZE)
 
 
@@ -228,43 +305,71 @@ def observe(
     observers: ArrayLike | None = None,
     quantities: str | Sequence[str] | None = None,
 ) -> ObserveResult:
-    """How observers see points of a scene: whether they do, and how much gaze they give what is there.
+    """Compute what observers see of points: visibility and gaze.
 
-    ``points`` (N, 3) on surfaces, in scene units; ``observers`` (M, 3), or None for the scene's own. Arrays are (M, N).
-    ``quantities``: ``gaze`` (1/sr, after occlusion), ``visibility`` (1 visible .. 0 hidden), ``distance`` from the
-    observer to the point and ``depth`` of what the observer meets on the way to it (that distance where nothing is
-    met), both in scene units; all of them without any. What stands nearer to the point than the integrator's
-    ``tolerance`` does not hide it. Raises `NergError`.
+    Parameters
+    ----------
+    scene : Scene or path
+        The scene, or a scene file.
+    points : array_like of shape (N, 3) or (3,)
+        Points on surfaces, in scene units. Surfaces closer to a point than the ``tolerance`` of the integrator do not
+        occlude it.
+    observers : array_like of shape (M, 3) or (3,), optional
+        Positions of the observers in scene units. Default: the observer of the scene.
+    quantities : str or sequence of str, optional
+        Any of ``gaze`` (1/sr, after occlusion), ``visibility`` (1 visible to 0 occluded), ``distance`` from the
+        observer to the point, and ``depth`` of the first surface in that direction, or the distance if there is none
+        (both in scene units). Default: all.
 
+    Returns
+    -------
+    ObserveResult
+        Arrays (M, N).
+
+    Raises
+    ------
+    NergError
+        An argument is invalid, or the scene has no observer.
+
+    Examples
+    --------
     >>> import nerg_mi as nerg
     >>> from importlib.resources import files
     >>> store = files("nerg_mi.scenes.store")
     >>> scene = nerg.make_scene(store / "store.safetensors", store / "shoppers.safetensors")
-    >>> seen = nerg.observe(scene, points=(4.4, 2.8, 0.02), observers=[(4.4, 2.8, 1.6), (6.3, 3.0, 1.6)])
-    >>> seen.visibility.round(2).tolist()
+    >>> result = nerg.observe(scene, points=(4.4, 2.8, 0.02), observers=[(4.4, 2.8, 1.6), (6.3, 3.0, 1.6)])
+    >>> result.visibility.round(2).tolist()
     [[1.0], [0.0]]
     """
     scene = Scene.coerce(scene)
     activate_mitsuba()
-    known = POINT_QUANTITIES if scene.has_gaze else POINT_QUANTITIES[1:]
-    asked = known if quantities is None else resolve_quantities(scene, quantities, known)
+    allowed = POINT_QUANTITIES if scene.has_gaze else POINT_QUANTITIES[1:]
+    requested = allowed if quantities is None else resolve_quantities(scene, quantities, allowed)
     p = arrays.as_points(points, "points")
-    eyes = resolve_observers(scene, observers)
+    positions = resolve_observers(scene, observers)
     with translate_mitsuba_errors():
-        each = [_at_points(SceneObserver(scene, eye), p, "gaze" in asked) for eye in eyes]
-    return ObserveResult({name: np.stack([one[name] for one in each]) for name in asked}, ("observer", "point"), eyes)
+        each = [_observe_points(SceneObserver(scene, eye), p, "gaze" in requested) for eye in positions]
+    return ObserveResult(
+        {name: np.stack([one[name] for one in each]) for name in requested}, ("observer", "point"), positions
+    )
 
 
 def resolve_observers(scene: Scene, observers: ArrayLike | None) -> Floats:
-    """``observers`` as positions (M, 3); None: the scene's own. Raises `NergError` where there is none."""
+    """Return the positions (M, 3) of ``observers``, or of the scene's observer for None.
+
+    Raises
+    ------
+    NergError
+        The scene has no observer.
+    """
     if observers is not None:
         return arrays.as_points(observers, "observers")
     if scene.observer is None:
-        raise NergError("the scene has no observer of its own; say where they are with observers=[(x, y, z), ...]")
+        raise NergError("the scene has no observer; pass positions with observers=[(x, y, z), ...]")
     return scene.observer[None]
 
 
-def _at_points(observer: SceneObserver, p: Floats, with_gaze: bool) -> dict[str, Floats]:
+def _observe_points(observer: SceneObserver, p: Floats, with_gaze: bool) -> dict[str, Floats]:
     import drjit as dr
     import mitsuba as mi
 
@@ -275,51 +380,57 @@ def _at_points(observer: SceneObserver, p: Floats, with_gaze: bool) -> dict[str,
             values = observer.observe(to_vector(mi.Point3f, part), with_gaze)
             dr.eval(values)
         for name, value in values.items():
-            parts.setdefault(name, []).append(_lanes(value, len(part)))
+            parts.setdefault(name, []).append(_to_array(value, len(part)))
     return {name: np.concatenate(values) for name, values in parts.items()}
 
 
-def _rays(origins: ArrayLike, directions: ArrayLike) -> tuple[Floats, Floats]:
+def _as_rays(origins: ArrayLike, directions: ArrayLike) -> tuple[Floats, Floats]:
     o = arrays.as_points(origins, "origins")
     d = arrays.as_points(directions, "directions")
     count = max(len(o), len(d))
     if len(o) not in (1, count):
-        raise NergError(f"there must be one origin or as many as directions, {count}, got {len(o)}")
+        raise NergError(f"the number of origins must be 1 or that of the directions ({count}), got {len(o)}")
     return np.ascontiguousarray(np.broadcast_to(o, (count, 3))), arrays.as_unit_vectors(directions, count, "directions")
 
 
-def _lanes(value: Any, count: int) -> Floats:
-    """A Dr.Jit Float as an array (count,); one lane stands for all."""
+def _to_array(value: Any, count: int) -> Floats:
+    """Convert a Dr.Jit Float to an array (count,); a single value is repeated."""
     return np.broadcast_to(np.array(value, np.float32).ravel(), (count,)).copy()
 
 
 # ---- Attention ----
 #
-# Attention on things: the share of observers' gaze that lands on a box, a mesh or a shape of the scene.
-#
-# Of a box it is the share of the gaze whose first surface lies in it, summed over directions
-# (`nerg_mi.statistics.shares`), as statistics, reports and the viewer have it. Of a mesh or a shape it is the share
-# that ends on its own surface, in area form (`nerg_mi.probes.surface_attention`), which also tells where on it.
+# The attention share of a box is the fraction of the gaze whose first surface is in the box, summed over directions
+# (`nerg_mi.statistics.shares`). Statistics, reports and the viewer use this definition. The attention share of a mesh
+# or shape is the integral over its own surface (`nerg_mi.probes.surface_attention`), which also yields its distribution
+# on the surface.
 
 
 DEFAULT_SUM_RULE = QuadratureRule()
-"""How finely the share of a box is summed, unless another tolerance is asked for."""
+"""Default accuracy of the attention share of a box."""
 
 PATCH_SIZE_RATIO = 4
-"""A piece of a surface is so many times shorter than its distance from the nearest observer."""
+"""Ratio of an observer's distance from a surface and the size of the patches into which it is divided."""
 
 MAX_AUTO_DIVISIONS = 32
-"""A triangle is cut into so many parts a side at most, unless more are asked for."""
+"""Maximum number of automatic divisions per side of a triangle."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Attention:
-    """Attention that a thing receives from M observers.
+    """Attention that an object receives from M observers.
 
-    ``share`` (M,): of each observer's gaze, the part whose first surface lies in the box, or is the mesh or the shape;
-    all of the gaze, with what meets no surface, is 1. ``error`` (M,): the one that a share of a box is likely to have
-    at most; None for meshes. ``escaped`` (M,): the share that meets no surface at all; None for meshes. ``observers``
-    (M, 3).
+    Attributes
+    ----------
+    share : ndarray of shape (M,)
+        Attention share: fraction of each observer's gaze whose first surface is in the box, or is the mesh or shape.
+        The denominator includes gaze that hits no surface.
+    observers : ndarray of shape (M, 3)
+        Positions of the observers in scene units.
+    error : ndarray of shape (M,) or None
+        Estimate of the maximum error of the share of a box; None for meshes.
+    escaped : ndarray of shape (M,) or None
+        Fraction of the gaze that hits no surface; None for meshes.
     """
 
     share: Floats
@@ -329,7 +440,7 @@ class Attention:
 
     @property
     def mean(self) -> float:
-        """Mean share over the observers."""
+        """Mean attention share of the observers."""
         return float(np.mean(self.share, dtype=np.float64))
 
     def __repr__(self) -> str:
@@ -338,10 +449,16 @@ class Attention:
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class SurfaceAttention(Attention):
-    """Attention that a surface, cut into K flat pieces, receives from M observers.
+    """Attention that a surface, divided into K flat patches, receives from M observers.
 
-    ``density`` (M, K): in area form, in 1 / square scene unit; times ``area`` (K,) it adds up to ``share``. ``points``,
-    ``normals`` (K, 3): centres of the pieces and their outward unit normals.
+    Attributes
+    ----------
+    density : ndarray of shape (M, K)
+        Attention share per area, in 1 / (scene unit)²; ``density @ area`` equals ``share``.
+    points, normals : ndarray of shape (K, 3)
+        Centres of the patches in scene units, and their outward unit normals.
+    area : ndarray of shape (K,)
+        Areas of the patches in (scene unit)².
     """
 
     density: Floats
@@ -352,7 +469,7 @@ class SurfaceAttention(Attention):
     def __repr__(self) -> str:
         return (
             f"<Attention: mean share {self.mean:.4g} of {len(self.observers)} observers "
-            f"on {float(self.area.sum()):.4g} square units in {len(self.area):,} pieces>"
+            f"on {float(self.area.sum()):.4g} square units in {len(self.area):,} patches>"
         )
 
 
@@ -367,32 +484,58 @@ def attention(
     two_sided: bool = False,
     reporter: Reporter = SILENT,
 ) -> Attention:
-    """How much of their gaze observers give a thing.
+    """Compute which fraction of their gaze observers direct at an object.
 
-    ``surface``: a box, as its lower and upper corner (2, 3); the id of a mesh of the scene; a mesh file (.ply, .obj,
-    .glb); a dict for ``mi.load_dict``, or a Mitsuba mesh. ``observers`` (M, 3), or None for the scene's own.
+    Parameters
+    ----------
+    scene : Scene or path
+        The scene, or a scene file; it needs a gaze field.
+    surface : array_like of shape (2, 3), str, path, mapping or mi.Mesh
+        A box, as its lower and upper corner in scene units; the id of a mesh of the scene; a mesh file (.ply, .obj,
+        .glb); a dict for ``mi.load_dict``; or a Mitsuba mesh.
+    observers : array_like of shape (M, 3) or (3,), optional
+        Positions of the observers in scene units. Default: the observer of the scene.
+    margin : float
+        Boxes only: a surface counts if it is at most this far outside the box along the ray, in scene units.
+    tolerance : float
+        Boxes only: directions are added until the error of the share is below this fraction of it, or below 1e-5, or
+        until a million directions are used.
+    divisions : int, optional
+        Meshes only: number of parts per side into which each triangle is divided. Default: patches of at most a quarter
+        of the distance to the nearest observer, at most 32 parts; the relative error is then a few thousandths.
+    two_sided : bool
+        Meshes only: count both sides of an open surface. Otherwise only the side with counterclockwise vertices counts.
+    reporter : Reporter
+        Receives the progress.
 
-    A box has the gaze whose first surface lies in it, whatever stands there, so that a larger box never has less, and
-    one in free air has none. ``margin``, in scene units: how far in front of the box, or behind it, on a ray that
-    crosses it, that surface may lie; with 0, boxes that fill space without overlap, none of whose faces runs along a
-    surface, add up to 1 with ``escaped``.
-    ``tolerance``: directions are added until the error of a share is less than this part of it (or 1e-5), or until a
-    million lie around the observer.
+    Returns
+    -------
+    Attention
+        For a mesh, a `SurfaceAttention`, which contains the distribution on the surface.
 
-    A mesh is a surface of its own, and the result a `SurfaceAttention`, which says where on it: one that is not of the
-    scene is looked at as if it stood there: the scene hides it, and it hides nothing but its own back. ``divisions``:
-    each triangle is cut into so many parts a side, whose centres stand for them; None: so many that pieces are no
-    longer than a quarter of the distance to the nearest observer, which is right to some thousandths, and 32 at most.
-    ``two_sided``: count both sides of an open surface; otherwise the one whose vertices run counter-clockwise. The
-    scene's fall-off has no part in it: what is hidden is not looked at. Raises `NergError`.
+    Raises
+    ------
+    NergError
+        An argument is invalid, or the scene has no gaze field or observer.
 
+    Notes
+    -----
+    A box contains the gaze that ends on any surface inside it: a larger box never has a smaller share, and a box in
+    empty space has none. With ``margin=0``, the shares of boxes that fill space without overlap, and whose faces do not
+    coincide with surfaces, sum to 1 together with ``escaped``.
+
+    A mesh that is not part of the scene is treated as if it were there: the scene occludes it, and it occludes only its
+    own back side. The fall-off of the scene is ignored: an occluded point receives no attention.
+
+    Examples
+    --------
     >>> import nerg_mi as nerg
     >>> from importlib.resources import files
     >>> store = files("nerg_mi.scenes.store")
     >>> scene = nerg.make_scene(store / "store.safetensors", store / "shoppers.safetensors", falloff=0.05)
     >>> shelf = [(3.79, 5.4, 0.0), (5.31, 6.0, 1.9)]
-    >>> seen = nerg.attention(scene, shelf, observers=[(4.4, 2.8, 1.6), (6.3, 3.0, 1.6)])
-    >>> seen.share.shape, bool((seen.share > 0).all() and (seen.error < 0.1 * seen.share).all())
+    >>> result = nerg.attention(scene, shelf, observers=[(4.4, 2.8, 1.6), (6.3, 3.0, 1.6)])
+    >>> result.share.shape, bool((result.share > 0).all() and (result.error < 0.1 * result.share).all())
     ((2,), True)
     """
     import drjit as dr
@@ -400,35 +543,37 @@ def attention(
     from nerg_mi.probes.surface_attention import make_patches
 
     scene = Scene.coerce(scene)
-    _check(scene)
+    _check_has_gaze(scene)
     check_number(margin, Range(0, MAX_COORDINATE), "margin")
     check_number(tolerance, Range(1e-9, 1), "tolerance")
-    if (region := _box(surface)) is not None:
+    if (region := _as_box(surface)) is not None:
         if divisions is not None or two_sided:
-            raise NergError("divisions and two_sided are of meshes, and this is a box; leave them out, or give a mesh")
-        eyes = resolve_observers(scene, observers)
+            raise NergError("divisions and two_sided apply to meshes only, but the surface is a box; omit them")
+        positions = resolve_observers(scene, observers)
         rule = QuadratureRule(rtol=float(tolerance))
-        found = compute_box_shares(scene, [region], eyes, margin=float(margin), rule=rule, reporter=reporter)
-        single = lambda v: np.ascontiguousarray(v, np.float32)
-        return Attention(single(found.share[:, 0]), eyes, single(found.error[:, 0]), single(found.escaped))
-    whole = isinstance(divisions, (int, np.integer)) and not isinstance(divisions, bool)
-    if not (divisions is None or (whole and 1 <= divisions <= 4096)):
-        raise NergError(f"divisions must be a whole number from 1 to 4,096, got {divisions!r}")
-    eyes = resolve_observers(scene, observers)
-    each = []
+        shares = compute_box_shares(scene, [region], positions, margin=float(margin), rule=rule, reporter=reporter)
+        to_single = lambda v: np.ascontiguousarray(v, np.float32)
+        return Attention(
+            to_single(shares.share[:, 0]), positions, to_single(shares.error[:, 0]), to_single(shares.escaped)
+        )
+    is_integer = isinstance(divisions, (int, np.integer)) and not isinstance(divisions, bool)
+    if not (divisions is None or (is_integer and 1 <= divisions <= 4096)):
+        raise NergError(f"divisions must be an integer from 1 to 4,096, got {divisions!r}")
+    positions = resolve_observers(scene, observers)
+    densities = []
     with translate_mitsuba_errors(), dr.suspend_grad():
-        mesh = _mesh(scene, surface)
-        pieces = make_patches(mesh, _enough_divisions(mesh, eyes) if divisions is None else int(divisions))
+        mesh = _as_mesh(scene, surface)
+        pieces = make_patches(mesh, _choose_divisions(mesh, positions) if divisions is None else int(divisions))
         area = np.array(pieces.area, np.float32)
-        for number, eye in enumerate(eyes):
-            each.append(_density(scene, eye, pieces, two_sided))
-            reporter.progress((number + 1) / len(eyes), f"observer {number + 1} of {len(eyes)}")
-        where, normals = (np.ascontiguousarray(np.array(v, np.float32).T) for v in (pieces.p, pieces.n))
-    density = np.stack(each)
+        for number, position in enumerate(positions):
+            densities.append(_compute_density(scene, position, pieces, two_sided))
+            reporter.progress((number + 1) / len(positions), f"observer {number + 1} of {len(positions)}")
+        centers, normals = (np.ascontiguousarray(np.array(v, np.float32).T) for v in (pieces.p, pieces.n))
+    density = np.stack(densities)
     share = (density.astype(np.float64) @ area.astype(np.float64)).astype(np.float32)
     if not np.isfinite(share).all():
-        raise NergError("the attention on this mesh is not finite; give one, and observers, of the scene's size")
-    return SurfaceAttention(share, eyes, density=density, points=where, normals=normals, area=area)
+        raise NergError("the attention on this mesh is not finite; check the scale of the mesh and of the observers")
+    return SurfaceAttention(share, positions, density=density, points=centers, normals=normals, area=area)
 
 
 def compute_box_shares(
@@ -440,13 +585,31 @@ def compute_box_shares(
     rule: QuadratureRule = DEFAULT_SUM_RULE,
     reporter: Reporter = SILENT,
 ) -> Shares:
-    """The shares of ``observers`` (M, 3) on N boxes, which may be turned, all of them at once, (M, N), as finely as
-    the ``rule`` says; arguments and errors as of `attention`."""
+    """Compute the attention shares of N boxes, which may be rotated, for M observers.
+
+    Parameters
+    ----------
+    scene : Scene
+        The scene, with a gaze field.
+    regions : sequence of Region
+        The boxes.
+    observers : ndarray of shape (M, 3)
+        Positions in scene units.
+    margin, reporter
+        As for `attention`.
+    rule : SumRule
+        Accuracy of the sum over directions.
+
+    Returns
+    -------
+    Shares
+        Shares of shape (M, N).
+    """
     from nerg_mi.transport.observer_gaze import make_gaze_evaluator
 
-    _check(scene)
+    _check_has_gaze(scene)
     i, place, count = scene.integrator, scene.geometry, len(observers)
-    told = lambda done: reporter.progress(done / count, f"observer {done} of {count}")
+    on_progress = lambda done: reporter.progress(done / count, f"observer {done} of {count}")
     with translate_mitsuba_errors():
         return gaze_shares(
             lambda eye: make_gaze_evaluator(i.gaze, place, i.observer_settings, eye),
@@ -455,72 +618,88 @@ def compute_box_shares(
             [(k,) for k in range(len(regions))],
             margin,
             rule,
-            told,
+            on_progress,
         )
 
 
 def compute_mesh_shares(
     scene: Scene, surfaces: Sequence[Any], observer: ArrayLike, *, divisions: int, two_sided: bool = False
 ) -> Floats:
-    """The share (N,) of one observer's gaze that each of N meshes, ``surfaces``, receives, all of them at once.
+    """Compute the attention share (N,) of each of N meshes for one observer.
 
-    Arguments and errors as of `attention`; ``observer`` (3,).
+    Parameters
+    ----------
+    scene : Scene
+        The scene, with a gaze field.
+    surfaces : sequence
+        Meshes, as for `attention`.
+    observer : array_like of shape (3,)
+        Position in scene units.
+    divisions, two_sided
+        As for `attention`.
+
+    Returns
+    -------
+    ndarray of shape (N,), float32
+        Attention shares.
     """
     import drjit as dr
 
     mi = variant_types()
     from nerg_mi.probes.surface_attention import Patches, make_patches
 
-    _check(scene)
+    _check_has_gaze(scene)
     if not len(surfaces):
         return np.zeros(0, np.float32)
-    eye = resolve_observers(scene, observer)[0]
+    position = resolve_observers(scene, observer)[0]
     with translate_mitsuba_errors(), dr.suspend_grad():
-        each = [make_patches(_mesh(scene, surface), divisions) for surface in surfaces]
-        area = [np.array(pieces.area, np.float64) for pieces in each]
-        lanes = lambda name: np.concatenate([np.array(getattr(pieces, name), np.float32) for pieces in each], axis=1)
-        pieces = Patches(mi.Point3f(lanes("p")), mi.Vector3f(lanes("n")), mi.Float(np.concatenate(area)))
-        density = _density(scene, eye, pieces, two_sided)
+        patches_by_mesh = [make_patches(_as_mesh(scene, surface), divisions) for surface in surfaces]
+        area = [np.array(pieces.area, np.float64) for pieces in patches_by_mesh]
+        concatenate = lambda name: np.concatenate(
+            [np.array(getattr(pieces, name), np.float32) for pieces in patches_by_mesh], axis=1
+        )
+        pieces = Patches(mi.Point3f(concatenate("p")), mi.Vector3f(concatenate("n")), mi.Float(np.concatenate(area)))
+        density = _compute_density(scene, position, pieces, two_sided)
     starts = np.cumsum([0, *(len(a) for a in area[:-1])])
     return np.add.reduceat(density * np.concatenate(area), starts).astype(np.float32)
 
 
-def _check(scene: Scene) -> None:
+def _check_has_gaze(scene: Scene) -> None:
     activate_mitsuba()
     if not scene.has_gaze:
-        raise NergError("attention needs a gaze field; give make_scene gaze=")
+        raise NergError("attention needs a scene with a gaze field; pass gaze= to make_scene")
 
 
-def _density(scene: Scene, eye: Floats, pieces: Any, two_sided: bool) -> Floats:
-    """Share of the gaze (K,) per area that ``pieces`` receive from the observer at ``eye`` (3,)."""
+def _compute_density(scene: Scene, position: Floats, pieces: Any, two_sided: bool) -> Floats:
+    """Compute the attention share per area (K,) of ``pieces`` for the observer at ``position`` (3,)."""
     from nerg_mi.probes.surface_attention import attention_per_area
 
-    observer = SceneObserver(scene, eye)
+    observer = SceneObserver(scene, position)
     settings = observer.integrator.observer_settings
-    found = attention_per_area(observer.geometry, observer.eval_gaze, observer.center, pieces.p, pieces.n, 0.0, settings, two_sided)
+    density = attention_per_area(observer.geometry, observer.eval_gaze, observer.center, pieces.p, pieces.n, 0.0, settings, two_sided)
     if not observer.integrator.gaze.field.config.normalized:
-        whole = compute_box_shares(scene, [], eye[None]).integral[0]
-        found /= whole if whole > 0 else 1
-    return np.array(found, np.float32)
+        total = compute_box_shares(scene, [], position[None]).integral[0]
+        density /= total if total > 0 else 1
+    return np.array(density, np.float32)
 
 
-def _enough_divisions(mesh: Any, eyes: Floats) -> int:
-    """A power of two, so that meshes of different sizes have kernels in common."""
+def _choose_divisions(mesh: Any, positions: Floats) -> int:
+    """Choose a power of two, so that meshes of different sizes share kernels."""
     import mitsuba as mi
 
     if not isinstance(mesh, mi.Mesh):
-        return 1  # no mesh, as will be said
-    positions, faces = (np.reshape(np.array(v), (-1, 3)) for v in (mesh.vertex_positions_buffer(), mesh.faces_buffer()))
-    corners = positions[faces]
+        return 1  # an error is raised later
+    vertices, faces = (np.reshape(np.array(v), (-1, 3)) for v in (mesh.vertex_positions_buffer(), mesh.faces_buffer()))
+    corners = vertices[faces]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max()
-    beside = np.maximum(np.maximum(corners.min((0, 1)) - eyes, eyes - corners.max((0, 1))), 0)
-    nearest = np.linalg.norm(beside, axis=1).min()
-    wanted = PATCH_SIZE_RATIO * longest / nearest if nearest > 0 else np.inf
-    return int(2 ** np.ceil(np.log2(np.clip(wanted, 1, MAX_AUTO_DIVISIONS))))
+    distances = np.maximum(np.maximum(corners.min((0, 1)) - positions, positions - corners.max((0, 1))), 0)
+    nearest = np.linalg.norm(distances, axis=1).min()
+    divisions = PATCH_SIZE_RATIO * longest / nearest if nearest > 0 else np.inf
+    return int(2 ** np.ceil(np.log2(np.clip(divisions, 1, MAX_AUTO_DIVISIONS))))
 
 
-def _box(surface: Any) -> Region | None:
-    """``surface`` as a box; None for what is a mesh, or the name of one."""
+def _as_box(surface: Any) -> Region | None:
+    """Return ``surface`` as a box; None if it is a mesh."""
     import mitsuba as mi
 
     if isinstance(surface, Region):
@@ -529,19 +708,19 @@ def _box(surface: Any) -> Region | None:
         return None
     corners = arrays.as_points(surface, "the corners of a box").astype(np.float64)
     if len(corners) != 2 or not np.all(corners[0] < corners[1]):
-        raise NergError(f"a box is a lower corner and an upper one, got {corners.tolist()}")
+        raise NergError(f"a box must be a lower and an upper corner, got {corners.tolist()}")
     return Region.create("box", *corners)
 
 
-def _mesh(scene: Scene, surface: Any) -> Any:
-    """``surface`` as a Mitsuba mesh."""
+def _as_mesh(scene: Scene, surface: Any) -> Any:
+    """Return ``surface`` as a Mitsuba mesh."""
     import mitsuba as mi
 
     if isinstance(surface, str) and Path(surface).suffix.lower() not in READERS:
         by_id = {shape.id(): shape for shape in scene.mitsuba.shapes()}
         if surface not in by_id:
-            known = f"it has {', '.join(by_id)}" if by_id else "it has none"
-            raise NergError(f'the scene has no shape "{surface}"; {known}')
+            available = f"its shapes are {', '.join(by_id)}" if by_id else "it has no shapes"
+            raise NergError(f'the scene has no shape "{surface}"; {available}')
         return by_id[surface]
     if isinstance(surface, (str, os.PathLike)):
         surface = load_mesh_child(surface)

@@ -1,4 +1,4 @@
-"""Pictures of a scene: for its own observer, or for many whose gaze is shown in one view."""
+"""Rendering of images, for one or many observers in one view."""
 
 from __future__ import annotations
 
@@ -25,8 +25,11 @@ AXES = ("observer", "row", "column")
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Pictures(LabelledArrays):
-    """Quantities of `render`, each (observers, height, width) or, with channels, (observers, height, width, channels):
-    ``pictures["gaze"][0]`` or ``pictures.gaze[0]`` is the first observer's."""
+    """Result of `render`.
+
+    The arrays have the shape (observers, height, width) or (observers, height, width, channels): ``result["gaze"][0]``
+    and ``result.gaze[0]`` are the gaze of the first observer.
+    """
 
 
 def render(
@@ -39,19 +42,45 @@ def render(
     seed: int = 0,
     reporter: Reporter = SILENT,
 ) -> Pictures:
-    """Render a scene, or a scene file, for one or many observers.
+    """Render a scene for one or many observers.
 
-    ``observers``: positions (M, 3) in scene units of those whose gaze is shown, or one (3,); None: the scene's own,
-    which is the camera where it has none. ``quantities``: ``"color"`` (linear rgb; the luminance in mono variants) and
-    any AOV of the integrator ``nerg``: ``depth`` and ``observer_depth`` (scene units), ``opacity``, ``position``,
-    ``gaze`` (1/sr), ``visibility``, ``support``, ...; without any ``color``, ``depth``, ``opacity`` and, where there is
-    a gaze field, ``gaze`` and ``visibility``. ``camera``: a `Camera`, or the number of one of the scene's own (the
-    first). ``spp``: samples a pixel, 0 for as many as the scene says. Equal seeds give equal pictures, and those of
-    ``nerg render`` to the bit where the camera has a box filter, as every `Camera` has.
+    The camera rays are traced once for all observers.
 
-    The camera's rays are traced once for all observers, and kernels are compiled for one of them. Raises `NergError`,
-    and ``KeyboardInterrupt`` after Ctrl-C.
+    Parameters
+    ----------
+    scene : Scene or path
+        The scene, or a scene file.
+    observers : array_like of shape (M, 3) or (3,), optional
+        Positions of the observers whose gaze is computed, in scene units. Default: the observer of the scene, or the
+        camera if the scene has no observer.
+    quantities : str or sequence of str, optional
+        ``"color"`` (linear RGB; luminance in mono variants) and any AOV of the integrator ``nerg``, such as ``depth``
+        and ``observer_depth`` (scene units), ``opacity``, ``position``, ``gaze`` (1/sr), ``visibility`` and
+        ``support``. Default: ``color``, ``depth``, ``opacity`` and, with a gaze field, ``gaze`` and ``visibility``.
+    camera : Camera, int or mi.Sensor, optional
+        The camera, or the index of a sensor of the scene. Default: the first sensor.
+    spp : int
+        Samples per pixel; 0 uses the number of the sensor.
+    seed : int
+        Equal seeds give equal images. With a box filter, as every `Camera` has, they equal those of ``nerg render`` bit
+        by bit.
+    reporter : Reporter
+        Receives the progress.
 
+    Returns
+    -------
+    Pictures
+        The images, with axes (observer, row, column).
+
+    Raises
+    ------
+    NergError
+        An argument is invalid, or the scene cannot compute a quantity.
+    KeyboardInterrupt
+        Ctrl-C was pressed.
+
+    Examples
+    --------
     >>> import nerg_mi as nerg
     >>> from importlib.resources import files
     >>> store = files("nerg_mi.scenes.store")
@@ -64,67 +93,73 @@ def render(
     """
     scene = Scene.coerce(scene)
     activate_mitsuba()
-    asked = resolve_quantities(scene, quantities)
+    requested = resolve_quantities(scene, quantities)
     sensor = scene.resolve_sensor(camera)
     _check_counts(spp, seed)
     with translate_mitsuba_errors():
-        context = make_aov_context(scene, asked)
-        eyes = _observers(scene, sensor, observers, bool(context.observer_aovs))
-        layers = _Layers(context, sensor, asked, eyes)
-        values = _render(scene, sensor, layers, int(spp), int(seed), reporter)
-    return Pictures({name: values[name] for name in asked}, AXES, eyes)
+        context = make_aov_context(scene, requested)
+        positions = _resolve_observers(scene, sensor, observers, bool(context.observer_aovs))
+        layers = _ObserverLayers(context, sensor, requested, positions)
+        values = _render_layers(scene, sensor, layers, int(spp), int(seed), reporter)
+    return Pictures({name: values[name] for name in requested}, AXES, positions)
 
 
-def _observers(scene: Scene, sensor: Any, given: ArrayLike | None, needed: bool) -> Floats:
-    """Positions (M, 3) of the observers of a picture; ``needed``: whether it depends on them."""
+def _resolve_observers(scene: Scene, sensor: Any, positions: ArrayLike | None, is_needed: bool) -> Floats:
+    """Return the positions (M, 3) of the observers; ``is_needed``: whether the image depends on them."""
     from nerg_mi.transport import observer
 
-    if given is not None:
-        return as_points(given, "observers")
+    if positions is not None:
+        return as_points(positions, "observers")
     if scene.observer is not None:
         return scene.observer[None]
-    if needed:
+    if is_needed:
         observer.check_center(sensor, "the camera")
     return np.array(observer.sensor_center(sensor), np.float32).reshape(1, 3)
 
 
-class _Layers:
-    """What `nerg_mi.rendering.bands.render_bands` renders: first what all observers have in common, then, for each of
-    them, what does not."""
+class _ObserverLayers:
+    """The layers for `nerg_mi.rendering.bands.render_bands`: one that all observers share, then one per observer."""
 
-    def __init__(self, context: Any, sensor: Any, asked: Sequence[str], eyes: Floats):
-        self.sensor, self.color, self.observers = sensor, COLOR in asked, len(eyes)
+    def __init__(self, context: Any, sensor: Any, requested: Sequence[str], positions: Floats):
+        self.sensor, self.color, self.num_observers = sensor, COLOR in requested, len(positions)
         self.context = context
-        self.shared, self.own = context.shared_aovs, context.observer_aovs
-        self.lookers = [context.make_observer(eye, len(eyes) == 1) for eye in eyes] if self.own else []
-        shared, own = (context.channel_names(names) for names in (self.shared, self.own))
-        self.names, self.count = [shared, *(own for _ in self.lookers)], len(shared) + len(own)
+        self.shared, self.per_observer = context.shared_aovs, context.observer_aovs
+        self.observer_contexts = (
+            [context.make_observer(eye, len(positions) == 1) for eye in positions] if self.per_observer else []
+        )
+        shared, per_observer = (context.channel_names(names) for names in (self.shared, self.per_observer))
+        self.channel_names, self.num_channels = (
+            [shared, *(per_observer for _ in self.observer_contexts)],
+            len(shared) + len(per_observer),
+        )
 
     def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any, active: Any) -> Iterator[tuple]:
         camera = self.context.trace(scene, [self.sensor], sampler, ray, active)
         shared = camera.compute_channels(self.shared)
-        radiance, shown, _ = camera.compute_radiance(scene, sampler, medium)
-        if self.lookers:
-            camera.eval_shared(radiance, shown, shared)
-        yield radiance, shown, shared
-        for looker in self.lookers:
-            yield 0, shown, camera.make_pixel(looker).compute_channels(self.own)
+        radiance, is_valid, _ = camera.compute_radiance(scene, sampler, medium)
+        if self.observer_contexts:
+            camera.eval_shared(radiance, is_valid, shared)
+        yield radiance, is_valid, shared
+        for looker in self.observer_contexts:
+            yield 0, is_valid, camera.make_pixel(looker).compute_channels(self.per_observer)
 
     def split(self, layer: int, pixels: Floats) -> dict[str, Floats]:
-        """The channels (height, width, C) of a layer by quantity."""
+        """Split the channels (height, width, C) of a layer by quantity."""
         alpha = _has_alpha(self.sensor.film())
         first = ([COLOR] if self.color else []) + self.shared
-        return split_channels(pixels, self.names[layer], self.own if layer else first, alpha)
+        return split_channels(pixels, self.channel_names[layer], self.per_observer if layer else first, alpha)
 
 
-def _render(scene: Scene, sensor: Any, layers: _Layers, spp: int, seed: int, reporter: Reporter) -> dict[str, Floats]:
-    """All quantities, each with an axis of observers in front."""
+def _render_layers(
+    scene: Scene, sensor: Any, layers: _ObserverLayers, spp: int, seed: int, reporter: Reporter
+) -> dict[str, Floats]:
+    """Render all quantities, each with a first axis of observers."""
     from nerg_mi.interruption import Interruption
     from nerg_mi.rendering.bands import render_bands, undividable_reason
 
     reason = undividable_reason(scene.mitsuba, sensor)
     if reason is not None:
-        raise NergError(f"this camera's rays cannot be shared between observers because of {reason}; give a Camera")
+        raise NergError(f"this camera cannot be rendered for several observers because of {reason}; pass a Camera")
     with Interruption() as stop:
 
         def on_strip(done: int, total: int) -> None:
@@ -135,13 +170,29 @@ def _render(scene: Scene, sensor: Any, layers: _Layers, spp: int, seed: int, rep
         parts = [layers.split(band.layer, np.array(band.film.develop(), np.float32)) for band in bands]
         stop.check()
     common, *each = parts
-    values = {name: broadcast_to_observers(value, layers.observers) for name, value in common.items()}
-    return values | {name: np.stack([one[name] for one in each]) for name in layers.own}
+    values = {name: broadcast_to_observers(value, layers.num_observers) for name, value in common.items()}
+    return values | {name: np.stack([one[name] for one in each]) for name in layers.per_observer}
 
 
 def split_channels(pixels: Floats, aov_names: Sequence[str], quantities: Sequence[str], alpha: bool) -> dict[str, Floats]:
-    """The channels (height, width, C) of a film by quantity: colour in front, perhaps ``alpha``, the AOVs at the
-    end."""
+    """Split the channels of an image by quantity.
+
+    Parameters
+    ----------
+    pixels : ndarray of shape (height, width, C)
+        Colour, an alpha channel if ``alpha``, and the AOVs.
+    aov_names : sequence of str
+        Names of the AOV channels.
+    quantities : sequence of str
+        Quantities to extract.
+    alpha : bool
+        Whether there is an alpha channel.
+
+    Returns
+    -------
+    dict of str to ndarray
+        Arrays (height, width) or (height, width, channels).
+    """
     first = pixels.shape[-1] - len(aov_names)
     columns: dict[str, list[int]] = {}
     for i, name in enumerate(aov_names):
@@ -151,8 +202,8 @@ def split_channels(pixels: Floats, aov_names: Sequence[str], quantities: Sequenc
         if name == COLOR:
             out[name] = np.ascontiguousarray(pixels[..., : first - alpha])
         else:
-            where = columns[name]
-            out[name] = np.ascontiguousarray(pixels[..., where[0]] if len(where) == 1 else pixels[..., where])
+            channels = columns[name]
+            out[name] = np.ascontiguousarray(pixels[..., channels[0]] if len(channels) == 1 else pixels[..., channels])
     return out
 
 

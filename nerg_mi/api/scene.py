@@ -1,4 +1,4 @@
-"""Scenes and fields: opened, made of fields, meshes and observers, and what calls of workflows take of them."""
+"""Scenes and fields: loading and construction, and the conversion of arguments of API functions."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from nerg_mi.formats.splats import choose_plugin
 from nerg_mi.rays.rays import Rays
 from nerg_mi.registration import get_plugin_class
 from nerg_mi.rendering.bands import is_nerg
-from nerg_mi.rendering.scene_writer import clip_distances
+from nerg_mi.rendering.scene_writer import compute_clip_distances
 from nerg_mi.transport.geometry import check_shape
 
 from .arrays import Camera, Floats, join_names, as_points
@@ -40,38 +40,68 @@ if TYPE_CHECKING:
     from nerg_mi.transport.geometry import SceneGeometry
 
 
-# ---- Shapes as a user has them (files, dicts, scenes, objects), as children of a Mitsuba scene ----
+# ---- Shapes (files, dicts, scenes, objects) as children of a Mitsuba scene ----
 
 
 def load_mesh_child(path: str | os.PathLike[str]) -> Any:
-    """The mesh file ``path`` as a child of a Mitsuba scene, in its colours or in grey, and seen from both sides: a
-    dict, or a mesh of what Mitsuba does not show as it is. What of the file is not used goes to Mitsuba's log. Raises
-    `NergError` for a file that is missing or damaged."""
+    """Load a mesh file as a two-sided child of a Mitsuba scene, with its colours or in grey.
+
+    Unused parts of the file are reported in Mitsuba's log.
+
+    Parameters
+    ----------
+    path : path-like
+        Mesh file.
+
+    Returns
+    -------
+    dict or mi.Mesh
+        A dict for ``mi.load_dict``; a mesh if Mitsuba cannot read the file as it is.
+
+    Raises
+    ------
+    NergError
+        The file does not exist or is damaged.
+    """
     import mitsuba as mi
 
     from nerg_mi.surfaces.mesh import mitsuba_mesh
 
     mesh = read_mesh_file(path)
-    log: Any = mi.Log  # of which the stubs know nothing
+    log: Any = mi.Log  # missing in the stubs
     for note in mesh.notes:
         log(mi.LogLevel.Warn, f"{path}: {note}")
     name, colors = ("face_color", mesh.face_colors) if mesh.colors is None else ("vertex_color", mesh.colors)
-    tint = {} if colors is None else {"reflectance": {"type": "mesh_attribute", "name": name}}
-    bsdf = {"type": "twosided", "bsdf": {"type": "diffuse", **tint}}
+    color_texture = {} if colors is None else {"reflectance": {"type": "mesh_attribute", "name": name}}
+    bsdf = {"type": "twosided", "bsdf": {"type": "diffuse", **color_texture}}
     if mesh.is_readable_by_mitsuba:
         return {"type": Path(path).suffix.lower()[1:], "filename": str(path), "bsdf": bsdf}
-    shown = mitsuba_mesh(mesh.vertices, mesh.faces, Path(path).stem, bsdf)
+    shape = mitsuba_mesh(mesh.vertices, mesh.faces, Path(path).stem, bsdf)
     if colors is not None:
-        shown.add_attribute(name, 3, colors.astype(np.float32).ravel())
-    return shown
+        shape.add_attribute(name, 3, colors.astype(np.float32).ravel())
+    return shape
 
 
 def to_scene_children(shapes: object, name: str = "shape") -> dict[str, Any]:
-    """``shapes`` by their names, as a scene's dict takes them; the variant must be active.
+    """Convert shapes to children of a Mitsuba scene dict; the variant must be active.
 
-    ``shapes``: a mesh file, a scene file, what `mi.load_dict` takes for a shape or a scene, a Mitsuba shape or scene,
-    or several of these in a list or in a dict by name. ``name``: of those that bring none. Raises `NergError` for
-    anything else.
+    Parameters
+    ----------
+    shapes : object
+        A mesh file, a scene file, a dict for ``mi.load_dict``, a Mitsuba shape or scene, or several of these in a list
+        or in a dict by name.
+    name : str
+        Name of shapes that have none.
+
+    Returns
+    -------
+    dict of str to object
+        The children by name.
+
+    Raises
+    ------
+    NergError
+        ``shapes`` is something else.
     """
     import mitsuba as mi
 
@@ -82,15 +112,15 @@ def to_scene_children(shapes: object, name: str = "shape") -> dict[str, Any]:
             return {name: load_mesh_child(shapes)}
         from nerg_mi.rendering.scene import load_scene
 
-        return _of_scene(load_scene(Path(shapes)), name)
+        return _list_scene_children(load_scene(Path(shapes)), name)
     if isinstance(shapes, mi.Scene):
-        return _of_scene(shapes, name)
+        return _list_scene_children(shapes, name)
     if isinstance(shapes, mi.Object):
         return {name: shapes}
     if isinstance(shapes, Mapping):
         if shapes.get("type") == "scene":
             with translate_mitsuba_errors():
-                return _of_scene(mi.load_dict(dict(shapes), optimize=False), name)
+                return _list_scene_children(mi.load_dict(dict(shapes), optimize=False), name)
         if "type" in shapes:
             return {name: dict(shapes)}
         named = [to_scene_children(child, str(key)) for key, child in shapes.items()]
@@ -98,29 +128,40 @@ def to_scene_children(shapes: object, name: str = "shape") -> dict[str, Any]:
         named = [to_scene_children(child, f"{name}_{i}") for i, child in enumerate(shapes)]
     else:
         raise NergError(
-            f"shapes are mesh or scene files, dicts for mi.load_dict or Mitsuba objects, got {type(shapes).__name__}"
+            "shapes must be mesh files, scene files, dicts for mi.load_dict or Mitsuba objects, "
+            f"got {type(shapes).__name__}"
         )
     return {key: child for children in named for key, child in children.items()}
 
 
-def _of_scene(scene, name: str) -> dict[str, Any]:
-    """Shapes of a scene, and those of its lights that are no shapes."""
+def _list_scene_children(scene, name: str) -> dict[str, Any]:
+    """Return the shapes of a scene by name, and its emitters that are not shapes."""
     shapes = list(scene.shapes())
-    found = {shape.id() or f"{name}_{i}": shape for i, shape in enumerate(shapes)}
-    if len(found) < len(shapes):
-        found = {f"{name}_{i}": shape for i, shape in enumerate(shapes)}
+    named = {shape.id() or f"{name}_{i}": shape for i, shape in enumerate(shapes)}
+    if len(named) < len(shapes):
+        named = {f"{name}_{i}": shape for i, shape in enumerate(shapes)}
     lights = [light for light in scene.emitters() if not any(s.is_emitter() and s.emitter() is light for s in shapes)]
-    return found | {f"{name}_light_{i}": light for i, light in enumerate(lights)}
+    return named | {f"{name}_light_{i}": light for i, light in enumerate(lights)}
 
 
-# ---- The Mitsuba variant that the library works in: the one that is set, or the best where none is ----
+# ---- The active Mitsuba variant ----
 
 
 def activate_mitsuba() -> ModuleType:
-    """The module ``mitsuba`` with a variant that fields work in.
+    """Import Mitsuba with a variant active.
 
-    A variant that is set stays set. Where none is, it is ``cuda_ad_rgb`` if that works here, and ``llvm_ad_rgb``
-    otherwise, as for the command `nerg`. Raises `NergError` for a variant without kernels.
+    An active variant is kept. Otherwise ``cuda_ad_rgb`` is activated if it works, and ``llvm_ad_rgb`` if not, as in the
+    command `nerg`.
+
+    Returns
+    -------
+    module
+        ``mitsuba``.
+
+    Raises
+    ------
+    NergError
+        A scalar variant is active.
     """
     import mitsuba as mi
 
@@ -131,20 +172,20 @@ def activate_mitsuba() -> ModuleType:
         activate_variant()
     elif variant.startswith("scalar"):
         raise NergError(
-            f'fields need a variant that compiles its kernels, and "{variant}" is active: '
-            'call mi.set_variant("llvm_ad_rgb") (or "cuda_ad_rgb") first'
+            f'fields do not support scalar variants such as "{variant}"; '
+            'call mi.set_variant("llvm_ad_rgb") or mi.set_variant("cuda_ad_rgb") first'
         )
     return mi
 
 
 def get_array_module() -> ModuleType:
-    """The Dr.Jit array types of the active variant (`nerg_mi.fields.mlp.namespace`)."""
+    """Return the Dr.Jit array types of the active variant (`nerg_mi.fields.mlp.namespace`)."""
     from nerg_mi.fields.mlp import namespace
 
     return namespace(activate_mitsuba().variant())
 
 
-# ---- Fields and rays in memory: read from files, handed to scenes, and saved again ----
+# ---- Fields and gaze samples in memory ----
 
 
 FilePath: TypeAlias = str | Path
@@ -155,9 +196,16 @@ Network = TypeVar("Network", RadianceField, AnyGazeField)
 class TrainedField(Generic[Network]):
     """A radiance field or a gaze field in memory.
 
-    ``network``: the field itself (`nerg_mi.fields`), whose arrays belong to the variant that was active when it was
-    made. ``provenance``: what it was trained on and with, as its file keeps it. ``name``: the file's, or what it is.
-    ``path``: the checkpoint that holds it, None where there is none.
+    Attributes
+    ----------
+    network : RadianceField or gaze field
+        The field (`nerg_mi.fields`). Its arrays belong to the variant that was active when it was created.
+    provenance : mapping
+        Training data, options and scores, as stored in the file.
+    name : str
+        Name of the file.
+    path : Path or None
+        The checkpoint; None if the field is not saved.
     """
 
     network: Network
@@ -172,22 +220,37 @@ class TrainedField(Generic[Network]):
 
     @property
     def bounds(self) -> NDArray[np.float64]:
-        """Lower and upper corner (2, 3) of where the field may hold density, in its own units."""
+        """Lower and upper corner (2, 3) of the bounding box of the field, in its own units."""
         return np.array([self.network.box.lower, self.network.box.upper], np.float64)
 
     @property
     def num_weights(self) -> int:
-        """How many numbers were trained."""
+        """Number of trained weights."""
         return sum(int(np.prod(value.shape)) for value in self.network.parameters().values())
 
     def save(self, path: FilePath, half: bool = False) -> Path:
-        """Write a checkpoint (.safetensors), whole or not at all, and give its path; ``half``: weights in fp16.
+        """Write a checkpoint (.safetensors) atomically.
 
-        Raises `NergError` for weights that are not finite or exceed fp16, and for a file that cannot be written.
+        Parameters
+        ----------
+        path : path
+            File to write.
+        half : bool
+            Whether to store the weights as fp16 instead of fp32.
+
+        Returns
+        -------
+        Path
+            The file.
+
+        Raises
+        ------
+        NergError
+            The weights are not finite or exceed fp16, or the file cannot be written.
         """
         path = Path(path)
         if path.suffix.lower() != ".safetensors":
-            raise NergError(f'a field is saved as .safetensors, and "{path}" ends otherwise; choose another name')
+            raise NergError(f'fields are saved as .safetensors; change the file name extension of "{path}"')
         if isinstance(self.network, RadianceField):
             save_radiance(self.network, path, dict(self.provenance), half)
         else:
@@ -202,12 +265,25 @@ class TrainedField(Generic[Network]):
 
 
 def load_field(path: FilePath) -> TrainedField[RadianceField]:
-    """Read a radiance field: density and colour of a place.
+    """Load a radiance field: density and colour of an environment.
 
-    ``path``: a checkpoint that ``nerg train radiance``, `train_radiance` or ``nerg import`` has written. Give what
-    comes back to `make_scene`, look at ``.bounds``, write it again with ``.save(path)``. Raises `NergError` for a file
-    that is missing, damaged, or holds something else.
+    Parameters
+    ----------
+    path : path
+        A checkpoint written by ``nerg train radiance``, `train_radiance` or ``nerg import``.
 
+    Returns
+    -------
+    TrainedField
+        The field, for `make_scene`.
+
+    Raises
+    ------
+    NergError
+        The file does not exist, is damaged, or contains something else.
+
+    Examples
+    --------
     >>> import nerg_mi as nerg
     >>> from importlib.resources import files
     >>> store = files("nerg_mi.scenes.store")
@@ -215,16 +291,30 @@ def load_field(path: FilePath) -> TrainedField[RadianceField]:
     >>> field.bounds.tolist()
     [[-0.1, -0.1, -0.1], [8.1, 6.1, 3.1]]
     """
-    network, metadata = load_radiance(_existing(path), get_array_module())
+    network, metadata = load_radiance(_as_path(path), get_array_module())
     return TrainedField(network, metadata.get("provenance", {}), Path(path).name, Path(path))
 
 
 def load_gaze(path: FilePath) -> TrainedField[AnyGazeField]:
-    """Read a gaze field, or an ensemble of them: how much surfaces attract an observer.
+    """Load a gaze field or an ensemble of gaze fields.
 
-    ``path``: a checkpoint that ``nerg train gaze``, `train_gaze` or ``nerg import`` has written; the rest is as for
-    `load_field`.
+    Parameters
+    ----------
+    path : path
+        A checkpoint written by ``nerg train gaze``, `train_gaze` or ``nerg import``.
 
+    Returns
+    -------
+    TrainedField
+        The field, for `make_scene`.
+
+    Raises
+    ------
+    NergError
+        The file does not exist, is damaged, or contains something else.
+
+    Examples
+    --------
     >>> import nerg_mi as nerg
     >>> from importlib.resources import files
     >>> store = files("nerg_mi.scenes.store")
@@ -232,17 +322,31 @@ def load_gaze(path: FilePath) -> TrainedField[AnyGazeField]:
     >>> gaze.kind
     'gaze'
     """
-    network, metadata = read_gaze(_existing(path), get_array_module())
+    network, metadata = read_gaze(_as_path(path), get_array_module())
     return TrainedField(network, metadata.get("provenance", {}), Path(path).name, Path(path))
 
 
 def load_rays(path: FilePath) -> Rays:
-    """Read rays of attention: who looked from where to where, and when.
+    """Load recorded gaze samples.
 
-    ``path``: a file (.npz or .parquet) that ``nerg rays import``, `import_rays` or the method ``save`` of rays has
-    written; or a dataset (.rays), of at most 50 million rays. Right-handed, z up, metres and seconds (`Rays`). Raises
-    `NergError` for a file that is missing or damaged.
+    Parameters
+    ----------
+    path : path
+        A file (.npz or .parquet) written by ``nerg rays import``, `import_rays` or `Rays.save`, or a dataset (.rays) of
+        at most 50 million samples.
 
+    Returns
+    -------
+    Rays
+        The samples, right-handed with z up, in metres and seconds.
+
+    Raises
+    ------
+    NergError
+        The file does not exist or is damaged.
+
+    Examples
+    --------
     >>> import nerg_mi as nerg
     >>> rays = nerg.Rays(t=[0, 0.1], person=[0, 0], persons=("Ada",), origin=[[1, 1, 1.6]] * 2,
     ...                  direction=[[1, 0, 0], [0, 1, 0]], confidence=[1, 1])
@@ -252,83 +356,132 @@ def load_rays(path: FilePath) -> Rays:
     """
     from nerg_mi.rays.dataset import load_rays as load
 
-    return load(_existing(path))
+    return load(_as_path(path))
 
 
-def _existing(path: FilePath) -> Path:
+def _as_path(path: FilePath) -> Path:
     try:
         return Path(path)
     except TypeError as error:
-        raise NergError(f"a file is named by a string or a path, got {type(path).__name__}") from error
+        raise NergError(f"a file must be given as a string or a path, got {type(path).__name__}") from error
 
 
-# ---- What a call of the library is given, looked at before any work: names of options first, then files ----
+# ---- Checks of options and files, before any computation ----
 
 
 Options = TypeVar("Options", bound="DataclassInstance")
 
-_WRITTEN = {"pictures", "json_file", "store"}
-"""Options that name a file or a folder which is written."""
+_OUTPUT_OPTIONS = {"pictures", "json_file", "store"}
+"""Options that name a file or folder to write."""
 
 
-def build_options(kind: type[Options], job: str, given: Options | None, changes: dict[str, Any]) -> Options:
-    """An object of the dataclass ``kind``: ``given`` (or the defaults) with ``changes``, for the variant in use. Files
-    may be named by strings.
+def build_options(kind: type[Options], function: str, options: Options | None, overrides: dict[str, Any]) -> Options:
+    """Build the options of a workflow for the active variant.
 
-    Raises `NergError` for an option that the ``job`` has not, naming those that it has, and for a file that is missing
-    or is none.
+    Parameters
+    ----------
+    kind : type
+        Dataclass of the options.
+    function : str
+        Name of the API function, for messages.
+    options : dataclass instance or None
+        Base options; None uses the defaults.
+    overrides : dict
+        Values by option name. Files can be given as strings.
+
+    Returns
+    -------
+    dataclass instance
+        The options.
+
+    Raises
+    ------
+    NergError
+        An option or a file does not exist.
     """
     types = {f.name: str(f.type) for f in fields(kind)}
-    if "mode" in changes:
-        raise NergError(f"{job} works in the variant that is set; call mi.set_variant({changes['mode']!r}) before it")
-    check_names(job, changes, [name for name in types if name != "mode"])
+    if "mode" in overrides:
+        raise NergError(f"{function} uses the active variant; call mi.set_variant({overrides['mode']!r}) before it")
+    check_names(function, overrides, [name for name in types if name != "mode"])
     if "mode" in types:
-        changes = {**changes, "mode": activate_mitsuba().variant()}
-    options = replace(kind() if given is None else given, **changes)
-    files = {k: getattr(options, k) for k, of in types.items() if "Path" in of}
+        overrides = {**overrides, "mode": activate_mitsuba().variant()}
+    updated = replace(kind() if options is None else options, **overrides)
+    files = {k: getattr(updated, k) for k, type_name in types.items() if "Path" in type_name}
     return replace(
-        options, **{k: Path(v) if k in _WRITTEN else resolve_file(v, k) for k, v in files.items() if v is not None}
+        updated, **{k: Path(v) if k in _OUTPUT_OPTIONS else resolve_file(v, k) for k, v in files.items() if v is not None}
     )
 
 
 def check_names(function: str, names: Iterable[str], allowed: Collection[str], noun: str = "option") -> None:
-    """Raise `NergError` for a name ``given`` that is none of those ``known``."""
+    """Check names of options.
+
+    Parameters
+    ----------
+    job : str
+        Name of the API function, for messages.
+    given : iterable of str
+        Names to check.
+    known : collection of str
+        Allowed names.
+    what : str
+        What the names stand for, for messages.
+
+    Raises
+    ------
+    NergError
+        A name is not allowed; the message suggests a similar one.
+    """
     for name in names:
         if name not in allowed:
             near = difflib.get_close_matches(name, allowed, n=1)
-            meant = f'did you mean "{near[0]}"?' if near else f"it has {join_names(list(allowed))}"
+            meant = f'did you mean "{near[0]}"?' if near else f"available: {join_names(list(allowed))}"
             raise NergError(f'{function} has no {noun} "{name}"; {meant}')
 
 
 def resolve_file(value: object, name: str) -> Path:
-    """The file or folder that the argument ``name`` is: a string, a path, or a field or scene that has a file.
+    """Return the file that an argument names.
 
-    Raises `NergError` for one that is missing, and for anything else.
+    Parameters
+    ----------
+    value : object
+        A string, a path, or a field or scene that has a file.
+    name : str
+        Name of the argument, for messages.
+
+    Returns
+    -------
+    Path
+        The existing file.
+
+    Raises
+    ------
+    NergError
+        The file does not exist, or ``value`` is something else.
     """
     path = getattr(value, "path", None) or value
     if not isinstance(path, (str, os.PathLike)):
-        remedy = "save it, and give the file" if hasattr(value, "save") else "give its name"
-        raise NergError(f'"{name}" is a file, named by a string or a path, got {type(value).__name__}; {remedy}')
+        remedy = "; save it and pass the file" if hasattr(value, "save") else ""
+        raise NergError(f'"{name}" must be a file, given as a string or a path, got {type(value).__name__}{remedy}')
     if not os.path.exists(path):
-        raise MissingFile(f'there is no file "{os.fspath(path)}", which "{name}" names; correct its name')
+        raise MissingFile(f'the file "{os.fspath(path)}" of "{name}" does not exist; correct the path')
     return Path(path)
 
 
 def resolve_rays(value: object) -> Rays | Path:
-    """Rays in memory as they are, or their file. Raises `NergError` for anything else."""
+    """Return `Rays` unchanged, or the path of their file. Raises `NergError` for anything else."""
     if isinstance(value, Rays):
         return value
     if not isinstance(value, (str, os.PathLike)):
         raise NergError(
-            f"rays are what load_rays and import_rays give, or a file of theirs, got {type(value).__name__}; "
-            "import_rays makes rays of a table (.csv, .parquet)"
+            f"rays must be a Rays object or a file of one, got {type(value).__name__}; "
+            "use import_rays to read a table (.csv, .parquet)"
         )
     return resolve_file(value, "rays")
 
 
 @contextmanager
 def resolve_checkpoint(value: object, name: str) -> Iterator[Path]:
-    """The checkpoint of a field that is the argument ``name``: its file, or one that is written for the block."""
+    """Yield the checkpoint of a field: its file, or a temporary one for the duration of the block."""
     if isinstance(value, TrainedField) and value.path is None:
         with TemporaryDirectory() as folder:
             yield value.save(Path(folder) / f"{value.kind}.safetensors")
@@ -336,21 +489,38 @@ def resolve_checkpoint(value: object, name: str) -> Iterator[Path]:
     yield resolve_file(value, name)
 
 
-# ---- Scenes: a place, whose gaze it is, and from where it is seen ----
+# ---- Scenes ----
 
 
 COLOR = "color"
-"""The quantity that is no AOV: linear colour."""
+"""Name of the linear colour, the only quantity that is not an AOV."""
 
 
 class Scene:
-    """A Mitsuba scene whose integrator is ``nerg``: what `render`, `trace`, `observe` and `attention` work on.
+    """A Mitsuba scene with the integrator ``nerg``, for `render`, `trace`, `observe` and `attention`.
 
-    ``mitsuba``: the scene itself, with which everything works that works with Mitsuba's scenes (``mi.traverse``,
-    ``mi.render``, ...). ``path``: its file, where it is what that says. `make_scene` makes one of fields;
-    ``Scene(scene)`` takes one that is loaded already, and ``Scene.load(path)`` a file. Raises `NergError` for a
-    scene with another integrator, and for shapes that are not finite.
+    `make_scene` makes a scene from fields, ``Scene(scene)`` wraps a loaded Mitsuba scene, and ``Scene.load(path)``
+    loads a file.
 
+    Parameters
+    ----------
+    mitsuba : mi.Scene
+        The scene.
+
+    Attributes
+    ----------
+    mitsuba : mi.Scene
+        The scene, for ``mi.traverse``, ``mi.render`` and other functions of Mitsuba.
+    path : Path or None
+        The scene file, if the scene is its unchanged content.
+
+    Raises
+    ------
+    NergError
+        The scene has another integrator, or the vertices of a shape are not finite.
+
+    Examples
+    --------
     >>> import nerg_mi as nerg
     >>> from importlib.resources import files
     >>> store = files("nerg_mi.scenes.store")
@@ -364,8 +534,8 @@ class Scene:
         if not is_nerg(integrator):
             have = "none" if integrator is None else f'"{integrator.class_name()}"'
             raise NergError(
-                f'a scene needs the integrator "nerg", and this one has {have}; '
-                "make one around its shapes with make_scene(shapes=scene)"
+                f'a scene needs the integrator "nerg", but this one has {have}; '
+                "use make_scene(shapes=scene) to make a scene with its shapes"
             )
         for shape in mitsuba.shapes():
             check_shape(shape)
@@ -374,62 +544,83 @@ class Scene:
 
     @classmethod
     def load(cls, path: FilePath, **values: object) -> Scene:
-        """The scene of an XML file; ``values`` for its `<default>` elements and `$key`, as those of ``nerg render -D``.
+        """Load a scene file.
 
-        Raises `NergError` for what Mitsuba does not take.
+        Parameters
+        ----------
+        path : path
+            XML file.
+        **values
+            Values of its `<default>`s and `$key`s, as for ``nerg render -D``.
+
+        Returns
+        -------
+        Scene
+            The scene.
+
+        Raises
+        ------
+        NergError
+            Mitsuba rejects the scene, or its integrator is not ``nerg``.
         """
         from nerg_mi.rendering.scene import load_scene
 
         activate_mitsuba()
-        # Merged meshes lose their names.
+        # Merged meshes would lose their names.
         scene = cls(load_scene(Path(path), {key: str(value) for key, value in values.items()}, merge=False))
         scene.path = None if values else Path(path)
         return scene
 
     @classmethod
-    def coerce(cls, given: Scene | FilePath | mi.Scene) -> Scene:
-        """A scene as a call is given it: one of these, a file of one, or Mitsuba's. Raises `NergError` for anything
-        else."""
-        if isinstance(given, Scene):
-            return given
-        if isinstance(given, (str, os.PathLike)):
-            return cls.load(given)
+    def coerce(cls, scene: Scene | FilePath | mi.Scene) -> Scene:
+        """Return ``scene`` as a `Scene`; a scene file is loaded, and a Mitsuba scene is wrapped. Raises `NergError`."""
+        if isinstance(scene, Scene):
+            return scene
+        if isinstance(scene, (str, os.PathLike)):
+            return cls.load(scene)
         import mitsuba as mi
 
         activate_mitsuba()
-        if isinstance(given, mi.Scene):
-            return cls(given)
-        raise NergError(f"a scene is what make_scene and Scene.load give, or a scene file, got {type(given).__name__}")
+        if isinstance(scene, mi.Scene):
+            return cls(scene)
+        raise NergError(f"a scene must be a Scene, a Mitsuba scene or a scene file, got {type(scene).__name__}")
 
     @property
     def integrator(self) -> Any:
-        """The scene's integrator."""
+        """The integrator ``nerg`` of the scene."""
         return self.mitsuba.integrator()
 
     @property
     def geometry(self) -> SceneGeometry:
-        """What rays of this scene meet: its field or volumes, and its shapes."""
+        """The geometry that rays can hit: the field or volumes, and the shapes."""
         from nerg_mi.transport.geometry import SceneGeometry
 
         return SceneGeometry(self.integrator.medium, self.mitsuba)
 
     @property
     def has_gaze(self) -> bool:
-        """Whether there is a gaze field."""
+        """Whether the scene has a gaze field."""
         return self.integrator.gaze is not None
 
     @property
     def observer(self) -> Floats | None:
-        """Position (3,) of the scene's own observer; None where the camera is the observer."""
+        """Position (3,) of the observer in scene units; None if the camera is the observer."""
         from nerg_mi.transport.observer import sensor_center
 
         sensor = self.integrator.observer
         return None if sensor is None else np.ravel(np.array(sensor_center(sensor), np.float32))
 
     def set_constant_weights(self, constant: bool = True) -> None:
-        """Write the weights of its trained fields into the kernels, for many pictures or rays of one scene: the same
-        results to the bit in less time, after some seconds of compilation (the page on performance, "Weights as
-        constants"). ``constant`` false takes it back."""
+        """Compile the weights of the trained fields into the kernels.
+
+        This makes many images or rays of one scene faster, after some seconds of compilation. The results are
+        identical. See "Weights as constants" on the page about performance.
+
+        Parameters
+        ----------
+        constant : bool
+            False reverts it.
+        """
         from nerg_mi.fields.mlp import set_constant_weights
         from nerg_mi.rendering.bands import get_trained_fields
 
@@ -438,33 +629,48 @@ class Scene:
 
     @property
     def default_quantities(self) -> tuple[str, ...]:
-        """What is computed when nothing is asked for by name."""
+        """The quantities to compute if none are requested."""
         return (COLOR, "depth", "opacity", *(("gaze", "visibility") if self.has_gaze else ()))
 
     def resolve_sensor(self, camera: Camera | int | mi.Sensor | None = None) -> mi.Sensor:
-        """The sensor that ``camera`` names: a `Camera`, one of the scene's own by its number, or a Mitsuba sensor;
-        without any the scene's first. Raises `NergError` where there is none."""
+        """Return a sensor for ``camera``.
+
+        Parameters
+        ----------
+        camera : Camera, int or mi.Sensor, optional
+            A `Camera`, the index of a sensor of the scene, or a Mitsuba sensor. Default: the first sensor of the scene.
+
+        Returns
+        -------
+        mi.Sensor
+            The sensor.
+
+        Raises
+        ------
+        NergError
+            The scene has no such sensor.
+        """
         import mitsuba as mi
 
         if isinstance(camera, Camera):
             with translate_mitsuba_errors():
-                return self._fitted(mi.load_dict(camera.to_dict()), camera)
+                return self._fit_clip_distances(mi.load_dict(camera.to_dict()), camera)
         if isinstance(camera, mi.Sensor):
             return camera
         if not (camera is None or isinstance(camera, (int, np.integer))):
-            raise NergError(f"a camera is a Camera, a number or a Mitsuba sensor, got {type(camera).__name__}")
+            raise NergError(f"a camera must be a Camera, an index or a Mitsuba sensor, got {type(camera).__name__}")
         sensors = self.mitsuba.sensors()
         if not 0 <= (number := camera or 0) < len(sensors):
-            have = f"{len(sensors)} of its own" if sensors else "none of its own"
-            raise NergError(f"the scene has {have}, and camera {number} was asked for; give camera=Camera(...)")
+            have = f"{len(sensors)} sensors" if sensors else "no sensors"
+            raise NergError(f"the scene has {have}, so camera {number} does not exist; pass camera=Camera(...)")
         return sensors[number]
 
-    def _fitted(self, sensor: mi.Sensor, camera: Camera) -> mi.Sensor:
-        """The ``sensor`` of ``camera``, made to see as near and as far as this scene needs."""
+    def _fit_clip_distances(self, sensor: mi.Sensor, camera: Camera) -> mi.Sensor:
+        """Extend the clip distances of the ``sensor`` of ``camera`` to the extent of the scene."""
         import mitsuba as mi
 
         params: Any = mi.traverse(sensor)
-        near, far = clip_distances(self.geometry.extent(camera.origin))
+        near, far = compute_clip_distances(self.geometry.extent(camera.origin))
         if near < params["near_clip"] or far > params["far_clip"]:
             params["near_clip"], params["far_clip"] = near, far
             params.update()
@@ -478,7 +684,7 @@ class Scene:
         if "field" not in files and medium is not None:
             lines.append("  density: a volume" + (" with colour" if medium.has_color else ""))
         lines += [f"  shapes: {shapes}"] if shapes else []
-        lines.append(f"  observer: {'the camera' if self.observer is None else _written(self.observer)}")
+        lines.append(f"  observer: {'the camera' if self.observer is None else _format_position(self.observer)}")
         for i, sensor in enumerate(self.mitsuba.sensors()):
             width, height = sensor.film().crop_size()
             lines.append(f"  camera {i}: {width} x {height} pixels")
@@ -495,17 +701,40 @@ def make_scene(
     to_world: ArrayLike | None = None,
     **settings: Any,
 ) -> Scene:
-    """A scene of a trained place, a gaze field, or shapes, without writing XML.
+    """Make a scene from fields, shapes or both, without writing XML.
 
-    ``field``, ``gaze``: what `load_field`, `load_gaze` or a training gave, or the name of a checkpoint; a place may be
-    Gaussian splats, too: a file of them, or what `nerg_mi.formats.splats.read_splats` gave. ``shapes``: what
-    stands in the field, or is all there is: a mesh file (.ply, .obj, .glb), a scene file, a dict for ``mi.load_dict``,
-    a Mitsuba scene or shape, or several of these in a list or a dict by name. ``camera``: a `Camera`, or a sensor as
-    Mitsuba takes it. ``observer``: position (3,) of the one whose gaze it is; without it the camera is the observer.
-    ``to_world``: (4, 4) rotation, uniform scale and translation that place both fields in the scene. ``settings``:
-    parameters of the integrator ``nerg`` (``falloff=0.3``, ``visibility="map"``, ``density={"type": ...}``,
-    ``kde={"type": "gazekde", "filename": "day.npz"}``, ...); its docstring is their manual. Raises `NergError`.
+    Parameters
+    ----------
+    field : TrainedField, RadianceField, Splats or path, optional
+        The environment: a radiance field (`load_field`, `train_radiance`) or Gaussian splats
+        (`nerg_mi.formats.splats.read_splats`), in memory or as a file.
+    gaze : TrainedField, gaze field or path, optional
+        The gaze field (`load_gaze`, `train_gaze`), in memory or as a file.
+    shapes : object, optional
+        Shapes in the environment, or all of it: a mesh file (.ply, .obj, .glb), a scene file, a dict for
+        ``mi.load_dict``, a Mitsuba scene or shape, or several of these in a list or in a dict by name.
+    camera : Camera, mapping or mi.Sensor, optional
+        The camera.
+    observer : array_like of shape (3,), optional
+        Position of the observer in scene units. Default: the camera is the observer.
+    to_world : array_like of shape (4, 4), optional
+        Rotation, uniform scale and translation from the frame of both fields to the scene.
+    **settings
+        Parameters of the integrator ``nerg``, such as ``falloff=0.3``, ``visibility="map"``, ``density={"type": ...}``
+        or ``kde={"type": "gazekde", "filename": "day.npz"}``. They are documented in its docstring.
 
+    Returns
+    -------
+    Scene
+        The scene.
+
+    Raises
+    ------
+    NergError
+        An argument is invalid, or there is neither a field nor a shape.
+
+    Examples
+    --------
     >>> import nerg_mi as nerg
     >>> from importlib.resources import files
     >>> store = files("nerg_mi.scenes.store")
@@ -521,100 +750,123 @@ def make_scene(
     import mitsuba as mi
 
     activate_mitsuba()
-    # Objects may be nested by any name.
-    check_names("make_scene", (k for k, v in settings.items() if isinstance(v, _PLAIN)), _parameters(), "setting")
+    # Children of the integrator can have any name.
+    check_names(
+        "make_scene",
+        (k for k, v in settings.items() if isinstance(v, _SCALAR_TYPES)),
+        _integrator_parameters(),
+        "setting",
+    )
     integrator: dict[str, Any] = {"type": "nerg", **settings}
-    where = None if to_world is None else _transform(to_world)
+    transform = None if to_world is None else _as_transform(to_world)
     if field is not None:
-        integrator["field"] = _volume(field, "field", where)
+        integrator["field"] = _make_volume(field, "field", transform)
     if gaze is not None:
-        integrator["gaze"] = _volume(gaze, "gaze", where)
+        integrator["gaze"] = _make_volume(gaze, "gaze", transform)
     if observer is not None:
         position = as_points(observer, "the observer")
         if len(position) != 1:
-            raise NergError("a scene has one observer; give render, observe or attention the others")
-        integrator["observer"] = _observer_sensor(position[0])
+            raise NergError("a scene has a single observer; pass several observers to render, observe or attention")
+        integrator["observer"] = _make_observer_sensor(position[0])
     integrator.setdefault("aovs", ",".join(["depth", "opacity", *(["gaze", "visibility"] if gaze is not None else [])]))
     children = to_scene_children(shapes)
     if not children and integrator.keys().isdisjoint({"field", "density"}):
-        raise NergError("there is nothing to see in this scene; give make_scene a field or shapes")
+        raise NergError("the scene is empty; pass a field or shapes to make_scene")
     if camera is not None:
         children["camera"] = camera.to_dict() if isinstance(camera, Camera) else camera
     with translate_mitsuba_errors():
-        # Merged meshes lose their names.
+        # Merged meshes would lose their names.
         scene = Scene(mi.load_dict({"type": "scene", "integrator": integrator, **children}, optimize=False))
     if isinstance(camera, Camera):
-        scene._fitted(next(s for s in scene.mitsuba.sensors() if s.id() == "camera"), camera)
+        scene._fit_clip_distances(next(s for s in scene.mitsuba.sensors() if s.id() == "camera"), camera)
     return scene
 
 
-_PLAIN = (str, bool, int, float, np.number)
+_SCALAR_TYPES = (str, bool, int, float, np.number)
 
 
-def _parameters() -> list[str]:
-    """The parameters of the integrator ``nerg``, which its manual lists."""
+def _integrator_parameters() -> list[str]:
+    """Return the parameters of the integrator ``nerg``, as listed in its manual."""
     manual = sys.modules[get_plugin_class("nerg").__module__].__doc__ or ""
     rows = re.findall(r"^ \* - ([a-z_]+(?:, [a-z_]+)*)$", manual, re.MULTILINE)
     return [name for row in rows for name in row.split(", ")]
 
 
-def _observer_sensor(position: ArrayLike) -> dict:
-    """An observer at ``position`` (3,) as the integrator takes it: a sensor of which only the centre counts."""
+def _make_observer_sensor(position: ArrayLike) -> dict:
+    """Make the sensor of an observer at ``position`` (3,), of which only the position is used."""
     import mitsuba as mi
 
-    place = mi.ScalarTransform4d().translate(np.asarray(position, np.float64).tolist())
-    return {"type": "perspective", "to_world": place, "film": {"type": "hdrfilm", "width": 1, "height": 1}}
+    to_world = mi.ScalarTransform4d().translate(np.asarray(position, np.float64).tolist())
+    return {"type": "perspective", "to_world": to_world, "film": {"type": "hdrfilm", "width": 1, "height": 1}}
 
 
 def make_aov_context(scene: Scene, quantities: Sequence[str]) -> Any:
-    """What ``quantities`` of the scene are computed with; the ``own`` depend on the observer, the ``shared`` do not.
+    """Return the context that computes ``quantities`` of the scene.
 
-    Raises `NergError` for those that it cannot compute.
+    Its ``own`` quantities depend on the observer, its ``shared`` ones do not. Raises `NergError` for quantities that
+    the scene cannot compute.
     """
     return scene.integrator.make_context([name for name in quantities if name != COLOR], COLOR in quantities)
 
 
 def resolve_quantities(scene: Scene, names: object, allowed: tuple[str, ...] | None = None) -> tuple[str, ...]:
-    """The quantities ``names`` (a name, several, or None for the scene's own choice), each once.
+    """Return requested quantities without duplicates.
 
-    ``known``: those that may be asked for; None leaves it to the integrator to say. Raises `NergError`.
+    Parameters
+    ----------
+    scene : Scene
+        The scene.
+    names : str, sequence of str or None
+        Requested quantities; None selects the default.
+    known : tuple of str, optional
+        Allowed quantities. None: the integrator checks them later.
+
+    Returns
+    -------
+    tuple of str
+        The quantities.
+
+    Raises
+    ------
+    NergError
+        A name is not a string or not allowed.
     """
     if names is None:
-        chosen = scene.default_quantities
-        return tuple(name for name in chosen if allowed is None or name in allowed)
-    given = [names] if isinstance(names, str) else list(names) if isinstance(names, (list, tuple)) else None
-    if not given or not all(isinstance(name, str) for name in given):
-        raise NergError(f'quantities are names such as "depth", got {names!r}')
-    for name in given:
+        defaults = scene.default_quantities
+        return tuple(name for name in defaults if allowed is None or name in allowed)
+    requested = [names] if isinstance(names, str) else list(names) if isinstance(names, (list, tuple)) else None
+    if not requested or not all(isinstance(name, str) for name in requested):
+        raise NergError(f'quantities must be names such as "depth", got {names!r}')
+    for name in requested:
         if allowed is not None and name not in allowed:
-            raise NergError(f'there is no quantity "{name}" here; there are {join_names(allowed)}')
-    return tuple(dict.fromkeys(given))
+            raise NergError(f'the quantity "{name}" is not available here; available: {join_names(allowed)}')
+    return tuple(dict.fromkeys(requested))
 
 
-def _volume(given: object, role: str, to_world: Any) -> Any:
-    """The volume of a field, which is a file or in memory, for the integrator's property ``role``."""
-    plugin = {"field": "splats" if isinstance(given, Splats) else "nerf", "gaze": "gazefield"}[role]
-    if isinstance(given, (str, os.PathLike)):
-        given = resolve_file(given, role)
-        plugin = choose_plugin(given) if role == "field" else plugin
-        where = {} if to_world is None else {"to_world": to_world}
-        return {"type": plugin, "filename": os.path.abspath(given), **where}
+def _make_volume(field: object, role: str, to_world: Any) -> Any:
+    """Make the volume of a field, a file or an object, for the integrator's property ``role``."""
+    plugin = {"field": "splats" if isinstance(field, Splats) else "nerf", "gaze": "gazefield"}[role]
+    if isinstance(field, (str, os.PathLike)):
+        field = resolve_file(field, role)
+        plugin = choose_plugin(field) if role == "field" else plugin
+        transform = {} if to_world is None else {"to_world": to_world}
+        return {"type": plugin, "filename": os.path.abspath(field), **transform}
     volume = get_plugin_class(plugin)
-    if isinstance(given, TrainedField):
-        return volume.of(given.network, to_world, given.name)
-    return volume.of(given, to_world)
+    if isinstance(field, TrainedField):
+        return volume.of(field.network, to_world, field.name)
+    return volume.of(field, to_world)
 
 
-def _transform(matrix: ArrayLike) -> Any:
+def _as_transform(matrix: ArrayLike) -> Any:
     import mitsuba as mi
 
     from nerg_mi.maths.geometry import Similarity
 
     matrix = np.array(getattr(matrix, "matrix", matrix), np.float64)
     if matrix.shape != (4, 4):
-        raise NergError(f'"to_world" must have 4 x 4 numbers, got the shape {matrix.shape}')
+        raise NergError(f'"to_world" must have the shape (4, 4), got {matrix.shape}')
     return mi.ScalarTransform4d(Similarity(matrix).matrix)
 
 
-def _written(position: Floats) -> str:
+def _format_position(position: Floats) -> str:
     return f"({', '.join(f'{x:.4g}' for x in position)})"

@@ -1,4 +1,4 @@
-"""Workflows as calls: training, evaluation, alignment, import of tracking, statistics and bakes."""
+"""Workflows as functions: training, evaluation, alignment, import of recordings, statistics and baking."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from nerg_mi.workflows.study import StudyResult
 
 
-# ---- How tracking lies in a place ----
+# ---- Alignment ----
 
 
 def align(
@@ -41,31 +41,51 @@ def align(
     *,
     options: AlignOptions | None = None,
     reporter: Reporter = SILENT,
-    **changes: Any,
+    **overrides: Any,
 ) -> Alignment:
-    """Find the similarity from the frame of ``rays`` (z up, metres) to that of a place.
+    """Estimate the similarity transform from the frame of recordings to the frame of an environment.
 
-    ``rays``: what `load_rays` or `import_rays` gave, or a file of them; not needed where other evidence is given.
-    ``output``: alignment to write besides (.json), which ``align=`` of `train_gaze` takes, with a picture beside it.
-    ``changes``: options one by one on top of ``options``: the place (``field=``, ``scene=``, ``surface=``), evidence
-    (``pairs=``, ``twin=``, ``cameras=`` with ``place_cameras=``; none of them: the tracking alone), and what is known
-    (``up=``, ``scale=``, ...); `nerg_mi.workflows.rays_commands.AlignOptions` says what there is. Raises `NergError`
-    for evidence that leaves it open, for a mirrored frame and for a bad fit.
+    Parameters
+    ----------
+    rays : Rays or path, optional
+        Recordings (z up, metres). Not needed if other evidence is given.
+    output : path, optional
+        Alignment file (.json) to write, for the option ``align`` of `train_gaze`, together with a picture.
+    options : AlignOptions, optional
+        Base options (`nerg_mi.workflows.rays_commands.AlignOptions`).
+    reporter : Reporter
+        Receives the progress.
+    **overrides
+        Single options on top of ``options``: the environment (``field``, ``scene``, ``surface``), the evidence
+        (``pairs``, ``twin``, ``cameras`` with ``place_cameras``; by default the recordings alone), and known parts
+        (``up``, ``scale``, ...).
 
+    Returns
+    -------
+    Alignment
+        The transform and its quality.
+
+    Raises
+    ------
+    NergError
+        The evidence is insufficient, the frames are mirrored, or the fit is bad.
+
+    Examples
+    --------
     >>> import nerg_mi as nerg
     >>> rows = "0,0,0,1,0,0\\n2,0,0,5,0,0\\n0,1,0,1,2,0\\n0,0,1,1,0,2\\n"
     >>> _ = (folder / "pairs.csv").write_text("x,y,z,place_x,place_y,place_z\\n" + rows)
-    >>> found = nerg.align(pairs=folder / "pairs.csv")
-    >>> (found.matrix.round(6) + 0.0)[0].tolist()
+    >>> alignment = nerg.align(pairs=folder / "pairs.csv")
+    >>> (alignment.matrix.round(6) + 0.0)[0].tolist()
     [2.0, 0.0, 0.0, 1.0]
     """
     from nerg_mi.workflows import align as alignment
 
-    job = build_options(AlignOptions, "align", options, changes)
-    return alignment.align(None if rays is None else resolve_rays(rays), output, job, reporter).alignment
+    resolved = build_options(AlignOptions, "align", options, overrides)
+    return alignment.align(None if rays is None else resolve_rays(rays), output, resolved, reporter).alignment
 
 
-# ---- Gaze on surfaces, for notebooks ----
+# ---- Baking ----
 
 
 def bake(
@@ -75,16 +95,38 @@ def bake(
     rays: Rays | FilePath | None = None,
     options: BakeOptions | None = None,
     reporter: Reporter = SILENT,
-    **changes: Any,
+    **overrides: Any,
 ) -> Bake | SplatBake:
-    """How much gaze each square metre of ``surface`` receives: a mesh file, a scene file, a radiance field's surface,
-    or a file of Gaussian splats.
+    """Compute the attention per area on a surface.
 
-    ``rays``: what `load_rays` gave, or a file of them; the people whose places a gaze field is asked for, or whose gaze
-    it is. ``outputs``: files to write (.ply, .glb, .csv, .json). ``changes``: options one by one
-    (``gaze="gaze.safetensors"``, ``observer=(4.4, 2.8, 1.6)``, ``smooth=0.05``, ...) on top of ``options``;
-    `nerg_mi.workflows.scene_commands.BakeOptions` says what there is. Raises `NergError`.
+    Parameters
+    ----------
+    surface : path
+        A mesh file, a scene file, a radiance field, or a file of Gaussian splats.
+    outputs : path or sequence of path
+        Files to write (.ply, .glb, .csv, .json).
+    rays : Rays or path, optional
+        Recordings. With a gaze field they provide the positions of the observers; otherwise they are the gaze to bake.
+    options : BakeOptions, optional
+        Base options (`nerg_mi.workflows.scene_commands.BakeOptions`).
+    reporter : Reporter
+        Receives the progress.
+    **overrides
+        Single options on top of ``options``, such as ``gaze="gaze.safetensors"``, ``observer=(4.4, 2.8, 1.6)`` or
+        ``smooth=0.05``.
 
+    Returns
+    -------
+    Bake or SplatBake
+        Attention per square metre and its sums.
+
+    Raises
+    ------
+    NergError
+        An option or a file is invalid.
+
+    Examples
+    --------
     >>> import nerg_mi as nerg
     >>> from importlib.resources import files
     >>> store = files("nerg_mi.scenes.store")
@@ -97,13 +139,13 @@ def bake(
 
     in_memory = rays if isinstance(rays, Rays) else None
     if rays is not None and in_memory is None:
-        changes = {**changes, "rays": rays}
-    job = build_options(BakeOptions, "bake", options, changes)
+        overrides = {**overrides, "rays": rays}
+    resolved = build_options(BakeOptions, "bake", options, overrides)
     files = [outputs] if isinstance(outputs, (str, Path)) or not isinstance(outputs, Sequence) else list(outputs)
-    return baking.bake_any(resolve_file(surface, "surface"), [Path(str(f)) for f in files], job, reporter, in_memory)
+    return baking.bake_any(resolve_file(surface, "surface"), [Path(str(f)) for f in files], resolved, reporter, in_memory)
 
 
-# ---- Scores of fields, and what settings cost ----
+# ---- Evaluation ----
 
 
 def evaluate_radiance(
@@ -112,26 +154,47 @@ def evaluate_radiance(
     *,
     options: RadianceScoreOptions | None = None,
     reporter: Reporter = SILENT,
-    **changes: Any,
+    **overrides: Any,
 ) -> ViewScores:
-    """Score a radiance field on posed photos: PSNR, SSIM and, where their depth is known, its error.
+    """Evaluate a radiance field on posed photos.
 
-    ``field``: a checkpoint, or a field in memory. ``photos``: as for `train_radiance`; those that were held out are
-    scored. ``changes``: options one by one (``spp=16``, ``pictures="folder"``, ...) on top of ``options``;
-    `nerg_mi.workflows.radiance_commands.RadianceScoreOptions` says what there is. Raises `NergError`.
+    Parameters
+    ----------
+    field : TrainedField or path
+        The radiance field.
+    photos : path
+        Posed photos, as for `train_radiance`. By default the held-out photos are used.
+    options : RadianceScoreOptions, optional
+        Base options (`nerg_mi.workflows.radiance_commands.RadianceScoreOptions`).
+    reporter : Reporter
+        Receives the progress.
+    **overrides
+        Single options on top of ``options``, such as ``spp=16`` or ``pictures="folder"``.
 
+    Returns
+    -------
+    ViewScores
+        PSNR, SSIM and, if the photos have depth, the depth error of each photo.
+
+    Raises
+    ------
+    NergError
+        An option or a file is invalid.
+
+    Examples
+    --------
     >>> import nerg_mi as nerg
     >>> from importlib.resources import files
     >>> store = files("nerg_mi.scenes.store")
     >>> scores = nerg.evaluate_radiance(store / "store.safetensors", photos, width=24, train=True)
-    >>> len(scores.psnr) == len(scores.views), scores.psnr_mean > 20  # of a folder of posed photos
+    >>> len(scores.psnr) == len(scores.views), scores.psnr_mean > 20  # photos: a folder of posed photos
     (True, True)
     """
     from nerg_mi.workflows import train_radiance
 
-    job = build_options(RadianceScoreOptions, "evaluate_radiance", options, changes)
+    resolved = build_options(RadianceScoreOptions, "evaluate_radiance", options, overrides)
     with resolve_checkpoint(field, "field") as path:
-        return train_radiance.evaluate_radiance(path, resolve_file(photos, "photos"), job, reporter)
+        return train_radiance.evaluate_radiance(path, resolve_file(photos, "photos"), resolved, reporter)
 
 
 def evaluate_gaze(
@@ -141,15 +204,37 @@ def evaluate_gaze(
     *,
     options: GazeEvaluationOptions | None = None,
     reporter: Reporter = SILENT,
-    **changes: Any,
+    **overrides: Any,
 ) -> GazeEvaluation:
-    """Score a gaze field at positions and of people that it was not trained on, beside what needs no field.
+    """Evaluate a gaze field on held-out positions and participants, and compare it with baselines.
 
-    ``gaze``: a checkpoint that was trained with ``test_zones``, or what that training gave. ``rays``: those that it
-    was trained on, or their file. ``output``: folder for tables and pictures, which is made. ``changes``: options
-    one by one (``split="pos"``, ``resamples=200``, ...) on top of ``options``;
-    `nerg_mi.workflows.gaze_commands.GazeEvaluationOptions` says what there is. Raises `NergError`.
+    Parameters
+    ----------
+    gaze : TrainedField or path
+        The gaze field, trained with ``test_zones``.
+    rays : Rays or path
+        The recordings of its training.
+    output : path, optional
+        Folder for tables and pictures; it is created.
+    options : GazeEvaluationOptions, optional
+        Base options (`nerg_mi.workflows.gaze_commands.GazeEvaluationOptions`).
+    reporter : Reporter
+        Receives the progress.
+    **overrides
+        Single options on top of ``options``, such as ``split="pos"`` or ``resamples=200``.
 
+    Returns
+    -------
+    GazeEvaluation
+        Scores of the field and the baselines.
+
+    Raises
+    ------
+    NergError
+        An option or a file is invalid.
+
+    Examples
+    --------
     >>> import nerg_mi as nerg
     >>> held_out = {"test_zones": 1, "test_positions": 4, "geometry": "none", "zones": 0}
     >>> small = {"steps": 2, "probes": 8, "directions": 64}
@@ -160,10 +245,10 @@ def evaluate_gaze(
     """
     from nerg_mi.workflows import evaluate
 
-    job = build_options(GazeEvaluationOptions, "evaluate_gaze", options, changes)
+    resolved = build_options(GazeEvaluationOptions, "evaluate_gaze", options, overrides)
     data = resolve_rays(rays)
     with resolve_checkpoint(gaze, "gaze") as path:
-        return evaluate.evaluate_gaze(path, data, output, job, reporter)
+        return evaluate.evaluate_gaze(path, data, output, resolved, reporter)
 
 
 def ablate(
@@ -172,15 +257,36 @@ def ablate(
     *,
     options: AblationOptions | None = None,
     reporter: Reporter = SILENT,
-    **changes: Any,
+    **overrides: Any,
 ) -> AblationResult:
-    """Train every variant of a gaze field alike, and compare their scores and the time of a frame.
+    """Train several variants of a gaze field under equal conditions, and compare their scores and rendering times.
 
-    ``rays``: what `load_rays` or `import_rays` gave, or a file of them. ``output``: folder for checkpoints, table and
-    plot, which is made; what an earlier run has left there is not trained again. Where people looked around is said as
-    for `train_gaze`. ``changes``: options one by one (``recipes="small"``, ``seeds=1``, ...) on top of ``options``;
-    `nerg_mi.workflows.gaze_commands.AblationOptions` says what there is. Raises `NergError`.
+    Parameters
+    ----------
+    rays : Rays or path
+        The recordings.
+    output : path
+        Folder for checkpoints, table and plot; it is created. Checkpoints of an earlier run are reused.
+    options : AblationOptions, optional
+        Base options (`nerg_mi.workflows.gaze_commands.AblationOptions`).
+    reporter : Reporter
+        Receives the progress.
+    **overrides
+        Single options on top of ``options``, such as ``recipes="small"`` or ``seeds=1``, and the environment as for
+        `train_gaze`.
 
+    Returns
+    -------
+    AblationResult
+        One row per variant.
+
+    Raises
+    ------
+    NergError
+        An option or a file is invalid.
+
+    Examples
+    --------
     >>> import nerg_mi as nerg
     >>> small = {"recipes": "default", "variant": ("emit",), "seeds": 1, "default_steps": 2, "probes": 8, "cameras": 0}
     >>> test = {"zones": 1, "positions": 4, "min_rays": 8}
@@ -190,8 +296,8 @@ def ablate(
     """
     from nerg_mi.workflows import ablation
 
-    job = build_options(AblationOptions, "ablate", options, changes)
-    return ablation.ablate(resolve_rays(rays), output, job, reporter)
+    resolved = build_options(AblationOptions, "ablate", options, overrides)
+    return ablation.ablate(resolve_rays(rays), output, resolved, reporter)
 
 
 def study(
@@ -200,15 +306,38 @@ def study(
     *,
     options: StudyOptions | None = None,
     reporter: Reporter = SILENT,
-    **changes: Any,
+    **overrides: Any,
 ) -> StudyResult:
-    """Measure error against run time: a scene at many settings, each compared with what is true.
+    """Measure the error of a scene against run time, for many settings.
 
-    ``scene``: a scene file, or one with a known truth: ``slab``, ``sphere``, ``sheets``, ``fog`` or ``ramp``.
-    ``output``: folder for tables and plots, which is made. ``changes``: options one by one (``quick=True``,
-    ``only="depth"``, ...) on top of ``options``; `nerg_mi.workflows.scene_commands.StudyOptions` says what there is. A
-    full study takes up to half an hour. Raises `NergError`.
+    A full study takes up to half an hour.
 
+    Parameters
+    ----------
+    scene : str or path
+        A scene file, or an analytic scene with an exact solution: ``slab``, ``sphere``, ``sheets``, ``fog`` or
+        ``ramp``.
+    output : path
+        Folder for tables and plots; it is created.
+    options : StudyOptions, optional
+        Base options (`nerg_mi.workflows.scene_commands.StudyOptions`).
+    reporter : Reporter
+        Receives the progress.
+    **overrides
+        Single options on top of ``options``, such as ``quick=True`` or ``only="depth"``.
+
+    Returns
+    -------
+    StudyResult
+        Errors and run times, and the written files.
+
+    Raises
+    ------
+    NergError
+        An option or a file is invalid.
+
+    Examples
+    --------
     >>> import nerg_mi as nerg
     >>> result = nerg.study("slab", folder / "study", quick=True, width=8, height=8)
     >>> result.files[0].name
@@ -216,11 +345,13 @@ def study(
     """
     from nerg_mi.workflows import study as studies
 
-    job = build_options(StudyOptions, "study", options, changes)
-    return studies.run_study(str(scene if isinstance(scene, str) else resolve_file(scene, "scene")), output, job, reporter)
+    resolved = build_options(StudyOptions, "study", options, overrides)
+    return studies.run_study(
+        str(scene if isinstance(scene, str) else resolve_file(scene, "scene")), output, resolved, reporter
+    )
 
 
-# ---- Attention on things as numbers, from a notebook ----
+# ---- Attention statistics ----
 
 
 def stats(
@@ -231,13 +362,33 @@ def stats(
     reporter: Reporter = SILENT,
     **options: Any,
 ) -> StatisticsResult:
-    """Numbers of attention on areas of interest: counted in rays, and as a gaze field foretells it.
+    """Compute attention statistics of areas of interest, from recordings and as predicted by a gaze field.
 
-    ``files``: rays (in memory, or their file, or a dataset), a scene, a gaze field, a radiance field, in any order.
-    ``areas``: a JSON file of boxes, meshes, shapes and groups (docs/how-to/statistics.md). ``output``: folder for the tables.
-    ``options``: those of `nerg stats` (`nerg_mi.aoi.options.StatisticsOptions`). Gives a
-    `nerg_mi.aoi.output.StatisticsResult`, whose tables are lists of dicts. Raises `NergError`.
+    Parameters
+    ----------
+    files : Rays, path, or sequence of these
+        Recordings (in memory, files or datasets), a scene, a gaze field and a radiance field, in any order.
+    areas : path, optional
+        JSON file of areas of interest: boxes, meshes, shapes and groups (docs/how-to/statistics.md).
+    output : path, optional
+        Folder for the tables.
+    reporter : Reporter
+        Receives the progress.
+    **options
+        Options of `nerg stats` (`nerg_mi.aoi.options.StatisticsOptions`).
 
+    Returns
+    -------
+    StatisticsResult
+        Tables as lists of dicts.
+
+    Raises
+    ------
+    NergError
+        An option or a file is invalid.
+
+    Examples
+    --------
     >>> import json, nerg_mi as nerg
     >>> _ = (folder / "areas.json").write_text(json.dumps({"shelf": [[2, -1, 0], [3, 1, 2]]}))
     >>> eye, ahead = [[0.0, 0.0, 1.6]] * 3, [[1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
@@ -248,15 +399,15 @@ def stats(
     """
     from nerg_mi.workflows.statistics import statistics
 
-    given = [files] if isinstance(files, (str, os.PathLike, Rays)) else list(files)
+    inputs = [files] if isinstance(files, (str, os.PathLike, Rays)) else list(files)
     if areas is not None:
         options["areas"] = areas
-    job = build_options(StatisticsOptions, "stats", None, options)
-    paths = [f if isinstance(f, Rays) else resolve_file(f, "files") for f in given]
-    return statistics(paths, None if output is None else Path(output), job, reporter)
+    resolved = build_options(StatisticsOptions, "stats", None, options)
+    paths = [f if isinstance(f, Rays) else resolve_file(f, "files") for f in inputs]
+    return statistics(paths, None if output is None else Path(output), resolved, reporter)
 
 
-# ---- Tracking files in, rays out ----
+# ---- Import of recordings ----
 
 
 def import_rays(
@@ -267,15 +418,36 @@ def import_rays(
     reporter: Reporter = SILENT,
     **options: Any,
 ) -> Rays:
-    """Read tracking files as rays of attention: right-handed, z up, metres, seconds.
+    """Import gaze recordings.
 
-    ``files``: one or several. ``reader``: the format's name, as for ``nerg rays import --preset``; ``table`` reads any
-    CSV or Parquet table through the option ``columns``. ``output``: rays file to write besides (.npz or .parquet), or a
-    dataset (.rays), of which large ones are given as a sample (`nerg_mi.workflows.rays.ImportResult`).
-    ``options``: those of the reader, and ``skip_bad_lines``, ``pseudonyms`` and ``salt``, of a dataset ``place_name``,
-    ``day`` and ``workers`` (`nerg_mi.workflows.rays_commands.RaysImportOptions`). What was dropped, and why, is in the
-    rays' ``metadata``. Raises `NergError`.
+    Parameters
+    ----------
+    files : path or sequence of path
+        Recordings.
+    reader : str
+        Name of the format, as for ``nerg rays import --preset``. ``table`` reads any CSV or Parquet table with the
+        option ``columns``.
+    output : path, optional
+        File to write (.npz or .parquet), or a dataset (.rays).
+    reporter : Reporter
+        Receives the progress.
+    **options
+        Options of the reader; ``skip_bad_lines``, ``pseudonyms`` and ``salt``; and for a dataset ``place_name``,
+        ``day`` and ``workers`` (`nerg_mi.workflows.rays_commands.RaysImportOptions`).
 
+    Returns
+    -------
+    Rays
+        The gaze samples, right-handed with z up, in metres and seconds. Their ``metadata`` contains the number of
+        dropped samples by reason. A large dataset is subsampled (`nerg_mi.workflows.rays.ImportResult`).
+
+    Raises
+    ------
+    NergError
+        An option or a file is invalid.
+
+    Examples
+    --------
     >>> import nerg_mi as nerg
     >>> _ = (folder / "day.csv").write_text("t,who,x,y,z,dx,dy,dz\\n0.0,Ada,1,1,1.6,1,0,0\\n0.1,Ada,1,1,1.6,0,1,0\\n")
     >>> columns = "origin=x,y,z direction=dx,dy,dz t=t person=who"
@@ -287,29 +459,31 @@ def import_rays(
     from nerg_mi.rays.readers.registry import make_options, get_reader, list_reader_names
     from nerg_mi.workflows import rays
 
-    several = [files] if isinstance(files, (str, os.PathLike)) or not isinstance(files, Sequence) else files
-    if not all(isinstance(file, (str, os.PathLike)) for file in several):
+    file_list = [files] if isinstance(files, (str, os.PathLike)) or not isinstance(files, Sequence) else files
+    if not all(isinstance(file, (str, os.PathLike)) for file in file_list):
         raise NergError(
-            f"import_rays reads files, named by strings or paths, got {type(files).__name__}; "
-            'write a table to a file (df.to_csv("day.csv")), and name its columns (columns="origin=x,y,z ...")'
+            f"import_rays reads files, given as strings or paths, got {type(files).__name__}; write a table to a file "
+            '(df.to_csv("day.csv")) and pass the names of its columns (columns="origin=x,y,z ...")'
         )
-    of_readers = list_options(get_reader(reader).Options)
-    ours = {f.name for f in fields(RaysImportOptions)} - {"reader", "settings", "output"}
-    every = {option.name for name in list_reader_names() for option in list_options(get_reader(name).Options)}
-    check_names("import_rays", options, sorted(every | ours))
-    paths = [resolve_file(file, "files") for file in several]
-    of_job = {name: value for name, value in options.items() if name in ours}
-    parse = {option.name: option.parse for option in of_readers}
-    of_reader = {name: value for name, value in options.items() if name not in ours}
-    for name, value in of_reader.items():
-        # Values may be written as for the command.
-        if isinstance(value, str) and (read := parse.get(name)) is not None:
-            of_reader[name] = read(value)
-    job = RaysImportOptions(reader=reader, settings=make_options(reader, of_reader), output=output, **of_job)
-    return rays.import_rays(paths, job, reporter).rays
+    reader_options = list_options(get_reader(reader).Options)
+    import_options = {f.name for f in fields(RaysImportOptions)} - {"reader", "settings", "output"}
+    all_reader_options = {option.name for name in list_reader_names() for option in list_options(get_reader(name).Options)}
+    check_names("import_rays", options, sorted(all_reader_options | import_options))
+    paths = [resolve_file(file, "files") for file in file_list]
+    import_values = {name: value for name, value in options.items() if name in import_options}
+    parsers = {option.name: option.parse for option in reader_options}
+    reader_values = {name: value for name, value in options.items() if name not in import_options}
+    for name, value in reader_values.items():
+        # Values can be strings, as on the command line.
+        if isinstance(value, str) and (parser := parsers.get(name)) is not None:
+            reader_values[name] = parser(value)
+    resolved = RaysImportOptions(
+        reader=reader, settings=make_options(reader, reader_values), output=output, **import_values
+    )
+    return rays.import_rays(paths, resolved, reporter).rays
 
 
-# ---- Trainings: from recordings to fields in memory ----
+# ---- Training ----
 
 
 def train_radiance(
@@ -318,27 +492,49 @@ def train_radiance(
     *,
     options: RadianceOptions | None = None,
     reporter: Reporter = SILENT,
-    **changes: Any,
+    **overrides: Any,
 ) -> TrainedField[RadianceField]:
     """Train a radiance field on posed photos.
 
-    ``photos``: a folder, its transforms.json, or a COLMAP model. ``output``: checkpoint to write besides
-    (.safetensors), with a preview and, while the training is not done, a state to resume from. ``changes``: options one
-    by one (``minutes=5``, ``size="medium"``, ...) on top of ``options``;
-    `nerg_mi.workflows.radiance_commands.RadianceOptions` says what there is. ``reporter`` is told how it goes
-    (`nerg_mi.workflows.base`). What comes back has the error on held-out photos in its ``provenance``. After Ctrl-C it
-    is the result so far, or ``KeyboardInterrupt`` where there is an ``output``, which is written. Raises `NergError`.
+    After Ctrl-C, the current state is returned if there is no ``output``.
 
+    Parameters
+    ----------
+    photos : path
+        A folder, its transforms.json, or a COLMAP model.
+    output : path, optional
+        Checkpoint to write (.safetensors), with a preview and, until the training is complete, a state to resume from.
+    options : RadianceOptions, optional
+        Base options (`nerg_mi.workflows.radiance_commands.RadianceOptions`).
+    reporter : Reporter
+        Receives the progress (`nerg_mi.workflows.base`).
+    **overrides
+        Single options on top of ``options``, such as ``minutes=5`` or ``size="medium"``.
+
+    Returns
+    -------
+    TrainedField
+        The radiance field. Its ``provenance`` contains the error on held-out photos.
+
+    Raises
+    ------
+    NergError
+        An option or a file is invalid.
+    KeyboardInterrupt
+        Ctrl-C was pressed and there is an ``output``, which has been written.
+
+    Examples
+    --------
     >>> import nerg_mi as nerg
-    >>> field = nerg.train_radiance(photos, steps=2, holdout=0)  # a folder of posed photos
+    >>> field = nerg.train_radiance(photos, steps=2, holdout=0)  # photos: a folder of posed photos
     >>> field.kind, field.provenance["steps"]
     ('radiance', 2)
     """
     from nerg_mi.workflows import train_radiance as radiance
 
-    job = build_options(RadianceOptions, "train_radiance", options, changes)
-    result = radiance.train_radiance(resolve_file(photos, "photos"), output, job, reporter)
-    return _trained(result.field, result.provenance, output)
+    resolved = build_options(RadianceOptions, "train_radiance", options, overrides)
+    result = radiance.train_radiance(resolve_file(photos, "photos"), output, resolved, reporter)
+    return _make_trained_field(result.field, result.provenance, output)
 
 
 def train_gaze(
@@ -347,17 +543,39 @@ def train_gaze(
     *,
     options: GazeOptions | None = None,
     reporter: Reporter = SILENT,
-    **changes: Any,
+    **overrides: Any,
 ) -> TrainedField[AnyGazeField]:
-    """Train a gaze field on rays of attention, on salience images of posed photos, or on both.
+    """Train a gaze field on recordings, on salience images of posed photos, or on both.
 
-    ``rays``: what `load_rays` or `import_rays` gave, or a file of them; None: salience images alone (``views=``,
-    ``salience=``). Where people looked around is said by one of the options ``field="field.safetensors"``,
-    ``scene="scene.xml"`` (or a mesh) and ``geometry="hits"`` or ``"none"``. ``changes``: these and other options one by
-    one (``minutes=5``, ``recipe="small"``, ``test_zones=3``, ...) on top of ``options``;
-    `nerg_mi.workflows.gaze_commands.GazeOptions` says what there is. ``output`` and ``reporter``: as for
-    `train_radiance`. What comes back has its scores on held-out positions in its ``provenance``. Raises `NergError`.
+    Parameters
+    ----------
+    rays : Rays, path or None
+        Recordings. None: salience images alone (options ``views`` and ``salience``).
+    output : path, optional
+        Checkpoint to write (.safetensors), as for `train_radiance`.
+    options : GazeOptions, optional
+        Base options (`nerg_mi.workflows.gaze_commands.GazeOptions`).
+    reporter : Reporter
+        Receives the progress.
+    **overrides
+        Single options on top of ``options``, such as ``minutes=5``, ``recipe="small"`` or ``test_zones=3``, and the
+        environment: ``field="field.safetensors"``, ``scene="scene.xml"`` (or a mesh), or ``geometry="hits"`` or
+        ``"none"``.
 
+    Returns
+    -------
+    TrainedField
+        The gaze field. Its ``provenance`` contains the scores on held-out positions.
+
+    Raises
+    ------
+    NergError
+        An option or a file is invalid.
+    KeyboardInterrupt
+        Ctrl-C was pressed and there is an ``output``, which has been written.
+
+    Examples
+    --------
     >>> import nerg_mi as nerg
     >>> gaze = nerg.train_gaze(rays, geometry="none", steps=2, zones=0, probes=8, directions=64)
     >>> gaze.kind, gaze.provenance["steps"]
@@ -365,9 +583,9 @@ def train_gaze(
     """
     from nerg_mi.workflows import train_gaze as gaze
 
-    job = build_options(GazeOptions, "train_gaze", options, changes)
-    result = gaze.train_gaze(None if rays is None else resolve_rays(rays), output, job, reporter)
-    return _trained(result.field, result.provenance, output)
+    resolved = build_options(GazeOptions, "train_gaze", options, overrides)
+    result = gaze.train_gaze(None if rays is None else resolve_rays(rays), output, resolved, reporter)
+    return _make_trained_field(result.field, result.provenance, output)
 
 
 def train_prior(
@@ -376,29 +594,51 @@ def train_prior(
     *,
     options: PriorOptions | None = None,
     reporter: Reporter = SILENT,
-    **changes: Any,
+    **overrides: Any,
 ) -> TrainedField[AnyGazeField]:
-    """Make a gaze field for a place where nobody was tracked, of how high people look in others.
+    """Fit a gaze field for an environment without recordings: the distribution of gaze elevations in other
+    environments.
 
-    ``rays``: those of each other place, in memory or their files; places count alike. ``output``: checkpoint to write
-    besides (.safetensors). ``changes``: options one by one (``seed=1``, ...) on top of ``options``;
-    `nerg_mi.workflows.gaze_commands.PriorOptions` says what there is. Raises `NergError`.
+    Parameters
+    ----------
+    rays : Rays, path, or sequence of these
+        Recordings, one item per environment. Environments have equal weights.
+    output : path, optional
+        Checkpoint to write (.safetensors).
+    options : PriorOptions, optional
+        Base options (`nerg_mi.workflows.gaze_commands.PriorOptions`).
+    reporter : Reporter
+        Receives the progress.
+    **overrides
+        Single options on top of ``options``, such as ``seed=1``.
 
+    Returns
+    -------
+    TrainedField
+        The gaze field.
+
+    Raises
+    ------
+    NergError
+        An option or a file is invalid.
+
+    Examples
+    --------
     >>> import nerg_mi as nerg
-    >>> prior = nerg.train_prior(rays)  # or a list of them, one a place
+    >>> prior = nerg.train_prior(rays)  # or a list of recordings, one per environment
     >>> prior.kind, len(prior.provenance["places"])
     ('gaze', 1)
     """
     from nerg_mi.workflows import train_gaze as gaze
 
-    job = build_options(PriorOptions, "train_prior", options, changes)
-    several = [rays] if isinstance(rays, (str, os.PathLike, Rays)) else rays
-    places = [place if isinstance(place, Rays) else resolve_file(place, "rays") for place in several]
-    result = gaze.learn_prior(places, output, job, reporter)
-    return _trained(result.field, result.provenance, output)
+    resolved = build_options(PriorOptions, "train_prior", options, overrides)
+    environments = [rays] if isinstance(rays, (str, os.PathLike, Rays)) else rays
+    inputs = [place if isinstance(place, Rays) else resolve_file(place, "rays") for place in environments]
+    result = gaze.learn_prior(inputs, output, resolved, reporter)
+    return _make_trained_field(result.field, result.provenance, output)
 
 
-def _trained(network: Any, provenance: dict[str, Any], output: FilePath | None) -> TrainedField[Any]:
+def _make_trained_field(network: Any, provenance: dict[str, Any], output: FilePath | None) -> TrainedField[Any]:
     if output is None:
         return TrainedField(network, provenance)
     return TrainedField(network, provenance, Path(output).name, Path(output))

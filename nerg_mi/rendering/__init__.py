@@ -1,1 +1,1 @@
-"""From a scene file to a picture file: checks, bands of rows, writers."""
+"""Loading scene files, rendering them in bands, and writing scene and image files."""

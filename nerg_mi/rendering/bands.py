@@ -1,5 +1,4 @@
-"""A picture rendered in bands of rows, which bound the memory, and strips of samples, which bound the time of a
-kernel, and taken apart into colour and AOVs."""
+"""Rendering in bands of rows, which bound the memory, and in strips of samples, which bound the time of a kernel."""
 
 from __future__ import annotations
 
@@ -26,121 +25,149 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
 
-# ---- Several pictures of the same rays, and the one that an integrator makes of them ----
+# ---- Layers: several images of the same rays ----
 
 
 class LayerSource(Protocol):
-    """What is rendered in place of a scene's integrator: several pictures of the same rays, each with AOVs of its
-    own."""
+    """Replaces the integrator of a scene by several images of the same rays, each with its own AOVs."""
 
-    names: list[list[str]]
-    """Names of the AOVs' channels of each picture."""
+    channel_names: list[list[str]]
+    """Names of the AOV channels of each image."""
 
-    count: int
-    """Channels of AOVs that a picture with all of them would have: they are added up as there."""
+    num_channels: int
+    """Number of AOV channels of a single image with all AOVs; samples are accumulated as in that image."""
 
     def sample(self, scene, sampler, ray, medium, active) -> Iterable[tuple]:
-        """Of each picture, one after the other, ``(radiance, valid, aovs)`` as the ``sample`` of an integrator gives
-        them."""
+        """Yield ``(radiance, valid, aovs)`` of each image, as the ``sample`` method of an integrator returns them."""
         ...
 
 
 class IntegratorLayer:
-    """The picture of an integrator, as the one layer."""
+    """The image of an integrator, as the only layer."""
 
     def __init__(self, integrator):
-        self.names, self._integrator = [integrator.aov_names()], integrator
-        self.count = len(self.names[0])
+        self.channel_names, self._integrator = [integrator.aov_names()], integrator
+        self.num_channels = len(self.channel_names[0])
 
     def sample(self, scene, sampler, ray, medium, active) -> Iterable[tuple]:
         return [self._integrator.sample(scene, sampler, ray, medium, active)]
 
 
-# ---- Pace ----
+# ---- Strips of samples ----
 #
-# How a picture is divided into strips of samples, which an interruption and a report of progress can fall between.
+# Interruptions and progress reports take place between strips.
 
-PACKET = 64
-"""Samples that Dr.Jit may add up as one (16 on a CPU, 32 on a GPU): a strip begins at a multiple of this many."""
+PACKET_SIZE = 64
+"""Number of samples that Dr.Jit can accumulate as one (16 on a CPU, 32 on a GPU); strips start at multiples of it."""
 
-LEAST = 1 << 12
-"""Samples below which the overhead of a strip outweighs its work."""
+MIN_STRIP_SAMPLES = 1 << 12
+"""Number of samples below which the overhead of a strip exceeds its work."""
 
 STRIP_SECONDS = 0.5
-"""A strip that took longer than this is followed by shorter ones, one that took less than half of it by longer ones."""
+"""Target time of a strip: strips get shorter above it, and longer below half of it."""
 
 
 class SamplePace:
-    """How many samples a strip has, from the time that those before it took; ``fixed``: always as many. It may serve
-    several pictures in turn, in one variant."""
+    """Chooses the number of samples in a strip from the time of previous strips.
+
+    An object can be used for several images in turn, in one variant.
+
+    Parameters
+    ----------
+    fixed : int
+        Constant number of samples in a strip; 0 adapts the number to the time.
+    """
 
     def __init__(self, fixed: int = 0):
         import mitsuba as mi
 
         self._fixed = fixed
         self._count = fixed or (1 << 20 if str(mi.variant()).startswith("cuda") else 1 << 15)
-        self._most = 1 << 24 if str(mi.variant()).startswith("cuda") else 1 << 18
-        self._since, self._strips = 0.0, 0
+        self._max_count = 1 << 24 if str(mi.variant()).startswith("cuda") else 1 << 18
+        self._last_time, self._num_strips = 0.0, 0
 
     def begin(self) -> None:
-        """A picture begins: what was done since the last one is no strip's time."""
-        self._strips = 0
+        """Start an image: the time since the previous one is not counted."""
+        self._num_strips = 0
 
-    def strips(self, start: int, stop: int, spp: int) -> Iterator[tuple[int, int]]:
-        """``(first, count)`` of strips from sample ``start``, or from the packet that it lies in, to ``stop``."""
-        # With whole pixels in every strip, unless a pixel alone has more samples than a strip may have.
-        unit = math.lcm(PACKET, spp)
-        unit = unit if unit <= self._most else PACKET
-        first = start - start % PACKET
+    def iter_strips(self, start: int, stop: int, spp: int) -> Iterator[tuple[int, int]]:
+        """Divide samples into strips.
+
+        Parameters
+        ----------
+        start, stop : int
+            Range of samples. The first strip starts at a multiple of `PACKET_SIZE`, possibly before ``start``.
+        spp : int
+            Samples per pixel.
+
+        Yields
+        ------
+        tuple of int
+            First sample and number of samples of each strip.
+        """
+        # Strips contain whole pixels unless a single pixel exceeds the maximum.
+        unit = math.lcm(PACKET_SIZE, spp)
+        unit = unit if unit <= self._max_count else PACKET_SIZE
+        first = start - start % PACKET_SIZE
         while first < stop:
             last = min(max((first + self._count) // unit, first // unit + 1) * unit, stop)
             yield first, last - first
             first = last
 
     def wait(self) -> None:
-        """Until the strip before is done."""
+        """Wait until the previous strip is finished, and adapt the number of samples."""
         import drjit as dr
 
         dr.sync_thread()
         now = time.perf_counter()
-        # The first wait is for nothing, and the first strip's kernel had to be compiled.
-        if self._strips > 1 and not self._fixed:
-            seconds = now - self._since
+        # The first call waits for nothing, and the first strip includes compilation.
+        if self._num_strips > 1 and not self._fixed:
+            seconds = now - self._last_time
             if seconds > STRIP_SECONDS:
-                self._count = max(self._count // 2, LEAST)
+                self._count = max(self._count // 2, MIN_STRIP_SAMPLES)
             elif seconds < STRIP_SECONDS / 2:
-                self._count = min(self._count * 2, self._most)
-        self._since, self._strips = now, self._strips + 1
+                self._count = min(self._count * 2, self._max_count)
+        self._last_time, self._num_strips = now, self._num_strips + 1
 
 
-# ---- The random numbers of some pixels of a picture, without those of all others ----
+# ---- Random numbers of a range of samples ----
 #
-# Mitsuba's ``independent`` sampler gives every sample of a picture its own PCG32 generator, whose state and stream are
-# the seed and the number of the sample, scrambled (Tiny Encryption Algorithm). Thus the numbers of any range of samples
-# can be had alone, and are those that they have in the whole picture.
+# Mitsuba's ``independent`` sampler gives each sample of an image its own PCG32 generator. State and stream are derived
+# from the seed and the index of the sample by the Tiny Encryption Algorithm. The random numbers of any range of samples
+# can therefore be computed separately.
 
 
 def get_base_seed(sampler) -> int | None:
-    """The ``seed`` of an ``independent`` sampler of Mitsuba; None for another kind, or for one that draws in another
-    way."""
+    """Return the ``seed`` of an ``independent`` sampler; None for other samplers and for unknown seeding schemes."""
     import drjit as dr
 
-    found = re.search(r"base_seed = (\d+)", str(sampler))
-    if sampler.class_name() != "IndependentSampler" or not found:
+    match = re.search(r"base_seed = (\d+)", str(sampler))
+    if sampler.class_name() != "IndependentSampler" or not match:
         return None
-    base, theirs, count = int(found[1]), sampler.clone(), 64
-    theirs.seed(7, count)
-    ours = make_strip_sampler(1, base, 7, 0, count)
-    # Another release of Mitsuba may seed differently: its pictures are then rendered in one piece, and stay what they
-    # are.
-    return base if dr.all(theirs.next_2d() == ours.next_2d(), axis=None) else None
+    base, reference, count = int(match[1]), sampler.clone(), 64
+    reference.seed(7, count)
+    sampler_copy = make_strip_sampler(1, base, 7, 0, count)
+    # If a release of Mitsuba seeds differently, images are rendered undivided and stay correct.
+    return base if dr.all(reference.next_2d() == sampler_copy.next_2d(), axis=None) else None
 
 
 def make_strip_sampler(spp: int, base: int, seed: int, first: int, count: int):
-    """A sampler for the samples ``first``, ..., ``first + count - 1`` of a picture with ``spp`` samples a pixel, which
-    are counted pixel by pixel. ``base`` is the sampler's own seed and ``seed`` that of the render.
+    """Make a sampler for a range of samples of an image.
 
-    Mitsuba renders at most 2^32 samples at once; beyond that the sequences are those of other seeds.
+    Parameters
+    ----------
+    spp : int
+        Samples per pixel.
+    base : int
+        Seed of the scene's sampler (`base_seed`).
+    seed : int
+        Seed of the rendering.
+    first, count : int
+        First sample and number of samples. Samples are numbered pixel by pixel.
+
+    Notes
+    -----
+    Mitsuba renders at most 2^32 samples at once; samples beyond that use other seeds.
     """
     import drjit as dr
 
@@ -150,12 +177,12 @@ def make_strip_sampler(spp: int, base: int, seed: int, first: int, count: int):
     high = mi.UInt32(number >> 32)
     key = dr.opaque(mi.UInt32, (base + seed) & 0xFFFFFFFF) + high * 0x9E3779B9
     state, stream = mi.sample_tea_32(key, low)
-    return _class(mi.variant())(spp, mi.PCG32(initstate=mi.UInt64(state), initseq=mi.UInt64(stream)))
+    return _get_sampler_class(mi.variant())(spp, mi.PCG32(initstate=mi.UInt64(state), initseq=mi.UInt64(stream)))
 
 
 @functools.cache
-def _class(variant: str):
-    # Mitsuba's classes belong to a variant.
+def _get_sampler_class(variant: str):
+    # Mitsuba's classes depend on the variant.
     import mitsuba as mi
 
     class StripSampler(mi.Sampler):
@@ -182,34 +209,41 @@ def _class(variant: str):
 
 # ---- Bands ----
 #
-# A picture rendered in pieces: bands of rows, which bound the memory, in strips of samples, which bound the time of
-# one step.
-#
-# A picture does not depend on how it is divided. Every sample keeps the position, the ray and the random numbers that
-# it has in the whole picture (`pixel_sampler`), and the samples of a pixel are added in the same groups, so that with a
-# box filter the pixels are those of ``mi.render``, bit by bit, also where a pixel's samples fall into two strips. With
-# a wider filter the samples of the rows around a band are rendered again for it; what is added up is the same, in
-# another order, and pixels differ by the rounding of single precision.
+# An image does not depend on how it is divided. Each sample has the position, the ray and the random numbers that it
+# has in the undivided image, and the samples of a pixel are accumulated in the same groups. With a box filter, the
+# pixels equal those of ``mi.render`` bit by bit, even if a pixel's samples are in two strips. With a wider filter, the
+# samples of the rows around a band are rendered again for it; the sums have another order, and pixels differ by the
+# rounding of single precision.
 
 BYTES_PER_VALUE = 22
-"""Memory that a band needs for each value (channel of a pixel), in bytes: 4 in the block that samples are added to, the
-others in the copies on the way to the file."""
+"""Memory of a band per value (channel of a pixel), in bytes.
+
+Four bytes are in the block that accumulates samples, the others in copies on the way to the file.
+"""
 
 
 @runtime_checkable
 class ObserverIntegrator(Protocol):
-    """An integrator in Python that renders as `mi.SamplingIntegrator` does within a context of its own."""
+    """A Python integrator that renders like `mi.SamplingIntegrator`, within a context of its own."""
 
     def rendering_from(self, sensor, scene) -> AbstractContextManager:
-        """The context in which samples of ``sensor``'s picture of ``scene`` are traced."""
+        """Return the context in which the samples of ``sensor`` are traced."""
         ...
 
 
 @dataclass(frozen=True)
 class Band:
-    """Rows ``top``, ..., ``top + rows - 1`` of the film's crop window. ``film`` holds them (``bitmap()``,
-    ``develop()``) until the next band is asked for, perhaps followed by empty rows. ``layer``: number of the picture,
-    where several are made of the same rays (`LayerSource`)."""
+    """A band of rows of an image.
+
+    Parameters
+    ----------
+    top, rows : int
+        First row and number of rows, in the crop window of the film.
+    film : mi.Film
+        Contains the rows until the next band is requested, possibly followed by empty rows.
+    layer : int
+        Index of the image, if a `LayerSource` renders several.
+    """
 
     top: int
     rows: int
@@ -218,7 +252,7 @@ class Band:
 
 
 def undividable_reason(scene, sensor) -> str | None:
-    """Why a picture of ``sensor`` can only be rendered in one piece; None where it can be divided."""
+    """Return the reason why an image of ``sensor`` can only be rendered undivided; None if it can be divided."""
     import mitsuba as mi
 
     from nerg_mi.transport.observer import is_batch
@@ -228,8 +262,8 @@ def undividable_reason(scene, sensor) -> str | None:
         return f"the variant {mi.variant()}"
     if not isinstance(integrator, mi.SamplingIntegrator) or isinstance(integrator, mi.CppADIntegrator):
         return f"the integrator {integrator.class_name()}"
-    if not isinstance(integrator, ObserverIntegrator) and _renders_itself(type(integrator), mi.SamplingIntegrator):
-        return f"the integrator {integrator.class_name()}, which renders in a way of its own"
+    if not isinstance(integrator, ObserverIntegrator) and _overrides_render(type(integrator), mi.SamplingIntegrator):
+        return f"the integrator {integrator.class_name()}, which overrides render()"
     if film.class_name() != "HDRFilm":
         return f"the film {film.class_name()}"
     if is_batch(sensor):
@@ -239,22 +273,25 @@ def undividable_reason(scene, sensor) -> str | None:
     return None
 
 
-def _renders_itself(kind: type, base: type) -> bool:
-    """Whether a class of integrators in Python has a ``render`` of its own, below ``base``."""
+def _overrides_render(kind: type, base: type) -> bool:
+    """Whether a Python integrator class overrides ``render`` of ``base``."""
     above = kind.__mro__
     return any("render" in vars(c) for c in above[: above.index(base)])
 
 
 def fit_rows_to_memory(scene, sensor, memory: float) -> int:
-    """Rows of a band that needs at most ``memory`` bytes; at least 1, and of a filter that is wider than a pixel so
-    many that the rows around a band, which are rendered again for it, are a quarter of it at most."""
+    """Compute how many rows of a band fit into ``memory`` bytes; at least 1.
+
+    With a filter wider than a pixel, a band has at least eight times the radius of the filter, so that at most a
+    quarter of the samples is rendered twice.
+    """
     width, height = sensor.film().crop_size()
     values = 5 + len(scene.integrator().aov_names())
-    return int(min(max(memory // (width * values * BYTES_PER_VALUE), 8 * _reach(sensor.film()), 1), height))
+    return int(min(max(memory // (width * values * BYTES_PER_VALUE), 8 * _filter_radius(sensor.film()), 1), height))
 
 
-def _reach(film) -> int:
-    """How many rows further than their own the samples of ``film`` reach."""
+def _filter_radius(film) -> int:
+    """Return how many rows beyond their own the samples of ``film`` contribute to."""
     return 0 if film.rfilter().is_box_filter() else int(film.rfilter().border_size())
 
 
@@ -270,52 +307,81 @@ def render_bands(
     layers: LayerSource | None = None,
     pace: SamplePace | None = None,
 ) -> Iterator[Band]:
-    """Render the picture of ``sensor`` band by band, from the top; in one piece where `why_whole` has a reason.
+    """Render an image band by band from the top, or undivided if `undividable_reason` gives a reason.
 
-    ``spp``: samples a pixel, 0 for those of the sampler. ``rows`` of a band; 0: all. ``strip``: samples of a strip, 0:
-    as many as take about `bands.STRIP_SECONDS`; ``pace``: that of the pictures before this one. ``on_strip`` is told
-    the number of samples done and that of all after every strip, and may raise. ``layers``: in place of the scene's
-    integrator, of a picture that can be divided; the bands of all of them follow each other. Raises
-    ``KeyboardInterrupt`` after a picture in one piece that was to be stopped: there Mitsuba itself takes the signal.
+    Parameters
+    ----------
+    scene : mi.Scene
+        The scene.
+    sensor : mi.Sensor
+        The camera.
+    spp : int
+        Samples per pixel; 0 uses the number of the sampler.
+    seed : int
+        Seed of the rendering.
+    rows : int
+        Rows of a band; 0 renders all rows in one band.
+    strip : int
+        Samples of a strip; 0 adapts the number to `STRIP_SECONDS`.
+    on_strip : callable, optional
+        Called after each strip with the number of finished samples and of all samples. It may raise an exception.
+    layers : LayerSource, optional
+        Replaces the integrator of the scene, for images that can be divided. The bands of all layers alternate.
+    pace : SamplePace, optional
+        The pace of previous images.
+
+    Yields
+    ------
+    Band
+        The next band, of each layer in turn.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        An undivided image was interrupted; Mitsuba handles the signal in this case.
     """
     if undividable_reason(scene, sensor):
-        yield _whole(scene, sensor, spp, seed, on_strip)
+        yield _render_undivided(scene, sensor, spp, seed, on_strip)
         return
-    grid = _Grid(sensor.film(), spp or sensor.sampler().sample_count(), rows)
+    grid = _PixelGrid(sensor.film(), spp or sensor.sampler().sample_count(), rows)
     integrator = scene.integrator()
     layers = IntegratorLayer(integrator) if layers is None else layers
-    observing = lambda: integrator.rendering_from(sensor, scene) if isinstance(integrator, ObserverIntegrator) else nullcontext()
+    rendering_context = lambda: (
+        integrator.rendering_from(sensor, scene) if isinstance(integrator, ObserverIntegrator) else nullcontext()
+    )
     base = get_base_seed(sensor.sampler())
     pace = pace or SamplePace(strip)
     pace.begin()
     done = 0
     for top in range(0, grid.height, grid.rows):
-        blocks = [grid.block(names) for names in layers.names]
-        start, stop = grid.samples(top)
-        with observing(), grid.as_whole(blocks[0], layers):
-            for first, count in pace.strips(start, stop, grid.spp):
-                where, active, found = _trace(scene, sensor, layers, grid, base, seed, top, first, count, start)
-                for block, values in zip(blocks, found):
-                    block.put(where, values, active)
+        blocks = [grid.make_block(names) for names in layers.channel_names]
+        start, stop = grid.sample_range(top)
+        with rendering_context(), grid.match_accumulation(blocks[0], layers):
+            for first, count in pace.iter_strips(start, stop, grid.spp):
+                positions, active, layer_values = _trace_strip(
+                    scene, sensor, layers, grid, base, seed, top, first, count, start
+                )
+                for block, values in zip(blocks, layer_values):
+                    block.put(positions, values, active)
                     if len(blocks) > 1:
-                        # Each in a kernel of its own, which layers of one kind then have in common.
-                        _evaluate(block)
-                # What was traced while the strip before it was computed is computed now.
+                        # One kernel per layer, so that layers of the same kind share a kernel.
+                        _evaluate_block(block)
+                # This strip was traced while the previous one was computed.
                 pace.wait()
                 if on_strip is not None and done:
                     on_strip(min(done, grid.total), grid.total)
                 for block in blocks:
-                    _evaluate(block)
+                    _evaluate_block(block)
                 done += count
             pace.wait()
         if on_strip is not None:
             on_strip(min(done, grid.total), grid.total)
-        for layer, (names, block) in enumerate(zip(layers.names, blocks)):
+        for layer, (names, block) in enumerate(zip(layers.channel_names, blocks)):
             grid.develop(names, block)
             yield Band(top, min(grid.rows, grid.height - top), sensor.film(), layer)
 
 
-def _whole(scene, sensor, spp, seed, on_strip) -> Band:
+def _render_undivided(scene, sensor, spp, seed, on_strip) -> Band:
     import drjit as dr
     import mitsuba as mi
 
@@ -329,22 +395,29 @@ def _whole(scene, sensor, spp, seed, on_strip) -> Band:
     return Band(0, int(sensor.film().crop_size()[1]), sensor.film())
 
 
-def _evaluate(block):
+def _evaluate_block(block):
     import drjit as dr
 
     dr.eval(block.tensor())
 
 
-def _trace(scene, sensor, layers: LayerSource, grid: _Grid, base, seed, top, first, count, start):
-    """Trace samples ``first``, ..., of which those before ``start`` are of no account: where they lie in the block of
-    the band at ``top``, who counts, and an iterator over their values in each layer. Follows
-    ``SamplingIntegrator::render_sample`` of Mitsuba 3.9, operation by operation."""
+def _trace_strip(scene, sensor, layers: LayerSource, grid: _PixelGrid, base, seed, top, first, count, start):
+    """Trace a strip of samples.
+
+    Samples before ``start`` are masked. Follows ``SamplingIntegrator::render_sample`` of Mitsuba 3.9, operation by
+    operation.
+
+    Returns
+    -------
+    tuple
+        Positions in the block of the band at ``top``, the mask, and an iterator over the values in each layer.
+    """
     import drjit as dr
 
     mi = variant_types()
     film, spp = sensor.film(), grid.spp
     sampler = make_strip_sampler(spp, base, seed, first, count)
-    # Numbers that differ from strip to strip are kept out of the kernel, which is then the same for all.
+    # Opaque numbers are not compiled into the kernel, so that all strips share it.
     number = dr.arange(mi.UInt32, count)
     active = number >= dr.opaque(mi.UInt32, max(start - first, 0))
     number += dr.opaque(mi.UInt32, first % spp)
@@ -358,22 +431,22 @@ def _trace(scene, sensor, layers: LayerSource, grid: _Grid, base, seed, top, fir
     offset = -mi.ScalarVector2f(film.crop_offset()) * scale
     relative = mi.Point2f(dr.fma(position, mi.Vector2f(scale), mi.Vector2f(offset)))
     aperture = sampler.next_2d(active) if sensor.needs_aperture_sample() else mi.Point2f(0.5)
-    moment = sensor.shutter_open()
+    time = sensor.shutter_open()
     if sensor.shutter_open_time() > 0:
-        moment = moment + sampler.next_1d(active) * sensor.shutter_open_time()
-    ray, weight = sensor.sample_ray_differential(moment, 0, relative, aperture, active)
+        time = time + sampler.next_1d(active) * sensor.shutter_open_time()
+    ray, weight = sensor.sample_ray_differential(time, 0, relative, aperture, active)
     if ray.has_differentials:
         ray.scale_differential(mi.Float(np.float32(1) / np.sqrt(np.float32(spp))))
-    found = layers.sample(scene, sampler, ray, sensor.get_medium(), active)
-    # With a box filter the pixel itself, as its samples may be rounded up into the next.
-    where = mi.Point2f(pixel) if film.rfilter().is_box_filter() else mi.Point2f(position)
-    if grid.divided:
-        where -= mi.Vector2f(mi.Vector2i(film.crop_offset()) + mi.Vector2i(0, dr.opaque(mi.Int32, top)))
-    return where, active, (_values(film, weight, *of_layer) for of_layer in found)
+    layer_samples = layers.sample(scene, sampler, ray, sensor.get_medium(), active)
+    # With a box filter, use the pixel itself: the position can be rounded up into the next pixel.
+    block_position = mi.Point2f(pixel) if film.rfilter().is_box_filter() else mi.Point2f(position)
+    if grid.is_divided:
+        block_position -= mi.Vector2f(mi.Vector2i(film.crop_offset()) + mi.Vector2i(0, dr.opaque(mi.Int32, top)))
+    return block_position, active, (_make_block_values(film, weight, *of_layer) for of_layer in layer_samples)
 
 
-def _values(film, weight, radiance, valid, aovs) -> list:
-    """What is added to a film's block for each sample."""
+def _make_block_values(film, weight, radiance, valid, aovs) -> list:
+    """Return the values that each sample adds to a block of the film."""
     import drjit as dr
     import mitsuba as mi
 
@@ -383,33 +456,32 @@ def _values(film, weight, radiance, valid, aovs) -> list:
     return [*color, *alpha, mi.Float(1), *aovs]
 
 
-class _Grid:
-    """Pixels that are sampled, row by row, and the bands of them."""
+class _PixelGrid:
+    """The sampled pixels, row by row, and their division into bands."""
 
     def __init__(self, film, spp: int, rows: int):
         self.film, self.spp = film, spp
         self.size, self.offset = [int(v) for v in film.crop_size()], [int(v) for v in film.crop_offset()]
         self.height = self.size[1]
         self.rows = min(rows or self.height, self.height)
-        self.divided = self.rows < self.height
+        self.is_divided = self.rows < self.height
         filters = film.rfilter()
         self.border = int(filters.border_size()) if film.sample_border() else 0
-        self._reach = _reach(film)
+        self._filter_radius = _filter_radius(film)
         self.width = self.size[0] + 2 * self.border
-        self.total = sum(b - a for a, b in map(self.samples, range(0, self.height, self.rows)))
+        self.total = sum(b - a for a, b in map(self.sample_range, range(0, self.height, self.rows)))
 
-    def samples(self, top: int) -> tuple[int, int]:
-        """The samples, of those of the whole picture, that reach the band at ``top``: the first, and the one after the
-        last."""
-        first = max(top - self._reach + self.border, 0)
-        last = min(top + self.rows + self._reach + self.border, self.height + 2 * self.border)
-        if not self.divided:
+    def sample_range(self, top: int) -> tuple[int, int]:
+        """Return the first sample that contributes to the band at ``top``, and the end of the range."""
+        first = max(top - self._filter_radius + self.border, 0)
+        last = min(top + self.rows + self._filter_radius + self.border, self.height + 2 * self.border)
+        if not self.is_divided:
             first, last = 0, self.height + 2 * self.border
         return first * self.width * self.spp, last * self.width * self.spp
 
-    def block(self, aov_names: list[str]):
-        """What the samples of a band are added to."""
-        with self._cropped():
+    def make_block(self, aov_names: list[str]):
+        """Make the block that accumulates the samples of a band."""
+        with self._crop_to_band():
             self.film.prepare(aov_names)
             block = self.film.create_block()
             block.set_offset(self.film.crop_offset())
@@ -417,14 +489,16 @@ class _Grid:
         return block
 
     @contextmanager
-    def as_whole(self, block, layers: LayerSource):
-        """Add samples to ``block``, that of the first of ``layers``, and to the others, in the way in which Dr.Jit
-        would add them to the whole picture, which is another for more than a million values
-        (`dr.set_expand_threshold`) and rounds differently."""
+    def match_accumulation(self, block, layers: LayerSource):
+        """Accumulate samples as Dr.Jit does for the undivided image.
+
+        Dr.Jit uses another method, which rounds differently, for more than a million values
+        (`dr.set_expand_threshold`). ``block`` is the block of the first layer.
+        """
         import drjit as dr
 
         threshold = dr.expand_threshold()
-        channels = block.channel_count() - len(layers.names[0]) + layers.count
+        channels = block.channel_count() - len(layers.channel_names[0]) + layers.num_channels
         if self.size[0] * self.size[1] * channels > threshold:
             dr.set_expand_threshold(0)
         try:
@@ -433,26 +507,26 @@ class _Grid:
             dr.set_expand_threshold(threshold)
 
     def develop(self, aov_names: list[str], block) -> None:
-        """Let the film hold what is in ``block``."""
-        with self._cropped():
+        """Copy ``block`` into the film."""
+        with self._crop_to_band():
             self.film.prepare(aov_names)
             self.film.put_block(block)
 
     @contextmanager
-    def _cropped(self):
-        # Only for as long as no ray is made: sensors see the whole film. All bands lie at the film's corner, so that
-        # the place of a band is not part of the kernel.
-        if not self.divided:
+    def _crop_to_band(self):
+        # Never while rays are traced: sensors need the size of the whole film. Each band is at the corner of the film,
+        # so that its position is not compiled into the kernel.
+        if not self.is_divided:
             yield
             return
-        _crop(self.film, [self.size[0], self.rows], [0, 0])
+        _set_crop(self.film, [self.size[0], self.rows], [0, 0])
         try:
             yield
         finally:
-            _crop(self.film, self.size, self.offset)
+            _set_crop(self.film, self.size, self.offset)
 
 
-def _crop(film, size, offset) -> None:
+def _set_crop(film, size, offset) -> None:
     import mitsuba as mi
 
     params = mi.traverse(film)
@@ -460,18 +534,25 @@ def _crop(film, size, offset) -> None:
     params.update()
 
 
-# ---- Channels ----
-#
-# A picture taken apart: its colour and its AOVs as arrays.
+# ---- Channels of an image ----
 
 SURFACE_OPACITY = 0.5
-"""Opacity from which on a pixel shows a surface, as the integrator has it by default."""
+"""Opacity above which a pixel counts as a surface; the default of the integrator."""
 
 
 @dataclass(frozen=True, eq=False)
 class Channels:
-    """``color`` (h, w, 3): linear radiance; ``aovs``: (h, w) each, by name, a vector's as ``position.X``; ``bitmap``:
-    Mitsuba's, with all channels."""
+    """The channels of an image.
+
+    Parameters
+    ----------
+    color : ndarray of shape (h, w, 3)
+        Linear radiance.
+    aovs : dict of str to ndarray of shape (h, w)
+        AOVs by name; components of vectors as in ``position.X``.
+    bitmap : mi.Bitmap
+        All channels.
+    """
 
     color: np.ndarray
     aovs: dict[str, np.ndarray]
@@ -479,48 +560,76 @@ class Channels:
 
     @property
     def mask(self) -> np.ndarray:
-        """Where there is a surface (h, w), bool; needs the AOV ``opacity``."""
+        """Whether a pixel shows a surface (h, w), bool. Requires the AOV ``opacity``."""
         return self.aovs["opacity"] >= SURFACE_OPACITY
 
 
 def render_channels(
     scene, sensor, spp: int = 0, seed: int = 0, on_strip: Callable[[int, int], None] | None = None
 ) -> Channels:
-    """Render what ``sensor`` sees of ``scene`` (`mi.Scene`) with the scene's integrator, as ``mi.render`` does.
+    """Render an image with the integrator of the scene, as ``mi.render`` does.
 
-    ``spp``: samples a pixel, 0 for those of the sensor's sampler. ``on_strip`` is told the samples done and those of
-    all, several times a second, and may raise.
+    Parameters
+    ----------
+    scene : mi.Scene
+        The scene.
+    sensor : mi.Sensor
+        The camera.
+    spp : int
+        Samples per pixel; 0 uses the number of the sampler.
+    seed : int
+        Seed of the rendering.
+    on_strip : callable, optional
+        Called several times per second with the number of finished samples and of all samples. It may raise an
+        exception.
+
+    Returns
+    -------
+    Channels
+        Colour and AOVs.
     """
     (band,) = render_bands(scene, sensor, spp=spp, seed=seed, on_strip=on_strip)
     return read_channels(band.film, scene.integrator().aov_names())
 
 
 def read_channels(film, aov_names: Sequence[str]) -> Channels:
-    """What a developed ``film`` holds, whose last channels are those of AOVs, with these names."""
+    """Read the channels of a developed ``film`` whose last channels are the AOV channels ``aov_names``."""
     names = [name.split(".") for name in aov_names]
     pixels = np.array(film.develop())
     color = pixels[..., : pixels.shape[2] - len(names)]
     first = color.shape[2]
-    several = {parts[0] for parts in names if [p[0] for p in names].count(parts[0]) > 1}
-    key = lambda parts: ".".join(parts) if parts[0] in several else parts[0]
+    vectors = {parts[0] for parts in names if [p[0] for p in names].count(parts[0]) > 1}
+    key = lambda parts: ".".join(parts) if parts[0] in vectors else parts[0]
     aovs = {key(parts): pixels[..., first + k] for k, parts in enumerate(names)}
     # Mono variants render one channel.
     return Channels(np.broadcast_to(color[..., :3], (*color.shape[:2], 3)), aovs, film.bitmap())
 
 
-# ---- The integrator `nerg` of a scene asked for AOVs that its own list may lack, for the scene's own observer ----
+# ---- AOVs in addition to those of a scene file ----
 
 
-class AovLayer:
-    """What is rendered in place of a scene's own picture (`LayerSource`): colour, and the AOVs ``names_asked``.
+class AskedLayer:
+    """A layer with colour and chosen AOVs, for the observer of the scene.
 
-    Raises `NergError` for those that ``integrator``, a `nerg`, cannot compute.
+    Parameters
+    ----------
+    integrator : NergIntegrator
+        The integrator of the scene.
+    sensor : mi.Sensor
+        The camera.
+    aovs : sequence of str
+        Names of AOVs, which the scene file need not list.
+
+    Raises
+    ------
+    NergError
+        The integrator cannot compute one of the AOVs.
     """
 
-    def __init__(self, integrator: Any, sensor: Any, names_asked: Sequence[str]):
-        self._sensor, self._context = sensor, integrator.make_context(names_asked, True)
-        self.names = [self._context.channel_names(self._context.aovs)]
-        self.count = len(self.names[0])
+    def __init__(self, integrator: Any, sensor: Any, aovs: Sequence[str]):
+        self._sensor, self._context = sensor, integrator.make_context(aovs, True)
+        self.channel_names = [self._context.channel_names(self._context.aovs)]
+        self.num_channels = len(self.channel_names[0])
 
     def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any, active: Any) -> Iterable[tuple]:
         camera = self._context.trace(scene, [self._sensor], sampler, ray, active)
@@ -530,18 +639,18 @@ class AovLayer:
 
 
 def is_nerg(integrator: Any) -> bool:
-    """Whether an integrator, or None, is `nerg`: by name, since each change of variant makes that class anew."""
+    """Whether an integrator is `nerg`. Compares names, since each change of the variant creates a new class."""
     return type(integrator).__name__ == "NergIntegrator"
 
 
 def require_nerg(path: Path, scene: Any) -> Any:
-    """The integrator of ``scene``, which was read from ``path``. Raises `NergError` where it is not `nerg`."""
+    """Return the integrator of ``scene``, loaded from ``path``. Raises `NergError` if it is not `nerg`."""
     integrator = scene.integrator()
     if not is_nerg(integrator):
         kind = "none" if integrator is None else f'"{integrator.class_name()}"'
         raise NergError(
-            f'an overlay needs the integrator "nerg", and "{path}" has {kind}; "nerg scene {path} -o new.xml" writes '
-            "one around it"
+            f'an overlay needs the integrator "nerg", but "{path}" has {kind}; '
+            f'use "nerg scene {path} -o new.xml" to add it'
         )
     return integrator
 
@@ -555,42 +664,64 @@ def render_aovs(
     seed: int = 0,
     on_strip: Callable[[int, int], None] | None = None,
 ) -> Channels:
-    """Colour and the AOVs ``names`` of what ``sensor`` sees of ``scene``, which was read from ``path``.
+    """Render colour and chosen AOVs of a scene.
 
-    Raises `NergError` for a scene whose integrator is not `nerg`, for AOVs that this cannot compute, and for pictures
-    that are made in one piece only (`why_whole`).
+    Parameters
+    ----------
+    path : Path
+        File of the scene, for messages.
+    scene : mi.Scene
+        The scene, whose integrator is `nerg`.
+    sensor : mi.Sensor
+        The camera.
+    names : sequence of str
+        Names of AOVs.
+    spp, seed, on_strip
+        As for `render_channels`.
+
+    Returns
+    -------
+    Channels
+        Colour and AOVs.
+
+    Raises
+    ------
+    NergError
+        The integrator is not `nerg` or cannot compute an AOV, or the image cannot be divided (`undividable_reason`).
     """
     integrator = require_nerg(path, scene)
     reason = undividable_reason(scene, sensor)
     if reason is not None:
-        raise NergError(f'"{path}" cannot be rendered with an overlay because of {reason}; choose another sensor')
+        raise NergError(f'"{path}" cannot be rendered with an overlay because of {reason}; use another sensor')
     layer = AovLayer(integrator, sensor, names)
     (band,) = render_bands(scene, sensor, spp=spp, seed=seed, on_strip=on_strip, layers=layer)
-    return read_channels(band.film, layer.names[0])
+    return read_channels(band.film, layer.channel_names[0])
 
 
-# ---- Long renders ----
+# ---- Long renderings ----
 #
-# What pays only where many samples are rendered of one scene: kernels that know the weights of its fields.
+# Kernels with constant network weights are faster but take seconds to compile.
 
 LONG_RENDER_SAMPLES = 1 << 27
-"""From so many on a render is long: 146 pictures of 1280 x 720 pay for some seconds of compilation many times."""
+"""Number of samples from which constant weights pay off: 146 images of 1280 x 720."""
 
 
 def prepare_long_render(samples: int, scene: Any) -> bool:
-    """Make ready ``scene`` for so many ``samples``, without a change of what it shows; whether there was anything to
-    do."""
+    """Prepare ``scene`` for a rendering of ``samples`` samples, which does not change the result.
+
+    Returns whether the rendering is long and the scene has trained fields.
+    """
     integrator = scene.integrator()
     if samples < LONG_RENDER_SAMPLES or not is_nerg(integrator):
         return False
-    found = get_trained_fields(integrator)
-    for field in found:
+    trained = get_trained_fields(integrator)
+    for field in trained:
         set_constant_weights(field)
-    return bool(found)
+    return bool(trained)
 
 
 def get_trained_fields(integrator: Any) -> list[RadianceField | AnyGazeField]:
-    """The trained fields of an integrator `nerg`, those that it has: of its radiance, of its gaze."""
+    """Return the radiance field and the gaze field of an integrator `nerg`, if present."""
     medium, gaze = integrator.medium, integrator.gaze
-    found: list[RadianceField | AnyGazeField] = [medium.field] if isinstance(medium, FieldMedium) else []
-    return found if gaze is None else [*found, gaze.field]
+    trained: list[RadianceField | AnyGazeField] = [medium.field] if isinstance(medium, FieldMedium) else []
+    return trained if gaze is None else [*trained, gaze.field]

@@ -1,5 +1,4 @@
-"""Files around a rendering: pictures written in pieces, values of frames, and meshes checked before Mitsuba reads
-them."""
+"""Files of a rendering: frames, meshes and volumes to check, and images written in pieces."""
 
 from __future__ import annotations
 
@@ -24,24 +23,39 @@ from nerg_mi.formats.ply import PLY_MAGIC, parse_ply, write_columns
 
 # ---- Frames file ----
 #
-# Sequences of pictures: a CSV file whose header names `<default>`s of a scene and whose rows are their values in each
-# picture.
+# A CSV file for image sequences: the header names `<default>`s of a scene, and each row contains their values in one
+# frame.
 
-FRAMES_BYTES = 64 << 20
-"""A file of frames may have so many bytes."""
+MAX_FRAMES_BYTES = 64 << 20
+"""Maximum size of a frames file."""
 
-FRAMES = 1_000_000
-"""And so many frames."""
+MAX_FRAMES = 1_000_000
+"""Maximum number of frames."""
 
-_COLUMNS = 64
+_MAX_COLUMNS = 64
 _NAME = re.compile(r"[A-Za-z_]\w*", re.ASCII)
 
 
 def read_frames(path: str | Path) -> list[dict[str, str]]:
-    """Values by the name of their `<default>`, of each picture. Raises `NergError` for what is no such file, naming the
-    line."""
-    raw = read_bytes(path, "file of frames", FRAMES_BYTES)
-    with translate_read_errors(path, "file of frames", "correct it"):
+    """Read a frames file.
+
+    Parameters
+    ----------
+    path : str or Path
+        CSV file.
+
+    Returns
+    -------
+    list of dict of str to str
+        For each frame, the values by the name of their `<default>`.
+
+    Raises
+    ------
+    NergError
+        The file is not a valid frames file; the message names the line.
+    """
+    raw = read_bytes(path, "frames file", MAX_FRAMES_BYTES)
+    with translate_read_errors(path, "frames file", "correct it"):
         text = raw.decode("utf-8-sig")
     names: list[str] | None = None
     frames: list[dict[str, str]] = []
@@ -51,65 +65,85 @@ def read_frames(path: str | Path) -> list[dict[str, str]]:
             if not any(cell.strip() for cell in cells):
                 continue
             if names is None:
-                names = _names(path, [cell.strip() for cell in cells])
+                names = _check_names(path, [cell.strip() for cell in cells])
                 continue
             if len(cells) != len(names):
                 raise NergError(
-                    f'"{path}" (line {lines.line_num}) has {len(cells)} values for {len(names)} names; positions have '
-                    'commas in them and need quotes: "1, 2, 3"'
+                    f'"{path}" (line {lines.line_num}) has {len(cells)} values for {len(names)} columns; values with '
+                    'commas, such as positions, need quotes: "1, 2, 3"'
                 )
-            if len(frames) == FRAMES:
-                raise NergError(f'"{path}" has more than {FRAMES:,} frames; divide it')
+            if len(frames) == MAX_FRAMES:
+                raise NergError(f'"{path}" has more than {MAX_FRAMES:,} frames; split the file')
             frames.append(dict(zip(names, cells)))
     except csv.Error as error:
-        raise NergError(f'"{path}" (line {lines.line_num}) is no CSV: {sanitize(error)}; correct it') from error
+        raise NergError(f'"{path}" (line {lines.line_num}) is not valid CSV: {sanitize(error)}') from error
     if not frames:
-        raise NergError(f'"{path}" holds no frames: a line of names of <default>s, and a line for each picture')
+        raise NergError(
+            f'"{path}" contains no frames; it needs a header with names of <default>s and one line per frame'
+        )
     return frames
 
 
-def _names(path: str | Path, names: list[str]) -> list[str]:
+def _check_names(path: str | Path, names: list[str]) -> list[str]:
     bad = next((name for name in names if not _NAME.fullmatch(name)), None)
-    if bad is not None or len(names) > _COLUMNS:
+    if bad is not None or len(names) > _MAX_COLUMNS:
         what = f"{len(names)} names" if bad is None else f'"{sanitize(bad, 40)}"'
-        raise NergError(f'"{path}" begins with {what}, where names of <default>s of the scene are needed, such as eye')
+        raise NergError(
+            f'the header of "{path}" contains {what}; it must consist of names of <default>s of the scene, such as eye'
+        )
     if len(set(names)) < len(names):
-        raise NergError(f'"{path}" names a <default> twice; leave one of the columns')
+        raise NergError(f'the header of "{path}" contains a name twice; remove one of the columns')
     return names
 
 
 def write_frames(path: str | Path, frames: Sequence[Mapping[str, str]]) -> None:
-    """Write ``frames``, whole or not at all."""
+    """Write a frames file atomically."""
     write_csv(path, frames)
 
 
 def frame_path(output: Path, number: int, count: int) -> Path:
-    """The file of the picture ``number``, from 1 on, of ``count``: walk.png, walk_0001.png."""
+    """Return the path of frame ``number``, from 1 to ``count``, of a sequence: walk.png becomes walk_0001.png."""
     return output.with_name(f"{output.stem}_{number:0{max(4, len(str(count)))}d}{output.suffix}")
 
 
-# ---- Mesh file ----
+# ---- Checks of meshes and volumes ----
 #
-# Meshes and volumes that Mitsuba is going to read, looked at before: its readers believe the counts and indices in a
-# file, and fill the memory or end the process where these are wrong.
+# Mitsuba trusts the counts and indices in a file; wrong ones exhaust the memory or crash the process. These functions
+# check files before Mitsuba reads them.
 
 
 def check_mesh(path: str | os.PathLike, kind: str, colored: bool = False) -> None:
-    """Raise `NergError` for a file that Mitsuba's plugin ``kind`` ("ply", "obj") does not read as a mesh, or not as the
-    one that it is; ``colored``: whether a texture is to show its colours."""
+    """Check that Mitsuba reads a mesh file correctly.
+
+    Parameters
+    ----------
+    path : path-like
+        Mesh file.
+    kind : str
+        Mitsuba plugin, "ply" or "obj".
+    colored : bool
+        Whether a texture uses the colours of the mesh.
+
+    Raises
+    ------
+    NergError
+        Mitsuba cannot read the file, or not all of it.
+    """
     mesh = read_mesh_file(path, suffix=f".{kind}")
     reason = mesh.unreadable_reason or (
-        "an alpha, or their format, hides its colours" if colored and mesh.hides_colors else ""
+        "Mitsuba does not read its colours because of an alpha channel or their format"
+        if colored and mesh.hides_colors
+        else ""
     )
     if reason:
         raise NergError(
-            f'Mitsuba does not read the mesh "{path}" as it is meant: {reason}; export it otherwise, or take what '
-            f'"nerg scene {path} -o scene.xml" makes of it'
+            f'Mitsuba cannot read the mesh "{path}" correctly: {reason}; export it in another format, or convert it '
+            f'with "nerg scene {path} -o scene.xml"'
         )
 
 
-def check_points(path: str | os.PathLike) -> None:
-    """Raise `NergError` for a PLY file that holds less than its header says, or no vertices."""
+def check_ply_points(path: str | os.PathLike) -> None:
+    """Check that a PLY file has vertices and is complete. Raises `NergError` otherwise."""
     raw = map_bytes(path, "PLY file", MAX_BYTES, PLY_MAGIC, "export it again")
     with translate_read_errors(path, "PLY file", "export it again"):
         tables = parse_ply(np.frombuffer(raw, np.uint8)).tables
@@ -118,57 +152,70 @@ def check_points(path: str | os.PathLike) -> None:
 
 
 def write_mesh(path: str | os.PathLike, mesh: MeshFile) -> None:
-    """Write ``mesh`` as a PLY file that Mitsuba shows: triangles, with the attributes ``vertex_color`` or
-    ``face_color``, linear in 0..1, where there are colours."""
+    """Write ``mesh`` as a PLY file that Mitsuba reads.
+
+    Colours become the attribute ``vertex_color`` or ``face_color``, linear in 0..1.
+    """
     columns = dict(zip("xyz", mesh.vertices.T))
     if mesh.normals is not None:
         columns |= dict(zip(("nx", "ny", "nz"), mesh.normals.T))
-    tint = lambda colors: {} if colors is None else {f"color_{k}": colors[:, k] for k in range(3)}
-    write_columns(path, columns | tint(mesh.colors), mesh.faces, tint(mesh.face_colors))
+    color_columns = lambda colors: {} if colors is None else {f"color_{k}": colors[:, k] for k in range(3)}
+    write_columns(path, columns | color_columns(mesh.colors), mesh.faces, color_columns(mesh.face_colors))
 
 
 def check_vol(path: str | os.PathLike) -> None:
-    """Raise `NergError` for a volume (Mitsuba's .vol) with counts below 1, or with fewer values than it announces."""
+    """Check that a Mitsuba volume (.vol) is valid and complete. Raises `NergError` otherwise."""
     path = Path(path)
     with open_file(path, "volume") as file:
         head = file.read(48)
         magic, version, kind, *size = struct.unpack("<3sB5i", head[:24])
         if magic != b"VOL" or version != 3:
-            raise ValueError("it is no volume of Mitsuba's version 3")
+            raise ValueError("it is not a Mitsuba volume of version 3")
         if kind != 1:
-            raise ValueError(f"its values are of kind {kind}, and only float32 (1) is read")
+            raise ValueError(f"its data type is {kind}, but only 1 (float32) is supported")
         if min(size) < 1:
             raise ValueError("it has {} x {} x {} voxels of {} channels".format(*size))
         # Python's integers do not overflow.
         needed = 48 + 4 * size[0] * size[1] * size[2] * size[3]
         if path.stat().st_size < needed:
-            raise ValueError(f"it has {path.stat().st_size:,} bytes, and its header asks for {needed:,}")
+            raise ValueError(f"it has {path.stat().st_size:,} bytes, but its header requires {needed:,}")
 
 
-# ---- Picture file ----
+# ---- Image files ----
 #
-# Picture files that are written from the top in pieces: .exr with all channels of a film, .png with its colour.
+# Images are written from the top in pieces: .exr with all channels of a film, .png with its colour.
 
 IMAGE_FORMATS = (".exr", ".png")
-_DITHER = 256
-"""Rows after which the pattern repeats that Mitsuba adds where it rounds to 8 bits."""
+_DITHER_ROWS = 256
+"""Period, in rows, of the dither pattern that Mitsuba adds when it rounds to 8 bits."""
 
 
 @contextmanager
 def open_image_rows(
     path: str | Path, width: int, height: int, text: Mapping[str, str] | None = None
 ) -> Iterator[Callable[[object, int], None]]:
-    """A picture file of ``width`` x ``height`` pixels, whole or absent.
+    """Write an image file row by row, atomically.
 
-    Gives a function that writes the next rows: the first ``rows`` of a Mitsuba bitmap. Float32 in .exr, tonemapped to
-    sRGB in .png. ``text``: what the header says, by PNG's names.
+    Parameters
+    ----------
+    path : str or Path
+        Image file: .exr stores float32, .png stores sRGB.
+    width, height : int
+        Size in pixels.
+    text : mapping of str to str, optional
+        Texts for the header, by PNG keyword.
+
+    Yields
+    ------
+    callable
+        ``write(bitmap, rows)`` appends the first ``rows`` rows of a Mitsuba bitmap.
     """
     check_writable(path, *IMAGE_FORMATS)
     if Path(path).suffix.lower() == ".exr":
         with open_exr_writer(path, width, height, text) as write:
             yield lambda bitmap, rows: write({name: values[:rows] for name, values in split_bitmap_channels(bitmap).items()})
         return
-    # Opened first, so that a folder that cannot be written to is found before anything is rendered.
+    # Open the file first, so that an unwritable folder is reported before the rendering.
     with replace_atomically(path) as temporary:
         display = DisplayRows(width, height)
         yield display.add
@@ -176,28 +223,31 @@ def open_image_rows(
 
 
 class DisplayRows:
-    """The colour of a picture of ``width`` x ``height`` pixels in 8 bits, tonemapped to sRGB, put together from the
-    top."""
+    """Collects the colour of an image of ``width`` x ``height`` pixels in 8 bits sRGB, from the top."""
 
     def __init__(self, width: int, height: int):
-        self._pixels, self._done = np.empty((height, width, 3), np.uint8), 0
-        self._waiting, self._format = [], None
+        self._pixels, self._num_converted = np.empty((height, width, 3), np.uint8), 0
+        self._pending, self._format = [], None
 
     def add(self, bitmap, rows: int) -> None:
-        """Add the first ``rows`` of a Mitsuba bitmap."""
+        """Append the first ``rows`` rows of a Mitsuba bitmap."""
         import mitsuba as mi
 
-        # With AOVs the bitmap has many channels, of which the colour is the layer without a name.
+        # In a bitmap with AOVs, the colour is the layer without a name.
         if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
             bitmap = dict(bitmap.split())["<root>"]
         self._format = bitmap.pixel_format()
-        self._waiting.append(np.array(bitmap)[:rows])
-        known = sum(len(part) for part in self._waiting)
-        ready = known if self._done + known == len(self._pixels) else known // _DITHER * _DITHER
-        if ready:
-            values = np.concatenate(self._waiting)
-            self._convert(values[:ready])
-            self._waiting = [values[ready:].copy()]
+        self._pending.append(np.array(bitmap)[:rows])
+        num_pending = sum(len(part) for part in self._pending)
+        num_ready = (
+            num_pending
+            if self._num_converted + num_pending == len(self._pixels)
+            else num_pending // _DITHER_ROWS * _DITHER_ROWS
+        )
+        if num_ready:
+            values = np.concatenate(self._pending)
+            self._convert(values[:num_ready])
+            self._pending = [values[num_ready:].copy()]
 
     def _convert(self, values: np.ndarray) -> None:
         import mitsuba as mi
@@ -205,17 +255,17 @@ class DisplayRows:
         bitmap = mi.Bitmap(values, pixel_format=self._format).convert(
             mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, True
         )
-        self._pixels[self._done : self._done + len(values)] = np.array(bitmap)
-        self._done += len(values)
+        self._pixels[self._num_converted : self._num_converted + len(values)] = np.array(bitmap)
+        self._num_converted += len(values)
 
     def bitmap(self):
-        """All of it as a Mitsuba bitmap. Raises ``ValueError`` while rows are missing."""
+        """Return the complete image as a Mitsuba bitmap. Raises ``ValueError`` if rows are missing."""
         import mitsuba as mi
 
         return mi.Bitmap(self.pixels())
 
     def pixels(self) -> np.ndarray:
-        """All of it (height, width, 3), uint8. Raises ``ValueError`` while rows are missing."""
-        if self._done != len(self._pixels):
-            raise ValueError(f"{self._done} of {len(self._pixels)} rows were written")
+        """Return the complete image (height, width, 3), uint8. Raises ``ValueError`` if rows are missing."""
+        if self._num_converted != len(self._pixels):
+            raise ValueError(f"{self._num_converted} of {len(self._pixels)} rows were written")
         return self._pixels

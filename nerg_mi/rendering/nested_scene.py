@@ -1,4 +1,4 @@
-"""A scene file read as elements: as the place of a scene with gaze, and with another gaze field in it."""
+"""Scene files as XML elements: nested in another scene, or with another gaze field."""
 
 from __future__ import annotations
 
@@ -14,95 +14,130 @@ from nerg_mi.files.safe_read import translate_read_errors, resolve_path, check_r
 from .scene import check_scene_file
 from .scene_writer import BlankLine, Comment, Node, SceneContent, Verbatim, format_document, element, relative_path, check_attribute
 
-# ---- Somebody's scene file as the place of a scene with gaze ----
+# ---- A scene file nested in a scene with gaze ----
 #
-# Mitsuba takes one integrator a scene, which has to be `nerg`; the one of the file then lights its shapes from within
-# (docs/how-to/environments.md). An `<include>` cannot do that, so that the file is copied: what it includes becomes a
-# part of the copy, its sensors come after ours, and a `<path>` leads to the files that it names.
+# A Mitsuba scene has one integrator, which must be `nerg`; the integrator of the nested file becomes its child and
+# computes the light on the shapes (docs/how-to/environments.md). An `<include>` cannot do this, so the elements of the
+# file are copied, included files are expanded, and a `<path>` makes its relative file names valid.
 
-BYTES = 16 << 20
-"""A scene file that is copied may have so many bytes, with each that it includes."""
+MAX_BYTES = 16 << 20
+"""Maximum size of a scene file to copy, and of each file that it includes."""
 
-SPP = 64
-"""Samples a pixel: paths of light have more noise than fields."""
+DEFAULT_SPP = 64
+"""Samples per pixel: path tracing is noisier than fields."""
 
 
 def nest_scene(path: Path, folder: Path) -> SceneContent:
-    """The scene file ``path`` as the place of one that is written into ``folder``.
+    """Make the content of a new scene file from an existing one.
 
-    Raises `NergError` for what is no scene file, and for one whose integrator is `nerg` already or one of several.
+    Parameters
+    ----------
+    path : Path
+        Scene file to nest.
+    folder : Path
+        Folder of the new scene file.
+
+    Returns
+    -------
+    SceneContent
+        The elements of the nested file.
+
+    Raises
+    ------
+    NergError
+        The file is not a scene file, has several integrators, or its integrator is already `nerg`.
     """
-    version, children = scene_elements(path)
+    version, children = read_scene_elements(path)
     defaults = [child for child in children if child.tag == "default"]
-    values = filled_values(children)
+    values = resolve_defaults(children)
     integrators = [child for child in children if child.tag == "integrator"]
     _check_integrators(path, integrators, values)
-    ids = {found.get("id", "") for child in children for found in child.iter()}
-    others = [child for child in children if child.tag not in ("default", "integrator", "path")]
-    light: tuple[Node, ...] = ()
+    ids = {node.get("id", "") for child in children for node in child.iter()}
+    other_elements = [child for child in children if child.tag not in ("default", "integrator", "path")]
+    light_nodes: tuple[Node, ...] = ()
     if integrators:
-        light = (Comment(f"What lights the shapes: the integrator of {path.name}."), *map(verbatim, integrators))
+        light_nodes = (
+            Comment(f"The integrator of {path.name} computes the light on the shapes."),
+            *map(to_verbatim, integrators),
+        )
     return SceneContent(
-        integrator_children=light,
-        scene_children=(Comment(f"What follows is {path.name}; its sensors are counted after ours."), *map(verbatim, others)),
-        preamble=(*_paths(path, children, folder), *map(verbatim, defaults), BlankLine()),
-        spp=SPP,
+        integrator_children=light_nodes,
+        scene_children=(
+            Comment(f"The rest is copied from {path.name}. Its sensors come after the sensors above."),
+            *map(to_verbatim, other_elements),
+        ),
+        preamble=(*_make_path_elements(path, children, folder), *map(to_verbatim, defaults), BlankLine()),
+        spp=DEFAULT_SPP,
         version=version,
         reserved_names=frozenset(values) | frozenset(ids),
     )
 
 
-def scene_elements(path: Path) -> tuple[str, list[ElementTree.Element]]:
-    """The version of the scene file ``path``, and its elements, with those that it includes in their place. Raises
-    `NergError` for what is no scene file."""
+def read_scene_elements(path: Path) -> tuple[str, list[ElementTree.Element]]:
+    """Read the version and the elements of a scene file, with its includes expanded.
+
+    Raises
+    ------
+    NergError
+        The file is not a scene file.
+    """
     check_scene_file(path)
-    root = _root(path)
-    return root.get("version", "3.0.0"), list(_inlined(root, path, [path.parent]))
+    root = _parse_root(path)
+    return root.get("version", "3.0.0"), list(_expand_includes(root, path, [path.parent]))
 
 
-def filled_values(children: list[ElementTree.Element]) -> dict[str, str]:
-    """The values of the `<default>`s among a scene's elements, where they name each other filled in."""
+def resolve_defaults(children: list[ElementTree.Element]) -> dict[str, str]:
+    """Return the values of the `<default>`s among the elements of a scene, with references resolved."""
     values: dict[str, str] = {}
     for default in children:
         if default.tag == "default":
-            values.setdefault(default.get("name", ""), fill(default.get("value", ""), values))
+            values.setdefault(default.get("name", ""), substitute_defaults(default.get("value", ""), values))
     return values
 
 
-def name_files(elements: list[ElementTree.Element], path: Path, children: list[ElementTree.Element]) -> None:
-    """Make names of files that are there absolute, in ``elements`` and below, and in the values of `<default>`s; they
-    are of the scene file ``path``, whose ``children`` say in which folders to look."""
+def make_paths_absolute(elements: list[ElementTree.Element], path: Path, children: list[ElementTree.Element]) -> None:
+    """Make file names in ``elements`` and their `<default>`s absolute, in place.
+
+    Parameters
+    ----------
+    elements : list of Element
+        Elements to change.
+    path : Path
+        The scene file that contains them.
+    children : list of Element
+        All elements of the scene file, whose `<path>` elements name the folders to search.
+    """
     folders = [path.parent, *(path.parent / c.get("value", "") for c in children if c.tag == "path")]
-    for one in (found for given in elements for found in given.iter()):
-        named = one.tag == "default" or (one.tag == "string" and one.get("name") == "filename")
-        value = one.get("value", "")
-        if not named or not value or value.startswith("$"):
+    for node in (node for top in elements for node in top.iter()):
+        names_file = node.tag == "default" or (node.tag == "string" and node.get("name") == "filename")
+        value = node.get("value", "")
+        if not names_file or not value or value.startswith("$"):
             continue
-        there = next((f / value for f in folders if (f / value).is_file()), None)
-        if there is not None:
-            one.set("value", check_attribute(str(resolve_path(there))))
+        path_in_folder = next((f / value for f in folders if (f / value).is_file()), None)
+        if path_in_folder is not None:
+            node.set("value", check_attribute(str(resolve_path(path_in_folder))))
 
 
-def verbatim(found: ElementTree.Element) -> Verbatim:
-    """An element of a scene file as a part of another."""
-    found = deepcopy(found)
-    found.tail = None
-    ElementTree.indent(found, " " * 4)
-    return Verbatim(ElementTree.tostring(found, encoding="unicode"))
+def to_verbatim(node: ElementTree.Element) -> Verbatim:
+    """Copy an element of a scene file for another one."""
+    node = deepcopy(node)
+    node.tail = None
+    ElementTree.indent(node, " " * 4)
+    return Verbatim(ElementTree.tostring(node, encoding="unicode"))
 
 
-def _root(path: Path) -> ElementTree.Element:
-    check_regular_file(path, "scene file", BYTES)
+def _parse_root(path: Path) -> ElementTree.Element:
+    check_regular_file(path, "scene file", MAX_BYTES)
     builder = ElementTree.TreeBuilder(insert_comments=True)
     with translate_read_errors(path, "scene file", "correct it", extra_errors=(ElementTree.ParseError,)):
         root = ElementTree.parse(path, ElementTree.XMLParser(target=builder)).getroot()
     if root.tag != "scene":
-        raise NergError(f'"{path}" is no scene file: it begins with <{sanitize(root.tag, 40)}> where <scene> is needed')
+        raise NergError(f'"{path}" is not a scene file: its root element is <{sanitize(root.tag, 40)}>, not <scene>')
     return root
 
 
-def _inlined(root: ElementTree.Element, path: Path, folders: list[Path]) -> Iterator[ElementTree.Element]:
-    """The elements of a scene with those that it includes in their place. `check_scene_file` has bounded the depth."""
+def _expand_includes(root: ElementTree.Element, path: Path, folders: list[Path]) -> Iterator[ElementTree.Element]:
+    """Yield the elements of a scene with its includes expanded. `check_scene_file` has limited the depth."""
     for child in root:
         if child.tag == "path":
             folders.append(folders[0] / child.get("value", ""))
@@ -110,87 +145,104 @@ def _inlined(root: ElementTree.Element, path: Path, folders: list[Path]) -> Iter
             yield child
             continue
         name = child.get("filename", "")
-        found = next((f / name for f in folders if name and (f / name).is_file()), None)
-        if found is None:
+        included = next((f / name for f in folders if name and (f / name).is_file()), None)
+        if included is None:
             raise NergError(f'the scene file "{path}" includes "{sanitize(name)}", which is not there; correct the name')
-        yield from _inlined(_root(found), found, folders)
+        yield from _expand_includes(_parse_root(included), included, folders)
 
 
 def _check_integrators(path: Path, integrators: list[ElementTree.Element], values: dict[str, str]) -> None:
     if len(integrators) > 1:
-        raise NergError(f'the scene file "{path}" has {len(integrators)} integrators; leave one of them')
-    kinds = {fill(found.get("type", ""), values) for i in integrators for found in i.iter("integrator")}
+        raise NergError(f'the scene file "{path}" has {len(integrators)} integrators; keep one of them')
+    kinds = {substitute_defaults(node.get("type", ""), values) for i in integrators for node in i.iter("integrator")}
     if "nerg" in kinds:
         raise NergError(
-            f'the integrator of "{path}" is "nerg" already; put the gaze field into it by hand, as a <volume '
-            'name="gaze" type="gazefield"> (docs/reference/plugins.md), and "nerg render" shows it'
+            f'the integrator of "{path}" is already "nerg"; add the gaze field to it as <volume name="gaze" '
+            'type="gazefield"> (docs/reference/plugins.md) and use "nerg render"'
         )
 
 
-def fill(text: str, values: dict[str, str]) -> str:
-    """``text`` with ``values`` in place of their `$key`s."""
-    # The longest name first, as Mitsuba does.
+def substitute_defaults(text: str, values: dict[str, str]) -> str:
+    """Replace `$key` references in ``text`` by ``values``."""
+    # Longest names first, as in Mitsuba.
     for key in sorted(values, key=len, reverse=True):
         text = text.replace(f"${key}", values[key])
     return text
 
 
-def _paths(path: Path, children: list[ElementTree.Element], folder: Path) -> list[Node]:
-    """Where the files are that the scene names."""
-    given = [path.parent, *(path.parent / child.get("value", "") for child in children if child.tag == "path")]
-    names = [relative_path(place, folder) for place in given]
+def _make_path_elements(path: Path, children: list[ElementTree.Element], folder: Path) -> list[Node]:
+    """Make `<path>` elements for the folders that contain the files of the scene."""
+    folders = [path.parent, *(path.parent / child.get("value", "") for child in children if child.tag == "path")]
+    names = [relative_path(place, folder) for place in folders]
     return [element("path", value=check_attribute(name)) for name in dict.fromkeys(names) if name != "."]
 
 
-# ---- A scene file with another gaze field in its place ----
+# ---- Replacing the gaze field of a scene file ----
 
-ROLE = "gaze"
-"""The integrator's property that is its gaze field."""
+GAZE_PROPERTY = "gaze"
+"""Name of the gaze field in the integrator."""
 
 
 def find_gaze_file(path: Path) -> Path | None:
-    """The file of the gaze field in the integrator of the scene file ``path``; None where it has none.
+    """Find the file of the gaze field of a scene file; None if it has no gaze field.
 
-    Raises `NergError` for a scene without an integrator of its own in the file.
+    Raises
+    ------
+    NergError
+        The file does not contain exactly one integrator.
     """
-    _, own = _elements(path)
-    volume = _gaze_volume(_integrator(path, own))
+    _, elements = _read_absolute_elements(path)
+    volume = _find_gaze_volume(_find_integrator(path, elements))
     if volume is None:
         return None
     name = next((c.get("value", "") for c in volume if c.get("name") == "filename"), "")
-    return path.parent / fill(name, filled_values(own)) if name else None
+    return path.parent / substitute_defaults(name, resolve_defaults(elements)) if name else None
 
 
 def replace_gaze(path: Path, gaze: Path) -> str:
-    """The scene file ``path`` as text, with the gaze field of the file ``gaze`` in place of its own, or beside what it
-    has; names of files are absolute, so that it may be written anywhere.
+    """Return the text of a scene file with another gaze field.
 
-    Raises `NergError` as `gaze_of_scene`.
+    Parameters
+    ----------
+    path : Path
+        Scene file.
+    gaze : Path
+        Gaze field, which replaces that of the scene or is added.
+
+    Returns
+    -------
+    str
+        The text. It contains absolute paths, so that it can be written anywhere.
+
+    Raises
+    ------
+    NergError
+        The file does not contain exactly one integrator.
     """
-    version, own = _elements(path)
-    integrator = _integrator(path, own)
-    volume = _gaze_volume(integrator)
+    version, elements = _read_absolute_elements(path)
+    integrator = _find_integrator(path, elements)
+    volume = _find_gaze_volume(integrator)
     if volume is not None:
         integrator.remove(volume)
-    volume = SubElement(integrator, "volume", name=ROLE, type="gazefield")
+    volume = SubElement(integrator, "volume", name=GAZE_PROPERTY, type="gazefield")
     SubElement(volume, "string", name="filename", value=check_attribute(str(resolve_path(gaze))))
-    return format_document(list(map(verbatim, own)), f"{path.name} with the gaze field {gaze.name}.", version)
+    return format_document(list(map(to_verbatim, elements)), f"{path.name} with the gaze field {gaze.name}.", version)
 
 
-def _elements(path: Path) -> tuple[str, list[Element]]:
-    """The version of a scene file, and its elements with absolute names of files."""
-    version, children = scene_elements(path)
-    own = [deepcopy(child) for child in children if child.tag != "path"]
-    name_files(own, path, children)
-    return version, own
+def _read_absolute_elements(path: Path) -> tuple[str, list[Element]]:
+    """Read the version and the elements of a scene file, with absolute file names."""
+    version, children = read_scene_elements(path)
+    elements = [deepcopy(child) for child in children if child.tag != "path"]
+    make_paths_absolute(elements, path, children)
+    return version, elements
 
 
-def _integrator(path: Path, children: list[Element]) -> Element:
-    found = [child for child in children if child.tag == "integrator"]
-    if len(found) != 1:
-        raise NergError(f'"{path}" has {len(found)} integrators, where a gaze field goes into one; leave one of them')
-    return found[0]
+def _find_integrator(path: Path, children: list[Element]) -> Element:
+    integrators = [child for child in children if child.tag == "integrator"]
+    if len(integrators) != 1:
+        raise NergError(f'"{path}" has {len(integrators)} integrators, but a scene with gaze needs exactly one')
+    return integrators[0]
 
 
-def _gaze_volume(integrator: Element) -> Element | None:
-    return next((child for child in integrator if child.tag == "volume" and child.get("name") == ROLE), None)
+def _find_gaze_volume(integrator: Element) -> Element | None:
+    return next((child for child in integrator if child.tag == "volume" and child.get("name") == GAZE_PROPERTY), None)

@@ -1,4 +1,4 @@
-"""Loading a scene: the Mitsuba variant, checks of its file before Mitsuba reads it, and of the scene after that."""
+"""Loading of scenes: the Mitsuba variant, checks of the scene file, and checks of the loaded scene."""
 
 from __future__ import annotations
 
@@ -21,58 +21,74 @@ from nerg_mi.properties import resolve_scene_file
 from nerg_mi.ranges import SPP, check_number
 from nerg_mi.transport.geometry import check_shape
 
-from .files import check_mesh, check_points, check_vol
+from .files import check_mesh, check_ply_points, check_vol
 
-# ---- Scene file ----
+# ---- Checks of a scene file ----
 #
-# A scene file looked at before Mitsuba reads it: what would end the process or fill the memory is refused in a
-# sentence.
-#
-# The XML is read as a stream of tags, without recursion and without entities; the files that it includes are followed,
-# and the meshes, volumes and pictures that it names are looked at by their headers.
+# Before Mitsuba reads a scene file, it is checked for contents that would crash the process or exhaust the memory. The
+# XML is read as a stream of tags, without recursion and without entities. Included files are followed, and the headers
+# of meshes, volumes and images are checked.
 
-DEPTH = 256
-"""Elements may be nested so deep; Mitsuba's parser ends the process at some thousands."""
+MAX_DEPTH = 256
+"""Maximum nesting depth of elements; Mitsuba's parser crashes at some thousands."""
 
-ELEMENTS = 1_000_000
-"""A scene may have so many elements, with those of the files that it includes."""
+MAX_ELEMENTS = 1_000_000
+"""Maximum number of elements of a scene, with included files."""
 
-BYTES = 256 << 20
-"""A scene may have so many bytes of XML, with what is filled in for its `$key`s: values that name others may grow with
-each of them."""
+MAX_BYTES = 256 << 20
+"""Maximum size of the XML of a scene after `$key` substitution; values that refer to others can grow exponentially."""
 
-INCLUDES = 16
-"""Files may be included so deep."""
+MAX_INCLUDE_DEPTH = 16
+"""Maximum nesting depth of includes."""
 
-PIXELS = 1 << 28
-"""A picture may have so many pixels: 16384 x 16384."""
+MAX_PIXELS = 1 << 28
+"""Maximum number of pixels of an image: 16384 x 16384."""
 
-_PICTURES = {".png", ".jpg", ".jpeg", ".exr", ".hdr", ".rgbe", ".pfm", ".ppm", ".bmp"}
-_CHECKS = {"gridvolume": check_vol, "sdfgrid": check_vol, "ellipsoids": check_points, "ellipsoidsmesh": check_points}
+_IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".exr", ".hdr", ".rgbe", ".pfm", ".ppm", ".bmp"}
+_CHECKS = {
+    "gridvolume": check_vol,
+    "sdfgrid": check_vol,
+    "ellipsoids": check_ply_points,
+    "ellipsoidsmesh": check_ply_points,
+}
 
 
 def check_scene_file(path: str | Path, defaults: Mapping[str, str] | None = None) -> None:
-    """Look at the scene file ``path`` and at all that it names; ``defaults``: values for its `<default>` and `$key`.
+    """Check a scene file and all files that it names.
 
-    What is missing or unknown is left to Mitsuba, which says so. Raises `NergError`.
+    Missing files and unknown elements are left to Mitsuba, which reports them.
+
+    Parameters
+    ----------
+    path : str or Path
+        Scene file.
+    defaults : mapping of str to str, optional
+        Values for its `<default>`s and `$key`s.
+
+    Raises
+    ------
+    NergError
+        A file is damaged, too large or nested too deeply.
     """
     path = Path(path)
-    _Scene(path.parent, {k: str(v) for k, v in (defaults or {}).items()}).read_whole(path)
+    _SceneFileChecker(path.parent, {k: str(v) for k, v in (defaults or {}).items()}).check(path)
 
 
 def list_scene_files(path: str | Path, defaults: Mapping[str, str] | None = None) -> list[Path]:
-    """The scene file ``path`` and the files that it names, as far as they are there: what it includes, meshes, fields,
-    textures; a mesh is its own only file. ``defaults`` and errors as of `check_scene_file`."""
+    """List a scene file and the existing files that it names: includes, meshes, fields and textures.
+
+    A mesh file is its own only file. Parameters and errors as for `check_scene_file`.
+    """
     path = Path(path)
     if path.suffix.lower() in MESHES:
         return [path]
-    reader = _Scene(path.parent, {k: str(v) for k, v in (defaults or {}).items()})
-    reader.read_whole(path)
+    reader = _SceneFileChecker(path.parent, {k: str(v) for k, v in (defaults or {}).items()})
+    reader.check(path)
     return list(dict.fromkeys([path, *reader.files]))
 
 
 def check_scene(path: str | Path, scene) -> None:
-    """Look at what Mitsuba has made of the file: shapes, sensors, films and samplers. Raises `NergError`."""
+    """Check the shapes, sensors, films and samplers of a loaded scene. Raises `NergError`."""
     for shape in scene.shapes():
         check_shape(shape, f' of "{path}"', check_merged=True)
     for index, sensor in enumerate(scene.sensors()):
@@ -82,193 +98,226 @@ def check_scene(path: str | Path, scene) -> None:
         )
         film, count = sensor.film(), sensor.sampler().sample_count()
         width, height = map(int, film.crop_size())
-        if not 0 < width * height <= PIXELS:
+        if not 0 < width * height <= MAX_PIXELS:
             raise NergError(
-                f'the film of sensor {index} of "{path}" has {width:,} x {height:,} pixels: give it 1 to {PIXELS:,}'
+                f'the film of sensor {index} of "{path}" has {width:,} x {height:,} pixels; the size must be 1 to '
+                f"{MAX_PIXELS:,} pixels"
             )
         check_samples(count, f'the sampler of sensor {index} of "{path}"')
 
 
-def check_samples(count: int, what: str) -> None:
-    """Raise `NergError` for no samples a pixel and for too many."""
-    check_number(count, SPP, f"the number of samples a pixel of {what}", is_integer=True)
+def check_samples(count: int, subject: str) -> None:
+    """Raise `NergError` if the number of samples per pixel is out of range."""
+    check_number(count, SPP, f"the number of samples per pixel of {subject}", is_integer=True)
 
 
-class _Scene:
+class _SceneFileChecker:
     def __init__(self, folder: Path, defaults: dict[str, str]):
         self._folders, self._values = [folder], dict(defaults)
-        self._given = set(defaults)
-        self._elements = self._bytes = 0
+        self._fixed_names = set(defaults)
+        self._num_elements = self._num_bytes = 0
         self.files: list[Path] = []
         # Kinds of the meshes, and whether a texture shows their colours.
         self._meshes: dict[Path, str] = {}
-        self._colored = False
+        self._uses_mesh_colors = False
 
-    def read_whole(self, path: Path) -> None:
-        self.read(path, 0, ())
+    def check(self, path: Path) -> None:
+        self._read(path, 0, ())
         for mesh, kind in self._meshes.items():
-            check_mesh(mesh, kind, self._colored)
+            check_mesh(mesh, kind, self._uses_mesh_colors)
 
-    def read(self, path: Path, depth: int, within: tuple[Path, ...]) -> None:
-        whole = resolve_path(path)
-        if whole in within:
-            raise NergError(f'the scene file "{path}" includes itself; take that <include> out')
-        if len(within) > INCLUDES:
-            raise NergError(f'the scene file "{path}" is included more than {INCLUDES} files deep; include fewer')
+    def _read(self, path: Path, depth: int, parents: tuple[Path, ...]) -> None:
+        resolved_path = resolve_path(path)
+        if resolved_path in parents:
+            raise NergError(f'the scene file "{path}" includes itself; remove that <include>')
+        if len(parents) > MAX_INCLUDE_DEPTH:
+            raise NergError(
+                f'the scene file "{path}" is nested more than {MAX_INCLUDE_DEPTH} includes deep; reduce the nesting'
+            )
         parser = expat.ParserCreate()
-        # The parser itself would grow the text of entities without bound.
+        # Expanded entities can grow without bound.
         parser.EntityDeclHandler = lambda *_: self._refuse(
-            path, parser, "declares an entity; write out what it stands for"
+            path, parser, "declares an entity, which is not supported; write out its text"
         )
         parser.SetParamEntityParsing(expat.XML_PARAM_ENTITY_PARSING_NEVER)
         stack: list[tuple[str, str]] = []
 
         def start(tag, attributes):
-            self._elements += 1
-            if depth + len(stack) >= DEPTH:
-                self._refuse(path, parser, f"nests elements more than {DEPTH} deep; nest fewer")
-            if self._elements > ELEMENTS:
-                self._refuse(path, parser, f"has more than {ELEMENTS:,} elements; keep meshes in files of their own")
-            values = {key: self._filled(value, path, parser) for key, value in attributes.items()}
+            self._num_elements += 1
+            if depth + len(stack) >= MAX_DEPTH:
+                self._refuse(path, parser, f"nests elements more than {MAX_DEPTH} levels deep; reduce the nesting")
+            if self._num_elements > MAX_ELEMENTS:
+                self._refuse(path, parser, f"has more than {MAX_ELEMENTS:,} elements; move meshes to separate files")
+            values = {key: self._substitute(value, path, parser) for key, value in attributes.items()}
             parent = stack[-1] if stack else ("", "")
             stack.append((tag, values.get("type", "")))
-            self._element(path, parser, tag, values, parent, depth + len(stack), (*within, whole))
+            self._check_element(path, parser, tag, values, parent, depth + len(stack), (*parents, resolved_path))
 
         parser.StartElementHandler = start
         parser.EndElementHandler = lambda tag: stack.pop()
         try:
             with open_file(path, "scene file") as file:
                 while part := file.read(1 << 16):
-                    self._count(len(part), path, parser)
+                    self._count_bytes(len(part), path, parser)
                     parser.Parse(part, False)
             parser.Parse(b"", True)
         except expat.ExpatError as error:
-            raise NergError(f'the scene file "{path}" is no well-formed XML ({error}); correct it') from error
+            raise NergError(f'the scene file "{path}" is not well-formed XML ({error})') from error
 
-    def _refuse(self, path, parser, why):
-        raise NergError(f'the scene file "{path}" (line {parser.CurrentLineNumber}) {why}')
+    def _refuse(self, path, parser, reason):
+        raise NergError(f'the scene file "{path}" (line {parser.CurrentLineNumber}) {reason}')
 
-    def _count(self, more: int, path, parser) -> None:
-        self._bytes += more
-        if self._bytes > BYTES:
-            self._refuse(path, parser, f"has more than {BYTES >> 20} MB of XML; keep meshes in files of their own")
+    def _count_bytes(self, num_bytes: int, path, parser) -> None:
+        self._num_bytes += num_bytes
+        if self._num_bytes > MAX_BYTES:
+            self._refuse(path, parser, f"has more than {MAX_BYTES >> 20} MB of XML; move meshes to separate files")
 
-    def _filled(self, value: str, path, parser) -> str:
+    def _substitute(self, value: str, path, parser) -> str:
         if "$" not in value:
             return value
-        # The longest name first, as Mitsuba does.
+        # Longest names first, as in Mitsuba.
         for key in sorted(self._values, key=len, reverse=True):
-            self._count(value.count(f"${key}") * len(self._values[key]), path, parser)
+            self._count_bytes(value.count(f"${key}") * len(self._values[key]), path, parser)
             value = value.replace(f"${key}", self._values[key])
         return value
 
-    def _element(self, path, parser, tag, values, parent, depth, within) -> None:
+    def _check_element(self, path, parser, tag, values, parent, depth, parents) -> None:
         name, value = values.get("name", ""), values.get("value", "")
-        if tag == "default" and name not in self._given:
+        if tag == "default" and name not in self._fixed_names:
             self._values.setdefault(name, value)
         elif tag == "path":
             self._folders.append(self._folders[0] / value)
         elif tag == "include":
-            found = self._find(values.get("filename", ""), "scene file")
-            if found is not None:
-                self.files.append(found)
-                self.read(found, depth, within)
+            file = self._find(values.get("filename", ""), "scene file")
+            if file is not None:
+                self.files.append(file)
+                self._read(file, depth, parents)
         elif tag == "spectrum" and "filename" in values:
-            found = self._find(values["filename"], "spectrum")
-            if found is not None:
-                self.files.append(found)
+            file = self._find(values["filename"], "spectrum")
+            if file is not None:
+                self.files.append(file)
         elif name == "sample_count" and parent[0] == "sampler" and tag == "integer":
             try:
                 count = int(value)
             except ValueError:
-                return  # Mitsuba names the line
+                return  # Mitsuba reports the line
             check_samples(count, f'the sampler of "{path}" (line {parser.CurrentLineNumber})')
         elif value in ("vertex_color", "face_color") and name == "name" and parent[1] == "mesh_attribute":
-            self._colored = True
+            self._uses_mesh_colors = True
         elif name == "filename" and tag == "string":
-            found = self._find(value, "file")
-            if found is None:
+            file = self._find(value, "file")
+            if file is None:
                 return
-            self.files.append(found)
+            self.files.append(file)
             if parent[1] in ("ply", "obj"):
-                self._meshes[found] = parent[1]
+                self._meshes[file] = parent[1]
             elif parent[1] in _CHECKS:
-                _CHECKS[parent[1]](found)
-            elif parent[1] in ("bitmap", "envmap") and found.suffix.lower() in _PICTURES:
-                check_image(found, "texture")
+                _CHECKS[parent[1]](file)
+            elif parent[1] in ("bitmap", "envmap") and file.suffix.lower() in _IMAGE_SUFFIXES:
+                check_image(file, "texture")
 
-    def _find(self, name: str, what: str) -> Path | None:
-        """The file that Mitsuba opens as ``name``, None where there is none. Raises `NergError` for a pipe, a device or
-        a folder."""
-        places = [folder / name for folder in self._folders] + [Path(resolve_scene_file(name))]
-        found = next((place for place in places if name and os.path.exists(place)), None)
-        if found is not None:
-            check_regular_file(found, what)
-        return found
+    def _find(self, name: str, kind: str) -> Path | None:
+        """Return the file that Mitsuba opens as ``name``; None if there is none. Raises `NergError` for pipes, devices
+        and folders."""
+        candidates = [folder / name for folder in self._folders] + [Path(resolve_scene_file(name))]
+        path = next((place for place in candidates if name and os.path.exists(place)), None)
+        if path is not None:
+            check_regular_file(path, kind)
+        return path
 
 
-# ---- Pictures ----
-#
-# What comes before a picture: the Mitsuba variant that renders it, and its scene.
+# ---- Variants and loading ----
 
-_PREFERRED = ("cuda_ad_rgb", "llvm_ad_rgb")
-# What mi.load_file takes besides the values of a scene.
-_OWN = ("path", "parallel", "optimize")
+_PREFERRED_VARIANTS = ("cuda_ad_rgb", "llvm_ad_rgb")
+# Parameters of mi.load_file besides the values of a scene.
+_RESERVED_NAMES = ("path", "parallel", "optimize")
 
 
 def activate_variant(variant: str | None = None) -> str:
-    """Make a Mitsuba variant the active one, with the plugins of this package, and give its name.
+    """Activate a Mitsuba variant with the plugins of this package.
 
-    `variant` None: `cuda_ad_rgb` where there is an NVIDIA driver, otherwise `llvm_ad_rgb`. Raises NergError for a name
-    that Mitsuba does not know and for a variant that does not work here.
+    Parameters
+    ----------
+    variant : str, optional
+        Name of the variant. Default: ``cuda_ad_rgb`` with an NVIDIA driver, otherwise ``llvm_ad_rgb``.
+
+    Returns
+    -------
+    str
+        Name of the active variant.
+
+    Raises
+    ------
+    NergError
+        The variant does not exist or does not work on this machine.
     """
     import mitsuba as mi
 
     if variant is not None and variant not in mi.variants():
-        raise NergError(f'there is no variant "{variant}"; this Mitsuba has {", ".join(mi.variants())}')
-    wanted = [variant] if variant else [v for v in _PREFERRED if not v.startswith("cuda") or llvm.has_cuda()]
+        raise NergError(f'there is no Mitsuba variant "{variant}"; available variants: {", ".join(mi.variants())}')
+    candidates = (
+        [variant] if variant else [v for v in _PREFERRED_VARIANTS if not v.startswith("cuda") or llvm.has_cuda()]
+    )
     reason = ""
-    for choice in wanted:
+    for candidate in candidates:
         try:
-            mi.set_variant(choice)
-            return choice
+            mi.set_variant(candidate)
+            return candidate
         except UnusableLLVM:
             raise
-        except ImportError as error:  # Mitsuba says so where the backend of a variant cannot start
+        except ImportError as error:  # The backend of the variant cannot start.
             reason = format_error(error)
-    raise NergError(f'the variant "{wanted[-1]}" does not work here ({reason}); "nerg doctor" says how to mend it')
+    raise NergError(
+        f'the variant "{candidates[-1]}" does not work on this machine ({reason}); run "nerg doctor" for help'
+    )
 
 
 def load_scene(path: str | Path, defaults: Mapping[str, str] | None = None, merge: bool = True):
-    """The scene of a file, with ``defaults`` for its `<default>` and `$key`; the variant must be active. ``merge``:
-    whether Mitsuba may make one of meshes of the same material, which then lose their names.
+    """Load a scene file; the variant must be active.
 
-    Raises NergError for what Mitsuba does not take, and for what would end its process or fill the memory.
+    Parameters
+    ----------
+    path : str or Path
+        Scene file.
+    defaults : mapping of str to str, optional
+        Values for its `<default>`s and `$key`s.
+    merge : bool
+        Whether Mitsuba may merge meshes of the same material, which then lose their names.
+
+    Returns
+    -------
+    mi.Scene
+        The scene.
+
+    Raises
+    ------
+    NergError
+        Mitsuba rejects the scene, or it fails the checks of this module.
     """
     import mitsuba as mi
 
     if not Path(path).exists():
         raise NergError(f'there is no scene file "{path}"')
-    # Values of any type, among which Mitsuba looks for its own parameters.
-    given: dict[str, Any] = dict(defaults or {})
-    for name in _OWN:
-        if name in given:
-            raise NergError(f'"{name}" is a name that Mitsuba keeps for itself: give the value in "{path}" another')
+    # Any type, since the parameters of mi.load_file are passed in the same way.
+    values: dict[str, Any] = dict(defaults or {})
+    for name in _RESERVED_NAMES:
+        if name in values:
+            raise NergError(f'the name "{name}" is reserved by Mitsuba; rename the <default> in "{path}"')
     check_scene_file(path, defaults)
     with translate_mitsuba_errors(), ensure_two_threads():
         try:
-            loaded = mi.load_file(str(path), optimize=merge, **given)
+            loaded = mi.load_file(str(path), optimize=merge, **values)
         except RuntimeError as error:
             unused = (
                 re.findall(r"^\s*- \$(\w+)=", str(error), re.MULTILINE) if "unused parameters" in str(error) else []
             )
             if unused:
                 raise NergError(
-                    f'the scene "{path}" asks for no "${unused[0]}": correct the name that is given a value'
+                    f'the scene "{path}" does not use "${unused[0]}"; correct the name of the value'
                 ) from error
             raise
         except UnicodeDecodeError as error:
-            # Mitsuba quotes what it cannot read, and that is no text.
-            raise NergError(f'a mesh or another file that the scene "{path}" names is damaged: make it anew') from error
+            # Mitsuba quotes the unreadable data, which is not text.
+            raise NergError(f'a mesh or another file of the scene "{path}" is damaged; create it again') from error
     check_scene(path, loaded)
     return loaded

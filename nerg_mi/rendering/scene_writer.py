@@ -1,4 +1,4 @@
-"""Scene files as text: elements with comments, and the parts of a scene with a place, a gaze field and an observer."""
+"""Writing of scene files: XML elements with comments, and scenes with a gaze field and an observer."""
 
 from __future__ import annotations
 
@@ -15,22 +15,46 @@ import numpy as np
 from nerg_mi.errors import NergError, sanitize
 from nerg_mi.maths.types import Point3f, variant_types
 
-# ---- Where a point of a scene lies in a camera's picture, and how near and far the camera sees ----
+# ---- Camera projection ----
 
 
-def clip_distances(extent: float, unit: float = 1.0) -> tuple[float, float]:
-    """Distances at which a camera begins and ends to see, in scene units: a centimetre and ten kilometres, and nearer
-    and farther where the scene is smaller or larger than what people are in, or in other units.
+def compute_clip_distances(extent: float, unit: float = 1.0) -> tuple[float, float]:
+    """Compute the near and far clip distances of a camera.
 
-    ``extent``: diagonal of a box around the scene and the camera; ``unit``: scene units of a metre. Of traced rays the
-    ratio of both costs no precision.
+    The defaults are one centimetre and ten kilometres; smaller or larger scenes widen the range. Ray tracing loses no
+    precision with a large ratio of the two.
+
+    Parameters
+    ----------
+    extent : float
+        Diagonal of a box around the scene and the camera, in scene units.
+    unit : float
+        Scene units per metre.
+
+    Returns
+    -------
+    tuple of float
+        Near and far distance in scene units.
     """
     return min(0.01 * unit, 3e-3 * extent), max(1e4 * unit, 100 * extent)
 
 
 def project_to_pixel(camera: Any, point: Point3f) -> tuple[float, float] | None:
-    """Where ``point`` (one lane, scene units) lies in the picture of the perspective ``camera``: (x, y) in pixels,
-    counted from the first one's centre; None outside of it, and behind the camera."""
+    """Project a point to the image of a perspective camera.
+
+    Parameters
+    ----------
+    camera : mi.Sensor
+        The camera.
+    point : Point3f
+        One point in scene units.
+
+    Returns
+    -------
+    tuple of float or None
+        (x, y) in pixels, relative to the centre of the first pixel; None if the point is outside the image or behind
+        the camera.
+    """
     mi = variant_types()
     film = camera.film()
     fov = mi.traverse(camera)["x_fov"]
@@ -45,28 +69,24 @@ def project_to_pixel(camera: Any, point: Point3f) -> tuple[float, float] | None:
     return x * width - 0.5, y * height - 0.5
 
 
-# ---- Scene writer ----
-#
-# Scene files as text: elements with comments, escaped, in the layout in which people write them by hand.
-#
-# Nothing here knows what a scene is for: `scene_parts` says what belongs into one.
+# ---- XML formatting ----
 
 _INDENT = "    "
 _WIDTH = 120
-# What XML 1.0 holds besides tabs and line ends; halves of pairs come from file names that are no text.
-_UNFIT = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]")
+# Characters that XML 1.0 forbids; lone surrogates come from file names that are not valid Unicode.
+_INVALID_CHARACTERS = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]")
 
 
 @dataclass(frozen=True)
 class Comment:
-    """A sentence or more, broken into lines where it is written."""
+    """A comment, wrapped when it is written."""
 
     text: str
 
 
 @dataclass(frozen=True)
 class Verbatim:
-    """XML that is written as it is, line by line, such as parts of somebody else's file."""
+    """XML that is written unchanged, such as parts of another file."""
 
     text: str
 
@@ -78,7 +98,7 @@ class BlankLine:
 
 @dataclass(frozen=True)
 class Element:
-    """An XML element: its ``tag``, its ``attributes`` in their order, and what stands within it."""
+    """An XML element: ``tag``, ``attributes`` in order, and ``children``."""
 
     tag: str
     attributes: tuple[tuple[str, str], ...]
@@ -89,84 +109,106 @@ Node = Element | Comment | Verbatim | BlankLine
 
 
 def element(tag: str, *children: Node, **attributes: object) -> Element:
-    """An element; attributes in the order in which they are given, a trailing underscore of their name left out."""
+    """Make an element with attributes in the given order; a trailing underscore of an attribute name is removed."""
     return Element(tag, tuple((name.rstrip("_"), str(value)) for name, value in attributes.items()), children)
 
 
 def prop(kind: str, name: str, value: object) -> Element:
-    """A property: ``<kind name="name" value="value"/>``."""
+    """Make a property: ``<kind name="name" value="value"/>``."""
     return element(kind, name=name, value=value)
 
 
 def format_numbers(values: Iterable[float]) -> str:
-    """Numbers with commas between them, with nine digits or, of single precision, as many as tell them apart; no
-    "-0"."""
-    return ", ".join(f"{_shortest(float(v)) + 0.0:.9g}" for v in values)
+    """Format numbers separated by commas, with nine digits, or the shortest text that restores a single-precision
+    value; -0 becomes 0."""
+    return ", ".join(f"{_round_single(float(v)) + 0.0:.9g}" for v in values)
 
 
-def _shortest(value: float) -> float:
+def _round_single(value: float) -> float:
     single = np.float32(value)
     return float(str(single)) if float(single) == value else value
 
 
 def transform(*steps: Node, name: str = "to_world") -> Element:
-    """A transform of ``steps``, of which the later apply after the earlier."""
+    """Make a transform of ``steps``, applied in this order."""
     return element("transform", *steps, name=name)
 
 
 def matrix(values: np.ndarray) -> Element:
-    """A step of a transform: the (4, 4) matrix ``values``, in double precision."""
+    """Make a transform step from a (4, 4) matrix, in double precision."""
     return element("matrix", value=" ".join(f"{float(v) + 0.0:.15g}" for v in np.asarray(values).ravel()))
 
 
 def format_document(nodes: Sequence[Node], head: str, version: str = "3.0.0") -> str:
-    """A scene file of ``nodes`` whose first comment is ``head``, its paragraphs apart.
+    """Format a scene file.
 
-    Raises `NergError` for characters that no XML holds.
+    Parameters
+    ----------
+    nodes : sequence of Node
+        Elements of the scene.
+    head : str
+        First comment; empty lines separate paragraphs.
+    version : str
+        Version of the scene format.
+
+    Returns
+    -------
+    str
+        The text of the file.
+
+    Raises
+    ------
+    NergError
+        An attribute contains characters that XML forbids.
     """
-    lines = _comment(head, "")
-    lines.append(f"<scene version={_quoted(version)}>")
+    lines = _format_comment(head, "")
+    lines.append(f"<scene version={_quote(version)}>")
     for node in nodes:
-        lines += _lines(node, _INDENT)
+        lines += _format_node(node, _INDENT)
     return "\n".join([*lines, "</scene>", ""])
 
 
 def check_attribute(name: str) -> str:
-    """A file's ``name`` as the value of an attribute. Raises `NergError` for one that Mitsuba would not take as it is:
-    it fills in what follows a dollar sign."""
-    if "$" in name or _UNFIT.search(name):
+    """Return the file name ``name`` if it can be used as an attribute of a scene file.
+
+    Raises
+    ------
+    NergError
+        The name contains ``$``, which Mitsuba would substitute, or characters that XML forbids.
+    """
+    if "$" in name or _INVALID_CHARACTERS.search(name):
         raise NergError(
-            f'the name "{sanitize(name)}" cannot stand in a scene file, because of "$" or of characters that are no text; '
-            "rename the file or its folder"
+            f'the path "{sanitize(name)}" cannot be written to a scene file, because it contains "$" or characters that '
+            "are not valid text; rename the file or its folder"
         )
     return name
 
 
-def _lines(node: Node, indent: str) -> list[str]:
+def _format_node(node: Node, indent: str) -> list[str]:
     match node:
         case BlankLine():
             return [""]
         case Comment(text):
-            return _comment(text, indent)
+            return _format_comment(text, indent)
         case Verbatim(text):
             return [indent + line if line.strip() else "" for line in text.splitlines()]
         case Element(tag, attributes, children):
-            head = "".join(f" {name}={_quoted(value)}" for name, value in attributes)
+            head = "".join(f" {name}={_quote(value)}" for name, value in attributes)
             if not children:
                 return [f"{indent}<{tag}{head}/>"]
-            inner = [line for child in children for line in _lines(child, indent + _INDENT)]
+            inner = [line for child in children for line in _format_node(child, indent + _INDENT)]
             return [f"{indent}<{tag}{head}>", *inner, f"{indent}</{tag}>"]
 
 
-def _quoted(value: str) -> str:
-    if _UNFIT.search(value):
-        raise NergError(f'"{sanitize(value)}" cannot stand in a scene file: it holds characters that are no text')
+def _quote(value: str) -> str:
+    if _INVALID_CHARACTERS.search(value):
+        raise NergError(f'"{sanitize(value)}" cannot be written to a scene file: it is not valid text')
     return '"' + escape(value, {'"': "&quot;", "\n": "&#10;", "\r": "&#13;", "\t": "&#9;"}) + '"'
 
 
-def _comment(text: str, indent: str) -> list[str]:
-    """``<!-- text -->`` in lines of at most 120 columns; two hyphens, which end a comment, become one."""
-    text = re.sub("-{2,}", "-", _UNFIT.sub("?", text)).rstrip("-")
+def _format_comment(text: str, indent: str) -> list[str]:
+    """Format a comment in lines of at most 120 columns; double hyphens, which end a comment, become single ones."""
+    text = re.sub("-{2,}", "-", _INVALID_CHARACTERS.sub("?", text)).rstrip("-")
     lines: list[str] = []
     for paragraph in text.split("\n"):
         line = ""
@@ -176,25 +218,30 @@ def _comment(text: str, indent: str) -> list[str]:
                 line = ""
             line += f" {word}" if line else word
         lines.append(line)
-    first, *others = lines
-    out = [f"{indent}<!-- {first}", *(f"{indent}     {line}" if line else "" for line in others)]
+    first, *rest = lines
+    out = [f"{indent}<!-- {first}", *(f"{indent}     {line}" if line else "" for line in rest)]
     out[-1] += " -->"
     return out
 
 
-# ---- Scene parts ----
+# ---- Scenes with gaze ----
 #
-# What a written scene consists of: the integrator `nerg` with a place, a gaze field and an observer, and three
-# sensors, all of it set by `<default>`s at the top of the file.
-#
-# Sensors: 0 a camera, 1 the observer's own view, 2 all directions around the observer. These are the sensors, and the
-# names, of ``scenes/store/scene.xml``.
+# A written scene consists of the integrator `nerg`, with fields and an observer, and three sensors: 0 a camera, 1 the
+# view of the observer, 2 a panorama around the observer. `<default>`s at the top of the file contain all settings.
+# Sensors and names are those of ``scenes/store/scene.xml``.
 
 
 @dataclass(frozen=True)
 class LookAt:
-    """Where somebody, or a camera, is and what they look at: (3,) each in scene units; ``up``: (3,), where it is not
-    that of the scene."""
+    """Position and target of a camera or an observer.
+
+    Parameters
+    ----------
+    origin, target : ndarray of shape (3,)
+        Position, and the point in the centre of the view, in scene units.
+    up : ndarray of shape (3,) or None
+        Up direction. None: the up direction of the scene.
+    """
 
     origin: np.ndarray
     target: np.ndarray
@@ -203,8 +250,17 @@ class LookAt:
 
 @dataclass(frozen=True)
 class Lens:
-    """``fov``: degrees between the left and right border; ``aspect``: width by height; ``offset``: of the principal
-    point, as shares of width and height, as Mitsuba counts it."""
+    """Projection of a perspective camera.
+
+    Parameters
+    ----------
+    fov : float
+        Horizontal field of view in degrees.
+    aspect : float
+        Width divided by height.
+    offset : tuple of float
+        Offset of the principal point, relative to width and height, with Mitsuba's sign.
+    """
 
     fov: float = 70.0
     aspect: float = 1.5
@@ -213,25 +269,48 @@ class Lens:
 
 @dataclass(frozen=True)
 class SceneContent:
-    """What a scene shows. ``inside``: children of the integrator (a field, volumes, an integrator that lights shapes);
-    ``beside``: of the scene (shapes, lights); ``first``: before all else (paths and defaults of another file).
-    ``files``: names of files by the `<default>` that holds them."""
+    """Environment of a written scene.
+
+    Parameters
+    ----------
+    integrator_children : tuple of Node
+        Children of the integrator: a field, volumes, or an integrator for the light on shapes.
+    scene_children : tuple of Node
+        Children of the scene: shapes and lights.
+    preamble : tuple of Node
+        Elements at the top of the file: paths and defaults of another file.
+    files : mapping of str to str
+        File names by the name of their `<default>`.
+    spp : int
+        Samples per pixel for an image with little noise.
+    version : str
+        Version of the scene format.
+    reserved_names : frozenset of str
+        Names of `<default>`s and ids that another file uses.
+    """
 
     integrator_children: tuple[Node, ...] = ()
     scene_children: tuple[Node, ...] = ()
     preamble: tuple[Node, ...] = ()
     files: Mapping[str, str] = field(default_factory=dict)
-    # Samples a pixel that make a picture without much noise.
     spp: int = 16
     version: str = "3.0.0"
-    # Names of <default>s, and ids, that another file has taken.
-    reserved_names: frozenset[str] = frozenset()
+    taken: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True)
 class GazeFiles:
-    """Whose attention it shows: files of a gaze field and of rays, or None; ``align`` (4, 4): from the rays to the
-    scene, None where they are the same."""
+    """Gaze of a written scene.
+
+    Parameters
+    ----------
+    gaze : str or None
+        File of a gaze field.
+    rays : str or None
+        File of recorded gaze samples, displayed as a kernel density.
+    align : ndarray of shape (4, 4) or None
+        Transform from the frame of the recordings to the scene. None: identity.
+    """
 
     gaze: str | None = None
     rays: str | None = None
@@ -239,15 +318,37 @@ class GazeFiles:
 
     @property
     def quantity(self) -> str | None:
-        """The AOV that is shown."""
+        """The AOV to display."""
         return "gaze" if self.gaze is not None else "kde" if self.rays is not None else None
 
 
 @dataclass(frozen=True)
 class SceneText:
-    """All that a scene file says. ``unit``: scene units of a metre, or what stands for one; ``extent``: length of the
-    diagonal of a box around the place and its cameras, in scene units; ``observer``: None where the camera is the
-    observer."""
+    """The contents of a scene file.
+
+    Parameters
+    ----------
+    content : SceneContent
+        The environment.
+    gaze_files : GazeFiles
+        The gaze.
+    camera : LookAt
+        The camera.
+    observer : LookAt or None
+        The observer. None: the camera is the observer.
+    up : ndarray of shape (3,)
+        Up direction of the scene.
+    lens : Lens
+        Projection of the camera.
+    width : int
+        Width of the image in pixels.
+    unit : float
+        Scene units per metre.
+    extent : float
+        Diagonal of a box around the environment and the cameras, in scene units.
+    comment, camera_comment, observer_comment : str
+        Comments in the file: at the top, at the camera and at the observer.
+    """
 
     content: SceneContent
     gaze_files: GazeFiles
@@ -258,24 +359,23 @@ class SceneText:
     width: int = 480
     unit: float = 1.0
     extent: float = 10.0
-    # Sentences for whoever opens the file: of the file, of the camera, of the observer.
     comment: str = ""
     camera_comment: str = ""
     observer_comment: str = ""
 
     @property
     def falloff(self) -> float:
-        """Distance over which gaze fades behind what the observer sees: 5 cm, within what a place of this size shows
-        and single precision resolves."""
+        """Distance in scene units over which gaze fades out behind a surface: 5 cm, within limits set by the extent of
+        the scene."""
         return float(np.clip(0.05 * self.unit, 1e-4 * self.extent, 0.02 * self.extent))
 
     def to_xml(self) -> str:
-        """The text of the file."""
-        return format_document(_nodes(self), self.comment, self.content.version)
+        """Return the text of the file."""
+        return format_document(_make_nodes(self), self.comment, self.content.version)
 
 
 class _SceneNames:
-    """The `<default>`s and ids of a scene, under names that no other file has taken."""
+    """Names of the `<default>`s and ids of a scene that do not collide with names of another file."""
 
     def __init__(self, taken: frozenset[str]):
         self._taken = taken
@@ -290,25 +390,25 @@ class _SceneNames:
         return f"${self(name)}"
 
 
-def _nodes(scene: SceneText) -> Sequence[Node]:
-    names, place = _SceneNames(scene.content.reserved_names), scene.content
+def _make_nodes(scene: SceneText) -> Sequence[Node]:
+    names, content = _SceneNames(scene.content.reserved_names), scene.content
     return [
-        *place.preamble,
-        *_defaults(scene, names),
+        *content.preamble,
+        *_make_defaults(scene, names),
         BlankLine(),
-        _integrator(scene, names),
+        _make_integrator(scene, names),
         BlankLine(),
-        _camera(scene, names),
+        _make_camera(scene, names),
         BlankLine(),
-        *_own_sensors(scene, names),
-        *([BlankLine(), *place.scene_children] if place.scene_children else []),
+        *_make_observer_sensors(scene, names),
+        *([BlankLine(), *content.scene_children] if content.scene_children else []),
     ]
 
 
-def _defaults(scene: SceneText, names: _SceneNames) -> list[Node]:
+def _make_defaults(scene: SceneText, names: _SceneNames) -> list[Node]:
     height = max(1, round(scene.width / scene.lens.aspect))
-    attention, sphere = scene.gaze_files, 2 * round(0.4 * scene.width)
-    files = {**scene.content.files, "gaze": attention.gaze, "rays": attention.rays}
+    gaze_files, sphere = scene.gaze_files, 2 * round(0.4 * scene.width)
+    files = {**scene.content.files, "gaze": gaze_files.gaze, "rays": gaze_files.rays}
     out: list[Node] = [names.default(name, file) for name, file in files.items() if file is not None]
     out += [
         names.default(name, value)
@@ -330,9 +430,9 @@ def _defaults(scene: SceneText, names: _SceneNames) -> list[Node]:
         out += [BlankLine(), Comment(scene.observer_comment)]
         out += [names.default("eye", format_numbers(scene.observer.origin))]
         out += [names.default("ahead", format_numbers(scene.observer.target))]
-    aovs = ["depth", "opacity", *([attention.quantity] if attention.quantity else []), "visibility"]
+    aovs = ["depth", "opacity", *([gaze_files.quantity] if gaze_files.quantity else []), "visibility"]
     falloff = Comment(
-        "How far behind what the observer sees gaze fades to zero, in units of the scene; 0: a hard edge."
+        "Distance behind a visible surface over which gaze fades to zero, in scene units. 0: a hard edge."
     )
     return [
         *out,
@@ -348,17 +448,17 @@ def _defaults(scene: SceneText, names: _SceneNames) -> list[Node]:
     ]
 
 
-def _integrator(scene: SceneText, names: _SceneNames) -> Element:
-    attention = scene.gaze_files
+def _make_integrator(scene: SceneText, names: _SceneNames) -> Element:
+    gaze_files = scene.gaze_files
     children: list[Node] = list(scene.content.integrator_children)
-    if attention.gaze is not None:
+    if gaze_files.gaze is not None:
         children.append(element("volume", prop("string", "filename", names.use("gaze")), name="gaze", type="gazefield"))
-    if attention.rays is not None:
-        where = [] if attention.align is None else [transform(matrix(attention.align))]
+    if gaze_files.rays is not None:
+        transforms = [] if gaze_files.align is None else [transform(matrix(gaze_files.align))]
         file = prop("string", "filename", names.use("rays"))
-        children.append(element("volume", file, *where, name="kde", type="gazekde"))
+        children.append(element("volume", file, *transforms, name="kde", type="gazekde"))
     if scene.observer is not None:
-        pose = _look(names.use("eye"), names.use("ahead"), _up(scene.observer, names))
+        pose = _make_look_at(names.use("eye"), names.use("ahead"), _format_up(scene.observer, names))
         children.append(element("sensor", pose, name="observer", type="perspective"))
     kinds = {"occlusion": "boolean", "radiance": "boolean", "falloff": "float", "tolerance": "float"}
     for name in ("occlusion", "radiance", "visibility", "falloff", "tolerance", "depth", "aovs"):
@@ -366,54 +466,56 @@ def _integrator(scene: SceneText, names: _SceneNames) -> Element:
     return element("integrator", *children, type="nerg", id=names("integrator"))
 
 
-def _camera(scene: SceneText, names: _SceneNames) -> Element:
-    pose = _look(names.use("camera"), names.use("target"), _up(scene.camera, names))
-    return _perspective("camera", pose, scene, names, scene.lens.offset)
+def _make_camera(scene: SceneText, names: _SceneNames) -> Element:
+    pose = _make_look_at(names.use("camera"), names.use("target"), _format_up(scene.camera, names))
+    return _make_perspective("camera", pose, scene, names, scene.lens.offset)
 
 
-def _own_sensors(scene: SceneText, names: _SceneNames) -> list[Node]:
+def _make_observer_sensors(scene: SceneText, names: _SceneNames) -> list[Node]:
     observer = scene.observer
     eye, ahead = ("camera", "target") if observer is None else ("eye", "ahead")
-    pose = _look(names.use(eye), names.use(ahead), _up(observer or scene.camera, names))
-    front = level_direction((observer or scene.camera), scene.up)
-    around = transform(
-        element("lookat", origin="0, 0, 0", target=format_numbers(front), up=format_numbers(scene.up)),
+    pose = _make_look_at(names.use(eye), names.use(ahead), _format_up(observer or scene.camera, names))
+    forward = level_direction((observer or scene.camera), scene.up)
+    pose_of_sphere = transform(
+        element("lookat", origin="0, 0, 0", target=format_numbers(forward), up=format_numbers(scene.up)),
         element("translate", value=names.use(eye)),
     )
-    film = _film(names.use("sphere_width"), names.use("sphere_height"))
-    sphere = element("sensor", around, _sampler(names), film, type="panorama", id=names("gaze_sphere"))
-    towards = "the direction in which the observer looks" if observer is not None else "where the camera looks"
+    film = _make_film(names.use("sphere_width"), names.use("sphere_height"))
+    sphere = element("sensor", pose_of_sphere, _make_sampler(names), film, type="panorama", id=names("gaze_sphere"))
+    direction = (
+        "the viewing direction of the observer" if observer is not None else "the viewing direction of the camera"
+    )
     return [
-        _perspective("own_view", pose, scene, names),
+        _make_perspective("own_view", pose, scene, names),
         BlankLine(),
-        Comment(f"The middle of this picture is the horizon towards {towards}."),
+        Comment(f"The centre of this image is the horizon in {direction}."),
         sphere,
     ]
 
 
-def level_direction(eye: LookAt, up: np.ndarray) -> np.ndarray:
-    """Unit direction (3,) in which ``eye`` looks, made level; any level one for an eye that looks straight up or
-    down."""
+def level_direction(pose: LookAt, up: np.ndarray) -> np.ndarray:
+    """Return the horizontal unit vector (3,) in the viewing direction of ``pose``; any horizontal one for a vertical
+    view."""
     up = np.asarray(up, float) / np.linalg.norm(up)
-    for along in (np.subtract(eye.target, eye.origin), np.roll(up, 1)):
+    for along in (np.subtract(pose.target, pose.origin), np.roll(up, 1)):
         level = along - up * (along @ up)
         if np.linalg.norm(level) > 1e-3 * np.linalg.norm(along):
             return level / np.linalg.norm(level)
-    raise ValueError(f"no direction is level under the up {up}")
+    raise ValueError(f"no direction is orthogonal to the up direction {up}")
 
 
-def _perspective(
+def _make_perspective(
     name: str, pose: Node, scene: SceneText, names: _SceneNames, offset: Sequence[float] = (0, 0)
 ) -> Element:
     lens: list[Node] = [prop("float", "fov", names.use("fov")), prop("string", "fov_axis", "x")]
     lens += [prop("float", f"principal_point_offset_{a}", format_numbers([v])) for a, v in zip("xy", offset) if v]
-    near, far = (format_numbers([distance]) for distance in clip_distances(scene.extent, scene.unit))
-    film = _film(names.use("width"), names.use("height"))
+    near, far = (format_numbers([distance]) for distance in compute_clip_distances(scene.extent, scene.unit))
+    film = _make_film(names.use("width"), names.use("height"))
     clip = [prop("float", "near_clip", near), prop("float", "far_clip", far)]
-    return element("sensor", *lens, *clip, pose, _sampler(names), film, type="perspective", id=names(name))
+    return element("sensor", *lens, *clip, pose, _make_sampler(names), film, type="perspective", id=names(name))
 
 
-def _film(width: str, height: str) -> Element:
+def _make_film(width: str, height: str) -> Element:
     return element(
         "film",
         prop("integer", "width", width),
@@ -425,25 +527,25 @@ def _film(width: str, height: str) -> Element:
     )
 
 
-def _sampler(names: _SceneNames) -> Element:
+def _make_sampler(names: _SceneNames) -> Element:
     return element("sampler", prop("integer", "sample_count", names.use("spp")), type="independent")
 
 
-def _look(origin: str, target: str, up: str) -> Element:
+def _make_look_at(origin: str, target: str, up: str) -> Element:
     return transform(element("lookat", origin=origin, target=target, up=up))
 
 
-def _up(eye: LookAt, names: _SceneNames) -> str:
-    return names.use("up") if eye.up is None else format_numbers(eye.up)
+def _format_up(pose: LookAt, names: _SceneNames) -> str:
+    return names.use("up") if pose.up is None else format_numbers(pose.up)
 
 
 def free_default_name(name: str, taken: frozenset[str]) -> str:
-    """The `<default>` of a written scene that is called ``name`` where no other file has ``taken`` that name."""
+    """Return ``name``, or a variant of it if ``taken`` contains it, as the name of a `<default>`."""
     return f"nerg_{name}" if name in taken else name
 
 
 def relative_path(path: Path, folder: Path) -> str:
-    """``path`` as a scene file in ``folder`` names it: relative where both lie below a common folder, else absolute."""
+    """Return ``path`` relative to ``folder``, or absolute if the two have no common folder except the root."""
     path, folder = Path(os.path.realpath(path)), Path(os.path.realpath(folder))
     common = os.path.commonpath([path, folder])
     return os.path.relpath(path, folder) if common != os.path.dirname(common) else str(path)

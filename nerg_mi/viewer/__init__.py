@@ -1,5 +1,6 @@
-"""A scene in the browser: a camera by mouse, an observer that is dragged, pictures that are refined when both rest.
+"""An interactive view of a scene in the browser.
 
-The browser draws points or meshes at once (`proxy`); one thread owns Mitsuba and Dr.Jit and renders what is asked for,
-the most urgent first (`worker`); `page` is what is seen of it, and `guard` says who may see it.
+The browser draws points by itself while the camera or the observer moves. When both rest, one thread that owns Mitsuba
+and Dr.Jit refines a picture of the scene (`session`). `page` connects the browsers to this thread, `controls`,
+`flights` and `scene` build the panel, and `server` restricts who can connect.
 """

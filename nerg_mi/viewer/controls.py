@@ -1,4 +1,4 @@
-"""Controls of the viewer: sliders, layers, and areas of interest that are drawn on the page."""
+"""The panel of the viewer: display settings, observer, attention, camera, and areas of interest."""
 
 from __future__ import annotations
 
@@ -24,20 +24,18 @@ from .page import BrowserWindow, Page
 from .points import PinholeView, make_heading
 from .scene import copy_view
 
-# ---- Controls ----
-#
-# The panel: what is shown and how, the observer's own view, the numbers, and the camera.
+# ---- Panel ----
 
 INSET_WIDTH = 240
-"""Width of the observer's own view, in pixels."""
+"""Width of the observer's views in the panel, in pixels."""
 
 _MAX_ROWS = 12
-_DEFAULT_COLORS = "as usual"
+_DEFAULT_COLORS = "default"
 _INSET_INTERVAL = 0.4
 
 
 def notify(event_or_client: Any, title: str, text: str) -> None:
-    """A note in the corner of one page."""
+    """Show a notification in the browser of a client or event."""
     client = getattr(event_or_client, "client", event_or_client)
     if client is not None:
         client.add_notification(title=title, body=text, with_close_button=True, auto_close_seconds=12.0)
@@ -45,7 +43,7 @@ def notify(event_or_client: Any, title: str, text: str) -> None:
 
 @contextmanager
 def notify_errors(event_or_client: Any, title: str) -> Iterator[None]:
-    """Tell one page of what is refused within the block, which ends there."""
+    """Show a `NergError` raised within the block as a notification."""
     try:
         yield
     except NergError as error:
@@ -53,7 +51,17 @@ def notify_errors(event_or_client: Any, title: str) -> Iterator[None]:
 
 
 class Inset:
-    """A small picture of the panel, ``title``, which is greyed while another one is made."""
+    """A small picture in the panel, which is grey while a new one is rendered.
+
+    Parameters
+    ----------
+    gui : viser.GuiApi
+        The panel.
+    title : str
+        Title of the picture.
+    height : int
+        Height in pixels; the width is `INSET_WIDTH`.
+    """
 
     def __init__(self, gui: Any, title: str, height: int):
         self._title, self._colors = title, np.zeros((height, INSET_WIDTH, 3), np.uint8)
@@ -62,21 +70,21 @@ class Inset:
         self.mark_stale()
 
     def mark_stale(self) -> None:
-        """What it shows is out of date."""
+        """Mark the picture as outdated."""
         if not self._stale:
             self._stale = True
             self._handle.image = layers.grey_out(self._colors)
-            self._handle.label = f"{self._title} (grey: out of date)"
+            self._handle.label = f"{self._title} (grey: outdated)"
 
     def show(self, colors: np.ndarray) -> None:
-        """Show ``colors`` (height, width, 3) uint8, which are up to date."""
+        """Show ``colors`` (height, width, 3) uint8."""
         self._stale, self._colors = False, colors
         self._handle.image = colors
         self._handle.label = self._title
 
 
 def slider_max(value: float) -> float:
-    """The upper end of a slider from 0 on which ``value`` lies: a power of ten, at least three times as large."""
+    """Return the maximum of a slider for ``value``: a power of ten, at least three times as large."""
     return 10.0 ** math.ceil(math.log10(3 * value)) if value > 0 else 1.0
 
 
@@ -88,7 +96,7 @@ class Controls:
         self._last_inset_time, self._is_inset_scheduled = 0.0, False
         self._inset_inputs: tuple[Any, ...] = ()
         self._lock, self._legend_lock = threading.Lock(), threading.Lock()
-        with self.gui.add_folder("Show"):
+        with self.gui.add_folder("Display"):
             self._build_display()
         with self.gui.add_folder("Observer"):
             self._build_observer()
@@ -100,7 +108,7 @@ class Controls:
         page.update_callbacks.append(self.refresh)
         page.scale_callbacks.append(self.refresh)
 
-    # What is shown
+    # Display settings
 
     def _build_display(self) -> None:
         session, gui = self.session, self.gui
@@ -113,19 +121,19 @@ class Controls:
         colors = gui.add_dropdown("Colours", _colormap_names(session.display.layer), initial_value=_DEFAULT_COLORS)
         automatic = gui.add_checkbox("Automatic range", True)
         range_input = gui.add_vector2("Range", (0.0, 1.0), step=0.01, disabled=True)
-        # As Mitsuba has it, in single precision, it would be written with all its digits.
+        # Rounded, since Mitsuba's single precision would show all its digits.
         max_falloff = slider_max(session.falloff)
         falloff = gui.add_slider("Fall-off", 0.0, max_falloff, 0.01 * max_falloff, float(f"{session.falloff:.4g}"))
 
         def change(event: Any) -> None:
             if event.client is None:
-                # Written by the program, which has set all else.
+                # Changed by the program, not by the user.
                 return
             selected = next(la for la in session.layers if la.title == layer.value)
             if tuple(colors.options) != _colormap_names(selected):
                 colors.options = _colormap_names(selected)
             if selected != session.display.layer and not automatic.value:
-                # A range in 1/sr says nothing of metres.
+                # The range of the previous layer has another unit.
                 automatic.value = True
             range_input.disabled = automatic.value
             if event.target is automatic and not automatic.value:
@@ -177,12 +185,12 @@ class Controls:
 
     def _build_observer(self) -> None:
         session, gui = self.session, self.gui
-        self._position = gui.add_vector3("At", round_position(session.observer), step=0.05)
-        to_camera = gui.add_button("Observer to the camera")
-        to_observer = gui.add_button("Camera to the observer")
+        self._position = gui.add_vector3("Position", round_position(session.observer), step=0.05)
+        to_camera = gui.add_button("Move observer to camera")
+        to_observer = gui.add_button("Move camera to observer")
         self._own_view, self._panorama = (
-            Inset(gui, "Own view", INSET_WIDTH * 2 // 3),
-            Inset(gui, "All around", INSET_WIDTH // 2),
+            Inset(gui, "Observer view", INSET_WIDTH * 2 // 3),
+            Inset(gui, "Panorama", INSET_WIDTH // 2),
         )
 
         @self._position.on_update
@@ -204,7 +212,7 @@ class Controls:
             set_camera(event.client, session.observer, session.observer + 2 * session.heading[:, 0], session.source.up)
 
     def refresh(self) -> None:
-        """Numbers, scale and insets as they are now; insets not more often than they can be looked at."""
+        """Update numbers, legend and insets; the insets at most once per `_INSET_INTERVAL`."""
         session = self.session
         self._update_legend()
         at = round_position(session.observer)
@@ -226,7 +234,7 @@ class Controls:
         self._start_insets()
 
     def _update_legend(self) -> None:
-        # Several threads come here, and the last to write should be the last to have looked.
+        # Several threads call this; without the lock, an older state could overwrite a newer one.
         with self._legend_lock:
             session = self.session
             self._legend.content = layers.format_legend(session.display.layer, session.scale(), self.page.stale_scale_reason)
@@ -234,7 +242,7 @@ class Controls:
                 self._table.content = format_shares(session.shares, session.are_shares_stale)
 
     def _get_inset_inputs(self) -> tuple[Any, ...]:
-        """What the insets depend on."""
+        """Return everything the insets depend on."""
         session = self.session
         at = session.observer.tolist(), session.heading.tolist()
         return *at, session.display, session.scale(), session.settings_version, session.ceiling
@@ -265,12 +273,12 @@ class Controls:
 
     def _build_camera(self) -> None:
         session, gui, place = self.session, self.gui, self.session.source
-        home = gui.add_button("First view")
-        above = gui.add_button("From above")
-        cut = gui.add_checkbox("Cut the ceiling off", session.ceiling is not None)
-        height = gui.add_slider("Height of the cut", 0.0, 1.0, 0.01, 0.8)
-        shot = gui.add_button("Save the picture (PNG)")
-        copy = gui.add_button("Copy as a scene (XML)")
+        home = gui.add_button("Initial view")
+        above = gui.add_button("View from above")
+        cut = gui.add_checkbox("Hide the ceiling", session.ceiling is not None)
+        height = gui.add_slider("Ceiling height", 0.0, 1.0, 0.01, 0.8)
+        shot = gui.add_button("Save picture (PNG)")
+        copy = gui.add_button("Save scene (XML)")
 
         @home.on_click
         def _(event: Any) -> None:
@@ -293,7 +301,7 @@ class Controls:
             change_cut(event)
             lower, upper = (np.asarray(corner, float) for corner in session.proxy.bounds)
             middle, size = (lower + upper) / 2, float(np.linalg.norm(upper - lower))
-            # Straight down there is no up: a little to the side keeps the picture the right way round.
+            # A view straight down has no up direction; a small tilt keeps the orientation of the picture.
             side = session.heading[:, 0] * 0.02 * size
             set_camera(event.client, middle + 0.95 * size * place.up - side, middle, place.up)
 
@@ -301,7 +309,7 @@ class Controls:
         def _(event: Any) -> None:
             window = self._find_window(event)
             if window is None or window.last_picture is None:
-                notify(event, "Picture", "There is no picture yet: wait until the view rests.")
+                notify(event, "Picture", "There is no picture yet. Wait until the view has been rendered.")
                 return
             with notify_errors(event, "Picture"):
                 data = encode_picture(session, window.last_picture[1], picture_provenance(session, window).text())
@@ -320,7 +328,7 @@ class Controls:
         return None if event.client is None else self.page.windows.get(event.client.client_id)
 
     def _height_range(self) -> tuple[float, float]:
-        """Lowest and highest of the points along up."""
+        """Return the lowest and highest coordinate of the points along the up direction, without outliers."""
         proxy = self.session.proxy
         if proxy is None:
             return 0.0, 1.0
@@ -333,12 +341,12 @@ def _colormap_names(layer: layers.Layer) -> tuple[str, ...]:
 
 
 def format_basis(session: Any) -> str:
-    """How many rays of how many people the gaze is made of, as HTML; "" where that is not known."""
+    """Format the number of gaze samples and participants behind the gaze as HTML; "" if unknown."""
     return layers.format_note(f"gaze {session.basis}") if session.basis else ""
 
 
 def set_camera(client: Any, origin: np.ndarray, target: np.ndarray, up: np.ndarray) -> None:
-    """Turn one page's camera."""
+    """Set the camera of one browser."""
     if client is None:
         return
     with client.atomic():
@@ -348,9 +356,9 @@ def set_camera(client: Any, origin: np.ndarray, target: np.ndarray, up: np.ndarr
 
 
 def format_shares(shares: dict[str, float], stale: bool = False) -> str:
-    """Shares of attention as HTML, the largest first; ``stale``: they are out of date."""
+    """Format attention shares as an HTML table, largest first; ``stale``: whether they are outdated."""
     if not shares:
-        return layers.format_note("Computing." if stale else "Name areas to see their share of attention.")
+        return layers.format_note("Computing." if stale else "Add areas of interest to see their attention shares.")
     rows = sorted(shares.items(), key=lambda item: -item[1])
     remainder = sum(share for _, share in rows[_MAX_ROWS:])
     shown = [*rows[:_MAX_ROWS], *([(f"{len(rows) - _MAX_ROWS} more", remainder)] if len(rows) > _MAX_ROWS else [])]
@@ -359,18 +367,24 @@ def format_shares(shares: dict[str, float], stale: bool = False) -> str:
         for name, share in shown
     )
     style = f"font-size:0.85em;margin:0 1em;{layers.STALE_STYLE if stale else ''}"
-    text = f"<table style='{style}'><tr><th>area</th><th>share</th></tr>{cells}</table>"
-    return text + (layers.format_note("Out of date: computing.") if stale else "")
+    text = f"<table style='{style}'><tr><th>area of interest</th><th>attention share</th></tr>{cells}</table>"
+    return text + (layers.format_note("Outdated: computing.") if stale else "")
 
 
 def round_position(position: np.ndarray) -> tuple[float, float, float]:
-    """A position as the panel shows it: to a thousandth of a unit."""
+    """Round a position to three decimals for the panel."""
     x, y, z = (float(round(float(v), 3)) for v in position)
     return x, y, z
 
 
 def picture_provenance(session: Any, window: BrowserWindow) -> Provenance:
-    """What the last picture of ``window`` was made of. Raises `NergError` for files of the scene that are gone."""
+    """Describe how the last picture of ``window`` was made.
+
+    Raises
+    ------
+    NergError
+        A file of the scene no longer exists.
+    """
     assert window.last_picture is not None and window.view is not None
     view, shade, scale = window.view, session.display, session.scale()
     settings = {
@@ -388,8 +402,7 @@ def picture_provenance(session: Any, window: BrowserWindow) -> Provenance:
 
 
 def encode_picture(session: Any, colors: np.ndarray, text: dict[str, str] | None = None) -> bytes:
-    """The bytes of a PNG of ``colors`` (height, width, 3) uint8 with ``text`` in its header, made on the render
-    thread."""
+    """Encode ``colors`` (height, width, 3) uint8 as PNG, with ``text`` in its header, on the render thread."""
 
     def encode() -> bytes:
         import mitsuba as mi
@@ -399,9 +412,7 @@ def encode_picture(session: Any, colors: np.ndarray, text: dict[str, str] | None
     return session.worker.call(encode).result()
 
 
-# ---- Areas ----
-#
-# Areas of interest in the page: boxes that are drawn, moved, named, and saved as JSON.
+# ---- Areas of interest ----
 
 AREA_COLOR = (90, 200, 255)
 _SELECTED_COLOR = (255, 210, 60)
@@ -411,7 +422,7 @@ _MAX_LABELS = 8
 
 
 class AreasPanel:
-    """The part of a page's panel for areas, and their boxes."""
+    """The folder of the panel for areas of interest, and their boxes in the view."""
 
     def __init__(self, page: Page):
         self.page, self.session = page, page.session
@@ -420,12 +431,12 @@ class AreasPanel:
         gui = page.server.gui
         with gui.add_folder("Areas of interest", expand_by_default=False):
             self._name = gui.add_text("Name", "area 1")
-            draw = gui.add_button("Draw a box in the view")
-            self._selected = gui.add_dropdown("Change", self._dropdown_options(), initial_value=_NONE)
+            draw = gui.add_button("Draw box in view")
+            self._selected = gui.add_dropdown("Selected area", self._dropdown_options(), initial_value=_NONE)
             self._size = gui.add_vector3("Size", (1.0, 1.0, 1.0), min=(_MIN_SIZE,) * 3, step=0.05)
-            remove = gui.add_button("Remove")
+            remove = gui.add_button("Remove area")
             self._visible = gui.add_checkbox("Show boxes", len(self.session.regions) <= _MAX_LABELS)
-            save = gui.add_button("Save (JSON)")
+            save = gui.add_button("Save areas (JSON)")
         draw.on_click(self._start_drawing)
         remove.on_click(self._remove)
         self._selected.on_update(lambda event: self._update_selection())
@@ -440,11 +451,17 @@ class AreasPanel:
         self._draw_boxes()
 
     def add(self, region: Region) -> None:
-        """One more area. Raises `NergError` for a name that there is already, and for too many."""
+        """Add an area of interest.
+
+        Raises
+        ------
+        NergError
+            An area of this name exists, or there are too many areas.
+        """
         if region.name in (r.name for r in self.session.regions):
-            raise NergError(f'there is an area "{region.name}" already; give it another name')
+            raise NergError(f'an area named "{region.name}" already exists; choose another name')
         if len(self.session.regions) >= MAX_AREAS:
-            raise NergError(f"there are {MAX_AREAS} areas already; remove one of them")
+            raise NergError(f"the maximum of {MAX_AREAS} areas is reached; remove an area first")
         self.session.regions = [*self.session.regions, region]
         self._on_regions_changed(region.name)
 
@@ -460,13 +477,13 @@ class AreasPanel:
             proxy, view = self.session.proxy, PinholeView.from_page(client.camera)
             with notify_errors(client, "Areas"):
                 if proxy is None:
-                    raise NergError("there are no points to lay a box around yet; wait a moment")
+                    raise NergError("the points are not loaded yet; try again in a moment")
                 lower, upper = fit_box(proxy.points, proxy.size, view, drawn.screen_min, drawn.screen_max)
                 self.add(Region.create(name, lower, upper))
                 self._name.value = f"area {len(self.session.regions) + 1}"
 
-        # Messages arrive in order: whoever reads this can draw, and does not turn the camera instead.
-        notify(client, "Areas", "Draw a rectangle around a thing: a box is laid around what is in it.")
+        # Messages arrive in order: once this is visible, dragging draws and does not rotate the camera.
+        notify(client, "Areas", "Draw a rectangle around an object. A box is fitted to the points inside it.")
 
     def _remove(self, event: Any) -> None:
         self.session.regions = [r for r in self.session.regions if r.name != self._selected.value]
@@ -482,7 +499,7 @@ class AreasPanel:
         self.page.request_shares()
 
     def _update_selection(self) -> None:
-        """A gizmo for the area that is chosen."""
+        """Attach the gizmo to the selected area."""
         if self._gizmo is not None:
             self._gizmo.remove()
             self._gizmo = None
@@ -516,7 +533,7 @@ class AreasPanel:
         try:
             new = Region.create(name, lower, upper, turn)
         except NergError:
-            # Nothing that a hand can drag: the gizmo goes back to where the area is.
+            # An invalid box: move the gizmo back to the area.
             self._update_selection()
             return
         self.session.regions = [new if r.name == name else r for r in self.session.regions]
@@ -545,7 +562,7 @@ class AreasPanel:
 
 
 def box_edges(region: Region) -> np.ndarray:
-    """The twelve edges (12, 2, 3) of a box, along one axis after the other."""
+    """Return the twelve edges (12, 2, 3) of a box, grouped by axis."""
     corners = region.vertices
     vertex_pairs = [(k, k | 1 << axis) for axis in range(3) for k in range(8) if not k >> axis & 1]
     return corners[np.array(vertex_pairs)].astype(np.float32)
@@ -554,11 +571,30 @@ def box_edges(region: Region) -> np.ndarray:
 def fit_box(
     points: np.ndarray, margin: float, view: PinholeView, low: tuple[float, float], high: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of a box around those of ``points`` (N, 3) that are seen within a rectangle of the picture (0..1 from its
-    upper left corner), with a ``margin``: those that lie no deeper behind the foremost than the rectangle is wide
-    there.
+    """Fit a box to the points within a rectangle of a view.
 
-    Raises `NergError` where there are none.
+    Points count if they are not farther behind the nearest surface than the rectangle is wide there.
+
+    Parameters
+    ----------
+    points : ndarray of shape (N, 3)
+        Positions in scene units.
+    margin : float
+        Distance to add on each side, in scene units.
+    view : PinholeView
+        The camera.
+    low, high : tuple of float
+        Upper left and lower right corner of the rectangle, from 0 to 1 over the picture.
+
+    Returns
+    -------
+    tuple of ndarray of shape (3,)
+        Lower and upper corner of the box.
+
+    Raises
+    ------
+    NergError
+        The rectangle contains too few points.
     """
     offsets = np.asarray(points, float) - view.origin
     depth = offsets @ view.forward
@@ -569,7 +605,7 @@ def fit_box(
         y = 0.5 - (offsets @ view.up) / (depth * tan_half_fov) / 2
     inside = (depth > 1e-3) & (x >= low[0]) & (x <= high[0]) & (y >= low[1]) & (y <= high[1])
     if inside.sum() < 8:
-        raise NergError("there is nothing within that rectangle; draw one around a thing")
+        raise NergError("the rectangle contains no points; draw it around an object")
     nearest_depth = float(np.percentile(depth[inside], 5))
     max_thickness = 2 * nearest_depth * tan_half_fov * max((high[0] - low[0]) * view.aspect, high[1] - low[1])
     nearest = np.asarray(points, float)[inside & (depth <= nearest_depth + max_thickness)]

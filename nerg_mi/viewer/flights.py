@@ -1,4 +1,4 @@
-"""Flights of the viewer's camera: recorded, played, and filmed."""
+"""Camera flights of the viewer: interpolated, saved as frames, and rendered as videos."""
 
 from __future__ import annotations
 
@@ -29,23 +29,23 @@ from .points import PinholeView
 from .scene import CAMERA_DEFAULT, TARGET_DEFAULT, ViewSettings, check_can_copy, copy_scene, get_ceiling
 from .session import NORMAL_PRIORITY
 
-# ---- A flight as a video, made on the render thread in turns with everything else ----
+# ---- Flight videos ----
 #
-# The job behind ``nerg render --frames`` does it, which knows nothing of turns: it runs in a thread of its own, which
-# goes on only while the render thread waits for it, so that Dr.Jit is used by one of them at a time.
+# `render_file`, the function behind ``nerg render --frames``, renders the video in a thread of its own. That thread and
+# the render thread run alternately, so that only one of them uses Dr.Jit at a time.
 
 _SIZE_MULTIPLE = 2
 
 
 def make_even(view: PinholeView, width: int) -> tuple[PinholeView, int]:
-    """``view`` and ``width`` with as many pixels in each row and column as a video has: even numbers of them."""
+    """Round the size of ``view`` at ``width`` pixels to even numbers, as video codecs require."""
     columns = max(width // _SIZE_MULTIPLE * _SIZE_MULTIPLE, 16)
     rows = max(round(columns / view.aspect / _SIZE_MULTIPLE) * _SIZE_MULTIPLE, 16)
     return replace(view, aspect=columns / rows), columns
 
 
 def make_video_options(layer: Layer, scale: Scale, frames: Path, fps: float, mode: str) -> PictureOptions:
-    """How `render_file` draws the frames of the file ``frames`` as ``layer`` shows them, with the ends and colours of
+    """Return the options with which `render_file` draws the frames of the file ``frames`` like ``layer`` with
     ``scale``."""
     overlay = layer.overlay
     options = PictureOptions(frames=frames, fps=fps, mode=mode)
@@ -56,10 +56,21 @@ def make_video_options(layer: Layer, scale: Scale, frames: Path, fps: float, mod
 
 
 class FlightVideo:
-    """A video that is being made of the scene file ``scene``: ``steps`` is what the `Worker` runs.
+    """A video being rendered.
 
-    ``on_progress(share, text)`` is told how far it is; ``on_end(error)`` of its end, with what went wrong, or None;
-    after `cancel` it is `KeyboardInterrupt`, and no file is left.
+    Parameters
+    ----------
+    scene : Path
+        Scene file.
+    output : Path
+        Video file to write.
+    options : PictureOptions
+        Options of `render_file`.
+    on_progress : callable
+        Called with the fraction done (0 to 1) and a text.
+    on_end : callable
+        Called at the end with the exception, or None. After `cancel` the exception is `KeyboardInterrupt`, and no file
+        is written.
     """
 
     def __init__(
@@ -77,11 +88,11 @@ class FlightVideo:
         self._error: BaseException | None = None
 
     def cancel(self) -> None:
-        """Make no further frame."""
+        """Stop before the next strip of a frame."""
         self._is_cancelled = True
 
     def steps(self) -> Iterator[None]:
-        """Each makes a strip of a picture."""
+        """Yield after each strip of a frame: the task for the `Worker`."""
         threading.Thread(target=self._run, name="nerg-view-film", daemon=True).start()
         try:
             while not self._is_done:
@@ -89,7 +100,7 @@ class FlightVideo:
                 self._paused.acquire()
                 yield None
         finally:
-            # Whoever drops the steps ends the job, too: nothing else would let its thread go on.
+            # If the generator is closed early, let the thread run to its end.
             while not self._is_done:
                 self._is_cancelled = True
                 self._resumed.release()
@@ -105,10 +116,10 @@ class FlightVideo:
         self._is_done = True
         self._paused.release()
 
-    # The job's reporter
+    # Interface of `Reporter`
 
     def progress(self, fraction: float, text: str = "") -> None:
-        """Let the others have their turn."""
+        """Report the progress and let other tasks run."""
         self._on_progress(fraction, text)
         self._paused.release()
         self._resumed.acquire()
@@ -116,16 +127,30 @@ class FlightVideo:
             raise KeyboardInterrupt
 
     def message(self, text: str) -> None:
-        """What is written is the page's to say."""
+        """Ignored: the page reports the result."""
 
     def warn(self, text: str) -> None:
-        """As any other progress."""
+        """Show a warning as progress."""
         self._on_progress(0.0, text)
 
 
 def prepare_flight(views: list[PinholeView], width: int, **settings: Any) -> tuple[list[PinholeView], ViewSettings]:
-    """The ``views`` of a flight with even sides, and what their scene file is made of: the first of them, and what
-    `Shown` has besides."""
+    """Prepare a flight for rendering.
+
+    Parameters
+    ----------
+    views : list of PinholeView
+        The views of the flight.
+    width : int
+        Width of the frames in pixels.
+    **settings
+        Other fields of `ViewSettings`.
+
+    Returns
+    -------
+    tuple of list of PinholeView and ViewSettings
+        The views with even sizes, and the settings of the scene file, whose camera is the first view.
+    """
     resized = [make_even(view, width) for view in views]
     first, columns = resized[0]
     return [replace(view, aspect=first.aspect, fov=first.fov) for view, _ in resized], ViewSettings(
@@ -133,24 +158,41 @@ def prepare_flight(views: list[PinholeView], width: int, **settings: Any) -> tup
     )
 
 
-# ---- Flights ----
-#
-# A camera's flight through views that were kept, as the frames of a sequence that `nerg render --frames` renders.
+# ---- Interpolation of views ----
 
 MAX_FRAMES = 20_000
-"""Frames of a flight at most."""
+"""Maximum number of frames of a flight."""
 
 
 def interpolate_views(views: Sequence[PinholeView], seconds: float, fps: float) -> list[PinholeView]:
-    """Views ``fps`` times a second on a smooth curve through ``views``, which it passes at equal intervals.
+    """Interpolate a flight through ``views`` with a cubic spline.
 
-    A cubic spline with its ends at rest; two views are joined by a line. Raises `NergError` for less than two.
+    Parameters
+    ----------
+    views : sequence of PinholeView
+        Key views, passed at equal time intervals. The flight starts and ends at rest.
+    seconds : float
+        Duration in seconds.
+    fps : float
+        Frames per second.
+
+    Returns
+    -------
+    list of PinholeView
+        One view per frame.
+
+    Raises
+    ------
+    NergError
+        There are fewer than two views, or the number of frames is out of range.
     """
     if len(views) < 2:
-        raise NergError("a flight needs two views at least; keep another one")
+        raise NergError("a flight needs at least two views; add another view")
     count = round(seconds * fps) + 1
     if not 2 <= count <= MAX_FRAMES:
-        raise NergError(f"a flight has 2 to {MAX_FRAMES:,} frames, and {seconds:g} s at {fps:g} a second are {count:,}")
+        raise NergError(
+            f"flights have 2 to {MAX_FRAMES:,} frames, but {seconds:g} s at {fps:g} frames per second are {count:,}"
+        )
     parameters = np.linspace(0, len(views) - 1, count)
     key_poses = np.array([np.concatenate([v.origin, v.origin + v.forward, v.up]) for v in views])
     poses = CubicSpline(np.arange(len(views)), key_poses, bc_type="clamped")(parameters)
@@ -159,7 +201,7 @@ def interpolate_views(views: Sequence[PinholeView], seconds: float, fps: float) 
 
 
 def format_frames(views: Sequence[PinholeView]) -> str:
-    """The text of a file of frames for a scene that `scene.copied` wrote."""
+    """Format views as a CSV file for ``nerg render --frames`` with a scene written by `copy_scene`."""
     text = io.StringIO(newline="")
     writer = csv.writer(text)
     writer.writerow([CAMERA_DEFAULT, TARGET_DEFAULT])
@@ -167,15 +209,13 @@ def format_frames(views: Sequence[PinholeView]) -> str:
     return text.getvalue()
 
 
-# ---- Flying ----
-#
-# The part of the panel for a camera's flight: views that are kept, and their frames or their video.
+# ---- Panel ----
 
 TITLE = "Flight"
 
 
 class FlightPanel:
-    """A folder of a `Page`'s panel. One video is made at a time, whoever asked for it."""
+    """The folder of the panel for camera flights. One video is rendered at a time, for all browsers together."""
 
     def __init__(self, page: Page):
         self.page, self.session = page, page.session
@@ -183,15 +223,15 @@ class FlightPanel:
         self._video: FlightVideo | None = None
         gui = page.server.gui
         with gui.add_folder(TITLE, expand_by_default=False):
-            add_view = gui.add_button("Keep this view")
-            clear_views = gui.add_button("Forget the views")
-            self._seconds = gui.add_number("Seconds", 6.0, min=0.1, max=3600.0, step=0.5)
-            self._fps = gui.add_number("Frames a second", 25.0, min=1.0, max=120.0, step=1.0)
-            save_frames = gui.add_button("Save the frames (CSV)")
-            self._start_button = gui.add_button("Make a video (MP4)")
+            add_view = gui.add_button("Add view")
+            clear_views = gui.add_button("Clear views")
+            self._seconds = gui.add_number("Duration (s)", 6.0, min=0.1, max=3600.0, step=0.5)
+            self._fps = gui.add_number("Frames per second", 25.0, min=1.0, max=120.0, step=1.0)
+            save_frames = gui.add_button("Save frames (CSV)")
+            self._start_button = gui.add_button("Render video (MP4)")
             self._progress_bar = gui.add_progress_bar(0.0, visible=False)
             self._status = gui.add_markdown("", visible=False)
-            self._cancel_button = gui.add_button("Cancel the video", visible=False)
+            self._cancel_button = gui.add_button("Cancel video", visible=False)
         add_view.on_click(self._add_view)
         save_frames.on_click(self._save_frames)
         self._start_button.on_click(self._start_video)
@@ -205,19 +245,19 @@ class FlightPanel:
     def _add_view(self, event: Any) -> None:
         self._views.append(PinholeView.from_page(event.client.camera))
         count = len(self._views)
-        notify(event, TITLE, "One view is kept." if count == 1 else f"{count} views are kept.")
+        notify(event, TITLE, "The flight has 1 view." if count == 1 else f"The flight has {count} views.")
 
     def _save_frames(self, event: Any) -> None:
         with notify_errors(event, TITLE):
             text = format_frames(interpolate_views(self._views, self._seconds.value, self._fps.value))
             event.client.send_file_download("view.frames.csv", text.encode(), save_immediately=True)
-            notify(event, TITLE, "nerg render view.xml -o flight.mp4 --frames view.frames.csv renders it.")
+            notify(event, TITLE, "To render it: nerg render view.xml -o flight.mp4 --frames view.frames.csv")
 
     def _start_video(self, event: Any) -> None:
-        """Make a video, and send it to the page that asked."""
+        """Render a video and send it to the browser that requested it."""
         session, client, shade = self.session, event.client, self.session.display
         if self._video is not None:
-            notify(client, TITLE, "A video is being made already; cancel it, or wait for it.")
+            notify(client, TITLE, "Another video is being rendered. Cancel it or wait for it.")
             return
         folder = tempfile.TemporaryDirectory()
         try:
@@ -259,7 +299,7 @@ class FlightPanel:
         options = make_video_options(shade.layer, session.scale(), frames, self._fps.value, session.variant)
         self._video = FlightVideo(scene, video, options, self._on_progress, on_end)
         self._set_running(True)
-        self._on_progress(0.0, "the video waits for its turn")
+        self._on_progress(0.0, "The video is waiting for other tasks")
         session.worker.submit("film", NORMAL_PRIORITY, self._video.steps())
 
     def _on_progress(self, fraction: float, text: str) -> None:

@@ -1,4 +1,4 @@
-"""The page of the viewer and its window."""
+"""The page of the viewer: its browsers, their cameras and pictures, and the shared observer."""
 
 from __future__ import annotations
 
@@ -17,29 +17,59 @@ from .points import NUM_LEVELS, PinholeView, StagePicture
 from .server import stop_server
 from .session import Session
 
-# ---- Window ----
-#
-# One browser that looks: its view, what it is shown, and how quickly it draws.
+# ---- State of one browser ----
 
 SLOW_FRAME, FAST_FRAME = 1 / 20, 1 / 40
-"""Seconds a frame above which a browser is given fewer points, and below which more."""
+"""Seconds per frame: above the first a browser gets fewer points, below the second it gets more."""
 
 _MIN_FRAMES = 8
-"""It is judged by so many frames."""
+"""Number of frames needed to judge the speed of a browser."""
 
 REST_SECONDS = 0.12
-"""Seconds without movement after which a picture is refined."""
+"""Seconds without camera movement after which the picture is refined."""
 
 _MAX_REST_SECONDS = 0.8
 
 
 @dataclass(eq=False)
 class BrowserWindow:
-    """One browser: its ``client`` and the points in it; when it or what it shows ``moved`` last and whether that was
-    ``noticed``, and when it ``looked`` elsewhere last; the ``version`` of its view, and whether it shows a ``picture``;
-    ``stale``: why its points are greyed, "" where they are not; ``note``: what was done to its camera; ``free``: where
-    that last stood in free air; the ``last`` picture, with its colours. ``level``: which of the proxy's numbers of
-    points it is given; ``frames``: seconds between the last views of a movement."""
+    """The state of one connected browser.
+
+    Parameters
+    ----------
+    client : viser.ClientHandle
+        The connection.
+    status : viser.GuiMarkdownHandle
+        The status text at the top of the panel.
+    cloud : viser.PointCloudHandle or None
+        The displayed points.
+    view : PinholeView or None
+        The camera.
+    change_time : float
+        Time (`time.monotonic`) of the last change of the camera or of the displayed contents.
+    last_view_time : float
+        Time of the last change of the camera alone.
+    is_handled : bool
+        Whether the refinement after the last change has started.
+    version : int
+        Counts the changes; a picture of an earlier version is dropped.
+    shows_picture : bool
+        Whether the browser displays a picture instead of the points.
+    stale_reason : str
+        Why the points are grey; "" if they are up to date.
+    message : str
+        A message about the camera.
+    free_position : ndarray or None
+        The last camera position (3,) in free space.
+    last_picture : tuple or None
+        The last picture and its colours (height, width, 3) uint8.
+    timings : list of str
+        One line for each stage of the current picture.
+    level : int
+        Index of the number of points that the browser gets (`PointProxy.levels`).
+    frame_times : list of float
+        Seconds between the last camera updates of a movement.
+    """
 
     client: Any
     status: Any
@@ -59,21 +89,23 @@ class BrowserWindow:
     frame_times: list[float] = field(default_factory=list)
 
     def record_frame(self, seconds: float) -> None:
-        """The view before was told ``seconds`` ago: a browser tells of each frame, while its camera moves."""
+        """Record that the previous camera update was ``seconds`` ago; browsers send one per frame."""
         if seconds < 1:
             self.frame_times.append(seconds)
 
     @property
     def rest_seconds(self) -> float:
-        """Seconds without a new view after which its camera rests: a browser that draws slowly tells of it seldom, and
-        pictures that are refined meanwhile would make it slower still."""
+        """Seconds without a camera update after which the camera counts as resting.
+
+        A slow browser sends updates rarely, and a refinement between them would slow it down further.
+        """
         return float(np.clip(3 * np.median(self.frame_times[-_MIN_FRAMES:] or [0.0]), REST_SECONDS, _MAX_REST_SECONDS))
 
     def choose_level(self, is_at_rest: bool) -> int:
-        """The level that its frames ask for; more points only ``at_rest``."""
+        """Choose the point level from the frame times; it increases the number of points only ``is_at_rest``."""
         if len(self.frame_times) < _MIN_FRAMES:
             return self.level
-        # The quickest quarter: a mouse that pauses is no slow browser.
+        # The fastest quarter: pauses of the mouse are not slow frames.
         frame = float(np.percentile(self.frame_times, 25))
         if frame > SLOW_FRAME:
             return min(self.level + 1, NUM_LEVELS - 1)
@@ -82,21 +114,25 @@ class BrowserWindow:
 
 # ---- Page ----
 #
-# The page: each browser's camera and picture, and the observer that all of them drag.
-#
-# While a camera moves its browser draws points by itself; when it rests a picture of the integrator stands in their
-# place, first small, then fine. Nothing here waits for rendering: a clock looks what is to be done.
+# While a camera moves, its browser draws points. When the camera rests, a rendered picture replaces them, first at low
+# resolution, then at full resolution. No callback waits for rendering: a clock thread starts pending work.
 
 TICK_SECONDS = 0.04
-"""Seconds between two looks of the clock."""
+"""Interval of the clock, in seconds."""
 
 _GIZMO_DISTANCE = 0.4
 _POINT_SCALE = 1.15
-"""Width of a drawn point, in cells of the grid that points lie in."""
+"""Width of a drawn point, as a multiple of the size of the grid cells."""
 
 
 class Page:
-    """A running page of ``server`` (viser) for what a `Session` finds; it is the session's listener."""
+    """The page of a viser server; it is the listener of a `Session`.
+
+    Parameters
+    ----------
+    server : viser.ViserServer
+        The running server (`start_server`).
+    """
 
     def __init__(self, server: Any):
         self.server = server
@@ -109,13 +145,13 @@ class Page:
         self._observer: Any = None
         self._clock = threading.Thread(target=self._run_clock, name="nerg-view-clock", daemon=True)
         self.update_callbacks: list[Any] = []
-        # The scale, or what is out of date, is another one.
+        # Called when the colour scale or the set of outdated contents has changed.
         self.scale_callbacks: list[Any] = []
         self._stale_state: tuple[Any, ...] = ()
         self._free_position: np.ndarray
 
     def open(self, session: Session) -> None:
-        """Show ``session``, which has started."""
+        """Display a started ``session``."""
         self.session, self._free_position = session, session.observer
         scene, home = self.server.scene, session.home_view
         scene.set_up_direction(tuple(session.source.up))
@@ -143,7 +179,7 @@ class Page:
         self._clock.start()
 
     def close(self) -> None:
-        """End the clock, the session's thread and the server."""
+        """Stop the clock, the session's thread and the server."""
         self._stopped.set()
         if self._clock.is_alive():
             self._clock.join(5)
@@ -154,9 +190,15 @@ class Page:
     # The observer
 
     def place_observer(self, at: np.ndarray, heading: np.ndarray | None = None) -> None:
-        """Let the observer stand at ``at`` (3,), as if dragged there. Raises `NergError` for what is no position."""
+        """Move the observer to ``at`` (3,), with the rotation ``heading`` (3, 3), as a user would drag it.
+
+        Raises
+        ------
+        NergError
+            The position or rotation is not finite or too far away.
+        """
         self.session.place_observer(at, heading)
-        # Who was put somewhere on purpose is dragged from there.
+        # The next drag starts from this position, even if it is inside a solid.
         self._free_position = self.session.observer
         self._observer.position = tuple(np.asarray(at, float))
         self._observer.wxyz = self._observer_quaternion()
@@ -166,7 +208,7 @@ class Page:
         session, (w, x, y, z) = self.session, np.asarray(self._observer.wxyz, float)
         try:
             if not 0 < np.linalg.norm([w, x, y, z]) < np.inf:
-                raise NergError("the page sent no rotation of the observer; drag them again")
+                raise NergError("the page sent an invalid rotation of the observer; drag the observer again")
             session.place_observer(self._observer.position, Rotation.from_quat([x, y, z, w]).as_matrix())
         except NergError as error:
             self._observer.position, self._observer.wxyz = tuple(session.observer), self._observer_quaternion()
@@ -180,7 +222,7 @@ class Page:
             )
 
     def _move_observer_out(self, at: np.ndarray, position: np.ndarray) -> None:
-        """The observer, who was dragged to ``at`` (3,), stands at ``found`` (3,): elsewhere if that is in something."""
+        """Move the observer, who was dragged to ``at`` (3,), to the free ``position`` (3,) if the two differ."""
         if self.session.observer is not at:
             return
         if position is at:
@@ -198,7 +240,7 @@ class Page:
             callback()
 
     def _update_gizmo_visibility(self) -> None:
-        """The gizmo, but not to somebody alone who looks out of the observer's eye: it would fill the view."""
+        """Show the gizmo unless the only browser looks from the observer's position, where it would fill the view."""
         views = [w.view for w in self.windows.values() if w.view is not None]
         distances = [float(np.linalg.norm(view.origin - self.session.observer)) for view in views]
         visible = len(distances) != 1 or distances[0] > _GIZMO_DISTANCE
@@ -212,27 +254,27 @@ class Page:
     # Pictures
 
     def request_points(self) -> None:
-        """Have the gaze on the points, and the shares, computed anew."""
+        """Request new gaze values on the points, and new attention shares."""
         self._is_points_update_pending = self._is_shares_update_pending = True
 
     def request_shares(self) -> None:
-        """Have the shares of attention counted, since there are other areas."""
+        """Request new attention shares, after a change of the areas."""
         self._is_shares_update_pending = True
 
     def restart_pictures(self, delay: float = 0.0) -> None:
-        """Make all pictures anew, ``wait`` seconds from now, since what they show has changed."""
+        """Restart all pictures, ``delay`` seconds from now, after a change of the displayed contents."""
         with self._lock:
             for window in self.windows.values():
                 self._hide_picture(window, time.monotonic() - window.rest_seconds + delay)
 
     def redraw_points(self) -> None:
-        """Colour the points anew, which are other ones where the ceiling is cut off."""
+        """Redraw the points, after a change of their colours or of the ceiling."""
         with self._lock:
             for window in self.windows.values():
                 self._draw_points(window)
 
     def _hide_picture(self, window: BrowserWindow, change_time: float) -> None:
-        """The view of ``window``, or what it shows, is another one now: its points take the picture's place."""
+        """Replace the picture of ``window`` by the points, since its view or the displayed contents have changed."""
         window.version += 1
         window.change_time, window.is_handled = change_time, False
         self.session.cancel(window.client.client_id)
@@ -243,7 +285,7 @@ class Page:
                     window.cloud.visible = True
                     window.client.scene.set_background_image(None)
                 elif window.last_picture is not None:
-                    # There is nothing to take its place yet.
+                    # There are no points yet: grey out the old picture.
                     window.client.scene.set_background_image(layers.grey_out(window.last_picture[1]), format="jpeg")
 
     def _start_refinement(self, window: BrowserWindow) -> None:
@@ -274,16 +316,16 @@ class Page:
         )
 
     def _move_camera_out(self, window: BrowserWindow, at: np.ndarray, position: np.ndarray) -> None:
-        """The camera of ``window``, which was moved to ``at`` (3,), stands at ``found`` (3,)."""
+        """Move the camera of ``window`` from ``at`` (3,) to the free ``position`` (3,) if the two differ."""
         with self._lock:
             if window.view is not None and window.view.origin is at:
                 window.free_position = position
                 if position is not at:
-                    window.message = "The camera was inside of something; it stands before it now."
+                    window.message = "The camera was inside a solid and was moved in front of it."
                     window.client.camera.position = tuple(position)
 
     def _update_status(self, window: BrowserWindow) -> None:
-        """Say what ``window`` shows, what of it is out of date, and what is computed; grey the points that are."""
+        """Update the status text of ``window``, and grey out its points if they are outdated."""
         stale = self.session.stale_points_reason
         if stale != window.stale_reason:
             window.stale_reason = stale
@@ -292,7 +334,7 @@ class Page:
             is_final = window.last_picture is not None and window.last_picture[0].is_final
             text = (window.timings[-1] if window.timings else "picture") + (" — done" if is_final else " …")
         elif window.cloud is None and window.last_picture is not None:
-            text = "**Grey: an earlier picture**"
+            text = "**Grey: outdated picture**"
         else:
             text = f"**Grey: {stale}**" if stale else "points"
         computing = self.session.running_tasks
@@ -304,13 +346,13 @@ class Page:
 
     @property
     def stale_scale_reason(self) -> str:
-        """Why the scale is that of nothing that is shown; "" where it is of a picture, or of the points."""
+        """Why the colour scale is outdated; "" if it belongs to the displayed picture or points."""
         if not self.session.has_scale:
-            return "No scale yet: it is being computed."
+            return "The colour scale is being computed."
         reason = self.session.stale_points_reason
         if not reason or any(window.shows_picture for window in list(self.windows.values())):
             return ""
-        return f"Out of date: {reason}."
+        return f"Outdated: {reason}."
 
     def _draw_points(self, window: BrowserWindow) -> None:
         points = self.session.points(window.level)
@@ -337,30 +379,30 @@ class Page:
     # The session's listener
 
     def on_proxy(self) -> None:
-        """Show the points."""
+        """Draw the new points."""
         self._is_points_update_pending = True
         self.redraw_points()
 
     def on_baked(self) -> None:
-        """Show the gaze on the points."""
+        """Draw the new gaze values on the points."""
         self.redraw_points()
         for callback in self.update_callbacks:
             callback()
 
     def on_shares(self) -> None:
-        """Nothing to be done here: whoever shows them has asked to be told."""
+        """Notify the panels about new attention shares."""
         for callback in self.update_callbacks:
             callback()
 
     def on_range(self) -> None:
-        """Have the scale beside the picture be that of the picture."""
+        """Notify the panels about a new colour range."""
         for callback in self.scale_callbacks:
             callback()
 
     def on_error(self, error: BaseException) -> None:
-        """Show what went wrong; a mistake of the program by its name as well."""
+        """Show an error in the status text, with its type if it is a bug."""
         text = format_error(error)
-        self.problem = text if is_user_error(error) else f"{type(error).__name__}: {text} (a mistake in the program)"
+        self.problem = text if is_user_error(error) else f"{type(error).__name__}: {text} (a bug in nerg_mi)"
 
     # Browsers
 
@@ -382,15 +424,15 @@ class Page:
     def _update_view(self, window: BrowserWindow) -> None:
         view, old = PinholeView.from_page(window.client.camera), window.view
         if not np.isfinite([*view.origin, *view.forward, *view.up, view.fov, view.aspect]).all():
-            self.on_error(NergError("the page sent a camera without a position; reload it"))
+            self.on_error(NergError("the page sent an invalid camera position; reload the page"))
             return
-        # The browser tells its camera again where nothing has changed.
+        # The browser also sends its camera when nothing has changed.
         names = ("origin", "forward", "up", "fov", "aspect")
         if old is not None and all(np.allclose(getattr(view, n), getattr(old, n), atol=1e-6) for n in names):
             return
         now = time.monotonic()
         if old is not None:
-            # Also after what seemed to be a rest: of a browser that is slow, each frame does.
+            # Also after an apparent rest: in a slow browser, each frame seems to be one.
             window.record_frame(now - window.last_view_time)
             self._adapt_level(window, is_at_rest=False)
             if window.free_position is None or not np.allclose(view.origin, window.free_position):
@@ -400,7 +442,7 @@ class Page:
         self._hide_picture(window, now)
 
     def _adapt_level(self, window: BrowserWindow, is_at_rest: bool) -> None:
-        """Give the browser of ``window`` as many points as it draws quickly."""
+        """Adapt the number of points to the speed of the browser of ``window``."""
         level = window.choose_level(is_at_rest)
         if level != window.level:
             window.frame_times.clear()
@@ -444,7 +486,7 @@ class Page:
                 callback()
 
     def _orbit_distance(self) -> float:
-        """How far ahead of the first camera its centre of rotation is: where the place's middle is level with it."""
+        """Distance from the initial camera to its centre of rotation, which is level with the observer; at least 1."""
         session = self.session
         away = float((session.observer - session.home_view.origin) @ session.home_view.forward)
         return max(away, 1.0)

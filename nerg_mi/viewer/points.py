@@ -1,4 +1,4 @@
-"""The viewer's picture of the place: points that stand for it, the view, and its refinement while nothing moves."""
+"""Views, their progressive refinement, and the points that the browser draws."""
 
 from __future__ import annotations
 
@@ -17,13 +17,24 @@ from nerg_mi.api.scene import Scene
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.transport.geometry import Ceiling
 
-# ---- From where a page looks, and the rays of its picture ----
+# ---- Views ----
 
 
 @dataclass(frozen=True, eq=False)
 class PinholeView:
-    """A pinhole camera: ``origin`` (3,) in scene units, the unit vectors ``ahead`` and ``up`` (3,), perpendicular to
-    each other, ``fov`` in radians between the lower and the upper border, and ``aspect``, width by height."""
+    """A pinhole camera.
+
+    Parameters
+    ----------
+    origin : ndarray of shape (3,)
+        Position in scene units.
+    forward, up : ndarray of shape (3,)
+        Orthogonal unit vectors in the frame of the scene.
+    fov : float
+        Vertical field of view in radians.
+    aspect : float
+        Width divided by height.
+    """
 
     origin: np.ndarray
     forward: np.ndarray
@@ -33,7 +44,10 @@ class PinholeView:
 
     @classmethod
     def look_at(cls, origin: Any, target: Any, up: Any, fov: float, aspect: float) -> PinholeView:
-        """One that looks at ``target``; ``up`` is made perpendicular, and chosen where it lies along the view."""
+        """Make a view from ``origin`` towards ``target``.
+
+        ``up`` is made orthogonal to the viewing direction; if the two are parallel, another axis replaces it.
+        """
         origin = np.asarray(origin, float)
         forward = _normalize(np.asarray(target, float) - origin)
         up = np.asarray(up, float)
@@ -43,7 +57,7 @@ class PinholeView:
 
     @classmethod
     def from_page(cls, camera: Any) -> PinholeView:
-        """That of a `viser.CameraHandle`, whose frame has x to the right, y down and z ahead."""
+        """Make the view of a `viser.CameraHandle`, whose frame has x right, y down and z forward."""
         w, x, y, z = camera.wxyz
         forward = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
         down = np.array([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)])
@@ -52,7 +66,7 @@ class PinholeView:
 
     @classmethod
     def from_sensor(cls, sensor: Any) -> PinholeView:
-        """That of a perspective sensor of a Mitsuba scene; of others the place and the direction, and a usual lens."""
+        """Make the view of a Mitsuba sensor. Sensors that are not perspective get a field of view of 70 degrees."""
         import mitsuba as mi
 
         pose = np.array(sensor.world_transform().matrix, float).reshape(4, 4)
@@ -64,32 +78,44 @@ class PinholeView:
 
     @property
     def target(self) -> np.ndarray:
-        """A point (3,) that it looks at, so far away that rounding it to the digits of a file does not turn it."""
+        """A point (3,) on the optical axis, distant enough that rounding it in a file does not rotate the view."""
         return self.origin + max(1.0, float(np.linalg.norm(self.origin))) * self.forward
 
     @property
     def fov_x_degrees(self) -> float:
-        """Degrees between the left and the right border."""
+        """Horizontal field of view in degrees."""
         return math.degrees(2 * math.atan(math.tan(self.fov / 2) * self.aspect))
 
     def to_camera(self, width: int) -> Camera:
-        """The same as a `Camera` whose pictures are ``width`` pixels wide."""
+        """Make a `Camera` with pictures of ``width`` pixels."""
         target = self.origin + self.forward
         size = dict(width=width, height=self.picture_height(width))
         return Camera(tuple(self.origin), tuple(target), tuple(self.up), self.fov_x_degrees, **size)
 
     def picture_height(self, width: int) -> int:
-        """Rows of a picture with ``width`` columns."""
+        """Return the height in pixels of a picture of ``width`` pixels."""
         return max(round(width / self.aspect), 1)
 
     def ray_directions(self, width: int, height: int, offsets: np.ndarray) -> np.ndarray:
-        """Unit directions (height * width, 3) through a picture's pixels, row by row. ``within`` (height * width, 2):
-        where in each pixel, 0..1 from its upper left corner."""
+        """Compute the directions of the rays through the pixels of a picture.
+
+        Parameters
+        ----------
+        width, height : int
+            Size of the picture in pixels.
+        offsets : ndarray of shape (height * width, 2)
+            Position in each pixel, from 0 to 1, measured from its upper left corner.
+
+        Returns
+        -------
+        ndarray of shape (height * width, 3)
+            Unit vectors in the frame of the scene, row by row.
+        """
         column = (np.tile(np.arange(width), height) + offsets[:, 0]) / width * 2 - 1
         row = 1 - (np.repeat(np.arange(height), width) + offsets[:, 1]) / height * 2
         half_height = math.tan(self.fov / 2)
         right = np.cross(self.forward, self.up)
-        # Pixels are squares, as those of a `Camera`, whose height follows from its width.
+        # Pixels are square, as those of `Camera`.
         half_width = half_height * self.aspect
         half_height = half_width * height / width
         directions = self.forward + (column * half_width)[:, None] * right + (row * half_height)[:, None] * self.up
@@ -102,7 +128,8 @@ def _normalize(v: np.ndarray) -> np.ndarray:
 
 
 def make_heading(forward: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """A rotation (3, 3) with the columns ahead, left and up, level by ``up``."""
+    """Make the rotation (3, 3) with the columns forward, left and up, whose forward is ``forward`` projected to the
+    horizontal."""
     level = forward - up * (forward @ up)
     if np.linalg.norm(level) < 1e-6:
         level = np.eye(3)[np.argmin(np.abs(up))]
@@ -112,36 +139,50 @@ def make_heading(forward: np.ndarray, up: np.ndarray) -> np.ndarray:
 
 
 def get_observer_forward(scene: Scene) -> np.ndarray:
-    """Where the observer of ``scene`` is turned to."""
+    """Return the viewing direction (3,) of the observer of ``scene``."""
     pose = np.array(scene.integrator.observer.world_transform().matrix, float).reshape(4, 4)
     return pose[:3, 2]
 
 
-# ---- Refining ----
+# ---- Progressive refinement ----
 #
-# A picture that is refined in steps: small at once, then in full, then with more samples a pixel.
-#
-# It is a generator, so that whoever drives it can stop between two bands of rays. Its values are those of the
-# integrator `nerg` (`nerg_mi.api.query.trace`).
+# A picture is rendered at low resolution, then at full resolution, then with more samples per pixel. The refinement is
+# a generator, so that it can stop after each band of rays. The values are those of the integrator `nerg`
+# (`nerg_mi.api.query.trace`).
 
 BAND_SECONDS = 0.35
-"""A band of rays should take so long at most: what is more urgent waits for its end."""
+"""Target for the longest time of a band of rays, in seconds: a more urgent task waits this long."""
 
 BAND_SIZES = tuple(1 << k for k in range(13, 18))
-"""Numbers of rays in a band."""
+"""The possible numbers of rays in a band."""
 
 ROUGH_DIRECTIONS = 1 << 12
-"""Of the integral over an observer's sphere that a normalised gaze field is divided by: right to some thousandths, in a
-tenth of the time that the settings of a scene take."""
+"""Maximum number of directions for the integral that normalises a gaze field, in all but the last picture.
+
+The relative error is a few thousandths, at a tenth of the time of the default settings.
+"""
 
 DOWNSAMPLING_STAGES = (4, 2, 1)
-"""The picture is computed first with a quarter of its columns and rows, then with half of them, then with all."""
+"""Factors by which the successive pictures are downsampled."""
 
 
 @dataclass(frozen=True, eq=False)
 class StagePicture:
-    """``values`` (height, width) or (height, width, channels) by quantity, means of ``samples`` a pixel; ``seconds``
-    since it was begun; ``share``: one of `SHARES`; ``whole``: whether this is the last."""
+    """A picture of one stage of the refinement.
+
+    Parameters
+    ----------
+    values : dict of str to ndarray
+        Quantities of shape (height, width) or (height, width, channels), averaged over the samples.
+    samples : int
+        Samples per pixel.
+    seconds : float
+        Time since the refinement started.
+    downsampling : int
+        The factor of the stage, one of `DOWNSAMPLING_STAGES`.
+    is_final : bool
+        Whether this is the last picture.
+    """
 
     values: dict[str, np.ndarray]
     samples: int
@@ -151,7 +192,7 @@ class StagePicture:
 
 
 class BandPace:
-    """How many rays a band has, one of `SIZES`, learnt from the time of those before."""
+    """Chooses the number of rays in a band from the time of previous bands."""
 
     def __init__(self) -> None:
         self._index = 0
@@ -159,12 +200,12 @@ class BandPace:
 
     @property
     def num_rays(self) -> int:
-        """So many."""
+        """The number of rays in the next band, one of `BAND_SIZES`."""
         return BAND_SIZES[self._index]
 
     def record(self, seconds: float) -> None:
-        """A band of `rays` took so long."""
-        # Once is chance, or a kernel that was compiled.
+        """Record that a band of `num_rays` rays took ``seconds``."""
+        # A single slow band can be due to the compilation of a kernel.
         self._num_slow = self._num_slow + 1 if seconds > 1.5 * BAND_SECONDS else 0
         if self._num_slow > 1:
             self._index, self._num_slow = max(self._index - 1, 0), 0
@@ -184,10 +225,33 @@ def refine(
     ceiling: Ceiling | None = None,
     seed: int = 0,
 ) -> Iterator[StagePicture | None]:
-    """Pictures of ``quantities``, each better than the one before; None after each band of one.
+    """Render pictures of increasing quality.
 
-    ``observer`` (3,): whose gaze it is; None: that of whoever stands at the camera. ``width`` in pixels and ``spp``
-    samples a pixel of the last. ``ceiling``: what is left out of views from above, whatever the scene says of it.
+    Parameters
+    ----------
+    scene : Scene
+        The scene.
+    view : PinholeView
+        The camera.
+    observer : ndarray of shape (3,) or None
+        Position of the observer in scene units. None: the observer is at the camera.
+    quantities : sequence of str
+        The quantities to compute, as for `nerg_mi.api.query.trace`.
+    width : int
+        Width of the final picture in pixels.
+    spp : int
+        Samples per pixel of the final picture.
+    pace : BandPace
+        Chooses the size of the bands.
+    ceiling : Ceiling or None
+        The part of the scene to hide in views from above; it replaces the ceiling of the scene.
+    seed : int
+        Seed of the sample positions.
+
+    Yields
+    ------
+    StagePicture or None
+        A picture after each stage, and None after each band of rays.
     """
     start = time.perf_counter()
     random = np.random.default_rng(seed)
@@ -205,7 +269,7 @@ def refine(
                 band_start = time.perf_counter()
                 part, size = directions[done : done + pace.num_rays], pace.num_rays
                 band_seed = seed + 7919 * sample + done
-                # The last and largest picture is that of the scene's own settings.
+                # The final picture uses the settings of the scene.
                 with rough_integrals(scene, downsampling > 1), override_attribute(scene, "ceiling", ceiling):
                     traced = _trace_from(
                         scene, view.origin, pad_directions(part, size), quantities, observer, band_seed
@@ -218,7 +282,7 @@ def refine(
             shaped = {name: v.reshape(rows, columns, *v.shape[1:]).astype(np.float64) for name, v in values.items()}
             sums = shaped if sample == 0 else {name: sums[name] + v for name, v in shaped.items()}
             num_samples = sample + 1
-            # Each one twice as good as the one before; others would only be sent.
+            # Only pictures with twice the samples of the previous one are worth sending.
             if num_samples == samples or num_samples & (num_samples - 1) == 0:
                 means = {name: (v / num_samples).astype(np.float32) for name, v in sums.items()}
                 is_final = downsampling == 1 and num_samples == samples
@@ -227,7 +291,7 @@ def refine(
 
 @contextmanager
 def override_attribute(scene: Scene, name: str, value: Any) -> Iterator[None]:
-    """Let the scene's integrator have this attribute within the block."""
+    """Set an attribute of the scene's integrator for the duration of the block."""
     previous = getattr(scene.integrator, name)
     setattr(scene.integrator, name, value)
     try:
@@ -237,14 +301,14 @@ def override_attribute(scene: Scene, name: str, value: Any) -> Iterator[None]:
 
 
 def rough_integrals(scene: Scene, is_rough: bool = True) -> AbstractContextManager[None]:
-    """Let gaze fields be integrated over `DIRECTIONS` alone within the block, where ``rough``."""
+    """Limit the integral of gaze fields to `ROUGH_DIRECTIONS` directions within the block, if ``is_rough``."""
     settings = scene.integrator.observer_settings
     fewer = replace(settings, directions=min(settings.directions, ROUGH_DIRECTIONS)) if is_rough else settings
     return override_attribute(scene, "observer_settings", fewer)
 
 
 def pad_directions(directions: np.ndarray, size: int) -> np.ndarray:
-    """``directions`` with the last one again and again, up to ``size``."""
+    """Pad ``directions`` (N, 3) to ``size`` rows with copies of the last row."""
     missing = size - len(directions)
     return np.concatenate([directions, np.repeat(directions[-1:], missing, axis=0)]) if missing > 0 else directions
 
@@ -257,45 +321,53 @@ def _trace_from(
     observer: np.ndarray | None,
     seed: int,
 ) -> dict[str, np.ndarray]:
-    """Quantities (N,) or (N, channels) of rays from ``origin``."""
+    """Compute quantities (N,) or (N, channels) of rays from ``origin`` (3,) in ``directions`` (N, 3)."""
     observer_position = origin if observer is None else observer
     traced = trace(scene, origin[None], directions, list(quantities), observers=observer_position[None], seed=seed)
     return {name: np.asarray(traced[name][0]) for name in quantities}
 
 
-# ---- Proxy ----
+# ---- Point proxy ----
 #
-# What the browser draws by itself: points on the surfaces of a place, with the gaze that they attract.
-#
-# Rays in all directions, from places that see different parts of it, end on surfaces; of points that lie in one cell of
-# a grid one is kept. They are in such an order that the first of them are spread over the place as evenly as all: a
-# browser that draws slowly is given fewer, and a step of their gaze says roughly that of all.
+# The browser draws points on the surfaces of the scene, coloured by their gaze. Rays in all directions are traced from
+# several positions; one point per cell of a grid is kept. The points are ordered so that any first part of them covers
+# the scene evenly: a slow browser gets fewer points, and the first batch of gaze values approximates all of them.
 
 RAYS_PER_POSITION = 1 << 14
-"""Rays from each place."""
+"""Rays traced from each position."""
 
 MAX_POSITIONS = 12
-"""So many places are looked from."""
+"""Maximum number of positions from which rays are traced."""
 
 MAX_POINTS = 60_000
-"""So many points are kept at most: what a browser without a graphics card still moves."""
+"""Maximum number of points, which a browser without a graphics card can still draw."""
 
 BATCH_SIZE = 1 << 14
-"""Points whose gaze is computed in one step."""
+"""Number of points whose gaze is computed in one step."""
 
 MAX_FREE_POSITIONS = 1 << 11
-"""Places in free air that are remembered at most."""
+"""Maximum number of positions in free space that are stored."""
 
 NUM_LEVELS = 4
-"""Numbers of points that a browser may be given: at each next one, cells are wider by a factor of √2."""
+"""Number of point levels: the cells of each level are √2 times wider than those of the previous one."""
 
 LIGHT_SEEDS = 4
-"""Samples of the light on shapes, which is random."""
+"""Number of samples of the light on shapes, which is random."""
 
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """``points`` (N, 3) in scene units with ``colors`` (N, 3) uint8, each in a cell of ``size``."""
+    """Coloured points.
+
+    Parameters
+    ----------
+    points : ndarray of shape (N, 3)
+        Positions in scene units.
+    colors : ndarray of shape (N, 3), uint8
+        Colours in sRGB.
+    size : float
+        Width of the grid cells, each of which contains at most one point.
+    """
 
     points: np.ndarray
     colors: np.ndarray
@@ -304,9 +376,23 @@ class Points:
 
 @dataclass(frozen=True, eq=False)
 class PointProxy:
-    """``points`` (N, 3) in scene units, their linear ``color`` (N, 3), and the ``size`` of the cells that they
-    lie in. ``levels``: how many of the first points lie in cells of a size, ``(N, size)`` and fewer. ``near`` (N,): of
-    the first `BATCH` points the one nearest to each. ``free`` (F, 3): places in free air."""
+    """Points on the surfaces of a scene.
+
+    Parameters
+    ----------
+    points : ndarray of shape (N, 3)
+        Positions in scene units.
+    color : ndarray of shape (N, 3)
+        Linear RGB.
+    size : float
+        Width of the grid cells, each of which contains at most one point.
+    levels : tuple of (int, float)
+        For each level, the number of points, counted from the first, and the width of its cells.
+    nearest : ndarray of shape (N,), int
+        Index of the nearest of the first `BATCH_SIZE` points.
+    free_positions : ndarray of shape (F, 3)
+        Positions in free space.
+    """
 
     points: np.ndarray
     color: np.ndarray
@@ -317,15 +403,29 @@ class PointProxy:
 
     @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Corners of what nearly all points lie in: a few may be far off."""
+        """Corners of a box that contains nearly all points; the outermost 0.5 % are ignored."""
         return np.percentile(self.points, 0.5, axis=0), np.percentile(self.points, 99.5, axis=0)
 
 
 def gather_points(
     scene: Scene, positions: Sequence[np.ndarray], max_positions: int = MAX_POSITIONS
 ) -> Iterator[PointProxy | None]:
-    """Points seen from ``eyes`` (3,), and from places between them and what they see; None between steps, a first
-    proxy of ``eyes`` alone, and in the end that of all."""
+    """Sample points on the surfaces of ``scene``.
+
+    Parameters
+    ----------
+    scene : Scene
+        The scene.
+    positions : sequence of ndarray of shape (3,)
+        Positions from which rays are traced first.
+    max_positions : int
+        Maximum number of positions; the others are chosen in free space.
+
+    Yields
+    ------
+    PointProxy or None
+        A first proxy of ``positions`` alone, the complete proxy at the end, and None between steps.
+    """
     directions = np.asarray(fibonacci_directions(RAYS_PER_POSITION), float)
     seeds = 1 if scene.integrator.medium is not None else LIGHT_SEEDS
     parts: list[tuple[np.ndarray, np.ndarray]] = []
@@ -352,7 +452,7 @@ def gather_points(
         depth = np.asarray(traced.depth, float)
         points = position + depth[:, None] * directions
         parts.append((points[hit], color[hit]))
-        # Half way to a surface that is not near there is room to look from.
+        # The midpoint of a ray to a distant surface is in free space.
         far_rays = np.flatnonzero(hit & (depth > np.median(depth[hit])))[::97] if hit.any() else []
         free_positions += [position + 0.5 * depth[k] * directions[k] for k in far_rays]
     yield replace(downsample_points(parts), free_positions=_subsample_positions(free_positions))
@@ -366,9 +466,28 @@ def _subsample_positions(positions: Sequence[np.ndarray]) -> np.ndarray:
 def find_free_position(
     scene: Scene, proxy: PointProxy, position: np.ndarray, free_position: np.ndarray
 ) -> np.ndarray | None:
-    """A position (3,) a little before the surface that hides ``at`` (3,) from the ``free`` one, where ``at`` lies
-    within something: where none of the places in free air is seen from it, though it is not outside of the place.
-    None where it does not."""
+    """Find a position in free space for a ``position`` inside a solid.
+
+    ``position`` counts as inside a solid if it is within the bounds of the scene and no free position is visible from
+    it.
+
+    Parameters
+    ----------
+    scene : Scene
+        The scene.
+    proxy : PointProxy
+        Its points and positions in free space.
+    position : ndarray of shape (3,)
+        The position to check.
+    free_position : ndarray of shape (3,)
+        A position in free space, from which ``position`` was reached.
+
+    Returns
+    -------
+    ndarray of shape (3,) or None
+        A position in front of the first surface between ``free_position`` and ``position``; None if ``position`` is
+        free.
+    """
     lower, upper = proxy.bounds
     if (position < lower).any() or (position > upper).any():
         return None
@@ -384,8 +503,8 @@ def find_free_position(
 
 
 def _trace_depth(scene: Scene, origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Distance (N,) to the surfaces in unit ``directions`` (N, 3), infinite where there is none."""
-    # As many rays as `gather` traces, whose kernel it is.
+    """Trace the distance (N,) to the surfaces along unit ``directions`` (N, 3); infinite where a ray hits none."""
+    # The same number of rays as in `gather_points`, so that the kernel is reused.
     traced = trace(scene, origin, pad_directions(directions, RAYS_PER_POSITION), ["color", "depth", "opacity"])
     depth = np.asarray(traced.depth, float).ravel()
     hit = (np.asarray(traced.opacity).ravel() > 0.5) & np.isfinite(depth)
@@ -393,7 +512,10 @@ def _trace_depth(scene: Scene, origin: np.ndarray, directions: np.ndarray) -> np
 
 
 def downsample_points(parts: Sequence[tuple[np.ndarray, np.ndarray]], max_points: int = MAX_POINTS) -> PointProxy:
-    """``found`` points (N, 3) with their colours (N, 3): one of those in each cell, ``most`` in all at most."""
+    """Keep one point per cell of a grid that is coarse enough for ``max_points`` points.
+
+    ``parts``: pairs of points (N, 3) and linear colours (N, 3).
+    """
     points, color = (np.concatenate([pair[k] for pair in parts]) for k in (0, 1))
     if not len(points):
         return order_points(points, color, 1.0)
@@ -408,7 +530,7 @@ def downsample_points(parts: Sequence[tuple[np.ndarray, np.ndarray]], max_points
 
 
 def order_points(points: np.ndarray, color: np.ndarray, size: float) -> PointProxy:
-    """The proxy of ``points`` (N, 3), of which there is one in each cell of ``size``, with their ``color`` (N, 3)."""
+    """Order ``points`` (N, 3), one per cell of width ``size``, by level, with their linear ``color`` (N, 3)."""
     from scipy.spatial import KDTree
 
     rank = np.zeros(len(points), int)
@@ -417,7 +539,7 @@ def order_points(points: np.ndarray, color: np.ndarray, size: float) -> PointPro
     for k, width in enumerate(widths, 1):
         selected = selected[_select_one_per_cell(points[selected], width)]
         rank[selected] = k
-    # Of one level in any order but that of the eyes, whose points would otherwise be the first.
+    # Random order within a level; otherwise the points of the first positions would come first.
     order = np.lexsort((np.random.default_rng(0).random(len(points)), -rank))
     points, color = points[order].astype(np.float32), color[order].astype(np.float32)
     counts = [int((rank >= k).sum()) for k in range(NUM_LEVELS)]
@@ -426,20 +548,35 @@ def order_points(points: np.ndarray, color: np.ndarray, size: float) -> PointPro
 
 
 def _select_one_per_cell(points: np.ndarray, size: float) -> np.ndarray:
-    """Indices, in their order, of one of ``points`` (N, 3) in each cell of a grid."""
+    """Return the sorted indices of one of ``points`` (N, 3) per cell of a grid."""
     cells = np.floor(points / size).astype(np.int64)
     return np.sort(np.unique(cells, axis=0, return_index=True)[1])
 
 
 def compute_point_gaze(scene: Scene, proxy: PointProxy, observer: np.ndarray) -> Iterator[dict[str, np.ndarray]]:
-    """``gaze`` (1/sr) and ``visibility`` (N,) of the points of ``proxy`` for the ``observer`` (3,), after each step
-    better: of points that are still to come that of the nearest one. Without a gaze field there is no gaze."""
+    """Compute the gaze on the points of ``proxy`` in steps.
+
+    Parameters
+    ----------
+    scene : Scene
+        The scene.
+    proxy : PointProxy
+        The points (N, 3).
+    observer : ndarray of shape (3,)
+        Position of the observer in scene units.
+
+    Yields
+    ------
+    dict of str to ndarray
+        ``gaze`` (N,) in 1/sr, if the scene has a gaze field, and ``visibility`` (N,). Points that are not computed yet
+        have the value of the nearest computed point.
+    """
     names = ["gaze", "visibility"] if scene.has_gaze else ["visibility"]
     points, values_by_name = proxy.points, {}
     for a in range(0, len(points), BATCH_SIZE):
         part = points[a : a + BATCH_SIZE]
         with rough_integrals(scene):
-            # Kernels are compiled for a number of points.
+            # Kernels depend on the number of points.
             observed = observe(scene, pad_directions(part, BATCH_SIZE), observers=observer[None], quantities=names)
         for name in names:
             values = np.asarray(observed[name][0, : len(part)])
@@ -451,7 +588,7 @@ def compute_point_gaze(scene: Scene, proxy: PointProxy, observer: np.ndarray) ->
 
 
 def _farthest_position(positions: Sequence[np.ndarray], visited: Sequence[np.ndarray]) -> np.ndarray | None:
-    """The one of ``free`` places that is farthest from all that were ``visited``."""
+    """Return the one of ``positions`` that is farthest from all ``visited`` positions."""
     if not positions:
         return None
     distances = np.linalg.norm(np.array(positions)[:, None] - np.array(visited)[None], axis=2).min(axis=1)

@@ -1,4 +1,4 @@
-"""The place and the people in it as the viewer's page shows them."""
+"""Scene files of what the viewer displays, and the panel of the participants."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import numpy as np
 
 from nerg_mi.api.query import trace
 from nerg_mi.errors import NergError
-from nerg_mi.rendering.nested_scene import name_files, scene_elements, verbatim
+from nerg_mi.rendering.nested_scene import make_paths_absolute, read_scene_elements, to_verbatim
 from nerg_mi.rendering.scene_writer import Comment, format_document, element, format_numbers, prop
 
 from . import layers
@@ -23,23 +23,39 @@ from .page import Page
 from .points import PinholeView, make_heading
 from .session import ALL_PARTICIPANTS, LOW_PRIORITY, MAX_RAYS, Tracks
 
-# ---- What a page shows as a scene file, which `nerg render` renders alike ----
+# ---- Scene files of a view ----
 
 CAMERA_DEFAULT, TARGET_DEFAULT, OBSERVER_DEFAULT = "view_camera", "view_target", "view_observer"
-"""`<default>`s of a copied scene."""
+"""Names of the `<default>`s of a copied scene."""
 
 CLIP_DISTANCES = {"near_clip": 1e-6, "far_clip": 1e12}
-"""Distances at which its camera begins and ends to see: a page's rays have no limits."""
+"""Clip distances of the copied camera, which are wide because rays of the viewer are not clipped."""
 
 SENSOR_ID = "view"
-"""The name of its camera."""
+"""The id of the copied camera."""
 
 
 @dataclass(frozen=True, eq=False)
 class ViewSettings:
-    """What a page shows: its ``view``, the ``observer`` (3,) or None where the camera is it, AOVs, the ``width`` of the
-    picture in pixels, samples ``spp`` a pixel, the integrator's ``falloff``, and the height and up (3,) of a
-    ``ceiling`` that is cut off, or None."""
+    """What a page displays.
+
+    Parameters
+    ----------
+    view : PinholeView
+        The camera.
+    observer : ndarray of shape (3,) or None
+        Position of the observer in scene units. None: the camera is the observer.
+    aovs : tuple of str
+        AOVs to compute.
+    width : int
+        Width of the picture in pixels.
+    spp : int
+        Samples per pixel.
+    falloff : float
+        Fall-off of the integrator, in scene units.
+    ceiling : tuple of (float, ndarray of shape (3,)) or None
+        Height of the hidden ceiling in scene units, and the up direction.
+    """
 
     view: PinholeView
     observer: np.ndarray | None
@@ -51,18 +67,32 @@ class ViewSettings:
 
 
 def copy_scene(path: Path, settings: ViewSettings) -> str:
-    """The scene file ``path`` as text, with the camera, the observer and the settings of what is ``shown``; names of
-    files are absolute, so that it may be saved anywhere.
+    """Copy a scene file with another camera, observer and settings.
 
-    Raises `NergError` for a scene whose integrator is not written in the file.
+    Parameters
+    ----------
+    path : Path
+        Scene file.
+    settings : ViewSettings
+        Camera, observer and settings of the copy.
+
+    Returns
+    -------
+    str
+        The text of the copy. It contains absolute paths, so that it can be saved anywhere.
+
+    Raises
+    ------
+    NergError
+        The file does not contain exactly one integrator.
     """
-    version, children = scene_elements(path)
+    version, children = read_scene_elements(path)
     observer_defaults = (
         []
         if settings.observer is None
         else [element("default", name=OBSERVER_DEFAULT, value=format_numbers(settings.observer))]
     )
-    # What a copy that is viewed itself has of its own is said anew.
+    # If the scene is itself such a copy, these elements are replaced.
     replaced = {("sensor", SENSOR_ID), ("default", CAMERA_DEFAULT), ("default", TARGET_DEFAULT)} | {
         ("default", OBSERVER_DEFAULT) for _ in observer_defaults
     }
@@ -70,22 +100,22 @@ def copy_scene(path: Path, settings: ViewSettings) -> str:
     copies = [deepcopy(child) for child in children if child.tag != "path" and key(child) not in replaced]
     integrators = [child for child in copies if child.tag == "integrator"]
     if len(integrators) != 1:
-        raise NergError(f'"{path}" has {len(integrators)} integrators, and a copy needs one; leave one of them')
-    name_files(copies, path, children)
+        raise NergError(f'"{path}" has {len(integrators)} integrators, but a copy needs exactly one')
+    make_paths_absolute(copies, path, children)
     _update_integrator(integrators[0], settings)
     nodes = [
         element("default", name=CAMERA_DEFAULT, value=format_numbers(settings.view.origin)),
         element("default", name=TARGET_DEFAULT, value=format_numbers(settings.view.target)),
         *observer_defaults,
         _make_sensor(settings),
-        Comment("What follows is from the scene that was viewed; its sensors are counted after ours."),
-        *map(verbatim, copies),
+        Comment("The rest is copied from the original scene. Its sensors come after the sensor above."),
+        *map(to_verbatim, copies),
     ]
-    return format_document(nodes, f"A view of {path.name}, copied from the viewer.", version)
+    return format_document(nodes, f"A view of {path.name}, saved by nerg view.", version)
 
 
 def _update_integrator(integrator: Element, settings: ViewSettings) -> None:
-    """Put observer, fall-off, ceiling and AOVs into the ``integrator``."""
+    """Set observer, fall-off, ceiling and AOVs of the ``integrator``."""
     names = {"falloff", "aovs", "ceiling", "up"} | ({"observer"} if settings.observer is not None else set())
     for child in [c for c in integrator if c.get("name") in names]:
         integrator.remove(child)
@@ -112,7 +142,7 @@ def _make_sensor(settings: ViewSettings):
         prop("string", "pixel_format", "rgb"),
         type="hdrfilm",
     )
-    # The angle between the left and the right border, which a picture's whole pixels may differ from by a trifle.
+    # From the exact aspect ratio; the height in pixels is rounded.
     fov_x = math.degrees(2 * math.atan(math.tan(view.fov / 2) * view.aspect))
     look = element("lookat", origin=f"${CAMERA_DEFAULT}", target=f"${TARGET_DEFAULT}", up=up)
     return element(
@@ -129,7 +159,7 @@ def _make_sensor(settings: ViewSettings):
 
 
 def copy_view(session: Any, view: PinholeView) -> str:
-    """A scene file of ``view`` with the observer, the layer and the settings of ``session``."""
+    """Return a scene file of ``view`` with the observer, the layer and the settings of ``session``."""
     check_can_copy(session)
     aovs = tuple(name for name in layers.required_quantities(session.display.layer) if name != "color")
     settings = session.options.width, session.spp, session.falloff, get_ceiling(session)
@@ -137,27 +167,33 @@ def copy_view(session: Any, view: PinholeView) -> str:
 
 
 def get_ceiling(session: Any) -> tuple[float, np.ndarray] | None:
-    """The height and the up of what ``session`` leaves out of views from above."""
+    """Return the height and the up direction of the hidden ceiling; None if it is visible."""
     return None if session.ceiling is None else (session.ceiling, session.ceiling_up)
 
 
 def check_can_copy(session: Any) -> None:
-    """Raise `NergError` for a place that ends with the viewer, so that no copy of it could be rendered."""
+    """Check that the scene of ``session`` can be saved.
+
+    Raises
+    ------
+    NergError
+        The scene depends on temporary files of the viewer.
+    """
     if session.source.made and session.scene_file.with_suffix(".vol").exists():
-        raise NergError('the place was made of rays for this viewer; "nerg scene" writes it as a scene of its own')
+        raise NergError(
+            'the viewer reconstructed this scene from gaze samples in a temporary folder; use "nerg scene" to write it'
+        )
 
 
-# ---- People ----
-#
-# People in the page: their paths, rays and probes, where they are at a moment, and whose eye the observer is.
+# ---- Participants ----
 
-NO_PARTICIPANT = "(nobody)"
+NO_PARTICIPANT = "(none)"
 _SLIDER_STEPS = 2000
 _MISS_LENGTH = 1.0  # length of a ray that meets no surface, in scene units
 
 
 class ParticipantsPanel:
-    """The part of a page's panel for rays, and their paths."""
+    """The folder of the panel for recordings: paths, gaze rays, probes and poses of the participants."""
 
     def __init__(self, page: Page, tracks: Tracks):
         self.page, self._tracks = page, tracks
@@ -166,10 +202,10 @@ class ParticipantsPanel:
         self._recording_handles: dict[str, Any] = {}
         gui = page.server.gui
         first, last = tracks.time_range
-        with gui.add_folder("People"):
-            self._group = gui.add_dropdown("Who", tracks.groups, initial_value=ALL_PARTICIPANTS)
+        with gui.add_folder("Participants"):
+            self._group = gui.add_dropdown("Group", tracks.groups, initial_value=ALL_PARTICIPANTS)
             self._show_paths = gui.add_checkbox("Paths", False)
-            self._rays_checkbox = gui.add_checkbox("Rays", False)
+            self._rays_checkbox = gui.add_checkbox("Gaze rays", False)
             self._probes_checkbox = gui.add_checkbox("Probes", False)
             step = max((last - first) / _SLIDER_STEPS, 1e-3)
             self._time = gui.add_slider("Time (s)", first, max(last, first + step), step, first)
@@ -199,15 +235,15 @@ class ParticipantsPanel:
         self._draw_probes()
 
     def _draw_rays(self) -> None:
-        """Lines from eyes to what they looked at, where rays are wanted."""
+        """Draw gaze rays up to the surfaces that they hit, if selected."""
         self._submit_drawing("rays", self._trace_rays if self._rays_checkbox.value else None)
 
     def _draw_probes(self) -> None:
-        """Balls where a density of the rays would be said to hold, where probes are wanted."""
+        """Draw the probes of a kernel density of the gaze samples, if selected."""
         self._submit_drawing("probes", self._place_probes if self._probes_checkbox.value else None)
 
     def _submit_drawing(self, name: str, draw: Callable[[], Any] | None) -> None:
-        """What is drawn as ``name``, by ``draw`` on the thread that renders; None: nothing."""
+        """Replace the drawing ``name`` by the result of ``draw``, called on the render thread; None removes it."""
 
         def steps() -> Iterator[None]:
             old = self._recording_handles.pop(name, None)
@@ -223,7 +259,7 @@ class ParticipantsPanel:
         origins, directions, person = self._tracks.sample(self._group.value)
         if not len(origins):
             return self.page.server.scene.add_frame("/people/rays", show_axes=False)
-        # Kernels are compiled for a number of rays.
+        # Kernels depend on the number of rays.
         padding = MAX_RAYS - len(origins)
         o, d = (np.concatenate([v, np.repeat(v[-1:], padding, axis=0)]) for v in (origins, directions))
         traced = trace(self.page.session.scene, o, d, ["depth"], observers=o[:1])
@@ -264,6 +300,6 @@ class ParticipantsPanel:
 
 
 def participant_colors(person: np.ndarray) -> np.ndarray:
-    """A colour (N, 3) uint8 for each person's number (N,)."""
+    """Return a colour (N, 3) uint8 for each participant index (N,)."""
     colors = matplotlib.colormaps["tab10"](np.asarray(person) % 10)[:, :3]
     return (255 * colors).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""What the viewer serves, and for how long."""
+"""Start and stop the viewer."""
 
 from __future__ import annotations
 
@@ -24,7 +24,15 @@ from .session import Session
 
 @dataclass(frozen=True)
 class RunningViewer:
-    """A running viewer: ``address`` to open, and its ``page``."""
+    """A running viewer.
+
+    Parameters
+    ----------
+    address : str
+        URL to open in a browser.
+    page : Page
+        Its page.
+    """
 
     address: str
     page: Page
@@ -34,10 +42,27 @@ class RunningViewer:
 def open_viewer(
     files: Sequence[str | Path], options: ViewOptions | None = None, reporter: Reporter = SILENT
 ) -> Iterator[RunningViewer]:
-    """Serve ``files`` as a page for as long as the block lasts: what `workflows.view.place_to_view` takes.
+    """Serve ``files`` as a page for the duration of the block.
 
-    Bound to this machine alone by default; at another host the address has a token. Raises `NergError` for files that
-    cannot be shown, for a port that is taken, and where the extra "viewer" is missing.
+    Parameters
+    ----------
+    files : sequence of str or Path
+        Files that `nerg_mi.workflows.view` can display.
+    options : ViewOptions, optional
+        Options of ``nerg view``. By default the server accepts connections from this machine only; with another host
+        the address contains a token.
+    reporter : Reporter
+        Receives progress and messages.
+
+    Yields
+    ------
+    RunningViewer
+        The address and the page.
+
+    Raises
+    ------
+    NergError
+        The files cannot be displayed, the port is in use, or viser is not installed.
     """
     options = options or ViewOptions()
     require_viser()
@@ -66,15 +91,17 @@ def open_viewer(
 
 
 def view_files(files: Sequence[str | Path], options: ViewOptions | None = None, reporter: Reporter = SILENT) -> None:
-    """Serve ``files`` until Ctrl-C, which is the way to end it. Raises as `viewer`."""
+    """Serve ``files`` until Ctrl-C. Arguments and errors as for `open_viewer`."""
     options = options or ViewOptions()
     if is_loopback(options.host):
         lower_priority()
     with open_viewer(files, options, reporter) as running:
         if not is_loopback(options.host):
-            reporter.warn("whoever has the address sees the place, and moves its observer; it is not encrypted")
+            reporter.warn(
+                "anyone who has the address can see the scene and move the observer; the connection is not encrypted"
+            )
         reporter.message(f"open {running.address}")
-        reporter.message("Ctrl-C ends the viewer")
+        reporter.message("press Ctrl-C to stop the viewer")
         if options.open:
             import webbrowser
 
@@ -82,17 +109,19 @@ def view_files(files: Sequence[str | Path], options: ViewOptions | None = None, 
         try:
             _wait()
         except KeyboardInterrupt:
-            reporter.message("the viewer has ended")
+            reporter.message("the viewer has stopped")
 
 
 def lower_priority() -> None:
-    """Let the browser, which draws on this machine as well, go before this thread and those that it begins, where the
-    system knows of such a thing: without a graphics card a page would stand still while pictures are refined."""
+    """Lower the priority of this thread and its children, where the operating system supports it.
+
+    The browser also draws on this machine; without a graphics card, it would freeze while pictures are refined.
+    """
     if hasattr(os, "nice"):
         os.nice(10)
 
 
 def _wait() -> None:
-    """Until Ctrl-C."""
+    """Block until Ctrl-C."""
     while True:
         threading.Event().wait(3600)

@@ -1,4 +1,4 @@
-"""The server of the viewer: its sockets, and the guard that refuses other origins."""
+"""The web server of the viewer and its access control."""
 
 from __future__ import annotations
 
@@ -19,23 +19,21 @@ from urllib.parse import parse_qs, urlsplit
 
 from nerg_mi.errors import NergError, format_error
 
-# ---- Guard ----
+# ---- Access control ----
 #
-# Who may talk to the viewer: checks of every HTTP request and of every websocket before it opens.
-#
-# A page of another site, open in the same browser, can send requests to this machine (cross-site websockets), and by a
-# name that it resolves anew even as if they were to itself (DNS rebinding). What it cannot choose are the headers
-# `Host` and `Origin`: the former must be a name of this server, the latter, where there is one, this very server.
-# Whoever can reach an address other than the loopback's needs a token as well.
+# Every HTTP request is checked, and every websocket before it opens. A page of another site in the same browser can
+# send requests to this machine (cross-site websocket hijacking), even under its own name (DNS rebinding). It cannot
+# choose the headers `Host` and `Origin`: `Host` must be a name of this server, and `Origin`, if present, must be this
+# server. On addresses other than loopback, a token is required as well.
 
 LOOPBACK_NAMES = ("localhost", "127.0.0.1", "::1")
-"""Names by which a browser on this machine reaches it."""
+"""Names by which a browser on this machine can address it."""
 
 MAX_MESSAGE_BYTES = 16 << 20
-"""A message of a browser may have so many bytes: a screenshot of a large window."""
+"""Maximum size of a message from a browser; a screenshot of a large window fits."""
 
 MAX_CLIENTS = 32
-"""So many pages may be open at once."""
+"""Maximum number of open pages."""
 
 _POLICY = (
     "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; connect-src 'self' data: blob: {sockets}; "
@@ -44,7 +42,7 @@ _POLICY = (
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only this machine reaches what is bound to ``host``."""
+    """Whether a server bound to ``host`` is reachable only from this machine."""
     try:
         return host == "localhost" or ipaddress.ip_address(host.strip("[]")).is_loopback
     except ValueError:
@@ -52,13 +50,13 @@ def is_loopback(host: str) -> bool:
 
 
 def make_token() -> str:
-    """192 random bits as text that may stand in an address."""
+    """Return 192 random bits as URL-safe text."""
     return secrets.token_urlsafe(24)
 
 
 @dataclass(frozen=True)
 class Refusal:
-    """``status`` of HTTP, and why, for people."""
+    """The refusal of a request: HTTP ``status`` and ``reason``."""
 
     status: int
     reason: str
@@ -66,32 +64,59 @@ class Refusal:
 
 @dataclass(frozen=True)
 class RequestGuard:
-    """``host`` that the server is bound to; ``token`` that requests must bring, or None; ``names``: more names by which
-    it is reached."""
+    """Decides which requests the server accepts.
+
+    Parameters
+    ----------
+    host : str
+        Address that the server is bound to.
+    token : str or None
+        Token that requests must contain.
+    host_names : tuple of str
+        Additional names by which the server is addressed.
+    """
 
     host: str
     token: str | None = field(default=None, repr=False)
     host_names: tuple[str, ...] = ()
 
     def check(self, headers: Mapping[str, str], path: str, port: int, num_clients: int = 0) -> Refusal | None:
-        """Why a request is refused, or None. ``headers``: one value each, of names in any case; ``path`` with its
-        query;
-        ``port`` of the server; ``clients`` that have a websocket already."""
+        """Check a request.
+
+        Parameters
+        ----------
+        headers : mapping of str to str
+            Headers, with names in any case.
+        path : str
+            Path with query.
+        port : int
+            Port of the server.
+        num_clients : int
+            Number of open websockets.
+
+        Returns
+        -------
+        Refusal or None
+            Why the request is refused; None if it is accepted.
+        """
         values = {name.lower(): value for name, value in headers.items()}
         host_header, origin = values.get("host", ""), values.get("origin")
         if not self._is_own_host(host_header):
-            return Refusal(403, "The header Host is no name of this server.")
+            return Refusal(403, "The Host header does not name this server.")
         if origin is not None and not self._is_same_origin(origin, host_header):
-            return Refusal(403, "The header Origin is that of another site.")
+            return Refusal(403, "The Origin header names another site.")
         if self.token is not None and not self._has_token(values.get("cookie", ""), path, port):
-            return Refusal(403, "The token is missing or wrong: open the address that nerg view printed.")
+            return Refusal(403, "The token is missing or wrong. Open the address that nerg view printed.")
         if values.get("upgrade", "").lower() == "websocket" and num_clients >= MAX_CLIENTS:
-            return Refusal(503, f"There are {MAX_CLIENTS} pages open already: close one.")
+            return Refusal(503, f"The maximum of {MAX_CLIENTS} open pages is reached. Close one of them.")
         return None
 
     def response_headers(self, path: str, host_header: str, port: int) -> dict[str, str]:
-        """What is added to an answer: the browser itself keeps the page from reaching any other machine, and brings the
-        token of ``path`` again from now on. ``asked``: the header Host."""
+        """Return headers to add to a response to ``path``.
+
+        They stop the page from contacting other machines, and set the token as a cookie. ``host_header`` is the Host
+        header of the request.
+        """
         headers = {
             "Content-Security-Policy": _POLICY.format(sockets=f"ws://{host_header} wss://{host_header}"),
             "Referrer-Policy": "no-referrer",
@@ -104,7 +129,7 @@ class RequestGuard:
         return headers
 
     def _is_own_host(self, host_header: str) -> bool:
-        """Whether the header Host is one of ours; the port may be another one, of a tunnel."""
+        """Whether a Host header names this server; the port can differ, for example behind a tunnel."""
         try:
             name = urlsplit(f"//{host_header}").hostname
         except ValueError:
@@ -114,12 +139,12 @@ class RequestGuard:
         own_names = {*LOOPBACK_NAMES, self.host.strip("[]").lower(), *(n.lower() for n in self.host_names)}
         if name.lower() in own_names:
             return True
-        # Bound to all addresses, it is reached by any of them; a name could lead anywhere, an address cannot.
+        # A server bound to all addresses accepts any address, but no unknown name, because of DNS rebinding.
         return not is_loopback(self.host) and _is_address(name)
 
     @staticmethod
     def _is_same_origin(origin: str, host_header: str) -> bool:
-        """Whether an Origin is the server of the header Host."""
+        """Whether an Origin header names the server of the Host header."""
         try:
             parts = urlsplit(origin)
             return parts.scheme in ("http", "https") and parts.netloc.lower() == host_header.lower()
@@ -147,7 +172,7 @@ class RequestGuard:
 
 
 def _cookie_name(port: int) -> str:
-    # Cookies are shared between the ports of a machine.
+    # Cookies are shared between all ports of a machine.
     return f"nerg_view_{port}"
 
 
@@ -161,16 +186,14 @@ def _is_address(name: str) -> bool:
 
 # ---- Server ----
 #
-# viser's server behind a `Guard`: bound where it is told, with capped messages, and no link to share.
-#
-# viser takes no checks of its own, so that the websockets' `serve` that it calls is wrapped while it starts; where that
-# call is not made as expected, nothing is served at all.
+# viser has no hook for access control, so the function `serve` of websockets is wrapped while viser starts. If viser
+# does not call it, the server is not started at all.
 
 _START_LOCK = threading.Lock()
 
 
 def require_viser() -> Any:
-    """The module `viser`. Raises `NergError` where the extra is not installed."""
+    """Import viser. Raises `NergError` if it is not installed."""
     try:
         import viser
     except ImportError as error:
@@ -179,37 +202,56 @@ def require_viser() -> Any:
 
 
 def start_server(guard: RequestGuard, port: int, label: str) -> Any:
-    """A running `viser.ViserServer` on ``guard``'s host and ``port`` (0: any that is free).
+    """Start a `viser.ViserServer` with access control.
 
-    Raises `NergError` for a port that is taken, and for a viser that cannot be guarded.
+    Parameters
+    ----------
+    guard : RequestGuard
+        Decides which requests are accepted; its host is the address to bind.
+    port : int
+        Port; 0 chooses a free one.
+    label : str
+        Title of the page.
+
+    Returns
+    -------
+    viser.ViserServer
+        The running server.
+
+    Raises
+    ------
+    NergError
+        The port is in use, or this version of viser does not support access control.
     """
     viser = require_viser()
     _check_port(guard.host, port)
 
     class Server(viser.ViserServer):
         def request_share_url(self, verbose: bool = True) -> None:
-            """Nothing leaves this machine, whatever a page asks for."""
+            """Disabled: the page must not be published on another server."""
 
     with _guard_websockets(guard) as calls, contextlib.redirect_stdout(io.StringIO()):
         server = Server(host=guard.host, port=port, label=label, verbose=False)
     if not calls:
         stop_server(server)
-        raise NergError('this viser cannot be guarded: pip install "nerg-mi[viewer]" again for one that can')
-    # Both lead to a page on other people's machines.
+        raise NergError(
+            "this version of viser does not support the viewer's access control; "
+            'reinstall it with: pip install "nerg-mi[viewer]"'
+        )
+    # Both link to external sites.
     server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
     return server
 
 
 def stop_server(server: Any) -> None:
-    """End a server that `start_server` gave, without a word of viser's."""
+    """Stop a server of `start_server` without viser's output."""
     with contextlib.redirect_stdout(io.StringIO()):
         server.stop()
 
 
 @contextlib.contextmanager
 def _guard_websockets(guard: RequestGuard) -> Iterator[list[bool]]:
-    """A block in which `websockets.asyncio.server.serve` checks what it serves; the list is filled when that is
-    called."""
+    """Wrap `websockets.asyncio.server.serve` within the block; the list is filled when it is called."""
     from websockets.asyncio import server as websockets_server
 
     calls: list[bool] = []
@@ -231,7 +273,7 @@ def _guard_websockets(guard: RequestGuard) -> Iterator[list[bool]]:
 
 
 class _CountingHandler:
-    """A handler of websockets that knows how many are open."""
+    """A websocket handler that counts the open connections."""
 
     def __init__(self, handler: Callable[[Any], Any]):
         self._handler, self.num_open = handler, 0
@@ -247,11 +289,11 @@ class _CountingHandler:
 def _process_request(
     guard: RequestGuard, counting: _CountingHandler, next_handler: Any, connection: Any, request: Any
 ) -> Any:
-    """The response to a request before any websocket opens: a refusal, viser's own, or None to open one."""
+    """Return the response to a request before a websocket opens: a refusal, viser's own, or None to open it."""
     port = int(connection.local_address[1])
     headers: dict[str, str] = {}
     for name, value in request.headers.raw_items():
-        # Two of a kind agree with nobody.
+        # Repeated headers are joined, so that they match nothing.
         headers[name.lower()] = f"{headers[name.lower()]}, {value}" if name.lower() in headers else value
     refusal = guard.check(headers, request.path, port, counting.num_open)
     if refusal is not None:
@@ -264,7 +306,7 @@ def _process_request(
 
 
 def _check_port(host: str, port: int) -> None:
-    """Raise `NergError` where ``port`` cannot be bound: viser would take another one."""
+    """Raise `NergError` if ``port`` cannot be bound; viser would silently use another one."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.socket(family, socket.SOCK_STREAM) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -272,5 +314,5 @@ def _check_port(host: str, port: int) -> None:
             probe.bind((host, port))
         except (OSError, OverflowError) as error:
             raise NergError(
-                f"port {port} of {host} cannot be used ({format_error(error).rstrip('.')}); choose another with --port"
+                f"port {port} of {host} cannot be used ({format_error(error).rstrip('.')}); choose another one with --port"
             ) from error

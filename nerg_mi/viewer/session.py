@@ -1,4 +1,4 @@
-"""A session of the viewer: its state, the worker that renders, tracks of people, and sharing."""
+"""The state of the viewer: the scene, its observer, the recordings, and the thread that renders."""
 
 from __future__ import annotations
 
@@ -47,44 +47,60 @@ from .points import (
     rough_integrals,
 )
 
-# ---- What a session tells of what it finds ----
+# ---- Listener ----
 
 
 class Listener(Protocol):
-    """Whoever shows what a session finds."""
+    """Receives the events of a `Session`, on its render thread."""
 
     def on_proxy(self) -> None:
-        """There are points, or more of them."""
+        """Called when new points are available."""
         ...
 
     def on_baked(self) -> None:
-        """The points have the gaze of the observer."""
+        """Called when new gaze values of the points are available."""
         ...
 
     def on_shares(self) -> None:
-        """The shares of attention are those of the observer."""
+        """Called when new attention shares are available."""
         ...
 
     def on_range(self) -> None:
-        """The automatic range of the layer that is shown is another one."""
+        """Called when the automatic range of the displayed layer has changed."""
         ...
 
     def on_error(self, error: BaseException) -> None:
-        """A task has failed."""
+        """Called when a task has failed."""
         ...
 
 
-# ---- Shares of attention of named areas and shapes, in steps between which other work is done ----
+# ---- Attention shares ----
 
 MAX_FACES_PER_STEP = 1 << 17
-"""Faces of shapes whose shares are counted in one step, but for a shape that has more."""
+"""Maximum number of faces whose attention share is computed in one step; a single shape can have more."""
 
 
 def iter_attention_shares(
     scene: Scene, observer: np.ndarray, regions: Sequence[Region], shapes: Sequence[str]
 ) -> Iterator[dict[str, float]]:
-    """The share of the observer at ``at`` (3,) of each of ``regions``, together, then of the meshes whose ids are
-    ``shapes``, so many at a time as a step can count."""
+    """Compute the attention shares of areas and shapes in steps.
+
+    Parameters
+    ----------
+    scene : Scene
+        The scene, with a gaze field.
+    observer : ndarray of shape (3,)
+        Position of the observer in scene units.
+    regions : sequence of Region
+        Areas of interest, computed in the first step.
+    shapes : sequence of str
+        Ids of meshes, computed in groups (`group_shapes`).
+
+    Yields
+    ------
+    dict of str to float
+        Shares of the observer's gaze, from 0 to 1, by name.
+    """
     if regions:
         boxes = compute_box_shares(scene, regions, np.asarray(observer, np.float32)[None], rule=COARSE).share[0]
         yield dict(zip([region.name for region in regions], boxes.tolist()))
@@ -95,7 +111,7 @@ def iter_attention_shares(
 
 
 def group_shapes(scene: Scene, shapes: Sequence[str]) -> Iterator[list[str]]:
-    """The ids ``shapes`` in groups of `FACES` faces at most, but for a shape that has more by itself."""
+    """Group the mesh ids ``shapes`` so that each group has at most `MAX_FACES_PER_STEP` faces or is a single mesh."""
     faces = {shape.id(): shape.face_count() for shape in scene.mitsuba.shapes() if shape.is_mesh()}
     group: list[str] = []
     for name in shapes:
@@ -107,28 +123,36 @@ def group_shapes(scene: Scene, shapes: Sequence[str]) -> Iterator[list[str]]:
         yield group
 
 
-# ---- Tracks ----
-#
-# People of the rays: their paths, and where they are at a moment.
+# ---- Recordings: paths and poses of participants ----
 
 MAX_VERTICES = 20_000
-"""Points of all paths together, at most: what a browser draws without effort."""
+"""Maximum number of vertices of all paths together."""
 
 MAX_GAP = 1.0
-"""Seconds without a ray that end a path, and that a person is still shown after the last one."""
+"""Seconds without a gaze sample that interrupt a path; a participant stays visible this long after a sample."""
 
 MAX_RAYS = 1 << 11
-"""Rays that are drawn at most."""
+"""Maximum number of gaze rays to draw."""
 
 MAX_PROBES = 512
-"""Probes that are drawn at most."""
+"""Maximum number of probes to draw."""
 
-ALL_PARTICIPANTS = "everybody"
+ALL_PARTICIPANTS = "all participants"
 
 
 @dataclass(frozen=True, eq=False)
 class ParticipantPose:
-    """``person``, their eye ``at`` (3,) and ``ahead`` (3,), a unit vector, both in the place."""
+    """The pose of a participant at a moment.
+
+    Parameters
+    ----------
+    participant : str
+        Name of the participant.
+    position : ndarray of shape (3,)
+        Position of the eye in scene units.
+    direction : ndarray of shape (3,)
+        Viewing direction, a unit vector in the frame of the scene.
+    """
 
     participant: str
     position: np.ndarray
@@ -136,7 +160,15 @@ class ParticipantPose:
 
 
 class Tracks:
-    """Rays in the place: ``align`` leads there from their own frame."""
+    """Recordings in the frame of the scene.
+
+    Parameters
+    ----------
+    rays : Rays
+        The recordings.
+    align : Similarity
+        Transform from the frame of the recordings to the frame of the scene.
+    """
 
     def __init__(self, rays: Rays, align: Similarity):
         order = np.lexsort((rays.t, rays.person))
@@ -148,21 +180,21 @@ class Tracks:
 
     @property
     def time_range(self) -> tuple[float, float]:
-        """When the first ray and the last one are, in seconds."""
+        """Times of the first and the last gaze sample, in seconds."""
         return (float(self._rays.t.min()), float(self._rays.t.max())) if len(self._rays) else (0.0, 0.0)
 
     @property
     def groups(self) -> list[str]:
-        """Everybody, and the cohorts."""
+        """The names of the groups: all participants, and each cohort."""
         return [ALL_PARTICIPANTS, *self._rays.cohorts]
 
     @property
     def participants(self) -> list[str]:
-        """Names of those who have rays."""
+        """Names of the participants who have gaze samples."""
         return [self._rays.persons[k] for k in np.unique(self._rays.person)]
 
     def segments(self, group: str = ALL_PARTICIPANTS) -> tuple[np.ndarray, np.ndarray]:
-        """Line segments (S, 2, 3) of the paths of a cohort, and the person's number (S,) of each."""
+        """Return line segments (S, 2, 3) of the paths of a group, and the index (S,) of the participant of each."""
         rows = np.flatnonzero(self._group_mask(group))
         rows = rows[:: max(len(rows) // MAX_VERTICES, 1)]
         person, t = self._rays.person[rows], self._rays.t[rows]
@@ -174,7 +206,7 @@ class Tracks:
         return pairs.astype(np.float32), person[:-1][is_joined]
 
     def poses_at(self, time: float, group: str = ALL_PARTICIPANTS) -> list[ParticipantPose]:
-        """Where those of a cohort are whose nearest ray is within `GAP` of ``time``."""
+        """Return the poses of the participants of a group who have a gaze sample within `MAX_GAP` of ``time``."""
         near = np.flatnonzero(self._group_mask(group) & (np.abs(self._rays.t - time) <= MAX_GAP))
         poses = []
         for person in np.unique(self._rays.person[near]):
@@ -186,15 +218,37 @@ class Tracks:
     def sample(
         self, group: str = ALL_PARTICIPANTS, max_rays: int = MAX_RAYS
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Eyes (K, 3) and unit directions (K, 3) of ``most`` rays of a cohort at most, evenly through each person's
-        time, and the person's number (K,)."""
+        """Sample gaze rays of a group, evenly in time.
+
+        Parameters
+        ----------
+        group : str
+            A name of `groups`.
+        max_rays : int
+            Maximum number of rays.
+
+        Returns
+        -------
+        tuple of ndarray
+            Origins (K, 3) in scene units, unit directions (K, 3), and the index (K,) of the participant of each ray.
+        """
         rows = np.flatnonzero(self._group_mask(group))
         rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), max_rays)).astype(int)] if len(rows) else rows
         return self.origins[rows], self.directions[rows], self._rays.person[rows]
 
     def place_probes(self, group: str = ALL_PARTICIPANTS) -> tuple[np.ndarray, np.ndarray]:
-        """Positions (P, 3) in the place of the probes that a density of a cohort's rays would have by default, and how
-        many rays each holds (P,). Raises `NergError` where nobody stayed long enough for one."""
+        """Place the probes that a kernel density of a group's gaze would have by default.
+
+        Returns
+        -------
+        tuple of ndarray
+            Positions (P, 3) in scene units, and the number of gaze samples of each probe (P,).
+
+        Raises
+        ------
+        NergError
+            No position has enough gaze samples.
+        """
         rows = np.flatnonzero(self._group_mask(group))
         probes = place_probes(self._rays.select(rows), count=MAX_PROBES)
         linear, shift = self._matrix[:3, :3], self._matrix[:3, 3]
@@ -206,18 +260,18 @@ class Tracks:
         return self._rays.cohort == self._rays.cohorts.index(group)
 
 
-# ---- One thread that does all rendering, in small steps, the most urgent first ----
+# ---- Render thread ----
 #
-# Dr.Jit is used from one thread at a time. A task is a generator: each of its steps is short, between two of them
-# another task may be more urgent, and whoever submits one under a name that is taken replaces the other, whose further
-# steps are then never made. That is how a picture is cancelled when the view moves.
+# Dr.Jit is used from one thread at a time. A task is a generator with short steps. Between two steps, a task of higher
+# priority can run. A new task replaces a task of the same name, which then does not continue: this cancels a picture
+# when the view moves.
 
 Result = TypeVar("Result")
 Task = Generator[Any, None, None] | Iterator[Any]
 
 
 class Worker:
-    """A thread that runs tasks; ``on_error(error)`` is told of exceptions that tasks raise, which end them alone."""
+    """A thread that runs tasks. An exception ends its task only and is passed to ``on_error(error)``."""
 
     def __init__(self, on_error: Callable[[BaseException], None]):
         self._on_error = on_error
@@ -229,21 +283,23 @@ class Worker:
         self._thread.start()
 
     def submit(self, name: Hashable, priority: int, task: Task) -> None:
-        """Run ``task`` from now on, in place of one of the same ``name``; smaller ``urgency`` first, tasks of one
-        urgency in turns."""
+        """Run ``task``, replacing a task of the same ``name``.
+
+        Tasks with a smaller ``priority`` value run first; tasks of equal priority take turns.
+        """
         with self._changed:
             if not self._is_stopped:
                 self._tasks[name] = priority, next(self._counter), task
                 self._changed.notify_all()
 
     def cancel(self, name: Hashable) -> None:
-        """Make no further step of the task ``name``, if there is one."""
+        """Cancel the task ``name`` if it exists."""
         with self._changed:
             self._tasks.pop(name, None)
             self._changed.notify_all()
 
     def call(self, function: Callable[[], Result]) -> Future[Result]:
-        """Call ``function`` on the thread, before any task; its result or its exception is the future's."""
+        """Call ``function`` on the thread before the next step of any task, and return a future of its result."""
         future: Future[Result] = Future()
 
         def steps() -> Iterator[None]:
@@ -258,23 +314,23 @@ class Worker:
 
     @property
     def task_names(self) -> list[Hashable]:
-        """The tasks that are not done yet."""
+        """Names of the unfinished tasks."""
         with self._changed:
             return list(self._tasks)
 
     @property
     def is_idle(self) -> bool:
-        """Whether nothing is left to do."""
+        """Whether there are no unfinished tasks."""
         with self._changed:
             return not self._tasks
 
     def wait_idle(self, timeout: float) -> bool:
-        """Wait until nothing is left to do, ``timeout`` seconds at most; whether it is so."""
+        """Wait at most ``timeout`` seconds until all tasks are finished; return whether they are."""
         with self._changed:
             return self._changed.wait_for(lambda: not self._tasks, timeout)
 
     def stop(self, timeout: float = 30.0) -> None:
-        """End the thread after the step that it is in."""
+        """Stop the thread after its current step."""
         with self._changed:
             self._is_stopped = True
             self._tasks.clear()
@@ -291,7 +347,7 @@ class Worker:
                 entry = self._tasks[name]
             is_done = self._step(entry[2])
             with self._changed:
-                # It may have been replaced in the meantime.
+                # Another task may have replaced it during the step.
                 if self._tasks.get(name) is entry:
                     if is_done:
                         del self._tasks[name]
@@ -300,7 +356,7 @@ class Worker:
                 self._changed.notify_all()
 
     def _step(self, task: Task) -> bool:
-        """Make a step of ``task``: whether it was the last."""
+        """Run one step of ``task`` and return whether the task is finished."""
         try:
             next(task)
         except StopIteration:
@@ -313,34 +369,42 @@ class Worker:
 
 # ---- Session ----
 #
-# What is viewed, whoever looks: the scene, its observer, the layer that is shown, and the tasks that compute them.
-#
-# All of Mitsuba and Dr.Jit is used on the thread of the `Worker`. What is found is told to a `Listener`, on that
-# thread.
+# The state that all browsers share: the scene, the observer, the displayed layer, and the tasks that compute them.
+# Mitsuba and Dr.Jit are used only on the thread of the `Worker`, which also calls the `Listener`.
 
 NORMAL_PRIORITY = 1
-"""Of tasks that take turns: the first picture is coarse, and nobody waits long for numbers."""
+"""Priority of tasks that take turns, such as pictures and attention shares."""
 
 LOW_PRIORITY = 2
-"""Of small pictures, which nobody waits for."""
+"""Priority of small pictures and of drawings of the recordings."""
 
 _TASK_NAMES = {
     "proxy": "points on surfaces",
     "picture": "picture",
     "gaze": "gaze on the points",
-    "shares": "shares of attention",
-    "inset": "the observer's views",
-    "people": "recorded rays",
+    "shares": "attention shares",
+    "inset": "observer views",
+    "people": "recordings",
     "film": "video",
 }
-"""Tasks of the worker, in words."""
+"""Descriptions of the worker's tasks for the status text."""
 
 _MAX_SPP = 256
 _MAX_SHAPES = 60
 
 
 class Session:
-    """A place that is viewed. ``start`` loads it; until then there is nothing to see."""
+    """A scene with its observer and display settings.
+
+    Parameters
+    ----------
+    load_source : callable
+        Returns the scene to view (`nerg_mi.workflows.view`); called on the render thread.
+    options : ViewOptions
+        Options of `nerg view`.
+    listener : Listener
+        Receives events.
+    """
 
     def __init__(self, load_source: Callable[[], ViewerScene], options: ViewOptions, listener: Listener):
         self.options, self.listener = options, listener
@@ -350,7 +414,7 @@ class Session:
         self.proxy: PointProxy | None = None
         self.point_values: dict[str, np.ndarray] = {}
         self.finished_observer: np.ndarray | None = None
-        # Whose values `baked` and `shares` are: an observer's, with areas or without, of a `version`.
+        # The inputs of `point_values` and `shares`: observer, areas and `settings_version`.
         self._point_inputs: tuple[np.ndarray, int] | None = None
         self._share_inputs: tuple[np.ndarray, tuple[Region, ...], int] | None = None
         self.shares: dict[str, float] = {}
@@ -362,16 +426,22 @@ class Session:
         self._ranges: dict[str, tuple[float, float]] = {}
         self._busy: set[str] = set()
         self._finished_share_inputs: tuple[np.ndarray, tuple[Region, ...], int] | None = None
-        # Of the gaze field and its settings: what was begun with others is not kept.
+        # Counts the changes of the gaze field and its settings; results of earlier versions are dropped.
         self.settings_version = 0
 
     def start(self) -> None:
-        """Load the place, and begin to gather its points. Raises `NergError` for what cannot be shown."""
+        """Load the scene and start to sample its points.
+
+        Raises
+        ------
+        NergError
+            The scene cannot be displayed.
+        """
         self.worker.call(self._load).result()
         self.worker.submit("proxy", NORMAL_PRIORITY, self._gather())
 
     def stop(self) -> None:
-        """End the render thread."""
+        """Stop the render thread."""
         self.worker.stop()
 
     def _load(self) -> None:
@@ -382,7 +452,7 @@ class Session:
         self.display = DisplaySettings(self._default_layer())
         sensors = self.scene.mitsuba.sensors()
         if not sensors:
-            raise NergError(f'"{self.source.scene}" has no sensor to begin with; give it one')
+            raise NergError(f'"{self.source.scene}" has no sensor for the initial view; add a <sensor> to the scene')
         self.home_view = PinholeView.from_sensor(sensors[0])
         self.spp = min(self.options.spp or int(sensors[0].sampler().sample_count()), _MAX_SPP)
         observer = check_point(self.options.observer, "--observer")
@@ -396,13 +466,13 @@ class Session:
         self.ceiling_up, self.ceiling = (self.source.up, None) if ceiling is None else (ceiling.up, ceiling.height)
         self.tracks = None if self.source.rays is None else Tracks(self.source.rays, self.source.align)
         areas = read_areas(self.options.aois) if self.options.aois is not None else AreaSet(())
-        # What is no box is not shown, and is saved again with what is.
+        # Areas that are not boxes are not displayed, but are saved with the boxes.
         self.regions, self.other_areas = areas.boxes, list(areas.non_boxes)
         shapes = [shape.id() for shape in self.scene.mitsuba.shapes() if shape.is_mesh()]
         self.shapes = [name for name in shapes if name and not name.startswith("__")][:_MAX_SHAPES]
 
     def _load_scene(self, scene_file: Path) -> None:
-        """Show the scene of that file from now on."""
+        """Load a scene file and use it from now on."""
         self.scene_file, self.scene = scene_file, Scene(load_scene(scene_file))
         self.layers = layers.list_layers(self.scene)
         self.basis = describe_basis(self.scene.mitsuba)
@@ -411,34 +481,51 @@ class Session:
         return next((la for la in self.layers if la.quantity in ("gaze", "kde")), self.layers[0])
 
     def _default_observer(self) -> np.ndarray:
-        """Where the observer stands of a scene whose camera it is: half way to what that looks at, so as to be seen."""
+        """Return an observer position for a scene without one: half way to the surface at the centre of the camera's
+        view."""
         traced = trace(
             self.scene, self.home_view.origin, pad_directions(self.home_view.forward[None], BAND_SIZES[0]), ["depth"]
         )
         depth = float(traced.depth[0])
         return self.home_view.origin + (0.5 * depth if np.isfinite(depth) else 0.0) * self.home_view.forward
 
-    # What changes
+    # Changes of the state
 
     def place_observer(self, position: np.ndarray, heading: np.ndarray | None = None) -> None:
-        """The observer stands at ``at`` (3,), turned by ``heading`` (3, 3): columns ahead, left and up.
+        """Move the observer.
 
-        Raises `NergError` for what is no position.
+        Parameters
+        ----------
+        position : ndarray of shape (3,)
+            Position in scene units.
+        heading : ndarray of shape (3, 3) or None
+            Rotation with the columns forward, left and up. None: unchanged.
+
+        Raises
+        ------
+        NergError
+            The position is not finite or too far away, or the rotation is not finite.
         """
         array = np.asarray(position, float)
         is_valid = array.shape == (3,) and (np.abs(array) <= MAX_COORDINATE).all()
         if not is_valid or not (heading is None or np.isfinite(heading).all()):
             text = ", ".join(f"{v:g}" for v in array.ravel()[:3])
-            raise NergError(f"an observer cannot stand at ({text}); give three numbers in scene units")
+            raise NergError(f"invalid observer position ({text}); enter three finite numbers in scene units")
         with self.lock:
             self.observer = np.array(position, float)
             if heading is not None:
                 self.heading = np.array(heading, float)
 
     def set_falloff(self, value: float) -> None:
-        """How far behind a surface is still seen a little, in scene units. Raises `NergError` for what is no length."""
+        """Set the distance behind a surface over which gaze fades out, in scene units.
+
+        Raises
+        ------
+        NergError
+            ``value`` is negative or not finite.
+        """
         if not 0 <= value < np.inf:
-            raise NergError(f"the fall-off is a length from 0 on, in scene units, got {value:g}")
+            raise NergError(f"the fall-off must be 0 or a positive length in scene units, got {value:g}")
 
         def change() -> None:
             self.falloff = float(value)
@@ -456,8 +543,15 @@ class Session:
             params.update()
 
     def select_gaze(self, name: str) -> None:
-        """Show the gaze field ``name`` of the place's variants; where it lacks the layer that is shown, its gaze.
-        Raises `NergError` for a file that is no longer there."""
+        """Use the gaze field ``name`` of the loaded gaze fields.
+
+        If the new field lacks the displayed layer, the gaze is displayed.
+
+        Raises
+        ------
+        NergError
+            The file no longer exists.
+        """
 
         def change() -> None:
             self._load_scene(self.source.variants[name])
@@ -472,41 +566,40 @@ class Session:
         self.worker.call(change).result()
 
     def _invalidate(self) -> None:
-        """Have the gaze on the points, and the shares, computed anew."""
+        """Invalidate the gaze on the points and the attention shares."""
         with self.lock:
             self.settings_version += 1
             self.finished_observer = self._finished_share_inputs = None
 
     def set_display(self, **changes: Any) -> None:
-        """Another layer, other colours, or another range."""
+        """Change the layer, the colours or the limits (fields of `DisplaySettings`)."""
         with self.lock:
             self.display = replace(self.display, **changes)
 
-    # What is computed, and what is out of date
+    # Results
 
     @property
     def stale_points_reason(self) -> str:
-        """Why the points do not show the layer as it is for the observer as they stand now; "" where they do."""
-        # Without the lock, which the thread that is told of a new range may hold: what was read a moment too early is
-        # read again.
+        """Why the points do not display the current layer, observer and settings; "" if they do."""
+        # No lock here: the thread that handles a new range may hold it, and the state is polled again soon.
         layer, inputs = self.display.layer, self._point_inputs
         if not layer.quantity:
             return ""
         if layer.quantity not in self.point_values:
             return f"the points do not show {layer.title}"
         if inputs is None or not np.array_equal(inputs[0], self.observer):
-            return f"{layer.title} of an earlier observer"
-        return "" if inputs[1] == self.settings_version else f"{layer.title} of earlier settings"
+            return f"{layer.title} of a previous observer position"
+        return "" if inputs[1] == self.settings_version else f"{layer.title} of previous settings"
 
     @property
     def are_shares_stale(self) -> bool:
-        """Whether the shares of attention are not those of the observer, the areas and the settings of now."""
+        """Whether the attention shares belong to another observer, other areas or other settings."""
         inputs = self._share_inputs
         return inputs is None or not _same_inputs(inputs, self._current_share_inputs())
 
     @property
     def has_scale(self) -> bool:
-        """Whether the scale of the layer is known: until then it goes from 0 to 1."""
+        """Whether the colour scale of the layer is known; until then it is 0 to 1."""
         display = self.display
         overlay = display.layer.overlay
         needs_no_scale = overlay is None or not overlay.needs_limits
@@ -514,7 +607,7 @@ class Session:
 
     @property
     def running_tasks(self) -> list[str]:
-        """What is being computed, in words."""
+        """Descriptions of the running tasks."""
         names = {name[0] if isinstance(name, tuple) else name for name in self.worker.task_names}
         descriptions = _TASK_NAMES | {"gaze": f"{'gaze' if self.scene.has_gaze else 'visibility'} on the points"}
         return [text for name, text in descriptions.items() if name in names]
@@ -522,16 +615,17 @@ class Session:
     def keep_in_free_space(
         self, name: Hashable, position: np.ndarray, free_position: np.ndarray, deliver: Callable[[np.ndarray], None]
     ) -> None:
-        """Call ``deliver`` with ``at`` (3,), or, where that lies within something, with a position before the surface
-        that hides it from the ``free`` one (3,)."""
+        """Check ``position`` (3,) and call ``deliver`` with it, or with a free position if it is inside a solid.
+
+        See `find_free_position` for ``free_position``.
+        """
         self.worker.submit(("way", name), NORMAL_PRIORITY, self._find_free_position(position, free_position, deliver))
 
     def _current_share_inputs(self) -> tuple[np.ndarray, tuple[Region, ...], int]:
         return self.observer, tuple(self.regions), self.settings_version
 
     def update_points(self) -> bool:
-        """Begin to compute the gaze on the points, and the shares of attention, of the observer as they stand now,
-        where that is not being done yet; whether there is nothing left to begin."""
+        """Start to compute the gaze on the points if needed; return whether it is up to date."""
         with self.lock:
             observer = self.observer
             is_current = self.finished_observer is not None and np.array_equal(self.finished_observer, observer)
@@ -541,7 +635,7 @@ class Session:
             return is_current
 
     def update_shares(self) -> bool:
-        """The same for the shares of attention of named areas and shapes."""
+        """Start to compute the attention shares, if needed; return whether they are up to date."""
         with self.lock:
             if not self.scene.has_gaze:
                 return True
@@ -560,34 +654,49 @@ class Session:
         width: int,
         spp: int,
     ) -> None:
-        """Refine the picture of ``view`` from now on, in place of one of the same ``name``; ``deliver`` is given each
-        with its colours (height, width, 3) uint8."""
+        """Start to refine a picture.
+
+        Parameters
+        ----------
+        name : hashable
+            Name of the picture; it replaces a picture of the same name.
+        view : PinholeView
+            The camera.
+        deliver : callable
+            Called with each picture and its colours (height, width, 3) uint8, on the render thread.
+        width : int
+            Width of the final picture in pixels.
+        spp : int
+            Samples per pixel of the final picture.
+        """
         self.worker.submit(("picture", name), NORMAL_PRIORITY, self._refine(view, deliver, width, spp))
 
     def refine_inset(
         self, name: Hashable, view: PinholeView, deliver: Callable[[StagePicture, np.ndarray], None], width: int
     ) -> None:
-        """The same for a small picture that nobody waits for."""
+        """Start to refine a small picture with one sample per pixel, at low priority. Arguments as for
+        `refine_picture`."""
         self.worker.submit(("inset", name), LOW_PRIORITY, self._refine(view, deliver, width, 1, False))
 
     def render_panorama(self, deliver: Callable[[np.ndarray], None], width: int) -> None:
-        """All that the observer could turn to, as an equirectangular picture whose middle is ahead of them."""
+        """Render an equirectangular picture around the observer, centred on the heading, and pass its colours to
+        ``deliver``."""
         self.worker.submit(("inset", "sphere"), LOW_PRIORITY, self._render_panorama(deliver, width))
 
     def cancel(self, name: Hashable) -> None:
-        """Refine the picture ``name`` no further."""
+        """Stop the refinement of the picture ``name``."""
         self.worker.cancel(("picture", name))
 
     def scale(self) -> Scale:
-        """The scale of the layer that is shown."""
+        """Return the colour scale of the displayed layer."""
         display = self.display
         return layers.choose_scale(
             display.layer, display.limits or self._ranges.get(display.layer.title), display.colors
         )
 
     def points(self, level: int = 0) -> Points | None:
-        """The points below the ceiling, coloured as the layer shows them, so many as the proxy has at ``level``; None
-        where there are no points yet."""
+        """Return the coloured points of a level (`PointProxy.levels`) below the ceiling; None if there are no points
+        yet."""
         with self.lock:
             proxy, point_values, display, ceiling = self.proxy, self.point_values, self.display, self.ceiling
         if proxy is None:
@@ -632,7 +741,7 @@ class Session:
                             self._update_range(name, values, values["visibility"] > 0.5)
                 self.listener.on_baked()
                 if has_moved:
-                    # Roughly is enough while the observer is dragged on.
+                    # While the observer is dragged, the first approximation is sufficient.
                     return
                 yield None
             with self.lock:
@@ -657,7 +766,7 @@ class Session:
                 self.shares, self._finished_share_inputs, self._share_inputs = shares, inputs, inputs
             self.listener.on_shares()
         except NergError:
-            # What cannot be counted is told once, not at each tick of a clock.
+            # Report the error once, not at each tick of the clock.
             self._finished_share_inputs = inputs
             raise
         finally:
@@ -682,7 +791,7 @@ class Session:
         spp: int,
         sets_range: bool = True,
     ) -> Iterator[None]:
-        """``leads``: whether the automatic range is taken from it."""
+        """Refine a picture; ``sets_range``: whether it sets the automatic range."""
         with self.lock:
             display, observer, height = self.display, self.observer, self.ceiling
         ceiling = None if height is None else Ceiling(height, self.ceiling_up)
@@ -723,7 +832,7 @@ class Session:
         deliver(layers.colorize(layer, values["color"], layer.select_values(values), mask, self.scale()))
 
     def _update_range(self, quantity: str, by_quantity: Mapping[str, np.ndarray], mask: np.ndarray) -> None:
-        """Take the automatic range of the layers of ``quantity`` from its values."""
+        """Set the automatic range of the layers of ``quantity`` from its values."""
         for layer in self.layers:
             values = layer.select_values(by_quantity)
             if layer.quantity == quantity and values is not None:

@@ -8,8 +8,8 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.rendering import bands
 from nerg_mi.rendering.bands import (
-    LEAST,
-    PACKET,
+    MIN_STRIP_SAMPLES,
+    PACKET_SIZE,
     LONG_RENDER_SAMPLES,
     Channels,
     IntegratorLayer,
@@ -120,7 +120,7 @@ def test_an_integrator_that_renders_in_a_way_of_its_own_is_asked_to(rgb):
 
     rgb.register_integrator("own_render", Own)
     scene = rgb.load_dict({"type": "scene", "integrator": {"type": "own_render"}, "sensor": {"type": "perspective"}})
-    assert "a way of its own" in bands.undividable_reason(scene, scene.sensors()[0])
+    assert "overrides render()" in bands.undividable_reason(scene, scene.sensors()[0])
 
 
 @pytest.mark.parametrize("sensor", ["perspective", "panorama"])
@@ -286,7 +286,7 @@ class Both:
     """The scene's own picture, and one of twice its depths."""
 
     def __init__(self, integrator):
-        self.integrator, self.names, self.count = integrator, [integrator.aov_names(), ["twice.T"]], 3
+        self.integrator, self.channel_names, self.num_channels = integrator, [integrator.aov_names(), ["twice.T"]], 3
 
     def sample(self, *ray):
         radiance, valid, aovs = self.integrator.sample(*ray)
@@ -296,7 +296,7 @@ class Both:
 
 def test01_the_picture_of_an_integrator_is_one_layer(rgb, scene_layers):
     layer = IntegratorLayer(scene_layers.integrator())
-    assert layer.names == [["depth.T", "opacity.Y"]] and layer.count == 2
+    assert layer.channel_names == [["depth.T", "opacity.Y"]] and layer.num_channels == 2
     (band,) = render_bands(scene_layers, scene_layers.sensors()[0], spp=4, layers=layer)
     assert band.layer == 0
     assert np.array_equal(np.array(band.film.develop()), np.array(rgb.render(scene_layers, spp=4)))
@@ -333,14 +333,14 @@ class Clock:
 @pytest.mark.parametrize(("fixed", "spp"), [(1 << 12, 1), (1 << 12, 3), (100, 1), (0, 4)])
 def test01_strips_follow_each_other_in_whole_packets_and_pixels(rgb, fixed, spp):
     start, stop = 1000 * spp, 1000 * spp + 50_000 * spp
-    strips = list(SamplePace(fixed).strips(start, stop, spp))
-    assert strips[0][0] == start - start % PACKET and sum(strips[-1]) == stop
+    strips = list(SamplePace(fixed).iter_strips(start, stop, spp))
+    assert strips[0][0] == start - start % PACKET_SIZE and sum(strips[-1]) == stop
     assert all(a + n == b for (a, n), (b, _) in zip(strips, strips[1:]))
-    assert all((a + n) % PACKET == 0 == (a + n) % spp for a, n in strips[:-1])
+    assert all((a + n) % PACKET_SIZE == 0 == (a + n) % spp for a, n in strips[:-1])
 
 
 def first_strip(it):
-    return next(iter(it.strips(0, 1 << 22, 1)))[1]
+    return next(iter(it.iter_strips(0, 1 << 22, 1)))[1]
 
 
 def test02_short_ones_grow_and_long_ones_shrink_to_a_limit(rgb, monkeypatch):
@@ -356,7 +356,7 @@ def test02_short_ones_grow_and_long_ones_shrink_to_a_limit(rgb, monkeypatch):
     clock.take(it, 0.01, 20)
     assert first_strip(it) == 1 << 18
     clock.take(it, 2 * bands.STRIP_SECONDS, 40)
-    assert first_strip(it) == LEAST
+    assert first_strip(it) == MIN_STRIP_SAMPLES
 
 
 def test03_fixed_ones_stay(rgb, monkeypatch):

@@ -14,7 +14,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.rendering import files
 from nerg_mi.rendering.files import (
     check_mesh,
-    check_points,
+    check_ply_points,
     check_vol,
     frame_path,
     open_image_rows,
@@ -37,12 +37,12 @@ def test_what_is_written_is_read(tmp_path):
 @pytest.mark.parametrize(
     "text, said",
     [
-        ("", "holds no frames"),
-        ("eye\n", "holds no frames"),
-        ("eye,ahead\n1,2,3\n", r"line 2\) has 3 values for 2 names; positions have commas"),
-        ("1,2\n3,4\n", 'begins with "1"'),
-        ("eye,eye\n1,2\n", "names a <default> twice"),
-        ('eye\n"1\n', "is no CSV"),
+        ("", "contains no frames"),
+        ("eye\n", "contains no frames"),
+        ("eye,ahead\n1,2,3\n", r"line 2\) has 3 values for 2 columns; values with commas"),
+        ("1,2\n3,4\n", 'header of .* contains "1"'),
+        ("eye,eye\n1,2\n", "contains a name twice"),
+        ('eye\n"1\n', "is not valid CSV"),
         (",".join(f"a{i}" for i in range(65)) + "\n", "65 names"),
     ],
 )
@@ -57,10 +57,10 @@ def test_bounds(tmp_path, monkeypatch):
     with pytest.raises(NergError, match="cannot be read"):
         read_frames(tmp_path / "a.csv")
     (tmp_path / "b.csv").write_text("eye\n1\n2\n")
-    monkeypatch.setattr(files, "FRAMES", 1)
+    monkeypatch.setattr(files, "MAX_FRAMES", 1)
     with pytest.raises(NergError, match="more than 1 frames"):
         read_frames(tmp_path / "b.csv")
-    with pytest.raises(NergError, match="there is no file of frames"):
+    with pytest.raises(NergError, match="there is no frames file"):
         read_frames(tmp_path / "nowhere.csv")
 
 
@@ -140,7 +140,7 @@ def test_wrong_meshes_are_a_sentence(tmp_path, data, said):
 
 def test_points_need_no_faces(tmp_path):
     (tmp_path / "a.ply").write_bytes(ply(3, 0, CORNERS))
-    check_points(tmp_path / "a.ply")
+    check_ply_points(tmp_path / "a.ply")
 
 
 @pytest.mark.parametrize(

@@ -80,11 +80,11 @@ def test_their_integrator_stays_what_it_is(rgb, theirs, tmp_path):
 @pytest.mark.parametrize(
     "text, said",
     [
-        (THEIRS.replace("{kind}", "nerg").replace('<integer name="max_depth" value="2"/>', ""), '"nerg" already'),
+        (THEIRS.replace("{kind}", "nerg").replace('<integer name="max_depth" value="2"/>', ""), 'already "nerg"'),
         ('<scene version="3.0.0"><integrator type="path"/><integrator type="path"/></scene>', "has 2 integrators"),
         ('<scene version="3.0.0"><include filename="nowhere.xml"/></scene>', 'includes "nowhere.xml"'),
-        ("<bsdf/>", "begins with <bsdf>"),
-        ("<scene", "no well-formed XML"),
+        ("<bsdf/>", "root element is <bsdf>"),
+        ("<scene", "not well-formed XML"),
         ('<!DOCTYPE x [<!ENTITY a "b">]><scene version="3.0.0"/>', "declares an entity"),
     ],
 )

@@ -10,7 +10,7 @@ import pytest
 
 from nerg_mi import llvm
 from nerg_mi.errors import NergError, UnusableLLVM
-from nerg_mi.rendering.scene import DEPTH, activate_variant, check_scene_file, load_scene
+from nerg_mi.rendering.scene import MAX_DEPTH, activate_variant, check_scene_file, load_scene
 from nerg_mi.workflows.render import find_sensor
 
 # ---- Variants that work and that do not, and scenes that are loaded ----
@@ -53,7 +53,7 @@ def test_values_of_a_scene(rgb, tmp_path):
     )
     width = lambda scene: scene.sensors()[0].film().size()[0]
     assert width(load_scene(tmp_path / "s.xml")) == 6 and width(load_scene(tmp_path / "s.xml", {"wide": "9"})) == 9
-    with pytest.raises(NergError, match=r'asks for no "\$tall"'):
+    with pytest.raises(NergError, match=r'does not use "\$tall"'):
         load_scene(tmp_path / "s.xml", {"tall": "2"})
 
 
@@ -61,7 +61,7 @@ def test_values_of_a_scene(rgb, tmp_path):
 def test_names_that_mitsuba_has_for_itself(rgb, tmp_path, name):
     file = tmp_path / "scene.xml"
     file.write_text(f'<scene version="3.0.0"><default name="{name}" value="1"/></scene>')
-    with pytest.raises(NergError, match=f'"{name}" is a name that Mitsuba keeps .*scene.xml"'):
+    with pytest.raises(NergError, match=f'"{name}" is reserved by Mitsuba.*scene.xml"'):
         load_scene(file, {name: "2"})
 
 
@@ -139,7 +139,7 @@ DEEP = '<shape type="cube">' * 20000 + "</shape>" * 20000
 
 # What ends the process without the checks.
 DEADLY = {
-    "deep": (scene(DEEP), {}, f"more than {DEPTH} deep"),
+    "deep": (scene(DEEP), {}, f"more than {MAX_DEPTH} levels deep"),
     "corner": (scene(shape("ply", "a.ply")), {"a.ply": mesh(999999999)}, "none of its 3 vertices"),
     "volume": (scene(GRID), {"a.vol": EMPTY_VOLUME}, "0 x 0 x 0 voxels"),
     "samples": (scene(spp="0"), {}, "must lie in 1 .. 16777216, got 0"),
@@ -226,7 +226,7 @@ def test_includes_are_followed_and_do_not_go_round(tmp_path):
     refused(tmp_path, scene('<include filename="b.xml"/>'), 'b.xml" .line 1. nests')
     for k in range(40):
         (tmp_path / f"i{k}.xml").write_text(f'<scene version="3.0.0"><include filename="i{k + 1}.xml"/></scene>')
-    refused(tmp_path, scene('<include filename="i0.xml"/>'), "files deep")
+    refused(tmp_path, scene('<include filename="i0.xml"/>'), "includes deep")
 
 
 @pytest.mark.parametrize(
@@ -237,7 +237,7 @@ def test_what_is_no_xml(tmp_path, text, said):
 
 
 def test_too_many_elements(tmp_path, monkeypatch):
-    monkeypatch.setattr("nerg_mi.rendering.scene.ELEMENTS", 100)
+    monkeypatch.setattr("nerg_mi.rendering.scene.MAX_ELEMENTS", 100)
     refused(tmp_path, scene('<shape type="cube"/>' * 101), "more than 100 elements")
 
 

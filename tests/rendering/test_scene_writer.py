@@ -177,7 +177,11 @@ def test_lines_are_short_and_indented():
 def test_names_that_no_scene_file_holds(name):
     with pytest.raises(NergError, match="rename the file"):
         check_attribute(name)
-    with pytest.raises(NergError, match="no text") if "$" not in name else pytest.raises(NergError, match="rename"):
+    with (
+        pytest.raises(NergError, match="not valid text")
+        if "$" not in name
+        else pytest.raises(NergError, match="rename")
+    ):
         format_document([prop("string", "a", name if "$" not in name else check_attribute(name))], "h")
 
 

@@ -31,7 +31,7 @@ def test01_around_the_foremost():
     view = PinholeView.look_at((0, 0, 1), (2, 0, 1), (0, 0, 1), 1.0, 1.5)
     lower, upper = fit_box(np.concatenate([thing, wall]), 0.01, view, (0.4, 0.35), (0.6, 0.65))
     assert np.allclose(lower, [1.9, -0.1, 0.9], atol=0.03) and np.allclose(upper, [2.1, 0.1, 1.1], atol=0.03)
-    with pytest.raises(NergError, match="nothing within"):
+    with pytest.raises(NergError, match="contains no points"):
         fit_box(thing, 0.01, view, (0.8, 0.8), (0.9, 0.9))
 
 
@@ -59,10 +59,10 @@ def test01_the_largest_share_first():
     assert cells(text) == ["b|&lt;b&gt;", "25.0 %", "a", "10.0 %", "c", "0.0 %"]
     many = cells(format_shares({f"n{k}": 0.01 for k in range(20)}))
     assert len(many) == 26 and many[-2:] == ["8 more", "8.0 %"]
-    assert "Name areas" in format_shares({}) and "Computing" in format_shares({}, True)
+    assert "Add areas" in format_shares({}) and "Computing" in format_shares({}, True)
     # Out of date, they are pale, and it is said.
-    assert "Out of date" not in text and STALE_STYLE not in text
-    assert "Out of date" in (old := format_shares({"a": 0.1}, True)) and STALE_STYLE in old
+    assert "Outdated" not in text and STALE_STYLE not in text
+    assert "Outdated" in (old := format_shares({"a": 0.1}, True)) and STALE_STYLE in old
 
 
 def test01_a_small_picture_is_greyed_while_another_is_made():
@@ -70,18 +70,18 @@ def test01_a_small_picture_is_greyed_while_another_is_made():
     gui = SimpleNamespace(
         add_image=lambda image, label: shown.append(SimpleNamespace(image=image, label=label)) or shown[0]
     )
-    inset = Inset(gui, "Own view", 8)
-    assert "out of date" in shown[0].label
+    inset = Inset(gui, "Observer view", 8)
+    assert "outdated" in shown[0].label
     red = np.full((8, 6, 3), (250, 10, 10), np.uint8)
     inset.show(red)
-    assert np.array_equal(shown[0].image, red) and shown[0].label == "Own view"
+    assert np.array_equal(shown[0].image, red) and shown[0].label == "Observer view"
     inset.mark_stale()
     grey = shown[0].image.astype(int)
-    assert np.ptp(grey, axis=-1).max() == 0 and "out of date" in shown[0].label
+    assert np.ptp(grey, axis=-1).max() == 0 and "outdated" in shown[0].label
     inset.mark_stale()
     assert np.array_equal(shown[0].image, grey), "not twice"
     inset.show(red)
-    assert np.array_equal(shown[0].image, red) and shown[0].label == "Own view"
+    assert np.array_equal(shown[0].image, red) and shown[0].label == "Observer view"
 
 
 @pytest.mark.parametrize("value, end", [(0, 1), (0.05, 1), (0.4, 10), (40, 1000), (300, 1000), (2e-5, 1e-4)])
@@ -188,7 +188,7 @@ def test04_ranges_are_those_of_the_values():
 
 @pytest.mark.parametrize("given", [(1.0, 1.0), (0.0, np.nan), (2.0, 1.0)])
 def test05_wrong_ranges_are_told(given):
-    with pytest.raises(NergError, match="a range goes from"):
+    with pytest.raises(NergError, match="the lower end of a range"):
         Scale(*given)
     with pytest.raises(NergError, match="perceptually uniform"):
         Scale(0, 1, "jet")

@@ -59,7 +59,7 @@ def test01_frames_are_those_of_the_flight(film_of, tmp_path):
     worker, turns = Worker(ended.append), []
 
     def others():
-        while not film._over:
+        while not film._is_done:
             turns.append(len(told))
             yield
 

@@ -187,7 +187,7 @@ def test05b_what_is_out_of_date_is_grey_and_named(running, driver):
     colorful = lambda: np.ptp(pixels(driver)[250:600, :800], axis=-1).mean()
     text = lambda: driver.find_element("tag name", "body").text
     fresh, go = colorful(), threading.Event()
-    assert "Grey:" not in text() and "out of date" not in text()
+    assert "Grey:" not in text() and "utdated" not in text()
 
     def wait():
         go.wait(60)
@@ -199,12 +199,12 @@ def test05b_what_is_out_of_date_is_grey_and_named(running, driver):
         until(lambda: session.running_tasks == ["video"])
         change()
         until(lambda: words in text() and colorful() < 0.5 * fresh, 20)
-        assert "Own view (grey: out of date)" in text() and "Computing: picture" in text()
+        assert "Observer view (grey: outdated)" in text() and "Computing: picture" in text()
         go.set()
         refined(running, window)
-        until(lambda: "Grey:" not in text() and "out of date" not in text())
+        until(lambda: "Grey:" not in text() and "utdated" not in text())
 
-    held(lambda: running.page.place_observer(np.array([4.4, 2.8, 1.6])), "Grey: gaze of an earlier observer")
+    held(lambda: running.page.place_observer(np.array([4.4, 2.8, 1.6])), "Grey: gaze of a previous observer position")
 
     def show(title):
         session.set_display(layer=get_layer(title))
@@ -227,7 +227,7 @@ def test05c_nobody_is_left_in_a_shelf(running, driver):
     # A browser under load tells its old camera once more before it follows.
     until(lambda: window.message and np.linalg.norm(window.view.origin - shelf) > 0.2, 60)
     refined(running, window)
-    until(lambda: "stands before it now" in window.status.content)
+    until(lambda: "inside a solid" in window.status.content)
     # Who was put somewhere is dragged from there.
     running.page.place_observer(session.observer + (0, 0, 0.5))
     before = session.observer.copy()

@@ -196,7 +196,7 @@ def test01_layers_and_their_scale(running, panel):
     until(lambda: session.display.layer.title == "depth" and session.display.limits is None)
     panel.choose("Colours", "magma")
     until(lambda: session.scale().colors == "magma")
-    panel.choose("Colours", "as usual")
+    panel.choose("Colours", "default")
     until(lambda: session.scale().colors == "viridis_r")
     panel.choose("Layer", "gaze")
     panel.slide("Fall-off", 0.5)
@@ -205,67 +205,67 @@ def test01_layers_and_their_scale(running, panel):
 
 def test02_observer_and_camera(running, panel):
     session, window = running.page.session, window_of(running)
-    panel.press("Observer to the camera")
+    panel.press("Move observer to camera")
     until(lambda: np.allclose(session.observer, window.view.origin))
     # The panel follows a moment later, and would write over what is typed meanwhile.
-    until(lambda: np.isclose(float(panel.input("At").get_attribute("value")), session.observer[0], atol=2e-3))
-    panel.write("At", "5.2")
+    until(lambda: np.isclose(float(panel.input("Position").get_attribute("value")), session.observer[0], atol=2e-3))
+    panel.write("Position", "5.2")
     until(lambda: np.isclose(session.observer[0], 5.2))
-    panel.press("Camera to the observer")
+    panel.press("Move camera to observer")
     until(lambda: np.allclose(window.view.origin, session.observer, atol=1e-3))
 
 
 def test03_from_above_and_what_is_saved(running, panel):
     session, window = running.page.session, window_of(running)
-    panel.open("Flight", "Keep this view")
-    panel.open("Camera", "From above")
-    panel.press("Keep this view")
-    panel.press("From above")
+    panel.open("Flight", "Add view")
+    panel.open("Camera", "View from above")
+    panel.press("Add view")
+    panel.press("View from above")
     until(lambda: window.view.forward @ session.source.up < -0.95)
     assert session.ceiling is not None and window.view.origin[2] > session.ceiling
-    panel.press("Keep this view")
-    panel.press("Save the frames (CSV)")
+    panel.press("Add view")
+    panel.press("Save frames (CSV)")
     rows = list(csv.reader(io.StringIO(panel.saved("view.frames.csv").decode())))
     assert rows[0] == ["view_camera", "view_target"] and len(rows) == 152
     assert np.allclose([float(v) for v in rows[-1][0].split(",")], window.view.origin, atol=1e-3)
     until(lambda: window.shows_picture)
-    panel.press("Save the picture (PNG)")
+    panel.press("Save picture (PNG)")
     data = panel.saved("view.png")
     assert data.startswith(b"\x89PNG") and int.from_bytes(data[16:20], "big") in (12, 24, 48)
     comment = data[data.index(b"tEXtComment\0") + 12 :]
     about = json.JSONDecoder().raw_decode(comment.decode("latin-1"))[0]
     assert about["what"] == "nerg view" and about["settings"]["layer"] == "gaze"
     assert "scene.xml" in about["inputs"] and "shoppers.safetensors" in about["inputs"]
-    panel.press("Copy as a scene (XML)")
+    panel.press("Save scene (XML)")
     root = ElementTree.fromstring(panel.saved("view.xml"))
     eye = next(d for d in root.iter("default") if d.get("name") == "view_observer")
     assert np.allclose([float(v) for v in eye.get("value").split(",")], session.observer, atol=1e-5)
-    panel.tick("Cut the ceiling off")
-    panel.press("First view")
+    panel.tick("Hide the ceiling")
+    panel.press("Initial view")
     until(lambda: np.allclose(window.view.origin, session.home_view.origin, atol=1e-3) and session.ceiling is None)
 
 
 def test04_a_flight_becomes_a_video(running, panel):
     av = pytest.importorskip("av")
-    panel.write("Seconds", "0.1")
-    panel.press("Make a video (MP4)")
+    panel.write("Duration (s)", "0.1")
+    panel.press("Render video (MP4)")
     # Three pictures can be done before anybody has looked for the button that cancels them.
     data = panel.saved("flight.mp4", 60)
     with av.open(io.BytesIO(data)) as container:
         frames = [frame.to_ndarray(format="rgb24").astype(float) for frame in container.decode(video=0)]
     assert len(frames) == 3 and np.abs(frames[0] - frames[-1]).mean() > 3
-    panel.write("Seconds", "60")
-    until(lambda: "Make a video (MP4)" in panel.texts())
-    panel.press("Make a video (MP4)")
-    until(lambda: "Cancel the video" in panel.texts())
-    panel.press("Cancel the video")
+    panel.write("Duration (s)", "60")
+    until(lambda: "Render video (MP4)" in panel.texts())
+    panel.press("Render video (MP4)")
+    until(lambda: "Cancel video" in panel.texts())
+    panel.press("Cancel video")
     until(lambda: "The video was cancelled." in panel.texts())
-    until(lambda: "Cancel the video" not in panel.texts())
+    until(lambda: "Cancel video" not in panel.texts())
 
 
 def test05_people_and_their_time(running, panel):
     session = running.page.session
-    panel.open("People", "Observer follows")
+    panel.open("Participants", "Observer follows")
     panel.choose("Observer follows", "Ada")
     until(lambda: np.allclose(session.observer, [4, 3, 1.6], atol=0.01))
     panel.slide("Time (s)", 2.0)
@@ -275,18 +275,18 @@ def test05_people_and_their_time(running, panel):
 def test06_an_area_is_drawn_named_and_saved(running, panel):
     session = running.page.session
     until(lambda: session.proxy is not None)
-    panel.open("Areas of interest", "Draw a box in the view")
+    panel.open("Areas of interest", "Draw box in view")
     panel.write("Name", "coolers")
-    panel.press("Draw a box in the view")
-    until(lambda: "Draw a rectangle around a thing" in panel.texts())
+    panel.press("Draw box in view")
+    until(lambda: "Draw a rectangle around an object" in panel.texts())
     panel.close_notes()
     drag(panel.driver, (220, 300), (420, 440))
     region = until(lambda: next(iter(session.regions), None))
-    panel.press("Save (JSON)")
+    panel.press("Save areas (JSON)")
     saved = json.loads(panel.saved("areas.json"))["regions"]
     assert [r["name"] for r in saved] == ["coolers"] and np.allclose(saved[0]["min"], region.lower)
     until(lambda: session.shares.get("coolers") is not None)
-    panel.press("Remove")
+    panel.press("Remove area")
     until(lambda: not session.regions)
     assert running.page.problem == ""
     assert not [e for e in panel.driver.get_log("browser") if e["level"] == "SEVERE"]

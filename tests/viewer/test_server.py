@@ -244,7 +244,7 @@ def test06_no_link_is_shared(local, monkeypatch):
 
 
 def test07_a_port_that_is_taken_is_told(local):
-    with pytest.raises(NergError, match="choose another with --port"):
+    with pytest.raises(NergError, match="choose another one with --port"):
         start_server(RequestGuard("127.0.0.1"), local.get_port(), "test")
 
 
@@ -256,7 +256,7 @@ def test08_a_viser_that_serves_otherwise_is_not_used(viser, monkeypatch):
     stopped = []
     monkeypatch.setattr(module, "_guard_websockets", lambda guard: contextlib.nullcontext([]))
     monkeypatch.setattr(viser.ViserServer, "stop", lambda self: stopped.append(self._websock_server.stop()))
-    with pytest.raises(NergError, match="cannot be guarded"):
+    with pytest.raises(NergError, match="access control"):
         start_server(RequestGuard("127.0.0.1"), 0, "test")
     assert stopped
 
@@ -312,7 +312,7 @@ def test03_a_moved_observer_is_seen_by_all(room):
             time.sleep(0.05)
         assert page.problem == ""
         page.on_error(KeyError("x"))
-        assert "mistake in the program" in page.problem
+        assert "bug in nerg_mi" in page.problem
 
 
 @pytest.mark.usefixtures("_viser")
@@ -325,7 +325,7 @@ def test04_until_ctrl_c(room, monkeypatch):
     monkeypatch.setattr(serve, "_wait", interrupted)
     view_files([room], ViewOptions(port=0), told)
     assert any(text.startswith("open http://127.0.0.1:") for text in told.messages)
-    assert told.messages[-1] == "the viewer has ended"
+    assert told.messages[-1] == "the viewer has stopped"
 
 
 @pytest.mark.usefixtures("_viser")

@@ -111,7 +111,7 @@ def test01_what_is_out_of_date_is_known(session_of, room, gaze_fields):
     )
     fresh = session.points().colors.astype(int)
     session.place_observer(np.array([3.0, 0, 0.5]))
-    assert session.stale_points_reason == "gaze of an earlier observer" and session.are_shares_stale
+    assert session.stale_points_reason == "gaze of a previous observer position" and session.are_shares_stale
     grey = session.points().colors.astype(int)
     assert np.ptp(grey, axis=1).max() == 0 < np.ptp(fresh, axis=1).max()
     started, finish = threading.Event(), threading.Event()
@@ -125,7 +125,7 @@ def test01_what_is_out_of_date_is_known(session_of, room, gaze_fields):
     assert started.wait(60)
     session.update_points()
     session.update_shares()
-    assert session.running_tasks == ["gaze on the points", "shares of attention", "video"]
+    assert session.running_tasks == ["gaze on the points", "attention shares", "video"]
     finish.set()
     settle(session)
     assert session.stale_points_reason == "" and not session.are_shares_stale
@@ -136,7 +136,7 @@ def test01_what_is_out_of_date_is_known(session_of, room, gaze_fields):
     assert session.stale_points_reason == "" and session.has_scale
     session.set_display(layer=get_layer("gaze"))
     session.set_falloff(0.2)
-    assert session.stale_points_reason == "gaze of earlier settings" and session.are_shares_stale
+    assert session.stale_points_reason == "gaze of previous settings" and session.are_shares_stale
     settle(session)
     session.regions = [Region.create("a", (1, -1, 0), (2, 1, 1))]
     assert session.stale_points_reason == "" and session.are_shares_stale
@@ -148,16 +148,16 @@ def test01_what_is_out_of_date_is_known(session_of, room, gaze_fields):
 def test01_an_observer_has_a_position(at):
     session = Session.__new__(Session)
     session.lock, session.observer = threading.RLock(), np.zeros(3)
-    with pytest.raises(NergError, match="an observer cannot stand at"):
+    with pytest.raises(NergError, match="invalid observer position"):
         session.place_observer(np.array(at))
-    with pytest.raises(NergError, match="an observer cannot stand at"):
+    with pytest.raises(NergError, match="invalid observer position"):
         session.place_observer(np.ones(3), np.full((3, 3), np.nan))
     assert (session.observer == 0).all()
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -0.1])
 def test01_a_fall_off_is_a_length(value):
-    with pytest.raises(NergError, match="fall-off is a length"):
+    with pytest.raises(NergError, match="fall-off must be 0"):
         Session.__new__(Session).set_falloff(value)
 
 
@@ -243,7 +243,7 @@ def test05_the_sphere_is_level_and_ahead_in_its_middle(session_of, room):
 def test06_what_cannot_be_shown_is_told(session_of, room, tmp_path):
     with pytest.raises(NergError, match="no file"):
         session_of(Path("nowhere.xml"))
-    with pytest.raises(NergError, match="three numbers"):
+    with pytest.raises(NergError, match="three finite numbers"):
         session_of(room, observer=(1.0, 2.0))
     for wrong in (float("nan"), float("-inf"), 1e30):
         with pytest.raises(NergError, match="--observer must lie in"):
