@@ -24,7 +24,7 @@ def shelf_run(tmp_path_factory):
 
 
 @pytest.mark.nightly
-def test01_the_box_climbs_to_where_the_sweep_says(shelf_run):
+def test01_optimum_equals_sweep(shelf_run):
     found, out = shelf_run
     at, values = found["sweep"]
     assert out.stat().st_size > 10_000 and values.min() > 0 and values.max() > 2 * values.min()
@@ -33,20 +33,20 @@ def test01_the_box_climbs_to_where_the_sweep_says(shelf_run):
 
 
 @pytest.mark.nightly
-def test02_derivatives_without_edges_are_those_of_the_sweep(shelf_run):
+def test02_derivatives_equal_differences(shelf_run):
     checks = shelf_run[0]["checks"]
     automatic, central = checks[:, 3], checks[:, 4]
     assert np.allclose(automatic, central, rtol=0.05, atol=0.05 * np.abs(central).max())
     assert np.all((checks[:, 5] >= 0) & (checks[:, 5] < 0.05))
 
 
-def test03_uphill():
+def test03_gradient_ascent():
     values = np.array([0, 1, 3, 2, 2.5, 4, 1, 0.0])
     assert place_product.uphill(values, 0, 1) == 2 and place_product.uphill(values, 0, 3) == 5
     assert place_product.uphill(values, 7, 2) == 5 and place_product.uphill(values, 5, 1) == 5
 
 
-def test04_an_unknown_shelf_is_named(rgb):
+def test04_unknown_shelf_is_reported(rgb):
     with pytest.raises(SystemExit, match='no shelf "attic".*wall_cosmetics'):
         place_product.Shelf("attic")
 
@@ -54,7 +54,7 @@ def test04_an_unknown_shelf_is_named(rgb):
 # ---- Recovering an observer, at sizes that take seconds: what is found, not what is printed ----
 
 
-def test01_distances_of_pictures():
+def test05_image_distance():
     a = np.random.default_rng(0).exponential(1, (2, 16, 24))
     b, c = (np.roll(a, k, axis=2) for k in (1, 8))
     assert example.distance(a, a) == 0 and example.loss(a, a) == 0
@@ -64,7 +64,7 @@ def test01_distances_of_pictures():
     assert example.distance(np.stack([a, b]), a).shape == (2,)
 
 
-def test02_a_step_solves_a_linear_problem_and_leaves_edges_out():
+def test06_step_solves_linear_problem():
     """Logarithms linear in the position: one step, but for its damping; pixels dark in either picture have no say."""
     rng = np.random.default_rng(1)
     J, truth = rng.normal(0, 0.1, (2, 6, 8, 3)), np.array([0.1, -0.05, 0.02])
@@ -80,7 +80,7 @@ def test02_a_step_solves_a_linear_problem_and_leaves_edges_out():
 
 
 @pytest.mark.nightly
-def test03_an_observer_is_found_again(rgb):
+def test07_observer_is_recovered(rgb):
     pictures, truth = example.Pictures((24, 16), cameras=example.CAMERAS[2:3]), np.array([4.4, 2.8, 1.6])
     start = truth + (0.1, 0.2, 0.05)
     derivatives = pictures.derivatives(truth)
@@ -99,7 +99,7 @@ def test03_an_observer_is_found_again(rgb):
     assert np.linalg.norm(end - truth) < 0.06 and least < found.losses[0]
 
 
-def test04_guesses_and_observers_stand_where_one_can_stand():
+def test08_positions_are_on_free_floor():
     for points, clearance in ((example.first_guesses(0.8), 0.15), (example.true_observers(5, 0), 0.22)):
         assert len(points) >= 5 and points.shape[1] == 3 and example.standing(points[:, :2], clearance).all()
     assert not np.array_equal(example.true_observers(5, 0), example.true_observers(5, 1))
@@ -118,7 +118,7 @@ def outputs(book) -> list[list[str]]:
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("path", sorted((ROOT / "examples").glob("*.ipynb")), ids=lambda p: p.stem)
-def test_it_runs_and_gives_what_is_stored(path, tmp_path):
+def test_notebook_reproduces_stored_outputs(path, tmp_path):
     nbformat = pytest.importorskip("nbformat", reason="nbclient, of the extra test, is not installed")
     pytest.importorskip("ipykernel", reason="ipykernel, of the extra test, is not installed")
     from jupyter_client.manager import KernelManager

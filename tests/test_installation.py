@@ -35,7 +35,7 @@ def clone(tmp_path):
     return tmp_path
 
 
-def uninstalled(code: str, folder: Path, **environment):
+def run_uninstalled(code: str, folder: Path, **environment):
     """Run ``code`` in ``folder`` by a Python that knows the dependencies, and no installation of the package."""
     begin = f"import sys\nsys.path.append({str(SITE)!r})\n"
     begin += "assert not any('editable' in repr(f).lower() for f in sys.meta_path)\n"
@@ -63,8 +63,8 @@ USE = """
 
 
 @pytest.mark.parametrize("elsewhere", [False, True])
-def test01_plugins_and_scenes_are_found(clone, elsewhere):
-    done = uninstalled(USE, Path("/"), PYTHONPATH=str(clone)) if elsewhere else uninstalled(USE, clone)
+def test01_checkout_works_without_installation(clone, elsewhere):
+    done = run_uninstalled(USE, Path("/"), PYTHONPATH=str(clone)) if elsewhere else run_uninstalled(USE, clone)
     assert done.returncode == 0, done.stderr
     kind, files = done.stdout.strip().splitlines()[-2:]
     assert kind == "NergIntegrator"
@@ -100,11 +100,11 @@ def run(code):
         "mi.set_variant('llvm_ad_rgb'); check()",
     ],
 )
-def test01_every_order(code):
+def test02_every_import_order(code):
     run(code)
 
 
-def test02_back_and_forth():
+def test03_repeated_variant_changes():
     run(
         """
         import nerg_mi, mitsuba as mi
@@ -116,12 +116,12 @@ def test02_back_and_forth():
     )
 
 
-def test03_import_loads_nothing():
+def test04_import_loads_nothing():
     loaded = run("import nerg_mi, sys; print(*sys.modules)").split()
     assert not {"mitsuba", "drjit", "numpy", "torch"} & set(loaded)
 
 
-def test04_mitsuba_without_torch():
+def test05_mitsuba_without_torch():
     assert (
         "torch"
         not in run(
@@ -131,7 +131,7 @@ def test04_mitsuba_without_torch():
 
 
 @pytest.mark.parametrize("name, kind", [p for p in PLUGINS if p[1] != "volume"])
-def test05_scalar_sentence(rgb, name, kind):
+def test06_scalar_variants_are_refused(rgb, name, kind):
     rgb.set_variant("scalar_rgb")
     said = f'"{name}" needs a variant that compiles its kernels, and "scalar_rgb" is active: call mi.set_variant'
     with pytest.raises(RuntimeError, match=said):
@@ -140,7 +140,7 @@ def test05_scalar_sentence(rgb, name, kind):
         rgb.load_string(f'<scene version="3.0.0"><{kind} type="{name}"/></scene>')
 
 
-def test05b_scalar_variants_are_warned_of_and_forgotten():
+def test07_scalar_variants_leave_no_state():
     # A volume that scalar_rgb knew, as a texture, could not be loaded from a dict in any later variant.
     code = (
         "import nerg_mi, mitsuba as mi\n"
@@ -156,7 +156,7 @@ def test05b_scalar_variants_are_warned_of_and_forgotten():
     assert '"nowhere" does not exist' in done.stdout.replace(str(Path.cwd()) + "/", "")
 
 
-def test06_entry_points():
+def test08_entry_points():
     entries = {e.name: e for e in importlib.metadata.entry_points(group="mitsuba") if e.name.startswith("nerg_")}
     assert set(entries) == {f"nerg_{name}" for name, _ in PLUGINS}
     for name, entry in entries.items():
@@ -165,7 +165,7 @@ def test06_entry_points():
         importlib.reload(module)  # what Mitsuba after 3.9 does when the variant changes
 
 
-def test07_broken_plugin_is_not_hidden():
+def test09_broken_plugin_is_reported():
     done = subprocess.run(
         [
             sys.executable,
@@ -182,7 +182,7 @@ def test07_broken_plugin_is_not_hidden():
 # ---- The choice of libLLVM ----
 
 
-def fake(folder, *names):
+def make_fake_libraries(folder, *names):
     for name in names:
         (folder / name).touch()
     return folder
@@ -212,18 +212,18 @@ def machine(tmp_path, monkeypatch):
         ("libLLVM.so.20.1-rust-1.86", (20, 1)),
     ],
 )
-def test01_version_from_name(tmp_path, name, version):
-    fake(tmp_path, name)
+def test10_llvm_version_from_name(tmp_path, name, version):
+    make_fake_libraries(tmp_path, name)
     assert llvm.find_version(str(tmp_path / name)) == version
 
 
-def test02_version_of_link_is_that_of_its_target(tmp_path):
-    fake(tmp_path, "libLLVM-15.so.1")
+def test11_llvm_version_of_link(tmp_path):
+    make_fake_libraries(tmp_path, "libLLVM-15.so.1")
     (tmp_path / "libLLVM.so").symlink_to("libLLVM-15.so.1")
     assert llvm.find_version(str(tmp_path / "libLLVM.so")) == (15,)
 
 
-def test03_nameless_library_is_asked(tmp_path):
+def test12_llvm_version_without_name(tmp_path):
     good = next((library for library in llvm.find_installed() if library.is_usable), None)
     if good is None:
         pytest.skip("no usable libLLVM in the usual places of this machine")
@@ -236,15 +236,15 @@ def test03_nameless_library_is_asked(tmp_path):
     assert llvm.find_version(str(nameless))[0] == good.version[0]
 
 
-def test04_no_library_has_no_version(tmp_path):
+def test13_invalid_library_has_no_version(tmp_path):
     (tmp_path / "libLLVM.so").write_text("not a library")
     assert llvm.find_version(str(tmp_path / "libLLVM.so")) is None
     assert llvm.find_version(str(tmp_path / "missing.so")) is None
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the names of the files are those of Linux")
-def test05_newest_usable_is_taken(machine):
-    fake(machine, "libLLVM-14.so.1", "libLLVM-15.so.1", "libLLVM.so.19.1", "libLLVM-17.so.1")
+def test14_newest_usable_llvm_is_selected(machine):
+    make_fake_libraries(machine, "libLLVM-14.so.1", "libLLVM-15.so.1", "libLLVM.so.19.1", "libLLVM-17.so.1")
     llvm.select_library()
     assert os.environ[llvm.PATH_VARIABLE] == str(machine / "libLLVM.so.19.1")
     assert llvm.find_problem() is None
@@ -252,8 +252,8 @@ def test05_newest_usable_is_taken(machine):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the names of the files are those of Linux")
-def test06_only_bad_ones(machine, monkeypatch):
-    fake(machine, "libLLVM-15.so.1", "libLLVM-16.so.1")
+def test15_only_unusable_llvm(machine, monkeypatch):
+    make_fake_libraries(machine, "libLLVM-15.so.1", "libLLVM-16.so.1")
     llvm.select_library()
     assert llvm.PATH_VARIABLE not in os.environ
     with pytest.raises(UnusableLLVM, match="16.*17.*libllvm19"):
@@ -266,7 +266,7 @@ def test06_only_bad_ones(machine, monkeypatch):
         llvm.require_usable("llvm_ad_rgb")
 
 
-def test07_none_at_all_is_refused_only_by_an_llvm_variant(machine):
+def test16_missing_llvm_is_refused_by_llvm_variants(machine):
     llvm.select_library()
     llvm.require_usable()
     llvm.require_usable("scalar_rgb")
@@ -274,8 +274,8 @@ def test07_none_at_all_is_refused_only_by_an_llvm_variant(machine):
         llvm.require_usable("llvm_ad_rgb")
 
 
-def test08_named_by_the_user_is_never_replaced(machine, monkeypatch):
-    fake(machine, "libLLVM.so.19.1", "libLLVM-15.so.1")
+def test17_user_setting_is_kept(machine, monkeypatch):
+    make_fake_libraries(machine, "libLLVM.so.19.1", "libLLVM-15.so.1")
     for bad, said in (("libLLVM-15.so.1", "LLVM 15"), ("missing.so", "is no file")):
         monkeypatch.setenv(llvm.PATH_VARIABLE, str(machine / bad))
         monkeypatch.setattr(llvm, "has_cuda", lambda: True)
@@ -286,13 +286,13 @@ def test08_named_by_the_user_is_never_replaced(machine, monkeypatch):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the names of the files are those of Linux")
-def test09_remedy_names_the_good_one_that_is_there(machine, monkeypatch):
-    fake(machine, "libLLVM.so.19.1", "libLLVM-15.so.1")
+def test18_remedy_names_usable_llvm(machine, monkeypatch):
+    make_fake_libraries(machine, "libLLVM.so.19.1", "libLLVM-15.so.1")
     monkeypatch.setenv(llvm.PATH_VARIABLE, str(machine / "libLLVM-15.so.1"))
     assert f"unset {llvm.PATH_VARIABLE}, since LLVM 19.1" in llvm.find_problem()
 
 
-def test10_real_old_library_is_refused_and_never_aborts():
+def test19_old_llvm_is_refused_without_abort():
     old = next((library for library in llvm.find_installed() if library.version[0] in (15, 16)), None)
     if old is None:
         pytest.skip("no libLLVM 15 or 16 on this machine")
@@ -306,7 +306,7 @@ def test10_real_old_library_is_refused_and_never_aborts():
         assert last.startswith(f"nerg_mi.errors.UnusableLLVM: LLVM {old.version[0]}"), last
 
 
-def test11_loaded_version_counts(monkeypatch):
+def test20_loaded_llvm_is_checked(monkeypatch):
     import drjit as dr
 
     assert llvm.find_current().version == tuple(dr.detail.llvm_version())
@@ -316,9 +316,9 @@ def test11_loaded_version_counts(monkeypatch):
 
 
 @pytest.mark.parametrize("late", ["drjit", "mitsuba"])
-def test12_refused_when_drjit_is_imported_and_not_before(late, tmp_path):
+def test21_error_is_raised_at_drjit_import(late, tmp_path):
     """What needs no kernel works without them, `nerg doctor` for one; a second import is refused like the first."""
-    fake(tmp_path, "libLLVM-15.so.1")
+    make_fake_libraries(tmp_path, "libLLVM-15.so.1")
     code = (
         "import nerg_mi.diagnosis\nprint('imported')\n"
         f"try: import {late}\nexcept ImportError as error: print(type(error).__name__)\nimport {late}"
@@ -332,21 +332,21 @@ def test12_refused_when_drjit_is_imported_and_not_before(late, tmp_path):
 # ---- What is found out about a machine, and how it is told ----
 
 
-def test_a_dying_backend_is_reported(monkeypatch):
+def test22_crashing_backend_is_reported(monkeypatch):
     monkeypatch.setattr(
         diagnosis, "_TRIAL", "import os, sys; print('LLVM ERROR: no', file=sys.stderr, flush=True); os.abort()"
     )
     assert diagnosis.try_backend("llvm") == {"variants": [], "failed": {"llvm": "LLVM ERROR: no"}}
 
 
-def test_extras_by_their_names(monkeypatch):
+def test23_extras_use_distribution_names(monkeypatch):
     """The names are those of distributions, as pyproject.toml has them: that of scikit-image is not that of its
     module."""
     project = (ROOT / "pyproject.toml").read_text()
     assert all(f'["{name}>=' in project for name in diagnosis.EXTRAS)
 
 
-def test_a_trouble_stands_below_its_topic():
+def test24_problems_follow_their_topic():
     found = diagnosis.Diagnosis(
         [diagnosis.Finding("LLVM", "none", "install it"), diagnosis.Finding("threads", "2")], is_usable=False
     )
@@ -354,22 +354,22 @@ def test_a_trouble_stands_below_its_topic():
 
 
 WORKS = {"variants": ["llvm_ad_rgb"], "failed": {}, "threads": 2, "version": [19, 1, 7]}
-NOTHING = {"variants": [], "failed": {"llvm": "it died"}}
+NO_FINDINGS = {"variants": [], "failed": {"llvm": "it died"}}
 
 
-@pytest.mark.parametrize("found, verdict", [(WORKS, "ready to render"), (NOTHING, "nothing can be rendered")])
-def test_the_verdict(monkeypatch, found, verdict):
+@pytest.mark.parametrize("found, verdict", [(WORKS, "ready to render"), (NO_FINDINGS, "nothing can be rendered")])
+def test25_verdict(monkeypatch, found, verdict):
     scalar = {"variants": ["scalar_rgb"], "failed": {}}
     monkeypatch.setattr(diagnosis, "try_backend", lambda backend: scalar if backend == "scalar" else found)
     monkeypatch.setattr(llvm, "has_cuda", lambda: False)
     monkeypatch.setattr(llvm, "find_problem", lambda: None)
     told = diagnosis.run_diagnosis()
     assert told.is_usable is (found is WORKS) and verdict in str(told)
-    assert ("it died" in str(told)) is (found is NOTHING)
+    assert ("it died" in str(told)) is (found is NO_FINDINGS)
 
 
 @pytest.mark.parametrize("version, old", [([12, 4], True), ([12, 8], False), ([13, 0], False)])
-def test_an_old_driver_is_named(monkeypatch, version, old):
+def test26_old_driver_is_reported(monkeypatch, version, old):
     monkeypatch.setattr(diagnosis, "try_backend", lambda backend: {**WORKS, "version": version})
     monkeypatch.setattr(llvm, "has_cuda", lambda: True)
     assert ("R570" in str(diagnosis.run_diagnosis())) is old

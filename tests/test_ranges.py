@@ -58,7 +58,7 @@ KINDS = list(
 LEFT_OUT = {"settings", "output", "train_output", "test_output", "align_output", "salt"}
 """Fields that are no options of the command line, or spelt otherwise there."""
 # What other options need beside them.
-BESIDE: dict[str, dict[str, Any]] = {
+PREREQUISITES: dict[str, dict[str, Any]] = {
     "FilterOptions": {"with_hit": True},
     "SplitOptions": {"persons": ("Ada",)},
     "GazeSettings": {"steps": 1},
@@ -76,7 +76,7 @@ def _numbers(kind):
 
 def _fault(kind, field, value) -> str | None:
     """What is said about a ``value`` of ``field``, but for what is said of several options together."""
-    given = {**BESIDE.get(kind.__name__, {}), field.name: (value,) * 3 if "tuple" in str(field.type) else value}
+    given = {**PREREQUISITES.get(kind.__name__, {}), field.name: (value,) * 3 if "tuple" in str(field.type) else value}
     if field.name == "minutes" and "Settings" in kind.__name__:
         given.pop("steps")
     try:
@@ -86,13 +86,13 @@ def _fault(kind, field, value) -> str | None:
     return None
 
 
-def test_all_kinds_of_options_are_found():
+def test_all_option_classes_are_collected():
     names = {kind.__name__ for kind in KINDS}
     assert {"BakeOptions", "GazeOptions", "FoldOptions", "TableOptions", "TickOption", "ProbeSettings"} <= names
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda k: f"{k.__module__}.{k.__name__}")
-def test_every_number_is_refused_beyond_its_range_and_nowhere_else(kind):
+def test_numbers_are_refused_outside_their_range(kind):
     assert not _numbers(kind) or issubclass(kind, ValidatedDataclass)
     for field in _numbers(kind):
         within = field.metadata[RANGE]
@@ -114,7 +114,7 @@ def test_every_number_is_refused_beyond_its_range_and_nowhere_else(kind):
 @pytest.mark.parametrize(
     "kind", [k for k in KINDS if all("help" in f.metadata for f in fields(k))], ids=lambda k: k.__name__
 )
-def test_the_command_line_refuses_the_same(kind):
+def test_command_line_refuses_the_same_values(kind):
     made: list[Any] = []
     left_out = tuple({f.name for f in fields(kind)} & LEFT_OUT)
     take = lambda options, reporter: made.append(options)
@@ -128,7 +128,7 @@ def test_the_command_line_refuses_the_same(kind):
     assert not made
 
 
-def test_every_number_of_the_command_line_shows_its_range():
+def test_help_shows_ranges():
     """Also where a command declares an option itself; those of readers of rays are checked by them."""
     of_readers = {option.name for option in collect_shared_options()}
     options = [p for _, command, _ in iter_commands() for p in command.params if isinstance(p, TyperOption)]
@@ -137,7 +137,7 @@ def test_every_number_of_the_command_line_shows_its_range():
     assert len(limits) > 80 and [limit for limit in limits if None in limit] == []
 
 
-def test_several_numbers_are_checked_one_by_one():
+def test_each_of_several_numbers_is_checked():
     from dataclasses import dataclass
 
     @dataclass(frozen=True)
@@ -150,7 +150,7 @@ def test_several_numbers_are_checked_one_by_one():
             Some(sizes=wrong)
 
 
-def test_numbers_of_numpy_are_numbers():
+def test_numpy_numbers_are_accepted():
     check_number(np.float32(2), Range(0, MAX_COORDINATE), "x")
     check_number(np.int64(2), Range(0, MAX_COORDINATE), "x", is_integer=True)
 
@@ -175,11 +175,11 @@ ANY = Range(-1e9, 1e9)
         (lambda p: properties.read_color(p, "x", 0.0), {"x": [0.1, 2.0, 0.0]}, [0.1, 2.0, 0.0]),
     ],
 )
-def test_values(read, given, found):
+def test_valid_property_values(read, given, found):
     assert read(given) == found and type(read(given)) is type(found)
 
 
-def test_a_colour_of_a_texture(rgb):
+def test_color_of_a_texture(rgb):
     texture = rgb.load_dict({"type": "rgb", "value": [0.1, 0.2, 0.4]})
     assert properties.read_color({"x": texture}, "x", 0.0) == pytest.approx([0.1, 0.2, 0.4])
 
@@ -200,13 +200,13 @@ def test_a_colour_of_a_texture(rgb):
         (lambda p: properties.read_color(p, "x", 0), "red", "an rgb colour, got 'red'"),
     ],
 )
-def test_a_wrong_value_is_named(read, value, words):
+def test_invalid_property_is_reported(read, value, words):
     with pytest.raises(NergError) as said:
         read({"x": value})
     assert '"x"' in str(said.value) and words in str(said.value)
 
 
-def test_a_field_of_a_file_or_in_memory(rgb):
+def test_field_from_file_or_memory(rgb):
     import drjit.llvm.ad as ns
 
     class Field:
@@ -228,7 +228,7 @@ def test_a_field_of_a_file_or_in_memory(rgb):
         properties.load_network({}, Field([1.0]), load, ns)
 
 
-def test_a_file_is_looked_for_in_the_folders_of_a_scene(rgb, tmp_path):
+def test_files_are_resolved_in_scene_folders(rgb, tmp_path):
     (tmp_path / "here.ply").touch()
     known = rgb.file_resolver()
     rgb.set_file_resolver(type(known)(known))
@@ -240,7 +240,7 @@ def test_a_file_is_looked_for_in_the_folders_of_a_scene(rgb, tmp_path):
         rgb.set_file_resolver(known)
 
 
-def test_a_transform_is_a_matrix_or_the_identity(rgb):
+def test_transform_is_matrix_or_identity(rgb):
     place = rgb.ScalarTransform4f().translate([1, 2, 3]).scale(2)
     assert np.allclose(properties.read_transform({"to_world": place}, "to_world"), np.array(place.matrix))
     assert np.array_equal(properties.read_transform({}, "to_world"), np.eye(4))
@@ -282,11 +282,11 @@ def caught(code) -> BaseException:
         (KeyboardInterrupt(), False),
     ],
 )
-def test_what_can_be_mended(error, mendable):
+def test_user_errors(error, mendable):
     assert errors.is_user_error(error) is mendable
 
 
-def test_values_that_were_chosen_are_the_users_to_mend():
+def test_errors_of_chosen_options_are_user_errors():
     with pytest.raises(NergError, match=r"^a box needs a size; give other values by --aabb$"):
         with errors.blame_options("--aabb"):
             raise ValueError("a box needs a size.")
@@ -298,7 +298,7 @@ def test_values_that_were_chosen_are_the_users_to_mend():
             raise TypeError
 
 
-def test_what_mitsuba_wraps_is_said_with_its_place():
+def test_wrapped_mitsuba_errors_name_the_location():
     with pytest.raises(NergError) as said:
         with errors.translate_mitsuba_errors():
             raise RuntimeError(TRACE.format(error="nerg_mi.errors.NergError"))
@@ -307,12 +307,12 @@ def test_what_mitsuba_wraps_is_said_with_its_place():
     assert "Traceback" not in words and "\n" not in words and "NergError" not in words
 
 
-def test_what_mitsuba_quotes_may_be_no_text():
+def test_quoted_data_need_not_be_text():
     with pytest.raises(NergError, match="is damaged"), errors.translate_mitsuba_errors():
         b"\xfe".decode()
 
 
-def test_a_mistake_in_a_plugin_is_none_of_the_scene():
+def test_plugin_bug_is_not_a_user_error():
     with pytest.raises(RuntimeError) as said:
         with errors.translate_mitsuba_errors():
             raise RuntimeError(TRACE.format(error="TypeError"))
@@ -358,7 +358,7 @@ def _camera_of_scene(folder):
         (lambda folder: lambda: nerg.make_scene(shapes={"type": "scene", "box": {"type": "cube"}}), False),
     ],
 )
-def test_what_mitsuba_refuses_of_a_file_or_camera_is_the_users(rgb, tmp_path, monkeypatch, prepare, names_file):
+def test_refused_files_and_cameras_are_user_errors(rgb, tmp_path, monkeypatch, prepare, names_file):
     def refuse(*_, **__):
         raise RuntimeError("[plugin.cpp:7] it has no sides")
 
@@ -371,7 +371,7 @@ def test_what_mitsuba_refuses_of_a_file_or_camera_is_the_users(rgb, tmp_path, mo
 
 @pytest.mark.parametrize("load", [_timer, lambda folder: lambda: FieldRenderer(folder / "file.safetensors")])
 @pytest.mark.parametrize("content", [None, b"", b"\x08\0\0\0\0\0\0\0{}      "], ids=["missing", "empty", "other"])
-def test_checkpoints_that_cannot_be_rendered_are_named(rgb, tmp_path, load, content):
+def test_unrenderable_checkpoints_are_reported(rgb, tmp_path, load, content):
     if content is not None:
         (tmp_path / "file.safetensors").write_bytes(content)
     with pytest.raises(NergError, match=r"file\.safetensors"):
@@ -389,10 +389,10 @@ def test_checkpoints_that_cannot_be_rendered_are_named(rgb, tmp_path, load, cont
         (KeyError(), "KeyError"),
     ],
 )
-def test_one_line(error, words):
+def test_errors_are_one_line(error, words):
     assert errors.format_error(error) == words
 
 
-def test_text_of_a_file_is_cut_and_made_printable():
+def test_quoted_text_is_sanitized():
     assert errors.sanitize("a\x1b[2Jb\n") == "a?[2Jb?"
     assert errors.sanitize("x" * 400, 10) == "x" * 10 + "..." and errors.sanitize("x" * 10, 10) == "x" * 10

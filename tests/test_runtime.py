@@ -16,7 +16,7 @@ from .plugins import fields
 # ---- Ctrl-C: noted between steps, and heard by Python after and while a picture is rendered ----
 
 
-def test_the_first_is_noted_and_the_second_raised():
+def test_first_interrupt_is_recorded_and_second_raised():
     before = signal.getsignal(signal.SIGINT)
     with pytest.raises(KeyboardInterrupt), Interruption() as stop:
         stop.check()
@@ -27,7 +27,7 @@ def test_the_first_is_noted_and_the_second_raised():
     assert signal.getsignal(signal.SIGINT) is before
 
 
-def test_a_handler_that_is_not_pythons_is_left_alone(monkeypatch):
+def test_foreign_signal_handler_is_kept(monkeypatch):
     """As where Python is part of another program: it could not be put back."""
     set_handlers = []
     monkeypatch.setattr(signal, "getsignal", lambda which: None)
@@ -37,7 +37,7 @@ def test_a_handler_that_is_not_pythons_is_left_alone(monkeypatch):
     assert not set_handlers
 
 
-def test_an_ignored_ctrl_c_stays_ignored():
+def test_ignored_interrupt_stays_ignored():
     """As for a command in the background of a script, which Ctrl-C is not meant for."""
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
@@ -66,7 +66,7 @@ def scene(rgb, tmp_path):
     )
 
 
-def test_python_hears_ctrl_c_after_a_picture(rgb, scene):
+def test_interrupt_works_after_rendering(rgb, scene):
     for _ in range(2):
         rgb.render(scene, spp=1)
         with pytest.raises(KeyboardInterrupt):
@@ -77,7 +77,7 @@ def test_python_hears_ctrl_c_after_a_picture(rgb, scene):
         assert stop.is_requested
 
 
-def test_ctrl_c_during_a_picture_is_raised(rgb, scene, monkeypatch):
+def test_interrupt_during_rendering_is_raised(rgb, scene, monkeypatch):
     integrator = scene.integrator()
     sample = type(integrator).sample
 
@@ -100,7 +100,7 @@ def test_ctrl_c_during_a_picture_is_raised(rgb, scene, monkeypatch):
 # ---- Threads are changed between computations, never within one ----
 
 
-def test_what_is_queued_is_done_first(monkeypatch):
+def test_pending_work_finishes_before_thread_change(monkeypatch):
     order = []
     monkeypatch.setattr(dr, "sync_thread", lambda: order.append("waited"))
     monkeypatch.setattr(dr, "set_thread_count", order.append)
@@ -110,7 +110,7 @@ def test_what_is_queued_is_done_first(monkeypatch):
     assert order == ["waited", 3]
 
 
-def test_arrays_keep_their_values_however_often_it_changes(rgb):
+def test_arrays_survive_thread_changes(rgb):
     before = dr.thread_count()
     try:
         for count in (2, 1, 3, before) * 5:
@@ -124,5 +124,5 @@ def test_arrays_keep_their_values_however_often_it_changes(rgb):
         set_thread_count(before)
 
 
-def test_a_worker_gives_a_job_what_it_asks_for_and_has():
+def test_worker_limits_threads_to_available():
     assert (limit_threads(4, 2), limit_threads(2, 4), limit_threads(0, 3), limit_threads(3, 0)) == (2, 2, 3, 3) and limit_threads(0, 0) >= 1

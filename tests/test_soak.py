@@ -167,7 +167,7 @@ print("\\n" + json.dumps([test_soak.slope(unit, count), test_soak.slope(leaking,
     "part, count, bound",
     [("frames", 2000, 1.0), ("radiance", 10_000, 0.5), ("gaze", 10_000, 0.2), ("variants", 60, 200.0)],
 )
-def test_memory_stays_flat_and_a_leak_is_seen(part, count, bound):
+def test_memory_is_flat_and_leaks_are_detected(part, count, bound):
     """``count`` units of work keep ``bound`` (KiB a unit), which leaking four times as much exceeds."""
     count, bound = max(30, count // SHORT), bound * (1 if SHORT == 1 else 100 if bound < 100 else 10)
     command = [sys.executable, "-c", _PROGRAM, part, str(count), str(bound)]

@@ -83,7 +83,7 @@ def _writes(call: ast.Call) -> bool:
     return name in METHODS and not owner.startswith(("sys.", "json"))
 
 
-def test_no_file_is_written_directly():
+def test_files_are_written_atomically():
     found = []
     for path in SOURCES:
         name = str(path.relative_to(ROOT))
@@ -116,7 +116,7 @@ def test_exceptions_are_still_needed():
         'gzip.open(path, "wt")',
     ],
 )
-def test_what_writes_is_found(text):
+def test_writing_calls_are_detected(text):
     assert direct_writers(text)
     assert not direct_writers(f"with replacing(path) as temporary:\n    {text}")
 
@@ -132,5 +132,5 @@ def test_what_writes_is_found(text):
         "sys.stdout.write(x)",
     ],
 )
-def test_what_does_not_is_left_alone(text):
+def test_other_calls_are_ignored(text):
     assert not direct_writers(text)

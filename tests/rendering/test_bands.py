@@ -28,7 +28,7 @@ from tests.plugins.scenes import camera, constant, make_observer, plugin, with_g
 # ---- A picture is the same however it is divided, and its memory is that of a band ----
 
 
-def neural(mi, folder, sensor, **kwargs):
+def make_neural_scene(mi, folder, sensor, **kwargs):
     fields.radiance(folder / "field.safetensors", density_scale=2.0)
     fields.gaze(folder / "gaze.safetensors")
     integrator = plugin(
@@ -41,7 +41,7 @@ def neural(mi, folder, sensor, **kwargs):
     return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor})
 
 
-def panorama(mi):
+def make_panorama(mi):
     return plugin(
         "panorama",
         to_world=mi.ScalarTransform4f().translate([0.3, 0, -2]),
@@ -49,7 +49,7 @@ def panorama(mi):
     )
 
 
-def lit(mi, film, sensor="perspective", sampler="independent"):
+def make_lit_scene(mi, film, sensor="perspective", sampler="independent"):
     """A textured ball under `path`, which draws random numbers in a loop of its own."""
     return mi.load_dict(
         plugin(
@@ -67,12 +67,12 @@ def lit(mi, film, sensor="perspective", sampler="independent"):
     )
 
 
-def whole(mi, scene, spp, seed=3):
+def render_undivided(mi, scene, spp, seed=3):
     mi.render(scene, spp=spp, seed=seed)
     return np.array(scene.sensors()[0].film().bitmap())
 
 
-def divided(scene, spp, seed=3, **kwargs):
+def render_divided(scene, spp, seed=3, **kwargs):
     parts = bands.render_bands(scene, scene.sensors()[0], spp=spp, seed=seed, **kwargs)
     return np.concatenate([np.array(band.film.bitmap())[: band.rows] for band in parts])
 
@@ -81,15 +81,15 @@ BOX = {"width": 18, "height": 11, "rfilter": {"type": "box"}, "component_format"
 
 
 @pytest.mark.parametrize("spp", [1, 3, 16])
-def test_shapes_are_the_same_to_the_bit(rgb, spp):
-    scene = lit(rgb, BOX)
-    expected = whole(rgb, scene, spp)
+def test_divided_shapes_are_bitwise_equal(rgb, spp):
+    scene = make_lit_scene(rgb, BOX)
+    expected = render_undivided(rgb, scene, spp)
     assert expected.std() > 0.1
     for rows, strip in ((0, 0), (1, 0), (4, 64), (5, 200)):
-        assert np.array_equal(divided(scene, spp, rows=rows, strip=strip), expected), (rows, strip)
+        assert np.array_equal(render_divided(scene, spp, rows=rows, strip=strip), expected), (rows, strip)
 
 
-def test_a_camera_in_fog_is_the_same_to_the_bit(rgb):
+def test_divided_fog_is_bitwise_equal(rgb):
     fog = {"type": "homogeneous", "albedo": 0.9, "sigma_t": 0.8}
     scene = rgb.load_dict(
         plugin(
@@ -107,10 +107,10 @@ def test_a_camera_in_fog_is_the_same_to_the_bit(rgb):
         )
     )
     assert bands.undividable_reason(scene, scene.sensors()[0]) is None
-    assert np.array_equal(divided(scene, 4, rows=4), whole(rgb, scene, 4))
+    assert np.array_equal(render_divided(scene, 4, rows=4), render_undivided(rgb, scene, 4))
 
 
-def test_an_integrator_that_renders_in_a_way_of_its_own_is_asked_to(rgb):
+def test_integrator_with_own_render_is_undivided(rgb):
     class Own(rgb.SamplingIntegrator):
         def sample(self, scene, sampler, ray, medium=None, active=True):
             return rgb.Color3f(0), True, []
@@ -124,16 +124,16 @@ def test_an_integrator_that_renders_in_a_way_of_its_own_is_asked_to(rgb):
 
 
 @pytest.mark.parametrize("sensor", ["perspective", "panorama"])
-def test_fields_seen_by_an_observer_elsewhere_are_the_same_to_the_bit(rgb, tmp_path, sensor):
-    eye = camera(rgb, size=17) if sensor == "perspective" else panorama(rgb)
-    scene = neural(rgb, tmp_path, eye, observer=make_observer(rgb, -3, 0.5, 0.5), falloff=1.0)
-    expected = whole(rgb, scene, 2)
+def test_divided_fields_with_observer_are_bitwise_equal(rgb, tmp_path, sensor):
+    eye = camera(rgb, size=17) if sensor == "perspective" else make_panorama(rgb)
+    scene = make_neural_scene(rgb, tmp_path, eye, observer=make_observer(rgb, -3, 0.5, 0.5), falloff=1.0)
+    expected = render_undivided(rgb, scene, 2)
     assert np.any(expected[..., 4] > 0)
-    assert np.array_equal(divided(scene, 2, rows=9, strip=256), expected)
+    assert np.array_equal(render_divided(scene, 2, rows=9, strip=256), expected)
 
 
-def test_the_observer_is_the_camera_of_the_picture_and_not_another(rgb, tmp_path):
-    scene = neural(rgb, tmp_path, camera(rgb, size=12), visibility="depth", aovs="gaze,observer_depth")
+def test_observer_is_the_rendering_camera(rgb, tmp_path):
+    scene = make_neural_scene(rgb, tmp_path, camera(rgb, size=12), visibility="depth", aovs="gaze,observer_depth")
     other = rgb.load_dict(camera(rgb, (3, 1, 2), size=12))
     rgb.render(scene, sensor=other, spp=1, seed=0)
     expected = np.array(other.film().bitmap())
@@ -141,12 +141,12 @@ def test_the_observer_is_the_camera_of_the_picture_and_not_another(rgb, tmp_path
     assert np.array_equal(np.concatenate(parts), expected)
 
 
-def test_more_than_a_million_values_are_added_in_the_same_way(rgb):
+def test_accumulation_matches_for_a_million_values(rgb):
     # Dr.Jit adds to large arrays in another order than to small ones.
-    scene = lit(rgb, BOX | {"width": 500, "height": 300})
-    expected = whole(rgb, scene, 4)
+    scene = make_lit_scene(rgb, BOX | {"width": 500, "height": 300})
+    expected = render_undivided(rgb, scene, 4)
     assert expected.size > 1e6
-    assert np.array_equal(divided(scene, 4, rows=60), expected)
+    assert np.array_equal(render_divided(scene, 4, rows=60), expected)
 
 
 @pytest.mark.parametrize(
@@ -160,10 +160,10 @@ def test_more_than_a_million_values_are_added_in_the_same_way(rgb):
     ],
 )
 def test_other_films(rgb, film):
-    scene = lit(rgb, film)
-    expected = whole(rgb, scene, 4)
+    scene = make_lit_scene(rgb, film)
+    expected = render_undivided(rgb, scene, 4)
     window = [list(v) for v in (scene.sensors()[0].film().crop_size(), scene.sensors()[0].film().crop_offset())]
-    found = divided(scene, 4, rows=3, strip=128)
+    found = render_divided(scene, 4, rows=3, strip=128)
     if film["rfilter"]["type"] == "box":
         assert np.array_equal(found, expected)
     else:
@@ -176,20 +176,20 @@ def test_mono(mono):
     scene = mono.load_dict(
         {"type": "scene", "integrator": constant(0.8, aovs="depth", background=0.2), "sensor": camera(mono, size=9)}
     )
-    assert np.array_equal(divided(scene, 2, rows=4), whole(mono, scene, 2))
+    assert np.array_equal(render_divided(scene, 2, rows=4), render_undivided(mono, scene, 2))
 
 
-def test_what_cannot_be_divided_comes_in_one_piece(rgb):
-    scene = lit(rgb, BOX, sampler="stratified")
+def test_undividable_image_is_one_band(rgb):
+    scene = make_lit_scene(rgb, BOX, sampler="stratified")
     assert "StratifiedSampler" in bands.undividable_reason(scene, scene.sensors()[0])
     assert len(list(bands.render_bands(scene, scene.sensors()[0], spp=4, rows=2))) == 1
-    assert np.array_equal(divided(scene, 4, rows=2), whole(rgb, scene, 4))
+    assert np.array_equal(render_divided(scene, 4, rows=2), render_undivided(rgb, scene, 4))
 
 
-def test_eight_times_the_pixels_take_eight_times_the_bands(rgb):
+def test_bands_scale_with_pixels(rgb):
     memory = 10e6
-    small = lit(rgb, BOX | {"width": 200, "height": 400})
-    large = lit(rgb, BOX | {"width": 200, "height": 3200})
+    small = make_lit_scene(rgb, BOX | {"width": 200, "height": 400})
+    large = make_lit_scene(rgb, BOX | {"width": 200, "height": 3200})
     rows = [bands.fit_rows_to_memory(s, s.sensors()[0], memory) for s in (small, large)]
     assert rows[0] == rows[1] and 0 < rows[0] < 400
     for scene, count in ((small, -(-400 // rows[0])), (large, -(-3200 // rows[0]))):
@@ -200,9 +200,9 @@ def test_eight_times_the_pixels_take_eight_times_the_bands(rgb):
     assert bands.fit_rows_to_memory(small, small.sensors()[0], 1.0) == 1
 
 
-def test_a_wide_filter_is_not_rendered_many_times_for_want_of_memory(rgb):
+def test_wide_filter_has_a_minimum_band(rgb):
     """As where the scene itself takes all of it: each band renders the rows around it again."""
-    scene = lit(rgb, {"width": 18, "height": 200, "rfilter": {"type": "gaussian"}})
+    scene = make_lit_scene(rgb, {"width": 18, "height": 200, "rfilter": {"type": "gaussian"}})
     rows = bands.fit_rows_to_memory(scene, scene.sensors()[0], -1e9)
     told = []
     for _ in bands.render_bands(
@@ -212,9 +212,9 @@ def test_a_wide_filter_is_not_rendered_many_times_for_want_of_memory(rgb):
     assert 1 < rows < 50 and told[-1] < 1.3 * 18 * 200
 
 
-def test_progress_and_stopping(rgb):
-    scene, seen = lit(rgb, BOX), []
-    divided(scene, 2, rows=4, strip=64, on_strip=lambda done, total: seen.append((done, total)))
+def test_progress_and_interruption(rgb):
+    scene, seen = make_lit_scene(rgb, BOX), []
+    render_divided(scene, 2, rows=4, strip=64, on_strip=lambda done, total: seen.append((done, total)))
     assert seen[-1] == (18 * 11 * 2, 18 * 11 * 2) and len(seen) > 5
     assert [d for d, _ in seen] == sorted(d for d, _ in seen)
 
@@ -222,7 +222,7 @@ def test_progress_and_stopping(rgb):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        divided(scene, 2, rows=4, strip=64, on_strip=stop)
+        render_divided(scene, 2, rows=4, strip=64, on_strip=stop)
     assert tuple(scene.sensors()[0].film().crop_size()) == (18, 11)
 
 
@@ -244,17 +244,17 @@ def scene_channels(rgb):
     )
 
 
-def test_each_channel_by_its_name(rgb, scene_channels):
+def test_channels_by_name(rgb, scene_channels):
     seen = render_channels(scene_channels, scene_channels.sensors()[0], spp=4, seed=3)
-    whole = np.array(rgb.render(scene_channels, spp=4, seed=3))
+    render_undivided = np.array(rgb.render(scene_channels, spp=4, seed=3))
     assert list(seen.aovs) == ["depth", "opacity", "position.X", "position.Y", "position.Z"]
-    assert seen.color.shape == (6, 9, 3) and np.array_equal(seen.color, whole[..., :3])
+    assert seen.color.shape == (6, 9, 3) and np.array_equal(seen.color, render_undivided[..., :3])
     for k, channel in enumerate(seen.aovs.values()):
-        assert np.array_equal(channel, whole[..., 3 + k])
+        assert np.array_equal(channel, render_undivided[..., 3 + k])
     assert tuple(seen.bitmap.size()) == (9, 6)
 
 
-def test_one_channel_of_colour_becomes_three(mono):
+def test_mono_becomes_rgb(mono):
     scene = mono.load_dict(
         plugin(
             "scene",
@@ -266,7 +266,7 @@ def test_one_channel_of_colour_becomes_three(mono):
     assert render_channels(scene, scene.sensors()[0], spp=1).color.shape == (3, 4, 3)
 
 
-def test_a_surface_is_where_half_is_absorbed():
+def test_mask_is_half_opacity():
     seen = Channels(np.zeros((1, 3, 3)), {"opacity": np.array([[0.49, 0.5, 1.0]])}, None)
     assert seen.mask.tolist() == [[False, True, True]]
 
@@ -282,7 +282,7 @@ def scene_layers(rgb):
     return rgb.load_dict({"type": "scene", "integrator": integrator, "camera": camera, "ball": {"type": "sphere"}})
 
 
-class Both:
+class TwoLayers:
     """The scene's own picture, and one of twice its depths."""
 
     def __init__(self, integrator):
@@ -294,7 +294,7 @@ class Both:
         yield 0, valid, [2 * aovs[0]]
 
 
-def test01_the_picture_of_an_integrator_is_one_layer(rgb, scene_layers):
+def test01_integrator_is_one_layer(rgb, scene_layers):
     layer = IntegratorLayer(scene_layers.integrator())
     assert layer.channel_names == [["depth.T", "opacity.Y"]] and layer.num_channels == 2
     (band,) = render_bands(scene_layers, scene_layers.sensors()[0], spp=4, layers=layer)
@@ -303,10 +303,10 @@ def test01_the_picture_of_an_integrator_is_one_layer(rgb, scene_layers):
 
 
 @pytest.mark.parametrize("rows", [0, 3])
-def test02_layers_follow_each_other_in_each_band(rgb, scene_layers, rows):
+def test02_layers_alternate_in_each_band(rgb, scene_layers, rows):
     expected, pictures = np.array(rgb.render(scene_layers, spp=4)), ([], [])
     for band in render_bands(
-        scene_layers, scene_layers.sensors()[0], spp=4, rows=rows, layers=Both(scene_layers.integrator())
+        scene_layers, scene_layers.sensors()[0], spp=4, rows=rows, layers=TwoLayers(scene_layers.integrator())
     ):
         pictures[band.layer].append(np.array(band.film.develop())[: band.rows])
     own, twice = (np.concatenate(parts) for parts in pictures)
@@ -331,7 +331,7 @@ class Clock:
 
 
 @pytest.mark.parametrize(("fixed", "spp"), [(1 << 12, 1), (1 << 12, 3), (100, 1), (0, 4)])
-def test01_strips_follow_each_other_in_whole_packets_and_pixels(rgb, fixed, spp):
+def test03_strips_consist_of_whole_packets_and_pixels(rgb, fixed, spp):
     start, stop = 1000 * spp, 1000 * spp + 50_000 * spp
     strips = list(SamplePace(fixed).iter_strips(start, stop, spp))
     assert strips[0][0] == start - start % PACKET_SIZE and sum(strips[-1]) == stop
@@ -343,7 +343,7 @@ def first_strip(it):
     return next(iter(it.iter_strips(0, 1 << 22, 1)))[1]
 
 
-def test02_short_ones_grow_and_long_ones_shrink_to_a_limit(rgb, monkeypatch):
+def test04_strip_size_adapts_within_limits(rgb, monkeypatch):
     clock, it = Clock(monkeypatch), SamplePace()
     before = first_strip(it)
     # The first two are not asked: they were compiled, or wait for what was.
@@ -359,13 +359,13 @@ def test02_short_ones_grow_and_long_ones_shrink_to_a_limit(rgb, monkeypatch):
     assert first_strip(it) == MIN_STRIP_SAMPLES
 
 
-def test03_fixed_ones_stay(rgb, monkeypatch):
+def test05_fixed_strip_size(rgb, monkeypatch):
     clock, it = Clock(monkeypatch), SamplePace(1 << 13)
     clock.take(it, 0.01, 10)
     assert first_strip(it) == 1 << 13
 
 
-def test04_the_next_picture_goes_on_with_the_pace_of_the_last(rgb, monkeypatch):
+def test06_pace_carries_over_to_next_image(rgb, monkeypatch):
     clock, it = Clock(monkeypatch), SamplePace()
     before = first_strip(it)
     clock.take(it, 0.01, 4)
@@ -384,7 +384,7 @@ def test04_the_next_picture_goes_on_with_the_pace_of_the_last(rgb, monkeypatch):
 
 
 @pytest.mark.parametrize("base, seed", [(0, 0), (5, 9), (4294967295, 3)])
-def test_numbers_are_those_of_the_whole(rgb, base, seed):
+def test_random_numbers_equal_undivided_image(rgb, base, seed):
     sampler = rgb.load_dict({"type": "independent", "seed": base, "sample_count": 2})
     assert bands.get_base_seed(sampler) == base
     sampler.seed(seed, 1000)
@@ -393,7 +393,7 @@ def test_numbers_are_those_of_the_whole(rgb, base, seed):
     assert np.array_equal(np.array([part.next_1d(), *part.next_2d()]), theirs[:, 137:637])
 
 
-def test_a_copy_goes_its_own_way(rgb):
+def test_sampler_clone_is_independent(rgb):
     sampler = bands.make_strip_sampler(1, 0, 0, 0, 10)
     copy = sampler.clone()
     first = np.array(sampler.next_1d())
@@ -401,12 +401,12 @@ def test_a_copy_goes_its_own_way(rgb):
     assert not np.array_equal(np.array(copy.next_1d()), first)
 
 
-def test_beyond_two_to_the_32_numbers_do_not_repeat(rgb):
+def test_random_numbers_beyond_2_to_32(rgb):
     near, far = (np.array(bands.make_strip_sampler(1, 0, 0, first, 64).next_1d()) for first in (0, 1 << 32))
     assert not np.any(near == far)
 
 
-def test_other_samplers_are_none_of_ours(rgb):
+def test_other_samplers_have_no_base_seed(rgb):
     assert bands.get_base_seed(rgb.load_dict({"type": "stratified"})) is None
 
 
@@ -425,7 +425,7 @@ def files(tmp_path_factory):
 
 
 @pytest.mark.parametrize("observed", [False, True])
-def test_equal_to_a_list_that_has_it(rgb, files, observed):
+def test_render_aovs_equals_scene_with_aovs(rgb, files, observed):
     observer = {"observer": make_observer(rgb, -0.4, 0.2, -2.5)} if observed else {}
     names = ["gaze", "opacity", "depth"]
     load = lambda aovs: rgb.load_dict(
@@ -440,7 +440,7 @@ def test_equal_to_a_list_that_has_it(rgb, files, observed):
         np.testing.assert_array_equal(found.aovs[name], wanted.aovs[name])
 
 
-def test_what_cannot_be_asked(rgb, files):
+def test_invalid_aov_requests_are_refused(rgb, files):
     path = {"type": "scene", "integrator": {"type": "path"}, "sensor": camera(rgb), "shape": {"type": "sphere"}}
     scene = rgb.load_dict(path)
     with pytest.raises(NergError, match='"PathIntegrator".*"nerg scene a.xml -o new.xml"'):
@@ -459,21 +459,21 @@ def test_what_cannot_be_asked(rgb, files):
 SMALL = {"width": "24", "height": "16", "spp": "1"}
 
 
-def networks(scene):
+def list_networks(scene):
     return [net for field in get_trained_fields(scene.integrator()) for net in field.mlps]
 
 
 @pytest.mark.nightly
 @pytest.mark.parametrize(("samples", "prepared"), [(LONG_RENDER_SAMPLES - 1, False), (LONG_RENDER_SAMPLES, True)])
-def test01_long_ones_are_prepared_and_show_the_same_to_the_bit(rgb, samples, prepared):
+def test07_long_rendering_is_prepared_and_equal(rgb, samples, prepared):
     plain, scene = load_scene(find_store_scene(), SMALL), load_scene(find_store_scene(), SMALL)
     assert prepare_long_render(samples, scene) is prepared
-    assert [net.constant for net in networks(scene)] == [prepared] * 5
+    assert [net.constant for net in list_networks(scene)] == [prepared] * 5
     found, expected = (np.array(rgb.render(s, sensor=0, spp=1)) for s in (scene, plain))
     assert expected[..., :3].max() > 0.1 and np.array_equal(found, expected)
 
 
-def test02_scenes_without_fields_are_left_alone(rgb):
+def test08_scene_without_fields_is_not_prepared(rgb):
     shapes = rgb.load_dict({"type": "scene", "integrator": {"type": "nerg"}, "ball": {"type": "sphere"}})
     others = rgb.load_dict({"type": "scene", "integrator": {"type": "path"}, "ball": {"type": "sphere"}})
     assert not prepare_long_render(LONG_RENDER_SAMPLES, shapes) and not prepare_long_render(LONG_RENDER_SAMPLES, others)

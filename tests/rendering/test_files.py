@@ -26,7 +26,7 @@ from tests.pictures import mitsuba_bitmap
 # ---- Files of frames: what is written is read, and what is none is told in a sentence ----
 
 
-def test_what_is_written_is_read(tmp_path):
+def test_frames_round_trip(tmp_path):
     frames = [{"eye": "1, 2, 3", "falloff": "0.1"}, {"eye": 'a "b"', "falloff": ""}]
     write_frames(tmp_path / "a.csv", frames)
     assert read_frames(tmp_path / "a.csv") == frames
@@ -46,13 +46,13 @@ def test_what_is_written_is_read(tmp_path):
         (",".join(f"a{i}" for i in range(65)) + "\n", "65 names"),
     ],
 )
-def test_what_is_none(tmp_path, text, said):
+def test_invalid_frames_file_is_refused(tmp_path, text, said):
     (tmp_path / "a.csv").write_text(text)
     with pytest.raises(NergError, match=said):
         read_frames(tmp_path / "a.csv")
 
 
-def test_bounds(tmp_path, monkeypatch):
+def test_frames_limits(tmp_path, monkeypatch):
     (tmp_path / "a.csv").write_bytes(b"eye\n\xff\n")
     with pytest.raises(NergError, match="cannot be read"):
         read_frames(tmp_path / "a.csv")
@@ -64,7 +64,7 @@ def test_bounds(tmp_path, monkeypatch):
         read_frames(tmp_path / "nowhere.csv")
 
 
-def test_numbers_in_names():
+def test_frame_paths():
     assert frame_path(Path("a/walk.png"), 7, 12) == Path("a/walk_0007.png")
     assert frame_path(Path("walk.exr"), 7, 12345) == Path("walk_00007.exr")
 
@@ -76,14 +76,14 @@ def test_numbers_in_names():
 CORNERS = struct.pack("<9f", 0, 0, 0, 1, 0, 0, 0, 1, 0)
 
 
-def ply(vertices: int, faces: int, body: bytes, kind="binary_little_endian", more="") -> bytes:
+def make_ply(vertices: int, faces: int, body: bytes, kind="binary_little_endian", more="") -> bytes:
     return (
         f"ply\nformat {kind} 1.0\ncomment of nothing\nelement vertex {vertices}\nproperty float x\nproperty float y\n"
         f"property float z\nelement face {faces}\nproperty list uchar int vertex_indices\n{more}end_header\n"
     ).encode() + body
 
 
-def face(*corners: int) -> bytes:
+def pack_face(*corners: int) -> bytes:
     return bytes([len(corners)]) + struct.pack(f"<{len(corners)}i", *corners)
 
 
@@ -94,14 +94,16 @@ BIG = struct.pack(">9f", 0, 0, 0, 1, 0, 0, 0, 1, 0) + b"\x03" + struct.pack(">3i
 @pytest.mark.parametrize(
     "data",
     [
-        ply(3, 1, CORNERS + face(0, 1, 2)),
-        ply(3, 2, CORNERS + face(0, 1, 2) + b"\x07" + face(2, 1, 0) + b"\x08", more="property uchar mark\n"),
-        ply(3, 1, TEXT + b"3 0 1 2\n", "ascii"),
-        ply(3, 1, TEXT + b"\n3 0 1 2", "ascii"),
-        ply(3, 1, BIG, "binary_big_endian"),
+        make_ply(3, 1, CORNERS + pack_face(0, 1, 2)),
+        make_ply(
+            3, 2, CORNERS + pack_face(0, 1, 2) + b"\x07" + pack_face(2, 1, 0) + b"\x08", more="property uchar mark\n"
+        ),
+        make_ply(3, 1, TEXT + b"3 0 1 2\n", "ascii"),
+        make_ply(3, 1, TEXT + b"\n3 0 1 2", "ascii"),
+        make_ply(3, 1, BIG, "binary_big_endian"),
     ],
 )
-def test_whole_meshes_pass_here_and_in_mitsuba(rgb, tmp_path, data):
+def test_complete_meshes_pass(rgb, tmp_path, data):
     (tmp_path / "a.ply").write_bytes(data)
     check_mesh(tmp_path / "a.ply", "ply")
     assert rgb.load_dict({"type": "ply", "filename": str(tmp_path / "a.ply")}).vertex_count() == 3
@@ -110,28 +112,28 @@ def test_whole_meshes_pass_here_and_in_mitsuba(rgb, tmp_path, data):
 @pytest.mark.parametrize(
     "data, said",
     [
-        (ply(3, 0, CORNERS), "has no faces"),
-        (ply(0, 1, face(0, 1, 2)), "has no vertices"),
-        (ply(3, 1, CORNERS + face(0, 1, 999999999)), "none of its 3 vertices"),
-        (ply(3, 1, CORNERS + face(0, -1, 2)), "none of its 3 vertices"),
-        (ply(3, 1, TEXT + b"3 0 1 3\n", "ascii"), "none of its 3 vertices"),
-        (ply(2000000000, 1, CORNERS + face(0, 1, 2)), "ends before"),
-        (ply(3, 2**62, CORNERS + face(0, 1, 2)), "ends before"),
-        (ply(3, 2**62, TEXT + b"3 0 1 2\n", "ascii"), "ends before"),
-        (ply(3, 1, CORNERS + face(0, 1)), "fewer than three"),
-        (ply(3, 1, CORNERS + face(0, 1, 2) + b"\n"), "more follows its rows"),
-        (ply(3, 1, struct.pack("<f", np.nan) + CORNERS[4:] + face(0, 1, 2)), "vertex 1 is not finite"),
-        (ply(3, 2, TEXT + b"3 0 1 2\n" + b" " * 40, "ascii"), "ends before row 2 of face"),
-        (ply(-3, 1, CORNERS), "-3 rows"),
-        (ply(4, 1, CORNERS + bytes(12) + face(0, 1, 2, 3)), "three corners"),
-        (ply(3, 1, TEXT + b"4 0 1 2 1\n", "ascii"), "three corners"),
+        (make_ply(3, 0, CORNERS), "has no faces"),
+        (make_ply(0, 1, pack_face(0, 1, 2)), "has no vertices"),
+        (make_ply(3, 1, CORNERS + pack_face(0, 1, 999999999)), "none of its 3 vertices"),
+        (make_ply(3, 1, CORNERS + pack_face(0, -1, 2)), "none of its 3 vertices"),
+        (make_ply(3, 1, TEXT + b"3 0 1 3\n", "ascii"), "none of its 3 vertices"),
+        (make_ply(2000000000, 1, CORNERS + pack_face(0, 1, 2)), "ends before"),
+        (make_ply(3, 2**62, CORNERS + pack_face(0, 1, 2)), "ends before"),
+        (make_ply(3, 2**62, TEXT + b"3 0 1 2\n", "ascii"), "ends before"),
+        (make_ply(3, 1, CORNERS + pack_face(0, 1)), "fewer than three"),
+        (make_ply(3, 1, CORNERS + pack_face(0, 1, 2) + b"\n"), "more follows its rows"),
+        (make_ply(3, 1, struct.pack("<f", np.nan) + CORNERS[4:] + pack_face(0, 1, 2)), "vertex 1 is not finite"),
+        (make_ply(3, 2, TEXT + b"3 0 1 2\n" + b" " * 40, "ascii"), "ends before row 2 of face"),
+        (make_ply(-3, 1, CORNERS), "-3 rows"),
+        (make_ply(4, 1, CORNERS + bytes(12) + pack_face(0, 1, 2, 3)), "three corners"),
+        (make_ply(3, 1, TEXT + b"4 0 1 2 1\n", "ascii"), "three corners"),
         (b"ply\n", "no header"),
         (b"", "does not begin"),
         (b"ply\nformat binary_little_endian 1.0\nelement vertex\nend_header\n", "a.ply"),
         (b"ply\nformat odd 1.0\nend_header\n", "a.ply"),
     ],
 )
-def test_wrong_meshes_are_a_sentence(tmp_path, data, said):
+def test_invalid_meshes_are_refused(tmp_path, data, said):
     (tmp_path / "a.ply").write_bytes(data)
     with pytest.raises(NergError, match=said) as error:
         check_mesh(tmp_path / "a.ply", "ply")
@@ -139,7 +141,7 @@ def test_wrong_meshes_are_a_sentence(tmp_path, data, said):
 
 
 def test_points_need_no_faces(tmp_path):
-    (tmp_path / "a.ply").write_bytes(ply(3, 0, CORNERS))
+    (tmp_path / "a.ply").write_bytes(make_ply(3, 0, CORNERS))
     check_ply_points(tmp_path / "a.ply")
 
 
@@ -163,31 +165,31 @@ def test_obj(tmp_path, faces, said):
         check_mesh(tmp_path / "a.obj", "obj")
 
 
-def vol(*size: int, kind: int = 1, values: int = 8) -> bytes:
+def make_vol(*size: int, kind: int = 1, values: int = 8) -> bytes:
     return b"VOL\x03" + struct.pack("<5i6f", kind, *size, 0, 0, 0, 1, 1, 1) + bytes(4 * values)
 
 
 @pytest.mark.parametrize(
     "data",
     [
-        vol(2, 2, 2, -1),
-        vol(0, 2, 2, 1),
-        vol(2, 2, 2, 2),
-        vol(2000, 2000, 2000, 1),
-        vol(2**31 - 1, 2**31 - 1, 2**31 - 1, 1),
-        vol(2, 2, 2, 1, kind=7),
-        vol(2, 2, 2, 1)[:30],
-        b"VOX" + vol(2, 2, 2, 1)[3:],
+        make_vol(2, 2, 2, -1),
+        make_vol(0, 2, 2, 1),
+        make_vol(2, 2, 2, 2),
+        make_vol(2000, 2000, 2000, 1),
+        make_vol(2**31 - 1, 2**31 - 1, 2**31 - 1, 1),
+        make_vol(2, 2, 2, 1, kind=7),
+        make_vol(2, 2, 2, 1)[:30],
+        b"VOX" + make_vol(2, 2, 2, 1)[3:],
         b"",
     ],
 )
-def test_wrong_volumes_are_a_sentence(tmp_path, data):
+def test_invalid_volumes_are_refused(tmp_path, data):
     (tmp_path / "a.vol").write_bytes(data)
     with pytest.raises(NergError, match="a.vol"):
         check_vol(tmp_path / "a.vol")
 
 
-def test_a_volume_of_ours_passes(tmp_path):
+def test_valid_volume_passes(tmp_path):
     from nerg_mi.formats.surfaces import write_volume
 
     write_volume(tmp_path / "a.vol", np.ones((2, 3, 4)), (0, 0, 0), (1, 1, 1))
@@ -203,7 +205,7 @@ def pixels():
 
 
 @pytest.mark.parametrize("step", [601, 300, 37])
-def test_png_is_rounded_as_mitsuba_rounds_it(rgb, tmp_path, pixels, step):
+def test_png_equals_mitsuba(rgb, tmp_path, pixels, step):
     rgb.util.write_bitmap(str(tmp_path / "whole.png"), rgb.Bitmap(pixels), write_async=False)
     with open_image_rows(tmp_path / "parts.png", 20, 601) as write:
         for top in range(0, 601, step):
@@ -214,7 +216,7 @@ def test_png_is_rounded_as_mitsuba_rounds_it(rgb, tmp_path, pixels, step):
     assert np.array_equal(*(np.array(mitsuba_bitmap(tmp_path / f"{n}.png")) for n in ("whole", "parts")))
 
 
-def test_exr_holds_every_row(rgb, tmp_path, pixels):
+def test_exr_contains_all_rows(rgb, tmp_path, pixels):
     with open_image_rows(tmp_path / "parts.exr", 20, 601) as write:
         for top in range(0, 601, 100):
             write(rgb.Bitmap(pixels[top : top + 100]), min(100, 601 - top))
@@ -222,21 +224,21 @@ def test_exr_holds_every_row(rgb, tmp_path, pixels):
 
 
 @pytest.mark.parametrize("name", ["a.exr", "a.png"])
-def test_a_picture_with_rows_missing_is_none(rgb, tmp_path, pixels, name):
+def test_missing_rows_are_an_error(rgb, tmp_path, pixels, name):
     with pytest.raises(ValueError, match="100 of 601|0 of 601"):
         with open_image_rows(tmp_path / name, 20, 601) as write:
             write(rgb.Bitmap(pixels[:100]), 100)
     assert not list(tmp_path.iterdir())
 
 
-def test_the_name_says_the_format(tmp_path):
+def test_unknown_format_is_refused(tmp_path):
     with pytest.raises(NergError, match=".exr or .png"):
         with open_image_rows(tmp_path / "a.bmp", 2, 2):
             pass
 
 
 @pytest.mark.parametrize("short_by", [1, 3000])
-def test_a_file_that_ends_too_early_is_noticed(tmp_path, short_by):
+def test_truncated_file_is_detected(tmp_path, short_by):
     # As on a disk that is full; a limit holds for the whole process, hence in a child.
     script = """
 import resource, signal, sys

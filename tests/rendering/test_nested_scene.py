@@ -58,7 +58,7 @@ def shown(path, out):
 
 
 @pytest.mark.parametrize("where", ["theirs/ours.xml", "elsewhere/ours.xml"])
-def test_light_sensors_and_files_are_theirs(rgb, theirs, tmp_path, where):
+def test_nested_light_sensors_and_files(rgb, theirs, tmp_path, where):
     path, out = theirs(), tmp_path / where
     out.parent.mkdir(exist_ok=True)
     scene = shown(path, out)
@@ -72,7 +72,7 @@ def test_light_sensors_and_files_are_theirs(rgb, theirs, tmp_path, where):
     assert ("<path" in text) == (where[0] == "e") and "theirs" in text and str(tmp_path) not in text
 
 
-def test_their_integrator_stays_what_it_is(rgb, theirs, tmp_path):
+def test_nested_integrator_is_kept(rgb, theirs, tmp_path):
     scene = shown(theirs("direct", THEIRS.replace('<integer name="max_depth" value="2"/>', "")), tmp_path / "a.xml")
     assert scene.integrator().shading.nested.class_name() == "DirectIntegrator"
 
@@ -88,7 +88,7 @@ def test_their_integrator_stays_what_it_is(rgb, theirs, tmp_path):
         ('<!DOCTYPE x [<!ENTITY a "b">]><scene version="3.0.0"/>', "declares an entity"),
     ],
 )
-def test_what_cannot_be_nested(theirs, tmp_path, text, said):
+def test_invalid_scenes_are_refused(theirs, tmp_path, text, said):
     with pytest.raises(NergError, match=said):
         nest_scene(theirs(text=text), tmp_path)
 
@@ -100,7 +100,7 @@ NERG = """<integrator type="nerg"><volume name="gaze" type="gazefield"><string n
 </integrator>"""
 
 
-def test01_the_gaze_field_of_a_file(tmp_path):
+def test01_find_gaze_file(tmp_path):
     path = tmp_path / "a.xml"
     path.write_text(PLAIN.format(NERG))
     assert find_gaze_file(path) == tmp_path / "a.bin"
@@ -111,7 +111,7 @@ def test01_the_gaze_field_of_a_file(tmp_path):
 
 
 @pytest.mark.parametrize("count", [0, 2])
-def test02_there_is_one_integrator(tmp_path, count):
+def test02_exactly_one_integrator_is_required(tmp_path, count):
     path = tmp_path / "a.xml"
     path.write_text(PLAIN.format('<integrator type="nerg"/>' * count))
     with pytest.raises(NergError, match=f"has {count} integrators"):
@@ -119,7 +119,7 @@ def test02_there_is_one_integrator(tmp_path, count):
 
 
 @pytest.mark.slow
-def test03_only_the_gaze_is_another(rgb, tmp_path):
+def test03_replaced_gaze_renders_the_same(rgb, tmp_path):
     """The store with its own gaze field in a file of another name: the same picture."""
     store = demo.find_store_scene()
     other = tmp_path / "other.safetensors"

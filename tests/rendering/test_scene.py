@@ -16,7 +16,7 @@ from nerg_mi.workflows.render import find_sensor
 # ---- Variants that work and that do not, and scenes that are loaded ----
 
 
-def test_the_best_variant_that_works(rgb, monkeypatch):
+def test_best_variant_is_activated(rgb, monkeypatch):
     tried = []
     monkeypatch.setattr(rgb, "set_variant", tried.append)
     monkeypatch.setattr(llvm, "has_cuda", lambda: True)
@@ -25,7 +25,7 @@ def test_the_best_variant_that_works(rgb, monkeypatch):
     assert activate_variant() == "llvm_ad_rgb" and tried == ["cuda_ad_rgb", "llvm_ad_mono", "llvm_ad_rgb"]
 
 
-def test_a_backend_that_cannot_start_is_followed_by_the_next(rgb, monkeypatch):
+def test_failing_backend_falls_back(rgb, monkeypatch):
     def only_llvm(name):
         if name.startswith("cuda"):
             raise ImportError("no device")
@@ -37,7 +37,7 @@ def test_a_backend_that_cannot_start_is_followed_by_the_next(rgb, monkeypatch):
         activate_variant("cuda_ad_rgb")
 
 
-def test_an_unusable_libllvm_is_told_as_such(rgb, monkeypatch):
+def test_unusable_libllvm_is_reported(rgb, monkeypatch):
     def refuse(name):
         raise UnusableLLVM("LLVM 15 cannot")
 
@@ -46,7 +46,7 @@ def test_an_unusable_libllvm_is_told_as_such(rgb, monkeypatch):
         activate_variant()
 
 
-def test_values_of_a_scene(rgb, tmp_path):
+def test_values_for_defaults(rgb, tmp_path):
     (tmp_path / "s.xml").write_text(
         '<scene version="3.0.0"><default name="wide" value="6"/><sensor type="perspective"><film type="hdrfilm">'
         '<integer name="width" value="$wide"/></film></sensor></scene>'
@@ -58,14 +58,14 @@ def test_values_of_a_scene(rgb, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["path", "parallel", "optimize"])
-def test_names_that_mitsuba_has_for_itself(rgb, tmp_path, name):
+def test_reserved_names_are_refused(rgb, tmp_path, name):
     file = tmp_path / "scene.xml"
     file.write_text(f'<scene version="3.0.0"><default name="{name}" value="1"/></scene>')
     with pytest.raises(NergError, match=f'"{name}" is reserved by Mitsuba.*scene.xml"'):
         load_scene(file, {name: "2"})
 
 
-def test_a_scene_that_is_not_there(tmp_path):
+def test_missing_scene_is_reported(tmp_path):
     with pytest.raises(NergError, match="there is no scene file"):
         load_scene(tmp_path / "s.xml")
 
@@ -87,18 +87,18 @@ SCALED = '<shape type="{}"><transform name="to_world"><scale value="{}"/></trans
         ),
     ],
 )
-def test_shapes_and_sensors_beyond_all_places(rgb, tmp_path, inside, said):
+def test_too_distant_shapes_and_sensors_are_refused(rgb, tmp_path, inside, said):
     (tmp_path / "s.xml").write_text(SCENE.format(inside))
     with pytest.raises(NergError, match=f"({said}).* must have coordinates from"):
         load_scene(tmp_path / "s.xml")
 
 
-def test_shapes_as_large_as_can_be_are_taken(rgb, tmp_path):
+def test_largest_shapes_are_accepted(rgb, tmp_path):
     (tmp_path / "s.xml").write_text(SCENE.format(SCALED.format("cube", 9.9e6) + SCALED.format("sphere", 1e-6)))
     assert len(load_scene(tmp_path / "s.xml").shapes()) == 2
 
 
-def test_a_picture_needs_an_integrator(rgb, tmp_path):
+def test_missing_integrator_is_refused(rgb, tmp_path):
     (tmp_path / "s.xml").write_text(SCENE.format('<sensor type="perspective"/>'))
     with pytest.raises(NergError, match="s.xml"):
         find_sensor(tmp_path / "s.xml", load_scene(tmp_path / "s.xml"), 0)
@@ -138,7 +138,7 @@ DEEP = '<shape type="cube">' * 20000 + "</shape>" * 20000
 
 
 # What ends the process without the checks.
-DEADLY = {
+CRASHING = {
     "deep": (scene(DEEP), {}, f"more than {MAX_DEPTH} levels deep"),
     "corner": (scene(shape("ply", "a.ply")), {"a.ply": mesh(999999999)}, "none of its 3 vertices"),
     "volume": (scene(GRID), {"a.vol": EMPTY_VOLUME}, "0 x 0 x 0 voxels"),
@@ -151,22 +151,22 @@ DEADLY = {
 
 def written(folder, name):
     """The scene file of what is deadly, and what is said of it."""
-    text, files, said = DEADLY[name]
+    text, files, said = CRASHING[name]
     (folder / "s.xml").write_text(text)
     for file, data in files.items():
         (folder / file).write_bytes(data)
     return folder / "s.xml", said
 
 
-@pytest.mark.parametrize("name", [name for name in DEADLY if "film" not in name])
-def test_what_would_end_the_process_is_refused_before_it_is_loaded(tmp_path, name):
+@pytest.mark.parametrize("name", [name for name in CRASHING if "film" not in name])
+def test_crashing_scenes_are_refused_before_loading(tmp_path, name):
     path, said = written(tmp_path, name)
     with pytest.raises(NergError, match=said):
         check_scene_file(path)
 
 
 @pytest.mark.parametrize("name", ["corner", "film", "long film"])
-def test_a_command_says_it_in_a_line(tmp_path, name):
+def test_command_reports_one_line(tmp_path, name):
     path, said = written(tmp_path, name)
     main = [sys.executable, "-c", "from nerg_mi.cli import main; main()"]
     run = [*main, "render", path.name, "-o", "a.exr", "-m", "llvm_ad_rgb"]
@@ -183,14 +183,14 @@ def refused(tmp_path, text, said, **defaults):
     assert "\n" not in str(error.value)
 
 
-def test_values_that_grow_with_every_default_are_refused_before_they_are_made(tmp_path):
+def test_exponential_defaults_are_refused(tmp_path):
     grown = "".join(f'<default name="{b}" value="{f"${a}" * 100}"/>' for a, b in zip("abcdef", "bcdefg"))
     (tmp_path / "s.xml").write_text(scene(f'<default name="a" value="{"x" * 1000}"/>{grown}'))
     with pytest.raises(NergError, match="more than 256 MB of XML"):
         check_scene_file(tmp_path / "s.xml")
 
 
-def test_good_scenes_load(rgb, tmp_path):
+def test_valid_scenes_load(rgb, tmp_path):
     (tmp_path / "more").mkdir()
     (tmp_path / "more" / "part.xml").write_text('<scene version="3.0.0"><shape type="cube"/></scene>')
     (tmp_path / "a.ply").write_bytes(mesh(2))
@@ -202,7 +202,7 @@ def test_good_scenes_load(rgb, tmp_path):
     assert len(loaded.shapes()) == 2 and loaded.sensors()[0].sampler().sample_count() == 3
 
 
-def test_values_given_count_and_not_the_defaults(tmp_path):
+def test_given_values_replace_defaults(tmp_path):
     text = scene(spp="$spp").replace("<integrator", '<default name="spp" value="4"/><integrator', 1)
     refused(tmp_path, text, "must lie in 1 .. 16777216, got 0", spp="0")
     refused(tmp_path, text, "got -3", spp="-3")
@@ -220,7 +220,7 @@ def test_entities_are_not_expanded(tmp_path):
     )
 
 
-def test_includes_are_followed_and_do_not_go_round(tmp_path):
+def test_includes_are_followed(tmp_path):
     refused(tmp_path, scene('<include filename="s.xml"/>'), "includes itself")
     (tmp_path / "b.xml").write_text(f'<scene version="3.0.0">{DEEP}</scene>')
     refused(tmp_path, scene('<include filename="b.xml"/>'), 'b.xml" .line 1. nests')
@@ -232,7 +232,7 @@ def test_includes_are_followed_and_do_not_go_round(tmp_path):
 @pytest.mark.parametrize(
     "text, said", [("<scene", "well-formed"), ("", "well-formed"), ("<scene></shape>", "well-formed")]
 )
-def test_what_is_no_xml(tmp_path, text, said):
+def test_invalid_xml_is_refused(tmp_path, text, said):
     refused(tmp_path, text, said)
 
 
@@ -250,13 +250,13 @@ HUGE = {
 
 
 @pytest.mark.parametrize("name", HUGE)
-def test_pictures_of_a_scene_are_looked_at(tmp_path, name):
+def test_textures_are_checked(tmp_path, name):
     (tmp_path / name).write_bytes(HUGE[name] + bytes(40))
     texture = f'<texture name="reflectance" type="bitmap"><string name="filename" value="{name}"/></texture>'
     refused(tmp_path, scene(f'<shape type="cube"><bsdf type="diffuse">{texture}</bsdf></shape>'), "100,000 x 100,000")
 
 
-def test_samples_of_the_option_are_bounded(tmp_path):
+def test_spp_option_is_bounded(tmp_path):
     from nerg_mi.workflows.render import render_file
     from nerg_mi.workflows.scene_commands import PictureOptions
 
@@ -264,7 +264,7 @@ def test_samples_of_the_option_are_bounded(tmp_path):
         render_file(tmp_path / "s.xml", tmp_path / "a.exr", PictureOptions(spp=1 << 31))
 
 
-def test_the_other_ways_in_are_guarded(standins, tmp_path):
+def test_other_entry_points_are_checked(standins, tmp_path):
     from nerg_mi.evaluation import study_subject
     from nerg_mi.train.geometry import load_scene_geometry
     from nerg_mi.workflows.demo import make_demo
@@ -298,7 +298,7 @@ type="mesh_attribute"><string name="name" value="vertex_color"/></texture></bsdf
         ("nx ny nz", "0 0 1", shape("ply", "a.ply"), None),
     ],
 )
-def test_meshes_that_would_be_black_are_refused(tmp_path, columns, value, shown, said):
+def test_meshes_with_unread_colors_are_refused(tmp_path, columns, value, shown, said):
     kind = "float" if columns.startswith("n") else "uchar"
     more = "".join(f"property {kind} {name}\n" for name in columns.split())
     head = f"ply\nformat ascii 1.0\nelement vertex 3\n{PROPERTIES}{more}element face 1\n"

@@ -49,7 +49,7 @@ def camera(rgb):
     )
 
 
-def test_pixels_of_points(rgb, camera):
+def test_points_project_to_pixels(rgb, camera):
     origin, ahead = np.array([1.0, -4, 2]), np.array([-1.0, 4, -1])
     ahead /= np.linalg.norm(ahead)
     right = np.cross(ahead, [0, 0, 1])
@@ -62,7 +62,7 @@ def test_pixels_of_points(rgb, camera):
         np.testing.assert_allclose(project_to_pixel(camera, rgb.Point3f(*point)), wanted, atol=1e-3)
 
 
-def test_what_is_not_in_the_picture(rgb, camera):
+def test_points_outside_the_image(rgb, camera):
     assert project_to_pixel(camera, rgb.Point3f(2, -8, 3)) is None  # behind
     assert project_to_pixel(camera, rgb.Point3f(20, 0, 1)) is None  # beside
 
@@ -73,7 +73,7 @@ CUBE = SceneContent(scene_children=(element("shape", type="cube"),))
 UP = np.array([0.0, 0, 1])
 
 
-def written(folder, **more):
+def write_scene(folder, **more):
     eye, camera = LookAt(np.array([0, 0, 5.0]), np.array([0, 0, 0.0])), LookAt(np.array([4, 1, 2.0]), np.array([0, 0, 0.5]))
     given = {"place": CUBE, "attention": GazeFiles(), "camera": camera, "observer": eye, "up": UP, "width": 24} | more
     scene = SceneText(**given)
@@ -85,8 +85,8 @@ def axis(sensor):
     return np.array(sensor.world_transform().matrix, float).reshape(4, 4)[:3, 2]
 
 
-def test_sensors_stand_and_look_where_they_should(rgb, tmp_path):
-    scene = written(tmp_path, observer=LookAt(np.array([0.0, -3, 1]), np.array([1.0, -2, 0])))
+def test_poses_of_sensors(rgb, tmp_path):
+    scene = write_scene(tmp_path, observer=LookAt(np.array([0.0, -3, 1]), np.array([1.0, -2, 0])))
     camera, own, sphere = load_scene(tmp_path / "scene.xml").sensors()
     to = lambda eye: (eye.target - eye.origin) / np.linalg.norm(eye.target - eye.origin)
     np.testing.assert_allclose(axis(camera), to(scene.camera), atol=1e-6)
@@ -98,8 +98,8 @@ def test_sensors_stand_and_look_where_they_should(rgb, tmp_path):
         np.testing.assert_allclose(np.array(sensor.world_transform().matrix)[:3, 3].ravel(), [0, -3, 1], atol=1e-6)
 
 
-def test_defaults_move_them(rgb, tmp_path):
-    written(tmp_path, observer=LookAt(np.array([0.0, -3, 1]), np.array([1.0, -2, 0])))
+def test_defaults_set_poses(rgb, tmp_path):
+    write_scene(tmp_path, observer=LookAt(np.array([0.0, -3, 1]), np.array([1.0, -2, 0])))
     scene = load_scene(tmp_path / "scene.xml", {"eye": "1, 2, 3", "width": "12", "fov": "40", "spp": "3"})
     camera, own, sphere = scene.sensors()
     for sensor in (own, sphere):
@@ -108,19 +108,19 @@ def test_defaults_move_them(rgb, tmp_path):
     assert float(np.array(rgb.traverse(camera)["x_fov"]).ravel()[0]) == pytest.approx(40)
 
 
-def test_without_an_observer_the_camera_is_it(rgb, tmp_path):
-    written(tmp_path, observer=None)
+def test_camera_is_the_default_observer(rgb, tmp_path):
+    write_scene(tmp_path, observer=None)
     scene = load_scene(tmp_path / "scene.xml")
     assert scene.integrator().observer is None and len(scene.sensors()) == 3
     for sensor in scene.sensors():
         np.testing.assert_allclose(np.array(sensor.world_transform().matrix)[:3, 3].ravel(), [4, 1, 2], atol=1e-6)
 
 
-def test_names_that_others_have_taken(rgb, tmp_path):
+def test_reserved_names_are_avoided(rgb, tmp_path):
     place = SceneContent(
         preamble=(element("default", name="eye", value="9"),), scene_children=CUBE.scene_children, reserved_names=frozenset({"eye", "camera"})
     )
-    written(tmp_path, place=place, lens=Lens(50, 2.0))
+    write_scene(tmp_path, place=place, lens=Lens(50, 2.0))
     text = (tmp_path / "scene.xml").read_text()
     assert '<default name="nerg_eye"' in text and 'origin="$nerg_eye"' in text and 'id="nerg_camera"' in text
     scene = load_scene(tmp_path / "scene.xml", {"nerg_eye": "1, 2, 3"})
@@ -128,14 +128,14 @@ def test_names_that_others_have_taken(rgb, tmp_path):
     assert free_default_name("eye", place.reserved_names) == "nerg_eye" and free_default_name("ahead", place.reserved_names) == "ahead"
 
 
-def test_a_level_direction():
+def test_direction_is_horizontal():
     for target, level in (((2, 0, 7), (1, 0, 0)), ((0, -3, 0), (0, -1, 0))):
         np.testing.assert_allclose(level_direction(LookAt(np.zeros(3), np.array(target, float)), 2 * UP), level, atol=1e-12)
     straight = level_direction(LookAt(np.zeros(3), UP), UP)
     assert straight @ UP == pytest.approx(0) and np.linalg.norm(straight) == pytest.approx(1)
 
 
-def test_names_are_relative_below_a_common_folder(tmp_path):
+def test_relative_paths(tmp_path):
     assert relative_path(tmp_path / "a" / "x.ply", tmp_path / "b") == "../a/x.ply"
     assert relative_path(tmp_path / "x.ply", tmp_path) == "x.ply" and relative_path(tmp_path, tmp_path) == "."
     assert relative_path(Path("/one/x.ply"), Path("/two")) == "/one/x.ply"
@@ -146,7 +146,7 @@ def test_names_are_relative_below_a_common_folder(tmp_path):
 NASTY = "a<b>&\"c\"'d' \n\té"
 
 
-def test_what_is_written_is_read_back():
+def test_document_round_trip():
     nodes = [
         prop("string", "filename", NASTY),
         BlankLine(),
@@ -158,13 +158,13 @@ def test_what_is_written_is_read_back():
     assert root[1].attrib == {"type": "cube", "id": "a"} and root[1][0].get("value") == "1.5"
 
 
-def test_comments_hold_nothing_that_ends_them():
+def test_comments_are_escaped():
     text = format_document([Comment("a -- b --> c ---")], "x--y -")
     assert text.count("-->") == 2 and "--" not in text.replace("<!--", "").replace("-->", "")
     ElementTree.fromstring(text)
 
 
-def test_lines_are_short_and_indented():
+def test_line_length_and_indentation():
     text = format_document(
         [element("sensor", Comment("word " * 100), prop("float", "fov", 70), type="perspective")], "w " * 200
     )
@@ -174,7 +174,7 @@ def test_lines_are_short_and_indented():
 
 
 @pytest.mark.parametrize("name", ["a$b.ply", "a\x01.ply", "a\udc80.ply"])
-def test_names_that_no_scene_file_holds(name):
+def test_invalid_file_names_are_refused(name):
     with pytest.raises(NergError, match="rename the file"):
         check_attribute(name)
     with (

@@ -24,7 +24,7 @@ from nerg_mi.viewer.session import Worker
 # ---- Boxes that are laid around what is seen within a rectangle ----
 
 
-def test01_around_the_foremost():
+def test01_box_fits_nearest_points():
     rng = np.random.default_rng(4)
     thing = np.array([2.0, 0, 1]) + 0.2 * (rng.random((500, 3)) - 0.5)
     wall = np.stack([np.full(500, 9.0), *(4 * rng.random((2, 500)) - 2)], axis=1)
@@ -35,7 +35,7 @@ def test01_around_the_foremost():
         fit_box(thing, 0.01, view, (0.8, 0.8), (0.9, 0.9))
 
 
-def test02_a_rectangle_to_the_right_and_above():
+def test02_rectangle_right_and_above():
     view = PinholeView.look_at((0, 0, 0), (1, 0, 0), (0, 0, 1), 1.0, 1.0)
     right, left = np.array([2, -0.5, 0.5]), np.array([2, 0.5, -0.5])
     points = np.concatenate([np.tile(p, (20, 1)) for p in (right, left)])
@@ -43,7 +43,7 @@ def test02_a_rectangle_to_the_right_and_above():
     assert np.allclose((lower + upper) / 2, right)
 
 
-def test03_a_box_has_twelve_edges():
+def test03_box_has_twelve_edges():
     found = box_edges(Region.create("a", [0, 0, 0], [1, 2, 3]))
     lengths = np.sort(np.abs(found[:, 1] - found[:, 0]).sum(axis=1))
     assert found.shape == (12, 2, 3) and np.allclose(lengths, [1] * 4 + [2] * 4 + [3] * 4)
@@ -53,7 +53,7 @@ def test03_a_box_has_twelve_edges():
 # ---- The panel's tables and files ----
 
 
-def test01_the_largest_share_first():
+def test04_shares_are_sorted():
     cells = lambda text: re.findall(r"<td[^>]*>(.*?)</td>", text)
     text = format_shares({"a": 0.1, "b|<b>": 0.25, "c": 0.0})
     assert cells(text) == ["b|&lt;b&gt;", "25.0 %", "a", "10.0 %", "c", "0.0 %"]
@@ -65,7 +65,7 @@ def test01_the_largest_share_first():
     assert "Outdated" in (old := format_shares({"a": 0.1}, True)) and STALE_STYLE in old
 
 
-def test01_a_small_picture_is_greyed_while_another_is_made():
+def test05_stale_inset_is_grey():
     shown = []
     gui = SimpleNamespace(
         add_image=lambda image, label: shown.append(SimpleNamespace(image=image, label=label)) or shown[0]
@@ -85,11 +85,11 @@ def test01_a_small_picture_is_greyed_while_another_is_made():
 
 
 @pytest.mark.parametrize("value, end", [(0, 1), (0.05, 1), (0.4, 10), (40, 1000), (300, 1000), (2e-5, 1e-4)])
-def test01_a_slider_holds_its_value_in_any_unit(value, end):
+def test06_slider_range_contains_value(value, end):
     assert slider_max(value) == pytest.approx(end)
 
 
-def test02_a_scene_of_what_is_shown(store, tmp_path):
+def test07_copied_view_is_a_scene(store, tmp_path):
     place = SimpleNamespace(made=False)
     options = SimpleNamespace(width=48)
     view = PinholeView.look_at((7, 3, 2), (5, 4, 1), (0, 0, 1), 0.9, 1.5)
@@ -114,7 +114,7 @@ def test02_a_scene_of_what_is_shown(store, tmp_path):
         copy_view(shown, view)
 
 
-def test03_a_png(rgb):
+def test08_png_has_size_and_text(rgb):
     worker = Worker(lambda error: None)
     try:
         data = encode_picture(SimpleNamespace(worker=worker), np.zeros((4, 6, 3), np.uint8), {"Comment": "a shelf"})
@@ -129,14 +129,14 @@ def test03_a_png(rgb):
 OF_ALL = "visible to the observer", "observer depth", "evaluations of density", "evaluations of colour"
 
 
-def test01_only_what_the_scene_has(store, room_scene):
+def test09_layers_of_a_scene(store, room_scene):
     titles = [la.title for la in layers.list_layers(room_scene)]
     assert titles == ["colour", "depth", "opacity", *(f"position {axis}" for axis in "XYZ"), *OF_ALL]
     found = [la.title for la in layers.list_layers(nerg.Scene.load(store))]
     assert {"gaze", "colour", "depth", *OF_ALL, "features 0"} < set(found) and "uncertainty of gaze" not in found
 
 
-def test01_a_factor_that_a_variant_lacks_is_no_layer(room, gaze_fields, tmp_path):
+def test10_missing_factor_has_no_layer(room, gaze_fields, tmp_path):
     factors = {"what surfaces attract", "what the observer gives"}
     for path, expected in zip(gaze_fields, (factors, {"what surfaces attract"})):
         scene = tmp_path / "with.xml"
@@ -145,7 +145,7 @@ def test01_a_factor_that_a_variant_lacks_is_no_layer(room, gaze_fields, tmp_path
         assert "gaze" in titles and titles & factors == expected
 
 
-def test01_a_channel_is_a_layer():
+def test11_each_channel_has_a_layer():
     found = dict(position=np.arange(12.0).reshape(2, 2, 3), depth=np.ones((2, 2)), features=np.ones((2, 5)) * range(5))
     for name, expected in (("position.Y", [[1, 4], [7, 10]]), ("depth", np.ones((2, 2))), ("features.3", [3, 3])):
         assert np.array_equal(get_layer(name).select_values(found), expected), name
@@ -153,7 +153,7 @@ def test01_a_channel_is_a_layer():
     assert get_layer("position.Y").quantity == "position" and get_layer("position.Y").title == "position Y"
 
 
-def test02_heat_is_that_of_pictures():
+def test12_heat_equals_overlay():
     rng = np.random.default_rng(2)
     color, gaze, mask = rng.random((8, 9, 3)), rng.random((8, 9)), np.ones((8, 9), bool)
     found = layers.colorize(get_layer("gaze"), color, gaze, mask, Scale(0, 0.7, "magma"))
@@ -163,7 +163,7 @@ def test02_heat_is_that_of_pictures():
     assert np.array_equal(points, found.reshape(-1, 3))
 
 
-def test03_no_data_is_hatched():
+def test13_missing_data_is_hatched():
     mask = np.ones((24, 24), bool)
     mask[:12] = False
     given = get_layer("depth"), np.zeros((24, 24, 3)), np.full((24, 24), 0.5), mask, Scale(0, 1)
@@ -175,7 +175,7 @@ def test03_no_data_is_hatched():
     assert (shown[:12][~drawn] > plain[:12][~drawn]).all()
 
 
-def test04_ranges_are_those_of_the_values():
+def test14_automatic_range():
     values, mask = np.linspace(1, 3, 1000), np.ones(1000, bool)
     low, high = layers.choose_range(get_layer("depth"), values, mask)
     assert low == pytest.approx(1.01) and high == pytest.approx(2.99)
@@ -187,20 +187,20 @@ def test04_ranges_are_those_of_the_values():
 
 
 @pytest.mark.parametrize("given", [(1.0, 1.0), (0.0, np.nan), (2.0, 1.0)])
-def test05_wrong_ranges_are_told(given):
+def test15_invalid_range_is_refused(given):
     with pytest.raises(NergError, match="the lower end of a range"):
         Scale(*given)
     with pytest.raises(NergError, match="perceptually uniform"):
         Scale(0, 1, "jet")
 
 
-def test06_hidden_is_dark():
+def test16_occluded_points_are_dark():
     color, mask = np.full((1, 2, 3), 0.5), np.ones((1, 2), bool)
     seen, hidden = layers.colorize(get_layer("visibility"), color, np.array([[1.0, 0.0]]), mask, Scale())[0].astype(int)
     assert seen.sum() > 2 * hidden.sum() and hidden[2] > hidden[0]
 
 
-def test07_the_legend_has_both_ends():
+def test17_legend_shows_both_ends():
     text = layers.format_legend(get_layer("gaze"), Scale(0.0, 0.1234))
     assert ">0<" in text and ">0.123<" in text and ">1/sr<" in text
     assert "hidden" in layers.format_legend(get_layer("visibility"), Scale())

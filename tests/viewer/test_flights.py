@@ -34,7 +34,7 @@ HOME = PinholeView.look_at((-2, 0, 1), (2, 0, 0), (0, 0, 1), 0.8, 1.37)
 
 
 @pytest.fixture
-def film_of(room, tmp_path):
+def make_video(room, tmp_path):
     """A function that makes a film of a few frames of the room, and the list of what it told."""
 
     def make(seconds=0.5):
@@ -53,9 +53,9 @@ def film_of(room, tmp_path):
     return make
 
 
-def test01_frames_are_those_of_the_flight(film_of, tmp_path):
+def test01_video_contains_all_frames(make_video, tmp_path):
     av = pytest.importorskip("av")
-    film, told, ended = film_of()
+    film, told, ended = make_video()
     worker, turns = Worker(ended.append), []
 
     def others():
@@ -77,9 +77,9 @@ def test01_frames_are_those_of_the_flight(film_of, tmp_path):
     assert np.abs(frames[-1] - frames[0]).mean() > 3
 
 
-def test02_cancelled_it_leaves_nothing(film_of, tmp_path):
+def test02_cancelled_video_leaves_no_file(make_video, tmp_path):
     pytest.importorskip("av")
-    film, told, ended = film_of(5.0)
+    film, told, ended = make_video(5.0)
     steps = film.steps()
     for _ in range(4):
         next(steps)
@@ -90,30 +90,30 @@ def test02_cancelled_it_leaves_nothing(film_of, tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["room.xml", "view.frames.csv", "view.xml"]
 
 
-def test03_dropped_steps_end_it_too(film_of):
+def test03_closing_the_generator_ends_the_thread(make_video):
     pytest.importorskip("av")
-    film, _, ended = film_of(5.0)
+    film, _, ended = make_video(5.0)
     steps = film.steps()
     next(steps)
     steps.close()
     assert [type(error) for error in ended] == [KeyboardInterrupt]
 
 
-def test04_without_pyav_it_says_so(film_of, monkeypatch):
+def test04_missing_pyav_is_reported(make_video, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
-    film, _, ended = film_of()
+    film, _, ended = make_video()
     for _ in film.steps():
         pass
     assert "nerg-mi[video]" in str(ended[0])
 
 
 @pytest.mark.parametrize("aspect, width", [(1.5, 720), (1.783, 481), (0.6, 33), (3.0, 2)])
-def test05_sides_are_even(aspect, width):
+def test05_frame_sizes_are_even(aspect, width):
     view, wide = make_even(PinholeView.look_at((0, 0, 0), (1, 0, 0), (0, 0, 1), 0.8, aspect), width)
     assert wide % 2 == 0 and view.picture_height(wide) % 2 == 0 and min(wide, view.picture_height(wide)) >= 16
 
 
-def test06_it_is_drawn_as_the_layer_is():
+def test06_video_options_of_a_layer():
     frames = Path("frames.csv")
     gaze = make_video_options(get_layer("gaze"), Scale(0, 0.4, "magma"), frames, 25, "llvm_ad_rgb")
     assert (gaze.overlay, gaze.vmax, gaze.cmap) == ("gaze", 0.4, "magma")
@@ -130,7 +130,7 @@ def view(x, ahead=(0, 1, 0)):
     return PinholeView.look_at((x, 0, 1), np.add((x, 0, 1), ahead), (0, 0, 1), 0.9, 1.5)
 
 
-def test01_it_passes_the_views():
+def test07_flight_passes_through_key_views():
     kept = [view(0), view(1), view(3, (1, 0, 0))]
     found = interpolate_views(kept, 2.0, 10)
     assert len(found) == 21
@@ -140,7 +140,7 @@ def test01_it_passes_the_views():
     assert (steps > 0).all() and steps[0] < steps[5], "it starts from rest"
 
 
-def test02_frames_are_read_again(tmp_path):
+def test08_frames_file_round_trip(tmp_path):
     (tmp_path / "f.csv").write_text(format_frames(interpolate_views([view(0), view(1)], 1.0, 4)), newline="")
     frames = read_frames(tmp_path / "f.csv")
     assert len(frames) == 5 and list(frames[0]) == ["view_camera", "view_target"]
@@ -149,7 +149,7 @@ def test02_frames_are_read_again(tmp_path):
 
 
 @pytest.mark.parametrize("views, seconds, fps", [([], 1, 25), ([view(0)], 1, 25), ([view(0), view(1)], 1e6, 120)])
-def test03_what_is_no_flight(views, seconds, fps):
+def test09_invalid_flights_are_refused(views, seconds, fps):
     with pytest.raises(NergError, match="a flight"):
         interpolate_views(views, seconds, fps)
 
@@ -168,7 +168,7 @@ class Client:
         self.files[name] = data
 
 
-def test01_a_video_is_sent(room):
+def test10_video_is_sent_to_the_browser(room):
     require("viser")
     pytest.importorskip("av")
     client = Client()

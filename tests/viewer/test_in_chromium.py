@@ -31,7 +31,7 @@ def until(what, seconds=60.0):
     raise AssertionError("it did not come about in time")
 
 
-def pixels(driver):
+def read_pixels(driver):
     """What the browser shows (height, width, 3), float."""
     import mitsuba as mi
 
@@ -42,7 +42,7 @@ def pixels(driver):
     return np.array(mi.Bitmap(stream))[..., :3].astype(float)
 
 
-def on_screen(driver, view: PinholeView, point) -> tuple[int, int]:
+def to_screen(driver, view: PinholeView, point) -> tuple[int, int]:
     """Where ``point`` is in the window, in pixels."""
     away = np.asarray(point, float) - view.origin
     depth, rise = away @ view.forward, np.tan(view.fov / 2)
@@ -92,7 +92,7 @@ def window_of(running):
     return until(lambda: list(running.page.windows.values()))[-1]
 
 
-def refined(running, window):
+def wait_for_picture(running, window):
     """The window's picture, once it is whole, and the browser has had time to show it."""
     until(lambda: window.shows_picture and window.last_picture is not None and window.last_picture[0].is_final)
     until(lambda: running.page.session.worker.is_idle)
@@ -100,17 +100,17 @@ def refined(running, window):
     return window.last_picture
 
 
-def drawn(driver):
+def wait_for_canvas(driver):
     """What the browser shows, once that is no empty canvas: the left half, beside the panel and below the note on
     software rendering. A busy machine may need a while for it."""
-    return until(lambda: (found := pixels(driver))[250:600, :800].std() > 20 and [found])[0]
+    return until(lambda: (found := read_pixels(driver))[250:600, :800].std() > 20 and [found])[0]
 
 
-def test01_it_loads_and_is_refined(running, driver):
+def test01_page_loads_and_refines(running, driver):
     window = window_of(running)
     until(lambda: window.cloud is not None)
-    refined(running, window)
-    shown = drawn(driver)
+    wait_for_picture(running, window)
+    shown = wait_for_canvas(driver)
     assert running.page.problem == ""
     # It is the picture that was rendered: its mean colours, cell by cell.
     colors = window.last_picture[1].astype(float)
@@ -121,39 +121,39 @@ def test01_it_loads_and_is_refined(running, driver):
     assert np.corrcoef(own.ravel(), seen.ravel())[0, 1] > 0.8
 
 
-def test02_the_observer_is_dragged_and_the_picture_changes(running, driver):
+def test02_dragging_the_observer_changes_the_picture(running, driver):
     session, window = running.page.session, window_of(running)
     running.page.place_observer(np.array([5.6, 3.6, 1.6]), np.eye(3))
-    refined(running, window)
-    before, numbers, at = pixels(driver), window.last_picture[0].values["gaze"].copy(), session.observer.copy()
-    start = on_screen(driver, window.view, at + np.array([0.3, 0, 0]))
+    wait_for_picture(running, window)
+    before, numbers, at = read_pixels(driver), window.last_picture[0].values["gaze"].copy(), session.observer.copy()
+    start = to_screen(driver, window.view, at + np.array([0.3, 0, 0]))
     drag(driver, start, (start[0] + 90, start[1] + 30))
     until(lambda: not np.array_equal(session.observer, at), 10)
     assert np.abs(session.observer - at)[1:].max() < 1e-3 and abs(session.observer[0] - at[0]) > 0.05, "along its arrow"
-    refined(running, window)
-    assert np.abs(pixels(driver) - before)[250:600, :800].mean() > 1
+    wait_for_picture(running, window)
+    assert np.abs(read_pixels(driver) - before)[250:600, :800].mean() > 1
     gaze = window.last_picture[0].values["gaze"]
     assert np.abs(gaze - numbers).max() > 0.05 * numbers.max()
     assert session.finished_observer is not None and np.array_equal(session.finished_observer, session.observer)
     assert np.allclose(running.page._observer.position, session.observer)
 
 
-def test03_the_camera_is_moved_by_mouse(running, driver):
+def test03_mouse_moves_the_camera(running, driver):
     window = window_of(running)
-    refined(running, window)
-    before, at = pixels(driver), window.view
+    wait_for_picture(running, window)
+    before, at = read_pixels(driver), window.view
     drag(driver, (500, 450), (650, 470))
     until(lambda: not np.allclose(window.view.origin, at.origin), 10)
-    refined(running, window)
-    assert np.abs(pixels(driver) - before)[250:600, :800].mean() > 3
+    wait_for_picture(running, window)
+    assert np.abs(read_pixels(driver) - before)[250:600, :800].mean() > 3
 
 
-def test04_two_browsers_have_one_observer_and_cameras_of_their_own(running, driver):
+def test04_browsers_share_the_observer_but_not_the_camera(running, driver):
     first = window_of(running)
     with chromium(700, 500) as other:
         other.get(running.address)
         second = until(lambda: next((w for w in running.page.windows.values() if w is not first), None))
-        refined(running, second)
+        wait_for_picture(running, second)
         assert len(running.page.windows) == 2
         view = first.view
         drag(other, (60, 200), (150, 210))
@@ -163,28 +163,28 @@ def test04_two_browsers_have_one_observer_and_cameras_of_their_own(running, driv
         assert first.view is view
         running.page.place_observer(np.array([4.4, 2.8, 1.6]))
         for window in (first, second):
-            refined(running, window)
+            wait_for_picture(running, window)
         assert not np.array_equal(first.last_picture[1], second.last_picture[1])
     until(lambda: len(running.page.windows) == 1, 20)
 
 
-def test05_reloaded_it_is_as_before(running, driver):
+def test05_reload_keeps_the_state(running, driver):
     running.page.place_observer(np.array([6.2, 3.0, 1.6]))
     old = window_of(running)
     driver.refresh()
     window = until(lambda: next((w for w in running.page.windows.values() if w is not old), None))
-    refined(running, window)
+    wait_for_picture(running, window)
     assert np.allclose(running.page.session.observer, [6.2, 3.0, 1.6])
-    drawn(driver)
+    wait_for_canvas(driver)
     assert running.page.problem == ""
 
 
-def test05b_what_is_out_of_date_is_grey_and_named(running, driver):
+def test05b_stale_contents_are_grey(running, driver):
     """While the render thread has something else to do, the heat of the observer before is not that of this one."""
     session, window = running.page.session, window_of(running)
-    refined(running, window)
+    wait_for_picture(running, window)
     until(lambda: not session.stale_points_reason and not session.are_shares_stale, 120)
-    colorful = lambda: np.ptp(pixels(driver)[250:600, :800], axis=-1).mean()
+    colorful = lambda: np.ptp(read_pixels(driver)[250:600, :800], axis=-1).mean()
     text = lambda: driver.find_element("tag name", "body").text
     fresh, go = colorful(), threading.Event()
     assert "Grey:" not in text() and "utdated" not in text()
@@ -201,7 +201,7 @@ def test05b_what_is_out_of_date_is_grey_and_named(running, driver):
         until(lambda: words in text() and colorful() < 0.5 * fresh, 20)
         assert "Observer view (grey: outdated)" in text() and "Computing: picture" in text()
         go.set()
-        refined(running, window)
+        wait_for_picture(running, window)
         until(lambda: "Grey:" not in text() and "utdated" not in text())
 
     held(lambda: running.page.place_observer(np.array([4.4, 2.8, 1.6])), "Grey: gaze of a previous observer position")
@@ -215,18 +215,18 @@ def test05b_what_is_out_of_date_is_grey_and_named(running, driver):
 
     held(lambda: show("depth"), "Grey: the points do not show depth")
     show("gaze")
-    refined(running, window)
+    wait_for_picture(running, window)
 
 
-def test05c_nobody_is_left_in_a_shelf(running, driver):
+def test05c_camera_and_observer_leave_solids(running, driver):
     """The camera, nor the observer where they are dragged."""
     session, window = running.page.session, window_of(running)
-    refined(running, window)
+    wait_for_picture(running, window)
     shelf = np.array([5.4, 3.6, 0.8])
     window.client.camera.position = tuple(shelf)
     # A browser under load tells its old camera once more before it follows.
     until(lambda: window.message and np.linalg.norm(window.view.origin - shelf) > 0.2, 60)
-    refined(running, window)
+    wait_for_picture(running, window)
     until(lambda: "inside a solid" in window.status.content)
     # Who was put somewhere is dragged from there.
     running.page.place_observer(session.observer + (0, 0, 0.5))
@@ -235,13 +235,13 @@ def test05c_nobody_is_left_in_a_shelf(running, driver):
     running.page._on_drag("end")
     assert np.allclose(session.observer, shelf)
     until(lambda: not np.allclose(session.observer, shelf), 30)
-    refined(running, window)
+    wait_for_picture(running, window)
     away = session.observer - before
     assert np.linalg.norm(np.cross(away, shelf - before)) < 1e-3 and 0 < np.linalg.norm(away)
     assert np.allclose(running.page._observer.position, session.observer) and running.page.problem == ""
 
 
-def test05d_what_is_no_position_is_refused(running, driver, monkeypatch):
+def test05d_invalid_positions_are_refused(running, driver, monkeypatch):
     """As a page that is not ours could send it."""
     page, session = running.page, running.page.session
     before = session.observer.copy()
@@ -273,7 +273,7 @@ def test06_no_request_leaves_the_machine(running, driver):
     assert not [e for e in driver.get_log("browser") if e["level"] == "SEVERE"]
 
 
-def test07_the_page_may_reach_nobody_else(running, driver):
+def test07_page_cannot_reach_other_hosts(running, driver):
     said = driver.execute_async_script(
         "const done = arguments[0];"
         "document.addEventListener('securitypolicyviolation', e => done(e.violatedDirective));"
@@ -282,7 +282,7 @@ def test07_the_page_may_reach_nobody_else(running, driver):
     assert said == "connect-src"
 
 
-def test08_nothing_is_left_running(rgb, room):
+def test08_no_thread_or_port_is_left(rgb, room):
     import threading
 
     require("viser")

@@ -140,7 +140,7 @@ class Panel:
 pytestmark = pytest.mark.slow
 
 
-def two_people() -> nerg.Rays:
+def make_rays() -> nerg.Rays:
     """Ada, of the cohort young, walks along x for four seconds, and Bob stands still."""
     t = np.tile(np.arange(0, 4, 0.1), 2)
     person = np.repeat([0, 1], 40)
@@ -160,7 +160,7 @@ def running(tmp_path_factory):
     if not all((path.parent / name).is_file() for name in demo.CHECKPOINTS.values()):
         pytest.skip("the store's fields are not here: python -m nerg_mi.scenes.store.make")
     rays = tmp_path_factory.mktemp("rays") / "rays.npz"
-    two_people().save(rays)
+    make_rays().save(rays)
     with open_viewer([path, rays], ViewOptions(port=0, width=48, spp=1)) as found:
         yield found
 
@@ -180,7 +180,7 @@ def window_of(running):
     return next(iter(running.page.windows.values()))
 
 
-def test01_layers_and_their_scale(running, panel):
+def test01_layer_and_color_scale(running, panel):
     session, window = running.page.session, window_of(running)
     panel.choose("Layer", "depth")
     until(lambda: session.display.layer.title == "depth")
@@ -215,7 +215,7 @@ def test02_observer_and_camera(running, panel):
     until(lambda: np.allclose(window.view.origin, session.observer, atol=1e-3))
 
 
-def test03_from_above_and_what_is_saved(running, panel):
+def test03_view_from_above_and_saved_files(running, panel):
     session, window = running.page.session, window_of(running)
     panel.open("Flight", "Add view")
     panel.open("Camera", "View from above")
@@ -245,7 +245,7 @@ def test03_from_above_and_what_is_saved(running, panel):
     until(lambda: np.allclose(window.view.origin, session.home_view.origin, atol=1e-3) and session.ceiling is None)
 
 
-def test04_a_flight_becomes_a_video(running, panel):
+def test04_flight_is_rendered_as_video(running, panel):
     av = pytest.importorskip("av")
     panel.write("Duration (s)", "0.1")
     panel.press("Render video (MP4)")
@@ -263,7 +263,7 @@ def test04_a_flight_becomes_a_video(running, panel):
     until(lambda: "Cancel video" not in panel.texts())
 
 
-def test05_people_and_their_time(running, panel):
+def test05_observer_follows_a_participant(running, panel):
     session = running.page.session
     panel.open("Participants", "Observer follows")
     panel.choose("Observer follows", "Ada")
@@ -272,7 +272,7 @@ def test05_people_and_their_time(running, panel):
     until(lambda: np.allclose(session.observer, [5, 3, 1.6], atol=0.2) and session.observer[0] > 4.5)
 
 
-def test06_an_area_is_drawn_named_and_saved(running, panel):
+def test06_area_is_drawn_and_saved(running, panel):
     session = running.page.session
     until(lambda: session.proxy is not None)
     panel.open("Areas of interest", "Draw box in view")
@@ -292,7 +292,7 @@ def test06_an_area_is_drawn_named_and_saved(running, panel):
     assert not [e for e in panel.driver.get_log("browser") if e["level"] == "SEVERE"]
 
 
-def test07_gaze_fields_to_choose_among(running, tmp_path):
+def test07_gaze_field_can_be_switched(running, tmp_path):
     """Two of them, of which one lacks a factor: other layers, and the pictures are made anew."""
     (tmp_path / "room.xml").write_text(ROOM)
     with open_viewer(

@@ -40,7 +40,7 @@ def last(steps):
     return [one for one in steps if one is not None][-1]
 
 
-def test01_points_lie_on_the_surfaces(room_scene):
+def test01_points_are_on_surfaces(room_scene):
     proxies = [p for p in gather_points(room_scene, [np.array([0, 0, 0.5])], max_positions=3) if p is not None]
     assert len(proxies) == 2 and len(proxies[0].points) < len(proxies[1].points)
     x, y, z = proxies[-1].points.T.astype(float)
@@ -51,7 +51,7 @@ def test01_points_lie_on_the_surfaces(room_scene):
     assert (lower > -3.01).all() and (upper < 3.01).all() and upper[2] > 0.9
 
 
-def test01_and_on_a_floor_of_splats(rgb):
+def test01b_points_are_on_splats(rgb):
     x, y = (v.ravel() for v in np.meshgrid(np.linspace(-2, 2, 21), np.linspace(-2, 2, 21)))
     n = len(x)
     centers, turns = np.stack([x, y, 0 * x], axis=1), np.tile([1.0, 0, 0, 0], (n, 1))
@@ -61,7 +61,7 @@ def test01_and_on_a_floor_of_splats(rgb):
     assert inside.sum() > 1000 and np.abs(points[inside, 2]).max() < 0.03
 
 
-def test02_one_point_in_a_cell():
+def test02_one_point_per_cell():
     points = np.random.default_rng(1).random((200_000, 3))
     proxy = downsample_points(
         [(points[:100_000], points[:100_000]), (points[100_000:], points[100_000:])], max_points=5000
@@ -73,7 +73,7 @@ def test02_one_point_in_a_cell():
     assert len(nothing.points) == 0 and [count for count, _ in nothing.levels] == [0] * NUM_LEVELS
 
 
-def test03_gaze_on_points_is_that_of_the_integrator(store):
+def test03_gaze_on_points_equals_integrator(store):
     scene = nerg.Scene.load(store, width=96, height=64)
     eye = np.array([4.4, 2.8, 1.6])
     seen = nerg.render(scene, observers=eye, quantities=["position", "gaze", "opacity"], spp=1)
@@ -89,7 +89,7 @@ def test03_gaze_on_points_is_that_of_the_integrator(store):
     assert np.corrcoef(baked["gaze"][met], true[met])[0, 1] > 0.97
 
 
-def test04_what_is_hidden_is_known(room_scene):
+def test04_occluded_points_are_invisible(room_scene):
     # Behind the box, in front of it, and beside it.
     points = np.array([[2.5, 0, 0.01], [0.5, 0, 0.01], [1.5, 1.5, 0.01]], np.float32)
     proxy = order_points(points, points, 0.1)
@@ -98,7 +98,7 @@ def test04_what_is_hidden_is_known(room_scene):
     assert np.allclose(baked["visibility"], ~hidden, atol=1e-3) and "gaze" not in baked
 
 
-def test05_the_first_points_are_spread_as_all():
+def test05_levels_cover_the_scene_evenly():
     points = np.random.default_rng(1).random((200_000, 3)) * [8, 6, 0.01]
     proxy = downsample_points([(points, points)], max_points=40_000)
     counts = [count for count, _ in proxy.levels]
@@ -113,7 +113,7 @@ def test05_the_first_points_are_spread_as_all():
     assert np.array_equal(proxy.nearest, nearest)
 
 
-def test06_each_step_of_the_gaze_is_better(store):
+def test06_gaze_improves_with_each_step(store):
     scene = nerg.Scene.load(store, width=96, height=64)
     eye, home = np.array([4.4, 2.8, 1.6]), np.array([6.3, 3.0, 1.6])
     proxy = last(gather_points(scene, [eye, home], max_positions=4))
@@ -125,7 +125,7 @@ def test06_each_step_of_the_gaze_is_better(store):
     assert off[0] < 0.35 and sorted(off, reverse=True) == off and off[-1] == 0
 
 
-def test07_who_is_put_into_something_is_put_out_before_it(room_scene):
+def test07_position_in_a_solid_is_moved_out(room_scene):
     """The box reaches from 1 to 2 along x."""
     eyes = [np.array([0, 0, 0.5]), np.array([-2, 0, 1.0])]
     proxy = last(gather_points(room_scene, eyes, max_positions=4))
@@ -150,7 +150,7 @@ def test07_who_is_put_into_something_is_put_out_before_it(room_scene):
 QUANTITIES = ["color", "depth", "opacity", "visibility"]
 
 
-def test01_the_last_picture_is_that_of_the_integrator(room_scene):
+def test08_final_picture_equals_integrator(room_scene):
     view = PinholeView.from_sensor(room_scene.sensor(0))
     steps = list(refine(room_scene, view, np.array([0, 0, 0.5]), QUANTITIES, 48, 64, BandPace()))
     pictures = [p for p in steps if p is not None]
@@ -173,7 +173,7 @@ def test01_the_last_picture_is_that_of_the_integrator(room_scene):
     assert errors[-1] < 0.5 * errors[0]
 
 
-def test02_equal_seeds_give_equal_pictures_whatever_the_bands(room_scene):
+def test09_equal_seeds_give_equal_pictures(room_scene):
     view = PinholeView.from_sensor(room_scene.resolve_sensor(0))
     names = ["depth", "opacity"]
     one, other = BandPace(), BandPace()
@@ -183,7 +183,7 @@ def test02_equal_seeds_give_equal_pictures_whatever_the_bands(room_scene):
     assert np.allclose(first.values["depth"], second.values["depth"], atol=1e-5)
 
 
-def test03_a_picture_that_is_left_off_is_not_gone_on_with(room_scene, monkeypatch):
+def test10_closed_refinement_traces_no_more(room_scene, monkeypatch):
     import nerg_mi.viewer.points as module
 
     traced = []
@@ -196,7 +196,7 @@ def test03_a_picture_that_is_left_off_is_not_gone_on_with(room_scene, monkeypatc
     assert traced == [BAND_SIZES[0]]
 
 
-def test04_the_pace_follows_the_time(monkeypatch):
+def test11_band_size_adapts_to_time(monkeypatch):
     pace = BandPace()
     for _ in range(10):
         pace.record(0.01)
@@ -208,7 +208,7 @@ def test04_the_pace_follows_the_time(monkeypatch):
     assert pace.num_rays == BAND_SIZES[0]
 
 
-def test05_from_above_the_ceiling_is_cut_off(room_scene):
+def test12_ceiling_is_hidden_from_above(room_scene):
     up = np.array([0.0, 0, 1])
     view = PinholeView.look_at((1.5, 0, 5), (1.5, 0.01, 0), up, 0.3, 1.0)
     whole = list(refine(room_scene, view, None, ["depth", "opacity"], 32, 1, BandPace()))[-1]
@@ -220,7 +220,7 @@ def test05_from_above_the_ceiling_is_cut_off(room_scene):
     assert room_scene.integrator.ceiling is None
 
 
-def test_integrals_are_rough_until_the_last_picture(store):
+def test13_integrals_are_rough_until_the_final_picture(store):
     scene = nerg.Scene.load(store)
     own = scene.integrator.observer_settings
     with rough_integrals(scene):
@@ -235,7 +235,7 @@ def test_integrals_are_rough_until_the_last_picture(store):
 # ---- A page's camera: its frame, and the rays of its picture ----
 
 
-def test01_the_frame_of_a_page():
+def test14_view_from_page():
     # Ahead along +y, down along -z: as a camera that is held level and looks north.
     turn = Rotation.from_matrix(np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0.0]]))
     x, y, z, w = turn.as_quat()
@@ -247,7 +247,7 @@ def test01_the_frame_of_a_page():
     assert view.aspect == 1.5 and view.fov == 0.8 and np.allclose(view.origin, [1, 2, 3])
 
 
-def test02_rays_are_those_of_the_same_mitsuba_sensor(rgb):
+def test15_rays_equal_mitsuba_sensor(rgb):
     view = PinholeView.look_at((1, 2, 3), (4, 3, 1), (0, 0, 1), 0.9, 1.5)
     sensor = rgb.load_dict(view.to_camera(30).to_dict())
     height = view.picture_height(30)
@@ -259,7 +259,7 @@ def test02_rays_are_those_of_the_same_mitsuba_sensor(rgb):
     assert np.allclose(own, np.array(ray.d).T, atol=1e-5)
 
 
-def test03_a_sensor_and_back(rgb):
+def test16_view_from_sensor(rgb):
     view = PinholeView.look_at((1, 2, 3), (4, 3, 1), (0, 0, 1), 0.9, 1.5)
     found = PinholeView.from_sensor(rgb.load_dict(view.to_camera(300).to_dict()))
     for name in ("origin", "forward", "up", "fov", "aspect"):
@@ -268,12 +268,12 @@ def test03_a_sensor_and_back(rgb):
 
 
 @pytest.mark.parametrize("up", [(0, 0, 1), (0, 0, -1)])
-def test04_straight_down_there_is_an_up_all_the_same(up):
+def test17_vertical_view_has_an_up_direction(up):
     view = PinholeView.look_at((0, 0, 5), (0, 0, 0), up, 0.9, 1.0)
     assert math.isclose(np.linalg.norm(view.up), 1) and abs(view.up @ view.forward) < 1e-9
 
 
-def test05_a_heading_is_level():
+def test18_heading_is_horizontal():
     for ahead in ((1, 2, -0.7), (0, 0, -1), (0, 0, 1)):
         turn = make_heading(np.array(ahead, float) / np.linalg.norm(ahead), np.array([0.0, 0, 1]))
         assert np.allclose(turn.T @ turn, np.eye(3)) and np.linalg.det(turn) == pytest.approx(1)

@@ -22,7 +22,7 @@ EYE = np.array([4.6, 3.1, 1.6])
 
 
 @pytest.mark.nightly
-def test01_pictures_are_alike(store, tmp_path):
+def test01_copied_scene_renders_the_same_picture(store, tmp_path):
     shown = ViewSettings(VIEW, EYE, ("depth", "opacity", "gaze"), 96, 16, 0.05)
     path = tmp_path / "elsewhere" / "view.xml"
     path.parent.mkdir()
@@ -43,7 +43,7 @@ def test01_pictures_are_alike(store, tmp_path):
     assert np.abs(other.color[0] - viewed["color"]).mean() / viewed["color"].mean() > 0.2
 
 
-def test02_the_settings_are_those_that_were_viewed(store, tmp_path):
+def test02_copied_scene_has_the_settings(store, tmp_path):
     path = tmp_path / "view.xml"
     path.write_text(copy_scene(store, ViewSettings(VIEW, EYE, ("depth",), 48, 3, 0.25)))
     scene = nerg.Scene.load(path, view_camera="1, 2, 1.5", view_observer="2, 2, 1.7")
@@ -53,7 +53,7 @@ def test02_the_settings_are_those_that_were_viewed(store, tmp_path):
     assert np.allclose(PinholeView.from_sensor(scene.resolve_sensor(0)).origin, [1, 2, 1.5])
 
 
-def test03_shapes_and_no_observer(room, tmp_path):
+def test03_shapes_without_observer(room, tmp_path):
     path = tmp_path / "view.xml"
     path.write_text(copy_scene(room, ViewSettings(VIEW, None, ("depth", "visibility"), 48, 1, 0.0)))
     scene = nerg.Scene.load(path)
@@ -61,7 +61,7 @@ def test03_shapes_and_no_observer(room, tmp_path):
 
 
 @pytest.mark.parametrize("up", [(0, 0, 1), (0.1, -0.2, 2)])
-def test04_what_is_cut_off_from_above(room, tmp_path, up):
+def test04_hidden_ceiling_is_copied(room, tmp_path, up):
     view, up = PinholeView.look_at((1.5, 0, 5), (1.5, 0.01, 0), (0, 0, 1), 0.3, 1.0), np.array(up, float)
     path = tmp_path / "view.xml"
     path.write_text(copy_scene(room, ViewSettings(view, None, ("depth",), 32, 1, 0.0, (0.5, up))))
@@ -77,7 +77,7 @@ def test04_what_is_cut_off_from_above(room, tmp_path, up):
     assert nerg.render(nerg.Scene.load(again), quantities=["depth"]).depth[0, 16, 16] == pytest.approx(4, abs=0.02)
 
 
-def test05_without_an_integrator_there_is_nothing_to_copy(tmp_path, rgb):
+def test05_scene_without_integrator_is_refused(tmp_path, rgb):
     path = tmp_path / "a.xml"
     path.write_text('<scene version="3.0.0"><shape type="sphere"/></scene>')
     with pytest.raises(NergError, match="0 integrators"):
@@ -98,7 +98,7 @@ def running(room, tmp_path):
         yield found
 
 
-def test02_the_observer_follows_somebody(running):
+def test06_observer_follows_a_participant(running):
     page: Page = running.page
     people = ParticipantsPanel(page, page.session.tracks)
     # Paths of all are drawn where they are wanted: many people's hide the place.

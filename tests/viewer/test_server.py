@@ -33,7 +33,7 @@ def status(guard, path="/", port=8080, clients=0, **headers):
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1:8080", "localhost:8080", "LOCALHOST", "[::1]:8080", "localhost:9999"])
-def test01_names_of_this_machine(host):
+def test01_own_host_names_are_accepted(host):
     assert status(LOCAL, Host=host) == 200
 
 
@@ -53,12 +53,12 @@ def test01_names_of_this_machine(host):
         "[::1",
     ],
 )
-def test02_other_names_are_refused(host):
+def test02_other_host_names_are_refused(host):
     assert status(LOCAL, Host=host) == 403
     assert status(LOCAL, Host=host, Upgrade="websocket") == 403
 
 
-def test03_no_host_at_all_is_refused():
+def test03_missing_host_is_refused():
     assert status(LOCAL) == 403
 
 
@@ -75,17 +75,17 @@ def test03_no_host_at_all_is_refused():
         "http://[",
     ],
 )
-def test04_other_sites_are_refused(origin):
+def test04_other_origins_are_refused(origin):
     assert status(LOCAL, Host="localhost:8080", Origin=origin, Upgrade="websocket") == 403
 
 
-def test05_the_page_itself_is_let_in():
+def test05_own_origin_is_accepted():
     assert status(LOCAL, host="localhost:8080", origin="http://localhost:8080", upgrade="websocket") == 200
     # Browsers write names in small letters, and whoever typed the address need not.
     assert status(LOCAL, host="LocalHost:8080", origin="http://localhost:8080", upgrade="websocket") == 200
 
 
-def test06_a_token_is_asked_for_elsewhere():
+def test06_token_is_required_on_other_addresses():
     guard = RequestGuard("0.0.0.0", "a-token")
     assert status(guard, Host="192.168.1.7:8080") == 403
     assert status(guard, "/?token=wrong", Host="192.168.1.7:8080") == 403
@@ -101,7 +101,7 @@ def test06_a_token_is_asked_for_elsewhere():
     assert "a-token" not in repr(guard)
 
 
-def test07_the_browser_keeps_the_token_and_stays_here():
+def test07_response_sets_cookie_and_policy():
     guard = RequestGuard("0.0.0.0", "a-token")
     headers = guard.response_headers("/?token=a-token", "192.168.1.7:8080", 8080)
     assert headers["Set-Cookie"].startswith("nerg_view_8080=a-token; HttpOnly; SameSite=Strict")
@@ -111,7 +111,7 @@ def test07_the_browser_keeps_the_token_and_stays_here():
     assert headers["Referrer-Policy"] == "no-referrer"
 
 
-def test08_so_many_pages_and_no_more():
+def test08_number_of_pages_is_limited():
     open_one = dict(Host="localhost:8080", Upgrade="WebSocket")
     assert status(LOCAL, clients=MAX_CLIENTS - 1, **open_one) == 200
     assert status(LOCAL, clients=MAX_CLIENTS, **open_one) == 503
@@ -161,28 +161,28 @@ def ask(server, path="/", **headers):
         connection.close()
 
 
-def opening(server, **headers):
+def open_websocket(server, **headers):
     headers.setdefault("Host", f"127.0.0.1:{server.get_port()}")
     return ask(server, "/", **headers, **{k.replace("-", "_"): v for k, v in OPEN.items()})[0]
 
 
-def test01_the_page_is_served_to_this_machine(local):
+def test10_page_is_served(local):
     status, headers, body = ask(local, Host=f"localhost:{local.get_port()}")
     assert status == 200 and b"<html" in body[:1000].lower()
     assert "connect-src 'self'" in headers["Content-Security-Policy"]
 
 
-def test02_forged_headers_are_refused(local):
+def test11_forged_headers_are_refused(local):
     port = local.get_port()
     assert ask(local, Host="evil.example")[0] == 403
     assert ask(local)[0] in (400, 403)
     assert ask(local, Host=f"localhost:{port}", Origin="http://evil.example")[0] == 403
-    assert opening(local) == 101
-    assert opening(local, Origin=f"http://127.0.0.1:{port}") == 101
-    assert opening(local, Origin="http://evil.example") == 403
-    assert opening(local, Origin="null") == 403
-    assert opening(local, Origin=f"http://localhost:{port}") == 403
-    assert opening(local, Host=f"evil.example:{port}", Origin=f"http://evil.example:{port}") == 403
+    assert open_websocket(local) == 101
+    assert open_websocket(local, Origin=f"http://127.0.0.1:{port}") == 101
+    assert open_websocket(local, Origin="http://evil.example") == 403
+    assert open_websocket(local, Origin="null") == 403
+    assert open_websocket(local, Origin=f"http://localhost:{port}") == 403
+    assert open_websocket(local, Host=f"evil.example:{port}", Origin=f"http://evil.example:{port}") == 403
 
 
 @pytest.mark.parametrize(
@@ -196,7 +196,7 @@ def test02_forged_headers_are_refused(local):
         ("Host: {own}", "Origin: http://evil.example", "Origin: http://{own}"),
     ],
 )
-def test03_two_headers_of_a_kind_are_refused(local, lines):
+def test12_repeated_headers_are_refused(local, lines):
     port = local.get_port()
     lines = ["GET / HTTP/1.1", *(line.format(own=f"localhost:{port}") for line in lines), "", ""]
     with socket.create_connection(("127.0.0.1", port), timeout=10) as connection:
@@ -204,23 +204,23 @@ def test03_two_headers_of_a_kind_are_refused(local, lines):
         assert connection.recv(4096).split()[1] in (b"403", b"400")
 
 
-def test04_a_token_where_others_reach_it(viser):
+def test13_token_on_other_addresses(viser):
     server = start_server(RequestGuard("0.0.0.0", "secret"), 0, "test")
     try:
         host = f"127.0.0.1:{server.get_port()}"
-        assert ask(server, Host=host)[0] == 403 and opening(server) == 403
+        assert ask(server, Host=host)[0] == 403 and open_websocket(server) == 403
         status, headers, _ = ask(server, "/?token=secret", Host=host)
         assert status == 200
         cookie = headers["Set-Cookie"].partition(";")[0]
         assert ask(server, Host=host, Cookie=cookie)[0] == 200
-        assert opening(server, Cookie=cookie) == 101
-        assert opening(server, Cookie=cookie, Origin="http://evil.example") == 403
-        assert opening(server, Cookie=cookie[:-1]) == 403
+        assert open_websocket(server, Cookie=cookie) == 101
+        assert open_websocket(server, Cookie=cookie, Origin="http://evil.example") == 403
+        assert open_websocket(server, Cookie=cookie[:-1]) == 403
     finally:
         server.stop()
 
 
-def test05_messages_are_capped(local, viser):
+def test14_message_size_is_limited(local, viser):
     from websockets.exceptions import ConnectionClosed
     from websockets.sync.client import connect
 
@@ -233,7 +233,7 @@ def test05_messages_are_capped(local, viser):
         assert closed.value.rcvd is not None and closed.value.rcvd.code == 1009
 
 
-def test06_no_link_is_shared(local, monkeypatch):
+def test15_share_url_is_disabled(local, monkeypatch):
     import viser._viser
 
     def tunnel(*given, **more):
@@ -243,12 +243,12 @@ def test06_no_link_is_shared(local, monkeypatch):
     assert local.request_share_url() is None
 
 
-def test07_a_port_that_is_taken_is_told(local):
+def test16_used_port_is_reported(local):
     with pytest.raises(NergError, match="choose another one with --port"):
         start_server(RequestGuard("127.0.0.1"), local.get_port(), "test")
 
 
-def test08_a_viser_that_serves_otherwise_is_not_used(viser, monkeypatch):
+def test17_unguarded_viser_is_refused(viser, monkeypatch):
     import contextlib
 
     import nerg_mi.viewer.server as module
@@ -261,7 +261,7 @@ def test08_a_viser_that_serves_otherwise_is_not_used(viser, monkeypatch):
     assert stopped
 
 
-def test09_without_the_extra_a_sentence(monkeypatch):
+def test18_missing_viser_is_reported(monkeypatch):
     import sys
 
     monkeypatch.setitem(sys.modules, "viser", None)
@@ -277,7 +277,7 @@ def _viser():
     require("viser")
 
 
-def answer_of(address: str) -> int:
+def get_status(address: str) -> int:
     parts = urlsplit(address)
     connection = http.client.HTTPConnection(parts.hostname, parts.port, timeout=10)
     connection.request("GET", f"/?{parts.query}")
@@ -285,23 +285,23 @@ def answer_of(address: str) -> int:
 
 
 @pytest.mark.usefixtures("_viser")
-def test01_an_address_that_answers_for_as_long_as_the_block(room):
+def test19_viewer_runs_within_the_block(room):
     with open_viewer([room], ViewOptions(port=0)) as running:
-        assert answer_of(running.address) == 200 and urlsplit(running.address).hostname == "127.0.0.1"
+        assert get_status(running.address) == 200 and urlsplit(running.address).hostname == "127.0.0.1"
         address = running.address
     with pytest.raises(ConnectionError):
-        answer_of(address)
+        get_status(address)
 
 
 @pytest.mark.usefixtures("_viser")
-def test02_elsewhere_there_is_a_token(room):
+def test20_other_host_has_a_token(room):
     with open_viewer([room], ViewOptions(host="0.0.0.0", port=0)) as running:
-        assert answer_of(running.address) == 200
-        assert answer_of(running.address.partition("?")[0]) == 403
+        assert get_status(running.address) == 200
+        assert get_status(running.address.partition("?")[0]) == 403
 
 
 @pytest.mark.usefixtures("_viser")
-def test03_a_moved_observer_is_seen_by_all(room):
+def test21_page_moves_the_observer(room):
     with open_viewer([room], ViewOptions(port=0)) as running:
         page, session = running.page, running.page.session
         page.place_observer(np.array([3.0, 0, 0.5]), np.eye(3))
@@ -316,7 +316,7 @@ def test03_a_moved_observer_is_seen_by_all(room):
 
 
 @pytest.mark.usefixtures("_viser")
-def test04_until_ctrl_c(room, monkeypatch):
+def test22_view_files_runs_until_ctrl_c(room, monkeypatch):
     told = Recorder()
 
     def interrupted():
@@ -329,7 +329,7 @@ def test04_until_ctrl_c(room, monkeypatch):
 
 
 @pytest.mark.usefixtures("_viser")
-def test05_files_that_are_not_there(tmp_path):
+def test23_missing_files_are_reported(tmp_path):
     with pytest.raises(NergError, match="no file"):
         with open_viewer([tmp_path / "a.xml"], ViewOptions(port=0)):
             pass
@@ -342,7 +342,7 @@ def test05_files_that_are_not_there(tmp_path):
     ("seconds", "at_rest", "change"),
     [(0.2, False, 1), (0.2, True, 1), (0.03, True, 0), (0.017, True, -1), (0.017, False, 0)],
 )
-def test01_points_follow_the_pace(seconds, at_rest, change):
+def test24_level_adapts_to_frame_times(seconds, at_rest, change):
     window = BrowserWindow(None, None)
     before = window.level
     for _ in range(20):
@@ -353,7 +353,7 @@ def test01_points_follow_the_pace(seconds, at_rest, change):
     assert window.choose_level(at_rest) == before + change
 
 
-def test02_a_few_frames_say_nothing_and_levels_have_an_end():
+def test25_level_limits():
     window = BrowserWindow(None, None)
     window.record_frame(0.9)
     assert window.choose_level(True) == window.level
@@ -364,7 +364,7 @@ def test02_a_few_frames_say_nothing_and_levels_have_an_end():
         assert window.level == end
 
 
-def test03_slow_frames_are_no_rest():
+def test26_slow_frames_do_not_count_as_rest():
     window = BrowserWindow(None, None)
     assert window.rest_seconds == pytest.approx(0.12)
     for _ in range(10):
@@ -383,7 +383,7 @@ def test03_slow_frames_are_no_rest():
 # ---- What is missing skips a test, or fails it where that was asked for ----
 
 
-def test01_what_is_missing(monkeypatch):
+def test27_missing_module_skips_or_fails(monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     monkeypatch.setattr(browser, "REQUIRED", False)
     with pytest.raises(pytest.skip.Exception, match=r"viser is not installed"):

@@ -28,14 +28,14 @@ TOLD = [name for name in vars(Listener) if name.startswith("on_")]
 
 
 @pytest.mark.parametrize("name", TOLD)
-def test_the_page_listens(name):
+def test_page_implements_listener(name):
     assert inspect.signature(getattr(Page, name)) == inspect.signature(getattr(Listener, name))
 
 
 # ---- What is viewed: the observer's gaze, numbers and pictures, on one thread ----
 
 
-class Heard:
+class CountingListener:
     """A listener that counts."""
 
     def __init__(self):
@@ -54,12 +54,12 @@ class Heard:
 
 
 @pytest.fixture
-def session_of(tmp_path):
+def make_session(tmp_path):
     made = []
 
     def make(path, *others, **options) -> Session:
         chosen = ViewOptions(**options)
-        session = Session(lambda: make_viewer_scene([path, *others], tmp_path, chosen), chosen, Heard())
+        session = Session(lambda: make_viewer_scene([path, *others], tmp_path, chosen), chosen, CountingListener())
         made.append(session)
         session.start()
         return session
@@ -77,8 +77,8 @@ def settle(session):
     assert not session.listener.errors
 
 
-def test01_points_and_what_is_seen_of_them(session_of, room):
-    session = session_of(room)
+def test01_points_and_visibility(make_session, room):
+    session = make_session(room)
     settle(session)
     assert session.listener.proxies == 2 and session.listener.baked >= 1
     hidden = session.point_values["visibility"] < 0.5
@@ -94,8 +94,8 @@ def test01_points_and_what_is_seen_of_them(session_of, room):
     )
 
 
-def test01_what_is_out_of_date_is_known(session_of, room, gaze_fields):
-    session = session_of(room, gaze_fields[0])
+def test02_stale_results_are_reported(make_session, room, gaze_fields):
+    session = make_session(room, gaze_fields[0])
     assert (
         session.stale_points_reason == "the points do not show gaze"
         and session.are_shares_stale
@@ -145,7 +145,7 @@ def test01_what_is_out_of_date_is_known(session_of, room, gaze_fields):
 @pytest.mark.parametrize(
     "at", [(np.nan, 0, 1), (0, np.inf, 1), (0, 0, -np.inf), (1e39, 0, 0), (0, 1), (0, 1, 2, 3)], ids=str
 )
-def test01_an_observer_has_a_position(at):
+def test03_invalid_position_is_refused(at):
     session = Session.__new__(Session)
     session.lock, session.observer = threading.RLock(), np.zeros(3)
     with pytest.raises(NergError, match="invalid observer position"):
@@ -156,13 +156,13 @@ def test01_an_observer_has_a_position(at):
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -0.1])
-def test01_a_fall_off_is_a_length(value):
+def test04_invalid_falloff_is_refused(value):
     with pytest.raises(NergError, match="fall-off must be 0"):
         Session.__new__(Session).set_falloff(value)
 
 
-def test02_a_picture_is_replaced_by_the_next(session_of, room):
-    session = session_of(room, spp=4)
+def test05_new_picture_replaces_old_one(make_session, room):
+    session = make_session(room, spp=4)
     settle(session)
     first, second = [], []
     session.refine_picture("a", session.home_view, lambda p, c: first.append(p), 400, 256)
@@ -176,10 +176,10 @@ def test02_a_picture_is_replaced_by_the_next(session_of, room):
     assert session.worker.wait_idle(60) and not any(p.is_final for p in first)
 
 
-def test03_layers_have_ranges_of_their_own(session_of, room):
+def test06_each_layer_has_its_range(make_session, room):
     cut = '<float name="ceiling" value="9"/><vector name="up" value="0, 0.1, 1"/><string name="aovs"'
     room.write_text(room.read_text().replace('<string name="aovs"', cut))
-    session = session_of(room)
+    session = make_session(room)
     assert session.ceiling == 9 and np.allclose(session.ceiling_up, np.array([0, 0.1, 1]) / np.hypot(0.1, 1))
     settle(session)
     session.set_display(layer=get_layer("depth"))
@@ -195,8 +195,8 @@ def test03_layers_have_ranges_of_their_own(session_of, room):
 
 @pytest.mark.nightly
 @pytest.mark.slow
-def test04_shares_are_those_of_the_library(session_of, store):
-    session = session_of(store, observer=(4.6, 3.0, 1.6))
+def test07_shares_equal_api(make_session, store):
+    session = make_session(store, observer=(4.6, 3.0, 1.6))
     session.regions = [
         Region.create("drinks", (4.4, 4.65, 0), (4.9, 5.0, 1.45)),
         Region.create("floor", (4, 2, -0.1), (5, 3, 0)),
@@ -224,8 +224,8 @@ def test04_shares_are_those_of_the_library(session_of, store):
     assert set(session.shares) == {"drinks"}
 
 
-def test05_the_sphere_is_level_and_ahead_in_its_middle(session_of, room):
-    session = session_of(room)
+def test08_panorama_is_centred_on_heading(make_session, room):
+    session = make_session(room)
     settle(session)
     session.set_display(layer=get_layer("visibility"))
     shown = []
@@ -240,18 +240,18 @@ def test05_the_sphere_is_level_and_ahead_in_its_middle(session_of, room):
     assert not is_hatched(sphere[12:16, 28:36]) and is_hatched(sphere[:15, :20]) and is_hatched(sphere[:15, 44:])
 
 
-def test06_what_cannot_be_shown_is_told(session_of, room, tmp_path):
+def test09_invalid_input_is_reported(make_session, room, tmp_path):
     with pytest.raises(NergError, match="no file"):
-        session_of(Path("nowhere.xml"))
+        make_session(Path("nowhere.xml"))
     with pytest.raises(NergError, match="three finite numbers"):
-        session_of(room, observer=(1.0, 2.0))
+        make_session(room, observer=(1.0, 2.0))
     for wrong in (float("nan"), float("-inf"), 1e30):
         with pytest.raises(NergError, match="--observer must lie in"):
-            session_of(room, observer=(1.0, 2.0, wrong))
+            make_session(room, observer=(1.0, 2.0, wrong))
 
 
-def test07_variants_are_shown_in_turn(session_of, room, gaze_fields):
-    session = session_of(room, *gaze_fields, observer=(0.5, 0.0, 1.0))
+def test10_gaze_field_can_be_switched(make_session, room, gaze_fields):
+    session = make_session(room, *gaze_fields, observer=(0.5, 0.0, 1.0))
     assert session.gaze_name == "emit_capture" and session.display.layer.title == "gaze"
     settle(session)
     first, points, shared, falloff = (
@@ -278,13 +278,13 @@ def test07_variants_are_shown_in_turn(session_of, room, gaze_fields):
     assert np.allclose(session.point_values["gaze"], first, rtol=1e-4, atol=1e-6)
 
 
-def test08_what_cannot_be_counted_is_told_once(session_of, room, gaze_fields, monkeypatch):
+def test11_failed_shares_are_reported_once(make_session, room, gaze_fields, monkeypatch):
     def refuse(*_):
         raise NergError("no")
         yield
 
     monkeypatch.setattr(module, "iter_attention_shares", refuse)
-    session = session_of(room, gaze_fields[0])
+    session = make_session(room, gaze_fields[0])
     assert session.worker.wait_idle(120)
     while not session.update_shares():
         assert session.worker.wait_idle(120)
@@ -305,7 +305,7 @@ def scene(room, gaze_fields, tmp_path):
     return nerg.Scene.load(path)
 
 
-def test01_areas_in_one_step_and_meshes_in_groups(scene, monkeypatch):
+def test12_areas_in_one_step_and_meshes_in_groups(scene, monkeypatch):
     faces = {"floor": 2, "box": 12}
     regions = [Region.create("left", (0, 0.5, -0.1), (2, 2, 0.4)), Region.create("right", (0, -2, -0.1), (2, -0.5, 0.4))]
     shapes = [name for name in faces if name in {s.id() for s in scene.mitsuba.shapes() if s.is_mesh()}]
@@ -317,7 +317,7 @@ def test01_areas_in_one_step_and_meshes_in_groups(scene, monkeypatch):
     assert list(module.group_shapes(scene, shapes)) == [[name] for name in shapes]
 
 
-def test02_without_areas_and_shapes_there_is_nothing(scene):
+def test13_no_areas_and_no_shapes(scene):
     assert list(module.iter_attention_shares(scene, AT, [], [])) == []
 
 
@@ -326,7 +326,7 @@ def test02_without_areas_and_shapes_there_is_nothing(scene):
 SAME = Similarity(np.eye(4))
 
 
-def walk(align=SAME, cohorts=True):
+def make_walk(align=SAME, cohorts=True):
     """Ada walks along x for 10 s, with a gap of 3 s in it; Ben stands for 2 s. Rays are out of order."""
     t = np.concatenate([np.arange(0, 4, 0.1), np.arange(7, 10, 0.1), np.arange(0, 2, 0.1)])
     person = np.concatenate([np.zeros(70, int), np.ones(20, int)])
@@ -338,16 +338,16 @@ def walk(align=SAME, cohorts=True):
     return Tracks(rays, align)
 
 
-def test01_a_gap_ends_a_path():
-    segments, person = walk().segments()
+def test14_gap_interrupts_path():
+    segments, person = make_walk().segments()
     assert len(segments) == 39 + 29 + 19 and segments.shape[1:] == (2, 3)
     ada = segments[person == 0]
     assert np.allclose(ada[:, 1, 0] - ada[:, 0, 0], 0.1, atol=1e-4)
     assert np.allclose(segments[person == 1][..., 0], 5)
 
 
-def test02_a_moment():
-    tracks = walk()
+def test15_poses_at_a_time():
+    tracks = make_walk()
     assert tracks.time_range == (0.0, pytest.approx(9.9)) and tracks.participants == ["Ada", "Ben"]
     poses = {p.participant: p for p in tracks.poses_at(1.0)}
     assert set(poses) == {"Ada", "Ben"} and np.allclose(poses["Ada"].position, [1, 0, 1.6], atol=1e-6)
@@ -356,19 +356,19 @@ def test02_a_moment():
     assert tracks.poses_at(5.45 + 0 * MAX_GAP) == [] and tracks.poses_at(99.0) == []
 
 
-def test03_cohorts():
-    tracks = walk()
+def test16_cohorts():
+    tracks = make_walk()
     assert tracks.groups == [ALL_PARTICIPANTS, "grown", "small"]
     assert [p.participant for p in tracks.poses_at(1.0, "small")] == ["Ben"]
     assert len(tracks.segments("small")[0]) == 19
-    assert walk(cohorts=False).groups == [ALL_PARTICIPANTS]
+    assert make_walk(cohorts=False).groups == [ALL_PARTICIPANTS]
 
 
-def test04_in_the_place():
+def test17_alignment_is_applied():
     turn = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = 2 * turn, [10, 0, 0]
-    (ada,) = walk(Similarity(matrix)).poses_at(8.0)
+    (ada,) = make_walk(Similarity(matrix)).poses_at(8.0)
     assert np.allclose(ada.position, [10, 16, 3.2], atol=1e-6) and np.allclose(ada.direction, [-1, 0, 0], atol=1e-6)
 
 
@@ -392,7 +392,7 @@ def steps(name, count, log, gate=None):
         yield
 
 
-def test01_all_steps_are_made_on_one_thread(worker):
+def test18_steps_run_on_one_thread(worker):
     log = []
     worker.submit("a", 1, steps("a", 3, log))
     worker.submit("b", 1, steps("b", 3, log))
@@ -402,7 +402,7 @@ def test01_all_steps_are_made_on_one_thread(worker):
 
 
 @pytest.fixture
-def held(worker):
+def start_blocked_task(worker):
     """Begins a task of a name and an urgency that waits in its first step: the log of all steps, and what lets it go
     on."""
 
@@ -423,24 +423,24 @@ def held(worker):
     return begin
 
 
-def test02_the_urgent_comes_between_the_steps_of_another(worker, held):
-    log, go_on = held("slow", 5, 4)
+def test19_higher_priority_runs_between_steps(worker, start_blocked_task):
+    log, go_on = start_blocked_task("slow", 5, 4)
     worker.submit("urgent", 0, (log.append(("urgent", k)) for k in range(2)))
     go_on()
     assert worker.wait_idle(10)
     assert log == [("slow", 0), ("urgent", 0), ("urgent", 1), ("slow", 1), ("slow", 2), ("slow", 3)]
 
 
-def test03_a_new_task_of_a_name_replaces_the_old_one(worker, held):
-    log, go_on = held("picture", 3, 100)
+def test20_new_task_replaces_task_of_same_name(worker, start_blocked_task):
+    log, go_on = start_blocked_task("picture", 3, 100)
     worker.submit("picture", 3, (log.append(("new", k)) for k in range(3)))
     go_on()
     assert worker.wait_idle(10)
     assert log == [("picture", 0), ("new", 0), ("new", 1), ("new", 2)]
 
 
-def test04_cancelled_tasks_end(worker, held):
-    log, go_on = held("picture", 3, 100)
+def test21_cancelled_task_ends(worker, start_blocked_task):
+    log, go_on = start_blocked_task("picture", 3, 100)
     worker.cancel("picture")
     go_on()
     assert worker.wait_idle(10) and worker.is_idle
@@ -448,7 +448,7 @@ def test04_cancelled_tasks_end(worker, held):
     assert log == [("picture", 0)]
 
 
-def test05_tasks_of_one_urgency_take_turns(worker):
+def test22_equal_priority_takes_turns(worker):
     log, gate = [], threading.Event()
     worker.submit("first", 2, steps("first", 3, log, gate))
     worker.submit("second", 2, steps("second", 3, log, gate))
@@ -457,7 +457,7 @@ def test05_tasks_of_one_urgency_take_turns(worker):
     assert [name for name, *_ in log] == ["first", "second"] * 3
 
 
-def test06_errors_are_told_and_end_one_task_alone(worker):
+def test23_error_ends_one_task_only(worker):
     def bad():
         yield
         raise ValueError("no such thing")
@@ -472,7 +472,7 @@ def test06_errors_are_told_and_end_one_task_alone(worker):
     assert len(worker.errors) == 1
 
 
-def test07_after_the_end_nothing_is_begun():
+def test24_stopped_worker_starts_nothing():
     worker = Worker(lambda error: None)
     worker.stop()
     worker.submit("late", 0, iter([1]))
