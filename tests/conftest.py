@@ -1,5 +1,4 @@
-"""What all tests share: variants, free memory between files, optional torch, and recorded data that may not be
-there."""
+"""Shared fixtures: Mitsuba variants, memory between files, optional torch, and recorded data."""
 
 from __future__ import annotations
 
@@ -25,7 +24,7 @@ TORCH_REQUIRED = os.environ.get("NERG_REQUIRE_TORCH", "0") not in ("", "0")
 
 @pytest.fixture(autouse=True)
 def rgb():
-    """Every test starts in llvm_ad_rgb, whatever the one before it left behind; gives the module `mitsuba`."""
+    """Activate llvm_ad_rgb before every test and return the module `mitsuba`."""
     import mitsuba as mi
 
     if mi.variant() != "llvm_ad_rgb":
@@ -35,7 +34,7 @@ def rgb():
 
 @pytest.fixture
 def mono(rgb):
-    """Runs the test in llvm_ad_mono; gives the module `mitsuba`."""
+    """Run the test in llvm_ad_mono; return the module `mitsuba`."""
     rgb.set_variant("llvm_ad_mono")
     yield rgb
     rgb.set_variant("llvm_ad_rgb")
@@ -43,14 +42,14 @@ def mono(rgb):
 
 @pytest.fixture(params=["llvm_ad_rgb", "llvm_ad_mono"])
 def rgb_and_mono(request, rgb):
-    """Runs the test in llvm_ad_rgb and in llvm_ad_mono; gives the module `mitsuba`."""
+    """Run the test in llvm_ad_rgb and in llvm_ad_mono; return the module `mitsuba`."""
     rgb.set_variant(request.param)
     yield rgb
     rgb.set_variant("llvm_ad_rgb")
 
 
 def _resident() -> float:
-    """Memory of this process in GiB; unbounded where the system does not tell."""
+    """Return the memory of this process in GiB; infinite if the system does not report it."""
     try:
         pages = int(Path("/proc/self/statm").read_text().split()[1])
     except OSError:
@@ -58,15 +57,15 @@ def _resident() -> float:
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**30
 
 
-# Memory after it was freed last, in GiB.
+# Memory after the last clean-up, in GiB.
 _freed = 1.0
 
 
 @pytest.fixture(autouse=True, scope="module")
 def _free_memory():
-    """Give back the kernels and arrays of the last files, where a process has grown by 0.5 GiB since it did so.
+    """Release kernels and arrays if the process has grown by 0.5 GiB since the last clean-up.
 
-    The suite must fit on a small machine; doing it after every file took a fifth of its time.
+    The suite must fit on a small machine; a clean-up after every file would take a fifth of its time.
     """
     global _freed  # noqa: PLW0603
     yield
@@ -82,12 +81,12 @@ def _free_memory():
 
 
 # ------------------------------------------------------------------------
-#  Slow tests: those of slow.txt are marked here, so that their list can be made anew from what was measured
+#  Slow tests: those of slow.txt are marked here, so that the list can be generated from measured times
 # ------------------------------------------------------------------------
 
 
 def listed_as_slow() -> set[str]:
-    """``file::function``, or ``file`` where all of its tests are, of what slow.txt lists."""
+    """Return the entries of slow.txt: ``file::function``, or ``file`` for all tests of a file."""
     lines = (ROOT / "tests" / "slow.txt").read_text(encoding="utf-8").splitlines()
     return {line for line in lines if line and not line.startswith("#")}
 
@@ -98,15 +97,15 @@ def pytest_collection_modifyitems(items):
         file = item.nodeid.partition("::")[0]
         if file in slow or item.nodeid.partition("[")[0] in slow:
             item.add_marker(pytest.mark.slow)
-        if "recorded" in item.fixturenames:  # large files, which are not everywhere
+        if "recorded" in item.fixturenames:  # large files, which are not available everywhere
             item.add_marker(pytest.mark.nightly)
         weight[file] += item.get_closest_marker("slow") is not None
-    # Files with many slow tests first: with several processes, all of them end at the same time.
+    # Files with many slow tests first, so that several processes finish at the same time.
     items.sort(key=lambda item: -weight[item.nodeid.partition("::")[0]])
 
 
 # ------------------------------------------------------------------------
-#  Files of tests: in memory where there is room, since thousands are synchronised, which takes a disk milliseconds
+#  Temporary files: in memory if there is space, since tests synchronise thousands of files to disk
 # ------------------------------------------------------------------------
 
 
@@ -120,13 +119,13 @@ def _use_memory_for_files(config) -> None:
 
 
 # ------------------------------------------------------------------------
-#  torch: an extra. With NERG_REQUIRE_TORCH=1 a test skipped for want of it is a failure
+#  torch is optional. With NERG_REQUIRE_TORCH=1, a test that is skipped because of it fails
 # ------------------------------------------------------------------------
 
 
 def pytest_configure(config):
     _use_memory_for_files(config)
-    # Where tests run in the background of a script, Ctrl-C is ignored, and their children would ignore it too.
+    # In the background of a script, SIGINT is ignored, and child processes would inherit that.
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     if TORCH_REQUIRED and importlib.util.find_spec("torch") is None:
@@ -159,18 +158,18 @@ def pytest_make_collect_report(collector):
 
 @pytest.fixture
 def torch():
-    """The module `torch`; without it the test is skipped, or fails where NERG_REQUIRE_TORCH is set."""
+    """Return the module `torch`; without it, the test is skipped, or fails if NERG_REQUIRE_TORCH is set."""
     return pytest.importorskip("torch", reason="torch is not installed (pip install torch)")
 
 
 # ------------------------------------------------------------------------
-#  What is trained or made at random, once a process: files that tests read, and copy where they write beside them
+#  Trained and random fields, made once per process; tests copy them if they write next to them
 # ------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="session")
 def standins(tmp_path_factory):
-    """A radiance and a gaze field in place of the store's own: the scene's defaults that name them."""
+    """Return values for the defaults of the store's scene that replace its fields by random ones."""
     import mitsuba as mi
 
     from tests.figures.standins import write_standins
@@ -181,8 +180,10 @@ def standins(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def trained(tmp_path_factory):
-    """A folder with ``rays.npz`` of four named people, and ``gaze.safetensors``, trained in their hit points on all but
-    three positions."""
+    """Return a folder with ``rays.npz`` of four named participants and a ``gaze.safetensors`` trained on it.
+
+    The geometry are the hit points; three positions are held out.
+    """
     from dataclasses import replace
 
     import mitsuba as mi
@@ -202,7 +203,7 @@ def trained(tmp_path_factory):
 
 @pytest.fixture
 def cube(tmp_path):
-    """An opaque grey cube of density 50 seen by 3 cameras, whose photos are grey of 0.5; and the field that it is."""
+    """Return a folder with an opaque grey cube of density 50 as a field, and 3 photos of grey 0.5 with their poses."""
     import drjit.llvm.ad as ns
     import mitsuba as mi
 
@@ -223,8 +224,8 @@ def cube(tmp_path):
         pose[:3, 3] = 0.05 * k, 0, 3
         frames.append({"file_path": f"{k}.png", "transform_matrix": pose.tolist()})
     lens = {"w": 16, "h": 14, "fl_x": 60.0, "fl_y": 60.0, "cx": 8.0, "cy": 7.0}
-    about = {**lens, "frames": frames, "aabb": [[-1, -1, -1], [1, 1, 1]]}
-    (tmp_path / "transforms.json").write_text(json.dumps(about))
+    transforms = {**lens, "frames": frames, "aabb": [[-1, -1, -1], [1, 1, 1]]}
+    (tmp_path / "transforms.json").write_text(json.dumps(transforms))
     save_radiance(field, tmp_path / "cube.safetensors", {})
     return tmp_path
 
@@ -236,15 +237,15 @@ def cube(tmp_path):
 
 @pytest.fixture(scope="session")
 def recorded():
-    """`recorded("fox")` is the folder of a recorded data set: in $NERG_DATA, else in ../shared/data of the checkout.
+    """`recorded("fox")` returns the folder of a recorded data set, in $NERG_DATA or in ../shared/data of the checkout.
 
-    The data are not part of the repository; a test that needs what is not there is skipped.
+    The data are not part of the repository; a test that needs missing data is skipped.
     """
     base = Path(os.environ.get("NERG_DATA", ROOT.parent / "shared" / "data"))
 
     def find(name: str) -> Path:
         if not (base / name).exists():
-            pytest.skip(f'the recorded data "{name}" are not here: set NERG_DATA to the folder that holds them')
+            pytest.skip(f'the recorded data "{name}" are not available: set NERG_DATA to their folder')
         return base / name
 
     return find

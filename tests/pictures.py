@@ -1,4 +1,4 @@
-"""A scene of stock plugins, a box as Mitsuba takes it, and pictures as Mitsuba reads them, also on one core."""
+"""A simple test scene, and helpers for Mitsuba bitmaps and boxes."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ SCENE = """
     </sensor>
 </scene>
 """
-"""A sphere of stock plugins, as a perspective camera and a panorama see it."""
+"""A sphere made of stock plugins, with a perspective camera and a panorama."""
 
 
 def mitsuba_bitmap(path):
-    """A Mitsuba bitmap of the file ``path``."""
+    """Load a file as a Mitsuba bitmap, also on one core."""
     import mitsuba as mi
 
     with ensure_two_threads():
@@ -35,7 +35,7 @@ def mitsuba_bitmap(path):
 
 
 def box_dict(lower, upper) -> dict:
-    """The box between two corners, as Mitsuba takes it."""
+    """Return a dict of a box between two corners for `mi.load_dict`."""
     import mitsuba as mi
 
     middle, half = (lower + upper) / 2, (upper - lower) / 2

@@ -1,4 +1,4 @@
-"""Examples, at sizes that take seconds: what is found, not what is printed; and notebooks from top to bottom."""
+"""The examples, at small sizes, and the notebooks."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from examples import place_product
 from examples import recover_observer as example
 from tests.conftest import ROOT
 
-# ---- Placing a product, at a size that takes seconds: what is found, not what is printed ----
+# ---- Placing a product ----
 
 
 @pytest.fixture(scope="module")
@@ -25,10 +25,10 @@ def shelf_run(tmp_path_factory):
 
 @pytest.mark.nightly
 def test01_optimum_equals_sweep(shelf_run):
-    found, out = shelf_run
-    at, values = found["sweep"]
+    result, out = shelf_run
+    at, values = result["sweep"]
     assert out.stat().st_size > 10_000 and values.min() > 0 and values.max() > 2 * values.min()
-    for start, end, before, after, optimum, share in found["rows"]:
+    for start, end, before, after, optimum, share in result["rows"]:
         assert after > before and abs(end - optimum) < 0.1 and share > 0.97, (start, end, optimum, share)
 
 
@@ -51,31 +51,31 @@ def test04_unknown_shelf_is_reported(rgb):
         place_product.Shelf("attic")
 
 
-# ---- Recovering an observer, at sizes that take seconds: what is found, not what is printed ----
+# ---- Recovering an observer ----
 
 
 def test05_image_distance():
     a = np.random.default_rng(0).exponential(1, (2, 16, 24))
     b, c = (np.roll(a, k, axis=2) for k in (1, 8))
     assert example.distance(a, a) == 0 and example.loss(a, a) == 0
-    # A block of 8 averages what moved by one pixel; not so what moved by eight.
+    # Blocks of 8 pixels average out a shift by one pixel, but not by eight.
     assert 0 < example.distance(a, b) < example.distance(a, c) and example.loss(a, b) > 0
     assert np.allclose(example.pooled(a, 8), a.reshape(2, 2, 8, 3, 8).mean((2, 4)))
     assert example.distance(np.stack([a, b]), a).shape == (2,)
 
 
 def test06_step_solves_linear_problem():
-    """Logarithms linear in the position: one step, but for its damping; pixels dark in either picture have no say."""
+    """Logarithms are linear in the position: one damped step; pixels that are dark in either picture are ignored."""
     rng = np.random.default_rng(1)
     J, truth = rng.normal(0, 0.1, (2, 6, 8, 3)), np.array([0.1, -0.05, 0.02])
     now = rng.uniform(1, 2, (2, 6, 8))
-    given = (now + example.FLOOR) * np.exp(J @ truth) - example.FLOOR
+    target = (now + example.FLOOR) * np.exp(J @ truth) - example.FLOOR
     slope = (now + example.FLOOR)[..., None] * J
-    assert np.allclose(example.gauss_newton_step(now, slope, given, 1e3), truth, rtol=0.02, atol=1e-3)
-    given[:, ::2] = 0
+    assert np.allclose(example.gauss_newton_step(now, slope, target, 1e3), truth, rtol=0.02, atol=1e-3)
+    target[:, ::2] = 0
     now[:, :, ::3] = 0
-    assert np.allclose(example.gauss_newton_step(now, slope, given, 1e3), truth, rtol=0.03, atol=2e-3)
-    far = example.gauss_newton_step(now, slope * 0.01, given, 1e3)
+    assert np.allclose(example.gauss_newton_step(now, slope, target, 1e3), truth, rtol=0.03, atol=2e-3)
+    far = example.gauss_newton_step(now, slope * 0.01, target, 1e3)
     assert np.linalg.norm(far) <= example.LONGEST * 1.0001
 
 
@@ -84,8 +84,8 @@ def test07_observer_is_recovered(rgb):
     pictures, truth = example.Pictures((24, 16), cameras=example.CAMERAS[2:3]), np.array([4.4, 2.8, 1.6])
     start = truth + (0.1, 0.2, 0.05)
     derivatives = pictures.derivatives(truth)
-    # Where all pictures around are bright no edge passes: there the derivatives are those of the pictures.
-    # Far enough for what directions add to the integral over the sphere where edges pass them.
+    # Where all neighbouring pictures are bright, no edge passes, and derivatives equal differences of the pictures.
+    # The distance is large enough for the discretisation of the integral over the sphere.
     h = 1e-2
     ends = [[pictures.at(truth + s * h * e) for s in (1, -1)] for e in np.eye(3)]
     differences = np.stack([(a - b) / (2 * h) for a, b in ends], -1)
@@ -94,9 +94,9 @@ def test07_observer_is_recovered(rgb):
     assert np.abs(differences[smooth]).max() > 0.1 and smooth.mean() > 0.5
     assert np.linalg.norm((derivatives - differences)[smooth]) < 0.1 * np.linalg.norm(differences[smooth])
 
-    found = example.descend(pictures, pictures.given(truth, seed=1), start, 5)
-    end, least = found.answer()
-    assert np.linalg.norm(end - truth) < 0.06 and least < found.losses[0]
+    descent = example.descend(pictures, pictures.given(truth, seed=1), start, 5)
+    end, min_loss = descent.answer()
+    assert np.linalg.norm(end - truth) < 0.06 and min_loss < descent.losses[0]
 
 
 def test08_positions_are_on_free_floor():
@@ -105,11 +105,11 @@ def test08_positions_are_on_free_floor():
     assert not np.array_equal(example.true_observers(5, 0), example.true_observers(5, 1))
 
 
-# ---- Notebooks run from top to bottom, and their cells give the kinds of output that are stored ----
+# ---- Notebooks ----
 
 
 def outputs(book) -> list[list[str]]:
-    """The kinds of output of each cell."""
+    """Return the kinds of output of each cell."""
     return [
         ["+".join(sorted(o["data"])) if "data" in o else o.get("name", o.output_type) for o in cell.get("outputs", ())]
         for cell in book.cells
@@ -126,7 +126,7 @@ def test_notebook_reproduces_stored_outputs(path, tmp_path):
 
     book = nbformat.read(path, as_version=4)
     stored = outputs(book)
-    # Over a socket of the file system and no port; of this Python, whatever kernels are installed by that name.
+    # Over a Unix socket instead of a port, and with this Python regardless of installed kernels.
     kernel = KernelManager(transport="ipc", ip=str(tmp_path / "kernel"))
     kernel.kernel_spec.argv = [sys.executable, "-m", "ipykernel_launcher", "-f", "{connection_file}"]
     NotebookClient(book, km=kernel, timeout=600, resources={"metadata": {"path": str(tmp_path)}}).execute()

@@ -1,4 +1,4 @@
-"""A checkout that nobody has installed, plugins in every order of imports, libLLVM, and what is found of a machine."""
+"""A checkout without installation, the order of imports, the choice of libLLVM, and the diagnosis of a machine."""
 
 from __future__ import annotations
 
@@ -19,31 +19,30 @@ from nerg_mi.errors import UnusableLLVM
 from nerg_mi.registration import PLUGINS
 from tests.conftest import ROOT
 
-# ---- A checkout that nobody has installed ----
+# ---- A checkout without installation ----
 
 
-# Where the dependencies are: without the site module nothing of that folder's .pth files, and so no editable
-# installation, counts.
+# Folder of the dependencies. Without the site module, .pth files and thus editable installations are ignored.
 SITE = Path(numpy.__file__).parents[1]
 
 
 @pytest.fixture
 def clone(tmp_path):
-    """The checkout as it is cloned."""
+    """A copy of the checkout."""
     for name in ("nerg_mi", "plugins", "scenes"):
         shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__", "build"))
     return tmp_path
 
 
 def run_uninstalled(code: str, folder: Path, **environment):
-    """Run ``code`` in ``folder`` by a Python that knows the dependencies, and no installation of the package."""
+    """Run ``code`` in ``folder`` with a Python that has the dependencies, but not the package."""
     begin = f"import sys\nsys.path.append({str(SITE)!r})\n"
     begin += "assert not any('editable' in repr(f).lower() for f in sys.meta_path)\n"
-    kept = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+    inherited = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
     return subprocess.run(
         [sys.executable, "-S", "-c", begin + textwrap.dedent(code)],
         cwd=folder,
-        env=kept | environment,
+        env=inherited | environment,
         capture_output=True,
         text=True,
         timeout=300,
@@ -71,7 +70,7 @@ def test01_checkout_works_without_installation(clone, elsewhere):
     assert files.split() == [str(clone / "plugins" / "nerg.py"), str(clone / "scenes" / "store" / "layout.py")]
 
 
-# ---- Plugins are there in every order of imports and after every change of variant. Each order needs a pr ----
+# ---- Plugins are registered after any order of imports and variant changes; each order needs a process ----
 
 
 CHECK = """
@@ -141,7 +140,7 @@ def test06_scalar_variants_are_refused(rgb, name, kind):
 
 
 def test07_scalar_variants_leave_no_state():
-    # A volume that scalar_rgb knew, as a texture, could not be loaded from a dict in any later variant.
+    # A volume registered as a texture in scalar_rgb could not be loaded from a dict in any later variant.
     code = (
         "import nerg_mi, mitsuba as mi\n"
         "mi.set_variant('scalar_rgb'); mi.set_variant('llvm_ad_rgb')\n"
@@ -190,12 +189,12 @@ def make_fake_libraries(folder, *names):
 
 @pytest.fixture
 def machine(tmp_path, monkeypatch):
-    """A machine whose only libraries are those put into a folder, with no NVIDIA driver and Dr.Jit not loaded."""
+    """A machine whose libraries are only those in a folder, without NVIDIA driver, and with Dr.Jit not loaded."""
     monkeypatch.setattr(llvm, "_FOLDERS", {sys.platform: (str(tmp_path),)})
     monkeypatch.setattr(sys, "prefix", str(tmp_path / "nothing"))
     monkeypatch.setattr(llvm, "_loaded", lambda: None)
     monkeypatch.setattr(llvm, "has_cuda", lambda: False)
-    # Set first, so that what a test makes of it is undone also where it was not set.
+    # Set it first, so that monkeypatch also restores it if it was not set.
     monkeypatch.setenv(llvm.PATH_VARIABLE, "")
     monkeypatch.delenv(llvm.PATH_VARIABLE)
     monkeypatch.delitem(sys.modules, "drjit", raising=False)
@@ -227,7 +226,7 @@ def test12_llvm_version_without_name(tmp_path):
     good = next((library for library in llvm.find_installed() if library.is_usable), None)
     if good is None:
         pytest.skip("no usable libLLVM in the usual places of this machine")
-    # A hard copy would be 100 MB; a file name without a number that is no link will do where hard links are possible.
+    # A hard link without a number in its name; a copy would have 100 MB.
     nameless = tmp_path / "libLLVM.so"
     try:
         os.link(os.path.realpath(good.path), nameless)
@@ -258,7 +257,7 @@ def test15_only_unusable_llvm(machine, monkeypatch):
     assert llvm.PATH_VARIABLE not in os.environ
     with pytest.raises(UnusableLLVM, match="16.*17.*libllvm19"):
         llvm.require_usable()
-    # With an NVIDIA driver the package is of use, and only an llvm variant is refused.
+    # With an NVIDIA driver, only llvm variants are refused.
     monkeypatch.setattr(llvm, "has_cuda", lambda: True)
     llvm.require_usable()
     llvm.require_usable("cuda_ad_rgb")
@@ -310,14 +309,14 @@ def test20_loaded_llvm_is_checked(monkeypatch):
     import drjit as dr
 
     assert llvm.find_current().version == tuple(dr.detail.llvm_version())
-    # What is set after Dr.Jit was loaded has no effect on it.
+    # Changes after loading Dr.Jit have no effect.
     monkeypatch.setenv(llvm.PATH_VARIABLE, "/nowhere/libLLVM-15.so.1")
     assert llvm.find_problem() is None
 
 
 @pytest.mark.parametrize("late", ["drjit", "mitsuba"])
 def test21_error_is_raised_at_drjit_import(late, tmp_path):
-    """What needs no kernel works without them, `nerg doctor` for one; a second import is refused like the first."""
+    """Functions without kernels work, such as `nerg doctor`; a second import fails like the first."""
     make_fake_libraries(tmp_path, "libLLVM-15.so.1")
     code = (
         "import nerg_mi.diagnosis\nprint('imported')\n"
@@ -329,7 +328,7 @@ def test21_error_is_raised_at_drjit_import(late, tmp_path):
     assert run.stderr.strip().splitlines()[-1].startswith("nerg_mi.errors.UnusableLLVM: LLVM 15")
 
 
-# ---- What is found out about a machine, and how it is told ----
+# ---- Diagnosis of the machine ----
 
 
 def test22_crashing_backend_is_reported(monkeypatch):
@@ -340,32 +339,33 @@ def test22_crashing_backend_is_reported(monkeypatch):
 
 
 def test23_extras_use_distribution_names(monkeypatch):
-    """The names are those of distributions, as pyproject.toml has them: that of scikit-image is not that of its
-    module."""
+    """The names are those of distributions in pyproject.toml; scikit-image differs from its module name."""
     project = (ROOT / "pyproject.toml").read_text()
     assert all(f'["{name}>=' in project for name in diagnosis.EXTRAS)
 
 
 def test24_problems_follow_their_topic():
-    found = diagnosis.Diagnosis(
+    result = diagnosis.Diagnosis(
         [diagnosis.Finding("LLVM", "none", "install it"), diagnosis.Finding("threads", "2")], is_usable=False
     )
-    assert str(found) == "LLVM     none\n         -> install it\nthreads  2"
+    assert str(result) == "LLVM     none\n         -> install it\nthreads  2"
 
 
 WORKS = {"variants": ["llvm_ad_rgb"], "failed": {}, "threads": 2, "version": [19, 1, 7]}
 NO_FINDINGS = {"variants": [], "failed": {"llvm": "it died"}}
 
 
-@pytest.mark.parametrize("found, verdict", [(WORKS, "ready to render"), (NO_FINDINGS, "nothing can be rendered")])
-def test25_verdict(monkeypatch, found, verdict):
+@pytest.mark.parametrize(
+    "backend_state, verdict", [(WORKS, "ready to render"), (NO_FINDINGS, "nothing can be rendered")]
+)
+def test25_verdict(monkeypatch, backend_state, verdict):
     scalar = {"variants": ["scalar_rgb"], "failed": {}}
-    monkeypatch.setattr(diagnosis, "try_backend", lambda backend: scalar if backend == "scalar" else found)
+    monkeypatch.setattr(diagnosis, "try_backend", lambda backend: scalar if backend == "scalar" else backend_state)
     monkeypatch.setattr(llvm, "has_cuda", lambda: False)
     monkeypatch.setattr(llvm, "find_problem", lambda: None)
-    told = diagnosis.run_diagnosis()
-    assert told.is_usable is (found is WORKS) and verdict in str(told)
-    assert ("it died" in str(told)) is (found is NO_FINDINGS)
+    result = diagnosis.run_diagnosis()
+    assert result.is_usable is (backend_state is WORKS) and verdict in str(result)
+    assert ("it died" in str(result)) is (backend_state is NO_FINDINGS)
 
 
 @pytest.mark.parametrize("version, old", [([12, 4], True), ([12, 8], False), ([13, 0], False)])

@@ -1,4 +1,4 @@
-"""Every number that a user gives has a range, declared with it; properties of plugins; and what errors say."""
+"""Ranges of all numeric options, properties of plugins, and error messages."""
 
 from __future__ import annotations
 
@@ -56,8 +56,8 @@ KINDS = list(
     )
 )
 LEFT_OUT = {"settings", "output", "train_output", "test_output", "align_output", "salt"}
-"""Fields that are no options of the command line, or spelt otherwise there."""
-# What other options need beside them.
+"""Fields that are not command-line options, or have another name there."""
+# Options that other options require.
 PREREQUISITES: dict[str, dict[str, Any]] = {
     "FilterOptions": {"with_hit": True},
     "SplitOptions": {"persons": ("Ada",)},
@@ -75,12 +75,12 @@ def _numbers(kind):
 
 
 def _fault(kind, field, value) -> str | None:
-    """What is said about a ``value`` of ``field``, but for what is said of several options together."""
-    given = {**PREREQUISITES.get(kind.__name__, {}), field.name: (value,) * 3 if "tuple" in str(field.type) else value}
+    """Return the error message for ``value`` of ``field``, ignoring errors about combinations of options."""
+    values = {**PREREQUISITES.get(kind.__name__, {}), field.name: (value,) * 3 if "tuple" in str(field.type) else value}
     if field.name == "minutes" and "Settings" in kind.__name__:
-        given.pop("steps")
+        values.pop("steps")
     try:
-        kind(**given)
+        kind(**values)
     except NergError as error:
         return str(error) if "must be a" in str(error) or "must lie in" in str(error) else None
     return None
@@ -97,13 +97,13 @@ def test_numbers_are_refused_outside_their_range(kind):
     for field in _numbers(kind):
         within = field.metadata[RANGE]
         assert isinstance(within, Range), f"{field.name} has no range"
-        whole = re.search(r"\bint\b", str(field.type))
+        is_integer = re.search(r"\bint\b", str(field.type))
         for end, beyond in ((within.low, -1), (within.high, 1)):
-            ends = (int(end), int(end) + beyond) if whole else (end, math.nextafter(end, beyond * math.inf))
+            ends = (int(end), int(end) + beyond) if is_integer else (end, math.nextafter(end, beyond * math.inf))
             assert _fault(kind, field, ends[0]) is None
             assert "must lie in" in (_fault(kind, field, ends[1]) or "")
         for value in STRANGE:
-            number = type(value) is int or (type(value) is float and not whole)
+            number = type(value) is int or (type(value) is float and not is_integer)
             none = value is None and "None" in str(field.type) and "tuple" not in str(field.type)
             said = _fault(kind, field, value)
             assert (said is None) == (none or (number and within.low <= value <= within.high)), (field.name, value)
@@ -129,7 +129,7 @@ def test_command_line_refuses_the_same_values(kind):
 
 
 def test_help_shows_ranges():
-    """Also where a command declares an option itself; those of readers of rays are checked by them."""
+    """Includes options that a command declares itself; options of readers are checked by the readers."""
     of_readers = {option.name for option in collect_shared_options()}
     options = [p for _, command, _ in iter_commands() for p in command.params if isinstance(p, TyperOption)]
     numbers = [p for p in options if p.type_descriptor.annotation in (int, float) and p.name not in of_readers]
@@ -155,14 +155,14 @@ def test_numpy_numbers_are_accepted():
     check_number(np.int64(2), Range(0, MAX_COORDINATE), "x", is_integer=True)
 
 
-# ---- Properties of plugins: what is taken, and that a wrong one is named with what it may be ----
+# ---- Properties of plugins ----
 
 
 ANY = Range(-1e9, 1e9)
 
 
 @pytest.mark.parametrize(
-    "read, given, found",
+    "read, value, expected",
     [
         (lambda p: properties.read_number(p, "x", 1.5, ANY), {}, 1.5),
         (lambda p: properties.read_number(p, "x", 1.5, Range(0, 9)), {"x": 2}, 2.0),
@@ -175,8 +175,8 @@ ANY = Range(-1e9, 1e9)
         (lambda p: properties.read_color(p, "x", 0.0), {"x": [0.1, 2.0, 0.0]}, [0.1, 2.0, 0.0]),
     ],
 )
-def test_valid_property_values(read, given, found):
-    assert read(given) == found and type(read(given)) is type(found)
+def test_valid_property_values(read, value, expected):
+    assert read(value) == expected and type(read(value)) is type(expected)
 
 
 def test_color_of_a_texture(rgb):
@@ -223,21 +223,21 @@ def test_field_from_file_or_memory(rgb):
     assert properties.load_network({}, mine, load, ns) == (mine, {}, "")
     with pytest.raises(NergError, match='"filename"'):
         properties.load_network({}, None, load, ns)
-    # Arrays that are not of the backend in use.
+    # Arrays of another backend.
     with pytest.raises(NergError, match='"llvm_ad_rgb"'):
         properties.load_network({}, Field([1.0]), load, ns)
 
 
 def test_files_are_resolved_in_scene_folders(rgb, tmp_path):
     (tmp_path / "here.ply").touch()
-    known = rgb.file_resolver()
-    rgb.set_file_resolver(type(known)(known))
+    path = rgb.file_resolver()
+    rgb.set_file_resolver(type(path)(path))
     try:
         rgb.file_resolver().append(rgb.filesystem.path(str(tmp_path)))
         assert properties.resolve_scene_file("here.ply") == str(tmp_path / "here.ply")
         assert properties.resolve_scene_file("there.ply") == "there.ply"
     finally:
-        rgb.set_file_resolver(known)
+        rgb.set_file_resolver(path)
 
 
 def test_transform_is_matrix_or_identity(rgb):
@@ -248,7 +248,7 @@ def test_transform_is_matrix_or_identity(rgb):
         properties.read_transform({"to_world": 3}, "to_world")
 
 
-# ---- Errors in one sentence, and which of them a user can mend ----
+# ---- Error messages ----
 
 
 TRACE = """While loading "a.xml" (line 3): could not instantiate plugin of type "nerg":

@@ -1,4 +1,4 @@
-"""Tests of `nerg_mi.runtime`."""
+"""Interruptions and the number of threads."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from nerg_mi.threads import set_thread_count, limit_threads
 
 from .plugins import fields
 
-# ---- Ctrl-C: noted between steps, and heard by Python after and while a picture is rendered ----
+# ---- Interruptions ----
 
 
 def test_first_interrupt_is_recorded_and_second_raised():
@@ -28,17 +28,17 @@ def test_first_interrupt_is_recorded_and_second_raised():
 
 
 def test_foreign_signal_handler_is_kept(monkeypatch):
-    """As where Python is part of another program: it could not be put back."""
+    """A handler that Python did not install cannot be restored."""
     set_handlers = []
     monkeypatch.setattr(signal, "getsignal", lambda which: None)
-    monkeypatch.setattr(signal, "signal", lambda *given: set_handlers.append(given))
+    monkeypatch.setattr(signal, "signal", lambda *args: set_handlers.append(args))
     with Interruption() as stop:
         stop.check()
     assert not set_handlers
 
 
 def test_ignored_interrupt_stays_ignored():
-    """As for a command in the background of a script, which Ctrl-C is not meant for."""
+    """As for a background command of a script."""
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         with Interruption() as stop:
@@ -81,23 +81,23 @@ def test_interrupt_during_rendering_is_raised(rgb, scene, monkeypatch):
     integrator = scene.integrator()
     sample = type(integrator).sample
 
-    def interrupted(self, *given):
+    def interrupted(self, *args):
         signal.raise_signal(signal.SIGINT)
-        return sample(self, *given)
+        return sample(self, *args)
 
     with monkeypatch.context() as change:
         change.setattr(type(integrator), "sample", interrupted)
-        # `mi.render` makes an error of its own of what an integrator raises.
-        with pytest.raises(RuntimeError) as found:
+        # `mi.render` wraps exceptions of an integrator.
+        with pytest.raises(RuntimeError) as raised:
             rgb.render(scene, spp=1)
-    error = found.value
+    error = raised.value
     while error.__cause__ is not None:
         error = error.__cause__
     assert isinstance(error, KeyboardInterrupt)
     rgb.render(scene, spp=1)
 
 
-# ---- Threads are changed between computations, never within one ----
+# ---- Number of threads ----
 
 
 def test_pending_work_finishes_before_thread_change(monkeypatch):

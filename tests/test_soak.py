@@ -26,7 +26,7 @@ SHORT = 1 if os.environ.get("NERG_SOAK") else 30
 
 
 def resident() -> float:
-    """Memory of this process that is in RAM, KiB, once what nothing refers to has gone back to the system."""
+    """Return the resident memory of this process in KiB after unused memory has been released."""
     import drjit as dr
 
     gc.collect()
@@ -37,14 +37,14 @@ def resident() -> float:
 
 
 def slope(unit: Callable[[int], object], count: int) -> float:
-    """KiB a unit by which memory grows over ``unit(k)`` for k in 0 .. ``count``."""
+    """Return the growth of the memory in KiB per unit of work ``unit(k)``, for k from 0 to ``count``."""
     every = max(1, count // 120)
     at, memory = [], []
     for k in range(count):
         unit(k)
         if (k + 1) % every == 0:
             at.append(k + 1)
-            # A thread that is about to end may still hold memory that nothing refers to.
+            # A finishing thread can still hold memory.
             memory.append(min(resident() for _ in range(3)))
     warm = len(at) // 3
     return float(np.polyfit(at[warm:], memory[warm:], 1)[0])
@@ -59,7 +59,7 @@ def store(**values: str):
 
 
 def frames() -> Callable[[int], None]:
-    """A frame of the store for an observer who walks up and down an aisle."""
+    """Render a frame of the store for an observer who walks along an aisle."""
     import mitsuba as mi
 
     scene = store()
@@ -76,7 +76,7 @@ def frames() -> Callable[[int], None]:
 
 
 def radiance_steps() -> Callable[[int], None]:
-    """A step of a tiny radiance training."""
+    """One step of a tiny radiance training."""
     import drjit as dr
     import drjit.llvm.ad as ns
 
@@ -100,7 +100,7 @@ def radiance_steps() -> Callable[[int], None]:
 
     def step(k: int) -> None:
         trainer.step()
-        # Whoever trains looks at the loss now and then; steps that nobody waits for would only queue up.
+        # Read the loss regularly, as in a training; otherwise steps would queue up.
         dr.eval(trainer.loss)
         dr.sync_thread()
 
@@ -108,7 +108,7 @@ def radiance_steps() -> Callable[[int], None]:
 
 
 def gaze_steps() -> Callable[[int], None]:
-    """A step of a tiny gaze training."""
+    """One step of a tiny gaze training."""
     import drjit as dr
     import drjit.llvm.ad as ns
 
@@ -134,7 +134,7 @@ def gaze_steps() -> Callable[[int], None]:
 
 
 def variants() -> Callable[[int], None]:
-    """A change of variant, after which the store is loaded and rendered."""
+    """Change the variant, then load and render the store."""
     import mitsuba as mi
 
     def change(k: int) -> None:
@@ -146,7 +146,7 @@ def variants() -> Callable[[int], None]:
 
 PARTS = {"frames": frames, "radiance": radiance_steps, "gaze": gaze_steps, "variants": variants}
 
-# In a process of its own, since this one's memory is that of all tests before.
+# In a separate process, because this one contains the memory of previous tests.
 _PROGRAM = """
 import json, sys
 import nerg_mi, mitsuba
@@ -168,7 +168,7 @@ print("\\n" + json.dumps([test_soak.slope(unit, count), test_soak.slope(leaking,
     [("frames", 2000, 1.0), ("radiance", 10_000, 0.5), ("gaze", 10_000, 0.2), ("variants", 60, 200.0)],
 )
 def test_memory_is_flat_and_leaks_are_detected(part, count, bound):
-    """``count`` units of work keep ``bound`` (KiB a unit), which leaking four times as much exceeds."""
+    """``count`` units of work stay below ``bound`` (KiB per unit), and a leak of four times that exceeds it."""
     count, bound = max(30, count // SHORT), bound * (1 if SHORT == 1 else 100 if bound < 100 else 10)
     command = [sys.executable, "-c", _PROGRAM, part, str(count), str(bound)]
     done = subprocess.run(command, cwd=ROOT, stdin=subprocess.DEVNULL, capture_output=True, text=True)

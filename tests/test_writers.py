@@ -1,5 +1,4 @@
-"""Nothing in the package writes a file but through `nerg_mi.files.atomic`: found in the source, so that none comes
-back."""
+"""The package writes files only through `nerg_mi.files.atomic`, which is checked in the source code."""
 
 from __future__ import annotations
 
@@ -34,24 +33,24 @@ METHODS = {
     "copyfile",
     "dump",
 }
-"""Methods and functions of modules that write, or make something, where they are given a name."""
+"""Methods and functions that write or create a file."""
 OPENERS = {"open", "ZipFile", "GzipFile", "fdopen", "TarFile"}
 
 EXCEPTIONS = {
     "nerg_mi/files/atomic.py": "the writer itself",
-    "nerg_mi/files/images.py:_raise_if_full": "finds out why the file that `replacing` has named takes no more",
-    "nerg_mi/formats/torch_files.py:write_torch": "has torch write to memory",
+    "nerg_mi/files/images.py:_raise_if_full": "determines why a file of `replacing` cannot be extended",
+    "nerg_mi/formats/torch_files.py:write_torch": "torch writes to memory",
     "nerg_mi/cli/ending.py:write": "is a standard stream",
     "nerg_mi/files/images.py": "encodes in memory",
     "nerg_mi/figures/style.py:encode": "encodes in memory",
-    "nerg_mi/photos/structure_worker.py": "fills a folder that `replacing_folder` has named, in its own process",
-    "nerg_mi/rays/readers/skeleton.py:_written": "is given the name that `replacing` has chosen",
+    "nerg_mi/photos/structure_worker.py": "writes to a folder of `replacing_folder`, in its own process",
+    "nerg_mi/rays/readers/skeleton.py:_written": "writes to the path of `replacing`",
 }
 
 
 def direct_writers(text: str) -> list[tuple[str, int, str]]:
-    """``(function, line, source)`` of what writes without `replacing` about it."""
-    found = []
+    """Return ``(function, line, source)`` of calls that write outside of a `replacing` block."""
+    calls = []
 
     def visit(node, function, safe):
         if isinstance(node, (ast.FunctionDef, ast.Lambda)):
@@ -59,45 +58,45 @@ def direct_writers(text: str) -> list[tuple[str, int, str]]:
         if isinstance(node, ast.With) and any("replacing" in ast.unparse(item.context_expr) for item in node.items):
             safe = True
         if isinstance(node, ast.Call) and not safe and _writes(node):
-            found.append((function, node.lineno, ast.unparse(node)))
+            calls.append((function, node.lineno, ast.unparse(node)))
         for child in ast.iter_child_nodes(node):
             visit(child, function, safe)
 
     visit(ast.parse(text), "", False)
-    return found
+    return calls
 
 
 def _writes(call: ast.Call) -> bool:
     name = call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")
     owner = ast.unparse(call.func.value) if isinstance(call.func, ast.Attribute) else ""
     if name in OPENERS:
-        given = [*call.args, *(k.value for k in call.keywords if k.arg == "mode")]
-        modes = [a.value for a in given if isinstance(a, ast.Constant) and isinstance(a.value, str)]
+        arguments = [*call.args, *(k.value for k in call.keywords if k.arg == "mode")]
+        modes = [a.value for a in arguments if isinstance(a, ast.Constant) and isinstance(a.value, str)]
         return any(set(mode) <= set("rwaxbt+") and set(mode) & set("wax+") for mode in modes)
     if name in ("write_text", "write_bytes"):
-        return bool(owner)  # of a Path; ours are functions
+        return bool(owner)  # a method of Path; the functions of this package are safe
     if name in ("save", "replace") and owner in ("np", "numpy", "torch", "image", "os"):
         return True
     if name == "write" and not owner:
-        return False  # a function that somebody was given
+        return False  # a function passed as an argument
     return name in METHODS and not owner.startswith(("sys.", "json"))
 
 
 def test_files_are_written_atomically():
-    found = []
+    violations = []
     for path in SOURCES:
         name = str(path.relative_to(ROOT))
         for function, line, text in direct_writers(path.read_text(encoding="utf-8")):
             if not {name, f"{name}:{function}"} & set(EXCEPTIONS):
-                found.append(f"{name}:{line}: {text}")
-    assert len(SOURCES) > 100 and not found, "write through nerg_mi.files.atomic:\n" + "\n".join(found)
+                violations.append(f"{name}:{line}: {text}")
+    assert len(SOURCES) > 100 and not violations, "write through nerg_mi.files.atomic:\n" + "\n".join(violations)
 
 
 def test_exceptions_are_still_needed():
     for name in EXCEPTIONS:
         path, _, function = name.partition(":")
-        found = direct_writers((ROOT / path).read_text(encoding="utf-8"))
-        assert [f for f in found if not function or f[0] == function], f"{name} writes nothing any more"
+        calls = direct_writers((ROOT / path).read_text(encoding="utf-8"))
+        assert [c for c in calls if not function or c[0] == function], f"{name} no longer writes anything"
 
 
 @pytest.mark.parametrize(

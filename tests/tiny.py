@@ -1,4 +1,4 @@
-"""Places that are small enough to be worked on thousands of times."""
+"""Tiny scenes and recordings, for tests that repeat an operation thousands of times."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import numpy as np
 import nerg_mi  # noqa: F401 (before Mitsuba, since it chooses the libLLVM)
 
 SIDE = 24
-"""Pixels of a photo's edge."""
+"""Width and height of a photo in pixels."""
 _FOCAL, _RADIUS = 30.0, 0.6
 CORNERS = (-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)
-"""Of the box that holds the ball."""
+"""Corners of the box around the ball."""
 
 
 def ball_pose(center: np.ndarray) -> np.ndarray:
-    """Camera to world (4, 4) of a camera at ``center`` that looks at the origin; x right, y up, z backward."""
+    """Camera-to-world matrix (4, 4) of a camera at ``center`` that looks at the origin; x right, y up, z backward."""
     z = center / np.linalg.norm(center)
     x = np.cross([0, 0, 1.0], z)
     x /= np.linalg.norm(x)
@@ -27,7 +27,7 @@ def ball_pose(center: np.ndarray) -> np.ndarray:
 
 
 def ball_photo(pose: np.ndarray) -> np.ndarray:
-    """A ball around the origin, coloured by its normal: (SIDE, SIDE, 4) in 0..1, with alpha 0 beside it."""
+    """Photo of a ball at the origin, coloured by its normal: (SIDE, SIDE, 4) in 0..1, with alpha 0 outside the ball."""
     v, u = np.meshgrid(np.arange(SIDE) + 0.5, np.arange(SIDE) + 0.5, indexing="ij")
     d = np.stack([(u - SIDE / 2) / _FOCAL, (SIDE / 2 - v) / _FOCAL, -np.ones_like(u)], axis=-1)
     d = (d / np.linalg.norm(d, axis=-1, keepdims=True)) @ pose[:3, :3].T
@@ -40,7 +40,7 @@ def ball_photo(pose: np.ndarray) -> np.ndarray:
 
 
 def write_photos(folder: Path, count: int = 12) -> Path:
-    """Photos of the ball with their poses, as a ``transforms.json`` in ``folder``; returns the folder."""
+    """Write photos of the ball and their poses (``transforms.json``) to ``folder`` and return the folder."""
     import mitsuba as mi
 
     folder.mkdir(parents=True, exist_ok=True)
@@ -56,7 +56,7 @@ def write_photos(folder: Path, count: int = 12) -> Path:
 
 
 def simulate_gaze(count: int = 400):
-    """Rays (`rays.rays.Rays`) of two people who walk about and look at one point of the wall x = 1.5."""
+    """Simulate recordings of two participants who walk around and look at one point of the wall x = 1.5."""
     from nerg_mi.rays.rays import Rays
 
     rng = np.random.default_rng(0)
@@ -70,7 +70,7 @@ def simulate_gaze(count: int = 400):
 
 
 def write_tracking(path: Path, count: int) -> Path:
-    """A table of the rays of `looks` as a tracker would write it; see `MAP`."""
+    """Write the recordings as a tracker's table; see `MAP`."""
     rays = simulate_gaze(count)
     rows = np.column_stack([rays.t, rays.origin, rays.direction])
     with open(path, "w", encoding="utf-8") as out:
@@ -83,4 +83,4 @@ def write_tracking(path: Path, count: int) -> Path:
 
 
 MAP = "origin=x,y,z direction=dx,dy,dz t=t person=person"
-"""The column map of `write_tracking`'s tables."""
+"""The column map of tables written by `write_tracking`."""

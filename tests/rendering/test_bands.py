@@ -1,4 +1,4 @@
-"""Pictures in bands: the same to the bit; AOVs that an integrator is asked for; and long renders."""
+"""Rendering in bands, additional AOVs, and long renderings."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from nerg_mi.workflows.demo import find_store_scene
 from tests.plugins import fields
 from tests.plugins.scenes import camera, constant, make_observer, plugin, with_gaze
 
-# ---- A picture is the same however it is divided, and its memory is that of a band ----
+# ---- Divided images ----
 
 
 def make_neural_scene(mi, folder, sensor, **kwargs):
@@ -50,7 +50,7 @@ def make_panorama(mi):
 
 
 def make_lit_scene(mi, film, sensor="perspective", sampler="independent"):
-    """A textured ball under `path`, which draws random numbers in a loop of its own."""
+    """A textured ball under `path`, which draws random numbers in its own loop."""
     return mi.load_dict(
         plugin(
             "scene",
@@ -111,14 +111,14 @@ def test_divided_fog_is_bitwise_equal(rgb):
 
 
 def test_integrator_with_own_render_is_undivided(rgb):
-    class Own(rgb.SamplingIntegrator):
+    class OverridingIntegrator(rgb.SamplingIntegrator):
         def sample(self, scene, sampler, ray, medium=None, active=True):
             return rgb.Color3f(0), True, []
 
         def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
             return super().render(scene, sensor, seed, spp, develop, evaluate)
 
-    rgb.register_integrator("own_render", Own)
+    rgb.register_integrator("own_render", OverridingIntegrator)
     scene = rgb.load_dict({"type": "scene", "integrator": {"type": "own_render"}, "sensor": {"type": "perspective"}})
     assert "overrides render()" in bands.undividable_reason(scene, scene.sensors()[0])
 
@@ -142,7 +142,7 @@ def test_observer_is_the_rendering_camera(rgb, tmp_path):
 
 
 def test_accumulation_matches_for_a_million_values(rgb):
-    # Dr.Jit adds to large arrays in another order than to small ones.
+    # Dr.Jit accumulates into large arrays in another order.
     scene = make_lit_scene(rgb, BOX | {"width": 500, "height": 300})
     expected = render_undivided(rgb, scene, 4)
     assert expected.size > 1e6
@@ -163,12 +163,12 @@ def test_other_films(rgb, film):
     scene = make_lit_scene(rgb, film)
     expected = render_undivided(rgb, scene, 4)
     window = [list(v) for v in (scene.sensors()[0].film().crop_size(), scene.sensors()[0].film().crop_offset())]
-    found = render_divided(scene, 4, rows=3, strip=128)
+    image = render_divided(scene, 4, rows=3, strip=128)
     if film["rfilter"]["type"] == "box":
-        assert np.array_equal(found, expected)
+        assert np.array_equal(image, expected)
     else:
-        assert np.allclose(found, expected, rtol=1e-4, atol=1e-4)
-    # The scene is as it was.
+        assert np.allclose(image, expected, rtol=1e-4, atol=1e-4)
+    # The scene is unchanged.
     assert [list(v) for v in (scene.sensors()[0].film().crop_size(), scene.sensors()[0].film().crop_offset())] == window
 
 
@@ -201,15 +201,15 @@ def test_bands_scale_with_pixels(rgb):
 
 
 def test_wide_filter_has_a_minimum_band(rgb):
-    """As where the scene itself takes all of it: each band renders the rows around it again."""
+    """Even if the scene exhausts the memory: each band renders the rows around it again."""
     scene = make_lit_scene(rgb, {"width": 18, "height": 200, "rfilter": {"type": "gaussian"}})
     rows = bands.fit_rows_to_memory(scene, scene.sensors()[0], -1e9)
-    told = []
+    totals = []
     for _ in bands.render_bands(
-        scene, scene.sensors()[0], spp=1, rows=rows, on_strip=lambda done, total: told.append(total)
+        scene, scene.sensors()[0], spp=1, rows=rows, on_strip=lambda done, total: totals.append(total)
     ):
         pass
-    assert 1 < rows < 50 and told[-1] < 1.3 * 18 * 200
+    assert 1 < rows < 50 and totals[-1] < 1.3 * 18 * 200
 
 
 def test_progress_and_interruption(rgb):
@@ -226,7 +226,7 @@ def test_progress_and_interruption(rgb):
     assert tuple(scene.sensors()[0].film().crop_size()) == (18, 11)
 
 
-# ---- A picture taken apart, against what Mitsuba makes of it ----
+# ---- Channels ----
 
 
 @pytest.fixture
@@ -271,7 +271,7 @@ def test_mask_is_half_opacity():
     assert seen.mask.tolist() == [[False, True, True]]
 
 
-# ---- Several pictures of the same rays: each is the one that an integrator makes alone ----
+# ---- Layers ----
 
 
 @pytest.fixture
@@ -283,7 +283,7 @@ def scene_layers(rgb):
 
 
 class TwoLayers:
-    """The scene's own picture, and one of twice its depths."""
+    """The image of the scene, and one with twice its depths."""
 
     def __init__(self, integrator):
         self.integrator, self.channel_names, self.num_channels = integrator, [integrator.aov_names(), ["twice.T"]], 3
@@ -309,16 +309,16 @@ def test02_layers_alternate_in_each_band(rgb, scene_layers, rows):
         scene_layers, scene_layers.sensors()[0], spp=4, rows=rows, layers=TwoLayers(scene_layers.integrator())
     ):
         pictures[band.layer].append(np.array(band.film.develop())[: band.rows])
-    own, twice = (np.concatenate(parts) for parts in pictures)
-    assert np.array_equal(own, expected)
-    assert np.allclose(twice[..., 3], 2 * expected[..., 3]) and not twice[..., :3].any()
+    first, twice = (np.concatenate(parts) for parts in pictures)
+    assert np.array_equal(first, expected)
+    assert np.allclose(twice[..., 3], 2 * first[..., 3]) and not twice[..., :3].any()
 
 
-# ---- Strips of samples: where they begin and end, and how long they become ----
+# ---- Strips ----
 
 
 class Clock:
-    """A clock that stands still but for ``take``."""
+    """A clock that advances only by ``take``."""
 
     def __init__(self, monkeypatch):
         self.now = 0.0
@@ -346,7 +346,7 @@ def first_strip(it):
 def test04_strip_size_adapts_within_limits(rgb, monkeypatch):
     clock, it = Clock(monkeypatch), SamplePace()
     before = first_strip(it)
-    # The first two are not asked: they were compiled, or wait for what was.
+    # The first two strips do not count, because of compilation.
     clock.take(it, 0.01, 2)
     assert first_strip(it) == before
     clock.take(it, 0.01)
@@ -371,7 +371,7 @@ def test06_pace_carries_over_to_next_image(rgb, monkeypatch):
     clock.take(it, 0.01, 4)
     grown = first_strip(it)
     assert grown > before
-    # Reading the next scene is no strip's time.
+    # Loading the next scene does not count.
     it.begin()
     clock.take(it, 10 * bands.STRIP_SECONDS)
     clock.take(it, 10 * bands.STRIP_SECONDS)
@@ -380,7 +380,7 @@ def test06_pace_carries_over_to_next_image(rgb, monkeypatch):
     assert first_strip(it) == grown // 2
 
 
-# ---- A range of samples draws the numbers that it has in Mitsuba's whole picture ----
+# ---- Random numbers of a range of samples ----
 
 
 @pytest.mark.parametrize("base, seed", [(0, 0), (5, 9), (4294967295, 3)])
@@ -410,7 +410,7 @@ def test_other_samplers_have_no_base_seed(rgb):
     assert bands.get_base_seed(rgb.load_dict({"type": "stratified"})) is None
 
 
-# ---- The integrator asked for what its own list lacks gives what it gives with a longer list ----
+# ---- Additional AOVs ----
 
 
 @pytest.fixture(scope="module")
@@ -431,13 +431,13 @@ def test_render_aovs_equals_scene_with_aovs(rgb, files, observed):
     load = lambda aovs: rgb.load_dict(
         {"type": "scene", "integrator": with_gaze(files, aovs=aovs, **observer), "sensor": camera(rgb)}
     )
-    own, bare = load(",".join(names)), load("depth")
-    wanted = render_channels(own, own.sensors()[0], spp=2, seed=3)
-    found = render_aovs("a.xml", bare, bare.sensors()[0], names, 2, 3)
-    assert found.aovs["gaze"].max() > 0
-    np.testing.assert_array_equal(found.color, wanted.color)
+    expected, bare = load(",".join(names)), load("depth")
+    wanted = render_channels(expected, expected.sensors()[0], spp=2, seed=3)
+    channels = render_aovs("a.xml", bare, bare.sensors()[0], names, 2, 3)
+    assert channels.aovs["gaze"].max() > 0
+    np.testing.assert_array_equal(channels.color, wanted.color)
     for name in names:
-        np.testing.assert_array_equal(found.aovs[name], wanted.aovs[name])
+        np.testing.assert_array_equal(channels.aovs[name], wanted.aovs[name])
 
 
 def test_invalid_aov_requests_are_refused(rgb, files):
@@ -454,7 +454,7 @@ def test_invalid_aov_requests_are_refused(rgb, files):
         render_aovs("a.xml", scene, scene.sensors()[0], ["gaze"])
 
 
-# ---- Renders of many samples: which are prepared, and that nothing else changes ----
+# ---- Long renderings ----
 
 SMALL = {"width": "24", "height": "16", "spp": "1"}
 
@@ -469,11 +469,11 @@ def test07_long_rendering_is_prepared_and_equal(rgb, samples, prepared):
     plain, scene = load_scene(find_store_scene(), SMALL), load_scene(find_store_scene(), SMALL)
     assert prepare_long_render(samples, scene) is prepared
     assert [net.constant for net in list_networks(scene)] == [prepared] * 5
-    found, expected = (np.array(rgb.render(s, sensor=0, spp=1)) for s in (scene, plain))
-    assert expected[..., :3].max() > 0.1 and np.array_equal(found, expected)
+    before, expected = (np.array(rgb.render(s, sensor=0, spp=1)) for s in (scene, plain))
+    assert expected[..., :3].max() > 0.1 and np.array_equal(before, expected)
 
 
 def test08_scene_without_fields_is_not_prepared(rgb):
     shapes = rgb.load_dict({"type": "scene", "integrator": {"type": "nerg"}, "ball": {"type": "sphere"}})
-    others = rgb.load_dict({"type": "scene", "integrator": {"type": "path"}, "ball": {"type": "sphere"}})
-    assert not prepare_long_render(LONG_RENDER_SAMPLES, shapes) and not prepare_long_render(LONG_RENDER_SAMPLES, others)
+    scenes = rgb.load_dict({"type": "scene", "integrator": {"type": "path"}, "ball": {"type": "sphere"}})
+    assert not prepare_long_render(LONG_RENDER_SAMPLES, shapes) and not prepare_long_render(LONG_RENDER_SAMPLES, scenes)

@@ -23,7 +23,7 @@ from nerg_mi.rendering.files import (
 )
 from tests.pictures import mitsuba_bitmap
 
-# ---- Files of frames: what is written is read, and what is none is told in a sentence ----
+# ---- Frames files ----
 
 
 def test_frames_round_trip(tmp_path):
@@ -69,17 +69,15 @@ def test_frame_paths():
     assert frame_path(Path("walk.exr"), 7, 12345) == Path("walk_00007.exr")
 
 
-# ---- Mesh file ----
-#
-# Meshes and volumes are refused where their counts or corners are wrong, before Mitsuba believes them.
+# ---- Checks of meshes and volumes ----
 
 CORNERS = struct.pack("<9f", 0, 0, 0, 1, 0, 0, 0, 1, 0)
 
 
-def make_ply(vertices: int, faces: int, body: bytes, kind="binary_little_endian", more="") -> bytes:
+def make_ply(vertices: int, faces: int, body: bytes, kind="binary_little_endian", extra_header="") -> bytes:
     return (
         f"ply\nformat {kind} 1.0\ncomment of nothing\nelement vertex {vertices}\nproperty float x\nproperty float y\n"
-        f"property float z\nelement face {faces}\nproperty list uchar int vertex_indices\n{more}end_header\n"
+        f"property float z\nelement face {faces}\nproperty list uchar int vertex_indices\n{extra_header}end_header\n"
     ).encode() + body
 
 
@@ -96,7 +94,10 @@ BIG = struct.pack(">9f", 0, 0, 0, 1, 0, 0, 0, 1, 0) + b"\x03" + struct.pack(">3i
     [
         make_ply(3, 1, CORNERS + pack_face(0, 1, 2)),
         make_ply(
-            3, 2, CORNERS + pack_face(0, 1, 2) + b"\x07" + pack_face(2, 1, 0) + b"\x08", more="property uchar mark\n"
+            3,
+            2,
+            CORNERS + pack_face(0, 1, 2) + b"\x07" + pack_face(2, 1, 0) + b"\x08",
+            extra_header="property uchar mark\n",
         ),
         make_ply(3, 1, TEXT + b"3 0 1 2\n", "ascii"),
         make_ply(3, 1, TEXT + b"\n3 0 1 2", "ascii"),
@@ -196,7 +197,7 @@ def test_valid_volume_passes(tmp_path):
     check_vol(tmp_path / "a.vol")
 
 
-# ---- Pictures written in pieces are those written as a whole ----
+# ---- Image files ----
 
 
 @pytest.fixture
@@ -239,7 +240,7 @@ def test_unknown_format_is_refused(tmp_path):
 
 @pytest.mark.parametrize("short_by", [1, 3000])
 def test_truncated_file_is_detected(tmp_path, short_by):
-    # As on a disk that is full; a limit holds for the whole process, hence in a child.
+    # As on a full disk; the limit applies to a process, hence the child process.
     script = """
 import resource, signal, sys
 import numpy as np

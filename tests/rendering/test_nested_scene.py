@@ -13,9 +13,7 @@ from nerg_mi.rendering.scene import load_scene
 from nerg_mi.rendering.scene_writer import LookAt, GazeFiles, SceneText
 from nerg_mi.workflows import demo
 
-# ---- Nested scene ----
-#
-# Somebody's scene as a place: its light goes into ours, its sensors come after ours, its files are found.
+# ---- Nested scenes ----
 
 THEIRS = """<scene version="3.0.0">
     <!-- theirs -->
@@ -63,11 +61,11 @@ def test_nested_light_sensors_and_files(rgb, theirs, tmp_path, where):
     out.parent.mkdir(exist_ok=True)
     scene = shown(path, out)
     assert len(scene.sensors()) == 4 and tuple(scene.sensors()[3].film().crop_size()) == (7, 5)
-    found = render_channels(scene, scene.sensors()[0], spp=256)
-    # A diffuse plane in an even light sends back its albedo of it: 0.8 x 0.5.
-    assert found.color[4].mean() == pytest.approx(0.4, rel=0.02)
-    assert found.mask[4].all()
-    np.testing.assert_allclose(found.aovs["depth"][4, 6], 4, atol=0.1)
+    image = render_channels(scene, scene.sensors()[0], spp=256)
+    # A diffuse plane under constant light reflects its albedo: 0.8 x 0.5.
+    assert image.color[4].mean() == pytest.approx(0.4, rel=0.02)
+    assert image.mask[4].all()
+    np.testing.assert_allclose(image.aovs["depth"][4, 6], 4, atol=0.1)
     text = out.read_text()
     assert ("<path" in text) == (where[0] == "e") and "theirs" in text and str(tmp_path) not in text
 
@@ -93,7 +91,7 @@ def test_invalid_scenes_are_refused(theirs, tmp_path, text, said):
         nest_scene(theirs(text=text), tmp_path)
 
 
-# ---- A scene with another gaze field: the same but for it, wherever the copy lies ----
+# ---- Replaced gaze fields ----
 
 PLAIN = """<scene version="3.0.0"><default name="n" value="a"/>{}<shape type="sphere"/></scene>"""
 NERG = """<integrator type="nerg"><volume name="gaze" type="gazefield"><string name="filename" value="$n.bin"/></volume>
@@ -120,7 +118,7 @@ def test02_exactly_one_integrator_is_required(tmp_path, count):
 
 @pytest.mark.slow
 def test03_replaced_gaze_renders_the_same(rgb, tmp_path):
-    """The store with its own gaze field in a file of another name: the same picture."""
+    """A copy of the store's gaze field under another name."""
     store = demo.find_store_scene()
     other = tmp_path / "other.safetensors"
     other.write_bytes((store.parent / "shoppers.safetensors").read_bytes())
@@ -128,5 +126,5 @@ def test03_replaced_gaze_renders_the_same(rgb, tmp_path):
     assert find_gaze_file(tmp_path / "copy.xml") == other.resolve()
     at, ahead = [(4.4, 2.8, 1.6)] * 16, np.random.default_rng(1).normal(size=(16, 3))
     ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
-    found = [nerg.trace(nerg.Scene.load(path), at, ahead, ["gaze", "depth"]) for path in (store, tmp_path / "copy.xml")]
-    assert np.array_equal(found[0]["gaze"], found[1]["gaze"]) and np.array_equal(found[0].depth, found[1].depth)
+    image = [nerg.trace(nerg.Scene.load(path), at, ahead, ["gaze", "depth"]) for path in (store, tmp_path / "copy.xml")]
+    assert np.array_equal(image[0]["gaze"], image[1]["gaze"]) and np.array_equal(image[0].depth, image[1].depth)

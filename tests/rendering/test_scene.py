@@ -13,7 +13,7 @@ from nerg_mi.errors import NergError, UnusableLLVM
 from nerg_mi.rendering.scene import MAX_DEPTH, activate_variant, check_scene_file, load_scene
 from nerg_mi.workflows.render import find_sensor
 
-# ---- Variants that work and that do not, and scenes that are loaded ----
+# ---- Variants and loading ----
 
 
 def test_best_variant_is_activated(rgb, monkeypatch):
@@ -80,7 +80,7 @@ SCALED = '<shape type="{}"><transform name="to_world"><scale value="{}"/></trans
         *[(f'<shape type="sphere"><float name="radius" value="{r}"/></shape>', "Sphere") for r in ("nan", "inf", 1e38)],
         *[(SCALED.format("cube", scale), "Mesh|Cube") for scale in ("nan", 1.1e7, -1e200)],
         (SCALED.format("disk", "inf"), "corners of the Disk"),
-        (SCALED.format("cube", 1) + SCALED.format("cube", 1e9), "corners"),  # which Mitsuba makes one mesh of
+        (SCALED.format("cube", 1) + SCALED.format("cube", 1e9), "corners"),  # merged by Mitsuba
         (
             '<sensor type="perspective"><transform name="to_world"><translate x="1e30"/></transform></sensor>',
             "the to_world of sensor 0",
@@ -104,19 +104,16 @@ def test_missing_integrator_is_refused(rgb, tmp_path):
         find_sensor(tmp_path / "s.xml", load_scene(tmp_path / "s.xml"), 0)
 
 
-# ---- Scene file ----
-#
-# A scene that would end the process or fill the memory is one sentence, by whichever command it comes in.
+# ---- Checks of scene files, for each entry point ----
 
 SENSOR = """<sensor type="perspective"><sampler type="{sampler}"><integer name="sample_count" value="{spp}"/></sampler>
 <film type="hdrfilm"><integer name="width" value="{width}"/><integer name="height" value="{height}"/></film></sensor>"""
 
 
-def scene(*things: str, sampler="independent", spp="1", width="8", height="8") -> str:
+def scene(*elements: str, sampler="independent", spp="1", width="8", height="8") -> str:
     sensor = SENSOR.format(sampler=sampler, spp=spp, width=width, height=height)
-    return (
-        f'<scene version="3.0.0"><integrator type="direct"/><emitter type="constant"/>{"".join(things)}{sensor}</scene>'
-    )
+    content = "".join(elements) + sensor
+    return f'<scene version="3.0.0"><integrator type="direct"/><emitter type="constant"/>{content}</scene>'
 
 
 def shape(kind: str, file: str) -> str:
@@ -137,7 +134,7 @@ GRID = """<shape type="cube"><medium name="interior" type="heterogeneous"><volum
 DEEP = '<shape type="cube">' * 20000 + "</shape>" * 20000
 
 
-# What ends the process without the checks.
+# Scenes that crash the process without the checks.
 CRASHING = {
     "deep": (scene(DEEP), {}, f"more than {MAX_DEPTH} levels deep"),
     "corner": (scene(shape("ply", "a.ply")), {"a.ply": mesh(999999999)}, "none of its 3 vertices"),
@@ -150,7 +147,7 @@ CRASHING = {
 
 
 def written(folder, name):
-    """The scene file of what is deadly, and what is said of it."""
+    """Write a crashing scene and return its file and the expected message."""
     text, files, said = CRASHING[name]
     (folder / "s.xml").write_text(text)
     for file, data in files.items():
@@ -300,8 +297,8 @@ type="mesh_attribute"><string name="name" value="vertex_color"/></texture></bsdf
 )
 def test_meshes_with_unread_colors_are_refused(tmp_path, columns, value, shown, said):
     kind = "float" if columns.startswith("n") else "uchar"
-    more = "".join(f"property {kind} {name}\n" for name in columns.split())
-    head = f"ply\nformat ascii 1.0\nelement vertex 3\n{PROPERTIES}{more}element face 1\n"
+    extra = "".join(f"property {kind} {name}\n" for name in columns.split())
+    head = f"ply\nformat ascii 1.0\nelement vertex 3\n{PROPERTIES}{extra}element face 1\n"
     (tmp_path / "a.ply").write_text(f"{head}property list uchar int vertex_indices\nend_header\n{ROW.format(value)}")
     (tmp_path / "a.xml").write_text(scene(shown))
     if said is None:

@@ -33,7 +33,7 @@ from nerg_mi.rendering.scene_writer import (
 )
 from tests.plugins.scenes import plugin
 
-# ---- Where points lie in a picture, against a pinhole written down by hand ----
+# ---- Projection ----
 
 
 @pytest.fixture
@@ -64,19 +64,26 @@ def test_points_project_to_pixels(rgb, camera):
 
 def test_points_outside_the_image(rgb, camera):
     assert project_to_pixel(camera, rgb.Point3f(2, -8, 3)) is None  # behind
-    assert project_to_pixel(camera, rgb.Point3f(20, 0, 1)) is None  # beside
+    assert project_to_pixel(camera, rgb.Point3f(20, 0, 1)) is None  # outside
 
 
-# ---- A written scene, loaded by Mitsuba: its sensors look where they should, and its defaults can be set ----
+# ---- Written scenes, loaded by Mitsuba ----
 
 CUBE = SceneContent(scene_children=(element("shape", type="cube"),))
 UP = np.array([0.0, 0, 1])
 
 
-def write_scene(folder, **more):
+def write_scene(folder, **overrides):
     eye, camera = LookAt(np.array([0, 0, 5.0]), np.array([0, 0, 0.0])), LookAt(np.array([4, 1, 2.0]), np.array([0, 0, 0.5]))
-    given = {"place": CUBE, "attention": GazeFiles(), "camera": camera, "observer": eye, "up": UP, "width": 24} | more
-    scene = SceneText(**given)
+    values = {
+        "place": CUBE,
+        "attention": GazeFiles(),
+        "camera": camera,
+        "observer": eye,
+        "up": UP,
+        "width": 24,
+    } | overrides
+    scene = SceneText(**values)
     (folder / "scene.xml").write_text(scene.to_xml())
     return scene
 
@@ -87,22 +94,22 @@ def axis(sensor):
 
 def test_poses_of_sensors(rgb, tmp_path):
     scene = write_scene(tmp_path, observer=LookAt(np.array([0.0, -3, 1]), np.array([1.0, -2, 0])))
-    camera, own, sphere = load_scene(tmp_path / "scene.xml").sensors()
+    camera, observer_view, sphere = load_scene(tmp_path / "scene.xml").sensors()
     to = lambda eye: (eye.target - eye.origin) / np.linalg.norm(eye.target - eye.origin)
     np.testing.assert_allclose(axis(camera), to(scene.camera), atol=1e-6)
-    np.testing.assert_allclose(axis(own), to(scene.observer), atol=1e-6)
+    np.testing.assert_allclose(axis(observer_view), to(scene.observer), atol=1e-6)
     # Level, and towards where the observer looks.
     np.testing.assert_allclose(axis(sphere), np.array([1, 1, 0]) / np.sqrt(2), atol=1e-6)
-    assert [tuple(s.film().crop_size()) for s in (camera, own, sphere)] == [(24, 16), (24, 16), (20, 10)]
-    for sensor in (own, sphere):
+    assert [tuple(s.film().crop_size()) for s in (camera, observer_view, sphere)] == [(24, 16), (24, 16), (20, 10)]
+    for sensor in (observer_view, sphere):
         np.testing.assert_allclose(np.array(sensor.world_transform().matrix)[:3, 3].ravel(), [0, -3, 1], atol=1e-6)
 
 
 def test_defaults_set_poses(rgb, tmp_path):
     write_scene(tmp_path, observer=LookAt(np.array([0.0, -3, 1]), np.array([1.0, -2, 0])))
     scene = load_scene(tmp_path / "scene.xml", {"eye": "1, 2, 3", "width": "12", "fov": "40", "spp": "3"})
-    camera, own, sphere = scene.sensors()
-    for sensor in (own, sphere):
+    camera, observer_view, sphere = scene.sensors()
+    for sensor in (observer_view, sphere):
         np.testing.assert_allclose(np.array(sensor.world_transform().matrix)[:3, 3].ravel(), [1, 2, 3], atol=1e-6)
     assert tuple(camera.film().crop_size()) == (12, 16) and camera.sampler().sample_count() == 3
     assert float(np.array(rgb.traverse(camera)["x_fov"]).ravel()[0]) == pytest.approx(40)
@@ -141,7 +148,7 @@ def test_relative_paths(tmp_path):
     assert relative_path(Path("/one/x.ply"), Path("/two")) == "/one/x.ply"
 
 
-# ---- Text of scene files: what is escaped, what is refused, and how it is laid out ----
+# ---- XML formatting ----
 
 NASTY = "a<b>&\"c\"'d' \n\té"
 
@@ -189,5 +196,5 @@ def test_numbers_and_matrices():
     assert format_numbers([np.float32(0.1), 5_600_000.25, np.float32(16777217)]) == "0.1, 5600000.25, 16777216"
     assert format_numbers([1, -0.0, 0.1, 1e-7, 123456.789]) == "1, 0, 0.1, 1e-07, 123456.789"
     values = np.arange(16).reshape(4, 4) / 3
-    found = ElementTree.fromstring(format_document([transform(matrix(values))], "h"))[0][0].get("value")
-    np.testing.assert_allclose(np.array(found.split(), float).reshape(4, 4), values, rtol=1e-14)
+    parsed = ElementTree.fromstring(format_document([transform(matrix(values))], "h"))[0][0].get("value")
+    np.testing.assert_allclose(np.array(parsed.split(), float).reshape(4, 4), values, rtol=1e-14)

@@ -1,4 +1,4 @@
-"""What tests of the viewer need and may not find: viser, selenium, and a headless Chromium."""
+"""Optional requirements of the viewer tests: viser, selenium and a headless Chromium."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def _missing(what: str):
 
 
 def require(module: str):
-    """The module; the test is skipped without it, or fails where NERG_REQUIRE_BROWSER is set."""
+    """Import a module; without it, the test is skipped, or fails if NERG_REQUIRE_BROWSER is set."""
     try:
         return importlib.import_module(module)
     except ImportError:
@@ -31,7 +31,7 @@ def require(module: str):
 
 @contextmanager
 def chromium(width: int = 1200, height: int = 760) -> Iterator:
-    """A driver of a headless Chromium with a profile of its own, which reaches this machine alone."""
+    """Start a headless Chromium with a temporary profile and yield its driver."""
     require("selenium")
     from selenium import webdriver
     from selenium.webdriver.chrome.service import Service

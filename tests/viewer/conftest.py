@@ -1,4 +1,4 @@
-"""The demo store, a room of a few shapes whose answers are known, and gaze fields in it."""
+"""Fixtures of the viewer tests: the demo store, and a simple room with gaze fields."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from nerg_mi.formats.fields import save_gaze
 from nerg_mi.maths.geometry import Box
 from nerg_mi.workflows import demo
 
-# ---- A room of a few shapes whose answers are known, and gaze fields in it ----
+# ---- A simple room with an analytic solution ----
 
 ROOM = """<scene version="3.0.0">
     <integrator type="nerg" id="integrator">
@@ -45,8 +45,7 @@ ROOM = """<scene version="3.0.0">
 
 
 def write_gaze_fields(folder: Path) -> list[Path]:
-    """Two untrained gaze fields in the room, of both factors and of emit alone: emit_capture.safetensors and
-    emit.safetensors in ``folder``."""
+    """Write two untrained gaze fields to ``folder``, of the variants emit_capture and emit, and return the files."""
     files, rng = [], np.random.default_rng(3)
     grid = HashGridConfig(levels=2, log2_rows=10, base=2, finest=4)
     for variant in ("emit_capture", "emit"):
@@ -54,7 +53,7 @@ def write_gaze_fields(folder: Path) -> list[Path]:
         field = LogGazeField.random(
             config, Box((-3, -3, -1), (3, 3, 2)), namespace("llvm"), 1, rng.normal(size=(8, 16))
         )
-        # So that they differ beyond what one lacks.
+        # Random tables, so that the fields differ also in the factor that they share.
         table = field.grid.table
         field.set_parameters({"grid.table": type(table)(rng.normal(size=len(table)).astype(np.float32))})
         files.append(folder / f"{variant}.safetensors")
@@ -62,12 +61,12 @@ def write_gaze_fields(folder: Path) -> list[Path]:
     return files
 
 
-# ---- The demo store, and a scene of a few shapes whose answers are known, for tests of the viewer ----
+# ---- Fixtures ----
 
 
 @pytest.fixture
 def room(rgb, tmp_path):
-    """The file of a floor at z = 0 with a box from 1 to 2 along x, in plain light."""
+    """File of a scene with a floor at z = 0, a box from x = 1 to x = 2, and constant light."""
     path = tmp_path / "room.xml"
     path.write_text(ROOM)
     return path
@@ -80,13 +79,13 @@ def room_scene(room):
 
 @pytest.fixture
 def gaze_fields(rgb, tmp_path):
-    """Files of two untrained gaze fields in the room, one of both factors and one of emit alone."""
+    """Files of two untrained gaze fields in the room, of the variants emit_capture and emit."""
     return write_gaze_fields(tmp_path)
 
 
 @pytest.fixture
 def store(rgb):
-    """The file of the demo store's scene, with its trained fields."""
+    """File of the demo store's scene with its trained fields."""
     path = demo.find_store_scene()
     if not all((path.parent / name).is_file() for name in demo.CHECKPOINTS.values()):
         pytest.skip("the store's fields are not here: python -m nerg_mi.scenes.store.make")

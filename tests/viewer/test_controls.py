@@ -1,4 +1,4 @@
-"""The panel's boxes, tables and files; layers, their ranges and colours."""
+"""Boxes, tables and files of the panel; layers with their ranges and colours."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from nerg_mi.viewer.points import PinholeView
 from nerg_mi.viewer.scene import copy_view
 from nerg_mi.viewer.session import Worker
 
-# ---- Boxes that are laid around what is seen within a rectangle ----
+# ---- Boxes fitted to a rectangle ----
 
 
 def test01_box_fits_nearest_points():
     rng = np.random.default_rng(4)
-    thing = np.array([2.0, 0, 1]) + 0.2 * (rng.random((500, 3)) - 0.5)
+    near_points = np.array([2.0, 0, 1]) + 0.2 * (rng.random((500, 3)) - 0.5)
     wall = np.stack([np.full(500, 9.0), *(4 * rng.random((2, 500)) - 2)], axis=1)
     view = PinholeView.look_at((0, 0, 1), (2, 0, 1), (0, 0, 1), 1.0, 1.5)
-    lower, upper = fit_box(np.concatenate([thing, wall]), 0.01, view, (0.4, 0.35), (0.6, 0.65))
+    lower, upper = fit_box(np.concatenate([near_points, wall]), 0.01, view, (0.4, 0.35), (0.6, 0.65))
     assert np.allclose(lower, [1.9, -0.1, 0.9], atol=0.03) and np.allclose(upper, [2.1, 0.1, 1.1], atol=0.03)
     with pytest.raises(NergError, match="contains no points"):
-        fit_box(thing, 0.01, view, (0.8, 0.8), (0.9, 0.9))
+        fit_box(near_points, 0.01, view, (0.8, 0.8), (0.9, 0.9))
 
 
 def test02_rectangle_right_and_above():
@@ -44,13 +44,15 @@ def test02_rectangle_right_and_above():
 
 
 def test03_box_has_twelve_edges():
-    found = box_edges(Region.create("a", [0, 0, 0], [1, 2, 3]))
-    lengths = np.sort(np.abs(found[:, 1] - found[:, 0]).sum(axis=1))
-    assert found.shape == (12, 2, 3) and np.allclose(lengths, [1] * 4 + [2] * 4 + [3] * 4)
-    assert len(np.unique(found.reshape(12, -1), axis=0)) == 12 and len(np.unique(found.reshape(-1, 3), axis=0)) == 8
+    segments = box_edges(Region.create("a", [0, 0, 0], [1, 2, 3]))
+    lengths = np.sort(np.abs(segments[:, 1] - segments[:, 0]).sum(axis=1))
+    assert segments.shape == (12, 2, 3) and np.allclose(lengths, [1] * 4 + [2] * 4 + [3] * 4)
+    assert (
+        len(np.unique(segments.reshape(12, -1), axis=0)) == 12 and len(np.unique(segments.reshape(-1, 3), axis=0)) == 8
+    )
 
 
-# ---- The panel's tables and files ----
+# ---- Tables and files of the panel ----
 
 
 def test04_shares_are_sorted():
@@ -60,7 +62,7 @@ def test04_shares_are_sorted():
     many = cells(format_shares({f"n{k}": 0.01 for k in range(20)}))
     assert len(many) == 26 and many[-2:] == ["8 more", "8.0 %"]
     assert "Add areas" in format_shares({}) and "Computing" in format_shares({}, True)
-    # Out of date, they are pale, and it is said.
+    # Outdated shares are pale and marked.
     assert "Outdated" not in text and STALE_STYLE not in text
     assert "Outdated" in (old := format_shares({"a": 0.1}, True)) and STALE_STYLE in old
 
@@ -124,7 +126,7 @@ def test08_png_has_size_and_text(rgb):
     assert b"tEXtComment\0a shelf" in data
 
 
-# ---- Layers: what a scene has, their ranges and colours ----
+# ---- Layers ----
 
 OF_ALL = "visible to the observer", "observer depth", "evaluations of density", "evaluations of colour"
 
@@ -132,8 +134,10 @@ OF_ALL = "visible to the observer", "observer depth", "evaluations of density", 
 def test09_layers_of_a_scene(store, room_scene):
     titles = [la.title for la in layers.list_layers(room_scene)]
     assert titles == ["colour", "depth", "opacity", *(f"position {axis}" for axis in "XYZ"), *OF_ALL]
-    found = [la.title for la in layers.list_layers(nerg.Scene.load(store))]
-    assert {"gaze", "colour", "depth", *OF_ALL, "features 0"} < set(found) and "uncertainty of gaze" not in found
+    titles_of_store = [la.title for la in layers.list_layers(nerg.Scene.load(store))]
+    assert {"gaze", "colour", "depth", *OF_ALL, "features 0"} < set(
+        titles_of_store
+    ) and "uncertainty of gaze" not in titles_of_store
 
 
 def test10_missing_factor_has_no_layer(room, gaze_fields, tmp_path):
@@ -146,30 +150,30 @@ def test10_missing_factor_has_no_layer(room, gaze_fields, tmp_path):
 
 
 def test11_each_channel_has_a_layer():
-    found = dict(position=np.arange(12.0).reshape(2, 2, 3), depth=np.ones((2, 2)), features=np.ones((2, 5)) * range(5))
+    values = dict(position=np.arange(12.0).reshape(2, 2, 3), depth=np.ones((2, 2)), features=np.ones((2, 5)) * range(5))
     for name, expected in (("position.Y", [[1, 4], [7, 10]]), ("depth", np.ones((2, 2))), ("features.3", [3, 3])):
-        assert np.array_equal(get_layer(name).select_values(found), expected), name
-    assert get_layer("gaze").select_values(found) is None and get_layer("color").select_values(found) is None
+        assert np.array_equal(get_layer(name).select_values(values), expected), name
+    assert get_layer("gaze").select_values(values) is None and get_layer("color").select_values(values) is None
     assert get_layer("position.Y").quantity == "position" and get_layer("position.Y").title == "position Y"
 
 
 def test12_heat_equals_overlay():
     rng = np.random.default_rng(2)
     color, gaze, mask = rng.random((8, 9, 3)), rng.random((8, 9)), np.ones((8, 9), bool)
-    found = layers.colorize(get_layer("gaze"), color, gaze, mask, Scale(0, 0.7, "magma"))
-    assert np.array_equal(found, to_bytes(overlay(color, gaze, Heat(0.7, "magma"), mask)))
-    # Points are coloured as pixels are.
+    image = layers.colorize(get_layer("gaze"), color, gaze, mask, Scale(0, 0.7, "magma"))
+    assert np.array_equal(image, to_bytes(overlay(color, gaze, Heat(0.7, "magma"), mask)))
+    # Points have the same colours as pixels.
     points = layers.colorize(get_layer("gaze"), color.reshape(-1, 3), gaze.ravel(), mask.ravel(), Scale(0, 0.7, "magma"))
-    assert np.array_equal(points, found.reshape(-1, 3))
+    assert np.array_equal(points, image.reshape(-1, 3))
 
 
 def test13_missing_data_is_hatched():
     mask = np.ones((24, 24), bool)
     mask[:12] = False
-    given = get_layer("depth"), np.zeros((24, 24, 3)), np.full((24, 24), 0.5), mask, Scale(0, 1)
-    shown, plain = layers.colorize(*given), layers.colorize(*given, hatched=False)
+    inputs = get_layer("depth"), np.zeros((24, 24, 3)), np.full((24, 24), 0.5), mask, Scale(0, 1)
+    shown, plain = layers.colorize(*inputs), layers.colorize(*inputs, hatched=False)
     assert np.array_equal(shown[12:], plain[12:]) and len(np.unique(shown[12:].reshape(-1, 3), axis=0)) == 1
-    # As pictures are: lines over paled colours.
+    # As in pictures: lines over pale colours.
     drawn = hatch_lines(24, 24)[:12]
     assert (shown[:12][drawn] == round(255 * LINE)).all()
     assert (shown[:12][~drawn] > plain[:12][~drawn]).all()
@@ -186,10 +190,10 @@ def test14_automatic_range():
     assert low < high
 
 
-@pytest.mark.parametrize("given", [(1.0, 1.0), (0.0, np.nan), (2.0, 1.0)])
-def test15_invalid_range_is_refused(given):
+@pytest.mark.parametrize("limits", [(1.0, 1.0), (0.0, np.nan), (2.0, 1.0)])
+def test15_invalid_range_is_refused(limits):
     with pytest.raises(NergError, match="the lower end of a range"):
-        Scale(*given)
+        Scale(*limits)
     with pytest.raises(NergError, match="perceptually uniform"):
         Scale(0, 1, "jet")
 

@@ -28,49 +28,53 @@ from nerg_mi.viewer.session import Worker
 from nerg_mi.workflows.scene_commands import ViewOptions
 from tests.viewer.browser import require
 
-# ---- A flight as a video: in turns with other tasks, cancelled, and with what is shown ----
+# ---- Flight videos ----
 
 HOME = PinholeView.look_at((-2, 0, 1), (2, 0, 0), (0, 0, 1), 0.8, 1.37)
 
 
 @pytest.fixture
 def make_video(room, tmp_path):
-    """A function that makes a film of a few frames of the room, and the list of what it told."""
+    """Return a function that renders a video of a few frames of the room, and the list of its progress."""
 
     def make(seconds=0.5):
         further = PinholeView.look_at((-1, 0, 1), (2, 0, 0), (0, 0, 1), 0.8, 1.37)
-        kept = interpolate_views([HOME, further], seconds, 10)
-        views, shown = prepare_flight(kept, 49, observer=None, aovs=("depth",), spp=1, falloff=0.05)
+        flight = interpolate_views([HOME, further], seconds, 10)
+        views, shown = prepare_flight(flight, 49, observer=None, aovs=("depth",), spp=1, falloff=0.05)
         (tmp_path / "view.xml").write_text(copy_scene(room, shown))
         (tmp_path / "view.frames.csv").write_text(format_frames(views), newline="")
-        told, ended = [], []
+        fractions, ended = [], []
         options = make_video_options(get_layer("color"), Scale(), tmp_path / "view.frames.csv", 10, "llvm_ad_rgb")
         film = FlightVideo(
-            tmp_path / "view.xml", tmp_path / "f.mp4", options, lambda share, text: told.append(share), ended.append
+            tmp_path / "view.xml",
+            tmp_path / "f.mp4",
+            options,
+            lambda share, text: fractions.append(share),
+            ended.append,
         )
-        return film, told, ended
+        return film, fractions, ended
 
     return make
 
 
 def test01_video_contains_all_frames(make_video, tmp_path):
     av = pytest.importorskip("av")
-    film, told, ended = make_video()
+    film, fractions, ended = make_video()
     worker, turns = Worker(ended.append), []
 
-    def others():
+    def other_task():
         while not film._is_done:
-            turns.append(len(told))
+            turns.append(len(fractions))
             yield
 
-    worker.submit("others", 1, others())
+    worker.submit("others", 1, other_task())
     worker.submit("film", 1, film.steps())
     try:
         assert worker.wait_idle(120) and ended == [None]
     finally:
         worker.stop()
     assert len(set(turns)) > 3, "others have their turns while it is made"
-    assert told == sorted(told) and told[-1] == pytest.approx(1)
+    assert fractions == sorted(fractions) and fractions[-1] == pytest.approx(1)
     with av.open(str(tmp_path / "f.mp4")) as container:
         frames = [frame.to_ndarray(format="rgb24").astype(float) for frame in container.decode(video=0)]
     assert len(frames) == 6 and frames[0].shape == (36, 48, 3)
@@ -79,14 +83,14 @@ def test01_video_contains_all_frames(make_video, tmp_path):
 
 def test02_cancelled_video_leaves_no_file(make_video, tmp_path):
     pytest.importorskip("av")
-    film, told, ended = make_video(5.0)
+    film, fractions, ended = make_video(5.0)
     steps = film.steps()
     for _ in range(4):
         next(steps)
     film.cancel()
     for _ in steps:
         pass
-    assert [type(error) for error in ended] == [KeyboardInterrupt] and len(told) < 10
+    assert [type(error) for error in ended] == [KeyboardInterrupt] and len(fractions) < 10
     assert sorted(p.name for p in tmp_path.iterdir()) == ["room.xml", "view.frames.csv", "view.xml"]
 
 
@@ -123,7 +127,7 @@ def test06_video_options_of_a_layer():
     assert (depth.overlay, depth.vmax, depth.cmap) == ("depth", 7, "inferno")
 
 
-# ---- Flights of a camera: through the views that were kept, as frames that are read again ----
+# ---- Interpolated views and frames ----
 
 
 def view(x, ahead=(0, 1, 0)):
@@ -131,12 +135,14 @@ def view(x, ahead=(0, 1, 0)):
 
 
 def test07_flight_passes_through_key_views():
-    kept = [view(0), view(1), view(3, (1, 0, 0))]
-    found = interpolate_views(kept, 2.0, 10)
-    assert len(found) == 21
-    for at, one in zip((0, 10, 20), kept):
-        assert np.allclose(found[at].origin, one.origin) and np.allclose(found[at].forward, one.forward, atol=1e-9)
-    steps = np.diff([v.origin[0] for v in found])
+    key_views = [view(0), view(1), view(3, (1, 0, 0))]
+    flight_views = interpolate_views(key_views, 2.0, 10)
+    assert len(flight_views) == 21
+    for at, one in zip((0, 10, 20), key_views):
+        assert np.allclose(flight_views[at].origin, one.origin) and np.allclose(
+            flight_views[at].forward, one.forward, atol=1e-9
+        )
+    steps = np.diff([v.origin[0] for v in flight_views])
     assert (steps > 0).all() and steps[0] < steps[5], "it starts from rest"
 
 
@@ -150,21 +156,21 @@ def test08_frames_file_round_trip(tmp_path):
 
 @pytest.mark.parametrize("views, seconds, fps", [([], 1, 25), ([view(0)], 1, 25), ([view(0), view(1)], 1e6, 120)])
 def test09_invalid_flights_are_refused(views, seconds, fps):
-    with pytest.raises(NergError, match="a flight"):
+    with pytest.raises(NergError, match="flight"):
         interpolate_views(views, seconds, fps)
 
 
-# ---- The panel's part for flights: what is refused is said, and a video is sent to the page that asked ----
+# ---- Panel ----
 
 
 class Client:
     def __init__(self):
         self.notes, self.files = [], {}
 
-    def add_notification(self, title, body, **more):
+    def add_notification(self, title, body, **kwargs):
         self.notes.append(body)
 
-    def send_file_download(self, name, data, **more):
+    def send_file_download(self, name, data, **kwargs):
         self.files[name] = data
 
 

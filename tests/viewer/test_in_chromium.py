@@ -1,4 +1,4 @@
-"""The page in a real browser: it loads, the observer is dragged, the picture changes, nothing leaves the machine."""
+"""The page in a real browser."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ pytestmark = pytest.mark.slow
 
 
 def until(what, seconds=60.0):
-    """Wait for ``what`` to be true, and give it."""
+    """Wait until ``what()`` is true and return its value."""
     end = time.monotonic() + seconds
     while time.monotonic() < end:
-        found = what()
-        if found:
-            return found
+        value = what()
+        if value:
+            return value
         time.sleep(0.05)
     raise AssertionError("it did not come about in time")
 
 
 def read_pixels(driver):
-    """What the browser shows (height, width, 3), float."""
+    """Return the contents of the browser window (height, width, 3), float."""
     import mitsuba as mi
 
     stream = mi.MemoryStream()
@@ -43,7 +43,7 @@ def read_pixels(driver):
 
 
 def to_screen(driver, view: PinholeView, point) -> tuple[int, int]:
-    """Where ``point`` is in the window, in pixels."""
+    """Return the position of ``point`` in the window, in pixels."""
     away = np.asarray(point, float) - view.origin
     depth, rise = away @ view.forward, np.tan(view.fov / 2)
     right = np.cross(view.forward, view.up)
@@ -54,7 +54,7 @@ def to_screen(driver, view: PinholeView, point) -> tuple[int, int]:
 
 
 def drag(driver, start, end):
-    """With the mouse, from pixel to pixel."""
+    """Drag the mouse from pixel ``start`` to pixel ``end``."""
     from selenium.webdriver.common.actions.action_builder import ActionBuilder
     from selenium.webdriver.common.actions.mouse_button import MouseButton
 
@@ -77,15 +77,15 @@ def running():
     path = demo.find_store_scene()
     if not all((path.parent / name).is_file() for name in demo.CHECKPOINTS.values()):
         pytest.skip("the store's fields are not here: python -m nerg_mi.scenes.store.make")
-    with open_viewer([path], ViewOptions(port=0, width=160, spp=1)) as found:
-        yield found
+    with open_viewer([path], ViewOptions(port=0, width=160, spp=1)) as viewer:
+        yield viewer
 
 
 @pytest.fixture(scope="module")
 def driver(running):
-    with chromium() as found:
-        found.get(running.address)
-        yield found
+    with chromium() as browser:
+        browser.get(running.address)
+        yield browser
 
 
 def window_of(running):
@@ -93,7 +93,7 @@ def window_of(running):
 
 
 def wait_for_picture(running, window):
-    """The window's picture, once it is whole, and the browser has had time to show it."""
+    """Wait until the final picture is displayed and return it."""
     until(lambda: window.shows_picture and window.last_picture is not None and window.last_picture[0].is_final)
     until(lambda: running.page.session.worker.is_idle)
     time.sleep(0.7)
@@ -101,9 +101,9 @@ def wait_for_picture(running, window):
 
 
 def wait_for_canvas(driver):
-    """What the browser shows, once that is no empty canvas: the left half, beside the panel and below the note on
-    software rendering. A busy machine may need a while for it."""
-    return until(lambda: (found := read_pixels(driver))[250:600, :800].std() > 20 and [found])[0]
+    """Wait until the canvas is drawn and return the left half of it, without the panel and the note on software
+    rendering."""
+    return until(lambda: (image := read_pixels(driver))[250:600, :800].std() > 20 and [image])[0]
 
 
 def test01_page_loads_and_refines(running, driver):
@@ -112,13 +112,13 @@ def test01_page_loads_and_refines(running, driver):
     wait_for_picture(running, window)
     shown = wait_for_canvas(driver)
     assert running.page.problem == ""
-    # It is the picture that was rendered: its mean colours, cell by cell.
+    # The window displays the rendered picture: compare mean colours of cells.
     colors = window.last_picture[1].astype(float)
     height, width = shown.shape[:2]
     rows, columns = np.linspace(0, 1, 24)[14:22], np.linspace(0, 1, 24)[1:14]
-    own = np.array([[colors[int(r * colors.shape[0]), int(c * colors.shape[1])] for c in columns] for r in rows])
+    expected = np.array([[colors[int(r * colors.shape[0]), int(c * colors.shape[1])] for c in columns] for r in rows])
     seen = np.array([[shown[int(r * height), int(c * width)] for c in columns] for r in rows])
-    assert np.corrcoef(own.ravel(), seen.ravel())[0, 1] > 0.8
+    assert np.corrcoef(expected.ravel(), seen.ravel())[0, 1] > 0.8
 
 
 def test02_dragging_the_observer_changes_the_picture(running, driver):
@@ -180,7 +180,7 @@ def test05_reload_keeps_the_state(running, driver):
 
 
 def test05b_stale_contents_are_grey(running, driver):
-    """While the render thread has something else to do, the heat of the observer before is not that of this one."""
+    """While the render thread is busy, the gaze of the previous observer position is grey."""
     session, window = running.page.session, window_of(running)
     wait_for_picture(running, window)
     until(lambda: not session.stale_points_reason and not session.are_shares_stale, 120)
@@ -219,16 +219,16 @@ def test05b_stale_contents_are_grey(running, driver):
 
 
 def test05c_camera_and_observer_leave_solids(running, driver):
-    """The camera, nor the observer where they are dragged."""
+    """Both the camera and a dragged observer."""
     session, window = running.page.session, window_of(running)
     wait_for_picture(running, window)
     shelf = np.array([5.4, 3.6, 0.8])
     window.client.camera.position = tuple(shelf)
-    # A browser under load tells its old camera once more before it follows.
+    # A slow browser sends its old camera once more.
     until(lambda: window.message and np.linalg.norm(window.view.origin - shelf) > 0.2, 60)
     wait_for_picture(running, window)
     until(lambda: "inside a solid" in window.status.content)
-    # Who was put somewhere is dragged from there.
+    # The next drag starts from the position that was set.
     running.page.place_observer(session.observer + (0, 0, 0.5))
     before = session.observer.copy()
     running.page._observer.position = tuple(shelf)
@@ -242,7 +242,7 @@ def test05c_camera_and_observer_leave_solids(running, driver):
 
 
 def test05d_invalid_positions_are_refused(running, driver, monkeypatch):
-    """As a page that is not ours could send it."""
+    """As a forged page could send them."""
     page, session = running.page, running.page.session
     before = session.observer.copy()
     for position, turn in (((np.nan, 0, 1), (1, 0, 0, 0)), ((4, 3, 1), (0, 0, 0, 0)), ((4, 3, 1), (np.nan, 0, 0, 1))):
@@ -251,25 +251,25 @@ def test05d_invalid_positions_are_refused(running, driver, monkeypatch):
             patched.setattr(page, "_observer", sent)
             page._on_drag("end")
         assert np.array_equal(session.observer, before) and page.problem
-        # The gizmo goes back to where they stand.
+        # The gizmo returns to the observer.
         assert np.allclose(sent.position, before) and np.isfinite(sent.wxyz).all()
     page.place_observer(before)
     assert page.problem == ""
 
 
 def test06_no_request_leaves_the_machine(running, driver):
-    own, asked = urlsplit(running.address).netloc, []
+    address, urls = urlsplit(running.address).netloc, []
     for entry in driver.get_log("performance"):
         event = json.loads(entry["message"])["message"]
-        about = event["params"]
-        # The browser's own first page is no page of ours.
-        if event["method"] == "Network.requestWillBeSent" and urlsplit(about["documentURL"]).netloc == own:
-            asked.append(about["request"]["url"])
+        params = event["params"]
+        # Ignore the initial page of the browser.
+        if event["method"] == "Network.requestWillBeSent" and urlsplit(params["documentURL"]).netloc == address:
+            urls.append(params["request"]["url"])
         if event["method"] == "Network.webSocketCreated":
-            asked.append(about["url"])
-    assert any(urlsplit(url).netloc == own for url in asked)
-    others = [url for url in asked if urlsplit(url.removeprefix("blob:")).netloc != own]
-    assert all(url.startswith("data:") for url in others), others
+            urls.append(params["url"])
+    assert any(urlsplit(url).netloc == address for url in urls)
+    external = [url for url in urls if urlsplit(url.removeprefix("blob:")).netloc != address]
+    assert all(url.startswith("data:") for url in external), external
     assert not [e for e in driver.get_log("browser") if e["level"] == "SEVERE"]
 
 
@@ -287,8 +287,8 @@ def test08_no_thread_or_port_is_left(rgb, room):
 
     require("viser")
     before = threading.active_count()
-    with open_viewer([room], ViewOptions(port=0)) as found:
-        port = urlsplit(found.address).port
+    with open_viewer([room], ViewOptions(port=0)) as viewer:
+        port = urlsplit(viewer.address).port
     until(lambda: threading.active_count() <= before, 10)
     import socket
 

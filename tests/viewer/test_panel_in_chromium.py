@@ -1,4 +1,4 @@
-"""The page's panel in a browser, as a person uses it: by what is written on it."""
+"""The panel in a real browser, operated by its labels."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from tests.viewer.browser import chromium, require
 from tests.viewer.conftest import ROOM, write_gaze_fields
 from tests.viewer.test_in_chromium import drag, until
 
-# ---- The page's panel as a person uses it: folders, buttons and controls by what is written on them ----
+# ---- Driver of the panel ----
 
 
 class Panel:
-    """The panel in a browser, ``driver``; what it saves comes into ``folder``."""
+    """The panel in the browser of ``driver``; downloads are saved to ``folder``."""
 
     def __init__(self, driver: Any, folder: Path):
         self.driver, self.folder = driver, folder
         driver.execute_cdp_cmd("Browser.setDownloadBehavior", {"behavior": "allow", "downloadPath": str(folder)})
 
     def open(self, title: str, inside: str) -> None:
-        """Open the folder ``title``, if what is ``inside`` is not to be seen, and wait until it has unfolded."""
+        """Open the folder ``title`` unless the control ``inside`` is visible, and wait until it is."""
         if not self._seen(inside):
             self._click(self._one(f"//*[normalize-space(text())='{title}']"))
             end = time.monotonic() + 10
@@ -41,59 +41,59 @@ class Panel:
             time.sleep(0.3)
 
     def _seen(self, text: str) -> bool:
-        found = self.driver.find_elements("xpath", f"//*[self::button or self::label][normalize-space(.)='{text}']")
-        return any(e.is_displayed() and e.size["height"] > 0 for e in found)
+        elements = self.driver.find_elements("xpath", f"//*[self::button or self::label][normalize-space(.)='{text}']")
+        return any(e.is_displayed() and e.size["height"] > 0 for e in elements)
 
     def press(self, text: str) -> None:
-        """Click the button that says ``text``."""
+        """Click the button labelled ``text``."""
         self._click(self._one(f"//button[normalize-space(.)='{text}']"))
 
     def choose(self, label: str, option: str) -> None:
-        """Pick ``option`` of a list."""
+        """Select ``option`` in a list."""
         from selenium.webdriver.common.keys import Keys
 
-        found = self.input(label)
-        self._click(found)
+        element = self.input(label)
+        self._click(element)
         time.sleep(0.2)
         self._click(self._one(f"//*[@role='option'][normalize-space(.)='{option}']"))
-        # A list that is still open lies over what is above it.
-        found.send_keys(Keys.ESCAPE)
+        # An open list would cover other controls.
+        element.send_keys(Keys.ESCAPE)
 
     def tick(self, label: str) -> None:
         """Click a checkbox."""
         self._click(self.input(label))
 
     def write(self, label: str, text: str) -> None:
-        """Replace the text of an input and leave it; of several, the first."""
+        """Replace the text of an input, the first of several, and leave it."""
         self._write(self.input(label), text)
 
     def slide(self, label: str, value: float) -> None:
-        """Set a slider, by the number beside it."""
-        found = self._one(f"//label[normalize-space(.)='{label}']")
-        self._write(found.find_element("xpath", "./following::input[not(@type='hidden')][1]"), f"{value:g}")
+        """Set a slider with its number input."""
+        element = self._one(f"//label[normalize-space(.)='{label}']")
+        self._write(element.find_element("xpath", "./following::input[not(@type='hidden')][1]"), f"{value:g}")
 
-    def _write(self, found: Any, text: str) -> None:
+    def _write(self, element: Any, text: str) -> None:
         from selenium.webdriver.common.keys import Keys
 
-        self._to(found)
-        found.click()
-        found.send_keys(Keys.CONTROL, "a")
-        found.send_keys(text, Keys.TAB)
+        self._to(element)
+        element.click()
+        element.send_keys(Keys.CONTROL, "a")
+        element.send_keys(text, Keys.TAB)
 
     def input(self, label: str) -> Any:
-        """The first input that stands by ``label``."""
-        found = self._one(f"//label[normalize-space(.)='{label}']")
-        named = self.driver.find_elements("id", found.get_attribute("for"))
-        # Texts have a label that names nothing.
-        return (named or found.find_elements("xpath", "./following::input"))[0]
+        """Return the first input labelled ``label``."""
+        element = self._one(f"//label[normalize-space(.)='{label}']")
+        named = self.driver.find_elements("id", element.get_attribute("for"))
+        # Labels of text inputs refer to no element.
+        return (named or element.find_elements("xpath", "./following::input"))[0]
 
     def texts(self) -> str:
-        """All that the page says."""
-        # Asking for what is laid out as text would keep the page from drawing.
+        """Return all text of the page."""
+        # Reading the rendered text instead would block drawing.
         return self.driver.execute_script("return document.body.textContent")
 
     def saved(self, name: str, seconds: float = 20.0) -> bytes:
-        """The bytes of the file ``name``, once it is there."""
+        """Wait for the download ``name`` and return its bytes."""
         end = time.monotonic() + seconds
         path = self.folder / name
         while not path.is_file():
@@ -102,7 +102,7 @@ class Panel:
         return path.read_bytes()
 
     def close_notes(self) -> None:
-        """Close the notes in the corner, and wait until they are gone: they slide over the view."""
+        """Close the notifications and wait until they have disappeared, because they cover the view."""
         end = time.monotonic() + 20
         while self.driver.find_elements("css selector", ".mantine-Notification-root"):
             assert time.monotonic() < end, "the notes do not close"
@@ -129,19 +129,19 @@ class Panel:
             try:
                 return element.click()
             except ElementClickInterceptedException:
-                # A slider shows its value above itself for a while.
+                # A slider displays its value above itself for a while.
                 if time.monotonic() > end:
                     raise
                 time.sleep(0.3)
 
 
-# ---- The panel in a real browser: what is clicked happens, and what is saved is what is shown ----
+# ---- Tests ----
 
 pytestmark = pytest.mark.slow
 
 
 def make_rays() -> nerg.Rays:
-    """Ada, of the cohort young, walks along x for four seconds, and Bob stands still."""
+    """Ada, of the cohort young, walks along x for four seconds; Bob stands still."""
     t = np.tile(np.arange(0, 4, 0.1), 2)
     person = np.repeat([0, 1], 40)
     origin = np.stack([np.where(person == 0, 4 + 0.5 * t, 5), np.full(80, 3.0), np.full(80, 1.6)], axis=1)
@@ -161,8 +161,8 @@ def running(tmp_path_factory):
         pytest.skip("the store's fields are not here: python -m nerg_mi.scenes.store.make")
     rays = tmp_path_factory.mktemp("rays") / "rays.npz"
     make_rays().save(rays)
-    with open_viewer([path, rays], ViewOptions(port=0, width=48, spp=1)) as found:
-        yield found
+    with open_viewer([path, rays], ViewOptions(port=0, width=48, spp=1)) as viewer:
+        yield viewer
 
 
 @pytest.fixture(scope="module")
@@ -171,9 +171,9 @@ def panel(running, tmp_path_factory):
         driver.get(running.address)
         window = until(lambda: next(iter(running.page.windows.values()), None))
         until(lambda: window.shows_picture)
-        found = Panel(driver, tmp_path_factory.mktemp("saved"))
-        found.close_notes()
-        yield found
+        result = Panel(driver, tmp_path_factory.mktemp("saved"))
+        result.close_notes()
+        yield result
 
 
 def window_of(running):
@@ -185,13 +185,13 @@ def test01_layer_and_color_scale(running, panel):
     panel.choose("Layer", "depth")
     until(lambda: session.display.layer.title == "depth")
     until(lambda: window.shows_picture and "depth" in window.last_picture[0].values and session._ranges.get("depth"))
-    # The scale beside the picture has the range that was taken from it.
+    # The colour scale has the range of the picture.
     until(lambda: f"{session.scale().high:.3g}" in panel.texts() and "units" in panel.texts())
     panel.choose("Layer", "gaze")
     until(lambda: session.display.layer.title == "gaze")
     panel.tick("Automatic range")
     until(lambda: session.display.limits is not None)
-    # A range of 1/sr says nothing of metres.
+    # A range in 1/sr does not apply to metres.
     panel.choose("Layer", "depth")
     until(lambda: session.display.layer.title == "depth" and session.display.limits is None)
     panel.choose("Colours", "magma")
@@ -207,7 +207,7 @@ def test02_observer_and_camera(running, panel):
     session, window = running.page.session, window_of(running)
     panel.press("Move observer to camera")
     until(lambda: np.allclose(session.observer, window.view.origin))
-    # The panel follows a moment later, and would write over what is typed meanwhile.
+    # The panel is updated with a delay, which would overwrite earlier input.
     until(lambda: np.isclose(float(panel.input("Position").get_attribute("value")), session.observer[0], atol=2e-3))
     panel.write("Position", "5.2")
     until(lambda: np.isclose(session.observer[0], 5.2))
@@ -233,9 +233,9 @@ def test03_view_from_above_and_saved_files(running, panel):
     data = panel.saved("view.png")
     assert data.startswith(b"\x89PNG") and int.from_bytes(data[16:20], "big") in (12, 24, 48)
     comment = data[data.index(b"tEXtComment\0") + 12 :]
-    about = json.JSONDecoder().raw_decode(comment.decode("latin-1"))[0]
-    assert about["what"] == "nerg view" and about["settings"]["layer"] == "gaze"
-    assert "scene.xml" in about["inputs"] and "shoppers.safetensors" in about["inputs"]
+    metadata = json.JSONDecoder().raw_decode(comment.decode("latin-1"))[0]
+    assert metadata["what"] == "nerg view" and metadata["settings"]["layer"] == "gaze"
+    assert "scene.xml" in metadata["inputs"] and "shoppers.safetensors" in metadata["inputs"]
     panel.press("Save scene (XML)")
     root = ElementTree.fromstring(panel.saved("view.xml"))
     eye = next(d for d in root.iter("default") if d.get("name") == "view_observer")
@@ -249,7 +249,7 @@ def test04_flight_is_rendered_as_video(running, panel):
     av = pytest.importorskip("av")
     panel.write("Duration (s)", "0.1")
     panel.press("Render video (MP4)")
-    # Three pictures can be done before anybody has looked for the button that cancels them.
+    # Three frames can be finished before the cancel button is checked.
     data = panel.saved("flight.mp4", 60)
     with av.open(io.BytesIO(data)) as container:
         frames = [frame.to_ndarray(format="rgb24").astype(float) for frame in container.decode(video=0)]
@@ -293,15 +293,15 @@ def test06_area_is_drawn_and_saved(running, panel):
 
 
 def test07_gaze_field_can_be_switched(running, tmp_path):
-    """Two of them, of which one lacks a factor: other layers, and the pictures are made anew."""
+    """One of two gaze fields lacks a factor: the list of layers and the pictures change."""
     (tmp_path / "room.xml").write_text(ROOM)
     with open_viewer(
         [tmp_path / "room.xml", *write_gaze_fields(tmp_path)], ViewOptions(port=0, width=48, spp=1)
-    ) as found:
-        session = found.page.session
+    ) as viewer:
+        session = viewer.page.session
         with chromium(900, 700) as driver:
-            driver.get(found.address)
-            window = until(lambda: next(iter(found.page.windows.values()), None))
+            driver.get(viewer.address)
+            window = until(lambda: next(iter(viewer.page.windows.values()), None))
             until(lambda: window.shows_picture)
             panel = Panel(driver, tmp_path)
             panel.close_notes()

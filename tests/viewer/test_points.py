@@ -31,9 +31,7 @@ from nerg_mi.viewer.points import (
     rough_integrals,
 )
 
-# ---- Proxy ----
-#
-# Points that stand for a place: they lie on its surfaces, and have the gaze that the integrator gives them.
+# ---- Point proxy: on surfaces, with the gaze of the integrator ----
 
 
 def last(steps):
@@ -69,8 +67,8 @@ def test02_one_point_per_cell():
     cells = np.floor((proxy.points - np.percentile(points, 0.5, axis=0)) / proxy.size)
     assert 1000 < len(proxy.points) <= 5000 and len(np.unique(cells, axis=0)) >= 0.999 * len(cells)
     assert np.array_equal(proxy.points, proxy.color)
-    nothing = downsample_points([(np.zeros((0, 3)), np.zeros((0, 3)))])
-    assert len(nothing.points) == 0 and [count for count, _ in nothing.levels] == [0] * NUM_LEVELS
+    empty = downsample_points([(np.zeros((0, 3)), np.zeros((0, 3)))])
+    assert len(empty.points) == 0 and [count for count, _ in empty.levels] == [0] * NUM_LEVELS
 
 
 def test03_gaze_on_points_equals_integrator(store):
@@ -81,16 +79,16 @@ def test03_gaze_on_points_equals_integrator(store):
     proxy = order_points(points, np.arange(3 * len(points)).reshape(-1, 3), 0.1)
     baked = last(compute_point_gaze(scene, proxy, eye))
     order = proxy.color[:, 0].astype(int) // 3
-    true, met = seen.gaze[0].ravel()[order], seen.opacity[0].ravel()[order] > 0.9
+    true, hit = seen.gaze[0].ravel()[order], seen.opacity[0].ravel()[order] > 0.9
     assert set(baked) == {"gaze", "visibility"} and baked["gaze"].shape == true.shape
     near = np.abs(baked["gaze"] - true) < 0.02 * true.max()
-    # Along edges of what the observer sees a point in half a pixel's width of them is either here or there.
-    assert near[met].mean() > 0.98
-    assert np.corrcoef(baked["gaze"][met], true[met])[0, 1] > 0.97
+    # Near silhouettes, a point within half a pixel can be on either side.
+    assert near[hit].mean() > 0.98
+    assert np.corrcoef(baked["gaze"][hit], true[hit])[0, 1] > 0.97
 
 
 def test04_occluded_points_are_invisible(room_scene):
-    # Behind the box, in front of it, and beside it.
+    # Behind the box, in front of it, and next to it.
     points = np.array([[2.5, 0, 0.01], [0.5, 0, 0.01], [1.5, 1.5, 0.01]], np.float32)
     proxy = order_points(points, points, 0.1)
     baked = last(compute_point_gaze(room_scene, proxy, np.array([0, 0, 0.5])))
@@ -104,7 +102,7 @@ def test05_levels_cover_the_scene_evenly():
     counts = [count for count, _ in proxy.levels]
     assert counts[0] == len(proxy.points) and all(1.4 < a / b < 2.9 for a, b in zip(counts, counts[1:]))
     for count, size in proxy.levels:
-        # Of a plane, whose cells are squares: no two in one, and none far from the next.
+        # On a plane with square cells: no two points in one cell, and no large gaps.
         cells = np.floor(proxy.points[:count] / size)
         assert size == proxy.size or len(np.unique(cells, axis=0)) > 0.97 * count
         away = KDTree(proxy.points[:count]).query(proxy.points)[0]
@@ -126,26 +124,26 @@ def test06_gaze_improves_with_each_step(store):
 
 
 def test07_position_in_a_solid_is_moved_out(room_scene):
-    """The box reaches from 1 to 2 along x."""
-    eyes = [np.array([0, 0, 0.5]), np.array([-2, 0, 1.0])]
-    proxy = last(gather_points(room_scene, eyes, max_positions=4))
+    """The box extends from 1 to 2 along x."""
+    positions = [np.array([0, 0, 0.5]), np.array([-2, 0, 1.0])]
+    proxy = last(gather_points(room_scene, positions, max_positions=4))
     assert len(proxy.free_positions) > 50 and (proxy.free_positions[:, 2] > 0).all()
     inside = lambda p: np.abs(np.asarray(p) - (1.5, 0, 0.5)).max() < 0.5
     assert not any(map(inside, proxy.free_positions))
     for at, free in (
-        ((1.5, 0, 0.5), eyes[0]),
-        ((1.02, 0.3, 0.2), eyes[1]),
+        ((1.5, 0, 0.5), positions[0]),
+        ((1.02, 0.3, 0.2), positions[1]),
         ((1.9, -0.4, 0.9), np.array([2.6, -1, 0.5])),
     ):
         out = find_free_position(room_scene, proxy, np.array(at), free)
         assert not inside(out) and np.abs(out - (1.5, 0, 0.5)).max() < 0.6
-        # On the way that was taken.
+        # On the line from the free position.
         assert np.cross(out - free, np.array(at) - free) == pytest.approx(0, abs=1e-6)
     for at in ((0.5, 0, 0.5), (2.5, 0, 0.3), (1.5, 0, 1.4), (1.5, 1.2, 0.1), (9, 9, 9)):
-        assert find_free_position(room_scene, proxy, np.array(at, float), eyes[0]) is None, at
+        assert find_free_position(room_scene, proxy, np.array(at, float), positions[0]) is None, at
 
 
-# ---- Pictures in steps: those of `nerg.render`, in bands that can be left off ----
+# ---- Progressive refinement ----
 
 QUANTITIES = ["color", "depth", "opacity", "visibility"]
 
@@ -166,9 +164,9 @@ def test08_final_picture_equals_integrator(room_scene):
     assert pictures[0].values["depth"].shape == (8, 12) and pictures[-1].values["color"].shape == (32, 48, 3)
     assert [p.is_final for p in pictures] == [False] * (len(pictures) - 1) + [True]
     true = nerg.render(room_scene, quantities=QUANTITIES, camera=view.to_camera(48), spp=256)
-    for name, most in (("color", 0.02), ("depth", 0.02), ("visibility", 0.02)):
-        assert np.abs(pictures[-1].values[name] - true[name][0]).mean() < most, name
-    # Each is nearer to the truth than the first one of its size.
+    for name, tolerance in (("color", 0.02), ("depth", 0.02), ("visibility", 0.02)):
+        assert np.abs(pictures[-1].values[name] - true[name][0]).mean() < tolerance, name
+    # Each picture is closer to the reference than the first one of its size.
     errors = [np.abs(p.values["color"] - true.color[0]).mean() for p in pictures[2:]]
     assert errors[-1] < 0.5 * errors[0]
 
@@ -211,32 +209,32 @@ def test11_band_size_adapts_to_time(monkeypatch):
 def test12_ceiling_is_hidden_from_above(room_scene):
     up = np.array([0.0, 0, 1])
     view = PinholeView.look_at((1.5, 0, 5), (1.5, 0.01, 0), up, 0.3, 1.0)
-    whole = list(refine(room_scene, view, None, ["depth", "opacity"], 32, 1, BandPace()))[-1]
+    is_visible = list(refine(room_scene, view, None, ["depth", "opacity"], 32, 1, BandPace()))[-1]
     cut = list(refine(room_scene, view, None, ["depth", "opacity"], 32, 1, BandPace(), ceiling=Ceiling(0.5, up)))[-1]
-    assert whole is not None and cut is not None
-    # The top of the box lies at z = 1, 4 below the camera; below the cut is the floor.
-    assert whole.values["depth"][16, 16] == pytest.approx(4, abs=0.02)
+    assert is_visible is not None and cut is not None
+    # The top of the box is at z = 1, 4 below the camera; below the ceiling is the floor.
+    assert is_visible.values["depth"][16, 16] == pytest.approx(4, abs=0.02)
     assert cut.values["depth"][16, 16] == pytest.approx(5, abs=0.02)
     assert room_scene.integrator.ceiling is None
 
 
 def test13_integrals_are_rough_until_the_final_picture(store):
     scene = nerg.Scene.load(store)
-    own = scene.integrator.observer_settings
+    settings = scene.integrator.observer_settings
     with rough_integrals(scene):
-        assert scene.integrator.observer_settings == replace(own, directions=ROUGH_DIRECTIONS)
+        assert scene.integrator.observer_settings == replace(settings, directions=ROUGH_DIRECTIONS)
     with rough_integrals(scene, False):
-        assert scene.integrator.observer_settings is own
+        assert scene.integrator.observer_settings is settings
     with pytest.raises(ZeroDivisionError), rough_integrals(scene):
         raise ZeroDivisionError
-    assert scene.integrator.observer_settings is own
+    assert scene.integrator.observer_settings is settings
 
 
-# ---- A page's camera: its frame, and the rays of its picture ----
+# ---- Views ----
 
 
 def test14_view_from_page():
-    # Ahead along +y, down along -z: as a camera that is held level and looks north.
+    # Forward along +y, down along -z: a horizontal camera.
     turn = Rotation.from_matrix(np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0.0]]))
     x, y, z, w = turn.as_quat()
     camera = SimpleNamespace(
@@ -255,15 +253,15 @@ def test15_rays_equal_mitsuba_sensor(rgb):
     columns, rows = np.meshgrid((np.arange(30) + 0.5) / 30, (np.arange(20) + 0.5) / 20)
     at = rgb.Point2f(columns.ravel().astype(np.float32), rows.ravel().astype(np.float32))
     ray, _ = sensor.sample_ray(0.0, 0.5, at, rgb.Point2f(0.5))
-    own = view.ray_directions(30, height, np.full((600, 2), 0.5))
-    assert np.allclose(own, np.array(ray.d).T, atol=1e-5)
+    directions = view.ray_directions(30, height, np.full((600, 2), 0.5))
+    assert np.allclose(directions, np.array(ray.d).T, atol=1e-5)
 
 
 def test16_view_from_sensor(rgb):
     view = PinholeView.look_at((1, 2, 3), (4, 3, 1), (0, 0, 1), 0.9, 1.5)
-    found = PinholeView.from_sensor(rgb.load_dict(view.to_camera(300).to_dict()))
+    copy = PinholeView.from_sensor(rgb.load_dict(view.to_camera(300).to_dict()))
     for name in ("origin", "forward", "up", "fov", "aspect"):
-        assert np.allclose(getattr(found, name), getattr(view, name), atol=1e-5), name
+        assert np.allclose(getattr(copy, name), getattr(view, name), atol=1e-5), name
     assert math.isclose(view.fov_x_degrees, math.degrees(2 * math.atan(math.tan(0.45) * 1.5)))
 
 

@@ -15,7 +15,7 @@ from nerg_mi.viewer.serve import open_viewer
 from nerg_mi.workflows.scene_commands import ViewOptions
 from tests.viewer.browser import require
 
-# ---- A copied scene renders as what was viewed ----
+# ---- Copied scenes ----
 
 VIEW = PinholeView.look_at((6.9, 3.0, 2.0), (4.8, 4.2, 1.0), (0, 0, 1), 0.9, 1.5)
 EYE = np.array([4.6, 3.1, 1.6])
@@ -36,7 +36,7 @@ def test01_copied_scene_renders_the_same_picture(store, tmp_path):
     for name in ("color", "gaze", "depth"):
         off = np.abs(rendered[name][0] - viewed[name]).mean() / viewed[name].mean()
         assert off < 0.05, name
-    # And not of any view: another one is off by far.
+    # Another view differs by far.
     other = nerg.render(
         copy, quantities=["color"], camera=PinholeView.look_at((4, 3, 2), (2, 3, 1), (0, 0, 1), 0.9, 1.5).to_camera(96)
     )
@@ -68,10 +68,10 @@ def test04_hidden_ceiling_is_copied(room, tmp_path, up):
     rendered = nerg.render(nerg.Scene.load(path), quantities=["depth"]).depth[0]
     steps = refine(nerg.Scene.load(room), view, None, ["depth"], 32, 1, BandPace(), ceiling=Ceiling(0.5, up))
     viewed = [p for p in steps if p is not None][-1].values["depth"]
-    # The floor, 5 below the camera, in place of the top of a box that is cut through; rays vary within a
-    # pixel, which tells at its edges.
+    # The floor, 5 below the camera, instead of the top of the hidden box. Sample positions within a pixel
+    # differ, which matters at edges.
     assert (np.abs(rendered - viewed) < 0.03).mean() > 0.8 and rendered[16, 16] == pytest.approx(5, abs=0.02)
-    # A copy of the copy that cuts nothing off shows the top again.
+    # A copy of the copy without a hidden ceiling shows the top again.
     again = tmp_path / "again.xml"
     again.write_text(copy_scene(path, ViewSettings(view, None, ("depth",), 32, 1, 0.0)))
     assert nerg.render(nerg.Scene.load(again), quantities=["depth"]).depth[0, 16, 16] == pytest.approx(4, abs=0.02)
@@ -84,7 +84,7 @@ def test05_scene_without_integrator_is_refused(tmp_path, rgb):
         copy_scene(path, ViewSettings(VIEW, None, ("depth",), 48, 1, 0.0))
 
 
-# ---- People in a page: their paths, a moment, and whose eye the observer follows ----
+# ---- Participants ----
 
 
 @pytest.fixture
@@ -94,14 +94,14 @@ def running(room, tmp_path):
     origin = np.stack([-2 + 0 * t, -1 + 0.5 * t, np.full(400, 1.6)], axis=1)
     rays = nerg.Rays(t, np.zeros(400, int), ("Ada",), origin, np.tile([0.0, 1, 0], (400, 1)), np.ones(400))
     rays.save(tmp_path / "rays.npz")
-    with open_viewer([room, tmp_path / "rays.npz"], ViewOptions(port=0)) as found:
-        yield found
+    with open_viewer([room, tmp_path / "rays.npz"], ViewOptions(port=0)) as viewer:
+        yield viewer
 
 
 def test06_observer_follows_a_participant(running):
     page: Page = running.page
     people = ParticipantsPanel(page, page.session.tracks)
-    # Paths of all are drawn where they are wanted: many people's hide the place.
+    # Paths are drawn on request, since many of them hide the scene.
     assert len(people._pose_handles) == 2 and people._path_handle is None
     people._show_paths.value = True
     people._draw_all()
@@ -115,7 +115,7 @@ def test06_observer_follows_a_participant(running):
     people._draw_all()
     page.session.worker.wait_idle(60)
     lines, probes = people._recording_handles["rays"].points, people._recording_handles["probes"].points
-    # The room's end is ahead of her, which the integrator knows.
+    # The wall in front of her, as computed by the integrator.
     assert lines.shape == (400, 2, 3) and np.allclose(lines[:, 0], page.session.tracks.origins, atol=1e-5)
     seen = nerg.trace(page.session.scene, lines[:, 0], [0.0, 1, 0], ["depth"]).depth
     assert np.allclose(lines[:, 1, 1] - lines[:, 0, 1], np.where(np.isfinite(seen) & (seen > 0), seen, 1), atol=1e-4)

@@ -1,4 +1,4 @@
-"""Who may talk to the viewer, what it serves and for how long, and how many points a browser is given."""
+"""Access control of the viewer, its start and end, and the point levels of a browser."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from tests.viewer import browser
 from tests.viewer.browser import require
 from tests.workflows.recorder import Recorder
 
-# ---- Who is refused: other names, other sites, and whoever has no token ----
+# ---- Access control ----
 
 LOCAL = RequestGuard("127.0.0.1")
 
 
 def status(guard, path="/", port=8080, clients=0, **headers):
-    found = guard.check(headers, path, port, clients)
-    return 200 if found is None else found.status
+    refusal = guard.check(headers, path, port, clients)
+    return 200 if refusal is None else refusal.status
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1:8080", "localhost:8080", "LOCALHOST", "[::1]:8080", "localhost:9999"])
@@ -81,7 +81,7 @@ def test04_other_origins_are_refused(origin):
 
 def test05_own_origin_is_accepted():
     assert status(LOCAL, host="localhost:8080", origin="http://localhost:8080", upgrade="websocket") == 200
-    # Browsers write names in small letters, and whoever typed the address need not.
+    # Browsers write host names in lower case; typed addresses can be upper case.
     assert status(LOCAL, host="LocalHost:8080", origin="http://localhost:8080", upgrade="websocket") == 200
 
 
@@ -94,7 +94,7 @@ def test06_token_is_required_on_other_addresses():
     assert status(guard, Host="192.168.1.7:8080", Cookie="other=1; nerg_view_8080=a-token") == 200
     assert status(guard, Host="192.168.1.7:8080", Cookie="nerg_view_8080=wrong") == 403
     assert status(guard, Host="192.168.1.7:8080", Cookie="nerg_view_8081=a-token") == 403
-    # Right as it is, it opens no door to another site, nor by a name that leads here.
+    # A valid token does not allow other origins or host names.
     assert status(guard, "/?token=a-token", Host="192.168.1.7:8080", Origin="http://evil.example") == 403
     assert status(guard, "/?token=a-token", Host="evil.example") == 403
     assert status(RequestGuard("0.0.0.0", "a-token", ("lab",)), "/?token=a-token", Host="lab:8080") == 200
@@ -124,7 +124,7 @@ def test09_loopback():
     assert len({make_token() for _ in range(8)}) == 8 and len(make_token()) == 32
 
 
-# ---- A running server refuses what its guard refuses, over HTTP and before a websocket opens ----
+# ---- Running server ----
 
 OPEN = {
     "Connection": "Upgrade",
@@ -147,7 +147,7 @@ def local(viser):
 
 
 def ask(server, path="/", **headers):
-    """Status, headers and body of a GET whose headers are these alone."""
+    """Return status, headers and body of a GET request with exactly these headers."""
     connection = http.client.HTTPConnection("127.0.0.1", server.get_port(), timeout=10)
     try:
         connection.putrequest("GET", path, skip_host=True, skip_accept_encoding=True)
@@ -236,7 +236,7 @@ def test14_message_size_is_limited(local, viser):
 def test15_share_url_is_disabled(local, monkeypatch):
     import viser._viser
 
-    def tunnel(*given, **more):
+    def tunnel(*args, **kwargs):
         raise AssertionError("a tunnel was asked for")
 
     monkeypatch.setattr(viser._viser, "ViserTunnel", tunnel)
@@ -269,7 +269,7 @@ def test18_missing_viser_is_reported(monkeypatch):
         start_server(RequestGuard("127.0.0.1"), 0, "test")
 
 
-# ---- A viewer from files to an address ----
+# ---- Viewer ----
 
 
 @pytest.fixture
@@ -317,15 +317,15 @@ def test21_page_moves_the_observer(room):
 
 @pytest.mark.usefixtures("_viser")
 def test22_view_files_runs_until_ctrl_c(room, monkeypatch):
-    told = Recorder()
+    recorder = Recorder()
 
     def interrupted():
         raise KeyboardInterrupt
 
     monkeypatch.setattr(serve, "_wait", interrupted)
-    view_files([room], ViewOptions(port=0), told)
-    assert any(text.startswith("open http://127.0.0.1:") for text in told.messages)
-    assert told.messages[-1] == "the viewer has stopped"
+    view_files([room], ViewOptions(port=0), recorder)
+    assert any(text.startswith("open http://127.0.0.1:") for text in recorder.messages)
+    assert recorder.messages[-1] == "the viewer has stopped"
 
 
 @pytest.mark.usefixtures("_viser")
@@ -335,7 +335,7 @@ def test23_missing_files_are_reported(tmp_path):
             pass
 
 
-# ---- A browser is given as many points as it draws quickly ----
+# ---- Point levels ----
 
 
 @pytest.mark.parametrize(
@@ -347,7 +347,7 @@ def test24_level_adapts_to_frame_times(seconds, at_rest, change):
     before = window.level
     for _ in range(20):
         window.record_frame(seconds)
-    # The mouse rests now and then, and the page was left for a while.
+    # With pauses of the mouse and a long absence.
     for pause in (0.4, 0.9, 60.0):
         window.record_frame(pause)
     assert window.choose_level(at_rest) == before + change
@@ -380,7 +380,7 @@ def test26_slow_frames_do_not_count_as_rest():
     assert window.rest_seconds == pytest.approx(0.8)
 
 
-# ---- What is missing skips a test, or fails it where that was asked for ----
+# ---- Missing requirements ----
 
 
 def test27_missing_module_skips_or_fails(monkeypatch):

@@ -22,21 +22,21 @@ from nerg_mi.viewer.session import ALL_PARTICIPANTS, MAX_GAP, Listener, Session,
 from nerg_mi.workflows.scene_commands import ViewOptions
 from nerg_mi.workflows.view import make_viewer_scene
 
-# ---- The page is told all that a session tells ----
+# ---- Listener ----
 
-TOLD = [name for name in vars(Listener) if name.startswith("on_")]
+EVENTS = [name for name in vars(Listener) if name.startswith("on_")]
 
 
-@pytest.mark.parametrize("name", TOLD)
+@pytest.mark.parametrize("name", EVENTS)
 def test_page_implements_listener(name):
     assert inspect.signature(getattr(Page, name)) == inspect.signature(getattr(Listener, name))
 
 
-# ---- What is viewed: the observer's gaze, numbers and pictures, on one thread ----
+# ---- Session ----
 
 
 class CountingListener:
-    """A listener that counts."""
+    """A listener that counts events."""
 
     def __init__(self):
         self.proxies = self.baked = self.shares = 0
@@ -57,9 +57,9 @@ class CountingListener:
 def make_session(tmp_path):
     made = []
 
-    def make(path, *others, **options) -> Session:
-        chosen = ViewOptions(**options)
-        session = Session(lambda: make_viewer_scene([path, *others], tmp_path, chosen), chosen, CountingListener())
+    def make(path, *other_files, **options) -> Session:
+        selected = ViewOptions(**options)
+        session = Session(lambda: make_viewer_scene([path, *other_files], tmp_path, selected), selected, CountingListener())
         made.append(session)
         session.start()
         return session
@@ -129,7 +129,7 @@ def test02_stale_results_are_reported(make_session, room, gaze_fields):
     finish.set()
     settle(session)
     assert session.stale_points_reason == "" and not session.are_shares_stale
-    # Colours under the scale of a depth are no depth.
+    # Colours do not count as the range of the depth.
     session.set_display(layer=get_layer("depth"))
     assert session.stale_points_reason == "the points do not show depth" and not session.has_scale
     session.set_display(layer=get_layer("color"))
@@ -233,7 +233,7 @@ def test08_panorama_is_centred_on_heading(make_session, room):
     settle(session)
     (sphere,) = shown
     assert sphere.shape == (32, 64, 3)
-    # The box is 1 m ahead, and half a metre higher than the eye: 27 degrees. Beside it and above there is nothing.
+    # The box is 1 m in front and half a metre above the eye: 27 degrees. Next to it and above there is nothing.
     hatched = {tuple(c) for c in np.unique(sphere[:10].reshape(-1, 3), axis=0)}
     assert len(hatched) == 2
     is_hatched = lambda part: {tuple(c) for c in part.reshape(-1, 3)} <= hatched
@@ -243,7 +243,7 @@ def test08_panorama_is_centred_on_heading(make_session, room):
 def test09_invalid_input_is_reported(make_session, room, tmp_path):
     with pytest.raises(NergError, match="no file"):
         make_session(Path("nowhere.xml"))
-    with pytest.raises(NergError, match="three finite numbers"):
+    with pytest.raises(NergError, match="--observer"):
         make_session(room, observer=(1.0, 2.0))
     for wrong in (float("nan"), float("-inf"), 1e30):
         with pytest.raises(NergError, match="--observer must lie in"):
@@ -263,7 +263,7 @@ def test10_gaze_field_can_be_switched(make_session, room, gaze_fields):
     assert first.max() > 0 and shared
     session.set_falloff(0.25)
     session.set_display(layer=get_layer("capture"))
-    # Even while the gaze of the other is being computed.
+    # Also while the gaze of the other field is being computed.
     session.update_points()
     session.select_gaze("emit")
     assert session.display.layer.title == "gaze", "a layer that this one has not"
@@ -271,7 +271,7 @@ def test10_gaze_field_can_be_switched(make_session, room, gaze_fields):
     settle(session)
     assert session.proxy.points is points and not np.allclose(session.point_values["gaze"], first, rtol=0.1)
     assert session.shares != shared
-    # It is that of the file by itself.
+    # It equals the gaze of the file loaded separately.
     session.select_gaze("emit_capture")
     session.set_falloff(falloff)
     settle(session)
@@ -293,7 +293,7 @@ def test11_failed_shares_are_reported_once(make_session, room, gaze_fields, monk
     assert not session.update_shares()
 
 
-# ---- Shares of attention in steps: those of the library, whichever are counted together ----
+# ---- Attention shares ----
 
 AT = np.array([0.2, 0.1, 0.6])
 
@@ -321,20 +321,20 @@ def test13_no_areas_and_no_shapes(scene):
     assert list(module.iter_attention_shares(scene, AT, [], [])) == []
 
 
-# ---- Paths of people, and where they are at a moment ----
+# ---- Recordings ----
 
 SAME = Similarity(np.eye(4))
 
 
 def make_walk(align=SAME, cohorts=True):
-    """Ada walks along x for 10 s, with a gap of 3 s in it; Ben stands for 2 s. Rays are out of order."""
+    """Ada walks along x for 10 s with a gap of 3 s; Ben stands still for 2 s. The samples are unsorted."""
     t = np.concatenate([np.arange(0, 4, 0.1), np.arange(7, 10, 0.1), np.arange(0, 2, 0.1)])
     person = np.concatenate([np.zeros(70, int), np.ones(20, int)])
     origin = np.stack([np.where(person == 0, t, 5.0), np.zeros(90), np.full(90, 1.6)], axis=1)
     direction = np.tile([0.0, 1.0, 0.0], (90, 1))
     mixed = np.random.default_rng(3).permutation(90)
-    more = dict(cohort=person[mixed], cohorts=("grown", "small")) if cohorts else {}
-    rays = Rays(t[mixed], person[mixed], ("Ada", "Ben"), origin[mixed], direction[mixed], np.ones(90), **more)
+    fields = dict(cohort=person[mixed], cohorts=("grown", "small")) if cohorts else {}
+    rays = Rays(t[mixed], person[mixed], ("Ada", "Ben"), origin[mixed], direction[mixed], np.ones(90), **fields)
     return Tracks(rays, align)
 
 
@@ -372,7 +372,7 @@ def test17_alignment_is_applied():
     assert np.allclose(ada.position, [10, 16, 3.2], atol=1e-6) and np.allclose(ada.direction, [-1, 0, 0], atol=1e-6)
 
 
-# ---- The render thread: the most urgent first, and what is replaced is not gone on with ----
+# ---- Render thread ----
 
 
 @pytest.fixture
@@ -403,8 +403,8 @@ def test18_steps_run_on_one_thread(worker):
 
 @pytest.fixture
 def start_blocked_task(worker):
-    """Begins a task of a name and an urgency that waits in its first step: the log of all steps, and what lets it go
-    on."""
+    """Return a function that starts a task which blocks in its first step; it returns the log of steps and an event to
+    continue."""
 
     def begin(name, urgency, count):
         log, gate, started = [], threading.Event(), threading.Event()
