@@ -140,8 +140,8 @@ class _ObserverLayers:
         if self.observer_contexts:
             camera.eval_shared(radiance, is_valid, shared)
         yield radiance, is_valid, shared
-        for looker in self.observer_contexts:
-            yield 0, is_valid, camera.make_pixel(looker).compute_channels(self.per_observer)
+        for context in self.observer_contexts:
+            yield 0, is_valid, camera.make_pixel(context).compute_channels(self.per_observer)
 
     def split(self, layer: int, pixels: Floats) -> dict[str, Floats]:
         """Split the channels (height, width, C) of a layer by quantity."""

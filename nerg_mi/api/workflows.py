@@ -633,7 +633,7 @@ def train_prior(
 
     resolved = build_options(PriorOptions, "train_prior", options, overrides)
     environments = [rays] if isinstance(rays, (str, os.PathLike, Rays)) else rays
-    inputs = [place if isinstance(place, Rays) else resolve_file(place, "rays") for place in environments]
+    inputs = [item if isinstance(item, Rays) else resolve_file(item, "rays") for item in environments]
     result = gaze.learn_prior(inputs, output, resolved, reporter)
     return _make_trained_field(result.field, result.provenance, output)
 

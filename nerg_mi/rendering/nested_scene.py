@@ -147,7 +147,7 @@ def _expand_includes(root: ElementTree.Element, path: Path, folders: list[Path])
         name = child.get("filename", "")
         included = next((f / name for f in folders if name and (f / name).is_file()), None)
         if included is None:
-            raise NergError(f'the scene file "{path}" includes "{sanitize(name)}", which is not there; correct the name')
+            raise NergError(f'the scene file "{path}" includes "{sanitize(name)}", which does not exist; correct the path')
         yield from _expand_includes(_parse_root(included), included, folders)
 
 
@@ -173,7 +173,7 @@ def substitute_defaults(text: str, values: dict[str, str]) -> str:
 def _make_path_elements(path: Path, children: list[ElementTree.Element], folder: Path) -> list[Node]:
     """Make `<path>` elements for the folders that contain the files of the scene."""
     folders = [path.parent, *(path.parent / child.get("value", "") for child in children if child.tag == "path")]
-    names = [relative_path(place, folder) for place in folders]
+    names = [relative_path(folder_path, folder) for folder_path in folders]
     return [element("path", value=check_attribute(name)) for name in dict.fromkeys(names) if name != "."]
 
 

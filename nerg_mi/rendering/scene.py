@@ -220,7 +220,7 @@ class _SceneFileChecker:
         """Return the file that Mitsuba opens as ``name``; None if there is none. Raises `NergError` for pipes, devices
         and folders."""
         candidates = [folder / name for folder in self._folders] + [Path(resolve_scene_file(name))]
-        path = next((place for place in candidates if name and os.path.exists(place)), None)
+        path = next((candidate for candidate in candidates if name and os.path.exists(candidate)), None)
         if path is not None:
             check_regular_file(path, kind)
         return path

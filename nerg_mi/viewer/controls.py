@@ -215,9 +215,9 @@ class Controls:
         """Update numbers, legend and insets; the insets at most once per `_INSET_INTERVAL`."""
         session = self.session
         self._update_legend()
-        at = round_position(session.observer)
-        if not np.allclose(self._position.value, at, atol=1e-3):
-            self._position.value = at
+        position = round_position(session.observer)
+        if not np.allclose(self._position.value, position, atol=1e-3):
+            self._position.value = position
         with self._lock:
             if self._get_inset_inputs() == self._inset_inputs:
                 return
@@ -361,10 +361,10 @@ def format_shares(shares: dict[str, float], stale: bool = False) -> str:
         return layers.format_note("Computing." if stale else "Add areas of interest to see their attention shares.")
     rows = sorted(shares.items(), key=lambda item: -item[1])
     remainder = sum(share for _, share in rows[_MAX_ROWS:])
-    shown = [*rows[:_MAX_ROWS], *([(f"{len(rows) - _MAX_ROWS} more", remainder)] if len(rows) > _MAX_ROWS else [])]
+    entries = [*rows[:_MAX_ROWS], *([(f"{len(rows) - _MAX_ROWS} more", remainder)] if len(rows) > _MAX_ROWS else [])]
     cells = "".join(
         f"<tr><td>{escape(name)}</td><td style='text-align:right'>{100 * share:.1f} %</td></tr>"
-        for name, share in shown
+        for name, share in entries
     )
     style = f"font-size:0.85em;margin:0 1em;{layers.STALE_STYLE if stale else ''}"
     text = f"<table style='{style}'><tr><th>area of interest</th><th>attention share</th></tr>{cells}</table>"
@@ -386,9 +386,9 @@ def picture_provenance(session: Any, window: BrowserWindow) -> Provenance:
         A file of the scene no longer exists.
     """
     assert window.last_picture is not None and window.view is not None
-    view, shade, scale = window.view, session.display, session.scale()
+    view, display, scale = window.view, session.display, session.scale()
     settings = {
-        "layer": shade.layer.title,
+        "layer": display.layer.title,
         "colors": scale.colors,
         "range": [scale.low, scale.high],
         "observer": session.observer.tolist(),

@@ -255,7 +255,7 @@ class FlightPanel:
 
     def _start_video(self, event: Any) -> None:
         """Render a video and send it to the browser that requested it."""
-        session, client, shade = self.session, event.client, self.session.display
+        session, client, display = self.session, event.client, self.session.display
         if self._video is not None:
             notify(client, TITLE, "Another video is being rendered. Cancel it or wait for it.")
             return
@@ -263,7 +263,7 @@ class FlightPanel:
         try:
             check_video_output(self._fps.value)
             check_can_copy(session)
-            aovs = tuple(name for name in layers.required_quantities(shade.layer) if name != "color")
+            aovs = tuple(name for name in layers.required_quantities(display.layer) if name != "color")
             views, settings = prepare_flight(
                 interpolate_views(self._views, self._seconds.value, self._fps.value),
                 session.options.width,
@@ -296,7 +296,7 @@ class FlightPanel:
                 self._video = None
                 self._set_running(False)
 
-        options = make_video_options(shade.layer, session.scale(), frames, self._fps.value, session.variant)
+        options = make_video_options(display.layer, session.scale(), frames, self._fps.value, session.variant)
         self._video = FlightVideo(scene, video, options, self._on_progress, on_end)
         self._set_running(True)
         self._on_progress(0.0, "The video is waiting for other tasks")

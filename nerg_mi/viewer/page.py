@@ -189,18 +189,18 @@ class Page:
 
     # The observer
 
-    def place_observer(self, at: np.ndarray, heading: np.ndarray | None = None) -> None:
-        """Move the observer to ``at`` (3,), with the rotation ``heading`` (3, 3), as a user would drag it.
+    def place_observer(self, position: np.ndarray, heading: np.ndarray | None = None) -> None:
+        """Move the observer to ``position`` (3,), with the rotation ``heading`` (3, 3), as a user would drag it.
 
         Raises
         ------
         NergError
             The position or rotation is not finite or too far away.
         """
-        self.session.place_observer(at, heading)
+        self.session.place_observer(position, heading)
         # The next drag starts from this position, even if it is inside a solid.
         self._free_position = self.session.observer
-        self._observer.position = tuple(np.asarray(at, float))
+        self._observer.position = tuple(np.asarray(position, float))
         self._observer.wxyz = self._observer_quaternion()
         self._on_observer_moved(True)
 
@@ -218,15 +218,15 @@ class Page:
         if phase == "end":
             at = session.observer
             session.keep_in_free_space(
-                "observer", at, self._free_position, lambda found: self._move_observer_out(at, found)
+                "observer", at, self._free_position, lambda corrected: self._move_observer_out(at, corrected)
             )
 
-    def _move_observer_out(self, at: np.ndarray, position: np.ndarray) -> None:
-        """Move the observer, who was dragged to ``at`` (3,), to the free ``position`` (3,) if the two differ."""
-        if self.session.observer is not at:
+    def _move_observer_out(self, target: np.ndarray, position: np.ndarray) -> None:
+        """Move the observer, who was dragged to ``target`` (3,), to the free ``position`` (3,) if the two differ."""
+        if self.session.observer is not target:
             return
-        if position is at:
-            self._free_position = at
+        if position is target:
+            self._free_position = target
         else:
             self.place_observer(position)
 
@@ -312,15 +312,15 @@ class Page:
         session.refine_picture(client.client_id, window.view, deliver, session.options.width, session.spp)
         free_position = session.home_view.origin if window.free_position is None else window.free_position
         session.keep_in_free_space(
-            client.client_id, origin, free_position, lambda found: self._move_camera_out(window, origin, found)
+            client.client_id, origin, free_position, lambda corrected: self._move_camera_out(window, origin, corrected)
         )
 
-    def _move_camera_out(self, window: BrowserWindow, at: np.ndarray, position: np.ndarray) -> None:
-        """Move the camera of ``window`` from ``at`` (3,) to the free ``position`` (3,) if the two differ."""
+    def _move_camera_out(self, window: BrowserWindow, target: np.ndarray, position: np.ndarray) -> None:
+        """Move the camera of ``window`` from ``target`` (3,) to the free ``position`` (3,) if the two differ."""
         with self._lock:
-            if window.view is not None and window.view.origin is at:
+            if window.view is not None and window.view.origin is target:
                 window.free_position = position
-                if position is not at:
+                if position is not target:
                     window.message = "The camera was inside a solid and was moved in front of it."
                     window.client.camera.position = tuple(position)
 
