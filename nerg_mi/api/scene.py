@@ -661,8 +661,8 @@ class Scene:
             raise NergError(f"a camera must be a Camera, an index or a Mitsuba sensor, got {type(camera).__name__}")
         sensors = self.mitsuba.sensors()
         if not 0 <= (number := camera or 0) < len(sensors):
-            have = f"{len(sensors)} sensors" if sensors else "no sensors"
-            raise NergError(f"the scene has {have}, so camera {number} does not exist; pass camera=Camera(...)")
+            available = f"{len(sensors) or 'no'} sensor{'' if len(sensors) == 1 else 's'}"
+            raise NergError(f"there is no camera {number}, the scene has {available}; pass camera=Camera(...)")
         return sensors[number]
 
     def _fit_clip_distances(self, sensor: mi.Sensor, camera: Camera) -> mi.Sensor:
