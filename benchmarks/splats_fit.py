@@ -1,7 +1,7 @@
 """Gaussian splats fitted to photos through ``mi.render``: PSNR of held-out views before and after, time, memory.
 
     python benchmarks/splats_fit.py [--resolution 96] [--views 24] [--width 96] [--steps 150] [--rays 8192] [--seeds 3]
-    [--update docs/explanation/accuracy.md]
+    [--update docs/explanation/environment-accuracy.md]
 
 Photos are those that a photographer takes of the demo store's twin, at cameras chosen as for the store's field; eight
 others, a shopper's, say which learning rates are taken (`RATES` times one of `FACTORS`, by the disturbed splats of seed

@@ -16,7 +16,7 @@ author = "The authors of nerg_mi"
 project_copyright = "the authors of nerg_mi, Apache-2.0"
 release = version = __version__
 
-extensions = ["myst_nb", "sphinx.ext.autodoc"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 include_patterns = ["docs/index.md", "docs/*/*.md", "CONTRIBUTING.md", "CHANGELOG.md", "examples/*.ipynb"]
 root_doc = "docs/index"
 language = "en"
