@@ -45,7 +45,7 @@ def _lists(command: Any, context: Any) -> Iterator[str]:
         if record is None or parameter.name == "help":
             continue
         meaning, default = split_default(record[1])
-        text = cell(meaning)
+        text = escape_cell(meaning)
         if default == "required":
             text += " Required."
         elif default:
@@ -83,4 +83,4 @@ def escape_cell(text: str) -> str:
 
 def _paragraphs(text: str) -> str:
     """The help of a command, whose lines may be broken anywhere."""
-    return "\n\n".join(wrapped(cell(part)) for part in re.split(r"\n\s*\n", text.strip()))
+    return "\n\n".join(wrapped(escape_cell(part)) for part in re.split(r"\n\s*\n", text.strip()))

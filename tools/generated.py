@@ -29,7 +29,7 @@ def plugins() -> str:
     _choose_variant()
     sections = []
     for name in PLUGINS:
-        page = manual.read(import_module(f"nerg_mi.plugins.{name}").__doc__ or "")
+        page = manual.parse_manual(import_module(f"nerg_mi.plugins.{name}").__doc__ or "")
         sections += [f"## {page.title}", page.parameter_list(), page.body]
     return "\n\n".join(sections)
 
@@ -38,14 +38,14 @@ def presets() -> str:
     """The presets of `nerg rays import`."""
     from nerg_mi.rays.readers.registry import format_preset_table
 
-    return _relisted(preset_table())
+    return _relisted(format_preset_table())
 
 
 def checks() -> str:
     """The data-quality checks."""
     from nerg_mi.rays.quality import format_check_table
 
-    return _relisted(check_table())
+    return _relisted(format_check_table())
 
 
 def _relisted(text: str) -> str:
@@ -58,9 +58,9 @@ def recipes() -> str:
     """The settings of each gaze recipe: field, length, losses and probes."""
     from nerg_mi.train import gaze_recipes
 
-    entries = list(gaze_recipes.recipes().values())
+    entries = list(gaze_recipes.load_recipes().values())
     rows: list[tuple[str, ...]] = []
-    parts = (("", "settings", "gaze_settings"), ("probes: ", "probes", "probe_settings"))
+    parts = (("", "settings", "make_gaze_settings"), ("probes: ", "probes", "make_probe_settings"))
     for prefix, keys, build in parts:
         values = [getattr(recipe, build)() for recipe in entries]
         names = dict.fromkeys(name for recipe in entries for name in getattr(recipe, keys))
@@ -131,7 +131,7 @@ def measures() -> str:
     """The statistics of `nerg stats` with their definitions."""
     from nerg_mi.statistics.tables import MEASURES
 
-    rows = [(m.title.partition(" [")[0], m.definition, m.over, "yes" if m.compared else "") for m in MEASURES]
+    rows = [(m.title.partition(" [")[0], m.definition, m.population, "yes" if m.is_compared else "") for m in MEASURES]
     return table_or_list(("statistic", "definition", "over", "differences"), rows)
 
 

@@ -94,5 +94,5 @@ def parse_manual(docstring: str) -> PluginManual:
         elif block.startswith(".. "):
             raise ValueError(f'the manual page "{title}" has a {block.split()[1]}, which tools/manual.py does not know')
         else:
-            body.append(inline(block))
-    return Manual(title, listed, wrapped("\n\n".join(body)))
+            body.append(convert_inline(block))
+    return PluginManual(title, listed, wrapped("\n\n".join(body)))

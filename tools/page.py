@@ -12,7 +12,7 @@ from pathlib import Path
 from nerg_mi.files.atomic import write_text
 from nerg_mi.files.tables import format_markdown_table as table
 
-__all__ = ["aligned", "cells", "replace_table", "table", "table_or_list", "update", "wrapped"]
+__all__ = ["aligned", "cells", "replace_table", "table", "table_or_list", "update_table", "wrapped"]
 
 WIDTH = 100
 """Columns of a line of source."""
