@@ -45,17 +45,27 @@ def _lists(command: Any, context: Any) -> Iterator[str]:
         if record is None or parameter.name == "help":
             continue
         meaning, default = split_default(record[1])
-        text = escape_cell(meaning)
+        text = escape_cell(_spell_range(meaning))
         if default == "required":
             text += " Required."
         elif default:
             text += f" Default: `{default}`."
         panel = getattr(parameter, "rich_help_panel", None)
         name = "Arguments" if parameter.param_type_name == "argument" else panel or "Options"
-        groups.setdefault(name, []).append(wrapped(f"- `{record[0]}`: {text}"))
+        term = record[0].replace(" range>", ">").replace("<list[", "<").replace("]>", ">")
+        groups.setdefault(name, []).append(wrapped(f"- `{term}`: {text}"))
     for name, items in groups.items():
         yield f"**{name}**"
         yield "\n".join(items)
+
+
+def _spell_range(meaning: str) -> str:
+    """A help text whose range "(0<=x<=1)" at the end reads "From 0 to 1."."""
+    match = re.fullmatch(r"(.*?) \(([-+\w.]+)<=x<=([-+\w.]+)\)", meaning, re.S)
+    if match is None:
+        return meaning
+    low, high = (re.sub(r"\.0$", "", number) for number in match.group(2, 3))
+    return f"{match[1]} From {low} to {high}."
 
 
 _RANGE = re.compile(r"(?:[-+\w.]+<=?)?x(?:[<>]=?[-+\w.]+)?")
