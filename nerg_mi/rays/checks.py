@@ -372,7 +372,7 @@ def check_frozen(stats: RayStatistics) -> list[str]:
     persons = persons[np.argsort(-num_frozen[persons] / num_rays[persons], kind="stable")]
     names = [f"{rays.persons[p]} ({100 * num_frozen[p] / num_rays[p]:.0f} % of the rays)" for p in persons]
     always_frozen = [p for p in persons if num_frozen[p] > 0.9 * num_rays[p]]
-    remedy = "exclude these times (nerg rays filter --from, --to)"
+    remedy = "exclude these times (nerg rays filter --start, --end)"
     if len(always_frozen) == len(persons):
         remedy = "exclude these participants (nerg rays filter --without-person)"
     return [

@@ -69,7 +69,7 @@ def check_place(place: str) -> str:
     """Return ``place`` if it is a valid name. Raises `NergError` otherwise."""
     if not place or len(place) > _MAX_PLACE_LENGTH or not place.isprintable() or place != place.strip():
         raise NergError(
-            f"the name of a place has 1 to {_MAX_PLACE_LENGTH} characters, got {place[:80]!r} (--place-name)"
+            f"the name of a place has 1 to {_MAX_PLACE_LENGTH} characters, got {place[:80]!r} (--environment)"
         )
     return place
 
@@ -689,8 +689,8 @@ class RayDataset:
     def _too_many(self, count: str, max_rays: int) -> NergError:
         return NergError(
             f'"{self.folder}" has {count} such rays, more than the maximum of {max_rays:,} '
-            f"({max_rays * BYTES_PER_RAY / 1e9:.2g} GB): select rays with 'nerg rays filter' (--box, --person, --from, "
-            "or --sample), or use one day of the dataset"
+            f"({max_rays * BYTES_PER_RAY / 1e9:.2g} GB): select rays with 'nerg rays filter' (--box, --person, "
+            "--start, or --sample), or use one day of the dataset"
         )
 
     def sample(self, n: int, seed: int = 0, *, runs: int | None = None, read_hits: bool = True) -> Rays:

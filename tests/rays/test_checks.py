@@ -134,7 +134,7 @@ def test_frozen_gaze_of_participants_and_times():
     assert "the gaze of bo (100 % of the rays) does not move" in warnings_of(complete)
     assert "--without-person" in warnings_of(complete)
     part = change(rays, slice(4000, 5000), direction=rays.direction[4000])
-    assert "bo (33 % of the rays)" in warnings_of(part) and "--from, --to" in warnings_of(part)
+    assert "bo (33 % of the rays)" in warnings_of(part) and "--start, --end" in warnings_of(part)
     # Short losses are not reported.
     assert "does not move" not in warnings_of(change(rays, slice(4000, 4100), direction=rays.direction[4000]))
 

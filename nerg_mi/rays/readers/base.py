@@ -233,7 +233,7 @@ class RaysBuilder:
         for code, count in self._filled_origins.undecided_counts.items():
             self.add_warning(
                 f"the first {count:,} rows of {self._persons.get_name(code)} in {self._sources[-1]['file']} have one "
-                "fill value as their origin, and were kept; exclude them (nerg rays filter --time)"
+                "fill value as their origin, and were kept; exclude them (nerg rays filter --start)"
             )
         self._filled_origins = FilledOriginFinder(float(np.cbrt(abs(np.linalg.det(self._transform[:3, :3])))))
 

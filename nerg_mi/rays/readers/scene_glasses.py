@@ -184,7 +184,7 @@ class SceneCoordinates:
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise NergError(
                 f'the checkpoint "{path}" does not contain the coordinates of its training; use --scale instead of '
-                "--place if it was trained in those of its file, or train it again"
+                "--field if it was trained in those of its file, or train it again"
             ) from error
         scale = float(np.cbrt(np.linalg.det(to_file[:3, :3]))) if np.isfinite(to_file).all() else 0.0
         rotation = to_file[:3, :3].T / scale if scale > 1e-9 else np.zeros((3, 3))
@@ -388,16 +388,26 @@ class SceneCameraOptions(ValidatedDataclass):
         within=RATES,
     )
     place: Path | None = option(
-        None, "Checkpoint of the scene (nerg train radiance); rays are converted to the coordinates of its training."
+        None,
+        "Radiance field of the scene (.safetensors of nerg train radiance). Rays are in the coordinates of its "
+        "training.",
+        flag="--field",
     )
-    scale: float = option(1.0, "Without --place: length of the model's unit in metres, as in training.", within=LENGTHS)
-    gap: float = option(0.2, "Maximum seconds between frames with poses for interpolation.", within=Range(1e-06, 3600))
+    scale: float = option(
+        1.0, "Without --field: length of one unit of the camera model in metres, as in training.", within=LENGTHS
+    )
+    gap: float = option(
+        0.2,
+        "Maximum time between two posed frames to interpolate over, in seconds.",
+        flag="--max-gap",
+        within=Range(1e-06, 3600),
+    )
     up: str = option("z", "Up axis: x, y, z, -x, -y or -z.", is_recorded=False)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.place is not None and self.scale != 1.0:
-            raise NergError("the checkpoint contains the scale; leave out --scale, or --place")
+            raise NergError("the checkpoint contains the scale; leave out --scale, or --field")
 
     @property
     def frame(self) -> TrackingFrame:
@@ -572,7 +582,7 @@ def _check_up_axis(up: np.ndarray | None, options: SceneCameraOptions, builder: 
         builder.add_warning(
             f"the up direction of the scene is ({', '.join(f'{x:.2f}' for x in up)}), {tilt:.0f} degrees from "
             f"{options.up}: train it with --coordinates upright, or import with --up {axis} and pass the matrix of "
-            "--write-align to the training"
+            "--align-output to the training"
         )
 
 
@@ -588,7 +598,7 @@ POSE_OPTIONS = {"--poses": "MODEL", "--frames": "frame_{frame1}"}
 
 POSE_QUESTION = (
     "the poses of the scene camera: --poses is the model with its frames and the photos of the environment, --frames "
-    "the pattern of their names, --place the scene that was trained on it"
+    "the pattern of their names, --field the scene that was trained on it"
 )
 """Description of these options."""
 

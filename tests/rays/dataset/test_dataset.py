@@ -305,7 +305,7 @@ def test_place_names_may_have_any_characters():
 
 @pytest.mark.parametrize("place", ["", " a", "a\n", "x" * 65, "\x1b[2J"])
 def test_invalid_places_are_refused(place):
-    with pytest.raises(NergError, match="--place-name"):
+    with pytest.raises(NergError, match="--environment"):
         dataset.check_place(place)
 
 
