@@ -389,7 +389,7 @@ _HEAD_HEIGHTS = 0.4, 2.3  # metres above the floor; range of the median height o
 
 
 @check(
-    "heights and extents that heads do not have, and the axis of the file along which they have them (`--units`, "
+    "implausible heights and extents of head positions, and the axis of the file with plausible heights (`--units`, "
     "`--up`)"
 )
 def check_lengths(stats: RayStatistics) -> list[str]:

@@ -24,7 +24,7 @@ _CENTRE_COLUMNS = [f"eye_center{eye}_3d_{axis}" for eye in "01" for axis in "xyz
 class PupilOptions(ValidatedDataclass):
     """Options for what the exports do not contain."""
 
-    marker: float | None = option(None, "Edge of a tracking marker in metres.", within=LENGTHS)  # needed
+    marker: float | None = option(None, "Edge of a tracking marker in metres.", within=LENGTHS)  # required
     up: str = option("y", "Up axis: x, y, z, -x, -y or -z.", is_recorded=False)
     min_confidence: float = option(0.6, "Drop rows below this confidence.", within=Range(0, 1))
 

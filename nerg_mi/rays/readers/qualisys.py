@@ -235,7 +235,7 @@ def _add_eye(path: Path, other: np.ndarray | None, builder: RaysBuilder) -> None
 class NeonMocapOptions:
     """Options for what the table does not contain."""
 
-    up: str | None = option(None, "Up axis: x, y, z, -x, -y or -z.", is_recorded=False)  # needed
+    up: str | None = option(None, "Up axis: x, y, z, -x, -y or -z.", is_recorded=False)  # required
     units: str = option("mm", "Unit of length: m, cm or mm.", is_recorded=False)
 
 

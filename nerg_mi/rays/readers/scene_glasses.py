@@ -369,7 +369,7 @@ _MAX_COMPARED_ROWS = 1 << 20  # rows of a recording for this comparison
 class SceneCameraOptions(ValidatedDataclass):
     """Options for the poses of the scene camera. Raises `NergError` for invalid or contradictory values."""
 
-    poses: Path | None = option(  # needed
+    poses: Path | None = option(  # required
         None,
         "Model with frames of the scene video and the photos of the environment: its transforms.json, or the folder of "
         "a COLMAP model; or aligned_poses.csv of tag-aligner, camera_pose.json of the Reference Image Mapper.",

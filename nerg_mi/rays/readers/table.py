@@ -22,7 +22,7 @@ from .tables import TableBlock, iterate_table
 class TableOptions(ValidatedDataclass):
     """Options for what tables do not contain. Raises `NergError` for invalid values."""
 
-    columns: ColumnMap | None = option(  # needed
+    columns: ColumnMap | None = option(  # required
         None,
         'Column map: "origin=x,y,z direction=dx,dy,dz t=time person=id confidence=c hit=hx,hy,hz cohort=g"; for heads, '
         "instead of direction: xyzw=..., wxyz=..., ypr=yaw,pitch,roll or matrix=... (12 or 16 columns, also instead of "
