@@ -383,8 +383,8 @@ class SceneCameraOptions(ValidatedDataclass):
     )
     fps: float | None = option(
         None,
-        "Rate of the frames that were extracted with ffmpeg's -vf fps=5, to which frame numbers refer. Default: "
-        "numbers refer to the video's frames.",
+        "Frames per second to which the video was resampled (ffmpeg -vf fps=5), if frame numbers count these frames.",
+        default_text="they count the video's frames",
         within=RATES,
     )
     place: Path | None = option(
