@@ -47,7 +47,7 @@ def test_scan_returns_all_rays_of_the_files(made):
 
 
 @pytest.mark.parametrize(
-    "given",
+    "conditions_given",
     [
         {"persons": ["p0_1", "p2_0"]},
         {"without_persons": ["p0_1"]},
@@ -59,12 +59,12 @@ def test_scan_returns_all_rays_of_the_files(made):
         {"cohorts": ["y"], "box": [0, 3, 0, 6, 0, 3], "time": (None, DAY + 5), "persons": ["p0_0"]},
     ],
 )
-def test_conditions_match_select_mask(made, given):
+def test_conditions_match_select_mask(made, conditions_given):
     dataset, rays = made
-    result = dataset.load(Conditions(**given))
+    result = dataset.load(Conditions(**conditions_given))
     assert 0 < len(result) < len(rays)
-    assert_same(result, rays.select(select_mask(rays, **given)))
-    complete = list(dataset.scan(Conditions(**given), whole_parts=True))
+    assert_same(result, rays.select(select_mask(rays, **conditions_given)))
+    complete = list(dataset.scan(Conditions(**conditions_given), whole_parts=True))
     assert sum(map(len, complete)) == len(result)
     for block in complete:
         names = [block.persons[k] for k in block.person]
@@ -254,20 +254,20 @@ def test_files_and_datasets(tmp_path):
 EXACT = ("rays", "persons", "duplicates", "rows_read", "dropped", "cohorts")
 
 
-@pytest.mark.parametrize("most", [10_000, 640])
-def test_quality_report_of_a_dataset(made, most):
+@pytest.mark.parametrize("max_rays", [10_000, 640])
+def test_quality_report_of_a_dataset(made, max_rays):
     dataset, rays = made
-    some, result, lines = summarise_dataset(dataset, most)
+    some, result, lines = summarise_dataset(dataset, max_rays)
     complete = summarise(rays)
     assert [getattr(result, name) for name in EXACT] == [getattr(complete, name) for name in EXACT]
     exact = ("duration", "box_low", "box_high", "hit_fraction")
-    for name in exact if most == 640 else (*exact, "eye_height", "speed_p95", "hit_distance", "sampling_rate"):
+    for name in exact if max_rays == 640 else (*exact, "eye_height", "speed_p95", "hit_distance", "sampling_rate"):
         assert np.allclose(getattr(result, name), getattr(complete, name), rtol=1e-5), name
-    assert abs(result.eye_height[1] - complete.eye_height[1]) < 0.1 and len(some) == min(most, len(rays))
+    assert abs(result.eye_height[1] - complete.eye_height[1]) < 0.1 and len(some) == min(max_rays, len(rays))
     assert lines[0][0] == "dataset" and lines[0][1].startswith("3 sources in ")
     assert lines[0][1].endswith("place shop, day 2 from 2024-10-04 to 2024-10-05")
-    assert [text for _, text in lines[1:]] == ([] if most > 640 else [lines[1][1]]) and (
-        most > 640 or "640 rays in 64 runs" in lines[1][1]
+    assert [text for _, text in lines[1:]] == ([] if max_rays > 640 else [lines[1][1]]) and (
+        max_rays > 640 or "640 rays in 64 runs" in lines[1][1]
     )
 
 

@@ -121,7 +121,7 @@ def test_damaged_dataset_manifest_is_refused(tmp_path, text, why):
 
 
 @pytest.mark.parametrize(
-    "given, holds",
+    "settings, holds",
     [
         ({}, True),
         ({"time": (1.0, None)}, True),  # its last time
@@ -135,10 +135,10 @@ def test_damaged_dataset_manifest_is_refused(tmp_path, text, why):
         ({"min_confidence": 0.9}, True),
     ],
 )
-def test_parts_are_selected_by_their_manifest(given, holds):
-    assert Conditions(**given).may_match_part(PART, 16) is holds
+def test_parts_are_selected_by_their_manifest(settings, holds):
+    assert Conditions(**settings).may_match_part(PART, 16) is holds
     bounds = {"t": (0.0, 1.0), **{f"origin_{axis}": (0.0, 1.0) for axis in "xyz"}}
-    assert Conditions(**given).may_match_group(bounds) is holds and Conditions(**given).may_match_group({})
+    assert Conditions(**settings).may_match_group(bounds) is holds and Conditions(**settings).may_match_group({})
 
 
 def test_parts_are_selected_by_person():

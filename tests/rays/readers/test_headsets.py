@@ -302,15 +302,15 @@ def log(path, column, values):
 
 
 @pytest.mark.parametrize(
-    "column, values, kept",
+    "column, values, valid_rows",
     [
         ("gaze_status", [0, 1, 2, 2], [2, 3]),  # Varjo's codes
         ("isValid", ["True", "False", "true", ""], [0, 2]),
     ],
 )
-def test_validity(tmp_path, column, values, kept):
+def test_validity(tmp_path, column, values, valid_rows):
     rays = read("unity", log(tmp_path / "a.csv", column, values))
-    assert np.allclose(rays.t, 0.02 * np.array(kept)) and sum(map(len, dropped(rays).values())) > 0
+    assert np.allclose(rays.t, 0.02 * np.array(valid_rows)) and sum(map(len, dropped(rays).values())) > 0
 
 
 def test_values_of_validity_are_collected_from_all_files(tmp_path):
@@ -372,15 +372,15 @@ def test_varjo_truncated_vector(tmp_path):
     assert len(rays) == 5 and list(dropped(rays).values()) == [[[7, 7]]]
 
 
-@pytest.mark.parametrize("status, kept", [("2", 1), ("1", 0), ("valid", 1), ("3", None), ("Visible", None)])
-def test_varjo_codes_of_the_status(tmp_path, status, kept):
+@pytest.mark.parametrize("status, valid_rows", [("2", 1), ("1", 0), ("valid", 1), ("3", None), ("Visible", None)])
+def test_varjo_codes_of_the_status(tmp_path, status, valid_rows):
     path = tmp_path / "v.csv"
     path.write_text(VARJO_HEAD + VARJO_ROW.format(0, "VALID") + VARJO_ROW.format(10**7, status))
-    if kept is None:
+    if valid_rows is None:
         with pytest.raises(NergError, match=f"GazeStatus '{status.upper()}', whose meaning is uncertain"):
             read("varjo", path)
     else:
-        assert len(read("varjo", path)) == 1 + kept
+        assert len(read("varjo", path)) == 1 + valid_rows
 
 
 # ---- Recordings of the VR supermarket ----

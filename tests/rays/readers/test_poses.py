@@ -79,10 +79,10 @@ def test_gaps():
 
 
 @pytest.mark.parametrize("far", [1.1e7, -1e200, np.inf])
-@pytest.mark.parametrize("of", ["times", "rotation_vectors", "positions"])
-def test_samples_beyond_the_limit_are_dropped(far, of):
+@pytest.mark.parametrize("key", ["times", "rotation_vectors", "positions"])
+def test_samples_beyond_the_limit_are_dropped(far, key):
     samples = {"times": np.arange(4.0), "rotation_vectors": np.zeros((4, 3)), "positions": np.zeros((4, 3))}
-    samples[of][2] = far * (1e14 if of == "times" and abs(far) < 1e100 else 1)
+    samples[key][2] = far * (1e14 if key == "times" and abs(far) < 1e100 else 1)
     with np.errstate(over="raise"):
         turn, place, lost = PoseTrack.from_samples(**samples).interpolate(np.array([0.1, 2.0, 2.9]), 0.2)
     assert np.isfinite(turn).all() and np.isfinite(place).all() and lost.tolist() == [False, True, False]

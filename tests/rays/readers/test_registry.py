@@ -95,8 +95,8 @@ def test_format_is_added_by_one_object(tmp_path, made_up):
     command = ["import", both_eyes, "-o", tmp_path / "r.npz", "--preset", "made_up", "--heads", heads, "--scale", 0.01]
     done = run(*command, "--tick", 1e-3)
     assert done.exit_code == 0, done.output
-    options_found = Rays.load(tmp_path / "r.npz")
-    assert np.array_equal(options_found.origin, rays.origin) and options_found.metadata == rays.metadata
+    loaded = Rays.load(tmp_path / "r.npz")
+    assert np.array_equal(loaded.origin, rays.origin) and loaded.metadata == rays.metadata
     done = run(*command, "--tick", 1e-3, "--blinks")
     assert done.exit_code == 0 and len(Rays.load(tmp_path / "r.npz")) == 2
     assert "name the file of the heads (--heads)" in str(run(*command[:6]).exception)

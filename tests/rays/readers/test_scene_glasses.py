@@ -238,13 +238,13 @@ def test_scene_of_another_file_gives_a_warning(neon):
     assert any("another file" in w for w in summarise(rays).warnings)
 
 
-@pytest.mark.parametrize("known", [False, True])
-def test_tilted_scene_gives_a_warning(neon, known):
+@pytest.mark.parametrize("has_up", [False, True])
+def test_tilted_scene_gives_a_warning(neon, has_up):
     """By the orientation of its cameras, or by the training; as declared, the rays are z up."""
     folder, options = neon
     straight = read("neon", folder, **options)
     turn_model(options["poses"], Rotation.from_euler("x", 90, degrees=True))
-    if known:
+    if has_up:
         options["place"] = write_place(folder / "p.safetensors", to_file=np.eye(4).tolist(), up=[0, -1, 0])
     rays = read("neon", folder, **options)
     (complaint,) = rays.metadata["complaints"]

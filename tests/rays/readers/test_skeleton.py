@@ -234,17 +234,17 @@ def test_units_and_axes(tmp_path):
     assert "are 150 m apart" in read("skeleton", path).metadata["complaints"][1]
 
 
-@pytest.mark.parametrize("name, sure", [("coco17", 1.0), ("mediapipe33", 1.0), ("kinect32", 2.0)])
-def test_missing_keypoints(tmp_path, name, sure):
+@pytest.mark.parametrize("name, has_confidence", [("coco17", 1.0), ("mediapipe33", 1.0), ("kinect32", 2.0)])
+def test_missing_keypoints(tmp_path, name, has_confidence):
     """NaN, exact zeros and a confidence of 0 are missing; keypoints outside the head may be missing."""
     nose, _, _, left_ear, right_ear = FACES[name]
     keypoints, turn, _ = bodies_of(name)
-    rows = np.concatenate([keypoints, np.full((*keypoints.shape[:2], 1), sure)], axis=2)
+    rows = np.concatenate([keypoints, np.full((*keypoints.shape[:2], 1), has_confidence)], axis=2)
     rows[3, nose, :3] = np.nan
     rows[4, left_ear, :3] = 0
     rows[5, right_ear, 3] = 0
     rows[6, 6] = 0
-    rows[7, nose, 3] = 0.5 * sure
+    rows[7, nose, 3] = 0.5 * has_confidence
     rows[8, right_ear, :2] = 0  # next to the camera, not at it
     path = tmp_path / "day.csv"
     write_skeleton(path, ["ann"] * 20, np.arange(20), rows)

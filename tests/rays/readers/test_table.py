@@ -243,7 +243,7 @@ def test_fill_values_in_the_heads_frame(tmp_path, heads):
 
 
 @pytest.mark.parametrize(
-    "columns, rows, kept",
+    "columns, rows, num_valid",
     [
         ("xyzw=a,b,c,d", [(0, 0, 0, 1), (-1, -1, -1, -1), (0, 0, 0, 0), (-9999,) * 4, (1, 1, 1, 1)], 2),
         ("ypr=a,b,c", [(0, 0, 0), (-9999,) * 3, (-1, -1, -1), (999, 999, 999), (-32768,) * 3], 2),
@@ -252,11 +252,11 @@ def test_fill_values_in_the_heads_frame(tmp_path, heads):
         ("direction=a,b,c", [(0, 0, 1), (3.402823e38,) * 3, (-32768,) * 3, (-1, -1, -1), (1, 2, 3)], 2),
     ],
 )
-def test_fill_values_of_poses_and_angles(tmp_path, columns, rows, kept):
+def test_fill_values_of_poses_and_angles(tmp_path, columns, rows, num_valid):
     names = "x,y,z," + columns.split("=")[1]
     path = write(tmp_path / "t.csv", names, [(1, 2, 1.6, *row) for row in rows])
     rays = read_table(path, f"origin=x,y,z {columns}")
-    assert len(rays) == kept and sum(d["count"] for d in rays.metadata["dropped"]) == 3
+    assert len(rays) == num_valid and sum(d["count"] for d in rays.metadata["dropped"]) == 3
 
 
 def test_columns_of_validity_of_a_map(tmp_path):
