@@ -393,7 +393,7 @@ def test_invalid_recording_is_refused_before_reading_all_of_it(tmp_path, monkeyp
     monkeypatch.setattr(SourceDigests, "digest_source", lambda *_: pytest.fail("it was read to its end"))
     with path.open("wb") as out:
         out.truncate(3 << 30)
-    assert "characters that are read" in (import_source(task(folder, path)).error or "")
+    assert "1,048,576 characters" in (import_source(task(folder, path)).error or "")
 
 
 def test_copy_of_a_source_is_recognised_at_its_first_rays(tmp_path, monkeypatch):
