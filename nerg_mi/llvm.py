@@ -151,7 +151,7 @@ def select_library() -> None:
 
 def _find_loaded() -> Library | None:
     """Return the libLLVM of a loaded Dr.Jit; None if drjit is not loaded or has found no suitable library."""
-    detail = getattr(sys.modules.get("drjit"), "max_edge", None)
+    detail = getattr(sys.modules.get("drjit"), "detail", None)
     get_version = getattr(detail, "llvm_version", None)
     version = get_version() if get_version else (-1,)
     return Library(os.environ.get(PATH_VARIABLE, ""), tuple(version)) if version[0] > 0 else None
