@@ -62,7 +62,7 @@ def test_truncated_exr_is_refused(tmp_path, shape):
         resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
         try:
             if size < content:
-                with pytest.raises(NergError, match="largest size"):
+                with pytest.raises(NergError, match="maximum file size"):
                     write_exr(path, channels, {"seed": "3"})
             else:
                 write_exr(path, channels, {"seed": "3"})
@@ -191,14 +191,14 @@ def test_exr_size_includes_all_channels(tmp_path):
 @pytest.mark.parametrize("size, bits, color", [((30000, 30000), 1, 0), ((1 << 31, 1), 8, 2), ((16000, 8000), 16, 6)])
 def test_large_images_in_small_files_are_refused(tmp_path, size, bits, color):
     (tmp_path / "a.png").write_bytes(make_png(*size, bits, color))
-    with pytest.raises(NergError, match='the mask ".*a.png" has .* make it smaller'):
+    with pytest.raises(NergError, match='the mask ".*a.png" has .* reduce its size'):
         check_image(tmp_path / "a.png", "mask")
 
 
 def test_large_image_in_large_file_is_accepted(tmp_path):
     raw = make_png(16384, 12288)
     (tmp_path / "a.png").write_bytes(raw)
-    with pytest.raises(NergError, match="make it smaller"):
+    with pytest.raises(NergError, match="reduce its size"):
         check_image(tmp_path / "a.png")
     with open(tmp_path / "a.png", "ab") as file:  # the maximum size, as a sparse file
         file.truncate(3 * 16384 * 12288 // images.MAX_EXPANSION)
@@ -280,9 +280,9 @@ import resource, sys
 import mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
 from nerg_mi.files.images import write_png
-from tests.files.test_images import picture
+from tests.files.test_images import make_bitmap
 resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
-write_png(sys.argv[1], picture(mi))
+write_png(sys.argv[1], make_bitmap(mi))
 """
 
 
@@ -291,7 +291,7 @@ def test_full_disk_keeps_old_image(tmp_path):
     path.write_bytes(b"old")
     env = {**os.environ, "PYTHONPATH": os.getcwd()}
     done = subprocess.run([sys.executable, "-c", _LIMITED, str(path)], capture_output=True, text=True, env=env)
-    assert done.returncode == 1 and "largest size" in done.stderr
+    assert done.returncode == 1 and "maximum file size" in done.stderr
     assert path.read_bytes() == b"old" and os.listdir(tmp_path) == ["a.png"]
 
 
