@@ -37,7 +37,7 @@ def test01_group_elements_are_unique():
 
 
 def test02_duplicate_names_are_refused():
-    with pytest.raises(NergError, match='two areas are called "a"'):
+    with pytest.raises(NergError, match='two areas have the name "a"'):
         AreaSet((A, A))
 
 

@@ -61,7 +61,7 @@ def test_each_kind_of_gaze_field_has_its_own_bounds():
 
 
 @pytest.mark.parametrize(
-    "about, words",
+    "config, words",
     [
         ([1], '"architecture"'),
         ({"width": 0}, '"width".*1.*4096.*0'),
@@ -92,13 +92,15 @@ def test_occupancy_size_is_limited():
     assert check_occupancy(config) is config
     check_occupancy({**config, "resolution": 128, "bound": 16.0})
     for wrong in ({"resolution": 407}, {"resolution": 2.0}, {"resolution": 128, "bound": 2.0**40}):
-        with pytest.raises(ValueError, match=f"{MAX_OCCUPANCY_CELLS:,} cells at most"):
+        with pytest.raises(ValueError, match=f"{MAX_OCCUPANCY_CELLS:,} cells in total"):
             check_occupancy({**config, **wrong})
 
 
 @pytest.mark.parametrize("error", [KeyError("box"), ValueError("x"), TypeError("x"), OverflowError("x")])
 def test_build_errors_name_file(error):
-    with pytest.raises(NergError, match='the checkpoint "a.safetensors" (lacks .box.|holds no usable field: x)') as e:
+    with pytest.raises(
+        NergError, match='the checkpoint "a.safetensors" (lacks .box.|contains no usable field: x)'
+    ) as e:
         with translate_build_errors("a.safetensors"):
             raise error
     assert e.value.__cause__ is error
@@ -136,7 +138,7 @@ def test_arrays_are_float32_with_required_shape():
 @pytest.mark.parametrize("value, largest", [(1e30, MAX_WEIGHT), (-1.1e6, MAX_WEIGHT), (81.0, 80.0)])
 def test_values_whose_products_single_precision_cannot_hold_are_refused(value, largest):
     arrays = StoredArrays({"a": np.array([0.0, value])}, ns)
-    with pytest.raises(ValueError, match=f'"a" holds values beyond {largest:g}'.replace("+", ".")):
+    with pytest.raises(ValueError, match=f'"a" contains values beyond {largest:g}'.replace("+", ".")):
         arrays.get_array("a", 2, max_value=largest)
     assert arrays.get_array("a", 2, max_value=2 * abs(value)).shape == (2,)
 
@@ -150,7 +152,7 @@ def test_networks_and_encodings():
     assert all(np.array_equal(again.named()[k].numpy(), v.numpy()) for k, v in net.named().items())
     assert arrays.build_network("net", [3, 4, 2]).norms is None
     assert arrays.build_grid(ARRAYS_GRID).table.numpy().tolist() == list(range(size))
-    with pytest.raises(ValueError, match='"grid.table" has the shape'):
+    with pytest.raises(ValueError, match='"grid.table" has shape'):
         arrays.build_grid(HashGridConfig(levels=2, log2_rows=3, base=1, finest=2))
 
 
@@ -273,10 +275,10 @@ DAMAGE = [
     *((without(name), name) for name in RADIANCE_NAMES),
     *((lambda _, meta, key=key: meta.pop(key), key) for key in ("architecture", "box", "color_space")),
     (lambda tensors, _: tensors.update({"occupancy.bits": tensors["occupancy.bits"][:1].copy()}), ""),
-    (array("grid.table", (4,)), '"grid.table" has the shape'),
-    (array("density_net.0", (3, 5)), '"density_net.0" has the shape'),
-    (array("color_net.0", (7,)), '"color_net.0" has the shape'),
-    (array("color_net.1", ()), '"color_net.1" has the shape'),
+    (array("grid.table", (4,)), '"grid.table" has shape'),
+    (array("density_net.0", (3, 5)), '"density_net.0" has shape'),
+    (array("color_net.0", (7,)), '"color_net.0" has shape'),
+    (array("color_net.1", ()), '"color_net.1" has shape'),
     (metadata(3, "architecture", "novelty"), "novelty"),
     (metadata(10**9, "architecture", "grid", "levels"), "levels"),
     (metadata(10**9, "architecture", "width"), "width"),

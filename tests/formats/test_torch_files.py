@@ -118,7 +118,7 @@ def test_vulnerable_torch_version_is_refused(tmp_path, torch, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "thing, name",
+    "target, name",
     [
         (Calls(exec, "import sys; sys.pwned = True"), "exec"),
         (Calls(getattr, "x", "upper"), "getattr"),
@@ -133,7 +133,7 @@ def test_vulnerable_torch_version_is_refused(tmp_path, torch, monkeypatch):
 )
 def test_other_callables_are_refused(tmp_path, torch, target, name):
     path = archive(tmp_path / "evil.pth", pickle.dumps({"model": target}, 2))
-    with pytest.raises(NergError, match=f'evil.pth" .* asks for ".*{name}"'):
+    with pytest.raises(NergError, match=f'evil.pth" .* uses ".*{name}"'):
         read_torch(path)
     with pytest.raises(NergError, match="evil.pth"):
         read_torch(archive(tmp_path / "evil.pth", pickle.dumps({"model": target}, 4)))
@@ -242,7 +242,7 @@ def test_repeated_numbers_are_read(tmp_path, torch):
 
 
 def test_damaged_archives(tmp_path, torch):
-    with pytest.raises(FileNotFoundError, match="no file"):
+    with pytest.raises(FileNotFoundError, match="does not exist"):
         read_torch(tmp_path / "none.pth")
     for data in (b"not a zip", b"", b"PK\3\4 and no more", pickle.dumps({"a": 1})):
         (tmp_path / "x.pth").write_bytes(data)
@@ -276,7 +276,7 @@ def test_pickle_size_is_limited(tmp_path, torch, monkeypatch):
     monkeypatch.setattr(module, "MAX_PICKLE_BYTES", 4)
     assert read_torch(path) is None
     monkeypatch.setattr(module, "MAX_PICKLE_BYTES", 3)
-    with pytest.raises(NergError, match=r"t.pth.*4 bytes.*the 3 that"):
+    with pytest.raises(NergError, match=r"t.pth.*4 bytes.*the limit is 3"):
         read_torch(path)
 
 

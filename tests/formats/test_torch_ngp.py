@@ -131,14 +131,14 @@ def test08_bare_state_dict_and_smaller_box(tmp_path):
 @pytest.mark.parametrize(
     "change, words",
     [
-        (lambda s: s.pop("sigma_net.1.weight"), "numbers, so it is not spherical harmonics"),
+        (lambda s: s.pop("sigma_net.1.weight"), "numbers, which does not match spherical harmonics"),
         (lambda s: s.pop("aabb_train"), 'lacks "aabb_train"'),
-        (lambda s: s.update({"aabb_train": s["aabb_train"] / 2}), "not those of a bound"),
-        (lambda s: s.update({"aabb_infer": np.array([0, 1e-44, 2e-44, 1.5e-36, 0])}), "not those of a bound"),
-        (lambda s: s.update({"aabb_train": np.linspace(0, 1e-30, 10_000)}), "not those of a bound"),
-        (lambda s: s.update({"encoder.offsets": s["encoder.offsets"] + 8}), "begin at rows .*--finest"),
+        (lambda s: s.update({"aabb_train": s["aabb_train"] / 2}), "do not match a bound"),
+        (lambda s: s.update({"aabb_infer": np.array([0, 1e-44, 2e-44, 1.5e-36, 0])}), "do not match a bound"),
+        (lambda s: s.update({"aabb_train": np.linspace(0, 1e-30, 10_000)}), "do not match a bound"),
+        (lambda s: s.update({"encoder.offsets": s["encoder.offsets"] + 8}), "start at rows .*--finest"),
         (lambda s: s.update({"color_net.0.bias": np.zeros(64, np.float32)}), "layers without biases"),
-        (lambda s: s.update({"color_net.0.weight": np.zeros((64, 30), np.float32)}), "not spherical harmonics"),
+        (lambda s: s.update({"color_net.0.weight": np.zeros((64, 30), np.float32)}), "not match spherical harmonics"),
         (lambda s: s.update({"color_net.2.weight": np.full((3, 64), np.nan, np.float32)}), "not finite.*diverged"),
         (lambda s: s.update({"density_bitfield": np.zeros(5, np.uint8)}), "40 density bits"),
         (lambda s: s.update({"encoder.params": np.zeros(5, np.float32)}), "--tcnn"),
@@ -186,12 +186,12 @@ def test10_grid_of_other_resolution(tmp_path):
             Box((0, 0, 0), (1, 2, 3)),
             "its unit",
         ),
-        (RadianceConfig(HashGridConfig(), deferred=True), Box((-1,) * 3, (1,) * 3), "torch-ngp asks"),
+        (RadianceConfig(HashGridConfig(), deferred=True), Box((-1,) * 3, (1,) * 3), "torch-ngp evaluates"),
     ],
 )
 def test11_unrepresentable_fields_are_refused(tmp_path, config, box, said):
     field = RadianceField.random(config, box, ns)
-    with pytest.raises(ValueError, match=f"torch-ngp form: {said}"):
+    with pytest.raises(ValueError, match=f"cannot represent this field: {said}"):
         write_torch_ngp(field, tmp_path / "x.pth")
     assert not list(tmp_path.iterdir())
 
@@ -299,7 +299,7 @@ def test04_checkpoint_with_custom_enum(tmp_path, torch, monkeypatch):
 
 @pytest.mark.parametrize("variant", ["EmitCaptureSemantic", "EmitSemanticFinetune", "EmitCaptureAttend"])
 def test05_unsupported_variants_are_refused(tmp_path, variant):
-    with pytest.raises(ValueError, match=f"of the variant {variant}; Emit, Capture, EmitCapture are read"):
+    with pytest.raises(ValueError, match=f"the variant {variant}; Emit, Capture, EmitCapture are supported"):
         read_nerg(save_nerg(tmp_path / "n.pth", small_gaze(), variant), ns)
 
 
@@ -309,7 +309,7 @@ def test06_mixture_head_and_missing_heads_are_refused(tmp_path):
     with pytest.raises(ValueError, match="von Mises-Fisher"):
         read_nerg(save_nerg(tmp_path / "n.pth", state), ns)
     del state["capture_head.mu.weight"]
-    with pytest.raises(ValueError, match="EmitCapture and lacks"):
+    with pytest.raises(ValueError, match="EmitCapture but lacks"):
         read_nerg(save_nerg(tmp_path / "n.pth", state), ns)
 
 
@@ -399,7 +399,7 @@ def test_cascades_are_packed_unchanged():
     ordered = np.unpackbits(packed, bitorder="little").reshape(2, -1)[:, morton_order()]
     assert np.array_equal(ordered.reshape(bits.shape), bits)
     assert pack_bitfield(None, 2.0).min() == 255
-    with pytest.raises(NergError, match="16.*no torch-ngp form"):
+    with pytest.raises(NergError, match="torch-ngp cannot represent.*16"):
         pack_bitfield(CascadeGrid(bits[:, :16, :16, :16], 2.0, ns, 0.1), 2.0)
 
 
@@ -423,15 +423,15 @@ def state(tmp_path):
 
 def test_state_dict(state):
     path, checkpoint, tensors = state
-    below = tensors.below("model.net.")
+    below = tensors.select("model.net.")
     assert below.names() == ["0.weight", "1.weight"] and "0.weight" in below and "other" not in below
     assert below.shape("0.weight") == (3, 2) and below["0.weight"].tolist() == [[1, 1]] * 3
     with pytest.raises(NergError, match='s.pth" lacks "model.net.2.weight"'):
         below.shape("2.weight")
-    assert tensors.weights("model.net.1.weight").dtype == np.float32
+    assert tensors.get_weights("model.net.1.weight").dtype == np.float32
     with pytest.raises(NergError, match='"model.far.0.weight".*diverged'):
-        tensors.weights("model.far.0.weight")
-    net = build_network(tensors.below("model."), "net", ns)
+        tensors.get_weights("model.far.0.weight")
+    net = build_network(tensors.select("model."), "net", ns)
     assert [w.shape for w in net.weights] == [(3, 2), (1, 3)]
     entries = {"imported_from": "s.pth", "format": "torch-ngp", "weights": "moving averages", "epoch": 3}
     assert describe_origin(path, checkpoint, "torch-ngp", True) == entries
@@ -439,10 +439,10 @@ def test_state_dict(state):
 
 def test_other_files_are_refused(tmp_path):
     write_torch(tmp_path / "x.pth", {"model": {"a": 1}})
-    with pytest.raises(NergError, match="holds no weights"):
+    with pytest.raises(NergError, match="contains no weights"):
         open_checkpoint(tmp_path / "x.pth")
     write_torch(tmp_path / "l.pth", [1])
-    with pytest.raises(NergError, match="holds a list, not a checkpoint"):
+    with pytest.raises(NergError, match="contains a list, not a checkpoint"):
         open_checkpoint(tmp_path / "l.pth")
 
 
@@ -451,7 +451,7 @@ def test_shortest_decimals(state):
     _, _, tensors = state
     assert infer_sh_degree(tensors, 16) == 4
     for wrong in (15, 0, -1):
-        with pytest.raises(NergError, match="not spherical harmonics"):
+        with pytest.raises(NergError, match="not match spherical harmonics"):
             infer_sh_degree(tensors, wrong)
 
 
@@ -494,5 +494,5 @@ def test_moving_averages(tmp_path, torch):
     with pytest.raises(ValueError, match="--no-ema"):
         read_torch_ngp(save(tmp_path / "raw.pth", state), ns, ema=True)
     bad = {"shadow_params": [np.zeros((2, 2), np.float32)]}
-    with pytest.raises(ValueError, match="1 moving averages .* do not fit its 6 weights"):
+    with pytest.raises(ValueError, match="1 moving averages .* do not match its 6 weights"):
         read_torch_ngp(save(tmp_path / "bad.pth", state, ema=bad), ns)
