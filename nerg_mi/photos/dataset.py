@@ -264,11 +264,11 @@ def explain_wrong_depth(views: list[tuple[PosedCamera, np.ndarray]]) -> str | No
     views then agree in each larger unit too, which is no evidence.
     """
     selected = [views[k] for k in np.unique(np.linspace(0, len(views) - 1, _COMPARED_VIEWS).astype(int))]
-    views = [(c, d, depth_points(c, d, _COMPARED_POINTS) - c.center) for c, d in selected]
-    agreement = _compute_agreement(views, 1.0)
+    compared = [(c, d, depth_points(c, d, _COMPARED_POINTS) - c.center) for c, d in selected]
+    agreement = _compute_agreement(compared, 1.0)
     if agreement <= 1 - _MIN_AGREEMENT_GAIN:
-        best, factor = max((_compute_agreement(views, f), f) for f in _UNIT_FACTORS)
-        if best >= _MIN_AGREEMENT_GAIN + max(agreement, _compute_agreement(views, 10 * factor)):
+        best, factor = max((_compute_agreement(compared, f), f) for f in _UNIT_FACTORS)
+        if best >= _MIN_AGREEMENT_GAIN + max(agreement, _compute_agreement(compared, 10 * factor)):
             return (
                 f"{best:.0%} of its points agree with the depth of other views after multiplication by {factor:g}, but "
                 f"{agreement:.0%} without it"

@@ -261,9 +261,9 @@ def write_claimed_count(count):
 @pytest.mark.parametrize(
     "change, said",
     [
-        (lambda raw: raw[:-4], "ends in the middle of {record} record"),
+        (lambda raw: raw[:-4], "ends within {record} record"),
         *((write_claimed_count(count), "") for count in (2**63, 2**64 - 1, 10**9)),
-        (lambda raw: write_claimed_count(struct.unpack("<Q", raw[:8])[0] - 1)(raw), "more bytes than the"),
+        (lambda raw: write_claimed_count(struct.unpack("<Q", raw[:8])[0] - 1)(raw), "bytes after the"),
     ],
 )
 def test_binary_files_with_wrong_counts_are_refused(tmp_path, name, record, change, said):
@@ -291,7 +291,7 @@ def test_only_observations_may_have_long_lines(tmp_path):
 def test_a_file_without_line_ends_is_read_in_pieces(tmp_path, monkeypatch):
     (tmp_path / "images").mkdir()
     write_txt(tmp_path, ["a.png"])
-    monkeypatch.setattr(colmap, "_PIECE", 1 << 21)
+    monkeypatch.setattr(colmap, "_READ_CHARACTERS", 1 << 21)
     (tmp_path / "cameras.txt").write_bytes(bytes(1 << 23))
     with pytest.raises(NergError, match="1.*cameras.txt.*2,097,152"):
         read_colmap(tmp_path, tmp_path / "images")
@@ -380,13 +380,13 @@ def test_limits_are_checked_before_reading(tmp_path, monkeypatch, write, name):
     (tmp_path / NAMES[0]).write_bytes(b"")
     monkeypatch.setattr(colmap, "file_sha256", lambda path: pytest.fail("it was read to its end"))
     write(tmp_path, NAMES[:1], {} if name == "images" else {1: CAMERAS[1]})
-    with monkeypatch.context() as limits, pytest.raises(NergError, match=f"{name}.* more than the 0 that are read"):
+    with monkeypatch.context() as limits, pytest.raises(NergError, match=f"{name}.* the limit is 0"):
         limits.setattr(colmap, "MAX_POINTS" if name == "points3D" else "MAX_IMAGES", 0)
         read_colmap(tmp_path, tmp_path)
     path = next(tmp_path.glob(f"{name}.*"))
     with path.open("r+b") as out:
         out.truncate(64 << 30)
-    with pytest.raises(NergError, match=f"{name}.* has 68,719,476,736 bytes, more than"):
+    with pytest.raises(NergError, match=f"{name}.* has 68,719,476,736 bytes; the limit is"):
         read_colmap(tmp_path, tmp_path)
 
 
@@ -474,7 +474,7 @@ def test_binary_models_are_counted_by_their_header(tmp_path):
         for file in ("cameras.bin", "images.bin"):
             (tmp_path / "sparse" / name / file).write_bytes(count.to_bytes(8, "little"))
     assert find_pose_source(tmp_path).name == "1"
-    assert describe_other_models(tmp_path / "sparse/0")[0].endswith('"0" (2 images) is used, and not "1" (24 images)')
+    assert describe_other_models(tmp_path / "sparse/0")[0].endswith('"0" (2 images) is used, but not "1" (24 images)')
 
 
 def test_notes_on_a_model_come_with_its_poses(tmp_path):
@@ -521,7 +521,7 @@ def angle(up: np.ndarray) -> float:
 EMPTY = np.zeros((0, 3))
 
 
-@pytest.mark.parametrize("arc, most", [(2 * np.pi, 0.01), (np.pi, 1.0), (np.pi / 2, 4.0)])
+@pytest.mark.parametrize("arc, max_pitch", [(2 * np.pi, 0.01), (np.pi, 1.0), (np.pi / 2, 4.0)])
 def test_level_cameras_determine_up_at_any_pitch(arc, max_pitch):
     up = estimate_up(*rotate(make_ring(arc=arc), EMPTY))
     assert (
@@ -555,7 +555,7 @@ def test_floor_is_more_precise_than_cameras():
     by_hands, up = estimate_up(poses, EMPTY), estimate_up(poses, points)
     assert angle(up.direction) < 0.3 < angle(by_hands.direction)
     assert 0.35 < up.plane_fraction < 0.55 and up.plane_angle == pytest.approx(angle(by_hands.direction), abs=0.4)
-    assert "plane of" in str(up) and "no plane" in str(by_hands)
+    assert "plane of" in str(up) and "no level plane" in str(by_hands)
 
 
 def test_walls_ceilings_and_lines_are_not_floors():

@@ -122,7 +122,7 @@ def test_object_without_background_ends_at_box():
 def test_room_ends_at_walls_despite_strays():
     strays = np.random.default_rng(7).uniform(-60, 60, (12, 3))
     extent = estimate_extent(INSIDE, points=np.concatenate([walls(), strays]))
-    assert extent.kind == "room" and not extent.box.is_contracted and "0.3 % of the points" in extent.reason
+    assert extent.kind == "room" and not extent.box.is_contracted and "0.3 % of the surface points" in extent.reason
 
 
 def test_scene_with_points_outside_of_box_is_unbounded():
@@ -131,9 +131,7 @@ def test_scene_with_points_outside_of_box_is_unbounded():
         np.random.default_rng(9).uniform(-90, 90, (100, 3)),
     )
     extent = estimate_extent(AROUND, points=np.concatenate([near, far]))
-    assert (
-        extent.kind == "unbounded" and extent.box.is_contracted and "% of the points on surfaces lie" in extent.reason
-    )
+    assert extent.kind == "unbounded" and extent.box.is_contracted and "% of the surface points are" in extent.reason
     # Nine tenths of the points are in the box from the cameras, whose longest edge is that of the core.
     box = estimate_box(AROUND, points=np.concatenate([near, far]))[0]
     assert extent.box.side == pytest.approx(box.side) and np.allclose(extent.box.center, box.center)
@@ -156,7 +154,7 @@ def test_distant_points_make_scene_unbounded():
 def test_scene_without_points_ends_at_box():
     for cameras in (AROUND, INSIDE):
         extent = estimate_extent(cameras)
-        assert extent.kind == "room" and extent.box == estimate_box(cameras)[0] and "no points" in extent.reason
+        assert extent.kind == "room" and extent.box == estimate_box(cameras)[0] and "no surface points" in extent.reason
 
 
 def facing(distance):
@@ -250,7 +248,7 @@ def test_unusable_frames_are_listed(ring, rgb):
     }.items():
         assert part in reasons[f"./images/{k}.png"]
     assert data.source["unused"] == reasons and data.source["training_frames"] == 3
-    assert str(data.unused[0]).startswith('left out "./images/')
+    assert str(data.unused[0]).startswith('not used: "./images/')
 
 
 def test_a_set_without_overlap_is_refused(ring):
@@ -261,7 +259,7 @@ def test_a_set_without_overlap_is_refused(ring):
             f["transform_matrix"] = m.tolist()
 
     rewrite(ring, change)
-    with pytest.raises(ValueError, match="no two of the 9.*same place"):
+    with pytest.raises(ValueError, match="no two of the 9.*same part"):
         open_dataset(ring, holdout=0, aabb=(-5, -5, -3, 85, 5, 0))
 
 
@@ -288,7 +286,7 @@ def test_masks_and_depth_are_resized(ring, rgb):
     assert np.allclose(view.depth * ahead, 2.5, rtol=1e-5) and view.pixels.dtype == np.uint16
     assert "metre" in data.unit_note
     rgb.Bitmap(np.zeros((H, W), np.uint8)).write(str(ring / "mask.png"))
-    with pytest.raises(ValueError, match="every pixel"):
+    with pytest.raises(ValueError, match="all pixels"):
         open_dataset(ring)
 
 
@@ -304,7 +302,7 @@ def test_box_unit_and_scale(ring):
     rewrite(ring, lambda c: c.update(aabb=box))
     data = open_dataset(ring, scale=0.5)
     assert np.allclose(data.box.lower, [-0.51875] * 3) and np.allclose(data.box.upper, [0.51875, 1.01875, 0.51875])
-    assert "counts 0.5" in data.unit_note and np.allclose(data.source["to_file"], np.diag([2, 2, 2, 1]))
+    assert "is scaled to 0.5" in data.unit_note and np.allclose(data.source["to_file"], np.diag([2, 2, 2, 1]))
     centers = np.array([v.camera.center for v in open_dataset(ring, holdout=0).train])
     assert np.allclose([v.camera.center for v in open_dataset(ring, holdout=0, scale=0.5).train], centers / 2)
     corners = open_dataset(ring, aabb=(0, 0, 0, 1, 1, 1))
@@ -321,7 +319,7 @@ def test_box_is_estimated_from_depth(ring):
     data = open_dataset(ring, holdout=0)
     points = np.concatenate([(o + 2 * d).reshape(-1, 3) for o, d in (expected_rays(OPENCV, p) for p in cameras_())])
     lower, upper = np.quantile(points, [0.0005, 0.9995], axis=0)
-    assert "points on surfaces" in data.box_source
+    assert "surface points" in data.box_source
     assert np.allclose(data.box.lower, lower - 0.05 * np.max(upper - lower), atol=1e-3)
     assert data.train[0].depth.dtype == np.float32 and "box" not in open_dataset(ring, depth=False).box_source
 
@@ -371,7 +369,7 @@ def test_consistent_depth_passes(depth_views, factor):
 @pytest.mark.parametrize("factor", [1e-3, 1e-2, 0.1, 0.2, 5.0, 100.0, 1e3])
 def test_depth_in_other_units_is_explained(depth_views, factor):
     reason = explain_wrong_depth([(c, factor * d) for c, d in depth_views])
-    assert reason is not None and f"multiplied by {1 / factor:g}, " in reason
+    assert reason is not None and f"multiplication by {1 / factor:g}, " in reason
 
 
 def test_constant_depth_is_no_evidence(depth_views):
@@ -397,14 +395,16 @@ def test_masked_fraction_is_noted(tmp_path, rgb, lens):
     rewrite(tmp_path, lambda c: [f.update(mask_path="mask.png") for f in c["frames"]])
     mask = np.full((H, W), 255, np.uint8)
     rgb.Bitmap(mask).write(str(tmp_path / "mask.png"))
-    assert f"the masks of all {COUNT} frames that have one leave out nothing" in open_dataset(tmp_path).notes[-1]
+    assert f"the {COUNT} masks exclude no pixels" in open_dataset(tmp_path).notes[-1]
     mask[:, : W // 2] = 0
     rgb.Bitmap(mask).write(str(tmp_path / "mask.png"))
-    assert open_dataset(tmp_path).notes[-1] == f"masks leave out 50.0% of the pixels of {COUNT} frames"
+    assert open_dataset(tmp_path).notes[-1] == f"masks exclude 50.0% of the pixels of {COUNT} frames"
 
 
 def test_rotated_photo_excludes_frame_with_reason(ring, rgb):
     """Exchanging width and height would train on rotated rays."""
     rgb.Bitmap(np.ascontiguousarray(np.rot90(picture(0)))).write(str(ring / "images/0.png"))
     data = open_dataset(ring, holdout=0)
-    assert len(data.train) == COUNT - 1 and "turn the pixels as the camera was held" in data.unused[0].reason
+    assert (
+        len(data.train) == COUNT - 1 and "rotate the pixels to the orientation of the camera" in data.unused[0].reason
+    )

@@ -86,7 +86,7 @@ def test_duplicate_image_counts_once(tmp_path):
     first = PosedFrame("a.png", tmp_path / "a.png", np.eye(4), {})
     again = PosedFrame("b.png", tmp_path / "b.png", np.diag([1.0, -1, -1, 1]), {})
     unique, unused = drop_duplicates([first, again])
-    assert unique == [first] and "another pose" in unused[0].reason
+    assert unique == [first] and "a different pose" in unused[0].reason
 
 
 # ---- Semi-dense points of Project Aria ----
@@ -112,9 +112,9 @@ def test_precise_points_of_one_world(tmp_path, monkeypatch):
     assert len(read_semidense(path, "a", max_inv_dist_std=1, max_dist_std=1)) == 4
     with pytest.raises(ValueError, match='"c"'):
         read_semidense(path, "c")
-    with pytest.raises(ValueError, match="holds no point that is known to 0.005 1/m and -1 m"):
+    with pytest.raises(ValueError, match="contains no point with deviations up to 0.005 1/m and -1 m"):
         read_semidense(path, max_dist_std=-1)
-    monkeypatch.setattr(posed, "_WORLDS", 1)
+    monkeypatch.setattr(posed, "_MAX_WORLDS", 1)
     with pytest.raises(ValueError, match="more than 1 worlds"):
         read_semidense(path)
 
@@ -123,7 +123,7 @@ def test_other_files_are_refused(tmp_path):
     for row, why in (
         ("1,a,1,2", "line 2: 4 cells, the header has 7"),
         ("1,a,1,2,3,0,0,0,0", "line 2: 9 cells, the header has 7"),
-        ("1,a,x,2,3,0,0", "is no point"),
+        ("1,a,x,2,3,0,0", "is not a point"),
     ):
         with pytest.raises(ValueError, match=why):
             read_semidense(write(tmp_path / "p.csv.gz", row))

@@ -183,10 +183,10 @@ def test_all_formats_give_same_map(tmp_path, rgb):
         ("a.npy", np.full((4, 4), np.nan), "16 values that are not finite"),
         ("a.exr", np.array([[1, np.inf]], np.float32), "1 values that are not finite"),
         ("a.npy", np.array([[-1.0, 2]]), "log densities"),
-        ("a.png", np.random.default_rng(0).integers(0, 255, (4, 4, 3)).astype(np.uint8), "in colours"),
+        ("a.png", np.random.default_rng(0).integers(0, 255, (4, 4, 3)).astype(np.uint8), "has colours"),
         ("a.png", np.arange(1, 17, dtype=np.uint8).reshape(4, 4, 1) * np.ones(4, np.uint8), "partly transparent"),
-        ("a.npy", np.ones((2, 3, 4, 5)), "one number a pixel"),
-        ("a.npy", np.array([["x"]]), "one number a pixel"),
+        ("a.npy", np.ones((2, 3, 4, 5)), "one number per pixel"),
+        ("a.npy", np.array([["x"]]), "one number per pixel"),
         *((name, None, f"{name}.*cannot be read") for name in ("a.png", "a.exr", "a.npy")),
     ],
 )
@@ -222,14 +222,14 @@ def test_maps_belong_to_frames_by_name(posed):
 
 def test_map_of_wrong_shape_or_without_frame_is_refused(posed):
     folder = posed()
-    with pytest.raises(ValueError, match='no image in .* would be "a"'):
+    with pytest.raises(ValueError, match='no file in .* expected "a"'):
         open_salience(folder, folder / "maps")
     with pytest.raises(FileNotFoundError, match="spectral-residual"):
         open_salience(folder, folder / "nothing")
     write(folder / "maps" / "b.npy", np.ones((32, 32)))
     with pytest.raises(ValueError, match="b.npy.*32.*32.*64.*48"):
         open_salience(folder, folder / "maps")
-    with pytest.raises(ValueError, match="per pixel or per steradian"):
+    with pytest.raises(ValueError, match="pixel or steradian"):
         open_salience(folder, folder / "maps", per="radian")
 
 
@@ -243,7 +243,7 @@ def test_map_of_two_photos_is_refused(posed):
         frame["file_path"] = f"{k}/a.png"
     (folder / "transforms.json").write_text(json.dumps(data))
     write(folder / "maps" / "a.npy", np.ones((48, 64)))
-    with pytest.raises(ValueError, match="could be of"):
+    with pytest.raises(ValueError, match="matches both"):
         open_salience(folder, folder / "maps")
 
 

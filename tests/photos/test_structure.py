@@ -102,7 +102,8 @@ def test_upright_photo_is_copied_byte_by_byte(folder, folders):
     assert [p.name for p in pictures] == ["a c.png", "b.JPG"] and not unused
     for k, p in enumerate(pictures):
         assert (folders.images / p.name).read_bytes() == (folder / p.name).read_bytes()
-        assert p.size == (48, 32) and p.small_size == (24, 16) == Image.open(folders.small_images / small_file_name(k)).size
+        assert p.size == (48, 32) and p.small_size == (24, 16)
+        assert Image.open(folders.small_images / small_file_name(k)).size == (24, 16)
         assert p.focal is None
 
 
@@ -150,7 +151,7 @@ def test_unusable_photos_are_listed(folder, folders):
     raw = (folder / "good.jpg").read_bytes()
     (folder / "cut.jpg").write_bytes(raw[: len(raw) // 2])
     (folder / "empty.png").write_bytes(b"")
-    (folder / "text.jpg").write_text("no picture")
+    (folder / "text.jpg").write_text("image format is not supported")
     ramp().save(folder / "gif.jpg", "gif")
     ramp().save(folder / "bmp.jpg", "bmp")
     ramp(seed=1).save(folder / "png.jpg", "png")
@@ -160,7 +161,7 @@ def test_unusable_photos_are_listed(folder, folders):
     used = ["a.jpg", "good.jpg", "palette.png", "png.jpg"]
     assert [p.name for p in pictures] == used and {p.name for p in folders.images.iterdir()} == set(used)
     assert Image.open(folders.images / "palette.png").mode == "RGB"
-    assert unused.pop("b.jpg") == 'it is the same file as "a.jpg"' and 'of the kind "bmp"' in unused.pop("bmp.jpg")
+    assert unused.pop("b.jpg") == 'it is the same file as "a.jpg"' and 'the format "bmp"' in unused.pop("bmp.jpg")
     assert set(unused) == {"cut.jpg", "empty.png", "text.jpg", "gif.jpg", "heic.jpg"}
     assert all("cannot be read" in reason and name in reason for name, reason in unused.items())
 
@@ -196,7 +197,7 @@ def test_photos_are_as_large_as_their_bytes_warrant(folder, folders, monkeypatch
         file.truncate((1 << 28) + 1)
     pictures, unused = copy_all(folder, folders)
     assert [p.name for p in pictures] == ["a.png"]
-    assert "8,193 x 8,193 pixels" in unused["b.png"] and "make it smaller" in unused["b.png"]
+    assert "8,193 x 8,193 pixels" in unused["b.png"] and "reduce its size" in unused["b.png"]
     assert "268,435,457 bytes" in unused["c.jpg"]
     # Rotated photos are stored as JPEG, which does not support longer sides.
     Image.new("L", (65_501, 1)).save(folder / "d.png")
@@ -243,7 +244,7 @@ def test_pipe_is_refused(folder, folders):
 
 
 def test_folder_without_photos_is_refused(folder, tmp_path):
-    with pytest.raises(NergError, match="name the folder"):
+    with pytest.raises(NergError, match="specify the folder"):
         list_photos(folder)
     (folder / "images").mkdir()
     with pytest.raises(NergError, match='did you mean ".*images"'):
@@ -345,9 +346,9 @@ def test_wrong_settings(installed, settings, said, tmp_path):
     "program, said",
     [
         ("import sys; sys.exit('E1 a.cc:1] Check failed: x\\n  @ trace')", "Check failed: x"),
-        ("raise ValueError('some reason')", r"with code 1 \(ValueError: some reason\)"),
-        ("import os, signal; os.kill(os.getpid(), signal.SIGKILL)", "want of memory"),
-        ("import os; os.abort()", f"with code {-signal.SIGABRT}"),
+        ("raise ValueError('some reason')", r"with exit code 1 \(ValueError: some reason\)"),
+        ("import os, signal; os.kill(os.getpid(), signal.SIGKILL)", "memory was short"),
+        ("import os; os.abort()", f"with exit code {-signal.SIGABRT}"),
     ],
 )
 def test_failures_of_colmap_are_explained(installed, program, said, monkeypatch, tmp_path):
@@ -414,7 +415,7 @@ def first(photos, tmp_path_factory):
 
 def test_poses_and_lens_are_estimated(first):
     made, model, steps = first[1]
-    assert made.parts == [[f"{k}.png" for k in range(8)]] and 0 < made.error < 0.5 and made.points > 300
+    assert made.models == [[f"{k}.png" for k in range(8)]] and 0 < made.error < 0.5 and made.num_points > 300
     assert list(dict.fromkeys(stage for stage, _, _ in steps)) == ["features", "matching", "mapping"]
     assert steps[-1] == ("mapping", 8, 8)
     poses = np.array([f.to_world for f in model.frames])
@@ -423,13 +424,13 @@ def test_poses_and_lens_are_estimated(first):
     assert angles.max() < 1 and distances.max() < 0.01
     # The model is upright, and its points are on a floor and a box on it.
     truth = similarity[:3, :3] / np.cbrt(np.linalg.det(similarity[:3, :3]))
-    assert np.degrees(np.arccos(truth[2, 2])) < 1 and made.up.sure and made.up.plane_fraction > 0.3
+    assert np.degrees(np.arccos(truth[2, 2])) < 1 and made.up.is_reliable and made.up.plane_fraction > 0.3
     points = model.points @ similarity[:3, :3].T + similarity[:3, 3]
     low, high = np.quantile(points[:, 2], [0.02, 0.98])
     assert low == pytest.approx(0, abs=0.03) and high == pytest.approx(0.7, abs=0.05)
     lens = model.frames[0].intrinsics(320, 240)
     assert lens.fx == lens.fy == pytest.approx(rendered.FOCAL, rel=0.02) and abs(lens.k1) < 0.05
-    assert len(made.surface) == len(made.colors) and made.colors.dtype == np.uint8
+    assert len(made.point_positions) == len(made.point_colors) and made.point_colors.dtype == np.uint8
 
 
 @pytest.mark.nightly

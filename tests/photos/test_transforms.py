@@ -386,7 +386,7 @@ def test_unknown_depth_keys_are_refused_with_depth(write):
 def test_unused_keys_are_noted_once(write):
     frames = [frame(n, time=0.5, sharpness=3.0) for n in ("a.png", "b.png")]
     t = read_transforms(write({"fl_x": 1.0, "aabb_scale": 4, "ply_file_path": "sparse_pc.ply", "frames": frames}))
-    assert t.notes == ["keys of transforms.json that are not used: ply_file_path, time"]
+    assert t.notes == ["unused keys of transforms.json: ply_file_path, time"]
 
 
 @pytest.mark.parametrize("key", ["from_mitsuba", "is_fisheye", "is_equirectangular", "is_euclidean_depth"])
