@@ -169,7 +169,7 @@ class GazeModule(_FieldModule):
 
     The integral of a normalised field is computed once per observer, over directions of equal solid angle::
 
-        around = Outlook(field, Similarity(), place, eye, settings).trace()  # directions, their depths, misses
+        around = Outlook(field, Similarity(), scene, position, settings).trace()  # directions, depths, misses
 
         Z = module.integral(p_od, p_o, r_o, misses)  # everywhere around the observer
         gaze = module(p_od, p_o, r_o, Z)  # anywhere
