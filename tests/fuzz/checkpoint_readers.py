@@ -77,8 +77,7 @@ def _read_gaze(folder: Path) -> object:
     return load_gaze(folder / "gaze.safetensors", _parts()[0])
 
 
-# --- training states
-# ----------------------------------------------------------------------------------------------------
+# --- training states --------------------------------------------------------------------------------------------------
 
 
 class _Grid:
@@ -111,7 +110,7 @@ def _trainer(kind):
         optimiser=optimiser,
         averaged=averaged,
         grid=_Grid(ns),
-        hard=np.zeros(4, np.float32),
+        hard_pixels=np.zeros(4, np.float32),
         rng=np.random.default_rng(1),
         steps=7,
         rays=100,
@@ -119,7 +118,12 @@ def _trainer(kind):
         _started=0.0,
         stride=4,
         looked=10.0,
-        settling=SimpleNamespace(at=0, found=ns.UInt8([0] * 8), shown=ns.UInt8([0] * 8), restore=lambda *state: None),
+        extraction=SimpleNamespace(
+            pieces_done=0,
+            dense_cells=ns.UInt8([0] * 8),
+            contributing_cells=ns.UInt8([0] * 8),
+            restore=lambda *state: None,
+        ),
         clock=StepClock(),
     )
     return trainer

@@ -144,7 +144,7 @@ def attempt(reader, folder: Path) -> dict:
         outcome, said = "executed", "; ".join(violations)
     elif not reader.is_command and _files(folder) != before:
         outcome, said = "left a file", str(_files(folder) ^ before)
-    elif taken > ROOM or "needs more memory than there is" in said:
+    elif taken > ROOM or "needs more memory than is available" in said:
         outcome, said = "memory", f"{taken >> 20} MB; {said}"
     elif seconds > SECONDS * (4 if reader.is_command else 1):
         outcome, said = "slow", f"{seconds:.1f} s; {said}"

@@ -63,7 +63,7 @@ READERS = [
     _reader("memory", lambda folder: np.ones(1200 << 20, np.uint8).sum()),
     _reader(
         "memory: refused",
-        lambda folder: _raise(NergError("the file cannot be read: it needs more memory than there is")),
+        lambda folder: _raise(NergError("the file cannot be read: it needs more memory than is available")),
     ),
     _reader("slow", lambda folder: _busy()),
     _reader("crash", lambda folder: signal.raise_signal(signal.SIGSEGV)),
