@@ -298,7 +298,10 @@ def test19_old_llvm_is_refused_without_abort():
     orders = "import nerg_mi, drjit", "import nerg_mi, mitsuba", "import drjit, nerg_mi", "import mitsuba, nerg_mi"
     for code in orders:
         run = subprocess.run(
-            [sys.executable, "-c", code], env={**os.environ, llvm.PATH_VARIABLE: old.path}, capture_output=True, text=True
+            [sys.executable, "-c", code],
+            env={**os.environ, llvm.PATH_VARIABLE: old.path},
+            capture_output=True,
+            text=True,
         )
         assert run.returncode == 1, code
         last = run.stderr.strip().splitlines()[-1]

@@ -25,7 +25,7 @@ from nerg_mi.evaluation.ablation import make_frame_timer
 from nerg_mi.evaluation.metrics import FieldRenderer
 from nerg_mi.formats.surfaces import write_volume
 from nerg_mi.photos.cameras import Intrinsics, PosedCamera
-from nerg_mi.ranges import MAX_COORDINATE, FLAG, RANGE, ValidatedDataclass, Range, check_number, range_field
+from nerg_mi.ranges import FLAG, MAX_COORDINATE, RANGE, Range, ValidatedDataclass, check_number, range_field
 from nerg_mi.rays.readers.registry import collect_shared_options
 from nerg_mi.train import gaze_settings, radiance_settings
 from nerg_mi.train.geometry import load_scene_geometry, load_volume_geometry

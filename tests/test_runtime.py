@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.interruption import Interruption
-from nerg_mi.threads import set_thread_count, limit_threads
+from nerg_mi.threads import limit_threads, set_thread_count
 
 from .plugins import fields
 
@@ -125,4 +125,9 @@ def test_arrays_survive_thread_changes(rgb):
 
 
 def test_worker_limits_threads_to_available():
-    assert (limit_threads(4, 2), limit_threads(2, 4), limit_threads(0, 3), limit_threads(3, 0)) == (2, 2, 3, 3) and limit_threads(0, 0) >= 1
+    assert (limit_threads(4, 2), limit_threads(2, 4), limit_threads(0, 3), limit_threads(3, 0)) == (
+        2,
+        2,
+        3,
+        3,
+    ) and limit_threads(0, 0) >= 1

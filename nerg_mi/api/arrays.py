@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from nerg_mi.errors import NergError, sanitize
 from nerg_mi.maths.coordinates import check_coordinates
-from nerg_mi.ranges import MAX_COORDINATE, FIELDS_OF_VIEW, Range, check_number
+from nerg_mi.ranges import FIELDS_OF_VIEW, MAX_COORDINATE, Range, check_number
 
 # ---- Input arrays and labelled results ----
 

@@ -17,13 +17,13 @@ from nerg_mi.formats.meshes import READERS
 from nerg_mi.maths.arrays import to_vector
 from nerg_mi.maths.types import variant_types
 from nerg_mi.ranges import MAX_COORDINATE, Range, check_number
-from nerg_mi.statistics.shares import Shares, QuadratureRule, gaze_shares
+from nerg_mi.statistics.shares import QuadratureRule, Shares, gaze_shares
 from nerg_mi.statistics.visits import MARGIN, BoxAoi
 from nerg_mi.workflows.base import SILENT, Reporter
 
 from . import arrays
 from .arrays import Floats, LabelledArrays, broadcast_to_observers
-from .scene import COLOR, FilePath, Scene, activate_mitsuba, resolve_quantities, make_aov_context, load_mesh_child
+from .scene import COLOR, FilePath, Scene, activate_mitsuba, load_mesh_child, make_aov_context, resolve_quantities
 
 # ---- One observer of a scene ----
 
@@ -223,9 +223,7 @@ class _Tracer:
         observers = (
             [self.context.make_observer(eye, len(positions) == 1) for eye in positions] if self.per_observer else []
         )
-        parts = [
-            self._trace_batch(o, d, a, lambda camera: map(camera.make_pixel, observers)) for a in _batch_starts(o)
-        ]
+        parts = [self._trace_batch(o, d, a, lambda camera: map(camera.make_pixel, observers)) for a in _batch_starts(o)]
         values = {}
         for name in self.requested:
             value = np.concatenate([part[name] for part in parts], axis=-1 if name in self.per_observer else 0)
@@ -676,7 +674,9 @@ def _compute_density(scene: Scene, position: Floats, pieces: Any, two_sided: boo
 
     observer = SceneObserver(scene, position)
     settings = observer.integrator.observer_settings
-    density = attention_per_area(observer.geometry, observer.eval_gaze, observer.center, pieces.p, pieces.n, 0.0, settings, two_sided)
+    density = attention_per_area(
+        observer.geometry, observer.eval_gaze, observer.center, pieces.p, pieces.n, 0.0, settings, two_sided
+    )
     if not observer.integrator.gaze.field.config.normalized:
         total = compute_box_shares(scene, [], position[None]).integral[0]
         density /= total if total > 0 else 1

@@ -14,7 +14,7 @@ from nerg_mi.ranges import SEEDS, SPP, Range, check_number
 from nerg_mi.workflows.base import SILENT, Reporter
 
 from .arrays import Camera, Floats, LabelledArrays, as_points, broadcast_to_observers
-from .scene import COLOR, FilePath, Scene, activate_mitsuba, resolve_quantities, make_aov_context
+from .scene import COLOR, FilePath, Scene, activate_mitsuba, make_aov_context, resolve_quantities
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -174,7 +174,9 @@ def _render_layers(
     return values | {name: np.stack([one[name] for one in each]) for name in layers.per_observer}
 
 
-def split_channels(pixels: Floats, aov_names: Sequence[str], quantities: Sequence[str], alpha: bool) -> dict[str, Floats]:
+def split_channels(
+    pixels: Floats, aov_names: Sequence[str], quantities: Sequence[str], alpha: bool
+) -> dict[str, Floats]:
     """Split the channels of an image by quantity.
 
     Parameters

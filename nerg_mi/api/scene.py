@@ -31,7 +31,7 @@ from nerg_mi.rendering.bands import is_nerg
 from nerg_mi.rendering.scene_writer import compute_clip_distances
 from nerg_mi.transport.geometry import check_shape
 
-from .arrays import Camera, Floats, join_names, as_points
+from .arrays import Camera, Floats, as_points, join_names
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -408,7 +408,8 @@ def build_options(kind: type[Options], function: str, options: Options | None, o
     updated = replace(kind() if options is None else options, **overrides)
     files = {k: getattr(updated, k) for k, type_name in types.items() if "Path" in type_name}
     return replace(
-        updated, **{k: Path(v) if k in _OUTPUT_OPTIONS else resolve_file(v, k) for k, v in files.items() if v is not None}
+        updated,
+        **{k: Path(v) if k in _OUTPUT_OPTIONS else resolve_file(v, k) for k, v in files.items() if v is not None},
     )
 
 

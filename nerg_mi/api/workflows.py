@@ -17,7 +17,7 @@ from nerg_mi.workflows.radiance_commands import RadianceOptions, RadianceScoreOp
 from nerg_mi.workflows.rays_commands import AlignOptions, RaysImportOptions
 from nerg_mi.workflows.scene_commands import BakeOptions, StudyOptions
 
-from .scene import FilePath, TrainedField, check_names, resolve_checkpoint, resolve_file, build_options, resolve_rays
+from .scene import FilePath, TrainedField, build_options, check_names, resolve_checkpoint, resolve_file, resolve_rays
 
 if TYPE_CHECKING:
     from nerg_mi.alignment.check import Alignment
@@ -142,7 +142,9 @@ def bake(
         overrides = {**overrides, "rays": rays}
     resolved = build_options(BakeOptions, "bake", options, overrides)
     files = [outputs] if isinstance(outputs, (str, Path)) or not isinstance(outputs, Sequence) else list(outputs)
-    return baking.bake_any(resolve_file(surface, "surface"), [Path(str(f)) for f in files], resolved, reporter, in_memory)
+    return baking.bake_any(
+        resolve_file(surface, "surface"), [Path(str(f)) for f in files], resolved, reporter, in_memory
+    )
 
 
 # ---- Evaluation ----
@@ -456,7 +458,7 @@ def import_rays(
     (2, ('Ada',))
     """
     from nerg_mi.rays.readers.base import list_options
-    from nerg_mi.rays.readers.registry import make_options, get_reader, list_reader_names
+    from nerg_mi.rays.readers.registry import get_reader, list_reader_names, make_options
     from nerg_mi.workflows import rays
 
     file_list = [files] if isinstance(files, (str, os.PathLike)) or not isinstance(files, Sequence) else files
@@ -467,7 +469,9 @@ def import_rays(
         )
     reader_options = list_options(get_reader(reader).Options)
     import_options = {f.name for f in fields(RaysImportOptions)} - {"reader", "settings", "output"}
-    all_reader_options = {option.name for name in list_reader_names() for option in list_options(get_reader(name).Options)}
+    all_reader_options = {
+        option.name for name in list_reader_names() for option in list_options(get_reader(name).Options)
+    }
     check_names("import_rays", options, sorted(all_reader_options | import_options))
     paths = [resolve_file(file, "files") for file in file_list]
     import_values = {name: value for name, value in options.items() if name in import_options}

@@ -608,7 +608,7 @@ def read_channels(film, aov_names: Sequence[str]) -> Channels:
 # ---- AOVs in addition to those of a scene file ----
 
 
-class AskedLayer:
+class AovLayer:
     """A layer with colour and chosen AOVs, for the observer of the scene.
 
     Parameters

@@ -15,7 +15,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError, sanitize
 from nerg_mi.files.atomic import check_writable, replace_atomically
-from nerg_mi.files.images import split_bitmap_channels, encode_png, open_exr_writer
+from nerg_mi.files.images import encode_png, open_exr_writer, split_bitmap_channels
 from nerg_mi.files.safe_read import map_bytes, open_file, read_bytes, translate_read_errors
 from nerg_mi.files.tables import write_csv
 from nerg_mi.formats.meshes import MAX_BYTES, MeshFile, read_mesh_file
@@ -213,7 +213,9 @@ def open_image_rows(
     check_writable(path, *IMAGE_FORMATS)
     if Path(path).suffix.lower() == ".exr":
         with open_exr_writer(path, width, height, text) as write:
-            yield lambda bitmap, rows: write({name: values[:rows] for name, values in split_bitmap_channels(bitmap).items()})
+            yield lambda bitmap, rows: write(
+                {name: values[:rows] for name, values in split_bitmap_channels(bitmap).items()}
+            )
         return
     # Open the file first, so that an unwritable folder is reported before the rendering.
     with replace_atomically(path) as temporary:

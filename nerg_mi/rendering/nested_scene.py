@@ -9,10 +9,20 @@ from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
 from nerg_mi.errors import NergError, sanitize
-from nerg_mi.files.safe_read import translate_read_errors, resolve_path, check_regular_file
+from nerg_mi.files.safe_read import check_regular_file, resolve_path, translate_read_errors
 
 from .scene import check_scene_file
-from .scene_writer import BlankLine, Comment, Node, SceneContent, Verbatim, format_document, element, relative_path, check_attribute
+from .scene_writer import (
+    BlankLine,
+    Comment,
+    Node,
+    SceneContent,
+    Verbatim,
+    check_attribute,
+    element,
+    format_document,
+    relative_path,
+)
 
 # ---- A scene file nested in a scene with gaze ----
 #
@@ -147,7 +157,9 @@ def _expand_includes(root: ElementTree.Element, path: Path, folders: list[Path])
         name = child.get("filename", "")
         included = next((f / name for f in folders if name and (f / name).is_file()), None)
         if included is None:
-            raise NergError(f'the scene file "{path}" includes "{sanitize(name)}", which does not exist; correct the path')
+            raise NergError(
+                f'the scene file "{path}" includes "{sanitize(name)}", which does not exist; correct the path'
+            )
         yield from _expand_includes(_parse_root(included), included, folders)
 
 

@@ -12,9 +12,9 @@ from xml.parsers import expat
 import numpy as np
 
 from nerg_mi import llvm
-from nerg_mi.errors import NergError, UnusableLLVM, translate_mitsuba_errors, format_error
+from nerg_mi.errors import NergError, UnusableLLVM, format_error, translate_mitsuba_errors
 from nerg_mi.files.images import check_image, ensure_two_threads
-from nerg_mi.files.safe_read import open_file, resolve_path, check_regular_file
+from nerg_mi.files.safe_read import check_regular_file, open_file, resolve_path
 from nerg_mi.formats.meshes import READERS as MESHES
 from nerg_mi.maths.coordinates import check_coordinates
 from nerg_mi.properties import resolve_scene_file

@@ -295,7 +295,7 @@ class SceneContent:
     files: Mapping[str, str] = field(default_factory=dict)
     spp: int = 16
     version: str = "3.0.0"
-    taken: frozenset[str] = frozenset()
+    reserved_names: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True)

@@ -116,7 +116,9 @@ class Controls:
         variant = gui.add_dropdown("Gaze field", names, initial_value=session.gaze_name) if len(names) > 1 else None
         titles = [layer.title for layer in session.layers]
         layer = gui.add_dropdown("Layer", titles, initial_value=session.display.layer.title)
-        self._legend = gui.add_html(layers.format_legend(session.display.layer, session.scale(), self.page.stale_scale_reason))
+        self._legend = gui.add_html(
+            layers.format_legend(session.display.layer, session.scale(), self.page.stale_scale_reason)
+        )
         basis = gui.add_html(format_basis(session))
         colors = gui.add_dropdown("Colours", _colormap_names(session.display.layer), initial_value=_DEFAULT_COLORS)
         automatic = gui.add_checkbox("Automatic range", True)
@@ -237,7 +239,9 @@ class Controls:
         # Several threads call this; without the lock, an older state could overwrite a newer one.
         with self._legend_lock:
             session = self.session
-            self._legend.content = layers.format_legend(session.display.layer, session.scale(), self.page.stale_scale_reason)
+            self._legend.content = layers.format_legend(
+                session.display.layer, session.scale(), self.page.stale_scale_reason
+            )
             if session.scene.has_gaze:
                 self._table.content = format_shares(session.shares, session.are_shares_stale)
 

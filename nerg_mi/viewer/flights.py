@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from nerg_mi.errors import NergError, is_user_error, format_error
+from nerg_mi.errors import NergError, format_error, is_user_error
 from nerg_mi.files.atomic import write_text
 from nerg_mi.files.video import check_video_output
 from nerg_mi.rendering.scene_writer import format_numbers

@@ -10,7 +10,16 @@ import numpy as np
 
 from nerg_mi.api.scene import COLOR, Scene
 from nerg_mi.errors import NergError
-from nerg_mi.figures.overlay import Overlay, OverlayLayers, Style, map_colors, find_overlay, list_overlays, srgb, to_bytes
+from nerg_mi.figures.overlay import (
+    Overlay,
+    OverlayLayers,
+    Style,
+    find_overlay,
+    list_overlays,
+    map_colors,
+    srgb,
+    to_bytes,
+)
 from nerg_mi.figures.style import CATEGORICAL, DIVERGING, SEQUENTIAL, find_colormap, hatch
 from nerg_mi.transport.aovs import AOVS
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from nerg_mi.errors import NergError, is_user_error, format_error
+from nerg_mi.errors import NergError, format_error, is_user_error
 
 from . import layers
 from .points import NUM_LEVELS, PinholeView, StagePicture

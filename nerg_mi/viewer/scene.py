@@ -16,7 +16,7 @@ import numpy as np
 from nerg_mi.api.query import trace
 from nerg_mi.errors import NergError
 from nerg_mi.rendering.nested_scene import make_paths_absolute, read_scene_elements, to_verbatim
-from nerg_mi.rendering.scene_writer import Comment, format_document, element, format_numbers, prop
+from nerg_mi.rendering.scene_writer import Comment, element, format_document, format_numbers, prop
 
 from . import layers
 from .page import Page

@@ -8,9 +8,9 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.rendering import bands
 from nerg_mi.rendering.bands import (
+    LONG_RENDER_SAMPLES,
     MIN_STRIP_SAMPLES,
     PACKET_SIZE,
-    LONG_RENDER_SAMPLES,
     Channels,
     IntegratorLayer,
     SamplePace,

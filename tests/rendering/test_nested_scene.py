@@ -10,7 +10,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.rendering.bands import render_channels
 from nerg_mi.rendering.nested_scene import find_gaze_file, nest_scene, replace_gaze
 from nerg_mi.rendering.scene import load_scene
-from nerg_mi.rendering.scene_writer import LookAt, GazeFiles, SceneText
+from nerg_mi.rendering.scene_writer import GazeFiles, LookAt, SceneText
 from nerg_mi.workflows import demo
 
 # ---- Nested scenes ----

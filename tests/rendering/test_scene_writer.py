@@ -13,23 +13,23 @@ from nerg_mi.rendering.scene import load_scene
 from nerg_mi.rendering.scene_writer import (
     BlankLine,
     Comment,
-    LookAt,
     GazeFiles,
     Lens,
+    LookAt,
     SceneContent,
     SceneText,
     Verbatim,
-    level_direction,
-    free_default_name,
-    format_document,
+    check_attribute,
     element,
-    matrix,
+    format_document,
     format_numbers,
+    free_default_name,
+    level_direction,
+    matrix,
     project_to_pixel,
     prop,
     relative_path,
     transform,
-    check_attribute,
 )
 from tests.plugins.scenes import plugin
 
@@ -74,7 +74,10 @@ UP = np.array([0.0, 0, 1])
 
 
 def write_scene(folder, **overrides):
-    eye, camera = LookAt(np.array([0, 0, 5.0]), np.array([0, 0, 0.0])), LookAt(np.array([4, 1, 2.0]), np.array([0, 0, 0.5]))
+    eye, camera = (
+        LookAt(np.array([0, 0, 5.0]), np.array([0, 0, 0.0])),
+        LookAt(np.array([4, 1, 2.0]), np.array([0, 0, 0.5])),
+    )
     values = {
         "place": CUBE,
         "attention": GazeFiles(),
@@ -125,19 +128,26 @@ def test_camera_is_the_default_observer(rgb, tmp_path):
 
 def test_reserved_names_are_avoided(rgb, tmp_path):
     place = SceneContent(
-        preamble=(element("default", name="eye", value="9"),), scene_children=CUBE.scene_children, reserved_names=frozenset({"eye", "camera"})
+        preamble=(element("default", name="eye", value="9"),),
+        scene_children=CUBE.scene_children,
+        reserved_names=frozenset({"eye", "camera"}),
     )
     write_scene(tmp_path, place=place, lens=Lens(50, 2.0))
     text = (tmp_path / "scene.xml").read_text()
     assert '<default name="nerg_eye"' in text and 'origin="$nerg_eye"' in text and 'id="nerg_camera"' in text
     scene = load_scene(tmp_path / "scene.xml", {"nerg_eye": "1, 2, 3"})
     assert tuple(scene.sensors()[0].film().crop_size()) == (24, 12)
-    assert free_default_name("eye", place.reserved_names) == "nerg_eye" and free_default_name("ahead", place.reserved_names) == "ahead"
+    assert (
+        free_default_name("eye", place.reserved_names) == "nerg_eye"
+        and free_default_name("ahead", place.reserved_names) == "ahead"
+    )
 
 
 def test_direction_is_horizontal():
     for target, level in (((2, 0, 7), (1, 0, 0)), ((0, -3, 0), (0, -1, 0))):
-        np.testing.assert_allclose(level_direction(LookAt(np.zeros(3), np.array(target, float)), 2 * UP), level, atol=1e-12)
+        np.testing.assert_allclose(
+            level_direction(LookAt(np.zeros(3), np.array(target, float)), 2 * UP), level, atol=1e-12
+        )
     straight = level_direction(LookAt(np.zeros(3), UP), UP)
     assert straight @ UP == pytest.approx(0) and np.linalg.norm(straight) == pytest.approx(1)
 

@@ -163,7 +163,9 @@ def test12_heat_equals_overlay():
     image = layers.colorize(get_layer("gaze"), color, gaze, mask, Scale(0, 0.7, "magma"))
     assert np.array_equal(image, to_bytes(overlay(color, gaze, Heat(0.7, "magma"), mask)))
     # Points have the same colours as pixels.
-    points = layers.colorize(get_layer("gaze"), color.reshape(-1, 3), gaze.ravel(), mask.ravel(), Scale(0, 0.7, "magma"))
+    points = layers.colorize(
+        get_layer("gaze"), color.reshape(-1, 3), gaze.ravel(), mask.ravel(), Scale(0, 0.7, "magma")
+    )
     assert np.array_equal(points, image.reshape(-1, 3))
 
 

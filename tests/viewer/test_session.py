@@ -59,7 +59,9 @@ def make_session(tmp_path):
 
     def make(path, *other_files, **options) -> Session:
         selected = ViewOptions(**options)
-        session = Session(lambda: make_viewer_scene([path, *other_files], tmp_path, selected), selected, CountingListener())
+        session = Session(
+            lambda: make_viewer_scene([path, *other_files], tmp_path, selected), selected, CountingListener()
+        )
         made.append(session)
         session.start()
         return session
@@ -307,7 +309,10 @@ def scene(room, gaze_fields, tmp_path):
 
 def test12_areas_in_one_step_and_meshes_in_groups(scene, monkeypatch):
     faces = {"floor": 2, "box": 12}
-    regions = [Region.create("left", (0, 0.5, -0.1), (2, 2, 0.4)), Region.create("right", (0, -2, -0.1), (2, -0.5, 0.4))]
+    regions = [
+        Region.create("left", (0, 0.5, -0.1), (2, 2, 0.4)),
+        Region.create("right", (0, -2, -0.1), (2, -0.5, 0.4)),
+    ]
     shapes = [name for name in faces if name in {s.id() for s in scene.mitsuba.shapes() if s.is_mesh()}]
     steps = list(module.iter_attention_shares(scene, AT, regions, shapes))
     assert [sorted(step) for step in steps] == [["left", "right"], sorted(shapes)]
