@@ -38,24 +38,24 @@ OPENERS = {"open", "ZipFile", "GzipFile", "fdopen", "TarFile"}
 
 EXCEPTIONS = {
     "nerg_mi/files/atomic.py": "the writer itself",
-    "nerg_mi/files/images.py:_raise_if_full": "determines why a file of `replacing` cannot be extended",
+    "nerg_mi/files/images.py:_raise_if_full": "determines why a file of `replace_atomically` cannot be extended",
     "nerg_mi/formats/torch_files.py:write_torch": "torch writes to memory",
     "nerg_mi/cli/ending.py:write": "is a standard stream",
     "nerg_mi/files/images.py": "encodes in memory",
     "nerg_mi/figures/style.py:encode": "encodes in memory",
-    "nerg_mi/photos/structure_worker.py": "writes to a folder of `replacing_folder`, in its own process",
-    "nerg_mi/rays/readers/skeleton.py:_written": "writes to the path of `replacing`",
+    "nerg_mi/photos/structure_worker.py": "writes to a folder of `create_folder_atomically`, in its own process",
+    "nerg_mi/rays/readers/skeleton.py:_written": "writes to the path of `replace_atomically`",
 }
 
 
 def direct_writers(text: str) -> list[tuple[str, int, str]]:
-    """Return ``(function, line, source)`` of calls that write outside of a `replacing` block."""
+    """Return ``(function, line, source)`` of calls that write outside of a `replace_atomically` block."""
     calls = []
 
     def visit(node, function, safe):
         if isinstance(node, (ast.FunctionDef, ast.Lambda)):
             function = getattr(node, "name", function)
-        if isinstance(node, ast.With) and any("replacing" in ast.unparse(item.context_expr) for item in node.items):
+        if isinstance(node, ast.With) and any("_atomically" in ast.unparse(item.context_expr) for item in node.items):
             safe = True
         if isinstance(node, ast.Call) and not safe and _writes(node):
             calls.append((function, node.lineno, ast.unparse(node)))
@@ -117,7 +117,7 @@ def test_exceptions_are_still_needed():
 )
 def test_writing_calls_are_detected(text):
     assert direct_writers(text)
-    assert not direct_writers(f"with replacing(path) as temporary:\n    {text}")
+    assert not direct_writers(f"with replace_atomically(path) as temporary:\n    {text}")
 
 
 @pytest.mark.parametrize(

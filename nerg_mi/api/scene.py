@@ -854,8 +854,8 @@ def _make_volume(field: object, role: str, to_world: Any) -> Any:
         return {"type": plugin, "filename": os.path.abspath(field), **transform}
     volume = get_plugin_class(plugin)
     if isinstance(field, TrainedField):
-        return volume.of(field.network, to_world, field.name)
-    return volume.of(field, to_world)
+        return volume.from_network(field.network, to_world, field.name)
+    return volume.from_network(field, to_world)
 
 
 def _as_transform(matrix: ArrayLike) -> Any:

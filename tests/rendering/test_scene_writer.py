@@ -79,8 +79,8 @@ def write_scene(folder, **overrides):
         LookAt(np.array([4, 1, 2.0]), np.array([0, 0, 0.5])),
     )
     values = {
-        "place": CUBE,
-        "attention": GazeFiles(),
+        "content": CUBE,
+        "gaze_files": GazeFiles(),
         "camera": camera,
         "observer": eye,
         "up": UP,
@@ -132,7 +132,7 @@ def test_reserved_names_are_avoided(rgb, tmp_path):
         scene_children=CUBE.scene_children,
         reserved_names=frozenset({"eye", "camera"}),
     )
-    write_scene(tmp_path, place=place, lens=Lens(50, 2.0))
+    write_scene(tmp_path, content=place, lens=Lens(50, 2.0))
     text = (tmp_path / "scene.xml").read_text()
     assert '<default name="nerg_eye"' in text and 'origin="$nerg_eye"' in text and 'id="nerg_camera"' in text
     scene = load_scene(tmp_path / "scene.xml", {"nerg_eye": "1, 2, 3"})

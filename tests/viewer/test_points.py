@@ -149,7 +149,7 @@ QUANTITIES = ["color", "depth", "opacity", "visibility"]
 
 
 def test08_final_picture_equals_integrator(room_scene):
-    view = PinholeView.from_sensor(room_scene.sensor(0))
+    view = PinholeView.from_sensor(room_scene.resolve_sensor(0))
     steps = list(refine(room_scene, view, np.array([0, 0, 0.5]), QUANTITIES, 48, 64, BandPace()))
     pictures = [p for p in steps if p is not None]
     assert [p.downsampling for p in pictures[:2]] == [4, 2] and [p.samples for p in pictures[2:]] == [
