@@ -132,7 +132,7 @@ def test05_mitsuba_without_torch():
 @pytest.mark.parametrize("name, kind", [p for p in PLUGINS if p[1] != "volume"])
 def test06_scalar_variants_are_refused(rgb, name, kind):
     rgb.set_variant("scalar_rgb")
-    said = f'"{name}" needs a variant that compiles its kernels, and "scalar_rgb" is active: call mi.set_variant'
+    said = f'"{name}" needs a variant .*"scalar_rgb" is active: call mi.set_variant'
     with pytest.raises(RuntimeError, match=said):
         rgb.load_dict({"type": name})
     with pytest.raises(RuntimeError, match=said):
@@ -148,10 +148,7 @@ def test07_scalar_variants_leave_no_state():
         "except RuntimeError as e: print(e)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert (
-        '"nerf", "gazefield", "gazekde", "splats", "nerg") needs a variant that compiles its kernels'
-        in done.stdout + done.stderr
-    )
+    assert '"nerf", "gazefield", "gazekde", "splats", "nerg") needs a variant' in done.stdout + done.stderr
     assert '"nowhere" does not exist' in done.stdout.replace(str(Path.cwd()) + "/", "")
 
 
@@ -192,7 +189,7 @@ def machine(tmp_path, monkeypatch):
     """A machine whose libraries are only those in a folder, without NVIDIA driver, and with Dr.Jit not loaded."""
     monkeypatch.setattr(llvm, "_FOLDERS", {sys.platform: (str(tmp_path),)})
     monkeypatch.setattr(sys, "prefix", str(tmp_path / "nothing"))
-    monkeypatch.setattr(llvm, "_loaded", lambda: None)
+    monkeypatch.setattr(llvm, "_find_loaded", lambda: None)
     monkeypatch.setattr(llvm, "has_cuda", lambda: False)
     # Set it first, so that monkeypatch also restores it if it was not set.
     monkeypatch.setenv(llvm.PATH_VARIABLE, "")
@@ -336,7 +333,7 @@ def test21_error_is_raised_at_drjit_import(late, tmp_path):
 
 def test22_crashing_backend_is_reported(monkeypatch):
     monkeypatch.setattr(
-        diagnosis, "_TRIAL", "import os, sys; print('LLVM ERROR: no', file=sys.stderr, flush=True); os.abort()"
+        diagnosis, "_TEST_SCRIPT", "import os, sys; print('LLVM ERROR: no', file=sys.stderr, flush=True); os.abort()"
     )
     assert diagnosis.try_backend("llvm") == {"variants": [], "failed": {"llvm": "LLVM ERROR: no"}}
 
@@ -358,9 +355,7 @@ WORKS = {"variants": ["llvm_ad_rgb"], "failed": {}, "threads": 2, "version": [19
 NO_FINDINGS = {"variants": [], "failed": {"llvm": "it died"}}
 
 
-@pytest.mark.parametrize(
-    "backend_state, verdict", [(WORKS, "ready to render"), (NO_FINDINGS, "nothing can be rendered")]
-)
+@pytest.mark.parametrize("backend_state, verdict", [(WORKS, "ready to render"), (NO_FINDINGS, "cannot render")])
 def test25_verdict(monkeypatch, backend_state, verdict):
     scalar = {"variants": ["scalar_rgb"], "failed": {}}
     monkeypatch.setattr(diagnosis, "try_backend", lambda backend: scalar if backend == "scalar" else backend_state)

@@ -468,7 +468,7 @@ def list_networks(scene):
 def test07_long_rendering_is_prepared_and_equal(rgb, samples, prepared):
     plain, scene = load_scene(find_store_scene(), SMALL), load_scene(find_store_scene(), SMALL)
     assert prepare_long_render(samples, scene) is prepared
-    assert [net.constant for net in list_networks(scene)] == [prepared] * 5
+    assert [net.has_constant_weights for net in list_networks(scene)] == [prepared] * 5
     before, expected = (np.array(rgb.render(s, sensor=0, spp=1)) for s in (scene, plain))
     assert expected[..., :3].max() > 0.1 and np.array_equal(before, expected)
 

@@ -137,7 +137,7 @@ DEEP = '<shape type="cube">' * 20000 + "</shape>" * 20000
 # Scenes that crash the process without the checks.
 CRASHING = {
     "deep": (scene(DEEP), {}, f"more than {MAX_DEPTH} levels deep"),
-    "corner": (scene(shape("ply", "a.ply")), {"a.ply": mesh(999999999)}, "none of its 3 vertices"),
+    "corner": (scene(shape("ply", "a.ply")), {"a.ply": mesh(999999999)}, "its 3 vertices"),
     "volume": (scene(GRID), {"a.vol": EMPTY_VOLUME}, "0 x 0 x 0 voxels"),
     "samples": (scene(spp="0"), {}, "must lie in 1 .. 16777216, got 0"),
     "multijitter": (scene(sampler="multijitter", spp="0"), {}, "must lie in 1 .. 16777216, got 0"),

@@ -128,7 +128,7 @@ def test08_png_has_size_and_text(rgb):
 
 # ---- Layers ----
 
-OF_ALL = "visible to the observer", "observer depth", "evaluations of density", "evaluations of colour"
+OF_ALL = "visible to the observer", "observer depth", "density evaluations", "colour evaluations"
 
 
 def test09_layers_of_a_scene(store, room_scene):
@@ -141,8 +141,8 @@ def test09_layers_of_a_scene(store, room_scene):
 
 
 def test10_missing_factor_has_no_layer(room, gaze_fields, tmp_path):
-    factors = {"what surfaces attract", "what the observer gives"}
-    for path, expected in zip(gaze_fields, (factors, {"what surfaces attract"})):
+    factors = {"attention that surfaces attract", "attention that the observer gives"}
+    for path, expected in zip(gaze_fields, (factors, {"attention that surfaces attract"})):
         scene = tmp_path / "with.xml"
         scene.write_text(replace_gaze(room, path))
         titles = {la.title for la in layers.list_layers(nerg.Scene.load(scene))}
