@@ -178,8 +178,8 @@ def check_attribute(name: str) -> str:
     """
     if "$" in name or _INVALID_CHARACTERS.search(name):
         raise NergError(
-            f'the path "{sanitize(name)}" cannot be written to a scene file, because it contains "$" or characters that '
-            "are not valid text; rename the file or its folder"
+            f'the path "{sanitize(name)}" cannot be written to a scene file, because it contains "$" or characters '
+            "that are not valid text; rename the file or its folder"
         )
     return name
 

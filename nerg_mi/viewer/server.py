@@ -314,5 +314,5 @@ def _check_port(host: str, port: int) -> None:
             probe.bind((host, port))
         except (OSError, OverflowError) as error:
             raise NergError(
-                f"port {port} of {host} cannot be used ({format_error(error).rstrip('.')}); choose another one with --port"
+                f"port {port} of {host} cannot be used ({format_error(error).rstrip('.')}); choose another with --port"
             ) from error
