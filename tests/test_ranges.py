@@ -384,13 +384,13 @@ def test_unrenderable_checkpoints_are_reported(rgb, tmp_path, load, content):
         (caught(lambda: open("/nowhere/a.txt")), 'there is no file "/nowhere/a.txt"'),
         (PermissionError(13, "Permission denied", "a.txt"), '"a.txt": permission denied'),
         (OSError(28, "No space left on device"), "no space left on device"),
-        (MemoryError(), "not enough memory; ask for less, or close other programs"),
+        (MemoryError(), "not enough memory"),
         (RuntimeError("[film.cpp:12] two\nlines"), "two lines"),
         (KeyError(), "KeyError"),
     ],
 )
 def test_errors_are_one_line(error, words):
-    assert errors.format_error(error).endswith(words)
+    assert words in errors.format_error(error)
 
 
 def test_quoted_text_is_sanitized():
