@@ -129,7 +129,9 @@ def test09_files_that_are_named_exist(page):
 
 
 def test10_settings_of_the_study_are_the_studys():
-    subject = SimpleNamespace(marched=True, hits=False, extent=1.0, has_gaze=True, normalized=True, resampled=True)
+    subject = SimpleNamespace(
+        is_marched=True, has_splats=False, extent=1.0, has_gaze=True, is_normalized=True, can_resample=True
+    )
     names = {setting.name for setting in study_settings.list_rows(subject)}
     told = set()
     for table in re.findall(
