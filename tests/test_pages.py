@@ -339,7 +339,7 @@ def test14_a_shop(rgb, tmp_path, monkeypatch):
         (tmp_path / f"{name}.json").write_text(block.text)
     shoppers().save(tmp_path / "shop.npz")
     block = blocks("python", page="store.md")[0]
-    fewer = 'output="numbers", eyes=5, directions=512, resamples=199, samples=8'
+    fewer = 'output="numbers", viewpoints=5, directions=512, resamples=199, aoi_samples=8'
     names = run(block.text.replace('output="numbers"', fewer), block.page)
     assert set(names["counted"]) == set(read_areas(tmp_path / "areas.json").names)
     assert names["weakest"] in names["counted"] and "display" in {r["thing"] for r in names["found"].what_if}
@@ -413,7 +413,7 @@ SMALLER = {
     "nerg eval": "--min-rays 4",
     "nerg scene": "--width 36",
     "nerg report": "--width 36 --spp 1 --points 500",
-    "nerg stats": "--eyes 8 --directions 256 --resamples 199",
+    "nerg stats": "--viewpoints 8 --directions 256 --resamples 199",
 }
 """What is added to a command, so that it takes a second."""
 

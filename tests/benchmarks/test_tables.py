@@ -44,7 +44,7 @@ def test03_alignments(benchmark):
     there = page("accuracy.md")
     assert f"| {' | '.join(alignment.HEAD)} |" in there
     for kind in ("pairs", "cameras"):
-        cells = alignment.cells(alignment.evaluate(world, kind, 2, 1))
+        cells = alignment.cells(alignment.measure(world, kind, 2, 1))
         assert cells[2] == "2 of 2" and cells[-2] == "1 of 1"
         assert any(line.startswith(f"| {cells[0]} |") for line in there)
 
