@@ -1,1 +1,1 @@
-"""Mathematics that knows no field, file or scene: boxes, the sphere, distributions on it, colour spaces."""
+"""Mathematics without fields, files or scenes: boxes, the sphere, distributions on it, colour spaces."""

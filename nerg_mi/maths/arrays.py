@@ -1,4 +1,4 @@
-"""Arrays of Dr.Jit: made from NumPy's without new kernels, and elementary functions that neither cancel nor
+"""Dr.Jit arrays from NumPy arrays without recompiled kernels, and elementary functions without cancellation or
 overflow."""
 
 from __future__ import annotations
@@ -11,30 +11,30 @@ from numpy.typing import ArrayLike, DTypeLike
 
 from .types import Float
 
-# ---- From NumPy to Dr.Jit so that kernels are the same for any number of values ----
+# ---- NumPy arrays to Dr.Jit, with kernels that do not depend on their length ----
 #
-# Dr.Jit reads the memory of NumPy's arrays where it lies. A vector that is made of one array has its length in the
-# kernel, as the distance of its components, and an array that begins anywhere has a kernel of its own, too, whose loads
-# expect no alignment: both are compiled anew where another number of rays is traced.
+# Dr.Jit uses the memory of NumPy arrays in place. A vector that is made of one array puts the length into the kernel,
+# as the distance between components, and the alignment of an array is also part of the kernel. Both cause recompilation
+# for another number of rays.
 
-ALIGNMENT = 64  # Bytes: the widest packet's
+ALIGNMENT = 64  # Bytes of the widest packet
 
 
 def copy_aligned(values: ArrayLike, dtype: DTypeLike = np.float32) -> np.ndarray:
-    """A copy of ``values``, of any shape, that begins at a whole packet."""
+    """A copy of ``values``, of any shape, that starts at a packet boundary."""
     array = np.asarray(values)
     return _columns(array.reshape(-1, 1), np.dtype(dtype))[0].reshape(array.shape)
 
 
-def to_vector(kind: Any, rows: ArrayLike, dtype: DTypeLike = np.float32) -> Any:
-    """The Dr.Jit vector type ``kind`` (``mi.Point3f``, say) whose lanes are ``rows`` (N, components)."""
+def to_vector(vector_type: Any, rows: ArrayLike, dtype: DTypeLike = np.float32) -> Any:
+    """The Dr.Jit vector of type ``vector_type`` (e.g. ``mi.Point3f``) with the lanes ``rows`` (N, components)."""
     import drjit as dr
 
-    return kind(*map(dr.value_t(kind), _columns(np.asarray(rows), np.dtype(dtype))))
+    return vector_type(*map(dr.value_t(vector_type), _columns(np.asarray(rows), np.dtype(dtype))))
 
 
 def _columns(rows: np.ndarray, dtype: np.dtype) -> np.ndarray:
-    """The columns of ``rows`` (N, C), as (C, N), each of which begins at a whole packet."""
+    """The columns of ``rows`` (N, C) as (C, N), each starting at a packet boundary."""
     count, components = rows.shape
     packet = ALIGNMENT // dtype.itemsize
     stride = -(-count // packet) * packet
@@ -45,7 +45,7 @@ def _columns(rows: np.ndarray, dtype: np.dtype) -> np.ndarray:
     return columns
 
 
-# ---- Elementary ----
+# ---- Elementary functions ----
 #
 # 1 - exp(-x), log(1 + x), quotients of tiny numbers and the logistic function, without cancellation or overflow.
 
@@ -54,7 +54,7 @@ def one_minus_exp(x: Float) -> Float:
     """1 - exp(-x) for x >= 0, to full relative precision also for tiny x; 1 at infinity."""
     # tanh is accurate near 0 and saturates at 1: 1 - exp(-x) = 2 th / (1 + th), th = tanh(x / 2).
     th = dr.tanh(0.5 * x)
-    # The derivative is written out: that of tanh, 1 - th², cancels as x grows.
+    # Explicit derivative: that of tanh, 1 - th², cancels for large x.
     return cast("Float", dr.replace_grad(2 * th / (1 + th), -dr.exp(-x)))
 
 
@@ -64,11 +64,11 @@ def log1p(x: Float) -> Float:
 
 
 def quotient(a: Float, b: Float) -> Float:
-    """a / b for b != 0. Its first derivatives do not square b, which would overflow below 1e-19."""
+    """a / b for b != 0. The first derivatives do not square b, which would overflow for b below 1e-19."""
     value = dr.detach(a) / dr.detach(b)
     return cast("Float", dr.replace_grad(value, (a - value * b) * (1 / dr.detach(b))))
 
 
 def sigmoid(x: Float) -> Float:
-    """1 / (1 + exp(-x)), finite with its gradient for every finite x."""
+    """1 / (1 + exp(-x)), finite with a finite gradient for every finite x."""
     return dr.fma(0.5, dr.tanh(0.5 * x), 0.5)

@@ -1,4 +1,4 @@
-"""Boxes, bounded and contracted, the part of a ray inside one, and similarity transforms."""
+"""Boxes, bounded and contracted, ray-box intersection, and similarity transforms."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from nerg_mi.ranges import MAX_COORDINATE
 from .coordinates import check_coordinates
 from .types import Array3f, Bool, Float, Point3f, Vector3f
 
-# ---- The axis-aligned box in which a field lives, and its map to the unit cube ----
+# ---- The axis-aligned box of a field, and its map to the unit cube ----
 
 
 @dataclass(frozen=True)
 class Box:
-    """``lower`` and ``upper`` corners, in the field's own units.
+    """An axis-aligned box with ``lower`` and ``upper`` corner, in the field's own units.
 
-    Points map to the unit cube by one uniform scale about the centre (grid cells
-    stay cubes), so the longest edge spans [0, 1] and the others a part of it.
-    ``bound``: the unit cube is [-bound, bound]³ instead, of which the box is a part, and the map is torch-ngp's
-    (p + bound) / (2 bound), rounded as there: in a fine hash grid the last bit of a coordinate can be seen.
+    One uniform scale about the centre maps points to the unit cube (grid cells stay cubes): the longest edge spans [0,
+    1], the others a part of it. ``bound``: the unit cube is [-bound, bound]³ instead, which contains the box, and the
+    map is torch-ngp's (p + bound) / (2 bound), with the same rounding: in a fine hash grid the last bit of a coordinate
+    is visible.
     """
 
-    lower: tuple[float, ...]  # The three coordinates of either corner; any sequences of numbers become tuples
+    lower: tuple[float, ...]  # Three coordinates each; any sequence is converted to a tuple
     upper: tuple[float, ...]
-    bound: float | None = None  # Half the edge of the unit cube, where that is not the box's longest
+    bound: float | None = None  # Half the edge of the unit cube, if not half of the box's longest edge
 
-    # Whether positions are contracted before they are encoded, and how far then (`geometry.ContractedBox`).
+    # Whether positions are contracted before they are encoded, and the size of the outer cube (`ContractedBox`).
     is_contracted: ClassVar[bool] = False
     outer_scale: ClassVar[float | None] = None
 
@@ -41,7 +41,8 @@ class Box:
         lower, upper = np.asarray(self.lower, float), np.asarray(self.upper, float)
         if lower.shape != (3,) or upper.shape != (3,) or not (np.abs([lower, upper]) <= MAX_COORDINATE).all():
             raise ValueError(
-                f"a box needs two finite corners of 3 numbers within {MAX_COORDINATE:g}, got {self.lower} and {self.upper}"
+                f"a box needs two finite corners of 3 numbers within {MAX_COORDINATE:g}, "
+                f"got {self.lower} and {self.upper}"
             )
         if not np.all(upper > lower):
             raise ValueError(f"the upper corner {self.upper} of a box must exceed its lower corner {self.lower}")
@@ -53,17 +54,17 @@ class Box:
 
     @property
     def side(self) -> float:
-        """Length of the unit cube in the field's units: the longest edge, where no ``bound`` is given."""
+        """Edge of the unit cube in the field's units: the longest edge without a ``bound``."""
         return 2 * self.bound if self.bound is not None else max(u - l for l, u in zip(self.lower, self.upper))
 
     @property
     def cube_side(self) -> float:
-        """Length, in the field's units, of the cube that `to_cube` makes the unit cube."""
+        """Edge, in the field's units, of the cube that `to_cube` maps to the unit cube."""
         return self.side
 
     @property
     def core(self) -> Box:
-        """The part that is resolved best: all of it."""
+        """The part with the highest resolution: all of it."""
         return self
 
     @property
@@ -76,7 +77,7 @@ class Box:
         return float(np.linalg.norm(np.subtract(self.upper, self.lower)))
 
     def to_unit(self, p: Any) -> Any:
-        """Unit-cube coordinates of ``p`` (Array3f or (N, 3) array)."""
+        """Unit-cube coordinates of ``p`` (Array3f or array (N, 3))."""
         if self.bound is not None:
             return self._divided(p + self.bound, 2 * self.bound)
         if dr.is_array_v(p):
@@ -84,24 +85,25 @@ class Box:
         return (np.asarray(p) - np.asarray(self.center)) / self.side + 0.5
 
     def from_unit(self, u: Array3f) -> Array3f:
-        """The points (Array3f) at ``u`` of the unit cube."""
+        """The points (Array3f) at the unit-cube coordinates ``u``."""
         return (u - 0.5) * self.side + type(u)(*self.center)
 
     def to_cube(self, p: Array3f) -> Array3f:
-        """``p`` (Array3f) in a unit cube in which straight lines stay straight: as `to_unit` has it."""
+        """``p`` (Array3f) in a unit cube in which lines stay straight: equal to `to_unit`."""
         return self.to_unit(p)
 
     def distance_scale(self, p: Array3f) -> Float | float:
-        """How much larger cells of the unit cube are at ``p`` than in the core: they are all alike."""
+        """Size of cells of the unit cube at ``p`` relative to the core: 1."""
         return 1.0
 
     def density_from_encoded(self, sigma: Float, p: Array3f) -> Float:
-        """Density per unit of the field at ``p`` where it is ``sigma`` per unit as positions are encoded: the same."""
+        """Density per unit of the field at ``p``, from ``sigma`` per unit of encoded coordinates: equal."""
         return sigma
 
     @staticmethod
     def _divided(x, divisor: float):
-        """``x / divisor``, correctly rounded: for Dr.Jit a division by a constant is a product with its reciprocal."""
+        """``x / divisor``, correctly rounded; Dr.Jit replaces division by a constant by multiplication with its
+        reciprocal."""
         if not dr.is_array_v(x):
             return np.asarray(x) / np.asarray(x).dtype.type(divisor)
         inverse = float(np.float32(1 / divisor))
@@ -121,50 +123,52 @@ class Box:
 
 # ---- Contraction ----
 #
-# A place without an end: a cube at full resolution, and all around it, contracted, out to a far bound.
+# Unbounded environments: a cube at full resolution, surrounded by contracted space up to a far bound.
 #
-# The map is that of mip-NeRF 360 (Barron et al. 2022, equation 10) with the largest coordinate in the place of the
-# length: with x the position in half edges of the inner cube and m = max |x_k|,
+# The map is that of mip-NeRF 360 (Barron et al. 2022, equation 10) with the maximum norm: for x in half edges of the
+# inner cube and m = max |x_k|,
 #
 #     contract(x) = x where m <= 1,   (2 - 1 / m) x / m elsewhere,
 #
-# which fills the cube [-2, 2]^3 as m grows without bound. Only where a field is *encoded* is anything contracted:
-# positions, distances and densities are those of the scene everywhere, and rays are straight.
+# which fills the cube [-2, 2]^3 for unbounded m. Only the encoding uses contracted positions. Positions, distances and
+# densities are those of the scene, and rays are straight.
 
-REACH = 64.0
-"""Half edges of the inner cube at which a place ends that knows no end: what lies farther away moves by less than a
-pixel as cameras within the cube walk about, and may as well stand there."""
+DEFAULT_OUTER_SCALE = 64.0
+"""Half edge of the outer cube, in half edges of the inner one. Objects beyond it move by less than a pixel as cameras
+move within the inner cube."""
 
 
 @dataclass(frozen=True)
 class ContractedBox:
-    """A cube around ``core``, whose edge is ``core``'s longest, and the ``reach`` times larger cube around that.
+    """An inner cube around ``core``, with ``core``'s longest edge, and an outer cube ``outer_scale`` times as large.
 
-    It answers what a `Box` answers. ``lower`` and ``upper`` bound everything that may be marched; ``side`` is the
-    length by which a scene is measured, the inner cube's edge. ``reach``: a power of two, at least 2. Raises
-    ``ValueError`` for another.
+    Same interface as `Box`. ``lower`` and ``upper`` bound everything that is marched; ``side``, the edge of the inner
+    cube, is the length scale of the scene. ``outer_scale``: a power of two, at least 2. Raises ``ValueError`` for other
+    values.
     """
 
     core: Box
-    outer_scale: float = REACH
+    outer_scale: float = DEFAULT_OUTER_SCALE
 
     is_contracted: ClassVar[bool] = True
-    bound: ClassVar[float | None] = None  # The unit cube is not the box's own (`Box.bound`)
+    bound: ClassVar[float | None] = None  # No `Box.bound`: the unit cube follows from the core
 
     def __post_init__(self):
         if not (2 <= self.outer_scale <= 2**12 and np.frexp(self.outer_scale)[0] == 0.5):
-            raise ValueError(f"the reach of a contracted box must be a power of two from 2 to 4096, got {self.outer_scale}")
+            raise ValueError(
+                f"the outer scale of a contracted box must be a power of two from 2 to 4096, got {self.outer_scale}"
+            )
         if self.core.bound is not None:
-            raise ValueError("a contracted box has a core that is bounded by its own corners")
+            raise ValueError("the core of a contracted box cannot have a bound of its own")
 
     @property
     def side(self) -> float:
-        """Edge of the inner cube, in the field's units."""
+        """Edge of the inner cube in the field's units."""
         return self.core.side
 
     @property
     def cube_side(self) -> float:
-        """Edge of the outer cube, in the field's units."""
+        """Edge of the outer cube in the field's units."""
         return self.core.side * self.outer_scale
 
     @property
@@ -181,38 +185,41 @@ class ContractedBox:
 
     @property
     def diagonal(self) -> float:
-        """Of the outer cube."""
+        """Diagonal of the outer cube."""
         return 3**0.5 * self.cube_side
 
     def _halves(self, p):
-        """``p`` (Array3f) in half edges of the inner cube from its centre, and the largest coordinate, at least 1."""
+        """``p`` (Array3f) relative to the centre in half edges of the inner cube, and its maximum norm, at least 1."""
         x = (p - type(p)(*self.center)) * (2 / self.side)
         return x, dr.maximum(dr.maximum(dr.maximum(dr.abs(x.x), dr.abs(x.y)), dr.abs(x.z)), 1)
 
     def to_unit(self, p: Any) -> Any:
-        """Where ``p`` (Array3f) is encoded, in the unit cube: the inner cube is its middle, half as wide."""
+        """Encoded position of ``p`` (Array3f) in the unit cube, of which the inner cube is the middle half."""
         x, m = self._halves(p)
         inverse = dr.rcp(m)
         return x * ((2 - inverse) * inverse * 0.25) + 0.5
 
     def from_unit(self, u: Array3f) -> Array3f:
-        """The points (Array3f) that are encoded at ``u``; those beyond the outer cube come to lie on its face."""
+        """The points (Array3f) with encoded positions ``u``; those beyond the outer cube are moved to its faces."""
         y = (u - 0.5) * 4
         n = dr.maximum(dr.maximum(dr.maximum(dr.abs(y.x), dr.abs(y.y)), dr.abs(y.z)), 1)
         scale = dr.rcp(n * dr.maximum(2 - n, 1 / self.outer_scale))
         return y * (scale * (0.5 * self.side)) + type(y)(*self.center)
 
     def distance_scale(self, p: Array3f) -> Float | float:
-        """How many times farther than the inner cube's face ``p`` (Array3f) is from the centre; 1 within the cube."""
+        """Distance of ``p`` (Array3f) from the centre relative to the face of the inner cube; 1 inside the cube."""
         return self._halves(p)[1]
 
     def density_from_encoded(self, sigma: Float, p: Array3f) -> Float:
-        """Density per unit of the field at ``p`` (Array3f) where it is ``sigma`` per unit as positions are encoded, out
-        along the line from the centre: σ / m². A field without structure then absorbs no more outside than within."""
+        """Density per unit of the field at ``p`` (Array3f), from ``sigma`` per unit of encoded coordinates along the
+        radius: σ / m².
+
+        A field without structure then absorbs no more outside than inside.
+        """
         return sigma * dr.rcp(dr.square(self._halves(p)[1]))
 
     def to_cube(self, p: Array3f) -> Array3f:
-        """``p`` (Array3f) in coordinates in which the outer cube is the unit cube: straight lines stay straight."""
+        """``p`` (Array3f) in coordinates in which the outer cube is the unit cube; lines stay straight."""
         return (p - type(p)(*self.center)) / self.cube_side + 0.5
 
     contains = Box.contains
@@ -221,25 +228,31 @@ class ContractedBox:
         return {**self.core.to_dict(), "reach": self.outer_scale}
 
 
-AnyBox = Box | ContractedBox  # Where a field lives: both kinds answer the same
+AnyBox = Box | ContractedBox  # The domain of a field; both have the same interface
 
 
-def box_from_dict(about: dict) -> AnyBox:
-    """The box whose ``to_dict`` made ``about``. Raises ``ValueError`` or ``TypeError`` for what is none."""
-    known = dict(about)
-    reach = known.pop("reach", None)
-    return Box(**known) if reach is None else ContractedBox(Box(**known), float(reach))
+def box_from_dict(data: dict) -> AnyBox:
+    """The inverse of ``to_dict``. Raises ``ValueError`` or ``TypeError`` for invalid data."""
+    fields = dict(data)
+    outer_scale = fields.pop("reach", None)
+    return Box(**fields) if outer_scale is None else ContractedBox(Box(**fields), float(outer_scale))
 
 
-# ---- Where a ray is inside an axis-aligned box (slab method) ----
+# ---- Ray-box intersection (slab method) ----
 
 
 def intersect_box(o: Array3f, d: Array3f, lower: Sequence[Any], upper: Sequence[Any]) -> tuple[Float, Float]:
     """Parameters ``(t_near, t_far)`` at which ``o + t d`` enters and leaves the box.
 
-    ``o``, ``d``: Array3f; ``lower``, ``upper``: sequences of 3 numbers, which kernels are compiled with, or of 3
-    Floats, which they read. The ray misses where ``t_near >= t_far``. ``t_near`` is not clamped to 0. A component of
-    ``d`` that is zero never divides: such a ray is inside that slab for all t or for none.
+    The ray misses the box if ``t_near >= t_far``; ``t_near`` can be negative. A zero component of ``d`` never divides:
+    such a ray is inside that slab for all t or for none.
+
+    Parameters
+    ----------
+    o, d : Array3f
+        Origin and direction, of any length.
+    lower, upper : sequence
+        3 numbers each, which become literals of the kernel, or 3 Floats, which are variables.
     """
     Float = type(o.x)
     lower, upper = ([v if dr.is_array_v(v) else float(v) for v in corner] for corner in (lower, upper))
@@ -255,31 +268,33 @@ def intersect_box(o: Array3f, d: Array3f, lower: Sequence[Any], upper: Sequence[
     return near, far
 
 
-def intersect_box_numpy(o: ArrayLike, d: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """The same for NumPy rays: ``o``, ``d`` broadcast to (N, 3); ``t_near`` and ``t_far`` (N,), infinite where no
-    component of ``d`` leaves its slab."""
+def intersect_box_numpy(
+    o: ArrayLike, d: ArrayLike, lower: ArrayLike, upper: ArrayLike
+) -> tuple[np.ndarray, np.ndarray]:
+    """`intersect_box` for NumPy rays: ``o``, ``d`` broadcast to (N, 3); returns ``t_near`` and ``t_far`` (N,), infinite
+    for a ray that never leaves its slabs."""
     near, far = -np.inf, np.inf
-    # Axis by axis: NumPy's reductions over three numbers take several times as long.
+    # Per axis: NumPy reductions over three numbers take several times as long.
     for oc, dc, lo, hi in zip(*(np.moveaxis(np.asarray(v), -1, 0) for v in (o, d, lower, upper))):
-        still = dc == 0
-        along = np.where(still, 1, dc)
+        parallel = dc == 0
+        divisor = np.where(parallel, 1, dc)
         with np.errstate(over="ignore"):
-            a, b = (lo - oc) / along, (hi - oc) / along
-        outside = still & ((oc < lo) | (oc > hi))
-        near = np.maximum(near, np.where(still, -np.inf, np.minimum(a, b)))
-        far = np.minimum(far, np.where(still, np.where(outside, -np.inf, np.inf), np.maximum(a, b)))
+            a, b = (lo - oc) / divisor, (hi - oc) / divisor
+        outside = parallel & ((oc < lo) | (oc > hi))
+        near = np.maximum(near, np.where(parallel, -np.inf, np.minimum(a, b)))
+        far = np.minimum(far, np.where(parallel, np.where(outside, -np.inf, np.inf), np.maximum(a, b)))
     return np.asarray(near), np.asarray(far)
 
 
-# ---- Rotations, uniform scales and translations: what places a field in a scene ----
+# ---- Similarity transforms: placement of a field in a scene ----
 
 
 class Similarity:
-    """A rotation, uniform scale and translation: a field's ``to_world``.
+    """A rotation, uniform scale and translation: the ``to_world`` of a field.
 
-    ``matrix``: (4, 4), local (the field's) to world (the scene's); the identity by default. ``scale``: length in the
-    scene of one unit of the field. Raises ``NergError`` when it shears, mirrors or scales
-    unevenly: densities and directions would then have no single scale; and for a translation beyond `FARTHEST`.
+    ``matrix``: (4, 4), local (field) to world (scene); default: the identity. ``scale``: length in the scene of one
+    unit of the field. Raises ``NergError`` for a shear, a reflection or a non-uniform scale, for which densities and
+    directions have no single scale, and for a translation beyond `FARTHEST`.
     """
 
     def __init__(self, matrix: np.ndarray | None = None):
@@ -306,7 +321,7 @@ class Similarity:
         return p if self.is_identity else self._apply(self.inverse, p, 1)
 
     def vector_to_local(self, v: Vector3f) -> Vector3f:
-        """A scene vector in field coordinates; a unit vector becomes 1 / scale long."""
+        """A scene vector in field coordinates; a unit vector gets the length 1 / scale."""
         return v if self.is_identity else self._apply(self.inverse, v, 0)
 
     def direction_to_local(self, v: Vector3f) -> Vector3f:
@@ -314,7 +329,7 @@ class Similarity:
         return v if self.is_identity else self._apply(self.inverse * self.scale, v, 0)
 
     def bounds(self, lower: Sequence[float], upper: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper corner, (3,) each, of the scene's axis-aligned box around the field's box with the corners
+        """Lower and upper corner, (3,) each, of the scene's axis-aligned box around the field's box with corners
         ``lower`` and ``upper``."""
         corners = np.array(
             [[x, y, z, 1] for x in (lower[0], upper[0]) for y in (lower[1], upper[1]) for z in (lower[2], upper[2])]

@@ -9,32 +9,33 @@ import numpy as np
 
 from .types import UInt32, Vector3f, variant_types
 
-# ---- Sets of directions on the unit sphere, with the solid angle of each ----
+# ---- Sets of directions on the unit sphere, with solid angles ----
 #
-# Directions are (N, 3) float64, unit. Solid angles are in steradian and sum to
-# 4π, so that ``sum(density * solid_angle)`` is the integral of a density.
+# Directions are (N, 3) float64 unit vectors. Solid angles are in steradian and sum to 4π, so that ``sum(density *
+# solid_angle)`` is the integral of a density.
 
 _GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 
 
-def fibonacci_directions(count: int, which: np.ndarray | None = None) -> np.ndarray:
-    """``count`` directions of equal area on a golden-angle spiral, (count, 3); ``which`` (N,): of these numbers, (N,
-    3).
+def fibonacci_directions(count: int, indices: np.ndarray | None = None) -> np.ndarray:
+    """``count`` directions of equal area on a golden-angle spiral, (count, 3); ``indices`` (N,): only these, (N, 3).
 
-    Each stands for 4π/count sr. The spiral runs from +z to -z: direction i has z = 1 - (2i + 1)/count. Neighbours are
-    about sqrt(4π/count) rad apart, 4.5 degrees at 2,048; narrower densities than that are not resolved. (Swinbank &
-    Purser 2006.) Raises ``ValueError`` for a count below 1.
+    Each direction covers 4π/count sr. The spiral runs from +z to -z: direction i has z = 1 - (2i + 1)/count. Neighbours
+    are about sqrt(4π/count) rad apart, 4.5 degrees for 2,048 directions; narrower densities are not resolved (Swinbank
+    & Purser 2006). Raises ``ValueError`` for a count below 1.
     """
     if count < 1:
         raise ValueError(f"count is {count}; a set of directions needs at least one")
-    i = np.arange(count) if which is None else np.asarray(which)
+    i = np.arange(count) if indices is None else np.asarray(indices)
     z = 1.0 - (2.0 * i + 1.0) / count
     return _from_height(z, i * _GOLDEN_ANGLE)
 
 
 def indices_in_cone(count: int, axis: np.ndarray, angle: float) -> np.ndarray:
-    """Numbers (N,), rising, of those of ``count`` `fibonacci_directions` that lie within ``angle`` (radian) of the unit
-    ``axis`` (3,). Only the turns of the spiral at the cone's heights are made."""
+    """Sorted indices (N,) of the `fibonacci_directions` within ``angle`` (radian) of the unit ``axis`` (3,).
+
+    Only the turns of the spiral at the heights of the cone are evaluated.
+    """
     if angle >= np.pi:
         return np.arange(count)
     polar = np.arccos(np.clip(axis[2], -1.0, 1.0))
@@ -45,30 +46,29 @@ def indices_in_cone(count: int, axis: np.ndarray, angle: float) -> np.ndarray:
     return numbers[fibonacci_directions(count, numbers) @ axis >= np.cos(angle)]
 
 
-def fibonacci_vectors(count: int, which: UInt32 | None = None) -> Vector3f:
-    """`fibonacci_directions` as a Vector3f of the Mitsuba variant in use, in its precision; ``which``: of these
-    numbers.
+def fibonacci_directions_jit(count: int, indices: UInt32 | None = None) -> Vector3f:
+    """`fibonacci_directions` as a Vector3f of the current Mitsuba variant, in its precision; ``indices``: only these.
 
-    Made by its kernels, since frozen functions take no arrays from NumPy.
+    Computed by kernels, since frozen functions cannot contain arrays of NumPy.
     """
     import drjit as dr
 
     mi = variant_types()
-    which = dr.arange(mi.UInt32, count) if which is None else which
-    z = 1 - (2 * mi.Float(which) + 1) / count
-    # Turns of the golden angle, of which whole ones are dropped in double precision.
-    turns = mi.Float64(which) * (1.5 - 0.5 * math.sqrt(5))
+    indices = dr.arange(mi.UInt32, count) if indices is None else indices
+    z = 1 - (2 * mi.Float(indices) + 1) / count
+    # Whole turns of the golden angle are removed in double precision.
+    turns = mi.Float64(indices) * (1.5 - 0.5 * math.sqrt(5))
     sin, cos = dr.sincos(mi.Float(dr.two_pi * (turns - dr.floor(turns))))
     r = dr.sqrt((1 - z) * (1 + z))
     return mi.Vector3f(r * cos, r * sin, z)
 
 
 @lru_cache(maxsize=8)
-def neighbourly_order(count: int) -> np.ndarray:
-    """The numbers (count,) uint32 of `fibonacci_directions` in an order in which neighbours follow each other.
+def morton_order(count: int) -> np.ndarray:
+    """The indices (count,) uint32 of `fibonacci_directions` in Morton order (1966), so that neighbours follow each
+    other.
 
-    Along Morton's curve (1966) through the cube around the sphere. Rays that are traced together then meet much the
-    same; along the spiral each looks elsewhere.
+    Rays that are traced together then traverse similar parts of the scene; in spiral order they do not.
     """
     order = np.argsort(_morton(fibonacci_directions(count)), kind="stable").astype(np.uint32)
     order.flags.writeable = False
@@ -76,7 +76,7 @@ def neighbourly_order(count: int) -> np.ndarray:
 
 
 def _morton(d: np.ndarray) -> np.ndarray:
-    """Number of the cell of unit directions (N, 3) along Morton's curve through 1024 cells a side."""
+    """Morton index of the cell of unit directions (N, 3), 1024 cells per axis."""
     code = np.zeros(len(d), np.uint32)
     for axis in range(3):
         bits = np.clip((d[:, axis] + 1) * 512, 0, 1023).astype(np.uint32)
@@ -92,11 +92,11 @@ def sample_uniform_directions(count: int, rng: np.random.Generator) -> np.ndarra
 
 
 def latlong_to_direction(u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Direction (..., 3) that Mitsuba's ``envmap`` shows at texture position
-    ``u``, ``v`` in [0, 1], in the map's own frame (y up).
+    """Direction (..., 3) that Mitsuba's ``envmap`` shows at the texture position ``u``, ``v`` in [0, 1], in the map's
+    own frame (y up).
 
-    Inverse of its u = atan2(x, -z) / 2π, v = acos(y) / π: the centre of the picture
-    is +z, its left and right edges are -z, its top row is +y.
+    Inverse of its u = atan2(x, -z) / 2π, v = acos(y) / π: the centre of the image is +z, its left and right edges are
+    -z, its top row is +y.
     """
     phi, theta = 2.0 * np.pi * np.asarray(u), np.pi * np.asarray(v)
     sin = np.sin(theta)
@@ -104,12 +104,12 @@ def latlong_to_direction(u: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 
 def latlong_grid(width: int, height: int, to_world: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Pixel-centre directions and exact pixel solid angles of a panorama.
+    """Directions of pixel centres and exact solid angles of the pixels of a panorama.
 
-    Pixel (row j, column i) is at u = (i + 1/2)/width, v = (j + 1/2)/height of the mapping of Mitsuba's ``envmap``
-    (whose bitmap has its columns there too, but its rows at v = j/(height - 1)). ``to_world``: (3, 3) or (4, 4), whose
-    rotation is applied as ``to_world`` of the envmap is; see :data:`Z_UP`. Returns directions (height * width, 3), row
-    by row, and solid angles (height * width,) sr: (2π/width)(cos θ_j - cos θ_{j+1}), summing to 4π.
+    Pixel (row j, column i) is at u = (i + 1/2)/width, v = (j + 1/2)/height in the mapping of Mitsuba's ``envmap``
+    (whose bitmap has the same columns, but rows at v = j/(height - 1)). ``to_world``: (3, 3) or (4, 4), whose rotation
+    is applied like the ``to_world`` of the envmap; see :data:`Z_UP`. Returns directions (height * width, 3), row by
+    row, and solid angles (height * width,) in sr: (2π/width)(cos θ_j - cos θ_{j+1}), summing to 4π.
     """
     if width < 1 or height < 1:
         raise ValueError(f"a panorama of {width} x {height} pixels has no directions; give at least 1 x 1")
@@ -124,8 +124,8 @@ def latlong_grid(width: int, height: int, to_world: np.ndarray | None = None) ->
     return direction, np.repeat(2.0 * np.pi / width * band, width)
 
 
-# Turns the envmap's y up into z up: (x, y, z) becomes (x, -z, y), so that the
-# edges of the panorama show +y and its centre column -y.
+# Rotates the envmap's y up to z up: (x, y, z) becomes (x, -z, y), so that the edges of the panorama show +y and its
+# centre column -y.
 Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
@@ -134,14 +134,14 @@ def _from_height(z: np.ndarray, phi: np.ndarray) -> np.ndarray:
     return np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=-1)
 
 
-# ---- Real spherical harmonics up to degree 3, and what a rotation does to their coefficients, in float64 ----
+# ---- Real spherical harmonics up to degree 3, and the rotation of their coefficients, in float64 ----
 #
 # Order and signs are those of Gaussian splats, of instant-ngp and of Dr.Jit's ``sh_eval``: l = 0..3, m = -l..l, with
 # the Condon-Shortley phase.
 
-SH_C0 = 0.28209479177387814  # The harmonic of degree 0, a constant: 1 / (2 sqrt(pi))
+SH_C0 = 0.28209479177387814  # The constant harmonic of degree 0: 1 / (2 sqrt(pi))
 
-HARMONIC_DEGREES = {1: 0, 4: 1, 9: 2, 16: 3}  # Degree by the number of coefficients
+HARMONIC_DEGREES = {1: 0, 4: 1, 9: 2, 16: 3}  # Degree by number of coefficients
 
 
 def eval_harmonics(directions: np.ndarray, degree: int) -> np.ndarray:
@@ -171,19 +171,22 @@ def eval_harmonics(directions: np.ndarray, degree: int) -> np.ndarray:
     return np.stack([h for group in of_degrees[: degree + 1] for h in group], axis=-1)
 
 
-def rotated_harmonics(coefficients: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    """``coefficients`` (N, K, channels) of functions that are turned by ``rotation`` (3, 3).
+def rotate_harmonics(coefficients: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """``coefficients`` (N, K, channels) of functions that are rotated by ``rotation`` (3, 3).
 
-    f'(d) = f(R^T d). A rotation does not mix degrees; the matrix of each is found from its values in more directions
-    than it has harmonics, which fixes it to rounding.
+    f'(d) = f(R^T d). A rotation does not mix degrees. The matrix of each degree is solved from values in more
+    directions than it has harmonics, which determines it to rounding.
     """
     coefficients = np.asarray(coefficients, np.float64)
     degree = HARMONIC_DEGREES[coefficients.shape[1]]
     directions = fibonacci_directions(48)
-    here, there = eval_harmonics(directions, degree), eval_harmonics(directions @ np.asarray(rotation, np.float64), degree)
+    values, rotated_values = (
+        eval_harmonics(directions, degree),
+        eval_harmonics(directions @ np.asarray(rotation, np.float64), degree),
+    )
     out = np.empty_like(coefficients)
     for order in range(degree + 1):
         part = slice(order * order, (order + 1) ** 2)
-        turn = np.linalg.lstsq(here[:, part], there[:, part], rcond=None)[0]
-        out[:, part] = np.einsum("kj,njc->nkc", turn, coefficients[:, part])
+        matrix = np.linalg.lstsq(values[:, part], rotated_values[:, part], rcond=None)[0]
+        out[:, part] = np.einsum("kj,njc->nkc", matrix, coefficients[:, part])
     return out

@@ -1,8 +1,8 @@
-"""Types of the arrays in signatures.
+"""Array types for annotations.
 
-Which class an array has is decided when a program runs: by the backend (LLVM or CUDA) that a field belongs to, or by
-Mitsuba's variant. Functions derive it from their arguments. These classes stand for all of them when types are checked,
-and are `Any` when the program runs. Every array holds one value a lane, and one of a single lane serves all of them.
+The class of an array is decided at run time: by the backend (LLVM or CUDA) of a field, or by Mitsuba's variant.
+Functions derive it from their arguments. These classes represent all of them for type checkers, and are `Any` at run
+time. Each array holds one value per lane; an array with a single lane is broadcast.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ if TYPE_CHECKING:
     from drjit import ArrayBase
 
     class Bool(ArrayBase["Bool", "Bool | bool", bool, bool, "Bool", "Bool", "Bool"]):
-        """Mask. A Python bool may stand for one."""
+        """Mask; a Python bool is accepted."""
 
     class Float(ArrayBase["Float", "Float | UInt32 | float", float, float, "Float", "Float", Bool]):
-        """Single-precision number a lane. A Python float may stand for one."""
+        """Single-precision number per lane; a Python float is accepted."""
 
     class UInt32(ArrayBase["UInt32", "UInt32 | int", int, int, "UInt32", "UInt32", Bool]):
-        """Unsigned 32-bit integer a lane. A Python int may stand for one."""
+        """Unsigned 32-bit integer per lane; a Python int is accepted."""
 
     class Array3f(ArrayBase["Array3f", "Array3f | Float | float", Float, "Float | float", Float, "Array3f", Bool]):
-        """Three single-precision numbers a lane, ``x``, ``y`` and ``z``: Dr.Jit's ``Array3f`` or one of Mitsuba's."""
+        """Three single-precision numbers per lane, ``x``, ``y`` and ``z``: Dr.Jit's ``Array3f`` or one of Mitsuba's."""
 
         x: Float
         y: Float
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
         def __iter__(self) -> Iterator[Float]: ...
 
     class Ray3f:
-        """Ray with an origin ``o``, a unit direction ``d`` and a greatest distance ``maxt``, as Mitsuba's."""
+        """Ray with an origin ``o``, a unit direction ``d`` and a maximum distance ``maxt``, like Mitsuba's."""
 
         def __init__(self, *args: Any) -> None: ...
 
@@ -48,11 +48,11 @@ Point3f: TypeAlias = Array3f  # Position, in the frame that the signature names
 
 Vector3f: TypeAlias = Array3f  # Direction or displacement, in the frame that the signature names
 
-Color: TypeAlias = Any  # Colour a lane: three numbers, or as many as the variant's ``Spectrum`` has
+Color: TypeAlias = Any  # Colour per lane: three numbers, or the components of the variant's ``Spectrum``
 
 
 def variant_types() -> Any:
-    """Mitsuba, as the namespace of the variant's arrays: its stubs know them as other classes than those above, and no
+    """Mitsuba as the namespace of the variant's array types; its stubs declare other classes than those above, without
     arithmetic between them."""
     import mitsuba
 

@@ -7,33 +7,33 @@ import pytest
 
 from nerg_mi.maths.arrays import ALIGNMENT, copy_aligned, log1p, one_minus_exp, quotient, sigmoid, to_vector
 
-# ---- Arrays for Dr.Jit: the same values, and the same kernels for any number of them ----
+# ---- Arrays for Dr.Jit: equal values, and kernels that do not depend on their number ----
 
 
 @pytest.mark.parametrize("count", [0, 1, 15, 16, 1003])
-def test01_values_are_those_given_and_begin_at_packets(rgb, count):
+def test01_copies_are_equal_and_aligned(rgb, count):
     rows = np.random.default_rng(count).normal(size=(count, 3))
     assert np.array_equal(np.array(to_vector(rgb.Point3f, rows)), rows.astype(np.float32).T)
     assert np.array_equal(np.array(to_vector(rgb.Vector3f, rows[:, ::-1])), rows[:, ::-1].astype(np.float32).T)
     for dtype in (np.float32, np.uint32, np.float64):
         values = copy_aligned(np.arange(count), dtype)
-        # Nothing begins nowhere.
+        # An empty array has no address.
         assert values.dtype == dtype and (count == 0 or values.ctypes.data % ALIGNMENT == 0)
         assert np.array_equal(values, np.arange(count))
     assert np.array_equal(copy_aligned(rows[:, ::-1]), rows[:, ::-1].astype(np.float32))
 
 
-def test02_what_is_given_may_change_afterwards(rgb):
+def test02_copies_are_independent(rgb):
     rows = np.ones((20, 3), np.float32)
     made, column = to_vector(rgb.Point3f, rows), rgb.Float(copy_aligned(rows[:, 0]))
     rows[:] = 7
     assert np.all(np.array(made) == 1) and np.all(np.array(column) == 1)
 
 
-def test03_another_number_is_no_other_kernel(rgb):
+def test03_kernels_do_not_depend_on_the_length(rgb):
     kernels = set()
     for count in (1000, 1003, 1999, 2048):
-        # Wherever the memory happens to lie.
+        # For any alignment of the memory.
         spare = [np.empty(k) for k in range(1, 9)]
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             dr.kernel_history_clear()
@@ -56,12 +56,12 @@ def test01_one_minus_exp():
     assert np.all(np.abs(got - expected) <= 4 * EPS * expected)
 
 
-def test02_its_gradient():
+def test02_gradient_of_one_minus_exp():
     x = np.concatenate([[0], np.logspace(-20, 8, 300)]).astype(np.float32)
     v = ns.Float(x)
     dr.enable_grad(v)
     dr.backward(dr.sum(one_minus_exp(v)))
-    # To full relative precision, also where nothing is left of it.
+    # To full relative precision, also for tiny results.
     assert np.allclose(dr.grad(v).numpy(), np.exp(-x.astype(float)), rtol=1e-5, atol=1e-37)
 
 
@@ -84,7 +84,7 @@ def test04_quotient():
     assert np.allclose(dr.grad(y).numpy(), -a.astype(float) / b.astype(float) ** 2, rtol=1e-6)
 
 
-def test05_sigmoid_at_its_ends():
+def test05_sigmoid_at_extremes():
     x = np.array([-1e30, -100, -1, 0, 1, 100, 1e30], np.float32)
     v = ns.Float(x)
     dr.enable_grad(v)

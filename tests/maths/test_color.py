@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 
 from nerg_mi.maths.color import (
+    color_corrected_psnr,
     composite_to_linear,
-    psnr_from_mse,
     decode_srgb,
     encode_srgb,
-    fit_colors,
+    fit_color_correction,
     psnr,
-    color_corrected_psnr,
+    psnr_from_mse,
     srgb_to_linear,
 )
 
@@ -31,7 +31,7 @@ def test01_srgb(rgb):
     assert np.allclose(y.numpy(), iec(c), atol=2e-6)
     slope = (iec(c + 1e-6) - iec(c - 1e-6)) / 2e-6
     assert np.allclose(dr.grad(x).numpy()[1:-2], slope[1:-2], rtol=1e-3)
-    # Mitsuba's own conversion, as a second opinion
+    # Mitsuba's own conversion, as a second reference
     bitmap = rgb.Bitmap(np.repeat(c[None, :, None], 3, 2).astype(np.float32))
     bitmap.set_srgb_gamma(True)
     linear = np.array(bitmap.convert(component_format=rgb.Struct.Type.Float32, srgb_gamma=False))
@@ -55,7 +55,7 @@ def test03_mono_is_the_luminance(mono, space):
 
 
 @pytest.mark.parametrize("α", [0.0, 1e-38, 1e-20, 1e-6])
-def test04_no_opacity_no_nan(rgb, α):
+def test04_zero_opacity_gives_no_nan(rgb, α):
     total, alpha = rgb.Color3f(α * 0.5), rgb.Float(α)
     dr.enable_grad(total, alpha)
     out = composite_to_linear(total, alpha, "srgb")
@@ -65,8 +65,8 @@ def test04_no_opacity_no_nan(rgb, α):
 
 
 @pytest.mark.parametrize("alpha", [0.02, 0.5, 1.0])
-def test05_derivatives_of_a_composite_are_those_of_its_colour(rgb, alpha):
-    """With respect to the weighted sum and to the opacity it is divided by: central differences of a lin(C / a)."""
+def test05_composite_derivatives(rgb, alpha):
+    """With respect to the weighted sum and to the opacity that divides it: central differences of a lin(C / a)."""
     shares = np.array([0.01, 0.03, 0.05, 0.3, 0.9])
     value = lambda total, a: a * iec(total / a)
     total, a = rgb.Float((shares * alpha).tolist()), rgb.Float(alpha)
@@ -84,19 +84,19 @@ def test05_derivatives_of_a_composite_are_those_of_its_colour(rgb, alpha):
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test06_numpy_values_there_and_back(dtype):
+def test06_numpy_round_trip(dtype):
     c = np.concatenate([np.linspace(0, 1, 101), [0.04045, -0.01]]).astype(dtype)
     linear = decode_srgb(c)
     assert linear.dtype == dtype and np.allclose(linear[:-1], iec(c[:-1].astype(float)), rtol=1e-5)
     assert np.allclose(encode_srgb(linear), c, atol=1e-6) and encode_srgb(linear).dtype == dtype
-    # Values that the standard's own tables give.
+    # Values of the standard's own tables.
     assert decode_srgb(np.array(0.5)) == pytest.approx(0.214041, abs=1e-6)
     assert encode_srgb(np.array(0.5)) == pytest.approx(0.735357, abs=1e-6)
 
 
-# ---- Color fit ----
+# ---- Colour correction ----
 #
-# Colours fitted from one picture to another: known corrections are found, and the scored half is never looked at.
+# Colours fitted from one image to another: corrections are recovered, and the scored half is not used for the fit.
 
 A = np.array([[0.8, 0.05, 0.0], [0.0, 0.9, -0.04], [0.02, 0.0, 1.1]])
 B = np.array([0.05, -0.02, 0.01])
@@ -107,11 +107,11 @@ def pictures(width=61):
     return color, color @ A.T + B
 
 
-def test_a_known_correction_is_found():
+def test_color_correction_is_recovered():
     color, truth = pictures()
-    m = fit_colors(color, truth)
+    m = fit_color_correction(color, truth)
     assert np.allclose(m, np.c_[A, B], atol=0.01)
-    # Least squares with the prior, solved for one channel by itself.
+    # Regularised least squares, solved for one channel alone.
     x = np.c_[color.reshape(-1, 3), np.ones(color[..., 0].size)]
     weight = 1e-3 * len(x)
     rows = np.r_[x, np.sqrt(weight) * np.eye(4)]
@@ -119,35 +119,37 @@ def test_a_known_correction_is_found():
     assert np.allclose(m[1], np.linalg.lstsq(rows, goal, rcond=None)[0])
 
 
-def test_what_cannot_be_known_stays():
+def test_undetermined_correction_is_identity():
     color, truth = pictures()
     nothing = np.zeros(color.shape[:2], bool)
-    assert np.allclose(fit_colors(color, truth, mask=nothing), np.eye(3, 4))
-    assert np.allclose(fit_colors(color, color), np.eye(3, 4))
+    assert np.allclose(fit_color_correction(color, truth, mask=nothing), np.eye(3, 4))
+    assert np.allclose(fit_color_correction(color, color), np.eye(3, 4))
 
 
-def test_the_offset_does_not_reach_what_is_not_covered():
+def test_offset_scales_with_coverage():
     color, truth = pictures()
     coverage = (np.arange(61) % 2).astype(float) * np.ones((40, 1))
     before_black = truth * coverage[..., None]
-    assert np.allclose(fit_colors(color * coverage[..., None], before_black, coverage), np.c_[A, B], atol=0.02)
+    assert np.allclose(
+        fit_color_correction(color * coverage[..., None], before_black, coverage), np.c_[A, B], atol=0.02
+    )
 
 
-def test_the_right_half_is_scored_after_a_fit_of_the_left():
+def test_right_half_is_scored_after_fit_on_the_left():
     color, truth = pictures()
     assert psnr(color, truth) < 25 < 40 < color_corrected_psnr(color, truth)
-    # The odd column belongs to the left half: what is wrong there is not scored, and what is wrong right of it is.
+    # The odd column belongs to the left half: errors there are not scored, errors to the right are.
     for column, scored in ((30, False), (31, True)):
         spoilt = truth.copy()
         spoilt[:, column] = 0
         assert (color_corrected_psnr(truth, spoilt) < 25) == scored
-    # Nothing is learnt from the half that is scored.
+    # The fit does not use the scored half.
     changed = color.copy()
     changed[:, 31:] = truth[:, 31:]
     assert color_corrected_psnr(changed, truth) < 25
 
 
-def test_masks_leave_out_what_they_hide():
+def test_masked_pixels_are_ignored():
     color, truth = pictures()
     mask = np.ones(color.shape[:2], bool)
     mask[:, ::3] = False
@@ -158,7 +160,7 @@ def test_masks_leave_out_what_they_hide():
     assert np.isnan(color_corrected_psnr(color, truth, mask=mask & False))
 
 
-# ---- The PSNR of pictures: known errors, masks, and no error at all ----
+# ---- PSNR of images: known errors, masks, and no error ----
 
 
 def test_psnr():
@@ -171,6 +173,6 @@ def test_psnr():
     assert psnr(b, b) == pytest.approx(120) and np.isnan(psnr(a, b, mask & False))
 
 
-def test_decibels_of_a_mean_square():
+def test_psnr_of_a_mean_squared_error():
     assert psnr_from_mse(0.01) == pytest.approx(20) and psnr_from_mse(1.0) == 0
     assert psnr_from_mse(0.0) == pytest.approx(120) and psnr_from_mse(0.0, 1e-24) == pytest.approx(240)

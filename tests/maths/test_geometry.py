@@ -12,7 +12,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.formats.ply import write_columns
 from nerg_mi.formats.splats import read_splats
 from nerg_mi.maths.coordinates import check_near_origin
-from nerg_mi.maths.geometry import Box, ContractedBox, Similarity, intersect_box_numpy, box_from_dict, intersect_box
+from nerg_mi.maths.geometry import Box, ContractedBox, Similarity, box_from_dict, intersect_box, intersect_box_numpy
 from nerg_mi.photos.posed import PosedFrame, sort_frames
 from nerg_mi.rays.readers.base import UNITY, RaysBuilder
 from tests.formats.splats.writers import random_splats, write_antimatter, write_inria, write_khronos
@@ -23,12 +23,12 @@ from tests.reference import march_numpy as reference
 BOX = Box((-1, 0, 2), (3, 2, 3))
 
 
-def test01_measures():
+def test01_box_measures():
     assert BOX.side == 4 and BOX.center == (1, 1, 2.5) and np.isclose(BOX.diagonal, 21**0.5)
     assert BOX.to_dict() == {"lower": [-1, 0, 2], "upper": [3, 2, 3]} and Box(**BOX.to_dict()) == BOX
 
 
-def test02_one_scale_about_the_centre():
+def test02_unit_cube_map_uses_one_scale():
     p = np.array([[-1, 0, 2], [3, 2, 3], [1, 1, 2.5]], float)
     expected = [[0, 0.25, 0.375], [1, 0.75, 0.625], [0.5, 0.5, 0.5]]
     assert np.allclose(BOX.to_unit(p), expected)
@@ -37,7 +37,7 @@ def test02_one_scale_about_the_centre():
 
 @pytest.mark.parametrize("factor", [1e-3, 1, 1e6])
 def test03_corners_map_into_the_cube(factor):
-    # A corner that rounding pushes out of the cube would lose its features.
+    # A corner that rounding moves out of the cube would lose its features.
     rng = np.random.default_rng(0)
     for _ in range(30):
         lower = rng.normal(size=3) * factor
@@ -62,12 +62,12 @@ def test04_contains():
         ((2, 0, 0), (1, 1, 1), "must exceed"),
     ],
 )
-def test05_wrong_corners(lower, upper, words):
+def test05_invalid_corners_are_refused(lower, upper, words):
     with pytest.raises(ValueError, match=words):
         Box(lower, upper)
 
 
-# ---- The contraction against its formula in float64, and the way back ----
+# ---- The contraction against its formula in float64, and its inverse ----
 
 CORE = Box((-1.0, 2.0, -0.5), (3.0, 5.0, 1.5))
 
@@ -89,19 +89,19 @@ def expected(p, box):
     return np.where(m <= 1, x, (2 - 1 / np.maximum(m, 1)) * x / np.maximum(m, 1)) / 4 + 0.5
 
 
-def test_is_the_formula_and_comes_back(rgb_contraction):
+def test_contraction_matches_formula_and_inverts(rgb_contraction):
     box, rng = ContractedBox(CORE, 64), np.random.default_rng(0)
     away = rng.normal(size=(2000, 3))
     p = box.center + away / np.abs(away).max(axis=1, keepdims=True) * np.geomspace(1e-3, 120, 2000)[:, None]
     u = box.to_unit(points(rgb_contraction, p))
     np.testing.assert_allclose(u.numpy().T, expected(p, box), atol=3e-7)
     back = box.from_unit(u).numpy().T
-    # Near the far end a spacing of single precision of u is m² / 2 of them of the position.
+    # Near the far end, a floating-point spacing of u is m² / 2 spacings of the position.
     m = np.maximum(np.abs((p - box.center) * 2 / box.side).max(axis=1), 1)
     assert np.all(np.abs(back - p).max(axis=1) <= 4e-6 * m**2)
 
 
-def test_the_inner_cube_keeps_its_shape(rgb_contraction):
+def test_contraction_is_linear_inside_the_inner_cube(rgb_contraction):
     box = ContractedBox(CORE, 8)
     p = np.random.default_rng(1).uniform(CORE.lower, CORE.upper, (500, 3))
     u = box.to_unit(points(rgb_contraction, p)).numpy().T
@@ -109,7 +109,7 @@ def test_the_inner_cube_keeps_its_shape(rgb_contraction):
     assert np.all(box.distance_scale(points(rgb_contraction, p)).numpy() == 1)
 
 
-def test_bounds_and_the_straight_cube(rgb_contraction):
+def test_contracted_box_bounds_and_linear_cube(rgb_contraction):
     box = ContractedBox(CORE, 8)
     assert box.side == 4 and box.cube_side == 32 and box.diagonal == pytest.approx(32 * 3**0.5)
     assert box.lower == (-15, -12.5, -15.5) and box.upper == (17, 19.5, 16.5)
@@ -117,33 +117,33 @@ def test_bounds_and_the_straight_cube(rgb_contraction):
     assert inside.numpy().tolist() == [True, True, False]
     corners = box.to_cube(points(rgb_contraction, [box.lower, box.upper])).numpy().T
     np.testing.assert_allclose(corners, [[0, 0, 0], [1, 1, 1]], atol=1e-6)
-    # What is encoded beyond the outer cube stands on its face.
+    # Encoded positions beyond the outer cube map to its face.
     assert box.contains(box.from_unit(rgb_contraction.Array3f(0.99999, 0.5, 0.5))).numpy().all()
 
 
-def test_its_dictionary_makes_it_again():
+def test_contracted_box_dict_round_trip():
     for box in (ContractedBox(CORE, 16), CORE, Box((-1, -1, -1), (1, 1, 1), 2.0)):
         assert box_from_dict(box.to_dict()) == box
 
 
 @pytest.mark.parametrize("reach", [1, 3, 0.5, float("nan"), float("inf"), 2**13])
-def test_the_reach_is_a_power_of_two(reach):
+def test_outer_scale_must_be_a_power_of_two(reach):
     with pytest.raises(ValueError, match="power of two"):
         ContractedBox(CORE, reach)
 
 
-def test_the_core_is_bounded_by_its_corners():
-    with pytest.raises(ValueError, match="own corners"):
+def test_core_with_bound_is_refused():
+    with pytest.raises(ValueError, match="bound of its own"):
         ContractedBox(Box((-1, -1, -1), (1, 1, 1), 2.0))
 
 
-# ---- The slab tests against the same in float64, on ordinary and on awkward rays ----
+# ---- The slab tests against float64, on ordinary and degenerate rays ----
 
 LOWER, UPPER = (-1, 0, 2), (3, 2, 4)
 
 
 def intersect(o, d, lower=LOWER, upper=UPPER):
-    """What both slab tests say, which must agree."""
+    """The result of both slab tests, which must agree."""
     o, d = np.atleast_2d(np.asarray(o, np.float32)), np.atleast_2d(np.asarray(d, np.float32))
     near, far = intersect_box(ns.Array3f(o.T), ns.Array3f(d.T), lower, upper)
     near, far = np.broadcast_to(near.numpy(), len(o)), np.broadcast_to(far.numpy(), len(o))
@@ -210,7 +210,7 @@ def test06_tiny_components_do_not_overflow_into_nan():
     assert np.allclose(near, 2) and np.allclose(far, 4)
 
 
-# ---- What places a field in a scene: rotations, uniform scales and translations, and no other transform ----
+# ---- Placement of a field in a scene: similarities are accepted, other transforms refused ----
 
 
 def turn(scale=1.0, angle=40, move=(1, -2, 3)):
@@ -239,7 +239,7 @@ def test01_similarity(rgb, scale):
     )
 
 
-def test02_bounds_hold_the_corners():
+def test02_bounds_contain_the_corners():
     m = turn(2.0)
     lower, upper = Similarity(m).bounds((0, 0, 0), (1, 1, 2))
     corners = np.array([m[:3] @ [x, y, z, 1] for x in (0, 1) for y in (0, 1) for z in (0, 2)])
@@ -250,29 +250,29 @@ def test02_bounds_hold_the_corners():
     "row, column, value",
     [
         (0, 1, 0.3),  # a shear
-        (2, 2, 1.5),  # uneven
-        (0, 0, -1),  # a mirror
-        (1, 1, 0),  # flat
+        (2, 2, 1.5),  # non-uniform
+        (0, 0, -1),  # a reflection
+        (1, 1, 0),  # singular
         (0, 0, np.nan),
         (3, 0, 0.5),  # projective
         (0, 3, np.nan),
         (1, 3, -1.1e7),
     ],
 )
-def test03_other_transforms_are_refused(row, column, value):
+def test03_non_similarities_are_refused(row, column, value):
     matrix = np.eye(4)
     matrix[row, column] = value
     with pytest.raises(ValueError, match='"to_world"'):
         Similarity(matrix)
 
 
-def test04_the_identity_returns_what_it_is_given(rgb):
+def test04_identity_returns_its_argument(rgb):
     p = rgb.Point3f(1, 2, 3)
     s = Similarity()
     assert s.is_identity and s.scale == 1 and s.point_to_local(p) is p and s.direction_to_local(p) is p
 
 
-# ---- Coordinates of surveys are refused by every reader, with the offset to subtract ----
+# ---- Survey coordinates are refused by all readers, with the offset to subtract ----
 
 ROOM = np.random.default_rng(0).uniform((0, 0, 0), (6, 4, 3), (200, 3))
 UTM = (500_000.0, 5_600_000.0, 0.0)
@@ -291,7 +291,7 @@ def read_cloud(path: Path, points: np.ndarray) -> None:
 def read_rays(path: Path, points: np.ndarray) -> None:
     builder = RaysBuilder(UNITY)
     builder.source(Path(__file__))
-    # Unity: y up, left-handed; the offset is named in the file's own coordinates.
+    # Unity: y up, left-handed; the offset is given in the file's own coordinates.
     builder.add(
         np.arange(len(points)), "ann", points, np.tile([1.0, 0, 0], (len(points), 1)), rows=np.arange(len(points))
     )
@@ -324,7 +324,7 @@ READERS = {
 
 
 @pytest.mark.parametrize("kind", READERS)
-def test_every_reader_refuses_them(tmp_path, kind):
+def test_readers_refuse_distant_coordinates(tmp_path, kind):
     READERS[kind](tmp_path, ROOM)
     with pytest.raises(NergError, match="subtract 500000,5600000,0 from it"):
         READERS[kind](tmp_path, ROOM + UTM)
@@ -343,7 +343,7 @@ def test_every_reader_refuses_them(tmp_path, kind):
         (np.zeros((0, 3)), False),
     ],
 )
-def test_what_is_small_beside_its_distance(points, refused):
+def test_small_data_far_from_origin_is_refused(points, refused):
     if not refused:
         check_near_origin(points, "it")
         return

@@ -6,28 +6,30 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from nerg_mi.maths import sphere
-from nerg_mi.maths.sphere import HARMONIC_DEGREES, fibonacci_directions, eval_harmonics, rotated_harmonics
+from nerg_mi.maths.sphere import HARMONIC_DEGREES, eval_harmonics, fibonacci_directions, rotate_harmonics
 
 # ---- Harmonics ----
 
 
 @pytest.mark.parametrize("degree", HARMONIC_DEGREES.values())
-def test_they_are_those_of_drjit(degree):
+def test_harmonics_match_drjit(degree):
     d = fibonacci_directions(50)
     theirs = dr.sh_eval(dr.llvm.Array3f(d.T.astype(np.float32)), degree)
-    assert np.abs(eval_harmonics(d, degree) - np.stack(np.broadcast_arrays(*map(np.array, theirs)), axis=1)).max() < 1e-6
+    assert (
+        np.abs(eval_harmonics(d, degree) - np.stack(np.broadcast_arrays(*map(np.array, theirs)), axis=1)).max() < 1e-6
+    )
 
 
-def test_they_are_orthonormal():
+def test_harmonics_are_orthonormal():
     y = eval_harmonics(fibonacci_directions(20_000), 3)
     assert np.abs(y.T @ y * (4 * np.pi / len(y)) - np.eye(16)).max() < 1e-3
 
 
-def test_a_turned_function_is_turned():
+def test_rotated_coefficients_give_a_rotated_function():
     rng = np.random.default_rng(0)
     c, d = rng.normal(size=(5, 16, 3)), fibonacci_directions(100)
     turn = Rotation.random(random_state=rng).as_matrix()
-    turned = rotated_harmonics(c, turn)
+    turned = rotate_harmonics(c, turn)
     at = lambda c, d: np.einsum("dk,nkc->ndc", eval_harmonics(d, 3), c)
     assert np.abs(at(turned, d) - at(c, d @ turn)).max() < 1e-12
 
@@ -35,14 +37,14 @@ def test_a_turned_function_is_turned():
 # ---- Sphere ----
 
 
-def test_fibonacci_is_equal_area():
+def test_fibonacci_directions_have_equal_area():
     x = sphere.fibonacci_directions(4096)
     assert np.allclose(np.linalg.norm(x, axis=1), 1, atol=1e-15)
     # Spherical harmonics up to degree 2 integrate to zero.
     a, b, c = x.T
     for y in (a, b, c, a * b, b * c, a * c, 3 * c * c - 1, a * a - b * b):
         assert abs(y.mean()) < 1e-3
-    # No hole and no crowd: the nearest neighbour is where equal areas put it.
+    # Even spacing: the nearest neighbour is at the distance of equal areas.
     near = np.sort(x[:200] @ x.T, axis=1)[:, -2]
     assert np.all(np.abs(np.arccos(near) / np.sqrt(4 * np.pi / 4096) - 1) < 0.3)
     with pytest.raises(ValueError, match="at least one"):
@@ -50,14 +52,14 @@ def test_fibonacci_is_equal_area():
 
 
 @pytest.mark.parametrize("count", [1, 7, 1 << 17])
-def test_the_spiral_of_kernels_is_the_same(rgb, count):
-    ours = np.array(sphere.fibonacci_vectors(count)).reshape(3, count).T
-    # Next to the poles float32 knows the height only so well.
+def test_fibonacci_directions_jit_match_numpy(rgb, count):
+    ours = np.array(sphere.fibonacci_directions_jit(count)).reshape(3, count).T
+    # Near the poles float32 limits the height.
     assert np.abs(ours - sphere.fibonacci_directions(count)).max() < 5e-5
     assert np.abs(np.linalg.norm(ours, axis=1) - 1).max() < 1e-6
 
 
-def test_uniform_directions_have_no_preference():
+def test_uniform_directions_are_isotropic():
     x = sphere.sample_uniform_directions(100_000, np.random.default_rng(1))
     assert np.abs(x.mean(axis=0)).max() < 0.01
     assert np.allclose(np.cov(x.T), np.eye(3) / 3, atol=0.01)
@@ -71,12 +73,12 @@ def test_latlong_grid_covers_the_sphere():
     assert up[0, 2] > 0.99 and up[-1, 2] < -0.99
 
 
-def test_latlong_is_the_mapping_of_mitsubas_envmap(rgb):
+def test_latlong_matches_mitsuba_envmap(rgb):
     mi = rgb
-    # A map that stores its own directions: what the emitter shows is where we looked.
+    # A map that stores its own directions: the emitter shows the direction of the ray.
     width, height = 64, 33
     u = (np.arange(width) + 0.5) / width
-    v = np.arange(height) / (height - 1)  # an envmap's rows reach the poles
+    v = np.arange(height) / (height - 1)  # an envmap's rows include the poles
     V, U = np.meshgrid(v, u, indexing="ij")
     stored = 0.5 + 0.5 * sphere.latlong_to_direction(U, V)
     emitter = mi.load_dict({"type": "envmap", "bitmap": mi.Bitmap(stored.astype(np.float32))})
@@ -87,17 +89,17 @@ def test_latlong_is_the_mapping_of_mitsubas_envmap(rgb):
     assert np.abs(shown - x).max() < 0.01  # bilinear interpolation of 64 columns
 
 
-def test_neighbours_follow_each_other():
-    order = sphere.neighbourly_order(2048)
+def test_morton_order_keeps_neighbours_close():
+    order = sphere.morton_order(2048)
     assert np.array_equal(np.sort(order), np.arange(2048))
     d = sphere.fibonacci_directions(2048)
     apart = lambda d: np.degrees(np.arccos(np.clip((d[1:] * d[:-1]).sum(axis=1), -1, 1))).mean()
-    # Neighbours are 4.5 degrees apart; along the spiral the next one is on the other side.
+    # Neighbours are 4.5 degrees apart; along the spiral the next direction is on the other side.
     assert apart(d[order]) < 9 < 90 < apart(d)
 
 
 @pytest.mark.parametrize("angle", [1e-3, 0.2, 1.7, 3.1, np.pi])
-def test_numbers_in_a_cone_are_those_of_the_directions_in_it(angle):
+def test_indices_in_a_cone_match_their_directions(angle):
     d = sphere.fibonacci_directions(5000)
     for axis in np.concatenate([np.eye(3), -np.eye(3), d[[17]]]):
         numbers = sphere.indices_in_cone(5000, axis, angle)
