@@ -1,4 +1,4 @@
-"""Encodings of positions and directions, which the networks are given: protocol, registry, and the hash grid."""
+"""Encodings of positions and directions for networks: protocol, registry, and the hash grid."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from .mlp import namespace
 
 # ---- Real spherical harmonics as an encoding of directions ----
 #
-# Order and signs are those of instant-ngp and torch-ngp (Condon-Shortley phase,
-# l = 0..3, m = -l..l), which Dr.Jit's ``sh_eval`` shares.
+# Order and signs are those of instant-ngp and torch-ngp (Condon-Shortley phase, l = 0..3, m = -l..l), like Dr.Jit's
+# ``sh_eval``.
 
 
 def encode_direction(d, degree: int = 4) -> list:
@@ -27,24 +27,25 @@ def encode_direction(d, degree: int = 4) -> list:
     return list(dr.sh_eval(d, degree - 1))
 
 
-# ---- What a field asks of the encoding of its positions ----
+# ---- Protocol of position encodings ----
 #
-# An encoding turns a point of the unit cube (or, with two dimensions, of the unit square) into ``config.size`` numbers,
-# which the networks are given. A field keeps it as ``grid`` and spells its parameters ``grid.NAME``, as checkpoints do.
+# An encoding maps a point of the unit cube (or, with two dimensions, of the unit square) to ``config.size`` numbers,
+# the inputs of a network. A field stores it as ``grid`` and names its parameters ``grid.NAME``, like checkpoints.
 #
-# A new encoding is one module: a frozen dataclass of its sizes that fulfils `EncodingConfig`, a class that fulfils
-# `Encoding`, and a call of :func:`nerg_mi.fields.encoding.register`. Both protocols are to be inherited from,
-# for what they already do.
+# To add an encoding, write one module: a frozen dataclass of its sizes that implements `EncodingConfig`, a class that
+# implements `Encoding`, and a call of :func:`nerg_mi.fields.encoding.register`. Inherit from both protocols for their
+# default methods.
 
 
 class EncodingConfig(Protocol):
-    """Sizes of an encoding: a frozen dataclass of JSON values, whose constructor raises ``ValueError`` for wrong ones.
+    """Sizes of an encoding: a frozen dataclass of JSON values, whose constructor raises ``ValueError`` for invalid
+    ones.
 
-    Encodings of equal configurations are interchangeable.
+    Encodings with equal configurations are interchangeable.
     """
 
-    kind: ClassVar[str]  # What a checkpoint calls this kind of encoding
-    # By name of a size that is a whole number: the largest that is read from a file.
+    kind: ClassVar[str]  # Name of the encoding in checkpoints
+    # Maximum values that are read from a file, for integer sizes by name.
     max_sizes: ClassVar[Mapping[str, int]]
 
     @property
@@ -54,16 +55,16 @@ class EncodingConfig(Protocol):
 
     @property
     def size(self) -> int:
-        """How many numbers a point is encoded by."""
+        """Number of features per point."""
         ...
 
     @property
     def finest(self) -> float:
-        """Cells along an edge of the unit cube that the encoding resolves at most."""
+        """Maximum resolution: cells along an edge of the unit cube."""
         ...
 
     def parameter_shapes(self) -> dict[str, tuple[int, ...]]:
-        """Shapes of the parameters, by name: flat arrays (Float) have one axis, tensors (TensorXf) more."""
+        """Shapes of the parameters by name: flat arrays (Float) have one axis, tensors (TensorXf) more."""
         ...
 
     def describe(self) -> str:
@@ -71,16 +72,16 @@ class EncodingConfig(Protocol):
         ...
 
     def to_dict(self) -> dict[str, Any]:
-        """The JSON object that stands in a checkpoint; see ``encoding.encoding_config`` for the way back."""
+        """The JSON object for a checkpoint; `config_from_dict` is the inverse."""
         return {"kind": self.kind, **asdict(self)}  # pyright: ignore[reportArgumentType] it is a dataclass
 
 
 class Encoding(Protocol):
     """Trainable features at points of the unit cube.
 
-    The constructor takes ``config``, the parameters by their names, and ``mode``: how derivatives are added to the
-    parameters (``Expand``, a copy for every thread, is a fraction of the cost of atomics for large batches). It raises
-    ``ValueError`` where parameters do not have the shapes of ``config``. Each parameter is an attribute of its name and
+    The constructor takes ``config``, the parameters by name, and ``mode``: how gradients are accumulated into the
+    parameters (``Expand``, a copy for each thread, costs a fraction of atomics for large batches). It raises
+    ``ValueError`` if the shapes of parameters do not match ``config``. Each parameter is an attribute of its name and
     an entry of ``DRJIT_STRUCT``, so that Dr.Jit finds it in frozen functions and loops.
     """
 
@@ -94,14 +95,15 @@ class Encoding(Protocol):
         ...
 
     def __call__(self, p: Array3f, active: Bool | bool = True) -> list[Float]:
-        """``config.size`` Floats at ``p`` (Array3f, or Array2f, of the unit cube).
+        """``config.size`` Floats at ``p`` (Array3f or Array2f in the unit cube or square).
 
-        Zeros where ``p`` lies outside of the cube or is not ``active``. Derivatives reach the parameters and ``p``.
+        Zeros where ``p`` is outside or not ``active``. Gradients reach the parameters and ``p``.
         """
         ...
 
     def evaluate_eagerly(self, p: Array3f, active: Bool | bool = True) -> list[Float]:
-        """The same numbers in memory, for many points at once; an encoding may have a faster way to them."""
+        """The same features, evaluated into memory, for many points at once; an encoding can have a faster
+        implementation."""
         out = self(p, active)
         dr.eval(out)
         return out
@@ -111,65 +113,65 @@ class Encoding(Protocol):
         return {name: getattr(self, name) for name in self.config.parameter_shapes()}
 
     def replace(self, name: str, value: Any) -> None:
-        """Put ``value`` in the place of the parameter ``name``, of the same shape; `pack` makes it count."""
+        """Replace the parameter ``name`` by ``value`` of the same shape; takes effect with `pack`."""
         setattr(self, name, value)
 
     def pack(self) -> None:
-        """Refresh what the kernels read, where that is not the parameters themselves; derivatives flow through."""
+        """Update what the kernels read, if that is not the parameters themselves; gradients flow through."""
 
     def kernel_parameters(self) -> list:
         """The flat arrays that evaluations read, attached to the parameters."""
         return [value.array for value in self.named().values()]
 
-    def require(self, config: Any) -> None:
+    def check_config(self, config: Any) -> None:
         """Raise ``ValueError`` unless this is an encoding of ``config``."""
         if self.config != config:
-            raise ValueError(f"this grid is {self.config} where its field needs {config}")
+            raise ValueError(f"this grid has the configuration {self.config}, but its field needs {config}")
 
 
 # ---- Registry ----
 #
-# The encodings of positions that there are, by the kind that a file names and by the type of their configuration.
+# Position encodings by their name in files and by the type of their configuration.
 
 DEFAULT_KIND = "hashgrid"
-"""What a configuration in a file is of that names no kind, as no file did when there was no other."""
+"""The encoding of a configuration without a kind in a file, as earlier versions wrote it."""
 
 _CONFIGS: dict[str, type[EncodingConfig]] = {}
 _ENCODINGS: dict[type[EncodingConfig], type[Encoding]] = {}
 
 
 def register(config: type[EncodingConfig], encoding: type[Encoding]) -> None:
-    """Let configurations of the type ``config`` stand for encodings of the type ``encoding``, in files too.
+    """Register the type ``config`` of configurations for encodings of the type ``encoding``.
 
-    Raises ``ValueError`` where another type has its kind.
+    Raises ``ValueError`` if another type has the same kind.
     """
     if _CONFIGS.get(config.kind, config) is not config:
-        raise ValueError(f'there is another encoding of the kind "{config.kind}": {_CONFIGS[config.kind].__name__}')
+        raise ValueError(f'the kind "{config.kind}" is already registered for {_CONFIGS[config.kind].__name__}')
     _CONFIGS[config.kind], _ENCODINGS[config] = config, encoding
 
 
 def kinds() -> tuple[str, ...]:
-    """The kinds that are registered."""
+    """The registered kinds."""
     return tuple(_CONFIGS)
 
 
-def config_type(about: Mapping[str, Any]) -> type[EncodingConfig]:
-    """The type of configuration that the JSON object ``about`` is of. Raises ``ValueError`` for an unknown kind."""
-    kind = about.get("kind", DEFAULT_KIND)
+def config_type(data: Mapping[str, Any]) -> type[EncodingConfig]:
+    """The type of the configuration in the JSON object ``data``. Raises ``ValueError`` for an unknown kind."""
+    kind = data.get("kind", DEFAULT_KIND)
     if not isinstance(kind, str) or kind not in _CONFIGS:
         raise ValueError(
-            f"its positions are encoded by {str(kind)[:40]!r}, which this version does not know; it knows "
+            f"its positions are encoded by {str(kind)[:40]!r}, which this version does not know; known encodings: "
             f"{', '.join(_CONFIGS)}"
         )
     return _CONFIGS[kind]
 
 
-def encoding_config(about: Mapping[str, Any]) -> EncodingConfig:
-    """The configuration that ``to_dict`` made ``about`` of. Raises ``ValueError`` or ``TypeError`` for what is none."""
-    return config_type(about)(**{k: v for k, v in about.items() if k != "kind"})
+def config_from_dict(data: Mapping[str, Any]) -> EncodingConfig:
+    """The inverse of ``to_dict``. Raises ``ValueError`` or ``TypeError`` for invalid data."""
+    return config_type(data)(**{k: v for k, v in data.items() if k != "kind"})
 
 
-def random_encoding(config: EncodingConfig, ns: ModuleType, rng: np.random.Generator) -> Encoding:
+def init_encoding(config: EncodingConfig, ns: ModuleType, rng: np.random.Generator) -> Encoding:
     """An untrained encoding of ``config`` on backend ``ns``."""
     return _ENCODINGS[type(config)].random(config, ns, rng)
 
@@ -177,18 +179,16 @@ def random_encoding(config: EncodingConfig, ns: ModuleType, rng: np.random.Gener
 def encoding_from_parameters(
     config: EncodingConfig, parameters: Mapping[str, Any], name: str = "grid", mode: dr.ReduceMode = dr.ReduceMode.Auto
 ) -> Encoding:
-    """The encoding of ``config`` whose parameters stand in ``parameters`` as ``NAME.PARAMETER``; see `Encoding`."""
+    """The encoding of ``config`` with the entries ``NAME.PARAMETER`` of ``parameters``; see `Encoding`."""
     arrays = {key: parameters[f"{name}.{key}"] for key in config.parameter_shapes()}
     return _ENCODINGS[type(config)](config, **arrays, mode=mode)  # pyright: ignore[reportCallIssue] as `Encoding` says
 
 
-# ---- Multiresolution hash grid (Müller et al ----
-#
-# 2022, "Instant Neural Graphics Primitives").
+# ---- Multiresolution hash grid (Müller et al. 2022, "Instant Neural Graphics Primitives") ----
 #
 # The memory layout is torch-ngp's, so that its checkpoints load without loss: a vertex stride of resolution + 1 on
 # dense levels (no aliasing at the far faces), rows rounded up to a multiple of 8, scales in float32, and zero outside
-# of the unit cube. A level whose (resolution + 1)^3 vertices do not fit in the table is hashed with the primes of the
+# the unit cube. A level whose (resolution + 1)^3 vertices do not fit into the table is hashed with the primes of the
 # paper.
 
 _PRIMES = (1, 2654435761, 805459861)
@@ -208,11 +208,11 @@ class HashGridConfig(EncodingConfig):
     }
 
     levels: int = 16  # Grids of different resolution, whose features are concatenated
-    features: int = 2  # Numbers at a vertex of a level: 2 or 4
-    log2_rows: int = 19  # Base 2 logarithm of the rows that a level has at most
+    features: int = 2  # Numbers per vertex of a level: 2 or 4
+    log2_rows: int = 19  # Base 2 logarithm of the maximum number of rows per level
     base: int = 16  # Cells along an edge of the coarsest level
     finest: int | float = 2048  # Cells along an edge of the finest level
-    dimensions: int = 3  # 3 for a grid over the unit cube, 2 for one over the unit square
+    dimensions: int = 3  # 3 for a grid over the unit cube, 2 for the unit square
 
     def __post_init__(self):
         if self.levels < 1 or self.base < 1 or self.finest < self.base:
@@ -223,13 +223,13 @@ class HashGridConfig(EncodingConfig):
         if self.dimensions not in (2, 3):
             raise ValueError(f"a hash grid has 2 or 3 dimensions, got {self.dimensions}")
         if self.features not in (2, 4):
-            raise ValueError(f"features must be 2 or 4 (one packet load a vertex), got {self.features}")
+            raise ValueError(f"features must be 2 or 4 (one packet load per vertex), got {self.features}")
         if not 3 <= self.log2_rows <= 26:
             raise ValueError(f"log2_rows must lie in 3..26, got {self.log2_rows}")
 
     @property
     def size(self) -> int:
-        """Number of features that the grid returns a point."""
+        """Number of features per point."""
         return self.levels * self.features
 
     def parameter_shapes(self) -> dict[str, tuple[int, ...]]:
@@ -239,7 +239,7 @@ class HashGridConfig(EncodingConfig):
         return f"{self.levels} x {self.features}, 2^{self.log2_rows} rows, {self.base} to {self.finest}"
 
     def to_dict(self) -> dict[str, Any]:
-        return asdict(self)  # Without a kind: so this version's files of hash grids can be read by all earlier ones
+        return asdict(self)  # Without a kind, so that all earlier versions can read hash grids
 
     def level_scales(self) -> np.ndarray:
         """Scale of each level as float32, (levels,): ``exp2(l log2 s) base - 1``."""
@@ -258,15 +258,15 @@ class HashGridConfig(EncodingConfig):
         return rows
 
     def offsets(self) -> list[int]:
-        """First row of each level, and the total at the end, (levels + 1,)."""
+        """First row of each level, followed by the total, (levels + 1,)."""
         return [0, *np.cumsum(self.level_rows()).tolist()]
 
 
 class HashGrid(Encoding):
     """Trainable features at points of the unit cube.
 
-    ``table`` is the flat parameter array (Float), (rows * features,), the features of one row adjacent and the levels
-    one after another; ``mode`` as for `Encoding`.
+    ``table`` is the flat parameter array (Float), (rows * features,), with adjacent features of a row and consecutive
+    levels; ``mode`` as for `Encoding`.
     """
 
     DRJIT_STRUCT: ClassVar[dict[str, Any]] = {"table": None}
@@ -275,7 +275,7 @@ class HashGrid(Encoding):
         self.config, self.table, self.mode = config, table, mode
         (expected,) = config.parameter_shapes()["table"]
         if len(table) != expected:
-            raise ValueError(f'"grid.table" has {len(table)} entries where its configuration {config} needs {expected}')
+            raise ValueError(f'"grid.table" has {len(table)} entries, but its configuration {config} needs {expected}')
         self._scales = config.level_scales()
         self._rows = config.level_rows()
         self._offsets = config.offsets()
@@ -287,7 +287,7 @@ class HashGrid(Encoding):
         return cls(config, ns.Float(rng.uniform(-scale, scale, size).astype(np.float32)))
 
     def is_hashed(self, level: int) -> bool:
-        """Whether the vertices of ``level`` do not fit in its rows."""
+        """Whether the vertices of ``level`` exceed its rows."""
         stride = int(np.ceil(self._scales[level])) + 2
         return stride**self.config.dimensions > self._rows[level]
 
@@ -300,9 +300,9 @@ class HashGrid(Encoding):
         return out
 
     def evaluate_eagerly(self, p: Array3f, active: Bool | bool = True) -> list[Float]:
-        """The same features, evaluated one level after another: the rows of one level stay in the caches.
+        """The same features, evaluated level by level, so that the rows of one level stay in the caches.
 
-        Worth it for many scattered points whose features are to be kept in memory anyhow.
+        Useful for many scattered points whose features are stored anyway.
         """
         p, inside = self._clamped(p, active)
         dr.eval(p, inside)
@@ -314,7 +314,7 @@ class HashGrid(Encoding):
 
     @staticmethod
     def _clamped(p, active):
-        """``p`` with 0 for what lies outside of the cube, and the mask of what lies inside."""
+        """``p`` with 0 for points outside the cube, and the mask of the points inside."""
         inside = active & dr.all((p >= 0) & (p <= 1))
         # A negative coordinate cast to an unsigned cell would extrapolate by 4e9.
         return dr.select(inside, p, 0), inside
@@ -338,7 +338,7 @@ class HashGrid(Encoding):
             steps = _PRIMES
         else:
             stride = int(np.ceil(self._scales[level])) + 2
-            steps = (1, stride, stride * stride)  # as far as there are axes
+            steps = (1, stride, stride * stride)  # as many as there are axes
         lo = [c * s for c, s in zip(cell, steps)]
         return lo, [a + s for a, s in zip(lo, steps)]
 
@@ -353,9 +353,9 @@ class HashGrid(Encoding):
 
 
 def _blend(read, lo: list, hi: list, w: list, axis: int, index: tuple):
-    """Lerps from the last axis inwards: seven a feature instead of eight weights and eight products.
+    """Interpolate from the last axis inwards: seven lerps per feature instead of eight weights and eight products.
 
-    Not a closure: one that calls itself is a cycle, and keeps its arrays until Python looks for those.
+    Not a closure: a closure that calls itself is a reference cycle, and keeps its arrays until garbage collection.
     """
     if axis < 0:
         return read(index)
@@ -364,8 +364,3 @@ def _blend(read, lo: list, hi: list, w: list, axis: int, index: tuple):
 
 
 register(HashGridConfig, HashGrid)
-
-
-# ---- Encodings of positions and directions, which the networks are given ----
-
-# What is there without being asked for registers itself here.

@@ -1,7 +1,7 @@
-"""Surfaces and lattices of a radiance field, as arrays for other tools.
+"""Surfaces and lattices of a radiance field as arrays for other tools.
 
-A surface is where density crosses a threshold. It is looked for in the opacity of a lattice cell, 1 - exp(-σ h), which
-is bounded where density is not, and then found along the lattice's edges in the field itself.
+A surface is where density crosses a threshold. It is first searched in the opacity of lattice cells, 1 - exp(-σ h),
+which is bounded unlike density, and then located along lattice edges in the field itself.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from nerg_mi.maths.arrays import to_vector
 
 from .radiance import RadianceField
 
-# Points a kernel launch: some hundred megabytes of intermediate values at most.
+# Points per kernel launch: a few hundred megabytes of intermediate values.
 _BATCH = 1 << 21
 _BISECTIONS = 8
-_TILTED = 4  # Tilted directions beside the head-on one that a surface's colour is the mean of
+_TILTED = 4  # Oblique directions, besides the normal, that a surface colour is averaged over
 
-_MOST_CELLS = 1 << 30  # Densities of a lattice are held in single precision, all at once
+_MAX_CELLS = 1 << 30  # Densities of a lattice are stored together, in single precision
 
 
 @dataclass(frozen=True)
 class Lattice:
-    """Middles of cubic cells of edge ``step`` that fill a box from ``lower`` on; ``shape``: cells along x, y, z."""
+    """Centres of cubic cells of edge ``step`` that fill a box from ``lower`` on; ``shape``: cells along x, y, z."""
 
     lower: tuple[float, float, float]
     step: float
@@ -35,19 +35,20 @@ class Lattice:
 
     @staticmethod
     def for_field(field: RadianceField, resolution: int) -> Lattice:
-        """``resolution`` cells along the longest edge of the field's box, or of the core of a contracted one."""
+        """A lattice with ``resolution`` cells along the longest edge of the field's box, or of the core of a contracted
+        box."""
         if resolution < 2:
             raise ValueError(f"a lattice needs at least 2 cells along its longest edge, got {resolution}")
         core = field.box.core
         edges = np.subtract(core.upper, core.lower)
         step = float(edges.max() / resolution)
         shape = np.maximum(np.ceil(edges / step - 1e-6).astype(int), 2)
-        if (cells := math.prod(shape.tolist())) > _MOST_CELLS:
+        if (cells := math.prod(shape.tolist())) > _MAX_CELLS:
             raise NergError(
-                f"a lattice of {' x '.join(map(str, shape))} cells takes {4 * cells / 1e9:.0f} GB; ask for a lower "
+                f"a lattice of {' x '.join(map(str, shape))} cells takes {4 * cells / 1e9:.0f} GB; use a lower "
                 "--resolution"
             )
-        # What the last cells overhang is shared by both sides.
+        # The overhang of the last cells is shared by both sides.
         lower = (np.add(core.upper, core.lower) - shape * step) / 2
         return Lattice(tuple(lower.tolist()), step, tuple(shape.tolist()))
 
@@ -57,7 +58,7 @@ class Lattice:
 
 
 class FieldSampler:
-    """Asks a field about many points, in batches; densities are 0 in the empty cells of its occupancy grid."""
+    """Evaluates a field at many points, in batches; densities are 0 in the empty cells of its occupancy grid."""
 
     def __init__(self, field: RadianceField):
         self.field, self.ns = field, field.ns
@@ -69,7 +70,7 @@ class FieldSampler:
         return dr.select(active, self.field.density(p, active), 0)
 
     def density(self, p: np.ndarray, masked: bool = True) -> np.ndarray:
-        """Density (1/unit) at points (N, 3); with ``masked`` False also what the networks say of empty cells."""
+        """Density (1/unit) at points (N, 3); ``masked`` False: the output of the networks also in empty cells."""
         with dr.suspend_grad():
             return _joined(lambda q: self._density(to_vector(self.ns.Array3f, q), masked).numpy(), p)
 
@@ -78,10 +79,10 @@ class FieldSampler:
         return self._over(lattice, 1, lambda sigma: sigma)
 
     def opacity_on(self, lattice: Lattice, samples: int) -> np.ndarray:
-        """Opacity (z, y, x) of the lattice's cells along their edges, the mean over ``samples``³ points of each."""
+        """Opacity (z, y, x) of the lattice's cells along their edges, averaged over ``samples``³ points of each."""
         return self._over(lattice, samples, lambda sigma: 1 - dr.exp(-sigma * lattice.step))
 
-    def _over(self, lattice: Lattice, samples: int, of) -> np.ndarray:
+    def _over(self, lattice: Lattice, samples: int, transform) -> np.ndarray:
         ns, (nx, ny, nz) = self.ns, lattice.shape
         out = np.zeros(nx * ny * nz, np.float32)
         with dr.suspend_grad():
@@ -95,11 +96,11 @@ class FieldSampler:
                     p = ns.Array3f(
                         *[l + (ns.Float(c) + o) * lattice.step for l, c, o in zip(lattice.lower, cell, offsets)]
                     )
-                    out[start : start + count] += of(self._density(p)).numpy()
+                    out[start : start + count] += transform(self._density(p)).numpy()
         return (out / samples**3).reshape(nz, ny, nx)
 
     def color(self, p: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Colour (N, 3) in the field's colour space of points (N, 3), as seen along unit ``directions`` (N, 3)."""
+        """Colour (N, 3) in the field's colour space of points (N, 3), seen along unit ``directions`` (N, 3)."""
 
         def ask(q):
             features = self.field.density_features(to_vector(self.ns.Array3f, q[:, :3]))[1]
@@ -111,7 +112,8 @@ class FieldSampler:
             return _joined(ask, np.concatenate([p, directions], 1), 3)
 
     def diffuse_color(self, p: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """Colour (N, 3) of surface points seen head on and at 45 degrees, averaged: a field's colour depends on it."""
+        """Colour (N, 3) of surface points, averaged over the normal and directions at 45 degrees, since a field's
+        colour is view-dependent."""
         first = np.where(np.abs(normals[:, :1]) < 0.7, [[1.0, 0, 0]], [[0, 1.0, 0]])
         u = np.cross(normals, first)
         u /= np.maximum(np.linalg.norm(u, axis=1, keepdims=True), 1e-12)
@@ -132,21 +134,34 @@ def _joined(ask, rows: np.ndarray, columns: int = 0) -> np.ndarray:
 
 
 def surface_density(lattice: Lattice) -> float:
-    """Density at which one cell of the lattice absorbs half of the light: what a surface is, to this lattice."""
+    """Density at which one cell of the lattice absorbs half of the light: the threshold of a surface."""
     return math.log(2) / lattice.step
 
 
 def cell_opacity(density: np.ndarray, lattice: Lattice) -> np.ndarray:
-    """Opacity of a cell of that density."""
+    """Opacity of a cell of this density."""
     return -np.expm1(-density * lattice.step)
 
 
-def find_crossings(sampler: FieldSampler, lattice: Lattice, index: np.ndarray, threshold: float) -> tuple[np.ndarray, np.ndarray]:
-    """``index`` (N, 3), fractional on one axis, moved along that edge to where density crosses ``threshold``; and where
-    no surface is, but only the end of what the field's occupancy grid has looked at (mask (N,)).
+def find_crossings(
+    sampler: FieldSampler, lattice: Lattice, index: np.ndarray, threshold: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Move points along lattice edges to where density crosses ``threshold``.
 
-    Points stay where they are if the field does not cross there: filled holes have put them there. Beyond an unseen
-    one the networks go on with dense matter: the backs of walls and the insides of things, which no picture shows.
+    Points stay where they are if the field does not cross: they come from filled holes. Behind a surface the networks
+    continue with dense matter (inside of walls and objects) that no photo shows.
+
+    Parameters
+    ----------
+    index : array (N, 3)
+        Cell indices, fractional on one axis.
+
+    Returns
+    -------
+    moved : array (N, 3)
+        The moved indices.
+    unobserved : array (N,)
+        Where the crossing is not a surface but the border of the field's occupied cells.
     """
     away = np.abs(index - np.round(index))
     axis = np.argmax(away, axis=1)

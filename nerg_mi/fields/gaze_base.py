@@ -1,5 +1,5 @@
-"""What gaze fields have in common: base classes, the registry of their kinds, ensembles, the table of the density that
-does not depend on the position, and where training data supports them."""
+"""Base classes of gaze fields, the registry of their kinds, ensembles, the position-independent prior, and the support
+by training data."""
 
 from __future__ import annotations
 
@@ -17,29 +17,31 @@ from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.maths.types import Bool, Float, Point3f, Vector3f
 from nerg_mi.ranges import MAX_COORDINATE
 
-from .encoding import Encoding, EncodingConfig, encoding_config
+from .encoding import Encoding, EncodingConfig, config_from_dict
 from .mlp import MLP, namespace
-from .radiance import assign
+from .radiance import assign_parameters
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-# ---- What a picture of gaze rests on: how many rays, of how many people ----
+# ---- Amount of data behind a gaze field: rays and participants ----
 
-_MOST = 1 << 60
+_MAX_COUNT = 1 << 60
 
 
 @dataclass(frozen=True)
 class DataSummary:
-    """``rays`` of ``people`` (None: not known), and ``images`` of salience, that a gaze field learnt from, or of which
-    a density is made."""
+    """The amount of data that a gaze field was fitted to, or that a density is estimated from.
+
+    ``rays``: number of rays; ``people``: number of participants (None: unknown); ``images``: number of salience images.
+    """
 
     rays: int
     people: int | None = None
     images: int = 0
 
     def words(self) -> str:
-        """All of it in words, such as "81,751 rays of 80 people"; "" for nothing."""
+        """In words, such as "81,751 rays of 80 people"; "" without data."""
         rays = _count(self.rays, "ray", "rays")
         if rays and self.people:
             rays += " of " + _count(self.people, "person", "people")
@@ -47,13 +49,14 @@ class DataSummary:
 
 
 def summarize_provenance(provenance: Mapping[str, Any]) -> DataSummary | None:
-    """That of a checkpoint's ``provenance``; None where it does not tell, as other programs' checkpoints do not."""
+    """The amount of data in a checkpoint's ``provenance``; None if it is not recorded, as in checkpoints of other
+    programs."""
     rays, people, images = (_number(provenance.get(name)) for name in ("rays", "people", "salience_views"))
     return DataSummary(rays or 0, people or None, images or 0) if rays or images else None
 
 
 def _number(value: object) -> int | None:
-    return value if isinstance(value, int) and not isinstance(value, bool) and 0 <= value < _MOST else None
+    return value if isinstance(value, int) and not isinstance(value, bool) and 0 <= value < _MAX_COUNT else None
 
 
 def _count(number: int, one: str, several: str) -> str:
@@ -62,123 +65,142 @@ def _count(number: int, one: str, several: str) -> str:
 
 # ---- Support ----
 #
-# How much data a gaze field rests on around a position: where the rays that it learnt from started, in a few kilobytes.
+# The amount of training data near a position: where the rays started, in a few kilobytes.
 #
-# Support at p is the sum over rays of Epanechnikov's kernel, Σ_i max(0, 1 - |o_i - p|² / (5R)²), R the radius of a
-# probe: a ray that started at p counts as one, a ray 5R away not at all. A field knows more than its probes: kernels of
-# R are zero wherever a field is asked for what it was not shown, where its error grows with the distance still. How
-# well those of 5 R rank the errors: docs/explanation/accuracy.md.
+# Support at p is a sum of Epanechnikov kernels over rays, Σ_i max(0, 1 - |o_i - p|² / (5R)²), with the probe radius R.
+# A ray that started at p counts as one, a ray 5R away as zero. Kernels of radius R would be zero at all positions
+# without a probe, although the error of a field keeps growing with the distance there. docs/explanation/accuracy.md
+# measures how well kernels of 5R rank the errors.
 #
-# Rays are kept as cells of R/2 with their number, mean origin and variance. The sum over a cell within reach follows
-# from these exactly. In one that the reach cuts, the squared distances are taken to be spread uniformly.
+# Rays are stored as cells of size R/2 with their number, mean origin and variance. The sum over a cell within the
+# cut-off follows from these exactly. For a cell that the cut-off divides, squared distances are assumed to be uniformly
+# distributed.
 
-CELLS = 2  # Cells along R
-REACH = 5.0  # Radii R from which a ray still counts
+CELLS_PER_RADIUS = 2  # Cells per R
+CUTOFF_RADII = 5.0  # Cut-off in radii R
 
-_DENSE = 64  # Cells that are looked at for the one with the greatest support
+_DENSE = 64  # Candidate cells for the position with the greatest support
 
 
 class RaySupport:
-    """``cells`` (n, 5): mean origin (3), number of rays, and their mean squared distance from that; ``radius``: R. Both
-    in one frame. ``reach``: how far away a ray still counts."""
+    """Number of training rays near a position.
+
+    ``cells`` (n, 5): mean origin (3), number of rays, and their mean squared distance from the mean; ``radius``: R;
+    both in one frame. ``cutoff``: distance beyond which a ray does not count.
+    """
 
     def __init__(self, cells: np.ndarray, radius: float):
         self.cells, self.radius = np.ascontiguousarray(cells, np.float32).reshape(-1, 5), float(radius)
-        self.cutoff = REACH * self.radius
+        self.cutoff = CUTOFF_RADII * self.radius
         if not np.all(np.isfinite(self.cells)) or not 0 < self.radius <= MAX_COORDINATE:
             raise ValueError(f"the support of a gaze field needs finite cells and a positive radius, got {self.radius}")
 
     @staticmethod
     def from_origins(origins: np.ndarray, radius: float) -> RaySupport:
-        """That of rays from ``origins`` (N, 3), for probes of ``radius``."""
+        """The support of rays from ``origins`` (N, 3), for probes of ``radius``."""
         origins = np.asarray(origins, np.float64).reshape(-1, 3)
         lower = origins.min(axis=0)
-        index = np.floor((origins - lower) * (CELLS / radius)).astype(np.int64)
+        index = np.floor((origins - lower) * (CELLS_PER_RADIUS / radius)).astype(np.int64)
         _, cell, count = np.unique(
             np.ravel_multi_index(index.T, index.max(axis=0) + 1), return_inverse=True, return_counts=True
         )
         mean = np.stack([np.bincount(cell, weights=x) for x in origins.T], axis=1) / count[:, None]
-        apart = np.bincount(cell, weights=((origins - mean[cell]) ** 2).sum(axis=1)) / count
-        return RaySupport(np.concatenate([mean, count[:, None], apart[:, None]], axis=1), radius)
+        variance = np.bincount(cell, weights=((origins - mean[cell]) ** 2).sum(axis=1)) / count
+        return RaySupport(np.concatenate([mean, count[:, None], variance[:, None]], axis=1), radius)
 
     def evaluate(self, p):
-        """Support at ``p`` (Array3f or Point3f of one lane), a Float of one lane, without derivatives."""
+        """Support at ``p`` (Array3f or Point3f, one lane): a Float of one lane, without derivatives."""
         Float: Any = dr.float32_array_t(type(p.x))
         p = dr.detach(p)
-        x, y, z, count, apart = (Float(np.ascontiguousarray(column)) for column in self.cells.T)
+        x, y, z, count, variance = (Float(np.ascontiguousarray(column)) for column in self.cells.T)
         square = dr.square(x - p.x) + dr.square(y - p.y) + dr.square(z - p.z)
         scale = 1 / self.cutoff**2
-        inside = 1 - (square + apart) * scale
-        # Half the width of a uniform law with the variance of |o - p|² in a cell whose rays spread alike in all
-        # directions.
-        reach = dr.sqrt(4 * square * apart) * scale + 1e-9
-        cut = dr.square(dr.maximum(inside + reach, 0)) / (4 * reach)
-        return dr.sum(count * dr.select(inside > reach, inside, cut))
+        inside = 1 - (square + variance) * scale
+        # Half width of a uniform distribution with the variance of |o - p|² in a cell with isotropic rays.
+        half_width = dr.sqrt(4 * square * variance) * scale + 1e-9
+        cut = dr.square(dr.maximum(inside + half_width, 0)) / (4 * half_width)
+        return dr.sum(count * dr.select(inside > half_width, inside, cut))
 
     def find_densest_position(self) -> np.ndarray:
-        """Where most rays started (3,) float64, by kernels of R: of the mean origins of the cells with most rays; of
-        equal ones the first."""
+        """The position (3,) float64 where most rays started, by kernels of R: among the mean origins of the fullest
+        cells; the first one in a tie."""
         cells = self.cells.astype(np.float64)
         best = cells[np.argsort(-cells[:, 3], kind="stable")[:_DENSE], :3]
         square = ((best[:, None] - cells[None, :, :3]) ** 2).sum(axis=-1) + cells[:, 4]
         return best[np.argmax((np.maximum(1 - square / self.radius**2, 0) * cells[:, 3]).sum(axis=1))]
 
 
-SIZE_LIMITS = {"width": 4096, "geometry": 4096, "hidden": 64, "layers": 64, "sh_degree": 10, "prior": 4096}
-"""The largest whole numbers of an architecture, by name; beyond them no field is trained and no kernel compiles."""
+MAX_SIZES = {"width": 4096, "geometry": 4096, "hidden": 64, "layers": 64, "sh_degree": 10, "prior": 4096}
+"""Maximum sizes of an architecture, by name; larger networks are not trained, and their kernels do not compile."""
 
-# ---- What every gaze field answers, whatever it is made of ----
+# ---- The common interface of gaze fields ----
 #
-# A gaze field is a density over the directions around an observer (1/sr): a product of two factors (``product``), a
-# normalised log density (``log_density``), or any other `GazeHead` that is registered; or the mean of several of these
-# (``ensemble``). Nothing outside of this package asks which of them it has.
+# A gaze field is a density over the directions around an observer (1/sr): a product of two factors (`gaze_product`), a
+# normalised log density (`gaze_log_density`) or any other registered `GazeHead`, or the mean of several of these
+# (`GazeEnsemble`). Code outside this package does not distinguish them.
 #
 # Positions and directions are Dr.Jit 3-arrays of the field's backend, in the field's own frame and units; directions
-# are unit vectors, and ``r_o`` points from the observer to the surface. Densities do not change with scale.
+# are unit vectors, and ``r_o`` points from the observer to the surface. Densities are invariant to scale.
 
-MAX_WEIGHT = 1e6  # No stored weight is larger; products of a network's layers then stay in single precision
+MAX_WEIGHT = (
+    1e6  # Maximum absolute weight in a file; products over the layers of a network then stay in single precision
+)
 
 
 class Arrays(Protocol):
-    """The arrays of a checkpoint, as a field's ``from_arrays`` asks for them. Every method raises ``ValueError`` for an
-    array that is not finite or does not have the shape, ``KeyError`` for one that is missing."""
+    """The arrays of a checkpoint, as ``from_arrays`` of a field needs them.
+
+    All methods raise ``ValueError`` for an array that is not finite or has the wrong shape, and ``KeyError`` for a
+    missing one.
+    """
 
     ns: ModuleType
 
-    def array(self, name: str, *shape: int | None, max_value: float = MAX_WEIGHT) -> np.ndarray:
-        """The float32 array ``name`` of that ``shape`` (None: of any length), with no value beyond ``largest``."""
+    def get_array(self, name: str, *shape: int | None, max_value: float = MAX_WEIGHT) -> np.ndarray:
+        """The float32 array ``name`` of this ``shape`` (None: any length), with absolute values up to ``max_value``."""
         ...
 
-    def grid(self, config: EncodingConfig, name: str = "grid") -> Encoding:
+    def build_grid(self, config: EncodingConfig, name: str = "grid") -> Encoding:
         """The encoding of ``config``."""
         ...
 
-    def net(self, name: str, sizes: list[int], normalized: bool = False) -> MLP:
-        """The network whose layers have these ``sizes``; ``normalized``: with the gains and shifts of LayerNorm."""
+    def build_network(self, name: str, sizes: list[int], normalized: bool = False) -> MLP:
+        """The network with layers of these ``sizes``; ``normalized``: with the gains and shifts of LayerNorm."""
         ...
 
-    def member(self, index: int, architecture: dict) -> tuple[dict, Arrays]:
-        """The checked architecture and the arrays of the member ``index`` of an ensemble."""
+    def get_member(self, index: int, architecture: dict) -> tuple[dict, Arrays]:
+        """The validated architecture and the arrays of the member ``index`` of an ensemble."""
         ...
 
 
 class AnyGazeField:
-    """Base of gaze fields on one backend: of one density (`GazeHead`), and of the mean of several (`GazeEnsemble`).
+    """Base of gaze fields on one backend: a single density (`GazeHead`), or the mean of several (`GazeEnsemble`).
 
-    ``config``: sizes and conventions; ``box``: where the field lives, positions outside of it are the encoding's to
-    deal with; ``ns``: array types of the backend (``fields.mlp.namespace``); ``members``: the densities whose mean it
-    is; ``networks``: how many one evaluation of gaze evaluates; ``mlps``: the networks of all members.
+    Attributes
+    ----------
+    config : GazeHeadConfig
+        Sizes and conventions.
+    box : AnyBox
+        The domain of the field; the encoding handles positions outside.
+    ns : module
+        Array types of the backend (`fields.mlp.namespace`).
+    members : sequence of GazeHead
+        The densities that are averaged.
+    networks : int
+        Number of networks that one evaluation of gaze evaluates.
+    mlps : list of MLP
+        The networks of all members.
     """
 
-    kind: ClassVar[str]  # The name under which a checkpoint knows the class
-    # The largest whole numbers that a checkpoint may claim for its sizes, by name.
-    max_sizes: ClassVar[Mapping[str, int]] = SIZE_LIMITS
-    fixed: ClassVar[tuple[str, ...]] = ()  # Parameters that no training changes
+    kind: ClassVar[str]  # Name of the class in checkpoints
+    # Maximum sizes that a checkpoint may contain, by name.
+    max_sizes: ClassVar[Mapping[str, int]] = MAX_SIZES
+    fixed: ClassVar[tuple[str, ...]] = ()  # Parameters that training does not change
 
     config: Any
     box: AnyBox
-    support: RaySupport | None = None  # How many rays it learnt from around a position, where that is known
-    basis: DataSummary | None = None  # How many rays and people it learnt from in all, where that is known
+    support: RaySupport | None = None  # Number of training rays near a position, if known
+    basis: DataSummary | None = None  # Total number of training rays and participants, if known
 
     @property
     def ns(self) -> ModuleType:
@@ -201,12 +223,12 @@ class AnyGazeField:
         raise NotImplementedError
 
     @classmethod
-    def from_arrays(cls, about: dict, box: AnyBox, arrays: Arrays) -> AnyGazeField:
-        """The field of ``architecture() == about`` with the ``arrays`` of a checkpoint."""
+    def from_arrays(cls, architecture: dict, box: AnyBox, arrays: Arrays) -> AnyGazeField:
+        """The field with this ``architecture()`` and the ``arrays`` of a checkpoint."""
         raise NotImplementedError
 
     def parameters(self) -> dict:
-        """Arrays that gaze depends on, by the names that checkpoints and ``mi.traverse`` give them."""
+        """Arrays that gaze depends on, named as in checkpoints and ``mi.traverse``."""
         raise NotImplementedError
 
     def set_parameters(self, values: dict) -> None:
@@ -214,38 +236,41 @@ class AnyGazeField:
         raise NotImplementedError
 
     def pack(self) -> None:
-        """Refresh what the kernels read; call after any change of the weights."""
+        """Update what the kernels read; call it after any change of the weights."""
         raise NotImplementedError
 
 
 class GazeHeadConfig:
-    """Base of the configuration of a gaze field that is one density: a frozen dataclass that a checkpoint keeps as
-    JSON. The defaults are those of a density that is normalised over the sphere, of both factors."""
+    """Base of the configurations of gaze fields with a single density: frozen dataclasses that a checkpoint stores as
+    JSON.
 
-    kind: ClassVar[str]  # The name under which a checkpoint knows the field's class
+    The defaults are those of a density with both factors that is normalised over the sphere.
+    """
+
+    kind: ClassVar[str]  # Name of the field's class in checkpoints
     grid: Any  # The encoding of positions
-    variant: Any = "emit_capture"  # emit, capture or emit_capture: which of the two factors there are
-    activation: Any = "log"  # What the network's output goes through to become a density; for people, not for code
-    # Whether ``evaluate`` divides by the integral over the observer's sphere, which it then must be given.
+    variant: Any = "emit_capture"  # emit, capture or emit_capture: the factors of the density
+    activation: Any = "log"  # Output activation that makes it a density; informative only
+    # Whether ``evaluate`` divides by the integral over the observer's sphere, which it then requires.
     normalized: Any = True
-    semantic: Any = ""  # Which features of a radiance field emit takes: accumulated, snapshot or none ("")
-    prior: Any = 0  # Rows of the table of the density that does not depend on the position; 0 for a field that has none
-    mix: Any = 0.0  # The share of that density
+    semantic: Any = ""  # Features of a radiance field that emit takes: accumulated, snapshot or none ("")
+    prior: Any = 0  # Rows of the table of the position-independent prior; 0 for a field without one
+    mix: Any = 0.0  # Weight of the position-independent prior
 
     @property
     def features(self) -> int:
-        """How many features of a radiance field emit is given."""
+        """Number of features of a radiance field that emit takes."""
         return 0
 
     @property
     def needs_surfaces(self) -> bool:
-        """Whether it matters where the observer's rays meet a surface."""
+        """Whether the field depends on the surfaces that the observer's rays meet."""
         return True
 
     @property
     def fills_escaped(self) -> bool:
-        """Whether a direction in which no surface is met takes the depth of the nearest ones that do; otherwise it ends
-        on the field's box."""
+        """Whether a direction without a surface takes the depth of the nearest directions with one; otherwise its ray
+        ends on the field's box."""
         return False
 
     def conventions(self) -> tuple:
@@ -253,17 +278,17 @@ class GazeHeadConfig:
         return self.kind, self.variant
 
     def to_dict(self) -> dict:
-        """As JSON."""
+        """As a JSON object."""
         return {"kind": self.kind, **asdict(self), "grid": self.grid.to_dict()}  # pyright: ignore[reportArgumentType]
 
     @classmethod
     def from_dict(cls, d: dict) -> Self:
-        """The configuration of which `to_dict` was kept."""
-        return cls(**{**{k: v for k, v in d.items() if k != "kind"}, "grid": encoding_config(d["grid"])})
+        """The inverse of `to_dict`."""
+        return cls(**{**{k: v for k, v in d.items() if k != "kind"}, "grid": config_from_dict(d["grid"])})
 
 
-def require_words(config: GazeHeadConfig, **words: tuple[str, ...]) -> None:
-    """Raise ``ValueError`` unless each entry of ``config`` that is named is one of its ``words``."""
+def check_choices(config: GazeHeadConfig, **words: tuple[str, ...]) -> None:
+    """Raise ``ValueError`` unless each named entry of ``config`` is one of its allowed ``words``."""
     for name, allowed in words.items():
         if getattr(config, name) not in allowed:
             raise ValueError(
@@ -273,15 +298,15 @@ def require_words(config: GazeHeadConfig, **words: tuple[str, ...]) -> None:
 
 
 class GazeHead(AnyGazeField):
-    """Base of a gaze field that is one density: an encoding ``grid``, bare ``ARRAYS`` and networks ``NETS``, attributes
-    of these names. A kind says how it is made and what its ``unnormalized`` density is."""
+    """Base of a gaze field with a single density: attributes are an encoding ``grid``, plain arrays ``ARRAYS`` and
+    networks ``NETS``. A subclass defines how it is constructed and its ``unnormalized`` density."""
 
     ARRAYS: ClassVar[tuple[str, ...]] = ()
     NETS: ClassVar[tuple[str, ...]] = ()
     DRJIT_STRUCT: ClassVar[dict]
 
     grid: Any
-    prior: Any  # Log of the density that does not depend on the position, of fields whose configuration has a ``prior``
+    prior: Any  # Log of the position-independent prior, if the configuration has one
 
     def __init_subclass__(cls, **kwargs: Any):
         super().__init_subclass__(**kwargs)
@@ -313,7 +338,7 @@ class GazeHead(AnyGazeField):
         for name in self.ARRAYS:
             if name in values:
                 setattr(self, name, values[name])
-        assign(self, {k: v for k, v in values.items() if k not in self.ARRAYS})
+        assign_parameters(self, {k: v for k, v in values.items() if k not in self.ARRAYS})
         self.pack()
 
     def pack(self) -> None:
@@ -329,13 +354,13 @@ class GazeHead(AnyGazeField):
         semantic: list[Float] | None = None,
         escaped: Bool | bool = False,
     ) -> tuple[Float, Float]:
-        """``(emit, capture)``, whose product a normalised field divides by its integral. A variant that lacks a factor
-        has 1 in its place and does not evaluate it.
+        """``(emit, capture)``, whose product a normalised field divides by its integral. A missing factor is 1 and is
+        not evaluated.
 
-        ``semantic``: ``config.features`` Floats where the configuration asks for them, else None; ``escaped``: mask of
-        directions in which no surface is met. Differentiable in the parameters, positions and directions.
+        ``semantic``: ``config.features`` Floats if the configuration has semantic features, else None; ``escaped``:
+        mask of directions without a surface. Differentiable in the parameters, positions and directions.
         """
-        raise NotImplementedError(f"{type(self).__name__} does not say what its density is")
+        raise NotImplementedError(f"{type(self).__name__} does not define its density")
 
     def evaluate(
         self,
@@ -347,16 +372,26 @@ class GazeHead(AnyGazeField):
         integral: Float | None = None,
         escaped: Bool | bool = False,
     ) -> tuple[Float, Float, Float]:
-        """``(gaze, emit, capture)`` in 1/sr of the observer at ``p_o`` attending ``p_od`` along unit ``r_o``;
-        ``active``, ``semantic`` and ``escaped`` as for ``unnormalized``.
+        """``(gaze, emit, capture)`` in 1/sr for the observer at ``p_o`` who looks at ``p_od`` along unit ``r_o``.
 
-        ``integral``: of a normalised field over the sphere at ``p_o`` (``transport.observer_gaze``), by which ``emit``
-        is divided; ``ValueError`` without it. With a share m of the density that does not depend on the position, gaze
-        = (1 - m) emit * capture + m blind.
+        With a weight m of the position-independent prior, gaze = (1 - m) emit * capture + m prior.
+
+        Parameters
+        ----------
+        active, semantic, escaped
+            As for ``unnormalized``.
+        integral : Float, optional
+            Integral of a normalised field over the sphere at ``p_o`` (`transport.observer_gaze`), by which ``emit`` is
+            divided.
+
+        Raises
+        ------
+        ValueError
+            For a normalised field without ``integral``.
         """
         if self.config.normalized and integral is None:
             raise ValueError(
-                "this gaze field is normalised over the observer's sphere: evaluating it needs its integral there"
+                "this gaze field is normalised over the observer's sphere; evaluating it requires its integral"
             )
         emit, capture = self.unnormalized(p_od, p_o, r_o, active, semantic, escaped)
         if integral is not None and self.config.normalized:
@@ -367,15 +402,16 @@ class GazeHead(AnyGazeField):
         return gaze, emit, capture
 
     def log_prior(self, r_o: Vector3f) -> Float:
-        """Log of the blind density (1/sr) in direction ``r_o``, interpolated in its table, the array ``prior``."""
+        """Log of the position-independent prior (1/sr) in the direction ``r_o``, interpolated in the table
+        ``prior``."""
         return interpolate_table(self.prior.array, self.config.prior, r_o)
 
-    def set_prior_weight(self, mix: float) -> None:
-        """Let the share of the blind density be ``mix``."""
-        self.config = replace(self.config, mix=mix)
+    def set_prior_weight(self, weight: float) -> None:
+        """Set the weight of the position-independent prior."""
+        self.config = replace(self.config, mix=weight)
 
 
-# ---- The kinds of gaze fields by the names that checkpoints give them ----
+# ---- Registry of gaze fields by their names in checkpoints ----
 
 Kind = TypeVar("Kind", bound=type[AnyGazeField])
 
@@ -383,40 +419,41 @@ _KINDS: dict[str, type[AnyGazeField]] = {}
 
 
 def register(cls: Kind) -> Kind:
-    """Have checkpoints of the kind ``cls.kind`` read by the class ``cls`` (a decorator)."""
+    """Register ``cls`` for checkpoints of the kind ``cls.kind`` (a decorator)."""
     _KINDS[cls.kind] = cls
     return cls
 
 
 def kinds() -> tuple[str, ...]:
-    """The names that are registered."""
+    """The registered names."""
     return tuple(_KINDS)
 
 
-def build_gaze_field(about: dict, box: AnyBox, arrays: Arrays) -> AnyGazeField:
-    """The gaze field that a checkpoint describes by ``about``, of its ``arrays``. Raises ``ValueError`` for a kind that
-    is not registered."""
-    # Checkpoints of the first version name no kind: there was one.
-    kind = about.get("kind", "product")
+def build_gaze_field(architecture: dict, box: AnyBox, arrays: Arrays) -> AnyGazeField:
+    """The gaze field with this ``architecture`` and the ``arrays`` of a checkpoint. Raises ``ValueError`` for an
+    unknown kind."""
+    # Checkpoints of the first version have no kind: there was only one.
+    kind = architecture.get("kind", "product")
     if kind not in _KINDS:
         raise ValueError(f'it is a gaze field of the kind "{sanitize(kind, 40)}", which this version does not know')
-    return _KINDS[kind].from_arrays(about, box, arrays)
+    return _KINDS[kind].from_arrays(architecture, box, arrays)
 
 
-def max_sizes_of(about: object) -> Mapping[str, int]:
-    """The largest sizes that a checkpoint may claim for the gaze field that it describes by ``about``; none for a kind
-    that is not registered, of which nothing is built."""
-    kind = about.get("kind", "product") if isinstance(about, dict) else None
+def max_sizes_of(architecture: object) -> Mapping[str, int]:
+    """Maximum sizes that a checkpoint with this ``architecture`` may contain; empty for an unknown kind, which is not
+    built."""
+    kind = architecture.get("kind", "product") if isinstance(architecture, dict) else None
     return _KINDS[kind].max_sizes if isinstance(kind, str) and kind in _KINDS else {}
 
 
-# ---- What people look at wherever they stand, the blind density, as a latitude-longitude table of its logarithm ----
+# ---- The position-independent prior as a latitude-longitude table of its logarithm ----
 
-_FLOOR = 1e-3  # Of the blind density that is uniform, so that its logarithm is finite
+_FLOOR = 1e-3  # Uniform fraction of the prior, which keeps its logarithm finite
 
 
 def interpolate_table(table, rows: int, d):
-    """Bilinear value of a flat latitude-longitude ``table`` (rows x 2 rows, texel centres, +z first) along ``d``."""
+    """Bilinear interpolation of a flat latitude-longitude ``table`` (rows x 2 rows, texel centres, +z first) along
+    ``d``."""
     Float = type(d.x)
     UInt32 = dr.uint32_array_t(Float)
     step, columns = dr.pi / rows, 2 * rows
@@ -432,7 +469,7 @@ def interpolate_table(table, rows: int, d):
 
 
 def table_directions(rows: int) -> np.ndarray:
-    """Directions (2 rows², 3) of the texels that ``look_up`` interpolates."""
+    """Directions (2 rows², 3) of the texels that `interpolate_table` uses."""
     theta, phi = np.meshgrid(
         (np.arange(rows) + 0.5) * np.pi / rows, (np.arange(2 * rows) + 0.5) * np.pi / rows, indexing="ij"
     )
@@ -440,29 +477,32 @@ def table_directions(rows: int) -> np.ndarray:
 
 
 def make_prior_table(density: np.ndarray, rows: int, ns: ModuleType, directions: np.ndarray) -> np.ndarray:
-    """Log table (rows, 2 rows) of a blind density given at ``table_directions(rows)``, 1/sr.
+    """Log table (rows, 2 rows) of a position-independent ``density`` (1/sr) in the directions
+    ``table_directions(rows)``.
 
-    A thousandth of it is uniform. Scaled so that what ``look_up`` makes of it integrates to one over ``directions`` (N,
-    3), a fine set of equal area.
+    A thousandth of it is uniform. Scaled so that its interpolant integrates to one over ``directions`` (N, 3), a fine
+    set of equal area.
     """
     density = np.asarray(density, np.float64)
     log = np.log((1 - _FLOOR) * density + _FLOOR / (4 * np.pi))
     d = to_vector(ns.Array3f, directions)
-    found = np.asarray(dr.exp(interpolate_table(ns.Float(log.astype(np.float32)), rows, d)), np.float64)
-    return (log - np.log(4 * np.pi * found.mean())).reshape(rows, 2 * rows).astype(np.float32)
+    values = np.asarray(dr.exp(interpolate_table(ns.Float(log.astype(np.float32)), rows, d)), np.float64)
+    return (log - np.log(4 * np.pi * values.mean())).reshape(rows, 2 * rows).astype(np.float32)
 
 
 # ---- Ensembles ----
 #
-# Several gaze fields for one: their mean is the gaze, their spread says how far the data decides it. Members are
-# trained alike on resamples of the people (bagging, Breiman 1996; deep ensembles, Lakshminarayanan et al. 2017).
+# The mean of several gaze fields is the gaze; their standard deviation estimates its uncertainty. Members are trained
+# alike on bootstrap samples of the participants (bagging, Breiman 1996; deep ensembles, Lakshminarayanan et al. 2017).
 
 
 @register
 class GazeEnsemble(AnyGazeField):
-    """``members``: two or more fields of one kind, variant and box. Raises ``ValueError`` where they differ in these.
+    """The mean of ``members``: two or more fields of one kind, variant and box. Raises ``ValueError`` if they differ in
+    these.
 
-    ``config`` and ``box`` are those of the first member; ``support``: of the rays that all members' were drawn from.
+    ``config`` and ``box`` are those of the first member; ``support``: of all rays that the members' samples were drawn
+    from.
     """
 
     DRJIT_STRUCT: ClassVar[dict] = {"_members": None}
@@ -485,12 +525,18 @@ class GazeEnsemble(AnyGazeField):
         return self._members
 
     @classmethod
-    def from_arrays(cls, about: dict, box: AnyBox, arrays: Arrays) -> GazeEnsemble:
-        members = [arrays.get_member(i, member) for i, member in enumerate(about["members"])]
-        # Before any is built: a file may hold them one inside of another, without end.
+    def from_arrays(cls, architecture: dict, box: AnyBox, arrays: Arrays) -> GazeEnsemble:
+        members = [arrays.get_member(i, member) for i, member in enumerate(architecture["members"])]
+        # Before any member is built: a file can nest ensembles without end.
         if any("members" in member for member, _ in members):
             raise ValueError("a member of its ensemble is an ensemble itself, which this version does not read")
-        return cls([density for member, own in members for density in build_gaze_field(member, box, own).members])
+        return cls(
+            [
+                density
+                for member, member_arrays in members
+                for density in build_gaze_field(member, box, member_arrays).members
+            ]
+        )
 
     def architecture(self) -> dict:
         return {"kind": self.kind, "members": [m.architecture() for m in self.members]}
@@ -515,21 +561,21 @@ class GazeEnsemble(AnyGazeField):
             member.pack()
 
 
-def mean(found: list[tuple]) -> tuple:
-    """Means of the ``(gaze, emit, capture)`` of one or more members; that of gaze is not the product of the others."""
-    if len(found) == 1:
-        return found[0]
-    return tuple(sum(parts[1:], parts[0]) / len(found) for parts in zip(*found))
+def mean_over_members(values: list[tuple]) -> tuple:
+    """Mean ``(gaze, emit, capture)`` over one or more members; mean gaze is not the product of the other means."""
+    if len(values) == 1:
+        return values[0]
+    return tuple(sum(parts[1:], parts[0]) / len(values) for parts in zip(*values))
 
 
-def spread(found: list[tuple]) -> Float:
+def std_over_members(values: list[tuple]) -> Float:
     """Standard deviation of gaze over the ``(gaze, emit, capture)`` of two or more members (1/sr, N - 1 degrees of
     freedom)."""
-    gaze = mean(found)[0]
-    variance: Any = sum(dr.square(g - gaze) for g, _, _ in found) / (len(found) - 1)
-    # Where members agree, the root's derivative would not be finite.
-    apart = variance > 1e-30
-    return dr.select(apart, dr.sqrt(dr.select(apart, variance, 1)), 0)
+    gaze = mean_over_members(values)[0]
+    variance: Any = sum(dr.square(g - gaze) for g, _, _ in values) / (len(values) - 1)
+    # Where members agree, the derivative of the square root would not be finite.
+    is_nonzero = variance > 1e-30
+    return dr.select(is_nonzero, dr.sqrt(dr.select(is_nonzero, variance, 1)), 0)
 
 
 def _common(field: GazeHead) -> tuple:

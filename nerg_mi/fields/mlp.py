@@ -1,4 +1,5 @@
-"""Multilayer perceptrons: by Dr.Jit's neural networks or unrolled with constant weights, and the backend of arrays."""
+"""Multilayer perceptrons: Dr.Jit's neural networks, or unrolled with constant weights; and the array types of a
+backend."""
 
 from __future__ import annotations
 
@@ -12,18 +13,17 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 
-# ---- The Dr.Jit array types of one backend ----
+# ---- Array types of one backend ----
 #
-# A field belongs to one backend (LLVM or CUDA): its weights are arrays of that backend. Nothing here depends on the
-# Mitsuba variant in use, so that the code survives a change of variant; the types derive from arguments.
+# A field belongs to one backend (LLVM or CUDA): its weights are arrays of that backend. Types derive from arguments and
+# not from the current Mitsuba variant, so the code works across changes of the variant.
 
 
 def namespace(source: str | dr.ArrayBase | type[dr.ArrayBase] | None) -> ModuleType:
-    """Module holding the differentiable array types of a backend.
+    """Module with the differentiable array types of a backend: ``drjit.llvm.ad`` or ``drjit.cuda.ad``.
 
-    ``source``: the name of a Mitsuba variant (``"llvm_ad_rgb"``; None, where none is active, is one that cannot be
-    used), ``"llvm"``, ``"cuda"``, or any JIT array or array type. Returns ``drjit.llvm.ad`` or ``drjit.cuda.ad``.
-    Raises ``NergError`` for scalar variants, which have no JIT arrays.
+    ``source``: the name of a Mitsuba variant (``"llvm_ad_rgb"``; None if none is active), ``"llvm"``, ``"cuda"``, or
+    any JIT array or array type. Raises ``NergError`` for scalar variants, which have no JIT arrays, and for None.
     """
     if source is None or isinstance(source, str):
         name = source or "none"
@@ -43,33 +43,33 @@ def namespace(source: str | dr.ArrayBase | type[dr.ArrayBase] | None) -> ModuleT
 
 
 def is_cuda(ns: ModuleType) -> bool:
-    """True when ``ns`` is the CUDA backend, where networks run in fp16."""
+    """Whether ``ns`` is the CUDA backend, where networks run in fp16."""
     return ns.__name__.startswith("drjit.cuda")
 
 
-# ---- A network whose weights are constants of the kernel that evaluates it ----
+# ---- A network with constant weights ----
 #
-# Dr.Jit's cooperative vectors keep a layer's sums in memory while they read its weights, which on processors takes two
-# to three times as long as the products themselves. With the weights written into the kernel the sums stay in
-# registers. The products and their order are the same, and so are the results, to the bit. The price is compilation:
-# some seconds once for each kernel and each set of weights.
+# Dr.Jit's cooperative vectors keep the sums of a layer in memory while they read its weights, which on CPUs takes two
+# to three times as long as the products themselves. With literal weights in the kernel the sums stay in registers.
+# Products and their order are the same, so results are bit-identical. The cost is compilation: some seconds for each
+# kernel and each set of weights.
 
-_APART = 2048
-"""Products from which on a network becomes a function of its own within a kernel: compilers take more than
-proportionally long over long functions."""
+_MAX_INLINE_PRODUCTS = 2048
+"""Number of products above which a network becomes a separate function of the kernel: compile time grows more than
+linearly with the length of a function."""
 
 
-def evaluate(layers: Sequence[Sequence[Sequence[float]]], x: list) -> list:
+def evaluate_with_constants(layers: Sequence[Sequence[Sequence[float]]], x: list) -> list:
     """Outputs (list of Floats) at ``x`` (list of Floats) of a ReLU network of ``layers``: weights [output][input]."""
-    if sum(len(layer) * len(layer[0]) for layer in layers) <= _APART:
+    if sum(len(layer) * len(layer[0]) for layer in layers) <= _MAX_INLINE_PRODUCTS:
         return _unrolled(layers, x)
     Float = type(x[0])
     UInt32 = dr.uint32_array_t(Float)
-    which = UInt32(0)
-    # A function that is known to be the only one is inlined.
-    dr.make_opaque(which)
-    nothing = lambda *x: (Float(0),) * len(layers[-1])
-    return list(dr.switch(which, [lambda *x: tuple(_unrolled(layers, list(x))), nothing], *x))
+    target = UInt32(0)
+    # A function that is known to be the only target is inlined.
+    dr.make_opaque(target)
+    zero_outputs = lambda *x: (Float(0),) * len(layers[-1])
+    return list(dr.switch(target, [lambda *x: tuple(_unrolled(layers, list(x))), zero_outputs], *x))
 
 
 def _unrolled(layers: Sequence[Sequence[Sequence[float]]], x: list) -> list:
@@ -84,24 +84,26 @@ def _unrolled(layers: Sequence[Sequence[Sequence[float]]], x: list) -> list:
     return x
 
 
-# ---- Small fully connected networks, evaluated inside kernels or as tensor products ----
+# ---- Small fully connected networks, inside kernels or as matrix products ----
 #
-# Two execution modes share one set of weights: cooperative vectors (one fused kernel, best for rendering) and tensor
-# products (``X @ W^T`` on whole batches, whose weight gradient on the LLVM backend is several times cheaper than the
-# atomically accumulated outer products of cooperative vectors; best for training).
+# Two execution modes share one set of weights: cooperative vectors (one fused kernel, best for rendering) and matrix
+# products (``X @ W^T`` on whole batches, best for training: on the LLVM backend their weight gradient is several times
+# cheaper than the atomically accumulated outer products of cooperative vectors).
 
-_NORM_EPSILON = 1e-5  # torch's LayerNorm (Ba et al. 2016) adds it to the variance.
+_NORM_EPSILON = 1e-5  # torch's LayerNorm (Ba et al. 2016) adds it to the variance
 
 
 class MLP:
-    """ReLU network; the last layer is linear.
+    """ReLU network; the last layer is linear. Raises ``ValueError`` for layers with inconsistent shapes.
 
-    ``weights``: one TensorXf of shape (outputs, inputs) a layer, in fp32. On CUDA the cooperative-vector path converts
-    them to fp16, which the hardware's matrix units require; on LLVM fp16 is slower than fp32 and is not used.
-
-    ``norms``: None, or for each layer ``{"gain", "shift", "bias"}``, TensorXf of shapes (inputs,), (inputs,) and
-    (outputs,): its inputs go through torch's LayerNorm (gain and shift included) first, and the bias is added to what
-    it returns. Raises ``ValueError`` for layers that do not fit together.
+    Parameters
+    ----------
+    weights : list of TensorXf
+        One tensor (outputs, inputs) per layer, in fp32. On CUDA cooperative vectors use fp16, as the hardware's matrix
+        units require; on LLVM fp16 is slower than fp32 and is not used.
+    norms : list of dict, optional
+        For each layer ``{"gain", "shift", "bias"}``, TensorXf of shapes (inputs,), (inputs,) and (outputs,): inputs
+        pass torch's LayerNorm (with gain and shift) first, and the bias is added to the output.
     """
 
     DRJIT_STRUCT: ClassVar[dict[str, Any]] = {"weights": list, "norms": None, "_views": None, "buffer": None}
@@ -110,14 +112,14 @@ class MLP:
         self.weights = list(weights)
         self.norms: list[dict[str, Any]] | None = None if norms is None else [dict(n) for n in norms]
         self._views: Any = None
-        self.buffer = None  # What the kernels read: the packed weights of all layers, attached to ``weights``
-        # Whether they are constants of the kernels instead (``unrolled``), and these as numbers.
-        self.constant = False
+        self.buffer = None  # Packed weights of all layers, which kernels read; attached to ``weights``
+        # Whether kernels contain the weights as literals instead (`evaluate_with_constants`), and these as numbers.
+        self.has_constant_weights = False
         self._constants: list[list[list[float]]] | None = None
         for first, second in zip(self.weights, self.weights[1:]):
             if first.shape[0] != second.shape[1]:
                 raise ValueError(
-                    f"layers of this network do not fit together: shapes {[w.shape for w in self.weights]}"
+                    f"the layers of this network have inconsistent shapes: {[w.shape for w in self.weights]}"
                 )
         for w, norm in zip(self.weights, self.norms or []):
             shapes = {k: tuple(v.shape) for k, v in norm.items()}
@@ -142,19 +144,19 @@ class MLP:
                 )
         return MLP(weights, norms or None)
 
-    def require(self, sizes: list[int], name: str, normalized: bool = False) -> None:
-        """``ValueError`` unless the layers have ``sizes`` [inputs, ..., outputs] and are ``normalized`` or not."""
+    def check_sizes(self, sizes: list[int], name: str, normalized: bool = False) -> None:
+        """Raise ``ValueError`` unless layers have ``sizes`` [inputs, ..., outputs] and the given normalisation."""
         shapes, expected = [tuple(w.shape) for w in self.weights], [(o, i) for i, o in zip(sizes, sizes[1:])]
         if shapes != expected:
-            raise ValueError(f'"{name}" has layers of shapes {shapes} where its architecture needs {expected}')
+            raise ValueError(f'"{name}" has layers of shapes {shapes}, but its architecture needs {expected}')
         if normalized != (self.norms is not None):
             raise ValueError(
                 f'"{name}" {"lacks" if normalized else "has"} layer normalisation, unlike its architecture'
             )
 
     def named(self) -> dict:
-        """Arrays by name: ``"0"``, ``"1"``, ...: weights; ``"0.gain"``, ``"0.shift"``, ``"0.bias"`` of normalised
-        ones."""
+        """Arrays by name: weights ``"0"``, ``"1"``, ...; ``"0.gain"``, ``"0.shift"``, ``"0.bias"`` of normalised
+        layers."""
         out = {}
         for i, w in enumerate(self.weights):
             out[str(i)] = w
@@ -163,7 +165,7 @@ class MLP:
         return out
 
     def replace(self, name: str, value) -> None:
-        """Put ``value`` in the place of the array ``name``; ``pack`` makes it count."""
+        """Replace the array ``name`` by ``value``; takes effect with `pack`."""
         layer, _, part = name.partition(".")
         if part and self.norms is not None:
             self.norms[int(layer)][part] = value
@@ -172,22 +174,22 @@ class MLP:
 
     @property
     def inputs(self) -> int:
-        """Numbers that the first layer takes."""
+        """Number of inputs of the first layer."""
         return self.weights[0].shape[1]
 
     @property
     def outputs(self) -> int:
-        """Numbers that the last layer returns."""
+        """Number of outputs of the last layer."""
         return self.weights[-1].shape[0]
 
     def pack(self) -> None:
-        """Refresh what the kernels read after a change of ``weights``; gradients flow through."""
+        """Update what the kernels read after a change of ``weights``; gradients flow through."""
         self._constants = None
         ns = namespace(self.weights[0])
         weights = self.weights
         if self.norms is not None:
-            # Gain and shift are part of the next product: W (g x + s) + b = (W g) x + (W s + b).
-            folded = [_folded(w, norm) for w, norm in zip(weights, self.norms)]
+            # Gain and shift are folded into the next product: W (g x + s) + b = (W g) x + (W s + b).
+            folded = [_fold_norm(w, norm) for w, norm in zip(weights, self.norms)]
             weights = [array for pair in folded for array in pair]
         weights = [ns.TensorXf16(w) if is_cuda(ns) else w for w in weights]
         packed: Any = nn.pack(*weights, layout="training")
@@ -200,13 +202,13 @@ class MLP:
             self.pack()
         ns = namespace(self.weights[0])
         half = is_cuda(ns)
-        # Cooperative vectors do not sum the derivatives of a lane that is shared by all the others.
+        # Cooperative vectors do not sum the gradients of a broadcast lane.
         width = max(dr.width(c) for c in x)
         x = [c + dr.zeros(ns.Float, width) if dr.width(c) < width else c for c in x]
-        if self.constant and self._may_be_constant(x, ns):
+        if self.has_constant_weights and self._may_be_constant(x, ns):
             if self._constants is None:
                 self._constants = [w.numpy().tolist() for w in self.weights]
-            return evaluate(self._constants, x)
+            return evaluate_with_constants(self._constants, x)
         if self.norms is not None:
             return self._normalized(x, ns, half)
         views: Any = self._views
@@ -219,7 +221,7 @@ class MLP:
         return [ns.Float(c) for c in out] if half else out
 
     def _may_be_constant(self, x: list, ns: ModuleType) -> bool:
-        """Whether nothing asks for the weights themselves: derivatives, a recording, a device's units, a norm."""
+        """Whether constant weights are possible: no gradients, recording, CUDA or layer normalisation."""
         if is_cuda(ns) or self.norms is not None or dr.flag(dr.JitFlag.FreezingScope):
             return False
         return not dr.grad_enabled(self.weights, x)
@@ -236,10 +238,10 @@ class MLP:
         return x
 
     def tensor(self, x: Any) -> Any:
-        """Outputs (N, outputs) at inputs ``x`` (N, inputs), both TensorXf, as tensor products.
+        """Outputs (N, outputs) at inputs ``x`` (N, inputs), both TensorXf, as matrix products.
 
-        Points by rows: the numbers of a point side by side are what Dr.Jit's products of matrices read quickest, by a
-        factor of up to two in the derivatives.
+        One point per row: Dr.Jit's matrix products are fastest with the inputs of a point adjacent in memory, by up to
+        a factor of two in the derivatives.
         """
         for i, w in enumerate(self.weights):
             if self.norms is None:
@@ -247,7 +249,7 @@ class MLP:
             else:
                 x = x - dr.reshape(type(x), dr.mean(x, axis=1), (-1, 1))
                 x = x * dr.reshape(type(x), dr.rsqrt(dr.mean(x * x, axis=1) + _NORM_EPSILON), (-1, 1))
-                w, bias = _folded(w, self.norms[i])
+                w, bias = _fold_norm(w, self.norms[i])
                 x = _products(x, w) + bias
             if i + 1 < len(self.weights):
                 x = dr.maximum(x, 0)
@@ -258,17 +260,17 @@ def _products(x: Any, w: Any) -> Any:
     return dr.matmul(x, w, Bt=True)
 
 
-def _folded(w, norm: dict[str, Any]) -> tuple:
-    """Weights and bias of a layer with the gain and shift of its inputs in them."""
+def _fold_norm(w, norm: dict[str, Any]) -> tuple:
+    """Weights and bias of a layer with the gain and shift of its inputs folded in."""
     return w * norm["gain"], norm["bias"] + dr.sum(w * norm["shift"], axis=1)
 
 
-def set_constant_weights(field: Any, constant: bool = True) -> None:
-    """Whether the networks of ``field`` (its ``mlps``; of an ensemble all members') are evaluated with their weights as
-    constants of the kernel.
+def set_constant_weights(field: Any, enabled: bool = True) -> None:
+    """Evaluate the networks of ``field`` (its ``mlps``; of an ensemble all members') with weights as literals of the
+    kernel.
 
-    It holds for processors, where nothing is differentiated and no function is recorded by ``dr.freeze``; elsewhere,
-    and of networks with normalised layers, evaluations are as before. New weights take a new compilation.
+    Applies on CPUs, without gradients, outside of ``dr.freeze`` and without layer normalisation; other evaluations are
+    unchanged. New weights require a new compilation.
     """
     for net in field.mlps:
-        net.constant = constant
+        net.has_constant_weights = enabled

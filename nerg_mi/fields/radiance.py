@@ -1,4 +1,4 @@
-"""Radiance fields: density and colour networks, the head of colours, and the background."""
+"""Radiance fields: density and colour networks, deferred shading, and the background."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.maths.types import Bool, Float
 from nerg_mi.ranges import MAX_COORDINATE, POSITIVE_VALUES
 
-from .encoding import Encoding, EncodingConfig, HashGridConfig, encode_direction, encoding_config, random_encoding
+from .encoding import Encoding, EncodingConfig, HashGridConfig, config_from_dict, encode_direction, init_encoding
 from .mlp import MLP, namespace
 from .occupancy import CascadeGrid, OccupancyGrid, RefinedGrid
 
@@ -23,14 +23,14 @@ if TYPE_CHECKING:
 
 # ---- Background ----
 #
-# Colour behind everything, on a sphere around the scene: torch-ngp's background network.
+# Colour behind the scene, on a surrounding sphere: torch-ngp's background network.
 #
-# The ray's far intersection with the sphere, as two angles, goes through a small 2-D hash grid; its features
-# and the harmonics of the direction go through a small network to a colour (``NeRFNetwork.background`` there).
+# The ray's far intersection with the sphere, as two angles, passes a small 2-D hash grid; its features and the
+# harmonics of the direction pass a small network to a colour (``NeRFNetwork.background`` in torch-ngp).
 
 
 class GridConfig:
-    """Base of frozen dataclasses of sizes with an encoding ``grid``, which a checkpoint keeps as a JSON object."""
+    """Base of frozen dataclasses of sizes with an encoding ``grid``, stored in checkpoints as JSON objects."""
 
     grid: EncodingConfig
 
@@ -39,18 +39,18 @@ class GridConfig:
 
     @classmethod
     def from_dict(cls, d: dict[str, Any]) -> Self:
-        """The configuration that ``to_dict`` made ``d`` of. Raises ``KeyError``, ``TypeError`` or ``ValueError``."""
-        return cls(**{**d, "grid": encoding_config(d["grid"])})
+        """The inverse of ``to_dict``. Raises ``KeyError``, ``TypeError`` or ``ValueError`` for invalid data."""
+        return cls(**{**d, "grid": config_from_dict(d["grid"])})
 
 
 @dataclass(frozen=True)
 class BackgroundConfig(GridConfig):
-    """Sizes of a background. The defaults are torch-ngp's. Raises ``ValueError`` for sizes that none has."""
+    """Sizes of a background. The defaults are torch-ngp's. Raises ``ValueError`` for invalid sizes."""
 
-    radius: float  # Of the sphere about the field's origin, in the field's units
-    # The encoding of the two angles.
+    radius: float  # Radius of the sphere about the field's origin, in the field's units
+    # The encoding of both angles.
     grid: EncodingConfig = field(default_factory=lambda: HashGridConfig(levels=4, dimensions=2))
-    width: int = 64  # Neurons of every hidden layer
+    width: int = 64  # Neurons of each hidden layer
     hidden: int = 1  # Hidden layers
     sh_degree: int = 4  # Degree of the encoding of directions
 
@@ -67,28 +67,28 @@ class BackgroundConfig(GridConfig):
 
 
 class Background:
-    """Colour (0..1, in the colour space of its radiance field) that rays meet behind the field.
+    """Colour (0..1, in the colour space of its radiance field) behind the field.
 
-    Raises ``ValueError`` for parts that are not those of ``config``.
+    Raises ``ValueError`` for parts that do not match ``config``.
     """
 
     DRJIT_STRUCT: ClassVar[dict[str, Any]] = {"grid": None, "net": None}
 
     def __init__(self, config: BackgroundConfig, grid: Encoding, net: MLP):
-        grid.require(config.grid)
-        net.require(config.sizes, "background_net")
+        grid.check_config(config.grid)
+        net.check_sizes(config.sizes, "background_net")
         self.config, self.grid, self.net = config, grid, net
 
     @staticmethod
     def random(config: BackgroundConfig, ns: ModuleType, seed: int = 0) -> Background:
         """An untrained background; equal seeds give equal weights."""
         rng = np.random.default_rng(seed)
-        return Background(config, random_encoding(config.grid, ns, rng), MLP.random(config.sizes, ns, rng))
+        return Background(config, init_encoding(config.grid, ns, rng), MLP.random(config.sizes, ns, rng))
 
     def coordinates(self, o, d) -> list:
         """[2 θ / π - 1, φ / π] where the ray ``o + t d`` (unit ``d``) leaves the sphere; θ from +y, φ from +x to +z."""
         b = dr.dot(o, d)
-        # A ray that misses the sphere takes the point of it nearest to its own nearest point.
+        # A ray that misses the sphere takes the sphere's point nearest to its own nearest point.
         inside = dr.maximum(b * b - dr.squared_norm(o) + self.config.radius**2, 0)
         p = o + d * (dr.sqrt(inside) - b)
         theta = dr.atan2(dr.sqrt(p.x * p.x + p.z * p.z), p.y)
@@ -103,44 +103,44 @@ class Background:
         return type(d)(*[dr.fma(0.5, dr.tanh(0.5 * c), 0.5) for c in rgb])
 
 
-# ---- What the colour network of a radiance field is asked with, and how its answer becomes a colour ----
+# ---- Inputs and outputs of the colour network ----
 #
-# At every sample of a ray, c(g, d) = sigmoid(color_net(Y(d), g)). A deferred field asks once a ray:
+# For each sample of a ray, c(g, d) = sigmoid(color_net(Y(d), g)). A deferred field evaluates it once per ray:
 #
 #     C = α c(ḡ, d),   ḡ = Σ_i w_i g_i / α,   α = Σ_i w_i,   c(g, d) = sigmoid(l + color_net(Y(d), l, g_4..))
 #
-# with l = logit(g_1..3) and w_i the weights of volume rendering, after Hedman et al. 2021 ("Baking Neural Radiance
-# Fields for Real-Time View Synthesis", section 3): the first three features are a diffuse colour in 0..1, which
-# composites as any colour does, and to which the network adds what depends on the direction. There colours are added,
-# here their logits, so that the sum stays in 0..1.
+# with l = logit(g_1..3) and the weights w_i of volume rendering, after Hedman et al. 2021 ("Baking Neural Radiance
+# Fields for Real-Time View Synthesis", section 3): the first three features are a diffuse colour in 0..1, composited
+# like any colour, to which the network adds the view-dependent part. Hedman et al. add colours; here their logits are
+# added, so that the sum stays in 0..1.
 
-_MARGIN = 1e-3  # How near to 0 and 1 a diffuse colour is taken before its logit
+_MARGIN = 1e-3  # Margin of a diffuse colour from 0 and 1 before its logit
 
 
 def point_features(outputs: list[Float], deferred: bool) -> list[Float]:
-    """Features of points, of the ``outputs`` of the density net behind the log density: of a deferred field the first
-    three become its diffuse colour, in 0..1."""
+    """Features of points, from the ``outputs`` of the density net behind the log density. For a deferred field the
+    first three become its diffuse colour in 0..1."""
     return [*(sigmoid(x) for x in outputs[:3]), *outputs[3:]] if deferred else outputs
 
 
 def mean_features(sums: list[Float], opacity: Float) -> list[Float]:
-    """Features Σ w g / α of rays of ``opacity`` α that composited ``sums`` Σ w g; 0 where nothing absorbs."""
-    # Its square, which derivatives have, stays finite.
+    """Mean features Σ w g / α of rays with opacity α and composited ``sums`` Σ w g; 0 without absorption."""
+    # The derivative contains the square, which must stay finite.
     per = 1 / dr.maximum(opacity, 1e-12)
     return [s * per for s in sums]
 
 
 def color_network_inputs(features: list[Float], deferred: bool) -> list[Float]:
-    """What the colour net is given, behind the direction, for ``features``."""
+    """Inputs of the colour net for ``features``, behind the direction."""
     if not deferred:
         return features
-    # Not clipped, which would hold black and white fast.
+    # Not clipped: clipping would have no gradient at black and white.
     inside = [dr.fma(1 - 2 * _MARGIN, f, _MARGIN) for f in features[:3]]
     return [*(dr.log(x / (1 - x)) for x in inside), *features[3:]]
 
 
 def decode_color(outputs: list[Float], inputs: list[Float], deferred: bool) -> list[Float]:
-    """Colour (3 Floats in 0..1) of the colour net's ``outputs`` for its ``inputs`` (`color_network_inputs`)."""
+    """Colour (3 Floats in 0..1) from the colour net's ``outputs`` and its ``inputs`` (`color_network_inputs`)."""
     return [sigmoid(c + x) for c, x in zip(outputs, inputs)] if deferred else [sigmoid(c) for c in outputs]
 
 
@@ -150,25 +150,24 @@ def decode_color(outputs: list[Float], inputs: list[Float], deferred: bool) -> l
 #
 #     (h, g) = density_net(encoding(p)),   σ(p) = density_scale · exp(h),   c(p, d) = sigmoid(color_net(Y(d), g))
 #
-# with Y the spherical harmonics of the direction: NeRF (Mildenhall et al. 2020, section 3) in the architecture of
-# instant-ngp (Müller et al. 2022, section 5.4) as torch-ngp and the paper use it. The colour network is asked at every
-# sample of a ray, or once a ray of a deferred field: see ``color_head``.
+# with the spherical harmonics Y of the direction: NeRF (Mildenhall et al. 2020, section 3) in the architecture of
+# instant-ngp (Müller et al. 2022, section 5.4), as torch-ngp and the paper use it.
 
-_MAX_LOG_DENSITY = 30.0  # exp(30) is 1e13 per unit: opaque at any scale, and far from the overflow of fp32 (exp(88))
+_MAX_LOG_DENSITY = 30.0  # exp(30) is 1e13 per unit: opaque at any scale, and far below the overflow of fp32 (exp(88))
 
 
 @dataclass(frozen=True)
 class RadianceConfig(GridConfig):
-    """Sizes of the networks. The defaults are the paper's. Raises ``ValueError`` for sizes that no field has."""
+    """Sizes of the networks. The defaults are the paper's. Raises ``ValueError`` for invalid sizes."""
 
     grid: EncodingConfig = field(default_factory=HashGridConfig)  # The encoding of positions
-    width: int = 64  # Neurons of every hidden layer
+    width: int = 64  # Neurons of each hidden layer
     density_hidden: int = 1  # Hidden layers of the density net
     color_hidden: int = 2  # Hidden layers of the colour net
-    geometry: int = 15  # Features handed from the density net to the colour net
+    geometry: int = 15  # Features passed from the density net to the colour net
     sh_degree: int = 4  # Degree of the encoding of directions, which has sh_degree**2 numbers
-    density_scale: float = 1.0  # Density, in 1/unit, where the density net returns 0
-    # Whether the colour net is asked once a ray, with the features composited along it, of which three are a colour.
+    density_scale: float = 1.0  # Density in 1/unit for an output of 0 of the density net
+    # Whether the colour net is evaluated once per ray, on the composited features, of which three are a colour.
     deferred: bool = False
 
     def __post_init__(self):
@@ -194,41 +193,52 @@ class RadianceConfig(GridConfig):
         return [self.sh_degree**2 + self.geometry] + [self.width] * self.color_hidden + [3]
 
     def to_dict(self) -> dict[str, Any]:
-        """The JSON object that stands in a checkpoint. Where colour is not deferred it says nothing of it, so that
-        releases that know no deferred fields read it."""
+        """The JSON object for a checkpoint. ``deferred`` is only written if true, so that releases without deferred
+        fields can read other fields."""
         out = super().to_dict()
         if not self.deferred:
             del out["deferred"]
         return out
 
 
-def assign(field, values: dict) -> None:
-    """Replace parameters of a field by name, each by one of the same shape. Raises ``ValueError`` for others."""
-    known = field.parameters()
+def assign_parameters(field, values: dict) -> None:
+    """Replace parameters of a field by name, each by one of the same shape. Raises ``ValueError`` for unknown names and
+    other shapes."""
+    parameters = field.parameters()
     for name, value in values.items():
-        if name not in known:
-            raise ValueError(f'this field has no parameter "{name}"; it has {", ".join(known)}')
-        if value.shape != known[name].shape:
-            raise ValueError(f'"{name}" has shape {known[name].shape}, and cannot become one of {value.shape}')
+        if name not in parameters:
+            raise ValueError(f'this field has no parameter "{name}"; it has {", ".join(parameters)}')
+        if value.shape != parameters[name].shape:
+            raise ValueError(
+                f'"{name}" has the shape {parameters[name].shape}, not that of the new value, {value.shape}'
+            )
     for name, value in values.items():
         owner, part = name.split(".", 1)
         getattr(field, owner).replace(part, value)
 
 
 def density_from_log(h, scale: float):
-    """Density from the density net's first output, clamped well before fp32 overflows."""
+    """Density from the first output of the density net, clamped well below the overflow of fp32."""
     return scale * dr.exp(dr.minimum(h, _MAX_LOG_DENSITY))
 
 
 class RadianceField:
     """Density (1/unit) and colour at points of ``box``.
 
-    ``color_space``: ``"srgb"`` or ``"linear"``, the space in which samples are composited because the field was trained
-    in it. ``occupancy``: where density may exceed its threshold; None marches the whole box. ``march_step``: step
-    length, in units, that the field was trained with, and ``march_growth`` the share of their distance that steps were
-    at least, where the box is contracted. ``background``: colour behind the field where it was trained with
-    one: what a ray shows in ``color_space`` is then C + (1 - α) background(o, d). Raises ``ValueError`` for parts that
-    are not those of ``config``.
+    Raises ``ValueError`` for parts that do not match ``config``.
+
+    Parameters
+    ----------
+    occupancy : OccupancyGrid or RefinedGrid or CascadeGrid, optional
+        Cells whose density may exceed the grid's threshold. Default: the whole box is marched.
+    color_space : str
+        ``"srgb"`` or ``"linear"``: the space of the training, in which samples are composited.
+    march_step : float, optional
+        Step length of the training, in the field's units.
+    background : Background, optional
+        Colour behind the field: a ray shows C + (1 - α) background(o, d) in ``color_space``.
+    march_growth : float
+        Minimum step of the training as a fraction of the distance, for a contracted box.
     """
 
     DRJIT_STRUCT: ClassVar[dict[str, Any]] = {
@@ -255,9 +265,9 @@ class RadianceField:
     ):
         if color_space not in ("srgb", "linear"):
             raise ValueError(f'color_space must be "srgb" or "linear", got "{color_space}"')
-        grid.require(config.grid)
-        density_net.require(config.density_sizes, "density_net")
-        color_net.require(config.color_sizes, "color_net")
+        grid.check_config(config.grid)
+        density_net.check_sizes(config.density_sizes, "density_net")
+        color_net.check_sizes(config.color_sizes, "color_net")
         self.config, self.box, self.color_space = config, box, color_space
         self.grid, self.density_net, self.color_net = grid, density_net, color_net
         self.march_step, self.background = march_step, background
@@ -273,14 +283,14 @@ class RadianceField:
         return RadianceField(
             config,
             box,
-            random_encoding(config.grid, ns, rng),
+            init_encoding(config.grid, ns, rng),
             MLP.random(config.density_sizes, ns, rng),
             MLP.random(config.color_sizes, ns, rng),
             **kwargs,
         )
 
     def parameters(self) -> dict:
-        """Trainable arrays by name, as checkpoints and ``mi.traverse`` spell them."""
+        """Trainable arrays by name, as in checkpoints and ``mi.traverse``."""
         owners = ["grid", "density_net", "color_net"]
         if self.background is not None:
             owners += ["background_grid", "background_net"]
@@ -294,28 +304,30 @@ class RadianceField:
 
     @property
     def ns(self) -> ModuleType:
-        """Array types of the field's backend; see ``fields.mlp.namespace``."""
+        """Array types of the field's backend; see `fields.mlp.namespace`."""
         return namespace(self.density_net.weights[0])
 
     @property
     def background_grid(self) -> Encoding | None:
-        """The encoding of the background, under the name that its parameters have."""
+        """The encoding of the background, named like its parameters."""
         return self.background.grid if self.background is not None else None
 
     @property
     def background_net(self) -> MLP | None:
-        """The network of the background, under the name that its parameters have."""
+        """The network of the background, named like its parameters."""
         return self.background.net if self.background is not None else None
 
     def set_parameters(self, values: dict) -> None:
         """Replace arrays by name (any subset of ``parameters()``) and repack the networks."""
-        assign(self, values)
+        assign_parameters(self, values)
         self.pack()
 
     def pack(self) -> None:
-        """Refresh what the kernels read; call after any change of the weights.
+        """Update what the kernels read; call it after any change of the weights.
 
-        A refined occupancy becomes the one that it refines: it holds for the weights that it was made of."""
+        A refined occupancy grid is replaced by the grid that it refines: it is only valid for the weights that it was
+        computed from.
+        """
         if self.occupancy is not None:
             self.occupancy = self.occupancy.coarse
         for part in (self.grid, self.density_net, self.color_net):
@@ -323,7 +335,7 @@ class RadianceField:
         # Depth passes need one output of the last layer, not 1 + geometry of them.
         last = self.density_net.weights[-1]
         self._head = MLP(self.density_net.weights[:-1] + [last[0:1, :]])
-        self._head.constant = self.density_net.constant
+        self._head.has_constant_weights = self.density_net.has_constant_weights
         self._head.pack()
         if self.background is not None:
             self.background.grid.pack()
@@ -334,13 +346,13 @@ class RadianceField:
         return [*self.grid.kernel_parameters(), self.density_net.buffer, self.color_net.buffer, self._head.buffer]
 
     def density(self, p, active: Bool | bool = True):
-        """Density in 1/unit at ``p`` (Array3f, the field's units); 0 outside of the box."""
+        """Density in 1/unit at ``p`` (Array3f, the field's units); 0 outside the box."""
         inside = active & self.box.contains(p)
         h = self._head(self.grid(self.box.to_unit(p), inside))
         return dr.select(inside, self._density(h[0], p), 0)
 
     def _density(self, h, p):
-        """Density (1/unit) at ``p`` where the density net's first output is ``h``."""
+        """Density (1/unit) at ``p`` for the first output ``h`` of the density net."""
         return self.box.density_from_encoded(density_from_log(h, self.config.density_scale), p)
 
     def density_features(self, p, active: Bool | bool = True):
@@ -350,8 +362,10 @@ class RadianceField:
         return dr.select(inside, self._density(h[0], p), 0), point_features(h[1:], self.config.deferred)
 
     def color(self, features: list, d):
-        """Colour (Array3f in ``color_space``, 0..1) of a point with ``features``, seen along unit ``d``; of a deferred
-        field also that of an opaque ray along ``d`` with these features on average (``radiance.mean_features``)."""
-        given = color_network_inputs(features, self.config.deferred)
-        rgb = self.color_net(encode_direction(d, self.config.sh_degree) + given)
-        return type(d)(*decode_color(rgb, given, self.config.deferred))
+        """Colour (Array3f in ``color_space``, 0..1) of a point with ``features``, seen along unit ``d``.
+
+        For a deferred field also the colour of an opaque ray along ``d`` with these mean features (`mean_features`).
+        """
+        inputs = color_network_inputs(features, self.config.deferred)
+        rgb = self.color_net(encode_direction(d, self.config.sh_degree) + inputs)
+        return type(d)(*decode_color(rgb, inputs, self.config.deferred))

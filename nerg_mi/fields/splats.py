@@ -1,8 +1,8 @@
-"""Gaussian splats: a place as many small Gaussians, each with an opacity and a colour that depends on direction.
+"""Gaussian splats: a scene of many small Gaussians, each with an opacity and a view-dependent colour.
 
-Along a ray a Gaussian absorbs ``opacity exp(-r^2 / 2)`` of the light where it is densest, r its least distance from the
-centre in standard deviations (Kerbl et al. 2023; the peak along the ray as in Moenne-Loccoz et al. 2024, "3D Gaussian
-Ray Tracing"). Held as NumPy arrays: what rays meet of them is `nerg_mi.transport.splat_medium`'.
+A Gaussian absorbs ``opacity exp(-r^2 / 2)`` of the light where it is densest along the ray, with r the minimum distance
+from the centre in standard deviations (Kerbl et al. 2023; peak along the ray as in Moenne-Loccoz et al. 2024, "3D
+Gaussian Ray Tracing"). NumPy arrays; rays are traced by `nerg_mi.transport.splat_medium`.
 """
 
 from __future__ import annotations
@@ -13,32 +13,33 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from nerg_mi.maths.geometry import Similarity
-from nerg_mi.maths.sphere import SH_C0, HARMONIC_DEGREES, rotated_harmonics
+from nerg_mi.maths.sphere import HARMONIC_DEGREES, SH_C0, rotate_harmonics
 from nerg_mi.ranges import MAX_COORDINATE
 
-_LEAST_SCALE = 1e-9
-_LEAST_OPACITY = 1e-7
-_BLOCK = 1 << 14  # Gaussians that are normalised at once
+_MIN_SCALE = 1e-9
+_MIN_OPACITY = 1e-7
+_BLOCK = 1 << 14  # Gaussians that are normalised in one block
 
 
 @dataclass(frozen=True)
 class Splats:
-    """N Gaussians, activated: what they mean, not what a training stores. float32, in the file's own frame and units.
+    """N Gaussians with activated parameters (not the raw ones of a training). float32, in the file's own frame and
+    units.
 
-    Raises `ValueError` for shapes that do not fit, for numbers that are not finite, and for none at all. Rotations are
-    normalised, opacities clipped to [0, 1], scales to at least 1e-9.
+    Raises `ValueError` for inconsistent shapes, non-finite numbers, and no Gaussians at all. Rotations are normalised,
+    opacities clipped to [0, 1], scales to at least 1e-9.
     """
 
     centers: np.ndarray  # (N, 3)
     scales: np.ndarray  # Standard deviations along the Gaussian's own axes, (N, 3)
     rotations: np.ndarray  # Unit quaternions (N, 4), w first: from the Gaussian's own axes to the frame of the centres
-    opacities: np.ndarray  # Share of light that is absorbed on a ray through the centre, (N,)
-    # Coefficients of real spherical harmonics (`maths.sphere`), (N, K, 3) with K = 1, 4, 9 or 16: the colour seen
-    # along a unit direction d of the ray is max(0, 1/2 + sum_k c_k Y_k(d)), in the colour space of the training.
+    opacities: np.ndarray  # Fraction of light that is absorbed on a ray through the centre, (N,)
+    # Coefficients of real spherical harmonics (`maths.sphere`), (N, K, 3) with K = 1, 4, 9 or 16: the colour along a
+    # unit ray direction d is max(0, 1/2 + sum_k c_k Y_k(d)), in the colour space of the training.
     harmonics: np.ndarray
     extra: Mapping[str, np.ndarray] = field(default_factory=dict)  # Further columns of the file, (N,) each, by name
-    color_space: str = "srgb"  # Of the colours: "srgb" or "linear"
-    # What a reader had to guess, and what the file holds that is not used: a sentence each.
+    color_space: str = "srgb"  # Colour space: "srgb" or "linear"
+    # Assumptions of the reader, and ignored contents of the file: one sentence each.
     assumptions: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
@@ -53,38 +54,38 @@ class Splats:
         colors = np.asarray(self.harmonics, np.float32)
         if colors.ndim != 3 or len(colors) != n or colors.shape[1] not in HARMONIC_DEGREES or colors.shape[2] != 3:
             raise ValueError(
-                f"the harmonics of {n:,} Gaussians have the shape {colors.shape}, which is no degree from 0 to 3"
+                f"the harmonics of {n:,} Gaussians have the shape {colors.shape}, which is not of degree 0 to 3"
             )
         object.__setattr__(self, "harmonics", colors)
         if n == 0:
-            raise ValueError("there are no Gaussians in it")
+            raise ValueError("it contains no Gaussians")
         for name in (*shapes, "harmonics"):
             if not np.isfinite(getattr(self, name)).all():
-                raise ValueError(f"some of the {name} of its Gaussians are not finite (a splat editor removes these)")
+                raise ValueError(f"some of the {name} of its Gaussians are not finite (a splat editor can remove them)")
         for name in ("centers", "scales"):
             if not (np.abs(getattr(self, name)) <= MAX_COORDINATE).all():
                 raise ValueError(f"some of the {name} of its Gaussians are beyond {MAX_COORDINATE:g} units")
         object.__setattr__(self, "rotations", _normalized(self.rotations))
         object.__setattr__(self, "opacities", np.clip(self.opacities, 0, 1))
-        if self.scales.min() < _LEAST_SCALE:
-            object.__setattr__(self, "scales", np.maximum(self.scales, np.float32(_LEAST_SCALE)))
+        if self.scales.min() < _MIN_SCALE:
+            object.__setattr__(self, "scales", np.maximum(self.scales, np.float32(_MIN_SCALE)))
 
     def __len__(self) -> int:
         return len(self.centers)
 
     @property
     def degree(self) -> int:
-        """Of the harmonics: 0 to 3."""
+        """Degree of the harmonics: 0 to 3."""
         return HARMONIC_DEGREES[self.harmonics.shape[1]]
 
     def transform(self, to_world: Similarity) -> Splats:
-        """These Gaussians in another frame, harmonics and all."""
+        """These Gaussians in another frame, with rotated harmonics."""
         if to_world.is_identity:
             return self
         turn = to_world.matrix[:3, :3] / to_world.scale
         centers = self.centers @ to_world.matrix[:3, :3].T + to_world.matrix[:3, 3]
         rotations = multiply_quaternions(matrices_to_quaternions(turn), self.rotations.astype(np.float64))
-        colors = rotated_harmonics(self.harmonics, turn)
+        colors = rotate_harmonics(self.harmonics, turn)
         scales = self.scales * np.float32(to_world.scale)
         return replace(self, centers=centers, scales=scales, rotations=rotations, harmonics=colors)
 
@@ -94,23 +95,23 @@ class Splats:
 
 
 def _normalized(rotations: np.ndarray) -> np.ndarray:
-    """Quaternions (N, 4) of length 1. Raises `ValueError` where one has the length 0."""
+    """Quaternions (N, 4) normalised to length 1. Raises `ValueError` for a quaternion of length 0."""
     unit = np.empty_like(rotations)
     # In blocks: in double precision all of them would take more memory than the Gaussians.
-    for at in range(0, len(unit), _BLOCK):
-        block = rotations[at : at + _BLOCK].astype(np.float64)
+    for start in range(0, len(unit), _BLOCK):
+        block = rotations[start : start + _BLOCK].astype(np.float64)
         length = np.linalg.norm(block, axis=1, keepdims=True)
         if not (length > 0).all():
-            raise ValueError("some of its Gaussians have a rotation of length 0 (a splat editor removes these)")
-        unit[at : at + _BLOCK] = block / length
+            raise ValueError("some of its Gaussians have a rotation of length 0 (a splat editor can remove them)")
+        unit[start : start + _BLOCK] = block / length
     return unit
 
 
 def concatenate_splats(parts: Sequence[Splats]) -> Splats:
-    """All Gaussians of ``parts``, without further columns. Raises `ValueError` for several degrees of harmonics, and
-    for several colour spaces."""
+    """All Gaussians of ``parts``, without further columns. Raises `ValueError` for different degrees of harmonics or
+    colour spaces."""
     if len({(splats.degree, splats.color_space) for splats in parts}) > 1:
-        raise ValueError("its splats have harmonics of several degrees, or several colour spaces")
+        raise ValueError("its splats have different degrees of harmonics or different colour spaces")
     names = ("centers", "scales", "rotations", "opacities", "harmonics")
     arrays = {name: np.concatenate([getattr(splats, name) for splats in parts]) for name in names}
     notes = tuple(dict.fromkeys(note for splats in parts for note in splats.notes))
@@ -120,30 +121,30 @@ def concatenate_splats(parts: Sequence[Splats]) -> Splats:
 def splats_from_raw_parameters(
     centers: np.ndarray, log_scales: np.ndarray, rotations: np.ndarray, logits: np.ndarray, harmonics: np.ndarray
 ) -> Splats:
-    """Splats of what a training stores: logarithms of the scales, logits of the opacities; quaternions w first."""
+    """Splats from the raw parameters of a training: log scales, logits of opacities; quaternions w first."""
     return Splats(centers, scales_from_logs(log_scales), rotations, opacities_from_logits(logits), harmonics)
 
 
 def scales_from_logs(logarithms: np.ndarray) -> np.ndarray:
-    """Scales, float64, of their ``logarithms``."""
+    """Scales (float64) from their logarithms."""
     with np.errstate(over="ignore"):
         return np.exp(np.asarray(logarithms, np.float64))
 
 
 def opacities_from_logits(logits: np.ndarray) -> np.ndarray:
-    """Opacities, float64, of their ``logits``."""
+    """Opacities (float64) from their logits."""
     with np.errstate(over="ignore"):
         return 1 / (1 + np.exp(-np.asarray(logits, np.float64)))
 
 
 def logits_from_opacities(opacities: np.ndarray) -> np.ndarray:
-    """Logits of ``opacities``, float64, of which those that are 0 or 1 are kept finite."""
-    p = np.clip(np.asarray(opacities, np.float64), _LEAST_OPACITY, 1 - _LEAST_OPACITY)
+    """Logits (float64) of ``opacities``; those of 0 and 1 are kept finite."""
+    p = np.clip(np.asarray(opacities, np.float64), _MIN_OPACITY, 1 - _MIN_OPACITY)
     return np.log(p) - np.log1p(-p)
 
 
 def harmonics_from_colors(colors: np.ndarray) -> np.ndarray:
-    """Harmonics of degree 0, (N, 1, 3), of ``colors`` (N, 3) that are the same from everywhere."""
+    """Harmonics of degree 0, (N, 1, 3), for view-independent ``colors`` (N, 3)."""
     return ((np.asarray(colors, np.float64) - 0.5) / SH_C0)[:, None]
 
 
@@ -159,14 +160,15 @@ def quaternions_to_matrices(quaternions: np.ndarray) -> np.ndarray:
 
 
 def matrices_to_quaternions(rotations: np.ndarray) -> np.ndarray:
-    """The quaternions (N, 4), or (4,), w first, of rotation matrices (N, 3, 3), or (3, 3)."""
+    """Quaternions (N, 4) or (4,), w first, of rotation matrices (N, 3, 3) or (3, 3)."""
     from scipy.spatial.transform import Rotation
 
     return Rotation.from_matrix(rotations).as_quat()[..., [3, 0, 1, 2]]
 
 
 def multiply_quaternions(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The products (N, 4) of quaternions ``a`` and ``b`` ((4,) or (N, 4) each), w first: first ``b``, then ``a``."""
+    """Products (N, 4) of quaternions ``a`` and ``b`` ((4,) or (N, 4) each), w first: ``b`` is applied first, then
+    ``a``."""
     aw, ax, ay, az = np.moveaxis(np.asarray(a), -1, 0)
     bw, bx, by, bz = np.moveaxis(np.asarray(b), -1, 0)
     return np.stack(

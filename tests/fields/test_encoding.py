@@ -11,17 +11,17 @@ import pytest
 from nerg_mi.fields.encoding import (
     HashGrid,
     HashGridConfig,
+    config_from_dict,
     config_type,
     encode_direction,
-    encoding_config,
     encoding_from_parameters,
-    random_encoding,
+    init_encoding,
     register,
 )
 from tests.reference import fields_numpy as reference
 from tests.reference import hashgrid_numpy as reference_hashgrid
 
-# ---- Direction encoding against the formulas of the spherical harmonics ----
+# ---- Direction encoding against the formulas of spherical harmonics ----
 
 
 def directions(n=200):
@@ -31,7 +31,7 @@ def directions(n=200):
 
 
 @pytest.mark.parametrize("degree", [1, 2, 3, 4])
-def test01_values(degree):
+def test01_harmonics_match_scipy_values(degree):
     d = directions()
     out = encode_direction(ns.Array3f(d.T), degree)
     assert len(out) == degree**2
@@ -46,7 +46,7 @@ def test03_degree_out_of_range(degree):
         encode_direction(ns.Array3f(0, 0, 1), degree)
 
 
-# ---- The hash grid against a restatement of torch-ngp's kernel, its published sizes, and central differences ----
+# ---- The hash grid against a reference of torch-ngp's kernel, its published sizes, and central differences ----
 
 SMALL = HashGridConfig(levels=4, log2_rows=12, base=4, finest=64)
 
@@ -71,12 +71,12 @@ def evaluate(grid, points):
     return np.stack([f.numpy() for f in grid(ns.Array3f(points.T))], -1)
 
 
-# The paper's NeRF is 2048 x bound, its gaze grid 256 x bound (nerg-method.md, section 4).
+# The paper's NeRF is 2048 x bound, its gaze grid 256 x bound.
 @pytest.mark.parametrize(
     "finest, rows",
     [(2048, 6_119_864), (4096, 6_328_848), (10240, 6_589_272), (256, 4_555_440), (512, 5_291_984), (1280, 5_842_848)],
 )
-def test01_sizes_are_those_of_torch_ngp(finest, rows):
+def test01_sizes_match_torch_ngp(finest, rows):
     config = HashGridConfig(finest=finest)
     assert config.offsets()[-1] == rows
     assert config.level_rows() == reference_hashgrid.rows_of_levels(16, 16, finest, 19)
@@ -85,8 +85,8 @@ def test01_sizes_are_those_of_torch_ngp(finest, rows):
 
 
 @pytest.mark.parametrize("finest, dense", [(2048, 5), (4096, 5), (10240, 4), (256, 9), (512, 7), (1280, 6)])
-def test02_which_levels_are_dense(finest, dense):
-    # Level 6 of finest 512 has a table of 66^3 rows and a stride of 65: dense all the same.
+def test02_dense_levels(finest, dense):
+    # Level 6 of finest 512 has a table of 66^3 rows and a stride of 65, and is dense.
     config = HashGridConfig(finest=finest)
     grid = HashGrid.__new__(HashGrid)
     grid.config = config
@@ -128,7 +128,7 @@ def test05_faces_edges_and_corners_do_not_alias():
     expected = reference_hashgrid.features(points, table, **spec(SMALL))
     got = evaluate(grid, points)
     assert np.abs(got - expected).max() <= 1e-6 * np.abs(table).max()
-    # The last vertex of a dense level is one of its own, not the first of the next line.
+    # The last vertex of a dense level is not the first of the next line.
     r = int(np.ceil(SMALL.level_scales()[0])) + 2
     assert r == 5 and np.abs(got[15, 0] - got[0, 0]) > 1e-3
 
@@ -155,7 +155,7 @@ def test06_zero_outside_with_zero_gradient(point):
     assert not np.any(dr.grad(grid.table).numpy())
 
 
-def test07_masked_lanes_give_zero():
+def test07_masked_lanes_are_zero():
     _, grid = random_grid(SMALL)
     out = grid(ns.Array3f(0.3, 0.4, ns.Float([0.5, 0.5])), ns.Bool([True, False]))
     assert out[0].numpy()[0] != 0 and all(f.numpy()[1] == 0 for f in out)
@@ -214,13 +214,13 @@ def test11_wrong_sizes_are_named(wrong, words):
         HashGridConfig(**wrong)
 
 
-def test12_a_table_of_the_wrong_length_is_refused():
+def test12_table_of_wrong_length_is_refused():
     with pytest.raises(ValueError, match="has 10 entries"):
         HashGrid(SMALL, dr.zeros(ns.Float, 10))
 
 
-def test13_an_evaluation_leaves_no_cycles():
-    """Arrays in a reference cycle stay until Python looks for cycles, which it hardly ever does for so few objects."""
+def test13_evaluation_leaves_no_reference_cycles():
+    """Arrays in a reference cycle stay until garbage collection, which is rare for so few objects."""
     _, grid = random_grid(SMALL)
     evaluate(grid, np.zeros((4, 3)))
     gc.disable()
@@ -231,30 +231,30 @@ def test13_an_evaluation_leaves_no_cycles():
             for _ in range(count):
                 evaluate(grid, np.zeros((4, 3)))
             cycles.append(gc.collect())
-        # What another thread of the process leaves meanwhile does not grow with the evaluations.
+        # Garbage of other threads does not grow with the evaluations.
         assert cycles[1] < 5 or cycles[1] <= cycles[0]
     finally:
         gc.enable()
 
 
-# ---- The register of encodings: kinds in files, and what is no encoding ----
+# ---- The registry of encodings: kinds in files, and invalid ones ----
 
 CONFIG = HashGridConfig(levels=2, log2_rows=6, base=2, finest=4)
 
 
-def test_a_configuration_without_a_kind_is_a_hash_grid():
-    assert encoding_config(CONFIG.to_dict()) == CONFIG and "kind" not in CONFIG.to_dict()
-    assert encoding_config({"kind": "hashgrid", **CONFIG.to_dict()}) == CONFIG
+def test_configuration_without_kind_is_a_hash_grid():
+    assert config_from_dict(CONFIG.to_dict()) == CONFIG and "kind" not in CONFIG.to_dict()
+    assert config_from_dict({"kind": "hashgrid", **CONFIG.to_dict()}) == CONFIG
     assert config_type({}) is HashGridConfig
 
 
 @pytest.mark.parametrize("kind", ["permutohedral", 3, None, ["hashgrid"]])
-def test_an_unknown_kind_is_named(kind):
+def test_unknown_kind_is_named(kind):
     with pytest.raises(ValueError, match="version does not know"):
-        encoding_config({"kind": kind})
+        config_from_dict({"kind": kind})
 
 
-def test_a_kind_has_one_encoding():
+def test_duplicate_kind_is_refused():
     @dataclass(frozen=True)
     class Other(HashGridConfig):
         pass
@@ -264,8 +264,8 @@ def test_a_kind_has_one_encoding():
     register(HashGridConfig, HashGrid)
 
 
-def test_encodings_by_configuration():
-    grid = random_encoding(CONFIG, ns, np.random.default_rng(1))
+def test_encoding_from_configuration():
+    grid = init_encoding(CONFIG, ns, np.random.default_rng(1))
     same = HashGrid.random(CONFIG, ns, np.random.default_rng(1))
     assert np.array_equal(grid.table.numpy(), same.table.numpy())
     parameters = {"behind.table": grid.table, "grid.table": grid.table * 0}

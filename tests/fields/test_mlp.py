@@ -14,16 +14,16 @@ from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.gaze_base import GazeEnsemble
 from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
 from nerg_mi.fields.gaze_product import GazeConfig, GazeField
-from nerg_mi.fields.mlp import MLP, evaluate, is_cuda, namespace, set_constant_weights
+from nerg_mi.fields.mlp import MLP, evaluate_with_constants, is_cuda, namespace, set_constant_weights
 from nerg_mi.fields.radiance import RadianceConfig, RadianceField
 from nerg_mi.maths.geometry import Box
-from nerg_mi.transport.jit import no_collection
+from nerg_mi.transport.jit import gc_paused
 from tests.reference import fields_numpy as reference
 
-# ---- The array types of a backend, and arrays at addresses that Dr.Jit reads fast ----
+# ---- The array types of a backend, and aligned arrays ----
 
 
-def test_types_of_a_variant_or_an_array(rgb):
+def test_namespace_of_a_variant_or_an_array(rgb):
     for source in ("llvm_ad_rgb", "llvm", drjit.llvm.ad.Float, drjit.llvm.ad.Float(1), rgb.Point3f, rgb.TensorXf):
         assert namespace(source) is drjit.llvm.ad
     for source in ("cuda_ad_spectral", "cuda", drjit.cuda.ad.Float):
@@ -32,19 +32,19 @@ def test_types_of_a_variant_or_an_array(rgb):
 
 
 @pytest.mark.parametrize("source", ["scalar_rgb", drjit.scalar.Array3f])
-def test_scalar_variants_have_none(source):
+def test_scalar_variants_are_refused(source):
     with pytest.raises(NergError, match='"llvm_ad_rgb"'):
         namespace(source)
 
 
-# ---- Networks: cooperative vectors, tensor products and NumPy agree, with their gradients ----
+# ---- Networks: cooperative vectors, matrix products and NumPy agree, with their gradients ----
 
 SIZES = [[3, 1], [8, 16, 5], [6, 16, 16, 3]]
 
 
 def evaluated_backwards(net, x, mix, mode):
-    """Outputs (N, outputs) at ``x`` (N, inputs), as cooperative vectors ("coop") or tensor products; the weights get
-    the derivatives of their sum weighted by ``mix`` (N, outputs)."""
+    """Outputs (N, outputs) at ``x`` (N, inputs), as cooperative vectors ("coop") or matrix products; the weights get
+    the gradients of their sum weighted by ``mix`` (N, outputs)."""
     dr.enable_grad(list(net.named().values()))
     net.pack()
     if mode == "coop":
@@ -65,7 +65,7 @@ def make(sizes, n=50):
 
 
 @pytest.mark.parametrize("sizes", SIZES)
-def test01_three_ways_agree(sizes):
+def test01_execution_modes_agree(sizes):
     net, weights, x = make(sizes)
     expected = reference.mlp(x, weights)
     coop = np.stack([o.numpy() for o in net([ns.Float(c) for c in x.T])], -1)
@@ -75,7 +75,7 @@ def test01_three_ways_agree(sizes):
     assert (net.inputs, net.outputs) == (sizes[0], sizes[-1])
 
 
-def test03_pack_takes_up_changed_weights():
+def test03_pack_applies_changed_weights():
     net, weights, x = make([8, 16, 5])
     inputs = [ns.Float(c) for c in x.T]
     before = net(inputs)[0].numpy()
@@ -84,12 +84,12 @@ def test03_pack_takes_up_changed_weights():
     assert np.allclose(net(inputs)[0].numpy(), 2 * before, rtol=1e-6)
 
 
-def test05_layers_that_do_not_fit():
-    with pytest.raises(ValueError, match="do not fit together"):
+def test05_inconsistent_layers_are_refused():
+    with pytest.raises(ValueError, match="inconsistent shapes"):
         MLP([dr.zeros(ns.TensorXf, (4, 3)), dr.zeros(ns.TensorXf, (2, 5))])
 
 
-def test06_inputs_of_one_and_of_many_lanes():
+def test06_broadcast_inputs():
     net, weights, x = make([3, 8, 2], n=5)
     one = ns.Float(0.25)
     dr.enable_grad(one)
@@ -104,7 +104,7 @@ def test06_inputs_of_one_and_of_many_lanes():
 
 @pytest.mark.parametrize("mode", ["coop", "tensor"])
 def test07_layer_normalisation(mode):
-    # Values and the gradients of every array against a restatement and its central differences.
+    # Values and gradients of all arrays against a reference and its central differences.
     rng = np.random.default_rng(2)
     net = MLP.random([5, 16, 3], ns, rng, normalized=True)
     for name, value in net.named().items():
@@ -130,23 +130,23 @@ def test07_layer_normalisation(mode):
         ), name
 
 
-# ---- A network whose weights are constants gives what its cooperative vectors give, to the bit ----
+# ---- A network with constant weights equals its cooperative vectors, bit by bit ----
 
 
 @pytest.mark.parametrize("sizes", [[1, 1], [3, 1], [8, 16, 5], [6, 16, 16, 3], [24, 64, 64, 2]])
-def test01_to_the_bit_small_and_large(sizes):
+def test01_constant_weights_are_bit_identical(sizes):
     rng = np.random.default_rng(3)
     net = MLP.random(sizes, ns, rng)
     x = rng.normal(size=(50, sizes[0])).astype(np.float32)
     columns = [ns.Float(c) for c in x.T]
     weights = [w.numpy() for w in net.weights]
-    found = np.array(evaluate([w.tolist() for w in weights], columns)).T
+    found = np.array(evaluate_with_constants([w.tolist() for w in weights], columns)).T
     assert np.array_equal(found, np.array(net(columns)).T)
     assert np.allclose(found, reference.mlp(x, weights), atol=1e-5)
 
 
 @pytest.mark.parametrize("sizes", [[3, 4, 1], [24, 64, 64, 1]])
-def test02_in_loops_and_branches(sizes):
+def test02_constant_weights_in_loops_and_branches(sizes):
     net = MLP.random(sizes, ns, np.random.default_rng(4))
     layers = [w.numpy().tolist() for w in net.weights]
 
@@ -160,11 +160,11 @@ def test02_in_loops_and_branches(sizes):
         start = (dr.arange(ns.UInt32, 20), dr.zeros(ns.Float, 20))
         return dr.while_loop(start, lambda i, total: i < 25, body)[1].numpy()
 
-    found = summed(lambda x: evaluate(layers, x))
+    found = summed(lambda x: evaluate_with_constants(layers, x))
     assert np.ptp(found) > 0 and np.array_equal(found, summed(net))
 
 
-# ---- Fields with constant weights, and when these are in the way ----
+# ---- Fields with constant weights, and when these do not apply ----
 
 GRID = HashGridConfig(levels=2, log2_rows=8, base=2, finest=8)
 BOX = Box((0, 0, 0), (1, 1, 1))
@@ -187,7 +187,7 @@ def radiance():
 
 
 def said_by(field):
-    """All that evaluations return (rows of numbers)."""
+    """All results of evaluations (rows of numbers)."""
     p, d = points(), directions()
     if isinstance(field, RadianceField):
         sigma, features = field.density_features(p)
@@ -199,12 +199,16 @@ def said_by(field):
 def unrolled(monkeypatch):
     """Networks that were evaluated with constant weights, one entry each."""
     found = []
-    monkeypatch.setattr(mlp, "evaluate", lambda layers, x: found.append(len(layers)) or evaluate(layers, x))
+    monkeypatch.setattr(
+        mlp,
+        "evaluate_with_constants",
+        lambda layers, x: found.append(len(layers)) or evaluate_with_constants(layers, x),
+    )
     return found
 
 
 @pytest.mark.parametrize("make", [radiance, gaze_log, lambda: GazeField.random(GazeConfig(grid=GRID), BOX, ns)])
-def test01_fields_say_the_same_to_the_bit(make, unrolled):
+def test01_fields_are_bit_identical(make, unrolled):
     field = make()
     before = said_by(field)
     set_constant_weights(field)
@@ -213,19 +217,21 @@ def test01_fields_say_the_same_to_the_bit(make, unrolled):
     assert len(unrolled) >= len(field.mlps)
 
 
-def test02_all_networks_of_all_members_and_back():
+def test02_constant_weights_apply_to_all_members():
     ensemble = GazeEnsemble([gaze_log(0), gaze_log(1)])
     for constant in (True, False):
         set_constant_weights(ensemble, constant)
-        assert [net.constant for m in ensemble.members for net in (m.emit_net, m.capture_net)] == [constant] * 4
+        assert [net.has_constant_weights for m in ensemble.members for net in (m.emit_net, m.capture_net)] == [
+            constant
+        ] * 4
 
 
-def test03_weights_that_are_replaced_count():
+def test03_replaced_weights_take_effect():
     field = radiance()
     set_constant_weights(field)
     before = said_by(field)
     field.set_parameters({k: v * 2 for k, v in field.parameters().items() if "net" in k})
-    assert field.density_net.constant and field.color_net.constant
+    assert field.density_net.has_constant_weights and field.color_net.has_constant_weights
     other = radiance()
     other.set_parameters({k: v * 2 for k, v in other.parameters().items() if "net" in k})
     after = said_by(field)
@@ -248,7 +254,7 @@ def slope_of_points(field):
 
 
 @pytest.mark.parametrize("slope", [slope_of_weights, slope_of_points])
-def test04_derivatives_are_as_without(slope, unrolled):
+def test04_derivatives_are_unchanged(slope, unrolled):
     plain, field = radiance(), radiance()
     set_constant_weights(field)
     expected = slope(plain)
@@ -256,13 +262,13 @@ def test04_derivatives_are_as_without(slope, unrolled):
     assert not unrolled
 
 
-def test05_a_recorded_function_sees_weights_that_change(unrolled):
+def test05_frozen_function_uses_changed_weights(unrolled):
     field = radiance()
     set_constant_weights(field)
 
     @dr.freeze
     def recorded(field, p):
-        with no_collection():
+        with gc_paused():
             return field.density(p)
 
     p = points()
@@ -274,11 +280,11 @@ def test05_a_recorded_function_sees_weights_that_change(unrolled):
     assert np.allclose(second, field.density(p).numpy(), rtol=1e-6) and not np.allclose(first, second)
 
 
-def test07_normalised_layers_stay_as_they_are():
+def test07_normalised_layers_are_unchanged():
     net = MLP.random([8, 16, 3], ns, np.random.default_rng(5), normalized=True)
     x = [ns.Float(c) for c in np.random.default_rng(6).normal(size=(8, 20)).astype(np.float32)]
     before = np.array(net(x))
-    net.constant = True
+    net.has_constant_weights = True
     assert np.ptp(before) > 0 and np.array_equal(np.array(net(x)), before)
 
 

@@ -9,13 +9,13 @@ import pytest
 from scipy.ndimage import distance_transform_cdt
 
 from nerg_mi.fields.occupancy import (
+    MIN_STEP_OPTICAL_DEPTH,
     PARTS_PER_AXIS,
-    STEP_DEPTH,
     CascadeGrid,
     OccupancyGrid,
     RefinedGrid,
-    chessboard,
     cascades_from_contracted,
+    chessboard_distance,
     refine_occupancy,
 )
 from nerg_mi.maths.geometry import Box, ContractedBox
@@ -30,13 +30,13 @@ def made(bound, share, seed=0):
     levels = 1 + int(np.ceil(np.log2(bound)))
     bits = rng.random((levels, R, R, R)) < share
     if seed % 2:
-        bits[1:] = False  # what is far away is empty, so that leaps are long
+        bits[1:] = False  # distant cells are empty, so that skips are long
         bits[-1, 0, 0, 0] = True
     return CascadeGrid(bits, bound, ns, 0.25), bits
 
 
 def middles(grid):
-    """Unit-cube middles (n, n, n, 3) of the common cells, [z, y, x]."""
+    """Unit-cube centres (n, n, n, 3) of the common cells, [z, y, x]."""
     n = grid.cells[0]
     c = (np.arange(n) + 0.5) / n
     z, y, x = np.meshgrid(c, c, c, indexing="ij")
@@ -44,7 +44,7 @@ def middles(grid):
 
 
 def occupied(grid, bits, bound):
-    """Whether each common cell is occupied: by the bit of the finest level that reaches it."""
+    """Whether each common cell is occupied: by the bit of the finest level that contains it."""
     p = (middles(grid) - 0.5) * 2 * bound
     out = np.zeros(p.shape[:3], bool)
     for index in np.ndindex(out.shape):
@@ -58,7 +58,7 @@ def occupied(grid, bits, bound):
 
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize("bound", [1, 2, 4])
-def test_cells_are_those_of_the_finest_level_and_leaps_pass_over_nothing(bound, seed):
+def test_common_grid_matches_levels_and_skips_no_matter(bound, seed):
     grid, bits = made(bound, 0.1, seed)
     full = occupied(grid, bits, bound)
     n = grid.cells[0]
@@ -71,12 +71,12 @@ def test_cells_are_those_of_the_finest_level_and_leaps_pass_over_nothing(bound, 
     nearest = np.abs(where[:, None] - held[None]).max(axis=2).min(axis=1)
     told = k[~full]
     assert (told >= 1).all() and (told <= nearest).all()
-    # Where the levels agree nothing is given away but what a coarse cell hides.
+    # Where the levels agree, only what a coarse cell hides is lost.
     assert bound > 1 or np.array_equal(told, nearest)
     assert bound == 1 or seed == 0 or told.max() > 2
 
 
-def test_points_beyond_the_cube_count_as_its_nearest_cell():
+def test_points_outside_are_clamped():
     grid, bits = made(4, 0.3)
     inside = np.random.default_rng(2).uniform(0, 1, (200, 3))
     inside[:, 1] = 0.001
@@ -86,7 +86,7 @@ def test_points_beyond_the_cube_count_as_its_nearest_cell():
 
 
 @pytest.mark.parametrize("bound", [1, 2, 4])
-def test_bytes_and_back(bound):
+def test_packed_bits_round_trip(bound):
     grid, bits = made(bound, 0.3)
     again = CascadeGrid.from_packed(grid.pack_bits(), R, bound, ns, 0.25)
     assert np.array_equal(again.bits, bits) and again.threshold == 0.25 and again.resolution == R
@@ -95,18 +95,20 @@ def test_bytes_and_back(bound):
 
 
 @pytest.mark.parametrize("reach", [2.0, 8.0, 64.0])
-def test_cascades_of_a_contracted_box_hold_all_that_its_cells_hold(reach):
+def test_cascades_cover_contracted_cells(reach):
     rng, r = np.random.default_rng(int(reach)), 16
     box, bits = ContractedBox(Box((0, 0, 0), (2, 2, 2)), reach), rng.random((r, r, r)) < 0.02
     grid = cascades_from_contracted(bits, reach, ns, 1.0)
     u = rng.random((3, 200_000)).astype(np.float32)
     x, y, z = np.minimum((u * r).astype(int), r - 1)
     p = box.from_unit(ns.Array3f(u))
-    # Those of the corners beyond the outer cube come to stand on its face, in other cells.
+    # Corners beyond the outer cube are moved to its face, into other cells.
     held = (np.abs((u - 0.5) * 4).max(axis=0) < 2 - 1 / reach) & bits[z, y, x]
     assert held.sum() > 500 and np.all(grid.distance_to_occupied(box.to_cube(p)).numpy()[held] == 0)
-    # They are not much larger either: by the cells that touch.
-    assert grid.bits[0].mean() < 0.2 and not cascades_from_contracted(np.zeros((r, r, r), bool), reach, ns, 1.0).bits.any()
+    # They are not much larger either: by touching cells.
+    assert (
+        grid.bits[0].mean() < 0.2 and not cascades_from_contracted(np.zeros((r, r, r), bool), reach, ns, 1.0).bits.any()
+    )
 
 
 # ---- Occupancy: distances against brute force, look-ups, and the packed form ----
@@ -128,14 +130,14 @@ def test01_chessboard_distances(share):
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 1), (5, 3, 131), (3, 2, 64), (300, 1, 2)])
-def test01_rows_of_any_length_and_the_farthest(shape):
-    """Rows that fill words of 64 cells, or not; beyond 255 all are alike."""
+def test01_rows_of_any_length_and_maximum_distance(shape):
+    """Rows that fill words of 64 cells, or not; distances saturate at 255."""
     bits = np.random.default_rng(1).random(shape) < 0.01
     bits[0, 0, 0] = True
     expected = np.minimum(distance_transform_cdt(~bits, metric="chessboard"), 255)
-    assert np.array_equal(chessboard(bits), expected) and chessboard(bits).dtype == np.uint8
+    assert np.array_equal(chessboard_distance(bits), expected) and chessboard_distance(bits).dtype == np.uint8
     bits[...] = False
-    assert (chessboard(bits) == 255).all()
+    assert (chessboard_distance(bits) == 255).all()
 
 
 def test02_lookup_is_indexed_zyx_and_clamped():
@@ -178,7 +180,7 @@ def test07_grids_with_unequal_edges():
         _ = grid.resolution
 
 
-# ---- Cells in parts: what is occupied stays so, and no leap passes it ----
+# ---- Refined cells: occupied parts stay occupied, and no skip passes them ----
 
 
 def refined(resolution=7, share=0.2, seed=0):
@@ -193,16 +195,16 @@ def centres(n):
 
 
 @pytest.mark.parametrize("share", [0.01, 0.2, 1.0])
-def test_no_leap_passes_an_occupied_part(share):
+def test_skips_pass_no_occupied_part(share):
     grid = refined(share=share)
     found = grid.distance_to_occupied(ns.Array3f(centres(grid.resolution))).numpy().reshape(grid.bits.shape)
     away = brute_force(grid.bits)
     assert np.array_equal(found == 0, grid.bits) and np.all(found <= away)
-    # Nor is it much too short: never less than half of the way, but for a part.
+    # Nor is it much too short: at least half of the way, minus a part.
     assert np.all(2 * found + PARTS_PER_AXIS > away)
 
 
-def test_parts_are_those_of_their_cells():
+def test_parts_belong_to_their_cells():
     bits = np.zeros((3, 3, 3), bool)
     bits[2, 0, 1] = True  # z = 2, y = 0, x = 1
     # The part with the upper x, the lower y and the upper z.
@@ -219,19 +221,19 @@ def test_cells_without_parts_are_empty():
     assert np.all(grid.distance_to_occupied(ns.Array3f(centres(4))).numpy() > 4)
 
 
-def test_bytes_that_do_not_fit():
+def test_wrong_byte_counts_are_refused():
     with pytest.raises(ValueError, match="7.*8.*2.*2.*2"):
         RefinedGrid(np.ones((2, 2, 2), bool), np.zeros(7, np.uint8), ns, 0, 0, 0)
 
 
-# ---- Refinement: what a finer bound keeps of analytic densities ----
+# ---- Refinement: a refined grid for analytic densities ----
 
 BOX = Box((-1, -2, 0), (3, 2, 2))
 R_REFINEMENT = 16
 
 
 def field(density, step=0.01, occupancy=None):
-    """A field of this density at (x, y, z), all of whose cells may hold some."""
+    """A field of this density at (x, y, z), all of whose cells are occupied."""
     everywhere = OccupancyGrid(np.ones((R_REFINEMENT,) * 3, bool), ns, 1.0)
     return SimpleNamespace(
         ns=ns,
@@ -248,9 +250,9 @@ def held(grid, count=200_000):
     return p, grid.distance_to_occupied(BOX.to_cube(p)).numpy() == 0
 
 
-def test_what_counts_is_held_and_nothing_far_from_it():
+def test_refined_grid_covers_density_tightly():
     def wall(x, y, z):
-        # A third of a part thick, aslant, and as dense as anything.
+        # A third of a part thick, oblique, and very dense.
         away = dr.abs(x + 0.3 * y - 0.7 * z - 0.2) / np.sqrt(1 + 0.3**2 + 0.7**2)
         return dr.select(away < 0.02, ns.Float(1e6), 0)
 
@@ -258,14 +260,14 @@ def test_what_counts_is_held_and_nothing_far_from_it():
     p, inside = held(grid)
     dense = wall(*p).numpy() > 0
     assert dense.sum() > 2000 and inside[dense].mean() > 0.995
-    # Parts are 4 / 32 long: what is a diagonal away from the wall cannot hold it.
+    # Parts are 4 / 32 long: parts more than a diagonal away from the wall cannot contain it.
     far = wall(p.x * 0.0 + p.x, p.y, p.z).numpy() == 0
     assert inside[far].mean() < 0.2
     assert grid.missed_optical_depth < 0.02
 
 
-def test_a_wire_is_missed_as_much_as_is_said():
-    # A twentieth of a part thick: many parts are looked at beside it.
+def test_missed_optical_depth_of_a_wire():
+    # A twentieth of a part thick: many neighbouring parts are sampled.
     radius, sigma, step = 0.003, 1e3, 0.01
     wire = lambda x, y, z: dr.select((x - 0.42) ** 2 + (y - 0.13) ** 2 < radius**2, ns.Float(sigma), 0)
     grid = refine_occupancy(field(wire, step))
@@ -275,33 +277,35 @@ def test_a_wire_is_missed_as_much_as_is_said():
     assert grid.missed_optical_depth == pytest.approx(lost * 4 / 64, abs=1e-3)
 
 
-def test_fog_below_the_threshold_is_missed_by_its_mean_depth():
-    thin = 0.5 * STEP_DEPTH / 0.01
+def test_missed_optical_depth_of_fog():
+    thin = 0.5 * MIN_STEP_OPTICAL_DEPTH / 0.01
     grid = refine_occupancy(field(lambda x, y, z: thin + 0 * x))
     assert not grid.masks.any()
     # The mean chord of a box is 4 V / S: 4 x 4 x 2 has V = 32, S = 64.
     assert grid.missed_optical_depth == pytest.approx(thin * 2, rel=0.02)
     thick = refine_occupancy(field(lambda x, y, z: 4 * thin + 0 * x))
-    # The box is half as high as the cube that cells divide.
+    # The box is half as high as the cube that is divided into cells.
     assert thick.occupied_fraction == pytest.approx(0.5, abs=0.04) and thick.missed_optical_depth == 0
 
 
-def test_cells_that_are_empty_stay_so_and_the_bound_is_one_of_the_field():
+def test_empty_cells_stay_empty_and_refinement_is_deterministic():
     bits = np.random.default_rng(2).random((R_REFINEMENT,) * 3) < 0.3
     smooth = lambda x, y, z: dr.exp(6 * dr.sin(3 * x) * dr.cos(2 * y) - 2)
     one, other = (refine_occupancy(field(smooth, occupancy=OccupancyGrid(bits, ns, 1.0))) for _ in range(2))
     assert np.array_equal(one.coarse_bits, bits) and np.array_equal(one.masks, other.masks)
     # Again, from the refined grid: the same.
     again = refine_occupancy(field(smooth, occupancy=one))
-    assert np.array_equal(again.masks, one.masks) and again.threshold == one.threshold == STEP_DEPTH / 0.01
+    assert np.array_equal(again.masks, one.masks) and again.threshold == one.threshold == MIN_STEP_OPTICAL_DEPTH / 0.01
     assert again.coarse_threshold == 1.0
 
 
-def test_nested_cubes_and_nothing_are_not_refined():
+def test_cascades_and_missing_grids_are_not_refined():
     nested = CascadeGrid(np.ones((2, 4, 4, 4), bool), 2.0, ns, 0.1)
     assert refine_occupancy(field(lambda x, y, z: x, occupancy=nested)) is None
     nothing = field(lambda x, y, z: x)
     nothing.occupancy = None
     assert refine_occupancy(nothing) is None
-    empty = refine_occupancy(field(lambda x, y, z: x, occupancy=OccupancyGrid(np.zeros((R_REFINEMENT,) * 3, bool), ns, 0.1)))
+    empty = refine_occupancy(
+        field(lambda x, y, z: x, occupancy=OccupancyGrid(np.zeros((R_REFINEMENT,) * 3, bool), ns, 0.1))
+    )
     assert empty.missed_optical_depth == 0 and empty.masks.size == 0

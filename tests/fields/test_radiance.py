@@ -14,17 +14,18 @@ from nerg_mi.fields.radiance import (
     BackgroundConfig,
     RadianceConfig,
     RadianceField,
+    color_network_inputs,
+    decode_color,
     density_from_log,
     mean_features,
-    decode_color,
-    color_network_inputs,
 )
 from nerg_mi.maths.geometry import Box
 from tests.reference import fields_numpy as reference
 
 # ---- Background ----
 #
-# What lies behind a field: where a ray leaves the sphere about it, whatever it comes from, and sizes that must fit.
+# The background behind a field: intersections with its sphere, dependence on position and direction, and matching
+# sizes.
 
 GRID = HashGridConfig(levels=2, log2_rows=8, base=4, finest=8, dimensions=2)
 CONFIG = BackgroundConfig(2.5, GRID, width=16)
@@ -34,7 +35,7 @@ def jit(v):
     return ns.Array3f(np.ascontiguousarray(np.asarray(v, np.float32).T))
 
 
-def test_rays_leave_the_sphere_where_they_do():
+def test_background_intersections():
     rng = np.random.default_rng(0)
     o, d = rng.uniform(-1.4, 1.4, (300, 3)), rng.normal(size=(300, 3))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
@@ -47,20 +48,20 @@ def test_rays_leave_the_sphere_where_they_do():
     assert np.allclose(found[:, 1], np.arctan2(p[:, 2], p[:, 0]) / np.pi, atol=1e-5)
 
 
-def test_a_ray_that_misses_takes_the_nearest_point():
+def test_missing_ray_takes_the_nearest_point():
     # Past the sphere along +z, 4 to the right: nearest at (4, 0, 0), which is seen along +x.
     theta, phi = Background.random(CONFIG, ns).coordinates(jit([[4, 0, -9]]), jit([[0, 0, 1]]))
     assert abs(theta[0]) < 1e-6 and abs(phi[0]) < 1e-6
 
 
-def test_colours_are_those_of_the_place_and_of_the_direction():
+def test_background_depends_on_position_and_direction():
     back = Background.random(CONFIG, ns, 3)
     table = np.random.default_rng(1).normal(size=len(back.grid.table)).astype(np.float32)
     back.grid.table = ns.Float(table)
     o, d = np.zeros((2, 3)), np.array([[0.6, 0, 0.8], [0, 0.6, 0.8]])
     c = np.array(back(jit(o), jit(d)))
     assert c.shape == (3, 2) and (c > 0).all() and (c < 1).all() and np.abs(c[:, 0] - c[:, 1]).max() > 1e-3
-    # From elsewhere towards the same place, the direction still counts.
+    # From elsewhere towards the same point, the direction still matters.
     place = 2.5 * d[0]
     other = np.array([1.0, 0.5, 0])
     towards = (place - other) / np.linalg.norm(place - other)
@@ -69,7 +70,7 @@ def test_colours_are_those_of_the_place_and_of_the_direction():
     assert np.abs(np.array(back(jit([other]), jit([towards])))[:, 0] - c[:, 0]).max() > 1e-4
 
 
-def test_the_default_is_a_square_grid_and_others_are_refused():
+def test_background_needs_a_2d_grid():
     assert BackgroundConfig(1.0).grid.dimensions == 2
     for wrong in ({"grid": HashGridConfig(levels=2)}, {"width": 0}, {"hidden": 0}):
         with pytest.raises(ValueError, match="2 dimensions and sizes of at least 1"):
@@ -80,7 +81,7 @@ def test_the_default_is_a_square_grid_and_others_are_refused():
     assert BackgroundConfig.from_dict(CONFIG.to_dict()) == CONFIG
 
 
-def test_what_does_not_belong_together_is_refused():
+def test_inconsistent_parts_are_refused():
     rng = np.random.default_rng(0)
     grid, net = HashGrid.random(GRID, ns, rng), MLP.random(CONFIG.sizes, ns, rng)
     Background(CONFIG, grid, net)
@@ -92,7 +93,7 @@ def test_what_does_not_belong_together_is_refused():
         Background(CONFIG, grid, MLP.random([CONFIG.sizes[0], 32, 3], ns, rng))
 
 
-# ---- How a deferred field makes colours of features, against NumPy, and where rays meet next to nothing ----
+# ---- Deferred colours from features, against NumPy, and for tiny opacities ----
 
 RNG = np.random.default_rng(0)
 
@@ -109,8 +110,8 @@ def logistic(x):
     return 0.5 + 0.5 * np.tanh(0.5 * x)
 
 
-def test_diffuse_colours_composite_as_colours_do():
-    """A ray over two surfaces has the mean of their colours, which the mean of their logits is not."""
+def test_diffuse_colors_composite_linearly():
+    """A ray over two surfaces has the mean of their colours, which is not that of their logits."""
     g = np.array([[0.1, 0.9], [0.3, 0.3], [0.8, 0.2], [-1, 1]])
     w = np.array([0.5, 0.25])
     means = mean_features(floats((g @ w)[:, None]), ns.Float(w.sum()))
@@ -119,8 +120,8 @@ def test_diffuse_colours_composite_as_colours_do():
 
 
 @pytest.mark.parametrize("opacity", [0.0, 1e-42, 1e-38, 1e-13, 1e-12, 1e-6, 1.0])
-def test_nothing_is_infinite_however_little_a_ray_meets(opacity):
-    """Values and derivatives, of features up to 1 that this opacity composites."""
+def test_results_are_finite_for_tiny_opacity(opacity):
+    """Values and derivatives, for features up to 1 composited with this opacity."""
     for g in (0.0, 0.5, 1.0):
         a, s = ns.Float(opacity), ns.Float(np.float32(g * opacity))
         dr.enable_grad(a, s)
@@ -133,7 +134,7 @@ def test_nothing_is_infinite_however_little_a_ray_meets(opacity):
             assert abs(float(means[0][0]) - g) < 1e-5
 
 
-# ---- The radiance field against its NumPy version, and its handling of parameters ----
+# ---- The radiance field against its NumPy version, and its parameters ----
 
 RADIANCE_GRID = dict(levels=4, features=2, log2_rows=12, base=4, finest=32)
 RADIANCE_CONFIG = RadianceConfig(grid=HashGridConfig(**RADIANCE_GRID), width=16, geometry=7, density_scale=2.5)
@@ -142,7 +143,7 @@ BOX = Box((-1, 0, 2), (3, 2, 4))
 
 def make(seed=0, config=RADIANCE_CONFIG, **kwargs):
     field = RadianceField.random(config, BOX, ns, seed, **kwargs)
-    # Features of order one, or every output would be that of zero input.
+    # Features of order one; otherwise every output would be that of zero input.
     rng = np.random.default_rng(seed)
     field.set_parameters({"grid.table": ns.Float(rng.normal(size=len(field.grid.table)).astype(np.float32))})
     return field
@@ -170,7 +171,7 @@ def test01_equals_numpy():
     assert np.allclose(rgb[~outside], c[~outside], atol=2e-6)
 
 
-def test03_the_mask_is_honoured():
+def test03_mask_is_respected():
     field = make()
     p = ns.Array3f(ns.Float([1, 1]), 1, 3)
     active = ns.Bool([True, False])
@@ -178,7 +179,7 @@ def test03_the_mask_is_honoured():
         assert sigma.numpy()[0] > 0 and sigma.numpy()[1] == 0
 
 
-def test04_density_is_clamped_before_it_overflows():
+def test04_density_is_clamped():
     h = np.array([0, -100, 29, 31, 1e30])
     x = ns.Float(h)
     dr.enable_grad(x)
@@ -232,7 +233,7 @@ def test08_gradients_reach_every_parameter(name):
     def loss(i, h):
         moved = dict(values)
         moved[name] = values[name].copy()
-        moved[name].num_degenerate_faces[i] += h
+        moved[name].flat[i] += h
         s, c = reference.radiance(p, d, moved, RADIANCE_GRID, BOX.lower, BOX.upper, scale=2.5)
         return (2 * s + c @ [1, 2, 3]).sum()
 
@@ -241,7 +242,7 @@ def test08_gradients_reach_every_parameter(name):
         assert np.isclose(gradient[i], difference, rtol=2e-3, atol=1e-4)
 
 
-def test10_defaults_are_the_papers():
+def test10_defaults_match_the_paper():
     config = RadianceConfig()
     assert config.density_sizes == [32, 64, 16] and config.color_sizes == [31, 64, 64, 3]
     assert sum(a * b for s in (config.density_sizes, config.color_sizes) for a, b in zip(s, s[1:])) == 3072 + 6272
@@ -268,14 +269,14 @@ def test12_wrong_color_space():
         make(color_space="aces")
 
 
-def test14_a_matrix_of_another_shape_is_refused():
+def test14_matrix_of_other_shape_is_refused():
     field = make()
     with pytest.raises(ValueError, match="density_net.0"):
         field.set_parameters({"density_net.0": dr.zeros(ns.TensorXf, (3, 3))})
 
 
-def test17_a_deferred_field():
-    """Its features and its colours are those of ``color_head``; a file of another field says nothing of it."""
+def test17_deferred_field():
+    """Its features and colours are those of the module's functions; files of other fields do not mention it."""
     config = replace(RADIANCE_CONFIG, deferred=True)
     field, plain, (p, d) = make(config=config), make(), points()
     sigma, features = field.density_features(ns.Array3f(p.T))
@@ -293,6 +294,6 @@ def test17_a_deferred_field():
 
 
 @pytest.mark.parametrize("change, words", [({"deferred": 1}, "true or false"), ({"geometry": 2}, "at least 3")])
-def test18_deferred_fields_that_cannot_be(change, words):
+def test18_invalid_deferred_fields_are_refused(change, words):
     with pytest.raises(ValueError, match=words):
         RadianceConfig(**{"deferred": True, **change})

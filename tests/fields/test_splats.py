@@ -2,9 +2,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from nerg_mi.fields.splats import Splats, splats_from_raw_parameters, harmonics_from_colors, logits_from_opacities, quaternions_to_matrices, multiply_quaternions
+from nerg_mi.fields.splats import (
+    Splats,
+    harmonics_from_colors,
+    logits_from_opacities,
+    multiply_quaternions,
+    quaternions_to_matrices,
+    splats_from_raw_parameters,
+)
 from nerg_mi.maths.geometry import Similarity
-from nerg_mi.maths.sphere import fibonacci_directions, eval_harmonics
+from nerg_mi.maths.sphere import eval_harmonics, fibonacci_directions
 
 RNG = np.random.default_rng(0)
 
@@ -21,7 +28,7 @@ def some(**changes):
     return Splats(**(parts | changes))
 
 
-def test_what_a_training_stores_is_activated_in_float64():
+def test_raw_parameters_are_activated_in_float64():
     logits, logs = np.array([-40.0, 0, 3.5]), np.array([[-8.0, 0, 1]] * 3)
     splats = splats_from_raw_parameters(np.zeros((3, 3)), logs, [[2, 0, 0, 0]] * 3, logits, np.zeros((3, 1, 3)))
     assert np.allclose(splats.opacities, 1 / (1 + np.exp(-logits)), rtol=1e-7)
@@ -29,20 +36,20 @@ def test_what_a_training_stores_is_activated_in_float64():
     assert np.allclose(logits_from_opacities(1 / (1 + np.exp(-np.array([-9.0, 0, 5])))), [-9, 0, 5])
 
 
-def test_colors_of_degree_0_are_the_same_from_everywhere():
+def test_degree_0_colors_are_view_independent():
     colors = RNG.uniform(size=(4, 3))
     seen = np.einsum("dk,nkc->ndc", eval_harmonics(fibonacci_directions(5), 0), harmonics_from_colors(colors)) + 0.5
     assert np.allclose(seen, colors[:, None])
 
 
-def test_quaternions_are_rotations():
+def test_quaternions_match_rotation_matrices():
     a, b = Rotation.random(4, random_state=RNG), Rotation.random(4, random_state=RNG)
     wxyz = lambda r: r.as_quat()[:, [3, 0, 1, 2]]
     assert np.allclose(quaternions_to_matrices(wxyz(a)), a.as_matrix())
     assert np.allclose(quaternions_to_matrices(multiply_quaternions(wxyz(a), wxyz(b))), (a * b).as_matrix())
 
 
-def test_a_placed_place_is_the_same_place():
+def test_transform_preserves_appearance():
     splats = some()
     turn = Rotation.random(random_state=RNG).as_matrix()
     matrix = np.eye(4)
@@ -62,14 +69,14 @@ def test_a_placed_place_is_the_same_place():
         ({"centers": np.full((6, 3), np.nan)}, "centers.*not finite"),
         ({"rotations": np.zeros((6, 4))}, "length 0"),
         ({"opacities": np.zeros(5)}, "shape"),
-        ({"harmonics": np.zeros((6, 5, 3))}, "no degree"),
+        ({"harmonics": np.zeros((6, 5, 3))}, "degree 0 to 3"),
     ],
 )
-def test_what_is_no_place_is_refused(changes, said):
+def test_invalid_splats_are_refused(changes, said):
     with pytest.raises(ValueError, match=said):
         some(**changes)
 
 
-def test_values_are_kept_where_they_make_sense():
+def test_values_are_clamped_to_valid_ranges():
     splats = some(opacities=np.linspace(-1, 2, 6), scales=np.zeros((6, 3)))
     assert splats.opacities.min() == 0 and splats.opacities.max() == 1 and splats.scales.min() > 0

@@ -1,4 +1,4 @@
-"""A dense grid of features: an encoding of positions that is not the hash grid."""
+"""A dense grid of features: a position encoding other than the hash grid."""
 
 from dataclasses import dataclass
 from itertools import product

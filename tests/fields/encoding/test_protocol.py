@@ -1,11 +1,11 @@
-"""The protocol of encodings: what another encoding than the hash grid needs to train, be stored and be rendered."""
+"""The protocol of encodings: what a user-defined encoding needs to be trained, stored and rendered."""
 
 import drjit as dr
 import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.fields.encoding import encoding_config, register
+from nerg_mi.fields.encoding import config_from_dict, register
 from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
 from nerg_mi.fields.gaze_product import GazeConfig, GazeField
 from nerg_mi.fields.radiance import RadianceConfig, RadianceField
@@ -26,7 +26,7 @@ DIRECTIONS = np.tile(np.float32([[0.6], [0], [0.8]]), 20)
 
 @pytest.fixture(scope="module")
 def trained():
-    """A radiance field of a dense grid after 40 steps, the first and the last loss."""
+    """A radiance field with a dense grid after 40 steps, and the first and the last loss."""
     views = [ball(ball_pose(np.array(c))) for c in ([2.0, 0, 0.4], [-1.2, 1.6, 0], [-1.2, -1.6, 0.4])]
     trainer, losses = RadianceTrainer(views, BOX, CONFIG, settings(steps=40, batch=2**10), ns), []
     for _ in range(40):
@@ -35,14 +35,14 @@ def trained():
     return trainer.make_field(), losses
 
 
-def test_a_dense_grid_trains(trained):
+def test_dense_grid_trains(trained):
     field, losses = trained
     assert np.mean(losses[-5:]) < 0.6 * np.mean(losses[:5])
     untrained = RadianceField.random(CONFIG, BOX, ns, 1).parameters()["grid.values"].numpy()
     assert np.abs(field.parameters()["grid.values"].numpy() - untrained).max() > 0.01
 
 
-def test_a_dense_grid_is_stored_under_its_kind(trained, tmp_path):
+def test_dense_grid_is_stored_under_its_kind(trained, tmp_path):
     field, _ = trained
     save_radiance(field, tmp_path / "dense.safetensors", {})
     again, meta = load_radiance(tmp_path / "dense.safetensors", ns)
@@ -52,7 +52,7 @@ def test_a_dense_grid_is_stored_under_its_kind(trained, tmp_path):
     assert np.array_equal(again.density(p).numpy(), field.density(p).numpy())
 
 
-def test_a_dense_grid_is_rendered_with_derivatives(rgb, trained, tmp_path):
+def test_dense_grid_renders_with_derivatives(rgb, trained, tmp_path):
     save_radiance(trained[0], tmp_path / "dense.safetensors", {})
     integrator = {"type": "nerg", "field": {"type": "nerf", "filename": str(tmp_path / "dense.safetensors")}}
     sensor = {**camera(rgb, size=16, fov=50), "to_world": look_at(rgb, (2, 0, 0.4), up=(0, 0, 1))}
@@ -70,7 +70,7 @@ def test_a_dense_grid_is_rendered_with_derivatives(rgb, trained, tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["product", "log"])
-def test_gaze_fields_of_a_dense_grid_are_stored_and_have_the_same_fast_form(tmp_path, kind):
+def test_gaze_fields_with_dense_grid_are_stored_and_match_their_tensor_form(tmp_path, kind):
     field = (
         GazeField.random(GazeConfig(DenseConfig(), width=16, geometry=7, sh_degree=2), BOX, ns)
         if kind == "product"
@@ -88,13 +88,15 @@ def test_gaze_fields_of_a_dense_grid_are_stored_and_have_the_same_fast_form(tmp_
     if kind == "product":
         fast = evaluate_gaze_density(again.config, BOX, parameters, p_od, p_o, r_o, ns)
     else:
-        fast = dr.exp(evaluate_log_density(again.config, BOX, parameters, p_od, p_o, r_o, dr.full(ns.Bool, False, 20), ns))
+        fast = dr.exp(
+            evaluate_log_density(again.config, BOX, parameters, p_od, p_o, r_o, dr.full(ns.Bool, False, 20), ns)
+        )
     assert np.allclose(fast.numpy(), (emit * capture).numpy(), rtol=1e-4)
     dr.backward(dr.sum(fast))
     assert np.abs(dr.grad(parameters["grid.values"]).numpy()).max() > 0
 
 
-def test_a_torch_module_of_a_dense_grid(torch):
+def test_dense_grid_as_torch_module(torch):
     from nerg_mi.interop.torch import RadianceModule
 
     field = RadianceField.random(CONFIG, BOX, ns, 3)
@@ -105,20 +107,20 @@ def test_a_torch_module_of_a_dense_grid(torch):
     assert module.get_parameter("grid__values").grad.abs().max() > 0
 
 
-def test_sizes_of_a_dense_grid_have_its_own_bounds(tmp_path):
+def test_dense_grid_has_its_own_size_limits(tmp_path):
     save_radiance(RadianceField.random(RadianceConfig(DenseConfig(size=17), width=16), BOX, ns), tmp_path / "f", {})
     with pytest.raises(ValueError, match='"size".*1.*16.*17'):
         load_radiance(tmp_path / "f", ns)
 
 
-def test_what_the_protocol_gives():
+def test_protocol_default_methods():
     grid = DenseGrid.random(DenseConfig(), ns, np.random.default_rng(0))
     (values,) = grid.named().values()
     assert grid.kernel_parameters()[0].index == values.array.index
     grid.replace("values", values * 2)
     p = ns.Array3f(0.5 + 0.5 * POINTS)
     assert np.allclose(np.array(grid.evaluate_eagerly(p)), np.array(grid(p)))
-    grid.require(DenseConfig())
-    with pytest.raises(ValueError, match="where its field needs"):
-        grid.require(DenseConfig(size=5))
-    assert encoding_config(DenseConfig(size=5).to_dict()) == DenseConfig(size=5)
+    grid.check_config(DenseConfig())
+    with pytest.raises(ValueError, match="but its field needs"):
+        grid.check_config(DenseConfig(size=5))
+    assert config_from_dict(DenseConfig(size=5).to_dict()) == DenseConfig(size=5)

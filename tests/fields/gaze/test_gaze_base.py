@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.fields import gaze_base
-from nerg_mi.fields.gaze_base import REACH, DataSummary, GazeEnsemble, RaySupport, summarize_provenance
+from nerg_mi.fields.gaze_base import CUTOFF_RADII, DataSummary, GazeEnsemble, RaySupport, summarize_provenance
 from nerg_mi.fields.gaze_log_density import LogGazeField
 from nerg_mi.fields.gaze_product import GazeConfig, GazeField
 from nerg_mi.fields.mlp import namespace
@@ -17,7 +17,7 @@ from nerg_mi.formats.fields import load_gaze, save_gaze
 from nerg_mi.maths.geometry import Box
 from tests.fields.gaze.test_log_density import BOX, GRID, SMALL, made
 
-# ---- What a field rests on, in words, and as a checkpoint has it ----
+# ---- Amount of training data, in words and in checkpoints ----
 
 
 @pytest.mark.parametrize(
@@ -31,24 +31,26 @@ from tests.fields.gaze.test_log_density import BOX, GRID, SMALL, made
         (DataSummary(0), ""),
     ],
 )
-def test_words(basis, words):
+def test_describe_counts(basis, words):
     assert basis.words() == words
 
 
-def test_of_a_checkpoint():
+def test_summary_from_checkpoint():
     assert summarize_provenance({"rays": 5, "people": 2, "salience_views": 0}) == DataSummary(5, 2)
-    # Checkpoints of earlier versions do not count people, and those of views have no rays.
+    # Checkpoints of earlier versions have no number of participants, and those of views have no rays.
     assert summarize_provenance({"rays": 5}) == DataSummary(5)
     assert summarize_provenance({"rays": 0, "people": 0, "salience_views": 3}) == DataSummary(0, None, 3)
     assert summarize_provenance({"made": "random"}) is None
 
 
 @pytest.mark.parametrize("value", [-1, 1e300, "5", [5], True, None, 1 << 70, float("nan")])
-def test_what_is_no_count_is_not_shown(value):
-    assert summarize_provenance({"rays": value}) is None and summarize_provenance({"rays": 7, "people": value}) == DataSummary(7)
+def test_invalid_counts_are_ignored(value):
+    assert summarize_provenance({"rays": value}) is None and summarize_provenance(
+        {"rays": 7, "people": value}
+    ) == DataSummary(7)
 
 
-# ---- Kinds of gaze fields by the names that checkpoints give them ----
+# ---- Kinds of gaze fields by their names in checkpoints ----
 
 
 def fields():
@@ -62,8 +64,8 @@ def fields():
 
 
 @pytest.mark.parametrize("kind", ["product", "log_density", "ensemble"])
-def test_kinds_of_the_library(kind):
-    """Registered whichever module is imported first; what each says of itself is what it is built of."""
+def test_registered_kinds(kind):
+    """Registered for any import order; each architecture builds the same field."""
     field = fields()[kind]
     assert field.kind == kind in gaze_base.kinds() and field.architecture().get("kind", "product") == kind
     assert (len(field.members) == 1) == (field.members[0] is field) == (kind != "ensemble")
@@ -71,15 +73,15 @@ def test_kinds_of_the_library(kind):
 
 
 @pytest.mark.parametrize("kind", ["wavelet", ["product"], 3])
-def test_an_unknown_kind_is_refused(kind):
+def test_unknown_kind_is_refused(kind):
     with pytest.raises((ValueError, TypeError), match="wavelet|kind|unhashable"):
         gaze_base.build_gaze_field({"kind": kind}, BOX, None)
 
 
-# ---- How much data there is around a position: cells against the sum over all rays ----
+# ---- Support near a position: cells against the sum over all rays ----
 
 
-def exact(origins, radius, p, reach=REACH):
+def exact(origins, radius, p, reach=CUTOFF_RADII):
     return np.maximum(1 - ((origins - p) ** 2).sum(axis=1) / (reach * radius) ** 2, 0).sum()
 
 
@@ -88,13 +90,13 @@ def at(support, p):
 
 
 def paths(n=20_000, seed=0):
-    """People who walk through a hall and stop here and there."""
+    """Participants who walk through a hall and stop occasionally."""
     rng = np.random.default_rng(seed)
     walk = np.cumsum(rng.normal(0, 0.03, (n, 2)) * (rng.random((n, 1)) < 0.5), axis=0) % 4
     return np.concatenate([walk, rng.normal(1.6, 0.08, (n, 1))], axis=1)
 
 
-def test_where_it_is_greatest():
+def test_densest_position():
     rng = np.random.default_rng(0)
     origins = np.concatenate([rng.normal(c, 0.05, (n, 3)) for c, n in (((0, 0, 1), 400), ((3, 1, 2), 900))])
     support = RaySupport.from_origins(origins, 0.3)
@@ -105,7 +107,7 @@ def test_where_it_is_greatest():
 
 
 @pytest.mark.parametrize("radius", [0.1, 0.6])
-def test_cells_stand_for_their_rays(radius):
+def test_cells_approximate_their_rays(radius):
     origins = paths()
     support = RaySupport.from_origins(origins, radius)
     assert support.cells[:, 3].sum() == len(origins) and len(support.cells) < len(origins)
@@ -121,39 +123,39 @@ def test_cells_stand_for_their_rays(radius):
     assert np.abs(found - expected)[~many].max() < 4
 
 
-def test_inside_of_the_radius_cells_are_exact():
+def test_cells_inside_the_cutoff_are_exact():
     origins = np.random.default_rng(0).normal(0, 0.05, (1000, 3))
     support = RaySupport.from_origins(origins, 1.0)
     assert at(support, (1.2, 2.1, 0)) == pytest.approx(exact(origins, 1.0, [1.2, 2.1, 0]), rel=1e-5)
 
 
-def test_one_ray_counts_one_where_it_started_and_nothing_five_radii_away():
+def test_single_ray_has_support_one_at_its_origin_and_zero_at_five_radii():
     support = RaySupport.from_origins([[1.0, 2, 3]], 0.5)
     assert at(support, (1, 2, 3)) == 1 and at(support, (1, 2, 4.25)) == 0.75 and at(support, (3.5, 2, 3)) < 1e-6
     assert support.cutoff == 2.5
 
 
-def test_what_is_no_support_is_refused():
+def test_invalid_support_is_refused():
     for cells, radius in (([[0, 0, 0, 1, np.nan]], 1.0), ([[0, 0, 0, 1, 0]], 0.0)):
         with pytest.raises(ValueError, match="finite cells and a positive radius"):
             RaySupport(np.array(cells), radius)
 
 
-# ---- Ensembles of gaze fields: what fits together, their arrays, their file ----
+# ---- Ensembles of gaze fields: compatible members, arrays, files ----
 
 
-def test_members_are_alike():
+def test_members_must_match():
     with pytest.raises(ValueError, match="at least two"):
         GazeEnsemble([made()])
     other_box = LogGazeField.random(SMALL, Box((0, 0, 0), (1, 1, 1)), namespace("llvm"))
     for other in (made(replace(SMALL, variant="emit")), made(replace(SMALL, escaped="nearest")), other_box):
         with pytest.raises(ValueError, match="train them alike"):
             GazeEnsemble([made(), other])
-    # Where people's heads were is each member's own.
+    # The box of observers can differ between members.
     GazeEnsemble([made(), made(replace(SMALL, heads=((0, 0, 1), (1, 1, 2))))])
 
 
-def test_arrays_are_the_members():
+def test_parameters_of_members_are_prefixed():
     ensemble = GazeEnsemble([made(seed=1), made(seed=2)])
     before = {k: np.array(v) for k, v in ensemble.parameters().items()}
     assert len(before) == 2 * len(made().parameters())
@@ -165,8 +167,8 @@ def test_arrays_are_the_members():
 
 
 @pytest.mark.parametrize("half", [False, True])
-def test_a_file_holds_all_members_and_the_support(half, tmp_path):
-    """Counts and places are never rounded to fp16."""
+def test_file_stores_all_members_and_support(half, tmp_path):
+    """Counts and positions are never rounded to fp16."""
     members = [made(seed=1), made(replace(SMALL, heads=((0, 0, 1), (1, 1, 2))), seed=2)]
     support = RaySupport.from_origins(np.random.default_rng(0).uniform(0, 9, (5000, 3)), 0.25)
     save_gaze(GazeEnsemble(members, support), tmp_path / "g.safetensors", {"made": "here"}, half)
@@ -181,8 +183,8 @@ def test_a_file_holds_all_members_and_the_support(half, tmp_path):
     assert again.support.radius == 0.25
 
 
-def test_ensembles_of_ensembles_are_refused(tmp_path):
-    """When they are made, and in a file, however deep they lie in one another."""
+def test_nested_ensembles_are_refused(tmp_path):
+    """On construction and in files, for any nesting depth."""
     pair = GazeEnsemble([made(seed=1), made(seed=2)])
     for members in ([pair, pair], [made(), pair]):
         with pytest.raises(ValueError, match="give its members instead"):
@@ -195,7 +197,7 @@ def test_ensembles_of_ensembles_are_refused(tmp_path):
 
 
 class NoArrays:
-    """Arrays of a file that has none."""
+    """Arrays of an empty file."""
 
-    def member(self, index, about):
-        return about, self
+    def get_member(self, index, architecture):
+        return architecture, self

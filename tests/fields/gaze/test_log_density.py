@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.fields.encoding import HashGridConfig
-from nerg_mi.fields.gaze_base import make_prior_table, interpolate_table, table_directions
+from nerg_mi.fields.gaze_base import interpolate_table, make_prior_table, table_directions
 from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.formats.fields import load_gaze, save_gaze
@@ -43,8 +43,8 @@ def jit(v):
     return namespace("llvm").Array3f(np.ascontiguousarray(np.asarray(v).T, np.float32))
 
 
-def test_is_what_it_says():
-    """The product of the factors in NumPy, of what the encodings return."""
+def test_density_matches_its_formula():
+    """The product of the factors in NumPy, on the outputs of the encodings."""
     field = made()
     p_o, p_od, r = vectors()
     net = lambda weights, x: weights[-1] @ np.maximum(weights[1] @ np.maximum(weights[0] @ x, 0), 0)
@@ -77,7 +77,7 @@ def test_is_what_it_says():
     np.testing.assert_allclose(np.array(gone), np.exp(0.7) * blind, rtol=1e-4)
 
 
-def test_without_geometry_the_surface_makes_no_difference():
+def test_without_geometry_density_ignores_the_surface():
     field = made(replace(SMALL, geometry="none", reach=1.5))
     p_o, p_od, r = vectors()
     near, far = (
@@ -87,20 +87,20 @@ def test_without_geometry_the_surface_makes_no_difference():
     assert np.ptp(near) > 0
 
 
-def test_needs_its_integral():
+def test_evaluation_needs_the_integral():
     p_o, p_od, r = (jit(v) for v in vectors())
     with pytest.raises(ValueError, match="integral"):
         made().evaluate(p_od, p_o, r)
 
 
-def test_gradients_are_finite_on_the_surface_itself():
+def test_gradients_are_finite_at_zero_distance():
     field, p = made(), jit([[0.1, 0.2, 1.5]])
     dr.enable_grad(p)
     dr.backward(field.evaluate(p, jit([[0.1, 0.2, 1.5]]), jit([[0, 0, 1.0]]), integral=1.0)[0])
     assert np.isfinite(np.array(dr.grad(p))).all()
 
 
-def test_table_of_a_known_density_integrates_to_one():
+def test_prior_table_integrates_to_one():
     ns, kappa, mean = namespace("llvm"), 20.0, np.array([0.6, 0, 0.8])
     truth = lambda d: np.exp(log_normaliser(kappa) + kappa * (d @ mean - 1))
     fine = fibonacci_directions(20_000)
@@ -110,8 +110,8 @@ def test_table_of_a_known_density_integrates_to_one():
     np.testing.assert_allclose(found, truth(fine), atol=0.03 * truth(mean))
 
 
-def test_the_table_is_interpolated_all_around():
-    """Against bilinear interpolation in NumPy whose columns go around and around; most azimuths beside 0 and pi."""
+def test_table_is_interpolated_across_the_seam():
+    """Against bilinear interpolation in NumPy with periodic columns; most azimuths near 0 and pi."""
     ns, rows, rng = namespace("llvm"), 6, np.random.default_rng(4)
     table, step = rng.normal(size=(rows, 2 * rows)), np.pi / rows
     seams = np.concatenate([c + step * np.linspace(-1.3, 1.3, 27) for c in (0, np.pi, -np.pi, 2 * np.pi)])
@@ -128,8 +128,8 @@ def test_the_table_is_interpolated_all_around():
     np.testing.assert_allclose(found, (1 - (y - j)) * above + (y - j) * below, atol=2e-4)
 
 
-def test_the_table_is_not_read_beyond_its_end():
-    """At the poles the outermost rows stand alone; what lies behind them in memory has no part in it."""
+def test_table_lookups_stay_within_bounds():
+    """At the poles only the outermost rows count; memory beyond them does not."""
     ns, rows = namespace("llvm"), 4
     table = np.concatenate(
         [np.full(2 * rows, 1.0), np.full(4 * rows, 7.0), np.full(2 * rows, 2.0), np.full(8 * rows, np.nan)]
@@ -144,9 +144,8 @@ def test_the_table_is_not_read_beyond_its_end():
     np.testing.assert_allclose(found, [1, 2, 2, 1])
 
 
-def test_densities_leave_no_float_whatever_the_weights_are():
-    """Weights of any size: the logit is held below where its exponential would overflow, and stays below where it is
-    not."""
+def test_densities_are_finite_for_any_weights():
+    """Weights of any size: the logit is clamped below the overflow of its exponential."""
     field = made(replace(SMALL, variant="emit"))
     p_o, p_od, r = (jit(v) for v in vectors())
     before = np.array(field.unnormalized(p_od, p_o, r)[0])
@@ -156,7 +155,7 @@ def test_densities_leave_no_float_whatever_the_weights_are():
 
 
 @pytest.mark.parametrize("half", [False, True])
-def test_file(tmp_path, half):
+def test_file_round_trip(tmp_path, half):
     ns, field = namespace("llvm"), made()
     save_gaze(field, tmp_path / "gaze.safetensors", {"note": 1}, half)
     again, meta = load_gaze(tmp_path / "gaze.safetensors", ns)
@@ -178,12 +177,12 @@ def test_file(tmp_path, half):
         {"heads": ((0, 0), (1, 1))},
     ],
 )
-def test_settings_that_make_no_sense_are_refused(wrong):
+def test_invalid_settings_are_refused(wrong):
     with pytest.raises(ValueError):
         replace(SMALL, **wrong)
 
 
-def test_heads_in_a_box_of_any_size_span_the_same_coordinates():
+def test_capture_coordinates_do_not_depend_on_the_box_size():
     found = []
     for size in (1.0, 1e-5):
         low, high = np.array([-1, -1, 1.4]) * size, np.array([1, 0.5, 1.8]) * size

@@ -1,4 +1,4 @@
-"""The gaze field against its NumPy version: equation 1, variants and activations."""
+"""The gaze field against NumPy: equation 1, variants and activations."""
 
 import drjit as dr
 import drjit.llvm.ad as ns
@@ -48,14 +48,14 @@ def test01_equals_numpy(variant, activation):
     expected = reference.gaze(p_od, p_o, r_o, arrays(field), GRID, BOX.lower, BOX.upper, variant, activation)
     for g, e in zip(got, expected):
         assert np.allclose(g, e, rtol=3e-5, atol=3e-6)
-    # Something is there to compare.
+    # The values are not trivial.
     assert np.ptp(expected[0]) > 0.05
 
 
-def test05_outside_of_the_box_the_features_are_zero():
+def test05_features_are_zero_outside_the_box():
     field = make(activation="linear")
     far = np.array([[100.0, 0, 0], [0, -50, 3]], np.float32)
-    # No bias anywhere: zero features leave only what the direction does.
+    # No bias anywhere: zero features leave only the dependence on direction.
     _, emit, _ = evaluate(field, far, far, np.tile([0, 0, 1.0], (2, 1)))
     assert emit[0] == emit[1]
 
@@ -71,7 +71,7 @@ def test06_softplus_and_its_gradient():
     assert np.allclose(dr.grad(x).numpy(), reference.sigmoid(v), atol=1e-6)
 
 
-def test07_activations_far_out_are_finite():
+def test07_extreme_activations_are_finite():
     x = ns.Float([-1e30, -90, 0, 29, 90, 1e30])
     for name in ("softplus", "exp"):
         assert np.all(np.isfinite(activate(x, name).numpy())) and np.all(activate(x, name).numpy() >= 0)
@@ -91,7 +91,7 @@ def test08_gradients_equal_central_differences(name):
         ends = []
         for h in (1e-6, -1e-6):
             moved = {**values, name: values[name].copy()}
-            moved[name].num_degenerate_faces[i] += h
+            moved[name].flat[i] += h
             ends.append(
                 reference.gaze(p_od, p_o, r_o, moved, GRID, BOX.lower, BOX.upper, "emit_capture", "softplus")[0].sum()
             )
@@ -123,19 +123,19 @@ def test09_names_and_sizes():
         (dict(activation="relu"), '"relu"'),
         (dict(width=0), "at least 1"),
         (dict(semantic="snapshot", normalized=True), "cannot be normalised"),
-        (dict(semantic="snapshot", variant="capture"), "no emit"),
+        (dict(semantic="snapshot", variant="capture"), "inputs of emit"),
     ],
 )
 def test10_wrong_settings(wrong, words):
     with pytest.raises(ValueError, match=words):
         GazeConfig(**wrong)
-    # One of two that do not go together is no mistake.
+    # One of two exclusive options is valid.
     for name, value in wrong.items() if len(wrong) > 1 else ():
         assert getattr(GazeConfig(**{name: value}), name) == value
 
 
-def test11_one_observer_and_many_directions():
-    # The way the integrator asks: a single position, a direction a pixel; forward and backward.
+def test11_single_observer_with_many_directions():
+    # As in the integrator: a single position, one direction per pixel; values and gradients.
     field, (p_od, p_o, r_o) = make(), queries(8)
     x = ns.Float(0)
     dr.enable_grad(x)

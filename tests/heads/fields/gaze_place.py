@@ -1,4 +1,4 @@
-"""A gaze field that is not one of the library's: what a place attracts, times how often a direction is looked in."""
+"""A user-defined gaze field: what a surface attracts, times how often a direction is looked in."""
 
 from dataclasses import dataclass, field
 from typing import ClassVar
@@ -8,7 +8,7 @@ import numpy as np
 
 from nerg_mi.maths.arrays import sigmoid
 
-from .encoding import EncodingConfig, HashGridConfig, encode_direction, random_encoding
+from .encoding import EncodingConfig, HashGridConfig, encode_direction, init_encoding
 from .gaze_base import GazeHead, GazeHeadConfig, register
 from .mlp import MLP
 
@@ -36,14 +36,14 @@ class PlaceField(GazeHead):
     def random(cls, config, box, ns, seed, prior):
         rng, sizes = np.random.default_rng(seed), ([config.grid.size, config.width, 1], [9, config.width, 1])
         nets = (MLP.random(layers, ns, rng) for layers in sizes)
-        return cls(config, box, random_encoding(config.grid, ns, rng), *nets, ns.TensorXf(np.float32(prior)))
+        return cls(config, box, init_encoding(config.grid, ns, rng), *nets, ns.TensorXf(np.float32(prior)))
 
     @classmethod
-    def from_arrays(cls, about, box, arrays):
-        config = PlaceConfig.from_dict(about)
-        nets = (arrays.net(name, [n, config.width, 1]) for name, n in zip(cls.NETS, (config.grid.size, 9)))
-        prior = arrays.array("prior", config.prior, 2 * config.prior)
-        return cls(config, box, arrays.grid(config.grid), *nets, arrays.ns.TensorXf(prior))
+    def from_arrays(cls, architecture, box, arrays):
+        config = PlaceConfig.from_dict(architecture)
+        nets = (arrays.build_network(name, [n, config.width, 1]) for name, n in zip(cls.NETS, (config.grid.size, 9)))
+        prior = arrays.get_array("prior", config.prior, 2 * config.prior)
+        return cls(config, box, arrays.build_grid(config.grid), *nets, arrays.ns.TensorXf(prior))
 
     def unnormalized(self, p_od, p_o, r_o, active=True, semantic=None, escaped=False):
         one, variant = type(p_od.x)(1), self.config.variant

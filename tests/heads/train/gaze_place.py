@@ -16,7 +16,9 @@ class PlaceTrainer(GazeTrainer):
         data, D = self.data, self.data.num_directions
         observers = self.rng.choice(data.num_observers, min(self.settings.probes, data.num_observers), replace=False)
         batch = data.gather_batch(observers, np.broadcast_to(np.arange(D), (len(observers), D)))
-        self.loss = compute_gaze_loss(self.evaluate_density(batch, self.current_parameters()), batch.truth, D, cc=0, mae=0).total
+        self.loss = compute_gaze_loss(
+            self.evaluate_density(batch, self.current_parameters()), batch.truth, D, cc=0, mae=0
+        ).total
         dr.backward(self.loss)
 
     def evaluate_density(self, batch, parameters):
@@ -34,7 +36,7 @@ register_recipe(
     Recipe(
         name="place",
         summary="what a place attracts, times how often a direction is looked in",
-        make_make_config=lambda choices: PlaceConfig(variant=choices.variant),
+        make_config=lambda choices: PlaceConfig(variant=choices.variant),
         trainer=PlaceTrainer,
         losses=("likelihood",),
         settings={"steps": 12, "zones": 0, "loss": "likelihood", "integral": 0.0, "probes": 8, "mix_folds": 2},
