@@ -1,5 +1,5 @@
-"""The AOVs of :ref:`nerg <integrator-nerg>`: a table that its checks, channel names, what is computed, its manual,
-overlays, the viewer's layers, contact sheets and differences follow. One more AOV is one more entry."""
+"""The AOVs of :ref:`nerg <integrator-nerg>`: one table for validation, channel names, evaluation, manual, overlays,
+layers of the viewer, contact sheets and differences. A new AOV is one new entry."""
 
 from __future__ import annotations
 
@@ -20,33 +20,39 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Need:
-    """Something without which an AOV makes no sense: whether the integrator has it, and what is said otherwise."""
+class Dependency:
+    """A part of the integrator that an AOV depends on: a test for it, and the error message without it."""
 
-    is_met: Callable[[Any], bool]
-    complaint: str
+    is_satisfied: Callable[[Any], bool]
+    message: str
 
 
-FIELD = Need(lambda nerg: "field" in nerg.children, 'which needs a "field"')
-GAZE = Need(lambda nerg: nerg.gaze is not None, 'which needs a "gaze" volume')
-KDE = Need(lambda nerg: "kde" in nerg.children, 'which needs a "kde" volume of type "gazekde"')
-MEMBERS = Need(
-    lambda nerg: len(nerg.gaze.field.members) > 1, 'which needs a "gaze" of several members; train it with --ensemble 5'
+FIELD = Dependency(lambda nerg: "field" in nerg.children, 'which needs a "field"')
+GAZE = Dependency(lambda nerg: nerg.gaze is not None, 'which needs a "gaze" volume')
+KDE = Dependency(lambda nerg: "kde" in nerg.children, 'which needs a "kde" volume of type "gazekde"')
+MEMBERS = Dependency(
+    lambda nerg: len(nerg.gaze.field.members) > 1, 'which needs an ensemble as "gaze"; train one with --ensemble 5'
 )
-SUPPORT = Need(
-    lambda nerg: nerg.gaze.field.support is not None, 'which the checkpoint of "gaze" does not hold; train it again'
+SUPPORT = Dependency(
+    lambda nerg: nerg.gaze.field.support is not None, 'which needs a "gaze" checkpoint with support; train it again'
 )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Display:
-    """How pictures show the values of an AOV.
+    """How images show the values of an AOV.
 
-    ``kind``: "sequential", colours from a least to a greatest value; "heat", the same over the colours of the picture,
-    the more opaque the higher; "diverging", to both sides of 0; "categorical", for whole numbers that name classes;
-    "shade", values from 0 to 1 by which the picture is darkened. ``cmap``: colour map of matplotlib, None for the usual
-    one of its kind. ``limits``: fixed ends of the scale; None for percentiles of what is seen: from 0 for a heat,
-    equally far to both sides where diverging.
+    Parameters
+    ----------
+    kind : str
+        "sequential": a colour scale; "heat": a colour scale blended over the image, more opaque for higher values;
+        "diverging": a scale symmetric about 0; "categorical": whole numbers that identify classes; "shade": values from
+        0 to 1 that darken the image.
+    cmap : str, optional
+        Colour map of matplotlib. Default: that of the kind.
+    limits : tuple of float, optional
+        Fixed ends of the scale. Default: percentiles of the visible values; from 0 for a heat map, symmetric if
+        diverging.
     """
 
     kind: Literal["sequential", "heat", "diverging", "categorical", "shade"] = "sequential"
@@ -56,10 +62,19 @@ class Display:
 
 @dataclass(frozen=True, kw_only=True)
 class Quantity:
-    """What pictures of a quantity need to know. ``title``: of a picture that shows it, and of the viewer's layer, by
-    default its ``name``; ``label``: what its scale measures, by default the name, in which ``unit``; ``data_source``: the
-    part of the integrator, "gaze" or "kde", that was made of rays, whose number pictures state; ``needs_support``:
-    whether it is hatched where no rays were recorded around the observer."""
+    """How a quantity is labelled and displayed.
+
+    Parameters
+    ----------
+    title : str
+        Title of an image and of the viewer's layer. Default: from the ``name``.
+    label, unit : str
+        Label of the colour bar (default: the name) and its unit.
+    data_source : str
+        The part of the integrator, "gaze" or "kde", that stems from tracking data; images state the amount of data.
+    needs_support : bool
+        Whether regions are hatched if no rays were recorded near the observer.
+    """
 
     name: str
     title: str = ""
@@ -71,36 +86,36 @@ class Quantity:
 
     @property
     def heading(self) -> str:
-        """Its title, or its name in words."""
+        """The title, or the name in words."""
         return self.title or self.name.replace("_", " ").capitalize()
 
     @property
     def scale_label(self) -> str:
-        """Label and unit, as they stand beside a scale."""
+        """Label and unit for a colour bar."""
         label = self.label or self.name.replace("_", " ")
         return f"{label} [{self.unit}]" if self.unit else label
 
 
 @dataclass(frozen=True, kw_only=True)
 class Aov(Quantity):
-    """One AOV. ``compute`` is called for those that are asked for, and for no others."""
+    """One AOV. ``compute`` is only called for the requested AOVs."""
 
-    # Suffixes of its channels; None: one a feature of the medium, by number.
+    # Suffixes of the channels; None: one channel per feature of the medium, numbered.
     channels: str | None = "Y"
-    # What it is, for the manual.
+    # Description for the manual.
     summary: str
-    # A Float for each channel, of a ``plugins.nerg_pixel.CameraView``, or of a ``Pixel`` where it is ``is_per_observer``.
+    # Computes one Float per channel from a `plugins.nerg_pixel.CameraView`, or from a `Pixel` if `is_per_observer`.
     compute: Callable[[Any], list]
-    # What is known of an observer once their position is, of the integrator, for ``Pixel.view_of_observer``.
+    # Creates, from the integrator, the observer view for ``Pixel.evaluate_observer_view``.
     view: Callable[[Any], ObserverView] | None = None
-    # Whether it depends on where the observer is: what does not is computed once for several of them.
+    # Whether it depends on the position of the observer; other AOVs are computed once for several observers.
     is_per_observer: bool = False
-    # Whether an integrator that can compute it gives the same value everywhere.
+    # Whether it is constant for a given integrator.
     is_constant: Callable[[Any], bool] = lambda nerg: False
     # In the order in which they are checked.
-    dependencies: tuple[Need, ...] = ()
-    # What has to be prepared for it, see ``Pixel``.
-    demands: frozenset[str] = frozenset()
+    dependencies: tuple[Dependency, ...] = ()
+    # Data that must be prepared for it, see `RenderContext`.
+    required_data: frozenset[str] = frozenset()
 
     @property
     def has_multiple_channels(self) -> bool:
@@ -108,7 +123,7 @@ class Aov(Quantity):
         return self.channels is None or len(self.channels) > 1
 
     def channel_suffixes(self, medium) -> list[str]:
-        """The suffixes of its channels for that medium."""
+        """Suffixes of its channels for ``medium``."""
         return [str(i) for i in range(medium.feature_count)] if self.channels is None else list(self.channels)
 
 
@@ -118,17 +133,19 @@ _EVALUATIONS = "evaluations per pixel"
 
 
 def _features_at(p: Any) -> list:
-    return evaluate_features(cast("Medium", p.context.medium), p.p_d, p.surface & (p.depth < p.view.distance))
+    return evaluate_features(
+        cast("Medium", p.context.medium), p.p_d, p.has_surface & (p.depth < p.ray_hit.shape_distance)
+    )
 
 
 def _color_evaluations(p: Any) -> list:
     import mitsuba as mi
 
-    march, medium = p.view.march, p.context.medium
-    if not p.lit or march is None or medium is None:
+    march, medium = p.ray_hit.march, p.context.medium
+    if not p.has_color or march is None or medium is None:
         return [mi.Float(0)]
-    once = dr.select(p.active & (p.view.front > 0), mi.Float(1), 0)
-    return [once if medium.deferred else march.color_evals]
+    once = dr.select(p.active & (p.ray_hit.medium_opacity > 0), mi.Float(1), 0)
+    return [once if medium.is_deferred else march.color_evals]
 
 
 AOVS: dict[str, Aov] = {
@@ -148,54 +165,54 @@ AOVS: dict[str, Aov] = {
             name="opacity",
             summary="1 - transmittance",
             display=Display(limits=(0.0, 1.0)),
-            compute=lambda p: [dr.select(p.active, p.view.opacity, 0)],
+            compute=lambda p: [dr.select(p.active, p.ray_hit.opacity, 0)],
         ),
         Aov(
             name="position",
             channels="XYZ",
             summary="the surface :math:`p_d`",
             unit="scene units",
-            compute=lambda p: list(dr.select(p.surface, p.p_d, 0)),
+            compute=lambda p: list(dr.select(p.has_surface, p.p_d, 0)),
         ),
         Aov(
             name="gaze",
-            summary="density in 1/sr of the observer attending this surface, after occlusion",
+            summary="gaze density in 1/sr of the observer on this surface, after occlusion",
             title="Gaze",
             label="gaze density",
             unit="1/sr",
             display=_HEAT,
             data_source="gaze",
             needs_support=True,
-            compute=lambda p: [p.attention.gaze],
+            compute=lambda p: [p.surface_gaze.gaze],
             is_per_observer=True,
             dependencies=(GAZE,),
-            demands=_GAZE,
+            required_data=_GAZE,
         ),
         Aov(
             name="emit",
-            summary="what the surface attracts, after its activation; 1 for a variant that lacks it",
-            title="What surfaces attract",
+            summary="factor of the surface, after its activation; 1 for a variant without it",
+            title="Attention that surfaces attract",
             label="emitted attention",
             display=_HEAT,
             data_source="gaze",
             is_constant=lambda nerg: nerg.gaze.field.config.variant == "capture",
-            compute=lambda p: [p.attention.emit],
+            compute=lambda p: [p.surface_gaze.emit],
             is_per_observer=True,
             dependencies=(GAZE,),
-            demands=_FACTORS,
+            required_data=_FACTORS,
         ),
         Aov(
             name="capture",
-            summary="what the observer gives, after its activation; 1 for a variant that lacks it",
-            title="What the observer gives",
+            summary="factor of the observer, after its activation; 1 for a variant without it",
+            title="Attention that the observer gives",
             label="captured attention",
             display=_HEAT,
             data_source="gaze",
             is_constant=lambda nerg: nerg.gaze.field.config.variant == "emit",
-            compute=lambda p: [p.attention.capture],
+            compute=lambda p: [p.surface_gaze.capture],
             is_per_observer=True,
             dependencies=(GAZE,),
-            demands=_FACTORS,
+            required_data=_FACTORS,
         ),
         Aov(
             name="gaze_std",
@@ -206,20 +223,20 @@ AOVS: dict[str, Aov] = {
             display=_HEAT,
             data_source="gaze",
             needs_support=True,
-            compute=lambda p: [p.attention.spread],
+            compute=lambda p: [p.surface_gaze.std],
             is_per_observer=True,
             dependencies=(GAZE, MEMBERS),
-            demands=frozenset({"gaze", "spread"}),
+            required_data=frozenset({"gaze", "spread"}),
         ),
         Aov(
             name="support",
-            summary="how many training rays started around the observer, one at distance d counting 1 - d²/(5R)² (R of "
-            "the training); one number an observer, shown where there is a surface",
+            summary="number of training rays that started near the observer; a ray at distance d counts 1 - d²/(5R)² "
+            "(R: probe radius of the training); one number per observer, shown on all surfaces",
             title="Support",
-            label="training rays around the observer",
+            label="training rays near the observer",
             display=_HEAT,
             data_source="gaze",
-            compute=lambda p: [p.view_of_observer("support")],
+            compute=lambda p: [p.evaluate_observer_view("support")],
             view=lambda nerg: SupportView(nerg.gaze.field.support, nerg.gaze.to_world),
             is_per_observer=True,
             dependencies=(GAZE, SUPPORT),
@@ -228,12 +245,12 @@ AOVS: dict[str, Aov] = {
             name="kde",
             summary="density in 1/sr of the tracked rays nearest to the observer, towards this surface, after "
             "occlusion",
-            title="Where people looked",
-            label="tracked gaze",
+            title="Where participants looked",
+            label="recorded gaze",
             unit="1/sr",
             display=_HEAT,
             data_source="kde",
-            compute=lambda p: [p.view_of_observer("kde")],
+            compute=lambda p: [p.evaluate_observer_view("kde")],
             view=lambda nerg: nerg.children["kde"].kde_view(),
             is_per_observer=True,
             dependencies=(KDE,),
@@ -244,28 +261,28 @@ AOVS: dict[str, Aov] = {
             title="Visible to the observer",
             label="0 hidden, 1 visible",
             display=Display(kind="shade", limits=(0.0, 1.0)),
-            compute=lambda p: [dr.select(p.camera.surface, p.sight.visibility, 0)],
+            compute=lambda p: [dr.select(p.camera.has_surface, p.observer_hit.visibility, 0)],
             is_per_observer=True,
         ),
         Aov(
             name="observer_depth",
             channels="T",
-            summary=":math:`d_o`; the distance to the surface where no occlusion is computed",
+            summary="depth :math:`d_o` along the observer's ray; the distance to the surface without occlusion",
             label="distance from the observer",
             unit="scene units",
             display=Display(cmap="viridis_r"),
-            compute=lambda p: [dr.select(p.camera.surface, p.sight.depth, 0)],
+            compute=lambda p: [dr.select(p.camera.has_surface, p.observer_hit.depth, 0)],
             is_per_observer=True,
-            demands=frozenset({"observer_depth"}),
+            required_data=frozenset({"observer_depth"}),
         ),
         Aov(
             name="features",
             channels=None,
-            summary="the field's geometry features, accumulated like colour (not divided by opacity)",
+            summary="the field's geometry features, composited like colour (not divided by opacity)",
             display=_SIGNED,
             compute=lambda p: p.accumulated_features,
             dependencies=(FIELD,),
-            demands=frozenset({"features"}),
+            required_data=frozenset({"features"}),
         ),
         Aov(
             name="features_at",
@@ -277,75 +294,75 @@ AOVS: dict[str, Aov] = {
         ),
         Aov(
             name="density_evals",
-            summary="evaluations of density made for the pixel",
-            title="Evaluations of density",
+            summary="density evaluations for the pixel",
+            title="Density evaluations",
             label=_EVALUATIONS,
-            compute=lambda p: [p.density_evaluations()],
+            compute=lambda p: [p.count_density_evaluations()],
             is_per_observer=True,
-            demands=_COUNTS,
+            required_data=_COUNTS,
         ),
         Aov(
             name="color_evals",
-            summary="evaluations of colour made for the pixel",
-            title="Evaluations of colour",
+            summary="colour evaluations for the pixel",
+            title="Colour evaluations",
             label=_EVALUATIONS,
             compute=_color_evaluations,
-            demands=_COUNTS,
+            required_data=_COUNTS,
         ),
         Aov(
             name="gaze_evals",
-            summary="evaluations of gaze networks made for the pixel",
-            title="Evaluations of gaze",
+            summary="evaluations of gaze networks for the pixel",
+            title="Gaze evaluations",
             label=_EVALUATIONS,
-            compute=lambda p: [p.attention.evaluations],
+            compute=lambda p: [p.surface_gaze.evaluations],
             is_per_observer=True,
             dependencies=(GAZE,),
-            demands=_GAZE,
+            required_data=_GAZE,
         ),
     )
 }
 
 
-def read_aovs(value: str, nerg) -> list[str]:
-    """The names in a comma-separated list. Raises ``NergError`` for one that is not known, that needs what the
-    integrator does not have, or that is named twice."""
+def parse_aovs(value: str, nerg) -> list[str]:
+    """The names in a comma-separated list. Raises ``NergError`` for a name that is unknown or repeated, or whose
+    dependencies the integrator lacks."""
     names = [n.strip() for n in value.split(",") if n.strip()]
     for name in names:
         if name not in AOVS:
-            raise NergError(f'"aovs" does not know "{name}"; it knows {", ".join(AOVS)}')
-        for need in AOVS[name].dependencies:
-            if not need.is_met(nerg):
-                raise NergError(f'"aovs" asks for "{name}", {need.complaint}')
+            raise NergError(f'"aovs" contains the unknown name "{name}"; known names: {", ".join(AOVS)}')
+        for dependency in AOVS[name].dependencies:
+            if not dependency.is_satisfied(nerg):
+                raise NergError(f'"aovs" contains "{name}", {dependency.message}')
     if len(set(names)) < len(names):
-        raise NergError(f'"aovs" names something twice: "{value}"')
+        raise NergError(f'"aovs" contains a name twice: "{value}"')
     return names
 
 
-def demands_of(names: Iterable[str]) -> frozenset[str]:
-    """What has to be prepared for these AOVs."""
-    return frozenset().union(*(AOVS[name].demands for name in names))
+def collect_required_data(names: Iterable[str]) -> frozenset[str]:
+    """The data that must be prepared for these AOVs."""
+    return frozenset().union(*(AOVS[name].required_data for name in names))
 
 
-def views_of(names: Iterable[str], nerg) -> dict[str, ObserverView]:
-    """The views of the observer that these AOVs show, by their names."""
+def collect_observer_views(names: Iterable[str], nerg) -> dict[str, ObserverView]:
+    """The observer views of these AOVs, by name."""
     return {name: view(nerg) for name in names if (view := AOVS[name].view) is not None}
 
 
 def channel_names(names: Iterable[str], medium) -> list[str]:
-    """The names of all channels of these AOVs, in their order."""
+    """The names of all channels of these AOVs, in order."""
     return [f"{name}.{channel}" for name in names for channel in AOVS[name].channel_suffixes(medium)]
 
 
-def compute(names: Sequence[str], pixel: Any) -> list:
-    """All channels of these AOVs, in their order."""
-    # Evaluations are counted when all else has made its own.
-    order = sorted((AOVS[name] for name in names), key=lambda aov: "counts" in aov.demands)
-    found = {aov.name: aov.compute(pixel if aov.is_per_observer else pixel.camera) for aov in order}
-    return [channel for name in names for channel in found[name]]
+def compute_channels(names: Sequence[str], pixel: Any) -> list:
+    """All channels of these AOVs, in order."""
+    # Evaluation counts come last, when all other AOVs have been computed.
+    order = sorted((AOVS[name] for name in names), key=lambda aov: "counts" in aov.required_data)
+    channels_by_name = {aov.name: aov.compute(pixel if aov.is_per_observer else pixel.camera) for aov in order}
+    return [channel for name in names for channel in channels_by_name[name]]
 
 
-def manual() -> str:
-    """The list of AOVs as the manual has it."""
+def format_manual() -> str:
+    """The list of AOVs for the manual."""
     return "\n".join(_entry(aov) for aov in AOVS.values())
 
 

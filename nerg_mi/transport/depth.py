@@ -1,4 +1,4 @@
-"""Kinds of depth: what a ray's optical depth makes of where it ends."""
+"""Kinds of depth: how the optical depth along a ray defines the distance of its surface."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from .march_primal import LOG2, MarchResult, MarchSettings, step_length
 from .medium import LocalRay, Medium
 from .quadrature import RULES, Registry
 
-# Most that a surface is moved towards the camera for being soft, as a share of its depth.
-_SOFTEST = 1 / 64
-# Sub-steps in which a refined depth searches the step that crosses.
+# Maximum shift of a soft surface towards the camera, as a fraction of its depth.
+_MAX_PENETRATION = 1 / 64
+# Sub-steps of a refined depth inside the step with the crossing.
 _PARTS = 16
 
 
 @dataclass
-class Marched:
-    """A march, and what it was asked: all that finding a depth may need. The arguments are those of ``march.march``."""
+class MarchContext:
+    """A march and its arguments (those of `march.march`): the input for finding a depth."""
 
     result: MarchResult
     medium: Medium
@@ -33,78 +33,85 @@ class Marched:
     t1: Float
     active: Bool
     settings: MarchSettings
-    # Rays that end on something opaque, so that their own opacity is 1; None where none does.
+    # Rays that end on an opaque shape, so that their own opacity is 1; None without such rays.
     backed: Bool | None = None
 
 
-class Profile(Protocol):
-    """What closed forms say of the density along rays (N,), for what `Depth.exact` makes of it."""
+class DensityProfile(Protocol):
+    """Closed-form densities along rays (N,), for `DepthKind.find_exact`."""
 
     @property
     def opacity(self) -> np.ndarray: ...
 
     @property
     def expected(self) -> np.ndarray:
-        """Mean distance of absorption (N,), 0 where nothing absorbs."""
+        """Mean distance of absorption (N,); 0 without absorption."""
         ...
 
     def quantile(self, fraction: float) -> np.ndarray:
-        """Distance (N,) at which this fraction of the ray's own opacity is reached, 0 where nothing absorbs."""
+        """Distance (N,) at which this fraction of the ray's own opacity is reached; 0 without absorption."""
         ...
 
 
-class Depth(Protocol):
-    """A kind of depth. It holds no state: one object serves every march."""
+class DepthKind(Protocol):
+    """A kind of depth. It has no state: one object serves all marches."""
 
     @property
     def name(self) -> str:
-        """Value of the parameter ``depth`` that chooses it."""
+        """Value of the parameter ``depth`` that selects the kind."""
         ...
 
     @property
     def summary(self) -> str:
-        """What it is, in a sentence without its full stop: for the manual."""
+        """One sentence for the manual, without its full stop."""
         ...
 
     @property
     def mean_free_paths(self) -> float:
-        """How deep in thick matter of constant density the surface lies, in mean free paths."""
+        """Depth of the surface inside thick matter of constant density, in mean free paths."""
         ...
 
     @property
-    def at_half(self) -> bool:
-        """Whether it lies in the step in which half of the ray's own opacity is reached."""
+    def is_at_half_opacity(self) -> bool:
+        """Whether the surface lies in the step in which half of the ray's own opacity is reached."""
         ...
 
     @property
     def surface_kind(self) -> str:
-        """Name of the kind whose surface it finds: its own, unless it finds that of another kind better. `nerg study`
-        compares with that kind."""
+        """Name of the kind that defines the same surface; its own name, unless it locates the surface of another kind
+        more accurately. ``nerg study`` compares with that kind."""
         ...
 
-    def find_exact(self, profile: Profile) -> np.ndarray:
-        """Distance (N,) of the surface where the density is in closed form, for `nerg study`."""
+    def find_exact(self, profile: DensityProfile) -> np.ndarray:
+        """Distance (N,) of the surface for a closed-form density, for ``nerg study``."""
         ...
 
-    def inside(self, marched: Marched) -> Float:
-        """Distance of the surface in the medium, in scene units; 0 where nothing absorbs, and on rays that are
-        ``backed`` where what is behind is reached first.
+    def inside(self, context: MarchContext) -> Float:
+        """Distance of the surface in the medium, in scene units; 0 without absorption, and on rays that ``ends_opaque``
+        marks if the shape behind is reached first.
 
-        Evaluations that finding it takes are added to the result's ``density_evals``, if that is counted.
-        Differentiable in what the march is.
+        Adds the evaluations of the search to ``density_evals`` of the result, if they are counted. Differentiable like
+        the march.
         """
         ...
 
-    def with_shape(self, result: MarchResult, front: Float, inside: Float, hit: Bool, distance: Float) -> Float:
-        """Depth on rays that end on a shape, where all light is absorbed that reaches it.
+    def combine_with_shape(self, result: MarchResult, front: Float, inside: Float, hit: Bool, distance: Float) -> Float:
+        """Depth on rays that end on a shape, which absorbs all light that reaches it.
 
-        ``front``: opacity of the medium before it; ``inside``: the depth there; ``hit``: which rays these are, at
-        ``distance`` (infinite on the others, which may return anything).
+        Parameters
+        ----------
+        front : Float
+            Opacity of the medium in front of the shape.
+        inside : Float
+            Depth in the medium.
+        hit, distance : Bool, Float
+            Whether a ray ends on a shape, and the distance of the shape (infinite on other rays, whose result is
+            arbitrary).
         """
         ...
 
 
-DEPTHS: Registry[Depth] = Registry("depth")
+DEPTHS: Registry[DepthKind] = Registry("depth")
 
 
 class Expected:
@@ -113,110 +120,112 @@ class Expected:
     name = "expected"
     summary = "mean distance of absorption"
     mean_free_paths = 1.0
-    at_half = False
+    is_at_half_opacity = False
     surface_kind = "expected"
 
-    def find_exact(self, profile: Profile) -> np.ndarray:
+    def find_exact(self, profile: DensityProfile) -> np.ndarray:
         return profile.expected
 
-    def inside(self, marched: Marched) -> Float:
-        return marched.result.expected_depth
+    def inside(self, context: MarchContext) -> Float:
+        return context.result.expected_depth
 
-    def with_shape(self, result: MarchResult, front: Float, inside: Float, hit: Bool, distance: Float) -> Float:
+    def combine_with_shape(self, result: MarchResult, front: Float, inside: Float, hit: Bool, distance: Float) -> Float:
         return dr.select(hit, (1 - front) * distance, 0) + front * inside
 
 
 class Median:
-    """Where half of this ray's own accumulated opacity is reached: the crossing of transmittance 1/2 for rays that
-    became opaque. The others (few) are marched again for theirs."""
+    """Where half of the ray's own opacity is reached: transmittance 1/2 for rays that became opaque. Other rays (few)
+    are marched a second time."""
 
     name = "median"
     summary = "where half of the ray's own opacity is reached"
     mean_free_paths = LOG2
-    at_half = True
+    is_at_half_opacity = True
     surface_kind = "median"
 
-    def find_exact(self, profile: Profile) -> np.ndarray:
+    def find_exact(self, profile: DensityProfile) -> np.ndarray:
         return profile.quantile(0.5)
 
-    def inside(self, marched: Marched) -> Float:
-        return _Half(marched).depth
+    def inside(self, context: MarchContext) -> Float:
+        return _Half(context).depth
 
-    def with_shape(self, result: MarchResult, front: Float, inside: Float, hit: Bool, distance: Float) -> Float:
-        # Half of the light, which is all absorbed, may pass the medium: the shape is then the median.
-        return dr.select(dr.isfinite(result.half), inside, distance)
+    def combine_with_shape(self, result: MarchResult, front: Float, inside: Float, hit: Bool, distance: Float) -> Float:
+        # If more than half of the light passes the medium, the shape is the median.
+        return dr.select(dr.isfinite(result.median_depth), inside, distance)
 
 
 class RefinedMedian(Median):
-    """The median, searched again with finer steps in the step that crosses, for densities that change within one."""
+    """The median, located with finer steps inside the step with the crossing, for densities that change within a
+    step."""
 
     name = "refined"
-    summary = "the median, searched again inside the step that reaches it"
+    summary = "the median, located with finer steps inside the step that contains it"
 
-    def inside(self, marched: Marched) -> Float:
-        half = _Half(marched)
+    def inside(self, context: MarchContext) -> Float:
+        half = _Half(context)
         with dr.suspend_grad():
-            moved = self._moved(marched, half)
+            moved = self._moved(context, half)
         return half.depth + moved
 
     @staticmethod
-    def _moved(marched: Marched, half: _Half) -> Float:
-        """How much farther the finer march finds the crossing."""
-        result, settings, t1, again = marched.result, marched.settings, marched.t1, half.again
-        enter = dr.select(half.rest, again.enter, result.enter)
-        missing = dr.select(half.rest, half.goal - again.enter_tau, LOG2 - result.enter_tau)
-        met = dr.isfinite(dr.select(half.rest, again.half, result.half))
-        found = marched.active & (half.rest | half.opaque) & met
-        # Steps of cells are as long as their voxels: they are searched until the crossing is found.
+    def _moved(context: MarchContext, half: _Half) -> Float:
+        """Shift of the crossing that the finer march finds."""
+        result, settings, t1, second = context.result, context.settings, context.t1, half.again
+        start = dr.select(half.rest, second.crossing_start, result.crossing_start)
+        remaining = dr.select(half.rest, half.goal - second.crossing_start_tau, LOG2 - result.crossing_start_tau)
+        has_crossing = dr.isfinite(dr.select(half.rest, second.median_depth, result.median_depth))
+        refinable = context.active & (half.rest | half.opaque) & has_crossing
+        # Steps of cells are as long as their voxels and are searched until the crossing is found.
         ends_at_cells = RULES.find(settings.quadrature).ends_at_cells
-        end = t1 if ends_at_cells else dr.minimum(enter + step_length(enter, settings), t1)
+        end = t1 if ends_at_cells else dr.minimum(start + step_length(start, settings), t1)
         part = settings.step / _PARTS
         fine = march(
-            marched.medium,
-            marched.ray,
-            enter,
+            context.medium,
+            context.ray,
+            start,
             end,
-            found,
+            refinable,
             replace(settings, step=part, cell_step=part),
-            until=dr.select(found, missing, 1),
+            until=dr.select(refinable, remaining, 1),
             count=half.count,
         )
-        result.count_in(fine)
-        # A finer march may find a little less in the step than the coarse one did.
-        return dr.select(found & dr.isfinite(fine.half), fine.half - half.depth, 0)
+        result.add_evaluations(fine)
+        # A finer march can find slightly less optical depth in the step than the coarse one.
+        return dr.select(refinable & dr.isfinite(fine.median_depth), fine.median_depth - half.depth, 0)
 
 
 class _Half:
-    """Where half of each ray's opacity is reached: ``depth``, and how it was found."""
+    """Where half of each ray's opacity is reached: ``depth``, and the masks of both cases."""
 
-    def __init__(self, marched: Marched):
-        result, settings, active, backed = marched.result, marched.settings, marched.active, marched.backed
-        opaque = result.tau >= settings.opaque
+    def __init__(self, context: MarchContext):
+        result, settings, active, ends_opaque = context.result, context.settings, context.active, context.backed
+        opaque = result.tau >= settings.max_optical_depth
         alpha = result.opacity
-        rest = active & (alpha > 0)
-        if backed is not None:
-            opaque |= backed
-            rest &= ~backed
-        opaque &= dr.isfinite(result.half)
-        rest &= ~opaque
-        # Rays whose crossing of transmittance 1/2 it is, and rays that are marched again up to an optical depth.
-        self.opaque, self.rest, self.goal = opaque, rest, -log1p(-0.5 * alpha)
+        remaining = active & (alpha > 0)
+        if ends_opaque is not None:
+            opaque |= ends_opaque
+            remaining &= ~ends_opaque
+        opaque &= dr.isfinite(result.median_depth)
+        remaining &= ~opaque
+        # Rays with the crossing at transmittance 1/2, and rays that are marched again up to an optical depth.
+        self.opaque, self.rest, self.goal = opaque, remaining, -log1p(-0.5 * alpha)
         self.count = result.density_evals is not None
-        until = dr.select(rest, self.goal, 1)
+        until = dr.select(remaining, self.goal, 1)
         self.again = march(
-            marched.medium, marched.ray, marched.t0, marched.t1, rest, settings, until=until, count=self.count
+            context.medium, context.ray, context.t0, context.t1, remaining, settings, until=until, count=self.count
         )
-        result.count_in(self.again)
-        # Rounding can leave the second march a hair short of its goal: the crossing is then the far end.
-        crossing = dr.minimum(self.again.half, marched.t1)
-        self.depth = dr.select(rest, crossing, dr.select(opaque & active, result.half, 0))
+        result.add_evaluations(self.again)
+        # Due to rounding, the second march can end just short of its goal; the crossing is then the end of the
+        # interval.
+        crossing = dr.minimum(self.again.median_depth, context.t1)
+        self.depth = dr.select(remaining, crossing, dr.select(opaque & active, result.median_depth, 0))
 
 
 for _depth in (Expected(), Median(), RefinedMedian()):
     DEPTHS.register(_depth)
 
 
-def surface_depth(
+def find_surface_depth(
     kind: str,
     result: MarchResult,
     medium: Medium,
@@ -225,16 +234,16 @@ def surface_depth(
     t1: Float,
     active: Bool,
     settings: MarchSettings,
-    backed: Bool | None = None,
+    ends_opaque: Bool | None = None,
 ) -> Float:
-    """Depth of ``kind`` (a name in ``DEPTHS``) from a march's result: ``Depth.inside``."""
-    return DEPTHS.find(kind).inside(Marched(result, medium, ray, t0, t1, active, settings, backed))
+    """Depth of ``kind`` (a name in ``DEPTHS``) from the result of a march: `DepthKind.find_in_medium`."""
+    return DEPTHS.find(kind).inside(MarchContext(result, medium, ray, t0, t1, active, settings, ends_opaque))
 
 
-def escape_distance(kind: str, result: MarchResult, depth: Float) -> Float:
-    """How far light goes into the matter before it meets the surface at ``depth`` (of ``kind``), in scene units.
+def penetration_depth(kind: str, result: MarchResult, depth: Float) -> Float:
+    """Penetration depth of light in front of the surface at ``depth`` (of ``kind``), in scene units.
 
-    As many mean free paths as the kind has, where transmittance is 1/2. At most 1/64 of ``depth``; 0 where half of the
-    light passes.
+    The mean free paths of the kind at transmittance 1/2; at most 1/64 of ``depth``; 0 if more than half of the light
+    passes.
     """
-    return dr.minimum(result.half_slope * DEPTHS.find(kind).mean_free_paths, depth * _SOFTEST)
+    return dr.minimum(result.median_depth_slope * DEPTHS.find(kind).mean_free_paths, depth * _MAX_PENETRATION)

@@ -1,4 +1,4 @@
-"""A radiance field as a medium, and its features where a ray ends."""
+"""A radiance field as a medium, and its geometry features."""
 
 from __future__ import annotations
 
@@ -15,98 +15,103 @@ from nerg_mi.maths.types import Array3f, Bool, Color, Float, Point3f, Ray3f, Vec
 
 from .geometry import SceneGeometry
 from .march_primal import MarchSettings
-from .medium import ColorPainter, LocalRay, Medium, Occupancy, Painter, bounded
+from .medium import ColorShader, LocalRay, Medium, Occupancy, SampleShader, clamp_density
 
 # ---- Features ----
 #
-# Geometry features of a radiance field along rays: accumulated like colour, or taken at the surface.
+# Geometry features of a radiance field along rays: composited like colour, or evaluated at the surface.
 #
-# What the density network hands to the colour network describes the place at a point without a label. Accumulated by
-# volume rendering it is a semantic signal in the manner of Semantic-NeRF (Zhi et al. 2021, eq. 2-4); the paper's
-# variants give either it or the snapshot at the surface to the gaze field.
+# The features that the density network passes to the colour network describe a point without labels. Composited by
+# volume rendering they are a semantic signal similar to Semantic-NeRF (Zhi et al. 2021, eq. 2-4). The paper's variants
+# condition the gaze field on them, or on the features at the surface.
 
 
-class FeaturePainter:
-    """Contributes a sample's features as an ArrayXf (see ``medium.Painter``).
+class FeatureShader:
+    """Contributes the features of a sample as an ArrayXf (see `medium.SampleShader`).
 
-    ``medium``: one that has features; ``color_type``: array type of a ray's colour, or None for features alone. A
-    deferred medium makes that colour of the features; of another one a sample's own colour stands before them."""
+    ``medium``: a medium with features; ``color_type``: array type of the colour, or None for features alone. Deferred
+    shading computes the colour from the composited features; otherwise the colour of the sample precedes its features.
+    """
 
     def __init__(self, medium: Medium, color_type: type | None = None):
         self.color_type, self.count = color_type, medium.feature_count
-        self._own = color_type is not None and not medium.is_deferred
+        self._has_own_color = color_type is not None and not medium.is_deferred
         self._ns = namespace(medium.parameters()[0])
 
     def zero(self) -> Any:
-        return self._ns.ArrayXf([self._ns.Float(0)] * (3 * self._own + self.count))
+        return self._ns.ArrayXf([self._ns.Float(0)] * (3 * self._has_own_color + self.count))
 
     def shade(self, medium: Medium, features: list[Float], p: Point3f, w: Vector3f, active: Bool) -> Any:
-        color = list(medium.color(features, p, w, active)) if self._own else []
+        color = list(medium.color(features, p, w, active)) if self._has_own_color else []
         return self._ns.ArrayXf([*color, *features])
 
     def resolve_color(self, medium: Medium, sums: Any, opacity: Float, ray: LocalRay, active: Bool) -> Color | None:
         array_type = self.color_type
-        if array_type is None or self._own:
+        if array_type is None or self._has_own_color:
             return None if array_type is None else array_type(list(sums)[:3])
         means = mean_features(self.features(sums), opacity)
         ask = lambda active: array_type(medium.color(means, ray.o, ray.w, active))
         if dr.grad_enabled(means, ray.w, *medium.parameters()):
             return dr.select(active, opacity * ask(active), 0)
-        # Where no ray of a packet meets anything, the network is passed over.
+        # Packets without any absorption skip the network.
         some = active & (opacity > 0)
         return opacity * dr.if_stmt((some,), some, ask, lambda _: dr.zeros(array_type), label="deferred colour")
 
     def features(self, sums: Any) -> list[Float]:
         """The features in ``sums``, composited but not divided by opacity."""
-        return list(sums)[3 * self._own :]
+        return list(sums)[3 * self._has_own_color :]
 
 
-def make_color_shader(medium: Medium, color_type: type, features: bool = False) -> Painter:
-    """What gathers the colour of a medium that has one, as ``color_type``; with ``features``, a `FeaturePainter`."""
-    return FeaturePainter(medium, color_type) if features or medium.is_deferred else ColorPainter(color_type)
+def make_color_shader(medium: Medium, color_type: type, with_features: bool = False) -> SampleShader:
+    """A shader for the colour of a medium, as ``color_type``; ``with_features``: a `FeatureShader`."""
+    return FeatureShader(medium, color_type) if with_features or medium.is_deferred else ColorShader(color_type)
 
 
 def evaluate_features(medium: Medium, p: Point3f, active: Bool) -> list[Float]:
-    """Features at scene points ``p``; 0 where not ``active``."""
+    """Features at scene points ``p``; 0 on inactive lanes."""
     features = medium.density_features(medium.to_local(p), active)[1]
     return [dr.select(active, f, 0) for f in features]
 
 
 def accumulate_features(place: SceneGeometry, ray: Ray3f, active: Bool, settings: MarchSettings) -> list[Float]:
-    """Features accumulated along ``ray`` through ``place``, whose medium has some; 0 where not ``active``.
+    """Features composited along ``ray`` through ``geometry``, whose medium has features; 0 on inactive lanes.
 
-    What gathers them is always the default's, in training as in every picture: ``color_cutoff`` chooses how exact
-    colours are."""
+    Always uses the default ``color_cutoff``, in training and rendering: the parameter only controls the accuracy of
+    colour.
+    """
     settings = replace(settings, color_cutoff=MarchSettings.color_cutoff)
-    march: Any = place.trace(ray, active, settings, color=FeaturePainter(_featured(place))).march
+    march: Any = place.trace(ray, active, settings, color=FeatureShader(_medium_with_features(place))).march
     return [dr.select(active, f, 0) for f in march.color]
 
 
-def observed_features(
+def features_for_observer(
     kind: str, place: SceneGeometry, p_od: Point3f, p_o: Point3f, r_o: Vector3f, active: Bool, settings: MarchSettings
 ) -> list[Float] | None:
-    """Features of what an observer sees at ``p_od`` along unit ``r_o`` from ``p_o``, for a gaze field that wants such
-    of ``kind`` (``fields.gaze_product.SEMANTICS``); None for one that wants none. ``settings``: of the march."""
+    """Features for a gaze field of the semantic ``kind`` (`fields.gaze_product.SEMANTICS`); None for a field without
+    them.
+
+    ``p_od``: the surface that the observer at ``p_o`` sees along unit ``r_o``; ``settings``: of the march.
+    """
     if kind == "snapshot":
-        return evaluate_features(_featured(place), p_od, active)
+        return evaluate_features(_medium_with_features(place), p_od, active)
     if kind == "accumulated":
         return accumulate_features(place, variant_types().Ray3f(p_o, r_o), active, settings)
     return None
 
 
-def _featured(place: SceneGeometry) -> Medium:
+def _medium_with_features(place: SceneGeometry) -> Medium:
     if place.medium is None:
-        raise ValueError("a place without a medium has no features")
+        raise ValueError("a scene without a medium has no features")
     return place.medium
 
 
-# ---- A trained radiance field as a medium that is marched ----
+# ---- Radiance field as a medium ----
 
 
 class FieldMedium:
-    """A radiance field placed in the scene: a ``medium.Medium`` in the field's own coordinates.
+    """A radiance field placed in the scene: a `medium.Medium` in the field's own coordinates.
 
-    ``to_world``: field to scene; the identity by default.
+    ``to_world``: field to scene; default: the identity.
     """
 
     has_color = True
@@ -125,7 +130,7 @@ class FieldMedium:
 
     @property
     def occupancy(self) -> Occupancy | None:
-        """The field's own, which changes with its weights."""
+        """The field's occupancy grid, which changes with its weights."""
         return self.field.occupancy
 
     @property
@@ -138,7 +143,7 @@ class FieldMedium:
 
     @property
     def default_step(self) -> float | None:
-        """The step that the field was trained with, in scene units."""
+        """The step length of the training, in scene units."""
         return None if self.field.march_step is None else self.field.march_step * self.to_world.scale
 
     @property
@@ -151,8 +156,8 @@ class FieldMedium:
     def parameters(self) -> list[Any]:
         return self.field.kernel_parameters()
 
-    def refresh(self, anyway: bool = False) -> None:
-        """Nothing to do: weights are read whenever the field is marched."""
+    def refresh(self, force: bool = False) -> None:
+        """No effect: weights are read in each march."""
 
     def ray_to_local(self, o: Point3f, d: Vector3f) -> LocalRay:
         o_l, d_l = self.to_world.point_to_local(o), self.to_world.vector_to_local(d)
@@ -169,23 +174,23 @@ class FieldMedium:
         return v / self.field.box.cube_side
 
     def density(self, p: Point3f, active: Bool) -> Float:
-        return bounded(self.field.density(p, active) * self._per_unit)
+        return clamp_density(self.field.density(p, active) * self._per_unit)
 
-    def occupied_density(self, p: Point3f, active: Bool) -> Float:
-        """``density`` where no march has looked up the occupancy grid before: 0 in its empty cells."""
+    def density_in_occupied_cells(self, p: Point3f, active: Bool) -> Float:
+        """``density`` where the march has not tested the occupancy grid: 0 in its empty cells."""
         if self.occupancy is not None:
             active = active & (self.occupancy.distance_to_occupied(self.to_unit(p), active) == 0)
         return dr.select(active, self.density(p, active), 0)
 
     def density_features(self, p: Point3f, active: Bool) -> tuple[Float, list[Float]]:
         sigma, features = self.field.density_features(p, active)
-        return bounded(sigma * self._per_unit), features
+        return clamp_density(sigma * self._per_unit), features
 
     def color(self, features: list[Float], p: Point3f, w: Vector3f, active: Bool) -> Color:
         return self.field.color(features, w)
 
     def background(self, o: Point3f, d: Vector3f) -> Color | None:
-        """Of the field's background network; None for a field without one."""
+        """Colour of the field's background network; None for a field without one."""
         if self.field.background is None:
             return None
         return self.field.background(self.to_world.point_to_local(o), self.to_world.direction_to_local(d))

@@ -1,4 +1,4 @@
-"""Dr.Jit's side of rendering: fingerprints of scenes and fields, and frozen functions."""
+"""Dr.Jit utilities of rendering: fingerprints of arrays, and frozen functions."""
 
 from __future__ import annotations
 
@@ -15,14 +15,15 @@ if TYPE_CHECKING:
 
 # ---- Fingerprint ----
 #
-# Whether arrays are still those that something was made of: told by identity, without reading them.
+# Whether arrays are unchanged, compared by identity and without reading them.
 
 
 class Fingerprint(list):
-    """Of ``values`` (Dr.Jit arrays, or anything that holds some): equal as long as these are.
+    """Fingerprint of ``values`` (Dr.Jit arrays, or objects that contain some): equal as long as these are the same.
 
-    Copies are held, so that no later variable can take the place of one: the objects that ``mi.traverse`` gives are
-    assigned to, and hold other variables then."""
+    Holds copies, so that a later variable cannot reuse an index: objects from ``mi.traverse`` are assigned to, and then
+    hold other variables.
+    """
 
     def __init__(self, values: Iterable[Any]):
         held = [dr.copy(v) for v in values]
@@ -31,51 +32,50 @@ class Fingerprint(list):
 
 
 class HasShapes(Protocol):
-    """A ``geometry.Place``, of which only the shapes count here."""
+    """The part of a `geometry.SceneGeometry` that matters here: its shapes."""
 
     scene: mi.Scene | None
 
 
-def of_shapes(place: HasShapes) -> Fingerprint:
-    """Of all shapes of ``place``, those that instances repeat among them; of a place without any, that of nothing."""
+def fingerprint_shapes(geometry: HasShapes) -> Fingerprint:
+    """Fingerprint of all shapes of ``geometry``, including instanced ones; empty without shapes."""
     import mitsuba as mi
 
-    if place.scene is None:
+    if geometry.scene is None:
         return Fingerprint([])
-    shapes = [*place.scene.shapes(), *_groups(mi, place.scene)]
+    shapes = [*geometry.scene.shapes(), *_groups(mi, geometry.scene)]
     return Fingerprint(v for shape in shapes for v in dict(mi.traverse(shape)).values())
 
 
 def _groups(mi: Any, scene: Any) -> list[Any]:
-    """What instances repeat: no shapes of the scene itself."""
-    found = []
+    """Shape groups of instances, which are not among the scene's shapes."""
+    groups = []
 
     class GroupCollector(mi.TraversalCallback):
         def put(self, name, value, *rest):
             if isinstance(value, mi.Shape) and value.class_name().startswith("ShapeGroup"):
-                found.append(value)
+                groups.append(value)
 
     if any(shape.class_name() == "Instance" for shape in scene.shapes()):
         scene.traverse(GroupCollector())
-    return found
+    return groups
 
 
 # ---- Freezing ----
 #
-# What to mind while ``dr.freeze`` records a function: it will be replayed with other values, and nothing is decided by
-# them.
+# While ``dr.freeze`` records a function, values cannot be read: the function is replayed with other values.
 
 
-def recording() -> bool:
-    """Whether a frozen function is being recorded: values cannot be read then."""
+def is_recording() -> bool:
+    """Whether ``dr.freeze`` is recording a function, so that values cannot be read."""
     return dr.flag(dr.JitFlag.FreezingScope)
 
 
 @contextmanager
-def no_collection() -> Iterator[None]:
-    """Keep Python's garbage while a function is recorded: Dr.Jit 1.5 ends the process where an array that lies in
-    NumPy's memory is freed."""
-    paused = recording() and gc.isenabled()
+def gc_paused() -> Iterator[None]:
+    """Pause garbage collection while a function is recorded: Dr.Jit 1.5 aborts the process if an array in NumPy memory
+    is freed."""
+    paused = is_recording() and gc.isenabled()
     if paused:
         gc.disable()
     try:
@@ -83,7 +83,8 @@ def no_collection() -> Iterator[None]:
     finally:
         if paused:
             if gc.get_freeze_count() == 0:
-                # Counts as if everything had just been looked at; otherwise the next object made would collect it all.
+                # Moves all objects to the oldest generation; otherwise the next allocation would start a full
+                # collection.
                 gc.freeze()
                 gc.unfreeze()
             gc.enable()

@@ -1,4 +1,4 @@
-"""The march through a medium as one differentiable operation: its adjoint, and that of hits."""
+"""The differentiable march through a medium: primal march, forward and reverse derivatives, and the coarse pre-pass."""
 
 from __future__ import annotations
 
@@ -16,58 +16,56 @@ from .march_primal import (
     MarchResult,
     MarchSettings,
     MarchSums,
-    Occlusion,
-    advance,
-    first_hit,
-    limits,
+    OcclusionQuery,
     march_hits,
     march_primal,
-    nothing_absorbed,
+    next_step,
+    optical_depth_limits,
+    position_before,
+    zero_sums,
 )
-from .medium import Hits, LastHit, LocalRay, Medium, Painter
-from .quadrature import RULES, absorbed_fraction, boundaries
+from .medium import Hits, LastHit, LocalRay, Medium, SampleShader
+from .quadrature import RULES, absorbed_fraction, cells_for_rule
 
-# ---- Derivatives of a march, by marching again ----
+# ---- Derivatives of a march in steps ----
 #
-# In the manner of path replay (Vicini et al. 2021): nothing is stored along the ray.
-# The primal's sums are known, so a second march that repeats its steps knows, at
-# step i, both what lies in front and what lies behind it. With T_i the
-# transmittance before the step, and M and C the weighted sums of distances and
-# colours, the derivative of the outputs with respect to the step's own optical
-# depth dτ_i, mean distance m_i (from t0 on) and colour c_i is that of
+# A variant of path replay backpropagation (Vicini et al. 2021): no sample is stored. The primal march returns its sums,
+# so a second march over the same steps knows at step i what lies in front of the step and what lies behind it. With T_i
+# the transmittance before step i, and M and C the weighted sums of distances and colours, the derivative of the outputs
+# with respect to the step's optical depth dτ_i, its mean distance m_i (measured from t0) and its colour c_i equals the
+# derivative of
 #
 #     f_i = δτ dτ_i + T_i (1 - e^{-dτ_i}) (δM m_i + δC c_i) - dτ_i (δM M_{>i} + δC C_{>i}) + δh h_i
 #
-# where δ are the adjoints, M_{>i} the part of M behind the step, and h_i the step's
-# part in the distance at which an optical depth is reached. Nothing is divided by a
-# transmittance, which may be zero.
+# where δ are the adjoints, M_{>i} is the part of M behind the step, and h_i is the step's contribution to the distance
+# at which a given optical depth is reached. No term divides by a transmittance, which can be zero.
 #
-# Steps keep their lengths and move with the ray's entry t0; the last one ends at t1.
+# Steps keep their lengths and move with the entry point t0 of the ray; the last step ends at t1.
 
 _INPUTS = ("o", "d", "w", "t0", "t1")
 
 
-def attached(medium: Medium, ray: LocalRay, t0: Float, t1: Float) -> bool:
-    """Whether any derivative is to be tracked through a march."""
+def needs_gradients(medium: Medium, ray: LocalRay, t0: Float, t1: Float) -> bool:
+    """Whether the ray, its interval or the medium's parameters carry gradients."""
     return any(dr.grad_enabled(x) for x in (ray.o, ray.d, ray.w, t0, t1, *medium.parameters()))
 
 
-def differentiable_march(
-    operation: type[March], ray: LocalRay, t0: Float, t1: Float, request: MarchRequest
+def march_differentiably(
+    operation: type[MarchOp], ray: LocalRay, t0: Float, t1: Float, request: MarchRequest
 ) -> MarchResult:
-    """A march as one differentiable ``operation``."""
-    # Every sample gets its own colour: a shared one would hand its derivative to the wrong samples.
+    """Run ``operation`` as a differentiable custom operation."""
+    # Each sample is shaded separately: a shared colour would send its gradient to the wrong samples.
     settings = replace(request.settings, color_cutoff=0.0)
     request = replace(request, settings=settings, occlusion=None)
     result = dr.custom(operation, ray.o, ray.d, ray.w, t0, t1, request)
-    for name in ("half_slope", "enter", "enter_tau"):
+    for name in ("median_depth_slope", "crossing_start", "crossing_start_tau"):
         setattr(result, name, dr.detach(getattr(result, name)))
     return result
 
 
 @dataclass(kw_only=True)
 class _Replay(MarchSums):
-    """Where a repeated march is: the primal's loop state as far as derivatives need it."""
+    """The part of the primal loop state that the derivative march repeats."""
 
     active: Bool
     color: Color
@@ -75,47 +73,46 @@ class _Replay(MarchSums):
 
 @dataclass(kw_only=True)
 class _ReplayedSteps(_Replay):
-    """Of a march in steps; the fields are those of the primal's state."""
+    """Replay state of a march in steps; the fields match those of the primal state."""
 
     t: Float
-    share: Float
+    fraction: Float
 
 
 @dataclass(kw_only=True)
 class _ReplayedHits(_Replay):
-    """Of a march from hit to hit; ``index``: of the hit to come."""
+    """Replay state of a march from hit to hit; ``index``: the next hit."""
 
     index: UInt32
 
 
 @dataclass
-class Replayed:
-    """One repeated step, attached to what derivatives are asked of."""
+class ReplayStep:
+    """One repeated step, attached to the differentiable inputs."""
 
     active: Bool
     dtau: Float
-    mean: Float
+    mean_distance: Float
     color: Color
-    # Detached, in front of the step.
+    # Transmittance in front of the step; detached.
     transmittance: Float
-    # Whether the crossing that is looked for lies behind the step, and whether it lies in it.
-    before: Bool
-    crosses: Bool
-    # Distance of that crossing, where it lies in the step.
-    crossing: Float
+    # Whether the optical depth that is searched for is reached behind the step, or inside it.
+    is_before_crossing: Bool
+    has_crossing: Bool
+    # Distance at which it is reached, if it is reached inside the step.
+    crossing_distance: Float
 
 
-class March(dr.CustomOp):
-    """A march as one node of the graph: ``march_primal`` forwards, and once more for the derivatives."""
+class MarchOp(dr.CustomOp):
+    """A march as one node of the AD graph: `march_primal` for the values, a second march for the derivatives."""
 
     def eval(self, o, d, w, t0, t1, request):
         self.request: MarchRequest = request
         self.inputs = (o, d, w, t0, t1)
-        # The medium's weights are read, not passed: tell the graph that the result depends on them.
+        # The medium's weights are read and not passed as inputs, so the graph has to be told about them.
         for parameter in request.medium.parameters():
             self.add_input(parameter)
-        # Symbolic also where an enclosing derivative has switched loops to evaluated ones: the steps must not be
-        # stored.
+        # Loops stay symbolic even if an enclosing derivative evaluates them: the steps must not be stored.
         with dr.suspend_grad(), dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, True):
             self.result = self._primal(LocalRay(*self.inputs), t0, t1, request)
         return self.result
@@ -125,20 +122,24 @@ class March(dr.CustomOp):
     def backward(self):
         color, primal = self.request.color, self.result
         adjoint: Any = self.grad_out()
-        d_half = dr.select(dr.isfinite(primal.half), adjoint.half, 0)
+        d_half = dr.select(dr.isfinite(primal.median_depth), adjoint.median_depth, 0)
 
         def body(state, grads):
             with dr.resume_grad():
                 leaves = [dr.detach(x) for x in self.inputs]
                 dr.enable_grad(leaves)
                 step, state = self._replay(leaves, state)
-                arriving = adjoint.moment * step.mean
+                arriving = adjoint.moment * step.mean_distance
                 behind = adjoint.moment * (primal.moment - state.moment)
                 if color is not None:
                     arriving += dr.dot(adjoint.color, step.color)
                     behind += dr.dot(adjoint.color, primal.color - state.color)
                 f = step.dtau * (adjoint.tau - behind) + step.transmittance * absorbed_fraction(step.dtau) * arriving
-                h = dr.select(step.before, -primal.half_slope * step.dtau, dr.select(step.crosses, step.crossing, 0))
+                h = dr.select(
+                    step.is_before_crossing,
+                    -primal.median_depth_slope * step.dtau,
+                    dr.select(step.has_crossing, step.crossing_distance, 0),
+                )
                 dr.backward_from(dr.select(step.active, f + d_half * h, 0))
                 grads = [g + dr.grad(x) for g, x in zip(grads, leaves)]
             return state, grads
@@ -159,41 +160,51 @@ class March(dr.CustomOp):
                 for leaf, tangent in zip(leaves, tangents):
                     dr.set_grad(leaf, tangent)
                 step, state = self._replay(leaves, state)
-                # The step's own weight, and what it adds to the sums while T_i is held fixed.
+                # The weight of the step, and its contribution to the sums at fixed T_i.
                 weight = step.transmittance * absorbed_fraction(step.dtau)
-                outputs = [step.dtau, weight * step.mean, dr.select(step.crosses, step.crossing, 0)]
+                outputs = [
+                    step.dtau,
+                    weight * step.mean_distance,
+                    dr.select(step.has_crossing, step.crossing_distance, 0),
+                ]
                 outputs += [] if color is None else [weight * step.color]
-                # Keep all derivatives: an output is an interior node of others, and the weights serve again.
+                # Keep all gradients: outputs are interior nodes of other outputs, and the weights are used again.
                 dr.forward_to(outputs, flags=dr.ADFlag.ClearNone)
-                own = [dr.select(step.active, dr.grad(x), 0) for x in outputs]
-            # T_i falls with the optical depth in front of the step.
-            moment = dot.moment + own[1] - dr.select(step.active, dot.tau * dr.detach(outputs[1]), 0)
-            half = dot.half + own[2] - dr.select(step.crosses, dot.tau * primal.half_slope, 0)
+                tangents_of_step = [dr.select(step.active, dr.grad(x), 0) for x in outputs]
+            # T_i decreases with the optical depth in front of the step.
+            moment = dot.moment + tangents_of_step[1] - dr.select(step.active, dot.tau * dr.detach(outputs[1]), 0)
+            half = (
+                dot.median_depth
+                + tangents_of_step[2]
+                - dr.select(step.has_crossing, dot.tau * primal.median_depth_slope, 0)
+            )
             painted = dot.color
             if color is not None:
-                painted = painted + own[3] - dr.select(step.active, dot.tau * dr.detach(outputs[3]), 0)
-            return state, replace(dot, tau=dot.tau + own[0], moment=moment, half=half, color=painted)
+                painted = painted + tangents_of_step[3] - dr.select(step.active, dot.tau * dr.detach(outputs[3]), 0)
+            return state, replace(
+                dot, tau=dot.tau + tangents_of_step[0], moment=moment, median_depth=half, color=painted
+            )
 
-        self.set_grad_out(self._march_again(body, replace(self.request.start(Float), half=Float(0))))
+        self.set_grad_out(self._march_again(body, replace(self.request.init_result(Float), median_depth=Float(0))))
 
     def _march_again(self, body: Callable[[Any, Any], tuple[Any, Any]], extra: Any) -> Any:
-        """Repeat the primal's steps, threading ``extra`` through ``body(state, extra)``."""
+        """Repeat the primal's steps and thread ``extra`` through ``body(state, extra)``."""
         f, t0 = self.request, self.inputs[3]
         Float = type(t0)
-        share, color = Float(1 if f.offset is None else f.offset), None if f.color is None else f.color.zero()
-        start = _ReplayedSteps(**nothing_absorbed(Float), active=f.active, color=color, t=t0, share=share)
+        fraction, color = Float(1 if f.offset is None else f.offset), None if f.color is None else f.color.zero()
+        start = _ReplayedSteps(**zero_sums(Float), active=f.active, color=color, t=t0, fraction=fraction)
         with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, True):
             _, extra = dr.while_loop((start, extra), lambda state, _: state.active, body, label="march adjoint")
         return extra
 
-    def _replay(self, leaves: list[Any], state: Any) -> tuple[Replayed, Any]:
+    def _replay(self, leaves: list[Any], state: Any) -> tuple[ReplayStep, Any]:
         """The next step, attached to ``leaves`` and the medium, and the state after it."""
         f, (primal_t0, primal_t1) = self.request, self.inputs[3:]
         quadrature = RULES.find(f.settings.quadrature)
-        cells = boundaries(quadrature, f.medium)
+        cells = cells_for_rule(quadrature, f.medium)
         ray = LocalRay(*self.inputs)
-        active, t, delta, t_next = advance(
-            f.medium, ray, state.t, primal_t1, state.share, f.settings, state.active, cells, f.fine_from
+        active, t, delta, t_next = next_step(
+            f.medium, ray, state.t, primal_t1, state.fraction, f.settings, state.active, cells, f.fine_from
         )
         o, d, w, t0, t1 = leaves
         begin = t0 + (t - primal_t0)
@@ -205,11 +216,11 @@ class March(dr.CustomOp):
             active,
             step.dtau,
             absorbed_fraction(dr.detach(step.dtau)),
-            dr.fma(length, step.share, t - primal_t0),
-            step.paint,
-            lambda missing: begin + step.crossing(missing),
+            dr.fma(length, step.mean_fraction, t - primal_t0),
+            step.shade,
+            lambda missing: begin + step.find_crossing(missing),
         )
-        return replayed, replace(after, active=after.active & (t_next < primal_t1), t=t_next, share=type(t0)(1))
+        return replayed, replace(after, active=after.active & (t_next < primal_t1), t=t_next, fraction=type(t0)(1))
 
     def _absorb(
         self,
@@ -218,11 +229,21 @@ class March(dr.CustomOp):
         dtau: Float,
         absorbed: Float,
         mean: Float,
-        paint: Callable[[Painter, Bool], Color],
+        paint: Callable[[SampleShader, Bool], Color],
         crossing: Callable[[Float], Float],
-    ) -> tuple[Replayed, Any]:
-        """One step, and the sums of ``state`` behind it: ``dtau`` and ``mean`` attached, ``absorbed`` detached."""
-        goal, end = limits(type(state.tau), self.request.settings, self.request.until)
+    ) -> tuple[ReplayStep, Any]:
+        """Add one step to the sums of ``state``.
+
+        Parameters
+        ----------
+        dtau, mean : Float
+            Optical depth of the step and its mean distance from the start of the march; attached.
+        absorbed : Float
+            Fraction of the arriving light that the step absorbs; detached.
+        paint, crossing : callable
+            The colour of the step on a mask of lanes, and the distance at which a remaining optical depth is reached.
+        """
+        goal, end = optical_depth_limits(type(state.tau), self.request.settings, self.request.until)
         after, weight, crosses = state.absorb(active, dr.detach(dtau), absorbed, dr.detach(mean), goal)
         painted = None
         if self.request.color is not None:
@@ -232,21 +253,21 @@ class March(dr.CustomOp):
         after.active = active & (after.tau < end)
         before = active & (after.tau < goal)
         at = crossing(dr.select(crosses, goal - state.tau, 0))
-        return Replayed(active, dtau, mean, painted, dr.exp(-state.tau), before, crosses, at), after
+        return ReplayStep(active, dtau, mean, painted, dr.exp(-state.tau), before, crosses, at), after
 
     def name(self):
         return "march"
 
 
-# ---- Derivatives of a march from hit to hit, by finding the hits again ----
+# ---- Derivatives of a march from hit to hit ----
 #
-# The sums are those of ``adjoint``, with a hit's optical depth, its distance and its colour for a step's: nothing is
-# stored along the ray, however many hits there are. Which hits there are, and their order, carry no derivatives: one
-# that moves past another, or to where it is cut off, changes the sums by a jump that is not seen.
+# The sums are those above, with the optical depth, distance and colour of a hit in place of those of a step. No hit is
+# stored, so memory does not grow with the number of hits. Which hits a ray has, and their order, carry no gradient: a
+# hit that moves past another one, or past a cut-off, makes the sums jump, and derivatives miss that jump.
 
 
-class HitMarch(March):
-    """``march_hits`` as one node of the graph."""
+class HitMarchOp(MarchOp):
+    """`march_hits` as one node of the AD graph."""
 
     _primal = staticmethod(march_hits)
 
@@ -255,10 +276,10 @@ class HitMarch(March):
         hits, ray = cast("Hits", f.medium.hits), LocalRay(*(dr.detach(x) for x in self.inputs))
         Float = type(t0)
         UInt32: Any = dr.uint32_array_t(Float)
-        end = limits(Float, f.settings, f.until)[1]
+        end = optical_depth_limits(Float, f.settings, f.until)[1]
 
         def take(state, t, index, extra):
-            """The first of the hits; the others move up."""
+            """Process the first hit of the group and shift the others."""
             state, extra = body(replace(state, index=index[0]), extra)
             t, index = t[1:] + [Float(dr.inf)], index[1:] + [UInt32(0)]
             return replace(state, active=state.active & (t[0] < dr.inf)), t, index, extra
@@ -273,13 +294,13 @@ class HitMarch(March):
             return active & (farthest.t < dr.inf) & (state.tau < end), farthest, state, extra
 
         color = None if f.color is None else f.color.zero()
-        state = _ReplayedHits(**nothing_absorbed(Float), active=f.active, color=color, index=UInt32(0))
-        first = first_hit(t0)
+        state = _ReplayedHits(**zero_sums(Float), active=f.active, color=color, index=UInt32(0))
+        first = position_before(t0)
         with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, True):
             out = dr.while_loop((f.active, first, state, extra), lambda active, *_: active, group, label="hits adjoint")
         return out[3]
 
-    def _replay(self, leaves: list[Any], state: Any) -> tuple[Replayed, Any]:
+    def _replay(self, leaves: list[Any], state: Any) -> tuple[ReplayStep, Any]:
         medium, active, index = self.request.medium, state.active, state.index
         o, d, w, t0, t1 = leaves
         t, absorbed = cast("Hits", medium.hits).reevaluate(LocalRay(o, d, w, t0, t1), index, active)
@@ -296,13 +317,11 @@ class HitMarch(March):
 
 # ---- March ----
 #
-# Volume rendering along rays: the march through a medium, with derivatives where any are tracked.
-#
-# Chooses between the plain march (``primal``) and the one that can be differentiated by marching again (``adjoint``),
-# and lets steps be coarse in front of all matter.
+# Volume rendering along rays: the plain march, or the differentiable one if anything carries gradients, with an
+# optional coarse pre-pass through empty space.
 
 
-# Optical depth that counts as a first trace of matter.
+# Optical depth at which the pre-pass reports matter.
 _TRACE = 1e-3
 
 
@@ -315,58 +334,81 @@ def march(
     settings: MarchSettings,
     *,
     offset: Float | None = None,
-    color: Painter | None = None,
+    color: SampleShader | None = None,
     count: bool = False,
     until: Float | float | None = None,
     fine_from: Float | None = None,
-    occlusion: Occlusion | None = None,
+    occlusion: OcclusionQuery | None = None,
 ) -> MarchResult:
-    """March ``ray`` from the distance ``t0`` to ``t1``, both in scene units and finite where there is matter.
+    """March ``ray`` from the distance ``t0`` to ``t1``.
 
-    ``offset`` in [0, 1]: length of the first step as a share of a full one (jitter; None: a full step). ``color``: what
-    samples contribute to the result's ``color``; None for a density-only pass. ``until``: optical depth at which to
-    end, for a march that only looks for that crossing. ``count``: count evaluations. ``fine_from``: distance up to
-    which steps are coarse. ``occlusion``: end as soon as its answer is known, unless derivatives are tracked, and say
-    so in ``known``. Differentiable, in forward and in reverse mode, in the ray, ``t0``, ``t1``, ``until`` and
-    the medium's parameters. Raises ``NergError`` for a quadrature rule that is not known, or that the medium does not
-    suit.
+    Differentiable, in forward and reverse mode, in the ray, ``t0``, ``t1``, ``until`` and the medium's parameters.
+
+    Parameters
+    ----------
+    t0, t1 : Float
+        Ends of the interval in scene units; both finite where there is matter.
+    offset : Float, optional
+        Length of the first step as a fraction of a full step, in [0, 1] (jitter). Default: a full step.
+    color : SampleShader, optional
+        What samples contribute to the ``color`` of the result. Default: a density-only pass.
+    count : bool
+        Count density and colour evaluations.
+    until : Float, optional
+        Optical depth at which the march ends, for a march that only searches this crossing.
+    fine_from : Float, optional
+        Distance up to which steps are coarse (`find_fine_start`).
+    occlusion : OcclusionQuery, optional
+        End as soon as the query is decided, and report it in ``decided``. Ignored if anything carries gradients.
+
+    Raises
+    ------
+    NergError
+        If the quadrature rule is unknown, or needs a medium of another kind.
     """
     Float = type(ray.t_near)
     active = dr.mask_t(Float)(active) & (t0 < t1)
     t0, t1 = Float(t0), Float(t1)
     request = MarchRequest(medium, active, settings, offset, color, count, until, fine_from, occlusion)
-    if attached(medium, ray, t0, t1):
-        result = differentiable_march(March if medium.hits is None else HitMarch, ray, t0, t1, request)
+    if needs_gradients(medium, ray, t0, t1):
+        result = march_differentiably(MarchOp if medium.hits is None else HitMarchOp, ray, t0, t1, request)
     else:
         result = (march_primal if medium.hits is None else march_hits)(ray, t0, t1, request)
-    result.origin = t0
+    result.start_distance = t0
     if until is not None and dr.grad_enabled(until):
-        crossed = dr.isfinite(result.half)
-        result.half = dr.select(crossed, dr.fma(result.half_slope, until - dr.detach(until), result.half), result.half)
+        crossed = dr.isfinite(result.median_depth)
+        result.median_depth = dr.select(
+            crossed,
+            dr.fma(result.median_depth_slope, until - dr.detach(until), result.median_depth),
+            result.median_depth,
+        )
     return result
 
 
-def fine_start(
+def find_fine_start(
     medium: Medium, ray: LocalRay, t0: Float, t1: Float, active: Bool, settings: MarchSettings
 ) -> tuple[Float, Float]:
-    """Distance from which matter must be marched finely, and the density evaluations that finding it took.
+    """Distance from which matter must be marched with fine steps, and the number of density evaluations of the search.
 
-    A coarse density-only march looks for the first trace of matter. What is thinner than a coarse step may be missed.
+    A coarse density-only march searches for the first trace of matter. It can miss matter that is thinner than a coarse
+    step.
     """
-    scout = replace(settings, step=settings.step * settings.coarse, coarse=1.0, quadrature="constant")
+    coarse_settings = replace(settings, step=settings.step * settings.coarse, coarse=1.0, quadrature="constant")
     with dr.suspend_grad():
-        found = march(medium, ray, t0, t1, active, scout, until=_TRACE, count=True)
-        return dr.select(dr.isfinite(found.half), found.enter - scout.step, dr.inf), cast("Float", found.density_evals)
+        coarse = march(medium, ray, t0, t1, active, coarse_settings, until=_TRACE, count=True)
+        return dr.select(dr.isfinite(coarse.median_depth), coarse.crossing_start - coarse_settings.step, dr.inf), cast(
+            "Float", coarse.density_evals
+        )
 
 
-def scouted_march(
+def march_with_prepass(
     medium: Medium, ray: LocalRay, t0: Float, t1: Float, active: Bool, settings: MarchSettings, **options: Any
 ) -> MarchResult:
-    """``march`` with coarse steps in front of all matter, where ``settings.coarse`` asks for them."""
+    """`march` with coarse steps through the empty space in front of all matter, if ``settings.coarse`` exceeds 1."""
     if settings.coarse <= 1 or medium.hits is not None:
         return march(medium, ray, t0, t1, active, settings, **options)
-    fine_from, scouted = fine_start(medium, ray, t0, t1, active, settings)
+    fine_from, prepass_evaluations = find_fine_start(medium, ray, t0, t1, active, settings)
     result = march(medium, ray, t0, t1, active, settings, fine_from=fine_from, **options)
     if result.density_evals is not None:
-        result.density_evals = result.density_evals + scouted
+        result.density_evals = result.density_evals + prepass_evaluations
     return result

@@ -1,4 +1,4 @@
-"""Quadrature of optical depth along a step: the protocol, the registry and the rules."""
+"""Quadrature of the optical depth along one step: protocol, registry and rules."""
 
 from __future__ import annotations
 
@@ -12,37 +12,36 @@ from nerg_mi.errors import NergError
 from nerg_mi.maths.arrays import one_minus_exp, quotient
 from nerg_mi.maths.types import Bool, Color, Float
 
-from .medium import LocalRay, Medium, Painter, VoxelCells
+from .medium import LocalRay, Medium, SampleShader, VoxelCells
 
-# ---- What one step of constant or linear density contributes to opacity and to depth ----
+# ---- Contribution of one step of constant or linear density to opacity and depth ----
 #
-# The NeRF rule (Mildenhall et al. 2020, eq. 3; Max 1995): density is constant over
-# a step of length δ, so that the step absorbs 1 - exp(-σδ) of what reaches it.
-# Under the same assumption the absorbed light comes from a mean distance into the
-# step of 1/σ - δ/expm1(σδ); using it makes the expected depth exact for piecewise
-# constant density, where the step's midpoint or end would be biased.
+# The NeRF rule (Mildenhall et al. 2020, eq. 3; Max 1995) takes density as constant over a step of length δ, which then
+# absorbs 1 - exp(-σδ) of the arriving light. Under the same assumption, light is absorbed at a mean distance of 1/σ -
+# δ/expm1(σδ) into the step. With this distance the expected depth is exact for piecewise constant density; the step's
+# midpoint or end would be biased.
 #
-# Where density rises or falls linearly from a to b (times δ), the mean is, by parts and with
-# T = (a + b) / 2, that of ∫ exp(-τ(s)) ds over the step: the scaled complementary error function
-# erfcx where density rises, Dawson's integral where it falls.
+# Where density changes linearly from a to b (times δ), the mean follows by parts, with T = (a + b) / 2, from ∫
+# exp(-τ(s)) ds over the step: the scaled complementary error function erfcx for rising density, Dawson's integral for
+# falling density.
 
 
-# Below it the closed form cancels; the series is then exact to 1e-8.
+# Below this optical depth the closed form cancels and the series is exact to 1e-8.
 _SERIES_BELOW = 0.5
-# exp overflows fp32 beyond 88, where its reciprocal is 0 to working precision anyway.
+# exp overflows fp32 beyond 88; its reciprocal is 0 in working precision there.
 _EXP_LIMIT = 80.0
 
 
 def absorbed_fraction(tau: Float) -> Float:
-    """Share 1 - exp(-τ) of the light that a step of optical depth ``tau`` absorbs."""
+    """Fraction 1 - exp(-τ) of the light that a step of optical depth ``tau`` absorbs."""
     return one_minus_exp(tau)
 
 
 def mean_depth_fraction(tau: Float) -> Float:
-    """Mean distance into a step at which light is absorbed, as a share of its length.
+    """Mean absorption distance of a step of constant density, as a fraction of its length.
 
-    h(τ) = 1/τ - 1/expm1(τ): 1/2 for thin steps, 1/τ for opaque ones. ``tau``: optical depth
-    σδ >= 0 of the step, up to infinity. Finite, with a finite derivative, everywhere.
+    h(τ) = 1/τ - 1/expm1(τ): 1/2 for thin steps, 1/τ for opaque ones. ``tau``: optical depth σδ >= 0 of the step, up to
+    infinity. Finite, with a finite derivative, everywhere.
     """
     small = dr.minimum(tau, _SERIES_BELOW)
     square = small * small
@@ -52,8 +51,8 @@ def mean_depth_fraction(tau: Float) -> Float:
     return dr.select(tau < _SERIES_BELOW, series, closed)
 
 
-# Up to this optical depth of a step the closed form of its mean depth cancels; then a polynomial is used,
-# of the optical depth T (rows) and of r = (b - a) / (a + b) (columns), good to 2e-8.
+# Up to this optical depth the closed form of the mean depth cancels. A polynomial in the optical depth T (rows) and r =
+# (b - a) / (a + b) (columns) is used instead; its error is 2e-8.
 _THIN_BELOW = 1.5
 _THIN = (
     (
@@ -85,8 +84,8 @@ _THIN = (
     (9.3366942e-07, 1.4200224e-07),
     (-9.0313165e-08,),
 )
-# √π x erfcx(x) (1 + 2.5 / x) = 1 + t + t² Σ c_i t^i, t = 1 / (1 + 0.4 x), good to 1e-8 for x >= 0; the first two
-# terms are those of x -> ∞, without which derivatives would err where density is nearly constant.
+# √π x erfcx(x) (1 + 2.5 / x) = 1 + t + t² Σ c_i t^i, t = 1 / (1 + 0.4 x), to 1e-8 for x >= 0. The first two terms are
+# the limits for x -> ∞; without them, derivatives would be wrong where density is nearly constant.
 _RISING = (
     0.919975234,
     0.760822631,
@@ -98,29 +97,29 @@ _RISING = (
     0.612999031,
     -0.127472229,
 )
-# (1 + 2 y²) D(y) / y = N(w) / Q(w), w = 1 / (1 + y²), good to 1e-7 for y >= 0, D Dawson's integral;
-# again 1 + w + ... as y -> ∞.
+# (1 + 2 y²) D(y) / y = N(w) / Q(w), w = 1 / (1 + y²), to 1e-7 for y >= 0, with Dawson's integral D; the leading terms
+# are the limits for y -> ∞.
 _FALLING_N = (1, -7.84594733, 113.145993, -51.5585158, 3020.43204, 13749.1012, 10526.1031, 530766.935, -269862.908)
 _FALLING_Q = (1, -8.84594733, 120.000291, -160.558328, 3061.92745, 7555.4792, 42396.4933, 101615.002, 133673.878)
-# Denser steps have their mean depth at their face to any precision, and squares of more would overflow.
-_DENSEST = 1e18
+# Denser steps have their mean depth at their start in any precision, and squares of larger values would overflow.
+_MAX_DENSITY_STEP = 1e18
 
 
-def linear_share(first: Float, last: Float) -> Float:
-    """Mean absorption distance, as a share of the step, of a density that is linear over it.
+def linear_mean_depth_fraction(first: Float, last: Float) -> Float:
+    """Mean absorption distance of a step of linear density, as a fraction of its length.
 
-    ``first``, ``last``: density at the ends times the step's length, >= 0. Good to 1e-6 (relative); equals
-    ``mean_depth_fraction`` where both are equal. Finite, with a finite derivative, everywhere.
+    ``first``, ``last``: density at both ends times the step length, >= 0. Relative error 1e-6; equals
+    `mean_depth_fraction` where both are equal. Finite, with a finite derivative, everywhere.
     """
-    first, last = dr.minimum(first, _DENSEST), dr.minimum(last, _DENSEST)
-    # Steps that are thinner than 1e-18 weigh nothing: the derivative's squares must not underflow.
+    first, last = dr.minimum(first, _MAX_DENSITY_STEP), dr.minimum(last, _MAX_DENSITY_STEP)
+    # Steps thinner than 1e-18 have no weight; the squares in the derivative must not underflow.
     total, slope = dr.maximum(first + last, 1e-18), last - first
     thin = total < 2 * _THIN_BELOW
     r = slope / total
     series = _horner([_horner(row, r) for row in _THIN], 0.5 * dr.minimum(total, 2 * _THIN_BELOW))
 
-    # ∫ exp(-τ) from where density is σ to infinity, along the line with the step's slope, is the tail of σ.
-    # Where density is nearly constant both have the same series, and Dawson's is smooth there in its slope.
+    # ∫ exp(-τ) from a point with density σ to infinity, along the line with the step's slope, is the tail of σ. For
+    # nearly constant density both tails have the same series, and Dawson's is smooth in the slope there.
     rises = ~thin & (slope > 1e-3 * first * first)
     falls = ~thin & ~rises
     tau = 0.5 * dr.select(thin, 1, total)
@@ -142,19 +141,19 @@ def linear_share(first: Float, last: Float) -> Float:
     return dr.select(thin, series, closed)
 
 
-def linear_crossing(first: Float, last: Float, length: Float, missing: Float) -> Float:
-    """Distance into a step of linear density at which the optical depth ``missing`` is reached.
+def find_linear_crossing(first: Float, last: Float, length: Float, remaining: Float) -> Float:
+    """Distance into a step of linear density at which the optical depth ``remaining`` is reached.
 
-    ``first``, ``last``: density at its ends; ``length``: of the step. The stable root s of
-    first s + (last - first) s² / (2 length) = missing, at most ``length``.
+    ``first``, ``last``: density at both ends; ``length``: length of the step. The numerically stable root s of first s
+    + (last - first) s² / (2 length) = remaining, at most ``length``.
     """
-    root = dr.sqrt(dr.maximum(first * first + 2 * (last - first) / length * missing, 1e-30))
+    root = dr.sqrt(dr.maximum(first * first + 2 * (last - first) / length * remaining, 1e-30))
     total = first + root
-    return dr.minimum(2 * missing / dr.select(total > 0, total, 1), length)
+    return dr.minimum(2 * remaining / dr.select(total > 0, total, 1), length)
 
 
 def _horner(coefficients: Sequence[Float] | Sequence[float], x: Float) -> Float:
-    """Σ c_i x^i."""
+    """Σ c_i x^i by Horner's rule."""
     value: Any = coefficients[-1]
     for c in reversed(coefficients[:-1]):
         value = dr.fma(value, x, c)
@@ -163,115 +162,115 @@ def _horner(coefficients: Sequence[Float] | Sequence[float], x: Float) -> Float:
 
 # ---- Registry ----
 #
-# Objects of one kind that are chosen by name, so that one more of them is one more object and nothing else.
+# Objects of one kind that are selected by name, so that an extension is one object and no other change.
 
 
-class Named(Protocol):
-    """What can be registered."""
+class RegistryEntry(Protocol):
+    """An object that can be registered."""
 
     @property
     def name(self) -> str:
-        """As which it is chosen."""
+        """Name by which the object is selected."""
         ...
 
     @property
     def summary(self) -> str:
-        """What it does, in a sentence without its full stop: for the manual."""
+        """One sentence for the manual, without its full stop."""
         ...
 
 
-Kind = TypeVar("Kind", bound=Named)
+Kind = TypeVar("Kind", bound=RegistryEntry)
 
 
 class Registry(Generic[Kind]):
-    """Objects by name, in the order in which they were registered. ``parameter``: what chooses among them."""
+    """Objects by name, in the order of their registration. ``parameter``: name of the parameter that selects one of
+    them."""
 
     def __init__(self, parameter: str):
         self.parameter = parameter
-        self._known: dict[str, Kind] = {}
+        self._items: dict[str, Kind] = {}
 
     def register(self, item: Kind) -> Kind:
-        """Make ``item`` known. Raises ``ValueError`` for a name that is taken."""
-        if item.name in self._known:
-            raise ValueError(f'there is already a "{item.name}" for "{self.parameter}"')
-        self._known[item.name] = item
+        """Register ``item``. Raises ``ValueError`` if its name is taken."""
+        if item.name in self._items:
+            raise ValueError(f'"{item.name}" is already registered for "{self.parameter}"')
+        self._items[item.name] = item
         return item
 
     def unregister(self, name: str) -> None:
-        """Forget what is called ``name``. Raises ``KeyError`` where nothing is."""
-        del self._known[name]
+        """Remove the object called ``name``. Raises ``KeyError`` if there is none."""
+        del self._items[name]
 
     def find(self, name: str) -> Kind:
-        """What is called ``name``. Raises ``NergError``, which names the others, where nothing is."""
-        if name not in self._known:
-            raise NergError(f'"{self.parameter}" must be one of {", ".join(self._known)}, got "{name}"')
-        return self._known[name]
+        """The object called ``name``. Raises ``NergError``, with the list of names, if there is none."""
+        if name not in self._items:
+            raise NergError(f'"{self.parameter}" must be one of {", ".join(self._items)}, got "{name}"')
+        return self._items[name]
 
     def names(self) -> tuple[str, ...]:
-        """All names."""
-        return tuple(self._known)
+        """All registered names."""
+        return tuple(self._items)
 
     def __iter__(self) -> Iterator[Kind]:
-        return iter(self._known.values())
+        return iter(self._items.values())
 
     def format_manual(self) -> str:
-        """One sentence about each, as the manual has it."""
+        """One sentence for each object, for the manual."""
         return " ".join(f"``{item.name}``: {item.summary}." for item in self)
 
 
 # ---- Rules ----
 #
-# Quadrature rules: how samples of the density become a step's optical depth and its mean depth.
+# Quadrature rules: how density samples become the optical depth and the mean depth of a step.
 #
-# A rule is one object of the protocol ``Rule``, registered in ``RULES``: the integrator's parameter ``quadrature``, its
-# manual and the study offer whatever stands there. Another rule is a class like those below and one line
-# ``register_quadrature(...)``, here or in any module that is imported.
+# A rule is an object of the protocol `QuadratureRule`, registered in ``RULES``: the integrator's parameter
+# ``quadrature``, its manual and ``nerg study`` list all registered rules. To add a rule, write a class like those below
+# and call ``register_quadrature(...)``, here or in any imported module.
 
 
-# Where the two Gauss-Legendre samples of an interval lie, from its middle and as a share of its length.
+# Distance of both Gauss-Legendre samples from the middle of an interval, as a fraction of its length.
 _GAUSS = 0.5 / 3**0.5
 
 
 @dataclass
 class MarchStep:
-    """One evaluated step, ``delta`` long in scene units. Attached to whatever carries derivatives."""
+    """One evaluated step, ``delta`` long in scene units. Attached to whatever carries gradients."""
 
-    # Its optical depth, 0 on lanes that are not active.
+    # Optical depth; 0 on inactive lanes.
     dtau: Float
-    # Mean distance of absorption into it, as a share of `delta`.
-    share: Float
-    # Distance into it, in scene units, at which an optical depth (at most `dtau`) is reached.
-    crossing: Callable[[Float], Float]
-    # What a painter makes it contribute to the sum of colours, on the lanes of a mask.
-    paint: Callable[[Painter, Bool], Color]
-    # What the next step reuses: a PyTree like the one of `Rule.start`.
+    # Mean absorption distance, as a fraction of `delta`.
+    mean_fraction: Float
+    # Distance into the step, in scene units, at which an optical depth (at most `dtau`) is reached.
+    find_crossing: Callable[[Float], Float]
+    # The step's contribution to the sum of colours, given a shader and a mask of lanes.
+    shade: Callable[[SampleShader, Bool], Color]
+    # What the next step reuses: a PyTree like that of `QuadratureRule.init_carry`.
     carry: Any
-    # Density evaluations made.
+    # Number of density evaluations.
     evals: Float
 
 
-class Rule(Protocol):
-    """A quadrature rule. It holds no state: one object serves every march."""
+class QuadratureRule(Protocol):
+    """A quadrature rule. It has no state: one object serves all marches."""
 
     @property
     def name(self) -> str:
-        """Value of the parameter ``quadrature`` that chooses it."""
+        """Value of the parameter ``quadrature`` that selects the rule."""
         ...
 
     @property
     def summary(self) -> str:
-        """What it does, in a sentence without its full stop: for the manual."""
+        """One sentence for the manual, without its full stop."""
         ...
 
     @property
     def ends_at_cells(self) -> bool:
-        """Whether steps end where the ray leaves a voxel, which asks for a medium with ``cells``. Otherwise they are
-        as long as the settings say."""
+        """Whether steps end where the ray leaves a voxel, which requires a medium with ``cells``. Otherwise the
+        settings determine the step length."""
         ...
 
-    def start(self, Float: type) -> Any:
-        """What the first step finds as its ``carry``: a PyTree of arrays of one lane, or None. ``Float``: array type
-        of distances."""
+    def init_carry(self, Float: type) -> Any:
+        """The ``carry`` of the first step: a PyTree of one-lane arrays, or None. ``Float``: array type of distances."""
         ...
 
     def step(
@@ -283,24 +282,31 @@ class Rule(Protocol):
         t_next: Float,
         carry: Any,
         active: Bool,
-        colored: bool,
+        needs_color: bool,
     ) -> MarchStep:
-        """Evaluate the step from the distance ``t`` on, ``delta`` long.
+        """Evaluate the step that starts at the distance ``t`` and is ``delta`` long.
 
-        ``t_next``: where it ends, detached; equal to the next step's ``t`` unless something is leapt over in between.
-        ``carry``: that of the step before, or None, from which nothing is known: derivatives are found so, step by
-        step. Densities and colours are to be attached to ``ray``, ``t``, ``delta`` and the medium. ``colored``:
-        whether the step may be asked to ``paint``.
+        Parameters
+        ----------
+        t_next : Float
+            End of the step, detached; equal to the next step's ``t`` unless empty space is skipped in between.
+        carry : PyTree or None
+            The previous step's, or None if nothing can be reused; derivatives are computed without it, step by step.
+        needs_color : bool
+            Whether the step may be shaded.
+
+        Notes
+        -----
+        Densities and colours must be attached to ``ray``, ``t``, ``delta`` and the medium.
         """
         ...
 
 
-RULES: Registry[Rule] = Registry("quadrature")
+RULES: Registry[QuadratureRule] = Registry("quadrature")
 
 
-def register_quadrature(rule: Rule) -> Rule:
-    """Make ``rule`` one that the integrator's parameter ``quadrature`` can name. Raises ``ValueError`` for a name that
-    is taken.
+def register_quadrature(rule: QuadratureRule) -> QuadratureRule:
+    """Register ``rule`` for the integrator's parameter ``quadrature``. Raises ``ValueError`` if its name is taken.
 
     >>> import nerg_mi as nerg
     >>> from nerg_mi.transport.quadrature import RULES
@@ -313,24 +319,27 @@ def register_quadrature(rule: Rule) -> Rule:
     return RULES.register(rule)
 
 
-def boundaries(rule: Rule, medium: Medium) -> VoxelCells | None:
-    """Where steps of ``rule`` end in ``medium``; None where they are as long as the settings say. Raises ``NergError``
-    for a medium that has no voxels where the rule needs them."""
+def cells_for_rule(rule: QuadratureRule, medium: Medium) -> VoxelCells | None:
+    """The voxels at whose boundaries the steps of ``rule`` end in ``medium``; None for a rule with steps of a given
+    length. Raises ``NergError`` if the rule needs voxels and the medium has none."""
     if not rule.ends_at_cells:
         return None
     if medium.cells is None:
-        others = " or ".join(f'"{other.name}"' for other in RULES if not other.ends_at_cells)
-        raise NergError(f'the quadrature "{rule.name}" needs an axis-aligned "gridvolume" as density; use {others}')
+        alternatives = " or ".join(f'"{alternative.name}"' for alternative in RULES if not alternative.ends_at_cells)
+        raise NergError(
+            f'the quadrature "{rule.name}" needs an axis-aligned "gridvolume" as density; use {alternatives}'
+        )
     return medium.cells
 
 
-def color_share(first: Float, last: Float, share: Float) -> Float:
-    """Where a step of linear density takes its colour, as a share of its length.
+def color_sample_fraction(first: Float, last: Float, share: Float) -> Float:
+    """Where a step of linear density takes its colour, as a fraction of its length.
 
-    ``first``, ``last``: density at its ends; ``share``: mean distance of absorption, as a share of the length. At the
-    mean absorption, ``share``, which is exact for a linear colour, where both ends are nearly as dense; at the
-    denser end where one is nearly empty: in the air before a wall a trained field's colour means nothing. The square
-    of the relative difference decides, so that colour stays of second order in the step.
+    ``first``, ``last``: density at both ends; ``share``: mean absorption distance, as a fraction of the length. Where
+    both ends are about equally dense, the colour is taken at the mean absorption distance, which is exact for a linear
+    colour. Where one end is nearly empty, it is taken at the denser end: the colour of a trained field is arbitrary in
+    the air in front of a wall. The squared relative difference blends both, so that colour stays second order in the
+    step.
     """
     r = (last - first) / dr.maximum(first + last, 1e-18)
     return dr.lerp(share, dr.select(r > 0, 1.0, 0.0), r * r)
@@ -347,32 +356,31 @@ def _step_along_line(
     carry: tuple | None,
     evaluations: Float,
 ) -> MarchStep:
-    """The step from ``t`` on, ``delta`` long and of optical depth ``dtau``, whose density runs in a line from ``first``
-    to ``last``."""
-    share = linear_share(first * delta, last * delta)
+    """A step of optical depth ``dtau`` whose density changes linearly from ``first`` to ``last``."""
+    share = linear_mean_depth_fraction(first * delta, last * delta)
 
     def paint(painter, lit):
-        p = ray.o + ray.d * dr.fma(delta, color_share(first, last, share), t)
+        p = ray.o + ray.d * dr.fma(delta, color_sample_fraction(first, last, share), t)
         return painter.shade(medium, medium.density_features(p, lit)[1], p, ray.w, lit)
 
     return MarchStep(
-        dtau, share, lambda missing: linear_crossing(first, last, delta, missing), paint, carry, evaluations
+        dtau, share, lambda missing: find_linear_crossing(first, last, delta, missing), paint, carry, evaluations
     )
 
 
 class Constant:
-    """Density constant over a step: its value at the middle (Mildenhall et al. 2020, eq. 3)."""
+    """Constant density over a step, sampled at its middle (Mildenhall et al. 2020, eq. 3)."""
 
     name = "constant"
     summary = "density is constant over a step, sampled at its middle"
     ends_at_cells = False
 
-    def start(self, Float):
+    def init_carry(self, Float):
         return None
 
-    def step(self, medium, ray, t, delta, t_next, carry, active, colored) -> MarchStep:
+    def step(self, medium, ray, t, delta, t_next, carry, active, needs_color) -> MarchStep:
         p = ray.o + ray.d * (t + 0.5 * delta)
-        sigma, features = medium.density_features(p, active) if colored else (medium.density(p, active), [])
+        sigma, features = medium.density_features(p, active) if needs_color else (medium.density(p, active), [])
         dtau = dr.select(active, sigma * delta, 0)
 
         def paint(painter, lit):
@@ -389,23 +397,23 @@ class Constant:
 
 
 class Linear:
-    """Density linear over a step, between samples at its ends, which neighbours share (Uy et al. 2023, "NeRF
+    """Linear density over a step, between samples at its ends, which adjacent steps share (Uy et al. 2023, "NeRF
     Revisited: Fixing Quadrature Instability in Volume Rendering")."""
 
     name = "linear"
-    summary = "linear between samples at the steps' ends"
+    summary = "density is linear over a step, between samples at its ends"
     ends_at_cells = False
 
-    def start(self, Float):
-        # Density at the end of the step before, and where that was (distances are not negative).
+    def init_carry(self, Float):
+        # Density at the end of the previous step, and the distance of that end (distances are not negative).
         return Float(0), Float(-1)
 
-    def step(self, medium, ray, t, delta, t_next, carry, active, colored) -> MarchStep:
+    def step(self, medium, ray, t, delta, t_next, carry, active, needs_color) -> MarchStep:
         fresh = active if carry is None else active & (carry[1] != t)
         if carry is None:
             first = medium.density(ray.o + ray.d * t, active)
         else:
-            # After a leap the step's start is no end of a step before.
+            # After skipped cells the step does not start at the end of the previous one.
             first = dr.if_stmt(
                 (t,),
                 fresh,
@@ -422,26 +430,26 @@ class Linear:
 
 class Cells:
     """Steps inside one voxel of a grid, whose interpolant is a cubic along the ray that two Gauss-Legendre samples
-    integrate exactly. Opacity is then exact, depth to a hundredth of a voxel: it takes the density between as the line
-    through both samples."""
+    integrate exactly. Opacity is exact; depth, which uses the line through both samples as the density, is accurate to
+    a hundredth of a voxel."""
 
     name = "cells"
     summary = (
-        "for an axis-aligned ``gridvolume`` as density, steps end at voxel boundaries only, where two samples "
-        "integrate its interpolant exactly (opacity to rounding, depth to a hundredth of a voxel); a ``step`` that is "
-        "given bounds them, ``dt_gamma``, ``coarse`` and ``jitter`` do not apply"
+        "for an axis-aligned ``gridvolume`` as density: steps end at voxel boundaries, and two samples per step "
+        "integrate the interpolant exactly (opacity to rounding, depth to a hundredth of a voxel); ``step`` limits "
+        "their length, ``dt_gamma``, ``coarse`` and ``jitter`` are not used"
     )
     ends_at_cells = True
 
-    def start(self, Float):
+    def init_carry(self, Float):
         return None
 
-    def step(self, medium, ray, t, delta, t_next, carry, active, colored) -> MarchStep:
+    def step(self, medium, ray, t, delta, t_next, carry, active, needs_color) -> MarchStep:
         a = medium.density(ray.o + ray.d * (t + (0.5 - _GAUSS) * delta), active)
         b = medium.density(ray.o + ray.d * (t + (0.5 + _GAUSS) * delta), active)
         mean = 0.5 * (a + b)
         dtau = dr.select(active, mean * delta, 0)
-        # The ends of the line through both samples, kept from leaving the density's range.
+        # The ends of the line through both samples, limited to non-negative densities.
         tilt = dr.clip((b - a) * (0.5 / (2 * _GAUSS)), -mean, mean)
         first, last = mean - tilt, mean + tilt
         return _step_along_line(medium, ray, t, delta, dtau, first, last, None, dr.select(active, type(dtau)(2), 0))

@@ -1,4 +1,4 @@
-"""Gaussian splats as a medium: their arrays, the tree over them, and those nearest to a ray."""
+"""Gaussian splats as a medium: their arrays, the bounding-volume hierarchy, and the next hits along a ray."""
 
 from __future__ import annotations
 
@@ -16,60 +16,59 @@ from nerg_mi.maths.types import Array3f, Bool, Color, Float, Point3f, UInt32, Ve
 
 from .medium import LastHit, LocalRay, NextHits
 
-# ---- Tree ----
+# ---- BoxTree ----
 #
-# A bounding-volume hierarchy that is walked without a stack: a complete binary tree of boxes.
+# A bounding-volume hierarchy for stackless traversal: a complete binary tree of boxes.
 #
-# Node i has the children 2 i and 2 i + 1, the root is 1, and all leaves lie on one level, so that the way from the root
-# is a number of bits (cf. Hapala et al. 2011, "Efficient Stack-less BVH Traversal for Ray Tracing"). Every node is
-# split at the median of its longest side, into halves that are one apart at most. Plain NumPy.
+# Node i has the children 2 i and 2 i + 1, the root is node 1, and all leaves lie on one level, so that a path from the
+# root is a bit pattern (cf. Hapala et al. 2011, "Efficient Stack-less BVH Traversal for Ray Tracing"). Each node is
+# split at the median of its longest side, into halves whose sizes differ by at most one. NumPy.
 
-COLUMNS = 8
-"""Numbers a node: the lower and the upper corner of its box, the axis that it is split along, and one unused."""
+NODE_SIZE = 8
+"""Numbers per node: lower and upper corner of its box, split axis, and one unused."""
 
-_NOWHERE = np.float32(1e30)
-# Boxes are this much wider than what is in them, for the rounding of rays.
-_SLACK = np.float32(1e-6)
+_OUTSIDE = np.float32(1e30)
+# Relative margin of boxes for the rounding of rays.
+_MARGIN_REL = np.float32(1e-6)
 
 
 @dataclass(frozen=True)
-class Tree:
-    """Of N boxes."""
+class BoxTree:
+    """A tree over N boxes."""
 
-    # The box that stands at each place of the tree's order, (N,) int64.
+    # Index of the box at each position in tree order, (N,) int64.
     order: np.ndarray
-    # The nodes from number 1 on, (2 leaves, COLUMNS) float32; what holds nothing is a point
-    # beyond all distances.
+    # Nodes from number 1 on, (2 leaves, NODE_SIZE) float32; an empty node is a point beyond all distances.
     nodes: np.ndarray
-    # Which place of the order a leaf holds, (leaves,) uint32.
+    # Position in tree order of each leaf's box, (leaves,) uint32.
     places: np.ndarray
 
     @property
     def leaves(self) -> int:
-        """How many there are: a power of 2."""
+        """Number of leaves, a power of 2."""
         return len(self.places)
 
 
-def build_tree(lower: np.ndarray, upper: np.ndarray) -> Tree:
-    """The tree of N boxes with the corners ``lower`` and ``upper``, (N, 3) each, finite."""
+def build_tree(lower: np.ndarray, upper: np.ndarray) -> BoxTree:
+    """Build the tree of N boxes with finite corners ``lower`` and ``upper``, (N, 3) each."""
     lower, upper = (np.asarray(v, np.float32) for v in (lower, upper))
     n = len(lower)
     depth = max(n - 1, 0).bit_length()
     centers = 0.5 * (lower.astype(np.float64) + upper)
-    nodes = np.zeros((2 << depth, COLUMNS), np.float32)
+    nodes = np.zeros((2 << depth, NODE_SIZE), np.float32)
     order, part, sizes = np.arange(n), np.zeros(n, np.int64), np.array([n])
     for level in range(depth):
-        # Parts that have become empty are given some neighbour's box, of which nothing comes.
+        # Empty parts take the box of a neighbour, which has no effect.
         starts = np.minimum(np.cumsum(sizes) - sizes, n - 1)
-        here = centers[order]
-        low, high = np.minimum.reduceat(here, starts), np.maximum.reduceat(here, starts)
+        level_centers = centers[order]
+        low, high = np.minimum.reduceat(level_centers, starts), np.maximum.reduceat(level_centers, starts)
         axis = np.argmax(high - low, axis=1)
         nodes[1 << level : 2 << level, 6] = axis
         along = axis[part]
         start = low[part, along]
         size = np.maximum(high[part, along] - start, 1e-300)
-        # One sort for all parts: each has a whole number of its own.
-        sorting = np.argsort(part + 0.999 * ((here[np.arange(n), along] - start) / size), kind="stable")
+        # One sort for all parts: the integer part of the key is the index of the part.
+        sorting = np.argsort(part + 0.999 * ((level_centers[np.arange(n), along] - start) / size), kind="stable")
         order = order[sorting]
         left = (sizes + 1) // 2
         sizes = np.stack([left, sizes - left], axis=1).ravel()
@@ -77,44 +76,44 @@ def build_tree(lower: np.ndarray, upper: np.ndarray) -> Tree:
     leaves = 1 << depth
     places = np.zeros(leaves, np.uint32)
     places[part] = np.arange(n)
-    wider = _SLACK * np.maximum(np.abs(lower), np.abs(upper))
-    nodes[:, :3], nodes[:, 3:6] = _NOWHERE, -_NOWHERE
+    wider = _MARGIN_REL * np.maximum(np.abs(lower), np.abs(upper))
+    nodes[:, :3], nodes[:, 3:6] = _OUTSIDE, -_OUTSIDE
     nodes[leaves + part, :3], nodes[leaves + part, 3:6] = (lower - wider)[order], (upper + wider)[order]
     for level in range(depth - 1, -1, -1):
-        here, below = slice(1 << level, 2 << level), nodes[2 << level : 4 << level]
-        nodes[here, :3] = np.minimum(below[::2, :3], below[1::2, :3])
-        nodes[here, 3:6] = np.maximum(below[::2, 3:6], below[1::2, 3:6])
-    # A ray's distances to a box without an inside would be put in order like any others: a point far away has none.
-    nodes[nodes[:, 0] > nodes[:, 3], :6] = _NOWHERE
-    return Tree(order, nodes, places)
+        level_centers, below = slice(1 << level, 2 << level), nodes[2 << level : 4 << level]
+        nodes[level_centers, :3] = np.minimum(below[::2, :3], below[1::2, :3])
+        nodes[level_centers, 3:6] = np.maximum(below[::2, 3:6], below[1::2, 3:6])
+    # An inverted box would be sorted like any other; a distant point is never hit.
+    nodes[nodes[:, 0] > nodes[:, 3], :6] = _OUTSIDE
+    return BoxTree(order, nodes, places)
 
 
 # ---- Arrays ----
 #
-# Gaussian splats as arrays of Dr.Jit: what can be trained, and what kernels read.
+# Gaussian splats as Dr.Jit arrays: the trainable parameters, and the packed arrays that kernels read.
 
-SHAPE = 16
-"""Numbers a Gaussian in ``shapes``: the matrix (row by row) that leads to its own axes and standard deviations, its
+SHAPE_SIZE = 16
+"""Numbers per Gaussian in ``shapes``: the matrix (row by row) to its own axes in units of its standard deviations, its
 centre, its opacity, and three unused."""
 
 MAX_ALPHA = 0.9999
-"""Share of light that one Gaussian absorbs at most, as in Mitsuba's ``volprim_rf_basic``."""
+"""Maximum fraction of light that one Gaussian absorbs, as in Mitsuba's ``volprim_rf_basic``."""
 
-_NAMES = ("centers", "scales", "rotations", "opacities", "harmonics")
-_PACKED = ("shapes", "colors", "nodes", "places", "order", "corners")
+_PARAMETERS = ("centers", "scales", "rotations", "opacities", "harmonics")
+_KERNEL_ARRAYS = ("shapes", "colors", "nodes", "places", "order", "corners")
 
 
 class SplatArrays:
-    """N Gaussians, cut off ``extent`` standard deviations from their centres, in their own frame.
+    """N Gaussians in their own frame, cut off at ``extent`` standard deviations.
 
-    ``ns``: namespace of the backend. The attributes ``centers``, ``scales``, ``rotations`` (w first), ``opacities`` and
-    ``harmonics`` are flat Floats in the order of ``splats``; after a change of them ``pack`` is to be called. What
-    kernels read is derived from them, with derivatives, in the order of a tree: ``shapes`` and ``colors``; ``nodes``
-    and ``places``: see `tree`; ``corners``: the lower and the upper corner of all, 6 Floats of one number.
+    ``ns``: array namespace of the backend. The attributes ``centers``, ``scales``, ``rotations`` (w first),
+    ``opacities`` and ``harmonics`` are flat Floats in the order of ``splats``; call `pack` after changing them. It
+    derives, differentiably, what kernels read, in tree order: ``shapes`` and ``colors``; ``nodes`` and ``leaf_boxes``:
+    see `BoxTree`; ``bounds_jit``: lower and upper corner of all Gaussians, 6 one-lane Floats.
     """
 
-    # So that Dr.Jit finds them in frozen functions.
-    DRJIT_STRUCT: ClassVar[dict[str, Any]] = dict.fromkeys((*_NAMES, *_PACKED))
+    # Lets Dr.Jit find the arrays in frozen functions.
+    DRJIT_STRUCT: ClassVar[dict[str, Any]] = dict.fromkeys((*_PARAMETERS, *_KERNEL_ARRAYS))
 
     centers: Float
     scales: Float
@@ -126,32 +125,32 @@ class SplatArrays:
         self._ns, self.count, self.extent = ns, len(splats), float(extent)
         self.rows = ns.ArrayXf
         self.terms = splats.harmonics.shape[1]
-        # Packets of four are gathered at once.
+        # Arrays are gathered in packets of four.
         self._stride = -(-3 * self.terms // 4) * 4
-        for name in _NAMES:
+        for name in _PARAMETERS:
             setattr(self, name, ns.Float(copy_aligned(getattr(splats, name)).ravel()))
         self.pack()
 
     def parameters(self) -> dict[str, Any]:
-        """The arrays that can be set, by name."""
-        return {name: getattr(self, name) for name in _NAMES}
+        """The trainable arrays by name."""
+        return {name: getattr(self, name) for name in _PARAMETERS}
 
     def pack(self) -> None:
         """Derive from the parameters what kernels read."""
         ns, n = self._ns, self.count
         centers, scales, rotations = (
-            np.array(dr.detach(getattr(self, name)), np.float64).reshape(n, -1) for name in _NAMES[:3]
+            np.array(dr.detach(getattr(self, name)), np.float64).reshape(n, -1) for name in _PARAMETERS[:3]
         )
         rotations /= np.linalg.norm(rotations, axis=1, keepdims=True)
-        # An ellipsoid's half extents are the lengths of its matrix' rows.
+        # The half extents of an ellipsoid are the lengths of its matrix rows.
         half = self.extent * np.sqrt(((quaternions_to_matrices(rotations) * scales[:, None]) ** 2).sum(axis=2))
         tree = build_tree(centers - half, centers + half)
         self.lower, self.upper = (centers - half).min(axis=0), (centers + half).max(axis=0)
-        # Read by kernels, which would be compiled anew if they held the numbers, as often as Gaussians are moved.
+        # Opaque: as literals they would compile a new kernel each time a Gaussian moves.
         self.corners = [dr.opaque(ns.Float, float(v)) for v in (*self.lower, *self.upper)]
         self.thickness = float(np.median(scales.min(axis=1)))
         self.leaves = tree.leaves
-        # Aligned alike each time: frozen functions tell arrays by it, and would be recorded anew.
+        # Always the same alignment: frozen functions distinguish arrays by it and would be recorded again.
         self.nodes, self.places = (
             ns.Float(copy_aligned(tree.nodes).ravel()),
             ns.UInt32(copy_aligned(tree.places, np.uint32).ravel()),
@@ -167,21 +166,22 @@ class SplatArrays:
             [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)],
         ]
         rows = [value / scale for scale, axis in zip(s, axes) for value in axis]
-        nothing = dr.zeros(ns.Float, n)
-        shape = [*rows, *c, *take(self.opacities, 1), nothing, nothing, nothing]
+        zeros = dr.zeros(ns.Float, n)
+        shape = [*rows, *c, *take(self.opacities, 1), zeros, zeros, zeros]
         color = take(self.harmonics, 3 * self.terms)
-        color += [nothing] * (self._stride - len(color))
+        color += [zeros] * (self._stride - len(color))
         self.shapes, self.colors = dr.ravel(ns.ArrayXf(shape)), dr.ravel(ns.ArrayXf(color))
-        # Places of the order that the parameters have, for whoever looks a Gaussian up there.
+        # Positions in the order of the parameters, to look up a Gaussian there.
         self.order = order
         dr.eval(self.shapes, self.colors, self.nodes, self.places)
 
-    def find_peak(self, place: UInt32, o: Any, d: Any, active: Bool) -> tuple[Float, Float, Float]:
-        """``(t, absorbed, distance)`` of the Gaussian at ``place`` of the tree's order on the ray ``o + t d``.
+    def find_peak(self, index: UInt32, o: Any, d: Any, active: Bool) -> tuple[Float, Float, Float]:
+        """``(t, absorbed, distance)`` of the Gaussian ``index`` (in tree order) on the ray ``o + t d``.
 
-        Where the ray is nearest to its centre by the Gaussian's own measure, the share of light absorbed, all of it
-        there, and the square of that distance in standard deviations."""
-        g = dr.gather(self._ns.ArrayXf, self.shapes, place, active, shape=(SHAPE, dr.width(place)))
+        ``t``: where the Gaussian is densest along the ray; ``absorbed``: the fraction of light absorbed, all of it
+        there; ``distance``: squared distance to the centre at that point, in standard deviations.
+        """
+        g = dr.gather(self._ns.ArrayXf, self.shapes, index, active, shape=(SHAPE_SIZE, dr.width(index)))
         x, y, z = o.x - g[9], o.y - g[10], o.z - g[11]
         from_center = [dr.fma(g[i], x, dr.fma(g[i + 1], y, g[i + 2] * z)) for i in (0, 3, 6)]
         along = [dr.fma(g[i], d.x, dr.fma(g[i + 1], d.y, g[i + 2] * d.z)) for i in (0, 3, 6)]
@@ -191,9 +191,9 @@ class SplatArrays:
         distance = _dot(off, off)
         return t, dr.minimum(g[12] * dr.exp(-0.5 * distance), MAX_ALPHA), distance
 
-    def color(self, place: UInt32, w: Vector3f, active: Bool) -> Color:
-        """Colour of the Gaussian at ``place`` in the unit direction ``w`` of the ray: a list of three."""
-        c = dr.gather(self._ns.ArrayXf, self.colors, place, active, shape=(self._stride, dr.width(place)))
+    def color(self, index: UInt32, w: Vector3f, active: Bool) -> Color:
+        """Colour of the Gaussian ``index`` (in tree order) for the unit ray direction ``w``: a list of three."""
+        c = dr.gather(self._ns.ArrayXf, self.colors, index, active, shape=(self._stride, dr.width(index)))
         values = dr.sh_eval(w, round(self.terms**0.5) - 1)
         sums = [self._ns.Float(0.5)] * 3
         for k, value in enumerate(values):
@@ -205,25 +205,24 @@ def _dot(a: list[Float], b: list[Float]) -> Float:
     return dr.fma(a[0], b[0], dr.fma(a[1], b[1], a[2] * b[2]))
 
 
-# ---- The next Gaussians along rays, in the order of their peaks ----
+# ---- The next Gaussians along rays, ordered by their peaks ----
 #
-# Where a Gaussian is densest along the ray decides its place among them, not where the ray enters its ellipsoid, nor
-# how far its centre is. The tree is walked nearer child first; a box is left out where it begins behind the last of the
-# Gaussians that are wanted, or behind where those already found leave no light. A ray may start inside of Gaussians:
-# what counts is that their peak lies before it.
+# The order is that of the densest points along the ray, not that of the entry points or of the centres. The traversal
+# visits the nearer child first and skips boxes that begin behind the last Gaussian needed, or behind the point where no
+# light is left. A ray may start inside Gaussians; those with a peak in front of it count.
 
-AT_ONCE = 12
-"""So many are found in one walk through the tree."""
+GROUP_SIZE = 12
+"""Gaussians that one traversal of the tree returns."""
 
 
 @dataclass
 class _Walk:
-    """Where a walk is. ``way``: a bit for each level, after a leading 1, whether it is in the farther child."""
+    """State of a traversal. ``path``: after a leading 1, one bit per level for the farther child."""
 
     active: Bool
     node: UInt32
-    way: UInt32
-    # Distance behind which nothing is wanted.
+    path: UInt32
+    # Distance behind which hits are not needed.
     far: Float
     t: list[Float]
     absorbed: list[Float]
@@ -232,9 +231,9 @@ class _Walk:
 
 
 class SplatHits:
-    """What rays meet of ``arrays``: a `medium.Hits`."""
+    """Hits of rays with ``arrays``: a `medium.Hits`."""
 
-    group_size = AT_ONCE
+    group_size = GROUP_SIZE
 
     def __init__(self, arrays: SplatArrays):
         self.arrays = arrays
@@ -246,59 +245,59 @@ class SplatHits:
         a, o, d = self.arrays, ray.o, ray.d
         Float = type(before)
         UInt32: Any = dr.uint32_array_t(Float)
-        # Axes along which the ray stands still never decide, unless it is outside of a box.
+        # Axes without a direction component never decide, unless the ray is outside the box.
         inverse = [dr.rcp(dr.select(dr.abs(v) > 1e-30, v, 1e-30)) for v in (d.x, d.y, d.z)]
         origin = (o.x, o.y, o.z)
 
         def test(walk: _Walk) -> _Walk:
-            place = dr.gather(UInt32, a.places, walk.node - a.leaves, walk.active)
-            t, absorbed, distance = a.find_peak(place, o, d, walk.active)
-            behind = (t > after.t) | ((t == after.t) & (place > after.index))
-            good = walk.active & behind & (distance < a.extent**2) & (t < walk.far) & (t < before)
-            t = dr.select(good, t, dr.inf)
-            light, far, ts, shares, places = transmittance, walk.far, [], [], []
-            for here, share, held in zip(walk.t, walk.absorbed, walk.index):
-                first = (t < here) | ((t == here) & (place < held))
-                ts.append(dr.select(first, t, here))
-                shares.append(dr.select(first, absorbed, share))
-                places.append(dr.select(first, place, held))
-                t, absorbed = dr.select(first, here, t), dr.select(first, share, absorbed)
-                place = dr.select(first, held, place)
-                light = light * dr.select(ts[-1] < dr.inf, 1 - shares[-1], 1)
-                # What is equally far is still wanted: its place decides.
+            index = dr.gather(UInt32, a.places, walk.node - a.leaves, walk.active)
+            t, absorbed, distance = a.find_peak(index, o, d, walk.active)
+            behind = (t > after.t) | ((t == after.t) & (index > after.index))
+            is_candidate = walk.active & behind & (distance < a.extent**2) & (t < walk.far) & (t < before)
+            t = dr.select(is_candidate, t, dr.inf)
+            light, far, ts, absorptions, indices = transmittance, walk.far, [], [], []
+            for held_t, held_absorbed, held_index in zip(walk.t, walk.absorbed, walk.index):
+                first = (t < held_t) | ((t == held_t) & (index < held_index))
+                ts.append(dr.select(first, t, held_t))
+                absorptions.append(dr.select(first, absorbed, held_absorbed))
+                indices.append(dr.select(first, index, held_index))
+                t, absorbed = dr.select(first, held_t, t), dr.select(first, held_absorbed, absorbed)
+                index = dr.select(first, held_index, index)
+                light = light * dr.select(ts[-1] < dr.inf, 1 - absorptions[-1], 1)
+                # Hits at the same distance are still needed: their index decides.
                 far = dr.select(light <= stop, dr.minimum(far, _above(ts[-1])), far)
             far, evals = dr.minimum(far, _above(ts[-1])), walk.evals + dr.select(walk.active, 1, 0)
-            return replace(walk, far=far, t=ts, absorbed=shares, index=places, evals=evals)
+            return replace(walk, far=far, t=ts, absorbed=absorptions, index=indices, evals=evals)
 
         def step(walk: _Walk) -> _Walk:
-            shape = (COLUMNS, dr.width(walk.node))
+            shape = (NODE_SIZE, dr.width(walk.node))
             box = dr.gather(a.rows, a.nodes, walk.node, walk.active, shape=shape)
             near, far = dr.maximum(after.t, 0), walk.far
             for i in range(3):
                 t0, t1 = (box[i] - origin[i]) * inverse[i], (box[i + 3] - origin[i]) * inverse[i]
                 near, far = dr.maximum(near, dr.minimum(t0, t1)), dr.minimum(far, dr.maximum(t0, t1))
-            met = walk.active & (near <= far)
+            hits_box = walk.active & (near <= far)
             leaf = walk.node >= a.leaves
             tested = dr.if_stmt(
-                (replace(walk, active=met & leaf),), met & leaf, test, lambda walk: walk, label="Gaussian"
+                (replace(walk, active=hits_box & leaf),), hits_box & leaf, test, lambda walk: walk, label="Gaussian"
             )
-            down = met & ~leaf
+            down = hits_box & ~leaf
             along = dr.select(box[6] < 0.5, d.x, dr.select(box[6] < 1.5, d.y, d.z))
             nearer = (walk.node << 1) | dr.select(along < 0, UInt32(1), UInt32(0))
-            # Up to the last node whose farther child is still to be seen.
-            up = dr.tzcnt(walk.way + 1)
+            # Up to the last node whose farther child has not been visited.
+            up = dr.tzcnt(walk.path + 1)
             node = dr.select(down, nearer, (walk.node >> up) ^ 1)
-            way = dr.select(down, walk.way << 1, (walk.way + 1) >> up)
-            return replace(tested, active=walk.active & (way != 1), node=node, way=way)
+            path = dr.select(down, walk.path << 1, (walk.path + 1) >> up)
+            return replace(tested, active=walk.active & (path != 1), node=node, path=path)
 
         start = _Walk(
             active,
             UInt32(1),
             UInt32(1),
             Float(before),
-            [Float(dr.inf) for _ in range(AT_ONCE)],
-            [Float(0) for _ in range(AT_ONCE)],
-            [UInt32(0) for _ in range(AT_ONCE)],
+            [Float(dr.inf) for _ in range(GROUP_SIZE)],
+            [Float(0) for _ in range(GROUP_SIZE)],
+            [UInt32(0) for _ in range(GROUP_SIZE)],
             Float(0),
         )
         (walk,) = dr.while_loop((start,), lambda walk: walk.active, lambda walk: (step(walk),), label="nearest")
@@ -311,23 +310,23 @@ class SplatHits:
 
 
 def _above(t: Float) -> Float:
-    """The next greater number, or a little more: ``t < _above(t)`` for finite ``t``."""
+    """A slightly larger number: ``t < _above(t)`` for finite ``t``."""
     return dr.fma(dr.abs(t), 2.0**-22, t + 1e-37)
 
 
 # ---- Gaussian splats as a medium ----
 #
-# They enter where a march sums what absorbs light, and not as shapes: a shape ends a ray, while a Gaussian lets light
-# through, and a depth or a surface is what comes of many. A march's steps would not do either. A Gaussian may be a
-# millimetre thick in a hall of fifty metres, and its optical depth by the convention of splats is no integral of a
-# density: it absorbs all its share at its peak. So a hit takes the place of a step (`media.hits`), and what a march
-# returns means what it always does.
+# Splats are hits of a march, neither shapes nor a density. A shape ends a ray, while a Gaussian transmits light, and a
+# depth or a surface results from many of them. Marching in steps does not suit them: a Gaussian can be a millimetre
+# thick in a hall of fifty metres, and by the convention of splats it absorbs its full fraction at its peak, so that its
+# optical depth is not the integral of a density. A hit therefore replaces a step (`medium.Hits`), and the results of a
+# march keep their meaning.
 
 
 class SplatMedium:
-    """Gaussian splats placed in the scene: a ``medium.Medium`` in their own coordinates.
+    """Gaussian splats placed in the scene: a `medium.Medium` in their own coordinates.
 
-    ``to_world``: splats to scene; the identity by default. ``color_space``: ``srgb``, as photos train them, or
+    ``to_world``: splats to scene; default: the identity. ``color_space``: ``srgb``, as trained from photos, or
     ``linear``.
     """
 
@@ -348,7 +347,7 @@ class SplatMedium:
 
     @property
     def default_step(self) -> float | None:
-        """The median thickness of a Gaussian: how far apart two ideas of a surface usually are."""
+        """The median thickness of a Gaussian, a typical depth difference of one surface."""
         return self.arrays.thickness * self.to_world.scale
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -357,8 +356,8 @@ class SplatMedium:
     def parameters(self) -> list[Any]:
         return [self.arrays.shapes, self.arrays.colors]
 
-    def refresh(self, anyway: bool = False) -> None:
-        """Nothing: whoever sets parameters of the splats packs them."""
+    def refresh(self, force: bool = False) -> None:
+        """No effect: setting parameters of the splats packs them."""
 
     def ray_to_local(self, o: Point3f, d: Vector3f) -> LocalRay:
         along = self.to_world.vector_to_local(d)
@@ -386,9 +385,9 @@ class SplatMedium:
         raise ValueError("Gaussian splats have no density at a point: they are met along rays")
 
     def color(self, features: list[Float], p: Point3f, w: Vector3f, active: Bool) -> Color:
-        """Colour of the Gaussian whose index is the only one of ``features``."""
+        """Colour of the Gaussian whose index is the only element of ``features``."""
         return self.arrays.color(cast("UInt32", features[0]), w, active)
 
     def background(self, o: Point3f, d: Vector3f) -> None:
-        """None: what is behind splats is the scene's."""
+        """None: the scene provides the background."""
         return None

@@ -1,4 +1,4 @@
-"""A grid of densities as a medium."""
+"""Mitsuba volumes as a medium."""
 
 from __future__ import annotations
 
@@ -13,21 +13,20 @@ from nerg_mi.fields.occupancy import OccupancyGrid
 from nerg_mi.maths.geometry import intersect_box
 from nerg_mi.maths.types import Array3f, Bool, Color, Float, Point3f, Vector3f
 
-from .jit import Fingerprint, recording
-from .medium import LocalRay, VoxelCells, bound, bounded, describe
+from .jit import Fingerprint, is_recording
+from .medium import LocalRay, VoxelCells, bound, clamp_density, read_grid_volume
 
 if TYPE_CHECKING:
     import mitsuba as mi
 
 
 class VolumeMedium:
-    """Any Mitsuba volume as density (1/scene unit), optionally with a second one as colour: a ``medium.Medium`` in
-    the scene's own coordinates.
+    """A Mitsuba volume as density (1/scene unit), and optionally a second one as colour: a `medium.Medium` in scene
+    coordinates.
 
-    Outside of the density volume's ``bbox()`` there is vacuum. Empty voxels of an axis-aligned
-    ``gridvolume`` are skipped, under the bound that its voxels give; any other volume states no bound and
-    is marched unskipped. Colours are spectra of the variant in use. Raises ``NergError`` for a density without a
-    finite extent, and for a grid with values that are not finite.
+    There is vacuum outside the density volume's ``bbox()``. Empty voxels of an axis-aligned ``gridvolume`` are skipped;
+    any other volume is marched without skipping. Colours are spectra of the current variant. Raises ``NergError`` for a
+    density without a finite extent, and for a grid with non-finite values.
     """
 
     color_space = "spectrum"
@@ -37,7 +36,7 @@ class VolumeMedium:
     def __init__(self, density: mi.Volume, color: mi.Volume | None = None):
         import mitsuba as mi
 
-        # Those of the variant in use: another one may be chosen later on.
+        # Types of the current variant: it can change later.
         self._interaction, self._ns = mi.Interaction3f, namespace(mi.Float)
         self._density: Any = density
         self._color: Any = color
@@ -55,30 +54,31 @@ class VolumeMedium:
         self._read: Fingerprint | None = None
         self.refresh()
 
-    def refresh(self, anyway: bool = False) -> None:
-        """Read the grid's voxels again if they are other arrays than before, or ``anyway``."""
-        if recording():
-            # A bound would be that of these voxels, and not of those of the replays.
+    def refresh(self, force: bool = False) -> None:
+        """Read the voxels of the grid again if they are other arrays than before, or if ``force``."""
+        if is_recording():
+            # The bound would belong to the voxels of the recording, not to those of a replay.
             self.bound = self._read = None
             return
         import mitsuba as mi
 
         arrays = Fingerprint(v for v in dict(mi.traverse(self._density)).values() if dr.is_array_v(v))
-        if arrays == self._read and not anyway:
+        if arrays == self._read and not force:
             return
-        described = describe(self._density)
+        described = read_grid_volume(self._density)
         self.cells, self.bound, self.default_step = None, None, None
         if described is not None:
             self.cells, data = described
-            # A step that is longer than a voxel can pass over a sheet.
-            self.default_step = min(self.length_scale / 1024, 0.5 * self.cells.edge)
+            # A step longer than a voxel could pass over a thin sheet.
+            self.default_step = min(self.length_scale / 1024, 0.5 * self.cells.min_edge)
             self.bound = bound(data, self._ns)
-        # At the end: what was refused is looked at again.
+        # Last, so that a rejected grid is checked again.
         self._read = arrays
 
     @property
     def occupancy(self) -> OccupancyGrid | None:
-        """Where there may be density; None while derivatives of it are tracked, which empty voxels have too."""
+        """Cells that may contain density; None while gradients of the density are tracked, which empty voxels have,
+        too."""
         if self.bound is None or any(dr.grad_enabled(v) for v in self.parameters()):
             return None
         return self.bound
@@ -125,24 +125,24 @@ class VolumeMedium:
         return it
 
     def density(self, p: Point3f, active: Bool) -> Float:
-        return bounded(self._density.eval_1(self._at(p), active))
+        return clamp_density(self._density.eval_1(self._at(p), active))
 
     def density_features(self, p: Point3f, active: Bool) -> tuple[Float, list[Float]]:
         return self.density(p, active), []
 
     def color(self, features: list[Float], p: Point3f, w: Vector3f, active: Bool) -> Color:
         if self._color is None:
-            raise ValueError("a medium without colour was asked for its colour")
+            raise ValueError("this medium has no colour")
         return self._color.eval(self._at(p), active)
 
     def background(self, o: Point3f, d: Vector3f) -> None:
-        """None: what is behind a volume is the scene's."""
+        """None: the scene provides the background."""
         return None
 
 
-class KnownEmpty:
-    """What a ``VolumeMedium`` skips, as dr.freeze finds it among an integrator's attributes. (The medium itself is
-    handed to custom operations, which would have to make another one of its kind.)"""
+class FrozenBound:
+    """Exposes the occupancy bound of a `VolumeMedium` to dr.freeze as an attribute of the integrator. (The medium
+    itself cannot be a PyTree: custom operations would try to construct another one.)"""
 
     DRJIT_STRUCT: ClassVar[dict[str, None]] = {"bound": None}
 

@@ -25,7 +25,7 @@ from nerg_mi.transport.march_primal import MarchSettings
 from nerg_mi.transport.volume_medium import VolumeMedium
 from tests.plugins.scenes import plugin
 
-# ---- Where rays begin that start above a ceiling ----
+# ---- Ceiling: clipping of rays that start above a plane ----
 
 
 def ray(mi, origins, directions, kind="RayDifferential3f"):
@@ -34,12 +34,12 @@ def ray(mi, origins, directions, kind="RayDifferential3f"):
 
 
 @pytest.mark.parametrize("scale", [1.0, 7.0])
-def test01_they_begin_where_they_come_below(rgb, scale):
+def test01_ceiling_clips_rays(rgb, scale):
     directions = [[0, 0, -1], [0.6, 0, -0.8], [1, 0, 0], [0, 0, 1], [0.6, 0, -0.8]]
     origins = [[0, 0, 3]] * 4 + [[0, 0, 0.5]]
     given = ray(rgb, origins, directions)
     given.maxt = rgb.Float(10)
-    moved, ahead = Ceiling(1.0, (0, 0, scale)).cut(given)
+    moved, ahead = Ceiling(1.0, (0, 0, scale)).clip_ray(given)
     assert np.allclose(ahead, [2, 2.5, 0, 0, 0])
     assert np.allclose(np.array(moved.o).T[:2], [[0, 0, 1], [1.5, 0, 1]]) and np.allclose(
         moved.maxt, [8, 7.5, 10, 10, 10]
@@ -47,13 +47,13 @@ def test01_they_begin_where_they_come_below(rgb, scale):
     assert np.allclose(np.array(moved.o).T[2:], origins[2:]) and np.array_equal(moved.d, given.d)
 
 
-def test02_along_any_direction_and_with_neighbouring_rays(rgb):
+def test02_ceiling_with_any_up_and_ray_differentials(rgb):
     rng = np.random.default_rng(3)
     up, o, d = rng.normal(size=3), rng.normal(size=(50, 3)) * 4, rng.normal(size=(50, 3))
     d /= np.linalg.norm(d, axis=1)[:, None]
     given = ray(rgb, o, d)
     given.o_x, given.d_x, given.o_y, given.d_y = given.o + 1, given.d, given.o, given.d
-    moved, ahead = Ceiling(0.3, up).cut(given)
+    moved, ahead = Ceiling(0.3, up).clip_ray(given)
     unit = up / np.linalg.norm(up)
     over, fall = o @ unit - 0.3, -(d @ unit)
     cuts = (over > 0) & (fall > 0)
@@ -63,24 +63,24 @@ def test02_along_any_direction_and_with_neighbouring_rays(rgb):
     assert np.allclose(moved.o_x - moved.o, 1, atol=1e-4) and np.allclose(moved.o_y - moved.o, 0, atol=1e-4)
 
 
-def test03_another_height_is_no_other_kernel(rgb):
+def test03_ceiling_height_reuses_the_kernel(rgb):
     given = ray(rgb, [[0, 0, 3]] * 4, [[0, 0, -1]] * 4, "Ray3f")
     kernels = []
     for height in (1.0, 1.5, 2.0):
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             dr.kernel_history_clear()
-            dr.eval(Ceiling(height).cut(given)[1])
+            dr.eval(Ceiling(height).clip_ray(given)[1])
             kernels.append({k["hash"] for k in dr.kernel_history([dr.KernelType.JIT])})
     assert kernels[0] == kernels[1] == kernels[2] and kernels[0]
 
 
 @pytest.mark.parametrize("up", [(0, 0, 0), (np.nan, 0, 1), (np.inf, 0, 0)])
-def test04_up_is_a_direction(rgb, up):
+def test04_invalid_up_is_refused(rgb, up):
     with pytest.raises(NergError, match='"up" must be a direction'):
         Ceiling(1.0, up)
 
 
-# ---- The mapping of a full-sphere picture: closed forms and round trips ----
+# ---- The mapping of a full-sphere image: closed forms and round trips ----
 
 SIZES = [(1, 2), (2, 3), (16, 8), (33, 17), (256, 128)]
 
@@ -113,21 +113,21 @@ def test05_too_small():
         pixel_solid_angles(4, 1)
 
 
-# ---- What one ray meets: shapes behind a medium, and derivatives of the distances to them ----
+# ---- Rays through shapes behind a medium, and derivatives of the distances ----
 
 SETTINGS = MarchSettings(0.01)
 
 
 def look(mi, place, o):
-    """Along +z from the points ``o``, a row a ray."""
+    """Rays along +z from the points ``o``, one row per ray."""
     return place.trace(mi.Ray3f(mi.Point3f(np.asarray(o, np.float32).T), mi.Vector3f(0, 0, 1)), True, SETTINGS)
 
 
 @pytest.mark.parametrize("sigma", [0.3, 2.0])
-def test_a_shape_is_opaque_and_a_medium_as_thick_as_it_is(rgb, sigma):
+def test_opacity_of_shape_and_medium(rgb, sigma):
     medium = VolumeMedium(rgb.load_dict({"type": "constvolume", "value": sigma}))
     ball = rgb.load_dict({"type": "scene", "ball": {"type": "sphere", "center": [0.25, 0.25, 3], "radius": 0.2}})
-    # Through the unit cube to the ball, past the ball, and past both.
+    # Through the unit cube to the sphere, past the sphere, and past both.
     view = look(rgb, SceneGeometry(medium, ball), [(0.25, 0.25, -1), (0.75, 0.75, -1), (1.75, 0.75, -1)])
     thick = -np.expm1(-sigma)
     assert np.allclose(view.opacity.numpy(), [1, thick, 0], rtol=1e-5)
@@ -137,7 +137,7 @@ def test_a_shape_is_opaque_and_a_medium_as_thick_as_it_is(rgb, sigma):
     assert view.has_surface(0.0).numpy().tolist() == [True, True, False]
 
 
-def test_distances_follow_the_ray_where_no_shape_moves(rgb):
+def test_shape_distance_derivative_of_the_ray(rgb):
     place = SceneGeometry(
         None, rgb.load_dict({"type": "scene", "ball": {"type": "sphere", "center": [0, 0, 5], "radius": 2.0}})
     )
@@ -151,32 +151,33 @@ def test_distances_follow_the_ray_where_no_shape_moves(rgb):
     assert np.allclose(dr.grad(z).numpy(), -1, rtol=1e-5)
 
 
-def test_distances_follow_a_shape_where_no_ray_moves(rgb):
+def test_shape_distance_derivative_of_the_shape(rgb):
     scene = rgb.load_dict(
         {"type": "scene", "plate": {"type": "rectangle", "to_world": rgb.ScalarTransform4f().translate([0, 0, 4])}}
     )
     params, lift = rgb.traverse(scene), rgb.Float(0)
     dr.enable_grad(lift)
     key = next(k for k in params.keys() if k.endswith("to_world"))
-    # Twice as far as it is lifted, whatever the place on it.
+    # Twice the displacement, anywhere on it.
     params[key] = rgb.Transform4f().translate(rgb.Point3f(0, 0, 4 + 2 * lift))
     params.update()
     view = look(rgb, SceneGeometry(None, scene), [(0, 0, 0), (0.4, -0.7, 1)])
     dr.forward(lift)
-    assert np.allclose(view.shape_distance.numpy(), [4, 3]) and np.allclose(dr.grad(view.shape_distance).numpy(), 2, rtol=1e-5)
+    assert np.allclose(view.shape_distance.numpy(), [4, 3]) and np.allclose(
+        dr.grad(view.shape_distance).numpy(), 2, rtol=1e-5
+    )
 
 
 # ---- Shading ----
 #
-# What light comes from behind a field: from shapes, lit or in their plain albedo, from an environment, or from the
-# background.
+# Radiance from behind a medium: lit shapes, shapes by their albedo, an environment emitter, or the background.
 
 BACKGROUND = 0.125
 SAMPLES = 1 << 14
 
 
 def scene_of(mi, *emitters, shapes=True):
-    """A square in the plane z = 2 of albedo 0.25, 0.5, 0.75, whose half with x > 0 rays along +z meet."""
+    """A square in the plane z = 2 of albedo 0.25, 0.5, 0.75, whose half with x > 0 is hit by rays along +z."""
     square = plugin(
         "rectangle",
         to_world=mi.ScalarTransform4f().translate([1, 0, 2]).rotate([1, 0, 0], 180),
@@ -187,8 +188,8 @@ def scene_of(mi, *emitters, shapes=True):
 
 
 def shade(mi, scene, nested=None, medium=None, hide=False):
-    """``(radiance, AOVs, shown)`` of a ray that meets the square and of one that does not, each the mean of many
-    samples; arrays a row each."""
+    """``(radiance, AOVs, shown)`` of a ray that hits the square and of one that misses it, averaged over many samples;
+    one array row each."""
     place = SceneGeometry(medium, scene)
     across = mi.Float(np.repeat(np.float32([0.5, -0.5]), SAMPLES))
     ray = mi.RayDifferential3f(mi.Point3f(across, 0.5, -1), mi.Vector3f(0, 0, 1))
@@ -212,18 +213,18 @@ def test01_shapes_without_light_show_their_albedo(rgb):
     assert shown.tolist() == [True, False] and aovs == [] and shading.aov_names() == []
 
 
-def test02_shapes_in_light_are_lit_by_paths(rgb):
+def test02_shapes_with_emitters_are_lit_by_path(rgb):
     color, _, shown, _ = shade(rgb, scene_of(rgb, SKY))
-    # Under a sky of radiance 2 all around, a plane that sees nothing but it reflects twice its albedo.
+    # Under a uniform environment of radiance 2, a plane that sees nothing else reflects twice its albedo.
     assert np.allclose(color, [[0.5, 1.0, 1.5], [2, 2, 2]], rtol=0.02) and shown.tolist() == [True, True]
 
 
-def test03_a_sky_that_is_hidden_leaves_the_background(rgb):
+def test03_hidden_environment_leaves_the_background(rgb):
     color, _, shown, _ = shade(rgb, scene_of(rgb, SKY), hide=True)
     assert np.allclose(color, [[0.5, 1.0, 1.5], [BACKGROUND] * 3], rtol=0.02) and shown.tolist() == [True, False]
 
 
-def test04_a_sky_without_shapes(rgb):
+def test04_environment_without_shapes(rgb):
     color, _, shown, _ = shade(rgb, scene_of(rgb, SKY, shapes=False), medium=fog(rgb, 1.0))
     assert np.allclose(color, 2) and shown.tolist() == [True, True]
 
@@ -233,33 +234,33 @@ def fog(mi, sigma):
     return VolumeMedium(mi.load_dict({"type": "constvolume", "value": sigma, "to_world": to_world}))
 
 
-def test05_what_opaque_matter_hides_is_not_shaded(rgb):
+def test05_occluded_shapes_are_not_shaded(rgb):
     color, _, _, _ = shade(rgb, scene_of(rgb, SKY), medium=fog(rgb, 1e6))
-    # What is there will be multiplied by nothing: no path was followed to the square.
+    # The weight of what is behind is zero: no path was traced to the square.
     assert np.allclose(color[0], 2)
 
 
-def test06_a_nested_integrator_lights_and_brings_its_aovs(rgb):
+def test06_nested_integrator_lights_and_adds_aovs(rgb):
     nested = {"type": "aov", "aovs": "far:depth", "light": {"type": "direct"}}
     color, aovs, shown, shading = shade(rgb, scene_of(rgb, SKY), nested)
     assert np.allclose(color, [[0.5, 1.0, 1.5], [2, 2, 2]], rtol=0.02)
     assert shading.aov_names()[-1] == "far.T" and np.allclose(aovs[-1], [3, 0]) and shown.tolist()[0]
 
 
-def test07_a_nested_integrator_leaves_the_background_where_nothing_is(rgb):
+def test07_nested_integrator_keeps_the_background(rgb):
     lamp = {"type": "point", "position": [0.5, 0.5, 0], "intensity": 4.0}
     color, _, shown, _ = shade(rgb, scene_of(rgb, lamp), {"type": "direct"})
-    # Straight above the point that is met, two units away: albedo / π times 4 / 2².
+    # Directly above the hit point, two units away: albedo / π times 4 / 2².
     assert np.allclose(color, [np.array([0.25, 0.5, 0.75]) / np.pi, [BACKGROUND] * 3], rtol=1e-4)
     assert shown.tolist() == [True, False]
 
 
-def test08_integrators_that_cannot_be_asked_ray_by_ray_are_refused(rgb):
-    with pytest.raises(NergError, match="AdjointIntegrator, which cannot be asked"):
+def test08_integrators_without_per_ray_radiance_are_refused(rgb):
+    with pytest.raises(NergError, match="AdjointIntegrator, which does not compute"):
         Shading(rgb.load_dict({"type": "ptracer"}))
 
 
-# ---- Depth tracing outside of a render: closed forms, both kinds of arrays, batches that do not matter ----
+# ---- Batched depth tracing: closed forms, both array types, independence of the batch size ----
 
 
 @pytest.fixture
@@ -270,7 +271,7 @@ def slab(rgb):
 
 @pytest.fixture
 def wall(rgb):
-    """Opaque from x = 0.5 on, empty before."""
+    """Opaque for x > 0.5, empty elsewhere."""
     data = np.zeros((4, 4, 4, 1), np.float32)
     data[:, :, 2:] = 1000
     return VolumeMedium(rgb.load_dict({"type": "gridvolume", "data": rgb.TensorXf(data), "filter_type": "nearest"}))
@@ -295,7 +296,7 @@ def test_expected_depth_in_closed_form(slab):
     assert depth[0] == pytest.approx(1 + mean, abs=1e-4)
 
 
-def test_a_wall_is_where_it_stands(wall):
+def test_wall_depth(wall):
     rng = np.random.default_rng(0)
     d = rng.normal(size=(200, 3))
     d[:, 0] = np.abs(d[:, 0]) + 0.5
@@ -309,7 +310,7 @@ def test_a_wall_is_where_it_stands(wall):
 
 
 @pytest.mark.parametrize("batch", [1, 2, 100])
-def test_batches_and_kinds_of_arrays_agree(slab, rgb, batch):
+def test_batches_and_array_types_agree(slab, rgb, batch):
     ns = namespace("llvm")
     expected = trace_depth(slab, O, D)
     found = trace_depth(slab, O, D, batch=batch)
@@ -320,7 +321,7 @@ def test_batches_and_kinds_of_arrays_agree(slab, rgb, batch):
         np.testing.assert_array_equal(np.array(j), e)
 
 
-def test_a_field_scaled_by_ten_is_ten_times_as_far(rgb):
+def test_scaled_field_has_scaled_depth(rgb):
     ns = namespace("llvm")
     config = RadianceConfig(grid=HashGridConfig(levels=2, log2_rows=8, base=4, finest=8), width=16, density_scale=20.0)
     field = RadianceField.random(config, Box((-1, -1, -1), (1, 1, 1)), ns, 1, march_step=1 / 64)
@@ -332,7 +333,7 @@ def test_a_field_scaled_by_ten_is_ten_times_as_far(rgb):
     np.testing.assert_allclose(a, b, rtol=1e-4)
 
 
-def test_no_gradient_is_left_behind(slab):
+def test_trace_depth_is_detached(slab):
     ns = namespace("llvm")
     o = ns.Array3f(O.T)
     dr.enable_grad(o)
@@ -340,7 +341,7 @@ def test_no_gradient_is_left_behind(slab):
     assert not dr.grad_enabled(depth) and not dr.grad_enabled(opacity)
 
 
-def test_what_does_not_fit_is_named(slab):
+def test_mismatched_shapes_are_refused(slab):
     with pytest.raises(ValueError, match=r"\(N, 3\)"):
         trace_depth(slab, O, D[:2])
     with pytest.raises(ValueError, match="median"):

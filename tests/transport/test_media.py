@@ -1,4 +1,4 @@
-"""Media: what the protocol asks of each, fields, volumes, cells that are known to be empty, and features."""
+"""Media: the protocol, radiance fields, volumes, empty cells, and features."""
 
 import inspect
 from dataclasses import replace
@@ -14,25 +14,25 @@ from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.occupancy import OccupancyGrid, cascades_from_contracted
 from nerg_mi.fields.radiance import RadianceConfig, RadianceField, mean_features
 from nerg_mi.maths.geometry import Box, ContractedBox, Similarity
-from nerg_mi.transport.field_medium import FeaturePainter, FieldMedium, make_color_shader, observed_features
+from nerg_mi.transport.field_medium import FeatureShader, FieldMedium, features_for_observer, make_color_shader
 from nerg_mi.transport.geometry import SceneGeometry
 from nerg_mi.transport.march import march
 from nerg_mi.transport.march_primal import MarchSettings
-from nerg_mi.transport.medium import MAX_DENSITY, ColorPainter, LocalRay, Medium, bound, bounded
-from nerg_mi.transport.volume_medium import KnownEmpty, VolumeMedium
+from nerg_mi.transport.medium import MAX_DENSITY, ColorShader, LocalRay, Medium, bound, clamp_density
+from nerg_mi.transport.volume_medium import FrozenBound, VolumeMedium
 from tests.maths.test_geometry import turn
 from tests.transport.test_splat_medium import medium_of, stack
 
 # ---- Cells ----
 #
-# The bound of a grid volume: nothing that its interpolant can return lies in a cell that counts as empty.
+# The occupancy bound of a grid volume: its interpolant is zero in all empty cells.
 
 
 @pytest.mark.parametrize("filter_type", ["nearest", "trilinear"])
 @pytest.mark.parametrize("wrap_mode", ["repeat", "mirror", "clamp"])
 @pytest.mark.parametrize("voxel", [(0, 3, 3), (7, 3, 3), (3, 0, 7), (4, 4, 4)])
-def test_no_matter_lies_in_an_empty_cell(rgb, wrap_mode, filter_type, voxel):
-    """Also not where a grid that repeats shows its first voxel at its far side."""
+def test_empty_cells_contain_no_density(rgb, wrap_mode, filter_type, voxel):
+    """Also for a repeating grid, which shows its first voxel at its far side."""
     data = np.zeros((8, 8, 8), np.float32)
     data[voxel] = 1
     volume = rgb.load_dict(
@@ -43,26 +43,26 @@ def test_no_matter_lies_in_an_empty_cell(rgb, wrap_mode, filter_type, voxel):
     it.p = rgb.Point3f(np.random.default_rng(0).random((3, 100_000)).astype(np.float32))
     matter, away = volume.eval_1(it).numpy() > 0, cells.distance_to_occupied(it.p).numpy()
     assert matter.any() and not away[matter].any()
-    # A bound that holds for all wrap modes, and yet leaves most of the box out.
+    # The bound holds for all wrap modes and still leaves most of the box empty.
     assert (away > 0).mean() > 0.8
 
 
 @pytest.mark.parametrize("data", [np.ones((4, 4, 4)), np.pad([[[1.0]]], 1)])
-def test_there_is_no_bound_where_nothing_could_be_skipped(data):
+def test_no_bound_without_empty_cells(data):
     assert bound(data, ns) is None
 
 
-# ---- What samples contribute to a sum: the medium's colour, in the array type that was asked for ----
+# ---- Sample shaders: the colour of the medium in the requested array type ----
 
 
 @pytest.mark.parametrize("kind", ["Color3f", "Spectrum", "Vector3f"])
-def test01_the_mediums_colour(rgb, kind):
+def test01_color_shader(rgb, kind):
     array_type = getattr(rgb, kind)
     data = np.broadcast_to(np.float32([0.2, 0.5, 0.8]), (2, 2, 2, 3)).copy()
     color = rgb.load_dict({"type": "gridvolume", "grid": rgb.VolumeGrid(data), "raw": True})
     medium, painter = (
         VolumeMedium(rgb.load_dict({"type": "constvolume", "value": 1.0}), color),
-        ColorPainter(array_type),
+        ColorShader(array_type),
     )
     p, w = rgb.Point3f(0.5, 0.5, 0.5), rgb.Vector3f(0, 0, 1)
     found = painter.shade(medium, [], p, w, rgb.Bool(True))
@@ -72,7 +72,7 @@ def test01_the_mediums_colour(rgb, kind):
     assert painter.resolve_color(medium, found, rgb.Float(0.5), medium.ray_to_local(p, w), rgb.Bool(True)) is found
 
 
-# ---- Every medium answers all that the protocol asks, and densities are fit to be marched ----
+# ---- All media implement the protocol, with valid densities ----
 
 ASKED = {name: what for name, what in vars(Medium).items() if isinstance(what, (FunctionType, property))}
 ASKED = {name: what for name, what in ASKED.items() if not name.startswith("_")}
@@ -89,7 +89,7 @@ def media(mi):
     ]
 
 
-def test01_every_medium_has_what_is_asked(rgb):
+def test01_media_implement_the_protocol(rgb):
     assert len(ASKED) > 15
     for medium in media(rgb):
         for name, what in ASKED.items():
@@ -101,14 +101,14 @@ def test01_every_medium_has_what_is_asked(rgb):
                 assert list(inspect.signature(found).parameters) == wanted, (type(medium), name)
 
 
-def test02_and_answers_as_it_says(rgb):
+def test02_media_return_consistent_values(rgb):
     for medium in media(rgb):
         assert medium.color_space in ("srgb", "linear", "spectrum") and medium.length_scale > 0
-        assert medium.step is None or 0 < medium.step < medium.length_scale
+        assert medium.default_step is None or 0 < medium.default_step < medium.length_scale
         lower, upper = medium.bounds()
         assert lower.shape == upper.shape == (3,) and (upper > lower).all()
         o, d = rgb.Point3f(0.4, 0.6, -1), rgb.Vector3f(0, 0, 1)
-        ray = medium.local(o, d)
+        ray = medium.ray_to_local(o, d)
         assert isinstance(ray, LocalRay) and 0 < ray.t_near[0] < ray.t_far[0] < 10
         assert medium.refresh() is None and medium.parameters()
         if medium.hits is not None:
@@ -123,10 +123,10 @@ def test02_and_answers_as_it_says(rgb):
 
 @pytest.mark.parametrize("wrong, right", [(-1, 0), (np.nan, 0), (np.inf, MAX_DENSITY), (3e38, MAX_DENSITY), (2.5, 2.5)])
 def test03_densities_are_finite_and_not_negative(wrong, right):
-    assert bounded(ns.Float(wrong))[0] == np.float32(right)
+    assert clamp_density(ns.Float(wrong))[0] == np.float32(right)
 
 
-# ---- A radiance field in the scene: scale and rotation, and nothing is asked for outside of its bounds ----
+# ---- A radiance field in the scene: scale, rotation, and its bounds ----
 
 GRID = HashGridConfig(levels=2, log2_rows=10, base=4, finest=16)
 BOX = Box((0, 0, 0), (1, 1, 2))
@@ -143,13 +143,13 @@ def field(**kwargs):
 
 
 def gather(mi, medium, o, d, scale):
-    ray = medium.local(mi.Point3f(o.tolist()), mi.Vector3f(d.tolist()))
+    ray = medium.ray_to_local(mi.Point3f(o.tolist()), mi.Vector3f(d.tolist()))
     t0 = dr.maximum(ray.t_near, 0)
-    result = march(medium, ray, t0, ray.t_far, True, MarchSettings(0.05 * scale), color=ColorPainter(mi.Color3f))
+    result = march(medium, ray, t0, ray.t_far, True, MarchSettings(0.05 * scale), color=ColorShader(mi.Color3f))
     return result.opacity.numpy()[0], result.expected_depth.numpy()[0], np.array(result.color).ravel()
 
 
-def test01_scaling_place_and_camera_changes_no_opacity(rgb):
+def test01_scaling_scene_and_camera_keeps_opacity(rgb):
     f = field()
     o, d = np.array([0.4, 0.3, -1.0]), np.array([0.1, 0.05, 1.0])
     d /= np.linalg.norm(d)
@@ -160,18 +160,18 @@ def test01_scaling_place_and_camera_changes_no_opacity(rgb):
         moved = FieldMedium(f, Similarity(m))
         got = gather(rgb, moved, (m @ [*o, 1])[:3], m[:3, :3] @ d / scale, scale)
         assert np.isclose(got[0], plain[0], rtol=1e-4) and np.isclose(got[1], plain[1] * scale, rtol=1e-4)
-        # The direction that colour depends on turns with the field.
+        # The direction of view-dependent colour rotates with the field.
         assert np.allclose(got[2], plain[2], rtol=1e-3)
         assert np.isclose(moved.default_step, 0.05 * scale) and np.isclose(moved.length_scale, 6**0.5 * scale)
 
 
-def test02_its_box_in_the_scene(rgb):
+def test02_bounding_box_in_the_scene(rgb):
     m = turn(2.0)
     medium = FieldMedium(field(), Similarity(m))
     corners = np.array([m[:3] @ [x, y, z, 1] for x in (0, 1) for y in (0, 1) for z in (0, 2)])
     lower, upper = medium.bounds()
     assert np.allclose(lower, corners.min(0)) and np.allclose(upper, corners.max(0))
-    # The unit cube of the occupancy grid holds the field's box: its longest edge spans it.
+    # The unit cube of the occupancy grid contains the field's box: its longest edge spans it.
     p = rgb.Point3f(*map(float, (m @ [0.25, 0.5, 2, 1])[:3]))
     assert np.allclose(np.array(medium.to_unit(medium.to_local(p))).ravel(), [0.375, 0.5, 1], atol=1e-6)
     v = medium.vector_to_unit(rgb.Vector3f(0, 0, 1))
@@ -179,7 +179,7 @@ def test02_its_box_in_the_scene(rgb):
 
 
 @pytest.mark.parametrize("scale", [0.5, 4.0])
-def test03_density_is_that_of_a_scene_unit(rgb, scale):
+def test03_density_is_per_scene_unit(rgb, scale):
     f = field()
     medium = FieldMedium(f, Similarity(np.diag([scale, scale, scale, 1])))
     p = ns.Array3f([0.2, 0.7], [0.3, 0.1], [0.4, 1.9])
@@ -189,18 +189,18 @@ def test03_density_is_that_of_a_scene_unit(rgb, scale):
     assert len(features) == medium.feature_count == 3
 
 
-def test04_empty_cells_hold_nothing_also_where_no_march_has_looked(rgb):
+def test04_density_in_occupied_cells(rgb):
     bits = np.zeros((4, 4, 4), bool)
     bits[0, 0, 0] = True
     medium = FieldMedium(field(occupancy=OccupancyGrid(bits, ns, 0.01)))
-    # The longest edge of the box, two units, spans the four cells, and the others lie in the middle of them.
+    # The longest edge of the box, two units, spans the four cells; the others are centred.
     p = ns.Array3f([0.1, 0.1, 0.9], [0.1, 0.1, 0.9], [0.1, 1.9, 1.0])
-    found, inside = medium.occupied_density(p, True).numpy(), medium.density(p, True).numpy()
+    found, inside = medium.density_in_occupied_cells(p, True).numpy(), medium.density(p, True).numpy()
     occupied = medium.occupancy.distance_to_occupied(medium.to_unit(p)).numpy() == 0
     assert (inside > 0).all() and np.array_equal(found, np.where(occupied, inside, 0))
 
 
-def test05_weights_are_read_whenever_it_is_asked(rgb):
+def test05_weights_are_read_on_each_evaluation(rgb):
     f = field()
     medium, p = FieldMedium(f), ns.Array3f(0.4, 0.3, 1.2)
     before = medium.density(p, True).numpy()
@@ -209,7 +209,7 @@ def test05_weights_are_read_whenever_it_is_asked(rgb):
     assert not np.allclose(medium.density(p, True).numpy(), before)
 
 
-# ---- A field without an end in the scene: rays through the contracted part against integrals in float64 ----
+# ---- An unbounded field: rays through contracted space against float64 integrals ----
 
 GRID = HashGridConfig(levels=2, log2_rows=10, base=4, finest=16)
 ENDLESS = ContractedBox(Box((-1, -2, -2), (3, 2, 2)), 64)
@@ -218,7 +218,7 @@ SCALE = 0.1
 
 
 def plain_field(**kwargs):
-    """One whose density net returns 0: σ = SCALE / m², m the largest coordinate in half edges (2 units) from (1, 0, 0),
+    """A field whose density net returns 0: σ = SCALE / m², m the maximum norm in half edges (2 units) from (1, 0, 0),
     at least 1."""
     config = RadianceConfig(GRID, width=16, geometry=3, sh_degree=2, density_scale=SCALE)
     field = RadianceField.random(config, ENDLESS, ns, march_step=0.02, march_growth=GROWTH, **kwargs)
@@ -227,7 +227,7 @@ def plain_field(**kwargs):
 
 
 def by_sums(o, d, stop, count=100_000):
-    """Optical depth and mean distance of absorption up to the distance ``stop``, by sums in float64."""
+    """Optical depth and mean distance of absorption up to the distance ``stop``, by float64 sums."""
     edges = np.concatenate([[0], np.geomspace(1e-3, stop, count)])
     t = 0.5 * (edges[1:] + edges[:-1])
     m = np.maximum(np.abs((o + t[:, None] * d - ENDLESS.center) / 2).max(axis=1), 1)
@@ -243,13 +243,13 @@ def rays(count=24):
 
 
 def absorbed(mi, medium, o, d, settings):
-    ray = medium.local(mi.Point3f(o.T.astype(np.float32)), mi.Vector3f(d.T.astype(np.float32)))
+    ray = medium.ray_to_local(mi.Point3f(o.T.astype(np.float32)), mi.Vector3f(d.T.astype(np.float32)))
     found = march(medium, ray, dr.maximum(ray.t_near, 0), ray.t_far, True, settings)
     return ray.t_far.numpy(), found.tau.numpy(), found.expected_depth.numpy()
 
 
-# Steps of a share γ of their distance see the density of their middle: an error of the order of γ², and that of single
-# precision over hundreds of steps.
+# Steps of a fraction γ of their distance use the density at their middle: an error of order γ², plus the rounding of
+# single precision over hundreds of steps.
 @pytest.mark.parametrize("growth, tolerance", [(1 / 16, 2e-3), (1 / 128, 5e-5)])
 def test_rays_through_the_contracted_part(rgb, growth, tolerance):
     medium, (o, d) = FieldMedium(plain_field()), rays()
@@ -260,7 +260,7 @@ def test_rays_through_the_contracted_part(rgb, growth, tolerance):
     assert depth.max() > 2 * ENDLESS.side
 
 
-def test_depths_are_those_of_the_scene_wherever_it_is_placed(rgb):
+def test_contracted_depths_are_in_scene_units(rgb):
     (o, d), field = rays(20), plain_field()
     _, tau, depth = absorbed(rgb, FieldMedium(field), o, d, MarchSettings(0.02, dt_gamma=GROWTH))
     m = turn(10.0)
@@ -272,8 +272,8 @@ def test_depths_are_those_of_the_scene_wherever_it_is_placed(rgb):
     np.testing.assert_allclose(depth_m, 10 * depth, rtol=1e-4)
 
 
-def test_empty_cells_are_passed_over_and_full_ones_are_not(rgb):
-    """One shell of cells far out, all else empty: what is absorbed lies there."""
+def test_contracted_empty_cells_are_skipped(rgb):
+    """One shell of distant cells, all others empty: absorption lies there."""
     r = 32
     bits = np.zeros((r, r, r), bool)
     bits[:, :, -3] = True
@@ -282,23 +282,23 @@ def test_empty_cells_are_passed_over_and_full_ones_are_not(rgb):
     o, d = np.array([[1.0, 0.1, 0.2]]), np.array([[1.0, 0.0, 0.0]])
     settings = MarchSettings(0.02, dt_gamma=GROWTH)
     _, tau, depth = absorbed(rgb, FieldMedium(plain_field(occupancy=cascades)), o, d, settings)
-    # Along x from the centre: the integral of SCALE / (x / 2)² over the shell, and over what its cells of the cascades
-    # are larger by.
+    # Along x from the centre: the integral of SCALE / (x / 2)² over the shell, and over the larger cells of the
+    # cascades.
     shell = SCALE * 4 * (1 / (near - 1) - 1 / (far - 1))
     assert shell * 0.95 < tau[0] < 1.6 * shell and near - 1 < depth[0] < 1.2 * far
     behind = absorbed(rgb, FieldMedium(plain_field(occupancy=cascades)), o, -d, settings)
     assert behind[1][0] == 0
 
 
-def test_the_medium_of_a_bounded_field_does_not_grow(rgb):
+def test_bounded_field_has_uniform_steps(rgb):
     config = RadianceConfig(GRID, width=16, geometry=3, sh_degree=2)
     assert FieldMedium(RadianceField.random(config, ENDLESS.core, ns, march_step=0.02)).default_dt_gamma == 0
 
 
-# ---- Mitsuba volumes as a medium: errors, what a march skips, and what a change of their data changes ----
+# ---- Mitsuba volumes as media: errors, skipped cells, and changes of their data ----
 
 
-def test01_a_volume_without_extent_is_refused(rgb):
+def test01_volume_without_extent_is_refused(rgb):
     class Endless(rgb.Volume):
         def __init__(self, lower, upper):
             super().__init__(rgb.Properties())
@@ -312,11 +312,11 @@ def test01_a_volume_without_extent_is_refused(rgb):
             VolumeMedium(Endless(lower, upper))
 
 
-def test02_volume_answers(rgb):
+def test02_volume_values(rgb):
     density = rgb.load_dict({"type": "gridvolume", "grid": rgb.VolumeGrid(np.array([[[-3.0, 5.0]]], np.float32))})
     medium = VolumeMedium(density)
     p = rgb.Point3f([0.1, 0.9], 0.5, 0.5)
-    # Negative density would make light.
+    # Negative density would create light.
     assert np.allclose(medium.density(p, True).numpy(), [0, 5]) and not medium.has_color and medium.occupancy is None
     assert np.isclose(medium.length_scale, 3**0.5)
     ray = medium.ray_to_local(rgb.Point3f(0.5, 0.5, -2), rgb.Vector3f(0, 0, 1))
@@ -324,7 +324,7 @@ def test02_volume_answers(rgb):
 
 
 def corner(n=8):
-    """Matter in one voxel only."""
+    """Density in one voxel only."""
     data = np.zeros((n, n, n), np.float32)
     data[0, 0, 0] = 2
     return data
@@ -334,16 +334,18 @@ def grid_of(mi, data):
     return mi.load_dict({"type": "gridvolume", "grid": mi.VolumeGrid(data)})
 
 
-def test03_a_grid_is_skipped_and_its_steps_are_short_enough_for_its_voxels(rgb):
+def test03_grid_is_skipped_and_its_default_step_fits_its_voxels(rgb):
     medium = VolumeMedium(grid_of(rgb, corner()))
     assert medium.occupancy is not None and medium.occupancy.occupied_fraction < 0.1
-    assert medium.default_step == pytest.approx(min(3**0.5 / 1024, 0.5 / 8)) and medium.cells.edge == pytest.approx(1 / 8)
+    assert medium.default_step == pytest.approx(min(3**0.5 / 1024, 0.5 / 8)) and medium.cells.min_edge == pytest.approx(
+        1 / 8
+    )
     assert VolumeMedium(grid_of(rgb, np.ones((200, 2, 2), np.float32))).default_step == pytest.approx(3**0.5 / 1024)
     fog = VolumeMedium(rgb.load_dict({"type": "constvolume", "value": 1.0}))
     assert fog.occupancy is None and fog.cells is None and fog.default_step is None
 
 
-def test04_nothing_is_skipped_while_derivatives_of_it_are_tracked(rgb):
+def test04_no_skipping_with_gradients(rgb):
     volume = grid_of(rgb, corner())
     medium, params = VolumeMedium(volume), rgb.traverse(volume)
     dr.enable_grad(params["data"])
@@ -356,17 +358,17 @@ def test04_nothing_is_skipped_while_derivatives_of_it_are_tracked(rgb):
     assert medium.occupancy is not None
 
 
-def test05_refreshing_reads_voxels_that_have_changed_and_no_others(rgb, monkeypatch):
+def test05_refresh_reads_changed_voxels_only(rgb, monkeypatch):
     from nerg_mi.transport import volume_medium as module
 
     volume, read = grid_of(rgb, corner()), []
-    describe = module.describe
-    monkeypatch.setattr(module, "describe", lambda v: read.append(1) or describe(v))
+    read_grid_volume = module.read_grid_volume
+    monkeypatch.setattr(module, "read_grid_volume", lambda v: read.append(1) or read_grid_volume(v))
     medium, params = VolumeMedium(volume), rgb.traverse(volume)
     first = medium.occupancy
     medium.refresh()
     assert len(read) == 1 and medium.occupancy is first
-    medium.refresh(anyway=True)
+    medium.refresh(force=True)
     assert len(read) == 2
     moved = np.ascontiguousarray(corner()[::-1, ::-1, ::-1])
     params["data"] = rgb.TensorXf(moved[..., None])
@@ -377,7 +379,7 @@ def test05_refreshing_reads_voxels_that_have_changed_and_no_others(rgb, monkeypa
     assert medium.density(far, True).numpy()[0] > 0 and medium.occupancy.distance_to_occupied(far).numpy()[0] == 0
 
 
-def test06_voxels_that_are_not_finite_are_refused(rgb):
+def test06_non_finite_voxels_are_refused(rgb):
     data = np.ones((3, 3, 3), np.float32)
     data[2, 0, 1] = np.nan
     with pytest.raises(NergError, match=r"1 values that are not finite.*\(2, 0, 1\)"):
@@ -386,7 +388,7 @@ def test06_voxels_that_are_not_finite_are_refused(rgb):
         VolumeMedium(grid_of(rgb, np.ones((3, 2, 4, 2), np.float32)))
 
 
-def test07_its_coordinates_are_the_scenes(rgb):
+def test07_volume_uses_scene_coordinates(rgb):
     to_world = rgb.ScalarTransform4f().translate([1, 2, 3]).scale([1, 2, 4])
     medium = VolumeMedium(rgb.load_dict({"type": "constvolume", "value": 1.0, "to_world": to_world}))
     lower, upper = medium.bounds()
@@ -397,17 +399,17 @@ def test07_its_coordinates_are_the_scenes(rgb):
     assert np.allclose(np.array(medium.vector_to_unit(rgb.Vector3f(1, 1, 1))).ravel(), [1, 0.5, 0.25])
 
 
-def test08_what_is_skipped_can_be_put_aside_and_back(rgb):
-    """As a recorded function does, which replaces what it finds by what it is called with."""
+def test08_frozen_bound_can_be_replaced(rgb):
+    """Like a frozen function, which replaces variables by its arguments."""
     medium = VolumeMedium(grid_of(rgb, corner()))
-    known = KnownEmpty(medium)
+    known = FrozenBound(medium)
     kept, known.bound = known.bound, None
     assert kept is not None and medium.occupancy is None
     known.bound = kept
     assert medium.occupancy is kept
 
 
-# ---- Features that a gaze field may ask for: of the point itself, or gathered on the way there ----
+# ---- Features for a gaze field: at a point, or composited along a ray ----
 
 O, D = np.array([0.1, -0.2, -3.0]), np.array([0.0, 0.1, 1.0]) / np.hypot(0.1, 1)
 
@@ -424,26 +426,26 @@ def place(rgb):
 def asked(rgb, place, kind, p, active=True):
     vector = lambda of, v: of(*map(float, v))
     settings = MarchSettings(1 / 128, stop=0.0, color_cutoff=1e-2)
-    found = observed_features(
+    found = features_for_observer(
         kind, place, vector(rgb.Point3f, p), vector(rgb.Point3f, O), vector(rgb.Vector3f, D), rgb.Bool(active), settings
     )
     return None if found is None else np.array([f[0] for f in found])
 
 
 def features(field, p):
-    """Density and features of points (N, 3) of the scene, whose unit is half of the field's."""
+    """Density and features of scene points (N, 3); the scene's unit is half of the field's."""
     sigma, f = field.density_features(ns.Array3f(np.ascontiguousarray((p / 2).T, np.float32)))
     return sigma.numpy() / 2, np.stack([x.numpy() for x in f], axis=1)
 
 
-def test_a_snapshot_is_of_the_point(rgb, place):
+def test_features_at_a_point(rgb, place):
     place, field = place
     p = np.array([0.3, 0.5, 0.2])
     assert np.allclose(asked(rgb, place, "snapshot", p), features(field, p[None])[1][0], atol=1e-5)
     assert not asked(rgb, place, "snapshot", p, active=False).any() and asked(rgb, place, "", p) is None
 
 
-def test_accumulated_ones_are_weighted_by_what_reaches_the_eye(rgb, place):
+def test_composited_features(rgb, place):
     place, field = place
     t = np.linspace(0, 6, 6001)
     p = O + D * (0.5 * (t[:-1] + t[1:]))[:, None]
@@ -456,15 +458,15 @@ def test_accumulated_ones_are_weighted_by_what_reaches_the_eye(rgb, place):
     assert np.abs(found - asked(rgb, place, "snapshot", (0.3, 0.5, 0.2))).max() > 0.01
 
 
-def test_colours_of_a_deferred_medium_come_of_what_is_accumulated(rgb, place):
-    """Beside features or alone; those of another medium from its samples."""
+def test_deferred_color_uses_composited_features(rgb, place):
+    """With features or without; those of another medium from its samples."""
     kinds = []
     for deferred in (False, True):
         field = place[1]
         config = replace(field.config, deferred=deferred)
         medium = FieldMedium(RadianceField(config, field.box, field.grid, field.density_net, field.color_net))
         ray = medium.ray_to_local(rgb.Point3f(0.1, -0.2, -3), rgb.Vector3f(*map(float, D)))
-        one, both = make_color_shader(medium, rgb.Color3f), make_color_shader(medium, rgb.Color3f, features=True)
+        one, both = make_color_shader(medium, rgb.Color3f), make_color_shader(medium, rgb.Color3f, with_features=True)
         kinds.append(type(one))
         found = []
         for painter in (one, both):
@@ -478,5 +480,5 @@ def test_colours_of_a_deferred_medium_come_of_what_is_accumulated(rgb, place):
             means = mean_features(sums, r.opacity)
             want = np.array(r.opacity * medium.field.color(means, ray.w)).ravel()
             assert np.allclose(found[0], want, atol=1e-6)
-    assert kinds == [ColorPainter, FeaturePainter]
-    assert FeaturePainter(medium).resolve_color(medium, r.color, r.opacity, ray, True) is None
+    assert kinds == [ColorShader, FeatureShader]
+    assert FeatureShader(medium).resolve_color(medium, r.color, r.opacity, ray, True) is None

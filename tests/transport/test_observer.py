@@ -1,4 +1,4 @@
-"""Observers: what is kept of them, what tells arrays apart, and whether they see a point."""
+"""Observers: cached data, fingerprints of arrays, and visibility of points."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ from nerg_mi.fields.gaze_base import RaySupport
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.transport import observer
 from nerg_mi.transport.geometry import SceneGeometry
-from nerg_mi.transport.jit import Fingerprint, no_collection, of_shapes, recording
+from nerg_mi.transport.jit import Fingerprint, fingerprint_shapes, gc_paused, is_recording
 from nerg_mi.transport.march_primal import MarchSettings
 from nerg_mi.transport.observer import (
-    Known,
+    CacheEntry,
     ObserverCache,
     ObserverSettings,
     SupportView,
-    fingerprint_of,
     evaluate_view,
+    fingerprint_geometry,
     visibility,
 )
 from nerg_mi.transport.volume_medium import VolumeMedium
 from tests.plugins.scenes import plugin
 
-# ---- What is kept of observers: for the same position, as long as what it was made of is the same ----
+# ---- Cached data of observers: for the same position and unchanged dependencies ----
 
 
 @pytest.fixture
 def made():
-    """A list, and a maker that appends to it the position that it was called for."""
+    """A list, and a function that appends its position to the list."""
     calls = []
 
     def make(center):
@@ -49,48 +49,50 @@ def values(known):
     return [k.value for k in known]
 
 
-def test_the_same_position_is_served_again(rgb, made):
+def test_entries_are_cached_by_position(rgb, made):
     cache, (calls, make) = ObserverCache(), made
     eyes = [rgb.Point3f(1, 2, 3), rgb.Point3f(4, 5, 6)]
     first = cache.get_or_compute_each("thing", eyes, 0, make)
     assert values(first) == [1, 2] and calls == [[1, 2, 3], [4, 5, 6]]
     assert np.allclose(np.array(first[1].center).ravel(), [4, 5, 6])
-    # In another order, and one of them alone: the other one is not kept then.
+    # In another order, and one of them alone: the other one is then dropped.
     assert values(cache.get_or_compute_each("thing", eyes[::-1], 0, make)) == [2, 1]
     assert values(cache.get_or_compute_each("thing", eyes[:1], 0, make)) == [1]
     assert values(cache.get_or_compute_each("thing", eyes, 0, make)) == [1, 3]
-    # To the bit.
+    # Exactly.
     next_to = rgb.Point3f(1, 2, float(np.nextafter(np.float32(3), np.float32(4))))
     assert values(cache.get_or_compute_each("thing", [next_to], 0, make)) == [4]
 
 
-def test_numbers_of_others_are_kept(rgb, made):
+def test_scalars_of_other_observers_are_kept(rgb, made):
     (calls, make), whole = made, ObserverCache()
     own = lambda known: make(known.center)
-    at = lambda x: [Known(rgb.Point3f(x, 0, 0), None)]
-    assert [values(whole.of_numbers("n", at(x), 0, own)) for x in (1, 2, 1)] == [[1], [2], [1]]
-    # Of a cache that lives shortly they are those of the whole; what is more than a number is its own.
-    part = ObserverCache(numbers=whole)
-    assert values(part.of_numbers("n", at(2), 0, own)) == [2]
-    assert values(part.of_known("n", at(2), 0, own)) == [3] and values(whole.of_known("m", at(2), 0, own)) == [4]
-    # Others of what has changed are dropped, and of very many those who were asked for first.
-    assert values(whole.of_numbers("n", at(1), 1, own)) == [5] and len(whole.peek("n")) == 1
+    at = lambda x: [CacheEntry(rgb.Point3f(x, 0, 0), None)]
+    assert [values(whole.get_or_compute_scalar("n", at(x), 0, own)) for x in (1, 2, 1)] == [[1], [2], [1]]
+    # A short-lived cache shares scalars with its parent; other values are its own.
+    part = ObserverCache(scalar_cache=whole)
+    assert values(part.get_or_compute_scalar("n", at(2), 0, own)) == [2]
+    assert values(part.get_or_compute("n", at(2), 0, own)) == [3] and values(
+        whole.get_or_compute("m", at(2), 0, own)
+    ) == [4]
+    # Entries with changed dependencies are dropped, and the oldest of very many.
+    assert values(whole.get_or_compute_scalar("n", at(1), 1, own)) == [5] and len(whole.peek("n")) == 1
     for x in range(2, 300):
-        whole.of_numbers("n", at(x), 1, own)
+        whole.get_or_compute_scalar("n", at(x), 1, own)
     assert len(whole.peek("n")) == 257
     count = len(calls)
-    whole.of_numbers("n", at(298), 1, own)
+    whole.get_or_compute_scalar("n", at(298), 1, own)
     assert len(calls) == count
-    whole.of_numbers("n", at(1), 1, own)
+    whole.get_or_compute_scalar("n", at(1), 1, own)
     assert len(calls) == count + 1
 
 
-def test_two_who_stand_at_one_place_share(rgb, made):
+def test_observers_at_one_position_share_an_entry(rgb, made):
     cache, (_, make) = ObserverCache(), made
     assert values(cache.get_or_compute_each("thing", [rgb.Point3f(1, 2, 3)] * 2, 0, make)) == [1, 1]
 
 
-def test_each_thing_has_its_own(rgb, made):
+def test_keys_are_independent(rgb, made):
     cache, (_, make) = ObserverCache(), made
     eye = [rgb.Point3f(1, 2, 3)]
     assert [values(cache.get_or_compute_each(t, eye, 0, make)) for t in ("a", "b", "a")] == [[1], [2], [1]]
@@ -99,20 +101,20 @@ def test_each_thing_has_its_own(rgb, made):
     assert values(cache.get_or_compute_each("a", eye, 0, make)) == [3] and cache.peek("b") == []
 
 
-def test_other_arrays_make_it_anew(rgb, made):
+def test_changed_arrays_invalidate_entries(rgb, made):
     cache, (_, make) = ObserverCache(), made
     eye, weights = [rgb.Point3f(1, 2, 3)], rgb.Float([1, 2, 3])
     ask = lambda: values(cache.get_or_compute_each("thing", eye, Fingerprint([weights]), make))
     assert ask() == ask() == [1]
     weights += 0
-    # Equal in value, and another array: it may be another one in every lane.
+    # An equal value in another array: the array could differ in each lane.
     weights = rgb.Float(weights.numpy())
     assert ask() == [2]
     dr.scatter(weights, rgb.Float(7), rgb.UInt32(1))
     assert ask() == [3]
 
 
-def test_positions_carry_no_derivatives(rgb, made):
+def test_cached_positions_are_detached(rgb, made):
     cache, (_, make) = ObserverCache(), made
     p = rgb.Point3f(1, 2, 3)
     dr.enable_grad(p)
@@ -120,8 +122,8 @@ def test_positions_carry_no_derivatives(rgb, made):
     assert not dr.grad_enabled(known.center)
 
 
-def test_nothing_is_kept_of_a_recording(rgb):
-    """What is made in a frozen function is the recording's, and is looked up in none."""
+def test_recordings_are_not_cached(rgb):
+    """Values made while a function is recorded belong to the recording and are not cached."""
     cache = ObserverCache()
 
     @dr.freeze
@@ -134,9 +136,9 @@ def test_nothing_is_kept_of_a_recording(rgb):
     assert cache.peek("thing") == []
 
 
-def test_a_place_is_told_by_its_shapes_and_its_medium(rgb):
+def test_geometry_fingerprint_covers_shapes_and_medium(rgb):
     scene = rgb.load_dict({"type": "scene", "ball": {"type": "sphere", "radius": 2.0}})
-    of = fingerprint_of
+    of = fingerprint_geometry
     first = of(SceneGeometry(None, scene))
     assert first == of(SceneGeometry(None, scene)) != of(SceneGeometry(None))
     params = rgb.traverse(scene)
@@ -153,7 +155,7 @@ def test_a_place_is_told_by_its_shapes_and_its_medium(rgb):
     assert of(SceneGeometry(medium)) != before
 
 
-# ---- Settings of what is traced from an observer: which of them decide where a ray meets its surface ----
+# ---- Observer settings: which of them determine where a ray meets its surface ----
 
 SETTINGS = ObserverSettings(march=MarchSettings(0.1))
 
@@ -173,18 +175,18 @@ OTHERS = dict(
 OF_A_POINT = ("visibility", "tolerance", "map_height", "directions", "integral_tolerance")
 
 
-def test_each_setting_is_tried():
+def test_all_settings_are_covered():
     assert {f.name for f in fields(ObserverSettings)} == set(OTHERS)
 
 
 @pytest.mark.parametrize("name", list(OTHERS))
-def test_surfaces_are_decided_by_the_ray_and_not_by_what_is_compared(name):
-    """What an observer sees all around is kept for other visibilities, and made anew for other surfaces."""
+def test_surface_settings_exclude_visibility(name):
+    """Sphere samples are kept for other visibilities and recomputed for other surfaces."""
     other = replace(SETTINGS, **{name: OTHERS[name]})
-    assert (other.surfaces == SETTINGS.surfaces) == (name in OF_A_POINT)
+    assert (other.surface_settings == SETTINGS.surface_settings) == (name in OF_A_POINT)
 
 
-# ---- Where eyes are: the sensor's centre, whatever the near plane, and for every member of a batch ----
+# ---- Centres: that of a sensor, independent of the near plane, and of each member of a batch ----
 
 
 def camera(mi, origin, target=(0, 0, 0), kind="perspective", **kwargs):
@@ -235,12 +237,12 @@ def batch(mi, *cameras):
 
 
 @pytest.mark.parametrize("near", [0.01, 1.0, 8.0])
-def test03_rays_of_a_batch_find_their_camera(rgb, near):
+def test03_batch_rays_are_assigned_to_their_camera(rgb, near):
     origins = [[0, 0, 3], [0.5, 0, 3], [-3, 1, 0], [0, 0, -3]]
     sensor = batch(rgb, *(camera(rgb, o, near_clip=near) for o in origins))
     ray = rays_of(rgb, sensor, 200)
     got = np.array(observer.center_of_ray([sensor], ray)).T
-    # The ray's own camera: its line passes through exactly one of the centres.
+    # The camera of the ray: its line passes through exactly one of the centres.
     o, d = np.array(ray.o).T, np.array(ray.d).T
     v = o[:, None] - np.array(origins)
     along = (v * d[:, None]).sum(-1, keepdims=True)
@@ -251,11 +253,17 @@ def test03_rays_of_a_batch_find_their_camera(rgb, near):
 def test04_same_center(rgb):
     a, b = rgb.load_dict(camera(rgb, [1, 2, 3], near_clip=1.0)), rgb.load_dict(camera(rgb, [1, 2, 3.001]))
     turned = rgb.load_dict(camera(rgb, [1, 2, 3], target=(5, 0, 1), fov=70))
-    assert observer.same_center([a], observer.sensor_center(turned)) and not observer.same_center([a], observer.sensor_center(b))
-    assert not observer.same_center([a, b], observer.sensor_center(a)) and not observer.same_center([], observer.sensor_center(a))
+    assert observer.have_same_center([a], observer.sensor_center(turned)) and not observer.have_same_center(
+        [a], observer.sensor_center(b)
+    )
+    assert not observer.have_same_center([a, b], observer.sensor_center(a)) and not observer.have_same_center(
+        [], observer.sensor_center(a)
+    )
     ortho = rgb.load_dict({"type": "orthographic"})
-    assert not observer.same_center([ortho], observer.sensor_center(ortho))
-    assert observer.same_center([batch(rgb, camera(rgb, [1, 2, 3]), camera(rgb, [1, 2, 3]))], observer.sensor_center(a))
+    assert not observer.have_same_center([ortho], observer.sensor_center(ortho))
+    assert observer.have_same_center(
+        [batch(rgb, camera(rgb, [1, 2, 3]), camera(rgb, [1, 2, 3]))], observer.sensor_center(a)
+    )
 
 
 def test05_no_sensor(rgb):
@@ -264,7 +272,7 @@ def test05_no_sensor(rgb):
         observer.center_of_ray([], ray)
 
 
-def test06_center_is_attached_to_the_placement(rgb):
+def test06_center_is_attached_to_to_world(rgb):
     sensor = rgb.load_dict(camera(rgb, [1, 2, 3]))
     params = rgb.traverse(sensor)
     x = rgb.Float(0)
@@ -277,8 +285,8 @@ def test06_center_is_attached_to_the_placement(rgb):
 
 
 @pytest.mark.parametrize("near", [0.5, 1.5])
-def test_cameras_on_one_line_are_told_apart_by_where_their_rays_start(rgb, near):
-    """Both look along the line that both stand on: a ray on it starts on the near plane of its own."""
+def test_collinear_cameras_are_distinguished_by_near_planes(rgb, near):
+    """Both look along the line through both: a ray on it starts on the near plane of its own camera."""
     sensor = batch(rgb, camera(rgb, [0, 0, 3], near_clip=near), camera(rgb, [0, 0, 1], [0, 0, -1], near_clip=near))
     for z in (3, 1):
         ray = rgb.Ray3f(rgb.Point3f(0, 0, z - near), rgb.Vector3f(0, 0, -1))
@@ -286,20 +294,20 @@ def test_cameras_on_one_line_are_told_apart_by_where_their_rays_start(rgb, near)
 
 
 @pytest.mark.parametrize("count", [1, 2, 5])
-def test_each_lane_has_what_belongs_to_the_nearest(rgb, count):
+def test_lanes_select_the_nearest_observer(rgb, count):
     rng = np.random.default_rng(count)
     centers, p = rng.normal(size=(count, 3)), rng.normal(size=(60, 3))
-    known = [Known(rgb.Point3f(*map(float, c)), rgb.Float(k)) for k, c in enumerate(centers)]
+    known = [CacheEntry(rgb.Point3f(*map(float, c)), rgb.Float(k)) for k, c in enumerate(centers)]
     lanes = rgb.Point3f(np.ascontiguousarray(p.T, np.float32))
     found = observer.select_nearest(known, lanes, lambda value: value).numpy()
     assert np.array_equal(np.broadcast_to(found, 60), np.linalg.norm(p[:, None] - centers, axis=2).argmin(axis=1))
 
 
-# ---- What else is known of observers: made once for each, and shown to every lane that belongs to them ----
+# ---- Views of observers: created once per observer, and selected lane by lane ----
 
 
 class Counting:
-    """A view that counts for whom it was made: the x of the observer, plus that of the direction."""
+    """A view that counts its creations; its value is the x of the observer plus that of the direction."""
 
     is_occluded = True
 
@@ -319,7 +327,7 @@ class Of:
         return self.x + r_o.x
 
 
-def test_a_view_is_made_once_an_observer(rgb):
+def test_view_is_created_once_per_observer(rgb):
     view, cache = Counting(), ObserverCache()
     eyes = [rgb.Point3f(1, 0, 0), rgb.Point3f(5, 0, 0)]
     p_o, r_o = rgb.Point3f([1, 5, 5], 0, 0), rgb.Vector3f([0.1, 0.2, 0.3], 0, 0)
@@ -328,7 +336,7 @@ def test_a_view_is_made_once_an_observer(rgb):
         assert view.made == 2
 
 
-def test_a_frozen_function_is_refused(rgb):
+def test_views_are_refused_in_frozen_functions(rgb):
     cache = ObserverCache()
 
     @dr.freeze
@@ -337,10 +345,10 @@ def test_a_frozen_function_is_refused(rgb):
 
     with pytest.raises(RuntimeError) as refused:
         frozen(rgb.Point3f(rgb.Float([1]), 0, 0))
-    assert isinstance(refused.value.__cause__, NergError) and 'out of "aovs"' in str(refused.value.__cause__)
+    assert isinstance(refused.value.__cause__, NergError) and 'from "aovs"' in str(refused.value.__cause__)
 
 
-def test_support_is_that_of_the_place_in_the_scene(rgb):
+def test_support_uses_scene_positions(rgb):
     origins = np.random.default_rng(0).normal(size=(100, 3))
     support = RaySupport.from_origins(origins, 2.0)
     m = np.array([[0, -2.0, 0, 5], [2, 0, 0, 6], [0, 0, 2, 7], [0, 0, 0, 1]])
@@ -351,19 +359,19 @@ def test_support_is_that_of_the_place_in_the_scene(rgb):
     assert found[0] == pytest.approx(alone, rel=1e-5) and alone > 1
 
 
-# ---- The shadow factor: its sign, its ramp, and fall-off zero ----
+# ---- Visibility: sign, ramp, and zero fall-off ----
 
 
 def seen(d_expected, d_met, falloff, tolerance=0.0):
     return visibility(ns.Float(d_expected), ns.Float(d_met), ns.Float(falloff), ns.Float(tolerance)).numpy().tolist()
 
 
-def test01_the_sign_is_corrected():
-    # The observer meets something at 2: a point at 5 is hidden, one at 2 or before is seen.
+def test01_visibility_sign():
+    # The observer's ray meets a surface at 2: a point at 5 is hidden, points at 2 or nearer are visible.
     assert seen([5, 2, 1], 2, 1) == [0, 1, 1]
 
 
-def test02_the_ramp():
+def test02_visibility_ramp():
     d = np.linspace(1.5, 3.5, 21)
     expected = 1 - np.clip((d - 2 - 0.25) / 0.5, 0, 1)
     assert np.allclose(seen(d, 2, 0.5, 0.25), expected, atol=1e-6)
@@ -380,7 +388,7 @@ def test04_extreme_falloffs(falloff):
     assert values[2] == (0 if falloff <= 1e-6 else pytest.approx(1 - 1 / falloff))
 
 
-def test05_nothing_met_is_visible():
+def test05_no_surface_is_visible():
     assert seen([1, 1e30], np.inf, 0) == [1, 1] and seen([1, 1e30], np.inf, 0.5) == [1, 1]
 
 
@@ -391,12 +399,12 @@ def test06_gradients(falloff):
     dr.enable_grad(f, d)
     y = visibility(d, ns.Float(2), f, ns.Float(0.1))
     dr.backward(dr.sum(y), dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
-    # d/dd_f of 1 - 0.15 / d_f = 0.15 / d_f²; only the point on the ramp counts
+    # d/dd_f of 1 - 0.15 / d_f = 0.15 / d_f²; only the point on the ramp has a derivative
     assert np.allclose(dr.grad(f).numpy(), 0 if falloff == 0 else 0.15 / 0.25, rtol=1e-5)
     assert np.allclose(dr.grad(d).numpy(), [0, 0, 0 if falloff == 0 else -2, 0], rtol=1e-5)
 
 
-def test07_gradients_are_finite_on_the_very_edge():
+def test07_gradients_are_finite_at_the_edge():
     d = ns.Float([2.25, 2.0, 3.0])
     dr.enable_grad(d)
     y = visibility(d, ns.Float(2), ns.Float(0), ns.Float(0.25))
@@ -405,17 +413,17 @@ def test07_gradients_are_finite_on_the_very_edge():
     assert not dr.grad(d).numpy().any()
 
 
-# ---- Arrays are told apart by identity, also where an object is assigned to and the old variable is gone ----
+# ---- Fingerprints compare arrays by identity, also after an object is assigned to ----
 
 
-def test01_equal_as_long_as_nothing_is_assigned(rgb):
+def test01_fingerprints_are_equal_until_assignment(rgb):
     a, b = dr.opaque(rgb.Float, 1, 10), rgb.TensorXf(np.zeros((2, 3), np.float32))
     first = Fingerprint([a, b])
     assert Fingerprint([a, b]) == first and Fingerprint([b, a]) != first and Fingerprint([a]) != first
 
 
-def test02_no_later_variable_takes_the_place_of_one(rgb):
-    """Without copies Dr.Jit would give the number of a variable that is gone to the next one."""
+def test02_fingerprints_hold_their_variables(rgb):
+    """Without copies Dr.Jit would reuse the index of a freed variable for the next one."""
     volume = rgb.load_dict({"type": "gridvolume", "grid": rgb.VolumeGrid(np.ones((4, 4, 4), np.float32))})
     params = rgb.traverse(volume)
     first = Fingerprint([params["data"]])
@@ -425,50 +433,50 @@ def test02_no_later_variable_takes_the_place_of_one(rgb):
         assert Fingerprint([params["data"]]) != first
 
 
-def test03_shapes_that_move(rgb):
+def test03_fingerprint_of_moved_shapes(rgb):
     scene = rgb.load_dict({"type": "scene", "s": {"type": "sphere"}})
-    first, params = of_shapes(SceneGeometry(None, scene)), rgb.traverse(scene)
+    first, params = fingerprint_shapes(SceneGeometry(None, scene)), rgb.traverse(scene)
     key = next(k for k in params.keys() if k.endswith("to_world"))
     for k in range(4):
         params[key] = rgb.Transform4f().translate([1 + k, 0, 0])
         params.update()
-        assert of_shapes(SceneGeometry(None, scene)) != first
-    assert of_shapes(SceneGeometry(None)) == []
+        assert fingerprint_shapes(SceneGeometry(None, scene)) != first
+    assert fingerprint_shapes(SceneGeometry(None)) == []
 
 
-# ---- What is minded while a function is recorded: that it is, and that garbage waits until it is over ----
+# ---- Recording of frozen functions: detection, and paused garbage collection ----
 
 
-def test01_it_is_known_while_a_function_is_recorded(rgb):
+def test01_recording_is_detected(rgb):
     seen = []
-    # A list that it refers to would be an input, whose length differs from call to call.
+    # A list that the function refers to would be an input with a varying length.
     note = SimpleNamespace(of=seen.append)
 
     @dr.freeze
     def twice(x):
-        note.of(recording())
+        note.of(is_recording())
         return 2 * x
 
-    assert not recording()
+    assert not is_recording()
     for value in (1, 2, 3, 4):
         assert twice(dr.opaque(rgb.Float, value, 16))[0] == 2 * value
     # Later calls replay.
-    assert seen == [True] and not recording()
+    assert seen == [True] and not is_recording()
 
 
-def test02_garbage_is_collected_as_usual_otherwise():
+def test02_gc_runs_outside_of_recordings():
     assert gc.isenabled()
-    with no_collection():
+    with gc_paused():
         assert gc.isenabled()
     assert gc.isenabled()
 
 
-def test03_garbage_waits_while_a_function_is_recorded(rgb):
+def test03_gc_is_paused_while_recording(rgb):
     seen = []
 
     @dr.freeze
     def add(x):
-        with no_collection():
+        with gc_paused():
             seen.append(gc.isenabled())
         seen.append(gc.isenabled())
         return x + 1
@@ -477,12 +485,12 @@ def test03_garbage_waits_while_a_function_is_recorded(rgb):
     assert seen == [False, True] and gc.isenabled()
 
 
-def test04_who_had_switched_it_off_finds_it_off(rgb):
+def test04_disabled_gc_stays_disabled(rgb):
     seen = []
 
     @dr.freeze
     def add(x):
-        with no_collection():
+        with gc_paused():
             pass
         seen.append(gc.isenabled())
         return x + 1

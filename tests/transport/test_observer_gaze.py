@@ -20,15 +20,21 @@ from nerg_mi.train.geometry import load_volume_geometry
 from nerg_mi.transport.geometry import SceneGeometry, default_march_settings
 from nerg_mi.transport.march_primal import MarchSettings
 from nerg_mi.transport.observer import ObserverCache, ObserverSettings
-from nerg_mi.transport.observer_gaze import FEWEST, FIRST, USUAL, GazeFieldInstance, integrate, interpolate_nearest_depth
+from nerg_mi.transport.observer_gaze import (
+    FIRST_DIRECTIONS,
+    MIN_DIRECTIONS,
+    USUAL_TOLERANCE,
+    GazeFieldInstance,
+    integrate_sphere,
+    interpolate_nearest_depth,
+)
 from nerg_mi.transport.occlusion import trace_from_observer
 from tests.fields.gaze.test_log_density import BOX, SMALL
 from tests.plugins.scenes import plugin
 
 # ---- Gaze ----
 #
-# A placed gaze field, which only what it says of observers can be evaluated of; its integral over an observer's
-# sphere.
+# A gaze field in the scene, which is evaluated for observers; its integral over an observer's sphere.
 
 SETTINGS = ObserverSettings(march=MarchSettings(0.1))
 
@@ -40,7 +46,7 @@ def integral_at(mi, gaze, place, p, settings=SETTINGS, count=1 << 12, **more):
 
 @pytest.fixture(scope="module")
 def speckled(tmp_path_factory):
-    """A room whose walls are known in places only, as hit points know them."""
+    """A room whose walls are only partly known, like those of hit points."""
     mi.set_variant("llvm_ad_rgb")
     rng = np.random.default_rng(3)
     density = 1e4 * (rng.random((24, 32, 32)) < 0.003)
@@ -51,11 +57,11 @@ def speckled(tmp_path_factory):
 
 
 @pytest.mark.parametrize("escaped", ["constant", "nearest"])
-def test_does_not_depend_on_the_number_of_directions(speckled, escaped):
+def test_integral_converges(speckled, escaped):
     config, ns = replace(SMALL, escaped=escaped), namespace("llvm_ad_rgb")
     field = LogGazeField.random(config, BOX, ns, 1)
     rng = np.random.default_rng(1)
-    # Steep, so that it matters where what escapes is taken to end.
+    # Steep, so that the end of escaping rays matters.
     field.set_parameters({"grid.table": ns.Float(10 * rng.normal(size=len(field.grid.table)).astype(np.float32))})
     place, settings = SceneGeometry(speckled), ObserverSettings(march=default_march_settings(speckled))
     integral = lambda count, p: integral_at(mi, GazeFieldInstance(field), place, p, settings, count)
@@ -64,8 +70,8 @@ def test_does_not_depend_on_the_number_of_directions(speckled, escaped):
 
 
 @pytest.mark.parametrize("variant", ["emit", "capture", "emit_capture"])
-def test_is_the_sum_over_what_is_seen_all_around(rgb, variant):
-    """In a room of shapes, whose walls are where a formula says."""
+def test_integral_over_traced_surfaces(rgb, variant):
+    """In a room of shapes with walls in closed form."""
     ns, rng = namespace("llvm_ad_rgb"), np.random.default_rng(1)
     field = LogGazeField.random(
         replace(SMALL, variant=variant, mix=0.0), BOX, ns, 1, rng.normal(size=(SMALL.prior, 2 * SMALL.prior))
@@ -81,7 +87,7 @@ def test_is_the_sum_over_what_is_seen_all_around(rgb, variant):
     found = integral_at(rgb, GazeFieldInstance(field), SceneGeometry(None, room), o, SETTINGS, 1 << 16)
     d = fibonacci_directions(20_000)
     walls = np.where(d > 0, [1.9, 1.9, 2.9], [-1.9, -1.9, 0.1])
-    # Parallel to a wall, a direction never meets it.
+    # A direction parallel to a wall never meets it.
     distance = np.divide(walls - o, d, out=np.full(d.shape, np.inf), where=d != 0).min(axis=1)
     array = lambda v: ns.Array3f(np.ascontiguousarray(v.T, np.float32))
     emit, capture = field.unnormalized(array(o + d * distance[:, None]), array(np.broadcast_to(o, d.shape)), array(d))
@@ -100,16 +106,16 @@ def normalized():
     return field
 
 
-def test_a_placed_field_has_no_densities(rgb):
-    """Neither the field's own are offered, nor those of observers whom nobody named."""
+def test_unnormalised_instance_and_missing_observers_are_refused(rgb):
+    """Neither the densities of the field itself nor those of unknown observers are available."""
     gaze = GazeFieldInstance(normalized())
     assert not any(hasattr(gaze, name) for name in ("evaluate", "spread", "along"))
-    with pytest.raises(ValueError, match="needs to know the observers"):
+    with pytest.raises(ValueError, match="needs at least one observer"):
         gaze.for_observers([], room(rgb), SETTINGS)
 
 
-def test_what_is_observed_stays_as_it_was(rgb):
-    """Other observers, who are asked for with the same cache, change nothing of it."""
+def test_observed_gaze_is_immutable(rgb):
+    """Requests for other observers with the same cache do not change it."""
     gaze, place, cache = GazeFieldInstance(normalized()), room(rgb), ObserverCache()
     eyes = [rgb.Point3f(0.1, 0.2, 0.3), rgb.Point3f(-0.4, 0.1, 0)]
     point, d = rgb.Point3f(0.2, 0.9, 0.4), rgb.Vector3f(0, 1, 0)
@@ -118,15 +124,15 @@ def test_what_is_observed_stays_as_it_was(rgb):
     second = gaze.for_observers(eyes[1:], place, replace(SETTINGS, directions=1 << 10), cache)
     assert first.evaluate(point, eyes[0], d, True)[0].numpy() == before
     assert first.integrals(eyes[0])[0].numpy() != second.integrals(eyes[1])[0].numpy()
-    # Of both together each lane has that of its own observer.
+    # For both together, each lane uses its own observer.
     both = gaze.for_observers(eyes, place, replace(SETTINGS, directions=1 << 10), cache)
     lanes = rgb.Point3f([0.1, -0.4], [0.2, 0.1], [0.3, 0.0])
     each = np.concatenate([o.integrals(eye)[0].numpy() for o, eye in zip((first, second), eyes)])
     assert np.array_equal(both.integrals(lanes)[0].numpy(), each)
 
 
-def test_surroundings_are_traced_once_an_observer(rgb, monkeypatch):
-    """Whatever becomes of the weights; anew for another observer, another place or other settings."""
+def test_sphere_samples_are_traced_once_per_observer(rgb, monkeypatch):
+    """For any weights; traced again for another observer, geometry or settings."""
     traced, trace = [], SceneGeometry.trace
     monkeypatch.setattr(SceneGeometry, "trace", lambda *a, **k: (traced.append(a), trace(*a, **k))[1])
     field = normalized()
@@ -142,7 +148,7 @@ def test_surroundings_are_traced_once_an_observer(rgb, monkeypatch):
     assert ask() == first and counts == [1, 1]
     field.set_parameters({"prior": field.prior + 1})
     assert ask() == pytest.approx(np.e * first, rel=1e-4) and counts[-1] == 1
-    # What decides of a surface counts, what decides of a point's visibility does not.
+    # Settings of surfaces matter; settings of visibility do not.
     ask(visibility="map", tolerance=0.1, map_height=8)
     assert counts[-1] == 1
     ask(surface_opacity=0.7)
@@ -152,7 +158,7 @@ def test_surroundings_are_traced_once_an_observer(rgb, monkeypatch):
     assert counts[-4:] == [2, 3, 4, 5]
 
 
-def test_derivatives_pass_the_integral_and_are_not_kept(rgb):
+def test_attached_integrals_are_not_cached(rgb):
     field, eye = normalized(), rgb.Point3f(0.1, 0.2, 0.3)
     gaze, place, cache = GazeFieldInstance(field), room(rgb), ObserverCache()
     prior = field.prior
@@ -166,7 +172,7 @@ def test_derivatives_pass_the_integral_and_are_not_kept(rgb):
     assert cache.peek((gaze, "integral", field)) == []
 
 
-def test_gaze_turns_and_does_not_scale(rgb):
+def test_gaze_rotates_and_is_scale_invariant(rgb):
     ns, grid = namespace("llvm_ad_rgb"), HashGridConfig(levels=2, log2_rows=10, base=4, finest=16)
     g = GazeField.random(GazeConfig(grid, width=16), Box((0, 0, 0), (1, 1, 2)), ns)
     table = np.random.default_rng(0).normal(size=len(g.grid.table)).astype(np.float32)
@@ -176,7 +182,9 @@ def test_gaze_turns_and_does_not_scale(rgb):
 
     def evaluate(gaze, p_od, p_o, r):
         p_od, p_o, r = (kind(v.tolist()) for kind, v in zip((rgb.Point3f, rgb.Point3f, rgb.Vector3f), (p_od, p_o, r)))
-        return [v.numpy()[0] for v in gaze.for_observers([p_o], SceneGeometry(None), SETTINGS).evaluate(p_od, p_o, r, True)]
+        return [
+            v.numpy()[0] for v in gaze.for_observers([p_o], SceneGeometry(None), SETTINGS).evaluate(p_od, p_o, r, True)
+        ]
 
     plain = evaluate(GazeFieldInstance(g), p_od, p_o, r)
     m = np.array([[0, -50.0, 0, 3], [50, 0, 0, -7], [0, 0, 50, 11], [0, 0, 0, 1]])
@@ -185,10 +193,10 @@ def test_gaze_turns_and_does_not_scale(rgb):
 
 
 @pytest.mark.parametrize("trained", [False, True])
-def test_derivatives_of_the_observer_pass_the_integral(rgb, trained):
-    """Against central differences of sums over walls where a formula says, in many directions."""
+def test_observer_derivatives_include_the_integral(rgb, trained):
+    """Against central differences of sums over closed-form walls, in many directions."""
     field = normalized()
-    # Steep, so that it matters where walls are.
+    # Steep, so that the position of walls matters.
     field.set_parameters({k: 16 * v for k, v in field.parameters().items() if k in ("emit_net.2", "capture_net.2")})
     gaze, place, o = GazeFieldInstance(field), room(rgb), np.array([0.3, -0.2, 0.4])
     array = lambda v: namespace("llvm_ad_rgb").Array3f(np.ascontiguousarray(v.T, np.float32))
@@ -215,10 +223,10 @@ def test_derivatives_of_the_observer_pass_the_integral(rgb, trained):
     assert not trained or np.abs(np.array(dr.grad(field.grid.table))).max() > 0
 
 
-def test_a_cache_tells_tolerances_of_the_integral_apart(rgb):
-    """Of integrals, and of the densities that a map of them holds."""
+def test_cache_distinguishes_integral_tolerances(rgb):
+    """Of integrals, and of the densities in a map."""
     field, eye = normalized(), rgb.Point3f(0.1, 0.2, 0.3)
-    # Steep, so that sums over few directions are off.
+    # Steep, so that sums over few directions are inaccurate.
     field.set_parameters({k: 16 * v for k, v in field.parameters().items() if k in ("emit_net.2", "capture_net.2")})
     gaze, place, cache = GazeFieldInstance(field), room(rgb), ObserverCache()
     point, ray = rgb.Point3f(0.2, 1, 0.4), rgb.Ray3f(rgb.Point3f(0.2, 0, 0.4), rgb.Vector3f(0, 1, 0))
@@ -240,13 +248,13 @@ def test_a_cache_tells_tolerances_of_the_integral_apart(rgb):
 
 # ---- Integral ----
 #
-# Integrals over the sphere against closed forms: in as few directions as do, and never worse than is said.
+# Integrals over the sphere against closed forms: with as few directions as possible, within the estimated error.
 
 MOST = 1 << 17
 
 
 def cap(direction, cos: float, background: float):
-    """Values of 1 within a cone, and of ``background`` elsewhere, at all directions; what they integrate to."""
+    """Values of 1 within a cone and of ``background`` elsewhere, in all directions, and their integral."""
     exact = 2 * np.pi * (1 - cos) + background * 2 * np.pi * (1 + cos)
     return lambda count: np.where(fibonacci_directions(count) @ direction > cos, 1.0, background), exact
 
@@ -264,72 +272,78 @@ def turned():
 
 
 @pytest.mark.parametrize("tolerance", [1e-2, 2e-3])
-def test_jumps_are_integrated_to_the_tolerance(turned, tolerance):
+def test_discontinuous_integrands_meet_the_tolerance(turned, tolerance):
     off, share, counts = [], [], []
     for k, direction in enumerate(turned):
         values, exact = cap(direction, np.cos(0.2 + 0.1 * k), 0.1)
-        found = integrate(values, MOST, tolerance)
+        found = integrate_sphere(values, MOST, tolerance)
         off.append(abs(found.value / exact - 1))
         share.append(off[-1] / found.error)
         counts.append(found.directions)
         assert found.error <= tolerance or found.directions == MOST
-    # One sum is no proof: the error of four in five is below what is told, and that of all below twice the tolerance.
+    # Several sums: the error of four in five is below the estimate, and that of all below twice the tolerance.
     assert max(off) <= 2 * tolerance and np.mean(off) < tolerance / 2 and np.mean(np.array(share) < 1) >= 0.75
     assert np.median(counts) < MOST / 4
     if tolerance == 1e-2:
-        assert max(counts) <= FIRST
+        assert max(counts) <= FIRST_DIRECTIONS
 
 
-def test_narrow_lobes_take_more_directions(turned):
+def test_narrow_lobes_need_more_directions(turned):
     counts = []
     for kappa in (1, 100, 1e4):
         values, exact = lobe(turned[0], kappa)
-        found = integrate(values, 1 << 18, 5e-3)
+        found = integrate_sphere(values, 1 << 18, 5e-3)
         assert found.value == pytest.approx(exact, rel=1e-3)
         counts.append(found.directions)
-    assert FIRST == counts[0] < counts[1] < counts[2]
+    assert FIRST_DIRECTIONS == counts[0] < counts[1] < counts[2]
 
 
 @pytest.mark.parametrize(
     ("tolerance", "first"),
-    [(1e-4, FIRST), (USUAL, FIRST), (1.9 * USUAL, FIRST // 2), (4 * USUAL, FIRST // 4), (1.0, FEWEST)],
+    [
+        (1e-4, FIRST_DIRECTIONS),
+        (USUAL_TOLERANCE, FIRST_DIRECTIONS),
+        (1.9 * USUAL_TOLERANCE, FIRST_DIRECTIONS // 2),
+        (4 * USUAL_TOLERANCE, FIRST_DIRECTIONS // 4),
+        (1.0, MIN_DIRECTIONS),
+    ],
 )
-def test_a_wider_tolerance_begins_with_fewer(tolerance, first):
+def test_larger_tolerance_starts_with_fewer_directions(tolerance, first):
     asked = []
 
     def even(count):
         asked.append(count)
         return np.ones(count)
 
-    assert integrate(even, MOST, tolerance).value == pytest.approx(4 * np.pi) and asked == [first]
-    assert integrate(even, 1000, tolerance).directions == 1000
+    assert integrate_sphere(even, MOST, tolerance).value == pytest.approx(4 * np.pi) and asked == [first]
+    assert integrate_sphere(even, 1000, tolerance).directions == 1000
 
 
-def test_a_tolerance_of_zero_takes_all(turned):
+def test_zero_tolerance_uses_all_directions(turned):
     values, exact = lobe(turned[0], 10)
     asked = []
-    found = integrate(lambda count: (asked.append(count), values(count))[1], 1 << 15, 0.0)
+    found = integrate_sphere(lambda count: (asked.append(count), values(count))[1], 1 << 15, 0.0)
     assert asked == [1 << 15] == [found.directions]
     assert found.value == pytest.approx(exact, rel=1e-6)
 
 
-@pytest.mark.parametrize("most", [1, 5, 64, FIRST])
-def test_no_more_than_are_allowed(most):
-    found = integrate(lambda count: np.arange(count) % 2 + 1.0, most, 1e-9)
+@pytest.mark.parametrize("most", [1, 5, 64, FIRST_DIRECTIONS])
+def test_number_of_directions_is_limited(most):
+    found = integrate_sphere(lambda count: np.arange(count) % 2 + 1.0, most, 1e-9)
     assert found.directions == most and found.value == pytest.approx(4 * np.pi * np.mean(np.arange(most) % 2 + 1))
 
 
-def test_nothing_at_all_is_zero():
-    found = integrate(np.zeros, MOST, 1e-3)
-    assert found.value == 0 and found.error == 0 and found.directions == FIRST
+def test_zero_integrand():
+    found = integrate_sphere(np.zeros, MOST, 1e-3)
+    assert found.value == 0 and found.error == 0 and found.directions == FIRST_DIRECTIONS
 
 
-# ---- What an observer meets all around, and what is made of the directions in which that is nothing ----
+# ---- Sphere samples, and the depths of escaping rays ----
 
 
 @pytest.mark.parametrize("count", [1, 5, 8, 40])
-def test_depths_of_what_escapes_are_those_of_its_neighbours(count):
-    """By hand: the weighted mean of the logarithm over the eight nearest, or all where there are fewer."""
+def test_escaped_rays_take_depths_of_neighbours(count):
+    """Reference: weighted mean of the logarithm over the eight nearest directions, or all if there are fewer."""
     rng = np.random.default_rng(count)
     unit = lambda n: (lambda v: v / np.linalg.norm(v, axis=1, keepdims=True))(rng.normal(size=(n, 3)))
     known, wanted, depth = unit(count), unit(30), rng.uniform(0.2, 9.0, count)
@@ -340,5 +354,5 @@ def test_depths_of_what_escapes_are_those_of_its_neighbours(count):
         weight = 1 / (apart[near] ** 2 + 1e-3)
         expected.append(np.exp(np.sum(weight * np.log(depth[near])) / weight.sum()))
     np.testing.assert_allclose(interpolate_nearest_depth(known, depth, wanted), expected, rtol=1e-5)
-    # A depth of zero has a logarithm too.
+    # A depth of zero must have a finite logarithm.
     assert interpolate_nearest_depth(known, np.zeros(count), wanted) == pytest.approx(1e-6)

@@ -9,7 +9,7 @@ import pytest
 from nerg_mi.transport.geometry import SceneGeometry
 from nerg_mi.transport.march_primal import MarchSettings
 from nerg_mi.transport.observer import ObserverCache, ObserverSettings
-from nerg_mi.transport.occlusion import ObserverMap, trace_from_observer
+from nerg_mi.transport.occlusion import ObserverDepthMap, trace_from_observer
 from nerg_mi.transport.volume_medium import VolumeMedium
 
 # ---- Depth map ----
@@ -22,9 +22,9 @@ SETTINGS = ObserverSettings(march=MarchSettings(0.1), depth="expected", map_heig
 
 @pytest.fixture
 def around(rgb):
-    """The map of an observer in the middle of a ball of radius 2."""
+    """The map of an observer at the centre of a sphere of radius 2."""
     ball = rgb.load_dict({"type": "scene", "ball": {"type": "sphere", "radius": 2.0}})
-    return ObserverMap(SceneGeometry(None, ball), rgb.Point3f(0.0), SETTINGS)
+    return ObserverDepthMap(SceneGeometry(None, ball), rgb.Point3f(0.0), SETTINGS)
 
 
 def unit(phi, theta):
@@ -33,7 +33,7 @@ def unit(phi, theta):
 
 
 def directions():
-    """Azimuths all around, many of them beside 0 and pi, from pole to pole."""
+    """Azimuths all around, many of them near 0 and pi, from pole to pole."""
     rng, width = np.random.default_rng(0), np.pi / HEIGHT
     seams = np.concatenate([c + width * np.linspace(-1.3, 1.3, 27) for c in (0, np.pi, -np.pi, 2 * np.pi)])
     phi = np.concatenate([seams, rng.uniform(-np.pi, np.pi, 500)])
@@ -43,7 +43,7 @@ def directions():
 
 
 def interpolated(table, phi, theta):
-    """Bilinear in NumPy: rows from pole to pole with centres at half spacings, columns around and around."""
+    """Bilinear in NumPy: rows from pole to pole with centres at half spacings, periodic columns."""
     width = np.pi / HEIGHT
     x, y = (phi / width - 0.5) % (2 * HEIGHT), np.clip(theta / width - 0.5, 0, HEIGHT - 1)
     i, j = np.floor(x).astype(int), np.minimum(np.floor(y).astype(int), HEIGHT - 2)
@@ -53,7 +53,7 @@ def interpolated(table, phi, theta):
     return (1 - fy) * rows[0] + fy * rows[1]
 
 
-def test_depths_are_those_of_the_directions(rgb, around):
+def test_map_depths_match_directions(rgb, around):
     assert np.allclose(around.depth.numpy(), 2, rtol=1e-5) and around.spacing == pytest.approx(np.pi / HEIGHT)
     around.center = rgb.Point3f(0.0)
     width = np.pi / HEIGHT
@@ -65,8 +65,10 @@ def test_visibility_is_interpolated_between_entries_and_across_the_seam(rgb, aro
     table = np.random.default_rng(1).uniform(0, 4, (HEIGHT, 2 * HEIGHT)).astype(np.float32)
     around.depth = rgb.Float(table.ravel())
     phi, theta = directions()
-    nearest, seen = around.look_up(rgb.Vector3f(unit(phi, theta)), dr.full(rgb.Float, 2.0, len(phi)), 0.0, 0.5, True)
-    # A point is hidden by what is nearer than it by more than the tolerance.
+    nearest, seen = around.eval_visibility(
+        rgb.Vector3f(unit(phi, theta)), dr.full(rgb.Float, 2.0, len(phi)), 0.0, 0.5, True
+    )
+    # A point is hidden by surfaces nearer than the tolerance.
     assert np.allclose(seen.numpy(), interpolated((table >= 1.5).astype(float), phi, theta), atol=2e-4)
     width = np.pi / HEIGHT
     column, row = (
@@ -83,19 +85,19 @@ def test_visibility_falls_off_softly(rgb, around):
     around.depth = dr.full(rgb.Float, 2.0, 2 * HEIGHT**2)
     d = rgb.Vector3f(unit(np.full(5, 1.0), 1.0))
     for falloff, want in ((0.5, [1, 1, 0.8, 0.4, 0]), (0.0, [1, 1, 0, 0, 0])):
-        seen = around.look_up(d, rgb.Float([1.9, 2.1, 2.2, 2.4, 2.9]), falloff, 0.1, True)[1].numpy()
+        seen = around.eval_visibility(d, rgb.Float([1.9, 2.1, 2.2, 2.4, 2.9]), falloff, 0.1, True)[1].numpy()
         assert np.allclose(seen, want, atol=1e-5)
 
 
-def test_gaze_is_that_of_the_entries_that_see_the_point(rgb, around):
+def test_gaze_lookup_uses_visible_entries(rgb, around):
     rng = np.random.default_rng(2)
     gaze = rng.uniform(0, 1, (HEIGHT, 2 * HEIGHT)).astype(np.float32)
-    # At 2 is the surface that is asked for; at 1 stands something in front of it, and at 3 lies what is behind an edge.
+    # The point's own surface is at 2; at 1 an occluder, at 3 the surface behind an edge.
     depth = rng.choice(np.float32([1, 2, 2, 3]), (HEIGHT, 2 * HEIGHT))
     around.depth, table = rgb.Float(depth.ravel()), rgb.Float(gaze.ravel())
     phi, theta = directions()
     d, distance = rgb.Vector3f(unit(phi, theta)), dr.full(rgb.Float, 2.0, len(phi))
-    found = around.gaze_along(table, d, distance, 0.0, 0.1, True).numpy()
+    found = around.eval_gaze(table, d, distance, 0.0, 0.1, True).numpy()
     known = (depth == 2).astype(float)
     share = interpolated(known, phi, theta)
     sure = share > 0.02
@@ -103,34 +105,36 @@ def test_gaze_is_that_of_the_entries_that_see_the_point(rgb, around):
         found[sure], (interpolated(known * gaze, phi, theta) / np.where(sure, share, 1))[sure], rtol=2e-2, atol=2e-3
     )
     around.depth = dr.full(rgb.Float, 3.0, 2 * HEIGHT**2)
-    assert (around.gaze_along(table, d, distance, 0.0, 0.1, True).numpy() == -1).all()
+    assert (around.eval_gaze(table, d, distance, 0.0, 0.1, True).numpy() == -1).all()
 
 
-def test_the_gaze_of_a_map_is_that_of_its_directions(rgb):
-    """0 where no surface is met, whatever the field says there."""
+def test_gaze_table_matches_directions(rgb):
+    """0 without a surface, for any field."""
 
     class Gaze:
         def evaluate(self, p_od, p_o, r_o, active):
             return (p_od.x + 10 * r_o.z + 100 * p_o.y,)
 
     half = {"type": "disk", "to_world": rgb.ScalarTransform4f().translate([0, 0, 2]).scale(1e3)}
-    around = ObserverMap(SceneGeometry(None, rgb.load_dict({"type": "scene", "half": half})), rgb.Point3f(0, 1, 0), SETTINGS)
+    around = ObserverDepthMap(
+        SceneGeometry(None, rgb.load_dict({"type": "scene", "half": half})), rgb.Point3f(0, 1, 0), SETTINGS
+    )
     width = np.pi / HEIGHT
     theta, phi = np.meshgrid((np.arange(HEIGHT) + 0.5) * width, (np.arange(2 * HEIGHT) + 0.5) * width, indexing="ij")
     x, _, z = unit(phi.ravel(), theta.ravel()).astype(float)
     met = np.isfinite(around.depth.numpy())
     assert np.array_equal(met[z > 0.01], np.ones((z > 0.01).sum(), bool)) and not met[z < 0].any()
     want = np.where(met, x * 2 / np.where(z > 0, z, 1) + 10 * z + 100, 0)
-    assert np.allclose(around.gaze_table(Gaze()).numpy(), want, rtol=1e-3, atol=1e-3)
+    assert np.allclose(around.make_gaze_table(Gaze()).numpy(), want, rtol=1e-3, atol=1e-3)
 
 
-# ---- What an observer meets on the way to a point: where the point is looked for, and what it costs ----
+# ---- Rays from an observer to a point: their target, and their cost ----
 
 STEP = 0.01
 
 
 def slab(mi, sigma):
-    """Matter between z = 0 and z = 1."""
+    """Density between z = 0 and z = 1."""
     return SceneGeometry(VolumeMedium(mi.load_dict({"type": "constvolume", "value": float(sigma)})))
 
 
@@ -148,7 +152,7 @@ def look(
     dt_gamma=0.0,
     **more,
 ):
-    """Sight of the point ``p_d`` that a camera sees along its ray, from ``p_o``."""
+    """What an observer at ``p_o`` sees of the point ``p_d`` on a camera's ray."""
     o, p_d, p_o = (np.asarray(v, np.float64) for v in (camera, p_d, p_o))
     ray = mi.Ray3f(mi.Point3f(*map(float, o)), mi.Vector3f(*map(float, (p_d - o) / np.linalg.norm(p_d - o))))
     march = MarchSettings(STEP, dt_gamma=dt_gamma)
@@ -161,9 +165,9 @@ def look(
     "dt_gamma, tolerance, want",
     [(0.0, 0.0, 2 * STEP), (0.004, 0.0, 2 * STEP), (0.1, 0.0, 2 * 0.1 * 2.5), (0.1, 0.3, 0.3)],
 )
-def test_a_point_is_looked_for_two_steps_in_front_of_its_surface(rgb, dt_gamma, tolerance, want):
-    # Steps grow with the distance from the camera, 2.5, and so does what two of them are; a tolerance that is given
-    # stays.
+def test_target_lies_two_steps_in_front_of_the_surface(rgb, dt_gamma, tolerance, want):
+    # Steps grow with the distance from the camera, 2.5, and with them the default tolerance; an explicit tolerance does
+    # not.
     for penetration in (0.0, 0.05):
         sight = look(
             rgb,
@@ -180,24 +184,24 @@ def test_a_point_is_looked_for_two_steps_in_front_of_its_surface(rgb, dt_gamma, 
 
 
 @pytest.mark.parametrize("kind", ["depth", "map", "transmittance"])
-def test_who_meets_nothing_sees_the_point_itself(rgb, kind):
+def test_unoccluded_observer_sees_the_point(rgb, kind):
     sight = look(rgb, slab(rgb, 0), kind, (0.5, 0.5, 0.5), (0.4, 0.9, -2))
     assert sight.visibility[0] == 1 and np.isfinite(sight.depth[0])
     assert np.allclose(np.array(sight.p_od).ravel(), [0.5, 0.5, 0.5])
     assert abs(sight.depth[0] - math.dist((0.5, 0.5, 0.5), (0.4, 0.9, -2))) < 0.2
 
 
-def test_what_stands_in_between_is_met_instead(rgb):
-    # The observer looks through the slab at a point behind it; its median is ln 2 / 50 deep.
+def test_occluder_is_returned(rgb):
+    # The observer looks through the slab at a point behind it; its median is at a depth of ln 2 / 50.
     sight = look(rgb, slab(rgb, 50), "depth", (0.5, 0.5, 2.0), (0.5, 0.5, -2), camera=(0.5, 0.5, 5))
     assert sight.visibility[0] == 0 and sight.depth[0] == pytest.approx(2 + math.log(2) / 50, abs=1e-4)
     assert np.allclose(np.array(sight.p_od).ravel(), [0.5, 0.5, math.log(2) / 50], atol=1e-4)
 
 
-def test_transmittance_is_what_matter_lets_through(rgb):
+def test_visibility_by_transmittance(rgb):
     sight = look(rgb, slab(rgb, 0.7), "transmittance", (0.5, 0.5, 2.0), (0.5, 0.5, -2), camera=(0.5, 0.5, 5))
     assert sight.visibility[0] == pytest.approx(math.exp(-0.7), rel=1e-4)
-    # Only what lies before the point: half of the slab.
+    # Only the part in front of the point: half of the slab.
     sight = look(
         rgb, slab(rgb, 0.7), "transmittance", (0.5, 0.5, 0.5), (0.5, 0.5, -2), camera=(0.5, 0.5, -1), tolerance=1e-4
     )
@@ -205,13 +209,13 @@ def test_transmittance_is_what_matter_lets_through(rgb):
 
 
 @pytest.mark.parametrize("kind, evals", [("transmittance", 100), ("depth", 100)])
-def test_evaluations_are_counted_where_that_is_asked_for(rgb, kind, evals):
+def test_evaluations_are_counted_on_request(rgb, kind, evals):
     given = {"p_d": (0.5, 0.5, 2.0), "p_o": (0.5, 0.5, -2), "camera": (0.5, 0.5, 5)}
     counted = look(rgb, slab(rgb, 0.0), kind, count=True, **given)
     assert abs(counted.density_evals[0] - evals) <= 2 and look(rgb, slab(rgb, 0.0), kind, **given).density_evals is None
 
 
-def test_a_map_is_kept_for_as_long_as_it_holds(rgb):
+def test_map_is_cached_while_valid(rgb):
     place, cache = slab(rgb, 50), ObserverCache()
     see = lambda p_o=(0.5, 0.5, -2), place=place: look(rgb, place, "map", (0.5, 0.5, 0.01), p_o, cache=cache)
     kept = lambda: cache.peek("map")[0].value

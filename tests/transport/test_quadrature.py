@@ -1,4 +1,4 @@
-"""The quadrature rules: their shares against extended precision, what each is exact for, and another rule."""
+"""The quadrature rules: fractions against extended precision, exactness, and a user-defined rule."""
 
 import math
 import subprocess
@@ -18,16 +18,16 @@ from nerg_mi.fields.occupancy import OccupancyGrid
 from nerg_mi.maths.arrays import quotient
 from nerg_mi.transport.march import march
 from nerg_mi.transport.march_primal import MarchSettings
-from nerg_mi.transport.medium import ColorPainter, LocalRay, VoxelCells
+from nerg_mi.transport.medium import ColorShader, LocalRay, VoxelCells
 from nerg_mi.transport.quadrature import (
     RULES,
     MarchStep,
     Registry,
     absorbed_fraction,
-    boundaries,
-    color_share,
-    linear_crossing,
-    linear_share,
+    cells_for_rule,
+    color_sample_fraction,
+    find_linear_crossing,
+    linear_mean_depth_fraction,
     mean_depth_fraction,
     register_quadrature,
 )
@@ -35,13 +35,13 @@ from nerg_mi.transport.volume_medium import VolumeMedium
 from tests.plugins.scenes import camera, channels, constant, named, render
 from tests.reference import march_numpy as reference
 
-# ---- The step rule against integrals in extended precision, and its invariances ----
+# ---- Constant density: against integrals in extended precision, and invariances ----
 
 TAU = np.logspace(-8, 8, 1601).astype(np.float32)
 
 
 def exact_share(tau):
-    """1/τ - 1/expm1(τ) by rational arithmetic (the series of exp), so that nothing cancels."""
+    """1/τ - 1/expm1(τ) by rational arithmetic (the series of exp), without cancellation."""
     out = []
     for t in np.atleast_1d(tau).astype(float):
         if t > 50:
@@ -73,13 +73,14 @@ def test02_mean_depth_share():
     assert np.all(np.abs(got - exact_share(tau)) <= 1e-6 * exact_share(tau))
 
 
-def test03_its_ends():
+def test03_mean_depth_fraction_limits():
     got = mean_depth_fraction(ns.Float([0, 1e-38, 3e38, np.inf])).numpy()
     assert got[0] == 0.5 and got[1] == 0.5 and abs(got[2]) < 1e-34 and abs(got[3]) < 1e-34
 
 
 def slope_of(function, x, mode):
-    """Derivative, lane by lane, of a function of the array ``x``. The modes meet other infinities on their way."""
+    """Derivative, lane by lane, of a function of the array ``x``. Forward and reverse mode meet different
+    infinities."""
     v = ns.Float(x)
     dr.enable_grad(v)
     result = function(v)
@@ -91,7 +92,7 @@ def slope_of(function, x, mode):
 
 
 @pytest.mark.parametrize("mode", ["forward", "backward"])
-def test04_derivatives_are_finite_and_right(mode):
+def test04_derivatives_are_finite_and_correct(mode):
     tau = np.concatenate([[0], TAU[::8], [np.inf]]).astype(np.float32)
     got = slope_of(mean_depth_fraction, tau, mode)
     assert np.all(np.isfinite(got))
@@ -111,13 +112,15 @@ def test05_splitting_a_step_changes_nothing(share):
     whole = ns.Float(tau)
     behind = dr.exp(-a) * absorbed_fraction(b)
     assert np.allclose((absorbed_fraction(a) + behind).numpy(), absorbed_fraction(whole).numpy(), rtol=1e-6)
-    moment = absorbed_fraction(a) * share * mean_depth_fraction(a) + behind * (share + (1 - share) * mean_depth_fraction(b))
+    moment = absorbed_fraction(a) * share * mean_depth_fraction(a) + behind * (
+        share + (1 - share) * mean_depth_fraction(b)
+    )
     expected = (absorbed_fraction(whole) * mean_depth_fraction(whole)).numpy()
     assert np.allclose(moment.numpy(), expected, rtol=2e-6)
 
 
 # ------------------------------------------------------------------------
-#  Density that is linear over a step
+#  Linear density
 # ------------------------------------------------------------------------
 
 
@@ -137,7 +140,7 @@ def exact_linear_share(a, b):
 
 
 def ends():
-    """Pairs of densities times length: from 0 and 1e-8 to 1e9 each, and pairs that hardly differ."""
+    """Pairs of densities times length: from 0 and 1e-8 to 1e9 each, and nearly equal pairs."""
     grid = np.concatenate([[0], np.logspace(-8, 9, 86)])
     rng = np.random.default_rng(0)
     near = 10 ** rng.uniform(-2, 3, 4000)
@@ -148,7 +151,7 @@ def ends():
 
 def test07_the_linear_reference_agrees_with_closed_forms():
     assert np.allclose(exact_linear_share(TAU[::40], TAU[::40]), exact_share(TAU[::40]), rtol=1e-13)
-    # From 0 up a half normal distribution, down to 0 Dawson's integral.
+    # From 0 up a half-normal distribution, down to 0 Dawson's integral.
     from scipy.special import dawsn, erf
 
     c = np.array([3.0, 10, 60, 800, 1e6])
@@ -163,18 +166,22 @@ def test07_the_linear_reference_agrees_with_closed_forms():
 
 def test08_linear_share():
     a, b = ends()
-    got = linear_share(ns.Float(a), ns.Float(b)).numpy()
+    got = linear_mean_depth_fraction(ns.Float(a), ns.Float(b)).numpy()
     assert np.abs(got / exact_linear_share(a, b) - 1).max() < 1e-6
-    equal = linear_share(ns.Float(TAU), ns.Float(TAU)).numpy()
+    equal = linear_mean_depth_fraction(ns.Float(TAU), ns.Float(TAU)).numpy()
     assert np.allclose(equal, mean_depth_fraction(ns.Float(TAU)).numpy(), rtol=1e-6)
 
 
 @pytest.mark.parametrize("mode", ["forward", "backward"])
 @pytest.mark.parametrize("which", [0, 1])
-def test09_its_derivatives(which, mode):
+def test09_linear_mean_depth_derivatives(which, mode):
     a, b = ends()
     got = slope_of(
-        lambda x: linear_share(x, ns.Float(b)) if which == 0 else linear_share(ns.Float(a), x), (a, b)[which], mode
+        lambda x: (
+            linear_mean_depth_fraction(x, ns.Float(b)) if which == 0 else linear_mean_depth_fraction(ns.Float(a), x)
+        ),
+        (a, b)[which],
+        mode,
     )
     assert np.all(np.isfinite(got))
     a, b = a.astype(float), b.astype(float)
@@ -186,23 +193,25 @@ def test09_its_derivatives(which, mode):
 
 
 @pytest.mark.parametrize("mode", ["forward", "backward"])
-def test10_its_ends(mode):
+def test10_mean_depth_fraction_limits(mode):
     a = np.float32([0, 0, 1e-38, np.inf, 1, 1e30, 3e38, 0])
     b = np.float32([0, 1e-38, 0, 1, np.inf, 1e30, 0, 3e38])
-    share = linear_share(ns.Float(a), ns.Float(b)).numpy()
+    share = linear_mean_depth_fraction(ns.Float(a), ns.Float(b)).numpy()
     assert np.allclose(share, [0.5, 0.5, 0.5, 0, 0, 0, 0, 0], atol=1e-8)
-    assert np.all(np.isfinite(slope_of(lambda x: linear_share(x, ns.Float(b)), a, mode)))
-    assert np.all(np.isfinite(slope_of(lambda y: linear_share(ns.Float(a), y), b, mode)))
+    assert np.all(np.isfinite(slope_of(lambda x: linear_mean_depth_fraction(x, ns.Float(b)), a, mode)))
+    assert np.all(np.isfinite(slope_of(lambda y: linear_mean_depth_fraction(ns.Float(a), y), b, mode)))
 
 
-def test11_the_polynomial_of_thin_steps_is_as_good_as_stated():
-    # In double precision, where its coefficients are all that errs.
+def test11_polynomial_of_thin_steps_is_accurate():
+    # In double precision, where only its coefficients cause errors.
     total, r = np.meshgrid(np.linspace(2e-3, 2.999, 31), np.linspace(-1, 1, 31))
     a, b = (0.5 * total * (1 - r)).ravel(), (0.5 * total * (1 + r)).ravel()
-    assert np.abs(linear_share(ns.Float64(a), ns.Float64(b)).numpy() - exact_linear_share(a, b)).max() < 2e-8
+    assert (
+        np.abs(linear_mean_depth_fraction(ns.Float64(a), ns.Float64(b)).numpy() - exact_linear_share(a, b)).max() < 2e-8
+    )
 
 
-# ---- Objects that are chosen by name: what is taken, what is missing, and in which order ----
+# ---- Registry: registration, unknown names, and order ----
 
 
 @dataclass(frozen=True)
@@ -219,18 +228,18 @@ def things():
     return made
 
 
-def test01_names_come_in_the_order_of_registration(things):
+def test01_names_keep_registration_order(things):
     assert things.names() == ("sweet", "bitter") and [t.name for t in things] == ["sweet", "bitter"]
     assert things.find("bitter").summary == "like tea"
     assert things.format_manual() == "``sweet``: like honey. ``bitter``: like tea."
 
 
-def test02_what_is_missing_is_said_beside_what_there_is(things):
+def test02_unknown_name_lists_alternatives(things):
     with pytest.raises(NergError, match='"flavour".*"sour"'):
         things.find("sour")
 
 
-def test03_a_name_is_taken_once_and_can_be_given_back(things):
+def test03_duplicate_names_are_refused_and_can_be_removed(things):
     again = Thing("sweet", "like sugar")
     with pytest.raises(ValueError, match='"sweet".*"flavour"'):
         things.register(again)
@@ -240,7 +249,7 @@ def test03_a_name_is_taken_once_and_can_be_given_back(things):
         things.unregister("sour")
 
 
-# ---- The quadrature rules: what each is exact for, and that every march ends ----
+# ---- The quadrature rules: exactness, and termination of every march ----
 
 
 def linear_moments(first, last, n=4000):
@@ -255,7 +264,7 @@ def linear_moments(first, last, n=4000):
 def test01_linear_share(first, last):
     tau, expected = linear_moments(first, last)
     assert np.isclose(tau, (first + last) / 2, rtol=1e-6)
-    got = linear_share(ns.Float(first), ns.Float(last)).numpy()[0]
+    got = linear_mean_depth_fraction(ns.Float(first), ns.Float(last)).numpy()[0]
     assert abs(got - expected) < 1e-5
 
 
@@ -263,13 +272,13 @@ def test01_linear_share(first, last):
 def test02_linear_crossing(first, last, length):
     total = (first + last) / 2 * length
     for share in (0.01, 0.5, 0.99):
-        s = linear_crossing(ns.Float(first), ns.Float(last), length, ns.Float(share * total)).numpy()[0]
+        s = find_linear_crossing(ns.Float(first), ns.Float(last), length, ns.Float(share * total)).numpy()[0]
         assert 0 <= s <= length
         assert np.isclose(first * s + (last - first) * s * s / (2 * length), share * total, rtol=1e-4)
 
 
 def ramp(mi, n=8, gain=4.0):
-    """Density that rises linearly with z between the first and the last voxel centre."""
+    """Density that increases linearly with z between the first and the last voxel centre."""
     data = np.broadcast_to(gain * (np.arange(n) + 0.5)[:, None, None] / n, (n, 2, 2)).astype(np.float32).copy()
     return VolumeMedium(mi.load_dict({"type": "gridvolume", "grid": mi.VolumeGrid(data)}))
 
@@ -305,7 +314,7 @@ def test04_cells_are_exact_in_opacity_for_any_grid(rgb):
 
 
 @pytest.mark.parametrize("kind", RULES.names())
-def test05_homogeneous_matter_is_exact_for_every_rule(rgb, kind):
+def test05_homogeneous_matter_is_exact_for_all_rules(rgb, kind):
     medium = VolumeMedium(
         rgb.load_dict({"type": "gridvolume", "grid": rgb.VolumeGrid(np.full((4, 4, 4), 3, np.float32))})
     )
@@ -313,20 +322,19 @@ def test05_homogeneous_matter_is_exact_for_every_rule(rgb, kind):
     opacity, expected, median = reference.slab(3, 1, 2)
     assert np.isclose(r.opacity.numpy()[0], opacity, rtol=1e-5)
     assert np.isclose(r.expected_depth.numpy()[0], expected, rtol=1e-4)
-    assert np.isclose(r.half.numpy()[0], 1 + math.log(2) / 3, rtol=1e-4)
+    assert np.isclose(r.median_depth.numpy()[0], 1 + math.log(2) / 3, rtol=1e-4)
 
 
-def test06_wrong_rules(rgb):
+def test06_invalid_rules_are_refused(rgb):
     medium = VolumeMedium(rgb.load_dict({"type": "constvolume", "value": 1.0}))
     with pytest.raises(ValueError, match='axis-aligned "gridvolume"'):
-        boundaries(RULES.find("cells"), medium)
+        cells_for_rule(RULES.find("cells"), medium)
     with pytest.raises(ValueError, match='"quadrature".*"simpson"'):
         RULES.find("simpson")
 
 
 class Colored:
-    """Density and colour that depend on z only: ``density(z, x)``, ``color(z)``; ``x`` is what derivatives are asked
-    of."""
+    """Density and colour that depend on z only: ``density(z, x)``, ``color(z)``; ``x`` carries the gradients."""
 
     occupancy = cells = step = hits = None
 
@@ -356,12 +364,12 @@ def along_z(medium, n, **controls):
         t1,
         True,
         MarchSettings(1 / n, stop=0, color_cutoff=0, **controls),
-        color=ColorPainter(ns.Array3f),
+        color=ColorShader(ns.Array3f),
     )
 
 
 @pytest.mark.parametrize("n", [1, 3, 10, 64])
-def test08_the_colour_of_a_wall_is_not_that_of_the_air_before_it(n):
+def test08_wall_color_ignores_the_air_in_front(n):
     wall = lambda z, x: dr.select((z > 0.487) & (z < 0.513 + 1 / n), 1e4 * x, 1e-6)
     tint = lambda z: dr.select((z > 0.48) & (z < 0.52 + 1 / n), 0.25, -9)
     r = along_z(Colored(wall, tint, ns.Float(1)), n, quadrature="linear")
@@ -374,7 +382,7 @@ def smooth(z, x, exp=dr.exp, sin=dr.sin):
     return x * 4 * exp(-2 * z) * (1.2 + sin(9 * z))
 
 
-def test09_colour_is_of_second_order_in_smooth_matter():
+def test09_color_converges_with_second_order():
     tint = lambda z, exp=dr.exp: exp(-z) * z
     total = reference.march(
         lambda p: smooth(p[:, 2], 1, np.exp, np.sin),
@@ -390,8 +398,8 @@ def test09_colour_is_of_second_order_in_smooth_matter():
     assert errors[3] < errors[0] / 40, errors
 
 
-def test10_derivatives_are_those_of_the_colour_that_is_shown():
-    # The place where a step takes its colour moves with the density, and the colour with it.
+def test10_color_derivatives_match_the_shown_color():
+    # The sample position of the colour moves with the density, and the colour with it.
     tint = lambda z: dr.sin(7 * z)
     for density in (smooth, lambda z, x: x * dr.select(z > 0.43, 30.0, 0.5)):
         x = ns.Float(1)
@@ -404,7 +412,7 @@ def test10_derivatives_are_those_of_the_colour_that_is_shown():
 
 
 @pytest.mark.parametrize("gain", [1, 100, 1e4])
-def test11_cells_step_from_wall_to_wall_of_voxels(rgb, gain):
+def test11_cells_rule_steps_between_voxel_boundaries(rgb, gain):
     data = (gain * np.random.default_rng(0).exponential(1, (8, 8, 8))).astype(np.float32)
     medium = VolumeMedium(rgb.load_dict({"type": "gridvolume", "grid": rgb.VolumeGrid(data), "raw": True}))
     o, d = np.array((0.21, 0.34, -1)), np.array((0.1, 0.17, 1)) / math.sqrt(1 + 0.1**2 + 0.17**2)
@@ -415,7 +423,7 @@ def test11_cells_step_from_wall_to_wall_of_voxels(rgb, gain):
     tau, expected, _, _, _ = reference.march(lambda p: reference.trilinear(data, p), o, d, borders)
     r = gather(rgb, medium, o, d, MarchSettings(1e-3, quadrature="cells", stop=0), count=True)
     assert np.isclose(r.tau.numpy()[0], tau, rtol=1e-5)
-    # The density between is a line through two samples of a cubic: good to a hundredth of a voxel or so.
+    # The density is the line through two samples of a cubic: accurate to about a hundredth of a voxel.
     assert abs(r.expected_depth.numpy()[0] - expected) < 0.015 / 8
     assert r.density_evals.numpy()[0] <= 2 * (9 + 3 + 3)
     short = gather(rgb, medium, o, d, MarchSettings(1e-3, quadrature="cells", stop=0, cell_step=1 / 80), count=True)
@@ -423,9 +431,8 @@ def test11_cells_step_from_wall_to_wall_of_voxels(rgb, gain):
 
 
 @pytest.mark.parametrize("offset", [None, 0.4])
-def test12_a_leap_forgets_the_density_before_it(offset):
-    # Matter everywhere, and growing; the steps whose middle lies in an empty cell are left out, the others are
-    # trapezia.
+def test12_skipping_resets_the_carried_density(offset):
+    # Increasing density everywhere; steps with their middle in an empty cell are skipped, the others are trapezia.
     rise = lambda z, x: 1 + 6 * z * z
     medium, n, occupied = Colored(rise, lambda z: z, ns.Float(1)), 32, np.array([1, 0, 1, 1, 0, 0, 0, 1], bool)
     bits = np.broadcast_to(occupied[:, None, None], (8, 2, 2))
@@ -440,13 +447,13 @@ def test12_a_leap_forgets_the_density_before_it(offset):
     kept = (b > a) & occupied[np.minimum((4 * (a + b)).astype(int), 7)]
     ends = 1 + 6 * np.stack([a, b]) ** 2
     assert np.isclose(got.tau[0], (ends.mean(0) * (b - a))[kept].sum(), rtol=1e-5)
-    # An end that two steps share is evaluated once.
+    # A shared end of two steps is evaluated once.
     assert got.density_evals[0] == kept.sum() + np.count_nonzero(kept & ~np.concatenate([[False], kept[:-1]]))
 
 
 @pytest.mark.parametrize("kind", RULES.names())
 def test07_every_march_ends(kind):
-    # Far away the voxels are as small as the spacing of floats. In a process of its own, which can be ended.
+    # Far from the origin, voxels are as small as the spacing of floats. In a separate process, which can be terminated.
     code = f"""
 import nerg_mi, numpy as np, mitsuba as mi, drjit as dr
 mi.set_variant("llvm_ad_rgb")
@@ -463,7 +470,7 @@ for distance in (3, 30, 300, 3e4):
     o = (distance * rng.normal(size=(3, 500))).astype(np.float32)
     d = rng.random((3, 500)) - o
     d = (d / np.linalg.norm(d, axis=0)).astype(np.float32)
-    ray = medium.local(mi.Point3f(o), mi.Vector3f(d))
+    ray = medium.ray_to_local(mi.Point3f(o), mi.Vector3f(d))
     settings = MarchSettings(1 / 64, quadrature="{kind}", stop=0)
     r = march(medium, ray, dr.maximum(ray.t_near, 0), ray.t_far, True, settings)
     length = np.maximum(ray.t_far.numpy() - ray.t_near.numpy(), 0)
@@ -477,16 +484,16 @@ for distance in (3, 30, 300, 3e4):
     assert run.returncode == 0, run.stderr[-1500:]
 
 
-def test13_where_a_step_takes_its_colour():
+def test13_color_sample_position():
     # At the mean absorption for equal ends, at the denser end where the other is empty, in between by the square of (b
     # - a) / (a + b).
     first, last = ns.Float([2, 0, 5, 1, 3, 1, 0]), ns.Float([2, 5, 0, 3, 1, 4, 0])
-    got = color_share(first, last, ns.Float(0.4)).numpy()
+    got = color_sample_fraction(first, last, ns.Float(0.4)).numpy()
     assert np.allclose(got, [0.4, 1, 0, 0.4 + 0.6 / 4, 0.4 - 0.4 / 4, 0.4 + 0.6 * 0.36, 0.4], rtol=1e-5)
 
 
-def test14_cells_show_the_features_colour(rgb):
-    """Of homogeneous matter whose colour is linear in depth, which steps of any length integrate exactly."""
+def test14_cells_rule_with_features(rgb):
+    """For homogeneous density with a colour linear in depth, which steps of any length integrate exactly."""
     medium = Colored(lambda z, x: 3 * x + 0 * z, lambda z: z, ns.Float(1))
     medium.cells = VoxelCells((0, 0, 0), (1, 1, 1), (4, 4, 4), 0.5)
     shown = np.array(along_z(medium, 8, quadrature="cells").color)[0, 0]
@@ -495,36 +502,36 @@ def test14_cells_show_the_features_colour(rgb):
 
 
 @pytest.mark.parametrize("kind", RULES.names())
-def test15_steps_that_are_not_taken_add_nothing(kind):
-    """Whatever the step before them has left: lanes may end between two steps."""
+def test15_inactive_steps_add_nothing(kind):
+    """For any carry of the previous step: lanes can end between two steps."""
     rule, z = RULES.find(kind), ns.Array3f(0, 0, 1)
     medium = Colored(lambda z, x: 3 * x + 0 * z, lambda z: z, ns.Float(1))
     ray, t, delta = LocalRay(ns.Array3f(0), z, z, ns.Float(0), ns.Float(2)), ns.Float(0), ns.Float(0.5)
-    taken = rule.step(medium, ray, t, delta, t + delta, rule.start(ns.Float), ns.Bool(True), False)
+    taken = rule.step(medium, ray, t, delta, t + delta, rule.init_carry(ns.Float), ns.Bool(True), False)
     left = rule.step(medium, ray, t + delta, delta, t + 2 * delta, taken.carry, ns.Bool(False), False)
     assert np.isclose(taken.dtau[0], 1.5) and (left.dtau[0], left.evals[0]) == (0, 0)
 
 
-# ---- Another rule is one object: registered, it marches, renders and is differentiated, and stands in the manual ----
+# ---- A user-defined rule is one object: it marches, renders, is differentiable and appears in the manual ----
 
 
 class Simpson:
-    """Three samples a step, which integrate cubic densities exactly."""
+    """Three samples per step, which integrate cubic densities exactly."""
 
     name = "simpson"
     summary = "three samples a step"
     ends_at_cells = False
 
-    def start(self, Float):
+    def init_carry(self, Float):
         return None
 
-    def step(self, medium, ray, t, delta, t_next, carry, active, colored) -> MarchStep:
+    def step(self, medium, ray, t, delta, t_next, carry, active, needs_color) -> MarchStep:
         first, middle, last = (medium.density(ray.o + ray.d * (t + s * delta), active) for s in (0, 0.5, 1))
         dtau = dr.select(active, (first + 4 * middle + last) * delta / 6, 0)
         p = ray.o + ray.d * (t + 0.5 * delta)
         return MarchStep(
             dtau,
-            linear_share(first * delta, last * delta),
+            linear_mean_depth_fraction(first * delta, last * delta),
             lambda missing: delta * quotient(missing, dr.select(dtau > 0, dtau, 1)),
             lambda painter, lit: painter.shade(medium, medium.density_features(p, lit)[1], p, ray.w, lit),
             None,
@@ -560,21 +567,21 @@ def marched(medium, rule, n):
     return march(medium, LocalRay(ns.Array3f(0), z, z, t0, t1), t0, t1, True, settings, count=True)
 
 
-def test01_it_marches(simpson):
+def test01_registered_rule_marches(simpson):
     found = marched(Cubic(), "simpson", 1)
     # ∫ 2 + z³ over [0, 2]
     assert np.isclose(found.tau[0], 8, rtol=1e-5) and found.density_evals[0] == 3
     assert abs(marched(Cubic(), "constant", 1).tau[0] - 8) > 1
 
 
-def test02_it_is_differentiated(simpson):
+def test02_registered_rule_is_differentiable(simpson):
     medium = Cubic()
     dr.enable_grad(medium.gain)
     dr.backward(marched(medium, "simpson", 5).tau)
     assert np.isclose(dr.grad(medium.gain)[0], 8, rtol=1e-5)
 
 
-def test03_it_renders(rgb, simpson):
+def test03_registered_rule_renders(rgb, simpson):
     sensor = camera(rgb, (0.5, 0.4, -3), (0.5, 0.5, 0.5))
     tint = {"type": "constvolume", "value": 0.25}
     pictures, counts = [], []
@@ -584,11 +591,11 @@ def test03_it_renders(rgb, simpson):
         pictures.append(picture[..., :-1])
         counts.append(named(rgb, picture, asked)["density_evals.Y"])
     assert counts[0].any() and np.array_equal(counts[0], 3 * counts[1])
-    # In homogeneous matter every rule is exact.
+    # For homogeneous density every rule is exact.
     assert pictures[1][..., :3].max() > 0.1 and np.allclose(*pictures, rtol=1e-4, atol=1e-6)
 
 
-def test04_shapes_and_other_depths_go_with_it(rgb, simpson):
+def test04_registered_rule_with_shapes_and_all_depths(rgb, simpson):
     plate = {"type": "rectangle", "to_world": rgb.ScalarTransform4f().translate([0, 0, 0.7])}
     for depth in ("median", "refined"):
         found = [
@@ -598,7 +605,9 @@ def test04_shapes_and_other_depths_go_with_it(rgb, simpson):
         assert found[1].any() and np.allclose(*found, rtol=1e-4)
 
 
-def test05_it_is_offered_wherever_rules_are(rgb, simpson):
-    subject = SimpleNamespace(marched=True, hits=False, extent=1.0, has_gaze=True, normalized=False, resampled=True)
+def test05_registered_rule_is_listed(rgb, simpson):
+    subject = SimpleNamespace(
+        is_marched=True, has_splats=False, extent=1.0, has_gaze=True, is_normalized=False, can_resample=True
+    )
     assert {s.params.get("quadrature") for s in study.list_rows(subject)} >= {"constant", "linear", "simpson"}
     assert RULES.format_manual().endswith("``simpson``: three samples a step.")

@@ -1,4 +1,4 @@
-"""Gaussian splats as a medium: arrays, what a placed one meets, the next of all in their order, and the tree."""
+"""Gaussian splats as a medium: arrays, placement, the next hits in order, and the tree."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from nerg_mi.fields.splats import Splats, harmonics_from_colors
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.sphere import eval_harmonics
 from nerg_mi.transport.medium import LastHit
-from nerg_mi.transport.splat_medium import AT_ONCE, SplatArrays, SplatMedium, build_tree
+from nerg_mi.transport.splat_medium import GROUP_SIZE, SplatArrays, SplatMedium, build_tree
 from tests.formats.splats.writers import random_splats
 from tests.reference.splats import peaks
 
-# ---- Small places of Gaussian splats, and rays through them ----
+# ---- Small scenes of Gaussian splats, and rays through them ----
 
 
 def medium_of(splats: Splats, to_world: Similarity | None = None) -> SplatMedium:
@@ -24,7 +24,7 @@ def medium_of(splats: Splats, to_world: Similarity | None = None) -> SplatMedium
 
 
 def stack(depths, opacities, scale=0.1, colors=None) -> Splats:
-    """Balls on the z axis."""
+    """Spheres on the z axis."""
     n = len(depths)
     centers = np.stack([np.zeros(n), np.zeros(n), np.asarray(depths, float)], axis=1)
     colors = np.full((n, 3), 0.5) if colors is None else colors
@@ -41,7 +41,7 @@ def rays(count: int, seed: int = 0, size: float = 1.2) -> tuple[np.ndarray, np.n
 # ---- Arrays ----
 
 
-def test_peaks_and_colors_are_those_of_float64():
+def test_peaks_and_colors_match_float64():
     splats = random_splats(30, degree=3)
     arrays = SplatArrays(splats, ns)
     o, d = rays(200)
@@ -56,14 +56,14 @@ def test_peaks_and_colors_are_those_of_float64():
     assert np.allclose(color, np.maximum(seen, 0), atol=1e-5)
 
 
-def test_what_is_set_is_packed_again():
+def test_parameter_changes_are_packed():
     arrays = SplatArrays(random_splats(5, degree=0), ns)
     before, colors = arrays.lower.copy(), arrays.colors
     arrays.centers = arrays.centers + 1
     arrays.pack()
     assert np.allclose(arrays.lower, before + 1, atol=1e-6) and next(iter(arrays.parameters())) == "centers"
     assert dr.width(colors) == 4 * 5 and dr.width(arrays.shapes) == 16 * 5
-    # Of any length: a rotation is a direction.
+    # Of any length: only the direction of a quaternion matters.
     turned = np.array(arrays.shapes)
     arrays.rotations = arrays.rotations * 3
     arrays.pack()
@@ -73,14 +73,14 @@ def test_what_is_set_is_packed_again():
 # ---- Medium ----
 
 
-def test_a_placed_medium_meets_what_placed_splats_would(rgb):
+def test_placed_medium_matches_transformed_splats(rgb):
     splats, (o, d) = random_splats(20, degree=2), rays(50)
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = 2.5 * Rotation.random(random_state=np.random.default_rng(1)).as_matrix(), [1, 0, 2]
     to_world = Similarity(matrix)
     placed, there = medium_of(splats, to_world), medium_of(splats.transform(to_world))
     assert np.isclose(placed.default_step, there.default_step, rtol=1e-5)
-    # A turned box has a larger one around it.
+    # A rotated box has a larger bounding box.
     (low, high), (least, most) = placed.bounds(), there.bounds()
     assert (low <= least + 1e-5).all() and (most <= high + 1e-5).all()
     of = []
@@ -93,7 +93,7 @@ def test_a_placed_medium_meets_what_placed_splats_would(rgb):
     assert np.allclose(of[0], of[1], rtol=1e-3, atol=1e-4)
 
 
-def test_there_is_no_density(rgb):
+def test_density_is_refused(rgb):
     medium = medium_of(stack([1], [0.5]))
     for ask in (medium.density, medium.density_features):
         with pytest.raises(ValueError, match="along rays"):
@@ -106,19 +106,19 @@ def test_there_is_no_density(rgb):
 # ---- Nearest ----
 
 
-def test_groups_are_the_next_of_all_in_their_order(rgb):
+def test_groups_follow_the_global_order(rgb):
     splats = random_splats(80, degree=0, size=0.3)
     medium, (o, d) = medium_of(splats), rays(300)
     ray = medium.ray_to_local(rgb.Point3f(o.T), rgb.Vector3f(d.T))
     all_t, share = peaks(splats, o, d)
     wanted = np.sort(np.where((share > 0) & (all_t > 0), all_t, np.inf), axis=1)
     after, everywhere = LastHit(rgb.Float(0), rgb.UInt32(0)), dr.full(rgb.Bool, True, 300)
-    # No light is ever used up: three groups hold the first of them, and nothing twice.
+    # Light is never used up: three groups contain the first hits, without repetition.
     for group in range(3):
         found = medium.hits.find_next(ray, after, ray.t_far, rgb.Float(1), rgb.Float(0), everywhere)
         dr.eval(found.t, found.absorbed, found.index)
         t = np.stack([np.array(v) for v in found.t], axis=1)
-        part = wanted[:, group * AT_ONCE : (group + 1) * AT_ONCE]
+        part = wanted[:, group * GROUP_SIZE : (group + 1) * GROUP_SIZE]
         met = np.isfinite(part)
         assert np.array_equal(np.isfinite(t), met) and np.allclose(t[met], part[met], atol=1e-5)
         after = LastHit(found.t[-1], found.index[-1])
@@ -129,8 +129,8 @@ def test_groups_are_the_next_of_all_in_their_order(rgb):
     assert np.array_equal(np.array(again[1])[first], np.array(found.absorbed[0])[first])
 
 
-def test_peaks_at_one_place_are_all_met(rgb):
-    count = 2 * AT_ONCE + 3
+def test_coincident_peaks_are_all_returned(rgb):
+    count = 2 * GROUP_SIZE + 3
     medium = medium_of(stack([1.0] * count, np.full(count, 0.1)))
     ray = medium.ray_to_local(rgb.Point3f(0, 0, 0), rgb.Vector3f(0, 0, 1))
     after, seen = LastHit(rgb.Float(0), rgb.UInt32(0)), []
@@ -142,7 +142,7 @@ def test_peaks_at_one_place_are_all_met(rgb):
     assert sorted(seen) == list(range(count))
 
 
-def test_behind_what_takes_all_light_nothing_is_looked_at(rgb):
+def test_opaque_hits_end_the_traversal(rgb):
     medium = medium_of(stack(np.arange(1, 65), [0.9999] * 64))
     ray = medium.ray_to_local(rgb.Point3f(0, 0, 0), rgb.Vector3f(0, 0, 1))
     look = lambda stop: medium.hits.find_next(
@@ -152,11 +152,11 @@ def test_behind_what_takes_all_light_nothing_is_looked_at(rgb):
     assert look(1e-3).t[0][0] == 1
 
 
-# ---- Tree ----
+# ---- BoxTree ----
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 7, 8, 1000])
-def test_every_box_is_in_one_leaf_and_in_all_above_it(count):
+def test_boxes_are_in_one_leaf_and_its_ancestors(count):
     rng = np.random.default_rng(count)
     lower = rng.normal(size=(count, 3))
     upper = lower + rng.uniform(0, 0.3, (count, 3))
@@ -172,18 +172,18 @@ def test_every_box_is_in_one_leaf_and_in_all_above_it(count):
             node //= 2
 
 
-def test_boxes_of_one_place_are_no_trouble():
+def test_coincident_boxes():
     tree = build_tree(np.zeros((9, 3)), np.ones((9, 3)))
     assert sorted(tree.order) == list(range(9)) and tree.nodes[1, :6].round(3).tolist() == [0, 0, 0, 1, 1, 1]
 
 
-def test_what_holds_nothing_is_no_box():
+def test_empty_nodes_are_never_hit():
     tree = build_tree(np.zeros((5, 3)), np.ones((5, 3)))
     empty = tree.nodes[tree.leaves :][~np.isin(np.arange(8), np.flatnonzero(tree.nodes[tree.leaves :, 0] < 1))]
     assert len(empty) == 3 and (empty[:, :6] == np.float32(1e30)).all()
 
 
-def test_halves_are_those_along_the_longest_side():
+def test_nodes_split_along_the_longest_side():
     x = np.arange(8.0)
     lower = np.stack([0 * x, x[::-1], 0 * x], axis=1)
     tree = build_tree(lower, lower)

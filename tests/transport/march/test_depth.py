@@ -1,4 +1,4 @@
-"""Depths against closed forms, for opaque and for semi-transparent matter, and another kind of depth."""
+"""Depths against closed forms, for opaque and semi-transparent matter, and a user-defined kind of depth."""
 
 import math
 from types import SimpleNamespace
@@ -9,7 +9,7 @@ import pytest
 
 from nerg_mi.evaluation import study
 from nerg_mi.evaluation.study_subject import open_subject
-from nerg_mi.transport.depth import DEPTHS, Expected, escape_distance, surface_depth
+from nerg_mi.transport.depth import DEPTHS, Expected, find_surface_depth, penetration_depth
 from nerg_mi.transport.geometry import trace_depth
 from nerg_mi.transport.march import march
 from nerg_mi.transport.march_primal import MarchSettings
@@ -17,7 +17,7 @@ from nerg_mi.transport.volume_medium import VolumeMedium
 from tests.plugins.scenes import channels, constant, straight
 from tests.reference import march_numpy as reference
 
-# ---- Expected and median depth against closed forms, for opaque and for semi-transparent matter ----
+# ---- Expected and median depth against closed forms ----
 
 
 def depth(mi, medium, kind, settings, o=(0.5, 0.5, 0), d=(0, 0, 1)):
@@ -25,7 +25,7 @@ def depth(mi, medium, kind, settings, o=(0.5, 0.5, 0), d=(0, 0, 1)):
     ray = medium.ray_to_local(mi.Point3f(o.T), mi.Vector3f(d.T))
     t0, t1, active = dr.maximum(ray.t_near, 0), ray.t_far, mi.Bool(True)
     result = march(medium, ray, t0, t1, active, settings)
-    return surface_depth(kind, result, medium, ray, t0, t1, active, settings).numpy()
+    return find_surface_depth(kind, result, medium, ray, t0, t1, active, settings).numpy()
 
 
 def slab(mi, sigma, near=1.0):
@@ -42,20 +42,20 @@ def test01_slab(rgb, kind, sigma):
 
 
 @pytest.mark.parametrize("kind", ["expected", "median"])
-def test02_nothing_met_is_zero(rgb, kind):
+def test02_no_matter_gives_zero_depth(rgb, kind):
     assert depth(rgb, slab(rgb, 0), kind, MarchSettings(0.01)).tolist() == [0]
     assert depth(rgb, slab(rgb, 5), kind, MarchSettings(0.01), o=(3, 3, 0)).tolist() == [0]
 
 
 def two_slabs(mi, front, back):
-    """Matter in [0.2, 0.4] and [0.7, 0.9] of the unit cube, as steps of a nearest-neighbour grid."""
+    """Density in [0.2, 0.4] and [0.7, 0.9] of the unit cube, as steps of a nearest-neighbour grid."""
     data = np.zeros((10, 1, 1), np.float32)
     data[2:4], data[7:9] = front, back
     return VolumeMedium(mi.load_dict({"type": "gridvolume", "grid": mi.VolumeGrid(data), "filter_type": "nearest"}))
 
 
 @pytest.mark.parametrize("front, back", [(1, 1), (2, 1e4), (0.1, 50), (5, 5), (100, 1)])
-def test03_a_window_and_a_wall(rgb, front, back):
+def test03_window_in_front_of_a_wall(rgb, front, back):
     medium = two_slabs(rgb, front, back)
     settings = MarchSettings(0.1 / 64)
     a, b = 0.2 * front, 0.2 * back
@@ -70,8 +70,8 @@ def test03_a_window_and_a_wall(rgb, front, back):
 
 @pytest.mark.parametrize("stop", [0, 1e-6, 1e-2, 0.3, 0.5, 0.6, 0.9, 1.0])
 @pytest.mark.parametrize("kind", ["expected", "median"])
-def test04_depth_is_inside_for_every_stop(rgb, kind, stop):
-    # A march that stops early has seen less, but what it saw lies in the box.
+def test04_depth_lies_in_the_box_for_any_stop(rgb, kind, stop):
+    # A march that ends early sees less, but its depth lies in the box.
     got = depth(rgb, slab(rgb, [20.0][0]), kind, MarchSettings(0.01, stop=stop))[0]
     assert 1 <= got <= 1.06
 
@@ -92,7 +92,7 @@ def test05_median_gradient_equals_central_differences(rgb):
             ray = medium.ray_to_local(rgb.Point3f(0.5, 0.5, -1), rgb.Vector3f(0, 0, 1))
             settings = MarchSettings(1 / 32)
             result = march(medium, ray, ray.t_near, ray.t_far, True, settings)
-            d = surface_depth(kind, result, medium, ray, ray.t_near, ray.t_far, rgb.Bool(True), settings)
+            d = find_surface_depth(kind, result, medium, ray, ray.t_near, ray.t_far, rgb.Bool(True), settings)
             dr.set_grad(s, 0)
             dr.backward(d, dr.ADFlag.ClearInterior)
             h = 1e-5 * sigma
@@ -101,14 +101,14 @@ def test05_median_gradient_equals_central_differences(rgb):
 
 
 @pytest.mark.parametrize("kind", DEPTHS.names())
-def test06_the_escape_distance_ends_at_the_face(rgb, kind):
-    # The surface of thick matter lies as deep in it as light goes; in fog the way is kept short.
+def test06_penetration_depth_of_thick_and_thin_matter(rgb, kind):
+    # The surface of thick matter lies at the penetration depth; in fog the distance is limited.
     for sigma, near in ((200, 1), (1e3, 1), (1e6, 2), (20, 1), (0.5, 1)):
         medium = slab(rgb, sigma, near)
         ray = medium.ray_to_local(rgb.Point3f(0.5, 0.5, 0), rgb.Vector3f(0, 0, 1))
         result = march(medium, ray, ray.t_near, ray.t_far, True, MarchSettings(1 / 64))
-        d = surface_depth(kind, result, medium, ray, ray.t_near, ray.t_far, rgb.Bool(True), MarchSettings(1 / 64))
-        out, d = escape_distance(kind, result, d).numpy()[0], d.numpy()[0]
+        d = find_surface_depth(kind, result, medium, ray, ray.t_near, ray.t_far, rgb.Bool(True), MarchSettings(1 / 64))
+        out, d = penetration_depth(kind, result, d).numpy()[0], d.numpy()[0]
         if sigma >= 200:
             assert abs(d - out - near) < 1e-5
         else:
@@ -117,26 +117,26 @@ def test06_the_escape_distance_ends_at_the_face(rgb, kind):
 
 
 @pytest.mark.parametrize("sigma", [0.4, 60.0])
-def test07_evaluations_that_a_depth_takes_are_added(rgb, sigma):
+def test07_evaluations_of_depth_search_are_added(rgb, sigma):
     medium, settings = slab(rgb, sigma), MarchSettings(0.01, stop=1e-3)
     ray = medium.ray_to_local(rgb.Point3f(0.5, 0.5, 0), rgb.Vector3f(0, 0, 1))
     counts = {}
     for kind in DEPTHS.names():
         result = march(medium, ray, ray.t_near, ray.t_far, True, settings, count=True)
         first = result.density_evals[0]
-        surface_depth(kind, result, medium, ray, ray.t_near, ray.t_far, rgb.Bool(True), settings)
+        find_surface_depth(kind, result, medium, ray, ray.t_near, ray.t_far, rgb.Bool(True), settings)
         counts[kind] = result.density_evals[0] - first
-    # Thin matter is marched again to where half of its own opacity is reached; a refined depth takes sixteen steps at
-    # most in one.
+    # Thin matter is marched again up to half of its own opacity; a refined depth takes at most sixteen steps inside
+    # one.
     again = 0 if sigma > 1 else -math.log1p(0.5 * math.expm1(-sigma)) / sigma * 100
     assert counts["expected"] == 0 and abs(counts["median"] - again) <= 1
     assert counts["median"] < counts["refined"] <= counts["median"] + 17
 
 
 @pytest.mark.parametrize("stop", [1e-6, 1e-2])
-def test08_a_refined_depth_finds_what_a_step_hides(rgb, stop):
-    """A wall that starts within a step: the step's own rule spreads it over all of it, a finer look does not. On rays
-    that became opaque and on those that did not."""
+def test08_refined_depth_resolves_walls_inside_a_step(rgb, stop):
+    """A wall that starts inside a step: the rule spreads it over the whole step, refinement does not. For opaque rays
+    and for others."""
     back = 40.0
     data = np.zeros((64, 1, 1), np.float32)
     data[27:37] = 3.0
@@ -151,35 +151,35 @@ def test08_a_refined_depth_finds_what_a_step_hides(rgb, stop):
 
 
 @pytest.mark.parametrize("kind", ["median", "refined"])
-def test09_no_depth_where_none_is_asked_for(rgb, kind):
-    """Of rays that have all been marched."""
+def test09_inactive_lanes_have_no_depth(rgb, kind):
+    """For rays that have all been marched."""
     medium, settings = slab(rgb, 60), MarchSettings(0.1)
     ray = medium.ray_to_local(rgb.Point3f(0.5, 0.5, 0), rgb.Vector3f(0, 0, 1))
     result = march(medium, ray, ray.t_near, ray.t_far, True, settings)
     asked = rgb.Bool([True, False])
-    found = surface_depth(kind, result, medium, ray, ray.t_near, ray.t_far, asked, settings).numpy()
+    found = find_surface_depth(kind, result, medium, ray, ray.t_near, ray.t_far, asked, settings).numpy()
     assert found[0] > 1 and found[1] == 0
 
 
-# ---- Another kind of depth is one object: registered, it is traced, rendered with and without shapes, and studied ----
+# ---- A user-defined kind of depth is one object: it is traced, rendered with and without shapes, and studied ----
 
 
 class Entered:
-    """Where the march begins, and the shape itself where there is one."""
+    """The start of the march, and the shape itself if there is one."""
 
     name = "entered"
     summary = "where the march begins"
     mean_free_paths = 0.0
-    at_half = False
+    is_at_half_opacity = False
     surface_kind = "entered"
 
     def find_exact(self, profile):
         return profile.quantile(0)
 
-    def inside(self, marched):
-        return dr.select(marched.result.tau > 0, marched.t0, 0)
+    def inside(self, context):
+        return dr.select(context.result.tau > 0, context.t0, 0)
 
-    def with_shape(self, result, front, inside, hit, distance):
+    def combine_with_shape(self, result, front, inside, hit, distance):
         return distance
 
 
@@ -190,17 +190,17 @@ def entered():
     DEPTHS.unregister("entered")
 
 
-def test01_it_is_traced(rgb, entered):
+def test01_registered_depth_is_traced(rgb, entered):
     fog = VolumeMedium(rgb.load_dict({"type": "constvolume", "value": 3.0}))
     depth, opacity = trace_depth(fog, [[0.5, 0.5, -1.5], [3, 0.5, -1]], [[0, 0, 1], [0, 0, 1]], kind="entered")
     assert depth.tolist() == [1.5, 0] and opacity[0] > 0.9
 
 
-def test02_it_is_rendered_with_and_without_shapes(rgb, entered):
+def test02_registered_depth_renders_with_and_without_shapes(rgb, entered):
     plate = {"type": "rectangle", "to_world": rgb.ScalarTransform4f().translate([0, 0, 0.5]).scale(2)}
     asked = constant(3.0, depth="entered", aovs="depth,position")
     sensor = straight(rgb, "perspective")
-    # The camera stands at z = -2, and its rays start a hundredth in front of it.
+    # The camera is at z = -2, and its rays start a hundredth in front of it.
     for more, want in (({}, 1.99), ({"plate": plate}, 2.49)):
         found = channels(rgb, asked, sensor, **more)
         assert np.allclose(found["depth.T"], want, rtol=1e-5) and np.allclose(
@@ -208,7 +208,7 @@ def test02_it_is_rendered_with_and_without_shapes(rgb, entered):
         )
 
 
-def test03_it_is_offered_where_depths_are_and_only_while_it_is_registered(rgb, entered):
+def test03_registered_depth_is_listed(rgb, entered):
     assert DEPTHS.names()[-1] == "entered"
     assert DEPTHS.format_manual().endswith("``entered``: where the march begins.")
     DEPTHS.unregister("entered")
@@ -217,8 +217,8 @@ def test03_it_is_offered_where_depths_are_and_only_while_it_is_registered(rgb, e
     DEPTHS.register(entered)
 
 
-def test04_the_surface_lies_as_deep_as_light_goes(rgb):
-    """The kinds' mean free paths are those of a thick slab of constant density."""
+def test04_penetration_depth_matches_mean_free_paths(rgb):
+    """The mean free paths of each kind are those of a thick slab of constant density."""
     sigma = 500.0
     slab = VolumeMedium(rgb.load_dict({"type": "constvolume", "value": sigma}))
     for kind in DEPTHS:
@@ -228,14 +228,16 @@ def test04_the_surface_lies_as_deep_as_light_goes(rgb):
 
 
 @pytest.mark.parametrize("hits", [False, True], ids=["marched", "splats"])
-def test05_a_study_has_it(entered, hits):
-    """Among its settings, but for splats not what finds the depth of another kind."""
-    subject = SimpleNamespace(marched=True, hits=hits, extent=1.0, has_gaze=True, normalized=False, resampled=True)
+def test05_study_includes_registered_depth(entered, hits):
+    """Each kind is among the study's settings, for splats only kinds with a surface of their own."""
+    subject = SimpleNamespace(
+        is_marched=True, has_splats=hits, extent=1.0, has_gaze=True, is_normalized=False, can_resample=True
+    )
     kinds = {s.params["depth"] for s in study.list_rows(subject) if s.group == "depth"}
     assert kinds >= {"expected", "median", "entered"} and ("refined" in kinds) is not hits
 
 
-def test06_a_study_compares_it_with_its_own_exact_value(rgb, entered):
+def test06_study_compares_registered_depth_with_its_exact_value(rgb, entered):
     subject = open_subject("slab", "auto", 8, 8)
     entry, median, refined = (subject.get_truth(1, kind, "depth") for kind in ("entered", "median", "refined"))
     rendered = subject.render_channels(subject.make_integrator({"depth": "entered"}), 1, 1)["depth"]

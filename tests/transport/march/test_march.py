@@ -12,7 +12,7 @@ from nerg_mi.fields.splats import quaternions_to_matrices
 from nerg_mi.transport import march as front
 from nerg_mi.transport.march import march
 from nerg_mi.transport.march_primal import MarchSettings, march_primal
-from nerg_mi.transport.medium import ColorPainter, LocalRay
+from nerg_mi.transport.medium import ColorShader, LocalRay
 from nerg_mi.transport.volume_medium import VolumeMedium
 from tests.formats.splats.writers import random_splats
 from tests.plugins.scenes import plugin
@@ -22,12 +22,11 @@ from tests.transport.test_splat_medium import medium_of, rays, stack
 
 # ---- Adjoint ----
 #
-# Derivatives by marching again, against those that Dr.Jit takes through the march itself, and what they hold in
-# memory.
+# Derivatives by marching again, against those of Dr.Jit through the march itself, and their memory.
 
 
 def scene_of(mi, size, step, quadrature="constant"):
-    """Voxels with a colour each: all rays of a camera cross them."""
+    """Voxels with one colour each, all crossed by camera rays."""
     rng = np.random.default_rng(2)
     place = mi.ScalarTransform4f().translate([-1, -1, -1]).scale(2)
     volume = lambda data: plugin("gridvolume", grid=mi.VolumeGrid(data.astype(np.float32)), to_world=place, raw=True)
@@ -77,13 +76,13 @@ def test01_equal_to_derivatives_through_the_loop(rgb, monkeypatch, quadrature):
     got = gradients(rgb, scene)
 
     def through_the_loop(ray, t0, t1, request):
-        # Every step is evaluated, and stays in memory until its derivative has been taken.
+        # Every step is evaluated and stays in memory until it is differentiated.
         with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, False):
             settings = replace(request.settings, color_cutoff=0.0)
             return march_primal(ray, t0, t1, replace(request, settings=settings))
 
     called = []
-    monkeypatch.setattr(front, "differentiable_march", lambda operation, *a: called.append(1) or through_the_loop(*a))
+    monkeypatch.setattr(front, "march_differentiably", lambda operation, *a: called.append(1) or through_the_loop(*a))
     expected = gradients(rgb, scene)
     assert called
     for g, e in zip(got, expected):
@@ -94,7 +93,7 @@ def test02_memory_does_not_grow_with_samples(rgb):
     peaks = []
     for samples in (16, 512):
         scene = scene_of(rgb, 32, 2 / samples)
-        gradients(rgb, scene)  # compiles, and makes what stays
+        gradients(rgb, scene)  # compiles, and allocates what is kept
         gc.collect()
         dr.sync_thread()
         dr.flush_malloc_cache()
@@ -103,7 +102,7 @@ def test02_memory_does_not_grow_with_samples(rgb):
         gradients(rgb, scene)
         dr.sync_thread()
         peaks.append(dr.detail.malloc_watermark(dr.JitBackend.LLVM) - before)
-    # Storing one number of each sample would add 2 MB.
+    # Storing one number per sample would add 2 MB.
     assert 0 < peaks[0] < 1e6 and abs(peaks[1] - peaks[0]) < 0.1 * peaks[0], peaks
 
 
@@ -113,7 +112,7 @@ def test02_memory_does_not_grow_with_samples(rgb):
 
 
 class Slanted:
-    """Density ``base`` + ``rise`` z, and a colour that is z itself, everywhere."""
+    """Density ``base`` + ``rise`` z, with the colour z, everywhere."""
 
     occupancy = cells = step = hits = None
 
@@ -142,7 +141,7 @@ def slopes(medium, value, mode, settings, offset=None):
         dr.enable_grad(*(x if mode == "backward" else [x[k]]))
         medium.base = x[3]
         ray = LocalRay(ns.Array3f(0, 0, x[2]), z, z, dr.opaque(ns.Float, 0), dr.opaque(ns.Float, 2))
-        result = value(march(medium, ray, x[0], x[1], True, settings, color=ColorPainter(ns.Array3f), offset=offset))
+        result = value(march(medium, ray, x[0], x[1], True, settings, color=ColorShader(ns.Array3f), offset=offset))
         if mode == "backward":
             dr.backward(result)
             medium.base = dr.detach(x[3])
@@ -156,7 +155,7 @@ def slopes(medium, value, mode, settings, offset=None):
 @pytest.mark.parametrize("offset", [None, 0.3])
 @pytest.mark.parametrize("quadrature", ["constant", "linear"])
 @pytest.mark.parametrize("mode", ["forward", "backward"])
-def test03_a_slab_between_entry_and_exit(mode, quadrature, offset):
+def test03_slab_derivatives_in_closed_form(mode, quadrature, offset):
     sigma, t0, t1 = 1.7, 0.25, 1.125
     length, passed = t1 - t0, np.exp(-1.7 * (1.125 - 0.25))
     settings = MarchSettings(1 / 16, stop=0, color_cutoff=0, quadrature=quadrature)
@@ -169,8 +168,8 @@ def test03_a_slab_between_entry_and_exit(mode, quadrature, offset):
     by_density = -1 / sigma**2 + length**2 * q / (1 - passed)
     assert np.allclose(of(lambda r: r.expected_depth), [1 - by_length, by_length, 0, by_density], rtol=1e-4, atol=1e-5)
     half = [1, 0, 0, -np.log(2) / sigma**2]
-    assert np.allclose(of(lambda r: r.half), half, rtol=1e-4, atol=1e-5)
-    # The colour z is that of the mean absorption: C = opacity (o + E). A step takes it at its middle, or at its mean.
+    assert np.allclose(of(lambda r: r.median_depth), half, rtol=1e-4, atol=1e-5)
+    # The colour z is that of the mean absorption: C = opacity (o + E). A step samples it at its middle, or at its mean.
     opacity, mean = 1 - passed, t0 + 1 / sigma - length * q
     want = [
         -sigma * passed * mean + opacity * (1 - by_length),
@@ -182,25 +181,25 @@ def test03_a_slab_between_entry_and_exit(mode, quadrature, offset):
 
 
 @pytest.mark.parametrize("mode", ["forward", "backward"])
-def test04_density_at_the_ends_is_what_moving_them_takes_in(mode):
-    # tau = base (t1 - t0) + rise ((t1 + o)^2 - (t0 + o)^2) / 2, exact by either rule.
+def test04_derivatives_at_the_ends_equal_the_density(mode):
+    # tau = base (t1 - t0) + rise ((t1 + o)^2 - (t0 + o)^2) / 2, exact for both rules.
     for quadrature in ("constant", "linear"):
         settings = MarchSettings(1 / 16, stop=0, color_cutoff=0, quadrature=quadrature)
         got = slopes(Slanted(0.5, 3.0), lambda r: r.tau, mode, settings)
         assert np.allclose(got, [-(0.5 + 3 * 0.25), 0.5 + 3 * 1.125, 3 * 0.875, 0.875], rtol=1e-4)
 
 
-# ---- Derivatives of splats against central differences in float64, of the ray and of what Gaussians are ----
+# ---- Derivatives of splats against float64 central differences, for the ray and the Gaussians ----
 
 
-# Ends nowhere, so that the sums are smooth but for the rims of Gaussians.
+# No end of the march, so that the sums are smooth except at the rims of Gaussians.
 SETTINGS = MarchSettings(0.01, stop=0.0)
 NAMES = ("centers", "scales", "rotations", "opacities", "harmonics")
 STEP = 1e-5
 
 
 class Double:
-    """Splats in float64, with one array of another value."""
+    """Splats in float64, with one array replaced."""
 
     def __init__(self, splats, name="", value=None):
         self.degree = splats.degree
@@ -213,9 +212,9 @@ class Double:
 
 def outputs(mi, medium, o, d):
     """A number that depends on all sums of a march."""
-    ray = medium.local(o, d)
-    result = march(medium, ray, mi.Float(0), ray.t_far, True, SETTINGS, color=ColorPainter(mi.Color3f))
-    half = dr.select(dr.isfinite(result.half), result.half, 0)
+    ray = medium.ray_to_local(o, d)
+    result = march(medium, ray, mi.Float(0), ray.t_far, True, SETTINGS, color=ColorShader(mi.Color3f))
+    half = dr.select(dr.isfinite(result.median_depth), result.median_depth, 0)
     return dr.sum(result.opacity + 0.3 * result.expected_depth + dr.dot(result.color, [0.5, 0.2, 0.1]) + 0.1 * half)
 
 
@@ -232,7 +231,7 @@ def reference(splats, o, d):
 
 @pytest.fixture
 def case():
-    # Rims of Gaussians, where they jump by a hundredth, pass no ray within the step of these differences.
+    # The rims of Gaussians, where they jump by a hundredth, do not cross a ray within the step of these differences.
     return random_splats(14, degree=1, size=0.5), *rays(12, size=0.6)
 
 
@@ -277,7 +276,7 @@ def test_memory_does_not_grow_with_hits(rgb):
         o = rgb.Point3f(dr.linspace(rgb.Float, -0.1, 0.1, count), 0, 0)
         dr.enable_grad(o)
         ray = medium.ray_to_local(o, rgb.Vector3f(0, 0, 1))
-        result = march(medium, ray, rgb.Float(0), rgb.Float(end), True, SETTINGS, color=ColorPainter(rgb.Color3f))
+        result = march(medium, ray, rgb.Float(0), rgb.Float(end), True, SETTINGS, color=ColorShader(rgb.Color3f))
         dr.backward(result.tau + result.color.x)
         dr.eval(dr.grad(o))
         return result.tau.numpy().mean()
@@ -293,27 +292,27 @@ def test_memory_does_not_grow_with_hits(rgb):
         found.append(gradient(end))
         dr.sync_thread()
         memory.append(dr.detail.malloc_watermark(dr.JitBackend.LLVM) - before)
-    # Four hits and 150; a number for each of these would be 5 MB.
+    # Four hits and 150; one number per hit would take 5 MB.
     assert found[1] > 30 * found[0] > 0 and abs(memory[1] - memory[0]) < 5e5, memory
 
 
-# ---- The front of the march: which of the two it takes, and where its steps become fine ----
+# ---- Dispatch: primal or differentiable march, and the coarse pre-pass ----
 
 
 @pytest.fixture
 def taken(monkeypatch):
-    """An entry for each march that can be differentiated."""
-    calls, made = [], front.differentiable_march
-    monkeypatch.setattr(front, "differentiable_march", lambda *a: calls.append(1) or made(*a))
+    """One entry per differentiable march."""
+    calls, made = [], front.march_differentiably
+    monkeypatch.setattr(front, "march_differentiably", lambda *a: calls.append(1) or made(*a))
     return calls
 
 
 def through(mi, medium, settings, z=None, march=front.march, **more):
-    ray = medium.local(mi.Point3f(0.5, 0.5, 0 if z is None else z), mi.Vector3f(0, 0, 1))
+    ray = medium.ray_to_local(mi.Point3f(0.5, 0.5, 0 if z is None else z), mi.Vector3f(0, 0, 1))
     return march(medium, ray, dr.maximum(ray.t_near, 0), ray.t_far, mi.Bool(True), settings, **more)
 
 
-def test01_derivatives_are_paid_for_where_any_are_tracked(rgb, taken):
+def test01_differentiable_march_only_with_gradients(rgb, taken):
     settings, medium, z = MarchSettings(0.01), slab(rgb, 2, 1), rgb.Float(0)
     through(rgb, medium, settings, z)
     assert not taken
@@ -325,59 +324,70 @@ def test01_derivatives_are_paid_for_where_any_are_tracked(rgb, taken):
     assert len(taken) == 1
 
 
-def test02_both_marches_find_the_same(rgb):
+def test02_both_marches_give_equal_results(rgb):
     z = rgb.Float(0)
     medium, settings = slab(rgb, 2, 1), MarchSettings(0.01)
     plain = through(rgb, medium, settings, z, count=True)
     dr.enable_grad(z)
     attached = through(rgb, medium, settings, z, count=True)
-    for name in ("tau", "moment", "half", "half_slope", "enter", "enter_tau", "density_evals", "origin"):
+    for name in (
+        "tau",
+        "moment",
+        "median_depth",
+        "median_depth_slope",
+        "crossing_start",
+        "crossing_start_tau",
+        "density_evals",
+        "start_distance",
+    ):
         assert np.array_equal(getattr(plain, name).numpy(), dr.detach(getattr(attached, name)).numpy()), name
     tracked = {
-        name for name in ("half", "half_slope", "enter", "enter_tau") if dr.grad_enabled(getattr(attached, name))
+        name
+        for name in ("median_depth", "median_depth_slope", "crossing_start", "crossing_start_tau")
+        if dr.grad_enabled(getattr(attached, name))
     }
-    assert tracked == {"half"}
+    assert tracked == {"median_depth"}
 
 
-def test03_a_goal_carries_derivatives_too(rgb):
+def test03_goal_carries_derivatives(rgb):
     goal = rgb.Float(0.4)
     dr.enable_grad(goal)
     found = through(rgb, slab(rgb, 2, 1), MarchSettings(0.01), until=goal)
-    dr.backward(found.half)
-    # Where σ s = goal: the crossing moves by 1 / σ with it.
-    assert np.isclose(found.half[0], 1.2, rtol=1e-5) and np.isclose(dr.grad(goal)[0], 0.5, rtol=1e-4)
+    dr.backward(found.median_depth)
+    # At σ s = goal: the crossing moves by 1 / σ per unit of the goal.
+    assert np.isclose(found.median_depth[0], 1.2, rtol=1e-5) and np.isclose(dr.grad(goal)[0], 0.5, rtol=1e-4)
 
 
-def test04_fine_steps_begin_before_matter_does(rgb):
-    """A step of the scout before where it found the first trace, so that none of the matter is marched coarsely."""
+def test04_fine_steps_begin_in_front_of_matter(rgb):
+    """One coarse step before the first trace of matter, so that no matter is marched coarsely."""
     for face in (0.3, 0.55, 0.9):
         data = np.zeros((200, 1, 1))
         data[round(200 * face) :] = 30
         medium = grid(rgb, data, filter_type="nearest")
         ray = medium.ray_to_local(rgb.Point3f(0.5, 0.5, 0), rgb.Vector3f(0, 0, 1))
         settings = MarchSettings(0.01, coarse=8)
-        start, evals = front.fine_start(medium, ray, rgb.Float(0), rgb.Float(1), rgb.Bool(True), settings)
+        start, evals = front.find_fine_start(medium, ray, rgb.Float(0), rgb.Float(1), rgb.Bool(True), settings)
         assert face - 2.1 * 0.08 < start[0] < face and 1 <= evals[0] <= 14
     vacuum = grid(rgb, np.zeros((4, 1, 1)))
-    assert front.fine_start(vacuum, ray, rgb.Float(0), rgb.Float(1), rgb.Bool(True), settings)[0][0] == np.inf
+    assert front.find_fine_start(vacuum, ray, rgb.Float(0), rgb.Float(1), rgb.Bool(True), settings)[0][0] == np.inf
 
 
-def test05_coarse_steps_spare_evaluations_and_their_scout_is_counted(rgb):
+def test05_prepass_saves_evaluations_and_is_counted(rgb):
     data = np.zeros((200, 1, 1))
     data[150:] = 30
     medium = grid(rgb, data, filter_type="nearest")
-    # As a medium that states no bound: nothing is skipped, and every step is evaluated.
+    # A medium without an occupancy bound: nothing is skipped, and every step is evaluated.
     medium.bound = None
     fine, coarse = MarchSettings(0.005, stop=1e-6), MarchSettings(0.005, stop=1e-6, coarse=8)
-    all_fine, scouted = (through(rgb, medium, s, march=front.scouted_march, count=True) for s in (fine, coarse))
+    all_fine, scouted = (through(rgb, medium, s, march=front.march_with_prepass, count=True) for s in (fine, coarse))
     assert np.isclose(all_fine.expected_depth[0], scouted.expected_depth[0], atol=2e-3)
-    # Most of the 150 steps in front of matter become 17 of the march, and 19 of its scout.
+    # Most of the 150 steps in front of matter become 17 of the march and 19 of the pre-pass.
     assert 80 < all_fine.density_evals[0] - scouted.density_evals[0] < 115
 
 
-def test06_what_is_not_asked_for_is_not_gathered(rgb):
+def test06_unrequested_results_are_none(rgb):
     sigma, tint = (rgb.load_dict({"type": "constvolume", "value": v}) for v in (2.0, 0.25))
-    colored = VolumeMedium(sigma, tint)
-    assert through(rgb, colored, MarchSettings(0.01)).color is None
-    gathered = through(rgb, colored, MarchSettings(0.01, color_cutoff=0), color=ColorPainter(rgb.Color3f))
+    needs_color = VolumeMedium(sigma, tint)
+    assert through(rgb, needs_color, MarchSettings(0.01)).color is None
+    gathered = through(rgb, needs_color, MarchSettings(0.01, color_cutoff=0), color=ColorShader(rgb.Color3f))
     assert np.allclose(np.array(gathered.color).ravel(), 0.25 * gathered.opacity[0], rtol=1e-5)

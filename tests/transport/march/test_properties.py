@@ -1,4 +1,4 @@
-"""What every march keeps, for densities over seventeen orders of magnitude, and how its error falls with the step."""
+"""Properties of all marches, for densities over seventeen orders of magnitude, and convergence with the step length."""
 
 import functools
 import math
@@ -9,15 +9,15 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from nerg_mi.transport.depth import DEPTHS, surface_depth
+from nerg_mi.transport.depth import DEPTHS, find_surface_depth
 from nerg_mi.transport.march import march
 from nerg_mi.transport.march_primal import MarchSettings
-from nerg_mi.transport.medium import ColorPainter, LocalRay
+from nerg_mi.transport.medium import ColorShader, LocalRay
 from nerg_mi.transport.volume_medium import VolumeMedium
 from tests.reference import march_numpy as reference
 
 PIECES = 8
-# The fixture `rgb` is the module mitsuba: there is nothing in it to reset between examples.
+# The fixture `rgb` is the module mitsuba, which has no state to reset between examples.
 few = settings(
     max_examples=40,
     deadline=None,
@@ -30,7 +30,7 @@ densities = st.lists(density, min_size=PIECES, max_size=PIECES).map(np.float32)
 
 
 class Along:
-    """A medium whose density depends on z in [0, 1] only: ``f(z)``, white all over."""
+    """A medium whose density depends on z in [0, 1] only: ``f(z)``, with white colour."""
 
     occupancy = cells = step = hits = None
 
@@ -89,14 +89,14 @@ WHOLE = MarchSettings(1 / PIECES, stop=0)
 
 @given(table=densities)
 @few
-def test01_a_march_is_its_float64_reference(rgb, table):
+def test01_march_matches_float64_reference(rgb, table):
     ray, r = through(rgb, pieces(rgb, table), WHOLE)
     opacity, expected, median = exact(table)
     assert np.isclose(one(r.opacity), opacity, rtol=2e-6)
     if opacity > 0:
         assert np.isclose(one(r.expected_depth), expected, rtol=2e-6, atol=1e-12)
-        found = surface_depth("median", r, pieces(rgb, table), ray, ray.t_near, ray.t_far, True, WHOLE)
-        # Where hardly anything is absorbed behind the median, rounding of the optical depth moves it along.
+        found = find_surface_depth("median", r, pieces(rgb, table), ray, ray.t_near, ray.t_far, True, WHOLE)
+        # With almost no absorption behind the median, rounding of the optical depth moves it.
         tau = lambda t: np.interp(
             t, np.linspace(0, 1, PIECES + 1), np.concatenate([[0], np.cumsum(table.astype(float) / PIECES)])
         )
@@ -107,9 +107,9 @@ def test01_a_march_is_its_float64_reference(rgb, table):
 @few
 def test02_weights_sum_to_opacity(rgb, table, cutoff):
     _, r = through(
-        rgb, pieces(rgb, table), MarchSettings(1 / 64, stop=0, color_cutoff=cutoff), color=ColorPainter(rgb.Color3f)
+        rgb, pieces(rgb, table), MarchSettings(1 / 64, stop=0, color_cutoff=cutoff), color=ColorShader(rgb.Color3f)
     )
-    # What is fainter than the cut-off as a whole has no colour.
+    # Matter that is fainter than the cut-off in total has no colour.
     if one(r.opacity) > 64 * cutoff:
         assert np.isclose(one(r.color.x), one(r.opacity), rtol=2e-6)
 
@@ -127,7 +127,7 @@ def test04_splitting_steps_preserves_everything(rgb, table, parts):
     _, a = through(rgb, pieces(rgb, table), WHOLE)
     _, b = through(rgb, pieces(rgb, table), MarchSettings(1 / PIECES / parts, stop=0))
     assert np.isclose(one(a.opacity), one(b.opacity), rtol=3e-6)
-    # Borders of parts may round to the far side of a piece's border, by a spacing of floats.
+    # Boundaries of parts can be rounded across a boundary of pieces, by one floating-point spacing.
     slip = 2.0**-22 * float(table.max()) * math.exp(-min(one(a.tau), 80))
     assert np.isclose(one(a.expected_depth), one(b.expected_depth), rtol=1e-5, atol=min(slip, 1) * 1e-3 + 1e-6)
 
@@ -142,7 +142,7 @@ def test05_the_linear_rule_is_exact_in_opacity_for_linear_densities(rgb, first, 
 
 @given(table=densities, gain=st.floats(1, 1e6))
 @few
-def test06_more_matter_hides_more(rgb, table, gain):
+def test06_opacity_is_monotonic(rgb, table, gain):
     a, b = (one(through(rgb, pieces(rgb, t), WHOLE)[1].opacity) for t in (table, table * np.float32(gain)))
     assert b >= a * (1 - 1e-6)
 
@@ -158,7 +158,7 @@ def test07_depth_lies_in_the_box(rgb, table, kind, quadrature, stop):
     controls = MarchSettings(1 / 20, stop=stop, quadrature=quadrature)
     medium = pieces(rgb, table)
     ray, r = through(rgb, medium, controls)
-    depth = one(surface_depth(kind, r, medium, ray, ray.t_near, ray.t_far, True, controls))
+    depth = one(find_surface_depth(kind, r, medium, ray, ray.t_near, ray.t_far, True, controls))
     assert 0 <= depth <= 1 + 1e-6
     assert depth == 0 if not table.any() else True
 
@@ -173,7 +173,7 @@ def test08_derivatives_with_respect_to_each_density(rgb, table):
     dr.backward(r.opacity, flags=dr.ADFlag.ClearVertices)
     slope = math.exp(-float(table.astype(float).sum()) / PIECES) / PIECES
     assert np.allclose(np.array(dr.grad(x)), slope, rtol=1e-4, atol=1e-6)
-    for y in (r.expected_depth, dr.select(dr.isfinite(r.half), r.half, 0)):
+    for y in (r.expected_depth, dr.select(dr.isfinite(r.median_depth), r.median_depth, 0)):
         dr.set_grad(x, 0)
         dr.backward(y, flags=dr.ADFlag.ClearVertices)
         assert np.all(np.isfinite(np.array(dr.grad(x))))
@@ -184,7 +184,7 @@ def test08_derivatives_with_respect_to_each_density(rgb, table):
     origin=st.tuples(*[st.one_of(st.sampled_from([0.0, 1.0, 0.5, -1.0]), st.floats(-2, 3, width=32))] * 3),
 )
 @few
-def test09_rays_of_any_direction_from_anywhere(rgb, direction, origin):
+def test09_arbitrary_rays(rgb, direction, origin):
     d = np.array(direction)
     if np.linalg.norm(d) < 1e-3:
         d = d + (0, 0, 1)
@@ -230,10 +230,11 @@ def test10_second_order_in_smooth_densities(rgb, quadrature):
         medium = Along(rgb, lambda z: smooth(z, dr.exp, dr.sin))
         controls = MarchSettings(1 / n, stop=0, quadrature=quadrature)
         ray, r = through(rgb, medium, controls)
-        median = surface_depth("median", r, medium, ray, ray.t_near, ray.t_far, True, controls)
+        median = find_surface_depth("median", r, medium, ray, ray.t_near, ray.t_far, True, controls)
         errors.append(np.abs(np.array([one(r.tau), one(r.expected_depth), one(median)]) - want))
     orders = np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
-    # Optical depth and expected depth: the promised order, at every halving. The median jumps about within its step.
+    # Optical depth and expected depth converge with the expected order at each halving. The median varies within its
+    # step.
     assert np.all(orders[:, :2] > 1.7), orders
     assert errors[-1][2] < errors[0][2] / 32, errors
 
@@ -241,7 +242,9 @@ def test10_second_order_in_smooth_densities(rgb, quadrature):
 def test11_cells_do_not_depend_on_the_step(rgb):
     data = np.random.default_rng(3).exponential(2, (4, 4, 4)).astype(np.float32)
     medium = VolumeMedium(rgb.load_dict({"type": "gridvolume", "grid": rgb.VolumeGrid(data), "raw": True}))
-    ray = medium.ray_to_local(rgb.Point3f(0.2, 0.3, -1), rgb.Vector3f(*(np.array([0.1, 0.2, 1]) / math.sqrt(1.05)).tolist()))
+    ray = medium.ray_to_local(
+        rgb.Point3f(0.2, 0.3, -1), rgb.Vector3f(*(np.array([0.1, 0.2, 1]) / math.sqrt(1.05)).tolist())
+    )
     tau = [
         one(
             march(
@@ -259,7 +262,8 @@ def test11_cells_do_not_depend_on_the_step(rgb):
 
 
 def test12_steps_shorter_than_a_sheet_find_it(rgb):
-    # A volume that states no bound is marched unskipped: a sheet is met wherever it lies within the steps.
+    # A volume without an occupancy bound is marched without skipping: a sheet is found wherever it lies within the
+    # steps.
     start = rgb.Float(np.linspace(0, 0.01, 500, dtype=np.float32))
     medium = Along(rgb, lambda z: dr.select((z >= 0.03) & (z < 0.0301), 1e9, 1e-8))
     z = rgb.Vector3f(0, 0, 1)
