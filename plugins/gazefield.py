@@ -1,53 +1,52 @@
 r"""
 .. _volume-gazefield:
 
-Trained gaze field (:monosp:`gazefield`)
-----------------------------------------
+Gaze field (:monosp:`gazefield`)
+--------------------------------
 
 .. pluginparameters::
 
  * - filename
    - |string|
-   - Checkpoint (safetensors) written by ``nerg train gaze`` or ``nerg_mi.formats.fields.save_gaze``.
-     Relative names are looked up beside the scene file.
+   - Checkpoint (safetensors) written by ``nerg train gaze`` or ``nerg_mi.formats.fields.save_gaze``. Relative names are
+     resolved in the folder of the scene file.
 
  * - to_world
    - |transform|
-   - A rotation, a uniform scale and a translation that place the field in the scene; it should be that of the radiance
-     field. Densities over directions do not change with scale. (Default: none)
+   - Rotation, uniform scale and translation of the field in the scene; usually that of the radiance field. Densities
+     over directions are invariant to scale. (Default: none)
 
  * - constant_weights
    - |bool|
-   - Write the weights of the networks into the kernels, for many large frames of one field: the same pictures to the
-     bit in less time, after some seconds of compilation for each size of picture (docs/explanation/performance.md, "Weights as
-     constants"). Only on processors, and where nothing is differentiated; weights that change often are not for it.
-     (Default: false)
+   - Write the weights of the networks into the kernels as literals: bit-identical images in less time, after some
+     seconds of compilation for each image size (docs/explanation/performance.md, "Weights as constants"). For many
+     large frames of one field; only on CPUs, without derivatives, and for weights that rarely change. (Default: false)
 
  * - grid.table, position_net.0, ..., direction_net.0, ..., emit_head.0, capture_head.0
    - |tensor|
-   - Features of the grid and the weight matrices of the trunk and of the two heads.
+   - Features of the grid and weight matrices of the trunk and of both heads.
    - |exposed|, |differentiable|
 
  * - 0.grid.table, 1.grid.table, ...
    - |tensor|
-   - Of an ensemble: the arrays of each member, by its number.
+   - For an ensemble: the arrays of each member, by its number.
    - |exposed|, |differentiable|
 
  * - grid.table, emit_net.0, ..., capture_net.0, ..., escaped, prior
    - |tensor|
-   - Of a log density: features of the grid, the weight matrices of its two networks, the logit where no surface is met,
-     and the table of the log of the density that does not depend on the position.
+   - For a log density: features of the grid, weight matrices of both networks, the logit of directions without a
+     surface, and the table of the log of the position-independent prior.
    - |exposed|, |differentiable|
 
-How much surfaces attract an observer: equation 1 of the paper,
-:math:`G(p_{od}, p_o) = F_e(p_{od}, -r_o) \cdot \mathrm{sigmoid}(F_c(p_o, r_o))`, a density in 1/sr over the directions
-around the observer. It is the ``gaze`` of the integrator :ref:`nerg <integrator-nerg>`; having two positions for an
-argument, it cannot be evaluated as a plain volume. A field that was trained on a radiance field's features
-(``nerg train gaze --semantic``) needs that radiance field beside it, as the integrator's ``field``.
+How much surfaces attract an observer: equation 1 of the paper, :math:`G(p_{od}, p_o) = F_e(p_{od}, -r_o) \cdot
+\mathrm{sigmoid}(F_c(p_o, r_o))`, a density in 1/sr over the directions around the observer. It is the ``gaze`` of the
+integrator :ref:`nerg <integrator-nerg>`; since it depends on two positions, it cannot be evaluated as a plain volume. A
+field that was trained on the features of a radiance field (``nerg train gaze --semantic``) needs that radiance field as
+the integrator's ``field``.
 
-Of an ensemble (``nerg train gaze --ensemble``) gaze is the mean of the members, each normalised by itself where it is
-normalised, and the integrator knows their standard deviation (its AOV ``gaze_std``). The checkpoint also says how many
-rays there were around a position (``support``).
+For an ensemble (``nerg train gaze --ensemble``) gaze is the mean of the members, each normalised separately if it is
+normalised; the AOV ``gaze_std`` of the integrator shows their standard deviation. The checkpoint also stores the number
+of training rays near a position (AOV ``support``).
 
 .. tabs::
     .. code-tab:: xml
@@ -74,7 +73,7 @@ from nerg_mi.fields.gaze_base import AnyGazeField, kinds
 from nerg_mi.fields.mlp import namespace, set_constant_weights
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.maths.geometry import Similarity
-from nerg_mi.properties import read_boolean, load_network, read_transform, make_volume_class
+from nerg_mi.properties import load_network, make_volume_class, read_boolean, read_transform
 from nerg_mi.registration import register
 from nerg_mi.transport.observer_gaze import GazeFieldInstance
 
@@ -84,7 +83,7 @@ class GazeFieldVolume(make_volume_class()):
     plugin = "gazefield"
 
     def __init__(self, props, network=None):
-        # ``network``: a field in memory in place of a file; see ``of``.
+        # ``network``: a field in memory instead of a file; see ``of``.
         super().__init__(props)
         self.field, self.metadata, self.filename = load_network(props, network, load_gaze, namespace(mi.Float))
         self._similarity = Similarity(read_transform(props, "to_world"))
@@ -94,10 +93,12 @@ class GazeFieldVolume(make_volume_class()):
     @staticmethod
     def check(network: AnyGazeField) -> None:
         if getattr(network, "kind", None) not in kinds():
-            raise NergError(f"a gaze field in memory is needed, got {type(network).__name__}; load one from its file")
+            raise NergError(
+                f"expected a gaze field in memory, got {type(network).__name__}; load it from its file first"
+            )
 
     def placed_gaze(self) -> GazeFieldInstance:
-        """The gaze field as the integrator sees it."""
+        """The gaze field for the integrator."""
         return GazeFieldInstance(self.field, self._similarity)
 
     def bounds(self):
@@ -105,8 +106,12 @@ class GazeFieldVolume(make_volume_class()):
 
     def describe(self):
         c = self.field.config
-        about = {"filename": self.filename, "members": len(self.field.members), "variant": c.variant}
-        return {**about, "normalized": c.normalized, **{k: v for k, v in c.to_dict().items() if k not in about}}
+        properties = {"filename": self.filename, "members": len(self.field.members), "variant": c.variant}
+        return {
+            **properties,
+            "normalized": c.normalized,
+            **{k: v for k, v in c.to_dict().items() if k not in properties},
+        }
 
 
 register("volume", "gazefield", GazeFieldVolume)

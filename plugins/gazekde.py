@@ -8,27 +8,29 @@ Kernel density of tracked rays (:monosp:`gazekde`)
 
  * - filename
    - |string|
-   - Rays file (``.npz`` or ``.parquet``) as ``nerg rays import`` writes it. Relative names are looked up beside the
-     scene file.
+   - Rays file (``.npz`` or ``.parquet``) written by ``nerg rays import``. Relative names are resolved in the folder of
+     the scene file.
 
  * - count
    - |int|
-   - How many of the rays that started nearest to the observer count. (Default: 4096)
+   - Number of rays, those that started nearest to the observer. (Default: 4096)
 
  * - kappa
    - |float|
-   - Concentration of the von Mises-Fisher kernel of each ray. (Default: 20, that of the truth in ``nerg eval gaze``)
+   - Concentration of the von Mises-Fisher kernel of each ray. (Default: 20, as for the ground truth of ``nerg eval
+     gaze``)
 
  * - to_world
    - |transform|
-   - A rotation, a uniform scale and a translation from the rays' frame to the scene's. For rays that a gaze field was
-     trained on: the field's own ``to_world`` after the similarity of ``nerg train gaze --align``. (Default: none)
+   - Rotation, uniform scale and translation from the rays' frame to the scene's. For the training rays of a gaze field:
+     the field's own ``to_world`` combined with the similarity of ``nerg train gaze --align``, which is applied first.
+     (Default: none)
 
-Where people around the observer really looked, as a density in 1/sr: the ground truth beside a gaze field (NeRG,
-Section 5.3). It is the ``kde`` of the integrator :ref:`nerg <integrator-nerg>`, whose AOV ``kde`` shows it on the
-surfaces that the camera sees; it cannot be evaluated as a plain volume. Rays are gathered once an observer. Pictures of
-4,096 pixels or more (and of 165 kappa or more) look the density up in a table (within 1e-4 of the highest density of
-one ray's kernel), smaller ones sum all rays at each pixel.
+Where participants near the observer looked, as a density in 1/sr: the ground truth for a gaze field (NeRG, Section
+5.3). It is the ``kde`` of the integrator :ref:`nerg <integrator-nerg>`, whose AOV ``kde`` shows it on the surfaces that
+the camera sees; it cannot be evaluated as a plain volume. Rays are collected once per observer. Images of at least
+4,096 pixels (and of at least 165 kappa pixels) interpolate the density in a table (within 1e-4 of the maximum density
+of one ray's kernel); smaller ones sum all rays for each pixel.
 
 .. tabs::
     .. code-tab:: xml
@@ -56,7 +58,7 @@ import mitsuba as mi
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.probes.kde_view import KdeView
-from nerg_mi.properties import read_integer, read_number, resolve_scene_file, read_string, read_transform
+from nerg_mi.properties import read_integer, read_number, read_string, read_transform, resolve_scene_file
 from nerg_mi.ranges import Range
 from nerg_mi.rays.rays import Rays
 from nerg_mi.registration import register
@@ -68,7 +70,10 @@ class GazeKdeVolume(mi.Volume):
     def __init__(self, props):
         super().__init__(props)
         self.filename = resolve_scene_file(read_string(props, "filename"))
-        count, kappa = read_integer(props, "count", 4096, Range(1, 1 << 24)), read_number(props, "kappa", 20.0, Range(0, 1e8))
+        count, kappa = (
+            read_integer(props, "count", 4096, Range(1, 1 << 24)),
+            read_number(props, "kappa", 20.0, Range(0, 1e8)),
+        )
         to_world = Similarity(read_transform(props, "to_world"))
         rays = Rays.load(self.filename)
         self.rays = len(rays)
@@ -76,7 +81,7 @@ class GazeKdeVolume(mi.Volume):
         self._bounds = to_world.bounds(rays.origin.min(axis=0), rays.origin.max(axis=0))
 
     def kde_view(self) -> KdeView:
-        """The density as the integrator sees it."""
+        """The density for the integrator."""
         return self._view
 
     def bbox(self):

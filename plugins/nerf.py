@@ -1,47 +1,45 @@
 r"""
 .. _volume-nerf:
 
-Trained radiance field (:monosp:`nerf`)
----------------------------------------
+Radiance field (:monosp:`nerf`)
+-------------------------------
 
 .. pluginparameters::
 
  * - filename
    - |string|
-   - Checkpoint (safetensors) written by ``nerg train radiance`` or ``nerg_mi.formats.fields.save_radiance``.
-     Relative names are looked up beside the scene file.
+   - Checkpoint (safetensors) written by ``nerg train radiance`` or ``nerg_mi.formats.fields.save_radiance``. Relative
+     names are resolved in the folder of the scene file.
 
  * - to_world
    - |transform|
-   - A rotation, a uniform scale and a translation that place the field in the scene. Under a scale of :math:`s` the
-     density becomes :math:`\sigma / s`, so that opacities do not change. (Default: none)
+   - Rotation, uniform scale and translation of the field in the scene. A scale of :math:`s` turns density into
+     :math:`\sigma / s`, so that opacities do not change. (Default: none)
 
  * - max_density
    - |float|
-   - For Mitsuba's own media only, which need a bound: what ``eval_1`` returns at most, in 1 / scene unit. Times the
-     longest way through the box it should stay below 50: a path tracer's work grows with it, and more is opaque anyway.
-     :ref:`nerg <integrator-nerg>` knows nothing of it. (Default: 0, no bound, and no use in media)
+   - Upper bound of ``eval_1`` in 1/scene unit, for Mitsuba's own media, which require one. Its product with the longest
+     path through the box should stay below 50: the cost of a path tracer grows with it, and larger values are opaque
+     anyway. Not used by :ref:`nerg <integrator-nerg>`. (Default: 0, no bound; the volume cannot be used in media)
 
  * - constant_weights
    - |bool|
-   - Write the weights of the networks into the kernels, for many large frames of one field: the same pictures to the
-     bit in less time, after some seconds of compilation for each size of picture (docs/explanation/performance.md, "Weights as
-     constants"). Only on processors, and where nothing is differentiated; weights that change often are not for it.
-     (Default: false)
+   - Write the weights of the networks into the kernels as literals: bit-identical images in less time, after some
+     seconds of compilation for each image size (docs/explanation/performance.md, "Weights as constants"). For many
+     large frames of one field; only on CPUs, without derivatives, and for weights that rarely change. (Default: false)
 
  * - grid.table, density_net.0, ..., color_net.0, ...
    - |tensor|
-   - Features of the grid and the weight matrices of both networks.
+   - Features of the grid and weight matrices of both networks.
    - |exposed|, |differentiable|
 
-Density and view-dependent colour of a place, as a multiresolution hash grid with two small networks. The second is
-asked for the colour of every sample of a ray; of a checkpoint that was trained so (``nerg train radiance --deferred``)
-once a ray, with the mean of what the first says of its samples (Hedman et al. 2021). It is meant as the ``field`` of
-the integrator :ref:`nerg <integrator-nerg>`. As a plain volume it returns the density, in 1 / scene unit,
-through ``eval_1``: 0 outside of ``bbox()``, and in the cells that the checkpoint's occupancy grid calls empty, which
-are vacuum by definition: training has left them unsampled, and whatever the networks say there is skipped when
-marching. With ``max_density`` it serves as ``sigma_t`` of a ``heterogeneous`` medium. (A plain volume is not told the
-direction that its colour depends on.)
+Density and view-dependent colour of a scene: a multiresolution hash grid with two small networks. The colour network is
+evaluated at each sample of a ray; for a checkpoint with deferred shading (``nerg train radiance --deferred``) once per
+ray, on the mean features of its samples (Hedman et al. 2021). The volume is meant as the ``field`` of the integrator
+:ref:`nerg <integrator-nerg>`. As a plain volume it returns the density in 1/scene unit through ``eval_1``. The density
+is 0 outside ``bbox()``, and in the empty cells of the checkpoint's occupancy grid: training does not sample these, and
+marching skips them. With ``max_density`` it can be the ``sigma_t`` of a ``heterogeneous`` medium. (A plain volume has
+no colour, since it is not given the direction.)
 
 .. tabs::
     .. code-tab:: xml
@@ -71,7 +69,7 @@ from nerg_mi.fields.mlp import namespace, set_constant_weights
 from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.formats.fields import load_radiance
 from nerg_mi.maths.geometry import Similarity
-from nerg_mi.properties import read_boolean, read_number, load_network, read_transform, make_volume_class
+from nerg_mi.properties import load_network, make_volume_class, read_boolean, read_number, read_transform
 from nerg_mi.ranges import POSITIVE_VALUES, Range
 from nerg_mi.registration import register
 from nerg_mi.transport.field_medium import FieldMedium
@@ -82,10 +80,10 @@ class NerfVolume(make_volume_class()):
     plugin = "nerf"
 
     def __init__(self, props, network=None):
-        # ``network``: a field in memory in place of a file; see ``of``.
+        # ``network``: a field in memory instead of a file; see ``of``.
         similarity = Similarity(read_transform(props, "to_world"))
         field, metadata, filename = load_network(props, network, load_radiance, namespace(mi.Float))
-        # Mitsuba's own media ask the base class, not bbox(): it makes its box from the unit cube.
+        # Mitsuba's own media use the box of the base class, which it derives from the unit cube, and not bbox().
         lower, upper = similarity.bounds(field.box.lower, field.box.upper)
         props["to_world"] = mi.ScalarTransform4f().translate(lower.tolist()).scale((upper - lower).tolist())
         super().__init__(props)
@@ -98,21 +96,21 @@ class NerfVolume(make_volume_class()):
     def check(network: RadianceField) -> None:
         if not isinstance(network, RadianceField):
             raise NergError(
-                f"a radiance field in memory is needed, got {type(network).__name__}; load one from its file"
+                f"expected a radiance field in memory, got {type(network).__name__}; load it from its file first"
             )
 
     def medium(self) -> FieldMedium:
-        """The field as the marcher sees it."""
+        """The field as a medium."""
         return FieldMedium(self.field, self._similarity)
 
     def eval_1(self, it: Any, active: Any = True):
-        sigma = self.medium().occupied_density(self._similarity.point_to_local(it.p), active)
+        sigma = self.medium().density_in_occupied_cells(self._similarity.point_to_local(it.p), active)
         return dr.minimum(sigma, self.max_density) if self.max_density else sigma
 
     def max(self):
         if not self.max_density:
             raise NergError(
-                f'a medium needs a bound on the density of "{self.filename}": give the volume a "max_density"'
+                f'a medium needs an upper bound of the density of "{self.filename}"; set "max_density" of the volume'
             )
         return self.max_density
 
@@ -125,7 +123,7 @@ class NerfVolume(make_volume_class()):
         return {
             "filename": self.filename,
             "grid": c.grid.describe(),
-            "networks": f"{c.density_sizes}, {c.color_sizes}{' (once a ray)' if c.deferred else ''}",
+            "networks": f"{c.density_sizes}, {c.color_sizes}{' (once per ray)' if c.deferred else ''}",
             "bbox": f"{lower.round(4).tolist()} to {upper.round(4).tolist()}",
             "color_space": self.field.color_space,
         }

@@ -8,22 +8,22 @@ Neural radiance and gaze fields (:monosp:`nerg`)
 
  * - field
    - :paramtype:`volume`
-   - A trained radiance field (:ref:`nerf <volume-nerf>`): density and colour. Either this, or ``density``, or neither:
-     the shapes of the scene are then all there is, and nothing is marched.
+   - Radiance field (:ref:`nerf <volume-nerf>`) or Gaussian splats (:ref:`splats <volume-splats>`): density and colour.
+     Alternative to ``density``. Without either, only the shapes of the scene are rendered, and nothing is marched.
 
  * - density, color
    - :paramtype:`volume`
-   - Any Mitsuba volumes: density in 1 / scene unit (first channel), and colour (optional; black without it). Outside of
-     the bounding box of ``density`` there is vacuum.
+   - Any Mitsuba volumes: density in 1/scene unit (first channel), and colour (optional; black by default). There is
+     vacuum outside the bounding box of ``density``.
 
  * - gaze
    - :paramtype:`volume`
-   - A trained gaze field (:ref:`gazefield <volume-gazefield>`). Without it no gaze is computed.
+   - Gaze field (:ref:`gazefield <volume-gazefield>`). Without it no gaze is computed.
 
  * - (nested)
    - :paramtype:`integrator`
-   - Lights the shapes of the scene; its AOVs follow ours. Without one it is ``path`` where the scene has emitters, and
-     shapes show their plain albedo where it has none.
+   - Lights the shapes of the scene; its AOVs follow those of ``nerg``. Without one, ``path`` lights the shapes of a
+     scene with emitters, and the shapes of other scenes show their albedo.
 
  * - kde
    - :paramtype:`volume`
@@ -31,40 +31,42 @@ Neural radiance and gaze fields (:monosp:`nerg`)
 
  * - observer
    - :paramtype:`sensor`
-   - Whose gaze it is; only its position counts. Without it the observer is the centre of the rendering camera, and an
-     observer placed exactly there gives the same picture. Cameras without a centre (orthographic, say) need one.
+   - Observer whose gaze is shown; only the position counts. By default the observer is at the centre of the rendering
+     camera, and an observer placed exactly there gives the same image. Cameras without a centre (e.g. orthographic
+     ones) require an observer.
    - |exposed|
 
  * - occlusion
    - |bool|
-   - Hide gaze on surfaces that the observer cannot see. Not needed, and not computed, while the observer is the camera.
-     (Default: true)
+   - Hide gaze on surfaces that the observer cannot see. Skipped if the observer is at the camera. (Default: true)
 
  * - falloff
    - |float|
-   - :math:`d_f`, in scene units: how far behind what the observer sees gaze fades to zero; 0 is a hard edge.
+   - :math:`d_f`: distance in scene units over which gaze fades to zero behind an occluder; 0 gives a hard edge.
      (Default: 0.1)
    - |exposed|, |differentiable|
 
  * - tolerance
    - |float|
-   - {apart} (Default: 0)
+   - {depth_tolerance} (Default: 0)
 
  * - visibility
    - |string|
-   - How occlusion is decided. ``depth``: what the observer meets is compared with the distance to the surface (the
-     paper). ``transmittance``: the share of light that passes between observer and surface; ``falloff`` has no part in
-     it. ``map``: as ``depth``, with depths and gaze around the observer computed once for all directions and kept until
-     the observer, the field or a shape changes; right for many pixels or frames of one observer. Its depths carry no
-     derivatives; gaze is then looked up only while none of it are wanted either. (Default: ``depth``)
+   - How occlusion is decided. ``depth``: the depth along the observer's ray is compared with the distance to the
+     surface (as in the paper). ``transmittance``: the fraction of light that passes between observer and surface;
+     ``falloff`` is not used. ``map``: like ``depth``, with a depth and gaze map around the observer that is computed
+     once and kept until the observer, the field or a shape changes; best for many pixels or frames of one observer.
+     Depths of the map carry no derivatives, and gaze is only looked up if no derivatives are needed. (Default:
+     ``depth``)
 
  * - map_height
    - |int|
-   - Rows of the ``map``; it has twice as many columns. More of them for fine silhouettes. (Default: 512)
+   - Rows of the ``map``; it has twice as many columns. Increase it for fine silhouettes. (Default: 512)
 
  * - directions
    - |int|
-   - Of the integral that a *normalised* gaze field is divided by, for each observer, at most. (Default: 131072)
+   - Maximum number of directions of the integral over each observer's sphere that a *normalised* gaze field is divided
+     by. (Default: 131072)
 
  * - integral_tolerance
    - |float|
@@ -72,19 +74,19 @@ Neural radiance and gaze fields (:monosp:`nerg`)
 
  * - depth
    - |string|
-   - {depths} The surface that gaze is evaluated on lies there. (Default: ``median``)
+   - Kind of depth: the surface on which gaze is evaluated. {depths} (Default: ``median``)
 
  * - surface_opacity
    - |float|
-   - Opacity from which on a ray is said to meet a surface; position, gaze and visibility are 0 below it. (Default: 0.5)
+   - Minimum opacity of a surface; position, gaze and visibility are 0 below it. (Default: 0.5)
 
  * - radiance
    - |bool|
-   - false computes no colour: the image is black, the AOVs are unchanged. (Default: true)
+   - Compute colour; if false, the image is black and the AOVs are unchanged. (Default: true)
 
  * - background
    - |float| or |rgb|
-   - Linear radiance behind everything; an environment emitter of the scene takes its place. (Default: 0)
+   - Linear radiance behind everything; an environment emitter of the scene replaces it. (Default: 0)
 
  * - ceiling
    - |float|
@@ -92,26 +94,26 @@ Neural radiance and gaze fields (:monosp:`nerg`)
 
  * - up
    - |vector|
-   - Along which ``ceiling`` is measured. (Default: 0, 0, 1)
+   - Direction along which ``ceiling`` is measured. (Default: 0, 0, 1)
 
  * - aovs
    - |string|
-   - What to compute, in the order wanted, with commas between; see below. (Default: ``depth,opacity``)
+   - AOVs to compute, in order, separated by commas; see below. (Default: ``depth,opacity``)
 
  * - step
    - |float|
-   - March step in scene units; 0 stands for the one that the field was trained with, or for a 1024th of the medium's
-     diagonal. Less for exact depths, and for sheets that are thinner. (Default: 0)
+   - March step in scene units; 0: the step of the field's training, or 1/1024 of the medium's diagonal. Decrease it for
+     exact depths and for thin sheets. (Default: 0)
 
  * - quadrature
    - |string|
-   - {quadratures} (Default: ``constant``)
+   - Quadrature rule. {quadratures} (Default: ``constant``)
 
  * - coarse
    - |float|
-   - Steps in front of all matter are this many times longer; a first, density-only march finds where matter begins.
-     What is thinner than such a step may be missed: for thick matter in a volume whose empty space is not known. 1 does
-     without. (Default: 1)
+   - Factor by which steps in front of all matter are longer; a density-only pre-pass finds where matter begins. Matter
+     thinner than such a step can be missed: use it for thick matter in a volume without known empty space. 1 disables
+     the pre-pass. (Default: 1)
 
  * - dt_gamma
    - |float|
@@ -123,7 +125,7 @@ Neural radiance and gaze fields (:monosp:`nerg`)
 
  * - color_cutoff
    - |float|
-   - Samples that contribute less than this weight get no colour. (Default: 1e-3)
+   - Minimum weight of a sample for which colour is evaluated. (Default: 1e-3)
 
  * - refined
    - |bool|
@@ -131,47 +133,46 @@ Neural radiance and gaze fields (:monosp:`nerg`)
 
  * - jitter
    - |bool|
-   - Shift the steps of each sample by a random share of a step, for noise in place of bands. (Default: false)
+   - Shift the steps of each sample by a random fraction of a step, which replaces banding by noise. (Default: false)
 
-What each of the defaults gains and costs is measured in docs/explanation/error-and-time.md ("Defaults").
+docs/explanation/error-and-time.md ("Defaults") measures the benefit and the cost of each default.
 
-This integrator marches a radiance field, or any pair of volumes, and evaluates a gaze field on the surface that each
-ray meets: :math:`G(p_{od}, p_o) = F_e(p_{od}, -r_o)\,\mathrm{sigmoid}(F_c(p_o, r_o))` (equation 1 of the paper), with
-:math:`p_o` the observer, :math:`r_o` the direction to the surface and :math:`p_{od}` the surface that the *observer*
-meets along it. For an observer who is not the camera, a second, density-only march from :math:`p_o` finds
-:math:`p_{od}` and the visibility :math:`1 - \mathrm{clip}((d_{o*} - d_o - \mathrm{tolerance}) / d_f, 0, 1)` that gaze
-is multiplied with.
+This integrator marches through a radiance field, or any pair of volumes, and evaluates a gaze field on the surface that
+each ray meets: :math:`G(p_{od}, p_o) = F_e(p_{od}, -r_o)\,\mathrm{sigmoid}(F_c(p_o, r_o))` (equation 1 of the paper),
+with the observer :math:`p_o`, the direction :math:`r_o` to the surface, and the surface :math:`p_{od}` that the
+*observer* sees along it. If the observer is not at the camera, a second, density-only march from :math:`p_o` finds
+:math:`p_{od}` and the visibility :math:`1 - \mathrm{clip}((d_{o*} - d_o - \mathrm{tolerance}) / d_f, 0, 1)`, by which
+gaze is multiplied.
 
-AOVs (0 where nothing is met):
+AOVs (0 on rays without a surface):
 
 {aovs}
 
-Colours are composited in the colour space that the field was trained in, then converted to linear:
-:math:`L = \alpha\,\mathrm{lin}(C / \alpha) + (1 - \alpha) L_{behind}`. Mono variants receive the luminance. The film's
-alpha is 1 wherever opacity > 0 or an environment emitter shows (not with ``hide_emitters``), as in other integrators;
-use the ``opacity`` AOV for the fractional one.
+Colours are composited in the colour space of the field's training, then converted to linear: :math:`L =
+\alpha\,\mathrm{lin}(C / \alpha) + (1 - \alpha) L_{behind}`. Mono variants use the luminance. The film's alpha is 1
+wherever opacity > 0 or an environment emitter is visible (not with ``hide_emitters``), as in other integrators; the AOV
+``opacity`` is the fractional opacity.
 
 Use a box filter and ``component_format`` ``float32`` for AOVs: other filters blend depths across edges, and fp16 rounds
-them. With a box filter equal seeds give equal pictures to the bit.
+them. With a box filter equal seeds give bit-identical images.
 
-Densities that are negative or NaN count as 0, infinite ones as 1e30 (a checkpoint with weights that are not finite is
-refused when it is loaded; weights set later are not looked at).
+Negative and NaN densities count as 0, infinite ones as 1e30. A checkpoint with non-finite weights is rejected when it
+is loaded; weights that are set later are not checked.
 
-Derivatives reach field and gaze weights, volumes, ``falloff``, camera and observer positions, in forward and in reverse
-mode, with memory that does not grow with the number of steps. They do not see the edges of visibility, nor where
-marching stops. In a ``batch`` of cameras, those of poses exist in reverse mode only. Empty voxels of a ``gridvolume``
-are skipped: change its data through the scene's or the integrator's parameters (``mi.traverse``), whose ``update()``
-refreshes what is known to be empty.
+Derivatives reach field and gaze weights, volumes, ``falloff``, camera and observer positions, in forward and reverse
+mode, with memory that does not grow with the number of steps. They ignore visibility edges and the end of the march.
+For a ``batch`` of cameras, derivatives with respect to poses exist in reverse mode only. Empty voxels of a
+``gridvolume`` are skipped: change its data through the parameters of the scene or of the integrator (``mi.traverse``),
+whose ``update()`` refreshes the occupancy.
 
 Shapes of the scene hide the field behind them, from the camera and from the observer, and the field in front of them
-attenuates them. Depth on a shape is that of the exact ray cast, and gaze is evaluated there as on any surface. Light
-does not pass between the two: a shape casts no shadow on the field, whose light is baked in, nor the field on a shape.
-The radiance of the default ``path`` carries no derivatives (nest ``direct``); distances to shapes do, except over
-silhouettes.
+attenuates them. Depth on a shape is that of the exact ray cast, and gaze is evaluated there as on any surface. There is
+no light transport between both: a shape casts no shadow on the field, whose light is baked in, and the field casts none
+on a shape. The radiance of the default ``path`` carries no derivatives (nest ``direct`` instead); distances to shapes
+do, except across silhouettes.
 
-Inside of another integrator (``aov``, ``moment``) the camera is looked for among the scene's sensors; give
-``mi.render`` one of these, or the integrator an explicit ``observer``. Spectral and polarized variants are not
-supported.
+Inside another integrator (``aov``, ``moment``) the camera is searched among the scene's sensors; pass one of these to
+``mi.render``, or give the integrator an explicit ``observer``. Spectral and polarized variants are not supported.
 
 .. tabs::
     .. code-tab:: xml
@@ -215,129 +216,137 @@ import mitsuba as mi
 from nerg_mi.errors import NergError
 from nerg_mi.interruption import restore_interrupt_handler
 from nerg_mi.maths.types import variant_types
-from nerg_mi.properties import read_boolean, read_choice, read_color, read_integer, read_number, read_string, read_vector
+from nerg_mi.properties import (
+    read_boolean,
+    read_choice,
+    read_color,
+    read_integer,
+    read_number,
+    read_string,
+    read_vector,
+)
 from nerg_mi.ranges import COORDINATES, MAX_COORDINATE, POSITIVE_VALUES, Range
 from nerg_mi.registration import register
 from nerg_mi.transport import aovs as nerg_aovs
 from nerg_mi.transport import observer
 from nerg_mi.transport.depth import DEPTHS
 from nerg_mi.transport.geometry import Ceiling, Shading
-from nerg_mi.transport.jit import no_collection, recording
-from nerg_mi.transport.march_primal import MarchSettings, default_growth, default_step, default_stop
+from nerg_mi.transport.jit import gc_paused, is_recording
+from nerg_mi.transport.march_primal import MarchSettings, default_dt_gamma, default_step, default_stop
 from nerg_mi.transport.medium import Medium
-from nerg_mi.transport.observer import VISIBILITIES, ObserverCache, ObserverSettings, sensor_center, check_center
+from nerg_mi.transport.observer import VISIBILITIES, ObserverCache, ObserverSettings, check_center, sensor_center
 from nerg_mi.transport.observer_gaze import GazeFieldInstance
-from nerg_mi.transport.quadrature import RULES, boundaries
-from nerg_mi.transport.volume_medium import KnownEmpty, VolumeMedium
+from nerg_mi.transport.quadrature import RULES, cells_for_rule
+from nerg_mi.transport.volume_medium import FrozenBound, VolumeMedium
 
 from .nerg_pixel import RenderContext
 
 # ---- Parameters ----
 
-TEXTS = {
-    "ceiling": "Height above which a place is left out of what cameras see from above it, so that a roof hides no "
-    "room: rays that start higher begin where they come below it; depths still count from the camera. What observers "
-    "see is not cut. (Default: none)",
-    "apart": "How far apart the camera's and the observer's idea of a surface may be, in scene units; 0 stands "
-    "for two march steps, or, without a field, for 1e-4 of the scene's diagonal (or of twice the larger distance of "
-    "surface and observer from the origin, if that is less: a far-away sky dome does not blunt shadows). The "
-    "point that the observer looks for lies this far, and as far as light goes into the surface (at most a 64th "
-    "of the depth), in front of the camera's surface, so that no surface hides itself. More than 1e18 counts as "
-    "that.",
-    "integral_tolerance": "Error of that integral, as a share of it, below which fewer directions will do: told by the "
-    "scatter of parts of the sum, which tells more than there is as a rule. 0: always as many; so it is, too, in what "
+PARAMETER_TEXTS = {
+    "ceiling": "Height of a clipping plane for cameras above it, so that a roof does not hide the rooms below: rays "
+    "that start above the plane begin where they cross it; depths are still measured from the camera. Observer rays "
+    "are not clipped. (Default: none)",
+    "depth_tolerance": "Depth tolerance between the camera's and the observer's surface, in scene units; 0: two march "
+    "steps, "
+    "or, without a field, 1e-4 of the scene's diagonal (or of twice the larger distance of surface and observer from "
+    "the origin, if that is less, so that a distant sky dome does not blur shadows). The target of the observer's ray "
+    "lies in front of the camera's surface by this distance plus the penetration depth of light (at most 1/64 of the "
+    "depth), so that no surface hides itself. Limited to 1e18.",
+    "integral_tolerance": "Relative error of that integral below which fewer directions are used; estimated from the "
+    "scatter of partial sums, usually too high. 0: always use the maximum number, which also applies to functions that "
     "``dr.freeze`` records.",
-    "dt_gamma": "Steps are at least this share of the distance travelled: for wide views, whose far parts need no "
-    "short steps. (Default: 0, i.e. uniform steps; for a field without an end that which it was trained with)",
-    "stop": "Transmittance below which what lies behind is left out: what then lacks of an expected depth is 16 times "
-    "that, in mean free paths.",
-    "refined": "Skip the parts of a field's occupied cells in which nothing was found when it was trained or refined "
-    "(``nerg refine``); false: only its empty cells.",
+    "dt_gamma": "Minimum step as a fraction of the distance travelled: for wide views, whose distant parts need no "
+    "short steps. (Default: 0, i.e. uniform steps; for an unbounded field the value of its training)",
+    "stop": "Transmittance below which the march ends; the error of an expected depth is 16 times this value, in mean "
+    "free paths.",
+    "refined": "Skip the parts of a field's occupied cells in which its training or ``nerg refine`` found no density; "
+    "false: skip only its empty cells.",
 }
 
 
-def complete(manual: str) -> str:
-    """The ``manual`` with the kinds of depth and of quadrature that are registered, and what else is said here."""
-    texts = {"quadratures": RULES.format_manual(), "depths": DEPTHS.format_manual(), **TEXTS}
+def fill_manual(manual: str) -> str:
+    """``manual`` with all registered kinds of depth and quadrature, and the texts above."""
+    texts = {"quadratures": RULES.format_manual(), "depths": DEPTHS.format_manual(), **PARAMETER_TEXTS}
     for name, sentence in texts.items():
         manual = manual.replace(f"{{{name}}}", sentence)
     return manual
 
 
 def read_children(props) -> dict:
-    """The objects that ``props`` names, or None, and the nested ``integrator``. Raises ``NergError`` for one that is
-    not what its name asks for."""
-    found = {name: props.get(name, None) for name in ("field", "density", "color", "gaze", "kde", "observer")}
-    if found["gaze"] is not None and not hasattr(found["gaze"], "placed_gaze"):
+    """The objects among ``props`` by name, or None, and the nested ``integrator``. Raises ``NergError`` for an object
+    of the wrong type."""
+    children = {name: props.get(name, None) for name in ("field", "density", "color", "gaze", "kde", "observer")}
+    if children["gaze"] is not None and not hasattr(children["gaze"], "placed_gaze"):
         raise NergError('"gaze" must be a volume of type "gazefield"')
-    if found["kde"] is not None and not hasattr(found["kde"], "kde_view"):
+    if children["kde"] is not None and not hasattr(children["kde"], "kde_view"):
         raise NergError('"kde" must be a volume of type "gazekde"')
-    if found["observer"] is not None and not isinstance(found["observer"], mi.Sensor):
+    if children["observer"] is not None and not isinstance(children["observer"], mi.Sensor):
         raise NergError('"observer" must be a sensor; its to_world places the observer')
-    return found | {"integrator": _nested(props)}
+    return children | {"integrator": _nested(props)}
 
 
 def _nested(props):
-    found = [(name, child) for name, child in props.objects() if isinstance(child, mi.Integrator)]
-    for name, _ in found:
+    nested = [(name, child) for name, child in props.objects() if isinstance(child, mi.Integrator)]
+    for name, _ in nested:
         props.mark_queried(name)
-    if len(found) > 1:
-        raise NergError(f'"nerg" takes one nested integrator, got {len(found)}')
-    return found[0][1] if found else None
+    if len(nested) > 1:
+        raise NergError(f'"nerg" takes one nested integrator, got {len(nested)}')
+    return nested[0][1] if nested else None
 
 
 def check_observer(observer) -> None:
-    """Raise ``NergError`` for an observer (a sensor, or None) who stands nowhere, or too far away."""
+    """Raise ``NergError`` for an observer (a sensor, or None) without a finite position within range."""
     if observer is not None:
         check_center(observer, '"observer"')
         if not dr.all(dr.abs(dr.detach(sensor_center(observer))) <= MAX_COORDINATE, axis=None):
             raise NergError(
-                f'"observer" stands at a position that is not finite, or beyond {MAX_COORDINATE:g}; correct its to_world'
+                f'the position of "observer" is not finite or beyond {MAX_COORDINATE:g}; correct its to_world'
             )
 
 
-def medium_of(children: dict) -> tuple[Medium | None, KnownEmpty | None]:
-    """What is marched: the ``field``, or ``density`` and ``color``, or nothing; and what of the latter is skipped."""
-    field, density, paint = (children[name] for name in ("field", "density", "color"))
+def make_medium(children: dict) -> tuple[Medium | None, FrozenBound | None]:
+    """The medium: the ``field``, or ``density`` and ``color``, or none; and its occupancy bound for ``dr.freeze``."""
+    field, density, color = (children[name] for name in ("field", "density", "color"))
     if field is not None and density is not None:
-        raise NergError('"nerg" takes either "field" (a volume of type "nerf") or "density" (any volume), and not both')
+        raise NergError('"nerg" takes either "field" (a volume of type "nerf") or "density" (any volume), not both')
     if field is not None:
-        if paint is not None:
+        if color is not None:
             raise NergError('"color" goes with "density"; a "field" brings its own colour')
         if not hasattr(field, "medium"):
             raise NergError(
-                '"field" must be a volume of type "nerf" or "splats"; give other volumes as "density" and "color"'
+                '"field" must be a volume of type "nerf" or "splats"; use other volumes as "density" and "color"'
             )
         return field.medium(), None
     if density is None:
-        if paint is not None:
+        if color is not None:
             raise NergError('"color" goes with "density", which is missing')
         return None, None
-    for name, volume in (("density", density), ("color", paint)):
+    for name, volume in (("density", density), ("color", color)):
         if volume is not None and not isinstance(volume, mi.Volume):
             raise NergError(f'"{name}" must be a volume')
-    medium = VolumeMedium(density, paint)
-    return medium, KnownEmpty(medium)
+    medium = VolumeMedium(density, color)
+    return medium, FrozenBound(medium)
 
 
-def gaze_of(children: dict, medium: Medium | None) -> GazeFieldInstance | None:
-    """The gaze field, whose features the medium must have."""
+def make_gaze(children: dict, medium: Medium | None) -> GazeFieldInstance | None:
+    """The gaze field. Raises ``NergError`` if the medium lacks the features that it needs."""
     if children["gaze"] is None:
         return None
     gaze = children["gaze"].placed_gaze()
-    wanted, given = gaze.field.config.features, None if children["field"] is None else medium
-    if wanted and (given is None or given.feature_count != wanted):
-        has = "there is none" if given is None else f"that has {given.feature_count}"
-        raise NergError(f'the "gaze" field asks for {wanted} semantic features of a "field", but {has}')
+    num_features, feature_medium = gaze.field.config.features, None if children["field"] is None else medium
+    if num_features and (feature_medium is None or feature_medium.feature_count != num_features):
+        reason = "there is none" if feature_medium is None else f"it has {feature_medium.feature_count}"
+        raise NergError(f'the "gaze" field needs {num_features} semantic features of a "field", but {reason}')
     return gaze
 
 
-def march_settings(props, medium: Medium | None) -> MarchSettings:
-    """Of the camera's and the observer's rays."""
+def read_march_settings(props, medium: Medium | None) -> MarchSettings:
+    """March settings of camera and observer rays."""
     step = read_number(props, "step", 0, Range(0, MAX_COORDINATE))
     settings = MarchSettings(
         step=step or default_step(medium),
-        dt_gamma=read_number(props, "dt_gamma", default_growth(medium), Range(0, 1)),
+        dt_gamma=read_number(props, "dt_gamma", default_dt_gamma(medium), Range(0, 1)),
         stop=read_number(props, "stop", default_stop(medium), Range(0, 1)),
         color_cutoff=read_number(props, "color_cutoff", MarchSettings.color_cutoff, Range(0, 1)),
         quadrature=read_choice(props, "quadrature", MarchSettings.quadrature, RULES.names()),
@@ -346,12 +355,12 @@ def march_settings(props, medium: Medium | None) -> MarchSettings:
         cell_step=step or math.inf,
     )
     if medium is not None:
-        boundaries(RULES.find(settings.quadrature), medium)
+        cells_for_rule(RULES.find(settings.quadrature), medium)
     return settings
 
 
-def observer_settings(props, march: MarchSettings) -> ObserverSettings:
-    """Of the surfaces, and of what the observer sees of them."""
+def read_observer_settings(props, march: MarchSettings) -> ObserverSettings:
+    """Settings of surfaces and of observer rays."""
     defaults = ObserverSettings(march=march)
     return ObserverSettings(
         march=march,
@@ -365,36 +374,36 @@ def observer_settings(props, march: MarchSettings) -> ObserverSettings:
     )
 
 
-def ceiling_of(props) -> Ceiling | None:
-    """What is left out of views from above."""
+def read_ceiling(props) -> Ceiling | None:
+    """The clipping plane for views from above."""
     up = read_vector(props, "up", (0.0, 0.0, 1.0))
     return Ceiling(read_number(props, "ceiling", 0, COORDINATES), up) if "ceiling" in props else None
 
 
-def background_of(props):
+def read_background(props):
     """Radiance (Spectrum) behind everything."""
     background = mi.Color3f(read_color(props, "background", 0.0))
     return mi.Spectrum(mi.luminance(background) if mi.is_monochromatic else background)
 
 
 def describe(nerg) -> str:
-    """The integrator ``nerg`` with all its parameters, for people."""
+    """The integrator ``nerg`` with all its parameters as text."""
     body: dict[str, Any] = {
         k: str(v).replace("\n", "\n  ") for k, v in nerg.children.items() if k not in ("observer", "integrator")
     }
     if nerg.observer is not None:
         body["observer"] = sensor_center(nerg.observer)
-    march, seen = nerg.settings, nerg.observer_settings
+    march, observer_settings = nerg.settings, nerg.observer_settings
     body |= {
         "occlusion": nerg.occlusion,
-        "visibility": seen.visibility,
+        "visibility": observer_settings.visibility,
         "falloff": nerg.falloff,
-        "tolerance": seen.tolerance or "2 steps",
-        "map_height": seen.map_height,
-        "directions": seen.directions,
-        "integral_tolerance": seen.integral_tolerance,
-        "depth": seen.depth,
-        "surface_opacity": seen.surface_opacity,
+        "tolerance": observer_settings.tolerance or "2 steps",
+        "map_height": observer_settings.map_height,
+        "directions": observer_settings.directions,
+        "integral_tolerance": observer_settings.integral_tolerance,
+        "depth": observer_settings.depth,
+        "surface_opacity": observer_settings.surface_opacity,
         "radiance": nerg.radiance,
         "ceiling": "none" if nerg.ceiling is None else nerg.ceiling,
         "aovs": ",".join(nerg.aovs),
@@ -411,7 +420,8 @@ def describe(nerg) -> str:
 
 
 class PoseFlags(mi.TraversalCallback):
-    """Shows the pose of a sensor as what it is to us. Mitsuba calls it not differentiable, as silhouettes are not."""
+    """Exposes the pose of a sensor as differentiable and discontinuous; Mitsuba declares it as not differentiable,
+    because of silhouettes."""
 
     def __init__(self, cb, prefix):
         super().__init__()
@@ -424,7 +434,7 @@ class PoseFlags(mi.TraversalCallback):
 
 # ---- The integrator ----
 
-__doc__ = complete(__doc__ or "").replace("{aovs}", nerg_aovs.manual())
+__doc__ = fill_manual(__doc__ or "").replace("{aovs}", nerg_aovs.format_manual())
 
 
 class NergIntegrator(mi.SamplingIntegrator):
@@ -437,26 +447,26 @@ class NergIntegrator(mi.SamplingIntegrator):
                 f'"nerg" renders rgb and mono variants, not "{mi.variant()}": radiance fields are trained on rgb '
                 'photos; call mi.set_variant("llvm_ad_rgb")'
             )
-        self._given = read_children(props)
-        self.medium, self._known_empty = medium_of(self._given)
-        self.gaze = gaze_of(self._given, self.medium)
-        self.observer, self.shading = self._given["observer"], Shading(self._given["integrator"])
+        self._children = read_children(props)
+        self.medium, self._frozen_bound = make_medium(self._children)
+        self.gaze = make_gaze(self._children, self.medium)
+        self.observer, self.shading = self._children["observer"], Shading(self._children["integrator"])
         check_observer(self.observer)
 
         self.occlusion = read_boolean(props, "occlusion", True)
         self.falloff: Any = mi.Float(read_number(props, "falloff", 0.1, Range(0, POSITIVE_VALUES.high)))
         self.radiance = read_boolean(props, "radiance", True)
-        self.background = background_of(props)
-        self.ceiling = ceiling_of(props)
+        self.background = read_background(props)
+        self.ceiling = read_ceiling(props)
         self.jitter = read_boolean(props, "jitter", False)
-        self.settings = march_settings(props, self.medium)
-        self.observer_settings = observer_settings(props, self.settings)
+        self.settings = read_march_settings(props, self.medium)
+        self.observer_settings = read_observer_settings(props, self.settings)
 
-        self.aovs = nerg_aovs.read_aovs(read_string(props, "aovs", "depth,opacity"), self)
-        self.demands = nerg_aovs.demands_of(self.aovs)
-        self.views = nerg_aovs.views_of(self.aovs, self)
+        self.aovs = nerg_aovs.parse_aovs(read_string(props, "aovs", "depth,opacity"), self)
+        self.required_data = nerg_aovs.collect_required_data(self.aovs)
+        self.views = nerg_aovs.collect_observer_views(self.aovs, self)
         self.cache = ObserverCache()
-        self._sensors = None  # of the render in progress; None when another integrator drives ours
+        self._sensors = None  # sensor of the current rendering; None if another integrator calls this one
 
     def aov_names(self):
         return nerg_aovs.channel_names(self.aovs, self.medium) + self.shading.aov_names()
@@ -465,16 +475,16 @@ class NergIntegrator(mi.SamplingIntegrator):
         if isinstance(sensor, int):
             sensor = scene.sensors()[sensor]
         restore_interrupt_handler()
-        with self.rendering_from(sensor, scene), no_collection():
+        with self.rendering_from(sensor, scene), gc_paused():
             image = super().render(scene, sensor, seed, spp, develop, evaluate)
         if self.should_stop():
-            raise KeyboardInterrupt  # Mitsuba has heard Ctrl-C, and told nobody.
+            raise KeyboardInterrupt  # Mitsuba stops on Ctrl-C without raising
         return image
 
     @contextmanager
     def rendering_from(self, sensor, scene):
-        """While this is open the rays that ``sample`` is given come from ``sensor``."""
-        self.context().check_place(scene)
+        """Context in which the rays that ``sample`` receives come from ``sensor``."""
+        self.context().check_scene(scene)
         if 0 in sensor.film().crop_size():
             raise NergError("the film's crop window is empty; give it a crop_width and a crop_height of at least 1")
         self._sensors = [sensor]
@@ -484,10 +494,12 @@ class NergIntegrator(mi.SamplingIntegrator):
             self._sensors = None
 
     def render_forward(self, scene, params, sensor, seed: Any = 0, spp=0):
-        # Mitsuba 3.9.1 ends the process instead, also with its own integrators: a batch calls its cameras through a
-        # table of all sensors, the observer among them.
-        eyes = observer.centers([sensor]) + ([] if self.observer is None else [observer.sensor_center(self.observer)])
-        if observer.is_batch(sensor) and any(dr.grad_enabled(c) for c in eyes):
+        # Mitsuba 3.9.1 aborts the process in this case, also for its own integrators: a batch calls its cameras through
+        # a table of all sensors, including the observer.
+        centers = observer.sensor_centers([sensor]) + (
+            [] if self.observer is None else [observer.sensor_center(self.observer)]
+        )
+        if observer.is_batch(sensor) and any(dr.grad_enabled(c) for c in centers):
             raise NergError(
                 'a "batch" of cameras has no forward derivatives with respect to the pose of an observer or a camera; '
                 "render its cameras one by one, or use reverse mode (dr.backward)"
@@ -502,10 +514,10 @@ class NergIntegrator(mi.SamplingIntegrator):
         return dr.select(active, L, 0), shown, aovs + nested
 
     def context(self) -> RenderContext:
-        """What its pictures are computed with."""
+        """The context of a rendering with the integrator's own AOVs."""
         return RenderContext(
             aovs=self.aovs,
-            demands=self.demands,
+            required_data=self.required_data,
             views=self.views,
             radiance=self.radiance,
             medium=self.medium,
@@ -524,17 +536,18 @@ class NergIntegrator(mi.SamplingIntegrator):
         )
 
     def make_context(self, aovs: Sequence[str], radiance: bool) -> RenderContext:
-        """The same for other AOVs, with colour or without. Raises ``NergError`` for those that it cannot compute."""
-        names = nerg_aovs.read_aovs(",".join(aovs), self)
-        views = nerg_aovs.views_of(names, self)
-        demands = nerg_aovs.demands_of(names)
-        return replace(self.context(), aovs=names, demands=demands, views=views, radiance=radiance)
+        """The context of a rendering with other AOVs, with or without colour. Raises ``NergError`` for AOVs that cannot
+        be computed."""
+        names = nerg_aovs.parse_aovs(",".join(aovs), self)
+        views = nerg_aovs.collect_observer_views(names, self)
+        required_data = nerg_aovs.collect_required_data(names)
+        return replace(self.context(), aovs=names, required_data=required_data, views=views, radiance=radiance)
 
     @property
     def children(self):
-        """The volumes, the observer and the nested integrator, by their names as parameters."""
-        given = self._given | {"integrator": self.shading.nested}
-        return {name: child for name, child in given.items() if child is not None}
+        """The volumes, the observer and the nested integrator, by parameter name."""
+        children = self._children | {"integrator": self.shading.nested}
+        return {name: child for name, child in children.items() if child is not None}
 
     def traverse(self, cb):
         for name, child in self.children.items():
@@ -546,15 +559,15 @@ class NergIntegrator(mi.SamplingIntegrator):
 
     def parameters_changed(self, keys=()):
         if not keys or {"field", "density", "color"} & set(keys):
-            # Of a volume that shows no arrays only this tells that it is another one.
+            # For a volume without arrays, this is the only sign of a change.
             self.cache.clear()
         if self.medium is not None:
-            self.medium.refresh(anyway=not keys or "density" in keys)
-        # Of the scene's parameters, and of this integrator's alone.
+            self.medium.refresh(force=not keys or "density" in keys)
+        # Keys of the scene's parameters, and of the integrator's own.
         if self.observer is not None and (not keys or {"to_world", "observer.to_world"} & set(keys)):
             self.observer.parameters_changed(["to_world"])
-        if recording():
-            # What is recorded is not looked at.
+        if is_recording():
+            # Values of a recording cannot be checked.
             return
         check_observer(self.observer)
         if not dr.all(self.falloff >= 0):

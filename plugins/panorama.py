@@ -8,8 +8,8 @@ Full-sphere panorama (:monosp:`panorama`)
 
  * - to_world
    - |transform|
-   - Where the panorama is taken and how it is turned: a rotation and a translation. Rays start at the image of the
-     origin. (Default: none, i.e. sensor space = world space)
+   - Position and orientation of the panorama: a rotation and a translation. Rays start at the image of the origin.
+     (Default: none, i.e. sensor space = world space)
    - |exposed|
 
  * - shutter_open, shutter_close
@@ -18,31 +18,31 @@ Full-sphere panorama (:monosp:`panorama`)
 
  * - (Nested plugin)
    - :paramtype:`film`, :paramtype:`sampler`
-   - The film may have any size from 1 x 2 pixels on; 2 : 1 gives square pixels at the horizon. Crop windows and
-     sample borders are honoured.
+   - The film may have any size of at least 1 x 2 pixels; 2 : 1 gives square pixels at the horizon. Crop windows and
+     sample borders are supported.
 
-This sensor sees all directions around a point: the gaze sphere of an observer who stands there, for example. Its
-mapping is the exact inverse of that of the emitter :ref:`envmap <emitter-envmap>` with the same ``to_world``: a film as
-large as the environment map, sampled at the centres of its pixels, returns the map's pixels, and what this sensor has
-rendered can be used as an ``envmap``.
+This sensor sees all directions around a point, e.g. the gaze sphere of an observer at that point. Its mapping is the
+exact inverse of that of the emitter :ref:`envmap <emitter-envmap>` with the same ``to_world``: a film of the size of
+the environment map, sampled at its pixel centres, returns the map's pixels, and an image of this sensor can be used as
+an ``envmap``.
 
-In the sensor's frame +Y points up. Pixel coordinates :math:`(x, y)` on a film of :math:`W \times H` pixels belong to
+In the sensor's frame +Y points up. Pixel coordinates :math:`(x, y)` on a film of :math:`W \times H` pixels correspond
+to
 
 .. math::
 
     v = (\sin\varphi\,\sin\theta,\; \cos\theta,\; -\cos\varphi\,\sin\theta), \qquad
     \varphi = \frac{2\pi x}{W}, \qquad \theta = \frac{\pi\,(y - 1/2)}{H - 1}
 
-so that the middle column looks along +Z, the way of Mitsuba's cameras, and the centres of the first and the last row
-lie *at* the poles, where ``envmap`` has them. What a sample of these two rows draws beyond the pole is seen over the
-pole, on the opposite meridian.
+so that the middle column looks along +Z, like Mitsuba's cameras, and the centres of the first and the last row lie *at*
+the poles, as in ``envmap``. Samples of these two rows beyond the pole continue on the opposite meridian.
 
 The solid angle of a pixel is :math:`2\pi/W\,(\cos\theta_0 - \cos\theta_1)` between the borders of its row, clipped to
-the sphere; the sum is :math:`4\pi`. ``nerg_mi.transport.geometry.pixel_solid_angles(W, H)`` gives it without a variant,
-and the method ``pixel_solid_angles()`` of the sensor for the crop window of its film.
+the sphere; the sum is :math:`4\pi`. ``nerg_mi.transport.geometry.pixel_solid_angles(W, H)`` returns it without a
+variant, and the sensor's method ``pixel_solid_angles()`` for the crop window of its film.
 
-Things that it does not do: it has no near and far clipping plane, no aperture, and does not take part in light tracing
-(integrators such as ``ptracer``, which connect light paths to the sensor, cannot use it).
+Limitations: no near and far clipping plane, no aperture, and no light tracing (integrators such as ``ptracer``, which
+connect light paths to the sensor, cannot use it).
 
 .. tabs::
     .. code-tab:: xml
@@ -82,15 +82,15 @@ from nerg_mi.registration import register
 from nerg_mi.transport.geometry import pixel_solid_angles
 
 POLE = 1e-4
-"""Least angle in radian between a ray and the panorama's axis."""
+"""Minimum angle in radian between a ray and the panorama's axis."""
 
 
 class Panorama(mi.Sensor):
-    """Sees the full sphere around a point. The module's docstring is its manual page."""
+    """A sensor for the full sphere around a point. The module's docstring is its manual page."""
 
     def __init__(self, props):
         super().__init__(props)
-        # Without this, integrators draw an aperture sample that nobody looks at.
+        # Otherwise integrators draw an unused aperture sample.
         self.m_needs_sample_3 = False
         self._check_to_world()
         self._check_film()
@@ -116,19 +116,19 @@ class Panorama(mi.Sensor):
         return ray, weight
 
     def _pixel(self, sample: Any) -> Any:
-        """Position on the whole film, in pixels, of a sample that is relative to the crop window."""
+        """Position on the whole film, in pixels, of a sample relative to the crop window."""
         film = self.film()
         size: Any = mi.Vector2f(film.crop_size())
         return mi.Point2f(sample) * size + mi.Vector2f(film.crop_offset())
 
     def _direction(self, pixel):
         """World direction of a position on the film; beyond a pole it continues on the opposite meridian."""
-        # Asked for each time: a film may be given another size through mi.traverse.
+        # Not cached: the size of a film can change through mi.traverse.
         width, height = self.film().size()
         φ = pixel.x * (dr.two_pi / width)
         θ = (pixel.y - 0.5) * (dr.pi / (height - 1))
-        # A direction that is the pole itself has no longitude, and all pixels of the row would see the same one of an
-        # environment map's. A hair beside it they keep theirs; in single precision the polar angle is the same.
+        # The pole itself has no longitude, so all pixels of the row would see the same pixel of an environment map.
+        # With a tiny offset they keep their longitude; in single precision the polar angle is the same.
         θ = dr.select(abs(θ) < POLE, POLE, θ)
         θ = dr.select(abs(θ - dr.pi) < POLE, dr.pi - POLE, θ)
         sin_φ, cos_φ = dr.sincos(φ)
@@ -174,7 +174,7 @@ class Panorama(mi.Sensor):
         matrix = np.array(self.world_transform().matrix, dtype=np.float64).reshape(4, 4)
         turn = matrix[:3, :3]
         if not np.allclose(turn.T @ turn, np.eye(3), atol=1e-3):
-            # mi.Transform4f.rotate does not normalise its axis, and gives a shear for one that is no unit vector.
+            # mi.Transform4f.rotate does not normalise its axis and gives a shear for an axis that is not a unit vector.
             raise NergError(
                 '"to_world" of a panorama must be a rotation and a translation: remove its scale or shear, '
                 "and give rotations an axis of unit length"

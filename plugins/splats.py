@@ -9,42 +9,42 @@ Gaussian splats (:monosp:`splats`)
  * - filename
    - |string|
    - Gaussian splats as 3DGS ``.ply`` (any order of columns, with or without normals), ``.splat``, ``.spz`` of version 1
-     to 3, or ``.glb`` with KHR_gaussian_splatting. Relative names are looked up beside the scene file.
+     to 3, or ``.glb`` with KHR_gaussian_splatting. Relative names are resolved in the folder of the scene file.
 
  * - to_world
    - |transform|
-   - A rotation, a uniform scale and a translation that place the splats in the scene; colours that depend on direction
-     turn with them. (Default: none)
+   - Rotation, uniform scale and translation of the splats in the scene; view-dependent colours are rotated, too.
+     (Default: none)
 
  * - color_space
    - |string|
-   - What the colours are that their harmonics give: ``srgb``, as photos train them, ``linear``, or what the ``file``
-     says, which only ``.glb`` does: the others are sRGB. (Default: ``file``)
+   - Colour space of the harmonics: ``srgb``, as trained from photos, ``linear``, or that of the ``file``, which only
+     ``.glb`` specifies (otherwise sRGB). (Default: ``file``)
 
  * - extent
    - |float|
-   - Where Gaussians are cut off, in standard deviations. (Default: 3)
+   - Cut-off radius of Gaussians in standard deviations. (Default: 3)
 
  * - centers, scales, rotations, opacities, harmonics
    - |tensor|
-   - What the Gaussians are, each flat: 3, 3, 4 (quaternion, w first), 1 and 3 (degree + 1)² numbers a Gaussian.
+   - Parameters of the Gaussians, flat: 3, 3, 4 (quaternion, w first), 1 and 3 (degree + 1)² numbers per Gaussian.
    - |exposed|, |differentiable|
 
-A place as many small Gaussians, as most photogrammetry gives it today: the ``field`` of the integrator
-:ref:`nerg <integrator-nerg>`, which gives of it all that it gives of a trained field. It is no volume for other
-plugins, since splats have no density at a point.
+A scene of many small Gaussians, the output of most current photogrammetry: a ``field`` of the integrator :ref:`nerg
+<integrator-nerg>`, which computes the same quantities as for a radiance field. It cannot be used by other plugins,
+since splats have no density at a point.
 
-A ray meets a Gaussian where it is nearest to its centre by the Gaussian's own measure, and loses there the share
-:math:`\alpha = \min(o\,e^{-r^2/2}, 0.9999)` of its light, :math:`r` that distance in standard deviations and :math:`o`
-the opacity. Gaussians are met in the order of these peaks, ray by ray, so that nothing pops as the camera turns;
-cameras and observers may stand inside of them. Colours are composited in their colour space and then made linear.
+A Gaussian acts where it is densest along the ray. It absorbs the fraction :math:`\alpha = \min(o\,e^{-r^2/2}, 0.9999)`
+of the light there, with the distance :math:`r` from its centre in standard deviations and the opacity :math:`o`.
+Gaussians are sorted by these peaks for each ray, so that nothing pops as the camera turns; cameras and observers may be
+inside them. Colours are composited in their colour space and then converted to linear.
 
-Depth is that of the peaks: ``expected`` their mean, ``median`` (and ``refined``) the peak at which half of the ray's
-own opacity is reached. Of the parameters of a march only ``stop`` applies (here 1e-4 by default), and ``step``, by
-which the tolerance of occlusion is measured: by default the median thickness of the Gaussians.
+Depth refers to the peaks: ``expected`` is their mean, ``median`` (and ``refined``) the peak at which half of the ray's
+own opacity is reached. Of the march parameters only ``stop`` applies (default here: 1e-4), and ``step``, which sets the
+tolerance of occlusion (default: the median thickness of the Gaussians).
 
-Derivatives reach the Gaussians, cameras and observers as those of a trained field do, with memory that does not grow
-with the number of hits. They do not see which Gaussians a ray meets, nor in which order.
+Derivatives reach the Gaussians, cameras and observers as for a radiance field, with memory that does not grow with the
+number of hits. They ignore changes of the set of Gaussians along a ray and of their order.
 
 .. tabs::
     .. code-tab:: xml
@@ -73,10 +73,17 @@ from nerg_mi.fields.mlp import namespace
 from nerg_mi.fields.splats import Splats
 from nerg_mi.formats.splats import read_splats
 from nerg_mi.maths.geometry import Similarity
-from nerg_mi.properties import read_choice, read_number, resolve_scene_file, read_string, read_transform, make_volume_class
+from nerg_mi.properties import (
+    make_volume_class,
+    read_choice,
+    read_number,
+    read_string,
+    read_transform,
+    resolve_scene_file,
+)
 from nerg_mi.ranges import Range
 from nerg_mi.registration import register
-from nerg_mi.transport.jit import recording
+from nerg_mi.transport.jit import is_recording
 from nerg_mi.transport.splat_medium import SplatArrays, SplatMedium
 
 
@@ -85,7 +92,7 @@ class SplatsVolume(make_volume_class()):
     plugin = "splats"
 
     def __init__(self, props, splats=None):
-        # ``splats``: Gaussians in memory in place of a file; see ``of``.
+        # ``splats``: Gaussians in memory instead of a file; see ``of``.
         self._similarity = Similarity(read_transform(props, "to_world"))
         color_space = read_choice(props, "color_space", "file", ("file", "srgb", "linear"))
         extent = read_number(props, "extent", 3, Range(0.1, 10))
@@ -93,7 +100,7 @@ class SplatsVolume(make_volume_class()):
         super().__init__(props)
         self.splats = splats if splats is not None else read_splats(self.filename)
         for note in (*self.splats.assumptions, *self.splats.notes):
-            log: Any = mi.Log  # of which the stubs know nothing
+            log: Any = mi.Log  # missing in the stubs
             log(mi.LogLevel.Warn, f"{self.filename}: {note}")
         self.color_space = self.splats.color_space if color_space == "file" else color_space
         self.field = SplatArrays(self.splats, namespace(mi.Float), extent)
@@ -101,20 +108,20 @@ class SplatsVolume(make_volume_class()):
     @staticmethod
     def check(network: Splats) -> None:
         if not isinstance(network, Splats):
-            raise NergError(f"splats in memory are needed, got {type(network).__name__}; read them from their file")
+            raise NergError(f"expected splats in memory, got {type(network).__name__}; read them from their file first")
 
     def medium(self) -> SplatMedium:
-        """The splats as rays meet them."""
+        """The splats as a medium."""
         return SplatMedium(self.field, self._similarity, self.color_space)
 
     def eval_1(self, it, active=True):
-        raise NergError('"splats" have no density at a point: give them to "nerg" as its "field"')
+        raise NergError('"splats" have no density at a point; use them as the "field" of "nerg"')
 
     def parameters_changed(self, keys=()):
-        if recording():
+        if is_recording():
             raise NergError(
-                "the Gaussians cannot be changed inside of a function that dr.freeze records, as their tree is built "
-                "outside of kernels: call params.update() before the function"
+                "Gaussians cannot change inside a function that dr.freeze records, since their tree is built outside "
+                "of kernels; call params.update() before the function"
             )
         super().parameters_changed(keys)
 

@@ -1,4 +1,4 @@
-"""What the tests of the plugins share: small fields in files."""
+"""Shared fixtures of the plugin tests: small fields in files."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Small scenes, and how to render them, for the tests of the integrator."""
+"""Small scenes for the tests of the integrator, and helpers to render them."""
 
 import drjit as dr
 import numpy as np
@@ -11,7 +11,7 @@ SIZE = 12
 
 
 def plugin(kind, **more):
-    """The description of a plugin, as ``mi.load_dict`` takes it."""
+    """The description of a plugin for ``mi.load_dict``."""
     return {"type": kind, **more}
 
 
@@ -26,7 +26,7 @@ def still(sensor):
 
 
 def center_rays(mi, sensor):
-    """Rays through the centres of the pixels of the description ``sensor``, row by row."""
+    """Rays through the pixel centres of the description ``sensor``, row by row."""
     sensor = mi.load_dict(sensor)
     w, h = sensor.film().crop_size()
     y, x = (np.mgrid[:h, :w].reshape(2, -1) + 0.5).astype(np.float32)
@@ -59,7 +59,7 @@ def camera(
     )
 
 
-# Expected depths have closed forms also where matter is thin, unlike the medians of the default.
+# Expected depths have closed forms for thin matter, too, unlike the default median.
 def with_field(files, **kwargs):
     return {"type": "nerg", "depth": "expected", "field": stored("nerf", files / "field.safetensors"), **kwargs}
 
@@ -91,7 +91,7 @@ def put(params, key, value):
 
 
 def attach(params, *keys):
-    """Track derivatives of parameters."""
+    """Enable gradients of parameters."""
     for key in keys:
         dr.enable_grad(params[key])
     params.update()
@@ -104,7 +104,7 @@ def named(mi, image, integrator):
 
 
 def points(out):
-    """Positions of the channels ``out``, in a last axis."""
+    """The positions of the channels ``out``, in a last axis."""
     return np.stack([out[f"position.{c}"] for c in "XYZ"], axis=-1)
 
 
@@ -131,7 +131,7 @@ def square(mi, z, size=1.0, x=0.0):
 
 
 def room(mi, open_side=False):
-    """A cube to look at from within, one side of which may be missing."""
+    """A cube seen from inside; one side can be missing."""
     walls = {}
     for axis in range(3):
         for side in (-1, 1):
@@ -164,7 +164,11 @@ def wall(mi, gap=0.3):
 def hidden_scene(mi, **kwargs):
     # The camera is behind the wall and sees the back wall; the observer is in front of it.
     sensor = camera(mi, (0.5, 0, 0.2), (0.5, 0, 1), fov=65, near_clip=1e-3)
-    how = {"aovs": "visibility,position,observer_depth", "step": 0.01, "observer": make_observer(mi, 0, 0, -0.9)} | kwargs
+    how = {
+        "aovs": "visibility,position,observer_depth",
+        "step": 0.01,
+        "observer": make_observer(mi, 0, 0, -0.9),
+    } | kwargs
     return channels(mi, plugin("nerg", density=wall(mi), **how), sensor)
 
 
@@ -172,6 +176,6 @@ GAZE = "depth,opacity,position,gaze,emit,capture,visibility,observer_depth"
 
 
 def observed(mi, gaze, p_o, place=None):
-    """The gaze field that the dict ``gaze`` describes, for the observer at ``p_o``."""
+    """The gaze field of the dict ``gaze``, for the observer at ``p_o``."""
     settings = ObserverSettings(march=MarchSettings(step=1))
-    return mi.load_dict(gaze).placed_gaze().at([p_o], place or SceneGeometry(None), settings)
+    return mi.load_dict(gaze).placed_gaze().for_observers([p_o], place or SceneGeometry(None), settings)

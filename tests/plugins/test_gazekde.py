@@ -1,4 +1,4 @@
-"""The density of tracked rays in the integrator: against the sum over the rays in float64."""
+"""The density of tracked rays in the integrator: against the float64 sum over the rays."""
 
 import numpy as np
 import pytest
@@ -7,15 +7,15 @@ from nerg_mi.maths.vmf import log_normaliser
 from nerg_mi.rays.rays import Rays
 from tests.reference import kde as reference
 
-from .scenes import camera, channels, named, make_observer, picture, plugin, points, put, room, scene_with, stored, wall
+from .scenes import camera, channels, make_observer, named, picture, plugin, points, put, room, scene_with, stored, wall
 
 KAPPA = 20.0
-# What the table may be off: a ten-thousandth of the highest density of one ray.
+# Error of the table: 1e-4 of the maximum density of one ray.
 TABLE = 1e-4 * float(np.exp(log_normaliser(KAPPA)))
 
 
 def tracked(n=600, seed=0):
-    """People about the middle of the room who look at two places of its walls."""
+    """Participants near the middle of the room who look at two regions of its walls."""
     rng = np.random.default_rng(seed)
     origin = rng.normal(0, 0.3, (n, 3)).clip(-0.7, 0.7)
     target = np.where(np.arange(n)[:, None] % 3, (0.9, 0.3, 0.1), (0.2, 0.9, -0.3)) + rng.normal(0, 0.2, (n, 3))
@@ -36,7 +36,7 @@ def shown(rays, aovs="kde,position", count=4096, **more):
 
 
 def expected(eye, out, count=4096):
-    """Float64 density of the ``count`` rays nearest to ``eye`` towards what the pixels show."""
+    """Float64 density of the ``count`` rays nearest to ``eye`` in the directions of the pixels."""
     data = tracked()
     near = np.argsort(np.linalg.norm(data.origin - eye, axis=1))[:count]
     p = points(out).astype(np.float64)
@@ -48,8 +48,8 @@ def expected(eye, out, count=4096):
 
 @pytest.mark.parametrize("count", [4096, 50])
 @pytest.mark.parametrize("size, error", [(12, 1e-5), (70, TABLE)], ids=["exact", "table"])
-def test01_the_density_is_that_of_the_rays(rgb, rays, count, size, error):
-    """Small pictures sum all rays at each pixel, large ones look a table up."""
+def test01_density_matches_the_rays(rgb, rays, count, size, error):
+    """Small images sum all rays for each pixel, large ones interpolate a table."""
     eye = (0.1, -0.2, 0.3)
     out = channels(rgb, shown(rays, count=count), camera(rgb, eye, (0.5, 0.4, 0), size=size, fov=90), **room(rgb))
     truth = expected(eye, out, count)
@@ -57,8 +57,8 @@ def test01_the_density_is_that_of_the_rays(rgb, rays, count, size, error):
     assert np.abs(out["kde.Y"] - truth).max() < error * (1 if error == TABLE else truth.max()) + 2e-6
 
 
-def test02_another_observer_and_what_is_hidden(rgb, rays):
-    """No gaze field is needed; what the observer does not see is 0, the rest is the observer's density."""
+def test02_other_observers_and_occlusion(rgb, rays):
+    """No gaze field is needed; hidden surfaces are 0, others have the observer's density."""
     eye = (0, 0, -0.9)
     sensor = camera(rgb, (0.5, 0, 0.2), (0.5, 0, 1), fov=65, near_clip=1e-3)
     how = {"density": wall(rgb), "step": 0.01, "falloff": 0.0, "observer": make_observer(rgb, *eye)}
@@ -70,7 +70,7 @@ def test02_another_observer_and_what_is_hidden(rgb, rays):
     assert (open_[hidden] > 0).all()
 
 
-def test03_rays_are_gathered_once_an_observer(rgb, rays):
+def test03_rays_are_collected_once_per_observer(rgb, rays):
     integrator = shown(rays, observer=make_observer(rgb, 0.2, 0.1, 0), falloff=0.0)
     scene = scene_with(rgb, integrator, camera(rgb, (0.1, -0.2, 0.3), (0.5, 0, 0), size=70), **room(rgb))
     view = scene.integrator().views["kde"]
@@ -86,7 +86,7 @@ def test03_rays_are_gathered_once_an_observer(rgb, rays):
     assert np.abs(moved["kde.Y"] - expected((-0.3, 0.1, 0.1), moved))[seen].max() < TABLE + 1e-5
 
 
-def test04_each_camera_of_a_batch_has_its_own(rgb, rays):
+def test04_each_camera_of_a_batch_has_its_own_density(rgb, rays):
     integrator, eyes = shown(rays, count=100), [(0.3, 0.1, 0), (-0.5, 0.4, 0.2)]
     film = {"type": "hdrfilm", "width": 24, "height": 12, "component_format": "float32", "rfilter": {"type": "box"}}
     batch = {"type": "batch", "film": film, **{f"s{i}": camera(rgb, eye, (0, 0.5, 0.9)) for i, eye in enumerate(eyes)}}
@@ -96,8 +96,8 @@ def test04_each_camera_of_a_batch_has_its_own(rgb, rays):
         np.testing.assert_allclose(half["kde.Y"], expected(eye, half, 100), rtol=1e-3, atol=1e-5)
 
 
-def test05_rays_of_another_frame(rgb, rays):
-    """The rays' frame turned, twice as large and moved: everything in the scene goes with it, densities stay."""
+def test05_rays_in_another_frame(rgb, rays):
+    """The rays' frame is rotated, scaled by two and moved, like the whole scene; densities do not change."""
     matrix = rgb.ScalarTransform4f().translate([1, 2, 3]).rotate([0, 0, 1], 90).scale(2)
     shapes = {k: {**v, "to_world": matrix @ v["to_world"]} for k, v in room(rgb).items()}
     integrator, sensor = shown(rays), camera(rgb, (0.1, -0.2, 0.3), (0.5, 0.4, 0), fov=60)
@@ -108,7 +108,7 @@ def test05_rays_of_another_frame(rgb, rays):
     np.testing.assert_allclose(channels(rgb, integrator, sensor, **shapes)["kde.Y"], plain, rtol=2e-3, atol=1e-4)
 
 
-def test07_what_is_needed_is_said(rgb, rays, tmp_path):
+def test07_missing_dependencies_are_reported(rgb, rays, tmp_path):
     for integrator, said in (
         ({"type": "nerg", "aovs": "kde"}, '"kde" volume of type "gazekde"'),
         ({"type": "nerg", "kde": {"type": "constvolume"}}, 'must be a volume of type "gazekde"'),
@@ -120,12 +120,14 @@ def test07_what_is_needed_is_said(rgb, rays, tmp_path):
     assert "count = 600" in str(rgb.load_dict(shown(rays)["kde"]))
 
 
-def test09_where_no_surface_is_there_is_no_density(rgb, rays):
-    """Neither beside a shape nor where matter is thinner than a surface."""
+def test09_density_is_zero_without_a_surface(rgb, rays):
+    """Neither next to a shape nor where matter is thinner than a surface."""
     eye, sensor = (0.1, -0.2, 0.3), camera(rgb, (0.5, 0.4, -3), (0, 0, 0), fov=60)
     ball = {"type": "sphere", "center": [0.3, 0.2, -0.4], "radius": 0.5}
     thin = {"density": {"type": "constvolume", "value": 0.4}, "surface_opacity": 0.5, "occlusion": False}
-    out = channels(rgb, shown(rays, "kde,position,opacity", observer=make_observer(rgb, *eye), **thin), sensor, ball=ball)
+    out = channels(
+        rgb, shown(rays, "kde,position,opacity", observer=make_observer(rgb, *eye), **thin), sensor, ball=ball
+    )
     solid = out["opacity.Y"] == 1
     assert solid.sum() > 5 and (out["opacity.Y"][~solid] > 0).any() and (out["opacity.Y"] == 0).any()
     assert not out["kde.Y"][~solid].any()

@@ -1,4 +1,4 @@
-"""The volume `nerf`: what it returns, and its pictures with a background, without an end, and deferred."""
+"""The volume `nerf`: values, and images with a background, contracted space, and deferred shading."""
 
 import drjit as dr
 import drjit.llvm.ad as ns
@@ -18,8 +18,8 @@ from .scenes import (
     camera,
     center_rays,
     channels,
-    named,
     make_observer,
+    named,
     picture,
     plugin,
     put,
@@ -29,7 +29,7 @@ from .scenes import (
     stored,
 )
 
-# ---- The volume: what it returns, where it lies, and what it says about wrong files ----
+# ---- The volume: values, placement, and invalid files ----
 
 
 @pytest.fixture
@@ -47,7 +47,7 @@ def evaluate(mi, volume, p):
     return volume.eval_1(it).numpy()
 
 
-def test01_density_in_the_scene(rgb, tmp_path, field):
+def test01_density_in_scene_units(rgb, tmp_path, field):
     p = np.random.default_rng(0).uniform(-1.2, 1.2, (50, 3)).astype(np.float32)
     expected = field.density(rgb.Point3f(p.T)).numpy()
     assert (expected == 0).any() and (expected > 0).any()
@@ -70,7 +70,7 @@ def test03_parameters(rgb, tmp_path, field):
     assert not np.isclose(evaluate(rgb, volume, [[0.1, 0.2, 0.3]]), before, rtol=1e-3)
 
 
-def test05_wrong_files(rgb, tmp_path, files):
+def test05_invalid_files_are_refused(rgb, tmp_path, files):
     (tmp_path / "x.safetensors").write_bytes(b"no")
     for path, more, said in (
         (files / "gaze.safetensors", {}, "holds a gaze field"),
@@ -84,8 +84,8 @@ def test05_wrong_files(rgb, tmp_path, files):
         rgb.load_dict({"type": "nerf", "filename": 3.0})
 
 
-def test07_empty_cells_are_vacuum_also_for_others(rgb, tmp_path):
-    # Training leaves them unsampled: the networks' density there means nothing, and marching passes over it.
+def test07_empty_cells_are_vacuum_for_eval_1(rgb, tmp_path):
+    # Training does not sample these cells: the networks' density is arbitrary there, and marching skips them.
     bits = np.zeros((4, 4, 4), bool)
     bits[:, :, 2:] = True
     field = fields.radiance(tmp_path / "half.safetensors", occupancy=OccupancyGrid(bits, ns, 0.01))
@@ -96,7 +96,7 @@ def test07_empty_cells_are_vacuum_also_for_others(rgb, tmp_path):
 
 
 def medium_scene(mi, files, **kwargs):
-    """The field as a medium that only absorbs, in a cube before white light."""
+    """The field as an absorbing medium, in a cube in front of white light."""
     volume = stored("nerf", files / "field.safetensors", **kwargs)
     interior = {"type": "heterogeneous", "sigma_t": volume, "albedo": {"type": "constvolume", "value": 0.0}}
     scale = kwargs.get("to_world", mi.ScalarTransform4f())
@@ -106,21 +106,21 @@ def medium_scene(mi, files, **kwargs):
 
 
 @pytest.mark.parametrize("placed", [False, True])
-def test_as_a_medium_it_absorbs_what_the_marcher_does(rgb, files, placed):
-    """Analog tracking lets a path through or not: counts of n paths around n T, by a z-test for each pixel."""
+def test_mitsuba_medium_matches_the_march(rgb, files, placed):
+    """Analog tracking transmits a path or not: counts of n paths around n T, by a z-test per pixel."""
     spp = 1024
     where = {"to_world": rgb.ScalarTransform4f().translate([0.1, 0, 0]).scale(0.6)} if placed else {}
     through = np.array(rgb.render(medium_scene(rgb, files, max_density=40.0, **where), spp=spp))[..., 0]
     field = stored("nerf", files / "field.safetensors", **where)
     integrator = plugin("nerg", field=field, aovs="opacity", step=0.01, radiance=False)
     T = 1 - channels(rgb, integrator, camera(rgb, size=8), spp=256)["opacity.Y"].astype(float)
-    # Within a pixel T varies, over silhouettes too much for a mean of 256.
+    # T varies within a pixel, across silhouettes too much for a mean of 256.
     inside = binary_erosion(T < 0.6)
     z = (through - T)[inside] / np.sqrt((T * (1 - T))[inside] / spp)
     assert inside.sum() > 8 and np.abs(z).max() < 4.5 and np.mean(z**2) < 1.6
 
 
-def test_a_medium_needs_a_bound_which_caps_densities(rgb, files):
+def test_medium_needs_max_density(rgb, files):
     with pytest.raises(RuntimeError, match='"max_density"'):
         medium_scene(rgb, files)
     p = np.random.default_rng(0).uniform(-0.9, 0.9, (100, 3))
@@ -132,16 +132,16 @@ def test_a_medium_needs_a_bound_which_caps_densities(rgb, files):
 def test_constant_weights_change_no_density(rgb, files):
     p = np.random.default_rng(0).uniform(-0.9, 0.9, (100, 3))
     plain, constant = (load(rgb, files / "field.safetensors", constant_weights=c) for c in (False, True))
-    assert constant.field.color_net.constant and not plain.field.color_net.constant
+    assert constant.field.color_net.has_constant_weights and not plain.field.color_net.has_constant_weights
     found = evaluate(rgb, plain, p)
     assert np.ptp(found) > 0 and np.array_equal(evaluate(rgb, constant, p), found)
 
 
-# ---- A background network behind a field: composited with the field in its own colour space ----
+# ---- A background network behind a field: composited in the field's colour space ----
 
 
 @pytest.mark.parametrize("scale, density", [(1.0, 1e-9), (2.5, 1e-9), (1.0, 0.4)])
-def test01_seen_behind_the_field(rgb, tmp_path, scale, density):
+def test01_background_network_behind_the_field(rgb, tmp_path, scale, density):
     grid = HashGridConfig(levels=2, log2_rows=8, base=4, finest=16, dimensions=2)
     behind = Background.random(BackgroundConfig(3.0, grid, 16, sh_degree=2), ns)
     table = np.random.default_rng(0).normal(size=len(behind.grid.table)).astype(np.float32)
@@ -164,21 +164,21 @@ def test01_seen_behind_the_field(rgb, tmp_path, scale, density):
     ray = center_rays(rgb, sensor)
     learnt = np.array(field.background(ns.Array3f(np.array(ray.o) / scale), ns.Array3f(np.array(ray.d))))
     learnt = learnt.T.reshape(8, 8, 3)
-    # C, out of α lin(C / α)
+    # C from α lin(C / α)
     ratio = encode_srgb(without[..., :3] / np.where(alpha > 0, alpha, 1))
     expected = decode_srgb(alpha * ratio + (1 - alpha) * learnt)
     assert np.allclose(image[..., :3], expected, rtol=1e-3, atol=1e-5) and np.ptp(learnt) > 0.05
-    # An environment of the scene takes its place.
+    # An environment emitter of the scene replaces it.
     sky = {"type": "constant", "radiance": {"type": "rgb", "value": [0.2, 0.4, 0.8]}}
     assert np.allclose(shown("behind", sky=sky), shown("field", sky=sky))
 
 
-# ---- A field without an end: depths in scene units beyond the box, and an observer's view of it ----
+# ---- Contracted space: depths in scene units beyond the box, for cameras and observers ----
 
 
 @pytest.fixture
 def endless(tmp_path):
-    """σ = 0.25 / m², m the largest coordinate in half edges (2 units), at least 1."""
+    """σ = 0.25 / m², m the maximum norm in half edges (2 units), at least 1."""
     grid = HashGridConfig(levels=2, log2_rows=8, base=4, finest=16)
     config = RadianceConfig(grid, width=16, geometry=3, sh_degree=2, density_scale=0.25)
     box = ContractedBox(Box((-2, -2, -2), (2, 2, 2)), 16)
@@ -189,28 +189,28 @@ def endless(tmp_path):
 
 
 def median(start: float) -> float:
-    """Distance along z, from ``start`` on the axis on, within which half of all that is absorbed is, by a sum in
-    float64."""
+    """Distance along z, from ``start`` on the axis, at which half of the total absorption is reached, by a float64
+    sum."""
     t = np.arange(0, 32 - start, 1e-4)
     tau = np.cumsum(0.25 / np.maximum(np.abs(start + t) / 2, 1) ** 2 * 1e-4)
     return float(t[np.searchsorted(tau, -np.log1p(0.5 * np.expm1(-tau[-1])))])
 
 
-# From within the inner cube out of it, from outside through it, and in uniform steps.
+# From inside the inner cube outwards, from outside through it, and in uniform steps.
 @pytest.mark.parametrize("start, more", [(1, {}), (-5, {}), (1, {"dt_gamma": 0.0, "step": 0.01})])
-def test_depth_beyond_the_box_is_that_of_the_scene(rgb, endless, start, more):
+def test_depth_beyond_the_box_is_in_scene_units(rgb, endless, start, more):
     eye = {} if more else {"observer": make_observer(rgb, 0, 0, -5)}
     integrator = plugin("nerg", field=endless, aovs="depth,position,observer_depth", jitter=False, **eye, **more)
     assert rgb.load_dict(integrator).settings.dt_gamma == more.get("dt_gamma", 1 / 128)
     out = channels(rgb, integrator, camera(rgb, (0, 0, start), (0, 0, 9), fov=0.5, size=4, near_clip=1e-4))
     np.testing.assert_allclose(out["depth.T"], median(start), rtol=5e-4)
     assert start + median(start) > 2 or start < 0
-    # The observer looks toward the point that the camera sees, and meets a surface before or behind it.
+    # The observer looks towards the point that the camera sees, and meets a surface in front of or behind it.
     np.testing.assert_allclose(out["position.Z"], start + median(start), rtol=5e-4)
     np.testing.assert_allclose(out["observer_depth.T"], median(-5 if eye else start), rtol=5e-4)
 
 
-# ---- Pictures of a field whose colour network is asked once a ray ----
+# ---- Deferred shading ----
 
 
 @pytest.fixture(scope="module")
@@ -232,8 +232,8 @@ def few(mi):
     return still(camera(mi, size=5))
 
 
-def test01_colour_is_that_of_the_mean_features(rgb, deferred):
-    """Of the accumulated features, which ``test_nerg_aovs`` checks, with the network of the field."""
+def test01_color_is_evaluated_on_mean_features(rgb, deferred):
+    """From the composited features, which ``test_nerg_aovs`` tests, with the network of the field."""
     image = render(rgb, nerg(deferred), few(rgb))
     with_features = nerg(deferred, "opacity,features")
     both = render(rgb, with_features, few(rgb))
@@ -249,19 +249,19 @@ def test01_colour_is_that_of_the_mean_features(rgb, deferred):
     assert np.allclose(found[:, some], expected[:, some], atol=2e-6) and not found[:, ~some].any()
 
 
-def test02_one_evaluation_of_colour_a_ray(rgb, deferred):
+def test02_one_color_evaluation_per_ray(rgb, deferred):
     seen = channels(rgb, nerg(deferred, "opacity,color_evals,density_evals"), few(rgb))
     assert np.array_equal(seen["color_evals.Y"], seen["opacity.Y"] > 0) and seen["density_evals.Y"].max() > 3
 
 
 @pytest.mark.parametrize("quadrature", ["constant", "linear"])
-def test03_a_cutoff_moves_colours_little(rgb, deferred, quadrature):
+def test03_cutoff_changes_colors_little(rgb, deferred, quadrature):
     with_cutoff = lambda c: render(rgb, nerg(deferred, quadrature=quadrature, color_cutoff=c, step=0.02), few(rgb))
     assert 0 < np.abs(with_cutoff(0.0) - with_cutoff(1e-2))[..., :3].max() < 0.02
 
 
-def test04_a_wall_behind_is_seen_through_it(rgb, deferred):
-    """The network adds nothing to what the wall sends, and is asked where the field is met alone."""
+def test04_wall_is_visible_through_the_field(rgb, deferred):
+    """The network does not affect the wall, and is evaluated only where the field is hit."""
     wide = {**few(rgb), "fov": 60}
     place = rgb.ScalarTransform4f().translate([0, 0, 1.5]).rotate([1, 0, 0], 180).scale(9)
     light = {"type": "area", "radiance": {"type": "rgb", "value": 0.7}}
@@ -269,12 +269,12 @@ def test04_a_wall_behind_is_seen_through_it(rgb, deferred):
     alone = render(rgb, nerg(deferred), wide)
     lit = nerg(deferred, "opacity,color_evals", shading={"type": "path", "max_depth": 1})
     image, opacity = render(rgb, lit, wide, wall=wall), alone[..., 3:4]
-    # Of rays that meet the wall alone no colour is asked.
+    # No colour is evaluated on rays that meet the wall alone.
     assert np.array_equal(image[..., 4:5], opacity > 0) and opacity.min() == 0 < opacity.max()
     assert image[..., 3].min() == 1 and np.allclose(image[..., :3], alone[..., :3] + 0.7 * (1 - opacity), atol=1e-4)
 
 
-def test05_pictures_are_frozen_and_weights_may_be_constants(rgb, deferred):
+def test05_frozen_rendering_with_constant_weights(rgb, deferred):
     scene = scene_with(rgb, nerg(deferred), few(rgb))
     constant = render(rgb, nerg(deferred, field=stored("nerf", deferred, constant_weights=True)), few(rgb))
     frozen = dr.freeze(lambda scene: rgb.render(scene, spp=1))

@@ -1,4 +1,4 @@
-"""The integrator `nerg` through Mitsuba: its channels, its parameters and its children."""
+"""The integrator `nerg` in Mitsuba: channels, parameters and children."""
 
 import re
 import sys
@@ -14,8 +14,8 @@ from .scenes import (
     channels,
     constant,
     look_at,
-    named,
     make_observer,
+    named,
     picture,
     plugin,
     put,
@@ -27,7 +27,7 @@ from .scenes import (
     with_gaze,
 )
 
-# ---- Its channels ----
+# ---- Channels ----
 
 CHANNELS = "depth.T opacity.Y position.X position.Y position.Z gaze.Y emit.Y capture.Y visibility.Y observer_depth.T"
 EVALS = ["density_evals.Y", "color_evals.Y", "gaze_evals.Y"]
@@ -51,7 +51,7 @@ def test03_without_radiance(rgb, files):
     assert not black[..., :3].any()
 
 
-def test04_below_the_surface_opacity(rgb, files):
+def test04_no_surface_below_surface_opacity(rgb, files):
     of = lambda s: channels(rgb, with_gaze(files, "opacity,depth,position,gaze,visibility", surface_opacity=s))
     low, high = of(0.05), of(0.97)
     for c in ("opacity.Y", "depth.T"):
@@ -68,8 +68,8 @@ def test05_to_string(rgb, files):
         assert part in text, part
 
 
-def test09_another_integrator_may_ask_for_some_rays_only(rgb):
-    """All of them, unless it says which; the others are black, not valid, and have no depth."""
+def test09_nested_use_with_masked_rays(rgb):
+    """All rays by default; inactive ones are black, not valid, and have no depth."""
     scene = scene_with(rgb, constant(aovs="depth,opacity", background=0.5))
     x = np.linspace(0.1, 1.9, 10, dtype=np.float32)  # five through the cube, five past it
     ray = rgb.RayDifferential3f(rgb.Point3f(x, 0.4, -1), rgb.Vector3f(0, 0, 1))
@@ -83,16 +83,16 @@ def test09_another_integrator_may_ask_for_some_rays_only(rgb):
     assert np.array_equal(some[2], aovs * wanted)
 
 
-# ---- Parameters as ``mi.traverse`` shows them ----
+# ---- Parameters of ``mi.traverse`` ----
 
 
-def test01_flags(rgb, files):
+def test01_parameter_flags(rgb, files):
     params = rgb.traverse(scene_with(rgb, with_gaze(files, observer=make_observer(rgb, -2, 0.3, -2))))
     D, edges = rgb.ParamFlags.Differentiable, rgb.ParamFlags.Discontinuous
     shown = {k: params.flags(k) for k in params.keys() if k.startswith("integrator.")}
     assert shown.pop("integrator.observer.to_world") == D | edges
     assert "integrator.falloff" in shown and len(shown) == 14 and all(v == D for v in shown.values())
-    # What of a sensor has no part in where it stands is no parameter of ours.
+    # Parameters of a sensor other than its pose are not exposed.
     assert [k for k in params.keys() if "observer" in k] == ["integrator.observer.to_world"]
 
 
@@ -107,7 +107,7 @@ def test01_flags(rgb, files):
         ("falloff", "visibility.Y", 30.0),
     ],
 )
-def test06_an_update_is_seen(rgb, files, key, channel, factor):
+def test06_update_takes_effect(rgb, files, key, channel, factor):
     integrator = with_gaze(files, GAZE, observer=make_observer(rgb, -2, 0.3, -2))
     scene = scene_with(rgb, integrator)
     params, key = rgb.traverse(scene), f"integrator.{key}"
@@ -121,13 +121,13 @@ def test06_an_update_is_seen(rgb, files, key, channel, factor):
     assert not np.allclose(shown(), before, rtol=1e-3)
 
 
-def test07_a_negative_falloff_is_refused_later_too(rgb):
+def test07_negative_falloff_is_refused_on_update(rgb):
     with pytest.raises(ValueError, match='"falloff"'):
         put(rgb.traverse(rgb.load_dict(constant())), "falloff", rgb.Float(-1))
 
 
 @pytest.mark.parametrize("kind", ["perspective", "panorama"])
-def test02_an_observer_is_moved(rgb, files, kind):
+def test02_observer_can_be_moved(rgb, files, kind):
     def scene_of(*eye):
         observer = {**make_observer(rgb, *eye), "type": kind}
         return scene_with(rgb, with_gaze(files, "gaze", falloff=2.0, observer=observer), still(camera(rgb, size=6)))
@@ -140,7 +140,7 @@ def test02_an_observer_is_moved(rgb, files, kind):
         put(params, key, rgb.ScalarTransform4f().translate([np.nan, 0, 0]))
 
 
-# ---- What is read of a scene, and what is refused ----
+# ---- Reading a scene, and error messages ----
 
 XML = """<scene version="3.0.0">
   <integrator type="nerg" id="integrator">
@@ -170,7 +170,7 @@ XML = """<scene version="3.0.0">
 </scene>"""
 
 
-def test01_xml_equals_dict_and_files_lie_beside_the_scene(rgb, files):
+def test01_xml_equals_dict_and_files_are_relative(rgb, files):
     path = files / "scene.xml"
     path.write_text(XML)
     scene = rgb.load_file(str(path))
@@ -178,7 +178,7 @@ def test01_xml_equals_dict_and_files_lie_beside_the_scene(rgb, files):
     more |= {"falloff": 0.3, "background": {"type": "rgb", "value": [0.1, 0.2, 0.3]}}
     integrator = with_gaze(files, "depth,opacity,gaze,visibility,position", **more)
     a, b = np.array(rgb.render(scene, spp=2, seed=3)), render(rgb, integrator, spp=2, seed=3)
-    # The XML parser rounds placements in another way.
+    # The XML parser rounds transforms differently.
     assert a.shape == (SIZE, SIZE, 3 + 7) and np.allclose(a, b, atol=3e-6)
     assert a[..., 3].max() > 0 and a[..., 5].max() > 0
     plain = render(rgb, {**integrator, "background": [0.1, 0.2, 0.3]}, spp=2, seed=3)
@@ -214,15 +214,15 @@ WRONG = {
 
 
 @pytest.mark.parametrize("name, value", [(name, value) for name, values in WRONG.items() for value in values])
-def test04_wrong_values_are_named(rgb, name, value):
+def test04_invalid_values_are_named(rgb, name, value):
     with pytest.raises((RuntimeError, ValueError), match=f'"{name}"'):
         rgb.load_dict(constant(**{name: value}))
 
 
-def test05_wrong_children_are_named(rgb, files):
+def test05_invalid_children_are_named(rgb, files):
     some, small = plugin("constvolume", value=1.0), {"type": "hdrfilm", "width": 2, "height": 2}
     eyes = {k: {"type": "perspective", "to_world": look_at(rgb, (k, 2, 3)), "film": small} for k in (1, 3)}
-    # It would stand at the origin of the scene.
+    # It would be at the origin of the scene.
     batch = plugin("batch", film={"type": "hdrfilm", "width": 4, "height": 2}, a=eyes[1], b=eyes[3])
     for integrator, said in (
         (with_field(files, density=some), '"field".*"density"'),
@@ -234,7 +234,7 @@ def test05_wrong_children_are_named(rgb, files):
         (constant(observer=some), '"observer"'),
         (constant(observer={"type": "orthographic"}), '"observer"'),
         (constant(observer=batch), '"observer"'),
-        (plugin("nerg", i={"type": "prb"}), "PRBIntegrator.*one ray"),
+        (plugin("nerg", i={"type": "prb"}), "PRBIntegrator.*single rays"),
         (plugin("nerg", field=stored("nerf", "nowhere.safetensors")), "nowhere.safetensors.*does not exist"),
         (constant(gaze=stored("gazefield", "nowhere.safetensors")), "nowhere.safetensors.*does not exist"),
         ({"type": "nerf"}, '"filename"'),
@@ -244,13 +244,13 @@ def test05_wrong_children_are_named(rgb, files):
             rgb.load_dict(integrator)
 
 
-def test05b_an_empty_place_is_refused(rgb):
+def test05b_empty_scene_is_refused(rgb):
     scene = scene_with(rgb, {"type": "nerg"})
-    with pytest.raises(ValueError, match="nothing to render.*or the scene shapes"):
+    with pytest.raises(ValueError, match="nothing to render.*or add shapes"):
         scene.integrator().render(scene, scene.sensors()[0])
 
 
-# ---- What the manual says of defaults is what it does without a say ----
+# ---- Defaults in the manual are those of the code ----
 
 NAMES = """occlusion falloff tolerance visibility map_height directions integral_tolerance depth surface_opacity
 radiance background aovs step quadrature coarse dt_gamma stop color_cutoff refined jitter""".split()
@@ -260,16 +260,16 @@ OTHERS, INTEGERS = TEXTS | SHARES, ("map_height", "directions")
 
 
 def manual(mi):
-    """Name of each parameter with a default -> that default, as the plugin's documentation spells it."""
+    """Parameter name -> default, as in the plugin's documentation."""
     mi.load_dict({"type": "nerg"})
     text = sys.modules["nerg_mi.plugins.nerg"].__doc__
     entries = re.split(r"^ \* - ", text, flags=re.MULTILINE)[1:]
     found = {e.split("\n")[0].strip(): re.search(r"\(Default:\s*([^;,:) ]+(?:,opacity)?)", e) for e in entries}
-    # A ceiling is none by default, and its up says nothing without one.
+    # There is no ceiling by default, and its up has no effect without one.
     return {name: m[1].strip("`\n ") for name, m in found.items() if m and name not in ("ceiling", "up")}
 
 
-def test01_every_parameter_has_its_default_in_the_manual(rgb):
+def test01_manual_states_all_defaults(rgb):
     assert list(manual(rgb)) == NAMES
 
 
@@ -280,7 +280,7 @@ def settings_of(mi, **more):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test02_a_default_that_is_given_changes_nothing(rgb, name):
+def test02_explicit_defaults_change_nothing(rgb, name):
     text = manual(rgb)[name]
     truth = {"true": True, "false": False}
     read = str if name in TEXTS else int if name in INTEGERS else float
@@ -290,17 +290,17 @@ def test02_a_default_that_is_given_changes_nothing(rgb, name):
     assert settings_of(rgb, **{name: other}) != settings_of(rgb)
 
 
-def test03_a_step_that_is_not_given_is_a_share_of_the_diagonal(rgb):
+def test03_default_step_is_a_fraction_of_the_diagonal(rgb):
     settings = rgb.load_dict(constant()).settings
     assert settings.step == pytest.approx(3**0.5 / 1024, rel=1e-5) and settings.cell_step == float("inf")
     given = rgb.load_dict(constant(step=0.25)).settings
     assert given.step == given.cell_step == 0.25
 
 
-def test_each_text_of_the_manual_has_one_place(rgb):
+def test_manual_texts_are_used_once(rgb):
     from nerg_mi.plugins import nerg
 
     source = Path(nerg.__file__).read_text("utf-8").split('"""')[1]
-    names = [*nerg.TEXTS, "quadratures", "depths", "aovs"]
-    # No formula is one of them.
+    names = [*nerg.PARAMETER_TEXTS, "quadratures", "depths", "aovs"]
+    # Formulas contain none of them.
     assert {name: source.count(f"{{{name}}}") for name in names} == dict.fromkeys(names, 1)

@@ -1,4 +1,4 @@
-"""The table of AOVs, features among them, and that what a scene does not need is not computed."""
+"""The table of AOVs, including features, and that unneeded values are not computed."""
 
 import subprocess
 import sys
@@ -14,7 +14,7 @@ from nerg_mi.evaluation.study import count_traced_operations
 from nerg_mi.figures.overlay import find_overlay, to_bytes
 from nerg_mi.files.images import write_exr
 from nerg_mi.transport import aovs
-from nerg_mi.viewer.layers import choose_range, list_layers, colorize, format_legend, choose_scale
+from nerg_mi.viewer.layers import choose_range, choose_scale, colorize, format_legend, list_layers
 from nerg_mi.workflows.draw import draw
 from nerg_mi.workflows.render import render_layers
 
@@ -25,8 +25,8 @@ from .scenes import (
     channels,
     constant,
     look_at,
-    named,
     make_observer,
+    named,
     picture,
     plugin,
     points,
@@ -40,24 +40,24 @@ from .scenes import (
     with_gaze,
 )
 
-# ---- The table of AOVs: one entry is all that an AOV is ----
+# ---- The table of AOVs: an AOV is one entry ----
 
 
 @pytest.fixture
 def table(rgb):
-    """The table, for a test to add to."""
+    """The table, extended by a test."""
     before = dict(aovs.AOVS)
     yield aovs
     aovs.AOVS.clear()
     aovs.AOVS.update(before)
 
 
-def test01_an_entry_is_all_that_an_aov_is(rgb, files, table):
+def test01_new_aov_needs_one_entry(rgb, files, table):
     entry = table.Aov(
         name="height",
         channels="ZT",
         summary="of the surface above the plane z = -1, and the distance to it",
-        compute=lambda p: [dr.select(p.surface, p.p_d.z + 1, 0), p.depth],
+        compute=lambda p: [dr.select(p.has_surface, p.p_d.z + 1, 0), p.depth],
         dependencies=(table.FIELD,),
     )
     table.AOVS["height"] = entry
@@ -73,7 +73,7 @@ def test01_an_entry_is_all_that_an_aov_is(rgb, files, table):
     assert "- ``height`` (``.Z .T``): of the surface above the plane" in table.format_manual()
 
 
-def test02_the_manual_lists_the_table(rgb, table):
+def test02_manual_lists_all_aovs(rgb, table):
     rgb.load_dict(constant())
     manual = sys.modules["nerg_mi.plugins.nerg"].NergIntegrator.__doc__
     assert table.format_manual() in manual and not any(w in manual for w in ("{aovs}", "{depths}", "{quadratures}"))
@@ -83,10 +83,10 @@ def test02_the_manual_lists_the_table(rgb, table):
 
 
 def test03_every_aov_renders(rgb, files, table, tmp_path):
-    """All that need nothing but a field and a gaze field, at once, with as many channels as they are said to have."""
+    """All AOVs of a field and a gaze field at once, with the declared numbers of channels."""
     eye = make_observer(rgb, -2, 0.3, -2)
     given = rgb.load_dict(with_gaze(files, observer=eye))
-    names = [n for n, aov in table.AOVS.items() if all(need.is_met(given) for need in aov.needs)]
+    names = [n for n, aov in table.AOVS.items() if all(need.is_satisfied(given) for need in aov.dependencies)]
     assert {"features", "gaze", "density_evals"} < set(names) and "gaze_std" not in names
     integrator = with_gaze(files, ",".join(names), observer=eye)
     scene = scene_with(rgb, integrator)
@@ -94,7 +94,7 @@ def test03_every_aov_renders(rgb, files, table, tmp_path):
     assert all(np.isfinite(v).all() and v.any() for v in out.values()), [k for k, v in out.items() if not v.any()]
     factors = out["emit.Y"] * out["capture.Y"] * out["visibility.Y"]
     np.testing.assert_allclose(out["gaze.Y"], factors, rtol=1e-5)
-    # Each alone is what it is beside the others.
+    # Each alone equals its value among the others.
     for name in names:
         alone = channels(rgb, {**integrator, "aovs": name})
         for channel, value in alone.items():
@@ -102,23 +102,23 @@ def test03_every_aov_renders(rgb, files, table, tmp_path):
                 np.testing.assert_allclose(value, out[channel], rtol=1e-5, atol=1e-6, err_msg=channel)
 
 
-def test04_what_is_not_asked_for_is_not_computed(rgb, files, table):
-    """An entry costs nothing until its name is asked for."""
+def test04_unrequested_aovs_are_not_computed(rgb, files, table):
+    """An entry costs nothing unless it is requested."""
     plain = operations(rgb, with_gaze(files, "depth"))
     calls = []
     table.AOVS["costly"] = table.Aov(
         name="costly",
         summary="many operations",
         compute=lambda p: (calls.append(p), [sum(dr.sin(p.depth * k) for k in range(400))])[1],
-        demands=frozenset({"counts", "features"}),
+        required_data=frozenset({"counts", "features"}),
     )
     assert operations(rgb, with_gaze(files, "depth")) == plain and not calls
     assert operations(rgb, with_gaze(files, "depth,costly")) > plain + 400 and calls
 
 
 @pytest.mark.parametrize("kind", ["sequential", "heat", "diverging", "categorical", "shade"])
-def test05_an_entry_is_shown_everywhere(rgb, table, tmp_path, kind):
-    """With its title, scale and unit, without another file that names it."""
+def test05_new_aov_is_displayed_everywhere(rgb, table, tmp_path, kind):
+    """With its title, scale and unit, without any other file that names it."""
     table.AOVS["rows"] = table.Aov(
         name="rows",
         title="Shelf row",
@@ -126,7 +126,7 @@ def test05_an_entry_is_shown_everywhere(rgb, table, tmp_path, kind):
         unit="rows",
         display=table.Display(kind=kind),
         summary="number of the row in which the surface lies",
-        compute=lambda p: [dr.select(p.surface, dr.floor(p.p_d.z * 2 + 3), 0)],
+        compute=lambda p: [dr.select(p.has_surface, dr.floor(p.p_d.z * 2 + 3), 0)],
     )
     scene = scene_with(rgb, constant())
     # Overlays, with the title, the label and the unit of the table.
@@ -158,7 +158,7 @@ def test05_an_entry_is_shown_everywhere(rgb, table, tmp_path, kind):
         assert any("difference of rows [rows]" in text.replace("\n", " ") for text in said)
 
 
-# ---- Geometry features as AOVs: accumulated along the ray, and at the surface ----
+# ---- Geometry features as AOVs: composited along the ray, and at the surface ----
 
 STEP = 0.05
 
@@ -168,7 +168,7 @@ def block(out, name):
     return np.stack([out[k] for k in keys], -1)
 
 
-def test01_accumulated_features_are_the_sum_of_weights_times_features(rgb, files):
+def test01_composited_features_are_weighted_sums(rgb, files):
     """Against a float64 sum over the same steps of the field's own densities and features."""
     integrator = with_field(files, aovs="features,opacity,depth", step=STEP, color_cutoff=0.0, stop=0.0)
     sensor = still(camera(rgb, size=4))
@@ -176,7 +176,7 @@ def test01_accumulated_features_are_the_sum_of_weights_times_features(rgb, files
     medium = rgb.load_dict(integrator["field"]).medium()
     assert features.shape[-1] == medium.feature_count
     ray = center_rays(rgb, sensor)
-    local = medium.local(ray.o, ray.d)
+    local = medium.ray_to_local(ray.o, ray.d)
     near, far = np.maximum(np.array(local.t_near, float), 0), np.array(local.t_far, float)
     T, total, t = np.ones(16), np.zeros_like(features, float), near.copy()
     while (t < far).any():
@@ -192,7 +192,7 @@ def test01_accumulated_features_are_the_sum_of_weights_times_features(rgb, files
     assert np.abs(features - total).max() < 0.05 * np.abs(total).max()
 
 
-def test02_colour_is_the_same_with_and_without_features(rgb, files):
+def test02_color_does_not_depend_on_features(rgb, files):
     plain, both, dark = (
         render(rgb, with_field(files, aovs=f"opacity,depth{more}", radiance=lit))
         for more, lit in (("", True), (",features", True), (",features", False))
@@ -201,7 +201,7 @@ def test02_colour_is_the_same_with_and_without_features(rgb, files):
     assert not dark[..., :3].any() and np.allclose(dark[..., 5:], both[..., 5:], atol=1e-6)
 
 
-def test03_the_snapshot_is_the_field_at_the_surface(rgb, files):
+def test03_features_at_the_surface_match_the_field(rgb, files):
     out = channels(rgb, with_field(files, aovs="position,features_at,opacity"))
     surface = out["opacity.Y"] >= 0.5
     medium = rgb.load_dict(with_field(files)["field"]).medium()
@@ -212,7 +212,7 @@ def test03_the_snapshot_is_the_field_at_the_surface(rgb, files):
     assert not got[~surface].any()
 
 
-def test04_a_shape_has_none_and_hides_those_behind(rgb, files):
+def test04_shapes_have_no_features_and_occlude(rgb, files):
     wall = plugin("rectangle", to_world=look_at(rgb, (0.5, 0.4, -2), (0.5, 0.4, -3)).scale(9))
     out = channels(rgb, with_field(files, aovs="features,features_at,opacity"), w=wall)
     assert (out["opacity.Y"] == 1).all() and not block(out, "features").any() and not block(out, "features_at").any()
@@ -220,7 +220,7 @@ def test04_a_shape_has_none_and_hides_those_behind(rgb, files):
 
 def test05_derivatives_reach_the_field(rgb, files):
     integrator = with_field(files, aovs="features,features_at", radiance=False, step=STEP, color_cutoff=0.0)
-    # Primal and gradient must look through the same points of the pixels.
+    # Primal and gradient must sample the same points of the pixels.
     scene = scene_with(rgb, integrator, still(camera(rgb, size=4)))
     params, key = rgb.traverse(scene), "integrator.field.density_net.1"
     start = rgb.TensorXf(params[key])
@@ -240,12 +240,12 @@ def test05_derivatives_reach_the_field(rgb, files):
     assert size > 0 and (ends[0] - ends[1]) / (2 * h) == pytest.approx(size, rel=0.03)
 
 
-# ---- What a scene does not need is not computed: counted in operations traced and evaluations made, not in time ----
+# ---- Unneeded values are not computed: counts of traced operations and evaluations, not times ----
 
 
 def operations(mi, integrator, sensor=None):
     scene = scene_with(mi, integrator, sensor)
-    mi.render(scene, spp=1)  # set-up that happens once is not counted
+    mi.render(scene, spp=1)  # one-time set-up is not counted
     return count_traced_operations(lambda: mi.render(scene, spp=1))
 
 
@@ -256,17 +256,17 @@ def test01_no_colour(rgb, files):
     assert evals["density_evals.Y"].max() > 5 and not evals["color_evals.Y"].any()
 
 
-def test02_nothing_asked_nothing_marched(rgb, files):
+def test02_no_aovs_no_march(rgb, files):
     nothing, depth = (operations(rgb, with_field(files, radiance=False, aovs=a)) for a in ("", "depth"))
     assert nothing < 0.1 * depth
 
 
-def test03_no_gaze_unless_asked(rgb, files):
+def test03_no_gaze_unless_requested(rgb, files):
     unasked, asked = (operations(rgb, with_gaze(files, aovs)) for aovs in ("depth,opacity", "depth,opacity,gaze"))
     assert unasked == operations(rgb, with_field(files, aovs="depth,opacity")) and asked > unasked + 300
 
 
-def test04_an_aligned_observer_needs_no_second_march(rgb, files):
+def test04_aligned_observer_needs_no_second_march(rgb, files):
     sensor, none = camera(rgb, (0.5, 0.4, -3)), with_gaze(files, "gaze,density_evals")
     here, there = (none | {"observer": make_observer(rgb, *o)} for o in ((0.5, 0.4, -3), (-2, 0.3, -2)))
     a, b, c = (channels(rgb, i, sensor)["density_evals.Y"] for i in (none, here, there))
@@ -275,14 +275,14 @@ def test04_an_aligned_observer_needs_no_second_march(rgb, files):
     assert second < first + 60 and third > second + 300
 
 
-def test05_without_occlusion_no_observer_march(rgb, files):
+def test05_no_observer_march_without_occlusion(rgb, files):
     aligned = with_gaze(files, "gaze,density_evals")
     off = aligned | {"observer": make_observer(rgb, -2, 0.3, -2), "occlusion": False}
     assert np.array_equal(*(channels(rgb, i)["density_evals.Y"] for i in (off, aligned)))
     assert operations(rgb, off) + 300 < operations(rgb, {**off, "occlusion": True})
 
 
-def test06_half_a_gaze_field_for_half_a_variant(rgb, files, tmp_path):
+def test06_single_factor_variants_evaluate_one_network(rgb, files, tmp_path):
     fields.gaze(tmp_path / "emit.safetensors", "emit")
     both = with_gaze(files, "gaze,gaze_evals")
     emit = {**both, "gaze": stored("gazefield", tmp_path / "emit.safetensors")}
@@ -291,8 +291,8 @@ def test06_half_a_gaze_field_for_half_a_variant(rgb, files, tmp_path):
 
 
 @pytest.mark.parametrize("thickness", [1, 4])
-def test08_empty_space_is_passed_over(rgb, thickness):
-    # A sheet of some voxels in an empty grid of 64: what is marched is the sheet and a voxel on either side.
+def test08_empty_space_is_skipped(rgb, thickness):
+    # A sheet of a few voxels in an empty grid of 64: the sheet and one voxel on either side are marched.
     data = np.zeros((64, 64, 64), np.float32)
     data[30 : 30 + thickness] = 0.01
     density = {"type": "gridvolume", "grid": rgb.VolumeGrid(data)}
@@ -301,7 +301,7 @@ def test08_empty_space_is_passed_over(rgb, thickness):
     assert 4 * thickness <= evals <= 4 * (thickness + 2) + 2
 
 
-def test10_rays_that_miss_cost_nothing(rgb, files):
+def test10_missing_rays_cost_nothing(rgb, files):
     out = channels(rgb, with_gaze(files, "density_evals,color_evals,gaze_evals"), camera(rgb, (0, 0, -3), (0, 5, -3)))
     assert not any(c.any() for c in out.values())
 

@@ -1,4 +1,4 @@
-"""The integrator at the ends of what a scene may ask for: densities, sizes, observers; forwards and backwards."""
+"""The integrator for extreme densities, sizes and observers; values and derivatives."""
 
 import math
 
@@ -34,12 +34,12 @@ SLAB = [1e-6, 1e-3, 1.0, 1e3, 1e6, 1e9]
 
 
 def slab_scene(mi, kind, sigma, ahead):
-    """One ray along +z through the unit cube, whose face lies ``ahead`` of the ray's origin."""
+    """One ray along +z through the unit cube, whose face is ``ahead`` of the ray's origin."""
     more = {"value": float(sigma)}
     if kind == "gridvolume":
         more = {"grid": mi.VolumeGrid(np.full((3, 3, 3), sigma, np.float32)), "raw": True}
     integrator = plugin("nerg", density=plugin(kind, **more), depth="expected", radiance=False)
-    # Mitsuba starts the rays of this sensor a hair in front of it.
+    # Mitsuba starts the rays of this sensor slightly in front of it.
     where = {"origin": [0.5, 0.5, -ahead - float(mi.math.RayEpsilon)], "direction": [0, 0, 1]}
     return scene_with(mi, integrator, plugin("radiancemeter", film=camera(mi, size=1)["film"], **where))
 
@@ -50,17 +50,17 @@ def fog(sigma, to_world):
 
 @pytest.mark.parametrize("ahead", [0, 1])
 @pytest.mark.parametrize("kind", ["constvolume", "gridvolume"])
-def test01_slabs_with_nothing_set(rgb, kind, ahead):
+def test01_slabs_with_default_parameters(rgb, kind, ahead):
     for sigma in SLAB:
         depth, opacity = picture(rgb, slab_scene(rgb, kind, sigma, ahead)).ravel()[3:]
         alpha, expected, _ = reference.slab(sigma, ahead, ahead + 1)
         assert np.isclose(opacity, alpha, rtol=1e-5), sigma
-        # With the face at the origin the depth of dense matter is 1/σ and nothing else.
+        # With the face at the origin the depth of dense matter is exactly 1/σ.
         assert np.isclose(depth, expected, rtol=1e-5), sigma
 
 
 @pytest.mark.parametrize("kind", ["constvolume", "gridvolume"])
-def test02_their_derivatives(rgb, kind):
+def test02_slab_derivatives(rgb, kind):
     for sigma in [0.1, 10.0, *SLAB]:
         scene = slab_scene(rgb, kind, sigma, 0)
         params = rgb.traverse(scene)
@@ -76,27 +76,27 @@ def test02_their_derivatives(rgb, kind):
         near = {"rtol": 1e-4} if slope > 1e-6 else {"rtol": 0, "atol": 1e-6}
         assert np.isclose(got["opacity"], slope, **near), sigma
         if 0.1 <= sigma <= 1e3:
-            # Of h(τ) = 1/τ - 1/expm1(τ), the mean depth of absorption.
+            # Of h(τ) = 1/τ - 1/expm1(τ), the mean absorption depth.
             change = -1 / sigma**2 + (1 / (4 * math.sinh(sigma / 2) ** 2) if sigma < 700 else 0)
             assert np.isclose(got["depth"], change, rtol=1e-4), sigma
         assert np.isfinite(got["depth"])
 
 
 @pytest.mark.parametrize("quadrature", RULES.names())
-def test03_thin_sheets_in_a_near_vacuum_are_met_with_nothing_else_set(rgb, quadrature):
+def test03_thin_sheets_are_found_with_default_parameters(rgb, quadrature):
     data = np.full((10000, 1, 1), 1e-8, np.float32)
     data[7000] = 1e9
     density = {"type": "gridvolume", "grid": rgb.VolumeGrid(data), "raw": True, "filter_type": "nearest"}
     integrator = {"type": "nerg", "density": density, "quadrature": quadrature}
     out = channels(rgb, integrator, camera(rgb, (0.5, 0.4, -1), (0.5, 0.5, 1), fov=10))
     assert np.all(out["opacity.Y"] == 1)
-    # The oblique pixels look from a little more than 1.7 away.
+    # Oblique pixels look from slightly more than 1.7 away.
     assert np.all((out["depth.T"] > 1.68) & (out["depth.T"] < 1.75))
 
 
 @pytest.mark.parametrize("size", [1e-3, 1e6])
-def test04_places_of_any_size(rgb, size):
-    # The near plane is at a share of the place's size.
+def test04_scenes_of_any_size(rgb, size):
+    # The near plane is at a fraction of the scene's size.
     def view(s):
         to_world = rgb.ScalarTransform4f().translate([-s / 2] * 3).scale(s)
         sensor = still(camera(rgb, np.multiply((0.5, 0.4, -3), s), fov=25, near_clip=1e-2 * s, far_clip=1e4 * s))
@@ -108,8 +108,8 @@ def test04_places_of_any_size(rgb, size):
     assert np.allclose(a["depth.T"][hit], b["depth.T"][hit] / size, rtol=1e-5)
 
 
-def test05_a_place_far_from_the_origin_keeps_what_floats_hold(rgb):
-    # 1e5 units away positions are 0.008 apart: opacity stays, depth is good to that.
+def test05_scene_far_from_the_origin(rgb):
+    # 1e5 units away positions are 0.008 apart: opacity is unchanged, depth is accurate to that.
     to_world = rgb.ScalarTransform4f().translate([1e5, 0, 0])
     integrator = plugin("nerg", density=fog(3.0, to_world), depth="expected")
     out = channels(rgb, integrator, camera(rgb, (1e5 + 0.5, 0.5, -2), (1e5 + 0.5, 0.5, 0), fov=2))
@@ -119,8 +119,8 @@ def test05_a_place_far_from_the_origin_keeps_what_floats_hold(rgb):
 
 
 @pytest.mark.parametrize("step, spp", [(10.0, 1), (1 / 4096, 1), (0.05, 4096)])
-def test06_samples(rgb, step, spp):
-    # Constant density is exact at any step, and so is the mean of equal samples.
+def test06_sample_counts(rgb, step, spp):
+    # Constant density is exact for any step, and so is the mean of equal samples.
     to_world = rgb.ScalarTransform4f().translate([-9, -9, 0]).scale([18, 18, 1])
     integrator = plugin("nerg", density=fog(2.0, to_world), depth="expected", step=step)
     sensor = camera(rgb, (0, 0, -1), (0, 0, 0), "orthographic", size=2, near_clip=0.5)
@@ -134,7 +134,7 @@ def test06_samples(rgb, step, spp):
 
 @pytest.mark.parametrize("kind", ["depth", "transmittance", "map"])
 @pytest.mark.parametrize("falloff", [0.0, 1e-38, 1e30])
-def test08_observers_anywhere_with_any_falloff(rgb, files, kind, falloff):
+def test08_extreme_observers_and_falloffs(rgb, files, kind, falloff):
     for origin in ((0, 0, -1), (0.1, 0.1, 0.1), (0.6, 0.5, -5), (1e6, 0, -1e6), (1e-30, 0, 0)):
         how = {"visibility": kind, "falloff": falloff, "map_height": 32, "surface_opacity": 0.0}
         out = channels(rgb, with_gaze(files, GAZE, observer=make_observer(rgb, *origin), **how))
@@ -143,7 +143,7 @@ def test08_observers_anywhere_with_any_falloff(rgb, files, kind, falloff):
 
 
 @pytest.mark.parametrize("kind", ["depth", "transmittance", "map"])
-def test09_who_stands_in_solid_matter_sees_nothing_of_its_outside(rgb, kind):
+def test09_observer_inside_solid_matter_sees_nothing(rgb, kind):
     density = fog(1e3, rgb.ScalarTransform4f().translate([-1, -1, -1]).scale(2))
     how = {"aovs": "visibility", "visibility": kind, "observer": make_observer(rgb, 0, 0, 0), "map_height": 64}
     out = channels(rgb, plugin("nerg", density=density, **how), camera(rgb, fov=20))
@@ -151,7 +151,7 @@ def test09_who_stands_in_solid_matter_sees_nothing_of_its_outside(rgb, kind):
 
 
 @pytest.mark.parametrize("origin", [(0.5, 0.4, -3), (0, 0, -1), (0.2, 0.1, 0.1)])
-def test10_observers_in_odd_places_give_finite_derivatives(rgb, files, origin):
+def test10_degenerate_observers_give_finite_derivatives(rgb, files, origin):
     how = {"observer": make_observer(rgb, *origin), "surface_opacity": 0.0, "falloff": 0.5}
     scene = scene_with(rgb, with_gaze(files, "gaze,visibility,depth", **how), camera(rgb, size=4))
     params, key = rgb.traverse(scene), "integrator.field.density_net.1"
@@ -161,7 +161,7 @@ def test10_observers_in_odd_places_give_finite_derivatives(rgb, files, origin):
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test11_observers_who_are_nowhere_are_refused(rgb, bad):
+def test11_observers_without_finite_position_are_refused(rgb, bad):
     matrix = np.eye(4)
     matrix[0, 3] = bad
     with pytest.raises(Exception, match='"observer"'):
@@ -170,7 +170,7 @@ def test11_observers_who_are_nowhere_are_refused(rgb, bad):
 
 @pytest.mark.parametrize("visibility", ["depth", "map", "transmittance"])
 @pytest.mark.parametrize("tolerance", [1e20, POSITIVE_VALUES.high])
-def test_observer_depth_is_finite_whatever_the_tolerance(rgb, tolerance, visibility):
+def test_observer_depth_is_finite_for_any_tolerance(rgb, tolerance, visibility):
     how = {"visibility": visibility, "map_height": 16, "observer": make_observer(rgb, -3, 0.5, 0.5)}
     integrator = constant(1.0, aovs="observer_depth,visibility,position", tolerance=tolerance, **how)
     image = render(rgb, integrator, camera(rgb, size=6))
@@ -181,8 +181,8 @@ def test_observer_depth_is_finite_whatever_the_tolerance(rgb, tolerance, visibil
 
 
 @pytest.mark.parametrize("gain", [1e3, 1e6, -1e6])
-def test14_activations_past_their_overflow(rgb, files, gain):
-    # exp(log σ) would overflow, or vanish, and the sigmoids of the colour saturate.
+def test14_overflowing_activations(rgb, files, gain):
+    # exp(log σ) would overflow, or underflow, and the sigmoids of the colour saturate.
     scene = scene_with(rgb, with_gaze(files, "depth,opacity,gaze"), camera(rgb, size=4))
     params = rgb.traverse(scene)
     keys = [f"integrator.{name}" for name in ("field.density_net.1", "field.color_net.2", "gaze.capture_head.0")]
@@ -196,8 +196,8 @@ def test14_activations_past_their_overflow(rgb, files, gain):
         assert np.all(np.isfinite(np.array(dr.grad(params[key])))), key
 
 
-def test15_the_median_puts_no_surface_in_mid_air(rgb):
-    # A ball with a soft edge before a wall: at its silhouette the mean of both depths lies between them.
+def test15_median_depth_lies_in_matter(rgb):
+    # A sphere with a soft edge in front of a wall: at its silhouette the mean of both depths lies between them.
     n = 48
     z, y, x = np.meshgrid(*[(np.arange(n) + 0.5) / n * 2 - 1] * 3, indexing="ij")
     radius = np.sqrt(x**2 + y**2 + (z + 0.4) ** 2) / 0.5
@@ -214,7 +214,7 @@ def test15_the_median_puts_no_surface_in_mid_air(rgb):
     assert flying["median"] == flying["refined"] == 0 < flying["expected"]
 
 
-def test16_weights_set_to_nan_are_empty_space(rgb, files):
+def test16_nan_weights_are_empty_space(rgb, files):
     scene = scene_with(rgb, with_gaze(files, "depth,opacity,visibility"))
     params, key = rgb.traverse(scene), "integrator.field.density_net.1"
     put(params, key, params[key] * math.nan)
@@ -222,9 +222,9 @@ def test16_weights_set_to_nan_are_empty_space(rgb, files):
     assert np.all(out[..., 3:] == 0) and np.all(np.isfinite(out))
 
 
-# ---- No derivative is NaN: where there is nothing and where all is solid, with observers on what they look at ----
+# ---- No derivative is NaN: in vacuum, in solid matter, and for observers on surfaces ----
 
-# In front of the fog, on it, in it, on the ball, and at the camera.
+# In front of the fog, on it, in it, on the sphere, and at the camera.
 EYES = ((-2.0, 0.3, -2.0), (0.0, 0.0, -1.0), (0.1, 0.2, 0.3), (0.0, 0.9, -0.3), (0.5, 0.4, -3.0))
 
 
@@ -232,9 +232,9 @@ EYES = ((-2.0, 0.3, -2.0), (0.0, 0.0, -1.0), (0.1, 0.2, 0.3), (0.0, 0.9, -0.3), 
 @pytest.mark.parametrize(
     "visibility, depth, eyes", [("depth", "median", EYES), ("transmittance", "expected", EYES[2::2])]
 )
-def test01_extremes(rgb, files, visibility, depth, eyes):
-    """Of all AOVs, summed, with respect to density, falloff, gaze weights, and where observer, camera and a shape
-    are."""
+def test01_extreme_parameters(rgb, files, visibility, depth, eyes):
+    """Of all AOVs, summed, with respect to density, falloff, gaze weights, and the positions of observer, camera and a
+    shape."""
     density = fog(1.0, rgb.ScalarTransform4f().translate(-1).scale(2))
     gaze, observer = stored("gazefield", files / "gaze.safetensors"), make_observer(rgb, *EYES[0])
     how = {"visibility": visibility, "depth": depth, "step": 0.2, "surface_opacity": 0.0, "falloff": 1.0}

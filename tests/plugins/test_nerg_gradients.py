@@ -1,4 +1,4 @@
-"""Derivatives of pictures against central differences, and what optimisers and loaders of rays make of them."""
+"""Derivatives of images against central differences, and their use by optimisers and ray loaders."""
 
 import drjit as dr
 import numpy as np
@@ -20,7 +20,7 @@ from .scenes import (
     with_gaze,
 )
 
-# ---- Derivatives of pictures, as mi.render gives them, against central differences of pictures ----
+# ---- Derivatives of images from mi.render, against central differences ----
 
 SIZE = 6
 COLOR, DEPTH, OPACITY, LAST = [0, 1, 2], [3], [4], [5]
@@ -43,7 +43,7 @@ def small_camera(mi, origin=(0.3, 0.2, -3), **more):
 
 
 def smooth(**kwargs):
-    """An integrator whose pictures have no jumps but those of geometry."""
+    """An integrator whose images are continuous except at geometric edges."""
     return plugin("nerg", depth="expected", step=0.1, stop=1e-12, color_cutoff=0.0, background=0.3) | kwargs
 
 
@@ -55,7 +55,7 @@ def neural(mi, files, aovs="depth,opacity,gaze", observer=None, **kwargs):
 
 
 def loss_of(mi, scene, params, channels):
-    """A sum in which each channel has a weight of its own, so that no two of them can cancel."""
+    """A sum with a separate weight for each channel, so that no two of them can cancel."""
     image = mi.render(scene, params=params, spp=1, seed=0)
     mask = np.zeros(image.shape, np.float32)
     mask[..., channels] = np.random.default_rng(0).uniform(0.2, 1, image.shape)[..., channels]
@@ -79,7 +79,7 @@ def check(mi, scene, name, channels, h, picks=3, rtol=0.04):
         ends = []
         for sign in (1, -1):
             moved = base.copy()
-            moved.num_degenerate_faces[i] += sign * h
+            moved.flat[i] += sign * h
             put(params, name, type(value)(moved))
             ends.append(np.float64(loss_of(mi, scene, params, channels).numpy().item()))
         expected.append((ends[0] - ends[1]) / (2 * h))
@@ -112,7 +112,7 @@ def test01_weights_and_falloff(rgb, learnt, name, h, channels, more):
 
 
 @pytest.mark.parametrize("name, h", [("grid.table", 5e-3), ("density_net.1", 2e-3), ("color_net.0", 1e-2)])
-def test02_a_deferred_field(rgb, learnt, name, h):
+def test02_deferred_field(rgb, learnt, name, h):
     field = stored("nerf", learnt / "deferred.safetensors")
     scene = scene_with(rgb, neural(rgb, learnt, field=field), small_camera(rgb))
     check(rgb, scene, f"integrator.field.{name}", COLOR, h)
@@ -121,7 +121,7 @@ def test02_a_deferred_field(rgb, learnt, name, h):
 @pytest.mark.parametrize("quadrature", ["constant", "linear"])
 def test07_gridvolume(rgb, quadrature):
     data = np.random.default_rng(0).exponential(1, (4, 5, 6)).astype(np.float32)
-    data[1] = 0  # empty voxels have derivatives too
+    data[1] = 0  # empty voxels have derivatives, too
     place = rgb.ScalarTransform4f().translate([-1, -1, -1]).scale(2)
     color = {"type": "constvolume", "value": {"type": "rgb", "value": [0.8, 0.5, 0.2]}}
     density = plugin("gridvolume", grid=rgb.VolumeGrid(data), to_world=place)
@@ -129,7 +129,7 @@ def test07_gridvolume(rgb, quadrature):
     scene = scene_with(rgb, integrator, small_camera(rgb))
     params = rgb.traverse(scene)
     key = next(k for k in params.keys() if k.endswith("density.data"))
-    # One-sided at 0, where density is clamped: lift the empty voxels a little.
+    # One-sided at 0, where density is clamped: raise the empty voxels slightly.
     put(params, key, rgb.TensorXf(np.maximum(params[key].numpy(), 0.02)))
     for channels in (COLOR, DEPTH, OPACITY):
         check(rgb, scene, key, channels, 1e-2, rtol=0.03)
@@ -144,7 +144,7 @@ def test08_observer_position(rgb, learnt, visible):
     base = rgb.Transform4f(params[key])
 
     def loss(x):
-        # A direction along which no edge is crossed; gaze is piecewise smooth in the observer's cell.
+        # A direction in which no edge is crossed; gaze is piecewise smooth in the observer's cell.
         put(params, key, rgb.Transform4f().translate(rgb.Vector3f(0.3 * x, x, -0.5 * x)) @ base)
         return loss_of(rgb, scene, params, LAST)
 
@@ -157,8 +157,8 @@ def test08_observer_position(rgb, learnt, visible):
     assert np.isclose(got, (ends[0] - ends[1]) / (2 * h), rtol=0.05, atol=2e-3)
 
 
-def test09_nothing_met_gives_no_nan(rgb, learnt):
-    # Most rays miss; half of the others meet almost nothing.
+def test09_rays_without_matter_give_no_nan(rgb, learnt):
+    # Most rays miss; half of the others meet almost no matter.
     integrator = neural(rgb, learnt, "depth,opacity,gaze,position,visibility", observer=(-2, 0.5, -2))
     scene = scene_with(rgb, integrator, small_camera(rgb, fov=120))
     params = rgb.traverse(scene)
@@ -169,7 +169,7 @@ def test09_nothing_met_gives_no_nan(rgb, learnt):
         assert np.all(np.isfinite(dr.grad(params[k]).numpy())), k
 
 
-def test10_a_sensor_that_stands_on_its_own_near_plane(rgb, learnt):
+def test10_sensor_on_its_near_plane(rgb, learnt):
     # Rays of a panorama start at the observer: where they miss, surface and observer coincide.
     sensor = still(camera(rgb, kind="panorama", film={"width": 8, "height": 4}))
     sensor["to_world"] = rgb.ScalarTransform4f().translate([0, 0, -3])
@@ -199,8 +199,8 @@ def test11_forward_mode(rgb, learnt):
 
 
 @pytest.mark.parametrize("whose", ["integrator.observer.to_world", "sensor.b.to_world"])
-def test12_poses_in_front_of_a_batch_go_backward_only(rgb, whose):
-    """Forward mode is refused where Mitsuba would end the process."""
+def test12_batch_poses_support_reverse_mode_only(rgb, whose):
+    """Forward mode is refused where Mitsuba would abort the process."""
     film = {**small_camera(rgb)["film"], "width": 2 * SIZE}
     cameras = {n: small_camera(rgb, (x, 0.4, -3)) for n, x in (("a", 0.5), ("b", -0.5))}
     integrator = plugin("nerg", aovs="observer_depth", occlusion=False, observer=make_observer(rgb, 2, 0.1, -3))
@@ -224,13 +224,13 @@ def test12_poses_in_front_of_a_batch_go_backward_only(rgb, whose):
     assert np.isfinite(dr.grad(x).numpy().item()) and dr.grad(x).numpy().item() != 0
 
 
-# ---- What Mitsuba's optimisers and loaders of rays make of pictures: parameters and gaze that they find ----
+# ---- Optimisation with Mitsuba's optimisers and ray loaders: parameters and gaze are recovered ----
 
 SEEN, HELD_OUT = ((0.5, 0.4, -3), (-1.5, 0.3, -2.6), (2.0, -0.5, -2.2)), (1.3, 0.0, -2.7)
 
 
 def learn(params, opt, loss, steps):
-    """Steps of ``opt`` down ``loss``, a function of the step; the losses."""
+    """Minimise ``loss``, a function of the step, with ``opt``; returns the losses."""
     params.update(opt)
     losses = []
     for i in range(steps):
@@ -242,8 +242,8 @@ def learn(params, opt, loss, steps):
     return losses
 
 
-def test01_adam_finds_falloff_and_density(rgb):
-    """Both at once: visibility tells the first, opacity the second, in a fog that camera and observer see from two
+def test01_adam_recovers_falloff_and_density(rgb):
+    """Both at once: visibility determines the first, opacity the second, in fog that camera and observer see from two
     sides."""
     fog = plugin("constvolume", value=1.5, to_world=rgb.ScalarTransform4f().translate(-1).scale(2))
     more = {"density": fog, "observer": make_observer(rgb, -2, 0.3, 2), "falloff": 2.0}
@@ -260,16 +260,18 @@ def test01_adam_finds_falloff_and_density(rgb):
 
 @pytest.fixture
 def improves(rgb, files):
-    """Whether gaze weights learn from ``batches(scene, views)``, a function of the step that gives a sensor and the
-    gaze to be found there. It grows with x, e-fold over a unit: pictures agree about it, whichever camera made them."""
-    integrator = with_gaze(files, "gaze,position", falloff=2.0, radiance=False, observer=make_observer(rgb, -2, 0.3, -2))
+    """Whether gaze weights can be trained on ``batches(scene, views)``, a function of the step that returns a sensor
+    and the reference gaze. The gaze grows with x, by a factor of e per unit, so all cameras are consistent."""
+    integrator = with_gaze(
+        files, "gaze,position", falloff=2.0, radiance=False, observer=make_observer(rgb, -2, 0.3, -2)
+    )
     sensors = {f"camera{i}": still(camera(rgb, origin, size=8)) for i, origin in enumerate((*SEEN, HELD_OUT))}
     scene = rgb.load_dict({"type": "scene", "integrator": integrator, **sensors})
     pictures = [np.array(rgb.render(scene, sensor=s, spp=1)) for s in scene.sensors()]
     views, params = [p[..., 3] * np.exp(p[..., 4]) for p in pictures], rgb.traverse(scene)
 
     def error():
-        """Of the camera that nothing is trained on, relative."""
+        """Relative error of a held-out camera."""
         got = np.array(rgb.render(scene, sensor=len(SEEN), spp=1))[..., 3]
         return np.linalg.norm(got - views[-1]) / np.linalg.norm(views[-1])
 
@@ -288,13 +290,13 @@ def improves(rgb, files):
     return improves
 
 
-def test02_gaze_weights_learn_from_whole_views(rgb, improves):
+def test02_gaze_weights_train_on_whole_views(rgb, improves):
     assert improves(lambda scene, views: lambda i: (i % 3, rgb.TensorXf(views[i % 3])))
 
 
 @pytest.mark.nightly
-def test03_gaze_weights_learn_from_batches_of_rays(rgb, improves):
-    """Random pixels of all cameras a step, their targets in the loader's colours."""
+def test03_gaze_weights_train_on_ray_batches(rgb, improves):
+    """Random pixels of all cameras per step, with their targets in the loader's colours."""
 
     def batches(scene, views):
         colors = [rgb.TensorXf(np.repeat(view[..., None], 3, -1)) for view in views]
@@ -310,15 +312,15 @@ def test03_gaze_weights_learn_from_batches_of_rays(rgb, improves):
     assert improves(batches)
 
 
-def test04_a_batch_of_rays_shows_what_its_pixels_show(rgb, files):
-    """All channels. Rays are almost parallel, as the loader moves each within its pixel: every camera shows but one
-    number."""
+def test04_ray_batch_matches_its_pixels(rgb, files):
+    """All channels. Rays are almost parallel, since the loader moves each within its pixel: all cameras show a single
+    value."""
     integrator = with_gaze(files, observer=make_observer(rgb, -2, 0.3, -2), falloff=2.0)
     eyes = [(0.2 * i - 0.5, 0.3 - 0.1 * i, -3) for i in range(3)]
     sensors = {f"camera{i}": camera(rgb, o, (o[0], o[1], 0), size=6, fov=0.01) for i, o in enumerate(eyes)}
     scene = rgb.load_dict({"type": "scene", "integrator": integrator, **sensors})
     pictures = [rgb.render(scene, sensor=s, spp=1) for s in scene.sensors()]
-    # A divisor of the number of pixels: without tiles the loader of 3.9.1 draws pixels beyond the last one otherwise.
+    # A divisor of the number of pixels: without tiles the loader of 3.9.1 otherwise draws pixels beyond the last one.
     how = {"pixels_per_batch": 36, "tile_size": 1}
     colors, rays = rgb.ad.loaders.RayDataLoader(scene.sensors(), [p[..., :3] for p in pictures], **how).next()
     got, chosen = np.array(rgb.render(scene, sensor=rays, spp=1))[0], np.array(rays.pixel_idx)

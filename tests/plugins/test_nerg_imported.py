@@ -1,5 +1,4 @@
-"""A checkpoint of the paper's authors, in their sizes, as a picture: `nerg` against NumPy from the state dictionary
-on."""
+"""An imported checkpoint of the paper's authors, at their sizes: `nerg` against NumPy on the state dictionary."""
 
 import drjit.llvm.ad as ns
 import numpy as np
@@ -19,8 +18,8 @@ SIZE, STEP = 6, 0.02
 
 
 def expected(state, nerf, bound, origins, directions, eye):
-    """Colour, depth, opacity, gaze, emit and capture of every ray, marched without skipping but for the kernel's
-    bits."""
+    """Colour, depth, opacity, gaze, emit and capture of each ray, marched with the kernel's occupancy bits as the only
+    skipping."""
     out = []
     for o, d in zip(origins, directions):
         near, far = march_numpy.box(o, d, [-bound] * 3, [bound] * 3)
@@ -41,7 +40,7 @@ def expected(state, nerf, bound, origins, directions, eye):
 
 
 def smooth(state, finest):
-    """Weaken fine levels as training does: white noise at 4096 cells would show the last bit of every position."""
+    """Attenuate fine levels as training does: white noise at 4096 cells would show the last bit of every position."""
     where, levels = state["encoder.offsets"], len(state["encoder.offsets"]) - 1
     for level in range(levels):
         state["encoder.embeddings"][where[level] : where[level + 1]] *= (16 / finest) ** (level / (levels - 1))
@@ -49,7 +48,7 @@ def smooth(state, finest):
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("bound, aligned", [(2, True), (5, False)])
-def test01_a_picture_of_a_checkpoint(rgb, tmp_path, bound, aligned):
+def test01_render_imported_checkpoint(rgb, tmp_path, bound, aligned):
     rng = np.random.default_rng(bound)
     nerf = reference.nerf_state(bound, rng, filled=0.2)
     state = reference.gaze_state(bound, rng)
@@ -80,5 +79,5 @@ def test01_a_picture_of_a_checkpoint(rgb, tmp_path, bound, aligned):
     assert true[:, 4].min() > 0.2 and np.ptp(true[:, 5]) > 0.1
     scale = np.abs(true).max(0)
     error = np.sort((np.abs(flat - true) / scale).max(1))
-    # A sample that rounding puts on the other side of a cell's face counts by its whole step: in one ray at most.
+    # A sample that rounding moves across a cell face changes the result by a whole step: for at most one ray.
     assert np.median(error) < 1e-5 and error[-2] < 1e-4 and error[-1] < 0.1

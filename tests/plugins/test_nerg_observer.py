@@ -1,4 +1,4 @@
-"""Observers and shapes: what is hidden from whom, how that is decided, and what a field and shapes show together."""
+"""Observers and shapes: occlusion, how it is decided, and images of a field with shapes."""
 
 import drjit as dr
 import numpy as np
@@ -14,9 +14,9 @@ from .scenes import (
     constant,
     hidden_scene,
     look_at,
+    make_observer,
     named,
     observed,
-    make_observer,
     picture,
     plugin,
     points,
@@ -31,11 +31,11 @@ from .scenes import (
     with_gaze,
 )
 
-# ---- What is hidden from observers, and how that is decided ----
+# ---- Occlusion from observers ----
 
 
 @pytest.mark.parametrize("near_clip", [0.01, 1.0])
-def test01_an_observer_at_the_camera_is_none(rgb, files, near_clip):
+def test01_observer_at_the_camera_changes_nothing(rgb, files, near_clip):
     sensor = camera(rgb, near_clip=near_clip)
     a = render(rgb, with_gaze(files, GAZE), sensor, spp=2)
     b = render(rgb, with_gaze(files, GAZE, observer=make_observer(rgb, 0.5, 0.4, -3, near_clip=0.5)), sensor, spp=2)
@@ -44,10 +44,10 @@ def test01_an_observer_at_the_camera_is_none(rgb, files, near_clip):
     assert set(np.unique(out["visibility.Y"])) <= {0, 0.5, 1} and out["gaze.Y"].max() > 0
 
 
-def test03_cameras_without_a_centre_need_an_observer(rgb, files):
+def test03_cameras_without_a_center_need_an_observer(rgb, files):
     sensor = {**camera(rgb, kind="orthographic"), "near_clip": 0.1}
     scene = scene_with(rgb, with_gaze(files, "gaze"), sensor)
-    with pytest.raises(ValueError, match="no centre to look from.*observer"):
+    with pytest.raises(ValueError, match="no centre; give.*observer"):
         scene.integrator().render(scene, scene.sensors()[0])
     out = channels(rgb, with_gaze(files, "gaze", observer=make_observer(rgb, 1, 0, -3)), sensor)
     assert out["gaze.Y"].any()
@@ -55,7 +55,8 @@ def test03_cameras_without_a_centre_need_an_observer(rgb, files):
 
 
 def sides(out, margin=0.06):
-    """Which points of the back wall the gap's wall hides from the observer, and which it certainly does not."""
+    """Points of the back wall that the wall with the gap hides from the observer, and points that it certainly does not
+    hide."""
     # The observer's line to (x, y, 0.8) passes z = -0.05 .. 0.05 at x (0.85 .. 0.95) / 1.7.
     x = out["position.X"]
     hidden, visible = x * 0.95 / 1.7 < 0.3 - margin, x * 0.85 / 1.7 > 0.3 + margin
@@ -78,36 +79,36 @@ def test04_behind_an_opaque_wall(rgb, kind, depth):
 
 
 def test05_falloff_is_a_ramp(rgb):
-    # Hidden surfaces lie 1.7 / 0.85 times as far as what the observer meets.
+    # Hidden surfaces are 1.7 / 0.85 times as far as the occluder.
     out = hidden_scene(rgb, falloff=2.0, tolerance=0.05)
     hidden, _, ray = sides(out)
     expected = 1 - np.clip((ray - out["observer_depth.T"] - 0.05) / 2, 0, 1)
-    # The point looked for lies the tolerance and a little more in front of the surface.
+    # The target lies in front of the surface by slightly more than the tolerance.
     assert np.allclose(out["visibility.Y"][hidden], expected[hidden], atol=0.04)
     assert 0.3 < expected[hidden].min() and expected[hidden].max() < 0.8
 
 
-def test06_without_occlusion_all_is_visible(rgb):
+def test06_everything_is_visible_without_occlusion(rgb):
     out = hidden_scene(rgb, occlusion=False)
     assert (out["visibility.Y"] == 1).all()
     assert np.allclose(out["observer_depth.T"], sides(out)[2], rtol=1e-5)
 
 
-def test10_coarse_steps_in_front_of_matter_change_nothing_behind(rgb):
+def test10_coarse_prepass_changes_nothing(rgb):
     aovs = "depth,opacity,visibility,position,observer_depth"
     a, b = (hidden_scene(rgb, coarse=c, falloff=0.0, aovs=aovs) for c in (1.0, 4.0))
-    # Steps end elsewhere: a pixel at the shadow's edge may change sides.
+    # Steps end elsewhere: a pixel at the shadow's edge can change.
     same = a["visibility.Y"] == b["visibility.Y"]
     assert np.mean(~same) < 0.06
     for c in ("depth.T", "opacity.Y", "observer_depth.T"):
         assert np.allclose(a[c][same], b[c][same], rtol=1e-2, atol=5e-3), c
 
 
-# σ = 50: the observer's light goes two steps deep, and by 1/cos less so in depth. None: a shape.
+# σ = 50: the observer's light penetrates by two steps, and by a factor of 1/cos less in depth. None: a shape.
 @pytest.mark.parametrize("sigma", [1e4, 50.0, None])
 @pytest.mark.parametrize("kind", ["depth", "map", "transmittance"])
 @pytest.mark.parametrize("angle", [0, 70, 85, 89])
-def test30_no_wall_hides_itself_from_an_oblique_observer(rgb, kind, sigma, angle):
+def test30_no_self_occlusion_at_grazing_angles(rgb, kind, sigma, angle):
     eye = [2 * np.sin(np.deg2rad(angle)), 0.0, 2 - 2 * np.cos(np.deg2rad(angle))]
     observer = {"type": "perspective", "to_world": look_at(rgb, eye, (0, 0, 2))}
     how = {"aovs": "visibility", "visibility": kind, "falloff": 0.0, "radiance": False, "map_height": 256}
@@ -120,9 +121,8 @@ def test30_no_wall_hides_itself_from_an_oblique_observer(rgb, kind, sigma, angle
 
 
 @pytest.mark.parametrize("kind", ["depth", "map"])
-def test31_an_observer_who_meets_nothing_is_not_blocked_by_it(rgb, kind):
-    """Also where any opacity counts as a surface: rays that pass a ball by a hair find the point in front of it in the
-    open."""
+def test31_observer_ray_without_surface_is_visible(rgb, kind):
+    """Also if any opacity counts as a surface: the target of rays just past a sphere is in the open."""
     eye = (-2, 0.5, -2.5)
     how = {"aovs": "visibility,observer_depth,position", "surface_opacity": 0.0, "visibility": kind}
     integrator = plugin("nerg", observer=make_observer(rgb, *eye), **how)
@@ -134,9 +134,9 @@ def test31_an_observer_who_meets_nothing_is_not_blocked_by_it(rgb, kind):
 
 @pytest.mark.parametrize("kind", ["depth", "transmittance", "map"])
 @pytest.mark.parametrize("veiled", [False, True])
-def test06_shapes_hide_from_the_observer(rgb, kind, veiled):
-    """A square at z = 0 between an observer in front and a wall at z = 1, seen from the side; also through a veil that
-    is far too thin to hide anything."""
+def test06_shapes_occlude_the_observer(rgb, kind, veiled):
+    """A square at z = 0 between an observer in front and a wall at z = 1, seen from the side; also through a haze that
+    is too thin to hide anything."""
     how = {"aovs": "position,visibility,observer_depth", "visibility": kind, "falloff": 0.0}
     if veiled:
         box = rgb.ScalarTransform4f().translate([-4, -4, -0.9]).scale([8, 8, 0.5])
@@ -145,7 +145,7 @@ def test06_shapes_hide_from_the_observer(rgb, kind, veiled):
     shapes = {"wall": square(rgb, 1.0, 3.0), "lid": square(rgb, 0.0, 0.5)}
     out = channels(rgb, integrator, camera(rgb, (3.0, 0, -1), (0, 0, 1), fov=40, size=24), **shapes)
     on_wall = np.abs(out["position.Z"] - 1) < 1e-3
-    # Its shadow is twice its size. A map knows edges to about a row.
+    # Its shadow is twice its size. A map resolves edges to about a row.
     reach = np.maximum(np.abs(out["position.X"]), np.abs(out["position.Y"]))
     hidden, seen = on_wall & (reach < 0.95), on_wall & (reach > 1.05)
     assert hidden.sum() > 10 and seen.sum() > 50
@@ -156,7 +156,7 @@ def test06_shapes_hide_from_the_observer(rgb, kind, veiled):
         assert np.allclose(out["observer_depth.T"][hidden], distance[hidden] / 2, atol=1e-2)
 
 
-# ---- Shapes, alone and together with a field: exact depths, compositing, and gaze on surfaces ----
+# ---- Shapes, alone and with a field: exact depths, compositing, and gaze on surfaces ----
 
 
 def gaze_only(files, aovs, **kwargs):
@@ -164,7 +164,7 @@ def gaze_only(files, aovs, **kwargs):
 
 
 @pytest.mark.parametrize("sigma", [0.3, 3.0])
-def test04_the_field_in_front_attenuates_a_shape(rgb, sigma):
+def test04_field_attenuates_a_shape_behind_it(rgb, sigma):
     """Closed forms: unit cube of constant density with a wall through its middle."""
     blue, red = ({"type": "rgb", "value": value} for value in ([0, 0, 1], [1, 0, 0]))
     integrator = constant(sigma, aovs="depth,opacity", color={"type": "constvolume", "value": blue})
@@ -178,7 +178,7 @@ def test04_the_field_in_front_attenuates_a_shape(rgb, sigma):
         assert image[0, 0] == pytest.approx([T, 0, 1 - T, depth, 1], rel=1e-5, abs=1e-5)
 
 
-def test05_a_shape_hides_the_field_and_the_field_a_shape(rgb):
+def test05_shapes_and_field_occlude_each_other(rgb):
     field = constant(1e6, aovs="depth,opacity,density_evals")
     front, behind = (channels(rgb, field, straight(rgb, "perspective"), w=square(rgb, z, 2.0)) for z in (-0.5, 1.5))
     assert front["depth.T"][0, 0] == pytest.approx(1.49) and front["density_evals.Y"][0, 0] == 0
@@ -197,7 +197,7 @@ def test08_gaze_on_a_shape_is_equation_1(rgb, files):
         assert np.allclose(out[name][seen], np.array(value), rtol=2e-4)
 
 
-def test09_without_a_volume_no_march_without_shapes_no_cast(rgb):
+def test09_no_march_without_volume_and_no_cast_without_shapes(rgb):
     def operations(integrator, **more):
         scene = scene_with(rgb, integrator, **more)
         rgb.render(scene, spp=1)
@@ -208,12 +208,12 @@ def test09_without_a_volume_no_march_without_shapes_no_cast(rgb):
     field, both = operations(constant()), operations(constant(), **shape)
     out = channels(rgb, {"type": "nerg", "aovs": "depth,density_evals,color_evals"}, **shape)
     assert not out["density_evals.Y"].any() and not out["color_evals.Y"].any()
-    # Both cost what each costs, but for the pixel filter and the camera.
+    # The cost is the sum of both, except for the pixel filter and the camera.
     assert shapes < field < both and both < field + shapes
 
 
-def test11_a_map_keeps_gaze(rgb, files):
-    """Looked up, gaze is that of the network but for interpolation, and costs no evaluation; weights are still
+def test11_map_stores_gaze(rgb, files):
+    """Interpolated gaze equals that of the network up to interpolation, without evaluations; weights are still
     differentiable."""
     network, table = (
         gaze_only(files, "gaze,visibility,gaze_evals", visibility=kind, observer=make_observer(rgb, -2, 0.3, -2))
@@ -223,7 +223,7 @@ def test11_a_map_keeps_gaze(rgb, files):
     before = picture(rgb, scene)
     exact, kept = channels(rgb, network, s=sphere(rgb, 0, 0, 0)), named(rgb, before, table)
     assert exact["gaze_evals.Y"].max() == 2 and kept["gaze_evals.Y"].max() == 2
-    # Where entries look past the ball, the network is asked.
+    # Where entries are past the sphere, the network is evaluated.
     assert 0 < kept["gaze_evals.Y"].sum() < 0.3 * exact["gaze_evals.Y"].sum()
     both = (exact["visibility.Y"] == 1) & (kept["visibility.Y"] > 0.999)
     assert both.sum() > 10
@@ -233,7 +233,7 @@ def test11_a_map_keeps_gaze(rgb, files):
     attach(params, key)
     dr.backward(dr.sum(rgb.render(scene, params, spp=1)[..., 3], axis=None))
     assert dr.any(params[key].grad != 0, axis=None)
-    # New weights are noticed.
+    # New weights take effect.
     put(params, key, dr.detach(params[key]) * 200)
     assert np.abs(picture(rgb, scene)[..., 3] - before[..., 3]).max() > 0.1
 
@@ -241,7 +241,7 @@ def test11_a_map_keeps_gaze(rgb, files):
 @pytest.mark.parametrize("veiled", [False, True])
 @pytest.mark.parametrize("depth", ["expected", "median"])
 def test12_depth_follows_a_moving_shape(rgb, depth, veiled):
-    """Derivative of depth with respect to a mesh's position, against central differences; also through a veil."""
+    """Derivative of depth with respect to a mesh's position, against central differences; also through a haze."""
     mesh = rgb.load_dict({"type": "cube", "to_world": rgb.ScalarTransform4f().rotate([0.3, 1, 0.2], 30).scale(0.4)})
     how = {"aovs": "depth", "depth": depth}
     integrator = constant(0.2, **how) if veiled else plugin("nerg", **how)
@@ -267,8 +267,8 @@ def test12_depth_follows_a_moving_shape(rgb, depth, veiled):
     assert float(dr.grad(z)[0]) == pytest.approx(differences.sum(), rel=0.02)
 
 
-def test14_a_gaze_field_over_a_field_and_a_shape_in_it(rgb, files):
-    """A ball put into a trained field hides what is behind it and carries gaze itself."""
+def test14_gaze_on_a_shape_inside_a_field(rgb, files):
+    """A sphere inside a trained field hides what is behind it and has gaze itself."""
     aovs, center = "depth,opacity,gaze,visibility,position", (0.5, 0.4, -1.6)
     integrator = with_gaze(files, aovs, falloff=0.0, observer=make_observer(rgb, -2, 0.3, -2))
     bare, ball = channels(rgb, integrator), channels(rgb, integrator, s=sphere(rgb, *center, radius=0.2))

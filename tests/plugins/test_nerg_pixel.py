@@ -1,4 +1,4 @@
-"""What is found along one camera ray, and when; for other AOVs, and for several observers of the same rays."""
+"""Lazy evaluation along one camera ray; contexts with other AOVs, and several observers of the same rays."""
 
 from functools import cached_property
 
@@ -10,21 +10,23 @@ from nerg_mi.transport import observer_gaze
 from nerg_mi.transport.geometry import SceneGeometry
 
 from . import fields
-from .scenes import camera, look_at, named, make_observer, picture, plugin, scene_with, stored, with_gaze
+from .scenes import camera, look_at, make_observer, named, picture, plugin, scene_with, stored, with_gaze
 
-# ---- What is found along one camera ray, and when ----
+# ---- Lazy evaluation along one camera ray ----
 
 
 @pytest.fixture
 def traced(monkeypatch):
-    """One entry for each ray that is traced: the origin of its first lane."""
+    """One entry per traced ray: the origin of its first lane."""
     found, trace = [], SceneGeometry.trace
-    monkeypatch.setattr(SceneGeometry, "trace", lambda *a, **k: (found.append(np.array(a[1].o)[:, 0]), trace(*a, **k))[1])
+    monkeypatch.setattr(
+        SceneGeometry, "trace", lambda *a, **k: (found.append(np.array(a[1].o)[:, 0]), trace(*a, **k))[1]
+    )
     return found
 
 
 def pixel(mi, integrator, eye=(0.5, 0.4, -3), **more):
-    """Of rays from a camera at ``eye`` to and past the field."""
+    """Rays from a camera at ``eye`` to the field and past it."""
     scene = scene_with(mi, {**integrator, **more}, camera(mi, eye))
     o = mi.Point3f(*map(float, eye))
     target = mi.Point3f([0, 0.1, 9], [0, 0.1, 9], 0)
@@ -33,35 +35,35 @@ def pixel(mi, integrator, eye=(0.5, 0.4, -3), **more):
     return context.trace(scene, scene.sensors(), None, ray, mi.Bool(True)).make_pixel()
 
 
-def test01_nothing_is_traced_before_it_is_asked_for(rgb, files, traced):
+def test01_values_are_computed_on_first_access(rgb, files, traced):
     found = pixel(rgb, with_gaze(files, "gaze,visibility", observer=make_observer(rgb, -2, 0.3, -2)))
     assert len(traced) == 1
-    found.camera.depth, found.camera.surface, found.camera.p_d, found.r_o  # noqa: B018
+    found.camera.depth, found.camera.has_surface, found.camera.p_d, found.r_o  # noqa: B018
     assert len(traced) == 1
-    found.sight, found.attention, found.sight  # noqa: B018
+    found.observer_hit, found.surface_gaze, found.observer_hit  # noqa: B018
     assert len(traced) == 2 and np.allclose(traced[1], (-2, 0.3, -2))
 
 
 @pytest.mark.parametrize("observer", [None, (0.5, 0.4, -3)])
-def test02_who_stands_at_the_camera_sees_what_it_sees(rgb, files, traced, observer):
+def test02_observer_at_the_camera_sees_the_same(rgb, files, traced, observer):
     more = {} if observer is None else {"observer": make_observer(rgb, *observer)}
     found = pixel(rgb, with_gaze(files, "gaze,visibility", **more))
-    assert found.aligned and np.allclose(np.array(found.observer.p_o).T, (0.5, 0.4, -3))
-    assert (found.sight.visibility.numpy() == 1).all() and len(traced) == 1
-    assert np.allclose(found.sight.depth.numpy()[:2], found.camera.depth.numpy()[:2], rtol=1e-5)
+    assert found.is_aligned and np.allclose(np.array(found.observer.p_o).T, (0.5, 0.4, -3))
+    assert (found.observer_hit.visibility.numpy() == 1).all() and len(traced) == 1
+    assert np.allclose(found.observer_hit.depth.numpy()[:2], found.camera.depth.numpy()[:2], rtol=1e-5)
 
 
 def test03_gaze_is_zero_without_a_surface(rgb, files):
     found = pixel(rgb, with_gaze(files, "gaze,emit"))
-    surface = found.camera.surface.numpy()
+    surface = found.camera.has_surface.numpy()
     assert surface.tolist() == [True, True, False]
-    for value in (found.attention.gaze, found.attention.emit, found.attention.capture):
+    for value in (found.surface_gaze.gaze, found.surface_gaze.emit, found.surface_gaze.capture):
         assert ((value.numpy() > 0) == surface).all()
-    assert found.attention.evaluations.numpy().tolist() == [2, 2, 0] and found.attention.spread is None
+    assert found.surface_gaze.evaluations.numpy().tolist() == [2, 2, 0] and found.surface_gaze.std is None
 
 
-def test03b_networks_are_evaluated_where_gaze_is_seen(rgb, files):
-    """And give what they give everywhere, as derivatives have it; with factors, wherever there is a surface."""
+def test03b_networks_are_evaluated_on_visible_surfaces_only(rgb, files):
+    """Results equal those of full evaluation, as with gradients; with factors, on all surfaces."""
 
     def attention(aovs, attached):
         integrator = with_gaze(files, aovs, observer=make_observer(rgb, -0.2, 3, 0.1), falloff=0.0)
@@ -84,38 +86,38 @@ def test03b_networks_are_evaluated_where_gaze_is_seen(rgb, files):
     np.testing.assert_allclose(whole["gaze"], seen["gaze"], rtol=1e-5)
 
 
-def test04_evaluations_are_those_of_all_that_was_traced(rgb, files):
+def test04_evaluation_counts_cover_all_marches(rgb, files):
     integrator = with_gaze(files, "visibility,density_evals", observer=make_observer(rgb, -2, 0.3, -2))
     found = pixel(rgb, integrator)
-    alone = found.density_evaluations().numpy()
-    found.sight  # noqa: B018
-    assert (found.density_evaluations().numpy()[:2] > alone[:2]).all() and (alone[:2] > 5).all()
+    alone = found.count_density_evaluations().numpy()
+    found.observer_hit  # noqa: B018
+    assert (found.count_density_evaluations().numpy()[:2] > alone[:2]).all() and (alone[:2] > 5).all()
 
 
 @pytest.mark.parametrize(
     "aovs, looked_up", [("gaze", True), ("gaze,gaze_evals,depth", True), ("gaze,emit", False), ("visibility", False)]
 )
-def test05_a_map_stands_in_for_gaze_alone(rgb, files, aovs, looked_up):
-    """It keeps neither factors nor what nobody asks for."""
+def test05_map_replaces_gaze_only(rgb, files, aovs, looked_up):
+    """A map stores neither factors nor unrequested values."""
     observer = make_observer(rgb, -2, 0.3, -2)
     found = pixel(rgb, with_gaze(files, aovs, observer=observer, visibility="map", map_height=32))
-    assert (found.sight.gaze is not None) == looked_up
+    assert (found.observer_hit.gaze is not None) == looked_up
     assert bool(found.context.cache.peek("gaze of map")) == looked_up
     assert len(found.context.cache.peek("map")) == 1
 
 
-def test07_another_observer_is_another_object(rgb, files):
-    """All that a pixel computes follows its observer; the camera's part is one object that knows of none."""
+def test07_each_observer_has_its_own_pixel(rgb, files):
+    """All values of a pixel follow its observer; the camera's part is one object without an observer."""
     first = pixel(rgb, with_gaze(files, "gaze,visibility,density_evals", observer=make_observer(rgb, -2, 0.3, -2)))
     for name, value in vars(type(first)).items():
         assert not isinstance(value, cached_property) or getattr(first, name) is not None
     other = first.camera.make_pixel(first.context.make_observer((2, 0.3, -2)))
     assert other.camera is first.camera and not set(vars(other)) & {"observer", "sight", "gaze", "attention"}
     assert not np.allclose(np.array(other.r_o), np.array(first.r_o))
-    assert not np.allclose(other.attention.gaze.numpy(), first.attention.gaze.numpy())
+    assert not np.allclose(other.surface_gaze.gaze.numpy(), first.surface_gaze.gaze.numpy())
 
 
-# ---- The integrator's context for other AOVs, along any rays, and for several observers of the same rays ----
+# ---- The integrator's context for other AOVs, arbitrary rays, and several observers of the same rays ----
 
 EYES = [(0.3, -3, 0.4), (2.5, -1, 0.5), (-1.5, -2.0, 1.0)]
 
@@ -139,26 +141,26 @@ def sampler(mi):
 
 
 def traced_for(mi, scene, aovs, ray, sensors=()):
-    """``(context for these AOVs, what the camera's ray meets)``."""
+    """``(context for these AOVs, result of tracing the camera's ray)``."""
     context = scene.integrator().make_context(aovs, False)
     return context, context.trace(scene, sensors, sampler(mi), ray, mi.Bool(True))
 
 
-def test01_what_depends_on_the_observer(scene):
+def test01_observer_dependent_aovs(scene):
     context = scene.integrator().make_context(["depth", "gaze", "position", "visibility"], True)
-    assert context.shared == ["depth", "position"] and context.own == ["gaze", "visibility"]
-    assert context.channels(context.shared) == ["depth.T", "position.X", "position.Y", "position.Z"]
-    # All else is the integrator's, which is left as it was.
+    assert context.shared_aovs == ["depth", "position"] and context.observer_aovs == ["gaze", "visibility"]
+    assert context.channel_names(context.shared_aovs) == ["depth.T", "position.X", "position.Y", "position.Z"]
+    # All other settings are the integrator's, which is unchanged.
     assert context.settings is scene.integrator().settings
     assert scene.integrator().aov_names() == ["depth.T", "opacity.Y"]
 
 
-def test03_the_values_of_a_render(rgb, scene, ray):
+def test03_values_match_a_rendering(rgb, scene, ray):
     names = ["gaze", "visibility", "gaze_evals"]
     context, camera = traced_for(rgb, scene, ["depth", *names], ray)
-    camera.settle()
+    camera.eval_shared()
     for eye in EYES:
-        found = camera.make_pixel(context.make_observer(eye)).channels(names)
+        found = camera.make_pixel(context.make_observer(eye)).compute_channels(names)
         observer = {"type": "perspective", "to_world": rgb.ScalarTransform4f().translate(list(eye))}
         alone = plugin("nerg", aovs=",".join(names), observer=observer, **scene.integrator().children)
         expected = rgb.load_dict(alone).sample(scene, sampler(rgb), ray)[2]
@@ -166,44 +168,44 @@ def test03_the_values_of_a_render(rgb, scene, ray):
             assert np.array_equal(np.array(mine), np.array(theirs))
 
 
-def test05_the_cameras_ray_is_traced_once_and_kernels_are_those_of_one_observer(rgb, scene, ray, traced):
+def test05_camera_rays_are_traced_once_for_several_observers(rgb, scene, ray, traced):
     context, camera = traced_for(rgb, scene, ["depth", "gaze", "visibility"], ray)
-    camera.settle()
+    camera.eval_shared()
     kernels = []
     for eye in EYES:
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
             dr.kernel_history_clear()
-            dr.eval(camera.make_pixel(context.make_observer(eye)).channels(["gaze", "visibility"]))
+            dr.eval(camera.make_pixel(context.make_observer(eye)).compute_channels(["gaze", "visibility"]))
             kernels.append({k["hash"] for k in dr.kernel_history() if "hash" in k})
     assert kernels[0] and kernels[0] == kernels[1] == kernels[2] and len(traced) == 1 + len(EYES)
 
 
-def test06_an_observer_where_the_camera_stands(rgb, scene):
+def test06_observer_at_the_camera_position(rgb, scene):
     to_world = look_at(rgb, (0, -3, 0), up=(0, 0, 1))
     sensor = rgb.load_dict({"type": "perspective", "to_world": to_world})
     ray, _ = sensor.sample_ray_differential(0, 0, rgb.Point2f([0.4, 0.5], [0.5, 0.6]), rgb.Point2f(0.5))
     context, camera = traced_for(rgb, scene, ["gaze", "visibility", "density_evals"], ray, [sensor])
     there, elsewhere = (camera.make_pixel(context.make_observer(eye)) for eye in ((0, -3, 0), EYES[1]))
-    assert there.aligned and not elsewhere.aligned
-    # For the others a second march decides what they see.
-    evaluations = lambda pixel: np.array(pixel.channels(["visibility", "density_evals"])[1])
+    assert there.is_aligned and not elsewhere.is_aligned
+    # For other observers a second march decides what they see.
+    evaluations = lambda pixel: np.array(pixel.compute_channels(["visibility", "density_evals"])[1])
     assert np.all(evaluations(there) < evaluations(elsewhere))
     own = camera.make_pixel_per_origin()
-    assert own.aligned and np.allclose(*(np.array(p.channels(["gaze"])[0]) for p in (own, there)), rtol=1e-3)
+    assert own.is_aligned and np.allclose(*(np.array(p.compute_channels(["gaze"])[0]) for p in (own, there)), rtol=1e-3)
 
 
-def test08_integrals_of_several_observers_are_kept(rgb, files, tmp_path, ray, monkeypatch):
-    """Two observers in turns: each has an integral of their own, which is found once."""
+def test08_integrals_of_several_observers_are_cached(rgb, files, tmp_path, ray, monkeypatch):
+    """Two alternating observers: each has its own integral, computed once."""
     fields.gaze(tmp_path / "gaze.safetensors", normalized=True)
     field, gaze = stored("nerf", files / "field.safetensors"), stored("gazefield", tmp_path / "gaze.safetensors")
     scene = rgb.load_dict({"type": "scene", "integrator": plugin("nerg", field=field, gaze=gaze)})
-    found, integrate = [], observer_gaze.integrate
-    monkeypatch.setattr(observer_gaze, "integrate", lambda *a: found.append(1) or integrate(*a))
+    found, integrate_sphere = [], observer_gaze.integrate_sphere
+    monkeypatch.setattr(observer_gaze, "integrate_sphere", lambda *a: found.append(1) or integrate_sphere(*a))
 
     def values():
         context, camera = traced_for(rgb, scene, ["gaze"], ray)
         pixels = (camera.make_pixel(context.make_observer(eye)) for eye in EYES[:2])
-        return [np.array(pixel.channels(["gaze"])[0]) for pixel in pixels]
+        return [np.array(pixel.compute_channels(["gaze"])[0]) for pixel in pixels]
 
     np.testing.assert_array_equal(values(), values())
     assert len(found) == 2

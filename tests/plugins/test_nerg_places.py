@@ -1,5 +1,5 @@
-"""Shapes, a field, and both, under everything that Mitsuba puts around an integrator: each picture against closed
-forms, against Mitsuba's own integrators, or against the same place built in another way."""
+"""Shapes, a field, and both, in all of Mitsuba's contexts of an integrator: each image against closed forms, Mitsuba's
+own integrators, or an equivalent scene."""
 
 import drjit as dr
 import numpy as np
@@ -10,8 +10,8 @@ from .scenes import (
     channels,
     constant,
     look_at,
-    named,
     make_observer,
+    named,
     picture,
     plugin,
     points,
@@ -30,17 +30,16 @@ TOLERANCE = 1e-3
 
 
 def closed_form(mi, sigma, eye, depth="expected", light=None):
-    """An integrator that knows the answers: shapes in a box of constant density, by one ray cast and closed forms.
+    """A reference integrator: shapes in a box of constant density, by one ray cast and closed forms.
 
     It shares no code with `nerg`: rays come from Mitsuba's sensors, distances from its ray casts, light on shapes from
-    its integrators. What it returns for a ray is what `nerg` should return for the same ray, whatever film, sensor or
-    integrator is around it. Density `sigma` (0: vacuum) and `COLOR` from -1 to 1; visibility by transmittance to the
-    point `eye` (None: everything with a surface is visible). `light`: the integrator that lights shapes; None: they
-    show their albedo.
+    its integrators. `nerg` should return the same for each ray, for any film, sensor or enclosing integrator. Density
+    `sigma` (0: vacuum) and `COLOR` from -1 to 1; visibility by transmittance to the point `eye` (None: everything with
+    a surface is visible). `light`: the integrator that lights shapes; None: they show their albedo.
     """
 
     def crossing(o, d, end):
-        """Where a ray is in the box, up to `end`."""
+        """The part of a ray inside the box, up to `end`."""
         a, b = (-1 - o) / d, (1 - o) / d
         start = dr.maximum(dr.max(dr.minimum(a, b)), 0)
         return start, dr.maximum(dr.minimum(dr.min(dr.maximum(a, b)), end), start)
@@ -64,7 +63,7 @@ def closed_form(mi, sigma, eye, depth="expected", light=None):
                 first = a - T * b + front / sigma if sigma else mi.Float(0)
                 z = dr.select(hit, first + T * t, first) / dr.select(opacity > 0, opacity, 1)
             else:
-                # Where half of the ray's own opacity is reached, and the shape if the box lets through more than half.
+                # Where half of the ray's own opacity is reached, or the shape if the box transmits more than half.
                 inside = a - dr.log(1 - 0.5 * opacity) / sigma if sigma else mi.Float(dr.inf)
                 z = dr.select(hit & (T > 0.5), t, inside)
             z = dr.select(opacity > 0, z, 0)
@@ -73,7 +72,7 @@ def closed_form(mi, sigma, eye, depth="expected", light=None):
             p = ray.o + ray.d * z
             visible = mi.Float(1)
             if eye is not None:
-                # The point looked for lies in front of the surface: by the tolerance, and as far as light goes into it.
+                # The target lies in front of the surface: by the tolerance and the penetration depth.
                 paths = 1.0 if depth == "expected" else dr.log(2)
                 fuzz = dr.select(front > 0.5, dr.minimum(paths / sigma, z / 64), 0) if sigma else 0
                 v = p - ray.d * (TOLERANCE + fuzz) - mi.Point3f(eye)
@@ -110,7 +109,7 @@ def nerg(mi, sigma, eye, depth="expected", light=None, aovs="depth,opacity,posit
 
 
 def furniture(mi):
-    """A ball inside of the unit box's field, half a board behind it, and a board that casts a shadow from ``EYE``."""
+    """A sphere inside the unit box's field, half a board behind it, and a board that casts a shadow from ``EYE``."""
     return dict(
         ball=sphere(mi, 0.5, 0, 0.2, radius=0.4), back=square(mi, 1.4, 0.8, x=-0.4), lid=square(mi, -0.2, 0.25, x=-0.6)
     )
@@ -118,17 +117,21 @@ def furniture(mi):
 
 CROP = dict(crop_offset_x=3, crop_offset_y=5, crop_width=6, crop_height=4)
 PIXEL = dict(crop_offset_x=6, crop_offset_y=5, crop_width=1, crop_height=1)
-FIRST, SECOND = (0.5, 0.4, -3), (-2.5, 0.2, -1)
+FIRST_DIRECTIONS, SECOND = (0.5, 0.4, -3), (-2.5, 0.2, -1)
 SENSORS = {
     "perspective": camera,
     "crop": lambda mi: camera(mi, film=CROP),
     "crop of one pixel": lambda mi: camera(mi, film=PIXEL),
     "thinlens": lambda mi: camera(mi, kind="thinlens", fov=35, aperture_radius=0.15, focus_distance=3.0),
     "orthographic": lambda mi: (
-        camera(mi, kind="orthographic") | {"to_world": look_at(mi, FIRST) @ mi.ScalarTransform4f().scale(1.5)}
+        camera(mi, kind="orthographic")
+        | {"to_world": look_at(mi, FIRST_DIRECTIONS) @ mi.ScalarTransform4f().scale(1.5)}
     ),
     "batch": lambda mi: plugin(
-        "batch", film=camera(mi)["film"] | {"height": 6}, a=camera(mi, FIRST, size=6), b=camera(mi, SECOND, size=6)
+        "batch",
+        film=camera(mi)["film"] | {"height": 6},
+        a=camera(mi, FIRST_DIRECTIONS, size=6),
+        b=camera(mi, SECOND, size=6),
     ),
     "panorama": lambda mi: (
         camera(mi, kind="panorama", film={"width": 16, "height": 9})
@@ -140,7 +143,7 @@ SENSORS = {
 
 
 def both_ways(mi, sensor, things, *place, spp=2, **kwargs):
-    """The picture of `nerg`, the closed form's, and the latter's channels by name."""
+    """The image of `nerg`, that of the closed form, and the latter's channels by name."""
     scene = mi.load_dict({"type": "scene", "sensor": sensor, **things})
     a = np.array(mi.render(scene, integrator=mi.load_dict(nerg(mi, *place, **kwargs)), spp=spp, seed=3))
     b = np.array(mi.render(scene, integrator=closed_form(mi, *place, **kwargs), spp=spp, seed=3))
@@ -165,13 +168,13 @@ def test02_every_sensor_sees_shapes_alone_and_a_field_alone(rgb, kind, sigma):
 
 @pytest.mark.parametrize("kind", ["thinlens", "batch", "panorama"])
 def test03_without_an_observer_it_is_the_camera(rgb, kind):
-    """Whatever has a surface is visible to it, and it stands at the centre of the camera that a ray comes from."""
+    """All surfaces are visible to it, and it is at the centre of the camera that a ray comes from."""
     sensor = SENSORS[kind](rgb)
     a, b, _ = both_ways(rgb, sensor, furniture(rgb), 1.0, None)
     assert np.allclose(a, b, atol=2e-4)
     out = channels(rgb, nerg(rgb, 1.0, None, aovs="position,observer_depth"), sensor, **furniture(rgb))
     p = points(out)
-    centers = {"panorama": [(0, 0.1, -1.6)], "batch": [FIRST, SECOND], "thinlens": [FIRST]}[kind]
+    centers = {"panorama": [(0, 0.1, -1.6)], "batch": [FIRST_DIRECTIONS, SECOND], "thinlens": [FIRST_DIRECTIONS]}[kind]
     width = p.shape[1] // len(centers)
     for i, c in enumerate(centers):
         part = np.s_[:, i * width : (i + 1) * width]
@@ -192,7 +195,7 @@ def test04_emitters_and_the_sky_light_shapes_and_are_the_background(rgb, light):
 
 
 @pytest.mark.parametrize("kind", ["depth", "map"])
-def test05_instances_are_what_they_stand_for(rgb, kind):
+def test05_instances_match_their_shapes(rgb, kind):
     T = rgb.ScalarTransform4f
     group = {"type": "shapegroup", "a": {"type": "cube", "to_world": T().scale(0.25)}}
     places = (
@@ -211,7 +214,7 @@ def test05_instances_are_what_they_stand_for(rgb, kind):
 
 
 def mover(mi, name):
-    """A shape, the key that moves it, the value to move it to, and the shape as it then is."""
+    """A shape, the key that moves it, the new value, and the resulting shape."""
     t = mi.ScalarTransform4f().translate([-0.4, 0.2, 0.1]).rotate([0, 1, 0], 20).scale(0.35)
     group = {"type": "shapegroup", "cube": {"type": "cube", "to_world": mi.ScalarTransform4f().scale(0.5)}}
     instance = plugin(
@@ -229,7 +232,7 @@ def mover(mi, name):
 
 @pytest.mark.parametrize("kind", ["depth", "map"])
 @pytest.mark.parametrize("name", ["sphere", "rectangle", "instance", "mesh", "group"])
-def test06_what_moves_is_seen_where_it_is(rgb, name, kind):
+def test06_moved_shapes_are_updated(rgb, name, kind):
     before, key, after = mover(rgb, name)
     integrator = plugin(
         "nerg", aovs="depth,visibility", visibility=kind, map_height=64, falloff=0.0, observer=make_observer(rgb, *EYE)
@@ -242,14 +245,14 @@ def test06_what_moves_is_seen_where_it_is(rgb, name, kind):
 
 
 def test07_textures(rgb):
-    """By hand: a board that fills the picture shows its bitmap (v runs upwards)."""
+    """Explicitly: a board that fills the image shows its bitmap (v runs upwards)."""
     texels = np.random.default_rng(0).random((6, 6, 3)).astype(np.float32)
     texture = {"type": "bitmap", "bitmap": rgb.Bitmap(texels), "raw": True, "filter_type": "nearest"}
     board = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": texture}}
     sensor = {**camera(rgb, kind="orthographic", size=6), "to_world": look_at(rgb, (0, 0, 3))}
     image = render(rgb, {"type": "nerg", "aovs": ""}, still(sensor), board=board)
     assert np.allclose(image[..., :3], texels[::-1], atol=1e-5)
-    # As `aov` has the albedo, also where it is turned and repeated.
+    # Equal to the albedo of `aov`, also rotated and repeated.
     texture["to_uv"] = rgb.ScalarTransform4f().scale([3, 2, 1])
     turned = rgb.ScalarTransform4f().rotate([0.5, 1, 0], 160)
     bsdf = {"type": "twosided", "b": {"type": "principled", "base_color": texture}}
@@ -261,12 +264,12 @@ def test07_textures(rgb):
     assert np.allclose(image[..., :3], albedo[..., -3:], atol=1e-5) and np.ptp(image[..., 0]) > 0.5
 
 
-def test08_inside_of_aov_and_moment(rgb):
+def test08_nested_in_aov_and_moment(rgb):
     inner, things, spp = nerg(rgb, 1.0, EYE), furniture(rgb), 4
     plain = render(rgb, inner, spp=spp, **things)
     around = render(rgb, {"type": "aov", "aovs": "z:depth", "nerg": nerg(rgb, 0, EYE)}, spp=spp, **things)
     z = named(rgb, render(rgb, nerg(rgb, 0, EYE), spp=spp, **things), inner)["depth.T"]
-    # `aov` puts the inner picture first and its own channels last.
+    # `aov` puts the inner image first and its own channels last.
     assert np.allclose(around[..., 3], z, atol=1e-5) and np.allclose(around[..., -1], z, atol=1e-5)
     moment = {"type": "moment", "in": inner}
     names, image = rgb.load_dict(moment).aov_names(), render(rgb, moment, spp=spp, **things)
@@ -274,7 +277,7 @@ def test08_inside_of_aov_and_moment(rgb):
     for i, name in enumerate(AOVS):
         first, second = (image[..., 3 + names.index(f"{p}in.{name}")] for p in ("", "m2_"))
         assert np.allclose(first, plain[..., 3 + i], atol=1e-5)
-        # E[x^2] >= E[x]^2, and equal where a pixel sees one thing only.
+        # E[x^2] >= E[x]^2, with equality where a pixel sees one value only.
         assert (second >= first**2 - 1e-4).all() and np.mean(np.abs(second - first**2) < 0.05) > 0.3
         assert np.allclose(first.mean(), single[..., i].mean(), atol=0.08)
 
@@ -294,8 +297,8 @@ def test09_channels_of_a_nested_integrator_survive_in_any_order(rgb):
 
 @pytest.mark.parametrize("sky", [False, True])
 @pytest.mark.parametrize("hide", [False, True])
-def test10_alpha_is_that_of_other_integrators(rgb, sky, hide):
-    """The film's alpha: the share of samples that meet anything, or an environment that shows."""
+def test10_alpha_matches_other_integrators(rgb, sky, hide):
+    """The film's alpha: the fraction of samples with a surface or a visible environment emitter."""
     more = {"sky": {"type": "constant"}} if sky else {}
     sensor = camera(rgb, film={"pixel_format": "rgba"})
     path = {"type": "path", "hide_emitters": hide}
@@ -311,8 +314,8 @@ def test10_alpha_is_that_of_other_integrators(rgb, sky, hide):
     assert np.array_equal(thin[..., 3], np.where(met | (sky and not hide), 1, 0)) and thin[..., 4].max() < 0.5
 
 
-def test11_hidden_emitters_are_hidden_from_the_picture_only(rgb):
-    """As in Mitsuba: `path` sees through a lamp, `depth` meets it."""
+def test11_hidden_emitters_still_light_shapes(rgb):
+    """As in Mitsuba: `path` sees through a lamp, `depth` hits it."""
     lamp = {"type": "sphere", "radius": 0.5, "e": {"type": "area", "radiance": 2.0}}
     things = {"lamp": lamp, "back": square(rgb, 1.0, 2.0)}
     image = render(rgb, {"type": "nerg", "aovs": "depth", "hide_emitters": True}, **things)
@@ -321,10 +324,15 @@ def test11_hidden_emitters_are_hidden_from_the_picture_only(rgb):
     assert image[..., :3].max() < 1.9
 
 
-def test12_what_is_far_away_does_not_blunt_shadows(rgb):
-    """A lid 20 cm before a wall hides it by a hard edge, also under a dome of a kilometre (1e-4 of its diagonal are 35
+def test12_distant_shapes_do_not_blur_shadows(rgb):
+    """A lid 20 cm in front of a wall casts a hard shadow, also under a dome of a kilometre (1e-4 of its diagonal is 35
     cm)."""
-    integrator = {"type": "nerg", "aovs": "visibility,position", "falloff": 0.0, "observer": make_observer(rgb, 0, 0, -1)}
+    integrator = {
+        "type": "nerg",
+        "aovs": "visibility,position",
+        "falloff": 0.0,
+        "observer": make_observer(rgb, 0, 0, -1),
+    }
     sensor = camera(rgb, (3.0, 0, -1), (0, 0, 1), fov=40, size=24)
     things = {"wall": square(rgb, 1.0, 3.0), "lid": square(rgb, 0.8, 0.5)}
     sky = plugin("sphere", radius=1000.0, bsdf={"type": "twosided", "b": {"type": "diffuse"}})
@@ -337,7 +345,7 @@ def test12_what_is_far_away_does_not_blunt_shadows(rgb):
         assert (out["visibility.Y"][hidden] == 0).all() and (out["visibility.Y"][seen] == 1).all()
 
 
-def test13_media_of_mitsuba_light_shapes_through_a_nested_volpath(rgb):
+def test13_nested_volpath_with_mitsuba_media(rgb):
     """Around shapes, and around the camera itself: the same paths as those of `volpath`."""
     fog = {"type": "homogeneous", "sigma_t": 0.4, "albedo": 0.5}
     things = {"back": square(rgb, 1.4, 1.5), "lamp": {"type": "point", "position": [1, 1, -1], "intensity": 9.0}}
@@ -349,8 +357,8 @@ def test13_media_of_mitsuba_light_shapes_through_a_nested_volpath(rgb):
 
 
 @pytest.mark.parametrize("case", ["aov", "moment", "faces"])
-def test14_what_cannot_be_rendered_is_said_inside_of_other_integrators_too(rgb, case):
-    """In one of the errors: ``mi.render`` puts one of its own around."""
+def test14_errors_inside_other_integrators(rgb, case):
+    """In one message: ``mi.render`` wraps it into its own."""
     outer, things = {"aov": {"aovs": "z:depth"}, "moment": {}}.get(case), {}
     integrator, words = plugin(case, **{"in": {"type": "nerg"}}, **(outer or {})), "there is nothing to render"
     if outer is None:

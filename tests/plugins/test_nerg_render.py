@@ -1,4 +1,4 @@
-"""Pictures of the integrator: seeds, films and variants, closed forms, and a roof that cameras look through."""
+"""Images of the integrator: seeds, films and variants, closed forms, and a ceiling that cameras look through."""
 
 import math
 import subprocess
@@ -43,14 +43,14 @@ def test01_equal_seeds(rgb, files, rfilter, tolerance):
     assert not np.allclose(a, c, atol=1e-4)
 
 
-def test01b_the_integrators_own_render_has_the_seed_of_mitsubas(rgb, files):
+def test01b_integrator_render_uses_the_same_seed_as_mi_render(rgb, files):
     scene = scene_with(rgb, with_field(files))
     own, other = scene.integrator().render(scene, spp=1), rgb.render(scene, spp=1, seed=1)
     assert np.array_equal(own, rgb.render(scene, spp=1)) and not np.array_equal(own, other)
 
 
 def test02_jitter_alone_makes_seeds_differ(rgb):
-    # One ray in the middle of the pixel: nothing but the jitter depends on the seed.
+    # One ray through the middle of the pixel: only the jitter depends on the seed.
     data = np.random.default_rng(0).exponential(3, (6, 6, 6)).astype(np.float32)
     grid = {"type": "gridvolume", "grid": rgb.VolumeGrid(data)}
 
@@ -61,8 +61,8 @@ def test02_jitter_alone_makes_seeds_differ(rgb):
     assert not np.array_equal(*of_seeds(True)) and np.allclose(*of_seeds(False), rtol=1e-3)
 
 
-def test07_an_integrator_and_a_sensor_may_be_given_to_render(rgb, files):
-    """The observer is the camera that renders, not the scene's own."""
+def test07_integrator_and_sensor_as_arguments_of_render(rgb, files):
+    """The observer is at the rendering camera, not at the scene's own."""
     integrator = with_gaze(files, GAZE)
     expected, elsewhere = render(rgb, integrator), camera(rgb, (2, 1, 2))
     without = rgb.load_dict({"type": "scene", "sensor": camera(rgb)})
@@ -100,8 +100,8 @@ def test11_spectral_and_polarized_are_refused(rgb, variant):
         rgb.set_variant("llvm_ad_rgb")
 
 
-def test12_scalar_is_refused_and_forgotten(files):
-    # In a process of its own: what scalar_rgb registers stays.
+def test12_scalar_variants_are_refused(files):
+    # In a separate process: registrations of scalar_rgb persist.
     code = f"""
 import nerg_mi, mitsuba as mi
 mi.set_variant("scalar_rgb")
@@ -119,7 +119,7 @@ mi.load_dict({{"type": "nerg", "field": {{"type": "nerf", "filename": r"{files /
     assert run.returncode == 0, run.stderr[-2000:]
 
 
-# ---- Pictures of the integrator against closed forms, and of grids that are skipped through ----
+# ---- Images against closed forms, and of grids with empty space ----
 
 
 @pytest.mark.parametrize("kind", ["orthographic", "perspective"])
@@ -129,13 +129,13 @@ def test01_unit_cube(rgb_and_mono, kind, depth):
     out = channels(mi, constant(3.0, depth=depth), straight(mi, kind))
     assert np.isclose(out["opacity.Y"].item(), 1 - math.exp(-3), rtol=1e-5)
     inside = {"expected": 1 / 3 - 1 / math.expm1(3), "median": -math.log((1 + math.exp(-3)) / 2) / 3}[depth]
-    # Distance from the ray's own origin, which lies on the near plane.
+    # Distance from the ray's own origin, which is on the near plane.
     assert abs(out["depth.T"].item() - (2 - 0.01 + inside)) < 1e-4
 
 
 @pytest.mark.parametrize("sigma", [0.05, 3.0])
 def test03_colour_of_a_homogeneous_volume(rgb_and_mono, sigma):
-    # α C + (1 - α) L_behind, also where every single step weighs less than color_cutoff.
+    # α C + (1 - α) L_behind, even if each step weighs less than color_cutoff.
     mi = rgb_and_mono
     color = {"type": "constvolume", "value": {"type": "rgb", "value": [0.9, 0.5, 0.2]}}
     background = {"type": "rgb", "value": [0.1, 0.2, 0.4]}
@@ -148,7 +148,7 @@ def test03_colour_of_a_homogeneous_volume(rgb_and_mono, sigma):
     assert np.allclose(image, expected, rtol=2e-3)
 
 
-def test04_environment_takes_the_place_of_the_background(rgb):
+def test04_environment_replaces_the_background(rgb):
     sky = {"type": "constant", "radiance": {"type": "rgb", "value": [0.2, 0.4, 0.8]}}
     image = render(rgb, constant(3.0, background=9.0, aovs=""), straight(rgb, "perspective"), sky=sky).ravel()
     assert np.allclose(image, math.exp(-3) * np.array([0.2, 0.4, 0.8]), rtol=1e-4)
@@ -156,7 +156,7 @@ def test04_environment_takes_the_place_of_the_background(rgb):
     assert not hidden.any()
 
 
-def test05_an_envmap_is_seen_where_it_belongs(rgb):
+def test05_envmap_orientation(rgb):
     data = np.random.default_rng(0).random((8, 16, 3)).astype(np.float32)
     sky = {"type": "envmap", "bitmap": rgb.Bitmap(data)}
     path, nerg = (render(rgb, i, seed=1, sky=sky) for i in ({"type": "path"}, constant(0.0, aovs="")))
@@ -164,8 +164,8 @@ def test05_an_envmap_is_seen_where_it_belongs(rgb):
 
 
 @pytest.mark.parametrize("angle", [45, 90, 180])
-def test06_a_turned_grid_is_not_skipped_by_its_own_voxels(rgb, angle):
-    # A small dense block of a large empty grid, turned: its place is elsewhere than its indices say.
+def test06_rotated_grid_is_not_skipped(rgb, angle):
+    # A small dense block of a large empty grid, rotated: its position differs from its indices.
     data = np.zeros((32, 32, 32), np.float32)
     data[14:18, 2:6, 2:6] = 50
     turn = rgb.ScalarTransform4f().rotate([0, 0, 1], angle).translate([-0.5, -0.5, -0.5])
@@ -176,7 +176,7 @@ def test06_a_turned_grid_is_not_skipped_by_its_own_voxels(rgb, angle):
     assert out["opacity.Y"].item() > 0.9
 
 
-def test07_a_grid_that_repeats_is_bounded_as_it_repeats(rgb):
+def test07_repeating_grid_is_bounded(rgb):
     # The last half voxel interpolates with the first voxel of the next repetition.
     data = np.zeros((8, 8, 8), np.float32)
     data[0] = 40
@@ -191,7 +191,7 @@ def test07_a_grid_that_repeats_is_bounded_as_it_repeats(rgb):
 
 
 @pytest.mark.parametrize("quadrature", RULES.names())
-def test08_quadratures_converge_to_one_picture(rgb, quadrature):
+def test08_quadrature_rules_converge_to_the_same_image(rgb, quadrature):
     data = np.random.default_rng(0).exponential(2, (4, 5, 6)).astype(np.float32)
     place = rgb.ScalarTransform4f().translate([-1, -1, -1]).scale(2)
     density = plugin("gridvolume", grid=rgb.VolumeGrid(data), to_world=place)
@@ -201,7 +201,7 @@ def test08_quadratures_converge_to_one_picture(rgb, quadrature):
         assert np.allclose(got[c], fine[c], rtol=1e-3, atol=1e-4), c
 
 
-# ---- A roof that cameras above it look through ----
+# ---- A ceiling that cameras above it look through ----
 
 SIGMA, HEIGHT = 3.0, 0.6
 
@@ -216,29 +216,34 @@ def cut(**more):
     return constant(SIGMA, ceiling=HEIGHT, up=[0.0, 2.0, 0.0], aovs="depth,opacity,position", **more)
 
 
-def test01_matter_above_is_left_out_and_depths_count_from_the_camera(rgb):
+def test01_ceiling_clips_and_depths_start_at_the_camera(rgb):
     out = channels(rgb, cut(depth="median", step=1e-3), above(rgb))
     ray = center_rays(rgb, above(rgb))
     o, d = np.array(ray.o, float).T, np.array(ray.d, float).T
     t0, t1 = ((o[:, 1] - y) / -d[:, 1] for y in (HEIGHT, 0.0))
     opacity = (1 - np.exp(-SIGMA * (t1 - t0))).reshape(12, 12)
-    # Where half of what is absorbed below the plane is.
+    # Where half of the absorption below the plane is reached.
     depth = t0.reshape(12, 12) - np.log1p(-opacity / 2) / SIGMA
     assert np.allclose(out["opacity.Y"], opacity, atol=1e-4) and np.allclose(out["depth.T"], depth, atol=1e-4)
     assert np.allclose(points(out).reshape(-1, 3), o + d * depth.reshape(-1, 1), atol=2e-4)
 
 
-def test02_who_stands_below_sees_all(rgb):
+def test02_camera_below_the_ceiling_is_unaffected(rgb):
     sensor = camera(rgb, origin=(0.5, 0.3, -3), target=(0.5, 0.8, 0.5))
     whole = channels(rgb, constant(SIGMA, aovs="depth,opacity"), sensor)
     same = channels(rgb, constant(SIGMA, aovs="depth,opacity", ceiling=HEIGHT, up=[0.0, 1.0, 0.0]), sensor)
     assert all(np.array_equal(whole[k], same[k]) for k in whole) and whole["opacity.Y"].max() > 0.5
 
 
-def test03_shapes_above_hide_nothing_from_the_camera_but_all_from_the_observer(rgb):
+def test03_ceiling_clips_camera_rays_only(rgb):
     sensor = camera(rgb, origin=(0.1, 0, -3), target=(0, 0, 0))
     lid, floor = sphere(rgb, 0, 0, -1, radius=0.4), square(rgb, 1.0, size=5.0)
-    given = {"type": "nerg", "aovs": "depth,visibility", "observer": make_observer(rgb, 0, 0, -3), "up": [0.0, 0.0, -1.0]}
+    given = {
+        "type": "nerg",
+        "aovs": "depth,visibility",
+        "observer": make_observer(rgb, 0, 0, -3),
+        "up": [0.0, 0.0, -1.0],
+    }
     middle = lambda out, name: out[name][6, 6]
     whole = channels(rgb, given, sensor, lid=lid, floor=floor)
     out = channels(rgb, {**given, "ceiling": 0.5}, sensor, lid=lid, floor=floor)
@@ -246,24 +251,24 @@ def test03_shapes_above_hide_nothing_from_the_camera_but_all_from_the_observer(r
     assert middle(out, "depth.T") == pytest.approx(4, abs=0.02) and middle(out, "visibility.Y") == 0
 
 
-def test04_depths_have_the_derivatives_of_the_cameras_ray(rgb):
+def test04_ceiling_depth_derivatives(rgb):
     sensor = above(rgb)
     scene = scene_with(rgb, cut(step=1e-3), sensor)
     params = rgb.traverse(scene)
     key = next(k for k in params.keys() if k.endswith("sensor.to_world"))
-    # Straight up by h, all depths grow as those to any fixed plane do.
+    # Upwards by h: all depths grow like that of a fixed plane.
     h = rgb.Float(0)
     dr.enable_grad(h)
     put(params, key, rgb.Transform4f().translate(rgb.Vector3f(0, h, 0)) @ rgb.Transform4f(sensor["to_world"]))
     depth = rgb.render(scene, params, spp=1)[:, :, 3]
     dr.forward(h)
-    # Matter begins at the plane, so that its expected depth moves by the ray's length a unit of height.
+    # Matter begins at the plane, so its expected depth moves by the ray's length per unit of height.
     assert np.allclose(np.ravel(dr.grad(depth)), 1 / -np.array(center_rays(rgb, sensor).d)[1], rtol=1e-3)
 
 
 @pytest.mark.parametrize(
     "given, why", [({"ceiling": "high"}, "ceiling"), ({"up": [0.0] * 3, "ceiling": 1.0}, "up"), ({"up": 1.0}, "three")]
 )
-def test05_what_is_no_plane_is_refused(rgb, given, why):
+def test05_invalid_ceiling_is_refused(rgb, given, why):
     with pytest.raises(RuntimeError, match=why):
         rgb.load_dict({"type": "nerg", **given})

@@ -1,4 +1,4 @@
-"""Updates of parameters: what they make anew; and functions frozen by ``dr.freeze``."""
+"""Updates of parameters, and functions frozen by ``dr.freeze``."""
 
 import drjit as dr
 import numpy as np
@@ -27,11 +27,11 @@ from .scenes import (
     with_gaze,
 )
 
-# ---- Updates of parameters: what they make anew, and what they leave as it is ----
+# ---- Updates of parameters: what is recomputed, and what is kept ----
 
 
 def behind_a_wall(mi, **more):
-    """An observer before a wall with a gap, and a camera that sees what lies behind it."""
+    """An observer in front of a wall with a gap, and a camera that sees what is behind it."""
     sensor = camera(mi, (0.5, 0, 0.2), (0.5, 0, 1), fov=65, near_clip=1e-3)
     how = {"aovs": "visibility", "step": 0.01, "falloff": 0.0, "radiance": False, **more}
     return scene_with(mi, plugin("nerg", density=wall(mi), observer=make_observer(mi, 0, 0, -0.9), **how), sensor)
@@ -43,13 +43,15 @@ def seen(mi, scene) -> np.ndarray:
 
 @pytest.fixture
 def reads(monkeypatch):
-    """One entry for each time that the voxels of a grid are read."""
-    count, describe = [], volume_medium.describe
-    monkeypatch.setattr(volume_medium, "describe", lambda volume: (count.append(volume), describe(volume))[1])
+    """One entry per reading of the voxels of a grid."""
+    count, read_grid_volume = [], volume_medium.read_grid_volume
+    monkeypatch.setattr(
+        volume_medium, "read_grid_volume", lambda volume: (count.append(volume), read_grid_volume(volume))[1]
+    )
     return count
 
 
-def test01_voxels_are_read_when_they_change_and_not_otherwise(rgb, reads):
+def test01_voxels_are_read_only_when_changed(rgb, reads):
     scene = behind_a_wall(rgb)
     assert len(reads) == 1
     params = rgb.traverse(scene)
@@ -64,8 +66,8 @@ def test01_voxels_are_read_when_they_change_and_not_otherwise(rgb, reads):
 
 
 @pytest.mark.parametrize("of", ["scene", "integrator"])
-def test01b_an_observer_who_moves_is_no_constant_of_the_kernel(rgb, of):
-    """Each position would be compiled anew otherwise, which takes longer than any frame."""
+def test01b_moving_observer_reuses_the_kernel(rgb, of):
+    """Otherwise each position would be compiled, which takes longer than any frame."""
     scene = behind_a_wall(rgb)
     params = rgb.traverse(scene if of == "scene" else scene.integrator())
     name = "integrator.observer.to_world" if of == "scene" else "observer.to_world"
@@ -75,7 +77,7 @@ def test01b_an_observer_who_moves_is_no_constant_of_the_kernel(rgb, of):
     assert scene.integrator().observer.world_transform().matrix[0, 3].state == dr.VarState.Evaluated
 
 
-def test02_voxels_that_were_refused_are_read_again(rgb, reads):
+def test02_rejected_voxels_are_read_again(rgb, reads):
     scene = behind_a_wall(rgb)
     params = rgb.traverse(scene)
     good = np.array(params["integrator.density.data"])
@@ -89,8 +91,8 @@ def test02_voxels_that_were_refused_are_read_again(rgb, reads):
     assert len(reads) == 4
 
 
-def test02b_voxels_that_are_written_to_in_place_are_read_when_that_is_said(rgb, reads):
-    """NumPy shares their memory; a scatter would write to a copy, as they are kept to be told from others."""
+def test02b_voxels_changed_in_place_are_read_on_update(rgb, reads):
+    """NumPy shares their memory; a scatter would write to a copy, since they are held for comparison."""
     scene = behind_a_wall(rgb)
     params = rgb.traverse(scene)
     data = params["integrator.density.data"].array
@@ -103,8 +105,8 @@ def test02b_voxels_that_are_written_to_in_place_are_read_when_that_is_said(rgb, 
 
 
 @pytest.mark.parametrize("change", ["density", "field"])
-def test03_a_map_follows_the_field(rgb, files, change):
-    """The map is one of depths: of other voxels or weights it is another one, whatever else stays."""
+def test03_map_is_updated_with_the_field(rgb, files, change):
+    """The map consists of depths: other voxels or weights need another one, even if everything else is unchanged."""
     if change == "density":
         scene = behind_a_wall(rgb, visibility="map", map_height=64)
         key = "integrator.density.data"
@@ -116,18 +118,18 @@ def test03_a_map_follows_the_field(rgb, files, change):
     before = seen(rgb, scene)
     value = np.array(params[key])
     if change == "density":
-        value[:36] = 0  # the wall with the gap; what lies behind it stays
+        value[:36] = 0  # the wall with the gap; what is behind it stays
     else:
-        value[0] = 0  # the logarithm of the density: the same everywhere, and thin
+        value[0] = 0  # the logarithm of the density: uniform, and thin
     put(params, key, rgb.TensorXf(value))
     after = seen(rgb, scene)
     assert np.abs(after - before).max() > 0.1
-    # What a map that was made for it says.
+    # The values of a new map.
     scene.integrator().cache.clear()
     np.testing.assert_array_equal(seen(rgb, scene), after)
 
 
-def test04_a_map_outlasts_what_it_does_not_depend_on(rgb):
+def test04_map_is_kept_across_unrelated_changes(rgb):
     scene = behind_a_wall(rgb, visibility="map", map_height=64)
     seen(rgb, scene)
     kept = scene.integrator().cache.peek("map")[0]
@@ -140,7 +142,7 @@ def test04_a_map_outlasts_what_it_does_not_depend_on(rgb):
     assert scene.integrator().cache.peek("map")[0] is not kept
 
 
-def test05_all_is_looked_at_where_nobody_says_what_changed(rgb, reads):
+def test05_update_without_keys_checks_everything(rgb, reads):
     scene = behind_a_wall(rgb, visibility="map", map_height=64)
     seen(rgb, scene)
     integrator = scene.integrator()
@@ -151,15 +153,15 @@ def test05_all_is_looked_at_where_nobody_says_what_changed(rgb, reads):
     assert integrator.cache.peek("map")[0] is not kept
 
 
-def test05b_an_observer_is_told_of_its_pose_and_refuses_what_cameras_do(rgb):
+def test05b_observer_pose_update_is_validated(rgb):
     params = rgb.traverse(behind_a_wall(rgb))
     params["integrator.observer.to_world"] = rgb.ScalarTransform4f().scale(2)
     with pytest.raises(RuntimeError, match="Scale factors"):
         params.update()
 
 
-def test06_gaze_and_its_spread_fade_with_visibility(rgb, files, tmp_path):
-    """By transmittance the point stays the same, so that hidden and open differ by that share alone, whatever it is."""
+def test06_gaze_and_std_fade_with_visibility(rgb, files, tmp_path):
+    """With transmittance the point is the same, so that hidden and unoccluded values differ by that fraction alone."""
     members = [fields.gaze(tmp_path / f"{k}.safetensors", seed=k) for k in (1, 2)]
     members[1].set_parameters({"emit_head.0": 20 * members[1].parameters()["emit_head.0"]})
     origins = np.random.default_rng(0).normal((-2, 0.3, -2), 0.3, (50, 3))
@@ -178,12 +180,12 @@ def test06_gaze_and_its_spread_fade_with_visibility(rgb, files, tmp_path):
     for name in ("gaze.Y", "gaze_std.Y", "kde.Y"):
         assert open_[name][part].max() > 1e-3
         np.testing.assert_allclose(hidden[name][part], (open_[name] * share)[part], rtol=2e-3, atol=1e-6, err_msg=name)
-    # How much was recorded around the observer is no matter of what is hidden.
+    # Support does not depend on occlusion.
     np.testing.assert_array_equal(hidden["support.Y"], open_["support.Y"])
     assert hidden["support.Y"].max() > 1
 
 
-# ---- Functions frozen by ``dr.freeze``: recorded once, their replays equal what is traced whatever has changed ----
+# ---- Functions frozen by ``dr.freeze``: replays equal traced calls, for any changes ----
 
 
 def moved(mi, value, i):
@@ -199,7 +201,7 @@ def shifted(mi, value, i):
 
 
 def sheet(mi, value, i):
-    """A sheet in an empty grid, elsewhere each time: what is known to be empty must not be what was recorded."""
+    """A sheet in an empty grid, at another position each time: empty cells must not be those of the recording."""
     data = np.zeros(value.shape, np.float32)
     data[2 + i] = 20
     return mi.TensorXf(data)
@@ -215,7 +217,7 @@ def scene_of(mi, files, shapes=(), **more):
 
 
 def splat_scene(mi):
-    place = get_plugin_class("splats").of(random_splats(40, degree=1, size=0.2))
+    place = get_plugin_class("splats").from_network(random_splats(40, degree=1, size=0.2))
     return scene_with(mi, plugin("nerg", field=place, aovs="depth,opacity"), small(mi))
 
 
@@ -241,7 +243,7 @@ FROZEN = {
     "observer": (scene_of, OBSERVER, moved),
     "gaze weights": (scene_of, "integrator.gaze.grid.table", scaled),
     "field weights": (scene_of, "integrator.field.density_net.1", scaled),
-    # What may be left out for one observer may not be for the next.
+    # What can be omitted for one observer may be needed for the next.
     "from camera": (lambda mi, files: scene_of(mi, files, observer=make_observer(mi, 0.5, 0.4, -3)), OBSERVER, moved),
     "camera": (lambda mi, files: scene_with(mi, with_gaze(files), camera(mi, size=6)), "sensor.to_world", moved),
     "map": (lambda mi, files: scene_of(mi, files, visibility="map", map_height=32), OBSERVER, moved),
@@ -254,7 +256,7 @@ FROZEN = {
 
 
 @pytest.mark.parametrize("what", list(FROZEN))
-def test10_replays_are_what_is_traced(rgb, files, what):
+def test10_replays_match_traced_calls(rgb, files, what):
     make, key, change = FROZEN[what]
     scene = make(rgb, files)
     params = rgb.traverse(scene)
@@ -264,7 +266,7 @@ def test10_replays_are_what_is_traced(rgb, files, what):
         put(params, key, change(rgb, start, i))
         pictures.append(np.array(rgb.render(scene, spp=1, seed=i)))
         assert np.allclose(np.array(frozen(scene, rgb.UInt32(i))), pictures[-1], atol=2e-6), i
-    # A parameter that was a number in the scene's description is recorded once more when it is an array.
+    # A parameter that was a literal in the scene's description is recorded again once it is an array.
     assert frozen.n_recordings <= 3
     assert not np.allclose(pictures[2], pictures[3], atol=1e-4)
 
@@ -273,8 +275,8 @@ SPLATS = ["field." + name for name in ("centers", "scales", "rotations", "opacit
 
 
 @pytest.mark.parametrize("names", [["gaze.emit_head.0"], ["falloff"], SPLATS], ids=["gaze", "falloff", "splats"])
-def test11_a_frozen_training_goes_the_same_way(rgb, files, names):
-    """Derivatives of a frozen loss are those of the loss; and no kernel is compiled for where Gaussians have gone."""
+def test11_frozen_training_matches(rgb, files, names):
+    """Derivatives of a frozen loss are those of the loss; moved Gaussians compile no kernel."""
     make = lambda: splat_scene(rgb) if names is SPLATS else scene_of(rgb, files, aovs="gaze", radiance=False)
     reference = rgb.render(make(), spp=1) * 1.3
     keys, ways = [f"integrator.{name}" for name in names], []
@@ -306,7 +308,7 @@ def test11_a_frozen_training_goes_the_same_way(rgb, files, names):
     assert frozen.n_recordings <= 3
 
 
-def test12_gaussians_are_not_changed_inside(rgb):
+def test12_changing_gaussians_in_a_frozen_function_is_refused(rgb):
     scene = splat_scene(rgb)
     params = rgb.traverse(scene)
 

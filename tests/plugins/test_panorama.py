@@ -1,4 +1,4 @@
-"""The sensor is the inverse of Mitsuba's envmap, in rgb and mono, turned, moved, cropped, and from XML."""
+"""The sensor is the inverse of Mitsuba's envmap, in rgb and mono, rotated, moved, cropped, and from XML."""
 
 import drjit as dr
 import numpy as np
@@ -36,7 +36,7 @@ def test01_returns_the_pixels_of_an_envmap(rgb, moved):
     to_world = turned(rgb) if moved else None
     image = noise()
     got = picture(rgb, scene(rgb, image, panorama(rgb, to_world), to_world))
-    # The rows at the poles included; single precision turns directions by 1e-7 / POLE there.
+    # Including the rows at the poles; single precision rotates directions by 1e-7 / POLE there.
     assert np.allclose(got, image, atol=5e-3)
     assert np.allclose(got[1:-1], image[1:-1], atol=1e-4)
 
@@ -49,7 +49,7 @@ def test03_constant_sky_with_random_samples(rgb_and_mono):
 
 
 def test04_smooth_sky_with_random_samples(rgb):
-    # A linear function of direction, on a map fine enough: pixels agree although samples are spread over them.
+    # A linear function of direction, on a fine map: pixels agree although samples are spread over them.
     v = pixel_directions(256, 129)
     sensor = panorama(rgb, random=True, width=32, height=17)
     got = np.array(rgb.render(scene(rgb, 1 + v, sensor), spp=256))
@@ -100,14 +100,14 @@ def test09_xml_equals_dict(rgb):
     look = rgb.ScalarTransform4f().look_at(origin=[1, 2, 3], target=[2, 2, 3], up=[0, 1, 0])
     from_dict = rgb.load_dict(panorama(rgb, look))
     for sensor in (from_xml, from_dict):
-        # The middle of the picture looks at the target, and the centre is where integrators ask for it.
+        # The middle of the image looks at the target, and integrators find the centre.
         ray, _ = sensor.sample_ray(0.0, 0.5, rgb.Point2f(0.5), rgb.Point2f(0), True)
         assert np.allclose(np.array(ray.d).ravel(), [1, 0, 0], atol=1e-6)
         assert np.allclose(np.array(sensor.world_transform() @ rgb.Point3f(0)).ravel(), [1, 2, 3])
     assert "Panorama[" in str(from_xml)
 
 
-def test10_is_moved_through_traverse(rgb):
+def test10_sensor_moves_through_traverse(rgb):
     image = noise()
     loaded = scene(rgb, image, panorama(rgb))
     params = rgb.traverse(loaded)
@@ -119,7 +119,7 @@ def test10_is_moved_through_traverse(rgb):
         params.update()
 
 
-def test11_wrong_values(rgb):
+def test11_invalid_values_are_refused(rgb):
     with pytest.raises(RuntimeError, match='"to_world"'):
         rgb.load_dict(panorama(rgb, rgb.ScalarTransform4f().scale([1, 2, 1])))
     with pytest.raises(RuntimeError, match='"height"'):
@@ -128,7 +128,7 @@ def test11_wrong_values(rgb):
         rgb.load_dict({**panorama(rgb), "fov": 45.0})
 
 
-def test12_no_aperture_and_a_point_for_a_box(rgb):
+def test12_no_aperture_and_point_bbox(rgb):
     sensor = rgb.load_dict(panorama(rgb, turned(rgb)))
     assert not sensor.needs_aperture_sample()
     assert dr.allclose(sensor.bbox().min, [1, -2, 3]) and dr.allclose(sensor.bbox().max, [1, -2, 3])

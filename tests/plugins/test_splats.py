@@ -1,4 +1,4 @@
-"""The volume `splats` in the integrator: against Mitsuba's own renderer of splats, and beside shapes and observers."""
+"""The volume `splats` in the integrator: against Mitsuba's own splat renderer, and with shapes and observers."""
 
 import re
 from dataclasses import replace
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from nerg_mi.fields.splats import Splats, harmonics_from_colors, concatenate_splats
+from nerg_mi.fields.splats import Splats, concatenate_splats, harmonics_from_colors
 from nerg_mi.formats.splats import write_ply_splats
 from nerg_mi.maths.color import decode_srgb, encode_srgb
 from nerg_mi.registration import get_plugin_class
@@ -21,7 +21,7 @@ from .scenes import render as draw
 
 @pytest.fixture
 def render(rgb, tmp_path):
-    """What `nerg` renders of splats, by the names of its channels."""
+    """The image of splats by `nerg`, by channel name."""
 
     def rendered(splats, sensor=None, others=(), field=(), **parameters):
         write_ply_splats(tmp_path / "a.ply", splats)
@@ -29,7 +29,7 @@ def render(rgb, tmp_path):
         integrator = {"type": "nerg", "field": place, **parameters}
         image = draw(rgb, integrator, sensor, **dict(others))
         names = rgb.load_dict(integrator).aov_names()
-        # All channels of an AOV together; one alone without an axis of its own.
+        # All channels of an AOV together; a single one without an axis.
         found: dict = {}
         for name, value in zip(names, np.moveaxis(image[..., image.shape[-1] - len(names) :], -1, 0)):
             found.setdefault(name.split(".")[0], []).append(value)
@@ -49,14 +49,15 @@ def wall(z=0.0, opacity=0.99, half=2.0, spacing=0.08, color=(0.2, 0.5, 0.8)):
 
 
 def of_mitsuba(mi, path, sensor):
-    """The sum of its colours, which it makes linear as it is."""
+    """The sum of the colours, linear as it is."""
     scene = {"type": "scene", "i": {"type": "volprim_rf_basic"}, "s": sensor, "e": {"type": "ellipsoids"}}
     scene["e"]["filename"] = str(path)
     return encode_srgb(picture(mi, mi.load_dict(scene))[..., :3])
 
 
-def test_colors_are_those_of_mitsubas_own_renderer(rgb, tmp_path, render):
-    # Balls of one size, few and thin: theirs stops at a hundredth of the light, and takes what overlaps by its shells.
+def test_colors_match_volprim_rf_basic(rgb, tmp_path, render):
+    # Spheres of one size, few and thin: Mitsuba's renderer stops at a hundredth of the light, and sorts overlapping
+    # ones by their shells.
     some = random_splats(25, degree=3)
     scales = np.full((25, 3), 0.12)
     some = Splats(some.centers, scales, some.rotations, 0.4 * some.opacities, some.harmonics)
@@ -67,8 +68,8 @@ def test_colors_are_those_of_mitsubas_own_renderer(rgb, tmp_path, render):
     assert len(apart) > 300 and np.median(apart) < 1e-6 and (apart < 1e-4).mean() > 0.9
 
 
-def test_a_gaussian_is_met_once(rgb, tmp_path, render):
-    # Mitsuba 3.9.1 meets one that is thin a second time where a ray grazes it: its next ray starts outside again.
+def test_each_gaussian_is_hit_once(rgb, tmp_path, render):
+    # Mitsuba 3.9.1 hits a thin one twice at grazing angles: its next ray starts outside again.
     one = Splats([[0, 0, 0]], [[0.3, 0.05, 0.1]], [[0.8, 0.3, 0.4, 0.2]], [0.5], harmonics_from_colors([[1, 1, 1]]))
     opacity = render(one, aovs="opacity", sensor=camera(rgb, size=64))["opacity"]
     theirs = of_mitsuba(rgb, tmp_path / "a.ply", camera(rgb, size=64))[..., 0]
@@ -80,7 +81,7 @@ def test_a_gaussian_is_met_once(rgb, tmp_path, render):
     assert np.allclose(theirs[twice], 1 - (1 - opacity[twice]) ** 2, atol=1e-5)
 
 
-def test_a_wall_is_where_it_stands_for_camera_and_observer(rgb, render):
+def test_wall_depth_for_camera_and_observer(rgb, render):
     found = render(
         wall(),
         aovs="depth,opacity,position,visibility,observer_depth",
@@ -95,10 +96,10 @@ def test_a_wall_is_where_it_stands_for_camera_and_observer(rgb, render):
 
 
 @pytest.mark.parametrize("visibility", ["depth", "transmittance", "map"])
-def test_what_stands_between_hides(rgb, render, visibility):
+def test_splats_occlude(rgb, render, visibility):
     back, front = wall(), wall(-1, half=0.6)
     both = concatenate_splats([back, front])
-    # The camera looks at the far wall below the near one, behind which the observer stands.
+    # The camera looks at the far wall below the near one, behind which the observer is.
     observer = {"type": "perspective", "to_world": look_at(rgb, (0, 0, -3), (0, 0, 0))}
     sensor = camera(rgb, (0, 0, -0.5), (0, 0, 0), fov=140)
     found = render(
@@ -106,13 +107,13 @@ def test_what_stands_between_hides(rgb, render, visibility):
     )
     x, y = np.abs(found["position"][..., :2]).max(-1), found["visibility"]
     inside = (x < 1.9) & (np.abs(found["position"][..., 2]) < 0.01)
-    # A shadow of what is 2 away on what is 3 away; its rim is as soft as the last Gaussians.
+    # A shadow on a surface at 3 of one at 2; its rim is as soft as the last Gaussians.
     assert y[inside & (x < 0.75)].max() < 0.05 and y[inside & (x > 1.3)].min() > 0.95
     assert (inside & (x < 0.75)).sum() > 3 and (inside & (x > 1.3)).sum() > 3
 
 
-def test_eyes_stand_inside_of_gaussians(rgb, render):
-    # A haze around camera and wall: its peak lies behind the camera on one side, before it on the other.
+def test_camera_inside_gaussians(rgb, render):
+    # A haze around camera and wall: its peak is behind the camera on one side, in front of it on the other.
     haze = Splats([[0.5, 0.4, -2.5]], [[3, 3, 3]], [[1, 0, 0, 0]], [0.5], harmonics_from_colors([[1, 1, 1]]))
     found = render(haze, aovs="opacity,depth")
     assert found["opacity"].min() > 0.4 and found["depth"].max() <= 0.5
@@ -120,7 +121,7 @@ def test_eyes_stand_inside_of_gaussians(rgb, render):
     assert away["opacity"].max() == 0
 
 
-def test_shapes_hide_and_are_hidden(rgb, render):
+def test_shapes_and_splats_occlude_each_other(rgb, render):
     ball = {"ball": {"type": "sphere", "radius": 0.5, "center": [0, 0, 1]}}
     behind = render(wall(opacity=0.3), others=ball, aovs="depth,opacity")
     middle = behind["depth"].shape[0] // 2
@@ -130,7 +131,7 @@ def test_shapes_hide_and_are_hidden(rgb, render):
     assert np.isclose(before["depth"][middle, middle], np.linalg.norm([0.5, 0.4, 2]) - 0.5, atol=0.02)
 
 
-def test_a_turned_place_shows_its_colors_turned(rgb, render):
+def test_rotated_splats_rotate_colors(rgb, render):
     splats = random_splats(25, degree=3, size=0.15)
     turn = Rotation.random(random_state=np.random.default_rng(4)).as_matrix()
     matrix = np.eye(4)
@@ -142,11 +143,11 @@ def test_a_turned_place_shows_its_colors_turned(rgb, render):
     moved = camera(rgb) | {"to_world": look_at(rgb, 2 * turn @ eye, target, up)}
     there = render(splats, moved, field={"to_world": to_world}, aovs="depth,opacity")
     assert np.abs(there["color"] - here["color"]).max() < 1e-4
-    # Rays begin at the near plane, which has not grown.
+    # Rays start at the near plane, which has not been scaled.
     assert np.allclose(there["depth"], 2 * here["depth"], atol=0.02)
 
 
-def test_a_picture_is_differentiated(rgb, tmp_path):
+def test_image_derivatives(rgb, tmp_path):
     write_ply_splats(tmp_path / "a.ply", random_splats(20, degree=0, size=0.2))
     place = stored("splats", tmp_path / "a.ply")
     scene = rgb.load_dict({"type": "scene", "i": {"type": "nerg", "id": "i", "field": place}, "s": camera(rgb)})
@@ -167,8 +168,8 @@ def test_a_picture_is_differentiated(rgb, tmp_path):
     assert abs(found) > 1e-2 and np.isclose(found, (ends[0] - ends[1]) / 2e-3, rtol=2e-2)
 
 
-def test_the_page_on_fitting_runs(rgb, tmp_path, monkeypatch):
-    """The block of docs/how-to/exchange.md on fitting."""
+def test_fitting_page_example_runs(rgb, tmp_path, monkeypatch):
+    """The block of docs/how-to/environments.md."""
     write_ply_splats(tmp_path / "store.ply", random_splats(20, degree=0, size=0.2))
     monkeypatch.chdir(tmp_path)
     page = (ROOT / "docs" / "how-to" / "exchange.md").read_text("utf-8")
@@ -179,15 +180,15 @@ def test_the_page_on_fitting_runs(rgb, tmp_path, monkeypatch):
     assert len(losses) == 4 and losses[-1] < 0.9 * losses[0]
 
 
-def test_all_sizes_and_opacities_give_finite_pictures(rgb, tmp_path):
-    # Needles, pancakes, points and haloes, many of them overlapping and hardly to be seen; the camera is inside.
+def test_extreme_splats_give_finite_images(rgb, tmp_path):
+    # Needles, pancakes, points and haloes, many of them overlapping and barely visible; the camera is inside.
     rng = np.random.default_rng(5)
     n = 300
     sizes = np.array([[1e-6] * 3, [1e-6, 1e-6, 1], [1e-6, 1, 1], [1e3] * 3, [1e3, 1e-6, 1e3], [0.3] * 3])
     opacities = rng.choice([0, 1e-3, 0.05, 1], n)
     colors = harmonics_from_colors(rng.uniform(-1, 2, (n, 3)))
     some = Splats(rng.normal(0, 1, (n, 3)), rng.choice(sizes, n), rng.normal(size=(n, 4)), opacities, colors)
-    place = get_plugin_class("splats").of(some)
+    place = get_plugin_class("splats").from_network(some)
     integrator = {"type": "nerg", "id": "i", "field": place, "aovs": "depth,opacity,position"}
     scene = rgb.load_dict({"type": "scene", "i": integrator, "s": camera(rgb, (0, 0, 0), (0.3, 0.2, 1), size=8)})
     params = rgb.traverse(scene)
@@ -204,7 +205,7 @@ def test_all_sizes_and_opacities_give_finite_pictures(rgb, tmp_path):
         assert np.isfinite(grad).all(), (name, (~np.isfinite(grad)).sum())
 
 
-def test_the_volume_says_what_it_is(rgb, tmp_path):
+def test_volume_to_string(rgb, tmp_path):
     write_ply_splats(tmp_path / "a.ply", wall())
     volume = rgb.load_dict(stored("splats", tmp_path / "a.ply", color_space="linear"))
     assert "count = 2601" in str(volume) and volume.medium().color_space == "linear"
@@ -216,10 +217,10 @@ def test_the_volume_says_what_it_is(rgb, tmp_path):
     with pytest.raises(Exception, match="no density at a point"):
         volume.eval_1(rgb.Interaction3f())
     kind = get_plugin_class("splats")
-    assert kind.of(replace(wall(), color_space="linear")).medium().color_space == "linear"
-    assert "in memory" in str(kind.of(wall()))
-    with pytest.raises(Exception, match="splats in memory are needed"):
-        kind.of(3)
+    assert kind.from_network(replace(wall(), color_space="linear")).medium().color_space == "linear"
+    assert "in memory" in str(kind.from_network(wall()))
+    with pytest.raises(Exception, match="expected splats in memory"):
+        kind.from_network(3)
     with pytest.raises(RuntimeError, match="lacks the column"):
         (tmp_path / "b.ply").write_text("ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n")
         rgb.load_dict(stored("splats", tmp_path / "b.ply"))

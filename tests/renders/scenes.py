@@ -1,9 +1,9 @@
 """Six scenes for statistical tests, and their stored references.
 
-    python -m tests.renders.scenes [NAME ...]     renders the references anew (about a minute on two cores)
+    python -m tests.renders.scenes [NAME ...]     renders the references again (about a minute on two cores)
 
-`mi.testing.RenderingRegressionTest` compares the first three channels of a `moment` integrator, and takes the three
-after them for the second moments. In Mitsuba 3.9 channels of the nested integrator stand there: `Shown` returns the
+`mi.testing.RenderingRegressionTest` compares the first three channels of a `moment` integrator, and expects the second
+moments in the three after them. In Mitsuba 3.9 these are channels of the nested integrator: `Shown` returns the
 squares.
 """
 
@@ -22,7 +22,7 @@ TEST_SPP, REFERENCE_SPP = 256, 4096
 
 
 def shown(mi, integrator, names):
-    """`integrator` with three of its channels (names of AOVs, or R, G, B) as the picture, and their squares as AOVs."""
+    """`integrator` with three of its channels (names of AOVs, or R, G, B) as the image, and their squares as AOVs."""
 
     class Shown(mi.SamplingIntegrator):
         def __init__(self, props):
@@ -50,7 +50,7 @@ def rgb_of(*value):
 
 
 def things(mi):
-    """A ball and a turned box on a floor."""
+    """A sphere and a rotated box on a floor."""
     T = mi.ScalarTransform4f
     return {
         "ball": {
@@ -86,7 +86,7 @@ def neural(folder, change=1.0, **kwargs):
 
 
 def gaze(mi, folder, change=1.0):
-    """What the camera itself attends, on a trained field's median surface."""
+    """Gaze of the camera itself, on a trained field's median surface."""
     return neural(folder, change, aovs="depth,gaze", jitter=True), {}, ("depth.T", "gaze.Y", "G"), camera(mi, size=SIZE)
 
 
@@ -111,7 +111,7 @@ def both(mi, folder, change=1.0):
 
 
 def observer(mi, folder, change=1.0):
-    """Who stands elsewhere sees through a long fall-off."""
+    """Visibility of an observer elsewhere, with a long fall-off."""
     integrator = neural(
         folder,
         aovs="gaze,visibility,observer_depth",
@@ -123,7 +123,7 @@ def observer(mi, folder, change=1.0):
 
 
 def panorama(mi, folder, change=1.0):
-    """From inside of a cloud of voxels with a ball in it."""
+    """Inside a cloud of voxels with a sphere in it."""
     data = np.random.default_rng(0).uniform(0, 2, (5, 5, 5)).astype(np.float32)
     box = mi.ScalarTransform4f().translate([-1.5, -1.5, -1.5]).scale(3)
     density = {"type": "gridvolume", "grid": mi.VolumeGrid(data * np.float32(change)), "to_world": box}
@@ -146,7 +146,7 @@ def panorama(mi, folder, change=1.0):
     return integrator, {"ball": things(mi)["ball"]}, ("depth.T", "opacity.Y", "visibility.Y"), sensor
 
 
-# name: (scene, the relative change of its density, light or fall-off that its test must notice)
+# name: (scene, the relative change of its density, light or fall-off that its test must detect)
 SCENES = {
     "slab": (slab, 0.02),
     "gaze": (gaze, 0.02),
@@ -181,7 +181,7 @@ test_of.__test__ = False
 def main(names):
     import mitsuba as mi
 
-    import nerg_mi  # noqa: F401  chooses the libLLVM, so it comes before mitsuba
+    import nerg_mi  # noqa: F401  selects the libLLVM, so it comes before mitsuba
 
     mi.set_variant("llvm_ad_rgb")
     with tempfile.TemporaryDirectory() as folder:
