@@ -1,17 +1,17 @@
-"""How well each kind of evidence finds where tracking lies in a place whose frame is another one.
+"""Accuracy of each alignment method between tracking data and a scene in another frame.
 
-    python benchmarks/alignment.py [--trials 50] [--only KIND] [--seed 0] [--shoppers 12] [--update docs/explanation/accuracy.md]
+    python benchmarks/alignment.py [--trials 50] [--only KIND] [--seed 0] [--shoppers 12] [--update
+    docs/explanation/accuracy.md]
 
-The place is the demo store's trained field, carried into another frame by a random similarity: scale from 0.14 to 7.4,
-a shift of some ten metres, and any rotation, or, where up has to be known, any turn about it. The tracking is of
+The scene is the demo store's trained field, transformed by a random similarity: scale from 0.14 to 7.4, a translation
+of about ten metres, and any rotation, or, if the up axis must be known, any rotation about it. The tracking is of
 generated shoppers, in metres; their hit points are those of rays cast at the store's mesh, with a noise of 2 cm.
-`right`: trials in which a fit was found, not refused, and is less than 10 cm (of the tracking) and 2 degrees from the
-truth. Errors are medians over these, of the median head of each; `95 %`: of all heads' errors in centimetres.
-`mirror named`: the same with the tracking's x axis negated, how often that is said. `residual cm`: the median that the
-fit itself states.
+`right`: trials with an accepted fit within 10 cm (of the tracking) and 2 degrees of the truth. Errors are medians over
+these, of the median head of each; `95 %`: of all heads' errors in centimetres. `mirror named`: the rate of detection
+after negating the tracking's x axis. `residual cm`: the median that the fit reports.
 
-Second table, where `../shared/data/fox` (or NERG_DATA) is: people looking about between the cameras of the fox photos,
-in a random other frame, from five picked points with errors of 1 % of the cameras' spread.
+Second table, if `../shared/data/fox` (or NERG_DATA) exists: participants who look around between the cameras of the fox
+photos, in a random other frame, from five picked points with errors of 1 % of the cameras' spread.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and
 from nerg_mi.alignment.constraints import AlignmentTarget, Evidence, SceneTraces, read_surface, trace_scene
 from nerg_mi.alignment.icp import Twin
 from nerg_mi.alignment.points import Cameras, Pairs
-from nerg_mi.alignment.similarity import MIRROR, residual_distances, transform_points, similarity_scale
+from nerg_mi.alignment.similarity import MIRROR, residual_distances, similarity_scale, transform_points
 from nerg_mi.alignment.tracking import Tracking
 from nerg_mi.errors import NergError
 from nerg_mi.rays.rays import Rays
@@ -44,7 +44,7 @@ HEAD = "evidence|known besides|right|error cm|95 %|degrees|scale %|residual cm|m
 
 @dataclass(frozen=True)
 class World:
-    """The store: what rays found of its field, its mesh as points, and its shoppers with their hit points."""
+    """The store: ray casts to its field, its mesh as points, and its shoppers with their hit points."""
 
     traces: SceneTraces
     mesh: np.ndarray
@@ -79,7 +79,7 @@ def random_similarity(rng: np.random.Generator, upright: bool) -> np.ndarray:
 
 
 # ----------------------------------------------------------------------------
-# Evidence: what it is, given the truth from the tracking to the place
+# Evidence, from the true transform of the tracking to the scene
 # ----------------------------------------------------------------------------
 
 Maker = Callable[[World, np.ndarray, np.random.Generator, bool], tuple[Evidence, AlignmentTarget]]
@@ -114,7 +114,7 @@ def cameras(world, truth, rng, mirrored):
     noise = Rotation.from_rotvec(rng.normal(0, np.radians(0.5), (40, 3))).as_matrix()
     other[:, :3, :3] = noise @ (turn @ poses[:, :3, :3])
     other[:, :3, 3] = transform_points(truth, poses[:, :3, 3] + rng.normal(0, 0.02, (40, 3)))
-    # One in ten is somewhere else.
+    # One in ten is an outlier.
     other[:4, :3, 3] += rng.normal(0, 5 * similarity_scale(truth), (4, 3))
     other[:4, :3, :3] = Rotation.random(4, random_state=rng).as_matrix()
     if mirrored:
@@ -141,7 +141,7 @@ def tracking(hits: bool) -> Maker:
     return make
 
 
-# Name, what is known besides, whether up is, how it is made.
+# Name, further known quantities, whether up is known, and the generator.
 KINDS: dict[str, tuple[str, str, bool, Maker]] = {
     "pairs": ("5 picked points, off by 1.4 cm an axis", "", False, pairs(5, False)),
     "floor": ("2 picked points", "up", True, pairs(2, True)),
@@ -157,7 +157,7 @@ SEARCHED = ("twin", "upright-twin", "tracking", "heads")
 
 
 def measure(world: World, kind: str, trials: int, mirrors: int, seed: int = 0) -> dict:
-    """One row; ``seed``: of the similarities and of the errors of what is given."""
+    """One row; ``seed``: of the similarities and of the errors of the evidence."""
     name, known, upright, make = KINDS[kind]
     found, off, named = [], [], []
     began = time.perf_counter()
@@ -211,7 +211,7 @@ def measure(world: World, kind: str, trials: int, mirrors: int, seed: int = 0) -
 
 def cells(row: dict) -> list[str]:
     numbers = [f"{row[k]:.2g}" for k in ("error cm", "95 %", "degrees", "scale %", "residual cm")]
-    # Of a scale that was given nothing is found.
+    # A given scale is not estimated.
     numbers[3] = "" if row["scale %"] < 1e-9 else numbers[3]
     named = f"{row['named']} of {row['mirrors']}" if row["mirrors"] else ""
     right = f"{row['right']} of {row['trials']}"
@@ -219,7 +219,7 @@ def cells(row: dict) -> list[str]:
 
 
 def measure_fox(trials: int) -> list[list[str]] | None:
-    """People about the fox, from five points; None where the photos are not there."""
+    """Participants around the fox, from five points; None without the photos."""
     path = Path(os.environ.get("NERG_DATA", ROOT.parent / "shared" / "data")) / "fox" / "transforms.json"
     if not path.is_file():
         return None

@@ -1,14 +1,14 @@
-"""All that is said of speed, in one run: frames and their stages beside PyTorch, densities beside SciPy, volumes beside
-`volpath`, and how each cost grows.
+"""All speed measurements in one run: frames and their stages against PyTorch, densities against SciPy, volumes against
+`volpath`, and the scaling of each cost.
 
     python benchmarks/bench.py [--only PARTS] [--long] [--mode llvm_ad_rgb] [--update docs/explanation/performance.md]
     [--out out/benchmarks/bench]
 
-Parts: ``frames``, ``stages``, ``kde``, ``volume``, ``growth``, ``memory``, ``start``; else all.
-Works that are compared do the same, which is checked first, and take turns; figures are medians with their quartiles.
-Prints tables, writes them as CSV and a figure, and puts them into the page that is named. ``--long``: more runs,
-larger sizes, and PyTorch at 1280 x 720. With a CUDA variant the parts without a peer are measured in wall-clock
-seconds; where there is no device it says so and ends.
+Parts: ``frames``, ``stages``, ``kde``, ``volume``, ``growth``, ``memory``, ``start``; default: all. Programs that are
+compared do the same work, which is checked first, and alternate; figures are medians with quartiles. Prints tables,
+writes them as CSV and a figure, and updates the given page. ``--long``: more runs, larger sizes, and PyTorch at 1280 x
+720. With a CUDA variant, parts without a reference program are measured in wall-clock seconds; without a device the
+benchmark ends with a message.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ Works = dict[str, Callable[[], np.ndarray]]
 
 
 def unit_vectors(count: int, seed: int) -> np.ndarray:
-    """Directions (count, 3), uniform over the sphere."""
+    """Uniform directions (count, 3) on the sphere."""
     d = np.random.default_rng(seed).normal(size=(count, 3))
     return d / np.linalg.norm(d, axis=1, keepdims=True)
 
@@ -69,7 +69,7 @@ def kernel_densities(rays: int, directions: int, kappa: float = 200.0) -> tuple[
 
 
 def cloud(cells: int) -> np.ndarray:
-    """Densities (z, y, x, 1) of a cloud of balls in an otherwise empty grid, 0 to 6 a unit."""
+    """Densities (z, y, x, 1) of a cloud of spheres in an otherwise empty grid, 0 to 6 per unit."""
     at = (np.stack(np.meshgrid(*[np.arange(cells)] * 3, indexing="ij"), -1) + 0.5) / cells
     value = np.zeros((cells,) * 3)
     for center in np.random.default_rng(0).uniform(0.25, 0.75, (12, 3)):
@@ -78,10 +78,12 @@ def cloud(cells: int) -> np.ndarray:
 
 
 def transmittances(size: int, samples: int, cells: int = 64) -> tuple[Works, Callable[[np.ndarray], float], float]:
-    """How much passes a cloud that only absorbs: by `nerg` (its quadrature, one sample a pixel) and by `volpath`
-    (``samples`` a pixel, in a medium of albedo 0 before a white surrounding). The works give pictures (size, size); the
-    function their error (root of the mean square) against 16 samples a pixel with steps of a 16th, and the last number
-    how far the means of the two are apart."""
+    """Transmittance of an absorbing cloud: by `nerg` (quadrature, one sample per pixel) and by `volpath` (``samples``
+    per pixel, in a medium of albedo 0 in front of white surroundings).
+
+    Returns programs that render images (size, size), a function for their RMS error against 16 samples per pixel with
+    steps of 1/16, and the difference of both means.
+    """
     import mitsuba as mi
 
     grid = {
@@ -137,7 +139,7 @@ STAGES = {
 
 
 class Run:
-    """What the parts have in common: the options, the variant's namespace, and the fields of the demo store."""
+    """Shared state of the parts: the options, the variant's namespace, and the fields of the demo store."""
 
     def __init__(self, args: argparse.Namespace):
         from nerg_mi.fields.mlp import namespace
@@ -153,7 +155,7 @@ class Run:
         self.gaze = load_gaze(folder / "shoppers.safetensors", ns)[0]
 
     def cost(self, times) -> list[float]:
-        """Seconds of each run: of the processor, or of the clock where a device computes."""
+        """Seconds of each run: CPU time, or wall-clock time on a device."""
         return [wall if self.cuda else cpu for wall, cpu in times]
 
     def table(self, title: str, head, rows: list[list[str]], name: str) -> None:
@@ -167,7 +169,7 @@ class Run:
 
 
 def the_run(run: Run) -> None:
-    """What was measured on what."""
+    """A description of the measurement and the machine."""
     import drjit
     import mitsuba as mi
 
@@ -187,8 +189,7 @@ def the_run(run: Run) -> None:
 
 
 def peers_of(run: Run, compiled: bool) -> dict[str, torch_frames.TorchRenderer]:
-    """Renderers in PyTorch that give our picture, which is checked; one that does not compile is left out, and why is
-    printed."""
+    """PyTorch renderers of the same image, which is checked; one that does not compile is skipped with a message."""
     import nerg_mi as nerg
 
     import torch
@@ -231,7 +232,7 @@ def frames(run: Run) -> None:
 
 
 def stages(run: Run) -> None:
-    """Each with those before it, of 640 x 360."""
+    """Each stage with those before it, at 640 x 360."""
     width, height = 640, 360
     values = {"width": width, "height": height, "spp": 1}
     works = {name: torch_frames.Ours({**values, **more}, "depth") for name, more in STAGES.items()}
@@ -254,7 +255,7 @@ def stages(run: Run) -> None:
 
 
 def peer_stages(run: Run, width: int, height: int) -> dict[str, float]:
-    """Microseconds a pixel of the eager renderer, by the names of `STAGES`: of the clock, since its threads spin while
+    """Microseconds per pixel of the eager renderer, by the names of `STAGES`: wall-clock, since its threads spin while
     they wait."""
     import nerg_mi as nerg
 
@@ -304,7 +305,7 @@ def volume(run: Run) -> None:
         raise SystemExit(f"the two do not render the same cloud: means are {apart:.1%} apart")
     errors = {name: error(work()) for name, work in works.items()}
     costs = {name: run.cost(times) for name, times in in_turns(works, run.runs).items()}
-    # An estimate by chance is n times as dear for 1 / sqrt(n) of the error.
+    # A Monte Carlo estimate costs n times as much for 1 / sqrt(n) of the error.
     worth = {name: median(cost) * errors[name] ** 2 for name, cost in costs.items()}
     rows = [
         [

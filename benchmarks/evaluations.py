@@ -1,10 +1,10 @@
-"""How many evaluations of density a frame takes, and what each way of saving them costs in time and in error.
+"""Density evaluations of a frame, and the cost in time and error of each way to save them.
 
     python benchmarks/evaluations.py SCENE.xml [-D KEY=VALUE] [--width 640] [--height 360] [--repeats 7]
     [--out out/benchmarks/evaluations.csv] [--update docs/explanation/error-and-time.md]
 
-Each row is the scene with some parameters, against the first row: all occupied cells are marched, and each observer's
-ray to its end. Times are processor time of both passes, colour and gaze, medians of rounds over all rows in turn.
+Each row is the scene with some parameters, against the first row: all occupied cells are marched, and each observer ray
+to its end. Times are CPU time of both passes, colour and gaze, medians of rounds over all rows in turn.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def main(argv=None) -> None:
         counts = f"{aovs(wanted)},density_evals,color_evals"
         seen = subject.render_channels(subject.make_integrator({**params, "aovs": counts}), 1, 1)
         integrator = subject.make_integrator({**params, "aovs": aovs(wanted)})
-        for _ in range(2):  # the second frame reads what the first keeps of the observer, and is another kernel
+        for _ in range(2):  # the second frame uses cached data of the observer, with another kernel
             subject.render(integrator, 1, 1)
         made.append(integrator)
         first = first or seen

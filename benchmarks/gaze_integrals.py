@@ -4,10 +4,10 @@ positions.
     python benchmarks/gaze_integrals.py GAZE PLACE.vol|FIELD.safetensors [--positions 1000] [--out
     out/benchmarks/gaze_integrals.csv]
 
-Positions are uniform in the box of the heads that the field was trained on. The finer integral has twice as many
-directions, others. Prints the largest and the mean difference from one, the share within 1e-3, and what an integral
-costs. ``--sweep``: the same of fewer and more directions, of which no finer sum is needed than that of the most, and of
-tolerances that decide how many there are.
+Positions are uniform in the box of training heads. The finer integral uses twice as many, other directions. Prints the
+maximum and the mean difference from one, the fraction within 1e-3, and the cost of an integral. ``--sweep``: the same
+for fewer and more directions, where the largest number serves as the reference, and for tolerances that determine their
+number.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def main(argv=None) -> None:
     from nerg_mi.formats.fields import load_gaze
     from nerg_mi.train.geometry import load_field_geometry, load_volume_geometry
     from nerg_mi.transport.geometry import SceneGeometry, default_march_settings
-    from nerg_mi.transport.observer import DIRECTIONS as COUNT
+    from nerg_mi.transport.observer import MAX_DIRECTIONS as COUNT
     from nerg_mi.transport.observer import ObserverSettings
     from nerg_mi.transport.observer_gaze import GazeFieldInstance
 
@@ -47,12 +47,18 @@ def main(argv=None) -> None:
     args = parser.parse_args(argv)
     ns = namespace("llvm_ad_rgb")
     field, _ = load_gaze(args.gaze, ns)
-    medium = (load_volume_geometry(args.place) if args.place.suffix == ".vol" else load_field_geometry(args.place, ns)).medium
-    gaze, place, settings = GazeFieldInstance(field), SceneGeometry(medium), ObserverSettings(march=default_march_settings(medium))
+    medium = (
+        load_volume_geometry(args.place) if args.place.suffix == ".vol" else load_field_geometry(args.place, ns)
+    ).medium
+    gaze, place, settings = (
+        GazeFieldInstance(field),
+        SceneGeometry(medium),
+        ObserverSettings(march=default_march_settings(medium)),
+    )
 
     def integral(p: list[float], count: int = COUNT, tolerance: float = 0.0) -> float:
         p_o = mi.Point3f(*p)
-        # As of a scene: a constant of the kernel would be compiled anew.
+        # Opaque like a scene's: a literal would be compiled again.
         dr.make_opaque(p_o)
         asked = replace(settings, directions=count, integral_tolerance=tolerance)
         return float(gaze.for_observers([p_o], place, asked).integrals(p_o)[0][0])

@@ -1,7 +1,8 @@
-"""Places of boxes whose people follow known laws of attention: a gallery, an office with windows, a corridor, a stage.
+"""Generated scenes of boxes whose participants follow known laws of attention: a gallery, an office with windows, a
+corridor, a stage.
 
-Unlike the demo store's, whose people share one law, these people differ: each has a taste of their own for every thing
-to look at. What they look at is held for a while, as fixations are. Everything follows from a seed.
+Unlike the demo store's shoppers, who share one law, these participants differ: each has an individual preference for
+each target. Gaze is held for a while, like a fixation. Everything follows from a seed.
 """
 
 from __future__ import annotations
@@ -16,9 +17,9 @@ import numpy as np
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
 
-# Standard deviation of the logarithm of a person's taste, and of the angle at which a thing is met (radians).
+# Standard deviation of the log preference of a participant, and of the angular error of gaze (radians).
 _TASTE, _JITTER = 0.5, np.radians(8.0)
-# Share of samples at which a new thing is looked at: five samples a second, and some 0.6 s a look.
+# Probability per sample of a new target: five samples per second, and about 0.6 s per fixation.
 _NEW_LOOK = 0.33
 _RATE = 5.0
 _SPEED = 0.7
@@ -26,7 +27,7 @@ _SPEED = 0.7
 
 @dataclass(frozen=True)
 class Thing:
-    """A rectangle that draws eyes: its middle and half edges (3,), metres, and how much it draws."""
+    """A rectangle that attracts gaze: its centre and half edges (3,) in metres, and its attraction."""
 
     middle: tuple[float, float, float]
     half: tuple[float, float, float]
@@ -35,19 +36,19 @@ class Thing:
 
 @dataclass(frozen=True, kw_only=True)
 class GeneratedPlace:
-    """A place and a law. The chance of a thing is its draw and the person's taste, times 1 / (1 + (d / falloff)²) and
-    the cosine at which it is seen, where it is seen at all; ``ahead`` and ``around`` are draws of the way that is
-    walked, and of no thing in particular."""
+    """A scene and a law. The probability of a target is its attraction and the participant's preference, times 1 / (1 +
+    (d / falloff)²) and the cosine of the viewing angle, if it is visible; ``ahead`` and ``around`` are attractions of
+    the walking direction, and of no target."""
 
     name: str
     boxes: tuple[Box, ...]
     things: tuple[Thing, ...]
-    # Corners (2, 2) of the floor that people walk on; beyond are the walls.
+    # Corners (2, 2) of the walkable floor; walls are beyond.
     floor: tuple[tuple[float, float], tuple[float, float]]
     falloff: float = 1e3
     ahead: float = 0.1
     around: float = 0.2
-    # Metres that a person strays from where they begin; None: they walk everywhere.
+    # Maximum distance in metres from the start of a participant; None: unlimited.
     strays: float | None = None
     seated: bool = False
     free: Callable[[np.ndarray], np.ndarray] = field(default=lambda p: np.ones(len(p), bool))
@@ -67,7 +68,7 @@ class GeneratedPlace:
         return path
 
     def record(self, scene: Path, people: int = 16, seconds: float = 240.0, seed: int = 0):
-        """Rays of ``people`` in ``scene`` (its file), ``seconds`` each."""
+        """Rays of ``people`` participants in ``scene`` (its file), ``seconds`` each."""
         from nerg_mi.rays.rays import Rays
 
         import mitsuba as mi
@@ -110,7 +111,8 @@ class GeneratedPlace:
         return Rays(joined[0], joined[1], names, joined[2], joined[3], np.ones(len(joined[0])))
 
     def _walk(self, rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Heads (count, 3) and ways (count, 2) of a person who walks from point to point and rests there."""
+        """Head positions (count, 3) and walking directions (count, 2) of a participant who walks from point to point
+        and pauses there."""
         (low, high), height = np.array(self.floor), rng.normal(1.22 if self.seated else 1.63, 0.07)
 
         def point(near: np.ndarray | None) -> np.ndarray:
@@ -140,20 +142,20 @@ class GeneratedPlace:
         return heads, ways
 
     def _look(self, rng: np.random.Generator, weight: np.ndarray) -> np.ndarray:
-        """What is looked at (N,), held for a while, by chances (N, K)."""
+        """Targets (N,), held for a while, drawn with probabilities (N, K)."""
         drawn = (np.cumsum(weight, axis=1) / weight.sum(axis=1, keepdims=True) < rng.random((len(weight), 1))).sum(
             axis=1
         )
         new, out = rng.random(len(weight)) < _NEW_LOOK, drawn.copy()
         for i in range(1, len(out)):
-            # A thing that has gone out of sight is looked at no longer.
+            # A target that is no longer visible is dropped.
             if not new[i] and weight[i, out[i - 1]] > 0:
                 out[i] = out[i - 1]
         return out
 
     @staticmethod
     def _seen(twin, p: np.ndarray, middles: np.ndarray) -> np.ndarray:
-        """Whether nothing lies between (N, K); a thing itself is not in its own way."""
+        """Whether targets are unoccluded (N, K); a target does not occlude itself."""
         from nerg_mi.maths.arrays import to_vector
 
         import mitsuba as mi
@@ -177,7 +179,7 @@ def _walls(x: float, y: float, z: float, thick: float = 0.1) -> list[Box]:
 
 
 def _gallery() -> GeneratedPlace:
-    """Pictures on the walls and on a partition that hides half of the room; near or far makes no difference."""
+    """Pictures on the walls and on a partition that hides half of the room; distance has no effect."""
     boxes = [*_walls(10, 8, 3.5), ((4.9, 2, 0), (5.1, 6, 3)), ((2, 6.4, 0), (2.5, 6.9, 1.1))]
     things = [Thing((x, 0.02, 1.6), (0.5, 0.01, 0.4), d) for x, d in ((1.5, 1.0), (4, 0.6), (6.5, 2.0), (8.8, 0.5))]
     things += [Thing((x, 7.98, 1.6), (0.4, 0.01, 0.6), d) for x, d in ((1.2, 0.8), (4.2, 1.5), (7.5, 1.0))]
@@ -195,9 +197,9 @@ def _gallery() -> GeneratedPlace:
 
 
 def _office() -> GeneratedPlace:
-    """Desks with screens, near, and two windows without glass, through which there is nothing to meet."""
+    """Near desks with screens, and two windows without glass, through which rays escape."""
     boxes = [box for box in _walls(9, 6, 2.8) if box[0] != (0, 6, 0)]
-    # The wall of the windows, in pieces around them.
+    # The wall with the windows, in pieces around them.
     boxes += [((0, 6, 0), (9, 6.1, 0.9)), ((0, 6, 2.3), (9, 6.1, 2.8))]
     boxes += [((a, 6, 0.9), (b, 6.1, 2.3)) for a, b in ((0, 1), (3.5, 5.5), (8, 9))]
     things = [Thing((2.25, 6.05, 1.6), (1.2, 0.01, 0.6), 0.7), Thing((6.75, 6.05, 1.6), (1.2, 0.01, 0.6), 0.7)]
@@ -223,7 +225,7 @@ def _office() -> GeneratedPlace:
 
 
 def _corridor() -> GeneratedPlace:
-    """Twenty metres to walk along, with a few doors and posters: ahead is what most look at."""
+    """A corridor of twenty metres with a few doors and posters: most gaze is straight ahead."""
     things = [Thing((x, 0.02, 1.4), (0.4, 0.01, 0.5), d) for x, d in ((3, 0.6), (8, 0.3), (15, 0.9))]
     things += [Thing((x, 1.98, 1.5), (0.4, 0.01, 0.5), d) for x, d in ((5, 0.4), (12, 0.8))]
     things.append(Thing((19.98, 1, 1.6), (0.01, 0.6, 0.7), 1.5))
@@ -238,7 +240,7 @@ def _corridor() -> GeneratedPlace:
 
 
 def _stage() -> GeneratedPlace:
-    """Rows of seats before a stage: everybody looks far ahead, and hardly moves."""
+    """Rows of seats in front of a stage: everybody looks far ahead, and hardly moves."""
     boxes = [*_walls(12, 16, 6), ((2, 0.5, 0), (10, 4, 1.0)), ((5.7, 2, 1.0), (6.3, 2.4, 2.1))]
     boxes += [((1, y, 0), (11, y + 0.1, 0.9)) for y in (7.6, 9.0, 10.4, 11.8, 13.2)]
     things = [Thing((6, 2.2, 2.3), (0.5, 0.2, 0.4), 4.0), Thing((3.4, 2, 2.0), (0.5, 0.3, 0.8), 1.5)]

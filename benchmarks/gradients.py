@@ -1,11 +1,11 @@
-"""Derivatives of pictures against central differences, for every quantity and parameter.
+"""Derivatives of images against central differences, for all quantities and parameters.
 
     python benchmarks/gradients.py [--depth median] [--case NAME] [--update docs/explanation/numerics.md]
 
-One number moves each parameter along a fixed line. Forward: derivatives of all pixels at once,
-as ``mi.render`` gives them. Reverse: derivative of one weighted sum of the pixels of one quantity. Both against central
-differences of pictures at two distances, extrapolated (Richardson); reverse also against the weighted sum of the
-forward derivatives, which is the dot-product test and holds to rounding. Prints markdown; nothing passes or fails here.
+One number moves each parameter along a fixed line. Forward: derivatives of all pixels at once, as computed by
+``mi.render``. Reverse: derivative of one weighted sum of the pixels of one quantity. Both are compared with central
+differences of images at two distances, extrapolated (Richardson); reverse also with the weighted sum of the forward
+derivatives, the dot-product test, which holds to rounding. Prints markdown; the benchmark does not pass or fail.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ BOX, AROUND = Box((-1, -1, -1), (1, 1, 1)), Box((-3.7, -3.7, -3.7), (3.7, 3.7, 3
 
 @dataclass
 class Case:
-    """A parameter that moves. ``scene``: a key of ``SCENES``; ``keys``: of ``mi.traverse``, all moved together;
-    ``line``: value of a parameter at x from its ``(mi, key, base, x)``; ``h``: how far the differences reach."""
+    """A parameter that moves. ``scene``: a key of ``SCENES``; ``keys``: of ``mi.traverse``, moved together; ``line``:
+    value of a parameter at x from its ``(mi, key, base, x)``; ``h``: step of the differences."""
 
     name: str
     scene: str
@@ -49,11 +49,10 @@ class Case:
 
 
 def write_fields(mi, folder: Path) -> None:
-    """A radiance field over the cube of side 2, a gaze field over a larger one, and an ensemble of that one with
-    another.
+    """A radiance field over the cube of side 2, a gaze field over a larger one, and an ensemble of it and another one.
 
-    Features are positive, and each neuron's weights have one sign: some ReLUs pass and some block, and none changes
-    over while a parameter moves, so that differences are those of a smooth function.
+    Features are positive, and the weights of each neuron have one sign: some ReLUs pass and some block, and none
+    switches while a parameter moves, so that differences are those of a smooth function.
     """
     ns = namespace(mi.variant())
     rng = np.random.default_rng(0)
@@ -72,7 +71,7 @@ def write_fields(mi, folder: Path) -> None:
             if not last:
                 layer[::3] *= -1
             if name in ("color_net.0", "direction_net.0"):
-                # Harmonics of the direction have either sign: the features behind them outweigh them.
+                # Harmonics of the direction have both signs: the features behind them dominate.
                 layer[:, 1:4] *= rng.choice([-1, 1], (len(w), 3)) * (5 if name == "direction_net.0" else 1)
                 layer[:, 4:] *= 2
             elif name in ("color_net.2", "emit_head.0", "capture_head.0"):
@@ -95,7 +94,7 @@ def look_at(mi, origin, target=(0, 0, 0)):
 
 
 def camera(mi, origin=(0.3, 0.2, -3), fov=20, size=SIZE):
-    """One ray through the centre of every pixel, whatever the seed: mi.render gives a derivative another one."""
+    """One ray through the centre of each pixel, for any seed: mi.render uses another seed for derivatives."""
     film = {"type": "hdrfilm", "width": size, "height": size, "component_format": "float32", "rfilter": {"type": "box"}}
     return {
         "type": "perspective",
@@ -125,7 +124,7 @@ def integrator(mi, folder, observer=(-2, 0.5, 2), **more):
 
 
 def field_scene(mi, folder, **more):
-    """With the AOVs that only a field and an ensemble of gaze fields have."""
+    """With the AOVs that require a field and an ensemble of gaze fields."""
     field = {"type": "nerf", "filename": str(folder / "field.safetensors")}
     gaze = {"type": "gazefield", "filename": str(folder / "ensemble.safetensors")}
     about = {"aovs": f"{AOVS},features,features_at,gaze_std", "field": field, "gaze": gaze, **more}
@@ -153,8 +152,8 @@ def grid_scene(mi, folder, **more):
 
 
 def shapes_scene(mi, folder, **more):
-    """A tilted slab that every ray of the camera meets, and a larger one between it and the observer: no silhouette is
-    seen."""
+    """A tilted slab that all camera rays hit, and a larger one between it and the observer: no silhouette is
+    visible."""
     slab = lambda z, size, tilt: (
         mi.ScalarTransform4f().translate([0, 0, z]).rotate([0.6, 1, 0], tilt).scale([size, size, 0.05])
     )
@@ -177,7 +176,7 @@ def ball_scene(mi, folder, **more):
 
 
 def both_scene(mi, folder, **more):
-    """A slab that light reaches through a haze."""
+    """A slab behind a haze."""
     place = mi.ScalarTransform4f().translate([-1, -1, -1]).scale(2)
     color = {"type": "constvolume", "value": {"type": "rgb", "value": [0.2, 0.3, 0.9]}}
     return shapes_scene(
@@ -203,7 +202,7 @@ SCENES = {
 
 
 # ----------------------------------------------------------------------------
-# What moves
+# Moving parameters
 # ----------------------------------------------------------------------------
 
 
@@ -227,12 +226,12 @@ def color(mi, key, base, x):
 
 
 def walk(mi, key, base, x):
-    """A pose is moved."""
+    """Translation of a pose."""
     return mi.Transform4f().translate(mi.Vector3f(0.3 * x, x, -0.5 * x)) @ mi.Transform4f(base)
 
 
 def turn(mi, key, base, x):
-    """A pose is turned about an axis through the origin."""
+    """Rotation of a pose about an axis through the origin."""
     return mi.Transform4f().rotate(mi.Vector3f(0.2, 1, 0.3), 20 * x) @ mi.Transform4f(base)
 
 
@@ -280,7 +279,7 @@ def cases() -> list[Case]:
     ]
 
 
-# Where derivatives miss what moves: (1), (2), ... stand below the table in docs/explanation/numerics.md.
+# Derivatives that miss a discontinuity: (1), (2), ... refer to the notes below the table in docs/how-to/derivatives.md.
 EXCLUDED = {
     "shape: its silhouette": dict.fromkeys(
         ("colour", "depth", "opacity", "position", "gaze", "emit", "capture", "visibility", "observer depth"),
@@ -312,9 +311,9 @@ QUANTITIES = {
 @dataclass
 class Entry:
     """Relative errors of one quantity's derivative with respect to one parameter: ``forward`` (over pixels, L2) and
-    ``reverse`` against central differences, ``dot`` of one against the other. ``share``: numbers of the picture that
-    have no kink within the differences' reach, which are those that count; ``doubt``: how far differences at both
-    distances are apart."""
+    ``reverse`` against central differences, ``dot`` of one against the other. ``share``: fraction of the image without
+    a kink within the step of the differences, to which the errors refer; ``doubt``: disagreement of the differences at
+    both distances."""
 
     forward: float
     reverse: float
@@ -324,7 +323,7 @@ class Entry:
 
 
 def measure(mi, scene, case, quantities=QUANTITIES) -> dict:
-    """``Entry`` of each quantity that the scene has, or None where it does not depend on the parameter."""
+    """``Entry`` of each quantity of the scene, or None if it does not depend on the parameter."""
     import drjit as dr
 
     params = mi.traverse(scene)
@@ -349,8 +348,7 @@ def measure(mi, scene, case, quantities=QUANTITIES) -> dict:
     ends = {s: picture(s * h) for s in (1, -1, 0.5, -0.5)}
     wide, near = (ends[1] - ends[-1]) / (2 * h), (ends[0.5] - ends[-0.5]) / h
     difference = (4 * near - wide) / 3
-    # A kink within reach shows in the differences themselves: their two sides disagree by more than a smooth bend
-    # would.
+    # A kink within the step shows in the differences: their two sides disagree by more than a smooth function's.
     bend, bend_near = np.abs(ends[1] + ends[-1] - 2 * middle) / h, np.abs(ends[0.5] + ends[-0.5] - 2 * middle) * 2 / h
     result = {}
     for name, channels in quantities.items():
@@ -373,7 +371,7 @@ def measure(mi, scene, case, quantities=QUANTITIES) -> dict:
         dr.enable_grad(x)
         dr.backward(dr.sum(image(x) * mi.TensorXf(mask), axis=None))
         reverse = float(np.array(dr.grad(x)).item())
-        # Relative to the sum of magnitudes: terms of both signs may cancel.
+        # Relative to the sum of magnitudes: terms of both signs can cancel.
         size = np.abs(w * fd).sum()
         result[name] = Entry(
             norm((ad - fd)[smooth]) / norm(fd[smooth]),
@@ -430,7 +428,7 @@ def main(argv=None) -> None:
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
-    # A sensor's pose counts as not differentiable in Mitsuba, which says so on each of its updates.
+    # Mitsuba declares a sensor's pose as not differentiable and warns on each update.
     mi.set_log_level(mi.LogLevel.Error)
     for title, head, rows in errors(mi, args.case, args.depth):
         print_table(title, head, rows, args.update)

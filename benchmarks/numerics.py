@@ -1,11 +1,11 @@
-"""Largest numerical errors of a march: slabs, single steps, sheets, profiles and densities that are hard to march.
+"""Largest numerical errors of a march: slabs, single steps, sheets, profiles and difficult densities.
 
     python benchmarks/numerics.py [--update docs/explanation/numerics.md]
 
-Every case is compared with a closed form or with float64, forwards and for its derivative, and gives one row: case,
-range, quantity, largest error found, reference. Prints markdown; `--update` puts the tables
-into a document in place of those that stand there under the same headings. Errors are relative unless
-the row says otherwise. Nothing passes or fails here: bounds are kept by the tests.
+Each case is compared with a closed form or with float64, for values and derivatives, and gives one row: case, range,
+quantity, largest error, reference. Prints markdown; `--update` replaces the tables under the same headings of a
+document. Errors are relative unless the row states otherwise. The benchmark does not pass or fail; the tests enforce
+bounds.
 """
 
 from __future__ import annotations
@@ -17,11 +17,17 @@ from pathlib import Path
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 from nerg_mi.fields.radiance import density_from_log
-from nerg_mi.transport.depth import surface_depth
+from nerg_mi.transport.depth import find_surface_depth
 from nerg_mi.transport.march import march
 from nerg_mi.transport.march_primal import MarchSettings
 from nerg_mi.transport.medium import LocalRay
-from nerg_mi.transport.quadrature import RULES, absorbed_fraction, linear_crossing, linear_share, mean_depth_fraction
+from nerg_mi.transport.quadrature import (
+    RULES,
+    absorbed_fraction,
+    find_linear_crossing,
+    linear_mean_depth_fraction,
+    mean_depth_fraction,
+)
 from nerg_mi.transport.volume_medium import VolumeMedium
 from timing import print_table
 
@@ -29,12 +35,12 @@ import drjit as dr
 import numpy as np
 
 HEAD = ["case", "range", "quantity", "largest error", "reference"]
-"""Of tables whose lines are `Row`s."""
+"""A parser of tables whose lines are `Row`s."""
 
 
 @dataclass
 class Row:
-    """One line of a table. ``error``: a number, or a sentence where the outcome is not one."""
+    """One line of a table. ``error``: a number, or a sentence for other outcomes."""
 
     case: str
     range: str
@@ -48,11 +54,11 @@ class Row:
 
 
 STEP = 3**0.5 / 1024
-"""With nothing set, a 1024th of the diagonal of a unit cube."""
+"""Default step: 1/1024 of the diagonal of a unit cube."""
 
 
 def worst(got, expected, relative=True) -> float:
-    """Largest error; infinite where something is not finite that should be."""
+    """Largest error; infinite if a value is not finite that should be."""
     got, expected = (np.asarray(v, float) for v in (got, expected))
     if not np.all(np.isfinite(got)):
         return math.inf
@@ -74,7 +80,7 @@ def gradient(x, f):
 
 
 def share(x):
-    """1/x - 1/expm1(x) in float64, by its series where that cancels."""
+    """1/x - 1/expm1(x) in float64, by its series where it cancels."""
     x = np.asarray(x, float)
     safe = np.clip(x, 0.05, 700)
     return np.where(x < 0.05, 0.5 - x / 12 + x**3 / 720 - x**5 / 30240, 1 / np.maximum(x, 0.05) - 1 / np.expm1(safe))
@@ -111,8 +117,8 @@ def smooth(tau, length=1.0, panels=2000):
     return float(opacity), float((gained * np.tile(0.5 * w / panels * length, panels)).sum() / opacity)
 
 
-class Profile:
-    """A medium in z from 0 to ``length``, of density ``f(z, *parameters)``, that states no bound."""
+class DensityProfile:
+    """A medium in z from 0 to ``length``, of density ``f(z, *parameters)``, without an occupancy bound."""
 
     occupancy = cells = step = hits = None
 
@@ -152,7 +158,7 @@ def grid(mi, data, **more):
 
 
 def through(mi, medium, o, d, settings):
-    """March of rays (N, 3) through a medium, and the ray and its ends."""
+    """March of rays (N, 3) through a medium, with the ray and its ends."""
     o, d = (np.atleast_2d(np.asarray(v, np.float32)) for v in (o, d))
     ray = medium.ray_to_local(mi.Point3f(o.T), mi.Vector3f(d.T))
     t0, t1 = dr.maximum(ray.t_near, 0), ray.t_far
@@ -160,7 +166,7 @@ def through(mi, medium, o, d, settings):
 
 
 def exact_box(o, d, lower=0.0, upper=1.0):
-    """Distances (N,) at which float64 rays (N, 3) enter and leave a box; the first is the larger one on a miss."""
+    """Distances (N,) at which float64 rays (N, 3) enter and leave a box; the first is larger on a miss."""
     parallel = d == 0
     inverse = 1 / np.where(parallel, 1, d)
     a, b = (lower - o) * inverse, (upper - o) * inverse
@@ -170,7 +176,7 @@ def exact_box(o, d, lower=0.0, upper=1.0):
 
 
 def all_finite(*arrays) -> str:
-    """What a row says where only finiteness is asked for."""
+    """Text of a row that tests for finite values only."""
     return "finite" if all(np.all(np.isfinite(np.asarray(a, float))) for a in arrays) else "NOT FINITE"
 
 
@@ -178,7 +184,7 @@ THIN = 1e-4
 
 
 def sheets_in_a_grid(mi):
-    """10,000 voxels along z, two of them matter: τ = 0.1, then opaque."""
+    """10,000 voxels along z, two of which are not empty: τ = 0.1, then opaque."""
     data = np.full((10000, 2, 2), 1e-8, np.float32)
     data[3000], data[7000] = 1e3, 1e9
     medium = grid(mi, data, filter_type="nearest")
@@ -205,10 +211,10 @@ def sheets_in_a_grid(mi):
 
 
 def sheets_and_steps(mi):
-    """Which share of rays meets an opaque sheet of a foreign volume, by step."""
+    """Fraction of rays that find an opaque sheet of another volume, by step length."""
     n = 4096
     z0 = mi.Float(np.linspace(0, 0.1, n, dtype=np.float32))
-    medium = Profile(lambda z: dr.select((z >= 0.5) & (z < 0.5 + THIN), 1e9, 1e-8))
+    medium = DensityProfile(lambda z: dr.select((z >= 0.5) & (z < 0.5 + THIN), 1e9, 1e-8))
     found = []
     for step in (0.5, 1, 2, 10):
         _, r = along_z(mi, medium, MarchSettings(step * THIN), z0)
@@ -223,12 +229,12 @@ def sheets_and_steps(mi):
 
 
 def jump(mi):
-    """Vacuum, then wall; the wall starts anywhere within a step."""
+    """Vacuum, then a wall that starts anywhere within a step."""
     walls = np.linspace(0.3, 0.3 + 2 * STEP, 41)
     for kind in ("constant", "linear"):
         errors = []
         for wall in walls:
-            medium = Profile(lambda z, w: dr.select(z >= w, 1e9, 1e-8), mi.Float(wall))
+            medium = DensityProfile(lambda z, w: dr.select(z >= w, 1e9, 1e-8), mi.Float(wall))
             _, r = along_z(mi, medium, MarchSettings(STEP, quadrature=kind))
             errors.append(abs(values(r.expected_depth)[0] - wall) / STEP)
         yield Row(
@@ -241,7 +247,7 @@ def jump(mi):
 
 
 def exponential(mi):
-    """σ = σ0 exp(k z), with the closed τ = σ0 (exp(k z) - 1) / k."""
+    """σ = σ0 exp(k z), with the closed form τ = σ0 (exp(k z) - 1) / k."""
     for kind in ("constant", "linear"):
         errors = np.zeros(4)
         for s0, k in ((1e-8, 1.0), (1e-3, 30.0), (50.0, -20.0), (1e3, -5.0)):
@@ -251,7 +257,7 @@ def exponential(mi):
             slope = [(np.array(exact(s0, k + h)) - np.array(exact(s0, k - h))) / (2 * h)]
             k_ = mi.Float(k)
             dr.enable_grad(k_)
-            medium = Profile(lambda z, k: s0 * dr.exp(k * z), k_)  # noqa: B023
+            medium = DensityProfile(lambda z, k: s0 * dr.exp(k * z), k_)  # noqa: B023
             _, r = along_z(mi, medium, MarchSettings(STEP, quadrature=kind, stop=1e-9))
             got = [values(r.opacity)[0], values(r.expected_depth)[0]]
             for y in (r.opacity, r.expected_depth):
@@ -321,20 +327,20 @@ def tables(mi):
 
 
 # ----------------------------------------------------------------------------
-# The slab, through the integrator with nothing set
+# The slab, through the integrator with default parameters
 # ----------------------------------------------------------------------------
 
 SIGMAS = (1e-6, 1e-3, 0.1, 1.0, 10.0, 100.0, 1e3, 1e6, 1e9)
 
 
 def slab_errors(mi, volume: str, sigma: float, ahead: float, kind: str) -> dict[str, float]:
-    """Errors of opacity and depth (of ``kind``) of a unit slab whose face lies ``ahead`` of the ray's origin, and of
+    """Errors of opacity and depth (of ``kind``) of a unit slab whose face is ``ahead`` of the ray's origin, and of
     their derivatives with respect to the density."""
     if volume == "constvolume":
         density = {"type": "constvolume", "value": float(sigma)}
     else:
         density = {"type": "gridvolume", "grid": mi.VolumeGrid(np.full((3, 3, 3), sigma, np.float32)), "raw": True}
-    # Mitsuba starts the rays of this sensor a hair in front of it.
+    # Mitsuba starts the rays of this sensor slightly in front of it.
     z = -ahead - float(mi.math.RayEpsilon)
     film = {"type": "hdrfilm", "width": 1, "height": 1, "component_format": "float32", "rfilter": {"type": "box"}}
     sensor = {
@@ -404,14 +410,14 @@ def one_step(mi):
     x = np.float32(np.logspace(-7, 6, 400))
     x64 = x.astype(float)
     y, dy = gradient(mi.Float(x), absorbed_fraction)
-    counts = x64 < 80  # beyond, exp(-x) is below what single precision holds
+    counts = x64 < 80  # beyond, exp(-x) is below the range of single precision
     reference, ends = "closed form", "1e-7 .. 1e6 a step"
     yield Row("optical depth of a step", ends, "opacity", worst(y, -np.expm1(-x64)), reference)
     yield Row("", "1e-7 .. 80", "its derivative", worst(dy[counts], np.exp(-x64[counts])), reference)
     y, dy = gradient(mi.Float(x), mean_depth_fraction)
     yield Row("", ends, "mean depth in the step", worst(y, share(x64)), reference)
     yield Row("", ends, "its derivative", worst(dy, share_slope(x64)), reference)
-    y, dy = gradient(mi.Float(x), lambda v: linear_share(v, v))
+    y, dy = gradient(mi.Float(x), lambda v: linear_mean_depth_fraction(v, v))
     yield Row(
         "", ends, "mean depth, linear rule, equal ends (absolute, in steps)", worst(y, share(x64), False), reference
     )
@@ -419,11 +425,11 @@ def one_step(mi):
     for a in (1e-6, 1e-2, 1.0, 30.0):
         for b in (0.0, 1e-3, 1.0, 100.0):
             expected = smooth(lambda z: a * z + (b - a) * z * z / 2)[1]  # noqa: B023
-            y, dy = gradient(mi.Float(a), lambda v: linear_share(v, mi.Float(b)))  # noqa: B023
+            y, dy = gradient(mi.Float(a), lambda v: linear_mean_depth_fraction(v, mi.Float(b)))  # noqa: B023
             errors.append(abs(y[0] - expected))
             slopes.append(dy[0])
     yield Row("", "ends 0 .. 100", "mean depth, linear rule (absolute, in steps)", max(errors), "float64 quadrature")
-    _, dy = gradient(mi.Float([0, 1e-30, 1, 1e30]), lambda v: linear_crossing(v, v * 0, mi.Float(1), mi.Float(0)))
+    _, dy = gradient(mi.Float([0, 1e-30, 1, 1e30]), lambda v: find_linear_crossing(v, v * 0, mi.Float(1), mi.Float(0)))
     yield Row("root at zero", "density 0 .. 1e30", "derivative of the crossing", all_finite(slopes, dy), "finite")
 
 
@@ -466,14 +472,14 @@ def million_rays(mi):
 def all_opacities(mi):
     x = np.logspace(-6, 1.5, 60).astype(np.float32)
     sigma = mi.Float(x)
-    medium = Profile(lambda z, s: s + 0 * z, sigma)
+    medium = DensityProfile(lambda z, s: s + 0 * z, sigma)
     settings = MarchSettings(STEP, stop=1e-9)
     ray, r = along_z(mi, medium, settings, dr.zeros(mi.Float, len(x)))
     x64 = x.astype(float)
     alpha = -np.expm1(-x64)
     truth = {"expected": share(x64), "median": -np.log1p(-alpha / 2) / x64, "refined": -np.log1p(-alpha / 2) / x64}
     for kind, expected in truth.items():
-        got = surface_depth(kind, r, medium, ray, mi.Float(0), mi.Float(1), mi.Mask(True), settings)
+        got = find_surface_depth(kind, r, medium, ray, mi.Float(0), mi.Float(1), mi.Mask(True), settings)
         yield Row(
             "depth at any opacity" if kind == "expected" else "",
             "1e-6 .. 1" if kind == "expected" else "",

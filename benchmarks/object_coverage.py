@@ -1,14 +1,14 @@
-"""How often 95 % intervals of attention on things hold the truth, and how often equal groups are found to differ.
+"""Coverage of 95 % intervals of AOI statistics, and the rate at which equal groups are found to differ.
 
-    python benchmarks/object_coverage.py shares        # intervals of shares of people, exactly
-    python benchmarks/object_coverage.py ratios        # ways to make intervals of ratios of sums over people
+    python benchmarks/object_coverage.py shares        # intervals of fractions of participants, exact
+    python benchmarks/object_coverage.py ratios        # methods for intervals of ratios of sums over participants
     python benchmarks/object_coverage.py numbers       # each number of `nerg stats` as it is
-    python benchmarks/object_coverage.py few           # what may hold numbers that few people decide
-    python benchmarks/object_coverage.py differences   # differences of two groups of the same people
+    python benchmarks/object_coverage.py few           # candidates for numbers that depend on few participants
+    python benchmarks/object_coverage.py differences   # differences of two groups of the same participants
 
-The population are the sums of 8,000 visits of the demo store's shoppers: 200 walks, each looked along 40 times anew by
-the store's law. Its numbers are the truth, and known exactly; a data set is so many visits, drawn with replacement.
-Things are the store's 30 goods, which nearly all look at, and 15 labels of 12 cm on them, which few do.
+The population consists of the sums of 8,000 visits of the demo store's shoppers: 200 walks, each with 40 independent
+draws of gaze from the store's law. Its numbers are the exact truth; a data set is a sample of visits with replacement.
+AOIs are the store's 30 goods, which almost everybody looks at, and 15 labels of 12 cm on them, which few look at.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pathlib import Path
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 from nerg_mi.statistics.estimates import adjust_p_values
-from nerg_mi.statistics.tables import MEASURES_BY_NAME, COMPARED_MEASURES, MEASURES
+from nerg_mi.statistics.tables import COMPARED_MEASURES, MEASURES, MEASURES_BY_NAME
 from object_statistics import Walks, counting_of, made_store
 
 import numpy as np
@@ -28,12 +28,12 @@ from scipy import stats
 WALKS, VISITS = 200, 40
 RESAMPLES = 599
 DRAWN = 50
-"""Fewer data sets than so many with an interval say nothing of a thing."""
+"""Minimum number of data sets with an interval for a statement about an AOI."""
 
 
 class Population:
-    """Numerators and denominators (N, K) of each measure, its ``truth`` (K,), and which things are ``common``: looked
-    at by half of the people or more."""
+    """Numerators and denominators (N, K) of each measure, its ``truth`` (K,), and which AOIs are ``common``: looked at
+    by at least half of the participants."""
 
     def __init__(self, file: Path | None) -> None:
         if file is not None and file.is_file():
@@ -137,7 +137,7 @@ def _share_intervals() -> dict:
 
 
 def ratio_intervals(x: np.ndarray, y: np.ndarray, seed: int) -> dict:
-    """Ends of the intervals (K,) of Σ x / Σ y in several ways."""
+    """Ends of the intervals (K,) of Σ x / Σ y by several methods."""
     from nerg_mi.statistics.estimates import estimate_ratios
 
     n, count = (y > 0).sum(axis=0), len(x)
@@ -183,7 +183,7 @@ def _bca(star: np.ndarray, m: np.ndarray, without: np.ndarray) -> tuple[np.ndarr
 
 
 class Held:
-    """How often intervals held the ``truth`` (K,), thing by thing."""
+    """Coverage of the ``truth`` (K,) by intervals, per AOI."""
 
     def __init__(self, truth: np.ndarray, common: np.ndarray, most: float):
         self.truth, self.common, self.most = truth, common, most
@@ -195,7 +195,7 @@ class Held:
         self.rows.append(np.stack([inside, known, np.where(known, (high - low) / self.truth, np.nan)]))
 
     def cells(self, common: bool) -> str:
-        """Mean, least, median width and how many are without, of things that are common or rare."""
+        """Mean, minimum, median width and number of missing intervals, for common and rare AOIs."""
         inside, known, width = (v[:, self.common == common] for v in np.moveaxis(np.array(self.rows, float), 1, 0))
         some = known.sum(axis=0) >= DRAWN
         if not some.any():
@@ -232,7 +232,7 @@ def compare(population: Population, sets: int, people: tuple[int, ...], names: t
 
 
 def few_intervals(x: np.ndarray, y: np.ndarray, seed: int) -> dict:
-    """Ends of the intervals (K,) with other factors of the error where few people decide a number."""
+    """Ends of the intervals (K,) with other factors of the error where few participants determine a number."""
     from nerg_mi.statistics import estimates
     from nerg_mi.statistics.estimates import estimate_ratios
 
@@ -267,14 +267,18 @@ def numbers(population: Population, sets: int, people: tuple[int, ...]) -> None:
             who, seed = rng.integers(0, population.count, n), int(rng.integers(1 << 30))
             for m in MEASURES:
                 x, y = population.draw(m.name, who)
-                e = estimate_proportions(x, y) if m.is_proportion else estimate_ratios(x, y, resamples=RESAMPLES, seed=seed, upper_limit=m.upper_limit)
+                e = (
+                    estimate_proportions(x, y)
+                    if m.is_proportion
+                    else estimate_ratios(x, y, resamples=RESAMPLES, seed=seed, upper_limit=m.upper_limit)
+                )
                 found[m.name].add(e.low, e.high, np.isfinite(e.low))
         for name, held in found.items():
             print(f"| {name} | {n} {held.cells(True)}{held.cells(False)}|", flush=True)
 
 
 def differences(population: Population, sets: int, pairs: tuple[tuple[int, int], ...]) -> None:
-    """How often two groups of one population are found to differ, p <= 0.05, and how often after the adjustment."""
+    """Rate at which two groups of one population are found to differ, p <= 0.05, before and after the adjustment."""
     from nerg_mi.statistics.estimates import estimate_proportion_differences, estimate_ratio_differences
 
     print("\n| people | number | p <= 0.05 | most of a thing | rare | most | a set has a false discovery |")

@@ -1,10 +1,10 @@
-"""Numbers of attention on things against what is true: errors (coverage of intervals: object_coverage.py).
+"""AOI statistics against the truth: errors (coverage of intervals: object_coverage.py).
 
     python benchmarks/object_statistics.py errors      # the store's law and brute-force ray casts
     python benchmarks/object_statistics.py shop        # the rays of docs/tutorials/store.md, as shop.npz in this folder
 
-The shoppers' walks are those of the demo store (`nerg_mi.scenes.store.shoppers`), each tracked once in 0.8 s (in
-the shop five times a second); where they look is drawn from the store's law.
+Walks are those of the demo store's shoppers (`nerg_mi.scenes.store.shoppers`), each tracked every 0.8 s (five times a
+second for the shop); gaze directions are drawn from the store's law.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and
 
 import numpy as np
 
-SENSORS = 4  # every so manieth sample of a walk
+SENSORS = 4  # subsampling factor of a walk
 STEP = 0.8
 
 
@@ -23,7 +23,7 @@ def made_store():
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
-    from nerg_mi.aoi.scene import shapes_by_id, load_scene_file, make_aois
+    from nerg_mi.aoi.scene import load_scene_file, make_aois, shapes_by_id
     from nerg_mi.formats.areas import read_areas
     from nerg_mi.workflows.demo import find_store_scene
 
@@ -35,7 +35,7 @@ def made_store():
 
 def counting_of(around, areas, things, seen: bool = True):
     from nerg_mi.aoi.measured import AoiContext
-    from nerg_mi.statistics.shares import VisibilityCache, SamplePoints
+    from nerg_mi.statistics.shares import SamplePoints, VisibilityCache
     from nerg_mi.statistics.visits import VisitRules
 
     in_view = VisibilityCache(SamplePoints.sample(things, 48), around.depth, 0.1, 0.03) if seen else None
@@ -69,7 +69,7 @@ class Walks:
         self.lobes = self.law.lobes(self.origin)
 
     def draw(self, rows: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Directions at the positions ``rows``: the law's own sampling, of a mixture that is known already."""
+        """Directions at the positions ``rows``: the law's own sampling, from a precomputed mixture."""
         from nerg_mi.scenes.store.attention_law import Lobes
 
         lobes = self.lobes
@@ -81,7 +81,7 @@ class Walks:
             del self.law.lobes
 
     def rays(self, who: np.ndarray, rng: np.random.Generator):
-        """Rays of these walks, each somebody's."""
+        """Rays of these walks, each of one participant."""
         from nerg_mi.rays.rays import Rays
 
         rows = np.concatenate([np.arange(self.start[w], self.start[w + 1]) for w in who])
@@ -107,7 +107,7 @@ def errors() -> None:
     rng = np.random.default_rng(1)
     rays = walks.rays(np.arange(12), rng)
     people = Participants.from_sums(count_block(rays, counting), ALL, True)
-    # Brute force: a ray at a time to the twin, every box by its six planes, sums by plain loops.
+    # Brute force: one ray at a time against the twin, each box by its six planes, sums by plain loops.
     depth = twin.cast_rays(rays.origin, rays.direction)
     dwell = np.zeros((12, len(areas.names)))
     reached = np.zeros_like(dwell)
@@ -127,7 +127,7 @@ def errors() -> None:
     largest = np.abs(people.dwell_time - dwell).max()
     print(f"| dwell [s], each person and thing | plain loops, ray casts to the twin | {largest:.2g} |")
     print(f"| reach, each person and thing | the same | {np.abs(people.hit_probability - reached).max():.2g} |")
-    # The law's own share, by quadrature over the sphere at some positions, beside the field's and a large draw.
+    # Fractions of the law, by quadrature over the sphere at some positions, next to the field's and a large sample.
     rows = np.linspace(0, len(walks.origin) - 1, 160).round().astype(int)
     d = fibonacci_directions(8192)
     eyes = walks.origin[rows]
@@ -142,7 +142,7 @@ def errors() -> None:
         for k, (at, distance) in enumerate(zip(found.rows, found.distance)):
             law[a : a + 40, k] = np.bincount(at // len(d), weights=weight[at], minlength=40)
             far[a : a + 40, k] = np.bincount(at // len(d), weights=weight[at] * distance, minlength=40)
-    # Many draws at the same positions, through the very counting of rays.
+    # Many draws at the same positions, through the same counting of rays.
     draws = 400
     many = np.tile(rows, draws)
     directions = walks.draw(many, rng)
@@ -181,7 +181,7 @@ def errors() -> None:
     )
     off = np.abs(told.distance.sum(axis=0) / told.share.sum(axis=0) - mean)
     print(f"| mean distance [m] by the field | the same | {off.max():.2g} (median {np.median(off):.2g}) |")
-    # What could be seen: exact ray casts from where people stood, against cells of 10 cm.
+    # Visibility: exact ray casts from the participants' positions, against cells of 10 cm.
     some = np.linspace(0, len(rays) - 1, 1500).round().astype(int)
     chosen = rays.select(some)
     seen = counting.visibility(chosen)

@@ -1,9 +1,9 @@
-"""What each part of a picture of the store costs: operations traced, evaluations made, seconds.
+"""Cost of each part of an image of the store: traced operations, evaluations, seconds.
 
     python benchmarks/operation_counts.py [--width 240] [--runs 5]
 
-Prints the table of docs/explanation/performance.md and writes it as CSV. Counts do not depend on the machine; processor seconds
-are medians of several runs, and only their ratios mean anything.
+Prints the table of docs/explanation/performance.md and writes it as CSV. Counts do not depend on the machine; CPU
+seconds are medians of several runs, and only their ratios are meaningful.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def look_at(origin):
 
 
 def configurations() -> dict[str, dict]:
-    """Name of each configuration and what it adds to a bare integrator."""
+    """Name of each configuration and its additions to a bare integrator."""
     there = {"observer": {"type": "perspective", "to_world": look_at(OBSERVER)}}
     here = {"observer": {"type": "perspective", "to_world": look_at(CAMERA)}}
     dark = {"radiance": False}
@@ -81,7 +81,7 @@ def scene(width: int, options: dict):
 
 
 def evaluations(width: int, options: dict) -> list[float]:
-    """Mean density, colour and gaze evaluations a pixel, counted in a render of their own."""
+    """Mean density, colour and gaze evaluations per pixel, counted in a separate rendering."""
     asked = [a for a in options["aovs"].split(",") if a]
     if not asked:
         return [0.0, 0.0, 0.0]
@@ -118,7 +118,11 @@ def main() -> None:
         [name, f"{operations:,}", f"{density:.1f}", f"{color:.1f}", f"{gaze:.2f}", f"{seconds:.3f}"]
         for name, operations, density, color, gaze, seconds in rows
     ]
-    print(format_markdown_table(["what", "operations traced", "density evals", "colour evals", "gaze evals", "CPU s"], shown))
+    print(
+        format_markdown_table(
+            ["what", "operations traced", "density evals", "colour evals", "gaze evals", "CPU s"], shown
+        )
+    )
     names = ("what", "operations", "density_evals", "color_evals", "gaze_evals", "seconds")
     write_rows(Path("out/benchmarks/operation_counts.csv"), [dict(zip(names, row)) for row in rows])
 

@@ -1,13 +1,14 @@
-"""What the paper claims of its variants, over people, positions and seeds: their order, losses, features, beginnings.
+"""The paper's claims about its variants, over participants, positions and seeds: their order, losses, features,
+initialisation.
 
     python benchmarks/paper_claims.py [--only supermarket,store] [--folds 4] [--steps 800] [--recipes default,paper]
 
-An ablation (`nerg ablate`) a fold, each with other people (half), other positions (60 in three zones) and another seed
-held out or begun with. A table a place has a row a recipe and variant: means over folds of the paper's loss,
-KLD + (1 - CC) + MAE, on positions of the training and by how much it rises to held-out ones, and of held-out KLD and
-CC; `less` is a variant less the product of emit and capture of the same recipe, fold by fold, with 95 % of Student's t.
-The last table has the CC of all places, a row a place and recipe: of the product, of the variants less it, and the
-median of the seconds that the product was trained for. Rows are kept, and trained once.
+One ablation (`nerg ablate`) per fold, with other participants (half), other positions (60 in three zones) and another
+seed held out. The table of a scene has one row per recipe and variant: means over folds of the paper's loss, KLD + (1 -
+CC) + MAE, on training positions and its increase on held-out ones, and of held-out KLD and CC; `less` is a variant
+minus the product of emit and capture of the same recipe, fold by fold, with 95 % of Student's t. The last table has the
+CC of all scenes, one row per scene and recipe: of the product, of the variants minus it, and the median training time
+of the product in seconds. Rows are cached, and trained once.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from timing import print_table, write_rows
 import numpy as np
 
 WHOLE = "emit_capture"
-# Of the last table; the paper's recipe alone has another loss.
+# Of the last table; only the paper's recipe has another loss.
 ORDER = ("emit", "capture", "loss code")
 
 
@@ -66,7 +67,7 @@ def main(argv=None) -> None:
 
 
 def summarise(rows: list[dict]) -> list[list[str]]:
-    """Means over folds of one place, and by how much they are above the product's."""
+    """Means over folds of one scene, and their difference from the product."""
     out = []
     for recipe, variant in dict.fromkeys((r["recipe"], r["variant"]) for r in rows):
         own = [r for r in rows if (r["recipe"], r["variant"]) == (recipe, variant)]
@@ -80,7 +81,7 @@ def summarise(rows: list[dict]) -> list[list[str]]:
 
 
 def order(rows: list[dict]) -> list[list[str]]:
-    """CC of the product in each place, by how much the variants of `ORDER` are above it, and seconds of training."""
+    """CC of the product in each scene, the differences of the variants of `ORDER` from it, and training seconds."""
     out = []
     for place, recipe in dict.fromkeys((r["place"], r["recipe"]) for r in rows):
         own = [r for r in rows if r["place"] == place]
@@ -93,14 +94,14 @@ def order(rows: list[dict]) -> list[list[str]]:
 
 
 def less(rows: list[dict], recipe: str, variant: str, key: str) -> list[float]:
-    """The score ``key`` of a variant less that of the product, in each fold that has both."""
+    """The score ``key`` of a variant minus that of the product, in each fold with both."""
     found = {(r["variant"], r["fold"]): r[key] for r in rows if r["recipe"] == recipe}
     folds = sorted({fold for name, fold in found if name == variant and (WHOLE, fold) in found})
     return [found[variant, fold] - found[WHOLE, fold] for fold in folds]
 
 
 def told(values: list[float]) -> str:
-    """Mean of ``values`` with its interval; nothing of none."""
+    """Mean of ``values`` with its interval; empty without values."""
     return f"{np.mean(values):+.3f} ± {interval(values):.3f}" if values else ""
 
 

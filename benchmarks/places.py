@@ -1,25 +1,25 @@
-"""One protocol for gaze in many places: where is a field better than what knows less, and where is it worse?
+"""One protocol for gaze in several scenes: where is a field better than simpler baselines, and where is it worse?
 
     python benchmarks/places.py [--only room,office] [--folds 4] [--first 0] [--mix-folds N] [--mix-kappa K]
         [--recipe default] [--variant VARIANT] [--no-surfaces] [--against FOLDS.csv] [--out out/benchmarks/places]
     python benchmarks/places.py --uncertainty --folds 3 --zones 6 [--ensemble 5] [--out out/benchmarks/uncertainty]
 
-Real people in a supermarket (surfaces from their hit points) and in three scenes of EyeNavGS (no geometry), the demo
-store's shoppers among its field, and four generated places with laws of their own (`generated_places.py`), among their
-walls. In each fold half of the people train, and the others are scored at 60 positions in three zones that nobody was
-trained on within 2R of. Beside the field: uniform, position-blind, nearest probes and nearest rays, and how well one
-half of those who are scored foretells the other. `rank` is among the methods that are no split half; `less` is the
-field less the best of the others, fold by fold, with 95 % of Student's t; `way` is how far the field goes from the
-blind density to the split half in CC, where that is better than blind. `--mix-folds 0` is a field without a chosen
-share of the blind density, `--no-surfaces` one that is told of no surfaces, where they are known, too. `--against`
-prints the field less that of another run, fold by fold, from its folds.csv.
+Recordings of a supermarket (surfaces from hit points) and of three scenes of EyeNavGS (no geometry), the demo store's
+shoppers in its field, and four generated scenes with their own laws of attention (`generated_places.py`) and walls. In
+each fold half of the participants train the field, and the others are scored at 60 positions in three zones from which
+training data is excluded within 2R. Baselines: uniform, position-independent, nearest probes and nearest rays, and the
+split-half agreement of the held-out participants. `rank` is among the methods other than the split half; `less` is the
+field minus the best baseline, fold by fold, with 95 % of Student's t; `way` is the field's position between the
+position-independent prior and the split half in CC, where the latter is better. `--mix-folds 0` trains without a
+selected weight of the prior, `--no-surfaces` without geometry even if it is known. `--against` prints the field minus
+that of another run, fold by fold, from its folds.csv.
 
-`--uncertainty` asks in the same folds whether a field knows what it does not know; more zones are better then, since
-positions of a zone are neighbours. A row a place: Spearman's rho of little support with the error, at new positions and
-at any where held-out people stood, with 95 % of resamples of zones; the mean error of all and of the surest half; and
-the share of held-out rays in the smallest regions that are said to hold 80 % of the gaze, and in those that should hold
-it by what the training held out. With `--ensemble` fields are means of so many, and the spread of these, which the AOV
-`gaze_std` shows, is ranked beside support.
+`--uncertainty` evaluates in the same folds whether a field estimates its own error; use more zones then, since
+positions of a zone are neighbours. One row per scene: Spearman's rho of low support with the error, at new positions
+and at all held-out ones, with 95 % of resampled zones; the mean error of all positions and of the most certain half;
+and the fraction of held-out rays in the smallest regions that contain 80 % of the gaze, and in those calibrated on
+held-out training data. With `--ensemble` fields are means of several members, and their standard deviation (AOV
+`gaze_std`) is ranked next to support.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ from timing import print_table, write_rows
 ROOT = Path(__file__).resolve().parents[1]
 
 Make = Callable[[Path], tuple[Path, dict]]
-"""Writes the rays of a place into a folder; gives their file and where the place is: options of a fold."""
+"""Writes the rays of a scene into a folder; returns their file and the location of the geometry: options of a fold."""
 
 
 def place_parser(what: str, out: str, folds: int) -> argparse.ArgumentParser:
-    """Options of a benchmark of places: which, in how many ``folds``, and where to (below out/benchmarks)."""
+    """Options of the benchmark: scenes, number of ``folds``, and the output folder (below out/benchmarks)."""
     parser = argparse.ArgumentParser(description=what.splitlines()[0])
     data = Path(os.environ.get("NERG_DATA", ROOT.parent / "shared" / "data"))
     parser.add_argument("--data", type=Path, default=data, help="folder of vr_supermarket and eyenavgs")
@@ -51,7 +51,7 @@ def place_parser(what: str, out: str, folds: int) -> argparse.ArgumentParser:
 
 
 def parse(parser: argparse.ArgumentParser, argv=None) -> argparse.Namespace:
-    """The options that were given; the output's folder is there then."""
+    """The parsed options; creates the output folder."""
     args = parser.parse_args(argv)
     args.out = args.out.resolve()
     args.out.mkdir(parents=True, exist_ok=True)
@@ -59,7 +59,7 @@ def parse(parser: argparse.ArgumentParser, argv=None) -> argparse.Namespace:
 
 
 def asked_places(args: argparse.Namespace) -> dict[str, Make]:
-    """What makes each of the places that are asked for, by their names. Raises ``SystemExit`` for others."""
+    """The generators of the requested scenes, by name. Raises ``SystemExit`` for unknown ones."""
     known = makers(args.data)
     names = args.only.split(",") if args.only else list(known)
     for name in names:
@@ -69,14 +69,14 @@ def asked_places(args: argparse.Namespace) -> dict[str, Make]:
 
 
 def write_place(name: str, make: Make, args: argparse.Namespace) -> tuple[Path, Path, dict]:
-    """``(folder, rays, where)`` of a place, below the output's folder."""
+    """``(folder, rays, where)`` of a scene, below the output folder."""
     folder = args.out / name
     folder.mkdir(exist_ok=True)
     return folder, *make(folder)
 
 
 def makers(data: Path) -> dict[str, Make]:
-    """By name, what writes the rays of a place into a folder and says where it is: options of a fold."""
+    """By name, functions that write the rays of a scene into a folder and return its location: options of a fold."""
     from generated_places import PLACES
 
     out: dict[str, Make] = {}
@@ -93,7 +93,7 @@ def makers(data: Path) -> dict[str, Make]:
 
 
 def recorded(files: list[Path], reader: str, folder: Path) -> Path:
-    """Rays of recordings; a reader leaves out those whose gaze is frozen, and says so."""
+    """Rays of recordings; readers skip recordings with frozen gaze and report them."""
     from nerg_mi.workflows.rays import import_rays
     from nerg_mi.workflows.rays_commands import RaysImportOptions
 
@@ -103,7 +103,7 @@ def recorded(files: list[Path], reader: str, folder: Path) -> Path:
 
 
 def store(folder: Path) -> tuple[Path, dict]:
-    """The demo store's shoppers among its radiance field."""
+    """The demo store's shoppers in its radiance field."""
     from nerg_mi.rays.readers.skeleton import SkeletonOptions
     from nerg_mi.scenes.store import make
     from nerg_mi.workflows import demo
@@ -165,7 +165,7 @@ def main(argv=None) -> None:
 
 
 def evaluate(name: str, make: Make, args: argparse.Namespace):
-    """What `nerg eval folds` finds in a place."""
+    """The results of `nerg eval folds` for a scene."""
     from nerg_mi.cli.progress import TerminalReporter
     from nerg_mi.workflows.base import select_backend
     from nerg_mi.workflows.evaluate import evaluate_folds
@@ -191,7 +191,7 @@ def evaluate(name: str, make: Make, args: argparse.Namespace):
 
 
 def summarise(each: list[dict]) -> list[dict]:
-    """A row a place: the field's scores, those of the best of the others, and how they differ."""
+    """One row per scene: the field's scores, those of the best baseline, and their difference."""
     import numpy as np
 
     out = []
@@ -210,7 +210,8 @@ def summarise(each: list[dict]) -> list[dict]:
             row |= {f"{s} rank": order.index(OURS) + 1, f"{s} less": less.mean(), f"{s} reach": reach}
             half = [r[s] for r in own if r["method"] == HALF]
             row[f"{s} half"] = float(np.mean(half)) if half else np.nan
-        # With few people one half says less of the other than the blind density does: there is no way to go.
+        # With few participants one half predicts the other worse than the position-independent prior does: the fraction
+        # is undefined.
         further = row["CC half"] - row["CC blind"]
         row["way"] = (row["CC"] - row["CC blind"]) / further if further > 0 else np.nan
         out.append(row)
@@ -218,7 +219,7 @@ def summarise(each: list[dict]) -> list[dict]:
 
 
 def interval(values) -> float:
-    """How far 95 % of Student's t reaches either side of the mean of ``values`` (F,); NaN of one alone."""
+    """Half width of 95 % of Student's t for the mean of ``values`` (F,); NaN for a single one."""
     import numpy as np
     from scipy.stats import t
 
@@ -227,8 +228,8 @@ def interval(values) -> float:
 
 
 def show_change(each: list[dict], before: Path) -> None:
-    """Print by how much the field of ``each`` is above that of the run whose folds.csv is ``before``, place by place in
-    the folds that both have."""
+    """Print the field of ``each`` minus that of the run with the folds.csv ``before``, scene by scene in shared
+    folds."""
     import csv
 
     import numpy as np
@@ -265,7 +266,7 @@ def show(rows: list[dict]) -> None:
 
 
 def uncertainty(name: str, result) -> list[dict]:
-    """A row a signal, population ("both": new positions) and error of one place."""
+    """One row per signal, population ("both": new positions) and error of one scene."""
     held = {(r["split"], r["method"]): r["80%"] for r in result.calibration}
     regions = {"of 80%": held["both", OURS], "of 80%, calibrated": held.get(("both", f"{OURS}, calibrated"), nan)}
     keys = ("signal", "split", "error", "positions", "rho", "100%", "50%")

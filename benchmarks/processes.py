@@ -1,17 +1,18 @@
-"""What is measured in processes of their own, for `bench.py`: the memory of a frame, and how long it takes to start.
+"""Measurements in separate processes, for `bench.py`: the memory of a frame, and start-up times.
 
-    python benchmarks/processes.py memory [--sizes 640x360,1280x720,1920x1080] [--update docs/explanation/performance.md]
+    python benchmarks/processes.py memory [--sizes 640x360,1280x720,1920x1080] [--update
+    docs/explanation/performance.md]
     python benchmarks/processes.py start [--runs 5] [--update docs/explanation/performance.md]
 
-Memory: the demo store, colour, depth and gaze of an observer who is not the camera, one sample a pixel. Resident: the
-most memory of the process (high-water mark of its resident set) beyond what it held with the package imported and the
-variant chosen; the field, the compiled kernels and the picture are in it. Arrays: the most that Dr.Jit held in arrays.
-In one piece by ``mi.render``, and by `nerg render`, which renders in strips. Kernels come from the cache: a first
-process, which is not counted, compiles them.
+Memory: the demo store, colour, depth and gaze of an observer who is not at the camera, one sample per pixel. Resident:
+the peak memory of the process (high-water mark of its resident set) beyond its size with the package imported and the
+variant set; it includes the field, the compiled kernels and the image. Arrays: the maximum that Dr.Jit held in arrays.
+In one piece by ``mi.render``, and in strips by `nerg render`. Kernels come from the cache: a first process, which does
+not count, compiles them.
 
-Start: until something is there, imports, the command's help, the first picture, the demo, in turns; medians of
-wall-clock seconds with their quartiles, and seconds of the processor. Files are in the system's memory after the first
-turn, which does not count. "Cold" has no kernels compiled, "warm" those of the runs before.
+Start: time until imports, the command's help, the first image and the demo are done, alternating; medians of wall-clock
+seconds with quartiles, and CPU seconds. Files are in the system's cache after the first round, which does not count.
+"Cold" has no compiled kernels, "warm" those of the previous runs.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ def status(name: str) -> float:
 
 
 def peak(way: str, width: int, height: int) -> dict[str, float]:
-    """Of one frame in this process."""
+    """Memory of one frame in this process."""
     import drjit as dr
     import mitsuba as mi
     import numpy as np
@@ -61,7 +62,7 @@ def peak(way: str, width: int, height: int) -> dict[str, float]:
 
     dr.eval(mi.Float([0.0, 1.0]) + 1)
     dr.sync_thread()
-    # What was held for a moment before counts no more.
+    # Resets the high-water mark.
     Path("/proc/self/clear_refs").write_text("5")
     before = status("VmRSS")
     values = {"width": str(width), "height": str(height), "spp": "1", "aovs": "depth,gaze"}
@@ -90,7 +91,7 @@ def memory(sizes=SIZES) -> list[list[str]]:
 
 
 def works(folder: Path) -> dict[str, tuple[list[str], bool]]:
-    """What is run, and whether it begins with no kernels compiled, by name; files are written into ``folder``."""
+    """Commands by name, and whether they start without compiled kernels; files are written into ``folder``."""
     picture = [*COMMAND, "render", str(find_store_scene()), "-o", str(folder / "a.png"), "-m", "llvm_ad_rgb"]
     demo = [*COMMAND, "demo", "-o", str(folder / "demo"), "-m", "llvm_ad_rgb"]
     return {
@@ -104,8 +105,8 @@ def works(folder: Path) -> dict[str, tuple[list[str], bool]]:
 
 
 def seconds_of(command: list[str], kernels: Path) -> tuple[float, float]:
-    """Wall-clock and processor seconds of ``command``, which keeps compiled ``kernels``. Raises
-    ``CalledProcessError`` where it fails."""
+    """Wall-clock and CPU seconds of ``command``, which caches compiled ``kernels``. Raises ``CalledProcessError`` if it
+    fails."""
     before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     environment = {**os.environ, "DRJIT_CACHE_DIR": str(kernels)}
     subprocess.run(command, env=environment, check=True, capture_output=True)

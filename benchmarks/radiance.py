@@ -1,28 +1,28 @@
-"""Radiance fields trained on photos: PSNR, SSIM and depth of views that were held out, rendered by the integrator.
+"""Radiance fields trained on photos: PSNR, SSIM and depth of held-out views, rendered by the integrator.
 
-    python benchmarks/radiance.py fox [--minutes 1,2,4,7,10] [--width 135] [--deferred] [--validate] [--set lr_hold_fraction=0.5]
-    python -m nerg_mi.scenes.store.make --stage views          # once: pictures of the store, rendered from the twin
+    python benchmarks/radiance.py fox [--minutes 1,2,4,7,10] [--width 135] [--deferred] [--validate] [--set hold=0.5]
+    python -m nerg_mi.scenes.store.make --stage views          # once: images of the store, rendered from the twin
     python benchmarks/radiance.py store [--minutes 10] [--size medium] [--only images|depth]
-    python -m nerg_mi.scenes.tabletop.make                     # once: photos, rendered from a place made of a seed
+    python -m nerg_mi.scenes.tabletop.make                     # once: photos, rendered from a generated scene
     python benchmarks/radiance.py tabletop [--minutes 4] [--bounded]
 
-fox: real photos, every 8th held out. One training of the last of the ``--minutes``, with the learning rate's schedule
-over all of it; at each of them the weights so far are written, the clock stopping, and scored as `nerg eval radiance`
-does, after training. A row for a shorter time is thus what a longer run has come to, not what a run of that length ends
-with. "fitted" is the PSNR of right halves, their colours fitted on left ones, since nobody knows the exposure of a
-photo that was held out. ``--data`` takes another posed image set.
+fox: real photos, every 8th held out. One training for the last of the ``--minutes``, with its learning-rate schedule
+over the whole time; at each of them the current weights are written, with the clock stopped, and scored like `nerg eval
+radiance` after training. A row for a shorter time is therefore an intermediate state of a longer run, not the result of
+a run of that length. "fitted" is the PSNR of right halves after a colour correction fitted on left ones, since the
+exposure of held-out photos is unknown. ``--data`` uses another posed image set.
 
-store: a room seen from inside, from its pictures alone and with their depth; depth and the opacity of the walls are
+store: a room seen from inside, from its images alone and with their depth; depth and the opacity of the walls are
 compared with exact ray casts to the twin.
 
-tabletop: an unbounded capture, photos around a table in a room with a view, at the defaults of `nerg train radiance`.
-The photos are read as a user's are: COLMAP's model, every 8th held out, the box found by its points. Depth is compared
-with exact ray casts. "near": what lies within 1.5 m of the object; "far": what is farther than 4 m from the camera,
-without the sky; "beyond": what lies outside of the field's box, or of the core of one whose surroundings are
-contracted, the sky too. ``--bounded``: as if nothing were to be seen beyond that box.
+tabletop: an unbounded scene, photos around a table in a room with a view, with the defaults of `nerg train radiance`.
+The photos are read like a user's: COLMAP's model, every 8th held out, the box from its points. Depth is compared with
+exact ray casts. "near": within 1.5 m of the object; "far": more than 4 m from the camera, without the sky; "beyond":
+outside the field's box, or the core of a contracted one, with the sky. ``--bounded``: as if nothing were visible beyond
+that box.
 
-``--validate`` never opens the held-out views: every 8th of the *training* views takes their place; choices are made
-with it. Each writes a CSV beside the printed table.
+``--validate`` never reads the held-out views: every 8th of the *training* views replaces them, for choosing settings.
+Each subcommand writes a CSV next to the printed table.
 """
 
 from __future__ import annotations
@@ -38,20 +38,20 @@ import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and
 
 import numpy as np
 
-# BLAS threads wait in a busy loop, in the way of the others.
+# BLAS threads spin while they wait, and slow down the others.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 ROOT = Path(__file__).resolve().parents[1]
 FOX = Path(os.environ.get("NERG_DATA", ROOT.parent / "shared" / "data")) / "fox"
 NEAR, FAR = 1.5, 4.0
-"""Metres: from the object's middle at most, and from the camera at least."""
+"""Metres: maximum distance from the object's centre, and minimum distance from the camera."""
 OFF = 0.1
-"""Depth that errs by a larger share is off."""
+"""Relative error above which a depth counts as wrong."""
 SCORES = ("minutes", "steps", "ms a step", "PSNR, dB", "fitted, dB", "SSIM")
 
 
 def open_views(folder: Path, args: argparse.Namespace, width: int | None = None):
-    """The data set of ``folder``; with ``--validate`` every 8th training view replaces those that are held out."""
+    """The data set of ``folder``; with ``--validate`` every 8th training view replaces the held-out ones."""
     from nerg_mi.photos.dataset import open_dataset
 
     if not folder.exists():
@@ -64,8 +64,8 @@ def open_views(folder: Path, args: argparse.Namespace, width: int | None = None)
 
 
 def fields(data, stops: list[float], args: argparse.Namespace, name: str, depth: bool, deferred=False) -> Iterator:
-    """Trains once; ``(trainer, path, row)`` after each of the minutes ``stops``, with the field so far in a file that
-    begins with ``name``."""
+    """Train once; yields ``(trainer, path, row)`` after each of the minutes ``stops``, with the current field in a file
+    whose name starts with ``name``."""
     from nerg_mi.formats.fields import save_radiance
     from nerg_mi.train.radiance_run import warm_up
     from nerg_mi.train.radiance_settings import RadianceSettings, make_radiance_config
@@ -88,14 +88,14 @@ def fields(data, stops: list[float], args: argparse.Namespace, name: str, depth:
         save_radiance(trainer.make_field(), path, {"minutes": stop, "settings": settings.to_dict()})
         row = {"minutes": stop, "steps": trainer.steps, "ms a step": 1e3 * seconds / trainer.steps}
         yield trainer, path, row | {"load": os.getloadavg()[0]}
-        # What was spent on looking is no training.
+        # Evaluation does not count as training time.
         trainer.restore(seconds, trainer.hard_pixels)
     speed = trainer.clock.summary()
     print(f"{speed['evaluations_a_second']:.3g} field evaluations a second; step in ms: {speed['step_ms']}")
 
 
 def scored(path: Path, held_out: list, spp: int):
-    """Scores of a field, and the columns of `SCORES` that come from them."""
+    """Scores of a field, and the columns of `SCORES` derived from them."""
     from nerg_mi.evaluation.metrics import score_views
 
     scores = score_views(path, held_out, spp, path.with_suffix(""))
@@ -104,13 +104,13 @@ def scored(path: Path, held_out: list, spp: int):
 
 
 def cells(row: dict) -> list[str]:
-    """Of the columns of `SCORES`."""
+    """The columns of `SCORES`."""
     formats = ("g", ",", ".1f", ".2f", ".2f", ".3f")
     return [f"{row[key]:{format_}}" for key, format_ in zip(SCORES, formats)]
 
 
 def fox(args: argparse.Namespace) -> tuple[str, list[str], list[list[str]], list[dict]]:
-    """Title, head and cells of the table, and the rows of the CSV."""
+    """Title, header and cells of the table, and the rows of the CSV."""
     from nerg_mi.train.radiance_run import evaluate_views
 
     data = open_views(args.data, args, args.width)
@@ -131,7 +131,11 @@ def store(args: argparse.Namespace) -> tuple[str, list[str], list[list[str]], li
             scores, columns = scored(path, data.held_out, args.spp)
             depth = scores.depth
             row |= {"from": source, **columns, "depth_median": depth.median, "depth_mean": depth.mean}
-            row |= {"depth_off": depth.outlier_fraction, "opacity": depth.opacity, "translucent": depth.translucent_fraction}
+            row |= {
+                "depth_off": depth.outlier_fraction,
+                "opacity": depth.opacity,
+                "translucent": depth.translucent_fraction,
+            }
             rows.append(row)
             name = "images alone" if source == "images" else "images and depth"
             more = [f"{100 * depth.median:.2f} cm", f"{depth.outlier_fraction:.1%}", f"{depth.opacity:.4f}"]
@@ -171,12 +175,12 @@ def tabletop(args: argparse.Namespace) -> tuple[str, list[str], list[list[str]],
 
 
 def score_depths(field: Path, views: list, box, center, spp: int, pictures: Path) -> dict[str, float]:
-    """Means over ``views`` of PSNR in dB and SSIM, and over all of their pixels: PSNR within and ``beyond`` the
-    ``box``, and errors of depth near ``center`` and far."""
+    """Means over ``views`` of PSNR in dB and SSIM, and over all of their pixels: PSNR inside and ``beyond`` the
+    ``box``, and depth errors near ``center`` and far."""
     from nerg_mi.evaluation.metrics import FieldRenderer, ssim
     from nerg_mi.figures.overlay import write_png
     from nerg_mi.files.atomic import make_folder
-    from nerg_mi.maths.color import psnr_from_mse, psnr
+    from nerg_mi.maths.color import psnr, psnr_from_mse
     from nerg_mi.photos.cameras import pixel_directions
 
     make_folder(pictures)
@@ -212,7 +216,7 @@ SETS = {
     "store": (store, ROOT / "scenes" / "store" / "build", "10"),
     "tabletop": (tabletop, ROOT / "scenes" / "tabletop" / "build", "4"),
 }
-"""What trains and scores, the folder of the views, and the minutes, by name."""
+"""Training and scoring functions, the folder of the views, and the minutes, by name."""
 
 
 def main(argv=None) -> None:

@@ -1,11 +1,11 @@
-"""Bakes and counts on one worker and on two: throughput, what a part costs, and the model that follows.
+"""Bakes and counts with one worker and with two: throughput, cost of a part, and a model of both.
 
     python benchmarks/scaling.py [--observers 48] [--rays 1500000] [--out out/benchmarks/scaling]
 
 A room of 8 x 6 x 3 m with the gaze field of the demo store. Bakes of a path of observers on a coarse and on a fine
-mesh, and counts of synthetic rays, by dask with one worker and with two of one thread each, after a warm run. Every
-result is compared with that of one go. What a part computed is said by its receipt; what it costs besides is the rest
-of the time that was waited.
+mesh, and counts of synthetic rays, by dask with one worker and with two of one thread each, after a warm-up run. Each
+result is compared with that of a single process. The manifest of a part states its computing time; its overhead is the
+rest of the elapsed time.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ DETAILS = (0.4, 0.15)
 
 
 def room(folder: Path, observers: int, count: int) -> None:
-    """The room as a mesh and a scene, a path in it, and rays of 40 people who look about."""
+    """The room as a mesh and a scene, a path in it, and rays of 40 participants who look around."""
     from nerg_mi.formats.ply import write_columns
     from nerg_mi.rays.rays import Rays
 
@@ -54,7 +54,7 @@ def room(folder: Path, observers: int, count: int) -> None:
 
 
 def bake(folder: Path, detail: float, name: str, **more) -> tuple[int, bytes]:
-    """Observers and the bytes of what is made of them."""
+    """Observers and the bytes of the results."""
     from nerg_mi.scenes import store
     from nerg_mi.workflows.bake import bake
     from nerg_mi.workflows.scene_commands import BakeOptions

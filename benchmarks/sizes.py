@@ -1,6 +1,6 @@
-"""What a cost grows by, for `bench.py`: pixels, samples, observers, rays, extent of the place, rows of a field's table.
+"""Scaling of costs, for `bench.py`: pixels, samples, observers, rays, extent of the scene, rows of a field's table.
 
-Each is a `Growth`: works by their size, of the demo store where nothing else is said.
+Each is a `Growth`: programs by size, for the demo store unless stated otherwise.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _PANEL = (330, 250)
 
 @dataclass(frozen=True)
 class Growth:
-    """``works`` by their size; ``axis``: what is counted, of ``what``; ``aim`` of the exponent."""
+    """``works`` by size; ``axis``: the quantity of ``what`` that is counted; ``aim``: expected exponent."""
 
     what: str
     axis: str
@@ -32,7 +32,7 @@ class Growth:
 
 
 def frames(width: int, height: int, spp: int = 1, **values) -> Callable[[], np.ndarray]:
-    """A function that renders colour, depth and gaze of the store in ``spp`` samples."""
+    """A function that renders colour, depth and gaze of the store with ``spp`` samples."""
     import mitsuba as mi
 
     scene = nerg.Scene.load(find_store_scene(), width=width, height=height, aovs="depth,gaze", **values).mitsuba
@@ -71,7 +71,7 @@ def rays(long: bool) -> Growth:
 
 def hall(side: float, cell: float = 0.1) -> np.ndarray:
     """Densities (z, y, x, 1) of a hall of ``side`` by ``side`` by 3.2, with shelves of 1.6 by 0.4 every 3.2, in voxels
-    of ``cell``: the same detail whatever the side."""
+    of ``cell``: the same detail for any side."""
     n, h = round(side / cell), round(3.2 / cell)
     x = (np.arange(n) + 0.5) * cell
     shelf = (x[:, None] % 3.2 > 1.4) & (x[:, None] % 3.2 < 1.8) & (x[None] % 3.2 > 0.8) & (x[None] % 3.2 < 2.4)
@@ -82,7 +82,7 @@ def hall(side: float, cell: float = 0.1) -> np.ndarray:
 
 
 def extent(long: bool) -> Growth:
-    """Colourless depth of a hall, seen along its diagonal from a corner; steps of a quarter of a voxel."""
+    """Depth of a hall without colour, along its diagonal from a corner; steps of a quarter of a voxel."""
     import mitsuba as mi
 
     film = {"type": "hdrfilm", "width": 320, "height": 180, "rfilter": {"type": "box"}}
@@ -101,7 +101,7 @@ def extent(long: bool) -> Growth:
 
 
 def random_points(field, count: int, seed: int = 0) -> np.ndarray:
-    """Places (3, count), uniform in the occupied cells that lie in the field's box."""
+    """Positions (3, count), uniform in the occupied cells inside the field's box."""
     bits, rng = field.occupancy.bits, np.random.default_rng(seed)
     side, n = field.box.side, bits.shape[0]
     cells = np.argwhere(bits)[:, ::-1]
@@ -154,7 +154,7 @@ def growths(long: bool) -> Iterator[Growth]:
 
 
 def _short(size: float) -> str:
-    """A size as the mark of an axis: 230k, 2.1M."""
+    """A size as a tick label: 230k, 2.1M."""
     for unit, letter in ((1e6, "M"), (1e3, "k")):
         if size >= unit:
             return f"{size / unit:.{1 if size < 10 * unit else 0}f}{letter}"
@@ -163,7 +163,7 @@ def _short(size: float) -> str:
 
 def growth_figure(curves: Sequence[Mapping]):
     """A panel for each of ``curves``: ``title``, ``axis``, ``sizes`` (n,), ``low``, ``middle`` and ``high`` (n,)
-    milliseconds, and the fitted ``exponent``; both axes logarithmic, with the slope of proportion in grey."""
+    milliseconds, and the fitted ``exponent``; logarithmic axes, with the proportional slope in grey."""
     from matplotlib.ticker import FuncFormatter, LogLocator
 
     columns = 3

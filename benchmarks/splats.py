@@ -1,16 +1,16 @@
-"""The demo store as Gaussian splats against the store as a field and as shapes; speed beside Mitsuba's own renderer.
+"""The demo store as Gaussian splats against the store as a field and as shapes; speed against Mitsuba's own renderer.
 
     python benchmarks/splats.py [--resolution 208] [--width 180] [--runs 5] [--picture FILE.png]
     [--out out/benchmarks/splats.csv]
 
-Splats are made of the trained field as `nerg export splats` makes them (`--splats FILE` takes others). First table:
-field and splats against exact ray casts to the twin, as in store_visibility.py, and the share of pixels in which their
-visibility is the same. Second table: seconds for 320 x 180 pixels of one ray each, median of `--runs` runs that are
-made in turn, and CPU seconds of all threads, which other programs of the machine change less; kernels are compiled
-before. `volprim_rf_basic` is Mitsuba's renderer of splats, which has colour alone, in the order of shells, and stops at
-a hundredth of the light; the row "colour, stop 0.01" does too.
+Splats are made of the trained field as by `nerg export splats` (or read with `--splats FILE`). First table: field and
+splats against exact ray casts to the twin, as in store_visibility.py, and the fraction of pixels with equal visibility.
+Second table: seconds for 320 x 180 pixels of one ray each, median of `--runs` alternating runs, and CPU seconds of all
+threads, which are less affected by other programs; kernels are compiled before. `volprim_rf_basic` is Mitsuba's
+renderer of splats, which computes colour alone, in the order of shells, and stops at a hundredth of the light, like the
+row "colour, stop 0.01".
 
-The picture: rows field, splats, shapes; columns colour, depth, gaze, visibility.
+The image: rows field, splats, shapes; columns colour, depth, gaze, visibility.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ COLUMNS = {
     "agree": "visibility right, away from silhouettes",
     "agree all": "everywhere",
 }
-"""Of `store_visibility.measure`, and what they are called."""
+"""Columns of `store_visibility.measure`, and their titles."""
 
 
 def make(path: Path, resolution: int) -> None:
@@ -50,7 +50,7 @@ def make(path: Path, resolution: int) -> None:
 
 
 def splat_scene(folder: Path) -> Path:
-    """The store's scene with splats for a field, written to ``folder``."""
+    """The store's scene with splats as its field, written to ``folder``."""
     from nerg_mi.workflows.demo import find_store_scene
 
     path = folder / "splats.xml"
@@ -76,7 +76,7 @@ def compare(scenes: dict[str, tuple[Path, dict]], width: int) -> list[dict]:
 
 
 def same_depth(scenes: dict[str, tuple[Path, dict]], width: int) -> list[dict]:
-    """How far the depths of the splats are from those of the field, in centimetres, ray by ray."""
+    """Difference between depths of splats and field in centimetres, ray by ray."""
     rows = []
     for pair in PAIRS:
         depth, seen = [], []
@@ -126,7 +126,7 @@ def times(scene: Path, files: dict, runs: int) -> list[dict]:
     theirs = {"type": "scene", "integrator": {"type": PEER}, "sensor": sensor, "splats": shape}
     loaded[PEER] = mi.load_dict(theirs)
     taken: dict[str, list[tuple[float, float]]] = {name: [] for name in loaded}
-    # The second frame of an observer reads what the first keeps, and is another kernel.
+    # The second frame of an observer uses cached data of the first, with another kernel.
     for run in range(runs + 2):
         for name, what in loaded.items():
             wall, cpu = time.perf_counter(), time.process_time()

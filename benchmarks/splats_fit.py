@@ -3,18 +3,19 @@
     python benchmarks/splats_fit.py [--resolution 96] [--views 24] [--width 96] [--steps 150] [--rays 8192] [--seeds 3]
     [--update docs/explanation/environment-accuracy.md]
 
-Photos are those that a photographer takes of the demo store's twin, at cameras chosen as for the store's field; eight
-others, a shopper's, say which learning rates are taken (`RATES` times one of `FACTORS`, by the disturbed splats of seed
-0), and eight more, of which nothing was chosen, are what is reported. Seeds decide the disturbance, the order of the
-rays and their samples; after ± is the standard deviation over them. Fitted are the splats that `nerg export splats`
-makes of the field (`--splats FILE` takes others), as they are and disturbed: centres moved by 2 cm in each axis, scales
-off by a third, axes turned by some 10 degrees, opacities cut by 3 tenths, colours off by a tenth (standard deviations).
-All that a Gaussian has is optimised: Adam over its centre, the logarithms of its scales, its quaternion, the logit of
-its opacity and its harmonics; rays are random pixels of all photos, errors are squared differences of sRGB values. None
-is added or taken away.
+Photos are renderings of the demo store's twin from a photographer's cameras, chosen as for the store's field. Eight
+other photos, from a shopper's eye, select the learning rates (`RATES` times one of `FACTORS`, by the disturbed splats
+of seed 0), and eight more, unused otherwise, are reported. Seeds determine the disturbance, the order of the rays and
+their samples; ± is the standard deviation over seeds. The initial splats are those that `nerg export splats` makes of
+the field (or `--splats FILE`), as they are and disturbed: centres moved by 2 cm per axis, scales changed by a third,
+axes rotated by some 10 degrees, opacities cut by 3 tenths, colours changed by a tenth (standard deviations). All
+parameters of Gaussians are optimised: Adam over the centre, log scales, the quaternion, the logit of the opacity and
+the harmonics; rays are random pixels of all photos, errors are squared differences of sRGB values. None is added or
+removed.
 
-Last table: the most that Dr.Jit holds during one derivative, beyond what it held before, against the number of hits a
-ray: the same 4,096 rays through stacks of walls, each figure of its own process. Nothing passes or fails here.
+Last table: maximum memory that Dr.Jit allocates during one derivative, beyond what was allocated before, against the
+number of hits per ray: the same 4,096 rays through stacks of walls, each figure in its own process. The benchmark does
+not pass or fail.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from pathlib import Path
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit)
 
-# BLAS threads wait in a busy loop, in the way of the others.
+# BLAS threads spin while they wait, and slow down the others.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from nerg_mi.fields.splats import Splats, harmonics_from_colors, multiply_quaternions
@@ -42,7 +43,7 @@ import mitsuba as mi
 import numpy as np
 
 PREFIX = "integrator.field."
-# A step of Adam moves by about so much: metres, logarithms, quaternions, logits, harmonics.
+# Approximate change per step of Adam: metres, logarithms, quaternions, logits, harmonics.
 RATES = {"centers": 1e-3, "log_scales": 0.02, "rotations": 0.01, "logits": 0.05, "harmonics": 0.02}
 FACTORS = (0.5, 1.0, 2.0)
 HITS = (16, 64, 256, 1024)
@@ -50,7 +51,7 @@ SIDE, WARM = 64, 4
 
 
 def disturbed(splats: Splats, seed: int = 0) -> Splats:
-    """``splats`` as the documentation of this file says."""
+    """``splats``, disturbed as documented above."""
     rng = np.random.default_rng(seed)
     noise = lambda like, size: size * rng.normal(size=like.shape)
     turn = np.concatenate([np.ones((len(splats), 1)), noise(splats.centers, 0.09)], axis=1)
@@ -64,7 +65,7 @@ def disturbed(splats: Splats, seed: int = 0) -> Splats:
 
 
 class Photos:
-    """Of the store's twin: ``fitted``, ``choosing`` and ``held_out``, cameras with their pictures."""
+    """Cameras of the store's twin with their images: ``fitted``, ``choosing`` and ``held_out``."""
 
     def __init__(self, count: int, width: int):
         from nerg_mi.scenes.store import cameras, layout, views
@@ -86,13 +87,18 @@ class Photos:
 
 
 def scene_of(splats: Splats):
-    """Their place, colour alone."""
-    integrator = {"type": "nerg", "field": get_plugin_class("splats").of(splats), "occlusion": False, "id": "integrator"}
+    """The scene of splats, colour alone."""
+    integrator = {
+        "type": "nerg",
+        "field": get_plugin_class("splats").from_network(splats),
+        "occlusion": False,
+        "id": "integrator",
+    }
     return mi.load_dict({"type": "scene", "integrator": integrator})
 
 
 def psnr(scene, cameras, photos) -> float:
-    """The mean over pictures, of four samples a pixel."""
+    """Mean PSNR over images, with four samples per pixel."""
     found = []
     for camera, photo in zip(cameras, photos):
         picture = srgb(np.array(mi.render(scene, sensor=camera, spp=4, seed=1))[..., :3])
@@ -101,12 +107,12 @@ def psnr(scene, cameras, photos) -> float:
 
 
 def as_srgb(x):
-    """sRGB values of linear ones, with derivatives."""
+    """sRGB values of linear ones, differentiable."""
     return dr.select(x <= 0.0031308, 12.92 * x, 1.055 * dr.power(dr.maximum(x, 0.0031308), 1 / 2.4) - 0.055)
 
 
 def fit(scene, photos: Photos, steps: int, rays: int, factor: float, seed: int) -> None:
-    """Optimise all Gaussians of ``scene`` by ``factor`` times the rates."""
+    """Optimise all Gaussians of ``scene`` with ``factor`` times the rates."""
     params = mi.traverse(scene)
     params.keep([PREFIX + name for name in ("centers", "scales", "rotations", "opacities", "harmonics")])
     opacities = dr.clip(params[PREFIX + "opacities"], 1e-4, 1 - 1e-4)
@@ -117,7 +123,7 @@ def fit(scene, photos: Photos, steps: int, rays: int, factor: float, seed: int) 
     targets = [mi.TensorXf(picture.astype(np.float32)) for picture in pictures]
     loader = mi.ad.loaders.RayDataLoader(cameras, targets, pixels_per_batch=rays, seed=seed, regular_reshuffle=True)
     for i in range(steps):
-        # Slower towards the end, down to a tenth.
+        # Decreasing to a tenth towards the end.
         opt.set_learning_rate({name: factor * rate * 0.1 ** (i / steps) for name, rate in RATES.items()})
         for name in ("centers", "rotations", "harmonics"):
             params[PREFIX + name] = opt[name]
@@ -131,17 +137,16 @@ def fit(scene, photos: Photos, steps: int, rays: int, factor: float, seed: int) 
 
 
 def stack(hits: int) -> Splats:
-    """As many flat Gaussians for every ``hits``, of which so many stand one behind the other before the rays, and the
-    others beside them."""
+    """The same number of flat Gaussians for all ``hits``: this many in a row in front of the rays, the others aside."""
     n = HITS[-1]
     centers = np.stack([np.where(np.arange(n) < hits, 0, 50), np.zeros(n), np.linspace(-1, 1, n)], axis=1)
     scales, turned = np.tile([2, 2, 1e-4], (n, 1)), np.tile([1, 0, 0, 0], (n, 1))
-    # Light is left behind the last, so that all are met.
+    # Some light is left behind the last, so that all are hit.
     return Splats(centers, scales, turned, np.full(n, 4 / n), harmonics_from_colors(np.full((n, 3), 0.3)))
 
 
 def peak(hits: int) -> float:
-    """MB (of 10^6 bytes) that a derivative holds at most beyond what is held before, compiled before."""
+    """Maximum MB (10^6 bytes) that a derivative allocates, compiled before."""
     scene = scene_of(stack(hits))
     params = mi.traverse(scene)
     keys = [key for key in params.keys() if key.startswith(PREFIX)]
@@ -161,7 +166,7 @@ def peak(hits: int) -> float:
 
 
 def held_at_most(work) -> float:
-    """MB that ``work`` holds at most beyond what is held before."""
+    """Maximum MB that ``work`` allocates."""
     gc.collect()
     dr.sync_thread()
     dr.flush_malloc_cache()
@@ -173,7 +178,7 @@ def held_at_most(work) -> float:
 
 
 def fitted(splats: Splats, photos: Photos, args, factor: float, seed: int) -> dict[str, float]:
-    """Of one fit, by the names of the first table's columns."""
+    """Results of one fit, by the column names of the first table."""
     scene = scene_of(splats)
     before = {"before": psnr(scene, *photos.held_out), "fitted to, before": psnr(scene, *photos.fitted)}
     start, cpu = time.perf_counter(), time.process_time()
@@ -187,7 +192,7 @@ def fitted(splats: Splats, photos: Photos, args, factor: float, seed: int) -> di
 
 
 def summary(found: list[dict[str, float]]) -> list[str]:
-    """Cells of a row of the fits ``found``."""
+    """Cells of a row for several fits."""
     of = lambda key: np.array([row[key] for row in found])
     keys = ("before", "after", "fitted to, before", "fitted to, after")
     cells = [f"{of(k).mean():.2f} ± {of(k).std(ddof=1):.2f}" for k in keys]

@@ -1,16 +1,16 @@
-"""The store's trained gaze against the true law, at positions that no training ray came near.
+"""The store's trained gaze against the true law, at positions without nearby training rays.
 
     python benchmarks/store_gaze.py [--gaze FILE] [--field FILE] [--rays FILE] [--out out/benchmarks/store_gaze.csv]
 
-The test positions are those that the gaze checkpoint says were held out (`nerg train gaze --test-zones`): shoppers
-stood there, and every ray within 2R of one was left out of the training. Truth is the attention law in closed form, in
-2,048 directions of equal area. Baselines see the rays that the field was trained on: the density of all rays whatever
-the position, the densities of the nearest probes, and that of the 4,096 nearest rays; each with two kernels, the
-training's and a wider one.
+The test positions are those that the gaze checkpoint lists as held out (`nerg train gaze --test-zones`): shoppers were
+there, and all rays within 2R were excluded from the training. The truth is the attention law in closed form, in 2,048
+directions of equal area. Baselines use the field's training rays: the density of all rays for any position, the
+densities of the nearest probes, and that of the 4,096 nearest rays; each with two kernels, the training's and a wider
+one.
 
 KLD is of densities normalised over the sphere, with 1e-6 of the uniform density added to both; MAE and `integral` are
-of the densities as they are. `law, seen by as many rays` is the kernel density of fresh draws from the law itself at
-the test position, as many as a probe holds: what a probe of perfect data would score.
+of the densities as they are. `law, seen by as many rays` is the kernel density of new samples of the law itself at the
+test position, as many as in a probe: the score of a probe with perfect data.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ DIRECTIONS = 2048
 
 
 def fresh_draws(law, count: int, kappa: float):
-    """Baseline: kernel densities of ``count`` draws from ``law`` at each position itself."""
+    """Baseline: kernel densities of ``count`` samples of ``law`` at each position."""
     from nerg_mi.probes.kde import SphericalKde
 
     def evaluate(positions, directions):
@@ -43,7 +43,14 @@ def main(argv=None) -> None:
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
-    from nerg_mi.evaluation.gaze import EPS, FieldDensity, compute_map_scores, make_nearest_probes_baseline, make_nearest_rays_baseline, make_position_blind_baseline
+    from nerg_mi.evaluation.gaze import (
+        EPS,
+        FieldDensity,
+        compute_map_scores,
+        make_nearest_probes_baseline,
+        make_nearest_rays_baseline,
+        make_position_blind_baseline,
+    )
     from nerg_mi.fields.mlp import namespace
     from nerg_mi.formats.fields import load_gaze, load_radiance
     from nerg_mi.maths.sphere import fibonacci_directions
@@ -75,7 +82,7 @@ def main(argv=None) -> None:
     truth = law.density(positions, directions)
 
     probe_settings = about["probes"]
-    # Of the silverman and loo rules there is no single kappa; the default stands for them.
+    # The silverman and loo rules have no single kappa; the default is used instead.
     narrow = probe_settings["kappa"]
     methods = {
         "gaze field": FieldDensity(gaze, medium, depth_kind=probe_settings["depth"]),
@@ -92,7 +99,10 @@ def main(argv=None) -> None:
             kappa=kappa,
             seed=0,
         )
-        methods |= {f"{k} nearest probe{'s' * (k > 1)}, kappa {kappa:g}": make_nearest_probes_baseline(probes, k) for k in (1, 16)}
+        methods |= {
+            f"{k} nearest probe{'s' * (k > 1)}, kappa {kappa:g}": make_nearest_probes_baseline(probes, k)
+            for k in (1, 16)
+        }
         methods[f"4,096 nearest rays, kappa {kappa:g}"] = make_nearest_rays_baseline(train, 4096, kappa=kappa)
     methods[f"law, seen by {probe_settings['cap']:,} rays, kappa {narrow:g}"] = fresh_draws(
         law, probe_settings["cap"], narrow

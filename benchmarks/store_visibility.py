@@ -3,17 +3,17 @@
     python benchmarks/store_visibility.py [--field FILE] [--width 240] [--out out/benchmarks/store_visibility.csv]
 
 For several pairs of a camera and an observer, the integrator `nerg` renders depth, position and visibility (falloff 0,
-one ray a pixel). The same rays are cast at the twin. A pixel agrees when visibility is 1 where the twin lets the
-observer see the surface that this pixel's ray meets in the twin, and 0 where it does not.
+one ray per pixel). The same rays are cast at the twin. A pixel agrees if visibility is 1 where the observer sees the
+twin's surface along this pixel's ray, and 0 where not.
 
 Away from silhouettes: pixels within `--margin` pixels of a discontinuity of the exact depth or of the exact visibility
-are left out; there a centimetre decides, and a field has no edges finer than its grid. How many that are is a column.
+are excluded; there a centimetre decides, and a field has no edges finer than its grid. A column gives their number.
 
-Printed are means over the pairs: how many pixels do not agree, away from silhouettes and all; how many are `kept` as
-away from them; errors of depth in cm over all pixels with a surface, `p90 cm away` over those away from silhouettes.
-The CSV has a row a pair: `agree` away from silhouettes, of it the share `wrongly seen` and `wrongly hidden`; `agree
-all` with silhouettes; `agree own`: the exact test is made at the field's own surface point instead of the twin's (5 cm
-before it are not tested); `visible` share of pixels that are exactly visible.
+Prints means over the pairs: the fraction of pixels that disagree, away from silhouettes and in total; the fraction
+`kept` away from silhouettes; depth errors in cm over all pixels with a surface, `p90 cm away` over those away from
+silhouettes. The CSV has one row per pair: `agree` away from silhouettes, split into `wrongly seen` and `wrongly
+hidden`; `agree all` with silhouettes; `agree own`: the exact test at the field's own surface point instead of the
+twin's (the last 5 cm are not tested); `visible`: fraction of exactly visible pixels.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and
 
 import numpy as np
 
-# name: (camera, target, eye). Cameras see over or around shelves; eyes are a shopper's.
+# name: (camera, target, eye). Cameras look over or around shelves; eyes are a shopper's.
 PAIRS = {
     "demo": ("7.4, 3.4, 2.2", "4.8, 4.2, 1.0", "4.4, 2.8, 1.6"),
     "aisle 3, from the south": ("6.5, 0.7, 2.3", "4.6, 3.0, 1.1", "4.8, 2.2, 1.6"),
@@ -42,7 +42,8 @@ KINDS = ("expected", "median", "refined")
 
 
 def near_edges(depth: np.ndarray, visible: np.ndarray, margin: int) -> np.ndarray:
-    """Pixels (h, w) within ``margin`` pixels of a jump of the exact depth (over 4 cm + 3 %) or of visibility."""
+    """Pixels (h, w) within ``margin`` pixels of a discontinuity of the exact depth (over 4 cm + 3 %) or of
+    visibility."""
     from scipy.ndimage import binary_dilation
 
     edge = np.zeros(depth.shape, bool)
@@ -53,7 +54,7 @@ def near_edges(depth: np.ndarray, visible: np.ndarray, margin: int) -> np.ndarra
         jump |= visible[hi] != visible[lo]
         edge[lo] |= jump
         edge[hi] |= jump
-    # The pixels at both sides of a jump are marked already.
+    # Pixels on both sides of a discontinuity are already marked.
     return binary_dilation(edge, np.ones((3, 3)), iterations=margin - 1) if margin > 1 else edge
 
 
@@ -83,7 +84,7 @@ def measure(scene: Path, pair: str, kind: str, visibility: str, files: dict, wid
     seconds = time.perf_counter() - start
     opacity, p, seen = picture[..., 0], picture[..., 1:4], picture[..., 4]
 
-    # Mitsuba draws each ray anywhere in its pixel; the surface point that the field reports gives it back.
+    # Mitsuba jitters each ray within its pixel; the surface point of the field identifies it.
     surface = opacity >= 0.5
     o, e = (np.array([float(x) for x in v.split(",")]) for v in (camera, eye))
     # From the camera's centre; the AOV "depth" starts at the near plane.
@@ -91,7 +92,7 @@ def measure(scene: Path, pair: str, kind: str, visibility: str, files: dict, wid
     d = (p - o) / np.maximum(depth[..., None], 1e-9)
     exact = np.full(depth.shape, np.nan)
     exact[surface] = twin.cast_rays(o, d[surface])
-    # A millimetre before the surface: the point itself must not hide itself.
+    # A millimetre in front of the surface, so that it does not hide itself.
     truth, own = np.zeros(depth.shape, bool), np.zeros(depth.shape, bool)
     truth[surface] = twin.is_visible(e, (o + (exact[surface, None] - 1e-3) * d[surface]))
     own[surface] = twin.is_visible(e, p[surface], tolerance=0.05)
@@ -121,7 +122,7 @@ def measure(scene: Path, pair: str, kind: str, visibility: str, files: dict, wid
 
 
 def table(rows: list[dict]) -> list[list[str]]:
-    """Cells of the means over pairs, a row a kind of depth and visibility."""
+    """Cells of the means over pairs, one row per kind of depth and visibility."""
     out = []
     for key in dict.fromkeys((r["depth"], r["visibility"]) for r in rows):
         mine = [r for r in rows if (r["depth"], r["visibility"]) == key]
@@ -160,7 +161,7 @@ def main(argv=None) -> None:
     rows = [
         measure(find_store_scene(), pair, kind, visibility, files, args.width, args.margin)
         for visibility in args.visibility.split(",")
-        for kind in args.dtypes.split(",")
+        for kind in args.kinds.split(",")
         for pair in args.pair or PAIRS
     ]
     head = ("depth", "visibility", "wrong %, away", "wrong %, all", "kept", *CENTIMETRES)

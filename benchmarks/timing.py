@@ -1,4 +1,4 @@
-"""How benchmarks measure: works in turns, medians with their spread, and how a cost grows."""
+"""Measurement: alternating runs, medians with their spread, and scaling exponents."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from tools.page import update_table
 
 
 def write_rows(path: Path, rows: list[dict]) -> None:
-    """Write ``rows`` as CSV, and say where."""
+    """Write ``rows`` as CSV, and print the path."""
     write_csv(path, rows)
     print(f"wrote {path}")
 
 
 def print_table(title: str, head: Sequence[str], rows: Sequence[Sequence], page: Path | None = None) -> None:
-    """Print a table below its heading, and put it into the ``page`` of the documentation that has this heading."""
+    """Print a table below its heading, and insert it into the ``page`` of the manual with this heading."""
     print(f"### {title}\n")
     update_table(page, title, format_markdown_table(head, rows))
     print(flush=True)
@@ -32,22 +32,22 @@ def print_table(title: str, head: Sequence[str], rows: Sequence[Sequence], page:
 median = statistics.median
 
 _SETTLE = 0.05
-"""Seconds in which threads that spin go to sleep."""
+"""Seconds after which spinning threads sleep."""
 
 Times = list[tuple[float, float]]
-"""Seconds of each run: wall-clock, and of processor."""
+"""Seconds of each run: wall-clock, and CPU."""
 
 
 def in_turns(works: Mapping[str, Callable[[], object]], runs: int, warm: int = 1) -> dict[str, Times]:
-    """Times of ``runs`` calls of each of ``works``, called in turns after ``warm`` calls that compile and fill caches:
-    what else the machine does then falls on all alike."""
+    """Times of ``runs`` calls of each of ``works``, which alternate after ``warm`` calls that compile and fill caches,
+    so that other load of the machine affects all equally."""
     for work in works.values():
         for _ in range(warm):
             work()
     taken: dict[str, Times] = {name: [] for name in works}
     for _ in range(runs):
         for name, work in works.items():
-            # Threads of the work before spin for a while before they sleep: Dr.Jit's, PyTorch's, OpenBLAS's.
+            # Threads of the previous work spin for a while before they sleep: Dr.Jit's, PyTorch's, OpenBLAS's.
             time.sleep(_SETTLE)
             wall, cpu = time.perf_counter(), time.process_time()
             work()
@@ -62,10 +62,10 @@ def spread(values: Iterable[float]) -> str:
 
 
 def exponent(sizes: Sequence[float], costs: Sequence[float]) -> float:
-    """The b of cost = a size^b that fits best in logarithms: 1 where a cost is in proportion to the size."""
+    """The b of cost = a size^b that fits best in logarithms: 1 for a proportional cost."""
     return float(np.polyfit(np.log(np.asarray(sizes, float)), np.log(np.asarray(costs, float)), 1)[0])
 
 
 def at_the_end(sizes: Sequence[float], costs: Sequence[float]) -> float:
-    """`exponent` between the two largest sizes, where what a call costs at least matters least."""
+    """`exponent` between the two largest sizes, where the constant cost of a call matters least."""
     return exponent(sizes[-2:], costs[-2:])

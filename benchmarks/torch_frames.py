@@ -1,12 +1,12 @@
-"""A frame of the demo store beside a plain PyTorch renderer of the same checkpoints, steps and camera, for `bench.py`.
+"""A frame of the demo store against a plain PyTorch renderer of the same checkpoints, steps and camera, for `bench.py`.
 
-Colour, depth and gaze of an observer who is not the camera, after occlusion. The peer is eager PyTorch as radiance
-fields are commonly rendered with it: steps of the field's own length in slabs, cells that its occupancy grid says are
-empty left out, samples and rays compacted, the density net first and the colour net where the weight exceeds 1e-3, rays
-ended at T < 1e-4; then the observer's rays to the surfaces, which end where they are opaque or have arrived; then the
-gaze; the integral over the observer's sphere is kept between frames, as ours is. Its grid is evaluated as torch-ngp's
-fallback does, eight gathers a level, in a second row with less traffic in memory, and in a third with the encoding and
-the networks through torch.compile. Our first frame is timed with no kernel compiled before.
+Colour, depth and gaze of an observer who is not at the camera, after occlusion. The reference is eager PyTorch as
+commonly used for radiance fields: uniform steps of the field's own length in slabs, empty cells of its occupancy grid
+skipped, samples and rays compacted, the density net first and the colour net where the weight exceeds 1e-3, rays ended
+at T < 1e-4; then the observer's rays to the surfaces, which end once they are opaque or at the surface; then gaze. The
+integral over the observer's sphere is kept between frames, as in nerg. Its grid is evaluated like torch-ngp's fallback,
+eight gathers per level, in a second row with less memory traffic, and in a third with the encoding and the networks in
+torch.compile. nerg's first frame is timed without compiled kernels.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import tempfile
 import time
 from functools import partial
 
-# First frames are first frames: no kernel is compiled before. Once Dr.Jit is loaded it would be too late.
+# First frames must not find a compiled kernel. Once Dr.Jit is loaded this cannot be set.
 if "drjit" not in sys.modules:
     os.environ["DRJIT_CACHE_DIR"] = tempfile.mkdtemp(prefix="kernels-")
     atexit.register(shutil.rmtree, os.environ["DRJIT_CACHE_DIR"], ignore_errors=True)
@@ -35,8 +35,8 @@ import numpy as np
 
 
 class Attention:
-    """Gaze as a density that integrates to one over an observer's sphere, of the weights of a ``model`` (`TorchModel`):
-    `nerg_mi.fields.gaze_log_density`."""
+    """Gaze as a density that integrates to one over an observer's sphere, with the weights of a ``model``
+    (`TorchModel`): `nerg_mi.fields.gaze_log_density`."""
 
     def __init__(self, model):
         import torch
@@ -48,7 +48,7 @@ class Attention:
         self.end = (high - low) * self.scale - 1
 
     def log_prior(self, r_o):
-        """Log of the density that knows no positions, bilinear in its table of latitudes and longitudes."""
+        """Log of the position-independent prior, bilinear in its latitude-longitude table."""
         import torch
 
         table = self.model.weights["prior"].detach()
@@ -63,7 +63,7 @@ class Attention:
         return upper.lerp(lower, fy)
 
     def unnormalized(self, p_od, p_o, r_o, escaped=None):
-        """What the integral is made of, 1/sr times a constant of the observer."""
+        """The integrand, 1/sr times a constant of the observer."""
         import torch
 
         c, weights = self.config, self.model.weights
@@ -79,26 +79,26 @@ class Attention:
         return (self.log_prior(r_o) + emit).clamp(max=30).exp() * capture[:, 0].sigmoid()
 
     def gaze(self, p_od, p_o, r_o, integral):
-        """Gaze in 1/sr of observers whose ``integral`` is known."""
+        """Gaze in 1/sr of observers with the given ``integral``."""
         mix = self.config.mix
         return (1 - mix) / integral * self.unnormalized(p_od, p_o, r_o) + mix * self.log_prior(r_o).exp()
 
 
 SLAB = 16
-"""Steps of a ray that are looked at together."""
+"""Steps per batch of a ray."""
 
 RAYS = 1 << 15
-"""Rays that are rendered together."""
+"""Rays per batch."""
 
 WEIGHT, STOP = 1e-3, 1e-4
 
-DIRECTIONS = 1 << 15
-"""Of an observer's integral."""
+MAX_DIRECTIONS = 1 << 15
+"""Directions of an observer's integral."""
 
 
 class QuickModel(TorchModel):
-    """The same grid with less traffic in memory, which nothing is differentiated for: corners one after the other, and
-    indices of 32 bits, whose products overflow as the hash wants them to."""
+    """The same grid with less memory traffic, without gradients: corners one after the other, and 32-bit indices, whose
+    products overflow as the hash requires."""
 
     def encode(self, p):
         torch, out = self.torch, []
@@ -149,7 +149,7 @@ class TorchRenderer:
         return self.model._net("color_net", self.torch.cat([harmonics(d), features], 1)).sigmoid()
 
     def occupied(self, p):
-        """Whether the cells of ``p`` (..., 3) may hold matter."""
+        """Whether the cells of ``p`` (..., 3) are occupied."""
         c = ((p - self.lower) * (self.cells / self.side)).long().clamp_(0, self.cells - 1)
         return self.bits[c[..., 0] + self.cells * (c[..., 1] + self.cells * c[..., 2])]
 
@@ -194,7 +194,7 @@ class TorchRenderer:
         return color, 1 - through, depth
 
     def frame(self, o, d, observer):
-        """Linear colour (N, 3), depth and gaze (N,) as arrays of rays from ``o`` along unit ``d`` (N, 3)."""
+        """Linear colour (N, 3), depth and gaze (N,) as arrays, of rays from ``o`` along unit ``d`` (N, 3)."""
         torch = self.torch
         rays, found = [torch.from_numpy(np.ascontiguousarray(v, np.float32)) for v in (o, d)], []
         p_o = torch.tensor(observer, dtype=torch.float32)
@@ -206,11 +206,11 @@ class TorchRenderer:
         return np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4), depth, gaze
 
     def integral(self, p_o) -> float:
-        """Of gaze over the sphere of the observer at ``p_o``; kept, as ours is, for as long as they stand there."""
+        """Integral of gaze over the sphere of the observer at ``p_o``; cached while they stay there, as in nerg."""
         torch, at = self.torch, tuple(p_o.tolist())
         if at not in self.integrals:
             found = []
-            for r_o in torch.from_numpy(fibonacci_directions(DIRECTIONS).astype(np.float32)).split(RAYS):
+            for r_o in torch.from_numpy(fibonacci_directions(MAX_DIRECTIONS).astype(np.float32)).split(RAYS):
                 o = p_o.expand(len(r_o), 3)
                 distance = self.march(o, r_o, colored=False)[2]
                 escaped = ~distance.isfinite()
@@ -239,7 +239,7 @@ class TorchRenderer:
 
 
 def camera_rays(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
-    """Origins and unit directions (width * height, 3) of the pixels' middles, seen by the scene's first sensor."""
+    """Origins and unit directions (width * height, 3) of the pixel centres of the scene's first sensor."""
     import mitsuba as mi
 
     sensor = nerg.Scene.load(find_store_scene(), width=width, height=height).mitsuba.sensors()[0]
@@ -250,7 +250,7 @@ def camera_rays(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def agreement(scene, peer: TorchRenderer, width: int = 160, height: int = 90) -> dict[str, float]:
-    """How alike both are on the same rays."""
+    """Agreement of both on the same rays."""
     o, d = camera_rays(width, height)
     observer = np.asarray(scene.observer, float)
     found = nerg.trace(scene, o, d, ["color", "depth", "gaze"], observers=observer[None])
@@ -269,8 +269,8 @@ def agreement(scene, peer: TorchRenderer, width: int = 160, height: int = 90) ->
 
 
 class Ours:
-    """Frames of the demo store with these ``values`` of its scene, when called; ``constant``: with the weights of its
-    networks as constants of the kernels. ``first``: seconds that the first frame took, compilation included."""
+    """A function that renders frames of the demo store with these ``values`` of its scene; ``constant``: with constant
+    weights of its networks. ``first``: seconds of the first frame, with compilation."""
 
     def __init__(self, values: dict, visibility: str, constant: bool = False):
         import mitsuba as mi
@@ -282,7 +282,7 @@ class Ours:
         start = time.perf_counter()
         self()
         self.first = time.perf_counter() - start
-        # What is kept of the observer is there now; this compiles what reads it.
+        # The observer's data is cached now; this compiles the kernel that reads it.
         self()
 
     def __call__(self) -> np.ndarray:
@@ -290,8 +290,8 @@ class Ours:
 
 
 def our_frames(values: dict) -> dict[str, Ours]:
-    """Ours by name, with these ``values`` of the scene; those with constant weights give the same pictures to the bit,
-    which is checked."""
+    """nerg's programs by name, with these ``values`` of the scene; those with constant weights give bit-identical
+    images, which is checked."""
     frames = {
         f"{name}{more}": Ours(values, visibility, constant)
         for constant, more in ((False, ""), (True, ", constant weights"))
@@ -304,7 +304,7 @@ def our_frames(values: dict) -> dict[str, Ours]:
 
 
 def measure(frames: dict, size: str, runs: int) -> list[dict]:
-    """A row for each of ``frames``, functions by their names, called in turns."""
+    """A row for each of ``frames``, functions by name, which alternate."""
     seconds = in_turns(frames, runs)
     medians = {name: median(wall for wall, _ in taken) for name, taken in seconds.items()}
     first = medians[next(iter(frames))]

@@ -1,14 +1,14 @@
-"""Our trainer beside a plain PyTorch trainer of the same model: steps a second, and PSNR after equal minutes.
+"""nerg's trainer against a plain PyTorch trainer of the same model: steps per second, and PSNR after equal time.
 
     python benchmarks/torch_radiance.py [--minutes 2] [--width 135] [--validate] [--data DIR] [--turns 0]
 
-Same grid, networks, initial weights, rays, step table, occupancy grid, density pass, losses, optimiser and schedule, on
-the same machine in the same run, one after the other; the peer is eager PyTorch, gathers and sums, autograd. Before
-they start, both evaluate the same random points, and the program stops if they differ. Without our trainer's extras:
-thinned samples, damped derivatives near cameras, cleared cells, colours of each photo, and the settling of the grid,
-which are switched off in both. Both fields are scored by the integrator, under the occupancy found in the same way.
-``--turns``: instead, both take 8 steps in turns, so often, after 100 that clear the first fog, marching finely from the
-start, and what a step takes is printed.
+Same grid, networks, initial weights, rays, step table, occupancy grid, density pre-pass, losses, optimiser and
+schedule, on the same machine in the same run, one after the other; the reference is eager PyTorch with gathers, sums
+and autograd. Both first evaluate the same random points, and the program stops if they differ. Extras of nerg's trainer
+are disabled in both: thinned samples, damped derivatives near cameras, cleared cells, per-photo colours, and occupancy
+extraction. Both fields are scored by the integrator, with occupancy found in the same way. ``--turns``: instead, both
+alternate this many times for 8 steps each, after 100 that clear the initial fog, with fine steps from the start, and
+the time per step is printed.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ import numpy as np
 
 
 def take_turns(ours, peer, turns: int, steps: int = 8, before: int = 100) -> None:
-    """Print what a step of each takes, in ``turns`` of ``steps``, after ``before`` that clear the first fog."""
+    """Print the time per step of each, in ``turns`` of ``steps``, after ``before`` steps that clear the initial fog."""
 
     def some(trainer, count: int) -> None:
         for _ in range(count):
@@ -50,12 +50,19 @@ def take_turns(ours, peer, turns: int, steps: int = 8, before: int = 100) -> Non
 
 _PRIMES = (1, 2654435761, 805459861)
 
-OFF = {"extraction_start": 2.0, "empty_weight": 0.0, "grid_decay": 0.0, "rr_min_probability": 1.0, "damping_distance": 0.0, "photo_colors": False}
-"""Settings without what the peer does not have."""
+OFF = {
+    "extraction_start": 2.0,
+    "empty_weight": 0.0,
+    "grid_decay": 0.0,
+    "rr_min_probability": 1.0,
+    "damping_distance": 0.0,
+    "photo_colors": False,
+}
+"""Settings without the features that the reference lacks."""
 
 
 class TorchModel:
-    """Hash grid and networks, evaluated as torch-ngp's fallback does: eight gathers a level, weighted and summed."""
+    """Hash grid and networks, evaluated like torch-ngp's fallback: eight gathers per level, weighted and summed."""
 
     def __init__(self, field):
         import torch
@@ -105,7 +112,7 @@ class TorchModel:
 
 
 def harmonics(d):
-    """Real spherical harmonics to degree 3, (N, 16), of unit directions (N, 3), as torch-ngp has them."""
+    """Real spherical harmonics up to degree 3, (N, 16), of unit directions (N, 3), as in torch-ngp."""
     import torch
 
     x, y, z = d.unbind(1)
@@ -134,8 +141,8 @@ def harmonics(d):
 
 
 class TorchTrainer:
-    """The scheme of ``nerg_mi.train``, in eager PyTorch. ``ours``: a trainer that has made no step, to start as it
-    does."""
+    """The scheme of ``nerg_mi.train``, in eager PyTorch. ``ours``: a trainer before its first step, for the same
+    initial state."""
 
     def __init__(self, ours, views):
         import torch
@@ -194,7 +201,7 @@ class TorchTrainer:
         self.bits = self.seen & (self.value > bound)
 
     def samples(self, o, d, stride):
-        """Ray, start, length and midpoint of the steps that matter, ray after ray."""
+        """Ray, start, length and midpoint of the contributing steps, ray by ray."""
         torch, s = self.torch, self.s
         t = torch.stack([(self.low - o) / d, (self.high - o) / d])
         t0, t1 = t.amin(0).amax(1).clamp(min=s.near * self.ours.box.side), t.amax(0).amin(1)
@@ -214,7 +221,7 @@ class TorchTrainer:
         return ray[kept], t[kept], length[kept], p[kept]
 
     def before(self, x, ray):
-        """Sum over the earlier samples of the same ray, float64 within."""
+        """Sum over the earlier samples of the same ray, float64 internally."""
         torch = self.torch
         running = torch.cumsum(x.double(), 0) - x.double()
         first = torch.ones_like(ray, dtype=torch.bool)
@@ -249,7 +256,11 @@ class TorchTrainer:
         opacity = torch.zeros(covered).index_add(0, ray, weight)
         background = torch.rand(covered, 3, generator=self.generator)
         error = (color + (1 - opacity)[:, None] * background - truth[:covered]).abs()
-        loss = torch.where(error < s.huber_delta, 0.5 * error**2, s.huber_delta * (error - 0.5 * s.huber_delta)).mean(1).mean()
+        loss = (
+            torch.where(error < s.huber_delta, 0.5 * error**2, s.huber_delta * (error - 0.5 * s.huber_delta))
+            .mean(1)
+            .mean()
+        )
         self.optimiser.zero_grad()
         loss.backward()
         for group in self.optimiser.param_groups:
@@ -273,7 +284,9 @@ def same_model(trainer, peer) -> float:
     d = rng.normal(size=p.shape).astype(np.float32)
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     ns = trainer.ns
-    scaled = {k: dr.detach(v) * (3e3 if k == "grid.table" else 1) for k, v in trainer.current_field.parameters().items()}
+    scaled = {
+        k: dr.detach(v) * (3e3 if k == "grid.table" else 1) for k, v in trainer.current_field.parameters().items()
+    }
     old = {k: v.detach().clone() for k, v in peer.weights.items()}
     with torch.no_grad():
         peer.weights["grid.table"] *= 3e3
@@ -313,7 +326,9 @@ def main(argv=None) -> None:
         raise SystemExit("the peer knows neither alpha nor masks; give a set of plain photos")
     fine = {"strides": ()} if args.turns else {}
     settings = RadianceSettings(minutes=args.minutes, **OFF, **fine)
-    make = lambda: RadianceTrainer(data.train, data.box, make_radiance_config(args.size, data.box), settings, ns, depth=False)
+    make = lambda: RadianceTrainer(
+        data.train, data.box, make_radiance_config(args.size, data.box), settings, ns, depth=False
+    )
     args.out.mkdir(parents=True, exist_ok=True)
     ours, judge = make(), make()
     peer = TorchTrainer(judge, data.train)

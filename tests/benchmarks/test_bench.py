@@ -1,4 +1,4 @@
-"""What `make bench` rests on: how growth and spread are fitted, and that those which are compared do the same work."""
+"""Basics of `make bench`: fits of growth and spread, and equal work of all compared programs."""
 
 import importlib
 
@@ -10,16 +10,16 @@ from tests.conftest import ROOT
 
 @pytest.fixture
 def benchmark(monkeypatch):
-    """Imports a benchmark by its name, as it is when it is run: beside the others."""
+    """Import a benchmark by name, as a script next to the others."""
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     return importlib.import_module
 
 
-def test01_exponents_and_turns(benchmark):
+def test01_scaling_exponents_and_alternating_runs(benchmark):
     timing = benchmark("timing")
     sizes = [1, 10, 100, 1000]
     assert np.isclose(timing.exponent(sizes, [3 * n**0.5 for n in sizes]), 0.5)
-    # A cost of a call flattens the whole, and not its end.
+    # A constant cost per call flattens the whole curve, not its end.
     costs = [n + 30 for n in sizes]
     assert timing.exponent(sizes, costs) < 0.6 < 0.85 < timing.at_the_end(sizes, costs) < 1
     assert timing.spread([4, 1, 2, 3, 5]) == "2, 4"
@@ -28,27 +28,27 @@ def test01_exponents_and_turns(benchmark):
     assert called == ["a", "b", "a", "b", "a", "b"] and [len(t) for t in taken.values()] == [2, 2]
 
 
-def test02_scipy_and_nerg_have_one_density(benchmark):
+def test02_scipy_and_nerg_densities_agree(benchmark):
     works, apart = benchmark("bench").kernel_densities(40, 300)
     assert apart < 1e-5 and set(works) == {"nerg", "SciPy"}
-    # Uniform directions take a mean over the sphere, of what integrates to one.
+    # Uniform directions average over the sphere, a density that integrates to one.
     assert np.isclose(np.mean(benchmark("bench").kernel_densities(500, 4000)[0]["nerg"]()), 1 / (4 * np.pi), rtol=0.1)
 
 
-def test03_volpath_and_nerg_have_one_cloud(benchmark, rgb):
+def test03_volpath_and_nerg_transmittances_agree(benchmark, rgb):
     works, error, apart = benchmark("bench").transmittances(24, 64, cells=16)
     ours, theirs = (error(work()) for work in works.values())
     assert apart < 0.02 and ours < 0.06 and theirs < 0.1
 
 
-def test04_figures(benchmark):
+def test04_figures_are_drawn(benchmark):
     figures = benchmark("sizes")
     curve = {"title": "a", "axis": "n", "sizes": [1, 2], "low": [1, 2], "middle": [1, 2], "high": [1, 3]}
     page = figures.growth_figure([curve | {"exponent": 1.0}] * 4)
     assert len([a for a in page.axes if a.get_visible()]) == 4 and "size^1.00" in page.axes[0].texts[0].get_text()
 
 
-def test05_a_missing_device_is_one_sentence(benchmark, monkeypatch, capsys):
+def test05_missing_device_is_reported(benchmark, monkeypatch, capsys):
     bench = benchmark("bench")
     monkeypatch.setattr(bench, "has_cuda", lambda: False)
     bench.main(["--mode", "cuda_ad_rgb"])
@@ -58,16 +58,16 @@ def test05_a_missing_device_is_one_sentence(benchmark, monkeypatch, capsys):
     assert 'there is no part "nothing"' in capsys.readouterr().err
 
 
-def test06_memory_of_this_process(benchmark):
+def test06_peak_memory_of_this_process(benchmark):
     memory = benchmark("processes")
-    # The kernel counts pages in batches, so that the two may be a few apart.
+    # The kernel counts pages in batches, so that both can differ by a few.
     assert memory.status("VmHWM") > 0.9 * memory.status("VmRSS") > 9
     with pytest.raises(RuntimeError, match="VmNothing"):
         memory.status("VmNothing")
 
 
-def test07_steps_in_turns(benchmark, capsys):
-    """As many steps of both, and the ratio of what they take."""
+def test07_steps_alternate(benchmark, capsys):
+    """Equal numbers of steps of both, and the ratio of their times."""
 
     class Trainer:
         steps = 0

@@ -1,5 +1,5 @@
-"""What scripts import of this repository is there, also what only a run to the end would come to; and nerg_mi, which
-chooses the libLLVM, comes before Dr.Jit and Mitsuba."""
+"""Imports of scripts exist, including those that only a full run reaches; and nerg_mi, which selects the libLLVM, is
+imported before Dr.Jit and Mitsuba."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ OURS = {"nerg_mi", "tests", "tools", *(p.stem for p in (ROOT / "benchmarks").glo
 
 
 def imports(source: str) -> Iterator[tuple[str, str | None]]:
-    """Modules that ``source`` imports anywhere, in programs for other processes too, with each name taken from them."""
+    """Modules that ``source`` imports anywhere, also in programs for other processes, with each name imported from
+    them."""
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
             yield from ((a.name, None) for a in node.names)
@@ -31,7 +32,7 @@ def imports(source: str) -> Iterator[tuple[str, str | None]]:
 
 
 @pytest.mark.parametrize("path", SCRIPTS, ids=lambda p: f"{p.parent.name}/{p.name}")
-def test_what_is_imported_is_there(rgb, monkeypatch, path):
+def test_imported_names_exist(rgb, monkeypatch, path):
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     for module, name in imports(path.read_text(encoding="utf-8")):
         top = module.split(".")[0]
@@ -41,7 +42,7 @@ def test_what_is_imported_is_there(rgb, monkeypatch, path):
 
 
 @pytest.mark.parametrize("path", SCRIPTS, ids=lambda p: f"{p.parent.name}/{p.name}")
-def test_libllvm_is_chosen_first(path):
+def test_libllvm_is_selected_first(path):
     order = [module.split(".")[0] for module, _ in imports(path.read_text(encoding="utf-8"))]
     if {"drjit", "mitsuba"} & {*order}:
         assert "nerg_mi" in order[: min(order.index(name) for name in ("drjit", "mitsuba") if name in order)]

@@ -1,4 +1,4 @@
-"""The measurement of visibility: what it leaves out, and that it can tell a good field from a wrong one."""
+"""The measurement of visibility: exclusions, and that it distinguishes a good field from a wrong one."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from benchmarks.store_visibility import PAIRS, measure, near_edges
 from nerg_mi.workflows.demo import find_store_scene
 
 
-def test01_pixels_near_jumps_are_left_out():
+def test01_pixels_near_discontinuities_are_excluded():
     depth = np.full((9, 12), 2.0)
     depth[:, 6:] = 3.0
     near = near_edges(depth, np.ones((9, 12), bool), margin=2)
@@ -14,21 +14,21 @@ def test01_pixels_near_jumps_are_left_out():
     visible = np.ones((9, 12), bool)
     visible[4, 4] = False
     assert near_edges(np.full((9, 12), 2.0), visible, margin=1).sum() == 5
-    # A slope of 2 % a pixel is no edge
+    # A slope of 2 % per pixel is not an edge
     assert not near_edges(2.0 * 1.02 ** np.arange(12.0)[None].repeat(9, 0), np.ones((9, 12), bool), 2).any()
 
 
-def test02_blocks_where_the_furniture_stands_hide_what_it_hides(standins):
+def test02_blocks_occlude_like_the_furniture(standins):
     row = measure(find_store_scene(), "aisle 3, from the south", "median", "depth", standins, 48, 2)
-    # Blocks of 13 cm for shelves with boards and gaps
+    # Blocks of 13 cm instead of shelves with boards and gaps
     assert row["agree"] > 0.85 and row["median cm"] < 15 and row["no surface"] < 0.05
     assert np.isclose(row["agree"] + row["wrongly seen"] + row["wrongly hidden"], 1)
 
 
-def test03_a_field_elsewhere_disagrees(standins, monkeypatch):
+def test03_displaced_field_disagrees(standins, monkeypatch):
     camera, target, eye = PAIRS["aisle 3, from the south"]
     right = measure(find_store_scene(), "aisle 3, from the south", "median", "depth", standins, 48, 2)
-    # The field is asked about another eye than the twin
+    # The field is evaluated for another eye than the twin
     monkeypatch.setitem(PAIRS, "moved", (camera, target, eye))
     from nerg_mi.scenes.store import twin
 

@@ -1,4 +1,4 @@
-"""Tables that benchmarks print have the heads of those on the pages, as far as that is quick to find out."""
+"""Tables of benchmarks have the headers of those in the manual, as far as this can be tested quickly."""
 
 import importlib
 
@@ -10,13 +10,13 @@ from tools.page import cells
 
 @pytest.fixture
 def benchmark(monkeypatch):
-    """Imports a benchmark by its name, as it is when it is run: beside the others."""
+    """Import a benchmark by name, as a script next to the others."""
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     return importlib.import_module
 
 
 def lines(text: str) -> list[str]:
-    """Lines of the tables in ``text``, whether their columns are padded or not."""
+    """Lines of the tables in ``text``."""
     return [f"| {' | '.join(cells(line))} |" for line in text.splitlines() if line.startswith("|")]
 
 
@@ -24,19 +24,19 @@ def page(name: str) -> list[str]:
     return lines((ROOT / "docs" / "explanation" / name).read_text(encoding="utf-8"))
 
 
-def test01_errors_of_derivatives(benchmark, capsys):
+def test01_derivative_errors(benchmark, capsys):
     benchmark("gradients").main(["--case", "silhouette"])
     head, rule, *rows = lines(capsys.readouterr().out)
     assert {head, *rows} <= set(page("numerics.md")) and len(rows) == 2
 
 
-def test02_samples_and_opacities(benchmark, rgb):
+def test02_sample_counts_and_opacities(benchmark, rgb):
     numerics, there = benchmark("numerics"), page("numerics.md")
     rows = [row.cells() for case in (numerics.any_number_of_samples, numerics.all_opacities) for row in case(rgb)]
     assert len(rows) == 6 and all(any(f"| {' | '.join(row[:3])} |" in line for line in there) for row in rows)
 
 
-def test03_alignments(benchmark):
+def test03_alignment_tables(benchmark):
     from tests.alignment import rooms
 
     alignment = benchmark("alignment")
@@ -53,7 +53,7 @@ SCRIPTS = sorted(p.stem for p in (ROOT / "benchmarks").glob("*.py") if "__main__
 
 
 @pytest.mark.parametrize("script", SCRIPTS)
-def test04_every_script_stands_on_a_page_and_says_its_options(benchmark, monkeypatch, capsys, script):
+def test04_scripts_are_documented_with_their_options(benchmark, monkeypatch, capsys, script):
     assert any(f"benchmarks/{script}.py" in p.read_text(encoding="utf-8") for p in (ROOT / "docs").rglob("*.md")) or (
         script == "bench"
     )
