@@ -158,8 +158,8 @@ SEARCHED = ("twin", "upright-twin", "tracking", "heads")
 
 def measure(world: World, kind: str, trials: int, mirrors: int, seed: int = 0) -> dict:
     """One row; ``seed``: of the similarities and of the errors of the evidence."""
-    name, known, upright, make = KINDS[kind]
-    found, off, named = [], [], []
+    name, expected, upright, make = KINDS[kind]
+    result, off, named = [], [], []
     began = time.perf_counter()
     for k in range(trials):
         rng = np.random.default_rng([k, seed])
@@ -181,7 +181,7 @@ def measure(world: World, kind: str, trials: int, mirrors: int, seed: int = 0) -
                 f"{kind} {k}: {np.median(each):.1f} cm, {angle:.1f} degrees, {fit.mirrored}, {fit.warnings}", flush=True
             )
         else:
-            found.append((np.median(each), angle, scale, residual))
+            result.append((np.median(each), angle, scale, residual))
             off.append(each)
     seconds = (time.perf_counter() - began) / trials
     for k in range(mirrors if kind not in ("floor", "heads") else 0):
@@ -191,12 +191,12 @@ def measure(world: World, kind: str, trials: int, mirrors: int, seed: int = 0) -
             named.append(evidence.fit(target, lambda *_: None).mirrored is not None)
         except NergError as error:
             named.append("mirror" in str(error))
-    median = np.median(np.array(found), axis=0) if found else np.full(4, np.nan)
+    median = np.median(np.array(result), axis=0) if result else np.full(4, np.nan)
     return {
         "kind": kind,
         "evidence": name,
-        "known besides": known,
-        "right": len(found),
+        "known besides": expected,
+        "right": len(result),
         "trials": trials,
         "error cm": median[0],
         "95 %": np.percentile(np.concatenate(off), 95) if off else np.nan,
@@ -251,7 +251,7 @@ def main(argv=None) -> None:
     parser.add_argument(
         "--searches", type=int, help="trials of kinds that search, some ten seconds each (default: all)"
     )
-    parser.add_argument("--mirrors", type=int, help="of them with the tracking mirrored besides (default: a fifth)")
+    parser.add_argument("--mirrors", type=int, help="additional trials with mirrored tracking (default: a fifth)")
     parser.add_argument("--only", action="append", choices=[*KINDS, "fox"], help="only this kind; repeatable")
     parser.add_argument("--seed", type=int, default=0, help="of the random similarities")
     parser.add_argument("--shoppers", type=int, default=12, help="people who are tracked")
@@ -260,18 +260,18 @@ def main(argv=None) -> None:
     parser.add_argument("--update", type=Path, help="page of the documentation to put the tables into")
     args = parser.parse_args(argv)
 
-    asked = args.only or [*KINDS, "fox"]
+    requested = args.only or [*KINDS, "fox"]
     counts = {kind: args.searches or args.trials if kind in SEARCHED else args.trials for kind in KINDS}
-    if [kind for kind in asked if kind != "fox"]:
+    if [kind for kind in requested if kind != "fox"]:
         world = make_world(args.shoppers, args.rays)
         rows = []
-        for kind in (k for k in KINDS if k in asked):
+        for kind in (k for k in KINDS if k in requested):
             mirrors = max(1, counts[kind] // 5) if args.mirrors is None else args.mirrors
             rows.append(measure(world, kind, counts[kind], mirrors, args.seed))
             print("; ".join(cells(rows[-1])), flush=True)
         print_table(TITLE, HEAD, [cells(row) for row in rows], args.update)
         write_rows(args.out, rows)
-    fox = measure_fox(args.trials) if "fox" in asked else None
+    fox = measure_fox(args.trials) if "fox" in requested else None
     if fox is not None:
         head = "trials|error, % of the cameras' spread|95 %|degrees|95 %|residual, %".split("|")
         print_table(FOX, head, fox, args.update)

@@ -64,8 +64,8 @@ def kernel_densities(rays: int, directions: int, kappa: float = 200.0) -> tuple[
     def with_nerg() -> np.ndarray:
         return np.array(ours.density(probe, where))
 
-    known, got = with_scipy(), with_nerg()
-    return {"nerg": with_nerg, "SciPy": with_scipy}, float(np.max(np.abs(got - known)) / known.mean())
+    expected, got = with_scipy(), with_nerg()
+    return {"nerg": with_nerg, "SciPy": with_scipy}, float(np.max(np.abs(got - expected)) / expected.mean())
 
 
 def cloud(cells: int) -> np.ndarray:
@@ -97,8 +97,8 @@ def transmittances(size: int, samples: int, cells: int = 64) -> tuple[Works, Cal
     sensor = {"type": "perspective", "fov": 35, "to_world": view, "film": film}
     fine = 2 * 3**0.5 / 1024 / 16
 
-    def marched(**more):
-        integrator = {"type": "nerg", "density": grid, "aovs": "opacity", **more}
+    def marched(**overrides):
+        integrator = {"type": "nerg", "density": grid, "aovs": "opacity", **overrides}
         return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor})
 
     medium = {"type": "heterogeneous", "sigma_t": grid, "albedo": 0.0}
@@ -206,12 +206,12 @@ def peers_of(run: Run, compiled: bool) -> dict[str, torch_frames.TorchRenderer]:
     for name, how in made.items():
         peer = torch_frames.TorchRenderer(run.field, run.gaze, falloff, **how)
         try:
-            found = torch_frames.agreement(scene, peer)
+            result = torch_frames.agreement(scene, peer)
         except torch._dynamo.exc.TorchDynamoException as error:
             print(f"{name}: torch.compile fails here: {str(error).strip().splitlines()[0]}\n")
             continue
-        print(name, ", ".join(f"{k} {v:.4g}" for k, v in found.items()), "\n", flush=True)
-        if found["color_db"] < 35 or abs(found["gaze_mean"]) > 0.02:
+        print(name, ", ".join(f"{k} {v:.4g}" for k, v in result.items()), "\n", flush=True)
+        if result["color_db"] < 35 or abs(result["gaze_mean"]) > 0.02:
             raise SystemExit("the two do not render the same picture")
         peers[name] = peer
     return peers
@@ -243,12 +243,12 @@ def stages(run: Run) -> None:
     rows, before = [], 0.0
     for name, times in taken.items():
         each = [1e6 * c / (width * height) for c in run.cost(times)]
-        more = "" if name.startswith("...") else f"{median(each) - before:.2f}"
+        overrides = "" if name.startswith("...") else f"{median(each) - before:.2f}"
         before = median(each)
         peer = theirs.get(name)
         clock = 1e6 * median(wall for wall, _ in times) / (width * height)
         cells = [f"{peer / clock:.0f}"] if peer else [""]
-        rows.append([name, f"{median(each):.2f}", spread(each), more, *cells])
+        rows.append([name, f"{median(each):.2f}", spread(each), overrides, *cells])
     unit = "us" if run.cuda else "us of CPU"
     head = ["what", f"{unit} a pixel", "quartiles", "more than above", "times faster than eager PyTorch"]
     run.table("Stages", head, rows, "stages")
@@ -285,24 +285,24 @@ def peer_stages(run: Run, width: int, height: int) -> dict[str, float]:
 def kde(run: Run) -> None:
     rows = []
     for rays in (1000, 10_000, *((100_000,) if run.long else ())):
-        works, apart = kernel_densities(rays, 1 << 13)
-        if not apart < 1e-4:
-            raise SystemExit(f"the two do not give the same densities: {apart:.1e} apart")
+        works, difference = kernel_densities(rays, 1 << 13)
+        if not difference < 1e-4:
+            raise SystemExit(f"the two do not give the same densities: {difference:.1e} apart")
         costs = {name: run.cost(times) for name, times in in_turns(works, run.runs).items()}
         ours, theirs = costs["nerg"], costs["SciPy"]
         times = f"{median(theirs) / median(ours):.0f}"
         rows.append(
             [f"{rays:,}", *(f"{1e3 * median(c):.3g} ({spread(1e3 * t for t in c)})" for c in (ours, theirs)), times]
         )
-        rows[-1].append(f"{apart:.0e}")
+        rows[-1].append(f"{difference:.0e}")
     head = ["rays", "nerg, CPU ms (quartiles)", "SciPy, CPU ms (quartiles)", "times", "largest difference"]
     run.table("Kernel densities beside SciPy", head, rows, "kde")
 
 
 def volume(run: Run) -> None:
-    works, error, apart = transmittances(256, 64 if run.long else 16)
-    if not apart < 0.01:
-        raise SystemExit(f"the two do not render the same cloud: means are {apart:.1%} apart")
+    works, error, difference = transmittances(256, 64 if run.long else 16)
+    if not difference < 0.01:
+        raise SystemExit(f"the two do not render the same cloud: means are {difference:.1%} apart")
     errors = {name: error(work()) for name, work in works.items()}
     costs = {name: run.cost(times) for name, times in in_turns(works, run.runs).items()}
     # A Monte Carlo estimate costs n times as much for 1 / sqrt(n) of the error.
@@ -325,16 +325,16 @@ def growth(run: Run) -> None:
     import sizes
 
     rows, curves = [], []
-    for found in sizes.growths(run.long):
-        taken = in_turns({str(n): work for n, work in found.works.items()}, run.runs, warm=2)
-        counts, costs = list(found.works), [run.cost(times) for times in taken.values()]
+    for result in sizes.growths(run.long):
+        taken = in_turns({str(n): work for n, work in result.works.items()}, run.runs, warm=2)
+        counts, costs = list(result.works), [run.cost(times) for times in taken.values()]
         middle = [1e3 * median(c) for c in costs]
         low, high = np.transpose([1e3 * np.quantile(c, (0.25, 0.75)) for c in costs])
         fitted = exponent(counts, middle)
         curves.append(
             {
-                "title": found.what.replace("`", ""),
-                "axis": found.axis,
+                "title": result.what.replace("`", ""),
+                "axis": result.axis,
                 "sizes": counts,
                 "low": low,
                 "middle": middle,
@@ -345,7 +345,7 @@ def growth(run: Run) -> None:
         )
         steps = ", ".join(f"{n:,}: {c:,.0f}" if c >= 1e3 else f"{n:,}: {c:.3g}" for n, c in zip(counts, middle))
         last = f"{at_the_end(counts, middle):.2f}"
-        rows.append([found.what, found.axis, steps, f"{fitted:.2f}", last, found.aim])
+        rows.append([result.what, result.axis, steps, f"{fitted:.2f}", last, result.aim])
     unit = "ms" if run.cuda else "CPU ms"
     head = ["cost", "against", f"{unit} by size", "exponent", "between the two largest", "aim"]
     run.table("Growth", head, rows, "growth")
@@ -373,8 +373,8 @@ def main(argv=None) -> None:
     parser.add_argument("--update", type=Path, help="page of the documentation to put the tables into")
     parser.add_argument("--out", type=Path, default=Path("out/benchmarks/bench"))
     args = parser.parse_args(argv)
-    asked = args.only.split(",")
-    if unknown := [name for name in asked if name not in PARTS]:
+    requested = args.only.split(",")
+    if unknown := [name for name in requested if name not in PARTS]:
         parser.error(f'there is no part "{unknown[0]}"; choose among {", ".join(PARTS)}')
     if args.mode.startswith("cuda") and not has_cuda():
         print(f"No CUDA device is here, so {args.mode} was not measured; run this on a machine with an NVIDIA driver.")
@@ -387,7 +387,7 @@ def main(argv=None) -> None:
     dr.set_thread_count(args.threads)
     run = Run(args)
     the_run(run)
-    for name in asked:
+    for name in requested:
         PARTS[name](run)
 
 

@@ -60,8 +60,8 @@ def main(argv=None) -> None:
         p_o = mi.Point3f(*p)
         # Opaque like a scene's: a literal would be compiled again.
         dr.make_opaque(p_o)
-        asked = replace(settings, directions=count, integral_tolerance=tolerance)
-        return float(gaze.for_observers([p_o], place, asked).integrals(p_o)[0][0])
+        requested = replace(settings, directions=count, integral_tolerance=tolerance)
+        return float(gaze.for_observers([p_o], place, requested).integrals(p_o)[0][0])
 
     low, high = np.array(field.config.heads)
     rng, rows = np.random.default_rng(0), []
@@ -91,18 +91,18 @@ def sweep(integral, positions: list[list[float]]) -> None:
     """Print error and time of an integral by its number of directions, and by its tolerance."""
     counts = [1 << k for k in range(9, 19)]
     true = np.array([integral(p, (1 << 20) + 13) for p in positions])
-    ways = {f"{count:,}": {"count": count} for count in counts}
-    ways |= {f"tolerance {tolerance:g}": {"tolerance": tolerance} for tolerance in TOLERANCES}
+    variants = {f"{count:,}": {"count": count} for count in counts}
+    variants |= {f"tolerance {tolerance:g}": {"tolerance": tolerance} for tolerance in TOLERANCES}
     rows = []
-    for name, options in ways.items():
+    for name, options in variants.items():
         for p in positions[:4]:
             integral(p, **options)  # compiles its kernels
-        found = np.empty((len(positions), 3))
+        result = np.empty((len(positions), 3))
         for k, p in enumerate(positions):
             wall, cpu = time.perf_counter(), time.process_time()
             value = integral(p, **options)
-            found[k] = value, time.perf_counter() - wall, time.process_time() - cpu
-        off, (wall, cpu) = np.abs(found[:, 0] / true - 1), 1e3 * np.median(found[:, 1:], axis=0)
+            result[k] = value, time.perf_counter() - wall, time.process_time() - cpu
+        off, (wall, cpu) = np.abs(result[:, 0] / true - 1), 1e3 * np.median(result[:, 1:], axis=0)
         errors = (f"{v:.1e}" for v in (off.mean(), np.quantile(off, 0.99), off.max()))
         rows.append((name, *errors, f"{wall:.0f} ms", f"{cpu:.0f} ms"))
     print(format_markdown_table(("directions", "mean", "99 %", "most", "time", "CPU"), rows))

@@ -82,7 +82,7 @@ class GeneratedPlace:
         draws = np.array([t.draw for t in self.things])
         origins, directions, who, times = [], [], [], []
         for person in range(people):
-            p, way = self._walk(rng, count)
+            p, direction = self._walk(rng, count)
             taste = np.exp(_TASTE * rng.normal(size=len(draws)))
             offset = middles[None] - p[:, None]
             distance = np.linalg.norm(offset, axis=2)
@@ -90,14 +90,14 @@ class GeneratedPlace:
             seen = self._seen(twin, p, middles)
             weight = draws * taste * cosine * seen / (1 + (distance / self.falloff) ** 2)
             weight = np.concatenate([weight, np.full((count, 1), self.ahead), np.full((count, 1), self.around)], axis=1)
-            chosen = self._look(rng, weight)
+            selected = self._look(rng, weight)
             d = np.empty((count, 3))
             spot = rng.uniform(-1, 1, (count, 3))
-            for i, k in enumerate(chosen):
+            for i, k in enumerate(selected):
                 if k < len(draws):
                     d[i] = middles[k] + 0.8 * spot[i] * halves[k] - p[i]
                 elif k == len(draws):
-                    d[i] = [*way[i], -0.15]
+                    d[i] = [*direction[i], -0.15]
                 else:
                     d[i] = [*rng.normal(size=2), 0.3 * rng.normal() - 0.15]
             d /= np.linalg.norm(d, axis=1, keepdims=True)
@@ -123,7 +123,7 @@ class GeneratedPlace:
 
         home = point(None) if self.strays is not None else None
         at, goal, rest = point(home), point(home), 0
-        heads, ways, way = np.empty((count, 3)), np.empty((count, 2)), np.array([1.0, 0.0])
+        heads, variants, direction = np.empty((count, 3)), np.empty((count, 2)), np.array([1.0, 0.0])
         for i in range(count):
             away = goal - at
             far = np.linalg.norm(away)
@@ -132,14 +132,14 @@ class GeneratedPlace:
             elif far < _SPEED / _RATE:
                 goal, rest = point(home), int(rng.integers(5, 40))
             else:
-                way = away / far
-                ahead = at + way * _SPEED / _RATE
+                direction = away / far
+                ahead = at + direction * _SPEED / _RATE
                 if self.free(ahead[None])[0]:
                     at = ahead
                 else:
                     goal = point(home)
-            heads[i], ways[i] = [*at, height + 0.01 * rng.normal()], way
-        return heads, ways
+            heads[i], variants[i] = [*at, height + 0.01 * rng.normal()], direction
+        return heads, variants
 
     def _look(self, rng: np.random.Generator, weight: np.ndarray) -> np.ndarray:
         """Targets (N,), held for a while, drawn with probabilities (N, K)."""
@@ -161,8 +161,8 @@ class GeneratedPlace:
         import mitsuba as mi
 
         a, b = np.repeat(p, len(middles), axis=0), np.tile(middles, (len(p), 1))
-        way = b - a
-        ray = mi.Ray3f(to_vector(mi.Point3f, a), to_vector(mi.Vector3f, way))
+        direction = b - a
+        ray = mi.Ray3f(to_vector(mi.Point3f, a), to_vector(mi.Vector3f, direction))
         ray.maxt = mi.Float(0.97)
         return ~np.array(twin.ray_test(ray)).reshape(len(p), len(middles))
 
@@ -181,10 +181,10 @@ def _walls(x: float, y: float, z: float, thick: float = 0.1) -> list[Box]:
 def _gallery() -> GeneratedPlace:
     """Pictures on the walls and on a partition that hides half of the room; distance has no effect."""
     boxes = [*_walls(10, 8, 3.5), ((4.9, 2, 0), (5.1, 6, 3)), ((2, 6.4, 0), (2.5, 6.9, 1.1))]
-    things = [Thing((x, 0.02, 1.6), (0.5, 0.01, 0.4), d) for x, d in ((1.5, 1.0), (4, 0.6), (6.5, 2.0), (8.8, 0.5))]
-    things += [Thing((x, 7.98, 1.6), (0.4, 0.01, 0.6), d) for x, d in ((1.2, 0.8), (4.2, 1.5), (7.5, 1.0))]
-    things += [Thing((4.88, 4, 1.6), (0.01, 0.9, 0.6), 2.5), Thing((5.12, 4, 1.6), (0.01, 0.5, 0.7), 1.2)]
-    things += [Thing((9.98, 4, 1.6), (0.01, 1.0, 0.6), 1.5), Thing((2.25, 6.65, 1.3), (0.2, 0.15, 0.2), 1.2)]
+    shapes = [Thing((x, 0.02, 1.6), (0.5, 0.01, 0.4), d) for x, d in ((1.5, 1.0), (4, 0.6), (6.5, 2.0), (8.8, 0.5))]
+    shapes += [Thing((x, 7.98, 1.6), (0.4, 0.01, 0.6), d) for x, d in ((1.2, 0.8), (4.2, 1.5), (7.5, 1.0))]
+    shapes += [Thing((4.88, 4, 1.6), (0.01, 0.9, 0.6), 2.5), Thing((5.12, 4, 1.6), (0.01, 0.5, 0.7), 1.2)]
+    shapes += [Thing((9.98, 4, 1.6), (0.01, 1.0, 0.6), 1.5), Thing((2.25, 6.65, 1.3), (0.2, 0.15, 0.2), 1.2)]
     free = lambda p: (
         ~(
             ((np.abs(p[:, 0] - 5) < 0.45) & (p[:, 1] > 1.6) & (p[:, 1] < 6.4))
@@ -192,7 +192,7 @@ def _gallery() -> GeneratedPlace:
         )
     )
     return GeneratedPlace(
-        name="gallery", boxes=tuple(boxes), things=tuple(things), floor=((0.6, 0.6), (9.4, 7.4)), falloff=4.0, free=free
+        name="gallery", boxes=tuple(boxes), things=tuple(shapes), floor=((0.6, 0.6), (9.4, 7.4)), falloff=4.0, free=free
     )
 
 
@@ -202,20 +202,20 @@ def _office() -> GeneratedPlace:
     # The wall with the windows, in pieces around them.
     boxes += [((0, 6, 0), (9, 6.1, 0.9)), ((0, 6, 2.3), (9, 6.1, 2.8))]
     boxes += [((a, 6, 0.9), (b, 6.1, 2.3)) for a, b in ((0, 1), (3.5, 5.5), (8, 9))]
-    things = [Thing((2.25, 6.05, 1.6), (1.2, 0.01, 0.6), 0.7), Thing((6.75, 6.05, 1.6), (1.2, 0.01, 0.6), 0.7)]
+    shapes = [Thing((2.25, 6.05, 1.6), (1.2, 0.01, 0.6), 0.7), Thing((6.75, 6.05, 1.6), (1.2, 0.01, 0.6), 0.7)]
     spots = [(x, y) for x in (1.5, 4.5, 7.5) for y in (1.6, 3.8)]
     for x, y in spots:
         boxes.append(((x - 0.8, y - 0.4, 0.7), (x + 0.8, y + 0.4, 0.75)))
         boxes.append(((x - 0.3, y - 0.05, 0.8), (x + 0.3, y, 1.2)))
-        things.append(Thing((x, y - 0.07, 1.0), (0.28, 0.01, 0.18), 3.0))
-    things.append(Thing((8.98, 3, 1.5), (0.01, 0.6, 0.45), 0.8))
+        shapes.append(Thing((x, y - 0.07, 1.0), (0.28, 0.01, 0.18), 3.0))
+    shapes.append(Thing((8.98, 3, 1.5), (0.01, 0.6, 0.45), 0.8))
     desks = lambda p: np.any(
         [(np.abs(p[:, 0] - x) < 0.85) & (p[:, 1] > y - 0.45) & (p[:, 1] < y + 0.45) for x, y in spots], axis=0
     )
     return GeneratedPlace(
         name="office",
         boxes=tuple(boxes),
-        things=tuple(things),
+        things=tuple(shapes),
         floor=((0.4, 0.4), (8.6, 5.6)),
         falloff=1.5,
         strays=1.2,
@@ -226,13 +226,13 @@ def _office() -> GeneratedPlace:
 
 def _corridor() -> GeneratedPlace:
     """A corridor of twenty metres with a few doors and posters: most gaze is straight ahead."""
-    things = [Thing((x, 0.02, 1.4), (0.4, 0.01, 0.5), d) for x, d in ((3, 0.6), (8, 0.3), (15, 0.9))]
-    things += [Thing((x, 1.98, 1.5), (0.4, 0.01, 0.5), d) for x, d in ((5, 0.4), (12, 0.8))]
-    things.append(Thing((19.98, 1, 1.6), (0.01, 0.6, 0.7), 1.5))
+    shapes = [Thing((x, 0.02, 1.4), (0.4, 0.01, 0.5), d) for x, d in ((3, 0.6), (8, 0.3), (15, 0.9))]
+    shapes += [Thing((x, 1.98, 1.5), (0.4, 0.01, 0.5), d) for x, d in ((5, 0.4), (12, 0.8))]
+    shapes.append(Thing((19.98, 1, 1.6), (0.01, 0.6, 0.7), 1.5))
     return GeneratedPlace(
         name="corridor",
         boxes=tuple(_walls(20, 2, 2.6)),
-        things=tuple(things),
+        things=tuple(shapes),
         floor=((0.5, 0.5), (19.5, 1.5)),
         falloff=2.5,
         ahead=0.8,
@@ -243,12 +243,12 @@ def _stage() -> GeneratedPlace:
     """Rows of seats in front of a stage: everybody looks far ahead, and hardly moves."""
     boxes = [*_walls(12, 16, 6), ((2, 0.5, 0), (10, 4, 1.0)), ((5.7, 2, 1.0), (6.3, 2.4, 2.1))]
     boxes += [((1, y, 0), (11, y + 0.1, 0.9)) for y in (7.6, 9.0, 10.4, 11.8, 13.2)]
-    things = [Thing((6, 2.2, 2.3), (0.5, 0.2, 0.4), 4.0), Thing((3.4, 2, 2.0), (0.5, 0.3, 0.8), 1.5)]
-    things += [Thing((8.8, 2.4, 2.0), (0.5, 0.3, 0.8), 1.0), Thing((6, 0.02, 4.3), (2.5, 0.01, 1.0), 1.2)]
+    shapes = [Thing((6, 2.2, 2.3), (0.5, 0.2, 0.4), 4.0), Thing((3.4, 2, 2.0), (0.5, 0.3, 0.8), 1.5)]
+    shapes += [Thing((8.8, 2.4, 2.0), (0.5, 0.3, 0.8), 1.0), Thing((6, 0.02, 4.3), (2.5, 0.01, 1.0), 1.2)]
     return GeneratedPlace(
         name="stage",
         boxes=tuple(boxes),
-        things=tuple(things),
+        things=tuple(shapes),
         floor=((1.2, 7.0), (10.8, 14.5)),
         strays=0.3,
         seated=True,

@@ -105,7 +105,7 @@ def camera(mi, origin=(0.3, 0.2, -3), fov=20, size=SIZE):
     }
 
 
-def integrator(mi, folder, observer=(-2, 0.5, 2), **more):
+def integrator(mi, folder, observer=(-2, 0.5, 2), **overrides):
     eye = {} if observer is None else {"observer": {"type": "perspective", "to_world": look_at(mi, observer)}}
     return {
         "type": "nerg",
@@ -119,26 +119,26 @@ def integrator(mi, folder, observer=(-2, 0.5, 2), **more):
         "falloff": 4.0,
         "tolerance": 0.05,
         **eye,
-        **more,
+        **overrides,
     }
 
 
-def field_scene(mi, folder, **more):
+def field_scene(mi, folder, **overrides):
     """With the AOVs that require a field and an ensemble of gaze fields."""
     field = {"type": "nerf", "filename": str(folder / "field.safetensors")}
     gaze = {"type": "gazefield", "filename": str(folder / "ensemble.safetensors")}
-    about = {"aovs": f"{AOVS},features,features_at,gaze_std", "field": field, "gaze": gaze, **more}
-    return {"integrator": integrator(mi, folder, **about), "sensor": camera(mi)}
+    metadata = {"aovs": f"{AOVS},features,features_at,gaze_std", "field": field, "gaze": gaze, **overrides}
+    return {"integrator": integrator(mi, folder, **metadata), "sensor": camera(mi)}
 
 
-def constant_scene(mi, folder, **more):
+def constant_scene(mi, folder, **overrides):
     place = mi.ScalarTransform4f().translate([-1, -1, -1]).scale(2)
     color = {"type": "constvolume", "value": {"type": "rgb", "value": [0.8, 0.5, 0.2]}}
     density = {"type": "constvolume", "value": 1.2, "to_world": place}
-    return {"integrator": integrator(mi, folder, density=density, color=color, **more), "sensor": camera(mi)}
+    return {"integrator": integrator(mi, folder, density=density, color=color, **overrides), "sensor": camera(mi)}
 
 
-def grid_scene(mi, folder, **more):
+def grid_scene(mi, folder, **overrides):
     rng = np.random.default_rng(2)
     place = mi.ScalarTransform4f().translate([-1, -1, -1]).scale(2)
     volume = lambda data: {
@@ -148,10 +148,10 @@ def grid_scene(mi, folder, **more):
         "raw": True,
     }
     density, color = volume(0.1 + rng.exponential(1.2, (4, 5, 6))), volume(rng.uniform(0.1, 0.9, (4, 5, 6, 3)))
-    return {"integrator": integrator(mi, folder, density=density, color=color, **more), "sensor": camera(mi)}
+    return {"integrator": integrator(mi, folder, density=density, color=color, **overrides), "sensor": camera(mi)}
 
 
-def shapes_scene(mi, folder, **more):
+def shapes_scene(mi, folder, **overrides):
     """A tilted slab that all camera rays hit, and a larger one between it and the observer: no silhouette is
     visible."""
     slab = lambda z, size, tilt: (
@@ -159,28 +159,28 @@ def shapes_scene(mi, folder, **more):
     )
     paint = lambda *rgb: {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(rgb)}}
     return {
-        "integrator": integrator(mi, folder, observer=(-0.9, 0.4, 2.8), **more),
+        "integrator": integrator(mi, folder, observer=(-0.9, 0.4, 2.8), **overrides),
         "sensor": camera(mi),
         "slab": {"type": "cube", "to_world": slab(-0.3, 0.8, 20), "bsdf": paint(0.8, 0.5, 0.2)},
         "lid": {"type": "cube", "to_world": slab(1.5, 2.5, -15)},
     }
 
 
-def ball_scene(mi, folder, **more):
+def ball_scene(mi, folder, **overrides):
     paint = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.5, 0.2]}}
     return {
-        "integrator": integrator(mi, folder, observer=(-2, 0.5, -2.5), **more),
+        "integrator": integrator(mi, folder, observer=(-2, 0.5, -2.5), **overrides),
         "sensor": camera(mi, fov=12),
         "ball": {"type": "sphere", "radius": 0.8, "bsdf": paint},
     }
 
 
-def both_scene(mi, folder, **more):
+def both_scene(mi, folder, **overrides):
     """A slab behind a haze."""
     place = mi.ScalarTransform4f().translate([-1, -1, -1]).scale(2)
     color = {"type": "constvolume", "value": {"type": "rgb", "value": [0.2, 0.3, 0.9]}}
     return shapes_scene(
-        mi, folder, density={"type": "constvolume", "value": 0.25, "to_world": place}, color=color, **more
+        mi, folder, density={"type": "constvolume", "value": 0.25, "to_world": place}, color=color, **overrides
     )
 
 
@@ -406,15 +406,15 @@ def errors(mi, only: str, depth: str):
     yield "Errors of derivatives", head, rows
 
 
-def summary(found: dict) -> list[str]:
+def summary(result: dict) -> list[str]:
     text = lambda e: f"{e.forward:.0e} / {e.reverse:.0e}" if e else "none"
-    cells = [text(found[quantity]) if quantity in found else "" for quantity in QUANTITIES]
-    known = [e for e in found.values() if e]
+    cells = [text(result[quantity]) if quantity in result else "" for quantity in QUANTITIES]
+    expected = [e for e in result.values() if e]
     return [
         *cells,
-        f"{max(e.dot for e in known):.0e}",
-        f"{max(e.doubt for e in known):.0e}",
-        f"{1 - min(e.share for e in known):.0%}",
+        f"{max(e.dot for e in expected):.0e}",
+        f"{max(e.doubt for e in expected):.0e}",
+        f"{1 - min(e.share for e in expected):.0%}",
     ]
 
 

@@ -151,9 +151,11 @@ def box(mi, sigma, near=0.0, length=1.0):
     return VolumeMedium(mi.load_dict({"type": "constvolume", "value": float(sigma), "to_world": to_world}))
 
 
-def grid(mi, data, **more):
+def grid(mi, data, **overrides):
     return VolumeMedium(
-        mi.load_dict({"type": "gridvolume", "grid": mi.VolumeGrid(np.asarray(data, np.float32)), "raw": True, **more})
+        mi.load_dict(
+            {"type": "gridvolume", "grid": mi.VolumeGrid(np.asarray(data, np.float32)), "raw": True, **overrides}
+        )
     )
 
 
@@ -200,11 +202,11 @@ def sheets_in_a_grid(mi):
         settings = MarchSettings(medium.default_step, quadrature=kind)
         r, *_ = through(mi, medium, o, d, settings)
         error = worst(r.expected_depth, expected, False)
-        found = np.mean(values(r.opacity) > 0.999)
+        result = np.mean(values(r.opacity) > 0.999)
         yield Row(
             "thin sheets in near-vacuum" if kind == "constant" else "",
             f"σ 1e-8, 1e3, 1e9; 1e-4 thick; {kind}",
-            f"depth (absolute); {found:.0%} of the rays end at the sheet",
+            f"depth (absolute); {result:.0%} of the rays end at the sheet",
             error,
             "closed form",
         )
@@ -215,15 +217,15 @@ def sheets_and_steps(mi):
     n = 4096
     z0 = mi.Float(np.linspace(0, 0.1, n, dtype=np.float32))
     medium = DensityProfile(lambda z: dr.select((z >= 0.5) & (z < 0.5 + THIN), 1e9, 1e-8))
-    found = []
+    result = []
     for step in (0.5, 1, 2, 10):
         _, r = along_z(mi, medium, MarchSettings(step * THIN), z0)
-        found.append(f"{step:g}: {np.mean(values(r.opacity) > 0.5):.1%}")
+        result.append(f"{step:g}: {np.mean(values(r.opacity) > 0.5):.1%}")
     yield Row(
         "the same sheet, a volume without bounds",
         "step / thickness 0.5 .. 10",
         "rays that meet it",
-        ", ".join(found),
+        ", ".join(result),
         "all",
     )
 

@@ -37,18 +37,19 @@ class Population:
 
     def __init__(self, file: Path | None) -> None:
         if file is not None and file.is_file():
-            with np.load(file) as kept:
-                found = {
-                    m.name: (kept[f"x_{m.name}"].astype(float), kept[f"y_{m.name}"].astype(float)) for m in MEASURES
+            with np.load(file) as selected:
+                result = {
+                    m.name: (selected[f"x_{m.name}"].astype(float), selected[f"y_{m.name}"].astype(float))
+                    for m in MEASURES
                 }
         else:
-            found = _visits()
+            result = _visits()
             if file is not None:
-                np.savez(file, **{f"{w}_{k}": v for k, pair in found.items() for w, v in zip("xy", pair)})
-        self.pairs = found
-        self.truth = {k: x.sum(axis=0) / y.sum(axis=0) for k, (x, y) in found.items()}
+                np.savez(file, **{f"{w}_{k}": v for k, pair in result.items() for w, v in zip("xy", pair)})
+        self.pairs = result
+        self.truth = {k: x.sum(axis=0) / y.sum(axis=0) for k, (x, y) in result.items()}
         self.common = self.truth["reach"] >= 0.5
-        self.count = len(found["reach"][0])
+        self.count = len(result["reach"][0])
 
     def draw(self, measure: str, who: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         x, y = self.pairs[measure]
@@ -71,12 +72,12 @@ def _visits() -> dict[str, tuple[np.ndarray, np.ndarray]]:
     areas = AreaSet((*goods.areas, *labels))
     counting = counting_of(around, areas, make_aois(areas.elements, {}))
     walks, rng = Walks(WALKS), np.random.default_rng(3)
-    found: dict[str, list] = defaultdict(list)
+    result: dict[str, list] = defaultdict(list)
     for _ in range(VISITS):
         people = Participants.from_sums(count_block(walks.rays(np.arange(WALKS), rng), counting), ALL, True)
         for m in MEASURES:
-            found[m.name].append(m.numerator_denominator(people))
-    made = {k: [np.concatenate(w).astype(float) for w in zip(*v)] for k, v in found.items()}
+            result[m.name].append(m.numerator_denominator(people))
+    made = {k: [np.concatenate(w).astype(float) for w in zip(*v)] for k, v in result.items()}
     return {k: (x, y) for k, (x, y) in made.items()}
 
 
@@ -163,8 +164,8 @@ def ratio_intervals(x: np.ndarray, y: np.ndarray, seed: int) -> dict:
     out["bootstrap, percentiles"] = tuple(np.nanquantile(star, (0.025, 0.975), axis=0))
     out["BCa bootstrap"] = _bca(star, m, without)
     out["bootstrap-t, two tails"] = (m - high * s, m - low * s)
-    kept = estimate_ratios(x, y, resamples=RESAMPLES, seed=seed)
-    out["symmetric bootstrap-t, jackknife (kept)"] = (kept.low, kept.high)
+    selected = estimate_ratios(x, y, resamples=RESAMPLES, seed=seed)
+    out["symmetric bootstrap-t, jackknife (kept)"] = (selected.low, selected.high)
     return out
 
 
@@ -185,26 +186,26 @@ def _bca(star: np.ndarray, m: np.ndarray, without: np.ndarray) -> tuple[np.ndarr
 class Held:
     """Coverage of the ``truth`` (K,) by intervals, per AOI."""
 
-    def __init__(self, truth: np.ndarray, common: np.ndarray, most: float):
-        self.truth, self.common, self.most = truth, common, most
+    def __init__(self, truth: np.ndarray, common: np.ndarray, maximum: float):
+        self.truth, self.common, self.most = truth, common, maximum
         self.rows: list[np.ndarray] = []
 
-    def add(self, low: np.ndarray, high: np.ndarray, known: np.ndarray) -> None:
+    def add(self, low: np.ndarray, high: np.ndarray, expected: np.ndarray) -> None:
         low, high = np.clip(low, 0, self.most), np.clip(high, 0, self.most)
-        inside = known & (low <= self.truth + 1e-12) & (self.truth <= high + 1e-12)
-        self.rows.append(np.stack([inside, known, np.where(known, (high - low) / self.truth, np.nan)]))
+        inside = expected & (low <= self.truth + 1e-12) & (self.truth <= high + 1e-12)
+        self.rows.append(np.stack([inside, expected, np.where(expected, (high - low) / self.truth, np.nan)]))
 
     def cells(self, common: bool) -> str:
         """Mean, minimum, median width and number of missing intervals, for common and rare AOIs."""
-        inside, known, width = (v[:, self.common == common] for v in np.moveaxis(np.array(self.rows, float), 1, 0))
-        some = known.sum(axis=0) >= DRAWN
+        inside, expected, width = (v[:, self.common == common] for v in np.moveaxis(np.array(self.rows, float), 1, 0))
+        some = expected.sum(axis=0) >= DRAWN
         if not some.any():
             return "| | | | 100 % "
-        each = inside.sum(axis=0)[some] / known.sum(axis=0)[some]
+        each = inside.sum(axis=0)[some] / expected.sum(axis=0)[some]
         middle = np.nanmedian(np.nanmedian(width[:, some], axis=0))
         return (
             f"| {100 * each.mean():.1f} % | {100 * each.min():.1f} % | {100 * middle:.0f} % | "
-            f"{100 * (1 - known.mean()):.0f} % "
+            f"{100 * (1 - expected.mean()):.0f} % "
         )
 
 
@@ -214,21 +215,23 @@ HEAD = (
 )
 
 
-def compare(population: Population, sets: int, people: tuple[int, ...], names: tuple[str, ...], ways=ratio_intervals):
+def compare(
+    population: Population, sets: int, people: tuple[int, ...], names: tuple[str, ...], variants=ratio_intervals
+):
     for name in names:
         print(f"\n{MEASURES_BY_NAME[name].title}\n\n| interval {HEAD}")
         for n in people:
-            rng, found = np.random.default_rng(n), {}
+            rng, result = np.random.default_rng(n), {}
             for _ in range(sets):
                 x, y = population.draw(name, rng.integers(0, population.count, n))
                 with np.errstate(all="ignore"):
-                    made = ways(x, y, int(rng.integers(1 << 30)))
-                known = np.isfinite(next(ends for way, ends in made.items() if "kept" in way)[0])
-                for way, (low, high) in made.items():
+                    made = variants(x, y, int(rng.integers(1 << 30)))
+                expected = np.isfinite(next(ends for way, ends in made.items() if "kept" in way)[0])
+                for direction, (low, high) in made.items():
                     held = Held(population.truth[name], population.common, MEASURES_BY_NAME[name].upper_limit)
-                    found.setdefault(way, held).add(low, high, known)
-            for way, held in found.items():
-                print(f"| {way} | {n} {held.cells(True)}{held.cells(False)}|", flush=True)
+                    result.setdefault(direction, held).add(low, high, expected)
+            for direction, held in result.items():
+                print(f"| {direction} | {n} {held.cells(True)}{held.cells(False)}|", flush=True)
 
 
 def few_intervals(x: np.ndarray, y: np.ndarray, seed: int) -> dict:
@@ -236,11 +239,11 @@ def few_intervals(x: np.ndarray, y: np.ndarray, seed: int) -> dict:
     from nerg_mi.statistics import estimates
     from nerg_mi.statistics.estimates import estimate_ratios
 
-    kept = estimate_ratios(x, y, resamples=RESAMPLES, seed=seed)
+    selected = estimate_ratios(x, y, resamples=RESAMPLES, seed=seed)
     value, _, people = estimates._linear(x, y)
-    apart = estimates._left_out(x, y, value, people)
-    error, square = np.sqrt((apart**2).sum(axis=0)), apart**2
-    c = (kept.high - value) / error
+    difference = estimates._left_out(x, y, value, people)
+    error, square = np.sqrt((difference**2).sum(axis=0)), difference**2
+    c = (selected.high - value) / error
     few = (people <= len(x) / 2) & (np.where(y > 0, y, np.inf).min(axis=0) < y.max(axis=0))
     t = lambda freedom: stats.t.ppf(0.975, np.maximum(freedom, 1.0))
     effective = square.sum(axis=0) ** 2 / (square**2).sum(axis=0)
@@ -262,7 +265,7 @@ def numbers(population: Population, sets: int, people: tuple[int, ...]) -> None:
     print(f"\n| number {HEAD}")
     for n in people:
         rng = np.random.default_rng(n)
-        found = {m.name: Held(population.truth[m.name], population.common, m.upper_limit) for m in MEASURES}
+        result = {m.name: Held(population.truth[m.name], population.common, m.upper_limit) for m in MEASURES}
         for _ in range(sets):
             who, seed = rng.integers(0, population.count, n), int(rng.integers(1 << 30))
             for m in MEASURES:
@@ -272,8 +275,8 @@ def numbers(population: Population, sets: int, people: tuple[int, ...]) -> None:
                     if m.is_proportion
                     else estimate_ratios(x, y, resamples=RESAMPLES, seed=seed, upper_limit=m.upper_limit)
                 )
-                found[m.name].add(e.low, e.high, np.isfinite(e.low))
-        for name, held in found.items():
+                result[m.name].add(e.low, e.high, np.isfinite(e.low))
+        for name, held in result.items():
             print(f"| {name} | {n} {held.cells(True)}{held.cells(False)}|", flush=True)
 
 
@@ -284,7 +287,7 @@ def differences(population: Population, sets: int, pairs: tuple[tuple[int, int],
     print("\n| people | number | p <= 0.05 | most of a thing | rare | most | a set has a false discovery |")
     print("| --- | --- | ---: | ---: | ---: | ---: | ---: |")
     for m, n in pairs:
-        rng, found, wrong = np.random.default_rng([m, n]), defaultdict(list), []
+        rng, result, wrong = np.random.default_rng([m, n]), defaultdict(list), []
         first = (np.arange(m + n) < m).astype(float)[:, None]
         for _ in range(sets):
             who, seed = rng.integers(0, population.count, m + n), int(rng.integers(1 << 30))
@@ -296,10 +299,10 @@ def differences(population: Population, sets: int, pairs: tuple[tuple[int, int],
                     d = estimate_proportion_differences(a, b)
                 else:
                     d = estimate_ratio_differences(a, b, resamples=RESAMPLES, seed=seed)
-                found[name].append(d.p)
+                result[name].append(d.p)
                 every.append(d.p)
             wrong.append(bool((adjust_p_values(np.concatenate(every)) <= 0.05).any()))
-        for name, p in found.items():
+        for name, p in result.items():
             rate = (np.array(p) <= 0.05).mean(axis=0)
             cells = [f"{100 * f(rate[population.common == c]):.1f} %" for c in (True, False) for f in (np.mean, np.max)]
             print(f"| {m} and {n} | {name} | {' | '.join(cells)} | {100 * np.mean(wrong):.1f} % |", flush=True)
@@ -312,28 +315,29 @@ def main() -> None:
     parser.add_argument("--people", type=int, nargs="+", default=[8, 16, 40], help="people of each (8 16 40)")
     parser.add_argument("--of", nargs="+", default=["share", "given_visible", "distance"], help="numbers of the ratios")
     parser.add_argument("--population", type=Path, help=".npz file of the sums, written where there is none")
-    given = parser.parse_args()
-    people = tuple(given.people)
-    if given.what == "shares":
+    arguments = parser.parse_args()
+    people = tuple(arguments.people)
+    if arguments.what == "shares":
         shares(people)
         return
-    population = Population(given.population)
+    population = Population(arguments.population)
     truth = population.truth["reach"]
     print(
-        f"{given.sets} data sets; reach of {population.common.sum()} common things {truth[population.common].min():.2f}"
+        f"{arguments.sets} data sets; hit ratio of {population.common.sum()} common AOIs "
+        f"{truth[population.common].min():.2f}"
     )
     print(
         f"to {truth.max():.4f}, of {(~population.common).sum()} rare ones {truth.min():.2f} to "
         f"{truth[~population.common].max():.2f}"
     )
-    if given.what == "ratios":
-        compare(population, given.sets, people, tuple(given.of))
-    elif given.what == "few":
-        compare(population, given.sets, people, tuple(given.of), few_intervals)
-    elif given.what == "numbers":
-        numbers(population, given.sets, people)
+    if arguments.what == "ratios":
+        compare(population, arguments.sets, people, tuple(arguments.of))
+    elif arguments.what == "few":
+        compare(population, arguments.sets, people, tuple(arguments.of), few_intervals)
+    elif arguments.what == "numbers":
+        numbers(population, arguments.sets, people)
     else:
-        differences(population, given.sets, tuple((n, n) for n in people) + ((6, 20),))
+        differences(population, arguments.sets, tuple((n, n) for n in people) + ((6, 20),))
 
 
 if __name__ == "__main__":

@@ -33,16 +33,16 @@ def made_store():
     return around, areas, make_aois(areas.elements, shapes_by_id(around.scene))
 
 
-def counting_of(around, areas, things, seen: bool = True):
+def counting_of(around, areas, shapes, seen: bool = True):
     from nerg_mi.aoi.measured import AoiContext
     from nerg_mi.statistics.shares import SamplePoints, VisibilityCache
     from nerg_mi.statistics.visits import VisitRules
 
-    in_view = VisibilityCache(SamplePoints.sample(things, 48), around.depth, 0.1, 0.03) if seen else None
+    in_view = VisibilityCache(SamplePoints.sample(shapes, 48), around.depth, 0.1, 0.03) if seen else None
     members = list(areas.members().values())
     rules = VisitRules(max_gap=2.0, session_pause=60.0, merge_gap=0.15, min_visit=0.1)
     return AoiContext(
-        around, things, areas.names, members, range(len(members)), rules, 0.03, fov=120.0, visibility_cache=in_view
+        around, shapes, areas.names, members, range(len(members)), rules, 0.03, fov=120.0, visibility_cache=in_view
     )
 
 
@@ -101,9 +101,9 @@ def errors() -> None:
     from nerg_mi.statistics.visits import ALL, assign_hits
     from nerg_mi.workflows.base import SILENT
 
-    around, areas, things = made_store()
+    around, areas, shapes = made_store()
     walks = Walks(12, seed=5)
-    counting = counting_of(around, areas, things)
+    counting = counting_of(around, areas, shapes)
     rng = np.random.default_rng(1)
     rays = walks.rays(np.arange(12), rng)
     people = Participants.from_sums(count_block(rays, counting), ALL, True)
@@ -130,16 +130,16 @@ def errors() -> None:
     # Fractions of the law, by quadrature over the sphere at some positions, next to the field's and a large sample.
     rows = np.linspace(0, len(walks.origin) - 1, 160).round().astype(int)
     d = fibonacci_directions(8192)
-    eyes = walks.origin[rows]
-    density = walks.law.density(eyes, d)
-    o, along = np.repeat(eyes, len(d), axis=0), np.tile(d, (len(eyes), 1))
+    positions = walks.origin[rows]
+    density = walks.law.density(positions, d)
+    o, along = np.repeat(positions, len(d), axis=0), np.tile(d, (len(positions), 1))
     law = np.zeros((len(rows), len(areas.names)))
     far = np.zeros_like(law)
-    for a in range(0, len(eyes), 40):
+    for a in range(0, len(positions), 40):
         part = slice(a * len(d), (a + 40) * len(d))
-        found = assign_hits(things, o[part], along[part], twin.cast_rays(o[part], along[part]), 0.03)
+        result = assign_hits(shapes, o[part], along[part], twin.cast_rays(o[part], along[part]), 0.03)
         weight = density[a : a + 40].ravel() * (4 * np.pi / len(d))
-        for k, (at, distance) in enumerate(zip(found.rows, found.distance)):
+        for k, (at, distance) in enumerate(zip(result.rows, result.distance)):
             law[a : a + 40, k] = np.bincount(at // len(d), weights=weight[at], minlength=40)
             far[a : a + 40, k] = np.bincount(at // len(d), weights=weight[at] * distance, minlength=40)
     # Many draws at the same positions, through the same counting of rays.
@@ -170,32 +170,35 @@ def errors() -> None:
     off = np.abs(near - mean)
     print(f"| mean distance [m] of these | the same | {off.max():.2g} (median {np.median(off):.2g}) |")
     at = Viewpoints(
-        eyes, np.tile([1.0, 0, 0], (len(eyes), 1)), tuple(map(str, range(len(eyes)))), (frozenset([ALL]),) * len(eyes)
+        positions,
+        np.tile([1.0, 0, 0], (len(positions), 1)),
+        tuple(map(str, range(len(positions)))),
+        (frozenset([ALL]),) * len(positions),
     )
-    told = predict_attention(around, at, things, counting.members, 0.03, 360.0, 48, 8192, SILENT)
-    error = np.abs(told.share.mean(axis=0) - shares)
-    r = np.corrcoef(told.share.mean(axis=0), shares)[0, 1]
+    reported = predict_attention(around, at, shapes, counting.members, 0.03, 360.0, 48, 8192, SILENT)
+    error = np.abs(reported.share.mean(axis=0) - shares)
+    r = np.corrcoef(reported.share.mean(axis=0), shares)[0, 1]
     print(
         f"| share by the field | the same | {error.max():.2g} (median {np.median(error):.2g} of "
         f"{np.median(shares):.2g}; r {r:.3f}) |"
     )
-    off = np.abs(told.distance.sum(axis=0) / told.share.sum(axis=0) - mean)
+    off = np.abs(reported.distance.sum(axis=0) / reported.share.sum(axis=0) - mean)
     print(f"| mean distance [m] by the field | the same | {off.max():.2g} (median {np.median(off):.2g}) |")
     # Visibility: exact ray casts from the participants' positions, against cells of 10 cm.
     some = np.linspace(0, len(rays) - 1, 1500).round().astype(int)
-    chosen = rays.select(some)
-    seen = counting.visibility(chosen)
-    targets = SamplePoints.sample(things, 48)
+    selected = rays.select(some)
+    seen = counting.visibility(selected)
+    targets = SamplePoints.sample(shapes, 48)
     exact = np.zeros_like(seen)
-    for n in range(len(chosen)):
-        away = targets.points - chosen.origin[n]
+    for n in range(len(selected)):
+        away = targets.points - selected.origin[n]
         length = np.linalg.norm(away, axis=1)
         front = (away * targets.normals).sum(axis=1) < 0
-        within = away @ chosen.direction[n] >= np.cos(np.radians(60)) * length
+        within = away @ selected.direction[n] >= np.cos(np.radians(60)) * length
         free = np.zeros(len(length), bool)
         ask = np.flatnonzero(front & within)
         if len(ask):
-            free[ask] = twin.is_visible(chosen.origin[n], targets.points[ask], tolerance=0.03)
+            free[ask] = twin.is_visible(selected.origin[n], targets.points[ask], tolerance=0.03)
         exact[n] = np.bincount(targets.aoi_index, weights=free, minlength=exact.shape[1]) > 0
     agree = (seen == exact).mean()
     print(

@@ -36,27 +36,27 @@ def look_at(origin):
 
 def configurations() -> dict[str, dict]:
     """Name of each configuration and its additions to a bare integrator."""
-    there = {"observer": {"type": "perspective", "to_world": look_at(OBSERVER)}}
-    here = {"observer": {"type": "perspective", "to_world": look_at(CAMERA)}}
+    moved = {"observer": {"type": "perspective", "to_world": look_at(OBSERVER)}}
+    local = {"observer": {"type": "perspective", "to_world": look_at(CAMERA)}}
     dark = {"radiance": False}
     return {
         "nothing": dark | {"aovs": ""},
         "depth": dark | {"aovs": "depth,opacity"},
         "expected depth": dark | {"aovs": "depth,opacity", "depth": "expected"},
         "colour, depth": {"aovs": "depth,opacity"},
-        "gaze given, not asked for": {"aovs": "depth,opacity"} | there,
+        "gaze given, not asked for": {"aovs": "depth,opacity"} | moved,
         "gaze, camera is the observer": {"aovs": "depth,opacity,gaze"},
-        "gaze, observer at the camera": {"aovs": "depth,opacity,gaze"} | here,
-        "gaze, observer elsewhere": {"aovs": "depth,opacity,gaze"} | there,
-        "... without occlusion": {"aovs": "depth,opacity,gaze", "occlusion": False} | there,
-        "... by transmittance": {"aovs": "depth,opacity,gaze", "visibility": "transmittance"} | there,
-        "... by a map, first frame": {"aovs": "depth,opacity,gaze", "visibility": "map"} | there,
-        "... by a map, next frames": {"aovs": "depth,opacity,gaze", "visibility": "map"} | there,
+        "gaze, observer at the camera": {"aovs": "depth,opacity,gaze"} | local,
+        "gaze, observer elsewhere": {"aovs": "depth,opacity,gaze"} | moved,
+        "... without occlusion": {"aovs": "depth,opacity,gaze", "occlusion": False} | moved,
+        "... by transmittance": {"aovs": "depth,opacity,gaze", "visibility": "transmittance"} | moved,
+        "... by a map, first frame": {"aovs": "depth,opacity,gaze", "visibility": "map"} | moved,
+        "... by a map, next frames": {"aovs": "depth,opacity,gaze", "visibility": "map"} | moved,
         "shapes in place of the field: depth": dark | {"aovs": "depth,opacity"} | SHAPES,
-        "... gaze, observer elsewhere": dark | {"aovs": "depth,opacity,gaze"} | there | SHAPES,
+        "... gaze, observer elsewhere": dark | {"aovs": "depth,opacity,gaze"} | moved | SHAPES,
         "... albedo, depth": {"aovs": "depth,opacity"} | SHAPES,
         "field and a shape: depth": dark | {"aovs": "depth,opacity", "shapes": BOX},
-        "... gaze, observer elsewhere ": dark | {"aovs": "depth,opacity,gaze", "shapes": BOX} | there,
+        "... gaze, observer elsewhere ": dark | {"aovs": "depth,opacity,gaze", "shapes": BOX} | moved,
     }
 
 
@@ -82,12 +82,12 @@ def scene(width: int, options: dict):
 
 def evaluations(width: int, options: dict) -> list[float]:
     """Mean density, colour and gaze evaluations per pixel, counted in a separate rendering."""
-    asked = [a for a in options["aovs"].split(",") if a]
-    if not asked:
+    requested = [a for a in options["aovs"].split(",") if a]
+    if not requested:
         return [0.0, 0.0, 0.0]
-    counts = ["density_evals", "color_evals"] + (["gaze_evals"] if "gaze" in asked else [])
-    image = mi.render(scene(width, options | {"aovs": ",".join(asked + counts)}), spp=1).numpy()
-    means = image[..., 3 + len(asked) :].mean((0, 1)).tolist()
+    counts = ["density_evals", "color_evals"] + (["gaze_evals"] if "gaze" in requested else [])
+    image = mi.render(scene(width, options | {"aovs": ",".join(requested + counts)}), spp=1).numpy()
+    means = image[..., 3 + len(requested) :].mean((0, 1)).tolist()
     return means + [0.0] * (3 - len(means))
 
 

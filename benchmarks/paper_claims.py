@@ -36,15 +36,15 @@ def main(argv=None) -> None:
     parser.set_defaults(only="supermarket,store")
     parser.add_argument("--steps", type=int, default=800, help="of the recipes but the default one")
     parser.add_argument("--recipes", default="default,paper")
-    parser.add_argument("--variant", action="append", default=[], help="only this one; may be given several times")
+    parser.add_argument("--variant", action="append", default=[], help="only this one; can be repeated")
     args = parse(parser, argv)
     select_backend("llvm_ad_rgb", args.threads)
-    known, each = {f.name for f in fields(AblationOptions)}, []
+    expected, each = {f.name for f in fields(AblationOptions)}, []
     for name, make in asked_places(args).items():
         folder, rays, where = write_place(name, make, args)
         for fold in range(args.folds):
             options = AblationOptions(
-                **{k: v for k, v in where.items() if k in known},
+                **{k: v for k, v in where.items() if k in expected},
                 recipes=args.recipes,
                 variant=tuple(args.variant),
                 seed=fold,
@@ -56,11 +56,11 @@ def main(argv=None) -> None:
                 threads=args.threads,
             )
             with TerminalReporter() as reporter:
-                found = ablate(rays, folder / f"fold{fold}", options, reporter)
-            each += [{"place": name, "fold": fold, **row} for row in found.rows]
-        own = [row for row in each if row["place"] == name]
+                result = ablate(rays, folder / f"fold{fold}", options, reporter)
+            each += [{"place": name, "fold": fold, **row} for row in result.rows]
+        separate = [row for row in each if row["place"] == name]
         heads = ("recipe", "variant", "loss, training", "rises by", "KLD", "less", "CC", "less")
-        print_table(f"The paper's variants: {name}", heads, summarise(own))
+        print_table(f"The paper's variants: {name}", heads, summarise(separate))
         write_rows(args.out / "folds.csv", each)
     heads = ("place", "recipe", "product", *(f"{v} less it" for v in ORDER), "s")
     print_table("CC in all places", heads, order(each))
@@ -70,12 +70,12 @@ def summarise(rows: list[dict]) -> list[list[str]]:
     """Means over folds of one scene, and their difference from the product."""
     out = []
     for recipe, variant in dict.fromkeys((r["recipe"], r["variant"]) for r in rows):
-        own = [r for r in rows if (r["recipe"], r["variant"]) == (recipe, variant)]
-        cells = [recipe, variant, f"{np.mean([r['train_loss'] for r in own]):.3f}"]
-        cells.append(told([r["test_loss"] - r["train_loss"] for r in own]))
+        separate = [r for r in rows if (r["recipe"], r["variant"]) == (recipe, variant)]
+        cells = [recipe, variant, f"{np.mean([r['train_loss'] for r in separate]):.3f}"]
+        cells.append(told([r["test_loss"] - r["train_loss"] for r in separate]))
         for key in ("test_KLD", "test_CC"):
             above = "" if variant == WHOLE else told(less(rows, recipe, variant, key))
-            cells += [f"{np.mean([r[key] for r in own]):.3f}", above]
+            cells += [f"{np.mean([r[key] for r in separate]):.3f}", above]
         out.append(cells)
     return out
 
@@ -84,20 +84,20 @@ def order(rows: list[dict]) -> list[list[str]]:
     """CC of the product in each scene, the differences of the variants of `ORDER` from it, and training seconds."""
     out = []
     for place, recipe in dict.fromkeys((r["place"], r["recipe"]) for r in rows):
-        own = [r for r in rows if r["place"] == place]
-        whole = [r for r in own if (r["recipe"], r["variant"]) == (recipe, WHOLE)]
-        cc = f"{np.mean([r['test_CC'] for r in whole]):.3f}" if whole else ""
-        seconds = f"{np.median([r['train_seconds'] for r in whole]):.0f}" if whole else ""
-        above = (told(less(own, recipe, variant, "test_CC")) for variant in ORDER)
+        separate = [r for r in rows if r["place"] == place]
+        full = [r for r in separate if (r["recipe"], r["variant"]) == (recipe, WHOLE)]
+        cc = f"{np.mean([r['test_CC'] for r in full]):.3f}" if full else ""
+        seconds = f"{np.median([r['train_seconds'] for r in full]):.0f}" if full else ""
+        above = (told(less(separate, recipe, variant, "test_CC")) for variant in ORDER)
         out.append([place, recipe, cc, *above, seconds])
     return out
 
 
 def less(rows: list[dict], recipe: str, variant: str, key: str) -> list[float]:
     """The score ``key`` of a variant minus that of the product, in each fold with both."""
-    found = {(r["variant"], r["fold"]): r[key] for r in rows if r["recipe"] == recipe}
-    folds = sorted({fold for name, fold in found if name == variant and (WHOLE, fold) in found})
-    return [found[variant, fold] - found[WHOLE, fold] for fold in folds]
+    result = {(r["variant"], r["fold"]): r[key] for r in rows if r["recipe"] == recipe}
+    folds = sorted({fold for name, fold in result if name == variant and (WHOLE, fold) in result})
+    return [result[variant, fold] - result[WHOLE, fold] for fold in folds]
 
 
 def told(values: list[float]) -> str:

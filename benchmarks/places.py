@@ -60,12 +60,14 @@ def parse(parser: argparse.ArgumentParser, argv=None) -> argparse.Namespace:
 
 def asked_places(args: argparse.Namespace) -> dict[str, Make]:
     """The generators of the requested scenes, by name. Raises ``SystemExit`` for unknown ones."""
-    known = makers(args.data)
-    names = args.only.split(",") if args.only else list(known)
+    expected = makers(args.data)
+    names = args.only.split(",") if args.only else list(expected)
     for name in names:
-        if name not in known:
-            raise SystemExit(f'no place is called "{name}" here; there are {", ".join(known)} (set NERG_DATA for more)')
-    return {name: known[name] for name in names}
+        if name not in expected:
+            raise SystemExit(
+                f'no place is called "{name}" here; there are {", ".join(expected)} (set NERG_DATA for more)'
+            )
+    return {name: expected[name] for name in names}
 
 
 def write_place(name: str, make: Make, args: argparse.Namespace) -> tuple[Path, Path, dict]:
@@ -137,7 +139,7 @@ def main(argv=None) -> None:
     parser.add_argument("--zones", type=int, default=3, help="zones of test positions of a fold")
     parser.add_argument("--mix-folds", type=int, help="Default: the recipe's.")
     parser.add_argument("--mix-kappa", type=float, help="Default: the recipe's.")
-    parser.add_argument("--no-surfaces", action="store_true", help="as if no place had known surfaces")
+    parser.add_argument("--no-surfaces", action="store_true", help="ignore known surfaces in all scenes")
     parser.add_argument("--against", type=Path, help="folds.csv of a run whose field this one is compared with")
     parser.add_argument("--uncertainty", action="store_true", help="whether fields know what they do not know")
     parser.add_argument("--ensemble", type=int, default=0, help="members of each fold's field")
@@ -196,19 +198,19 @@ def summarise(each: list[dict]) -> list[dict]:
 
     out = []
     for name in dict.fromkeys(row["place"] for row in each):
-        own = [row for row in each if row["place"] == name]
-        methods = [m for m in dict.fromkeys(row["method"] for row in own) if m != HALF]
-        row: dict = {"place": name, "folds": len({r["fold"] for r in own})}
+        separate = [row for row in each if row["place"] == name]
+        methods = [m for m in dict.fromkeys(row["method"] for row in separate) if m != HALF]
+        row: dict = {"place": name, "folds": len({r["fold"] for r in separate})}
         for s, high in SCORES.items():
-            values = {m: np.array([r[s] for r in own if r["method"] == m], float) for m in methods}
+            values = {m: np.array([r[s] for r in separate if r["method"] == m], float) for m in methods}
             means = {m: v.mean() for m, v in values.items()}
             order = sorted(methods, key=lambda m: -means[m] if high else means[m])
             best = next(m for m in order if m != OURS)
             less = values[OURS] - values[best]
-            reach = interval(less)
+            scale = interval(less)
             row |= {s: means[OURS], f"{s} blind": means[BLIND], f"{s} best": means[best], f"{s} best is": best}
-            row |= {f"{s} rank": order.index(OURS) + 1, f"{s} less": less.mean(), f"{s} reach": reach}
-            half = [r[s] for r in own if r["method"] == HALF]
+            row |= {f"{s} rank": order.index(OURS) + 1, f"{s} less": less.mean(), f"{s} reach": scale}
+            half = [r[s] for r in separate if r["method"] == HALF]
             row[f"{s} half"] = float(np.mean(half)) if half else np.nan
         # With few participants one half predicts the other worse than the position-independent prior does: the fraction
         # is undefined.
@@ -235,12 +237,12 @@ def show_change(each: list[dict], before: Path) -> None:
     import numpy as np
 
     with before.open() as file:
-        known = {(r["place"], int(r["fold"])): r for r in csv.DictReader(file) if r["method"] == OURS}
+        expected = {(r["place"], int(r["fold"])): r for r in csv.DictReader(file) if r["method"] == OURS}
     print(f"\nfield less that of {before}")
-    own = [r for r in each if r["method"] == OURS and (r["place"], r["fold"]) in known]
-    for name in dict.fromkeys(r["place"] for r in own):
-        folds = [r for r in own if r["place"] == name]
-        less = {s: np.array([float(r[s]) - float(known[name, r["fold"]][s]) for r in folds]) for s in SCORES}
+    separate = [r for r in each if r["method"] == OURS and (r["place"], r["fold"]) in expected]
+    for name in dict.fromkeys(r["place"] for r in separate):
+        folds = [r for r in separate if r["place"] == name]
+        less = {s: np.array([float(r[s]) - float(expected[name, r["fold"]][s]) for r in folds]) for s in SCORES}
         print(f"{name:12s}" + ", ".join(f"{s} {v.mean():+.3f} ± {interval(v):.3f}" for s, v in less.items()))
 
 

@@ -49,7 +49,7 @@ def status(name: str) -> float:
     raise RuntimeError(f'this system does not say "{name}" of a process; measure on Linux')
 
 
-def peak(way: str, width: int, height: int) -> dict[str, float]:
+def peak(direction: str, width: int, height: int) -> dict[str, float]:
     """Memory of one frame in this process."""
     import drjit as dr
     import mitsuba as mi
@@ -66,7 +66,7 @@ def peak(way: str, width: int, height: int) -> dict[str, float]:
     Path("/proc/self/clear_refs").write_text("5")
     before = status("VmRSS")
     values = {"width": str(width), "height": str(height), "spp": "1", "aovs": "depth,gaze"}
-    if way == "mi.render":
+    if direction == "mi.render":
         np.array(mi.render(load_scene(find_store_scene(), values), spp=1))
     else:
         with tempfile.TemporaryDirectory() as folder:
@@ -81,8 +81,8 @@ def memory(sizes=SIZES) -> list[list[str]]:
     rows = []
     for width, height in sizes:
         row = [f"{width} x {height}"]
-        for way in WAYS:
-            command = [sys.executable, __file__, "memory", "--one", way, "--sizes", f"{width}x{height}"]
+        for direction in WAYS:
+            command = [sys.executable, __file__, "memory", "--one", direction, "--sizes", f"{width}x{height}"]
             for _ in range(2):
                 peaks = json.loads(subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout)
             row.append(f"{peaks['resident']:.0f} ({peaks['arrays']:.0f})")

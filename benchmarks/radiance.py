@@ -138,8 +138,8 @@ def store(args: argparse.Namespace) -> tuple[str, list[str], list[list[str]], li
             }
             rows.append(row)
             name = "images alone" if source == "images" else "images and depth"
-            more = [f"{100 * depth.median:.2f} cm", f"{depth.outlier_fraction:.1%}", f"{depth.opacity:.4f}"]
-            table.append([name, *cells(row), *more])
+            overrides = [f"{100 * depth.median:.2f} cm", f"{depth.outlier_fraction:.1%}", f"{depth.opacity:.4f}"]
+            table.append([name, *cells(row), *overrides])
     return "The store", ["from", *SCORES, "depth off, median", "by more than a tenth", "opacity"], table, rows
 
 
@@ -156,21 +156,27 @@ def tabletop(args: argparse.Namespace) -> tuple[str, list[str], list[list[str]],
     unbounded = False if args.bounded else None
     options = RadianceOptions(minutes=minutes, unbounded=unbounded, threads=args.threads, seed=args.seed)
     result = train_radiance(args.data, path, options)
-    about, box = result.provenance, result.field.box.core
+    metadata, box = result.provenance, result.field.box.core
     held_out = open_dataset(args.data / DEPTH_FILE).held_out
-    if [v.name.rpartition("/")[2] for v in held_out] != about["held_out"]["frames"]:
+    if [v.name.rpartition("/")[2] for v in held_out] != metadata["held_out"]["frames"]:
         raise SystemExit(f"{args.data / DEPTH_FILE} holds out other photos than the capture beside it")
-    for line in about["complaints"]:
+    for line in metadata["complaints"]:
         print(line)
     s = score_depths(path, held_out, box, OBJECT_CENTER, args.spp, args.out / "pictures")
     size = " x ".join(f"{u - l:.1f}" for l, u in zip(box.lower, box.upper)) + " m"
     size += ", contracted" if result.field.box.is_contracted else ""
-    table = [f"{minutes:g}", f"{about['seconds']:.0f}", f"{about['steps']:,}", f"{s['psnr']:.2f}", f"{s['ssim']:.3f}"]
+    table = [
+        f"{minutes:g}",
+        f"{metadata['seconds']:.0f}",
+        f"{metadata['steps']:,}",
+        f"{s['psnr']:.2f}",
+        f"{s['ssim']:.3f}",
+    ]
     table += [f"{s['psnr_within']:.2f}, {s['psnr_beyond']:.2f}", f"{s['beyond']:.1%}"]
     table += [f"{100 * s['near_median']:.2f} cm, {s['near_off']:.1%}", f"{s['far_median']:.1%}, {s['far_off']:.1%}"]
     head = ["minutes", "seconds", "steps", "PSNR, dB", "SSIM", "within, beyond", "pixels beyond"]
     head += ["near: median, off", "far: median, off", "box"]
-    row = {"minutes": minutes, "seconds": about["seconds"], "steps": about["steps"], **s, "box": size}
+    row = {"minutes": minutes, "seconds": metadata["seconds"], "steps": metadata["steps"], **s, "box": size}
     return "An unbounded capture", head, [[*table, size]], [row]
 
 

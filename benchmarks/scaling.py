@@ -53,7 +53,7 @@ def room(folder: Path, observers: int, count: int) -> None:
     Rays(t, person, names, origin, d, np.ones(len(person))).save(folder / "rays.npz")
 
 
-def bake(folder: Path, detail: float, name: str, **more) -> tuple[int, bytes]:
+def bake(folder: Path, detail: float, name: str, **overrides) -> tuple[int, bytes]:
     """Observers and the bytes of the results."""
     from nerg_mi.scenes import store
     from nerg_mi.workflows.bake import bake
@@ -61,17 +61,19 @@ def bake(folder: Path, detail: float, name: str, **more) -> tuple[int, bytes]:
 
     out = folder / f"{name}.ply"
     gaze = files(store) / "shoppers.safetensors"
-    given = {"gaze": gaze, "path": folder / "path.csv", "detail": detail, "angle": 2.0, "mode": "llvm_ad_rgb"}
-    found = bake(folder / "room.ply", [out], BakeOptions(**given, **more))
-    return len(found.mesh.faces), out.read_bytes()
+    arguments = {"gaze": gaze, "path": folder / "path.csv", "detail": detail, "angle": 2.0, "mode": "llvm_ad_rgb"}
+    result = bake(folder / "room.ply", [out], BakeOptions(**arguments, **overrides))
+    return len(result.mesh.faces), out.read_bytes()
 
 
-def count(folder: Path, name: str, **more) -> tuple[int, bytes]:
+def count(folder: Path, name: str, **overrides) -> tuple[int, bytes]:
     """Rays and the bytes of the table."""
     from nerg_mi.aoi.options import StatisticsOptions
     from nerg_mi.workflows.statistics import statistics as stats
 
-    options = StatisticsOptions(aois=folder / "areas.json", resamples=199, show_names=True, mode="llvm_ad_rgb", **more)
+    options = StatisticsOptions(
+        aois=folder / "areas.json", resamples=199, show_names=True, mode="llvm_ad_rgb", **overrides
+    )
     stats([folder / "scene.xml", folder / "rays.npz"], folder / name, options)
     return 0, (folder / name / "things.csv").read_bytes()
 
@@ -96,21 +98,21 @@ def main() -> None:
             for d in DETAILS
         }
         works[f"counts of {args.rays:,} rays"] = (args.rays, "rays", partial(count, folder))
-        whole = {what: work(f"whole {what}", threads=1) for what, (_, _, work) in works.items()}
+        full = {what: work(f"whole {what}", threads=1) for what, (_, _, work) in works.items()}
         with ClusterOfProcesses(folder) as cluster:
             for workers in (1, 2):
                 cluster.start_worker()
                 for what, (units, unit, work) in works.items():
-                    given = {"scheduler": cluster.address, "threads": 1}
-                    work(f"warm {what}", **given, store=folder / f"warm {what} {workers}")
+                    arguments = {"scheduler": cluster.address, "threads": 1}
+                    work(f"warm {what}", **arguments, store=folder / f"warm {what} {workers}")
                     store = folder / f"{what} {workers}"
                     start = time.perf_counter()
-                    faces, made = work(f"{what} {workers}", **given, store=store)
+                    faces, made = work(f"{what} {workers}", **arguments, store=store)
                     seconds = time.perf_counter() - start
                     receipts = list(Store(store).iter_manifests())
                     each = [r.seconds for r in receipts]
                     size = sum(r.size for r in receipts) / len(receipts)
-                    if made != whole[what][1]:
+                    if made != full[what][1]:
                         raise SystemExit(f"{what}: {workers} workers make something else than one process")
                     row = {
                         "work": f"{what}, {faces:,} triangles" if faces else what,

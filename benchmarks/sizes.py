@@ -54,8 +54,8 @@ def observers(long: bool) -> Growth:
     scene = nerg.Scene.load(find_store_scene(), width=320, height=180)
     some = np.asarray(OBSERVER) + np.random.default_rng(0).uniform(-0.4, 0.4, (32, 3)) * (1, 1, 0.2)
     counts = (1, 2, 4, 8, *((16, 32) if long else ()))
-    asked = partial(nerg.render, scene, quantities=["depth", "gaze"], spp=1)
-    return Growth("pictures of 320 x 180", "observers", "1", {n: partial(asked, some[:n]) for n in counts})
+    requested = partial(nerg.render, scene, quantities=["depth", "gaze"], spp=1)
+    return Growth("pictures of 320 x 180", "observers", "1", {n: partial(requested, some[:n]) for n in counts})
 
 
 def rays(long: bool) -> Growth:
@@ -63,9 +63,9 @@ def rays(long: bool) -> Growth:
     o, d = camera_rays(640, 360)
     order = np.random.default_rng(0).permutation(len(o))
     counts = (1 << 13, 1 << 15, 1 << 17, *((len(o),) if long else ()))
-    asked = partial(nerg.trace, scene, quantities=["depth", "gaze"], observers=np.array([OBSERVER]))
+    requested = partial(nerg.trace, scene, quantities=["depth", "gaze"], observers=np.array([OBSERVER]))
     return Growth(
-        "`trace` of rays in no order", "rays", "1", {n: partial(asked, o[order[:n]], d[order[:n]]) for n in counts}
+        "`trace` of rays in no order", "rays", "1", {n: partial(requested, o[order[:n]], d[order[:n]]) for n in counts}
     )
 
 

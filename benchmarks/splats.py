@@ -59,11 +59,11 @@ def splat_scene(folder: Path) -> Path:
     return path
 
 
-def values(pair: str, width: int, height: int, **more: str) -> dict[str, str]:
+def values(pair: str, width: int, height: int, **overrides: str) -> dict[str, str]:
     """Parameters of the scene files for one camera and observer."""
     camera, target, eye = PAIRS[pair]
     size = {"width": str(width), "height": str(height)}
-    return {"camera": camera, "target": target, "eye": eye, **size, "falloff": "0", **more}
+    return {"camera": camera, "target": target, "eye": eye, **size, "falloff": "0", **overrides}
 
 
 def compare(scenes: dict[str, tuple[Path, dict]], width: int) -> list[dict]:
@@ -84,9 +84,11 @@ def same_depth(scenes: dict[str, tuple[Path, dict]], width: int) -> list[dict]:
             picture = render(scene, values(pair, width, 2 * width // 3, aovs="depth,visibility", **files))
             depth.append(picture[..., 3])
             seen.append(picture[..., 4] > 0.5)
-        apart = 100 * np.abs(depth[0] - depth[1])
+        difference = 100 * np.abs(depth[0] - depth[1])
         same = float((seen[0] == seen[1]).mean())
-        rows.append({"pair": pair, "median cm": np.median(apart), "p90 cm": np.percentile(apart, 90), "same": same})
+        rows.append(
+            {"pair": pair, "median cm": np.median(difference), "p90 cm": np.percentile(difference, 90), "same": same}
+        )
     return rows
 
 
@@ -103,13 +105,13 @@ def times(scene: Path, files: dict, runs: int) -> list[dict]:
     loaded = {}
     width, height = SIZE
     colour, observed = {"aovs": "opacity", "occlusion": "false"}, {"aovs": "depth,opacity,gaze,visibility"}
-    for name, more in {
+    for name, overrides in {
         "colour, stop 0.01": colour | {"stop": "0.01"},
         "colour": colour,
         "colour, depth and gaze of an observer": observed,
         "the same, by the observer's map": observed | {"visibility": "map"},
     }.items():
-        stop = more.pop("stop", None)
+        stop = overrides.pop("stop", None)
         path = scene
         if stop is not None:
             path = scene.with_name("stop.xml")
@@ -117,7 +119,7 @@ def times(scene: Path, files: dict, runs: int) -> list[dict]:
                 '<string name="depth"', f'<float name="stop" value="{stop}"/><string name="depth"'
             )
             path.write_text(text)
-        loaded[name] = mi.load_file(str(path), **values(PAIR, width, height, spp="1", **more, **files))
+        loaded[name] = mi.load_file(str(path), **values(PAIR, width, height, spp="1", **overrides, **files))
     camera, target, _ = ([float(v) for v in text.split(",")] for text in PAIRS[PAIR])
     sensor = {"type": "perspective", "fov": 78, "fov_axis": "x"}
     sensor["to_world"] = mi.ScalarTransform4f().look_at(camera, target, [0, 0, 1])
@@ -133,7 +135,7 @@ def times(scene: Path, files: dict, runs: int) -> list[dict]:
             np.array(mi.render(what, sensor=0, spp=1, seed=run))
             if run > 1:
                 taken[name].append((time.perf_counter() - wall, time.process_time() - cpu))
-    middle = {name: np.median(found, axis=0) for name, found in taken.items()}
+    middle = {name: np.median(result, axis=0) for name, result in taken.items()}
     peer = middle[PEER]
     return [
         {"what": name, "s": float(m[0]), "CPU s": float(m[1]), "of volprim": float(m[1] / peer[1])}
@@ -147,11 +149,11 @@ def picture(path: Path, scenes: dict[str, tuple[Path, dict]]) -> None:
 
     rows, brightest = [], None
     for scene, files in scenes.values():
-        found = render(scene, values(PAIR, *SIZE, aovs="depth,gaze,visibility", **files), spp=16)
-        brightest = brightest or found[..., 4].max()
-        depth, gaze, seen = found[..., 3] / DEEPEST, np.sqrt(found[..., 4] / brightest), found[..., 5]
+        result = render(scene, values(PAIR, *SIZE, aovs="depth,gaze,visibility", **files), spp=16)
+        brightest = brightest or result[..., 4].max()
+        depth, gaze, seen = result[..., 3] / DEEPEST, np.sqrt(result[..., 4] / brightest), result[..., 5]
         grey = [np.repeat(np.clip(v, 0, 1)[..., None], 3, axis=2) for v in (depth, gaze, seen)]
-        rows.append(np.concatenate([srgb(found[..., :3]), *grey], axis=1))
+        rows.append(np.concatenate([srgb(result[..., :3]), *grey], axis=1))
     write_png(path, np.concatenate(rows))
 
 
@@ -197,8 +199,8 @@ def main(argv=None) -> None:
             ]
         )
     print_table("Against exact ray casts", ("", *COLUMNS.values()), rows)
-    own = same_depth(scenes, args.width)
-    medians, same = ([row[key] for row in own] for key in ("median cm", "same"))
+    separate = same_depth(scenes, args.width)
+    medians, same = ([row[key] for row in separate] for key in ("median cm", "same"))
     print(
         f"splats against the field: depths are {min(medians):.2f} to {max(medians):.2f} cm apart (medians by pair), "
         f"visibility is the same for {np.mean(same):.1%} ({min(same):.1%} to {max(same):.1%} by pair)\n"

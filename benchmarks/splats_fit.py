@@ -99,11 +99,11 @@ def scene_of(splats: Splats):
 
 def psnr(scene, cameras, photos) -> float:
     """Mean PSNR over images, with four samples per pixel."""
-    found = []
+    result = []
     for camera, photo in zip(cameras, photos):
         picture = srgb(np.array(mi.render(scene, sensor=camera, spp=4, seed=1))[..., :3])
-        found.append(-10 * np.log10(np.square(picture - photo).mean()))
-    return float(np.mean(found))
+        result.append(-10 * np.log10(np.square(picture - photo).mean()))
+    return float(np.mean(result))
 
 
 def as_srgb(x):
@@ -191,12 +191,12 @@ def fitted(splats: Splats, photos: Photos, args, factor: float, seed: int) -> di
     return row
 
 
-def summary(found: list[dict[str, float]]) -> list[str]:
+def summary(result: list[dict[str, float]]) -> list[str]:
     """Cells of a row for several fits."""
-    of = lambda key: np.array([row[key] for row in found])
+    make = lambda key: np.array([row[key] for row in result])
     keys = ("before", "after", "fitted to, before", "fitted to, after")
-    cells = [f"{of(k).mean():.2f} ± {of(k).std(ddof=1):.2f}" for k in keys]
-    return cells + [f"{of(k).mean():.0f}" for k in ("s", "CPU ms a step", "MB at most")]
+    cells = [f"{make(k).mean():.2f} ± {make(k).std(ddof=1):.2f}" for k in keys]
+    return cells + [f"{make(k).mean():.0f}" for k in ("s", "CPU ms a step", "MB at most")]
 
 
 def main(argv=None) -> None:
@@ -208,7 +208,7 @@ def main(argv=None) -> None:
     parser.add_argument("--steps", type=int, default=150, help="of Adam")
     parser.add_argument("--rays", type=int, default=8192, help="rays a step")
     parser.add_argument("--seeds", type=int, default=3, help="fits of each kind, two at least")
-    parser.add_argument("--hits", type=int, help="print the memory for so many hits, measured in this process")
+    parser.add_argument("--hits", type=int, help="print the memory for this number of hits, measured in this process")
     parser.add_argument("--update", type=Path, help="a document whose tables are replaced")
     args = parser.parse_args(argv)
     mi.set_variant("llvm_ad_rgb")
@@ -230,20 +230,20 @@ def main(argv=None) -> None:
     kinds = {"as they are": lambda seed: splats, "disturbed": lambda seed: disturbed(splats, seed)}
     rows = []
     for name, of_seed in kinds.items():
-        known = tried[factor] if name == "disturbed" else None
-        found = [
-            known if seed == 0 and known else fitted(of_seed(seed), photos, args, factor, seed)
+        expected = tried[factor] if name == "disturbed" else None
+        result = [
+            expected if seed == 0 and expected else fitted(of_seed(seed), photos, args, factor, seed)
             for seed in range(args.seeds)
         ]
-        rows.append([name, *summary(found)])
+        rows.append([name, *summary(result)])
     head = ["splats", "held-out photos, before", "after", "photos fitted to, before", "after"]
     head += ["s", "CPU ms a step", "MB at most"]
     print_table("PSNR of photos, dB", head, rows, args.update)
     rows = []
     for hits in HITS:
         command = [sys.executable, __file__, "--hits", str(hits)]
-        found = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout.strip()
-        rows.append([f"{hits:,}", found])
+        result = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout.strip()
+        rows.append([f"{hits:,}", result])
     print_table("Memory of a derivative", ["hits a ray", "MB at most"], rows, args.update)
 
 

@@ -61,27 +61,27 @@ def main(argv=None) -> None:
     from nerg_mi.scenes.store.attention_law import AttentionLaw
     from nerg_mi.transport.field_medium import FieldMedium
 
-    here = Path(store.__file__).resolve().parent
+    local = Path(store.__file__).resolve().parent
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--gaze", type=Path, default=here / "shoppers.safetensors")
-    parser.add_argument("--field", type=Path, default=here / "store.safetensors")
-    parser.add_argument("--rays", type=Path, default=here / "build" / "rays.npz")
+    parser.add_argument("--gaze", type=Path, default=local / "shoppers.safetensors")
+    parser.add_argument("--field", type=Path, default=local / "store.safetensors")
+    parser.add_argument("--rays", type=Path, default=local / "build" / "rays.npz")
     parser.add_argument("--wide", type=float, default=20.0, help="kappa of the baselines' wider kernel")
     parser.add_argument("--out", type=Path, default=Path("out/benchmarks/store_gaze.csv"))
     args = parser.parse_args(argv)
 
     ns = namespace("llvm_ad_rgb")
     gaze, meta = load_gaze(args.gaze, ns)
-    about = meta["provenance"]
-    if "test" not in about:
+    metadata = meta["provenance"]
+    if "test" not in metadata:
         raise SystemExit(f'"{args.gaze}" was trained without held-out positions; train it with --test-zones 8')
     medium, rays, law = FieldMedium(load_radiance(args.field, ns)[0]), Rays.load(args.rays), AttentionLaw()
-    positions, radius = np.array(about["test"]["centres"]), about["test"]["radius"]
-    train = rays.select(purge(rays, positions, about["test"]["purged_within"]))
+    positions, radius = np.array(metadata["test"]["centres"]), metadata["test"]["radius"]
+    train = rays.select(purge(rays, positions, metadata["test"]["purged_within"]))
     directions = fibonacci_directions(DIRECTIONS)
     truth = law.density(positions, directions)
 
-    probe_settings = about["probes"]
+    probe_settings = metadata["probes"]
     # The silverman and loo rules have no single kappa; the default is used instead.
     narrow = probe_settings["kappa"]
     methods = {

@@ -93,9 +93,9 @@ def measure(scene: Path, pair: str, kind: str, visibility: str, files: dict, wid
     exact = np.full(depth.shape, np.nan)
     exact[surface] = twin.cast_rays(o, d[surface])
     # A millimetre in front of the surface, so that it does not hide itself.
-    truth, own = np.zeros(depth.shape, bool), np.zeros(depth.shape, bool)
+    truth, separate = np.zeros(depth.shape, bool), np.zeros(depth.shape, bool)
     truth[surface] = twin.is_visible(e, (o + (exact[surface, None] - 1e-3) * d[surface]))
-    own[surface] = twin.is_visible(e, p[surface], tolerance=0.05)
+    separate[surface] = twin.is_visible(e, p[surface], tolerance=0.05)
 
     far = surface & ~near_edges(np.nan_to_num(exact, nan=1e3), truth, margin)
     shown = seen > 0.5
@@ -108,7 +108,7 @@ def measure(scene: Path, pair: str, kind: str, visibility: str, files: dict, wid
         "wrongly seen": (shown & ~truth)[far].mean(),
         "wrongly hidden": (~shown & truth)[far].mean(),
         "agree all": (shown == truth)[surface].mean(),
-        "agree own": (shown == own)[far].mean(),
+        "agree own": (shown == separate)[far].mean(),
         "kept": far.mean(),
         "visible": truth[surface].mean(),
         "no surface": 1 - surface.mean(),
@@ -144,9 +144,7 @@ def main(argv=None) -> None:
     parser.add_argument("--margin", type=int, default=2, help="pixels left out around silhouettes")
     parser.add_argument("--kinds", default="expected,median", help=f"kinds of depth, of {', '.join(KINDS)}")
     parser.add_argument("--visibility", default="depth", help="kinds of visibility: depth, transmittance, map")
-    parser.add_argument(
-        "--pair", action="append", choices=list(PAIRS), help="only this one; may be given several times"
-    )
+    parser.add_argument("--pair", action="append", choices=list(PAIRS), help="only this one; can be repeated")
     parser.add_argument(
         "--out", type=Path, default=Path("out/benchmarks/store_visibility.csv"), help="CSV file to write"
     )

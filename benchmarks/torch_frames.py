@@ -183,9 +183,9 @@ class TorchRenderer:
                 depth[alive[at]] = t[at, k] + dt * (first[at, k] / 0.5).log() / tau[at, k]
                 if colored:
                     w = weight[row, column]
-                    kept = w > WEIGHT
-                    ray = alive[row[kept]]
-                    color.index_add_(0, ray, w[kept, None] * self.color(features[kept], d[ray]))
+                    selected = w > WEIGHT
+                    ray = alive[row[selected]]
+                    color.index_add_(0, ray, w[selected, None] * self.color(features[selected], d[ray]))
                 through[alive] = after[:, -1]
             start[alive] = t[:, -1] + dt
             going = start[alive] < t1[alive]
@@ -196,45 +196,45 @@ class TorchRenderer:
     def frame(self, o, d, observer):
         """Linear colour (N, 3), depth and gaze (N,) as arrays, of rays from ``o`` along unit ``d`` (N, 3)."""
         torch = self.torch
-        rays, found = [torch.from_numpy(np.ascontiguousarray(v, np.float32)) for v in (o, d)], []
+        rays, result = [torch.from_numpy(np.ascontiguousarray(v, np.float32)) for v in (o, d)], []
         p_o = torch.tensor(observer, dtype=torch.float32)
         with torch.no_grad():
             integral = self.integral(p_o)
             for a in range(0, len(o), RAYS):
-                found.append(self._part(*(v[a : a + RAYS] for v in rays), p_o, integral))
-        color, depth, gaze = (np.concatenate(v) for v in zip(*found))
+                result.append(self._part(*(v[a : a + RAYS] for v in rays), p_o, integral))
+        color, depth, gaze = (np.concatenate(v) for v in zip(*result))
         return np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4), depth, gaze
 
     def integral(self, p_o) -> float:
         """Integral of gaze over the sphere of the observer at ``p_o``; cached while they stay there, as in nerg."""
         torch, at = self.torch, tuple(p_o.tolist())
         if at not in self.integrals:
-            found = []
+            result = []
             for r_o in torch.from_numpy(fibonacci_directions(MAX_DIRECTIONS).astype(np.float32)).split(RAYS):
                 o = p_o.expand(len(r_o), 3)
                 distance = self.march(o, r_o, colored=False)[2]
                 escaped = ~distance.isfinite()
                 p_od = p_o + r_o * distance.masked_fill(escaped, 0.0)[:, None]
-                found.append(self.attention.unnormalized(p_od, o, r_o, escaped))
-            self.integrals[at] = 4 * np.pi * torch.cat(found).mean().item()
+                result.append(self.attention.unnormalized(p_od, o, r_o, escaped))
+            self.integrals[at] = 4 * np.pi * torch.cat(result).mean().item()
         return self.integrals[at]
 
     def _part(self, o, d, p_o, integral):
         torch = self.torch
         color, _, depth = self.march(o, d)
         gaze = torch.zeros(len(o))
-        met = depth.isfinite().nonzero()[:, 0]
-        p_d = o[met] + depth[met, None] * d[met]
+        has_surface = depth.isfinite().nonzero()[:, 0]
+        p_d = o[has_surface] + depth[has_surface, None] * d[has_surface]
         tolerance = 2 * self.dt
-        away = p_d - d[met] * tolerance - p_o
+        away = p_d - d[has_surface] * tolerance - p_o
         distance = away.norm(dim=1)
         r_o = away / distance[:, None]
-        _, _, d_o = self.march(p_o.expand(len(met), 3), r_o, distance, colored=False)
+        _, _, d_o = self.march(p_o.expand(len(has_surface), 3), r_o, distance, colored=False)
         seen = torch.where(d_o.isfinite(), (1 - (distance - d_o - tolerance) / self.falloff).clamp(0, 1), 1.0)
         lit = (seen > 0).nonzero()[:, 0]
         blocked = d_o[lit] < distance[lit] - tolerance
         p_od = torch.where(blocked[:, None], p_o + r_o[lit] * d_o[lit, None].nan_to_num(posinf=0.0), p_d[lit])
-        gaze[met[lit]] = seen[lit] * self.gaze(p_od, p_o.expand(len(lit), 3), r_o[lit], integral)
+        gaze[has_surface[lit]] = seen[lit] * self.gaze(p_od, p_o.expand(len(lit), 3), r_o[lit], integral)
         return color.numpy(), depth.numpy(), gaze.numpy()
 
 
@@ -253,17 +253,17 @@ def agreement(scene, peer: TorchRenderer, width: int = 160, height: int = 90) ->
     """Agreement of both on the same rays."""
     o, d = camera_rays(width, height)
     observer = np.asarray(scene.observer, float)
-    found = nerg.trace(scene, o, d, ["color", "depth", "gaze"], observers=observer[None])
+    result = nerg.trace(scene, o, d, ["color", "depth", "gaze"], observers=observer[None])
     color, depth, gaze = peer.frame(o, d, observer)
-    mse = np.mean((srgb(np.reshape(found["color"], (-1, 3))) - srgb(color)) ** 2)
-    truth = np.ravel(found["depth"])
+    mse = np.mean((srgb(np.reshape(result["color"], (-1, 3))) - srgb(color)) ** 2)
+    truth = np.ravel(result["depth"])
     both = np.isfinite(depth) & np.isfinite(truth)
-    apart = np.abs(depth - truth)[both]
-    mean = float(np.mean(found["gaze"]))
+    difference = np.abs(depth - truth)[both]
+    mean = float(np.mean(result["gaze"]))
     return {
         "color_db": float(-10 * np.log10(mse)),
-        "depth_mm": float(1e3 * np.median(apart)),
-        "depth_mae_mm": float(1e3 * np.mean(apart)),
+        "depth_mm": float(1e3 * np.median(difference)),
+        "depth_mae_mm": float(1e3 * np.mean(difference)),
         "gaze_mean": float(np.mean(gaze)) / mean - 1,
     }
 
@@ -293,8 +293,8 @@ def our_frames(values: dict) -> dict[str, Ours]:
     """nerg's programs by name, with these ``values`` of the scene; those with constant weights give bit-identical
     images, which is checked."""
     frames = {
-        f"{name}{more}": Ours(values, visibility, constant)
-        for constant, more in ((False, ""), (True, ", constant weights"))
+        f"{name}{overrides}": Ours(values, visibility, constant)
+        for constant, overrides in ((False, ""), (True, ", constant weights"))
         for name, visibility in (("nerg", "depth"), ("nerg, same observer again", "map"))
     }
     for name in ("nerg", "nerg, same observer again"):

@@ -212,13 +212,13 @@ class TorchTrainer:
         middle = start + 0.5 * length
         ray, k = ((middle > t0[:, None]) & (middle < t1[:, None])).nonzero(as_tuple=True)
         p = o[ray] + d[ray] * middle[ray, k][:, None]
-        kept = self.bits[self.cell(p)]
-        ray, k, p = ray[kept], k[kept], p[kept]
+        selected = self.bits[self.cell(p)]
+        ray, k, p = ray[selected], k[selected], p[selected]
         t, length = start[ray, k], length[ray, k]
         with torch.no_grad():
             tau = (self.model.sigma(p) * length).clamp(max=60)
-        kept = (-self.before(tau, ray)).exp() > s.stop
-        return ray[kept], t[kept], length[kept], p[kept]
+        selected = (-self.before(tau, ray)).exp() > s.stop
+        return ray[selected], t[selected], length[selected], p[selected]
 
     def before(self, x, ray):
         """Sum over the earlier samples of the same ray, float64 internally."""
@@ -240,8 +240,8 @@ class TorchTrainer:
         covered = self.rays
         if len(ray) > s.batch:
             covered = int(ray[s.batch])
-            kept = ray < covered
-            ray, length, p = ray[kept], length[kept], p[kept]
+            selected = ray < covered
+            ray, length, p = ray[selected], length[selected], p[selected]
         if len(ray):
             self.descend(d, truth, ray, length, p, covered)
         wanted = 0.95 * s.batch / max(len(ray) / max(covered, 1), 1e-3)

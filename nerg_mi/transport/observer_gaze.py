@@ -197,7 +197,7 @@ class ObserverTracer:
         return MissDepths(np.array(directions).T[has_surface], distance[has_surface])
 
     def trace_surfaces(self, directions: Vector3f, miss_distance: Float | float = 0.0) -> tuple[Bool, Float]:
-        """Whether a surface is met along unit ``directions``, and its distance in scene units; ``miss_distance``
+        """Whether there is a surface along unit ``directions``, and its distance in scene units; ``miss_distance``
         without one."""
         mi, settings = variant_types(), self.settings
         all_lanes = dr.full(mi.Bool, True, dr.width(directions))

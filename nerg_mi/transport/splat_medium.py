@@ -379,10 +379,10 @@ class SplatMedium:
         return type(v)(*(1 / (self.arrays.upper - self.arrays.lower)).tolist())
 
     def density(self, p: Point3f, active: Bool) -> Float:
-        raise ValueError("Gaussian splats have no density at a point: they are met along rays")
+        raise ValueError("Gaussian splats have no density at a point: they are evaluated along rays")
 
     def density_features(self, p: Point3f, active: Bool) -> tuple[Float, list[Float]]:
-        raise ValueError("Gaussian splats have no density at a point: they are met along rays")
+        raise ValueError("Gaussian splats have no density at a point: they are evaluated along rays")
 
     def color(self, features: list[Float], p: Point3f, w: Vector3f, active: Bool) -> Color:
         """Colour of the Gaussian whose index is the only element of ``features``."""

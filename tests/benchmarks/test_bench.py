@@ -29,16 +29,16 @@ def test01_scaling_exponents_and_alternating_runs(benchmark):
 
 
 def test02_scipy_and_nerg_densities_agree(benchmark):
-    works, apart = benchmark("bench").kernel_densities(40, 300)
-    assert apart < 1e-5 and set(works) == {"nerg", "SciPy"}
+    works, difference = benchmark("bench").kernel_densities(40, 300)
+    assert difference < 1e-5 and set(works) == {"nerg", "SciPy"}
     # Uniform directions average over the sphere, a density that integrates to one.
     assert np.isclose(np.mean(benchmark("bench").kernel_densities(500, 4000)[0]["nerg"]()), 1 / (4 * np.pi), rtol=0.1)
 
 
 def test03_volpath_and_nerg_transmittances_agree(benchmark, rgb):
-    works, error, apart = benchmark("bench").transmittances(24, 64, cells=16)
+    works, error, difference = benchmark("bench").transmittances(24, 64, cells=16)
     ours, theirs = (error(work()) for work in works.values())
-    assert apart < 0.02 and ours < 0.06 and theirs < 0.1
+    assert difference < 0.02 and ours < 0.06 and theirs < 0.1
 
 
 def test04_figures_are_drawn(benchmark):

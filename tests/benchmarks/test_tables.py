@@ -31,9 +31,9 @@ def test01_derivative_errors(benchmark, capsys):
 
 
 def test02_sample_counts_and_opacities(benchmark, rgb):
-    numerics, there = benchmark("numerics"), page("numerics.md")
+    numerics, moved = benchmark("numerics"), page("numerics.md")
     rows = [row.cells() for case in (numerics.any_number_of_samples, numerics.all_opacities) for row in case(rgb)]
-    assert len(rows) == 6 and all(any(f"| {' | '.join(row[:3])} |" in line for line in there) for row in rows)
+    assert len(rows) == 6 and all(any(f"| {' | '.join(row[:3])} |" in line for line in moved) for row in rows)
 
 
 def test03_alignment_tables(benchmark):
@@ -41,12 +41,12 @@ def test03_alignment_tables(benchmark):
 
     alignment = benchmark("alignment")
     world = alignment.World(rooms.traces(2000), rooms.traces(2000).end, rooms.people(200))
-    there = page("accuracy.md")
-    assert f"| {' | '.join(alignment.HEAD)} |" in there
+    moved = page("accuracy.md")
+    assert f"| {' | '.join(alignment.HEAD)} |" in moved
     for kind in ("pairs", "cameras"):
         cells = alignment.cells(alignment.measure(world, kind, 2, 1))
         assert cells[2] == "2 of 2" and cells[-2] == "1 of 1"
-        assert any(line.startswith(f"| {cells[0]} |") for line in there)
+        assert any(line.startswith(f"| {cells[0]} |") for line in moved)
 
 
 SCRIPTS = sorted(p.stem for p in (ROOT / "benchmarks").glob("*.py") if "__main__" in p.read_text(encoding="utf-8"))

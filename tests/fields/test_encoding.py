@@ -269,6 +269,6 @@ def test_encoding_from_configuration():
     same = HashGrid.random(CONFIG, ns, np.random.default_rng(1))
     assert np.array_equal(grid.table.numpy(), same.table.numpy())
     parameters = {"behind.table": grid.table, "grid.table": grid.table * 0}
-    found = encoding_from_parameters(CONFIG, parameters, "behind", dr.ReduceMode.Expand)
-    assert found.table is grid.table and found.mode == dr.ReduceMode.Expand
+    result = encoding_from_parameters(CONFIG, parameters, "behind", dr.ReduceMode.Expand)
+    assert result.table is grid.table and result.mode == dr.ReduceMode.Expand
     assert not encoding_from_parameters(CONFIG, parameters).table.numpy().any()

@@ -84,12 +84,12 @@ def test_diffuse_color_averages_normal_and_oblique_views():
     n[0], n[1] = (1, 0, 0), (0, 0, -1)
     n /= np.linalg.norm(n, axis=1, keepdims=True)
     assert np.allclose(sampler.color(p, n), np.stack([p[:, 0], n[:, 0] ** 2, n[:, 2]], axis=1), atol=1e-6)
-    found = sampler.diffuse_color(p, n)
+    result = sampler.diffuse_color(p, n)
     # Over the normal direction and four at 45 degrees around it, d = -n and -(n + t) / sqrt 2 with t all around: the
     # mean of d is -n (1 + 4 / sqrt 2) / 5, that of d_x² is (n_x² + 4 (n_x² + (1 - n_x²) / 2) / 2) / 5.
-    assert np.allclose(found[:, 0], p[:, 0], atol=1e-6)
-    assert np.allclose(found[:, 2], -n[:, 2] * (1 + 4 / math.sqrt(2)) / 5, atol=1e-6)
-    assert np.allclose(found[:, 1], (n[:, 0] ** 2 + 2 * (n[:, 0] ** 2 + (1 - n[:, 0] ** 2) / 2)) / 5, atol=1e-6)
+    assert np.allclose(result[:, 0], p[:, 0], atol=1e-6)
+    assert np.allclose(result[:, 2], -n[:, 2] * (1 + 4 / math.sqrt(2)) / 5, atol=1e-6)
+    assert np.allclose(result[:, 1], (n[:, 0] ** 2 + 2 * (n[:, 0] ** 2 + (1 - n[:, 0] ** 2) / 2)) / 5, atol=1e-6)
 
 
 class Wall(Ramp):

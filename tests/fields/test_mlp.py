@@ -140,9 +140,9 @@ def test01_constant_weights_are_bit_identical(sizes):
     x = rng.normal(size=(50, sizes[0])).astype(np.float32)
     columns = [ns.Float(c) for c in x.T]
     weights = [w.numpy() for w in net.weights]
-    found = np.array(evaluate_with_constants([w.tolist() for w in weights], columns)).T
-    assert np.array_equal(found, np.array(net(columns)).T)
-    assert np.allclose(found, reference.mlp(x, weights), atol=1e-5)
+    result = np.array(evaluate_with_constants([w.tolist() for w in weights], columns)).T
+    assert np.array_equal(result, np.array(net(columns)).T)
+    assert np.allclose(result, reference.mlp(x, weights), atol=1e-5)
 
 
 @pytest.mark.parametrize("sizes", [[3, 4, 1], [24, 64, 64, 1]])
@@ -160,8 +160,8 @@ def test02_constant_weights_in_loops_and_branches(sizes):
         start = (dr.arange(ns.UInt32, 20), dr.zeros(ns.Float, 20))
         return dr.while_loop(start, lambda i, total: i < 25, body)[1].numpy()
 
-    found = summed(lambda x: evaluate_with_constants(layers, x))
-    assert np.ptp(found) > 0 and np.array_equal(found, summed(net))
+    result = summed(lambda x: evaluate_with_constants(layers, x))
+    assert np.ptp(result) > 0 and np.array_equal(result, summed(net))
 
 
 # ---- Fields with constant weights, and when these do not apply ----
@@ -198,13 +198,13 @@ def said_by(field):
 @pytest.fixture
 def unrolled(monkeypatch):
     """Networks that were evaluated with constant weights, one entry each."""
-    found = []
+    result = []
     monkeypatch.setattr(
         mlp,
         "evaluate_with_constants",
-        lambda layers, x: found.append(len(layers)) or evaluate_with_constants(layers, x),
+        lambda layers, x: result.append(len(layers)) or evaluate_with_constants(layers, x),
     )
-    return found
+    return result
 
 
 @pytest.mark.parametrize("make", [radiance, gaze_log, lambda: GazeField.random(GazeConfig(grid=GRID), BOX, ns)])

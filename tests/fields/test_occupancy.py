@@ -69,11 +69,11 @@ def test_common_grid_matches_levels_and_skips_no_matter(bound, seed):
     held = np.argwhere(full)
     where = np.argwhere(~full)
     nearest = np.abs(where[:, None] - held[None]).max(axis=2).min(axis=1)
-    told = k[~full]
-    assert (told >= 1).all() and (told <= nearest).all()
+    reported = k[~full]
+    assert (reported >= 1).all() and (reported <= nearest).all()
     # Where the levels agree, only what a coarse cell hides is lost.
-    assert bound > 1 or np.array_equal(told, nearest)
-    assert bound == 1 or seed == 0 or told.max() > 2
+    assert bound > 1 or np.array_equal(reported, nearest)
+    assert bound == 1 or seed == 0 or reported.max() > 2
 
 
 def test_points_outside_are_clamped():
@@ -81,8 +81,8 @@ def test_points_outside_are_clamped():
     inside = np.random.default_rng(2).uniform(0, 1, (200, 3))
     inside[:, 1] = 0.001
     beyond = inside - (0, 3, 0)
-    of = lambda u: grid.distance_to_occupied(ns.Array3f(np.ascontiguousarray(u.T, np.float32))).numpy()
-    assert np.array_equal(of(inside), of(beyond))
+    make = lambda u: grid.distance_to_occupied(ns.Array3f(np.ascontiguousarray(u.T, np.float32))).numpy()
+    assert np.array_equal(make(inside), make(beyond))
 
 
 @pytest.mark.parametrize("bound", [1, 2, 4])
@@ -197,11 +197,11 @@ def centres(n):
 @pytest.mark.parametrize("share", [0.01, 0.2, 1.0])
 def test_skips_pass_no_occupied_part(share):
     grid = refined(share=share)
-    found = grid.distance_to_occupied(ns.Array3f(centres(grid.resolution))).numpy().reshape(grid.bits.shape)
+    result = grid.distance_to_occupied(ns.Array3f(centres(grid.resolution))).numpy().reshape(grid.bits.shape)
     away = brute_force(grid.bits)
-    assert np.array_equal(found == 0, grid.bits) and np.all(found <= away)
+    assert np.array_equal(result == 0, grid.bits) and np.all(result <= away)
     # Nor is it much too short: at least half of the way, minus a part.
-    assert np.all(2 * found + PARTS_PER_AXIS > away)
+    assert np.all(2 * result + PARTS_PER_AXIS > away)
 
 
 def test_parts_belong_to_their_cells():
@@ -302,9 +302,9 @@ def test_empty_cells_stay_empty_and_refinement_is_deterministic():
 def test_cascades_and_missing_grids_are_not_refined():
     nested = CascadeGrid(np.ones((2, 4, 4, 4), bool), 2.0, ns, 0.1)
     assert refine_occupancy(field(lambda x, y, z: x, occupancy=nested)) is None
-    nothing = field(lambda x, y, z: x)
-    nothing.occupancy = None
-    assert refine_occupancy(nothing) is None
+    zeros = field(lambda x, y, z: x)
+    zeros.occupancy = None
+    assert refine_occupancy(zeros) is None
     empty = refine_occupancy(
         field(lambda x, y, z: x, occupancy=OccupancyGrid(np.zeros((R_REFINEMENT,) * 3, bool), ns, 0.1))
     )

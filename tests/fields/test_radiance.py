@@ -43,9 +43,9 @@ def test_background_intersections():
     t = -b + np.sqrt(b * b - (o * o).sum(1) + 2.5**2)
     p = o + d * t[:, None]
     assert np.allclose(np.linalg.norm(p, axis=1), 2.5)
-    found = np.stack([c.numpy() for c in Background.random(CONFIG, ns).coordinates(jit(o), jit(d))], axis=1)
-    assert np.allclose(found[:, 0], 2 / np.pi * np.arccos(p[:, 1] / 2.5) - 1, atol=1e-5)
-    assert np.allclose(found[:, 1], np.arctan2(p[:, 2], p[:, 0]) / np.pi, atol=1e-5)
+    result = np.stack([c.numpy() for c in Background.random(CONFIG, ns).coordinates(jit(o), jit(d))], axis=1)
+    assert np.allclose(result[:, 0], 2 / np.pi * np.arccos(p[:, 1] / 2.5) - 1, atol=1e-5)
+    assert np.allclose(result[:, 1], np.arctan2(p[:, 2], p[:, 0]) / np.pi, atol=1e-5)
 
 
 def test_missing_ray_takes_the_nearest_point():
@@ -286,10 +286,12 @@ def test17_deferred_field():
     expected = np.concatenate([reference.sigmoid(g[:3]), g[3:]])
     assert np.allclose(np.stack([f.numpy() for f in features]), expected, atol=1e-6)
     inside = 1e-3 + (1 - 2e-3) * expected[:3]
-    given = np.concatenate([np.log(inside / (1 - inside)), expected[3:]])
-    outputs = np.array(plain.color_net([*encode_direction(ns.Array3f(d.T), config.sh_degree), *map(ns.Float, given)]))
-    found = np.array(field.color(features, ns.Array3f(d.T)))
-    assert np.allclose(found, reference.sigmoid(outputs + given[:3]), atol=1e-5)
+    arguments = np.concatenate([np.log(inside / (1 - inside)), expected[3:]])
+    outputs = np.array(
+        plain.color_net([*encode_direction(ns.Array3f(d.T), config.sh_degree), *map(ns.Float, arguments)])
+    )
+    result = np.array(field.color(features, ns.Array3f(d.T)))
+    assert np.allclose(result, reference.sigmoid(outputs + arguments[:3]), atol=1e-5)
     assert RadianceConfig.from_dict(config.to_dict()) == config and "deferred" not in RADIANCE_CONFIG.to_dict()
 
 

@@ -121,8 +121,8 @@ def test_color_correction_is_recovered():
 
 def test_undetermined_correction_is_identity():
     color, truth = pictures()
-    nothing = np.zeros(color.shape[:2], bool)
-    assert np.allclose(fit_color_correction(color, truth, mask=nothing), np.eye(3, 4))
+    zeros = np.zeros(color.shape[:2], bool)
+    assert np.allclose(fit_color_correction(color, truth, mask=zeros), np.eye(3, 4))
     assert np.allclose(fit_color_correction(color, color), np.eye(3, 4))
 
 

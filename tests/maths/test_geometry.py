@@ -290,7 +290,7 @@ def read_cloud(path: Path, points: np.ndarray) -> None:
 
 def read_rays(path: Path, points: np.ndarray) -> None:
     builder = RaysBuilder(UNITY)
-    builder.source(Path(__file__))
+    builder.begin_source(Path(__file__))
     # Unity: y up, left-handed; the offset is given in the file's own coordinates.
     builder.add(
         np.arange(len(points)), "ann", points, np.tile([1.0, 0, 0], (len(points), 1)), rows=np.arange(len(points))

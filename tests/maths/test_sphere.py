@@ -93,9 +93,9 @@ def test_morton_order_keeps_neighbours_close():
     order = sphere.morton_order(2048)
     assert np.array_equal(np.sort(order), np.arange(2048))
     d = sphere.fibonacci_directions(2048)
-    apart = lambda d: np.degrees(np.arccos(np.clip((d[1:] * d[:-1]).sum(axis=1), -1, 1))).mean()
+    difference = lambda d: np.degrees(np.arccos(np.clip((d[1:] * d[:-1]).sum(axis=1), -1, 1))).mean()
     # Neighbours are 4.5 degrees apart; along the spiral the next direction is on the other side.
-    assert apart(d[order]) < 9 < 90 < apart(d)
+    assert difference(d[order]) < 9 < 90 < difference(d)
 
 
 @pytest.mark.parametrize("angle", [1e-3, 0.2, 1.7, 3.1, np.pi])

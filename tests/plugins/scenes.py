@@ -10,14 +10,14 @@ from nerg_mi.transport.observer import ObserverSettings
 SIZE = 12
 
 
-def plugin(kind, **more):
+def plugin(kind, **overrides):
     """The description of a plugin for ``mi.load_dict``."""
-    return {"type": kind, **more}
+    return {"type": kind, **overrides}
 
 
-def stored(kind, path, **more):
+def stored(kind, path, **overrides):
     """A volume that reads a file."""
-    return {"type": kind, "filename": str(path), **more}
+    return {"type": kind, "filename": str(path), **overrides}
 
 
 def still(sensor):
@@ -72,16 +72,16 @@ def constant(sigma=3.0, **kwargs):
     return {"type": "nerg", "depth": "expected", "density": {"type": "constvolume", "value": sigma}, **kwargs}
 
 
-def scene_with(mi, integrator, sensor=None, **more):
-    return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor or camera(mi), **more})
+def scene_with(mi, integrator, sensor=None, **overrides):
+    return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor or camera(mi), **overrides})
 
 
 def picture(mi, scene):
     return np.array(mi.render(scene, spp=1))
 
 
-def render(mi, integrator, sensor=None, spp=1, seed=0, **more):
-    return np.array(mi.render(scene_with(mi, integrator, sensor, **more), spp=spp, seed=seed))
+def render(mi, integrator, sensor=None, spp=1, seed=0, **overrides):
+    return np.array(mi.render(scene_with(mi, integrator, sensor, **overrides), spp=spp, seed=seed))
 
 
 def put(params, key, value):

@@ -40,8 +40,8 @@ from .test_nerg_aovs import operations
 INSIDE = (0.1, -0.2, 0.3)
 
 
-def gaze_only(gaze, aovs="gaze,position", **more):
-    return plugin("nerg", aovs=aovs, radiance=False, gaze=gaze, **more)
+def gaze_only(gaze, aovs="gaze,position", **overrides):
+    return plugin("nerg", aovs=aovs, radiance=False, gaze=gaze, **overrides)
 
 
 def saved(path, field):
@@ -66,8 +66,8 @@ def test01_gaze_field_is_placed_in_the_scene(rgb, tmp_path, variant):
     plain = ask(rgb, stored("gazefield", path), p_od, p_o, r_o)
     to_world = rgb.ScalarTransform4f().translate([1, 2, 3]).rotate([0, 1, 0], 30).scale(4)
     m = np.array(to_world.matrix)
-    there = (m @ [*p_od, 1])[:3], (m @ [*p_o, 1])[:3], m[:3, :3] @ r_o / 4
-    assert np.allclose(ask(rgb, stored("gazefield", path, to_world=to_world), *there), plain, rtol=1e-4)
+    moved = (m @ [*p_od, 1])[:3], (m @ [*p_o, 1])[:3], m[:3, :3] @ r_o / 4
+    assert np.allclose(ask(rgb, stored("gazefield", path, to_world=to_world), *moved), plain, rtol=1e-4)
 
 
 def test02_parameters_and_text(rgb, tmp_path, files):
@@ -76,7 +76,7 @@ def test02_parameters_and_text(rgb, tmp_path, files):
     assert set(rgb.traverse(volume).keys()) == set(field.parameters())
     assert "variant = emit_capture" in str(volume) and "g.safetensors" in str(volume)
     assert np.allclose(np.array(volume.bbox().max).ravel(), 1)
-    with pytest.raises(RuntimeError, match="holds a radiance field"):
+    with pytest.raises(RuntimeError, match="contains a radiance field"):
         rgb.load_dict(stored("gazefield", files / "field.safetensors"))
 
 
@@ -194,8 +194,8 @@ def test04_registered_field_is_evaluated(rgb, tmp_path, lobe):
     field, _ = load_gaze(tmp_path / "g.safetensors", ns)
     place = SceneGeometry(None, rgb.load_dict({"type": "scene", **room(rgb)}))
     d = np.array([[0, 0, 1.0], [1, 0, 0], [0, 0, -1]])
-    found = FieldDensity(field, place)(np.array([[0.1, 0.2, 0.3]]), d)[0]
-    np.testing.assert_allclose(found, np.exp(2 * d[:, 2]) / TOTAL, rtol=2e-3)
+    result = FieldDensity(field, place)(np.array([[0.1, 0.2, 0.3]]), d)[0]
+    np.testing.assert_allclose(result, np.exp(2 * d[:, 2]) / TOTAL, rtol=2e-3)
 
 
 def test05_checkpoint_of_unregistered_kind_is_refused(tmp_path, lobe):
@@ -374,8 +374,10 @@ def test01_mean_and_std_over_members(rgb, files, ensemble, aligned):
     """In NumPy, at the surface that the camera sees."""
     gaze, members = ensemble
     eye = np.array([0.5, 0.4, -3] if aligned else [-2, 0.3, -2.0])
-    more = {} if aligned else {"observer": make_observer(rgb, *eye)}
-    out = channels(rgb, with_field(files, gaze=gaze, aovs="gaze,gaze_std,position,gaze_evals", occlusion=False, **more))
+    overrides = {} if aligned else {"observer": make_observer(rgb, *eye)}
+    out = channels(
+        rgb, with_field(files, gaze=gaze, aovs="gaze,gaze_std,position,gaze_evals", occlusion=False, **overrides)
+    )
     p = points(out)
     seen = np.abs(p).sum(axis=-1) > 0
     p = p[seen]
@@ -410,9 +412,9 @@ def test03_members_are_normalised_separately(rgb, tmp_path):
 def test04_support_depends_on_the_observer(rgb, files, ensemble, eye):
     integrator = with_field(files, gaze=ensemble[0], aovs="support,position", observer=make_observer(rgb, *eye))
     out = channels(rgb, integrator, camera(rgb, fov=80))
-    there = out["position.Z"] != 0
-    np.testing.assert_allclose(out["support.Y"][there], support_at(*eye), rtol=0.03)
-    assert 0 < there.sum() < there.size and not out["support.Y"][~there].any()
+    moved = out["position.Z"] != 0
+    np.testing.assert_allclose(out["support.Y"][moved], support_at(*eye), rtol=0.03)
+    assert 0 < moved.sum() < moved.size and not out["support.Y"][~moved].any()
     assert (support_at(*eye) == 0) == (eye[0] > 0)
 
 

@@ -31,8 +31,8 @@ def rays(tmp_path_factory):
     return str(path)
 
 
-def shown(rays, aovs="kde,position", count=4096, **more):
-    return plugin("nerg", aovs=aovs, radiance=False, kde=stored("gazekde", rays, count=count, kappa=KAPPA), **more)
+def shown(rays, aovs="kde,position", count=4096, **overrides):
+    return plugin("nerg", aovs=aovs, radiance=False, kde=stored("gazekde", rays, count=count, kappa=KAPPA), **overrides)
 
 
 def expected(eye, out, count=4096):
@@ -42,8 +42,10 @@ def expected(eye, out, count=4096):
     p = points(out).astype(np.float64)
     d = p - eye
     d /= np.linalg.norm(d, axis=-1, keepdims=True)
-    chosen = data.direction[near]
-    return reference.kde(d.reshape(-1, 3), chosen, np.array([0, len(chosen)]), np.array([KAPPA])).reshape(d.shape[:-1])
+    selected = data.direction[near]
+    return reference.kde(d.reshape(-1, 3), selected, np.array([0, len(selected)]), np.array([KAPPA])).reshape(
+        d.shape[:-1]
+    )
 
 
 @pytest.mark.parametrize("count", [4096, 50])
@@ -74,24 +76,28 @@ def test03_rays_are_collected_once_per_observer(rgb, rays):
     integrator = shown(rays, observer=make_observer(rgb, 0.2, 0.1, 0), falloff=0.0)
     scene = scene_with(rgb, integrator, camera(rgb, (0.1, -0.2, 0.3), (0.5, 0, 0), size=70), **room(rgb))
     view = scene.integrator().views["kde"]
-    kept = lambda: scene.integrator().cache.peek(view)[0].value
+    selected = lambda: scene.integrator().cache.peek(view)[0].value
     first = picture(rgb, scene)
-    made, table = kept(), kept().table
+    made, table = selected(), selected().table
     np.testing.assert_array_equal(picture(rgb, scene), first)
-    assert kept() is made and made.table is table is not None
+    assert selected() is made and made.table is table is not None
     put(rgb.traverse(scene), "integrator.observer.to_world", rgb.Transform4f().translate([-0.3, 0.1, 0.1]))
     moved = named(rgb, picture(rgb, scene), integrator)
-    assert kept() is not made
+    assert selected() is not made
     seen = moved["kde.Y"] > 0
     assert np.abs(moved["kde.Y"] - expected((-0.3, 0.1, 0.1), moved))[seen].max() < TABLE + 1e-5
 
 
 def test04_each_camera_of_a_batch_has_its_own_density(rgb, rays):
-    integrator, eyes = shown(rays, count=100), [(0.3, 0.1, 0), (-0.5, 0.4, 0.2)]
+    integrator, positions = shown(rays, count=100), [(0.3, 0.1, 0), (-0.5, 0.4, 0.2)]
     film = {"type": "hdrfilm", "width": 24, "height": 12, "component_format": "float32", "rfilter": {"type": "box"}}
-    batch = {"type": "batch", "film": film, **{f"s{i}": camera(rgb, eye, (0, 0.5, 0.9)) for i, eye in enumerate(eyes)}}
+    batch = {
+        "type": "batch",
+        "film": film,
+        **{f"s{i}": camera(rgb, eye, (0, 0.5, 0.9)) for i, eye in enumerate(positions)},
+    }
     both = channels(rgb, integrator, batch, **room(rgb))
-    for i, eye in enumerate(eyes):
+    for i, eye in enumerate(positions):
         half = {k: v[:, 12 * i : 12 * i + 12] for k, v in both.items()}
         np.testing.assert_allclose(half["kde.Y"], expected(eye, half, 100), rtol=1e-3, atol=1e-5)
 

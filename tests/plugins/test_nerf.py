@@ -72,14 +72,14 @@ def test03_parameters(rgb, tmp_path, field):
 
 def test05_invalid_files_are_refused(rgb, tmp_path, files):
     (tmp_path / "x.safetensors").write_bytes(b"no")
-    for path, more, said in (
-        (files / "gaze.safetensors", {}, "holds a gaze field"),
+    for path, overrides, said in (
+        (files / "gaze.safetensors", {}, "contains a gaze field"),
         (tmp_path / "x.safetensors", {}, "x.safetensors.*not a readable safetensors file"),
         (files / "field.safetensors", {"bogus": 1.0}, "bogus"),
         (files / "field.safetensors", {"constant_weights": "yes"}, "constant_weights"),
     ):
         with pytest.raises(RuntimeError, match=said):
-            load(rgb, path, **more)
+            load(rgb, path, **overrides)
     with pytest.raises(RuntimeError, match='"filename"'):
         rgb.load_dict({"type": "nerf", "filename": 3.0})
 
@@ -125,7 +125,7 @@ def test_medium_needs_max_density(rgb, files):
         medium_scene(rgb, files)
     p = np.random.default_rng(0).uniform(-0.9, 0.9, (100, 3))
     path = files / "field.safetensors"
-    free, capped = (evaluate(rgb, load(rgb, path, **more), p) for more in ({}, {"max_density": 2.2}))
+    free, capped = (evaluate(rgb, load(rgb, path, **overrides), p) for overrides in ({}, {"max_density": 2.2}))
     assert free.max() > 2.2 and np.allclose(capped, np.minimum(free, 2.2))
 
 
@@ -133,8 +133,8 @@ def test_constant_weights_change_no_density(rgb, files):
     p = np.random.default_rng(0).uniform(-0.9, 0.9, (100, 3))
     plain, constant = (load(rgb, files / "field.safetensors", constant_weights=c) for c in (False, True))
     assert constant.field.color_net.has_constant_weights and not plain.field.color_net.has_constant_weights
-    found = evaluate(rgb, plain, p)
-    assert np.ptp(found) > 0 and np.array_equal(evaluate(rgb, constant, p), found)
+    result = evaluate(rgb, plain, p)
+    assert np.ptp(result) > 0 and np.array_equal(evaluate(rgb, constant, p), result)
 
 
 # ---- A background network behind a field: composited in the field's colour space ----
@@ -154,9 +154,9 @@ def test01_background_network_behind_the_field(rgb, tmp_path, scale, density):
     to_world = rgb.ScalarTransform4f().scale(scale)
     sensor = still(camera(rgb, (0.5 * scale, 0.4 * scale, -2.5 * scale), size=8))
 
-    def shown(name, **more):
+    def shown(name, **overrides):
         field = stored("nerf", tmp_path / f"{name}.safetensors", to_world=to_world)
-        return render(rgb, plugin("nerg", field=field, aovs="opacity", color_cutoff=0.0), sensor, **more)
+        return render(rgb, plugin("nerg", field=field, aovs="opacity", color_cutoff=0.0), sensor, **overrides)
 
     image, without = shown("behind"), shown("field")
     alpha = image[..., 3:4]
@@ -223,8 +223,8 @@ def deferred(tmp_path_factory):
     return path
 
 
-def nerg(path, aovs="opacity", **more):
-    how = {"step": 0.05, "stop": 0.0, "color_cutoff": 0.0, "field": stored("nerf", path)} | more
+def nerg(path, aovs="opacity", **overrides):
+    how = {"step": 0.05, "stop": 0.0, "color_cutoff": 0.0, "field": stored("nerf", path)} | overrides
     return plugin("nerg", aovs=aovs, **how)
 
 
@@ -245,8 +245,8 @@ def test01_color_is_evaluated_on_mean_features(rgb, deferred):
     sums = np.stack([seen[f"features.{k}"].ravel() for k in range(medium.feature_count)])
     means = [rgb.Float(np.ascontiguousarray((s / np.where(some, opacity, 1)).astype(np.float32))) for s in sums]
     expected = opacity * np.array(medium.field.color(means, center_rays(rgb, few(rgb)).d))
-    found = image[..., :3].reshape(-1, 3).T
-    assert np.allclose(found[:, some], expected[:, some], atol=2e-6) and not found[:, ~some].any()
+    result = image[..., :3].reshape(-1, 3).T
+    assert np.allclose(result[:, some], expected[:, some], atol=2e-6) and not result[:, ~some].any()
 
 
 def test02_one_color_evaluation_per_ray(rgb, deferred):

@@ -52,8 +52,8 @@ def test03_without_radiance(rgb, files):
 
 
 def test04_no_surface_below_surface_opacity(rgb, files):
-    of = lambda s: channels(rgb, with_gaze(files, "opacity,depth,position,gaze,visibility", surface_opacity=s))
-    low, high = of(0.05), of(0.97)
+    make = lambda s: channels(rgb, with_gaze(files, "opacity,depth,position,gaze,visibility", surface_opacity=s))
+    low, high = make(0.05), make(0.97)
     for c in ("opacity.Y", "depth.T"):
         assert np.array_equal(low[c], high[c])
     thin = high["opacity.Y"] < 0.97
@@ -174,9 +174,9 @@ def test01_xml_equals_dict_and_files_are_relative(rgb, files):
     path = files / "scene.xml"
     path.write_text(XML)
     scene = rgb.load_file(str(path))
-    more = {"observer": {"type": "perspective", "to_world": look_at(rgb, (-2, 0.3, -2))}, "depth": "median"}
-    more |= {"falloff": 0.3, "background": {"type": "rgb", "value": [0.1, 0.2, 0.3]}}
-    integrator = with_gaze(files, "depth,opacity,gaze,visibility,position", **more)
+    overrides = {"observer": {"type": "perspective", "to_world": look_at(rgb, (-2, 0.3, -2))}, "depth": "median"}
+    overrides |= {"falloff": 0.3, "background": {"type": "rgb", "value": [0.1, 0.2, 0.3]}}
+    integrator = with_gaze(files, "depth,opacity,gaze,visibility,position", **overrides)
     a, b = np.array(rgb.render(scene, spp=2, seed=3)), render(rgb, integrator, spp=2, seed=3)
     # The XML parser rounds transforms differently.
     assert a.shape == (SIZE, SIZE, 3 + 7) and np.allclose(a, b, atol=3e-6)
@@ -221,9 +221,9 @@ def test04_invalid_values_are_named(rgb, name, value):
 
 def test05_invalid_children_are_named(rgb, files):
     some, small = plugin("constvolume", value=1.0), {"type": "hdrfilm", "width": 2, "height": 2}
-    eyes = {k: {"type": "perspective", "to_world": look_at(rgb, (k, 2, 3)), "film": small} for k in (1, 3)}
+    positions = {k: {"type": "perspective", "to_world": look_at(rgb, (k, 2, 3)), "film": small} for k in (1, 3)}
     # It would be at the origin of the scene.
-    batch = plugin("batch", film={"type": "hdrfilm", "width": 4, "height": 2}, a=eyes[1], b=eyes[3])
+    batch = plugin("batch", film={"type": "hdrfilm", "width": 4, "height": 2}, a=positions[1], b=positions[3])
     for integrator, said in (
         (with_field(files, density=some), '"field".*"density"'),
         (with_field(files, color=some), '"color" goes with "density"'),
@@ -256,7 +256,7 @@ NAMES = """occlusion falloff tolerance visibility map_height directions integral
 radiance background aovs step quadrature coarse dt_gamma stop color_cutoff refined jitter""".split()
 TEXTS = {"visibility": "map", "depth": "refined", "quadrature": "linear", "aovs": "opacity"}
 SHARES = dict.fromkeys(("surface_opacity", "integral_tolerance", "dt_gamma", "stop", "color_cutoff"), 0.25)
-OTHERS, INTEGERS = TEXTS | SHARES, ("map_height", "directions")
+OTHER_VALUES, INTEGERS = TEXTS | SHARES, ("map_height", "directions")
 
 
 def manual(mi):
@@ -264,19 +264,19 @@ def manual(mi):
     mi.load_dict({"type": "nerg"})
     text = sys.modules["nerg_mi.plugins.nerg"].__doc__
     entries = re.split(r"^ \* - ", text, flags=re.MULTILINE)[1:]
-    found = {e.split("\n")[0].strip(): re.search(r"\(Default:\s*([^;,:) ]+(?:,opacity)?)", e) for e in entries}
+    result = {e.split("\n")[0].strip(): re.search(r"\(Default:\s*([^;,:) ]+(?:,opacity)?)", e) for e in entries}
     # There is no ceiling by default, and its up has no effect without one.
-    return {name: m[1].strip("`\n ") for name, m in found.items() if m and name not in ("ceiling", "up")}
+    return {name: m[1].strip("`\n ") for name, m in result.items() if m and name not in ("ceiling", "up")}
 
 
 def test01_manual_states_all_defaults(rgb):
     assert list(manual(rgb)) == NAMES
 
 
-def settings_of(mi, **more):
-    integrator = mi.load_dict(constant(1.0, depth="median") | more)
-    more = {"text": str(integrator), "background": np.array(integrator.background).tolist()}
-    return vars(integrator.settings) | vars(integrator.observer_settings) | more
+def settings_of(mi, **overrides):
+    integrator = mi.load_dict(constant(1.0, depth="median") | overrides)
+    overrides = {"text": str(integrator), "background": np.array(integrator.background).tolist()}
+    return vars(integrator.settings) | vars(integrator.observer_settings) | overrides
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -286,15 +286,15 @@ def test02_explicit_defaults_change_nothing(rgb, name):
     read = str if name in TEXTS else int if name in INTEGERS else float
     value = truth[text] if text in truth else read(text)
     assert settings_of(rgb, **{name: value}) == settings_of(rgb)
-    other = OTHERS[name] if name in OTHERS else not value if isinstance(value, bool) else value + 2
+    other = OTHER_VALUES[name] if name in OTHER_VALUES else not value if isinstance(value, bool) else value + 2
     assert settings_of(rgb, **{name: other}) != settings_of(rgb)
 
 
 def test03_default_step_is_a_fraction_of_the_diagonal(rgb):
     settings = rgb.load_dict(constant()).settings
     assert settings.step == pytest.approx(3**0.5 / 1024, rel=1e-5) and settings.cell_step == float("inf")
-    given = rgb.load_dict(constant(step=0.25)).settings
-    assert given.step == given.cell_step == 0.25
+    arguments = rgb.load_dict(constant(step=0.25)).settings
+    assert arguments.step == arguments.cell_step == 0.25
 
 
 def test_manual_texts_are_used_once(rgb):

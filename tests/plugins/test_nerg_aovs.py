@@ -64,10 +64,10 @@ def test01_new_aov_needs_one_entry(rgb, files, table):
     integrator = with_field(files, aovs="position,height,depth")
     out = channels(rgb, integrator)
     assert list(out)[3:5] == ["height.Z", "height.T"]
-    met = out["position.Z"] != 0
-    assert met.sum() > 20
-    np.testing.assert_allclose(out["height.Z"][met], out["position.Z"][met] + 1, rtol=1e-5)
-    assert not out["height.Z"][~met].any() and np.array_equal(out["height.T"], out["depth.T"])
+    has_surface = out["position.Z"] != 0
+    assert has_surface.sum() > 20
+    np.testing.assert_allclose(out["height.Z"][has_surface], out["position.Z"][has_surface] + 1, rtol=1e-5)
+    assert not out["height.Z"][~has_surface].any() and np.array_equal(out["height.T"], out["depth.T"])
     with pytest.raises(RuntimeError, match='"aovs".*"height".*"field"'):
         rgb.load_dict(constant(aovs="height"))
     assert "- ``height`` (``.Z .T``): of the surface above the plane" in table.format_manual()
@@ -85,8 +85,8 @@ def test02_manual_lists_all_aovs(rgb, table):
 def test03_every_aov_renders(rgb, files, table, tmp_path):
     """All AOVs of a field and a gaze field at once, with the declared numbers of channels."""
     eye = make_observer(rgb, -2, 0.3, -2)
-    given = rgb.load_dict(with_gaze(files, observer=eye))
-    names = [n for n, aov in table.AOVS.items() if all(need.is_satisfied(given) for need in aov.dependencies)]
+    arguments = rgb.load_dict(with_gaze(files, observer=eye))
+    names = [n for n, aov in table.AOVS.items() if all(need.is_satisfied(arguments) for need in aov.dependencies)]
     assert {"features", "gaze", "density_evals"} < set(names) and "gaze_std" not in names
     integrator = with_gaze(files, ",".join(names), observer=eye)
     scene = scene_with(rgb, integrator)
@@ -194,8 +194,8 @@ def test01_composited_features_are_weighted_sums(rgb, files):
 
 def test02_color_does_not_depend_on_features(rgb, files):
     plain, both, dark = (
-        render(rgb, with_field(files, aovs=f"opacity,depth{more}", radiance=lit))
-        for more, lit in (("", True), (",features", True), (",features", False))
+        render(rgb, with_field(files, aovs=f"opacity,depth{overrides}", radiance=lit))
+        for overrides, lit in (("", True), (",features", True), (",features", False))
     )
     assert np.allclose(both[..., :5], plain[..., :5], atol=1e-6)
     assert not dark[..., :3].any() and np.allclose(dark[..., 5:], both[..., 5:], atol=1e-6)
@@ -257,21 +257,23 @@ def test01_no_colour(rgb, files):
 
 
 def test02_no_aovs_no_march(rgb, files):
-    nothing, depth = (operations(rgb, with_field(files, radiance=False, aovs=a)) for a in ("", "depth"))
-    assert nothing < 0.1 * depth
+    zeros, depth = (operations(rgb, with_field(files, radiance=False, aovs=a)) for a in ("", "depth"))
+    assert zeros < 0.1 * depth
 
 
 def test03_no_gaze_unless_requested(rgb, files):
-    unasked, asked = (operations(rgb, with_gaze(files, aovs)) for aovs in ("depth,opacity", "depth,opacity,gaze"))
-    assert unasked == operations(rgb, with_field(files, aovs="depth,opacity")) and asked > unasked + 300
+    not_requested, requested = (
+        operations(rgb, with_gaze(files, aovs)) for aovs in ("depth,opacity", "depth,opacity,gaze")
+    )
+    assert not_requested == operations(rgb, with_field(files, aovs="depth,opacity")) and requested > not_requested + 300
 
 
 def test04_aligned_observer_needs_no_second_march(rgb, files):
     sensor, none = camera(rgb, (0.5, 0.4, -3)), with_gaze(files, "gaze,density_evals")
-    here, there = (none | {"observer": make_observer(rgb, *o)} for o in ((0.5, 0.4, -3), (-2, 0.3, -2)))
-    a, b, c = (channels(rgb, i, sensor)["density_evals.Y"] for i in (none, here, there))
+    local, moved = (none | {"observer": make_observer(rgb, *o)} for o in ((0.5, 0.4, -3), (-2, 0.3, -2)))
+    a, b, c = (channels(rgb, i, sensor)["density_evals.Y"] for i in (none, local, moved))
     assert np.array_equal(a, b) and c.sum() > 1.3 * a.sum()
-    first, second, third = (operations(rgb, i, sensor) for i in (none, here, there))
+    first, second, third = (operations(rgb, i, sensor) for i in (none, local, moved))
     assert second < first + 60 and third > second + 300
 
 

@@ -35,10 +35,10 @@ SLAB = [1e-6, 1e-3, 1.0, 1e3, 1e6, 1e9]
 
 def slab_scene(mi, kind, sigma, ahead):
     """One ray along +z through the unit cube, whose face is ``ahead`` of the ray's origin."""
-    more = {"value": float(sigma)}
+    overrides = {"value": float(sigma)}
     if kind == "gridvolume":
-        more = {"grid": mi.VolumeGrid(np.full((3, 3, 3), sigma, np.float32)), "raw": True}
-    integrator = plugin("nerg", density=plugin(kind, **more), depth="expected", radiance=False)
+        overrides = {"grid": mi.VolumeGrid(np.full((3, 3, 3), sigma, np.float32)), "raw": True}
+    integrator = plugin("nerg", density=plugin(kind, **overrides), depth="expected", radiance=False)
     # Mitsuba starts the rays of this sensor slightly in front of it.
     where = {"origin": [0.5, 0.5, -ahead - float(mi.math.RayEpsilon)], "direction": [0, 0, 1]}
     return scene_with(mi, integrator, plugin("radiancemeter", film=camera(mi, size=1)["film"], **where))
@@ -242,9 +242,9 @@ def test01_extreme_parameters(rgb, files, visibility, depth, eyes):
     ball = {"type": "sphere", "center": [0, 0.9, 0], "radius": 0.3}
     scene = scene_with(rgb, integrator, camera(rgb, size=4), ball=ball)
     params, poses = rgb.traverse(scene), ["sensor.to_world", "ball.to_world"]
-    others = ["integrator.gaze.grid.table", "integrator.gaze.capture_head.0"]
+    rest = ["integrator.gaze.grid.table", "integrator.gaze.capture_head.0"]
     start = {key: rgb.Transform4f(params[key]) for key in poses}
-    weights = {key: type(params[key])(params[key]) for key in others}
+    weights = {key: type(params[key])(params[key]) for key in rest}
     for sigma in (0.0, 1e-30, 1e9):
         for eye in eyes:
             x = rgb.Float(0)
@@ -254,7 +254,7 @@ def test01_extreme_parameters(rgb, files, visibility, depth, eyes):
             params["integrator.observer.to_world"] = rgb.Transform4f().translate(rgb.Vector3f(*eye) + x)
             for key in poses:
                 params[key] = rgb.Transform4f().translate(rgb.Vector3f(x, 0.5 * x, -x)) @ start[key]
-            for key in others:
+            for key in rest:
                 params[key] = weights[key] + x
             params.update()
             picture = rgb.render(scene, params, spp=1)

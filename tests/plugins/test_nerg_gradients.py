@@ -38,8 +38,8 @@ def learnt(tmp_path_factory):
     return folder
 
 
-def small_camera(mi, origin=(0.3, 0.2, -3), **more):
-    return still(camera(mi, origin, size=SIZE, **{"fov": 25, **more}))
+def small_camera(mi, origin=(0.3, 0.2, -3), **overrides):
+    return still(camera(mi, origin, size=SIZE, **{"fov": 25, **overrides}))
 
 
 def smooth(**kwargs):
@@ -48,10 +48,10 @@ def smooth(**kwargs):
 
 
 def neural(mi, files, aovs="depth,opacity,gaze", observer=None, **kwargs):
-    more = {} if observer is None else {"observer": {"type": "perspective", "to_world": look_at(mi, observer)}}
+    overrides = {} if observer is None else {"observer": {"type": "perspective", "to_world": look_at(mi, observer)}}
     volumes = {"field": stored("nerf", files / "field.safetensors")}
     volumes["gaze"] = stored("gazefield", files / "gaze.safetensors")
-    return smooth(aovs=aovs, surface_opacity=0.0, **volumes, **more) | kwargs
+    return smooth(aovs=aovs, surface_opacity=0.0, **volumes, **overrides) | kwargs
 
 
 def loss_of(mi, scene, params, channels):
@@ -246,8 +246,8 @@ def test01_adam_recovers_falloff_and_density(rgb):
     """Both at once: visibility determines the first, opacity the second, in fog that camera and observer see from two
     sides."""
     fog = plugin("constvolume", value=1.5, to_world=rgb.ScalarTransform4f().translate(-1).scale(2))
-    more = {"density": fog, "observer": make_observer(rgb, -2, 0.3, 2), "falloff": 2.0}
-    scene = scene_with(rgb, constant(aovs="opacity,visibility") | more, still(camera(rgb, size=6)))
+    overrides = {"density": fog, "observer": make_observer(rgb, -2, 0.3, 2), "falloff": 2.0}
+    scene = scene_with(rgb, constant(aovs="opacity,visibility") | overrides, still(camera(rgb, size=6)))
     target, params = rgb.render(scene, spp=1), rgb.traverse(scene)
     falloff, density = "integrator.falloff", "integrator.density.value.value"
     opt = rgb.ad.Adam(lr=0.05, params={falloff: rgb.Float(1.0), density: rgb.Float(0.6)})
@@ -281,8 +281,8 @@ def improves(rgb, files):
 
         def loss(i):
             sensor, target = next_batch(i)
-            found = rgb.render(scene, params, sensor=sensor, spp=1, seed=i)[..., 3]
-            return dr.mean(dr.square(found - target), axis=None) / np.mean(np.square(views))
+            result = rgb.render(scene, params, sensor=sensor, spp=1, seed=i)[..., 3]
+            return dr.mean(dr.square(result - target), axis=None) / np.mean(np.square(views))
 
         losses = learn(params, rgb.ad.Adam(lr=0.02, params={key: params[key] for key in keys}), loss, 36)
         return np.mean(losses[-3:]) < 0.4 * np.mean(losses[:3]) and error() < 0.5 * before
@@ -316,16 +316,16 @@ def test04_ray_batch_matches_its_pixels(rgb, files):
     """All channels. Rays are almost parallel, since the loader moves each within its pixel: all cameras show a single
     value."""
     integrator = with_gaze(files, observer=make_observer(rgb, -2, 0.3, -2), falloff=2.0)
-    eyes = [(0.2 * i - 0.5, 0.3 - 0.1 * i, -3) for i in range(3)]
-    sensors = {f"camera{i}": camera(rgb, o, (o[0], o[1], 0), size=6, fov=0.01) for i, o in enumerate(eyes)}
+    positions = [(0.2 * i - 0.5, 0.3 - 0.1 * i, -3) for i in range(3)]
+    sensors = {f"camera{i}": camera(rgb, o, (o[0], o[1], 0), size=6, fov=0.01) for i, o in enumerate(positions)}
     scene = rgb.load_dict({"type": "scene", "integrator": integrator, **sensors})
     pictures = [rgb.render(scene, sensor=s, spp=1) for s in scene.sensors()]
     # A divisor of the number of pixels: without tiles the loader of 3.9.1 otherwise draws pixels beyond the last one.
     how = {"pixels_per_batch": 36, "tile_size": 1}
     colors, rays = rgb.ad.loaders.RayDataLoader(scene.sensors(), [p[..., :3] for p in pictures], **how).next()
-    got, chosen = np.array(rgb.render(scene, sensor=rays, spp=1))[0], np.array(rays.pixel_idx)
-    expected = np.array(pictures).reshape(3 * 36, -1)[chosen]
-    assert len(np.unique(chosen)) == 36 and len(np.unique(chosen // 36)) == 3
+    got, selected = np.array(rgb.render(scene, sensor=rays, spp=1))[0], np.array(rays.pixel_idx)
+    expected = np.array(pictures).reshape(3 * 36, -1)[selected]
+    assert len(np.unique(selected)) == 36 and len(np.unique(selected // 36)) == 3
     assert np.allclose(np.array(colors)[0], expected[:, :3])
     span = np.ptp(expected, axis=0)
     assert np.all(span[:6] > 1e-4) and np.all(np.abs(got - expected) <= 0.1 * span)

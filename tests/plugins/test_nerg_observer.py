@@ -146,8 +146,8 @@ def test06_shapes_occlude_the_observer(rgb, kind, veiled):
     out = channels(rgb, integrator, camera(rgb, (3.0, 0, -1), (0, 0, 1), fov=40, size=24), **shapes)
     on_wall = np.abs(out["position.Z"] - 1) < 1e-3
     # Its shadow is twice its size. A map resolves edges to about a row.
-    reach = np.maximum(np.abs(out["position.X"]), np.abs(out["position.Y"]))
-    hidden, seen = on_wall & (reach < 0.95), on_wall & (reach > 1.05)
+    scale = np.maximum(np.abs(out["position.X"]), np.abs(out["position.Y"]))
+    hidden, seen = on_wall & (scale < 0.95), on_wall & (scale > 1.05)
     assert hidden.sum() > 10 and seen.sum() > 50
     assert (out["visibility.Y"][hidden] < 1e-3).all()
     assert (out["visibility.Y"][seen] > (0.95 if kind == "map" else 0.999)).all()
@@ -198,8 +198,8 @@ def test08_gaze_on_a_shape_is_equation_1(rgb, files):
 
 
 def test09_no_march_without_volume_and_no_cast_without_shapes(rgb):
-    def operations(integrator, **more):
-        scene = scene_with(rgb, integrator, **more)
+    def operations(integrator, **overrides):
+        scene = scene_with(rgb, integrator, **overrides)
         rgb.render(scene, spp=1)
         return count_traced_operations(lambda: rgb.render(scene, spp=1))
 
@@ -221,13 +221,13 @@ def test11_map_stores_gaze(rgb, files):
     )
     scene = scene_with(rgb, table, s=sphere(rgb, 0, 0, 0))
     before = picture(rgb, scene)
-    exact, kept = channels(rgb, network, s=sphere(rgb, 0, 0, 0)), named(rgb, before, table)
-    assert exact["gaze_evals.Y"].max() == 2 and kept["gaze_evals.Y"].max() == 2
+    exact, selected = channels(rgb, network, s=sphere(rgb, 0, 0, 0)), named(rgb, before, table)
+    assert exact["gaze_evals.Y"].max() == 2 and selected["gaze_evals.Y"].max() == 2
     # Where entries are past the sphere, the network is evaluated.
-    assert 0 < kept["gaze_evals.Y"].sum() < 0.3 * exact["gaze_evals.Y"].sum()
-    both = (exact["visibility.Y"] == 1) & (kept["visibility.Y"] > 0.999)
+    assert 0 < selected["gaze_evals.Y"].sum() < 0.3 * exact["gaze_evals.Y"].sum()
+    both = (exact["visibility.Y"] == 1) & (selected["visibility.Y"] > 0.999)
     assert both.sum() > 10
-    assert np.allclose(kept["gaze.Y"][both], exact["gaze.Y"][both], rtol=0.02, atol=1e-5)
+    assert np.allclose(selected["gaze.Y"][both], exact["gaze.Y"][both], rtol=0.02, atol=1e-5)
 
     params, key = rgb.traverse(scene), "integrator.gaze.emit_head.0"
     attach(params, key)

@@ -95,17 +95,17 @@ def closed_form(mi, sigma, eye, depth="expected", light=None):
     return ClosedForm(mi.Properties())
 
 
-def nerg(mi, sigma, eye, depth="expected", light=None, aovs="depth,opacity,position,visibility", **more):
+def nerg(mi, sigma, eye, depth="expected", light=None, aovs="depth,opacity,position,visibility", **overrides):
     """The same as a description of `nerg`."""
     if light not in (None, "path"):
-        more["light"] = {"type": light}
+        overrides["light"] = {"type": light}
     if sigma:
         box = mi.ScalarTransform4f().translate([-1, -1, -1]).scale(2)
-        more["density"] = {"type": "constvolume", "value": sigma, "to_world": box}
-        more["color"] = {"type": "constvolume", "value": {"type": "rgb", "value": list(COLOR)}}
+        overrides["density"] = {"type": "constvolume", "value": sigma, "to_world": box}
+        overrides["color"] = {"type": "constvolume", "value": {"type": "rgb", "value": list(COLOR)}}
     if eye is not None:
-        more["observer"] = make_observer(mi, *eye)
-    return plugin("nerg", aovs=aovs, depth=depth, visibility="transmittance", tolerance=TOLERANCE, **more)
+        overrides["observer"] = make_observer(mi, *eye)
+    return plugin("nerg", aovs=aovs, depth=depth, visibility="transmittance", tolerance=TOLERANCE, **overrides)
 
 
 def furniture(mi):
@@ -142,9 +142,9 @@ SENSORS = {
 }
 
 
-def both_ways(mi, sensor, things, *place, spp=2, **kwargs):
+def both_ways(mi, sensor, shapes, *place, spp=2, **kwargs):
     """The image of `nerg`, that of the closed form, and the latter's channels by name."""
-    scene = mi.load_dict({"type": "scene", "sensor": sensor, **things})
+    scene = mi.load_dict({"type": "scene", "sensor": sensor, **shapes})
     a = np.array(mi.render(scene, integrator=mi.load_dict(nerg(mi, *place, **kwargs)), spp=spp, seed=3))
     b = np.array(mi.render(scene, integrator=closed_form(mi, *place, **kwargs), spp=spp, seed=3))
     return a, b, dict(zip(AOVS, np.moveaxis(b[..., 3:], -1, 0)))
@@ -152,18 +152,20 @@ def both_ways(mi, sensor, things, *place, spp=2, **kwargs):
 
 @pytest.mark.parametrize("kind", list(SENSORS))
 def test01_every_sensor_sees_shapes_in_a_field(rgb, kind):
-    a, b, known = both_ways(rgb, SENSORS[kind](rgb), furniture(rgb), 1.0, EYE)
+    a, b, expected = both_ways(rgb, SENSORS[kind](rgb), furniture(rgb), 1.0, EYE)
     assert np.allclose(a, b, atol=2e-4)
-    seen = known["visibility.Y"]
-    assert kind == "crop of one pixel" or (np.ptp(seen) > 0.1 and seen.max() > 0.3 and np.ptp(known["depth.T"]) > 0.2)
+    seen = expected["visibility.Y"]
+    assert kind == "crop of one pixel" or (
+        np.ptp(seen) > 0.1 and seen.max() > 0.3 and np.ptp(expected["depth.T"]) > 0.2
+    )
 
 
 @pytest.mark.parametrize("kind", ["orthographic", "batch"])
 @pytest.mark.parametrize("sigma", [0, 4.0])
 def test02_every_sensor_sees_shapes_alone_and_a_field_alone(rgb, kind, sigma):
-    things = {} if sigma else furniture(rgb)
-    a, b, known = both_ways(rgb, SENSORS[kind](rgb), things, sigma, EYE, depth="median")
-    assert np.allclose(a, b, atol=2e-4) and np.ptp(known["visibility.Y"]) > 0.1
+    shapes = {} if sigma else furniture(rgb)
+    a, b, expected = both_ways(rgb, SENSORS[kind](rgb), shapes, sigma, EYE, depth="median")
+    assert np.allclose(a, b, atol=2e-4) and np.ptp(expected["visibility.Y"]) > 0.1
 
 
 @pytest.mark.parametrize("kind", ["thinlens", "batch", "panorama"])
@@ -178,9 +180,11 @@ def test03_without_an_observer_it_is_the_camera(rgb, kind):
     width = p.shape[1] // len(centers)
     for i, c in enumerate(centers):
         part = np.s_[:, i * width : (i + 1) * width]
-        met = p[part].any(-1)
+        has_surface = p[part].any(-1)
         distance = np.linalg.norm(p[part] - c, axis=-1)
-        assert met.any() and np.allclose(out["observer_depth.T"][part][met], distance[met], rtol=1e-4)
+        assert has_surface.any() and np.allclose(
+            out["observer_depth.T"][part][has_surface], distance[has_surface], rtol=1e-4
+        )
 
 
 @pytest.mark.parametrize("light", ["path", "direct"])
@@ -188,8 +192,8 @@ def test04_emitters_and_the_sky_light_shapes_and_are_the_background(rgb, light):
     """`path` is the default of a scene with emitters. Equal seeds: the same paths."""
     sky = {"type": "constant", "radiance": {"type": "rgb", "value": [0.3, 0.5, 0.2]}}
     lamp = {"type": "sphere", "center": [0, 0.7, -0.5], "radius": 0.2, "e": {"type": "area", "radiance": 3.0}}
-    things = {**furniture(rgb), "sky": sky, "lamp": lamp}
-    a, b, _ = both_ways(rgb, camera(rgb, fov=90), things, 0.5, EYE, light=light)
+    shapes = {**furniture(rgb), "sky": sky, "lamp": lamp}
+    a, b, _ = both_ways(rgb, camera(rgb, fov=90), shapes, 0.5, EYE, light=light)
     assert np.allclose(a, b, atol=2e-4) and a[..., 0].max() > 1.5
     assert np.allclose(a[0, 0, :3], [0.3, 0.5, 0.2], atol=1e-5)
 
@@ -237,7 +241,7 @@ def test06_moved_shapes_are_updated(rgb, name, kind):
     integrator = plugin(
         "nerg", aovs="depth,visibility", visibility=kind, map_height=64, falloff=0.0, observer=make_observer(rgb, *EYE)
     )
-    moved, new = (scene_with(rgb, integrator, back=square(rgb, 1.4, 1.5), **things) for things in (before, after))
+    moved, new = (scene_with(rgb, integrator, back=square(rgb, 1.4, 1.5), **shapes) for shapes in (before, after))
     first = picture(rgb, moved)
     put(rgb.traverse(moved), key, rgb.traverse(new)[key])
     a, b = (picture(rgb, s) for s in (moved, new))
@@ -257,23 +261,23 @@ def test07_textures(rgb):
     turned = rgb.ScalarTransform4f().rotate([0.5, 1, 0], 160)
     bsdf = {"type": "twosided", "b": {"type": "principled", "base_color": texture}}
     checkers = {"type": "diffuse", "reflectance": {"type": "checkerboard"}}
-    things = {"board": plugin("rectangle", to_world=turned, bsdf=bsdf)}
-    things["ball"] = sphere(rgb, 0.7, 0, -0.7, radius=0.4) | {"bsdf": checkers}
-    albedo = render(rgb, {"type": "aov", "aovs": "a:albedo"}, **things)
-    image = render(rgb, {"type": "nerg", "aovs": ""}, **things)
+    shapes = {"board": plugin("rectangle", to_world=turned, bsdf=bsdf)}
+    shapes["ball"] = sphere(rgb, 0.7, 0, -0.7, radius=0.4) | {"bsdf": checkers}
+    albedo = render(rgb, {"type": "aov", "aovs": "a:albedo"}, **shapes)
+    image = render(rgb, {"type": "nerg", "aovs": ""}, **shapes)
     assert np.allclose(image[..., :3], albedo[..., -3:], atol=1e-5) and np.ptp(image[..., 0]) > 0.5
 
 
 def test08_nested_in_aov_and_moment(rgb):
-    inner, things, spp = nerg(rgb, 1.0, EYE), furniture(rgb), 4
-    plain = render(rgb, inner, spp=spp, **things)
-    around = render(rgb, {"type": "aov", "aovs": "z:depth", "nerg": nerg(rgb, 0, EYE)}, spp=spp, **things)
-    z = named(rgb, render(rgb, nerg(rgb, 0, EYE), spp=spp, **things), inner)["depth.T"]
+    inner, shapes, spp = nerg(rgb, 1.0, EYE), furniture(rgb), 4
+    plain = render(rgb, inner, spp=spp, **shapes)
+    around = render(rgb, {"type": "aov", "aovs": "z:depth", "nerg": nerg(rgb, 0, EYE)}, spp=spp, **shapes)
+    z = named(rgb, render(rgb, nerg(rgb, 0, EYE), spp=spp, **shapes), inner)["depth.T"]
     # `aov` puts the inner image first and its own channels last.
     assert np.allclose(around[..., 3], z, atol=1e-5) and np.allclose(around[..., -1], z, atol=1e-5)
     moment = {"type": "moment", "in": inner}
-    names, image = rgb.load_dict(moment).aov_names(), render(rgb, moment, spp=spp, **things)
-    single = render(rgb, closed_form(rgb, 1.0, EYE), seed=1, spp=64, **things)[..., 3:]
+    names, image = rgb.load_dict(moment).aov_names(), render(rgb, moment, spp=spp, **shapes)
+    single = render(rgb, closed_form(rgb, 1.0, EYE), seed=1, spp=64, **shapes)[..., 3:]
     for i, name in enumerate(AOVS):
         first, second = (image[..., 3 + names.index(f"{p}in.{name}")] for p in ("", "m2_"))
         assert np.allclose(first, plain[..., 3 + i], atol=1e-5)
@@ -288,39 +292,41 @@ def test09_channels_of_a_nested_integrator_survive_in_any_order(rgb):
     outer = {"type": "moment", "in": nerg(rgb, 0.5, EYE, aovs="opacity,depth", lit=nested)}
     names = rgb.load_dict(outer).aov_names()
     out = dict(zip(names, np.moveaxis(render(rgb, outer, ball=furniture(rgb)["ball"], sky=sky)[..., 3:], -1, 0)))
-    known = render(rgb, {"type": "aov", "aovs": "n:sh_normal,z:depth"}, ball=furniture(rgb)["ball"])
-    hit = known[..., -1] > 0
-    assert np.allclose(out["in.z.T"], known[..., -1], atol=1e-5) and hit.sum() > 5
-    assert all(np.allclose(out[f"in.n.{c}"][hit], known[..., -4 + i][hit], atol=1e-5) for i, c in enumerate("XYZ"))
-    assert np.allclose(out["m2_in.z.T"], known[..., -1] ** 2, rtol=1e-4) and (out["in.opacity.Y"][hit] == 1).all()
+    expected = render(rgb, {"type": "aov", "aovs": "n:sh_normal,z:depth"}, ball=furniture(rgb)["ball"])
+    hit = expected[..., -1] > 0
+    assert np.allclose(out["in.z.T"], expected[..., -1], atol=1e-5) and hit.sum() > 5
+    assert all(np.allclose(out[f"in.n.{c}"][hit], expected[..., -4 + i][hit], atol=1e-5) for i, c in enumerate("XYZ"))
+    assert np.allclose(out["m2_in.z.T"], expected[..., -1] ** 2, rtol=1e-4) and (out["in.opacity.Y"][hit] == 1).all()
 
 
 @pytest.mark.parametrize("sky", [False, True])
 @pytest.mark.parametrize("hide", [False, True])
 def test10_alpha_matches_other_integrators(rgb, sky, hide):
     """The film's alpha: the fraction of samples with a surface or a visible environment emitter."""
-    more = {"sky": {"type": "constant"}} if sky else {}
+    overrides = {"sky": {"type": "constant"}} if sky else {}
     sensor = camera(rgb, film={"pixel_format": "rgba"})
     path = {"type": "path", "hide_emitters": hide}
-    more["ball"] = sphere(rgb, 0, 0, 0)
+    overrides["ball"] = sphere(rgb, 0, 0, 0)
     for nested in ({}, {"lit": {"type": "direct", "hide_emitters": hide}}):
-        known = render(rgb, nested.get("lit", path), sensor, spp=4, **more)[..., 3]
-        ours = render(rgb, {"type": "nerg", "aovs": "opacity", "hide_emitters": hide, **nested}, sensor, spp=4, **more)
-        assert np.array_equal(ours[..., 3], known)
+        expected = render(rgb, nested.get("lit", path), sensor, spp=4, **overrides)[..., 3]
+        ours = render(
+            rgb, {"type": "nerg", "aovs": "opacity", "hide_emitters": hide, **nested}, sensor, spp=4, **overrides
+        )
+        assert np.array_equal(ours[..., 3], expected)
         assert 0 < ours[..., 4].mean() < 0.5
-    del more["ball"]
-    thin = render(rgb, constant(0.2, aovs="opacity", hide_emitters=hide), sensor, **more)
-    met = thin[..., 4] > 0
-    assert np.array_equal(thin[..., 3], np.where(met | (sky and not hide), 1, 0)) and thin[..., 4].max() < 0.5
+    del overrides["ball"]
+    thin = render(rgb, constant(0.2, aovs="opacity", hide_emitters=hide), sensor, **overrides)
+    has_surface = thin[..., 4] > 0
+    assert np.array_equal(thin[..., 3], np.where(has_surface | (sky and not hide), 1, 0)) and thin[..., 4].max() < 0.5
 
 
 def test11_hidden_emitters_still_light_shapes(rgb):
     """As in Mitsuba: `path` sees through a lamp, `depth` hits it."""
     lamp = {"type": "sphere", "radius": 0.5, "e": {"type": "area", "radiance": 2.0}}
-    things = {"lamp": lamp, "back": square(rgb, 1.0, 2.0)}
-    image = render(rgb, {"type": "nerg", "aovs": "depth", "hide_emitters": True}, **things)
-    assert np.allclose(image[..., 3], render(rgb, {"type": "depth"}, **things)[..., 0], atol=1e-5)
-    assert np.allclose(image[..., :3], render(rgb, {"type": "path", "hide_emitters": True}, **things), atol=1e-5)
+    shapes = {"lamp": lamp, "back": square(rgb, 1.0, 2.0)}
+    image = render(rgb, {"type": "nerg", "aovs": "depth", "hide_emitters": True}, **shapes)
+    assert np.allclose(image[..., 3], render(rgb, {"type": "depth"}, **shapes)[..., 0], atol=1e-5)
+    assert np.allclose(image[..., :3], render(rgb, {"type": "path", "hide_emitters": True}, **shapes), atol=1e-5)
     assert image[..., :3].max() < 1.9
 
 
@@ -334,13 +340,13 @@ def test12_distant_shapes_do_not_blur_shadows(rgb):
         "observer": make_observer(rgb, 0, 0, -1),
     }
     sensor = camera(rgb, (3.0, 0, -1), (0, 0, 1), fov=40, size=24)
-    things = {"wall": square(rgb, 1.0, 3.0), "lid": square(rgb, 0.8, 0.5)}
+    shapes = {"wall": square(rgb, 1.0, 3.0), "lid": square(rgb, 0.8, 0.5)}
     sky = plugin("sphere", radius=1000.0, bsdf={"type": "twosided", "b": {"type": "diffuse"}})
     for dome in ({}, {"dome": sky}):
-        out = channels(rgb, integrator, sensor, **things, **dome)
-        reach = np.maximum(np.abs(out["position.X"]), np.abs(out["position.Y"]))
+        out = channels(rgb, integrator, sensor, **shapes, **dome)
+        scale = np.maximum(np.abs(out["position.X"]), np.abs(out["position.Y"]))
         on_wall = np.abs(out["position.Z"] - 1) < 1e-3
-        hidden, seen = on_wall & (reach < 0.55), on_wall & (reach > 0.56) & (reach < 2.9)
+        hidden, seen = on_wall & (scale < 0.55), on_wall & (scale > 0.56) & (scale < 2.9)
         assert hidden.sum() > 10 and seen.sum() > 100
         assert (out["visibility.Y"][hidden] == 0).all() and (out["visibility.Y"][seen] == 1).all()
 
@@ -348,25 +354,27 @@ def test12_distant_shapes_do_not_blur_shadows(rgb):
 def test13_nested_volpath_with_mitsuba_media(rgb):
     """Around shapes, and around the camera itself: the same paths as those of `volpath`."""
     fog = {"type": "homogeneous", "sigma_t": 0.4, "albedo": 0.5}
-    things = {"back": square(rgb, 1.4, 1.5), "lamp": {"type": "point", "position": [1, 1, -1], "intensity": 9.0}}
+    shapes = {"back": square(rgb, 1.4, 1.5), "lamp": {"type": "point", "position": [1, 1, -1], "intensity": 9.0}}
     cloud = {"cloud": plugin("cube", to_world=rgb.ScalarTransform4f().scale(0.6), bsdf={"type": "null"}, interior=fog)}
-    for sensor, more in ((camera(rgb), cloud), ({**camera(rgb), "medium": fog}, {})):
+    for sensor, overrides in ((camera(rgb), cloud), ({**camera(rgb), "medium": fog}, {})):
         lit = plugin("nerg", aovs="depth", lit={"type": "volpath"})
-        known, ours = (render(rgb, i, sensor, spp=2, seed=2, **things, **more) for i in ({"type": "volpath"}, lit))
-        assert np.allclose(ours[..., :3], known, atol=1e-5) and np.ptp(known) > 0.05
+        expected, ours = (
+            render(rgb, i, sensor, spp=2, seed=2, **shapes, **overrides) for i in ({"type": "volpath"}, lit)
+        )
+        assert np.allclose(ours[..., :3], expected, atol=1e-5) and np.ptp(expected) > 0.05
 
 
 @pytest.mark.parametrize("case", ["aov", "moment", "faces"])
 def test14_errors_inside_other_integrators(rgb, case):
     """In one message: ``mi.render`` wraps it into its own."""
-    outer, things = {"aov": {"aovs": "z:depth"}, "moment": {}}.get(case), {}
+    outer, shapes = {"aov": {"aovs": "z:depth"}, "moment": {}}.get(case), {}
     integrator, words = plugin(case, **{"in": {"type": "nerg"}}, **(outer or {})), "there is nothing to render"
     if outer is None:
         integrator = plugin("nerg", aovs="visibility", observer=make_observer(rgb, *EYE))
-        things = {"ball": sphere(rgb, 0, 0, 0), "leftover": rgb.Mesh("leftover", 0, 0)}
+        shapes = {"ball": sphere(rgb, 0, 0, 0), "leftover": rgb.Mesh("leftover", 0, 0)}
         words = 'the mesh "leftover" has no faces'
     with pytest.raises(Exception) as raised:
-        render(rgb, integrator, **things)
+        render(rgb, integrator, **shapes)
     error, said = raised.value, ""
     while error is not None:
         said, error = said + str(error), error.__cause__ or error.__context__

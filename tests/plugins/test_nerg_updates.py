@@ -30,10 +30,10 @@ from .scenes import (
 # ---- Updates of parameters: what is recomputed, and what is kept ----
 
 
-def behind_a_wall(mi, **more):
+def behind_a_wall(mi, **overrides):
     """An observer in front of a wall with a gap, and a camera that sees what is behind it."""
     sensor = camera(mi, (0.5, 0, 0.2), (0.5, 0, 1), fov=65, near_clip=1e-3)
-    how = {"aovs": "visibility", "step": 0.01, "falloff": 0.0, "radiance": False, **more}
+    how = {"aovs": "visibility", "step": 0.01, "falloff": 0.0, "radiance": False, **overrides}
     return scene_with(mi, plugin("nerg", density=wall(mi), observer=make_observer(mi, 0, 0, -0.9), **how), sensor)
 
 
@@ -132,25 +132,25 @@ def test03_map_is_updated_with_the_field(rgb, files, change):
 def test04_map_is_kept_across_unrelated_changes(rgb):
     scene = behind_a_wall(rgb, visibility="map", map_height=64)
     seen(rgb, scene)
-    kept = scene.integrator().cache.peek("map")[0]
+    selected = scene.integrator().cache.peek("map")[0]
     params = rgb.traverse(scene)
     put(params, "integrator.falloff", rgb.Float(0.7))
     softer = seen(rgb, scene)
-    assert scene.integrator().cache.peek("map")[0] is kept and ((softer > 0.05) & (softer < 0.95)).any()
+    assert scene.integrator().cache.peek("map")[0] is selected and ((softer > 0.05) & (softer < 0.95)).any()
     put(params, "integrator.observer.to_world", rgb.ScalarTransform4f().translate([0.3, 0, -0.9]))
     seen(rgb, scene)
-    assert scene.integrator().cache.peek("map")[0] is not kept
+    assert scene.integrator().cache.peek("map")[0] is not selected
 
 
 def test05_update_without_keys_checks_everything(rgb, reads):
     scene = behind_a_wall(rgb, visibility="map", map_height=64)
     seen(rgb, scene)
     integrator = scene.integrator()
-    kept = integrator.cache.peek("map")[0]
+    selected = integrator.cache.peek("map")[0]
     integrator.parameters_changed()
     assert len(reads) == 2
     seen(rgb, scene)
-    assert integrator.cache.peek("map")[0] is not kept
+    assert integrator.cache.peek("map")[0] is not selected
 
 
 def test05b_observer_pose_update_is_validated(rgb):
@@ -169,11 +169,11 @@ def test06_gaze_and_std_fade_with_visibility(rgb, files, tmp_path):
     d = np.random.default_rng(1).normal(size=(50, 3)) + (2, -0.3, 2)
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     Rays(np.arange(50), np.zeros(50), ("a",), origins, d, np.ones(50)).save(tmp_path / "rays.npz")
-    more = {"observer": make_observer(rgb, -2, 0.3, -2), "visibility": "transmittance"}
-    more["gaze"] = stored("gazefield", tmp_path / "e.safetensors")
-    more["kde"] = stored("gazekde", tmp_path / "rays.npz", kappa=2.0)
+    overrides = {"observer": make_observer(rgb, -2, 0.3, -2), "visibility": "transmittance"}
+    overrides["gaze"] = stored("gazefield", tmp_path / "e.safetensors")
+    overrides["kde"] = stored("gazekde", tmp_path / "rays.npz", kappa=2.0)
     aovs = "gaze,gaze_std,kde,support,visibility,opacity"
-    hidden, open_ = (channels(rgb, with_field(files, aovs=aovs, occlusion=o, **more)) for o in (True, False))
+    hidden, open_ = (channels(rgb, with_field(files, aovs=aovs, occlusion=o, **overrides)) for o in (True, False))
     share = hidden["visibility.Y"]
     part = (share > 0.1) & (share < 0.9)
     assert part.sum() > 10
@@ -211,8 +211,8 @@ def small(mi):
     return still(camera(mi, size=6))
 
 
-def scene_of(mi, files, shapes=(), **more):
-    how = {"aovs": "depth,gaze,visibility", "falloff": 2.0, "observer": make_observer(mi, -2, 0.3, -2), **more}
+def scene_of(mi, files, shapes=(), **overrides):
+    how = {"aovs": "depth,gaze,visibility", "falloff": 2.0, "observer": make_observer(mi, -2, 0.3, -2), **overrides}
     return scene_with(mi, with_gaze(files, **how), small(mi), **dict(shapes))
 
 
@@ -279,7 +279,7 @@ def test11_frozen_training_matches(rgb, files, names):
     """Derivatives of a frozen loss are those of the loss; moved Gaussians compile no kernel."""
     make = lambda: splat_scene(rgb) if names is SPLATS else scene_of(rgb, files, aovs="gaze", radiance=False)
     reference = rgb.render(make(), spp=1) * 1.3
-    keys, ways = [f"integrator.{name}" for name in names], []
+    keys, variants = [f"integrator.{name}" for name in names], []
 
     def step(scene, params, reference, seed):
         loss = dr.mean(dr.square(rgb.render(scene, params, spp=1, seed=seed) - reference), axis=None)
@@ -288,7 +288,7 @@ def test11_frozen_training_matches(rgb, files, names):
 
     frozen = dr.freeze(step)
     for descend in (step, frozen):
-        scene, way = make(), []
+        scene, direction = make(), []
         params = rgb.traverse(scene)
         params.keep(keys)
         opt = rgb.ad.Adam(lr=1e-2, params={key: params[key] for key in keys})
@@ -297,14 +297,14 @@ def test11_frozen_training_matches(rgb, files, names):
             for i in range(5):
                 if i == 3:
                     dr.kernel_history_clear()
-                way.append(descend(scene, params, reference, rgb.UInt32(i)).numpy().item())
+                direction.append(descend(scene, params, reference, rgb.UInt32(i)).numpy().item())
                 opt.step()
                 params.update(opt)
             # Of all 36 pixels; others pack the Gaussians.
-            found = [k["cache_hit"] for k in dr.kernel_history() if k["size"] == 36 and "cache_hit" in k]
-        assert all(found) and (descend is frozen or found)
-        ways.append(way)
-    assert ways[0][1] != ways[0][0] and np.allclose(*ways, rtol=1e-4)
+            result = [k["cache_hit"] for k in dr.kernel_history() if k["size"] == 36 and "cache_hit" in k]
+        assert all(result) and (descend is frozen or result)
+        variants.append(direction)
+    assert variants[0][1] != variants[0][0] and np.allclose(*variants, rtol=1e-4)
     assert frozen.n_recordings <= 3
 
 
@@ -317,6 +317,6 @@ def test12_changing_gaussians_in_a_frozen_function_is_refused(rgb):
         put(params, "integrator.field.centers", params["integrator.field.centers"] + by)
         return rgb.render(scene, spp=1)
 
-    with pytest.raises(RuntimeError) as found:
+    with pytest.raises(RuntimeError) as result:
         move(scene, params, rgb.Float(0.1))
-    assert "call params.update() before the function" in str(found.value.__cause__)
+    assert "call params.update() before the function" in str(result.value.__cause__)

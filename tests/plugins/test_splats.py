@@ -30,11 +30,11 @@ def render(rgb, tmp_path):
         image = draw(rgb, integrator, sensor, **dict(others))
         names = rgb.load_dict(integrator).aov_names()
         # All channels of an AOV together; a single one without an axis.
-        found: dict = {}
+        result: dict = {}
         for name, value in zip(names, np.moveaxis(image[..., image.shape[-1] - len(names) :], -1, 0)):
-            found.setdefault(name.split(".")[0], []).append(value)
-        found = {name: v[0] if len(v) == 1 else np.stack(v, axis=-1) for name, v in found.items()}
-        return found | {"color": image[..., :3]}
+            result.setdefault(name.split(".")[0], []).append(value)
+        result = {name: v[0] if len(v) == 1 else np.stack(v, axis=-1) for name, v in result.items()}
+        return result | {"color": image[..., :3]}
 
     return rendered
 
@@ -64,8 +64,8 @@ def test_colors_match_volprim_rf_basic(rgb, tmp_path, render):
     ours = render(some, aovs="opacity", sensor=camera(rgb, size=32))
     opacity = ours["opacity"][..., None]
     sums = opacity * encode_srgb(ours["color"] / np.maximum(opacity, 1e-9))
-    apart = np.abs(sums - of_mitsuba(rgb, tmp_path / "a.ply", camera(rgb, size=32))).max(-1)[opacity[..., 0] > 0]
-    assert len(apart) > 300 and np.median(apart) < 1e-6 and (apart < 1e-4).mean() > 0.9
+    difference = np.abs(sums - of_mitsuba(rgb, tmp_path / "a.ply", camera(rgb, size=32))).max(-1)[opacity[..., 0] > 0]
+    assert len(difference) > 300 and np.median(difference) < 1e-6 and (difference < 1e-4).mean() > 0.9
 
 
 def test_each_gaussian_is_hit_once(rgb, tmp_path, render):
@@ -74,25 +74,25 @@ def test_each_gaussian_is_hit_once(rgb, tmp_path, render):
     opacity = render(one, aovs="opacity", sensor=camera(rgb, size=64))["opacity"]
     theirs = of_mitsuba(rgb, tmp_path / "a.ply", camera(rgb, size=64))[..., 0]
     # Within the rim, where both cut it off.
-    met = opacity > 0
-    theirs, opacity = theirs[met], opacity[met]
+    has_surface = opacity > 0
+    theirs, opacity = theirs[has_surface], opacity[has_surface]
     twice = theirs > 1.2 * opacity
-    assert met.sum() > 500 and twice.mean() < 0.05 and np.allclose(theirs[~twice], opacity[~twice], atol=1e-5)
+    assert has_surface.sum() > 500 and twice.mean() < 0.05 and np.allclose(theirs[~twice], opacity[~twice], atol=1e-5)
     assert np.allclose(theirs[twice], 1 - (1 - opacity[twice]) ** 2, atol=1e-5)
 
 
 def test_wall_depth_for_camera_and_observer(rgb, render):
-    found = render(
+    result = render(
         wall(),
         aovs="depth,opacity,position,visibility,observer_depth",
         observer={"type": "perspective", "to_world": look_at(rgb, (1, 0.5, -2), (0, 0, 0))},
     )
-    assert found["opacity"].min() > 0.99
-    assert np.abs(found["position"][..., 2]).max() < 2e-3
+    assert result["opacity"].min() > 0.99
+    assert np.abs(result["position"][..., 2]).max() < 2e-3
     # From the near plane on.
-    assert np.allclose(found["depth"], np.linalg.norm(found["position"] - [0.5, 0.4, -3], axis=-1), atol=0.02)
-    assert found["visibility"].min() == 1
-    assert np.allclose(decode_srgb(np.array([0.2, 0.5, 0.8])), found["color"].mean((0, 1)), atol=1e-3)
+    assert np.allclose(result["depth"], np.linalg.norm(result["position"] - [0.5, 0.4, -3], axis=-1), atol=0.02)
+    assert result["visibility"].min() == 1
+    assert np.allclose(decode_srgb(np.array([0.2, 0.5, 0.8])), result["color"].mean((0, 1)), atol=1e-3)
 
 
 @pytest.mark.parametrize("visibility", ["depth", "transmittance", "map"])
@@ -102,11 +102,11 @@ def test_splats_occlude(rgb, render, visibility):
     # The camera looks at the far wall below the near one, behind which the observer is.
     observer = {"type": "perspective", "to_world": look_at(rgb, (0, 0, -3), (0, 0, 0))}
     sensor = camera(rgb, (0, 0, -0.5), (0, 0, 0), fov=140)
-    found = render(
+    result = render(
         both, sensor, aovs="position,visibility", observer=observer, visibility=visibility, falloff=0.0, map_height=256
     )
-    x, y = np.abs(found["position"][..., :2]).max(-1), found["visibility"]
-    inside = (x < 1.9) & (np.abs(found["position"][..., 2]) < 0.01)
+    x, y = np.abs(result["position"][..., :2]).max(-1), result["visibility"]
+    inside = (x < 1.9) & (np.abs(result["position"][..., 2]) < 0.01)
     # A shadow on a surface at 3 of one at 2; its rim is as soft as the last Gaussians.
     assert y[inside & (x < 0.75)].max() < 0.05 and y[inside & (x > 1.3)].min() > 0.95
     assert (inside & (x < 0.75)).sum() > 3 and (inside & (x > 1.3)).sum() > 3
@@ -115,8 +115,8 @@ def test_splats_occlude(rgb, render, visibility):
 def test_camera_inside_gaussians(rgb, render):
     # A haze around camera and wall: its peak is behind the camera on one side, in front of it on the other.
     haze = Splats([[0.5, 0.4, -2.5]], [[3, 3, 3]], [[1, 0, 0, 0]], [0.5], harmonics_from_colors([[1, 1, 1]]))
-    found = render(haze, aovs="opacity,depth")
-    assert found["opacity"].min() > 0.4 and found["depth"].max() <= 0.5
+    result = render(haze, aovs="opacity,depth")
+    assert result["opacity"].min() > 0.4 and result["depth"].max() <= 0.5
     away = render(haze, camera(rgb, (0.5, 0.4, -2), (0.5, 0.4, 0)), aovs="opacity")
     assert away["opacity"].max() == 0
 
@@ -138,13 +138,13 @@ def test_rotated_splats_rotate_colors(rgb, render):
     matrix[:3, :3] = 2 * turn
     to_world = rgb.ScalarTransform4f(matrix)
     eye, target = np.array([0.5, 0.4, -3]), np.zeros(3)
-    here = render(splats, aovs="depth,opacity")
+    local = render(splats, aovs="depth,opacity")
     up = turn @ [0, 1, 0]
     moved = camera(rgb) | {"to_world": look_at(rgb, 2 * turn @ eye, target, up)}
-    there = render(splats, moved, field={"to_world": to_world}, aovs="depth,opacity")
-    assert np.abs(there["color"] - here["color"]).max() < 1e-4
+    other = render(splats, moved, field={"to_world": to_world}, aovs="depth,opacity")
+    assert np.abs(other["color"] - local["color"]).max() < 1e-4
     # Rays start at the near plane, which has not been scaled.
-    assert np.allclose(there["depth"], 2 * here["depth"], atol=0.02)
+    assert np.allclose(other["depth"], 2 * local["depth"], atol=0.02)
 
 
 def test_image_derivatives(rgb, tmp_path):
@@ -159,13 +159,13 @@ def test_image_derivatives(rgb, tmp_path):
     params[key] = value
     params.update()
     dr.backward(dr.mean(rgb.render(scene, params, spp=1, seed=0)[:, :, :4], axis=None))
-    found = float(dr.sum(dr.grad(value))[0])
+    result = float(dr.sum(dr.grad(value))[0])
     ends = []
     for sign in (1, -1):
         params[key] = before + sign * 1e-3
         params.update()
         ends.append(np.array(rgb.render(scene, params, spp=1, seed=0), np.float64)[..., :4].mean())
-    assert abs(found) > 1e-2 and np.isclose(found, (ends[0] - ends[1]) / 2e-3, rtol=2e-2)
+    assert abs(result) > 1e-2 and np.isclose(result, (ends[0] - ends[1]) / 2e-3, rtol=2e-2)
 
 
 def test_fitting_page_example_runs(rgb, tmp_path, monkeypatch):
@@ -196,9 +196,9 @@ def test_extreme_splats_give_finite_images(rgb, tmp_path):
         dr.enable_grad(params[f"i.field.{name}"])
     params.update()
     picture = rgb.render(scene, params, spp=1)
-    found = np.array(picture)
-    assert np.isfinite(found).all() and found[..., 4].min() >= 0 and found[..., 4].max() <= 1
-    assert found[..., 4].max() > 0.1
+    result = np.array(picture)
+    assert np.isfinite(result).all() and result[..., 4].min() >= 0 and result[..., 4].max() <= 1
+    assert result[..., 4].max() > 0.1
     dr.backward(dr.mean(picture, axis=None))
     for name in ("centers", "scales", "rotations", "opacities", "harmonics"):
         grad = np.array(dr.grad(params[f"i.field.{name}"]))

@@ -92,8 +92,8 @@ def gaze(mi, folder, change=1.0):
 
 def shapes(mi, folder, change=1.0):
     lit = {"type": "path", "max_depth": 4}
-    more = things(mi) | {"sky": {"type": "constant", "radiance": rgb_of(0.9 * change, change, 1.2 * change)}}
-    return {"type": "nerg", "lit": lit, "aovs": ""}, more, ("R", "G", "B"), camera(mi, (1, 1, -3), size=SIZE)
+    overrides = things(mi) | {"sky": {"type": "constant", "radiance": rgb_of(0.9 * change, change, 1.2 * change)}}
+    return {"type": "nerg", "lit": lit, "aovs": ""}, overrides, ("R", "G", "B"), camera(mi, (1, 1, -3), size=SIZE)
 
 
 def both(mi, folder, change=1.0):
@@ -158,9 +158,9 @@ SCENES = {
 
 
 def scene(mi, name, folder, change=1.0):
-    integrator, more, names, sensor = SCENES[name][0](mi, folder, change)
+    integrator, overrides, names, sensor = SCENES[name][0](mi, folder, change)
     moments = {"type": "moment", "in": shown(mi, integrator, names)}
-    return mi.load_dict({"type": "scene", "integrator": moments, "sensor": sensor, **more})
+    return mi.load_dict({"type": "scene", "integrator": moments, "sensor": sensor, **overrides})
 
 
 def test_of(mi, name, folder, references=REFERENCES, change=1.0):

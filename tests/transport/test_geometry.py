@@ -37,23 +37,23 @@ def ray(mi, origins, directions, kind="RayDifferential3f"):
 def test01_ceiling_clips_rays(rgb, scale):
     directions = [[0, 0, -1], [0.6, 0, -0.8], [1, 0, 0], [0, 0, 1], [0.6, 0, -0.8]]
     origins = [[0, 0, 3]] * 4 + [[0, 0, 0.5]]
-    given = ray(rgb, origins, directions)
-    given.maxt = rgb.Float(10)
-    moved, ahead = Ceiling(1.0, (0, 0, scale)).clip_ray(given)
+    arguments = ray(rgb, origins, directions)
+    arguments.maxt = rgb.Float(10)
+    moved, ahead = Ceiling(1.0, (0, 0, scale)).clip_ray(arguments)
     assert np.allclose(ahead, [2, 2.5, 0, 0, 0])
     assert np.allclose(np.array(moved.o).T[:2], [[0, 0, 1], [1.5, 0, 1]]) and np.allclose(
         moved.maxt, [8, 7.5, 10, 10, 10]
     )
-    assert np.allclose(np.array(moved.o).T[2:], origins[2:]) and np.array_equal(moved.d, given.d)
+    assert np.allclose(np.array(moved.o).T[2:], origins[2:]) and np.array_equal(moved.d, arguments.d)
 
 
 def test02_ceiling_with_any_up_and_ray_differentials(rgb):
     rng = np.random.default_rng(3)
     up, o, d = rng.normal(size=3), rng.normal(size=(50, 3)) * 4, rng.normal(size=(50, 3))
     d /= np.linalg.norm(d, axis=1)[:, None]
-    given = ray(rgb, o, d)
-    given.o_x, given.d_x, given.o_y, given.d_y = given.o + 1, given.d, given.o, given.d
-    moved, ahead = Ceiling(0.3, up).clip_ray(given)
+    arguments = ray(rgb, o, d)
+    arguments.o_x, arguments.d_x, arguments.o_y, arguments.d_y = arguments.o + 1, arguments.d, arguments.o, arguments.d
+    moved, ahead = Ceiling(0.3, up).clip_ray(arguments)
     unit = up / np.linalg.norm(up)
     over, fall = o @ unit - 0.3, -(d @ unit)
     cuts = (over > 0) & (fall > 0)
@@ -64,12 +64,12 @@ def test02_ceiling_with_any_up_and_ray_differentials(rgb):
 
 
 def test03_ceiling_height_reuses_the_kernel(rgb):
-    given = ray(rgb, [[0, 0, 3]] * 4, [[0, 0, -1]] * 4, "Ray3f")
+    arguments = ray(rgb, [[0, 0, 3]] * 4, [[0, 0, -1]] * 4, "Ray3f")
     kernels = []
     for height in (1.0, 1.5, 2.0):
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             dr.kernel_history_clear()
-            dr.eval(Ceiling(height).clip_ray(given)[1])
+            dr.eval(Ceiling(height).clip_ray(arguments)[1])
             kernels.append({k["hash"] for k in dr.kernel_history([dr.KernelType.JIT])})
     assert kernels[0] == kernels[1] == kernels[2] and kernels[0]
 
@@ -313,9 +313,9 @@ def test_wall_depth(wall):
 def test_batches_and_array_types_agree(slab, rgb, batch):
     ns = namespace("llvm")
     expected = trace_depth(slab, O, D)
-    found = trace_depth(slab, O, D, batch=batch)
+    result = trace_depth(slab, O, D, batch=batch)
     jit = trace_depth(slab, ns.Array3f(O.T), ns.Array3f(D.T), batch=batch)
-    for e, f, j in zip(expected, found, jit):
+    for e, f, j in zip(expected, result, jit):
         np.testing.assert_array_equal(f, e)
         assert dr.is_array_v(j)
         np.testing.assert_array_equal(np.array(j), e)

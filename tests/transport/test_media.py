@@ -65,17 +65,17 @@ def test01_color_shader(rgb, kind):
         ColorShader(array_type),
     )
     p, w = rgb.Point3f(0.5, 0.5, 0.5), rgb.Vector3f(0, 0, 1)
-    found = painter.shade(medium, [], p, w, rgb.Bool(True))
-    assert type(found) is type(painter.zero()) is array_type
-    assert np.allclose(np.array(found).ravel(), [0.2, 0.5, 0.8], atol=1e-6)
+    result = painter.shade(medium, [], p, w, rgb.Bool(True))
+    assert type(result) is type(painter.zero()) is array_type
+    assert np.allclose(np.array(result).ravel(), [0.2, 0.5, 0.8], atol=1e-6)
     assert not np.array(painter.zero()).any()
-    assert painter.resolve_color(medium, found, rgb.Float(0.5), medium.ray_to_local(p, w), rgb.Bool(True)) is found
+    assert painter.resolve_color(medium, result, rgb.Float(0.5), medium.ray_to_local(p, w), rgb.Bool(True)) is result
 
 
 # ---- All media implement the protocol, with valid densities ----
 
-ASKED = {name: what for name, what in vars(Medium).items() if isinstance(what, (FunctionType, property))}
-ASKED = {name: what for name, what in ASKED.items() if not name.startswith("_")}
+PROTOCOL = {name: what for name, what in vars(Medium).items() if isinstance(what, (FunctionType, property))}
+PROTOCOL = {name: what for name, what in PROTOCOL.items() if not name.startswith("_")}
 
 
 def media(mi):
@@ -90,15 +90,15 @@ def media(mi):
 
 
 def test01_media_implement_the_protocol(rgb):
-    assert len(ASKED) > 15
+    assert len(PROTOCOL) > 15
     for medium in media(rgb):
-        for name, what in ASKED.items():
-            found = getattr(medium, name)
+        for name, what in PROTOCOL.items():
+            result = getattr(medium, name)
             if isinstance(what, property):
-                assert not callable(found), name
+                assert not callable(result), name
             else:
                 wanted = list(inspect.signature(what).parameters)[1:]
-                assert list(inspect.signature(found).parameters) == wanted, (type(medium), name)
+                assert list(inspect.signature(result).parameters) == wanted, (type(medium), name)
 
 
 def test02_media_return_consistent_values(rgb):
@@ -195,9 +195,9 @@ def test04_density_in_occupied_cells(rgb):
     medium = FieldMedium(field(occupancy=OccupancyGrid(bits, ns, 0.01)))
     # The longest edge of the box, two units, spans the four cells; the others are centred.
     p = ns.Array3f([0.1, 0.1, 0.9], [0.1, 0.1, 0.9], [0.1, 1.9, 1.0])
-    found, inside = medium.density_in_occupied_cells(p, True).numpy(), medium.density(p, True).numpy()
+    result, inside = medium.density_in_occupied_cells(p, True).numpy(), medium.density(p, True).numpy()
     occupied = medium.occupancy.distance_to_occupied(medium.to_unit(p)).numpy() == 0
-    assert (inside > 0).all() and np.array_equal(found, np.where(occupied, inside, 0))
+    assert (inside > 0).all() and np.array_equal(result, np.where(occupied, inside, 0))
 
 
 def test05_weights_are_read_on_each_evaluation(rgb):
@@ -244,8 +244,8 @@ def rays(count=24):
 
 def absorbed(mi, medium, o, d, settings):
     ray = medium.ray_to_local(mi.Point3f(o.T.astype(np.float32)), mi.Vector3f(d.T.astype(np.float32)))
-    found = march(medium, ray, dr.maximum(ray.t_near, 0), ray.t_far, True, settings)
-    return ray.t_far.numpy(), found.tau.numpy(), found.expected_depth.numpy()
+    result = march(medium, ray, dr.maximum(ray.t_near, 0), ray.t_far, True, settings)
+    return ray.t_far.numpy(), result.tau.numpy(), result.expected_depth.numpy()
 
 
 # Steps of a fraction γ of their distance use the density at their middle: an error of order γ², plus the rounding of
@@ -402,11 +402,11 @@ def test07_volume_uses_scene_coordinates(rgb):
 def test08_frozen_bound_can_be_replaced(rgb):
     """Like a frozen function, which replaces variables by its arguments."""
     medium = VolumeMedium(grid_of(rgb, corner()))
-    known = FrozenBound(medium)
-    kept, known.bound = known.bound, None
-    assert kept is not None and medium.occupancy is None
-    known.bound = kept
-    assert medium.occupancy is kept
+    expected = FrozenBound(medium)
+    selected, expected.bound = expected.bound, None
+    assert selected is not None and medium.occupancy is None
+    expected.bound = selected
+    assert medium.occupancy is selected
 
 
 # ---- Features for a gaze field: at a point, or composited along a ray ----
@@ -426,10 +426,10 @@ def place(rgb):
 def asked(rgb, place, kind, p, active=True):
     vector = lambda of, v: of(*map(float, v))
     settings = MarchSettings(1 / 128, stop=0.0, color_cutoff=1e-2)
-    found = features_for_observer(
+    result = features_for_observer(
         kind, place, vector(rgb.Point3f, p), vector(rgb.Point3f, O), vector(rgb.Vector3f, D), rgb.Bool(active), settings
     )
-    return None if found is None else np.array([f[0] for f in found])
+    return None if result is None else np.array([f[0] for f in result])
 
 
 def features(field, p):
@@ -452,10 +452,10 @@ def test_composited_features(rgb, place):
     sigma, f = features(field, p)
     tau = sigma * np.diff(t) * (np.abs(p).max(axis=1) < 2)
     weight = np.exp(-(np.cumsum(tau) - tau)) * -np.expm1(-tau)
-    found = asked(rgb, place, "accumulated", (0.3, 0.5, 0.2))
-    assert found.shape == (3,) and np.allclose(found, weight @ f, atol=5e-3 * np.abs(f).max())
+    result = asked(rgb, place, "accumulated", (0.3, 0.5, 0.2))
+    assert result.shape == (3,) and np.allclose(result, weight @ f, atol=5e-3 * np.abs(f).max())
     assert not asked(rgb, place, "accumulated", (0.3, 0.5, 0.2), active=False).any()
-    assert np.abs(found - asked(rgb, place, "snapshot", (0.3, 0.5, 0.2))).max() > 0.01
+    assert np.abs(result - asked(rgb, place, "snapshot", (0.3, 0.5, 0.2))).max() > 0.01
 
 
 def test_deferred_color_uses_composited_features(rgb, place):
@@ -468,17 +468,17 @@ def test_deferred_color_uses_composited_features(rgb, place):
         ray = medium.ray_to_local(rgb.Point3f(0.1, -0.2, -3), rgb.Vector3f(*map(float, D)))
         one, both = make_color_shader(medium, rgb.Color3f), make_color_shader(medium, rgb.Color3f, with_features=True)
         kinds.append(type(one))
-        found = []
+        result = []
         for painter in (one, both):
             r = march(medium, ray, ray.t_near, ray.t_far, True, MarchSettings(1 / 64, color_cutoff=0.0), color=painter)
-            found.append(np.array(painter.resolve_color(medium, r.color, r.opacity, ray, rgb.Bool(True))).ravel())
+            result.append(np.array(painter.resolve_color(medium, r.color, r.opacity, ray, rgb.Bool(True))).ravel())
             hidden = painter.resolve_color(medium, r.color, r.opacity, ray, rgb.Bool(False))
             assert not deferred or not np.array(hidden).any()
         sums = both.features(r.color)
-        assert len(sums) == 3 and np.allclose(found[0], found[1], atol=1e-6) and found[0].max() > 0.01
+        assert len(sums) == 3 and np.allclose(result[0], result[1], atol=1e-6) and result[0].max() > 0.01
         if deferred:
             means = mean_features(sums, r.opacity)
             want = np.array(r.opacity * medium.field.color(means, ray.w)).ravel()
-            assert np.allclose(found[0], want, atol=1e-6)
+            assert np.allclose(result[0], want, atol=1e-6)
     assert kinds == [ColorShader, FeatureShader]
     assert FeatureShader(medium).resolve_color(medium, r.color, r.opacity, ray, True) is None

@@ -45,45 +45,45 @@ def made():
     return calls, make
 
 
-def values(known):
-    return [k.value for k in known]
+def values(expected):
+    return [k.value for k in expected]
 
 
 def test_entries_are_cached_by_position(rgb, made):
     cache, (calls, make) = ObserverCache(), made
-    eyes = [rgb.Point3f(1, 2, 3), rgb.Point3f(4, 5, 6)]
-    first = cache.get_or_compute_each("thing", eyes, 0, make)
+    positions = [rgb.Point3f(1, 2, 3), rgb.Point3f(4, 5, 6)]
+    first = cache.get_or_compute_each("thing", positions, 0, make)
     assert values(first) == [1, 2] and calls == [[1, 2, 3], [4, 5, 6]]
     assert np.allclose(np.array(first[1].center).ravel(), [4, 5, 6])
     # In another order, and one of them alone: the other one is then dropped.
-    assert values(cache.get_or_compute_each("thing", eyes[::-1], 0, make)) == [2, 1]
-    assert values(cache.get_or_compute_each("thing", eyes[:1], 0, make)) == [1]
-    assert values(cache.get_or_compute_each("thing", eyes, 0, make)) == [1, 3]
+    assert values(cache.get_or_compute_each("thing", positions[::-1], 0, make)) == [2, 1]
+    assert values(cache.get_or_compute_each("thing", positions[:1], 0, make)) == [1]
+    assert values(cache.get_or_compute_each("thing", positions, 0, make)) == [1, 3]
     # Exactly.
     next_to = rgb.Point3f(1, 2, float(np.nextafter(np.float32(3), np.float32(4))))
     assert values(cache.get_or_compute_each("thing", [next_to], 0, make)) == [4]
 
 
 def test_scalars_of_other_observers_are_kept(rgb, made):
-    (calls, make), whole = made, ObserverCache()
-    own = lambda known: make(known.center)
+    (calls, make), full = made, ObserverCache()
+    separate = lambda known: make(known.center)
     at = lambda x: [CacheEntry(rgb.Point3f(x, 0, 0), None)]
-    assert [values(whole.get_or_compute_scalar("n", at(x), 0, own)) for x in (1, 2, 1)] == [[1], [2], [1]]
+    assert [values(full.get_or_compute_scalar("n", at(x), 0, separate)) for x in (1, 2, 1)] == [[1], [2], [1]]
     # A short-lived cache shares scalars with its parent; other values are its own.
-    part = ObserverCache(scalar_cache=whole)
-    assert values(part.get_or_compute_scalar("n", at(2), 0, own)) == [2]
-    assert values(part.get_or_compute("n", at(2), 0, own)) == [3] and values(
-        whole.get_or_compute("m", at(2), 0, own)
+    part = ObserverCache(scalar_cache=full)
+    assert values(part.get_or_compute_scalar("n", at(2), 0, separate)) == [2]
+    assert values(part.get_or_compute("n", at(2), 0, separate)) == [3] and values(
+        full.get_or_compute("m", at(2), 0, separate)
     ) == [4]
     # Entries with changed dependencies are dropped, and the oldest of very many.
-    assert values(whole.get_or_compute_scalar("n", at(1), 1, own)) == [5] and len(whole.peek("n")) == 1
+    assert values(full.get_or_compute_scalar("n", at(1), 1, separate)) == [5] and len(full.peek("n")) == 1
     for x in range(2, 300):
-        whole.get_or_compute_scalar("n", at(x), 1, own)
-    assert len(whole.peek("n")) == 257
+        full.get_or_compute_scalar("n", at(x), 1, separate)
+    assert len(full.peek("n")) == 257
     count = len(calls)
-    whole.get_or_compute_scalar("n", at(298), 1, own)
+    full.get_or_compute_scalar("n", at(298), 1, separate)
     assert len(calls) == count
-    whole.get_or_compute_scalar("n", at(1), 1, own)
+    full.get_or_compute_scalar("n", at(1), 1, separate)
     assert len(calls) == count + 1
 
 
@@ -118,8 +118,8 @@ def test_cached_positions_are_detached(rgb, made):
     cache, (_, make) = ObserverCache(), made
     p = rgb.Point3f(1, 2, 3)
     dr.enable_grad(p)
-    (known,) = cache.get_or_compute_each("thing", [p], 0, make)
-    assert not dr.grad_enabled(known.center)
+    (expected,) = cache.get_or_compute_each("thing", [p], 0, make)
+    assert not dr.grad_enabled(expected.center)
 
 
 def test_recordings_are_not_cached(rgb):
@@ -128,8 +128,8 @@ def test_recordings_are_not_cached(rgb):
 
     @dr.freeze
     def double(p):
-        (known,) = cache.get_or_compute_each("thing", [p], 0, lambda center: center.x * 2)
-        return known.value + 0
+        (expected,) = cache.get_or_compute_each("thing", [p], 0, lambda center: center.x * 2)
+        return expected.value + 0
 
     for x in (1.0, 2.0, 3.0):
         assert double(rgb.Point3f(rgb.Float([x]), 0, 0)).numpy()[0] == 2 * x
@@ -138,21 +138,21 @@ def test_recordings_are_not_cached(rgb):
 
 def test_geometry_fingerprint_covers_shapes_and_medium(rgb):
     scene = rgb.load_dict({"type": "scene", "ball": {"type": "sphere", "radius": 2.0}})
-    of = fingerprint_geometry
-    first = of(SceneGeometry(None, scene))
-    assert first == of(SceneGeometry(None, scene)) != of(SceneGeometry(None))
+    make = fingerprint_geometry
+    first = make(SceneGeometry(None, scene))
+    assert first == make(SceneGeometry(None, scene)) != make(SceneGeometry(None))
     params = rgb.traverse(scene)
     params[next(k for k in params.keys() if k.endswith("to_world"))] = rgb.Transform4f().translate([0, 0, 0.5])
     params.update()
-    assert of(SceneGeometry(None, scene)) != first
+    assert make(SceneGeometry(None, scene)) != first
     volume = rgb.load_dict({"type": "gridvolume", "grid": rgb.VolumeGrid(np.ones((2, 2, 2), np.float32))})
     medium = VolumeMedium(volume)
-    before = of(SceneGeometry(medium))
-    assert before == of(SceneGeometry(medium))
+    before = make(SceneGeometry(medium))
+    assert before == make(SceneGeometry(medium))
     params = rgb.traverse(volume)
     params["data"] = params["data"] * 2
     params.update()
-    assert of(SceneGeometry(medium)) != before
+    assert make(SceneGeometry(medium)) != before
 
 
 # ---- Observer settings: which of them determine where a ray meets its surface ----
@@ -160,7 +160,7 @@ def test_geometry_fingerprint_covers_shapes_and_medium(rgb):
 SETTINGS = ObserverSettings(march=MarchSettings(0.1))
 
 
-OTHERS = dict(
+OTHER_VALUES = dict(
     march=MarchSettings(0.2),
     depth="expected",
     surface_opacity=0.7,
@@ -176,13 +176,13 @@ OF_A_POINT = ("visibility", "tolerance", "map_height", "directions", "integral_t
 
 
 def test_all_settings_are_covered():
-    assert {f.name for f in fields(ObserverSettings)} == set(OTHERS)
+    assert {f.name for f in fields(ObserverSettings)} == set(OTHER_VALUES)
 
 
-@pytest.mark.parametrize("name", list(OTHERS))
+@pytest.mark.parametrize("name", list(OTHER_VALUES))
 def test_surface_settings_exclude_visibility(name):
     """Sphere samples are kept for other visibilities and recomputed for other surfaces."""
-    other = replace(SETTINGS, **{name: OTHERS[name]})
+    other = replace(SETTINGS, **{name: OTHER_VALUES[name]})
     assert (other.surface_settings == SETTINGS.surface_settings) == (name in OF_A_POINT)
 
 
@@ -246,8 +246,8 @@ def test03_batch_rays_are_assigned_to_their_camera(rgb, near):
     o, d = np.array(ray.o).T, np.array(ray.d).T
     v = o[:, None] - np.array(origins)
     along = (v * d[:, None]).sum(-1, keepdims=True)
-    own = np.linalg.norm(v - along * d[:, None], axis=-1).argmin(-1)
-    assert len(set(own)) == 4 and np.allclose(got, np.array(origins)[own], atol=1e-5)
+    separate = np.linalg.norm(v - along * d[:, None], axis=-1).argmin(-1)
+    assert len(set(separate)) == 4 and np.allclose(got, np.array(origins)[separate], atol=1e-5)
 
 
 def test04_same_center(rgb):
@@ -297,10 +297,10 @@ def test_collinear_cameras_are_distinguished_by_near_planes(rgb, near):
 def test_lanes_select_the_nearest_observer(rgb, count):
     rng = np.random.default_rng(count)
     centers, p = rng.normal(size=(count, 3)), rng.normal(size=(60, 3))
-    known = [CacheEntry(rgb.Point3f(*map(float, c)), rgb.Float(k)) for k, c in enumerate(centers)]
+    expected = [CacheEntry(rgb.Point3f(*map(float, c)), rgb.Float(k)) for k, c in enumerate(centers)]
     lanes = rgb.Point3f(np.ascontiguousarray(p.T, np.float32))
-    found = observer.select_nearest(known, lanes, lambda value: value).numpy()
-    assert np.array_equal(np.broadcast_to(found, 60), np.linalg.norm(p[:, None] - centers, axis=2).argmin(axis=1))
+    result = observer.select_nearest(expected, lanes, lambda value: value).numpy()
+    assert np.array_equal(np.broadcast_to(result, 60), np.linalg.norm(p[:, None] - centers, axis=2).argmin(axis=1))
 
 
 # ---- Views of observers: created once per observer, and selected lane by lane ----
@@ -316,10 +316,10 @@ class Counting:
 
     def for_position(self, p_o):
         self.made += 1
-        return Of(p_o.x)
+        return CountedValue(p_o.x)
 
 
-class Of:
+class CountedValue:
     def __init__(self, x):
         self.x = x
 
@@ -329,10 +329,10 @@ class Of:
 
 def test_view_is_created_once_per_observer(rgb):
     view, cache = Counting(), ObserverCache()
-    eyes = [rgb.Point3f(1, 0, 0), rgb.Point3f(5, 0, 0)]
+    positions = [rgb.Point3f(1, 0, 0), rgb.Point3f(5, 0, 0)]
     p_o, r_o = rgb.Point3f([1, 5, 5], 0, 0), rgb.Vector3f([0.1, 0.2, 0.3], 0, 0)
     for _ in range(2):
-        assert np.allclose(evaluate_view(view, eyes, p_o, r_o, cache).numpy(), [1.1, 5.2, 5.3])
+        assert np.allclose(evaluate_view(view, positions, p_o, r_o, cache).numpy(), [1.1, 5.2, 5.3])
         assert view.made == 2
 
 
@@ -354,16 +354,18 @@ def test_support_uses_scene_positions(rgb):
     m = np.array([[0, -2.0, 0, 5], [2, 0, 0, 6], [0, 0, 2, 7], [0, 0, 0, 1]])
     p = np.array([0.2, -0.3, 0.4])
     alone = support.evaluate(rgb.Point3f(*map(float, p)))[0]
-    there = rgb.Point3f(*map(float, (m @ [*p, 1])[:3]))
-    found = SupportView(support, Similarity(m)).for_position(there).evaluate(rgb.Vector3f(0, 0, 1))
-    assert found[0] == pytest.approx(alone, rel=1e-5) and alone > 1
+    moved = rgb.Point3f(*map(float, (m @ [*p, 1])[:3]))
+    result = SupportView(support, Similarity(m)).for_position(moved).evaluate(rgb.Vector3f(0, 0, 1))
+    assert result[0] == pytest.approx(alone, rel=1e-5) and alone > 1
 
 
 # ---- Visibility: sign, ramp, and zero fall-off ----
 
 
-def seen(d_expected, d_met, falloff, tolerance=0.0):
-    return visibility(ns.Float(d_expected), ns.Float(d_met), ns.Float(falloff), ns.Float(tolerance)).numpy().tolist()
+def seen(d_expected, d_observed, falloff, tolerance=0.0):
+    return (
+        visibility(ns.Float(d_expected), ns.Float(d_observed), ns.Float(falloff), ns.Float(tolerance)).numpy().tolist()
+    )
 
 
 def test01_visibility_sign():

@@ -39,9 +39,11 @@ from tests.plugins.scenes import plugin
 SETTINGS = ObserverSettings(march=MarchSettings(0.1))
 
 
-def integral_at(mi, gaze, place, p, settings=SETTINGS, count=1 << 12, **more):
+def integral_at(mi, gaze, place, p, settings=SETTINGS, count=1 << 12, **overrides):
     p_o = mi.Point3f(*map(float, p))
-    return float(gaze.for_observers([p_o], place, replace(settings, directions=count), **more).integrals(p_o)[0][0])
+    return float(
+        gaze.for_observers([p_o], place, replace(settings, directions=count), **overrides).integrals(p_o)[0][0]
+    )
 
 
 @pytest.fixture(scope="module")
@@ -84,14 +86,14 @@ def test_integral_over_traced_surfaces(rgb, variant):
         )
     )
     o = np.array([0.4, -0.7, 1.7])
-    found = integral_at(rgb, GazeFieldInstance(field), SceneGeometry(None, room), o, SETTINGS, 1 << 16)
+    result = integral_at(rgb, GazeFieldInstance(field), SceneGeometry(None, room), o, SETTINGS, 1 << 16)
     d = fibonacci_directions(20_000)
     walls = np.where(d > 0, [1.9, 1.9, 2.9], [-1.9, -1.9, 0.1])
     # A direction parallel to a wall never meets it.
     distance = np.divide(walls - o, d, out=np.full(d.shape, np.inf), where=d != 0).min(axis=1)
     array = lambda v: ns.Array3f(np.ascontiguousarray(v.T, np.float32))
     emit, capture = field.unnormalized(array(o + d * distance[:, None]), array(np.broadcast_to(o, d.shape)), array(d))
-    assert found == pytest.approx(4 * np.pi * np.mean(np.array(emit * capture, np.float64)), rel=3e-3)
+    assert result == pytest.approx(4 * np.pi * np.mean(np.array(emit * capture, np.float64)), rel=3e-3)
 
 
 def room(mi):
@@ -117,17 +119,17 @@ def test_unnormalised_instance_and_missing_observers_are_refused(rgb):
 def test_observed_gaze_is_immutable(rgb):
     """Requests for other observers with the same cache do not change it."""
     gaze, place, cache = GazeFieldInstance(normalized()), room(rgb), ObserverCache()
-    eyes = [rgb.Point3f(0.1, 0.2, 0.3), rgb.Point3f(-0.4, 0.1, 0)]
+    positions = [rgb.Point3f(0.1, 0.2, 0.3), rgb.Point3f(-0.4, 0.1, 0)]
     point, d = rgb.Point3f(0.2, 0.9, 0.4), rgb.Vector3f(0, 1, 0)
-    first = gaze.for_observers(eyes[:1], place, replace(SETTINGS, directions=1 << 10), cache)
-    before = first.evaluate(point, eyes[0], d, True)[0].numpy()
-    second = gaze.for_observers(eyes[1:], place, replace(SETTINGS, directions=1 << 10), cache)
-    assert first.evaluate(point, eyes[0], d, True)[0].numpy() == before
-    assert first.integrals(eyes[0])[0].numpy() != second.integrals(eyes[1])[0].numpy()
+    first = gaze.for_observers(positions[:1], place, replace(SETTINGS, directions=1 << 10), cache)
+    before = first.evaluate(point, positions[0], d, True)[0].numpy()
+    second = gaze.for_observers(positions[1:], place, replace(SETTINGS, directions=1 << 10), cache)
+    assert first.evaluate(point, positions[0], d, True)[0].numpy() == before
+    assert first.integrals(positions[0])[0].numpy() != second.integrals(positions[1])[0].numpy()
     # For both together, each lane uses its own observer.
-    both = gaze.for_observers(eyes, place, replace(SETTINGS, directions=1 << 10), cache)
+    both = gaze.for_observers(positions, place, replace(SETTINGS, directions=1 << 10), cache)
     lanes = rgb.Point3f([0.1, -0.4], [0.2, 0.1], [0.3, 0.0])
-    each = np.concatenate([o.integrals(eye)[0].numpy() for o, eye in zip((first, second), eyes)])
+    each = np.concatenate([o.integrals(eye)[0].numpy() for o, eye in zip((first, second), positions)])
     assert np.array_equal(both.integrals(lanes)[0].numpy(), each)
 
 
@@ -139,8 +141,8 @@ def test_sphere_samples_are_traced_once_per_observer(rgb, monkeypatch):
     gaze, place, cache = GazeFieldInstance(field), room(rgb), ObserverCache()
     counts = []
 
-    def ask(p=(0.1, 0.2, 0.3), place=place, **more):
-        value = integral_at(rgb, gaze, place, p, replace(SETTINGS, **more), cache=cache)
+    def ask(p=(0.1, 0.2, 0.3), place=place, **overrides):
+        value = integral_at(rgb, gaze, place, p, replace(SETTINGS, **overrides), cache=cache)
         counts.append(len(traced))
         return value
 
@@ -215,9 +217,9 @@ def test_observer_derivatives_include_the_integral(rgb, trained):
     dr.enable_grad(p_o)
     if trained:
         dr.enable_grad(field.grid.table)
-    found = gaze.for_observers([p_o], place, replace(SETTINGS, directions=1 << 15)).integrals(p_o)[0]
-    assert float(dr.detach(found)[0]) == pytest.approx(integral(o), rel=2e-3)
-    dr.backward(found)
+    result = gaze.for_observers([p_o], place, replace(SETTINGS, directions=1 << 15)).integrals(p_o)[0]
+    assert float(dr.detach(result)[0]) == pytest.approx(integral(o), rel=2e-3)
+    dr.backward(result)
     assert np.linalg.norm(true) > 0.1 * integral(o)
     assert np.linalg.norm(np.array(dr.grad(p_o)).ravel() - true) < 0.03 * np.linalg.norm(true)
     assert not trained or np.abs(np.array(dr.grad(field.grid.table))).max() > 0
@@ -232,10 +234,10 @@ def test_cache_distinguishes_integral_tolerances(rgb):
     point, ray = rgb.Point3f(0.2, 1, 0.4), rgb.Ray3f(rgb.Point3f(0.2, 0, 0.4), rgb.Vector3f(0, 1, 0))
 
     def ask(cache, **settings):
-        chosen = replace(SETTINGS, directions=1 << 15, visibility="map", map_height=16, **settings)
-        observed = gaze.for_observers([eye], place, chosen, cache)
+        selected = replace(SETTINGS, directions=1 << 15, visibility="map", map_height=16, **settings)
+        observed = gaze.for_observers([eye], place, selected, cache)
         sight = trace_from_observer(
-            place, ray, point, eye, rgb.Float(0), rgb.Bool(True), 0.0, chosen, gaze=observed, cache=cache
+            place, ray, point, eye, rgb.Float(0), rgb.Bool(True), 0.0, selected, gaze=observed, cache=cache
         )
         return float(observed.integrals(eye)[0][0]), float(sight.gaze[0])
 
@@ -276,11 +278,11 @@ def test_discontinuous_integrands_meet_the_tolerance(turned, tolerance):
     off, share, counts = [], [], []
     for k, direction in enumerate(turned):
         values, exact = cap(direction, np.cos(0.2 + 0.1 * k), 0.1)
-        found = integrate_sphere(values, MOST, tolerance)
-        off.append(abs(found.value / exact - 1))
-        share.append(off[-1] / found.error)
-        counts.append(found.directions)
-        assert found.error <= tolerance or found.directions == MOST
+        result = integrate_sphere(values, MOST, tolerance)
+        off.append(abs(result.value / exact - 1))
+        share.append(off[-1] / result.error)
+        counts.append(result.directions)
+        assert result.error <= tolerance or result.directions == MOST
     # Several sums: the error of four in five is below the estimate, and that of all below twice the tolerance.
     assert max(off) <= 2 * tolerance and np.mean(off) < tolerance / 2 and np.mean(np.array(share) < 1) >= 0.75
     assert np.median(counts) < MOST / 4
@@ -292,9 +294,9 @@ def test_narrow_lobes_need_more_directions(turned):
     counts = []
     for kappa in (1, 100, 1e4):
         values, exact = lobe(turned[0], kappa)
-        found = integrate_sphere(values, 1 << 18, 5e-3)
-        assert found.value == pytest.approx(exact, rel=1e-3)
-        counts.append(found.directions)
+        result = integrate_sphere(values, 1 << 18, 5e-3)
+        assert result.value == pytest.approx(exact, rel=1e-3)
+        counts.append(result.directions)
     assert FIRST_DIRECTIONS == counts[0] < counts[1] < counts[2]
 
 
@@ -309,33 +311,33 @@ def test_narrow_lobes_need_more_directions(turned):
     ],
 )
 def test_larger_tolerance_starts_with_fewer_directions(tolerance, first):
-    asked = []
+    requested = []
 
     def even(count):
-        asked.append(count)
+        requested.append(count)
         return np.ones(count)
 
-    assert integrate_sphere(even, MOST, tolerance).value == pytest.approx(4 * np.pi) and asked == [first]
+    assert integrate_sphere(even, MOST, tolerance).value == pytest.approx(4 * np.pi) and requested == [first]
     assert integrate_sphere(even, 1000, tolerance).directions == 1000
 
 
 def test_zero_tolerance_uses_all_directions(turned):
     values, exact = lobe(turned[0], 10)
-    asked = []
-    found = integrate_sphere(lambda count: (asked.append(count), values(count))[1], 1 << 15, 0.0)
-    assert asked == [1 << 15] == [found.directions]
-    assert found.value == pytest.approx(exact, rel=1e-6)
+    requested = []
+    result = integrate_sphere(lambda count: (requested.append(count), values(count))[1], 1 << 15, 0.0)
+    assert requested == [1 << 15] == [result.directions]
+    assert result.value == pytest.approx(exact, rel=1e-6)
 
 
 @pytest.mark.parametrize("most", [1, 5, 64, FIRST_DIRECTIONS])
 def test_number_of_directions_is_limited(most):
-    found = integrate_sphere(lambda count: np.arange(count) % 2 + 1.0, most, 1e-9)
-    assert found.directions == most and found.value == pytest.approx(4 * np.pi * np.mean(np.arange(most) % 2 + 1))
+    result = integrate_sphere(lambda count: np.arange(count) % 2 + 1.0, most, 1e-9)
+    assert result.directions == most and result.value == pytest.approx(4 * np.pi * np.mean(np.arange(most) % 2 + 1))
 
 
 def test_zero_integrand():
-    found = integrate_sphere(np.zeros, MOST, 1e-3)
-    assert found.value == 0 and found.error == 0 and found.directions == FIRST_DIRECTIONS
+    result = integrate_sphere(np.zeros, MOST, 1e-3)
+    assert result.value == 0 and result.error == 0 and result.directions == FIRST_DIRECTIONS
 
 
 # ---- Sphere samples, and the depths of escaping rays ----
@@ -346,13 +348,13 @@ def test_escaped_rays_take_depths_of_neighbours(count):
     """Reference: weighted mean of the logarithm over the eight nearest directions, or all if there are fewer."""
     rng = np.random.default_rng(count)
     unit = lambda n: (lambda v: v / np.linalg.norm(v, axis=1, keepdims=True))(rng.normal(size=(n, 3)))
-    known, wanted, depth = unit(count), unit(30), rng.uniform(0.2, 9.0, count)
+    reference, wanted, depth = unit(count), unit(30), rng.uniform(0.2, 9.0, count)
     expected = []
     for w in wanted:
-        apart = np.linalg.norm(known - w, axis=1)
-        near = np.argsort(apart)[:8]
-        weight = 1 / (apart[near] ** 2 + 1e-3)
+        difference = np.linalg.norm(reference - w, axis=1)
+        near = np.argsort(difference)[:8]
+        weight = 1 / (difference[near] ** 2 + 1e-3)
         expected.append(np.exp(np.sum(weight * np.log(depth[near])) / weight.sum()))
-    np.testing.assert_allclose(interpolate_nearest_depth(known, depth, wanted), expected, rtol=1e-5)
+    np.testing.assert_allclose(interpolate_nearest_depth(reference, depth, wanted), expected, rtol=1e-5)
     # A depth of zero must have a finite logarithm.
-    assert interpolate_nearest_depth(known, np.zeros(count), wanted) == pytest.approx(1e-6)
+    assert interpolate_nearest_depth(reference, np.zeros(count), wanted) == pytest.approx(1e-6)

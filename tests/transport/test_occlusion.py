@@ -97,12 +97,15 @@ def test_gaze_lookup_uses_visible_entries(rgb, around):
     around.depth, table = rgb.Float(depth.ravel()), rgb.Float(gaze.ravel())
     phi, theta = directions()
     d, distance = rgb.Vector3f(unit(phi, theta)), dr.full(rgb.Float, 2.0, len(phi))
-    found = around.eval_gaze(table, d, distance, 0.0, 0.1, True).numpy()
-    known = (depth == 2).astype(float)
-    share = interpolated(known, phi, theta)
-    sure = share > 0.02
+    result = around.eval_gaze(table, d, distance, 0.0, 0.1, True).numpy()
+    expected = (depth == 2).astype(float)
+    share = interpolated(expected, phi, theta)
+    certain = share > 0.02
     assert np.allclose(
-        found[sure], (interpolated(known * gaze, phi, theta) / np.where(sure, share, 1))[sure], rtol=2e-2, atol=2e-3
+        result[certain],
+        (interpolated(expected * gaze, phi, theta) / np.where(certain, share, 1))[certain],
+        rtol=2e-2,
+        atol=2e-3,
     )
     around.depth = dr.full(rgb.Float, 3.0, 2 * HEIGHT**2)
     assert (around.eval_gaze(table, d, distance, 0.0, 0.1, True).numpy() == -1).all()
@@ -122,9 +125,9 @@ def test_gaze_table_matches_directions(rgb):
     width = np.pi / HEIGHT
     theta, phi = np.meshgrid((np.arange(HEIGHT) + 0.5) * width, (np.arange(2 * HEIGHT) + 0.5) * width, indexing="ij")
     x, _, z = unit(phi.ravel(), theta.ravel()).astype(float)
-    met = np.isfinite(around.depth.numpy())
-    assert np.array_equal(met[z > 0.01], np.ones((z > 0.01).sum(), bool)) and not met[z < 0].any()
-    want = np.where(met, x * 2 / np.where(z > 0, z, 1) + 10 * z + 100, 0)
+    has_surface = np.isfinite(around.depth.numpy())
+    assert np.array_equal(has_surface[z > 0.01], np.ones((z > 0.01).sum(), bool)) and not has_surface[z < 0].any()
+    want = np.where(has_surface, x * 2 / np.where(z > 0, z, 1) + 10 * z + 100, 0)
     assert np.allclose(around.make_gaze_table(Gaze()).numpy(), want, rtol=1e-3, atol=1e-3)
 
 
@@ -150,7 +153,7 @@ def look(
     tolerance=0.0,
     falloff=0.0,
     dt_gamma=0.0,
-    **more,
+    **overrides,
 ):
     """What an observer at ``p_o`` sees of the point ``p_d`` on a camera's ray."""
     o, p_d, p_o = (np.asarray(v, np.float64) for v in (camera, p_d, p_o))
@@ -158,7 +161,9 @@ def look(
     march = MarchSettings(STEP, dt_gamma=dt_gamma)
     settings = ObserverSettings(march=march, visibility=kind, tolerance=tolerance, map_height=64)
     points = (mi.Point3f(*map(float, p)) for p in (p_d, p_o))
-    return trace_from_observer(place, ray, *points, penetration, mi.Bool(True), mi.Float(falloff), settings, **more)
+    return trace_from_observer(
+        place, ray, *points, penetration, mi.Bool(True), mi.Float(falloff), settings, **overrides
+    )
 
 
 @pytest.mark.parametrize(
@@ -210,21 +215,24 @@ def test_visibility_by_transmittance(rgb):
 
 @pytest.mark.parametrize("kind, evals", [("transmittance", 100), ("depth", 100)])
 def test_evaluations_are_counted_on_request(rgb, kind, evals):
-    given = {"p_d": (0.5, 0.5, 2.0), "p_o": (0.5, 0.5, -2), "camera": (0.5, 0.5, 5)}
-    counted = look(rgb, slab(rgb, 0.0), kind, count=True, **given)
-    assert abs(counted.density_evals[0] - evals) <= 2 and look(rgb, slab(rgb, 0.0), kind, **given).density_evals is None
+    arguments = {"p_d": (0.5, 0.5, 2.0), "p_o": (0.5, 0.5, -2), "camera": (0.5, 0.5, 5)}
+    counted = look(rgb, slab(rgb, 0.0), kind, count=True, **arguments)
+    assert (
+        abs(counted.density_evals[0] - evals) <= 2
+        and look(rgb, slab(rgb, 0.0), kind, **arguments).density_evals is None
+    )
 
 
 def test_map_is_cached_while_valid(rgb):
     place, cache = slab(rgb, 50), ObserverCache()
     see = lambda p_o=(0.5, 0.5, -2), place=place: look(rgb, place, "map", (0.5, 0.5, 0.01), p_o, cache=cache)
-    kept = lambda: cache.peek("map")[0].value
+    selected = lambda: cache.peek("map")[0].value
     see()
-    first = kept()
+    first = selected()
     see()
-    assert kept() is first
+    assert selected() is first
     see((0.5, 0.5, -1.9))
-    other = kept()
+    other = selected()
     assert other is not first
     see((0.5, 0.5, -1.9), slab(rgb, 50))
-    assert kept() is not other
+    assert selected() is not other

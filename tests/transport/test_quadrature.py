@@ -109,13 +109,13 @@ def test04_derivatives_are_finite_and_correct(mode):
 def test05_splitting_a_step_changes_nothing(share):
     tau = TAU[TAU < 1e4]
     a, b = ns.Float(tau * np.float32(share)), ns.Float(tau * np.float32(1 - share))
-    whole = ns.Float(tau)
+    full = ns.Float(tau)
     behind = dr.exp(-a) * absorbed_fraction(b)
-    assert np.allclose((absorbed_fraction(a) + behind).numpy(), absorbed_fraction(whole).numpy(), rtol=1e-6)
+    assert np.allclose((absorbed_fraction(a) + behind).numpy(), absorbed_fraction(full).numpy(), rtol=1e-6)
     moment = absorbed_fraction(a) * share * mean_depth_fraction(a) + behind * (
         share + (1 - share) * mean_depth_fraction(b)
     )
-    expected = (absorbed_fraction(whole) * mean_depth_fraction(whole)).numpy()
+    expected = (absorbed_fraction(full) * mean_depth_fraction(full)).numpy()
     assert np.allclose(moment.numpy(), expected, rtol=2e-6)
 
 
@@ -215,7 +215,7 @@ def test11_polynomial_of_thin_steps_is_accurate():
 
 
 @dataclass(frozen=True)
-class Thing:
+class Entry:
     name: str
     summary: str
 
@@ -224,7 +224,7 @@ class Thing:
 def things():
     made = Registry("flavour")
     for name, summary in (("sweet", "like honey"), ("bitter", "like tea")):
-        made.register(Thing(name, summary))
+        made.register(Entry(name, summary))
     return made
 
 
@@ -240,7 +240,7 @@ def test02_unknown_name_lists_alternatives(things):
 
 
 def test03_duplicate_names_are_refused_and_can_be_removed(things):
-    again = Thing("sweet", "like sugar")
+    again = Entry("sweet", "like sugar")
     with pytest.raises(ValueError, match='"sweet".*"flavour"'):
         things.register(again)
     things.unregister("sweet")
@@ -444,11 +444,13 @@ def test12_skipping_resets_the_carried_density(offset):
     first = 1 if offset is None else offset
     borders = np.minimum(np.concatenate([[0], (first + np.arange(n + 1)) / n]), 1)
     a, b = borders[:-1], borders[1:]
-    kept = (b > a) & occupied[np.minimum((4 * (a + b)).astype(int), 7)]
+    selected = (b > a) & occupied[np.minimum((4 * (a + b)).astype(int), 7)]
     ends = 1 + 6 * np.stack([a, b]) ** 2
-    assert np.isclose(got.tau[0], (ends.mean(0) * (b - a))[kept].sum(), rtol=1e-5)
+    assert np.isclose(got.tau[0], (ends.mean(0) * (b - a))[selected].sum(), rtol=1e-5)
     # A shared end of two steps is evaluated once.
-    assert got.density_evals[0] == kept.sum() + np.count_nonzero(kept & ~np.concatenate([[False], kept[:-1]]))
+    assert got.density_evals[0] == selected.sum() + np.count_nonzero(
+        selected & ~np.concatenate([[False], selected[:-1]])
+    )
 
 
 @pytest.mark.parametrize("kind", RULES.names())
@@ -568,9 +570,9 @@ def marched(medium, rule, n):
 
 
 def test01_registered_rule_marches(simpson):
-    found = marched(Cubic(), "simpson", 1)
+    result = marched(Cubic(), "simpson", 1)
     # ∫ 2 + z³ over [0, 2]
-    assert np.isclose(found.tau[0], 8, rtol=1e-5) and found.density_evals[0] == 3
+    assert np.isclose(result.tau[0], 8, rtol=1e-5) and result.density_evals[0] == 3
     assert abs(marched(Cubic(), "constant", 1).tau[0] - 8) > 1
 
 
@@ -586,10 +588,10 @@ def test03_registered_rule_renders(rgb, simpson):
     tint = {"type": "constvolume", "value": 0.25}
     pictures, counts = [], []
     for rule in ("simpson", "constant"):
-        asked = constant(2.0, color=tint, quadrature=rule, step=0.05, aovs="opacity,depth,density_evals")
-        picture = render(rgb, asked, sensor)
+        requested = constant(2.0, color=tint, quadrature=rule, step=0.05, aovs="opacity,depth,density_evals")
+        picture = render(rgb, requested, sensor)
         pictures.append(picture[..., :-1])
-        counts.append(named(rgb, picture, asked)["density_evals.Y"])
+        counts.append(named(rgb, picture, requested)["density_evals.Y"])
     assert counts[0].any() and np.array_equal(counts[0], 3 * counts[1])
     # For homogeneous density every rule is exact.
     assert pictures[1][..., :3].max() > 0.1 and np.allclose(*pictures, rtol=1e-4, atol=1e-6)
@@ -598,11 +600,11 @@ def test03_registered_rule_renders(rgb, simpson):
 def test04_registered_rule_with_shapes_and_all_depths(rgb, simpson):
     plate = {"type": "rectangle", "to_world": rgb.ScalarTransform4f().translate([0, 0, 0.7])}
     for depth in ("median", "refined"):
-        found = [
+        result = [
             channels(rgb, constant(5.0, quadrature=rule, depth=depth, step=0.03), plate=plate)["depth.T"]
             for rule in ("simpson", "constant")
         ]
-        assert found[1].any() and np.allclose(*found, rtol=1e-4)
+        assert result[1].any() and np.allclose(*result, rtol=1e-4)
 
 
 def test05_registered_rule_is_listed(rgb, simpson):

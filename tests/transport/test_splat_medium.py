@@ -78,19 +78,19 @@ def test_placed_medium_matches_transformed_splats(rgb):
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = 2.5 * Rotation.random(random_state=np.random.default_rng(1)).as_matrix(), [1, 0, 2]
     to_world = Similarity(matrix)
-    placed, there = medium_of(splats, to_world), medium_of(splats.transform(to_world))
-    assert np.isclose(placed.default_step, there.default_step, rtol=1e-5)
+    placed, moved = medium_of(splats, to_world), medium_of(splats.transform(to_world))
+    assert np.isclose(placed.default_step, moved.default_step, rtol=1e-5)
     # A rotated box has a larger bounding box.
-    (low, high), (least, most) = placed.bounds(), there.bounds()
-    assert (low <= least + 1e-5).all() and (most <= high + 1e-5).all()
-    of = []
-    for medium in (placed, there):
+    (low, high), (minimum, maximum) = placed.bounds(), moved.bounds()
+    assert (low <= minimum + 1e-5).all() and (maximum <= high + 1e-5).all()
+    make = []
+    for medium in (placed, moved):
         ray = medium.ray_to_local(rgb.Point3f((2.5 * o).T), rgb.Vector3f(d.T))
         index = np.argsort(np.array(medium.arrays.order))[np.arange(50) % 20]
         t, share = medium.hits.reevaluate(ray, rgb.UInt32(index), True)
         color = medium.color([rgb.UInt32(index)], None, ray.w, True)
-        of.append(np.stack([np.array(v) for v in (t, share, *color)]))
-    assert np.allclose(of[0], of[1], rtol=1e-3, atol=1e-4)
+        make.append(np.stack([np.array(v) for v in (t, share, *color)]))
+    assert np.allclose(make[0], make[1], rtol=1e-3, atol=1e-4)
 
 
 def test_density_is_refused(rgb):
@@ -115,18 +115,18 @@ def test_groups_follow_the_global_order(rgb):
     after, everywhere = LastHit(rgb.Float(0), rgb.UInt32(0)), dr.full(rgb.Bool, True, 300)
     # Light is never used up: three groups contain the first hits, without repetition.
     for group in range(3):
-        found = medium.hits.find_next(ray, after, ray.t_far, rgb.Float(1), rgb.Float(0), everywhere)
-        dr.eval(found.t, found.absorbed, found.index)
-        t = np.stack([np.array(v) for v in found.t], axis=1)
+        result = medium.hits.find_next(ray, after, ray.t_far, rgb.Float(1), rgb.Float(0), everywhere)
+        dr.eval(result.t, result.absorbed, result.index)
+        t = np.stack([np.array(v) for v in result.t], axis=1)
         part = wanted[:, group * GROUP_SIZE : (group + 1) * GROUP_SIZE]
-        met = np.isfinite(part)
-        assert np.array_equal(np.isfinite(t), met) and np.allclose(t[met], part[met], atol=1e-5)
-        after = LastHit(found.t[-1], found.index[-1])
-        everywhere = everywhere & dr.isfinite(found.t[-1])
-    again = medium.hits.reevaluate(ray, found.index[0], dr.isfinite(found.t[0]))
+        has_surface = np.isfinite(part)
+        assert np.array_equal(np.isfinite(t), has_surface) and np.allclose(t[has_surface], part[has_surface], atol=1e-5)
+        after = LastHit(result.t[-1], result.index[-1])
+        everywhere = everywhere & dr.isfinite(result.t[-1])
+    again = medium.hits.reevaluate(ray, result.index[0], dr.isfinite(result.t[0]))
     first = np.isfinite(t[:, 0])
     assert np.array_equal(np.array(again[0])[first], t[first, 0])
-    assert np.array_equal(np.array(again[1])[first], np.array(found.absorbed[0])[first])
+    assert np.array_equal(np.array(again[1])[first], np.array(result.absorbed[0])[first])
 
 
 def test_coincident_peaks_are_all_returned(rgb):
@@ -135,10 +135,10 @@ def test_coincident_peaks_are_all_returned(rgb):
     ray = medium.ray_to_local(rgb.Point3f(0, 0, 0), rgb.Vector3f(0, 0, 1))
     after, seen = LastHit(rgb.Float(0), rgb.UInt32(0)), []
     for _ in range(3):
-        found = medium.hits.find_next(ray, after, ray.t_far, rgb.Float(1), rgb.Float(0), rgb.Bool(True))
-        dr.eval(found.t, found.absorbed, found.index)
-        seen += [i[0] for i, t in zip(found.index, found.t) if np.isfinite(t[0])]
-        after = LastHit(found.t[-1], found.index[-1])
+        result = medium.hits.find_next(ray, after, ray.t_far, rgb.Float(1), rgb.Float(0), rgb.Bool(True))
+        dr.eval(result.t, result.absorbed, result.index)
+        seen += [i[0] for i, t in zip(result.index, result.t) if np.isfinite(t[0])]
+        after = LastHit(result.t[-1], result.index[-1])
     assert sorted(seen) == list(range(count))
 
 

@@ -81,8 +81,8 @@ def test_unknown_kind_is_refused(kind):
 # ---- Support near a position: cells against the sum over all rays ----
 
 
-def exact(origins, radius, p, reach=CUTOFF_RADII):
-    return np.maximum(1 - ((origins - p) ** 2).sum(axis=1) / (reach * radius) ** 2, 0).sum()
+def exact(origins, radius, p, scale=CUTOFF_RADII):
+    return np.maximum(1 - ((origins - p) ** 2).sum(axis=1) / (scale * radius) ** 2, 0).sum()
 
 
 def at(support, p):
@@ -113,14 +113,14 @@ def test_cells_approximate_their_rays(radius):
     assert support.cells[:, 3].sum() == len(origins) and len(support.cells) < len(origins)
     rng = np.random.default_rng(1)
     places = np.concatenate([origins[rng.integers(0, len(origins), 200)], rng.uniform(-6, 10, (100, 3))])
-    found, expected = (
+    result, expected = (
         np.array([f(p) for p in places]) for f in (lambda p: at(support, p), lambda p: exact(origins, radius, p))
     )
     many = expected >= 5
     assert many.sum() > 100 and (expected == 0).sum() > 20
-    off = np.abs(found / np.where(many, expected, 1) - 1)[many]
+    off = np.abs(result / np.where(many, expected, 1) - 1)[many]
     assert np.percentile(off, 95) < 0.04 and np.median(off) < 0.01
-    assert np.abs(found - expected)[~many].max() < 4
+    assert np.abs(result - expected)[~many].max() < 4
 
 
 def test_cells_inside_the_cutoff_are_exact():
@@ -189,11 +189,11 @@ def test_nested_ensembles_are_refused(tmp_path):
     for members in ([pair, pair], [made(), pair]):
         with pytest.raises(ValueError, match="give its members instead"):
             GazeEnsemble(members)
-    about = pair.architecture()
+    metadata = pair.architecture()
     for _ in range(500):
-        about = {"kind": "ensemble", "members": [about, about]}
+        metadata = {"kind": "ensemble", "members": [metadata, metadata]}
     with pytest.raises(ValueError, match="is an ensemble itself, which this version does not read"):
-        gaze_base.build_gaze_field(about, pair.box, NoArrays())
+        gaze_base.build_gaze_field(metadata, pair.box, NoArrays())
 
 
 class NoArrays:

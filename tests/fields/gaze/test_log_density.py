@@ -105,9 +105,9 @@ def test_prior_table_integrates_to_one():
     truth = lambda d: np.exp(log_normaliser(kappa) + kappa * (d @ mean - 1))
     fine = fibonacci_directions(20_000)
     table = make_prior_table(truth(table_directions(64)), 64, ns, fine)
-    found = np.exp(np.array(interpolate_table(ns.Float(table.ravel()), 64, jit(fine)), np.float64))
-    assert 4 * np.pi * found.mean() == pytest.approx(1, abs=1e-5)
-    np.testing.assert_allclose(found, truth(fine), atol=0.03 * truth(mean))
+    result = np.exp(np.array(interpolate_table(ns.Float(table.ravel()), 64, jit(fine)), np.float64))
+    assert 4 * np.pi * result.mean() == pytest.approx(1, abs=1e-5)
+    np.testing.assert_allclose(result, truth(fine), atol=0.03 * truth(mean))
 
 
 def test_table_is_interpolated_across_the_seam():
@@ -124,8 +124,8 @@ def test_table_is_interpolated_across_the_seam():
     i, j = np.floor(x).astype(int), np.minimum(np.floor(y).astype(int), rows - 2)
     at = lambda column, row: table[row, column % (2 * rows)]
     above, below = ((1 - (x - i)) * at(i, row) + (x - i) * at(i + 1, row) for row in (j, j + 1))
-    found = np.array(interpolate_table(ns.Float(table.astype(np.float32).ravel()), rows, jit(d)))
-    np.testing.assert_allclose(found, (1 - (y - j)) * above + (y - j) * below, atol=2e-4)
+    result = np.array(interpolate_table(ns.Float(table.astype(np.float32).ravel()), rows, jit(d)))
+    np.testing.assert_allclose(result, (1 - (y - j)) * above + (y - j) * below, atol=2e-4)
 
 
 def test_table_lookups_stay_within_bounds():
@@ -134,14 +134,14 @@ def test_table_lookups_stay_within_bounds():
     table = np.concatenate(
         [np.full(2 * rows, 1.0), np.full(4 * rows, 7.0), np.full(2 * rows, 2.0), np.full(8 * rows, np.nan)]
     )
-    found = np.array(
+    result = np.array(
         interpolate_table(
             ns.Float(table.astype(np.float32)),
             rows,
             jit([[0, 0, 1.0], [0, 0, -1.0], [1e-4, 0, -1.0], [1e-4, -1e-5, 1.0]]),
         )
     )
-    np.testing.assert_allclose(found, [1, 2, 2, 1])
+    np.testing.assert_allclose(result, [1, 2, 2, 1])
 
 
 def test_densities_are_finite_for_any_weights():
@@ -183,10 +183,10 @@ def test_invalid_settings_are_refused(wrong):
 
 
 def test_capture_coordinates_do_not_depend_on_the_box_size():
-    found = []
+    result = []
     for size in (1.0, 1e-5):
         low, high = np.array([-1, -1, 1.4]) * size, np.array([1, 0.5, 1.8]) * size
         field = made(replace(SMALL, heads=(tuple(low), tuple(high))))
-        found.append([np.array(v) for v in field.capture_position(jit(np.linspace(low, high, 5)))])
-    assert np.ptp(found[0][0]) == pytest.approx(2, abs=1e-5)
-    np.testing.assert_allclose(found[1], found[0], atol=1e-4)
+        result.append([np.array(v) for v in field.capture_position(jit(np.linspace(low, high, 5)))])
+    assert np.ptp(result[0][0]) == pytest.approx(2, abs=1e-5)
+    np.testing.assert_allclose(result[1], result[0], atol=1e-4)

@@ -112,8 +112,8 @@ def test06_penetration_depth_of_thick_and_thin_matter(rgb, kind):
         if sigma >= 200:
             assert abs(d - out - near) < 1e-5
         else:
-            way = min(DEPTHS.find(kind).mean_free_paths / sigma, d / 64)
-            assert math.isclose(out, way if sigma == 20 else 0, rel_tol=1e-5)
+            direction = min(DEPTHS.find(kind).mean_free_paths / sigma, d / 64)
+            assert math.isclose(out, direction if sigma == 20 else 0, rel_tol=1e-5)
 
 
 @pytest.mark.parametrize("sigma", [0.4, 60.0])
@@ -156,9 +156,9 @@ def test09_inactive_lanes_have_no_depth(rgb, kind):
     medium, settings = slab(rgb, 60), MarchSettings(0.1)
     ray = medium.ray_to_local(rgb.Point3f(0.5, 0.5, 0), rgb.Vector3f(0, 0, 1))
     result = march(medium, ray, ray.t_near, ray.t_far, True, settings)
-    asked = rgb.Bool([True, False])
-    found = find_surface_depth(kind, result, medium, ray, ray.t_near, ray.t_far, asked, settings).numpy()
-    assert found[0] > 1 and found[1] == 0
+    requested = rgb.Bool([True, False])
+    results = find_surface_depth(kind, result, medium, ray, ray.t_near, ray.t_far, requested, settings).numpy()
+    assert results[0] > 1 and results[1] == 0
 
 
 # ---- A user-defined kind of depth is one object: it is traced, rendered with and without shapes, and studied ----
@@ -198,13 +198,13 @@ def test01_registered_depth_is_traced(rgb, entered):
 
 def test02_registered_depth_renders_with_and_without_shapes(rgb, entered):
     plate = {"type": "rectangle", "to_world": rgb.ScalarTransform4f().translate([0, 0, 0.5]).scale(2)}
-    asked = constant(3.0, depth="entered", aovs="depth,position")
+    requested = constant(3.0, depth="entered", aovs="depth,position")
     sensor = straight(rgb, "perspective")
     # The camera is at z = -2, and its rays start a hundredth in front of it.
-    for more, want in (({}, 1.99), ({"plate": plate}, 2.49)):
-        found = channels(rgb, asked, sensor, **more)
-        assert np.allclose(found["depth.T"], want, rtol=1e-5) and np.allclose(
-            found["position.Z"], want - 1.99, atol=1e-4
+    for overrides, want in (({}, 1.99), ({"plate": plate}, 2.49)):
+        result = channels(rgb, requested, sensor, **overrides)
+        assert np.allclose(result["depth.T"], want, rtol=1e-5) and np.allclose(
+            result["position.Z"], want - 1.99, atol=1e-4
         )
 
 

@@ -135,7 +135,7 @@ class Slanted:
 def slopes(medium, value, mode, settings, offset=None):
     """Derivative of ``value`` (a function of the march) with respect to entry, exit, the origin's z and the density."""
     z = ns.Array3f(0, 0, 1)
-    found = []
+    results = []
     for k in range(4):
         x = [dr.opaque(ns.Float, v) for v in (0.25, 1.125, 0, float(medium.base[0]))]
         dr.enable_grad(*(x if mode == "backward" else [x[k]]))
@@ -148,8 +148,8 @@ def slopes(medium, value, mode, settings, offset=None):
             return [dr.grad(v)[0] for v in x]
         dr.forward(x[k])
         medium.base = dr.detach(x[3])
-        found.append(dr.grad(result)[0])
-    return found
+        results.append(dr.grad(result)[0])
+    return results
 
 
 @pytest.mark.parametrize("offset", [None, 0.3])
@@ -160,15 +160,17 @@ def test03_slab_derivatives_in_closed_form(mode, quadrature, offset):
     length, passed = t1 - t0, np.exp(-1.7 * (1.125 - 0.25))
     settings = MarchSettings(1 / 16, stop=0, color_cutoff=0, quadrature=quadrature)
     offset = None if offset is None else ns.Float(offset)
-    of = lambda value: slopes(Slanted(sigma), value, mode, settings, offset)
-    assert np.allclose(of(lambda r: r.tau), [-sigma, sigma, 0, length], rtol=1e-5, atol=1e-5)
+    make = lambda value: slopes(Slanted(sigma), value, mode, settings, offset)
+    assert np.allclose(make(lambda r: r.tau), [-sigma, sigma, 0, length], rtol=1e-5, atol=1e-5)
     # E = t0 + 1 / sigma - L / (exp(sigma L) - 1), the mean distance of absorption, of which the opacity is 1 - passed.
     q = passed / (1 - passed)
     by_length = -q + length * sigma * q / (1 - passed)
     by_density = -1 / sigma**2 + length**2 * q / (1 - passed)
-    assert np.allclose(of(lambda r: r.expected_depth), [1 - by_length, by_length, 0, by_density], rtol=1e-4, atol=1e-5)
+    assert np.allclose(
+        make(lambda r: r.expected_depth), [1 - by_length, by_length, 0, by_density], rtol=1e-4, atol=1e-5
+    )
     half = [1, 0, 0, -np.log(2) / sigma**2]
-    assert np.allclose(of(lambda r: r.median_depth), half, rtol=1e-4, atol=1e-5)
+    assert np.allclose(make(lambda r: r.median_depth), half, rtol=1e-4, atol=1e-5)
     # The colour z is that of the mean absorption: C = opacity (o + E). A step samples it at its middle, or at its mean.
     opacity, mean = 1 - passed, t0 + 1 / sigma - length * q
     want = [
@@ -177,7 +179,7 @@ def test03_slab_derivatives_in_closed_form(mode, quadrature, offset):
         opacity,
         length * passed * mean + opacity * by_density,
     ]
-    assert np.allclose(of(lambda r: r.color.x), want, rtol=2e-2 if quadrature == "constant" else 1e-4)
+    assert np.allclose(make(lambda r: r.color.x), want, rtol=2e-2 if quadrature == "constant" else 1e-4)
 
 
 @pytest.mark.parametrize("mode", ["forward", "backward"])
@@ -250,8 +252,8 @@ def test_gradients_of_gaussians(rgb, case):
         along = rng.normal(size=base.shape)
         ends = [reference(Double(splats, name, base + s * STEP * along), o, d) for s in (1, -1)]
         wanted = (ends[0] - ends[1]) / (2 * STEP)
-        found = (np.array(dr.grad(value)).reshape(base.shape) * along).sum()
-        assert abs(wanted) > 0.02 and np.isclose(found, wanted, rtol=1e-3, atol=2e-4), name
+        result = (np.array(dr.grad(value)).reshape(base.shape) * along).sum()
+        assert abs(wanted) > 0.02 and np.isclose(result, wanted, rtol=1e-3, atol=2e-4), name
 
 
 @pytest.mark.parametrize("mode", ["backward", "forward"])
@@ -264,8 +266,8 @@ def test_gradients_of_rays(rgb, case, mode):
     at = rgb.Point3f(o.T) + rgb.Vector3f(*along.tolist()) * shift
     loss = outputs(rgb, medium_of(splats), at, rgb.Vector3f(d.T))
     getattr(dr, mode)(loss if mode == "backward" else shift)
-    found = dr.grad(shift if mode == "backward" else loss)[0]
-    assert np.isclose(found, (ends[0] - ends[1]) / (2 * STEP), rtol=1e-3)
+    result = dr.grad(shift if mode == "backward" else loss)[0]
+    assert np.isclose(result, (ends[0] - ends[1]) / (2 * STEP), rtol=1e-3)
 
 
 @pytest.mark.nightly
@@ -281,7 +283,7 @@ def test_memory_does_not_grow_with_hits(rgb):
         dr.eval(dr.grad(o))
         return result.tau.numpy().mean()
 
-    found, memory = [], []
+    results, memory = [], []
     for end in (2.2, 80.0):
         gradient(end)
         gc.collect()
@@ -289,11 +291,11 @@ def test_memory_does_not_grow_with_hits(rgb):
         dr.flush_malloc_cache()
         dr.detail.malloc_clear_statistics()
         before = dr.detail.malloc_watermark(dr.JitBackend.LLVM)
-        found.append(gradient(end))
+        results.append(gradient(end))
         dr.sync_thread()
         memory.append(dr.detail.malloc_watermark(dr.JitBackend.LLVM) - before)
     # Four hits and 150; one number per hit would take 5 MB.
-    assert found[1] > 30 * found[0] > 0 and abs(memory[1] - memory[0]) < 5e5, memory
+    assert results[1] > 30 * results[0] > 0 and abs(memory[1] - memory[0]) < 5e5, memory
 
 
 # ---- Dispatch: primal or differentiable march, and the coarse pre-pass ----
@@ -307,9 +309,9 @@ def taken(monkeypatch):
     return calls
 
 
-def through(mi, medium, settings, z=None, march=front.march, **more):
+def through(mi, medium, settings, z=None, march=front.march, **overrides):
     ray = medium.ray_to_local(mi.Point3f(0.5, 0.5, 0 if z is None else z), mi.Vector3f(0, 0, 1))
-    return march(medium, ray, dr.maximum(ray.t_near, 0), ray.t_far, mi.Bool(True), settings, **more)
+    return march(medium, ray, dr.maximum(ray.t_near, 0), ray.t_far, mi.Bool(True), settings, **overrides)
 
 
 def test01_differentiable_march_only_with_gradients(rgb, taken):
@@ -352,10 +354,10 @@ def test02_both_marches_give_equal_results(rgb):
 def test03_goal_carries_derivatives(rgb):
     goal = rgb.Float(0.4)
     dr.enable_grad(goal)
-    found = through(rgb, slab(rgb, 2, 1), MarchSettings(0.01), until=goal)
-    dr.backward(found.median_depth)
+    result = through(rgb, slab(rgb, 2, 1), MarchSettings(0.01), until=goal)
+    dr.backward(result.median_depth)
     # At σ s = goal: the crossing moves by 1 / σ per unit of the goal.
-    assert np.isclose(found.median_depth[0], 1.2, rtol=1e-5) and np.isclose(dr.grad(goal)[0], 0.5, rtol=1e-4)
+    assert np.isclose(result.median_depth[0], 1.2, rtol=1e-5) and np.isclose(dr.grad(goal)[0], 0.5, rtol=1e-4)
 
 
 def test04_fine_steps_begin_in_front_of_matter(rgb):

@@ -124,8 +124,8 @@ def clouds(rgb):
     grid = rgb.VolumeGrid(data.astype(np.float32)[..., None])
     medium = VolumeMedium(rgb.load_dict({"type": "gridvolume", "grid": grid, "filter_type": "nearest"}))
     turned = rng.normal(size=(2, COUNT, 3))
-    eyes = 0.5 + 2 * turned / np.linalg.norm(turned, axis=-1, keepdims=True)
-    return SceneGeometry(medium), *eyes, rng.uniform(0.1, 0.9, (COUNT, 3))
+    positions = 0.5 + 2 * turned / np.linalg.norm(turned, axis=-1, keepdims=True)
+    return SceneGeometry(medium), *positions, rng.uniform(0.1, 0.9, (COUNT, 3))
 
 
 def sights(mi, clouds, settings, falloff):
@@ -133,8 +133,8 @@ def sights(mi, clouds, settings, falloff):
     place, camera, observer, at = clouds
     o, d = camera, (at - camera) / np.linalg.norm(at - camera, axis=1, keepdims=True)
     ray = mi.Ray3f(mi.Point3f(o.T), mi.Vector3f(d.T))
-    about = place, ray, mi.Point3f(at.T), mi.Point3f(observer.T), 0, mi.Bool(True), mi.Float(falloff), settings
-    return [trace_from_observer(*about, count=True, needs_depth=whole) for whole in (True, False)]
+    metadata = place, ray, mi.Point3f(at.T), mi.Point3f(observer.T), 0, mi.Bool(True), mi.Float(falloff), settings
+    return [trace_from_observer(*metadata, count=True, needs_depth=full) for full in (True, False)]
 
 
 @pytest.mark.parametrize(
@@ -143,12 +143,12 @@ def sights(mi, clouds, settings, falloff):
 )
 def test_occlusion_query_matches_full_march(rgb, clouds, depth, surface_opacity, falloff):
     settings = ObserverSettings(march=MarchSettings(0.02), depth=depth, surface_opacity=surface_opacity, tolerance=0.05)
-    whole, short = sights(rgb, clouds, settings, falloff)
-    seen, evaluations = whole.visibility.numpy(), [s.density_evals.numpy().mean() for s in (whole, short)]
+    full, short = sights(rgb, clouds, settings, falloff)
+    seen, evaluations = full.visibility.numpy(), [s.density_evals.numpy().mean() for s in (full, short)]
     assert np.array_equal(short.visibility.numpy(), seen)
     assert 0.1 < seen.mean() < 0.9
     # Where gaze is not 0, its surface point is the same.
-    assert np.array_equal(np.array(short.p_od)[:, seen > 0], np.array(whole.p_od)[:, seen > 0])
+    assert np.array_equal(np.array(short.p_od)[:, seen > 0], np.array(full.p_od)[:, seen > 0])
     if depth == "expected":
         # Matter behind the point moves a mean: there is no early end.
         assert evaluations[0] == evaluations[1]
@@ -158,13 +158,13 @@ def test_occlusion_query_matches_full_march(rgb, clouds, depth, surface_opacity,
 
 def test_depth_of_hidden_points_is_in_front(rgb, clouds):
     settings = ObserverSettings(march=MarchSettings(0.02), tolerance=0.05)
-    whole, short = sights(rgb, clouds, settings, 0.0)
-    hidden = whole.visibility.numpy() == 0
+    full, short = sights(rgb, clouds, settings, 0.0)
+    hidden = full.visibility.numpy() == 0
     before = np.linalg.norm(clouds[3] - clouds[2], axis=1)[hidden]
     assert np.all(short.depth.numpy()[hidden] < before)
     # On opaque rays the surface itself; on others it lies behind.
-    found, surface = short.depth.numpy()[hidden], whole.depth.numpy()[hidden]
-    assert np.mean(np.isclose(found, surface, rtol=1e-5)) > 0.5 and np.all(found > surface - 1e-4)
+    result, surface = short.depth.numpy()[hidden], full.depth.numpy()[hidden]
+    assert np.mean(np.isclose(result, surface, rtol=1e-5)) > 0.5 and np.all(result > surface - 1e-4)
 
 
 def test_occlusion_query_with_shapes(rgb, clouds):
@@ -172,9 +172,9 @@ def test_occlusion_query_with_shapes(rgb, clouds):
     scene = rgb.load_dict({"type": "scene", "ball": ball})
     place = SceneGeometry(clouds[0].medium, scene)
     settings = ObserverSettings(march=MarchSettings(0.02), tolerance=0.05)
-    whole, short = sights(rgb, (place, *clouds[1:]), settings, 0.1)
-    assert np.array_equal(short.visibility.numpy(), whole.visibility.numpy())
-    assert short.density_evals.numpy().mean() < whole.density_evals.numpy().mean()
+    full, short = sights(rgb, (place, *clouds[1:]), settings, 0.1)
+    assert np.array_equal(short.visibility.numpy(), full.visibility.numpy())
+    assert short.density_evals.numpy().mean() < full.density_evals.numpy().mean()
 
 
 def test_occlusion_query_is_ignored_with_gradients(rgb, clouds):
@@ -194,14 +194,18 @@ def test_occlusion_query_is_ignored_with_gradients(rgb, clouds):
 
 
 def test_occlusion_query_limits(rgb):
-    asked = OcclusionQuery(rgb.Float(2), rgb.Float(1.5), 0.5)
+    requested = OcclusionQuery(rgb.Float(2), rgb.Float(1.5), 0.5)
     quarter, half = -math.log(0.75), math.log(2)
     t = rgb.Float([1.9, 2.0, 2.0])
-    assert asked.is_clear(t, rgb.Float([0, 0.99 * quarter, 1.01 * quarter])).numpy().tolist() == [False, True, False]
+    assert requested.is_clear(t, rgb.Float([0, 0.99 * quarter, 1.01 * quarter])).numpy().tolist() == [
+        False,
+        True,
+        False,
+    ]
     t = rgb.Float([1.4, 1.4, 1.6])
-    assert asked.is_hidden(t, rgb.Float([0.99 * half, 1.01 * half, 9])).numpy().tolist() == [False, True, False]
+    assert requested.is_hidden(t, rgb.Float([0.99 * half, 1.01 * half, 9])).numpy().tolist() == [False, True, False]
     # All light must be absorbed, which no ray can decide before its end.
-    assert not np.any(replace(asked, surface_opacity=1.0).is_hidden(t, rgb.Float(100.0)).numpy())
+    assert not np.any(replace(requested, surface_opacity=1.0).is_hidden(t, rgb.Float(100.0)).numpy())
 
 
 # ---- Primal ----
@@ -549,7 +553,7 @@ def test03_default_step(medium, step):
 
 def test04_opacity_and_expected_depth():
     tau, moment = ns.Float([0, 1e-9, math.log(2), 40]), ns.Float([0, 3e-9, 1, 2])
-    nothing = dict.fromkeys(
+    zeros = dict.fromkeys(
         (
             "tau_compensation",
             "moment_compensation",
@@ -560,7 +564,7 @@ def test04_opacity_and_expected_depth():
         ),
         ns.Float(0),
     )
-    result = MarchResult(tau=tau, moment=moment, **nothing, start_distance=ns.Float(10))
+    result = MarchResult(tau=tau, moment=moment, **zeros, start_distance=ns.Float(10))
     assert np.allclose(result.opacity.numpy(), [0, 1e-9, 0.5, 1], rtol=1e-6)
     # The first ray meets nothing; distances on the others exceed the start of the march.
     assert np.allclose(result.expected_depth.numpy(), [0, 13, 12, 12], rtol=1e-6)

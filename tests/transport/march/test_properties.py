@@ -57,12 +57,12 @@ def pieces(mi, table):
     return Along(mi, pick, table)
 
 
-def through(mi, medium, controls, **more):
+def through(mi, medium, controls, **overrides):
     z = mi.Vector3f(0, 0, 1)
     # Opaque, so that all examples share their kernels.
     t0, t1 = dr.opaque(mi.Float, 0), dr.opaque(mi.Float, 1)
     ray = LocalRay(mi.Point3f(0), z, z, t0, t1)
-    return ray, march(medium, ray, t0, t1, True, controls, **more)
+    return ray, march(medium, ray, t0, t1, True, controls, **overrides)
 
 
 def exact(table, borders=None):
@@ -95,12 +95,12 @@ def test01_march_matches_float64_reference(rgb, table):
     assert np.isclose(one(r.opacity), opacity, rtol=2e-6)
     if opacity > 0:
         assert np.isclose(one(r.expected_depth), expected, rtol=2e-6, atol=1e-12)
-        found = find_surface_depth("median", r, pieces(rgb, table), ray, ray.t_near, ray.t_far, True, WHOLE)
+        result = find_surface_depth("median", r, pieces(rgb, table), ray, ray.t_near, ray.t_far, True, WHOLE)
         # With almost no absorption behind the median, rounding of the optical depth moves it.
         tau = lambda t: np.interp(
             t, np.linspace(0, 1, PIECES + 1), np.concatenate([[0], np.cumsum(table.astype(float) / PIECES)])
         )
-        assert np.isclose(one(found), median, rtol=1e-5) or np.isclose(tau(one(found)), tau(median), rtol=1e-5)
+        assert np.isclose(one(result), median, rtol=1e-5) or np.isclose(tau(one(result)), tau(median), rtol=1e-5)
 
 
 @given(table=densities, cutoff=st.sampled_from([0.0, 1e-4]))
@@ -268,8 +268,8 @@ def test12_steps_shorter_than_a_sheet_find_it(rgb):
     medium = Along(rgb, lambda z: dr.select((z >= 0.03) & (z < 0.0301), 1e9, 1e-8))
     z = rgb.Vector3f(0, 0, 1)
     ray = LocalRay(rgb.Point3f(0, 0, start), z, z, rgb.Float(0), rgb.Float(0.05))
-    for step, least in ((5e-5, 1), (9.5e-5, 1), (2e-4, 0.45)):
+    for step, minimum in ((5e-5, 1), (9.5e-5, 1), (2e-4, 0.45)):
         r = march(medium, ray, dr.zeros(rgb.Float, 500), rgb.Float(0.05), True, MarchSettings(step))
-        met = np.array(r.opacity) > 0.5
-        assert met.mean() >= least
-        assert np.allclose((np.array(r.expected_depth) + np.array(start))[met], 0.03, atol=1.01 * step)
+        has_surface = np.array(r.opacity) > 0.5
+        assert has_surface.mean() >= minimum
+        assert np.allclose((np.array(r.expected_depth) + np.array(start))[has_surface], 0.03, atol=1.01 * step)
