@@ -111,7 +111,7 @@ def concatenate_splats(parts: Sequence[Splats]) -> Splats:
     """All Gaussians of ``parts``, without further columns. Raises `ValueError` for different degrees of harmonics or
     colour spaces."""
     if len({(splats.degree, splats.color_space) for splats in parts}) > 1:
-        raise ValueError("its splats have different degrees of harmonics or different colour spaces")
+        raise ValueError("its splats have harmonics of several degrees, or several colour spaces")
     names = ("centers", "scales", "rotations", "opacities", "harmonics")
     arrays = {name: np.concatenate([getattr(splats, name) for splats in parts]) for name in names}
     notes = tuple(dict.fromkeys(note for splats in parts for note in splats.notes))

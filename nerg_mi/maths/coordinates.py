@@ -45,7 +45,7 @@ def check_near_origin(points: np.ndarray, name: str, to_file: np.ndarray | None 
         center = center if to_file is None else to_file[:3, :3] @ center + to_file[:3, 3]
         offset = ",".join(f"{v:.0f}" for v in np.round(center, -2) + 0.0)
         raise NergError(
-            f"{name} lies {far:,.0f} units from the origin of its coordinates, where single precision resolves only "
+            f"{name} lies {far:,.0f} units from the origin of its coordinates, where single precision has steps of "
             f"{np.spacing(np.float32(far)):.2g}; subtract {offset} from it and from all data in the same coordinates "
             "(scenes, rays, cameras)"
         )

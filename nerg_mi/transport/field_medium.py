@@ -73,19 +73,25 @@ def evaluate_features(medium: Medium, p: Point3f, active: Bool) -> list[Float]:
     return [dr.select(active, f, 0) for f in features]
 
 
-def accumulate_features(place: SceneGeometry, ray: Ray3f, active: Bool, settings: MarchSettings) -> list[Float]:
+def accumulate_features(geometry: SceneGeometry, ray: Ray3f, active: Bool, settings: MarchSettings) -> list[Float]:
     """Features composited along ``ray`` through ``geometry``, whose medium has features; 0 on inactive lanes.
 
     Always uses the default ``color_cutoff``, in training and rendering: the parameter only controls the accuracy of
     colour.
     """
     settings = replace(settings, color_cutoff=MarchSettings.color_cutoff)
-    march: Any = place.trace(ray, active, settings, color=FeatureShader(_medium_with_features(place))).march
+    march: Any = geometry.trace(ray, active, settings, color=FeatureShader(_medium_with_features(geometry))).march
     return [dr.select(active, f, 0) for f in march.color]
 
 
 def features_for_observer(
-    kind: str, place: SceneGeometry, p_od: Point3f, p_o: Point3f, r_o: Vector3f, active: Bool, settings: MarchSettings
+    kind: str,
+    geometry: SceneGeometry,
+    p_od: Point3f,
+    p_o: Point3f,
+    r_o: Vector3f,
+    active: Bool,
+    settings: MarchSettings,
 ) -> list[Float] | None:
     """Features for a gaze field of the semantic ``kind`` (`fields.gaze_product.SEMANTICS`); None for a field without
     them.
@@ -93,16 +99,16 @@ def features_for_observer(
     ``p_od``: the surface that the observer at ``p_o`` sees along unit ``r_o``; ``settings``: of the march.
     """
     if kind == "snapshot":
-        return evaluate_features(_medium_with_features(place), p_od, active)
+        return evaluate_features(_medium_with_features(geometry), p_od, active)
     if kind == "accumulated":
-        return accumulate_features(place, variant_types().Ray3f(p_o, r_o), active, settings)
+        return accumulate_features(geometry, variant_types().Ray3f(p_o, r_o), active, settings)
     return None
 
 
-def _medium_with_features(place: SceneGeometry) -> Medium:
-    if place.medium is None:
+def _medium_with_features(geometry: SceneGeometry) -> Medium:
+    if geometry.medium is None:
         raise ValueError("a scene without a medium has no features")
-    return place.medium
+    return geometry.medium
 
 
 # ---- Radiance field as a medium ----
