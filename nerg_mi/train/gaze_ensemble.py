@@ -1,4 +1,4 @@
-"""Ensembles of gaze fields, whose spread says how far a prediction is to be trusted."""
+"""Ensembles of gaze fields. The spread of their predictions is an uncertainty estimate."""
 
 from __future__ import annotations
 
@@ -19,22 +19,31 @@ from nerg_mi.photos.salience import SalienceView
 from nerg_mi.rays.rays import Rays
 
 from .gaze_data import Supervision
-from .gaze_run import SELECTION_KEY, FOLD_TIME_FRACTION, select_variant, evaluate_folds, selects_prior_weight, scale_progress, train_gaze
+from .gaze_run import (
+    FOLD_TIME_FRACTION,
+    SELECTION_KEY,
+    evaluate_folds,
+    scale_progress,
+    select_variant,
+    selects_prior_weight,
+    train_gaze,
+)
 from .gaze_settings import GazeSettings
 from .gaze_trainer import KIND as RUN
 from .gaze_trainer import GazePlan, ProgressCallback, StateSettings, read_run_identity
 from .geometry import TrainingGeometry
-from .trainer import saving_on_failure, check_same_run
+from .trainer import check_same_run, saving_on_failure
 
-MIN_BLOCKS = 5  # Blocks that a resample needs at least; people are the blocks where there are as many of them
-BLOCK_SECONDS = 30.0  # Seconds of a block where there are too few people
+MIN_BLOCKS = 5  # Minimum number of blocks for resampling; participants are the blocks if there are at least this many
+BLOCK_SECONDS = 30.0  # Duration of a block in seconds, used if there are too few participants
 VIEWS = "views"
 
 
 def assign_blocks(rays: Rays) -> tuple[np.ndarray, str]:
-    """The block (N,) that each ray is resampled with, and what the blocks are: ``people``, or ``blocks of 30 s``.
+    """Assign each ray to a resampling block.
 
-    Raises ``NergError`` where there are too few of either.
+    Returns the block index (N,) of each ray and the kind of block: ``people``, or ``blocks of 30 s``. Raises
+    `NergError` if there are too few blocks.
     """
     persons, block = np.unique(rays.person, return_inverse=True)
     if len(persons) >= MIN_BLOCKS:
@@ -44,16 +53,16 @@ def assign_blocks(rays: Rays) -> tuple[np.ndarray, str]:
     _, block = np.unique(np.stack([block, stretch]), axis=1, return_inverse=True)
     if block.max() + 1 < MIN_BLOCKS:
         raise NergError(
-            f"{block.max() + 1} stretches of {BLOCK_SECONDS:g} s of {len(persons)} people are too few to resample; "
-            "leave out --ensemble"
+            f"{block.max() + 1} blocks of {BLOCK_SECONDS:g} s of {len(persons)} participants are too few to resample; "
+            "record more data or leave out --ensemble"
         )
     return block.ravel(), f"blocks of {BLOCK_SECONDS:g} s"
 
 
 def resample_rays(rays: Rays, seed: int | tuple[int, int]) -> Rays:
-    """As many blocks as ``rays`` has, drawn with replacement: a block that is drawn twice counts twice (Efron 1979).
+    """Draw as many blocks as ``rays`` has with replacement (bootstrap; Efron 1979).
 
-    A person who is drawn twice is two people then, so that weights by person count both.
+    A participant who is drawn twice becomes two participants, so that weighting by participant counts both.
     """
     block, kind = assign_blocks(rays)
     count = block.max() + 1
@@ -62,20 +71,22 @@ def resample_rays(rays: Rays, seed: int | tuple[int, int]) -> Rays:
     drawn = rays.select(index)
     if kind != "people":
         return drawn
-    again, known = np.arange(len(index)) - np.repeat(np.cumsum(times) - times, times), len(rays.persons)
-    names = [*rays.persons, *(f"{name} ({k + 2})" for k in range(again.max()) for name in rays.persons)]
-    return replace(drawn, person=drawn.person + known * again, persons=tuple(names))
+    repetition, num_persons = np.arange(len(index)) - np.repeat(np.cumsum(times) - times, times), len(rays.persons)
+    names = [*rays.persons, *(f"{name} ({k + 2})" for k in range(repetition.max()) for name in rays.persons)]
+    return replace(drawn, person=drawn.person + num_persons * repetition, persons=tuple(names))
 
 
 def resample_views(views: tuple[SalienceView, ...], seed: int | tuple[int, int]) -> tuple[SalienceView, ...]:
-    """As many views as ``views`` has, drawn with replacement. Raises ``NergError`` for fewer than five."""
+    """Draw ``len(views)`` views with replacement. Raises `NergError` for fewer than five views."""
     if len(views) < MIN_BLOCKS:
-        raise NergError(f"{len(views)} salience images are too few to resample; leave out --ensemble")
+        raise NergError(
+            f"{len(views)} salience images are too few to resample; use at least {MIN_BLOCKS} or leave out --ensemble"
+        )
     return tuple(views[k] for k in np.random.default_rng(seed).integers(0, len(views), len(views)))
 
 
 class TrainedEnsemble(NamedTuple):
-    """What the training of an ensemble came to: the fields, and their provenance (JSON)."""
+    """Result of an ensemble training: the ensemble and its provenance (JSON)."""
 
     field: GazeEnsemble
     provenance: dict
@@ -92,62 +103,81 @@ def train_ensemble(
     on_progress: ProgressCallback | None = None,
     write: Callable[[GazeEnsemble, dict], None] | None = None,
 ) -> TrainedEnsemble:
-    """Train ``members`` gaze fields as ``gaze_run.train_gaze`` does, each on a resample of the rays and the views and
-    with a seed of its own.
+    """Train ``members`` gaze fields, each on its own bootstrap resample and with its own seed.
 
-    Minutes are those of all members together. With a file in ``state``, what is done is kept beside it, one file a
-    member, and removed once ``write`` has put the ensemble into a file; without ``write`` the members stay. Raises
-    `NergError` for what cannot be resampled, and `KeyboardInterrupt`, which says how to go on, where it is interrupted.
+    Parameters
+    ----------
+    members : int
+        Number of fields, at least 2.
+    supervision, geometry, plan, ns
+        As for ``gaze_run.train_gaze``. A time limit applies to all members together.
+    state : StateSettings, optional
+        Run state. With a path, each finished member is stored in its own file next to the state and removed after
+        ``write`` has returned; without ``write`` the members remain.
+    on_progress : ProgressCallback, optional
+        Called with the progress of all members.
+    write : callable, optional
+        Called with the ensemble and its provenance to store them.
+
+    Raises
+    ------
+    NergError
+        If the data cannot be resampled.
+    KeyboardInterrupt
+        If the training is interrupted; the message says how to resume.
     """
     state = state or StateSettings()
-    kind, path = _kind(members, supervision, plan), state.path
-    # Folds of resamples would have a person on both sides: the share of the blind density is chosen once, on the rays.
-    mixed = selects_prior_weight(plan) and supervision.rays is not None
+    kind, path = _get_resampling_kind(members, supervision, plan), state.path
+    # Folds of a resample would have the same participant on both sides. The prior weight is therefore selected once, on
+    # the original rays.
+    selects_weight = selects_prior_weight(plan) and supervision.rays is not None
     parts = [path and path.with_name(f"{path.stem}.member{k}.safetensors") for k in range(members)]
     is_file = lambda file: file is not None and file.is_file()
     if state.resume and not any(map(is_file, (path, *parts))):
-        raise NergError(f'there is nothing to resume: "{path}" does not exist; leave out --resume to start')
+        raise NergError(f'cannot resume: the state file "{path}" does not exist; leave out --resume to start a new run')
     on_progress = on_progress or (lambda progress: None)
-    plan, choice = select_variant(supervision, geometry, plan, ns, on_progress, _kept(state, parts, ns))
-    if choice is not None:
-        state = replace(state, identity={**state.identity, SELECTION_KEY: choice.to_dict()})
-    whole, plan = plan, plan.with_settings(mix_folds=0)
+    plan, selection = select_variant(supervision, geometry, plan, ns, on_progress, _read_identity(state, parts, ns))
+    if selection is not None:
+        state = replace(state, identity={**state.identity, SELECTION_KEY: selection.to_dict()})
+    full_plan, plan = plan, plan.with_settings(mix_folds=0)
     if plan.settings.minutes is not None:
-        share = 1 - FOLD_TIME_FRACTION if mixed else 1.0
-        plan = plan.with_settings(minutes=share * plan.settings.minutes / members)
-    fields, each = [], []
+        time_fraction = 1 - FOLD_TIME_FRACTION if selects_weight else 1.0
+        plan = plan.with_settings(minutes=time_fraction * plan.settings.minutes / members)
+    fields, provenances = [], []
     for k, part in enumerate(parts):
-        own = replace(state, identity={**state.identity, "member": [k, members]})
+        member_state = replace(state, identity={**state.identity, "member": [k, members]})
         member_plan = plan.with_settings(seed=plan.settings.seed + 100 * k)
-        # All that a state of the run compares, of the rays that the resamples are drawn from.
-        identity = member_plan.make_identity(supervision, geometry, own)
+        # The identity describes the original rays, from which the resamples are drawn.
+        identity = member_plan.make_identity(supervision, geometry, member_state)
         if state.resume and part is not None and part.is_file():
-            field, provenance = _finished(part, identity, own, ns)
+            field, provenance = _load_member(part, identity, member_state, ns)
         else:
             field, provenance = train_gaze(
-                _resampled(supervision, (plan.settings.seed, k)),
+                _resample_supervision(supervision, (plan.settings.seed, k)),
                 geometry,
                 member_plan,
                 ns,
-                state=replace(own, resume=state.resume and is_file(path)),
+                state=replace(member_state, resume=state.resume and is_file(path)),
                 on_progress=scale_progress(on_progress, k, members, f"{k + 1}/{members} {{}}"),
-                write=None if part is None else _writer(part, identity),
+                write=None if part is None else _make_writer(part, identity),
             )
             if provenance["interrupted"]:
-                kept = "nothing was kept" if path is None else f"go on with --resume (state in {path})"
-                raise KeyboardInterrupt(f"interrupted while training member {k + 1} of {members}; {kept}")
+                hint = "no state was saved" if path is None else f"resume with --resume (state in {path})"
+                raise KeyboardInterrupt(f"interrupted while training member {k + 1} of {members}; {hint}")
         fields.append(field)
-        each.append(provenance)
-    if mixed and choice is None:
-        choice = evaluate_folds(supervision, geometry, whole, ns, on_progress).select_weight()
-    if choice is not None:
+        provenances.append(provenance)
+    if selects_weight and selection is None:
+        selection = evaluate_folds(supervision, geometry, full_plan, ns, on_progress).select_weight()
+    if selection is not None:
         for field in fields:
-            field.set_prior_weight(choice.mix)
+            field.set_prior_weight(selection.prior_weight)
     ensemble = GazeEnsemble(fields, supervision.make_support(plan.probes.radius, geometry))
     ensemble.basis = summarize_provenance(supervision.count_data())
-    provenance = _account(each, plan.settings, supervision, kind) | ({"mix": choice.to_dict()} if choice else {})
+    provenance = _combine_provenances(provenances, plan.settings, supervision, kind) | (
+        {"mix": selection.to_dict()} if selection else {}
+    )
     if write is not None:
-        # Every member is in its file by now: there is nothing more to keep if this fails.
+        # Every member is already in its file, so there is nothing to save if this fails.
         with saving_on_failure(path, lambda: None, is_done=False):
             write(ensemble, provenance)
         for part in parts:
@@ -156,50 +186,56 @@ def train_ensemble(
     return TrainedEnsemble(ensemble, provenance)
 
 
-def _kept(state: StateSettings, parts: list[Path | None], ns: ModuleType) -> dict | None:
+def _read_identity(state: StateSettings, parts: list[Path | None], ns: ModuleType) -> dict | None:
     """What an ensemble that is gone on with has been started as, by the first of its files; None for a new one."""
     if not state.resume or (state.path is not None and state.path.is_file()):
         return read_run_identity(state)
     return next((load_gaze(p, ns)[1]["provenance"]["about"] for p in parts if p is not None and p.is_file()), None)
 
 
-def _kind(members: int, supervision: Supervision, plan: GazePlan) -> str:
-    """What is drawn together. Raises `NergError` for what cannot be resampled."""
+def _get_resampling_kind(members: int, supervision: Supervision, plan: GazePlan) -> str:
+    """Return the kind of resampling block. Raises `NergError` if the data cannot be resampled."""
     if members < 2:
         raise NergError(f"an ensemble needs at least two members, got {members}")
     if supervision.rays is None:
         return VIEWS
     if plan.probes.kappa_rule == "loo":
         raise NergError(
-            'an ensemble draws people twice, who would predict themselves; choose the kappa rule "fixed" or "silverman"'
+            'the kappa rule "loo" cannot be used with --ensemble, because resampled participants would predict '
+            'themselves; choose "fixed" or "silverman"'
         )
     _, kind = assign_blocks(supervision.rays)
     return f"{kind} and {VIEWS}" if supervision.views else kind
 
 
-def _resampled(supervision: Supervision, seed: tuple[int, int]) -> Supervision:
-    """What a member is trained on."""
+def _resample_supervision(supervision: Supervision, seed: tuple[int, int]) -> Supervision:
+    """Return the resampled supervision of a member."""
     rays, views = supervision.rays, supervision.views
-    return Supervision(None if rays is None else resample_rays(rays, seed), resample_views(views, seed) if views else ())
+    return Supervision(
+        None if rays is None else resample_rays(rays, seed), resample_views(views, seed) if views else ()
+    )
 
 
-def _finished(part: Path, identity: dict, state: StateSettings, ns: ModuleType) -> tuple[AnyGazeField, dict]:
-    """A member that an earlier process has finished, and its provenance. Raises `NergError` for one of another run."""
+def _load_member(part: Path, identity: dict, state: StateSettings, ns: ModuleType) -> tuple[AnyGazeField, dict]:
+    """Load a member that an earlier process has finished, and its provenance. Raises `NergError` if it belongs to
+    another run.
+    """
     field, meta = load_gaze(part, ns)
-    kept = meta["provenance"]
-    check_same_run(part, kept["about"], identity)
+    stored = meta["provenance"]
+    check_same_run(part, stored["about"], identity)
     run = state.path
     if (
         run is not None
         and run.is_file()
         and read_checkpoint(run, RUN)[1]["about"].get("member") == state.identity["member"]
     ):
-        run.unlink()  # Killed between the writing of the member and the removal of its state
-    return field, kept["trained"]
+        run.unlink()  # The process was killed after writing the member and before removing its state
+    return field, stored["trained"]
 
 
-def _writer(part: Path, identity: dict) -> Callable[[GazeHead, dict], None]:
-    """Writes a member into ``part``; one that was interrupted has its state, and is none yet."""
+def _make_writer(part: Path, identity: dict) -> Callable[[GazeHead, dict], None]:
+    """Return a function that writes a finished member to ``part``. An interrupted member is only stored as run
+    state."""
 
     def write(field: GazeHead, provenance: dict) -> None:
         if not provenance["interrupted"]:
@@ -208,24 +244,28 @@ def _writer(part: Path, identity: dict) -> Callable[[GazeHead, dict], None]:
     return write
 
 
-def _account(each: list[dict], settings: GazeSettings, supervision: Supervision, kind: str) -> dict:
-    """One account of all members: means of their scores, sums of their seconds."""
-    total = lambda name: round(sum(d[name] for d in each), 1)
-    mean = lambda name: round(float(np.mean([d[name] for d in each])), 6)
+def _combine_provenances(provenances: list[dict], settings: GazeSettings, supervision: Supervision, kind: str) -> dict:
+    """Combine the provenance of all members: mean scores and total times."""
+    total = lambda name: round(sum(d[name] for d in provenances), 1)
+    mean = lambda name: round(float(np.mean([d[name] for d in provenances])), 6)
     out = {
-        **each[0],
+        **provenances[0],
         "settings": settings.to_dict(),
         **supervision.count_data(),
         "probes_made": round(mean("probes_made")),
         **{k: mean(k) for k in ("escaped_directions", "escaped_gaze")},
         **{k: total(k) for k in ("steps", "seconds", "seconds_preparing")},
         "made": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-        "ensemble": {"members": len(each), "resampled": kind, "seeds": [d["settings"]["seed"] for d in each]},
+        "ensemble": {
+            "members": len(provenances),
+            "resampled": kind,
+            "seeds": [d["settings"]["seed"] for d in provenances],
+        },
     }
     if "validation" in out:
-        scores = [d["validation"] for d in each]
+        scores = [d["validation"] for d in provenances]
         out["ensemble"]["validation"] = scores
-        number = [k for k, v in scores[0].items() if isinstance(v, (int, float))]
-        out["validation"] = {k: round(float(np.mean([s[k] for s in scores])), 5) for k in number}
+        numeric = [k for k, v in scores[0].items() if isinstance(v, (int, float))]
+        out["validation"] = {k: round(float(np.mean([s[k] for s in scores])), 5) for k in numeric}
         out["validation"]["best_step"] = round(out["validation"]["best_step"])
     return out

@@ -1,4 +1,4 @@
-"""The log-density head in training: its model, the likelihood of rays, its recipe, and a field of a prior alone."""
+"""Training of the log-density gaze field: its forward pass, its likelihood, its recipe, and the elevation prior."""
 
 from __future__ import annotations
 
@@ -26,27 +26,47 @@ from .gaze_recipes import DEFAULT_RECIPE, FieldOptions, Recipe, register_recipe
 from .gaze_trainer import GazeTrainer
 from .radiance_losses import stack
 
-# ---- The log-density gaze field's forward pass in the form that trains fastest: networks as tensor products ----
+# ---- Forward pass with the networks as tensor products, which trains fastest ----
 
 
 def evaluate_log_density(
     config: LogGazeConfig, box: AnyBox, parameters: dict, p_od: Any, p_o: Any, r_o: Any, misses: Any, ns: ModuleType
 ) -> Any:
-    """Log of the unnormalised density of B observers ``p_o`` (Array3f, B lanes) along ``r_o`` (Array3f, B * D lanes, D
-    for each in turn) at ``p_od``, ``escaped`` (Bool, as many) where there is no surface.
+    """Evaluate the log of the unnormalised gaze density.
 
-    The logarithm of what ``LogGazeField.unnormalized`` multiplies, on ``parameters`` spelt as the field spells them;
-    gradients reach every entry that the variant uses.
+    Parameters
+    ----------
+    config : LogGazeConfig
+        Configuration of the field.
+    box : AnyBox
+        Bounds of the field.
+    parameters : dict
+        Parameter arrays by their names in the field. Gradients reach every entry that the variant uses.
+    p_od : Array3f
+        Surface points (B * D lanes).
+    p_o : Array3f
+        Observer positions (B lanes).
+    r_o : Array3f
+        Unit viewing directions (B * D lanes), D for each observer in turn.
+    misses : Bool
+        Directions that hit no surface (B * D lanes).
+
+    Returns
+    -------
+    Float
+        Logarithm of what ``LogGazeField.unnormalized`` multiplies (B * D lanes).
     """
     net = lambda name: MLP([parameters[f"{name}.{i}"] for i in range(config.layers + 1)])
-    # The field's own inputs.
-    field = _Inputs(config, box, encoding_from_parameters(config.grid, parameters, mode=dr.ReduceMode.Expand), parameters["prior"])
+    # The field computes the network inputs.
+    field = _Inputs(
+        config, box, encoding_from_parameters(config.grid, parameters, mode=dr.ReduceMode.Expand), parameters["prior"]
+    )
     repeats = dr.width(r_o) // dr.width(p_o)
     logit = field.log_prior(r_o)
     each = dr.gather(type(p_o), p_o, dr.arange(ns.UInt32, dr.width(r_o)) // repeats)
     if config.variant != "capture":
         inputs = field.emit_inputs(p_od, each, r_o)
-        emit = net("emit_net").tensor(stack(_full(inputs, r_o), ns)).array
+        emit = net("emit_net").tensor(stack(_broadcast(inputs, r_o), ns)).array
         logit = logit + (
             emit
             if config.escaped == "nearest"
@@ -60,55 +80,55 @@ def evaluate_log_density(
         )
     if config.variant != "emit":
         position = [dr.repeat(v, repeats) for v in field.capture_position(p_o)]
-        x = net("capture_net").tensor(stack(_full(field.capture_inputs(position, r_o), r_o), ns)).array
+        x = net("capture_net").tensor(stack(_broadcast(field.capture_inputs(position, r_o), r_o), ns)).array
         logit = logit - softplus(-x)
     return logit
 
 
 class _Inputs(LogGazeField):
-    """The part of a field that has no networks."""
+    """A field without networks, used for its inputs."""
 
     def __init__(self, config: LogGazeConfig, box: AnyBox, grid: Encoding, prior: Any):
         self.config, self.box, self.grid, self.prior = config, box, grid, prior
 
 
-def _full(rows: list, like: Any) -> list:
-    """``rows`` of as many lanes as ``like``: constants have one."""
+def _broadcast(rows: list, like: Any) -> list:
+    """Broadcast constants among ``rows``, which have one lane, to the number of lanes of ``like``."""
     return [r + dr.zeros(type(r), dr.width(like)) if dr.width(r) == 1 else r for r in rows]
 
 
 def select_trainable_parameters(config: LogGazeConfig, parameters: dict) -> dict:
-    """Those of ``parameters`` that are trained: the blind density is not, and nothing that the variant leaves out."""
-    idle = {"emit": ("capture_net",), "capture": ("emit_net", "grid", "escaped")}.get(config.variant, ())
+    """Select the trainable ``parameters``: all but the position-independent prior and what the variant does not use."""
+    unused = {"emit": ("capture_net",), "capture": ("emit_net", "grid", "escaped")}.get(config.variant, ())
     if config.escaped == "nearest":
-        idle += ("escaped",)
-    return {k: v for k, v in parameters.items() if k != "prior" and not k.startswith(idle or ("-",))}
+        unused += ("escaped",)
+    return {k: v for k, v in parameters.items() if k != "prior" and not k.startswith(unused or ("-",))}
 
 
 # ---- Likelihood ----
 #
-# Training a normalised gaze field by the likelihood of rays: a softmax over each observer's sphere.
+# Maximum-likelihood training of a normalised gaze field: a softmax over the sphere of each observer.
 #
-# A probe's rays are drawn from its kernel density: rays, each moved by its kernel, so that what is learnt is as smooth
-# as the kernel is wide. The loss is their mean negative log density; the integral that normalises it is estimated from
-# directions drawn uniformly (Blanc & Rendle 2018 on sampled softmax). Expectations are those of KL(truth || field).
+# Rays are drawn from the kernel density of a probe, so that the target is as smooth as the kernel is wide. The loss is
+# the mean negative log density of these rays. Its normalising integral is estimated from uniformly drawn directions
+# (sampled softmax; Blanc and Rendle 2018). The expected gradient is that of KL(truth || field).
 
 
 class LikelihoodTrainer(GazeTrainer):
-    """A run of a ``LogGazeField``; see ``GazeTrainer``. ``targets.blind``: its table of the blind density."""
+    """Trains a ``LogGazeField`` by maximum likelihood; see ``GazeTrainer``. Requires ``targets.prior_table``."""
 
     def complete_config(self, config: LogGazeConfig, targets: GazeTargets) -> LogGazeConfig:
-        self._blind = targets.prior_table
-        # Capture's encoding spans where people's heads were.
+        self._prior_table = targets.prior_table
+        # Capture's encoding spans the observer positions.
         return replace(config, heads=targets.observer_bounds or compute_observer_bounds(targets.positions, self.box))
 
     def set_targets(self, targets: GazeTargets, epoch: int) -> None:
         super().set_targets(targets, epoch)
-        # Inverse transform sampling: each probe's distribution function over its directions of equal area.
-        self._steps = np.cumsum(targets.truth, axis=1, dtype=np.float64)
+        # Cumulative distribution of each probe over its directions of equal area, for inverse transform sampling.
+        self._cumulative = np.cumsum(targets.truth, axis=1, dtype=np.float64)
 
     def init_field(self) -> LogGazeField:
-        return LogGazeField.random(self.config, self.box, self.ns, self.settings.seed, self._blind)
+        return LogGazeField.random(self.config, self.box, self.ns, self.settings.seed, self._prior_table)
 
     def select_trainable(self, parameters: dict) -> dict:
         return select_trainable_parameters(self.config, parameters)
@@ -118,26 +138,28 @@ class LikelihoodTrainer(GazeTrainer):
         observers = self.rng.choice(data.num_observers, min(s.probes, data.num_observers), replace=False)
         D = min(s.directions, data.num_directions)
         uniform = np.argpartition(self.rng.random((len(observers), data.num_directions)), D - 1, axis=1)[:, :D]
-        steps = self._steps[observers]
-        drawn = self.rng.random((len(observers), s.rays)) * steps[:, -1:]
-        rays = np.stack([np.searchsorted(row, u) for row, u in zip(steps, drawn)])
+        cumulative = self._cumulative[observers]
+        drawn = self.rng.random((len(observers), s.rays)) * cumulative[:, -1:]
+        rays = np.stack([np.searchsorted(row, u) for row, u in zip(cumulative, drawn)])
         batch = data.gather_batch(observers, np.concatenate([uniform, rays], axis=1))
-        logit = self._logit(batch, self.current_parameters())
-        # Back into the two halves of each probe's run.
+        logit = self._evaluate_logit(batch, self.current_parameters())
+        # Split each probe's directions into the uniform ones and the rays.
         run, lane = D + s.rays, lambda n: dr.arange(ns.UInt32, len(observers) * n)
         part = lambda n, first: dr.gather(ns.Float, logit, lane(n) // n * run + lane(n) % n + first)
         likelihood = dr.block_sum(part(s.rays, D), s.rays) / s.rays
         self.loss = dr.mean(log_mean_exp(part(D, 0), D) - likelihood + dr.log(batch.solid_angle))
         dr.backward(self.loss)
 
-    def _logit(self, batch: GazeBatch, parameters: dict) -> Any:
-        return evaluate_log_density(self.config, self.box, parameters, batch.p_od, batch.p_o, batch.r_o, batch.misses, self.ns)
+    def _evaluate_logit(self, batch: GazeBatch, parameters: dict) -> Any:
+        return evaluate_log_density(
+            self.config, self.box, parameters, batch.p_od, batch.p_o, batch.r_o, batch.misses, self.ns
+        )
 
     def evaluate_density(self, batch: GazeBatch, parameters: dict) -> Any:
-        return self._normalised(batch, self._logit(batch, parameters))
+        return self._normalise(batch, self._evaluate_logit(batch, parameters))
 
     @staticmethod
-    def _normalised(batch: GazeBatch, logit: Any) -> Any:
+    def _normalise(batch: GazeBatch, logit: Any) -> Any:
         D = dr.width(logit) // dr.width(batch.solid_angle)
         return dr.exp(logit - dr.repeat(log_mean_exp(logit, D) + dr.log(batch.solid_angle), D))
 
@@ -146,70 +168,93 @@ class LikelihoodTrainer(GazeTrainer):
 
 
 def log_mean_exp(logit: Any, count: int) -> Any:
-    """Log of the mean of exp over each run of ``count`` values, without overflow."""
+    """Return the log of the mean of exp over each run of ``count`` values, without overflow."""
     top = dr.detach(dr.block_reduce(dr.ReduceOp.Max, logit, count))
     return dr.log(dr.block_sum(dr.exp(logit - dr.repeat(top, count)), count) / count) + top
 
 
-# ---- Prior ----
+# ---- Elevation prior ----
 #
-# A gaze field for a place where nobody was tracked: how high people look, learnt in other places.
+# A gaze field for an environment without recordings: the distribution of the gaze elevation in other environments.
 #
-# Of what was tried, the elevation alone carries over from place to place (docs/explanation/accuracy.md): laws of distance,
-# incidence and the like that were learnt in some places say less in others than it does.
+# Among the candidates tried, only the elevation transfers between environments (docs/gaze-evaluation.md): laws of
+# distance or incidence fitted in other environments predict gaze worse.
 
 ELEVATION_KAPPA = 30.0  # Concentration of the kernel of a ray
-# Bins of the sine of the elevation; directions over which the table is scaled to integrate to one.
-_BINS, _SCALED_OVER = 2048, 1 << 16
+# Bins of the sine of the elevation, and directions of the quadrature that normalises the table.
+_NUM_BINS, _QUADRATURE_DIRECTIONS = 2048, 1 << 16
 
 
-def compute_elevation_density(environments: Sequence[Rays], sine: np.ndarray, kappa: float = ELEVATION_KAPPA) -> np.ndarray:
-    """Density (N,), 1/sr, of a direction whose elevation has ``sine`` (N,): the kernel density of the rays of
-    ``places``, each turned to every azimuth alike. Places count alike, and people within a place.
+def compute_elevation_density(
+    environments: Sequence[Rays], sine: np.ndarray, kappa: float = ELEVATION_KAPPA
+) -> np.ndarray:
+    """Estimate the gaze density as a function of the elevation only.
 
-    The mean over azimuths of a von Mises-Fisher density of concentration ``kappa`` about a direction of sine t is
-    C(κ) exp(κ (s t - 1)) I₀(κ √(1 - s²) √(1 - t²)), `maths.vmf`'s C; `ive` is I₀ with its exponent taken out.
+    Parameters
+    ----------
+    environments : sequence of Rays
+        Gaze rays of each environment, z up. Environments have equal weight, and so have the participants of an
+        environment.
+    sine : numpy.ndarray
+        Sine of the elevation (N,) at which to evaluate.
+    kappa : float
+        Concentration of the von Mises-Fisher kernel of a ray.
+
+    Returns
+    -------
+    numpy.ndarray
+        Density (N,) in 1/sr.
+
+    Notes
+    -----
+    The mean over azimuths of a von Mises-Fisher density of concentration κ about a direction with sine t is C(κ) exp(κ
+    (s t - 1)) I₀(κ √(1 - s²) √(1 - t²)), with C of `maths.vmf`. `ive` is the exponentially scaled I₀.
     """
     from scipy.special import ive
 
-    share = np.zeros(_BINS)
+    histogram = np.zeros(_NUM_BINS)
     for rays in environments:
         weights = compute_participant_weights(rays) / len(rays) / len(environments)
-        share += np.histogram(rays.direction[:, 2], _BINS, (-1, 1), weights=weights)[0]
-    t, s = (np.arange(_BINS) + 0.5) * 2 / _BINS - 1, np.asarray(sine, np.float64)[:, None]
+        histogram += np.histogram(rays.direction[:, 2], _NUM_BINS, (-1, 1), weights=weights)[0]
+    t, s = (np.arange(_NUM_BINS) + 0.5) * 2 / _NUM_BINS - 1, np.asarray(sine, np.float64)[:, None]
     across = np.sqrt(np.maximum(1 - s**2, 0)) * np.sqrt(1 - t**2)
-    return np.exp(log_normaliser(kappa) + kappa * (s * t + across - 1)) * ive(0, kappa * across) @ share
+    return np.exp(log_normaliser(kappa) + kappa * (s * t + across - 1)) * ive(0, kappa * across) @ histogram
 
 
 def make_elevation_prior(environments: Sequence[Rays], ns: ModuleType) -> LogGazeField:
-    """A gaze field that is `elevation_density` of ``places`` wherever an observer stands, with arrays of the backend
-    ``ns``: in any place whose z axis points up, of any unit of length."""
-    # All of it is the blind density: a network is there, and counts for nothing.
+    """Make a gaze field that is the elevation density of ``environments`` at every observer position.
+
+    It can be used in any environment whose z axis points up, in any unit of length. ``ns`` is the Dr.Jit backend.
+    """
+    # The prior weight is 1: the networks exist but have no influence.
     grid = HashGridConfig(levels=1, log2_rows=4, base=2, finest=2)
     config = LogGazeConfig(grid=grid, variant="emit", width=8, layers=1, geometry="none", mix=1.0)
     rows = config.prior
-    # One row of texels, for all columns.
+    # Evaluate one texel per row; the density is the same in all columns.
     density = np.repeat(compute_elevation_density(environments, table_directions(rows)[:: 2 * rows, 2]), 2 * rows)
-    table = make_prior_table(density, rows, ns, fibonacci_directions(_SCALED_OVER))
+    table = make_prior_table(density, rows, ns, fibonacci_directions(_QUADRATURE_DIRECTIONS))
     return LogGazeField.random(config, Box((-1.0,) * 3, (1.0,) * 3), ns, prior=table)
 
 
 # ---- Recipe ----
 
 
-def _log_density(choices: FieldOptions) -> LogGazeConfig:
+def _make_log_density_config(options: FieldOptions) -> LogGazeConfig:
     return LogGazeConfig(
         grid=HashGridConfig(levels=5, log2_rows=14, base=2, finest=32),
-        variant=choices.variant,
+        variant=options.variant,
         sh_degree=3,
         mix=0.05,
-        **get_geometry_options(choices.geometry_kind),
+        **get_geometry_options(options.geometry_kind),
     )
 
 
 def get_geometry_options(geometry_kind: str) -> dict[str, Any]:
-    """What `LogGazeConfig` is told of a kind of ``place``: one of hit points has holes, through which nobody saw whom
-    it was made from; no place has no surfaces."""
+    """Return the `LogGazeConfig` options for a kind of training geometry.
+
+    Geometry made of hit points has holes, so misses take the depth of neighbouring directions. Without geometry there
+    are no surfaces.
+    """
     return {
         "escaped": "nearest" if geometry_kind == "hits" else "constant",
         "geometry": "none" if geometry_kind == "none" else "surface",
@@ -219,13 +264,13 @@ def get_geometry_options(geometry_kind: str) -> dict[str, Any]:
 register_recipe(
     Recipe(
         name=DEFAULT_RECIPE,
-        summary="a log density, normalised over the sphere, trained by the likelihood of rays; generalises best",
-        make_config=_log_density,
+        summary="a log density, normalised over the sphere, trained by maximum likelihood; generalises best",
+        make_config=_make_log_density_config,
         trainer=LikelihoodTrainer,
         losses=("likelihood",),
-        # No zones: fits without those that a validation takes, and all around them, lack most of the probes. The
-        # decay and the few harmonics keep longer trainings from following the people at hand: two or three times
-        # the steps end alike.
+        # No validation zones: a fit without the validation zones and their surroundings would lack most probes. Weight
+        # decay and few harmonics prevent overfitting to the training participants: two or three times as many steps
+        # give the same result.
         settings={
             "steps": 160,
             "zones": 0,
@@ -242,8 +287,9 @@ register_recipe(
             "validation_min_rays": 64,
             "mix_folds": 5,
         },
-        # Evenly over where people stood: as many at each place as there are rays would follow where people linger.
-        # By person, not by time: whoever stays long at a place says little of others.
+        # Probes are spaced evenly over the observer positions; a density proportional to the rays would follow where
+        # people linger. Participants are weighted equally, because a long stay of one participant says little about
+        # others.
         probes={
             "placement": "blue",
             "spacing": 0.08,

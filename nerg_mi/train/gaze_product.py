@@ -1,4 +1,4 @@
-"""The product head, emit times capture, in training."""
+"""Training of the product gaze field, emit times capture."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ from .radiance_losses import stack, unstack
 
 # ---- Product model ----
 #
-# The gaze field's forward pass in the form that trains fastest: networks as tensor products.
+# Forward pass with the networks as tensor products, which trains fastest.
 #
-# An observer looks in many directions from one position: what capture needs of the position is computed once a probe.
+# Capture's position features are computed once per probe, because its directions share the position.
 
 
 def evaluate_gaze_density(
@@ -42,11 +42,29 @@ def evaluate_gaze_density(
     ns: ModuleType,
     semantic: list | None = None,
 ) -> Any:
-    """Gaze (1/sr) of B observers ``p_o`` (Array3f, B lanes) along ``r_o`` (Array3f, B * D lanes, D for each) at
-    ``p_od``.
+    """Evaluate the gaze density; the same model as ``GazeField.evaluate``.
 
-    The same maths as ``GazeField.evaluate`` on ``parameters`` spelt as the field spells them. Gradients reach every
-    entry that the variant uses. ``semantic``: features (Floats, a lane a direction) where ``config`` wants them.
+    Parameters
+    ----------
+    config : GazeConfig
+        Configuration of the field.
+    box : AnyBox
+        Bounds of the field.
+    parameters : dict
+        Parameter arrays by their names in the field. Gradients reach every entry that the variant uses.
+    p_od : Array3f
+        Surface points (B * D lanes).
+    p_o : Array3f
+        Observer positions (B lanes).
+    r_o : Array3f
+        Unit viewing directions (B * D lanes), D for each observer in turn.
+    semantic : list of Float, optional
+        Radiance-field features (B * D lanes) if ``config`` uses them.
+
+    Returns
+    -------
+    Float
+        Gaze density in 1/sr (B * D lanes).
     """
 
     def net(name: str) -> MLP:
@@ -58,7 +76,7 @@ def evaluate_gaze_density(
     repeats = dr.width(r_o) // dr.width(p_o)
 
     def head(name: str, geometry: list, d: Any) -> Any:
-        # Every direction of r_o is there, so that stack sees rows of one length.
+        # All rows have the width of r_o, as stack requires.
         hidden = direction.tensor(stack(encode_direction(d, config.sh_degree) + geometry, ns))
         return net(name).tensor(dr.maximum(hidden, 0)).array
 
@@ -79,16 +97,16 @@ def evaluate_gaze_density(
 
 
 def select_trainable_parameters(config: GazeConfig, parameters: dict) -> dict:
-    """Those of ``parameters`` that the variant evaluates; the rest would only decay."""
-    idle = {"emit": "capture_head", "capture": "emit_head"}.get(config.variant)
-    return {k: v for k, v in parameters.items() if idle is None or not k.startswith(idle)}
+    """Select the ``parameters`` that the variant evaluates. The others would only decay."""
+    unused = {"emit": "capture_head", "capture": "emit_head"}.get(config.variant)
+    return {k: v for k, v in parameters.items() if unused is None or not k.startswith(unused)}
 
 
-# ---- Training a gaze field that is a product (equation 1), on the paper's losses ----
+# ---- Training of a product gaze field (equation 1) on the losses of the paper ----
 
 
 class ProductTrainer(GazeTrainer):
-    """A run of a ``GazeField``; see ``GazeTrainer``."""
+    """Trains a ``GazeField``; see ``GazeTrainer``."""
 
     @classmethod
     def init_from_radiance(cls, radiance: RadianceField, config: GazeConfig) -> tuple[GazeConfig, dict]:
@@ -118,13 +136,15 @@ class ProductTrainer(GazeTrainer):
         self.loss = compute_gaze_loss(density, batch.truth, D, **LOSSES[s.loss])
         total = self.loss.total
         if s.integral:
-            # Against the truth in the same directions, so that drawing few of them is no bias.
+            # Compare with the truth in the same directions, so that a subset of directions causes no bias.
             total += s.integral * dr.mean(dr.square(batch.integrate(density - batch.truth)))
         dr.backward(total)
 
     def evaluate_density(self, batch: GazeBatch, parameters: dict) -> Any:
         semantic = batch.semantic if self.config.semantic else None
-        density = evaluate_gaze_density(self.config, self.box, parameters, batch.p_od, batch.p_o, batch.r_o, self.ns, semantic)
+        density = evaluate_gaze_density(
+            self.config, self.box, parameters, batch.p_od, batch.p_o, batch.r_o, self.ns, semantic
+        )
         return batch.condition_on_view(density, batch.truth)
 
     def validation_objective(self, kld: float, cc: float, mae: float, off: float) -> float:
@@ -132,27 +152,28 @@ class ProductTrainer(GazeTrainer):
         return w["kld"] * kld + w["cc"] * (1 - cc) + w["mae"] * mae + self.settings.integral * off
 
 
-# ---- The paper's two initialisations: a trunk that starts as the radiance field's, frozen or fine-tuned ----
+# ---- The two initialisations of the paper: a trunk with the weights of the radiance field, frozen or fine-tuned ----
 
 
 def match_trunk_config(config: GazeConfig, radiance: RadianceConfig) -> GazeConfig:
-    """``config`` with the sizes that let its trunk begin as that of a field of the configuration ``radiance``."""
+    """Return ``config`` with the trunk sizes of the radiance-field configuration ``radiance``."""
     return replace(
         config, grid=radiance.grid, width=radiance.width, geometry=radiance.geometry, sh_degree=radiance.sh_degree
     )
 
 
 def extract_initial_weights(field: RadianceField, config: GazeConfig) -> dict:
-    """Grid and position network of ``field`` by the names of a gaze field: what its features come from, not its
-    density.
+    """Return the grid and position network of ``field`` under the parameter names of a gaze field.
 
-    Raises `NergError` where ``config`` has other sizes.
+    Raises `NergError` if the sizes of ``config`` differ.
     """
     like = match_trunk_config(config, field.config)
     if (config.grid, config.position_sizes) != (like.grid, like.position_sizes):
-        raise NergError("a gaze field that begins with a radiance field's weights must have its sizes")
+        raise NergError(
+            "a gaze field initialised from a radiance field must have its grid and network sizes; leave out --size"
+        )
     weights = [dr.detach(w) for w in field.density_net.weights]
-    # The first output is the logarithm of the density.
+    # Drop the first output, which is the log density.
     weights[-1] = weights[-1][1:, :]
     arrays = {f"grid.{k}": v for k, v in field.grid.named().items()}
     arrays |= {f"position_net.{i}": w for i, w in enumerate(weights)}
@@ -161,16 +182,16 @@ def extract_initial_weights(field: RadianceField, config: GazeConfig) -> dict:
 
 # ---- Sizes ----
 #
-# Architectures of a gaze field that is a product (equation 1), by one word, and the scale that they begin with.
+# Named architectures of a product gaze field (equation 1) and their initial scale.
 
 
-# (levels, log2 rows, base and finest resolution, width, geometry features). "paper" has the paper's sizes, 10.6 million
-# entries; "small" is what generalises to positions that nobody trained on, and stores in 0.4 MB as fp16.
+# (levels, log2 rows, base and finest resolution, width, geometry features). "paper" has the sizes of the paper, 10.6
+# million parameters; "small" generalises to held-out positions and takes 0.4 MB as fp16.
 _SIZES = {"small": (8, 14, 4, 128, 64, 15), "paper": (16, 19, 16, 512, 64, 15)}
 
 
 def make_gaze_config(size: str = "small", variant: str = "emit_capture", activation: str = "softplus") -> GazeConfig:
-    """Architecture of a ``size``: ``small`` or ``paper``. Raises `NergError` for another word."""
+    """Return the architecture of a ``size``, ``small`` or ``paper``. Raises `NergError` for another size."""
     if size not in _SIZES:
         raise NergError(f'size must be one of {", ".join(_SIZES)}, got "{size}"')
     levels, rows, base, finest, width, geometry = _SIZES[size]
@@ -186,10 +207,10 @@ def make_gaze_config(size: str = "small", variant: str = "emit_capture", activat
 
 
 def compute_uniform_scale(variant: str, activation: str) -> float:
-    """The ``emit_scale`` with which weights of zero are the uniform density, 1/(4π).
+    """Return the ``emit_scale`` with which zero weights give the uniform density, 1/(4π).
 
-    Networks without biases fall to zero under weight decay. Were that a density of another integral, they would have to
-    spend weight on the scale alone, and do: fields that must fight for it follow their probes much less well.
+    Weight decay pulls networks without biases towards zero. If zero had another integral, the networks would spend
+    their weights on the scale and fit the probes much less well.
     """
     at_zero = {"softplus": math.log(2.0), "exp": 1.0}.get(activation)
     if at_zero is None:
@@ -200,40 +221,40 @@ def compute_uniform_scale(variant: str, activation: str) -> float:
 # ---- Recipes ----
 
 
-def _product(size: str, activation: str) -> Callable[[FieldOptions], GazeConfig]:
-    def config(choices: FieldOptions) -> GazeConfig:
-        plain = make_gaze_config(choices.size or size, choices.variant, choices.activation or activation)
-        if choices.geometry_kind == "none":
+def _make_product_config(size: str, activation: str) -> Callable[[FieldOptions], GazeConfig]:
+    def config(options: FieldOptions) -> GazeConfig:
+        base = make_gaze_config(options.size or size, options.variant, options.activation or activation)
+        if options.geometry_kind == "none":
             raise NergError(
-                "a gaze field of this recipe needs surfaces; without any geometry only a log density trains, "
-                f"such as that of the recipe {DEFAULT_RECIPE}"
+                "a product gaze field needs surfaces to train on; without geometry use a log-density recipe such as "
+                f"{DEFAULT_RECIPE}"
             )
         return replace(
-            plain, normalized=choices.normalized, semantic=choices.semantic, semantic_own=choices.semantic_own
+            base, normalized=options.normalized, semantic=options.semantic, semantic_own=options.semantic_own
         )
 
     return config
 
 
-_OF_PRODUCTS = frozenset({"activation", "size", "normalized", "semantic", "begin", "loss", "integral"})
+_PRODUCT_OPTIONS = frozenset({"activation", "size", "normalized", "semantic", "begin", "loss", "integral"})
 
 register_recipe(
     Recipe(
         name="small",
-        summary="emit times capture on a small grid, on the paper's losses and the integral over the sphere",
-        make_config=_product("small", "softplus"),
+        summary="emit times capture on a small grid, with the losses of the paper and an integral penalty",
+        make_config=_make_product_config("small", "softplus"),
         trainer=ProductTrainer,
         losses=("paper", "code"),
         settings={"steps": 600},
         probes={},
-        supported_options=_OF_PRODUCTS,
+        supported_options=_PRODUCT_OPTIONS,
     )
 )
 register_recipe(
     Recipe(
         name="paper",
-        summary="the paper's networks, losses and probes, as many steps as 50 epochs have",
-        make_config=_product("paper", "linear"),
+        summary="networks, losses and probes of the paper, trained for the equivalent of 50 epochs",
+        make_config=_make_product_config("paper", "linear"),
         trainer=ProductTrainer,
         losses=("paper", "code"),
         settings={
@@ -247,7 +268,7 @@ register_recipe(
             "lr_hold_fraction": 0.0,
             "weight_decay": 0.0,
         },
-        # Bandwidth and least number of rays are those of the authors' code.
+        # Bandwidth and minimum number of rays are those of the authors' code.
         probes={
             "radius": 0.1,
             "count": 4096,
@@ -256,6 +277,6 @@ register_recipe(
             "directions": 1024,
             "min_rays": 8,
         },
-        supported_options=_OF_PRODUCTS,
+        supported_options=_PRODUCT_OPTIONS,
     )
 )

@@ -1,5 +1,4 @@
-"""A training of a gaze field from its data to its checkpoint, and the folds that choose its architecture and its share
-of the blind density."""
+"""Gaze training from data to checkpoint, including the folds that select the architecture and the prior weight."""
 
 from __future__ import annotations
 
@@ -24,13 +23,13 @@ from .gaze_data import (
     GazeTargets,
     Supervision,
     TargetRequirements,
-    concatenate_targets,
     compute_observer_bounds,
+    concatenate_targets,
     make_probes,
-    split_validation,
     make_targets_from_probes,
     make_targets_from_rays,
     make_targets_from_views,
+    split_validation,
 )
 from .gaze_trainer import (
     GazeFit,
@@ -40,233 +39,275 @@ from .gaze_trainer import (
     ProgressCallback,
     StateSettings,
     alignment_to_json,
-    refit,
     fit_with_validation,
     read_run_identity,
+    refit,
     round_scores,
 )
 from .geometry import TrainingGeometry
 from .trainer import saving_on_failure
 
-# ---- Mixing ----
+# ---- Selection of the prior weight ----
 #
-# How much of the blind density a gaze field is given, so that it is not worse than one that knows no position.
+# The weight of the position-independent prior, so that a field is not worse than the prior alone.
 #
-# Where few people were tracked, or hardly moved, a field follows those whom it has seen, and is worse for others than
-# where people look wherever they stand. Folds of the training rays tell: in each some people are held out, at places
-# that are held out too, and a field is trained on the others. The share of the blind density is that which foretells
-# those who were held out best, by a mixture of both densities (stacking, Wolpert 1992; Smyth and Wolpert 1999). Of
-# shares that are alike the largest is taken: the simpler density unless the field is better by half a standard error,
-# in place of the whole one of Breiman et al. (1984), which costs places that are sure of their field. Where the field
-# needs none of it in the first folds, the others are left out. The same looks that were held out tell which regions of
-# the mixture hold 80 % of the gaze of others.
+# With few or stationary participants a field overfits and scores below the position-independent prior. The weight is
+# therefore chosen by cross-validation on the training rays: each fold holds out some participants at held-out positions
+# and trains a field on the others. The weight is the one whose mixture predicts the held-out rays best (stacking;
+# Wolpert 1992, Smyth and Wolpert 1999). Among weights within half a standard error of the best, the largest is taken,
+# that is, the simpler density; the full standard error of Breiman et al. (1984) would cost too much where the field is
+# reliable. If the field needs no prior in the first folds, the others are skipped. The held-out rays also calibrate the
+# highest-density regions of the mixture.
 
 PRIOR_WEIGHTS = np.linspace(0.05, 1.0, 20)
-"""Shares of the blind density that are tried: never none, so that no density is zero."""
-FOLD_TIME_FRACTION = 0.5  # Share of the minutes of a training that the folds take
-# Zones, positions in all of them and rays at each, of what a fold holds out; and directions that it is judged in.
-_ZONES, _POSITIONS, _RAYS, _DIRECTIONS = 3, 48, 16, 1024
-# Folds after which a field that needs no more than the least share in any is believed; probes of a fold at most, and
-# its steps as a share of the training's: both end alike for this question.
-_ENOUGH, _PROBES, _STEPS = 2, 512, 0.5
-_DOUBT = 0.5  # Standard errors by which a share may be worse than the best
-_LEAST = 1e-9  # Of a density (1/sr), so that its logarithm is finite
+"""Candidate weights of the prior. Zero is excluded, so that no density is zero."""
+FOLD_TIME_FRACTION = 0.5  # Fraction of a training's time limit that the folds take
+# Zones, positions in all zones and minimum rays per position that a fold holds out; directions per validation probe.
+_NUM_ZONES, _NUM_POSITIONS, _MIN_RAYS, _NUM_DIRECTIONS = 3, 48, 16, 1024
+# Number of folds after which the smallest weight is accepted if each fold prefers it; maximum number of probes of a
+# fold; its steps as a fraction of the training's. Fewer probes and steps select the same weight.
+_MIN_FOLDS, _MAX_PROBES, _STEP_FRACTION = 2, 512, 0.5
+_SE_FACTOR = 0.5  # Standard errors by which a weight may be worse than the best
+_MIN_DENSITY = 1e-9  # Minimum density (1/sr), so that its logarithm is finite
+
+
+_KEYS = {"prior_weight": "mix", "kld_prior": "kld_blind"}  # Fields with another name in checkpoints
 
 
 @dataclass(frozen=True)
 class PriorWeightSelection:
-    """The share of the blind density that was chosen, and why; of no folds the given share alone."""
+    """The selected prior weight and the scores behind it. Without folds it is the default weight."""
 
-    mix: float  # The share
-    folds: int  # How many folds had people and positions enough to be judged by
-    # KLD (nats) of what was held out, means over folds: with this share, of the field as it is (with the least share
-    # that is tried), and of the blind density alone; of kernel densities, so that none reaches zero.
+    prior_weight: float  # Selected weight
+    folds: int  # Number of folds with enough participants and positions
+    # KLD (nats) of the held-out data, means over folds: with the selected weight, of the field alone (with the smallest
+    # candidate weight), and of the prior alone. Each is computed from kernel densities, so that none reaches zero.
     kld: float | None = None
     kld_field: float | None = None
-    kld_blind: float | None = None
-    # Shares that are to be asked for so that regions hold those of ``probes.probes.LEVELS``, by their names.
+    kld_prior: float | None = None
+    # Nominal levels at which the regions hold `probes.probes.REGION_LEVELS` of the held-out gaze, by level name.
     regions: dict[str, float] | None = None
-    # Of several variants (`choose_variant`) the one that was chosen, and the KLD of each, with its share,
-    # in the folds that all have.
+    # The variant selected by `select_variant`, and the KLD of each variant with its own weight in the common folds.
     variant: str | None = None
     variants: dict[str, float] | None = None
 
     def to_dict(self) -> dict:
-        """As JSON, for the provenance."""
-        return {k: _rounded(v) for k, v in asdict(self).items()}
+        """Return the selection as JSON, for the provenance."""
+        return {_KEYS.get(k, k): _round_values(v) for k, v in asdict(self).items()}
 
     @staticmethod
-    def from_dict(found: dict) -> PriorWeightSelection:
-        """The one of which `to_dict` was kept. Raises ``TypeError`` and ``ValueError`` for what is none."""
-        choice = PriorWeightSelection(**found)
-        if not 0 <= choice.mix <= 1:
-            raise ValueError(f'the share "mix" must be from 0 to 1, got {choice.mix}')
-        return choice
+    def from_dict(data: dict) -> PriorWeightSelection:
+        """Restore a selection from `to_dict`. Raises ``TypeError`` or ``ValueError`` for invalid data."""
+        names = {key: name for name, key in _KEYS.items()}
+        selection = PriorWeightSelection(**{names.get(k, k): v for k, v in dict(data).items()})
+        if not 0 <= selection.prior_weight <= 1:
+            raise ValueError(f'its "mix" must be from 0 to 1, got {selection.prior_weight}')
+        return selection
 
 
 def selects_prior_weight(plan: GazePlan) -> bool:
-    """Whether ``plan`` asks for a share that folds choose."""
+    """Return whether ``plan`` selects the prior weight by folds."""
     return plan.settings.mix_folds > 0 and plan.config.prior > 0
 
 
-class _Judgement(NamedTuple):
-    """What a fold tells of regions: densities (P, D) of the field and of the blind density, and the directions (n,)
-    that the rays of those who are held out are nearest to, probe after probe by ``offsets`` (P + 1,)."""
+class _FoldDensities(NamedTuple):
+    """Densities of a fold (P, D): of the field and of the prior, and for each held-out ray the index of its nearest
+    direction (n,), probe by probe according to ``offsets`` (P + 1,).
+    """
 
     field: np.ndarray
-    blind: np.ndarray
+    prior: np.ndarray
     bins: np.ndarray
     offsets: np.ndarray
 
 
 @dataclass(frozen=True)
 class FoldResults:
-    """What folds tell of one architecture."""
+    """Scores of one architecture in the folds."""
 
-    default_weight: float  # The share that it has of itself
-    kld_curves: np.ndarray  # KLD (F, S) in each fold with each of ``SHARES``
-    densities: list[_Judgement]  # Of each fold
+    default_weight: float  # Default prior weight of the architecture
+    kld_curves: np.ndarray  # KLD (F, S) in each fold with each of ``PRIOR_WEIGHTS``
+    densities: list[_FoldDensities]  # Densities of each fold
 
     def select_weight(self) -> PriorWeightSelection:
-        """The share that it is given: its own where there is no fold."""
+        """Select the prior weight; the default weight if there are no folds."""
         if not len(self.kld_curves):
             return PriorWeightSelection(self.default_weight, 0)
-        choice = _choose(self.kld_curves)
-        return replace(choice, regions=_regions(self.densities, choice.mix))
+        selection = _select_weight(self.kld_curves)
+        return replace(selection, regions=_calibrate_regions(self.densities, selection.prior_weight))
 
 
 def evaluate_folds(
-    supervision: Supervision, geometry: TrainingGeometry, plan: GazePlan, ns: ModuleType, on_progress: ProgressCallback = lambda progress: None
+    supervision: Supervision,
+    geometry: TrainingGeometry,
+    plan: GazePlan,
+    ns: ModuleType,
+    on_progress: ProgressCallback = lambda progress: None,
 ) -> FoldResults:
-    """How well fields that ``plan`` trains on ``supervision``, which has rays, in ``place`` foretell people and
-    positions that are held out, with each share of the blind density.
+    """Train and score a field in each fold, with each candidate weight of the prior.
 
-    ``tell`` is told how it goes. Raises ``KeyboardInterrupt`` after Ctrl-C, or where ``tell`` does. The place is that
-    of all rays in each fold: one of hit points knows the surfaces that held-out people have met, not who looked there.
+    Parameters
+    ----------
+    supervision : Supervision
+        Training data with rays.
+    geometry : TrainingGeometry
+        Training geometry, the same in all folds. Geometry made of hit points includes the surfaces that held-out
+        participants looked at, but not who looked at them.
+    plan : GazePlan
+        Training plan of the field.
+    ns : module
+        Dr.Jit backend.
+    on_progress : ProgressCallback
+        Called with the progress.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        After Ctrl-C, or if ``on_progress`` raises it.
     """
-    rays, config, curves, judgements = supervision.rays, plan.config, [], []
+    rays, config, curves, densities = supervision.rays, plan.config, [], []
     if rays is None or not config.prior:
-        raise ValueError("folds are of rays, and of fields that have a density that does not depend on the position")
+        raise ValueError("folds need rays and a field with a position-independent prior")
     if plan.settings.minutes is not None:
         plan = plan.with_settings(minutes=FOLD_TIME_FRACTION * plan.settings.minutes / plan.settings.mix_folds)
     settings, needs = plan.settings, TargetRequirements.from_config(plan.config)
-    probes = replace(plan.probes, count=min(plan.probes.count, _PROBES), fresh=False)
+    probes = replace(plan.probes, count=min(plan.probes.count, _MAX_PROBES), fresh=False)
     if settings.steps is not None:
-        settings = replace(settings, steps=math.ceil(_STEPS * settings.steps))
+        settings = replace(settings, steps=math.ceil(_STEP_FRACTION * settings.steps))
     box = compute_observer_bounds(geometry.points_to_field(rays.origin), geometry.box)
-    for k, (learn, held, centres) in enumerate(iter_folds(rays, plan)):
+    for k, (train, held_out, centres) in enumerate(iter_folds(rays, plan)):
         try:
-            targets = make_targets_from_rays(learn, geometry, probes, needs, seed=settings.seed)
+            targets = make_targets_from_rays(train, geometry, probes, needs, seed=settings.seed)
         except NergError:
-            # Those who are left make no probe: this fold says nothing.
+            # The remaining participants make no probe: skip this fold.
             continue
-        judged = replace(probes, directions=_DIRECTIONS, min_rays=1)
-        probes_held = make_probes(held, judged, centres, settings.seed + 3)
-        truth = make_targets_from_probes(probes_held, geometry, _DIRECTIONS, judged.depth, needs, settings.seed + 3)
+        validation_settings = replace(probes, directions=_NUM_DIRECTIONS, min_rays=1)
+        validation_probes = make_probes(held_out, validation_settings, centres, settings.seed + 3)
+        truth = make_targets_from_probes(
+            validation_probes, geometry, _NUM_DIRECTIONS, validation_settings.depth, needs, settings.seed + 3
+        )
         trainer = plan.trainer(replace(targets, observer_bounds=box), geometry.box, config, settings, ns)
         with Interruption() as stop:
             while trainer.progress < 1:
                 trainer.step()
-                done = (k + trainer.progress) / settings.mix_folds
-                on_progress(GazeProgress(f"fold {k + 1}", done, trainer.steps, trainer.seconds, None))
+                fraction = (k + trainer.progress) / settings.mix_folds
+                on_progress(GazeProgress(f"fold {k + 1}", fraction, trainer.steps, trainer.seconds, None))
                 stop.check()
-        field, blind = trainer.evaluate_densities(truth)
-        curves.append([_kld(truth.truth, (1 - m) * field + m * blind) for m in PRIOR_WEIGHTS])
-        judgements.append(_Judgement(field, blind, _bins(probes_held, geometry, truth.directions), probes_held.offsets))
-        if len(curves) == _ENOUGH and all(int(np.argmin(curve)) == 0 for curve in curves):
+        field, prior = trainer.evaluate_densities(truth)
+        curves.append([_mean_kld(truth.truth, (1 - m) * field + m * prior) for m in PRIOR_WEIGHTS])
+        densities.append(
+            _FoldDensities(
+                field,
+                prior,
+                _find_nearest_directions(validation_probes, geometry, truth.directions),
+                validation_probes.offsets,
+            )
+        )
+        if len(curves) == _MIN_FOLDS and all(int(np.argmin(curve)) == 0 for curve in curves):
             break
     on_progress(GazeProgress("folds", 1.0, settings.steps or 0, 0.0, None))
-    return FoldResults(config.mix, np.array(curves), judgements)
+    return FoldResults(config.mix, np.array(curves), densities)
 
 
 def iter_folds(rays: Rays, plan: GazePlan) -> Iterator[tuple[Rays, Rays, np.ndarray]]:
-    """``(learn, held, centres)`` of each fold: the rays of some people away from ``centres`` (T, 3), and those of the
-    others, who are judged there. One person alone is held out at places only. A fold without such places is left out.
+    """Yield ``(training rays, held-out rays, centres)`` of each fold.
+
+    Each fold holds out a group of participants at test positions ``centres`` (T, 3) and removes other rays near these
+    positions from the training rays. With one participant, only positions are held out. Folds without enough rays are
+    skipped.
     """
     settings, radius = plan.settings, plan.probes.radius
     rng = np.random.default_rng(settings.seed + 7)
-    people = rng.permutation(np.unique(rays.person))
-    alone = len(people) == 1
-    groups = [people] * settings.mix_folds if alone else np.array_split(people, min(settings.mix_folds, len(people)))
+    participants = rng.permutation(np.unique(rays.person))
+    is_single = len(participants) == 1
+    groups = (
+        [participants] * settings.mix_folds
+        if is_single
+        else np.array_split(participants, min(settings.mix_folds, len(participants)))
+    )
     for k, group in enumerate(groups):
         mask = np.isin(rays.person, group)
-        held = rays.select(mask)
+        held_out = rays.select(mask)
         try:
-            # Those who hardly moved leave nothing of their own to learn from: the others are learnt from.
+            # The other participants provide the training rays, so no minimum applies to those who hardly moved.
             split = split_by_position(
-                held,
+                held_out,
                 radius,
-                zones=_ZONES,
-                test_probes=_POSITIONS,
-                min_rays=_RAYS,
+                zones=_NUM_ZONES,
+                test_probes=_NUM_POSITIONS,
+                min_rays=_MIN_RAYS,
                 min_train=0,
                 seed=1000 * settings.seed + k,
             )
         except NergError:
-            # These people have no zones with rays enough.
+            # These participants have no zones with enough rays.
             continue
-        learn = purge(rays, split.test_centres, 2 * radius)
-        if not alone:
-            learn &= ~mask
-        if learn.any():
-            yield rays.select(learn), held, split.test_centres
+        is_training = purge(rays, split.test_centres, 2 * radius)
+        if not is_single:
+            is_training &= ~mask
+        if is_training.any():
+            yield rays.select(is_training), held_out, split.test_centres
 
 
-def _rounded(value):
-    """``value`` with its numbers to four digits."""
+def _round_values(value):
+    """Round the numbers in ``value`` to four digits."""
     if isinstance(value, dict):
-        return {k: _rounded(v) for k, v in value.items()}
+        return {k: _round_values(v) for k, v in value.items()}
     return round(value, 4) if isinstance(value, float) else value
 
 
-def _kld(truth: np.ndarray, density: np.ndarray) -> float:
-    """Mean over observers of KLD (nats) of densities (P, D) in directions of equal area, each normalised."""
+def _mean_kld(truth: np.ndarray, density: np.ndarray) -> float:
+    """Return the mean KLD (nats) of densities (P, D) in directions of equal area, each normalised."""
     p = truth / truth.sum(axis=1, keepdims=True, dtype=np.float64)
-    q = np.maximum(density, _LEAST)
+    q = np.maximum(density, _MIN_DENSITY)
     q = q / q.sum(axis=1, keepdims=True, dtype=np.float64)
-    return float((p * np.log(np.maximum(p, _LEAST / p.shape[1]) / q)).sum(axis=1).mean())
+    return float((p * np.log(np.maximum(p, _MIN_DENSITY / p.shape[1]) / q)).sum(axis=1).mean())
 
 
-def _bins(probes: Probes, place: TrainingGeometry, directions: np.ndarray) -> np.ndarray:
-    """Which of the ``directions`` (P, D, 3), those of its probe, each ray of ``probes`` is nearest to, (n,)."""
+def _find_nearest_directions(probes: Probes, place: TrainingGeometry, directions: np.ndarray) -> np.ndarray:
+    """Return the index of the nearest of its probe's ``directions`` (P, D, 3) for each ray of ``probes``, (n,)."""
     along, o = place.directions_to_field(probes.directions), probes.offsets
     return np.concatenate([np.argmax(along[a:b] @ d.T, axis=1) for a, b, d in zip(o[:-1], o[1:], directions)])
 
 
-def _regions(judgements: Sequence[_Judgement], mix: float) -> dict[str, float]:
-    """Shares to ask for so that regions hold `probes.probes.LEVELS` of the looks in all folds; positions count
-    alike."""
+def _calibrate_regions(densities: Sequence[_FoldDensities], mix: float) -> dict[str, float]:
+    """Calibrate the region levels on the held-out rays of all folds, with equal weight for each position."""
     levels, weights = [], []
-    for of in judgements:
-        density = (1 - mix) * of.field + mix * of.blind
-        for p, (a, b) in enumerate(zip(of.offsets[:-1], of.offsets[1:])):
-            levels.append(compute_region_levels(density[p : p + 1], density[p : p + 1, of.bins[a:b]])[0])
+    for fold in densities:
+        density = (1 - mix) * fold.field + mix * fold.prior
+        for p, (a, b) in enumerate(zip(fold.offsets[:-1], fold.offsets[1:])):
+            levels.append(compute_region_levels(density[p : p + 1], density[p : p + 1, fold.bins[a:b]])[0])
             weights.append(np.full(b - a, 1 / (b - a)))
     return calibrate_levels(np.concatenate(levels), np.concatenate(weights))
 
 
 def within_half_se(curves: np.ndarray) -> np.ndarray:
-    """Indices of the columns of ``curves`` (F, S), a row a fold, that are worse than the one of the least mean by no
-    more than half a standard error over folds."""
-    more = curves - curves[:, [int(curves.mean(axis=0).argmin())]]
-    error = more.std(axis=0, ddof=1) / np.sqrt(len(curves)) if len(curves) > 1 else np.zeros(curves.shape[1])
-    return np.flatnonzero(more.mean(axis=0) <= _DOUBT * error)
+    """Return the columns of ``curves`` (F, S), one row per fold, whose mean is within half a standard error of the
+    smallest.
+
+    The standard error is that of the difference to the best column, over folds.
+    """
+    excess = curves - curves[:, [int(curves.mean(axis=0).argmin())]]
+    error = excess.std(axis=0, ddof=1) / np.sqrt(len(curves)) if len(curves) > 1 else np.zeros(curves.shape[1])
+    return np.flatnonzero(excess.mean(axis=0) <= _SE_FACTOR * error)
 
 
-def _choose(curves: np.ndarray) -> PriorWeightSelection:
-    """The largest of `SHARES` that is nearly the best over folds (F, S)."""
-    mean, chosen = curves.mean(axis=0), int(within_half_se(curves)[-1])
-    return PriorWeightSelection(float(PRIOR_WEIGHTS[chosen]), len(curves), float(mean[chosen]), float(mean[0]), float(mean[-1]))
+def _select_weight(curves: np.ndarray) -> PriorWeightSelection:
+    """Select the largest of `PRIOR_WEIGHTS` that is within half a standard error of the best over folds (F, S)."""
+    mean, index = curves.mean(axis=0), int(within_half_se(curves)[-1])
+    return PriorWeightSelection(
+        float(PRIOR_WEIGHTS[index]), len(curves), float(mean[index]), float(mean[0]), float(mean[-1])
+    )
 
 
-# ---- Variants ----
+# ---- Selection of the variant ----
 #
-# Which of several architectures a place gets, by the folds that choose its share of the blind density.
+# The folds also select between several architectures.
 #
-# Where no surfaces are known, emit is told of points at one distance whatever is there. In some places it tells where
-# others look from elsewhere all the same, in others it follows whom it has seen: those who are held out tell which.
+# Without surfaces, emit sees points at one constant distance. In some environments it still predicts the gaze of
+# others, in others it overfits to the training participants; the held-out participants decide.
 
-SELECTION_KEY = "choice"  # Entry of what a run must agree on (``GazePlan.identity``): what was chosen before it began
+SELECTION_KEY = "choice"  # Key of the selection in the run identity (``GazePlan.make_identity``)
 
 
 def select_variant(
@@ -277,78 +318,101 @@ def select_variant(
     on_progress: ProgressCallback = lambda progress: None,
     resumed_identity: dict | None = None,
 ) -> tuple[GazePlan, PriorWeightSelection | None]:
-    """``plan`` with one architecture, and the share of the blind density where folds have chosen both.
+    """Select one architecture of ``plan``, and its prior weight, by folds.
 
-    That of `GazePlan.config` stays, unless one of the ``alternatives`` foretells those who are held out better by half
-    a standard error over folds, each with its own share. Without alternatives, rays or folds nothing is chosen.
-    ``kept``: what a run that is gone on with has been started as; its choice stands. ``tell``: is told how it goes.
-    Raises ``KeyboardInterrupt`` after Ctrl-C, or where ``tell`` does.
+    ``GazePlan.config`` is kept unless one of the ``alternatives`` predicts the held-out participants better by half a
+    standard error over folds, each with its own prior weight. Without alternatives, rays or folds nothing is selected.
+
+    Parameters
+    ----------
+    supervision, geometry, plan, ns, on_progress
+        As for `evaluate_folds`.
+    resumed_identity : dict, optional
+        Identity of the run to resume; its selection is reused.
+
+    Returns
+    -------
+    plan : GazePlan
+        Plan with one architecture.
+    selection : PriorWeightSelection or None
+        Prior weight, if it was selected.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        After Ctrl-C, or if ``on_progress`` raises it.
     """
     configs, plan = (plan.config, *plan.alternatives), replace(plan, alternatives=())
     if len(configs) == 1 or not selects_prior_weight(plan) or supervision.rays is None:
         return plan, None
     if resumed_identity is not None:
-        return _kept(plan, configs, resumed_identity)
-    each, judging = [], plan
+        return _restore_selection(plan, configs, resumed_identity)
+    results, fold_plan = [], plan
     if plan.settings.minutes is not None:
-        judging = plan.with_settings(minutes=plan.settings.minutes / len(configs))
+        fold_plan = plan.with_settings(minutes=plan.settings.minutes / len(configs))
     try:
         for k, config in enumerate(configs):
-            told = scale_progress(on_progress, k, len(configs), f"{{}} of {config.variant}")
-            each.append(evaluate_folds(supervision, geometry, replace(judging, config=config), ns, told))
+            report = scale_progress(on_progress, k, len(configs), f"{{}} of {config.variant}")
+            results.append(evaluate_folds(supervision, geometry, replace(fold_plan, config=config), ns, report))
     except KeyboardInterrupt as error:
         names = " and ".join(config.variant for config in configs)
-        raise KeyboardInterrupt(f"interrupted while folds chose between {names}; nothing was kept") from error
-    return _best(plan, configs, each)
+        raise KeyboardInterrupt(f"interrupted while selecting between {names}; no state was saved") from error
+    return _select_best(plan, configs, results)
 
 
-def _kept(plan: GazePlan, configs: tuple[GazeHeadConfig, ...], kept: dict) -> tuple[GazePlan, PriorWeightSelection | None]:
-    """What was chosen among ``configs``; that of another run is found out when the two are compared."""
-    started = [c for c in configs if json.loads(json.dumps(c.to_dict())) == kept.get("architecture")]
-    plan = replace(plan, config=started[0]) if started else plan
-    if SELECTION_KEY not in kept:
+def _restore_selection(
+    plan: GazePlan, configs: tuple[GazeHeadConfig, ...], identity: dict
+) -> tuple[GazePlan, PriorWeightSelection | None]:
+    """Return the selection of the run to resume. A selection of another run is detected when the identities are
+    compared.
+    """
+    matching = [c for c in configs if json.loads(json.dumps(c.to_dict())) == identity.get("architecture")]
+    plan = replace(plan, config=matching[0]) if matching else plan
+    if SELECTION_KEY not in identity:
         return plan, None
     try:
-        return plan, PriorWeightSelection.from_dict(kept[SELECTION_KEY])
+        return plan, PriorWeightSelection.from_dict(identity[SELECTION_KEY])
     except (TypeError, ValueError) as error:
-        raise NergError(f"what the run had chosen is damaged ({error}); start anew without --resume") from error
+        raise NergError(f"the saved selection of the run is damaged ({error}); start again without --resume") from error
 
 
-def _best(
-    plan: GazePlan, configs: tuple[GazeHeadConfig, ...], each: list[FoldResults]
+def _select_best(
+    plan: GazePlan, configs: tuple[GazeHeadConfig, ...], results: list[FoldResults]
 ) -> tuple[GazePlan, PriorWeightSelection | None]:
-    """The plan with the best of ``configs``, which were judged as ``each`` says, and its share."""
-    choices = [judged.select_weight() for judged in each]
-    # Folds end early for a field that needs none of the blind density.
-    folds = min(len(judged.kld_curves) for judged in each)
+    """Return the plan with the best of ``configs`` and its prior weight, given the fold results of each."""
+    selections = [judged.select_weight() for judged in results]
+    # Folds stop early for a field that needs no prior.
+    folds = min(len(judged.kld_curves) for judged in results)
     if not folds:
-        return plan, choices[0]
-    shares = [int(np.abs(PRIOR_WEIGHTS - choice.mix).argmin()) for choice in choices]
-    curves = np.stack([judged.kld_curves[:folds, s] for judged, s in zip(each, shares)], axis=1)
+        return plan, selections[0]
+    weight_indices = [int(np.abs(PRIOR_WEIGHTS - choice.prior_weight).argmin()) for choice in selections]
+    curves = np.stack([judged.kld_curves[:folds, s] for judged, s in zip(results, weight_indices)], axis=1)
     k = int(within_half_se(curves)[0])
     variants = {config.variant: float(kld) for config, kld in zip(configs, curves.mean(axis=0))}
-    return replace(plan, config=configs[k]), replace(choices[k], variant=configs[k].variant, variants=variants)
+    return replace(plan, config=configs[k]), replace(selections[k], variant=configs[k].variant, variants=variants)
 
 
 def scale_progress(on_progress: ProgressCallback, k: int, count: int, stage: str) -> ProgressCallback:
-    """Tells how the whole of ``count`` parts goes by how number ``k`` does; its stages are named as ``stage`` says."""
+    """Return a callback that reports part ``k`` of ``count`` as progress of the whole; ``stage`` formats the stage
+    names.
+    """
 
-    def told(progress: GazeProgress) -> None:
+    def report(progress: GazeProgress) -> None:
         on_progress(replace(progress, stage=stage.format(progress.stage), fraction=(k + progress.fraction) / count))
 
-    return told
+    return report
 
 
-# ---- Run ----
+# ---- Training run ----
 #
-# A whole gaze training: from rays and a place to a field, with its scores at positions that it was not trained on.
+# A complete gaze training with scores at held-out validation positions.
 #
-# The way of the data: supervision (rays, views) is split; each part becomes targets, rays by way of probes; trainers
-# draw batches of these.
+# Data flow: the supervision (rays, views) is split; each part becomes targets, rays through probes; trainers draw
+# batches from the targets.
 
 
 class TrainedGaze(NamedTuple):
-    """What a training came to: the field, and its provenance (JSON)."""
+    """Result of a training: the field and its provenance (JSON)."""
 
     field: GazeHead
     provenance: dict
@@ -364,72 +428,103 @@ def train_gaze(
     on_progress: ProgressCallback | None = None,
     write: Callable[[GazeHead, dict], None] | None = None,
 ) -> TrainedGaze:
-    """Train a gaze field on ``supervision`` in ``place``, with arrays of the backend ``ns``.
+    """Train a gaze field.
 
-    Some zones of positions are held out, purged by 2R, and watched: the weights that score best there count (the loss
-    that is trained), and the run ends when they get no better. With ``refit`` a second fit then uses everything for as
-    many steps; the scores stay those of the first. Where there are rays, and ``plan.settings.mix_folds`` asks for them,
-    folds of people and positions then choose a log density's share of the blind density (``mixing``); of several
-    architectures they choose one before (``variants``). Ctrl-C ends the run after the step at hand, with what it has
-    come to; before the first fit it raises ``KeyboardInterrupt``. Raises `NergError` when the rays make no probe.
+    Parameters
+    ----------
+    supervision : Supervision
+        Gaze rays and salience views.
+    geometry : TrainingGeometry
+        Geometry in which the surface points are traced.
+    plan : GazePlan
+        Architecture, settings and trainer.
+    ns : module
+        Dr.Jit backend.
+    state : StateSettings, optional
+        Where to store the state of the run, and whether to resume from it.
+    on_progress : ProgressCallback, optional
+        Called with the progress.
+    write : callable, optional
+        Called with the field and its provenance to store them. The run state is removed after it returns; if it raises,
+        the final state is saved. Without ``write`` the state remains.
 
-    ``state``: where the state of the run is kept, and whether to go on from it. ``tell``: is told how the run goes.
-    ``write``: is given the result, which it puts into a file. Once it has done so, the state of a run that is done is
-    removed; if it raises, the state is that of the end. Without it the state stays.
+    Returns
+    -------
+    TrainedGaze
+        Field and provenance.
+
+    Raises
+    ------
+    NergError
+        If the rays make no probe.
+    KeyboardInterrupt
+        If Ctrl-C is pressed before the first fit. Later, Ctrl-C ends the run after the current step with the result so
+        far.
+
+    Notes
+    -----
+    Zones of positions are held out for validation, and training data within 2R of them are removed. The best weights on
+    the validation data count, and the run stops early when they no longer improve. With ``refit``, a second fit uses
+    all data for the best number of steps; the reported scores remain those of the first fit. With
+    ``plan.settings.mix_folds`` and rays, folds select the prior weight of a log density (`evaluate_folds`), and before
+    that the variant, if there are several (`select_variant`).
     """
     on_progress, state, started = on_progress or (lambda progress: None), state or StateSettings(), time.perf_counter()
-    plan, choice = select_variant(supervision, geometry, plan, ns, on_progress, read_run_identity(state))
-    if choice is not None:
-        state = replace(state, identity={**state.identity, SELECTION_KEY: choice.to_dict()})
-    settings, needs = plan.settings, TargetRequirements.from_config(plan.config)
+    plan, selection = select_variant(supervision, geometry, plan, ns, on_progress, read_run_identity(state))
+    if selection is not None:
+        state = replace(state, identity={**state.identity, SELECTION_KEY: selection.to_dict()})
+    settings, requirements = plan.settings, TargetRequirements.from_config(plan.config)
     file = GazeRunFile(state.path, plan.make_identity(supervision, geometry, state), state.interval, state.resume)
     file.seconds += time.perf_counter() - started
     started = time.perf_counter()
     on_progress(GazeProgress("probes", 0.0, 0, 0.0, None))
-    split, watched = split_validation(supervision, geometry, settings, plan.probes), None
+    split, validation = split_validation(supervision, geometry, settings, plan.probes), None
     if split.validation is not None:
-        watched = make_targets(split.validation, geometry, plan, needs, settings.seed + 2, split.centres)
-    refits, mixed = settings.refit and watched is not None, selects_prior_weight(plan) and supervision.rays is not None
-    share = (0.5 if refits else 1.0) * (1 - FOLD_TIME_FRACTION if mixed else 1.0)
-    prepared, again = 0.0, file.stage == "refit"
-    used = supervision if again else split.training
-    targets = make_targets(used, geometry, plan, needs, settings.seed)
-    if again:
+        validation = make_targets(split.validation, geometry, plan, requirements, settings.seed + 2, split.centres)
+    needs_refit, selects_weight = (
+        settings.refit and validation is not None,
+        selects_prior_weight(plan) and supervision.rays is not None,
+    )
+    minutes_fraction = (0.5 if needs_refit else 1.0) * (1 - FOLD_TIME_FRACTION if selects_weight else 1.0)
+    preparation_seconds, is_refit = 0.0, file.stage == "refit"
+    training = supervision if is_refit else split.training
+    targets = make_targets(training, geometry, plan, requirements, settings.seed)
+    if is_refit:
         first = GazeFit.from_dict(file.validation_state)
     else:
-        prepared = time.perf_counter() - started
-        first = fit_with_validation(targets, watched, geometry.box, plan, ns, share, file, on_progress)
-        again = refits and not first.interrupted
-        if again:
-            # Making the targets of everything may take long: what was found is kept before.
+        preparation_seconds = time.perf_counter() - started
+        first = fit_with_validation(targets, validation, geometry.box, plan, ns, minutes_fraction, file, on_progress)
+        is_refit = needs_refit and not first.interrupted
+        if is_refit:
+            # Save first, because making the targets of all data may take long.
             file.save("refit", None, first.to_dict(), {}, force=True)
-            used, targets = supervision, make_targets(supervision, geometry, plan, needs, settings.seed)
-    last = refit(targets, first, geometry.box, plan, ns, file, on_progress) if again else first
+            training, targets = supervision, make_targets(supervision, geometry, plan, requirements, settings.seed)
+    last = refit(targets, first, geometry.box, plan, ns, file, on_progress) if is_refit else first
     trainer = last.trainer
     interrupted = first.interrupted or last.interrupted
-    if mixed and choice is None and not interrupted:
+    if selects_weight and selection is None and not interrupted:
         try:
-            choice = evaluate_folds(supervision, geometry, plan, ns, on_progress).select_weight()
+            selection = evaluate_folds(supervision, geometry, plan, ns, on_progress).select_weight()
         except KeyboardInterrupt:
             interrupted = True
     field = trainer.make_field(last.weights)
-    if choice is not None:
-        field.set_prior_weight(choice.mix)
-    field.support = used.make_support(plan.probes.radius, geometry)
+    if selection is not None:
+        field.set_prior_weight(selection.prior_weight)
+    field.support = training.make_support(plan.probes.radius, geometry)
     field.basis = summarize_provenance(supervision.count_data())
-    provenance = _provenance(supervision, geometry, plan, targets) | {
+    provenance = _make_provenance(supervision, geometry, plan, targets) | {
         "steps": trainer.steps,
         "seconds": round(file.elapsed, 1),
-        "seconds_preparing": round(prepared, 1),
-        "refitted": again,
+        "seconds_preparing": round(preparation_seconds, 1),
+        "refitted": is_refit,
         "interrupted": interrupted,
     }
-    if choice is not None:
-        provenance["mix"] = choice.to_dict()
-    if watched is not None and first.scores is not None:
+    if selection is not None:
+        provenance["mix"] = selection.to_dict()
+    if validation is not None and first.scores is not None:
         provenance["validation"] = {
             "zones": settings.zones,
-            "probes": len(watched.truth),
+            "probes": len(validation.truth),
             "rays_held_out": split.rays_held_out,
             "views_held_out": split.views_held_out,
             "best_step": first.best_step,
@@ -437,9 +532,9 @@ def train_gaze(
             "history": first.history,
         }
     if write is not None:
-        stage, weights = ("refit", {}) if again else ("fit", last.weights)
-        keep = lambda: file.save(stage, trainer, first.to_dict(), weights, force=True)
-        with saving_on_failure(state.path, keep, is_done=not provenance["interrupted"]):
+        stage, weights = ("refit", {}) if is_refit else ("fit", last.weights)
+        save = lambda: file.save(stage, trainer, first.to_dict(), weights, force=True)
+        with saving_on_failure(state.path, save, is_done=not provenance["interrupted"]):
             write(field, provenance)
     return TrainedGaze(field, provenance)
 
@@ -452,21 +547,23 @@ def make_targets(
     seed: int,
     centres: np.ndarray | None = None,
 ) -> GazeTargets:
-    """Targets of the rays and the views of ``supervision``; ``centres`` (T, 3): where its rays make probes, in their
-    frame; None: where the plan places them."""
+    """Make targets of the rays and views of ``supervision``.
+
+    ``centres`` (T, 3) are the probe positions in the frame of the rays; None: as placed by the plan.
+    """
     rays, views, probes = supervision.rays, supervision.views, plan.probes
     if rays is None:
         return make_targets_from_views(views, geometry, probes, requirements, seed)
     targets = make_targets_from_rays(rays, geometry, probes, requirements, centres, seed)
     if not views:
         return targets
-    # The blind density is that of the rays.
+    # The prior is estimated from the rays.
     requirements = TargetRequirements(requirements.semantic, requirements.fill_misses)
     return concatenate_targets(targets, make_targets_from_views(views, geometry, probes, requirements, seed))
 
 
-def _provenance(supervision: Supervision, place: TrainingGeometry, plan: GazePlan, targets: GazeTargets) -> dict:
-    """What the field was trained with and on (JSON)."""
+def _make_provenance(supervision: Supervision, place: TrainingGeometry, plan: GazePlan, targets: GazeTargets) -> dict:
+    """Return the settings and data of the training (JSON)."""
     return {
         "settings": plan.settings.to_dict(),
         "probes": plan.probes.to_dict(),

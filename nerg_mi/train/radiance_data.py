@@ -1,4 +1,4 @@
-"""Pixels of photographs and depth as training data of radiance fields."""
+"""Pixels of photos, with depth, as training data of radiance fields."""
 
 from __future__ import annotations
 
@@ -13,56 +13,58 @@ from nerg_mi.maths.types import Array3f, Float, UInt32
 from nerg_mi.photos.cameras import Intrinsics, find_fisheye_limit
 from nerg_mi.photos.images import PhotoView
 
-# ---- Directions that lenses show, on the device: the float32 counterpart of `photos.cameras.rays` ----
+# ---- Pixel directions on the device: the float32 counterpart of `photos.cameras.image_to_directions` ----
 
 
-# From the image's own coordinates, Newton's iteration reaches float32 in 3 to 5 steps at the corners of usual lenses.
+# Starting from the image coordinates, Newton's iteration converges to float32 in 3 to 5 steps at the corners of usual
+# lenses.
 _STEPS = 8
 _ROUNDING = 1e-5
 
 
 class LensTable:
-    """The lenses of some frames; only what they need is computed.
+    """Lens parameters of some frames on the device; only what these lenses need is computed.
 
-    A row has the half-pixel offset and inverse focal length of both axes, then the eight coefficients and, for
-    fisheyes, the image radius where they end (0: no fisheye).
+    A row has the half-pixel offset and inverse focal length of both axes, then eight distortion coefficients and, for
+    fisheyes, the image radius and angle at which they end (0: no fisheye).
     """
 
     def __init__(self, ns, lenses: list[Intrinsics]):
         self.ns = ns
-        self.fisheye = [i.fisheye for i in lenses]
+        self.is_fisheye = [i.fisheye for i in lenses]
         plain = [i for i in lenses if not i.fisheye]
-        self.distorted = any(any(i.distortion) for i in plain)
-        self.rational = any(i.k4 or i.k5 or i.k6 for i in plain)
-        rows = [[0.5 - i.cx, 0.5 - i.cy, 1 / i.fx, 1 / i.fy, *i.distortion, *_end(i)] for i in lenses]
+        self.is_distorted = any(any(i.distortion) for i in plain)
+        self.is_rational = any(i.k4 or i.k5 or i.k6 for i in plain)
+        rows = [[0.5 - i.cx, 0.5 - i.cy, 1 / i.fx, 1 / i.fy, *i.distortion, *_get_fisheye_end(i)] for i in lenses]
         self._columns = [ns.Float(c) for c in np.array(rows, np.float32).T]
 
     def compute_directions(self, frame, column, row):
-        """Directions (3 Floats, OpenGL camera frame, of any length) of pixels ``column``, ``row`` of ``frame``,
-        UInt32."""
+        """Compute the directions (3 Floats, OpenGL camera frame, not normalised) of pixels ``column``, ``row`` of
+        ``frame``, UInt32.
+        """
         ns = self.ns
         get = lambda k: dr.gather(ns.Float, self._columns[k], frame)
         x, y = (ns.Float(column) + get(0)) * get(2), (ns.Float(row) + get(1)) * get(3)
         z = ns.Float(1)
-        if self.distorted or any(self.fisheye):
+        if self.is_distorted or any(self.is_fisheye):
             k = [get(4 + n) for n in range(8)]
-            out = self._pinhole(x, y, k) if self.distorted else (x, y, z)
-            if any(self.fisheye):
+            out = self._undistort_pinhole(x, y, k) if self.is_distorted else (x, y, z)
+            if any(self.is_fisheye):
                 end, angle = get(12), get(13)
-                bent = self._fisheye(x, y, k, end, angle)
-                out = bent if all(self.fisheye) else tuple(dr.select(end > 0, b, a) for a, b in zip(out, bent))
+                fisheye = self._undistort_fisheye(x, y, k, end, angle)
+                out = fisheye if all(self.is_fisheye) else tuple(dr.select(end > 0, b, a) for a, b in zip(out, fisheye))
             x, y, z = out
         return x, -y, -z
 
-    def _pinhole(self, x0, y0, k):
-        """Newton's iteration on OpenCV's model, see `photos.cameras.undistort`."""
+    def _undistort_pinhole(self, x0, y0, k):
+        """Invert OpenCV's distortion model by Newton's iteration, see `photos.cameras.undistort`."""
         k1, k2, p1, p2, k3, k4, k5, k6 = k
         x, y = x0, y0
         for _ in range(_STEPS):
             r2 = x * x + y * y
             radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
             slope = k1 + r2 * (2 * k2 + r2 * 3 * k3)
-            if self.rational:
+            if self.is_rational:
                 under = dr.rcp(1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
                 radial *= under
                 slope = (slope - radial * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) * under
@@ -75,19 +77,19 @@ class LensTable:
             x, y = x - (d * ex - b * ey) * inverse, y - (a * ey - b * ex) * inverse
         return x, y, self.ns.Float(1)
 
-    def _fisheye(self, x, y, k, end, most):
-        """Newton's iteration on the angle, kept within its rising part, see `photos.cameras.rays`."""
+    def _undistort_fisheye(self, x, y, k, end, max_angle):
+        """Invert the fisheye model by Newton's iteration on the angle within its monotonic range."""
         k1, k2, _, _, k3, k4, _, _ = k
         r = dr.sqrt(x * x + y * y)
         goal = dr.minimum(r, end)
-        low, high, theta = self.ns.Float(0), most, dr.minimum(goal, most)
+        low, high, theta = self.ns.Float(0), max_angle, dr.minimum(goal, max_angle)
         for _ in range(3 * _STEPS):
             t = theta * theta
             excess = theta * (1 + t * (k1 + t * (k2 + t * (k3 + t * k4)))) - goal
             slope = 1 + t * (3 * k1 + t * (5 * k2 + t * (7 * k3 + t * 9 * k4)))
             low, high = dr.select(excess > 0, low, theta), dr.select(excess > 0, theta, high)
             step = theta - excess / slope
-            # Where the polynomial flattens Newton's step may leave the bracket, by more than rounding: halve it
+            # Where the polynomial flattens, Newton's step may leave the bracket by more than rounding error: bisect
             # instead.
             theta = dr.select((step > low - _ROUNDING) & (step < high + _ROUNDING), step, 0.5 * (low + high))
         sine, cosine = dr.sincos(theta)
@@ -95,8 +97,8 @@ class LensTable:
         return x * across, y * across, cosine
 
 
-def _end(lens: Intrinsics) -> tuple[float, float]:
-    """Image radius and angle where a fisheye ends."""
+def _get_fisheye_end(lens: Intrinsics) -> tuple[float, float]:
+    """Return the image radius and angle at which a fisheye ends."""
     if not lens.fisheye:
         return 0.0, 0.0
     angle, radius = find_fisheye_limit(lens)
@@ -105,15 +107,18 @@ def _end(lens: Intrinsics) -> tuple[float, float]:
 
 # ---- All training pixels as device arrays, and batches of their rays ----
 
-# A pixel's place in its colours is 32 bits, four channels each.
-_MOST = 2**30
+# The index into the colours is 32 bits, with four channels per pixel.
+_MAX_PIXELS = 2**30
 _DEPTH_STEPS = 65535
 
 
 @dataclass
 class PixelBatch:
-    """Rays of chosen pixels: ``o``, ``d`` (Array3f, world, d of unit length), ``rgb`` (Array3f, sRGB, straight),
-    ``alpha`` (Float or None), ``depth`` (Float, scene units, 0 where unknown; None without any)."""
+    """Rays and colours of selected pixels.
+
+    ``o``, ``d`` are ray origins and unit directions (Array3f, world), ``rgb`` (Array3f) is sRGB with straight alpha,
+    ``alpha`` is Float or None, ``depth`` (Float, scene units) is 0 where unknown, or None without any depth.
+    """
 
     o: Array3f
     d: Array3f
@@ -124,10 +129,12 @@ class PixelBatch:
 
 
 class PixelBank:
-    """Pixels of ``views`` that their masks leave in; which of them are drawn is the caller's business.
+    """Unmasked pixels of ``views`` on the device.
 
-    A pixel takes 3 bytes (8-bit pictures) or 6 (others), a third more with alpha, 2 with depth, and 4 with masks; its
-    ray is computed from its camera when it is drawn. Depth keeps 1/65535 of its picture's largest.
+    Notes
+    -----
+    A pixel takes 3 bytes (8-bit pictures) or 6 (others), a third more with alpha, 2 with depth, and 4 with masks. Its
+    ray is computed from its camera on demand. Depth is quantised to 1/65535 of the largest depth of its picture.
     """
 
     def __init__(self, ns, views: list[PhotoView]):
@@ -135,8 +142,8 @@ class PixelBank:
         counts = [v.pixels.shape[0] * v.pixels.shape[1] for v in views]
         used = [n if v.mask is None else int(np.count_nonzero(v.mask)) for n, v in zip(counts, views)]
         self.size = sum(used)
-        if sum(counts) >= _MOST:
-            raise NergError(f"{sum(counts)} training pixels are too many; load the pictures at a smaller width")
+        if sum(counts) >= _MAX_PIXELS:
+            raise NergError(f"{sum(counts)} training pixels are too many; use a smaller --width or fewer photos")
         self.centers = np.array([v.camera.center for v in views])
         self._ends = ns.UInt32(np.cumsum(counts).astype(np.uint32))
         self._starts = ns.UInt32(np.cumsum([0, *counts[:-1]]).astype(np.uint32))
@@ -144,12 +151,15 @@ class PixelBank:
         self._lenses = LensTable(ns, [v.camera.intrinsics for v in views])
         self._pose = ns.Float(np.concatenate([v.camera.to_world[:3].ravel() for v in views]).astype(np.float32))
         self._frames = len(views)
-        self._where = None
+        self._pixel_index = None
         if any(v.mask is not None for v in views):
             starts = np.cumsum([0, *counts[:-1]])
-            self._where = ns.UInt32(
+            self._pixel_index = ns.UInt32(
                 np.concatenate(
-                    [(start + np.flatnonzero(_mask(v).ravel())).astype(np.uint32) for start, v in zip(starts, views)]
+                    [
+                        (start + np.flatnonzero(_get_mask(v).ravel())).astype(np.uint32)
+                        for start, v in zip(starts, views)
+                    ]
                 )
             )
         self._store_colors(views, used)
@@ -182,14 +192,14 @@ class PixelBank:
             if view.depth is not None:
                 depth = view.depth.ravel() if view.mask is None else view.depth[view.mask]
                 unit[k] = max(float(depth.max(initial=0)), 1e-30) / _DEPTH_STEPS
-                # What is known must not round to unknown.
+                # Known depth must not round to 0, which means unknown.
                 table[at : at + n] = np.where(depth > 0, np.clip(np.round(depth / unit[k]), 1, _DEPTH_STEPS), 0)
             at += n
         self.has_full_depth = np.count_nonzero(table) >= 0.999 * self.size
         self._depth, self._depth_unit = self.ns.UInt8(table.view(np.uint8)), self.ns.Float(unit)
 
     def gather_batch(self, index) -> PixelBatch:
-        """Rays and colours of the pixels at ``index`` (UInt32)."""
+        """Gather rays and colours of the pixels at ``index`` (UInt32)."""
         ns = self.ns
         frame, column, row = self._locate(index)
         x, y, z = self._lenses.compute_directions(frame, column, row)
@@ -209,27 +219,27 @@ class PixelBank:
         return PixelBatch(o, d, rgb, alpha, depth, frame)
 
     def _locate(self, index):
-        """Frame, column and row (UInt32) of the pixels at ``index``."""
+        """Return frame, column and row (UInt32) of the pixels at ``index``."""
         ns = self.ns
-        pixel = index if self._where is None else dr.gather(ns.UInt32, self._where, index)
+        pixel = index if self._pixel_index is None else dr.gather(ns.UInt32, self._pixel_index, index)
         frame = ns.UInt32(0)
         if self._frames > 1:
             frame = dr.binary_search(0, self._frames - 1, lambda k: dr.gather(ns.UInt32, self._ends, k) <= pixel)
         offset = pixel - dr.gather(ns.UInt32, self._starts, frame)
-        # The unused lanes of a vector gather 0, and a division of integers by it kills the process.
+        # Unused SIMD lanes gather 0, and an integer division by zero kills the process.
         width = dr.maximum(dr.gather(ns.UInt32, self._widths, frame), 1)
         row = offset // width
         return frame, offset - row * width, row
 
     def iter_surface_points(self, chunk: int = 2**20):
-        """The points (Array3f, world) that the pixels with depth see, ``chunk`` pixels at a time."""
+        """Yield the surface points (Array3f, world) of the pixels with depth, ``chunk`` pixels at a time."""
         for first in range(0, self.size, chunk):
             index = dr.arange(self.ns.UInt32, min(chunk, self.size - first)) + dr.opaque(self.ns.UInt32, first)
             pixels = self.gather_batch(index)
             if pixels.depth is not None:
-                known: Any = dr.compress(pixels.depth > 0)
-                yield dr.gather(self.ns.Array3f, pixels.o + pixels.d * pixels.depth, known)
+                has_depth: Any = dr.compress(pixels.depth > 0)
+                yield dr.gather(self.ns.Array3f, pixels.o + pixels.d * pixels.depth, has_depth)
 
 
-def _mask(view: PhotoView) -> np.ndarray:
+def _get_mask(view: PhotoView) -> np.ndarray:
     return np.ones(view.shape, bool) if view.mask is None else view.mask

@@ -1,4 +1,4 @@
-"""The occupancy grid while a radiance field is trained, and how it settles at the end."""
+"""Occupancy grid during radiance training, and its extraction at the end."""
 
 from __future__ import annotations
 
@@ -8,30 +8,48 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid, cell_corner, cascades_from_contracted, dilate
+from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid, cascades_from_contracted, cell_corner, dilate
 from nerg_mi.maths.arrays import copy_aligned
 from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.maths.types import Array3f
 from nerg_mi.photos.cameras import PosedCamera, find_view_tangents
 
-# ---- Where density may be while a field trains, and the bound that is stored when it is done ----
+# ---- Density grid during training, and the occupancy that is stored ----
 #
-# A cubic grid over the field's unit cube, x varying fastest, as instant-ngp keeps it: each cell
-# remembers a decaying maximum of the optical depth that one step finds in it.
+# A cubic grid over the unit cube of the field, x varying fastest, as in instant-ngp: each cell stores a decaying
+# maximum of the optical depth of one step.
 
 _DECAY = 0.6
-# A share of the cells is refreshed at a time; the strides walk over all of them.
-_PARTS = 8
-GRID_STATE = ("value", "bits", "seen", "always")  # Arrays of the grid that the state of a run keeps
+# One part of the cells is updated at a time; strides cycle through all parts.
+_NUM_PARTS = 8
+GRID_STATE = ("value", "bits", "seen", "always")  # Arrays of the grid in the run state
 
 
 class DensityGrid:
     """Decaying maxima of σ times ``step``, and the cells in which samples are taken.
 
-    ``step``: length, in scene units, that turns density into optical depth; ``threshold``: optical
-    depth a step from which on a cell counts, lowered to half of the mean while the field is thin. Of a contracted box
-    the cells are equal where positions are encoded, and a step is at least ``growth`` times the distance from its
-    centre: cells and steps grow alike outwards.
+    Parameters
+    ----------
+    ns : module
+        Dr.Jit backend.
+    box : AnyBox
+        Bounds of the field. In a contracted box the cells have equal size in encoded positions.
+    resolution : int
+        Cells along an edge.
+    step : float
+        Length in scene units that converts density to optical depth.
+    cameras : list of PosedCamera
+        Training cameras.
+    min_views : int
+        Cells seen by fewer cameras are empty.
+    threshold : float
+        Optical depth of a step above which a cell is occupied. It is lowered to half of the mean while the field is
+        thin.
+    near : float
+        Distance from each camera within which cells are empty.
+    growth : float
+        In a contracted box, a step is at least ``growth`` times the distance from the centre, so that steps and cells
+        grow alike.
     """
 
     def __init__(
@@ -50,45 +68,50 @@ class DensityGrid:
         self.growth = growth if box.is_contracted else 0.0
         cells = resolution**3
         self.index = dr.arange(ns.UInt32, cells)
-        self._allow(self._seen(cameras, min_views, near))
+        self._restrict_to(self._find_seen_cells(cameras, min_views, near))
         if self.seen_count == 0:
             raise NergError(
-                f"not one cell of the scene box {box.lower} to {box.upper} is seen by {min_views} cameras; "
-                "give a box that holds what the pictures show with --aabb"
+                f"no cell of the scene box {box.lower} to {box.upper} is seen by {min_views} cameras; "
+                "pass a box around the photographed scene with --aabb"
             )
         self.always = dr.full(ns.Bool, False, cells)
         self.turn = 0
 
-    def _corner(self, index):
-        """Lower corner of cells in the unit cube."""
+    def _get_corner(self, index):
+        """Return the lower corner of cells in the unit cube."""
         return cell_corner(index, self.resolution, self.ns) / self.resolution
 
-    def _point(self, index, rng: np.random.Generator, stratum=0, parts: int = 1):
-        """A random world point in each cell, in part ``stratum`` of ``parts`` an axis."""
-        jitter = self.ns.Array3f(*[self.ns.Float(copy_aligned(rng.random(dr.width(index), np.float32))) for _ in range(3)])
-        return self._to_world(self._corner(index) + (stratum + jitter) / (parts * self.resolution))
+    def _sample_point(self, index, rng: np.random.Generator, stratum=0, parts: int = 1):
+        """Return a random world point in each cell, in part ``stratum`` of ``parts`` per axis."""
+        jitter = self.ns.Array3f(
+            *[self.ns.Float(copy_aligned(rng.random(dr.width(index), np.float32))) for _ in range(3)]
+        )
+        return self._to_world(self._get_corner(index) + (stratum + jitter) / (parts * self.resolution))
 
     def _to_world(self, u):
         return self.box.from_unit(u)
 
     def step_length_at(self, p):
-        """Length of a training step at ``p`` (Array3f, world), about: rays start anywhere near the centre."""
+        """Return the approximate length of a training step at ``p`` (Array3f, world), assuming that rays start near the
+        centre.
+        """
         if not self.growth:
             return self.step
         return dr.maximum(self.growth * dr.norm(p - self.ns.Array3f(*self.box.center)), self.step)
 
     def cell_size_at(self, p):
-        """Edge of the cell that holds ``p`` (Array3f, world), in the field's units; across the line to the centre."""
+        """Return the edge of the cell that holds ``p`` (Array3f, world), in scene units, across the line to the
+        centre."""
         inner = 2 if self.box.is_contracted else 1
         return self.box.distance_scale(p) * (inner * self.box.side / self.resolution)
 
-    def _seen(self, cameras: list[PosedCamera], min_views: int, near: float):
-        """Cells whose centre lies within the box and in at least ``min_views`` pictures.
+    def _find_seen_cells(self, cameras: list[PosedCamera], min_views: int, near: float):
+        """Return the cells whose centre is in the box and in at least ``min_views`` pictures.
 
-        Occlusion is not considered, and pictures are taken to be 10 % wider than their borders' rays.
+        Occlusion is ignored, and the frusta are widened by 10 %.
         """
         Float, UInt32 = self.ns.Float, self.ns.UInt32
-        p = self._to_world(self._corner(self.index) + 0.5 / self.resolution)
+        p = self._to_world(self._get_corner(self.index) + 0.5 / self.resolution)
         cell = 0 if self.box.is_contracted else self.box.side / self.resolution
         half = ((np.subtract(self.box.upper, self.box.lower) + cell) / 2).tolist()
         inside = dr.all(dr.abs(p - self.ns.Array3f(*self.box.center)) < self.ns.Array3f(*half))
@@ -98,43 +121,43 @@ class DensityGrid:
             rows = [Float(v) for v in camera.to_world[:3, :3].T.ravel()]
             origin = [Float(v) for v in camera.center]
             edge = [Float(v) for v in find_view_tangents(camera.intrinsics)]
-            # As literals the pose would compile one kernel a camera.
+            # Literal poses would compile one kernel per camera.
             dr.make_opaque(rows, origin, edge)
             d = [p[k] - origin[k] for k in range(3)]
             x, y, z = (rows[3 * k] * d[0] + rows[3 * k + 1] * d[1] + rows[3 * k + 2] * d[2] for k in range(3))
             left, right, up, down = (e * 1.1 for e in edge)
-            sees = (z < 0) & (x > left * z) & (x < -right * z) & (-y > up * z) & (-y < -down * z)
-            count += dr.select(sees, UInt32(1), 0)
+            is_in_view = (z < 0) & (x > left * z) & (x < -right * z) & (-y > up * z) & (-y < -down * z)
+            count += dr.select(is_in_view, UInt32(1), 0)
             inside &= d[0] * d[0] + d[1] * d[1] + d[2] * d[2] > near * near
             dr.eval(count, inside)
         return inside & (count >= min(min_views, len(cameras)))
 
     def carve(self, points) -> None:
-        """Keep only the cells that hold or touch one of the surface points: ``points`` yields Array3f (world).
+        """Restrict samples to the cells that hold or touch a surface point; ``points`` yields Array3f (world).
 
-        For depth that is exact and known at every pixel: all that a camera can see lies on those points. The
-        cells that hold one stay on whatever is found in them: once off, nothing would be learnt there again.
+        Use this if every pixel has exact depth, so that all visible surfaces are known. Cells that hold a point are
+        always sampled, because a cell that is switched off would never be trained again.
         """
-        found = self._holding(points)
-        self.always = self.seen & self.ns.Bool(found.ravel())
-        self._allow(self.seen & self.ns.Bool(dilate(found).ravel()))
+        surface_cells = self._find_cells_with(points)
+        self.always = self.seen & self.ns.Bool(surface_cells.ravel())
+        self._restrict_to(self.seen & self.ns.Bool(dilate(surface_cells).ravel()))
 
-    def _holding(self, points) -> np.ndarray:
-        """Cells (R, R, R) that hold one of the points (Array3f, world) of an iterable."""
+    def _find_cells_with(self, points) -> np.ndarray:
+        """Return the cells (R, R, R) that hold one of the points (Array3f, world) of an iterable."""
         r = self.resolution
-        found = dr.zeros(self.ns.UInt8, r**3)
+        cells = dr.zeros(self.ns.UInt8, r**3)
         for p in points:
-            self.mark_cells(found, p)
-        return found.numpy().reshape(r, r, r) > 0
+            self.mark_cells(cells, p)
+        return cells.numpy().reshape(r, r, r) > 0
 
     def mark_cells(self, cells, p) -> None:
-        """Set ``found`` (UInt8 a cell) where it holds one of the points ``p`` (Array3f, world)."""
+        """Set ``cells`` (UInt8 per cell) where they hold one of the points ``p`` (Array3f, world)."""
         if dr.width(p) > 0:
-            dr.scatter(cells, self.ns.UInt8(1), self._cell(p))
+            dr.scatter(cells, self.ns.UInt8(1), self._find_cell(p))
             dr.eval(cells)
 
-    def _allow(self, cells) -> None:
-        """Restrict samples to ``cells`` (mask), all of which count as occupied until they are looked at."""
+    def _restrict_to(self, cells) -> None:
+        """Restrict samples to the mask ``cells``. All of them count as occupied until they are evaluated."""
         self.seen = cells
         count: Any = dr.count(cells)
         self.seen_count = int(count[0])
@@ -143,30 +166,30 @@ class DensityGrid:
         dr.eval(self.seen, self.value, self.bits)
 
     def is_occupied(self, p, active):
-        """Mask of the points ``p`` (Array3f, world) in cells that may hold density."""
+        """Return the mask of points ``p`` (Array3f, world) in occupied cells."""
         return self.is_within(self.bits, p, active)
 
     def is_within(self, bits, p, active):
-        """Mask of the points ``p`` (Array3f, world) in cells of ``bits`` (UInt8 a cell)."""
-        return active & (dr.gather(self.ns.UInt8, bits, self._cell(p), active) > 0)
+        """Return the mask of points ``p`` (Array3f, world) in cells set in ``bits`` (UInt8 per cell)."""
+        return active & (dr.gather(self.ns.UInt8, bits, self._find_cell(p), active) > 0)
 
-    def _cell(self, p):
-        """Index (UInt32) of the cell that holds ``p`` (Array3f, world)."""
+    def _find_cell(self, p):
+        """Return the index (UInt32) of the cell that holds ``p`` (Array3f, world)."""
         r = self.resolution
         u: Array3f = self.box.to_unit(p)
         c = [self.ns.UInt32(dr.clip(x * r, 0, r - 1)) for x in (u.x, u.y, u.z)]
         return c[0] + r * (c[1] + r * c[2])
 
     def update(self, density, rng: np.random.Generator, everywhere: bool = False) -> None:
-        """Look at one random point in an eighth of the cells, or in all of them.
+        """Evaluate the density at one random point in an eighth of the cells, or in all of them.
 
-        ``density``: σ at world points (Array3f, mask), without gradient.
+        ``density`` maps world points (Array3f, mask) to σ without gradient.
         """
-        index = self.select_cells(self.turn, 1 if everywhere else _PARTS)
+        index = self.select_cells(self.turn, 1 if everywhere else _NUM_PARTS)
         self.turn += not everywhere
         if dr.width(index) > 0:
-            # Beyond some optical depth more says nothing, and would drown the mean.
-            p = self._point(index, rng)
+            # Clamp the optical depth: larger values carry no information and would dominate the mean.
+            p = self._sample_point(index, rng)
             value = dr.minimum(density(p, True) * self.step_length_at(p), 10)
             if not everywhere:
                 value = dr.maximum(dr.gather(self.ns.Float, self.value, index) * _DECAY, value)
@@ -179,58 +202,78 @@ class DensityGrid:
         self.unsampled = dr.compress(self.seen & (self.bits == 0))
 
     def restore(self, value, bits, seen, always, turn: int) -> None:
-        """Go on from a stored state (arrays of the attributes of these names)."""
+        """Restore a stored state (arrays of the attributes of these names)."""
         ns = self.ns
         self.value, self.bits, self.seen, self.always = ns.Float(value), ns.UInt8(bits), ns.Bool(seen), ns.Bool(always)
         self.seen_count, self.turn = int(seen.sum()), turn
         self.unsampled = dr.compress(self.seen & (self.bits == 0))
 
     def empty_points(self, count: int, rng: np.random.Generator):
-        """Random points (Array3f, world) in cells that cameras see and that are not sampled; None without any."""
+        """Return random points (Array3f, world) in visible cells that are not sampled; None if there are none."""
         if dr.width(self.unsampled) == 0:
             return None
         pick = self.ns.UInt32(copy_aligned(rng.integers(0, dr.width(self.unsampled), count, np.uint32), np.uint32))
-        return self._point(dr.gather(self.ns.UInt32, self.unsampled, pick), rng)
+        return self._sample_point(dr.gather(self.ns.UInt32, self.unsampled, pick), rng)
 
     @property
     def occupied_fraction(self) -> float:
-        """Share of all cells that samples are taken in."""
+        """Fraction of all cells in which samples are taken."""
         return float(dr.sum(self.ns.Float(self.bits))[0]) / self.resolution**3
 
-    def extract_occupancy(self, density, rng: np.random.Generator, contributing_points, probes: int = 3) -> OccupancyGrid | CascadeGrid:
-        """A grid for rendering, of cells that may hold density and that matter to the training rays.
+    def extract_occupancy(
+        self, density, rng: np.random.Generator, contributing_points, probes: int = 3
+    ) -> OccupancyGrid | CascadeGrid:
+        """Extract the occupancy for rendering: cells that may hold density and contribute to training rays.
 
-        ``probes``**3 jittered points a cell are looked at; a cell with one above the threshold stays on, and so do all
-        that touch it, so that a bump between the probes of a face is not cut. The threshold, in 1/unit, is the density
-        that absorbs ``self.threshold`` in one training step. Of these cells those stay that take more than a
-        thousandth of some training ray's light, or touch one that does: ``lit(density, occupied)`` yields
-        the points of such samples. All others are empty by definition: no picture says what is in them.
+        Parameters
+        ----------
+        density : callable
+            Maps world points and a mask to σ.
+        rng : numpy.random.Generator
+            Random numbers of the probes.
+        contributing_points : callable
+            ``contributing_points(density, occupied)`` yields the points of samples with more than a thousandth of the
+            light of a training ray.
+        probes : int
+            The density is evaluated at ``probes``**3 jittered points per cell.
+
+        Notes
+        -----
+        A cell with a point above the threshold is occupied, and so are its neighbours, so that a bump between the
+        probes of a face is not cut. The threshold, in 1/unit, is the density that absorbs ``self.threshold`` in one
+        training step. Of these cells those are kept that contribute, or touch one that does. All others are empty by
+        definition, because no picture constrains them.
         """
-        found = dr.zeros(self.ns.UInt8, self.resolution**3)
+        dense_cells = dr.zeros(self.ns.UInt8, self.resolution**3)
         for k in range(probes**3):
-            index = dr.compress(self.seen & (found == 0))
+            index = dr.compress(self.seen & (dense_cells == 0))
             if dr.width(index) == 0:
                 break
-            self.mark_dense_cells(found, index, density, rng, (k % probes, k // probes % probes, k // probes**2), probes)
-        dense = self.dilate_cells(found)
+            self.mark_dense_cells(
+                dense_cells, index, density, rng, (k % probes, k // probes % probes, k // probes**2), probes
+            )
+        dense = self.dilate_cells(dense_cells)
         bits = self.ns.UInt8(dense.ravel())
-        shown = self._holding(contributing_points(density, lambda p, active: self.is_within(bits, p, active)))
-        bits = dense & dilate(shown)
+        contributing = self._find_cells_with(
+            contributing_points(density, lambda p, active: self.is_within(bits, p, active))
+        )
+        bits = dense & dilate(contributing)
         if self.box.outer_scale is not None:
             return cascades_from_contracted(bits, self.box.outer_scale, self.ns, self.density_threshold)
         return OccupancyGrid(bits, self.ns, self.density_threshold)
 
     @property
     def density_threshold(self) -> float:
-        """Density, in 1/unit, that absorbs ``threshold`` in one training step; of a contracted box, near its centre."""
+        """Density, in 1/unit, that absorbs ``threshold`` in one training step; in a contracted box, near its centre."""
         return self.threshold / self.step
 
     def mark_dense_cells(self, cells, index, density, rng: np.random.Generator, stratum: tuple, parts: int) -> None:
-        """Set ``found`` (UInt8 a cell) for those of the cells ``index`` that are denser than ``limit`` at a random
-        point of their ``stratum`` (three numbers) of ``parts`` an axis."""
+        """Set ``cells`` (UInt8 per cell) for the cells ``index`` that are denser than ``density_threshold`` at a random
+        point of their ``stratum`` (three numbers) of ``parts`` per axis.
+        """
         corner = self.ns.Array3f(*stratum)
         dr.make_opaque(corner)
-        p = self._point(index, rng, corner, parts)
+        p = self._sample_point(index, rng, corner, parts)
         limit = self.threshold / self.step_length_at(p) if self.growth else self.density_threshold
         hit: Any = dr.compress(density(p, True) > limit)
         if dr.width(hit) > 0:
@@ -238,44 +281,51 @@ class DensityGrid:
             dr.eval(cells)
 
     def dilate_cells(self, cells) -> np.ndarray:
-        """Cells (R, R, R) of ``found`` (UInt8 a cell) and all that touch one of them, as far as they may be sampled."""
+        """Return ``cells`` (UInt8 per cell) and their neighbours (R, R, R), restricted to cells that may be sampled."""
         shape = (self.resolution,) * 3
         return dilate(cells.numpy().reshape(shape) > 0) & self.seen.numpy().reshape(shape)
 
     def keep_sampled(self, cells: np.ndarray) -> None:
-        """From now on sample ``cells`` (R, R, R) whatever is found in them."""
+        """Always sample ``cells`` (R, R, R) from now on."""
         self.always = self.always | self.ns.Bool(cells.ravel())
         dr.eval(self.always)
 
-    def select_cells(self, turn: int, parts: int = _PARTS):
-        """Every ``parts``-th cell (UInt32) that may be sampled, from cell ``turn`` modulo ``parts`` on."""
+    def select_cells(self, turn: int, parts: int = _NUM_PARTS):
+        """Return every ``parts``-th cell (UInt32) that may be sampled, starting from cell ``turn`` modulo ``parts``."""
         index = dr.arange(self.ns.UInt32, self.resolution**3 // parts) * parts + dr.opaque(self.ns.UInt32, turn % parts)
         seen: Any = dr.compress(dr.gather(self.ns.Bool, self.seen, index))
         return dr.gather(self.ns.UInt32, index, seen)
 
 
-# ---- Settling ----
+# ---- Occupancy extraction during training ----
 #
-# From some point of a training on, every cell that rendering will visit is sampled; found a piece a step.
+# From some step on, every cell that rendering will visit is sampled. These cells are found one piece per step.
 #
-# Cells that were left out stopped learning, and what hashing made of them shows once a picture is rendered under the
-# bound of what the field has become (`DensityGrid.bound`): the last part of a run must clear it. Finding them at once
-# would take as long as hundreds of steps.
+# Cells that were not sampled have stopped training, and hash collisions fill them with artefacts that appear once a
+# picture is rendered with the extracted occupancy (`DensityGrid.extract_occupancy`). The last part of a run must clear
+# them. Extracting the occupancy at once would take as long as hundreds of steps.
 
 
-# Every cell is looked at in alternate corners of its 2 x 2 x 2 parts: each half along each axis has two of them.
+# Each cell is evaluated in alternate corners of its 2 x 2 x 2 parts: each half along each axis has two of them.
 _STRATA = ((0, 0, 0), (1, 1, 0), (1, 0, 1), (0, 1, 1))
-_LOOKS = 32  # Groups of training rays that decide which cells matter
+_RAY_GROUPS = 32  # Groups of training rays that decide which cells contribute
 
 
 class OccupancyExtraction:
-    """Which cells the `DensityGrid.bound` of this moment would hold, nearly: by fewer points a cell and fewer rays.
+    """Incremental approximation of `DensityGrid.extract_occupancy` with fewer points per cell and fewer rays.
 
-    ``at``: pieces done; ``found``: cells (UInt8 each) with density; ``shown``: cells that absorb some light.
+    Attributes
+    ----------
+    pieces_done : int
+        Number of completed pieces.
+    dense_cells : UInt8
+        Cells with density.
+    contributing_cells : UInt8
+        Cells that absorb some light.
     """
 
-    PROBE_PIECES = len(_STRATA) * _PARTS
-    NUM_PIECES = PROBE_PIECES + _LOOKS
+    PROBE_PIECES = len(_STRATA) * _NUM_PARTS
+    NUM_PIECES = PROBE_PIECES + _RAY_GROUPS
 
     def __init__(self, grid: DensityGrid):
         self.grid, self.pieces_done = grid, 0
@@ -288,15 +338,27 @@ class OccupancyExtraction:
         return self.pieces_done >= self.NUM_PIECES
 
     def restore(self, pieces_done: int, dense_cells: np.ndarray, contributing_cells: np.ndarray) -> None:
-        """Go on from a stored state."""
+        """Restore a stored state."""
         UInt8 = self.grid.ns.UInt8
-        self.pieces_done, self.dense_cells, self.contributing_cells, self.dilated_dense = pieces_done, UInt8(dense_cells), UInt8(contributing_cells), None
+        self.pieces_done, self.dense_cells, self.contributing_cells, self.dilated_dense = (
+            pieces_done,
+            UInt8(dense_cells),
+            UInt8(contributing_cells),
+            None,
+        )
 
     def advance(self, density, contributing_points, seed: int) -> None:
-        """The next piece; with the last one the grid is told.
+        """Process the next piece; after the last one the grid is updated.
 
-        ``density``: of the field, as `DensityGrid.bound` has it; ``lit(density, occupied, rng)``: points (Array3f,
-        world) of samples that some training rays see, or None; ``seed``: of the points and rays.
+        Parameters
+        ----------
+        density : callable
+            As for `DensityGrid.extract_occupancy`.
+        contributing_points : callable
+            ``contributing_points(density, occupied, rng)`` returns points (Array3f, world) of visible samples on some
+            training rays, or None.
+        seed : int
+            Seed of the points and rays.
         """
         if self.is_done:
             return
@@ -306,7 +368,7 @@ class OccupancyExtraction:
             open_: Any = dr.compress(dr.gather(grid.ns.UInt8, self.dense_cells, part) == 0)
             if dr.width(open_) > 0:
                 index = dr.gather(grid.ns.UInt32, part, open_)
-                grid.mark_dense_cells(self.dense_cells, index, density, rng, _STRATA[self.pieces_done // _PARTS], 2)
+                grid.mark_dense_cells(self.dense_cells, index, density, rng, _STRATA[self.pieces_done // _NUM_PARTS], 2)
         else:
             if self.dilated_dense is None:
                 self.dilated_dense = grid.ns.UInt8(grid.dilate_cells(self.dense_cells).ravel())

@@ -1,4 +1,4 @@
-"""The model of a radiance field in training, its losses, and colours of single photographs."""
+"""Radiance field in training: its forward pass, its losses, and per-photo colour corrections."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from nerg_mi.fields.encoding import encode_direction, encoding_from_parameters
 from nerg_mi.fields.mlp import MLP
 from nerg_mi.fields.radiance import (
     RadianceConfig,
+    color_network_inputs,
+    decode_color,
     density_from_log,
     mean_features,
-    decode_color,
-    color_network_inputs,
     point_features,
 )
 from nerg_mi.maths.geometry import AnyBox
@@ -22,9 +22,9 @@ from nerg_mi.maths.types import Float, UInt32
 from nerg_mi.transport.quadrature import mean_depth_fraction
 
 from .radiance_data import PixelBatch
-from .radiance_sampling import RaySamples, sum_along_rays, compute_weights
+from .radiance_sampling import RaySamples, compute_weights, sum_along_rays
 
-# ---- What a radiance field is fitted to: the colours of rays and, where it is known, their depth ----
+# ---- Losses of ray colours and depths ----
 
 
 def huber_loss(error, delta: float):
@@ -34,10 +34,10 @@ def huber_loss(error, delta: float):
 
 
 def color_loss(color, opacity, pixels: PixelBatch, background, delta: float):
-    """Mean Huber loss a ray (Float, one entry a ray) of composited ``color`` (3 Floats) over ``background``.
+    """Mean Huber loss per ray (Float) of composited ``color`` (3 Floats) over a random ``background`` (Array3f).
 
-    The random ``background`` (Array3f) shows through what is transparent, in the prediction and, by its
-    alpha, in the picture: leaving holes in what is opaque then costs.
+    The background shows through transparent parts of the prediction and, by its alpha, of the picture. This penalises
+    holes in opaque surfaces.
     """
     loss = 0
     for k in range(3):
@@ -49,40 +49,58 @@ def color_loss(color, opacity, pixels: PixelBatch, background, delta: float):
 
 
 def depth_loss(weight: Float, tau: Float, samples: RaySamples, depth: Float, margin: float | Float, scale: Float):
-    """Loss a ray of the absorption's place against the true ``depth`` (as in `PixelBatch`); 0 where that is unknown.
+    """Loss per ray of the absorbed light relative to the true ``depth`` (as in `PixelBatch`); 0 where the depth is
+    unknown.
 
-    Two terms: the share of the light that is not absorbed within ``margin`` (scene units; a number, or a ray each) of
-    the true surface, or within the step that holds it (line-of-sight supervision, Rematas et al. 2022, with a box for
-    its Gaussian), which forbids fog, holes and floaters alike; and the distance of the expected depth from the true
-    one, in units of ``scale`` (of all rays, or a ray each), which places the surface within the step.
+    Parameters
+    ----------
+    weight, tau : Float
+        Weights and optical depths of the samples.
+    samples : RaySamples
+        Samples of the rays.
+    depth : Float
+        True depth per ray, 0 where unknown.
+    margin : float or Float
+        Distance from the true surface, in scene units, within which light should be absorbed.
+    scale : Float
+        Unit of the distance term, one value or one per ray.
+
+    Notes
+    -----
+    The first term is the fraction of the light that is not absorbed within ``margin`` of the true surface, or within
+    the step that holds it (line-of-sight supervision, Rematas et al. 2022, with a box in place of the Gaussian). It
+    prevents fog, holes and floaters. The second term is the distance of the expected depth from the true depth, which
+    places the surface within the step.
     """
     s = samples.segments
     truth = dr.gather(type(weight), depth, s.ray, s.active)
     if not isinstance(margin, float):
         margin = dr.gather(type(weight), margin, s.ray, s.active)
     near = (samples.t < truth + margin) & (samples.t + samples.length > truth - margin)
-    caught = sum_along_rays(dr.select(near, weight, 0), s)
-    # Only absorption near the surface is moved: a floater is to vanish, not to drag the surface along.
+    absorbed = sum_along_rays(dr.select(near, weight, 0), s)
+    # Only absorption near the surface is moved: a floater should vanish, not drag the surface along.
     offset = samples.t + samples.length * mean_depth_fraction(tau) - truth
     shift = sum_along_rays(dr.select(near, weight * offset, 0), s)
-    loss = (1 - caught) + dr.minimum(dr.abs(shift) / scale, 10)
+    loss = (1 - absorbed) + dr.minimum(dr.abs(shift) / scale, 10)
     return dr.select(depth > 0, loss, 0)
 
 
 def feature_decay_loss(features):
-    """Mean square (Float) of a grid's ``features``.
+    """Mean square (Float) of the ``features`` of a grid.
 
-    What many rays see outweighs it, as each feature has one share in millions. Features that few rays have shaped, or
-    chance alone, it takes back to 0: Adam moves all alike, however small their derivatives are.
+    Features seen by many rays hardly change, because each has a share of one in millions. Features shaped by few rays
+    or by chance decay to 0; Adam would otherwise move them as much as all others.
     """
     return dr.mean(dr.square(features))
 
 
 def distortion_loss(weight, samples: RaySamples, scale: float):
-    """Loss a ray that draws its weight together: Σ_ij w_i w_j |m_i - m_j| + Σ_i w_i² δ_i / 3 with midpoints m and
-    lengths δ of the samples, in units of ``scale`` (Barron et al. 2022, mip-NeRF 360, eq. 15; summed in O(n) as samples
-    are in order). The samples' places have no derivative. Samples that stand for others count as one: the second term
-    is then too large by 1/p of each."""
+    """Distortion loss per ray, which concentrates its weight: Σ_ij w_i w_j |m_i - m_j| + Σ_i w_i² δ_i / 3.
+
+    m are midpoints and δ lengths of the samples in units of ``scale`` (Barron et al. 2022, mip-NeRF 360, eq. 15;
+    evaluated in O(n) for sorted samples). Sample positions have no derivative. Russian-roulette samples count as single
+    samples, which makes the second term too large by 1/p each.
+    """
     length = samples.length / scale
     return sum_along_rays(
         dr.custom(_Distortion, weight, samples.t / scale + 0.5 * length, length, samples.segments), samples.segments
@@ -90,12 +108,12 @@ def distortion_loss(weight, samples: RaySamples, scale: float):
 
 
 class _Distortion(dr.CustomOp):
-    """Each sample's part of the distortion: 2 w_i (m_i Σ_{j<i} w_j - Σ_{j<i} w_j m_j) + w_i² δ_i / 3."""
+    """Distortion per sample: 2 w_i (m_i Σ_{j<i} w_j - Σ_{j<i} w_j m_j) + w_i² δ_i / 3."""
 
     def eval(self, weight, middle, length, segments):
         Float = type(weight)
         self.weight, self.length, self.segments = weight, length, segments
-        # From the ray's first sample on: the two sums are of like size, and cancel.
+        # Relative to the first sample of the ray, so that the two sums have similar size and cancel accurately.
         start = dr.gather(Float, middle, dr.gather(type(segments.ray), segments.start, segments.ray, segments.active))
         self.middle = dr.select(segments.active, middle - start, 0)
         return Float(2 * weight * self._before(weight)) + weight * weight * length / 3
@@ -121,10 +139,14 @@ class _Distortion(dr.CustomOp):
 
 
 def composite(sigma: Float, parts: list, samples: RaySamples) -> tuple[Float, Float, list[Float], Float]:
-    """Weights, optical depths, sums of the ``parts`` of samples (colours, as a rule) and opacity of every ray.
+    """Composite samples along rays.
 
-    Of thinned samples the opacity is that of all, and a sum their mean times it: both without the noise of the
-    sums of weights. Derivatives are those of the plain sums, which are right on average.
+    Returns the weights, the optical depths, the sums of the ``parts`` (colours, usually) and the opacity of each ray.
+
+    Notes
+    -----
+    With Russian roulette the opacity is that of all samples, and a sum is the mean of the survivors times it, so that
+    neither has the noise of the sum of weights. Derivatives are those of the plain sums, which are unbiased.
     """
     s, thinned = samples.segments, samples.thinned
     tau = dr.select(s.active, sigma * samples.length, 0)
@@ -137,20 +159,20 @@ def composite(sigma: Float, parts: list, samples: RaySamples) -> tuple[Float, Fl
     return weight, tau, sums, opacity
 
 
-# ---- The radiance field's forward pass in the form that trains fastest: networks as tensor products ----
+# ---- Forward pass with the networks as tensor products, which trains fastest ----
 
 
 def stack(rows: list, ns):
-    """Rows (Floats of one length, or constants) as a TensorXf (N, rows)."""
+    """Stack rows (Floats of one length, or constants) to a TensorXf (N, rows)."""
     flat = dr.ravel(ns.ArrayXf(rows), order="F")
     return ns.TensorXf(flat, (dr.width(flat) // len(rows), len(rows)))
 
 
 def unstack(x, ns) -> list:
-    """Columns of a TensorXf (N, rows) as Floats.
+    """Split a TensorXf (N, rows) into its columns as Floats.
 
-    A plain slice would send its gradient back through atomic additions; no two columns share an
-    entry, so that ``Permute`` (plain stores) is right.
+    A plain slice would propagate its gradient through atomic additions. No two columns share an entry, so ``Permute``
+    (plain stores) is correct.
     """
     width, rows = x.shape
     index = dr.arange(ns.UInt32, width)
@@ -161,110 +183,135 @@ def unstack(x, ns) -> list:
 
 
 def evaluate_samples(config: RadianceConfig, box: AnyBox, parameters: dict, p, d, ns, features: list | None = None):
-    """Density (1/unit) at world points ``p`` seen along ``d``, and what a ray composites of them (list of Floats):
-    colour (3 in 0..1), or of a deferred field the features that `ray_color` makes colour of.
+    """Evaluate density and composited quantities at samples; the same model as ``RadianceField.density_features`` and
+    ``color``.
 
-    The same maths as ``RadianceField.density_features`` and ``color`` on ``parameters`` spelt as the field spells them;
-    points must lie in ``box``. Gradients reach every entry of ``parameters``. ``features``: what the grid returns at
-    ``p``, where that has been looked up already.
+    Parameters
+    ----------
+    config : RadianceConfig
+        Configuration of the field.
+    box : AnyBox
+        Bounds of the field; must contain ``p``.
+    parameters : dict
+        Parameter arrays by their names in the field. Gradients reach every entry.
+    p, d : Array3f
+        World points and ray directions.
+    ns : module
+        Dr.Jit backend.
+    features : list of Float, optional
+        Output of the grid at ``p``, if already evaluated.
+
+    Returns
+    -------
+    sigma : Float
+        Density in 1/unit.
+    parts : list of Float
+        Colour (3 Floats in 0..1), or for a deferred field the features for `evaluate_ray_color`.
     """
-    h = unstack(_net(parameters, "density_net").tensor(_features(config, box, parameters, p, ns, features)), ns)
+    h = unstack(
+        _make_network(parameters, "density_net").tensor(_evaluate_features(config, box, parameters, p, ns, features)),
+        ns,
+    )
     sigma = box.density_from_encoded(density_from_log(h[0], config.density_scale), p)
     features = point_features(h[1:], config.deferred)
-    return sigma, features if config.deferred else _color(config, parameters, features, d, ns)
+    return sigma, features if config.deferred else _evaluate_color(config, parameters, features, d, ns)
 
 
 def evaluate_ray_color(config: RadianceConfig, parameters: dict, sums: list, opacity, d, ns) -> list:
-    """Colour (3 Floats, times opacity) of rays along ``d`` that composited ``sums`` of what `density_summand` returns,
-    with this ``opacity``."""
+    """Return the colour (3 Floats, times opacity) of rays along ``d`` from the composited ``sums`` of
+    `evaluate_samples`.
+    """
     if not config.deferred:
         return sums
-    return [opacity * c for c in _color(config, parameters, mean_features(sums, opacity), d, ns)]
+    return [opacity * c for c in _evaluate_color(config, parameters, mean_features(sums, opacity), d, ns)]
 
 
-def _color(config: RadianceConfig, parameters: dict, features: list, d, ns) -> list:
-    given = color_network_inputs(features, config.deferred)
-    c = _net(parameters, "color_net").tensor(stack(encode_direction(d, config.sh_degree) + given, ns))
-    return decode_color(unstack(c, ns), given, config.deferred)
+def _evaluate_color(config: RadianceConfig, parameters: dict, features: list, d, ns) -> list:
+    inputs = color_network_inputs(features, config.deferred)
+    c = _make_network(parameters, "color_net").tensor(stack(encode_direction(d, config.sh_degree) + inputs, ns))
+    return decode_color(unstack(c, ns), inputs, config.deferred)
 
 
 def evaluate_density(config: RadianceConfig, box: AnyBox, parameters: dict, p, ns):
-    """Density (1/unit) alone, at world points ``p`` in ``box``; see `density_summand`."""
-    head = _head(parameters)
-    log_density = head.tensor(_features(config, box, parameters, p, ns)).array
+    """Evaluate the density (1/unit) at world points ``p`` in ``box``; see `evaluate_samples`."""
+    head = _make_density_head(parameters)
+    log_density = head.tensor(_evaluate_features(config, box, parameters, p, ns)).array
     return box.density_from_encoded(density_from_log(log_density, config.density_scale), p)
 
 
 def evaluate_density_from_features(config: RadianceConfig, box: AnyBox, parameters: dict, p, features: list):
-    """Density (1/unit) at ``p`` where the grid returns ``features`` (list of Floats); no weight gradients, one
-    kernel."""
-    return box.density_from_encoded(density_from_log(_head(parameters)(features)[0], config.density_scale), p)
+    """Evaluate the density (1/unit) at ``p`` from grid ``features`` (list of Floats), in one kernel without weight
+    gradients.
+    """
+    return box.density_from_encoded(
+        density_from_log(_make_density_head(parameters)(features)[0], config.density_scale), p
+    )
 
 
-def _head(parameters: dict) -> MLP:
-    net = _net(parameters, "density_net")
+def _make_density_head(parameters: dict) -> MLP:
+    net = _make_network(parameters, "density_net")
     return MLP(net.weights[:-1] + [net.weights[-1][0:1, :]])
 
 
-def _features(config: RadianceConfig, box: AnyBox, parameters: dict, p, ns, known: list | None = None):
+def _evaluate_features(config: RadianceConfig, box: AnyBox, parameters: dict, p, ns, features: list | None = None):
     rows = encoding_from_parameters(config.grid, parameters, mode=dr.ReduceMode.Expand)(box.to_unit(p))
-    return stack(rows if known is None else [dr.replace_grad(a, b) for a, b in zip(known, rows)], ns)
+    return stack(rows if features is None else [dr.replace_grad(a, b) for a, b in zip(features, rows)], ns)
 
 
-def _net(parameters: dict, name: str) -> MLP:
+def _make_network(parameters: dict, name: str) -> MLP:
     count = sum(k.startswith(name + ".") for k in parameters)
     return MLP([parameters[f"{name}.{i}"] for i in range(count)])
 
 
-# ---- Photo colors ----
+# ---- Per-photo colour corrections ----
 #
-# Colours as each photo has them: a camera chooses exposure and white balance anew for every picture.
+# Each photo has its own exposure and white balance.
 #
-# Where the scene's colour is c, a photo has A c + b in sRGB values, with a matrix A (3, 3) and an offset b of its own
-# (Rematas et al. 2022, Urban Radiance Fields, sec. 4.1, there decoded from a latent code). Over the photos their mean
-# is no change at all, so that the scene has the colours of the average photo.
+# A photo shows A c + b of a scene colour c in sRGB, with its own matrix A (3, 3) and offset b (Rematas et al. 2022,
+# Urban Radiance Fields, sec. 4.1, where they are decoded from a latent code). Their mean over the photos is the
+# identity, so that the scene has the colours of the average photo.
 
-PHOTO_PARAMETER = "photos"  # Name of the optimiser's parameter
-# The optimiser moves a number by up to its learning rate a step, which is much for a colour.
+PHOTO_PARAMETER = "photos"  # Name of the parameter in the optimiser
+# Scale of the parameter: an optimiser step of the size of the learning rate is large for a colour.
 _UNIT = 0.01
 _GREY = 0.5
 
 
 class PhotoColors:
-    """What becomes of colours in each of ``frames`` photos; 12 numbers each, which the optimiser holds as `PHOTOS`."""
+    """Affine colour corrections of ``frames`` photos, 12 numbers each, optimised as the parameter `PHOTO_PARAMETER`."""
 
     def __init__(self, ns, frames: int):
         self.ns, self.frames = ns, frames
 
     def init_parameter(self) -> Float:
-        """The parameter where no photo changes anything."""
+        """Return the parameter of identity corrections."""
         return dr.zeros(self.ns.Float, 12 * self.frames)
 
     def compute_changes(self, parameter: Float) -> Float:
-        """The entries of [A - 1 | b], photo by photo and row by row."""
+        """Return the entries of [A - 1 | b], photo by photo and row by row."""
         ns, each = self.ns, dr.arange(self.ns.UInt32, 12 * self.frames) % 12
         mean = dr.zeros(ns.Float, 12)
         dr.scatter_add(mean, parameter / self.frames, each)
         return _UNIT * (parameter - dr.gather(ns.Float, mean, each))
 
     def apply(self, changes: Float, color: list[Float], opacity: Float, frame: UInt32) -> list[Float]:
-        """``color`` (3 Floats), composited with ``opacity``, as it is in the photos ``frame``."""
+        """Apply the corrections of photos ``frame`` to ``color`` (3 Floats), composited with ``opacity``."""
         rows = [dr.gather(self.ns.Array4f, changes, 3 * frame + k) for k in range(3)]
         return [c + r[0] * color[0] + r[1] * color[1] + r[2] * color[2] + r[3] * opacity for c, r in zip(color, rows)]
 
     def decay_loss(self, changes: Float) -> Float:
-        """Mean over the photos of the squares of their ``changes``, summed."""
+        """Return the mean over the photos of the squared norm of their ``changes``."""
         return dr.sum(dr.square(changes)) / self.frames
 
     def compute_exposure_spread(self, parameter: Float) -> float:
-        """How far the photos' exposures are apart: the standard deviation of what becomes of a middle grey, in f-stops.
+        """Return the standard deviation of the photos' exposure in f-stops, measured on a middle grey.
 
-        A stop, twice the light, multiplies sRGB values of middle greys by about 2^(1/2.2).
+        A stop doubles the light, which multiplies sRGB values of middle greys by about 2^(1/2.2).
         """
         m = self.compute_matrices(parameter)
         grey = (m[..., :3].sum(axis=-1) * _GREY + m[..., 3]).mean(axis=-1) / _GREY
         return float(2.2 * np.std(np.log2(np.maximum(grey, 1e-3))))
 
     def compute_matrices(self, parameter: Float) -> np.ndarray:
-        """[A | b] of every photo, (frames, 3, 4)."""
+        """Return [A | b] of each photo, (frames, 3, 4)."""
         return np.eye(3, 4) + self.compute_changes(parameter).numpy().reshape(-1, 3, 4)

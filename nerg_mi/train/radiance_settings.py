@@ -1,4 +1,4 @@
-"""Settings of a radiance field's training, and the pace of its steps."""
+"""Settings of radiance training, and the control of its step size and number of rays."""
 
 from __future__ import annotations
 
@@ -6,21 +6,32 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
 from nerg_mi.errors import NergError
-from nerg_mi.ranges import LEARNING_RATES, LOSS_WEIGHTS, MINUTES, SEEDS, STEPS, ValidatedDataclass, Range, range_field, setting
+from nerg_mi.ranges import (
+    LEARNING_RATES,
+    LOSS_WEIGHTS,
+    MINUTES,
+    SEEDS,
+    STEPS,
+    Range,
+    ValidatedDataclass,
+    range_field,
+    setting,
+)
 
 if TYPE_CHECKING:
     from nerg_mi.fields.radiance import RadianceConfig
     from nerg_mi.maths.geometry import AnyBox
 
-# ---- What settings of all trainings have ----
+# ---- Common settings of all trainings ----
 
 
 class RunSettings(ValidatedDataclass):
-    """Base of the settings of a training, a dataclass with these fields."""
+    """Base class of training settings, a dataclass with these fields."""
 
-    steps: int | None  # Of both one is set
+    steps: int | None  # Exactly one of both is set
     minutes: float | None
-    # Held for the share ``hold`` of the run; then it decays exponentially to ``final_rate`` times itself.
+    # Constant for the fraction ``lr_hold_fraction`` of the run; then it decays exponentially by the factor
+    # ``lr_final_ratio``.
     learning_rate: float
     lr_final_ratio: float
     lr_hold_fraction: float
@@ -28,7 +39,7 @@ class RunSettings(ValidatedDataclass):
     def __post_init__(self) -> None:
         super().__post_init__()
         if (self.steps is None) == (self.minutes is None):
-            raise NergError("give the length of the training either in steps or in minutes")
+            raise NergError("set the length of the training either in steps or in minutes")
 
     def learning_rate_at(self, progress: float) -> float:
         """Learning rate at ``progress`` in 0..1 of the run."""
@@ -36,68 +47,113 @@ class RunSettings(ValidatedDataclass):
         return self.learning_rate * self.lr_final_ratio ** min(late, 1.0)
 
     def to_dict(self) -> dict:
-        """As JSON, for the provenance."""
+        """Return the settings as JSON, for the provenance."""
         return asdict(self)  # pyright: ignore[reportArgumentType] it is a dataclass
 
 
-# ---- How much one step of a radiance training takes on, from what the last one found ----
+# ---- Number of rays and march stride of a step, adapted to the previous one ----
 #
-# Everything here follows the number of samples, and nothing the clock: equal steps do equal work on every machine.
+# All decisions depend on numbers of samples and not on the clock, so that equal steps do equal work on every machine.
 
 
-# Fewer rays a step are too noisy to learn from; marching waits to get finer until so many are affordable.
+# Gradients of fewer rays per step are too noisy; the march is not refined until this many rays are affordable.
 MIN_RAYS_TO_REFINE = 256
-_MOST_RAYS, _LEAST_RAYS = 2**14, 64
-_FILLED = 0.95  # A batch that is filled to this share seldom overflows, and what overflows is dropped
+_MAX_RAYS, _MIN_RAYS = 2**14, 64
+_FILL_TARGET = 0.95  # Target fill of a batch, which seldom overflows; samples that overflow are dropped
 
 
-def adapt_ray_count(rays: int, samples_per_ray: float, prepass_samples_per_ray: float, batch: int, max_prepass_samples: int) -> int:
-    """Rays of the next step: as many as fill a batch of ``batch`` samples, or the ``most`` of the density-only pass.
+def adapt_ray_count(
+    rays: int, samples_per_ray: float, prepass_samples_per_ray: float, batch: int, max_prepass_samples: int
+) -> int:
+    """Return the number of rays of the next step.
 
-    ``rays``: of the last step; ``kept``, ``looked``: samples a ray in its batch, and in the pass before it.
+    It fills the batch, or the density pass if that fills first.
+
+    Parameters
+    ----------
+    rays : int
+        Rays of the last step.
+    samples_per_ray, prepass_samples_per_ray : float
+        Samples per ray in its batch, and in its density pass.
+    batch, max_prepass_samples : int
+        Sample limits of the batch and of the density pass.
     """
-    wanted = _FILLED * min(batch / max(samples_per_ray, 1e-3), max_prepass_samples / max(prepass_samples_per_ray, 1e-3))
-    # Damped, because a batch of few rays is a noisy estimate.
-    wanted = min(max(0.5 * (rays + wanted), rays / 2), 2 * rays)
-    return int(min(max(wanted, _LEAST_RAYS), _MOST_RAYS))
+    target = _FILL_TARGET * min(
+        batch / max(samples_per_ray, 1e-3), max_prepass_samples / max(prepass_samples_per_ray, 1e-3)
+    )
+    # Damped, because the estimate from a batch of few rays is noisy.
+    target = min(max(0.5 * (rays + target), rays / 2), 2 * rays)
+    return int(min(max(target, _MIN_RAYS), _MAX_RAYS))
 
 
-def limit_ray_count(rays: int, prepass_samples_per_ray: float, steps: int, max_prepass_samples: int, max_candidates: int) -> int:
-    """``rays``, or as many of them as keep the density-only pass within ``most`` samples and their ``steps`` each
-    within ``candidates``.
+def limit_ray_count(
+    rays: int, prepass_samples_per_ray: float, steps: int, max_prepass_samples: int, max_candidates: int
+) -> int:
+    """Limit ``rays`` so that the density pass stays within ``max_prepass_samples`` and all steps within
+    ``max_candidates``.
 
-    ``looked``: samples a ray that the pass is expected to look at.
+    ``prepass_samples_per_ray`` is the expected number of samples per ray of the density pass, ``steps`` the number of
+    steps per ray.
     """
-    return max(1, min(rays, int(_FILLED * max_prepass_samples / max(prepass_samples_per_ray, 1e-3)), max_candidates // steps))
+    return max(
+        1,
+        min(
+            rays, int(_FILL_TARGET * max_prepass_samples / max(prepass_samples_per_ray, 1e-3)), max_candidates // steps
+        ),
+    )
 
 
-def refine_stride(stride: int, strides: tuple[int, ...], scheduled: int, prepass_samples_per_ray: float, max_prepass_samples: int, wait_for_clearing: bool = True) -> int:
-    """The stride of the next step: ``stride``, or the next finer one of ``strides`` and 1.
+def refine_stride(
+    stride: int,
+    strides: tuple[int, ...],
+    scheduled: int,
+    prepass_samples_per_ray: float,
+    max_prepass_samples: int,
+    wait_for_clearing: bool = True,
+) -> int:
+    """Return the march stride of the next step: ``stride``, or the next finer one of ``strides`` and 1.
 
-    It is refined when the schedule has come to a finer one (``scheduled``), and free space is cleared far enough that
-    the pass has room for ``FEW_RAYS`` rays at it. ``looked``: samples a ray that the pass last looked at, at
-    ``stride``; ``most``: of its samples a step. ``waits``: False refines without regard to what is cleared.
+    The stride is refined if the schedule (``scheduled``) is finer and free space is cleared far enough that the density
+    pass has room for ``MIN_RAYS_TO_REFINE`` rays.
+
+    Parameters
+    ----------
+    stride : int
+        Current stride.
+    strides : tuple of int
+        Available strides.
+    scheduled : int
+        Stride of the schedule.
+    prepass_samples_per_ray : float
+        Samples per ray of the last density pass, at ``stride``.
+    max_prepass_samples : int
+        Sample limit of the density pass.
+    wait_for_clearing : bool
+        False refines even if free space is not cleared.
     """
     if scheduled >= stride:
         return stride
     finer = max(s for s in (*strides, 1) if s < stride)
-    fits = prepass_samples_per_ray * stride / finer * MIN_RAYS_TO_REFINE <= max_prepass_samples
-    return finer if fits or not wait_for_clearing else stride
+    is_affordable = prepass_samples_per_ray * stride / finer * MIN_RAYS_TO_REFINE <= max_prepass_samples
+    return finer if is_affordable or not wait_for_clearing else stride
 
 
-# ---- What a radiance field is trained with ----
+# ---- Settings of a radiance training ----
 
-# (levels, log2 rows, base and finest resolution, width, hidden layers of the colour net). "paper" has the paper's
-# sizes; "small" is what trains in minutes on two CPU cores and stores in 2 MB as fp16; "medium" holds the texture of a
-# room, in 7 MB.
+# (levels, log2 rows, base and finest resolution, width, hidden layers of the colour network). "paper" has the sizes of
+# the paper; "small" trains in minutes on two CPU cores and takes 2 MB as fp16; "medium" resolves the texture of a room,
+# in 7 MB.
 _SIZES = {"small": (8, 16, 32, 512, 32, 1), "medium": (8, 18, 32, 512, 32, 1), "paper": (16, 19, 16, 2048, 64, 2)}
 
 
 def make_radiance_config(size: str, box: AnyBox, deferred: bool = False) -> RadianceConfig:
-    """Architecture of a ``size`` for a scene box: an untrained field absorbs about 1 - 1/e across it. Of a contracted
-    one, whose inner cube takes half of each edge of the grid, it resolves that as it would a box. ``deferred``: whether
-    the colour network is asked once a ray."""
-    # The options of a training are read without them, which load Dr.Jit.
+    """Return the architecture of a ``size`` for a scene box.
+
+    An untrained field absorbs about 1 - 1/e across the box. In a contracted box, whose inner cube takes half of each
+    edge of the grid, the resolution is doubled, so that the inner cube is resolved like a box. With ``deferred`` the
+    colour network is evaluated once per ray.
+    """
+    # Imported here, so that reading the options does not load Dr.Jit.
     from nerg_mi.fields.encoding import HashGridConfig
     from nerg_mi.fields.radiance import RadianceConfig
 
@@ -117,55 +173,67 @@ def make_radiance_config(size: str, box: AnyBox, deferred: bool = False) -> Radi
 
 @dataclass(frozen=True)
 class RadianceSettings(RunSettings):
-    """Controls of a training run; lengths are shares of the scene box's side. Exactly one of ``steps`` and ``minutes``
-    says how long it takes."""
+    """Settings of a radiance training. Lengths are fractions of the side of the scene box.
+
+    Exactly one of ``steps`` and ``minutes`` is set.
+    """
 
     minutes: float | None = setting(None, "Train for this long. Default: 5.", allowed=MINUTES)
     steps: int | None = setting(None, "Or: train for so many steps.", allowed=STEPS)
     seed: int = setting(0, "Seed of the weights, rays and jitter.", allowed=SEEDS)
-    # Samples a step. Not a power of two: arrays that many bytes apart share their place in the caches, which costs a
-    # factor of two.
+    # Samples per step. Not a power of two: arrays with such distances in memory share cache sets, which costs a factor
+    # of two.
     batch: int = range_field(2**14 + 240, Range(1, 1 << 26))
-    learning_rate: float = range_field(1.5e-2, LEARNING_RATES)  # Held for the share ``hold`` of the run
-    lr_final_ratio: float = range_field(0.03, Range(0, 1))  # What it decays to exponentially after that, times itself
-    lr_hold_fraction: float = range_field(0.4, Range(0, 0.999))  # Share of the run for which the learning rate is held
-    ema_decay: float = range_field(0.99, Range(0, 1))  # Decay a step of the averaged weights, which are the result
-    march_step: float = range_field(3**0.5 / 1024, Range(1e-6, 1))  # Shortest step, as instant-ngp has it
-    step_growth: float = range_field(1 / 128, Range(0, 1))  # Steps are at least this share of their distance
-    near: float = range_field(0.02, Range(0, 1))  # Where rays start, and distance to every camera within which nothing is
-    # Derivatives of samples nearer than this are scaled by the square of their share of it (Philip and Deschaintre
-    # 2023, "Floaters No More"); 0: none are.
+    # Constant for the fraction ``lr_hold_fraction`` of the run
+    learning_rate: float = range_field(1.5e-2, LEARNING_RATES)
+    # Final learning rate as a fraction of the initial one; the decay is exponential
+    lr_final_ratio: float = range_field(0.03, Range(0, 1))
+    lr_hold_fraction: float = range_field(0.4, Range(0, 0.999))  # Fraction of the run with constant learning rate
+    # Decay per step of the exponential moving average of the weights, which is the result
+    ema_decay: float = range_field(0.99, Range(0, 1))
+    march_step: float = range_field(3**0.5 / 1024, Range(1e-6, 1))  # Minimum step, as in instant-ngp
+    step_growth: float = range_field(1 / 128, Range(0, 1))  # Minimum step as a fraction of its distance
+    # Near distance of rays; space within this distance of any camera is empty
+    near: float = range_field(0.02, Range(0, 1))
+    # Distance within which derivatives of samples are scaled by the square of their relative distance (Philip and
+    # Deschaintre 2023, "Floaters No More"); 0 disables the scaling.
     damping_distance: float = range_field(0.4, Range(0, 1000))
-    # Share of the run over which ``reach`` falls to 0, as surfaces come to stand where fog was.
+    # Fraction of the run over which ``damping_distance`` falls to 0, when surfaces have replaced fog.
     damping_fraction: float = range_field(0.5, Range(1e-6, 1e6))
-    min_transmittance: float = range_field(2e-3, Range(0, 1))  # Samples that less light reaches are left out
-    # Weight from which on a sample is always kept; others are by chance, in proportion to their weight.
+    min_transmittance: float = range_field(2e-3, Range(0, 1))  # Samples reached by less light are dropped
+    # Russian roulette: samples of at least this weight are always kept, others with a probability proportional to their
+    # weight.
     rr_weight: float = range_field(1 / 32, Range(1e-30, 1e30))
-    rr_min_probability: float = range_field(1 / 32, Range(1e-30, 1))  # Least chance of a sample to be kept; 1: all are
+    # Russian roulette: minimum probability of keeping a sample; 1 keeps all
+    rr_min_probability: float = range_field(1 / 32, Range(1e-30, 1))
     resolution: int = range_field(128, Range(8, 2048))  # Cells of the density grid along an edge
-    grid_interval: int = range_field(16, Range(1, 10**6))  # Steps after which the density grid is looked over
-    min_views: int = range_field(2, Range(0, 10**6))  # Cells that fewer cameras see stay empty
-    # Share of the run from which on the cells that rendering will visit are found, all of which are then sampled.
+    grid_interval: int = range_field(16, Range(1, 10**6))  # Steps between updates of the density grid
+    min_views: int = range_field(2, Range(0, 10**6))  # Cells seen by fewer cameras stay empty
+    # Fraction of the run after which the occupancy for rendering is extracted, all of whose cells are then sampled.
     extraction_start: float = range_field(0.8, Range(0, 1e6))
-    # Samples of the density-only pass, in batches: what it costs is then of the order of the rest of a step.
+    # Sample limit of the density pass in batches, so that it costs about as much as the rest of a step.
     max_prepass_batches: float = range_field(8.0, Range(1, 1e6))
-    # How many times coarser the run marches at first, each for a like part of ``stride_share``, which clears early fog
-    # cheaply; while the pass has no room for enough rays at the next, it waits, for as long again.
+    # March strides at the start, each for an equal part of ``stride_fraction``. Coarse marching clears early fog at low
+    # cost. If the density pass has no room for enough rays at the next stride, the run waits, at most as long again.
     strides: tuple[int, ...] = range_field((16, 8, 4, 2), Range(1, 10**6))
-    stride_fraction: float = range_field(0.33, Range(0, 1e6))  # Share of the run that is marched coarser
-    huber_delta: float = range_field(1.0, Range(0, 1e6))  # Error at which the colour loss turns linear; colours are in 0..1
-    empty_weight: float = range_field(0.003, LOSS_WEIGHTS)  # Weight of the penalty on density in cells that are not sampled
-    # Weight of the mean square of the hash grid's features, which lets go of what few rays have shaped (Barron et al.
-    # 2023, Zip-NeRF, there level by level).
+    stride_fraction: float = range_field(0.33, Range(0, 1e6))  # Fraction of the run with coarse strides
+    # Error at which the colour loss becomes linear; colours are in 0..1
+    huber_delta: float = range_field(1.0, Range(0, 1e6))
+    # Weight of the penalty on density in cells that are not sampled
+    empty_weight: float = range_field(0.003, LOSS_WEIGHTS)
+    # Weight of the mean square of the hash-grid features, which removes features shaped by few rays (Barron et al.
+    # 2023, Zip-NeRF, there per level).
     grid_decay: float = range_field(0.1, LOSS_WEIGHTS)
     photo_colors: bool = setting(True, "Learn the exposure and white balance of each photo.")
-    # Weight of the squares of how far they are from the average, the mean over the photos.
+    # Weight of the squared deviation of the photo colours from their average, a mean over the photos.
     photo_decay: float = range_field(0.01, LOSS_WEIGHTS)
     depth_weight: float = setting(0.02, "Weight of the depth's loss, where depth is known.", allowed=LOSS_WEIGHTS)
-    depth_weight_final_ratio: float = range_field(0.25, Range(0, 1e6))  # What ``depth_weight`` falls to, times itself
-    # Distance from the true surface, in march steps, within which a ray's weight should lie.
+    # Final ``depth_weight`` as a fraction of the initial one
+    depth_weight_final_ratio: float = range_field(0.25, Range(0, 1e6))
+    # Distance from the true surface, in march steps, within which light should be absorbed.
     depth_margin: float = range_field(1.5, Range(0, 1e6))
-    hard_pixel_fraction: float = range_field(0.25, Range(0, 1))  # Share of the rays drawn from those whose depth was wrong
+    # Fraction of the rays drawn from pixels with a large depth error
+    hard_pixel_fraction: float = range_field(0.25, Range(0, 1))
     distortion_weight: float = setting(
         0.0, "Weight of mip-NeRF 360's distortion loss, against fog; 0 is none.", allowed=LOSS_WEIGHTS
     )
@@ -177,14 +245,16 @@ class RadianceSettings(RunSettings):
 
     @property
     def max_prepass_samples(self) -> int:
-        """Samples at most of a step's density-only pass."""
+        """Maximum number of samples of the density pass of a step."""
         return int(self.max_prepass_batches * self.batch)
 
     def damping_distance_at(self, progress: float) -> float:
-        """Distance within which derivatives are damped at ``progress`` in 0..1 of the run, a share of the side."""
+        """Damping distance at ``progress`` in 0..1 of the run, as a fraction of the side."""
         return self.damping_distance * max(0.0, 1 - progress / self.damping_fraction)
 
     def stride_at(self, progress: float) -> int:
-        """How many times coarser than ``march_step`` the run marches at ``progress`` in 0..1."""
-        stage = int(progress / self.stride_fraction * len(self.strides)) if self.stride_fraction > 0 else len(self.strides)
+        """March stride in units of ``march_step`` at ``progress`` in 0..1 of the run."""
+        stage = (
+            int(progress / self.stride_fraction * len(self.strides)) if self.stride_fraction > 0 else len(self.strides)
+        )
         return self.strides[stage] if stage < len(self.strides) else 1

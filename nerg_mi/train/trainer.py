@@ -1,5 +1,4 @@
-"""What trainings of radiance and of gaze share: length, learning rate, averaged weights, the state on disk from which
-they resume, and the clock of their steps."""
+"""Common parts of radiance and gaze training: schedule, averaged weights, run state and step clock."""
 
 from __future__ import annotations
 
@@ -22,12 +21,12 @@ from nerg_mi.formats.fields import read_number
 
 
 class Trainer:
-    """Base of one run: an optimiser, the moving averages of its weights, which are the result, and the clock.
+    """Base class of a training run: optimiser, averaged weights (the result) and clock.
 
-    ``schedule``: steps that the learning rate's schedule spans, where that is not ``settings``' own length.
+    ``schedule`` is the number of steps that the learning-rate schedule spans, if it differs from the length of the run.
     """
 
-    AVERAGE_INTERVAL: ClassVar[int] = 1  # The average is taken of every so many steps
+    AVERAGE_INTERVAL: ClassVar[int] = 1  # Steps between two updates of the average
 
     def __init__(self, settings: Any, ns: ModuleType, schedule: int | None = None):
         self.settings, self.ns, self._schedule = settings, ns, schedule
@@ -37,7 +36,7 @@ class Trainer:
         self.averaged: dict[str, Any] = {}
 
     def start(self, optimiser: Any = None) -> None:
-        """Start the clock of the run; with an ``optimiser`` (Adam or AdamW), of whose weights."""
+        """Start the clock of the run and, if given, train the weights of ``optimiser`` (Adam or AdamW)."""
         if optimiser is not None:
             self.optimiser = optimiser
             self.averaged = {k: type(v)(dr.detach(v)) for k, v in optimiser.items()}
@@ -45,51 +44,51 @@ class Trainer:
 
     @property
     def seconds(self) -> float:
-        """Wall time of the run, without that between an interruption and its resumption."""
+        """Wall time of the run, excluding the time between an interruption and its resumption."""
         return time.perf_counter() - self._started
 
     @property
     def progress(self) -> float:
-        """Share of the schedule that is done, 0..1."""
+        """Completed fraction of the schedule, 0..1."""
         steps, minutes = self._schedule or self.settings.steps, self.settings.minutes
         return min(1.0, self.steps / steps if steps else self.seconds / (60 * minutes))
 
     def move_weights(self) -> None:
-        """Move the weights along the gradients that are in them."""
+        """Update the weights with the current gradients and learning rate."""
         self.optimiser.set_learning_rate(self.settings.learning_rate_at(self.progress))
         self.optimiser.step()
 
     def average_weights(self) -> None:
-        """Move the averages towards the weights of this step."""
-        # A short memory at first: the start of a run is not worth remembering.
+        """Update the exponential moving average of the weights."""
+        # Use a short memory at first, so that the average forgets the initial weights.
         decay = min(self.settings.ema_decay, (1 + self.steps) / (10 + self.steps)) ** self.AVERAGE_INTERVAL
-        # As a literal it would compile a kernel each time.
+        # A literal would compile a new kernel in each step.
         part = dr.opaque(self.ns.Float, 1 - decay)
         for k, old in self.averaged.items():
             self.averaged[k] = type(old)(old + (dr.detach(self.optimiser[k]) - old) * part)
         dr.eval(self.averaged)
 
     def get_state(self) -> tuple[dict, dict]:
-        """``(tensors, metadata)`` for `restore`: weights, moments and averages by name, and all that a run counts."""
-        tensors, taken = {}, {}
+        """Return ``(tensors, metadata)`` for `restore`: weights, moments, averages and counters."""
+        tensors, counts = {}, {}
         for name, (value, _, _, (count, first, second, _)) in self.optimiser.state.items():
-            taken[name] = int(count.numpy()[0])
+            counts[name] = int(count.numpy()[0])
             parts = {"weights": value, "first": first, "second": second, "averaged": self.averaged[name]}
             tensors |= {f"{part}.{name}": x.numpy() for part, x in parts.items()}
         random = self.rng.bit_generator.state
-        return tensors, {"taken": taken, "steps": self.steps, "seconds": self.seconds, "random": random}
+        return tensors, {"taken": counts, "steps": self.steps, "seconds": self.seconds, "random": random}
 
     def restore(self, tensors: dict, meta: dict) -> None:
-        """Go on from what `state` gave. Raises ``ValueError`` or `KeyError` where that does not fit."""
-        taken, optimiser = meta["taken"], self.optimiser
-        for name, (value, promoted, rate, (count, first, second, largest)) in optimiser.state.items():
+        """Restore the state from `get_state`. Raises ``ValueError`` or `KeyError` if it does not match."""
+        counts, optimiser = meta["taken"], self.optimiser
+        for name, (value, promoted, rate, (count, first, second, max_second)) in optimiser.state.items():
             old = {"weights": value, "first": first, "second": second, "averaged": self.averaged[name]}
             for part, x in old.items():
                 check_shape(tensors, f"{part}.{name}", x)
             new = {part: type(x)(tensors[f"{part}.{name}"]) for part, x in old.items()}
             dr.enable_grad(new["weights"])
-            count = dr.opaque(type(count), int(read_count(taken, name)))
-            optimiser.state[name] = new["weights"], promoted, rate, (count, new["first"], new["second"], largest)
+            count = dr.opaque(type(count), int(read_count(counts, name)))
+            optimiser.state[name] = new["weights"], promoted, rate, (count, new["first"], new["second"], max_second)
             self.averaged[name] = new["averaged"]
         dr.eval(optimiser.state, self.averaged)
         self.steps = int(read_count(meta, "steps"))
@@ -97,43 +96,56 @@ class Trainer:
         self.rng.bit_generator.state = meta["random"]
 
 
-# ---- The state of a training in a file, so that an interrupted run goes on as if it had not been ----
+# ---- Run state in a file, from which an interrupted run continues as if it had not been interrupted ----
 #
-# With one thread the weights then equal those of a run without interruption bit for bit; with more, sums over threads
-# come in no fixed order in either.
+# With one thread the weights equal those of an uninterrupted run bit for bit. With more threads the order of sums
+# differs between any two runs.
 
 
-# The least and the most of what a run counts; arrays count steps in 32 bits.
+# Ranges of the counters of a run. Arrays count steps in 32 bits.
 _COUNTS = {"rays": (0, 2**60), "samples": (0, 2**60), "looked": (0, 2**60), "stride": (1, 2**20)}
 
 
 @contextmanager
 def reading_run_state(path: str | Path) -> Iterator[None]:
-    """What a damaged state makes the block raise, as a `NergError` that names ``path``."""
-    with translate_read_errors(path, "state of a run", "start anew without --resume", extra_errors=(TypeError, AttributeError)):
+    """Convert errors caused by a damaged run state in the block to a `NergError` that names ``path``."""
+    with translate_read_errors(
+        path, "run state", "start again without --resume", extra_errors=(TypeError, AttributeError)
+    ):
         yield
 
 
 def read_count(meta: dict, name: str) -> float:
-    """The number ``name`` of a state's metadata. Raises ``ValueError`` where it is none that a run can have come to."""
-    value, (least, most) = read_number(meta, name, "state"), _COUNTS.get(name, (0, 2**32 - 1))
-    if not least <= value <= most:
-        raise ValueError(f'"{name}" of its state is {value:g}, which no run comes to')
+    """Read the number ``name`` of a run state. Raises ``ValueError`` if it is outside its range."""
+    value, (minimum, maximum) = read_number(meta, name, "state"), _COUNTS.get(name, (0, 2**32 - 1))
+    if not minimum <= value <= maximum:
+        raise ValueError(f'"{name}" of its state is {value:g}, which is outside {minimum:g} to {maximum:g}')
     return value
 
 
 def check_shape(tensors: dict, name: str, like) -> None:
     """Raise ``ValueError`` unless the stored array ``name`` has the shape of the Dr.Jit array ``like``."""
     if tuple(tensors[name].shape) != tuple(dr.shape(like)):
-        raise ValueError(f'its array "{name}" has the shape {tensors[name].shape} and not {tuple(dr.shape(like))}')
+        raise ValueError(f'its array "{name}" has shape {tuple(tensors[name].shape)}; expected {tuple(dr.shape(like))}')
 
 
 @contextmanager
 def saving_on_failure(path: Path | None, save: Callable[[], None], is_done: bool) -> Iterator[None]:
-    """A block that measures and writes what a training has come to; the state in ``path`` is removed when it has ended.
+    """Save the run state if the block, which evaluates and writes the result of a training, raises.
 
-    ``path``: None where no state is kept; ``keep``: brings it up to date, called if the block raises, so that no step
-    is lost to a full disk or to Ctrl-C; ``done``: whether the state goes. A `NergError` then says how to go on.
+    Parameters
+    ----------
+    path : Path or None
+        State file; None: no state is stored. It is removed after the block if ``is_done``.
+    save : callable
+        Updates the state file. It is called if the block raises, so that a full disk or Ctrl-C loses no step.
+    is_done : bool
+        Whether the state is no longer needed.
+
+    Raises
+    ------
+    NergError
+        The error of the block, extended by how to resume.
     """
     try:
         yield
@@ -143,41 +155,85 @@ def saving_on_failure(path: Path | None, save: Callable[[], None], is_done: bool
         try:
             save()
         except NergError:
-            # The same full disk: an older state stays, and what could not be written first is what is told.
+            # Probably the same full disk: an older state remains, and the first error is the one to report.
             raise error from None
         if isinstance(error, NergError):
             reason = str(error).rstrip(".")
-            raise NergError(f"{reason}; the training is kept: once that is mended, --resume writes it") from error
+            raise NergError(f"{reason}; the training is saved: fix this and write it with --resume") from error
         if isinstance(error, KeyboardInterrupt):
-            raise KeyboardInterrupt(f"interrupted; go on with --resume (state in {path})") from error
+            raise KeyboardInterrupt(f"interrupted; resume with --resume (state in {path})") from error
         raise
     if path is not None and is_done:
         path.unlink(missing_ok=True)
 
 
+# Settings in states of earlier versions, and their current names.
+_OLD_SETTINGS = {
+    "final_rate": "lr_final_ratio",
+    "hold": "lr_hold_fraction",
+    "average": "ema_decay",
+    "looks": "num_validations",
+    "watched": "validation_probes",
+    "watched_rays": "validation_min_rays",
+    "growth": "step_growth",
+    "reach": "damping_distance",
+    "reach_share": "damping_fraction",
+    "stop": "min_transmittance",
+    "thin_sure": "rr_weight",
+    "thin_least": "rr_min_probability",
+    "grid_every": "grid_interval",
+    "settle": "extraction_start",
+    "look_most": "max_prepass_batches",
+    "stride_share": "stride_fraction",
+    "huber": "huber_delta",
+    "final_depth": "depth_weight_final_ratio",
+    "replay": "hard_pixel_fraction",
+}
+
+
+def _use_current_names(identity: dict) -> dict:
+    """Replace old names of settings in the ``identity`` of a run by their current names."""
+    settings = identity.get("settings")
+    if not isinstance(settings, dict):
+        return identity
+    return {**identity, "settings": {_OLD_SETTINGS.get(name, name): value for name, value in settings.items()}}
+
+
 def check_same_run(path: str | Path, then: dict, now: dict) -> None:
-    """Raise `NergError` unless a run that was started as ``then`` says is the one that ``now`` says, entry by entry."""
+    """Raise `NergError` unless the identities ``then`` of the stored run and ``now`` of this run agree."""
     if not isinstance(then, dict):
-        raise NergError(f'the run in "{path}" cannot go on: its state is damaged; start anew without --resume')
-    now = json.loads(json.dumps(now))
+        raise NergError(f'cannot resume the run in "{path}": its state is damaged; start again without --resume')
+    then, now = _use_current_names(then), json.loads(json.dumps(now))
     different = [k for k in now if then.get(k) != now[k]]
     if different:
         raise NergError(
-            f'the run in "{path}" cannot go on: it was started with other {", ".join(different)}; give the options and '
-            "the data set that it was started with, or start anew without --resume"
+            f'cannot resume the run in "{path}": it was started with different {", ".join(different)}; use the same '
+            "options and data, or start again without --resume"
         )
 
 
-# ---- How long the steps of a training take, and how fast the machine evaluates the field in them ----
+# ---- Duration of the steps and rate of field evaluations ----
 
-MAX_DURATIONS = 1 << 12  # Durations that are kept at most: the state of a run of days must stay small enough to be read again
+MAX_DURATIONS = 1 << 12  # Maximum number of stored durations, so that the state of a long run stays small
 
 
 class StepClock:
-    """A context around each step. ``evaluations``: of the field, in steps; ``steps`` and ``seconds``: of all of them;
-    ``extremes``: the shortest and the longest, in seconds; ``durations``: of every ``each``-th, for the median.
+    """Context manager that times each step.
 
-    Dr.Jit may still be computing when a step ends; the next one then waits for it.
+    Attributes
+    ----------
+    evaluations : int
+        Field evaluations within steps.
+    steps, seconds : int, float
+        Number and total duration of all steps.
+    extremes : list of float
+        Shortest and longest duration in seconds.
+    durations : list of float
+        Duration of every ``keep_every``-th step, for the median.
+
+    Notes
+    -----
+    Dr.Jit may still be computing when a step ends; the next step then waits for it.
     """
 
     def __init__(self):
@@ -193,7 +249,7 @@ class StepClock:
         self.add_step(time.perf_counter() - self._begin)
 
     def add_step(self, seconds: float) -> None:
-        """One more step, of so many ``seconds``."""
+        """Record a step of this duration in seconds."""
         if self.steps % self.keep_every == 0:
             self.durations.append(seconds)
         self.steps, self.seconds = self.steps + 1, self.seconds + seconds
@@ -202,12 +258,14 @@ class StepClock:
             self.durations, self.keep_every = self.durations[::2], 2 * self.keep_every
 
     def add_evaluations(self, evaluations: int) -> None:
-        """Add to the evaluations, if there is a step on: others, for looks and bounds, are not timed."""
+        """Count field evaluations if a step is running. Evaluations of validations and bounds are not timed."""
         if self._running:
             self.evaluations += evaluations
 
     def summary(self) -> dict:
-        """``evaluations_a_second``, and ``step_ms`` with ``min``, ``median`` and ``max``; empty without a step."""
+        """Return ``evaluations_a_second`` and ``step_ms`` with ``min``, ``median`` and ``max``; empty before the first
+        step.
+        """
         if not self.steps:
             return {}
         ms = {"min": self.extremes[0], "median": np.median(self.durations), "max": self.extremes[1]}
@@ -217,7 +275,7 @@ class StepClock:
         }
 
     def to_dict(self) -> dict:
-        """State for ``restore``."""
+        """Return the state for ``restore``."""
         return {
             "evaluations": self.evaluations,
             "steps": self.steps,
@@ -232,4 +290,4 @@ class StepClock:
         self.seconds, self.durations = float(state["seconds"]), [float(x) for x in state["durations"]]
         self.extremes = [float(x) for x in state["extremes"]] or [float("inf"), 0.0]
         if self.steps < 0 or self.keep_every < 1 or len(self.extremes) != 2 or bool(self.durations) != bool(self.steps):
-            raise ValueError('its "clock" is not one of a run')
+            raise ValueError('its "clock" is inconsistent')

@@ -1,4 +1,4 @@
-"""What tests of several kinds of training share."""
+"""Common fixtures of the training tests."""
 
 import drjit as dr
 import numpy as np
@@ -18,7 +18,7 @@ def dataset():
 
 @pytest.fixture
 def one_thread():
-    """Sums come in one order, so that equal runs are equal bit for bit."""
+    """Use one thread, so that sums have a fixed order and equal runs are equal bit for bit."""
     threads = dr.thread_count()
     dr.set_thread_count(1)
     yield
@@ -27,7 +27,7 @@ def one_thread():
 
 @pytest.fixture
 def rays():
-    """Of two people who look at a point of the wall."""
+    """Rays of two participants who look at a point of the wall."""
     return looking_at((1.5, 0.4, 1.2))
 
 
@@ -43,7 +43,7 @@ def wall(rgb):
 
 @pytest.fixture
 def threads():
-    """Sets the number of threads, which the end puts back."""
+    """Set the number of threads, and restore it at the end."""
     before = dr.thread_count()
     yield dr.set_thread_count
     dr.set_thread_count(before)

@@ -17,18 +17,18 @@ from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.scene import list_scene_files
 from nerg_mi.train.geometry import (
-    PADDING_VOXELS,
     DEFAULT_VOXEL,
-    TrainingGeometry,
+    PADDING_VOXELS,
     HitExtent,
+    TrainingGeometry,
     compute_hit_extent,
     load_field_geometry,
-    make_hit_geometry,
-    no_geometry,
     load_scene_geometry,
     load_volume_geometry,
-    shade_hits,
+    make_hit_geometry,
     make_volume_dict,
+    no_geometry,
+    shade_hits,
     voxelise_hits,
 )
 from nerg_mi.transport.geometry import trace_depth
@@ -44,8 +44,9 @@ WINDOW = np.array([[1.0, 0.8], [5.0, 2.4]])
 
 
 def office(n: int = 200_000, far: float = 40.0, seed: int = 0) -> Rays:
-    """Rays of three people in a room of 8 x 6 x 3 m, evenly in all directions but the steepest; what leaves through the
-    window ends 5 to ``far`` metres behind it."""
+    """Rays of three participants in a room of 8 x 6 x 3 m, uniform in all but the steepest directions; rays through the
+    window end 5 to ``far`` metres behind it.
+    """
     rng = np.random.default_rng(seed)
     origin = rng.uniform([1.5, 1.5, 1.5], [6.5, 4.5, 1.7], (n, 3))
     azimuth, z = rng.uniform(0, 2 * np.pi, n), rng.uniform(-0.86, 0.95, n)
@@ -58,7 +59,7 @@ def office(n: int = 200_000, far: float = 40.0, seed: int = 0) -> Rays:
 
 
 def looks_out(origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """Which rays go through the window, (N,) bool."""
+    """Which rays pass through the window, (N,) bool."""
     with np.errstate(divide="ignore"):
         t = np.where(direction[:, 0] > 0, (ROOM[1, 0] - origin[:, 0]) / direction[:, 0], np.nan)
     through = origin[:, 1:] + t[:, None] * direction[:, 1:]
@@ -79,34 +80,36 @@ def extent(rays_hit_extent):
 
 
 def test_the_box_of_an_office_is_the_room(rays_hit_extent, extent):
-    """At the voxels' usual edge, though the hits outside would make it 45 x 60 m."""
+    """With the default voxel edge, although the outside hits would extend it to 45 x 60 m."""
     spread = np.ptp(np.quantile(rays_hit_extent.hit, [0.005, 0.995], axis=0), axis=0)
     assert np.prod(spread / DEFAULT_VOXEL) > 16 * MOST
     assert extent.is_cut and extent.voxel == DEFAULT_VOXEL and np.prod(extent.shape) <= MOST
     low, high = extent.shell
     assert np.abs(low - ROOM[0]).max() < DEFAULT_VOXEL and np.abs(high - ROOM[1]).max() < 1.5 * DEFAULT_VOXEL
-    assert extent.outside_fraction == pytest.approx(looks_out(rays_hit_extent.origin, rays_hit_extent.direction).mean(), abs=2e-3)
+    assert extent.outside_fraction == pytest.approx(
+        looks_out(rays_hit_extent.origin, rays_hit_extent.direction).mean(), abs=2e-3
+    )
 
 
 def test_depths_in_an_office(rgb, rays_hit_extent, extent, tmp_path, monkeypatch):
-    """What is in the room is where it is; what is outside is met where it is looked at through the box's shell."""
+    """Surfaces inside the room are at their position; outside surfaces are on the shell, in the right direction."""
     monkeypatch.setattr("nerg_mi.train.geometry.compute_hit_extent", lambda *_: extent)
     place = make_hit_geometry(rays_hit_extent, tmp_path / "office.vol")
-    assert place.metadata["geometry_file"]["beyond"] == pytest.approx(extent.beyond, abs=1e-4)
-    seen = office(4000, seed=1)  # other rays than the place was made of
+    assert place.metadata["geometry_file"]["beyond"] == pytest.approx(extent.outside_fraction, abs=1e-4)
+    seen = office(4000, seed=1)  # rays that were not used for the volume
     depth, opacity = trace_depth(place.medium, seen.origin, seen.direction)
     out = looks_out(seen.origin, seen.direction)
     true = np.linalg.norm(seen.hit - seen.origin, axis=1)
     off = np.abs(depth - true)[~out]
     assert (opacity[~out] > 0.99).mean() > 0.995
     assert np.median(off) < 1.5 * DEFAULT_VOXEL and np.quantile(off, 0.99) < 4 * DEFAULT_VOXEL
-    # The shell stands in the plane of the window, which is where the box was cut.
+    # The shell is in the plane of the window, where the box was cut.
     window = ((ROOM[1, 0] - seen.origin[:, 0]) / seen.direction[:, 0])[out]
     assert out.sum() > 100 and (opacity[out] > 0.99).mean() > 0.97
     assert np.quantile(np.abs(depth[out] - window), 0.95) < 4 * DEFAULT_VOXEL
 
 
-def test_a_place_that_is_not_too_large_is_left_as_it_was(rays_hit_extent):
+def test_a_small_extent_is_not_cut(rays_hit_extent):
     room = rays_hit_extent.select(~looks_out(rays_hit_extent.origin, rays_hit_extent.direction))
     extent = compute_hit_extent(room)
     assert not extent.is_cut and extent.outside_fraction == 0 and extent.voxel == DEFAULT_VOXEL
@@ -115,7 +118,7 @@ def test_a_place_that_is_not_too_large_is_left_as_it_was(rays_hit_extent):
     assert not extent.is_outside_shell(np.full((1, 3), 1e6)).any()
 
 
-def test_what_stands_on_the_shell_is_more_than_half_a_voxel_beyond_it():
+def test_projected_hits_are_more_than_half_a_voxel_outside():
     extent = HitExtent(np.array([1.0, 2.0, 3.0]), (PADDING_VOXELS * 2 + 4,) * 3, 0.5, is_cut=True)
     low, high = extent.shell
     np.testing.assert_allclose([low, high], [[4, 5, 6], [6, 7, 8]])
@@ -124,15 +127,15 @@ def test_what_stands_on_the_shell_is_more_than_half_a_voxel_beyond_it():
         assert extent.is_outside_shell(np.array(hits)).tolist() == [False, True, False, True]
 
 
-def test_a_place_is_a_file_of_64_mib_at_most():
-    """A cube of 24 m, all of which people looked at, is nearly twice as many voxels."""
+def test_a_volume_file_has_at_most_64_mib():
+    """A cube of 24 m, looked at everywhere, has nearly twice as many voxels."""
     corners = np.array(list(np.ndindex(2, 2, 2))) * 24.0
     extent = compute_hit_extent(replace(office(8), origin=corners, hit=corners))
     assert 4 * np.prod(extent.shape) <= 64 * 2**20 and (extent.is_cut or extent.voxel > DEFAULT_VOXEL)
 
 
-def test_voxels_grow_where_people_were_everywhere():
-    """A hall that people fill has no far part to give up."""
+def test_voxels_grow_if_the_box_cannot_be_cut():
+    """A hall filled with observers has no distant part to cut."""
     rng = np.random.default_rng(0)
     room = office(2000)
     hall = replace(room, origin=room.origin * 20, hit=room.origin * 20 + rng.normal(0, 2, (2000, 3)))
@@ -142,28 +145,28 @@ def test_voxels_grow_where_people_were_everywhere():
     assert ((hall.hit >= low) & (hall.hit <= high)).all(axis=1).mean() >= 0.74
 
 
-def test_one_lost_head_does_not_make_the_box(rays_hit_extent):
+def test_tracking_outliers_do_not_enlarge_the_box(rays_hit_extent):
     origin = rays_hit_extent.origin.copy()
     origin[7] = [900.0, -900.0, 50.0]
     extent = compute_hit_extent(replace(rays_hit_extent, origin=origin), max_voxels=MOST)
     assert extent.voxel == DEFAULT_VOXEL and np.abs(extent.shell[1] - ROOM[1]).max() < 2 * DEFAULT_VOXEL
 
 
-def test_a_voxel_that_is_asked_for_is_kept(rays_hit_extent):
+def test_a_given_voxel_size_is_used(rays_hit_extent):
     assert compute_hit_extent(rays_hit_extent, 0.2, MOST).voxel == 0.2
     fine = compute_hit_extent(rays_hit_extent, 0.05, 1 << 21)
     assert fine.voxel == 0.05 and fine.is_cut
-    with pytest.raises(NergError, match=r"enlarge the voxel \(--voxel\)"):
+    with pytest.raises(NergError, match="--voxel-size"):
         compute_hit_extent(rays_hit_extent, 0.005, MOST)
     for bad in (0.0, -1.0, np.nan, np.inf):
-        with pytest.raises(NergError, match="--voxel"):
+        with pytest.raises(NergError, match="--voxel-size"):
             compute_hit_extent(rays_hit_extent, bad)
     with pytest.raises(NergError, match="--field"):
         compute_hit_extent(replace(rays_hit_extent, hit=None))
 
 
 def test_hits_seen_from_outside_of_the_box_are_left_out(rays_hit_extent, extent):
-    """Rays that start and end beyond the shell on one side never are in it."""
+    """Rays that start and end outside the shell on one side never enter it."""
     away = replace(
         rays_hit_extent.select(np.arange(100)),
         origin=np.full((100, 3), 60.0),
@@ -182,7 +185,7 @@ def rays_hit_geometry():
     return looking_at((1.5, 0.4, 1.2))
 
 
-def test_a_place_made_of_hits(rgb, rays_hit_geometry, tmp_path):
+def test_geometry_from_hits(rgb, rays_hit_geometry, tmp_path):
     density, box = voxelise_hits(rays_hit_geometry, 0.1)
     assert density.dtype == np.float32 and (density > 0).any()
     write_volume(tmp_path / "place.vol", density, box.lower, box.upper)
@@ -206,10 +209,10 @@ def test_gaps_of_up_to_eight_voxels_are_closed(axis, gap, closed):
     assert solid[[0, -1]].all() and (solid[1:-1] == closed).all()
 
 
-def test_a_place_needs_hits(rays_hit_geometry):
+def test_hit_geometry_needs_hits(rays_hit_geometry):
     with pytest.raises(NergError, match="--field"):
         voxelise_hits(replace(rays_hit_geometry, hit=None))
-    with pytest.raises(NergError, match="enlarge the voxel"):
+    with pytest.raises(NergError, match="--voxel-size"):
         voxelise_hits(rays_hit_geometry, 1e-3)
 
 
@@ -229,7 +232,7 @@ def test_a_sheet_has_the_grey_of_its_axis(axis, grey):
     np.testing.assert_allclose(middle, grey, atol=0.01)
 
 
-def test_odd_numbers_of_voxels_and_nothing():
+def test_odd_and_empty_volumes():
     color, upper = shade_hits(np.zeros((5, 4, 3), np.float32), np.array([1.0, 2, 3]), np.array([4.0, 6, 8]))
     assert color.shape == (3, 2, 2, 3) and np.isfinite(color).all()
     np.testing.assert_allclose(upper, [5, 6, 9])  # A voxel is 1 wide
@@ -245,8 +248,8 @@ def volume(tmp_path):
     return path
 
 
-def test_a_whole_one(rgb, volume):
-    # Mitsuba returns the box by a transform in single precision.
+def test_a_complete_volume_is_read(rgb, volume):
+    # Mitsuba returns the box through a transform in single precision.
     assert np.allclose(load_volume_geometry(volume).box.upper, (1, 2, 3), rtol=1e-6)
 
 
@@ -265,7 +268,7 @@ def test_a_whole_one(rgb, volume):
         (36, struct.pack("<f", -1)),
     ],
 )
-def test_a_header_that_lies(rgb, volume, at, value):
+def test_inconsistent_headers_are_refused(rgb, volume, at, value):
     data = volume.read_bytes()
     volume.write_bytes(data[:at] + value + data[at + len(value) :])
     with pytest.raises(NergError, match="place.vol"):
@@ -273,14 +276,14 @@ def test_a_header_that_lies(rgb, volume, at, value):
 
 
 @pytest.mark.parametrize("size", [0, 10, 30, 48, 100])
-def test_one_that_is_cut_off(rgb, volume, size):
+def test_truncated_volumes_are_refused(rgb, volume, size):
     volume.write_bytes(volume.read_bytes()[:size])
     with pytest.raises(NergError, match="place.vol"):
         load_volume_geometry(volume)
 
 
-def test_frames_of_rays_and_place():
-    """Twice the size, a quarter turn about z, and moved."""
+def test_frames_of_rays_and_geometry():
+    """Twice the size, a quarter turn about z, and shifted."""
     align = Similarity([[0, -2, 0, 1], [2, 0, 0, 2], [0, 0, 2, 3], [0, 0, 0, 1]])
     place = TrainingGeometry(None, Box((0, 0, 0), (1, 1, 1)), "none", align=align)
     np.testing.assert_allclose(place.points_to_field(np.array([[1.0, 0, 0], [0, 1, 1]])), [[1, 4, 3], [-1, 2, 5]])
@@ -290,11 +293,11 @@ def test_frames_of_rays_and_place():
     np.testing.assert_allclose(place.directions_to_rays(turned), d, atol=1e-12)
 
 
-def test_without_geometry_the_box_is_around_whoever_looked():
+def test_without_geometry_the_box_surrounds_the_observers():
     assert no_geometry(np.array([[0.0, 1, 2], [1, 0, 2]])).box == Box((-2, -2, 0), (3, 3, 4))
 
 
-def test_a_scenes_box_holds_its_field_and_its_shapes_and_a_hundredth_more(rgb, tmp_path):
+def test_a_scene_box_holds_field_and_shapes_with_a_margin(rgb, tmp_path):
     (tmp_path / "both.xml").write_text("""<scene version="3.0.0">
       <integrator type="nerg"><volume name="density" type="constvolume"><float name="value" value="1"/>
       </volume></integrator>
@@ -304,7 +307,7 @@ def test_a_scenes_box_holds_its_field_and_its_shapes_and_a_hundredth_more(rgb, t
 
 
 @pytest.mark.parametrize("name", ["a.ply", "a.obj"])
-def test_a_mesh_is_a_scene_of_its_own(rgb, tmp_path, name):
+def test_a_mesh_is_loaded_as_a_scene(rgb, tmp_path, name):
     rgb.load_dict({"type": "cube"}).write_ply(str(tmp_path / "a.ply"))
     corners, faces = "-1 -1 -1|1 -1 -1|1 1 -1|-1 1 1".split("|"), ("1 2 3", "1 3 4")
     (tmp_path / "a.obj").write_text("".join(f"v {c}\n" for c in corners) + "".join(f"f {f}\n" for f in faces))
@@ -314,19 +317,19 @@ def test_a_mesh_is_a_scene_of_its_own(rgb, tmp_path, name):
     assert list_scene_files(tmp_path / name) == [tmp_path / name]
 
 
-def test_splats_are_no_scene(rgb, tmp_path):
+def test_splats_are_refused_as_a_scene(rgb, tmp_path):
     write_ply_splats(tmp_path / "a.ply", random_splats(10))
     with pytest.raises(NergError, match="--field"):
         load_scene_geometry(tmp_path / "a.ply")
 
 
-def test_a_scene_without_anything_is_no_place(rgb, tmp_path):
+def test_an_empty_scene_is_refused(rgb, tmp_path):
     (tmp_path / "empty.xml").write_text('<scene version="3.0.0"/>')
-    with pytest.raises(NergError, match="neither shapes nor a field"):
+    with pytest.raises(NergError, match="no shapes and no field"):
         load_scene_geometry(tmp_path / "empty.xml")
 
 
-def test_splats_are_a_place_without_their_strays(tmp_path):
+def test_splat_geometry_excludes_outliers(tmp_path):
     splats = random_splats(1000, degree=0, size=0.02)
     far = Splats([[90, 0, 0]], [[1, 1, 1]], [[1, 0, 0, 0]], [0.5], np.zeros((1, 1, 3)))
     write_ply_splats(tmp_path / "a.ply", concatenate_splats([splats, far]))
@@ -334,5 +337,5 @@ def test_splats_are_a_place_without_their_strays(tmp_path):
     assert place.kind == "field" and place.radiance is None and place.metadata["field_file"]["file"] == "a.ply"
     assert np.allclose(place.box.upper, 1, atol=0.15) and np.allclose(place.box.lower, -1, atol=0.15)
     origin, along = np.float32([[0, 0, -3]]), np.float32([[0, 0, 1]])
-    # Trained in as it is rendered.
+    # The same geometry as in rendering.
     assert 1.9 < trace_depth(place.medium, origin, along)[0][0] < 4.1

@@ -25,7 +25,7 @@ LENSES = [
 ]
 
 
-# Far stronger than lenses are: the iteration only arrives in its steps where every term of its derivative is right.
+# Far stronger than real lenses: the iteration only converges if every term of its derivative is correct.
 STRONG = {
     "radial": replace(PLAIN, k1=0.6, k2=0.4, k3=0.3),
     "barrel": replace(PLAIN, k1=-0.35, k2=0.25, k3=-0.1),
@@ -60,7 +60,7 @@ def view(lens, rng, dtype=np.uint8, channels=3, depth=False, mask=False):
 
 
 def expected(views):
-    """Origins, directions, colours, alpha and depth of all pixels in use, view after view, in float64."""
+    """Origins, directions, colours, alpha and depth of all unmasked pixels, view after view, in float64."""
     out = [[] for _ in range(5)]
     for v in views:
         use = np.ones(v.shape, bool) if v.mask is None else v.mask
@@ -133,7 +133,7 @@ def test_colours_alpha_depth_and_masks(dtype, channels, depth, mask):
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_what_has_no_alpha_is_opaque_among_what_has(dtype):
+def test_views_without_alpha_are_opaque(dtype):
     rng = np.random.default_rng(3)
     views = [view(PLAIN, rng, dtype, channels=4), view(PLAIN, rng, dtype)]
     bank = PixelBank(ns, views)
@@ -142,7 +142,7 @@ def test_what_has_no_alpha_is_opaque_among_what_has(dtype):
     assert bank.size == 2 * count and np.abs(alpha[count:] - 1).max() < 1e-6 and alpha[:count].min() < 0.1
 
 
-def test_known_depth_never_rounds_to_unknown():
+def test_measured_depth_never_rounds_to_zero():
     v = view(PLAIN, np.random.default_rng(4))
     depth = np.full(v.shape, 1e-3, np.float32)
     depth[0, 0] = 1e4
@@ -157,20 +157,19 @@ def test_surface_points_lie_at_the_depth_of_their_rays():
     views = [view(lens, rng, depth=True, mask=True) for lens in LENSES[:2]]
     points = np.concatenate([p.numpy().T for p in PixelBank(ns, views).iter_surface_points(100)])
     o, d, _, _, depth = expected(views)
-    known = depth > 0
-    assert not known.all() and np.allclose(points, (o + d * depth[:, None])[known], atol=2e-4)
+    truth = depth > 0
+    assert not truth.all() and np.allclose(points, (o + d * depth[:, None])[truth], atol=2e-4)
 
 
 def test_too_many_pixels_are_refused(monkeypatch):
-    monkeypatch.setattr("nerg_mi.train.radiance_data._MOST", 100)
-    with pytest.raises(ValueError, match="smaller width"):
+    monkeypatch.setattr("nerg_mi.train.radiance_data._MAX_PIXELS", 100)
+    with pytest.raises(ValueError, match="smaller --width"):
         PixelBank(ns, [view(PLAIN, np.random.default_rng(5))])
 
 
 # ---- Unproject ----
 #
-# Directions of a lens's pixels on the device: projected again by OpenCV's formulas they are the pixels that were asked
-# for.
+# Pixel directions on the device: OpenCV's formulas project them back to the pixels.
 
 
 def pixels(lens):
@@ -194,7 +193,9 @@ def test_the_pixel_on_the_axis_looks_along_it():
 
 
 def test_beyond_its_end_a_fisheye_shows_its_last_direction():
-    """The polynomial θ - θ³/12 rises to θ = 2, where the image radius is 4/3; its inverse has no finite slope there."""
+    """The polynomial θ - θ³/12 increases up to θ = 2, where the image radius is 4/3; its inverse has no finite slope
+    there.
+    """
     lens = replace(PLAIN, fx=6.0, fy=6.0, cx=12.0, cy=9.0, k1=-1 / 12, fisheye=True)
     column, row = pixels(lens)
     x, y = (column + 0.5 - 12) / 6, (row + 0.5 - 9) / 6

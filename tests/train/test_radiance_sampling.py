@@ -12,11 +12,11 @@ from nerg_mi.train.radiance_sampling import (
     Segments,
     StepTable,
     ThinnedSamples,
-    find_occupied_steps,
-    sum_along_rays,
     clip_rays,
-    select_visible_samples,
     compute_weights,
+    find_occupied_steps,
+    select_visible_samples,
+    sum_along_rays,
 )
 
 # ---- Compositing of packed samples against a float64 reference and against finite differences ----
@@ -68,7 +68,7 @@ def test_weights_and_sums_equal_the_reference(packed):
 
 
 def test_the_ends_of_a_ray_are_written_once(packed, monkeypatch):
-    """Of several samples that write to one address the threads' order would choose."""
+    """If several samples wrote to one address, the thread order would decide."""
     written, scatter = [], dr.scatter
     monkeypatch.setattr(dr, "scatter", lambda *a: (written.append(np.array(a[2])[np.array(a[3])]), scatter(*a)))
     ray, _, _, segments = packed
@@ -76,8 +76,8 @@ def test_the_ends_of_a_ray_are_written_once(packed, monkeypatch):
     assert [w.tolist() for w in written] == [np.unique(ray).tolist()] * 2
 
 
-def test_opaque_samples_leave_the_other_rays_alone():
-    """An astronomically dense sample must not cost the rays after it their precision."""
+def test_opaque_samples_do_not_affect_other_rays():
+    """An extremely dense sample must not reduce the precision of later rays."""
     tau = np.array([1e12, 1e12, 0.1, 0.2])
     segments = Segments(ns.UInt32([0, 0, 1, 1]), ns.Bool([True] * 4), 2)
     w = compute_weights(ns.Float(tau), segments).numpy()
@@ -123,7 +123,7 @@ def test_forward_mode_agrees_with_reverse_mode(packed):
     assert np.allclose(forward.numpy()[0], np.sum(dr.grad(x).numpy() * direction), atol=1e-5)
 
 
-def test_forward_mode_agrees_with_reverse_mode_of_samples_that_stand_for_others(packed):
+def test_forward_mode_agrees_with_reverse_mode_with_roulette(packed):
     ray, tau, padded_tau, segments = packed
     rng = np.random.default_rng(4)
     n = len(padded_tau)
@@ -223,42 +223,46 @@ def test_candidates_split_into_ray_and_step_like_integers(step):
 
 
 @pytest.mark.parametrize("stride", [16, 8, 4, 2, 1])
-def test_the_pass_stays_within_its_bound_in_fog(stride):
-    """Fog that fills the box: at every stride the network is asked at no more points, and whole rays remain."""
-    table, most = StepTable(ns, 0.01, 4, stride / 200, 0), 5000
+def test_density_pass_stays_within_its_limit_in_fog(stride):
+    """Fog that fills the box: at every stride the limit on evaluations holds, and complete rays remain."""
+    table, limit = StepTable(ns, 0.01, 4, stride / 200, 0), 5000
     r, offset = rays(300)
-    asked = []
+    calls = []
 
     def density(p, active):
-        asked.append(dr.width(p))
+        calls.append(dr.width(p))
         return dr.full(ns.Float, 0.1, dr.width(p))
 
-    samples, covered = select_visible_samples(r, table, offset, lambda p, a: a, density, 1e-9, max_prepass_samples=most)
-    whole, everything = select_visible_samples(r, table, offset, lambda p, a: a, density, 1e-9)
-    assert everything == 300 and asked[0] <= most and asked[1] == whole.count
-    counts = np.bincount(whole.ray.numpy(), minlength=300)
-    assert covered == min(300, int(np.searchsorted(np.cumsum(counts), most, side="right")))
-    assert (covered < 300) == (asked[1] > most) and asked[0] == counts[:covered].sum()
-    # The rays that remain are complete, and the same as without a bound.
+    samples, covered = select_visible_samples(
+        r, table, offset, lambda p, a: a, density, 1e-9, max_prepass_samples=limit
+    )
+    full, everything = select_visible_samples(r, table, offset, lambda p, a: a, density, 1e-9)
+    assert everything == 300 and calls[0] <= limit and calls[1] == full.count
+    counts = np.bincount(full.ray.numpy(), minlength=300)
+    assert covered == min(300, int(np.searchsorted(np.cumsum(counts), limit, side="right")))
+    assert (covered < 300) == (calls[1] > limit) and calls[0] == counts[:covered].sum()
+    # The remaining rays are complete, and the same as without a limit.
     for name in ("ray", "t", "length"):
-        got, expected = getattr(samples, name).numpy(), getattr(whole, name).numpy()
+        got, expected = getattr(samples, name).numpy(), getattr(full, name).numpy()
         assert np.array_equal(got, expected[: counts[:covered].sum()])
-    assert samples.prepass_samples_per_ray == pytest.approx(asked[0] / covered)
+    assert samples.prepass_samples_per_ray == pytest.approx(calls[0] / covered)
 
 
-def test_the_batch_and_the_pass_may_both_be_full():
+def test_batch_and_density_pass_may_both_be_full():
     table = StepTable(ns, 0.01, 4, 0.02, 0)
     r, offset = rays(300)
     fog = lambda p, a: dr.full(ns.Float, 0.1, dr.width(p))
-    samples, covered = select_visible_samples(r, table, offset, lambda p, a: a, fog, 1e-9, pad=2000, max_prepass_samples=5000)
+    samples, covered = select_visible_samples(
+        r, table, offset, lambda p, a: a, fog, 1e-9, pad=2000, max_prepass_samples=5000
+    )
     assert dr.width(samples.ray) == 2000 and 0 < covered < 40
     counts = np.bincount(samples.ray.numpy()[samples.segments.active.numpy()], minlength=300)
     assert (counts[:covered] > 50).all() and not counts[covered:].any()
-    # Of all that the pass looked at, not only of what the batch took.
+    # Of all samples of the density pass, not only those in the batch.
     assert samples.prepass_samples_per_ray == pytest.approx(100, rel=0.1)
 
 
-def test_a_ray_that_alone_is_too_long_is_refused():
+def test_a_single_ray_that_is_too_long_is_refused():
     r, offset = rays(3)
     with pytest.raises(ValueError, match="a single ray has more than 50 steps"):
         find_occupied_steps(r, StepTable(ns, 0.01, 4, 0.01, 0), offset, lambda p, a: a, max_steps=50)
@@ -266,7 +270,7 @@ def test_a_ray_that_alone_is_too_long_is_refused():
 
 @pytest.mark.parametrize("growth", [0, 1 / 16])
 def test_edges_rise_by_the_rule_and_one_step_beyond_the_end(growth):
-    """Jitter shifts every edge by up to a step: a ray that is shifted by a whole one still ends beyond ``far``."""
+    """Jitter shifts every edge by up to a step: a ray shifted by a whole step still ends beyond ``far``."""
     table = StepTable(ns, 0.1, 4.03, 0.05, growth)
     edges = table.edges.numpy()[: table.steps + 1].astype(float)
     np.testing.assert_allclose(np.diff(edges), np.maximum(0.05, growth * edges[:-1]), rtol=1e-4)
@@ -274,7 +278,7 @@ def test_edges_rise_by_the_rule_and_one_step_beyond_the_end(growth):
 
 
 def test_more_candidates_than_indices_are_refused():
-    """They are counted in 32 bits: one more would be the first again."""
+    """Indices have 32 bits: one more would wrap around."""
     table = SimpleNamespace(steps=2, split=lambda index: pytest.fail("candidates are made"))
     with pytest.raises(ValueError, match="2147483648.*2"):
         find_occupied_steps(SimpleNamespace(count=2**31), table, ns.Float(0), lambda p, a: a)

@@ -27,10 +27,10 @@ from tests.train.radiance.ball import BOX, TINY, settings, state, trainer
 
 
 def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(dataset, one_thread, tmp_path):
-    """Past updates of the grid, its settling and the drawing of hard pixels, on either side of the interruption."""
-    whole, first, second = (trainer(dataset) for _ in range(3))
-    while whole.progress < 1:
-        whole.step()
+    """Through grid updates, occupancy extraction and hard pixels, on both sides of the interruption."""
+    full, first, second = (trainer(dataset) for _ in range(3))
+    while full.progress < 1:
+        full.step()
     while first.steps < 21:
         first.step()
     save_run(first, tmp_path / "a.run", {"sha": 1}, [{"psnr": 3.0}])
@@ -38,13 +38,13 @@ def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(dataset, one_thre
     assert second.steps == 21
     while second.progress < 1:
         second.step()
-    expected, got = state(whole), state(second)
+    expected, got = state(full), state(second)
     for name, value in expected.items():
         assert np.array_equal(value, got[name]), name
-    assert whole.extraction.pieces_done == second.extraction.pieces_done > 0
+    assert full.extraction.pieces_done == second.extraction.pieces_done > 0
 
 
-def test_ctrl_c_keeps_the_state_and_writing_removes_it(dataset, tmp_path):
+def test_ctrl_c_saves_the_state_and_writing_removes_it(dataset, tmp_path):
     path, seen, written = tmp_path / "a.run", [], []
 
     def stop(progress):
@@ -56,30 +56,30 @@ def test_ctrl_c_keeps_the_state_and_writing_removes_it(dataset, tmp_path):
         "state": path,
         "preview": tmp_path / "a.png",
         "on_progress": stop,
-        "write": lambda field, about: written.append((about["steps"], path.is_file())),
+        "write": lambda field, provenance: written.append((provenance["steps"], path.is_file())),
     }
-    _, about = train_field(dataset, TINY, settings(steps=12), ns, **options)
-    assert about["interrupted"] and path.is_file()
-    _, about = train_field(dataset, TINY, settings(steps=12), ns, resume=True, **options)
-    assert not about["interrupted"] and seen[5].steps == 6 and (tmp_path / "a.png").stat().st_size > 100
+    _, provenance = train_field(dataset, TINY, settings(steps=12), ns, **options)
+    assert provenance["interrupted"] and path.is_file()
+    _, provenance = train_field(dataset, TINY, settings(steps=12), ns, resume=True, **options)
+    assert not provenance["interrupted"] and seen[5].steps == 6 and (tmp_path / "a.png").stat().st_size > 100
     assert written == [(5, True), (12, True)] and not path.exists()
 
 
-def test_a_result_that_cannot_be_written_is_kept(dataset, one_thread, tmp_path):
-    """Weights beyond fp16, and then without --half: no step is trained again."""
+def test_a_result_that_cannot_be_written_is_saved(dataset, one_thread, tmp_path):
+    """Weights beyond fp16, and then without --half: no step is repeated."""
     path, seen = tmp_path / "a.run", []
 
-    def refuse(field, about):
+    def refuse(field, provenance):
         parameters = field.parameters()
         field.set_parameters(parameters | {"grid.table": parameters["grid.table"] * 0 + 1e6})
-        save_radiance(field, tmp_path / "a.safetensors", about, half=True)
+        save_radiance(field, tmp_path / "a.safetensors", provenance, half=True)
 
     options = {"state": path, "save_every": 1e9, "on_progress": seen.append}
     with pytest.raises(NergError, match="fp16.*--half.*--resume"):
         train_field(dataset, TINY, settings(steps=6), ns, write=refuse, **options)
     assert [p.name for p in tmp_path.iterdir()] == ["a.run"]
     seen.clear()
-    _, about = train_field(
+    _, provenance = train_field(
         dataset,
         TINY,
         settings(steps=6),
@@ -88,21 +88,20 @@ def test_a_result_that_cannot_be_written_is_kept(dataset, one_thread, tmp_path):
         write=lambda f, a: save_radiance(f, tmp_path / "a.safetensors", a),
         **options,
     )
-    assert about["steps"] == 6 and not seen and [p.name for p in tmp_path.iterdir()] == ["a.safetensors"]
+    assert provenance["steps"] == 6 and not seen and [p.name for p in tmp_path.iterdir()] == ["a.safetensors"]
 
 
 def test_a_second_ctrl_c_leaves_the_state_before_the_step(dataset, one_thread, monkeypatch, tmp_path):
-    """Raised in the middle of a step, when weights and random numbers are of different steps: that state is not
-    kept."""
-    path, descend = tmp_path / "a.run", RadianceTrainer._descend
+    """Raised in the middle of a step, when weights and random numbers are inconsistent: that state is not saved."""
+    path, descend = tmp_path / "a.run", RadianceTrainer._optimize_step
 
-    def twice(self, *given):
+    def twice(self, *options):
         if self.steps == 5:
             signal.raise_signal(signal.SIGINT)
             signal.raise_signal(signal.SIGINT)
-        descend(self, *given)
+        descend(self, *options)
 
-    monkeypatch.setattr(RadianceTrainer, "_descend", twice)
+    monkeypatch.setattr(RadianceTrainer, "_optimize_step", twice)
     with pytest.raises(KeyboardInterrupt):
         train_field(dataset, TINY, settings(steps=12), ns, state=path, save_every=0.0)
     assert read_checkpoint(path, "radiance run")[1]["steps"] == 4
@@ -120,8 +119,8 @@ train_field(ball_dataset(), TINY, settings(steps=10**6), ns, state=Path(sys.argv
 
 
 @pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGINT])
-def test_a_run_that_is_ended_from_outside_leaves_a_whole_state(dataset, one_thread, sent, tmp_path):
-    """Killed at any moment, the state is one that an uninterrupted run has been in; Ctrl-C is heard between steps."""
+def test_a_killed_run_leaves_a_complete_state(dataset, one_thread, sent, tmp_path):
+    """Killed at any time, the state is one of an uninterrupted run; Ctrl-C is handled between steps."""
     path = tmp_path / "a.run"
     child = subprocess.Popen([sys.executable, "-c", _CHILD, str(path)], env={**os.environ, "PYTHONPATH": os.getcwd()})
     until = time.time() + 600
@@ -130,9 +129,9 @@ def test_a_run_that_is_ended_from_outside_leaves_a_whole_state(dataset, one_thre
     time.sleep(0.3)
     child.send_signal(sent)
     assert child.wait(600) == (0 if sent == signal.SIGINT else -sent)
-    about = dict.fromkeys(("sha256", "training_frames", "width", "height"))
+    provenance = dict.fromkeys(("sha256", "training_frames", "width", "height"))
     killed = trainer(dataset, steps=10**6)
-    load_run(killed, path, about)
+    load_run(killed, path, provenance)
     same = trainer(dataset, steps=10**6)
     while same.steps < killed.steps:
         same.step()
@@ -154,7 +153,7 @@ def test_a_run_that_is_ended_from_outside_leaves_a_whole_state(dataset, one_thre
         lambda tensors, meta: meta.update(history=3),
     ],
 )
-def test_a_damaged_state_is_told_with_its_name(dataset, tmp_path, change):
+def test_a_damaged_state_is_reported_with_its_name(dataset, tmp_path, change):
     from nerg_mi.formats.checkpoint import write_checkpoint
 
     t = trainer(dataset)
@@ -188,7 +187,7 @@ def test_a_state_is_restored_with_and_without_steps(seconds):
     assert again.summary() == clock.summary() and again.summary()["step_ms"]["max"] == 2000
 
 
-def test_durations_are_kept_of_steps_that_are_equally_far_apart(monkeypatch):
+def test_stored_durations_are_evenly_spaced(monkeypatch):
     monkeypatch.setattr(shared, "MAX_DURATIONS", 4)
     for steps, each in ((4, 1), (5, 2), (9, 4), (30, 8)):
         clock = timed(*range(steps))
@@ -204,8 +203,9 @@ def test_steps_without_durations_and_durations_without_steps_are_refused(change)
 # ---- What a machine's speed changes: nothing at equal steps ----
 
 
-def test_a_run_by_minutes_is_the_run_of_as_many_steps(dataset, one_thread, monkeypatch):
-    """A slow machine's few steps in its minutes go through the same schedules: strides, rates, damping and settling."""
+def test_a_run_by_minutes_equals_a_run_by_steps(dataset, one_thread, monkeypatch):
+    """The few steps of a slow machine go through the same schedules: strides, rates, damping and occupancy
+    extraction."""
     by_steps, by_minutes = trainer(dataset, steps=40), trainer(dataset, steps=None, minutes=2.0)
     monkeypatch.setattr(RadianceTrainer, "seconds", property(lambda self: self.steps * 3.0))
     for t in (by_steps, by_minutes):
@@ -217,8 +217,8 @@ def test_a_run_by_minutes_is_the_run_of_as_many_steps(dataset, one_thread, monke
         assert np.array_equal(value, got[name]), name
 
 
-def test_no_pass_of_a_run_is_larger_than_its_bound(dataset, monkeypatch):
-    """A field that never clears: its density-only pass stays within the bound at every stride, down to the finest."""
+def test_density_passes_stay_within_their_limit(dataset, monkeypatch):
+    """A field that never clears: its density pass stays within the limit at every stride, down to the finest."""
     t = RadianceTrainer(
         dataset.train,
         BOX,
@@ -227,14 +227,14 @@ def test_no_pass_of_a_run_is_larger_than_its_bound(dataset, monkeypatch):
         ns,
         depth=False,
     )
-    strides, asked = set(), []
-    look = t._look
-    t._look = lambda p, active: asked.append(dr.width(p)) or look(p, active)
+    strides, calls = set(), []
+    look = t._density_prepass
+    t._density_prepass = lambda p, active: calls.append(dr.width(p)) or look(p, active)
     while t.progress < 1:
         t.step()
         strides.add(t.stride)
     assert t.grid.occupied_fraction > 0.5 and t.stride == 1 and len(strides) > 1
-    assert 0.5 * t.settings.max_prepass_samples < max(asked) <= t.settings.max_prepass_samples
+    assert 0.5 * t.settings.max_prepass_samples < max(calls) <= t.settings.max_prepass_samples
 
 
 def test_the_clock_counts_what_steps_evaluate():
@@ -253,10 +253,10 @@ def test_the_clock_counts_what_steps_evaluate():
     assert clock.summary() == {"evaluations_a_second": 3333, "step_ms": {"min": 10.0, "median": 20.0, "max": 60.0}}
 
 
-def test_the_result_tells_its_steps_speed_and_what_is_wrong(dataset):
-    _, about = train_field(dataset, TINY, settings(steps=8), ns)
-    assert about["evaluations_a_second"] > 0 and set(about["step_ms"]) == {"min", "median", "max"}
-    assert any("only 8 steps" in x for x in about["complaints"])
-    # The last look is that of the result.
-    assert about["psnr_watched"]["history"][-1]["steps"] == 8
-    assert about["psnr_held_out"]["every_pixel"] == 1
+def test_the_result_reports_speed_and_problems(dataset):
+    _, provenance = train_field(dataset, TINY, settings(steps=8), ns)
+    assert provenance["evaluations_a_second"] > 0 and set(provenance["step_ms"]) == {"min", "median", "max"}
+    assert any("only 8 steps" in x for x in provenance["complaints"])
+    # The last evaluation is that of the result.
+    assert provenance["psnr_watched"]["history"][-1]["steps"] == 8
+    assert provenance["psnr_held_out"]["every_pixel"] == 1

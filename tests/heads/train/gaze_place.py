@@ -16,9 +16,8 @@ class PlaceTrainer(GazeTrainer):
         data, D = self.data, self.data.num_directions
         observers = self.rng.choice(data.num_observers, min(self.settings.probes, data.num_observers), replace=False)
         batch = data.gather_batch(observers, np.broadcast_to(np.arange(D), (len(observers), D)))
-        self.loss = compute_gaze_loss(
-            self.evaluate_density(batch, self.current_parameters()), batch.truth, D, cc=0, mae=0
-        ).total
+        density = self.evaluate_density(batch, self.current_parameters())
+        self.loss = compute_gaze_loss(density, batch.truth, D, cc=0, mae=0).total
         dr.backward(self.loss)
 
     def evaluate_density(self, batch, parameters):

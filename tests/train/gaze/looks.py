@@ -1,4 +1,4 @@
-"""People who look at one point, the small fields that learn it, and plans of their training: what these tests share."""
+"""Simulated participants who look at one point, small fields trained on them, and training plans."""
 
 from __future__ import annotations
 
@@ -28,12 +28,20 @@ PROBES = ProbeSettings(radius=0.5, count=16, cap=64, min_rays=8, kappa=20.0, dir
 NOWHERE = TrainingGeometry(None, BOX, "none")
 PRODUCT = GazeSettings(steps=16, num_validations=8, zones=2, validation_probes=6, probes=4, directions=32)
 LIKELIHOOD = GazeSettings(
-    steps=16, num_validations=8, zones=2, validation_probes=6, probes=4, directions=32, loss="likelihood", integral=0.0, rays=16
+    steps=16,
+    num_validations=8,
+    zones=2,
+    validation_probes=6,
+    probes=4,
+    directions=32,
+    loss="likelihood",
+    integral=0.0,
+    rays=16,
 )
 
 
 def looking_at(target, n=400, seed=0, spread=1.2):
-    """Rays of two people who walk about and look at ``target``, with hits on the wall x = 1.5."""
+    """Rays of two participants who move and look at ``target``, with hits on the wall x = 1.5."""
     rng = np.random.default_rng(seed)
     origin = np.stack([rng.uniform(-1.2, 0, n), rng.uniform(-spread, spread, n), rng.uniform(1.5, 1.7, n)], axis=1)
     direction = np.asarray(target) + rng.normal(0, 0.15, (n, 3)) - origin
@@ -42,24 +50,24 @@ def looking_at(target, n=400, seed=0, spread=1.2):
     return Rays(np.arange(n), np.arange(n) % 2, ("a", "b"), origin, direction, np.ones(n), hit)
 
 
-def planned(config, settings: GazeSettings, probes: ProbeSettings = PROBES, **more) -> GazePlan:
-    """The training of a field of the kind that the loss is of."""
+def planned(config, settings: GazeSettings, probes: ProbeSettings = PROBES, **options) -> GazePlan:
+    """Make the plan of a field of the kind that matches the loss."""
     trainer = LikelihoodTrainer if settings.loss == "likelihood" else ProductTrainer
-    return GazePlan(config=config, settings=settings, probes=probes, trainer=trainer, **more)
+    return GazePlan(config=config, settings=settings, probes=probes, trainer=trainer, **options)
 
 
 RAYS = looking_at((1.5, 0, 1.2), 3000, spread=6.0)
 
 
-def train(place, settings, config, probes=PROBES, supervision=None, *, tell=None, write=None, **state):
-    """A training on ``RAYS``, unless others are given; ``state``: of `StateSettings`."""
+def train(place, settings, config, probes=PROBES, supervision=None, *, on_progress=None, write=None, **state):
+    """Train on ``RAYS``, unless other data are given; ``state`` are arguments of `StateSettings`."""
     plan = planned(config, settings, probes)
     supervision = supervision or Supervision(RAYS)
-    return train_gaze(supervision, place, plan, ns, state=StateSettings(**state), on_progress=tell, write=write)
+    return train_gaze(supervision, place, plan, ns, state=StateSettings(**state), on_progress=on_progress, write=write)
 
 
 def stopping(stage, step):
-    """Ctrl-C as soon as a stage has come to a step."""
+    """Simulate Ctrl-C when a stage reaches a step."""
     seen = []
 
     def watch(state):
@@ -71,7 +79,7 @@ def stopping(stage, step):
     return watch
 
 
-# ---- Views of a law: what an observer sees of it through a lens ----
+# ---- Views of a density, as an observer sees it through a lens ----
 
 LENS = Intrinsics(24, 18, 14.0, 14.0, 12.0, 9.0, k1=-0.08)
 TARGET = np.array([1.9, 0.5, 1.6])
@@ -88,7 +96,7 @@ def pose(centre, towards):
 
 
 def view(density, centre, towards, lens=LENS, name="a"):
-    """What an observer with ``density(p, d)`` sees of it through a lens."""
+    """Make the view of an observer with ``density(p, d)`` through a lens."""
     camera = PosedCamera(lens, pose(centre, towards))
     directions = pixel_directions(lens) @ camera.to_world[:3, :3].T
     solid = pixel_solid_angles(lens)
@@ -97,13 +105,13 @@ def view(density, centre, towards, lens=LENS, name="a"):
 
 
 def lobe(p, d, kappa=12.0):
-    """Most look at one point, the others anywhere."""
+    """Most gaze is at one point, the rest uniform."""
     mean = (TARGET - p) / np.linalg.norm(TARGET - p)
     return 0.8 * kappa / (2 * np.pi * -np.expm1(-2 * kappa)) * np.exp(kappa * (d @ mean - 1)) + 0.2 / (4 * np.pi)
 
 
 def around(count, seed=0, density=lobe):
-    """Cameras in the room that look about them, and a little down."""
+    """Cameras in the room that look around, and slightly down."""
     rng = np.random.default_rng(seed)
     centres = rng.uniform((-1, -1, 1.4), (1, 1, 1.8), (count, 3))
     angle = rng.uniform(0, 2 * np.pi, count)

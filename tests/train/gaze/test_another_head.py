@@ -1,4 +1,4 @@
-"""One more kind of gaze field is two modules: everything finds it by its kind and by its recipe."""
+"""A new kind of gaze field consists of two modules: all commands find it by its kind and its recipe."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ OPTIONS = GazeOptions(recipe="place", geometry="hits", voxel_size=0.3, threads=1
 
 @pytest.fixture(scope="module")
 def head():
-    """The two modules as if they lay in the packages, and gone again from the registers."""
+    """The two modules as if they were in the packages, removed from the registries afterwards."""
     kinds, recipes = dict(gaze_base._KINDS), dict(gaze_recipes.RECIPES)
     for package in (nerg_mi.fields, nerg_mi.train):
         package.__path__.append(str(HEADS / package.__name__.rpartition(".")[2]))
@@ -46,10 +46,10 @@ def trained(head, tmp_path_factory):
     return train_gaze(crowd(3000), tmp_path_factory.mktemp("head") / "gaze.safetensors", OPTIONS)
 
 
-def test_its_recipe_trains_and_folds_choose_its_share(head, trained):
-    field, about = trained.field, trained.provenance
-    assert isinstance(field, head.PlaceField) and about["recipe"] == "place" and about["steps"] == 12
-    assert about["mix"]["folds"] == 2 and field.config.mix == about["mix"]["mix"] > 0
+def test_its_recipe_trains_and_folds_select_the_weight(head, trained):
+    field, provenance = trained.field, trained.provenance
+    assert isinstance(field, head.PlaceField) and provenance["recipe"] == "place" and provenance["steps"] == 12
+    assert provenance["mix"]["folds"] == 2 and field.config.mix == provenance["mix"]["mix"] > 0
     untrained = head.PlaceField.random(field.config, field.box, ns, 1, field.prior.numpy()).parameters()
     moved = {k for k, v in field.parameters().items() if not np.allclose(v.numpy(), untrained[k].numpy())}
     assert moved == set(field.parameters()) - {"prior"}
@@ -68,15 +68,15 @@ def test_it_is_stored_rendered_and_a_torch_module(rgb, trained, tmp_path):
     torch = pytest.importorskip("torch")
     from nerg_mi.interop.torch import GazeModule
 
-    # Whatever the folds chose, the networks count.
+    # The networks have influence, whatever the folds select.
     again.set_prior_weight(0.1)
     module, rng, box = GazeModule(again), np.random.default_rng(0), again.box
     p_od, p_o, r_o = (rng.uniform(box.lower, box.upper, size=(20, 3)).astype(np.float32) for _ in range(3))
     r_o /= np.linalg.norm(r_o, axis=1, keepdims=True)
-    found = module(*map(torch.from_numpy, (p_od, p_o, r_o)), 2.0)
+    result = module(*map(torch.from_numpy, (p_od, p_o, r_o)), 2.0)
     arrays = [ns.Array3f(np.ascontiguousarray(v.T)) for v in (p_od, p_o, r_o)]
-    np.testing.assert_allclose(found.detach().numpy(), again.evaluate(*arrays, integral=2.0)[0].numpy(), rtol=1e-5)
-    found.sum().backward()
+    np.testing.assert_allclose(result.detach().numpy(), again.evaluate(*arrays, integral=2.0)[0].numpy(), rtol=1e-5)
+    result.sum().backward()
     assert module.get_parameter("emit_net__0").grad.abs().max() > 0
     assert not module.get_parameter("prior").requires_grad
 

@@ -1,4 +1,4 @@
-"""Ensembles: what is resampled, members by themselves, going on."""
+"""Ensembles: resampling, individual members, resuming."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SHORT = replace(LIKELIHOOD, steps=4, zones=0)
 
 
 def crowd(people=6, n=1200, seconds=100.0):
-    """Rays of several people, interleaved, with times of their own."""
+    """Rays of several participants, interleaved, with individual times."""
     rays = looking_at((1.5, 0, 1.2), n, spread=2.0)
     who = np.arange(n) % people
     t = np.sort(np.random.default_rng(1).uniform(0, seconds, n)) + 1000 * who
@@ -32,7 +32,7 @@ def crowd(people=6, n=1200, seconds=100.0):
 
 
 def together(members=3, rays=None, *, place=NOWHERE, config=PLACE, settings=SHORT, probes=PROBES, **options):
-    tell, write = options.pop("tell", None), options.pop("write", None)
+    on_progress, write = options.pop("on_progress", None), options.pop("write", None)
     return train_ensemble(
         members,
         Supervision(rays or crowd()),
@@ -40,7 +40,7 @@ def together(members=3, rays=None, *, place=NOWHERE, config=PLACE, settings=SHOR
         planned(config, settings, probes),
         ns,
         state=StateSettings(**options),
-        on_progress=tell,
+        on_progress=on_progress,
         write=write,
     )
 
@@ -49,7 +49,7 @@ def arrays(field):
     return {k: np.array(v) for k, v in field.parameters().items()}
 
 
-def test_people_are_blocks_and_else_stretches_of_their_time():
+def test_blocks_are_participants_or_time_intervals():
     rays = crowd()
     block, kind = assign_blocks(rays)
     assert kind == "people" and np.array_equal(block, rays.person)
@@ -58,15 +58,15 @@ def test_people_are_blocks_and_else_stretches_of_their_time():
     assert kind == "blocks of 30 s" and block.max() + 1 == 8
     for b in range(8):
         assert len(set(few.person[block == b])) == 1 and np.ptp(few.t[block == b]) < 30
-    with pytest.raises(ValueError, match="2 stretches of 30 s of 1 people are too few"):
+    with pytest.raises(ValueError, match="2 blocks of 30 s of 1 participants are too few"):
         assign_blocks(crowd(people=1, seconds=40.0))
 
 
-def test_a_resample_holds_whole_people_as_often_as_they_were_drawn():
+def test_resamples_hold_whole_participants():
     rays, times = crowd(), []
     for seed in range(300):
         drawn = resample_rays(rays, seed)
-        # One who is drawn twice is two people, of 200 rays each, who are told apart by their names.
+        # A participant drawn twice becomes two with 200 rays each and different names.
         each = np.bincount(drawn.person, minlength=len(drawn.persons))
         assert set(each) <= {0, 200} and drawn.persons[:6] == rays.persons
         counts = np.bincount(drawn.person % 6, minlength=6) / 200
@@ -81,20 +81,27 @@ def test_a_resample_holds_whole_people_as_often_as_they_were_drawn():
 def test_members_are_trainings_of_resamples(threads):
     threads(1)
     rays = crowd()
-    ensemble, about = together(3, rays)
+    ensemble, provenance = together(3, rays)
     for k, member in enumerate(ensemble.members):
-        own = Supervision(resample_rays(rays, (SHORT.seed, k)))
-        alone, _ = train(NOWHERE, replace(SHORT, seed=100 * k), PLACE, supervision=own)
+        individual = Supervision(resample_rays(rays, (SHORT.seed, k)))
+        alone, _ = train(NOWHERE, replace(SHORT, seed=100 * k), PLACE, supervision=individual)
         for name, value in arrays(alone).items():
             np.testing.assert_array_equal(arrays(member)[name], value, err_msg=name)
-    assert about["ensemble"] == {"members": 3, "resampled": "people", "seeds": [0, 100, 200]} and about["steps"] == 12
-    # Of all rays, not of a resample.
-    assert ensemble.support.cells[:, 3].sum() == len(rays) == about["rays"] and ensemble.support.radius == PROBES.radius
-    assert ensemble.basis == DataSummary(len(rays), len(rays.persons)) and about["people"] == len(rays.persons)
+    assert (
+        provenance["ensemble"] == {"members": 3, "resampled": "people", "seeds": [0, 100, 200]}
+        and provenance["steps"] == 12
+    )
+    # The support of all rays, not of a resample.
+    assert (
+        ensemble.support.cells[:, 3].sum() == len(rays) == provenance["rays"]
+        and ensemble.support.radius == PROBES.radius
+    )
+    assert ensemble.basis == DataSummary(len(rays), len(rays.persons)) and provenance["people"] == len(rays.persons)
 
 
-def test_an_interrupted_ensemble_goes_on(threads, tmp_path):
-    """In the second member: the first is not trained again, and all come out as if nothing had happened."""
+def test_an_interrupted_ensemble_resumes(threads, tmp_path):
+    """Interrupted in the second member: the first is not trained again, and the result is that of an uninterrupted
+    run."""
     threads(1)
     path, seen = tmp_path / "a.run", []
 
@@ -104,25 +111,25 @@ def test_an_interrupted_ensemble_goes_on(threads, tmp_path):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt, match="2.*3.*--resume"):
-        together(path=path, tell=stop)
+        together(path=path, on_progress=stop)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.member0.safetensors", "a.run"]
-    with pytest.raises(NergError, match="started with other probes"):
+    with pytest.raises(NergError, match="started with different probes"):
         together(path=path, resume=True, probes=replace(PROBES, kappa=9.0))
     seen.clear()
     written = []
     shares = []
-    got, about = together(
+    got, provenance = together(
         path=path,
         resume=True,
-        tell=lambda s: (seen.append(s.stage), shares.append(s.done)),
+        on_progress=lambda s: (seen.append(s.stage), shares.append(s.fraction)),
         write=lambda *_: written.append(sorted(p.name for p in tmp_path.iterdir())),
     )
     assert set(seen) == {"2/3 probes", "2/3 fit", "3/3 probes", "3/3 fit"} and seen.count("2/3 fit") == 2
-    # Each member is a third of what is done, the first of them from before.
+    # Each member is a third of the progress, the first of them already done.
     assert shares == sorted(shares) and shares[-1] == pytest.approx(1)
     assert all(int(stage[0]) - 1 - 1e-9 <= 3 * share <= int(stage[0]) + 1e-9 for stage, share in zip(seen, shares))
     assert written == [[f"a.member{k}.safetensors" for k in range(3)]] and not list(tmp_path.iterdir())
-    assert about["steps"] == 12
+    assert provenance["steps"] == 12
     expected = arrays(together()[0])
     for name, value in arrays(got).items():
         np.testing.assert_array_equal(value, expected[name], err_msg=name)
@@ -132,8 +139,7 @@ def test_an_interrupted_ensemble_goes_on(threads, tmp_path):
     "change, said", [({"config": replace(PLACE, width=8)}, "architecture"), ({"rays": crowd(people=7)}, "rays")]
 )
 def test_members_of_another_run_are_refused(tmp_path, change, said):
-    """Finished members count as members only of the run that they are of: of another architecture they would be
-    averaged with it."""
+    """Finished members count only for their own run: members of another architecture must not be averaged."""
     path = tmp_path / "a.run"
 
     def stop(state):
@@ -141,41 +147,44 @@ def test_members_of_another_run_are_refused(tmp_path, change, said):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        together(2, path=path, tell=stop)
+        together(2, path=path, on_progress=stop)
     assert (tmp_path / "a.member0.safetensors").is_file()
-    with pytest.raises(NergError, match=f"a.member0.safetensors.*started with other .*{said}"):
+    with pytest.raises(NergError, match=f"a.member0.safetensors.*started with different .*{said}"):
         together(2, **change, path=path, resume=True)
     assert (tmp_path / "a.member0.safetensors").is_file()
 
 
-def test_an_ensemble_that_cannot_be_written_is_kept(threads, tmp_path):
-    """Refused at the end: the next start trains no member again; nor does one that was killed before it removed a
-    state."""
+def test_an_ensemble_that_cannot_be_written_is_saved(threads, tmp_path):
+    """The final write fails: the next start trains no member again, nor one that was killed before its state was
+    removed.
+    """
     threads(1)
     path, stages = tmp_path / "a.run", []
 
-    def refuse(field, about):
+    def refuse(field, provenance):
         raise NergError("a weight does not fit into fp16; leave out --half")
 
-    with pytest.raises(NergError, match="fp16.*--resume writes it"):
+    with pytest.raises(NergError, match="fp16.*--resume"):
         together(path=path, write=refuse)
     members = sorted(p.name for p in tmp_path.iterdir())
     assert members == [f"a.member{k}.safetensors" for k in range(3)]
     write_checkpoint(path, "gaze run", {"x": np.zeros(1)}, {"about": {"member": [1, 3]}})
-    _, about = together(path=path, resume=True, tell=lambda s: stages.append(s.stage), write=lambda *_: None)
-    assert not stages and about["steps"] == 12 and not list(tmp_path.iterdir())
+    _, provenance = together(
+        path=path, resume=True, on_progress=lambda s: stages.append(s.stage), write=lambda *_: None
+    )
+    assert not stages and provenance["steps"] == 12 and not list(tmp_path.iterdir())
 
 
-def test_what_cannot_be_resampled_is_refused():
+def test_unsuitable_data_for_resampling_are_refused():
     for members, said, options in (
         (1, "at least two members", {}),
-        (2, "who would predict themselves", {"probes": replace(PROBES, kappa_rule="loo")}),
+        (2, "would predict themselves", {"probes": replace(PROBES, kappa_rule="loo")}),
     ):
         with pytest.raises(ValueError, match=said):
             together(members, **options)
     with pytest.raises(NergError, match="4 salience images are too few to resample"):
         train_ensemble(2, Supervision(None, around(4)), NOWHERE, planned(PLACE, SHORT), ns)
-    with pytest.raises(NergError, match="nothing to resume"):
+    with pytest.raises(NergError, match="cannot resume"):
         together(path=Path("nowhere.run"), resume=True)
 
 
@@ -185,9 +194,13 @@ def test_views_are_resampled_one_by_one():
     assert len(drawn) == 12 and 5 <= len(set(drawn)) < 12 and set(drawn) <= set(views)
     assert drawn == resample_views(views, (0, 1)) != resample_views(views, (0, 2))
     plan = planned(PLACE, replace(SHORT, mix_folds=3))
-    field, about = train_ensemble(2, Supervision(None, views), NOWHERE, plan, ns)
-    assert about["ensemble"]["resampled"] == "views" and about["salience_views"] == 12 and about["rays"] == 0
-    assert field.support is None and "mix" not in about
+    field, provenance = train_ensemble(2, Supervision(None, views), NOWHERE, plan, ns)
+    assert (
+        provenance["ensemble"]["resampled"] == "views"
+        and provenance["salience_views"] == 12
+        and provenance["rays"] == 0
+    )
+    assert field.support is None and "mix" not in provenance
     assert not np.array_equal(arrays(field)["0.capture_net.0"], arrays(field)["1.capture_net.0"])
-    _, about = train_ensemble(2, Supervision(crowd(), views), NOWHERE, planned(PLACE, SHORT), ns)
-    assert about["ensemble"]["resampled"] == "people and views" and about["people"] == 6
+    _, provenance = train_ensemble(2, Supervision(crowd(), views), NOWHERE, planned(PLACE, SHORT), ns)
+    assert provenance["ensemble"]["resampled"] == "people and views" and provenance["people"] == 6

@@ -27,25 +27,31 @@ from nerg_mi.train.gaze_data import (
     Supervision,
     TargetArrays,
     TargetRequirements,
-    make_prior_from_rays,
-    make_prior_from_views,
     compute_box_exit,
+    compute_semantic_features,
+    compute_surface_distances,
     concatenate_targets,
-    select_far_views,
     hold_out,
     make_observer_targets,
+    make_prior_from_rays,
+    make_prior_from_views,
     make_probes,
     make_rotated_directions,
-    compute_semantic_features,
-    split_validation,
-    split_views,
-    compute_surface_distances,
     make_targets_from_probes,
     make_targets_from_rays,
     make_targets_from_views,
+    select_far_views,
+    split_validation,
+    split_views,
 )
 from nerg_mi.train.gaze_log_density import LikelihoodTrainer
-from nerg_mi.train.gaze_product import ProductTrainer, evaluate_gaze_density, extract_initial_weights, make_gaze_config, match_trunk_config
+from nerg_mi.train.gaze_product import (
+    ProductTrainer,
+    evaluate_gaze_density,
+    extract_initial_weights,
+    make_gaze_config,
+    match_trunk_config,
+)
 from nerg_mi.train.gaze_settings import GazeSettings, ProbeSettings
 from nerg_mi.train.geometry import DEFAULT_DEPTH as NOWHERE_FAR
 from nerg_mi.train.geometry import TrainingGeometry, load_field_geometry
@@ -62,8 +68,9 @@ from .looks import SMALL as PLAIN
 
 @pytest.fixture
 def drawn():
-    """Three probes of four directions, the first of the whole sphere, the others of parts of it; and that on the
-    device."""
+    """Three probes of four directions, the first over the whole sphere, the others over parts; as targets and on the
+    device.
+    """
     rng = np.random.default_rng(0)
     directions = rng.normal(size=(3, 4, 3))
     directions /= np.linalg.norm(directions, axis=2, keepdims=True)
@@ -74,27 +81,27 @@ def drawn():
     return data, TargetArrays(data, ns)
 
 
-def test_a_batch_is_of_its_probes_and_their_directions(drawn):
+def test_a_batch_gathers_probes_and_directions(drawn):
     data, arrays = drawn
     probe, which = np.array([2, 0, 2]), np.array([[3, 1], [0, 0], [1, 2]])
-    batch = arrays.batch(probe, which)
+    batch = arrays.gather_batch(probe, which)
     towards, distance = data.directions[probe[:, None], which], data.distance[probe[:, None], which]
     np.testing.assert_allclose(batch.p_o.numpy().T, data.positions[probe], rtol=1e-6)
     np.testing.assert_allclose(batch.r_o.numpy().T, towards.reshape(-1, 3), rtol=1e-6)
     ends = data.positions[probe][:, None] + towards * distance[..., None]
     np.testing.assert_allclose(batch.p_od.numpy().T, ends.reshape(-1, 3), rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(batch.truth.numpy(), data.truth[probe[:, None], which].ravel(), rtol=1e-6)
-    np.testing.assert_array_equal(batch.escaped.numpy(), data.escaped[probe[:, None], which].ravel())
-    np.testing.assert_allclose(batch.extent.numpy(), data.extent[probe], rtol=1e-6)
+    np.testing.assert_array_equal(batch.misses.numpy(), data.misses[probe[:, None], which].ravel())
+    np.testing.assert_allclose(batch.solid_angle.numpy(), data.solid_angle[probe], rtol=1e-6)
     features = np.stack([f.numpy() for f in batch.semantic], axis=-1)
     np.testing.assert_array_equal(features, data.semantic[probe[:, None], which].reshape(-1, 2))
 
 
 @pytest.mark.parametrize("known", [False, True])
-def test_only_views_are_given_what_they_show(drawn, known):
-    """A part of the sphere has the truth's integral, or one; the whole sphere and what is zero stay as they are."""
+def test_only_views_are_conditioned(drawn, known):
+    """A part of the sphere has the integral of the truth, or one; the whole sphere and zeros are unchanged."""
     data, arrays = drawn
-    batch = arrays.batch(np.arange(3), np.tile(np.arange(4), (3, 1)))
+    batch = arrays.gather_batch(np.arange(3), np.tile(np.arange(4), (3, 1)))
     density = np.array([[1.0, 2, 3, 4], [0, 1, 0, 2], [0, 0, 0, 0]])
     flat = lambda v: ns.Float(v.ravel().astype(np.float32))
     got = batch.condition_on_view(flat(density), flat(data.truth) if known else None).numpy().reshape(3, 4)
@@ -102,7 +109,7 @@ def test_only_views_are_given_what_they_show(drawn, known):
     np.testing.assert_allclose(got, [density[0], density[1] * goal / (0.75 * 1.5), density[2]], rtol=1e-5)
 
 
-def test_without_an_observer_there_is_nothing_to_gather():
+def test_targets_without_observers_are_refused():
     none = np.zeros((0, 4), np.float32)
     with pytest.raises(NergError, match="no probes to train on"):
         TargetArrays(GazeTargets(np.zeros((0, 3)), np.zeros((0, 4, 3)), none, none, none.astype(bool)), ns)
@@ -111,8 +118,8 @@ def test_without_an_observer_there_is_nothing_to_gather():
 # ---- The blind density: of rays by person or by ray, and put together from views ----
 
 
-def test_the_blind_density_counts_people_or_rays():
-    """Nine rays of one person, one of another, elsewhere: the ratio of the kernels' peaks."""
+def test_prior_weights_participants_or_rays():
+    """Nine rays of one participant, one of another, elsewhere: the ratio of the kernel peaks."""
     direction = np.array(9 * [[1.0, 0, 0]] + [[0, 1.0, 0]])
     rays = Rays(np.arange(10.0), np.array(9 * [0] + [1]), ("a", "b"), np.zeros((10, 3)), direction, np.ones(10))
     for weights, ratio in (("equal", 9), ("person", 1)):
@@ -123,56 +130,60 @@ def test_the_blind_density_counts_people_or_rays():
         assert x / y == pytest.approx(expected, rel=0.02), weights
 
 
-def test_kernels_that_the_table_cannot_show_are_refused():
-    """Of one much narrower than a texel nothing would be left but the uniform part."""
+def test_kernels_too_narrow_for_the_table_are_refused():
+    """A kernel much narrower than a texel would leave only the uniform part."""
     rays = Rays(np.arange(3.0), np.zeros(3), ("a",), np.zeros((3, 3)), np.tile([0.6, 0.0, 0.8], (3, 1)), np.ones(3))
     assert np.exp(make_prior_from_rays(rays, 64, kappa=400.0)).max() > 40  # 1/sr; its peak is 400 / 2π
     with pytest.raises(NergError, match="64.*1660"):
         make_prior_from_rays(rays, 64, kappa=1700.0)
 
 
-def test_it_is_in_the_frame_of_the_place():
-    """Everybody looks along x, which is y in a place that lies a quarter turn from the rays."""
+def test_prior_is_in_the_frame_of_the_geometry():
+    """All look along x, which is y in a geometry rotated by a quarter turn."""
     direction = np.tile([1.0, 0, 0], (10, 1))
     rays = Rays(np.arange(10.0), np.zeros(10), ("a",), np.zeros((10, 3)), direction, np.ones(10))
-    turned = TrainingGeometry(None, BOX, "none", align=Similarity([[0, -3, 0, 1], [3, 0, 0, 2], [0, 0, 3, 0], [0, 0, 0, 1]]))
+    turned = TrainingGeometry(
+        None, BOX, "none", align=Similarity([[0, -3, 0, 1], [3, 0, 0, 2], [0, 0, 3, 0], [0, 0, 0, 1]])
+    )
     for place, towards in ((None, (1, 0, 0)), (turned, (0, 1, 0))):
         peak = table_directions(32)[np.argmax(make_prior_from_rays(rays, 32, place).ravel())]
         assert peak @ towards > 0.99
 
 
-def test_a_blind_law_is_put_together_from_its_parts():
-    """No view shows more than a sixth of the sphere; the law does not depend on the position."""
+def test_prior_is_estimated_from_partial_views():
+    """No view covers more than a sixth of the sphere; the density does not depend on the position."""
     law = lambda p, d: np.exp(1.5 * d[:, 0] - 4 * (d[:, 2] + 0.1) ** 2)
     table = make_prior_from_views(around(60, density=law), 24)
     ns, d = namespace("llvm"), fibonacci_directions(4000)
-    found = np.exp(np.array(interpolate_table(ns.Float(table.ravel()), 24, ns.Array3f(np.ascontiguousarray(d.T, np.float32)))))
-    assert 4 * np.pi * found.mean() == pytest.approx(1, abs=1e-3)
+    result = np.exp(
+        np.array(interpolate_table(ns.Float(table.ravel()), 24, ns.Array3f(np.ascontiguousarray(d.T, np.float32))))
+    )
+    assert 4 * np.pi * result.mean() == pytest.approx(1, abs=1e-3)
     seen = np.abs(d[:, 2]) < 0.7
-    found, expected = (v[seen] / v[seen].mean() for v in (found, law(None, d)))
-    assert np.corrcoef(found, expected)[0, 1] > 0.97 and np.mean(expected * np.log(expected / found)) < 0.05
+    result, expected = (v[seen] / v[seen].mean() for v in (result, law(None, d)))
+    assert np.corrcoef(result, expected)[0, 1] > 0.97 and np.mean(expected * np.log(expected / result)) < 0.05
 
 
-def test_one_view_counts_as_much_as_the_uniform_one_that_links_all():
-    """Closed form for one view of A sr, of density p in it: inside b is in proportion to p + 1/4π."""
+def test_one_view_weighs_as_much_as_the_uniform_view():
+    """Closed form for one view of A sr with density p: inside, b is proportional to p + 1/4π."""
     right = lambda p, d: (d[:, 1] < 0).astype(float)
     one = view(right, (0, 0, 1.6), (1.0, 0, 0))
     table = make_prior_from_views([one], 24)
     ns = namespace("llvm")
-    # Farther from the middle than densities are smoothed.
+    # Farther from the middle than the smoothing.
     angle = np.radians(32)
     d = np.array([[np.cos(angle), s * np.sin(angle), z] for s in (1, -1) for z in (-0.1, 0, 0.1)])
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     log = interpolate_table(ns.Float(table.ravel()), 24, ns.Array3f(np.ascontiguousarray(d.T, np.float32)))
-    found = np.exp(np.array(log)).reshape(2, 3).mean(axis=1)
+    result = np.exp(np.array(log)).reshape(2, 3).mean(axis=1)
     extent = pixel_solid_angles(LENS).sum()
-    assert found[0] / found[1] == pytest.approx(1 / (1 + 8 * np.pi / extent), rel=0.2)
+    assert result[0] / result[1] == pytest.approx(1 / (1 + 8 * np.pi / extent), rel=0.2)
 
 
 # ---- From rays to probes to targets: rotations, frames, fresh directions ----
 
 
-def test_sets_of_directions_are_turned_each_its_own_way():
+def test_direction_sets_have_independent_rotations():
     sets = make_rotated_directions(64, 3, np.random.default_rng(0))
     np.testing.assert_allclose(np.linalg.norm(sets, axis=-1), 1)
     np.testing.assert_allclose(
@@ -182,7 +193,7 @@ def test_sets_of_directions_are_turned_each_its_own_way():
 
 
 def test_rays_are_aligned_with_the_field(rays, wall):
-    """Half the size, turned and moved: the same supervision, in the field's frame."""
+    """Half the size, rotated and shifted: the same supervision in the frame of the field."""
     turn = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = 2 * turn, (0.3, -0.4, 0.5)
@@ -196,20 +207,20 @@ def test_rays_are_aligned_with_the_field(rays, wall):
     np.testing.assert_allclose(b.positions, a.positions, atol=1e-5)
     back = b.directions @ turn
     np.testing.assert_allclose(back, a.directions, atol=1e-6)
-    # The distances are those from the field's frame: traced again along the same rays.
+    # The distances are in the frame of the field: trace them again along the same rays.
     np.testing.assert_allclose(np.linalg.norm(b.directions, axis=-1), 1, atol=1e-6)
     inside = ~b.misses
     p = b.positions[:, None] + b.directions * b.distance[..., None]
     assert inside.any() and np.abs(p[inside][:, 0] - 1.5).max() < 0.02
 
 
-def test_kernels_that_vanish_between_all_directions_are_refused(rays, wall):
+def test_kernels_too_narrow_for_the_directions_are_refused(rays, wall):
     probes = place_probes(rays, 0.5, count=2, min_rays=8, kappa_rule="fixed", kappa=1e8, seed=1)
     with pytest.raises(NergError, match="16.*--kappa"):
         make_targets_from_probes(probes, wall, 16)
 
 
-def test_probes_are_placed_as_the_settings_say(rays):
+def test_probes_are_placed_according_to_the_settings(rays):
     probes = make_probes(rays, PROBES, seed=3)
     assert 1 <= len(probes) <= PROBES.count and (probes.kappa == PROBES.kappa).all()
     assert probes.radius == PROBES.radius
@@ -220,23 +231,25 @@ def test_probes_are_placed_as_the_settings_say(rays):
     assert np.diff(np.unique(lattice.queries[:, 1].round(9))) == pytest.approx(0.3)
 
 
-def test_the_blind_density_is_made_for_whoever_needs_it(rays, wall):
+def test_prior_is_only_made_if_required(rays, wall):
     assert make_targets_from_rays(rays, wall, PROBES).prior_table is None
     wide, narrow = (
-        make_targets_from_rays(rays, wall, replace(PROBES, mix_kappa=kappa), TargetRequirements(prior_rows=12)).prior_table
+        make_targets_from_rays(
+            rays, wall, replace(PROBES, mix_kappa=kappa), TargetRequirements(prior_rows=12)
+        ).prior_table
         for kappa in (10.0, 40.0)
     )
     assert wide.shape == narrow.shape == (12, 24)
-    # The log of a density: narrower kernels reach higher.
+    # The log of a density: narrower kernels have higher peaks.
     assert narrow.max() > wide.max() + 0.5
 
 
 # ---- Gaze fields that learn on a radiance field's features, and such that begin as its trunk ----
 
 
-def gaze_config(radiance, variant="emit_capture", **more):
-    """Of a gaze field that can begin as the radiance field."""
-    return replace(match_trunk_config(make_gaze_config("small", variant), radiance.config), **more)
+def gaze_config(radiance, variant="emit_capture", **options):
+    """Configuration of a gaze field that can be initialised from the radiance field."""
+    return replace(match_trunk_config(make_gaze_config("small", variant), radiance.config), **options)
 
 
 def place_of(field):
@@ -266,7 +279,7 @@ def test01_the_trunk_gives_the_fields_features(radiance):
     assert len(got) == 5
     for a, b in zip(got, expected):
         assert np.allclose(np.array(a), np.array(b), atol=1e-6)
-    with pytest.raises(ValueError, match="must have its sizes"):
+    with pytest.raises(ValueError, match="--size"):
         extract_initial_weights(radiance, replace(gaze.config, geometry=6))
 
 
@@ -294,7 +307,7 @@ def test04_frozen_trunks_stay_and_others_move(rgb, radiance, rays, frozen):
     data = make_targets_from_rays(rays, place_of(radiance), PROBES, TargetRequirements(semantic="accumulated"))
     assert data.semantic.shape == (*data.truth.shape, 5)
     trainer = ProductTrainer(
-        data, BOX, config, GazeSettings(steps=30, frozen=frozen), ns, initial_field=extract_initial_weights(radiance, config)
+        data, BOX, config, GazeSettings(steps=30, frozen=frozen), ns, initial=extract_initial_weights(radiance, config)
     )
     before = trainer.evaluate(data).loss
     while trainer.progress < 1:
@@ -308,7 +321,7 @@ def test04_frozen_trunks_stay_and_others_move(rgb, radiance, rays, frozen):
 @pytest.mark.parametrize("cutoff", [None, 0.0, 0.05])
 @pytest.mark.parametrize("kind", ["snapshot", "accumulated"])
 def test_features_of_training_are_those_of_rendering(rgb, radiance, tmp_path, monkeypatch, kind, cutoff):
-    """Whatever the picture's colours are cut off at: a field must be shown what it was trained on."""
+    """Independent of the colour cut-off of the picture: rendering must provide the features of the training."""
     save_radiance(radiance, tmp_path / "field.safetensors", {})
     config = gaze_config(radiance, "emit", semantic=kind)
     save_gaze(GazeField.random(config, BOX, namespace("llvm"), 3), tmp_path / "gaze.safetensors", {})
@@ -318,29 +331,29 @@ def test_features_of_training_are_those_of_rendering(rgb, radiance, tmp_path, mo
     eye = np.array([0.1, -1.9, 1.6])
     to_world = look_at(rgb, eye.tolist(), [0, 0, 1.4], [0, 0, 1])
     sensor = {**camera(rgb, size=8, near_clip=1e-4), "to_world": to_world}
-    scene, given = rgb.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor}), []
+    scene, options = rgb.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor}), []
     made = scene.integrator()
     if cutoff is None:
         assert made.settings == default_march_settings(made.medium)
     field = made.gaze.field
     evaluate = field.evaluate
-    # Kept as the render hands them over, and evaluated with the picture.
-    monkeypatch.setattr(field, "evaluate", lambda *a: (given.append([rgb.Float(f) for f in a[4]]), evaluate(*a))[1])
+    # Recorded from the render, and evaluated with the picture.
+    monkeypatch.setattr(field, "evaluate", lambda *a: (options.append([rgb.Float(f) for f in a[4]]), evaluate(*a))[1])
     picture = np.array(rgb.render(scene, spp=1)).reshape(64, -1)[:, -5:]
-    rendered = np.stack([np.array(f) for f in given[0]], axis=-1)
-    met = picture[:, 0] >= 0.5
-    way = picture[:, 1:4] - eye
-    distance = np.linalg.norm(way, axis=1)
+    rendered = np.stack([np.array(f) for f in options[0]], axis=-1)
+    hits = picture[:, 0] >= 0.5
+    direction = picture[:, 1:4] - eye
+    distance = np.linalg.norm(direction, axis=1)
     trained = compute_semantic_features(
         load_field_geometry(tmp_path / "field.safetensors", namespace("llvm")),
-        np.broadcast_to(eye, way.shape)[met],
-        (way / distance[:, None])[met],
-        distance[met],
+        np.broadcast_to(eye, direction.shape)[hits],
+        (direction / distance[:, None])[hits],
+        distance[hits],
         kind,
     )
-    assert met.sum() > 30 and np.ptp(rendered[met]) > 0.1
-    # Half precision, and directions that were read back from positions.
-    np.testing.assert_allclose(rendered[met], trained, atol=2e-3 * np.abs(trained).max())
+    assert hits.sum() > 30 and np.ptp(rendered[hits]) > 0.1
+    # Half precision, and directions recovered from positions.
+    np.testing.assert_allclose(rendered[hits], trained, atol=2e-3 * np.abs(trained).max())
 
 
 # ---- What a training leaves out: positions and people of a test, zones of a validation, views near either ----
@@ -348,27 +361,29 @@ def test_features_of_training_are_those_of_rendering(rgb, radiance, tmp_path, mo
 
 def test_held_out_positions_are_purged():
     rays = looking_at((1.5, 0, 1.2), 3000, spread=6.0)
-    kept, account = hold_out(rays, 0.25, zones=2, positions=10, min_rays=8)
+    selected, account = hold_out(rays, 0.25, zones=2, positions=10, min_rays=8)
     centres = np.array(account["centres"])
-    apart = np.linalg.norm(kept.origin[:, None] - centres[None], axis=2)
-    assert apart.min() > 0.5 and len(kept) == account["rays_to_train"] < len(rays)
+    distances = np.linalg.norm(selected.origin[:, None] - centres[None], axis=2)
+    assert distances.min() > 0.5 and len(selected) == account["rays_to_train"] < len(rays)
     assert json.loads(json.dumps(account)) == account
 
 
 def test_people_and_positions_are_held_out():
     rays = looking_at((1.5, 0, 1.2), 4000, spread=6.0)
-    kept, account = hold_out(rays, 0.25, zones=2, positions=10, min_rays=8, participant_fraction=0.5)
-    assert len(account["people"]) == 1 and set(np.unique(kept.person)) == {1 - rays.persons.index(account["people"][0])}
-    assert np.linalg.norm(kept.origin[:, None] - np.array(account["centres"])[None], axis=2).min() > 0.5
+    selected, account = hold_out(rays, 0.25, zones=2, positions=10, min_rays=8, participant_fraction=0.5)
+    assert len(account["people"]) == 1 and set(np.unique(selected.person)) == {
+        1 - rays.persons.index(account["people"][0])
+    }
+    assert np.linalg.norm(selected.origin[:, None] - np.array(account["centres"])[None], axis=2).min() > 0.5
 
 
-def test_watched_views_are_far_from_the_others():
+def test_validation_views_are_far_from_training_views():
     views = around(80)
     learn, watched = split_views(views, 3, 0.3, seed=4)
     assert 8 <= len(watched) <= 12 and len(learn) < 80 - len(watched)
     centres = np.array([v.camera.center for v in watched])
     assert all(np.linalg.norm(centres - v.camera.center, axis=1).min() > 0.3 for v in learn)
-    with pytest.raises(ValueError, match="--zones"):
+    with pytest.raises(ValueError, match="--validation-zones"):
         split_views(views, 3, 5.0)
     moved = Similarity([[2, 0, 0, 1], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]])
     at = (views[0].camera.center - [1, 0, 0]) / 2
@@ -377,11 +392,11 @@ def test_watched_views_are_far_from_the_others():
 
 
 def in_a_row(count):
-    """Cameras a metre apart, on a line."""
+    """Cameras on a line, one metre apart."""
     return [view(lobe, (float(k), 0, 1.6), (0, 1, 0), name=f"v{k}") for k in range(count)]
 
 
-def test_as_many_views_must_be_left_as_a_quarter():
+def test_a_quarter_of_the_views_must_remain():
     views = in_a_row(12)
     for distance in np.arange(0.5, 12.0):
         try:
@@ -393,15 +408,15 @@ def test_as_many_views_must_be_left_as_a_quarter():
     assert left < 3
 
 
-def test_zones_of_rays_are_watched_with_all_rays_around_them():
+def test_validation_zones_use_all_rays_around_them():
     double = TrainingGeometry(None, BOX, "none", align=Similarity(np.diag([2.0, 2, 2, 1])))
     settings = GazeSettings(steps=1, zones=2, validation_probes=6)
     for place in (NOWHERE, double):
-        eyes = place.points_to_field(RAYS.origin[::60])
-        views = [view(lobe, eye, (1, 0, 0), name=f"v{k}") for k, eye in enumerate(eyes)]
+        observers = place.points_to_field(RAYS.origin[::60])
+        views = [view(lobe, eye, (1, 0, 0), name=f"v{k}") for k, eye in enumerate(observers)]
         split = split_validation(Supervision(RAYS, views), place, settings, PROBES)
-        apart = np.linalg.norm(split.training.rays.origin[:, None] - split.centres, axis=2)
-        assert apart.min() > 2 * PROBES.radius and split.rays_held_out == len(RAYS) - len(split.training.rays) > 0
+        distances = np.linalg.norm(split.training.rays.origin[:, None] - split.centres, axis=2)
+        assert distances.min() > 2 * PROBES.radius and split.rays_held_out == len(RAYS) - len(split.training.rays) > 0
         assert split.validation.rays is RAYS and not split.validation.views
         near = place.points_to_field(split.centres)
         left = {v.name for v in split.training.views}
@@ -411,7 +426,7 @@ def test_zones_of_rays_are_watched_with_all_rays_around_them():
         assert split.views_held_out == len(views) - len(left) >= 2
 
 
-def test_of_views_alone_some_are_watched():
+def test_views_alone_are_split_for_validation():
     split = split_validation(
         Supervision(None, around(80)), NOWHERE, GazeSettings(steps=1, zones=3), replace(PROBES, radius=0.15)
     )
@@ -424,7 +439,9 @@ def test_of_views_alone_some_are_watched():
 
 def test_the_support_is_of_all_rays_in_the_frame_of_the_place():
     rays = looking_at((1.5, 0, 1.2))
-    double = TrainingGeometry(None, BOX, "none", align=Similarity([[2, 0, 0, 1], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]))
+    double = TrainingGeometry(
+        None, BOX, "none", align=Similarity([[2, 0, 0, 1], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]])
+    )
     plain, moved = (Supervision(rays).make_support(0.5, place) for place in (NOWHERE, double))
     assert plain.radius == 0.5 and moved.radius == pytest.approx(1.0)
     assert plain.cells[:, 3].sum() == moved.cells[:, 3].sum() == 400
@@ -435,7 +452,7 @@ def test_the_support_is_of_all_rays_in_the_frame_of_the_place():
 # ---- Targets: what escapes, features for those who need them, two sets in one ----
 
 
-def test_what_escapes_is_counted_by_directions_and_by_gaze():
+def test_misses_are_counted_by_directions_and_by_gaze():
     rng = np.random.default_rng(0)
     directions, truth, escaped = rng.normal(size=(3, 5, 3)), rng.random((3, 5)), rng.random((3, 5)) < 0.4
     targets = GazeTargets(np.zeros((3, 3)), directions, truth, truth, escaped)
@@ -451,8 +468,10 @@ def test_features_are_those_of_a_radiance_field():
     targets = make_observer_targets(positions, directions, np.ones((1, 2)), NOWHERE)
     assert targets.semantic is None and (targets.distance == 2).all() and not targets.misses.any()
     assert targets.positions.dtype == targets.directions.dtype == targets.truth.dtype == np.float32
-    with pytest.raises(NergError, match="give one with --field"):
-        make_observer_targets(positions, directions, np.ones((1, 2)), NOWHERE, requirements=TargetRequirements(semantic="snapshot"))
+    with pytest.raises(NergError, match="--field"):
+        make_observer_targets(
+            positions, directions, np.ones((1, 2)), NOWHERE, requirements=TargetRequirements(semantic="snapshot")
+        )
 
 
 # ---- Views as targets: what they hold, likelihood and losses given a view, a law learnt from views ----
@@ -462,22 +481,24 @@ VIEW_TARGETS_PROBES = ProbeSettings(directions=512, radius=0.25, min_rays=1)
 
 def test_directions_and_densities_of_a_view():
     views = around(3)
-    found = make_targets_from_views(views, NOWHERE, VIEW_TARGETS_PROBES)
-    assert found.truth.shape == (3, 512) and found.prior_table is None
-    np.testing.assert_allclose(found.truth.mean(axis=1) * found.solid_angle, 1, rtol=1e-5)
-    np.testing.assert_allclose(found.solid_angle, pixel_solid_angles(LENS).sum(), rtol=1e-5)
+    result = make_targets_from_views(views, NOWHERE, VIEW_TARGETS_PROBES)
+    assert result.truth.shape == (3, 512) and result.prior_table is None
+    np.testing.assert_allclose(result.truth.mean(axis=1) * result.solid_angle, 1, rtol=1e-5)
+    np.testing.assert_allclose(result.solid_angle, pixel_solid_angles(LENS).sum(), rtol=1e-5)
     for k, v in enumerate(views):
-        np.testing.assert_allclose(found.positions[k], v.camera.center, atol=1e-6)
-        assert v.evaluate(found.directions[k])[1].all()
-        # Pixels of 6 degrees are averages: the law is as steep as it is.
-        given = lobe(v.camera.center, found.directions[k].astype(float))
-        given /= given.mean() * found.solid_angle[k]
-        assert np.corrcoef(given, found.truth[k])[0, 1] > 0.9
+        np.testing.assert_allclose(result.positions[k], v.camera.center, atol=1e-6)
+        assert v.evaluate(result.directions[k])[1].all()
+        # Pixels of 6 degrees average the steep density.
+        options = lobe(v.camera.center, result.directions[k].astype(float))
+        options /= options.mean() * result.solid_angle[k]
+        assert np.corrcoef(options, result.truth[k])[0, 1] > 0.9
 
 
-def test_the_likelihood_is_given_the_view():
-    """Drawn loss and validation against the field's own densities, divided by their sum over the view in NumPy."""
-    data = make_targets_from_views(around(4), NOWHERE, VIEW_TARGETS_PROBES, TargetRequirements.from_config(VIEW_TARGETS_SMALL))
+def test_the_likelihood_is_conditioned_on_the_view():
+    """Sampled loss and validation, compared with the field's densities normalised over the view in NumPy."""
+    data = make_targets_from_views(
+        around(4), NOWHERE, VIEW_TARGETS_PROBES, TargetRequirements.from_config(VIEW_TARGETS_SMALL)
+    )
     settings = GazeSettings(steps=1, loss="likelihood", integral=0.0, probes=4, directions=512, rays=2048, zones=0)
     trainer = LikelihoodTrainer(data, BOX, replace(VIEW_TARGETS_SMALL, mix=0.0, geometry="none"), settings, ns)
     field = trainer.initial_field
@@ -496,7 +517,7 @@ def test_the_likelihood_is_given_the_view():
 
 
 def test_the_losses_of_a_density_do_not_see_its_scale_through_views():
-    """But do for probes of rays that are beside them."""
+    """But they do for probes of rays in the same batch."""
     data = make_targets_from_views(around(3), NOWHERE, VIEW_TARGETS_PROBES)
     sphere = GazeTargets(
         data.positions,
@@ -506,15 +527,17 @@ def test_the_losses_of_a_density_do_not_see_its_scale_through_views():
         data.misses,
     )
     settings = GazeSettings(steps=1, zones=0)
-    of = lambda data, scale: ProductTrainer(data, BOX, replace(PLAIN, emit_scale=scale), settings, ns).evaluate(data)
-    np.testing.assert_allclose(of(data, 0.1), of(data, 0.7), rtol=1e-4, atol=1e-6)
-    assert of(data, 0.1).integral == pytest.approx(1, abs=1e-5)
+    source = lambda data, scale: ProductTrainer(data, BOX, replace(PLAIN, emit_scale=scale), settings, ns).evaluate(
+        data
+    )
+    np.testing.assert_allclose(source(data, 0.1), source(data, 0.7), rtol=1e-4, atol=1e-6)
+    assert source(data, 0.1).integral == pytest.approx(1, abs=1e-5)
     both = concatenate_targets(sphere, data)
     assert both.truth.shape == (6, 512) and both.solid_angle[0] == pytest.approx(4 * np.pi)
     for scale in (0.1, 0.7):
-        parts = np.array(of(sphere, scale)), np.array(of(data, scale))
-        np.testing.assert_allclose(of(both, scale), np.mean(parts, axis=0), rtol=1e-4, atol=1e-6)
-    assert of(sphere, 0.7).mae > 2 * of(sphere, 0.1).mae
+        parts = np.array(source(sphere, scale)), np.array(source(data, scale))
+        np.testing.assert_allclose(source(both, scale), np.mean(parts, axis=0), rtol=1e-4, atol=1e-6)
+    assert source(sphere, 0.7).mae > 2 * source(sphere, 0.1).mae
 
 
 @pytest.mark.nightly
@@ -534,56 +557,62 @@ def test_a_law_is_learnt_from_views_alone_and_holds_around():
     )
     config = replace(VIEW_TARGETS_SMALL, mix=0.05, geometry="none", prior=16)
     views = Supervision(None, around(90))
-    field, about = train(NOWHERE, settings, config, replace(VIEW_TARGETS_PROBES, radius=0.1), views)
-    assert about["rays"] == 0 and about["salience_views"] == 90 and about["validation"]["views_held_out"] >= 10
+    field, provenance = train(NOWHERE, settings, config, replace(VIEW_TARGETS_PROBES, radius=0.1), views)
+    assert (
+        provenance["rays"] == 0
+        and provenance["salience_views"] == 90
+        and provenance["validation"]["views_held_out"] >= 10
+    )
     from nerg_mi.evaluation.gaze import FieldDensity
 
     rng, d = np.random.default_rng(5), fibonacci_directions(1024)
     positions = rng.uniform((-0.9, -0.9, 1.45), (0.9, 0.9, 1.75), (8, 3))
     truth = np.stack([lobe(p, d) for p in positions])
-    found = FieldDensity(field, None)(positions, d)
-    # Of 1,024 directions and of an integral that errs by 2e-3 at most, as a rule.
-    np.testing.assert_allclose(4 * np.pi * found.mean(axis=1), 1, atol=4e-3)
+    result = FieldDensity(field, None)(positions, d)
+    # Error of 1,024 directions and of an integral accurate to 2e-3.
+    np.testing.assert_allclose(4 * np.pi * result.mean(axis=1), 1, atol=4e-3)
     kld = lambda q: np.mean(truth * np.log(truth / q)) * 4 * np.pi
-    cc = np.mean([np.corrcoef(a, b)[0, 1] for a, b in zip(truth, found)])
+    cc = np.mean([np.corrcoef(a, b)[0, 1] for a, b in zip(truth, result)])
     assert kld(np.full(1024, 1 / (4 * np.pi))) > 0.8
-    assert kld(found) < 0.25 and cc > 0.85
+    assert kld(result) < 0.25 and cc > 0.85
 
 
 def test_rays_and_views_train_one_field():
     both = Supervision(looking_at((1.5, 0.4, 1.2)), around(6))
     settings = GazeSettings(steps=4, probes=4, directions=32, zones=1, validation_probes=4, num_validations=2)
     probes = ProbeSettings(radius=0.25, count=8, cap=64, min_rays=4, directions=64)
-    for config, more in ((PLAIN, {}), (VIEW_TARGETS_SMALL, {"loss": "likelihood"})):
-        field, about = train(NOWHERE, replace(settings, **more), config, probes, both)
-        assert about["rays"] == 400 and about["salience_views"] == 6 and about["probes_made"] == 14
+    for config, options in ((PLAIN, {}), (VIEW_TARGETS_SMALL, {"loss": "likelihood"})):
+        field, provenance = train(NOWHERE, replace(settings, **options), config, probes, both)
+        assert provenance["rays"] == 400 and provenance["salience_views"] == 6 and provenance["probes_made"] == 14
         assert all(np.isfinite(np.array(v)).all() for v in field.parameters().values())
 
 
 # ---- Where observers meet surfaces: what escapes ends on the box, or at the depth around it ----
 
 
-def test_what_meets_nothing_ends_where_the_box_ends(wall):
+def test_misses_end_at_the_box(wall):
     positions = np.array([[-0.5, 0, 1.6], [0.2, -0.4, 1.5]])
     directions = np.tile(fibonacci_directions(256), (2, 1, 1))
     distance, escaped = compute_surface_distances(wall, positions, directions)
     p = positions[:, None] + directions * distance[..., None]
-    # The wall is met from x = 1.5 on, everything else ends on the box.
+    # The wall is at x = 1.5, everything else ends on the box.
     assert np.abs(p[~escaped][:, 0] - 1.5).max() < 0.02
     on_box = np.minimum(np.abs(p - BOX.lower), np.abs(p - BOX.upper)).min(axis=-1)
     assert on_box[escaped].max() < 1e-5 and 0.5 < escaped.mean() < 0.95
 
 
 def test_holes_are_filled_with_the_depth_around_them(wall):
-    """Of directions that look past the wall, the ones beside it are as far as it is."""
+    """Directions that pass the wall take the depth of the neighbouring ones."""
     positions, directions = np.array([[-0.5, 0, 1.6]]), fibonacci_directions(1024)[None]
     plain, escaped = compute_surface_distances(wall, positions, directions)
     filled, same = compute_surface_distances(wall, positions, directions, fill_misses=True)
     np.testing.assert_array_equal(escaped, same)
     np.testing.assert_array_equal(filled[~escaped], plain[~escaped])
     assert plain[~escaped].min() <= filled[escaped].min() and filled[escaped].max() <= plain[~escaped].max()
-    nothing = np.array([[[-1.0, 0, 0], [-0.8, 0.6, 0]]])
-    np.testing.assert_array_equal(*(compute_surface_distances(wall, positions, nothing, fill_misses=f)[0] for f in (True, False)))
+    empty = np.array([[[-1.0, 0, 0], [-0.8, 0.6, 0]]])
+    np.testing.assert_array_equal(
+        *(compute_surface_distances(wall, positions, empty, fill_misses=f)[0] for f in (True, False))
+    )
 
 
 def test_without_geometry_everything_is_equally_far():

@@ -42,7 +42,7 @@ FAST = GazeSettings(
 
 
 def targets(probes=6, count=512, seed=0):
-    """Everyone looks at one point of a wall, from wherever they stand; the wall x = 1.5 is all there is."""
+    """All look at one point of a wall, from any position; the wall x = 1.5 is the only surface."""
     rng = np.random.default_rng(seed)
     positions = rng.uniform((-1, -1, 1.4), (1, 1, 1.8), (probes, 3))
     d = np.broadcast_to(fibonacci_directions(count), (probes, count, 3))
@@ -65,12 +65,12 @@ def targets(probes=6, count=512, seed=0):
 
 def testlog_mean_exp():
     x = np.array([[1.0, 2, 3], [900, 901, 899], [-500, -501, -502]])
-    found = np.array(log_mean_exp(namespace("llvm").Float(x.astype(np.float32).ravel()), 3))
-    np.testing.assert_allclose(found, x.max(1) + np.log(np.exp(x - x.max(1, keepdims=True)).mean(1)), rtol=1e-6)
+    result = np.array(log_mean_exp(namespace("llvm").Float(x.astype(np.float32).ravel()), 3))
+    np.testing.assert_allclose(result, x.max(1) + np.log(np.exp(x - x.max(1, keepdims=True)).mean(1)), rtol=1e-6)
 
 
 def test_the_loss_is_the_cross_entropy():
-    """Over all directions and many rays, what is drawn is what it stands for."""
+    """With all directions and many rays, the sampled loss converges."""
     data, ns = targets(3), namespace("llvm")
     trainer = LikelihoodTrainer(
         data, BOX, replace(SMALL, mix=0.0), replace(FAST, probes=3, directions=512, rays=8192), ns
@@ -84,11 +84,13 @@ def test_the_loss_is_the_cross_entropy():
 
 
 @pytest.mark.parametrize("mix", [0.0, 0.3])
-def test_a_validation_sees_the_density_that_the_field_has(mix):
-    """With its share of the blind density, and its integral, taken over the same directions."""
+def test_validation_uses_the_density_of_the_field(mix):
+    """With the prior weight and its integral over the same directions."""
     data, ns = targets(2), namespace("llvm")
     rows = np.random.default_rng(3).normal(size=(SMALL.prior, 2 * SMALL.prior))
-    data = replace(data, prior_table=make_prior_table(np.exp(rows).ravel(), SMALL.prior, ns, data.directions[0].astype(float)))
+    data = replace(
+        data, prior_table=make_prior_table(np.exp(rows).ravel(), SMALL.prior, ns, data.directions[0].astype(float))
+    )
     trainer = LikelihoodTrainer(data, BOX, replace(SMALL, mix=mix), replace(FAST, probes=2), ns)
     scores = trainer.evaluate(data)
     assert scores.integral == pytest.approx(1, abs=1e-4)
@@ -168,7 +170,7 @@ def test_one_probe_is_learnt(rays, wall):
 
 
 @pytest.mark.parametrize("loss, judged", [("paper", 0.5 + 0.25 + 0.01), ("code", 0.1 * 0.25 + 0.01)])
-def test_a_validation_is_judged_by_the_loss_that_is_trained(rays, wall, loss, judged):
+def test_validation_objective_is_the_training_loss(rays, wall, loss, judged):
     probes = place_probes(rays, 0.5, queries=[[-0.6, 0, 1.6]], min_rays=8, kappa_rule="fixed", kappa=20.0)
     settings = GazeSettings(steps=1, loss=loss, integral=2.0, zones=0)
     trainer = ProductTrainer(make_targets_from_probes(probes, wall, 64), BOX, PRODUCT, settings, ns)
@@ -183,7 +185,7 @@ def test_a_validation_is_judged_by_the_loss_that_is_trained(rays, wall, loss, ju
 def test_the_fast_path_is_the_field_product(variant, activation):
     ns, rng = namespace("llvm"), np.random.default_rng(3)
     field = GazeField.random(replace(PRODUCT, variant=variant, activation=activation, emit_scale=0.3), BOX, ns, 5)
-    # Random tables are near zero: features of size one show an index that is wrong.
+    # Random tables are near zero; features of size one reveal wrong indices.
     field.set_parameters({"grid.table": ns.Float(rng.normal(size=len(field.grid.table)).astype(np.float32))})
     B, D = 3, 7
     p_o, p_od = rng.uniform(0, 1.9, (3, B)), rng.uniform(-0.5, 2.5, (3, B * D))
@@ -202,6 +204,8 @@ def test_gradients_reach_what_the_variant_uses_product(variant):
     parameters = gaze_product.select_trainable_parameters(config, GazeField.random(config, BOX, ns, 5).parameters())
     dr.enable_grad(parameters)
     p_o, r_o = ns.Array3f([0.1], [0.2], [1.0]), ns.Array3f([0, 0.6], [0.8, 0], [0.6, 0.8])
-    dr.backward(dr.sum(evaluate_gaze_density(config, BOX, parameters, ns.Array3f([0.1, 1], [1, 0.2], [2, 2]), p_o, r_o, ns)))
+    dr.backward(
+        dr.sum(evaluate_gaze_density(config, BOX, parameters, ns.Array3f([0.1, 1], [1, 0.2], [2, 2]), p_o, r_o, ns))
+    )
     for name, value in parameters.items():
         assert np.any(np.array(dr.grad(value)) != 0), name

@@ -90,8 +90,9 @@ def test_constants_give_numbers(densities, value, Float):
 
 @pytest.mark.parametrize("Float", [ns.Float32, ns.Float64])
 def test_negative_predictions_count_as_zero_in_the_divergence(densities, Float):
-    """A linear activation predicts both signs: the divergence is that of the clamped prediction, and moves only what is
-    positive."""
+    """A linear activation predicts both signs: the divergence is that of the clamped prediction, and moves only
+    positive values.
+    """
     truth, guess = densities
     guess = guess - 0.4
     assert (guess < 0).any(axis=1).all() and (guess > 0).any(axis=1)[:3].all()
@@ -107,11 +108,11 @@ def test_negative_predictions_count_as_zero_in_the_divergence(densities, Float):
 
 def test_refusals():
     x = ns.Float(np.ones(12))
-    with pytest.raises(ValueError, match="do not fit"):
+    with pytest.raises(ValueError, match="do not match"):
         compute_gaze_loss(x, x, 5)
     with pytest.raises(ValueError, match="solid angles"):
         compute_gaze_loss(x, x, 4, ns.Float(1, 2))
-    with pytest.raises(ValueError, match="every weight"):
+    with pytest.raises(ValueError, match="all weights"):
         compute_gaze_loss(x, x, 4, kld=0, cc=0, mae=0)
 
 
@@ -121,7 +122,9 @@ def test_refusals():
 def test_the_learning_rate_is_held_and_then_falls_to_its_last():
     s = GazeSettings(steps=10, learning_rate=0.02, lr_final_ratio=0.04, lr_hold_fraction=0.25)
     assert s.learning_rate_at(0) == s.learning_rate_at(0.25) == 0.02
-    assert s.learning_rate_at(0.625) == pytest.approx(0.02 * 0.2) and s.learning_rate_at(1) == s.learning_rate_at(1.5) == pytest.approx(0.02 * 0.04)
+    assert s.learning_rate_at(0.625) == pytest.approx(0.02 * 0.2) and s.learning_rate_at(1) == s.learning_rate_at(
+        1.5
+    ) == pytest.approx(0.02 * 0.04)
 
 
 @pytest.mark.parametrize("wrong", [{}, {"steps": 1, "minutes": 1.0}, {"steps": 1, "loss": "mse"}])
@@ -158,8 +161,10 @@ HITS = TrainingGeometry(None, BOX, "hits")
 SCENE = TrainingGeometry(None, BOX, "scene")
 
 
-def test_there_are_three():
-    assert tuple(load_recipes())[:3] == ("default", "small", "paper") and get_recipe().name == DEFAULT_RECIPE == "default"
+def test_three_recipes_exist():
+    assert (
+        tuple(load_recipes())[:3] == ("default", "small", "paper") and get_recipe().name == DEFAULT_RECIPE == "default"
+    )
     with pytest.raises(NergError, match='one of default, small, paper.*, got "best"'):
         get_recipe("best")
     with pytest.raises(ValueError, match="already"):
@@ -167,7 +172,7 @@ def test_there_are_three():
 
 
 @pytest.mark.parametrize("name", load_recipes())
-def test_each_is_whole(name):
+def test_recipes_are_complete(name):
     recipe = get_recipe(name)
     plan = recipe.make_plan(SCENE, FieldOptions(variant="emit"))
     assert plan.config.variant == "emit" and plan.trainer is recipe.trainer and plan.initial_arrays is None
@@ -176,22 +181,22 @@ def test_each_is_whole(name):
     assert recipe.make_plan(SCENE, views_only=True).settings.patience == 10
 
 
-def test_the_default_one_looks_longer_where_there_are_views_alone():
+def test_default_recipe_has_more_patience_with_views_only():
     plain, alone = (get_recipe().make_plan(SCENE, views_only=alone).settings for alone in (False, True))
     assert plain.zones == 0 and alone.zones == 3 and alone.steps > plain.steps
-    # The others' lengths stay their own.
+    # Other recipes keep their length.
     assert all("steps" not in get_recipe(name).views_only_settings for name in ("small", "paper"))
 
 
-def test_a_log_density_is_told_of_its_place():
-    told = lambda place: (c := get_recipe().make_plan(place).config) and (c.geometry, c.escaped)
-    assert told(SCENE) == ("surface", "constant") and told(HITS) == ("surface", "nearest")
-    assert told(NOWHERE) == ("none", "constant")
+def test_log_density_depends_on_the_geometry_kind():
+    messages = lambda place: (c := get_recipe().make_plan(place).config) and (c.geometry, c.escaped)
+    assert messages(SCENE) == ("surface", "constant") and messages(HITS) == ("surface", "nearest")
+    assert messages(NOWHERE) == ("none", "constant")
     with pytest.raises(NergError, match="needs surfaces"):
         get_recipe("small").make_plan(NOWHERE)
 
 
-def test_without_surfaces_folds_choose_between_capture_and_both_unless_told_otherwise():
+def test_without_surfaces_folds_select_the_variant():
     def variants(place, *choices, recipe="default"):
         plan = get_recipe(recipe).make_plan(place, *choices)
         return [c.variant for c in (plan.config, *plan.alternatives)]
@@ -203,7 +208,7 @@ def test_without_surfaces_folds_choose_between_capture_and_both_unless_told_othe
     assert variants(SCENE, recipe="small") == ["emit_capture"]
 
 
-def test_what_is_chosen_arrives():
+def test_options_reach_the_plan():
     choices = FieldOptions(activation="exp", size="small", normalized=True)
     config = get_recipe("paper").make_plan(SCENE, choices).config
     assert config.activation == "exp" and config.normalized
@@ -216,32 +221,34 @@ def test_what_is_chosen_arrives():
 @pytest.mark.parametrize(
     "given, steps, minutes", [({}, 600, None), ({"minutes": 2.0}, None, 2.0), ({"steps": 5}, 5, None)]
 )
-def test_of_minutes_and_steps_the_one_that_is_given_counts(given, steps, minutes):
+def test_minutes_and_steps_override_each_other(given, steps, minutes):
     settings = get_recipe("small").make_gaze_settings(given)
     assert (settings.steps, settings.minutes) == (steps, minutes)
 
 
 @pytest.mark.parametrize("name, takes", [(DEFAULT_RECIPE, False), ("small", True), ("paper", True)])
-def test_what_a_recipe_does_not_take_is_refused(name, takes):
+def test_unsupported_options_are_refused(name, takes):
     recipe = get_recipe(name)
     recipe.check_options([])
     if takes:
         recipe.check_options(["loss", "semantic", "begin"])
         return
-    with pytest.raises(NergError, match="no choice of --loss, --begin field, but ways of its own; add --recipe small"):
+    with pytest.raises(NergError, match="does not support --loss, --init field; add --recipe small"):
         recipe.check_options(["loss", "begin"])
 
 
 def test_features_and_weights_are_those_of_a_radiance_field():
-    for wrong in ({"begin": True}, {"choices": FieldOptions(semantic="snapshot")}):
-        with pytest.raises(NergError, match="needs a radiance field: give it with --field"):
+    for wrong in ({"init_from_field": True}, {"options": FieldOptions(semantic="snapshot")}):
+        with pytest.raises(NergError, match="needs a radiance field; pass one with --field"):
             get_recipe("small").make_plan(SCENE, **wrong)
 
 
 def test_the_papers_recipe_is_fifty_epochs_at_a_rate_that_falls_from_the_start():
-    """Each probe is drawn fifty times; the rate is lower with every step, down to a tenth."""
+    """Each probe is drawn fifty times; the rate decreases with every step, down to a tenth."""
     recipe = get_recipe("paper")
     assert recipe.settings["steps"] * recipe.settings["probes"] == 50 * recipe.probes["count"]
     settings = GazeSettings(**recipe.settings)
     assert settings.learning_rate_at(0) == 1e-3 and settings.learning_rate_at(0.01) < 1e-3
-    assert settings.learning_rate_at(0.5) == pytest.approx(1e-3 * 0.1**0.5) and settings.learning_rate_at(1) == pytest.approx(1e-4)
+    assert settings.learning_rate_at(0.5) == pytest.approx(1e-3 * 0.1**0.5) and settings.learning_rate_at(
+        1
+    ) == pytest.approx(1e-4)

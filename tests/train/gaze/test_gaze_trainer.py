@@ -20,7 +20,7 @@ from nerg_mi.train.gaze_log_density import compute_elevation_density, make_eleva
 from nerg_mi.train.gaze_product import ProductTrainer
 from nerg_mi.train.gaze_run import make_targets
 from nerg_mi.train.gaze_settings import GazeSettings
-from nerg_mi.train.gaze_trainer import GazeRunFile, GazeTrainer, StateSettings, refit, fit_with_validation
+from nerg_mi.train.gaze_trainer import GazeRunFile, GazeTrainer, StateSettings, fit_with_validation, refit
 
 from .looks import (
     BOX,
@@ -49,8 +49,8 @@ def targets_fit():
 
 
 @pytest.mark.parametrize("patience, looks", [(3, 4), (1, 2), (0, 10)])
-def test_a_fit_ends_when_looking_has_been_in_vain_for_long_enough(wall, patience, looks):
-    """Nothing is learnt at a rate of next to nothing: the first look is the best, and ``patience`` more are taken."""
+def test_early_stopping(wall, patience, looks):
+    """With a rate of almost zero nothing is learned: the first validation is the best, and ``patience`` more follow."""
     settings = GazeSettings(
         steps=20,
         num_validations=10,
@@ -62,27 +62,39 @@ def test_a_fit_ends_when_looking_has_been_in_vain_for_long_enough(wall, patience
         learning_rate=1e-30,
         refit=False,
     )
-    _, about = train(wall, settings, SMALL)
-    v = about["validation"]
+    _, provenance = train(wall, settings, SMALL)
+    v = provenance["validation"]
     assert [h["steps"] for h in v["history"]] == [2 * k for k in range(1, looks + 1)]
-    assert v["best_step"] == 2 and about["steps"] == 2 * looks
+    assert v["best_step"] == 2 and provenance["steps"] == 2 * looks
 
 
-def test_a_fit_that_nobody_watches_ends_with_its_schedule(targets_fit):
-    told = []
-    fit = fit_with_validation(targets_fit, None, BOX, planned(SMALL, replace(PRODUCT, zones=0)), ns, 1.0, NO_FILE, told.append)
+def test_a_fit_without_validation_ends_with_its_schedule(targets_fit):
+    messages = []
+    fit = fit_with_validation(
+        targets_fit, None, BOX, planned(SMALL, replace(PRODUCT, zones=0)), ns, 1.0, NO_FILE, messages.append
+    )
     assert (fit.best_step, fit.schedule, fit.scores, fit.history, fit.interrupted) == (16, 16, None, [], False)
-    assert [p.steps for p in told] == list(range(1, 17)) and told[-1].fraction == 1 and {p.stage for p in told} == {"fit"}
+    assert (
+        [p.steps for p in messages] == list(range(1, 17))
+        and messages[-1].fraction == 1
+        and {p.stage for p in messages} == {"fit"}
+    )
 
 
-def test_the_second_fit_has_as_many_steps_as_were_best_along_the_same_schedule(targets_fit):
-    plan, told = planned(SMALL, PRODUCT), []
+def test_refit_uses_the_best_number_of_steps(targets_fit):
+    plan, messages = planned(SMALL, PRODUCT), []
     first = fit_with_validation(targets_fit, targets_fit, BOX, plan, ns, 1.0, NO_FILE, lambda progress: None)
     first.best_step = 5
-    second = refit(targets_fit, first, BOX, plan, ns, NO_FILE, told.append)
+    second = refit(targets_fit, first, BOX, plan, ns, NO_FILE, messages.append)
     assert second.trainer.steps == second.best_step == 5 and second.scores is first.scores
-    assert second.trainer.progress == pytest.approx(5 / 16) and [p.done for p in told] == [0.2, 0.4, 0.6, 0.8, 1.0]
-    # The same seed and targets: the first five steps of the first fit.
+    assert second.trainer.progress == pytest.approx(5 / 16) and [p.fraction for p in messages] == [
+        0.2,
+        0.4,
+        0.6,
+        0.8,
+        1.0,
+    ]
+    # The same seed and targets as the first five steps of the first fit.
     plain = planned(SMALL, replace(PRODUCT, steps=16))
     trainer = plain.trainer(targets_fit, BOX, SMALL, plain.settings, ns)
     for _ in range(5):
@@ -92,8 +104,8 @@ def test_the_second_fit_has_as_many_steps_as_were_best_along_the_same_schedule(t
 
 
 @pytest.mark.parametrize("stopped", [2, 99])
-def test_a_schedule_of_minutes_is_told_in_steps(targets_fit, monkeypatch, stopped):
-    """Half a minute of steps of six seconds: five, also where the fit ends before."""
+def test_a_schedule_in_minutes_is_converted_to_steps(targets_fit, monkeypatch, stopped):
+    """Half a minute with steps of six seconds: five steps, even if the fit ends earlier."""
     monkeypatch.setattr(GazeTrainer, "seconds", property(lambda trainer: 6.0 * trainer.steps))
 
     def stop(progress):
@@ -123,7 +135,7 @@ MOVED = replace(NOWHERE, align=Similarity(np.diag([2.0, 2, 2, 1])))
         ("place", None, None, NOWHERE, {"place": "elsewhere"}),
     ],
 )
-def test_runs_differ_in_what_they_are_made_of(name, plan, supervision, place, about):
+def test_run_identities_differ(name, plan, supervision, place, about):
     base = planned(SMALL, PRODUCT).make_identity(Supervision(RAYS), NOWHERE, StateSettings())
     other = (plan or planned(SMALL, PRODUCT)).make_identity(
         supervision or Supervision(RAYS), place, StateSettings(identity=about)
@@ -140,29 +152,29 @@ def test_runs_differ_in_what_they_are_made_of(name, plan, supervision, place, ab
     ids=["product", "fresh", "two threads"],
 )
 def test_a_resumed_run_equals_an_uninterrupted_one(wall, settings, config, probes, count, threads, tmp_path):
-    """Bit for bit at one thread, to 1e-5 at two; interrupted in both of its fits, past validations and epochs."""
+    """Bit for bit with one thread, to 1e-5 with two; interrupted in both fits, after validations and epochs."""
     threads(count)
-    expected, whole = train(wall, settings, config, probes)
+    expected, full = train(wall, settings, config, probes)
     path = tmp_path / "a.run"
-    _, about = train(wall, settings, config, probes, path=path, tell=stopping("fit", 5))
-    assert about["interrupted"] and about["steps"] <= 5 and path.is_file()
-    assert whole["validation"]["best_step"] > 3
+    _, provenance = train(wall, settings, config, probes, path=path, on_progress=stopping("fit", 5))
+    assert provenance["interrupted"] and provenance["steps"] <= 5 and path.is_file()
+    assert full["validation"]["best_step"] > 3
     watch = stopping("refit", 3)
-    _, about = train(wall, settings, config, probes, path=path, resume=True, tell=watch)
-    assert about["interrupted"] and path.is_file() and ("fit", 5) not in watch.seen and ("fit", 6) in watch.seen
+    _, provenance = train(wall, settings, config, probes, path=path, resume=True, on_progress=watch)
+    assert provenance["interrupted"] and path.is_file() and ("fit", 5) not in watch.seen and ("fit", 6) in watch.seen
     watch = stopping("", 0)
-    there = []
-    got, about = train(
+    is_valid = []
+    got, provenance = train(
         wall,
         settings,
         config,
         probes,
         path=path,
         resume=True,
-        tell=watch,
-        write=lambda *_: there.append(path.is_file()),
+        on_progress=watch,
+        write=lambda *_: is_valid.append(path.is_file()),
     )
-    assert not about["interrupted"] and there == [True] and not path.exists()
+    assert not provenance["interrupted"] and is_valid == [True] and not path.exists()
     assert {s for s, _ in watch.seen} == {"probes", "refit"}
     assert ("refit", 3) not in watch.seen and ("refit", 4) in watch.seen
     for name, value in expected.parameters().items():
@@ -173,37 +185,37 @@ def test_a_resumed_run_equals_an_uninterrupted_one(wall, settings, config, probe
         )
         compare(np.array(got.parameters()[name]), np.array(value), err_msg=name)
     if count == 1:
-        assert about["validation"] == whole["validation"] and about["steps"] == whole["steps"]
+        assert provenance["validation"] == full["validation"] and provenance["steps"] == full["steps"]
 
 
 def test_another_run_is_not_resumed(wall, tmp_path):
     path = tmp_path / "a.run"
-    train(wall, PRODUCT, SMALL, path=path, tell=stopping("fit", 1))
-    with pytest.raises(NergError, match="other settings;"):
+    train(wall, PRODUCT, SMALL, path=path, on_progress=stopping("fit", 1))
+    with pytest.raises(NergError, match="different settings;"):
         train(wall, replace(PRODUCT, seed=3), SMALL, path=path, resume=True)
-    with pytest.raises(NergError, match="other place, probes;"):
-        train(wall, PRODUCT, SMALL, replace(PROBES, kappa=9.0), path=path, resume=True, about={"place": "elsewhere"})
-    with pytest.raises(NergError, match="nothing to resume"):
+    with pytest.raises(NergError, match="different place, probes;"):
+        train(wall, PRODUCT, SMALL, replace(PROBES, kappa=9.0), path=path, resume=True, identity={"place": "elsewhere"})
+    with pytest.raises(NergError, match="cannot resume"):
         train(wall, PRODUCT, SMALL, path=tmp_path / "b.run", resume=True)
 
 
-def test_the_state_is_kept_every_so_often_and_when_asked(monkeypatch, tmp_path):
+def test_the_state_is_saved_at_intervals_and_on_request(monkeypatch, tmp_path):
     from nerg_mi.train import gaze_trainer as gaze_state
 
-    clock, kept = [100.0], []
+    clock, selected = [100.0], []
     monkeypatch.setattr(gaze_state.time, "perf_counter", lambda: clock[0])
     monkeypatch.setattr(
-        gaze_state, "write_checkpoint", lambda path, kind, tensors, meta: kept.append((clock[0], meta["spent"]))
+        gaze_state, "write_checkpoint", lambda path, kind, tensors, meta: selected.append((clock[0], meta["spent"]))
     )
     file = gaze_state.GazeRunFile(tmp_path / "a.run", {}, 10.0, False)
     for clock[0] in (105.0, 109.0, 111.0, 112.0, 120.0, 122.5):
         file.save("fit", None, {}, {}, force=clock[0] == 112.0)
-    assert kept == [(111.0, 11.0), (112.0, 12.0), (122.5, 22.5)]
+    assert selected == [(111.0, 11.0), (112.0, 12.0), (122.5, 22.5)]
     gaze_state.GazeRunFile(None, {}, 10.0, False).save("fit", None, {}, {}, force=True)
 
 
-def test_what_was_found_is_kept_before_the_second_fit_is_prepared(wall, monkeypatch, tmp_path):
-    """Probes and depths of all rays take long: whoever ends the run there does not train the first fit again."""
+def test_the_first_fit_is_saved_before_the_refit(wall, monkeypatch, tmp_path):
+    """Probes and depths of all rays take long: a run interrupted there does not repeat the first fit."""
     from nerg_mi.train import gaze_run
 
     make_targets, calls = gaze_run.make_targets, []
@@ -214,33 +226,35 @@ def test_what_was_found_is_kept_before_the_second_fit_is_prepared(wall, monkeypa
             raise MemoryError("killed")
         return make_targets(supervision, *rest)
 
-    path, how = tmp_path / "a.run", {"path": tmp_path / "a.run", "every": 1e9}
+    path, how = tmp_path / "a.run", {"path": tmp_path / "a.run", "interval": 1e9}
     monkeypatch.setattr(gaze_run, "make_targets", killed)
     with pytest.raises(MemoryError):
         train(wall, PRODUCT, SMALL, **how)
-    # To watch, to learn without what is watched, and of all rays.
+    # For validation, for training without the validation data, and for all rays.
     assert calls[0] == calls[2] > calls[1] and path.is_file()
     watch = stopping("", 0)
-    _, about = train(wall, PRODUCT, SMALL, resume=True, tell=watch, **how)
-    assert {stage for stage, _ in watch.seen} == {"probes", "refit"} and about["refitted"]
+    _, provenance = train(wall, PRODUCT, SMALL, resume=True, on_progress=watch, **how)
+    assert {stage for stage, _ in watch.seen} == {"probes", "refit"} and provenance["refitted"]
 
 
 @pytest.mark.parametrize("refit", [True, False])
-def test_a_result_that_cannot_be_written_is_kept(wall, refit, threads, tmp_path):
+def test_a_result_that_cannot_be_written_is_saved(wall, refit, threads, tmp_path):
     """A full disk at the end, once: nothing is trained again."""
     threads(1)
     path, written = tmp_path / "a.run", []
 
-    def refuse(field, about):
+    def refuse(field, provenance):
         raise NergError("the disk is full.")
 
     settings = replace(PRODUCT, refit=refit)
-    how = {"path": path, "every": 1e9}
+    how = {"path": path, "interval": 1e9}
     with pytest.raises(NergError, match="--resume"):
         train(wall, settings, SMALL, write=refuse, **how)
     assert path.is_file()
     watch = stopping("", 0)
-    field, _ = train(wall, settings, SMALL, resume=True, tell=watch, write=lambda *given: written.append(given), **how)
+    field, _ = train(
+        wall, settings, SMALL, resume=True, on_progress=watch, write=lambda *options: written.append(options), **how
+    )
     assert {s for s, _ in watch.seen} == {"probes"} and written[0][0] is field and not path.exists()
     expected = train(wall, settings, SMALL)[0].parameters()
     for name, value in field.parameters().items():
@@ -252,15 +266,14 @@ def test_a_result_that_cannot_be_written_is_kept(wall, refit, threads, tmp_path)
 
 @pytest.fixture
 def targets_trainer(rays, wall):
-    """Of one probe in 64 directions."""
+    """Targets of one probe in 64 directions."""
     probes = place_probes(rays, 0.5, queries=[[-0.6, 0, 1.6]], min_rays=8, kappa_rule="fixed", kappa=20.0)
     return make_targets_from_probes(probes, wall, 64)
 
 
 @pytest.mark.parametrize("average", [0.0, 0.3, 0.999])
-def test_what_is_kept_is_the_average_of_the_weights_so_far(targets_trainer, average):
-    """An exponential one, whose memory is short at first: of (k + 1) in (k + 10) after k steps, of ``average``
-    later."""
+def test_the_result_is_the_average_of_the_weights(targets_trainer, average):
+    """Exponential average with a short memory at first: (k + 1) / (k + 10) after k steps, at most ``average``."""
     settings = GazeSettings(steps=5, learning_rate=1e-2, zones=0, ema_decay=average)
     trainer = ProductTrainer(targets_trainer, BOX, SMALL, settings, ns)
     expected = {k: v.numpy().astype(float) for k, v in trainer.optimiser.items()}
@@ -300,14 +313,16 @@ def test_it_is_the_kernel_density_of_rays_that_are_turned_to_every_azimuth():
         assert compute_elevation_density([rays], sine, kappa) == pytest.approx(expected, rel=2e-2, abs=2e-4)
 
 
-def test_places_count_alike_and_people_within_them():
-    """One place has nine rays up of one person and one down of another; the other place has one up."""
+def test_environments_and_participants_have_equal_weight():
+    """One environment has nine upward rays of one participant and one downward ray of another; the other has one upward
+    ray.
+    """
     first = looking(9 * [[0, 0, 1.0]] + [[0, 0, -1.0]], 9 * [0] + [1])
     down, up = compute_elevation_density([first, looking([[0, 0, 1.0]])], np.array([-1.0, 1.0]))
     assert up / down == pytest.approx(3, rel=1e-2)
 
 
-def test_the_field_is_that_density_wherever_somebody_stands():
+def test_elevation_prior_does_not_depend_on_position():
     ns, d = namespace("llvm"), fibonacci_directions(20_000)
     rays = looking(np.random.default_rng(1).normal(size=(50, 3)) * [1, 1, 0.3] - [0, 0, 0.2])
     field = make_elevation_prior([rays], ns)
@@ -316,10 +331,10 @@ def test_the_field_is_that_density_wherever_somebody_stands():
     r = ns.Array3f(np.ascontiguousarray(d.T, np.float32))
     for place in ((0.0, 0.0, 0.0), (40.0, -7.0, 1.6)):
         gaze, _, _ = field.evaluate(r * 3 + ns.Array3f(*place), ns.Array3f(*place), r, integral=ns.Float(1.0))
-        found = np.array(gaze)
-        assert 4 * np.pi * found.mean() == pytest.approx(1, abs=1e-3)
+        result = np.array(gaze)
+        assert 4 * np.pi * result.mean() == pytest.approx(1, abs=1e-3)
         # A thousandth is uniform, and the table has rows of 2.8 degrees.
-        assert np.abs(found - expected).max() < 0.01
+        assert np.abs(result - expected).max() < 0.01
     assert not field.config.needs_surfaces
 
 
@@ -327,11 +342,13 @@ def test_the_field_is_that_density_wherever_somebody_stands():
 
 
 def test_directions_are_fresh_in_every_epoch(wall, monkeypatch):
-    """16 probes, 4 a step: an epoch is four steps. Without it there is one set of directions."""
+    """16 probes, 4 per step: an epoch has four steps. Otherwise there is one set of directions."""
     from nerg_mi.train import gaze_data
 
     drawn, sets = [], gaze_data.make_rotated_directions
-    monkeypatch.setattr(gaze_data, "make_rotated_directions", lambda *given: drawn.append(sets(*given)) or drawn[-1])
+    monkeypatch.setattr(
+        gaze_data, "make_rotated_directions", lambda *options: drawn.append(sets(*options)) or drawn[-1]
+    )
     settings = replace(PRODUCT, zones=0, steps=9)
     train(wall, settings, SMALL, replace(PROBES, fresh=True))
     assert len(drawn) == 3 and np.abs(drawn[0] - drawn[1]).max() > 0.1 and np.abs(drawn[1] - drawn[2]).max() > 0.1
@@ -340,7 +357,7 @@ def test_directions_are_fresh_in_every_epoch(wall, monkeypatch):
     assert len(drawn) == 1
 
 
-def test_the_blind_density_of_rays_and_views_is_that_of_the_rays():
+def test_prior_of_rays_and_views_is_that_of_the_rays():
     needs = TargetRequirements(prior_rows=8)
     plan, views = planned(LOG, LIKELIHOOD), around(4)
     rays = make_targets(Supervision(RAYS), NOWHERE, plan, needs, 3)

@@ -1,4 +1,4 @@
-"""A ball in a box, as pictures with exact depth, and trainers that learn it in seconds."""
+"""A ball in a box as pictures with exact depth, and trainers that learn it in seconds."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ LENS = Intrinsics(24, 24, 30.0, 30.0, 12.0, 12.0)
 
 
 def ball(pose, depth=True):
-    """A ball of radius RADIUS, coloured by its normal, before nothing (alpha 0)."""
+    """Render a ball of radius RADIUS, coloured by its normal, in front of a transparent background."""
     d = (pixel_directions(LENS) @ pose[:3, :3].T).reshape(-1, 3)
     o = pose[:3, 3]
     b, c = d @ o, o @ o - RADIUS**2
@@ -41,7 +41,7 @@ def ball(pose, depth=True):
 
 
 def ball_dataset():
-    """Twenty views of the ball to train on, and four that are held out."""
+    """Twenty training views of the ball, and four held-out views."""
     rng = np.random.default_rng(0)
     centers = rng.normal(size=(24, 3)) * [1, 1, 0.5]
     views = [ball(ball_pose(2 * c / np.linalg.norm(c))) for c in centers]
@@ -49,7 +49,7 @@ def ball_dataset():
 
 
 def settings(**changes):
-    given = {
+    options = {
         "steps": 300,
         "batch": 2**12,
         "resolution": 32,
@@ -60,12 +60,14 @@ def settings(**changes):
         "grid_decay": 1e-3,
         **changes,
     }
-    return RadianceSettings(**given)
+    return RadianceSettings(**options)
 
 
 def trainer(dataset, **changes):
     depth = changes.pop("depth", True)
-    return RadianceTrainer(dataset.train, BOX, TINY, settings(**{"steps": 40, "extraction_start": 0.75, **changes}), ns, depth)
+    return RadianceTrainer(
+        dataset.train, BOX, TINY, settings(**{"steps": 40, "extraction_start": 0.75, **changes}), ns, depth
+    )
 
 
 def state(t):

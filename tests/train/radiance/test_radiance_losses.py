@@ -13,12 +13,12 @@ from nerg_mi.train.radiance_losses import (
     PHOTO_PARAMETER,
     PhotoColors,
     color_loss,
+    depth_loss,
     evaluate_density,
     evaluate_density_from_features,
-    evaluate_samples,
-    depth_loss,
-    huber_loss,
     evaluate_ray_color,
+    evaluate_samples,
+    huber_loss,
     stack,
     unstack,
 )
@@ -45,8 +45,8 @@ def absorbed():
     """Weights of the samples, in float64."""
     weight = -np.expm1(-TAU)
     for r in range(3):
-        of = RAY == r
-        weight[of] *= np.exp(-np.concatenate([[0], np.cumsum(TAU[of])[:-1]]))
+        source = RAY == r
+        weight[source] *= np.exp(-np.concatenate([[0], np.cumsum(TAU[source])[:-1]]))
     return weight
 
 
@@ -55,7 +55,7 @@ def test_depth_loss(margin):
     truth, scale = np.array([1.45, 0.46, 0.0]), 0.2
     weight = absorbed()
     near = (T < truth[RAY] + margin) & (T + LENGTH > truth[RAY] - margin)
-    # Mean distance of absorption into a step: the integral of s tau exp(-tau s) over it, by the midpoint rule.
+    # Mean distance of absorption in a step: the integral of s tau exp(-tau s), by the midpoint rule.
     s = (np.arange(200_000) + 0.5) / 200_000
     mean = np.array([(s * np.exp(-tau * s)).sum() / np.exp(-tau * s).sum() for tau in TAU])
     offset = T + LENGTH * mean - truth[RAY]
@@ -80,7 +80,7 @@ def test_color_loss(alpha):
     opacity, delta = np.array([0.9, 0.4, 0.0]), 0.2
     pixels = SimpleNamespace(rgb=[ns.Float(c) for c in target], alpha=None if alpha is None else ns.Float(alpha))
     got = color_loss([ns.Float(c) for c in color], ns.Float(opacity), pixels, ns.Array3f(behind), delta).numpy()
-    # Of a picture with alpha the colour is that before nothing: what is transparent shows the background.
+    # The colour of a picture with alpha has no background: the background shows through transparent parts.
     goal = target if alpha is None else behind * (1 - np.array(alpha)) + target * np.array(alpha)
     error = np.abs(color + (1 - opacity) * behind - goal)
     want = np.where(error < delta, error**2 / 2, delta * (error - delta / 2)).mean(axis=0)
@@ -98,8 +98,7 @@ def test_huber_is_smooth_where_its_pieces_meet():
 
 # ---- Model ----
 #
-# The forward pass that trains: what was looked up already changes no value and no derivative, and heads are the
-# field's.
+# Forward pass of the training: precomputed features change nothing, and the heads equal those of the field.
 
 
 def field():
@@ -114,16 +113,16 @@ def points():
     return p, dr.normalize(ns.Array3f(rng.normal(size=(3, 40)).astype(np.float32)))
 
 
-def test_known_features_change_no_value_and_no_derivative():
-    f, (p, d), found = field(), points(), []
-    known = [dr.detach(x) for x in f.grid(BOX.to_unit(p))]
-    for features in (None, known):
+def test_precomputed_features_change_nothing():
+    f, (p, d), result = field(), points(), []
+    truth = [dr.detach(x) for x in f.grid(BOX.to_unit(p))]
+    for features in (None, truth):
         parameters = {k: type(v)(v) for k, v in f.parameters().items()}
         dr.enable_grad(parameters)
         sigma, rgb = evaluate_samples(TINY, BOX, parameters, p, d, ns, features)
         dr.backward(dr.sum(sigma + rgb[0] - 2 * rgb[1] * rgb[2]))
-        found.append([dr.detach(sigma).numpy()] + [dr.grad(v).numpy() for v in parameters.values()])
-    for a, b in zip(*found):
+        result.append([dr.detach(sigma).numpy()] + [dr.grad(v).numpy() for v in parameters.values()])
+    for a, b in zip(*result):
         assert np.abs(b).max() > 0 and np.allclose(a, b, rtol=1e-4, atol=1e-5)
 
 
@@ -173,7 +172,7 @@ def test_a_deferred_field_composites_features_and_colours_rays():
 
 # ---- Photo colors ----
 #
-# Photos of one place that differ in exposure and white balance: what is learnt is the place of the average photo.
+# Photos of one scene with different exposure and white balance: the field learns the average photo.
 
 
 def numbers(count=3):
@@ -181,36 +180,38 @@ def numbers(count=3):
 
 
 def test_colors_change_by_a_matrix_and_an_offset_of_each_photo():
-    """Against NumPy; the mean over the photos is no change."""
-    photos, given = PhotoColors(ns, 3), numbers()
-    matrices = photos.compute_matrices(ns.Float(given))
-    shifted = 0.01 * (given.reshape(3, 3, 4) - given.reshape(3, 3, 4).mean(axis=0))
+    """Compared with NumPy; the mean over the photos is the identity."""
+    photos, options = PhotoColors(ns, 3), numbers()
+    matrices = photos.compute_matrices(ns.Float(options))
+    shifted = 0.01 * (options.reshape(3, 3, 4) - options.reshape(3, 3, 4).mean(axis=0))
     assert np.allclose(matrices, np.eye(3, 4) + shifted, atol=1e-6)
     assert np.allclose(matrices.mean(axis=0), np.eye(3, 4), atol=1e-6)
     color, opacity, frame = np.random.default_rng(1).random((3, 5)), np.linspace(0, 1, 5), [0, 2, 1, 2, 0]
     out = photos.apply(
-        photos.compute_changes(ns.Float(given)), [ns.Float(c) for c in color], ns.Float(opacity), ns.UInt32(frame)
+        photos.compute_changes(ns.Float(options)), [ns.Float(c) for c in color], ns.Float(opacity), ns.UInt32(frame)
     )
     m = matrices[frame]
     expected = np.einsum("nij,jn->in", m[..., :3], color) + m[..., 3].T * opacity
     assert np.allclose(np.array([c.numpy() for c in out]), expected, atol=1e-6)
-    assert photos.decay_loss(photos.compute_changes(ns.Float(given)))[0] == pytest.approx(np.sum(shifted**2) / 3, rel=1e-5)
+    assert photos.decay_loss(photos.compute_changes(ns.Float(options)))[0] == pytest.approx(
+        np.sum(shifted**2) / 3, rel=1e-5
+    )
 
 
 def test_stops_of_photos_with_twice_and_half_the_light():
     photos, gain = PhotoColors(ns, 2), 2 ** (1 / 2.2)
-    # Their mean is to be no change: one photo is brighter by what the other is darker.
+    # Their mean is the identity: one photo is brighter by as much as the other is darker.
     half = (gain - 1) / (gain + 1)
-    given = np.zeros((2, 3, 4), np.float32)
+    options = np.zeros((2, 3, 4), np.float32)
     for k, sign in enumerate((1, -1)):
-        given[k, :, :3] = sign * half / 0.01 * np.eye(3)
-    assert photos.compute_exposure_spread(ns.Float(given.ravel())) == pytest.approx(0.5, rel=1e-5)
+        options[k, :, :3] = sign * half / 0.01 * np.eye(3)
+    assert photos.compute_exposure_spread(ns.Float(options.ravel())) == pytest.approx(0.5, rel=1e-5)
 
 
 @pytest.mark.nightly
 @pytest.mark.slow
-def test_exposures_are_found():
-    """Of photos that show the same, so that nothing else can explain how they differ."""
+def test_exposures_are_recovered():
+    """From photos of the same content, so that nothing else explains their differences."""
     gains = np.linspace(0.9, 1.1, 6)[:, None] * (1 + np.random.default_rng(0).uniform(-0.02, 0.02, (6, 3)))
     view, views = ball(ball_pose(np.array([0, -2.0, 0])), depth=False), []
     for gain in gains:
@@ -220,14 +221,14 @@ def test_exposures_are_found():
     trainer = RadianceTrainer(views, BOX, TINY, settings(steps=500, photo_decay=1e-4), ns, depth=False)
     while trainer.progress < 1:
         trainer.step()
-    found = trainer.photos.compute_matrices(trainer.averaged[PHOTO_PARAMETER])
-    # What becomes of the mean colour of the ball.
+    result = trainer.photos.compute_matrices(trainer.averaged[PHOTO_PARAMETER])
+    # The corrected mean colour of the ball.
     mean = view.pixels[view.pixels[..., 3] > 0.5][:, :3].mean(axis=0)
-    changed = (found[..., :3] @ mean + found[..., 3]) / mean
+    changed = (result[..., :3] @ mean + result[..., 3]) / mean
     assert np.allclose(changed, gains / gains.mean(axis=0), atol=0.005)
 
 
-def test_a_single_photo_has_nothing_to_differ_from(dataset):
+def test_a_single_photo_has_no_correction(dataset):
     alone = RadianceTrainer(dataset.train[:1], BOX, TINY, settings(), ns, depth=False)
     without = RadianceTrainer(dataset.train, BOX, TINY, settings(photo_colors=False), ns, depth=False)
     assert alone.photos is None and without.photos is None and PHOTO_PARAMETER not in without.averaged
@@ -235,7 +236,7 @@ def test_a_single_photo_has_nothing_to_differ_from(dataset):
     without.step()
 
 
-def test_the_field_is_the_place_without_any_photos_colors(dataset):
+def test_the_field_excludes_photo_corrections(dataset):
     trainer = RadianceTrainer(dataset.train, BOX, TINY, settings(), ns, depth=False)
     trainer.step()
     trainer.averaged[PHOTO_PARAMETER] = ns.Float(numbers(len(dataset.train)))

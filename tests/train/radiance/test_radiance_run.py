@@ -10,12 +10,19 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.formats.fields import load_radiance, save_radiance
-from nerg_mi.maths.color import psnr, color_corrected_psnr
+from nerg_mi.maths.color import color_corrected_psnr, psnr
 from nerg_mi.maths.geometry import Box, ContractedBox
 from nerg_mi.photos.cameras import Intrinsics, PosedCamera, pixel_directions
 from nerg_mi.photos.images import PhotoView
 from nerg_mi.train import radiance_run
-from nerg_mi.train.radiance_run import find_problems, evaluate_views, compute_outside_fraction, train_field, warm_up, write_preview
+from nerg_mi.train.radiance_run import (
+    compute_outside_fraction,
+    evaluate_views,
+    find_problems,
+    train_field,
+    warm_up,
+    write_preview,
+)
 from nerg_mi.train.radiance_trainer import Preview, RadianceTrainer
 from nerg_mi.transport.field_medium import FieldMedium
 from nerg_mi.transport.geometry import trace_depth
@@ -29,7 +36,7 @@ WIDE = Intrinsics(40, 20, 40.0, 40.0, 20.0, 10.0)
 
 
 def made(x, opacity=1.0):
-    """A camera at (x, 0, 0) that looks along -z at the plane z = -4, and what it sees."""
+    """A camera at (x, 0, 0) that looks along -z at the plane z = -4, and its picture."""
     pose = np.eye(4)
     pose[0, 3] = x
     depth = 4 / -pixel_directions(WIDE)[..., 2]
@@ -38,7 +45,7 @@ def made(x, opacity=1.0):
 
 
 @pytest.mark.parametrize("every", [1, 2])
-def test_half_of_a_plane_lies_beyond(every):
+def test_half_of_a_plane_is_outside(every):
     core = Box((0, -9, -9), (9, 9, 0))
     part = slice(every // 2, None, every)
     views = {view.camera.center[0]: (view, seen) for view, seen in (made(0.0), made(-50.0))}
@@ -52,7 +59,7 @@ def test_half_of_a_plane_lies_beyond(every):
     assert compute_outside_fraction([ahead, aside], render, core, every) == 0.75
 
 
-def test_what_lets_light_through_shows_nothing_within():
+def test_transparent_pixels_count_as_outside():
     view, seen = made(0.0, opacity=0.3)
     assert compute_outside_fraction([view], lambda v: seen, Box((-9, -9, -9), (9, 9, 0))) == 1
 
@@ -60,13 +67,13 @@ def test_what_lets_light_through_shows_nothing_within():
 # ---- The error on views that are not learnt from: of which pixels, of which colours ----
 
 
-def test_what_a_mask_hides_does_not_count_in_the_progress(dataset):
+def test_masked_pixels_do_not_count(dataset):
     view = dataset.held_out[0]
     trainer = RadianceTrainer(dataset.train, BOX, TINY, settings(), ns, depth=False)
     mask = np.arange(24)[:, None] < np.full(24, 12)
     spoilt = view.pixels.copy()
     spoilt[~mask] = 1 - spoilt[~mask]
-    whole, other, masked, same = evaluate_views(
+    full, other, masked, same = evaluate_views(
         trainer,
         [
             view,
@@ -75,7 +82,7 @@ def test_what_a_mask_hides_does_not_count_in_the_progress(dataset):
         ],
         2,
     ).psnr
-    assert masked == same and whole != other and masked != whole
+    assert masked == same and full != other and masked != full
 
 
 def test_both_errors_are_those_of_the_rendered_view(dataset):
@@ -83,7 +90,7 @@ def test_both_errors_are_those_of_the_rendered_view(dataset):
     field = trainer.make_field(with_occupancy=False)
     error = evaluate_views(trainer, views, 2, field)
     for k, view in enumerate(views):
-        seen, truth = trainer.render(view, 2, field).color, view.over(0)[1::2, 1::2]
+        seen, truth = trainer.render(view, 2, field).color, view.composite_over(0)[1::2, 1::2]
         assert error.psnr[k] == pytest.approx(psnr(seen, truth), rel=1e-6)
         alpha = view.color[1::2, 1::2, 3]
         assert error.psnr_fitted[k] == pytest.approx(color_corrected_psnr(seen, truth, alpha), rel=1e-6)
@@ -93,33 +100,33 @@ def test_both_errors_are_those_of_the_rendered_view(dataset):
 
 
 @pytest.mark.slow
-def test_learns_a_ball_it_has_not_seen_from_there(dataset, tmp_path):
-    """20 dB on held-out views after 300 small steps; the checkpoint says how."""
+def test_held_out_views_of_a_ball(dataset, tmp_path):
+    """20 dB on held-out views after 300 small steps; the checkpoint documents the run."""
     seen = []
     field, provenance = train_field(dataset, TINY, settings(), ns, on_progress=seen.append)
     assert provenance["psnr_held_out"]["mean"] > 20
-    assert provenance["depth_supervision"] and provenance["steps"] == 300 and seen[-1].done == 1
+    assert provenance["depth_supervision"] and provenance["steps"] == 300 and seen[-1].fraction == 1
     save_radiance(field, tmp_path / "ball.safetensors", provenance, half=True)
     loaded, meta = load_radiance(tmp_path / "ball.safetensors", ns)
     assert meta["provenance"]["settings"]["seed"] == 1
     assert loaded.color_space == "srgb" and loaded.march_step == pytest.approx(2 / 64)
 
 
-def test_a_preview_shows_colours_within_their_range_beside_the_truth(dataset, tmp_path, rgb):
-    """What is brighter than white is white, and not dark again."""
+def test_previews_clamp_colours_and_show_the_photo(dataset, tmp_path, rgb):
+    """Colours above white are white and do not wrap around."""
     seen = np.zeros((12, 12, 3), np.float32)
     seen[:, :4], seen[:, 4:8], seen[:, 8:] = 1.7, -0.4, 0.5
-    found = SimpleNamespace(color=seen)
-    trainer = SimpleNamespace(pixels_within=lambda views, most: 2, render=lambda view, every: found)
+    result = SimpleNamespace(color=seen)
+    trainer = SimpleNamespace(choose_pixel_stride=lambda views, limit: 2, render=lambda view, every: result)
     write_preview(trainer, dataset.held_out[0], tmp_path / "a.png")
     picture = np.array(rgb.Bitmap(str(tmp_path / "a.png")))
     assert picture.shape == (12, 24, 3)
     assert (picture[:, :4] == 255).all() and (picture[:, 4:8] == 0).all() and (picture[:, 8:12] == 128).all()
-    truth = 255 * dataset.held_out[0].over(0)[1::2, 1::2]
+    truth = 255 * dataset.held_out[0].composite_over(0)[1::2, 1::2]
     assert np.abs(picture[:, 12:] - truth).max() <= 1
 
 
-def test_previews_show_the_first_watched_view(dataset, tmp_path, monkeypatch):
+def test_previews_show_the_first_validation_view(dataset, tmp_path, monkeypatch):
     shown = []
     monkeypatch.setattr(radiance_run, "write_preview", lambda trainer, view, path: shown.append(view))
     monkeypatch.setattr(radiance_run, "MIN_EVALUATION_INTERVAL", 1)
@@ -127,33 +134,33 @@ def test_previews_show_the_first_watched_view(dataset, tmp_path, monkeypatch):
     assert len(shown) > 1 and all(view is dataset.held_out[0] for view in shown)
 
 
-def test_nothing_is_resumed_without_a_state(dataset):
-    with pytest.raises(NergError, match="nothing to resume: name"):
+def test_resuming_needs_a_state(dataset):
+    with pytest.raises(NergError, match="cannot resume"):
         train_field(dataset, TINY, settings(steps=1), ns, resume=True)
 
 
 # ---- A training says when its result is worse than it might be ----
 
 
-def looks(*psnr):
+def make_history(*psnr):
     return [{"steps": 100 * (k + 1), "psnr": x} for k, x in enumerate(psnr)]
 
 
-def test_a_fall_below_an_earlier_look_is_named_with_its_numbers():
-    (said,) = find_problems(looks(18, 24.31, 22, 23.2), 2000, 1, 2.0, 120.0)
-    assert "23.20 dB" in said and "step 200 had 24.31 dB" in said and "1.1 dB worse" in said and "--minutes" in said
-    assert find_problems(looks(18, 24.2, 22, 23.3), 2000, 1, 2.0, 120.0) == []
+def test_a_drop_below_an_earlier_evaluation_is_reported():
+    (said,) = find_problems(make_history(18, 24.31, 22, 23.2), 2000, 1, 2.0, 120.0)
+    assert "23.20 dB" in said and "24.31 dB at step 200" in said and "1.1 dB less" in said and "--minutes" in said
+    assert find_problems(make_history(18, 24.2, 22, 23.3), 2000, 1, 2.0, 120.0) == []
 
 
-def test_an_end_at_a_coarse_stride_is_named():
+def test_a_coarse_final_stride_is_reported():
     (said,) = find_problems([], 2000, 4, None)
     assert "4 times coarser" in said and "--steps" in said and "--minutes" not in said
 
 
-def test_few_steps_are_named_with_the_machine_s_rate():
-    (said,) = find_problems(looks(10, 12.6), 44, 1, 2.0, 120.0)
-    assert "only 44 steps (0.37 a second: this machine is slow or busy)" in said and "--minutes" in said
-    (said,) = find_problems(looks(10, 12.6), 40, 1, None, 2.0)
+def test_too_few_steps_are_reported_with_the_rate():
+    (said,) = find_problems(make_history(10, 12.6), 44, 1, 2.0, 120.0)
+    assert "only 44 steps (0.37 per second: this machine is slow or busy)" in said and "--minutes" in said
+    (said,) = find_problems(make_history(10, 12.6), 40, 1, None, 2.0)
     assert "only 40 steps," in said and "machine" not in said and "--minutes" not in said
     assert find_problems([], 500, 1, None) == [] != find_problems([], 499, 1, None)
 
@@ -162,18 +169,18 @@ def test_few_steps_are_named_with_the_machine_s_rate():
 
 
 def kernels_of_a_run(t) -> list[tuple[int, int, int]]:
-    """Step, size and operations of each kernel that the rest of a run compiles, or loads from the cache on the disk."""
-    found = []
+    """Step, size and operations of each kernel that the rest of a run compiles, or loads from the disk cache."""
+    result = []
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history()
         while t.progress < 1:
             t.step()
-            found += [
+            result += [
                 (t.steps, k["size"], k["operation_count"])
                 for k in dr.kernel_history([dr.KernelType.JIT])
                 if not k["cache_hit"] or k["cache_disk"]
             ]
-    return [k for k in found if k[2] > 20]  # Those of a few operations take no longer than a step
+    return [k for k in result if k[2] > 20]  # Kernels of a few operations take no longer than a step
 
 
 @pytest.mark.parametrize("depth", [True, False])
@@ -191,9 +198,9 @@ def test_a_run_is_the_same_bit_for_bit(dataset, one_thread, depth):
 
 @pytest.mark.parametrize("depth", [True, False])
 def test_nothing_is_compiled_in_a_run(dataset, depth):
-    """Through all strides, grid updates, the drawing of hard pixels, the end of damping near cameras, and settling."""
+    """Through all strides, grid updates, hard pixels, the end of damping near cameras, and occupancy extraction."""
     t = trainer(dataset, steps=120, depth=depth, extraction_start=0.4)
-    # Other trainings of this process have made most kernels already.
+    # Other trainings in this process have compiled most kernels.
     dr.flush_kernel_cache()
     warm_up(t)
     assert not kernels_of_a_run(t)
@@ -201,12 +208,12 @@ def test_nothing_is_compiled_in_a_run(dataset, depth):
 
 
 def test_nothing_is_compiled_once_fog_has_cleared(dataset):
-    """Where all is fog at first nothing is known to be empty, and the bound of rendering holds nothing."""
+    """If everything is fog at first, no cell is empty and the occupancy is empty."""
     t = trainer(dataset, steps=60, depth=False, extraction_start=0.4)
     value = type(t.grid.value)(t.grid.value)
     t.grid.value, t.grid.dilate_cells = (
         dr.full(type(value), 1, len(value)),
-        lambda found: np.zeros((t.grid.resolution,) * 3, bool),
+        lambda result: np.zeros((t.grid.resolution,) * 3, bool),
     )
     dr.eval(t.grid.value)
     dr.flush_kernel_cache()
@@ -222,7 +229,7 @@ FAR = 6.0
 
 
 def before_a_wall(pose):
-    """The ball, and behind it a sphere of radius FAR, coloured in waves."""
+    """The ball, and behind it a sphere of radius FAR with coloured waves."""
     view = ball(pose)
     d = pixel_directions(LENS) @ pose[:3, :3].T
     o = pose[:3, 3]
@@ -236,7 +243,7 @@ def before_a_wall(pose):
 
 
 def poses(count):
-    """Cameras 2 from the ball, all on one side of it, so that each part of the wall is in many pictures."""
+    """Cameras at distance 2 from the ball, all on one side, so that each part of the wall is in many pictures."""
     rng = np.random.default_rng(0)
     for a, e in rng.uniform([-0.7, -0.5], [0.7, 0.5], (count, 2)):
         yield ball_pose(2 * np.array([np.sin(a) * np.cos(e), -np.cos(a) * np.cos(e), np.sin(e)]))
@@ -254,7 +261,7 @@ def trained():
 
 @pytest.mark.nightly
 @pytest.mark.slow
-def test_what_is_far_is_learnt_as_well(trained):
+def test_distant_surfaces_are_learned(trained):
     assert trained[1] > 17
 
 
@@ -276,8 +283,8 @@ def test_depths_are_those_of_the_scene(trained):
 
 
 @pytest.mark.slow
-def test_its_occupancy_leaves_nothing_out_that_is_seen(trained):
-    """The marcher, which leaps by cascades, against the trainer, which samples the cells of its own grid."""
+def test_occupancy_contains_all_visible_surfaces(trained):
+    """The renderer, which skips by cascades, compared with the trainer, which samples the cells of its own grid."""
     field, _, trainer = trained
     view = before_a_wall(next(poses(1)))
     d = (pixel_directions(LENS) @ view.camera.to_world[:3, :3].T).reshape(-1, 3)
@@ -285,5 +292,5 @@ def test_its_occupancy_leaves_nothing_out_that_is_seen(trained):
     trained_in = trainer.render(view)
     assert np.mean(np.abs(opacity - trained_in.opacity.ravel()) < 0.05) > 0.95
     np.testing.assert_allclose(np.median(depth / trained_in.depth.ravel()), 1, atol=0.02)
-    assert field.march_growth == trainer.settings.growth and field.occupancy.bound == 32
+    assert field.march_growth == trainer.settings.step_growth and field.occupancy.bound == 32
     assert field.occupancy.bits.mean() < 0.6

@@ -14,16 +14,30 @@ from nerg_mi.photos.cameras import Intrinsics, PosedCamera, pixel_directions
 from nerg_mi.photos.images import PhotoView
 from nerg_mi.train import radiance_trainer
 from nerg_mi.train.radiance_data import PixelBank
-from nerg_mi.train.radiance_losses import color_loss, composite, evaluate_samples, depth_loss, feature_decay_loss, evaluate_ray_color
+from nerg_mi.train.radiance_losses import (
+    color_loss,
+    composite,
+    depth_loss,
+    evaluate_ray_color,
+    evaluate_samples,
+    feature_decay_loss,
+)
 from nerg_mi.train.radiance_run import evaluate_views
-from nerg_mi.train.radiance_sampling import StepTable, RussianRoulette, damp_near, sum_along_rays, clip_rays, select_visible_samples
+from nerg_mi.train.radiance_sampling import (
+    RussianRoulette,
+    StepTable,
+    clip_rays,
+    damp_near,
+    select_visible_samples,
+    sum_along_rays,
+)
 from nerg_mi.train.radiance_settings import (
     MIN_RAYS_TO_REFINE,
     RadianceSettings,
     adapt_ray_count,
     limit_ray_count,
-    refine_stride,
     make_radiance_config,
+    refine_stride,
 )
 from nerg_mi.train.radiance_trainer import RadianceTrainer, render_view
 
@@ -36,7 +50,7 @@ STEP, NEAR = 0.1, 0.3
 
 
 class Lump:
-    """A soft ball in a box, brighter to the right, redder to the camera."""
+    """A soft ball in a box, brighter to the right, redder towards the camera."""
 
     box, ns, config = Box((-1, -1, -1), (1, 1, 1)), ns, RadianceConfig()
 
@@ -89,22 +103,22 @@ def test_pictures(every, chunk, monkeypatch):
 
 
 def test_a_deferred_field_has_the_colour_of_its_mean_features():
-    """Which for one that is linear in them is the mean of colours."""
+    """For a colour that is linear in the features this is the mean of colours."""
     lump = Lump()
     lump.config = RadianceConfig(deferred=True)
     table, anywhere = StepTable(ns, 0.0, 4.4, STEP, 0.0), lambda p, active: active
     seen = render_view(lump, anywhere, table, view(), NEAR, min_transmittance=0.0)
     assert np.allclose(seen.color, expected()[0], atol=2e-5)
     lump.color = lambda features, d: ns.Array3f(dr.square(features[0]))
-    squares = render_view(lump, lambda p, a: a, StepTable(ns, 0.0, 4.4, STEP, 0.0), view(), NEAR, min_transmittance=0.0).color[
-        ..., 0
-    ]
+    squares = render_view(
+        lump, lambda p, a: a, StepTable(ns, 0.0, 4.4, STEP, 0.0), view(), NEAR, min_transmittance=0.0
+    ).color[..., 0]
     opacity = expected()[1]
     mean = (expected()[0][..., 0] - 0.5 * opacity) / 0.4 / np.where(opacity > 0, opacity, 1)
     assert np.allclose(squares, opacity * mean**2, atol=2e-5)
 
 
-def test_empty_cells_and_pictures_of_nothing():
+def test_empty_cells_and_empty_pictures():
     table = StepTable(ns, 0.0, 4.4, STEP, 0.0)
     seen = render_view(Lump(), lambda p, active: active & False, table, view(), NEAR)
     assert not seen.color.any() and not seen.opacity.any() and not seen.depth.any() and seen.color.shape == (9, 13, 3)
@@ -116,9 +130,9 @@ DEFERRED = replace(TINY, deferred=True)
 
 
 @pytest.mark.parametrize("average", [0.0, 0.5, 0.999])
-def test_what_is_kept_is_the_average_of_every_fourth_steps_weights(dataset, average):
-    """An exponential one, whose memory is short at first: of (k + 1) in (k + 10) a step after k steps, of ``average``
-    later."""
+def test_result_is_the_average_of_every_fourth_step(dataset, average):
+    """Exponential average with a short memory at first: (k + 1) / (k + 10) per step after k steps, at most
+    ``average``."""
     trainer = RadianceTrainer(dataset.train, BOX, TINY, settings(ema_decay=average), ns)
     expected = {k: v.numpy().astype(float) for k, v in trainer.optimiser.items()}
     for k in range(1, 13):
@@ -162,7 +176,7 @@ def test_gradient_of_the_whole_loss_agrees_with_finite_differences(dataset, conf
     parameters = {k: type(v)(v) for k, v in start.items()}
     dr.enable_grad(parameters)
     dr.backward(loss(parameters))
-    # Along the signs of the gradient the parts of the slope do not cancel.
+    # Along the signs of the gradient the terms of the slope do not cancel.
     direction = {
         k: type(v)(dr.sign(dr.grad(v))) * type(v)(rng.random(v.shape).astype(np.float32)) for k, v in parameters.items()
     }
@@ -174,7 +188,7 @@ def test_gradient_of_the_whole_loss_agrees_with_finite_differences(dataset, conf
 
 @pytest.mark.nightly
 def test_a_deferred_field_learns_the_same_pictures(dataset):
-    """As well as one that is asked at every sample; it is what is kept, looked at and rendered."""
+    """As well as a field that evaluates colour at each sample; it is stored, evaluated and rendered."""
     errors = []
     for config in (TINY, DEFERRED):
         trainer = RadianceTrainer(dataset.train, BOX, config, settings(steps=150), ns)
@@ -186,9 +200,10 @@ def test_a_deferred_field_learns_the_same_pictures(dataset):
     assert min(errors) > 22 and errors[1] > errors[0] - 1.5, errors
 
 
-def test_thinned_samples_stand_for_all():
-    """Opacity is exact, colours (a ratio) nearly and derivatives wholly those of all samples on the mean over many
-    choices."""
+def test_russian_roulette_is_unbiased():
+    """Averaged over many decisions, opacity is exact, colours (a ratio) nearly and derivatives exactly those of all
+    samples.
+    """
     rng = np.random.default_rng(8)
     o = ns.Array3f(np.tile([[0.0], [0.0], [-2.0]], 16).astype(np.float32))
     d = dr.normalize(
@@ -209,27 +224,32 @@ def test_thinned_samples_stand_for_all():
         return (samples.count, np.array([c.numpy() for c in color]), opacity.numpy(), dr.grad(gain).numpy()[0])
 
     count, color, opacity, slope = render(None)
-    found = [render(RussianRoulette(1 / 16, 1 / 32, k)) for k in range(400)]
-    assert max(f[0] for f in found) < 0.5 * count
-    for f in found[::40]:
+    result = [render(RussianRoulette(1 / 16, 1 / 32, k)) for k in range(400)]
+    assert max(f[0] for f in result) < 0.5 * count
+    for f in result[::40]:
         assert np.allclose(f[2], opacity, atol=1e-6)
-    assert np.allclose(np.mean([f[1] for f in found], 0), color, atol=0.03)
-    slopes = [f[3] for f in found]
+    assert np.allclose(np.mean([f[1] for f in result], 0), color, atol=0.03)
+    slopes = [f[3] for f in result]
     assert abs(np.mean(slopes) - slope) < 4 * np.std(slopes) / 20 and np.std(slopes) > 0
 
 
 def test_damping_near_cameras(dataset):
-    """Derivatives nearer than the reach fall with the square of the distance, values stay; a trainer's step follows."""
+    """Derivatives within the distance are scaled by its square, values do not change; a step of the trainer follows."""
     t, x = ns.Float([0.1, 0.2, 0.4, 3]), ns.Float([1, 2, 3, 4])
     dr.enable_grad(x)
     (y,) = damp_near([x], t, 0.4)
     dr.backward(dr.sum(2 * y))
     assert np.array_equal(y.numpy(), x.numpy()) and np.allclose(dr.grad(x).numpy(), [2 / 16, 2 / 4, 2, 2])
 
-    def first_step(reach):
-        # All samples are nearer than a reach of a thousand sides: nothing of the pictures reaches the weights.
+    def first_step(half_width):
+        # All samples are within a distance of a thousand sides: no gradient of the pictures reaches the weights.
         trainer = RadianceTrainer(
-            dataset.train, BOX, TINY, settings(damping_distance=reach, empty_weight=0.0, photo_colors=False), ns, False
+            dataset.train,
+            BOX,
+            TINY,
+            settings(damping_distance=half_width, empty_weight=0.0, photo_colors=False),
+            ns,
+            False,
         )
         trainer.step()
         return max(np.abs(state[3][1].numpy()).max() for state in trainer.optimiser.state.values())
@@ -237,12 +257,12 @@ def test_damping_near_cameras(dataset):
     assert first_step(1000.0) < 1e-4 * first_step(0.0)
 
 
-def test_a_box_that_no_camera_sees_is_refused(dataset):
+def test_a_box_outside_all_views_is_refused(dataset):
     with pytest.raises(ValueError, match="--aabb"):
         RadianceTrainer(dataset.train, Box((50, 50, 50), (51, 51, 51)), TINY, settings(), ns)
 
 
-def test_features_that_no_ray_shapes_are_let_go(dataset):
+def test_unused_features_decay(dataset):
     x = ns.Float([1, -2, 0, 4])
     dr.enable_grad(x)
     y = feature_decay_loss(x)
@@ -250,9 +270,14 @@ def test_features_that_no_ray_shapes_are_let_go(dataset):
     assert float(y[0]) == pytest.approx(21 / 4) and np.allclose(dr.grad(x).numpy(), [0.5, -1, 0, 2])
 
     def left(weight):
-        # Nearer than a reach of a thousand sides: nothing of the pictures reaches the features.
+        # Within a distance of a thousand sides: no gradient of the pictures reaches the features.
         trainer = RadianceTrainer(
-            dataset.train, BOX, TINY, settings(damping_distance=1000.0, empty_weight=0.0, grid_decay=weight), ns, depth=False
+            dataset.train,
+            BOX,
+            TINY,
+            settings(damping_distance=1000.0, empty_weight=0.0, grid_decay=weight),
+            ns,
+            depth=False,
         )
         trainer.optimiser["grid.table"] = dr.full(ns.Float, 0.5, len(trainer.current_field.parameters()["grid.table"]))
         for _ in range(10):
@@ -265,33 +290,33 @@ def test_features_that_no_ray_shapes_are_let_go(dataset):
 
 
 @pytest.mark.parametrize("depth", [True, False])
-def test_free_space_is_carved_where_all_depth_is_known(dataset, depth):
-    """Cells far in front of the surface are then empty from the start; without depth nothing is known of them."""
+def test_free_space_is_carved_with_full_depth(dataset, depth):
+    """Cells far in front of the surface are then empty from the start; without depth they are unknown."""
     views = [replace(v, depth=np.where(v.depth > 0, v.depth, 9).astype(np.float32)) for v in dataset.train]
     trainer = RadianceTrainer(views, BOX, TINY, settings(), ns, depth=depth)
     assert trainer.is_carved == depth and trainer.pixels.has_full_depth
-    # Where the cameras are looking from to the ball: nearer to them than its surface by four cells and more.
+    # Between the cameras and the ball: at least four cells in front of its surface.
     p = dr.normalize(ns.Array3f(*np.random.default_rng(0).normal(size=(3, 500)).astype(np.float32))) * 0.9
     seen = trainer.grid.is_occupied(p, dr.full(ns.Bool, True, 500)).numpy()
     assert (seen.mean() < 0.2) == depth
 
 
-def test_places_count_first_and_colours_later(dataset, monkeypatch):
-    """The loss of depth alone, of one a ray: its weight, which falls by ``final_depth`` over the run."""
+def test_depth_weight_decays(dataset, monkeypatch):
+    """The loss of depth alone, one per ray: its weight, which decreases over the run."""
     from nerg_mi.train import radiance_trainer as radiance
 
-    monkeypatch.setattr(radiance, "color_loss", lambda *given: 0 * color_loss(*given))
-    monkeypatch.setattr(radiance, "depth_loss", lambda *given: 0 * depth_loss(*given) + 1)
+    monkeypatch.setattr(radiance, "color_loss", lambda *options: 0 * color_loss(*options))
+    monkeypatch.setattr(radiance, "depth_loss", lambda *options: 0 * depth_loss(*options) + 1)
     for steps in (0, 49, 99):
-        given = settings(steps=100, depth_weight=0.3, depth_weight_final_ratio=0.04, distortion_weight=0.0)
-        trainer = RadianceTrainer(dataset.train, BOX, TINY, given, ns)
+        options = settings(steps=100, depth_weight=0.3, depth_weight_final_ratio=0.04, distortion_weight=0.0)
+        trainer = RadianceTrainer(dataset.train, BOX, TINY, options, ns)
         trainer.steps = steps
         trainer.step()
         assert float(trainer.loss[0]) == pytest.approx(0.3 * 0.04 ** ((steps + 1) / 100), rel=1e-4)
 
 
-def test_rays_that_do_not_fit_into_a_batch_do_not_count(dataset, monkeypatch):
-    """With a loss of 1 a ray the mean over those that are complete is 1."""
+def test_incomplete_rays_do_not_count(dataset, monkeypatch):
+    """With a loss of 1 per ray the mean over complete rays is 1."""
     from nerg_mi.train import radiance_trainer as module
 
     monkeypatch.setattr(module, "color_loss", lambda _, opacity, *rest: dr.ones(ns.Float, dr.width(opacity)))
@@ -313,36 +338,58 @@ def test_rays_that_do_not_fit_into_a_batch_do_not_count(dataset, monkeypatch):
 STRIDES = (16, 8, 4, 2)
 
 
-def test_rays_fill_the_batch_or_the_pass_before_it_whichever_is_full_first():
-    assert adapt_ray_count(1000, samples_per_ray=10, prepass_samples_per_ray=20, batch=16000, max_prepass_samples=128000) == 1260  # half way to .95 * 1600
-    assert adapt_ray_count(1000, samples_per_ray=10, prepass_samples_per_ray=100, batch=16000, max_prepass_samples=128000) == 1108  # half way to .95 * 1280
+def test_ray_count_fills_the_batch_or_the_density_pass():
+    # halfway to 0.95 * 1600
+    assert (
+        adapt_ray_count(1000, samples_per_ray=10, prepass_samples_per_ray=20, batch=16000, max_prepass_samples=128000)
+        == 1260
+    )
+    # halfway to 0.95 * 1280
+    assert (
+        adapt_ray_count(1000, samples_per_ray=10, prepass_samples_per_ray=100, batch=16000, max_prepass_samples=128000)
+        == 1108
+    )
     rays = 1000
     for _ in range(40):
-        rays = adapt_ray_count(rays, samples_per_ray=2, prepass_samples_per_ray=300, batch=16000, max_prepass_samples=128000)
+        rays = adapt_ray_count(
+            rays, samples_per_ray=2, prepass_samples_per_ray=300, batch=16000, max_prepass_samples=128000
+        )
     assert rays * 300 <= 0.95 * 128000 < (rays + 2) * 300
 
 
-def test_rays_change_by_a_factor_of_two_at_most_and_stay_in_bounds():
-    assert adapt_ray_count(1000, samples_per_ray=0, prepass_samples_per_ray=0, batch=16000, max_prepass_samples=128000) == 2000
-    assert adapt_ray_count(1000, samples_per_ray=1e6, prepass_samples_per_ray=1e6, batch=16000, max_prepass_samples=128000) == 500
-    assert adapt_ray_count(2**14, samples_per_ray=0, prepass_samples_per_ray=0, batch=16000, max_prepass_samples=128000) == 2**14
-    assert adapt_ray_count(64, samples_per_ray=1e6, prepass_samples_per_ray=1e6, batch=16000, max_prepass_samples=128000) == 64
+def test_ray_count_changes_at_most_by_a_factor_of_two():
+    assert (
+        adapt_ray_count(1000, samples_per_ray=0, prepass_samples_per_ray=0, batch=16000, max_prepass_samples=128000)
+        == 2000
+    )
+    assert (
+        adapt_ray_count(1000, samples_per_ray=1e6, prepass_samples_per_ray=1e6, batch=16000, max_prepass_samples=128000)
+        == 500
+    )
+    assert (
+        adapt_ray_count(2**14, samples_per_ray=0, prepass_samples_per_ray=0, batch=16000, max_prepass_samples=128000)
+        == 2**14
+    )
+    assert (
+        adapt_ray_count(64, samples_per_ray=1e6, prepass_samples_per_ray=1e6, batch=16000, max_prepass_samples=128000)
+        == 64
+    )
 
 
 @pytest.mark.parametrize(
     "rays, looked, steps, expected",
     [
         (500, 100, 340, 500),
-        (5000, 100, 340, 1216),  # the pass
-        (5000, 1, 3400, 617),  # the steps on the way
+        (5000, 100, 340, 1216),  # limited by the density pass
+        (5000, 1, 3400, 617),  # limited by the steps
         (5000, 0, 10**9, 1),
     ],
 )
-def test_rays_of_a_step_are_those_that_are_affordable(rays, looked, steps, expected):
+def test_ray_count_is_limited(rays, looked, steps, expected):
     assert limit_ray_count(rays, looked, steps, max_prepass_samples=128000, max_candidates=2_100_000) == expected
 
 
-def test_marching_gets_finer_by_one_stride_a_step_when_it_is_time_to():
+def test_stride_is_refined_on_schedule():
     assert refine_stride(16, STRIDES, 16, 1, 128000) == 16
     assert refine_stride(16, STRIDES, 8, 1, 128000) == 8
     assert refine_stride(16, STRIDES, 1, 1, 128000) == 8
@@ -353,15 +400,15 @@ def test_marching_gets_finer_by_one_stride_a_step_when_it_is_time_to():
     assert refine_stride(4, (), 1, 1, 128000) == 1
 
 
-def test_marching_waits_while_the_next_stride_has_no_room_for_enough_rays():
-    most = 128000
-    fits = most / MIN_RAYS_TO_REFINE / 2  # samples a ray, of which the finer stride has twice as many
-    assert refine_stride(8, STRIDES, 1, 0.99 * fits, most) == 4
-    assert refine_stride(8, STRIDES, 1, 1.01 * fits, most) == 8
-    assert refine_stride(8, STRIDES, 1, 1.01 * fits, most, wait_for_clearing=False) == 4
-    # From 16 to 1 is sixteen times as many.
-    assert refine_stride(16, (16,), 1, 0.99 * fits, most) == 16
-    assert refine_stride(16, (16,), 1, 0.99 * fits / 8, most) == 1
+def test_stride_refinement_waits_for_clearing():
+    limit = 128000
+    fits = limit / MIN_RAYS_TO_REFINE / 2  # samples per ray; the finer stride has twice as many
+    assert refine_stride(8, STRIDES, 1, 0.99 * fits, limit) == 4
+    assert refine_stride(8, STRIDES, 1, 1.01 * fits, limit) == 8
+    assert refine_stride(8, STRIDES, 1, 1.01 * fits, limit, wait_for_clearing=False) == 4
+    # From 16 to 1 there are sixteen times as many.
+    assert refine_stride(16, (16,), 1, 0.99 * fits, limit) == 16
+    assert refine_stride(16, (16,), 1, 0.99 * fits / 8, limit) == 1
 
 
 # ---- What a radiance training is asked for: sizes, schedules, and what is refused ----
@@ -383,13 +430,13 @@ def test_settings_and_sizes_are_checked():
     assert make_radiance_config("paper", BOX).grid.log2_rows == 19
 
 
-def test_damping_near_cameras_ends_when_surfaces_stand():
+def test_damping_near_cameras_ends():
     s = RadianceSettings(steps=5, damping_distance=0.4, damping_fraction=0.5)
     assert [s.damping_distance_at(p) for p in (0, 0.25, 0.5, 1)] == pytest.approx([0.4, 0.2, 0, 0])
 
 
 def test_a_size_is_a_grid_and_a_contracted_box_has_one_twice_as_fine():
-    """Its inner cube takes half of each edge."""
+    """The inner cube takes half of each edge."""
     small = make_radiance_config("small", BOX)
     assert small.grid == HashGridConfig(levels=8, log2_rows=16, base=32, finest=512) and small.density_scale == 0.5
     around = make_radiance_config("small", ContractedBox(BOX))
