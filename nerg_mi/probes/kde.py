@@ -1,5 +1,5 @@
-"""Kernel densities on the sphere: the bandwidth, the exact estimate in one Dr.Jit kernel, and a table of one
-density."""
+"""Kernel density estimates on the sphere: bandwidth selection, exact evaluation in one Dr.Jit kernel, and
+tabulation."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from nerg_mi.maths.vmf import log_normaliser
 
 # ---- Bandwidth ----
 #
-# How wide a kernel: rules for the concentration κ of a probe's density.
+# Rules for the concentration κ of the kernels of a probe.
 #
-# ``silverman``: the published code's rule (:func:`nerg_mi.maths.vmf.silverman_kappa`). ``loo``: the κ under which each
-# ray is best predicted by the others. Each for every probe, or one for all of them.
+# ``silverman`` is the rule of the published code (:func:`nerg_mi.maths.vmf.silverman_kappa`). ``loo`` maximises the
+# leave-one-out likelihood. Both select κ for each probe, or one value for all probes.
 
 KAPPA_MIN = 1.0
-SHARED_KAPPA_PROBES = 256  # probes that speak for all where one κ is sought
+SHARED_KAPPA_PROBES = 256  # Probes sampled to select one common κ
 
 
 def make_kappa_grid(kappa_max: float, kappa_min: float = KAPPA_MIN) -> np.ndarray:
-    """Concentrations that ``loo`` chooses from: geometric, 25 % steps."""
+    """Return the candidate concentrations of ``loo``: a geometric grid with steps of 25 %."""
     return np.geomspace(kappa_min, kappa_max, max(2, 1 + round(np.log(kappa_max / kappa_min) / np.log(1.25))))
 
 
@@ -42,26 +42,46 @@ def compute_loo_scores(
     max_rays: int = 256,
     rng: np.random.Generator | None = None,
 ) -> np.ndarray:
-    """Mean log-likelihood a ray at each κ of ``grid`` (K,), natural, of 1/sr: Σ_i log mean_j f(x_i; x_j, κ) / n.
+    """Compute the leave-one-out log-likelihood per ray for each κ of ``grid``: Σ_i log mean_j f(x_i; x_j, κ) / n.
 
-    j runs over rays of other ``groups`` (n,) where there are two or more, else over j ≠ i. Leaving out people and not
-    only the ray itself matters at 50 Hz: successive rays repeat each other, and the sharpest κ would win.
-    ``directions`` (n, 3) unit, at least two; of more than ``most`` a random choice is used.
+    Parameters
+    ----------
+    directions : numpy.ndarray
+        Unit directions (n, 3), at least two.
+    groups : numpy.ndarray, optional
+        Group (n,) of each ray, such as its participant. j runs over rays of other groups if there are two or more,
+        otherwise over j ≠ i.
+    grid : numpy.ndarray
+        Concentrations (K,).
+    max_rays : int
+        If there are more rays, a random subset is used.
+    rng : numpy.random.Generator, optional
+        Random numbers of the subset.
+
+    Returns
+    -------
+    numpy.ndarray
+        Scores (K,) in nats of 1/sr.
+
+    Notes
+    -----
+    At 50 Hz successive rays are nearly equal, so leaving out only the ray itself would select the largest κ. Therefore
+    whole participants are left out.
     """
     rng = rng or np.random.default_rng(0)
     if len(directions) > max_rays:
-        chosen = rng.choice(len(directions), max_rays, replace=False)
-        directions, groups = directions[chosen], None if groups is None else np.asarray(groups)[chosen]
+        subset = rng.choice(len(directions), max_rays, replace=False)
+        directions, groups = directions[subset], None if groups is None else np.asarray(groups)[subset]
     if groups is None or len(np.unique(groups)) < 2:
         groups = np.arange(len(directions))
-    others = groups[:, None] != groups[None, :]
-    apart = vmf.one_minus_cosine(directions[:, None], directions[None, :])
-    apart = np.where(others, apart, np.inf)
-    nearest = apart.min(axis=1, keepdims=True)
-    log_count = np.log(others.sum(axis=1))
-    # exp(-κ (a - a_min)) with the nearest taken out: no ray ever has log 0, and single precision suffices.
-    beyond = (apart - nearest).astype(np.float32)
-    sums = np.array([np.exp(np.float32(-k) * beyond).sum(axis=1) for k in grid], dtype=np.float64)
+    is_other_group = groups[:, None] != groups[None, :]
+    distance = vmf.one_minus_cosine(directions[:, None], directions[None, :])
+    distance = np.where(is_other_group, distance, np.inf)
+    nearest = distance.min(axis=1, keepdims=True)
+    log_count = np.log(is_other_group.sum(axis=1))
+    # exp(-κ (a - a_min)) relative to the nearest ray: no ray has log 0, and single precision suffices.
+    excess = (distance - nearest).astype(np.float32)
+    sums = np.array([np.exp(np.float32(-k) * excess).sum(axis=1) for k in grid], dtype=np.float64)
     return (np.log(sums) - np.multiply.outer(grid, nearest[:, 0]) - log_count).mean(axis=1) + vmf.log_normaliser(grid)
 
 
@@ -73,7 +93,7 @@ def select_loo_kappa(
     max_rays: int = 256,
     rng: np.random.Generator | None = None,
 ) -> float:
-    """κ between 1 and ``kappa_max`` under which rays are best predicted by the others; 1 for a ray alone."""
+    """Select κ between 1 and ``kappa_max`` by leave-one-out likelihood; 1 for a single ray."""
     if len(directions) < 2:
         return KAPPA_MIN
     grid = make_kappa_grid(kappa_max)
@@ -88,8 +108,11 @@ def select_loo_kappas(
     shared: bool,
     rng: np.random.Generator,
 ) -> np.ndarray:
-    """κ (P,) of probes that hold ``directions[offsets[p]:offsets[p + 1]]`` by ``loo``. ``shared``: one for all, under
-    which the rays of 256 probes (at random) are best predicted together."""
+    """Select κ (P,) of each probe by leave-one-out likelihood.
+
+    Probe p holds ``directions[offsets[p]:offsets[p + 1]]``. With ``shared`` one κ maximises the joint likelihood of 256
+    random probes.
+    """
     runs = [slice(a, b) for a, b in zip(offsets[:-1], offsets[1:])]
     if not shared:
         return np.array([select_loo_kappa(directions[r], persons[r], kappa_max=kappa_max, rng=rng) for r in runs])
@@ -104,8 +127,11 @@ def select_loo_kappas(
 def compute_silverman_kappas(
     directions: np.ndarray, weights: np.ndarray | None, offsets: np.ndarray, kappa_max: float, shared: bool
 ) -> np.ndarray:
-    """κ (P,) by the published code's rule, at most ``kappa_max``; with ``weights`` (n,) from the weighted mean
-    resultant and the effective count (Σw)²/Σw². ``shared``: one for all, 1 over the mean of 1/κ."""
+    """Compute κ (P,) by the rule of the published code, at most ``kappa_max``.
+
+    With ``weights`` (n,) the rule uses the weighted mean resultant length and the effective count (Σw)²/Σw². With
+    ``shared`` all probes have one κ, 1 over the mean of 1/κ.
+    """
     w = np.ones(len(directions)) if weights is None else weights
     total = np.add.reduceat(w, offsets[:-1])
     count = total**2 / np.add.reduceat(w**2, offsets[:-1])
@@ -116,30 +142,46 @@ def compute_silverman_kappas(
 
 # ---- Kernel densities on the sphere, evaluated exactly in one Dr.Jit kernel ----
 #
-# A probe p holds a run of ray directions μ_i with weights w_i that sum to one, and one concentration: p(x) = Σ_i w_i
-# f(x; μ_i, κ_p), f von Mises-Fisher (NeRG, Section 5.1). It integrates to one over the sphere whatever κ is.
+# Probe p holds ray directions μ_i with weights w_i that sum to one, and one concentration: p(x) = Σ_i w_i f(x; μ_i,
+# κ_p), where f is the von Mises-Fisher density (NeRG, Section 5.1). It integrates to one over the sphere for any κ.
 
 Backend = str | ModuleType | dr.ArrayBase | None
-"""Where a density is evaluated: a name such as ``"llvm"``, a namespace of Dr.Jit's arrays, an array, or None for that
-of Mitsuba's variant (:func:`default_backend`)."""
+"""Where a density is evaluated: a name such as ``"llvm"``, a Dr.Jit namespace, a Dr.Jit array, or None for the backend
+of Mitsuba's variant (:func:`get_default_backend`).
+"""
 
-DIRECTIONS_PER_LANE = 16  # Directions that a lane of `SphericalKde.evaluate` takes at once
+DIRECTIONS_PER_LANE = 16  # Directions evaluated by one lane of `SphericalKde.evaluate`
 
 
 def get_default_backend() -> str:
-    """``"cuda"`` where Mitsuba was switched to a CUDA variant, else ``"llvm"``."""
+    """Return ``"cuda"`` if a CUDA variant of Mitsuba is active, otherwise ``"llvm"``."""
     mitsuba = sys.modules.get("mitsuba")
     variant = (mitsuba.variant() if mitsuba is not None else None) or ""
     return "cuda" if variant.startswith("cuda") else "llvm"
 
 
 class SphericalKde:
-    """P kernel densities on one Dr.Jit backend.
+    """P kernel density estimates on one Dr.Jit backend.
 
-    ``rays`` (n, 3): unit directions, probe after probe; ``offsets`` (P + 1,): probe p holds
-    ``rays[offsets[p]:offsets[p + 1]]``, at least one; ``kappa`` (P,) or a number; ``weights`` (n,) not negative,
-    normalised here per probe, or ``None`` for equal ones. ``backend``: see `Backend`. Raises ``ValueError`` for shapes
-    that do not fit, `NergError` for a probe without rays, or whose rays all have weight zero.
+    Parameters
+    ----------
+    rays : numpy.ndarray
+        Unit directions (n, 3), probe after probe.
+    offsets : numpy.ndarray
+        Offsets (P + 1,): probe p holds ``rays[offsets[p]:offsets[p + 1]]``, at least one ray.
+    kappa : numpy.ndarray or float
+        Concentrations (P,) of the kernels.
+    weights : numpy.ndarray, optional
+        Non-negative weights (n,), normalised per probe. Default: equal.
+    backend : Backend
+        Where the densities are evaluated.
+
+    Raises
+    ------
+    ValueError
+        If the shapes do not match.
+    NergError
+        If a probe has no rays, or only rays with weight zero.
     """
 
     def __init__(
@@ -161,26 +203,29 @@ class SphericalKde:
             or offsets[-1] != len(rays)
         ):
             raise ValueError(
-                f"rays {rays.shape} and offsets {offsets.shape} do not fit: offsets run from 0 to the number of rays"
+                f"rays {rays.shape} and offsets {offsets.shape} do not match: offsets must run from 0 to the number of "
+                "rays"
             )
         if counts.min() < 1:
-            raise NergError(f"probe {int(np.argmin(counts))} has no ray; raise min_rays")
+            raise NergError(f"probe {int(np.argmin(counts))} has no rays; increase min_rays")
         kappa = np.broadcast_to(np.asarray(kappa, dtype=np.float64), counts.shape)
         if weights is None:
-            share = np.repeat(1.0 / counts, counts)
+            ray_weights = np.repeat(1.0 / counts, counts)
         else:
             weights = np.asarray(weights, dtype=np.float64)
             if weights.shape != (len(rays),) or not (weights >= 0).all():
-                raise ValueError(f"weights {weights.shape} must be {len(rays)} non-negative numbers, one a ray")
+                raise ValueError(f"weights {weights.shape} must be {len(rays)} non-negative numbers, one per ray")
             total = np.add.reduceat(weights, offsets[:-1])
             if not (total > 0).all():
-                raise NergError(f"the weights of probe {int(np.argmin(total))} are all zero; leave the probe out")
-            share = weights / np.repeat(total, counts)
+                raise NergError(f"all weights of probe {int(np.argmin(total))} are zero; remove the probe")
+            ray_weights = weights / np.repeat(total, counts)
 
         self.count = len(counts)
-        self.ns: ModuleType = backend if isinstance(backend, ModuleType) else namespace(backend or get_default_backend())
-        # One packet of four floats a ray: direction and weight come in one gather.
-        packed = np.concatenate([rays, share[:, None]], axis=1).astype(np.float32)
+        self.ns: ModuleType = (
+            backend if isinstance(backend, ModuleType) else namespace(backend or get_default_backend())
+        )
+        # Four floats per ray, so that direction and weight are loaded by one gather.
+        packed = np.concatenate([rays, ray_weights[:, None]], axis=1).astype(np.float32)
         self._rays = self.ns.Float(packed.ravel())
         self._offsets = self.ns.UInt32(offsets.astype(np.uint32))
         self._kappa = self.ns.Float(kappa.astype(np.float32))
@@ -192,7 +237,7 @@ class SphericalKde:
         return np.array(self._kappa)
 
     def select_range(self, first: int, last: int) -> SphericalKde:
-        """The densities of probes ``first`` to ``last`` - 1 as an object of their own."""
+        """Return the densities of probes ``first`` to ``last`` - 1."""
         if (first, last) == (0, self.count):
             return self
         offsets = np.array(self._offsets)[first : last + 1].astype(np.int64)
@@ -200,8 +245,10 @@ class SphericalKde:
         return SphericalKde(packed[:, :3], offsets - offsets[0], self.kappa[first:last], packed[:, 3], self.ns)
 
     def density(self, probe: UInt32, direction: Array3f) -> Float:
-        """Density of probe ``probe`` (M lanes) in ``direction`` (unit, M lanes), in 1/sr, M lanes: traced, not
-        evaluated. Lanes of one probe should be neighbours: they then share their loop."""
+        """Density in 1/sr of ``probe`` (M lanes) in unit ``direction`` (M lanes); traced, not evaluated.
+
+        Lanes of one probe should be adjacent, because they then share their loop.
+        """
         ns = self.ns
         first = dr.gather(ns.UInt32, self._offsets, probe)
         last = dr.gather(ns.UInt32, self._offsets, probe + 1)
@@ -223,9 +270,17 @@ class SphericalKde:
         return total * dr.exp(log_c)
 
     def evaluate(self, directions: np.ndarray) -> np.ndarray:
-        """Densities of every probe in many directions, (P, D) float32, 1/sr, in one kernel.
+        """Evaluate the densities of all probes in many directions in one kernel.
 
-        ``directions``: (D, 3), the same for all, or (P, D, 3), each its own.
+        Parameters
+        ----------
+        directions : numpy.ndarray
+            Unit directions (D, 3), common to all probes, or (P, D, 3).
+
+        Returns
+        -------
+        numpy.ndarray
+            Densities (P, D) in 1/sr, float32.
         """
         directions = np.asarray(directions, dtype=np.float32)
         if (
@@ -233,9 +288,9 @@ class SphericalKde:
             or directions.ndim not in (2, 3)
             or (directions.ndim == 3 and len(directions) != self.count)
         ):
-            raise ValueError(f"directions have shape {directions.shape}, expected (D, 3) or ({self.count}, D, 3)")
-        # A lane takes several directions of one probe, so that a ray is fetched once for all of them: four times as
-        # fast.
+            raise ValueError(f"directions have shape {directions.shape}; expected (D, 3) or ({self.count}, D, 3)")
+        # A lane evaluates several directions of one probe, so that each ray is loaded once for all of them: four times
+        # as fast.
         D = directions.shape[-2]
         G = min(DIRECTIONS_PER_LANE, D)
         groups = -(-D // G)
@@ -268,25 +323,43 @@ class SphericalKde:
 
 # ---- Table ----
 #
-# One kernel density on a table over the sphere: as good as exact for pictures, and for any number of directions.
+# One kernel density tabulated over the sphere, practically exact for pictures and independent of the number of
+# directions.
 #
-# A density of kernels is smooth on the scale 1/sqrt(κ). So it is evaluated exactly at the texels of a cube map whose
-# spacing is a fraction of that, and in between by cubic interpolation: a lookup costs sixteen values, however many rays
+# A kernel density is smooth on the scale 1/sqrt(κ). It is evaluated exactly at the texels of a cube map with a spacing
+# of a fraction of that scale, and interpolated cubically in between: a lookup reads sixteen values, however many rays
 # the probe holds.
 
 TEXEL_SPACING = 0.15
-"""Texels' distance in units of 1/sqrt(κ). The error of the cubic interpolation goes with its fourth power; at 0.15 it
-is below 1e-4 of the highest density that the kernel of one ray reaches (measured in the tests)."""
-_PAD = 2  # texels that a face has beyond its edge, so that the interpolation never crosses from one face to another
-_MOST = 4096
+"""Distance of the texels in units of 1/sqrt(κ). The error of cubic interpolation scales with its fourth power; at 0.15
+it is below 1e-4 of the maximum of a single kernel (measured in the tests).
+"""
+_PADDING = 2  # Padding of a face in texels, so that the interpolation never crosses faces
+_MAX_RESOLUTION = 4096
 
 
 class SphericalKdeTable:
-    """The density of probe ``probe`` of ``kde``, tabulated.
+    """The density of probe ``probe`` of ``kde``, tabulated on a cube map.
 
-    ``used`` (N, 3): the directions that will be asked for, where they are known; other texels are then not evaluated,
-    and lookups there are wrong. A face of the cube is divided in equal angles, u = (4/π) atan(x/z). Raises
-    ``ValueError`` for a concentration whose texels would be too many (above about 1.5e5).
+    Parameters
+    ----------
+    kde : SphericalKde
+        Kernel densities.
+    probe : int
+        Index of the probe.
+    directions : numpy.ndarray, optional
+        Directions (N, 3) of all later lookups, if known. Other texels are not evaluated, and lookups there are wrong.
+    spacing : float
+        Distance of the texels in units of 1/sqrt(κ).
+
+    Raises
+    ------
+    ValueError
+        If the concentration needs too many texels (κ above about 1.5e5).
+
+    Notes
+    -----
+    A face of the cube is divided into equal angles, u = (4/π) atan(x/z).
     """
 
     def __init__(
@@ -294,33 +367,37 @@ class SphericalKdeTable:
     ) -> None:
         self.ns = ns = kde.ns
         kappa = float(kde.kappa[probe])
-        self.resolution = n = _texels(kappa, spacing)
-        if n > _MOST:
+        self.resolution = n = _count_texels(kappa, spacing)
+        if n > _MAX_RESOLUTION:
             raise ValueError(
                 f"κ = {kappa:.3g} needs {6 * n * n:,} texels; evaluate the density directly (SphericalKde.evaluate)"
             )
-        self.padded_resolution = n + 2 * _PAD
-        wanted = np.ones((6, self.padded_resolution, self.padded_resolution), bool) if directions is None else self._touched(directions)
-        at = np.flatnonzero(wanted.ravel())
+        self.padded_resolution = n + 2 * _PADDING
+        is_needed = (
+            np.ones((6, self.padded_resolution, self.padded_resolution), bool)
+            if directions is None
+            else self._find_texels(directions)
+        )
+        at = np.flatnonzero(is_needed.ravel())
         face, row = np.divmod(at, self.padded_resolution * self.padded_resolution)
         j, i = np.divmod(row, self.padded_resolution)
-        angle = lambda k: np.tan(0.25 * math.pi * ((k - _PAD + 0.5) * 2.0 / n - 1.0))
-        values = np.zeros(wanted.size, np.float32)
-        values[at] = kde.select_range(probe, probe + 1).evaluate(_from_face(face, angle(i), angle(j)))[0]
+        angle = lambda k: np.tan(0.25 * math.pi * ((k - _PADDING + 0.5) * 2.0 / n - 1.0))
+        values = np.zeros(is_needed.size, np.float32)
+        values[at] = kde.select_range(probe, probe + 1).evaluate(_face_directions(face, angle(i), angle(j)))[0]
         self.num_evaluated = len(at)
         self._values = ns.Float(values)
 
     @staticmethod
     def is_worthwhile(kde: SphericalKde, count: int) -> bool:
-        """Whether a table of the first probe has texels no denser than ``count`` directions over the sphere."""
-        n = _texels(float(kde.kappa[0]), TEXEL_SPACING)
-        return n <= _MOST and 6 * n * n <= 16 * count
+        """Return whether a table of the first probe is at most as dense as ``count`` directions over the sphere."""
+        n = _count_texels(float(kde.kappa[0]), TEXEL_SPACING)
+        return n <= _MAX_RESOLUTION and 6 * n * n <= 16 * count
 
-    def _touched(self, directions: np.ndarray) -> np.ndarray:
-        """Texels (6, width, width) that lookups in ``directions`` read."""
+    def _find_texels(self, directions: np.ndarray) -> np.ndarray:
+        """Return the texels (6, width, width) that lookups in ``directions`` read."""
         ns = self.ns
         hit = dr.zeros(ns.UInt32, 6 * self.padded_resolution * self.padded_resolution)
-        first = self._cell(to_vector(ns.Array3f, directions.reshape(-1, 3)))[0]
+        first = self._locate(to_vector(ns.Array3f, directions.reshape(-1, 3)))[0]
         dr.scatter(hit, ns.UInt32(1), first)
         corner = np.array(hit).reshape(6, self.padded_resolution, self.padded_resolution) > 0
         out = corner.copy()
@@ -329,8 +406,9 @@ class SphericalKdeTable:
                 out[:, dj:, di:] |= corner[:, : self.padded_resolution - dj, : self.padded_resolution - di]
         return out
 
-    def _cell(self, d: Array3f) -> tuple[UInt32, list[Float]]:
-        """Index of the first of a lookup's 4 x 4 texels, and where between the middle ones it lies, in [0, 1)."""
+    def _locate(self, d: Array3f) -> tuple[UInt32, list[Float]]:
+        """Return the index of the first of a lookup's 4 x 4 texels, and the position between the middle ones in [0,
+        1)."""
         ns = self.ns
         a = dr.abs(d)
         on_x, on_y = (a.x >= a.y) & (a.x >= a.z), (a.y > a.x) & (a.y >= a.z)
@@ -339,42 +417,44 @@ class SphericalKdeTable:
         face += dr.select(major < 0, ns.UInt32(1), ns.UInt32(0))
         u = dr.select(on_x, d.y, d.x) / dr.abs(major)
         v = dr.select(on_x | on_y, d.z, d.y) / dr.abs(major)
-        place = [dr.fma(dr.atan(w), 2.0 / math.pi, 0.5) * self.resolution + (_PAD - 0.5) for w in (u, v)]
-        whole = [dr.clip(dr.floor(p), 1, self.padded_resolution - 3) for p in place]
-        i, j = (ns.UInt32(w) - 1 for w in whole)
-        return (face * self.padded_resolution + j) * self.padded_resolution + i, [p - w for p, w in zip(place, whole)]
+        position = [dr.fma(dr.atan(w), 2.0 / math.pi, 0.5) * self.resolution + (_PADDING - 0.5) for w in (u, v)]
+        base = [dr.clip(dr.floor(p), 1, self.padded_resolution - 3) for p in position]
+        i, j = (ns.UInt32(w) - 1 for w in base)
+        return (face * self.padded_resolution + j) * self.padded_resolution + i, [p - w for p, w in zip(position, base)]
 
     def density(self, direction: Array3f) -> Float:
-        """Density in ``direction`` (unit), in 1/sr: traced, not evaluated, differentiable."""
-        first, (s, t) = self._cell(direction)
-        ws, wt = _cubic(s), _cubic(t)
+        """Density in 1/sr in unit ``direction``: traced, not evaluated, differentiable."""
+        first, (s, t) = self._locate(direction)
+        ws, wt = _cubic_weights(s), _cubic_weights(t)
         total: Any = 0
         for j in range(4):
             row = 0
             for i in range(4):
-                row = dr.fma(dr.gather(self.ns.Float, self._values, first + (j * self.padded_resolution + i)), ws[i], row)
+                row = dr.fma(
+                    dr.gather(self.ns.Float, self._values, first + (j * self.padded_resolution + i)), ws[i], row
+                )
             total = dr.fma(row, wt[j], total)
-        return dr.maximum(total, 0)  # Interpolation may fall below zero by the size of its error
+        return dr.maximum(total, 0)  # Interpolation errors may make the density negative
 
     def evaluate(self, directions: np.ndarray) -> np.ndarray:
-        """Densities (N,) float32 in ``directions`` (N, 3), 1/sr."""
+        """Evaluate the densities (N,) in 1/sr, float32, in ``directions`` (N, 3)."""
         d = to_vector(self.ns.Array3f, directions)
         return np.array(self.density(d))
 
 
-def _texels(kappa: float, spacing: float) -> int:
-    """Texels along a face's edge."""
+def _count_texels(kappa: float, spacing: float) -> int:
+    """Return the number of texels along the edge of a face."""
     return max(8, math.ceil(0.5 * math.pi / spacing * math.sqrt(kappa)))
 
 
-def _cubic(t: Float) -> tuple[Float, Float, Float, Float]:
-    """Weights of four equidistant values at -1, 0, 1, 2 (Lagrange) for a place t between the middle two."""
+def _cubic_weights(t: Float) -> tuple[Float, Float, Float, Float]:
+    """Return the Lagrange weights of four equidistant values at -1, 0, 1, 2 for a position t between the middle two."""
     a, b, c = t + 1, t - 1, t - 2
     return -t * b * c / 6, a * b * c / 2, -a * t * c / 2, a * t * b / 6
 
 
-def _from_face(face: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Unit directions (N, 3) of places on the cube's faces +x, -x, +y, -y, +z, -z."""
+def _face_directions(face: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Return the unit directions (N, 3) of positions on the cube faces +x, -x, +y, -y, +z, -z."""
     out = np.empty((len(face), 3))
     axis = face // 2
     n = np.arange(len(face))

@@ -1,4 +1,4 @@
-"""Kernel densities of tracked rays in pictures: for a whole picture, and as an observer's view in the integrator."""
+"""Kernel densities of gaze rays for whole pictures, and for observers in the integrator."""
 
 from __future__ import annotations
 
@@ -18,32 +18,49 @@ from .probes import Probes, place_probes
 
 # ---- Frame ----
 #
-# The ground truth of a whole picture: the kernel density of the rays around an observer, at every pixel.
+# Ground truth of a whole picture: the kernel density of the rays around an observer, at every pixel.
 #
-# What the paper shows beside its field (Section 5.3), there in five seconds a frame and more.
+# The paper compares it with its field (Section 5.3), where a frame takes five seconds and more.
 
 METHODS = ("auto", "exact", "table")
-MIN_TABLE_DIRECTIONS = 4096  # directions from which on a table is quicker
+MIN_TABLE_DIRECTIONS = 4096  # Minimum number of directions for which a table is faster
 
 
 def make_probe_at(
     rays: Rays, observer: np.ndarray, radius: float = 0.25, *, index: RayIndex | None = None, **options: Any
 ) -> Probes:
-    """The one probe of an observer at ``observer`` (3,), in metres in the rays' frame; ``options`` as for
-    :func:`nerg_mi.probes.probes.place_probes`. Raises `NergError` where too few rays start near."""
+    """Make the probe of an observer at ``observer`` (3,), in metres in the frame of the rays.
+
+    ``options`` are those of :func:`nerg_mi.probes.probes.place_probes`. Raises `NergError` if too few rays start
+    nearby.
+    """
     options = {"min_rays": 1, "centre": "query", **options}
     return place_probes(rays, radius, queries=np.asarray(observer).reshape(1, 3), index=index, **options)
 
 
 def compute_directions(observer: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Unit directions r_o (N, 3) float32 from ``observer`` (3,) to ``points`` (..., 3), such as the AOV ``position``,
-    and the mask (...) of points that have one: finite and not the observer's own place. Others get +z."""
+    """Compute unit directions from an observer to points.
+
+    Parameters
+    ----------
+    observer : numpy.ndarray
+        Observer position (3,).
+    points : numpy.ndarray
+        Points (..., 3), such as the AOV ``position``.
+
+    Returns
+    -------
+    directions : numpy.ndarray
+        Unit directions (N, 3), float32; +z for invalid points.
+    mask : numpy.ndarray
+        Mask (...) of valid points: finite and different from the observer's position.
+    """
     points = np.asarray(points)
     offset = points.reshape(-1, 3).astype(np.float32) - np.asarray(observer, np.float32)
     length = np.sqrt(np.einsum("ni,ni->n", offset, offset))
-    there = np.isfinite(length) & (length > 0)
-    offset[~there], length[~there] = (0, 0, 1), 1
-    return offset / length[:, None], there.reshape(points.shape[:-1])
+    is_valid = np.isfinite(length) & (length > 0)
+    offset[~is_valid], length[~is_valid] = (0, 0, 1), 1
+    return offset / length[:, None], is_valid.reshape(points.shape[:-1])
 
 
 def evaluate_kde_frame(
@@ -56,57 +73,101 @@ def evaluate_kde_frame(
     method: str = "auto",
     backend: Backend = None,
 ) -> np.ndarray:
-    """Densities in 1/sr at every pixel, float32, of the shape of the picture.
+    """Evaluate the kernel density at every pixel of a picture.
 
-    ``probe``: one density (:func:`probe_at`). Either ``directions`` (..., 3), unit, from the observer; or ``observer``
-    (3,) and ``points`` (..., 3), what each pixel shows. ``mask`` (...): pixels that show a surface; others are 0.
+    Parameters
+    ----------
+    probe : Probes or SphericalKde
+        One density (:func:`make_probe_at`).
+    directions : numpy.ndarray, optional
+        Unit directions (..., 3) from the observer. Alternatively pass ``observer`` and ``points``.
+    observer, points : numpy.ndarray, optional
+        Observer position (3,) and the points (..., 3) that the pixels show.
+    mask : numpy.ndarray, optional
+        Pixels (...) that show a surface; others are 0.
+    method : str
+        ``exact`` sums all rays at all pixels in one kernel. ``table`` interpolates a table of the visible part of the
+        sphere, with an error below 1e-4 of the maximum of a single kernel (:mod:`nerg_mi.probes.kde`). ``auto`` uses a
+        table from 4,096 pixels on. Run times: docs/rays.md.
+    backend : Backend
+        Where the density is evaluated.
 
-    ``method``: ``exact`` sums all rays at all pixels in one kernel; ``table`` does so on the part of the sphere that is
-    seen, at a spacing that resolves the kernels, and interpolates (:mod:`nerg_mi.probes.kde`: within 1e-4 of the
-    highest density of one ray's kernel); ``auto`` tabulates from 4,096 pixels on. Run times: docs/explanation/performance.md. Raises
-    `NergError` for another word, ``ValueError`` where it is not given where the pixels look, or more than one density.
+    Returns
+    -------
+    numpy.ndarray
+        Densities (...) in 1/sr, float32, with the shape of the picture.
+
+    Raises
+    ------
+    NergError
+        For an unknown method.
+    ValueError
+        If the directions are not given exactly once, or ``probe`` has more than one density.
     """
     if method not in METHODS:
-        raise NergError(f'method is "{method}"; it is one of {", ".join(METHODS)}')
-    there = None
+        raise NergError(f'the method must be one of {", ".join(METHODS)}, got "{method}"')
+    is_valid = None
     if directions is None and points is not None and observer is not None:
         shape = np.shape(points)[:-1]
-        directions, there = compute_directions(observer, points)
+        directions, is_valid = compute_directions(observer, points)
     elif directions is None or points is not None:
-        raise ValueError("say where the pixels look: either directions, or an observer and points")
+        raise ValueError("pass either directions, or an observer and points")
     else:
         directions = np.asarray(directions, np.float32)
         shape = directions.shape[:-1]
         directions = directions.reshape(-1, 3)
     kde = probe.kde(backend) if isinstance(probe, Probes) else probe
     if kde.count != 1:
-        raise ValueError(f"a picture has one observer and needs one probe, got {kde.count}")
-    table = method == "table" or (
-        method == "auto" and len(directions) >= MIN_TABLE_DIRECTIONS and SphericalKdeTable.is_worthwhile(kde, len(directions))
+        raise ValueError(f"a picture needs exactly one probe, got {kde.count}")
+    use_table = method == "table" or (
+        method == "auto"
+        and len(directions) >= MIN_TABLE_DIRECTIONS
+        and SphericalKdeTable.is_worthwhile(kde, len(directions))
     )
-    density = SphericalKdeTable(kde, directions=directions).evaluate(directions) if table else kde.evaluate(directions)[0]
+    density = (
+        SphericalKdeTable(kde, directions=directions).evaluate(directions) if use_table else kde.evaluate(directions)[0]
+    )
     density = density.reshape(shape)
-    for shown in (there, mask):
-        if shown is not None:
-            density = np.where(np.asarray(shown, bool), density, np.float32(0))
+    for pixels in (is_valid, mask):
+        if pixels is not None:
+            density = np.where(np.asarray(pixels, bool), density, np.float32(0))
     return density
 
 
 # ---- View ----
 #
-# The kernel density of tracked rays as an observer's view: the ground truth beside a gaze field, inside the integrator
+# Kernel density of gaze rays as an observer view, to compare with a gaze field in the integrator
 # (``transport.observer``).
 #
-# An observer's density is that of the rays that started nearest (NeRG, Section 5.3, and the baseline of ``nerg eval
-# gaze``). It is gathered once an observer, and summed at every pixel or tabulated (:mod:`nerg_mi.probes.kde`).
+# The density is estimated from the rays with the nearest origins (NeRG, Section 5.3, and the baseline of ``nerg eval
+# gaze``). The rays are selected once per observer; the density is summed at every pixel or tabulated
+# (:mod:`nerg_mi.probes.kde`).
 
 
 class KdeView:
-    """``rays`` around observers in the scene.
+    """Kernel density of the rays nearest to an observer in a scene.
 
-    ``count``: how many of the nearest; ``kappa``: of their kernels; ``to_world``: from the rays' frame to the scene's;
-    ``backend``: as of ``SphericalKde``. What is hidden from the observer fades, as gaze does. Raises `NergError` where
-    there are no rays.
+    Parameters
+    ----------
+    rays : Rays
+        Gaze rays.
+    count : int
+        Number of nearest rays.
+    kappa : float
+        Concentration of their kernels.
+    to_world : Similarity, optional
+        Similarity from the frame of the rays to the scene.
+    backend : Backend
+        Where the density is evaluated.
+
+    Raises
+    ------
+    NergError
+        If there are no rays.
+
+    Notes
+    -----
+    Surfaces hidden from the observer fade as for a gaze field.
     """
 
     is_occluded = True
@@ -120,21 +181,23 @@ class KdeView:
         backend: Backend = None,
     ) -> None:
         if len(rays) == 0:
-            raise NergError("there are no rays to show the density of; give a file that has some")
+            raise NergError("the ray file contains no rays; pass a file with at least one")
         self.to_world, self.backend = to_world or Similarity(), backend
         self.count, self.kappa = min(count, len(rays)), kappa
         self.basis = DataSummary(len(rays), len(np.unique(rays.person)))
         self._origin, self._direction = rays.origin, rays.direction
 
     def find_nearest(self, p: np.ndarray) -> np.ndarray:
-        """Directions (count, 3) of the rays that started nearest to ``p`` (3,), in metres in the rays' frame."""
+        """Return the directions (count, 3) of the rays with origins nearest to ``p`` (3,), in metres in the frame of
+        the rays.
+        """
         square = ((self._origin - p) ** 2).sum(axis=1)
         if self.count == len(square):
             return self._direction
         return self._direction[np.argpartition(square, self.count - 1)[: self.count]]
 
     def for_position(self, p_o: Point3f) -> ObservedKde:
-        """The density of the observer at ``p_o`` (in the scene, one lane)."""
+        """Return the density of the observer at ``p_o`` (in the scene, one lane)."""
         p = np.array(self.to_world.point_to_local(p_o), np.float64).ravel()
         rays = self.find_nearest(p)
         kde = SphericalKde(rays, np.array([0, len(rays)]), self.kappa, backend=self.backend)
@@ -142,22 +205,23 @@ class KdeView:
 
 
 class ObservedKde:
-    """The density of one observer: that of ``kde``, whose frame ``to_world`` places in the scene.
+    """Kernel density of one observer; ``to_world`` maps the frame of ``kde`` to the scene.
 
-    ``kde_view.WORTH`` directions or more are looked up in a table, where that costs less; fewer are summed exactly.
+    From ``MIN_TABLE_DIRECTIONS`` directions on a table is used if it is cheaper; otherwise the density is summed
+    exactly.
     """
 
     def __init__(self, kde: SphericalKde, to_world: Similarity) -> None:
         self.kde, self.to_world = kde, to_world
-        self.table: SphericalKdeTable | None = None  # Made when it first pays
+        self.table: SphericalKdeTable | None = None  # Made on first use
 
     def evaluate(self, r_o: Vector3f) -> Float:
-        """Density (1/sr) in unit scene directions ``r_o``, without derivatives."""
+        """Evaluate the density (1/sr) in unit scene directions ``r_o``, without derivatives."""
         d = self.to_world.direction_to_local(dr.detach(r_o))
         ns, lanes = self.kde.ns, dr.width(d)
         d = ns.Array3f(d.x, d.y, d.z)
         with dr.suspend_grad():
-            # All of a table is made, whatever is seen of it; a texel costs a fifth of a lane.
+            # The whole table is computed, whatever part is visible; a texel costs a fifth of a lane.
             if lanes < MIN_TABLE_DIRECTIONS or not SphericalKdeTable.is_worthwhile(self.kde, lanes // 4):
                 return self.kde.density(dr.zeros(ns.UInt32, lanes), d)
             if self.table is None:

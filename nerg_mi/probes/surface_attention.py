@@ -1,14 +1,14 @@
-r"""Attention received by a surface, in area form.
+r"""Attention on surfaces, integrated over their area.
 
-An observer at p_o looks into the direction ω with the density g(ω), in 1/sr. The probability that the look lands on a
-surface S is the integral of g over the directions in which S is seen. Over the surface's own points y it reads
+An observer at p_o looks in the direction ω with the density g(ω), in 1/sr. The probability of looking at a surface S is
+the integral of g over the directions in which S is visible. As an integral over the points y of the surface it is
 
     A = ∫_S g V(y, p_o) max(0, -n · ω) / |y - p_o|² dA,    ω = (y - p_o) / |y - p_o|,
 
-with the change of variables dω = |cos θ| dA / d² (Veach 1997, section 8.2.2.2, "three-point form"), n the normal at y,
-and V the visibility of ``transport.occlusion``. Unlike pixels, the points move with the surface: A has derivatives
-with respect to where the surface is, without any edge of its own that would have to be sampled. The moving edges of
-what *else* hides it are not seen by derivatives; the fall-off behind them is.
+by the change of variables dω = |cos θ| dA / d² (Veach 1997, section 8.2.2.2, "three-point form"), where n is the normal
+at y and V the visibility of ``transport.occlusion``. Unlike pixels, the points move with the surface: A is
+differentiable with respect to the position of the surface, and none of its own edges need to be sampled. Derivatives do
+not include the moving edges of *other* occluders; they include the fall-off behind them.
 """
 
 from __future__ import annotations
@@ -31,36 +31,37 @@ if TYPE_CHECKING:
 
 
 Density = Callable[[Point3f, Point3f, Vector3f, Bool], Float]
-"""Of ``p_od``, ``p_o``, ``r_o`` and the active lanes: gaze in 1/sr of an observer at ``p_o`` along the unit direction
-``r_o``, who sees the surface ``p_od`` there (``ObservedGaze.evaluate(...)[0]``, or anything else)."""
+"""Gaze density in 1/sr: maps surface points ``p_od``, an observer ``p_o``, unit directions ``r_o`` and the active
+lanes to a density (``ObservedGaze.evaluate(...)[0]``, or any other function).
+"""
 
 
 @dataclass
 class Patches:
-    """Small flat pieces of a surface, one a lane, in the scene."""
+    """Small flat patches of a surface, one per lane, in the scene."""
 
     p: Point3f  # centroids
     n: Vector3f  # unit normals
     area: Float  # square scene units
 
     def translate(self, offset: Vector3f) -> Patches:
-        """The same pieces, shifted by ``offset``."""
+        """Return the patches shifted by ``offset``."""
         return Patches(self.p + offset, self.n, self.area)
 
 
 def make_patches(mesh: mi.Mesh, divisions: int = 4) -> Patches:
-    """A Mitsuba mesh, each triangle cut into ``divisions``² congruent ones: the centroid rule, of second order.
+    """Divide each triangle of a Mitsuba mesh into ``divisions``² congruent patches: the centroid rule, of second order.
 
-    Normals are the faces' own, to the side that sees the vertices counter-clockwise. Attached to the
-    ``vertex_positions`` of the mesh, or the ``to_world`` of a rectangle. Raises `NergError` for what is not a mesh,
-    ``ValueError`` for no divisions.
+    The normals are the face normals, on the side that sees the vertices counter-clockwise. The patches are
+    differentiable with respect to ``vertex_positions`` of the mesh, or ``to_world`` of a rectangle. Raises `NergError`
+    if the shape is not a mesh, ``ValueError`` if ``divisions`` is below 1.
     """
     mi = variant_types()
     if not isinstance(mesh, mi.Mesh):
-        raise NergError(f'"{mesh.id()}" is not a mesh; attention is received by meshes (cube, rectangle, ply, obj)')
+        raise NergError(f'"{mesh.id()}" is not a mesh; use a mesh shape (cube, rectangle, ply, obj)')
     if divisions < 1:
-        raise ValueError(f"a triangle is cut into at least 1 piece a side, got divisions={divisions}")
-    # Not its parameters: a rectangle is a mesh that has no others than its transform.
+        raise ValueError(f"divisions must be at least 1, got {divisions}")
+    # Not read from its parameters, because a rectangle only exposes its transform.
     positions, faces = mesh.vertex_positions_buffer(), mi.UInt32(mesh.faces_buffer())
     centre = _centroids(divisions)
     count = len(faces) // 3
@@ -70,14 +71,14 @@ def make_patches(mesh: mi.Mesh, divisions: int = 4) -> Patches:
     a, b, c = corners
     u, v = (dr.gather(mi.Float, mi.Float(np.ascontiguousarray(centre[:, k])), piece) for k in range(2))
     across = dr.cross(b - a, c - a)
-    twice = dr.norm(across)
-    flat = twice > 0
-    n = dr.select(flat, across / dr.select(flat, twice, 1), mi.Vector3f(0, 0, 1))
-    return Patches(a + u * (b - a) + v * (c - a), n, 0.5 * twice / len(centre))
+    double_area = dr.norm(across)
+    flat = double_area > 0
+    n = dr.select(flat, across / dr.select(flat, double_area, 1), mi.Vector3f(0, 0, 1))
+    return Patches(a + u * (b - a) + v * (c - a), n, 0.5 * double_area / len(centre))
 
 
 def _centroids(n: int) -> np.ndarray:
-    """Barycentric u, v (n², 2) of the centroids of a triangle's n² congruent parts."""
+    """Return the barycentric coordinates u, v (n², 2) of the centroids of the n² congruent parts of a triangle."""
     upright = [(i + 1 / 3, j + 1 / 3) for i in range(n) for j in range(n - i)]
     turned = [(i + 2 / 3, j + 2 / 3) for i in range(n) for j in range(n - i - 1)]
     return np.array(upright + turned, np.float32) / n
@@ -94,28 +95,35 @@ def attention_per_sr(
     two_sided: bool = False,
     penetration: Float | float = 0.0,
 ) -> Float:
-    """Attention per solid angle, in 1/sr, that the observer ``p_o`` gives ``p`` with normal ``n`` after occlusion.
+    """Compute the visible attention of observers on points, per solid angle (1/sr).
 
-    Arguments as of ``arriving``, which is this times the Jacobian from solid angle to area. ``penetration``: how far,
-    along the normal, what is seen of ``p`` may begin before it, in scene units.
+    This is `attention_per_area` without the Jacobian from solid angle to area; see there for the parameters.
+
+    Parameters
+    ----------
+    penetration : Float or float
+        Distance along the normal, in scene units, by which the surface of a medium may begin before ``p``.
     """
     mi = variant_types()
-    distance, r_o, cosine = _faced(p_o, p, n)
+    distance, r_o, cosine = _compute_facing(p_o, p, n)
     n = dr.select(two_sided & (cosine < 0), -n, n)
     active = ((cosine != 0) if two_sided else (cosine > 0)) & (distance > 0)
-    p_od, seen = p, mi.Float(1)
+    p_od, visibility = p, mi.Float(1)
     if scene is not None:
         settings = settings or ObserverSettings(march=default_march_settings(scene))
-        # Looked for a tolerance above the surface, as if a camera stood there.
+        # As seen by a camera in front of the surface, so that the tolerance is applied above it.
         ray = mi.Ray3f(p + n, -n)
-        found = trace_from_observer(scene, ray, p, p_o, penetration, active, mi.Float(falloff), settings, needs_depth=False)
-        p_od, seen = found.p_od, found.visibility
-        active &= seen > 0
-    return dr.select(active, density(p_od, p_o, r_o, active) * seen, 0)
+        hit = trace_from_observer(
+            scene, ray, p, p_o, penetration, active, mi.Float(falloff), settings, needs_depth=False
+        )
+        p_od, visibility = hit.p_od, hit.visibility
+        active &= visibility > 0
+    return dr.select(active, density(p_od, p_o, r_o, active) * visibility, 0)
 
 
-def _faced(p_o: Point3f, p: Point3f, n: Vector3f) -> tuple[Float, Vector3f, Float]:
-    """Distance and direction from ``p_o`` to ``p``, and the cosine under which its normal ``n`` faces ``p_o``."""
+def _compute_facing(p_o: Point3f, p: Point3f, n: Vector3f) -> tuple[Float, Vector3f, Float]:
+    """Return distance and direction from ``p_o`` to ``p``, and the cosine between the direction and the normal
+    ``n``."""
     distance, r_o = distance_and_direction(p_o, p)
     return distance, r_o, -dr.dot(n, r_o)
 
@@ -130,19 +138,34 @@ def attention_per_area(
     settings: ObserverSettings | None = None,
     two_sided: bool = False,
 ) -> Float:
-    """Attention per area, in 1 / square scene unit, that arrives at ``p`` with normal ``n`` from the observer ``p_o``.
+    """Compute the attention of observers on points, per area (1 / square scene unit).
 
-    ``place``: what may stand in between (shapes, a field, both; None: nothing). ``falloff`` d_f in scene units,
-    ``settings``: as of the integrator. A closed surface hides its own back, which therefore receives nothing;
-    ``two_sided`` counts both sides of an open one. Lanes are pairs; differentiable in all of them, in the density's
-    parameters and in ``falloff``, but not over the edges of ``place``.
+    Lanes are pairs of an observer and a point. The result is differentiable in all arguments, in the parameters of the
+    density and in ``falloff``, but not across the edges of ``scene``.
+
+    Parameters
+    ----------
+    scene : SceneGeometry or None
+        Occluders: shapes, a field, or both; None: no occlusion.
+    density : Density
+        Gaze density of the observers.
+    p_o : Point3f
+        Observers.
+    p, n : Point3f, Vector3f
+        Points and unit normals.
+    falloff : Float or float
+        Fall-off distance d_f of the visibility in scene units.
+    settings : ObserverSettings, optional
+        As of the integrator.
+    two_sided : bool
+        Count both sides of the surface. A closed surface hides its own back, which therefore has no attention.
     """
     g = attention_per_sr(scene, density, p_o, p, n, falloff, settings, two_sided)
-    distance, _, cosine = _faced(p_o, p, n)
+    distance, _, cosine = _compute_facing(p_o, p, n)
     cosine = dr.abs(cosine) if two_sided else cosine
-    facing = (cosine > 0) & (distance > 0)
-    square = dr.square(dr.select(facing, distance, 1))
-    return dr.select(facing, g * cosine / square, 0)
+    is_facing = (cosine > 0) & (distance > 0)
+    square = dr.square(dr.select(is_facing, distance, 1))
+    return dr.select(is_facing, g * cosine / square, 0)
 
 
 def attention_per_patch(
@@ -154,18 +177,18 @@ def attention_per_patch(
     settings: ObserverSettings | None = None,
     two_sided: bool = False,
 ) -> Float:
-    """Share of each observer's look that each patch receives, all patches of the first observer first.
+    """Compute the probability that each observer looks at each patch, all patches of the first observer first.
 
-    Arguments as of ``arriving``; ``observers``: a lane an observer.
+    ``observers`` has one lane per observer; the other parameters are those of `attention_per_area`.
     """
     mi = variant_types()
-    count, people = dr.width(surface.p, surface.n, surface.area), dr.width(observers)
-    index = dr.arange(mi.UInt32, count * people)
-    who, where = index // count, index % count
-    p_o = dr.gather(mi.Point3f, mi.Point3f(observers), who)
-    p = dr.gather(mi.Point3f, mi.Point3f(surface.p), where)
-    n = dr.gather(mi.Vector3f, mi.Vector3f(surface.n), where)
-    area = dr.gather(mi.Float, mi.Float(surface.area), where)
+    num_patches, num_observers = dr.width(surface.p, surface.n, surface.area), dr.width(observers)
+    index = dr.arange(mi.UInt32, num_patches * num_observers)
+    observer_index, patch_index = index // num_patches, index % num_patches
+    p_o = dr.gather(mi.Point3f, mi.Point3f(observers), observer_index)
+    p = dr.gather(mi.Point3f, mi.Point3f(surface.p), patch_index)
+    n = dr.gather(mi.Vector3f, mi.Vector3f(surface.n), patch_index)
+    area = dr.gather(mi.Float, mi.Float(surface.area), patch_index)
     return area * attention_per_area(scene, density, p_o, p, n, falloff, settings, two_sided)
 
 
@@ -178,10 +201,10 @@ def attention_on(
     settings: ObserverSettings | None = None,
     two_sided: bool = False,
 ) -> Float:
-    """Probability (a lane an observer) that the look of each of ``observers`` lands on ``surface``.
+    """Compute the probability that each observer looks at ``surface`` (one lane per observer).
 
-    Arguments as of ``arriving``. Makes observers x patches lanes at once. Exact as patches shrink against their
-    distance from the observer: at a distance of k patch diameters the error is of the order 1 / k².
+    The parameters are those of `attention_per_area`. Evaluates observers x patches lanes at once. The error is of order
+    1 / k² at a distance of k patch diameters.
     """
     each = attention_per_patch(scene, density, observers, surface, falloff, settings, two_sided)
     return dr.block_sum(each, dr.width(each) // dr.width(observers))

@@ -9,11 +9,11 @@ from nerg_mi.maths.sphere import fibonacci_directions, sample_uniform_directions
 from nerg_mi.probes.kde import (
     SphericalKde,
     SphericalKdeTable,
+    compute_loo_scores,
+    compute_silverman_kappas,
     make_kappa_grid,
     select_loo_kappa,
-    compute_loo_scores,
     select_loo_kappas,
-    compute_silverman_kappas,
 )
 from tests.reference.kde import kde as reference
 
@@ -66,25 +66,25 @@ def test_refusals():
     rays, offsets, kappa, _ = ragged()
     with pytest.raises(ValueError, match="probe 1 has no ray"):
         SphericalKde(rays, [0, 5, 5, len(rays)], 1.0, backend="llvm")
-    with pytest.raises(ValueError, match="do not fit"):
+    with pytest.raises(ValueError, match="do not match"):
         SphericalKde(rays, [0, 5], 1.0, backend="llvm")
-    with pytest.raises(ValueError, match="all zero"):
+    with pytest.raises(ValueError, match="are zero"):
         SphericalKde(rays, [0, len(rays)], 1.0, np.zeros(len(rays)), "llvm")
     with pytest.raises(ValueError, match="expected"):
         SphericalKde(rays, offsets, kappa, backend="llvm").evaluate(np.zeros((2, 5, 3)))
 
 
 @pytest.mark.parametrize("weighted", [False, True])
-def test_a_part_is_the_same_densities(weighted):
+def test_a_range_has_the_same_densities(weighted):
     rays, offsets, kappa, rng = ragged()
-    # Some rays of each probe weigh much more than others: equal weights would be off by a large share of the peak.
+    # Some rays of each probe weigh much more than others, so that equal weights would give large errors.
     weights = rng.random(len(rays)) ** 4 if weighted else None
     kde, x = SphericalKde(rays, offsets, kappa, weights, "llvm"), fibonacci_directions(200)
-    whole = kde.evaluate(x)
+    full = kde.evaluate(x)
     for first, last in [(0, 2), (1, 3), (2, 4), (3, 4), (0, 4)]:
         part = kde.select_range(first, last)
         assert part.count == last - first
-        assert np.allclose(part.evaluate(x), whole[first:last], rtol=1e-5, atol=1e-7)
+        assert np.allclose(part.evaluate(x), full[first:last], rtol=1e-5, atol=1e-7)
 
 
 # ---- Table ----
@@ -96,7 +96,7 @@ def test_close_to_exact_everywhere(kappa, count):
     rng = np.random.default_rng(0)
     mu = sample_uniform_directions(count, rng)
     kde = SphericalKde(mu, [0, count], kappa, backend="llvm")
-    # All over, near the peaks, and on the cube's edges and corners.
+    # Everywhere, near the peaks, and at edges and corners of the cube.
     edges = np.array([[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z], float)
     edges = np.concatenate([edges, edges + 1e-6, edges - 1e-6])
     x = np.concatenate(
@@ -115,12 +115,12 @@ def test_close_to_exact_everywhere(kappa, count):
     assert table.evaluate(fibonacci_directions(8192)).min() >= 0
 
 
-def test_only_what_is_used_is_evaluated():
+def test_only_requested_texels_are_evaluated():
     rng = np.random.default_rng(1)
     kde = SphericalKde(sample_uniform_directions(30, rng), [0, 30], 60.0, backend="llvm")
     x = vmf.sample(np.tile([0.6, 0.0, 0.8], (2000, 1)), 100.0, rng)
-    part, whole = SphericalKdeTable(kde, directions=x), SphericalKdeTable(kde)
-    assert np.array_equal(part.evaluate(x), whole.evaluate(x)) and part.num_evaluated < 0.2 * whole.num_evaluated
+    part, full = SphericalKdeTable(kde, directions=x), SphericalKdeTable(kde)
+    assert np.array_equal(part.evaluate(x), full.evaluate(x)) and part.num_evaluated < 0.2 * full.num_evaluated
 
 
 def test_one_probe_of_several_and_its_slope():
@@ -133,7 +133,7 @@ def test_one_probe_of_several_and_its_slope():
     assert np.isclose(table.evaluate(x0[None])[0], kde.evaluate(x0[None])[1, 0], rtol=1e-3)
     x = ns.Array3f(x0.tolist())
     dr.enable_grad(x)
-    side = np.array([0.8, -0.6, 0.0])  # along the sphere, where both are the same function
+    side = np.array([0.8, -0.6, 0.0])  # along the sphere, where both functions are equal
     dr.set_grad(x, ns.Array3f(side.tolist()))
     slope = dr.forward_to(table.density(x))[0]
     ends = np.array([x0 + h * side for h in (1e-3, -1e-3)])
@@ -162,17 +162,17 @@ def gazes(n, kappa=30.0, seed=0):
 
 
 @pytest.mark.parametrize("most", [2.0, 30.0, 1000.0])
-def test_what_is_chosen_from_ends_at_the_bounds_in_steps_of_a_quarter(most):
+def test_kappa_grid_bounds_and_steps(most):
     grid = make_kappa_grid(most)
     assert grid[0] == 1 and grid[-1] == pytest.approx(most)
-    # As many equal steps as come nearest to a quarter each.
+    # The number of equal steps nearest to 25 % each.
     assert abs(len(grid) - 1 - np.log(most) / np.log(1.25)) <= 0.5
     assert np.allclose(np.diff(np.log(grid)), np.log(grid[1] / grid[0]))
     assert len(make_kappa_grid(1.01)) == 2
 
 
 @pytest.mark.parametrize("groups", [None, [0, 0, 1, 1, 1, 2, 0, 2, 2, 1, 0, 3]])
-def test_the_score_is_the_log_likelihood_under_the_others(groups):
+def test_loo_score_is_the_log_likelihood_under_other_groups(groups):
     x, grid = gazes(12), np.array([1.0, 20.0, 400.0])
     g = np.arange(12) if groups is None else np.array(groups)
     want = []
@@ -180,11 +180,11 @@ def test_the_score_is_the_log_likelihood_under_the_others(groups):
         density = np.exp(vmf.log_normaliser(kappa) + kappa * (x @ x.T - 1))
         want.append(np.mean([np.log(density[i][g != g[i]].mean()) for i in range(12)]))
     assert np.allclose(compute_loo_scores(x, None if groups is None else g, grid), want, rtol=1e-5)
-    # Of one person alone, the ray itself is left out.
+    # With one participant, only the ray itself is left out.
     assert np.allclose(compute_loo_scores(x, np.zeros(12), grid), compute_loo_scores(x, None, grid))
 
 
-def test_one_width_for_all_is_that_of_the_sum_of_the_scores():
+def test_shared_kappa_maximises_the_sum_of_scores():
     x, offsets = np.concatenate([gazes(60, 5.0, 1), gazes(1, 5.0, 2), gazes(200, 60.0, 3)]), np.array([0, 60, 61, 261])
     person, grid = np.arange(261), make_kappa_grid(500.0)
     each = select_loo_kappas(x, person, offsets, 500.0, False, np.random.default_rng(0))
@@ -193,19 +193,25 @@ def test_one_width_for_all_is_that_of_the_sum_of_the_scores():
     assert each[1] == 1
     total = sum(compute_loo_scores(x[a:b], person[a:b], grid) for a, b in runs)
     assert (
-        select_loo_kappas(x, person, offsets, 500.0, True, np.random.default_rng(0)).tolist() == [grid[np.argmax(total)]] * 3
+        select_loo_kappas(x, person, offsets, 500.0, True, np.random.default_rng(0)).tolist()
+        == [grid[np.argmax(total)]] * 3
     )
-    assert select_loo_kappas(x[:2], person[:2], np.array([0, 1, 2]), 500.0, True, np.random.default_rng(0)).tolist() == [1, 1]
+    assert select_loo_kappas(
+        x[:2], person[:2], np.array([0, 1, 2]), 500.0, True, np.random.default_rng(0)
+    ).tolist() == [1, 1]
 
 
-def test_the_published_rule_counts_weighted_rays_by_what_they_are_worth():
+def test_silverman_rule_uses_effective_counts():
     x, offsets = gazes(90), np.array([0, 40, 90])
     plain = compute_silverman_kappas(x, None, offsets, 1e9, False)
     doubled = compute_silverman_kappas(x, np.full(90, 2.0), offsets, 1e9, False)
     assert np.allclose(plain, doubled)
-    # Rays of no weight are not there.
+    # Rays of weight zero are ignored.
     weights = np.r_[np.ones(40), np.zeros(20), np.ones(30)]
     want = compute_silverman_kappas(np.delete(x, np.s_[40:60], axis=0), None, np.array([0, 40, 70]), 1e9, False)
     assert np.allclose(compute_silverman_kappas(x, weights, offsets, 1e9, False), want)
     shared = compute_silverman_kappas(x, None, offsets, 1e9, True)
-    assert np.allclose(1 / shared, np.mean(1 / plain)) and (compute_silverman_kappas(x, None, offsets, 2.0, False) == 2).all()
+    assert (
+        np.allclose(1 / shared, np.mean(1 / plain))
+        and (compute_silverman_kappas(x, None, offsets, 2.0, False) == 2).all()
+    )

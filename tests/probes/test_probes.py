@@ -11,14 +11,14 @@ from nerg_mi.probes.kde import select_loo_kappa
 from nerg_mi.probes.probes import (
     REGION_LEVELS,
     calibrate_levels,
-    count_effective_participants,
     compute_entropy,
     compute_integral,
-    format_level,
     compute_participant_weights,
+    compute_region_levels,
+    count_effective_participants,
+    format_level,
     place_probes,
     place_queries,
-    compute_region_levels,
     sample_directions,
 )
 from nerg_mi.rays.rays import Rays
@@ -28,7 +28,7 @@ from nerg_mi.rays.rays import Rays
 
 @pytest.fixture(scope="module")
 def rays_measures():
-    """Four people in a 3 x 2 m room who look at (1.5, 4, 1), give or take κ = 60; the first of them twice as often."""
+    """Four participants in a 3 x 2 m room who look at (1.5, 4, 1) with κ = 60; the first of them twice as often."""
     rng = np.random.default_rng(5)
     n = 12_000
     origin = rng.uniform([0, 0, 1.5], [3, 2, 1.7], (n, 3))
@@ -52,9 +52,9 @@ def test_integral_is_one_at_a_thousand_random_positions(rays_measures):
     assert np.abs(compute_integral(probes, 8192, "llvm") - 1).max() < 1e-3
 
 
-def test_entropy_of_known_laws(rays_measures):
+def test_entropy_of_analytic_densities(rays_measures):
     probes = place_probes(rays_measures, 0.25, count=3, min_rays=1, max_rays=1, kappa_rule="fixed", kappa=40.0)
-    # One ray: von Mises-Fisher, whose entropy is κ (1 - A(κ)) - log C(κ).
+    # One ray: von Mises-Fisher with entropy κ (1 - A(κ)) - log C(κ).
     want = 40 * (1 - vmf.mean_resultant_length(40.0)) - vmf.log_normaliser(40.0)
     assert np.allclose(compute_entropy(probes, backend="llvm"), want, atol=1e-4)
     flat = place_probes(rays_measures, 0.25, count=3, kappa_rule="fixed", kappa=0.0)
@@ -71,16 +71,18 @@ def test_samples_follow_the_density(rays_measures):
         run = slice(probes.offsets[p], probes.offsets[p + 1])
         w = probes.weights[run] / probes.weights[run].sum()
         assert np.allclose(x[p].mean(axis=0), vmf.mean_resultant_length(30.0) * (w @ probes.directions[run]), atol=0.01)
-        # E[log p] under its own samples is minus the entropy.
+        # E[log p] under samples of p is minus the entropy.
         log = np.log(probes.density(np.stack([x[0], x[1]]), "llvm")[p])
         assert np.isclose(-log.mean(), compute_entropy(probes, backend="llvm")[p], atol=0.02)
 
 
-def test_people_who_count(rays_measures):
+def test_effective_participants(rays_measures):
     probes = place_probes(rays_measures, 0.3, count=20)
     people = count_effective_participants(probes, rays_measures)
     assert ((people > 2.5) & (people < 4)).all()
-    even = place_probes(rays_measures, 0.3, queries=probes.queries, ray_weights=compute_participant_weights(rays_measures))
+    even = place_probes(
+        rays_measures, 0.3, queries=probes.queries, ray_weights=compute_participant_weights(rays_measures)
+    )
     assert count_effective_participants(even, rays_measures).mean() > people.mean() + 0.1
 
 
@@ -89,7 +91,7 @@ def test_people_who_count(rays_measures):
 
 @pytest.fixture(scope="module")
 def origin():
-    """A walk, most of it standing in one corner."""
+    """A walk with a long stay in one corner."""
     rng = np.random.default_rng(0)
     return np.concatenate(
         [rng.uniform([0, 0, 1.5], [4, 3, 1.7], (3000, 3)), rng.normal([1, 1, 1.6], 0.02, (20_000, 3))]
@@ -98,28 +100,28 @@ def origin():
 
 def test_blue_noise_is_even_and_covers(origin):
     rng = np.random.default_rng(1)
-    found = place_queries(origin, "blue", 10_000, 0.3, 0.25, rng)
-    apart = np.linalg.norm(found[:, None] - found[None], axis=2) + 10 * np.eye(len(found))
-    assert apart.min() > 0.3
-    # Where someone was, a probe is near: no gap wider than the discs (and the cells of the candidates).
-    assert np.linalg.norm(origin[:, None] - found[None], axis=2).min(axis=1).max() < 0.3 * 1.5
-    assert {tuple(p) for p in found} <= {tuple(p) for p in origin}
-    # Random origins crowd where people stood.
+    result = place_queries(origin, "blue", 10_000, 0.3, 0.25, rng)
+    distances = np.linalg.norm(result[:, None] - result[None], axis=2) + 10 * np.eye(len(result))
+    assert distances.min() > 0.3
+    # Every origin has a probe nearby: no gap is wider than the discs (and the cells of the candidates).
+    assert np.linalg.norm(origin[:, None] - result[None], axis=2).min(axis=1).max() < 0.3 * 1.5
+    assert {tuple(p) for p in result} <= {tuple(p) for p in origin}
+    # Random origins cluster where participants stood.
     crowd = lambda p: (np.linalg.norm(p[:, :2] - [1, 1], axis=1) < 0.1).mean()
-    assert crowd(place_queries(origin, "data", 500, None, 0.25, rng)) > 0.5 > 10 * crowd(found)
+    assert crowd(place_queries(origin, "data", 500, None, 0.25, rng)) > 0.5 > 10 * crowd(result)
 
 
 @pytest.mark.parametrize("count", [20, 200])
 def test_blue_noise_of_a_number(origin, count):
-    found = place_queries(origin, "blue", count, None, 0.1, np.random.default_rng(2))
-    assert 0.4 * count <= len(found) <= count
+    result = place_queries(origin, "blue", count, None, 0.1, np.random.default_rng(2))
+    assert 0.4 * count <= len(result) <= count
 
 
 def test_lattice_and_box(origin):
     rng = np.random.default_rng(3)
     grid = place_queries(origin, "grid", 1, None, 0.25, rng)
     assert np.allclose(np.diff(np.unique(grid[:, 0].round(9))), 0.5)
-    # As far from one wall as from the other.
+    # Equal distance to opposite walls.
     assert np.allclose(grid.min(axis=0) + grid.max(axis=0), origin.min(axis=0) + origin.max(axis=0))
     box = place_queries(origin, "random", 300, None, 0.25, rng)
     assert len(box) == 300 and (box >= origin.min(axis=0)).all() and (box <= origin.max(axis=0)).all()
@@ -127,13 +129,13 @@ def test_lattice_and_box(origin):
         place_queries(origin, "hexagons", 1, None, 0.25, rng)
 
 
-def test_places_that_are_far_enough_apart_all_have_a_probe():
-    """Few, down a steep line, where the cells of candidates are easily taken for one another."""
+def test_positions_far_apart_all_have_a_probe():
+    """Few origins along a steep line, where cells of candidates are easily confused."""
     steps = np.arange(5.0)
     for axes in ([0, 1, 2], [1, 2, 0], [2, 0, 1], [0, 2, 1]):
         down = np.stack([0 * steps, 0.26 * steps, 1.26 * (4 - steps)], axis=1)[:, axes]
-        found = place_queries(np.repeat(down, 7, axis=0), "blue", 100, 1.0, 0.25, np.random.default_rng(0))
-        assert sorted(map(tuple, found)) == sorted(map(tuple, down))
+        result = place_queries(np.repeat(down, 7, axis=0), "blue", 100, 1.0, 0.25, np.random.default_rng(0))
+        assert sorted(map(tuple, result)) == sorted(map(tuple, down))
 
 
 # ---- Probes ----
@@ -154,7 +156,7 @@ def test_holds_the_nearest_rays_within_the_radius(rays_measures):
 
 
 def test_leave_one_out_sees_through_repetition():
-    # Each person's rays repeat one direction: leaving out the ray alone would choose the sharpest kernel there is.
+    # Each participant repeats one direction: leaving out only the ray would select the largest κ.
     rng = np.random.default_rng(0)
     centre = vmf.sample(np.tile([0, 0, 1.0], (12, 1)), 20.0, rng)
     rays, person = np.repeat(centre, 20, axis=0), np.repeat(np.arange(12), 20)
@@ -167,48 +169,48 @@ def test_refusals(rays_measures):
         place_probes(rays_measures, 0.25, placement="hexagons", queries=np.zeros((1, 3)))
     with pytest.raises(ValueError, match="kappa_rule"):
         place_probes(rays_measures, 0.25, kappa_rule="magic")
-    with pytest.raises(ValueError, match="enlarge the radius"):
+    with pytest.raises(ValueError, match="increase the radius"):
         place_probes(rays_measures, 0.001, count=10)
     with pytest.raises(ValueError, match="min_rays"):
         place_probes(rays_measures, 0.25, max_rays=10, min_rays=20)
 
 
-def test_people_of_a_probe_can_count_alike():
-    """One who stayed a hundred times as long weighs as much as the other; times the rays' own weights, within a
-    person."""
+def test_participants_can_have_equal_weight():
+    """A stay that is a hundred times as long has the same weight; ray weights multiply within a participant."""
     toward = np.array([[1.0, 0, 0]] * 100 + [[0, 1.0, 0]])
     rays = Rays(
         np.arange(101.0), np.array([0] * 100 + [1]), ("stays", "passes"), np.zeros((101, 3)), toward, np.ones(101)
     )
     both = np.array([[[1.0, 0, 0], [0, 1.0, 0]]])
-    about = dict(queries=np.zeros((1, 3)), min_rays=1, kappa_rule="fixed", kappa=50.0)
-    stays, passes = place_probes(rays, 0.2, weights="person", **about).density(both)[0]
+    provenance = dict(queries=np.zeros((1, 3)), min_rays=1, kappa_rule="fixed", kappa=50.0)
+    stays, passes = place_probes(rays, 0.2, weights="person", **provenance).density(both)[0]
     assert stays == pytest.approx(passes, rel=1e-5)
-    assert np.divide(*place_probes(rays, 0.2, **about).density(both)[0]) == pytest.approx(100, rel=1e-3)
+    assert np.divide(*place_probes(rays, 0.2, **provenance).density(both)[0]) == pytest.approx(100, rel=1e-3)
     some = np.array([1.0] * 50 + [0.0] * 50 + [1.0])
-    stays, passes = place_probes(rays, 0.2, weights="person", ray_weights=some, **about).density(both)[0]
+    stays, passes = place_probes(rays, 0.2, weights="person", ray_weights=some, **provenance).density(both)[0]
     assert stays == pytest.approx(passes, rel=1e-5)
 
 
-def test_distance_and_the_rays_own_weights_multiply():
-    """Of rays at 0, R/2 and the very rim; the last keeps a trace of weight, so that a probe of rims alone is one."""
+def test_distance_and_ray_weights_multiply():
+    """Rays at 0, R/2 and exactly at the rim; the last has a tiny weight, so that a probe with only rim rays is
+    valid."""
     x = np.array([0.0, 0.1, 0.2])
     rays = Rays(np.arange(3.0), np.zeros(3), ("a",), x[:, None] * [1.0, 0, 0], np.eye(3), np.ones(3))
-    about = dict(queries=np.zeros((1, 3)), min_rays=1, kappa_rule="fixed", kappa=200.0)
-    alone = place_probes(rays, 0.2, weights="distance", **about)
+    provenance = dict(queries=np.zeros((1, 3)), min_rays=1, kappa_rule="fixed", kappa=200.0)
+    alone = place_probes(rays, 0.2, weights="distance", **provenance)
     assert alone.weights == pytest.approx([1.0, 0.5, 1e-6], rel=1e-9)
-    own = np.array([0.25, 3.0, 1.0])
-    both = place_probes(rays, 0.2, weights="distance", ray_weights=own, **about)
+    individual = np.array([0.25, 3.0, 1.0])
+    both = place_probes(rays, 0.2, weights="distance", ray_weights=individual, **provenance)
     assert both.weights == pytest.approx([0.25, 1.5, 1e-6], rel=1e-9)
     assert both.positions[0, 0] == pytest.approx((0.25 * 0 + 1.5 * 0.1) / 1.75, rel=1e-5)
     peaks = both.density(np.eye(3)[None])[0]
     assert peaks[1] / peaks[0] == pytest.approx(6, rel=1e-4)
-    rim = place_probes(rays.select([2]), 0.2, weights="distance", **about)
+    rim = place_probes(rays.select([2]), 0.2, weights="distance", **provenance)
     assert rim.density(np.eye(3)[None])[0, 2] > 10
 
 
-def test_person_weights_of_people_without_rays():
-    """Names without rays do not count as people: the mean stays one, and everybody who is there has the same sum."""
+def test_participants_without_rays_are_ignored():
+    """Names without rays do not count: the mean stays one, and all others have equal sums."""
     person = np.array([0] * 6 + [3] * 2)
     rays = Rays(np.arange(8.0), person, tuple("abcd"), np.zeros((8, 3)), np.tile([1.0, 0, 0], (8, 1)), np.ones(8))
     weights = compute_participant_weights(rays)
@@ -219,8 +221,8 @@ def test_person_weights_of_people_without_rays():
 # ---- Smallest regions of densities on the sphere, and the shares to ask for ----
 
 
-def test_regions_of_a_cap_hold_what_they_say():
-    """A density that falls with the angle from z: the region that ends at cos a holds (e^k - e^ka) / (e^k - e^-k)."""
+def test_region_levels_of_a_cap():
+    """A density that decreases with the angle from z: the region up to cos a holds (e^k - e^ka) / (e^k - e^-k)."""
     d, kappa = fibonacci_directions(20_000), 3.0
     maps, at = np.exp(kappa * d[None, :, 2]), np.array([[1.0, 0.5, 0.0, -1.0]])
     level = compute_region_levels(maps, np.exp(kappa * at))
@@ -232,14 +234,12 @@ def test_regions_of_a_cap_hold_what_they_say():
 
 def test_calibrated_levels_are_weighted_quantiles():
     rng = np.random.default_rng(0)
-    # Of a density whose looks lie at the square root of a uniform level, the share q holds q^2 of them.
+    # If rays are at the square root of a uniform level, a level q covers q^2 of them.
     levels = np.sqrt(rng.random(40_000))
-    found = calibrate_levels(levels, np.ones(len(levels)))
-    np.testing.assert_allclose([found[format_level(q)] for q in REGION_LEVELS], np.sqrt(REGION_LEVELS), atol=0.01)
-    # A look of weight 3 is three looks; those of weight zero are none.
+    result = calibrate_levels(levels, np.ones(len(levels)))
+    np.testing.assert_allclose([result[format_level(q)] for q in REGION_LEVELS], np.sqrt(REGION_LEVELS), atol=0.01)
+    # A ray of weight 3 counts three times, one of weight zero not at all.
     some = levels[:999]
     times = rng.integers(0, 4, len(some))
-    assert calibrate_levels(some, times.astype(float)) == calibrate_levels(
-        np.repeat(some, times), np.ones(times.sum())
-    )
+    assert calibrate_levels(some, times.astype(float)) == calibrate_levels(np.repeat(some, times), np.ones(times.sum()))
     assert calibrate_levels(np.array([0.3]), np.ones(1)) == {"50%": 0.3, "80%": 0.3, "95%": 0.3}

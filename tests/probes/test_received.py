@@ -1,10 +1,10 @@
-"""Attention received by a surface: solid angles, visibility, derivatives, and the integrator's picture."""
+"""Attention on surfaces: solid angles, visibility, derivatives, and the integrator's picture."""
 
 import drjit as dr
 import numpy as np
 import pytest
 
-from nerg_mi.probes.surface_attention import Patches, attention_per_patch, make_patches, attention_on
+from nerg_mi.probes.surface_attention import Patches, attention_on, attention_per_patch, make_patches
 from nerg_mi.transport.geometry import SceneGeometry, pixel_solid_angles
 from tests.plugins import fields
 from tests.plugins.scenes import camera
@@ -28,7 +28,7 @@ def sheet(mi, a=0.6, b=0.4, z=0.0):
 
 
 def solid_angle(a, b, p):
-    """Of the rectangle 2a x 2b in z = 0 from p above it: four corners' arctangents."""
+    """Solid angle of the rectangle 2a x 2b in z = 0 from p above it: arctangents of four corners."""
     x, y, z = p
     out = 0
     for i, u in ((1, a - x), (-1, -a - x)):
@@ -64,9 +64,9 @@ def test15_a_rectangle_is_a_mesh_that_follows_its_transform(rgb):
 
 
 @pytest.mark.parametrize("bad", ["sphere", "divisions"])
-def test02_what_cannot_be_cut(rgb, bad):
+def test02_invalid_meshes_are_refused(rgb, bad):
     shape = rgb.load_dict({"type": "sphere" if bad == "sphere" else "cube"})
-    with pytest.raises(ValueError, match="not a mesh" if bad == "sphere" else "divisions=0"):
+    with pytest.raises(ValueError, match="not a mesh" if bad == "sphere" else "divisions must be at least 1"):
         make_patches(shape, 4 if bad == "sphere" else 0)
 
 
@@ -80,15 +80,15 @@ def test03_a_uniform_density_gives_the_share_of_the_solid_angle(rgb):
     assert np.allclose(both, [*expected, behind], rtol=5e-4)
 
 
-def test05_from_inside_of_a_box_everything_is_seen_once(rgb):
-    eyes = rgb.Point3f([0.1, -0.3], [0.2, 0.0], [0.0, 0.4])
+def test05_inside_a_box_attention_sums_to_one(rgb):
+    observers = rgb.Point3f([0.1, -0.3], [0.2, 0.0], [0.0, 0.4])
     box = make_patches(rgb.load_dict({"type": "cube"}), 24)
-    assert np.allclose(attention_on(None, uniform, eyes, box, two_sided=True).numpy(), 1, rtol=1e-3)
-    assert np.allclose(attention_on(None, uniform, eyes, box).numpy(), 0)
+    assert np.allclose(attention_on(None, uniform, observers, box, two_sided=True).numpy(), 1, rtol=1e-3)
+    assert np.allclose(attention_on(None, uniform, observers, box).numpy(), 0)
 
 
-def test06_what_stands_in_between_hides(rgb):
-    # A plate over x < 0 halfway to the eye: what lies under x < 0 at z = 0 is hidden.
+def test06_occluders_hide_surfaces(rgb):
+    # A plate over x < 0 halfway to the observer hides the part of z = 0 below it.
     plate = sheet(rgb, 10, 10, 0.5)
     vertices = rgb.traverse(plate)
     vertices["vertex_positions"] = np.ravel([(-10, -10, 0.5), (0, -10, 0.5), (0, 10, 0.5), (-10, 10, 0.5)]).astype(
@@ -105,20 +105,22 @@ def test06_what_stands_in_between_hides(rgb):
 
 @pytest.mark.parametrize("falloff, share", [(0.0, 0.0), (0.5, 0.6), (4.0, 0.95)])
 def test07_the_fall_off_behind_a_plate(rgb, falloff, share):
-    # The plate lies 0.2 above a small patch right below the eye.
+    # The plate is 0.2 above a small patch directly below the observer.
     place = SceneGeometry(None, rgb.load_dict({"type": "scene", "plate": sheet(rgb, 0.5, 0.5, 0.2)}))
     eye, surface = rgb.Point3f(0, 0, 1), make_patches(sheet(rgb, 0.01, 0.01), 2)
     got = attention_on(place, uniform, eye, surface, falloff)[0] / attention_on(None, uniform, eye, surface)[0]
     assert got == pytest.approx(share, abs=1e-3)
 
 
-def test08_a_surface_in_the_place_does_not_hide_itself(rgb):
+def test08_a_surface_of_the_scene_does_not_hide_itself(rgb):
     box = rgb.load_dict({"type": "cube"})
     place = SceneGeometry(None, rgb.load_dict({"type": "scene", "box": {"type": "cube"}}))
-    eyes = rgb.Point3f(np.array([(3, 2, 1.5), (1.001, 4, 0), (0, 0, 1.2)], np.float32).T)
+    observers = rgb.Point3f(np.array([(3, 2, 1.5), (1.001, 4, 0), (0, 0, 1.2)], np.float32).T)
     surface = make_patches(box, 6)
     assert np.allclose(
-        attention_on(place, uniform, eyes, surface).numpy(), attention_on(None, uniform, eyes, surface).numpy(), rtol=1e-5
+        attention_on(place, uniform, observers, surface).numpy(),
+        attention_on(None, uniform, observers, surface).numpy(),
+        rtol=1e-5,
     )
 
 
@@ -126,7 +128,11 @@ def test08_a_surface_in_the_place_does_not_hide_itself(rgb):
 def test14_neither_side_of_an_open_sheet_hides_itself(rgb, z):
     surface, eye = make_patches(sheet(rgb), 8), rgb.Point3f(0.2, -0.1, z)
     each = attention_per_patch(
-        SceneGeometry(None, rgb.load_dict({"type": "scene", "sheet": sheet(rgb)})), uniform, eye, surface, two_sided=True
+        SceneGeometry(None, rgb.load_dict({"type": "scene", "sheet": sheet(rgb)})),
+        uniform,
+        eye,
+        surface,
+        two_sided=True,
     )
     free = attention_per_patch(None, uniform, eye, surface, two_sided=True).numpy()
     assert (free > 0).all() and np.allclose(each.numpy(), free, rtol=1e-5)
@@ -142,8 +148,8 @@ def moved(rgb, surface, x, kind):
 def test09_derivatives_of_a_solid_angle(rgb, kind):
     surface, x = make_patches(sheet(rgb), 24), rgb.Float(0)
     dr.enable_grad(x)
-    eye, there = moved(rgb, surface, x, kind)
-    dr.backward(attention_on(None, uniform, eye, there))
+    eye, is_valid = moved(rgb, surface, x, kind)
+    dr.backward(attention_on(None, uniform, eye, is_valid))
     h = 1e-4
     ends = [solid_angle(0.6, 0.4, (0.4 + 0.5 * s, s, 0.9 - s)) / (4 * np.pi) for s in (h, -h)]
     assert np.isclose(dr.grad(x)[0], (ends[0] - ends[1]) / (2 * h), rtol=2e-3)
@@ -177,7 +183,7 @@ def test11_no_derivative_is_nan_where_the_eye_touches_the_surface(rgb):
 
 
 def test12_the_integrator_sees_the_same_attention(rgb, tmp_path):
-    # Pixels of all that the observer could turn to, times their solid angle: the same integral over directions.
+    # Pixels over the whole sphere, times their solid angle: the same integral over directions.
     fields.gaze(tmp_path / "gaze.safetensors")
     eye, h = (-0.2, 0.3, 0.8), 96
     box = {"type": "cube", "to_world": rgb.ScalarTransform4f().translate([0.3, 0.1, -0.2]).scale([0.3, 0.2, 0.25])}
