@@ -1,1 +1,1 @@
-"""Ready scenes, each a folder with the script that makes it."""
+"""Ready-made scenes, each a folder with the script that generates it."""

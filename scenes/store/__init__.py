@@ -1,6 +1,6 @@
-"""The demo store: a procedural convenience store of 8 x 6 x 3 m, made from a seed by ``make.py``.
+"""The demo store: a procedural convenience store of 8 x 6 x 3 m, generated from a seed by ``make.py``.
 
-`layout` and `furniture` build the place, `twin` makes it Mitsuba shapes and casts exact rays, `cameras` and `views`
-take its posed pictures with depth, `attention_law` states in closed form where its shoppers look, `shoppers` walks them
-about. Frame: x east, y north, z up, metres.
+`layout` and `furniture` build the geometry, `twin` converts it to Mitsuba shapes and casts exact rays, `cameras` and
+`views` render posed pictures with depth, `attention_law` defines the true gaze density of the shoppers in closed form,
+and `shoppers` simulates their walks. Frame: x east, y north, z up, metres.
 """

@@ -1,4 +1,4 @@
-"""What a place is built of: axis-aligned boxes whose faces are patches of colour, and areas of interest on them.
+"""Building blocks of the store: axis-aligned boxes whose faces are coloured patches, and areas of interest.
 
 Frame: x east, y north, z up, metres.
 """
@@ -15,13 +15,13 @@ SOUTH, NORTH, WEST, EAST = (0, -1, 0), (0, 1, 0), (-1, 0, 0), (1, 0, 0)
 
 
 def parse_srgb(code: str) -> np.ndarray:
-    """Linear reflectance (3,) of an sRGB colour written as six hex digits."""
+    """Return the linear reflectance (3,) of an sRGB colour written as six hex digits."""
     return decode_srgb(np.array([int(code[i : i + 2], 16) for i in (0, 2, 4)]) / 255.0)
 
 
 @dataclass(frozen=True)
 class Region:
-    """A named area of interest: an axis-aligned box in metres, and the direction in which its goods face.
+    """An area of interest: an axis-aligned box in metres, and the direction that its goods face.
 
     ``focus`` is the box of its eye-catcher (the special offer of a shelf bay, the till of a counter), lo and hi.
     """
@@ -50,7 +50,7 @@ class StoreBuilder:
     """Coloured quads and solid boxes under construction.
 
     ``quads`` (N, 4, 3) corners in metres, counter-clockwise seen from outside; ``colors`` (N, 3) linear reflectances;
-    ``lights`` (M, 4, 3) emitting quads; ``solids`` (K, 2, 3) boxes that nobody can stand in.
+    ``lights`` (M, 4, 3) emitting quads; ``solids`` (K, 2, 3) obstacles to walking.
     """
 
     quads: list = field(default_factory=list)
@@ -60,8 +60,9 @@ class StoreBuilder:
     regions: list = field(default_factory=list)
 
     def add_patch(self, axis: int, sign: int, at: float, lo2, hi2, color) -> None:
-        """One rectangle in the plane ``axis = at``, facing ``sign``; lo2, hi2 in the two other axes in ascending
-        order."""
+        """Add a rectangle in the plane ``axis = at``, facing ``sign``; lo2, hi2 are in the two other axes in ascending
+        order.
+        """
         a, b = [k for k in range(3) if k != axis]
         corners = np.empty((4, 3))
         corners[:, axis] = at
@@ -74,8 +75,9 @@ class StoreBuilder:
         self.colors.append(np.asarray(color, float))
 
     def add_grid(self, axis: int, sign: int, at: float, lo2, hi2, cells, color_of) -> None:
-        """A rectangle cut into ``cells`` (n, m) patches; ``color_of(i, j)`` gives a colour, or None for a light
-        panel."""
+        """Add a rectangle divided into ``cells`` (n, m) patches; ``color_of(i, j)`` returns a colour, or None for a
+        light panel.
+        """
         us, vs = np.linspace(lo2[0], hi2[0], cells[0] + 1), np.linspace(lo2[1], hi2[1], cells[1] + 1)
         for i in range(cells[0]):
             for j in range(cells[1]):
@@ -86,18 +88,19 @@ class StoreBuilder:
                     self.colors.pop()
 
     def add_box(self, lo, hi, color, skip=(), fronts=None, solid=True) -> None:
-        """A box. ``skip``: faces (axis, sign) that are left out, because something else covers them.
+        """Add a box.
 
-        ``fronts``: {(axis, sign): (cells, color_of)} for faces that carry a pattern.
+        ``skip`` lists faces (axis, sign) that are left out because something else covers them. ``fronts`` maps faces
+        with a pattern to (cells, color_of).
         """
         lo, hi = np.minimum(lo, hi), np.maximum(lo, hi)
         for axis in range(3):
-            rest = [k for k in range(3) if k != axis]
+            other_axes = [k for k in range(3) if k != axis]
             for sign in (-1, 1):
                 if (axis, sign) in skip:
                     continue
                 at = (hi if sign > 0 else lo)[axis]
                 cells, color_of = (fronts or {}).get((axis, sign), ((1, 1), lambda i, j: color))
-                self.add_grid(axis, sign, at, lo[rest], hi[rest], cells, color_of)
+                self.add_grid(axis, sign, at, lo[other_axes], hi[other_axes], cells, color_of)
         if solid:
             self.solids.append(np.stack([lo, hi]))

@@ -1,8 +1,8 @@
-"""Where the cameras of the demo store stand: a plan that lets every visible surface be seen often and from many sides.
+"""Camera placement in the demo store, so that every visible surface is seen often and from many sides.
 
-Rooms seen from inside are hard for radiance fields because most views see most surfaces from afar and from one side. So
-the views are chosen greedily among many candidates by exact ray casts. Poses are camera-to-world matrices with OpenGL
-axes (x right, y up, z back), metres, z up.
+Rooms seen from inside are difficult for radiance fields, because most views see most surfaces from afar and from one
+side. The views are therefore selected greedily among many candidates by exact ray casts. Poses are camera-to-world
+matrices with OpenGL axes (x right, y up, z back), metres, z up.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ import numpy as np
 from nerg_mi.scenes.store import twin
 from nerg_mi.scenes.store.layout import ROOM, StoreLayout
 
-SECTORS = 6  # directions of view are told apart by their azimuth about the surface normal
+SECTORS = 6  # viewing directions are classified by their azimuth about the surface normal
 HEIGHTS = (0.6, 2.4)
 CLEARANCE = 0.35
 
 
 @dataclass(frozen=True)
 class Pinhole:
-    """A pinhole camera without distortion: size in pixels, focal length in pixels, the centre in the middle."""
+    """A pinhole camera without distortion; the principal point is the centre."""
 
     width: int = 160
     height: int = 120
@@ -38,8 +38,10 @@ class Pinhole:
         return d / np.linalg.norm(d, axis=-1, keepdims=True)
 
     def project(self, pose: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pixel coordinates (N, 2) of world points (N, 3), (0.5, 0.5) in the centre of the first pixel, and whether
-        they lie in front of the camera and inside of the picture."""
+        """Project world points (N, 3) to pixel coordinates (N, 2), with (0.5, 0.5) in the centre of the first pixel.
+
+        Also returns whether the points are in front of the camera and inside the picture.
+        """
         local = (points - pose[:3, 3]) @ pose[:3, :3]
         depth = np.maximum(-local[:, 2], 1e-9)
         uv = np.stack([local[:, 0], -local[:, 1]], axis=-1) / depth[:, None] * self.focal
@@ -49,8 +51,8 @@ class Pinhole:
 
 
 def pose_from_angles(position, yaw: float, pitch: float) -> np.ndarray:
-    """Camera-to-world (4, 4) at a position, looking along azimuth ``yaw`` and elevation ``pitch`` (radians),
-    upright."""
+    """Return the upright camera-to-world (4, 4) at a position with azimuth ``yaw`` and elevation ``pitch``
+    (radians)."""
     forward = np.array([np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)])
     right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])
     pose = np.eye(4)
@@ -58,22 +60,24 @@ def pose_from_angles(position, yaw: float, pitch: float) -> np.ndarray:
     return pose
 
 
-def sample_free_positions(layout: StoreLayout, rng, count: int, heights=HEIGHTS, clearance: float = CLEARANCE) -> np.ndarray:
-    """Uniform positions (count, 3) at least ``clearance`` metres away from everything solid."""
-    found = np.empty((0, 3))
+def sample_free_positions(
+    layout: StoreLayout, rng, count: int, heights=HEIGHTS, clearance: float = CLEARANCE
+) -> np.ndarray:
+    """Sample uniform positions (count, 3) with at least ``clearance`` metres to all solids."""
+    positions = np.empty((0, 3))
     for _ in range(1000):
         p = rng.uniform((0, 0, heights[0]), (ROOM[0], ROOM[1], heights[1]), (4 * count, 3))
-        found = np.concatenate([found, p[layout.compute_clearance(p) >= clearance]])
-        if len(found) >= count:
-            return found[:count]
-    raise ValueError(f"No room for a clearance of {clearance} m; ask for less.")
+        positions = np.concatenate([positions, p[layout.compute_clearance(p) >= clearance]])
+        if len(positions) >= count:
+            return positions[:count]
+    raise ValueError(f"no positions have a clearance of {clearance} m; use a smaller clearance")
 
 
 def sample_surface_points(layout: StoreLayout, rng, count: int, scene=None) -> tuple[np.ndarray, np.ndarray]:
-    """Points (N, 3), uniform by area on the surfaces that a camera in free space can see, and their normals (N, 3).
+    """Sample points (N, 3) uniformly by area on surfaces visible from free space, with their normals (N, 3).
 
-    Free space is where cameras may stand (`HEIGHTS`, `CLEARANCE`). ``count`` is how many are drawn; those behind goods,
-    under low boards and inside of joints drop out.
+    Free space is where cameras may be (`HEIGHTS`, `CLEARANCE`). ``count`` points are drawn; those behind goods, under
+    low boards and in joints are removed.
     """
     a, b, d = layout.quads[:, 0], layout.quads[:, 1], layout.quads[:, 3]
     cross = np.cross(b - a, d - a)
@@ -82,20 +86,20 @@ def sample_surface_points(layout: StoreLayout, rng, count: int, scene=None) -> t
     s, t = rng.random((2, count, 1))
     normals = cross[k] / area[k, None]
     points = a[k] + s * (b[k] - a[k]) + t * (d[k] - a[k]) + 2e-3 * normals
-    eyes = sample_free_positions(layout, rng, 400)
-    seen = np.zeros(count, bool)
-    for chunk in np.array_split(eyes, 10):
-        rest = np.flatnonzero(~seen)
-        towards = chunk[:, None] - points[None, rest]
-        facing = np.einsum("enk,nk->en", towards, normals[rest]) > 0.05 * np.linalg.norm(towards, axis=-1)
+    viewpoints = sample_free_positions(layout, rng, 400)
+    is_seen = np.zeros(count, bool)
+    for chunk in np.array_split(viewpoints, 10):
+        unseen = np.flatnonzero(~is_seen)
+        offset = chunk[:, None] - points[None, unseen]
+        facing = np.einsum("enk,nk->en", offset, normals[unseen]) > 0.05 * np.linalg.norm(offset, axis=-1)
         e, n = np.nonzero(facing)
-        hit = twin.is_visible(chunk[e], points[rest[n]], scene)
-        seen[rest[n[hit]]] = True
-    return points[seen], normals[seen]
+        hit = twin.is_visible(chunk[e], points[unseen[n]], scene)
+        is_seen[unseen[n[hit]]] = True
+    return points[is_seen], normals[is_seen]
 
 
 def find_visible_points(camera: Pinhole, poses, points, normals, scene=None):
-    """Which view sees which surface point: arrays (pose index, point index, cosine of view, distance, sector)."""
+    """Find which view sees which surface point: arrays (pose index, point index, cosine of view, distance, sector)."""
     parts = []
     for i, pose in enumerate(poses):
         to_eye = pose[:3, 3] - points
@@ -105,8 +109,8 @@ def find_visible_points(camera: Pinhole, poses, points, normals, scene=None):
         parts.append(np.stack([np.full(len(n), i), n]))
     i, n = np.concatenate(parts, axis=1)
     origins = np.stack([p[:3, 3] for p in poses])[i]
-    keep = twin.is_visible(origins, points[n], scene)
-    i, n, origins = i[keep], n[keep], origins[keep]
+    is_visible = twin.is_visible(origins, points[n], scene)
+    i, n, origins = i[is_visible], n[is_visible], origins[is_visible]
     to_eye = origins - points[n]
     distance = np.linalg.norm(to_eye, axis=1)
     cosine = np.einsum("nk,nk->n", to_eye, normals[n]) / distance
@@ -119,11 +123,11 @@ def find_visible_points(camera: Pinhole, poses, points, normals, scene=None):
 
 
 def choose_views(layout: StoreLayout, camera: Pinhole, count: int, held_out: int, seed: int = 0, scene=None):
-    """Training poses (count, 4, 4) and held-out poses (held_out, 4, 4).
+    """Choose training poses (count, 4, 4) and held-out poses (held_out, 4, 4).
 
-    Greedy: each next view is the candidate that sees most of what was seen seldom, or from one side only, until now;
-    views from near and face on count for more. Held-out views are a shopper's: at eye height, nearly level, looking
-    into the open.
+    Training views are selected greedily: each next view is the candidate that sees most of what was seen rarely, or
+    only from one side; near and frontal views count more. Held-out views are those of a shopper: at eye height, nearly
+    level, looking into open space.
     """
     rng = np.random.default_rng([seed, 0xCA])
     candidates = 30 * (count + held_out)
@@ -134,47 +138,46 @@ def choose_views(layout: StoreLayout, camera: Pinhole, count: int, held_out: int
     points, normals = sample_surface_points(layout, rng, 6000, scene)
     i, n, cosine, distance, sector = find_visible_points(camera, poses, points, normals, scene)
     value = np.minimum(1.0, cosine / 0.3) * np.minimum(1.0, 1.2 / distance)
-    seen = np.zeros(len(points))
+    visibility_count = np.zeros(len(points))
     sides = np.zeros((len(points), SECTORS))
-    chosen: list[int] = []
+    selected: list[int] = []
     bounds = np.searchsorted(i, np.arange(candidates + 1))
     for _ in range(count):
-        gain = value * (1.0 / (1.0 + seen[n]) ** 2 + 0.5 / (1.0 + sides[n, sector]) ** 2)
+        gain = value * (1.0 / (1.0 + visibility_count[n]) ** 2 + 0.5 / (1.0 + sides[n, sector]) ** 2)
         total = np.bincount(i, gain, candidates)
-        total[chosen] = -1.0
+        total[selected] = -1.0
         best = int(np.argmax(total))
-        chosen.append(best)
-        mine = slice(bounds[best], bounds[best + 1])
-        np.add.at(seen, n[mine], value[mine])
-        np.add.at(sides, (n[mine], sector[mine]), value[mine])
+        selected.append(best)
+        visible = slice(bounds[best], bounds[best + 1])
+        np.add.at(visibility_count, n[visible], value[visible])
+        np.add.at(sides, (n[visible], sector[visible]), value[visible])
 
-    return poses[chosen], _held_out_views(layout, rng, held_out, scene)
+    return poses[selected], _choose_held_out_views(layout, rng, held_out, scene)
 
 
-def _held_out_views(layout: StoreLayout, rng, count: int, scene) -> np.ndarray:
-    """Poses (count, 4, 4) far from each other in place and direction; a picture of one good from 40 cm would test
-    little."""
+def _choose_held_out_views(layout: StoreLayout, rng, count: int, scene) -> np.ndarray:
+    """Choose poses (count, 4, 4) that differ in position and direction; a close-up of one product would test little."""
     positions = sample_free_positions(layout, rng, 400, (1.2, 1.9))
     yaw, pitch = rng.uniform(0, 2 * np.pi, 400), np.radians(rng.uniform(-18, 8, 400))
     poses = np.stack([pose_from_angles(*v) for v in zip(positions, yaw, pitch)])
     probe = Pinhole(16, 12).directions().reshape(-1, 3)
-    ahead = np.stack([twin.cast_rays(p[:3, 3], probe @ p[:3, :3].T, scene) for p in poses])
-    open_ = (np.median(ahead, axis=1) > 1.8) & (np.quantile(ahead, 0.1, axis=1) > 0.6)
-    poses, positions, yaw = poses[open_], positions[open_], yaw[open_]
-    picked = [0]
-    while len(picked) < min(count, len(poses)):
-        far = np.linalg.norm(positions[:, None] - positions[picked][None], axis=-1)
-        turn = 1.0 - np.cos(yaw[:, None] - yaw[picked][None])
-        picked.append(int(np.argmax((far + 0.5 * turn).min(axis=1))))
-    return poses[picked[:count]]
+    distances = np.stack([twin.cast_rays(p[:3, 3], probe @ p[:3, :3].T, scene) for p in poses])
+    is_open = (np.median(distances, axis=1) > 1.8) & (np.quantile(distances, 0.1, axis=1) > 0.6)
+    poses, positions, yaw = poses[is_open], positions[is_open], yaw[is_open]
+    selected = [0]
+    while len(selected) < min(count, len(poses)):
+        far = np.linalg.norm(positions[:, None] - positions[selected][None], axis=-1)
+        turn = 1.0 - np.cos(yaw[:, None] - yaw[selected][None])
+        selected.append(int(np.argmax((far + 0.5 * turn).min(axis=1))))
+    return poses[selected[:count]]
 
 
 def measure_coverage(layout: StoreLayout, camera: Pinhole, poses, seed: int = 1, scene=None) -> dict:
-    """How well poses see the place: fractions of fresh surface points seen by so many views.
+    """Measure how well poses see the store: fractions of new surface points seen by a number of views.
 
-    "area": points uniform by area on what a camera in free space can see at all, slits behind and above goods included.
-    "sight": points as they meet the eye, hits of uniform directions from uniform positions in free space.
-    Also the fraction of the area seen by two views at least 30 degrees apart, and the median numbers of views.
+    "area": points uniform by area on surfaces visible from free space, including slits behind and above goods. "sight":
+    hits of uniform directions from uniform positions in free space. Also the fraction of the area seen by two views at
+    least 30 degrees apart, and the median numbers of views.
     """
     rng = np.random.default_rng([seed, 0xC0])
     points, normals = sample_surface_points(layout, rng, 4000, scene)
@@ -184,22 +187,22 @@ def measure_coverage(layout: StoreLayout, camera: Pinhole, poses, seed: int = 1,
     to_eye /= np.linalg.norm(to_eye, axis=1, keepdims=True)
     order = np.argsort(n, kind="stable")
     starts = np.searchsorted(n[order], np.arange(len(points) + 1))
-    wide = np.zeros(len(points), bool)
+    is_wide = np.zeros(len(points), bool)
     for k in range(len(points)):
         v = to_eye[order[starts[k] : starts[k + 1]]]
-        wide[k] = len(v) > 1 and (v @ v.T).min() < np.cos(np.radians(30))
+        is_wide[k] = len(v) > 1 and (v @ v.T).min() < np.cos(np.radians(30))
 
-    eyes = sample_free_positions(layout, rng, 4000)
-    directions = rng.normal(size=eyes.shape)
+    origins = sample_free_positions(layout, rng, 4000)
+    directions = rng.normal(size=origins.shape)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    met = eyes + (twin.cast_rays(eyes, directions, scene) - 2e-3)[:, None] * directions
-    sight = np.zeros(len(met))
+    hits = origins + (twin.cast_rays(origins, directions, scene) - 2e-3)[:, None] * directions
+    sight = np.zeros(len(hits))
     for pose in poses:
-        k = np.flatnonzero(camera.project(pose, met)[1])
-        sight[k] += twin.is_visible(pose[:3, 3], met[k], scene)
+        k = np.flatnonzero(camera.project(pose, hits)[1])
+        sight[k] += twin.is_visible(pose[:3, 3], hits[k], scene)
 
     out = {}
     for name, views in (("area", count), ("sight", sight)):
         out |= {f"{name}: seen by {m} or more views": float((views >= m).mean()) for m in (1, 3, 5, 10)}
         out[f"{name}: median views"] = float(np.median(views))
-    return out | {"area: seen from directions 30 degrees apart": float(wide.mean())}
+    return out | {"area: seen from directions 30 degrees apart": float(is_wide.mean())}

@@ -1,7 +1,7 @@
-"""Make the demo store from a seed: ``python -m nerg_mi.scenes.store.make --seed 0 [--stage NAME ...]``.
+"""Generate the demo store from a seed: ``python -m nerg_mi.scenes.store.make --seed 0 [--stage NAME ...]``.
 
-Stages run in the order of `STAGES`. What the package carries is written beside this file, what can be made again into
-``build/``. Each stage reads only what earlier stages wrote.
+Stages run in the order of `STAGES`. Files that are part of the package are written next to this file, all others into
+``build/``. Each stage only reads files of earlier stages.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from pathlib import Path
 
 FOLDER = Path(__file__).resolve().parent
 SAMPLE_DIVISOR = 10
-"""One part in so many of each shopper's visit is packed with the store."""
+"""The packaged sample has one in this many parts of each shopper's visit."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """What a stage is told: the seed, the folder of the committed results and the folder of everything else."""
+    """Arguments of a stage: the seed, the folder of the packaged results and the folder of all other files."""
 
     seed: int
     store: Path = FOLDER
@@ -26,18 +26,20 @@ class Job:
 
 
 def make_twin(job: Job) -> list[Path]:
-    """The place as Mitsuba shapes, and its areas of interest: twin.xml, two meshes, regions.json."""
+    """Mitsuba shapes and areas of interest: twin.xml, two meshes, regions.json."""
     from nerg_mi.scenes.store import layout, twin
 
-    place = layout.build_store(job.seed)
-    return [*twin.write_twin(place, job.store), layout.write_regions(place, job.store / "regions.json")]
+    store = layout.build_store(job.seed)
+    return [*twin.write_twin(store, job.store), layout.write_regions(store, job.store / "regions.json")]
 
 
 def make_views(job: Job) -> list[Path]:
-    """Posed pictures with exact depth, from the twin."""
+    """Posed pictures with exact depth, rendered from the twin."""
     from nerg_mi.scenes.store import layout, twin, views
 
-    views.write_views(layout.build_store(job.seed), job.build, seed=job.seed, scene=twin.load_twin(job.store / "twin.xml"))
+    views.write_views(
+        layout.build_store(job.seed), job.build, seed=job.seed, scene=twin.load_twin(job.store / "twin.xml")
+    )
     return [job.build / "transforms.json", job.build / "transforms_test.json"]
 
 
@@ -46,61 +48,70 @@ def make_shoppers(job: Job) -> list[Path]:
     from nerg_mi.scenes.store import layout, shoppers, twin
 
     path = job.build / "shoppers.csv"
-    shoppers.write_shoppers(layout.build_store(job.seed), path, seed=job.seed, scene=twin.load_twin(job.store / "twin.xml"))
+    shoppers.write_shoppers(
+        layout.build_store(job.seed), path, seed=job.seed, scene=twin.load_twin(job.store / "twin.xml")
+    )
     return [path]
 
 
 def make_field(job: Job) -> list[Path]:
-    """The radiance field, trained on the pictures and their exact depth; the test views are held out."""
+    """Radiance field, trained on the pictures and their exact depth; the test views are held out."""
     import mitsuba as mi
 
     from nerg_mi.workflows.radiance_commands import RadianceOptions
     from nerg_mi.workflows.train_radiance import train_radiance
 
-    _require(job.build / "transforms.json", "views")
+    _require_file(job.build / "transforms.json", "views")
     path = job.build / "store.safetensors"
     train_radiance(job.build, path, RadianceOptions(steps=6500, seed=job.seed, half=True, mode=mi.variant()))
-    # The run's preview and its state stay with what can be made again.
+    # The preview and the state of the run stay in the build folder.
     return [path.replace(job.store / path.name)]
 
 
 def make_rays(job: Job) -> list[Path]:
-    """Rays of attention from the tracking data, as `nerg rays import --preset skeleton --tick 0.001` makes them, and
-    a tenth of each visit for the demo's report."""
+    """Gaze rays of the tracking data, and a sample of each visit.
+
+    The rays are those of `nerg rays import --preset skeleton --tick 0.001`; the sample, a tenth of each visit, is for
+    the report of the demo.
+    """
     import numpy as np
 
     from nerg_mi.rays.readers.registry import read_rays
     from nerg_mi.rays.readers.skeleton import SkeletonOptions
 
     tracking, path = job.build / "shoppers.csv", job.build / "rays.npz"
-    _require(tracking, "shoppers")
+    _require_file(tracking, "shoppers")
     rays = read_rays("skeleton", tracking, SkeletonOptions(tick=1e-3))
     rays.save(path)
     sample = job.store / "shoppers.npz"
     visits = [np.flatnonzero(rays.person == k) for k in range(len(rays.persons))]
-    # A run of each visit, from its begin for the first shopper to its end for the last.
+    # A contiguous part of each visit, from its begin for the first shopper to its end for the last.
     starts = [int(k * (len(v) - len(v) // SAMPLE_DIVISOR) / max(len(visits) - 1, 1)) for k, v in enumerate(visits)]
-    some = rays.select(np.sort(np.concatenate([v[s : s + len(v) // SAMPLE_DIVISOR] for v, s in zip(visits, starts)])))
-    some.with_step(step="sample", kept=len(some), of=len(rays)).save(sample)
+    sampled = rays.select(
+        np.sort(np.concatenate([v[s : s + len(v) // SAMPLE_DIVISOR] for v, s in zip(visits, starts)]))
+    )
+    sampled.with_step(step="sample", kept=len(sampled), of=len(rays)).save(sample)
     return [path, sample]
 
 
 def make_gaze(job: Job) -> list[Path]:
-    """The gaze field, trained on the rays in the store's radiance field; 64 positions are held out and recorded in
-    it."""
+    """Gaze field, trained on the rays in the radiance field of the store.
+
+    64 positions are held out and recorded in it.
+    """
     import mitsuba as mi
 
     from nerg_mi.workflows.gaze_commands import GazeOptions
     from nerg_mi.workflows.train_gaze import train_gaze
 
-    source, place = job.build / "rays.npz", job.store / "store.safetensors"
-    _require(source, "rays")
-    _require(place, "field")
+    source, field_path = job.build / "rays.npz", job.store / "store.safetensors"
+    _require_file(source, "rays")
+    _require_file(field_path, "field")
     path = job.store / "shoppers.safetensors"
     options = GazeOptions(
-        field=place,
-        # Heads are drawn from the law at 5 Hz: rays are exact and independent, so that a narrow kernel is no noise and
-        # more steps do not follow the people at hand.
+        field=field_path,
+        # Heads are sampled from the law at 5 Hz: rays are exact and independent, so narrow kernels are not noisy and
+        # more steps do not overfit.
         kappa=200.0,
         steps=640,
         test_zones=8,
@@ -114,7 +125,7 @@ def make_gaze(job: Job) -> list[Path]:
 
 
 def make_evaluation(job: Job) -> list[Path]:
-    """Scores of the gaze field at the positions that were held out, beside those of what needs no field."""
+    """Scores of the gaze field and of the baselines at the held-out positions."""
     import mitsuba as mi
 
     from nerg_mi.workflows.evaluate import evaluate_gaze
@@ -122,22 +133,22 @@ def make_evaluation(job: Job) -> list[Path]:
     from nerg_mi.workflows.report import RESULTS
 
     source, gaze = job.build / "rays.npz", job.store / "shoppers.safetensors"
-    _require(source, "rays")
-    _require(gaze, "gaze")
+    _require_file(source, "rays")
+    _require_file(gaze, "gaze")
     options = GazeEvaluationOptions(field=job.store / "store.safetensors", pictures=0, seed=job.seed, mode=mi.variant())
     evaluate_gaze(gaze, source, job.build / "shoppers.eval", options)
     path = job.store / RESULTS
     return [(job.build / "shoppers.eval" / RESULTS).replace(path)]
 
 
-def _require(path: Path, stage: str) -> None:
+def _require_file(path: Path, stage: str) -> None:
     if not path.exists():
         raise FileNotFoundError(
-            f'"{path}" is missing; make it with: python -m nerg_mi.scenes.store.make --stage {stage}'
+            f'"{path}" is missing; create it with: python -m nerg_mi.scenes.store.make --stage {stage}'
         )
 
 
-# Name and function, in order. A stage returns the files that it wrote.
+# Stages in order. Each returns the files that it wrote.
 STAGES = {
     "twin": make_twin,
     "views": make_views,
@@ -151,9 +162,9 @@ STAGES = {
 
 def main(argv=None) -> None:
     parser = argparse.ArgumentParser(prog="python -m nerg_mi.scenes.store.make", description=__doc__.splitlines()[0])
-    parser.add_argument("--seed", type=int, default=0, help="everything is made from it (default: 0)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the generation (default: 0)")
     parser.add_argument(
-        "--stage", action="append", choices=list(STAGES), help="only this one; may be given several times"
+        "--stage", action="append", choices=list(STAGES), help="stage to run (default: all); repeatable"
     )
     parser.add_argument("-m", "--mode", default="llvm_ad_rgb", help="Mitsuba variant (default: llvm_ad_rgb)")
     args = parser.parse_args(argv)

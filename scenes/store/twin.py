@@ -1,7 +1,7 @@
-"""The digital twin of the demo store: ``twin.xml`` with two small meshes, and exact ray casts against them.
+"""Digital twin of the demo store: ``twin.xml`` with two small meshes, and exact ray casts.
 
-``twin.ply`` carries one linear reflectance for each face (mesh attribute ``face_color``), ``twin_lights.ply`` the
-ceiling panels. Any stock Mitsuba renders ``twin.xml`` with its ``path`` integrator; units are metres, z up.
+``twin.ply`` stores a linear reflectance per face (mesh attribute ``face_color``), ``twin_lights.ply`` the ceiling
+panels. Mitsuba renders ``twin.xml`` with its ``path`` integrator; units are metres, z up.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from nerg_mi.formats.ply import write_columns
 FOLDER = Path(__file__).resolve().parent
 TWIN_XML = FOLDER / "twin.xml"
 
-# Reflectances stay away from black and white: interreflection keeps the light soft, and no texel is without a gradient.
+# Reflectances exclude black and white: interreflection keeps the light soft, and every texel has a gradient.
 ALBEDO_RANGE = (0.03, 0.82)
 PANEL_RADIANCE = 7.0
 
@@ -78,7 +78,9 @@ XML = """<!-- The demo store as shapes. Metres, z up. Made by nerg_mi.scenes.sto
 
 
 def _write_ply(path: Path, quads: np.ndarray, colors: np.ndarray | None) -> None:
-    """Binary PLY of quads (N, 4, 3), each as two triangles; colors (N, 3) become the attribute ``face_color``."""
+    """Write a binary PLY of quads (N, 4, 3), each as two triangles; ``colors`` (N, 3) become the attribute
+    ``face_color``.
+    """
     corners = np.round(quads.reshape(-1, 3), 5)
     vertices, index = np.unique(corners, axis=0, return_inverse=True)
     index = index.reshape(-1, 4)
@@ -89,7 +91,7 @@ def _write_ply(path: Path, quads: np.ndarray, colors: np.ndarray | None) -> None
 
 
 def write_twin(layout, folder=FOLDER) -> list[Path]:
-    """Write twin.xml, twin.ply and twin_lights.ply of a `Layout` into a folder; returns their paths."""
+    """Write twin.xml, twin.ply and twin_lights.ply of a `StoreLayout` into a folder; returns their paths."""
     folder = Path(folder)
     _write_ply(folder / "twin.ply", layout.quads, np.clip(layout.colors, *ALBEDO_RANGE))
     _write_ply(folder / "twin_lights.ply", layout.lights, None)
@@ -99,25 +101,27 @@ def write_twin(layout, folder=FOLDER) -> list[Path]:
 
 
 @lru_cache(maxsize=8)
-def _load(path: str, variant: str, stamp: float):
+def _load_scene(path: str, variant: str, stamp: float):
     import mitsuba as mi
 
     return mi.load_file(path)
 
 
 def load_twin(path=TWIN_XML):
-    """The twin as an `mi.Scene` of the active variant, loaded once for each file and variant."""
+    """Load the twin as an `mi.Scene` of the active variant, once per file and variant."""
     import mitsuba as mi
 
     path = Path(path)
     if mi.variant() is None:
-        raise RuntimeError('No Mitsuba variant is set; call mi.set_variant("llvm_ad_rgb") before loading the twin.')
+        raise RuntimeError('no Mitsuba variant is set; call mi.set_variant("llvm_ad_rgb") before loading the twin')
     if not path.exists():
-        raise FileNotFoundError(f'"{path}" is missing; make it with: python -m nerg_mi.scenes.store.make --stage twin')
-    return _load(str(path), mi.variant(), path.stat().st_mtime)
+        raise FileNotFoundError(
+            f'"{path}" is missing; create it with: python -m nerg_mi.scenes.store.make --stage twin'
+        )
+    return _load_scene(str(path), mi.variant(), path.stat().st_mtime)
 
 
-def _rays(origins, directions, maxt=None):
+def _make_rays(origins, directions, maxt=None):
     import mitsuba as mi
 
     o = np.ascontiguousarray(np.asarray(origins, np.float32).reshape(-1, 3).T)
@@ -130,28 +134,29 @@ def _rays(origins, directions, maxt=None):
     return ray, n
 
 
-RAYS_PER_LAUNCH = 1 << 21  # rays a launch: bounds the memory of large queries
+RAYS_PER_LAUNCH = 1 << 21  # rays per launch, which limits the memory of large queries
 
 
 def cast_rays(origins, directions, scene=None) -> np.ndarray:
-    """Distance in metres from origins (N, 3) along unit directions (N, 3) to the twin; float64 (N,), inf on a miss.
+    """Return the distance in metres from origins (N, 3) along unit directions (N, 3) to the twin; float64 (N,), inf on
+    a miss.
 
-    One origin or one direction is broadcast. ``scene``: another scene than the store's own twin.
+    A single origin or direction is broadcast. ``scene`` replaces the twin of the store.
     """
     scene = load_twin() if scene is None else scene
     o, d = np.broadcast_arrays(np.atleast_2d(origins), np.atleast_2d(directions))
     out = np.empty(len(o))
     for a in range(0, len(o), RAYS_PER_LAUNCH):
-        ray, n = _rays(o[a : a + RAYS_PER_LAUNCH], d[a : a + RAYS_PER_LAUNCH])
+        ray, n = _make_rays(o[a : a + RAYS_PER_LAUNCH], d[a : a + RAYS_PER_LAUNCH])
         t = scene.ray_intersect_preliminary(ray, coherent=False).t
         out[a : a + n] = np.asarray(t, np.float64)
     return out
 
 
 def is_visible(origins, points, scene=None, tolerance: float = 1e-3) -> np.ndarray:
-    """Whether each of points (N, 3) is seen from origins (N, 3): nothing of the twin lies between them. Bool (N,).
+    """Return whether each of points (N, 3) is visible from origins (N, 3), (N,) bool.
 
-    The last ``tolerance`` metres before the point are not tested, so that a point on a surface is not hidden by it.
+    The last ``tolerance`` metres before the point are not tested, so that a point on a surface is not occluded by it.
     """
     scene = load_twin() if scene is None else scene
     o, p = np.broadcast_arrays(np.atleast_2d(origins), np.atleast_2d(points))
@@ -159,7 +164,7 @@ def is_visible(origins, points, scene=None, tolerance: float = 1e-3) -> np.ndarr
     for a in range(0, len(o), RAYS_PER_LAUNCH):
         offset = (p[a : a + RAYS_PER_LAUNCH] - o[a : a + RAYS_PER_LAUNCH]).astype(np.float64)
         length = np.linalg.norm(offset, axis=1)
-        ray, n = _rays(
+        ray, n = _make_rays(
             o[a : a + RAYS_PER_LAUNCH], offset / np.maximum(length, 1e-12)[:, None], np.maximum(length - tolerance, 0.0)
         )
         out[a : a + n] = ~np.asarray(scene.ray_test(ray), bool)

@@ -1,9 +1,9 @@
-"""The posed pictures of the demo store: what a photographer with a depth camera would bring home.
+"""Posed pictures of the demo store, as a photographer with a depth camera would take them.
 
-Writes into a folder: ``images/*.png`` (8-bit sRGB), ``depth/*.npy`` (float32 (h, w), metres along the ray from the
-camera's centre through each pixel's centre, exact; 0 where nothing is hit), ``transforms.json`` and
+Writes into a folder: ``images/*.png`` (8-bit sRGB), ``depth/*.npy`` (float32 (h, w), exact distance in metres along the
+ray from the camera centre through the pixel centre; 0 where nothing is hit), ``transforms.json`` and
 ``transforms_test.json`` (held-out views) with the conventions of instant-ngp and nerfstudio: OpenGL camera-to-world (x
-right, y up, z back), in the store's own metric frame with z up. ``aabb`` are the bounds of the store.
+right, y up, z back), in the metric frame of the store with z up. ``aabb`` are the bounds of the store.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ _GL_TO_MITSUBA = np.diag([-1.0, 1.0, -1.0, 1.0])
 
 
 def to_mitsuba_pose(pose: np.ndarray) -> np.ndarray:
-    """The ``to_world`` (4, 4) of a Mitsuba sensor for an OpenGL camera-to-world pose."""
+    """Convert an OpenGL camera-to-world pose to the ``to_world`` (4, 4) of a Mitsuba sensor."""
     return np.asarray(pose) @ _GL_TO_MITSUBA
 
 
 class StorePhotographer:
-    """Renders pictures and depths of a scene for poses; one sensor is moved about, so that nothing recompiles."""
+    """Renders pictures and depths of a scene; one sensor is moved, so that nothing is recompiled."""
 
     def __init__(self, camera: cameras.Pinhole, scene=None, spp: int = 64):
         import mitsuba as mi
@@ -60,26 +60,28 @@ class StorePhotographer:
         self.params = mi.traverse(self.sensor)
 
     def render_picture(self, pose: np.ndarray, seed: int, spp: int | None = None) -> np.ndarray:
-        """Linear radiance (h, w, 3), float32."""
+        """Render linear radiance (h, w, 3), float32."""
         import drjit as dr
         import mitsuba as mi
 
         to_world = mi.Transform4f(mi.Matrix4f(to_mitsuba_pose(pose).tolist()))
-        # as literals the pose would be baked into the kernel, and every view compiled anew
+        # a literal pose would be part of the kernel, and each view would be compiled again
         dr.make_opaque(to_world)
         self.params["to_world"] = to_world
         self.params.update()
         return np.array(mi.render(self.scene, sensor=self.sensor, spp=spp or self.spp, seed=mi.UInt32(seed)))
 
     def render_depth(self, pose: np.ndarray) -> np.ndarray:
-        """Distance (h, w) float32 in metres along the rays through the pixels' centres; 0 where nothing is hit."""
+        """Return the distance (h, w) float32 in metres along the rays through the pixel centres; 0 where nothing is
+        hit.
+        """
         directions = self.camera.directions().reshape(-1, 3) @ pose[:3, :3].T
         t = twin.cast_rays(pose[:3, 3], directions, self.scene)
         return np.where(np.isfinite(t), t, 0.0).astype(np.float32).reshape(self.camera.height, self.camera.width)
 
 
 def write_picture(path: Path, picture: np.ndarray) -> None:
-    """Write linear radiance (h, w, 3) as 8-bit sRGB; what is brighter than white is clipped."""
+    """Write linear radiance (h, w, 3) as 8-bit sRGB, clipped at white."""
     import mitsuba as mi
 
     bitmap = mi.Bitmap(np.ascontiguousarray(picture, np.float32))
@@ -87,7 +89,7 @@ def write_picture(path: Path, picture: np.ndarray) -> None:
 
 
 def make_transforms(camera: cameras.Pinhole, layout: StoreLayout, frames: list) -> dict:
-    """The content of a ``transforms.json``: intrinsics in pixels, frames, bounds."""
+    """Make the content of a ``transforms.json``: intrinsics in pixels, frames, bounds."""
     return {
         "camera_model": "OPENCV",
         "w": camera.width,
@@ -119,16 +121,37 @@ def write_views(
     scene=None,
     log=print,
 ) -> dict:
-    """Choose, render and write the picture set into ``folder``; returns the coverage figures, also in
-    ``coverage.json``.
+    """Choose, render and write the picture set into ``folder``.
 
-    ``train``, ``test``: numbers of views; ``spp``: samples a pixel of a training view; a held-out view gets four times
-    as many, so that its noise does not limit what it can measure; ``say``: where progress goes.
+    Parameters
+    ----------
+    layout : StoreLayout
+        Layout of the store.
+    folder : Path
+        Output folder.
+    camera : Pinhole, optional
+        Camera of all views.
+    train, test : int
+        Numbers of training and held-out views.
+    spp : int
+        Samples per pixel of a training view. Held-out views get four times as many, so that their noise does not limit
+        the measured error.
+    seed : int
+        Seed of the views and of the noise.
+    scene : mitsuba.Scene, optional
+        Scene to render; the twin by default.
+    log : callable
+        Receives progress messages.
+
+    Returns
+    -------
+    dict
+        Coverage of the views, which is also written to ``coverage.json``.
     """
     camera = camera or cameras.Pinhole()
     folder = Path(folder)
     for name in ("images", "depth"):
-        # an earlier, larger set would leave pictures behind that no file lists
+        # remove pictures of an earlier, larger set
         for old in (folder / name).glob("t*_???.*"):
             old.unlink()
     start = time.perf_counter()

@@ -1,7 +1,7 @@
-"""A table in a furnished room with a view: photos as somebody takes them who walks around an object on a table, made
-from a seed by ``make.py``.
+"""A table in a furnished room with windows: photos as taken by walking around the table, generated from a seed by
+``make.py``.
 
-`layout` puts the place together of `table`, `room` and `outside`, which `mesh` shapes and `textures` paints; `stage`
-makes it a Mitsuba scene, `cameras` walks around the table, `photos` takes the pictures with exact depth, and `sparse`
-writes the COLMAP model. Frame: x east, y north, z up, metres.
+`layout` combines the geometry of `table`, `room` and `outside`, built with `mesh` and textured with `textures`; `stage`
+converts it to a Mitsuba scene, `cameras` places the cameras around the table, `photos` renders the photos with exact
+depth, and `sparse` writes the COLMAP model. Frame: x east, y north, z up, metres.
 """

@@ -1,4 +1,4 @@
-"""What the place is built of: triangles with normals and texture coordinates, gathered by their material.
+"""Mesh construction: triangles with normals and texture coordinates, grouped by material.
 
 Frame: x east, y north, z up, metres.
 """
@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 FULL_PATCH = (0.0, 0.0, 1.0, 1.0)
-"""Texture coordinates of a face that shows all of its texture: u0, v0, u1, v1."""
+"""Texture coordinates of a face that shows the whole texture: u0, v0, u1, v1."""
 _QUAD = np.array([(0, 2, 3), (0, 3, 1)])
 
 
@@ -31,18 +31,18 @@ class Mesh(NamedTuple):
 
 @dataclass
 class MeshBuilder:
-    """A place under construction: ``parts``, lists of meshes by the name of their material."""
+    """Geometry under construction: ``parts``, lists of meshes by the name of their material."""
 
     parts: dict[str, list[Mesh]] = field(default_factory=dict)
 
     def join_meshes(self) -> dict[str, Mesh]:
-        """One mesh for each material."""
-        return {material: _joined(parts) for material, parts in self.parts.items()}
+        """Join the meshes of each material."""
+        return {material: _join(parts) for material, parts in self.parts.items()}
 
     def add_surface(self, material: str, points, patch=FULL_PATCH) -> None:
-        """A smooth surface through a grid of ``points`` (N, M, 3); u runs along the second axis, v along the first.
+        """Add a smooth surface through a grid of ``points`` (N, M, 3); u runs along the second axis, v along the first.
 
-        Its normals, of which no shading depends on the sign, are those of the derivatives along both axes.
+        Its normals are those of the derivatives along both axes; shading does not depend on their sign.
         """
         points = np.asarray(points, float)
         n, m = points.shape[:2]
@@ -55,8 +55,7 @@ class MeshBuilder:
         self.parts.setdefault(material, []).append(Mesh(points.reshape(-1, 3), normals.reshape(-1, 3), uv, faces))
 
     def add_quad(self, material: str, corner, along, up, tile: float | None = None, patch=FULL_PATCH) -> None:
-        """A parallelogram. Its texture is repeated every ``tile`` metres from the origin of the frame, or shows its
-        ``patch`` once."""
+        """Add a parallelogram. Its texture repeats every ``tile`` metres from the origin, or shows ``patch`` once."""
         corner, along, up = (np.asarray(v, float) for v in (corner, along, up))
         if tile is not None:
             size = np.sqrt(along @ along), np.sqrt(up @ up)
@@ -70,9 +69,14 @@ class MeshBuilder:
         uv = np.array([(u0, v0), (u1, v0), (u0, v1), (u1, v1)])
         self.parts.setdefault(material, []).append(Mesh(points, normals, uv, _QUAD))
 
-    def add_box(self, material: str, lo, hi, tile: float | None = None, patch=FULL_PATCH, yaw: float = 0.0, skip="") -> None:
-        """A box whose sides have the texture as `quad` says, upright. ``yaw``: turned about its vertical axis,
-        radians. ``skip``: faces that are left out, of "wensbt" (west, east, north, south, bottom, top)."""
+    def add_box(
+        self, material: str, lo, hi, tile: float | None = None, patch=FULL_PATCH, yaw: float = 0.0, skip=""
+    ) -> None:
+        """Add a box with upright sides, textured as in `add_quad`.
+
+        ``yaw`` rotates it about its vertical axis (radians). ``skip`` lists faces that are left out, of "wensbt" (west,
+        east, north, south, bottom, top).
+        """
         lo, hi = np.minimum(lo, hi).astype(float), np.maximum(lo, hi).astype(float)
         x, y, z = np.diag(hi - lo)
         sides = {
@@ -84,21 +88,28 @@ class MeshBuilder:
             "t": (lo + z, x, y),
         }
         middle = (lo + hi) / 2
-        turn = rotate_about_z(yaw)
+        rotation = rotate_about_z(yaw)
         for name, (corner, along, up) in sides.items():
             if name not in skip:
-                self.add_quad(material, middle + turn @ (corner - middle), turn @ along, turn @ up, tile, patch)
+                self.add_quad(
+                    material, middle + rotation @ (corner - middle), rotation @ along, rotation @ up, tile, patch
+                )
 
     def add_revolved(self, material: str, centre, profile, around: int = 48, patch=FULL_PATCH) -> None:
-        """The surface that a ``profile`` of radii and heights (N, 2) sweeps about the vertical through ``centre``."""
+        """Add the surface of revolution of a ``profile`` of radii and heights (N, 2) about the vertical through
+        ``centre``.
+        """
         r, h = np.asarray(profile, float).T
         angle = np.linspace(0, 2 * np.pi, around + 1)
         ring = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=-1)
         self.add_surface(material, centre + r[:, None, None] * ring + h[:, None, None] * np.array([0, 0, 1.0]), patch)
 
-    def add_ball(self, material: str, centre, radius, lumps: float = 0.0, rng=None, patch=FULL_PATCH, steps: int = 24) -> None:
-        """An ellipsoid of ``radius`` (a number or three); ``lumps``: how far waves drawn from ``rng`` displace it, in
-        radii."""
+    def add_ball(
+        self, material: str, centre, radius, lumps: float = 0.0, rng=None, patch=FULL_PATCH, steps: int = 24
+    ) -> None:
+        """Add an ellipsoid of ``radius`` (a number or three). ``lumps`` is the displacement by waves drawn from
+        ``rng``, in radii.
+        """
         polar, azimuth = np.meshgrid(np.linspace(np.pi - 0.01, 0.01, steps), np.linspace(0, 2 * np.pi, 2 * steps))
         r, z = np.sin(polar.T), np.cos(polar.T)
         d = np.stack([r * np.cos(azimuth.T), r * np.sin(azimuth.T), z], axis=-1)
@@ -109,7 +120,7 @@ class MeshBuilder:
         self.add_surface(material, centre + gain[..., None] * d * np.broadcast_to(radius, 3), patch)
 
     def add_tube(self, material: str, path, radius: float, around: int = 10) -> None:
-        """A tube along a ``path`` (N, 3), open at its ends."""
+        """Add a tube along a ``path`` (N, 3), open at its ends."""
         path = np.asarray(path, float)
         along = np.gradient(path, axis=0)
         side = np.cross(along, (0.31, 0.87, 0.38))
@@ -122,12 +133,12 @@ class MeshBuilder:
 
 
 def rotate_about_z(yaw: float) -> np.ndarray:
-    """The rotation (3, 3) about z by ``yaw`` radians."""
+    """Return the rotation (3, 3) about z by ``yaw`` radians."""
     c, s = np.cos(yaw), np.sin(yaw)
     return np.array([(c, -s, 0), (s, c, 0), (0, 0, 1.0)])
 
 
-def _joined(parts: list[Mesh]) -> Mesh:
+def _join(parts: list[Mesh]) -> Mesh:
     starts = np.cumsum([0, *(len(p.points) for p in parts[:-1])])
     faces = np.concatenate([p.faces + s for p, s in zip(parts, starts)])
     points, normals, uv = (np.concatenate([getattr(p, k) for p in parts]) for k in ("points", "normals", "uv"))

@@ -1,10 +1,9 @@
-"""The photos of the table with exact depth, and the file that says where they were taken.
+"""Photos of the table with exact depth, and the file with their poses.
 
-Writes into a folder: ``images/photo_NNN.png`` (8-bit sRGB), ``depth/photo_NNN.npy`` (float32 (h, w), metres along the
-ray from the camera's centre through each pixel's centre, exact; 0 where only sky is seen) and
-``transforms_depth.json``, which names both with poses and lenses as instant-ngp and nerfstudio do. A folder's reader
-does not look for that name: the capture that is trained on is the COLMAP model that `sparse` writes beside it, which
-knows no depth.
+Writes into a folder: ``images/photo_NNN.png`` (8-bit sRGB), ``depth/photo_NNN.npy`` (float32 (h, w), exact distance in
+metres along the ray from the camera centre through the pixel centre; 0 for sky) and ``transforms_depth.json``, which
+lists both with poses and lenses as instant-ngp and nerfstudio do. Readers of folders ignore that file name: training
+uses the COLMAP model that `sparse` writes, which has no depth.
 """
 
 from __future__ import annotations
@@ -21,19 +20,20 @@ from nerg_mi.files.atomic import replace_atomically
 from nerg_mi.files.images import write_png
 from nerg_mi.files.tables import write_json
 from nerg_mi.maths.color import encode_srgb
-from nerg_mi.photos.cameras import PosedCamera, pixel_directions, make_sensor_dict
+from nerg_mi.photos.cameras import PosedCamera, make_sensor_dict, pixel_directions
 
 DEPTH_FILE = "transforms_depth.json"
-"""The same photos, with their depth."""
+"""The same photos with their depth."""
 ALBEDO_SPP = 100
-"""Samples a pixel of what is painted on surfaces, in a photo."""
+"""Albedo samples per pixel of a photo."""
 HOLDOUT_INTERVAL = 8
-"""Every so many photos one is held out by default: it gets four times the samples, so that its noise does not limit
-what it can measure."""
+"""Default interval of held-out photos. They get four times the samples, so that their noise does not limit the measured
+error.
+"""
 
 
 class Photo(NamedTuple):
-    """``pixels`` (h, w, 3) uint8, sRGB; ``depth`` (h, w) float32, metres along the rays, 0 where only sky is seen."""
+    """A photo: ``pixels`` (h, w, 3) uint8, sRGB; ``depth`` (h, w) float32, metres along the rays, 0 for sky."""
 
     name: str
     camera: PosedCamera
@@ -42,7 +42,7 @@ class Photo(NamedTuple):
 
 
 class TabletopPhotographer:
-    """Takes photos in a scene, with ``spp`` samples a pixel of the light."""
+    """Renders photos of a scene with ``spp`` light samples per pixel."""
 
     def __init__(self, scene, spp: int = 24):
         import mitsuba as mi
@@ -52,18 +52,18 @@ class TabletopPhotographer:
         self.albedo = mi.load_dict({"type": "aov", "aovs": "albedo:albedo"})
 
     def render_radiance(self, camera: PosedCamera, seed: int, times: int = 1) -> np.ndarray:
-        """Linear radiance (h, w, 3); ``times`` as many samples."""
+        """Render denoised linear radiance (h, w, 3) with ``times`` as many samples."""
         light = self._render(camera, seed, times * self.spp)
-        # Equal seeds and numbers of samples: the same points of the film.
+        # Equal seeds and numbers of samples give the same film samples.
         guides = self._render(camera, seed, times * self.spp, self.guides)
         return denoise(light, guides, self.render_albedo(camera, seed + 1))
 
     def render_albedo(self, camera: PosedCamera, seed: int, spp: int = ALBEDO_SPP) -> np.ndarray:
-        """Albedo (h, w, 3)."""
+        """Render the albedo (h, w, 3)."""
         return self._render(camera, seed, spp, self.albedo, "multijitter")
 
     def render_depth(self, camera: PosedCamera) -> np.ndarray:
-        """Exact distances (h, w) float32 along the rays through the pixels' centres; 0 where nothing is hit."""
+        """Return exact distances (h, w) float32 along the rays through the pixel centres; 0 where nothing is hit."""
         directions = pixel_directions(camera.intrinsics) @ camera.to_world[:3, :3].T
         t = twin.cast_rays(camera.center, directions.reshape(-1, 3), self.scene)
         return np.where(np.isfinite(t), t, 0).astype(np.float32).reshape(directions.shape[:2])
@@ -74,7 +74,7 @@ class TabletopPhotographer:
 
         sensor = mi.load_dict(make_sensor_dict(camera) | {"sampler": {"type": sampler, "sample_count": spp}})
         params = mi.traverse(sensor)
-        # As a literal every pose would compile kernels of its own.
+        # Literal poses would compile kernels for each camera.
         pose = mi.Transform4f(params["to_world"])
         dr.make_opaque(pose)
         params["to_world"] = pose
@@ -84,7 +84,7 @@ class TabletopPhotographer:
 
 
 def take_photos(scene, cameras: list[PosedCamera], spp: int = 24, seed: int = 0, log=print) -> list[Photo]:
-    """A photo of ``scene`` by each camera; ``say``: where progress goes."""
+    """Render a photo of ``scene`` with each camera; ``log`` receives progress messages."""
     photographer, out, start = TabletopPhotographer(scene, spp), [], time.perf_counter()
     for k, camera in enumerate(cameras):
         linear = photographer.render_radiance(camera, 2 * (10_000 * seed + k), 1 if k % HOLDOUT_INTERVAL else 4)
@@ -101,7 +101,7 @@ def write_photos(photos: list[Photo], folder: str | Path) -> Path:
 
     folder, frames = Path(folder), []
     for name in ("images", "depth"):
-        # An earlier, larger set would leave photos behind that no file lists.
+        # Remove photos of an earlier, larger set.
         for old in (folder / name).glob("photo_???.*"):
             old.unlink()
     for photo in photos:
@@ -113,6 +113,6 @@ def write_photos(photos: list[Photo], folder: str | Path) -> Path:
         lens = {"w": i.width, "h": i.height, "fl_x": i.fx, "fl_y": i.fy, "cx": i.cx, "cy": i.cy}
         files = {"file_path": f"images/{photo.name}", "depth_file_path": depth}
         frames.append(files | lens | {"transform_matrix": photo.camera.to_world.tolist()})
-    about = {"camera_model": "OPENCV", "depth_unit_scale_factor": 1.0, "is_euclidean_depth": True}
-    write_json(folder / DEPTH_FILE, about | {"frames": frames})
+    header = {"camera_model": "OPENCV", "depth_unit_scale_factor": 1.0, "is_euclidean_depth": True}
+    write_json(folder / DEPTH_FILE, header | {"frames": frames})
     return folder / DEPTH_FILE

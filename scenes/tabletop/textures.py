@@ -1,4 +1,4 @@
-"""Paints for the place: procedural bitmaps (h, w, 3) of sRGB values in 0..1 that repeat without a seam."""
+"""Procedural textures: bitmaps (h, w, 3) of sRGB values in 0..1 that tile seamlessly."""
 
 from __future__ import annotations
 
@@ -6,32 +6,35 @@ import numpy as np
 
 
 def parse_colors(*colors: str) -> np.ndarray:
-    """sRGB values (N, 3), or (3,) of one, of colours written as six hex digits."""
+    """Parse colours written as six hex digits to sRGB values (N, 3), or (3,) for a single colour."""
     out = np.array([[int(c[i : i + 2], 16) for i in (0, 2, 4)] for c in colors]) / 255.0
     return out[0] if len(colors) == 1 else out
 
 
 def make_noise(rng, shape, cells, octaves: int = 4, fall: float = 0.5) -> np.ndarray:
-    """Smooth periodic noise of ``shape`` in 0..1: waves of random phase from ``cells`` (rows, columns) a side up to so
-    many ``octaves`` above, each octave weaker than the one before by the factor ``fall``."""
+    """Make smooth periodic noise of ``shape`` in 0..1.
+
+    It consists of waves of random phase from ``cells`` (rows, columns) per side up to ``octaves`` octaves above. Each
+    octave is weaker than the previous one by the factor ``fall``.
+    """
     spectrum = np.fft.rfft2(rng.standard_normal(shape))
     rows, columns = np.fft.fftfreq(shape[0], 1 / shape[0]), np.fft.rfftfreq(shape[1], 1 / shape[1])
     f = np.hypot(rows[:, None] / cells[0], columns / cells[1])
-    # There are as many more waves in an octave as it is wider, in both dimensions.
+    # The number of waves in an octave grows with its width, in both dimensions.
     gain = np.where((f > 0.5) & (f < 2.0**octaves), np.maximum(f, 0.5) ** (np.log2(fall) - 1), 0)
     out = np.fft.irfft2(spectrum * gain, shape)
     return np.clip(0.5 + out / (5 * out.std()), 0, 1)
 
 
 def interpolate_colors(t, *colors: str) -> np.ndarray:
-    """Colours along a ramp through ``colors`` at ``t`` in 0..1."""
+    """Interpolate along a ramp through ``colors`` at ``t`` in 0..1."""
     stops = parse_colors(*colors)
     at = np.linspace(0, 1, len(stops))
     return np.stack([np.interp(t, at, stops[:, k]) for k in range(3)], axis=-1)
 
 
 def wood(rng, size=512, *colors) -> np.ndarray:
-    """Boards along u: stretched noise makes rings of it."""
+    """Boards along u, with rings made from stretched noise."""
     grain = make_noise(rng, (size, size), (10, 2), 5, 0.55)
     fine = make_noise(rng, (size, size), (96, 4), 2)
     rings = 0.5 + 0.5 * np.sin(34 * grain)
@@ -54,7 +57,7 @@ def planks(rng, size=768, rows=8) -> np.ndarray:
 
 
 def plaster(rng, size=512, color="d9d2c4", motif="c3b8a4") -> np.ndarray:
-    """Wallpaper: rows of small diamonds on ground that is nowhere quite even."""
+    """Wallpaper: rows of small diamonds on a slightly uneven ground."""
     y, x = np.mgrid[:size, :size] / size
     out = parse_colors(color) * (0.88 + 0.2 * make_noise(rng, (size, size), (6, 6), 5, 0.6)[..., None])
     rows = np.floor(y * 8)
@@ -75,7 +78,7 @@ def weave(rng, size=512, threads=48, *colors) -> np.ndarray:
 
 
 def carpet(rng, size=768) -> np.ndarray:
-    """A rug: a border, and a field of stars, each with a shade of its own."""
+    """A rug: a border and a field of stars of different shades."""
     y, x = np.mgrid[:size, :size] / size
     a, b = (x * 8) % 1 - 0.5, (y * 6) % 1 - 0.5
     star = np.abs(a) + np.abs(b) + 0.18 * np.cos(4 * np.arctan2(b, a))
@@ -107,7 +110,7 @@ def ceramic(rng, size=512) -> np.ndarray:
 
 
 def spines(rng, high=256, columns=32) -> np.ndarray:
-    """The backs of ``columns`` books side by side, each with its colour, bands and title."""
+    """The backs of ``columns`` books in a row, each with its colour, bands and title."""
     wide = 32
     out = np.empty((high, wide * columns, 3))
     for k in range(columns):
@@ -125,7 +128,7 @@ def spines(rng, high=256, columns=32) -> np.ndarray:
 
 
 def pictures(rng, size=192) -> np.ndarray:
-    """Six paintings, three beside each other: stripes, fields, cells, waves, discs and a hilly land."""
+    """Six paintings, three per row: stripes, fields, cells, waves, discs and a hilly landscape."""
     y, x = np.mgrid[:size, :size] / size
     grid = rng.integers(6, size=(9, 9))
     palette = parse_colors("f1ead8", "c8442f", "1f4f86", "e3b23c", "22252b", "4f8a5b")
@@ -138,25 +141,25 @@ def pictures(rng, size=192) -> np.ndarray:
     for cx, cy, r, pick in zip(*rng.random((2, 26)), rng.uniform(0.03, 0.14, 26), rng.integers(1, 6, 26)):
         ring = np.hypot(x - cx, y - cy) / r
         discs[(ring < 1) & ((ring * 3) % 1 < 0.6)] = palette[pick]
-    land = interpolate_colors(y, "3f5d3a", "7f9a57", "c9b37a", "d8e3ea", "8fb4d6")
+    landscape = interpolate_colors(y, "3f5d3a", "7f9a57", "c9b37a", "d8e3ea", "8fb4d6")
     for k in range(5):
         ridge = 0.62 - 0.11 * k + 0.06 * np.interp(x[0], np.linspace(0, 1, 24), rng.random(24))
-        land[y < ridge] = interpolate_colors(k / 4, "6f8ca3", "5f7f5e", "3e5c34")
+        landscape[y < ridge] = interpolate_colors(k / 4, "6f8ca3", "5f7f5e", "3e5c34")
     stripes = palette[rng.integers(6, size=40)[(np.clip(x + 0.05 * np.sin(9 * y), 0, 0.999) * 40).astype(int)]]
     waves = interpolate_colors(0.5 + 0.5 * np.sin(60 * swirl), "14304d", "d9e4e6", "c8442f")
-    rows = [(stripes, field, palette[near % 6] * (0.7 + 0.4 * swirl[..., None])), (waves, discs, land)]
+    rows = [(stripes, field, palette[near % 6] * (0.7 + 0.4 * swirl[..., None])), (waves, discs, landscape)]
     return np.clip(np.concatenate([np.concatenate(r, axis=1) for r in rows]), 0, 1)
 
 
 def foliage(rng, size=512, *colors) -> np.ndarray:
-    """Leaves: light ones before dark gaps."""
+    """Leaves: light ones in front of dark gaps."""
     fine = make_noise(rng, (size, size), (40, 40), 3, 0.7)
     coarse = make_noise(rng, (size, size), (6, 6), 3)
     return interpolate_colors(0.65 * fine + 0.35 * coarse, *(colors or ("16260f", "3c5a25", "6f8f3f", "a3b765")))
 
 
 def blossoms(rng, size=256) -> np.ndarray:
-    """Petals: four patches of colour side by side, each with streaks towards its rim."""
+    """Petals: four patches of colour in a row, with streaks towards the rim."""
     grounds = ("d8402f", "e7b13a", "d9739b", "f0e6d6")
     y, x = np.mgrid[:size, :size] / size
     streak = 0.7 + 0.3 * np.abs(np.sin(2 * np.pi * 20 * x + 5 * make_noise(rng, (size, size), (6, 6))))
@@ -166,7 +169,7 @@ def blossoms(rng, size=256) -> np.ndarray:
 
 
 def grass(rng, size=768) -> np.ndarray:
-    """A meadow with paths that were mown into it."""
+    """A meadow with mown paths."""
     fine, coarse = make_noise(rng, (size, size), (96, 96), 3, 0.7), make_noise(rng, (size, size), (5, 5), 4)
     out = interpolate_colors(0.5 * fine + 0.5 * coarse, "33501f", "567a33", "86a24d", "b3b56c")
     out[make_noise(rng, (size, size), (4, 4), 3) > 0.86] *= (1.15, 1.0, 0.8)
@@ -174,7 +177,7 @@ def grass(rng, size=768) -> np.ndarray:
 
 
 def facades(rng, size=256) -> np.ndarray:
-    """Four fronts of houses side by side: brick or render, each with rows of windows and a door."""
+    """Four house fronts in a row: brick or render, with rows of windows and a door."""
     grounds = ("a4553c", "d9c9a5", "b9c4c9", "8b5e48")
     out = []
     for k, ground in enumerate(grounds):
@@ -202,7 +205,7 @@ def tiles(rng, size=256) -> np.ndarray:
 
 
 def sky(rng, high=256) -> np.ndarray:
-    """The sky over a whole sphere (h, 2 h, 3), zenith first: blue that pales to the horizon, with clouds."""
+    """The sky over the whole sphere (h, 2 h, 3), zenith first: blue that fades to the horizon, with clouds."""
     up = np.cos((np.arange(high) + 0.5) / high * np.pi)[:, None]
     clouds = make_noise(rng, (high, 2 * high), (5, 8), 5, 0.55)
     cover = np.clip((clouds - 0.52) / 0.3, 0, 1) * np.clip(up / 0.15, 0, 1) * 0.9

@@ -1,4 +1,4 @@
-"""The demo store: its layout, twin, pictures, attention law and shoppers."""
+"""The demo store: layout, twin, pictures, attention law and shoppers."""
 
 import json
 
@@ -25,7 +25,7 @@ EYES = np.array([[2.75, 2.0, 1.6], [0.93, 0.8, 1.5], [6.3, 2.5, 1.7], [4.0, 4.8,
 
 
 def equal_area(n):
-    """Directions (n, 3) on a Fibonacci spiral, each standing for 4 pi / n steradians."""
+    """Directions (n, 3) on a Fibonacci spiral, each representing 4 pi / n steradians."""
     i = np.arange(n) + 0.5
     z, phi = 1 - 2 * i / n, np.pi * (1 + 5**0.5) * i
     r = np.sqrt(1 - z * z)
@@ -86,12 +86,12 @@ def test_twin_casts_exact_distances(store):
 
 def test_twin_is_closed(store):
     rng = np.random.default_rng(0)
-    eyes = cameras.sample_free_positions(store, rng, 2000)
-    d = rng.normal(size=eyes.shape)
+    observers = cameras.sample_free_positions(store, rng, 2000)
+    d = rng.normal(size=observers.shape)
     d /= np.linalg.norm(d, axis=1, keepdims=True)
-    t = twin.cast_rays(eyes, d)
+    t = twin.cast_rays(observers, d)
     assert np.isfinite(t).all()
-    end = eyes + t[:, None] * d
+    end = observers + t[:, None] * d
     assert np.all(end > -1e-4) and np.all(end < np.array(layout.ROOM) + 1e-4)
 
 
@@ -102,7 +102,7 @@ def test_visible_agrees_with_cast(store):
     assert np.array_equal(twin.is_visible(a, b), twin.cast_rays(a, (b - a) / length[:, None]) > length - 1e-3)
 
 
-def test_missing_twin_is_a_sentence(tmp_path):
+def test_missing_twin_error_names_the_remedy(tmp_path):
     with pytest.raises(FileNotFoundError, match="--stage twin"):
         twin.load_twin(tmp_path / "twin.xml")
 
@@ -124,8 +124,8 @@ def test_pinhole_projects_its_own_directions():
 
 @pytest.mark.nightly
 def test_views_agree_with_each_other(store, tmp_path):
-    """A pixel moved into another view by its depth meets its own colour there: poses, depth and pictures are one
-    frame."""
+    """A pixel reprojected into another view by its depth has the same colour: poses, depth and pictures are
+    consistent."""
     camera = cameras.Pinhole(80, 60)
     views.write_views(store, tmp_path, camera=camera, train=8, test=2, spp=16, log=lambda text: None)
     sets = [json.loads((tmp_path / n).read_text()) for n in ("transforms.json", "transforms_test.json")]
@@ -170,10 +170,10 @@ def test_law_integrates_to_one(law):
     assert np.allclose(density.mean(axis=1) * 4 * np.pi, 1.0, atol=1e-5)
 
 
-def test_law_depends_on_position_and_hides_what_is_hidden(law):
-    lobes = law.lobes(EYES)
+def test_law_depends_on_position_and_occlusion(law):
+    lobes = law.compute_lobes(EYES)
     k = law.names.index("cooler_1_dairy")
-    assert lobes.visible[2, k] == 0 and lobes.weights[2, k] == 0  # three gondolas stand between
+    assert lobes.visible[2, k] == 0 and lobes.weights[2, k] == 0  # three gondolas are in between
     d = law.density(EYES, equal_area(4096))
     assert np.corrcoef(d)[np.triu_indices(4, 1)].max() < 0.8
     z = equal_area(512)  # above the ceiling nothing of the store is visible
@@ -182,7 +182,7 @@ def test_law_depends_on_position_and_hides_what_is_hidden(law):
 
 @pytest.mark.nightly
 def test_law_sample_follows_density(law):
-    """Draws counted in the cells around 192 directions agree with the density integrated over the same cells."""
+    """The number of samples in cells around 192 directions agrees with the density integrated over these cells."""
     centres, fine = equal_area(192), equal_area(60000)
     cell = lambda d: np.argmax(d @ centres.T, axis=1)
     n = 40000

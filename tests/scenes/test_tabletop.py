@@ -1,4 +1,4 @@
-"""The table in a room with a view: its layout, cameras, photos with exact depth, and the capture made of them."""
+"""The table in a room: layout, cameras, photos with exact depth, and the capture."""
 
 import numpy as np
 import pytest
@@ -42,7 +42,7 @@ def test_layout_is_deterministic_and_varies_with_the_seed(place):
     for name, made in place.meshes.items():
         assert all(np.array_equal(a, b) for a, b in zip(made, again.meshes[name])), name
     assert not np.array_equal(place.meshes["books"].points, other.meshes["books"].points)
-    # furniture stands where it stands
+    # furniture is fixed
     assert np.array_equal(place.meshes["sofa"].points, other.meshes["sofa"].points)
 
 
@@ -52,7 +52,7 @@ def test_meshes_are_sound(place):
         assert np.isfinite(m.points).all() and np.isfinite(m.uv).all() and m.faces.max() < len(m.points), name
 
 
-def test_things_are_far_away_and_near(place):
+def test_scene_has_near_and_far_objects(place):
     far = lambda name: np.linalg.norm(place.meshes[name].points[:, :2] - table.OBJECT_CENTER[:2], axis=1)
     assert far("vase").min() < 0.1 and far("facade").min() > 15 and 150 < far("facade").max() < 250
 
@@ -148,7 +148,7 @@ def test_denoising_keeps_what_is_painted():
     noisy = truth * rng.gamma(10, 1 / 10, (24, 32, 1))
     error = np.abs(denoising.denoise(noisy, guides, paint) - truth).mean()
     assert error < 0.25 * np.abs(noisy - truth).mean()
-    # what reflects nothing, as the sky, stays as it is
+    # pixels without albedo, such as sky, are unchanged
     assert np.array_equal(denoising.denoise(noisy, 0 * guides, paint), noisy.astype(np.float32))
 
 
@@ -168,36 +168,36 @@ def test_the_capture_is_read_back(capture):
 
 
 def test_points_are_triangulated_where_surfaces_are(scene):
-    """From photos of the paint alone, which take no light to make."""
+    """From photos of the albedo only, which are fast to render."""
     photographer = photos.TabletopPhotographer(scene)
     walk = cameras.make_cameras(0, 96, 160, 120)[34:40]
     taken = [
         photos.Photo(
             f"{k}.png",
             camera,
-            (255 * np.sqrt(photographer.paint(camera, k, 16))).astype(np.uint8),
+            (255 * np.sqrt(photographer.render_albedo(camera, k, 16))).astype(np.uint8),
             photographer.depth(camera),
         )
         for k, camera in enumerate(walk)
     ]
-    found, points = sparse.triangulate_points(taken)
-    assert len(points) > 100 and max(len(at) for at in found) <= sparse.MAX_CORNERS
+    result, points = sparse.triangulate_points(taken)
+    assert len(points) > 100 and max(len(at) for at in result) <= sparse.MAX_CORNERS
     gaps = []
     for p in points:
         assert len(p.track) >= 2 and len({j for j, _ in p.track}) == len(p.track)
         j, m = p.track[0]
-        x, y = found[j][m].astype(int)
+        x, y = result[j][m].astype(int)
         gaps.append(abs(np.linalg.norm(p.place - taken[j].camera.center) / taken[j].depth[y, x] - 1))
     assert np.median(gaps) < 0.02
 
 
-def test_a_corner_is_found_where_it_is():
+def test_corners_are_located_exactly():
     picture = np.zeros((40, 40, 3), np.uint8)
     picture[20:, 15:] = 255
     assert np.abs(sparse.detect_corners(picture)[0] - (15, 20)).max() < 1.6  # within the blur
 
 
-def test_the_command_says_what_it_makes(capsys):
+def test_the_command_reports_its_output(capsys):
     with pytest.raises(SystemExit, match="0"):
         make.main(["--help"])
     assert "--count" in capsys.readouterr().out
