@@ -1,16 +1,15 @@
-"""Who looked like that? The position of an observer, from pictures of where they look.
+"""Recover the position of an observer from pictures of their gaze.
 
     python examples/recover_observer.py [--observers 8 | --eye 4.4,2.8,1.6] [--seed 0] [--out recover-observer.png]
     [--quick]
 
-The integrator renders the gaze of an observer on what four cameras see. Here the pictures are given and the observer is
-not. First the pictures of observers on a grid over the floor are compared with the given ones; from the best of them
-Gauss-Newton steps follow, whose derivatives are those of ``mi.render`` in forward mode: three unknowns, three passes.
+The integrator renders the gaze of an observer as seen by four cameras. This example solves the inverse problem. First,
+the pictures of observers on a grid over the floor are compared with the target pictures. From the best of them,
+Gauss-Newton steps follow, with derivatives from ``mi.render`` in forward mode: three unknowns, three passes.
 
-The edges of the observer's shadows are no part of these derivatives. A step therefore counts only pixels that are
-looked at in both the given picture and the present one, where no edge has passed, and counts those less that fit badly.
-Which answer to believe is decided on all pixels. The given pictures have noise of their own; the truth serves to say
-how far off an answer is.
+These derivatives do not include the moving edges of the observer's shadows. A step therefore only uses pixels with gaze
+in both the target and the current picture, where no edge has passed, and gives outliers less weight. The best solution
+is selected on all pixels. The target pictures are noisy; the true position is only used to measure the error.
 """
 
 from __future__ import annotations
@@ -28,17 +27,21 @@ OBSERVER = "integrator.observer.to_world"
 CAMERAS = [(x, y, 2.7) for x in (0.5, 7.5) for y in (0.8, 5.2)]
 TARGET = (4.0, 3.0, 0.6)
 LOW, HIGH = np.array([0.2, 0.2, 1.3]), np.array([7.8, 5.8, 1.95])
-DARK = 2e-3  # 1/sr under which a pixel counts as not looked at
-FLOOR = 1e-3  # 1/sr added before the logarithm is taken
-SCALES = 0.5, 0.03  # of residuals (logarithms of densities) that count half, at first and from 60 % of the steps on
-LONGEST = 0.25  # metres of a step at most
-ENOUGH = 5e-4  # metres of a step after which the descent is over
+DARK = 2e-3  # 1/sr below which a pixel has no gaze
+FLOOR = 1e-3  # 1/sr added before taking the logarithm
+SCALES = 0.5, 0.03  # scale of the robust loss of log densities, at first and from 60 % of the steps on
+LONGEST = 0.25  # maximum length of a step in metres
+ENOUGH = 5e-4  # length of a step in metres at which the descent stops
 
 
 @dataclass(frozen=True)
 class Settings:
-    """``size`` of a picture (width, height), multiples of 8; ``spacing`` of the grid of first guesses in metres;
-    ``starts`` of them that are improved, by ``steps`` steps at most; ``observers`` to be found."""
+    """Settings of the example.
+
+    ``size`` of a picture (width, height), multiples of 8; ``spacing`` of the grid of initial positions in metres;
+    ``starts`` is the number of initial positions that are refined, with at most ``steps`` steps; ``observers`` is the
+    number of observers.
+    """
 
     size: tuple = (48, 32)
     spacing: float = 0.4
@@ -51,7 +54,7 @@ QUICK = Settings(size=(24, 16), spacing=0.8, steps=6, observers=2)
 
 
 class Pictures:
-    """Gaze of an observer at a position, as cameras in the demo store see it: (cameras, h, w) in 1/sr."""
+    """Gaze of an observer as seen by cameras in the demo store: (cameras, h, w) in 1/sr."""
 
     def __init__(self, size, cameras=CAMERAS, file="shapes.xml"):
         from nerg_mi.scenes.store.attention_law import FOLDER
@@ -62,10 +65,10 @@ class Pictures:
         self.params = mi.traverse(self.scene)
         self.params.keep([OBSERVER])
         self.size, self.cameras = size, cameras
-        # Derivatives are rendered with another seed than the picture, unless there is nothing to draw.
-        self.sensors = self._sensors({"type": "stratified", "jitter": False, "sample_count": 4})
+        # Derivatives would be rendered with another seed than the picture, so the sampler does not use random numbers.
+        self.sensors = self._make_sensors({"type": "stratified", "jitter": False, "sample_count": 4})
 
-    def _sensors(self, sampler: dict) -> list:
+    def _make_sensors(self, sampler: dict) -> list:
         import mitsuba as mi
 
         film = {
@@ -88,7 +91,7 @@ class Pictures:
         return [mi.render(self.scene, self.params, sensor=s, seed=seed)[..., 3] for s in sensors]
 
     def at(self, position, sensors=None, seed: int = 0) -> np.ndarray:
-        """The pictures of an observer at ``position`` (3,)."""
+        """Render the pictures of an observer at ``position`` (3,)."""
         import mitsuba as mi
 
         rendered = self._render(mi.Point3f(*map(float, position)), sensors or self.sensors, seed)
@@ -96,10 +99,10 @@ class Pictures:
 
     def given(self, position, seed: int) -> np.ndarray:
         """The pictures as they are given: with the noise of 16 random samples a pixel."""
-        return self.at(position, self._sensors({"type": "independent", "sample_count": 16}), seed)
+        return self.at(position, self._make_sensors({"type": "independent", "sample_count": 16}), seed)
 
     def derivatives(self, position) -> np.ndarray:
-        """Derivatives (cameras, h, w, 3) of the pictures with respect to ``position``, by forward mode."""
+        """Compute the derivatives (cameras, h, w, 3) of the pictures with respect to ``position`` in forward mode."""
         import drjit as dr
         import mitsuba as mi
 
@@ -116,25 +119,26 @@ class Pictures:
 
 
 # ----------------------------------------------------------------------------
-# How far apart pictures are
+# Distance between pictures
 # ----------------------------------------------------------------------------
 
 
 def pooled(pictures, factor: int) -> np.ndarray:
-    """Means over blocks of ``factor`` x ``factor`` pixels of (..., h, w)."""
+    """Average over blocks of ``factor`` x ``factor`` pixels of (..., h, w)."""
     h, w = pictures.shape[-2:]
     return pictures.reshape(*pictures.shape[:-2], h // factor, factor, w // factor, factor).mean((-3, -1))
 
 
 def distance(a, b, levels=(2, 4, 8)) -> np.ndarray:
-    """Squared Hellinger distances of pictures (..., cameras, h, w), summed over blocks of 2, 4 and 8 pixels: bright
-    pixels do not drown the others, and a detail that lies elsewhere than it should is still close to where it
-    belongs."""
+    """Compute squared Hellinger distances of pictures (..., cameras, h, w), summed over blocks of 2, 4 and 8 pixels.
+
+    Bright pixels do not dominate, and small displacements of details cause small distances.
+    """
     return sum(((np.sqrt(pooled(a, k)) - np.sqrt(pooled(b, k))) ** 2).mean((-3, -2, -1)) for k in levels)
 
 
 def loss(pictures, given, scale: float = SCALES[1]) -> float:
-    """Mean over all pixels of a robust (Cauchy) function of differences between logarithms of densities."""
+    """Compute the mean over all pixels of a robust (Cauchy) function of the difference of log densities."""
     r = np.log(pictures + FLOOR) - np.log(given + FLOOR)
     return float(np.mean(np.log1p((r / scale) ** 2)))
 
@@ -145,7 +149,7 @@ def loss(pictures, given, scale: float = SCALES[1]) -> float:
 
 
 def gauss_newton_step(pictures, derivatives, given, scale: float) -> np.ndarray:
-    """The step (3,) in metres that brings ``pictures`` nearer to ``given``, from pixels that are looked at in both."""
+    """Compute the Gauss-Newton step (3,) in metres, from pixels with gaze in both pictures."""
     r = np.log(pictures + FLOOR) - np.log(given + FLOOR)
     J = derivatives / (pictures + FLOOR)[..., None]
     w = ((pictures > DARK) & (given > DARK)) / (1 + (r / scale) ** 2)
@@ -157,39 +161,41 @@ def gauss_newton_step(pictures, derivatives, given, scale: float) -> np.ndarray:
 
 @dataclass
 class Descent:
-    """Positions of a descent (steps + 1, 3), and the loss of each on all pixels. Its last position is its answer."""
+    """Positions of a descent (steps + 1, 3), and the loss of each on all pixels. The last position is the result."""
 
     path: list = field(default_factory=list)
     losses: list = field(default_factory=list)
 
     def answer(self):
-        """The last position, and its loss."""
+        """The last position and its loss."""
         return self.path[-1], self.losses[-1]
 
 
 def descend(pictures: Pictures, given, start, steps: int) -> Descent:
-    """Gauss-Newton from ``start`` with at most ``steps`` steps; the scale of residuals falls along the way."""
-    found, p = Descent(), np.asarray(start, float)
+    """Run Gauss-Newton from ``start`` with at most ``steps`` steps; the scale of the robust loss decreases along the
+    way.
+    """
+    descent, p = Descent(), np.asarray(start, float)
     for step in range(steps + 1):
         present = pictures.at(p)
-        found.path.append(p)
-        found.losses.append(loss(present, given))
-        if step == steps or (step and np.linalg.norm(p - found.path[-2]) < ENOUGH):
+        descent.path.append(p)
+        descent.losses.append(loss(present, given))
+        if step == steps or (step and np.linalg.norm(p - descent.path[-2]) < ENOUGH):
             break
         scale = SCALES[0] * (SCALES[1] / SCALES[0]) ** min(1, step / (0.6 * steps))
         p = np.clip(p + gauss_newton_step(present, pictures.derivatives(p), given, scale), LOW, HIGH)
-    return found
+    return descent
 
 
 def standing(points, clearance: float) -> np.ndarray:
-    """Which of the floor's points (N, 2) keep that distance from all furniture and walls."""
+    """Return which floor points (N, 2) have this distance to all furniture and walls."""
     from nerg_mi.scenes.store import layout, shoppers
 
     return shoppers.compute_floor_clearance(layout.build_store(0), points) > clearance
 
 
 def first_guesses(spacing: float) -> np.ndarray:
-    """Heads (N, 3) of a grid over all of the floor that one can stand on, at an average height."""
+    """Return head positions (N, 3) on a grid over the walkable floor, at average height."""
     from nerg_mi.scenes.store import layout, shoppers
 
     x, y = (np.arange(spacing / 2, side, spacing) for side in layout.ROOM[:2])
@@ -199,7 +205,7 @@ def first_guesses(spacing: float) -> np.ndarray:
 
 
 def true_observers(count: int, seed: int) -> np.ndarray:
-    """Heads (count, 3) anywhere that a body can stand, of any height that shoppers have."""
+    """Return random head positions (count, 3) on the walkable floor, with the heights of shoppers."""
     from nerg_mi.scenes.store import layout, shoppers
 
     rng = np.random.default_rng([seed, 0x0B5E])
@@ -209,21 +215,21 @@ def true_observers(count: int, seed: int) -> np.ndarray:
 
 
 def search(pictures: Pictures, given, guesses, known, settings: Settings) -> list:
-    """Descents from the guesses (N, 3) whose pictures ``known`` (N, cameras, h, w) are nearest to the given ones, best
-    first."""
+    """Run descents from the guesses (N, 3) with the pictures nearest to the target, sorted by loss."""
     order = np.argsort(distance(known, given))[: settings.starts]
-    found = [descend(pictures, given, guesses[k], settings.steps) for k in order]
-    return sorted(found, key=lambda d: d.answer()[1])
+    descents = [descend(pictures, given, guesses[k], settings.steps) for k in order]
+    return sorted(descents, key=lambda d: d.answer()[1])
 
 
 # ----------------------------------------------------------------------------
-# What is shown
+# Figure and output
 # ----------------------------------------------------------------------------
 
 
 def figure(shown, truths, searches):
-    """The first observer's given pictures, those of the best descent before and after, and a floor plan with all of
-    them."""
+    """Draw the target pictures of the first observer, those of the best descent before and after, and a floor plan with
+    all descents.
+    """
     from nerg_mi.scenes.store import layout
 
     from matplotlib.figure import Figure
@@ -236,7 +242,7 @@ def figure(shown, truths, searches):
         width_ratios=(1.25, 1),
     )
     top = float(np.percentile(shown["given"], 99))
-    for name, title in (("given", "given"), ("before", "best first guess"), ("after", "answer")):
+    for name, title in (("given", "target"), ("before", "best initial position"), ("after", "result")):
         axes[name].imshow(
             np.concatenate(shown[name], axis=1), cmap="inferno", vmin=0, vmax=top, interpolation="nearest"
         )
@@ -255,9 +261,9 @@ def figure(shown, truths, searches):
     for x, y, _ in CAMERAS:
         plan.plot(x, y, "^", ms=6, color="0.3")
     plan.set(xlim=(0, 8), ylim=(0, 6), aspect="equal", xlabel="x [m]", ylabel="y [m]")
-    plan.set_title("crosses: truth, circles: first guesses, triangles: cameras", fontsize=8)
+    plan.set_title("crosses: truth, circles: initial positions, triangles: cameras", fontsize=8)
     off.set(xlabel="step")
-    off.set_title("distance from the truth [cm]", fontsize=8)
+    off.set_title("error [cm]", fontsize=8)
     return sheet
 
 
@@ -265,13 +271,15 @@ def main(argv=None) -> dict:
     import mitsuba as mi
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--observers", type=int, help="how many to find, at random places (default: 8)")
-    parser.add_argument("--eye", help="where one observer truly is, in metres, in place of random ones")
+    parser.add_argument("--observers", type=int, help="number of observers, at random positions (default: 8)")
+    parser.add_argument("--eye", help="true position of one observer in metres, instead of random ones")
     parser.add_argument(
-        "--seed", type=int, default=0, help="of the random places and of the noise of the given pictures"
+        "--seed", type=int, default=0, help="seed of the positions and of the noise of the target pictures (default: 0)"
     )
-    parser.add_argument("--out", type=Path, default=Path("recover-observer.png"))
-    parser.add_argument("--quick", action="store_true", help="small pictures, two observers: a try in seconds")
+    parser.add_argument("--out", type=Path, default=Path("recover-observer.png"), help="output picture")
+    parser.add_argument(
+        "--quick", action="store_true", help="use small pictures and two observers, to finish in seconds"
+    )
     args = parser.parse_args(argv)
     if mi.variant() is None:
         mi.set_variant("llvm_ad_rgb")
@@ -282,34 +290,35 @@ def main(argv=None) -> dict:
         truths = np.array([[float(v) for v in args.eye.split(",")]])
     began = time.process_time()
     pictures, guesses = Pictures(settings.size), first_guesses(settings.spacing)
-    known = np.array([pictures.at(p) for p in guesses])
-    print(f"{len(guesses)} first guesses rendered in {time.process_time() - began:.0f} s of CPU time")
-    print("observer [m]          guess off [cm]   answer [m]            off [cm]  loss   steps  CPU [s]")
-    searches, off, shown = [], [], None
+    initial_pictures = np.array([pictures.at(p) for p in guesses])
+    print(f"{len(guesses)} initial positions rendered in {time.process_time() - began:.0f} s of CPU time")
+    print("observer [m]        initial error [cm]  result [m]          error [cm]  loss   steps  CPU [s]")
+    searches, errors, shown = [], [], None
     for n, truth in enumerate(truths):
-        given, began = pictures.given(truth, args.seed + n + 1), time.process_time()
-        found = search(pictures, given, guesses, known, settings)
-        best = found[0]
-        end, least = best.answer()
-        searches.append(found)
-        off.append([100 * np.linalg.norm(p - truth) for p in (best.path[0], end)])
-        shown = shown or {"given": given, "before": pictures.at(best.path[0]), "after": pictures.at(end)}
+        target, began = pictures.given(truth, args.seed + n + 1), time.process_time()
+        descents = search(pictures, target, guesses, initial_pictures, settings)
+        best = descents[0]
+        end, min_loss = best.answer()
+        searches.append(descents)
+        errors.append([100 * np.linalg.norm(p - truth) for p in (best.path[0], end)])
+        shown = shown or {"given": target, "before": pictures.at(best.path[0]), "after": pictures.at(end)}
         print(
-            f"{_text(truth)}  {off[-1][0]:12.1f}  ->  {_text(end)}  {off[-1][1]:8.2f}  {least:.4f}  "
+            f"{_text(truth)}  {errors[-1][0]:12.1f}  ->  {_text(end)}  {errors[-1][1]:8.2f}  {min_loss:.4f}  "
             f"{len(best.path) - 1:5}  {time.process_time() - began:7.0f}",
             flush=True,
         )
-    off = np.array(off)
+    errors = np.array(errors)
     print(
-        f"median {np.median(off[:, 1]):.2f} cm, worst {off[:, 1].max():.2f} cm "
-        f"(first guesses: median {np.median(off[:, 0]):.1f} cm); {np.sum(off[:, 1] < 10)} of {len(off)} within 10 cm"
+        f"median {np.median(errors[:, 1]):.2f} cm, worst {errors[:, 1].max():.2f} cm "
+        f"(initial positions: median {np.median(errors[:, 0]):.1f} cm); "
+        f"{np.sum(errors[:, 1] < 10)} of {len(errors)} within 10 cm"
     )
 
     from nerg_mi.figures.style import save
 
     save(figure(shown, truths, searches), args.out)
     print(f"wrote {args.out}")
-    return {"truths": truths, "searches": searches, "off": off}
+    return {"truths": truths, "searches": searches, "off": errors}
 
 
 def _text(p) -> str:

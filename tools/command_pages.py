@@ -1,4 +1,4 @@
-"""The reference of the command line as Markdown: every command, option and default, as its parser has them."""
+"""Command-line reference as Markdown: every command, option and default, read from the parser."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from tools.page import wrapped
 
 
 def iter_commands() -> Iterator[tuple[str, Any, Any]]:
-    """Each command that does something: its words, as "nerg train gaze", its parser's command, and a context for it."""
+    """Yield each command that runs something: its words, such as "nerg train gaze", its parser command, and a
+    context."""
     import typer
 
     from nerg_mi import cli
@@ -28,7 +29,7 @@ def _below(command: Any, name: str, parent: Any) -> Iterator[tuple[str, Any, Any
 
 
 def format_reference() -> str:
-    """A section for each command: what it does, how it is called, its arguments and its options."""
+    """Format a section per command: description, usage, arguments and options."""
     sections = []
     for path, command, context in iter_commands():
         sections += [f"## {path}", _paragraphs(command.help or "")]
@@ -38,7 +39,7 @@ def format_reference() -> str:
 
 
 def _lists(command: Any, context: Any) -> Iterator[str]:
-    """The arguments, then the options by their groups; each with its meaning and its default."""
+    """Yield a list of the arguments and one of the options, if there are any."""
     groups: dict[str, list[str]] = {}
     for parameter in command.params:
         record = parameter.get_help_record(context)
@@ -72,25 +73,27 @@ _RANGE = re.compile(r"(?:[-+\w.]+<=?)?x(?:[<>]=?[-+\w.]+)?")
 
 
 def split_default(text: str) -> tuple[str, str]:
-    """The help of a parameter with its range, and its default or "required"; the parser adds them in brackets."""
+    """Split the help of a parameter into its text with the range, and its default or "required", which the parser
+    appends in brackets.
+    """
     found = re.fullmatch(r"(.*?)\s*\[([^\[\]]*)\]", text, re.S)
     notes = [note.strip() for note in found[2].split(";")] if found else []
     ranges = [note for note in notes if _RANGE.fullmatch(note)]
     rest = [note for note in notes if note not in ranges and note != "required"]
     if found is None or not (ranges or "required" in notes or (rest and rest[0].startswith("default:"))):
         return text, ""
-    # A default in words stands in the help itself, in brackets of its own.
+    # A default in words is part of the help text, in its own brackets.
     meaning, default = split_default(found[1]) if not rest else (found[1], "; ".join(rest).removeprefix("default:"))
     meaning += "".join(f" ({note})" for note in ranges)
     return meaning, default.strip() or ("required" if "required" in notes else "")
 
 
 def escape_cell(text: str) -> str:
-    """Text of a help line within a table: what Markdown would take for markup is kept as it stands."""
+    """Escape Markdown markup in the help text of a table cell."""
     text = " ".join(text.split())
     return re.sub(r"([*<]|(?<!\w)_|_(?!\w))", r"\\\1", text)
 
 
 def _paragraphs(text: str) -> str:
-    """The help of a command, whose lines may be broken anywhere."""
+    """Join the lines of each paragraph of a command's help."""
     return "\n\n".join(wrapped(escape_cell(part)) for part in re.split(r"\n\s*\n", text.strip()))

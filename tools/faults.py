@@ -1,11 +1,11 @@
-"""Kills: whatever happens to a command, files that were whole stay whole.
+"""Kill tests: a killed command never leaves a damaged file.
 
     python -m tools.faults [--tries 100] [--only WORD] [--update docs/explanation/robustness.md]
 
-Commands run in a folder with an earlier result of each. Every second try is killed (SIGKILL) at a moment of its usual
-run, spread from its begin to its end; the others are killed as soon as a file is being written. After each, every file
-of the folder must be as it was, byte for byte, or another that its reader reads whole; and the next start, which
-resumes where there is a state, must not fail. Exit code 1 where a file is lost or a start fails.
+Commands run in a folder with an earlier result of each. Every second try is killed (SIGKILL) at a time spread evenly
+over its usual run; the others are killed as soon as a file is being written. Afterwards every file of the folder must
+be unchanged, byte for byte, or a new file that its reader can read completely; and the next start, which resumes if
+there is a state, must succeed. The exit code is 1 if a file is lost or a start fails.
 """
 
 from __future__ import annotations
@@ -30,13 +30,17 @@ from tools.page import table, update_table
 
 @dataclass(frozen=True)
 class Command:
-    """``line``: of `nerg`, in which OUT stands for the output and IN for the folder of inputs; ``output``: its name;
-    ``made``: the files that it makes; ``weight``: of the tries; ``state``: the file from which --resume goes on."""
+    """A command under test.
+
+    ``line`` are the arguments of `nerg`, with OUT for the output and IN for the folder of inputs; ``output`` is the
+    name of the output, ``made`` lists the files that it writes, ``weight`` is its relative number of tries, and
+    ``state`` is the file from which --resume continues.
+    """
 
     name: str
     line: str
     output: str
-    made: tuple[str, ...]
+    outputs: tuple[str, ...]
     weight: int
     state: str = ""
 
@@ -96,13 +100,16 @@ COMMANDS = (
 
 @dataclass
 class Tally:
-    """What became of the tries of a command: of ``tried``, ``landed`` met it while it ran; ``lost``: files that were
-    neither the old ones nor whole; ``started``: starts that did not fail; ``left``: hidden files of killed writers."""
+    """Results of the tries of a command.
+
+    ``landed`` of the ``tried`` kills hit it while it ran; ``lost`` counts missing or damaged files, ``started``
+    successful starts, ``left`` hidden files of killed writers.
+    """
 
     tried: int = 0
-    landed: int = 0
+    hit: int = 0
     lost: int = 0
-    started: int = 0
+    restarted: int = 0
     left: int = 0
 
 
@@ -113,23 +120,23 @@ class Tally:
 _LIMIT = 900.0
 
 
-def start(arguments: list[str], log: Path) -> int:
-    """Begin `nerg` with ``arguments`` in a process of its own; returns its id.
+def start_process(arguments: list[str], log: Path) -> int:
+    """Start `nerg` with ``arguments`` in a new process; returns its id.
 
-    It is forked from this one, which has the modules loaded and has not begun anything with them.
+    The process is forked from this one, which has the modules loaded but not used.
     """
     pid = os.fork()
     if pid:
         return pid
     code = 70
     try:
-        with open(log, "wb") as out, open(os.devnull, "rb") as nothing:
-            for target, stream in ((0, nothing), (1, out), (2, out)):
+        with open(log, "wb") as out, open(os.devnull, "rb") as null:
+            for target, stream in ((0, null), (1, out), (2, out)):
                 os.dup2(stream.fileno(), target)
         sys.stdout, sys.stderr = os.fdopen(1, "w"), os.fdopen(2, "w")
         from nerg_mi import cli
 
-        # A column map has spaces in it.
+        # Spaces in column maps are written as "~".
         cli.main([a.replace("~", " ") for a in arguments])
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else int(end.code is not None)
@@ -144,8 +151,10 @@ def start(arguments: list[str], log: Path) -> int:
         os._exit(code)
 
 
-def wait(pid: int, limit: float = _LIMIT) -> int:
-    """Exit code of the process ``pid``, negative for the signal that ended it; it is killed after ``limit`` seconds."""
+def wait_for(pid: int, limit: float = _LIMIT) -> int:
+    """Return the exit code of the process ``pid``, negative for the signal that ended it; it is killed after ``limit``
+    seconds.
+    """
     end = time.monotonic() + limit
     while time.monotonic() < end:
         done, status = os.waitpid(pid, os.WNOHANG)
@@ -154,26 +163,27 @@ def wait(pid: int, limit: float = _LIMIT) -> int:
         time.sleep(0.005)
     os.kill(pid, signal.SIGKILL)
     os.waitpid(pid, 0)
-    raise TimeoutError(f"no end after {limit:.0f} s")
+    raise TimeoutError(f"the process did not end within {limit:.0f} s")
 
 
 def kill_at(pid: int, seconds: float) -> int:
-    """Kill ``pid`` after ``seconds`` unless it has ended; its exit code."""
+    """Kill ``pid`` after ``seconds`` unless it has ended; returns its exit code."""
     with contextlib.suppress(TimeoutError):
-        return wait(pid, seconds)
+        return wait_for(pid, seconds)
     return -signal.SIGKILL
 
 
 def kill_while_writing(pid: int, folder: Path, turn: random.Random, skip: int) -> int:
-    """Kill ``pid`` within the ``skip``-th write after this, or a few milliseconds later; its exit code."""
-    there, seen = set(filter(is_partial, folder.rglob("*"))), 0
+    """Kill ``pid`` during a later write, after ``skip`` writes, or a few milliseconds after it; returns its exit
+    code."""
+    known_files, seen = set(filter(is_partial, folder.rglob("*"))), 0
     end = time.monotonic() + _LIMIT
     while time.monotonic() < end:
         done, status = os.waitpid(pid, os.WNOHANG)
         if done:
             return os.waitstatus_to_exitcode(status)
-        new = set(filter(is_partial, folder.rglob("*"))) - there
-        there |= new
+        new = set(filter(is_partial, folder.rglob("*"))) - known_files
+        known_files |= new
         seen += len(new)
         if seen > skip:
             return kill_at(pid, turn.choice((0, 0.001, 0.003, 0.01)))
@@ -182,23 +192,23 @@ def kill_while_writing(pid: int, folder: Path, turn: random.Random, skip: int) -
 
 
 # ----------------------------------------------------------------------------
-# Files that are whole
+# Complete files
 # ----------------------------------------------------------------------------
 
 
-def contents(*folders: Path) -> dict[Path, str]:
-    """SHA-256 of every file in ``folders``, without the hidden ones that a killed writer leaves."""
-    found = (p for folder in folders for p in folder.rglob("*") if p.is_file() and not is_partial(p))
-    return {p: hashlib.sha256(p.read_bytes()).hexdigest() for p in found}
+def hash_files(*folders: Path) -> dict[Path, str]:
+    """Return the SHA-256 of every file in ``folders``, without the hidden files of killed writers."""
+    paths = (p for folder in folders for p in folder.rglob("*") if p.is_file() and not is_partial(p))
+    return {p: hashlib.sha256(p.read_bytes()).hexdigest() for p in paths}
 
 
 def is_partial(path: Path) -> bool:
-    """Whether ``path`` is a file that was being written."""
+    """Return whether ``path`` is a file that is being written."""
     return path.name.startswith(".") and ".part" in path.name
 
 
 def read_whole(path: Path) -> None:
-    """Read ``path`` to its end by the reader of its kind; raises whatever that raises where it is not whole."""
+    """Read ``path`` completely with the reader of its kind; raises any exception if it is damaged."""
     data = path.read_bytes()
     if path.suffix in (".safetensors", ".run"):
         from safetensors.numpy import load
@@ -230,17 +240,17 @@ def read_whole(path: Path) -> None:
         assert data.endswith(b"\n"), "its last line is cut off"
 
 
-def lost_files(before: dict[Path, str], after: dict[Path, str]) -> list[str]:
-    """Files that are gone, or neither as they were nor whole, each with what is wrong."""
-    found = [f"{path} is gone" for path in before if path not in after and path.suffix != ".run"]
+def find_lost_files(before: dict[Path, str], after: dict[Path, str]) -> list[str]:
+    """List files that are missing, or changed and damaged, with the problem."""
+    problems = [f"{path} is missing" for path in before if path not in after and path.suffix != ".run"]
     for path, digest in after.items():
         if before.get(path) == digest:
             continue
         try:
             read_whole(path)
-        except Exception as error:  # whatever a reader says of what is not whole
-            found.append(f"{path} is not whole: {type(error).__name__}: {error}")
-    return found
+        except Exception as error:  # readers raise different exceptions for damaged files
+            problems.append(f"{path} is damaged: {type(error).__name__}: {error}")
+    return problems
 
 
 # ----------------------------------------------------------------------------
@@ -248,8 +258,8 @@ def lost_files(before: dict[Path, str], after: dict[Path, str]) -> list[str]:
 # ----------------------------------------------------------------------------
 
 
-def prepare(folder: Path) -> None:
-    """Inputs of the commands, in ``folder``."""
+def write_inputs(folder: Path) -> None:
+    """Write the inputs of the commands into ``folder``."""
     import shutil
 
     import mitsuba as mi
@@ -265,41 +275,40 @@ def prepare(folder: Path) -> None:
         shutil.copy(find_store_scene().parent / name, folder / name)
 
 
-def begin(command: Command, inputs: Path, out: Path) -> list[str]:
-    """Arguments of the next start: with --resume where there is a state to go on from."""
+def make_arguments(command: Command, inputs: Path, out: Path) -> list[str]:
+    """Return the arguments of the next start, with --resume if there is a state."""
     resume = ["--resume"] if command.state and (out / command.state).is_file() else []
     return command.arguments(inputs, out / command.output) + resume
 
 
 def try_kills(command: Command, inputs: Path, out: Path, tries: int, seed: int = 0) -> Tally:
-    """Kill ``command`` ``tries`` times, and let it come to its end after that; raises `AssertionError` for a failing
-    start."""
+    """Kill ``command`` ``tries`` times, and then let it finish; raises `AssertionError` if a start fails."""
     tally, turn, log = Tally(), random.Random(seed), out.parent / "log.txt"
     if "place" in command.output:
         (out / command.output).write_bytes((inputs / "rays.npz").read_bytes())
     since = time.monotonic()
-    _require_success(command, wait(start(begin(command, inputs, out), log)), log)
+    _require_success(command, wait_for(start_process(make_arguments(command, inputs, out), log)), log)
     usual = time.monotonic() - since
     for k in range(tries):
-        before = contents(inputs, out)
-        pid = start(begin(command, inputs, out), log)
+        before = hash_files(inputs, out)
+        pid = start_process(make_arguments(command, inputs, out), log)
         code = (
             kill_at(pid, usual * (k + 0.5) / tries)
             if k % 2
             else kill_while_writing(pid, out, turn, turn.randrange(4) if command.state else 0)
         )
         tally.tried += 1
-        tally.landed += code == -signal.SIGKILL
+        tally.hit += code == -signal.SIGKILL
         if code != -signal.SIGKILL:
             _require_success(command, code, log)
-        tally.started += 1
-        lost = lost_files(before, contents(inputs, out))
+        tally.restarted += 1
+        lost = find_lost_files(before, hash_files(inputs, out))
         tally.lost += len(lost)
         for line in lost:
             print(f"{command.name}: {line}", file=sys.stderr)
     tally.left = sum(map(is_partial, out.rglob("*")))
-    _require_success(command, wait(start(begin(command, inputs, out), log)), log)
-    assert all((out / name).is_file() for name in command.made), f"{command.name} has not made {command.made}"
+    _require_success(command, wait_for(start_process(make_arguments(command, inputs, out), log)), log)
+    assert all((out / name).is_file() for name in command.outputs), f"{command.name} did not write {command.outputs}"
     return tally
 
 
@@ -311,55 +320,55 @@ def _require_success(command: Command, code: int, log: Path) -> None:
 # The table
 # ----------------------------------------------------------------------------
 
-HEAD = ("What", "Times tried", "While running", "Files lost", "Next start works", "Hidden parts left")
+HEADER = ("Command", "Tries", "Killed while running", "Files lost", "Successful restarts", "Partial files left")
 
 
-def kills(work: Path, inputs: Path, tries: int, only: str) -> list[list[object]]:
-    """Rows of the kills, a command each and their sum."""
-    chosen = [c for c in COMMANDS if only in c.name]
+def run_kills(work: Path, inputs: Path, tries: int, only: str) -> list[list[object]]:
+    """Return the rows of the kill tests, one per command, and their sum."""
+    selected = [c for c in COMMANDS if only in c.name]
     total, rows, tallies = sum(c.weight for c in COMMANDS), [], []
-    for k, command in enumerate(chosen):
+    for k, command in enumerate(selected):
         out = work / f"out{k}" / "results"
         out.mkdir(parents=True)
         count = max(1, round(tries * command.weight / total))
         tally = try_kills(command, inputs, out, count, k)
         tallies.append(tally)
-        rows.append(_row(f"SIGKILL: `nerg {command.name}`", tally))
+        rows.append(_make_row(f"SIGKILL: `nerg {command.name}`", tally))
         print(" | ".join(map(str, rows[-1])), file=sys.stderr, flush=True)
     every = Tally(*(sum(getattr(t, n) for t in tallies) for n in ("tried", "landed", "lost", "started", "left")))
-    return [*rows, _row("SIGKILL, all", every)]
+    return [*rows, _make_row("SIGKILL, all", every)]
 
 
-def _row(what: str, t: Tally) -> list[object]:
-    return [what, t.tried, t.landed, t.lost, f"{t.started} of {t.tried}", t.left]
+def _make_row(what: str, t: Tally) -> list[object]:
+    return [what, t.tried, t.hit, t.lost, f"{t.restarted} of {t.tried}", t.left]
 
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--tries", type=int, default=100, help="kills altogether")
-    parser.add_argument("--only", default="", help="commands with this word in their name")
-    parser.add_argument("--update", type=Path, help="page whose table is exchanged")
+    parser.add_argument("--tries", type=int, default=100, help="total number of kills")
+    parser.add_argument("--only", default="", help="only commands with this word in their name")
+    parser.add_argument("--update", type=Path, help="page whose table is replaced")
     options = parser.parse_args(arguments)
-    # Children have what is loaded here; nothing may be begun with it.
+    # Loaded here, so that child processes have it; it must not be used in this process.
     import matplotlib  # noqa: F401
 
     with tempfile.TemporaryDirectory(prefix="nerg-faults-") as made:
         work, inputs = Path(made), Path(made) / "inputs"
         work.chmod(0o755)
-        _prepare_apart(inputs)
-        rows = kills(work, inputs, options.tries, options.only)
-    update_table(options.update, "Faults", table(HEAD, rows))
+        _write_inputs_in_process(inputs)
+        rows = run_kills(work, inputs, options.tries, options.only)
+    update_table(options.update, "Faults", table(HEADER, rows))
     return int(any(row[3] for row in rows))
 
 
-def _prepare_apart(inputs: Path) -> None:
-    """`prepare` in a process of its own, since it begins something with Mitsuba."""
+def _write_inputs_in_process(inputs: Path) -> None:
+    """Run `prepare` in its own process, because it initialises Mitsuba."""
     inputs.mkdir()
     pid = os.fork()
     if pid == 0:
         code = 70
         try:
-            prepare(inputs)
+            write_inputs(inputs)
             code = 0
         except BaseException:
             import traceback
@@ -367,7 +376,7 @@ def _prepare_apart(inputs: Path) -> None:
             traceback.print_exc()
         finally:
             os._exit(code)
-    assert wait(pid) == 0, "the inputs could not be made"
+    assert wait_for(pid) == 0, "the inputs could not be created"
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""The import rules of pyproject.toml, kept or broken.
+"""Check the import rules of pyproject.toml.
 
     python -m tools.import_rules
 
-runs import-linter on a copy of the sources that is laid out as the installed package, with `plugins/` and `scenes/`
-within it. Exit code 1 where a contract is broken.
+Runs import-linter on a copy of the sources laid out as the installed package, with `plugins/` and `scenes/` inside it.
+The exit code is 1 if a contract is broken.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def main() -> int:
                 target = Path(folder) / installed / path.relative_to(ROOT / source)
                 target.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(path, target)
-        # import-linter looks for the package where it is started, before anywhere else.
+        # import-linter searches the package in the working directory first.
         os.chdir(folder)
         return lint_imports(config_filename=str(ROOT / "pyproject.toml"), no_cache=True)
 

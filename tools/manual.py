@@ -1,7 +1,7 @@
-"""The manual pages of the plugins, which are the docstrings of their modules, as Markdown.
+"""Plugin manual pages, converted from the docstrings of their modules to Markdown.
 
-Read is as much of reStructuredText as Mitsuba's plugin manuals use: the list of parameters, inline roles, formulas,
-bullets and examples in tabs. Anything else raises `ValueError`, so that no page shows it raw.
+Supported is the part of reStructuredText that Mitsuba's plugin manuals use: the list of parameters, inline roles,
+formulas, bullets and examples in tabs. Anything else raises `ValueError`, so that no page shows raw markup.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ FLAGS = {
     "differentiable": "differentiable",
     "discontinuous": "moves edges, whose derivatives are missing",
 }
-"""What Mitsuba's manual calls a property of a parameter -> what it means."""
+"""Parameter flags of Mitsuba's manual -> their meaning."""
 
 
 @dataclass(frozen=True)
 class PluginParameter:
-    """One parameter of a plugin; `flags`: what Mitsuba may do with it besides setting it."""
+    """A parameter of a plugin; `flags` are its roles in Mitsuba besides being set."""
 
     name: str
     type: str
@@ -46,29 +46,29 @@ class PluginManual:
 
 
 def convert_inline(text: str) -> str:
-    """reStructuredText within a line as Markdown."""
+    """Convert inline reStructuredText to Markdown."""
     text = re.sub(r":math:`([^`]+)`", r"$\1$", text)
     text = re.sub(r":ref:`([^`<]+?) <[^`>]+>`", r"`\1`", text)
     text = re.sub(r":(?:paramtype|monosp):`([^`]+)`", r"`\1`", text)
     text = re.sub(r"\|(\w+)\|", r"\1", text)
     text = re.sub(r"``([^`]+)``", r"`\1`", text)
     if unknown := re.search(r":\w+:`", text):
-        raise ValueError(f"the role {unknown[0]}...` of a manual page is not known here; add it to tools/manual.py")
+        raise ValueError(f"the role {unknown[0]}...` is not supported; add it to tools/manual.py")
     return text
 
 
 def parse_parameters(block: str) -> list[PluginParameter]:
-    """The entries of a ``pluginparameters`` list."""
-    found = []
+    """Parse the entries of a ``pluginparameters`` list."""
+    entries = []
     for entry in re.split(r"^ \* - ", block, flags=re.M)[1:]:
         name, kind, meaning, *flags = (" ".join(part.split()) for part in re.split(r"^   - ", entry, flags=re.M))
         marks = tuple(re.findall(r"\|(\w+)\|", " ".join(flags)))
-        found.append(PluginParameter(name, convert_inline(kind).replace("`", ""), convert_inline(meaning), marks))
-    return found
+        entries.append(PluginParameter(name, convert_inline(kind).replace("`", ""), convert_inline(meaning), marks))
+    return entries
 
 
 def convert_examples(block: str) -> str:
-    """The examples of a ``tabs`` block as fenced code."""
+    """Convert the examples of a ``tabs`` block to fenced code."""
     fences = []
     for language, code in re.findall(r"^ {4}\.\. code-tab:: (\w+)\n((?:(?: {8}.*)?\n)+)", block + "\n", flags=re.M):
         code = re.sub(r"^\s*:name:.*\n", "", code).strip("\n")
@@ -77,22 +77,24 @@ def convert_examples(block: str) -> str:
 
 
 def parse_manual(docstring: str) -> PluginManual:
-    """The manual page that a plugin's docstring is. Raises `ValueError` for what cannot be read."""
+    """Parse the manual page in a plugin's docstring. Raises `ValueError` for unsupported markup."""
     blocks = re.split(r"\n\n(?=\S)", inspect.cleandoc(docstring))
-    title, listed, body = "", [], []
+    title, parameters, body = "", [], []
     for block in blocks:
         if block.startswith(".. _"):
             continue
         if re.fullmatch(r".+\n-{3,}", block):
             title = convert_inline(block.splitlines()[0])
         elif block.startswith(".. pluginparameters::"):
-            listed = parse_parameters(block)
+            parameters = parse_parameters(block)
         elif block.startswith(".. tabs::"):
             body.append(convert_examples(block))
         elif block.startswith(".. math::"):
             body.append(f"```math\n{textwrap.dedent(block.split('::', 1)[1].strip(chr(10))).rstrip()}\n```")
         elif block.startswith(".. "):
-            raise ValueError(f'the manual page "{title}" has a {block.split()[1]}, which tools/manual.py does not know')
+            raise ValueError(
+                f'the manual page "{title}" has an unsupported {block.split()[1]}; add it to tools/manual.py'
+            )
         else:
             body.append(convert_inline(block))
-    return PluginManual(title, listed, wrapped("\n\n".join(body)))
+    return PluginManual(title, parameters, wrapped("\n\n".join(body)))

@@ -1,7 +1,4 @@
-"""Text of the manual as Markdown source that can be read as it stands: aligned tables, lists, wrapped paragraphs.
-
-Benchmarks put the tables that they print into pages with `update`.
-"""
+"""Tables that commands print and write into pages of the documentation."""
 
 from __future__ import annotations
 
@@ -147,16 +144,16 @@ def _filled(lines: Sequence[str], width: int) -> list[str]:
 
 
 def replace_table(document: str, title: str, text: str) -> str:
-    """``document`` with the first table below the heading ``title`` exchanged for ``text``, or ``text`` added there.
+    """Replace the first table below the heading ``title`` of ``document`` by ``text``, or add ``text`` there.
 
-    The heading is of the second or third level. Raises ``ValueError`` where there is no such heading.
+    The heading is of the second or third level. Raises ``ValueError`` if there is no such heading.
     """
     lines = document.split("\n")
     mark = next((mark for mark in ("##", "###") if f"{mark} {title}" in lines), None)
     if mark is None:
-        raise ValueError(f'the document has no heading "## {title}" to put a table under; add it')
+        raise ValueError(f'the document has no heading "## {title}" for the table; add it')
     start = lines.index(f"{mark} {title}") + 1
-    # What ends its part of the page: a heading of its own level or above.
+    # The section ends at the next heading of the same or a higher level.
     ends = tuple(f"{'#' * level} " for level in range(2, len(mark) + 1))
     stop = next((k for k in range(start, len(lines)) if lines[k].startswith(ends)), len(lines))
     first = next((k for k in range(start, stop) if lines[k].startswith("|")), None)
@@ -170,7 +167,7 @@ def replace_table(document: str, title: str, text: str) -> str:
 
 
 def update_table(path: str | Path | None, title: str, text: str) -> None:
-    """Print ``text``, and put it into the page ``path`` (None: only print)."""
+    """Print ``text`` and, if ``path`` is given, write it into that page."""
     print(text)
     if path is not None:
         path = Path(path)

@@ -1,10 +1,10 @@
-"""Makes the checkout ready to run: a usable libLLVM, `.venv`, and the package in it, editable.
+"""Set up the checkout: a usable libLLVM, `.venv`, and an editable installation of the package.
 
     python3 tools/setup.py [EXTRA ...]
 
-EXTRA: optional dependencies of pyproject.toml, such as `test`. Run again, it does only what is missing. Works on Debian
-and Ubuntu with Python 3.10 or newer; elsewhere on Linux and on macOS everything but the installation of libLLVM does.
-Nothing but the standard library is used, since nothing else may be there yet.
+EXTRA are optional dependencies of pyproject.toml, such as `test`. A second run only does what is missing. Works on
+Debian and Ubuntu with Python 3.10 or newer; on other Linux systems and macOS, libLLVM must be installed manually. Only
+the standard library is used, because nothing else may be installed yet.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ STAMP = VENV / "nerg-setup.json"
 
 
 class Stop(Exception):
-    """Set-up cannot go on; the message is one sentence with what to do."""
+    """Set-up cannot continue; the message is one sentence with the remedy."""
 
 
 # ------------------------------------------------------------------------
@@ -33,21 +33,21 @@ class Stop(Exception):
 # ------------------------------------------------------------------------
 
 
-def newest_package(names: list[str], minimum: int) -> str | None:
-    """Of apt's package names, the libLLVM with the highest version from `minimum` up; None if there is none."""
-    # Ubuntu 24.04 added "t64" to some of them.
-    found = [(int(match[1]), name) for name in names if (match := re.fullmatch(r"libllvm(\d+)(t64)?", name))]
-    return max((entry for entry in found if entry[0] >= minimum), default=(0, None))[1]
+def find_newest_package(names: list[str], minimum: int) -> str | None:
+    """Return the libLLVM package with the highest version from `minimum` up; None if there is none."""
+    # Ubuntu 24.04 added "t64" to some names.
+    candidates = [(int(match[1]), name) for name in names if (match := re.fullmatch(r"libllvm(\d+)(t64)?", name))]
+    return max((entry for entry in candidates if entry[0] >= minimum), default=(0, None))[1]
 
 
 def find_offered_package(minimum: int) -> str | None:
-    """The newest libLLVM package from `minimum` up that apt offers; None if it offers none."""
+    """Return the newest libLLVM package from `minimum` up that apt offers; None if there is none."""
     answer = subprocess.run(["apt-cache", "pkgnames", "libllvm"], capture_output=True, text=True, check=True)
-    return newest_package(answer.stdout.split(), minimum)
+    return find_newest_package(answer.stdout.split(), minimum)
 
 
 def get_root_command() -> list[str] | None:
-    """What to put before a command to run it as root without a question; None if that is not allowed."""
+    """Return the prefix that runs a command as root without a password; None if that is not allowed."""
     if os.geteuid() == 0:
         return []
     if shutil.which("sudo") and subprocess.run(["sudo", "-n", "true"], capture_output=True).returncode == 0:
@@ -56,7 +56,7 @@ def get_root_command() -> list[str] | None:
 
 
 def provide_llvm() -> None:
-    """Have a libLLVM on which Dr.Jit's kernels run, installing one with apt if need be and allowed."""
+    """Ensure that there is a libLLVM for Dr.Jit, installing one with apt if necessary and allowed."""
     sys.path.insert(0, str(ROOT))
     from nerg_mi import llvm
 
@@ -69,14 +69,14 @@ def provide_llvm() -> None:
     root = get_root_command()
     package = find_offered_package(llvm.MIN_VERSION)
     if package is None and root is not None:
-        # A fresh machine may not have fetched the lists of packages.
+        # A new machine may not have package lists yet.
         subprocess.run([*root, "apt-get", "update", "-qq"], check=True)
         package = find_offered_package(llvm.MIN_VERSION)
     if root is None:
         command = f"sudo apt-get install {package}" if package else "sudo apt-get update"
         raise Stop(
-            f"LLVM {llvm.MIN_VERSION} or newer is missing and installing it needs your password: type\n\n"
-            f"    {command}\n\nand run this again."
+            f"LLVM {llvm.MIN_VERSION} or newer is missing, and its installation needs your password: run\n\n"
+            f"    {command}\n\nand start this again."
         )
     if package is None:
         raise Stop(
@@ -85,7 +85,7 @@ def provide_llvm() -> None:
         )
     print(f"Installing {package} ...", flush=True)
     environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
-    # A machine that has just started often updates itself in the background and holds the package database meanwhile.
+    # A machine that has just started often updates itself in the background and locks the package database.
     waiting = ["-o", "DPkg::Lock::Timeout=600"]
     install = [*root, "apt-get", "install", "-y", "-qq", "--no-install-recommends", *waiting, package]
     if subprocess.run(install, env=environment).returncode != 0:
@@ -103,30 +103,30 @@ def provide_llvm() -> None:
 
 
 def provide_venv() -> Path:
-    """Have a virtual environment with pip, and give its Python."""
+    """Ensure that there is a virtual environment with pip, and return its Python."""
     python = VENV / "bin" / "python"
     if python.exists() and subprocess.run([python, "-m", "pip", "--version"], capture_output=True).returncode == 0:
         return python
     if importlib.util.find_spec("ensurepip") is None or importlib.util.find_spec("venv") is None:
         raise Stop(
-            "Python's venv module is missing: type\n\n    sudo apt-get install python3-venv\n\nand run this again."
+            "Python's venv module is missing: run\n\n    sudo apt-get install python3-venv\n\nand start this again."
         )
-    print(f"Making {VENV.name} ...", flush=True)
+    print(f"Creating {VENV.name} ...", flush=True)
     subprocess.run([sys.executable, "-m", "venv", "--clear", VENV], check=True)
     return python
 
 
 def provide_package(python: Path, extras: set[str]) -> None:
-    """Have the package installed as pyproject.toml says, with at least these extras."""
+    """Ensure that the package is installed according to pyproject.toml, with at least these extras."""
     key = hashlib.sha256((ROOT / "pyproject.toml").read_bytes()).hexdigest()
     done = json.loads(STAMP.read_text()) if STAMP.exists() else {}
     if done.get("pyproject") == key and extras <= set(done["extras"]):
         return
     extras |= set(done.get("extras", ()))
     what = str(ROOT) + (f"[{','.join(sorted(extras))}]" if extras else "")
-    print("Installing nerg_mi and what it needs ...", flush=True)
+    print("Installing nerg_mi and its dependencies ...", flush=True)
     subprocess.run([python, "-m", "pip", "install", "-q", "--disable-pip-version-check", "-e", what], check=True)
-    # Written last: an installation that was interrupted is done again.
+    # Written last, so that an interrupted installation is repeated.
     STAMP.write_text(json.dumps({"pyproject": key, "extras": sorted(extras)}))
 
 
@@ -135,7 +135,7 @@ def main(extras: list[str]) -> int:
         if sys.version_info < (3, 10):  # noqa: UP036 (whoever runs this has not read what the package requires)
             version = sys.version.split()[0]
             raise Stop(
-                f"Python 3.10 or newer is needed and this is {version}: name another with make PYTHON=python3.12."
+                f"Python 3.10 or newer is needed and this is {version}: use another one with make PYTHON=python3.12."
             )
         provide_llvm()
         provide_package(provide_venv(), set(extras))
@@ -143,8 +143,8 @@ def main(extras: list[str]) -> int:
         print(f"set-up: {stop}", file=sys.stderr)
         return 1
     except subprocess.CalledProcessError as error:
-        # The command has said itself what went wrong.
-        print(f"set-up: this failed, mend what it says and run again: {' '.join(map(str, error.cmd))}", file=sys.stderr)
+        # The command has printed its error.
+        print(f"set-up: fix the reported error and run again: {' '.join(map(str, error.cmd))}", file=sys.stderr)
         return 1
     return 0
 

@@ -1,15 +1,15 @@
-"""What the commands make, compared bit for bit with what they made before: for changes that are to change nothing.
+"""Regression test: compares the outputs of all commands bit for bit with recorded ones.
 
-    python tools/unchanged.py record FOLDER [--only NAME ...]   run every command below and keep what it writes
-    python tools/unchanged.py compare FOLDER [--only NAME ...]  run them again, and name what differs; exit code 1 where
-                                                                anything does
+    python tools/unchanged.py record FOLDER [--only NAME ...]   run every command below and store its outputs
+    python tools/unchanged.py compare FOLDER [--only NAME ...]  run them again and list the differences; exit code 1 if
+                                                                there are any
 
-Compared are channels and pixels, arrays, tables and the errors of a study, not headers, times or names of files.
+Channels, pixels, arrays, tables and the errors of a study are compared; headers, times and file names are not.
 
-Pictures of the demo store with every kind of depth, visibility, quadrature, gaze field and AOV, of shapes and through a
-panorama; trainings of radiance and gaze at one thread; a study's errors; tables and exports. Everything is made of the
-demo store and of seeds, by the command line alone, so that it can be recorded by one version and compared by another.
-The bits depend on the machine, on libLLVM and on Mitsuba: record and compare on the same one.
+The outputs are pictures of the demo store with every kind of depth, visibility, quadrature, gaze field and AOV, of
+shapes and through a panorama; radiance and gaze trainings with one thread; the errors of a study; tables and exports.
+They only depend on the demo store, seeds and the command line, so one version can record them and another can compare.
+The bits depend on the machine, libLLVM and Mitsuba: record and compare on the same machine.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from PIL import Image
 
 ROOT = Path(__file__).resolve().parents[1]
 STORE = ROOT / "scenes" / "store"
-# Not the installed script, so that a tree whose entry point has moved is run as well.
+# Not the installed script, so that a tree with another entry point also works.
 NERG = [sys.executable, "-c", "from nerg_mi.cli import main; main()"]
 SIZE = ["-D", "width=96", "-D", "height=64", "-D", "sphere_width=96", "-D", "sphere_height=48", "-D", "spp=2"]
 ALL_AOVS = "depth,opacity,position,gaze,emit,capture,visibility,observer_depth,features,features_at"
@@ -71,11 +71,11 @@ PICTURES = {
     "open": ["occlusion=false"],
     "dark": ["radiance=false"],
 }
-"""Pictures of the store's scene by name, and what they change in it."""
+"""Pictures of the store scene by name, and their changes of its defaults."""
 
 
 def make_rays(folder: Path) -> Path:
-    """Rays of three people who walk through the store and look at its middle, as a CSV file."""
+    """Write the rays of three participants who walk through the store and look at its middle as a CSV file."""
     rng = np.random.default_rng(7)
     lines = ["person,time,x,y,z,dx,dy,dz"]
     for person in range(3):
@@ -91,7 +91,7 @@ def make_rays(folder: Path) -> Path:
 
 
 def write_transforms(folder: Path, width: int, height: int) -> None:
-    """The pictures ``photos/K.png`` as a posed image set."""
+    """Write the poses of the pictures ``photos/K.png``."""
     frames = []
     for k, eye in enumerate(VIEWS):
         back = np.subtract(eye, TARGET)
@@ -106,8 +106,8 @@ def write_transforms(folder: Path, width: int, height: int) -> None:
     (folder / "transforms.json").write_text(json.dumps({**camera, "frames": frames}))
 
 
-def commands(folder: Path) -> Iterator[tuple[str, list[str]]]:
-    """Each command line in the order that they need each other, and the file or folder that it writes."""
+def iter_commands(folder: Path) -> Iterator[tuple[str, list[str]]]:
+    """Yield the command lines in the order of their dependencies, with the file or folder that each writes."""
     render = ["render", str(STORE / "scene.xml")]
     one = ["--threads", "1"]
     rays = str(folder / "rays.npz")
@@ -161,10 +161,10 @@ def commands(folder: Path) -> Iterator[tuple[str, list[str]]]:
                 *one,
             ],
         )
-        more = {"ensemble": "gaze,gaze_std,support", "emit": "gaze,emit", "capture": "gaze,capture"}.get(
+        aovs = {"ensemble": "gaze,gaze_std,support", "emit": "gaze,emit", "capture": "gaze,capture"}.get(
             name, "gaze,emit,capture"
         )
-        yield f"gaze_{name}.exr", [*render, *SIZE, "-D", f"gaze={folder}/gaze_{name}.safetensors", "-D", f"aovs={more}"]
+        yield f"gaze_{name}.exr", [*render, *SIZE, "-D", f"gaze={folder}/gaze_{name}.safetensors", "-D", f"aovs={aovs}"]
     yield (
         "study",
         ["study", str(STORE / "scene.xml"), "--quick", "--width", "48", "--height", "32", "--only", "depth|visib|step"],
@@ -190,7 +190,7 @@ def commands(folder: Path) -> Iterator[tuple[str, list[str]]]:
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """What a rays file or a picture holds by its names: headers, which name files and times, are left out."""
+    """Read the named arrays of a rays file or picture, without headers, which contain file names and times."""
     if path.suffix == ".exr":
         with OpenEXR.File(str(path), separate_channels=True) as file:
             return {name: channel.pixels for name, channel in file.channels().items()}
@@ -202,8 +202,10 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
     return {name: array for name, array in stored.items() if array.dtype.kind in "fiub" and array.ndim}
 
 
-def digest(path: Path) -> str:
-    """Digest of the arrays of a picture, a rays file or a checkpoint, of the rows of a study, or of a file's bytes."""
+def compute_digest(path: Path) -> str:
+    """Return a digest of the arrays of a picture, rays file or checkpoint, of the rows of a study, or of the bytes of a
+    file.
+    """
     if path.name == "study":
         data = read_study_errors(path)
     elif path.suffix in (".exr", ".png", ".npz"):
@@ -220,7 +222,7 @@ def digest(path: Path) -> str:
 
 
 def read_study_errors(folder: Path) -> bytes:
-    """A study's rows without their times and memory, and without the fronts that follow from times."""
+    """Read the rows of a study without times, memory, and Pareto fronts, which depend on times."""
     rows = list(csv.DictReader((folder / "study.csv").open()))
     measured = ("ms", "second", "time", "memory", "bytes", "peak", "pareto")
     errors = [{k: v for k, v in row.items() if not any(w in k for w in measured)} for row in rows]
@@ -228,19 +230,20 @@ def read_study_errors(folder: Path) -> bytes:
 
 
 def select_commands(folder: Path, only: list[str]) -> list[tuple[str, list[str]]]:
-    """Of ``commands`` those whose outputs' names contain one of ``only`` (all where there is none), and those that make
-    what these read."""
-    kept = []
-    for name, line in reversed(list(commands(folder))):
+    """Select the commands whose outputs contain one of ``only`` (all if it is empty), and those whose outputs they
+    read.
+    """
+    selected = []
+    for name, line in reversed(list(iter_commands(folder))):
         out = folder / name
         reads = lambda given, out=out: str(out) in given or (out.parent != folder and given == str(out.parent))
-        if not only or any(o in name for o in only) or any(reads(g) for _, other in kept for g in other):
-            kept.append((name, line))
-    return kept[::-1]
+        if not only or any(o in name for o in only) or any(reads(g) for _, other in selected for g in other):
+            selected.append((name, line))
+    return selected[::-1]
 
 
-def run(folder: Path, only: list[str]) -> dict[str, str]:
-    """Run every command that is ``wanted``; output -> digest, or the error."""
+def run_commands(folder: Path, only: list[str]) -> dict[str, str]:
+    """Run all selected commands; returns output -> digest, or the error."""
     results = {}
     for name, line in select_commands(folder, only):
         out = folder / name
@@ -249,7 +252,7 @@ def run(folder: Path, only: list[str]) -> dict[str, str]:
         for path in tables or [out]:
             output = path.relative_to(folder).as_posix()
             failed = f"exit code {process.returncode}: {process.stderr.strip()[-400:]}" if process.returncode else ""
-            results[output] = failed or digest(path)
+            results[output] = failed or compute_digest(path)
             print(f"{output:28} {results[output][:70]}", flush=True)
     return results
 
@@ -257,16 +260,17 @@ def run(folder: Path, only: list[str]) -> dict[str, str]:
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=["record", "compare"])
-    parser.add_argument("folder", type=Path, help="of what the commands made")
-    more = "only outputs whose names contain this, and what they are made of; may be given several times"
-    parser.add_argument("--only", action="append", default=[], help=more)
+    parser.add_argument("folder", type=Path, help="folder of the recorded outputs")
+    only_help = "only outputs whose names contain this, and their inputs; repeatable"
+
+    parser.add_argument("--only", action="append", default=[], help=only_help)
     args = parser.parse_args(argv)
     if args.what == "record":
         args.folder.mkdir(parents=True, exist_ok=True)
-        return int(any(v.startswith("exit code") for v in run(args.folder.resolve(), args.only).values()))
+        return int(any(v.startswith("exit code") for v in run_commands(args.folder.resolve(), args.only).values()))
     with tempfile.TemporaryDirectory(prefix="nerg-unchanged-") as temporary:
-        results = run(Path(temporary), args.only)
-    before = {name: digest(args.folder / name) for name in results if (args.folder / name).exists()}
+        results = run_commands(Path(temporary), args.only)
+    before = {name: compute_digest(args.folder / name) for name in results if (args.folder / name).exists()}
     differ = [name for name, value in results.items() if before.get(name) != value]
     print(f"{len(results)} outputs, {len(differ)} of them differ" + "".join(f"\n  {n}" for n in differ))
     return int(bool(differ))
