@@ -1,4 +1,4 @@
-"""Variants of a gaze field trained alike and compared, and the time of a frame."""
+"""Ablation of gaze-field variants trained alike, and the time per frame."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from nerg_mi.train.gaze_recipes import get_recipe
 from nerg_mi.train.geometry import TrainingGeometry, make_volume_dict
 from nerg_mi.transport.geometry import SceneGeometry
 
-from .gaze import Baseline, GazeTest, make_test, compute_map_scores
+from .gaze import Baseline, GazeTest, compute_map_scores, make_test
 from .study_scenes import make_sensor
 
 # ---- Ablation ----
 #
-# The paper's ablation: every variant of a gaze field, trained alike and scored on what it saw and on what it did not.
+# The ablation of the paper: every variant of a gaze field, scored at training positions and at held-out positions.
 #
-# Losses are the paper's, KLD + (1 - CC) + MAE, of densities over directions of equal area, on positions of the training
-# and on positions that were held out; normalised by the product of emit and capture of the same recipe. A frame is a
-# render of the gaze by the integrator, observer and camera in one place.
+# The loss is that of the paper, KLD + (1 - CC) + MAE, of densities over directions of equal area. Relative losses are
+# divided by that of the product of emit and capture of the same recipe. A frame is a rendering of the gaze by the
+# integrator, with the camera as the observer.
 
 COLUMNS = tuple(
     """
@@ -41,30 +41,37 @@ COLUMNS = tuple(
 
 @dataclass(frozen=True, kw_only=True)
 class Variant:
-    """One way to train a gaze field that an ablation compares with others."""
+    """A variant of a gaze field in an ablation."""
 
-    name: str  # What it is called in tables
-    recipe: str  # Of `train.gaze_recipes`
+    name: str  # Name in tables
+    recipe: str  # Recipe (`train.gaze_recipes`)
     field_variant: str = "emit_capture"  # Factors: "emit", "capture" or "emit_capture"
-    semantic: str = ""  # Features of a radiance field that emit is given (`train.gaze_recipes.FieldChoices`)
-    semantic_own: bool = False  # Whether emit has the field's own features besides
-    init_from_field: bool = False  # Whether the trunk begins as the radiance field's,
-    frozen: bool = False  # and stays so
-    loss: str = ""  # What it is trained on (`train.gaze_settings.LOSSES`); "": the recipe's
+    semantic: str = ""  # Radiance-field features as input of emit (`train.gaze_recipes.FieldOptions`); "": none
+    semantic_own: bool = False  # Whether emit also has the field's own features
+    init_from_field: bool = False  # Whether the trunk is initialised from the radiance field
+    frozen: bool = False  # Whether these weights are not trained
+    loss: str = ""  # Training loss (`train.gaze_settings.LOSSES`); "": set by the recipe
 
     def file_name(self, seed: int) -> str:
-        """Name of the checkpoint of its training with a ``seed``."""
+        """Return the checkpoint name of the training with this ``seed``."""
         return f"{self.recipe}_{self.name.replace(', ', '_').replace(' ', '_')}_{seed}.safetensors"
 
 
 def list_variants(has_radiance: bool, recipes: Sequence[str] = ("default", "paper")) -> list[Variant]:
-    """Of each of ``recipes`` the three variants, the product on each other loss that the recipe may be trained on and,
-    where there is a ``radiance`` field and the recipe takes them, the semantic ones and the two initialisations."""
+    """List the variants of each recipe: the three combinations of factors, the other losses that the recipe supports
+    and, with a radiance field, the semantic variants and the two initialisations that it supports.
+    """
     out = []
     for recipe in map(get_recipe, recipes):
-        out += [Variant(name=name, recipe=recipe.name, field_variant=name) for name in ("emit", "capture", "emit_capture")]
-        own = recipe.make_gaze_settings().loss
-        out += [Variant(name=f"loss {loss}", recipe=recipe.name, loss=loss) for loss in recipe.losses if loss != own]
+        out += [
+            Variant(name=name, recipe=recipe.name, field_variant=name) for name in ("emit", "capture", "emit_capture")
+        ]
+        default_loss = recipe.make_gaze_settings().loss
+        out += [
+            Variant(name=f"loss {loss}", recipe=recipe.name, loss=loss)
+            for loss in recipe.losses
+            if loss != default_loss
+        ]
         if has_radiance and "semantic" in recipe.supported_options:
             out += [
                 Variant(name=f"semantic {kind}{', own too' * own}", recipe=recipe.name, semantic=kind, semantic_own=own)
@@ -88,14 +95,24 @@ def make_tests(
     min_rays: int,
     truth: Baseline | None = None,
 ) -> dict[str, GazeTest]:
-    """What every variant is scored on: ``train``, positions of the training, and ``test``, the ``centres`` (T, 3).
+    """Make the test sets of an ablation: ``train`` at training positions and ``test`` at held-out positions.
 
-    ``rays``: whose density at ``centres`` is the truth of the test; ``train``: what is trained on;
-    ``truth(positions, directions)``: the true density, where it is known in another way. Lengths are metres.
+    Parameters
+    ----------
+    rays : Rays
+        Rays whose density is the truth of the test; lengths in metres.
+    train : Rays
+        Training rays.
+    centres : numpy.ndarray
+        Held-out positions (T, 3).
+    radius, kappa, min_rays
+        Probe radius, kernel concentration and minimum number of rays per position.
+    truth : Baseline, optional
+        ``truth(positions, directions)`` returns the true density, if it is known.
     """
-    seen = train.origin[np.random.default_rng(0).permutation(len(train))[: len(centres)]]
+    train_centres = train.origin[np.random.default_rng(0).permutation(len(train))[: len(centres)]]
     tests = {
-        "train": make_test(train, seen, radius, kappa, min_rays=min(min_rays, 16)),
+        "train": make_test(train, train_centres, radius, kappa, min_rays=min(min_rays, 16)),
         "test": make_test(rays, centres, radius, kappa, min_rays=min_rays),
     }
     if truth is not None:
@@ -104,7 +121,7 @@ def make_tests(
 
 
 def score_density(tests: dict[str, GazeTest], density: Baseline) -> dict[str, float]:
-    """Scores of a ``density(positions, directions)`` in 1/sr on each of ``tests``, and the paper's loss."""
+    """Score ``density(positions, directions)`` in 1/sr on each of ``tests``, including the loss of the paper."""
     row = {}
     for side, test in tests.items():
         scores = compute_map_scores(test.truth, density(test.centres, test.directions))
@@ -114,24 +131,24 @@ def score_density(tests: dict[str, GazeTest], density: Baseline) -> dict[str, fl
 
 
 def add_relative_losses(rows: list[dict]) -> None:
-    """Give each of ``rows`` its losses relative to the mean of emit_capture of the same recipe, where that is there."""
+    """Add the loss relative to the mean of emit_capture of the same recipe to each of ``rows``, if it exists."""
     for recipe in {r["recipe"] for r in rows}:
-        whole = [r for r in rows if (r["recipe"], r["variant"]) == (recipe, "emit_capture")]
-        for side in ("train", "test") if whole else ():
-            unit = np.mean([r[f"{side}_loss"] for r in whole])
+        reference_rows = [r for r in rows if (r["recipe"], r["variant"]) == (recipe, "emit_capture")]
+        for side in ("train", "test") if reference_rows else ():
+            unit = np.mean([r[f"{side}_loss"] for r in reference_rows])
             for r in rows:
                 if r["recipe"] == recipe:
                     r[f"{side}_relative"] = r[f"{side}_loss"] / unit
 
 
 def summarise(rows: list[dict]) -> list[dict]:
-    """A row a recipe and variant: means over seeds, and the spread (standard deviation) of what differs."""
+    """Summarise rows by recipe and variant: means over seeds, and standard deviations (``.spread``)."""
     out = []
     for key in dict.fromkeys((r["recipe"], r["variant"]) for r in rows):
-        found = [r for r in rows if (r["recipe"], r["variant"]) == key]
-        row = {"recipe": key[0], "variant": key[1], "seeds": len(found)}
+        group = [r for r in rows if (r["recipe"], r["variant"]) == key]
+        row = {"recipe": key[0], "variant": key[1], "seeds": len(group)}
         for k in COLUMNS[3:]:
-            values = [r[k] for r in found if k in r]
+            values = [r[k] for r in group if k in r]
             if values:
                 row[k] = float(np.mean(values))
                 if len(values) > 1 and k.startswith(("train_", "test_")) and not k.endswith("seconds"):
@@ -141,14 +158,13 @@ def summarise(rows: list[dict]) -> list[dict]:
 
 
 def format_table(summary: list[dict]) -> str:
-    """``summary`` as Markdown: losses relative to emit_capture of the same recipe and as they are, scores on held-out
-    positions, seconds."""
-    shown = [f"{side}_{kind}" for kind in ("relative", "loss") for side in ("train", "test")]
-    shown += ["test_KLD", "test_CC", "test_MAE", "train_seconds", "frame_seconds"]
-    head, lines = ["recipe", "variant", "seeds", "steps", *(k.replace("_", " ") for k in shown)], []
+    """Format ``summary`` as Markdown: relative and absolute losses, scores at held-out positions, and times."""
+    columns = [f"{side}_{kind}" for kind in ("relative", "loss") for side in ("train", "test")]
+    columns += ["test_KLD", "test_CC", "test_MAE", "train_seconds", "frame_seconds"]
+    head, lines = ["recipe", "variant", "seeds", "steps", *(k.replace("_", " ") for k in columns)], []
     for r in summary:
         cells = []
-        for k in shown:
+        for k in columns:
             digits = 4 if k.endswith("MAE") else 3
             spread = f" ± {r[f'{k}.spread']:.{digits}f}" if f"{k}.spread" in r else ""
             cells.append(f"{r[k]:.{digits}f}{spread}" if k in r else "")
@@ -157,7 +173,9 @@ def format_table(summary: list[dict]) -> str:
 
 
 def write_ablation(folder: Path, rows: list[dict], notes: str, provenance: Provenance | None = None) -> list[Path]:
-    """Write ``ablation.md`` (below ``notes``), ``.csv``, ``.json`` and the plot ``.png`` into ``folder``; the paths."""
+    """Write ``ablation.md`` (below ``notes``), ``.csv``, ``.json`` and the plot ``.png`` into ``folder``; returns the
+    paths.
+    """
     summary, files = summarise(rows), [folder / f"ablation.{e}" for e in ("md", "csv", "json", "png")]
     write_text(files[0], f"{notes}\n\n{format_table(summary)}")
     write_csv(files[1], rows, COLUMNS)
@@ -167,14 +185,14 @@ def write_ablation(folder: Path, rows: list[dict], notes: str, provenance: Prove
 
 
 def _figure(summary: list[dict]) -> Any:
-    """Bars of the relative losses on training and on held-out positions, a pair a variant."""
+    """Draw the relative losses at training and held-out positions as bars, a pair per variant."""
     figure = new_page(180 + 120 * len(summary), 480)
     figure.set_layout_engine("constrained")
     axis = figure.subplots()
     x = np.arange(len(summary))
     for side, shift, colour in (("train", -0.2, "#9db7d5"), ("test", 0.2, "#2f5f93")):
         bars = [r.get(f"{side}_relative", np.nan) for r in summary]
-        # One seed has no spread, which is not one of zero.
+        # A single seed has an unknown spread, not zero.
         spread = [r.get(f"{side}_relative.spread", np.nan) for r in summary]
         axis.bar(x + shift, bars, 0.4, yerr=spread, label=f"{side} probes", color=colour, capsize=3)
     axis.axhline(1, color="0.5", lw=0.8)
@@ -184,7 +202,7 @@ def _figure(summary: list[dict]) -> Any:
     return figure
 
 
-# ---- How long the integrator takes for a frame of gaze, observer and camera in one place ----
+# ---- Rendering time of a gaze frame with the camera as the observer ----
 
 
 def make_frame_timer(
@@ -196,18 +214,34 @@ def make_frame_timer(
     height: int = 180,
     seed: int = 0,
 ) -> Callable[[Path], float] | None:
-    """``render(checkpoint)``: mean seconds a frame of ``cameras`` at random ``centres`` (T, 3), looking about level;
-    None where there is nothing to render, and for a scene of shapes that also has a field.
+    """Return ``render(checkpoint)``, which measures the mean rendering time of a frame in seconds.
 
-    ``folder``: where the file of the place is. The first render of each checkpoint, which compiles, does not count; the
-    integral of a normalised field does, since each camera has one of its own.
+    Parameters
+    ----------
+    geometry : TrainingGeometry
+        Geometry to render. The result is None without geometry, and for a scene of shapes that also has a field.
+    centres : numpy.ndarray
+        Candidate camera positions (T, 3).
+    folder : Path
+        Folder of the file of the geometry.
+    cameras : int
+        Number of random cameras, which look nearly horizontally.
+    width, height : int
+        Size of the frame in pixels.
+    seed : int
+        Seed of the cameras.
+
+    Notes
+    -----
+    The first frame of each checkpoint, which compiles kernels, is not counted. The integral of a normalised field is
+    counted, because each camera has its own.
     """
     import mitsuba as mi
 
     if geometry.kind == "none" or (isinstance(geometry.medium, SceneGeometry) and geometry.medium.medium is not None):
         return None
     rng = np.random.default_rng(seed)
-    eyes, angles = centres[rng.integers(0, len(centres), cameras)], rng.uniform(0, 2 * np.pi, cameras)
+    origins, angles = centres[rng.integers(0, len(centres), cameras)], rng.uniform(0, 2 * np.pi, cameras)
 
     def render(checkpoint: Path) -> float:
         integrator = {"type": "nerg", "aovs": "gaze", "radiance": False, **_medium(geometry, folder)}
@@ -215,7 +249,7 @@ def make_frame_timer(
         with translate_mitsuba_errors(checkpoint):
             scene = mi.load_dict({"type": "scene", "integrator": integrator, **_shapes(geometry)})
         times = []
-        for eye, angle in [(eyes[0], angles[0]), *zip(eyes, angles)]:
+        for eye, angle in [(origins[0], angles[0]), *zip(origins, angles)]:
             target = eye + (np.cos(angle), np.sin(angle), -0.1)
             sensor = mi.load_dict(make_sensor(eye.tolist(), target.tolist(), 70, width, height))
             started = time.perf_counter()
@@ -227,7 +261,7 @@ def make_frame_timer(
 
 
 def _medium(place: TrainingGeometry, folder: Path) -> dict:
-    """What the integrator of ``place`` marches, as parameters of its plugin."""
+    """Return the medium of ``geometry`` as plugin parameters of the integrator."""
     if place.kind == "field":
         path = folder / place.metadata["field_file"]["file"]
         return {"field": {"type": choose_plugin(path), "filename": str(path)}}
@@ -237,6 +271,6 @@ def _medium(place: TrainingGeometry, folder: Path) -> dict:
 
 
 def _shapes(place: TrainingGeometry) -> dict:
-    """The shapes of ``place``, as children of a scene."""
+    """Return the shapes of ``geometry`` as children of a scene."""
     scene = place.medium.scene if isinstance(place.medium, SceneGeometry) else None
     return {} if scene is None else {f"shape{i}": s for i, s in enumerate(scene.shapes())}

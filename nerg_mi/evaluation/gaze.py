@@ -1,4 +1,4 @@
-"""Scores of a gaze field at held-out positions, and the baselines that it is compared with."""
+"""Scores of a gaze field at held-out positions, and baselines to compare it with."""
 
 from __future__ import annotations
 
@@ -22,28 +22,31 @@ from nerg_mi.rays.rays import Rays
 from nerg_mi.train.gaze_data import SURFACE_OPACITY
 from nerg_mi.transport.geometry import SceneGeometry, default_march_settings
 from nerg_mi.transport.observer import ObserverSettings
-from nerg_mi.transport.observer_gaze import ObservedGaze, GazeFieldInstance
+from nerg_mi.transport.observer_gaze import GazeFieldInstance, ObservedGaze
 
 from . import metrics
 
 # ---- Baselines ----
 #
-# What a gaze field must beat: densities without a field.
+# Densities without a field, which a gaze field must outperform.
 #
-# Each baseline is a function ``(positions (P, 3), directions) -> (P, D)`` of densities in 1/sr that integrate to one;
-# ``directions`` is (D, 3) for all positions or (P, D, 3). All share the kernels of :mod:`nerg_mi.probes.kde`.
+# Each baseline is a function ``(positions (P, 3), directions) -> (P, D)`` that returns densities in 1/sr, which
+# integrate to one; ``directions`` is (D, 3) for all positions or (P, D, 3). All baselines use the kernels of
+# :mod:`nerg_mi.probes.kde`.
 
 Baseline = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Densities (P, D), 1/sr, of positions (P, 3) in directions (D, 3) or (P, D, 3)."""
 
 UNIFORM_DENSITY = 1.0 / (4.0 * np.pi)  # 1/sr
-# Points in a leaf of a KD-tree, which decides the order of those that are equally far, and so the last bits of sums.
-_LEAF = 16
+# Points per leaf of a KD-tree. The value decides the order of equally distant points, and so the last bits of sums.
+_LEAF_SIZE = 16
 
 
 class CachedBaseline:
-    """A function of positions and directions that is not asked twice for the same two arrays: its answers are kept, and
-    cannot be written to. Neither may the arrays change."""
+    """Caches the densities of a baseline for each pair of position and direction arrays.
+
+    Arrays are compared by identity and must not change. The returned arrays are read-only.
+    """
 
     def __init__(self, method: Baseline):
         self._method = method
@@ -60,7 +63,7 @@ class CachedBaseline:
 
 
 def make_uniform_baseline() -> Baseline:
-    """The density that knows nothing: 1/(4π) everywhere."""
+    """Return the uniform density, 1/(4π)."""
 
     def evaluate(positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
         return np.full((len(np.atleast_2d(positions)), np.shape(directions)[-2]), UNIFORM_DENSITY)
@@ -69,10 +72,9 @@ def make_uniform_baseline() -> Baseline:
 
 
 def make_position_blind_baseline(rays: Rays, *, kappa: float = 50.0, backend: Backend = None) -> Baseline:
-    """One density for all positions: the KDE of all training rays, with ``kappa``
-    (what people look at wherever they stand)."""
-    # Runs of rays are separate mixtures averaged in float64: one sum of 10^5
-    # terms in float32 would lose digits, and a lane alone would take it all.
+    """Return the kernel density of all training rays with concentration ``kappa``, independent of the position."""
+    # Runs of rays are separate mixtures, averaged in float64: one float32 sum of 10^5 terms would lose precision and
+    # run in a single lane.
     runs = np.array_split(np.arange(len(rays)), max(1, len(rays) // 4096))
     offsets = np.concatenate([[0], np.cumsum([len(r) for r in runs])])
     kde = SphericalKde(rays.direction, offsets, kappa, backend=backend)
@@ -88,24 +90,23 @@ def make_position_blind_baseline(rays: Rays, *, kappa: float = 50.0, backend: Ba
 
 
 def make_nearest_probes_baseline(probes: Probes, k: int = 16, *, backend: Backend = None) -> Baseline:
-    """Mean density of the ``k`` training probes nearest to a position; k = 1 is
-    the nearest probe. Fewer where there are fewer probes."""
+    """Return the mean density of the ``k`` training probes nearest to a position (or of all, if there are fewer)."""
     from scipy.spatial import KDTree
 
-    tree = KDTree(probes.positions, leafsize=_LEAF)
+    tree = KDTree(probes.positions, leafsize=_LEAF_SIZE)
     k = min(k, len(probes))
     rays = [np.arange(a, b) for a, b in zip(probes.offsets[:-1], probes.offsets[1:])]
 
     def evaluate(positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        found = _nearest(tree, np.atleast_2d(positions), k)
-        # The probes used, once each when the directions are common to all.
+        nearest = _find_nearest(tree, np.atleast_2d(positions), k)
+        # With common directions each probe is evaluated only once.
         if np.ndim(directions) == 2:
-            used, back = np.unique(found, return_inverse=True)
-            density = _some(probes, rays, used, backend).evaluate(directions)
-            return _mean_rows(density, back.reshape(found.shape))
+            used_probes, back = np.unique(nearest, return_inverse=True)
+            density = _select_probes(probes, rays, used_probes, backend).evaluate(directions)
+            return _average_rows(density, back.reshape(nearest.shape))
         density = [
-            _some(probes, rays, near, backend).evaluate(d).mean(axis=0, dtype=np.float64)
-            for near, d in zip(found, directions)
+            _select_probes(probes, rays, near, backend).evaluate(d).mean(axis=0, dtype=np.float64)
+            for near, d in zip(nearest, directions)
         ]
         return np.stack(density)
 
@@ -113,19 +114,21 @@ def make_nearest_probes_baseline(probes: Probes, k: int = 16, *, backend: Backen
 
 
 def make_nearest_rays_baseline(rays: Rays, k: int = 4096, *, kappa: float = 20.0, backend: Backend = None) -> Baseline:
-    """KDE of the ``k`` training rays whose origins are nearest to a position: a
-    probe without a radius, hard to beat where rays are many."""
+    """Return the kernel density of the ``k`` training rays with the origins nearest to a position.
+
+    This is a probe without a radius, and a strong baseline for dense data.
+    """
     from scipy.spatial import KDTree
 
-    tree = KDTree(rays.origin, leafsize=_LEAF)
+    tree = KDTree(rays.origin, leafsize=_LEAF_SIZE)
     k = min(k, len(rays))
 
     def evaluate(positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
         positions, directions = np.atleast_2d(positions), np.asarray(directions)
         out = []
         for start in range(0, len(positions), 64):  # 64 x 4,096 rays at a time
-            found = _nearest(tree, positions[start : start + 64], k)
-            kde = SphericalKde(rays.direction[found.ravel()], np.arange(len(found) + 1) * k, kappa, backend=backend)
+            nearest = _find_nearest(tree, positions[start : start + 64], k)
+            kde = SphericalKde(rays.direction[nearest.ravel()], np.arange(len(nearest) + 1) * k, kappa, backend=backend)
             out.append(kde.evaluate(directions if directions.ndim == 2 else directions[start : start + 64]))
         return np.concatenate(out)
 
@@ -135,8 +138,11 @@ def make_nearest_rays_baseline(rays: Rays, k: int = 4096, *, kappa: float = 20.0
 def make_standard_baselines(
     rays: Rays, radius: float, kappa: float = 20.0, blind_kappa: float = 50.0, seed: int = 0, count: int = 2048
 ) -> tuple[Baseline, dict[str, Baseline]]:
-    """``(blind, baselines)``: the density that information is counted from, and by name all that a gaze field is shown
-    beside: uniform, position-blind, nearest probes and nearest rays of the training ``rays``, kernels of ``kappa``."""
+    """Make the baselines that a gaze field is compared with from the training ``rays``.
+
+    Returns ``(blind, baselines)``: the reference density of the information gain, and the baselines by name (uniform,
+    position-blind, nearest probes and nearest rays, with kernels of concentration ``kappa``).
+    """
     probes = place_probes(
         rays, radius, count=count, min_rays=min(64, len(rays)), kappa_rule="fixed", kappa=kappa, seed=seed
     )
@@ -151,13 +157,13 @@ def make_standard_baselines(
     }
 
 
-def _nearest(tree: Any, positions: np.ndarray, k: int) -> np.ndarray:
-    """Indices (P, k) of the ``k`` points of a KD-tree that are nearest to each of ``positions`` (P, 3)."""
+def _find_nearest(tree: Any, positions: np.ndarray, k: int) -> np.ndarray:
+    """Return the indices (P, k) of the ``k`` points of a KD-tree that are nearest to each of ``positions`` (P, 3)."""
     return tree.query(positions, k=np.arange(1, k + 1))[1]
 
 
-def _some(probes: Probes, rays: list[np.ndarray], which: np.ndarray, backend: Backend) -> SphericalKde:
-    """The densities of the probes ``which`` of ``probes``, whose rays are at ``rays``."""
+def _select_probes(probes: Probes, rays: list[np.ndarray], which: np.ndarray, backend: Backend) -> SphericalKde:
+    """Return the densities of a subset of the probes, whose ray indices are ``rays``."""
     runs = [rays[p] for p in which]
     offsets = np.concatenate([[0], np.cumsum([len(r) for r in runs])])
     flat = np.concatenate(runs)
@@ -165,30 +171,47 @@ def _some(probes: Probes, rays: list[np.ndarray], which: np.ndarray, backend: Ba
     return SphericalKde(probes.directions[flat], offsets, probes.kappa[which], weights, backend)
 
 
-def _mean_rows(density: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Mean (P, D) of the ``rows`` (P, k) of ``density`` (n, D)."""
+def _average_rows(density: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Return the mean (P, D) of the ``rows`` (P, k) of ``density`` (n, D)."""
     return np.stack([density[r].mean(axis=0, dtype=np.float64) for r in rows])
 
 
-# ---- A trained gaze field beside its baselines: densities over the sphere at positions, and a table of scores ----
+# ---- Densities of a trained gaze field at positions, and the table of scores ----
 
 
-# Of the uniform density: what a density of zero counts as in KLD. A truth that is a kernel density has
-# long empty stretches where nothing should hinge on how empty exactly.
+# Floor of a density in KLD relative to the uniform density. A kernel-density truth has nearly empty regions, whose
+# exact values should not matter.
 EPS = 1e-6
 
 
 class FieldDensity:
-    """``field`` in a place as a function ``(positions (P, 3), directions) -> (P, D)`` of densities in 1/sr of the
-    positions' units.
+    """Evaluates a gaze field in its geometry as a baseline: ``(positions (P, 3), directions) -> (P, D)`` in 1/sr.
 
-    What the integrator ``nerg`` shows on surfaces for an observer there, by the same functions: its depths, its
-    integral of a normalised field, its mean of an ensemble. Where no surface is met the field is as it was trained.
+    The values are those of the integrator ``nerg`` for an observer at that position, by the same functions: depths,
+    integral of a normalised field, mean of an ensemble. Directions that hit no surface are evaluated as in training.
 
-    ``medium``: what the observer's depth is traced in, in the field's frame (a medium or a ``Place``; None for a field
-    that knows no geometry); ``align``: similarity from the frame of the positions to the field's. The integrals of
-    positions are kept: neither the field nor its place may change. ``on_position`` is told how many positions are
-    known, after each new one. Raises `NergError` for a field that needs surfaces where there is no place.
+    Parameters
+    ----------
+    field : AnyGazeField
+        Gaze field.
+    medium : medium, SceneGeometry or None
+        Medium or scene in which observer depths are traced, in the frame of the field; None for a field without
+        geometry.
+    align : Similarity, optional
+        Similarity from the frame of the positions to that of the field.
+    depth_kind : str
+        Depth estimator.
+    on_position : callable, optional
+        Called with the number of evaluated positions after each new one.
+
+    Raises
+    ------
+    NergError
+        If the field needs surfaces and ``medium`` is None.
+
+    Notes
+    -----
+    The integrals of positions are cached, so the field and its geometry must not change.
     """
 
     def __init__(
@@ -201,29 +224,31 @@ class FieldDensity:
     ):
         if medium is None and field.config.needs_surfaces:
             raise NergError(
-                "this gaze field was trained among surfaces, and there is no place that has any: give it the field, "
-                "the scene or the geometry"
+                "this gaze field was trained with surfaces; pass its geometry with --field, --scene or --geometry"
             )
-        self._gaze, self._place = GazeFieldInstance(field), medium if isinstance(medium, SceneGeometry) else SceneGeometry(medium)
+        self._gaze, self._place = (
+            GazeFieldInstance(field),
+            medium if isinstance(medium, SceneGeometry) else SceneGeometry(medium),
+        )
         march = default_march_settings(self._place)
         self._settings = ObserverSettings(march=march, depth=depth_kind, surface_opacity=SURFACE_OPACITY)
         self._align, self._on_position = align or Similarity(), on_position
         self._observed: dict[bytes, ObservedGaze] = {}
 
     def __call__(self, positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Densities (P, D) of positions (P, 3) in unit directions (D, 3) or (P, D, 3)."""
+        """Evaluate the densities (P, D) of positions (P, 3) in unit directions (D, 3) or (P, D, 3)."""
         return self.members(positions, directions).mean(axis=0)
 
     def members(self, positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """The same of each member of an ensemble (M, P, D); of one field, that alone."""
+        """Evaluate the densities of each member of an ensemble (M, P, D); M is 1 for a single field."""
         align = self._align
         positions = np.atleast_2d(np.asarray(positions, np.float64)) @ align.matrix[:3, :3].T + align.matrix[:3, 3]
         directions = np.asarray(directions, np.float64) @ (align.matrix[:3, :3] / align.scale).T
         directions = np.broadcast_to(directions, (len(positions), *directions.shape[-2:]))
-        return np.stack([self._of(p, d) for p, d in zip(positions, directions)], axis=1)
+        return np.stack([self._evaluate_members(p, d) for p, d in zip(positions, directions)], axis=1)
 
-    def _of(self, position: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Densities (M, D) of one observer (3,), both in the field's frame."""
+    def _evaluate_members(self, position: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Evaluate the densities (M, D) of one observer (3,), both in the frame of the field."""
         mi = variant_types()
         p_o, key = mi.Point3f(*position.tolist()), position.tobytes()
         new = key not in self._observed
@@ -237,7 +262,7 @@ class FieldDensity:
 
 
 def format_score_table(rows: list[dict], title: str) -> str:
-    """``rows`` as a table for the terminal."""
+    """Format ``rows`` as a table for the terminal."""
     from rich.console import Console
     from rich.table import Table
 
@@ -246,74 +271,101 @@ def format_score_table(rows: list[dict], title: str) -> str:
         out.add_column(k, justify="left" if isinstance(rows[0][k], str) else "right")
     for row in rows:
         out.add_row(*(v if isinstance(v, str) else f"{v:.4f}" if k == "MAE" else f"{v:.3f}" for k, v in row.items()))
-    # A width of its own: a table in a file or a pipe must not be folded.
+    # Fixed width, so that a table in a file or pipe is not folded.
     console = Console(width=120)
     with console.capture() as text:
         console.print(out)
     return text.get().removesuffix("\n")
 
 
-# ---- A gaze field at positions, and of people, that it was not trained on, beside what needs no field ----
+# ---- Evaluation at held-out positions and on held-out participants ----
 #
-# Truth at a test position is the kernel density of the rays within R of it. Maps are compared over directions of equal
-# area, rays one by one as they are. What is uncertain is which people came: intervals are a bootstrap over persons, who
-# are drawn whole, with all of their rays (Efron & Tibshirani 1993).
+# The truth at a test position is the kernel density of the rays within R. Maps are compared over directions of equal
+# area, rays individually. The confidence intervals treat participants as the sampling unit: a bootstrap draws whole
+# participants with all of their rays (Efron and Tibshirani 1993).
 
-SPLITS = ("both", "pos", "people")  # What may be new to a field: positions and people, positions, or people
+SPLITS = ("both", "pos", "people")  # Held-out data: positions and participants, positions only, or participants only
 MAP_SCORES, RAY_SCORES = ("KLD", "CC", "SIM", "MAE"), ("NSS", "AUC", "sAUC", "bits", "loglik")
 SCORES = MAP_SCORES + RAY_SCORES
-"""KLD in nats and CC, SIM of densities normalised over the sphere; MAE in 1/sr of densities as they are; NSS; AUC-Judd;
-sAUC against rays of other test positions; bits a ray beyond the blind density; mean log density (nats of 1/sr)."""
-# Share of an evaluation's time that goes to the densities of methods that are quick; the rest goes to resamples.
-_ANSWERS = 0.2
-_PER_POSITION = 128  # Rays that are drawn at each test position, and scored one by one
+"""KLD in nats, CC and SIM of densities normalised over the sphere; MAE in 1/sr of unnormalised densities; NSS;
+AUC-Judd; sAUC against rays of other test positions; information gain over the position-blind baseline in bits per
+ray; mean log density (nats of 1/sr).
+"""
+# Fraction of the progress for evaluating the methods; the rest is for the bootstrap.
+_EVALUATION_FRACTION = 0.2
+_RAYS_PER_POSITION = 128  # Rays drawn at each test position for the ray scores
 
 
 @dataclass(frozen=True, eq=False)
 class GazeTest:
-    """What a density is scored on at P positions, of N persons, in D directions and by K rays each."""
+    """Test data at P positions, with N participants, D directions and K rays per position."""
 
-    centres: np.ndarray  # Positions (P, 3), metres, in the rays' frame
-    directions: np.ndarray  # Directions (D, 3) of equal area, in which maps are compared
+    centres: np.ndarray  # Positions (P, 3) in metres, in the frame of the rays
+    directions: np.ndarray  # Directions (D, 3) of equal area in which maps are compared
     truth: np.ndarray  # True densities (P, D), 1/sr
-    participant_densities: np.ndarray  # Those of each person alone (P, N, D)
-    counts: np.ndarray  # Rays of each person at each position (P, N)
-    participants: tuple[str, ...]  # Names of the persons
-    sample_directions: np.ndarray  # Rays drawn at each position (P, K, 3)
-    sample_participants: np.ndarray  # Whose they are (P, K), indices of the persons
-    other_directions: np.ndarray  # Rays drawn at other positions (P, K, 3)
+    participant_densities: np.ndarray  # Densities of each participant (P, N, D)
+    counts: np.ndarray  # Number of rays of each participant at each position (P, N)
+    participants: tuple[str, ...]  # Names of the participants
+    sample_directions: np.ndarray  # Directions of rays drawn at each position (P, K, 3)
+    sample_participants: np.ndarray  # Their participants (P, K)
+    other_directions: np.ndarray  # Directions of rays drawn at other positions (P, K, 3)
 
     @cached_property
     def query_directions(self) -> np.ndarray:
-        """Rays that densities are asked for, (P, 2 K, 3): those drawn at each position, then those at others."""
+        """Directions (P, 2 K, 3) at which methods are evaluated: rays of each position, then rays of other
+        positions."""
         return np.concatenate([self.sample_directions, self.other_directions], axis=1)
 
 
-def select_held_out_rays(rays: Rays, holdout: dict, split: str = "both", seed: int = 0) -> tuple[Rays, Rays, np.ndarray]:
-    """``(training rays, test rays, test centres)`` of a checkpoint's ``account`` of what it held out (``hold_out``).
+def select_held_out_rays(
+    rays: Rays, holdout: dict, split: str = "both", seed: int = 0
+) -> tuple[Rays, Rays, np.ndarray]:
+    """Select training and test rays according to the ``holdout`` description of a checkpoint
+    (``train.gaze_data.hold_out``).
 
-    ``split``: ``both``: positions and people that are new; ``pos``: people who were trained on, at new positions;
-    ``people``: new people where others were trained on. Raises ``NergError`` where nobody was held out.
+    Parameters
+    ----------
+    rays : Rays
+        All rays.
+    holdout : dict
+        Description of the held-out data.
+    split : str
+        ``both``: held-out participants at held-out positions; ``pos``: training participants at held-out positions;
+        ``people``: held-out participants at training positions.
+    seed : int
+        Seed of the test positions of ``people``.
+
+    Returns
+    -------
+    train, test : Rays
+        Training and test rays.
+    centres : numpy.ndarray
+        Test positions (T, 3).
+
+    Raises
+    ------
+    NergError
+        If the split needs held-out participants and there are none.
     """
     if split not in SPLITS:
         raise NergError(f'the split must be one of {", ".join(SPLITS)}, got "{split}"')
-    centres, unseen = np.array(holdout["centres"]), np.zeros(len(rays), bool)
+    centres, is_held_out = np.array(holdout["centres"]), np.zeros(len(rays), bool)
     if holdout.get("people"):
-        unseen = split_by_person(rays, test_persons=holdout["people"])[1]
+        is_held_out = split_by_person(rays, test_persons=holdout["people"])[1]
     elif split != "pos":
         raise NergError(
-            f'no people were held out of this training, so that there is no split "{split}"; train with --test-people'
+            f'this training held out no participants, so the split "{split}" is empty; train with --test-participants'
         )
-    away = purge(rays, centres, holdout["purged_within"])
-    train = rays.select(~unseen & away)
+    is_far = purge(rays, centres, holdout["purged_within"])
+    train = rays.select(~is_held_out & is_far)
     if split == "people":
-        scored = rays.select(unseen & away)
+        scored = rays.select(is_held_out & is_far)
         return train, scored, scored.origin[np.random.default_rng(seed).permutation(len(scored))[: len(centres)]]
-    return train, rays.select(unseen if split == "both" else ~unseen), centres
+    return train, rays.select(is_held_out if split == "both" else ~is_held_out), centres
 
 
-# Memory of an evaluation at most: maps of each person in single precision, and of a dozen methods in double.
-_BYTES_A_METHOD, _MOST_BYTES = 100, 2e9
+# Memory limit of an evaluation: maps of each participant in single precision, and of a dozen methods in double.
+_BYTES_PER_METHOD, _MAX_BYTES = 100, 2e9
 
 
 def make_test(
@@ -326,55 +378,99 @@ def make_test(
     max_rays: int = 1024,
     seed: int = 0,
 ) -> GazeTest:
-    """Truth around those of ``centres`` that have ``min_rays`` rays within ``radius`` metres, by kernels of ``kappa``.
+    """Make the test data at the ``centres`` with at least ``min_rays`` rays within ``radius`` metres.
 
-    ``directions``: that maps are compared in; ``cap``: rays that a truth is made of at most, the nearest; ``seed``: of
-    the rays that are drawn. Raises `NergError` where none has.
+    Parameters
+    ----------
+    rays : Rays
+        Test rays.
+    centres : numpy.ndarray
+        Positions (T, 3).
+    radius : float
+        Probe radius in metres.
+    kappa : float
+        Concentration of the kernels of the truth.
+    directions : int
+        Number of directions in which maps are compared.
+    min_rays, max_rays : int
+        Minimum number of rays of a position, and maximum number of (nearest) rays that define its truth.
+    seed : int
+        Seed of the drawn rays.
+
+    Raises
+    ------
+    NergError
+        If no position has enough rays, or the maps exceed the memory limit.
     """
-    enough = _enough(rays, centres, radius, min_rays)
-    if not enough.any():
-        raise NergError(f"none of {len(centres)} test positions has {min_rays} rays within {radius} m; lower min_rays")
+    has_enough = _has_enough_rays(rays, centres, radius, min_rays)
+    if not has_enough.any():
+        raise NergError(
+            f"none of {len(centres)} test positions has {min_rays} rays within {radius} m; reduce --min-rays"
+        )
     probes = place_probes(
-        rays, radius, queries=centres[enough], max_rays=max_rays, min_rays=1, kappa_rule="fixed", kappa=kappa, centre="query"
+        rays,
+        radius,
+        queries=centres[has_enough],
+        max_rays=max_rays,
+        min_rays=1,
+        kappa_rule="fixed",
+        kappa=kappa,
+        centre="query",
     )
     d, rng = fibonacci_directions(directions), np.random.default_rng(seed)
     person = rays.person[probes.indices]
     present = np.unique(person)
     P, N = len(probes), len(present)
-    if (size := P * directions * (4 * N + _BYTES_A_METHOD)) > _MOST_BYTES:
+    if (size := P * directions * (4 * N + _BYTES_PER_METHOD)) > _MAX_BYTES:
         raise NergError(
-            f"maps of {directions:,} directions at {P} positions, of {N} persons, take {size / 1e9:.0f} GB; ask for "
-            "fewer --directions, of which some thousand tell maps apart as well"
+            f"maps of {directions:,} directions at {P} positions for {N} participants need {size / 1e9:.0f} GB; use "
+            "fewer --directions (a few thousand are enough)"
         )
-    parts, counts = np.zeros((P, N, directions), np.float32), np.zeros((P, N))
+    participant_densities, counts = np.zeros((P, N, directions), np.float32), np.zeros((P, N))
     probe = np.repeat(np.arange(P), probes.counts)
-    # Runs of one person at one position are mixtures of their own.
+    # The rays of one participant at one position form a mixture.
     order = np.lexsort((person, probe))
     pair = np.stack([probe[order], np.searchsorted(present, person[order])], axis=1)
     runs, first = np.unique(pair, axis=0, return_index=True)
     kde = SphericalKde(probes.directions[order], np.append(first, len(order)), kappa)
-    parts[runs[:, 0], runs[:, 1]] = kde.evaluate(d)
+    participant_densities[runs[:, 0], runs[:, 1]] = kde.evaluate(d)
     counts[runs[:, 0], runs[:, 1]] = np.diff(np.append(first, len(order)))
-    which = np.stack([rng.integers(a, b, _PER_POSITION) for a, b in zip(probes.offsets[:-1], probes.offsets[1:])])
-    at = probes.directions[which]
-    # From farther away than 2R where there is such a position, so that no ray is on both sides.
-    apart = np.linalg.norm(probes.queries[:, None] - probes.queries[None], axis=2)
-    far = [np.flatnonzero(row > 2 * radius) if (row > 2 * radius).any() else np.flatnonzero(row > 0) for row in apart]
-    others = np.stack(
+    drawn_rays = np.stack(
+        [rng.integers(a, b, _RAYS_PER_POSITION) for a, b in zip(probes.offsets[:-1], probes.offsets[1:])]
+    )
+    sample_directions = probes.directions[drawn_rays]
+    # Take rays from positions farther than 2R away if possible, so that no ray is on both sides.
+    distance = np.linalg.norm(probes.queries[:, None] - probes.queries[None], axis=2)
+    far = [
+        np.flatnonzero(row > 2 * radius) if (row > 2 * radius).any() else np.flatnonzero(row > 0) for row in distance
+    ]
+    other_directions = np.stack(
         [
-            at[rng.choice(f, _PER_POSITION), rng.integers(0, _PER_POSITION, _PER_POSITION)] if len(f) else at[i]
+            sample_directions[
+                rng.choice(f, _RAYS_PER_POSITION), rng.integers(0, _RAYS_PER_POSITION, _RAYS_PER_POSITION)
+            ]
+            if len(f)
+            else sample_directions[i]
             for i, f in enumerate(far)
         ]
     )
-    truth = np.einsum("pn,pnd->pd", counts / counts.sum(axis=1, keepdims=True), parts)
+    truth = np.einsum("pn,pnd->pd", counts / counts.sum(axis=1, keepdims=True), participant_densities)
     names = tuple(rays.persons[i] for i in present)
     return GazeTest(
-        centres[enough], d, truth, parts, counts, names, at, np.searchsorted(present, person[which]), others
+        centres[has_enough],
+        d,
+        truth,
+        participant_densities,
+        counts,
+        names,
+        sample_directions,
+        np.searchsorted(present, person[drawn_rays]),
+        other_directions,
     )
 
 
-def _enough(rays: Rays, centres: np.ndarray, radius: float, min_rays: int) -> np.ndarray:
-    """Which of ``centres`` (P,) have ``min_rays`` rays within ``radius`` metres."""
+def _has_enough_rays(rays: Rays, centres: np.ndarray, radius: float, min_rays: int) -> np.ndarray:
+    """Return which of ``centres`` (P,) have at least ``min_rays`` rays within ``radius`` metres."""
     from scipy.spatial import KDTree
 
     return KDTree(rays.origin).query_ball_point(centres, radius, return_length=True) >= min_rays
@@ -388,86 +484,119 @@ def evaluate_gaze(
     seed: int = 0,
     on_progress: Callable[[float], None] | None = None,
 ) -> list[dict]:
-    """One row a method: the scores of ``SCORES``, each with ``.low`` and ``.high`` of a 95 % interval, and the
-    integral.
+    """Score methods on test data, with bootstrap confidence intervals.
 
-    ``blind``: the density that bits are counted from. An interval is 1.96 standard errors of the bootstrap either way;
-    not its quantiles, since the truth of a resample has fewer persons and narrower peaks, which every map meets worse.
-    The resamples are the same for all methods: the last method is the bar, and of the first one the row has ``.less``,
-    how much it is above the bar, with ``.less.low`` and ``.less.high``. The row of every other method has ``.gap``, how
-    much the first method is above it, likewise. With fewer than three persons there are no intervals. ``on_part`` is
-    told the share that is done.
+    Parameters
+    ----------
+    test : GazeTest
+        Test data.
+    methods : dict of str to Baseline
+        Methods by name. The first is compared with each of the others.
+    blind : Baseline
+        Reference density of the information gain.
+    resamples : int
+        Number of bootstrap resamples of the participants. With fewer than three participants there are no intervals.
+    seed : int
+        Seed of the bootstrap.
+    on_progress : callable, optional
+        Called with the completed fraction.
+
+    Returns
+    -------
+    list of dict
+        A row per method with the scores of ``SCORES``, each with the ends ``.low`` and ``.high`` of its 95 % confidence
+        interval, and the integral. The first row also has ``.less``, its difference to the last method; each other row
+        has ``.gap``, the difference of the first method to it. Both have intervals.
+
+    Notes
+    -----
+    An interval is ± 1.96 standard errors of the bootstrap. Quantiles are not used, because the truth of a resample has
+    fewer participants and narrower peaks, which lowers every score. All methods share the same resamples.
     """
     rng, N = np.random.default_rng(seed), len(test.participants)
-    told = on_progress or (lambda share: None)
-    answers = _answers(test, methods, blind, lambda share: told(_ANSWERS * share))
+    report = on_progress or (lambda share: None)
+    evaluated = _evaluate_methods(test, methods, blind, lambda share: report(_EVALUATION_FRACTION * share))
     rows = [
         {"method": name, **compute_map_scores(test.truth, maps), **{k: float(v.mean()) for k, v in values.items()}}
-        for name, maps, values in answers
+        for name, maps, values in evaluated
     ]
-    boot = [[] for _ in answers]
+    bootstrap = [[] for _ in evaluated]
     for number in range(resamples if N >= 3 else 0):
-        told(_ANSWERS + (1 - _ANSWERS) * number / resamples)
+        report(_EVALUATION_FRACTION + (1 - _EVALUATION_FRACTION) * number / resamples)
         times = rng.multinomial(N, np.full(N, 1 / N))
         share = test.counts * times
-        held = share.sum(axis=1) > 0
-        share = share[held] / share[held].sum(axis=1, keepdims=True)
-        truth, weight = np.einsum("pn,pnd->pd", share, test.participant_densities[held]), times[test.sample_participants].astype(float)
-        for kept, (_, maps, values) in zip(boot, answers):
-            kept.append(
+        has_rays = share.sum(axis=1) > 0
+        share = share[has_rays] / share[has_rays].sum(axis=1, keepdims=True)
+        truth, weight = (
+            np.einsum("pn,pnd->pd", share, test.participant_densities[has_rays]),
+            times[test.sample_participants].astype(float),
+        )
+        for resampled, (_, maps, values) in zip(bootstrap, evaluated):
+            resampled.append(
                 {
-                    **compute_map_scores(truth, maps[held]),
+                    **compute_map_scores(truth, maps[has_rays]),
                     **{k: float((v * weight).sum() / weight.sum()) for k, v in values.items()},
                 }
             )
-    for row, kept, (_, maps, _) in zip(rows, boot, answers):
-        for k in SCORES if kept else ():
-            reach = 1.96 * np.std([b[k] for b in kept])
-            row[f"{k}.low"], row[f"{k}.high"] = float(row[k] - reach), float(row[k] + reach)
+    for row, resampled, (_, maps, _) in zip(rows, bootstrap, evaluated):
+        for k in SCORES if resampled else ():
+            half_width = 1.96 * np.std([b[k] for b in resampled])
+            row[f"{k}.low"], row[f"{k}.high"] = float(row[k] - half_width), float(row[k] + half_width)
         row["integral"] = float(4 * np.pi * maps.mean())
-    for other, kept in zip(rows[1:], boot[1:]):
+    for other, resampled in zip(rows[1:], bootstrap[1:]):
         for k in SCORES:
-            other |= _difference(f"{k}.gap", rows[0][k] - other[k], [a[k] - b[k] for a, b in zip(boot[0], kept)])
+            other |= _make_difference(
+                f"{k}.gap", rows[0][k] - other[k], [a[k] - b[k] for a, b in zip(bootstrap[0], resampled)]
+            )
     if len(rows) > 1:
         for k in SCORES:
             rows[0] |= {key.replace(".gap", ".less"): v for key, v in rows[-1].items() if key.startswith(f"{k}.gap")}
     return rows
 
 
-def _difference(name: str, value: float, resampled: list[float]) -> dict[str, float]:
-    """``value`` by ``name``, and the ends of its 95 % interval, where it was ``resampled``."""
+def _make_difference(name: str, value: float, resampled: list[float]) -> dict[str, float]:
+    """Return ``value`` under ``name`` and, if ``resampled``, the ends of its 95 % confidence interval."""
     if not resampled:
         return {name: value}
-    reach = 1.96 * np.std(resampled)
-    return {name: value, f"{name}.low": float(value - reach), f"{name}.high": float(value + reach)}
+    half_width = 1.96 * np.std(resampled)
+    return {name: value, f"{name}.low": float(value - half_width), f"{name}.high": float(value + half_width)}
 
 
-def _answers(
-    test: GazeTest, methods: dict[str, Baseline], blind: Baseline, on_part: Callable[[float], None] | None = None
+def _evaluate_methods(
+    test: GazeTest, methods: dict[str, Baseline], blind: Baseline, on_progress: Callable[[float], None] | None = None
 ) -> list[tuple[str, np.ndarray, dict[str, np.ndarray]]]:
-    """``(name, maps (P, D), ray scores (P, K) by name)`` of each method. ``on_part`` is told the share that is done."""
+    """Evaluate each method: ``(name, maps (P, D), ray scores (P, K) by name)``.
+
+    ``on_part`` is called with the completed fraction.
+    """
     K = test.sample_directions.shape[1]
-    ask = lambda method: [np.asarray(method(test.centres, v), np.float64) for v in (test.directions, test.query_directions)]
-    maps, at = ask(blind)
-    log_prior, out = _log(at[:, :K], maps), []
+    evaluate_method = lambda method: [
+        np.asarray(method(test.centres, v), np.float64) for v in (test.directions, test.query_directions)
+    ]
+    maps, at = evaluate_method(blind)
+    log_prior, out = _log_density(at[:, :K], maps), []
     for name, method in methods.items():
-        maps, at = ask(method)
+        maps, at = evaluate_method(method)
         out.append((name, maps, compute_ray_scores(maps, at[:, :K], at[:, K:], log_prior)))
-        if on_part is not None:
-            on_part(len(out) / len(methods))
+        if on_progress is not None:
+            on_progress(len(out) / len(methods))
     return out
 
 
 def score_participants(test: GazeTest, methods: dict[str, Baseline], blind: Baseline, min_rays: int = 64) -> list[dict]:
-    """One row a method and person: the person's rays, scored; map scores at positions of ``min_rays`` such rays."""
+    """Score each method on each participant: ray scores, and map scores at positions with ``min_rays`` rays of the
+    participant.
+    """
     rows = []
-    for name, maps, values in _answers(test, methods, blind):
+    for name, maps, values in _evaluate_methods(test, methods, blind):
         for i, person in enumerate(test.participants):
-            own, enough = test.sample_participants == i, test.counts[:, i] >= min_rays
+            is_participant, has_enough = test.sample_participants == i, test.counts[:, i] >= min_rays
             scores = dict.fromkeys(MAP_SCORES, float("nan"))
-            if enough.any():
-                scores = compute_map_scores(test.participant_densities[enough, i], maps[enough])
-            rays = {k: float(v[own].mean()) if own.any() else float("nan") for k, v in values.items()}
+            if has_enough.any():
+                scores = compute_map_scores(test.participant_densities[has_enough, i], maps[has_enough])
+            rays = {
+                k: float(v[is_participant].mean()) if is_participant.any() else float("nan") for k, v in values.items()
+            }
             rows.append({"method": name, "person": person, "rays": int(test.counts[:, i].sum()), **scores, **rays})
     return rows
 
@@ -481,15 +610,18 @@ def score_split_half(
     min_rays: int = 64,
     seed: int = 0,
 ) -> dict | None:
-    """Scores of one half of the people of ``test_side`` as predicted by the other, where both have ``min_rays`` rays: a
-    reference and no bound. None where there is no such position, or only one person."""
+    """Score one half of the participants as predicted by the other half, at positions where both have ``min_rays``
+    rays.
+
+    This is a reference, not an upper bound. Returns None if there is no such position, or only one participant.
+    """
     if len(np.unique(test_rays.person)) < 2:
         return None
     halves = [test_rays.select(mask) for mask in split_by_person(test_rays, seed=seed)]
-    both = np.logical_and(*(_enough(half, centres, radius, min_rays) for half in halves))
-    if not both.any():
+    has_both = np.logical_and(*(_has_enough_rays(half, centres, radius, min_rays) for half in halves))
+    if not has_both.any():
         return None
-    first = make_test(halves[0], centres[both], radius, kappa, min_rays=min_rays)
+    first = make_test(halves[0], centres[has_both], radius, kappa, min_rays=min_rays)
     probes = place_probes(
         halves[1], radius, queries=first.centres, min_rays=1, kappa_rule="fixed", kappa=kappa, centre="query"
     )
@@ -499,7 +631,7 @@ def score_split_half(
 
 
 def compute_map_scores(truth: np.ndarray, maps: np.ndarray) -> dict[str, float]:
-    """Means over positions of the scores of ``MAPS``."""
+    """Return the means over positions of ``MAP_SCORES``."""
     return {
         "KLD": float(metrics.kld(truth, maps, eps=EPS).mean()),
         "CC": float(metrics.cc(truth, maps).mean()),
@@ -508,12 +640,29 @@ def compute_map_scores(truth: np.ndarray, maps: np.ndarray) -> dict[str, float]:
     }
 
 
-def compute_ray_scores(maps: np.ndarray, sample_densities: np.ndarray, other_densities: np.ndarray, log_prior: np.ndarray) -> dict[str, np.ndarray]:
-    """The scores of ``RAYS`` of each ray, (P, K), from the densities ``maps`` (P, D), at the rays ``at`` (P, K), and at
-    rays that were seen from elsewhere, ``others`` (P, M). AUC of a ray: the share of the sphere whose density is lower,
-    ties half; their mean is AUC-Judd with as many thresholds as there are values."""
-    log = _log(sample_densities, maps)
-    below = lambda among: np.stack([_share_below(a, g) for a, g in zip(among, sample_densities)])
+def compute_ray_scores(
+    maps: np.ndarray, sample_densities: np.ndarray, other_densities: np.ndarray, log_prior: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Compute ``RAY_SCORES`` of each ray (P, K).
+
+    Parameters
+    ----------
+    maps : numpy.ndarray
+        Densities (P, D) over the sphere.
+    sample_densities : numpy.ndarray
+        Densities (P, K) at the rays.
+    other_densities : numpy.ndarray
+        Densities (P, M) at rays of other positions.
+    log_blind : numpy.ndarray
+        Log of the reference density (P, K) at the rays.
+
+    Notes
+    -----
+    The AUC of a ray is the fraction of the sphere with a lower density, counting ties half. Its mean is AUC-Judd with a
+    threshold at each value.
+    """
+    log = _log_density(sample_densities, maps)
+    below = lambda among: np.stack([_fraction_below(a, g) for a, g in zip(among, sample_densities)])
     return {
         "NSS": metrics.nss(maps, sample_densities),
         "AUC": below(maps),
@@ -523,12 +672,13 @@ def compute_ray_scores(maps: np.ndarray, sample_densities: np.ndarray, other_den
     }
 
 
-def _log(at: np.ndarray, maps: np.ndarray) -> np.ndarray:
-    """Log of densities at rays, normalised over the sphere; what is negative or zero counts as the smallest."""
+def _log_density(sample_densities: np.ndarray, maps: np.ndarray) -> np.ndarray:
+    """Return the log of densities at rays, normalised over the sphere; non-positive values count as the smallest
+    float."""
     sphere = 4 * np.pi * np.maximum(maps, 0).mean(axis=1, keepdims=True)
-    return np.log(np.maximum(at, 0) / np.where(sphere > 0, sphere, 1) + np.finfo(float).eps)
+    return np.log(np.maximum(sample_densities, 0) / np.where(sphere > 0, sphere, 1) + np.finfo(float).eps)
 
 
-def _share_below(row: np.ndarray, gaze: np.ndarray) -> np.ndarray:
+def _fraction_below(row: np.ndarray, gaze: np.ndarray) -> np.ndarray:
     ordered = np.sort(row)
     return 0.5 * (np.searchsorted(ordered, gaze, "left") + np.searchsorted(ordered, gaze, "right")) / len(row)

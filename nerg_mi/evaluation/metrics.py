@@ -1,4 +1,4 @@
-"""Measures: of images, and of densities over directions."""
+"""Metrics of images and of densities over directions."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from nerg_mi.errors import NergError, translate_mitsuba_errors
 from nerg_mi.figures.overlay import srgb, write_png
 from nerg_mi.figures.style import make_provenance
 from nerg_mi.files.atomic import make_folder
-from nerg_mi.maths.color import mean_ignoring_nan, psnr, color_corrected_psnr
-from nerg_mi.photos.cameras import PosedCamera, pixel_directions, make_sensor_dict
-from nerg_mi.photos.images import PhotoView, make_pinhole_camera, apply_lens
+from nerg_mi.maths.color import color_corrected_psnr, mean_ignoring_nan, psnr
+from nerg_mi.photos.cameras import PosedCamera, make_sensor_dict, pixel_directions
+from nerg_mi.photos.images import PhotoView, apply_lens, make_pinhole_camera
 
 # ---- Images ----
 #
-# How well a radiance field's pictures equal posed pictures: PSNR, SSIM, depth.
+# Quality of a radiance field's renderings compared with posed photos: PSNR, SSIM, depth.
 #
-# Pictures are rendered by the `nerg` integrator at its defaults, through ``mi.render``. A photo with lens distortion is
-# left as it is; the rendering is bent to its lens.
+# Renderings use the `nerg` integrator with its defaults, through ``mi.render``. A photo with lens distortion is not
+# resampled; the lens is applied to the rendering.
 
 
-# Wang et al. 2004: window of 11 x 11 pixels, a Gaussian of 1.5; constants for values in 0..1.
+# Wang et al. 2004: window of 11 x 11 pixels, Gaussian with σ = 1.5; constants for values in 0..1.
 _RADIUS, _SIGMA, _C1, _C2 = 5, 1.5, 0.01**2, 0.03**2
 
 
 def ssim(picture: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """Structural similarity (Wang et al. 2004) of values in 0..1, (h, w, c), the mean over channels.
+    """Compute the structural similarity (Wang et al. 2004) of values in 0..1, (h, w, c), averaged over channels.
 
-    Averaged over the windows that lie in the picture and, where one is given, in ``mask`` (h, w); NaN if there is none.
+    The mean is over the windows inside the picture and ``mask`` (h, w), if given; NaN if there are none.
     """
     from scipy.ndimage import correlate1d, minimum_filter
 
@@ -46,16 +46,22 @@ def ssim(picture: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None)
     var_a, var_b, covariance = blur(a * a) - mean_a**2, blur(b * b) - mean_b**2, blur(a * b) - mean_a * mean_b
     score = (2 * mean_a * mean_b + _C1) * (2 * covariance + _C2)
     score /= (mean_a**2 + mean_b**2 + _C1) * (var_a + var_b + _C2)
-    whole = np.ones((height, width), bool) if mask is None else np.asarray(minimum_filter(mask, 2 * _RADIUS + 1), bool)
+    is_inside = (
+        np.ones((height, width), bool) if mask is None else np.asarray(minimum_filter(mask, 2 * _RADIUS + 1), bool)
+    )
     inner = (slice(_RADIUS, -_RADIUS),) * 2
-    kept = score[inner][whole[inner]]
-    return float(kept.mean()) if kept.size else float("nan")
+    scores = score[inner][is_inside[inner]]
+    return float(scores.mean()) if scores.size else float("nan")
 
 
 @dataclass(frozen=True)
 class DepthScore:
-    """Over pixels whose true depth is known: ``median``, ``mean``: of the absolute error, scene units; ``off``: share
-    that is wrong by more than a tenth (or empty); ``opacity``: mean, and ``translucent``: share below 0.9."""
+    """Depth errors over pixels with known depth.
+
+    ``median`` and ``mean`` are absolute errors in scene units, ``outlier_fraction`` the fraction of pixels with an
+    error above 10 % (or without a surface), ``opacity`` the mean, and ``translucent_fraction`` the fraction of pixels
+    with opacity below 0.9.
+    """
 
     median: float
     mean: float
@@ -65,18 +71,19 @@ class DepthScore:
 
 
 def compute_depth_score(depth: np.ndarray, opacity: np.ndarray, truth: np.ndarray) -> DepthScore | None:
-    """Score of ``depth`` (h, w), 0 where there is none, against ``truth`` (h, w), 0 where unknown; None if nowhere
-    known."""
-    known = truth > 0
-    if not known.any():
+    """Score ``depth`` (h, w), 0 where there is none, against ``truth`` (h, w), 0 where unknown; None if no depth is
+    known.
+    """
+    has_truth = truth > 0
+    if not has_truth.any():
         return None
-    # A hole is as wrong as its depth of 0 says.
-    error = np.abs(depth[known] - truth[known])
-    alpha = opacity[known]
+    # A hole counts with its depth of 0.
+    error = np.abs(depth[has_truth] - truth[has_truth])
+    alpha = opacity[has_truth]
     return DepthScore(
         float(np.median(error)),
         float(error.mean()),
-        float(np.mean(error > 0.1 * truth[known])),
+        float(np.mean(error > 0.1 * truth[has_truth])),
         float(alpha.mean()),
         float(np.mean(alpha < 0.9)),
     )
@@ -84,9 +91,11 @@ def compute_depth_score(depth: np.ndarray, opacity: np.ndarray, truth: np.ndarra
 
 @dataclass(frozen=True)
 class RenderedView:
-    """``color`` (h, w, 3): sRGB before black, composited as a picture with alpha is; ``depth`` (h, w): the
-    integrator's default, the median, from the camera's centre, scene units; ``opacity`` (h, w); ``mask``: pixels that
-    could be rendered."""
+    """Rendering of a view.
+
+    ``color`` (h, w, 3) is sRGB over black, composited as a photo with alpha; ``depth`` (h, w) the integrator's default,
+    the median, from the camera centre in scene units; ``opacity`` (h, w); ``mask`` the pixels that could be rendered.
+    """
 
     color: np.ndarray
     depth: np.ndarray
@@ -94,11 +103,11 @@ class RenderedView:
     mask: np.ndarray
 
 
-_LAUNCH = 1 << 23  # Samples that are rendered at once: the memory for those of a whole picture may not be there
+_MAX_LAUNCH = 1 << 23  # Maximum samples per launch, to limit memory
 
 
 class FieldRenderer:
-    """Renders the field in a checkpoint as the cameras of a data set see it. Needs a Mitsuba variant."""
+    """Renders the field of a checkpoint with the cameras of a data set. Needs a Mitsuba variant."""
 
     def __init__(self, field: str | Path, spp: int = 16):
         import mitsuba as mi
@@ -109,41 +118,41 @@ class FieldRenderer:
             self.scene = mi.load_dict({"type": "scene", "integrator": integrator})
 
     def __call__(self, camera: PosedCamera, seed: int = 0) -> RenderedView:
-        """``camera``'s picture, ``spp`` rays a pixel."""
+        """Render the view of ``camera`` with ``spp`` rays per pixel."""
         import drjit as dr
         import mitsuba as mi
 
         i = camera.intrinsics
-        plain = not i.is_distorted and abs(i.fx / i.fy - 1) < 1e-9
-        source = camera if plain else make_pinhole_camera(camera)
-        about = make_sensor_dict(source)
-        about["sampler"] = {"type": "multijitter", "sample_count": self.spp}
+        is_pinhole = not i.is_distorted and abs(i.fx / i.fy - 1) < 1e-9
+        source = camera if is_pinhole else make_pinhole_camera(camera)
+        sensor_params = make_sensor_dict(source)
+        sensor_params["sampler"] = {"type": "multijitter", "sample_count": self.spp}
         with translate_mitsuba_errors():
-            sensor = mi.load_dict(about)
+            sensor = mi.load_dict(sensor_params)
         params = mi.traverse(sensor)
         to_world: Any = params["to_world"]
-        # As a literal every pose would compile kernels of its own.
+        # Literal poses would compile kernels for each camera.
         pose = mi.Transform4f(to_world)
         dr.make_opaque(pose)
         params["to_world"] = pose
         params.update()
-        each = max(_LAUNCH // (source.intrinsics.width * source.intrinsics.height), 1)
+        launch_spp = max(_MAX_LAUNCH // (source.intrinsics.width * source.intrinsics.height), 1)
         out = np.zeros(())
-        for first in range(0, self.spp, each):
-            count = min(each, self.spp - first)
+        for first in range(0, self.spp, launch_spp):
+            count = min(launch_spp, self.spp - first)
             with translate_mitsuba_errors():
                 part = mi.render(self.scene, sensor=sensor, spp=count, seed=mi.UInt32(seed + first))
                 out = out + np.array(part, np.float64) * (count / self.spp)
-            # Mitsuba takes Ctrl-C while it renders.
+            # Mitsuba handles Ctrl-C while it renders.
             if self.scene.integrator().should_stop():
                 raise KeyboardInterrupt
         opacity = np.clip(out[..., 4], 0, 1)
-        some = np.maximum(opacity, 1e-6)[..., None]
-        color = opacity[..., None] * srgb(out[..., :3] / some)
-        # Rays start at the near plane; depth is counted from there.
+        safe_opacity = np.maximum(opacity, 1e-6)[..., None]
+        color = opacity[..., None] * srgb(out[..., :3] / safe_opacity)
+        # Rays start at the near plane, and depth is measured from there.
         along = -pixel_directions(source.intrinsics)[..., 2]
-        depth = np.where(opacity > 0, out[..., 3] + about["near_clip"] / along, 0)
-        if plain:
+        depth = np.where(opacity > 0, out[..., 3] + sensor_params["near_clip"] / along, 0)
+        if is_pinhole:
             return RenderedView(color, depth, opacity, np.ones(opacity.shape, bool))
         stacked, mask = apply_lens(np.dstack([color, depth, opacity]).astype(np.float32), source, camera)
         return RenderedView(np.clip(stacked[..., :3], 0, 1), stacked[..., 3], np.clip(stacked[..., 4], 0, 1), mask)
@@ -151,35 +160,35 @@ class FieldRenderer:
 
 @dataclass(frozen=True)
 class ViewScores:
-    """Scores of a field on posed pictures."""
+    """Scores of a field on posed photos."""
 
-    views: list[str]  # Names of the views; the lists below are in their order
-    width: int  # Of the first view's picture, in pixels
+    views: list[str]  # Names of the views, in the order of the lists below
+    width: int  # Size of the first photo in pixels
     height: int
-    spp: int  # Rays a pixel
-    psnr: list[float]  # Of each view, in dB; NaN of one that its mask leaves nothing of
-    ssim: list[float]  # Of each view; NaN of one that holds no window of 11 x 11 pixels
-    # Of the right half of each view in dB, its colours fitted on the left half; NaN where it has no pixel.
+    spp: int  # Rays per pixel
+    psnr: list[float]  # PSNR of each view in dB; NaN if fully masked
+    ssim: list[float]  # SSIM of each view; NaN if it has no window of 11 x 11 pixels
+    # PSNR of the right half of each view in dB after fitting its colours on the left half; NaN without pixels.
     psnr_fitted: list[float]
-    depth: DepthScore | None  # Means over the views with true depth; None where there are none
+    depth: DepthScore | None  # Means over the views with true depth; None if there are none
 
     @property
     def psnr_mean(self) -> float:
-        """The mean over the views, in dB."""
+        """Mean over the views in dB."""
         return mean_ignoring_nan(self.psnr)
 
     @property
     def psnr_fitted_mean(self) -> float:
-        """The mean over the views whose colours could be fitted, in dB."""
+        """Mean over the views with fitted colours in dB."""
         return mean_ignoring_nan(self.psnr_fitted)
 
     @property
     def ssim_mean(self) -> float:
-        """The mean over the views that have one."""
+        """Mean over the views with windows."""
         return mean_ignoring_nan(self.ssim)
 
     def to_dict(self) -> dict:
-        """For JSON: the fields and the means; without ``depth`` where it is None."""
+        """Return the fields and means for JSON, without ``depth`` if it is None."""
         names = ["views", "width", "height", "spp", "psnr", "psnr_mean", "ssim", "ssim_mean"]
         names += ["psnr_fitted", "psnr_fitted_mean"]
         out = {name: getattr(self, name) for name in names}
@@ -193,28 +202,48 @@ def score_views(
     picture_folder: Path | None = None,
     on_view: Callable[[str, float, float], None] = lambda name, psnr, ssim: None,
 ) -> ViewScores:
-    """Scores of the field in a checkpoint on ``views``; writes each picture beside its truth into the folder
-    ``pictures``. ``on_view`` is told each view's name, PSNR in dB and SSIM. Raises `NergError` without any view."""
+    """Score the field of a checkpoint on ``views``.
+
+    Parameters
+    ----------
+    field : str or Path
+        Checkpoint of a radiance field.
+    views : list of PhotoView
+        Posed photos.
+    spp : int
+        Rays per pixel.
+    picture_folder : Path, optional
+        Folder for pictures of each rendering, with the photo to its right.
+    on_view : callable
+        Called with the name, PSNR in dB and SSIM of each view.
+
+    Raises
+    ------
+    NergError
+        If there are no views.
+    """
     if not views:
-        raise NergError("there are no views to score; the data set holds none out, so give --holdout 8 or --train")
+        raise NergError(
+            "the data set has no held-out views to score; use --holdout 8, or --train to score training views"
+        )
     render, rows, depths = FieldRenderer(field, spp), [], []
     text: dict[str, str] = {}
     if picture_folder is not None:
         make_folder(picture_folder)
         text = make_provenance("nerg eval radiance", [field], None, {"spp": spp}).text()
     for k, view in enumerate(views):
-        seen, truth = render(view.camera, k), view.composite_over(0)
-        mask = seen.mask if view.mask is None else seen.mask & view.mask
+        rendered, truth = render(view.camera, k), view.composite_over(0)
+        mask = rendered.mask if view.mask is None else rendered.mask & view.mask
         alpha = view.color[..., 3] if view.has_alpha else None
-        fitted = color_corrected_psnr(seen.color, truth, alpha, mask)
-        rows.append((psnr(seen.color, truth, mask), ssim(seen.color, truth, mask), fitted))
+        fitted = color_corrected_psnr(rendered.color, truth, alpha, mask)
+        rows.append((psnr(rendered.color, truth, mask), ssim(rendered.color, truth, mask), fitted))
         if view.depth is not None:
-            depths.append(compute_depth_score(seen.depth, seen.opacity, np.where(mask, view.depth, 0)))
+            depths.append(compute_depth_score(rendered.depth, rendered.opacity, np.where(mask, view.depth, 0)))
         if picture_folder is not None:
-            both = np.concatenate([seen.color, truth], axis=1)
+            both = np.concatenate([rendered.color, truth], axis=1)
             write_png(picture_folder / f"{Path(view.name).stem}.png", both, text)
         on_view(view.name, *rows[-1][:2])
-    known = [d for d in depths if d is not None]
+    depth_scores = [d for d in depths if d is not None]
     return ViewScores(
         views=[v.name for v in views],
         width=views[0].shape[1],
@@ -223,7 +252,7 @@ def score_views(
         psnr=[r[0] for r in rows],
         ssim=[r[1] for r in rows],
         psnr_fitted=[r[2] for r in rows],
-        depth=_mean_depth_score(known) if known else None,
+        depth=_mean_depth_score(depth_scores) if depth_scores else None,
     )
 
 
@@ -233,70 +262,84 @@ def _mean_depth_score(scores: list[DepthScore]) -> DepthScore:
 
 # ---- Scores of gaze densities, weighted by solid angle ----
 #
-# Definitions of saliency research (pysaliency, Kümmerer et al. 2018), which on a sphere need the solid angle of each
-# direction: on a latitude-longitude picture the unweighted KLD of a known pair is 0.69 where the true one is 1.01.
+# Definitions of saliency research (pysaliency, Kümmerer et al. 2018), weighted by the solid angle of each direction: on
+# a latitude-longitude picture the unweighted KLD of a test pair is 0.69 instead of the correct 1.01.
 #
-# Maps are arrays (..., D), directions along the last axis; scores have the leading shape. ``weights`` (D,) or
-# broadcastable: solid angles, in any unit; ``None`` says that all directions are of equal area. Everything is float64
-# and defined: maps that are constant or zero give a number, not NaN.
+# Maps are arrays (..., D) with directions along the last axis; scores have the leading shape. ``weights`` (D,) or
+# broadcastable are solid angles in any unit; ``None`` means equal areas. All results are float64 and finite: constant
+# and zero maps give a number, not NaN.
 
-EPS = 1e-20  # Of a map's mean: far below any density that matters, far above underflow
+EPS = 1e-20  # Relative to the mean of a map: far below any relevant density, far above underflow
 
 
 def kld(
     truth: np.ndarray, prediction: np.ndarray, weights: np.ndarray | None = None, *, eps: float = EPS
 ) -> np.ndarray:
-    """Kullback-Leibler divergence KL(truth || prediction) in nats; 0 is best.
+    """Compute the Kullback-Leibler divergence KL(truth || prediction) in nats; 0 is best.
 
-    Both are divided by their integral; negative values are lifted to zero by the map's minimum, as pysaliency does.
-    ``eps``, in units of the uniform density, is added to both, and bounds what a prediction of zero costs: a sparse
-    truth makes the score depend on it, so name it where it is not the default.
+    Both are normalised to their integral after shifting negative values to zero by the minimum of the map, as in
+    pysaliency. ``eps``, relative to the uniform density, is added to both and bounds the penalty of a zero prediction.
+    With a sparse truth the score depends on it, so state it if it is not the default.
     """
-    w = _shares(truth, prediction, weights)
-    p, q = _relative(truth, w) + eps, _relative(prediction, w) + eps
+    w = _normalise_weights(truth, prediction, weights)
+    p, q = _normalise_density(truth, w) + eps, _normalise_density(prediction, w) + eps
     return np.sum(w * p * (np.log(p) - np.log(q)), axis=-1) / (1.0 + eps)
 
 
 def cc(truth: np.ndarray, prediction: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
-    """Pearson's correlation with weighted means, in [-1, 1]; 0 when either map
-    is constant (there is nothing to agree with)."""
-    w = _shares(truth, prediction, weights)
-    x, y = _standardised(truth, w), _standardised(prediction, w)
+    """Compute Pearson's correlation with weighted means, in [-1, 1]; 0 if either map is constant."""
+    w = _normalise_weights(truth, prediction, weights)
+    x, y = _standardise(truth, w), _standardise(prediction, w)
     return np.clip(np.sum(w * x * y, axis=-1), -1.0, 1.0)
 
 
 def sim(truth: np.ndarray, prediction: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
-    """Histogram intersection of the two normalised densities, in [0, 1]; 1 is
-    best. Not range-normalised first, as pysaliency and unlike Salient360."""
-    w = _shares(truth, prediction, weights)
-    return np.sum(w * np.minimum(_relative(truth, w), _relative(prediction, w)), axis=-1)
+    """Compute the histogram intersection of the normalised densities, in [0, 1]; 1 is best.
+
+    Maps are not range-normalised first, as in pysaliency and unlike Salient360.
+    """
+    w = _normalise_weights(truth, prediction, weights)
+    return np.sum(w * np.minimum(_normalise_density(truth, w), _normalise_density(prediction, w)), axis=-1)
 
 
 def mae(truth: np.ndarray, prediction: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
-    """Mean absolute difference over the sphere in the maps' unit, 1/sr; 4π times it is relative to uniform. Not
-    normalised, so it sees a wrong integral; it grows with κ."""
-    w = _shares(truth, prediction, weights)
+    """Compute the mean absolute difference over the sphere in the unit of the maps, 1/sr; times 4π it is relative to
+    uniform.
+
+    Maps are not normalised, so a wrong integral counts; the value grows with κ.
+    """
+    w = _normalise_weights(truth, prediction, weights)
     return np.sum(w * np.abs(np.asarray(truth, np.float64) - np.asarray(prediction, np.float64)), axis=-1)
 
 
 def nss(density: np.ndarray, at_gaze: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
-    """Normalised scanpath saliency of each gaze: (value - mean) / standard deviation of the map (population, weighted).
-    Average it over gazes.
+    """Compute the normalised scanpath saliency of each gaze sample: (value - mean) / standard deviation of the map.
 
-    ``density`` (..., D); ``at_gaze`` (..., K): the map's values where people looked (rays or fixations, not a blurred
-    map). Returns (..., K); 0 for a constant map.
+    Parameters
+    ----------
+    density : numpy.ndarray
+        Map (..., D).
+    at_gaze : numpy.ndarray
+        Values (..., K) of the map at gaze samples (rays or fixations, not a blurred map).
+    weights : numpy.ndarray, optional
+        Solid angles.
+
+    Returns
+    -------
+    numpy.ndarray
+        Scores (..., K) to be averaged over samples; 0 for a constant map.
     """
-    w = _shares(density, density, weights)
+    w = _normalise_weights(density, density, weights)
     density, at_gaze = np.asarray(density, np.float64), np.asarray(at_gaze, np.float64)
-    mean, deviation = _moments(density, w)
+    mean, deviation = _compute_moments(density, w)
     return np.where(deviation > 0, (at_gaze - mean) / np.where(deviation > 0, deviation, 1.0), 0.0)
 
 
-def _shares(a: np.ndarray, b: np.ndarray, weights: np.ndarray | None) -> np.ndarray:
-    """Weights that sum to one along the last axis."""
+def _normalise_weights(a: np.ndarray, b: np.ndarray, weights: np.ndarray | None) -> np.ndarray:
+    """Return weights that sum to one along the last axis."""
     shape, other = np.shape(a), np.shape(b)
     if not shape or not other or shape[-1] != other[-1]:
-        raise ValueError(f"maps of shape {shape} and {other} do not have the same directions along the last axis")
+        raise ValueError(f"maps of shape {shape} and {other} must have the same directions along the last axis")
     if weights is None:
         return np.full(shape[-1], 1.0 / shape[-1])
     w = np.asarray(weights, dtype=np.float64)
@@ -307,36 +350,38 @@ def _shares(a: np.ndarray, b: np.ndarray, weights: np.ndarray | None) -> np.ndar
     return w / w.sum(axis=-1, keepdims=True)
 
 
-def _relative(density: np.ndarray, w: np.ndarray) -> np.ndarray:
-    """Density over its mean, that is in units of the uniform density of the same
-    integral; a map of zeros is uniform."""
+def _normalise_density(density: np.ndarray, w: np.ndarray) -> np.ndarray:
+    """Return the density relative to the uniform density of the same integral; a map of zeros is uniform."""
     density = np.asarray(density, dtype=np.float64)
     density = density - np.minimum(density.min(axis=-1, keepdims=True), 0.0)
-    # Scaled by the maximum first: the mean of tiny values may underflow.
+    # Scale by the maximum first, because the mean of tiny values may underflow.
     top = density.max(axis=-1, keepdims=True)
     density = np.where(top > 0, density / np.where(top > 0, top, 1.0), 1.0)
     mean = np.sum(w * density, axis=-1, keepdims=True)
     return np.where(mean > 0, density / np.where(mean > 0, mean, 1.0), 1.0)
 
 
-def _moments(values: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Weighted mean and population standard deviation, (..., 1); a deviation within rounding of a constant is zero."""
-    # In units of the largest: squares of the values themselves under- or overflow beyond 1e±154.
-    top = _largest(values)
+def _compute_moments(values: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the weighted mean and population standard deviation, (..., 1).
+
+    A deviation within the rounding error of a constant is zero.
+    """
+    # Relative to the largest value, because squares of values beyond 1e±154 under- or overflow.
+    top = _max_magnitude(values)
     values = values / top
     mean = np.sum(w * values, axis=-1, keepdims=True)
     deviation = np.sqrt(np.sum(w * (values - mean) ** 2, axis=-1, keepdims=True))
     return mean * top, np.where(deviation > 1e-13, deviation, 0.0) * top
 
 
-def _largest(values: np.ndarray) -> np.ndarray:
-    """Largest magnitude along the last axis, (..., 1); 1 where all are zero."""
+def _max_magnitude(values: np.ndarray) -> np.ndarray:
+    """Return the largest magnitude along the last axis, (..., 1); 1 if all are zero."""
     top = np.abs(values).max(axis=-1, keepdims=True)
     return np.where(top > 0, top, 1.0)
 
 
-def _standardised(values: np.ndarray, w: np.ndarray) -> np.ndarray:
+def _standardise(values: np.ndarray, w: np.ndarray) -> np.ndarray:
     values = np.asarray(values, dtype=np.float64)
-    values = values / _largest(values)
-    mean, deviation = _moments(values, w)
+    values = values / _max_magnitude(values)
+    mean, deviation = _compute_moments(values, w)
     return np.where(deviation > 0, (values - mean) / np.where(deviation > 0, deviation, 1.0), 0.0)

@@ -1,4 +1,4 @@
-"""A study of error against run time: its settings, its operations, the paper's march, and the measurement."""
+"""Study of error against run time: settings, operation counts, the march of the paper, and measurement."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from nerg_mi.transport.observer import visibility
 from nerg_mi.transport.quadrature import RULES
 
 from . import study_truth
-from .study_subject import read_splat_extent, read_parameters
+from .study_subject import read_parameters, read_splat_extent
 from .study_truth import ERROR_NAMES, StudyTruth, compute_errors
 
-# ---- How much work a render is, counted: operations traced into its kernels, and evaluations made ----
+# ---- Amount of work of a render: traced operations and evaluations ----
 
 
 def count_traced_operations(render) -> int:
-    """Operations of all kernels that the call ``render()`` launches.
+    """Count the operations of all kernels that ``render()`` launches.
 
-    Dr.Jit counts the instructions of its intermediate representation, loops counted once: what is not traced
-    is not counted, and a count does not depend on the machine or on how busy it is.
+    Dr.Jit counts the instructions of its intermediate representation, loops once. The count does not depend on the
+    machine or its load.
     """
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history()
@@ -43,30 +43,43 @@ def count_traced_operations(render) -> int:
 
 # ---- Paper ----
 #
-# The marching of the paper's code, for comparison: an implementation of its rule apart from ``transport``.
+# The march of the paper's code for comparison, implemented independently of ``transport``.
 #
-# As the inference kernels of torch-ngp do it, on which the paper's code rests: at most ``steps`` samples a ray; step
-# dt = clamp(t·γ, diagonal/steps, diagonal/128); density and colour sampled at the step's start; α = 1 - exp(-σ dt),
-# w = αT; a cell of the occupancy grid that is empty is left in multiples of dt; the march ends where T < 1e-4. Depth is
-# Σ w_i t_i with t_i the *end* of step i, and is not divided by the opacity Σ w_i. Every sample gets a colour. The
-# observer's ray towards p_d is marched likewise, and its depth compared with the distance.
+# It follows the inference kernels of torch-ngp, on which the paper's code is based: at most ``steps`` samples per ray;
+# step dt = clamp(t·γ, diagonal/steps, diagonal/128); density and colour sampled at the start of the step; α = 1 -
+# exp(-σ dt), w = αT; empty cells of the occupancy grid are skipped in multiples of dt; the march ends where T < 1e-4.
+# Depth is Σ w_i t_i with t_i the *end* of step i, and is not divided by the opacity Σ w_i. Every sample evaluates the
+# colour. The observer ray towards p_d is marched in the same way, and its depth is compared with the distance.
 #
-# Not taken over, because they would only make it worse here: fp16 networks, the near distance of 0.2, cascades, a
-# comparison tolerance of 1e-5 (ours is the study's), gaze without a surface, and a sign of the shadow that shows what
-# is hidden. A normalised gaze field is divided by the integral that ``nerg`` finds: the paper has none.
+# Omitted, because they would only increase the error here: fp16 networks, the near distance of 0.2, cascades, a
+# comparison tolerance of 1e-5 (the tolerance of the study is used), gaze without a surface, and the sign of the shadow
+# that shows hidden regions. A normalised gaze field is divided by the integral of ``nerg``, because the paper has none.
 
 PAPER_STEPS = 1024
-PAPER_DT_GAMMA = 1 / 128  # The step growth that the paper's code has by default for scenes larger than its unit cube
+PAPER_DT_GAMMA = 1 / 128  # Default step growth of the paper's code for scenes larger than its unit cube
 PAPER_STOP = 1e-4
 
 
 def make_paper_integrator(integrator, sensor, tolerance: float, steps: int = PAPER_STEPS, dt_gamma: float = 0.0):
-    """An integrator with the field, gaze, observer and AOVs of ``integrator`` (a ``nerg``) that marches by the paper's
-    rule.
+    """Make an integrator that marches as in the paper, with the field, gaze, observer and AOVs of ``integrator`` (a
+    ``nerg``).
 
-    ``sensor``: the camera, which is the observer where there is no other; ``tolerance`` of visibility in scene units;
-    ``steps``: to the medium's diagonal, and most samples a ray; ``dt_gamma``: growth γ of steps with distance. Its AOVs
-    are depth, opacity, visibility, gaze and the three counts.
+    Parameters
+    ----------
+    integrator : NergIntegrator
+        Source of the field and settings.
+    sensor : mitsuba.Sensor
+        Camera, which is the observer if there is no other.
+    tolerance : float
+        Tolerance of the visibility in scene units.
+    steps : int
+        Steps along the diagonal of the medium, and maximum number of samples per ray.
+    dt_gamma : float
+        Growth γ of steps with distance.
+
+    Notes
+    -----
+    Available AOVs are depth, opacity, visibility, gaze and the three counts.
     """
     import mitsuba as mi
 
@@ -75,7 +88,7 @@ def make_paper_integrator(integrator, sensor, tolerance: float, steps: int = PAP
 
 @functools.cache
 def _integrator_class(variant: str):
-    """The class for a variant; Mitsuba's must not be derived from when this module is imported."""
+    """Return the class for a variant. Mitsuba classes cannot be derived from when this module is imported."""
     import mitsuba as mi
 
     class PaperIntegrator(mi.SamplingIntegrator):
@@ -97,29 +110,29 @@ def _integrator_class(variant: str):
 
         def sample(self, scene, sampler, ray, medium=None, active=True):
             like, names = self._like, self._like.aovs
-            painter, active = None, mi.Bool(active)
+            shader, active = None, mi.Bool(active)
             if like.radiance and like.medium.has_color:
                 spectral = like.medium.color_space == "spectrum"
-                painter = make_color_shader(like.medium, mi.Spectrum if spectral else mi.Color3f)
+                shader = make_color_shader(like.medium, mi.Spectrum if spectral else mi.Color3f)
             local = like.medium.ray_to_local(ray.o, ray.d)
             t0, t1 = dr.maximum(local.t_near, 0), dr.minimum(local.t_far, ray.maxt)
-            alpha, depth, total, n = self._march(local, t0, t1, active, painter)
+            alpha, depth, total, n = self._march(local, t0, t1, active, shader)
             surface = alpha >= like.observer_settings.surface_opacity
             out = {
                 "depth": depth,
                 "opacity": alpha,
                 "density_evals": n,
-                "color_evals": mi.Float(0) if painter is None else n,
+                "color_evals": mi.Float(0) if shader is None else n,
             }
-            if painter is not None and like.medium.is_deferred:
+            if shader is not None and like.medium.is_deferred:
                 out["color_evals"] = dr.select(alpha > 0, mi.Float(1), 0)
             if {"visibility", "gaze"} & set(names):
                 out["density_evals"] = n + self._look(ray.o + ray.d * depth, surface, out, "gaze" in names)
             L = mi.Spectrum(0)
             if like.radiance:
                 L = (1 - alpha) * like.background
-                if painter is not None:
-                    color = painter.resolve_color(like.medium, total, alpha, local, cast("Any", active))
+                if shader is not None:
+                    color = shader.resolve_color(like.medium, total, alpha, local, cast("Any", active))
                     L += composite_to_linear(color, alpha, like.medium.color_space)
             return L, alpha > 0, [out[name] for name in names]
 
@@ -146,12 +159,13 @@ def _integrator_class(variant: str):
 
 
 def march_as_in_paper(medium, ray, t0, t1, active, shader, *, steps, min_step, max_step, dt_gamma):
-    """``(opacity, depth, sum of what samples contribute, samples)`` of ``ray`` (`LocalRay`) between ``t0`` and ``t1``.
+    """March ``ray`` (`LocalRay`) between ``t0`` and ``t1``.
 
-    ``painter``: what samples contribute (``medium.Painter``), or None for a density-only pass.
+    Returns ``(opacity, depth, sum of the sample contributions, number of samples)``. ``shader`` computes the
+    contributions; None for a density-only pass.
     """
     Float = type(ray.t_near)
-    # The paper's grid knows no parts of cells.
+    # The grid of the paper has no refined cells.
     grid: Any = None if medium.occupancy is None else medium.occupancy.coarse
 
     def length(t):
@@ -172,22 +186,22 @@ def march_as_in_paper(medium, ray, t0, t1, active, shader, *, steps, min_step, m
     def body(active, t, transmittance, moment, total, n):
         if grid is not None:
             _, t = dr.while_loop((active, t), lambda seeking, *_: seeking, leave, label="paper leap")
-        full = active & (t < t1)
+        is_active = active & (t < t1)
         dt = length(t)
         p = ray.o + ray.d * t
         if shader is None:
-            sigma, features = medium.density(p, full), None
+            sigma, features = medium.density(p, is_active), None
         else:
-            sigma, features = medium.density_features(p, full)
-        weight = dr.select(full, (1 - dr.exp(-sigma * dt)) * transmittance, 0)
+            sigma, features = medium.density_features(p, is_active)
+        weight = dr.select(is_active, (1 - dr.exp(-sigma * dt)) * transmittance, 0)
         moment = moment + weight * (t + dt)
         if shader is not None:
-            total = total + weight * shader.paint(medium, features, p, ray.w, full)
-        # The kernels test the transmittance in front of the sample, so that one more is taken.
-        more = transmittance >= PAPER_STOP
-        transmittance, n = transmittance - weight, n + dr.select(full, 1, 0)
+            total = total + weight * shader.shade(medium, features, p, ray.w, is_active)
+        # The kernels test the transmittance in front of the sample, so one more sample is taken.
+        continues = transmittance >= PAPER_STOP
+        transmittance, n = transmittance - weight, n + dr.select(is_active, 1, 0)
         t = t + dt
-        return full & (t < t1) & more & (n < steps), t, transmittance, moment, total, n
+        return is_active & (t < t1) & continues & (n < steps), t, transmittance, moment, total, n
 
     start = (
         dr.mask_t(Float)(active) & (t0 < t1),
@@ -212,33 +226,42 @@ PAPER = "paper"
 
 @dataclass(frozen=True)
 class StudyRow:
-    """One row of a study."""
+    """One setting of a study."""
 
-    name: str  # As the tables have it
-    group: str  # The factor that it belongs to
-    params: Mapping = field(default_factory=dict)  # Of the integrator, over the scene's own
-    spp: int = 1  # Samples a pixel
-    resolution: int = 0  # Of the density as a grid; 0: the scene's own
-    paper: tuple[int, float] | None = None  # (steps, γ) of the paper's marching; None: ours
-    is_first_frame: bool = False  # What is kept from frame to frame is made anew in each
+    name: str  # Name in the tables
+    group: str  # Factor that it varies
+    params: Mapping = field(default_factory=dict)  # Parameters of the integrator that override the scene's
+    spp: int = 1  # Samples per pixel
+    resolution: int = 0  # Resolution of the density as a grid; 0: the density of the scene
+    paper: tuple[int, float] | None = None  # (steps, γ) of the march of the paper; None: the march of this package
+    is_first_frame: bool = False  # Whether caches are cleared before each frame
 
-    def make_integrator(self, subject, **more):
-        """The integrator that renders this row; ``more``: further parameters, such as AOVs that count."""
-        made = subject.make_integrator({**self.params, **more}, self.resolution)
-        return made if self.paper is None else make_paper_integrator(made, subject.sensor, subject.tolerance, *self.paper)
+    def make_integrator(self, subject, **extra_params):
+        """Make the integrator of this row; ``extra_params`` are further parameters, such as AOVs that count."""
+        integrator = subject.make_integrator({**self.params, **extra_params}, self.resolution)
+        return (
+            integrator
+            if self.paper is None
+            else make_paper_integrator(integrator, subject.sensor, subject.tolerance, *self.paper)
+        )
 
 
 def list_rows(subject, quick: bool = False) -> list[StudyRow]:
-    """All rows for ``subject``; ``quick``: one or two of each factor."""
+    """List all rows for ``subject``; with ``quick`` only one or two of each factor."""
 
     if not subject.is_marched:
-        return [StudyRow("default", "default"), *_observer(subject, quick), *_left_out(subject), *_samples(quick)]
+        return [
+            StudyRow("default", "default"),
+            *_observer_rows(subject, quick),
+            *_reduced_rows(subject),
+            *_sample_rows(quick),
+        ]
 
-    def some(values):
+    def thin_out(values):
         return values[:: max(len(values) - 1, 1)] if quick else values
 
     if subject.has_splats:
-        return [*_met(some), *_observer(subject, quick), *_left_out(subject), *_samples(quick)]
+        return [*_splat_rows(thin_out), *_observer_rows(subject, quick), *_reduced_rows(subject), *_sample_rows(quick)]
 
     def steps(n):
         return {"step": subject.extent / n}
@@ -247,21 +270,21 @@ def list_rows(subject, quick: bool = False) -> list[StudyRow]:
     for rule in (r.name for r in RULES if not r.ends_at_cells):
         for n in (64, 512) if quick else STEP_COUNTS:
             rows.append(StudyRow(f"{rule}, {n} steps", f"steps, {rule}", {"quadrature": rule, **steps(n)}))
-    for g in some((1 / 1024, 1 / 512, 1 / 256, 1 / 128)):
+    for g in thin_out((1 / 1024, 1 / 512, 1 / 256, 1 / 128)):
         rows.append(StudyRow(f"dt_gamma 1/{round(1 / g)}", "dt_gamma", {"dt_gamma": g}))
     sweeps = {
         "coarse": (2.0, 4.0, 8.0, 16.0),
         "stop": (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-8),
         "color_cutoff": (0.0, 1e-4, 1e-3, 3e-3, 1e-2, 3e-2),
     }
-    rows += [StudyRow(f"{name} {v:g}", name, {name: v}) for name, values in sweeps.items() for v in some(values)]
+    rows += [StudyRow(f"{name} {v:g}", name, {name: v}) for name, values in sweeps.items() for v in thin_out(values)]
     for k in DEPTHS.names():
         rows.append(StudyRow(f"depth {k}", "depth", {"depth": k}))
         for n in () if quick else (128, 256, 512, 1024):
             rows.append(StudyRow(f"depth {k}, {n} steps", "depth", {"depth": k, **steps(n)}))
     rows.append(StudyRow("unrefined", "refined", {"refined": False}))
     rows.append(StudyRow("jitter", "jitter", {"jitter": True}))
-    rows += _observer(subject, quick) + _left_out(subject) + _samples(quick)
+    rows += _observer_rows(subject, quick) + _reduced_rows(subject) + _sample_rows(quick)
     if subject.can_resample:
         for r in RESOLUTIONS[:1] if quick else RESOLUTIONS:
             for rule in RULES.names():
@@ -273,22 +296,22 @@ def list_rows(subject, quick: bool = False) -> list[StudyRow]:
                         f"grid 64, {rule}, {n} steps", "resolution", {"quadrature": rule, **steps(n)}, resolution=64
                     )
                 )
-    rows += [] if quick else _together(subject)
-    return rows + _paper(quick)
+    rows += [] if quick else _combined_rows(subject)
+    return rows + _paper_rows(quick)
 
 
-def _met(some) -> list[StudyRow]:
-    """Of Gaussian splats, which are met one by one and not marched."""
+def _splat_rows(some) -> list[StudyRow]:
+    """List the rows for Gaussian splats, which are intersected individually and not marched."""
     rows = [StudyRow("default", "default")]
     rows += [StudyRow(f"stop {s:g}", "stop", {"stop": s}) for s in some(study_truth.SPLAT_STOPS)]
     rows += [StudyRow(f"extent {e:g}", "extent", {"extent": e}) for e in some(study_truth.SPLAT_EXTENTS)]
-    # What finds the depth of another kind, finds the same here.
+    # Estimators that refine another kind of depth give the same result here.
     rows += [StudyRow(f"depth {d.name}", "depth", {"depth": d.name}) for d in DEPTHS if d.surface_kind == d.name]
     loose = [(2.0, 1e-2), (2.5, 1e-2), (2.5, 1e-3)]
     return rows + [StudyRow(f"extent {e:g}, stop {s:g}", "together", {"extent": e, "stop": s}) for e, s in some(loose)]
 
 
-def _visibility(quick: bool) -> list[StudyRow]:
+def _visibility_rows(quick: bool) -> list[StudyRow]:
     rows = [StudyRow(f"visibility {k}", "visibility", {"visibility": k}) for k in ("depth", "transmittance")]
     for h in (16,) if quick else (64, 128, 256, 512, 1024):
         params = {"visibility": "map", "map_height": h}
@@ -297,22 +320,22 @@ def _visibility(quick: bool) -> list[StudyRow]:
     return rows
 
 
-def _observer(subject, quick: bool) -> list[StudyRow]:
-    """What is found out for each observer: visibility, and the integral of a gaze that is divided by one."""
+def _observer_rows(subject, quick: bool) -> list[StudyRow]:
+    """List the rows that vary observer computations: visibility, and the integral of a normalised gaze field."""
     if not subject.is_normalized:
-        return _visibility(quick)
-    return _visibility(quick) + [
+        return _visibility_rows(quick)
+    return _visibility_rows(quick) + [
         StudyRow(f"integral_tolerance {t:g}, first frame", "integral", {"integral_tolerance": t}, is_first_frame=True)
         for t in ((0.0, 5e-3) if quick else (0.0, 3.125e-4, 1.25e-3, 5e-3, 2e-2))
     ]
 
 
-def _samples(quick: bool) -> list[StudyRow]:
+def _sample_rows(quick: bool) -> list[StudyRow]:
     return [StudyRow(f"spp {k}", "spp", spp=k) for k in ((2,) if quick else (4, 16, 64))]
 
 
-def _left_out(subject) -> list[StudyRow]:
-    """What a scene does not need, taken away piece by piece."""
+def _reduced_rows(subject) -> list[StudyRow]:
+    """List the rows that leave out optional outputs."""
     rows = [
         StudyRow("no colour", "leave out", {"radiance": False}),
         StudyRow("no observer", "leave out", {"aovs": "depth,opacity"}),
@@ -323,33 +346,38 @@ def _left_out(subject) -> list[StudyRow]:
     return rows
 
 
-def _together(subject) -> list[StudyRow]:
-    """Several factors at once, to find the front."""
+def _combined_rows(subject) -> list[StudyRow]:
+    """List the rows that vary several factors at once, to find the Pareto front."""
     rows = []
     for n in (128, 256, 512, 1024, 2048):
         step = {"step": subject.extent / n}
         rows.append(StudyRow(f"{n} steps, coarse 4", "together", {**step, "coarse": 4.0}))
         loose = {**step, "stop": 1e-4, "color_cutoff": 1e-2}
-        for name, more in (("", {}), (", linear", {"quadrature": "linear"}), (", refined", {"depth": "refined"})):
-            rows.append(StudyRow(f"{n} steps, stop 1e-4, cutoff 1e-2{name}", "together", {**loose, **more}))
+        for name, extra_params in (
+            ("", {}),
+            (", linear", {"quadrature": "linear"}),
+            (", refined", {"depth": "refined"}),
+        ):
+            rows.append(StudyRow(f"{n} steps, stop 1e-4, cutoff 1e-2{name}", "together", {**loose, **extra_params}))
     return rows
 
 
-def _paper(quick: bool) -> list[StudyRow]:
+def _paper_rows(quick: bool) -> list[StudyRow]:
     counts = (64, PAPER_STEPS) if quick else (128, 256, 512, PAPER_STEPS, 2048, 4096)
-    # The rule is one of depth comparison and of expected depth, whatever the scene prefers.
+    # The march of the paper compares expected depths, whatever the scene uses.
     params = {"depth": "expected", "visibility": "depth"}
     rows = [StudyRow(f"paper, {n} steps", PAPER, params, paper=(n, 0.0)) for n in counts]
-    return rows + [StudyRow(f"paper, {PAPER_STEPS} steps, dt_gamma 1/128", PAPER, params, paper=(PAPER_STEPS, PAPER_DT_GAMMA))]
+    return rows + [
+        StudyRow(f"paper, {PAPER_STEPS} steps, dt_gamma 1/128", PAPER, params, paper=(PAPER_STEPS, PAPER_DT_GAMMA))
+    ]
 
 
 # ---- Measure ----
 #
-# From settings to rows: errors, evaluations, memory, and times taken in rounds over all settings.
+# Measurement of each setting: errors, evaluations, memory and times.
 #
-# Time is the median of several renders of a finished kernel; the rounds go over all settings in turn, so that a busy
-# moment of the machine falls on all of them alike. Evaluations are counted in a render of their own, since counting
-# costs time.
+# Time is the median of several renders with compiled kernels. The rounds cycle over all settings, so that a load peak
+# of the machine affects all settings alike. Evaluations are counted in a separate render, because counting costs time.
 
 COLUMNS = (
     *"setting group seconds cpu_seconds density_evals color_evals gaze_evals".split(),
@@ -360,11 +388,11 @@ COLUMNS = (
     """.split(),
 )
 MARCH_PARAMETERS = ("quadrature", "step", "coarse", "dt_gamma", "stop", "color_cutoff", "refined", "depth", "jitter")
-"""The parameters that mean nothing where nothing is marched."""
-SPLAT_PARAMETERS = ("stop", "depth")  # Those of them that mean something where Gaussians are met
+"""Parameters without effect if nothing is marched."""
+SPLAT_PARAMETERS = ("stop", "depth")  # Those that have an effect for splats
 COUNTS = ("density_evals", "color_evals", "gaze_evals")
 SEED = 1
-PIXEL_SPP = 256  # Samples a pixel of the picture that settings with several are compared with
+PIXEL_SPP = 256  # Samples per pixel of the reference for settings with several samples
 
 
 def measure_rows(
@@ -374,26 +402,32 @@ def measure_rows(
     pixel_spp: int = PIXEL_SPP,
     on_step: Callable[[str], None] = lambda name: None,
 ) -> list[dict]:
-    """One dict of `COLUMNS` a setting (but ``pareto``); ``on_step`` is told what is measured, ``2 len(rows)`` times."""
+    """Measure all settings.
+
+    Returns one dict of `COLUMNS` per setting (without ``pareto``). ``on_step`` is called with the name of each
+    measurement, ``2 len(rows)`` times.
+    """
     pixels: dict = {}
-    # Ray casts at a scene's exact geometry may take a minute, and are the same for all rows.
+    # Exact ray casts may take a minute, and are the same for all rows.
     exact = subject.find_exact_hits(SEED)
-    table, made = [], []
+    table, integrators = [], []
     for row in rows:
         on_step(row.name)
         integrator = row.make_integrator(subject)
-        values = _parameters(subject, row, subject.make_integrator(row.params, row.resolution))
+        values = _collect_parameters(subject, row, subject.make_integrator(row.params, row.resolution))
         table.append(
-            values | _quality(subject, row, integrator, values, exact, pixels, pixel_spp) | _counts(subject, row)
+            values
+            | _measure_quality(subject, row, integrator, values, exact, pixels, pixel_spp)
+            | _count_evaluations(subject, row)
         )
-        made.append(integrator)
-    times = _times(subject, rows, made, repeats, on_step)
+        integrators.append(integrator)
+    times = _measure_times(subject, rows, integrators, repeats, on_step)
     for line, (wall, cpu) in zip(table, times):
         line["seconds"], line["cpu_seconds"] = statistics.median(wall), statistics.median(cpu)
     return table
 
 
-def _parameters(subject, row: StudyRow, integrator) -> dict:
+def _collect_parameters(subject, row: StudyRow, integrator) -> dict:
     values = read_parameters(integrator)
     if row.paper is not None:
         steps, dt_gamma = row.paper
@@ -404,7 +438,9 @@ def _parameters(subject, row: StudyRow, integrator) -> dict:
     if not subject.is_marched:
         values |= dict.fromkeys(MARCH_PARAMETERS, "")
     if subject.has_splats:
-        values |= dict.fromkeys((n for n in MARCH_PARAMETERS if n not in SPLAT_PARAMETERS), "") | {"extent": read_splat_extent(integrator)}
+        values |= dict.fromkeys((n for n in MARCH_PARAMETERS if n not in SPLAT_PARAMETERS), "") | {
+            "extent": read_splat_extent(integrator)
+        }
     return {n: values[n] for n in values if n in COLUMNS} | {
         "setting": row.name,
         "group": row.group,
@@ -416,79 +452,81 @@ def _parameters(subject, row: StudyRow, integrator) -> dict:
     }
 
 
-def _quality(subject, row: StudyRow, integrator, values: dict, exact, pixels: dict, pixel_spp: int) -> dict:
+def _measure_quality(subject, row: StudyRow, integrator, values: dict, exact, pixels: dict, pixel_spp: int) -> dict:
     import drjit as dr
 
-    backend = dr.JitBackend.CUDA if _on_cuda() else dr.JitBackend.LLVM
+    backend = dr.JitBackend.CUDA if _is_cuda() else dr.JitBackend.LLVM
     gc.collect()
     dr.flush_malloc_cache()
     dr.detail.malloc_clear_statistics()
-    # What other rows keep (their maps, say) is not this one's.
+    # Subtract memory held by other rows, such as their maps.
     before = dr.detail.malloc_watermark(backend)
     picture = subject.render_channels(integrator, row.spp, SEED)
     peak = dr.detail.malloc_watermark(backend) - before
     if row.spp > 1:
         if not pixels:
-            pixels["truth"] = _pixel_truth(subject, pixel_spp)
-        known, exact = pixels["truth"], None
+            pixels["truth"] = _render_pixel_truth(subject, pixel_spp)
+        truth, exact = pixels["truth"], None
     else:
-        # Unnormalised depths are meant to be expected ones.
+        # Compare unnormalised depths with expected depths.
         depth = "expected" if row.paper is not None else values["depth"]
-        known = subject.get_truth(SEED, depth, values["visibility"])
-    return compute_errors(picture, known, exact) | {"peak_mb": peak / 2**20, "reference": known.source}
+        truth = subject.get_truth(SEED, depth, values["visibility"])
+    return compute_errors(picture, truth, exact) | {"peak_mb": peak / 2**20, "reference": truth.source}
 
 
-def _pixel_truth(subject, spp: int) -> StudyTruth:
-    """The mean over many samples of each pixel, at the scene's own setting, with another seed."""
-    seen = subject.render_channels(subject.make_integrator(), spp, SEED + 1)
-    none = np.zeros(len(seen["depth"]))
+def _render_pixel_truth(subject, spp: int) -> StudyTruth:
+    """Render the mean over many samples per pixel with the scene's settings and another seed."""
+    channels = subject.render_channels(subject.make_integrator(), spp, SEED + 1)
+    none = np.zeros(len(channels["depth"]))
     return StudyTruth(
-        **{n: seen[n] for n in ("color", "opacity", "depth", "visibility")},
-        gaze=seen.get("gaze", none),
-        source=f"mean of {spp} samples a pixel",
+        **{n: channels[n] for n in ("color", "opacity", "depth", "visibility")},
+        gaze=channels.get("gaze", none),
+        source=f"mean of {spp} samples per pixel",
         convergence={},
     )
 
 
-def _counts(subject, row: StudyRow) -> dict:
-    """Mean evaluations a pixel. The count keeps what the setting asks for, so that the same passes are made."""
+def _count_evaluations(subject, row: StudyRow) -> dict:
+    """Count the mean evaluations per pixel, with the AOVs of the setting, so that the same passes run."""
     names = row.params.get("aovs", subject.aov_names()).split(",")
     counted = [n for n in COUNTS if n != "gaze_evals" or "gaze" in names]
-    seen = subject.render_channels(row.make_integrator(subject, aovs=",".join([*names, *counted])), 1, SEED)
-    return {n: row.spp * float(seen[n].mean()) if n in counted else 0.0 for n in COUNTS}
+    channels = subject.render_channels(row.make_integrator(subject, aovs=",".join([*names, *counted])), 1, SEED)
+    return {n: row.spp * float(channels[n].mean()) if n in counted else 0.0 for n in COUNTS}
 
 
-def _times(subject, rows, made, repeats: int, on_step) -> list[tuple[list[float], list[float]]]:
-    taken = [([], []) for _ in rows]
-    for row, integrator in zip(rows, made):
-        # The first frame was one of quality; the next reads what that kept of the observer, and is another kernel.
+def _measure_times(subject, rows, integrators, repeats: int, on_step) -> list[tuple[list[float], list[float]]]:
+    times = [([], []) for _ in rows]
+    for row, integrator in zip(rows, integrators):
+        # The first frame rendered the errors; the next one reads its caches and is another kernel.
         if not row.is_first_frame:
             subject.render(integrator, row.spp, SEED)
     for k in range(repeats):
-        for row, integrator, (wall, cpu) in zip(rows, made, taken):
+        for row, integrator, (wall, cpu) in zip(rows, integrators, times):
             if k == 0:
                 on_step(f"time of {row.name}")
             if row.is_first_frame:
                 integrator.parameters_changed()
-            seconds, busy = time_render(subject, integrator, row.spp)
+            seconds, cpu_seconds = time_render(subject, integrator, row.spp)
             wall.append(seconds)
-            cpu.append(busy)
-    return taken
+            cpu.append(cpu_seconds)
+    return times
 
 
 def time_render(subject, integrator, spp: int = 1) -> tuple[float, float]:
-    """Wall-clock and processor seconds of one render."""
-    start, busy = time.perf_counter(), time.process_time()
+    """Measure wall-clock and processor seconds of one render."""
+    start, cpu_start = time.perf_counter(), time.process_time()
     subject.render(integrator, spp, SEED)
-    return time.perf_counter() - start, time.process_time() - busy
+    return time.perf_counter() - start, time.process_time() - cpu_start
 
 
 def describe_precision() -> str:
-    """Of the variant in use: networks are fp16 on CUDA, where matrix units need it; all else is fp32."""
-    return "fp32, networks fp16" if _on_cuda() else "fp32"
+    """Describe the precision of the active variant: networks are fp16 on CUDA for its matrix units, everything else is
+    fp32.
+    """
+    return "fp32, networks fp16" if _is_cuda() else "fp32"
 
 
-def _on_cuda() -> bool:
+def _is_cuda() -> bool:
     import mitsuba as mi
 
     return str(mi.variant()).startswith("cuda")
@@ -500,11 +538,14 @@ def _on_cuda() -> bool:
 def measure_scaling(
     subject, repeats: int, quick: bool = False, on_step: Callable[[str], None] = lambda name: None
 ) -> list[dict]:
-    """Cost of the default against pixels, samples a pixel, and the scene's extent: rows of ``axis``, ``value``,
-    ``seconds``, ``density_evals`` (mean a pixel).
+    """Measure the cost of the default against pixels, samples per pixel, and scene extent.
 
-    A scene s times as large, marched with steps of the same length, is by the scaling law of densities (σ/s) this scene
-    marched with steps s times shorter: that is how its extent is varied.
+    Returns rows of ``axis``, ``value``, ``seconds`` and ``density_evals`` (mean per pixel).
+
+    Notes
+    -----
+    A scene scaled by s and marched with the same step is equivalent, by the scaling law of densities (σ/s), to this
+    scene marched with steps s times shorter. This is how the extent is varied.
     """
     size = subject.size
     plan = [("pixels", k, {}) for k in ((16, 32) if quick else (16, 32, 64, 128, 256, 512))]
@@ -518,10 +559,10 @@ def measure_scaling(
             subject.resize(value, 2 * value // 3)
         setting = StudyRow("", axis, params, spp=value if axis == "samples" else 1)
         integrator = setting.make_integrator(subject)
-        for _ in range(2):  # the second frame reads what the first keeps of the observer, and is another kernel
+        for _ in range(2):  # the second frame reads the observer caches of the first, and is another kernel
             subject.render(integrator, setting.spp, SEED)
         seconds = statistics.median(time_render(subject, integrator, setting.spp)[0] for _ in range(repeats))
-        counts = _counts(subject, setting)
+        counts = _count_evaluations(subject, setting)
         amount = value * (2 * value // 3) if axis == "pixels" else value
         out.append({"axis": axis, "value": amount, "seconds": seconds, "density_evals": counts["density_evals"]})
         if axis == "pixels":

@@ -1,4 +1,4 @@
-"""Analytic scenes of a study, and their volumes and sensors."""
+"""Analytic scenes of a study, with their volumes and sensors."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ from nerg_mi.fields.mlp import namespace
 from nerg_mi.maths.geometry import Box
 from nerg_mi.transport.observer_gaze import GazeFieldInstance
 
-NUMPY_FUNCTIONS = SimpleNamespace(select=np.where, exp=np.exp)  # The functions that densities use, as Dr.Jit names them
+# NumPy versions of the Dr.Jit functions that densities use
+NUMPY_FUNCTIONS = SimpleNamespace(select=np.where, exp=np.exp)
 
-# Linear radiance at the box's lower corner, and what it gains along x, y, z.
+# Linear radiance at the lower corner of the box, and its gradient along x, y, z.
 COLOR_BASE = np.array([0.1, 0.2, 0.15])
 COLOR_SLOPE = np.array([[0.8, 0.0, 0.1], [0.0, 0.3, 0.4], [0.2, 0.5, 0.0]])
 
@@ -26,10 +27,17 @@ COLOR_SLOPE = np.array([[0.8, 0.0, 0.1], [0.0, 0.3, 0.4], [0.2, 0.5, 0.0]])
 class AnalyticScene:
     """Matter in the unit cube, a camera and an observer; lengths in scene units.
 
-    ``density(x, y, z, ns)``: in 1/unit, with the functions of ``ns`` (`NUMPY` or drjit). ``breaks(o, d)``: distances
-    (N, K) at which density may jump along float64 rays (N, 3). ``optical_depth(o, d, a, b)``: of the density between
-    the distances a and b (N,), in closed form; None says that density is constant between the breaks. ``opaque``:
-    surfaces are hard enough for visibility to be yes or no.
+    Attributes
+    ----------
+    density : callable
+        ``density(x, y, z, ns)`` in 1/unit, with the functions of ``ns`` (`NUMPY_FUNCTIONS` or drjit).
+    breaks : callable
+        ``breaks(o, d)`` returns the distances (N, K) at which the density may jump along float64 rays (N, 3).
+    optical_depth : callable or None
+        ``optical_depth(o, d, a, b)`` between the distances a and b (N,) in closed form; None if the density is constant
+        between the breaks.
+    is_opaque : bool
+        Whether surfaces are hard enough for binary visibility.
     """
 
     name: str
@@ -44,7 +52,7 @@ class AnalyticScene:
 
 
 def evaluate_color(p: np.ndarray) -> np.ndarray:
-    """Linear radiance (..., 3) at points (..., 3)."""
+    """Evaluate the linear radiance (..., 3) at points (..., 3)."""
     return COLOR_BASE + p @ COLOR_SLOPE.T
 
 
@@ -53,7 +61,7 @@ def evaluate_color(p: np.ndarray) -> np.ndarray:
 SLAB_DENSITY = 6.0
 SPHERE_DENSITY, SPHERE_CENTER, SPHERE_RADIUS = 60.0, 0.5, 0.35
 SHEET_DENSITY, SHEET_VACUUM, SHEET_THICKNESS = 1e5, 1e-4, 4e-3
-# Each covers the part of the plane y = const in which x < x_max and z < z_max.
+# Each covers the part of the plane y = const with x < x_max and z < z_max.
 SHEETS = ((0.25, 0.5, 1.0), (0.5, 1.0, 0.55), (0.75, 1.0, 1.0))
 
 
@@ -69,7 +77,7 @@ def _sphere(x, y, z, ns):
 def _sphere_breaks(o, d):
     v = o - SPHERE_CENTER
     b, c = (v * d).sum(-1), (v * v).sum(-1) - SPHERE_RADIUS**2
-    # Rays of single precision are unit vectors to 1e-7 only.
+    # Single-precision directions are unit vectors only to 1e-7.
     a = (d * d).sum(-1)
     root = np.sqrt(np.maximum(b * b - a * c, 0))
     return np.stack([(-b - root) / a, (-b + root) / a], -1)
@@ -134,15 +142,15 @@ SCENES = {
         AnalyticScene("ramp", _ramp, _no_breaks, _ramp_optical_depth),
     )
 }
-"""Scenes by the name that ``nerg study`` knows them by."""
+"""Scenes by their name in ``nerg study``."""
 
 
 # ---- As Mitsuba objects ----
 
 
 @functools.cache
-def _volumes(variant: str):
-    """The volume classes of a variant; Mitsuba's classes must not be derived from when this module is imported."""
+def _make_volume_classes(variant: str):
+    """Return the volume classes of a variant. Mitsuba classes cannot be derived from when this module is imported."""
     import drjit as dr
     import mitsuba as mi
 
@@ -196,23 +204,26 @@ def _volumes(variant: str):
 
 
 def make_volumes(scene: AnalyticScene, resolution: int = 0) -> dict:
-    """``density``, ``color`` and ``gaze`` of the integrator; with a ``resolution`` the density is a ``gridvolume`` of
-    so many voxels along an edge, holding the exact density at their centres."""
+    """Make ``density``, ``color`` and ``gaze`` of the integrator.
+
+    With a ``resolution`` the density is a ``gridvolume`` with this number of voxels along an edge and the exact density
+    at their centres.
+    """
     import mitsuba as mi
 
-    made = _volumes(mi.variant())
-    density = made.density(scene.density)
+    classes = _make_volume_classes(mi.variant())
+    density = classes.density(scene.density)
     if resolution:
         x = (np.arange(resolution) + 0.5) / resolution
         z, y, x = np.meshgrid(x, x, x, indexing="ij")
         values = np.broadcast_to(scene.density(x, y, z, NUMPY_FUNCTIONS), x.shape)
         grid = mi.VolumeGrid(np.ascontiguousarray(values[..., None], np.float32))
         density = mi.load_dict({"type": "gridvolume", "grid": grid, "filter_type": "trilinear", "wrap_mode": "clamp"})
-    return {"density": density, "color": made.color(), "gaze": made.gaze()}
+    return {"density": density, "color": classes.color(), "gaze": classes.gaze()}
 
 
 def make_sensor(origin, target, fov: float, width: int, height: int) -> dict:
-    """A perspective camera with a box filter and float32 channels, z up."""
+    """Make a perspective camera with a box filter and float32 channels, z up."""
     import mitsuba as mi
 
     return {

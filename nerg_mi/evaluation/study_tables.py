@@ -1,4 +1,4 @@
-"""A study as tables and plots."""
+"""Tables and plots of a study."""
 
 from __future__ import annotations
 
@@ -15,69 +15,81 @@ from .study import COLUMNS, PAPER
 
 # ---- Tables ----
 #
-# What follows from a study's rows: the Pareto front, the comparison with the paper's marching, and the files.
+# Results derived from the rows of a study: the Pareto front, the comparison with the march of the paper, and the files.
 
 PARETO_ERRORS = ("color_rmse", "depth_mae", "visibility_mae", "gaze_mae")
-"""The errors that are set against time; a row's ``pareto`` names those for which it is on the front."""
+"""Errors that are compared with time; ``pareto`` of a row lists those for which it is on the Pareto front."""
 
 TIMING_COLUMNS = ("default_seconds", "default_cpu_seconds", "timed_by")
-"""Columns of rows that were timed in parts: the default's times by the process that timed the row, and which it was."""
+"""Columns of rows that were timed by several processes: the times of the default in the process that timed the row, and
+the index of that process.
+"""
 
 
 def find_pareto_front(points: list[tuple[float, float]]) -> list[bool]:
-    """Which of the points (time, error) no other one beats: no other is at most as large in both and smaller in one."""
+    """Return which points (time, error) are on the Pareto front: no other point is at most as large in both and
+    smaller in one.
+    """
     order = sorted(range(len(points)), key=lambda i: points[i])
-    on, best = [False] * len(points), math.inf
+    is_front, best = [False] * len(points), math.inf
     for i in order:
         time, error = points[i]
-        # Of equal points all are on the front.
-        if error < best or (error == best and any(on[j] and points[j] == points[i] for j in order)):
-            on[i], best = True, error
-    return on
+        # Equal points are all on the front.
+        if error < best or (error == best and any(is_front[j] and points[j] == points[i] for j in order)):
+            is_front[i], best = True, error
+    return is_front
 
 
 def is_comparable(row: dict) -> bool:
-    """Whether a row renders all that the default does, for one ray a pixel of the scene itself."""
+    """Return whether a row renders everything that the default does, with one ray per pixel of the scene itself."""
     return row["spp"] == 1 and not row["resolution"] and row["group"] not in ("leave out", "spp")
 
 
 def mark_pareto_fronts(rows: list[dict]) -> None:
-    """Set ``pareto`` of each row: the errors of `FRONTS` for which it is on the front, space-separated."""
+    """Set ``pareto`` of each row: the errors of `PARETO_ERRORS` for which it is on the front, space-separated."""
     for row in rows:
         row["pareto"] = ""
     for error in PARETO_ERRORS:
-        able = [r for r in rows if is_comparable(r) and error in r]
-        for row, on in zip(able, find_pareto_front([(r["seconds"], r[error]) for r in able])):
+        candidates = [r for r in rows if is_comparable(r) and error in r]
+        for row, on in zip(candidates, find_pareto_front([(r["seconds"], r[error]) for r in candidates])):
             if on:
                 row["pareto"] = f"{row['pareto']} {error.rsplit('_', 1)[0]}".strip()
 
 
 def compare_with_paper(rows: list[dict], clock: str = "seconds") -> list[dict]:
-    """For each row of the paper's marching: the default beside it, the least depth error of ours that takes no longer,
-    and the shortest time of ours whose depth error is no larger, with the ratios; None where ours has no such row.
+    """Compare each row of the paper's march with the default, and with the best rows of this package at equal time and
+    at equal error.
 
-    ``clock``: ``seconds``, or ``cpu_seconds`` where other work shares the machine.
+    ``equal_time`` has the smallest depth error among rows that take no longer, ``equal_error`` the shortest time
+    among rows with at most the same depth error, each with its ratio; None if there is no such row. ``clock`` is
+    ``seconds``, or ``cpu_seconds`` if the machine is shared.
     """
-    # A map is made once for many frames: its rows' times are not those of one picture.
-    ours = [r for r in rows if r["group"] != PAPER and is_comparable(r) and r["visibility"] != "map"]
+    # A map is computed once for many frames, so the times of its rows are not those of one picture.
+    candidates = [r for r in rows if r["group"] != PAPER and is_comparable(r) and r["visibility"] != "map"]
     default = next(r for r in rows if r["group"] == "default")
     out = []
     for paper in (r for r in rows if r["group"] == PAPER):
-        no_longer = min((r for r in ours if r[clock] <= paper[clock]), key=lambda r: r["depth_mae"], default=None)
-        no_worse = min((r for r in ours if r["depth_mae"] <= paper["depth_mae"]), key=lambda r: r[clock], default=None)
+        equal_time = min(
+            (r for r in candidates if r[clock] <= paper[clock]), key=lambda r: r["depth_mae"], default=None
+        )
+        equal_error = min(
+            (r for r in candidates if r["depth_mae"] <= paper["depth_mae"]), key=lambda r: r[clock], default=None
+        )
         out.append(
             {
-                "paper": _brief(paper),
-                "default": _brief(default),
-                "equal_time": no_longer
-                and _brief(no_longer) | {"error_ratio": paper["depth_mae"] / max(no_longer["depth_mae"], 1e-12)},
-                "equal_error": no_worse and _brief(no_worse) | {"time_ratio": paper[clock] / no_worse[clock]},
+                "paper": _select_columns(paper),
+                "default": _select_columns(default),
+                "equal_time": equal_time
+                and _select_columns(equal_time)
+                | {"error_ratio": paper["depth_mae"] / max(equal_time["depth_mae"], 1e-12)},
+                "equal_error": equal_error
+                and _select_columns(equal_error) | {"time_ratio": paper[clock] / equal_error[clock]},
             }
         )
     return out
 
 
-def _brief(row: dict) -> dict:
+def _select_columns(row: dict) -> dict:
     names = (
         "setting seconds cpu_seconds density_evals color_evals depth_mae depth_p99 surface_mae visibility_wrong".split()
     )
@@ -85,11 +97,14 @@ def _brief(row: dict) -> dict:
 
 
 def write_tables(out: Path, report: dict) -> list[Path]:
-    """Write ``study.csv`` (the rows), ``study.md`` (the same by factor, to read), ``scaling.csv`` and ``study.json``
-    (all of ``report``); returns their paths."""
+    """Write ``study.csv`` (rows), ``study.md`` (rows by factor), ``scaling.csv`` and ``study.json`` (all of
+    ``report``).
+
+    Returns their paths.
+    """
     paths = [out / "study.csv", out / "study.md", out / "scaling.csv", out / "study.json"]
-    of_rows = [*COLUMNS, *(TIMING_COLUMNS if report.get("timed_by") else ())]
-    for path, rows, columns in ((paths[0], report["rows"], of_rows), (paths[2], report["scaling"], None)):
+    row_columns = [*COLUMNS, *(TIMING_COLUMNS if report.get("timed_by") else ())]
+    for path, rows, columns in ((paths[0], report["rows"], row_columns), (paths[2], report["scaling"], None)):
         write_csv(
             path,
             ({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in r.items()} for r in rows),
@@ -101,41 +116,42 @@ def write_tables(out: Path, report: dict) -> list[Path]:
 
 
 def summarise(report: dict) -> list[str]:
-    """The default beside the paper's marching, in words: a line each."""
+    """Summarise the comparison of the default with the march of the paper, one line each."""
     lines = []
     for pair in report["against_paper"]:
         paper, default = pair["paper"], pair["default"]
         if not lines:
-            lines.append(_line(default))
-        lines.append(_line(paper))
+            lines.append(_format_line(default))
+        lines.append(_format_line(paper))
         if pair["equal_time"]:
             lines.append(
-                f"  no slower: {pair['equal_time']['setting']}, "
-                f"depth error {pair['equal_time']['error_ratio']:.1f} times less"
+                f"  at equal time: {pair['equal_time']['setting']}, "
+                f"depth error {pair['equal_time']['error_ratio']:.1f} times smaller"
             )
         if pair["equal_error"]:
             lines.append(
-                f"  no worse: {pair['equal_error']['setting']}, {pair['equal_error']['time_ratio']:.1f} times faster"
+                f"  at equal error: {pair['equal_error']['setting']}, "
+                f"{pair['equal_error']['time_ratio']:.1f} times faster"
             )
     return lines
 
 
-def _line(row: dict) -> str:
+def _format_line(row: dict) -> str:
     return (
-        f"{row['setting']}: {1000 * row['seconds']:.0f} ms, {row['density_evals']:.0f} density evaluations a pixel, "
-        f"depth error {row['depth_mae']:.2g} (99 %: {row['depth_p99']:.2g})"
+        f"{row['setting']}: {1000 * row['seconds']:.0f} ms, {row['density_evals']:.0f} density evaluations per pixel, "
+        f"depth error {row['depth_mae']:.2g} (99th percentile: {row['depth_p99']:.2g})"
     )
 
 
-# Column of study.csv, its heading to read, and what it is multiplied with.
-_SHOWN = (
+# Column of study.csv, its heading, and the factor of its values.
+_TABLE_COLUMNS = (
     ("seconds", "ms", 1e3),
     ("cpu_seconds", "CPU ms", 1e3),
     ("density_evals", "density", 1),
     ("color_evals", "colour", 1),
     ("color_rmse", "colour RMSE", 1),
     ("depth_mae", "depth MAE", 1),
-    ("depth_p99", "depth 99 %", 1),
+    ("depth_p99", "depth p99", 1),
     ("surface_mae", "surface MAE", 1),
     ("visibility_mae", "visibility MAE", 1),
     ("visibility_wrong", "wrong %", 100),
@@ -146,11 +162,13 @@ _SHOWN = (
 
 
 def format_report(report: dict) -> str:
-    """A table for each factor, the default first in all of them, and the comparison with the paper's marching."""
+    """Format the report as Markdown: a table per factor, with the default first, and the comparison with the paper's
+    march.
+    """
     rows = report["rows"]
-    shown = [c for c in _SHOWN if any(c[0] in r for r in rows)]
+    columns = [c for c in _TABLE_COLUMNS if any(c[0] in r for r in rows)]
     default = rows[0]
-    head = ["setting", *(title for _, title, _ in shown)]
+    head = ["setting", *(title for _, title, _ in columns)]
     text = [
         f"{report['scene']}, {report['size'][0]} x {report['size'][1]}, {report['variant']}, "
         f"reference: {report['reference']}"
@@ -159,13 +177,13 @@ def format_report(report: dict) -> str:
         change = ", ".join(f"{k} {v:.2g}" for k, v in report["reference_change_when_step_halved"].items())
         text.append(f"The next coarser reference differs by: {change}")
     if report.get("timed_by"):
-        text.append(_timed_by(report["timed_by"]))
+        text.append(_format_timing(report["timed_by"]))
     for group in dict.fromkeys(r["group"] for r in rows[1:]):
-        mine = [default, *(r for r in rows if r["group"] == group)]
-        cells = [[r["setting"], *(f"{r[k] * by:.3g}" if k in r else "" for k, _, by in shown)] for r in mine]
+        group_rows = [default, *(r for r in rows if r["group"] == group)]
+        cells = [[r["setting"], *(f"{r[k] * by:.3g}" if k in r else "" for k, _, by in columns)] for r in group_rows]
         text.append(f"### {group}\n\n{format_markdown_table(head, cells)}")
     for clock, unit in (("seconds", "ms"), ("cpu_seconds", "CPU ms")):
-        head = ["paper", unit, "depth MAE", "no slower", "times less error", "no worse", "times faster"]
+        head = ["paper", unit, "depth MAE", "at equal time", "error ratio", "at equal error", "speed-up"]
         cells = []
         for pair in compare_with_paper(rows, clock):
             paper, time, error = pair["paper"], pair["equal_time"], pair["equal_error"]
@@ -174,22 +192,23 @@ def format_report(report: dict) -> str:
             cells[-1] += [error["setting"], f"{error['time_ratio']:.3g}"] if error else ["none", ""]
         if not cells:
             continue
-        title = f"against the paper's marching, by {clock.replace('_', ' ')}"
+        title = f"compared with the march of the paper, by {clock.replace('_', ' ')}"
         text.append(f"### {title}\n\n{format_markdown_table(head, cells)}")
     return "\n\n".join(text) + "\n"
 
 
-def _timed_by(who: list[dict]) -> str:
-    """Who took the times, in a sentence."""
-    get_or_compute_each = (
-        f"process {found['process']} ({found['processor']}, {found['threads']} threads), {found['rows']} settings, "
-        "the default in {:.3g} to {:.3g} ms".format(*(1e3 * s for s in found["seconds"]))
-        for found in who
+def _format_timing(processes: list[dict]) -> str:
+    """Describe the processes that took the times."""
+    sentences = (
+        f"process {process['process']} ({process['processor']}, {process['threads']} threads), "
+        f"{process['rows']} settings, "
+        "the default in {:.3g} to {:.3g} ms".format(*(1e3 * s for s in process["seconds"]))
+        for process in processes
     )
-    return f"Times are those of whoever measured a setting: {'; '.join(get_or_compute_each)}."
+    return f"Each setting was timed by one of several processes: {'; '.join(sentences)}."
 
 
-# ---- Pictures of a study: error against time with the Pareto front, and cost against size on log axes ----
+# ---- Plots of a study: error against time with the Pareto front, and cost against size on log axes ----
 
 PANELS = (
     ("color_rmse", "colour RMSE [linear radiance]"),
@@ -197,32 +216,37 @@ PANELS = (
     ("visibility_mae", "visibility MAE"),
     ("gaze_mae", "gaze MAE [1/sr]"),
 )
-MIN_PLOTTED_ERROR = 1e-9  # Errors below it are shown on the axis' lower end: single precision has nothing to say there
+# Errors below this value, the limit of single precision, are drawn at the lower end of the axis
+MIN_PLOTTED_ERROR = 1e-9
 
 
 def plot_errors(path: Path, rows: list[dict], title: str, provenance: Provenance | None = None) -> None:
-    """Four panels of error against seconds, a colour a factor, the front as a line, the paper's marching as crosses."""
+    """Plot error against time in four panels, with a colour per factor, the Pareto front as a line, and the paper's
+    march as crosses.
+    """
     import matplotlib
     from matplotlib.ticker import LogFormatterSciNotation, LogLocator
 
     figure = new_page(960, 720)
-    able = [r for r in rows if is_comparable(r)]
-    groups = list(dict.fromkeys(r["group"] for r in able))
+    candidates = [r for r in rows if is_comparable(r)]
+    groups = list(dict.fromkeys(r["group"] for r in candidates))
     colors = matplotlib.colormaps["tab20"](np.linspace(0, 1, 20))[: len(groups)]
     handles = {}
     for axes, (error, label) in zip(figure.subplots(2, 2).ravel(), PANELS):
         for group, color in zip(groups, colors):
-            mine = [r for r in able if r["group"] == group and error in r]
-            if not mine:
+            group_rows = [r for r in candidates if r["group"] == group and error in r]
+            if not group_rows:
                 continue
-            xy = np.array([(r["seconds"], max(r[error], MIN_PLOTTED_ERROR)) for r in mine])
+            xy = np.array([(r["seconds"], max(r[error], MIN_PLOTTED_ERROR)) for r in group_rows])
             marker, size = {"default": ("*", 150), PAPER: ("x", 34)}.get(group, ("o", 16))
-            tint = {"default": "black", PAPER: "crimson"}.get(group, color)
+            marker_color = {"default": "black", PAPER: "crimson"}.get(group, color)
             handles[group] = axes.scatter(
-                *xy.T, s=size, marker=marker, color=tint, zorder=4 if group in ("default", PAPER) else 3
+                *xy.T, s=size, marker=marker, color=marker_color, zorder=4 if group in ("default", PAPER) else 3
             )
         front = sorted(
-            (r["seconds"], max(r[error], MIN_PLOTTED_ERROR)) for r in able if error.rsplit("_", 1)[0] in r["pareto"].split()
+            (r["seconds"], max(r[error], MIN_PLOTTED_ERROR))
+            for r in candidates
+            if error.rsplit("_", 1)[0] in r["pareto"].split()
         )
         if front:
             (handles["Pareto front"],) = axes.plot(
@@ -230,11 +254,11 @@ def plot_errors(path: Path, rows: list[dict], title: str, provenance: Provenance
             )
         axes.set_xscale("log")
         axes.set_yscale("log")
-        axes.set_xlabel("seconds a picture", fontsize=8)
+        axes.set_xlabel("seconds per picture", fontsize=8)
         axes.set_ylabel(label, fontsize=8)
         axes.tick_params(labelsize=7, which="both")
         for axis in (axes.xaxis, axes.yaxis):
-            # Where hardly a decade is shown, matplotlib would label every minor tick, one upon the other.
+            # With less than a decade, matplotlib would label every minor tick, and the labels would overlap.
             axis.set_minor_locator(LogLocator(subs=(2, 5)))
             axis.set_minor_formatter(LogFormatterSciNotation(minor_thresholds=(1.5, 1.5)))
         axes.grid(True, which="major", color="0.9", linewidth=0.6)
@@ -245,9 +269,10 @@ def plot_errors(path: Path, rows: list[dict], title: str, provenance: Provenance
 
 
 def plot_scaling(path: Path, rows: list[dict], title: str, provenance: Provenance | None = None) -> None:
-    """Seconds against pixels, samples a pixel and extent, log-log, with the exponent of the upper half of each."""
+    """Plot time against pixels, samples per pixel and extent on log axes, with the exponent of the upper half of
+    each."""
     figure = new_page(960, 320)
-    names = {"pixels": "pixels", "samples": "samples a pixel", "extent": "extent of the scene at equal step"}
+    names = {"pixels": "pixels", "samples": "samples per pixel", "extent": "extent of the scene at equal step"}
     varied = [axis for axis in names if any(r["axis"] == axis for r in rows)]
     for axes, axis in zip(figure.subplots(1, len(varied)), varied):
         x, y = np.array([(r["value"], r["seconds"]) for r in rows if r["axis"] == axis]).T
@@ -255,7 +280,7 @@ def plot_scaling(path: Path, rows: list[dict], title: str, provenance: Provenanc
         half = len(x) // 2
         axes.set_title(f"exponent {fit_exponent(x[half - 1 :], y[half - 1 :]):.2f} in the upper half", fontsize=8)
         axes.set_xlabel(names[axis], fontsize=8)
-        axes.set_ylabel("seconds a picture", fontsize=8)
+        axes.set_ylabel("seconds per picture", fontsize=8)
         axes.tick_params(labelsize=7, which="both")
         axes.grid(True, which="major", color="0.9", linewidth=0.6)
     figure.suptitle(title, fontsize=10)
@@ -264,5 +289,5 @@ def plot_scaling(path: Path, rows: list[dict], title: str, provenance: Provenanc
 
 
 def fit_exponent(x, y) -> float:
-    """Slope of log y against log x, by least squares."""
+    """Fit the slope of log y against log x by least squares."""
     return float(np.polyfit(np.log(np.asarray(x, float)), np.log(np.asarray(y, float)), 1)[0])

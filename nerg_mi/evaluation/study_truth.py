@@ -1,4 +1,4 @@
-"""True values of a study's scenes: of media in closed form, of shapes and of splats, and errors against them."""
+"""True values of the scenes of a study: media in closed form, shapes and splats, and errors relative to them."""
 
 from __future__ import annotations
 
@@ -21,23 +21,35 @@ from .study_scenes import COLOR_BASE, COLOR_SLOPE, NUMPY_FUNCTIONS, AnalyticScen
 
 # ---- Reference ----
 #
-# What a ray sees of an analytic scene, in float64: closed forms, and Gauss-Legendre where there is none.
+# True values along rays through an analytic scene in float64: closed forms, and Gauss-Legendre quadrature where there
+# is none.
 #
-# Independent of ``transport``: nothing is stepped. Opacity α = 1 - exp(-τ); the first moment ∫ t σ T dt; the median,
-# where the optical depth reaches -log(1 - α/2). Between breaks of constant density σ a piece of length δ and optical
-# depth x = σδ absorbs 1 - e^{-x} at the mean distance 1/σ - δ/expm1(x) into it. Smooth profiles have τ in closed form
-# and a moment by composite Gauss-Legendre quadrature (32 panels of 16 nodes: the integrands are analytic, so it is
-# exact to rounding).
+# Independent of ``transport``, without steps. Opacity is α = 1 - exp(-τ); the first moment is ∫ t σ T dt; the median is
+# where the optical depth reaches -log(1 - α/2). Between breaks, a piece of constant density σ, length δ and optical
+# depth x = σδ absorbs 1 - e^{-x} at the mean distance 1/σ - δ/expm1(x) from its start. Smooth profiles have τ in closed
+# form and the moment by composite Gauss-Legendre quadrature (32 panels of 16 nodes; the integrands are analytic, so it
+# is exact to rounding).
 
 QUADRATURE_PANELS, QUADRATURE_NODES = 32, 16
-SOLID_DENSITY = 1.0  # Density (1/unit) that counts as a solid in a scene of hard surfaces; the vacuum between has 1e-4
-MAX_SURFACE_SHIFT = 1 / 64  # Most that a surface is moved towards the camera for being soft, as a share of its depth
+SOLID_DENSITY = 1.0  # Density (1/unit) above which matter in a scene of hard surfaces is solid; the vacuum has 1e-4
+MAX_SURFACE_SHIFT = 1 / 64  # Maximum shift of a soft surface towards the camera, relative to its depth
 
 
 @dataclass(frozen=True)
 class RayTruth:
-    """Along rays (N,): optical depth, first moment ∫ t σ T dt, the distances at which optical depths up to ``tau`` are
-    reached, and the mean free path 1/σ where T = 1/2 (0 where that is not reached)."""
+    """True values along rays (N,).
+
+    Attributes
+    ----------
+    tau : numpy.ndarray
+        Optical depth.
+    moment : numpy.ndarray
+        First moment ∫ t σ T dt.
+    crossing : callable
+        Maps optical depths up to ``tau`` to the distances at which they are reached.
+    free_path : numpy.ndarray
+        Mean free path 1/σ where T = 1/2; 0 if that is not reached.
+    """
 
     tau: np.ndarray
     moment: np.ndarray
@@ -51,25 +63,25 @@ class RayTruth:
     @property
     def expected(self) -> np.ndarray:
         """Mean distance of absorption, 0 where nothing absorbs."""
-        some = self.opacity > 0
-        return np.where(some, self.moment / np.where(some, self.opacity, 1), 0)
+        is_absorbing = self.opacity > 0
+        return np.where(is_absorbing, self.moment / np.where(is_absorbing, self.opacity, 1), 0)
 
     def quantile(self, fraction: float) -> np.ndarray:
-        """Distance at which this fraction of the ray's own opacity is reached, 0 where nothing absorbs."""
+        """Distance at which this fraction of the ray's opacity is reached, 0 where nothing absorbs."""
         return np.where(self.tau > 0, self.crossing(-np.log1p(fraction * np.expm1(-self.tau))), 0)
 
     def depth(self, kind: str) -> np.ndarray:
-        """Of a kind that the integrator knows."""
+        """Depth of a kind that the integrator supports."""
         return DEPTHS.find(kind).find_exact(self)
 
     def color(self, o: np.ndarray, d: np.ndarray) -> np.ndarray:
-        """Linear radiance (N, 3) of the scenes' affine colour, black behind."""
-        place = o * self.opacity[:, None] + d * self.moment[:, None]
-        return COLOR_BASE * self.opacity[:, None] + place @ COLOR_SLOPE.T
+        """Linear radiance (N, 3) of the affine colour of the scenes, with black behind."""
+        mean_position = o * self.opacity[:, None] + d * self.moment[:, None]
+        return COLOR_BASE * self.opacity[:, None] + mean_position @ COLOR_SLOPE.T
 
 
 def intersect_unit_cube(o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where float64 rays (N, 3) enter and leave the unit cube, from the origin on; equal on a miss."""
+    """Intersect float64 rays (N, 3) with the unit cube, from the origin on; both distances are equal on a miss."""
     near, far = intersect_box_numpy(o, d, np.zeros(3), np.ones(3))
     near = np.maximum(near, 0)
     miss = ~(near < far)
@@ -77,23 +89,27 @@ def intersect_unit_cube(o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def trace_rays(scene: AnalyticScene, o: np.ndarray, d: np.ndarray, end: np.ndarray | None = None) -> RayTruth:
-    """What float64 rays ``o + t d`` (N, 3) see of ``scene``, up to the distances ``end`` (N,)."""
+    """Compute the true values along float64 rays ``o + t d`` (N, 3) through ``scene``, up to the distances ``end``
+    (N,).
+    """
     near, far = intersect_unit_cube(o, d)
     if end is not None:
         far = np.clip(far, near, np.maximum(end, near))
-    return (_pieces if scene.optical_depth is None else _profile)(scene, o, d, near, far)
+    return (_trace_pieces if scene.optical_depth is None else _trace_profile)(scene, o, d, near, far)
 
 
 def find_first_solid(scene: AnalyticScene, o: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """Distance (N,) at which float64 rays meet the solid of a scene that is constant between breaks: matter denser than
-    `SOLID`; inf on a miss."""
-    start, length, sigma = _intervals(scene, o, d, *intersect_unit_cube(o, d))
+    """Find the distance (N,) to the first solid in a scene with constant density between breaks; inf on a miss.
+
+    Solid is matter denser than `SOLID_DENSITY`.
+    """
+    start, length, sigma = _find_intervals(scene, o, d, *intersect_unit_cube(o, d))
     solid = (sigma > SOLID_DENSITY) & (length > 0)
     return np.where(solid.any(-1), start[np.arange(len(o)), np.argmax(solid, -1)], np.inf)
 
 
-def _intervals(scene, o, d, near, far):
-    """Starts, lengths and densities (N, K) of the pieces between breaks."""
+def _find_intervals(scene, o, d, near, far):
+    """Return starts, lengths and densities (N, K) of the pieces between breaks."""
     t = np.concatenate([near[:, None], scene.breaks(o, d), far[:, None]], -1)
     t = np.sort(np.clip(t, near[:, None], far[:, None]), -1)
     start, length = t[:, :-1], np.diff(t, axis=-1)
@@ -101,18 +117,19 @@ def _intervals(scene, o, d, near, far):
     return start, length, scene.density(p[..., 0], p[..., 1], p[..., 2], NUMPY_FUNCTIONS)
 
 
-def _pieces(scene, o, d, near, far) -> RayTruth:
-    start, length, sigma = _intervals(scene, o, d, near, far)
+def _trace_pieces(scene, o, d, near, far) -> RayTruth:
+    start, length, sigma = _find_intervals(scene, o, d, near, far)
     tau = sigma * length
     before = np.cumsum(tau, -1) - tau
-    share = mean_depth_fraction(tau)
-    moment = (np.exp(-before) * -np.expm1(-tau) * (start + length * share)).sum(-1)
+    mean_depth = mean_depth_fraction(tau)
+    moment = (np.exp(-before) * -np.expm1(-tau) * (start + length * mean_depth)).sum(-1)
     total = tau.sum(-1)
 
     row = np.arange(len(o))
 
     def crossing(goal):
-        """Distance, and length per optical depth there, at which the optical depths ``goal`` are reached."""
+        """Return the distance at which the optical depths ``goal`` are reached, and the length per optical depth
+        there."""
         i = np.argmax((before + tau >= goal[:, None]) & (tau > 0), -1)
         slope = length[row, i] / np.where(tau[row, i] > 0, tau[row, i], 1)
         return start[row, i] + slope * (goal - before[row, i]), slope
@@ -122,14 +139,14 @@ def _pieces(scene, o, d, near, far) -> RayTruth:
 
 
 def mean_depth_fraction(x: np.ndarray) -> np.ndarray:
-    """1/x - 1/expm1(x), with its series where that cancels."""
+    """Return 1/x - 1/expm1(x), by its series where the difference cancels."""
     small = x < 1e-2
     y = np.clip(np.where(small, 1, x), None, 700)
     large = 1 / np.where(small, 1, x) - 1 / np.expm1(y)
     return np.where(small, 0.5 - x / 12 + x**3 / 720, large)
 
 
-def _profile(scene, o, d, near, far) -> RayTruth:
+def _trace_profile(scene, o, d, near, far) -> RayTruth:
     x, w = np.polynomial.legendre.leggauss(QUADRATURE_NODES)
     edges = (np.arange(QUADRATURE_PANELS)[:, None] + 0.5 + 0.5 * x) / QUADRATURE_PANELS
     length = far - near
@@ -151,18 +168,17 @@ def _profile(scene, o, d, near, far) -> RayTruth:
         return high
 
     p = o + d * crossing(np.log(2))[:, None]
-    reached = total >= np.log(2)
-    sigma = np.where(reached, scene.density(p[:, 0], p[:, 1], p[:, 2], NUMPY_FUNCTIONS), 1)
-    return RayTruth(total, moment, crossing, np.where(reached, 1 / sigma, 0))
+    is_reached = total >= np.log(2)
+    sigma = np.where(is_reached, scene.density(p[:, 0], p[:, 1], p[:, 2], NUMPY_FUNCTIONS), 1)
+    return RayTruth(total, moment, crossing, np.where(is_reached, 1 / sigma, 0))
 
 
 @dataclass(frozen=True)
 class StudyTruth:
-    """A reference picture, a row a ray or pixel: ``color`` (N, 3) linear, the others (N,); ``gaze`` is 0 throughout
-    without a gaze field.
+    """Reference picture with one row per ray or pixel.
 
-    ``source``: what it is; ``convergence``: how much it changed when its step was halved, by error (empty for closed
-    forms).
+    ``color`` (N, 3) is linear, the others are (N,); ``gaze`` is 0 without a gaze field. ``source`` describes the
+    reference, ``convergence`` its change, by error, when its step was halved (empty for closed forms).
     """
 
     color: np.ndarray
@@ -186,63 +202,72 @@ def compute_truth(
     tolerance: float,
     surface_opacity: float,
 ) -> StudyTruth:
-    """The reference of ``nerg``'s channels for rays (N, 3), as its manual page defines them.
+    """Compute the reference of the channels of ``nerg`` for rays (N, 3), as defined on its manual page.
 
-    ``gaze``: for the scene's observer (a single-precision network, evaluated at float64 positions), or None.
+    ``gaze`` is the gaze of the scene's observer (a single-precision network, evaluated at float64 positions), or None.
     """
-    seen = trace_rays(scene, o, d)
-    t = seen.depth(depth)
-    surface = seen.opacity >= surface_opacity
+    camera_ray = trace_rays(scene, o, d)
+    t = camera_ray.depth(depth)
+    surface = camera_ray.opacity >= surface_opacity
     p_d = o + d * t[:, None]
     p_o = np.asarray(scene.observer, float)
-    # The point looked for lies in front of the surface, by the tolerance and by how far light goes into it.
-    in_front = tolerance + np.minimum(DEPTHS.find(depth).mean_free_paths * seen.free_path, t * MAX_SURFACE_SHIFT)
+    # The target point is in front of the surface, by the tolerance and by the penetration depth of light.
+    in_front = tolerance + np.minimum(DEPTHS.find(depth).mean_free_paths * camera_ray.free_path, t * MAX_SURFACE_SHIFT)
     distance, r_o = distance_and_direction(p_o, p_d - d * in_front[:, None])
     start = np.broadcast_to(p_o, o.shape)
     p_od = p_d
     if visibility == "transmittance":
-        share = np.exp(-trace_rays(scene, start, r_o, distance).tau)
+        visible_fraction = np.exp(-trace_rays(scene, start, r_o, distance).tau)
     else:
-        met = trace_rays(scene, start, r_o)
-        d_o = np.where(met.opacity >= surface_opacity, met.depth(depth), np.inf)
-        share, p_od = _hidden(distance, d_o, tolerance, falloff, p_d, p_o, r_o)
-    share = np.where(surface, share, 0)
-    density = np.zeros(len(o)) if gaze is None else evaluate_gaze(gaze, p_od, p_o, distance_and_direction(p_o, p_d)[1]) * share
-    return StudyTruth(seen.color(o, d), seen.opacity, t, share, density, "float64 closed form", {})
+        observer_ray = trace_rays(scene, start, r_o)
+        d_o = np.where(observer_ray.opacity >= surface_opacity, observer_ray.depth(depth), np.inf)
+        visible_fraction, p_od = _compare_depths(distance, d_o, tolerance, falloff, p_d, p_o, r_o)
+    visible_fraction = np.where(surface, visible_fraction, 0)
+    density = (
+        np.zeros(len(o))
+        if gaze is None
+        else evaluate_gaze(gaze, p_od, p_o, distance_and_direction(p_o, p_d)[1]) * visible_fraction
+    )
+    return StudyTruth(
+        camera_ray.color(o, d), camera_ray.opacity, t, visible_fraction, density, "float64 closed form", {}
+    )
 
 
-def _hidden(distance, d_o, tolerance: float, falloff: float, p_d, p_o, r_o) -> tuple[np.ndarray, np.ndarray]:
-    """Visibility (N,) by comparing the ``distance`` (N,) to the points ``p_d`` with that to what is met first, ``d_o``
-    (N,), and the points (N, 3) that the observer at ``p_o`` sees along ``r_o`` (N, 3)."""
+def _compare_depths(distance, d_o, tolerance: float, falloff: float, p_d, p_o, r_o) -> tuple[np.ndarray, np.ndarray]:
+    """Compute the visibility (N,) from the ``distance`` (N,) to the points ``p_d`` and the distance ``d_o`` (N,) to the
+    first surface.
+
+    Also returns the points (N, 3) that the observer at ``p_o`` sees along ``r_o`` (N, 3).
+    """
     excess = distance - d_o - tolerance
-    share = 1 - (np.clip(excess / falloff, 0, 1) if falloff > 0 else (excess > 0))
+    visible_fraction = 1 - (np.clip(excess / falloff, 0, 1) if falloff > 0 else (excess > 0))
     blocked = excess > 0
-    return share, np.where(blocked[:, None], p_o + r_o * np.where(blocked, d_o, 0)[:, None], p_d)
+    return visible_fraction, np.where(blocked[:, None], p_o + r_o * np.where(blocked, d_o, 0)[:, None], p_d)
 
 
 def distance_and_direction(p_o, p):
-    """Distance (N,) and unit direction (N, 3) from ``p_o`` to ``p``."""
+    """Return the distance (N,) and unit direction (N, 3) from ``p_o`` to ``p``."""
     v = p - p_o
     distance = np.linalg.norm(v, axis=-1)
     return distance, v / np.where(distance > 0, distance, 1)[:, None]
 
 
 def evaluate_gaze(gaze: ObservedGaze, p_od, p_o, r_o) -> np.ndarray:
-    """Gaze density (N,) in 1/sr at points (N, 3) seen along unit ``r_o`` (N, 3) from ``p_o``, an observer of
-    ``gaze``."""
+    """Evaluate the gaze density (N,) in 1/sr at points (N, 3) seen along unit ``r_o`` (N, 3) from the observer
+    ``p_o``."""
     mi = variant_types()
-    met, eye, along = (
+    surface, observer, direction = (
         to_vector(kind, np.broadcast_to(v, p_od.shape))
         for kind, v in ((mi.Point3f, p_od), (mi.Point3f, p_o), (mi.Vector3f, r_o))
     )
-    return np.array(gaze.evaluate(met, eye, along, mi.Bool(True))[0], float)
+    return np.array(gaze.evaluate(surface, observer, direction, mi.Bool(True))[0], float)
 
 
-# ---- How far a picture is from the truth: the errors that a study reports ----
+# ---- Errors of a picture relative to the truth ----
 
-MIN_SURFACE_OPACITY = 0.5  # Opacity from which on a ray meets a surface
-MIN_DEPTH_OPACITY = 1e-3  # Opacity from which on a depth is compared
-KLD_EPS = 1e-6  # Of the mean: what a gaze of zero costs where the truth is not zero is bounded by it (13.8 nats)
+MIN_SURFACE_OPACITY = 0.5  # Opacity from which a ray hits a surface
+MIN_DEPTH_OPACITY = 1e-3  # Opacity from which depths are compared
+KLD_EPS = 1e-6  # Relative to the mean; bounds the penalty of zero gaze where the truth is not zero (13.8 nats)
 
 ERROR_NAMES = tuple(
     """
@@ -255,14 +280,26 @@ ERROR_NAMES = tuple(
 def compute_errors(
     channels: dict[str, np.ndarray], truth: StudyTruth, exact: tuple[np.ndarray, np.ndarray] | None = None
 ) -> dict[str, float]:
-    """Errors of the channels ``seen`` (N,), colour (N, 3), by name; what was not rendered is left out.
+    """Compute the errors of rendered channels by name; missing channels are skipped.
 
-    ``color_rmse``: linear radiance, over pixels and channels; ``color_psnr``: -20 log10 of it in dB; ``depth_mae``,
-    ``depth_p99``: mean and 99th percentile of |depth - truth| in scene units, over rays of opacity >= `TRACE`, a ray
-    that met nothing counting with its depth of 0; ``visibility_mae``, ``gaze_mae`` (1/sr): over pixels that truly show
-    a surface; ``gaze_kld``: nats, of both pictures as densities over those pixels. With ``exact`` distances and
-    visibilities: ``surface_mae``, ``surface_p99``: |depth - exact| over exact hits; ``visibility_wrong``: share of
-    these pixels that are shown (above 1/2) and hidden, or the reverse.
+    Parameters
+    ----------
+    channels : dict
+        Rendered channels (N,), colour (N, 3).
+    truth : StudyTruth
+        Reference.
+    exact : tuple, optional
+        Exact distances (inf on a miss) and visibilities.
+
+    Returns
+    -------
+    dict
+        ``color_rmse``: linear radiance, over pixels and channels; ``color_psnr``: -20 log10 of it in dB; ``depth_mae``,
+        ``depth_p99``: mean and 99th percentile of |depth - truth| in scene units, over rays of opacity >=
+        `MIN_DEPTH_OPACITY`, where misses count with depth 0; ``visibility_mae``, ``gaze_mae`` (1/sr): over pixels that
+        truly show a surface; ``gaze_kld``: nats, of both pictures as densities over those pixels. With ``exact``:
+        ``surface_mae``, ``surface_p99``: |depth - exact| over exact hits; ``visibility_wrong``: fraction of these
+        pixels with the wrong binary visibility (threshold 1/2).
     """
     out = {}
     if "color" in channels and np.any(channels["color"]):
@@ -291,44 +328,49 @@ def compute_errors(
     return out
 
 
-# ---- A scene of shapes alone as the subject of a study: its truth is float64 ray casts at their triangles ----
+# ---- Scenes of shapes without a field: float64 ray casts at their triangles ----
 
 CHUNK = 64  # Rays tested against all triangles at once
-COLOR_SPP = 256  # The mean of so many samples a pixel is the colour that pictures are compared with
+COLOR_SPP = 256  # Samples per pixel of the reference colour
 
 
 def extract_triangles(scene) -> np.ndarray:
-    """Corners (N, 3, 3), float64, of all shapes of a Mitsuba scene. Raises NergError for a shape that is no mesh."""
+    """Extract the corners (N, 3, 3), float64, of all shapes of a Mitsuba scene. Raises `NergError` for a shape that is
+    not a mesh.
+    """
     import mitsuba as mi
 
-    found = []
+    parts = []
     for shape in scene.shapes():
         if not shape.is_mesh():
             raise NergError(
-                f"a study of shapes needs meshes, and this scene has a {shape.class_name()}: give it as triangles"
+                f"a study of shapes supports only meshes, and this scene has a {shape.class_name()}; convert it to "
+                "triangles"
             )
         params = mi.traverse(shape)
         corners = np.array(params["vertex_positions"], float).reshape(-1, 3)
-        found.append(corners[np.array(params["faces"], int).reshape(-1, 3)])
-    return np.concatenate(found)
+        parts.append(corners[np.array(params["faces"], int).reshape(-1, 3)])
+    return np.concatenate(parts)
 
 
 def find_first_hit(triangles: np.ndarray, o: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """Distance (N,) at which rays ``o + t d`` (N, 3), t > 0, first meet one of the triangles (M, 3, 3); inf on a miss.
+    """Find the distance (N,) at which rays ``o + t d`` (N, 3), t > 0, first hit one of the triangles (M, 3, 3); inf on
+    a miss.
 
-    Möller and Trumbore 1997, in float64. Edges count as inside to rounding, so that no ray slips between neighbours.
+    Möller and Trumbore 1997, in float64. Edges count as inside up to rounding, so that no ray passes between
+    neighbours.
     """
     a, u, v = triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     out = np.empty(len(o))
     for begin in range(0, len(o), CHUNK):
-        origin, way = o[begin : begin + CHUNK, None], d[begin : begin + CHUNK, None]
-        p = np.cross(way, v)
+        origin, direction = o[begin : begin + CHUNK, None], d[begin : begin + CHUNK, None]
+        p = np.cross(direction, v)
         det = (p * u).sum(-1)
         with np.errstate(divide="ignore", invalid="ignore"):
             s = origin - a
             first = (s * p).sum(-1) / det
             q = np.cross(s, u)
-            second = (q * way).sum(-1) / det
+            second = (q * direction).sum(-1) / det
             t = (q * v).sum(-1) / det
             hit = (first >= -1e-12) & (second >= -1e-12) & (first + second <= 1 + 1e-12) & (t > 0) & (det != 0)
         out[begin : begin + CHUNK] = np.where(hit, t, np.inf).min(-1)
@@ -336,20 +378,20 @@ def find_first_hit(triangles: np.ndarray, o: np.ndarray, d: np.ndarray) -> np.nd
 
 
 def make_observed_gaze(subject, p_o: np.ndarray) -> ObservedGaze:
-    """The gaze field of ``subject`` for the observer at ``p_o`` (3,)."""
+    """Make the gaze field of ``subject`` for the observer at ``p_o`` (3,)."""
     import mitsuba as mi
 
-    # The integral is the integrator's own, of all directions: over ray casts, which are exact to single precision, and
-    # tested against ``first_hit``.
+    # Use the integral of the integrator over all directions: its ray casts are exact to single precision, and tested
+    # against ``find_first_hit``.
     integrator = subject.make_integrator({"integral_tolerance": 0.0})
     place = SceneGeometry(None, subject.scene)
     return integrator.gaze.for_observers([mi.Point3f(*p_o.tolist())], place, integrator.observer_settings)
 
 
 def compute_truth_of_shapes(subject, seed: int, visibility: str, color: np.ndarray) -> StudyTruth:
-    """The reference of ``nerg``'s channels for shapes alone, as its manual page defines them.
+    """Compute the reference of the channels of ``nerg`` for shapes without a field, as defined on its manual page.
 
-    ``color``: (N, 3), what the colours of the picture tend to.
+    ``color`` (N, 3) is the converged colour.
     """
     o, d = subject.record_rays(seed)
     t = subject.find_first_hits(seed)
@@ -357,44 +399,48 @@ def compute_truth_of_shapes(subject, seed: int, visibility: str, color: np.ndarr
     depth = np.where(hit, t, 0)
     p_d, p_o = o + d * depth[:, None], subject.observer_position()
     distance, r_o = distance_and_direction(p_o, p_d - d * subject.tolerance)
-    met = find_first_hit(subject.triangles, np.broadcast_to(p_o, o.shape), r_o)
+    first_hit = find_first_hit(subject.triangles, np.broadcast_to(p_o, o.shape), r_o)
     p_od = p_d
     if visibility == "transmittance":
-        share = (met >= distance).astype(float)
+        visible_fraction = (first_hit >= distance).astype(float)
     else:
         falloff = float(subject.base_params["falloff"])
-        share, p_od = _hidden(distance, met, subject.tolerance, falloff, p_d, p_o, r_o)
-    share = np.where(hit, share, 0)
+        visible_fraction, p_od = _compare_depths(distance, first_hit, subject.tolerance, falloff, p_d, p_o, r_o)
+    visible_fraction = np.where(hit, visible_fraction, 0)
     gaze = np.zeros(len(o))
     if subject.has_gaze:
-        gaze = evaluate_gaze(make_observed_gaze(subject, p_o), p_od, p_o, distance_and_direction(p_o, p_d)[1]) * share
-    source = f"float64 ray casts; colour the mean of {COLOR_SPP} samples a pixel"
-    return StudyTruth(color, hit.astype(float), depth, share, gaze, source, {})
+        gaze = (
+            evaluate_gaze(make_observed_gaze(subject, p_o), p_od, p_o, distance_and_direction(p_o, p_d)[1])
+            * visible_fraction
+        )
+    source = f"float64 ray casts; colour the mean of {COLOR_SPP} samples per pixel"
+    return StudyTruth(color, hit.astype(float), depth, visible_fraction, gaze, source, {})
 
 
 # ---- Splats ----
 #
-# What can be set of Gaussian splats: they are not marched, but cut off, each at so many standard deviations, and rays
-# end where little light is left.
+# Parameters of Gaussian splats: they are not marched, but cut off at a number of standard deviations, and rays end
+# where little light is left.
 
 SPLAT_EXTENTS = (1.5, 2.0, 2.5, 3.0, 4.0, 5.0)
 SPLAT_STOPS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
 REFERENCE_EXTENTS = ({"extent": 8.0}, {"extent": 6.0})
-"""Where Gaussians are cut off in a reference, and in one that tells how good it is."""
+"""Cut-off of the Gaussians in a reference, and in a second one that measures its convergence."""
 SPLAT_SOURCE = f"render of Gaussians cut off at {REFERENCE_EXTENTS[0]['extent']:g} standard deviations"
 
 
 def apply_splat_extent(params: Mapping) -> dict:
-    """``params`` of an integrator without ``extent``, where Gaussians of its field are cut off: if it is there, the
-    field is another one that is cut off there."""
+    """Remove ``extent`` from the integrator ``params`` and apply it: the field is replaced by one whose Gaussians are
+    cut off there.
+    """
     import mitsuba as mi
 
-    found = dict(params)
-    extent = found.pop("extent", None)
+    result = dict(params)
+    extent = result.pop("extent", None)
     if extent is not None:
-        field = found["field"]
+        field = result["field"]
         medium = field.medium()
         to_world = mi.ScalarTransform4f(medium.to_world.matrix.tolist())
         splats = {"type": "splats", "filename": field.filename, "color_space": medium.color_space}
-        found["field"] = mi.load_dict(splats | {"to_world": to_world, "extent": extent})
-    return found
+        result["field"] = mi.load_dict(splats | {"to_world": to_world, "extent": extent})
+    return result

@@ -1,4 +1,4 @@
-"""Whether a gaze field knows where it is wrong: its spread and its support against its errors."""
+"""Evaluation of uncertainty: spread and support of a gaze field compared with its errors."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.probes.probes import REGION_LEVELS, get_calibrated_level, format_level, compute_region_levels
+from nerg_mi.probes.probes import REGION_LEVELS, compute_region_levels, format_level, get_calibrated_level
 
 from . import metrics
 from .gaze import EPS, SCORES, GazeTest
 
 SIGNALS = {"support": True, "spread": False}
-"""What tells how sure a field is, by its name in a row of `position_rows`, and whether more of it is surer."""
+"""Signals of certainty by their name in a row of `score_positions`, and whether higher values are more certain."""
 ERRORS = ("KLD", "excess")
-"""Errors of a position: KLD (nats), and by how much it is above that of one half of the people under the other."""
-RETAINED_FRACTIONS = (1.0, 0.75, 0.5, 0.25)  # Shares of the positions, the surest, whose mean error is told
-# Halves of the people that are drawn, rays that each half has at a position at least, and the blind density's share of
-# what one half tells of the other, so that where it never looked is not impossible.
-_HALVES, _RAYS, _BLIND = 8, 32, 0.2
-_GROUPS = 5  # Groups of positions from which on there is an interval
+"""Errors at a position: KLD (nats), and its excess over the split-half KLD."""
+RETAINED_FRACTIONS = (1.0, 0.75, 0.5, 0.25)  # Fractions of the most certain positions whose mean error is reported
+# Random halves of the participants, minimum rays of each half at a position, and the weight of the position-blind
+# density in the prediction of one half from the other, so that unseen directions have non-zero probability.
+_NUM_HALVES, _MIN_RAYS, _BLIND_WEIGHT = 8, 32, 0.2
+_MIN_GROUPS = 5  # Minimum number of position groups for a confidence interval
 
 
 def score_positions(
@@ -34,17 +34,37 @@ def score_positions(
     groups: Sequence[Any] | None = None,
     seed: int = 0,
 ) -> list[dict[str, Any]]:
-    """A row a position of ``test``: where it is (m), its ``group``, rays and people, KLD of ``maps`` and of ``blind``
-    (P, D), that of the people's ``half`` and the ``excess`` over it, where they are enough, and how sure the field is:
-    ``support`` (P,), rays, and ``spread`` (P,), the standard deviation over an ensemble's members, integrated over the
-    sphere. ``groups``: of neighbouring positions; None: each is its own."""
-    error, less = (metrics.kld(test.truth, m, eps=EPS) for m in (maps, blind))
+    """Make a row per position of ``test`` with its errors and signals of certainty.
+
+    Parameters
+    ----------
+    test : GazeTest
+        Test data.
+    maps, blind : numpy.ndarray
+        Densities (P, D) of the field and of the position-blind baseline.
+    support : numpy.ndarray, optional
+        Number of nearby training rays (P,).
+    spread : numpy.ndarray, optional
+        Standard deviation over the members of an ensemble, integrated over the sphere (P,).
+    groups : sequence, optional
+        Group of neighbouring positions of each position. Default: each position is its own group.
+    seed : int
+        Seed of the random halves.
+
+    Returns
+    -------
+    list of dict
+        Position (m), ``group``, numbers of rays and participants (``people``), KLD of the field and of the baseline
+        (``blind``), the split-half KLD (``half``) and the ``excess`` over it if there is enough data, ``support`` and
+        ``spread``.
+    """
+    error, blind_error = (metrics.kld(test.truth, m, eps=EPS) for m in (maps, blind))
     half = compute_split_half_errors(test, blind, seed)
     rows = []
     for i, (x, y, z) in enumerate(test.centres.tolist()):
         row = {"x": x, "y": y, "z": z, "group": str(i if groups is None else groups[i])}
         row |= {"rays": int(test.counts[i].sum()), "people": int(np.count_nonzero(test.counts[i]))}
-        row |= {"KLD": float(error[i]), "blind": float(less[i])}
+        row |= {"KLD": float(error[i]), "blind": float(blind_error[i])}
         if np.isfinite(half[i]):
             row |= {"half": float(half[i]), "excess": float(error[i] - half[i])}
         row |= {k: float(v[i]) for k, v in (("support", support), ("spread", spread)) if v is not None}
@@ -53,41 +73,53 @@ def score_positions(
 
 
 def compute_split_half_errors(test: GazeTest, blind: np.ndarray, seed: int = 0) -> np.ndarray:
-    """KLD (P,) of half of the people under the other half, mixed with a fifth of ``blind`` (P, D): means over both
-    directions and several draws of the halves. NaN where no draw leaves both halves 32 rays."""
-    rng, found = np.random.default_rng(seed), []
-    people = len(test.participants)
-    for _ in range(_HALVES if people > 1 else 0):
-        side = rng.permutation(people) < people // 2
+    """Compute the KLD (P,) of one half of the participants under the other half, mixed with a fifth of ``blind`` (P,
+    D).
+
+    The result is the mean over both directions and several random halves; NaN if no split leaves 32 rays in both
+    halves.
+    """
+    rng, errors = np.random.default_rng(seed), []
+    num_participants = len(test.participants)
+    for _ in range(_NUM_HALVES if num_participants > 1 else 0):
+        side = rng.permutation(num_participants) < num_participants // 2
         counts = [test.counts * side, test.counts * ~side]
-        both = np.logical_and(*(c.sum(axis=1) >= _RAYS for c in counts))
+        has_both = np.logical_and(*(c.sum(axis=1) >= _MIN_RAYS for c in counts))
         error = np.full(len(test.truth), np.nan)
-        shares = [c[both] / c[both].sum(axis=1, keepdims=True) for c in counts]
-        a, b = (np.einsum("pn,pnd->pd", share, test.participant_densities[both]) for share in shares)
-        told = lambda maps, both=both: (1 - _BLIND) * maps + _BLIND * blind[both]
-        error[both] = (metrics.kld(a, told(b), eps=EPS) + metrics.kld(b, told(a), eps=EPS)) / 2
-        found.append(error)
-    each = np.array(found).reshape(-1, len(test.truth))
-    known = np.isfinite(each)
-    return np.where(known.any(axis=0), np.where(known, each, 0).sum(axis=0) / np.maximum(known.sum(axis=0), 1), np.nan)
+        shares = [c[has_both] / c[has_both].sum(axis=1, keepdims=True) for c in counts]
+        a, b = (np.einsum("pn,pnd->pd", share, test.participant_densities[has_both]) for share in shares)
+        mix_blind = lambda maps, both=has_both: (1 - _BLIND_WEIGHT) * maps + _BLIND_WEIGHT * blind[both]
+        error[has_both] = (metrics.kld(a, mix_blind(b), eps=EPS) + metrics.kld(b, mix_blind(a), eps=EPS)) / 2
+        errors.append(error)
+    stacked = np.array(errors).reshape(-1, len(test.truth))
+    is_known = np.isfinite(stacked)
+    return np.where(
+        is_known.any(axis=0), np.where(is_known, stacked, 0).sum(axis=0) / np.maximum(is_known.sum(axis=0), 1), np.nan
+    )
 
 
-def correlate_uncertainty(rows: Sequence[Mapping[str, Any]], resamples: int = 200, seed: int = 0) -> list[dict[str, Any]]:
-    """A row a signal of `SIGNALS` that ``rows`` of `position_rows` have, and error: Spearman's rank correlation of what
-    makes unsure with the error, ``rho``, with ``.low`` and ``.high`` of its 95 % interval where there are five groups
-    of positions, and the mean error of the surest `KEPT` of the positions. NaN where a signal is the same everywhere,
-    and so says nothing."""
+def correlate_uncertainty(
+    rows: Sequence[Mapping[str, Any]], resamples: int = 200, seed: int = 0
+) -> list[dict[str, Any]]:
+    """Correlate signals of certainty with errors.
+
+    Returns a row per signal of `SIGNALS` and error: Spearman's rank correlation ``rho`` of the uncertainty with the
+    error, the ends ``.low`` and ``.high`` of its 95 % confidence interval if there are five groups of positions, and
+    the mean error of the most certain `RETAINED_FRACTIONS` of the positions. A constant signal has rho NaN.
+    """
     out = []
-    for signal, surer in SIGNALS.items():
+    for signal, is_higher_better in SIGNALS.items():
         for error in ERRORS:
             used = [r for r in rows if signal in r and error in r]
             if not used:
                 continue
-            doubt = np.array([r[signal] for r in used], float) * (-1 if surer else 1)
+            uncertainty = np.array([r[signal] for r in used], float) * (-1 if is_higher_better else 1)
             value = np.array([r[error] for r in used], float)
-            row = {"signal": signal, "error": error, "positions": len(used), "rho": _spearman(doubt, value)}
-            row |= _interval(doubt, value, [r["group"] for r in used], resamples, seed)
-            out.append(row | {f"{share:.0%}": _risk(doubt, value, share) for share in RETAINED_FRACTIONS})
+            row = {"signal": signal, "error": error, "positions": len(used), "rho": _spearman(uncertainty, value)}
+            row |= _bootstrap_interval(uncertainty, value, [r["group"] for r in used], resamples, seed)
+            out.append(
+                row | {f"{share:.0%}": _mean_certain_error(uncertainty, value, share) for share in RETAINED_FRACTIONS}
+            )
     return out
 
 
@@ -98,27 +130,44 @@ def measure_calibration(
     seed: int = 0,
     calibrated: Mapping[str, Mapping[str, float]] | None = None,
 ) -> list[dict[str, Any]]:
-    """A row a method: the share of the rays of ``test`` that lie in the smallest regions which are said to hold
-    `LEVELS` of the gaze, with ``.low`` and ``.high`` where there are three persons. ``methods``: densities in the
-    test's directions (P, D), and at its rays (P, K). ``calibrated``: by methods that have them, what its training found
-    are to be asked for (`probes.probes.calibrated_levels`), which make a row "METHOD, calibrated"."""
-    rng, people = np.random.default_rng(seed), len(test.participants)
-    draws = rng.multinomial(people, np.full(people, 1 / people), resamples if people >= 3 else 0)
+    """Measure the coverage of highest-density regions on held-out rays.
+
+    Parameters
+    ----------
+    test : GazeTest
+        Test data.
+    methods : mapping
+        Densities by method in the directions of the test (P, D), and at its rays (P, K).
+    resamples, seed : int
+        Bootstrap of the participants.
+    calibrated : mapping, optional
+        Calibrated levels of methods (`probes.probes.calibrate_levels`). Each adds a row "METHOD, calibrated".
+
+    Returns
+    -------
+    list of dict
+        A row per method: the fraction of the rays in the regions of each of `REGION_LEVELS`, with ``.low`` and
+        ``.high`` if there are three participants.
+    """
+    rng, num_participants = np.random.default_rng(seed), len(test.participants)
+    draws = rng.multinomial(
+        num_participants, np.full(num_participants, 1 / num_participants), resamples if num_participants >= 3 else 0
+    )
     out = []
     for name, (maps, at) in methods.items():
         level = compute_region_levels(maps, at)
         rows: dict[str, Mapping[str, float] | None] = {name: None}
         if calibrated and name in calibrated:
             rows[f"{name}, calibrated"] = calibrated[name]
-        for title, asked in rows.items():
+        for title, level_map in rows.items():
             row: dict[str, Any] = {"method": title}
-            for share in REGION_LEVELS:
-                inside, key = level <= get_calibrated_level(share, asked), format_level(share)
-                row[key] = float(inside.mean())
+            for coverage in REGION_LEVELS:
+                is_inside, key = level <= get_calibrated_level(coverage, level_map), format_level(coverage)
+                row[key] = float(is_inside.mean())
                 if len(draws):
                     weights = [times[test.sample_participants] for times in draws]
-                    reach = 1.96 * np.std([(inside * w).sum() / w.sum() for w in weights])
-                    row[f"{key}.low"], row[f"{key}.high"] = row[key] - reach, row[key] + reach
+                    half_width = 1.96 * np.std([(is_inside * w).sum() / w.sum() for w in weights])
+                    row[f"{key}.low"], row[f"{key}.high"] = row[key] - half_width, row[key] + half_width
             out.append(row)
     return out
 
@@ -132,69 +181,74 @@ def _spearman(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.corrcoef(a, b)[0, 1])
 
 
-def _interval(
-    doubt: np.ndarray, error: np.ndarray, groups: Sequence[str], resamples: int, seed: int
+def _bootstrap_interval(
+    uncertainty: np.ndarray, error: np.ndarray, groups: Sequence[str], resamples: int, seed: int
 ) -> dict[str, float]:
-    """The ends of the interval of ``rho``: quantiles over resamples of the groups, each with all of its positions."""
-    names, own = np.unique(groups, return_inverse=True)
-    if len(names) < _GROUPS or not resamples:
+    """Return the 95 % confidence interval of ``rho``: quantiles over resamples of whole position groups."""
+    names, group_index = np.unique(groups, return_inverse=True)
+    if len(names) < _MIN_GROUPS or not resamples:
         return {}
-    rng, members = np.random.default_rng(seed), [np.flatnonzero(own == k) for k in range(len(names))]
-    found = []
+    rng, members = np.random.default_rng(seed), [np.flatnonzero(group_index == k) for k in range(len(names))]
+    correlations = []
     for _ in range(resamples):
         drawn = np.concatenate([members[k] for k in rng.integers(0, len(names), len(names))])
-        found.append(_spearman(doubt[drawn], error[drawn]))
-    found = [v for v in found if np.isfinite(v)]
-    if not found:
+        correlations.append(_spearman(uncertainty[drawn], error[drawn]))
+    correlations = [v for v in correlations if np.isfinite(v)]
+    if not correlations:
         return {}
-    low, high = np.quantile(found, [0.025, 0.975])
+    low, high = np.quantile(correlations, [0.025, 0.975])
     return {"rho.low": float(low), "rho.high": float(high)}
 
 
-def _risk(doubt: np.ndarray, error: np.ndarray, share: float) -> float:
-    """Mean ``error`` of the surest ``share``; those that are equally sure count alike."""
-    _, place = np.unique(doubt, return_inverse=True)
-    alike = (np.bincount(place, weights=error) / np.bincount(place))[place]
-    surest = np.argsort(place, kind="stable")[: max(1, round(share * len(error)))]
-    return float(alike[surest].mean())
+def _mean_certain_error(uncertainty: np.ndarray, error: np.ndarray, fraction: float) -> float:
+    """Return the mean ``error`` of the most certain ``share``; ties have equal weight."""
+    _, rank = np.unique(uncertainty, return_inverse=True)
+    tied_mean = (np.bincount(rank, weights=error) / np.bincount(rank))[rank]
+    most_certain = np.argsort(rank, kind="stable")[: max(1, round(fraction * len(error)))]
+    return float(tied_mean[most_certain].mean())
 
 
-# ---- Scores of several folds as one table: means, and how far folds are from each other ----
+# ---- Summary of several folds: means and confidence intervals ----
 #
-# An interval is that of Student's t distribution for the mean of K folds: mean ± t(0.975, K - 1) s / √K. Folds share
-# people who train, so that they are not independent, and no estimate of the variance is unbiased (Y. Bengio and
-# Y. Grandvalet 2004): the interval tells the spread over people and zones that were held out, and not what a new shop
-# would give. Differences are taken fold by fold, where most of that spread is the same for both methods.
+# The confidence interval is that of Student's t distribution for the mean of K folds: mean ± t(0.975, K - 1) s / √K.
+# Folds share training participants, so they are not independent, and no estimate of the variance is unbiased (Bengio
+# and Grandvalet 2004): the interval measures the variation over held-out participants and zones, not that of a new
+# environment. Differences are taken fold by fold, where most of the variation is common to both methods.
 
-SPLIT_HALF = "split half"  # A reference and no method: what half of the people tell of the other half
+SPLIT_HALF = "split half"  # A reference, not a method: prediction of one half of the participants from the other
 _SCORES = (*SCORES, "integral")
 
 
 def summarise_folds(folds: Sequence[Sequence[Mapping[str, Any]]], confidence: float = 0.95) -> list[dict[str, Any]]:
-    """`means` of the scores and of the integral of ``folds``, which have the rows of `workflows.evaluate_gaze`, the
-    field's first. The last row is the field less the last method, fold by fold."""
-    found = average_folds(folds, _SCORES, confidence)
-    names = [row["method"] for row in found]
+    """Average the scores and the integral of ``folds``, the rows of `workflows.evaluate_gaze` with the field's first.
+
+    The last row is the difference of the field to the last method, fold by fold.
+    """
+    summary = average_folds(folds, _SCORES, confidence)
+    names = [row["method"] for row in summary]
     by_name = [{row["method"]: row for row in rows} for rows in folds]
-    bar = next((name for name in reversed(names) if name != SPLIT_HALF), None)
-    if bar is None or bar == names[0]:
-        return found
-    both = [(rows[names[0]], rows[bar]) for rows in by_name if names[0] in rows and bar in rows]
-    less = [{k: ours[k] - other[k] for k in SCORES if k in ours and k in other} for ours, other in both]
-    return [*found, _row(f"{names[0]} less {bar}", less, _SCORES, confidence)]
+    reference = next((name for name in reversed(names) if name != SPLIT_HALF), None)
+    if reference is None or reference == names[0]:
+        return summary
+    pairs = [(rows[names[0]], rows[reference]) for rows in by_name if names[0] in rows and reference in rows]
+    differences = [{k: ours[k] - other[k] for k in SCORES if k in ours and k in other} for ours, other in pairs]
+    return [*summary, _make_row(f"{names[0]} less {reference}", differences, _SCORES, confidence)]
 
 
 def average_folds(
     folds: Sequence[Sequence[Mapping[str, Any]]], scores: Sequence[str], confidence: float = 0.95
 ) -> list[dict[str, Any]]:
-    """A row a method, in the order of the first fold: means of ``scores`` over the ``folds`` whose rows have them, with
-    ``.low`` and ``.high``, and how many ``folds`` these are. A score of one fold alone has no interval."""
+    """Average ``scores`` over the ``folds`` that have them.
+
+    Returns a row per method in the order of the first fold, with ``.low`` and ``.high`` of the confidence interval, and
+    the number of ``folds``. A score of a single fold has no interval.
+    """
     names = list(dict.fromkeys(row["method"] for rows in folds for row in rows))
     by_name = [{row["method"]: row for row in rows} for rows in folds]
-    return [_row(name, [rows[name] for rows in by_name if name in rows], scores, confidence) for name in names]
+    return [_make_row(name, [rows[name] for rows in by_name if name in rows], scores, confidence) for name in names]
 
 
-def _row(name: str, rows: Sequence[Mapping[str, Any]], scores: Sequence[str], confidence: float) -> dict[str, Any]:
+def _make_row(name: str, rows: Sequence[Mapping[str, Any]], scores: Sequence[str], confidence: float) -> dict[str, Any]:
     from scipy.stats import t
 
     out: dict[str, Any] = {"method": name, "folds": len(rows)}
@@ -204,6 +258,6 @@ def _row(name: str, rows: Sequence[Mapping[str, Any]], scores: Sequence[str], co
             continue
         out[score] = float(np.mean(values))
         if len(values) > 1:
-            reach = t.ppf(0.5 + confidence / 2, len(values) - 1) * np.std(values, ddof=1) / math.sqrt(len(values))
-            out[f"{score}.low"], out[f"{score}.high"] = float(out[score] - reach), float(out[score] + reach)
+            half_width = t.ppf(0.5 + confidence / 2, len(values) - 1) * np.std(values, ddof=1) / math.sqrt(len(values))
+            out[f"{score}.low"], out[f"{score}.high"] = float(out[score] - half_width), float(out[score] + half_width)
     return out

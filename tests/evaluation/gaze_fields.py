@@ -1,4 +1,4 @@
-"""Small gaze fields of every kind in files, for tests that render them and evaluate them otherwise."""
+"""Small gaze fields of every kind in files, for tests that compare rendering and evaluation."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ KINDS = ("linear", "normalised", "default recipe", "ensemble")
 GRID = HashGridConfig(levels=2, log2_rows=10, base=2, finest=4)
 
 
-def made(kind: str, box: Box, seed: int = 4, **more):
-    """A field of ``kind``: far from constant, so that what is evaluated elsewhere is another value."""
+def made(kind: str, box: Box, seed: int = 4, **options):
+    """Make a field of ``kind`` with strong variation, so that evaluation errors are detected."""
     if kind == "ensemble":
-        return GazeEnsemble([made("default recipe", box, s, **more) for s in (seed, seed + 1)])
+        return GazeEnsemble([made("default recipe", box, s, **options) for s in (seed, seed + 1)])
     rng = np.random.default_rng(seed)
     if kind == "default recipe":
-        config = LogGazeConfig(grid=GRID, width=16, prior=16, heads=(box.lower, box.upper), mix=0.2, **more)
+        config = LogGazeConfig(grid=GRID, width=16, prior=16, heads=(box.lower, box.upper), mix=0.2, **options)
         blind = make_prior_table(np.exp(0.5 * rng.normal(size=512)) / 14.2, 16, ns, fibonacci_directions(1 << 14))
         field = LogGazeField.random(config, box, ns, seed, blind)
         steep = {k: 8 * v for k, v in field.parameters().items() if k in ("emit_net.2", "capture_net.2")} | {
@@ -31,7 +31,10 @@ def made(kind: str, box: Box, seed: int = 4, **more):
         }
     else:
         field = GazeField.random(
-            GazeConfig(GRID, width=16, geometry=7, sh_degree=2, normalized=kind == "normalised", **more), box, ns, seed
+            GazeConfig(GRID, width=16, geometry=7, sh_degree=2, normalized=kind == "normalised", **options),
+            box,
+            ns,
+            seed,
         )
         steep = {k: 30 * v for k, v in field.parameters().items() if k in ("emit_head.0", "capture_head.0")}
     table = 2 * rng.normal(size=len(field.grid.table)).astype(np.float32)
@@ -39,8 +42,8 @@ def made(kind: str, box: Box, seed: int = 4, **more):
     return field
 
 
-def saved(path, kind: str, box: Box, seed: int = 4, **more):
-    """The field of ``kind`` that is written to ``path``."""
-    field = made(kind, box, seed, **more)
+def saved(path, kind: str, box: Box, seed: int = 4, **options):
+    """Make a field of ``kind`` and write it to ``path``."""
+    field = made(kind, box, seed, **options)
     save_gaze(field, path, {})
     return field

@@ -12,16 +12,16 @@ import pytest
 from nerg_mi.evaluation import ablation
 from nerg_mi.evaluation.ablation import (
     COLUMNS,
+    add_relative_losses,
+    format_table,
     list_variants,
     make_frame_timer,
-    add_relative_losses,
     score_density,
     summarise,
-    format_table,
     write_ablation,
 )
 from nerg_mi.maths.geometry import Box
-from nerg_mi.train.geometry import TrainingGeometry, load_field_geometry, make_hit_geometry, load_scene_geometry
+from nerg_mi.train.geometry import TrainingGeometry, load_field_geometry, load_scene_geometry, make_hit_geometry
 from tests.formats.splats.writers import random_splats, write_inria
 from tests.plugins import fields
 from tests.train.gaze.looks import looking_at
@@ -55,7 +55,7 @@ def test_variants():
     assert len(list_variants(False)) == 7 and len(list_variants(True, ("small",))) == 10
 
 
-def test_losses_are_related_to_those_of_the_whole_field():
+def test_losses_are_relative_to_the_full_field():
     made = [r for r in rows() if r["recipe"] == "default"] + [{**rows()[0], "recipe": "small"}]
     for r in made:
         r.pop("test_relative"), r.pop("train_relative")
@@ -84,11 +84,11 @@ def test_the_loss_is_the_papers():
     from types import SimpleNamespace
 
     rng = np.random.default_rng(0)
-    truth, found = rng.random((2, 3, 50)) / 8
+    truth, result = rng.random((2, 3, 50)) / 8
     test = SimpleNamespace(truth=truth, centres=None, directions=None)
-    row = score_density({"test": test}, lambda centres, directions: found)
+    row = score_density({"test": test}, lambda centres, directions: result)
     assert row["test_loss"] == pytest.approx(row["test_KLD"] + 1 - row["test_CC"] + row["test_MAE"])
-    assert row["test_MAE"] == pytest.approx(np.abs(truth - found).mean()) and row["test_KLD"] > 0
+    assert row["test_MAE"] == pytest.approx(np.abs(truth - result).mean()) and row["test_KLD"] > 0
 
 
 # ---- The time of a frame: of what there is to render, and without the first one, which compiles ----
@@ -100,7 +100,7 @@ ROOM = '<scene version="3.0.0"><shape type="cube"><boolean name="flip_normals" v
 
 @pytest.fixture
 def clock(monkeypatch):
-    """A clock by which the k-th frame takes k seconds."""
+    """A clock on which the k-th frame takes k seconds."""
     ticks = iter([t for k in range(1, 20) for t in (100 * k, 101 * k)])
     monkeypatch.setattr(ablation.time, "perf_counter", lambda: next(ticks))
 
@@ -119,11 +119,11 @@ def made(kind, folder):
 
 
 @pytest.mark.parametrize("kind", ["field", "splats", "scene", "hits"])
-def test_it_is_the_mean_of_all_frames_but_the_first(rgb, tmp_path, clock, kind):
+def test_frame_time_excludes_the_first_frame(rgb, tmp_path, clock, kind):
     saved(tmp_path / "gaze.safetensors", "linear", BOX)
     render = make_frame_timer(made(kind, tmp_path), CENTRES, tmp_path, cameras=2, width=8, height=4)
     assert render(tmp_path / "gaze.safetensors") == pytest.approx((2 + 3) / 2)
 
 
-def test_without_anything_to_render_there_is_no_time(tmp_path):
+def test_no_frame_time_without_geometry(tmp_path):
     assert make_frame_timer(TrainingGeometry(None, BOX, "none"), CENTRES, tmp_path) is None

@@ -10,7 +10,12 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation import gaze, metrics
-from nerg_mi.evaluation.gaze import FieldDensity, compute_map_scores, make_position_blind_baseline, make_uniform_baseline
+from nerg_mi.evaluation.gaze import (
+    FieldDensity,
+    compute_map_scores,
+    make_position_blind_baseline,
+    make_uniform_baseline,
+)
 from nerg_mi.maths import vmf
 from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
@@ -30,7 +35,7 @@ X = fibonacci_directions(1024)
 
 @pytest.fixture(scope="module")
 def rays_baselines():
-    """People who look at one thing in the middle of the room."""
+    """Participants who look at one object in the middle of the room."""
     rng = np.random.default_rng(1)
     origin = rng.uniform([0, 0, 1.5], [4, 4, 1.6], (9000, 3))
     to = np.array([2.0, 2.0, 1.0]) - origin
@@ -43,8 +48,10 @@ def test_position_blind_is_the_kde_of_all(rays_baselines):
     density = gaze.make_position_blind_baseline(rays_baselines, kappa=30.0, backend="llvm")(np.zeros((3, 3)), X)
     want = reference(X, rays_baselines.direction, [0, len(rays_baselines)], [30.0])
     assert density.shape == (3, 1024) and np.allclose(density, want, rtol=2e-4)
-    own = gaze.make_position_blind_baseline(rays_baselines, kappa=30.0, backend="llvm")(np.zeros((2, 3)), np.stack([X, X[::-1]]))
-    assert np.allclose(own[0], own[1, ::-1], rtol=1e-5)
+    individual = gaze.make_position_blind_baseline(rays_baselines, kappa=30.0, backend="llvm")(
+        np.zeros((2, 3)), np.stack([X, X[::-1]])
+    )
+    assert np.allclose(individual[0], individual[1, ::-1], rtol=1e-5)
 
 
 def test_nearest_probes(rays_baselines):
@@ -57,7 +64,7 @@ def test_nearest_probes(rays_baselines):
     four = gaze.make_nearest_probes_baseline(probes, 4, backend="llvm")
     assert np.allclose(four(at, X)[0], density[near].mean(axis=0), rtol=1e-5)
     assert np.allclose(four(at, X[None])[0], four(at, X)[0], rtol=1e-5)
-    # Averaged in float64 either way: float32 would lose digits of what differs little.
+    # Both averages are in float64, because float32 would lose precision.
     assert four(at, X).dtype == four(at, X[None]).dtype == np.float64
 
 
@@ -70,7 +77,7 @@ def test_nearest_rays(rays_baselines):
 
 @pytest.mark.parametrize("weights", ["distance", "person"])
 def test_probes_keep_their_weights(rays_baselines, weights):
-    """What a probe weighs its rays by is part of its density, for one probe and for several."""
+    """The ray weights of a probe are part of its density, for one probe and for several."""
     one = lambda w: np.concatenate([np.zeros(8000), np.arange(1, 1001) % 7]).astype(int) if w else np.zeros(9000, int)
     people = Rays(
         rays_baselines.t, one(True), tuple("abcdefg"), rays_baselines.origin, rays_baselines.direction, np.ones(9000)
@@ -81,22 +88,27 @@ def test_probes_keep_their_weights(rays_baselines, weights):
     plain = place_probes(people, 0.4, count=50, kappa_rule="fixed", kappa=20.0).density(X, "llvm")
     assert np.abs(density - plain).max() > 0.02
     at = probes.positions[:4]
-    assert np.allclose(gaze.make_nearest_probes_baseline(probes, 1, backend="llvm")(at, X), density[:4], rtol=1e-4, atol=1e-5)
+    assert np.allclose(
+        gaze.make_nearest_probes_baseline(probes, 1, backend="llvm")(at, X), density[:4], rtol=1e-4, atol=1e-5
+    )
     near = np.argsort(np.linalg.norm(probes.positions - at[0], axis=1))[:3]
     assert np.allclose(
-        gaze.make_nearest_probes_baseline(probes, 3, backend="llvm")(at[:1], X)[0], density[near].mean(axis=0), rtol=1e-4, atol=1e-5
+        gaze.make_nearest_probes_baseline(probes, 3, backend="llvm")(at[:1], X)[0],
+        density[near].mean(axis=0),
+        rtol=1e-4,
+        atol=1e-5,
     )
 
 
-def test_a_remembered_density_is_asked_once_for_the_same_arrays():
-    asked = []
-    method = gaze.CachedBaseline(lambda *given: asked.append(1) or gaze.make_uniform_baseline()(*given))
+def test_cached_baseline_evaluates_equal_arrays_once():
+    calls = []
+    method = gaze.CachedBaseline(lambda *options: calls.append(1) or gaze.make_uniform_baseline()(*options))
     positions, directions = np.zeros((2, 3)), fibonacci_directions(8)
     first = method(positions, directions)
-    assert method(positions, directions) is first and len(asked) == 1
-    # Equal values are not the same arrays: they are not compared.
+    assert method(positions, directions) is first and len(calls) == 1
+    # Equal values in other arrays are not compared.
     np.testing.assert_array_equal(method(positions.copy(), directions), first)
-    assert len(asked) == 2
+    assert len(calls) == 2
     with pytest.raises(ValueError, match="read-only"):
         first[0] = 0
 
@@ -105,18 +117,18 @@ def test_a_remembered_density_is_asked_once_for_the_same_arrays():
 
 
 def crowd(n=3000, people=4, seed=0):
-    """People along a corridor who look at a point of the wall x = 1.5, each at another height."""
+    """Participants along a corridor who look at the wall x = 1.5, each at a different height."""
     rng = np.random.default_rng(seed)
     origin = np.stack([rng.uniform(-1, 0, n), rng.uniform(-5, 5, n), rng.uniform(1.5, 1.7, n)], axis=1)
     person = rng.integers(0, people, n)
     hit = np.stack([np.full(n, 1.5), rng.normal(0, 0.2, n), 1 + 0.3 * person + rng.normal(0, 0.1, n)], axis=1)
-    way = hit - origin
+    direction = hit - origin
     return Rays(
         np.arange(n),
         person,
         tuple("abcdefgh"[:people]),
         origin,
-        way / np.linalg.norm(way, axis=1, keepdims=True),
+        direction / np.linalg.norm(direction, axis=1, keepdims=True),
         np.ones(n),
         hit,
     )
@@ -150,10 +162,13 @@ def test_truth_is_the_probes(rays_evaluation, test_set):
     assert (test_set.counts.sum(axis=1) == probes.counts).all() and set(test_set.participants) == set("abcd")
 
 
-def test_scores_of_the_truth_and_of_nothing(test_set):
+def test_scores_of_the_truth_and_of_the_uniform_density(test_set):
     rows = gaze.evaluate_gaze(
         test_set,
-        {"truth": lambda p, d: test_set.truth if d.ndim == 2 else np.ones(d.shape[:2]), "uniform": make_uniform_baseline()},
+        {
+            "truth": lambda p, d: test_set.truth if d.ndim == 2 else np.ones(d.shape[:2]),
+            "uniform": make_uniform_baseline(),
+        },
         make_uniform_baseline(),
         20,
     )
@@ -172,24 +187,31 @@ def test_scores_of_the_truth_and_of_nothing(test_set):
     assert not any(".gap" in key for key in best)
 
 
-def test_other_rays_are_of_positions_farther_than_two_radii_where_there_are_any(rays_evaluation):
-    """A to C stand in a row; B is within 2R of A, C of none."""
+def test_other_rays_are_farther_than_two_radii_if_possible(rays_evaluation):
+    """A to C are in a row; B is within 2R of A, C of none."""
     centres = np.array([[-0.5, 0, 1.6], [-0.5, 1, 1.6], [-0.5, 4, 1.6]])
-    of = lambda a: {tuple(v) for v in a.reshape(-1, 3)}
-    found = gaze.make_test(rays_evaluation, centres, 0.6, 20.0, 64, min_rays=20)
-    (a, b, c), others = map(of, found.sample_directions), [of(o) for o in found.other_directions]
+    source = lambda a: {tuple(v) for v in a.reshape(-1, 3)}
+    result = gaze.make_test(rays_evaluation, centres, 0.6, 20.0, 64, min_rays=20)
+    (a, b, c), other_values = map(source, result.sample_directions), [source(o) for o in result.other_directions]
     assert a.isdisjoint(c) and b.isdisjoint(c)
-    assert others[0] <= c and others[1] <= c and others[2] <= a | b and others[2] & a and others[2] & b
-    # Where all are nearer, any other one, and its own where it is alone.
-    found = gaze.make_test(rays_evaluation, centres[:2], 0.6, 20.0, 64, min_rays=20)
-    a, b = map(of, found.sample_directions)
-    assert of(found.other_directions[0]) <= b and of(found.other_directions[1]) <= a
-    found = gaze.make_test(rays_evaluation, centres[:1], 0.6, 20.0, 64, min_rays=20)
-    assert np.array_equal(found.other_directions, found.sample_directions)
+    assert (
+        other_values[0] <= c
+        and other_values[1] <= c
+        and other_values[2] <= a | b
+        and other_values[2] & a
+        and other_values[2] & b
+    )
+    # If all are nearer, any other position is used, or the position itself if it is the only one.
+    result = gaze.make_test(rays_evaluation, centres[:2], 0.6, 20.0, 64, min_rays=20)
+    a, b = map(source, result.sample_directions)
+    assert source(result.other_directions[0]) <= b and source(result.other_directions[1]) <= a
+    result = gaze.make_test(rays_evaluation, centres[:1], 0.6, 20.0, 64, min_rays=20)
+    assert np.array_equal(result.other_directions, result.sample_directions)
 
 
 def by_hand(persons: int) -> gaze.GazeTest:
-    """One position and sixteen directions, of which each person sees one of their own; the rays are of them in turn."""
+    """One position and sixteen directions; each participant looks in another one, and the rays alternate between
+    them."""
     d = np.eye(16, 3)
     parts = 16 / (4 * np.pi) * np.eye(16)[None, :persons]
     who = np.arange(4 * persons)[None] % persons
@@ -198,7 +220,9 @@ def by_hand(persons: int) -> gaze.GazeTest:
 
 
 def test_intervals_are_a_bootstrap_over_persons():
-    """Of three persons all 27 draws can be made: the error of what one of them sees is the share of the others."""
+    """For three participants all 27 resamples can be enumerated: the error of one participant is the weight of the
+    others.
+    """
     test = by_hand(3)
     sees = lambda k: lambda p, d: test.participant_densities[:, k] if d.ndim == 2 else np.ones(d.shape[:2])
     row, _ = gaze.evaluate_gaze(test, {"first": sees(0), "second": sees(1)}, make_uniform_baseline(), resamples=1000)
@@ -207,7 +231,7 @@ def test_intervals_are_a_bootstrap_over_persons():
     assert row["MAE"] == pytest.approx(np.mean(mae))
     assert row["MAE.high"] - row["MAE"] == pytest.approx(1.96 * np.std(mae), rel=0.1)
     assert row["MAE"] - row["MAE.low"] == pytest.approx(1.96 * np.std(mae), rel=0.1)
-    # Of a difference: over the same draws.
+    # The interval of a difference uses the same resamples.
     less = [2 * (draw.count(1) - draw.count(0)) / 3 / (4 * np.pi) for draw in draws]
     assert row["MAE.less.high"] - row["MAE.less"] == pytest.approx(1.96 * np.std(less), rel=0.1)
     assert row["MAE.less"] - row["MAE.less.low"] == pytest.approx(1.96 * np.std(less), rel=0.1)
@@ -215,14 +239,19 @@ def test_intervals_are_a_bootstrap_over_persons():
 
 @pytest.mark.parametrize("persons, known", [(2, False), (3, True), (4, True)])
 def test_fewer_than_three_persons_have_no_interval(persons, known):
-    for row in gaze.evaluate_gaze(by_hand(persons), {"a": make_uniform_baseline(), "b": make_uniform_baseline()}, make_uniform_baseline(), resamples=5):
+    for row in gaze.evaluate_gaze(
+        by_hand(persons),
+        {"a": make_uniform_baseline(), "b": make_uniform_baseline()},
+        make_uniform_baseline(),
+        resamples=5,
+    ):
         assert all((f"{k}.low" in row) == known and (f"{k}.high" in row) == known for k in gaze.SCORES)
 
 
 def test_ray_scores_by_hand():
     maps = np.array([[0.0, 1.0, 2.0, 5.0]]) / (4 * np.pi * 2)
-    at, others = maps[:, [3, 1]], maps[:, [0, 0, 1, 3]]
-    scores = gaze.compute_ray_scores(maps, at, others, np.zeros((1, 2)))
+    at, other_values = maps[:, [3, 1]], maps[:, [0, 0, 1, 3]]
+    scores = gaze.compute_ray_scores(maps, at, other_values, np.zeros((1, 2)))
     np.testing.assert_allclose(scores["AUC"], [[3.5 / 4, 1.5 / 4]])
     np.testing.assert_allclose(scores["sAUC"], [[3.5 / 4, 2.5 / 4]])
     np.testing.assert_allclose(scores["loglik"], np.log(at), rtol=1e-6)
@@ -231,17 +260,17 @@ def test_ray_scores_by_hand():
     np.testing.assert_allclose(scores["NSS"], [[(5 - 2) / values.std(), (1 - 2) / values.std()]])
 
 
-def test_persons_are_scored_each_by_their_own(rays_evaluation, test_set):
+def test_participants_are_scored_on_their_own_rays(rays_evaluation, test_set):
     blind = make_position_blind_baseline(rays_evaluation, kappa=50)
     rows = gaze.score_participants(test_set, {"blind": blind}, blind, min_rays=10)
     assert [r["person"] for r in rows] == list(test_set.participants)
     assert sum(r["rays"] for r in rows) == test_set.counts.sum()
     assert all(r["bits"] == pytest.approx(0) for r in rows)
-    # The heights of what they look at differ, and so does how well one density for all fits.
+    # The participants look at different heights, so one common density fits them differently.
     assert np.ptp([r["KLD"] for r in rows]) > 0.01
 
 
-def test_nothing_is_on_both_sides(rays_evaluation):
+def test_training_and_test_rays_are_disjoint(rays_evaluation):
     _, account = hold_out(rays_evaluation, 0.3, zones=2, positions=8, min_rays=8, participant_fraction=0.5)
     for split in gaze.SPLITS:
         train, scored, centres = gaze.select_held_out_rays(rays_evaluation, account, split)
@@ -250,45 +279,54 @@ def test_nothing_is_on_both_sides(rays_evaluation):
         assert named(scored) == (named(train) if split == "pos" else set(account["people"]))
         assert np.linalg.norm(train.origin[:, None] - np.array(account["centres"])[None], axis=2).min() > 0.6
     _, without = hold_out(rays_evaluation, 0.3, zones=2, positions=8, min_rays=8)
-    with pytest.raises(ValueError, match="--test-people"):
+    with pytest.raises(ValueError, match="--test-participants"):
         gaze.select_held_out_rays(rays_evaluation, without, "both")
     with pytest.raises(ValueError, match="both, pos, people"):
         gaze.select_held_out_rays(rays_evaluation, account, "time")
 
 
 def test_positions_without_rays_are_refused(rays_evaluation):
-    with pytest.raises(ValueError, match="lower min_rays"):
+    with pytest.raises(ValueError, match="--min-rays"):
         gaze.make_test(rays_evaluation, np.array([[40.0, 0, 0]]), 0.5)
 
 
-def test_maps_that_no_memory_holds_are_refused(rays_evaluation, monkeypatch):
-    monkeypatch.setattr(gaze, "_MOST_BYTES", 1e5)
+def test_maps_that_exceed_memory_are_refused(rays_evaluation, monkeypatch):
+    monkeypatch.setattr(gaze, "_MAX_BYTES", 1e5)
     with pytest.raises(NergError, match="--directions"):
         gaze.make_test(rays_evaluation, np.array([[-0.5, 0, 1.6], [-0.5, 3, 1.6]]), 0.6, 20.0, 512, min_rays=20)
 
 
-def test_halves_of_the_people_are_compared_where_both_were(rays_evaluation, test_set):
+def test_split_half_uses_positions_of_both_halves(rays_evaluation, test_set):
     row = gaze.score_split_half(
-        rays_evaluation, np.array([[-0.5, 0, 1.6], [-0.5, 3, 1.6], [40, 0, 0]]), 0.6, 20.0, make_uniform_baseline(), min_rays=20
+        rays_evaluation,
+        np.array([[-0.5, 0, 1.6], [-0.5, 3, 1.6], [40, 0, 0]]),
+        0.6,
+        20.0,
+        make_uniform_baseline(),
+        min_rays=20,
     )
     assert row["method"] == "split half" and 0 < row["CC"] < 1 and row["KLD"] > 0
     nobody = np.array([[40.0, 0, 0]])
     assert gaze.score_split_half(rays_evaluation, nobody, 0.6, 20.0, make_uniform_baseline(), min_rays=20) is None
     two = gaze.score_split_half(
-        rays_evaluation.select(rays_evaluation.person < 2), test_set.centres, 0.6, 20.0, make_uniform_baseline(), min_rays=20
+        rays_evaluation.select(rays_evaluation.person < 2),
+        test_set.centres,
+        0.6,
+        20.0,
+        make_uniform_baseline(),
+        min_rays=20,
     )
     assert two is not None and two["KLD"] > 0
     alone = rays_evaluation.select(rays_evaluation.person == 0)
     assert gaze.score_split_half(alone, test_set.centres, 0.6, 20.0, make_uniform_baseline(), min_rays=20) is None
     with pytest.raises(ValueError, match="kappa is negative"):
-        # What is wrong is said, and not taken for "nobody was there".
+        # Errors are raised and not mistaken for missing rays.
         gaze.score_split_half(rays_evaluation, test_set.centres, 0.6, -1.0, make_uniform_baseline(), min_rays=20)
 
 
 # ---- Scores ----
 #
-# What is scored is what is rendered: the field's densities at positions against the integrator's pictures, for every
-# kind of field.
+# The evaluated densities equal the rendered ones, for every kind of field.
 
 BOX = Box((-1, -1, -1), (1, 1, 1))
 EYES = [(0.1, -0.2, 0.3), (-0.4, 0.3, -0.1)]
@@ -301,7 +339,7 @@ ROOM = """<scene version="3.0.0">
 
 @pytest.fixture(scope="module")
 def places(tmp_path_factory):
-    """What gaze fields are evaluated in, and the same as children of an integrator and of a scene."""
+    """Geometries of gaze fields, and the same as children of an integrator and of a scene."""
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
@@ -317,43 +355,43 @@ def places(tmp_path_factory):
 
 
 def pictured(mi, gaze, children: dict, shapes: dict, eye) -> tuple[np.ndarray, np.ndarray]:
-    """Directions (N, 3) in which the observer at ``eye`` meets a surface, and the gaze (N,) that a panorama shows
+    """Directions (N, 3) in which the observer at ``eye`` sees a surface, and the gaze (N,) that a panorama shows
     there."""
     to_world = mi.ScalarTransform4f().translate(list(eye))
     sensor = {**camera(mi, kind="panorama", size=32, film={"height": 16}), "to_world": to_world}
     field = {"type": "gazefield", "filename": str(gaze)}
     integrator = {"type": "nerg", "aovs": "opacity,position,gaze", "radiance": False, "gaze": field, **children}
     out = channels(mi, integrator, sensor, **shapes)
-    met = out["opacity.Y"] >= 0.5
-    way = np.stack([out[f"position.{c}"][met] for c in "XYZ"], axis=-1) - np.array(eye)
-    return way / np.linalg.norm(way, axis=-1, keepdims=True), out["gaze.Y"][met]
+    hits = out["opacity.Y"] >= 0.5
+    direction = np.stack([out[f"position.{c}"][hits] for c in "XYZ"], axis=-1) - np.array(eye)
+    return direction / np.linalg.norm(direction, axis=-1, keepdims=True), out["gaze.Y"][hits]
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("place", ["shapes", "field"])
-def test01_is_what_is_rendered(rgb, places, tmp_path, place, kind):
-    """To 2e-4 of the largest density: directions are read back from positions in single precision."""
+def test01_densities_equal_the_rendering(rgb, places, tmp_path, place, kind):
+    """To 2e-4 of the largest density: directions are recovered from positions in single precision."""
     medium, children, shapes = places[place]
     field = saved(tmp_path / "g.safetensors", kind, BOX)
     density = FieldDensity(field, medium)
     for eye in EYES:
         directions, expected = pictured(rgb, tmp_path / "g.safetensors", children, shapes, eye)
         assert len(expected) > 50 and np.ptp(expected) > 0.2 * expected.max()
-        found = density(np.array([eye]), directions)
-        assert found.shape == (1, len(expected))
-        np.testing.assert_allclose(found[0], expected, atol=2e-4 * expected.max())
+        result = density(np.array([eye]), directions)
+        assert result.shape == (1, len(expected))
+        np.testing.assert_allclose(result[0], expected, atol=2e-4 * expected.max())
 
 
 @pytest.mark.parametrize("kind", ["normalised", "default recipe", "ensemble"])
-def test02_other_positions_have_integrals_of_their_own(rgb, places, kind):
-    """As many of them as the first ones: nothing is kept by how many there are."""
+def test02_each_position_has_its_integral(rgb, places, kind):
+    """The same number of new positions: the cache does not depend on the count."""
     medium, field, d = places["shapes"][0], made(kind, BOX), fibonacci_directions(256)
     density = FieldDensity(field, medium)
     first, second = (np.array([eye]) for eye in EYES)
     alone = FieldDensity(field, medium)(second, d)
     a = density(first, d)
     np.testing.assert_array_equal(density(second, d), alone)
-    # Kept, and in an order of their own.
+    # Cached, and in another order.
     np.testing.assert_array_equal(density(np.concatenate([second, first]), d), np.concatenate([alone, a]))
     integral = density(first, fibonacci_directions(4096)).mean() * 4 * np.pi
     assert integral == pytest.approx(1, abs=5e-3)
@@ -372,14 +410,14 @@ def test03_alignment_moves_turns_and_scales(rgb, places, kind):
 
 def test04_each_position_may_have_its_own_directions(rgb, places):
     medium, field, d = places["shapes"][0], made("default recipe", BOX), fibonacci_directions(64)
-    density, own = FieldDensity(field, medium), np.stack([d, d[::-1]])
-    common, found = density(np.array(EYES), d), density(np.array(EYES), own)
-    np.testing.assert_array_equal(found[0], common[0])
-    np.testing.assert_allclose(found[1], common[1][::-1], rtol=1e-5)
+    density, individual = FieldDensity(field, medium), np.stack([d, d[::-1]])
+    common, result = density(np.array(EYES), d), density(np.array(EYES), individual)
+    np.testing.assert_array_equal(result[0], common[0])
+    np.testing.assert_allclose(result[1], common[1][::-1], rtol=1e-5)
 
 
-def test05_a_field_of_surfaces_needs_a_place(rgb):
-    with pytest.raises(NergError, match="there is no place"):
+def test05_a_field_with_surfaces_needs_geometry(rgb):
+    with pytest.raises(NergError, match="with surfaces"):
         FieldDensity(made("default recipe", BOX), None)
     without = made("default recipe", BOX, geometry="none", reach=1.5)
     d = fibonacci_directions(2048)
@@ -387,21 +425,21 @@ def test05_a_field_of_surfaces_needs_a_place(rgb):
 
 
 def test06_semantic_features_are_those_of_the_render(rgb, places, tmp_path):
-    """Of the place's field, as the integrator hands them over."""
+    """Features of the radiance field, as the integrator provides them."""
     medium, children, shapes = places["field"]
     for kind in ("snapshot", "accumulated"):
         field = saved(tmp_path / "g.safetensors", "linear", BOX, semantic=kind)
         directions, expected = pictured(rgb, tmp_path / "g.safetensors", children, shapes, EYES[0])
-        found = FieldDensity(field, medium)(np.array(EYES[:1]), directions)[0]
-        np.testing.assert_allclose(found, expected, atol=2e-3 * expected.max())
+        result = FieldDensity(field, medium)(np.array(EYES[:1]), directions)[0]
+        np.testing.assert_allclose(result, expected, atol=2e-3 * expected.max())
 
 
-def test_a_density_of_zero_costs_what_a_millionth_of_the_uniform_one_does():
+def test_zero_density_counts_as_a_millionth_of_uniform():
     """Half of the sphere is empty, the other twice as dense: ½ ln 1/2 + ½ ln 1e6."""
     half = np.repeat([0.0, 2.0], 32)[None] / (4 * np.pi)
     flat = np.ones((1, 64)) / (4 * np.pi)
     millionth = np.where(half > 0, half, 1e-6 / (4 * np.pi))
     assert compute_map_scores(flat, half)["KLD"] == pytest.approx(0.5 * np.log(1e6 / 2), abs=1e-5)
     assert compute_map_scores(flat, half)["KLD"] == pytest.approx(np.mean(np.log(flat / millionth)), abs=1e-5)
-    # The other way round nothing hinges on it.
+    # In the other direction it has no influence.
     assert compute_map_scores(half, flat)["KLD"] == pytest.approx(np.log(2), abs=2e-5)

@@ -20,17 +20,17 @@ from nerg_mi.evaluation.gaze_report import (
     WORSE,
     Comparison,
     ScoreDifference,
-    compute_verdict,
     compare_scores,
+    compute_verdict,
+    draw_comparison,
     format_table,
     read_results,
-    draw_comparison,
     small_sample_factor,
     write_report,
 )
 from nerg_mi.evaluation.uncertainty import summarise_folds
 from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.probes.probes import REGION_LEVELS, calibrate_levels, format_level, compute_region_levels
+from nerg_mi.probes.probes import REGION_LEVELS, calibrate_levels, compute_region_levels, format_level
 from tests.evaluation.test_gaze import crowd
 
 # ---- What an evaluation of gaze writes: cells by hand, files that are valid, and pictures of what was asked for ----
@@ -67,15 +67,17 @@ def test_files(tmp_path):
     persons = [{"method": "field", "person": "ann", "rays": 3, "KLD": 0.5, "NSS": math.nan}]
     files = write_report(tmp_path, ROWS, persons, {"seed": 4}, "notes")
     page = files[0].read_text()
-    # Our method is compared with the last of the baselines, which the people's own agreement is none of.
+    # The field is compared with the last of the baselines, and the split half is not a baseline.
     assert page.startswith("notes\n") and "| field less uniform | -0.250 |" in page
     assert "| field | ann | 3 | 0.500 |  |" in page
     with open(files[1], newline="") as f:
         rows = list(csv.DictReader(f))
     assert [r["method"] for r in rows] == ["field", "uniform", "split half"] and float(rows[0]["MAE"]) == 0.012345
-    about = json.loads(files[3].read_text(), parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
-    assert about["seed"] == 4 and about["methods"][0]["NSS"] is None and about["persons"][0]["NSS"] is None
-    assert about["methods"][0]["KLD"] == 0.51234 and about["persons"][0]["rays"] == 3
+    provenance = json.loads(files[3].read_text(), parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
+    assert (
+        provenance["seed"] == 4 and provenance["methods"][0]["NSS"] is None and provenance["persons"][0]["NSS"] is None
+    )
+    assert provenance["methods"][0]["KLD"] == 0.51234 and provenance["persons"][0]["rays"] == 3
 
 
 def test_pictures_are_on_the_scale_of_the_truth(tmp_path, monkeypatch):
@@ -84,28 +86,28 @@ def test_pictures_are_on_the_scale_of_the_truth(tmp_path, monkeypatch):
     truth = np.exp(3 * d @ np.array([1.0, 0, 0])) * np.arange(1, 6)[:, None]
     counts = np.array([[3, 0, 4], [1, 1, 1], [1, 1, 1], [1, 1, 1], [900, 600, 0]])
     test, drawn = SimpleNamespace(centres=centres, directions=d, truth=truth, counts=counts), []
-    monkeypatch.setattr(gaze_report, "save", lambda figure, path, about: drawn.append(figure))
-    asked = []
+    monkeypatch.setattr(gaze_report, "save", lambda figure, path, provenance: drawn.append(figure))
+    calls = []
 
     def twice(positions, directions):
-        asked.append(positions)
+        calls.append(positions)
         return 2 * np.exp(3 * directions[:, 0]) * np.ones((len(positions), 1))
 
     draw_comparison(test, {"twice": twice}, tmp_path / "a.png", count=2, height=8)
     images = [a for a in drawn[0].axes if a.images]
-    # Each row has a scale of its own, which says what its colours mean.
+    # Each row has its own scale with a colour bar.
     scales = [a for a in drawn[0].axes if a not in images]
     assert [a.get_ylabel() for a in scales] == ["1/sr", "1/sr"]
     assert [tuple(a.get_ylim()) for a in scales] == [images[k].images[0].get_clim() for k in (0, 2)]
-    assert np.array_equal(asked[0], centres[[0, 4]]) and [a.get_title() for a in images] == ["truth", "twice", "", ""]
-    assert images[0].get_ylabel() == "0.0, 1.0, 2.0 m\n7 rays of 2 people"
-    assert images[2].get_ylabel() == "12.0, 13.0, 14.0 m\n1,500 rays of 2 people"
+    assert np.array_equal(calls[0], centres[[0, 4]]) and [a.get_title() for a in images] == ["truth", "twice", "", ""]
+    assert images[0].get_ylabel() == "0.0, 1.0, 2.0 m\n7 samples of 2 participants"
+    assert images[2].get_ylabel() == "12.0, 13.0, 14.0 m\n1,500 samples of 2 participants"
     for a, b in (images[:2], images[2:]):
-        # One scale a row.
+        # One scale per row.
         assert a.images[0].get_clim() == b.images[0].get_clim() and a.images[0].get_clim()[0] == 0
         shown = [np.asarray(x.images[0].get_array()) for x in (a, b)]
         row = 1 if a is images[0] else 5
-        # The truth's nearest directions are off by up to a tenth of a radian.
+        # The nearest directions of the truth differ by up to a tenth of a radian.
         assert shown[0].shape == (8, 16) and np.allclose(2 * shown[0], row * shown[1], rtol=0.6)
 
 
@@ -120,17 +122,19 @@ PERSONS = [{"method": "gaze field", "person": "Ada", "rays": 4, "bits": 0.1}]
 ABOUT = {"gaze": "g.safetensors", "split": "both", "kappa": 20.0, "positions": 12}
 
 
-def test_as_it_was_written(tmp_path):
+def test_results_are_read_back(tmp_path):
     write_report(tmp_path, RESULTS_ROWS, PERSONS, {**ABOUT, "people": 7, "gaze_sha256": "ab"}, "# notes")
-    found = read_results(tmp_path / "gaze.json")
-    assert (found.gaze, found.split, found.num_positions, found.num_participants, found.sha256) == (
+    result = read_results(tmp_path / "gaze.json")
+    assert (result.gaze, result.split, result.num_positions, result.num_participants, result.sha256) == (
         "g.safetensors",
         "both",
         12,
         7,
         "ab",
     )
-    assert found.rows[0]["KLD"] is None and found.rows[1]["KLD"] == 1.0 and found.participant_rows[0]["person"] == "Ada"
+    assert (
+        result.rows[0]["KLD"] is None and result.rows[1]["KLD"] == 1.0 and result.participant_rows[0]["person"] == "Ada"
+    )
 
 
 @pytest.mark.parametrize(
@@ -150,23 +154,23 @@ def test_as_it_was_written(tmp_path):
         {"persons": [{"method": "m", "person": ["a"]}]},
     ],
 )
-def test_what_is_none(tmp_path, change):
+def test_invalid_results_are_refused(tmp_path, change):
     path = tmp_path / "gaze.json"
-    whole = {**ABOUT, "methods": RESULTS_ROWS[1:], "persons": PERSONS}
-    path.write_text(json.dumps(change if isinstance(change, list) else {**whole, **change}))
+    full = {**ABOUT, "methods": RESULTS_ROWS[1:], "persons": PERSONS}
+    path.write_text(json.dumps(change if isinstance(change, list) else {**full, **change}))
     with pytest.raises(NergError, match='"nerg eval gaze"'):
         read_results(path)
-    path.write_text(json.dumps(whole))
+    path.write_text(json.dumps(full))
     assert read_results(path).num_participants == 1
 
 
 # ---- Verdict ----
 #
-# The verdict on constructed scores: better, worse, undecided, too few, and what speaks for two things at once.
+# The verdict on synthetic scores: better, worse, undecided, too few, and ambiguous cases.
 
 
 def row(method, bits, cc, kld, reach=0.05, gap=None):
-    """Scores with intervals of ``reach`` either way; ``gap``: that of the field's lead, where it is known."""
+    """Scores with intervals of ± ``reach``; ``gap`` is that of the difference to the field, if known."""
     values = {"bits": bits, "CC": cc, "KLD": kld}
     out = {"method": method, **values}
     for name, value in values.items():
@@ -176,13 +180,13 @@ def row(method, bits, cc, kld, reach=0.05, gap=None):
     return out
 
 
-def scored(field, nearest=(0.4, 0.65, 0.55), **more):
+def scored(field, nearest=(0.4, 0.65, 0.55), **options):
     return [
-        row("gaze field", *field, **more),
-        row("uniform", -0.5, 0.0, 1.0, **more),
-        row("position-blind", 0.0, 0.4, 0.75, **more),
-        row("position-blind, kappa 50", -0.1, 0.38, 0.8, **more),
-        row("4,096 nearest rays", *nearest, **more),
+        row("gaze field", *field, **options),
+        row("uniform", -0.5, 0.0, 1.0, **options),
+        row("position-blind", 0.0, 0.4, 0.75, **options),
+        row("position-blind, kappa 50", -0.1, 0.38, 0.8, **options),
+        row("4,096 nearest rays", *nearest, **options),
         {"method": "split half", "bits": 0.1, "CC": 0.7, "KLD": 0.9},
     ]
 
@@ -190,12 +194,12 @@ def scored(field, nearest=(0.4, 0.65, 0.55), **more):
 @pytest.mark.parametrize(
     "field, grade, words",
     [
-        ((0.9, 0.85, 0.3), "use", "Better than nearest rays, the strongest baseline, for new people at new places."),
-        ((0.42, 0.66, 0.54), "limited", "whether it is better than nearest rays is undecided with 30 people"),
-        ((0.2, 0.5, 0.65), "limited", "worse than nearest rays for new people at new places: use the rays"),
-        ((0.01, 0.41, 0.74), "unclear", "Not shown to be better than position-blind for new people"),
-        ((-0.3, 0.2, 0.95), "reject", "Worse than position-blind for new people at new places: do not use."),
-        ((-0.9, -0.3, 1.6), "reject", "Worse than knowing nothing for new people at new places: do not use."),
+        ((0.9, 0.85, 0.3), "use", "Better than nearest rays, the strongest baseline, for held-out participants at held-out positions."),
+        ((0.42, 0.66, 0.54), "limited", "the comparison with nearest rays is undecided with 30 participants"),
+        ((0.2, 0.5, 0.65), "limited", "worse than nearest rays for held-out participants at held-out positions: use the rays directly"),
+        ((0.01, 0.41, 0.74), "unclear", "Not shown to be better than position-blind for held-out participants"),
+        ((-0.3, 0.2, 0.95), "reject", "Worse than position-blind for held-out participants at held-out positions: do not use."),
+        ((-0.9, -0.3, 1.6), "reject", "Worse than the uniform density for held-out participants at held-out positions: do not use."),
     ],
 )
 def test_each_grade(field, grade, words):
@@ -205,13 +209,13 @@ def test_each_grade(field, grade, words):
 
 
 @pytest.mark.parametrize("people, positions", [(4, 60), (30, 9), (0, 0), (1, 1)])
-def test_never_a_verdict_from_too_few(people, positions):
+def test_no_verdict_from_too_few_participants(people, positions):
     verdict = compute_verdict(scored((0.9, 0.85, 0.3), reach=0.0), "pos", people, positions)
     assert verdict.grade == "none" and verdict.comparisons == () and "too few" in verdict.sentence
     assert compute_verdict(scored((0.9, 0.85, 0.3)), "pos", 5, 10).grade != "none"
 
 
-def test_scores_that_contradict_each_other_decide_nothing():
+def test_contradicting_scores_are_undecided():
     leads = lambda *ends: tuple(ScoreDifference("x", (a + b) / 2, a, b) for a, b in ends)
     good, bad, open_ = (0.1, 0.3), (-0.3, -0.1), (-0.1, 0.2)
     cases = [
@@ -244,17 +248,17 @@ def test_the_strongest_baseline_is_named(strongest, words):
     next(r for r in rows if r["method"] == strongest).update(row(strongest, 0.5, 0.6, 0.6, 0.02))
     verdict = compute_verdict(rows, "both", 30, 60)
     assert verdict.grade == "use" and verdict.sentence.startswith(words)
-    # The other half of the people is no baseline, however well it does.
+    # The split half is not a baseline, however good it is.
     rows[5]["bits"] = 2.0
     assert compute_verdict(rows, "both", 30, 60).sentence == verdict.sentence
 
 
-def test_a_baseline_stronger_than_nearest_rays_decides_too():
-    rows = lambda bits, reach: [*scored((0.9, 0.85, 0.3), reach=0.02), row("16 nearest probes", bits, *reach)]
+def test_a_stronger_baseline_is_also_compared():
+    rows = lambda bits, half_width: [*scored((0.9, 0.85, 0.3), reach=0.02), row("16 nearest probes", bits, *half_width)]
     better = compute_verdict(rows(1.2, (0.9, 0.2, 0.02)), "both", 30, 60)
     assert better.grade == "limited" and "worse than 16 nearest probes for" in better.sentence
     level = compute_verdict(rows(0.91, (0.84, 0.31, 0.2)), "both", 30, 60)
-    assert level.grade == "limited" and "better than 16 nearest probes is undecided" in level.sentence
+    assert level.grade == "limited" and "the comparison with 16 nearest probes is undecided" in level.sentence
     assert {c.reference for c in level.comparisons} >= {"uniform", "position-blind", "16 nearest probes"}
 
 
@@ -270,35 +274,38 @@ def test_missing_numbers_and_methods():
     assert compute_verdict(
         [{k: None if k in ("bits", "CC") else v for k, v in r.items()} for r in rows], "both", 30, 60
     ).grade == ("unclear")
-    assert "not compared with nearest rays" in compute_verdict(rows[:4], "both", 30, 60).sentence
+    assert "not compared with the nearest rays" in compute_verdict(rows[:4], "both", 30, 60).sentence
     assert compute_verdict(rows[:2], "both", 30, 60).grade == "none"
     bare = [{k: v for k, v in r.items() if "." not in k} for r in rows]
     assert compute_verdict(bare, "both", 30, 60).grade == "unclear"
 
 
-def test_the_lead_by_its_own_interval_is_sharper_than_by_two():
+def test_paired_interval_is_narrower_than_two_intervals():
     field, other = row("f", 0.6, 0.7, 0.5, 0.2), row("o", 0.4, 0.6, 0.6, 0.2)
     wide = compare_scores(field, other, "bits", 30)
     assert wide.value == pytest.approx(0.2) and wide.high - wide.value == pytest.approx(0.4 * small_sample_factor(30))
     paired = compare_scores(field, row("o", 0.4, 0.6, 0.6, 0.2, gap=0.1), "bits", 30)
     assert paired.outcome == BETTER and wide.outcome == UNDECIDED
-    # Less KLD is better.
+    # Lower KLD is better.
     assert compare_scores(field, other, "KLD", 30).value == pytest.approx(0.1)
 
 
-def test_intervals_for_few_people_cover_as_they_should():
-    """Leads of n people drawn from a normal law around zero: 95 of 100 intervals hold zero, and those without the
-    widening far fewer."""
+def test_small_sample_intervals_have_nominal_coverage():
+    """Differences of n participants drawn from a normal distribution around zero: 95 of 100 intervals contain zero, and
+    far fewer without the widening.
+    """
     rng, n, trials = np.random.default_rng(0), 6, 4000
     x = rng.normal(size=(trials, n))
-    reach = 1.96 * x.std(axis=1) / np.sqrt(n)  # what a bootstrap of the mean has in the limit of many resamples
+    half_width = (
+        1.96 * x.std(axis=1) / np.sqrt(n)
+    )  # half-width of a bootstrap of the mean in the limit of many resamples
     mean = np.abs(x.mean(axis=1))
-    assert np.mean(mean <= reach * small_sample_factor(n)) == pytest.approx(0.95, abs=0.012)
-    assert np.mean(mean <= reach) < 0.88
+    assert np.mean(mean <= half_width * small_sample_factor(n)) == pytest.approx(0.95, abs=0.012)
+    assert np.mean(mean <= half_width) < 0.88
     assert small_sample_factor(10**6) == pytest.approx(1, abs=1e-3)
 
 
-def test_the_way_to_the_other_half_of_the_people():
+def test_split_half_fraction():
     verdict = compute_verdict(scored((0.3, 0.55, 0.6)), "both", 30, 60)
     assert verdict.split_half_fraction == pytest.approx((0.55 - 0.4) / (0.7 - 0.4))
     assert compute_verdict(scored((0.3, 0.55, 0.6))[:5], "both", 30, 60).split_half_fraction is None
@@ -316,7 +323,7 @@ def test_means_intervals_and_differences_of_pairs():
     ours, bars = np.array([0.4, 0.6, 0.5]), np.array([0.7, 0.8, 0.75])
     rows = {row["method"]: row for row in summarise_folds([fold(a, b) for a, b in zip(ours, bars)])}
     assert list(rows) == ["gaze field", "nearest", "gaze field less nearest"]
-    # SciPy's own interval of a mean.
+    # SciPy's interval of a mean.
     low, high = stats.ttest_1samp(ours, 0).confidence_interval(0.95)
     field = rows["gaze field"]
     assert (field["KLD"], field["KLD.low"], field["KLD.high"]) == pytest.approx((0.5, low, high))
@@ -326,81 +333,83 @@ def test_means_intervals_and_differences_of_pairs():
     assert (less["KLD"], less["KLD.low"], less["KLD.high"]) == pytest.approx((-0.25, low, high))
 
 
-def test_what_some_folds_lack_is_a_mean_of_the_others():
+def test_missing_scores_of_folds_are_skipped():
     rows = {row["method"]: row for row in summarise_folds([fold(0.4, 0.7, 0.2), fold(0.6, math.nan)])}
     assert rows["split half"] == {"method": "split half", "folds": 1, "KLD": 0.2}
     assert rows["nearest"]["KLD"] == 0.7 and "KLD.low" not in rows["nearest"]
-    # The bar is the last method, and no reference.
+    # The comparison is with the last method, not with the split half.
     assert "gaze field less nearest" in rows and summarise_folds([fold(1, 2)[:1]])[0]["KLD"] == 1
 
 
 # ---- Ranks, risks and regions ----
 
 
-def row_uncertainty(support, error, group, **more):
-    return {"support": support, "KLD": error, "group": group, **more}
+def row_uncertainty(support, error, group, **options):
+    return {"support": support, "KLD": error, "group": group, **options}
 
 
 @pytest.fixture(scope="module")
 def asked():
-    """A test of four people, and what is asked of it: a map, and the uniform one."""
+    """Test data of four participants, and two methods: a map and the uniform density."""
     centres = np.array([[-0.5, 0, 1.6], [-0.5, 3, 1.6], [-0.5, -3, 1.6]])
     test = gaze.make_test(crowd(), centres, 0.6, 20.0, 256, min_rays=20)
     return test, test.truth[::-1], np.full_like(test.truth, 1 / (4 * np.pi))
 
 
-def test_little_support_ranks_great_errors():
+def test_low_support_correlates_with_errors():
     rng = np.random.default_rng(0)
     support = rng.integers(0, 40, 60)
     error = 1 / (1 + support) + rng.normal(0, 0.1, 60)
     rows = [row_uncertainty(s, e, str(i // 6)) for i, (s, e) in enumerate(zip(support, error))]
-    (found,) = uncertainty.correlate_uncertainty(rows)
-    assert found["signal"] == "support" and found["error"] == "KLD" and found["positions"] == 60
-    assert found["rho"] == pytest.approx(spearmanr(-support, error)[0])
-    assert found["rho.low"] < found["rho"] < found["rho.high"]
-    assert found["100%"] == pytest.approx(error.mean()) and found["25%"] < found["50%"] < found["100%"]
+    (result,) = uncertainty.correlate_uncertainty(rows)
+    assert result["signal"] == "support" and result["error"] == "KLD" and result["positions"] == 60
+    assert result["rho"] == pytest.approx(spearmanr(-support, error)[0])
+    assert result["rho.low"] < result["rho"] < result["rho.high"]
+    assert result["100%"] == pytest.approx(error.mean()) and result["25%"] < result["50%"] < result["100%"]
 
 
-def test_a_wide_spread_ranks_great_errors_and_a_few_groups_have_no_interval():
+def test_spread_correlates_with_errors_and_few_groups_have_no_interval():
     rows = [row_uncertainty(5.0, float(k), str(k % 4), spread=float(k), excess=-float(k)) for k in range(12)]
-    found = {(r["signal"], r["error"]): r for r in uncertainty.correlate_uncertainty(rows)}
-    assert found["spread", "KLD"]["rho"] == pytest.approx(1) and found["spread", "excess"]["rho"] == pytest.approx(-1)
-    assert found["spread", "KLD"]["25%"] == 1 and "rho.low" not in found["spread", "KLD"]
-    # What is the same everywhere says nothing, and leaves out nobody.
-    same = found["support", "KLD"]
+    result = {(r["signal"], r["error"]): r for r in uncertainty.correlate_uncertainty(rows)}
+    assert result["spread", "KLD"]["rho"] == pytest.approx(1) and result["spread", "excess"]["rho"] == pytest.approx(-1)
+    assert result["spread", "KLD"]["25%"] == 1 and "rho.low" not in result["spread", "KLD"]
+    # A constant signal has no rank, and all positions count.
+    same = result["support", "KLD"]
     assert math.isnan(same["rho"]) and same["25%"] == same["100%"] == 5.5
 
 
-def test_positions_tell_their_errors(asked):
+def test_position_rows_have_their_errors(asked):
     test, maps, uniform = asked
     rows = uncertainty.score_positions(test, maps, uniform, support=np.array([1, 2, 3]), groups=["a", "a", "b"])
     assert [r["group"] for r in rows] == ["a", "a", "b"] and [r["support"] for r in rows] == [1, 2, 3]
     expected = metrics.kld(test.truth, maps, eps=1e-6)
     assert [r["KLD"] for r in rows] == pytest.approx(expected.tolist()) and "spread" not in rows[0]
-    # Half of these four, who look at different heights, tells less of the other half than all tell of themselves.
+    # The four participants look at different heights, so one half predicts the other worse than itself.
     assert all(0 < r["half"] < r["blind"] and r["excess"] == r["KLD"] - r["half"] for r in rows)
     alone = gaze.make_test(crowd(people=1), test.centres, 0.6, 20.0, 256, min_rays=20)
     assert "half" not in uncertainty.score_positions(alone, maps, uniform)[0]
 
 
-def test_halves_that_look_alike_agree():
+def test_equal_halves_agree():
     test = gaze.make_test(crowd(20_000), np.array([[-0.5, 0, 1.6]]), 0.6, 20.0, 256, max_rays=4096)
-    apart = uncertainty.compute_split_half_errors(test, np.zeros_like(test.truth))
-    alike = type(test)(**{**vars(test), "parts": np.repeat(test.truth[:, None], 4, axis=1)})
-    assert uncertainty.compute_split_half_errors(alike, np.zeros_like(test.truth)) == pytest.approx(-np.log(1), abs=1e-6)
-    assert apart[0] > 0.05
+    distances = uncertainty.compute_split_half_errors(test, np.zeros_like(test.truth))
+    alike = type(test)(**{**vars(test), "participant_densities": np.repeat(test.truth[:, None], 4, axis=1)})
+    assert uncertainty.compute_split_half_errors(alike, np.zeros_like(test.truth)) == pytest.approx(
+        -np.log(1), abs=1e-6
+    )
+    assert distances[0] > 0.05
 
 
-def test_calibrated_regions_hold_what_is_asked(asked):
-    """A density that is too sharp holds too little; the shares that its own misses ask for hold what they should."""
+def test_calibrated_regions_have_nominal_coverage(asked):
+    """Regions of a density that is too narrow have too little coverage; calibrated levels restore it."""
     test, _, _ = asked
     rng = np.random.default_rng(1)
-    chosen = np.stack([rng.choice(256, 4000, p=row / row.sum()) for row in test.truth])
-    drawn = type(test)(**{**vars(test), "who": rng.integers(0, 4, chosen.shape)})
-    sharp = test.truth**3, np.take_along_axis(test.truth**3, chosen, axis=1)
+    selected = np.stack([rng.choice(256, 4000, p=row / row.sum()) for row in test.truth])
+    drawn = type(test)(**{**vars(test), "sample_participants": rng.integers(0, 4, selected.shape)})
+    sharp = test.truth**3, np.take_along_axis(test.truth**3, selected, axis=1)
     half = compute_region_levels(sharp[0], sharp[1][:, :2000]).ravel()
-    found = calibrate_levels(half, np.ones(len(half)))
-    rows = uncertainty.measure_calibration(drawn, {"sharp": sharp, "other": sharp}, 0, 0, {"sharp": found})
+    result = calibrate_levels(half, np.ones(len(half)))
+    rows = uncertainty.measure_calibration(drawn, {"sharp": sharp, "other": sharp}, 0, 0, {"sharp": result})
     assert [r["method"] for r in rows] == ["sharp", "sharp, calibrated", "other"]
     for share in REGION_LEVELS:
         name = format_level(share)

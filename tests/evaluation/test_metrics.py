@@ -19,7 +19,7 @@ from nerg_mi.photos.images import PhotoView
 
 # ---- Images ----
 #
-# Scores of pictures against plain restatements and closed forms, and the command on a field whose pictures are known.
+# Image scores compared with direct implementations and closed forms, and the command on a field with known pictures.
 
 
 def noisy():
@@ -48,7 +48,7 @@ def test_ssim_equals_scikit_image_and_its_definition():
     assert np.isnan(ssim(truth[:8], truth[:8]))
 
 
-def test_depth_is_scored_where_it_is_known():
+def test_depth_is_scored_where_truth_exists():
     truth = np.array([[1.0, 2.0, 0.0, 4.0]])
     score = compute_depth_score(np.array([[1.05, 2.5, 9.0, 0.0]]), np.array([[1, 0.5, 1, 0.0]]), truth)
     assert score.median == pytest.approx(0.5) and score.outlier_fraction == pytest.approx(2 / 3)
@@ -58,7 +58,7 @@ def test_depth_is_scored_where_it_is_known():
 
 @pytest.fixture
 def fog(tmp_path):
-    """A field of density 1.5 and colour (0.5, 0.5, 0.5) in the cube [-1, 1]³; without weights it has no more to say."""
+    """A field of density 1.5 and colour (0.5, 0.5, 0.5) in the cube [-1, 1]³, with zero weights."""
     config = RadianceConfig(
         grid=HashGridConfig(levels=2, log2_rows=8, base=4, finest=8), width=16, color_hidden=1, density_scale=1.5
     )
@@ -79,13 +79,13 @@ def test_ctrl_c_ends_a_picture_between_two_parts(fog, monkeypatch):
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
-    monkeypatch.setattr(metrics, "_LAUNCH", 16 * 12)
+    monkeypatch.setattr(metrics, "_MAX_LAUNCH", 16 * 12)
     seeds, rendered, render = [], mi.render, FieldRenderer(fog, 4)
 
     def stopped(scene, **how):
         seeds.append(how["seed"])
         picture = rendered(scene, **how)
-        # As Mitsuba's handler does, which takes the signal while it renders.
+        # As Mitsuba's handler does, which receives the signal while it renders.
         scene.integrator().cancel()
         return picture
 
@@ -108,25 +108,25 @@ def test_rendered_through_mitsuba_it_is_the_closed_form(fog):
     assert np.allclose(seen.depth[middle], 2 - np.log(1 - alpha / 2) / 1.5, atol=0.005)
 
 
-def test_many_samples_are_rendered_a_part_at_a_time(fog, rgb, monkeypatch):
-    """As many as an option takes, which no memory holds at once."""
+def test_many_samples_are_rendered_in_parts(fog, rgb, monkeypatch):
+    """As many as the option allows, which exceed memory at once."""
     render, parts = rgb.render, []
 
-    def render_part(*args, spp, **more):
+    def render_part(*args, spp, **options):
         parts.append(spp)
-        return render(*args, spp=spp, **more)
+        return render(*args, spp=spp, **options)
 
     monkeypatch.setattr(rgb, "render", render_part)
-    monkeypatch.setattr(metrics, "_LAUNCH", 4 * 16 * 12 + 5)
+    monkeypatch.setattr(metrics, "_MAX_LAUNCH", 4 * 16 * 12 + 5)
     seen = FieldRenderer(fog, 9)(camera())
     assert parts == [4, 4, 1]
     assert np.allclose(seen.opacity[5:7, 7:9], 1 - np.exp(-3), atol=2e-3)
-    monkeypatch.setattr(metrics, "_LAUNCH", 1)
+    monkeypatch.setattr(metrics, "_MAX_LAUNCH", 1)
     FieldRenderer(fog, 2)(camera())
     assert parts[3:] == [1, 1]
 
 
-def test_a_distorted_camera_is_followed(fog):
+def test_distorted_cameras_are_supported(fog):
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
@@ -136,7 +136,7 @@ def test_a_distorted_camera_is_followed(fog):
     assert bent.color.shape == plain.color.shape
 
 
-def test_scores_of_views_and_what_is_written(fog, tmp_path):
+def test_scores_and_pictures_of_views(fog, tmp_path):
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
@@ -223,7 +223,7 @@ def test_identity_scale_and_batches():
         batch = score(p, q, w)
         assert batch.shape == (4, 3) and np.isclose(batch[2, 1], score(p[2, 1], q[2, 1], w))
         assert np.allclose(score(p, q, w), score(p, q, 9 * w))  # any unit of solid angle
-        each = rng.random(p.shape)  # weights of each map's own
+        each = rng.random(p.shape)  # individual weights of each map
         assert np.isclose(score(p, q, each)[2, 1], score(p[2, 1], q[2, 1], each[2, 1]))
     assert (metrics.kld(p, q, w) > 0).all()
     assert np.isclose(metrics.mae(np.array([1.0, 3]), np.array([2.0, 5]), np.array([1.0, 3])), 1.75)
@@ -245,7 +245,7 @@ def test_defined_everywhere(a, b):
     assert np.isfinite(metrics.nss(p, p[:4])).all()
     if a == "ones":
         assert metrics.cc(p, q) == 0 and metrics.cc(q, p) == 0 and (metrics.nss(p, p[:4]) == 0).all()
-        assert np.isclose(metrics.kld(p, maps["zeros"]), 0)  # zeros know nothing: uniform
+        assert np.isclose(metrics.kld(p, maps["zeros"]), 0)  # zeros count as uniform
 
 
 @pytest.mark.parametrize("scale", [1e-307, 1e-200, 1e-150, 1e150, 1e300])

@@ -13,7 +13,7 @@ import pytest
 
 from nerg_mi.evaluation import study as study_paper
 from nerg_mi.evaluation import study_scenes
-from nerg_mi.evaluation.study import RESOLUTIONS, STEP_COUNTS, list_rows, count_traced_operations
+from nerg_mi.evaluation.study import RESOLUTIONS, STEP_COUNTS, count_traced_operations, list_rows
 from nerg_mi.evaluation.study_subject import open_subject
 from nerg_mi.fields.occupancy import OccupancyGrid
 from nerg_mi.transport.medium import LocalRay
@@ -23,10 +23,10 @@ from tests.reference import march_numpy
 
 # ---- Measure ----
 #
-# What a study measures, and what it says meanwhile.
+# Measurements of a study and their progress messages.
 
 
-def test_what_the_second_frame_of_an_observer_compiles_is_in_no_time(monkeypatch):
+def test_compilation_of_the_second_frame_is_not_timed(monkeypatch):
     subject, calls = open_subject("slab", "auto", 6, 4), []
     render = subject.render
     monkeypatch.setattr(study_paper, "time_render", lambda *args: calls.append("timed") or (1.0, 1.0))
@@ -35,21 +35,21 @@ def test_what_the_second_frame_of_an_observer_compiles_is_in_no_time(monkeypatch
     said = []
     study_paper.measure_rows(subject, rows, 2, on_step=said.append)
     assert said == ["depth only", "time of depth only"]
-    # For the rays of the truth, the errors, the counts, and what is compiled then.
+    # Renders of the truth's rays, the errors, the counts, and the compilation.
     assert calls == ["render"] * 4 + ["timed"] * 2
 
 
 # ---- What is counted: operations that are traced, whatever the machine ----
 
 
-def test_more_work_has_more_operations_and_more_lanes_have_not():
+def test_operation_count_grows_with_work_but_not_lanes():
     x = lambda n: dr.arange(ns.Float, n)
     one, two = (count_traced_operations(lambda f=f: f(x(100))) for f in (dr.sin, lambda v: dr.sin(v) + dr.cos(v * v)))
     assert 0 < one < two
     assert count_traced_operations(lambda: dr.sin(x(100_000))) == one
 
 
-def test_what_was_computed_before_is_not_counted():
+def test_earlier_computations_are_not_counted():
     y = dr.sin(dr.arange(ns.Float, 100))
     dr.eval(y)
     assert count_traced_operations(lambda: y) == 0
@@ -60,58 +60,60 @@ def test_what_was_computed_before_is_not_counted():
 
 @pytest.fixture
 def seen(rgb):
-    """A function from AOVs, radiance and steps to the subject and its channels by the paper's rule."""
+    """Map AOVs, radiance and steps to the subject and its channels with the march of the paper."""
     subject = open_subject("sphere", "auto", 24, 16)
 
     def render(aovs, radiance=True, steps=256):
         made = subject.make_integrator({"aovs": aovs, "radiance": radiance})
-        return subject.render_channels(study_paper.make_paper_integrator(made, subject.sensor, subject.tolerance, steps), 1, 1)
+        return subject.render_channels(
+            study_paper.make_paper_integrator(made, subject.sensor, subject.tolerance, steps), 1, 1
+        )
 
     render.subject = subject
     return render
 
 
-def test_the_observers_evaluations_are_added_and_gaze_takes_none(seen):
+def test_observer_evaluations_are_counted(seen):
     depth = seen("depth,opacity,density_evals")
-    looked = seen("depth,opacity,visibility,density_evals")
+    evaluated = seen("depth,opacity,visibility,density_evals")
     gazed = seen("depth,opacity,visibility,gaze,density_evals")
     surface = depth["opacity"] >= 0.5
-    more = looked["density_evals"] - depth["density_evals"]
+    options = evaluated["density_evals"] - depth["density_evals"]
     assert surface.any() and not surface.all()
-    assert (depth["density_evals"] >= 0).all() and (more[surface] >= 1).all() and (more[~surface] == 0).all()
+    assert (depth["density_evals"] >= 0).all() and (options[surface] >= 1).all() and (options[~surface] == 0).all()
     for name in ("density_evals", "visibility"):
-        assert np.array_equal(looked[name], gazed[name])
+        assert np.array_equal(evaluated[name], gazed[name])
     attended = gazed["visibility"] > 0
     assert attended.any() and (gazed["gaze"][attended] > 0).any() and (gazed["gaze"][~attended] == 0).all()
 
 
 def test_the_picture_tends_to_the_true_one_and_is_black_without_radiance(seen):
-    known = seen.subject.get_truth(1, "expected", "depth")
-    off = [np.abs(seen("depth,opacity", steps=n)["color"] - known.color).mean() for n in (128, 2048)]
-    assert known.color.max() > 0.5 and off[1] < off[0] / 4 < 0.01
+    truth = seen.subject.get_truth(1, "expected", "depth")
+    off = [np.abs(seen("depth,opacity", steps=n)["color"] - truth.color).mean() for n in (128, 2048)]
+    assert truth.color.max() > 0.5 and off[1] < off[0] / 4 < 0.01
     dark = seen("depth,opacity", radiance=False, steps=128)
     assert (dark["color"] == 0).all() and dark["opacity"].max() > 0.9
 
 
-def test_a_deferred_field_is_asked_for_colour_once_a_ray(rgb, tmp_path):
-    """And its picture tends to that of ``nerg``."""
+def test_deferred_fields_evaluate_colour_once_per_ray(rgb, tmp_path):
+    """And its picture converges to that of ``nerg``."""
     fields.radiance(tmp_path / "f.safetensors", deferred=True)
     field = {"type": "nerf", "filename": str(tmp_path / "f.safetensors")}
     made = rgb.load_dict({"type": "nerg", "field": field, "aovs": "depth,opacity,color_evals", "step": 2e-3})
     scene = rgb.load_dict({"type": "scene", "sensor": camera(rgb, size=8)})
-    known = np.array(rgb.render(scene, integrator=made, spp=1, seed=0))
+    truth = np.array(rgb.render(scene, integrator=made, spp=1, seed=0))
     off = []
     for steps in (64, 1024):
         paper = study_paper.make_paper_integrator(made, scene.sensors()[0], 0.01, steps)
         seen = np.array(rgb.render(scene, integrator=paper, spp=1, seed=0))
-        off.append(np.abs(seen - known)[..., :3].mean())
+        off.append(np.abs(seen - truth)[..., :3].mean())
         assert np.array_equal(seen[..., 5], seen[..., 4] > 0)
-    assert known[..., :3].max() > 0.2 and off[1] < off[0] / 4 < 0.01
+    assert truth[..., :3].max() > 0.2 and off[1] < off[0] / 4 < 0.01
 
 
 @pytest.mark.parametrize("dt_gamma", [0.0, 0.05])
-def test_empty_cells_are_left_without_a_loss(dt_gamma):
-    """Where steps do not grow, the same samples are taken beyond an empty cell as without a leap; none in it."""
+def test_skipping_empty_cells_changes_nothing(dt_gamma):
+    """With constant steps, the same samples are taken behind an empty cell as without skipping, and none in it."""
     rng = np.random.default_rng(3)
     grid = OccupancyGrid(rng.random((5, 4, 6)) < 0.4, ns, 0)
 
@@ -124,25 +126,25 @@ def test_empty_cells_are_left_without_a_loss(dt_gamma):
     d = np.stack([rng.random(count), rng.random(count), np.full(count, 1.2)]) - o
     d /= np.linalg.norm(d, axis=0)
     t0, t1 = (ns.Float(np.asarray(a / d[2], np.float32)) for a in (0.5, 1.5))
-    origin, way = (ns.Array3f(v.astype(np.float32)) for v in (o, d))
-    ray = LocalRay(origin, way, way, t0, t1)
-    found = []
-    # Of a refined grid that which it refines.
+    origin, direction = (ns.Array3f(v.astype(np.float32)) for v in (o, d))
+    ray = LocalRay(origin, direction, direction, t0, t1)
+    result = []
+    # The coarse grid of a refined grid.
     for occupancy in (grid, SimpleNamespace(coarse=grid), None):
         medium = SimpleNamespace(occupancy=occupancy, to_unit=lambda p: p, vector_to_unit=lambda v: v, density=density)
-        how = {"steps": 4096, "shortest": step, "longest": 0.02, "dt_gamma": dt_gamma}
+        how = {"steps": 4096, "min_step": step, "max_step": 0.02, "dt_gamma": dt_gamma}
         alpha, depth, _, n = study_paper.march_as_in_paper(medium, ray, t0, t1, True, None, **how)
-        found.append([np.array(v, float) for v in (alpha, depth, n)])
-    leaping, refining, whole = found
+        result.append([np.array(v, float) for v in (alpha, depth, n)])
+    leaping, refining, complete = result
     assert all(np.array_equal(a, b) for a, b in zip(leaping, refining))
-    assert (leaping[2] <= whole[2]).all() and leaping[2].mean() < 0.6 * whole[2].mean()
-    # A sample at a wall may fall to either side of it by rounding; grown steps begin elsewhere behind a leap.
+    assert (leaping[2] <= complete[2]).all() and leaping[2].mean() < 0.6 * complete[2].mean()
+    # A sample at a cell wall may be on either side by rounding; growing steps start elsewhere behind a skipped cell.
     bound = 0.04 if dt_gamma else 0.01
-    assert whole[0].max() > 0.5 and np.abs(leaping[0] - whole[0]).max() < bound
-    assert np.abs(leaping[1] - whole[1]).max() < 2 * bound
+    assert complete[0].max() > 0.5 and np.abs(leaping[0] - complete[0]).max() < bound
+    assert np.abs(leaping[1] - complete[1]).max() < 2 * bound
     if not dt_gamma:
-        assert np.median(np.abs(leaping[0] - whole[0])) < 1e-5
-        # As many as lie in occupied cells of the unit cube.
+        assert np.median(np.abs(leaping[0] - complete[0])) < 1e-5
+        # The samples in occupied cells of the unit cube.
         t = 0.5 / d[2] + step * np.arange(600)[:, None]
         p = o[:, None] + d[:, None] * t
         cell = np.floor(p * np.array([6, 4, 5])[:, None, None]).astype(int)
@@ -174,8 +176,8 @@ def test_the_papers_depth_is_unnormalised_and_at_the_steps_end():
         assert abs(seen["depth"][i] - depth) < 2e-2 * step + 0.04 * (1 - seen["opacity"][i])
         assert abs(seen["opacity"][i] - (1 - T)) < 2e-2
     half = (seen["opacity"] > 0.3) & (seen["opacity"] < 0.9)
-    known = subject.get_truth(1, "expected", "depth")
-    assert half.any() and np.all(seen["depth"][half] < 0.95 * known.depth[half])
+    truth = subject.get_truth(1, "expected", "depth")
+    assert half.any() and np.all(seen["depth"][half] < 0.95 * truth.depth[half])
 
 
 # ---- The rows of a study: sweeps that are even on log axes, and what a row's name promises ----
@@ -184,7 +186,9 @@ def test_the_papers_depth_is_unnormalised_and_at_the_steps_end():
 @pytest.fixture(scope="module")
 def rows():
     return list_rows(
-        SimpleNamespace(marched=True, hits=False, extent=2.0, has_gaze=True, normalized=True, resampled=True)
+        SimpleNamespace(
+            is_marched=True, has_splats=False, extent=2.0, has_gaze=True, is_normalized=True, can_resample=True
+        )
     )
 
 
@@ -206,15 +210,15 @@ def test_sweeps_are_even_on_a_log_axis(rows):
     assert tuple(sweeps["steps"]) == STEP_COUNTS and tuple(sweeps["resolutions"]) == RESOLUTIONS
 
 
-def test_rows_do_what_their_names_say(rows):
+def test_rows_match_their_names(rows):
     assert rows[0].name == "default" and not rows[0].params and len({r.name for r in rows}) == len(rows)
     for row in rows:
         assert row.is_first_frame == row.name.endswith("first frame"), row.name
-        if found := re.search(r"(\d+) steps", row.name):
+        if result := re.search(r"(\d+) steps", row.name):
             n = row.paper[0] if row.paper else 2.0 / row.params["step"]
-            assert n == int(found[1]), row.name
-        if found := re.search(r"dt_gamma 1/(\d+)", row.name):
+            assert n == int(result[1]), row.name
+        if result := re.search(r"dt_gamma 1/(\d+)", row.name):
             gamma = row.paper[1] if row.paper else row.params["dt_gamma"]
-            assert gamma == 1 / int(found[1]), row.name
+            assert gamma == 1 / int(result[1]), row.name
         elif row.paper:
             assert row.paper[1] == 0, row.name

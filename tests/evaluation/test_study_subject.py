@@ -14,7 +14,7 @@ from nerg_mi.maths.geometry import Box
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.train.gaze_data import compute_box_exit
 from nerg_mi.workflows.scene_commands import StudyOptions
-from nerg_mi.workflows.study import run_study, find_reference_scene
+from nerg_mi.workflows.study import find_reference_scene, run_study
 from tests.evaluation.gaze_fields import KINDS, saved
 from tests.reference import march_numpy
 
@@ -23,8 +23,8 @@ from tests.reference import march_numpy
 NONE_OF_A_STUDY = {"aovs", "ceiling", "up"}
 
 
-def test_all_settings_are_read_back_and_make_the_same_integrator(rgb):
-    given = {
+def test_settings_round_trip(rgb):
+    options = {
         "occlusion": False,
         "radiance": False,
         "jitter": True,
@@ -46,14 +46,14 @@ def test_all_settings_are_read_back_and_make_the_same_integrator(rgb):
         "background": [0.25, 0.5, 0.75],
     }
     density = {"type": "constvolume", "value": 3.0}
-    first = rgb.load_dict({"type": "nerg", "density": density, **given})
-    found = read_parameters(first)
-    assert found == given
-    assert read_parameters(rgb.load_dict({"type": "nerg", "density": density, **found})) == given
-    # None is forgotten of those that the manual page names.
+    first = rgb.load_dict({"type": "nerg", "density": density, **options})
+    result = read_parameters(first)
+    assert result == options
+    assert read_parameters(rgb.load_dict({"type": "nerg", "density": density, **result})) == options
+    # All parameters of the manual page are read.
     rows = re.findall(r"^ \* - ([\w, ]+)\n   - (?!:paramtype)", type(first).__doc__, re.MULTILINE)
     named = {name for row in rows for name in row.split(", ")}
-    assert named - NONE_OF_A_STUDY == set(given) and NONE_OF_A_STUDY < named and np.isfinite(found["step"])
+    assert named - NONE_OF_A_STUDY == set(options) and NONE_OF_A_STUDY < named and np.isfinite(result["step"])
 
 
 # ---- What a study knows of its subjects: where surfaces are, and the limit that a scene file is compared with ----
@@ -73,7 +73,7 @@ TWIN = """<scene version="3.0.0"><shape type="cube">
   <transform name="to_world"><scale value="0.5"/><translate x="0.5" y="0.5" z="0.5"/></transform></shape></scene>"""
 
 
-def test_the_twin_says_what_the_observer_sees(rgb, tmp_path):
+def test_the_twin_has_exact_visibility(rgb, tmp_path):
     eye = np.array([-2.0, -1.0, 3.0])
     (tmp_path / "scene.xml").write_text(SCENE.format(eye=", ".join(map(str, eye))))
     (tmp_path / "twin.xml").write_text(TWIN)
@@ -85,11 +85,11 @@ def test_the_twin_says_what_the_observer_sees(rgb, tmp_path):
     p = o[hit] + d[hit] * t[hit, None]
     face = np.argmax(np.abs(p - 0.5), axis=1)
     assert 50 < hit.sum() < hit.size and np.allclose(np.abs(p - 0.5).max(axis=1), 0.5, atol=1e-5)
-    # A convex body hides the faces that look away: of the three in the picture x = 1, from an eye at x < 0.
+    # A convex body hides its back faces: of the three in the picture x = 1, for an observer at x < 0.
     assert set(face) == {0, 1, 2} and np.array_equal(visible[hit], face != 0) and not visible[~hit].any()
 
 
-def test_solids_are_met_where_geometry_says():
+def test_first_solid_matches_geometry():
     subject = open_subject("sphere", "auto", 24, 16)
     t, visible = subject.find_exact_hits(1)
     o, d = subject.record_rays(1)
@@ -98,13 +98,13 @@ def test_solids_are_met_where_geometry_says():
     p = o[hit] + d[hit] * t[hit, None]
     normal = (p - center) / radius
     assert hit.any() and np.allclose(np.linalg.norm(normal, axis=-1), 1, atol=1e-6)
-    # A convex body hides from an observer what faces away.
+    # A convex body hides its back faces from an observer.
     towards = np.asarray(subject.analytic.observer) - p
     assert np.array_equal(visible[hit], (towards * normal).sum(-1) > 0) and 0 < visible[hit].mean() < 1
     assert not visible[~hit].any() and open_subject("fog", "auto", 4, 4).find_exact_hits(1) is None
 
 
-def test_a_scene_file_is_compared_with_its_own_limit(rgb, tmp_path):
+def test_a_scene_file_is_compared_with_its_limit(rgb, tmp_path):
     path = tmp_path / "scene.xml"
     path.write_text("""<scene version="3.0.0">
       <integrator type="nerg">
@@ -115,18 +115,18 @@ def test_a_scene_file_is_compared_with_its_own_limit(rgb, tmp_path):
           <string name="component_format" value="float32"/></film>
       </sensor></scene>""")
     subject = open_subject(str(path), "auto", 12, 8)
-    known = subject.get_truth(1, "median", "depth")
-    assert known.depth.shape == (96,) and not subject.has_gaze and subject.find_exact_hits(1) is None
+    truth = subject.get_truth(1, "median", "depth")
+    assert truth.depth.shape == (96,) and not subject.has_gaze and subject.find_exact_hits(1) is None
     o, d = subject.record_rays(1)
     slab = study_scenes.SCENES["slab"]
     for i in range(0, 96, 13):
         hit = march_numpy.box(o[i], d[i], (0, 0, 0), (1, 1, 1))
         median = 0 if hit is None else march_numpy.slab(4.0, *hit)[2]
-        assert abs(known.depth[i] - median) < 1e-5
-    assert slab.name == "slab" and known.convergence["depth_mae"] < 1e-5
-    whole = path.read_text()
+        assert abs(truth.depth[i] - median) < 1e-5
+    assert slab.name == "slab" and truth.convergence["depth_mae"] < 1e-5
+    full = path.read_text()
     bad = (
-        whole.replace('<integrator type="nerg">', '<integrator type="path">')
+        full.replace('<integrator type="nerg">', '<integrator type="path">')
         .replace("<volume", "<!--")
         .replace("</volume>", "-->")
     )
@@ -134,7 +134,7 @@ def test_a_scene_file_is_compared_with_its_own_limit(rgb, tmp_path):
     with pytest.raises(ValueError, match='is not "nerg"'):
         open_subject(str(path), "file", 12, 8)
     path.write_text(
-        whole.replace('<integrator type="nerg">', '<integrator type="nerg"><float name="ceiling" value="1"/>')
+        full.replace('<integrator type="nerg">', '<integrator type="nerg"><float name="ceiling" value="1"/>')
     )
     with pytest.raises(ValueError, match='has a "ceiling"'):
         open_subject(str(path), "file", 12, 8)
@@ -175,16 +175,15 @@ def scene(folder, kind: str, shapes: bool):
 def test01_shapes_agree_with_their_reference(rgb, tmp_path, kind):
     subject = open_subject(str(scene(tmp_path, kind, True)), "auto", 24, 16)
     seen = subject.render_channels(subject.make_integrator(), 1, 1)
-    known = subject.get_truth(1, "median", "depth")
-    assert np.ptp(known.gaze) > 1e-2
-    off = np.abs(seen["gaze"] - known.gaze) > 1e-3 * known.gaze.max()
+    truth = subject.get_truth(1, "median", "depth")
+    assert np.ptp(truth.gaze) > 1e-2
+    off = np.abs(seen["gaze"] - truth.gaze) > 1e-3 * truth.gaze.max()
     assert off.mean() < 0.01
 
 
 @pytest.mark.parametrize("kind", ["normalised", "default recipe"])
 def test02_the_integral_is_that_of_exact_geometry(rgb, tmp_path, kind):
-    """The reference takes the integrator's integral; here it is found again, by float64 intersections with the
-    triangles."""
+    """The reference uses the integrator's integral, which is verified here with float64 intersections."""
     subject = open_subject(str(scene(tmp_path, kind, True)), "auto", 8, 8)
     eye = subject.observer_position()
     observed = study_shapes.make_observed_gaze(subject, eye)
@@ -220,12 +219,12 @@ def test03_the_study_of_a_default_recipe(rgb, tmp_path, shapes):
 
 @pytest.mark.parametrize("kind", ["default recipe", "ensemble"])
 def test04_the_papers_marching_is_divided_by_the_same_integral(rgb, tmp_path, kind):
-    """In an opaque box both rules meet the same surfaces; what they say of them is then the same density."""
+    """In an opaque box both marches find the same surfaces, so their densities are equal."""
     from nerg_mi.evaluation.study import make_paper_integrator
 
     subject = open_subject(str(scene(tmp_path, kind, False)), "auto", 24, 16)
     made = subject.make_integrator({"aovs": "depth,opacity,gaze,visibility,gaze_evals", "depth": "expected"})
-    # First: afterwards the field would face the observer whatever the paper's marching does.
+    # First, because afterwards the field would face the observer with any march.
     theirs = subject.render_channels(make_paper_integrator(made, subject.sensor, subject.tolerance, 4096), 1, 1)
     ours = subject.render_channels(made, 1, 1)
     both = (ours["visibility"] > 0.8) & (theirs["visibility"] > 0.8) & (ours["opacity"] > 0.99)

@@ -17,7 +17,7 @@ from nerg_mi.evaluation import study_tables as study_plots
 @pytest.fixture
 def drawn(monkeypatch):
     figures = []
-    monkeypatch.setattr(study_plots, "save", lambda figure, path, about: figures.append(figure))
+    monkeypatch.setattr(study_plots, "save", lambda figure, path, provenance: figures.append(figure))
     return figures
 
 
@@ -47,10 +47,10 @@ def test_panels_show_all_rows_and_the_front_below_them(drawn):
     study_plots.plot_errors("a.png", ROWS, "title")
     panels = drawn[0].axes
     assert [a.get_ylabel() for a in panels] == [label for _, label in study_plots.PANELS]
-    assert {a.get_xlabel() for a in panels} == {"seconds a picture"}
+    assert {a.get_xlabel() for a in panels} == {"seconds per picture"}
     for axes in panels:
         (front,) = axes.lines
-        # In the order of time; an error of zero stands on the axis' lower end.
+        # Sorted by time; an error of zero is at the lower end of the axis.
         assert np.allclose(front.get_xydata(), [(0.01, 2e-3), (0.02, 1e-3), (0.16, study_plots.MIN_PLOTTED_ERROR)])
         assert front.get_drawstyle() == "steps-post"
         points = {len(c.get_offsets()): c for c in axes.collections}
@@ -67,11 +67,11 @@ def test_panels_show_all_rows_and_the_front_below_them(drawn):
 def test_cost_is_drawn_over_named_axes_with_the_exponent(drawn):
     study_plots.plot_scaling("a.png", SCALING, "title")
     panels = drawn[0].axes
-    assert [a.get_xlabel() for a in panels] == ["pixels", "samples a pixel", "extent of the scene at equal step"]
+    assert [a.get_xlabel() for a in panels] == ["pixels", "samples per pixel", "extent of the scene at equal step"]
     assert [a.get_title().split()[1] for a in panels] == ["1.00", "0.50", "2.00"]
-    assert {a.get_ylabel() for a in panels} == {"seconds a picture"}
+    assert {a.get_ylabel() for a in panels} == {"seconds per picture"}
     assert np.allclose(panels[2].lines[0].get_xydata(), [(v, 0.1 * v**2) for v in (1, 2, 4, 8)])
-    # The exponent is that of the upper half: what a render costs at least is none of it.
+    # The exponent of the upper half excludes the fixed cost of a render.
     study_plots.plot_scaling("a.png", [r | {"seconds": 9.0} if r["value"] == 1 else r for r in SCALING], "title")
     assert [a.get_title() for a in drawn[1].axes] == [a.get_title() for a in panels]
 
@@ -89,20 +89,26 @@ def test_pareto():
     assert study_tables.find_pareto_front(points) == [not b for b in beaten]
 
 
-def test_a_page_shows_times_in_ms_shares_in_percent_and_errors_as_they_are():
+def test_units_of_the_report():
     units = {"seconds": 1e3, "cpu_seconds": 1e3, "visibility_wrong": 100}
     names = [*units, "density_evals", "color_evals", "peak_mb", "color_rmse", "depth_mae", "depth_p99", "surface_mae"]
     names += ["visibility_mae", "gaze_mae", "gaze_kld"]
     row = {"setting": "a", "group": "leave out", "spp": 1, "resolution": "", "visibility": "depth"}
     row |= {name: (k + 1) / 128 for k, name in enumerate(names)}
-    about = {"scene": "s", "size": (1, 1), "variant": "v", "reference": "r", "reference_change_when_step_halved": {}}
-    page = study_tables.format_report({"rows": [{**row, "group": "default"}, row], **about})
+    provenance = {
+        "scene": "s",
+        "size": (1, 1),
+        "variant": "v",
+        "reference": "r",
+        "reference_change_when_step_halved": {},
+    }
+    page = study_tables.format_report({"rows": [{**row, "group": "default"}, row], **provenance})
     assert "against the paper" not in page
     shown = [float(cell) for cell in page.split("| a |")[2].split("\n")[0].strip(" |").split("|")]
     assert sorted(shown) == sorted(float(f"{row[name] * units.get(name, 1):.3g}") for name in names)
 
 
-def test_against_paper_takes_the_best_of_either_kind():
+def test_comparison_with_the_paper_selects_the_best_rows():
     def row(setting, group, seconds, depth_mae):
         return {
             "setting": setting,

@@ -9,8 +9,8 @@ import pytest
 
 from nerg_mi.cli import main
 from nerg_mi.evaluation import study_scenes, study_subject, study_truth
-from nerg_mi.evaluation.study import measure_rows, list_rows
-from nerg_mi.evaluation.study_subject import read_splat_extent, open_subject
+from nerg_mi.evaluation.study import list_rows, measure_rows
+from nerg_mi.evaluation.study_subject import open_subject, read_splat_extent
 from nerg_mi.evaluation.study_truth import compute_errors
 from nerg_mi.formats.splats import write_ply_splats
 from tests.formats.splats.writers import random_splats
@@ -19,10 +19,10 @@ from tests.reference import march_numpy
 # ---- Errors of pictures whose distance from the truth is known ----
 
 
-def test_errors_of_known_pictures():
+def test_errors_of_synthetic_pictures():
     n = 1000
     one, none = np.ones(n), np.zeros(n)
-    known = study_truth.StudyTruth(np.full((n, 3), 0.5), one, 2 * one, one, np.linspace(1, 2, n), "", {})
+    truth = study_truth.StudyTruth(np.full((n, 3), 0.5), one, 2 * one, one, np.linspace(1, 2, n), "", {})
     seen = {
         "color": np.full((n, 3), 0.6),
         "opacity": one,
@@ -30,17 +30,17 @@ def test_errors_of_known_pictures():
         "visibility": one,
         "gaze": np.linspace(1, 2, n),
     }
-    off = compute_errors(seen, known, (2 * one, np.arange(n) >= 250))
+    off = compute_errors(seen, truth, (2 * one, np.arange(n) >= 250))
     assert math.isclose(off["color_rmse"], 0.1, rel_tol=1e-9) and math.isclose(off["color_psnr"], 20, rel_tol=1e-9)
     assert math.isclose(off["depth_mae"], 0.05) and off["depth_p99"] == 0.5
     assert off["visibility_mae"] == 0 and off["visibility_wrong"] == 0.25
     assert off["gaze_mae"] == 0 and abs(off["gaze_kld"]) < 1e-12
-    # Errors of either sign; and half seen is seen.
+    # Errors of both signs; half visible counts as visible.
     half = np.where(np.arange(n) % 2, 0.4, 0.6)
-    off = compute_errors({"opacity": 0.5 + half, "visibility": half}, known, (2 * one, one > 0))
+    off = compute_errors({"opacity": 0.5 + half, "visibility": half}, truth, (2 * one, one > 0))
     assert math.isclose(off["opacity_mae"], 0.1) and off["visibility_wrong"] == 0.5
-    # A ray that met nothing counts in full; what was not rendered has no error.
-    off = compute_errors({"depth": none, "color": none[:, None]}, known)
+    # A miss counts with its full depth; channels that are not rendered have no error.
+    off = compute_errors({"depth": none, "color": none[:, None]}, truth)
     assert off["depth_mae"] == 2 and "color_rmse" not in off and "gaze_mae" not in off
 
 
@@ -67,17 +67,21 @@ def test_references_are_the_limit_of_a_float64_march(name):
     for i in range(len(o) - 1):
         near, far = march_numpy.box(o[i], d[i], (0, 0, 0), (1, 1, 1))
         jumps = scene.breaks(o[i : i + 1], d[i : i + 1])[0]
-        # Steps end at the jumps of density, so that midpoints do not straddle them.
+        # Steps end at the discontinuities, so that midpoints do not straddle them.
         borders = np.unique(np.concatenate([np.linspace(near, far, 20001), jumps[(jumps > near) & (jumps < far)]]))
         tau, expected, median, total, _ = march_numpy.march(
-            lambda p: scene.density(*p.T, study_scenes.NUMPY_FUNCTIONS) + 0 * p[:, 0], o[i], d[i], borders, study_scenes.evaluate_color
+            lambda p: scene.density(*p.T, study_scenes.NUMPY_FUNCTIONS) + 0 * p[:, 0],
+            o[i],
+            d[i],
+            borders,
+            study_scenes.evaluate_color,
         )
         assert math.isclose(seen.tau[i], tau, rel_tol=1e-6)
         assert math.isclose(seen.expected[i], expected, rel_tol=1e-6) and math.isclose(medians[i], median, rel_tol=1e-6)
         assert np.allclose(color[i], total, atol=2e-5)
 
 
-def test_a_trace_that_ends_is_the_front_of_a_whole_one():
+def test_a_truncated_trace_equals_the_front_of_a_full_one():
     for scene in study_scenes.SCENES.values():
         o, d = rays(scene, 8)
         seen = study_truth.trace_rays(scene, o, d)
@@ -85,15 +89,15 @@ def test_a_trace_that_ends_is_the_front_of_a_whole_one():
         assert np.allclose(half.opacity, seen.opacity / 2, rtol=1e-9)
 
 
-def test_the_point_looked_for_lies_on_the_face_of_a_solid_for_each_kind_of_depth():
-    # A lift beyond the face would show a strip beyond the terminator, one short of it would hide a strip before it.
+def test_target_points_are_on_the_faces_of_solids():
+    # A shift beyond the face would show a strip beyond the terminator, a smaller one would hide a strip before it.
     subject = open_subject("sphere", "auto", 96, 64)
     t, visible = subject.find_exact_hits(1)
     o, d = subject.record_rays(1)
     seen = study_truth.trace_rays(subject.analytic, o, d)
     thick = np.isfinite(t) & (seen.tau > 12)
     for kind in ("expected", "median"):
-        known = study_truth.compute_truth(
+        truth = study_truth.compute_truth(
             subject.analytic,
             None,
             o,
@@ -104,19 +108,19 @@ def test_the_point_looked_for_lies_on_the_face_of_a_solid_for_each_kind_of_depth
             tolerance=1e-9,
             surface_opacity=0.5,
         )
-        assert thick.sum() > 100 and np.array_equal(known.visibility[thick] > 0.999, visible[thick]), kind
+        assert thick.sum() > 100 and np.array_equal(truth.visibility[thick] > 0.999, visible[thick]), kind
 
 
 @pytest.mark.parametrize("visibility", ["depth", "transmittance"])
-def test_what_is_no_surface_is_not_visible(visibility):
+def test_only_surfaces_are_visible(visibility):
     scene = study_scenes.SCENES["ramp"]
     o, d = rays(scene, 64)
-    known = study_truth.compute_truth(
+    truth = study_truth.compute_truth(
         scene, None, o, d, depth="expected", visibility=visibility, falloff=0.1, tolerance=1e-3, surface_opacity=0.9
     )
-    thin = known.opacity < 0.9
-    assert 5 < thin.sum() < 60 and (known.opacity[thin] > 0.1).any() and known.opacity[-1] == 0
-    assert (known.visibility[thin] == 0).all() and (known.visibility[~thin] > 0).any() and (known.gaze == 0).all()
+    thin = truth.opacity < 0.9
+    assert 5 < thin.sum() < 60 and (truth.opacity[thin] > 0.1).any() and truth.opacity[-1] == 0
+    assert (truth.visibility[thin] == 0).all() and (truth.visibility[~thin] > 0).any() and (truth.gaze == 0).all()
 
 
 @pytest.mark.parametrize("x", [0, 1e-300, 1e-6, 9.9e-3, 1.01e-2, 1, 50, 1e9])
@@ -131,11 +135,12 @@ def test_mean_share(x):
 @pytest.mark.parametrize("name", NAMES)
 def test_integrator_agrees_with_the_reference(name):
     subject = open_subject(name, "auto", 12, 8)
-    known = subject.get_truth(1, "expected", "depth")
+    truth = subject.get_truth(1, "expected", "depth")
     off = compute_errors(
-        subject.render_channels(subject.make_integrator({"depth": "expected", "step": subject.extent / 2048}), 1, 1), known
+        subject.render_channels(subject.make_integrator({"depth": "expected", "step": subject.extent / 2048}), 1, 1),
+        truth,
     )
-    # Thin or hard matter is what steps of a finite length find late.
+    # Finite steps find thin or hard matter late.
     bound = 1e-3 if subject.is_opaque else 2e-6
     assert off["depth_mae"] < bound and off["opacity_mae"] < bound and off["color_rmse"] < max(20 * bound, 1e-4)
     assert off["visibility_mae"] < 30 * bound and off["gaze_mae"] < 30 * bound
@@ -143,11 +148,13 @@ def test_integrator_agrees_with_the_reference(name):
 
 def test_a_grid_tends_to_its_density():
     subject = open_subject("fog", "auto", 12, 8)
-    known = subject.get_truth(1, "expected", "depth")
+    truth = subject.get_truth(1, "expected", "depth")
     off = [
         compute_errors(
-            subject.render_channels(subject.make_integrator({"quadrature": "cells", "depth": "expected"}, resolution=r), 1, 1),
-            known,
+            subject.render_channels(
+                subject.make_integrator({"quadrature": "cells", "depth": "expected"}, resolution=r), 1, 1
+            ),
+            truth,
         )["depth_mae"]
         for r in (8, 32)
     ]
@@ -187,10 +194,10 @@ def test01_first_hits_are_those_of_a_ray_caster(rgb, scene):
     loaded = subject.scene
     ray = rgb.Ray3f(*(kind(np.ascontiguousarray(v.T, np.float32)) for kind, v in ((rgb.Point3f, o), (rgb.Vector3f, d))))
     expected = np.array(loaded.ray_intersect_preliminary(ray).t, float)
-    found = subject.find_first_hits(3)
-    assert np.array_equal(np.isfinite(found), np.isfinite(expected)) and np.isfinite(found).sum() > 200
-    hit = np.isfinite(found)
-    assert np.allclose(found[hit], expected[hit], rtol=1e-5)
+    result = subject.find_first_hits(3)
+    assert np.array_equal(np.isfinite(result), np.isfinite(expected)) and np.isfinite(result).sum() > 200
+    hit = np.isfinite(result)
+    assert np.allclose(result[hit], expected[hit], rtol=1e-5)
 
 
 def test02_rays_do_not_slip_between_triangles():
@@ -209,13 +216,13 @@ def test03_the_integrator_agrees_with_the_reference(rgb, scene, falloff, visibil
     scene.write_text(SCENE.format(falloff=falloff, more=""))
     subject = study_subject.open_subject(str(scene), "auto", 24, 16)
     seen = subject.render_channels(subject.make_integrator({"visibility": visibility}), 1, 1)
-    known = subject.get_truth(1, "median", visibility)
-    assert np.array_equal(seen["opacity"], known.opacity)
-    assert np.allclose(seen["depth"], known.depth, atol=2e-5)
-    assert np.mean(np.abs(seen["visibility"] - known.visibility) > 1e-3) < 0.01
+    truth = subject.get_truth(1, "median", visibility)
+    assert np.array_equal(seen["opacity"], truth.opacity)
+    assert np.allclose(seen["depth"], truth.depth, atol=2e-5)
+    assert np.mean(np.abs(seen["visibility"] - truth.visibility) > 1e-3) < 0.01
     distance, visible = subject.find_exact_hits(1)
-    # A hair of tolerance lies between what is asked and what is exactly so.
-    shown = known.visibility > 0.5 if falloff == 0 or visibility == "transmittance" else None
+    # A small tolerance, because the query is not exactly on the surface.
+    shown = truth.visibility > 0.5 if falloff == 0 or visibility == "transmittance" else None
     if shown is not None:
         assert np.mean(shown != visible) < 0.02 and 0.1 < visible[np.isfinite(distance)].mean() < 0.95
 
@@ -224,7 +231,7 @@ def test05_shapes_without_triangles_are_refused(tmp_path, scene, capsys):
     scene.write_text(SCENE.format(falloff=0.0, more='<shape type="sphere"/>'))
     with pytest.raises(SystemExit):
         main(["study", str(scene), "--out", str(tmp_path / "out"), "--quick", "-m", "llvm_ad_rgb"])
-    assert "a study of shapes needs meshes, and this scene has a Sphere" in " ".join(capsys.readouterr().err.split())
+    assert "a study of shapes supports only meshes, and this scene has a Sphere" in " ".join(capsys.readouterr().err.split())
 
 
 # ---- Gaussian splats as a subject of a study: what is set of them, and what they are compared with ----
@@ -243,7 +250,7 @@ def subject(rgb, tmp_path):
     return open_subject(str(tmp_path / "scene.xml"), "auto", 12, 8)
 
 
-def test_a_field_is_cut_off_elsewhere_and_else_the_same(subject):
+def test_splat_extent_changes_only_the_cut_off(subject):
     first, other = subject.make_integrator(), subject.make_integrator({"extent": 5.0})
     assert read_splat_extent(first) == 3 and read_splat_extent(other) == 5
     assert np.allclose(other.medium.to_world.matrix, first.medium.to_world.matrix, atol=1e-6)
@@ -252,14 +259,14 @@ def test_a_field_is_cut_off_elsewhere_and_else_the_same(subject):
 
 
 @pytest.mark.nightly
-def test_settings_that_gaussians_know_buy_error_with_time(subject):
+def test_splat_settings_trade_error_for_time(subject):
     rows = [r for r in list_rows(subject) if r.group in ("default", "stop", "extent")]
     assert {r.group for r in list_rows(subject)} >= {"stop", "extent", "depth", "visibility", "together"}
     assert not {r.group for r in list_rows(subject)} & {"coarse", "paper", "dt_gamma"}
     rows = [r for r in rows if r.name in ("default", "extent 2", "extent 5")]
-    found = {row["setting"]: row for row in measure_rows(subject, rows, 1, 4)}
-    error = {name: row["color_rmse"] for name, row in found.items()}
+    result = {row["setting"]: row for row in measure_rows(subject, rows, 1, 4)}
+    error = {name: row["color_rmse"] for name, row in result.items()}
     assert error["extent 5"] < 0.1 * error["default"] and error["default"] < 0.3 * error["extent 2"]
-    assert found["extent 2"]["density_evals"] < found["extent 5"]["density_evals"]
-    assert found["extent 2"]["extent"] == 2 and found["default"]["steps"] == ""
+    assert result["extent 2"]["density_evals"] < result["extent 5"]["density_evals"]
+    assert result["extent 2"]["extent"] == 2 and result["default"]["steps"] == ""
     assert subject.get_truth(1, "median", "depth").convergence["depth_mae"] < 1e-4
