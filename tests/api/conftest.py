@@ -1,4 +1,4 @@
-"""What the tests of the API share: small fields in files, and a scene of them."""
+"""Common fixtures of the API tests: small fields in files, and a scene with them."""
 
 import pytest
 
@@ -7,7 +7,7 @@ from tests.plugins import fields
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
-    """A folder with `field.safetensors` and `gaze.safetensors`: a box of ±1."""
+    """A folder with `field.safetensors` and `gaze.safetensors` in a box of ±1."""
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
@@ -26,7 +26,7 @@ def camera():
 
 @pytest.fixture
 def scene(files, camera):
-    """A field and a ball, which stands before it for those who look from the right; the camera is the observer."""
+    """A field and a ball, which occludes it as seen from the right; the camera is the observer."""
     import nerg_mi as nerg
 
     ball = {"type": "sphere", "center": [1.4, -1.0, 0.3], "radius": 0.4}

@@ -1,4 +1,4 @@
-"""The names at the top of the package, the variant that they take, and their arrays and cameras."""
+"""Public names of the package, the variant they select, and arrays and cameras."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import nerg_mi as nerg
-from nerg_mi.api.arrays import LabelledArrays, as_points, broadcast_to_observers, as_unit_vectors
+from nerg_mi.api.arrays import LabelledArrays, as_points, as_unit_vectors, broadcast_to_observers
 from nerg_mi.api.scene import activate_mitsuba, get_array_module
 from nerg_mi.errors import NergError
 
@@ -30,7 +30,7 @@ def run(code: str) -> str:
     return done.stdout
 
 
-def test01_dir_shows_them():
+def test01_dir_lists_public_names():
     assert nerg.__all__ == sorted(nerg.__all__)
     assert set(nerg.__all__) == set(nerg._WHERE)
     assert set(nerg.__all__) <= set(dir(nerg))
@@ -53,12 +53,12 @@ def test03_a_name_loads_its_module_and_not_the_others():
 def test04_unknown_names_are_attribute_errors():
     with pytest.raises(AttributeError, match='"nerg_mi".*"rendre"') as error:
         nerg.rendre  # noqa: B018
-    # With these Python suggests a name.
+    # Python uses these to suggest a name.
     assert (error.value.name, error.value.obj) == ("rendre", nerg)
 
 
 @pytest.mark.parametrize("name", nerg.__all__)
-def test05_types_are_known(name):
+def test05_types_are_resolved(name):
     value = getattr(nerg, name)
     assert value.__doc__ and value.__name__ == name
     if inspect.isfunction(value):
@@ -69,7 +69,7 @@ def test05_types_are_known(name):
 
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory):
-    """A folder of posed photos: the store, rendered from four places."""
+    """A folder of posed photos: the store, rendered from four positions."""
     import json
 
     import mitsuba as mi
@@ -85,14 +85,14 @@ def photos(tmp_path_factory):
         pose = np.array(mi.ScalarTransform4f().look_at(list(camera.origin), list(camera.target), [0, 0, 1]).matrix)
         # Mitsuba's cameras look along +z with x to the left, those of transforms.json along -z with x to the right.
         frames.append({"file_path": f"{i}.png", "transform_matrix": (pose @ np.diag([-1, 1, -1, 1])).tolist()})
-    about = {"camera_angle_x": float(np.radians(70)), "w": 24, "h": 16, "frames": frames}
-    (folder / "transforms.json").write_text(json.dumps(about))
+    provenance = {"camera_angle_x": float(np.radians(70)), "w": 24, "h": 16, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(provenance))
     return folder
 
 
 @pytest.fixture(scope="module")
 def rays():
-    """Somebody who stands about and looks around."""
+    """A participant who moves and looks around."""
     import numpy as np
 
     rng = np.random.default_rng(0)
@@ -104,7 +104,7 @@ def rays():
     return nerg.Rays(np.arange(n) / 30, who, ("Ada", "Bob"), origin, direction, np.ones(n))
 
 
-# Each of them trains, or measures, for seconds, which quicker tests of its job do with less.
+# These examples train or measure for seconds; faster tests of the same workflows exist.
 LONG = {"ablate", "study", "train_radiance"}
 
 
@@ -125,14 +125,14 @@ def test07_examples_run(name, tmp_path, request):
 # ---- The API takes the variant that is set, and sets one only where there is none ----
 
 
-def test01_one_is_set_where_there_is_none():
+def test01_default_variant_is_set():
     code = "import nerg_mi as nerg, mitsuba as mi; nerg.Scene; print(mi.variant()); "
     code += "from nerg_mi.api.scene import active_mitsuba; print(active_mitsuba().variant())"
     before, after = run(code).split()
     assert before == "None" and after in ("cuda_ad_rgb", "llvm_ad_rgb")
 
 
-def test02_one_that_is_set_stays(mono):
+def test02_active_variant_is_kept(mono):
     assert activate_mitsuba() is mono and mono.variant() == "llvm_ad_mono"
     assert get_array_module().__name__ == "drjit.llvm.ad"
     assert mono.variant() == "llvm_ad_mono"
@@ -166,12 +166,12 @@ def test01_points_of_every_shape():
         ([(0, 0), (0, 0, 1)], "eyes must be numbers"),
     ],
 )
-def test02_wrong_points_are_told_by_name(wrong, said):
+def test02_errors_name_the_invalid_points(wrong, said):
     with pytest.raises(NergError, match=said):
         as_points(wrong, "eyes")
 
 
-def test03_directions_are_made_unit_and_one_serves_all():
+def test03_directions_are_normalised_and_broadcast():
     d = as_unit_vectors((0, 3, 4), 5, "d")
     assert d.shape == (5, 3) and np.allclose(d, (0, 0.6, 0.8))
     with pytest.raises(NergError, match="d must not be zero, and row 1 is"):
@@ -198,14 +198,14 @@ def test04_arrays_have_names():
     ]
 
 
-def test05_what_is_not_there_is_said():
+def test05_missing_arrays_are_errors():
     with pytest.raises(KeyError, match='"gaze"'):
         make()["gaze"]
     with pytest.raises(AttributeError, match='there is no "gaze"'):
         make().gaze  # noqa: B018
 
 
-def test06_what_is_the_same_for_all_cannot_be_written_to():
+def test06_broadcast_arrays_are_read_only():
     with pytest.raises(ValueError):
         make().depth[0, 0, 0] = 1
 
@@ -252,6 +252,6 @@ def test02_fov_is_that_of_the_width_and_up_is_up(rgb):
         ({"origin": [(0, 1, 2)]}, "origin of a camera"),
     ],
 )
-def test03_what_is_no_camera(wrong, said):
+def test03_invalid_cameras_are_refused(wrong, said):
     with pytest.raises(nerg.NergError, match=said):
         nerg.Camera(**{"origin": (1, 2, 3), "target": (4, 5, 6), **wrong})

@@ -1,4 +1,4 @@
-"""Pictures for one observer and for many: those of Mitsuba, and of the command."""
+"""Pictures of one and several observers, compared with Mitsuba and the command."""
 
 import numpy as np
 import pytest
@@ -46,18 +46,18 @@ def test01_pixels_of_the_command_to_the_bit(files, scene, tmp_path):
     names = [field.name for field in bitmap.struct_()]
     written = dict(zip(names, np.moveaxis(np.array(bitmap), -1, 0)))
     quantities = ["gaze", "visibility", "position", "color", "opacity", "depth"]
-    found = nerg.render(scene, EYES, quantities, spp=4, seed=5)
-    assert found.names == tuple(quantities)
-    of = {"gaze": ["gaze.Y"], "visibility": ["visibility.Y"], "opacity": ["opacity.Y"], "depth": ["depth.T"]}
-    of |= {"color": ["R", "G", "B"], "position": ["position.X", "position.Y", "position.Z"]}
-    for name, channels in of.items():
+    result = nerg.render(scene, EYES, quantities, spp=4, seed=5)
+    assert result.names == tuple(quantities)
+    source = {"gaze": ["gaze.Y"], "visibility": ["visibility.Y"], "opacity": ["opacity.Y"], "depth": ["depth.T"]}
+    source |= {"color": ["R", "G", "B"], "position": ["position.X", "position.Y", "position.Z"]}
+    for name, channels in source.items():
         expected = np.stack([written[c] for c in channels], axis=-1)
-        mine = found[name][1] if name in ("color", "position") else found[name][1][..., None]
+        mine = result[name][1] if name in ("color", "position") else result[name][1][..., None]
         assert np.array_equal(mine, expected), name
-    assert found.gaze.max() > 0 and found.visibility.min() == 0 < found.visibility.max()
+    assert result.gaze.max() > 0 and result.visibility.min() == 0 < result.visibility.max()
 
 
-def test02_many_observers_are_each_alone(scene):
+def test02_observers_are_independent(scene):
     quantities = ("color", "depth", "gaze", "visibility", "observer_depth", "gaze_evals", "density_evals")
     together = nerg.render(scene, EYES, quantities, spp=2)
     assert together.gaze.shape == (3, 8, 12) and together.color.shape == (3, 8, 12, 3)
@@ -70,27 +70,27 @@ def test02_many_observers_are_each_alone(scene):
 
 
 def test03_an_observer_at_the_camera_is_the_camera(scene):
-    own, there = nerg.render(scene, spp=2), nerg.render(scene, EYES[0], spp=2)
-    assert np.allclose(own.observers, EYES[:1])
-    for name in own:
-        assert np.array_equal(own[name], there[name]), name
+    individual, is_valid = nerg.render(scene, spp=2), nerg.render(scene, EYES[0], spp=2)
+    assert np.allclose(individual.observers, EYES[:1])
+    for name in individual:
+        assert np.array_equal(individual[name], is_valid[name]), name
 
 
 def test04_the_scenes_own_observer(files, camera):
     scene = nerg.make_scene(files / "field.safetensors", files / "gaze.safetensors", camera=camera, observer=EYES[1])
-    own, given = nerg.render(scene, spp=1), nerg.render(scene, EYES[1], spp=1)
-    assert np.array_equal(own.observers, given.observers)
-    assert all(np.array_equal(own[name], given[name]) for name in own)
+    individual, options = nerg.render(scene, spp=1), nerg.render(scene, EYES[1], spp=1)
+    assert np.array_equal(individual.observers, options.observers)
+    assert all(np.array_equal(individual[name], options[name]) for name in individual)
 
 
-def test05_the_scene_is_left_as_it_was(files, camera):
+def test05_the_scene_is_not_changed(files, camera):
     scene = nerg.make_scene(files / "field.safetensors", files / "gaze.safetensors", camera=camera, observer=EYES[1])
     before = repr(scene), repr(scene.integrator)
     nerg.render(scene, EYES, ["gaze", "emit"], spp=1)
     assert (repr(scene), repr(scene.integrator)) == before
 
 
-def test06_a_moved_parameter_is_seen(files, camera, rgb):
+def test06_changed_parameters_take_effect(files, camera, rgb):
     scene = nerg.make_scene(files / "field.safetensors", files / "gaze.safetensors", shapes=BALL, camera=camera)
     before = nerg.render(scene, EYES, ["visibility", "opacity"], spp=1)
     params = rgb.traverse(scene.mitsuba)
@@ -115,17 +115,17 @@ def test08_another_camera(scene):
     assert nerg.render(scene, quantities="opacity", camera=other, spp=1).opacity.shape == (1, 5, 6)
 
 
-def test09_progress_is_told(scene):
-    told = []
+def test09_progress_is_reported(scene):
+    messages = []
 
     class Reporter:
         def message(self, text): ...
         def warn(self, text): ...
         def progress(self, share, text=""):
-            told.append(share)
+            messages.append(share)
 
     nerg.render(scene, EYES, spp=1, reporter=Reporter())
-    assert told == sorted(told) and told[-1] == 1
+    assert messages == sorted(messages) and messages[-1] == 1
 
 
 @pytest.mark.parametrize(
@@ -157,6 +157,8 @@ def test11_without_gaze(files, camera):
 
 def test12_channels_by_name():
     pixels = np.arange(2 * 3 * 8, dtype=np.float32).reshape(2, 3, 8)
-    found = split_channels(pixels, ["depth.T", "position.X", "position.Y", "position.Z"], ["position", "color", "depth"], True)
-    assert np.array_equal(found["color"], pixels[..., :3]) and np.array_equal(found["depth"], pixels[..., 4])
-    assert np.array_equal(found["position"], pixels[..., 5:8]) and list(found) == ["position", "color", "depth"]
+    result = split_channels(
+        pixels, ["depth.T", "position.X", "position.Y", "position.Z"], ["position", "color", "depth"], True
+    )
+    assert np.array_equal(result["color"], pixels[..., :3]) and np.array_equal(result["depth"], pixels[..., 4])
+    assert np.array_equal(result["position"], pixels[..., 5:8]) and list(result) == ["position", "color", "depth"]

@@ -41,13 +41,13 @@ def hits_box(o, d, low, high) -> np.ndarray:
 
 @pytest.fixture
 def empty(files):
-    """Nothing near, and a gaze field."""
+    """An empty surrounding and a gaze field."""
     return nerg.make_scene(gaze=files / "gaze.safetensors", shapes=FAR)
 
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory):
-    """A room with a sign, a stand before it for some, and one side open, as a file; and its scene."""
+    """A room with a sign, an occluder for some observers, and one open side, as a file; and its scene."""
     path = write_place(tmp_path_factory.mktemp("room"))
     return path, nerg.Scene.load(path)
 
@@ -57,34 +57,34 @@ def test01_the_share_is_the_integral_over_directions(empty):
     seen = nerg.attention(empty, box_dict(*np.array(BOX)), eye, divisions=16)
     d = on_sphere(400_000)
     d = d[hits_box(eye, d, *BOX) & (d @ (np.mean(BOX, axis=0) - eye) > 0)]
-    # Where the rays enter the box is where its gaze is.
+    # The gaze of the box is at the entry points of the rays.
     low, high = ((np.array(corner) - eye) / d for corner in BOX)
     entry = eye + d * np.minimum(low, high).max(axis=1)[:, None]
     gaze = nerg.observe(empty, entry, eye, "gaze").gaze[0]
-    # A field that is not normalised is divided by its own integral.
-    whole = compute_box_shares(empty, [], eye[None].astype(np.float32)).integral[0]
-    assert np.isclose(seen.share[0], gaze.sum() * 4 * np.pi / 400_000 / whole, rtol=1e-2) and abs(whole - 1) > 0.1
+    # A field that is not normalised is divided by its integral.
+    full = compute_box_shares(empty, [], eye[None].astype(np.float32)).integral[0]
+    assert np.isclose(seen.share[0], gaze.sum() * 4 * np.pi / 400_000 / full, rtol=1e-2) and abs(full - 1) > 0.1
 
 
 def test02_density_times_area_is_the_share(empty):
-    eyes = [(0.4, 0.1, 0.2), (-1, 0.5, 0.3), (0, 5, 0)]
-    seen = nerg.attention(empty, box_dict(*np.array(BOX)), eyes, divisions=3)
+    observers = [(0.4, 0.1, 0.2), (-1, 0.5, 0.3), (0, 5, 0)]
+    seen = nerg.attention(empty, box_dict(*np.array(BOX)), observers, divisions=3)
     assert seen.density.shape == (3, 12 * 9) and seen.points.shape == seen.normals.shape == (108, 3)
     assert np.allclose(seen.density @ seen.area, seen.share, rtol=1e-5)
     assert np.isclose(seen.area.sum(), 2 * (0.4 * 0.4 + 0.4 * 0.2 + 0.4 * 0.2), rtol=1e-5)
     assert np.allclose(np.linalg.norm(seen.normals, axis=1), 1, atol=1e-5)
-    # A side that is turned away receives nothing.
-    away = (np.array(eyes)[:, None] - seen.points) @ np.eye(3) * seen.normals
+    # A face that is turned away has no attention.
+    away = (np.array(observers)[:, None] - seen.points) @ np.eye(3) * seen.normals
     assert np.array_equal(seen.density[away.sum(axis=-1) < -1e-5], np.zeros((away.sum(axis=-1) < -1e-5).sum()))
     assert seen.mean == pytest.approx(float(seen.share.mean()))
     assert repr(seen).startswith("<Attention: mean share ") and "3 observers" in repr(seen) and seen.error is None
 
 
-def test03_what_stands_before_it_hides_it(files, empty):
+def test03_occluders_hide_surfaces(files, empty):
     wall = box_dict(np.array((-3.0, 1.0, -3.0)), np.array((3.0, 1.1, 3.0)))
     hidden = nerg.make_scene(gaze=files / "gaze.safetensors", shapes=wall)
-    eyes = [(0, 0, 0), (0, 4, 0)]
-    seen, before = (nerg.attention(scene, box_dict(*np.array(BOX)), eyes) for scene in (hidden, empty))
+    observers = [(0, 0, 0), (0, 4, 0)]
+    seen, before = (nerg.attention(scene, box_dict(*np.array(BOX)), observers) for scene in (hidden, empty))
     assert before.share.min() > 0 and seen.share[0] == 0
     assert np.isclose(seen.share[1], before.share[1], rtol=1e-3)
 
@@ -96,7 +96,7 @@ def test04_a_shape_of_the_scene_by_its_id(files, rgb, tmp_path):
     rgb.load_dict(box).write_ply(str(path))
     eye = (0.4, 0.1, 0.2)
     by_id = nerg.attention(scene, "product", eye)
-    # It does not hide itself.
+    # A surface does not occlude itself.
     assert by_id.share[0] > 0
     alone = nerg.make_scene(gaze=files / "gaze.safetensors", shapes=FAR)
     for surface in (box, path, str(path), rgb.load_dict(box)):
@@ -109,8 +109,8 @@ def test05_both_sides_of_an_open_surface(empty, rgb):
     params["vertex_positions"] = np.float32([0, 2, 0, 0.3, 2, 0, 0, 2, 0.3])
     params["faces"] = np.uint32([0, 1, 2])
     params.update()
-    eyes = [(0, 0, 0), (0, 4, 0)]
-    one, both = (nerg.attention(empty, mesh, eyes, two_sided=t).share for t in (False, True))
+    observers = [(0, 0, 0), (0, 4, 0)]
+    one, both = (nerg.attention(empty, mesh, observers, two_sided=t).share for t in (False, True))
     assert (one > 0).sum() == 1 and (both > 0).all() and np.allclose(one[one > 0], both[one > 0])
 
 
@@ -125,7 +125,7 @@ def test05_both_sides_of_an_open_surface(empty, rgb):
         (object(), "corners of a box"),
     ],
 )
-def test06_what_is_no_surface(empty, surface, said):
+def test06_invalid_surfaces_are_refused(empty, surface, said):
     with pytest.raises(nerg.NergError, match=said):
         nerg.attention(empty, surface, (0, 0, 0))
 
@@ -145,7 +145,7 @@ def test07_errors_are_sentences(files, empty):
         nerg.attention(empty, BOX)
 
 
-def test09_pieces_are_small_against_their_distance(empty):
+def test09_patches_are_small_relative_to_distance(empty):
     cube = box_dict(*np.array(BOX))
     near, far = nerg.attention(empty, cube, (0, 1.5, 0)), nerg.attention(empty, cube, [(0, 0, 0), (0, -30, 0)])
     assert len(near.area) > len(far.area)
@@ -154,36 +154,36 @@ def test09_pieces_are_small_against_their_distance(empty):
     assert len(nerg.attention(empty, cube, np.mean(BOX, axis=0)).area) == 12 * 32**2
 
 
-def test08_progress_is_told(empty):
-    told = []
+def test08_progress_is_reported(empty):
+    messages = []
 
     class Reporter:
         def message(self, text): ...
         def warn(self, text): ...
         def progress(self, share, text=""):
-            told.append(share)
+            messages.append(share)
 
     nerg.attention(empty, box_dict(*np.array(BOX)), [(0, 0, 0), (0.1, 0, 0)], reporter=Reporter())
-    assert told == [0.5, 1.0]
+    assert messages == [0.5, 1.0]
 
 
 def rays_of_gaze(scene, eye, count=40_000, seed=0):
-    """Where so many rays end that are drawn from an observer's gaze by rejection: (count, 3)."""
+    """End points of rays drawn from an observer's gaze by rejection sampling: (count, 3)."""
     d = np.random.default_rng(seed).normal(size=(20 * count, 3))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     seen = nerg.trace(scene, eye, d, ["gaze", "depth"], observers=[eye])
     gaze, depth = seen.gaze[0], np.ravel(seen.depth)
-    chosen = np.flatnonzero(np.random.default_rng(seed + 1).random(len(d)) * gaze.max() < gaze)[:count]
-    assert len(chosen) == count and (depth[chosen] > 0).all()
-    return eye + depth[chosen, None] * d[chosen]
+    selected = np.flatnonzero(np.random.default_rng(seed + 1).random(len(d)) * gaze.max() < gaze)[:count]
+    assert len(selected) == count and (depth[selected] > 0).all()
+    return eye + depth[selected, None] * d[selected]
 
 
-def test10_a_larger_box_never_has_less_and_has_what_rays_say(room):
+def test10_attention_grows_with_the_box_and_matches_rays(room):
     _, scene = room
     grown = (0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8, 9.0)
     regions = [Region.create("sign", SIGN[0] - g, SIGN[1] + g) for g in grown]
-    found = compute_box_shares(scene, regions, np.float32([EYE]))
-    share, error = found.share[0], found.error[0]
+    result = compute_box_shares(scene, regions, np.float32([EYE]))
+    share, error = result.share[0], result.error[0]
     assert (np.diff(share) >= -error[1:]).all() and share[-1] == pytest.approx(1, abs=2e-6)
     assert (error < 0.01 * share + 1e-4).all()
     ends = rays_of_gaze(scene, EYE)
@@ -197,8 +197,8 @@ def test10_a_larger_box_never_has_less_and_has_what_rays_say(room):
 
 
 @pytest.mark.parametrize("eye", [EYE, (5.5, 3.5, 0.4)])
-def test11_boxes_that_fill_space_share_out_all_of_the_gaze(files, eye):
-    """With what escapes; planes between them pass through the observer, too."""
+def test11_boxes_that_fill_space_sum_to_one(files, eye):
+    """Includes rays that escape; planes between the boxes also pass through the observer."""
     shapes = {"floor": box_dict(np.array((0.0, 0, -1)), np.array((6.0, 4, 0)))}
     shapes["stand"] = box_dict(*STAND)
     scene = nerg.make_scene(gaze=files / "gaze.safetensors", shapes=shapes)
@@ -207,27 +207,29 @@ def test11_boxes_that_fill_space_share_out_all_of_the_gaze(files, eye):
     spans = [list(zip(c[:-1], c[1:])) for c in cuts]
     corners = [np.transpose((a, b, c)) for a in spans[0] for b in spans[1] for c in spans[2]]
     regions = [Region.create(f"{k}", *corner) for k, corner in enumerate(corners)]
-    found = compute_box_shares(scene, regions, np.float32([eye]), margin=0.0)
-    assert 0.2 < found.escaped[0] < 0.8
-    assert found.share.sum() + found.escaped[0] == pytest.approx(1, abs=3 * np.linalg.norm(found.error))
-    assert np.linalg.norm(found.error) < 2e-3
-    # Of two boxes beside each other it is the sum.
-    whole = nerg.attention(scene, [(2.0, 0.5, -0.5), (4.0, 3.0, 2.3)], eye, margin=0)
+    result = compute_box_shares(scene, regions, np.float32([eye]), margin=0.0)
+    assert 0.2 < result.escaped[0] < 0.8
+    assert result.share.sum() + result.escaped[0] == pytest.approx(1, abs=3 * np.linalg.norm(result.error))
+    assert np.linalg.norm(result.error) < 2e-3
+    # Two adjacent boxes have the sum.
+    full = nerg.attention(scene, [(2.0, 0.5, -0.5), (4.0, 3.0, 2.3)], eye, margin=0)
     parts = [nerg.attention(scene, [(2 + k, 0.5, -0.5), (3 + k, 3.0, 2.3)], eye, margin=0) for k in range(2)]
-    assert sum(p.share[0] for p in parts) == pytest.approx(whole.share[0], abs=3 * float(whole.error[0]))
+    assert sum(p.share[0] for p in parts) == pytest.approx(full.share[0], abs=3 * float(full.error[0]))
     everything = nerg.attention(scene, [(-1e7,) * 3, (1e7,) * 3], eye)
     assert everything.share[0] + everything.escaped[0] == pytest.approx(1, abs=1e-5)
 
 
-def test12_small_things_are_seen(files):
-    """A cube of 2 cm, three metres away, which no direction of a coarse rule meets; and none of what it hides."""
-    thing = np.array([(-0.01, 2.99, 0.2), (0.01, 3.01, 0.22)])
-    scene = nerg.make_scene(gaze=files / "gaze.safetensors", shapes={"thing": box_dict(*thing), "far": FAR})
+def test12_small_objects_are_sampled(files):
+    """A cube of 2 cm at three metres, which no direction of a coarse quadrature hits; and no attention on occluded
+    objects.
+    """
+    aoi = np.array([(-0.01, 2.99, 0.2), (0.01, 3.01, 0.22)])
+    scene = nerg.make_scene(gaze=files / "gaze.safetensors", shapes={"thing": box_dict(*aoi), "far": FAR})
     by_id = nerg.attention(scene, "thing", (0, 0, 0.1))
-    by_box = nerg.attention(scene, thing, (0, 0, 0.1), tolerance=1e-3)
+    by_box = nerg.attention(scene, aoi, (0, 0, 0.1), tolerance=1e-3)
     assert 0 < by_id.share[0] < 1e-4 and by_box.share[0] == pytest.approx(by_id.share[0], rel=0.05)
-    assert nerg.attention(scene, thing + (0, 0, 0.5), (0, 0, 0.1)).share[0] == 0
-    assert nerg.attention(scene, thing + (0, 1, 0), (0, 0, 0.1)).share[0] == 0
+    assert nerg.attention(scene, aoi + (0, 0, 0.5), (0, 0, 0.1)).share[0] == 0
+    assert nerg.attention(scene, aoi + (0, 1, 0), (0, 0, 0.1)).share[0] == 0
 
 
 @pytest.mark.parametrize(
@@ -239,32 +241,32 @@ def test12_small_things_are_seen(files):
         (BOX, (float("nan"), 0, 0), "observers must have coordinates from"),
     ],
 )
-def test13_what_is_beyond_all_measure_is_told(empty, box, eye, said):
+def test13_extreme_sizes_are_reported(empty, box, eye, said):
     with pytest.raises(nerg.NergError, match=said):
         nerg.attention(empty, box, eye)
 
 
-def test14_statistics_viewer_and_report_say_the_same(room):
+def test14_statistics_viewer_and_report_agree(room):
     from nerg_mi.viewer.session import iter_attention_shares
 
     path, scene = room
     regions = [Region.create("the sign", *SIGN), Region.create("corner", (4.5, 2.5, 0), (6.1, 4.1, 3.1), 20)]
     eye = np.array(EYE)
-    here = nerg.attention(scene, SIGN, eye)
+    position = nerg.attention(scene, SIGN, eye)
     options = StatisticsOptions(
         aois=path.parent / "areas.json", observers=(",".join(map(str, EYE)),), resamples=199, mode="llvm_ad_rgb"
     )
-    told = {row["thing"]: row["share"] for row in statistics([path], options=options).aois}
+    messages = {row["thing"]: row["share"] for row in statistics([path], options=options).aois}
     assert options.margin == MARGIN
-    assert told["the sign"] == pytest.approx(here.share[0], rel=0.03)
-    assert told["the stand"] == pytest.approx(nerg.attention(scene, "stand", eye).share[0], rel=0.03)
+    assert messages["the sign"] == pytest.approx(position.share[0], rel=0.03)
+    assert messages["the stand"] == pytest.approx(nerg.attention(scene, "stand", eye).share[0], rel=0.03)
     (viewer, *_) = iter_attention_shares(scene, eye, regions, [])
-    assert viewer["the sign"] == pytest.approx(here.share[0], rel=0.03)
+    assert viewer["the sign"] == pytest.approx(position.share[0], rel=0.03)
     field = scene.integrator.gaze.field
     onlooker = GazeSampler(field, TrainingGeometry(scene.place, field.box, "scene"))
     things = [BoxAoi(region) for region in regions]
     report = gaze_shares(onlooker.query_from, eye[None], things, [(0,), (1,)], MARGIN, COARSE)
-    assert report.share[0, 0] == pytest.approx(here.share[0], rel=0.03)
+    assert report.share[0, 0] == pytest.approx(position.share[0], rel=0.03)
     assert report.share[0, 1] == pytest.approx(viewer["corner"], rel=0.03) and viewer["corner"] > 1e-3
 
 
@@ -310,7 +312,7 @@ def ball(files):
 
 
 def pixel_rays(rgb, scene, camera):
-    """Rays through the middles of a camera's pixels."""
+    """Rays through the pixel centres of a camera."""
     sensor = scene.sensor(camera)
     x, y = np.meshgrid((np.arange(camera.width) + 0.5) / camera.width, (np.arange(camera.height) + 0.5) / camera.height)
     at = rgb.Point2f(np.float32(x.ravel()), np.float32(y.ravel()))
@@ -319,7 +321,7 @@ def pixel_rays(rgb, scene, camera):
 
 
 def test01_rays_are_those_of_a_fine_picture(scene, rgb):
-    # One pixel of half a degree, through whose middle a ray goes.
+    # A pixel of half a degree, with a ray through its centre.
     camera = nerg.Camera((0.3, -3, 0.4), (0, 0, 0), fov=0.01, width=1, height=1)
     o, d = pixel_rays(rgb, scene, camera)
     eye = (2.5, -1, 0.5)
@@ -338,7 +340,7 @@ def test02_depth_and_position_on_a_ball(ball):
     assert np.allclose(where.position, [(0, -0.5, 0)], atol=1e-5) and where.names == ("position",)
 
 
-def test03_who_stands_at_the_origin_of_a_ray_looks_along_it(scene):
+def test03_an_observer_at_the_ray_origin_sees_along_it(scene):
     o = np.array([(0.3, -3, 0.4), (2.5, -1, 0.5), (0.3, -3, 0.4)])
     d = -o + [(0, 0, 0), (0, 0, 0), (0.1, 0, 0.1)]
     seen = nerg.trace(scene, o, d, ["gaze", "visibility", "depth"])
@@ -360,36 +362,36 @@ def test04_points_before_on_and_behind_a_ball(ball):
 
 
 def test05_gaze_at_a_point_is_that_of_the_ray_that_meets_it(scene):
-    eyes = [(0.3, -3, 0.4), (2.5, -1, 0.5)]
-    there = nerg.trace(
-        scene, eyes[0], [(-0.1, 1, -0.1), (-0.1, 1, 0)], ["position", "gaze", "visibility"], observers=eyes
+    origins = [(0.3, -3, 0.4), (2.5, -1, 0.5)]
+    is_valid = nerg.trace(
+        scene, origins[0], [(-0.1, 1, -0.1), (-0.1, 1, 0)], ["position", "gaze", "visibility"], observers=origins
     )
-    points = there.position[0]
-    seen = nerg.observe(scene, points, eyes)
-    # The first observer's own rays meet the points; the second sees some of them.
-    assert np.allclose(seen.gaze[0], there.gaze[0], rtol=1e-3) and np.array_equal(seen.visibility[0], [1, 1])
+    points = is_valid.position[0]
+    seen = nerg.observe(scene, points, origins)
+    # The rays of the first observer hit the points; the second observer sees some of them.
+    assert np.allclose(seen.gaze[0], is_valid.gaze[0], rtol=1e-3) and np.array_equal(seen.visibility[0], [1, 1])
     assert seen.gaze.shape == (2, 2)
 
 
-def test06_many_are_batches_of_few(scene, monkeypatch):
+def test06_large_queries_equal_batches(scene, monkeypatch):
     from nerg_mi.api import query
 
     rng = np.random.default_rng(0)
     o, d = np.tile((0.3, -3, 0.4), (50, 1)), rng.normal(size=(50, 3)) * 0.2 + (0, 1, 0)
-    whole = nerg.trace(scene, o, d, observers=[(2.5, -1, 0.5)])
+    full = nerg.trace(scene, o, d, observers=[(2.5, -1, 0.5)])
     points = nerg.observe(scene, rng.uniform(-1, 1, (50, 3)), (2.5, -1, 0.5))
     monkeypatch.setattr(query, "BATCH_SIZE", 16)
     rng = np.random.default_rng(0)
     d = rng.normal(size=(50, 3)) * 0.2 + (0, 1, 0)
     parts = nerg.trace(scene, o, d, observers=[(2.5, -1, 0.5)])
-    for name in whole:
-        assert np.array_equal(whole[name], parts[name]), name
+    for name in full:
+        assert np.array_equal(full[name], parts[name]), name
     again = nerg.observe(scene, rng.uniform(-1, 1, (50, 3)), (2.5, -1, 0.5))
     for name in points:
         assert np.array_equal(points[name], again[name]), name
 
 
-def test07_shapes_of_what_comes_out(scene):
+def test07_output_shapes(scene):
     rays = {"origins": (0, -3, 0), "directions": np.tile((0.0, 1, 0), (5, 1))}
     assert nerg.trace(scene, **rays, quantities=["color", "depth"]).color.shape == (5, 3)
     both = nerg.trace(scene, **rays, quantities=["color", "gaze"], observers=[(0, -3, 0), (1, -3, 0)])
@@ -399,8 +401,8 @@ def test07_shapes_of_what_comes_out(scene):
 
 def test08_the_scenes_own_observer_sees(files):
     scene = nerg.make_scene(files / "field.safetensors", files / "gaze.safetensors", observer=(0, -3, 0))
-    own, given = nerg.observe(scene, (0, -2, 0)), nerg.observe(scene, (0, -2, 0), (0, -3, 0))
-    assert np.array_equal(own.gaze, given.gaze) and np.array_equal(own.observers, [(0, -3, 0)])
+    individual, options = nerg.observe(scene, (0, -2, 0)), nerg.observe(scene, (0, -2, 0), (0, -3, 0))
+    assert np.array_equal(individual.gaze, options.gaze) and np.array_equal(individual.observers, [(0, -3, 0)])
 
 
 @pytest.mark.parametrize(
@@ -436,9 +438,9 @@ def test11_mono(mono, files):
 
 
 @pytest.mark.parametrize(("normalized", "expected"), [(True, [0.5, 1.0]), (False, [])])
-def test_progress_is_told_where_every_origin_is_integrated(tmp_path, rgb, normalized, expected):
+def test_progress_is_reported_for_integrals_of_all_origins(tmp_path, rgb, normalized, expected):
     fields.gaze(tmp_path / "gaze.safetensors", normalized=normalized)
     scene = nerg.make_scene(gaze=tmp_path / "gaze.safetensors", shapes=BALL)
-    told = Recorder()
-    nerg.trace(scene, [(0, -3, 0), (0, 3, 0), (0, -3, 0)], (0, 1, 0), "gaze", reporter=told)
-    assert [share for share, _ in told.steps] == expected
+    messages = Recorder()
+    nerg.trace(scene, [(0, -3, 0), (0, 3, 0), (0, -3, 0)], (0, 1, 0), "gaze", reporter=messages)
+    assert [share for share, _ in messages.steps] == expected

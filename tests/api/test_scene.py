@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import nerg_mi as nerg
-from nerg_mi.api.scene import TrainedField, resolve_quantities, load_mesh_child, build_options, to_scene_children
+from nerg_mi.api.scene import TrainedField, build_options, load_mesh_child, resolve_quantities, to_scene_children
 from nerg_mi.api.workflows import bake, stats
 from nerg_mi.errors import NergError
 from tests.formats.splats.writers import random_splats, write_inria
@@ -15,7 +15,7 @@ from tests.formats.splats.writers import random_splats, write_inria
 # ---- Fields and rays in memory, from files and back ----
 
 
-def test01_a_field_is_what_its_file_says(files):
+def test01_a_field_has_the_data_of_its_file(files):
     field = nerg.load_field(files / "field.safetensors")
     assert field.kind == "radiance" and field.name == "field.safetensors" and field.provenance == {"test": 0}
     assert np.array_equal(field.bounds, [(-1, -1, -1), (1, 1, 1)])
@@ -25,7 +25,7 @@ def test01_a_field_is_what_its_file_says(files):
     )
 
 
-def test02_what_is_saved_is_the_same_field(files, tmp_path):
+def test02_saved_fields_are_equal(files, tmp_path):
     for load, name in ((nerg.load_field, "field"), (nerg.load_gaze, "gaze")):
         field = load(str(files / f"{name}.safetensors"))
         path = field.save(tmp_path / f"{name}.safetensors")
@@ -37,8 +37,8 @@ def test02_what_is_saved_is_the_same_field(files, tmp_path):
 
 def test03_half_the_size(files, tmp_path):
     field = nerg.load_field(files / "field.safetensors")
-    whole, half = (field.save(tmp_path / f"{h}.safetensors", half=h).stat().st_size for h in (False, True))
-    assert half < 0.7 * whole
+    full, half = (field.save(tmp_path / f"{h}.safetensors", half=h).stat().st_size for h in (False, True))
+    assert half < 0.7 * full
 
 
 @pytest.mark.parametrize(
@@ -56,7 +56,7 @@ def test04_errors_are_sentences(files, load, name, said):
         load(files / name)
 
 
-def test05_what_is_no_name(files):
+def test05_invalid_names_are_refused(files):
     with pytest.raises(nerg.NergError, match="named by a string"):
         nerg.load_field(3)
     with pytest.raises(nerg.NergError, match="saved as .safetensors"):
@@ -73,7 +73,7 @@ def test06_a_field_without_a_file(files):
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Of a job."""
+    """Options of a workflow."""
 
     steps: int = 5
     folder: Path | None = None
@@ -82,14 +82,14 @@ class Options:
     mode: str | None = None
 
 
-def test01_changes_are_on_top_of_what_is_given(rgb):
+def test01_changes_override_options(rgb):
     assert build_options(Options, "job", None, {}) == Options(mode="llvm_ad_rgb")
     assert build_options(Options, "job", Options(steps=9, seed=2), {"seed": 3}) == Options(
         steps=9, seed=3, mode="llvm_ad_rgb"
     )
 
 
-def test02_the_variant_in_use_is_kept(mono):
+def test02_active_variant_is_used(mono):
     assert build_options(Options, "job", Options(mode="llvm_ad_rgb"), {}).mode == "llvm_ad_mono"
 
 
@@ -129,14 +129,14 @@ CALLS = [
 
 
 @pytest.mark.parametrize("call, said", CALLS)
-def test_names_come_before_files_and_files_before_work(rgb, tmp_path, monkeypatch, call, said):
+def test_names_are_checked_before_files_and_files_before_work(rgb, tmp_path, monkeypatch, call, said):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(NergError, match=said) as told:
+    with pytest.raises(NergError, match=said) as messages:
         call()
-    assert len(str(told.value)) < 300 and not any(tmp_path.iterdir())
+    assert len(str(messages.value)) < 300 and not any(tmp_path.iterdir())
 
 
-def test_what_is_natural_is_taken(rgb, tmp_path):
+def test_natural_arguments_are_accepted(rgb, tmp_path):
     import mitsuba as mi
 
     path = tmp_path / "room.xml"
@@ -145,14 +145,16 @@ def test_what_is_natural_is_taken(rgb, tmp_path):
         'type="hdrfilm"><integer name="width" value="4"/><integer name="height" value="4"/></film></sensor></scene>'
     )
     scene = nerg.Scene.load(path)
-    pictures = [nerg.render(given, quantities="opacity").opacity for given in (path, str(path), scene, scene.mitsuba)]
+    pictures = [
+        nerg.render(options, quantities="opacity").opacity for options in (path, str(path), scene, scene.mitsuba)
+    ]
     assert all((picture == pictures[0]).all() for picture in pictures)
     assert build_options(Options, "job", None, {"folder": scene}).folder == path
-    # Values of `<default>`s make another scene of it than the file says.
+    # Values of `<default>`s change the scene of the file.
     assert nerg.Scene.load(path).path == path and nerg.Scene(mi.load_file(str(path))).path is None
 
 
-def test03_unknown_options_are_told(rgb):
+def test03_unknown_options_are_refused(rgb):
     with pytest.raises(NergError, match='job has no option "step"; did you mean "steps"?'):
         build_options(Options, "job", None, {"step": 3})
     with pytest.raises(NergError, match="mi.set_variant"):
@@ -167,7 +169,7 @@ def test03_unknown_options_are_told(rgb):
 BALL = {"type": "sphere", "radius": 0.3}
 
 
-def test01_what_a_scene_says_of_itself(files, camera):
+def test01_scene_representation(files, camera):
     scene = nerg.make_scene(
         files / "field.safetensors",
         files / "gaze.safetensors",
@@ -196,23 +198,23 @@ def test02_a_field_in_memory_is_its_file(files, camera):
         nerg.make_scene(field, gaze, camera=camera),
         nerg.make_scene(field.network, TrainedField(gaze.network), camera=camera),
     ):
-        found = nerg.render(made, spp=2)
+        result = nerg.render(made, spp=2)
         for name in expected:
-            assert np.array_equal(found[name], expected[name]), name
+            assert np.array_equal(result[name], expected[name]), name
     assert "field: field.safetensors" in repr(nerg.make_scene(field)) and "in memory" in repr(
         nerg.make_scene(field.network)
     )
 
 
-def test02_splats_are_a_place_as_a_field_is(camera, tmp_path):
+def test02_splats_replace_a_field(camera, tmp_path):
     splats = random_splats(20)
     write_inria(tmp_path / "place.ply", splats)
     from_file = nerg.make_scene(tmp_path / "place.ply", camera=camera)
     assert "field: place.ply" in repr(from_file)
     expected = nerg.render(from_file, spp=2)
     assert expected.opacity.max() > 0.2
-    found = nerg.render(nerg.make_scene(splats, camera=camera), spp=2)
-    assert np.allclose(found.depth, expected.depth, atol=1e-4)
+    result = nerg.render(nerg.make_scene(splats, camera=camera), spp=2)
+    assert np.allclose(result.depth, expected.depth, atol=1e-4)
 
 
 def test03_where_the_fields_are_placed(files):
@@ -220,10 +222,10 @@ def test03_where_the_fields_are_placed(files):
     make = lambda matrix, falloff: nerg.make_scene(
         files / "field.safetensors", files / "gaze.safetensors", to_world=matrix, falloff=falloff
     )
-    here, there = make(None, 0.1), make(turned, 0.2)
+    position, is_valid = make(None, 0.1), make(turned, 0.2)
     o, d = np.array([(0.2, -3, 0.1), (3, 0.1, 0.2)]), np.array([(0, 1, 0), (-1, 0.1, 0)])
-    a = nerg.trace(here, o, d)
-    b = nerg.trace(there, o @ turned[:3, :3].T + turned[:3, 3], d @ turned[:3, :3].T)
+    a = nerg.trace(position, o, d)
+    b = nerg.trace(is_valid, o @ turned[:3, :3].T + turned[:3, 3], d @ turned[:3, :3].T)
     assert np.allclose(2 * a.depth, b.depth, rtol=1e-3) and np.allclose(a.opacity, b.opacity, atol=1e-4)
     assert a.gaze.max() > 0 and np.allclose(a.gaze, b.gaze, rtol=2e-2)
 
@@ -292,7 +294,7 @@ def test07_errors_are_sentences(files, given, said):
     assert "\n" not in str(error.value)
 
 
-def test08_kinds_are_not_confused(files):
+def test08_wrong_kinds_are_refused(files):
     field, gaze = nerg.load_field(files / "field.safetensors"), nerg.load_gaze(files / "gaze.safetensors")
     with pytest.raises(nerg.NergError, match="radiance field in memory"):
         nerg.make_scene(gaze)
@@ -343,20 +345,20 @@ def test12_quantities(scene):
         resolve_quantities(scene, "gazes", ("gaze", "depth"))
 
 
-def test_constant_weights_change_nothing_and_are_taken_back(files, camera):
+def test_constant_weights_change_nothing_and_are_undone(files, camera):
     scene = nerg.make_scene(files / "field.safetensors", files / "gaze.safetensors", camera=camera, observer=(0, -2, 0))
     nets = [*scene.integrator.medium.field.mlps, *scene.integrator.gaze.field.mlps]
     expected = nerg.render(scene, spp=2)
     scene.set_constant_weights()
     assert all(net.constant for net in nets)
-    found = nerg.render(scene, spp=2)
-    assert expected.color.max() > 0 and np.array_equal(found.color, expected.color)
+    result = nerg.render(scene, spp=2)
+    assert expected.color.max() > 0 and np.array_equal(result.color, expected.color)
     scene.set_constant_weights(False)
     assert not any(net.constant for net in nets)
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1, 1e6])
-def test_a_camera_sees_a_scene_of_any_unit(rgb, scale):
+def test_cameras_support_any_unit(rgb, scale):
     import mitsuba as mi
 
     box = {"type": "cube", "to_world": mi.ScalarTransform4f().scale(scale)}
@@ -367,7 +369,7 @@ def test_a_camera_sees_a_scene_of_any_unit(rgb, scale):
 
 
 @pytest.mark.parametrize("radius", [float("nan"), 1e30, 1.1e7])
-def test_shapes_beyond_all_places_are_refused(rgb, radius):
+def test_shapes_at_extreme_positions_are_refused(rgb, radius):
     with pytest.raises(nerg.NergError, match="corners of the shape .* must have coordinates from"):
         nerg.make_scene(shapes={"type": "sphere", "radius": radius})
 
@@ -387,7 +389,7 @@ def test02_a_scene_gives_its_shapes_and_lights(rgb):
     lamp = {"type": "sphere", "emitter": {"type": "area"}}
     scene = rgb.load_dict({"type": "scene", "lamp": lamp, "sky": {"type": "constant"}, "spot": {"type": "point"}})
     children = to_scene_children(scene)
-    # The lamp brings its own light.
+    # The lamp has its own light.
     assert set(children) == {"lamp", "shape_light_0", "shape_light_1"}
     again = rgb.load_dict({"type": "scene", **children})
     assert len(again.emitters()) == 3 and len(again.shapes()) == 1
@@ -413,14 +415,14 @@ end_header
 """
 
 
-def test04_files_are_looked_at_first(rgb, tmp_path):
+def test04_files_are_checked_first(rgb, tmp_path):
     path = tmp_path / "cube.ply"
     rgb.load_dict({"type": "cube"}).write_ply(str(path))
     assert rgb.load_dict(load_mesh_child(path)).face_count() == 12
     path.write_bytes(path.read_bytes()[:-10])
     with pytest.raises(NergError, match="cube.ply"):
         load_mesh_child(path)
-    # Mitsuba reads no quads; what takes a mesh does, with the material that others have.
+    # Mitsuba does not read quads; mesh arguments support them, with the material of other meshes.
     (tmp_path / "quad.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf -4 -3 -2 -1\n")
     shape = rgb.load_dict({"type": "scene", **to_scene_children(tmp_path / "quad.obj", "quad")}).shapes()[0]
     assert shape.face_count() == 2 and shape.id() == "quad" and shape.bsdf().class_name() == "TwoSidedBRDF"
@@ -437,7 +439,7 @@ def test04_files_are_looked_at_first(rgb, tmp_path):
         ("a.ply", PLY.format("float", "1 0 0 7"), "quality"),
     ],
 )
-def test_colours_of_files_are_shown_and_the_rest_is_named(rgb, monkeypatch, tmp_path, name, text, said):
+def test_colours_of_files_are_used_and_other_content_is_reported(rgb, monkeypatch, tmp_path, name, text, said):
     (tmp_path / name).write_text(text)
     notes = []
     monkeypatch.setattr(rgb, "Log", lambda level, note: notes.append(note))

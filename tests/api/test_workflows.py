@@ -23,7 +23,7 @@ from tests.surfaces.meshes import box
 
 
 def run_example(function, names):
-    """How many statements of the example in a docstring fail."""
+    """Count the failing statements of the example in a docstring."""
     (example,) = doctest.DocTestFinder().find(function, function.__name__, globs=names)
     return doctest.DocTestRunner().run(example).failed
 
@@ -36,9 +36,9 @@ ROWS = "0,0,0,1,0,0\n2,0,0,5,0,0\n0,1,0,1,2,0\n0,0,1,1,0,2\n"
 
 def test_files_may_be_named_by_strings_and_options_are_checked(tmp_path):
     (tmp_path / "p.csv").write_text("x,y,z,place_x,place_y,place_z\n" + ROWS)
-    found = nerg.align(output=str(tmp_path / "a.json"), pairs=str(tmp_path / "p.csv"))
-    np.testing.assert_allclose(found.matrix, json.loads((tmp_path / "a.json").read_text())["matrix"])
-    np.testing.assert_allclose(found.matrix[:3, :3], 2 * np.eye(3), atol=1e-12)
+    result = nerg.align(output=str(tmp_path / "a.json"), pairs=str(tmp_path / "p.csv"))
+    np.testing.assert_allclose(result.matrix, json.loads((tmp_path / "a.json").read_text())["matrix"])
+    np.testing.assert_allclose(result.matrix[:3, :3], 2 * np.eye(3), atol=1e-12)
     with pytest.raises(nerg.NergError, match='"pair".*"pairs"'):
         nerg.align(pair="p.csv")
 
@@ -107,7 +107,7 @@ JOBS = {
 
 @pytest.fixture
 def asked(monkeypatch, tmp_path):
-    """Jobs that raise what they are asked, and the files that they are asked for."""
+    """Workflows that raise with their options, and the files that they need."""
     monkeypatch.chdir(tmp_path)
     for name in ("f.safetensors", "g.safetensors", "r.npz", "photos"):
         Path(name).touch()
@@ -120,27 +120,27 @@ def asked(monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize("job", JOBS)
-def test01_options_reach_the_jobs(asked, job):
+def test01_options_reach_the_workflows(asked, job):
     _, call, expected = JOBS[job]
-    with pytest.raises(Asked) as found:
+    with pytest.raises(Asked) as result:
         call()
-    assert found.value.args[:-1] == expected
+    assert result.value.args[:-1] == expected
 
 
 @pytest.mark.parametrize(
     "name", ["evaluate_radiance", "evaluate_gaze", "ablate", "study", "train_gaze", "train_radiance"]
 )
-def test02_wrong_options_are_told(name):
+def test02_invalid_options_are_refused(name):
     with pytest.raises(nerg.NergError, match=f'{name} has no option "nothing"'):
         getattr(nerg, name)("a", "b", nothing=3)
     with pytest.raises(nerg.NergError, match=f"{name} works in the variant that is set"):
         getattr(nerg, name)("a", "b", mode="scalar_rgb")
 
 
-def test03_the_variant_in_use_stays(mono, asked):
-    with pytest.raises(Asked) as found:
+def test03_active_variant_is_kept(mono, asked):
+    with pytest.raises(Asked) as result:
         nerg.train_radiance("photos")
-    assert found.value.args[2].mode == "llvm_ad_mono" and mono.variant() == "llvm_ad_mono"
+    assert result.value.args[2].mode == "llvm_ad_mono" and mono.variant() == "llvm_ad_mono"
 
 
 # ---- Statistics from a notebook: the example of its docstring, and its options ----
@@ -153,7 +153,7 @@ def test01_the_example(tmp_path):
     assert run_example(workflows.stats, {"folder": tmp_path}) == 0
 
 
-def test02_an_option_that_there_is_not():
+def test02_unknown_options_are_refused():
     with pytest.raises(NergError, match='no option "area"'):
         workflows.stats("a.npz", area="x")
 
@@ -183,31 +183,31 @@ def test02_options_of_the_import(table, tmp_path):
     assert nerg.load_rays(out).persons == rays.persons
 
 
-def test03_wrong_options_are_told(table):
+def test03_invalid_options_are_refused(table):
     with pytest.raises(nerg.NergError, match="colums"):
         nerg.import_rays(table, colums=COLUMNS)
     with pytest.raises(nerg.NergError, match='"nope"'):
         nerg.import_rays(table, "nope")
 
 
-def test04_progress_is_told(table):
-    told = []
+def test04_progress_is_reported(table):
+    messages = []
 
     class Reporter:
         def message(self, text): ...
         def warn(self, text): ...
         def progress(self, share, text=""):
-            told.append(text)
+            messages.append(text)
 
     nerg.import_rays(table, columns=COLUMNS, reporter=Reporter())
-    assert any("day.csv" in text for text in told)
+    assert any("day.csv" in text for text in messages)
 
 
 # ---- What comes back of a training is a field in memory with its provenance ----
 
 
 @pytest.mark.nightly
-def test04_what_is_trained_can_be_shown(rgb, tmp_path):
+def test04_trained_fields_can_be_rendered(rgb, tmp_path):
     rng = np.random.default_rng(0)
     origin = rng.uniform((1, 1, 1.5), (2, 2, 1.6), (500, 3))
     direction = rng.normal(size=(500, 3)) * (1, 1, 0.2)

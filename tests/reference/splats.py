@@ -32,7 +32,7 @@ def trace(splats, o, d, t0=0.0, t1=np.inf, stop=1e-4):
     color = np.maximum(np.einsum("rk,nkc->rnc", basis, splats.harmonics.astype(np.float64)) + 0.5, 0)
     color = np.take_along_axis(color, order[..., None], 1)
     opacity = weight.sum(1)
-    met = np.maximum(opacity, 1e-30)
+    hits = np.maximum(opacity, 1e-30)
     half = np.argmax(np.cumsum(weight, 1) >= 0.5 * opacity[:, None], axis=1)
     median = np.where(opacity > 0, t[np.arange(len(t)), half], 0)
-    return opacity, (weight[..., None] * color).sum(1), (weight * t).sum(1) / met, median
+    return opacity, (weight[..., None] * color).sum(1), (weight * t).sum(1) / hits, median
