@@ -1,4 +1,4 @@
-"""Whether rays lie in a place as people's do, and ``alignment.json``, the record of an alignment."""
+"""Plausibility check of rays in a scene, and ``alignment.json``, the record of an alignment."""
 
 from __future__ import annotations
 
@@ -20,27 +20,29 @@ from nerg_mi.transport.geometry import SceneGeometry, trace_depth
 from nerg_mi.transport.medium import Medium
 
 from .constraints import AlignmentFit
-from .similarity import transform_points, similarity_scale
+from .similarity import similarity_scale, transform_points
 
 # ---- Check ----
 #
-# Whether rays lie in a place as people's do: asked of every training and evaluation, before time is spent on it.
+# Run before every training and evaluation, so that a wrong alignment is reported before time is spent.
 
-NUM_RAYS, NUM_HEADS = 2048, 256  # So many rays, and heads, are asked about
-IMPOSSIBLE_ESCAPED = 0.98  # Where more of the gaze than this meets no surface, the alignment is certainly wrong
+NUM_RAYS, NUM_HEADS = 2048, 256  # number of rays and of heads that are traced
+IMPOSSIBLE_ESCAPED = 0.98  # share of gaze without a surface above which the alignment is certainly wrong
 DOUBTFUL = {"escaped": 0.3, "inside": 0.1, "below": 0.1}
-"""Shares from which on it is doubtful: of gaze that meets nothing, of heads inside of something and below the floor."""
+"""Shares above which the alignment is doubtful: gaze without a surface, heads inside solids, heads below the floor."""
 
 _SURFACE_OPACITY = 0.5
-# A head is inside of something where most directions end within so many metres.
-_TIGHT, _MOSTLY, _DIRECTIONS = 0.06, 0.8, 16
+# A head is inside a solid if this fraction of directions meets a surface within this distance in metres.
+_TIGHT_DISTANCE, _TIGHT_FRACTION, _NUM_DIRECTIONS = 0.06, 0.8, 16
 
 
 @dataclass(frozen=True)
 class AlignmentCheck:
-    """Shares, from 0 to 1: ``escaped`` of the gaze, which meets no surface; ``inside`` of the heads, which are in
-    something solid; ``below`` of the heads, which are below the floor. ``mirrored``: a sentence where more of the gaze
-    ends on surfaces with an axis negated."""
+    """Shares, from 0 to 1, that indicate a wrong alignment.
+
+    ``escaped``: gaze that meets no surface; ``inside``: heads inside solids; ``below``: heads below the floor;
+    ``mirrored``: a message if more gaze ends on surfaces with an axis negated, else None.
+    """
 
     escaped: float
     inside: float
@@ -49,67 +51,80 @@ class AlignmentCheck:
 
     @property
     def is_impossible(self) -> bool:
-        """Whether (nearly) all the gaze meets nothing."""
+        """Whether (nearly) all gaze meets no surface."""
         return self.escaped > IMPOSSIBLE_ESCAPED
 
     def list_warnings(self) -> list[str]:
-        """What is doubtful, in a few words each."""
-        said = {
+        """Return a short message for each doubtful share."""
+        messages = {
             "escaped": f"{100 * self.escaped:.0f} % of the gaze meets no surface",
-            "inside": f"{100 * self.inside:.0f} % of the heads are inside of something solid",
+            "inside": f"{100 * self.inside:.0f} % of the heads are inside solid objects",
             "below": f"{100 * self.below:.0f} % of the heads are below the floor",
         }
-        found = [text for name, text in said.items() if getattr(self, name) > DOUBTFUL[name]]
-        return [*found, self.mirrored] if self.mirrored else found
+        warnings = [text for name, text in messages.items() if getattr(self, name) > DOUBTFUL[name]]
+        return [*warnings, self.mirrored] if self.mirrored else warnings
 
 
 def check_alignment(geometry: Medium | SceneGeometry, rays: Rays, align: Similarity, seed: int = 0) -> AlignmentCheck:
-    """Trace some of ``rays``, which ``align`` carries into the place ``subject``, and directions all
-    around some heads."""
-    some = np.random.default_rng(seed).permutation(len(rays))[:NUM_RAYS]
-    if not len(some):
+    """Trace a sample of ``rays``, and directions around a sample of heads, in a scene; ``align`` maps the rays to
+    the scene."""
+    subset = np.random.default_rng(seed).permutation(len(rays))[:NUM_RAYS]
+    if not len(subset):
         return AlignmentCheck(0.0, 0.0, 0.0)
-    turn = align.matrix[:3, :3] / align.scale
-    origin, direction = transform_points(align.matrix, rays.origin[some]), rays.direction[some] @ turn.T
+    rotation = align.matrix[:3, :3] / align.scale
+    origin, direction = transform_points(align.matrix, rays.origin[subset]), rays.direction[subset] @ rotation.T
     _, opacity = trace_depth(geometry, origin, direction)
     heads = origin[:NUM_HEADS]
-    around = np.concatenate([turn @ [[0, 0], [0, 0], [-1, 1]], fibonacci_directions(_DIRECTIONS).T], axis=1).T
-    depth, met = trace_depth(geometry, np.repeat(heads, len(around), 0), np.tile(around, (len(heads), 1)))
-    depth, met = depth.reshape(len(heads), -1), met.reshape(len(heads), -1) >= _SURFACE_OPACITY
-    tight = (met & (depth < _TIGHT * align.scale))[:, 2:].mean(axis=1)
-    # Something is above, and nothing below: what is above is the floor.
-    below = ~met[:, 0] & met[:, 1]
+    directions = np.concatenate(
+        [rotation @ [[0, 0], [0, 0], [-1, 1]], fibonacci_directions(_NUM_DIRECTIONS).T], axis=1
+    ).T
+    depth, is_hit = trace_depth(geometry, np.repeat(heads, len(directions), 0), np.tile(directions, (len(heads), 1)))
+    depth, is_hit = depth.reshape(len(heads), -1), is_hit.reshape(len(heads), -1) >= _SURFACE_OPACITY
+    tight_fraction = (is_hit & (depth < _TIGHT_DISTANCE * align.scale))[:, 2:].mean(axis=1)
+    # A surface above and none below: the surface above is the floor.
+    below = ~is_hit[:, 0] & is_hit[:, 1]
     escaped = float((opacity < _SURFACE_OPACITY).mean())
     mirrored = None
-    # People look out of windows too: a mirror is asked for only where something is wrong.
+    # Some gaze leaves through windows, so mirrored axes are tested only if the share is doubtful.
     if escaped > DOUBTFUL["escaped"]:
 
-        def trace(at: np.ndarray, along: np.ndarray) -> np.ndarray:
-            depth, met = trace_depth(geometry, at, along)
-            return np.where(met >= _SURFACE_OPACITY, depth, np.inf)
+        def trace(origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+            depth, opacity = trace_depth(geometry, origins, directions)
+            return np.where(opacity >= _SURFACE_OPACITY, depth, np.inf)
 
-        mirrored = describe_mirroring(compute_hit_fractions(trace, origin, direction, turn.T), len(origin))
-    return AlignmentCheck(escaped, float((tight >= _MOSTLY).mean()), float(below.mean()), mirrored)
+        mirrored = describe_mirroring(compute_hit_fractions(trace, origin, direction, rotation.T), len(origin))
+    return AlignmentCheck(escaped, float((tight_fraction >= _TIGHT_FRACTION).mean()), float(below.mean()), mirrored)
 
 
 # ---- Record ----
 #
-# ``alignment.json``: a similarity with what it was found from, how well it fits, and how well it is determined.
-#
-# Whatever takes an alignment (``--align``) reads this file, and as well a plain JSON list of the four rows of the
-# matrix.
+# ``alignment.json`` stores a similarity with its evidence, residuals and uncertainty. Options that take an alignment
+# (``--align``) read this file, or a JSON list of the four rows of the matrix.
 
 KIND, VERSION = "alignment", 1
 
-_BYTES = 4 << 20
+_MAX_BYTES = 4 << 20
 
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """``matrix`` (4, 4) from the tracking (z up, metres) to the place; ``evidence``: its kind and figures;
-    ``residuals``: median and 95 % in centimetres and degrees; ``uncertainty``: one standard deviation of position (cm),
-    rotation (degrees) and scale (percent), None where it is not known; ``files``: names and checksums of what it was
-    found from; ``forced``: written though it was to be refused. All but the matrix are JSON."""
+    """An alignment and its record. All fields except the matrix are JSON values.
+
+    Parameters
+    ----------
+    matrix
+        Similarity (4, 4) from the tracking frame (z up, metres) to the scene.
+    evidence
+        Kind of evidence and its figures.
+    residuals
+        Median and 95th percentile in centimetres and degrees.
+    uncertainty
+        Standard deviation of position (cm), rotation (degrees) and scale (percent); None if unknown.
+    files
+        Names and checksums of the input files.
+    forced
+        Whether it was written in spite of a failed check.
+    """
 
     matrix: np.ndarray
     evidence: dict[str, Any]
@@ -120,13 +135,17 @@ class Alignment:
 
     @classmethod
     def from_fit(cls, kind: str, fit: AlignmentFit, files: Mapping[str, Any], forced: bool) -> Alignment:
-        """What is recorded of a fit."""
-        residuals = {"count": len(fit.residuals_cm), **_spread(fit.residuals_cm, "cm"), **_spread(fit.residuals_deg, "degrees")}
+        """Create the record of a fit."""
+        residuals = {
+            "count": len(fit.residuals_cm),
+            **_percentiles(fit.residuals_cm, "cm"),
+            **_percentiles(fit.residuals_deg, "degrees"),
+        }
         return cls(fit.matrix, {"kind": kind, **fit.metadata}, residuals, _uncertainty(fit), dict(files), forced)
 
     def save(self, path: Path) -> None:
-        """Write the file, whole or not at all."""
-        about = {
+        """Write the file atomically."""
+        data = {
             "kind": KIND,
             "version": VERSION,
             "from": "tracking",
@@ -139,38 +158,52 @@ class Alignment:
             "files": self.files,
             "forced": self.forced,
         }
-        write_json(path, about, allow_nan=False)
+        write_json(path, data, allow_nan=False)
 
 
 def read_similarity(path: Path, option: str, frames: str) -> Similarity:
-    """The similarity in the JSON file ``path``, an alignment or four rows, which was given by ``option`` and leads from
-    and to what ``frames`` says ("rays to field"). Raises `NergError` for a file that holds none."""
-    found: Any = read_json(path, f"similarity of {option}", _BYTES)
-    if isinstance(found, dict):
-        if found.get("kind") != KIND or "matrix" not in found:
+    """Read a similarity from a JSON file, an alignment or four rows.
+
+    Parameters
+    ----------
+    path
+        JSON file.
+    option
+        Option that named the file, for messages.
+    frames
+        Source and target frame, such as "rays to field", for messages.
+
+    Raises
+    ------
+    NergError
+        If the file does not contain a similarity.
+    """
+    data: Any = read_json(path, f"similarity of {option}", _MAX_BYTES)
+    if isinstance(data, dict):
+        if data.get("kind") != KIND or "matrix" not in data:
             raise NergError(
-                f'{option} needs a JSON file with the 4 rows of a similarity from {frames}; "{path}": it is neither '
-                'that nor what "nerg align" writes'
+                f'{option} needs a JSON file with the 4 rows of a similarity from {frames}; "{path}" is neither '
+                'that nor an output of "nerg align"'
             )
-        version = found.get("version")
+        version = data.get("version")
         if not isinstance(version, int) or isinstance(version, bool) or not 1 <= version <= VERSION:
             raise NergError(
-                f'the alignment "{path}" has the version {sanitize(version, 40)}, and up to {VERSION} is read; '
+                f'the alignment "{path}" has version {sanitize(version, 40)}, but at most {VERSION} is supported; '
                 "update nerg_mi"
             )
-        found = found["matrix"]
+        data = data["matrix"]
     try:
-        return Similarity(np.array([[float(x) for x in row] for row in found]))
+        return Similarity(np.array([[float(x) for x in row] for row in data]))
     except (TypeError, ValueError, IndexError, OverflowError) as error:
         raise NergError(
             f'{option} needs a JSON file with the 4 rows of a similarity from {frames}; "{path}": {sanitize(error)}'
         ) from error
 
 
-def _spread(values: np.ndarray, unit: str) -> dict[str, float | None]:
-    known = values[np.isfinite(values)]
-    at = lambda percent: float(np.percentile(known, percent)) if len(known) else None
-    return {f"median_{unit}": at(50), f"p95_{unit}": at(95)}
+def _percentiles(values: np.ndarray, unit: str) -> dict[str, float | None]:
+    finite = values[np.isfinite(values)]
+    percentile = lambda percent: float(np.percentile(finite, percent)) if len(finite) else None
+    return {f"median_{unit}": percentile(50), f"p95_{unit}": percentile(95)}
 
 
 def _uncertainty(fit: AlignmentFit) -> dict[str, float] | None:

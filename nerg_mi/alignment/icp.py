@@ -1,5 +1,5 @@
-"""The similarity that agrees best with several scores near a start (iterative closest points among them), and how
-well it is determined."""
+"""Refinement of a similarity by robust least squares over several scores, including iterative closest points, with
+its uncertainty."""
 
 from __future__ import annotations
 
@@ -18,60 +18,67 @@ from .constraints import (
     AlignmentFit,
     AlignmentTarget,
     DistanceGrid,
-    PlaceSurface,
-    Progress,
+    ProgressCallback,
+    SceneSurface,
     angles_between,
-    mirror_sentence,
-    pair_covariance,
-    surface_of_points,
+    describe_mirror,
     downsample,
+    pair_covariance,
+    surface_from_points,
 )
-from .similarity import ALL, MIRROR, Chart, fit_similarity, transform_points, similarity_scale, upright_basis
+from .similarity import (
+    FULL_BASIS,
+    MIRROR,
+    LocalSimilarity,
+    fit_similarity,
+    similarity_scale,
+    transform_points,
+    upright_basis,
+)
 
 # ---- Scores ----
 #
-# How well a similarity agrees with what tracking says about a place, each as residuals with their derivatives.
+# Each score measures how well a similarity agrees with one property of the tracking, as residuals with derivatives.
 #
-# People's heads are in free space; they are above the floor, by about the height of a person; gaze goes through free
-# space and ends on surfaces, at its hit points where these are known. Residuals are lengths in units of the tracking
-# (metres of people), so that a smaller place is no better than a larger one; their derivatives are with respect to the
-# numbers of a chart (`Chart`). Another score is another class with these methods.
+# Heads are in free space, at a plausible height above the floor. Gaze passes through free space and ends on surfaces,
+# at its hit points if they are known. Residuals are lengths in units of the tracking, so that a smaller scene is not
+# favoured. Derivatives are with respect to the parameters of a `LocalSimilarity`. A new score is another class with
+# these methods.
 
-NEAR, FAR, STEPS = 0.3, 12.0, 32
-"""Gaze without a hit point ends between so many metres; at so many places along it a surface is looked for."""
+MIN_GAZE_LENGTH, MAX_GAZE_LENGTH, GAZE_STEPS = 0.3, 12.0, 32
+"""Range of the length of gaze without a hit point, in metres, and the number of positions tested along it."""
 
-STANDS = 0.9, 2.05
-"""Metres above the floor between which a head is plausible: of somebody who sits, and of somebody tall."""
+HEAD_HEIGHT_RANGE = 0.9, 2.05
+"""Plausible heights of a head above the floor in metres, from sitting to tall standing persons."""
 
 
 class Score(Protocol):
-    """A property that a right alignment has."""
+    """A property of a correct alignment."""
 
     @property
     def name(self) -> str:
-        """What it is about, in a few words."""
+        """Short description."""
         ...
 
     @property
     def scale(self) -> float:
-        """Residuals beyond this many metres count less and less: strays of the tracker, holes of the place."""
+        """Scale of the robust loss in metres; larger residuals have decreasing influence."""
         ...
 
     @property
     def group(self) -> np.ndarray:
-        """(N,) whose each residual is: those of a group are not independent of each other."""
+        """Group of each residual, (N,). Residuals of a group may be correlated."""
         ...
 
-    def residuals(self, chart: Chart, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Residuals (N,) in metres, 0 where all is well, of the similarity ``chart.matrix(q)``, and their derivatives
-        (N, k) with respect to ``q``."""
+    def residuals(self, chart: LocalSimilarity, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return residuals (N,) in metres, 0 for a perfect fit, of the similarity ``chart.matrix(q)``, and their
+        derivatives (N, k) with respect to ``q``."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
-class AtZero:
-    """Points (N, 3) are where a distance of the place is 0: hit points on its surface (`PlaceSurface.distance`), heads
-    and what gaze passes in its free space (`PlaceSurface.blocked`)."""
+class ZeroDistance:
+    """Points (N, 3) should have distance 0: hit points to surfaces, heads and gaze paths to free space."""
 
     grid: DistanceGrid
     points: np.ndarray
@@ -79,38 +86,40 @@ class AtZero:
     name: str
     scale: float = 0.1
 
-    def residuals(self, chart: Chart, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return _of_grid(self.grid, self.points, chart, q)
+    def residuals(self, chart: LocalSimilarity, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return _grid_residuals(self.grid, self.points, chart, q)
 
 
 @dataclass(frozen=True, eq=False)
 class GazeEnds:
-    """Gaze from ``origins`` along unit ``directions`` (N, 3), whose hit points are not known, comes upon a surface."""
+    """Gaze without hit points, from ``origins`` along unit ``directions`` (N, 3), should meet a surface."""
 
-    surface: PlaceSurface
+    surface: SceneSurface
     origins: np.ndarray
     directions: np.ndarray
     group: np.ndarray
     scale: float = 0.5
     name: str = "gaze ends on surfaces"
 
-    def residuals(self, chart: Chart, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        along = np.geomspace(NEAR, FAR, STEPS)
-        points = self.origins[:, None] + along[:, None] * self.directions[:, None]
-        distance = self.surface.distance.interpolate(chart.transform(q, points.reshape(-1, 3))).reshape(len(points), STEPS)
-        # Between two places a ray may come nearer by half of the way from one to the other.
-        reach = 0.5 * np.gradient(along) * chart.scale(q)
-        nearest = np.argmin(distance - reach, axis=1)
-        each = np.arange(len(points))
-        # The derivative of a least value is that of the value that is least.
-        r, by = _of_grid(self.surface.distance, points[each, nearest], chart, q)
-        r = r - 0.5 * np.gradient(along)[nearest]
-        return np.maximum(r, 0), by * (r > 0)[:, None]
+    def residuals(self, chart: LocalSimilarity, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        lengths = np.geomspace(MIN_GAZE_LENGTH, MAX_GAZE_LENGTH, GAZE_STEPS)
+        points = self.origins[:, None] + lengths[:, None] * self.directions[:, None]
+        distance = self.surface.distance.interpolate(chart.transform(q, points.reshape(-1, 3))).reshape(
+            len(points), GAZE_STEPS
+        )
+        # Between two positions, a ray may come closer by half of their distance.
+        slack = 0.5 * np.gradient(lengths) * chart.scale(q)
+        nearest = np.argmin(distance - slack, axis=1)
+        rows = np.arange(len(points))
+        # The derivative of a minimum is that of the smallest value.
+        r, jacobian = _grid_residuals(self.surface.distance, points[rows, nearest], chart, q)
+        r = r - 0.5 * np.gradient(lengths)[nearest]
+        return np.maximum(r, 0), jacobian * (r > 0)[:, None]
 
 
 @dataclass(frozen=True, eq=False)
 class HeadHeight:
-    """Heads (N, 3) are above the floor at the height ``floor`` of the place, z up, as people's are."""
+    """Heads (N, 3) should be at a plausible height above the floor."""
 
     floor: float
     points: np.ndarray
@@ -118,32 +127,37 @@ class HeadHeight:
     scale: float = 0.2
     name: str = "heads above the floor"
 
-    def residuals(self, chart: Chart, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def residuals(self, chart: LocalSimilarity, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         moved, s = chart.transform(q, self.points), chart.scale(q)
         height = (moved[:, 2] - self.floor) / s
         up = np.broadcast_to([0.0, 0.0, 1.0], moved.shape)
-        slope = chart.pulled(q, moved, up) / s - height[:, None] * chart.basis[6]
-        low, high = STANDS
+        slope = chart.gradient(q, moved, up) / s - height[:, None] * chart.basis[6]
+        low, high = HEAD_HEIGHT_RANGE
         sign = np.where(height < low, -1.0, np.where(height > high, 1.0, 0.0))
         return np.maximum(np.maximum(low - height, height - high), 0), sign[:, None] * slope
 
 
-def _of_grid(grid: DistanceGrid, points: np.ndarray, chart: Chart, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distances in units of the tracking of ``points`` (N, 3) of its frame, and their derivatives."""
+def _grid_residuals(
+    grid: DistanceGrid, points: np.ndarray, chart: LocalSimilarity, q: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return distances of ``points`` (N, 3) in units of the tracking, and their derivatives."""
     moved, s = chart.transform(q, points), chart.scale(q)
-    value, slope = grid.with_slope(moved)
-    return value / s, (chart.pulled(q, moved, slope) - value[:, None] * chart.basis[6]) / s
+    value, slope = grid.interpolate_with_gradient(moved)
+    return value / s, (chart.gradient(q, moved, slope) - value[:, None] * chart.basis[6]) / s
 
 
-# ---- The similarity that agrees best with several scores, near one that is given, and how well it is determined ----
+# ---- Refinement ----
 
-_FEW = 10
+_MIN_PARTICIPANTS = 10
 
 
 @dataclass(frozen=True, eq=False)
 class RefinedAlignment:
-    """``matrix`` (4, 4); ``cost``: the robust mean over all scores, 0 where all is well, below 1; ``covariance`` (7, 7)
-    of rotation vector, translation and logarithm of the scale about the chart's ``center``."""
+    """Refined similarity.
+
+    ``matrix`` (4, 4); ``cost``: robust mean over all scores, 0 for a perfect fit; ``covariance`` (7, 7) of rotation
+    vector, translation and logarithm of the scale about ``center``.
+    """
 
     matrix: np.ndarray
     cost: float
@@ -152,63 +166,80 @@ class RefinedAlignment:
 
 
 def refine(
-    scores: Sequence[Score], base: np.ndarray, center: np.ndarray, basis: np.ndarray, scale_factor: float = 1.0, max_evaluations: int = 60
+    scores: Sequence[Score],
+    base: np.ndarray,
+    center: np.ndarray,
+    basis: np.ndarray,
+    scale_factor: float = 1.0,
+    max_evaluations: int = 60,
 ) -> RefinedAlignment:
-    """Minimise the robust residuals of ``scores`` by Gauss-Newton steps in a trust region (SciPy's least_squares with a
-    Cauchy loss), from the similarity ``base`` (4, 4) on.
+    """Minimise the robust residuals of ``scores`` by Gauss-Newton steps in a trust region (SciPy's least_squares,
+    Cauchy loss).
 
-    Each score has the same weight, however many residuals it has. ``center``, ``basis``: of the chart; ``wide``: factor
-    of the scores' own scales, larger for a first, coarse fit; ``most``: evaluations.
+    Parameters
+    ----------
+    scores
+        Scores; each has the same total weight.
+    base
+        Initial similarity (4, 4).
+    center, basis
+        Centre and parameter basis of the `LocalSimilarity`.
+    scale_factor
+        Factor of the scores' scales, larger for a coarse fit.
+    max_evaluations
+        Maximum number of evaluations.
     """
-    chart = Chart(base, center, basis)
+    chart = LocalSimilarity(base, center, basis)
     weight = [1 / (scale_factor * s.scale * np.sqrt(max(len(s.group), 1))) for s in scores]
 
-    def stacked(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def stack_residuals(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         parts = [s.residuals(chart, q) for s in scores]
         return (
             np.concatenate([w * r for w, (r, _) in zip(weight, parts)]),
-            np.concatenate([w * by for w, (_, by) in zip(weight, parts)]),
+            np.concatenate([w * jacobian for w, (_, jacobian) in zip(weight, parts)]),
         )
 
-    # SciPy's loss is of each residual, of which those of a score count less the more there are of them.
+    # The weights divide by the number of residuals of a score; the loss needs the unweighted squares.
     counts = np.concatenate([np.full(len(s.group), len(s.group), float) for s in scores])
 
-    def weighed(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        # log(1 + z) as a square, whose root has derivatives where z > 0: z = r^2 in units of a score's scale.
-        r, by = stacked(q)
+    def robust_residuals(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        # The Cauchy loss log(1 + z) as the square of a residual, with z = r^2 in units of a score's scale.
+        r, jacobian = stack_residuals(q)
         z = r * r * counts
         factor = np.sqrt(np.where(z > 1e-12, np.log1p(z) / np.maximum(z, 1e-300), 1.0))
         slope = np.where(z > 1e-12, 1 / ((1 + z) * np.maximum(factor, 1e-150)), 1.0)
-        return r * factor, by * slope[:, None]
+        return r * factor, jacobian * slope[:, None]
 
     q = np.zeros(chart.size)
     if len(counts):
-        last: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
+        cache: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
 
-        def at(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        def evaluate(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             key = q.tobytes()
-            if key not in last:
-                last.clear()
-                last[key] = weighed(q)
-            return last[key]
+            if key not in cache:
+                cache.clear()
+                cache[key] = robust_residuals(q)
+            return cache[key]
 
-        derivatives: Any = lambda q: at(q)[1]
-        q = least_squares(lambda q: at(q)[0], q, derivatives, x_scale="jac", max_nfev=max_evaluations).x
-    r, by = stacked(q)
+        derivatives: Any = lambda q: evaluate(q)[1]
+        q = least_squares(lambda q: evaluate(q)[0], q, derivatives, x_scale="jac", max_nfev=max_evaluations).x
+    r, jacobian = stack_residuals(q)
     z = r * r * counts
     group = np.concatenate([s.group for s in scores])
-    covariance = _sandwich(r, by, 1 / (1 + z), group)
+    covariance = _sandwich_covariance(r, jacobian, 1 / (1 + z), group)
     return RefinedAlignment(
         chart.matrix(q), float(np.sum(np.log1p(z) / counts)), chart.basis @ covariance @ chart.basis.T, center
     )
 
 
-def _sandwich(r: np.ndarray, by: np.ndarray, weight: np.ndarray, group: np.ndarray) -> np.ndarray:
-    """Covariance (k, k) of the parameters where residuals of a group may depend on each other: H^-1 (sum of g g') H^-1,
-    g the gradient of a group (K.-Y. Liang, S. Zeger: Longitudinal data analysis using generalized linear models,
-    1986)."""
-    hessian = (by * weight[:, None]).T @ by
-    gradient = by * (weight * r)[:, None]
+def _sandwich_covariance(r: np.ndarray, jacobian: np.ndarray, weight: np.ndarray, group: np.ndarray) -> np.ndarray:
+    """Return the cluster-robust (sandwich) covariance (k, k) of the parameters: H^-1 (sum of g g') H^-1, with g the
+    gradient of a group.
+
+    Reference: K.-Y. Liang, S. Zeger, Longitudinal data analysis using generalized linear models, 1986.
+    """
+    hessian = (jacobian * weight[:, None]).T @ jacobian
+    gradient = jacobian * (weight * r)[:, None]
     _, where = np.unique(group, return_inverse=True)
     where = where.reshape(-1)
     sums = np.stack([np.bincount(where, g) for g in gradient.T], axis=1)
@@ -217,224 +248,234 @@ def _sandwich(r: np.ndarray, by: np.ndarray, weight: np.ndarray, group: np.ndarr
     return inverse @ (sums.T @ sums) @ inverse * (count / max(count - 1, 1))
 
 
-def groups_of(person: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """(N,) numbers of groups that are taken for independent: people, or, of few people, ten seconds of each."""
-    if len(np.unique(person)) >= _FEW:
+def independent_groups(person: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """Return group numbers (N,) of samples that are treated as independent: participants or, for few participants,
+    blocks of ten seconds."""
+    if len(np.unique(person)) >= _MIN_PARTICIPANTS:
         return person.astype(np.int64)
     blocks = np.floor((t - t.min(initial=np.inf)) / 10).astype(np.int64) if len(t) else np.zeros(0, np.int64)
     return person.astype(np.int64) * (int(blocks.max(initial=0)) + 1) + blocks
 
 
-# ---- Icp ----
+# ---- Iterative closest points ----
 #
-# Alignment from a twin: a mesh, or points on surfaces, in the tracking's frame, against the surface of the place.
+# Alignment from a twin: a mesh, or points on surfaces, in the frame of the tracking, aligned with the surface of the
+# scene.
 #
-# First all turns (and mirrors) on a lattice of rotations, judged by both distance fields at once, since a twin that
-# shrinks onto a single spot of the place would lie on its surface too; then iterated closest points with scale (P.
-# Besl, N. McKay, 1992; scale after T. Zinsser et al., 2005), in both directions for the same reason, trimmed of what
-# only one of them has (D. Chetverikov et al., 2002); and at last steps on the place's distance field (`refine`).
+# The search starts from a set of rotations (and mirrored ones), scored by both distance fields, since a twin that
+# shrinks to a single point of the scene would lie on its surface. The best starts are refined by iterative closest
+# points with scale (P. Besl, N. McKay, 1992; T. Zinsser et al., 2005) in both directions, trimmed of points without a
+# counterpart (D. Chetverikov et al., 2002), and finally on the distance field of the scene (`refine`).
 
-_TURNS, _COARSE, _FINE = 1000, 150, 2000
+_NUM_ROTATIONS, _COARSE_POINTS, _FINE_POINTS = 1000, 150, 2000
 _SCALES = np.exp(np.linspace(-0.25, 0.25, 5))
-_STARTS, _LAST = 30, 3
-# Share of the points of either side that the other one is taken to have too.
+_NUM_STARTS, _NUM_FINAL = 30, 3
+# Assumed fraction of the points with a counterpart.
 _OVERLAP = 0.8
-# At the end points farther from the surface than this share of the place's size count less and less.
-_NEAR = 0.005
-_FAR = 0.04
-# A mirrored twin is told where it fits so much better; a rival of another placement where it fits almost as well.
-_CLEAR, _RIVAL = 0.8, 1.15
+# Scale of the robust loss, and maximum distance in the cost, relative to the size of the scene.
+_NEAR_FRACTION = 0.005
+_FAR_FRACTION = 0.04
+# Cost ratio below which a mirrored twin is reported, and below which another placement is reported.
+_MIRROR_RATIO, _RIVAL_RATIO = 0.8, 1.15
 
 
 @dataclass(frozen=True, eq=False)
 class Twin:
-    """``points`` (N, 3) on surfaces, in the frame of the tracking; ``source``: whose they are, for messages."""
+    """Points (N, 3) on surfaces in the frame of the tracking; ``source`` names them in messages."""
 
     points: np.ndarray
     source: str = "the twin"
 
     kind = "twin"
 
-    def fit(self, target: AlignmentTarget, progress: Progress) -> AlignmentFit:
-        """The best placement. Raises `NergError` for a twin of too few points."""
-        twin, place = _even(self.points, self.source), target.surface
-        found: dict[bool, list[_Placed]] = {}
+    def fit(self, target: AlignmentTarget, progress: ProgressCallback) -> AlignmentFit:
+        """Find the best placement. Raises `NergError` for too few points."""
+        twin, place = _downsample_evenly(self.points, self.source), target.surface
+        placements: dict[bool, list[_Placement]] = {}
         for flip in (False, True):
             progress(0.1 + 0.4 * flip, "placing the mirrored twin" if flip else "placing the twin")
-            found[flip] = _placed(transform_points(MIRROR, twin) if flip else twin, place, target)
-        best = found[False][0]
-        s = similarity_scale(best.matrix)
-        x, y, forth = _closest(twin, place.points, KDTree(place.points), KDTree(twin), best.matrix, _OVERLAP)
-        basis = upright_basis(False) if target.is_upright else ALL
-        off = _nearest(KDTree(place.points), transform_points(best.matrix, twin))[0] / s
-        kept = np.sort(off)[: int(_OVERLAP * len(off))]
+            placements[flip] = _find_placements(transform_points(MIRROR, twin) if flip else twin, place, target)
+        best = placements[False][0]
+        scale = similarity_scale(best.matrix)
+        x, y, is_forward = _closest_pairs(twin, place.points, KDTree(place.points), KDTree(twin), best.matrix, _OVERLAP)
+        basis = upright_basis(False) if target.is_upright else FULL_BASIS
+        distance = _query_tree(KDTree(place.points), transform_points(best.matrix, twin))[0] / scale
+        residuals = np.sort(distance)[: int(_OVERLAP * len(distance))]
         notes = [
-            f"{len(twin):,} points of the twin; {_OVERLAP:.0%} of them lie within {100 * kept[-1]:.2g} cm",
-            *_unit(s),
+            f"{len(twin):,} points of the twin; {_OVERLAP:.0%} are within {100 * residuals[-1]:.2g} cm",
+            *_describe_scale(scale),
         ]
         mirrored = None
-        if found[True][0].cost < _CLEAR * best.cost:
-            flipped = found[True][0].cost / similarity_scale(found[True][0].matrix)
-            mirrored = mirror_sentence("the twin fits", flipped, best.cost / s)
-        about = {"points": len(twin), "overlap": _OVERLAP, "mean_cm": 100 * best.cost / s}
-        covariance = pair_covariance(x[forth], y[forth], best.matrix, basis)
+        if placements[True][0].cost < _MIRROR_RATIO * best.cost:
+            flipped = placements[True][0].cost / similarity_scale(placements[True][0].matrix)
+            mirrored = describe_mirror("the twin fits the scene", flipped, best.cost / scale)
+        metadata = {"points": len(twin), "overlap": _OVERLAP, "mean_cm": 100 * best.cost / scale}
+        covariance = pair_covariance(x[is_forward], y[is_forward], best.matrix, basis)
         return AlignmentFit(
-            target.to_place(best.matrix),
-            100 * kept,
-            angles_between(transform_points(best.matrix, x.mean(axis=0)), transform_points(best.matrix, x[forth]), y[forth]),
+            target.to_scene_frame(best.matrix),
+            100 * residuals,
+            angles_between(
+                transform_points(best.matrix, x.mean(axis=0)),
+                transform_points(best.matrix, x[is_forward]),
+                y[is_forward],
+            ),
             covariance,
             mirrored,
             twin,
             None,
-            about,
+            metadata,
             notes,
-            _rivals(found[False], place.diagonal),
+            _warn_rivals(placements[False], place.diagonal),
         )
 
 
 @dataclass(frozen=True, eq=False)
-class _Placed:
-    """A placement, and its mean distance in units of the place."""
+class _Placement:
+    """A similarity and its mean distance in scene units."""
 
     matrix: np.ndarray
     cost: float
 
 
-def _even(points: np.ndarray, source: str) -> np.ndarray:
+def _downsample_evenly(points: np.ndarray, source: str) -> np.ndarray:
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) < 100:
-        raise NergError(f"{source} has {len(points)} usable points, and 100 or more are needed to place it")
+        raise NergError(f"{source} has {len(points)} usable points, but an alignment needs at least 100")
     size = np.linalg.norm(np.ptp(points, axis=0))
     if not size > 0:
-        raise NergError(f"all points of {source} are one; give a mesh or points on surfaces")
+        raise NergError(f"all points of {source} coincide; give a mesh or points on surfaces")
     return downsample(points, float(size) / 250)
 
 
-def _placed(twin: np.ndarray, place: PlaceSurface, target: AlignmentTarget) -> list[_Placed]:
-    """The best placements of the points ``twin``, best first."""
-    own = surface_of_points(twin, 1 << 19).distance
+def _find_placements(twin: np.ndarray, place: SceneSurface, target: AlignmentTarget) -> list[_Placement]:
+    """Return the best placements of the points ``twin``, best first."""
+    twin_distance = surface_from_points(twin, 1 << 19).distance
     rng = np.random.default_rng(0)
-    few = lambda p, n: p[rng.permutation(len(p))[:n]]
-    x, y = few(twin, _COARSE), few(place.points, _COARSE)
+    draw = lambda p, n: p[rng.permutation(len(p))[:n]]
+    x, y = draw(twin, _COARSE_POINTS), draw(place.points, _COARSE_POINTS)
     x0, y0 = twin.mean(axis=0), place.points.mean(axis=0)
     spread = lambda p, p0: float(np.sqrt(np.mean(np.sum((p - p0) ** 2, axis=1))))
     ratio = spread(place.points, y0) / spread(twin, x0)
     scales = ratio * _SCALES if target.scale is None else np.array([target.scale])
-    wide = 0.06 * place.diagonal
+    width = 0.06 * place.diagonal
     starts = []
-    for turn in _turns(target.is_upright):
+    for turn in _candidate_rotations(target.is_upright):
         # All scales at once.
         moved = scales[:, None, None] * ((x - x0) @ turn.T) + y0
         back = ((y - y0) @ turn) / scales[:, None, None] + x0
-        forth = place.distance.interpolate(moved.reshape(-1, 3)).reshape(len(scales), -1)
-        away = own.interpolate(back.reshape(-1, 3)).reshape(len(scales), -1) * scales[:, None]
-        near = np.exp(-0.5 * (forth / wide) ** 2).mean(axis=1) + np.exp(-0.5 * (away / wide) ** 2).mean(axis=1)
-        starts += [(n, s, turn) for n, s in zip(near.tolist(), scales)]
+        forward = place.distance.interpolate(moved.reshape(-1, 3)).reshape(len(scales), -1)
+        backward = twin_distance.interpolate(back.reshape(-1, 3)).reshape(len(scales), -1) * scales[:, None]
+        score = np.exp(-0.5 * (forward / width) ** 2).mean(axis=1) + np.exp(-0.5 * (backward / width) ** 2).mean(axis=1)
+        starts += [(n, s, turn) for n, s in zip(score.tolist(), scales)]
     starts.sort(key=lambda g: -g[0])
-    found = []
-    x, y = few(twin, 500), few(place.points, 500)
-    for _, s, turn in starts[:_STARTS]:
+    placements = []
+    x, y = draw(twin, 500), draw(place.points, 500)
+    for _, s, turn in starts[:_NUM_STARTS]:
         matrix = np.eye(4)
         matrix[:3, :3] = s * turn
         matrix[:3, 3] = y0 - s * turn @ x0
-        found.append(_icp(x, y, matrix, target, 15))
-    found.sort(key=lambda f: f.cost / similarity_scale(f.matrix))
-    x, y = few(twin, _FINE), few(place.points, 2 * _FINE)
-    last = [_settled(x, y, f.matrix, place, own, target) for f in _different(found, place.diagonal)[:_LAST]]
-    return sorted(last, key=lambda f: f.cost / similarity_scale(f.matrix))
+        placements.append(_icp(x, y, matrix, target, 15))
+    placements.sort(key=lambda f: f.cost / similarity_scale(f.matrix))
+    x, y = draw(twin, _FINE_POINTS), draw(place.points, 2 * _FINE_POINTS)
+    final = [
+        _refine_placement(x, y, f.matrix, place, twin_distance, target)
+        for f in _distinct_placements(placements, place.diagonal)[:_NUM_FINAL]
+    ]
+    return sorted(final, key=lambda f: f.cost / similarity_scale(f.matrix))
 
 
-def _turns(upright: bool) -> list[np.ndarray]:
-    if upright:
+def _candidate_rotations(is_upright: bool) -> list[np.ndarray]:
+    if is_upright:
         return [Rotation.from_rotvec([0, 0, a]).as_matrix() for a in 2 * np.pi * np.arange(60) / 60]
-    return list(Rotation.from_quat(np.random.default_rng(0).normal(size=(_TURNS, 4))).as_matrix())
+    return list(Rotation.from_quat(np.random.default_rng(0).normal(size=(_NUM_ROTATIONS, 4))).as_matrix())
 
 
-def _icp(x: np.ndarray, y: np.ndarray, matrix: np.ndarray, target: AlignmentTarget, most: int) -> _Placed:
-    tree, own = KDTree(y), KDTree(x)
+def _icp(x: np.ndarray, y: np.ndarray, matrix: np.ndarray, target: AlignmentTarget, max_iterations: int) -> _Placement:
+    tree, source_tree = KDTree(y), KDTree(x)
     cost = np.inf
-    for k in range(most):
-        # More is taken for common as the two come together.
-        share = 0.6 + (_OVERLAP - 0.6) * min(1.0, 2 * k / most)
-        a, b, _ = _closest(x, y, tree, own, matrix, share)
+    for k in range(max_iterations):
+        # Increase the assumed overlap as the fit improves.
+        fraction = 0.6 + (_OVERLAP - 0.6) * min(1.0, 2 * k / max_iterations)
+        a, b, _ = _closest_pairs(x, y, tree, source_tree, matrix, fraction)
         matrix = fit_similarity(a, b, upright=target.is_upright, scale=target.scale)
-        now = float(np.mean(np.linalg.norm(transform_points(matrix, a) - b, axis=1)))
-        if 2 * k > most and abs(cost - now) < 1e-5 * max(now, 1e-300):
+        new_cost = float(np.mean(np.linalg.norm(transform_points(matrix, a) - b, axis=1)))
+        if 2 * k > max_iterations and abs(cost - new_cost) < 1e-5 * max(new_cost, 1e-300):
             break
-        cost = now
-    return _Placed(matrix, cost)
+        cost = new_cost
+    return _Placement(matrix, cost)
 
 
-def _settled(
-    x: np.ndarray, y: np.ndarray, matrix: np.ndarray, place: PlaceSurface, twin: DistanceGrid, target: AlignmentTarget
-) -> _Placed:
-    """Closest points slide along surfaces by small steps; the distance field has the slope that leads there at once.
+def _refine_placement(
+    x: np.ndarray, y: np.ndarray, matrix: np.ndarray, place: SceneSurface, twin: DistanceGrid, target: AlignmentTarget
+) -> _Placement:
+    """Refine a placement by closest points, then on the distance field, whose gradient converges faster along surfaces.
 
-    The mean distance is that of both fields (``twin``: that of the twin), with what is far counted as no farther than
-    it has to be to tell that it is.
+    The cost is the mean distance in both directions, with large distances clipped.
     """
     matrix = _icp(x, y, matrix, target, 8).matrix
-    near = _NEAR * place.diagonal / similarity_scale(matrix)
-    basis = upright_basis(False) if target.is_upright else ALL
+    near_distance = _NEAR_FRACTION * place.diagonal / similarity_scale(matrix)
+    basis = upright_basis(False) if target.is_upright else FULL_BASIS
     basis = basis if target.scale is None else basis[:, :-1]
-    center, own = transform_points(matrix, x).mean(axis=0), np.arange(len(x))
-    on_surface = AtZero(place.distance, x, own, "points of the twin on surfaces", near)
-    for wide in (3.0, 1.0):
-        matrix = refine([on_surface], matrix, center, basis, wide, 30).matrix
-    s, most = similarity_scale(matrix), _FAR * place.diagonal
-    forth = np.minimum(place.distance.interpolate(transform_points(matrix, x)), most)
-    back = np.minimum(twin.interpolate(transform_points(np.linalg.inv(matrix), y)) * s, most)
-    return _Placed(matrix, float(0.5 * (forth.mean() + back.mean())))
+    center, index = transform_points(matrix, x).mean(axis=0), np.arange(len(x))
+    on_surface = ZeroDistance(place.distance, x, index, "points of the twin on surfaces", near_distance)
+    for factor in (3.0, 1.0):
+        matrix = refine([on_surface], matrix, center, basis, factor, 30).matrix
+    s, max_distance = similarity_scale(matrix), _FAR_FRACTION * place.diagonal
+    forward = np.minimum(place.distance.interpolate(transform_points(matrix, x)), max_distance)
+    backward = np.minimum(twin.interpolate(transform_points(np.linalg.inv(matrix), y)) * s, max_distance)
+    return _Placement(matrix, float(0.5 * (forward.mean() + backward.mean())))
 
 
-def _closest(
-    x: np.ndarray, y: np.ndarray, tree: KDTree, own: KDTree, matrix: np.ndarray, share: float
+def _closest_pairs(
+    x: np.ndarray, y: np.ndarray, tree: KDTree, source_tree: KDTree, matrix: np.ndarray, fraction: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points of ``x`` and of ``y`` that belong together, (M, 3) each, nearest from either side, without those that are
-    farthest apart; and which were found from the side of ``x``, (M,) bool."""
-    forth, at = _nearest(tree, transform_points(matrix, x))
-    back, of = _nearest(own, transform_points(np.linalg.inv(matrix), y))
-    back = back * similarity_scale(matrix)
-    a = np.flatnonzero(forth <= np.quantile(forth, share))
-    b = np.flatnonzero(back <= np.quantile(back, share))
-    side = np.arange(len(a) + len(b)) < len(a)
-    return np.concatenate([x[a], x[of[b]]]), np.concatenate([y[at[a]], y[b]]), side
+    """Return closest pairs in both directions, (M, 3) each, without the most distant ones, and whether each pair was
+    found from ``x``, (M,) bool."""
+    forward, target_index = _query_tree(tree, transform_points(matrix, x))
+    backward, source_index = _query_tree(source_tree, transform_points(np.linalg.inv(matrix), y))
+    backward = backward * similarity_scale(matrix)
+    a = np.flatnonzero(forward <= np.quantile(forward, fraction))
+    b = np.flatnonzero(backward <= np.quantile(backward, fraction))
+    is_forward = np.arange(len(a) + len(b)) < len(a)
+    return np.concatenate([x[a], x[source_index[b]]]), np.concatenate([y[target_index[a]], y[b]]), is_forward
 
 
-def _nearest(tree: KDTree, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _query_tree(tree: KDTree, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     distance, index = tree.query(points)
     return np.asarray(distance), np.asarray(index)
 
 
-def _different(found: list[_Placed], size: float) -> list[_Placed]:
-    out: list[_Placed] = []
-    for f in found:
-        if all(_apart(f, o, size) for o in out):
+def _distinct_placements(placements: list[_Placement], size: float) -> list[_Placement]:
+    out: list[_Placement] = []
+    for f in placements:
+        if all(_is_distinct(f, o, size) for o in out):
             out.append(f)
     return out
 
 
-def _apart(a: _Placed, b: _Placed, size: float) -> bool:
-    turned = a.matrix[:3, :3] / similarity_scale(a.matrix) @ (b.matrix[:3, :3] / similarity_scale(b.matrix)).T
-    angle = np.degrees(np.arccos(np.clip((np.trace(turned) - 1) / 2, -1, 1)))
+def _is_distinct(a: _Placement, b: _Placement, size: float) -> bool:
+    relative_rotation = (
+        a.matrix[:3, :3] / similarity_scale(a.matrix) @ (b.matrix[:3, :3] / similarity_scale(b.matrix)).T
+    )
+    angle = np.degrees(np.arccos(np.clip((np.trace(relative_rotation) - 1) / 2, -1, 1)))
     return bool(angle > 10 or abs(np.log(similarity_scale(a.matrix) / similarity_scale(b.matrix))) > 0.1)
 
 
-def _rivals(found: list[_Placed], size: float) -> list[str]:
-    best = found[0]
-    each = lambda f: f.cost / similarity_scale(f.matrix)
-    for other in found[1:]:
-        if _apart(best, other, size) and each(other) < _RIVAL * each(best):
+def _warn_rivals(placements: list[_Placement], size: float) -> list[str]:
+    best = placements[0]
+    mean_distance = lambda f: f.cost / similarity_scale(f.matrix)
+    for other in placements[1:]:
+        if _is_distinct(best, other, size) and mean_distance(other) < _RIVAL_RATIO * mean_distance(best):
             return [
-                f"another placement fits almost as well ({100 * each(other):.2g} cm, the best {100 * each(best):.2g} "
-                "cm): the place may look alike from two sides; settle it with three picked points (--pairs)"
+                f"another placement fits almost as well ({100 * mean_distance(other):.2g} cm, the best {100 * mean_distance(best):.2g} "
+                "cm): the scene may be symmetric; use three picked points (--pairs) to decide"
             ]
     return []
 
 
-def _unit(scale: float) -> list[str]:
-    """What a scale that is a unit of length means."""
+def _describe_scale(scale: float) -> list[str]:
+    """Explain a scale that corresponds to a unit of length."""
     for unit, factor in (("millimetres", 1e-3), ("centimetres", 1e-2), ("inches", 0.0254), ("feet", 0.3048)):
         if abs(np.log(scale / factor)) < 0.02:
-            return [f"the scale is {scale:.4g}: the twin is in {unit} where the place is in metres"]
+            return [f"the scale is {scale:.4g}: the twin is in {unit} and the scene in metres"]
     return []

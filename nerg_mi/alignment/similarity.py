@@ -1,4 +1,4 @@
-"""Similarities: the one that carries points to points in closed form, and those near it by seven numbers."""
+"""Similarities: closed-form fits to point pairs, and a local parametrisation with seven parameters."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from scipy.spatial.transform import Rotation
 from nerg_mi.errors import NergError
 from nerg_mi.maths.coordinates import check_coordinates
 
-# ---- The similarity that carries points to points, in closed form ----
+# ---- Closed-form fit ----
 #
-# S. Umeyama: Least-squares estimation of transformation parameters between two point patterns, PAMI 13 (1991). Where up
-# is known in both frames, what is left is a turn about it: the same in the plane.
+# S. Umeyama: Least-squares estimation of transformation parameters between two point patterns, PAMI 13 (1991). If the
+# up direction is known in both frames, only a rotation about it is fitted, by the same method in the plane.
 
-LINE = 0.01  # Points lie on a line where their second extent is less than this share of the first
-PLANE = 0.02
-"""Points lie in a plane, which looks the same in a mirror, where their third extent is less than this share."""
+MAX_LINE_RATIO = 0.01  # points are collinear below this ratio of their second to their first singular value
+MAX_PLANE_RATIO = 0.02
+"""Points are coplanar, so that a mirrored frame fits as well, below this ratio of the third to the first singular value."""
 
 MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0])
-"""A mirrored frame: x negated. Of any other axis, or of all three, it is this and a rotation."""
+"""Mirror of the x axis. Mirroring another axis, or all three, equals this and a rotation."""
 
 
 def fit_similarity(
@@ -31,17 +31,25 @@ def fit_similarity(
     upright: bool = False,
     scale: float | None = None,
 ) -> np.ndarray:
-    """The (4, 4) proper similarity that carries ``source`` (N, 3) to ``target`` (N, 3) with the least weighted sum of
+    """Fit the proper similarity (4, 4) from ``source`` to ``target``, (N, 3) each, with the smallest weighted sum of
     squares.
 
-    ``upright``: z is up in both, and stays up; ``scale``: known, else found. Nothing is asked of the points: see
-    `check_points`.
+    Parameters
+    ----------
+    source, target
+        Corresponding points. They are not checked; see `check_points`.
+    weights
+        Weights (N,). Default: equal weights.
+    upright
+        Whether z is up in both frames and stays up.
+    scale
+        Fixed scale. None: estimated.
     """
     w = np.full(len(source), 1 / len(source)) if weights is None else np.asarray(weights) / np.sum(weights)
     x0, y0 = w @ source, w @ target
     x, y = source - x0, target - y0
     covariance = (y * w[:, None]).T @ x
-    rotation = _turn(covariance) if upright else _rotation(covariance)
+    rotation = _fit_vertical_rotation(covariance) if upright else _fit_rotation(covariance)
     spread = float(w @ np.sum(x * x, axis=1))
     if scale is None:
         scale = float(np.sum(covariance * rotation)) / spread if spread > 0 else 1.0
@@ -51,15 +59,15 @@ def fit_similarity(
     return matrix
 
 
-def _rotation(covariance: np.ndarray) -> np.ndarray:
+def _fit_rotation(covariance: np.ndarray) -> np.ndarray:
     u, _, vt = np.linalg.svd(covariance)
     sign = np.ones(3)
-    # The nearest orthogonal matrix may be a mirror; the nearest rotation gives up the least of the three.
+    # The nearest orthogonal matrix may be a reflection; flip the axis with the smallest singular value.
     sign[2] = np.sign(np.linalg.det(u) * np.linalg.det(vt))
     return (u * sign) @ vt
 
 
-def _turn(covariance: np.ndarray) -> np.ndarray:
+def _fit_vertical_rotation(covariance: np.ndarray) -> np.ndarray:
     c = covariance
     angle = np.arctan2(c[1, 0] - c[0, 1], c[0, 0] + c[1, 1])
     cos, sin = np.cos(angle), np.sin(angle)
@@ -67,129 +75,134 @@ def _turn(covariance: np.ndarray) -> np.ndarray:
 
 
 def transform_points(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """``points`` (..., 3) by a (4, 4) matrix."""
+    """Transform ``points`` (..., 3) by a matrix (4, 4)."""
     return points @ matrix[:3, :3].T + matrix[:3, 3]
 
 
 def similarity_scale(matrix: np.ndarray) -> float:
-    """Length in the target of one unit of the source."""
+    """Return the scale of a similarity: units of the target per unit of the source."""
     return float(np.cbrt(abs(np.linalg.det(matrix[:3, :3]))))
 
 
 def residual_distances(matrix: np.ndarray, source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """How far ``matrix`` carries points from where they belong, (N,), in units of the source."""
+    """Return the distances (N,) between the transformed ``source`` and ``target``, in units of the source."""
     return np.linalg.norm(transform_points(matrix, source) - target, axis=1) / similarity_scale(matrix)
 
 
-def leave_one_out(
+def leave_one_out_distances(
     source: np.ndarray, target: np.ndarray, *, upright: bool = False, scale: float | None = None
 ) -> np.ndarray:
-    """How far each point is from where the others carry it, (N,) in units of the source; NaN where the others are too
-    few or lie on a line."""
+    """Return the distance of each point from the fit to the others, (N,) in units of the source; NaN if the others
+    are degenerate."""
     out = np.full(len(source), np.nan)
     for k in range(len(source)):
-        rest = np.arange(len(source)) != k
-        if not _refused(source[rest], upright) and not _refused(target[rest], upright):
-            matrix = fit_similarity(source[rest], target[rest], upright=upright, scale=scale)
+        others = np.arange(len(source)) != k
+        if not _degeneracy(source[others], upright) and not _degeneracy(target[others], upright):
+            matrix = fit_similarity(source[others], target[others], upright=upright, scale=scale)
             if similarity_scale(matrix) > 0:
                 out[k] = residual_distances(matrix, source[k : k + 1], target[k : k + 1])[0]
     return out
 
 
 def check_points(source: np.ndarray, target: np.ndarray, label: str, *, upright: bool = False) -> None:
-    """Raise `NergError` for points that do not tell a similarity: too few, at one place, on a line, not finite.
+    """Raise `NergError` for points that do not determine a similarity: too few, coincident, collinear, or not finite.
 
-    ``what``: whose points they are, for the message ('the file "pairs.csv"').
+    ``label`` names the points in the message, such as 'the file "pairs.csv"'.
     """
     for points, frame in ((source, "tracking"), (target, "place")):
         check_coordinates(points, f"{label}: points in the frame of the {frame}")
     for points, frame in ((source, "tracking"), (target, "place")):
-        why = _refused(points, upright)
-        if why:
-            raise NergError(f"{label}: {why} in the frame of the {frame}, which leaves the alignment open; pick others")
+        reason = _degeneracy(points, upright)
+        if reason:
+            raise NergError(
+                f"{label}: {reason} in the frame of the {frame}, so the alignment is undetermined; pick other points"
+            )
 
 
-def _refused(points: np.ndarray, upright: bool) -> str:
-    """Why ``points`` tell no similarity; empty where they do."""
-    least = 2 if upright else 3
-    if len(points) < least:
-        return f"there are {len(points)} pairs of points where {least} or more are needed"
-    around = points - points.mean(axis=0)
-    around = around[:, :2] if upright else around
-    size = np.linalg.svd(around, compute_uv=False)
+def _degeneracy(points: np.ndarray, upright: bool) -> str:
+    """Return why ``points`` do not determine a similarity; empty if they do."""
+    min_points = 2 if upright else 3
+    if len(points) < min_points:
+        return f"there are {len(points)} pairs of points, but {min_points} or more are needed"
+    centered = points - points.mean(axis=0)
+    centered = centered[:, :2] if upright else centered
+    size = np.linalg.svd(centered, compute_uv=False)
     if not size[0] > 1e-9 * max(1.0, float(np.abs(points).max())):
-        return f"all points lie {'above one another' if upright else 'at one place'}"
-    return "" if upright or size[1] > LINE * size[0] else "all points lie on a line"
+        return f"all points lie {'above one another' if upright else 'at one position'}"
+    return "" if upright or size[1] > MAX_LINE_RATIO * size[0] else "all points lie on a line"
 
 
-def in_plane(points: np.ndarray) -> bool:
-    """Whether ``points`` (N, 3) lie in a plane, so that a mirrored frame fits them as well."""
+def is_planar(points: np.ndarray) -> bool:
+    """Return whether ``points`` (N, 3) are coplanar, so that a mirrored frame fits as well."""
     size = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return len(size) < 3 or bool(size[2] < PLANE * size[0])
+    return len(size) < 3 or bool(size[2] < MAX_PLANE_RATIO * size[0])
 
 
-# ---- Similarities near one that is given, by seven numbers, and the derivatives of points with respect to these ----
+# ---- Local parametrisation ----
 #
-# A point x goes to c + exp(l) exp([w]) (S x - c) + t: S the given similarity, c a centre in the place, w a rotation
-# vector (radians), t a translation (units of the place), l the logarithm of a scale. The derivative of a rotated y by
-# the vector has the closed form -exp([w]) [y] Jr(w) with the right Jacobian Jr of the rotation group (J. Sola, J.
+# A point x is mapped to c + exp(l) exp([w]) (S x - c) + t, with the base similarity S, a centre c in the scene, a
+# rotation vector w (radians), a translation t (scene units) and the logarithm l of a scale. The derivative of a rotated
+# y with respect to the vector is -exp([w]) [y] Jr(w), with the right Jacobian Jr of the rotation group (J. Sola, J.
 # Deray, D. Atchuthan: A micro Lie theory for state estimation in robotics, 2018, eq. 143 and 184).
 
-ALL = np.eye(7)  # Any similarity: (w, t, l)
+FULL_BASIS = np.eye(7)  # all parameters (w, t, l)
 
 
-def upright_basis(floor: bool) -> np.ndarray:
-    """Columns (7, k) of the numbers that are left where z is up and stays up, and, with ``floor``, where nothing that
-    stands on the floor leaves it (the centre of the chart must lie on it)."""
-    return ALL[:, [2, 3, 4, 6]] if floor else ALL[:, [2, 3, 4, 5, 6]]
+def upright_basis(fix_floor: bool) -> np.ndarray:
+    """Return columns (7, k) of the parameters that keep z up and, with ``fix_floor``, keep the floor in place.
+
+    For a fixed floor, the centre of the parametrisation must lie on the floor.
+    """
+    return FULL_BASIS[:, [2, 3, 4, 6]] if fix_floor else FULL_BASIS[:, [2, 3, 4, 5, 6]]
 
 
 @dataclass(frozen=True, eq=False)
-class Chart:
-    """Similarities around ``base`` (4, 4), by ``basis`` (7, k) times a vector of k numbers."""
+class LocalSimilarity:
+    """Similarities near ``base`` (4, 4), parametrised by ``basis`` (7, k) times a vector of k numbers."""
 
     base: np.ndarray
     center: np.ndarray
-    basis: np.ndarray = field(default_factory=lambda: ALL)
+    basis: np.ndarray = field(default_factory=lambda: FULL_BASIS)
 
     @property
     def size(self) -> int:
-        """k."""
+        """Number of parameters k."""
         return self.basis.shape[1]
 
     def matrix(self, q: np.ndarray) -> np.ndarray:
-        """The similarity (4, 4) of the numbers ``q`` (k,)."""
+        """Return the similarity (4, 4) of the parameters ``q`` (k,)."""
         p = self.basis @ q
-        turn = np.exp(p[6]) * Rotation.from_rotvec(p[:3]).as_matrix()
-        step = np.eye(4)
-        step[:3, :3] = turn
-        step[:3, 3] = self.center + p[3:6] - turn @ self.center
-        return step @ self.base
+        rotation = np.exp(p[6]) * Rotation.from_rotvec(p[:3]).as_matrix()
+        update = np.eye(4)
+        update[:3, :3] = rotation
+        update[:3, 3] = self.center + p[3:6] - rotation @ self.center
+        return update @ self.base
 
     def scale(self, q: np.ndarray) -> float:
-        """Its scale."""
+        """Return the scale of the similarity."""
         return float(np.exp(self.basis[6] @ q)) * similarity_scale(self.base)
 
     def transform(self, q: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """``points`` (N, 3) in the place."""
+        """Transform ``points`` (N, 3) to the scene."""
         return transform_points(self.matrix(q), points)
 
-    def pulled(self, q: np.ndarray, moved: np.ndarray, slope: np.ndarray) -> np.ndarray:
-        """Derivatives (N, k) with respect to ``q`` of a function whose gradients at the ``moved`` points (N, 3) are
-        ``slope`` (N, 3)."""
+    def gradient(self, q: np.ndarray, moved: np.ndarray, gradients: np.ndarray) -> np.ndarray:
+        """Return derivatives (N, k) with respect to ``q`` of a function with the given gradients (N, 3) at the
+        transformed points."""
         p = self.basis @ q
-        around = moved - self.center - p[3:6]
-        turn = Rotation.from_rotvec(p[:3]).as_matrix() @ right_jacobian(p[:3])
+        offset = moved - self.center - p[3:6]
+        rotation = Rotation.from_rotvec(p[:3]).as_matrix() @ right_jacobian(p[:3])
         # R (y x v) = (R y) x (R v), and a . (b x c) = b . (c x a).
-        by = np.empty((len(moved), 7))
-        by[:, :3] = np.cross(around, slope) @ turn
-        by[:, 3:6] = slope
-        by[:, 6] = np.sum(slope * around, axis=1)
-        return by @ self.basis
+        jacobian = np.empty((len(moved), 7))
+        jacobian[:, :3] = np.cross(offset, gradients) @ rotation
+        jacobian[:, 3:6] = gradients
+        jacobian[:, 6] = np.sum(gradients * offset, axis=1)
+        return jacobian @ self.basis
 
 
 def right_jacobian(w: np.ndarray) -> np.ndarray:
-    """How exp([w]) turns when ``w`` (3,) changes: exp([w + d]) = exp([w]) exp([Jr d]) to first order, (3, 3)."""
+    """Return the right Jacobian Jr (3, 3) of the rotation vector ``w`` (3,): exp([w + d]) = exp([w]) exp([Jr d]) to
+    first order."""
     angle = float(np.linalg.norm(w))
     cross = np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
     if angle < 1e-4:

@@ -1,4 +1,4 @@
-"""Alignment from tracking alone: the first guess, the scores of heads, gaze and hit points, and mirrored axes."""
+"""Alignment from tracking alone: initial search, scores of heads, gaze and hit points, and mirrored axes."""
 
 from __future__ import annotations
 
@@ -11,218 +11,241 @@ from scipy import fft
 from scipy.stats import wilcoxon
 
 from nerg_mi.errors import NergError
-from nerg_mi.rays.direction_checks import DECLARED, AXIS_SWAPS, compute_head_frames
+from nerg_mi.rays.direction_checks import AXIS_SWAPS, DECLARED, compute_head_frames
 from nerg_mi.rays.rays import Rays
 
-from .constraints import AlignmentFit, AlignmentTarget, PlaceSurface, Progress
-from .icp import AtZero, GazeEnds, HeadHeight, RefinedAlignment, Score, groups_of, refine
-from .similarity import ALL, MIRROR, transform_points, similarity_scale, upright_basis
+from .constraints import AlignmentFit, AlignmentTarget, ProgressCallback, SceneSurface
+from .icp import GazeEnds, HeadHeight, RefinedAlignment, Score, ZeroDistance, independent_groups, refine
+from .similarity import FULL_BASIS, MIRROR, similarity_scale, transform_points, upright_basis
 
-# ---- Flips ----
+# ---- Flipped axes ----
 #
-# Directions with an axis negated, told by the points of a place: gaze goes to what is there, a mirrored one beside it.
+# Detects directions with a negated axis by the points of a scene: gaze is directed at objects, mirrored gaze is not.
 #
-# Rooms are closed: nearly every ray ends on a surface, negated or not. But points, as cameras triangulate them, lie on
-# what there is to see, and gaze passes within a fraction of a degree of one.
+# Rooms are closed, so nearly every ray meets a surface, flipped or not. But triangulated points lie on visible
+# features, and gaze passes within a fraction of a degree of one.
 
-MAX_RAYS, POINTS = 400, 100_000  # So many rays are looked at, and so many points
+MAX_RAYS, MAX_POINTS = 400, 100_000  # maximum numbers of rays and of points
 
-# A flip is told where it is so much better at the median, and better in more rays than chance would have it.
-_BETTER, _CHANCE = 0.75, 1e-4
-_FEWEST = 30
+# A flip is reported below this ratio of median angles and this p-value.
+_FLIP_RATIO, _FLIP_P_VALUE = 0.75, 1e-4
+_MIN_FLIP_RAYS = 30
 
 
 @dataclass(frozen=True, eq=False)
-class Flips:
-    """``degrees``: by the name of what is negated, the angle (N,) from each ray to the nearest point."""
+class AxisFlips:
+    """Angles in degrees (N,) from each ray to the nearest point, by the name of the flip."""
 
     degrees: dict[str, np.ndarray]
 
     def warning(self) -> str | None:
-        """A sentence where gaze is nearer to the points with an axis negated than `DECLARED`; None elsewhere."""
+        """Return a message if gaze is closer to the points with a flip than as declared, else None."""
         declared = self.degrees[DECLARED]
-        if len(declared) < _FEWEST:
+        if len(declared) < _MIN_FLIP_RAYS:
             return None
         best = min(self.degrees, key=lambda name: float(np.median(self.degrees[name])))
-        there, here = float(np.median(self.degrees[best])), float(np.median(declared))
-        if best == DECLARED or there > _BETTER * here:
+        best_median, declared_median = float(np.median(self.degrees[best])), float(np.median(declared))
+        if best == DECLARED or best_median > _FLIP_RATIO * declared_median:
             return None
-        _, chance = wilcoxon(self.degrees[best], declared, alternative="less")
-        if cast("float", chance) > _CHANCE:
+        _, p_value = wilcoxon(self.degrees[best], declared, alternative="less")
+        if cast("float", p_value) > _FLIP_P_VALUE:
             return None
         return (
-            f"the gaze passes {here:.2g} degrees from the nearest point of the place (median), and {there:.2g} with "
+            f"the gaze passes {declared_median:.2g} degrees from the nearest point of the scene (median), but {best_median:.2g} with "
             f"{best}: check the axes of the directions at the import (--hand, --forward, or a sign in --map)"
         )
 
 
 def compare_flips(
     points: np.ndarray, matrix: np.ndarray, origin: np.ndarray, direction: np.ndarray, head: np.ndarray | None = None
-) -> Flips:
-    """How near gaze comes to ``points`` (M, 3) of a place, as it is and with an axis negated.
+) -> AxisFlips:
+    """Measure how close gaze comes to the points of a scene, as declared and with an axis negated.
 
-    ``matrix``: similarity (4, 4) from the tracking to the place; ``origin``, ``direction`` (N, 3), unit, and ``head``
-    (N, 3), where heads point or None where nobody knows, of the tracking, z up. Negated are the axes of the tracking,
-    and, where heads are known, left and right or up and down in the head. Rays and points beyond `RAYS` and `POINTS`
-    are left out, at random.
+    Axes of the tracking are negated and, if head directions are known, left and right or up and down in the head.
+
+    Parameters
+    ----------
+    points
+        Points of the scene, (M, 3).
+    matrix
+        Similarity (4, 4) from the tracking to the scene.
+    origin, direction, head
+        Origins, unit gaze directions and head directions (N, 3) of the tracking, z up; ``head`` is None if unknown.
     """
     rng = np.random.default_rng(0)
-    some = rng.permutation(len(origin))[:MAX_RAYS]
-    points = points[rng.permutation(len(points))[:POINTS]]
-    origin, direction = transform_points(matrix, origin[some]), direction[some]
-    turn = matrix[:3, :3] / similarity_scale(matrix)
-    kinds = {DECLARED: direction}
-    kinds |= {f"{'xyz'[k]} of the directions negated": direction * np.where(np.arange(3) == k, -1, 1) for k in range(3)}
+    subset = rng.permutation(len(origin))[:MAX_RAYS]
+    points = points[rng.permutation(len(points))[:MAX_POINTS]]
+    origin, direction = transform_points(matrix, origin[subset]), direction[subset]
+    rotation = matrix[:3, :3] / similarity_scale(matrix)
+    variants = {DECLARED: direction}
+    variants |= {
+        f"{'xyz'[k]} of the directions negated": direction * np.where(np.arange(3) == k, -1, 1) for k in range(3)
+    }
     if head is not None:
-        known = np.all(np.isfinite(head[some]), axis=1, keepdims=True)
-        frames = compute_head_frames(head[some])
-        own = np.einsum("nij,nj->ni", frames, direction)
+        is_known = np.all(np.isfinite(head[subset]), axis=1, keepdims=True)
+        frames = compute_head_frames(head[subset])
+        local = np.einsum("nij,nj->ni", frames, direction)
         for what, signs in AXIS_SWAPS.items():
-            mirrored = np.einsum("nij,ni->nj", frames, own * signs)
-            kinds[f"{what} of the eyes exchanged"] = np.where(known, mirrored, direction)
-    turned = np.stack([kind @ turn.T for kind in kinds.values()], axis=1)
-    found = np.empty(turned.shape[:2])
-    for k, (eye, ways) in enumerate(zip(origin, turned)):
-        to = points - eye
-        to = to / np.maximum(np.linalg.norm(to, axis=1, keepdims=True), 1e-12)
-        # By the chord: the arc of a cosine loses small angles.
-        nearest = to[np.argmax(to @ ways.T, axis=0)]
-        found[k] = np.degrees(2 * np.arcsin(np.minimum(np.linalg.norm(nearest - ways, axis=1) / 2, 1)))
-    return Flips(dict(zip(kinds, found.T)))
+            mirrored = np.einsum("nij,ni->nj", frames, local * signs)
+            variants[f"{what} of the eyes exchanged"] = np.where(is_known, mirrored, direction)
+    rotated = np.stack([kind @ rotation.T for kind in variants.values()], axis=1)
+    angles = np.empty(rotated.shape[:2])
+    for k, (eye, directions) in enumerate(zip(origin, rotated)):
+        to_points = points - eye
+        to_points = to_points / np.maximum(np.linalg.norm(to_points, axis=1, keepdims=True), 1e-12)
+        # The chord is accurate for small angles; arccos is not.
+        nearest = to_points[np.argmax(to_points @ directions.T, axis=0)]
+        angles[k] = np.degrees(2 * np.arcsin(np.minimum(np.linalg.norm(nearest - directions, axis=1) / 2, 1)))
+    return AxisFlips(dict(zip(variants, angles.T)))
 
 
 # ---- Search ----
 #
-# Where tracking lies in a place, from nothing but the tracking, where up and the floor are known: the first guess.
+# Initial placement from the tracking alone, for known up direction and floor.
 #
-# For every turn about the vertical and every scale, all shifts at once: hit points are counted on the place's lattice
-# and correlated, by fast Fourier transforms level by level, with how near its surfaces are; heads likewise with free
-# space.
+# For every rotation about the vertical axis and every scale, all shifts are scored at once: hit points are binned on a
+# lattice and correlated, by fast Fourier transforms per level, with the proximity to surfaces, and heads with the
+# proximity to free space.
 
-NEAR = 0.25  # Metres within which a hit point counts as on a surface, at this stage
-_TURNS, _CELLS, _KEPT = 36, 48, 16
-_MOST = 4000
+HIT_DISTANCE = 0.25  # tolerance in metres of hit points on surfaces during the search
+_NUM_ROTATIONS, _NUM_CELLS, _MAX_GUESSES = 36, 48, 16
+_MAX_SEARCH_POINTS = 4000
 
 
 @dataclass(frozen=True, eq=False)
 class Guess:
-    """``matrix`` (4, 4) from the tracking to the place, and its score, 1 where all is well."""
+    """A similarity (4, 4) from the tracking to the scene, with its score (1 is best)."""
 
     matrix: np.ndarray
     score: float
 
 
-def scale_range(surface: PlaceSurface, points: np.ndarray) -> np.ndarray:
-    """Scales to be tried for ``points`` (N, 3) that lie on surfaces: from what lets them fill the place, down to a
-    third of it, since people may have walked in a part of it; in steps of eight percent."""
+def candidate_scales(surface: SceneSurface, points: np.ndarray) -> np.ndarray:
+    """Return candidate scales for ``points`` (N, 3) on surfaces.
+
+    They range from the scale at which the points fill the scene down to a third of it, in steps of eight percent, since
+    participants may have visited only a part of the scene.
+    """
     size = lambda p: float(np.linalg.norm(np.subtract(*np.percentile(p, [98, 2], axis=0))[:2]))
-    most = 1.25 * size(surface.points) / max(size(points), 1e-9)
-    return most / 1.08 ** np.arange(15)
+    max_scale = 1.25 * size(surface.points) / max(size(points), 1e-9)
+    return max_scale / 1.08 ** np.arange(15)
 
 
 def search_placements(
-    surface: PlaceSurface,
+    surface: SceneSurface,
     hits: np.ndarray,
-    free: np.ndarray,
+    free_points: np.ndarray,
     scales: Sequence[float] | np.ndarray,
     floor_heights: tuple[float, float],
-    turns: int = _TURNS,
-    max_guesses: int = _KEPT,
+    num_rotations: int = _NUM_ROTATIONS,
+    max_guesses: int = _MAX_GUESSES,
 ) -> list[Guess]:
-    """The best guesses, best first.
+    """Return the best placements, best first.
 
-    ``hits`` (N, 3), which may be none, and ``free`` (M, 3), heads and what gaze passes, in the frame of the tracking;
-    ``floor``: its height there and in the place.
+    Parameters
+    ----------
+    surface
+        Surface of the scene.
+    hits, free_points
+        Hit points (N, 3), possibly none, and points in free space (M, 3), in the frame of the tracking.
+    scales
+        Candidate scales.
+    floor_heights
+        Height of the floor in the tracking and in the scene.
+    num_rotations
+        Number of rotations about the vertical axis.
+    max_guesses
+        Maximum number of results.
     """
     rng = np.random.default_rng(0)
-    some = lambda p: p[rng.permutation(len(p))[:_MOST]]
-    hits, free = some(hits), some(free)
-    found: list[Guess] = []
+    draw = lambda p: p[rng.permutation(len(p))[:_MAX_SEARCH_POINTS]]
+    hits, free_points = draw(hits), draw(free_points)
+    guesses: list[Guess] = []
     low, high = surface.distance.lower, surface.distance.upper
     for scale in scales:
-        maps = _Maps(surface, low, high, scale)
-        for angle in 2 * np.pi * np.arange(turns) / turns:
-            found += maps.best(hits, free, angle, floor_heights)
-    found.sort(key=lambda g: -g.score)
-    return _apart(found, max_guesses, 0.05 * surface.diagonal)
+        maps = _CorrelationMaps(surface, low, high, scale)
+        for angle in 2 * np.pi * np.arange(num_rotations) / num_rotations:
+            guesses += maps.best(hits, free_points, angle, floor_heights)
+    guesses.sort(key=lambda g: -g.score)
+    return _distinct_guesses(guesses, max_guesses, 0.05 * surface.diagonal)
 
 
-class _Maps:
-    """A place on a coarse lattice, for one scale: what a point of either kind is worth in each cell."""
+class _CorrelationMaps:
+    """Scores of surface points and free points on a coarse lattice, for one scale."""
 
-    def __init__(self, surface: PlaceSurface, low: np.ndarray, high: np.ndarray, scale: float):
+    def __init__(self, surface: SceneSurface, low: np.ndarray, high: np.ndarray, scale: float):
         self.scale, self.low = scale, low
-        self.cell = float(np.max((high - low)[:2])) / _CELLS
+        self.cell = float(np.max((high - low)[:2])) / _NUM_CELLS
         self.shape = np.maximum(np.ceil((high - low) / self.cell).astype(int), 1)
         nodes = np.stack(np.meshgrid(*(np.arange(n) for n in self.shape), indexing="ij"), axis=-1)
         nodes = low + self.cell * (nodes.reshape(-1, 3) + 0.5)
-        wide = max(NEAR * scale, 0.7 * self.cell)
-        on = np.exp(-0.5 * (surface.distance.interpolate(nodes) / wide) ** 2)
-        open_ = np.exp(-0.5 * (surface.blocked.interpolate(nodes) / wide) ** 2)
-        # Twice as wide, so that what leaves it on one side does not come in on the other.
+        width = max(HIT_DISTANCE * scale, 0.7 * self.cell)
+        surface_score = np.exp(-0.5 * (surface.distance.interpolate(nodes) / width) ** 2)
+        free_score = np.exp(-0.5 * (surface.free_space_distance.interpolate(nodes) / width) ** 2)
+        # Zero padding prevents wrap-around.
         next_length: Any = fft.next_fast_len  # the stubs know no result
         self.size = [next_length(2 * int(n), real=True) for n in self.shape[:2]]
-        levels = lambda v: np.asarray(fft.rfft2(_by_level(v.reshape(self.shape)), self.size, axes=(1, 2)))
-        self.on, self.open = levels(on), levels(open_)
+        levels = lambda v: np.asarray(fft.rfft2(_levels_first(v.reshape(self.shape)), self.size, axes=(1, 2)))
+        self.surface_maps, self.free_maps = levels(surface_score), levels(free_score)
 
     def best(self, hits: np.ndarray, free: np.ndarray, angle: float, floor: tuple[float, float]) -> list[Guess]:
-        """The best shifts of a turn."""
+        """Return the best shifts for one rotation."""
         cos, sin = np.cos(angle), np.sin(angle)
-        turn = self.scale * np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
-        lift = floor[1] - self.scale * floor[0]
+        rotation = self.scale * np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
+        offset_z = floor[1] - self.scale * floor[0]
         corner = None
         total = np.zeros(self.size)
-        for points, maps in ((hits, self.on), (free, self.open)):
+        for points, maps in ((hits, self.surface_maps), (free, self.free_maps)):
             if not len(points):
                 continue
-            moved = points @ turn.T + (0, 0, lift)
+            moved = points @ rotation.T + (0, 0, offset_z)
             if corner is None:
-                corner = np.percentile(np.concatenate([moved, free @ turn.T + (0, 0, lift)])[:, :2], 1, axis=0)
+                corner = np.percentile(np.concatenate([moved, free @ rotation.T + (0, 0, offset_z)])[:, :2], 1, axis=0)
             total += self._correlation(moved, corner, maps)
         assert corner is not None
         parts = (len(hits) > 0) + (len(free) > 0)
         out = []
         for _ in range(2):
-            at = np.array(np.unravel_index(int(np.argmax(total)), total.shape))
-            score = float(total[tuple(at)]) / parts
-            shift = np.where(at > np.array(self.size) // 2, at - self.size, at) * self.cell
+            index = np.array(np.unravel_index(int(np.argmax(total)), total.shape))
+            score = float(total[tuple(index)]) / parts
+            shift = np.where(index > np.array(self.size) // 2, index - self.size, index) * self.cell
             matrix = np.eye(4)
-            matrix[:3, :3] = turn
-            matrix[:3, 3] = *(self.low[:2] + shift - corner), lift
+            matrix[:3, :3] = rotation
+            matrix[:3, 3] = *(self.low[:2] + shift - corner), offset_z
             out.append(Guess(matrix, score))
-            # The next one is another one.
-            rows, columns = ((at[a] + np.arange(-3, 4)) % self.size[a] for a in (0, 1))
+            # Suppress the neighbourhood, so that the next maximum is a different placement.
+            rows, columns = ((index[a] + np.arange(-3, 4)) % self.size[a] for a in (0, 1))
             total[np.ix_(rows, columns)] = -1
         return out
 
     def _correlation(self, moved: np.ndarray, corner: np.ndarray, maps: np.ndarray) -> np.ndarray:
-        """Mean worth of points for every shift of ``corner`` to a cell."""
+        """Return the mean score of the points for every shift."""
         index = np.floor((moved - (*corner, self.low[2])) / self.cell).astype(int)
-        # Beyond the lattice, and in cells that wrap around, nothing is worth anything.
+        # Points outside the lattice score 0.
         inside = ((index >= (0, 0, 0)) & (index < (*self.shape[:2], self.shape[2]))).all(axis=1)
         flat = np.ravel_multi_index(tuple(index[inside].T), self.shape)
         count = np.bincount(flat, minlength=int(np.prod(self.shape))).reshape(self.shape)
-        spectrum = np.asarray(fft.rfft2(_by_level(count), self.size, axes=(1, 2)))
+        spectrum = np.asarray(fft.rfft2(_levels_first(count), self.size, axes=(1, 2)))
         joint = np.einsum("zxy,zxy->xy", np.conj(spectrum), maps)
         return np.asarray(fft.irfft2(joint, self.size)) / max(len(moved), 1)
 
 
-def _by_level(values: np.ndarray) -> np.ndarray:
-    """(nx, ny, nz) as (nz, nx, ny); single precision is enough for a guess."""
+def _levels_first(values: np.ndarray) -> np.ndarray:
+    """Reorder (nx, ny, nz) to (nz, nx, ny) in single precision."""
     return np.ascontiguousarray(np.moveaxis(values, 2, 0), np.float32)
 
 
 def is_close(a: np.ndarray, b: np.ndarray, distance: float) -> bool:
-    """Whether two similarities (4, 4) are of the same placement: within a ``distance`` in the place, and a fifth of
-    turn and scale."""
-    turned = np.linalg.norm(a[:3, :3] - b[:3, :3]) < 0.2 * np.linalg.norm(b[:3, :3])
-    return bool(turned and np.linalg.norm(a[:3, 3] - b[:3, 3]) < distance)
+    """Return whether two similarities are the same placement: within ``distance`` in the scene, and within a fifth
+    in rotation and scale."""
+    is_same_rotation = np.linalg.norm(a[:3, :3] - b[:3, :3]) < 0.2 * np.linalg.norm(b[:3, :3])
+    return bool(is_same_rotation and np.linalg.norm(a[:3, 3] - b[:3, 3]) < distance)
 
 
-def _apart(found: list[Guess], count: int, distance: float) -> list[Guess]:
-    """The first ``count`` that are not close to a better one."""
+def _distinct_guesses(guesses: list[Guess], count: int, distance: float) -> list[Guess]:
+    """Return the first ``count`` guesses that are not close to a better one."""
     out: list[Guess] = []
-    for guess in found:
+    for guess in guesses:
         if not any(is_close(guess.matrix, o.matrix, distance) for o in out):
             out.append(guess)
         if len(out) == count:
@@ -232,205 +255,229 @@ def _apart(found: list[Guess], count: int, distance: float) -> list[Guess]:
 
 # ---- Tracking ----
 #
-# Alignment from the tracking alone: heads in free space above the floor, gaze that ends on surfaces, hit points on
-# them.
+# Alignment from the tracking alone: heads are in free space above the floor, gaze ends on surfaces, hit points lie on
+# surfaces.
 
-MAX_SAMPLES = 4000  # Rays that are looked at, evenly chosen over people
-_FEW = 400
-# Gaze without hit points is looked along for one of so many rays: it tells little, and takes long.
-_SPARED = 5
-# Of the way to a hit point; the last tenth may graze what it ends on.
-_ALONG = 0.4, 0.8
-# Gaze without a hit point is free for so many metres.
-_ARM = 0.2, 0.4
-# A mirrored tracking is told where it is so much better, and a rival placement where it is almost as good.
-_CLEAR, _RIVAL = 0.75, 1.15
+MAX_SAMPLES = 4000  # maximum number of samples
+_NUM_COARSE = 400
+# Stride of the samples without hit points, which are expensive and carry little information.
+_GAZE_STRIDE = 5
+# Fractions of the path to a hit point that are tested for free space; the last part may graze the surface.
+_FREE_FRACTIONS = 0.4, 0.8
+# Distances in metres along gaze without a hit point that are tested for free space.
+_FREE_LENGTHS = 0.2, 0.4
+# Cost ratio below which a mirrored tracking is reported, and below which another placement is reported.
+_MIRROR_RATIO, _RIVAL_RATIO = 0.75, 1.15
 
 
 @dataclass(frozen=True, eq=False)
 class Tracking:
-    """``rays`` of attention, z up, metres; ``start``: a similarity (4, 4) to the place that is refined, None: it is
-    looked for."""
+    """Gaze samples, z up, in metres, and an initial similarity (4, 4) to refine; None: search for it."""
 
     rays: Rays
     initial: np.ndarray | None = None
 
     kind = "tracking"
 
-    def fit(self, target: AlignmentTarget, progress: Progress) -> AlignmentFit:
-        """The best placement. Raises `NergError` where the rays leave it open."""
-        some = _sample(self.rays)
+    def fit(self, target: AlignmentTarget, progress: ProgressCallback) -> AlignmentFit:
+        """Find the best placement. Raises `NergError` if the samples do not determine it."""
+        sample = _draw_sample(self.rays)
         if self.initial is not None:
             progress(0.5, "refining")
-            coarse = _refined(some, target, target.to_z_up @ self.initial, 3.0, 30)
-            return self._fit_of(_refined(some, target, coarse.matrix, 1.0, 60), some, target, [], None)
+            coarse = _refine_sample(sample, target, target.to_z_up @ self.initial, 3.0, 30)
+            return self._make_fit(_refine_sample(sample, target, coarse.matrix, 1.0, 60), sample, target, [], None)
         if not target.is_upright:
             raise NergError(
-                "from the tracking alone only its turn about the vertical is looked for: say which way is up in the "
-                "place (--up), or give other evidence (--pairs, --twin, --cameras)"
+                "an alignment from the tracking alone needs the up direction of the scene: give --up, or other evidence "
+                "(--pairs, --tracking-surface, --tracking-cameras)"
             )
         if target.tracking_floor is None:
-            raise NergError("from the tracking alone the height of its floor must be known; give it with --floor")
-        if target.scale is None and not len(some.hits):
             raise NergError(
-                "rays without hit points do not tell how large the place is: give --scale (1 where the place is in "
-                "metres), or other evidence (--pairs)"
+                "an alignment from the tracking alone needs the height of the floor in the tracking; give it with --floor-height"
             )
-        progress(0.1, "looking for the place of the tracking")
-        proper = _searched(some, target)
-        if not len(some.hits):
-            # Free space has room for many placements, mirrored ones too: heads cannot tell them apart.
-            return self._fit_of(proper[0], some, target, [], None)
-        progress(0.55, "looking for the place of the mirrored tracking")
-        mirrored = _searched(some.mirrored(), target)
-        doubts = []
-        for other in proper[1:]:
-            alike = is_close(proper[0].matrix, other.matrix, 0.05 * target.surface.diagonal)
-            if not alike and other.cost < _RIVAL * proper[0].cost:
-                doubts.append(
-                    f"another placement agrees almost as well (cost {other.cost:.3f}, the best {proper[0].cost:.3f}): "
-                    "the place may look alike from two sides; settle it with picked points (--pairs)"
+        if target.scale is None and not len(sample.hits):
+            raise NergError(
+                "samples without hit points do not determine the scale: give --scale (1 if the scene is in metres), or "
+                "other evidence (--pairs)"
+            )
+        progress(0.1, "searching the placement of the tracking")
+        placements = _search_and_refine(sample, target)
+        if not len(sample.hits):
+            # Heads alone do not distinguish a placement from its mirror image.
+            return self._make_fit(placements[0], sample, target, [], None)
+        progress(0.55, "searching the placement of the mirrored tracking")
+        mirrored = _search_and_refine(sample.mirrored(), target)
+        warnings = []
+        for other in placements[1:]:
+            is_same = is_close(placements[0].matrix, other.matrix, 0.05 * target.surface.diagonal)
+            if not is_same and other.cost < _RIVAL_RATIO * placements[0].cost:
+                warnings.append(
+                    f"another placement agrees almost as well (cost {other.cost:.3f}, the best {placements[0].cost:.3f}): "
+                    "the scene may be symmetric; use picked points (--pairs) to decide"
                 )
                 break
-        sentence = None
-        if mirrored[0].cost < _CLEAR * proper[0].cost:
-            sentence = (
-                f"with an axis of the tracking negated it agrees with the place (cost {mirrored[0].cost:.3f}), and as "
-                f"it is it does not (cost {proper[0].cost:.3f})"
+        mirror_warning = None
+        if mirrored[0].cost < _MIRROR_RATIO * placements[0].cost:
+            mirror_warning = (
+                f"the tracking agrees better with the scene if an axis is negated (cost {mirrored[0].cost:.3f}) than as "
+                f"it is (cost {placements[0].cost:.3f})"
             )
-        return self._fit_of(proper[0], some, target, doubts, sentence)
+        return self._make_fit(placements[0], sample, target, warnings, mirror_warning)
 
-    def _fit_of(
-        self, best: RefinedAlignment, some: _Sample, target: AlignmentTarget, doubts: list[str], mirrored: str | None
+    def _make_fit(
+        self,
+        best: RefinedAlignment,
+        sample: _Sample,
+        target: AlignmentTarget,
+        warnings: list[str],
+        mirrored: str | None,
     ) -> AlignmentFit:
-        surface, s = target.surface, similarity_scale(best.matrix)
-        points = some.hits if len(some.hits) else some.heads
-        grid = surface.distance if len(some.hits) else surface.blocked
-        off = grid.interpolate(transform_points(best.matrix, points)) / s
+        surface, scale = target.surface, similarity_scale(best.matrix)
+        points = sample.hits if len(sample.hits) else sample.heads
+        grid = surface.distance if len(sample.hits) else surface.free_space_distance
+        distance = grid.interpolate(transform_points(best.matrix, points)) / scale
         degrees = np.zeros(0)
-        if len(some.hits):
-            way = np.linalg.norm(some.hits - some.hit_heads, axis=1)
-            degrees = np.degrees(np.arctan2(off, np.maximum(way, 1e-6)))
-        inside = surface.blocked.interpolate(transform_points(best.matrix, some.heads)) / s
-        about = {
+        if len(sample.hits):
+            length = np.linalg.norm(sample.hits - sample.hit_heads, axis=1)
+            degrees = np.degrees(np.arctan2(distance, np.maximum(length, 1e-6)))
+        solid_depth = surface.free_space_distance.interpolate(transform_points(best.matrix, sample.heads)) / scale
+        metadata = {
             "rays": len(self.rays),
-            "looked_at": len(some.heads),
-            "hits": len(some.hits),
+            "looked_at": len(sample.heads),
+            "hits": len(sample.hits),
             "cost": best.cost,
-            "heads_in_solids": float((inside > 0.1).mean()),
+            "heads_in_solids": float((solid_depth > 0.1).mean()),
         }
         notes = [
-            f"{len(some.heads):,} heads, of which {100 * (inside > 0.1).mean():.1f} % are more than 10 cm inside of "
-            f"something; {len(some.hits):,} hit points"
+            f"{len(sample.heads):,} heads, of which {100 * (solid_depth > 0.1).mean():.1f} % are more than 10 cm inside solid "
+            f"objects; {len(sample.hits):,} hit points"
         ]
-        if not len(some.hits):
-            doubts = [*doubts, "without hit points only heads tell: look at the picture before you trust it"]
+        if not len(sample.hits):
+            warnings = [*warnings, "without hit points the alignment rests on head positions only: check the figure"]
         return AlignmentFit(
-            target.to_place(best.matrix),
-            100 * off,
+            target.to_scene_frame(best.matrix),
+            100 * distance,
             degrees,
-            # Heads alone may be moved about in free space at no cost, of which derivatives know nothing.
-            best.covariance if len(some.hits) else None,
+            # Heads can move in free space at no cost, which derivatives do not show.
+            best.covariance if len(sample.hits) else None,
             mirrored,
             points,
             None,
-            about,
+            metadata,
             notes,
-            doubts,
+            warnings,
         )
 
 
 @dataclass(frozen=True, eq=False)
 class _Sample:
-    """Some of the rays: ``heads`` (N, 3) with their ``directions`` and ``group`` (N,), the ``hits`` (M, 3) that the
-    heads ``at`` (M,) look at, and points (K, 3) that the gaze of the heads ``of`` (K,) ``passed``."""
+    """A subset of the samples.
+
+    ``heads``, ``directions`` (N, 3) and ``group`` (N,); ``hits`` (M, 3) with the index of their heads (M,); points in
+    free space on the gaze paths, (K, 3), with the index of their heads (K,).
+    """
 
     heads: np.ndarray
     directions: np.ndarray
     group: np.ndarray
     hits: np.ndarray
-    at: np.ndarray
-    passed: np.ndarray
-    of: np.ndarray
+    hit_head_index: np.ndarray
+    free_points: np.ndarray
+    free_head_index: np.ndarray
 
     @property
     def hit_heads(self) -> np.ndarray:
-        """Where each hit point was looked at from, (M, 3)."""
-        return self.heads[self.at]
+        """Head position of each hit point, (M, 3)."""
+        return self.heads[self.hit_head_index]
 
     def mirrored(self) -> _Sample:
-        """The same in a mirror."""
-        moved = {k: transform_points(MIRROR, getattr(self, k)) for k in ("heads", "directions", "hits", "passed")}
+        """Return the mirrored sample."""
+        moved = {k: transform_points(MIRROR, getattr(self, k)) for k in ("heads", "directions", "hits", "free_points")}
         return replace(self, **moved)
 
-    def few(self, count: int) -> _Sample:
-        """Fewer of them."""
-        kept = np.arange(0, len(self.heads), max(1, len(self.heads) // count))
-        new = np.full(len(self.heads), -1)
-        new[kept] = np.arange(len(kept))
-        hit, way = new[self.at] >= 0, new[self.of] >= 0
+    def subsample(self, count: int) -> _Sample:
+        """Return about ``count`` of the heads with their points."""
+        chosen = np.arange(0, len(self.heads), max(1, len(self.heads) // count))
+        new_index = np.full(len(self.heads), -1)
+        new_index[chosen] = np.arange(len(chosen))
+        has_hit_head, has_head = new_index[self.hit_head_index] >= 0, new_index[self.free_head_index] >= 0
         return _Sample(
-            self.heads[kept],
-            self.directions[kept],
-            self.group[kept],
-            self.hits[hit],
-            new[self.at[hit]],
-            self.passed[way],
-            new[self.of[way]],
+            self.heads[chosen],
+            self.directions[chosen],
+            self.group[chosen],
+            self.hits[has_hit_head],
+            new_index[self.hit_head_index[has_hit_head]],
+            self.free_points[has_head],
+            new_index[self.free_head_index[has_head]],
         )
 
     def scores(self, target: AlignmentTarget) -> list[Score]:
-        """What is known of them in the place; free space is not, where the place is bare points."""
+        """Return the scores of the sample; those of free space are omitted if it is unknown."""
         surface = target.surface
-        out: list[Score] = [HeadHeight(target.place_level, self.heads, self.group)] if target.is_upright else []
+        out: list[Score] = [HeadHeight(target.floor_height, self.heads, self.group)] if target.is_upright else []
         if len(self.hits):
-            out.append(AtZero(surface.distance, self.hits, self.group[self.at], "hit points on surfaces"))
+            out.append(
+                ZeroDistance(surface.distance, self.hits, self.group[self.hit_head_index], "hit points on surfaces")
+            )
         else:
-            some = slice(None, None, _SPARED)
-            out.append(GazeEnds(surface, self.heads[some], self.directions[some], self.group[some]))
-        if surface.bounded:
-            out.append(AtZero(surface.blocked, self.heads, self.group, "heads in free space"))
-            out.append(AtZero(surface.blocked, self.passed, self.group[self.of], "gaze through free space"))
+            stride = slice(None, None, _GAZE_STRIDE)
+            out.append(GazeEnds(surface, self.heads[stride], self.directions[stride], self.group[stride]))
+        if surface.has_free_space:
+            out.append(ZeroDistance(surface.free_space_distance, self.heads, self.group, "heads in free space"))
+            out.append(
+                ZeroDistance(
+                    surface.free_space_distance,
+                    self.free_points,
+                    self.group[self.free_head_index],
+                    "gaze through free space",
+                )
+            )
         return out
 
 
-def _sample(rays: Rays) -> _Sample:
+def _draw_sample(rays: Rays) -> _Sample:
     if not len(rays):
-        raise NergError("there are no rays to align; give a file that holds some")
+        raise NergError("there are no gaze samples to align; give a file with samples")
     rng = np.random.default_rng(0)
-    # Everybody counts as much as they were there, and strays of the tracker are chosen as seldom as they are.
-    kept = np.sort(rng.permutation(len(rays))[:MAX_SAMPLES])
-    heads, directions = rays.origin[kept], rays.direction[kept]
-    group = groups_of(rays.person[kept], rays.t[kept])
-    known = np.zeros(len(kept), bool) if rays.hit is None else np.isfinite(rays.hit[kept]).all(axis=1)
-    at = np.flatnonzero(known)
-    hits = np.zeros((0, 3)) if rays.hit is None else rays.hit[kept][known]
-    way = hits - heads[at]
-    arm = np.flatnonzero(~known)
-    passed = [heads[at] + a * way for a in _ALONG] + [heads[arm] + a * directions[arm] for a in _ARM]
-    of = np.concatenate([at] * len(_ALONG) + [arm] * len(_ARM))
-    return _Sample(heads, directions, group, hits, at, np.concatenate(passed), of)
+    # A uniform subset preserves the participants' recorded time and the frequency of outliers.
+    chosen = np.sort(rng.permutation(len(rays))[:MAX_SAMPLES])
+    heads, directions = rays.origin[chosen], rays.direction[chosen]
+    group = independent_groups(rays.person[chosen], rays.t[chosen])
+    has_hit = np.zeros(len(chosen), bool) if rays.hit is None else np.isfinite(rays.hit[chosen]).all(axis=1)
+    hit_rows = np.flatnonzero(has_hit)
+    hits = np.zeros((0, 3)) if rays.hit is None else rays.hit[chosen][has_hit]
+    to_hit = hits - heads[hit_rows]
+    miss_rows = np.flatnonzero(~has_hit)
+    free_points = [heads[hit_rows] + a * to_hit for a in _FREE_FRACTIONS] + [
+        heads[miss_rows] + a * directions[miss_rows] for a in _FREE_LENGTHS
+    ]
+    free_head_index = np.concatenate([hit_rows] * len(_FREE_FRACTIONS) + [miss_rows] * len(_FREE_LENGTHS))
+    return _Sample(heads, directions, group, hits, hit_rows, np.concatenate(free_points), free_head_index)
 
 
-def _searched(some: _Sample, target: AlignmentTarget) -> list[RefinedAlignment]:
-    """The best placements, best first."""
+def _search_and_refine(sample: _Sample, target: AlignmentTarget) -> list[RefinedAlignment]:
+    """Return the best placements, best first."""
     assert target.tracking_floor is not None
-    surface, floor = target.surface, (target.tracking_floor, target.place_level)
-    free = np.concatenate([some.heads, some.passed]) if surface.bounded else some.heads
-    scales = np.array([target.scale]) if target.scale is not None else scale_range(surface, some.hits)
-    guesses: list[Guess] = search_placements(surface, some.hits, free, scales, floor)
-    few = some.few(_FEW)
-    found = [_refined(few, target, g.matrix, 4.0, 12) for g in guesses]
-    found = [_refined(few, target, f.matrix, 1.5, 20) for f in sorted(found, key=lambda f: f.cost)[:6]]
-    last = [_refined(some, target, f.matrix, 1.0, 30) for f in sorted(found, key=lambda f: f.cost)[:2]]
-    return sorted(last, key=lambda f: f.cost)
+    surface, floor = target.surface, (target.tracking_floor, target.floor_height)
+    free = np.concatenate([sample.heads, sample.free_points]) if surface.has_free_space else sample.heads
+    scales = np.array([target.scale]) if target.scale is not None else candidate_scales(surface, sample.hits)
+    guesses: list[Guess] = search_placements(surface, sample.hits, free, scales, floor)
+    subsample = sample.subsample(_NUM_COARSE)
+    placements = [_refine_sample(subsample, target, g.matrix, 4.0, 12) for g in guesses]
+    placements = [
+        _refine_sample(subsample, target, f.matrix, 1.5, 20) for f in sorted(placements, key=lambda f: f.cost)[:6]
+    ]
+    final = [_refine_sample(sample, target, f.matrix, 1.0, 30) for f in sorted(placements, key=lambda f: f.cost)[:2]]
+    return sorted(final, key=lambda f: f.cost)
 
 
-def _refined(some: _Sample, target: AlignmentTarget, base: np.ndarray, wide: float, most: int) -> RefinedAlignment:
-    center = transform_points(base, np.median(some.heads, axis=0))
+def _refine_sample(
+    sample: _Sample, target: AlignmentTarget, base: np.ndarray, scale_factor: float, max_evaluations: int
+) -> RefinedAlignment:
+    center = transform_points(base, np.median(sample.heads, axis=0))
     if target.is_upright and target.tracking_floor is not None:
-        center[2] = target.place_level
-    basis = upright_basis(target.tracking_floor is not None) if target.is_upright else ALL
+        center[2] = target.floor_height
+    basis = upright_basis(target.tracking_floor is not None) if target.is_upright else FULL_BASIS
     if target.scale is not None:
         basis = basis[:, :-1]
-    return refine(some.scores(target), base, center, basis, wide, most)
+    return refine(sample.scores(target), base, center, basis, scale_factor, max_evaluations)

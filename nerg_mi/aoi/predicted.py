@@ -1,5 +1,5 @@
-"""What a gaze field predicts of areas: for people where they stood, for places where nobody was tracked, after a
-change, and how far it is to be trusted."""
+"""Predicted attention on AOIs: for recorded viewpoints, for positions on the floor, after changes, with its
+uncertainty."""
 
 from __future__ import annotations
 
@@ -19,48 +19,66 @@ from nerg_mi.formats.meshes import MeshFile
 from nerg_mi.statistics.estimates import adjust_p_values, estimate_ratio_differences
 from nerg_mi.statistics.shares import (
     COARSE,
-    VisibilityCache,
     Isovists,
     SamplePoints,
+    VisibilityCache,
+    compute_visibility,
+    find_standing_positions,
     gaze_shares,
     visible_in_fov,
-    find_standing_positions,
-    unhidden,
 )
-from nerg_mi.statistics.tables import MEASURES_BY_NAME, PREDICTED, MIN_VIEWPOINTS, MinParticipantsFilter, Participants, Row
+from nerg_mi.statistics.tables import (
+    MEASURES_BY_NAME,
+    MIN_VIEWPOINTS,
+    PREDICTED,
+    MinParticipantsFilter,
+    Participants,
+    Row,
+)
 from nerg_mi.statistics.visits import ALL, Aoi, Cell
 from nerg_mi.workflows.base import SILENT, Reporter
 
 from .measured import AoiContext, TimeWindow, Viewpoints
-from .options import CountOptions, PredictionOptions, AoiOptions, parse_window
+from .options import AoiOptions, CountOptions, PredictionOptions, parse_window
 from .scene import (
     Changes,
     GazeScene,
     apply_to_areas,
-    changed_scene,
+    apply_to_scene,
+    load_gaze_scene,
+    make_aois,
     read_changes,
     read_cohorts,
     read_meshes,
     shapes_by_id,
-    surroundings_of_files,
-    make_aois,
 )
 
-# ---- Foretold ----
+# ---- Prediction ----
 #
-# What a gaze field foretells of people who stand where they stood: the same numbers as those that are counted, as far
-# as a field tells them.
+# A gaze field predicts the attention shares of areas for the recorded viewpoints.
 #
-# A field knows how gaze is shared out at a moment, and nothing of its course: there are no looks, returns or first
-# looks in it. The probability that somebody looked at all follows if glances, one every so many seconds, are
-# independent of each other: 1 - Π (1 - s_i) over their time, s_i the share at glance i.
+# A gaze field has no time course, so visits, revisits and the time to first visit cannot be predicted. The probability
+# of at least one visit is predicted under the assumption that glances of a fixed duration are independent: 1 - Π (1 -
+# s_i) over the recorded time, where s_i is the attention share at glance i.
 
 
 @dataclass(frozen=True, eq=False)
 class PredictedAttention:
-    """Of E eyes and A areas: ``share`` (E, A) of the gaze, ``distance`` (E, A) its mean in metres, times the share,
-    ``visible`` (E, A) bool, ``support`` (E,) rays that the field learnt from there, NaN where it does not say;
-    ``members`` (M, E, A): the share by each member of an ensemble, by one field the same share again."""
+    """Predicted attention of E viewpoints on A areas.
+
+    Parameters
+    ----------
+    share
+        Attention share, (E, A).
+    distance
+        Mean distance in metres times the share, (E, A).
+    visible
+        Whether the area is in the field of view and not occluded, (E, A) bool.
+    support
+        Number of training samples around the viewpoint, (E,); NaN if the checkpoint does not contain it.
+    members
+        Attention share by each ensemble member, (M, E, A); for a single field the share again.
+    """
 
     share: np.ndarray
     distance: np.ndarray
@@ -69,17 +87,22 @@ class PredictedAttention:
     members: np.ndarray
 
 
-def subsample_participants(viewpoints: Viewpoints, most: int, reporter: Reporter) -> Viewpoints:
-    """Those of at most ``most`` people, who are the same whatever the order in which they came: those whose names have
-    the least checksums."""
-    people = sorted(set(viewpoints.participants), key=lambda name: (crc32(name.encode("utf-8", "surrogatepass")), name))
-    if len(people) <= most:
+def subsample_participants(viewpoints: Viewpoints, max_participants: int, reporter: Reporter) -> Viewpoints:
+    """Return the viewpoints of at most ``max_participants`` participants.
+
+    The subset consists of the participants whose names have the smallest checksums, so it does not depend on the order
+    of the samples.
+    """
+    names = sorted(set(viewpoints.participants), key=lambda name: (crc32(name.encode("utf-8", "surrogatepass")), name))
+    if len(names) <= max_participants:
         return viewpoints
-    reporter.message(f"the field is asked of {most:,} of {len(people):,} people; --eyes {len(people)} asks of all")
-    chosen = set(people[:most])
-    rows = [k for k, person in enumerate(viewpoints.participants) if person in chosen]
+    reporter.message(
+        f"the prediction uses {max_participants:,} of {len(names):,} participants; --viewpoints {len(names)} uses all"
+    )
+    chosen_names = set(names[:max_participants])
+    rows = [k for k, person in enumerate(viewpoints.participants) if person in chosen_names]
     person, cells = tuple(viewpoints.participants[k] for k in rows), tuple(viewpoints.cells[k] for k in rows)
-    return Viewpoints(viewpoints.positions[rows], viewpoints.ahead[rows], person, cells)
+    return Viewpoints(viewpoints.positions[rows], viewpoints.facing[rows], person, cells)
 
 
 def predict_attention(
@@ -89,92 +112,160 @@ def predict_attention(
     members: Sequence[tuple[int, ...]],
     margin: float,
     fov: float,
-    samples: int,
+    num_points: int,
     num_directions: int,
     reporter: Reporter,
 ) -> PredictedAttention:
-    """What the gaze field of ``around`` says of each of the ``eyes``, whose shares over the sphere add up to one, in
-    so many ``directions`` around each or, where a thing is small, more."""
+    """Predict the attention of viewpoints on areas with the gaze field of a scene.
+
+    Parameters
+    ----------
+    gaze_scene
+        Scene with a gaze field.
+    viewpoints
+        E viewpoints.
+    aois
+        Elementary AOIs.
+    members
+        Indices into ``aois`` of each of A areas.
+    margin
+        Surface tolerance in scene units.
+    fov
+        Angle of the field of view in degrees.
+    num_points
+        Number of sample points per AOI, for visibility.
+    num_directions
+        Initial number of directions around a viewpoint; small areas use more.
+    reporter
+        Reports progress.
+    """
     E = len(viewpoints.positions)
-    told = lambda done: reporter.progress(done / E, f"the field: place {done} of {E}")
-    found = gaze_shares(
-        gaze_scene.query_from, viewpoints.positions, aois, members, margin, replace(COARSE, initial_directions=num_directions), told
+    on_progress = lambda done: reporter.progress(done / E, f"prediction: viewpoint {done} of {E}")
+    shares = gaze_shares(
+        gaze_scene.query_from,
+        viewpoints.positions,
+        aois,
+        members,
+        margin,
+        replace(COARSE, initial_directions=num_directions),
+        on_progress,
     )
-    targets = SamplePoints.sample(aois, samples)
-    seen = visible_in_fov(targets, viewpoints.positions, viewpoints.ahead, unhidden(targets, viewpoints.positions, gaze_scene.trace_depth, margin), fov)
-    visible = np.stack([seen[:, list(of)].any(axis=1) for of in members], axis=1)
+    targets = SamplePoints.sample(aois, num_points)
+    in_fov = visible_in_fov(
+        targets,
+        viewpoints.positions,
+        viewpoints.facing,
+        compute_visibility(targets, viewpoints.positions, gaze_scene.trace_depth, margin),
+        fov,
+    )
+    visible = np.stack([in_fov[:, list(indices)].any(axis=1) for indices in members], axis=1)
     support = np.array([gaze_scene.support_at(p) for p in viewpoints.positions])
-    return PredictedAttention(found.share, found.distance / gaze_scene.scale, visible, support, found.members)
+    return PredictedAttention(shares.share, shares.distance / gaze_scene.scale, visible, support, shares.members)
 
 
 def aggregate_by_participant(
-    predicted: PredictedAttention, viewpoints: Viewpoints, cell: Cell, times: dict[str, float], glance: float
+    predicted: PredictedAttention,
+    viewpoints: Viewpoints,
+    cell: Cell,
+    durations: dict[str, float],
+    glance_duration: float,
 ) -> Participants | None:
-    """The people of a cell by the field; ``times``: for how long each was there, in seconds; ``glance``: seconds that
-    one takes. None where no eye is of the cell."""
-    rows = [k for k, cells in enumerate(viewpoints.cells) if cell in cells and viewpoints.participants[k] in times]
+    """Aggregate a prediction by participant; None if the cell has no viewpoints.
+
+    Parameters
+    ----------
+    predicted
+        Predicted attention.
+    viewpoints
+        Viewpoints of the prediction.
+    cell
+        Cell to aggregate.
+    durations
+        Recorded time of each participant in seconds.
+    glance_duration
+        Duration of a glance in seconds.
+    """
+    rows = [k for k, cells in enumerate(viewpoints.cells) if cell in cells and viewpoints.participants[k] in durations]
     names = sorted({viewpoints.participants[k] for k in rows})
     if not names:
         return None
-    place = {name: k for k, name in enumerate(names)}
-    who = np.array([place[viewpoints.participants[k]] for k in rows])
-    count = np.bincount(who, minlength=len(names)).astype(float)
+    row_of = {name: k for k, name in enumerate(names)}
+    index = np.array([row_of[viewpoints.participants[k]] for k in rows])
+    count = np.bincount(index, minlength=len(names)).astype(float)
 
     def mean(v: np.ndarray) -> np.ndarray:
         total = np.zeros((len(names), v.shape[1]))
-        np.add.at(total, who, v[rows].astype(float))
+        np.add.at(total, index, v[rows].astype(float))
         return total / count[:, None]
 
-    time = np.array([times[name] for name in names])
+    time = np.array([durations[name] for name in names])
     share = mean(predicted.share)
-    missed = mean(-np.log1p(-np.minimum(predicted.share, 1 - 1e-12)))
-    reached = -np.expm1(-missed * (time / glance)[:, None])
+    log_miss = mean(-np.log1p(-np.minimum(predicted.share, 1 - 1e-12)))
+    hit_probability = -np.expm1(-log_miss * (time / glance_duration)[:, None])
     seconds = time[:, None]
     distance, visible = mean(predicted.distance) * seconds, mean(predicted.visible) * seconds
-    return Participants(tuple(names), time, share * seconds, distance, visible, reached)
+    return Participants(tuple(names), time, share * seconds, distance, visible, hit_probability)
 
 
-# ---- Places ----
-#
-# Places on the floor where nobody was tracked: where one can stand, and what is seen from there.
+# ---- Observers without recordings ----
 
 
-def place_observers_on_floor(around: GazeScene, height: float, step: float, floor: float) -> np.ndarray:
-    """Places (G, 3) at eye height where one can stand. Raises `NergError` where there are none."""
-    lower, upper = around.bounds()
-    found = find_standing_positions(lower, upper, step * around.scale, height * around.scale, around.trace_depth, floor)
-    if not len(found):
+def place_observers_on_floor(gaze_scene: GazeScene, height: float, step: float, floor: float) -> np.ndarray:
+    """Return standing positions (G, 3) at eye ``height`` on a grid. Raises `NergError` if there are none."""
+    lower, upper = gaze_scene.bounds()
+    positions = find_standing_positions(
+        lower, upper, step * gaze_scene.scale, height * gaze_scene.scale, gaze_scene.trace_depth, floor
+    )
+    if not len(positions):
         raise NergError(
-            f"nobody can stand anywhere: there is no floor at {floor:g} (--floor) below eyes at {height:g} (--height)"
+            f"no walkable floor was found at height {floor:g} (--floor-height) below eyes at {height:g} (--eye-height); "
+            "correct one of them"
         )
-    return found
+    return positions
 
 
 def viewpoints_at(positions: np.ndarray) -> Viewpoints:
-    """Somebody at each of ``positions`` (M, 3), who may turn round."""
+    """Return a viewpoint of a separate observer, who may face any direction, at each of ``positions`` (M, 3)."""
     names = tuple(f"observer {k + 1:0{len(str(len(positions)))}d}" for k in range(len(positions)))
     return Viewpoints(positions, np.tile([1.0, 0, 0], (len(positions), 1)), names, (frozenset([ALL]),) * len(positions))
 
 
 def isovist_rows(isovists: Isovists, names: Sequence[str], members: Sequence[tuple[int, ...]]) -> list[Row]:
-    """A row for each place; of each area the share of its points that are seen from there."""
+    """Return a row for each position, with the share of each area's sample points that are visible from it."""
     rows = []
     for k, (x, y, z) in enumerate(isovists.points.tolist()):
         row: Row = {"x": x, "y": y, "z": z}
         row |= {n: float(getattr(isovists, n)[k]) for n in ("area", "perimeter", "nearest", "farthest", "radius")}
-        rows.append(row | {f"sees {n}": float(isovists.visible_share[k, list(of)].mean()) for n, of in zip(names, members)})
+        rows.append(
+            row
+            | {
+                f"sees {n}": float(isovists.visible_share[k, list(indices)].mean())
+                for n, indices in zip(names, members)
+            }
+        )
     return rows
 
 
-# ---- Setting ----
-#
-# What a count needs besides rays, from files and options: the same in whatever process it is made.
+# ---- AOI scene ----
 
 
 @dataclass(frozen=True, eq=False)
 class AoiScene:
-    """``areas`` in what is ``around`` people, and the ``things`` that they consist of; ``options`` of how it is
-    counted (`CountOptions`), asked of a field (`PredictionOptions`), or both; ``meshes`` that were read, by file."""
+    """Areas of interest in a scene.
+
+    Parameters
+    ----------
+    gaze_scene
+        Surfaces and gaze field.
+    areas
+        Areas.
+    aois
+        Elementary AOIs of the areas.
+    options
+        Options of the measurement (`CountOptions`), of the prediction (`PredictionOptions`), or of both.
+    meshes
+        Meshes of AOIs and changes, by file.
+    """
 
     gaze_scene: GazeScene
     areas: AreaSet
@@ -184,29 +275,31 @@ class AoiScene:
 
     @property
     def warnings(self) -> list[str]:
-        """Sentences on what of the meshes is not used."""
+        """Warnings about unused content of the meshes."""
         return [f"of {file}: {note}" for file, mesh in self.meshes.items() for note in mesh.notes]
 
     @cached_property
     def members(self) -> list[tuple[int, ...]]:
-        """Of each area the numbers of its things."""
+        """Indices of the elementary AOIs of each area."""
         return list(self.areas.element_indices().values())
 
     @property
     def margin(self) -> float:
-        """In units of the place."""
+        """Surface tolerance in scene units."""
         return self.options.margin * self.gaze_scene.scale
 
     def make_context(self, use_hit_points: bool, cohorts: tuple[str, ...]) -> AoiContext:
-        """How rays are counted which end at their ``hits``, or not, and have these ``cohorts`` where no table does."""
+        """Create the context for measured samples; ``cohorts`` are those of the samples if no table defines cohorts."""
         o = self.options
         assert isinstance(o, CountOptions)
-        in_view = None
+        visibility_cache = None
         if o.aoi_visibility:
             targets = SamplePoints.sample(self.aois, o.aoi_samples)
-            in_view = VisibilityCache(targets, self._depth_or_things, o.cell_size * self.gaze_scene.scale, self.margin)
+            visibility_cache = VisibilityCache(
+                targets, self._trace_depth, o.cell_size * self.gaze_scene.scale, self.margin
+            )
         leaves = [k for k, area in enumerate(self.areas.areas) if not isinstance(area, AreaGroup)]
-        table = {} if o.cohorts is None else read_cohorts(o.cohorts)
+        cohort_of = {} if o.cohorts is None else read_cohorts(o.cohorts)
         return AoiContext(
             self.gaze_scene,
             self.aois,
@@ -218,141 +311,166 @@ class AoiScene:
             o.tolerance,
             use_hit_points,
             o.fov,
-            in_view,
+            visibility_cache,
             [TimeWindow(*parse_window(text)) for text in o.windows],
             [] if o.zones is None else read_regions(o.zones),
-            table,
-            tuple(sorted(set(table.values()))) if table else cohorts,
+            cohort_of,
+            tuple(sorted(set(cohort_of.values()))) if cohort_of else cohorts,
         )
 
     def apply_changes(self, changes: Changes) -> AoiScene:
-        """The same after ``changes`` of shapes and areas. Raises `NergError` for those that cannot be made."""
-        areas, around, shapes = apply_to_areas(self.areas, changes), self.gaze_scene, shapes_by_id(self.gaze_scene.scene)
+        """Return the scene after ``changes`` of shapes and areas. Raises `NergError` for invalid changes."""
+        areas, gaze_scene, shapes = (
+            apply_to_areas(self.areas, changes),
+            self.gaze_scene,
+            shapes_by_id(self.gaze_scene.scene),
+        )
         meshes = {**self.meshes, **read_meshes(file for file in changes.meshes if file not in self.meshes)}
-        if changes.of_shapes:
-            scene, shapes = changed_scene(around.scene, changes, meshes)
-            around = around.with_scene(scene)
-        things = make_aois(areas.elements, shapes, meshes)
-        return replace(self, gaze_scene=around, areas=areas, aois=things, meshes=meshes)
+        if changes.changes_shapes:
+            scene, shapes = apply_to_scene(gaze_scene.scene, changes, meshes)
+            gaze_scene = gaze_scene.with_scene(scene)
+        aois = make_aois(areas.elements, shapes, meshes)
+        return replace(self, gaze_scene=gaze_scene, areas=areas, aois=aois, meshes=meshes)
 
-    def predict(self, viewpoints: Viewpoints, view: float, reporter: Reporter = SILENT) -> PredictedAttention:
-        """What the field says of the gaze of ``eyes`` that see so many degrees (``view``)."""
+    def predict(self, viewpoints: Viewpoints, fov: float, reporter: Reporter = SILENT) -> PredictedAttention:
+        """Predict the attention of ``viewpoints`` with a field of view of ``fov`` degrees."""
         o = self.options
         assert isinstance(o, PredictionOptions)
         return predict_attention(
-            self.gaze_scene, viewpoints, self.aois, self.members, self.margin, view, o.aoi_samples, o.directions, reporter
+            self.gaze_scene,
+            viewpoints,
+            self.aois,
+            self.members,
+            self.margin,
+            fov,
+            o.aoi_samples,
+            o.directions,
+            reporter,
         )
 
-    def _depth_or_things(self, o: np.ndarray, d: np.ndarray) -> np.ndarray:
-        """How far is seen: to the surfaces of the place, or, where none is known, to the nearest thing."""
+    def _trace_depth(self, o: np.ndarray, d: np.ndarray) -> np.ndarray:
+        """Return the distance to the surfaces of the scene or, if they are unknown, to the nearest AOI."""
         if self.gaze_scene.geometry is not None:
             return self.gaze_scene.trace_depth(o, d)
-        reach = np.full(len(o), np.inf)
-        for thing in self.aois:
-            near, far = thing.interval(o, d)
-            met = (near >= 0) & (np.isfinite(near) if thing.is_surface else near < far)
-            reach = np.where(met, np.minimum(reach, near), reach)
-        return reach
+        depth = np.full(len(o), np.inf)
+        for aoi in self.aois:
+            near, far = aoi.intersect(o, d)
+            is_hit = (near >= 0) & (np.isfinite(near) if aoi.is_surface else near < far)
+            depth = np.where(is_hit, np.minimum(depth, near), depth)
+        return depth
 
 
 def load_aoi_scene(
     scene: Path | None, field: Path | None, gaze: Path | None, areas: AreaSet, options: AoiOptions, ns: ModuleType
 ) -> AoiScene:
-    """The setting of these files. Raises `NergError`; what is plainly wrong is told before anything is loaded."""
+    """Load the AOI scene from files. Raises `NergError`; options are checked before any file is loaded."""
     if isinstance(options, CountOptions):
-        # Before anything is read.
+        # Fail before files are read.
         options.visit_rules()
-    align = None if options.align is None else read_similarity(options.align, "--align", "rays to place")
-    around = surroundings_of_files(scene, field, gaze, align, ns)
+    align = None if options.align is None else read_similarity(options.align, "--align", "rays to scene")
+    gaze_scene = load_gaze_scene(scene, field, gaze, align, ns)
     meshes = read_meshes(areas.meshes)
-    return AoiScene(around, areas, make_aois(areas.elements, shapes_by_id(around.scene), meshes), options, meshes)
+    return AoiScene(
+        gaze_scene, areas, make_aois(areas.elements, shapes_by_id(gaze_scene.scene), meshes), options, meshes
+    )
 
 
-# ---- Trust ----
+# ---- Uncertainty ----
 #
-# How far what a field foretells is to be trusted: the spread of an ensemble's members, and how many rays it learnt
-# from around the eyes.
+# Uncertainty of a prediction: the standard deviation over ensemble members, and the number of training samples around
+# the viewpoints.
 
-SPREAD = ("share", "dwell", "reach")  # numbers whose spread over members is told
+MEASURES_WITH_SPREAD = ("share", "dwell", "hit_ratio")  # measures with a standard deviation over ensemble members
 
 
 def add_uncertainty(
     rows: Sequence[Row],
     predicted: PredictedAttention,
     viewpoints: Viewpoints,
-    times: Mapping[Cell, dict[str, float]],
-    glance: float,
+    durations: Mapping[Cell, dict[str, float]],
+    glance_duration: float,
 ) -> None:
-    """Give ``rows`` of the table of things ``support``, the median over the eyes of their cell, ``places``, the eyes of
-    the cell for each of its people, and ``share_spread``, ``dwell_spread`` and ``reach_spread``, the standard
-    deviations over the members of an ensemble; None for what was counted, is blank, or is not known."""
-    found: dict[tuple[str, str], tuple[float | None, float | None, dict[str, np.ndarray]]] = {}
-    areas: dict[str, int] = {}
-    for cell in times:
-        mine = np.array([cell in cells for cells in viewpoints.cells], bool)
-        people = {person for person, own in zip(viewpoints.participants, mine.tolist()) if own}
-        places = float(mine.sum()) / len(people) if people else None
-        spreads = _spreads(predicted, viewpoints, cell, times, glance)
-        found[cell.dimension, cell.value] = support_of(predicted, mine), places, spreads
+    """Add the uncertainty of predictions to ``rows`` of the AOI table.
+
+    ``support`` is the median number of training samples around the viewpoints of the cell, ``viewpoints`` the number of
+    viewpoints per participant, and ``share_spread``, ``dwell_spread`` and ``hit_ratio_spread`` are standard deviations
+    over ensemble members. Values are None for measured rows, and if they are suppressed or unknown.
+    """
+    uncertainty: dict[tuple[str, str], tuple[float | None, float | None, dict[str, np.ndarray]]] = {}
+    area_index: dict[str, int] = {}
+    for cell in durations:
+        mask = np.array([cell in cells for cells in viewpoints.cells], bool)
+        participants = {person for person, is_in_cell in zip(viewpoints.participants, mask.tolist()) if is_in_cell}
+        viewpoints_per_participant = float(mask.sum()) / len(participants) if participants else None
+        spreads = _spreads(predicted, viewpoints, cell, durations, glance_duration)
+        uncertainty[cell.dimension, cell.value] = median_support(predicted, mask), viewpoints_per_participant, spreads
     for row in rows:
-        place = areas.setdefault(row["thing"], len(areas))
-        support, places, spreads = found[row["cell"], row["value"]]
-        told = row["source"] == PREDICTED
-        for name in SPREAD:
-            known = told and name in spreads and row[name] is not None
-            row[f"{name}_spread"] = float(spreads[name][place]) if known else None
-        row["support"] = support if told and row["people"] is not None else None
-        row["places"] = places if told and row["people"] is not None else None
+        index = area_index.setdefault(row["aoi"], len(area_index))
+        support, viewpoints_per_participant, spreads = uncertainty[row["cell"], row["value"]]
+        is_predicted = row["source"] == PREDICTED
+        for name in MEASURES_WITH_SPREAD:
+            has_spread = is_predicted and name in spreads and row[name] is not None
+            row[f"{name}_spread"] = float(spreads[name][index]) if has_spread else None
+        row["support"] = support if is_predicted and row["participants"] is not None else None
+        row["viewpoints"] = viewpoints_per_participant if is_predicted and row["participants"] is not None else None
 
 
-def support_of(foretold: PredictedAttention, mine: np.ndarray | None = None) -> float | None:
-    """Rays that the field learnt from around an eye, at the median of all, or of ``mine`` (E,); None where the
-    checkpoint keeps none."""
-    some = foretold.support if mine is None else foretold.support[mine]
-    some = some[np.isfinite(some)]
-    return float(np.median(some)) if len(some) else None
+def median_support(predicted: PredictedAttention, mask: np.ndarray | None = None) -> float | None:
+    """Return the median number of training samples around the viewpoints, or around those in ``mask`` (E,); None if
+    the checkpoint does not contain support."""
+    support = predicted.support if mask is None else predicted.support[mask]
+    support = support[np.isfinite(support)]
+    return float(np.median(support)) if len(support) else None
 
 
 def warn_missing_support(predicted: PredictedAttention, reporter: Reporter) -> None:
-    """Say what is missing where nobody can tell how much data the numbers of a field rest on."""
-    if support_of(predicted) is None:
+    """Report that the checkpoint lacks the training support."""
+    if median_support(predicted) is None:
         reporter.message(
-            "the gaze field's checkpoint keeps no support, so that the tables cannot say where it learnt from nobody; "
-            "nerg train gaze with the rays makes one that does"
+            "the checkpoint of the gaze field does not contain training support, so the tables cannot show where the "
+            "field extrapolates; train the field again with nerg train gaze to add it"
         )
 
 
 def warn_few_viewpoints(viewpoints: Viewpoints, reporter: Reporter) -> None:
-    """Say so where a field is asked from too few places a person for their reach: who looks at a thing only where it is
-    near is taken for somebody who does not, unless one of their places is there."""
-    people = len(set(viewpoints.participants))
-    if people and len(viewpoints.participants) < MIN_VIEWPOINTS * people:
+    """Report that too few viewpoints per participant bias the predicted hit ratio.
+
+    A participant who looks at an area only from nearby is missed if none of their viewpoints is near the area.
+    """
+    num_participants = len(set(viewpoints.participants))
+    if num_participants and len(viewpoints.participants) < MIN_VIEWPOINTS * num_participants:
         reporter.message(
-            f"the field is asked from {len(viewpoints.participants) / people:.1f} places a person, by which reach comes out too "
-            f"low; --eyes {MIN_VIEWPOINTS * people} asks from {MIN_VIEWPOINTS}"
+            f"the prediction uses {len(viewpoints.participants) / num_participants:.1f} viewpoints per participant, which biases "
+            f"the hit ratio low; use --viewpoints {MIN_VIEWPOINTS * num_participants} for {MIN_VIEWPOINTS} per participant"
         )
 
 
 def _spreads(
-    foretold: PredictedAttention, eyes: Viewpoints, cell: Cell, times: Mapping[Cell, dict[str, float]], glance: float
+    predicted: PredictedAttention,
+    viewpoints: Viewpoints,
+    cell: Cell,
+    durations: Mapping[Cell, dict[str, float]],
+    glance_duration: float,
 ) -> dict[str, np.ndarray]:
-    if len(foretold.members) < 2:
+    if len(predicted.members) < 2:
         return {}
-    values: dict[str, list[np.ndarray]] = {name: [] for name in SPREAD}
-    for share in foretold.members:
-        people = aggregate_by_participant(replace(foretold, share=share), eyes, cell, times[cell], glance)
-        for name in SPREAD:
-            pair = None if people is None else MEASURES_BY_NAME[name].numerator_denominator(people)
-            if pair is None:
+    values: dict[str, list[np.ndarray]] = {name: [] for name in MEASURES_WITH_SPREAD}
+    for share in predicted.members:
+        participants = aggregate_by_participant(
+            replace(predicted, share=share), viewpoints, cell, durations[cell], glance_duration
+        )
+        for name in MEASURES_WITH_SPREAD:
+            sums = None if participants is None else MEASURES_BY_NAME[name].numerator_denominator(participants)
+            if sums is None:
                 return {}
             with np.errstate(divide="ignore", invalid="ignore"):
-                values[name].append(pair[0].sum(axis=0) / pair[1].sum(axis=0))
-    return {name: np.std(found, axis=0, ddof=1) for name, found in values.items()}
+                values[name].append(sums[0].sum(axis=0) / sums[1].sum(axis=0))
+    return {name: np.std(member_values, axis=0, ddof=1) for name, member_values in values.items()}
 
 
-# ---- The table of what a change would do, by the field ----
+# ---- What-if table ----
 
-Foretell = Callable[[AoiScene, Viewpoints], PredictedAttention]
+Predict = Callable[[AoiScene, Viewpoints], PredictedAttention]
 
 
 def what_if_rows(
@@ -360,73 +478,95 @@ def what_if_rows(
     aoi_scene: AoiScene,
     viewpoints: Viewpoints,
     before: PredictedAttention,
-    foretell: Foretell,
+    predict: Predict,
     min_participants: MinParticipantsFilter,
     resamples: int,
     seed: int,
 ) -> list[Row]:
-    """Of each area and measure (``share`` of gaze, ``visible`` share of people's time) what the field says ``before``
-    and ``after`` the changes in the file ``path``, the ``difference`` with its interval over people and, of an
-    ensemble's shares, its ``difference_spread`` over the members, and the ``support``: rays that the field learnt from
-    around an eye, at the median after the changes. ``foretell`` is asked what the field says in the changed setting of
-    the observers that there are then. Raises `NergError`."""
+    """Compare predictions before and after the changes in the file ``path``.
+
+    Each row has an area, a measure (``share`` of gaze or ``visible`` share of time), the values ``before`` and
+    ``after``, the ``difference`` with its interval over participants, the standard deviation of the difference over
+    ensemble members (``difference_spread``), and the median ``support`` after the changes. Raises `NergError`.
+
+    Parameters
+    ----------
+    path
+        File of changes.
+    aoi_scene
+        Scene before the changes.
+    viewpoints, before
+        Viewpoints and their prediction before the changes.
+    predict
+        Predicts the attention of viewpoints in the changed scene.
+    min_participants
+        Suppresses values of few participants.
+    resamples, seed
+        Number and seed of the bootstrap draws.
+    """
     changes = read_changes(path)
-    there = aoi_scene.apply_changes(changes)
-    areas, after_areas = aoi_scene.areas, there.areas
-    others = viewpoints
+    changed_scene = aoi_scene.apply_changes(changes)
+    areas, after_areas = aoi_scene.areas, changed_scene.areas
+    changed_viewpoints = viewpoints
     if changes.observers is not None:
-        others = viewpoints_at(changes.observers)
+        changed_viewpoints = viewpoints_at(changes.observers)
     if changes.shift is not None:
-        others = replace(others, positions=others.positions + changes.shift)
-    after = foretell(there, others)
-    # People who are the same before and after are compared with themselves.
-    names = sorted({*viewpoints.participants, *others.participants})
-    support = support_of(after)
+        changed_viewpoints = replace(changed_viewpoints, positions=changed_viewpoints.positions + changes.shift)
+    after = predict(changed_scene, changed_viewpoints)
+    # Participants with viewpoints before and after the changes are paired.
+    names = sorted({*viewpoints.participants, *changed_viewpoints.participants})
+    support = median_support(after)
     rows: list[Row] = []
     for name in dict.fromkeys((*areas.names, *after_areas.names)):
         for measure in ("share", "visible"):
-            old = _of(viewpoints, names, getattr(before, measure), areas, name)
-            new = _of(others, names, getattr(after, measure), after_areas, name)
-            row = _row(name, measure, old, new, min_participants, resamples, seed)
+            old_sums = _mean_by_participant(viewpoints, names, getattr(before, measure), areas, name)
+            new_sums = _mean_by_participant(changed_viewpoints, names, getattr(after, measure), after_areas, name)
+            row = _what_if_row(name, measure, old_sums, new_sums, min_participants, resamples, seed)
             row["difference_spread"] = None
             if measure == "share" and row["difference"] is not None and len(after.members) > 1:
-                apart = [
-                    _mean(_of(others, names, to, after_areas, name)) - _mean(_of(viewpoints, names, at, areas, name))
-                    for at, to in zip(before.members, after.members)
+                differences = [
+                    _overall_mean(_mean_by_participant(changed_viewpoints, names, new_share, after_areas, name))
+                    - _overall_mean(_mean_by_participant(viewpoints, names, old_share, areas, name))
+                    for old_share, new_share in zip(before.members, after.members)
                 ]
-                row["difference_spread"] = float(np.std(apart, ddof=1))
+                row["difference_spread"] = float(np.std(differences, ddof=1))
             rows.append(row | {"support": support, "source": PREDICTED})
-    corrected = adjust_p_values(np.array([np.nan if row["p"] is None else row["p"] for row in rows], float))
-    for row, p in zip(rows, corrected):
+    adjusted_p = adjust_p_values(np.array([np.nan if row["p"] is None else row["p"] for row in rows], float))
+    for row, p in zip(rows, adjusted_p):
         row["p_adjusted"] = float(p) if np.isfinite(p) else None
     return rows
 
 
-def _of(
-    eyes: Viewpoints, names: list[str], values: np.ndarray, areas: AreaSet, name: str
+def _mean_by_participant(
+    viewpoints: Viewpoints, names: list[str], values: np.ndarray, areas: AreaSet, name: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mean of an area's ``values`` (E, A) over the eyes of each person, and who has any, (P, 1) each."""
+    """Return the mean of an area's ``values`` (E, A) over the viewpoints of each participant, and whether the
+    participant has viewpoints, (P, 1) each."""
     total, count = np.zeros((len(names), 1)), np.zeros((len(names), 1))
     if name in areas.names:
-        place = {n: k for k, n in enumerate(names)}
-        who = np.array([place[p] for p in eyes.participants])
-        np.add.at(total[:, 0], who, values[:, areas.names.index(name)].astype(float))
-        np.add.at(count[:, 0], who, 1.0)
+        row_of = {n: k for k, n in enumerate(names)}
+        index = np.array([row_of[p] for p in viewpoints.participants])
+        np.add.at(total[:, 0], index, values[:, areas.names.index(name)].astype(float))
+        np.add.at(count[:, 0], index, 1.0)
     return total / np.maximum(count, 1), (count > 0).astype(float)
 
 
-def _mean(pair: tuple[np.ndarray, np.ndarray]) -> float:
+def _overall_mean(pair: tuple[np.ndarray, np.ndarray]) -> float:
     return float(pair[0].sum() / pair[1].sum())
 
 
-def _row(name: str, measure: str, old, new, floor: MinParticipantsFilter, resamples: int, seed: int) -> Row:
-    mean = lambda pair: _mean(pair) if pair[1].sum() else None
-    people = int(min(old[1].sum() or new[1].sum(), new[1].sum() or old[1].sum()))
-    told = floor.passes(people)
-    row: Row = {"thing": name, "measure": measure, "people": people if told else None}
-    row |= {"before": mean(old) if told else None, "after": mean(new) if told else None}
-    both = bool(old[1].sum() and new[1].sum())
-    found = estimate_ratio_differences(old, new, resamples=resamples, seed=seed) if both and told else None
+def _what_if_row(
+    name: str, measure: str, old, new, min_participants: MinParticipantsFilter, resamples: int, seed: int
+) -> Row:
+    mean = lambda pair: _overall_mean(pair) if pair[1].sum() else None
+    num_participants = int(min(old[1].sum() or new[1].sum(), new[1].sum() or old[1].sum()))
+    is_allowed = min_participants.allows(num_participants)
+    row: Row = {"aoi": name, "measure": measure, "participants": num_participants if is_allowed else None}
+    row |= {"before": mean(old) if is_allowed else None, "after": mean(new) if is_allowed else None}
+    has_both = bool(old[1].sum() and new[1].sum())
+    differences = (
+        estimate_ratio_differences(old, new, resamples=resamples, seed=seed) if has_both and is_allowed else None
+    )
     number = lambda v: float(v[0]) if np.isfinite(v[0]) else None
     keys = {"difference": "value", "low": "low", "high": "high", "p": "p"}
-    return row | {k: None if found is None else number(getattr(found, v)) for k, v in keys.items()}
+    return row | {k: None if differences is None else number(getattr(differences, v)) for k, v in keys.items()}

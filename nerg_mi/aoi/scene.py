@@ -1,4 +1,4 @@
-"""The scene of a count: areas as what rays meet, surfaces and observers around them, changes to both, and cohorts."""
+"""Scene of AOI statistics: surfaces, gaze field, AOI geometry, what-if changes, and cohorts."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError, translate_mitsuba_errors, sanitize
+from nerg_mi.errors import NergError, sanitize, translate_mitsuba_errors
 from nerg_mi.files.safe_read import read_json
 from nerg_mi.files.tables import unescape_formula
 from nerg_mi.formats.areas import (
@@ -24,8 +24,8 @@ from nerg_mi.formats.areas import (
     SceneShape,
     check_area_name,
     is_number,
-    resolve_mesh_path,
     parse_box,
+    resolve_mesh_path,
 )
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.formats.meshes import MeshFile, read_mesh_file
@@ -41,45 +41,64 @@ from nerg_mi.surfaces.mesh import mitsuba_mesh
 from nerg_mi.train import geometry
 from nerg_mi.train.gaze_data import SURFACE_OPACITY
 from nerg_mi.train.geometry import TrainingGeometry
-from nerg_mi.transport.geometry import SceneGeometry, shape_corners, default_march_settings, trace_depth
+from nerg_mi.transport.geometry import SceneGeometry, default_march_settings, shape_corners, trace_depth
 from nerg_mi.transport.observer import ObserverSettings
 from nerg_mi.transport.observer_gaze import GazeFieldInstance, make_gaze_evaluator
 from nerg_mi.workflows.gaze_commands import GazeEvaluationOptions
-from nerg_mi.workflows.geometry import read_training_alignment, load_training_geometry
+from nerg_mi.workflows.geometry import load_training_geometry, read_training_alignment
 
 if TYPE_CHECKING:
     import mitsuba as mi
 
 
-# ---- Which cohort people are of, from a table ----
+# ---- Cohorts ----
 
-MOST_PEOPLE = 10_000_000  # so many people may have a cohort
+MAX_PARTICIPANTS = 10_000_000  # maximum number of participants in a table of cohorts
 
 
 def read_cohorts(path: Path) -> dict[str, str]:
-    """The cohort of each person, from the columns ``person`` and ``cohort`` of a CSV. Raises `NergError` for a table
-    without them, and for somebody who is of two."""
-    found: dict[str, str] = {}
+    """Read the cohort of each participant from the columns ``person`` and ``cohort`` of a CSV file.
+
+    Raises `NergError` for missing columns, and for a participant in two cohorts.
+    """
+    cohorts: dict[str, str] = {}
     for block in iterate_table(path, (), ("person", "cohort")):
-        for person, cohort in (map(unescape_formula, row) for row in block.texts.tolist()):
-            if found.setdefault(person, cohort) != cohort:
-                raise NergError(f'"{path}" has "{sanitize(person, 40)}" in two cohorts; leave one')
-        if len(found) > MOST_PEOPLE:
-            raise NergError(f'"{path}" names more than {MOST_PEOPLE:,} people; give fewer')
-    if not found:
-        raise NergError(f'"{path}" names nobody; write a line person,cohort and one for each')
-    return found
+        for participant, cohort in (map(unescape_formula, row) for row in block.texts.tolist()):
+            if cohorts.setdefault(participant, cohort) != cohort:
+                raise NergError(f'"{path}" has "{sanitize(participant, 40)}" in two cohorts; remove one of them')
+        if len(cohorts) > MAX_PARTICIPANTS:
+            raise NergError(f'"{path}" names more than {MAX_PARTICIPANTS:,} participants; remove some')
+    if not cohorts:
+        raise NergError(
+            f'"{path}" contains no participants; write the header person,cohort and one row per participant'
+        )
+    return cohorts
 
 
-# ---- Surroundings ----
-#
-# What people have around them: surfaces that rays meet, and the gaze that a field foretells there.
+# ---- Scene and gaze field ----
 
 
 @dataclass(frozen=True, eq=False)
 class GazeScene:
-    """``place``: what rays meet, None where nothing is known; ``gaze`` of a field, or None; ``align``: from the rays'
-    frame; ``scene``: whose shapes they are, or None; ``observer`` (3,): the scene's own; ``kind`` of depth."""
+    """Surfaces and gaze field of a scene.
+
+    Parameters
+    ----------
+    geometry
+        Surfaces that rays meet; None if unknown.
+    gaze
+        Gaze field, or None.
+    align
+        Similarity from the frame of the samples to the scene.
+    scene
+        Mitsuba scene with named shapes, or None.
+    settings
+        Settings of an observer's rays.
+    observer
+        Observer of the scene, (3,), or None.
+    depth_kind
+        Depth estimate of a ray in a medium.
+    """
 
     geometry: SceneGeometry | None
     gaze: GazeFieldInstance | None
@@ -91,27 +110,26 @@ class GazeScene:
 
     @property
     def scale(self) -> float:
-        """Units of the place a metre."""
+        """Scene units per metre."""
         return float(self.align.scale)
 
     def transform_points(self, points: np.ndarray) -> np.ndarray:
-        """Points (..., 3) of the rays' frame in the place."""
+        """Transform points (..., 3) from the frame of the samples to the scene."""
         return points @ self.align.matrix[:3, :3].T + self.align.matrix[:3, 3]
 
     def transform_directions(self, directions: np.ndarray) -> np.ndarray:
-        """Unit directions (..., 3) of the rays' frame in the place."""
+        """Rotate unit directions (..., 3) from the frame of the samples to the scene."""
         return directions @ (self.align.matrix[:3, :3] / self.scale).T
 
     def trace_depth(self, o: np.ndarray, d: np.ndarray) -> np.ndarray:
-        """Distance (N,) to the first surface along rays (N, 3) of the place, infinite where there is none."""
+        """Return the distance (N,) to the first surface on rays (N, 3), infinite if there is none."""
         if self.geometry is None:
             return np.full(len(o), np.inf)
         depth, opacity = trace_depth(self.geometry, o, d, kind=self.depth_kind)
         return np.where((opacity >= SURFACE_OPACITY) & (depth > 0), depth, np.inf).astype(np.float64)
 
     def query_from(self, observer: np.ndarray) -> DirectionQuery:
-        """A function of unit directions (D, 3), as `nerg_mi.statistics.shares.gaze_shares` wants it of an observer at
-        ``eye`` (3,)."""
+        """Return the `DirectionQuery` of an observer at a position (3,), as `gaze_shares` needs it."""
         assert self.gaze is not None
         place = self.geometry if self.geometry is not None else SceneGeometry(None)
         settings = self.settings or ObserverSettings(
@@ -123,7 +141,7 @@ class GazeScene:
         return lambda directions: (look(directions)[0], None)
 
     def support_at(self, observer: np.ndarray) -> float:
-        """Rays that the field learnt from around ``eye`` (3,); NaN where it does not say."""
+        """Return the number of training samples around a position (3,); NaN if the field does not contain it."""
         mi = variant_types()
         if self.gaze is None or self.gaze.field.support is None:
             return float("nan")
@@ -131,181 +149,194 @@ class GazeScene:
         return float(np.array(self.gaze.field.support.evaluate(p)).ravel()[0])
 
     def bounds(self) -> np.ndarray:
-        """Corners (2, 3) of the place. Raises `NergError` where none is known."""
+        """Return the corners (2, 3) of the bounding box. Raises `NergError` if it is unknown."""
         bounds = None if self.geometry is None else self.geometry.bounds()
         if bounds is None:
-            raise NergError("there is no place whose bounds are known; give a scene or a radiance field")
+            raise NergError("the bounds of the scene are unknown; give a scene or a radiance field")
         return np.array(bounds, float)
 
     def with_scene(self, scene: mi.Scene) -> GazeScene:
-        """The same with the shapes of another ``scene``."""
+        """Return a copy with the shapes of another ``scene``."""
         assert self.geometry is not None
         return replace(self, geometry=SceneGeometry(self.geometry.medium, scene), scene=scene)
 
 
 def load_scene_file(path: Path, gaze: Path | None, align: Similarity | None, ns: ModuleType) -> GazeScene:
-    """A scene's shapes, and the field and gaze of its integrator where that is a ``nerg``; ``gaze``: another gaze field
-    in their stead. Raises `NergError` for a scene with neither shapes nor a field."""
+    """Load the shapes of a scene file, and the fields of its integrator if it is a ``nerg``.
+
+    ``gaze`` replaces the gaze field of the scene. Raises `NergError` for a scene without shapes and fields.
+    """
     from nerg_mi.transport.observer import sensor_center
 
     scene = load_scene(path, merge=False)
     integrator: Any = scene.integrator()
-    own = is_nerg(integrator)
-    medium = integrator.medium if own else None
-    place = SceneGeometry(medium, scene)
-    if medium is None and place.scene is None:
-        raise NergError(f'the scene "{path}" has neither shapes nor a field; name one that has')
-    sensor = integrator.observer if own else None
+    has_nerg = is_nerg(integrator)
+    medium = integrator.medium if has_nerg else None
+    geometry = SceneGeometry(medium, scene)
+    if medium is None and geometry.scene is None:
+        raise NergError(f'the scene "{path}" has neither shapes nor a radiance field; use another scene')
+    sensor = integrator.observer if has_nerg else None
     observer = None if sensor is None else np.ravel(np.array(sensor_center(sensor), np.float64))
     if gaze is not None:
-        field, about = load_gaze(gaze, ns)
-        provenance = about.get("provenance", about)
-        return GazeScene(place, GazeFieldInstance(field), align or read_training_alignment(provenance), scene, observer=observer)
-    settings = integrator.observer_settings if own and integrator.gaze is not None else None
-    found = integrator.gaze if own else None
-    return GazeScene(place, found, align or Similarity(), scene, settings, observer)
+        field, metadata = load_gaze(gaze, ns)
+        provenance = metadata.get("provenance", metadata)
+        return GazeScene(
+            geometry, GazeFieldInstance(field), align or read_training_alignment(provenance), scene, observer=observer
+        )
+    settings = integrator.observer_settings if has_nerg and integrator.gaze is not None else None
+    gaze_field = integrator.gaze if has_nerg else None
+    return GazeScene(geometry, gaze_field, align or Similarity(), scene, settings, observer)
 
 
-def surroundings_of_files(
+def load_gaze_scene(
     scene: Path | None, field: Path | None, gaze: Path | None, align: Similarity | None, ns: ModuleType
 ) -> GazeScene:
-    """What the files that are given say. Raises `NergError` for those that cannot be used together."""
+    """Load a scene from the given files. Raises `NergError` for combinations that are not supported."""
     if scene is not None:
         if field is not None:
-            raise NergError(f'"{scene}" and "{field}" are both a place; a scene names its field itself')
+            raise NergError(
+                f'"{scene}" and "{field}" both define the geometry; a scene file refers to its radiance field, so give the scene only'
+            )
         return load_scene_file(scene, gaze, align, ns)
     if gaze is not None:
-        network, about = load_gaze(gaze, ns)
+        network, metadata = load_gaze(gaze, ns)
         options = GazeEvaluationOptions(field=field)
-        made = load_training_geometry(gaze, about.get("provenance", about), network.box, options, ns)
-        return _of_place(made, GazeFieldInstance(network), align or made.align)
+        training_geometry = load_training_geometry(gaze, metadata.get("provenance", metadata), network.box, options, ns)
+        return _gaze_scene_from_training(
+            training_geometry, GazeFieldInstance(network), align or training_geometry.align
+        )
     if field is not None:
-        return _of_place(geometry.load_field_geometry(field, ns), None, align or Similarity())
+        return _gaze_scene_from_training(geometry.load_field_geometry(field, ns), None, align or Similarity())
     return GazeScene(None, None, align or Similarity())
 
 
-def _of_place(place: TrainingGeometry, gaze: GazeFieldInstance | None, align: Similarity) -> GazeScene:
-    medium = place.medium
-    inside = medium if isinstance(medium, SceneGeometry) or medium is None else SceneGeometry(medium)
-    return GazeScene(inside, gaze, align, None if inside is None else inside.scene)
+def _gaze_scene_from_training(
+    training_geometry: TrainingGeometry, gaze: GazeFieldInstance | None, align: Similarity
+) -> GazeScene:
+    medium = training_geometry.medium
+    geometry = medium if isinstance(medium, SceneGeometry) or medium is None else SceneGeometry(medium)
+    return GazeScene(geometry, gaze, align, None if geometry is None else geometry.scene)
 
 
-# ---- Things ----
+# ---- AOI geometry ----
 #
-# Areas of interest as things that rays meet: boxes in closed form, meshes and shapes by ray casts of Mitsuba.
+# Boxes are intersected in closed form, meshes and shapes by ray casts in Mitsuba.
 
-_RAYS = 1 << 20
+_RAY_BATCH = 1 << 20
 
 
 @dataclass(frozen=True, eq=False)
 class ShapeAoi:
-    """A Mitsuba shape, of the scene or by itself."""
+    """A Mitsuba shape as an AOI; ``isolated`` is a scene that contains only this shape."""
 
     name: str
     shape: Any
-    alone: Any
+    isolated: Any
     is_surface = True
 
-    def interval(self, o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def intersect(self, o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         import mitsuba as mi
 
         out = np.full(len(o), np.inf)
-        for a in range(0, len(o), _RAYS):
-            origin, along = (np.ascontiguousarray(v[a : a + _RAYS].T, np.float32) for v in (o, d))
-            ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(along))
-            found = np.array(self.alone.ray_intersect_preliminary(ray, coherent=False).t, np.float64)
-            out[a : a + _RAYS] = found
+        for a in range(0, len(o), _RAY_BATCH):
+            origin, direction = (np.ascontiguousarray(v[a : a + _RAY_BATCH].T, np.float32) for v in (o, d))
+            ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(direction))
+            t = np.array(self.isolated.ray_intersect_preliminary(ray, coherent=False).t, np.float64)
+            out[a : a + _RAY_BATCH] = t
         return out, out
 
     @cached_property
-    def _corners(self) -> np.ndarray:
-        """Corners (2, 3) of a box around it that is no flatter than single precision is exact."""
+    def _bounds(self) -> np.ndarray:
+        """Corners (2, 3) of a bounding box, padded by the accuracy of single precision."""
         lower, upper = (np.array(c, np.float64) for c in shape_corners(self.shape))
-        room = 1e-6 * np.maximum(np.abs([lower, upper]).max(), np.linalg.norm(upper - lower))
-        return np.array([lower - room, upper + room])
+        padding = 1e-6 * np.maximum(np.abs([lower, upper]).max(), np.linalg.norm(upper - lower))
+        return np.array([lower - padding, upper + padding])
 
     @property
-    def ball(self) -> tuple[np.ndarray, float]:
-        lower, upper = self._corners
+    def bounding_sphere(self) -> tuple[np.ndarray, float]:
+        lower, upper = self._bounds
         return (lower + upper) / 2, float(np.linalg.norm(upper - lower)) / 2
 
-    def may_meet(self, o: np.ndarray, d: np.ndarray) -> np.ndarray:
-        near, far = intersect_box_numpy(o, d, *self._corners)
+    def hits_bounds(self, o: np.ndarray, d: np.ndarray) -> np.ndarray:
+        near, far = intersect_box_numpy(o, d, *self._bounds)
         return (near < far) & (far > 0)
 
     def sample_points(self, count: int) -> tuple[np.ndarray, np.ndarray]:
         import mitsuba as mi
 
-        # The R2 sequence (Roberts 2018): points that are spread evenly, whatever their number.
+        # R2 sequence (Roberts 2018): uniformly distributed points for any number.
         n = np.arange(1, count + 1)
         u, v = (np.mod(0.5 + n / g, 1.0) for g in (1.32471795724474602596, 1.32471795724474602596**2))
-        found = self.shape.sample_position(0.0, mi.Point2f(u.astype(np.float32), v.astype(np.float32)))
-        points = np.array(found.p, np.float64).T
+        sample = self.shape.sample_position(0.0, mi.Point2f(u.astype(np.float32), v.astype(np.float32)))
+        points = np.array(sample.p, np.float64).T
         return points, np.zeros_like(points)
 
 
 def read_meshes(files: Iterable[Path]) -> dict[Path, MeshFile]:
-    """The meshes in ``files``, each read once. Raises `NergError` for a file that is missing or damaged."""
+    """Read the mesh of each file once. Raises `NergError` for missing and damaged files."""
     return {file: read_mesh_file(file) for file in dict.fromkeys(files)}
 
 
 def make_aois(
     areas: Sequence[Region | MeshPart | SceneShape], shapes: Mapping[str, Any], meshes: Mapping[Path, MeshFile]
 ) -> list[Aoi]:
-    """``areas`` as things, in their order; ``shapes`` of the scene by name, ``meshes`` of parts by file; the variant
-    must be active. Raises `NergError` for shapes and faces that there are not."""
-    found: list[Aoi] = []
+    """Create the elementary AOIs of ``areas``, in the same order.
+
+    ``shapes`` are those of the scene by name, ``meshes`` those of mesh parts by file. A Mitsuba variant must be active.
+    Raises `NergError` for unknown shapes and faces.
+    """
+    aois: list[Aoi] = []
     for area in areas:
         if isinstance(area, Region):
-            found.append(BoxAoi(area))
+            aois.append(BoxAoi(area))
         elif isinstance(area, MeshPart):
-            found.append(thing_of_shape(area.name, _mesh_of_part(area, meshes[area.file])))
+            aois.append(aoi_from_shape(area.name, _make_part_mesh(area, meshes[area.file])))
         else:
-            found.append(thing_of_shape(area.name, shape_named(shapes, area.shape)))
-    return found
+            aois.append(aoi_from_shape(area.name, find_shape(shapes, area.shape)))
+    return aois
 
 
-def thing_of_shape(name: str, shape: Any) -> ShapeAoi:
-    """A Mitsuba shape as a thing."""
+def aoi_from_shape(name: str, shape: Any) -> ShapeAoi:
+    """Create an AOI from a Mitsuba shape."""
     return ShapeAoi(name, shape, scene_from_shapes({name: shape}))
 
 
 def scene_from_shapes(shapes: Mapping[str, Any]) -> mi.Scene:
-    """A scene of nothing but ``shapes``, which keep the names that they have: Mitsuba gives them others."""
+    """Create a scene of ``shapes``. Mitsuba renames the shapes it is given, so their names are restored."""
     import mitsuba as mi
 
     names = [shape.id() for shape in shapes.values()]
     with translate_mitsuba_errors():
-        made = {f"shape_{k}": shape for k, shape in enumerate(shapes.values())}
-        scene = mi.load_dict({"type": "scene", **made}, optimize=False)
+        children = {f"shape_{k}": shape for k, shape in enumerate(shapes.values())}
+        scene = mi.load_dict({"type": "scene", **children}, optimize=False)
     for shape, name in zip(shapes.values(), names):
         shape.set_id(name)
     return scene
 
 
 def shapes_by_id(scene: mi.Scene | None) -> dict[str, Any]:
-    """The shapes of a scene by their ids."""
+    """Return the shapes of a scene by id."""
     return {} if scene is None else {shape.id(): shape for shape in scene.shapes()}
 
 
-def shape_named(shapes: Mapping[str, Any], name: str) -> Any:
-    """The shape of this name. Raises `NergError` where there is none, naming those that there are."""
+def find_shape(shapes: Mapping[str, Any], name: str) -> Any:
+    """Return the shape with this name. Raises `NergError`, listing the available names, if there is none."""
     if name not in shapes:
-        known = f"it has {', '.join(list(shapes)[:20])}" if shapes else "give a scene that has shapes"
-        raise NergError(f'there is no shape "{sanitize(name, 40)}" in the scene; {known}')
+        remedy = f"its shapes are {', '.join(list(shapes)[:20])}" if shapes else "use a scene with shapes"
+        raise NergError(f'there is no shape "{sanitize(name, 40)}" in the scene; {remedy}')
     return shapes[name]
 
 
-def _mesh_of_part(part: MeshPart, mesh: MeshFile) -> Any:
-    """The faces of a part alone, which are numbered as in the file of its ``mesh``."""
-    chosen = mesh.faces[part.select_faces(int(mesh.polygons.max()) + 1)[mesh.polygons]]
-    used, index = np.unique(chosen, return_inverse=True)
+def _make_part_mesh(part: MeshPart, mesh: MeshFile) -> Any:
+    """Create a mesh of the faces of ``part``, whose numbers refer to the file of the mesh."""
+    faces = mesh.faces[part.select_faces(int(mesh.polygons.max()) + 1)[mesh.polygons]]
+    used, index = np.unique(faces, return_inverse=True)
     return mitsuba_mesh(mesh.vertices[used], index.reshape(-1, 3), part.name)
 
 
-# ---- Changes ----
+# ---- What-if changes ----
 #
-# What if: a file of changes to a scene and its observers, read and made.
+# A file of changes to a scene and its observers:
 #
 # .. code-block:: json
 #
@@ -314,19 +345,19 @@ def _mesh_of_part(part: MeshPart, mesh: MeshFile) -> Any:
 #      "swap": [{"shape": "till", "mesh": "till2.ply"}],
 #      "observers": [[1, 2, 1.6]], "shift": [0, 0, -0.2]}
 #
-# A turn is in degrees about the vertical through the middle of what is moved, counter-clockwise seen from above. Moved
-# shapes keep the areas that name them; boxes, which name no shape, are moved as areas. The gaze field stays as it was
-# trained: it knows places and what stood there, and says of a thing at its new place what it learnt of surfaces there.
+# A turn is in degrees about the vertical axis through the centre of the moved object, counter-clockwise seen from
+# above. Areas that refer to a moved shape move with it; boxes, which refer to no shape, are moved as areas. The gaze
+# field is not retrained: it predicts the gaze on surfaces at the new position from what it learnt there.
 
-MAX_CHANGES_BYTES = 1 << 20  # a file of changes may have so many bytes
-MOST_CHANGES = 1000  # and so many changes, or observers, of a kind
-_KEYS = ("move", "remove", "add", "swap", "observers", "shift")
+MAX_CHANGES_BYTES = 1 << 20  # maximum size of a file of changes
+MAX_CHANGES = 1000  # maximum number of changes of each kind, and of observers
+_CHANGE_KEYS = ("move", "remove", "add", "swap", "observers", "shift")
 _EXAMPLE = '{"move": [{"shape": "sign", "by": [0.5, 0, 0]}], "remove": ["stand"]}'
 
 
 @dataclass(frozen=True)
 class Move:
-    """Of a shape, or, if not, an area: first turned by degrees about its middle's vertical, then moved ``by``."""
+    """Move a shape (or an area): rotate it about the vertical axis through its centre, then translate it."""
 
     name: str
     is_shape: bool
@@ -336,7 +367,7 @@ class Move:
 
 @dataclass(frozen=True)
 class NewShape:
-    """What is added, or stands in place of the shape of its name: a box or a mesh."""
+    """A box or a mesh that is added, or that replaces the shape of the same name."""
 
     name: str
     geometry: Region | Path
@@ -344,7 +375,7 @@ class NewShape:
 
 @dataclass(frozen=True)
 class Changes:
-    """All changes; ``observers`` (M, 3) in place of those that there were, or None; ``shift`` of these (3,)."""
+    """All changes; ``observers`` (M, 3) replace the recorded ones, ``shift`` (3,) translates them."""
 
     move: tuple[Move, ...] = ()
     remove: tuple[str, ...] = ()
@@ -355,165 +386,178 @@ class Changes:
 
     @property
     def meshes(self) -> list[Path]:
-        """Files of what is added or swapped."""
+        """Files of the added and replacement meshes."""
         return [put.geometry for put in (*self.add, *self.swap) if isinstance(put.geometry, Path)]
 
     @property
-    def of_shapes(self) -> bool:
-        """Whether the scene is another one."""
+    def changes_shapes(self) -> bool:
+        """Whether the shapes of the scene change."""
         return bool(self.remove or self.add or self.swap or any(m.is_shape for m in self.move))
 
 
 def read_changes(path: str | Path) -> Changes:
-    """The changes of a JSON file. Raises `NergError` for what is none of them."""
+    """Read changes from a JSON file. Raises `NergError` for invalid files."""
     path = Path(path)
-    found = read_json(path, "file of changes", MAX_CHANGES_BYTES)
-    unknown = next((k for k in found if k not in _KEYS), None) if isinstance(found, dict) else ""
-    if not isinstance(found, dict) or not found or unknown is not None:
-        said = "" if not unknown else f'; "{sanitize(unknown, 40)}" is none of {", ".join(_KEYS)}'
-        raise NergError(f'"{path}" holds no changes; write {_EXAMPLE}{said}')
+    data = read_json(path, "file of changes", MAX_CHANGES_BYTES)
+    unknown = next((k for k in data if k not in _CHANGE_KEYS), None) if isinstance(data, dict) else ""
+    if not isinstance(data, dict) or not data or unknown is not None:
+        detail = "" if not unknown else f'; "{sanitize(unknown, 40)}" is not one of {", ".join(_CHANGE_KEYS)}'
+        raise NergError(f'"{path}" contains no valid changes; write {_EXAMPLE}{detail}')
     try:
-        listed = {key: _listed(found, key) for key in _KEYS[:5]}
-        observers = listed["observers"]
+        lists = {key: _get_list(data, key) for key in _CHANGE_KEYS[:5]}
+        observers = lists["observers"]
         return Changes(
-            tuple(_move(one) for one in listed["move"]),
-            tuple(_word(one, "remove") for one in listed["remove"]),
-            tuple(_put(one, "name", path) for one in listed["add"]),
-            tuple(_put(one, "shape", path) for one in listed["swap"]),
-            np.array([_three(one, "observers") for one in observers]) if observers else None,
-            np.array(_three(found["shift"], "shift")) if "shift" in found else None,
+            tuple(_parse_move(one) for one in lists["move"]),
+            tuple(_parse_name(one, "remove") for one in lists["remove"]),
+            tuple(_parse_new_shape(one, "name", path) for one in lists["add"]),
+            tuple(_parse_new_shape(one, "shape", path) for one in lists["swap"]),
+            np.array([_parse_vector(one, "observers") for one in observers]) if observers else None,
+            np.array(_parse_vector(data["shift"], "shift")) if "shift" in data else None,
         )
     except NergError as error:
         raise NergError(f'"{path}": {error}') from error
 
 
-def files_of_changes(path: str | Path, changes: Changes) -> list[Path]:
-    """The files that ``changes`` were read from: the ``path`` and its meshes."""
+def list_change_files(path: str | Path, changes: Changes) -> list[Path]:
+    """Return the file of the changes and the files of its meshes."""
     return list(dict.fromkeys([Path(path), *changes.meshes]))
 
 
-def _listed(found: dict[str, Any], key: str) -> list[Any]:
-    given = found.get(key, [])
-    if not isinstance(given, list) or len(given) > MOST_CHANGES or (key in found and not given):
-        raise NergError(f'"{key}" is a list of 1 to {MOST_CHANGES}, as in {_EXAMPLE}')
-    return given
+def _get_list(data: dict[str, Any], key: str) -> list[Any]:
+    entries = data.get(key, [])
+    if not isinstance(entries, list) or len(entries) > MAX_CHANGES or (key in data and not entries):
+        raise NergError(f'"{key}" must be a list of 1 to {MAX_CHANGES}, as in {_EXAMPLE}')
+    return entries
 
 
-def _move(given: Any) -> Move:
-    keys = [k for k in ("shape", "area") if isinstance(given, dict) and k in given]
-    if len(keys) != 1 or set(given) - {keys[0], "by", "turn"}:
-        raise NergError(f'a "move" names a "shape" or an "area", "by" what, and a "turn" in degrees, as in {_EXAMPLE}')
-    turn = given.get("turn", 0)
+def _parse_move(entry: Any) -> Move:
+    keys = [k for k in ("shape", "area") if isinstance(entry, dict) and k in entry]
+    if len(keys) != 1 or set(entry) - {keys[0], "by", "turn"}:
+        raise NergError(f'a "move" needs a "shape" or an "area", and "by" or a "turn" in degrees, as in {_EXAMPLE}')
+    turn = entry.get("turn", 0)
     if not is_number(turn) or not abs(turn) <= 1e6:
-        raise NergError('a "turn" must be in degrees')
-    by = _three(given.get("by", [0, 0, 0]), "by")
-    return Move(_word(given[keys[0]], keys[0]), keys[0] == "shape", by, float(turn))
+        raise NergError('a "turn" must be a number of degrees up to 1e6')
+    offset = _parse_vector(entry.get("by", [0, 0, 0]), "by")
+    return Move(_parse_name(entry[keys[0]], keys[0]), keys[0] == "shape", offset, float(turn))
 
 
-def _put(given: Any, key: str, path: Path) -> NewShape:
-    if not isinstance(given, dict) or not isinstance(given.get(key), str):
-        raise NergError(f'what is added has a "name", and what is swapped a "shape", as in {_EXAMPLE}')
-    name = _word(given[key], key)
+def _parse_new_shape(entry: Any, key: str, path: Path) -> NewShape:
+    if not isinstance(entry, dict) or not isinstance(entry.get(key), str):
+        raise NergError(f'an entry of "add" needs a "name", and one of "swap" a "shape", as in {_EXAMPLE}')
+    name = _parse_name(entry[key], key)
     check_area_name(name)
-    if "mesh" not in given:
-        return NewShape(name, parse_box(AreaEntry(name, given, f'"{sanitize(name, 40)}"')))
-    return NewShape(name, resolve_mesh_path(given["mesh"], path, "changes"))
+    if "mesh" not in entry:
+        return NewShape(name, parse_box(AreaEntry(name, entry, f'"{sanitize(name, 40)}"')))
+    return NewShape(name, resolve_mesh_path(entry["mesh"], path, "changes"))
 
 
-def _word(given: Any, what: str) -> str:
-    if not isinstance(given, str) or not 0 < len(given) <= 1000 or "\0" in given:
-        raise NergError(f'"{what}" is a name, as in {_EXAMPLE}')
-    return given
+def _parse_name(value: Any, key: str) -> str:
+    if not isinstance(value, str) or not 0 < len(value) <= 1000 or "\0" in value:
+        raise NergError(f'"{key}" must be a name, as in {_EXAMPLE}')
+    return value
 
 
-def _three(given: Any, what: str) -> tuple[float, float, float]:
-    numbers = isinstance(given, list) and len(given) == 3 and all(is_number(v) for v in given)
-    if not numbers or not all(v in COORDINATES for v in given):
-        raise NergError(f'"{what}" is three numbers x, y, z of {COORDINATES}')
-    return float(given[0]), float(given[1]), float(given[2])
+def _parse_vector(value: Any, key: str) -> tuple[float, float, float]:
+    is_vector = isinstance(value, list) and len(value) == 3 and all(is_number(v) for v in value)
+    if not is_vector or not all(v in COORDINATES for v in value):
+        raise NergError(f'"{key}" must be three numbers x, y, z of {COORDINATES}')
+    return float(value[0]), float(value[1]), float(value[2])
 
 
 def apply_to_areas(areas: AreaSet, changes: Changes) -> AreaSet:
-    """The areas after the changes: without those of shapes that are gone, boxes moved, and one for each shape that was
-    added and has none. Raises `NergError` for an area to be moved that there is not, or is no box."""
-    found: dict[str, Area] = {area.name: area for area in areas.areas}
+    """Apply changes to areas: drop areas of removed shapes, move boxes, and add an area for each added shape without
+    one.
+
+    Raises `NergError` if an area to be moved is unknown or not a box.
+    """
+    area_of: dict[str, Area] = {area.name: area for area in areas.areas}
     for move in changes.move:
         if move.is_shape:
             continue
-        area = found.get(move.name)
+        area = area_of.get(move.name)
         if not isinstance(area, Region):
-            what = "is no box, and moves with its shape" if area is not None else "is none of the areas"
-            raise NergError(f'"{sanitize(move.name, 40)}" cannot be moved as an area: it {what}')
-        found[move.name] = _moved(area, move)
+            reason = "is not a box; move its shape" if area is not None else "is not in the file of areas"
+            raise NergError(f'"{sanitize(move.name, 40)}" cannot be moved as an area: it {reason}')
+        area_of[move.name] = _move_box(area, move)
     for put in changes.add:
-        found.setdefault(put.name, SceneShape(put.name, put.name))
-    # Areas of what is removed go, and groups with them that have nothing else.
-    lost = {a.name for a in found.values() if isinstance(a, SceneShape) and a.shape in changes.remove}
-    rest: list[Area] = []
-    for area in found.values():
+        area_of.setdefault(put.name, SceneShape(put.name, put.name))
+    # Remove areas of removed shapes, and groups that would become empty.
+    removed = {a.name for a in area_of.values() if isinstance(a, SceneShape) and a.shape in changes.remove}
+    remaining: list[Area] = []
+    for area in area_of.values():
         if isinstance(area, AreaGroup):
-            parts = tuple(p for p in area.parts if p not in lost)
-            lost |= set() if parts else {area.name}
+            parts = tuple(p for p in area.parts if p not in removed)
+            removed |= set() if parts else {area.name}
             area = AreaGroup(area.name, parts)
-        if area.name not in lost:
-            rest.append(area)
-    return AreaSet(tuple(rest))
+        if area.name not in removed:
+            remaining.append(area)
+    return AreaSet(tuple(remaining))
 
 
-def _moved(box: Region, move: Move) -> Region:
+def _move_box(box: Region, move: Move) -> Region:
     from scipy.spatial.transform import Rotation
 
-    about = Rotation.from_euler("z", move.rotation_degrees, degrees=True)
-    turn = None if box.rotation is None and move.rotation_degrees == 0 else (about * Rotation.from_matrix(box.rotation_matrix)).as_quat()
-    by = np.array(move.offset)
-    return Region.create(box.name, np.array(box.lower) + by, np.array(box.upper) + by, turn)
+    rotation = Rotation.from_euler("z", move.rotation_degrees, degrees=True)
+    turn = (
+        None
+        if box.rotation is None and move.rotation_degrees == 0
+        else (rotation * Rotation.from_matrix(box.rotation_matrix)).as_quat()
+    )
+    offset = np.array(move.offset)
+    return Region.create(box.name, np.array(box.lower) + offset, np.array(box.upper) + offset, turn)
 
 
-def changed_scene(
+def apply_to_scene(
     scene: mi.Scene | None, changes: Changes, meshes: Mapping[Path, MeshFile]
 ) -> tuple[mi.Scene, dict[str, Any]]:
-    """Another scene with the changed shapes, which has those that stay in common with ``scene``, and all of its shapes
-    by name; ``meshes`` of what is added, by file. Raises `NergError` for shapes that there are not, or cannot be
-    moved."""
+    """Create a scene with the changed shapes; unchanged shapes are shared with ``scene``. Return it with all shapes by
+    name.
+
+    ``meshes`` are those of added shapes, by file. Raises `NergError` for shapes that are unknown or cannot be moved.
+    """
     if scene is None:
-        raise NergError("shapes are changed in a scene; give one (.xml), since a trained field cannot be taken apart")
-    kept = shapes_by_id(scene)
-    gone = {*changes.remove, *(put.name for put in changes.swap)}
-    for name in gone:
-        shape_named(kept, name)
-    for name in gone:
-        del kept[name]
+        raise NergError("changes of shapes need a scene (.xml), since a radiance field has no shapes")
+    shapes = shapes_by_id(scene)
+    removed = {*changes.remove, *(put.name for put in changes.swap)}
+    for name in removed:
+        find_shape(shapes, name)
+    for name in removed:
+        del shapes[name]
     for move in changes.move:
         if move.is_shape:
-            if move.name in gone:
-                raise NergError(f'the shape "{sanitize(move.name, 40)}" is moved and taken away; do one of them')
-            kept[move.name] = _moved_shape(shape_named(kept, move.name), move)
+            if move.name in removed:
+                raise NergError(
+                    f'the shape "{sanitize(move.name, 40)}" is both moved and removed; remove one of the changes'
+                )
+            shapes[move.name] = _move_shape(find_shape(shapes, move.name), move)
     for put in (*changes.add, *changes.swap):
-        if put.name in kept:
-            raise NergError(f'there is a shape "{sanitize(put.name, 40)}" already; "swap" it, or choose another name')
-        kept[put.name] = _made(put, meshes)
-    if not kept:
-        raise NergError("no shape is left; leave one at least")
-    return scene_from_shapes(kept), kept
+        if put.name in shapes:
+            raise NergError(f'there already is a shape "{sanitize(put.name, 40)}"; "swap" it, or choose another name')
+        shapes[put.name] = _make_shape(put, meshes)
+    if not shapes:
+        raise NergError("the changes remove all shapes; keep at least one")
+    return scene_from_shapes(shapes), shapes
 
 
-def _moved_shape(shape: Any, move: Move) -> Any:
+def _move_shape(shape: Any, move: Move) -> Any:
     import mitsuba as mi
 
     if not shape.is_mesh():
-        raise NergError(f'the shape "{sanitize(move.name, 40)}" is no mesh, and only meshes are moved; "swap" it for one')
+        raise NergError(
+            f'the shape "{sanitize(move.name, 40)}" is not a mesh and cannot be moved; "swap" it for a mesh'
+        )
     params: Any = mi.traverse(shape)
     vertices = np.array(params["vertex_positions"], np.float64).reshape(-1, 3)
-    middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+    center = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
     c, s = np.cos(np.radians(move.rotation_degrees)), np.sin(np.radians(move.rotation_degrees))
-    turned = (vertices - middle) @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T + middle + move.offset
-    return mitsuba_mesh(turned, np.array(params["faces"]).reshape(-1, 3), move.name)
+    moved = (vertices - center) @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T + center + move.offset
+    return mitsuba_mesh(moved, np.array(params["faces"]).reshape(-1, 3), move.name)
 
 
-def _made(put: NewShape, meshes: Mapping[Path, MeshFile]) -> Any:
-    if isinstance(put.geometry, Path):
-        mesh = meshes[put.geometry]
-        return mitsuba_mesh(mesh.vertices, mesh.faces, put.name)
+def _make_shape(new_shape: NewShape, meshes: Mapping[Path, MeshFile]) -> Any:
+    if isinstance(new_shape.geometry, Path):
+        mesh = meshes[new_shape.geometry]
+        return mitsuba_mesh(mesh.vertices, mesh.faces, new_shape.name)
     corner = lambda *bits: sum(b << k for k, b in enumerate(bits))
     faces = []
     for axis in range(3):
@@ -524,4 +568,4 @@ def _made(put: NewShape, meshes: Mapping[Path, MeshFile]) -> Any:
                 at[n][axis], at[n][u], at[n][v] = side, a, b
             q = [corner(*bits) for bits in at]
             faces += [[q[0], q[1], q[2]], [q[0], q[2], q[3]]]
-    return mitsuba_mesh(put.geometry.vertices, np.array(faces), put.name)
+    return mitsuba_mesh(new_shape.geometry.vertices, np.array(faces), new_shape.name)

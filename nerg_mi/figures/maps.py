@@ -1,4 +1,4 @@
-"""Figures of a place from above and of rays in it: alignment, cameras, floors, rays."""
+"""Plan views of a scene: alignment, cameras, floor plans, gaze samples."""
 
 from __future__ import annotations
 
@@ -12,13 +12,11 @@ from nerg_mi.errors import NergError
 
 from .style import INK, PAPER, SMALL, TITLE, label_axes, label_bar, new_page, wrap
 
-# ---- Alignment figures ----
-#
-# How tracking lies in a place, before and after it is aligned: from above and from the side.
+# ---- Alignment ----
 
-_PLACE, _HITS, _HEADS, _WANTED = "#b9b4aa", "#d9730d", "#2b6cb0", "#1c7c3c"
-_MOST = 20_000  # points drawn of a kind; more of them only hide each other
-_SIDE = 420
+_PLACE, _HITS, _HEADS, _TARGETS = "#b9b4aa", "#d9730d", "#2b6cb0", "#1c7c3c"
+_MAX_POINTS = 20_000  # maximum number of drawn points per kind
+_ALIGNMENT_SIDE = 420
 
 
 def alignment_figure(
@@ -28,26 +26,38 @@ def alignment_figure(
     matrix: np.ndarray,
     targets: np.ndarray | None = None,
     title: str = "Alignment",
-    cut: float | None = None,
+    cut_height: float | None = None,
 ):
-    """``points`` (N, 3) and ``heads`` (M, 3) of the tracking as they are and by ``matrix`` (4, 4), over points (K, 3)
-    of the ``place`` and the ``targets`` (N, 3) that they belong to; all z up.
+    """Draw the tracking before and after an alignment, from above and from the side; z is up.
 
-    ``cut``: height above which the place is left out of the plans from above, so that no ceiling hides it.
+    Parameters
+    ----------
+    place
+        Points of the scene, (K, 3), or None.
+    points, heads
+        Points (N, 3) and head positions (M, 3) of the tracking.
+    matrix
+        Similarity (4, 4) from the tracking to the scene.
+    targets
+        Positions (N, 3) to which the points should be mapped.
+    title
+        Title of the figure.
+    cut_height
+        Height above which the scene is omitted in views from above, such as a ceiling.
     """
-    figure = new_page(2 * _SIDE, 2 * _SIDE + 60)
+    figure = new_page(2 * _ALIGNMENT_SIDE, 2 * _ALIGNMENT_SIDE + 60)
     moved = lambda p: p @ matrix[:3, :3].T + matrix[:3, 3]
     rows = ((points, heads, "before"), (moved(points), None if heads is None else moved(heads), "after"))
     for line, (p, h, when) in zip(figure.subplots(2, 2), rows):
         for axes, (a, b), view in zip(line, ((0, 1), (0, 2)), ("from above", "from the side")):
             shown = place
-            if shown is not None and cut is not None and b == 1:
-                shown = shown[shown[:, 2] < cut]
-            _dots(axes, shown, (a, b), _PLACE, 1.2, "the place")
-            _dots(axes, targets, (a, b), _WANTED, 30, "where they belong", "+")
-            _dots(axes, p, (a, b), _HITS, 2 if len(p) > 100 else 14, "hit points" if h is not None else "points")
-            _dots(axes, h, (a, b), _HEADS, 2, "heads")
-            _frame(axes, [v for v in (shown, targets, p, h) if v is not None and len(v)], (a, b))
+            if shown is not None and cut_height is not None and b == 1:
+                shown = shown[shown[:, 2] < cut_height]
+            _draw_points(axes, shown, (a, b), _PLACE, 1.2, "scene")
+            _draw_points(axes, targets, (a, b), _TARGETS, 30, "targets", "+")
+            _draw_points(axes, p, (a, b), _HITS, 2 if len(p) > 100 else 14, "hit points" if h is not None else "points")
+            _draw_points(axes, h, (a, b), _HEADS, 2, "heads")
+            _set_limits(axes, [v for v in (shown, targets, p, h) if v is not None and len(v)], (a, b))
             axes.set_title(f"{when}, {view}", fontsize=9, color=INK, loc="left")
             label_axes(axes, "xyz"[a], "xyz"[b], 7, labelpad=1)
     figure.axes[0].legend(fontsize=7, frameon=False, markerscale=5, loc="upper right")
@@ -56,17 +66,19 @@ def alignment_figure(
     return figure
 
 
-def _dots(axes, points: np.ndarray | None, at: tuple[int, int], color: str, size: float, name: str, mark=".") -> None:
+def _draw_points(
+    axes, points: np.ndarray | None, at: tuple[int, int], color: str, size: float, name: str, mark="."
+) -> None:
     if points is None or not len(points):
         return
-    some = points[np.random.default_rng(0).permutation(len(points))[:_MOST]]
+    subset = points[np.random.default_rng(0).permutation(len(points))[:_MAX_POINTS]]
     edge = 0 if mark == "." else 1
-    x, y = some[:, at].T
+    x, y = subset[:, at].T
     axes.scatter(x, y, s=size, c=color, marker=mark, linewidths=edge, label=name, rasterized=True)
 
 
-def _frame(axes, parts: Sequence[np.ndarray], at: tuple[int, int]) -> None:
-    """Axes of equal scale that hold all parts but for their strays."""
+def _set_limits(axes, parts: Sequence[np.ndarray], at: tuple[int, int]) -> None:
+    """Set limits of equal scale that contain all parts except outliers."""
     low = np.min([np.percentile(p[:, at], 1, axis=0) for p in parts], axis=0)
     high = np.max([np.percentile(p[:, at], 99, axis=0) for p in parts], axis=0)
     edge = 0.06 * max(float(np.max(high - low)), 1e-9)
@@ -75,29 +87,33 @@ def _frame(axes, parts: Sequence[np.ndarray], at: tuple[int, int]) -> None:
     axes.set_aspect("equal", adjustable="box")
 
 
-# ---- Camera figures ----
-#
-# Where pictures were taken: cameras and points of a place, from above and from the side.
+# ---- Cameras ----
 
 _CAMERA, _PATH = "#c0392b", "#e2a49c"
-_MOST_POINTS = 40_000  # drawn; more of them only hide each other
-_CAMERA_FIGURES_SIDE = 520  # pixels of each of the two plans
+_MAX_CAMERA_POINTS = 40_000  # maximum number of drawn points
+_CAMERA_SIDE = 520  # pixels of each of the two plans
 
 
 def camera_figure(to_world: np.ndarray, points: np.ndarray, colors: np.ndarray, title: str):
-    """OpenGL camera-to-world poses (N, 4, 4), as wedges that open to where they look, and ``points`` (M, 3) in their
-    ``colors`` (M, 3), uint8: x and y from above, x and z from the side, +z up. Lengths are in units of the poses.
+    """Draw cameras and points from above (x, y) and from the side (x, z); z is up, lengths are in units of the poses.
 
-    Points far beyond the others are left out of the plans.
+    Parameters
+    ----------
+    to_world
+        OpenGL camera-to-world poses, (N, 4, 4). A camera is a wedge that opens in the viewing direction.
+    points, colors
+        Points (M, 3), without outliers, and their colours (M, 3), uint8.
+    title
+        Title of the figure.
     """
-    figure = new_page(2 * _CAMERA_FIGURES_SIDE, _CAMERA_FIGURES_SIDE + 50)
+    figure = new_page(2 * _CAMERA_SIDE, _CAMERA_SIDE + 50)
     centers = to_world[:, :3, 3]
-    low, high = _bounds(centers, points)
+    low, high = _camera_bounds(centers, points)
     size = 0.04 * float(np.max(high - low)) or 1.0
     near = np.all((points >= low) & (points <= high), axis=1)
     points, colors = points[near], colors[near]
-    if len(points) > _MOST_POINTS:
-        some = np.random.default_rng(0).choice(len(points), _MOST_POINTS, replace=False)
+    if len(points) > _MAX_CAMERA_POINTS:
+        some = np.random.default_rng(0).choice(len(points), _MAX_CAMERA_POINTS, replace=False)
         points, colors = points[some], colors[some]
     for axes, (a, b), name in zip(figure.subplots(1, 2), ((0, 1), (0, 2)), ("from above", "from the side")):
         axes.scatter(points[:, a], points[:, b], s=1.5, c=colors / 255.0, linewidths=0, rasterized=True)
@@ -117,8 +133,8 @@ def camera_figure(to_world: np.ndarray, points: np.ndarray, colors: np.ndarray, 
     return figure
 
 
-def _bounds(centers: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Corners that hold all cameras, and the points but for those far off."""
+def _camera_bounds(centers: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return corners that contain all cameras, and the points except outliers."""
     low, high = centers.min(axis=0), centers.max(axis=0)
     if len(points):
         lower, upper = np.quantile(points, [0.05, 0.95], axis=0)
@@ -126,28 +142,28 @@ def _bounds(centers: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.nda
     return low, high
 
 
-# ---- Floor figures ----
+# ---- Floor plans ----
 #
-# The floor plan of a place: what stands there, where people walked, what they looked at and what they could see.
-#
-# Axes are in metres, x to the right and y up, z the height; +z is up.
+# Floor plan with walls, participants' paths, gaze targets and fields of view. Axes are in metres; z is up.
 
-PEOPLE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#882255", "#332288")
-"""Colours of people, which can be told apart with any kind of colour blindness (Okabe and Ito; Tol), and in grey by
-their lightness as far as eight can."""
+PARTICIPANT_COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#882255", "#332288")
+"""Colours of participants, distinguishable with colour vision deficiencies (Okabe and Ito; Tol)."""
 
-_FLOOR_FIGURES_SIDE = 720  # pixels of the plan's longer side
+_FLOOR_SIDE = 720  # pixels of the plan's longer side
 _LEFT, _FOOT, _RIGHT = 56, 50, 16
-_GREYS = (0.94, 0.62)  # of the lowest and of the highest things below the cut
-_CUT = 0.25
-_NAMED = 8
+_GREYS = (0.94, 0.62)  # grey of the lowest and of the highest objects below the cut
+_CUT_GREY = 0.25
+_MAX_LEGEND_PATHS = 8
 
 
 @dataclass(frozen=True, eq=False)
 class Walls:
-    """A place cut at a height. ``low``, ``high`` (2,): corners of the grid on the floor; ``height`` (ny, nx): that of
-    what is met below the cut, NaN where nothing is; ``cut`` (ny, nx), bool: where the cut goes through something. Rows
-    from the least y on. ``level``: the height of the cut."""
+    """A horizontal cut through a scene.
+
+    ``low``, ``high`` (2,): corners of the grid on the floor; ``height`` (ny, nx): height of the first surface below the
+    cut, NaN if there is none; a mask (ny, nx) of the cells in which the cut passes through a solid; the height of the
+    cut. Rows start at the smallest y.
+    """
 
     low: np.ndarray
     high: np.ndarray
@@ -158,17 +174,17 @@ class Walls:
 
 @dataclass(frozen=True, eq=False)
 class ParticipantPath:
-    """Where a person was: ``places`` (N, 2) in the order of time, ``breaks`` (N,) bool where a new walk begins."""
+    """Path of a participant: positions (N, 2) sorted by time, and whether a new segment starts at each, (N,)."""
 
     name: str
     positions: np.ndarray
-    breaks: np.ndarray
+    is_start: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
 class SightLines:
-    """``origins`` (N, 2), and unit ``directions`` (N, 2) or ``ends`` (N, 2) on the floor, of the people numbered
-    ``person`` (N,)."""
+    """``origins`` (N, 2), unit ``directions`` (N, 2) or ``ends`` (N, 2) on the floor, and the index of the
+    participant of each (N,)."""
 
     origins: np.ndarray
     ends: np.ndarray
@@ -185,13 +201,27 @@ def floor_figure(
     fov: float = 60.0,
     title: str = "Floor plan",
 ) -> Any:
-    """The plan between the corners ``low`` and ``high`` (2,), metres.
+    """Draw a floor plan between the corners ``low`` and ``high`` (2,), in metres.
 
-    ``walks``: paths, a colour a person; ``rays``: lines from eyes to what was looked at; ``fields``: fields of view
-    ``fov`` degrees wide, as wedges that end where the sight does. Each kind is explained by a legend.
+    Parameters
+    ----------
+    low, high
+        Corners of the plan.
+    walls
+        Cut through the scene.
+    paths
+        Paths, one colour per participant.
+    rays
+        Lines from observers to gaze targets.
+    fields
+        Fields of view, drawn as wedges that end at the first surface.
+    fov
+        Angle of the fields of view in degrees.
+    title
+        Title of the figure.
     """
     size = np.asarray(high, float) - low
-    pixels = np.maximum(size / size.max() * _FLOOR_FIGURES_SIDE, 200)
+    pixels = np.maximum(size / size.max() * _FLOOR_SIDE, 200)
     names = _legend_entries(walls, paths or [], rays, fields, fov)
     columns = max(int(pixels[0] // 190), 1)
     head = 30 + 17 * -(-len(names) // columns)
@@ -200,16 +230,22 @@ def floor_figure(
     axes = page.add_axes((_LEFT / width, _FOOT / height, pixels[0] / width, pixels[1] / height))
     if walls is not None:
         extent = (walls.low[0], walls.high[0], walls.low[1], walls.high[1])
-        axes.imshow(_plan(walls), origin="lower", extent=extent, interpolation="nearest", zorder=0)
+        axes.imshow(_shade_plan(walls), origin="lower", extent=extent, interpolation="nearest", zorder=0)
     if fields is not None:
         _draw_fields(axes, fields, fov)
     if rays is not None:
         _draw_rays(axes, rays)
     for k, walk in enumerate(paths or []):
-        starts = walk.positions[walk.breaks]
+        starts = walk.positions[walk.is_start]
         axes.plot(*_with_gaps(walk).T, color=participant_color(k), linewidth=1.4, zorder=4, solid_joinstyle="round")
         axes.plot(
-            *starts.T, "o", color=participant_color(k), markersize=3.5, markeredgecolor=PAPER, markeredgewidth=0.6, zorder=5
+            *starts.T,
+            "o",
+            color=participant_color(k),
+            markersize=3.5,
+            markeredgecolor=PAPER,
+            markeredgewidth=0.6,
+            zorder=5,
         )
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
@@ -226,21 +262,21 @@ def floor_figure(
 
 
 def participant_color(index: int) -> str:
-    """The colour of the person with this number; those beyond the last colour begin anew."""
-    return PEOPLE[index % len(PEOPLE)]
+    """Return the colour of a participant; colours repeat after the last one."""
+    return PARTICIPANT_COLORS[index % len(PARTICIPANT_COLORS)]
 
 
 def _with_gaps(walk: ParticipantPath) -> np.ndarray:
-    """The places of a walk with a NaN before each at which a new one begins."""
-    return np.insert(walk.positions.astype(float), np.flatnonzero(walk.breaks), np.nan, axis=0)
+    """Return the positions of a path with a NaN before each new segment."""
+    return np.insert(walk.positions.astype(float), np.flatnonzero(walk.is_start), np.nan, axis=0)
 
 
-def _plan(walls: Walls) -> np.ndarray:
-    """Greys (ny, nx, 3): the higher the darker, white where nothing is met, and darkest where the cut goes through."""
-    share = np.clip(np.nan_to_num(walls.height) / walls.cut_height, 0.0, 1.0)
-    grey = _GREYS[0] + share * (_GREYS[1] - _GREYS[0])
+def _shade_plan(walls: Walls) -> np.ndarray:
+    """Return greys (ny, nx, 3): darker for higher surfaces, white without a surface, darkest at the cut."""
+    fraction = np.clip(np.nan_to_num(walls.height) / walls.cut_height, 0.0, 1.0)
+    grey = _GREYS[0] + fraction * (_GREYS[1] - _GREYS[0])
     grey = np.where(np.isnan(walls.height), 1.0, grey)
-    return np.repeat(np.where(walls.is_cut, _CUT, grey)[..., None], 3, axis=-1)
+    return np.repeat(np.where(walls.is_cut, _CUT_GREY, grey)[..., None], 3, axis=-1)
 
 
 def _draw_rays(axes: Any, rays: SightLines) -> None:
@@ -257,8 +293,8 @@ def _draw_fields(axes: Any, fields: SightLines, fov: float) -> None:
     from matplotlib.patches import Wedge
 
     along = fields.ends - fields.origins
-    angle, reach = np.degrees(np.arctan2(along[:, 1], along[:, 0])), np.linalg.norm(along, axis=1)
-    wedges = [Wedge(tuple(o), r, a - fov / 2, a + fov / 2) for o, r, a in zip(fields.origins, reach, angle)]
+    angle, length = np.degrees(np.arctan2(along[:, 1], along[:, 0])), np.linalg.norm(along, axis=1)
+    wedges = [Wedge(tuple(o), r, a - fov / 2, a + fov / 2) for o, r, a in zip(fields.origins, length, angle)]
     colors = [participant_color(k) for k in fields.participant]
     axes.add_collection(
         PatchCollection(wedges, facecolor=colors, edgecolor=colors, alpha=0.22, linewidth=0.7, zorder=2)
@@ -269,90 +305,108 @@ def _legend_entries(
     walls: Walls | None, walks: list[ParticipantPath], rays: SightLines | None, fields: SightLines | None, fov: float
 ) -> list[tuple[str, dict[str, Any]]]:
     square = dict(linestyle="none", marker="s", markersize=6)
-    found: list[tuple[str, dict[str, Any]]] = []
+    entries: list[tuple[str, dict[str, Any]]] = []
     if walls is not None:
-        found.append((f"cut at {walls.cut_height:g} m", {**square, "color": str(_CUT)}))
-        found.append(("lower things", {**square, "color": str(_GREYS[1])}))
+        entries.append((f"cut at {walls.cut_height:g} m", {**square, "color": str(_CUT_GREY)}))
+        entries.append(("lower objects", {**square, "color": str(_GREYS[1])}))
         if np.isnan(walls.height[~walls.is_cut]).any():
             edge = dict(color=PAPER, markeredgecolor="0.6", markeredgewidth=0.6)
-            found.append(("nothing below", {**square, **edge}))
-    for k, walk in enumerate(walks[:_NAMED]):
-        found.append(
-            (walk.name if len(walk.name) <= 22 else walk.name[:21] + "…", dict(color=participant_color(k), linewidth=1.4))
+            entries.append(("no surface below", {**square, **edge}))
+    for k, walk in enumerate(walks[:_MAX_LEGEND_PATHS]):
+        entries.append(
+            (
+                walk.name if len(walk.name) <= 22 else walk.name[:21] + "…",
+                dict(color=participant_color(k), linewidth=1.4),
+            )
         )
-    if len(walks) > _NAMED:
-        found.append((f"and {len(walks) - _NAMED} more people", dict(color="none")))
+    if len(walks) > _MAX_LEGEND_PATHS:
+        entries.append((f"and {len(walks) - _MAX_LEGEND_PATHS} more participants", dict(color="none")))
     if rays is not None:
-        found.append(("to what was looked at", dict(color="0.4", linewidth=0.8, marker="o", markersize=2.5)))
+        entries.append(("lines of sight", dict(color="0.4", linewidth=0.8, marker="o", markersize=2.5)))
     if fields is not None:
-        found.append((f"field of view, {fov:g}°", {**square, "color": "0.75"}))
-    return found
+        entries.append((f"field of view, {fov:g}°", {**square, "color": "0.75"}))
+    return entries
 
 
-# ---- Ray figures ----
+# ---- Gaze samples ----
 #
-# Rays from above: how densely a floor is walked, and the layout with every ray's place.
-#
-# Both return a matplotlib ``Figure`` with axes in metres, x to the right and y up; ``figures.save`` writes it. pyplot
-# stays out of it.
+# Both functions return a matplotlib ``Figure`` with axes in metres; `nerg_mi.figures.style.save` writes it.
 
 _POINTS, _SURFACES = "#2b6cb0", "#b9b4aa"
-_RAY_FIGURES_MOST_POINTS = 60_000  # drawn; more of them only hide each other
-_MOST_CELLS = 4_000_000
-_RAY_FIGURES_SIDE = 640  # pixels of the plan's longer side
+_MAX_RAY_POINTS = 60_000  # maximum number of drawn points
+_MAX_CELLS = 4_000_000
+_PLAN_SIDE = 640  # pixels of the plan's longer side
 
 
-def floor_plan(rays, cell: float | None = None, title: str = "Where people stood"):
-    """Density of the rays' origins on the floor, in rays/m², on a logarithmic scale; cells without a ray stay white,
-    as the scale says.
+def floor_plan(rays, cell: float | None = None, title: str = "Participants' positions"):
+    """Draw the density of the samples' origins on the floor in samples/m², on a logarithmic scale; empty cells are
+    white.
 
-    ``cell``: edge of a cell in metres (default: a fiftieth of the plan's shorter side, 5 cm at least). Short lines show
-    where the people of a coarser cell look on average; the longer, the more they agree. Raises `NergError` for no rays,
-    and for cells that are no length or too many.
+    Arrows show the mean horizontal gaze direction in coarser cells; longer arrows mean more agreement. Raises
+    `NergError` if there are no samples, and for an invalid cell size.
+
+    Parameters
+    ----------
+    rays
+        Gaze samples.
+    cell
+        Edge length of a cell in metres. Default: a fiftieth of the shorter side, at least 5 cm.
+    title
+        Title of the figure.
     """
     from matplotlib.colors import LogNorm
 
     xy = rays.origin[:, :2]
-    low, high = _box(xy)
+    low, high = _bounding_box(xy)
     size = high - low
     cell = max(0.05, round(float(size.min()) / 50, 2)) if cell is None else cell
     if not 0 < cell < np.inf:
-        raise NergError(f"the edge of a cell is a positive length in metres, got {cell:g} (--cell)")
-    if not np.prod(size / cell + 1) <= _MOST_CELLS:
+        raise NergError(f"the edge length of a cell must be positive, in metres; got {cell:g} (--cell-size)")
+    if not np.prod(size / cell + 1) <= _MAX_CELLS:
         raise NergError(
-            f"a plan of {size[0]:.4g} x {size[1]:.4g} m has more than {_MOST_CELLS:,} cells of {cell:g} m; name "
-            "larger ones (--cell)"
+            f"a plan of {size[0]:.4g} x {size[1]:.4g} m has more than {_MAX_CELLS:,} cells of {cell:g} m; choose "
+            "larger cells (--cell-size)"
         )
     edges = [np.arange(a, b + cell, cell) for a, b in zip(low, high)]
     counts, *_ = np.histogram2d(xy[:, 0], xy[:, 1], edges)
     density = np.ma.masked_equal(counts.T / cell**2, 0)
-    figure, axes = _sheet(low, high, f"{title}: {_of(rays)}", bar=True)
+    figure, axes = _new_plan(low, high, f"{title}: {_describe_rays(rays)}", bar=True)
     top = float(density.max())
     bottom = max(float(density.min()), top * 1e-4)
     image = axes.pcolormesh(
         *edges, density, cmap="viridis", norm=LogNorm(bottom, max(top, bottom * 1.01)), rasterized=True
     )
-    _arrows(axes, rays, low, high)
-    label_bar(figure.colorbar(image, cax=figure.axes[1]), f"rays/m² in cells of {cell:g} m; white: no ray", 7)
+    _draw_arrows(axes, rays, low, high)
+    label_bar(figure.colorbar(image, cax=figure.axes[1]), f"samples/m² in cells of {cell:g} m; white: no sample", 7)
     return figure
 
 
 def layout_figure(rays, test=None, centres=None, radius: float | None = None, title: str = "Layout"):
-    """The paper's layout figure: a point for every ray's place (blue) within the place and its dimensions in metres.
+    """Draw the origin of every sample (blue) in the scene, with its dimensions in metres.
 
-    The place is drawn as what was looked at: hit points between knee and reach (0.3 to 2 m above the floor), in grey.
-    ``test``: rays held out, in orange. ``centres`` (T, 3) with ``radius``: test positions, as circles.
+    The scene is outlined by the hit points between 0.3 and 2 m above the floor, in grey.
+
+    Parameters
+    ----------
+    rays
+        Gaze samples.
+    test
+        Held-out samples, in orange.
+    centres, radius
+        Centres (T, 3) and radius of test positions, drawn as circles.
+    title
+        Title of the figure.
     """
     points = [rays.origin[:, :2]] + ([] if test is None else [test.origin[:, :2]])
-    walls = _walls([rays] if test is None else [rays, test])
-    low, high = _box(np.concatenate([*points, *([] if walls is None else [walls])]))
-    figure, axes = _sheet(low, high, f"{title}: {_of(rays, test)}", pad=0.13)
+    walls = _hit_outline([rays] if test is None else [rays, test])
+    low, high = _bounding_box(np.concatenate([*points, *([] if walls is None else [walls])]))
+    figure, axes = _new_plan(low, high, f"{title}: {_describe_rays(rays, test)}", pad=0.13)
     if walls is not None:
-        axes.plot(*_some(walls).T, ",", color=_SURFACES, rasterized=True, zorder=1)
+        axes.plot(*_subsample(walls).T, ",", color=_SURFACES, rasterized=True, zorder=1)
     for xy, color in zip(points, (_POINTS, "#d9730d")):
         size = 3.5 - 0.5 * np.log10(max(len(xy), 10))  # few points are drawn larger
         axes.plot(
-            *_some(xy).T, ".", markersize=max(size, 1.1), markeredgewidth=0, color=color, rasterized=True, zorder=2
+            *_subsample(xy).T, ".", markersize=max(size, 1.1), markeredgewidth=0, color=color, rasterized=True, zorder=2
         )
     if centres is not None and radius is not None:
         from matplotlib.collections import PatchCollection
@@ -360,11 +414,11 @@ def layout_figure(rays, test=None, centres=None, radius: float | None = None, ti
 
         circles = [Circle(c, radius) for c in np.asarray(centres)[:, :2]]
         axes.add_collection(PatchCollection(circles, facecolor="#d9730d", edgecolor="none", alpha=0.02, zorder=1.5))
-    first, last = _box(np.concatenate(points), margin=0.0)
-    _dimension(axes, first, last)
-    names = [(_POINTS, "rays" if test is None else "training rays")]
-    names += ([] if test is None else [("#d9730d", "test rays")]) + (
-        [] if walls is None else [(_SURFACES, "what was looked at")]
+    first, last = _bounding_box(np.concatenate(points), margin=0.0)
+    _draw_dimensions(axes, first, last)
+    names = [(_POINTS, "samples" if test is None else "training samples")]
+    names += ([] if test is None else [("#d9730d", "test samples")]) + (
+        [] if walls is None else [(_SURFACES, "gaze hit points")]
     )
     handles = [axes.plot([], [], "s", markersize=5, color=color, label=name)[0] for color, name in names]
     axes.legend(
@@ -380,51 +434,51 @@ def layout_figure(rays, test=None, centres=None, radius: float | None = None, ti
     return figure
 
 
-def _walls(sets) -> np.ndarray | None:
+def _hit_outline(sets) -> np.ndarray | None:
     hits = [r.hit[np.isfinite(r.hit).all(axis=1)] for r in sets if r.hit is not None]
-    found = [h[(h[:, 2] > 0.3) & (h[:, 2] < 2.0), :2] for h in hits]
-    found = [f for f in found if len(f)]
-    if not found:
+    outlines = [h[(h[:, 2] > 0.3) & (h[:, 2] < 2.0), :2] for h in hits]
+    outlines = [f for f in outlines if len(f)]
+    if not outlines:
         return None
-    walls = np.concatenate(found)
-    # A glance through a gap ends tens of metres away.
+    walls = np.concatenate(outlines)
+    # Drop outliers, such as gaze through a window.
     low, high = np.percentile(walls, [1, 99], axis=0)
     return walls[((walls >= low) & (walls <= high)).all(axis=1)]
 
 
-def _box(xy: np.ndarray, margin: float = 0.03) -> tuple[np.ndarray, np.ndarray]:
+def _bounding_box(xy: np.ndarray, margin: float = 0.03) -> tuple[np.ndarray, np.ndarray]:
     if not len(xy):
-        raise NergError("there are no rays to draw; select fewer away")
+        raise NergError("there are no gaze samples to draw; relax the selection")
     low, high = xy.min(axis=0), xy.max(axis=0)
     edge = np.maximum(margin * (high - low).max(), 0.05 if margin else 0.0)
     return low - edge, high + edge
 
 
-def _some(xy: np.ndarray) -> np.ndarray:
+def _subsample(xy: np.ndarray) -> np.ndarray:
     return (
         xy
-        if len(xy) <= _RAY_FIGURES_MOST_POINTS
-        else xy[np.random.default_rng(0).choice(len(xy), _RAY_FIGURES_MOST_POINTS, replace=False)]
+        if len(xy) <= _MAX_RAY_POINTS
+        else xy[np.random.default_rng(0).choice(len(xy), _MAX_RAY_POINTS, replace=False)]
     )
 
 
-def _of(rays, test=None) -> str:
-    people = np.unique(
+def _describe_rays(rays, test=None) -> str:
+    num_participants = np.unique(
         np.concatenate([np.asarray(rays.persons)[np.unique(r.person)] for r in (rays, test) if r is not None])
     ).size
-    count = f"{len(rays):,} rays" if test is None else f"{len(rays):,} + {len(test):,} rays"
-    return f"{count} of {people} {'person' if people == 1 else 'people'}"
+    count = f"{len(rays):,} samples" if test is None else f"{len(rays):,} + {len(test):,} samples"
+    return f"{count} of {num_participants} {'participant' if num_participants == 1 else 'participants'}"
 
 
-def _arrows(axes, rays, low, high) -> None:
+def _draw_arrows(axes, rays, low, high) -> None:
     step = float((high - low).max()) / 24
     at = np.floor((rays.origin[:, :2] - low) / step).astype(int)
     width = int(np.ceil((high - low)[0] / step)) + 1
     _, cell, count = np.unique(at[:, 1] * width + at[:, 0], return_inverse=True, return_counts=True)
     mean = lambda v: np.stack([np.bincount(cell, weights=c) for c in v.T], axis=1) / count[:, None]
     place, level = mean(rays.origin[:, :2]), mean(rays.direction[:, :2])
-    enough = count >= max(20, len(rays) * 1e-4)
-    place, level = place[enough], level[enough]
+    is_sufficient = count >= max(20, len(rays) * 1e-4)
+    place, level = place[is_sufficient], level[is_sufficient]
     axes.quiver(
         *place.T,
         *(level.T * step),
@@ -442,8 +496,8 @@ def _arrows(axes, rays, low, high) -> None:
     )
 
 
-def _dimension(axes, low, high) -> None:
-    """Lines along two sides that say how far the rays reach."""
+def _draw_dimensions(axes, low, high) -> None:
+    """Draw dimension lines with the extent of the samples."""
     x0, x1 = axes.get_xlim()
     y0, y1 = axes.get_ylim()
     line = dict(
@@ -457,13 +511,12 @@ def _dimension(axes, low, high) -> None:
     axes.text(x, 0.5 * (low[1] + high[1]), f"{high[1] - low[1]:.2f} m", rotation=90, **text)
 
 
-def _sheet(low, high, title: str, bar: bool = False, pad: float = 0.0):
-    """A figure with axes in metres, of equal scale: so large that the plan's longer side has a fixed number of
-    pixels. ``bar``: the figure's second axes are those of a colour bar."""
-    # Room for the lines of dimension, outside of what they measure.
+def _new_plan(low, high, title: str, bar: bool = False, pad: float = 0.0):
+    """Create a figure with axes in metres of equal scale; ``bar`` adds axes for a colour bar."""
+    # Margin for the dimension lines.
     room = pad * (high - low).max()
     low, high = low - (0, room), high + (room, 0)
-    size = np.maximum((high - low) / (high - low).max() * _RAY_FIGURES_SIDE, 160)
+    size = np.maximum((high - low) / (high - low).max() * _PLAN_SIDE, 160)
     left, foot, head, right = 48, 40, 46, 96 if bar else 14
     width, height = left + size[0] + right, foot + size[1] + head
     figure = new_page(width, height)

@@ -1,4 +1,4 @@
-"""One picture of a dataset: where people were, where they looked, and when."""
+"""Automatic choice of a camera that shows a scene, or the attention of an observer."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from nerg_mi.maths.sphere import fibonacci_directions
 
 Trace = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 SURFACE_OPACITY = 0.5
-"""Opacity from which on a ray meets a surface."""
+"""Minimum opacity of a surface hit."""
 
-_COARSE, _FINE = (18, 12), (48, 32)
-_KEPT = 10
-# Nearer than this share of the usual distance things fill a picture.
-_NEAR = 0.2
-# Where the mean and the median depth differ by this share there is more fog than surface.
-_FOG = 0.1
-# Attention above this share of its greatest density counts as seen where it is seen.
-_ATTENDED = 0.15
+_COARSE_SIZE, _FINE_SIZE = (18, 12), (48, 32)
+_NUM_CANDIDATES = 10
+# Surfaces closer than this fraction of the typical distance fill an image.
+_NEAR_FRACTION = 0.2
+# Relative difference of mean and median depth that indicates fog rather than a surface.
+_FOG_FRACTION = 0.1
+# A surface is attended if its gaze density exceeds this fraction of the maximum.
+_ATTENTION_THRESHOLD = 0.15
 
 
 @dataclass(frozen=True)
 class CameraView:
-    """A camera at ``origin`` (3,) that looks at ``target`` (3,); ``score``: 0 .. 1, of `Judge`; ``opaque``: share of
-    its picture that shows surfaces; ``attended``: share of the observer's attention that it shows, None without one."""
+    """A camera at ``origin`` (3,) that looks at ``target`` (3,), its score (0..1), the fraction of pixels with a
+    surface, and the share of the observer's attention in the image (None without an observer)."""
 
     origin: np.ndarray
     target: np.ndarray
@@ -38,43 +38,45 @@ class CameraView:
 
 @dataclass(frozen=True)
 class PinholeFrame:
-    """Pixels of a pinhole camera: ``fov``, degrees from left to right, ``aspect``: width by height, ``up`` (3,)."""
+    """Image of a pinhole camera: horizontal ``fov`` in degrees, ``aspect`` (width by height) and ``up`` axis (3,)."""
 
     fov: float
     aspect: float
     up: np.ndarray
 
     def axes(self, ahead: np.ndarray) -> np.ndarray:
-        """Right, up and ahead (..., 3, 3) of cameras that look along unit ``ahead`` (..., 3)."""
+        """Return the right, up and forward axes (..., 3, 3) of cameras with unit forward directions ``ahead`` (...,
+        3)."""
         right = np.cross(ahead, self.up)
         right /= np.maximum(np.linalg.norm(right, axis=-1, keepdims=True), 1e-9)
         return np.stack([right, np.cross(right, ahead), ahead], axis=-2)
 
     def directions(self, ahead: np.ndarray, width: int, height: int) -> np.ndarray:
-        """Unit directions (..., height * width, 3) of the pixels of cameras that look along ``ahead`` (..., 3)."""
-        reach = np.tan(np.radians(self.fov / 2))
-        x = ((np.arange(width) + 0.5) / width * 2 - 1) * reach
-        y = (1 - (np.arange(height) + 0.5) / height * 2) * reach / self.aspect
+        """Return the unit directions (..., height * width, 3) of the pixels of cameras with forward directions
+        ``ahead`` (..., 3)."""
+        half_width = np.tan(np.radians(self.fov / 2))
+        x = ((np.arange(width) + 0.5) / width * 2 - 1) * half_width
+        y = (1 - (np.arange(height) + 0.5) / height * 2) * half_width / self.aspect
         local = np.stack([*(v.ravel() for v in np.meshgrid(x, y)), np.ones(width * height)], axis=-1)
         local /= np.linalg.norm(local, axis=-1, keepdims=True)
         return local @ self.axes(np.asarray(ahead, float))
 
     def pixels(self, origins: np.ndarray, ahead: np.ndarray, points: np.ndarray, width: int, height: int) -> np.ndarray:
-        """The pixel (N, P) in which each of ``points`` (P, 3) lies for cameras at ``origins`` (N, 3); -1 outside."""
+        """Return the pixel index (N, P) of ``points`` (P, 3) in cameras at ``origins`` (N, 3); -1 if outside."""
         away = points[None] - origins[:, None]
         local = np.einsum("npj,nij->npi", away, self.axes(ahead))
         z = np.maximum(local[..., 2], 1e-9)
-        reach = np.tan(np.radians(self.fov / 2))
-        x = np.floor((local[..., 0] / z / reach + 1) / 2 * width)
-        y = np.floor((1 - local[..., 1] / z / reach * self.aspect) / 2 * height)
+        half_width = np.tan(np.radians(self.fov / 2))
+        x = np.floor((local[..., 0] / z / half_width + 1) / 2 * width)
+        y = np.floor((1 - local[..., 1] / z / half_width * self.aspect) / 2 * height)
         inside = (local[..., 2] > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
         return np.where(inside, y * width + x, -1).astype(int)
 
 
 @dataclass(frozen=True)
 class SeenSurfaces:
-    """What somebody at ``eye`` (3,) meets: unit ``directions`` (P, 3), ``depth`` (P,), whether it is a surface,
-    ``met`` (P,) bool, and ``attention`` (P,), density in 1/sr; ``weight`` (P,): solid angles."""
+    """Surfaces around an observer at a position (3,): unit ``directions`` (P, 3), ``depth`` (P,), whether each
+    direction meets a surface (P,), ``attention`` density in 1/sr (P,), and solid angles (P,)."""
 
     observer: np.ndarray
     directions: np.ndarray
@@ -85,18 +87,18 @@ class SeenSurfaces:
 
     @property
     def points(self) -> np.ndarray:
-        """Where the directions end (P, 3)."""
+        """End points of the directions (P, 3)."""
         return self.observer + self.depth[:, None] * self.directions
 
     @property
     def median_depth(self) -> float:
-        """How far away most of what is met is; 0 where nothing is."""
+        """Median depth of the surfaces; 0 if there are none."""
         return float(np.median(self.depth[self.is_hit])) if self.is_hit.any() else 0.0
 
     @cached_property
     def main_direction(self) -> np.ndarray:
-        """Unit direction (3,) towards which most of the attention goes, within some 20 degrees (a von Mises-Fisher
-        kernel of concentration 8); of even attention some direction."""
+        """Unit direction (3,) of the largest attention, smoothed by a von Mises-Fisher kernel of concentration 8
+        (about 20 degrees)."""
         share = np.where(self.is_hit, self.attention * self.solid_angle, 0)
         # (P, P), in place: it takes hundreds of megabytes.
         kernel = self.directions @ self.directions.T
@@ -106,8 +108,11 @@ class SeenSurfaces:
         return self.directions[np.argmax(kernel @ share)]
 
     def mean_target(self, width: float = 60.0) -> np.ndarray | None:
-        """Mean point (3,) of the attention within ``width`` degrees around the main direction, far ones counted as
-        three times the usual distance; None where there is none."""
+        """Return the mean point (3,) of the attention within ``width`` degrees of the main direction; None without
+        attention.
+
+        Distances are clipped to three times the median depth.
+        """
         towards = self.directions @ self.main_direction > np.cos(np.radians(width))
         share = np.where(self.is_hit & towards, self.attention * self.solid_angle, 0)
         if not share.sum() > 0:
@@ -117,11 +122,24 @@ class SeenSurfaces:
 
 
 class ViewScorer:
-    """Scores pictures by their depths: the share that shows surfaces, less what is right before the lens, how far away
-    these are, how many sizes of depth there are, and how much of the attention of ``seen`` there is in them.
+    """Scores images by their depth and attention.
 
-    ``usual``: how far away things are. ``mean``: gives the mean depth at which light ends where ``trace`` gives the
-    median; they are the same on a surface and differ by half in fog, as there is in a field where no photo looked.
+    The score increases with the fraction of surface pixels, the distance and the spread of depths, and the attention in
+    the image, and decreases with surfaces close to the camera.
+
+    Parameters
+    ----------
+    trace
+        Traces rays, and returns median depth and opacity.
+    frame
+        Image of the camera.
+    typical_distance
+        Typical distance of surfaces.
+    seen
+        Surfaces around an observer whose attention should be shown.
+    trace_mean
+        Traces rays, and returns mean depth. It equals the median on surfaces and differs in fog, for example in
+        unobserved parts of a radiance field.
     """
 
     def __init__(
@@ -132,122 +150,148 @@ class ViewScorer:
         seen: SeenSurfaces | None = None,
         trace_mean: Trace | None = None,
     ):
-        self.trace, self.frame, self.typical_distance, self.seen, self.trace_mean = trace, frame, typical_distance, seen, trace_mean
+        self.trace, self.frame, self.typical_distance, self.seen, self.trace_mean = (
+            trace,
+            frame,
+            typical_distance,
+            seen,
+            trace_mean,
+        )
 
-    def shots(self, origins: np.ndarray, targets: np.ndarray, size: tuple[int, int]) -> list[CameraView]:
-        """One a camera at ``origins`` (N, 3) that looks at ``targets`` (N, 3), in pictures of ``size``."""
+    def score_views(self, origins: np.ndarray, targets: np.ndarray, size: tuple[int, int]) -> list[CameraView]:
+        """Score cameras at ``origins`` that look at ``targets``, (N, 3) each, in images of the given size."""
         width, height = size
         ahead = targets - origins
         ahead = ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-12)
         directions = self.frame.directions(ahead, width, height)
         o = np.repeat(origins, width * height, axis=0)
         depth, opacity = self.trace(o, directions.reshape(-1, 3))
-        depth, met = depth.reshape(len(origins), -1), opacity.reshape(len(origins), -1) >= SURFACE_OPACITY
-        opaque, near = met.mean(axis=1), (met & (depth < _NEAR * self.typical_distance)).mean(axis=1)
-        spread = np.array([_spread(d[m]) for d, m in zip(depth, met)])
-        # The farther away things are, the more of the place there is in the picture.
-        reach = np.array([np.median(d[m]) if m.any() else 0.0 for d, m in zip(depth, met)]) / self.typical_distance
-        score = opaque * (1 - near) ** 3 * (0.35 + 0.65 * np.minimum(spread / 0.6, 1))
-        score = score * (0.1 + 0.9 * np.minimum(reach, 1))
+        depth, is_hit = depth.reshape(len(origins), -1), opacity.reshape(len(origins), -1) >= SURFACE_OPACITY
+        surface_fraction, near_fraction = (
+            is_hit.mean(axis=1),
+            (is_hit & (depth < _NEAR_FRACTION * self.typical_distance)).mean(axis=1),
+        )
+        spread = np.array([_depth_spread(d[m]) for d, m in zip(depth, is_hit)])
+        # More distant surfaces show more of the scene.
+        relative_depth = (
+            np.array([np.median(d[m]) if m.any() else 0.0 for d, m in zip(depth, is_hit)]) / self.typical_distance
+        )
+        score = surface_fraction * (1 - near_fraction) ** 3 * (0.35 + 0.65 * np.minimum(spread / 0.6, 1))
+        score = score * (0.1 + 0.9 * np.minimum(relative_depth, 1))
         if self.trace_mean is not None:
-            other = self.trace_mean(o, directions.reshape(-1, 3))[0].reshape(depth.shape)
-            clear = np.exp(-np.abs(other - depth) / np.maximum(depth, 1e-9) / _FOG)
-            score = score * (0.02 + 0.98 * np.where(met, clear, 0).sum(axis=1) / np.maximum(met.sum(axis=1), 1))
-        attended: list[float | None] = [None] * len(origins)
+            mean_depth = self.trace_mean(o, directions.reshape(-1, 3))[0].reshape(depth.shape)
+            clarity = np.exp(-np.abs(mean_depth - depth) / np.maximum(depth, 1e-9) / _FOG_FRACTION)
+            score = score * (0.02 + 0.98 * np.where(is_hit, clarity, 0).sum(axis=1) / np.maximum(is_hit.sum(axis=1), 1))
+        attention: list[float | None] = [None] * len(origins)
         if self.seen is not None:
-            shown, covered = self._attention(origins, ahead, directions, depth, met, size)
-            # A third of the picture is enough for what is attended: the rest tells where that is.
+            shown, covered = self._attention_shares(origins, ahead, directions, depth, is_hit, size)
+            # Attended surfaces should cover a third of the image; the rest shows the context.
             score = score * (0.05 + 0.95 * shown) * (0.25 + 0.75 * np.minimum(covered / 0.3, 1))
-            attended = [float(x) for x in shown]
-        return [CameraView(*row) for row in zip(origins, targets, score.tolist(), opaque.tolist(), attended)]
+            attention = [float(x) for x in shown]
+        return [CameraView(*row) for row in zip(origins, targets, score.tolist(), surface_fraction.tolist(), attention)]
 
-    def _attention(
+    def _attention_shares(
         self,
         origins: np.ndarray,
         ahead: np.ndarray,
         directions: np.ndarray,
         depth: np.ndarray,
-        met: np.ndarray,
+        is_hit: np.ndarray,
         size: tuple[int, int],
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Of each picture the share of the observer's attention that it shows, and the share of its pixels that show
-        attended surfaces. What the observer meets is known in the directions of ``seen`` alone."""
+        """Return the share of the observer's attention in each image, and the fraction of its pixels on attended
+        surfaces."""
         seen = self.seen
         assert seen is not None
         share = np.where(seen.is_hit, seen.attention * seen.solid_angle, 0)
         points = seen.points
         pixel = self.frame.pixels(origins, ahead, points, *size)
         away = np.linalg.norm(points[None] - origins[:, None], axis=-1)
-        there = np.take_along_axis(np.where(met, depth, np.inf), np.maximum(pixel, 0), axis=1)
-        visible = (pixel >= 0) & (away < 1.1 * there + 0.02 * self.typical_distance)
+        depth_at_pixel = np.take_along_axis(np.where(is_hit, depth, np.inf), np.maximum(pixel, 0), axis=1)
+        visible = (pixel >= 0) & (away < 1.1 * depth_at_pixel + 0.02 * self.typical_distance)
         shown = (visible * share).sum(axis=1) / max(share.sum(), 1e-12)
         if not share.any():
             return np.ones(len(origins)), np.ones(len(origins))
-        # The other way round: which pixels lie where the observer looks, and are not hidden from there.
+        # Pixels on attended surfaces that are visible to the observer.
         from scipy.spatial import KDTree
 
         surface = origins[:, None] + depth[..., None] * directions
-        way = surface - seen.observer
-        distance = np.linalg.norm(way, axis=-1)
-        _, nearest = KDTree(seen.directions).query((way / np.maximum(distance, 1e-9)[..., None]).reshape(-1, 3))
+        from_observer = surface - seen.observer
+        distance = np.linalg.norm(from_observer, axis=-1)
+        _, nearest = KDTree(seen.directions).query(
+            (from_observer / np.maximum(distance, 1e-9)[..., None]).reshape(-1, 3)
+        )
         nearest = nearest.reshape(distance.shape)
-        top = _ATTENDED * float(np.quantile(seen.attention[seen.is_hit], 0.99))
-        attended = (seen.attention[nearest] > top) & (distance < 1.1 * seen.depth[nearest] + 0.02 * self.typical_distance)
-        return shown, (met & attended).mean(axis=1)
+        top = _ATTENTION_THRESHOLD * float(np.quantile(seen.attention[seen.is_hit], 0.99))
+        is_attended = (seen.attention[nearest] > top) & (
+            distance < 1.1 * seen.depth[nearest] + 0.02 * self.typical_distance
+        )
+        return shown, (is_hit & is_attended).mean(axis=1)
 
     def best_index(self, origins: np.ndarray, targets: np.ndarray) -> int:
-        """Number of the best of a few cameras."""
-        return int(np.argmax([shot.score for shot in self.shots(origins, targets, _COARSE)]))
+        """Return the index of the best of a few cameras."""
+        return int(np.argmax([shot.score for shot in self.score_views(origins, targets, _COARSE_SIZE)]))
 
-    def best(self, origins: np.ndarray, targets: np.ndarray) -> CameraView | None:
-        """The best of many cameras; None where none of them shows anything."""
-        apart = np.linalg.norm(targets - origins, axis=1) > 1e-6 * max(self.typical_distance, 1e-12)
-        if not apart.any():
+    def find_best(self, origins: np.ndarray, targets: np.ndarray) -> CameraView | None:
+        """Return the best of many cameras; None if no image shows a surface."""
+        is_valid = np.linalg.norm(targets - origins, axis=1) > 1e-6 * max(self.typical_distance, 1e-12)
+        if not is_valid.any():
             return None
-        found = sorted(self.shots(origins[apart], targets[apart], _COARSE), key=lambda s: -s.score)[:_KEPT]
-        again = self.shots(np.array([s.origin for s in found]), np.array([s.target for s in found]), _FINE)
-        best = max(again, key=lambda s: s.score)
+        candidates = sorted(
+            self.score_views(origins[is_valid], targets[is_valid], _COARSE_SIZE), key=lambda s: -s.score
+        )[:_NUM_CANDIDATES]
+        refined = self.score_views(
+            np.array([s.origin for s in candidates]), np.array([s.target for s in candidates]), _FINE_SIZE
+        )
+        best = max(refined, key=lambda s: s.score)
         return best if best.score > 0 else None
 
 
-def _spread(depth: np.ndarray) -> float:
-    """How many sizes of depth there are: the standard deviation of its logarithm."""
+def _depth_spread(depth: np.ndarray) -> float:
+    """Return the standard deviation of the logarithm of the depth."""
     return float(np.std(np.log(np.maximum(depth, 1e-9)))) if depth.size else 0.0
 
 
-def view_of_observer(trace: Trace, frame: PinholeFrame, seen: SeenSurfaces, trace_mean: Trace | None = None) -> CameraView | None:
-    """The camera that shows best what the observer of ``seen`` looks at: in free sight of the observer, from above or
-    beside. ``mean``: as `Judge` has it. None where nothing is met."""
+def view_of_observer(
+    trace: Trace, frame: PinholeFrame, seen: SeenSurfaces, trace_mean: Trace | None = None
+) -> CameraView | None:
+    """Return the camera that shows best where an observer looks, from a position visible to the observer; None without
+    surfaces.
+
+    ``trace_mean``: as for `ViewScorer`.
+    """
     target = seen.mean_target()
     if target is None:
         return None
     up = frame.up / np.linalg.norm(frame.up)
-    across = seen.main_direction - up * (seen.main_direction @ up)
-    across = across if np.linalg.norm(across) > 1e-6 else np.roll(up, 1) - up * (np.roll(up, 1) @ up)
-    across /= np.linalg.norm(across)
-    beside = np.cross(up, across)
+    forward = seen.main_direction - up * (seen.main_direction @ up)
+    forward = forward if np.linalg.norm(forward) > 1e-6 else np.roll(up, 1) - up * (np.roll(up, 1) @ up)
+    forward /= np.linalg.norm(forward)
+    sideways = np.cross(up, forward)
     azimuth = np.arange(16) / 16 * 2 * np.pi
     directions = []
     for elevation in np.radians([8, 20, 33, 47]):
-        level = np.cos(azimuth)[:, None] * across + np.sin(azimuth)[:, None] * beside
+        level = np.cos(azimuth)[:, None] * forward + np.sin(azimuth)[:, None] * sideways
         directions.append(np.cos(elevation) * level + np.sin(elevation) * up)
     along = np.concatenate(directions)
     depth, opacity = trace(np.broadcast_to(seen.observer, along.shape).copy(), along)
-    free = np.where(opacity >= SURFACE_OPACITY, depth, np.inf)
+    free_distance = np.where(opacity >= SURFACE_OPACITY, depth, np.inf)
     origins = []
     for share in (0.85, 0.5):
-        # Not farther than what the observer looks at needs.
-        away = np.minimum(share * free, 2.5 * share * seen.median_depth)
+        # Stay close to the attended surfaces.
+        away = np.minimum(share * free_distance, 2.5 * share * seen.median_depth)
         origins.append(seen.observer + along * away[:, None])
     places = np.concatenate(origins)
-    far = np.linalg.norm(places - seen.observer, axis=1) > 0.3 * seen.median_depth
-    places = places[far]
+    is_far = np.linalg.norm(places - seen.observer, axis=1) > 0.3 * seen.median_depth
+    places = places[is_far]
     if not len(places):
         return None
-    # At what is looked at, or half way to it, so that the observer's surroundings are in the picture.
+    # Look at the target, or half way to it to include the observer's surroundings.
     targets = [target, 0.5 * (target + seen.observer)]
-    every = np.concatenate([np.broadcast_to(t, places.shape) for t in targets])
-    return ViewScorer(trace, frame, seen.median_depth, seen, trace_mean).best(np.concatenate([places, places]), every)
+    all_targets = np.concatenate([np.broadcast_to(t, places.shape) for t in targets])
+    return ViewScorer(trace, frame, seen.median_depth, seen, trace_mean).find_best(
+        np.concatenate([places, places]), all_targets
+    )
 
 
 def view_of_scene(
@@ -259,9 +303,19 @@ def view_of_scene(
     trace_mean: Trace | None = None,
     is_solid: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> CameraView | None:
-    """The camera that shows best what lies between the corners ``lower`` and ``upper`` (3,): from within, where it can
-    stand free, or, with ``outside``, from around. ``mean``: as `Judge` has it; ``solid``: whether points (N, 3) lie
-    inside of something solid, where no camera stands. None where nothing is met."""
+    """Return the camera that shows best the box between ``lower`` and ``upper`` (3,); None without surfaces.
+
+    Parameters
+    ----------
+    trace, frame, trace_mean
+        As for `ViewScorer`.
+    lower, upper
+        Corners of the box.
+    allow_outside
+        Whether the camera may be outside the box.
+    is_solid
+        Returns whether points (N, 3) are inside a solid, where no camera is placed.
+    """
     lower, upper = np.asarray(lower, float), np.asarray(upper, float)
     up = frame.up / np.linalg.norm(frame.up)
     center, size = (lower + upper) / 2, upper - lower
@@ -272,17 +326,17 @@ def view_of_scene(
     origins, targets = [], []
     vertical = int(np.argmax(np.abs(up)))
     shares: list[tuple[float, ...]] = [(0.2, 0.5, 0.8)] * 3
-    # People look at places from the middle of their height, or from above it.
+    # Heights at or above the centre give familiar views.
     shares[vertical] = (0.5, 0.7) if up[vertical] > 0 else (0.5, 0.3)
     grid = np.stack([a.ravel() for a in np.meshgrid(*shares, indexing="ij")], axis=-1)
-    within = lower + grid * size
-    free = _clearance(trace, within, radius)
-    within = within[free > 0.06 * radius]
+    interior = lower + grid * size
+    clearance = _clearance(trace, interior, radius)
+    interior = interior[clearance > 0.06 * radius]
     for elevation in np.radians([-5, -20]):
         along = np.cos(elevation) * level + np.sin(elevation) * up
-        origins.append(np.repeat(within, len(along), axis=0))
-        targets.append(origins[-1] + np.tile(along, (len(within), 1)) * 0.5 * radius)
-    # What photos were taken around is often in the middle.
+        origins.append(np.repeat(interior, len(along), axis=0))
+        targets.append(origins[-1] + np.tile(along, (len(interior), 1)) * 0.5 * radius)
+    # Captures often surround an object at the centre.
     away = [share * 0.5 * float(size.max()) for share in (0.3, 0.5, 0.7)]
     away += [1.15 * radius / np.tan(np.radians(frame.fov / 2))] if allow_outside else []
     for distance in away:
@@ -294,14 +348,14 @@ def view_of_scene(
     ends = np.concatenate(targets)
     if is_solid is not None:
         places, which = np.unique(o, axis=0, return_inverse=True)
-        outside_of_all = ~is_solid(places)[which.reshape(-1)]
-        o, ends = o[outside_of_all], ends[outside_of_all]
-    return ViewScorer(trace, frame, 0.5 * radius, trace_mean=trace_mean).best(o, ends) if len(o) else None
+        is_free = ~is_solid(places)[which.reshape(-1)]
+        o, ends = o[is_free], ends[is_free]
+    return ViewScorer(trace, frame, 0.5 * radius, trace_mean=trace_mean).find_best(o, ends) if len(o) else None
 
 
-def _clearance(trace: Trace, points: np.ndarray, far: float) -> np.ndarray:
-    """How far matter is from each of ``points`` (N, 3), in the direction in which it is nearest but for a tenth."""
+def _clearance(trace: Trace, points: np.ndarray, default: float) -> np.ndarray:
+    """Return the distance of surfaces from each of ``points`` (N, 3), the 10 % quantile over directions."""
     around = fibonacci_directions(64)
     depth, opacity = trace(np.repeat(points, len(around), axis=0), np.tile(around, (len(points), 1)))
-    depth = np.where(opacity >= SURFACE_OPACITY, depth, far).reshape(len(points), -1)
+    depth = np.where(opacity >= SURFACE_OPACITY, depth, default).reshape(len(points), -1)
     return np.quantile(depth, 0.1, axis=1)

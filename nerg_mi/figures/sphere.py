@@ -1,4 +1,4 @@
-"""Densities over directions as pictures: projections of the sphere, and figures of them."""
+"""Spherical densities as figures: map projections of the sphere."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from .style import INK, SMALL, Sheet, hatch
 
 # ---- Projections ----
 #
-# Maps of the sphere: how a longitude and a latitude become a place on paper, and back.
+# A projection maps longitude and latitude to the plane and back.
 #
-# Longitude λ in (-π, π] is positive to the right of the front, latitude φ in [-π/2, π/2] positive upwards. Places (x,
-# y) lie in [-1, 1] x [-1, 1], on paper twice as wide as it is high. One more map is one more entry of `PROJECTIONS`.
+# Longitude λ in (-π, π] is positive to the right of the front, latitude φ in [-π/2, π/2] is positive upwards. Plane
+# coordinates are in [-1, 1] x [-1, 1] and are drawn twice as wide as high. Add a projection to `PROJECTIONS`.
 
 _STEPS = 60
 _POLE = 1e-12
@@ -26,8 +26,11 @@ _POLE = 1e-12
 
 @dataclass(frozen=True)
 class Projection:
-    """``name``; ``summary`` for people; ``forward(longitude, latitude)`` gives (x, y), ``inverse(x, y)`` gives
-    (longitude, latitude, inside), where ``inside`` tells whether the place belongs to the map."""
+    """A map projection.
+
+    ``summary``: description for help texts; ``forward(longitude, latitude)`` returns (x, y); ``inverse(x, y)`` returns
+    (longitude, latitude, inside), where ``inside`` is whether the point belongs to the map.
+    """
 
     name: str
     summary: str
@@ -47,13 +50,13 @@ def _from_equirectangular(x: Any, y: Any) -> tuple[np.ndarray, np.ndarray, np.nd
 def _mollweide(longitude: Any, latitude: Any) -> tuple[np.ndarray, np.ndarray]:
     """Mollweide 1805, in Snyder, Map projections: a working manual (1987), p. 249: 2θ + sin 2θ = π sin φ."""
     longitude, latitude = np.broadcast_arrays(np.asarray(longitude, np.float64), np.asarray(latitude, np.float64))
-    wanted = np.pi * np.sin(latitude)
-    # By halving: what Newton's method does at the poles, where the slope is 0, would be slow.
-    low, high = np.full(wanted.shape, -np.pi / 2), np.full(wanted.shape, np.pi / 2)
+    target = np.pi * np.sin(latitude)
+    # Bisection: Newton's method converges slowly at the poles, where the derivative is 0.
+    low, high = np.full(target.shape, -np.pi / 2), np.full(target.shape, np.pi / 2)
     for _ in range(_STEPS):
         middle = 0.5 * (low + high)
-        less = 2 * middle + np.sin(2 * middle) < wanted
-        low, high = np.where(less, middle, low), np.where(less, high, middle)
+        is_below = 2 * middle + np.sin(2 * middle) < target
+        low, high = np.where(is_below, middle, low), np.where(is_below, high, middle)
     θ = 0.5 * (low + high)
     return longitude / np.pi * np.cos(θ), np.sin(θ)
 
@@ -77,17 +80,17 @@ PROJECTIONS = {
 
 
 def find_projection(name: str) -> Projection:
-    """The projection ``name``. Raises `NergError` for one that is not known."""
+    """Return the projection ``name``. Raises `NergError` for an unknown name."""
     if name not in PROJECTIONS:
-        raise NergError(f'there is no projection "{name}"; there are {", ".join(PROJECTIONS)}')
+        raise NergError(f'unknown projection "{name}"; choose one of {", ".join(PROJECTIONS)}')
     return PROJECTIONS[name]
 
 
 def resample_panorama(panorama: Any, projection: Projection, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """A full-sphere picture (h, w, ...), of the sensor `panorama`, on the paper of ``projection``, ``width`` pixels
-    wide and half as high: the nearest pixel's value at each, and where the map is (width // 2, width), bool.
+    """Resample a full-sphere image (h, w, ...) of the sensor `panorama` to a projection by nearest neighbours.
 
-    Columns of a panorama are cells around its front, its first and last row lie at the poles
+    The result is ``width`` pixels wide and half as high. Returns the image and the mask of pixels inside the map.
+    Columns of a panorama are cells around its front; the first and last rows are at the poles
     (`nerg_mi.transport.geometry`).
     """
     panorama = np.asarray(panorama)
@@ -101,11 +104,11 @@ def resample_panorama(panorama: Any, projection: Projection, width: int) -> tupl
     return panorama[row, column], inside
 
 
-# ---- The gaze of an observer over all directions that they could turn to ----
+# ---- Figure ----
 
 _LINES = dict(color="white", alpha=0.3, linewidth=0.6)
-_FINE = 181
-_LEFT = 0.2
+_CURVE_POINTS = 181
+_MAX_LABEL_X = 0.2
 
 
 def sphere_figure(
@@ -113,54 +116,72 @@ def sphere_figure(
     gaze,
     mask,
     heat: Heat,
-    title: str = "All that the observer could turn to",
+    title: str = "Gaze in all directions",
     projection: str = "equirectangular",
     unknown=None,
     label: str = GAZE_LABEL,
     note: str = "",
 ) -> Any:
-    """Pictures (h, w, ...) of a `panorama` sensor as a map of the observer's sphere, as wide as they are.
+    """Draw images (h, w, ...) of a `panorama` sensor as a map of the observer's sphere.
 
-    ``color`` is linear, ``gaze`` in 1/sr; the heat stays away from where ``mask`` is false, and where ``unknown`` is
-    true it is hatched. Azimuth 0 is the sensor's front, positive to the right; elevation 0 the horizon; both in
-    degrees. ``projection``: one of `sphere.PROJECTIONS`, "mollweide" (equal areas) or "equirectangular".
-    ``note``: what it rests on.
+    Azimuth 0 is the front of the sensor, positive to the right; elevation 0 is the horizon; both are in degrees.
+
+    Parameters
+    ----------
+    color
+        Linear colour.
+    gaze
+        Gaze density in 1/sr.
+    mask
+        Whether there is a surface; gaze is drawn on surfaces only.
+    heat
+        Appearance of the gaze.
+    title
+        Title of the figure.
+    projection
+        "mollweide" (equal area) or "equirectangular".
+    unknown
+        Pixels without data, which are hatched.
+    label
+        Label of the scale.
+    note
+        Note below the figure.
     """
-    chosen = find_projection(projection)
+    map_projection = find_projection(projection)
     width = int(np.shape(gaze)[1]) // 2 * 2
-    shown, inside = resample_panorama(overlay(color, gaze, heat, mask), chosen, width)
-    hatched = unknown is not None and bool(np.any(unknown))
-    if hatched:
-        shown = hatch(shown, resample_panorama(unknown, chosen, width)[0])
+    shown, inside = resample_panorama(overlay(color, gaze, heat, mask), map_projection, width)
+    has_unknown = unknown is not None and bool(np.any(unknown))
+    if has_unknown:
+        shown = hatch(shown, resample_panorama(unknown, map_projection, width)[0])
     sheet = Sheet([np.where(inside[..., None], shown, 1.0)], [title], scale=True, axes=True, note=note)
     axes = sheet.panels[0]
     sheet.images[0].set_extent((-1, 1, -1, 1))
     axes.set_aspect("auto")
-    _graticule(axes, chosen, 45 if width >= 360 else 90, sheet.unit)
-    add_scale(sheet, heat, label, [(gaze, mask)], hatched)
+    _draw_graticule(axes, map_projection, 45 if width >= 360 else 90, sheet.unit)
+    add_scale(sheet, heat, label, [(gaze, mask)], has_unknown)
     return sheet.page
 
 
-def _graticule(axes: Any, projection: Projection, step: int, unit: float) -> None:
-    """Meridians and parallels every ``step`` degrees, with their numbers at the lower and the left edge of the map."""
-    along, across = np.radians(np.linspace(-90, 90, _FINE)), np.radians(np.linspace(-180, 180, _FINE))
+def _draw_graticule(axes: Any, projection: Projection, step: int, unit: float) -> None:
+    """Draw meridians and parallels every ``step`` degrees, with labels at the lower and left border."""
+    along, across = np.radians(np.linspace(-90, 90, _CURVE_POINTS)), np.radians(np.linspace(-180, 180, _CURVE_POINTS))
     meridians, parallels = range(-180, 181, step), range(-90, 91, 45)
     for degrees in meridians:
-        axes.plot(*projection.forward(np.full(_FINE, np.radians(degrees)), along), **_LINES)
+        axes.plot(*projection.forward(np.full(_CURVE_POINTS, np.radians(degrees)), along), **_LINES)
     for degrees in parallels:
-        axes.plot(*projection.forward(across, np.full(_FINE, np.radians(degrees))), **_LINES)
+        axes.plot(*projection.forward(across, np.full(_CURVE_POINTS, np.radians(degrees))), **_LINES)
     axes.set_xlim(-1, 1)
     axes.set_ylim(-1, 1)
-    # Meridians meet at the poles of some maps: they are numbered where they cross the horizon.
+    # Label meridians at the horizon, since they meet at the poles in some projections.
     crossing = projection.forward(np.radians(list(meridians)), np.zeros(len(meridians)))[0]
-    axes.set_xticks(crossing, [_degrees(d) for d in meridians])
+    axes.set_xticks(crossing, [_format_degrees(d) for d in meridians])
     axes.set_yticks([])
     for degrees in parallels:
         x, y = (float(v) for v in projection.forward(-np.pi, np.radians(degrees)))
-        if x > -_LEFT:
-            continue  # a pole that is a point, where the title is
+        if x > -_MAX_LABEL_X:
+            continue  # a pole that is a point, below the title
         where = dict(textcoords="offset points", ha="right", va="center", annotation_clip=False)
-        axes.annotate(_degrees(degrees), (x, y), (-4 * unit, 0), fontsize=SMALL * unit, color=INK, **where)
+        axes.annotate(_format_degrees(degrees), (x, y), (-4 * unit, 0), fontsize=SMALL * unit, color=INK, **where)
     axes.tick_params(labelsize=SMALL * unit, colors=INK, length=2 * unit, pad=2 * unit)
     axes.set_xlabel("azimuth, to the right of the front", fontsize=SMALL * unit, color=INK, labelpad=2 * unit)
     room = 30 * unit / 72 * axes.figure.dpi / axes.bbox.width
@@ -168,5 +189,5 @@ def _graticule(axes: Any, projection: Projection, step: int, unit: float) -> Non
     axes.text(-room, 0.5, "elevation", **text)
 
 
-def _degrees(value: int) -> str:
+def _format_degrees(value: int) -> str:
     return f"{value}°".replace("-", "−")

@@ -1,4 +1,4 @@
-"""How figures look, and how they are written: colours, hatching, scales, tone mapping, sheets, provenance."""
+"""Appearance and files of figures: colour maps, hatching, scales, page layout, provenance."""
 
 from __future__ import annotations
 
@@ -21,22 +21,20 @@ from nerg_mi import __version__
 from nerg_mi.errors import NergError
 from nerg_mi.files.atomic import check_writable, file_sha256, write_bytes
 
-# ---- Colors ----
+# ---- Colour maps ----
 #
-# Colour maps by name: the one place where they are checked.
-#
-# All have a lightness that rises evenly, or rises evenly to both sides of a middle, so that equal steps of a value look
-# equal, also to people who do not tell red from green, and on grey paper. Rainbows (``jet``) are left out: they show
-# edges where the values have none.
+# All maps are perceptually uniform, or symmetric around a centre, so that equal steps of a value look equal, also with
+# colour vision deficiencies and in greyscale. Rainbow maps (``jet``) are excluded, since they show edges that are not
+# in the data.
 
 SEQUENTIAL = ("inferno", "magma", "plasma", "viridis", "cividis")
-"""For values from a least to a greatest one."""
+"""Sequential colour maps."""
 
 DIVERGING = ("RdBu_r", "PuOr_r", "BrBG_r", "PRGn_r")
-"""For differences, whose middle is 0."""
+"""Diverging colour maps, for differences."""
 
 CATEGORICAL = ("tab20", "tab10")
-"""For whole numbers that name classes."""
+"""Categorical colour maps, for class indices."""
 
 _COLORS = {
     "sequential": (SEQUENTIAL, "perceptually uniform"),
@@ -46,71 +44,75 @@ _COLORS = {
 
 
 def find_colormap(name: str, kind: str = "sequential") -> Any:
-    """The colour map ``name`` of matplotlib: a function from 0..1 to RGBA. A name may end in ``_r``, for the other
-    direction. Raises `NergError` for one that is not of the ``kind``: "sequential", "diverging" or "categorical"."""
+    """Return matplotlib's colour map ``name``, which may end in ``_r`` for the reverse direction.
+
+    Raises `NergError` for a name that is not of the ``kind`` "sequential", "diverging" or "categorical".
+    """
     import matplotlib
 
     names, words = _COLORS[kind]
-    if name.removesuffix("_r") not in {of.removesuffix("_r") for of in names}:
-        raise NergError(f'"{name}" is no {words} colour map: choose one of {", ".join(names)}')
+    if name.removesuffix("_r") not in {known_name.removesuffix("_r") for known_name in names}:
+        raise NergError(f'"{name}" is not a {words} colour map; choose one of {", ".join(names)}')
     return matplotlib.colormaps[name]
 
 
-def apply_colormap(name: str, shares: Any, kind: str = "sequential") -> np.ndarray:
-    """Display colours (..., 3) of places ``shares`` (...) on a scale, 0..1."""
-    return np.asarray(find_colormap(name, kind)(np.asarray(shares, np.float64)))[..., :3]
+def apply_colormap(name: str, values: Any, kind: str = "sequential") -> np.ndarray:
+    """Map positions in 0..1 to display colours (..., 3)."""
+    return np.asarray(find_colormap(name, kind)(np.asarray(values, np.float64)))[..., :3]
 
 
 # ---- Hatching ----
 #
-# Where a picture knows nothing: diagonal lines over paled colours, which no value of any scale looks like.
+# Diagonal lines over pale colours mark pixels without data.
 
 PERIOD, WIDTH = 8, 2
-"""Pixels from line to line along a row, and of a line."""
+"""Spacing and width of the lines in pixels."""
 
 PALE, LINE = 0.82, 0.42
-"""Grey that the picture is mixed with, and grey of the lines, display values."""
+"""Display values of the grey that the image is blended with, and of the lines."""
 
-_MIXED = 0.65
+_PALE_FRACTION = 0.65
 
 
 def hatch_lines(height: int, width: int, unit: int = 1) -> np.ndarray:
-    """Whether a pixel (``height``, ``width``) lies on a line of the hatching; ``unit``: by what lines are coarser."""
+    """Return whether pixels (``height``, ``width``) are on a hatching line, magnified by ``unit``."""
     y, x = np.ogrid[:height, :width]
     return (x + y) % (PERIOD * unit) < WIDTH * unit
 
 
 def hatch(display: Any, unknown: Any, unit: int = 1) -> np.ndarray:
-    """``display`` values (h, w, 3), hatched where ``unknown`` (h, w) is true, and unchanged elsewhere."""
+    """Hatch ``display`` values (h, w, 3) where ``unknown`` (h, w) is true."""
     shown = np.asarray(display, np.float64)
     where = np.asarray(unknown, bool)[..., None]
-    pale = shown + _MIXED * (PALE - shown)
+    pale = shown + _PALE_FRACTION * (PALE - shown)
     height, width = shown.shape[:2]
     drawn = np.where(hatch_lines(height, width, unit)[..., None], LINE, pale)
     return np.where(where, drawn, shown)
 
 
 def hatch_swatch(height: int, width: int, unit: int = 1) -> np.ndarray:
-    """What stands in a legend (``height``, ``width``, 3): the hatching over a middle grey."""
+    """Return a legend entry (``height``, ``width``, 3) of the hatching over a middle grey."""
     return hatch(np.full((height, width, 3), 0.5), np.full((height, width), True), unit)
 
 
 # ---- Provenance ----
 #
-# Where a picture comes from, as every picture and video says it of itself: inputs, seed, settings and versions.
+# Inputs, seed, settings and versions, which every image and video contains.
 #
-# Nothing of the machine is in it: of files their names and the SHA-256 of their bytes, no folders, no users, no times,
-# so that equal inputs give equal files.
+# Files are identified by name and SHA-256; paths, users and times are excluded, so that equal inputs give equal files.
 
-_PROGRAMS = ("mitsuba", "drjit")
-_OF_THE_RUN = ("seed", "store", "scheduler")
-"""Options that are said elsewhere, or on which nothing that is made depends."""
+_PACKAGES = ("mitsuba", "drjit")
+_EXCLUDED_OPTIONS = ("seed", "store", "scheduler")
+"""Options that are recorded elsewhere, or do not change results."""
 
 
 @dataclass(frozen=True)
 class Provenance:
-    """``what`` made a picture (a command, or a function); ``inputs``: SHA-256 (hex) of files by their names; ``seed``
-    of the random numbers, or None where there are none; ``settings`` that were given; ``versions`` of programs."""
+    """Origin of an image.
+
+    ``what``: command or function; ``inputs``: SHA-256 (hex) of the input files by name; ``seed`` of random numbers, or
+    None; ``settings``: non-default options; ``versions`` of packages.
+    """
 
     what: str
     inputs: Mapping[str, str] = field(default_factory=dict)
@@ -119,11 +121,11 @@ class Provenance:
     versions: Mapping[str, str] = field(default_factory=dict)
 
     def json(self) -> str:
-        """All of it as one line of ASCII."""
+        """Return all fields as one line of ASCII."""
         return json.dumps({f.name: getattr(self, f.name) for f in fields(self)}, sort_keys=True, default=str)
 
     def text(self) -> dict[str, str]:
-        """What the header of a picture says, by the names that PNG has for it: ``Software`` and ``Comment``."""
+        """Return the tEXt chunks of a PNG: ``Software`` and ``Comment``."""
         programs = ", ".join(f"{name} {number}" for name, number in self.versions.items())
         return {"Software": programs, "Comment": self.json()}
 
@@ -135,11 +137,20 @@ def make_provenance(
     settings: Any = None,
     checksums: dict[Path, str] | None = None,
 ) -> Provenance:
-    """That of what is made of the files, or datasets of rays, ``inputs`` by ``settings``.
+    """Record the origin of an output.
 
-    ``settings``: a mapping, or a dataclass of options, of which those are said that differ from their defaults.
-    ``known``: checksums by path that need not be computed again; those that are computed are added. Raises `NergError`
-    for a file that cannot be read.
+    Parameters
+    ----------
+    what
+        Command or function.
+    inputs
+        Files or datasets. Raises `NergError` for a file that cannot be read.
+    seed
+        Seed of the random numbers.
+    settings
+        A mapping, or a dataclass of options, of which those with non-default values are recorded.
+    checksums
+        Cache of checksums by path, which is extended.
     """
     checksums = {} if checksums is None else checksums
     sums: dict[str, str] = {}
@@ -148,13 +159,13 @@ def make_provenance(
         while name in sums:
             name, number = f"{path.name} ({number})", number + 1
         if path not in checksums:
-            checksums[path] = _digest(path)
+            checksums[path] = _input_digest(path)
         sums[name] = checksums[path]
-    given = {name: value for name, value in _given(settings).items() if name not in _OF_THE_RUN}
-    return Provenance(what, sums, seed, {k: _plain(v) for k, v in given.items()}, versions())
+    options = {name: value for name, value in _changed_options(settings).items() if name not in _EXCLUDED_OPTIONS}
+    return Provenance(what, sums, seed, {k: _to_json(v) for k, v in options.items()}, versions())
 
 
-def _digest(path: Path) -> str:
+def _input_digest(path: Path) -> str:
     if not path.is_dir():
         return file_sha256(path)
     from nerg_mi.rays.dataset import hash_rays
@@ -163,39 +174,39 @@ def _digest(path: Path) -> str:
 
 
 def existing_files(*values: Any) -> list[Path]:
-    """Those of ``values`` that name files or folders which are there; others, such as rays in memory, have no name."""
+    """Return the paths of existing files and folders among ``values``."""
     return [Path(v) for v in values if isinstance(v, (str, os.PathLike)) and Path(v).exists()]
 
 
 def versions() -> dict[str, str]:
-    """Version of each program that has a part in a picture, by name."""
-    return {"nerg_mi": __version__, **{name: _version(name) for name in _PROGRAMS}}
+    """Return the versions of the packages that affect an image, by name."""
+    return {"nerg_mi": __version__, **{name: _version(name) for name in _PACKAGES}}
 
 
 def _version(name: str) -> str:
     loaded = sys.modules.get(name)
-    if loaded is not None:  # where a picture was rendered; it says the same as what is installed, at once
+    if loaded is not None:  # faster than reading the package metadata
         return loaded.__version__
     from importlib.metadata import version
 
     return version(name)
 
 
-def _given(settings: Any) -> dict[str, Any]:
+def _changed_options(settings: Any) -> dict[str, Any]:
     if settings is None:
         return {}
     if isinstance(settings, Mapping):
         return dict(settings)
-    every = {f.name: (getattr(settings, f.name), f.default) for f in fields(settings)}
-    return {name: value for name, (value, default) in every.items() if value != default and value is not None}
+    all_options = {f.name: (getattr(settings, f.name), f.default) for f in fields(settings)}
+    return {name: value for name, (value, default) in all_options.items() if value != default and value is not None}
 
 
-def _plain(value: Any) -> Any:
-    """A setting as JSON has it, with the names of files in place of their paths."""
+def _to_json(value: Any) -> Any:
+    """Convert a setting to JSON; paths become file names."""
     if isinstance(value, Mapping):
-        return {str(k): _plain(v) for k, v in value.items()}
+        return {str(k): _to_json(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]
+        return [_to_json(v) for v in value]
     if isinstance(value, PurePath):
         return value.name
     if isinstance(value, str):
@@ -205,20 +216,26 @@ def _plain(value: Any) -> Any:
 
 # ---- Saving ----
 #
-# Figures as files: PNG and SVG, byte for byte the same for the same input, and as pixels for a video.
+# PNG and SVG files that are bitwise reproducible, and pixel arrays for videos.
 
 FORMATS = (".png", ".svg")
-"""Suffixes of figures that are written."""
+"""Supported file suffixes."""
 
-_OF_SVG = {"Software": "Creator", "Comment": "Description", "Title": "Title"}
+_SVG_KEYS = {"Software": "Creator", "Comment": "Description", "Title": "Title"}
 _SALT = "nerg_mi"
 
 
 def save(figure: Any, path: str | os.PathLike, metadata: Provenance | Mapping[str, str] | None = None) -> None:
-    """Write a matplotlib figure as .png, or as .svg with its pictures embedded and all else as lines and text.
+    """Write a matplotlib figure as .png, or as .svg with embedded images and text as text.
 
-    ``about``: what its header says, names of PNG's texts (such as ``Comment``) in a mapping; no time is in it, so that
-    equal figures are equal files. Raises `NergError` for other suffixes and for what cannot be written.
+    Parameters
+    ----------
+    figure
+        Figure.
+    path
+        Output file. Raises `NergError` for other suffixes and for files that cannot be written.
+    metadata
+        Provenance, or tEXt chunks by name, such as ``Comment``. Timestamps are omitted.
     """
     check_writable(path, *FORMATS)
     text = dict(metadata.text() if isinstance(metadata, Provenance) else metadata or {})
@@ -226,14 +243,14 @@ def save(figure: Any, path: str | os.PathLike, metadata: Provenance | Mapping[st
 
 
 def encode(figure: Any, suffix: str, text: Mapping[str, str] | None = None) -> bytes:
-    """The bytes of ``figure`` in one of `FORMATS`, with ``text`` in its header."""
+    """Encode ``figure`` in one of `FORMATS`, with metadata ``text``."""
     import matplotlib
 
     out, text = io.BytesIO(), dict(text or {})
     if suffix == ".svg":
-        known = {_OF_SVG[k]: v for k, v in text.items() if k in _OF_SVG}
-        metadata: dict[str, Any] = {"Date": None, "Creator": None, **known}
-        # Ids are made of the salt, and at random without one.
+        svg_metadata = {_SVG_KEYS[k]: v for k, v in text.items() if k in _SVG_KEYS}
+        metadata: dict[str, Any] = {"Date": None, "Creator": None, **svg_metadata}
+        # A fixed salt makes ids deterministic.
         with matplotlib.rc_context({"svg.hashsalt": _SALT, "svg.fonttype": "none", "svg.image_inline": True}):
             figure.savefig(out, format="svg", dpi=figure.dpi, metadata=metadata)
         return out.getvalue()
@@ -244,97 +261,97 @@ def encode(figure: Any, suffix: str, text: Mapping[str, str] | None = None) -> b
 
 
 def rasterize(figure: Any) -> np.ndarray:
-    """``figure`` as display values (h, w, 3) of uint8, as its PNG has them."""
+    """Render ``figure`` to display values (h, w, 3), uint8, identical to its PNG."""
     figure.canvas.draw()
     return np.asarray(figure.canvas.buffer_rgba())[..., :3].copy()
 
 
-# ---- Scale ----
-#
-# Ticks of a scale: round values, written so that they are short however small or large they are.
+# ---- Ticks ----
 
-_SUPER = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
-def ticks_of(low: float, high: float, most: int, log: bool = False) -> tuple[list[float], list[str], str]:
-    """``(places, names, factor)``: where ticks stand on a scale from 0 (``low``) to 1 (``high``), what is written
-    there, and what belongs before the unit, such as "10⁻⁶" of values that are so small. About ``most`` of them;
-    ``log``: at powers of ten of a logarithmic scale."""
+def scale_ticks(low: float, high: float, max_ticks: int, log: bool = False) -> tuple[list[float], list[str], str]:
+    """Choose about ``max_ticks`` ticks of a scale.
+
+    Returns their positions (0 at ``low``, 1 at ``high``), their labels, and a factor for the unit, such as "10⁻⁶".
+    ``log``: powers of ten of a logarithmic scale.
+    """
     from matplotlib.ticker import MaxNLocator
 
     if log:
         first, last = math.log10(low), math.log10(high)
-        step = max(1, math.ceil((last - first) / most))
+        step = max(1, math.ceil((last - first) / max_ticks))
         powers = [p for p in range(math.ceil(first - 1e-9), math.floor(last + 1e-9) + 1) if p % step == 0]
         if len(powers) >= 2:
-            return [(p - first) / (last - first) for p in powers], [_power(p) for p in powers], ""
+            return [(p - first) / (last - first) for p in powers], [_format_power(p) for p in powers], ""
         ends = [low, math.sqrt(low * high), high]
         return [0.0, 0.5, 1.0], [f"{v:.2g}" for v in ends], ""
-    most_of_all = max(abs(low), abs(high))
-    power = math.floor(math.log10(most_of_all)) if most_of_all > 0 else 0
+    max_magnitude = max(abs(low), abs(high))
+    power = math.floor(math.log10(max_magnitude)) if max_magnitude > 0 else 0
     power = 0 if -3 <= power < 4 else power
     unit = 10.0**power
-    found = MaxNLocator(most, steps=[1, 2, 2.5, 5, 10]).tick_values(low / unit, high / unit)
+    candidates = MaxNLocator(max_ticks, steps=[1, 2, 2.5, 5, 10]).tick_values(low / unit, high / unit)
     edge = 1e-9 * (high - low) / unit
-    values = [v for v in found if low / unit - edge <= v <= high / unit + edge]
+    values = [v for v in candidates if low / unit - edge <= v <= high / unit + edge]
     span = (high - low) / unit
     gap = min((b - a for a, b in zip(values, values[1:])), default=span)
-    # As many digits as tell neighbours apart.
+    # Use enough digits to distinguish neighbouring ticks.
     digits = max(0, -math.floor(math.log10(gap) + 1e-9)) if gap > 0 else 0
     if gap > 0 and abs(round(gap, digits) - gap) > 1e-6 * gap:
         digits += 1
     names = [f"{0.0 if abs(v) < 1e-12 * span else v:.{digits}f}".replace("-", "−") for v in values]
-    return [(v - low / unit) / span for v in values], names, "" if power == 0 else _power(power)
+    return [(v - low / unit) / span for v in values], names, "" if power == 0 else _format_power(power)
 
 
-def _power(p: int) -> str:
-    return {0: "1", 1: "10"}.get(p, "10" + str(p).translate(_SUPER))
+def _format_power(p: int) -> str:
+    return {0: "1", 1: "10"}.get(p, "10" + str(p).translate(_SUPERSCRIPTS))
 
 
-# ---- Sheet ----
+# ---- Page layout ----
 #
-# The page that pictures are shown on: panels of one size, pixel for pixel, with titles, a scale and a legend.
+# A page of equally sized panels with titles, a scale and a legend.
 #
-# A pixel of a picture is a pixel of the page; one that is too small to carry a title is shown with each pixel as a
-# square of several. Text, bars and gaps grow with the pictures, so that they can be read when a large one is shown
-# small.
+# A pixel of an image is a pixel of the page; images that are too small for a title are magnified by an integer factor.
+# Text, bars and gaps grow with the images, so that they remain legible if a large page is displayed at a small size.
 
 DPI = 100
 INK, PAPER = "#1c1c1c", "#ffffff"
 SMALL, TITLE = 8, 10
-"""Sizes of text, in points, on a page of pictures of `USUAL` pixels."""
+"""Sizes of text, in points, on a page of pictures of `DEFAULT_STYLE` pixels."""
 
-USUAL = 700.0
-_LEAST = 150  # pixels: the room that a title and a scale need
-_PER_POINT = DPI / 72
-_HAIR = 1e-6
-_WIDE = 0.62  # mean width of a letter, in sizes of the text
+REFERENCE_SIZE = 700.0
+_MIN_SIZE = 150  # minimum size in pixels of an image with a title and a scale
+_PIXELS_PER_POINT = DPI / 72
+_EPSILON = 1e-6
+_LETTER_WIDTH = 0.62  # mean width of a letter relative to the font size
 _BAR, _GAP, _EDGE, _TIP, _SIDE = 14, 12, 10, 9, 104
 
 
 def new_page(width: float, height: float) -> Any:
-    """An empty figure of matplotlib of so many pixels, which notebooks show by themselves; pyplot, and with it any
-    window, stays out of it."""
-    # Inches times dots an inch must not fall short of a whole pixel.
-    size = (width + _HAIR) / DPI, (height + _HAIR) / DPI
+    """Create an empty matplotlib figure of the given size in pixels. It displays itself in notebooks and does not
+    use pyplot."""
+    # Avoid rounding down to one pixel less.
+    size = (width + _EPSILON) / DPI, (height + _EPSILON) / DPI
     return _page_type()(figsize=size, dpi=DPI, facecolor=PAPER)
 
 
 def label_axes(axes: Any, x: str, y: str, size: float = SMALL, ticks: float = 7, **how: Any) -> None:
-    """Say along ``axes`` what they are of, in letters of a ``size``, beside ``ticks`` of another."""
+    """Label ``axes`` with font sizes ``size`` for the labels and ``ticks`` for the ticks."""
     axes.set_xlabel(x, fontsize=size, color=INK, **how)
     axes.set_ylabel(y, fontsize=size, color=INK, **how)
     axes.tick_params(labelsize=ticks, colors=INK, length=2)
 
 
 def label_bar(bar: Any, text: str, size: float = SMALL) -> None:
+    """Label a colour bar."""
     bar.set_label(text, fontsize=size, color=INK)
     bar.ax.tick_params(labelsize=7, colors=INK, length=2)
 
 
 @functools.cache
 def _page_type() -> Any:
-    # Matplotlib is loaded when something is drawn, and not with every command.
+    # Import matplotlib only when a figure is drawn.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -350,11 +367,23 @@ def _page_type() -> Any:
 
 
 class Sheet:
-    """Pictures (h, w, 3) of one size in rows of ``columns``, each with one of ``titles``.
+    """Images (h, w, 3) of equal size with titles, arranged in rows.
 
-    ``scale``: room for a bar on the right; ``axes``: room for ticks and labels of each panel; ``note``: a line below
-    all of it. ``page``: the figure; ``panels``, ``images``: axes of each picture and what they show; ``unit``: by what
-    text is larger than usual.
+    Attributes: ``page``: figure; ``panels``, ``images``: axes and image of each panel; ``unit``: text size relative to
+    the default.
+
+    Parameters
+    ----------
+    pictures, titles
+        Images and their titles.
+    scale
+        Whether to reserve space for a colour bar.
+    axes
+        Whether to reserve space for ticks and labels of each panel.
+    columns
+        Number of columns. Default: one row.
+    note
+        Note below the panels.
     """
 
     def __init__(
@@ -367,21 +396,23 @@ class Sheet:
         note: str = "",
     ):
         h, w = pictures[0].shape[:2]
-        times = max(1, math.ceil(_LEAST / max(h, w)))
-        h, w = h * times, w * times
-        self.unit = unit = float(np.clip(math.sqrt(h * w) / USUAL, 1.0, 6.0))
+        magnification = max(1, math.ceil(_MIN_SIZE / max(h, w)))
+        h, w = h * magnification, w * magnification
+        self.unit = unit = float(np.clip(math.sqrt(h * w) / REFERENCE_SIZE, 1.0, 6.0))
         columns = min(columns or len(pictures), len(pictures))
         rows = -(-len(pictures) // columns)
-        slot_w, slot_h = max(w, _LEAST), max(h, _LEAST if scale and rows == 1 else 1)
+        slot_w, slot_h = max(w, _MIN_SIZE), max(h, _MIN_SIZE if scale and rows == 1 else 1)
         wrapped = [wrap(title, slot_w, TITLE * unit) for title in titles]
-        line = TITLE * unit * _PER_POINT * 1.25
+        line = TITLE * unit * _PIXELS_PER_POINT * 1.25
         head = 9 * unit + line * max(text.count("\n") + 1 for text in wrapped)
         left, below = (54 * unit, 42 * unit) if axes else (_EDGE * unit, 0.0)
         foot, gap = _EDGE * unit, _GAP * unit
         self._side = _SIDE * unit if scale else 0.0
-        self.width = round_up_to_even(left + columns * slot_w + (columns - 1) * (left if axes else gap) + self._side + foot)
+        self.width = round_up_to_even(
+            left + columns * slot_w + (columns - 1) * (left if axes else gap) + self._side + foot
+        )
         note = wrap(note, self.width - 2 * left, SMALL * unit) if note else ""
-        foot += SMALL * unit * _PER_POINT * 1.25 * (note.count("\n") + 1) if note else 0.0
+        foot += SMALL * unit * _PIXELS_PER_POINT * 1.25 * (note.count("\n") + 1) if note else 0.0
         self.height = round_up_to_even(rows * (head + slot_h + below) + foot)
         self.page = new_page(self.width, self.height)
         self.panels: list[Any] = []
@@ -391,7 +422,7 @@ class Sheet:
             row, column = divmod(k, columns)
             x = round(left + column * step + (slot_w - w) / 2)
             top = round(row * (head + slot_h + below) + head + (slot_h - h) / 2)
-            panel = self._add(x, top, w, h)
+            panel = self._add_axes(x, top, w, h)
             self.images.append(panel.imshow(np.clip(picture, 0, 1), interpolation="nearest"))
             panel.set_anchor("C")
             for spine in panel.spines.values():
@@ -404,11 +435,15 @@ class Sheet:
         if note:
             at = left / self.width, 0.6 * _EDGE * unit / self.height
             self.page.text(*at, note, fontsize=SMALL * unit, color=INK, va="bottom")
-        whole = rows * (head + slot_h + below) - head - below
-        self._bar_at = (round(left + columns * step - (left if axes else gap) + gap), round(head), round(whole))
+        content_height = rows * (head + slot_h + below) - head - below
+        self._bar_position = (
+            round(left + columns * step - (left if axes else gap) + gap),
+            round(head),
+            round(content_height),
+        )
 
-    def _add(self, x: float, top: float, width: float, height: float) -> Any:
-        """Axes at a place in pixels, from the page's upper left corner."""
+    def _add_axes(self, x: float, top: float, width: float, height: float) -> Any:
+        """Add axes at a position in pixels from the upper left corner of the page."""
         return self.page.add_axes(
             (x / self.width, 1 - (top + height) / self.height, width / self.width, height / self.height)
         )
@@ -424,26 +459,40 @@ class Sheet:
         log: bool = False,
         unknown: bool = False,
     ) -> None:
-        """The scale: ``strip`` (n, 3) display colours from ``low`` to ``high``, evenly in the value, or in its
-        logarithm where ``log``; ``above``, ``below``: some values exceed it, which a tip at its end says; ``unknown``:
-        a swatch below it explains the hatching."""
-        unit, (x, top, height) = self.unit, self._bar_at
+        """Draw the scale.
+
+        Parameters
+        ----------
+        strip
+            Display colours (n, 3) from ``low`` to ``high``, uniform in the value or, if ``log``, in its logarithm.
+        low, high
+            Ends of the scale.
+        label
+            Label with the unit.
+        above, below
+            Whether values exceed the scale, which a tip at its end shows.
+        log
+            Whether the scale is logarithmic.
+        unknown
+            Whether to explain the hatching below the scale.
+        """
+        unit, (x, top, height) = self.unit, self._bar_position
         strip = np.asarray(strip)
         if unknown:
             height -= round(24 * unit)
-            self._no_data(x, top + height + round(8 * unit))
+            self._draw_no_data(x, top + height + round(8 * unit))
         tip = round(_TIP * unit)
         start, long = top + (tip if above else 0), height - tip * (above + below)
-        axes = self._add(x, start, round(_BAR * unit), long)
+        axes = self._add_axes(x, start, round(_BAR * unit), long)
         axes.imshow(strip[:, None], origin="lower", aspect="auto", extent=(0, 1, 0, 1), interpolation="bilinear")
         axes.set_xticks([])
         axes.yaxis.tick_right()
         axes.yaxis.set_label_position("right")
-        places, names, factor = ticks_of(low, high, int(np.clip(long / (26 * unit), 3, 9)), log)
+        places, names, factor = scale_ticks(low, high, int(np.clip(long / (26 * unit), 3, 9)), log)
         axes.set_yticks(places, names)
         axes.tick_params(labelsize=SMALL * unit, colors=INK, length=2 * unit, width=0.6 * unit, pad=2 * unit)
         axes.set_ylabel(
-            wrap(_scaled(label, factor), long, SMALL * unit), fontsize=SMALL * unit, color=INK, labelpad=4 * unit
+            wrap(_insert_factor(label, factor), long, SMALL * unit), fontsize=SMALL * unit, color=INK, labelpad=4 * unit
         )
         for spine in axes.spines.values():
             spine.set_linewidth(0.6 * unit)
@@ -456,13 +505,13 @@ class Sheet:
         axes.set_ylim(0, 1)
 
     def legend(self, text: str = "no data") -> None:
-        """The swatch that explains the hatching, without a scale above it."""
-        x, top, height = self._bar_at
-        self._no_data(x, top + height - round(16 * self.unit), text)
+        """Draw the legend of the hatching, for pages without a scale."""
+        x, top, height = self._bar_position
+        self._draw_no_data(x, top + height - round(16 * self.unit), text)
 
-    def _no_data(self, x: float, top: float, text: str = "no data") -> None:
+    def _draw_no_data(self, x: float, top: float, text: str = "no data") -> None:
         side = round(16 * self.unit)
-        axes = self._add(x, top, side, side)
+        axes = self._add_axes(x, top, side, side)
         axes.imshow(np.clip(hatch_swatch(side, side, max(round(self.unit), 1)), 0, 1), interpolation="nearest")
         axes.set_xticks([])
         axes.set_yticks([])
@@ -472,25 +521,25 @@ class Sheet:
         axes.annotate(text, (1, 0.5), (5 * self.unit, 0), fontsize=SMALL * self.unit, color=INK, **where)
 
 
-def _scaled(label: str, factor: str) -> str:
-    """``label`` with ``factor`` before its unit."""
+def _insert_factor(label: str, factor: str) -> str:
+    """Insert ``factor`` before the unit in ``label``."""
     if not factor:
         return label
     return label.replace("[", f"[{factor} ", 1) if "[" in label else f"{label} [{factor}]"
 
 
 def round_up_to_even(pixels: float) -> int:
-    """Rounded up to an even number, as the sides of a video's frames have to be."""
+    """Round up to an even number, as video frames require."""
     return 2 * math.ceil(round(pixels) / 2)
 
 
 def wrap(text: str, width: float, size: float) -> str:
-    """``text`` in lines that fit into ``width`` pixels at ``size`` points."""
-    letters = max(int(width / (size * _PER_POINT * _WIDE)), 8)
+    """Wrap ``text`` to ``width`` pixels at ``size`` points."""
+    letters = max(int(width / (size * _PIXELS_PER_POINT * _LETTER_WIDTH)), 8)
     return "\n".join(textwrap.wrap(text, letters)) or text
 
 
-# ---- Contact sheets of several pictures ----
+# ---- Contact sheets ----
 
 
 def contact_sheet(
@@ -500,17 +549,29 @@ def contact_sheet(
     add_scale: Callable[[Sheet], None] | None = None,
     note: str = "",
 ) -> Any:
-    """``pictures`` (h, w, 3), display values, each under its title, in rows of ``columns`` (default: about as many as
-    rows); smaller ones lie in the middle of their place.
+    """Arrange images, display values, with titles in a grid; smaller images are centred.
 
-    ``add_scale``: draws the one scale of all on the sheet; ``note``: what they rest on.
+    Parameters
+    ----------
+    pictures, titles
+        Images and their titles.
+    columns
+        Number of columns. Default: about the number of rows.
+    add_scale
+        Draws the common scale.
+    note
+        Note below the images.
     """
     if not pictures:
         raise ValueError("a contact sheet needs at least one picture")
     columns = columns or math.ceil(math.sqrt(len(pictures)))
     height, width = (max(p.shape[axis] for p in pictures) for axis in (0, 1))
     sheet = Sheet(
-        [_padded(p, height, width) for p in pictures], titles, scale=add_scale is not None, columns=columns, note=note
+        [_pad_picture(p, height, width) for p in pictures],
+        titles,
+        scale=add_scale is not None,
+        columns=columns,
+        note=note,
     )
     if add_scale is not None:
         add_scale(sheet)
@@ -518,18 +579,17 @@ def contact_sheet(
 
 
 def shrink(picture: Any, width: int) -> np.ndarray:
-    """``picture`` (h, w, 3) at most ``width`` pixels wide: means of squares of whole pixels, so that nothing is
-    invented; what lacks to a square at the right and lower edge is left out."""
+    """Reduce ``picture`` (h, w, 3) to at most ``width`` pixels by averaging blocks; incomplete blocks are dropped."""
     picture = np.asarray(picture, np.float64)
-    by = max(math.ceil(picture.shape[1] / width), 1)
-    h, w = (max(n // by, 1) for n in picture.shape[:2])
-    if by == 1:
+    factor = max(math.ceil(picture.shape[1] / width), 1)
+    h, w = (max(n // factor, 1) for n in picture.shape[:2])
+    if factor == 1:
         return picture
-    some = picture[: h * by, : w * by]
-    return some.reshape(h, some.shape[0] // h, w, some.shape[1] // w, 3).mean(axis=(1, 3))
+    cropped = picture[: h * factor, : w * factor]
+    return cropped.reshape(h, cropped.shape[0] // h, w, cropped.shape[1] // w, 3).mean(axis=(1, 3))
 
 
-def _padded(picture: np.ndarray, height: int, width: int) -> np.ndarray:
+def _pad_picture(picture: np.ndarray, height: int, width: int) -> np.ndarray:
     out = np.ones((height, width, 3))
     h, w = picture.shape[:2]
     top, left = (height - h) // 2, (width - w) // 2

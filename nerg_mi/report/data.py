@@ -1,5 +1,4 @@
-"""What a report shows: one run of a gaze field with its scores, its areas, glances and the stage on which they
-stand."""
+"""Data of a report on one gaze field: scores, AOI attention, sampled viewpoints, and the packed 3D view."""
 
 from __future__ import annotations
 
@@ -24,93 +23,107 @@ from nerg_mi.rays.quality import RaysSummary
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.bands import render_channels
 from nerg_mi.statistics.shares import DirectionQuery, Shares
-from nerg_mi.statistics.visits import Aoi, HitAssignment, assign_hits, regroup
+from nerg_mi.statistics.visits import Aoi, HitAssignment, assign_hits, merge_members
 from nerg_mi.train.gaze_data import SURFACE_OPACITY
 from nerg_mi.train.geometry import TrainingGeometry
 from nerg_mi.transport.geometry import SceneGeometry, default_march_settings, trace_depth
 from nerg_mi.transport.observer import ObserverSettings
 from nerg_mi.transport.observer_gaze import GazeFieldInstance, make_gaze_evaluator
 
-# ---- Glances ----
+# ---- Gaze at sampled viewpoints ----
 #
-# What people could look at, and how much gaze a field says they give it: from places where they stood, in all
-# directions. Everything is in the coordinates of the place.
+# Gaze is evaluated in all directions from positions where participants stood. Coordinates are those of the scene.
 
-_GOLDEN = (math.sqrt(5) - 1) / 2
-# Directions of the integral of a normalised field: shares are divided by their own sum.
-_INTEGRAL = 2048
+_GOLDEN_RATIO = (math.sqrt(5) - 1) / 2
+# Number of directions for the normalisation of a field. Attention shares are divided by their sum, so few are enough.
+_NORMALIZATION_DIRECTIONS = 2048
 
 
 @dataclass(frozen=True, eq=False)
 class EyePositions:
-    """Where people stood: ``positions`` (P, 3), and whose they are, ``person`` (P,)."""
+    """Sampled viewpoints: ``positions`` (P, 3) in scene units, and the index of the participant of each, (P,)."""
 
     positions: np.ndarray
     participant: np.ndarray
 
 
 class GazeSampler:
-    """A gaze field in its place, asked about observers in the place's coordinates.
+    """Evaluate a gaze field in a scene for given observers.
 
-    ``kind``: of the depth at which a ray meets its surface.
+    Parameters
+    ----------
+    field
+        Gaze field.
+    geometry
+        Geometry of the scene. All coordinates are in its frame.
+    kind
+        Depth estimate of a ray in a medium, such as "median".
     """
 
     def __init__(self, field: AnyGazeField, geometry: TrainingGeometry, kind: str = "median"):
         self.field, self._kind = field, kind
-        self._place = geometry.medium if isinstance(geometry.medium, SceneGeometry) else SceneGeometry(geometry.medium)
-        self._known = geometry.medium is not None
-        march = default_march_settings(self._place)
+        self._geometry = (
+            geometry.medium if isinstance(geometry.medium, SceneGeometry) else SceneGeometry(geometry.medium)
+        )
+        self._has_geometry = geometry.medium is not None
+        march = default_march_settings(self._geometry)
         self._settings = ObserverSettings(
-            march=march, depth=kind, surface_opacity=SURFACE_OPACITY, directions=_INTEGRAL
+            march=march, depth=kind, surface_opacity=SURFACE_OPACITY, directions=_NORMALIZATION_DIRECTIONS
         )
         self._gaze = GazeFieldInstance(field)
 
     def trace(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Depth (N,) along rays (N, 3), and whether they meet a surface; nothing is met where no place is known."""
-        if not self._known:
+        """Return the depth (N,) along rays (N, 3) and whether each hits a surface (N,). Without geometry, no ray
+        hits."""
+        if not self._has_geometry:
             return np.zeros(len(origins), np.float32), np.zeros(len(origins), bool)
-        depth, opacity = trace_depth(self._place, origins, directions, kind=self._kind)
+        depth, opacity = trace_depth(self._geometry, origins, directions, kind=self._kind)
         return depth, (opacity >= SURFACE_OPACITY) & (depth > 0)
 
     def density(self, observer: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Gaze (N,) in 1/sr of the ``observer`` (3,) in unit ``directions`` (N, 3)."""
+        """Return the gaze density (N,) of ``observer`` (3,) in unit ``directions`` (N, 3), in 1/sr."""
         mi = variant_types()
         center = mi.Point3f(*np.asarray(observer, float).tolist())
-        observed = self._gaze.for_observers([center], self._place, self._settings)
-        return np.array(observed.along(center, to_vector(mi.Vector3f, directions)))
+        observed = self._gaze.for_observers([center], self._geometry, self._settings)
+        return np.array(observed.evaluate_along(center, to_vector(mi.Vector3f, directions)))
 
     def density_at_points(self, observer: np.ndarray, points: np.ndarray, spacing: float) -> np.ndarray:
-        """Gaze (N,) in 1/sr that the ``observer`` (3,) gives ``points`` (N, 3) of surfaces, none to those that are
-        hidden by more than twice the ``spacing``."""
-        away = points - observer
-        distance = np.linalg.norm(away, axis=1)
-        directions = away / np.maximum(distance, 1e-9)[:, None]
-        depth, met = self.trace(np.broadcast_to(observer, points.shape), directions)
-        seen = ~met | (depth >= distance - 2 * spacing)
-        return np.where(seen, self.density(observer, directions), 0)
+        """Return the gaze density (N,) of ``observer`` (3,) towards surface ``points`` (N, 3), in 1/sr.
+
+        Points that are hidden by a surface more than two ``spacing`` in front of them have density 0.
+        """
+        to_points = points - observer
+        distance = np.linalg.norm(to_points, axis=1)
+        directions = to_points / np.maximum(distance, 1e-9)[:, None]
+        depth, is_hit = self.trace(np.broadcast_to(observer, points.shape), directions)
+        is_visible = ~is_hit | (depth >= distance - 2 * spacing)
+        return np.where(is_visible, self.density(observer, directions), 0)
 
     def query_from(self, observer: np.ndarray) -> DirectionQuery:
-        """What the observer at ``eye`` (3,) meets and gives their gaze, as `gaze_shares` wants it."""
-        return make_gaze_evaluator(self._gaze, self._place, self._settings, observer)
+        """Return the `DirectionQuery` of the observer at this position (3,), as `gaze_shares` needs it."""
+        return make_gaze_evaluator(self._gaze, self._geometry, self._settings, observer)
 
 
-def sample_eye_positions(rays: Rays, geometry: TrainingGeometry, most: int) -> EyePositions:
-    """About ``most`` of the positions of ``rays``, in the place's coordinates, as many of each person: evenly chosen
-    among theirs in the order of time, and begun at another part of it for each person, so that all together are spread
-    over whole visits even where each person has only one. Of more people than that so many, evenly chosen."""
-    there = np.unique(rays.person)
-    if len(there) > most:
-        there = there[np.linspace(0, len(there) - 1, most).astype(int)]
-    each, chosen = max(1, most // len(there)), []
-    # Multiples of the golden ratio, modulo one, are spread evenly however many there are; the first is one half.
-    starts = (0.5 + np.arange(len(there)) * _GOLDEN) % 1
-    for person, start in zip(there, starts):
-        own = np.flatnonzero(rays.person == person)
-        own = own[np.argsort(rays.t[own], kind="stable")]
-        count = min(each, len(own))
-        # At the same share of as many equal stretches.
-        chosen.append(own[((np.arange(count) + start) * len(own) / count).astype(int)])
-    rows = np.concatenate(chosen)
+def sample_eye_positions(rays: Rays, geometry: TrainingGeometry, max_positions: int) -> EyePositions:
+    """Sample about ``max_positions`` viewpoints from ``rays``, the same number for each participant.
+
+    The samples of a participant are evenly spaced in time. Each participant starts at a different phase, so that the
+    viewpoints cover whole recordings even if every participant contributes only one. If there are more participants
+    than ``max_positions``, an evenly spaced subset of participants is used.
+    """
+    participants = np.unique(rays.person)
+    if len(participants) > max_positions:
+        participants = participants[np.linspace(0, len(participants) - 1, max_positions).astype(int)]
+    per_participant, rows_of_participants = max(1, max_positions // len(participants)), []
+    # Multiples of the golden ratio modulo one are evenly spread for any number of participants.
+    starts = (0.5 + np.arange(len(participants)) * _GOLDEN_RATIO) % 1
+    for person, start in zip(participants, starts):
+        samples = np.flatnonzero(rays.person == person)
+        samples = samples[np.argsort(rays.t[samples], kind="stable")]
+        count = min(per_participant, len(samples))
+        # One sample per interval of equal length, at the participant's phase.
+        rows_of_participants.append(samples[((np.arange(count) + start) * len(samples) / count).astype(int)])
+    rows = np.concatenate(rows_of_participants)
     return EyePositions(geometry.points_to_field(rays.origin[rows]), rays.person[rows])
 
 
@@ -118,108 +131,132 @@ def assign_ray_hits(
     rays: Rays,
     geometry: TrainingGeometry,
     sampler: GazeSampler,
-    most: int,
-    things: Sequence[Aoi],
+    max_rays: int,
+    aois: Sequence[Aoi],
     members: Sequence[tuple[int, ...]],
     margin: float,
 ) -> tuple[HitAssignment, np.ndarray]:
-    """What up to ``most`` of the ``rays``, evenly chosen, are on of objects that consist of ``things`` by their
-    numbers, ``members``, and whose each is (N,). Rays end at their own hit points, or else at what they meet in the
-    place. ``margin``: as of `visits.land`."""
-    some = rays if len(rays) <= most else rays.select(np.linspace(0, len(rays) - 1, most).round().astype(int))
-    origins, directions = geometry.points_to_field(some.origin), geometry.directions_to_field(some.direction)
-    met, hit = sampler.trace(origins, directions)
-    depth = np.where(hit, met, np.inf)
-    if some.hit is not None:
-        away = geometry.points_to_field(some.hit) - origins
-        far = np.linalg.norm(away, axis=1)
-        ends = np.isfinite(far) & (far > 0)
-        directions = np.where(ends[:, None], away / np.where(ends, far, 1)[:, None], directions)
-        depth = np.where(ends, far, depth)
-    return regroup(assign_hits(things, origins, directions, depth, margin), members), some.person
+    """Assign gaze samples to AOIs, and return the hits with the participant index of each sample (N,).
+
+    Parameters
+    ----------
+    rays
+        Gaze samples. Up to ``max_rays`` of them, evenly spaced, are used. A sample ends at its recorded hit point, if
+        it has one, otherwise at the first surface of the scene.
+    geometry
+        Geometry of the scene.
+    sampler
+        Traces the samples in the scene.
+    max_rays
+        Maximum number of samples.
+    aois
+        Elementary AOIs.
+    members
+        Indices into ``aois`` of each area.
+    margin
+        Tolerance in scene units, as for `nerg_mi.statistics.visits.assign_hits`.
+    """
+    subset = rays if len(rays) <= max_rays else rays.select(np.linspace(0, len(rays) - 1, max_rays).round().astype(int))
+    origins, directions = geometry.points_to_field(subset.origin), geometry.directions_to_field(subset.direction)
+    trace_depth, is_hit = sampler.trace(origins, directions)
+    depth = np.where(is_hit, trace_depth, np.inf)
+    if subset.hit is not None:
+        to_hit = geometry.points_to_field(subset.hit) - origins
+        hit_distance = np.linalg.norm(to_hit, axis=1)
+        has_hit = np.isfinite(hit_distance) & (hit_distance > 0)
+        directions = np.where(has_hit[:, None], to_hit / np.where(has_hit, hit_distance, 1)[:, None], directions)
+        depth = np.where(has_hit, hit_distance, depth)
+    return merge_members(assign_hits(aois, origins, directions, depth, margin), members), subset.person
 
 
-# ---- Names ----
+# ---- Anonymisation ----
 #
-# People without their names: what a report shows of rays and of evaluations unless names are asked for.
+# By default a report replaces the names of participants by numbered labels.
 
 
-# Metadata of rays that name nobody.
-_KEPT = ("frame", "source_frame", "transform", "rows_read", "preset")
-# Names of fewer characters are parts of too many words to be looked for within them.
-_WORD = 3
+# Metadata keys that cannot contain a name.
+_SAFE_METADATA = ("frame", "source_frame", "transform", "rows_read", "preset")
+# Shorter names are only replaced as whole words, since they occur within many other words.
+_MIN_SUBSTRING = 3
 
 
 class ParticipantLabels:
-    """Numbered people, as in "person 1", in place of names: by the number of rays, the most first, and then those who
-    are only named by evaluations."""
+    """Numbered labels, such as "person 1", in place of participants' names.
+
+    Participants are numbered by their number of samples, the largest first, followed by those that only occur in
+    evaluations.
+    """
 
     def __init__(self, rays: Rays | None, results: Iterable[GazeResults] = ()):
         names: list[str] = []
         if rays is not None:
             count = np.bincount(rays.person, minlength=len(rays.persons))
             names = [rays.persons[i] for i in np.argsort(-count, kind="stable")]
-        for found in results:
-            names += [str(row["person"]) for row in found.participant_rows if "person" in row]
+        for result in results:
+            names += [str(row["person"]) for row in result.participant_rows if "person" in row]
         self._number = {name: k + 1 for k, name in enumerate(dict.fromkeys(names))}
         self._label = {name: f"person {number}" for name, number in self._number.items()}
 
     def label(self, name: str) -> str:
-        """What stands for ``name``."""
+        """Return the label of the participant ``name``."""
         return self._label.get(name, "a person")
 
     def number(self, name: str) -> int:
-        """The number that stands for ``name``, 0 for nobody's."""
+        """Return the number of the participant ``name``, 0 if unknown."""
         return self._number.get(name, 0)
 
     def anonymize(self, text: str) -> str:
-        """``text``, such as a file's name, with what stands for people in place of their names: also within words, but
-        for names of one or two characters."""
-        parts = sorted((n for n in self._label if n), key=len, reverse=True)
-        pattern = "|".join(re.escape(n) if len(n) >= _WORD else rf"(?<!\w){re.escape(n)}(?!\w)" for n in parts)
-        folded = {name.lower(): label for name, label in self._label.items()}
-        swap = lambda found: folded.get(found.group().lower(), "a person")
-        return re.sub(pattern, swap, text, flags=re.IGNORECASE) if pattern else text
+        """Replace participants' names in ``text``, such as a file name, by their labels.
+
+        Names are also replaced within words, except names of one or two characters.
+        """
+        names = sorted((n for n in self._label if n), key=len, reverse=True)
+        pattern = "|".join(re.escape(n) if len(n) >= _MIN_SUBSTRING else rf"(?<!\w){re.escape(n)}(?!\w)" for n in names)
+        label_of = {name.lower(): label for name, label in self._label.items()}
+        replace_name = lambda found: label_of.get(found.group().lower(), "a person")
+        return re.sub(pattern, replace_name, text, flags=re.IGNORECASE) if pattern else text
 
 
 def anonymize_rays(rays: Rays, labels: ParticipantLabels) -> Rays:
-    """``rays`` whose people are called by ``labels``, and of whose metadata only that is left which names nobody."""
-    about = {key: rays.metadata[key] for key in _KEPT if key in rays.metadata}
+    """Return ``rays`` with labels in place of names, and with only the metadata that cannot contain a name."""
+    metadata = {key: rays.metadata[key] for key in _SAFE_METADATA if key in rays.metadata}
     files = [d.get("file") for d in rays.metadata.get("dropped", [])]
     number = {name: f"file {k + 1}" for k, name in enumerate(dict.fromkeys(files))}
-    about["dropped"] = [{**d, "file": number[d.get("file")]} for d in rays.metadata.get("dropped", [])]
-    words = ("step", "side", "kept", "of")
-    about["steps"] = [{k: step[k] for k in words if k in step} for step in rays.metadata.get("steps", [])]
-    # In the order of the labels, since that of names or files can be guessed.
+    metadata["dropped"] = [{**d, "file": number[d.get("file")]} for d in rays.metadata.get("dropped", [])]
+    step_keys = ("step", "side", "kept", "of")
+    metadata["steps"] = [{k: step[k] for k in step_keys if k in step} for step in rays.metadata.get("steps", [])]
+    # Sorted by label: the order of names or files could reveal them.
     order = sorted(range(len(rays.persons)), key=lambda i: labels.number(rays.persons[i]))
     code = np.empty(len(order), np.int32)
     code[order] = np.arange(len(order))
     return replace(
-        rays, person=code[rays.person], persons=tuple(labels.label(rays.persons[i]) for i in order), metadata=about
+        rays, person=code[rays.person], persons=tuple(labels.label(rays.persons[i]) for i in order), metadata=metadata
     )
 
 
 def anonymize_results(results: GazeResults, labels: ParticipantLabels) -> GazeResults:
-    """``found`` whose people are called by ``labels``."""
+    """Return the evaluation results with labels in place of names."""
     persons = tuple({**row, "person": labels.label(str(row.get("person", "")))} for row in results.participant_rows)
     return replace(results, participant_rows=persons)
 
 
-# ---- Objects ----
+# ---- Attention on AOIs ----
 #
-# How much attention named objects have: by the field, and by the rays; of people, each of whom counts alike.
+# Attention shares of AOIs, predicted by the field and measured from gaze samples. Every participant has the same
+# weight.
 #
-# Intervals are of 95 %, of the mean over people: Student's t with n - 1 degrees of freedom, which for means is what the
-# bootstrap over people comes to with many resamples, widened for few (`nerg_mi.evaluation.gaze_report.widening`).
+# Intervals are 95 % confidence intervals of the mean over participants: Student's t with n - 1 degrees of freedom. For
+# means this is the limit of the bootstrap over participants, widened for small numbers
+# (`nerg_mi.evaluation.gaze_report.widening`).
 
-LEAST_PEOPLE = 3
-"""Fewer people than these give no interval."""
+MIN_PARTICIPANTS = 3
+"""Minimum number of participants for a confidence interval."""
 
 
 @dataclass(frozen=True)
 class MeanShare:
-    """A mean share of attention over people, and the 95 % interval of that mean; NaN where people are too few for
-    it."""
+    """Mean attention share over participants with the 95 % confidence interval of the mean; NaN limits for too few
+    participants."""
 
     mean: float
     low: float
@@ -228,9 +265,13 @@ class MeanShare:
 
 @dataclass(frozen=True)
 class ObjectAttention:
-    """Of what is called ``name``: ``field``: the share of gaze that the field says people give it where they stood;
-    ``recorded``: the share of their rays that end at it (None without rays); ``saw``: people who stood somewhere from
-    where it can be seen, and ``looked``: who have a ray on it, of ``people``; None where nobody was recorded."""
+    """Attention on one AOI.
+
+    ``name``: of the AOI; ``field`` / ``predicted``: predicted share of gaze at the participants' viewpoints;
+    ``recorded``: share of gaze samples that hit the AOI; ``num_could_see``: participants with a viewpoint from which it
+    is visible, or with a sample on it; ``num_looked``: participants with a sample on it; ``num_participants``: all
+    participants. Values that need gaze samples are None without them.
+    """
 
     name: str
     predicted: MeanShare
@@ -241,65 +282,89 @@ class ObjectAttention:
 
 
 def summarize_objects(
-    names: Sequence[str], shares: Shares, who: np.ndarray, recorded: tuple[HitAssignment, np.ndarray] | None = None
+    names: Sequence[str],
+    shares: Shares,
+    participant: np.ndarray,
+    recorded: tuple[HitAssignment, np.ndarray] | None = None,
 ) -> tuple[ObjectAttention, ...]:
-    """Attention on each of the objects called ``names``, by the ``shares`` of eyes, which are those of ``who`` (P,).
+    """Summarise the attention on AOIs.
 
-    ``recorded``: what people's rays land on, object by object, and whose each is (N,); without it the eyes are
-    nobody's.
+    Parameters
+    ----------
+    names
+        Names of the AOIs.
+    shares
+        Predicted attention shares at P viewpoints.
+    participant
+        Index of the participant of each viewpoint, (P,).
+    recorded
+        Hits of N gaze samples and the participant index of each sample, (N,). None: viewpoints belong to no
+        participant.
     """
     out = []
     for k, name in enumerate(names):
         share = shares.share[:, k]
         if recorded is None:
-            out.append(ObjectAttention(name, MeanShare(float(share.mean()), math.nan, math.nan), None, None, None, None))
+            out.append(
+                ObjectAttention(name, MeanShare(float(share.mean()), math.nan, math.nan), None, None, None, None)
+            )
             continue
-        landed, person = recorded
-        on = np.zeros(len(person))
-        on[landed.rows[k]] = 1.0
-        rays = _each(on, person)
-        saw = _each(shares.is_hit[:, k].astype(float), who)
-        field, people = mean_over_people(_each(share, who)), len(np.unique(person))
-        seen, looked = int(np.sum(saw > 0)), int(np.sum(rays > 0))
-        out.append(ObjectAttention(name, field, mean_over_people(rays), max(seen, looked), looked, people))
+        hits, person = recorded
+        is_hit = np.zeros(len(person))
+        is_hit[hits.rows[k]] = 1.0
+        hit_share = _mean_by_participant(is_hit, person)
+        seen_share = _mean_by_participant(shares.is_hit[:, k].astype(float), participant)
+        field, num_participants = (
+            mean_over_participants(_mean_by_participant(share, participant)),
+            len(np.unique(person)),
+        )
+        num_seen, num_looked = int(np.sum(seen_share > 0)), int(np.sum(hit_share > 0))
+        out.append(
+            ObjectAttention(
+                name, field, mean_over_participants(hit_share), max(num_seen, num_looked), num_looked, num_participants
+            )
+        )
     return tuple(out)
 
 
-def mean_over_people(values: np.ndarray) -> MeanShare:
-    """The mean of ``values`` (N,), one a person, between 0 and 1, and its interval."""
+def mean_over_participants(values: np.ndarray) -> MeanShare:
+    """Return the mean of ``values`` (N,), one per participant and within 0..1, with its confidence interval."""
     mean, n = float(values.mean()), len(values)
-    if n < LEAST_PEOPLE:
+    if n < MIN_PARTICIPANTS:
         return MeanShare(mean, math.nan, math.nan)
-    # The bootstrap's standard error of a mean is that of the population: divided by n, not by n - 1.
-    reach = 1.96 * float(values.std()) / math.sqrt(n) * small_sample_factor(n)
-    return MeanShare(mean, max(mean - reach, 0.0), min(mean + reach, 1.0))
+    # The bootstrap's standard error uses the population variance: it divides by n, not by n - 1.
+    half_width = 1.96 * float(values.std()) / math.sqrt(n) * small_sample_factor(n)
+    return MeanShare(mean, max(mean - half_width, 0.0), min(mean + half_width, 1.0))
 
 
-def _each(values: np.ndarray, person: np.ndarray) -> np.ndarray:
-    """Mean of ``values`` for each person there is."""
-    _, who, count = np.unique(person, return_inverse=True, return_counts=True)
-    return np.bincount(who, weights=values) / count
+def _mean_by_participant(values: np.ndarray, person: np.ndarray) -> np.ndarray:
+    """Return the mean of ``values`` for each participant that occurs."""
+    _, index, count = np.unique(person, return_inverse=True, return_counts=True)
+    return np.bincount(index, weights=values) / count
 
 
-# ---- Proxy ----
+# ---- Scene proxy ----
 #
-# A place as some ten thousand points that a browser draws by itself, with the gaze of observers baked into them.
-#
-# Points are what panoramas from several eyes show, one a small cube. All lengths are scene units.
+# The 3D view draws the scene as some ten thousand points with the observers' gaze baked in. The points are sampled from
+# panoramas at several viewpoints, one per small cube. Lengths are in scene units.
 
 GazeAt = Callable[[np.ndarray, np.ndarray, float], np.ndarray]
-"""``(observer (3,), points (V, 3), spacing) -> (V,)``: gaze in 1/sr after occlusion, of points known to ``spacing``."""
+"""``(observer (3,), points (V, 3), spacing) -> (V,)``: gaze density in 1/sr after occlusion; points are accurate to
+``spacing``."""
 
-# What is farther away than so many times the usual distance is left out: a sky, a glance through a window.
-_FAR = 5.0
-# Cubes along the longest edge of the place, to begin with.
-_FINE = 320
+# Points farther away than this multiple of the median distance are dropped, such as the sky or a view through a window.
+_MAX_RELATIVE_DISTANCE = 5.0
+# Initial number of cubes along the longest edge of the scene.
+_INITIAL_CUBES = 320
 
 
 @dataclass(frozen=True, eq=False)
 class ReportProxy:
-    """``vertices`` (V, 3) float32; ``normals`` (V, 3) unit, towards where they were seen from; ``colors`` (V, 3) uint8
-    sRGB; ``gaze`` (M, V) in 1/sr of M observers; ``spacing``: edge of the cube that a point stands for."""
+    """Point proxy of a scene.
+
+    ``vertices`` (V, 3) float32; ``normals`` (V, 3), unit, towards the viewpoints; ``colors`` (V, 3) uint8 sRGB;
+    ``gaze`` (M, V) of M observers in 1/sr; ``spacing``: edge length of the cube that a point represents.
+    """
 
     vertices: np.ndarray
     normals: np.ndarray
@@ -314,28 +379,43 @@ def make_proxy(
     up: np.ndarray,
     observers: np.ndarray,
     gaze: GazeAt,
-    most: int = 80_000,
+    max_points: int = 80_000,
     size: tuple[int, int] = (320, 160),
     on_panorama: Callable[[int, int], None] | None = None,
 ) -> ReportProxy | None:
-    """What panoramas of ``size`` from ``eyes`` (K, 3) show of ``scene`` (`mi.Scene`), as ``most`` points at most.
+    """Sample a point proxy of ``scene`` from panoramas; None if no panorama shows a surface.
 
-    The scene's integrator is ``nerg`` with the AOVs opacity and position. ``up`` (3,): up axis of the panoramas.
-    ``observers`` (M, 3): whose ``gaze`` is baked. ``on_eye`` is told the panoramas done, and of how many. None where
-    there is no surface.
+    Parameters
+    ----------
+    scene : mi.Scene
+        Scene whose integrator is ``nerg`` with the AOVs opacity and position.
+    viewpoints
+        Positions (K, 3) of the panoramas.
+    up
+        Up axis (3,) of the panoramas.
+    observers
+        Observers (M, 3) whose gaze is baked into the points.
+    gaze
+        Returns the gaze density of an observer at points.
+    max_points
+        Maximum number of points.
+    size
+        Width and height of the panoramas in pixels.
+    on_panorama
+        Called with the number of finished panoramas and their total number.
     """
     parts = []
     for number, eye in enumerate(viewpoints):
-        parts.append(_panorama(scene, np.asarray(eye, float), np.asarray(up, float), size))
+        parts.append(_render_panorama(scene, np.asarray(eye, float), np.asarray(up, float), size))
         if on_panorama is not None:
             on_panorama(number + 1, len(viewpoints))
     points, normals, facing, colors, distance = (np.concatenate(columns) for columns in zip(*parts))
     if not len(points):
         return None
-    near = distance <= _FAR * np.median(distance)
+    is_near = distance <= _MAX_RELATIVE_DISTANCE * np.median(distance)
     values = np.concatenate([colors, facing], axis=1)
-    points, values, spacing = downsample_points(points[near], normals[near], values[near], most)
-    colors, normals = values[:, :3], smooth_normals(points, values[:, 3:])
+    points, values, spacing = downsample_points(points[is_near], normals[is_near], values[is_near], max_points)
+    colors, normals = values[:, :3], estimate_normals(points, values[:, 3:])
     baked = [gaze(np.asarray(observer, float), points, spacing) for observer in observers]
     heat = np.stack(baked).astype(np.float32) if baked else np.zeros((0, len(points)), np.float32)
     return ReportProxy(points.astype(np.float32), normals.astype(np.float32), to_bytes(srgb(colors)), heat, spacing)
@@ -344,110 +424,122 @@ def make_proxy(
 def downsample_points(
     points: np.ndarray, normals: np.ndarray, values: np.ndarray, max_points: int
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """The means of ``points`` (N, 3) and of their ``values`` (N, C) in each of at most ``most`` cubes, and the cubes'
-    edge. Surfaces whose ``normals`` face opposite ways are kept apart, as the two sides of a thin wall are."""
-    edge = float(np.ptp(points, axis=0).max()) / _FINE or 1.0
+    """Average ``points`` (N, 3) and ``values`` (N, C) within cubes, and return the means with the edge length of the
+    cubes.
+
+    The edge length is increased until at most ``max_points`` cubes are occupied. Points whose ``normals`` face opposite
+    directions are averaged separately, so that the two sides of a thin wall stay apart.
+    """
+    edge = float(np.ptp(points, axis=0).max()) / _INITIAL_CUBES or 1.0
     side = np.argmax(np.abs(normals), axis=1)
     facing = 2 * side + (np.take_along_axis(normals, side[:, None], axis=1)[:, 0] > 0)
     while True:
         cell = np.floor((points - points.min(axis=0)) / edge).astype(np.int64)
         key = np.ravel_multi_index((*cell.T, facing), (*(cell.max(axis=0) + 1), 6))
-        _, which, count = np.unique(key, return_inverse=True, return_counts=True)
+        _, cube, count = np.unique(key, return_inverse=True, return_counts=True)
         if len(count) <= max_points:
             break
         edge *= 1.1
-    mean = lambda v: np.stack([np.bincount(which, weights=c) for c in v.T], axis=1) / count[:, None]
+    mean = lambda v: np.stack([np.bincount(cube, weights=c) for c in v.T], axis=1) / count[:, None]
     return mean(points), mean(values), edge
 
 
-def smooth_normals(points: np.ndarray, towards: np.ndarray, count: int = 12) -> np.ndarray:
-    """Unit normals (N, 3) of the surface through ``points`` (N, 3), on the side of ``towards`` (N, 3): of the plane
-    that lies nearest to each one's ``count`` nearest neighbours (its covariance's least axis). ``towards`` itself for
-    fewer than three points."""
+def estimate_normals(points: np.ndarray, towards: np.ndarray, count: int = 12) -> np.ndarray:
+    """Estimate unit normals (N, 3) of the surface through ``points`` (N, 3), oriented to the side of ``towards`` (N,
+    3).
+
+    A normal is the smallest principal axis of the ``count`` nearest neighbours. For fewer than three points, the
+    normalised ``towards`` is returned.
+    """
     from scipy.spatial import KDTree
 
     facing = towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
     count = min(count, len(points))
     if count < 3:
         return facing
-    near = points[KDTree(points).query(points, k=count)[1]]
-    apart = near - near.mean(axis=1, keepdims=True)
-    normals = np.linalg.eigh(np.einsum("nki,nkj->nij", apart, apart))[1][:, :, 0]
+    neighbours = points[KDTree(points).query(points, k=count)[1]]
+    offset = neighbours - neighbours.mean(axis=1, keepdims=True)
+    normals = np.linalg.eigh(np.einsum("nki,nkj->nij", offset, offset))[1][:, :, 0]
     return np.where((normals * facing).sum(axis=1, keepdims=True) < 0, -normals, normals)
 
 
-def _panorama(
+def _render_panorama(
     scene: Any, eye: np.ndarray, up: np.ndarray, size: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Points, normals, directions to the eye, linear colours, (N, 3) each, and distances (N,) of what is met around
-    ``eye``."""
+    """Render a panorama at ``eye`` (3,), and return points, normals, directions to the viewpoint and linear colours,
+    (N, 3) each, with the distances (N,)."""
     import mitsuba as mi
 
     level = np.cross(up, [1.0, 0, 0] if abs(up[0]) < 0.9 else [0, 1.0, 0])
-    look = mi.ScalarTransform4f().look_at(origin=eye.tolist(), target=(eye + level).tolist(), up=up.tolist())
+    to_world = mi.ScalarTransform4f().look_at(origin=eye.tolist(), target=(eye + level).tolist(), up=up.tolist())
     film = {"type": "hdrfilm", "width": size[0], "height": size[1], "rfilter": {"type": "box"}}
     film |= {"component_format": "float32", "pixel_format": "rgb"}
-    sensor = mi.load_dict({"type": "panorama", "to_world": look, "film": film})
-    found = render_channels(scene, sensor, spp=1)
-    points = np.stack([found.aovs[f"position.{axis}"] for axis in "XYZ"], axis=-1).astype(np.float64)
-    met = found.mask & np.isfinite(points).all(axis=-1)
-    away = eye - points
-    distance = np.linalg.norm(away, axis=-1)
-    met &= distance > 0
-    normals = surface_normals(np.where(met[..., None], points, np.nan), away)
-    facing = away[met] / distance[met][:, None]
-    return points[met], normals[met], facing, np.array(found.color, np.float64)[met], distance[met]
+    sensor = mi.load_dict({"type": "panorama", "to_world": to_world, "film": film})
+    channels = render_channels(scene, sensor, spp=1)
+    points = np.stack([channels.aovs[f"position.{axis}"] for axis in "XYZ"], axis=-1).astype(np.float64)
+    is_hit = channels.mask & np.isfinite(points).all(axis=-1)
+    to_eye = eye - points
+    distance = np.linalg.norm(to_eye, axis=-1)
+    is_hit &= distance > 0
+    normals = normals_from_image(np.where(is_hit[..., None], points, np.nan), to_eye)
+    facing = to_eye[is_hit] / distance[is_hit][:, None]
+    return points[is_hit], normals[is_hit], facing, np.array(channels.color, np.float64)[is_hit], distance[is_hit]
 
 
-def surface_normals(points: np.ndarray, towards: np.ndarray) -> np.ndarray:
-    """Unit normals (h, w, 3) of the surface through a picture of ``points`` (h, w, 3), on the side of ``towards`` (h,
-    w, 3); where neighbours tell of none, ``towards`` itself. Of the two neighbours along a row or column the nearer
-    one counts, so that an edge does not lean over what is behind it."""
-    along = lambda axis: _nearer_step(points, axis)
-    normals = np.cross(along(0), along(1))
+def normals_from_image(points: np.ndarray, towards: np.ndarray) -> np.ndarray:
+    """Compute unit normals (h, w, 3) from an image of ``points`` (h, w, 3), oriented to the side of ``towards`` (h, w,
+    3).
+
+    Derivatives use the nearer of the two neighbours along each axis, so that normals at depth discontinuities do not
+    mix two surfaces. Pixels without a valid derivative get the normalised ``towards``.
+    """
+    step = lambda axis: _nearer_step(points, axis)
+    normals = np.cross(step(0), step(1))
     length = np.linalg.norm(normals, axis=-1, keepdims=True)
     facing = towards / np.maximum(np.linalg.norm(towards, axis=-1, keepdims=True), 1e-12)
-    known = np.isfinite(length) & (length > 1e-12)
-    normals = np.where(known, normals / np.where(known, length, 1), facing)
+    is_known = np.isfinite(length) & (length > 1e-12)
+    normals = np.where(is_known, normals / np.where(is_known, length, 1), facing)
     return np.where((normals * facing).sum(axis=-1, keepdims=True) < 0, -normals, normals)
 
 
 def _nearer_step(points: np.ndarray, axis: int) -> np.ndarray:
-    """From each point to that of its two neighbours along ``axis`` which is nearer, forwards; rows end, columns go
-    around."""
+    """Return the forward step from each point to its nearer neighbour along ``axis``; rows end at the border,
+    columns wrap around."""
     forward = np.roll(points, -1, axis) - points
     backward = points - np.roll(points, 1, axis)
     if axis == 0:
         forward[-1], backward[0] = np.nan, np.nan
-    far = lambda step: np.nan_to_num(np.linalg.norm(step, axis=-1, keepdims=True), nan=np.inf)
-    return np.where(far(forward) <= far(backward), forward, backward)
+    step_length = lambda step: np.nan_to_num(np.linalg.norm(step, axis=-1, keepdims=True), nan=np.inf)
+    return np.where(step_length(forward) <= step_length(backward), forward, backward)
 
 
 def farthest_point_sampling(points: np.ndarray, count: int, first: np.ndarray | None = None) -> np.ndarray:
-    """Indices of up to ``count`` of ``points`` (N, 3), each the farthest from those before; the first one is the
-    farthest from ``first`` (K, 3), or number 0."""
+    """Return indices of up to ``count`` of ``points`` (N, 3) by farthest-point sampling.
+
+    The first index is the point farthest from ``first`` (K, 3), or 0 if ``first`` is None.
+    """
     if not len(points):
         return np.zeros(0, int)
-    away = np.full(len(points), np.inf)
+    distance = np.full(len(points), np.inf)
     if first is not None:
-        away = np.linalg.norm(points[:, None] - np.atleast_2d(first)[None], axis=2).min(axis=1)
-    chosen: list[int] = []
-    while len(chosen) < min(count, len(points)):
-        chosen.append(int(np.argmax(away)) if chosen or first is not None else 0)
-        away = np.minimum(away, np.linalg.norm(points - points[chosen[-1]], axis=1))
-        if away.max() <= 0:
+        distance = np.linalg.norm(points[:, None] - np.atleast_2d(first)[None], axis=2).min(axis=1)
+    indices: list[int] = []
+    while len(indices) < min(count, len(points)):
+        indices.append(int(np.argmax(distance)) if indices or first is not None else 0)
+        distance = np.minimum(distance, np.linalg.norm(points - points[indices[-1]], axis=1))
+        if distance.max() <= 0:
             break
-    return np.array(chosen, int)
+    return np.array(indices, int)
 
 
 # ---- Run ----
 #
-# What a report is made of: everything that is at hand of one gaze field, computed and drawn.
+# All data of one report.
 
 
 @dataclass(frozen=True)
 class ReportPicture:
-    """A PNG file, what it shows in words (``alt``) and what is said below it."""
+    """A PNG image with its alternative text (``alt``) and its caption."""
 
     png: bytes
     alt: str
@@ -456,13 +548,12 @@ class ReportPicture:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """One gaze field and what is known of it; None or empty is what is not at hand.
+    """One gaze field with all data that a report shows; missing data is None or empty.
 
-    ``gaze``, ``radiance``: metadata of its checkpoint and of the radiance field's; ``place``: what the place is, in a
-    sentence, and its ``kind`` ("field", "scene", "hits", "mesh" or "none"). ``rays`` and ``results`` have no names of
-    people but those that may be shown. ``pictures`` by what they show: "color", "gaze", "own", "sphere", "depth",
-    "spread", "plan", "layout". ``stage``: the packed 3D scene (`data.pack`). ``inputs``: role, name and SHA-256 of
-    each file.
+    ``gaze``, ``radiance``: metadata of the checkpoints; ``place`` / ``geometry_description``: one sentence about the
+    scene, and its kind ("field", "scene", "hits", "mesh" or "none"). ``rays`` and ``results`` contain only names that
+    may be shown. Keys of ``pictures``: "color", "gaze", "own", "sphere", "depth", "spread", "plan", "layout".
+    ``stage``: packed 3D view (`pack_stage`). ``inputs``: role, name and SHA-256 of each file.
     """
 
     title: str
@@ -474,62 +565,61 @@ class Run:
     rays: Rays | None = None
     summary: RaysSummary | None = None
     results: tuple[GazeResults, ...] = ()
-    # Remarks on them: of another name, of an earlier version.
+    # Warnings about the results, such as a different field name or an older version.
     warnings: tuple[str, ...] = ()
     objects: tuple[ObjectAttention, ...] = ()
-    # From how many places of people objects were looked for.
+    # Number of viewpoints over which the attention on AOIs is averaged.
     num_viewpoints: int = 0
-    # Shares of objects that fewer people could see are not shown.
+    # AOIs that fewer participants could see are hidden.
     min_participants: int = 1
-    # For each looked-from place of people, how many people were within its radius.
+    # Number of participants near each viewpoint.
     nearby_participants: tuple[int, ...] = ()
     pictures: Mapping[str, ReportPicture] = field(default_factory=dict)
     stage: str | None = None
-    # How many observers, paths and points the 3D scene has.
+    # Numbers of observers, paths, points and boxes of the 3D view.
     stage_observers: int = 0
     stage_paths: int = 0
     stage_points: int = 0
     stage_boxes: int = 0
     inputs: tuple[tuple[str, str, str], ...] = ()
     versions: Mapping[str, str] = field(default_factory=dict)
-    # What the report was made with, by the option's name.
+    # Options of the report.
     settings: Mapping[str, str] = field(default_factory=dict)
-    # Rays and people that the gaze rests on, in words, "" where that is not known.
+    # Number of samples and participants that support the gaze, as text; "" if unknown.
     support_note: str = ""
-    # Where all of this comes from (`figures.style`), as JSON.
+    # Provenance (`nerg_mi.figures.style`) as JSON.
     provenance_json: str = ""
-    # ``objects`` of the observer alone, where one was named; of people otherwise.
+    # Attention on AOIs of the chosen observer alone; empty if none was chosen.
     observed_objects: tuple[ObjectAttention, ...] = ()
 
     @property
     def provenance(self) -> Mapping[str, Any]:
-        """What the gaze field was trained on and with."""
+        """Training data and settings of the gaze field."""
         return self.gaze.get("provenance", {})
 
     @property
     def verdicts(self) -> list[tuple[GazeResults, Verdict]]:
-        """The verdict on each evaluation."""
+        """Each evaluation with its verdict."""
         return [(r, compute_verdict(r.rows, r.split, r.num_participants, r.num_positions)) for r in self.results]
 
 
-# ---- Stage ----
+# ---- 3D view ----
 #
-# The embedded 3D scene: what the page's own viewer (``viewer.js``) draws, packed into a few bytes a point.
-#
-# Positions are 16 bits an axis of the points' box, normals and colours 8 bits a component, gaze the square root of its
-# share of the observer's own scale in 8 bits.
+# Data of the page's viewer (``viewer.js``), packed into a few bytes per point: positions with 16 bits per axis of the
+# bounding box, normals and colours with 8 bits per component, and gaze as the square root of its fraction of the
+# observer's scale in 8 bits.
 
 MAX_PATH_POINTS = 16_000
-"""Positions of all people's paths together, at most."""
+"""Maximum number of points of all paths together."""
 
-# Angle above the level from which the scene is shown at first, in radians.
-_RISE = 0.85
+# Initial elevation of the camera in radians.
+_INITIAL_ELEVATION = 0.85
 _EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b) in (1, 2, 4)]
 
 
 @dataclass(frozen=True)
 class ReportCamera:
-    """From where the pictures are taken: a camera at ``origin`` that looks at ``target`` (3,)."""
+    """Camera of the report's images: ``origin`` and ``target``, (3,) each."""
 
     origin: np.ndarray
     target: np.ndarray
@@ -537,8 +627,8 @@ class ReportCamera:
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """What is drawn: the ``proxy`` of the place; ``observers`` (M, 3), of whom it has the gaze; people's ``paths``,
-    (n, 3) each; ``boxes``; ``up`` (3,); the ``camera``."""
+    """Content of the 3D view: ``proxy`` of the scene, ``observers`` (M, 3) whose gaze it holds, participants'
+    ``paths`` (n, 3) each, AOI ``boxes``, ``up`` axis (3,) and initial ``camera``."""
 
     proxy: ReportProxy
     observers: np.ndarray
@@ -549,23 +639,23 @@ class Stage:
 
 
 def pack_stage(stage: Stage) -> str:
-    """The scene as JSON that is safe within a page, its arrays in base64."""
+    """Serialise the 3D view to JSON that can be embedded in a page; arrays are base64-encoded."""
     proxy, M = stage.proxy, len(stage.observers)
-    lower, size = _frame(stage)
-    place = lambda points: _bits((np.asarray(points, np.float64).reshape(-1, 3) - lower) / size, 16)
+    lower, size = _bounding_box(stage)
+    place = lambda points: _quantize((np.asarray(points, np.float64).reshape(-1, 3) - lower) / size, 16)
     corners = [b.vertices[a] for b in stage.boxes for e in _EDGES for a in e]
     mean = proxy.gaze.mean(axis=0, keepdims=True) if M > 1 else proxy.gaze[:0]
     gaze = np.concatenate([mean, proxy.gaze, np.zeros((int(M == 0), len(proxy.vertices)))])
-    tops = np.array([_top(values) for values in gaze])
-    heat = np.sqrt(np.clip(gaze / np.where(tops > 0, tops, 1)[:, None], 0, 1))
+    scale_tops = np.array([_scale_top(values) for values in gaze])
+    heat = np.sqrt(np.clip(gaze / np.where(scale_tops > 0, scale_tops, 1)[:, None], 0, 1))
     arrays = {
         "place": place(proxy.vertices),
         "paths": place(np.concatenate([np.zeros((0, 3)), *stage.paths])),
         "boxes": place(np.array(corners)),
         "marks": place(stage.observers),
-        "normal": _bits(proxy.normals * 0.5 + 0.5, 8),
+        "normal": _quantize(proxy.normals * 0.5 + 0.5, 8),
         "color": np.ascontiguousarray(proxy.colors, np.uint8),
-        "gaze": _bits(heat, 8),
+        "gaze": _quantize(heat, 8),
         "map": _color_map(),
     }
     parts, start = {}, 0
@@ -575,55 +665,62 @@ def pack_stage(stage: Stage) -> str:
     marks = [list(range(M))] if M != 1 else []
     marks += [[k] for k in range(M)]
     ends = np.cumsum([0, *(len(p) for p in stage.paths)]).tolist()
-    about = {
+    data = {
         "count": len(proxy.vertices),
-        "lower": _rounded(lower),
-        "size": _rounded(size),
+        "lower": _round_list(lower),
+        "size": _round_list(size),
         "spacing": float(f"{proxy.spacing:.6g}"),
-        "up": _rounded(stage.up),
+        "up": _round_list(stage.up),
         "reach": float(f"{np.linalg.norm(size):.6g}"),
-        "camera": _orbit(stage),
-        "observers": [{"marks": m, "top": float(f"{top:.3g}")} for m, top in zip(marks, tops)],
+        "camera": _initial_orbit(stage),
+        "observers": [{"marks": m, "top": float(f"{top:.3g}")} for m, top in zip(marks, scale_tops)],
         "marks": M,
         "paths": [[a, b - a] for a, b in pairwise(ends)],
         "parts": parts,
         "data": base64.b64encode(b"".join(a.tobytes() for a in arrays.values())).decode(),
     }
-    return json.dumps(about, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+    return json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
 
 
-def _frame(stage: Stage) -> tuple[np.ndarray, np.ndarray]:
-    """Lower corner and edges of the box that holds everything that is drawn."""
-    every = [stage.proxy.vertices, stage.observers, *stage.paths, *(b.bounds for b in stage.boxes)]
-    points = np.concatenate([np.reshape(p, (-1, 3)) for p in every])
+def _bounding_box(stage: Stage) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lower corner and the size of the bounding box of everything that is drawn."""
+    arrays = [stage.proxy.vertices, stage.observers, *stage.paths, *(b.bounds for b in stage.boxes)]
+    points = np.concatenate([np.reshape(p, (-1, 3)) for p in arrays])
     lower = points.min(axis=0).astype(np.float64)
     return lower, np.maximum(points.max(axis=0) - lower, 1e-6)
 
 
-def _top(gaze: np.ndarray) -> float:
-    """The end of the scale of ``gaze`` (V,): what all but a few of the points that have any stay below; 0 for none."""
+def _scale_top(gaze: np.ndarray) -> float:
+    """Return the upper end of the scale of ``gaze`` (V,): the 99th percentile of its positive values, or 0."""
     positive = gaze[gaze > 0]
     return float(np.percentile(positive, 99)) if len(positive) else 0.0
 
 
-def _orbit(stage: Stage) -> dict:
-    """From where the scene is shown at first: above the middle of it, on the side of the camera. The axes beside ``up``
-    are made as in ``viewer.js``."""
+def _initial_orbit(stage: Stage) -> dict:
+    """Return the initial camera: above the centre of the scene, on the side of ``stage.camera``.
+
+    The horizontal axes are defined as in ``viewer.js``.
+    """
     up = np.asarray(stage.up, float)
     east = np.cross([0.0, 1, 0] if abs(up[1]) < 0.9 else [1.0, 0, 0], up)
     east /= np.linalg.norm(east)
-    # A few points lie far away from all others.
+    # Ignore outliers.
     low, high = np.percentile(stage.proxy.vertices.astype(np.float64), [3, 97], axis=0)
     back = np.subtract(stage.camera.origin, (low + high) / 2)
     turn = math.atan2(float(back @ np.cross(up, east)), float(back @ east))
     away = 1.05 * float(np.linalg.norm(high - low))
-    return {"turn": float(f"{turn:.6g}"), "rise": _RISE, "away": away, "target": _rounded((low + high) / 2)}
+    return {
+        "turn": float(f"{turn:.6g}"),
+        "rise": _INITIAL_ELEVATION,
+        "away": away,
+        "target": _round_list((low + high) / 2),
+    }
 
 
-def _bits(shares: np.ndarray, bits: int) -> np.ndarray:
-    """``shares`` in 0..1 as unsigned integers, little-endian."""
+def _quantize(values: np.ndarray, bits: int) -> np.ndarray:
+    """Quantise values in 0..1 to unsigned little-endian integers."""
     top = (1 << bits) - 1
-    return np.ascontiguousarray(np.round(np.clip(shares, 0, 1) * top), "<u2" if bits == 16 else "u1")
+    return np.ascontiguousarray(np.round(np.clip(values, 0, 1) * top), "<u2" if bits == 16 else "u1")
 
 
 def _color_map() -> np.ndarray:
@@ -632,5 +729,5 @@ def _color_map() -> np.ndarray:
     return np.ascontiguousarray(matplotlib.colormaps["inferno"](np.linspace(0, 1, 256))[:, :3] * 255 + 0.5, np.uint8)
 
 
-def _rounded(values: np.ndarray) -> list[float]:
+def _round_list(values: np.ndarray) -> list[float]:
     return [float(f"{v:.7g}") for v in np.asarray(values, float)]

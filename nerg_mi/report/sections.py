@@ -1,4 +1,5 @@
-"""Sections of a report, each with its title, its text and what is said where it has nothing to show, and their page."""
+"""Sections of a report: the title, the text and the reason shown in place of an empty section; and the page they
+form."""
 
 from __future__ import annotations
 
@@ -14,35 +15,39 @@ from nerg_mi import __version__
 from nerg_mi.evaluation.gaze_report import POSITION_BLIND, SPLIT_HALF, SPLIT_LABELS, Comparison, GazeResults, Verdict
 from nerg_mi.rays.quality import WARNING_LABEL, make_quality_report
 
-from .data import ObjectAttention, Run, MeanShare
-from .html import Html, Point, element, figure, image, interval_chart, markup, key_value_table, paragraph, table
+from .data import MeanShare, ObjectAttention, Run
+from .html import Html, Point, element, figure, image, interval_chart, key_value_table, markup, paragraph, table
 
-# ---- What a section of a report is ----
+# ---- Section ----
 
 
 @dataclass(frozen=True)
 class Section:
-    """``name``: of its anchor; ``title``; ``body(run)``: what it shows; ``absent(run)``: in a sentence why it is left
-    out, or None where it is shown."""
+    """One section of the page.
+
+    ``name``: anchor of the section; ``title``: heading; ``body(run)`` / ``render(run)``: content as HTML;
+    ``absent(run)`` / ``reason_absent(run)``: sentence that explains why the section is empty, or None if it has
+    content.
+    """
 
     name: str
     title: str
     render: Callable[[Run], Html]
-    absent: Callable[[Run], str | None] = lambda run: None
+    reason_absent: Callable[[Run], str | None] = lambda run: None
 
 
-# ---- The data, and their card ----
+# ---- Data quality ----
 
 
 def _show_data(run: Run) -> Html:
-    """The sanity card of the rays."""
+    """Show the data-quality report of the gaze samples."""
     assert run.rays is not None and run.summary is not None
     lines = make_quality_report(run.rays, run.summary)
     warned = any(name == WARNING_LABEL for name, _ in lines)
     words = (
-        "What is marked as implausible is the likely mistake; mend it before anything else is believed."
+        "Implausible values are marked below. Correct them before you use any other result of this report."
         if warned
-        else "Nothing in them is implausible."
+        else "The data-quality checks found no implausible values."
     )
     return markup([paragraph(words), key_value_table(lines)])
 
@@ -51,27 +56,25 @@ def _explain_absent_data(run: Run) -> str | None:
     if run.rays is not None:
         return None
     trained = run.provenance.get("rays")
-    count = f"; the field was trained on {trained:,}" if isinstance(trained, int) else ""
-    return f"The rays are not at hand, so that nothing is shown of who was recorded{count}."
+    count = f" The field was trained on {trained:,} gaze samples." if isinstance(trained, int) else ""
+    return f"No gaze samples were given, so the report has no data-quality section.{count}"
 
 
 DATA = Section("data", "The data", _show_data, _explain_absent_data)
 
 
 # ---- Gaze ----
-#
-# The gaze: pictures of it.
 
 
 def _show_gaze(run: Run) -> Html:
-    """The overview, and the observer's own view and sphere."""
+    """Show the gaze in the overview, in the observer's view and on the observer's sphere."""
     shown = lambda names: [
         figure(image(p.png, p.alt), p.caption) for p in (run.pictures.get(n) for n in names) if p is not None
     ]
     basis = f" The field is {run.support_note}." if run.support_note else ""
     words = (
-        f"{run.observer}{basis} Densities are in 1/sr: what a colour stands for, times the solid angle that "
-        "it covers for the observer, is the probability that they look there."
+        f"{run.observer}{basis} Gaze densities are in 1/sr. A density times the solid angle of a region, as seen by "
+        "the observer, is the probability that the observer looks at the region."
     )
     return markup([paragraph(words), *shown(["gaze"]), element("div", shown(["own", "sphere"]), class_="side")])
 
@@ -79,101 +82,111 @@ def _show_gaze(run: Run) -> Html:
 def _explain_absent_gaze(run: Run) -> str | None:
     if {"gaze", "own", "sphere"} & set(run.pictures):
         return None
-    return "There are no pictures of the gaze, for it is nowhere above zero around the observer."
+    return "The gaze density is zero everywhere around the observer, so there are no images of it."
 
 
 GAZE = Section("gaze", "The gaze", _show_gaze, _explain_absent_gaze)
 
 
-# ---- What none of this can tell ----
+# ---- Limits ----
 
 _LIMITS = (
-    "A head is not a gaze: eyes turn away from where a head points. A field from heads says where heads point, and "
-    "shares of small things are then too even.",
-    "Places are static: what was moved, restocked or stood in the way on other days is as it was when the place was "
-    "made.",
-    "Gaze that passes a thing on its way counts as gaze on what is behind it wherever the place's surfaces are "
-    "off, which they are by a few centimetres along edges.",
-    "Far from where people were recorded the field extrapolates.",
-    "Attention is where gaze goes, not what was seen, understood or wanted.",
-    "Shares are of these people, in this place; that a thing has more of them is no reason why.",
+    "Head direction is not gaze direction, because the eyes rotate in the head. A field trained on head directions "
+    "predicts head directions, and spreads attention too evenly over small AOIs.",
+    "The scene is static. Objects that were moved, restocked or removed on other days are shown as they were when the "
+    "scene was captured.",
+    "Surfaces are off by a few centimetres along edges. Gaze that passes close to an edge may be assigned to the "
+    "surface behind it.",
+    "The field extrapolates at positions far from the recorded ones.",
+    "Attention is the direction of gaze. It does not show what participants noticed, understood or wanted.",
+    "Attention shares describe these participants in this scene. They do not explain why an AOI attracts attention.",
 )
 
 
 def _show_limits(run: Run) -> Html:
-    """A list."""
+    """List the limits."""
     return element("ul", [element("li", text) for text in _LIMITS])
 
 
 LIMITS = Section("limits", "Limits", _show_limits)
 
 
-# ---- Named objects ----
+# ---- Areas of interest ----
 
-_DRAWN = 24
+_MAX_CHART_ROWS = 24
 
 
 def _show_objects(run: Run) -> Html:
-    """A table and a chart, the most attended first."""
+    """Show a table and a chart of the AOIs, sorted by attention share."""
     order = sorted(run.objects, key=lambda o: (-o.predicted.mean, o.name))
-    shown = [o for o in order if not _hidden(o, run.min_participants)]
+    shown = [o for o in order if not _is_hidden(o, run.min_participants)]
     recorded = any(o.recorded is not None for o in order)
-    shown_parts: list = [paragraph(_words(run, recorded))]
+    shown_parts: list = [paragraph(_objects_text(run, recorded))]
     if shown:
-        shown_parts.append(figure(_chart(shown[:_DRAWN], recorded), _caption(len(shown), recorded)))
-    head = ["object", "gaze by the field, %", *(["rays recorded, %", "could see it", "looked"] if recorded else [])]
-    rows = [_row(o, run.min_participants, recorded) for o in [*shown, *(o for o in order if _hidden(o, run.min_participants))]]
+        shown_parts.append(
+            figure(_objects_chart(shown[:_MAX_CHART_ROWS], recorded), _chart_caption(len(shown), recorded))
+        )
+    measured = ["share of samples, %", "participants with view", "participants with hits"] if recorded else []
+    head = ["AOI", "predicted share of gaze, %", *measured]
+    rows = [
+        _object_row(o, run.min_participants, recorded)
+        for o in [*shown, *(o for o in order if _is_hidden(o, run.min_participants))]
+    ]
     shown_parts.append(table(head, rows, range(1, len(head))))
     return markup(shown_parts)
 
 
-def _hidden(o: ObjectAttention, least: int) -> bool:
-    return o.num_could_see is not None and o.num_could_see < least
+def _is_hidden(o: ObjectAttention, min_participants: int) -> bool:
+    return o.num_could_see is not None and o.num_could_see < min_participants
 
 
-def _row(o: ObjectAttention, least: int, recorded: bool) -> list[str]:
-    if _hidden(o, least):
-        return [o.name, "hidden", *(["hidden", f"fewer than {least}", "hidden"] if recorded else [])]
-    cells = [o.name, _percent(o.predicted)]
+def _object_row(o: ObjectAttention, min_participants: int, recorded: bool) -> list[str]:
+    if _is_hidden(o, min_participants):
+        return [o.name, "hidden", *(["hidden", f"fewer than {min_participants}", "hidden"] if recorded else [])]
+    cells = [o.name, _format_share(o.predicted)]
     if recorded and o.recorded is not None:
-        cells += [_percent(o.recorded), f"{o.num_could_see} of {o.num_participants}", f"{o.num_looked}"]
+        cells += [_format_share(o.recorded), f"{o.num_could_see} of {o.num_participants}", f"{o.num_looked}"]
     return cells
 
 
-def _percent(share: MeanShare) -> str:
+def _format_share(share: MeanShare) -> str:
     text = f"{100 * share.mean:.2f}"
     return text if math.isnan(share.low) else f"{text} [{100 * share.low:.2f}, {100 * share.high:.2f}]"
 
 
-def _chart(objects: list[ObjectAttention], recorded: bool) -> Html:
+def _objects_chart(objects: list[ObjectAttention], recorded: bool) -> Html:
     point = lambda o, s: Point(
         o.name if len(o.name) < 28 else o.name[:26] + "…", 100 * s.mean, 100 * s.low, 100 * s.high
     )
-    panels = [("gaze by the field, %", [point(o, o.predicted) for o in objects])]
+    panels = [("predicted share of gaze, %", [point(o, o.predicted) for o in objects])]
     if recorded:
-        panels.append(("rays recorded, %", [point(o, o.recorded) for o in objects if o.recorded is not None]))
+        panels.append(("share of samples, %", [point(o, o.recorded) for o in objects if o.recorded is not None]))
     return interval_chart(panels)
 
 
-def _caption(count: int, recorded: bool) -> str:
-    some = f" The first {_DRAWN} of {count}." if count > _DRAWN else ""
-    return f"Shares of attention{', with 95 % intervals over people' if recorded else ''}.{some}"
+def _chart_caption(count: int, recorded: bool) -> str:
+    some = f" The chart shows {_MAX_CHART_ROWS} of {count} AOIs." if count > _MAX_CHART_ROWS else ""
+    return f"Attention shares{' with 95 % confidence intervals over participants' if recorded else ''}.{some}"
 
 
-def _words(run: Run, recorded: bool) -> str:
+def _objects_text(run: Run, recorded: bool) -> str:
     if not recorded:
         return (
-            f"The share of gaze that the field says an observer gives each object, at {run.num_viewpoints} "
-            f"{'place' if run.num_viewpoints == 1 else 'places'}. Without rays nothing is known of people, and there are no "
-            "intervals."
+            f"Predicted share of an observer's gaze on each AOI, averaged over {run.num_viewpoints} "
+            f"{'viewpoint' if run.num_viewpoints == 1 else 'viewpoints'}. No gaze samples were given, so there are no participants "
+            "and no confidence intervals."
         )
-    least = f" What fewer than {run.min_participants} people could see is hidden." if run.min_participants > 1 else ""
+    hidden_note = (
+        f" AOIs that fewer than {run.min_participants} participants could see are hidden."
+        if run.min_participants > 1
+        else ""
+    )
     return (
-        f"The share of gaze that the field says people give each object, at {run.num_viewpoints} places where they stood, and "
-        "the share of their rays that end at it. Each person counts alike; brackets are 95 % intervals over "
-        "people. Who could see it stood at one of these places in view of it, or looked at it. A field is smooth: "
-        "small things that many look at may have a smaller share of it than of the rays."
-        f"{least}"
+        f"Predicted share of gaze on each AOI, averaged over {run.num_viewpoints} viewpoints of the participants, and the share "
+        "of the recorded gaze samples that hit the AOI. Every participant has the same weight; brackets are 95 % "
+        "confidence intervals over participants. A participant has a view of an AOI if it is visible from one of their "
+        "viewpoints, or if one of their samples hits it. The field is smooth, so it may underestimate the share of "
+        f"small AOIs that attract many samples.{hidden_note}"
     )
 
 
@@ -181,90 +194,93 @@ def _explain_absent_objects(run: Run) -> str | None:
     if run.objects:
         return None
     if run.geometry_kind == "none":
-        return "No objects are named, for nothing is known of the place."
-    return "No objects are named: --objects FILE.json gives their boxes."
+        return "AOIs need the geometry of the scene, which was not given."
+    return "No AOIs were given. Name a file of AOIs with --aois FILE.json."
 
 
-OBJECTS = Section("objects", "Named objects", _show_objects, _explain_absent_objects)
+OBJECTS = Section("objects", "Areas of interest", _show_objects, _explain_absent_objects)
 
 
-# ---- Where people were ----
+# ---- Participants' positions ----
 
 
 def _show_people(run: Run) -> Html:
-    """Plans of the floor."""
+    """Show floor plans of the participants' positions."""
     shown = [run.pictures[name] for name in ("plan", "layout") if name in run.pictures]
     sides = [figure(image(p.png, p.alt), p.caption) for p in shown]
-    return markup([element("div", sides, class_="side"), *(paragraph(w) for w in _company(run))])
+    return markup([element("div", sides, class_="side"), *(paragraph(w) for w in _nearby_text(run))])
 
 
-def _company(run: Run) -> list[str]:
+def _nearby_text(run: Run) -> list[str]:
     if not run.nearby_participants:
         return []
     radius = (run.provenance.get("probes") or {}).get("radius")
     within = f"{radius:g} m" if isinstance(radius, (int, float)) else "half a metre"
-    alone, middle = sum(n <= 1 for n in run.nearby_participants), sorted(run.nearby_participants)[len(run.nearby_participants) // 2]
-    words = f"At the {len(run.nearby_participants)} places that were looked from, the median number of people within {within} is"
+    alone, middle = (
+        sum(n <= 1 for n in run.nearby_participants),
+        sorted(run.nearby_participants)[len(run.nearby_participants) // 2],
+    )
+    words = f"The median number of participants within {within} of a viewpoint ({len(run.nearby_participants)} viewpoints) is"
     if not alone:
-        return [f"{words} {middle}, and nowhere fewer than two."]
+        return [f"{words} {middle}; no viewpoint has fewer than two."]
     return [
-        f"{words} {middle}; at {alone} of them there was only one person. What a field says of a place where one "
-        "person stood is what one person did."
+        f"{words} {middle}; {alone} viewpoints have only one. Near such a viewpoint the field reproduces the gaze of a "
+        "single participant."
     ]
 
 
 def _explain_absent_people(run: Run) -> str | None:
-    return None if run.rays is not None else "The rays are not at hand, so that it is not known where people were."
+    return None if run.rays is not None else "No gaze samples were given, so the participants' positions are unknown."
 
 
-PEOPLE = Section("people", "Where people were", _show_people, _explain_absent_people)
+PEOPLE = Section("people", "Participants' positions", _show_people, _explain_absent_people)
 
 
-# ---- The place ----
+# ---- Scene ----
 
 
 def _show_place(run: Run) -> Html:
-    """What it is and what it looks like."""
-    shown = [paragraph(run.geometry_description), key_value_table(_facts(run))]
+    """Describe and show the scene."""
+    shown = [paragraph(run.geometry_description), key_value_table(_scene_facts(run))]
     picture = run.pictures.get("color")
     if picture is not None:
         shown.append(figure(image(picture.png, picture.alt), picture.caption))
     return markup(shown)
 
 
-def _facts(run: Run) -> list[tuple[str, str]]:
-    about, facts = run.radiance.get("provenance", {}), []
+def _scene_facts(run: Run) -> list[tuple[str, str]]:
+    provenance, facts = run.radiance.get("provenance", {}), []
     box = run.radiance.get("box") or run.gaze.get("box") or {}
     if "lower" in box and "upper" in box:
         edges = [b - a for a, b in zip(box["lower"], box["upper"])]
-        facts.append(("box", " × ".join(f"{e:.2f}" for e in edges) + " scene units (metres, as a rule)"))
-    if "training_frames" in about:
-        facts.append(("photos", f"{about['training_frames']} that it was trained on"))
-    held = about.get("psnr_held_out")
+        facts.append(("box", " × ".join(f"{e:.2f}" for e in edges) + " scene units (usually metres)"))
+    if "training_frames" in provenance:
+        facts.append(("training photos", f"{provenance['training_frames']}"))
+    held = provenance.get("psnr_held_out")
     if isinstance(held, dict) and held.get("mean") is not None:
-        facts.append(("likeness", f"{held['mean']:.1f} dB PSNR on {len(held.get('views', ()))} photos held out"))
+        facts.append(("image quality", f"{held['mean']:.1f} dB PSNR on {len(held.get('views', ()))} held-out photos"))
     shape = (run.provenance.get("geometry_file") or {}).get("shape")
     if shape:
-        facts.append(("hit points", " × ".join(map(str, shape)) + " voxels made of what people looked at"))
+        facts.append(("hit points", " × ".join(map(str, shape)) + " voxels of the gaze hit points"))
     return facts
 
 
-PLACE = Section("place", "The place", _show_place)
+PLACE = Section("place", "Scene", _show_place)
 
 
-# ---- What all of this was made of, and by what ----
+# ---- Provenance ----
 
 
 def _show_provenance(run: Run) -> Html:
-    """Files with their checksums, and versions of programs."""
+    """Show the input files with their checksums, and the software versions."""
     shown = [
         table(["", "file", "SHA-256"], [[role, name, element("code", digest)] for role, name, digest in run.inputs])
     ]
     shown.append(key_value_table(list(run.versions.items())))
     shown.append(
         paragraph(
-            "Equal files, settings and versions make an equal report, to the byte. It holds everything that it shows "
-            "and asks no network for anything.",
+            "The report is reproducible: the same files, settings and versions give the same bytes. The page is "
+            "self-contained and makes no network requests.",
             kind="note",
         )
     )
@@ -274,160 +290,180 @@ def _show_provenance(run: Run) -> Html:
 PROVENANCE = Section("provenance", "Provenance", _show_provenance)
 
 
-# ---- The evaluation beside its baselines ----
+# ---- Evaluation ----
 
 COLUMNS = {"bits": "log score, bits", "CC": "CC", "KLD": "KLD, nats", "NSS": "NSS", "AUC": "AUC"}
-"""The scores that are shown, and their names."""
+"""Column headers of the scores, by key."""
 
 _PANELS = ("bits", "CC", "KLD")
 
 
 def _show_scores(run: Run) -> Html:
-    """A part for each split."""
+    """Show the scores of each split."""
     parts = [
         paragraph(
-            "Truth at a place is the density of the rays of people who stood there. The log score is how many bits "
-            "better a ray is told than by the position-blind density, higher is better, as are CC, NSS and AUC; of "
-            "KLD less is better. Intervals are of 95 %, over people. The split half, half of the people as told by "
-            "the other half, is a reference and no bound.",
+            "The ground truth at a position is the density of the gaze samples recorded there. The log score is the "
+            "gain in bits per sample over the position-independent baseline. Higher values of the log score, CC, NSS "
+            "and AUC are better; lower values of KLD are better. Intervals are 95 % confidence intervals over "
+            "participants. The split-half score predicts one half of the participants from the other half; it is a "
+            "reference, not an upper bound.",
             kind="note",
         )
     ]
     for results, verdict in run.verdicts:
-        parts += [element("h3", _title(results)), *_split(results, verdict)]
+        parts += [element("h3", _split_title(results)), *_render_split(results, verdict)]
     return markup(parts)
 
 
-def _title(found: GazeResults) -> str:
-    words = SPLIT_LABELS.get(found.split, found.split)
-    return f"{words[:1].upper()}{words[1:]} ({found.num_participants} people, {found.num_positions} places)"
-
-
-def _split(found: GazeResults, verdict: Verdict) -> list[Html]:
-    shown = [element("div", verdict.sentence, class_=f"verdict {verdict.grade}")]
-    panels = [(COLUMNS[s], [_point(r, s, i == 0) for i, r in enumerate(found.rows)]) for s in _PANELS]
-    shown.append(
-        figure(interval_chart(panels), "The field (blue) beside what needs none, with 95 % intervals over people.")
+def _split_title(results: GazeResults) -> str:
+    words = SPLIT_LABELS.get(results.split, results.split)
+    return (
+        f"{words[:1].upper()}{words[1:]} ({results.num_participants} participants, {results.num_positions} positions)"
     )
-    there = [c for c in COLUMNS if any(_known(r.get(c)) for r in found.rows)]
-    rows = [[str(r["method"]), *(_cell(r, c) for c in there)] for r in found.rows]
-    shown.append(table(["", *(COLUMNS[c] for c in there)], rows, range(1, 1 + len(there))))
+
+
+def _render_split(results: GazeResults, verdict: Verdict) -> list[Html]:
+    shown = [element("div", verdict.sentence, class_=f"verdict {verdict.grade}")]
+    panels = [(COLUMNS[s], [_score_point(r, s, i == 0) for i, r in enumerate(results.rows)]) for s in _PANELS]
+    shown.append(
+        figure(
+            interval_chart(panels),
+            "The field (blue) and the baselines, with 95 % confidence intervals over participants.",
+        )
+    )
+    columns = [c for c in COLUMNS if any(_is_finite(r.get(c)) for r in results.rows)]
+    rows = [[str(r["method"]), *(_format_score(r, c) for c in columns)] for r in results.rows]
+    shown.append(table(["", *(COLUMNS[c] for c in columns)], rows, range(1, 1 + len(columns))))
     if verdict.comparisons:
-        leads = table(
-            ["the field beside", *(f"lead in {COLUMNS[s]}" for s in _PANELS), "so it is"],
-            [_lead(c) for c in verdict.comparisons],
+        comparison_table = table(
+            ["baseline", *(f"gain in {COLUMNS[s]}" for s in _PANELS), "outcome"],
+            [_comparison_row(c) for c in verdict.comparisons],
             range(1, 1 + len(_PANELS)),
         )
-        note = "Leads are positive where the field is better; their intervals are made wider for few people."
-        shown += [leads, paragraph(note, kind="note")]
-    if found.participant_rows:
-        shown.append(_persons(found))
+        note = (
+            "A positive gain means that the field is better. Intervals are widened for small numbers of participants."
+        )
+        shown += [comparison_table, paragraph(note, kind="note")]
+    if results.participant_rows:
+        shown.append(_participants_table(results))
     return shown
 
 
-def _persons(found: GazeResults) -> Html:
+def _participants_table(results: GazeResults) -> Html:
     rows = [
-        [str(r["method"]), str(r.get("person", "")), f"{r.get('rays') or 0:,}", *(_number(r.get(s)) for s in _PANELS)]
-        for r in found.participant_rows
+        [
+            str(r["method"]),
+            str(r.get("person", "")),
+            f"{r.get('rays') or 0:,}",
+            *(_format_number(r.get(s)) for s in _PANELS),
+        ]
+        for r in results.participant_rows
     ]
-    head = ["", "person", "rays", *(COLUMNS[s] for s in _PANELS)]
+    head = ["", "participant", "samples", *(COLUMNS[s] for s in _PANELS)]
     if len(rows) > 60:
-        rows, head[1] = rows[:60], "person (the first 60 rows)"
-    return element("details", element("summary", "Person by person"), table(head, rows, range(2, len(head))))
+        rows, head[1] = rows[:60], "participant (first 60 rows)"
+    return element("details", element("summary", "Scores by participant"), table(head, rows, range(2, len(head))))
 
 
-def _point(row: Mapping[str, Any], score: str, own: bool) -> Point:
-    value = lambda key: float(row[key]) if _known(row.get(key)) else math.nan
-    return Point(str(row["method"]), value(score), value(f"{score}.low"), value(f"{score}.high"), own)
+def _score_point(row: Mapping[str, Any], score: str, is_highlighted: bool) -> Point:
+    value = lambda key: float(row[key]) if _is_finite(row.get(key)) else math.nan
+    return Point(str(row["method"]), value(score), value(f"{score}.low"), value(f"{score}.high"), is_highlighted)
 
 
-def _lead(found: Comparison) -> list[str]:
+def _comparison_row(comparison: Comparison) -> list[str]:
     cells = [
         f"{lead.value:+.3f}" + ("" if math.isnan(lead.low) else f" [{lead.low:+.3f}, {lead.high:+.3f}]")
-        for lead in found.differences
+        for lead in comparison.differences
     ]
-    return [found.reference, *cells, found.outcome]
+    return [comparison.reference, *cells, comparison.outcome]
 
 
-def _cell(row: Mapping[str, Any], column: str) -> str:
-    text = _number(row.get(column))
-    if text and _known(row.get(f"{column}.low")) and _known(row.get(f"{column}.high")) and row["method"] != SPLIT_HALF:
+def _format_score(row: Mapping[str, Any], column: str) -> str:
+    text = _format_number(row.get(column))
+    if (
+        text
+        and _is_finite(row.get(f"{column}.low"))
+        and _is_finite(row.get(f"{column}.high"))
+        and row["method"] != SPLIT_HALF
+    ):
         text += f" [{row[f'{column}.low']:.3f}, {row[f'{column}.high']:.3f}]"
     return text
 
 
-def _number(value: object) -> str:
-    return f"{value:.3f}" if _known(value) else ""
+def _format_number(value: object) -> str:
+    return f"{value:.3f}" if _is_finite(value) else ""
 
 
-def _known(value: Any) -> bool:
+def _is_finite(value: Any) -> bool:
     return isinstance(value, (int, float)) and math.isfinite(value)
 
 
 def _explain_absent_scores(run: Run) -> str | None:
     if run.results:
         return None
-    return "No evaluation is at hand: give the folder that nerg eval gaze wrote, or the rays with --evaluate."
+    return "No evaluation was given. Name the output folder of nerg eval gaze, or give gaze samples and --evaluate."
 
 
 SCORES = Section("scores", "Evaluation", _show_scores, _explain_absent_scores)
 
 
-# ---- What the field was trained with, and what the report was made with ----
+# ---- Settings ----
 
-_ABOUT = {
+_PROVENANCE_LABELS = {
     "recipe": "recipe",
     "steps": "steps",
     "seconds": "seconds",
-    "rays": "rays trained on",
+    "rays": "training samples",
     "probes_made": "probes",
-    "escaped_directions": "share of directions that meet no surface",
-    "escaped_gaze": "share of gaze that meets none",
-    "made": "made",
+    "escaped_directions": "share of directions without a surface",
+    "escaped_gaze": "share of gaze without a surface",
+    "made": "created",
 }
-"""Entries of the provenance that are numbers or words, and their names."""
+"""Labels of the scalar provenance entries, by key."""
 
 
 def _show_settings(run: Run) -> Html:
-    """Tables of settings. What names people, such as who was held out, is counted and not shown."""
-    about = run.provenance
-    facts = [(words, _shown(about[key])) for key, words in _ABOUT.items() if key in about]
-    test = about.get("test")
+    """Show tables of settings. Participant names, such as those held out, are replaced by their number."""
+    provenance = run.provenance
+    facts = [
+        (words, _format_setting(provenance[key])) for key, words in _PROVENANCE_LABELS.items() if key in provenance
+    ]
+    test = provenance.get("test")
     if isinstance(test, dict):
-        facts.append(("held out", _held_out(test)))
+        facts.append(("held out", _describe_held_out(test)))
     shown = [element("h3", "Training"), key_value_table(facts)]
-    for key, title in (("settings", "Its settings"), ("probes", "Its probes")):
-        rows = _flat(about.get(key, {}))
+    for key, title in (("settings", "Training settings"), ("probes", "Probes")):
+        rows = _flatten_settings(provenance.get(key, {}))
         if rows:
             shown.append(element("details", element("summary", title), key_value_table(rows)))
-    architecture = _flat(run.gaze.get("architecture", {}))
+    architecture = _flatten_settings(run.gaze.get("architecture", {}))
     if architecture:
-        shown.append(element("details", element("summary", "Its field"), key_value_table(architecture)))
+        shown.append(element("details", element("summary", "Field architecture"), key_value_table(architecture)))
     if run.settings:
         shown += [element("h3", "This report"), key_value_table(list(run.settings.items()))]
     return markup(shown)
 
 
-def _held_out(test: Mapping[str, Any]) -> str:
+def _describe_held_out(test: Mapping[str, Any]) -> str:
     parts = [f"{len(test.get('centres', ()))} positions"]
     if test.get("people"):
-        parts.append(f"{len(test['people'])} people")
+        parts.append(f"{len(test['people'])} participants")
     if isinstance(test.get("purged_within"), (int, float)):
-        parts.append(f"and every ray within {test['purged_within']:g} m of these positions")
+        parts.append(f"and all samples within {test['purged_within']:g} m of these positions")
     return ", ".join(parts)
 
 
-def _flat(found: object, prefix: str = "") -> list[tuple[str, str]]:
-    """Numbers, words and flags of ``found``, those of its parts by "part.name"; lists are counted where they are
-    long."""
+def _flatten_settings(settings: object, prefix: str = "") -> list[tuple[str, str]]:
+    """Flatten nested settings into ``(name, text)`` rows; nested names are joined by dots, long lists become their
+    length."""
     rows = []
-    for key, value in found.items() if isinstance(found, dict) else ():
+    for key, value in settings.items() if isinstance(settings, dict) else ():
         name = f"{prefix}{key}"
-        rows += _flat(value, f"{name}.") if isinstance(value, dict) else [(name, _shown(value))]
+        rows += _flatten_settings(value, f"{name}.") if isinstance(value, dict) else [(name, _format_setting(value))]
     return rows
 
 
-def _shown(value: object) -> str:
+def _format_setting(value: object) -> str:
     if isinstance(value, bool) or value is None:
         return {True: "yes", False: "no", None: "none"}[value]
     if isinstance(value, int):
@@ -443,81 +479,87 @@ def _shown(value: object) -> str:
 SETTINGS = Section("settings", "Settings", _show_settings)
 
 
-# ---- The place in 3D ----
+# ---- 3D view ----
 
 
 def _show_stage(run: Run) -> Html:
-    """The viewer with its data, and the picture that stands for it without scripts and without WebGL. On paper all of
-    it is left out, for the picture is in the section before."""
+    """Show the 3D viewer with its data, and a fallback image for browsers without scripts or WebGL.
+
+    The viewer is hidden in print, where the gaze section shows the same image.
+    """
     assert run.stage is not None
     still = run.pictures.get("gaze") or run.pictures.get("color")
     picture = None if still is None else image(still.png, still.alt, "still")
-    everyone = [f"the mean of all {run.stage_observers}"] if run.stage_observers != 1 else []
-    names = [*everyone, *(f"observer {k + 1}" for k in range(run.stage_observers))]
+    mean_option = [f"mean of all {run.stage_observers} observers"] if run.stage_observers != 1 else []
+    names = [*mean_option, *(f"observer {k + 1}" for k in range(run.stage_observers))]
     choices = [element("option", name, value=k) for k, name in enumerate(names)]
-    kinds = [("gaze", "gaze"), ("paths", "people's paths"), ("boxes", "named objects")]
-    there = {"gaze": run.stage_observers, "paths": run.stage_paths, "boxes": run.stage_boxes}
+    kinds = [("gaze", "gaze"), ("paths", "participants' paths"), ("boxes", "AOIs")]
+    counts = {"gaze": run.stage_observers, "paths": run.stage_paths, "boxes": run.stage_boxes}
     switches = [
         element("label", element("input", type="checkbox", name=name, checked=True), " ", words)
         for name, words in kinds
-        if there[name] or name == "gaze"
+        if counts[name] or name == "gaze"
     ]
     controls = element(
         "div",
         element("label", "Gaze of ", element("select", choices)),
         element("output"),
         switches,
-        element("button", "Back to the start", type="button"),
+        element("button", "Reset view", type="button"),
         class_="controls",
     )
-    canvas = element("canvas", aria_label="The place in 3D with the gaze of observers", role="img")
+    canvas = element("canvas", aria_label="3D view of the scene with the observers' gaze", role="img")
     data = element("script", Html(run.stage), type="application/json", id="stage-data")
     words = (
-        f"{run.stage_points:,} points of surfaces as they were seen from where people can stand. Drag to turn, "
-        "shift and drag to move, the wheel comes closer; backs of surfaces are left out, so that one looks into "
-        "rooms from outside. Blue marks are observers. Where scripts or WebGL are off, a picture stands for it."
+        f"{run.stage_points:,} surface points, sampled from panoramas at viewpoints. Drag to rotate, Shift-drag to "
+        "pan, and use the wheel to zoom. Back faces are hidden, so that rooms can be seen from outside. Blue marks are "
+        "observers. Browsers without scripts or WebGL show an image instead."
         f"{f' The gaze is {run.support_note}.' if run.support_note else ''}"
     )
     return markup([paragraph(words), element("div", controls, canvas, picture, data)])
 
 
 def _explain_absent_stage(run: Run) -> str | None:
-    return None if run.stage is not None else "There is no 3D scene, for nothing is known of the place's surfaces."
+    return None if run.stage is not None else "The 3D view needs the geometry of the scene, which was not given."
 
 
-STAGE = Section("stage", "In 3D", _show_stage, _explain_absent_stage)
+STAGE = Section("stage", "3D view", _show_stage, _explain_absent_stage)
 
 
-# ---- What is uncertain, and how that is known ----
+# ---- Uncertainty ----
 
 
 def _show_uncertainty(run: Run) -> Html:
-    """Of the scores, of the field, and of single places."""
+    """Explain the uncertainty of the scores and of the field."""
     members = len(run.gaze.get("architecture", {}).get("members", ()))
     shown = [
         paragraph(
-            "Which people came is what is most uncertain: intervals of scores and shares are over people, of whom "
-            "each is taken whole. They say nothing of other places, other days or other crowds."
+            "Confidence intervals of scores and shares treat the participant as the sampling unit. They do not cover "
+            "other scenes, other days or other populations."
         )
     ]
     spread = run.pictures.get("spread")
     if spread is not None:
-        shown.append(paragraph(f"The field is the mean of {members} fields, each trained on a resample of the people."))
+        shown.append(
+            paragraph(
+                f"The field is the mean of {members} members, each trained on a bootstrap resample of the participants."
+            )
+        )
         shown.append(figure(image(spread.png, spread.alt), spread.caption))
     else:
         shown.append(
             paragraph(
-                "This is a single field, which says nothing of its own uncertainty; nerg train gaze --ensemble 5 "
-                "trains one that does."
+                "A single field does not report its own uncertainty. Train an ensemble (nerg train gaze --ensemble 5) "
+                "to estimate it."
             )
         )
     validation = run.provenance.get("validation")
     if isinstance(validation, dict) and {"cc", "kld", "zones", "probes"} <= set(validation):
         shown.append(
             paragraph(
-                f"While it was trained, {validation['probes']} probes in {validation['zones']} zones were watched: "
-                f"CC {validation['cc']:.3f}, KLD {validation['kld']:.3f}. The length of the training was chosen by "
-                "them, so that they are no test."
+                f"Early stopping used {validation['probes']} validation probes in {validation['zones']} zones: "
+                f"CC {validation['cc']:.3f}, KLD {validation['kld']:.3f}. These are not test scores, because the number "
+                "of training steps was selected on them."
             )
         )
     return markup(shown)
@@ -526,29 +568,31 @@ def _show_uncertainty(run: Run) -> Html:
 UNCERTAINTY = Section("uncertainty", "Uncertainty", _show_uncertainty)
 
 
-# ---- The verdict, before all else ----
+# ---- Verdict ----
 
 
 def _show_verdict(run: Run) -> Html:
-    """A sentence for each evaluation, and what it rests on."""
+    """Show the verdict on each evaluation and the rule behind it."""
     shown = [element("div", verdict.sentence, class_=f"verdict {verdict.grade}") for _, verdict in run.verdicts]
     results = run.results[0]
     basis = (
-        f"By {results.num_participants} people at {results.num_positions} places that were kept from the training. What decides is "
-        "whether the 95 % interval over people of the lead in log score, CC and KLD leaves out zero; two of three must "
-        f"agree and none may object. {POSITION_BLIND.capitalize()} is where people look wherever they stand. The strongest "
-        "baseline is the one with the highest log score."
+        f"Evaluated on {results.num_participants} held-out participants at {results.num_positions} held-out positions. A gain counts "
+        "if its 95 % confidence interval over participants excludes zero. The verdict needs a gain in two of the three "
+        f"scores (log score, CC, KLD) and a loss in none. {POSITION_BLIND.capitalize()} is a baseline that ignores the "
+        "observer's position. The strongest baseline is the one with the highest log score."
     )
     half = next((v.split_half_fraction for _, v in run.verdicts if v.split_half_fraction is not None), None)
-    way = (
+    half_note = (
         ""
         if half is None
         else (
-            f" Of the way in CC from position-blind to what half of these people say of the other half, the field goes "
-            f"{100 * half:.0f} %{'' if half <= 1 else ': further, for half of so few people tell little'}."
+            f" The field covers {100 * half:.0f} % of the difference in CC between the position-independent baseline and "
+            f"the split-half score{'' if half <= 1 else ', which is low because each half has few participants'}."
         )
     )
-    return markup([*shown, paragraph(basis, way, kind="note"), *(paragraph(d, kind="note") for d in run.warnings)])
+    return markup(
+        [*shown, paragraph(basis, half_note, kind="note"), *(paragraph(d, kind="note") for d in run.warnings)]
+    )
 
 
 def _explain_absent_verdict(run: Run) -> str | None:
@@ -556,20 +600,21 @@ def _explain_absent_verdict(run: Run) -> str | None:
         return None
     held_out = "test" in run.provenance
     remedy = (
-        "nerg eval gaze scores it" if held_out else "a training with --test-zones and --test-people keeps some back"
+        "Score the field with nerg eval gaze"
+        if held_out
+        else "Train with --test-zones and --test-participants to hold out test data"
     )
     return (
-        "There is no verdict, for no evaluation is at hand: nothing is said here of how well the field predicts; "
-        f"{remedy}."
+        f"No evaluation was given, so this report does not state how well the field predicts held-out data. {remedy}."
     )
 
 
 VERDICT = Section("verdict", "Verdict", _show_verdict, _explain_absent_verdict)
 
 
-# ---- The sections, in the order in which they are shown ----
+# ---- Order of the sections ----
 #
-# Another one is defined beside these and named here.
+# Define a new section above and add it here.
 
 SECTIONS: tuple[Section, ...] = (
     VERDICT,
@@ -589,19 +634,19 @@ SECTIONS: tuple[Section, ...] = (
 
 # ---- Page ----
 #
-# The page: its sections in order, what they need to be shown, and a policy by which it loads nothing.
+# The page holds its styles and scripts. Its content security policy forbids loading anything else.
 
 
 def render_page(run: Run) -> str:
-    """The whole document. Equal runs give equal text."""
-    style, script = (_part(name) for name in ("style.css", "viewer.js"))
+    """Return the HTML document of ``run``; equal runs give equal text."""
+    style, script = (_read_asset(name) for name in ("style.css", "viewer.js"))
     scripts = [script] if run.stage is not None else []
     policy = "; ".join(
         [
             "default-src 'none'",
             "img-src data:",
-            f"style-src {_hash(style)}",
-            f"script-src {' '.join(map(_hash, scripts)) or chr(39) + 'none' + chr(39)}",
+            f"style-src {_csp_hash(style)}",
+            f"script-src {' '.join(map(_csp_hash, scripts)) or chr(39) + 'none' + chr(39)}",
             "base-uri 'none'",
             "form-action 'none'",
         ]
@@ -618,24 +663,24 @@ def render_page(run: Run) -> str:
     ]
     links = [element("a", s.title, href=f"#{s.name}") for s in SECTIONS]
     body = [
-        element("header", element("h1", run.title), paragraph("Where people look, as a field: a report.", kind="lead")),
+        element("header", element("h1", run.title), paragraph("Report on a gaze field", kind="lead")),
         element("nav", links),
-        *(_section(s, run) for s in SECTIONS),
+        *(_render_section(s, run) for s in SECTIONS),
         *(element("script", Html(text)) for text in scripts),
     ]
     document = [element("head", head), "\n", element("body", element("main", body))]
     return "<!DOCTYPE html>\n" + element("html", markup(document), lang="en") + "\n"
 
 
-def _section(section, run: Run) -> Html:
-    absent = section.absent(run)
+def _render_section(section, run: Run) -> Html:
+    absent = section.reason_absent(run)
     body = paragraph(absent, kind="absent") if absent else section.render(run)
     return element("section", element("h2", section.title), body, id=section.name)
 
 
-def _part(name: str) -> str:
+def _read_asset(name: str) -> str:
     return files("nerg_mi.report").joinpath(name).read_text(encoding="utf-8")
 
 
-def _hash(text: str) -> str:
+def _csp_hash(text: str) -> str:
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"

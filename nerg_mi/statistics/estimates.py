@@ -1,4 +1,4 @@
-"""Estimates with intervals of 95 %: of ratios by people drawn at random, of shares of people, and their differences."""
+"""Estimates with 95 % confidence intervals over participants: ratios, proportions, and their differences."""
 
 from __future__ import annotations
 
@@ -7,14 +7,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-# ---- Numbers with their 95 % intervals, their differences, and which of many differences are found ----
+# ---- Estimates and differences ----
 
-MIN_PARTICIPANTS = 3  # fewer people than these, or than these who add anything to a number, give no interval
+MIN_PARTICIPANTS = (
+    3  # minimum number of participants, and of participants with non-zero values, for a confidence interval
+)
 
 
 @dataclass(frozen=True)
 class Estimates:
-    """K numbers with their intervals, NaN where there are none; ``people`` (K,): whom each concerns."""
+    """K estimates with the limits of their confidence intervals, NaN if there is none, and the number of
+    participants of each."""
 
     value: np.ndarray
     low: np.ndarray
@@ -24,7 +27,7 @@ class Estimates:
 
 @dataclass(frozen=True)
 class Differences:
-    """K differences with their intervals, and ``p``: how probable one so large is where there is none (two-sided)."""
+    """K differences with the limits of their confidence intervals and two-sided p-values."""
 
     value: np.ndarray
     low: np.ndarray
@@ -33,8 +36,8 @@ class Differences:
 
 
 def adjust_p_values(p: np.ndarray) -> np.ndarray:
-    """p-values (K,) adjusted by the procedure of Benjamini and Hochberg (1995): the least false discovery rate at which
-    each is rejected; NaN stays NaN and counts for nothing."""
+    """Adjust p-values (K,) for the false discovery rate by the procedure of Benjamini and Hochberg (1995); NaN
+    values are ignored and stay NaN."""
     from scipy.stats import false_discovery_control
 
     out = np.array(p, float)
@@ -43,198 +46,240 @@ def adjust_p_values(p: np.ndarray) -> np.ndarray:
     return out
 
 
-# ---- Intervals ----
+# ---- Ratios ----
 #
-# Intervals of 95 % that take people for what was drawn at random, not rays; shares of people have their own
-# (`proportions`).
+# 95 % confidence intervals that treat participants, not gaze samples, as the sampling unit. Proportions of participants
+# have their own intervals (`estimate_proportions`).
 #
-# Each number is a ratio of sums over people, m = Σ x_p / Σ y_p: a mean where y_p is 1, or 1 for those whom it concerns.
-# Its standard error s is the jackknife's, which leaves out one person at a time (Tukey 1958; of clusters the most
-# reliable one for few, MacKinnon, Nielsen and Webb 2023); of a mean it is the usual one. The interval is m ± c s, with
-# c of the symmetric bootstrap-t over people (Hall 1988): people are drawn with replacement, t* = |m* - m| / s*, and c
-# is the 95 % quantile of t*. For few people it errs by less than the one with two tails of 2.5 % each, and a p-value
-# comes of the same: how often t* is at least that of the data. s* is that of the linearised residuals x_p - m* y_p
-# (Cochran 1977, section 6.4), drawn towards that of the data, s*² <- (1 - λ) s*² + λ s² (as the constant of Tusher et
-# al. 2001): some draws of few people have hardly any spread, and would make it endless.
+# Each estimate is a ratio of sums over participants, m = Σ x_p / Σ y_p. With y_p = 1 it is a mean; with y_p in {0, 1}
+# it is a mean over a subset. Its standard error s is the jackknife's, which leaves out one participant at a time (Tukey
+# 1958; the most reliable one for few clusters according to MacKinnon, Nielsen and Webb 2023); for a mean it equals the
+# usual standard error. The interval is m ± c s, with c from the symmetric bootstrap-t over participants (Hall 1988):
+# participants are drawn with replacement, t* = |m* - m| / s*, and c is the 95 % quantile of t*. For few participants it
+# is more accurate than an interval with two tails of 2.5 % each. The p-value uses the same draws: it is the fraction of
+# t* that are at least the t of the data. s* is the standard error of the linearised residuals x_p - m* y_p (Cochran
+# 1977, section 6.4), shrunk towards that of the data, s*² <- (1 - λ) s*² + λ s², similar to the constant of Tusher et
+# al. (2001). Without shrinkage, draws with hardly any spread would make the interval arbitrarily wide for few
+# participants.
 #
-# A number to which fewer than three people add anything has no interval, and no difference from it has one, but that of
-# the same people from 0, to which none of them adds. Where a number concerns at most half of the people, and they weigh
-# differently (y_p), as in the mean distance to what few look at, one or two of them may decide it: c is then at least
-# that of Student's t of n - 1 degrees of freedom, n = (Σ j²)² / Σ j⁴ the effective number of people (Kish 1965, section
-# 8.2) of what each one adds to the jackknife's error, j_p.
+# An estimate with fewer than three non-zero contributions has no interval. A difference from such an estimate has none
+# either, except that a difference from zero over the same participants is allowed if none of them contributes to one of
+# the estimates. If an estimate concerns at most half of the participants with unequal weights y_p, such as the mean
+# distance to a rarely visited AOI, one or two participants may dominate it. In this case c is at least the quantile of
+# Student's t with n - 1 degrees of freedom, where n = (Σ j²)² / Σ j⁴ is the effective number of participants (Kish
+# 1965, section 8.2) for their jackknife contributions j_p.
 
 RESAMPLES = 1999  # draws of participants
-TOWARDS = 0.01  # λ
-_HELD = 0.95
-_BLOCK = 1 << 22
+SHRINKAGE = 0.01  # shrinkage λ of the bootstrap's standard error
+_CONFIDENCE = 0.95
+_MAX_DRAWS = 1 << 22
 Pair = tuple[np.ndarray, np.ndarray]
 
 
 def estimate_ratios(
     x: np.ndarray, y: np.ndarray, *, resamples: int = RESAMPLES, seed: int = 0, upper_limit: float = np.inf
 ) -> Estimates:
-    """Σ x / Σ y over P people of K numbers, (P, K) each, y >= 0; ``most``: no interval goes beyond it, or below 0."""
-    value, residual, people = _linear(x, y)
-    apart = _left_out(x, y, value, people)
-    linear, error = _spread(residual, people), _spread(apart, people)
-    few = (people <= len(x) / 2) & (np.where(y > 0, y, np.inf).min(axis=0, initial=np.inf) < y.max(axis=0, initial=0))
-    least = np.where(few, _student(apart), 0.0)
-    more = _more(people)
+    """Estimate Σ x / Σ y over P participants for K quantities.
+
+    Parameters
+    ----------
+    x, y
+        Numerators and denominators, (P, K) each, with y >= 0.
+    resamples
+        Number of bootstrap draws.
+    seed
+        Seed of the draws.
+    upper_limit
+        Intervals are clipped to the range from 0 to this value.
+    """
+    value, residual, num_participants = _linearize(x, y)
+    jackknife = _jackknife(x, y, value, num_participants)
+    linear_error, error = _standard_error(residual, num_participants), _standard_error(jackknife, num_participants)
+    needs_student = (num_participants <= len(x) / 2) & (
+        np.where(y > 0, y, np.inf).min(axis=0, initial=np.inf) < y.max(axis=0, initial=0)
+    )
+    min_quantile = np.where(needs_student, _student_quantile(jackknife), 0.0)
+    factor = _bessel_factor(num_participants)
     t = np.full((resamples, x.shape[1]), np.nan)
     with np.errstate(divide="ignore", invalid="ignore"):
-        for part, w in _blocks(len(x), resamples, seed, np.zeros(len(x), int)):
-            m, square = _moments(w, x, y)
-            t[part] = _studentised(m - value, square * more, linear)
-    c = np.where((x != 0).sum(axis=0) >= MIN_PARTICIPANTS, np.maximum(_quantile(t, error), least), np.nan)
+        for part, w in _iter_draws(len(x), resamples, seed, np.zeros(len(x), int)):
+            m, variance = _weighted_moments(w, x, y)
+            t[part] = _studentize(m - value, variance * factor, linear_error)
+    c = np.where(
+        (x != 0).sum(axis=0) >= MIN_PARTICIPANTS, np.maximum(_bootstrap_quantile(t, error), min_quantile), np.nan
+    )
     low, high = value - c * error, value + c * error
-    return Estimates(value, np.clip(low, 0.0, upper_limit), np.clip(high, 0.0, upper_limit), people)
+    return Estimates(value, np.clip(low, 0.0, upper_limit), np.clip(high, 0.0, upper_limit), num_participants)
 
 
 def estimate_ratio_differences(first: Pair, second: Pair, *, resamples: int = RESAMPLES, seed: int = 0) -> Differences:
-    """Σ x / Σ y of the ``second`` less that of the ``first``, each of arrays (P, K) over the same list of P people,
-    with y = 0 for those who are not of it: people who are of both are drawn together."""
+    """Estimate differences of ratios, Σ x / Σ y of ``second`` minus that of ``first``.
+
+    Both are pairs of arrays (P, K) over the same P participants, with y = 0 for participants without data. Participants
+    with data in both are drawn together.
+    """
     (x, y), (u, v) = first, second
-    (a, ra, na), (b, rb, nb) = _linear(x, y), _linear(u, v)
+    (a, ra, na), (b, rb, nb) = _linearize(x, y), _linearize(u, v)
     value, n = b - a, np.minimum(na, nb)
-    # What leaving somebody out does to both is subtracted, so that what is alike in them cancels.
-    linear, error = _spread(rb - ra, n), _spread(_left_out(u, v, b, nb) - _left_out(x, y, a, na), n)
-    more_a, more_b = _more(na), _more(nb)
+    # Differences of the contributions: shared variation of participants in both cancels.
+    linear_error, error = (
+        _standard_error(rb - ra, n),
+        _standard_error(_jackknife(u, v, b, nb) - _jackknife(x, y, a, na), n),
+    )
+    factor_a, factor_b = _bessel_factor(na), _bessel_factor(nb)
     strata = (y > 0).any(axis=1).astype(int) + 2 * (v > 0).any(axis=1).astype(int)
     t = np.full((resamples, x.shape[1]), np.nan)
     with np.errstate(divide="ignore", invalid="ignore"):
-        for part, w in _blocks(len(x), resamples, seed, strata):
-            ma, sa = _moments(w, x, y)
-            mb, sb = _moments(w, u, v)
-            # Products of the two residuals, of people who are of both.
+        for part, w in _iter_draws(len(x), resamples, seed, strata):
+            ma, sa = _weighted_moments(w, x, y)
+            mb, sb = _weighted_moments(w, u, v)
+            # Covariance of the residuals, from participants in both.
             cross = w @ (x * u) - ma * (w @ (y * u)) - mb * (w @ (x * v)) + ma * mb * (w @ (y * v))
-            cross *= 2 * np.sqrt(more_a * more_b) / ((w @ y) * (w @ v))
-            t[part] = _studentised(mb - ma - value, np.maximum(more_a * sa + more_b * sb - cross, 0.0), linear)
-    adds, others = (x != 0).sum(axis=0), (u != 0).sum(axis=0)
-    # A number to which nobody adds is 0 of each: of people who are of both, the difference is the other number.
-    same = (((x != 0) | (u != 0)) & (y > 0) & (v > 0)).sum(axis=0)
-    enough = np.minimum(np.where(adds, adds, same), np.where(others, others, same)) >= MIN_PARTICIPANTS
-    reach = np.where(enough, _quantile(t, error) * error, np.nan)
-    low, high = value - reach, value + reach
+            cross *= 2 * np.sqrt(factor_a * factor_b) / ((w @ y) * (w @ v))
+            t[part] = _studentize(mb - ma - value, np.maximum(factor_a * sa + factor_b * sb - cross, 0.0), linear_error)
+    contributors_first, contributors_second = (x != 0).sum(axis=0), (u != 0).sum(axis=0)
+    # If an estimate has no contributions, it is 0 for every participant; the difference then needs participants in both.
+    contributors_both = (((x != 0) | (u != 0)) & (y > 0) & (v > 0)).sum(axis=0)
+    is_sufficient = (
+        np.minimum(
+            np.where(contributors_first, contributors_first, contributors_both),
+            np.where(contributors_second, contributors_second, contributors_both),
+        )
+        >= MIN_PARTICIPANTS
+    )
+    half_width = np.where(is_sufficient, _bootstrap_quantile(t, error) * error, np.nan)
+    low, high = value - half_width, value + half_width
     with np.errstate(divide="ignore", invalid="ignore"):
-        far = t >= np.abs(value / error)
-    p = np.where(np.isfinite(low), (far.sum(axis=0) + 1) / (np.isfinite(t).sum(axis=0) + 1), np.nan)
-    # No spread in either: the same, or beyond all doubt different, which nobody can tell from so few.
+        is_as_extreme = t >= np.abs(value / error)
+    p = np.where(np.isfinite(low), (is_as_extreme.sum(axis=0) + 1) / (np.isfinite(t).sum(axis=0) + 1), np.nan)
+    # Without spread in either estimate, equal values have p = 1; the p-value of different values is undefined.
     return Differences(value, low, high, np.where(error == 0, np.where(value == 0, 1.0, np.nan), p))
 
 
-def _linear(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The ratios (K,), what each person adds to their linear error (P, K), and how many people they concern (K,)."""
-    people, total = (y > 0).sum(axis=0), y.sum(axis=0)
+def _linearize(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the ratios (K,), each participant's contribution to their linearised error (P, K), and the number of
+    participants with y > 0 (K,)."""
+    num_participants, total = (y > 0).sum(axis=0), y.sum(axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
         value = np.where(total > 0, x.sum(axis=0) / total, np.nan)
-        return value, (x - value * y) / total * np.sqrt(_more(people)), people
+        return value, (x - value * y) / total * np.sqrt(_bessel_factor(num_participants)), num_participants
 
 
-def _left_out(x: np.ndarray, y: np.ndarray, value: np.ndarray, people: np.ndarray) -> np.ndarray:
-    """What each person adds to the jackknife's error (P, K): how far the ratios fall without them."""
+def _jackknife(x: np.ndarray, y: np.ndarray, value: np.ndarray, num_participants: np.ndarray) -> np.ndarray:
+    """Return each participant's contribution to the jackknife's error (P, K): the decrease of the ratio without the
+    participant."""
     with np.errstate(divide="ignore", invalid="ignore"):
         without = (x.sum(axis=0) - x) / (y.sum(axis=0) - y)
-        return np.where(y > 0, (value - without) / np.sqrt(_more(people)), 0.0)
+        return np.where(y > 0, (value - without) / np.sqrt(_bessel_factor(num_participants)), 0.0)
 
 
-def _more(people: np.ndarray) -> np.ndarray:
+def _bessel_factor(num_participants: np.ndarray) -> np.ndarray:
     """n / (n - 1)."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        return people / (people - 1.0)
+        return num_participants / (num_participants - 1.0)
 
 
-def _spread(parts: np.ndarray, people: np.ndarray) -> np.ndarray:
-    """Standard error (K,) of the sum of independent ``parts`` (P, K), NaN for few ``people`` (K,)."""
-    return np.where(people >= MIN_PARTICIPANTS, np.sqrt((parts**2).sum(axis=0)), np.nan)
+def _standard_error(parts: np.ndarray, num_participants: np.ndarray) -> np.ndarray:
+    """Return the standard error (K,) of a sum of independent ``parts`` (P, K), NaN for too few participants."""
+    return np.where(num_participants >= MIN_PARTICIPANTS, np.sqrt((parts**2).sum(axis=0)), np.nan)
 
 
-def _studentised(far: np.ndarray, square: np.ndarray, linear: np.ndarray) -> np.ndarray:
-    return np.abs(far) / np.sqrt((1 - TOWARDS) * square + TOWARDS * linear**2)
+def _studentize(deviation: np.ndarray, variance: np.ndarray, standard_error: np.ndarray) -> np.ndarray:
+    return np.abs(deviation) / np.sqrt((1 - SHRINKAGE) * variance + SHRINKAGE * standard_error**2)
 
 
-def _draws(rng: np.random.Generator, strata: np.ndarray, resamples: int) -> np.ndarray:
-    """How often each person is drawn (B, P), as many of each of the ``strata`` (P,) as there are."""
+def _draw_counts(rng: np.random.Generator, strata: np.ndarray, resamples: int) -> np.ndarray:
+    """Return how often each participant is drawn (B, P); the size of each stratum in ``strata`` (P,) is preserved."""
     out = np.zeros((resamples, len(strata)))
     for k in np.unique(strata):
-        who = np.flatnonzero(strata == k)
-        out[:, who] = rng.multinomial(len(who), np.full(len(who), 1 / len(who)), size=resamples)
+        members = np.flatnonzero(strata == k)
+        out[:, members] = rng.multinomial(len(members), np.full(len(members), 1 / len(members)), size=resamples)
     return out
 
 
-def _blocks(people: int, resamples: int, seed: int, strata: np.ndarray) -> Iterator[tuple[slice, np.ndarray]]:
+def _iter_draws(
+    num_participants: int, resamples: int, seed: int, strata: np.ndarray
+) -> Iterator[tuple[slice, np.ndarray]]:
     rng = np.random.default_rng(seed)
-    each = max(1, min(resamples, _BLOCK // max(people, 1)))
-    for a in range(0, resamples, each):
-        yield slice(a, min(a + each, resamples)), _draws(rng, strata, min(each, resamples - a))
+    block_size = max(1, min(resamples, _MAX_DRAWS // max(num_participants, 1)))
+    for a in range(0, resamples, block_size):
+        yield slice(a, min(a + block_size, resamples)), _draw_counts(rng, strata, min(block_size, resamples - a))
 
 
-def _moments(w: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Ratio and sum of squared residuals over the squared sum of y, of each draw (B, K)."""
+def _weighted_moments(w: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the ratios of the draws, and the sums of squared residuals over the squared sum of y, (B, K) each."""
     sx, sy = w @ x, w @ y
     with np.errstate(divide="ignore", invalid="ignore"):
         m = sx / sy
-        square = (w @ x**2 - 2 * m * (w @ (x * y)) + m**2 * (w @ y**2)) / sy**2
-    return m, np.maximum(square, 0.0)
+        variance = (w @ x**2 - 2 * m * (w @ (x * y)) + m**2 * (w @ y**2)) / sy**2
+    return m, np.maximum(variance, 0.0)
 
 
-def _student(parts: np.ndarray) -> np.ndarray:
-    """Quantile of Student's t (K,) for the effective number of people of ``parts`` (P, K) of an error."""
+def _student_quantile(parts: np.ndarray) -> np.ndarray:
+    """Return the quantile of Student's t (K,) for the effective number of participants in ``parts`` (P, K)."""
     from scipy.special import stdtrit
 
     with np.errstate(divide="ignore", invalid="ignore"):
-        people = (parts**2).sum(axis=0) ** 2 / (parts**4).sum(axis=0)
-    return stdtrit(np.maximum(people - 1, 1.0), (1 + _HELD) / 2)
+        effective_size = (parts**2).sum(axis=0) ** 2 / (parts**4).sum(axis=0)
+    return stdtrit(np.maximum(effective_size - 1, 1.0), (1 + _CONFIDENCE) / 2)
 
 
-def _quantile(t: np.ndarray, error: np.ndarray) -> np.ndarray:
-    """c (K,) of the draws ``t`` (B, K); NaN where nothing varies, such as where nobody looks."""
-    known = np.isfinite(t).mean(axis=0) if len(t) else np.zeros(error.shape)
-    every, some = (known == 1) & (error > 0), (known >= 0.9) & (known < 1) & (error > 0)
-    found = np.full(error.shape, np.nan)
-    found[every] = np.quantile(t[:, every], _HELD, axis=0)
-    for k in np.flatnonzero(some):
-        found[k] = np.quantile(t[np.isfinite(t[:, k]), k], _HELD)
-    return found
+def _bootstrap_quantile(t: np.ndarray, error: np.ndarray) -> np.ndarray:
+    """Return the factor c (K,) from the draws ``t`` (B, K); NaN without variation, for example without any visit."""
+    finite_fraction = np.isfinite(t).mean(axis=0) if len(t) else np.zeros(error.shape)
+    all_finite, mostly_finite = (
+        (finite_fraction == 1) & (error > 0),
+        (finite_fraction >= 0.9) & (finite_fraction < 1) & (error > 0),
+    )
+    quantile = np.full(error.shape, np.nan)
+    quantile[all_finite] = np.quantile(t[:, all_finite], _CONFIDENCE, axis=0)
+    for k in np.flatnonzero(mostly_finite):
+        quantile[k] = np.quantile(t[np.isfinite(t[:, k]), k], _CONFIDENCE)
+    return quantile
 
 
 # ---- Proportions ----
 #
-# Intervals of shares of people, of whom each counts as 0 or 1, and of their differences, that hold for few people.
+# Intervals of proportions of participants, and of their differences, that are accurate for few participants.
 #
-# The interval of x of n is the mid-p one (Lancaster 1961): all π at which neither P(X > x) + P(X = x) / 2 nor its
-# counterpart below is less than 0.025, X binomial. Wilson's score interval holds the truth less than 84 % of the time
-# where π is near 0 or 1 (Brown, Cai and DasGupta 2001), Clopper and Pearson's 99 % of it; this one 92 % or more,
-# whatever π and n >= 3, at widths that are 2 (n = 40) to 7 % (n = 8) above Wilson's (Agresti and Gottard 2007).
+# The interval for x of n is the mid-p interval (Lancaster 1961): all π for which neither P(X > x) + P(X = x) / 2 nor
+# its lower counterpart is below 0.025, with X binomial. Near π = 0 or 1, the coverage of Wilson's score interval drops
+# below 84 % (Brown, Cai and DasGupta 2001), and that of the Clopper-Pearson interval is about 99 %. The mid-p interval
+# covers at least 92 % for every π and n >= 3, and is 2 (n = 40) to 7 % (n = 8) wider than Wilson's (Agresti and Gottard
+# 2007).
 #
-# A difference has one success and one failure added to both shares, which makes Wald's interval hold for few people: of
-# others (Agresti and Caffo 2000), and of the same ones, where the two that are added are of opposite outcomes (Bonett
-# and Price 2012). Of people some of whom are of both, these two are their covariance's ends. Interval and p-value are
-# of one statistic: p < 0.05 where 0 is outside.
+# Differences add one success and one failure to both samples, which makes Wald's interval accurate for few
+# participants: for independent samples (Agresti and Caffo 2000), and for paired samples if the two additions have
+# opposite outcomes (Bonett and Price 2012). If only some participants are in both samples, the covariance of the
+# additions is interpolated between these two cases. Interval and p-value use the same statistic: p < 0.05 if and only
+# if the interval excludes 0.
 
 _ALPHA = 0.05
 _Z = 1.959963984540054
 
 
 def estimate_proportions(x: np.ndarray, y: np.ndarray) -> Estimates:
-    """Σ x / Σ y of ``x`` and ``y`` (P, K) that are 0 or 1, x <= y, with their intervals."""
-    people = y.sum(axis=0)
+    """Estimate Σ x / Σ y with confidence intervals for binary ``x`` and ``y`` (P, K), x <= y."""
+    num_participants = y.sum(axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        value = x.sum(axis=0) / people
-    low, high = mid_p_interval(x.sum(axis=0), people)
-    few = people < MIN_PARTICIPANTS
-    return Estimates(value, np.where(few, np.nan, low), np.where(few, np.nan, high), people.astype(int))
+        value = x.sum(axis=0) / num_participants
+    low, high = mid_p_interval(x.sum(axis=0), num_participants)
+    is_too_few = num_participants < MIN_PARTICIPANTS
+    return Estimates(
+        value, np.where(is_too_few, np.nan, low), np.where(is_too_few, np.nan, high), num_participants.astype(int)
+    )
 
 
 def mid_p_interval(successes: np.ndarray, trials: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Ends (K,) of the mid-p interval of a probability, of ``successes`` (K,) of as many ``trials``."""
+    """Return the limits (K,) of the mid-p interval of a probability, for ``successes`` (K,) out of ``trials`` (K,)."""
     x, n = np.asarray(successes, float), np.asarray(trials, float)
-    return _lower(x, n), 1.0 - _lower(n - x, n)
+    return _lower_limit(x, n), 1.0 - _lower_limit(n - x, n)
 
 
-def _lower(x: np.ndarray, n: np.ndarray) -> np.ndarray:
+def _lower_limit(x: np.ndarray, n: np.ndarray) -> np.ndarray:
     from scipy.special import betainc
 
-    def above(k: np.ndarray, p: np.ndarray) -> np.ndarray:
+    def tail_probability(k: np.ndarray, p: np.ndarray) -> np.ndarray:
         """P(X >= k)."""
         inside = betainc(np.maximum(k, 1), np.maximum(n - k + 1, 1), p)
         return np.where(k <= 0, 1.0, np.where(k > n, 0.0, inside))
@@ -242,26 +287,30 @@ def _lower(x: np.ndarray, n: np.ndarray) -> np.ndarray:
     low, high = np.zeros(x.shape), np.ones(x.shape)
     for _ in range(50):
         middle = (low + high) / 2
-        rare = above(x, middle) + above(x + 1, middle) < _ALPHA
-        low, high = np.where(rare, middle, low), np.where(rare, high, middle)
+        is_below = tail_probability(x, middle) + tail_probability(x + 1, middle) < _ALPHA
+        low, high = np.where(is_below, middle, low), np.where(is_below, high, middle)
     return np.where(x > 0, low, 0.0)
 
 
-def estimate_proportion_differences(first: tuple[np.ndarray, np.ndarray], second: tuple[np.ndarray, np.ndarray]) -> Differences:
-    """The share of the ``second`` less that of the ``first``, each of arrays (P, K) over the same list of P people,
-    with y = 0 for those who are not of it."""
+def estimate_proportion_differences(
+    first: tuple[np.ndarray, np.ndarray], second: tuple[np.ndarray, np.ndarray]
+) -> Differences:
+    """Estimate differences of proportions, that of ``second`` minus that of ``first``.
+
+    Both are pairs of binary arrays (P, K) over the same P participants, with y = 0 for participants without data.
+    """
     from scipy.special import ndtr
 
     (x, y), (u, v) = ([np.asarray(w, float) for w in pair] for pair in (first, second))
-    m, n, both = y.sum(axis=0), v.sum(axis=0), (y * v).sum(axis=0)
+    m, n, num_both = y.sum(axis=0), v.sum(axis=0), (y * v).sum(axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
         value = u.sum(axis=0) / n - x.sum(axis=0) / m
         a, b = (x.sum(axis=0) + 1) / (m + 2), (u.sum(axis=0) + 1) / (n + 2)
-        # Products of residuals, those of the two that are added as far as people are the same.
-        shared = ((x - a) * (u - b) * y * v).sum(axis=0) + both / np.maximum(m, n) * (2 * a * b - a - b)
-        square = a * (1 - a) / (m + 2) + b * (1 - b) / (n + 2) - 2 * shared / ((m + 2) * (n + 2))
-        error = np.sqrt(np.maximum(square, 0.0))
+        # Covariance of the residuals; that of the added observations is weighted by the fraction of shared participants.
+        covariance_sum = ((x - a) * (u - b) * y * v).sum(axis=0) + num_both / np.maximum(m, n) * (2 * a * b - a - b)
+        variance = a * (1 - a) / (m + 2) + b * (1 - b) / (n + 2) - 2 * covariance_sum / ((m + 2) * (n + 2))
+        error = np.sqrt(np.maximum(variance, 0.0))
         p = 2 * ndtr(-np.abs(b - a) / error)
     low, high = np.maximum(b - a - _Z * error, -1.0), np.minimum(b - a + _Z * error, 1.0)
-    few = (m < MIN_PARTICIPANTS) | (n < MIN_PARTICIPANTS)
-    return Differences(value, *(np.where(few, np.nan, w) for w in (low, high, p)))
+    is_too_few = (m < MIN_PARTICIPANTS) | (n < MIN_PARTICIPANTS)
+    return Differences(value, *(np.where(is_too_few, np.nan, w) for w in (low, high, p)))

@@ -1,5 +1,4 @@
-"""Triangle meshes as attention is put on them: read from scenes, connected, refined, unrolled into a texture, and
-cast at."""
+"""Triangle meshes that receive attention: welding, refinement, UV unwrapping, and ray casts."""
 
 from __future__ import annotations
 
@@ -20,8 +19,6 @@ from nerg_mi.transport.medium import Medium
 from nerg_mi.transport.observer import ObserverSettings
 
 # ---- Mesh ----
-#
-# Triangle meshes as attention is put on them: connected where they touch, and without faces that are none.
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,97 +35,112 @@ class Mesh:
 
     @cached_property
     def area(self) -> np.ndarray:
-        """Area (F,) of the triangles, square scene units."""
+        """Area of the triangles, (F,), in square scene units."""
         return triangle_areas(self.corners)
 
     @cached_property
     def normals(self) -> np.ndarray:
-        """Unit normals (F, 3), to the side that sees the corners counter-clockwise; 0 of faces without area."""
-        across = _across(self.corners)
+        """Unit normals (F, 3), on the side from which the corners are counter-clockwise; 0 for degenerate faces."""
+        across = _cross_products(self.corners)
         length = np.linalg.norm(across, axis=1, keepdims=True)
         return across / np.where(length > 0, length, 1)
 
     @cached_property
     def vertex_area(self) -> np.ndarray:
-        """A third of the area of the triangles around each vertex, (V,): the integral of its hat function."""
+        """Integral of the hat function of each vertex, (V,): a third of the area of its triangles."""
         return np.bincount(self.faces.ravel(), np.repeat(self.area / 3, 3), len(self.vertices))
 
     @property
     def diagonal(self) -> float:
-        """Diagonal of the box around all vertices."""
+        """Diagonal of the bounding box."""
         return float(np.linalg.norm(np.ptp(self.vertices, axis=0)))
 
 
 @dataclass(frozen=True)
 class Repairs:
-    """What of a mesh was put right: ``merged`` vertices that lay on others, and faces left out: ``flat`` ones without
-    area, and ``repeated`` ones with the corners of another."""
+    """Repairs of a mesh: the numbers of merged vertices, of faces without area, and of duplicate faces that were
+    removed."""
 
-    merged: int
+    num_merged_vertices: int
     num_degenerate_faces: int
-    repeated: int
+    num_duplicate_faces: int
 
     @property
     def summary(self) -> str | None:
-        """What was done, None where nothing was."""
-        said = [
+        """Description of the repairs, None if there were none."""
+        parts = [
             f"{number:,} {what}"
             for number, what in (
-                (self.merged, "vertices that lie on others merged"),
-                (self.num_degenerate_faces, "faces without area left out"),
-                (self.repeated, "faces that repeat others left out"),
+                (self.num_merged_vertices, "duplicate vertices merged"),
+                (self.num_degenerate_faces, "faces without area removed"),
+                (self.num_duplicate_faces, "duplicate faces removed"),
             )
             if number
         ]
-        return ", ".join(said) or None
+        return ", ".join(parts) or None
 
 
 def triangle_areas(corners: np.ndarray) -> np.ndarray:
-    """Area (...) of triangles (..., 3, 3)."""
-    return 0.5 * np.linalg.norm(_across(corners), axis=-1)
+    """Return the area (...) of triangles (..., 3, 3)."""
+    return 0.5 * np.linalg.norm(_cross_products(corners), axis=-1)
 
 
-def _across(corners: np.ndarray) -> np.ndarray:
+def _cross_products(corners: np.ndarray) -> np.ndarray:
     a, b, c = (corners[..., k, :] for k in range(3))
     return np.cross(b - a, c - a)
 
 
-def weld_mesh(vertices: np.ndarray, faces: np.ndarray, what: str = "the mesh") -> tuple[Mesh, np.ndarray, Repairs]:
-    """The mesh of ``vertices`` (V, 3) and ``faces`` (F, 3) with one vertex for each place, ``(mesh, index, repairs)``.
+def weld_mesh(vertices: np.ndarray, faces: np.ndarray, label: str = "the mesh") -> tuple[Mesh, np.ndarray, Repairs]:
+    """Create a mesh with unique vertices and without invalid faces. Return ``(mesh, index, repairs)``.
 
-    Files repeat vertices along edges where normals or colours jump; surfaces that touch there are one surface, and
-    smoothing goes on over it. Only vertices of exactly equal coordinates are one: plates a hair apart stay apart. Faces
-    without area receive nothing and faces with the corners of another would receive it twice: both are left out.
-    ``index`` (F',): which of ``faces`` the mesh's are. Raises `NergError`, about ``what``, for vertices that are not
-    finite, and where no face is left.
+    Files duplicate vertices along edges where normals or colours are discontinuous; welding makes such surfaces
+    connected, so that smoothing crosses these edges. Only vertices with exactly equal coordinates are merged. Faces
+    without area, and duplicates of other faces, are removed.
+
+    Parameters
+    ----------
+    vertices, faces
+        Vertices (V, 3) and triangles (F, 3).
+    label
+        Name of the mesh in messages.
+
+    Returns
+    -------
+    tuple
+        The mesh, the indices (F',) of its faces in ``faces``, and the repairs.
+
+    Raises
+    ------
+    NergError
+        If vertices are not finite, or no face is left.
     """
-    # A zero may be negative, and is the same place.
+    # Adding 0 converts negative zeros.
     vertices = np.ascontiguousarray(vertices, np.float64).reshape(-1, 3) + 0.0
     faces = np.asarray(faces, np.int64).reshape(-1, 3)
-    check_coordinates(vertices, f"the vertices of {what}")
-    kept = np.unique(faces)
-    one, number = _unique_rows(vertices[kept])
-    place = vertices[kept[one]]
-    of = np.zeros(len(vertices), np.int64)
-    of[kept] = number
-    joined = of[faces]
+    check_coordinates(vertices, f"the vertices of {label}")
+    used = np.unique(faces)
+    unique, number = _unique_rows(vertices[used])
+    positions = vertices[used[unique]]
+    new_index = np.zeros(len(vertices), np.int64)
+    new_index[used] = number
+    joined = new_index[faces]
     a, b, c = (joined[:, k] for k in range(3))
-    whole = (a != b) & (b != c) & (c != a)
-    # Products of tiny edges vanish before the edges do.
-    extent = float(np.abs(place - place.mean(0)).max(initial=0)) or 1.0
-    whole[whole] = triangle_areas(place[joined[whole]] / extent) > 0
-    first, _ = _unique_rows(np.sort(joined[whole], axis=1))
-    index = np.flatnonzero(whole)[np.sort(first)]
+    is_valid = (a != b) & (b != c) & (c != a)
+    # Normalise to avoid underflow of the products of tiny edges.
+    extent = float(np.abs(positions - positions.mean(0)).max(initial=0)) or 1.0
+    is_valid[is_valid] = triangle_areas(positions[joined[is_valid]] / extent) > 0
+    first, _ = _unique_rows(np.sort(joined[is_valid], axis=1))
+    index = np.flatnonzero(is_valid)[np.sort(first)]
     if not len(index):
-        raise NergError(f"{what} has no face with an area; export it again, as triangles")
-    left, corner = np.unique(joined[index], return_inverse=True)
-    mesh = Mesh(place[left], corner.reshape(-1, 3).astype(np.int64))
-    flat = int(len(faces) - whole.sum())
-    return mesh, index, Repairs(len(kept) - len(place), flat, int(whole.sum() - len(index)))
+        raise NergError(f"{label} has no face with an area; export it again, as triangles")
+    remaining, corner = np.unique(joined[index], return_inverse=True)
+    mesh = Mesh(positions[remaining], corner.reshape(-1, 3).astype(np.int64))
+    flat = int(len(faces) - is_valid.sum())
+    return mesh, index, Repairs(len(used) - len(positions), flat, int(is_valid.sum() - len(index)))
 
 
 def _unique_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """``(first, number)`` of rows (N, 3) that are equal: the first of each kind, and the kind (N,) of each."""
+    """Return the first row of each group of equal rows (N, 3), and the group (N,) of each row."""
     order = np.lexsort(rows.T[::-1])
     new = np.r_[True, (rows[order[1:]] != rows[order[:-1]]).any(axis=1)] if len(rows) else np.zeros(0, bool)
     number = np.empty(len(rows), np.int64)
@@ -136,118 +148,122 @@ def _unique_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return order[new], number
 
 
-# ---- Shapes of Mitsuba scenes as triangles ----
+# ---- Shapes of Mitsuba scenes ----
 
 Triangles = tuple[np.ndarray, np.ndarray]  # vertices (V, 3) float64 and faces (F, 3) int64
 
 
 def shape_triangles(shape: Any) -> Triangles | None:
-    """Those of a shape of a Mitsuba scene, in the scene; None of a shape that has none."""
+    """Return the triangles of a shape in scene coordinates; None if it is not a mesh."""
     if not shape.is_mesh():
         return None
     vertices = np.array(shape.vertex_positions_buffer(), np.float64).reshape(-1, 3)
     return vertices, np.array(shape.faces_buffer(), np.int64).reshape(-1, 3)
 
 
-# ---- Triangles cut until none of their edges is longer than attention is to be resolved ----
+# ---- Refinement ----
 #
-# An edge that is too long is halved in all triangles that have it, so that no vertex comes to lie in the middle of an
-# edge of a neighbour: a surface stays as connected as it was. Triangles of one, two or three such edges become two,
-# three or four (Bank, Sherman, Weiser 1983, "red" and "green").
+# Edges that are too long are bisected in all of their triangles, so that no vertex lies in the middle of an edge of a
+# neighbour and the surface stays connected. Triangles with one, two or three such edges are split into two, three or
+# four ("red" and "green" refinement, Bank, Sherman, Weiser 1983).
 
-MOST_REFINED_FACES = 8_000_000  # a refined mesh has so many faces at most
+MAX_REFINED_FACES = 8_000_000  # maximum number of faces of a refined mesh
 
 
 @dataclass(frozen=True, eq=False)
 class RefinedMesh:
-    """``mesh`` cut of another: ``parent`` (F,) the face of that which each face lies in, and ``place`` (F, 3, 3), of
-    each of its corners the barycentric coordinates there."""
+    """A refined mesh: the parent face of each face, (F,), and the barycentric coordinates of its corners in the
+    parent, (F, 3, 3)."""
 
     mesh: Mesh
     parent: np.ndarray
     barycentric: np.ndarray
 
 
-def refine(mesh: Mesh, longest: float) -> RefinedMesh:
-    """``mesh`` with edges of at most ``longest`` scene units. Raises `NergError` for more than `MOST_REFINED_FACES`
-    faces."""
+def refine(mesh: Mesh, max_edge: float) -> RefinedMesh:
+    """Refine ``mesh`` to edges of at most ``max_edge`` scene units.
+
+    Raises `NergError` if the result has more than `MAX_REFINED_FACES` faces.
+    """
     vertices, faces = mesh.vertices, mesh.faces
-    parent, place = np.arange(len(faces)), np.broadcast_to(np.eye(3), (len(faces), 3, 3)).copy()
+    parent, barycentric = np.arange(len(faces)), np.broadcast_to(np.eye(3), (len(faces), 3, 3)).copy()
     while True:
         edges, of_face = _edges(faces)
         ends = vertices[edges]
-        long = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) > longest
-        if not long.any():
-            return RefinedMesh(Mesh(vertices, faces), parent, place)
+        is_long = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) > max_edge
+        if not is_long.any():
+            return RefinedMesh(Mesh(vertices, faces), parent, barycentric)
         middle = np.full(len(edges), -1)
-        middle[long] = len(vertices) + np.arange(np.count_nonzero(long))
-        cut = middle[of_face]
-        if len(faces) + np.count_nonzero(cut >= 0) > MOST_REFINED_FACES:
+        middle[is_long] = len(vertices) + np.arange(np.count_nonzero(is_long))
+        midpoint = middle[of_face]
+        if len(faces) + np.count_nonzero(midpoint >= 0) > MAX_REFINED_FACES:
             raise NergError(
-                f"edges of at most {longest:.3g} scene units make more than {MOST_REFINED_FACES:,} faces; give a "
-                "larger --detail"
+                f"edges of at most {max_edge:.3g} scene units make more than {MAX_REFINED_FACES:,} faces; use a "
+                "larger --max-edge"
             )
-        vertices = np.concatenate([vertices, 0.5 * (ends[long, 0] + ends[long, 1])])
-        faces, parent, place = _cut(vertices, faces, cut, parent, place)
+        vertices = np.concatenate([vertices, 0.5 * (ends[is_long, 0] + ends[is_long, 1])])
+        faces, parent, barycentric = _split_faces(vertices, faces, midpoint, parent, barycentric)
 
 
 def _edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Edges (E, 2), and the number (F, 3) of that from each corner of a face to the next."""
+    """Return the edges (E, 2), and the index of the edge from each corner of a face to the next, (F, 3)."""
     pairs = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
-    # One number a pair sorts in a tenth of the time that rows take.
+    # Sorting one key per pair is ten times faster than sorting rows.
     count = int(faces.max()) + 1
     key, number = np.unique(pairs[:, 0] * count + pairs[:, 1], return_inverse=True)
     return np.stack([key // count, key % count], axis=1), number.reshape(-1, 3)
 
 
-def _cut(vertices, faces, cut, parent, place):
-    """Faces, parents and places after their edges were halved; ``cut`` (F, 3): the vertex in the middle of each edge,
-    -1 of those that stay."""
-    halves = 0.5 * (place + np.roll(place, -1, axis=1))
-    known = np.concatenate([faces, cut], axis=1)
-    where = np.concatenate([place, halves], axis=1)
+def _split_faces(vertices, faces, midpoint, parent, barycentric):
+    """Split faces at the midpoints of their edges. Return faces, parents and barycentric coordinates.
+
+    ``midpoint`` (F, 3) is the vertex in the middle of each edge, -1 for edges that are not split.
+    """
+    halves = 0.5 * (barycentric + np.roll(barycentric, -1, axis=1))
+    all_vertices = np.concatenate([faces, midpoint], axis=1)
+    all_barycentric = np.concatenate([barycentric, halves], axis=1)
     out: list[tuple[np.ndarray, np.ndarray]] = []
-    marks = cut >= 0
-    number = marks.sum(axis=1)
-    # Corners 0, 1, 2, and 3, 4, 5 in the middle of the edges behind them.
-    out.append(_taken(np.flatnonzero(number == 0), ((0, 1, 2),)))
-    out.append(_taken(np.flatnonzero(number == 3), ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))))
+    is_split = midpoint >= 0
+    number = is_split.sum(axis=1)
+    # Vertices 0, 1, 2 are corners; 3, 4, 5 are the midpoints of the edges that start there.
+    out.append(_repeat_triangles(np.flatnonzero(number == 0), ((0, 1, 2),)))
+    out.append(_repeat_triangles(np.flatnonzero(number == 3), ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5))))
     for k in range(3):
         a, b, c = k, (k + 1) % 3, (k + 2) % 3
-        only = np.flatnonzero((number == 1) & marks[:, k])
-        out.append(_taken(only, ((a, 3 + a, c), (3 + a, b, c))))
-        # The edge behind c stays, and the quadrangle beside it is cut along its shorter diagonal.
-        both = np.flatnonzero((number == 2) & ~marks[:, c])
-        corner = vertices[known[both]]
+        one_edge = np.flatnonzero((number == 1) & is_split[:, k])
+        out.append(_repeat_triangles(one_edge, ((a, 3 + a, c), (3 + a, b, c))))
+        # The edge that starts at c is not split; the adjacent quadrilateral is cut along its shorter diagonal.
+        two_edges = np.flatnonzero((number == 2) & ~is_split[:, c])
+        corner = vertices[all_vertices[two_edges]]
         first = np.linalg.norm(corner[:, a] - corner[:, 3 + b], axis=1)
-        short = first <= np.linalg.norm(corner[:, 3 + a] - corner[:, c], axis=1)
-        out.append(_taken(both, ((3 + a, b, 3 + b),)))
-        out.append(_taken(both[short], ((a, 3 + a, 3 + b), (a, 3 + b, c))))
-        out.append(_taken(both[~short], ((a, 3 + a, c), (3 + a, 3 + b, c))))
+        is_short = first <= np.linalg.norm(corner[:, 3 + a] - corner[:, c], axis=1)
+        out.append(_repeat_triangles(two_edges, ((3 + a, b, 3 + b),)))
+        out.append(_repeat_triangles(two_edges[is_short], ((a, 3 + a, 3 + b), (a, 3 + b, c))))
+        out.append(_repeat_triangles(two_edges[~is_short], ((a, 3 + a, c), (3 + a, 3 + b, c))))
     rows, corners = (np.concatenate(part) for part in zip(*out))
     order = np.argsort(rows, kind="stable")
     rows, corners = rows[order], corners[order]
-    return known[rows[:, None], corners], parent[rows], where[rows[:, None], corners]
+    return all_vertices[rows[:, None], corners], parent[rows], all_barycentric[rows[:, None], corners]
 
 
-def _taken(rows: np.ndarray, triangles) -> tuple[np.ndarray, np.ndarray]:
-    """Each of ``triangles``, three corners, for each of ``rows``."""
+def _repeat_triangles(rows: np.ndarray, triangles) -> tuple[np.ndarray, np.ndarray]:
+    """Repeat ``triangles`` for each of ``rows``."""
     corners = np.tile(np.array(triangles), (len(rows), 1))
     return np.repeat(rows, len(triangles)), corners
 
 
-# ---- A surface among all that may hide it, as rays are cast at it ----
+# ---- Ray casts ----
 
-SURFACE_OPACITY = 0.5  # opacity of a medium from which on a ray ends in it
+SURFACE_OPACITY = 0.5  # minimum opacity of a medium for a surface hit
 
-NEAR = 1e-5
-"""What a ray meets so near before a point, as a share of the distance, does not hide it: its own face, a neighbour."""
+SELF_HIT_TOLERANCE = 1e-5
+"""Relative distance within which a hit in front of a point does not occlude it, such as its own face or a neighbour."""
 
 
 @dataclass(frozen=True, eq=False)
 class RayEnds:
-    """Where N rays end: ``face`` (N,) of the surface, or -1; ``place`` (N, 3), barycentric coordinates on it;
-    ``elsewhere`` (N,) bool: at something else."""
+    """End points of N rays: face of the surface (N,) or -1, barycentric coordinates (N, 3), and whether the ray ends
+    elsewhere (N,)."""
 
     face: np.ndarray
     barycentric: np.ndarray
@@ -255,11 +271,20 @@ class RayEnds:
 
 
 class SurfaceTarget:
-    """``mesh``, which receives attention, ``others``, meshes that hide it, and a ``medium`` that both stand in, with
-    ``place``, in which all of it is traced.
+    """A mesh that receives attention, with everything that may occlude it.
 
-    ``settings``: of an observer's rays; by default those of the integrator ``nerg`` with nothing set, and ``falloff``
-    0, by which a point is either seen or not.
+    Parameters
+    ----------
+    mesh
+        Mesh that receives attention.
+    occluders
+        Vertices and faces of other meshes.
+    medium
+        Medium that contains the meshes.
+    settings
+        Settings of an observer's rays. Default: those of the integrator ``nerg``.
+    falloff
+        Softness of occlusion boundaries; 0 for binary visibility.
     """
 
     def __init__(
@@ -274,9 +299,9 @@ class SurfaceTarget:
 
         self.mesh, self.falloff = mesh, falloff
         self._shape = mitsuba_mesh(mesh.vertices, mesh.faces, "surface")
-        hiding = {f"other_{k}": mitsuba_mesh(v, f, f"other_{k}") for k, (v, f) in enumerate(occluders or ())}
-        scene: Any = mi.load_dict({"type": "scene", "surface": self._shape, **hiding}, optimize=False)
-        # What a scene is made of is given to it, and may come out as another object.
+        occluder_shapes = {f"other_{k}": mitsuba_mesh(v, f, f"other_{k}") for k, (v, f) in enumerate(occluders or ())}
+        scene: Any = mi.load_dict({"type": "scene", "surface": self._shape, **occluder_shapes}, optimize=False)
+        # The scene may wrap the shape in another object.
         self._shape = next(shape for shape in scene.shapes() if shape.id() == "surface")
         self.geometry = SceneGeometry(medium, scene)
         self.settings = settings or ObserverSettings(
@@ -285,51 +310,58 @@ class SurfaceTarget:
 
     @property
     def has_binary_visibility(self) -> bool:
-        """Whether what is met hides all that is behind it: shapes alone, without a medium, and without a fall-off."""
+        """Whether visibility is binary: shapes without a medium and without a fall-off."""
         return self.geometry.medium is None and self.falloff == 0
 
     def is_visible(self, observer: np.ndarray, points: np.ndarray, faces: np.ndarray) -> np.ndarray:
-        """Whether ``eye`` (3,) sees ``points`` (N, 3) of the surface, which lie in its ``faces`` (N,); of `sharp`
-        targets. A point is seen where the ray at it ends at its own face, however obliquely, or not before it."""
+        """Return whether surface points (N, 3) in ``faces`` (N,) are visible to an observer at a position (3,).
+
+        A point is visible if the ray towards it hits its own face, or nothing before the point. Requires binary
+        visibility.
+        """
         mi = variant_types()
-        to = points - observer
-        distance = np.linalg.norm(to, axis=1)
-        d = to_vector(mi.Vector3f, to / np.where(distance > 0, distance, 1)[:, None])
+        to_points = points - observer
+        distance = np.linalg.norm(to_points, axis=1)
+        d = to_vector(mi.Vector3f, to_points / np.where(distance > 0, distance, 1)[:, None])
         o = mi.Point3f(np.asarray(observer, np.float64).tolist())
-        # A position that is a constant of the kernel would be compiled anew for every observer.
+        # A literal position would compile a new kernel for each observer.
         dr.make_opaque(o)
         count = len(points)
         with dr.suspend_grad():
             view = self.geometry.trace(mi.Ray3f(o, d), dr.full(mi.Bool, True, count), self.settings.march)
             assert view.shape_intersection is not None, "a target has shapes"
-            own = (view.shape_intersection.shape == mi.ShapePtr(self._shape)) & (
+            is_own_face = (view.shape_intersection.shape == mi.ShapePtr(self._shape)) & (
                 view.shape_intersection.prim_index == mi.UInt32(copy_aligned(faces, np.uint32).ravel())
             )
-            seen = ~view.hits_shape | own | (view.shape_distance >= mi.Float(copy_aligned(distance * (1 - NEAR)).ravel()))
-        return np.broadcast_to(np.array(seen).astype(bool), (count,)) & (distance > 0)
+            is_seen = (
+                ~view.hits_shape
+                | is_own_face
+                | (view.shape_distance >= mi.Float(copy_aligned(distance * (1 - SELF_HIT_TOLERANCE)).ravel()))
+            )
+        return np.broadcast_to(np.array(is_seen).astype(bool), (count,)) & (distance > 0)
 
     def trace(self, origins: np.ndarray, directions: np.ndarray) -> RayEnds:
-        """Where rays with ``origins`` (N, 3) and unit ``directions`` (N, 3) end."""
+        """Trace rays with ``origins`` and unit ``directions`` (N, 3) to their end points."""
         mi = variant_types()
         o, d = (to_vector(mi.Point3f, v) for v in (origins, directions))
         count = len(origins)
         with dr.suspend_grad():
             view = self.geometry.trace(mi.Ray3f(o, mi.Vector3f(d)), dr.full(mi.Bool, True, count), self.settings.march)
             assert view.shape_intersection is not None, "a target has shapes"
-            before = view.medium_opacity >= self.settings.surface_opacity
-            on = view.hits_shape & ~before & (view.shape_intersection.shape == mi.ShapePtr(self._shape))
+            hits_medium = view.medium_opacity >= self.settings.surface_opacity
+            on_surface = view.hits_shape & ~hits_medium & (view.shape_intersection.shape == mi.ShapePtr(self._shape))
             uv, prim = view.shape_intersection.prim_uv, view.shape_intersection.prim_index
-            dr.eval(on, uv, prim, view.hits_shape, before)
-        on_it = np.array(on).astype(bool)
-        met = np.broadcast_to(np.array(view.hits_shape | before).astype(bool), (count,))
+            dr.eval(on_surface, uv, prim, view.hits_shape, hits_medium)
+        is_on_surface = np.array(on_surface).astype(bool)
+        is_hit = np.broadcast_to(np.array(view.hits_shape | hits_medium).astype(bool), (count,))
         u, v = (np.array(c, np.float64) for c in (uv.x, uv.y))
-        place = np.stack([1 - u - v, u, v], axis=1)
-        face = np.where(on_it, np.array(prim).astype(np.int64), -1)
-        return RayEnds(face, np.where(on_it[:, None], place, 0.0), met & ~on_it)
+        barycentric = np.stack([1 - u - v, u, v], axis=1)
+        face = np.where(is_on_surface, np.array(prim).astype(np.int64), -1)
+        return RayEnds(face, np.where(is_on_surface[:, None], barycentric, 0.0), is_hit & ~is_on_surface)
 
 
 def mitsuba_mesh(vertices: np.ndarray, faces: np.ndarray, name: str, bsdf: Mapping[str, Any] | None = None) -> Any:
-    """Triangles as a Mitsuba mesh of the variant in use, with the id ``name`` and the ``bsdf`` of a dict."""
+    """Create a Mitsuba mesh in the active variant, with the id ``name`` and a ``bsdf`` given as a dict."""
     import mitsuba as mi
 
     props = mi.Properties()
@@ -344,19 +376,19 @@ def mitsuba_mesh(vertices: np.ndarray, faces: np.ndarray, name: str, bsdf: Mappi
     return mesh
 
 
-# ---- Charts ----
+# ---- Textures ----
 #
-# A surface unrolled into a square, and values on it as a texture: charts by xatlas, an optional extra.
+# UV unwrapping by xatlas, an optional dependency, and values as textures.
 
-GUTTER = 4  # pixels by which colours go on beyond the border of a chart, for filters that look there
-TEXTURE_ROWS = 256  # rows of a texture that are computed at once
-MOST_CHART_FACES = 400_000  # a mesh of more triangles is not unrolled
+GUTTER_PIXELS = 4  # pixels by which values extend beyond the border of a chart, for texture filtering
+TEXTURE_ROWS = 256  # number of texture rows per batch
+MAX_CHART_FACES = 400_000  # maximum number of triangles for UV unwrapping
 
 
 @dataclass(frozen=True, eq=False)
 class Charts:
-    """``vertex`` (W,): of which vertex of the mesh each corner on the square is; ``uv`` (W, 2), from 0 to 1, v down the
-    picture; ``faces`` (F, 3) of such corners, in the mesh's order."""
+    """UV charts: mesh vertex of each UV vertex (W,), ``uv`` (W, 2) in 0..1 with v downwards, and ``faces`` (F, 3) of
+    UV vertices in the order of the mesh."""
 
     vertex: np.ndarray
     uv: np.ndarray
@@ -364,26 +396,27 @@ class Charts:
 
 
 def import_xatlas() -> Any:
-    """The package xatlas; `ImportError` with the remedy where it is not installed."""
+    """Import xatlas. Raises `ImportError` with a remedy if it is not installed."""
     return import_extra("xatlas", "a texture needs xatlas", "bake")
 
 
 def unwrap_uv(mesh: Mesh, pixels: int) -> Charts:
-    """``mesh`` cut into charts that fill a square of ``pixels`` a side without overlaps. Needs xatlas; raises
-    `NergError` for meshes that are too large."""
+    """Unwrap ``mesh`` into charts on a square of ``pixels`` per side without overlaps.
+
+    Needs xatlas. Raises `NergError` for meshes that are too large.
+    """
     xatlas = import_xatlas()
-    if len(mesh.faces) > MOST_CHART_FACES:
+    if len(mesh.faces) > MAX_CHART_FACES:
         raise NergError(
-            f"a mesh of {len(mesh.faces):,} triangles is not unrolled into a texture, but up to "
-            f"{MOST_CHART_FACES:,}; leave "
-            "out --texture for colours of vertices"
+            f"the mesh has {len(mesh.faces):,} triangles, but a texture supports at most {MAX_CHART_FACES:,}; "
+            "omit --texture-size to write vertex colours"
         )
-    # In a unit in which nothing of it vanishes in single precision.
+    # Normalise to avoid underflow in single precision.
     unit = (mesh.vertices - mesh.vertices.mean(axis=0)) / (mesh.diagonal or 1.0)
     atlas, pack = xatlas.Atlas(), xatlas.PackOptions()
     atlas.add_mesh(unit.astype(np.float32), mesh.faces.astype(np.uint32))
     pack.padding, pack.resolution, pack.bruteForce = 2, pixels, False
-    # Of a resolution and no scale xatlas may need several squares; a scale is found with which one is enough.
+    # Reduce the scale until all charts fit on one square.
     texels = 0.8 * pixels / np.sqrt(float((mesh.area / (mesh.diagonal or 1.0) ** 2).sum()))
     for _ in range(40):
         pack.texels_per_unit = float(texels)
@@ -392,9 +425,9 @@ def unwrap_uv(mesh: Mesh, pixels: int) -> Charts:
             break
         texels *= 0.85
     else:
-        raise NergError(f"the surface does not fit on {pixels} x {pixels} pixels; give a larger --texture")
+        raise NergError(f"the surface does not fit on {pixels} x {pixels} pixels; use a larger --texture-size")
     vertex, faces, uv = atlas[0]
-    # xatlas divides by its own size, which may be less than the square's.
+    # xatlas normalises by the size of its atlas, which may be smaller than the square.
     size = np.array([atlas.width, atlas.height], np.float64)
     return Charts(vertex.astype(np.int64), uv.astype(np.float64) * size / pixels, faces.astype(np.int64))
 
@@ -402,43 +435,46 @@ def unwrap_uv(mesh: Mesh, pixels: int) -> Charts:
 def iter_texture_rows(
     charts: Charts, refined: RefinedMesh, values: np.ndarray, pixels: int
 ) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
-    """``values`` (V,) on the vertices of ``refined``, of whose whole mesh ``charts`` are, as a square texture.
+    """Rasterise ``values`` (V,) on the vertices of ``refined`` to a square texture.
 
-    Yields ``(rows, values (n, pixels), known (n, pixels) bool)``, some rows at a time: the memory of a whole texture of
-    8192 x 8192 would be 5 GB. Values are linear in every triangle, and carried on over a gutter around charts. Raises
-    `NergError`, at the end, where no texel shows the surface.
+    Yields ``(rows, values (n, pixels), mask (n, pixels))`` in batches of rows, since a whole texture of 8192 x 8192
+    would need 5 GB. Values are interpolated linearly in each triangle and extended over a gutter around the charts.
+    Raises `NergError` if no texel shows the surface.
     """
     import mitsuba as mi
     from scipy.ndimage import distance_transform_edt
 
     corners = np.einsum("fij,fjk->fik", refined.barycentric, charts.uv[charts.faces[refined.parent]])
     flat = np.concatenate([corners, np.zeros((*corners.shape[:2], 1))], axis=2).reshape(-1, 3)
-    # A texel shows what lies under its centre, which is found as all else is: by a ray.
+    # Find the triangle under the centre of each texel by a ray cast.
     sheet = mitsuba_mesh(flat, np.arange(len(flat)).reshape(-1, 3), "charts")
     scene: Any = mi.load_dict({"type": "scene", "charts": sheet})
     center = (np.arange(pixels) + 0.5) / pixels
     is_empty = True
     for start in range(0, pixels, TEXTURE_ROWS):
         stop = min(start + TEXTURE_ROWS, pixels)
-        # The rows around them too, from which a gutter may reach in.
-        first, last = max(start - GUTTER, 0), min(stop + GUTTER, pixels)
+        # Include neighbouring rows for the gutter.
+        first, last = max(start - GUTTER_PIXELS, 0), min(stop + GUTTER_PIXELS, pixels)
         u, v = (c.ravel() for c in np.meshgrid(center, center[first:last]))
-        above = mi.Point3f(np.stack([u, v, np.ones_like(u)]).astype(np.float32))
+        origins = mi.Point3f(np.stack([u, v, np.ones_like(u)]).astype(np.float32))
         with dr.suspend_grad():
-            found = scene.ray_intersect_preliminary(mi.Ray3f(above, mi.Vector3f(0, 0, -1)), coherent=True)
-            hit, face = np.array(found.is_valid()).astype(bool), np.array(found.prim_index).astype(np.int64)
-            b, c = np.where(hit, np.array(found.prim_uv), 0).astype(np.float64)
-        of_corners = values[refined.mesh.faces[np.where(hit, face, 0)]]
-        out = np.where(hit, of_corners[:, 0] * (1 - b - c) + of_corners[:, 1] * b + of_corners[:, 2] * c, 0.0)
+            intersection = scene.ray_intersect_preliminary(mi.Ray3f(origins, mi.Vector3f(0, 0, -1)), coherent=True)
+            hit, face = (
+                np.array(intersection.is_valid()).astype(bool),
+                np.array(intersection.prim_index).astype(np.int64),
+            )
+            b, c = np.where(hit, np.array(intersection.prim_uv), 0).astype(np.float64)
+        corner_values = values[refined.mesh.faces[np.where(hit, face, 0)]]
+        out = np.where(hit, corner_values[:, 0] * (1 - b - c) + corner_values[:, 1] * b + corner_values[:, 2] * c, 0.0)
         out, hit = out.reshape(-1, pixels), hit.reshape(-1, pixels)
         if hit.any():
             is_empty = False
             nearest = distance_transform_edt(~hit, return_indices=True)
-            assert nearest is not None, "both were asked for"
+            assert nearest is not None, "distances and indices are requested"
             distance, index = nearest
-            out, hit = out[index[0], index[1]], np.asarray(distance) <= GUTTER
+            out, hit = out[index[0], index[1]], np.asarray(distance) <= GUTTER_PIXELS
         rows = slice(start, stop)
         inside = slice(start - first, stop - first)
         yield rows, out[inside], hit[inside]
     if is_empty:
-        raise NergError(f"no pixel of a texture of {pixels} x {pixels} shows the surface; give a larger --texture")
+        raise NergError(f"no pixel of a texture of {pixels} x {pixels} shows the surface; give a larger --texture-size")

@@ -1,5 +1,4 @@
-"""What leaves attention on a surface: the gaze of observers and tracked rays, each as a cone, with the quadrature
-over the sphere and over faces."""
+"""Attention on surfaces from observers' gaze and from gaze samples, with quadratures over the sphere and over faces."""
 
 from __future__ import annotations
 
@@ -28,68 +27,69 @@ from .mesh import Mesh, SurfaceTarget
 
 # ---- Cones ----
 #
-# Gaze as a cone in place of a line: trackers err by about a degree, and the fovea sees two.
+# Gaze is modelled as a cone, since eye trackers have an error of about a degree and the fovea covers two.
 #
-# A cone is a Gaussian of the angles to both sides of the line of sight, of standard deviation σ each. Of a density over
-# directions it is the convolution by a rule of seven directions that is exact to the fifth degree in the tangent plane
-# (A. H. Stroud, D. Secrest, "Approximate integration formulas for certain spherically symmetric regions", 1963, for the
-# weight exp(-r²)): half in the middle, a twelfth in each of six at 2σ around it. It turns a spherical harmonic of
-# degree l into itself times (1 + P_l(cos 2σ)) / 2, and so keeps the integral over the sphere. Of a ray, which is a
-# point among directions, it is a bundle of rays, each of which ends at what it meets itself.
+# A cone is a Gaussian of the two angles to the line of sight, with standard deviation σ. Convolving a density over
+# directions with it uses a rule of seven directions that is exact to degree five in the tangent plane (A. H. Stroud, D.
+# Secrest, "Approximate integration formulas for certain spherically symmetric regions", 1963, for the weight exp(-r²)):
+# weight 1/2 at the centre and 1/12 at each of six directions at 2σ. It multiplies a spherical harmonic of degree l by
+# (1 + P_l(cos 2σ)) / 2, and so preserves the integral over the sphere. For a sample, a single direction, the cone is a
+# bundle of rays.
 
-RING = 6  # directions around the middle one
+RING_DIRECTIONS = 6  # number of directions around the central one
 _GOLDEN = np.pi * (3 - np.sqrt(5))
 
 
 def blur_density(density: Callable[[Vector3f], Any], directions: Vector3f, sigma: float) -> Any:
-    """``density`` along ``directions`` (unit, a lane each), seen through a cone of ``sigma`` radian."""
+    """Evaluate ``density`` along unit ``directions`` (one per lane), convolved with a cone of ``sigma`` radians."""
     import drjit as dr
 
     mi = variant_types()
     side, up = mi.coordinate_system(directions)
-    found = 0.5 * density(directions)
+    total = 0.5 * density(directions)
     sin, cos = dr.sincos(mi.Float(2 * sigma))
-    for k in range(RING):
-        turn = 2 * math.pi * k / RING
-        found += density(cos * directions + sin * (math.cos(turn) * side + math.sin(turn) * up)) / (2 * RING)
-    return found
+    for k in range(RING_DIRECTIONS):
+        angle = 2 * math.pi * k / RING_DIRECTIONS
+        total += density(cos * directions + sin * (math.cos(angle) * side + math.sin(angle) * up)) / (
+            2 * RING_DIRECTIONS
+        )
+    return total
 
 
 def sample_cone(directions: np.ndarray, sigma: float, count: int, rng: np.random.Generator) -> np.ndarray:
-    """``count`` unit directions (N, count, 3) of equal weight in a cone of ``sigma`` radian around each of
-    ``directions`` (N, 3).
+    """Sample ``count`` unit directions of equal weight in a cone of ``sigma`` radians around each of ``directions`` (N,
+    3).
 
-    Their angles from the middle are one in each of as many shells of equal weight, their turns steps of the golden
-    angle from one that is drawn: bundles are spread evenly, and all of them together without any pattern.
+    Returns (N, count, 3). Angles to the axis are stratified in shells of equal weight, and azimuths are multiples of
+    the golden angle with a random offset, so that bundles are uniform and uncorrelated.
     """
     n = len(directions)
     if sigma == 0:
         return np.repeat(directions[:, None], count, axis=1)
     shell = (np.arange(count) + rng.random((n, 1))) / count
-    # The angle of a Gaussian of two dimensions is Rayleigh's.
+    # The radius of a two-dimensional Gaussian has a Rayleigh distribution.
     angle = np.minimum(sigma * np.sqrt(-2 * np.log1p(-shell)), np.pi)
-    turn = 2 * np.pi * rng.random((n, 1)) + _GOLDEN * np.arange(count)
+    azimuth = 2 * np.pi * rng.random((n, 1)) + _GOLDEN * np.arange(count)
     side, up = tangent_frame(directions)
-    around = np.cos(turn)[..., None] * side[:, None] + np.sin(turn)[..., None] * up[:, None]
-    out = np.cos(angle)[..., None] * directions[:, None] + np.sin(angle)[..., None] * around
+    tangent = np.cos(azimuth)[..., None] * side[:, None] + np.sin(azimuth)[..., None] * up[:, None]
+    out = np.cos(angle)[..., None] * directions[:, None] + np.sin(angle)[..., None] * tangent
     return out / np.linalg.norm(out, axis=-1, keepdims=True)
 
 
-# ---- Pieces of faces that are small as an observer sees them, with their exact solid angles ----
+# ---- Face pieces ----
 #
-# A face is cut into four congruent ones until each is seen under a small angle, however near the observer stands:
-# pieces are many where they are near, and about as many in all wherever that is, since the sphere around an observer
-# has room for so many of them only. The solid angle of a triangle is that of A. van Oosterom and J. Strackee, "The
-# Solid Angle of a Plane Triangle" (1983); no Jacobian has to be evaluated where it is steep.
+# Faces are subdivided into four congruent triangles until each is small as seen by the observer. Pieces are smaller
+# near the observer, and their number is limited by the solid angle of the sphere. Solid angles of triangles are exact
+# (A. van Oosterom and J. Strackee, "The Solid Angle of a Plane Triangle", 1983), which avoids the singular Jacobian.
 
-MAX_LEVELS = 40  # a face is cut in four so many times at most: to 10^-12 of its size
-MOST_PIECES = 1 << 25  # pieces of a mesh at most, as one observer sees it: five gigabytes
+MAX_LEVELS = 40  # maximum number of subdivisions of a face, to 10^-12 of its size
+MAX_PIECES = 1 << 25  # maximum number of pieces per observer, five gigabytes
 
 
 @dataclass(frozen=True, eq=False)
 class Pieces:
-    """Parts of faces as ``eye`` (3,) sees them: ``face`` (P,) that each lies in; ``cut`` (P, 3, 3), of each of its
-    corners the barycentric coordinates there; ``relative`` (P, 3, 3), its corners from the eye in scene units."""
+    """Pieces of faces as seen by an observer at a position (3,): the face of each (P,), the barycentric coordinates
+    of its corners (P, 3, 3), and its corners relative to the observer (P, 3, 3), in scene units."""
 
     observer: np.ndarray
     face: np.ndarray
@@ -101,68 +101,74 @@ class Pieces:
 
     @property
     def centroid_barycentric(self) -> np.ndarray:
-        """Barycentric coordinates (P, 3) of the centroids."""
+        """Barycentric coordinates of the centroids, (P, 3)."""
         return self.barycentric.mean(axis=1)
 
     @property
     def centroids(self) -> np.ndarray:
-        """Centroids (P, 3) in the scene."""
+        """Centroids in the scene, (P, 3)."""
         return self.relative.mean(axis=1) + self.observer
 
     @cached_property
     def solid_angle(self) -> np.ndarray:
-        """Solid angles (P,) under which the eye sees them, in steradian."""
+        """Solid angles in steradians, (P,)."""
         return solid_angles(self.relative)
 
     def select(self, rows: np.ndarray | slice) -> Pieces:
-        """Those numbered, or marked, by ``rows``."""
+        """Select pieces by indices or a mask."""
         return Pieces(self.observer, self.face[rows], self.barycentric[rows], self.relative[rows])
 
-    def quartered(self) -> Pieces:
-        """Each cut into four congruent ones, one after the other."""
-        return Pieces(self.observer, np.repeat(self.face, 4), _quarters(self.barycentric), _quarters(self.relative))
+    def subdivide(self) -> Pieces:
+        """Subdivide each piece into four congruent ones."""
+        return Pieces(
+            self.observer,
+            np.repeat(self.face, 4),
+            _quarter_triangles(self.barycentric),
+            _quarter_triangles(self.relative),
+        )
 
 
-def pieces_of(mesh: Mesh, eye: np.ndarray, angle: float, faces: slice = slice(None)) -> Pieces:
-    """The ``faces`` of ``mesh``, cut into pieces none of whose edges is seen from ``eye`` (3,) under more than about
-    ``angle`` (radian).
+def subdivide_faces(mesh: Mesh, observer: np.ndarray, max_angle: float, faces: slice = slice(None)) -> Pieces:
+    """Subdivide ``faces`` of ``mesh`` until each edge subtends at most about ``max_angle`` (radians) at the observer.
 
-    An edge counts as seen from the nearest point of the ball around its piece; a piece that holds the eye itself is cut
-    `LEVELS` times. Raises `NergError` for more than `MOST_PIECES` pieces.
+    Edges are measured from the nearest point of the bounding sphere of their piece; a piece that contains the observer
+    is subdivided `MAX_LEVELS` times. Raises `NergError` for more than `MAX_PIECES` pieces.
     """
-    relative = mesh.corners[faces] - eye
+    relative = mesh.corners[faces] - observer
     number = np.arange(len(mesh.faces))[faces]
-    left = Pieces(eye, number, np.broadcast_to(np.eye(3), (len(number), 3, 3)), relative)
-    found: list[Pieces] = []
+    pending = Pieces(observer, number, np.broadcast_to(np.eye(3), (len(number), 3, 3)), relative)
+    finished: list[Pieces] = []
     for level in range(MAX_LEVELS + 1):
-        here = left.relative
-        middle = here.mean(axis=1)
-        radius = np.sqrt(_square(here - middle[:, None]).max(axis=1))
-        edge = np.sqrt(_square(here - here[:, [2, 0, 1]]).max(axis=1))
-        # Not "<=": what is not finite is cut no further.
-        small = ~(edge > angle * np.maximum(np.sqrt(_square(middle)) - radius, 0))
+        corners = pending.relative
+        middle = corners.mean(axis=1)
+        radius = np.sqrt(_squared_norm(corners - middle[:, None]).max(axis=1))
+        edge = np.sqrt(_squared_norm(corners - corners[:, [2, 0, 1]]).max(axis=1))
+        # The negation also stops at values that are not finite.
+        is_small = ~(edge > max_angle * np.maximum(np.sqrt(_squared_norm(middle)) - radius, 0))
         if level == MAX_LEVELS:
-            small[:] = True
-        found.append(left.select(small))
-        if small.all():
+            is_small[:] = True
+        finished.append(pending.select(is_small))
+        if is_small.all():
             break
-        if sum(map(len, found)) + 4 * np.count_nonzero(~small) > MOST_PIECES:
+        if sum(map(len, finished)) + 4 * np.count_nonzero(~is_small) > MAX_PIECES:
             raise NergError(
-                f"the observer at {','.join(f'{v:g}' for v in eye)} sees the surfaces in more than "
-                f"{MOST_PIECES:,} pieces of "
-                f"{np.degrees(angle):g} degrees; give a larger --angle"
+                f"the observer at {','.join(f'{v:g}' for v in observer)} needs more than "
+                f"{MAX_PIECES:,} surface pieces of "
+                f"{np.degrees(max_angle):g} degrees; use a larger --max-angle"
             )
-        left = left.select(~small).quartered()
-    joined = (np.concatenate([getattr(part, name) for part in found]) for name in ("face", "cut", "relative"))
-    return Pieces(eye, *joined)
+        pending = pending.select(~is_small).subdivide()
+    joined = (
+        np.concatenate([getattr(part, name) for part in finished]) for name in ("face", "barycentric", "relative")
+    )
+    return Pieces(observer, *joined)
 
 
-def _square(v: np.ndarray) -> np.ndarray:
+def _squared_norm(v: np.ndarray) -> np.ndarray:
     return np.einsum("...i,...i->...", v, v)
 
 
-def _quarters(corners: np.ndarray) -> np.ndarray:
-    """Corners (4 P, 3, 3) of the quarters of triangles (P, 3, 3)."""
+def _quarter_triangles(corners: np.ndarray) -> np.ndarray:
+    """Return the corners (4 P, 3, 3) of the quarters of triangles (P, 3, 3)."""
     middle = 0.5 * (corners + corners[:, [1, 2, 0]])
     (a, b, c), (ab, bc, ca) = (np.moveaxis(v, 1, 0) for v in (corners, middle))
     out = np.empty((len(corners), 4, 3, 3))
@@ -173,96 +179,106 @@ def _quarters(corners: np.ndarray) -> np.ndarray:
 
 
 def solid_angles(corners: np.ndarray) -> np.ndarray:
-    """Solid angle (P,), in steradian, of triangles (P, 3, 3) seen from the origin, from either side.
+    """Return the solid angles (P,) in steradians of triangles (P, 3, 3) seen from the origin, from either side.
 
-    Of one in whose plane the origin lies it is 0, also where it lies in the triangle.
+    The solid angle is 0 if the origin lies in the plane of the triangle.
     """
     a, b, c = (corners[:, k] for k in range(3))
-    # The ratio is free of the scale, and products of tiny lengths are not.
+    # Normalise to avoid underflow; the result does not depend on the scale.
     unit = np.abs(corners).max(axis=(1, 2))
     scale = np.where(unit > 0, unit, 1)[:, None]
     a, b, c = a / scale, b / scale, c / scale
     la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
     dot = lambda u, v: np.einsum("ij,ij->i", u, v)
-    # Of differences: corners that are far away compared with their distance from each other lose no digits.
+    # Differences of corners avoid cancellation for small distant triangles.
     volume = np.abs(dot(a, np.cross(b - a, c - a)))
     below = la * lb * lc + dot(a, b) * lc + dot(b, c) * la + dot(c, a) * lb
     return np.where(volume > 0, 2 * np.arctan2(volume, below), 0.0)
 
 
-# ---- Outlines ----
+# ---- Occlusion boundaries ----
 #
-# What of a surface is seen, cut where the outline of something passes: pieces that are seen in part are cut again.
+# Pieces that are partly visible are subdivided further.
 #
-# A piece is looked at in four points and at its corners. Where all of it is hidden it ends there; where it is seen in
-# part, and carries more of the gaze than `MIXED`, it is cut in four. Without this an outline that runs along the cuts
-# of a face, as those of shelves on walls do, falls between the same two rows of pieces everywhere, and loses up to a
-# third of a piece along all its length; halving the pieces keeps the cuts parallel to it, and the loss often as large.
+# Visibility is tested at four points of a piece and at its corners. Hidden pieces are dropped. Partly visible pieces
+# with more than `MAX_PARTIAL_SHARE` of the gaze are subdivided. Without this, an occlusion boundary that is parallel to
+# the subdivision, such as that of a shelf on a wall, falls between the same two rows of pieces along its whole length,
+# which loses up to a third of a piece; uniform refinement keeps the boundary parallel and the loss similar.
 
-MIXED = 1e-6  # of all gaze, what a piece may have at most that is seen in part
+MAX_PARTIAL_SHARE = 1e-6  # maximum share of the gaze on a partly visible piece
 
-WHOLE = 2e-5
-"""Of all gaze, what a piece may have at most: densities narrower than a piece is are integrated too."""
+MAX_PIECE_SHARE = 2e-5
+"""Maximum share of the gaze on a visible piece, so that densities narrower than a piece are integrated."""
 
-CUTS = 12  # a piece is cut so many times at most
+MAX_CUTS = 12  # maximum number of subdivisions of a piece
 
-# Four points spread over a piece tell which share of it is seen. Its corners tell whether an outline passes, and
-# nothing else: those of a hidden side reach into sight wherever it meets an edge that is seen. They are looked at a
-# little within, for a ray at the very edge of a face may meet its neighbour.
-_WITHIN = 1e-3
-_SPREAD = np.vstack([np.full((1, 3), 1 / 3), 1 / 6 + 0.5 * np.eye(3)])
-_LOOKED_AT = np.vstack([_SPREAD, _WITHIN + (1 - 3 * _WITHIN) * np.eye(3)])
+# Four points spread over a piece estimate its visible fraction. The corners only detect occlusion boundaries: corners
+# of a hidden side are visible where it meets a visible edge. They are inset slightly, since a ray to the edge of a face
+# may hit its neighbour.
+_CORNER_INSET = 1e-3
+_AREA_POINTS = np.vstack([np.full((1, 3), 1 / 3), 1 / 6 + 0.5 * np.eye(3)])
+_TEST_POINTS = np.vstack([_AREA_POINTS, _CORNER_INSET + (1 - 3 * _CORNER_INSET) * np.eye(3)])
 
 
-def visible_pieces(
+def iter_visible_pieces(
     target: SurfaceTarget, pieces: Pieces, density: Callable[[Pieces], np.ndarray], total: float, batch: int
 ) -> Iterator[tuple[Pieces, np.ndarray]]:
-    """``pieces`` that are seen, cut where outlines pass, with the gaze (P,) that each receives.
+    """Yield the visible pieces, subdivided at occlusion boundaries, with the gaze (P,) that each receives.
 
-    ``density`` of pieces, in 1/sr, what hides them left out; ``total``: all gaze, which limits are shares of;
-    ``batch``: pieces that are looked at together. The target is `sharp`.
+    Parameters
+    ----------
+    target
+        Target with binary visibility.
+    pieces
+        Pieces to test.
+    density
+        Returns the gaze density of pieces in 1/sr, without occlusion.
+    total
+        Total gaze, to which the limits are relative.
+    batch
+        Number of pieces per batch.
     """
     for a in range(0, len(pieces), batch):
-        left = pieces.select(slice(a, a + batch))
-        for level in range(CUTS + 1):
-            seen = _seen(target, left)
-            rows = np.flatnonzero(seen.any(axis=1))
-            left, seen = left.select(rows), seen[rows]
-            if not len(left):
+        pending = pieces.select(slice(a, a + batch))
+        for level in range(MAX_CUTS + 1):
+            is_visible = _test_visibility(target, pending)
+            rows = np.flatnonzero(is_visible.any(axis=1))
+            pending, is_visible = pending.select(rows), is_visible[rows]
+            if not len(pending):
                 break
-            whole = left.solid_angle * density(left)
-            most = np.where(seen.all(axis=1), WHOLE, MIXED) * total
-            cut = (whole > most) & (level < CUTS)
-            yield left.part(~cut), (whole * seen[:, : len(_SPREAD)].mean(axis=1))[~cut]
-            if not cut.any():
+            unoccluded = pending.solid_angle * density(pending)
+            limit = np.where(is_visible.all(axis=1), MAX_PIECE_SHARE, MAX_PARTIAL_SHARE) * total
+            needs_cut = (unoccluded > limit) & (level < MAX_CUTS)
+            yield pending.select(~needs_cut), (unoccluded * is_visible[:, : len(_AREA_POINTS)].mean(axis=1))[~needs_cut]
+            if not needs_cut.any():
                 break
-            left = left.part(cut).quartered()
+            pending = pending.select(needs_cut).subdivide()
 
 
-def _seen(target: SurfaceTarget, pieces: Pieces) -> np.ndarray:
-    """Whether each of the points (P, 7) is seen at which pieces are looked at."""
-    points = np.matmul(_LOOKED_AT, pieces.relative) + pieces.observer
-    count = len(_LOOKED_AT)
+def _test_visibility(target: SurfaceTarget, pieces: Pieces) -> np.ndarray:
+    """Return whether each of the test points (P, 7) is visible."""
+    points = np.matmul(_TEST_POINTS, pieces.relative) + pieces.observer
+    count = len(_TEST_POINTS)
     return target.is_visible(pieces.observer, points.reshape(-1, 3), np.repeat(pieces.face, count)).reshape(-1, count)
 
 
-# ---- Population ----
+# ---- Observers of a recording ----
 #
-# Where people were, by how long: the time of each tracked ray, and a few observers that stand for all of them.
+# Weights of gaze samples by the time they represent, and a few observers that represent all positions.
 
-MAX_GAP = 0.5  # seconds that a ray stands for at most: nobody knows where people were while they were not tracked
+MAX_GAP = 0.5  # maximum time in seconds that a sample represents
 
 WEIGHTINGS = ("time", "person", "equal")
-"""Whom rays count by: each by its time; so that all people count alike; each alike."""
+"""Weightings of samples: by represented time, with equal total weight per participant, or equal."""
 
-_CELLS = 4096
-_ROUNDS = 50
+_MAX_CELLS = 4096
+_MAX_ROUNDS = 50
 
 
 @dataclass(frozen=True, eq=False)
 class WeightedObservers:
-    """Observers at ``positions`` (M, 3), places where somebody was, with ``weights`` (M,) that add up to one. ``mean``
-    and ``farthest``: distance from there of where people were, the root of its mean square and 95 % of it."""
+    """Observers at ``positions`` (M, 3) with ``weights`` (M,) that sum to one, and the root mean square and the 95th
+    percentile of the distance between recorded positions and their observer."""
 
     positions: np.ndarray
     weights: np.ndarray
@@ -270,120 +286,131 @@ class WeightedObservers:
     p95_distance: float = 0.0
 
 
-def ray_durations(rays: Rays, gap: float = MAX_GAP) -> np.ndarray:
-    """Seconds (N,) that each ray stands for: until the next one of the same person and recording, and ``gap`` at most;
-    of the last of a recording the median of the others in it."""
+def ray_durations(rays: Rays, max_gap: float = MAX_GAP) -> np.ndarray:
+    """Return the time (N,) in seconds that each sample represents.
+
+    It is the time to the next sample of the same recording, at most ``max_gap``; for the last sample, the median of the
+    others.
+    """
     sessions = find_sessions(rays)
     order = np.arange(len(rays)) if sessions.order is None else sessions.order
     out = np.zeros(len(rays))
     for a, b in zip(sessions.starts[:-1], sessions.starts[1:]):
         rows = order[a:b]
-        step = np.clip(np.diff(rays.t[rows]), 0, gap)
+        step = np.clip(np.diff(rays.t[rows]), 0, max_gap)
         out[rows] = np.r_[step, np.median(step) if len(step) else 0.0]
-    # One ray alone, or many at one time, tell no length.
-    return out if out.sum() > 0 else np.full(len(rays), gap)
+    # Without any time step all samples get the same duration.
+    return out if out.sum() > 0 else np.full(len(rays), max_gap)
 
 
-def ray_weights(rays: Rays, by: str, gap: float = MAX_GAP) -> np.ndarray:
-    """Weights (N,) of ``rays`` that add up to one, by one of `WEIGHTS`."""
-    seconds = np.ones(len(rays)) if by == "equal" else ray_durations(rays, gap)
-    if by == "person":
+def ray_weights(rays: Rays, weighting: str, max_gap: float = MAX_GAP) -> np.ndarray:
+    """Return weights (N,) of samples that sum to one, by one of `WEIGHTINGS`."""
+    seconds = np.ones(len(rays)) if weighting == "equal" else ray_durations(rays, max_gap)
+    if weighting == "person":
         each = np.bincount(rays.person, seconds)
         seconds = seconds / np.where(each > 0, each, 1)[rays.person]
     return seconds / seconds.sum()
 
 
 def cluster_observers(positions: np.ndarray, weights: np.ndarray, count: int, seed: int = 0) -> WeightedObservers:
-    """At most ``count`` observers that stand for people who were at ``positions`` (N, 3) by ``weights`` (N,).
+    """Return at most ``count`` observers that represent ``positions`` (N, 3) with ``weights`` (N,).
 
-    Weighted k-means (S. Lloyd 1982) from starts that are drawn far apart (k-means++, D. Arthur, S. Vassilvitskii 2007),
-    on cells of positions; every centre is then moved to the nearest place where somebody was, since the mean of two
-    aisles lies in the shelf between them. An observer has the weight of all who are nearest to them.
+    Weighted k-means (S. Lloyd 1982) with k-means++ initialisation (D. Arthur, S. Vassilvitskii 2007) on binned
+    positions. Each centre is moved to the nearest recorded position, since the mean of two aisles lies in the shelf
+    between them. An observer's weight is that of the positions nearest to it.
     """
     from scipy.spatial import KDTree
 
     weights = np.asarray(weights, np.float64) / np.sum(weights)
-    place, mass = _cells(positions, weights)
-    if len(place) <= count:
-        centers = place
+    cells, mass = _bin_positions(positions, weights)
+    if len(cells) <= count:
+        centers = cells
     else:
         rng = np.random.default_rng(seed)
-        centers = _spread(place, mass, count, rng)
-        for _ in range(_ROUNDS):
-            near = KDTree(centers).query(place)[1]
-            total = np.bincount(near, mass, len(centers))
-            sums = np.stack([np.bincount(near, mass * c, len(centers)) for c in place.T], axis=1)
+        centers = _choose_initial_centers(cells, mass, count, rng)
+        for _ in range(_MAX_ROUNDS):
+            nearest = KDTree(centers).query(cells)[1]
+            total = np.bincount(nearest, mass, len(centers))
+            sums = np.stack([np.bincount(nearest, mass * c, len(centers)) for c in cells.T], axis=1)
             moved = np.where(total[:, None] > 0, sums / np.where(total > 0, total, 1)[:, None], centers)
             if np.allclose(moved, centers, rtol=0, atol=1e-6):
                 break
             centers = moved
-    # The nearest of people's positions, each once.
-    standing = positions[np.unique(KDTree(positions, leafsize=16, balanced_tree=False).query(centers)[1])]
-    apart, near = KDTree(standing).query(positions)
-    total = np.bincount(near, weights, len(standing))
-    order = np.argsort(apart, kind="stable")
-    far = apart[order][np.searchsorted(np.cumsum(weights[order]), 0.95 * weights.sum()).clip(max=len(apart) - 1)]
-    kept = total > 0
+    # Nearest recorded positions, without duplicates.
+    observers = positions[np.unique(KDTree(positions, leafsize=16, balanced_tree=False).query(centers)[1])]
+    distance, nearest = KDTree(observers).query(positions)
+    total = np.bincount(nearest, weights, len(observers))
+    order = np.argsort(distance, kind="stable")
+    p95_distance = distance[order][
+        np.searchsorted(np.cumsum(weights[order]), 0.95 * weights.sum()).clip(max=len(distance) - 1)
+    ]
+    has_weight = total > 0
     return WeightedObservers(
-        standing[kept], total[kept] / total.sum(), float(np.sqrt((weights * apart**2).sum())), float(far)
+        observers[has_weight],
+        total[has_weight] / total.sum(),
+        float(np.sqrt((weights * distance**2).sum())),
+        float(p95_distance),
     )
 
 
-def _cells(positions: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Means and weights of positions in a grid that grows coarser until it holds some thousand of them."""
+def _bin_positions(positions: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return means and weights of positions in a grid, which is coarsened until at most `_MAX_CELLS` cells are
+    occupied."""
     low, size = positions.min(axis=0), float(np.ptp(positions, axis=0).max())
     step = size / 1024
     while True:
         cell = np.floor((positions - low) / step).astype(np.int64) if step > 0 else np.zeros_like(positions, np.int64)
-        # Of each axis there are fewer than 2^20 cells: one number sorts faster than three.
+        # Each axis has fewer than 2^20 cells, so that one key represents a cell.
         key = cell @ np.array([1 << 40, 1 << 20, 1])
         _, number = np.unique(key, return_inverse=True)
         mass = np.bincount(number, weights)
-        if len(mass) <= _CELLS or step == 0:
+        if len(mass) <= _MAX_CELLS or step == 0:
             break
         step *= 1.5
     sums = np.stack([np.bincount(number, weights * c) for c in positions.T], axis=1)
-    known = mass > 0
-    return sums[known] / mass[known, None], mass[known]
+    is_occupied = mass > 0
+    return sums[is_occupied] / mass[is_occupied, None], mass[is_occupied]
 
 
-def _spread(place: np.ndarray, mass: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
-    chosen = [int(rng.choice(len(place), p=mass / mass.sum()))]
-    square = np.square(place - place[chosen[0]]).sum(axis=1)
-    while len(chosen) < count and (mass * square).sum() > 0:
-        chosen.append(int(rng.choice(len(place), p=mass * square / (mass * square).sum())))
-        square = np.minimum(square, np.square(place - place[chosen[-1]]).sum(axis=1))
-    return place[chosen]
+def _choose_initial_centers(cells: np.ndarray, mass: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
+    chosen = [int(rng.choice(len(cells), p=mass / mass.sum()))]
+    squared_distance = np.square(cells - cells[chosen[0]]).sum(axis=1)
+    while len(chosen) < count and (mass * squared_distance).sum() > 0:
+        chosen.append(int(rng.choice(len(cells), p=mass * squared_distance / (mass * squared_distance).sum())))
+        squared_distance = np.minimum(squared_distance, np.square(cells - cells[chosen[-1]]).sum(axis=1))
+    return cells[chosen]
 
 
-# ---- Ray source ----
+# ---- Gaze samples ----
 #
-# What tracked rays leave on a surface: each as a bundle of rays in a cone, in place of a line without width.
+# A sample is cast as a bundle of rays in a cone.
 #
-# A line ends at one point of a mesh: a thin edge loses it, and a gap lets all of it through. A cone as wide as the
-# tracker errs and the fovea sees is divided among what it meets (Martin et al., view-cone sampling, arXiv 2601.02721).
+# A single ray ends at one point of a mesh: it misses thin edges and passes through gaps. A cone with the width of the
+# tracking error and the fovea distributes the sample over all surfaces in it (Martin et al., view-cone sampling, arXiv
+# 2601.02721).
 
-CASTS = 1 << 20  # rays that are cast in one launch
+MAX_CASTS = 1 << 20  # maximum number of rays per launch
 
 
 @dataclass(frozen=True, kw_only=True)
 class RaySettings:
-    """``cone``: its standard deviation in radian, 0 for a line; ``bundle``: rays of each; ``seed`` of their turns."""
+    """Standard deviation of the cone in radians (0: a single ray), number of rays per cone, and ``seed`` of their
+    azimuths."""
 
     cone_sigma: float = 0.0
     rays_per_cone: int = 16
     seed: int = 0
 
     @property
-    def casts(self) -> int:
-        """Rays cast for each tracked one."""
+    def rays_per_sample(self) -> int:
+        """Number of rays per sample."""
         return self.rays_per_cone if self.cone_sigma > 0 else 1
 
 
 @dataclass(frozen=True, eq=False)
 class TrackedRays:
-    """``origins``, unit ``directions`` (N, 3) in the scene and ``weights`` (N,); ``first``: the number of the first one
-    among all rays, with which the draws of the bundles begin."""
+    """``origins`` and unit ``directions`` (N, 3) in the scene, ``weights`` (N,), and the index of the first sample
+    in the recording, which seeds the cones."""
 
     origins: np.ndarray
     directions: np.ndarray
@@ -394,78 +421,80 @@ class TrackedRays:
         return len(self.weights)
 
     def select(self, start: int, stop: int) -> TrackedRays:
-        """The rays from ``start`` up to ``stop``."""
+        """Return the samples from ``start`` to ``stop``."""
         rows = slice(start, stop)
         return TrackedRays(self.origins[rows], self.directions[rows], self.weights[rows], self.first_index + start)
 
 
 def sum_rays(target: SurfaceTarget, rays: TrackedRays, settings: RaySettings) -> SurfaceSums:
-    """What ``rays`` leave on ``target``: partial sums, which `visits.merge` adds up to those of more rays.
+    """Sum the attention of samples on ``target``. `merge_sums` adds the results of several parts.
 
-    The draws depend on the seed and on ``rays.first`` alone, so that parts that are cut alike give the same everywhere.
+    The random numbers depend on the seed and the index of the first sample only, so that equal parts give equal
+    results.
     """
     mesh = target.mesh
     on_faces, on_vertices = np.zeros(len(mesh.faces)), np.zeros(len(mesh.vertices))
     rng = np.random.default_rng([settings.seed, rays.first_index])
-    each, elsewhere, escaped = settings.casts, 0.0, 0.0
-    step = max(1, CASTS // each)
+    rays_per_sample, elsewhere, escaped = settings.rays_per_sample, 0.0, 0.0
+    step = max(1, MAX_CASTS // rays_per_sample)
     for a in range(0, len(rays), step):
-        some = rays.select(a, min(a + step, len(rays)))
-        directions = sample_cone(some.directions, settings.cone_sigma, each, rng).reshape(-1, 3)
-        ends = target.trace(np.repeat(some.origins, each, axis=0), directions)
-        weights = np.repeat(some.weights / each, each)
-        on = ends.face >= 0
-        found = deposit(mesh.faces, len(mesh.vertices), ends.face[on], ends.barycentric[on], weights[on])
-        on_faces, on_vertices = on_faces + found[0], on_vertices + found[1]
+        batch = rays.select(a, min(a + step, len(rays)))
+        directions = sample_cone(batch.directions, settings.cone_sigma, rays_per_sample, rng).reshape(-1, 3)
+        ends = target.trace(np.repeat(batch.origins, rays_per_sample, axis=0), directions)
+        weights = np.repeat(batch.weights / rays_per_sample, rays_per_sample)
+        on_surface = ends.face >= 0
+        sums = deposit(
+            mesh.faces, len(mesh.vertices), ends.face[on_surface], ends.barycentric[on_surface], weights[on_surface]
+        )
+        on_faces, on_vertices = on_faces + sums[0], on_vertices + sums[1]
         elsewhere += float(weights[ends.elsewhere].sum())
-        escaped += float(weights[~on & ~ends.elsewhere].sum())
+        escaped += float(weights[~on_surface & ~ends.elsewhere].sum())
     weight = float(rays.weights.sum())
     return SurfaceSums(on_faces, on_vertices, elsewhere, escaped, weight, weight, len(rays))
 
 
-# ---- Sphere rule ----
+# ---- Quadrature over the sphere ----
 #
-# Directions over the sphere, many where there is much to see: a sum over them integrates narrow densities too.
+# Directions are denser where the density is high, so that narrow densities are integrated accurately.
 #
-# Rings of cells that are about as wide as high are cut again by what a density has in their middles, so that all
-# directions stand for about as much of it. What a part of the sphere with an outline receives has then an error that
-# falls with their number alone, and not with how narrow the density is. The rings lie askew in the scene: along its
-# axes they would be parallel to the outlines of upright things, which would fall between the same two directions
-# everywhere.
+# The sphere is divided into rings of approximately square cells, which are subdivided according to the density at their
+# centres, so that all directions represent about the same share. The error at occlusion boundaries then depends on the
+# number of directions only, and not on the width of the density. The rings are rotated relative to the scene axes,
+# since they would otherwise be parallel to the boundaries of upright objects.
 
-CELLS = 1 << 14  # cells of the first cut, 1.6 degrees wide: narrower densities may be missed
-_FINEST = 64
-# Any turn that makes no axis of the scene lie along a ring.
-_ASKEW = np.linalg.qr(np.array([[0.61, -0.37, 0.42], [0.29, 0.83, -0.31], [-0.53, 0.17, 0.71]]))[0]
+CELLS = 1 << 14  # initial number of cells, 1.6 degrees wide; narrower densities may be missed
+_MAX_SUBDIVISIONS = 64
+# A rotation that aligns no scene axis with a ring.
+_RING_ROTATION = np.linalg.qr(np.array([[0.61, -0.37, 0.42], [0.29, 0.83, -0.31], [-0.53, 0.17, 0.71]]))[0]
 
 
-def sphere_rule(
+def sphere_quadrature(
     density: Callable[[np.ndarray], np.ndarray], count: int, cells: int = CELLS
 ) -> tuple[np.ndarray, np.ndarray]:
-    """About ``count`` unit directions (N, 3), some more, and the solid angle (N,) of each in steradian, 4π together.
+    """Return at least ``count`` unit directions (N, 3) and their solid angles (N,) in steradians, which sum to 4π.
 
-    ``density`` of unit directions (M, 3) gives values (M,), not negative. Raises ``ValueError`` for no directions.
+    ``density`` maps unit directions (M, 3) to non-negative values (M,). Raises ``ValueError`` for a count below 1.
     """
     if count < 1 or cells < 1:
-        raise ValueError(f"a rule has a direction and a cell at least, got {count} and {cells}")
-    top, bottom, turn, width = _cells_sphere_rule(cells)
+        raise ValueError(f"a quadrature needs at least one direction and one cell, got {count} and {cells}")
+    top, bottom, turn, width = _ring_cells(cells)
     area = (top - bottom) * width
-    mass = area * density(_directions(0.5 * (top + bottom), turn + 0.5 * width))
+    mass = area * density(_directions_from_cylindrical(0.5 * (top + bottom), turn + 0.5 * width))
     share = mass / mass.sum() if mass.sum() > 0 else area / (4 * np.pi)
-    parts = np.clip(np.ceil(np.sqrt(count * share)), 1, _FINEST).astype(np.int64)
+    subdivisions = np.clip(np.ceil(np.sqrt(count * share)), 1, _MAX_SUBDIVISIONS).astype(np.int64)
     directions, angles = [], []
-    for n in np.unique(parts):
-        of = np.flatnonzero(parts == n)[:, None, None]
-        at = (np.arange(n) + 0.5) / n
-        z = bottom[of] + (top - bottom)[of] * at[:, None]
-        phi = turn[of] + width[of] * at
-        directions.append(_directions(*(np.ravel(v) for v in np.broadcast_arrays(z, phi))))
-        angles.append(np.repeat(area[of.ravel()] / n**2, n * n))
+    for n in np.unique(subdivisions):
+        indices = np.flatnonzero(subdivisions == n)[:, None, None]
+        fraction = (np.arange(n) + 0.5) / n
+        z = bottom[indices] + (top - bottom)[indices] * fraction[:, None]
+        phi = turn[indices] + width[indices] * fraction
+        directions.append(_directions_from_cylindrical(*(np.ravel(v) for v in np.broadcast_arrays(z, phi))))
+        angles.append(np.repeat(area[indices.ravel()] / n**2, n * n))
     return np.concatenate(directions), np.concatenate(angles)
 
 
-def _cells_sphere_rule(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Heights of the upper and the lower edge of each cell, its first azimuth, and how many radian it spans."""
+def _ring_cells(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the upper and lower height of each cell, its first azimuth, and its width in radians."""
     rings = max(1, round(np.sqrt(np.pi * count / 4)))
     z = np.cos(np.pi * np.arange(rings + 1) / rings)
     around = np.maximum(1, np.rint(2 * rings * np.sin(np.pi * (np.arange(rings) + 0.5) / rings))).astype(np.int64)
@@ -475,32 +504,30 @@ def _cells_sphere_rule(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, 
     return z[ring], z[ring + 1], number * width, width
 
 
-def _directions(z: np.ndarray, phi: np.ndarray) -> np.ndarray:
+def _directions_from_cylindrical(z: np.ndarray, phi: np.ndarray) -> np.ndarray:
     r = np.sqrt(np.maximum((1 - z) * (1 + z), 0))
-    return np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=-1) @ _ASKEW.T
+    return np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=-1) @ _RING_ROTATION.T
 
 
-# ---- What the gaze of observers leaves on a surface, after occlusion ----
+# ---- Gaze of observers ----
 #
-# An observer at p_o looks into the direction ω with the density g(ω), in 1/sr. On a face A they leave
+# An observer at p_o with the gaze density g(ω) in 1/sr leaves on a face A the attention
 #
 #     ∫_A g(ω) V(y, p_o) dω(y),    dω = |cos θ| dA / |y - p_o|²
 #
-# (Veach 1997, section 8.2.2.2), summed over pieces that are small as seen from p_o, each of which counts with its exact
-# solid angle (`pieces`), with g at its centre, and with the share of it that is seen, for which it is cut where
-# outlines pass (`outlines`). In a medium, or with a fall-off behind outlines, V is that of
-# `nerg_mi.probes.surface_attention.attended` at the centre. Over the sphere of the same observer directions
-# (`sphere_rule`) tell what g adds up to and how much of it meets something else, or nothing. Both sums use other
-# points, and what they lack of each other is the error that is told.
+# (Veach 1997, section 8.2.2.2). The integral is a sum over small pieces with their exact solid angles, the density at
+# their centres and their visible fractions. In a medium, or with a fall-off at occlusion boundaries, V is evaluated at
+# the centre by `nerg_mi.probes.surface_attention`. The total gaze, and the parts that hit other surfaces or escape, are
+# integrated over the sphere. The two quadratures use different points; their discrepancy is reported as the error.
 
-BATCH = 1 << 18  # pieces in one launch
-FACES_PER_BATCH = 1 << 16  # faces that are cut into pieces together
+BATCH_SIZE = 1 << 18  # number of pieces per launch
+FACES_PER_BATCH = 1 << 16  # number of faces per subdivision batch
 
 
 @dataclass(frozen=True, kw_only=True)
 class GazeSumSettings:
-    """``angle``: radian under which an observer sees a piece at most; ``cone``: standard deviation in radian of the
-    cone that gaze is seen through, 0 for none; ``directions`` over the sphere, about."""
+    """Maximum angle of a piece in radians, standard deviation of the gaze cone in radians (0: none), and approximate
+    number of ``directions`` over the sphere."""
 
     max_angle: float = 0.035
     cone_sigma: float = 0.0
@@ -509,28 +536,28 @@ class GazeSumSettings:
 
 @dataclass(frozen=True, eq=False)
 class SurfaceObserver:
-    """An observer at ``center`` (one lane): their ``density`` where they see a surface, as
-    `nerg_mi.probes.surface_attention` wants it, and ``along`` directions, whatever is met there."""
+    """An observer at ``center`` (one lane): ``density`` at surface points, as `nerg_mi.probes.surface_attention`
+    needs it, and density along directions."""
 
     center: Point3f
     density: Density
-    along: Callable[[Vector3f], Any]
+    density_along: Callable[[Vector3f], Any]
 
 
-MakeObserver = Callable[[np.ndarray], SurfaceObserver]  # of an observer's position (3,)
+MakeObserver = Callable[[np.ndarray], SurfaceObserver]  # maps a position (3,) to an observer
 
 
 def observers_from_field(gaze: GazeFieldInstance, geometry: SceneGeometry, settings: ObserverSettings) -> MakeObserver:
-    """Observers whose gaze is the field ``gaze`` in ``place``, traced with ``settings``."""
+    """Return a function that creates observers whose gaze is the field ``gaze``, traced with ``settings``."""
 
     def make(eye: np.ndarray) -> SurfaceObserver:
-        center = _center(eye)
-        # Nobody is asked for twice, and what is known of all of them would fill the memory.
+        center = _opaque_point(eye)
+        # A new cache per observer, since observers are not reused and a common cache would grow.
         observed = gaze.for_observers([center], geometry, settings, ObserverCache())
         return SurfaceObserver(
             center,
             lambda p_od, p_o, r_o, active: observed.evaluate(p_od, p_o, r_o, active)[0],
-            lambda directions: observed.along(center, directions),
+            lambda directions: observed.evaluate_along(center, directions),
         )
 
     return make
@@ -539,80 +566,98 @@ def observers_from_field(gaze: GazeFieldInstance, geometry: SceneGeometry, setti
 def sum_gaze(
     target: SurfaceTarget,
     make_observer: MakeObserver,
-    eyes: np.ndarray,
+    positions: np.ndarray,
     weights: Sequence[float] | np.ndarray,
     settings: GazeSumSettings,
 ) -> SurfaceSums:
-    """What observers at ``eyes`` (M, 3), who count by ``weights`` (M,), leave on ``target``: partial sums, which
-    `merge` adds up to those of more observers."""
+    """Sum the attention of weighted observers on ``target``. `merge_sums` adds the results of several parts."""
     none = SurfaceSums.zeros(len(target.mesh.faces), len(target.mesh.vertices))
     with dr.suspend_grad():
-        return merge_sums([none, *(_of_one(target, make_observer(eye), float(w), eye, settings) for eye, w in zip(eyes, weights))])
+        return merge_sums(
+            [
+                none,
+                *(
+                    _sum_one_observer(target, make_observer(eye), float(w), eye, settings)
+                    for eye, w in zip(positions, weights)
+                ),
+            ]
+        )
 
 
-def _of_one(
-    target: SurfaceTarget, looker: SurfaceObserver, weight: float, eye: np.ndarray, settings: GazeSumSettings
+def _sum_one_observer(
+    target: SurfaceTarget, observer: SurfaceObserver, weight: float, position: np.ndarray, settings: GazeSumSettings
 ) -> SurfaceSums:
-    mesh, eye = target.mesh, np.asarray(eye, np.float64)
-    everywhere = along_through(looker, settings.cone_sigma)
-    directions, angles = sphere_rule(everywhere, settings.directions)
-    share = weight * angles * everywhere(directions)
-    ends = target.trace(np.broadcast_to(eye, directions.shape), directions)
+    mesh, position = target.mesh, np.asarray(position, np.float64)
+    density = cone_density_along(observer, settings.cone_sigma)
+    directions, angles = sphere_quadrature(density, settings.directions)
+    share = weight * angles * density(directions)
+    ends = target.trace(np.broadcast_to(position, directions.shape), directions)
     total, escaped = float(share.sum()), float(share[(ends.face < 0) & ~ends.elsewhere].sum())
     on_faces, on_vertices = np.zeros(len(mesh.faces)), np.zeros(len(mesh.vertices))
     for a in range(0, len(mesh.faces), FACES_PER_BATCH):
-        pieces = pieces_of(mesh, eye, settings.max_angle, slice(a, a + FACES_PER_BATCH))
-        for some, received in _received(target, looker, pieces, total / weight if weight else 0.0, settings.cone_sigma):
-            found = deposit(mesh.faces, len(mesh.vertices), some.face, some.centroid_barycentric, weight * received)
-            on_faces, on_vertices = on_faces + found[0], on_vertices + found[1]
+        pieces = subdivide_faces(mesh, position, settings.max_angle, slice(a, a + FACES_PER_BATCH))
+        for some, received in _iter_received_gaze(
+            target, observer, pieces, total / weight if weight else 0.0, settings.cone_sigma
+        ):
+            sums = deposit(mesh.faces, len(mesh.vertices), some.face, some.centroid_barycentric, weight * received)
+            on_faces, on_vertices = on_faces + sums[0], on_vertices + sums[1]
     return SurfaceSums(on_faces, on_vertices, float(share[ends.elsewhere].sum()), escaped, total, weight, 1)
 
 
-def _received(
-    target: SurfaceTarget, looker: SurfaceObserver, pieces: Pieces, total: float, cone: float
+def _iter_received_gaze(
+    target: SurfaceTarget, observer: SurfaceObserver, pieces: Pieces, total: float, cone: float
 ) -> Iterator[tuple[Pieces, np.ndarray]]:
-    """Pieces, some of which may be cut again, and the gaze (P,) that each receives."""
-    density = density_through(looker, cone)
+    """Yield pieces, possibly subdivided, with the gaze (P,) that each receives."""
+    density = cone_density(observer, cone)
     if target.has_binary_visibility:
-        yield from visible_pieces(target, pieces, lambda some: _of_pieces(looker, density, some), total, BATCH)
+        yield from iter_visible_pieces(
+            target, pieces, lambda batch: _unoccluded_density(observer, density, batch), total, BATCH_SIZE
+        )
         return
-    for a in range(0, len(pieces), BATCH):
-        # Most of a place is hidden from wherever one stands, and gaze costs more than rays.
-        some = pieces.select(slice(a, a + BATCH))
-        some = some.select(_of_seen(target, looker, unit_density, some) > 0)
-        if len(some):
-            yield some, some.solid_angle * _of_seen(target, looker, density, some)
+    for a in range(0, len(pieces), BATCH_SIZE):
+        # Most surfaces are occluded, and evaluating gaze is more expensive than tracing.
+        batch = pieces.select(slice(a, a + BATCH_SIZE))
+        batch = batch.select(_occluded_density(target, observer, unit_density, batch) > 0)
+        if len(batch):
+            yield batch, batch.solid_angle * _occluded_density(target, observer, density, batch)
 
 
-def _of_seen(target: SurfaceTarget, looker: SurfaceObserver, density: Density, pieces: Pieces) -> np.ndarray:
+def _occluded_density(target: SurfaceTarget, observer: SurfaceObserver, density: Density, pieces: Pieces) -> np.ndarray:
     normals = target.mesh.normals[pieces.face]
-    return after_occlusion(target.geometry, looker, density, pieces.centroids, normals, target.falloff, target.settings)
+    return occluded_density(
+        target.geometry, observer, density, pieces.centroids, normals, target.falloff, target.settings
+    )
 
 
-def unhidden(looker: SurfaceObserver, density: Density, points: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """``density`` (N,) of ``looker`` at ``points`` (N, 3), along unit ``directions`` (N, 3), in 1/sr, whatever may
-    stand between."""
+def unoccluded_density(
+    observer: SurfaceObserver, density: Density, points: np.ndarray, directions: np.ndarray
+) -> np.ndarray:
+    """Return the gaze density (N,) of an observer at ``points`` (N, 3), along unit ``directions`` (N, 3), in 1/sr,
+    without occlusion."""
     mi = variant_types()
     r_o, p_od = to_vector(mi.Vector3f, directions), to_vector(mi.Point3f, points)
-    p_o = looker.center + dr.zeros(mi.Point3f, len(points))
-    return _rows(density(p_od, p_o, r_o, dr.full(mi.Bool, True, len(points))), len(points))
+    p_o = observer.center + dr.zeros(mi.Point3f, len(points))
+    return _to_array(density(p_od, p_o, r_o, dr.full(mi.Bool, True, len(points))), len(points))
 
 
-def density_through(looker: SurfaceObserver, cone: float) -> Density:
-    """The density of ``looker`` seen through a cone of standard deviation ``cone`` in radian; 0: itself."""
-    if cone == 0:
-        return looker.density
-    return lambda p_od, p_o, r_o, active: blur_density(looker.along, r_o, cone)
+def cone_density(observer: SurfaceObserver, cone_sigma: float) -> Density:
+    """Return the density of an observer, convolved with a cone; a standard deviation of 0 returns the density
+    itself."""
+    if cone_sigma == 0:
+        return observer.density
+    return lambda p_od, p_o, r_o, active: blur_density(observer.density_along, r_o, cone_sigma)
 
 
-def _of_pieces(looker: SurfaceObserver, density: Density, pieces: Pieces) -> np.ndarray:
+def _unoccluded_density(observer: SurfaceObserver, density: Density, pieces: Pieces) -> np.ndarray:
     middle = pieces.relative.mean(axis=1)
-    return unhidden(looker, density, pieces.centroids, middle / np.linalg.norm(middle, axis=1, keepdims=True))
+    return unoccluded_density(
+        observer, density, pieces.centroids, middle / np.linalg.norm(middle, axis=1, keepdims=True)
+    )
 
 
-def after_occlusion(
-    place: SceneGeometry,
-    looker: SurfaceObserver,
+def occluded_density(
+    geometry: SceneGeometry,
+    observer: SurfaceObserver,
     density: Density,
     points: np.ndarray,
     normals: np.ndarray,
@@ -620,34 +665,43 @@ def after_occlusion(
     settings: ObserverSettings,
     penetration: Float | float = 0.0,
 ) -> np.ndarray:
-    """``density`` (N,) of ``looker`` after occlusion by what may be a medium, at ``points`` on surfaces with
-    ``normals`` (N, 3), in 1/sr; ``penetration`` as of `nerg_mi.probes.surface_attention.attended`."""
+    """Return the gaze density (N,) of an observer at surface ``points`` with ``normals`` (N, 3), in 1/sr, after
+    occlusion.
+
+    ``penetration`` and ``falloff`` are as in `nerg_mi.probes.surface_attention`.
+    """
     mi = variant_types()
-    p_o, p = looker.center + dr.zeros(mi.Point3f, len(points)), to_vector(mi.Point3f, points)
+    p_o, p = observer.center + dr.zeros(mi.Point3f, len(points)), to_vector(mi.Point3f, points)
     n = to_vector(mi.Vector3f, normals)
-    return _rows(attention_per_sr(place, density, p_o, p, n, falloff, settings, True, penetration=penetration), len(points))
+    return _to_array(
+        attention_per_sr(geometry, density, p_o, p, n, falloff, settings, True, penetration=penetration), len(points)
+    )
 
 
 def unit_density(p_od: Any, p_o: Any, r_o: Any, active: Any) -> Any:
-    """A density of 1, of which occlusion leaves the visibility."""
+    """Constant density of 1, whose value after occlusion is the visibility."""
     return type(r_o.x)(1)
 
 
-def _rows(values: Any, count: int) -> np.ndarray:
-    """What a kernel gives, (count,) float64, also where it is one constant."""
+def _to_array(values: Any, count: int) -> np.ndarray:
+    """Convert kernel values to float64 (count,), also if they are a single constant."""
     return np.broadcast_to(np.array(values, np.float64), (count,))
 
 
-def along_through(looker: SurfaceObserver, cone: float) -> Callable[[np.ndarray], np.ndarray]:
-    """The density (N,) of ``looker`` in unit directions (N, 3), seen through a cone as `density_through` has it."""
+def cone_density_along(observer: SurfaceObserver, cone_sigma: float) -> Callable[[np.ndarray], np.ndarray]:
+    """Return a function of unit directions (N, 3) that evaluates the density of an observer, convolved with a cone."""
     mi = variant_types()
-    along = looker.along if cone == 0 else lambda directions: blur_density(looker.along, directions, cone)
-    return lambda d: _rows(along(to_vector(mi.Vector3f, d)), len(d))
+    along = (
+        observer.density_along
+        if cone_sigma == 0
+        else lambda directions: blur_density(observer.density_along, directions, cone_sigma)
+    )
+    return lambda d: _to_array(along(to_vector(mi.Vector3f, d)), len(d))
 
 
-def _center(eye: np.ndarray) -> Point3f:
+def _opaque_point(position: np.ndarray) -> Point3f:
     mi = variant_types()
-    center = mi.Point3f(np.asarray(eye, np.float64).tolist())
-    # A position that is a constant of the kernel would be compiled anew for every observer.
+    center = mi.Point3f(np.asarray(position, np.float64).tolist())
+    # A literal position would compile a new kernel for each observer.
     dr.make_opaque(center)
     return center

@@ -1,4 +1,4 @@
-"""Attention on Gaussian splats: from observers and from tracked rays, the area that each stands for, and smoothing."""
+"""Attention on Gaussian splats from observers and gaze samples, splat areas, and smoothing."""
 
 from __future__ import annotations
 
@@ -24,130 +24,156 @@ from .sources import (
     RaySettings,
     SurfaceObserver,
     TrackedRays,
-    after_occlusion,
-    along_through,
+    cone_density,
+    cone_density_along,
+    occluded_density,
     sample_cone,
-    density_through,
-    sphere_rule,
-    unhidden,
+    sphere_quadrature,
     unit_density,
+    unoccluded_density,
 )
 
 # ---- Splat hits ----
 #
-# The Gaussians that rays meet, hit by hit, as arrays of NumPy: sums of them are the same to the bit each time.
+# Gaussians on rays, in order, as NumPy arrays, so that sums are bitwise reproducible.
 #
-# A kernel that added to the Gaussians itself would add in whatever order its threads arrive. So it only finds hits,
-# some at a time, as the march does (`nerg_mi.transport.march_primal`), and the light that is left is followed in
-# float64.
+# A kernel that accumulates on the Gaussians would add in the order of its threads. Therefore kernels only find hits,
+# some at a time as in the march (`nerg_mi.transport.march_primal`), and transmittance is accumulated in float64.
 
 
 @dataclass(frozen=True, eq=False)
 class HitGroup:
-    """The next hits of the rays numbered ``rows`` (M,), nearest first, K at most: ``index`` (M, K) of the Gaussians in
-    the order of the file, ``arriving`` and ``absorbed`` (M, K), the light that reaches each and the share of it that it
-    takes, which is 0 where there is no hit. ``left`` (M,): light behind the last; ``through`` (M,): nothing is met of
-    it any more."""
+    """The next hits of M rays, nearest first, K at most.
+
+    Parameters
+    ----------
+    rows
+        Indices of the rays, (M,).
+    index
+        Gaussian of each hit in the order of the file, (M, K).
+    transmittance
+        Transmittance before each hit, (M, K).
+    alpha
+        Opacity of each hit, (M, K); 0 if there is no hit.
+    remaining
+        Transmittance after the last hit, (M,).
+    has_escaped
+        Whether the ray has no further hits, (M,).
+    """
 
     rows: np.ndarray
     index: np.ndarray
-    arriving: np.ndarray
+    transmittance: np.ndarray
     alpha: np.ndarray
     remaining: np.ndarray
-    through: np.ndarray
+    has_escaped: np.ndarray
 
 
-def groups_of_hits(
+def iter_hit_groups(
     arrays: SplatArrays,
     origins: np.ndarray,
     directions: np.ndarray,
-    before: np.ndarray | None = None,
-    stop: float = DEFAULT_HITS_STOP,
+    max_distance: np.ndarray | None = None,
+    min_transmittance: float = DEFAULT_HITS_STOP,
 ) -> Generator[HitGroup, np.ndarray | None, None]:
-    """What rays with ``origins`` (N, 3) and unit ``directions`` (N, 3), in the frame of ``arrays``, meet of them.
+    """Yield the hits of rays with ``origins`` and unit ``directions`` (N, 3), in the frame of ``arrays``.
 
-    Up to the distances ``before`` (N,), everywhere without them, and until no more than ``stop`` of the light is left.
-    Who has seen enough of a ray may `send` the rows that go on, a part of those of the last group.
+    Rays end at ``max_distance`` (N,) and when their transmittance falls to ``min_transmittance``. Use `send` to pass
+    the rows of the last group that should continue.
     """
     hits, order = SplatHits(arrays), np.array(arrays.order).astype(np.int64)
-    rows, ends = np.arange(len(origins)), np.full(len(origins), np.inf) if before is None else np.asarray(before)
-    light, last, thing = np.ones(len(origins)), np.full(len(origins), -1e-37), np.zeros(len(origins), np.int64)
+    rows, ends = (
+        np.arange(len(origins)),
+        np.full(len(origins), np.inf) if max_distance is None else np.asarray(max_distance),
+    )
+    light, last, tree_index = np.ones(len(origins)), np.full(len(origins), -1e-37), np.zeros(len(origins), np.int64)
     while len(rows):
-        t, absorbed, place = _next(hits, origins[rows], directions[rows], (last, thing), ends[rows], light, stop)
-        met = np.isfinite(t)
-        absorbed = np.where(met, absorbed, 0.0)
+        t, absorbed, place = _next_hits(
+            hits, origins[rows], directions[rows], (last, tree_index), ends[rows], light, min_transmittance
+        )
+        is_hit = np.isfinite(t)
+        absorbed = np.where(is_hit, absorbed, 0.0)
         after = light[:, None] * np.cumprod(1 - absorbed, axis=1)
         arriving = np.concatenate([light[:, None], after[:, :-1]], axis=1)
         left = after[:, -1]
-        more = met[:, -1] & (left > stop)
-        # A group is cut short where no light is left, too.
-        through = ~more & (left > stop)
-        index = np.where(met, order[np.where(met, place, 0)], -1)
-        wanted = yield HitGroup(rows, index, arriving, absorbed, left, through)
-        if wanted is not None:
-            more &= np.isin(rows, wanted)
-        rows, light, last, thing = rows[more], left[more], t[more, -1], place[more, -1]
+        is_active = is_hit[:, -1] & (left > min_transmittance)
+        # A group also ends when the transmittance is too low.
+        through = ~is_active & (left > min_transmittance)
+        index = np.where(is_hit, order[np.where(is_hit, place, 0)], -1)
+        requested_rows = yield HitGroup(rows, index, arriving, absorbed, left, through)
+        if requested_rows is not None:
+            is_active &= np.isin(rows, requested_rows)
+        rows, light, last, tree_index = rows[is_active], left[is_active], t[is_active, -1], place[is_active, -1]
 
 
-def _next(hits, origins, directions, after, before, light, stop) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Distance, share and place in the tree (M, K) of the next hits; distances are infinite where there are none."""
+def _next_hits(hits, origins, directions, after, before, light, stop) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return distance, opacity and tree index (M, K) of the next hits; distances are infinite without a hit."""
     mi = variant_types()
     o, d = to_vector(mi.Point3f, origins), to_vector(mi.Vector3f, directions)
     count = len(origins)
-    given = lambda values: mi.Float(copy_aligned(values).ravel())
+    to_float = lambda values: mi.Float(copy_aligned(values).ravel())
     ray = LocalRay(o, d, d, mi.Float(0), mi.Float(dr.inf))
-    last = LastHit(given(after[0]), mi.UInt32(copy_aligned(after[1], np.uint32).ravel()))
+    last = LastHit(to_float(after[0]), mi.UInt32(copy_aligned(after[1], np.uint32).ravel()))
     with dr.suspend_grad():
-        found = hits.find_next(
-            ray, last, given(before), given(light), dr.opaque(mi.Float, stop), dr.full(mi.Bool, True, count)
+        hits_found = hits.find_next(
+            ray, last, to_float(before), to_float(light), dr.opaque(mi.Float, stop), dr.full(mi.Bool, True, count)
         )
-        dr.eval(found.t, found.absorbed, found.index)
+        dr.eval(hits_found.t, hits_found.absorbed, hits_found.index)
     stacked = lambda values, kind: np.stack([np.array(v).astype(kind) for v in values], axis=1)
-    return stacked(found.t, np.float64), stacked(found.absorbed, np.float64), stacked(found.index, np.int64)
+    return (
+        stacked(hits_found.t, np.float64),
+        stacked(hits_found.absorbed, np.float64),
+        stacked(hits_found.index, np.int64),
+    )
 
 
-# ---- The area that each Gaussian takes of the surface it is a part of, seen from either of its sides ----
+# ---- Splat areas ----
 #
-# Parallel rays that fall on a surface of Gaussians, one to a unit of area, leave A_i = ∫ T_i α_i dA on each of them:
-# areas that add up to the surface's where it is opaque, however many overlap. With α_i = o_i exp(-r² / 2) that is
+# Effective area of each Gaussian, seen from either side.
+#
+# Parallel rays on a surface of Gaussians, with one ray per unit area, leave A_i = ∫ T_i α_i dA on each of them. These
+# areas sum to the area of an opaque surface, for any overlap. With α_i = o_i exp(-r² / 2),
 #
 #     A_i = 2π σ_1 σ_2 o_i (1 - exp(-e² / 2)) E[T_i]
 #
-# for the two longest standard deviations, the cut-off at e of them, and the mean of the light that reaches the Gaussian
-# over its own profile, which a few rays around the shortest axis tell: not along it, for the order of Gaussians in one
-# plane would then be that of their numbers. They start as far before it as a point may lie
-# behind a surface and still be seen: a place that stands before it hides it, and takes nothing of its area.
+# with the two largest standard deviations, the cut-off e in units of them, and the mean transmittance over the profile
+# of the Gaussian. The mean is estimated from a few rays around the shortest axis. They are tilted, since along the axis
+# the order of Gaussians in one plane would be that of their indices. They start in front of the Gaussian by the
+# tolerance with which a point behind a surface counts as visible, so that closer surfaces do not reduce the area.
 
-RAYS_PER_SIDE = 8  # to a side of a Gaussian
-MIN_VISIBLE_FRACTION = 0.05  # of its whole area: a side of which less is seen counts as hidden
-TILT = np.radians(25)  # of the rays
-_BATCH = 1 << 17
-# Multiples of both together fill a square evenly (the plastic number).
-_SPREAD = 0.7548776662466927, 0.5698402909980532
+RAYS_PER_SIDE = 8  # number of rays per side of a Gaussian
+MIN_VISIBLE_FRACTION = 0.05  # minimum visible fraction of the area of a side
+TILT = np.radians(25)  # tilt of the rays
+_BATCH_SIZE = 1 << 17
+# R2 sequence (plastic number): multiples fill a square uniformly.
+_PLASTIC_STEPS = 0.7548776662466927, 0.5698402909980532
 _GOLDEN = np.pi * (3 - np.sqrt(5))
 
 
 def shortest_axes(splats: Splats) -> np.ndarray:
-    """The unit shortest axis (N, 3) of each Gaussian, float64."""
+    """Return the unit shortest axis (N, 3) of each Gaussian, float64."""
     return np.take_along_axis(splats.axes(), splats.scales.argmin(axis=1)[:, None, None], axis=2)[..., 0]
 
 
-def sides_of(directions: np.ndarray, axes: np.ndarray) -> np.ndarray:
-    """Which side (N,) of Gaussians with the shortest ``axes`` is seen along ``directions`` (N, 3 each): 0 along the
+def visible_sides(directions: np.ndarray, axes: np.ndarray) -> np.ndarray:
+    """Return the side (N,) of Gaussians with shortest ``axes`` that is seen along ``directions`` (N, 3): 0 along the
     axis, 1 against it."""
     return (np.einsum("ij,ij->i", directions, axes) <= 0).astype(np.int64)
 
 
 def unoccluded_areas(splats: Splats, extent: float) -> np.ndarray:
-    """Areas (N,) of Gaussians that nothing hides, in square scene units."""
+    """Return the areas (N,) of unoccluded Gaussians, in square scene units."""
     scales = np.sort(splats.scales.astype(np.float64), axis=1)
     opacity = np.minimum(splats.opacities.astype(np.float64), MAX_ALPHA)
     return 2 * np.pi * scales[:, 1] * scales[:, 2] * opacity * -np.expm1(-(extent**2) / 2)
 
 
 def compute_splat_areas(splats: Splats, arrays: SplatArrays, tolerance: float) -> np.ndarray:
-    """Areas (2, N) in square scene units of the sides (`sides_of`) of ``splats``, which ``arrays`` hold. ``tolerance``:
-    how far a point may lie behind a surface that is not hidden by it."""
+    """Return the areas (2, N) of both sides of ``splats``, in square scene units.
+
+    ``arrays`` hold the same splats. ``tolerance``: distance behind a surface within which a point is not occluded by
+    it.
+    """
     lights = np.zeros((2, len(splats)))
     axes, sigma = splats.axes(), splats.scales.astype(np.float64)
     order = np.argsort(sigma, axis=1, kind="stable")
@@ -159,124 +185,147 @@ def compute_splat_areas(splats: Splats, arrays: SplatArrays, tolerance: float) -
     radius = np.sqrt(-2 * np.log1p(-(np.arange(RAYS_PER_SIDE) + 0.5) / RAYS_PER_SIDE))
     turn = _GOLDEN * np.arange(RAYS_PER_SIDE)
     away = np.minimum(radius, arrays.extent) * np.array([np.cos(turn), np.sin(turn)])
-    step = _BATCH // RAYS_PER_SIDE
+    step = _BATCH_SIZE // RAYS_PER_SIDE
     for start in range(0, len(splats), step):
         part = slice(start, start + step)
-        on = (a * first)[part, None] * away[0][:, None] + (b * second)[part, None] * away[1][:, None]
-        # Which way each leans has nothing to do with where its point lies, or all of a plane would come too early.
-        lean = 2 * np.pi * np.modf(np.arange(len(splats))[part, None] * _SPREAD[0] + np.arange(RAYS_PER_SIDE) * _SPREAD[1])[0]
-        tilt = np.sin(TILT) * np.stack([np.cos(lean), np.sin(lean)])[..., None]
-        aside = first[part, None] * tilt[0] + second[part, None] * tilt[1]
-        # Where the peaks of rays lie that lean so: in the plane that the Gaussian's own measure calls upright to them.
-        over = (thin**2 / a)[part] * tilt[0, ..., 0] * away[0] + (thin**2 / b)[part] * tilt[1, ..., 0] * away[1]
-        before = (thin[part] + tolerance)[:, None] / np.cos(TILT)
+        offset = (a * first)[part, None] * away[0][:, None] + (b * second)[part, None] * away[1][:, None]
+        # Azimuths are independent of the positions, to avoid a systematic order in a plane.
+        azimuth = (
+            2
+            * np.pi
+            * np.modf(
+                np.arange(len(splats))[part, None] * _PLASTIC_STEPS[0] + np.arange(RAYS_PER_SIDE) * _PLASTIC_STEPS[1]
+            )[0]
+        )
+        tilt = np.sin(TILT) * np.stack([np.cos(azimuth), np.sin(azimuth)])[..., None]
+        tangential = first[part, None] * tilt[0] + second[part, None] * tilt[1]
+        # The peak of a tilted ray lies in the plane that is conjugate to it with respect to the covariance.
+        peak_shift = (thin**2 / a)[part] * tilt[0, ..., 0] * away[0] + (thin**2 / b)[part] * tilt[1, ..., 0] * away[1]
+        distance = (thin[part] + tolerance)[:, None] / np.cos(TILT)
         for side, sign in enumerate((1.0, -1.0)):
-            d = sign * np.cos(TILT) * normal[part, None] + aside
-            peak = splats.centers[part, None] + on - sign * (over / np.cos(TILT))[..., None] * normal[part, None]
-            o = peak - before * d
-            found = _light(arrays, o.reshape(-1, 3), d.reshape(-1, 3), np.repeat(before, RAYS_PER_SIDE), start)
-            lights[side, part] = found.reshape(-1, RAYS_PER_SIDE).mean(axis=1)
+            d = sign * np.cos(TILT) * normal[part, None] + tangential
+            peak = (
+                splats.centers[part, None] + offset - sign * (peak_shift / np.cos(TILT))[..., None] * normal[part, None]
+            )
+            o = peak - distance * d
+            light = _trace_light(arrays, o.reshape(-1, 3), d.reshape(-1, 3), np.repeat(distance, RAYS_PER_SIDE), start)
+            lights[side, part] = light.reshape(-1, RAYS_PER_SIDE).mean(axis=1)
     return unoccluded_areas(splats, arrays.extent) * lights
 
 
-def _light(arrays: SplatArrays, o: np.ndarray, d: np.ndarray, distance: np.ndarray, start: int) -> np.ndarray:
-    """Light (R,) that reaches, along each ray, the Gaussian that it is aimed at: `RAYS` to each, from number ``start``
-    on, whose peaks lie at ``distance`` (R,)."""
-    own, found = start + np.arange(len(o)) // RAYS_PER_SIDE, np.zeros(len(o))
-    # A little behind the peak, which is found once more.
-    groups = groups_of_hits(arrays, o, d, distance * 1.01 + 1e-5 * (np.abs(o).max(axis=1) + distance))
+def _trace_light(arrays: SplatArrays, o: np.ndarray, d: np.ndarray, distance: np.ndarray, start: int) -> np.ndarray:
+    """Return the transmittance (R,) at the target Gaussian of each ray, `RAYS_PER_SIDE` rays per Gaussian from index
+    ``start`` on.
+
+    ``distance`` (R,) is the distance to the peak of the target.
+    """
+    target, light = start + np.arange(len(o)) // RAYS_PER_SIDE, np.zeros(len(o))
+    # Extend slightly behind the peak, so that it is found.
+    groups = iter_hit_groups(arrays, o, d, distance * 1.01 + 1e-5 * (np.abs(o).max(axis=1) + distance))
     try:
         group = next(groups)
         while True:
-            met = group.index == own[group.rows, None]
-            here = met.any(axis=1)
-            found[group.rows[here]] = group.arriving[here, met[here].argmax(axis=1)]
-            group = groups.send(group.rows[~here])
+            is_target = group.index == target[group.rows, None]
+            has_target = is_target.any(axis=1)
+            light[group.rows[has_target]] = group.transmittance[has_target, is_target[has_target].argmax(axis=1)]
+            group = groups.send(group.rows[~has_target])
     except StopIteration:
-        return found
+        return light
 
 
-# ---- What tracked rays leave on Gaussian splats, and how much gaze meets none ----
+# ---- Gaze samples on splats ----
 #
-# A ray leaves on each Gaussian that it meets what it would contribute to a picture, T_i α_i: the light that reaches it
-# times the share that it takes. All of them and what goes through add up to one. It comes to one of the two sides of
-# the Gaussian (`splats.sides_of`).
+# A sample leaves on each Gaussian its contribution to an image, T_i α_i: the transmittance times the opacity.
+# Contributions and the escaped part sum to one. They are assigned to one of the two sides of a Gaussian
+# (`visible_sides`).
 #
-# Gaze per area is that share by the area that a Gaussian takes of what is seen (`splat_areas`): of rays that fall on a
-# surface with the density D, a Gaussian receives D ∫ T_i α_i dA, whatever else is around.
+# Attention per area is this contribution divided by the area of the Gaussian (`compute_splat_areas`): a Gaussian of a
+# surface with the ray density D receives D ∫ T_i α_i dA, whatever surrounds it.
 
-NUM_DIRECTIONS = 1 << 14  # in which an observer's gaze is looked at, about
-CASTS = 1 << 17  # rays that are cast in one launch: each brings a dozen hits
+NUM_DIRECTIONS = 1 << 14  # approximate number of directions for the total gaze of an observer
+MAX_CASTS = 1 << 17  # maximum number of rays per launch, with about a dozen hits each
 
 
 def sum_rays_on_splats(arrays: SplatArrays, axes: np.ndarray, rays: TrackedRays, settings: RaySettings) -> SurfaceSums:
-    """What ``rays``, in the frame of ``arrays``, leave on the Gaussians: partial sums, whose ``face`` (2 N,) are the
-    shares on their sides 0, then on their sides 1, and whose ``vertex`` is empty.
+    """Sum the attention of samples, in the frame of ``arrays``, on the Gaussians.
 
-    ``axes`` (N, 3): their shortest axes. ``escaped`` is the light that meets nothing more; what is left where a march
-    ends is unaccounted for: 1e-4 of a ray at most. The draws depend on the seed and on ``rays.first`` alone.
+    Parameters
+    ----------
+    arrays
+        Gaussians.
+    axes
+        Shortest axes, (N, 3).
+    rays
+        Gaze samples.
+    settings
+        Settings of the cones.
+
+    Returns
+    -------
+    SurfaceSums
+        The face sums (2 N,) are those of sides 0, then of sides 1; there are no vertex sums. The remaining
+        transmittance where a march ends, at most 1e-4 of a ray, is unaccounted for. Random numbers depend on the seed
+        and the index of the first sample only.
     """
     count = len(axes)
     rng = np.random.default_rng([settings.seed, rays.first_index])
-    each, shares, escaped = settings.casts, np.zeros(2 * count), 0.0
-    step = max(1, CASTS // each)
+    rays_per_sample, shares, escaped = settings.rays_per_sample, np.zeros(2 * count), 0.0
+    step = max(1, MAX_CASTS // rays_per_sample)
     for a in range(0, len(rays), step):
-        some = rays.select(a, min(a + step, len(rays)))
-        directions = sample_cone(some.directions, settings.cone_sigma, each, rng).reshape(-1, 3)
-        weights = np.repeat(some.weights / each, each)
-        for group in groups_of_hits(arrays, np.repeat(some.origins, each, axis=0), directions):
+        batch = rays.select(a, min(a + step, len(rays)))
+        directions = sample_cone(batch.directions, settings.cone_sigma, rays_per_sample, rng).reshape(-1, 3)
+        weights = np.repeat(batch.weights / rays_per_sample, rays_per_sample)
+        for group in iter_hit_groups(arrays, np.repeat(batch.origins, rays_per_sample, axis=0), directions):
             ray, hit = np.nonzero(group.index >= 0)
-            thing, rows = group.index[ray, hit], group.rows[ray]
-            side = sides_of(directions[rows], axes[thing])
-            share = weights[rows] * group.arriving[ray, hit] * group.alpha[ray, hit]
-            shares += np.bincount(side * count + thing, share, 2 * count)
-            escaped += float((weights[group.rows] * group.remaining)[group.through].sum())
+            gaussian, rows = group.index[ray, hit], group.rows[ray]
+            side = visible_sides(directions[rows], axes[gaussian])
+            share = weights[rows] * group.transmittance[ray, hit] * group.alpha[ray, hit]
+            shares += np.bincount(side * count + gaussian, share, 2 * count)
+            escaped += float((weights[group.rows] * group.remaining)[group.has_escaped].sum())
     weight = float(rays.weights.sum())
     return SurfaceSums(shares, np.zeros(0), 0.0, escaped, weight, weight, len(rays))
 
 
 def integrate_gaze(
-    arrays: SplatArrays, observer: SurfaceObserver, position: np.ndarray, cone: float = 0.0
+    arrays: SplatArrays, observer: SurfaceObserver, position: np.ndarray, cone_sigma: float = 0.0
 ) -> tuple[float, float]:
-    """What the gaze of ``looker``, an observer at ``eye`` (3,) in the frame of ``arrays``, adds up to over the sphere,
-    and how much of it meets no Gaussian: what comes through, as of rays. ``cone``: as of `sources.GazeSumSettings`.
+    """Return the integral of an observer's gaze over the sphere, and the part that meets no Gaussian.
+
+    The observer is at a position (3,) in the frame of ``arrays``; the cone is as in `GazeSumSettings`.
     """
-    density = along_through(observer, cone)
+    density = cone_density_along(observer, cone_sigma)
     with dr.suspend_grad():
-        directions, angles = sphere_rule(density, NUM_DIRECTIONS)
+        directions, angles = sphere_quadrature(density, NUM_DIRECTIONS)
         share, escaped = angles * density(directions), 0.0
-        for group in groups_of_hits(arrays, np.broadcast_to(position, directions.shape), directions):
-            escaped += float((share[group.rows] * group.remaining)[group.through].sum())
+        for group in iter_hit_groups(arrays, np.broadcast_to(position, directions.shape), directions):
+            escaped += float((share[group.rows] * group.remaining)[group.has_escaped].sum())
     return float(share.sum()), escaped
 
 
-# ---- Splat smoothing ----
+# ---- Smoothing on splats ----
 #
-# Smoothing of attention along the surfaces of Gaussian splats: from neighbour to neighbour, never through the air.
-#
-# Gaussians have no edges that heat could flow over (`smoothing`). What lies on a side of one of them moves in n equal
-# steps of the standard deviation e = s / √n, no less than `CLOSE` of what Gaussians are usually apart, to sides near
-# it:
+# Attention is exchanged between neighbouring sides of Gaussians, in n equal steps of the standard deviation e = s / √n,
+# at least `MIN_STEP_FRACTION` of the typical spacing:
 #
 #     u'_i = u_i + Σ_j w_ij (u_j / A_j - u_i / A_i),    w_ij = K_ij A_i A_j / max(S_i, S_j),    S_i = Σ_k K_ik A_k,
 #
-# with their areas A and K_ij = exp(-|c_i - c_j|² / 2e²): an integral with that kernel over what is there (cf. Belkin,
-# Sun, Wang 2009, "Constructing Laplace operator from point clouds in R^d"). Since w_ij = w_ji, nothing is lost and a
-# density that is the same everywhere stays so; since its sums are A_i at most, no amount becomes negative.
+# with the areas A and K_ij = exp(-|c_i - c_j|² / 2e²), a kernel integral (cf. Belkin, Sun, Wang 2009, "Constructing
+# Laplace operator from point clouds in R^d"). Since w_ij = w_ji, the total is conserved and a constant density stays
+# constant; since the row sums are at most A_i, amounts stay non-negative.
 #
-# K_ij is 0 unless both are sides of one surface: they are no farther than 3 e apart, face the same way (`FACING`), and
-# each lies in the other's plane, to `RISE` of their distance and to the tolerance with which a point counts as seen. So
-# nothing comes through a gap that is wider than 3 e sin `RISE` and the tolerance, and neither from one face of a board
-# to the other nor around an edge. Sides that are hidden, and what is on them, stay as they are.
+# K_ij is 0 unless both sides belong to one surface: they are at most `KERNEL_CUTOFF` e apart, face the same direction
+# (`MIN_NORMAL_COSINE`), and each lies in the plane of the other, within `MAX_PLANE_SINE` of their distance and the
+# visibility tolerance. Attention therefore does not cross wide gaps, thin boards or edges. Hidden sides keep their
+# attention.
 #
-# Gaussians closer than half a step, which face the same way, are one cell, whose density all of them have.
+# Gaussians closer than half a step that face the same direction form one cell with a common density.
 
-FACING = np.cos(np.radians(30))  # cosine between the normals of neighbours at least
-RISE = np.sin(np.radians(15))  # sine of the angle at which a neighbour may lie out of the plane
-MAX_STEPS = 100  # steps at most, where all of a kernel's reach is covered
-MAX_BORDER_STEPS = 400  # steps at most, where many Gaussians lie at borders
-CLOSE = 0.7  # standard deviation of a step at least, as a share of the edge of a square of a Gaussian's area
-REACH = 3.0  # standard deviations of a step after which it is cut off
+MIN_NORMAL_COSINE = np.cos(np.radians(30))  # minimum cosine between the normals of neighbours
+MAX_PLANE_SINE = np.sin(np.radians(15))  # maximum sine of the angle of a neighbour to the plane
+MAX_STEPS = 100  # maximum number of steps if kernels are fully covered
+MAX_BORDER_STEPS = 400  # maximum number of steps if many Gaussians lie at borders
+MIN_STEP_FRACTION = 0.7  # minimum standard deviation of a step, relative to the square root of a Gaussian's area
+KERNEL_CUTOFF = 3.0  # cut-off of the kernel in standard deviations
 
 
 class SplatSmoother:
@@ -291,22 +340,22 @@ class SplatSmoother:
         centers: np.ndarray,
         axes: np.ndarray,
         areas: np.ndarray,
-        hidden: np.ndarray,
+        hidden_area: np.ndarray,
         length: float,
         tolerance: float,
     ):
         if not (np.isfinite(length) and length > 0):
             raise ValueError(f"smoothing needs a positive length, got {length}")
-        self._sides = np.flatnonzero((areas > hidden).ravel())
+        self._sides = np.flatnonzero((areas > hidden_area).ravel())
         count = len(axes)
         which, sign = self._sides % count, np.where(self._sides < count, -1.0, 1.0)
         area = areas.ravel()[self._sides]
-        apart = _weighted_median(np.sqrt(area), area) if len(area) else length
-        step = min(max(CLOSE * apart, length / np.sqrt(MAX_STEPS)), length)
+        spacing = _weighted_median(np.sqrt(area), area) if len(area) else length
+        step = min(max(MIN_STEP_FRACTION * spacing, length / np.sqrt(MAX_STEPS)), length)
         step = length / np.sqrt(max(1, np.floor((length / step) ** 2)))
         # Normals of surfaces, which point to where they are seen from.
         normals, places = sign[:, None] * axes[which], np.asarray(centers, np.float64)[which]
-        cells, self._cell = _cells(places, normals, step / 2)
+        cells, self._cell = _make_cells(places, normals, step / 2)
         self._area = np.bincount(self._cell, area, cells)
         mean = lambda rows: np.stack(
             [np.bincount(self._cell, area * c, cells).astype(np.float64) for c in rows.T], axis=1
@@ -314,7 +363,7 @@ class SplatSmoother:
         place, normal = mean(places) / self._area[:, None], mean(normals)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         self._share, self.steps = area / self._area[self._cell], 1
-        i, j, square = _neighbours(place, normal, REACH * step, tolerance)
+        i, j, square = _find_neighbours(place, normal, KERNEL_CUTOFF * step, tolerance)
         kernel = np.exp(-0.5 * square / step**2)
         near = np.bincount(i, kernel * self._area[j], cells)
         weight = kernel * self._area[i] * self._area[j] / np.maximum(near[i], near[j])
@@ -327,7 +376,7 @@ class SplatSmoother:
             self.steps = min(max(1, round(length**2 / variance)), MAX_BORDER_STEPS)
 
     def __call__(self, amounts: np.ndarray) -> np.ndarray:
-        """The amounts (2, N) on the sides after smoothing; their sum stays."""
+        """Smooth the amounts (2, N) on the sides; their sum is conserved."""
         out = np.array(amounts, np.float64)
         flat = out.reshape(-1)
         heat = np.bincount(self._cell, flat[self._sides], len(self._area))
@@ -337,36 +386,37 @@ class SplatSmoother:
         return out
 
 
-def _cells(places: np.ndarray, normals: np.ndarray, size: float) -> tuple[int, np.ndarray]:
-    """How many cells of the edge ``size`` and of alike normals there are, and the number of each row's."""
+def _make_cells(places: np.ndarray, normals: np.ndarray, size: float) -> tuple[int, np.ndarray]:
+    """Return the number of cells of edge ``size`` and similar normals, and the cell of each row."""
     key = np.concatenate([np.floor(places / size), np.rint(2 * normals)], axis=1).astype(np.int64)
     if not len(key):
         return 0, np.zeros(0, np.int64)
     order = np.lexsort(key.T)
     first = np.r_[True, (np.diff(key[order], axis=0) != 0).any(axis=1)]
-    found = np.empty(len(key), np.int64)
-    found[order] = np.cumsum(first) - 1
-    return int(first.sum()), found
+    cell = np.empty(len(key), np.int64)
+    cell[order] = np.cumsum(first) - 1
+    return int(first.sum()), cell
 
 
-def _neighbours(
-    place: np.ndarray, normal: np.ndarray, reach: float, tolerance: float
+def _find_neighbours(
+    place: np.ndarray, normal: np.ndarray, max_distance: float, tolerance: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """``(i, j, square of the distance)`` of cells of one surface, in both orders, each with itself too."""
+    """Return ``(i, j, squared distance)`` of neighbouring cells of one surface, in both orders and including each
+    cell itself."""
     from scipy.spatial import KDTree
 
-    own = np.arange(len(place))
+    index = np.arange(len(place))
     if not len(place):
-        return own, own, np.zeros(0)
-    pairs = KDTree(place).query_pairs(reach, output_type="ndarray")
+        return index, index, np.zeros(0)
+    pairs = KDTree(place).query_pairs(max_distance, output_type="ndarray")
     i, j = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))].T
-    apart = place[j] - place[i]
-    square = np.einsum("ij,ij->i", apart, apart)
-    most = RISE * np.sqrt(square) + tolerance
-    level = lambda k: np.abs(np.einsum("ij,ij->i", apart, normal[k])) <= most
-    alike = (np.einsum("ij,ij->i", normal[i], normal[j]) >= FACING) & level(i) & level(j)
-    i, j, square = i[alike], j[alike], square[alike]
-    return np.r_[i, j, own], np.r_[j, i, own], np.r_[square, square, np.zeros(len(own))]
+    offset = place[j] - place[i]
+    square = np.einsum("ij,ij->i", offset, offset)
+    max_height = MAX_PLANE_SINE * np.sqrt(square) + tolerance
+    in_plane = lambda k: np.abs(np.einsum("ij,ij->i", offset, normal[k])) <= max_height
+    is_neighbour = (np.einsum("ij,ij->i", normal[i], normal[j]) >= MIN_NORMAL_COSINE) & in_plane(i) & in_plane(j)
+    i, j, square = i[is_neighbour], j[is_neighbour], square[is_neighbour]
+    return np.r_[i, j, index], np.r_[j, i, index], np.r_[square, square, np.zeros(len(index))]
 
 
 def _weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
@@ -375,55 +425,69 @@ def _weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
     return float(values[order[np.searchsorted(total, 0.5 * total[-1])]])
 
 
-# ---- Splats ----
+# ---- Gaze of observers on splats ----
 #
-# What the gaze of observers leaves on Gaussian splats, after occlusion: a density per area for each of them.
+# A ray of direction ω meets a Gaussian with centre c and covariance Σ at its peak. For parallel rays the peaks form the
+# plane through c with normal Σ⁻¹ω, so the Gaussian acts as a surface in that plane: a flat Gaussian as its disk, an
+# isotropic one as a disk that faces the observer. From an observer at p_o with gaze density g(ω) in 1/sr it receives,
+# per area,
 #
-# Rays of direction ω meet a Gaussian with centre c and covariance Σ where they are nearest to c by its own measure,
-# which for parallel rays is the plane through c with the normal Σ⁻¹ω: as seen from there, the Gaussian is a surface in
-# that plane. A flat one is its own disk from wherever it is seen, a ball a disk that faces the observer. Of an observer
-# at p_o who looks with the density g(ω), in 1/sr, it receives
+#     g(ω) V(c, p_o) C(ω) / |c - p_o|²,    C(ω) = |Σ^{-1/2} ω| min σ,    ω = (c - p_o) / |c - p_o|
 #
-#     g(ω) V(c, p_o) C(ω) / |c - p_o|²,    C(ω) = |Σ^{-1/2} ω| min σ,    ω = (c - p_o) / |c - p_o|,
-#
-# per area: the density of `nerg_mi.probes.surface_attention` at the centre, with the area under which the Gaussian is
-# seen, as a share of the largest under which it can be seen (C), in place of a cosine. V is the visibility of
-# `nerg_mi.probes.surface_attention.attended`, of a point that lies before the centre by the thickness of the Gaussian
-# too. Such densities are colours: rendered in place of them, they mix by the light that reaches the eye.
+# This is the density of `nerg_mi.probes.surface_attention` at the centre, with the projected area relative to the
+# largest one (C) in place of a cosine. V is the visibility of a point that lies before the centre by the thickness of
+# the Gaussian. The densities can be rendered as colours: they are blended by transmittance.
 
-BATCH_SIZE = 1 << 18  # Gaussians in one launch
+BATCH_SIZE = 1 << 18  # number of Gaussians per launch
 
 
 def splat_densities(
     splats: Splats,
     geometry: SceneGeometry,
     make_observer: MakeObserver,
-    eyes: np.ndarray,
+    positions: np.ndarray,
     weights: np.ndarray,
     settings: ObserverSettings,
-    cone: float = 0.0,
+    cone_sigma: float = 0.0,
     falloff: float = 0.0,
 ) -> np.ndarray:
-    """Gaze (2, N), float64, that each side of ``splats`` receives per square scene unit from observers at ``eyes``
-    (M, 3) who count by ``weights`` (M,): a sum over them. Sides are those of `splats.sides_of`.
+    """Return the gaze (2, N), float64, that each side of ``splats`` receives from weighted observers, per square scene
+    unit.
 
-    ``place``: what hides, the splats themselves among it, in their frame, traced with ``settings``; ``cone``: standard
-    deviation in radian of the cone that gaze is seen through, ``falloff`` as of the integrator. From within its own
-    width a Gaussian receives what it does from as far as it is wide.
+    Within its own width of an observer, a Gaussian receives the value at that distance.
+
+    Parameters
+    ----------
+    splats
+        Gaussians.
+    geometry
+        Occluders, including the splats, in the frame of the splats.
+    make_observer
+        Creates the observer at a position.
+    positions, weights
+        Positions (M, 3) and weights (M,) of the observers.
+    settings
+        Settings of an observer's rays.
+    cone_sigma
+        Standard deviation of the gaze cone in radians.
+    falloff
+        Softness of occlusion boundaries.
     """
-    out, every, axes = np.zeros((2, len(splats))), np.arange(len(splats)), shortest_axes(splats)
+    out, index, axes = np.zeros((2, len(splats))), np.arange(len(splats)), shortest_axes(splats)
     with dr.suspend_grad():
-        for eye, weight in zip(np.asarray(eyes, np.float64), weights):
-            found = float(weight) * _of_one(splats, geometry, make_observer(eye), eye, settings, cone, falloff)
-            out[sides_of(splats.centers - eye, axes), every] += found
+        for eye, weight in zip(np.asarray(positions, np.float64), weights):
+            density = float(weight) * _observer_density(
+                splats, geometry, make_observer(eye), eye, settings, cone_sigma, falloff
+            )
+            out[visible_sides(splats.centers - eye, axes), index] += density
     return out
 
 
-def _of_one(
+def _observer_density(
     splats: Splats,
     place: SceneGeometry,
-    looker: SurfaceObserver,
-    eye: np.ndarray,
+    observer: SurfaceObserver,
+    position: np.ndarray,
     settings: ObserverSettings,
     cone: float,
     falloff: float,
@@ -432,33 +496,39 @@ def _of_one(
     for a in range(0, len(splats), BATCH_SIZE):
         part = slice(a, a + BATCH_SIZE)
         centers, scales = splats.centers[part].astype(np.float64), splats.scales[part].astype(np.float64)
-        facing, normals, depth = _facing(centers - eye, quaternions_to_matrices(splats.rotations[part]), scales)
-        before = variant_types().Float(copy_aligned(depth))
-        seen = after_occlusion(place, looker, unit_density, centers, normals, falloff, settings, before)
-        rows = np.flatnonzero(seen > 0)
-        # Most of a place is hidden from wherever one stands, and gaze costs more than rays.
+        facing, normals, depth = _projected_profile(
+            centers - position, quaternions_to_matrices(splats.rotations[part]), scales
+        )
+        half_thickness = variant_types().Float(copy_aligned(depth))
+        visibility = occluded_density(
+            place, observer, unit_density, centers, normals, falloff, settings, half_thickness
+        )
+        rows = np.flatnonzero(visibility > 0)
+        # Most surfaces are occluded, and evaluating gaze is more expensive than tracing.
         if len(rows):
-            to = centers[rows] - eye
-            directions = to / np.linalg.norm(to, axis=1, keepdims=True)
-            gaze = unhidden(looker, density_through(looker, cone), centers[rows], directions)
-            out[a + rows] = seen[rows] * facing[rows] * gaze
+            to_centers = centers[rows] - position
+            directions = to_centers / np.linalg.norm(to_centers, axis=1, keepdims=True)
+            gaze = unoccluded_density(observer, cone_density(observer, cone), centers[rows], directions)
+            out[a + rows] = visibility[rows] * facing[rows] * gaze
     return out
 
 
-def _facing(to: np.ndarray, axes: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """``(C(ω) / distance² (N,), the unit normals (N, 3) of what is seen, and its standard deviation along them (N,))``
-    of Gaussians that lie ``to`` (N, 3) of an eye."""
-    distance = np.linalg.norm(to, axis=1)
-    w = to / np.where(distance > 0, distance, 1)[:, None]
-    own = np.einsum("nji,nj->ni", axes, w)
-    least, widest = scales.min(axis=1), scales.max(axis=1)
-    # In units of the least deviation, so that squares of thin ones stay finite.
-    once = own * (least[:, None] / scales)
-    twice = once * (least[:, None] / scales)
+def _projected_profile(
+    to_centers: np.ndarray, axes: np.ndarray, scales: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return C(ω) / distance² (N,), unit normals (N, 3) and the standard deviation along them (N,) of Gaussians at
+    offsets (N, 3) from an observer."""
+    distance = np.linalg.norm(to_centers, axis=1)
+    w = to_centers / np.where(distance > 0, distance, 1)[:, None]
+    local = np.einsum("nji,nj->ni", axes, w)
+    min_scale, max_scale = scales.min(axis=1), scales.max(axis=1)
+    # Relative to the smallest standard deviation, to avoid overflow for thin Gaussians.
+    once = local * (min_scale[:, None] / scales)
+    twice = once * (min_scale[:, None] / scales)
     area = np.linalg.norm(once, axis=1)
     length = np.linalg.norm(twice, axis=1)
-    across = twice / np.where(length > 0, length, 1)[:, None]
-    depth = np.linalg.norm(across * scales, axis=1)
-    normals = -np.einsum("nij,nj->ni", axes, across)
-    near = np.maximum(distance, widest)
-    return np.where(length > 0, area / near**2, 0.0), normals, depth
+    normal = twice / np.where(length > 0, length, 1)[:, None]
+    depth = np.linalg.norm(normal * scales, axis=1)
+    normals = -np.einsum("nij,nj->ni", axes, normal)
+    distance_clamped = np.maximum(distance, max_scale)
+    return np.where(length > 0, area / distance_clamped**2, 0.0), normals, depth

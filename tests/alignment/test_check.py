@@ -53,7 +53,7 @@ def test_heads_within_matter_are_inside_of_something():
         mi.load_dict({"type": "constvolume", "value": 500.0, "to_world": mi.ScalarTransform4f().scale([9, 9, 9])})
     )
     found = check_alignment(solid, RAYS, moved(0, 0, 0))
-    assert found.inside > 0.9 and "inside of something solid" in " ".join(found.list_warnings())
+    assert found.inside > 0.9 and "inside solid objects" in " ".join(found.list_warnings())
 
 
 def test_no_rays_are_no_doubt(room):
@@ -100,7 +100,7 @@ def test_what_is_written_is_read_by_every_command(tmp_path):
 @pytest.mark.parametrize(
     "change, why",
     [
-        ({"version": 99}, "version 99, and up to 1 is read"),
+        ({"version": 99}, "version 99"),
         ({"version": True}, "version True"),
         ({"kind": "x"}, "neither that"),
         ({"matrix": [[1, 2]]}, "--align"),

@@ -12,14 +12,14 @@ from nerg_mi.alignment.constraints import (
     DistanceGrid,
     SceneTraces,
     angles_between,
+    downsample,
     pair_covariance,
     read_surface,
-    surface_of_points,
-    surface_of_traces,
-    downsample,
+    surface_from_points,
+    surface_from_traces,
     trace_scene,
 )
-from nerg_mi.alignment.similarity import ALL, fit_similarity, similarity_scale
+from nerg_mi.alignment.similarity import FULL_BASIS, fit_similarity, similarity_scale
 from nerg_mi.errors import NergError
 from nerg_mi.formats.ply import write_columns
 
@@ -42,11 +42,13 @@ def test_the_covariance_is_that_of_many_fits():
     scales = np.log([similarity_scale(m) for m in draws])
     middle = np.array([carried(m, x.mean(axis=0)[None])[0] for m in draws])
     y = exact + rng.normal(0, noise, x.shape)
-    stated = [pair_covariance(x, exact + rng.normal(0, noise, x.shape), fit_similarity(x, y), ALL) for _ in range(50)]
+    stated = [
+        pair_covariance(x, exact + rng.normal(0, noise, x.shape), fit_similarity(x, y), FULL_BASIS) for _ in range(50)
+    ]
     mean = np.mean(stated, axis=0)
     assert np.sqrt(mean[6, 6]) == pytest.approx(scales.std(), rel=0.25)
     np.testing.assert_allclose(np.sqrt(np.diag(mean)[3:6]), middle.std(axis=0), rtol=0.3)
-    assert pair_covariance(x[:2], y[:2], truth, ALL) is None
+    assert pair_covariance(x[:2], y[:2], truth, FULL_BASIS) is None
 
 
 def test_a_place_is_needed_by_what_asks_for_it():
@@ -66,13 +68,15 @@ def test_inside_it_is_the_trilinear_interpolation():
     # Beyond it the distance to it is added, and a lattice of one layer has no slope across.
     p = GRID.upper + np.array([[3.0, 4, 0], [0, 0, 2]])
     np.testing.assert_allclose(GRID.interpolate(p), GRID.values[-1, -1, -1] + np.array([5, 2]))
-    value, slope = DistanceGrid(np.arange(4.0).reshape(4, 1, 1), np.zeros(3), 1.0).with_slope(np.array([[1.5, 0, 0]]))
+    value, slope = DistanceGrid(np.arange(4.0).reshape(4, 1, 1), np.zeros(3), 1.0).interpolate_with_gradient(
+        np.array([[1.5, 0, 0]])
+    )
     assert value[0] == 1.5 and slope[0].tolist() == [1, 0, 0]
 
 
 def test_gradients_are_those_of_central_differences():
     p = np.random.default_rng(2).uniform(GRID.lower - 1, GRID.upper + 1, (500, 3))
-    slope = GRID.with_slope(p)[1]
+    slope = GRID.interpolate_with_gradient(p)[1]
     for a, e in enumerate(1e-7 * np.eye(3)):
         np.testing.assert_allclose(slope[:, a], (GRID.interpolate(p + e) - GRID.interpolate(p - e)) / 2e-7, atol=1e-6)
 
@@ -108,7 +112,7 @@ def test_clouds_tables_and_arrays(tmp_path):
 @pytest.mark.parametrize(
     "name, data, why",
     [
-        ("a.txt", b"", "no surface that is read"),
+        ("a.txt", b"", "not a supported surface file"),
         ("a.ply", b"ply\nno", "no header"),
         ("a.obj", b"", "no vertices"),
         ("a.csv", b"x,y,z\n", "no points"),
@@ -117,7 +121,7 @@ def test_clouds_tables_and_arrays(tmp_path):
         ("a.csv", b"x,y,z\n0,0,0\n1,1.1e7,0\n", "the points of .*a.csv.* must have coordinates from"),
         ("a.csv", b"x,y,z\n0,0,0\n1,1e308,0\n", "the points of .*a.csv.* must have coordinates from"),
         ("a.npy", None, r"shape \(3, 2\)"),
-        ("a/no.ply", None, "there is no surface"),
+        ("a/no.ply", None, "does not exist"),
     ],
 )
 def test_other_files_are_refused(tmp_path, name, data, why):
@@ -134,7 +138,7 @@ def test_other_files_are_refused(tmp_path, name, data, why):
 
 @pytest.fixture(scope="module")
 def surface():
-    return surface_of_traces(rooms.traces(), 1 << 17)
+    return surface_from_traces(rooms.traces(), 1 << 17)
 
 
 def exact(points):
@@ -154,9 +158,9 @@ def test_distances_are_those_to_walls_and_blocks(surface):
 
 def test_solids_are_blocked_and_the_room_is_free(surface):
     p = np.random.default_rng(1).uniform(0, rooms.SIZE, (4000, 3))
-    blocked = surface.blocked.at(p)
+    blocked = surface.free_space_distance.at(p)
     deep = ~rooms.free(p, -2 * surface.step)
-    assert surface.bounded and (blocked[deep] > 0).mean() > 0.97
+    assert surface.has_free_space and (blocked[deep] > 0).mean() > 0.97
     assert (blocked[rooms.free(p, 1.5 * surface.step)] == 0).mean() > 0.99
 
 
@@ -171,9 +175,9 @@ def test_the_inside_of_a_hollow_thing_is_no_free_space():
         np.concatenate([room.end, begin + along * to_wall[:, None]]),
         np.ones(len(room.is_hit) + 4000, bool),
     )
-    found = surface_of_traces(both, 1 << 16)
+    found = surface_from_traces(both, 1 << 16)
     middle = block.mean(axis=0)[None]
-    assert found.blocked.interpolate(middle)[0] > 0.2
+    assert found.free_space_distance.interpolate(middle)[0] > 0.2
 
 
 def test_the_floor_is_found(surface):
@@ -182,12 +186,12 @@ def test_the_floor_is_found(surface):
 
 def test_bare_points_know_no_free_space_and_must_be_some():
     points = rooms.traces().end
-    found = surface_of_points(points, 1 << 15)
-    assert not found.bounded and found.distance.interpolate(points[:500]).max() < 2 * found.step
-    with pytest.raises(NergError, match="99 points, and 100"):
-        surface_of_points(np.zeros((99, 3)))
+    found = surface_from_points(points, 1 << 15)
+    assert not found.has_free_space and found.distance.interpolate(points[:500]).max() < 2 * found.step
+    with pytest.raises(NergError, match="99 points"):
+        surface_from_points(np.zeros((99, 3)))
     with pytest.raises(NergError, match="single point"):
-        surface_of_points(np.zeros((200, 3)))
+        surface_from_points(np.zeros((200, 3)))
 
 
 def test_thinned_points_are_the_means_of_voxels():
@@ -203,5 +207,5 @@ def test_a_place_without_surfaces_is_refused(monkeypatch):
     monkeypatch.setattr(
         "nerg_mi.alignment.constraints.trace_depth", lambda s, o, d: (np.zeros(len(o)), np.zeros(len(o)))
     )
-    with pytest.raises(NergError, match="no surfaces that rays could meet"):
+    with pytest.raises(NergError, match="meet no surface"):
         trace_scene(_Nothing(), np.zeros(3), np.ones(3), 1000)  # pyright: ignore[reportArgumentType] # traced by nothing

@@ -7,14 +7,14 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from nerg_mi.alignment.similarity import (
-    ALL,
+    FULL_BASIS,
     MIRROR,
-    Chart,
+    LocalSimilarity,
     check_points,
-    residual_distances,
     fit_similarity,
-    in_plane,
-    leave_one_out,
+    is_planar,
+    leave_one_out_distances,
+    residual_distances,
     right_jacobian,
     similarity_scale,
     upright_basis,
@@ -39,14 +39,14 @@ def test_right_jacobian_is_that_of_the_matrix_exponential(size):
         np.testing.assert_allclose(expm(hat(w)).T @ turned, hat(right_jacobian(w)[:, k]), atol=1e-8)
 
 
-@pytest.mark.parametrize("basis", [ALL, ALL[:, :-1], upright_basis(False), upright_basis(True)])
+@pytest.mark.parametrize("basis", [FULL_BASIS, FULL_BASIS[:, :-1], upright_basis(False), upright_basis(True)])
 def test_derivatives_are_those_of_central_differences(basis):
     rng = np.random.default_rng(0)
-    chart = Chart(similarity(rng), rng.normal(size=3), basis)
+    chart = LocalSimilarity(similarity(rng), rng.normal(size=3), basis)
     x, q, slope = rng.normal(size=(20, 3)), rng.normal(0, 0.4, basis.shape[1]), rng.normal(size=(20, 3))
     moved = chart.transform(q, x)
     np.testing.assert_allclose(moved, carried(chart.matrix(q), x), atol=1e-12)
-    by = chart.pulled(q, moved, slope)
+    by = chart.gradient(q, moved, slope)
     for k, e in enumerate(1e-6 * np.eye(len(q))):
         numeric = np.sum(slope * (chart.transform(q + e, x) - chart.transform(q - e, x)), axis=1) / 2e-6
         np.testing.assert_allclose(by[:, k], numeric, atol=1e-7)
@@ -57,7 +57,7 @@ def test_upright_charts_keep_up_and_the_floor():
     rng = np.random.default_rng(1)
     base = similarity(rng, upright=True)
     floor = base[2, 3]
-    chart = Chart(base, np.array([1.0, 2.0, floor]), upright_basis(True))
+    chart = LocalSimilarity(base, np.array([1.0, 2.0, floor]), upright_basis(True))
     m = chart.matrix(rng.normal(size=4))
     np.testing.assert_allclose(m[:3, 2] / similarity_scale(m), [0, 0, 1], atol=1e-12)
     assert m[2, 3] == pytest.approx(floor)
@@ -92,7 +92,7 @@ def test_noisy_points_give_the_least_squares_that_a_minimiser_finds():
 def test_known_scale_and_flat_points():
     rng = np.random.default_rng(2)
     truth, x = similarity(rng, scale=2.0), rng.normal(size=(5, 3)) * (1, 1, 0)
-    assert in_plane(x) and not in_plane(rng.normal(size=(9, 3)))
+    assert is_planar(x) and not is_planar(rng.normal(size=(9, 3)))
     np.testing.assert_allclose(fit_similarity(x, carried(truth, x), scale=2.0), truth, atol=1e-9)
     assert np.linalg.det(fit_similarity(x, carried(truth @ MIRROR, x))[:3, :3]) > 0
 
@@ -109,16 +109,16 @@ def test_leave_one_out_is_the_error_of_the_fit_to_the_others():
     truth, x = similarity(rng), rng.normal(size=(5, 3))
     y = carried(truth, x)
     y[2] += similarity_scale(truth) * np.array([0.5, 0, 0])
-    left = leave_one_out(x, y)
+    left = leave_one_out_distances(x, y)
     assert left[2] == pytest.approx(0.5, rel=1e-6) and residual_distances(fit_similarity(x, y), x, y).max() < 0.5
-    assert np.isnan(leave_one_out(x[:3], y[:3])).all()
+    assert np.isnan(leave_one_out_distances(x[:3], y[:3])).all()
 
 
 @pytest.mark.parametrize(
     "points, why",
     [
-        (np.zeros((2, 3)), "2 pairs of points where 3"),
-        (np.zeros((4, 3)), "at one place"),
+        (np.zeros((2, 3)), "2 pairs of points, but 3"),
+        (np.zeros((4, 3)), "at one position"),
         (np.outer(np.arange(5.0), [1, 2, 3]), "on a line"),
         (np.full((4, 3), np.nan), "points in the frame"),
     ],

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nerg_mi.alignment.constraints import AlignmentTarget, surface_of_traces
+from nerg_mi.alignment.constraints import AlignmentTarget, surface_from_traces
 from nerg_mi.alignment.similarity import MIRROR, residual_distances
-from nerg_mi.alignment.tracking import DECLARED, Tracking, is_close, compare_flips, scale_range, search_placements
+from nerg_mi.alignment.tracking import DECLARED, Tracking, candidate_scales, compare_flips, is_close, search_placements
 from nerg_mi.errors import NergError
 from nerg_mi.photos.posed import read_semidense
 from nerg_mi.rays.readers.registry import read_rays
@@ -95,8 +95,8 @@ def test_heads_that_nobody_knows_are_left_out():
 
 def test_turn_shift_and_scale_are_guessed_from_hit_points_and_heads():
     rays, truth = rooms.people(1500), rooms.similarity(np.random.default_rng(2), upright=True)
-    surface = surface_of_traces(rooms.traces().transform(truth), 1 << 16)
-    scales = scale_range(surface, rays.hit)
+    surface = surface_from_traces(rooms.traces().transform(truth), 1 << 16)
+    scales = candidate_scales(surface, rays.hit)
     scale = np.cbrt(np.linalg.det(truth[:3, :3]))
     assert scales[0] > scale > scales[-1] and np.abs(np.log(scales / scale)).min() < 0.04
     near = scales[np.abs(np.log(scales / scale)) < 0.3]
@@ -145,10 +145,10 @@ def test_a_start_is_refined_to_any_rotation():
 @pytest.mark.parametrize(
     "changes, known, why",
     [
-        ({}, {"upright": False}, "say which way is up"),
+        ({}, {"upright": False}, "needs the up direction"),
         ({}, {"floor": None}, "give it with --floor"),
-        ({"hit": None}, {}, "without hit points do not tell how large"),
-        (None, {}, "no rays to align"),
+        ({"hit": None}, {}, "do not determine the scale"),
+        (None, {}, "no gaze samples"),
     ],
 )
 def test_rays_that_leave_it_open_are_refused(changes, known, why):

@@ -9,7 +9,7 @@ import pytest
 from nerg_mi.aoi import output
 from nerg_mi.aoi.options import StatisticsOptions
 from nerg_mi.aoi.output import StatisticsResult, write_results
-from nerg_mi.figures.statistics import things_figure
+from nerg_mi.figures.statistics import aois_figure
 from nerg_mi.statistics.tables import MIN_VIEWPOINTS, ParticipantRows
 from nerg_mi.statistics.visits import ALL, VisitSums
 from tests.workflows.recorder import Recorder
@@ -19,11 +19,11 @@ from tests.workflows.recorder import Recorder
 THING = {
     "cell": "all",
     "value": "",
-    "thing": "a",
-    "source": "tracked",
-    "people": 4,
+    "aoi": "a",
+    "source": "measured",
+    "participants": 4,
     "share": 0.2,
-    "reach": 0.5,
+    "hit_ratio": 0.5,
     "dwell": 3.0,
 }
 
@@ -35,9 +35,9 @@ def test01_what_there_is_and_nothing_else(tmp_path):
     files = write_results(tmp_path, made, [], StatisticsOptions(), recorder)
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted(p.name for p in files)
     names = {p.name for p in files}
-    assert {"things.csv", "things.md", "things.png", "isovists.png", "blanked.txt", "about.json"} <= names
-    assert not any(name.startswith(("moves", "what_if", "people")) for name in names)
-    assert "2 numbers" in (tmp_path / "blanked.txt").read_text() and recorder.messages
+    assert {"aois.csv", "aois.md", "aois.png", "isovists.png", "suppressed.txt", "about.json"} <= names
+    assert not any(name.startswith(("transitions", "what_if", "participants")) for name in names)
+    assert "2 values" in (tmp_path / "suppressed.txt").read_text() and recorder.messages
 
 
 def test02_equal_results_are_equal_files(tmp_path):
@@ -52,16 +52,16 @@ def test02_equal_results_are_equal_files(tmp_path):
 # ---- Tables as CSV, Markdown and Parquet ----
 
 ROWS = [
-    {"cell": "all", "value": "", "thing": "a|b", "n": 3, "x": 0.125},
-    {"cell": "zone", "value": "z", "thing": "c", "n": None, "x": None},
+    {"cell": "all", "value": "", "aoi": "a|b", "n": 3, "x": 0.125},
+    {"cell": "zone", "value": "z", "aoi": "c", "n": None, "x": None},
 ]
 
 
 def test01_all_kinds(tmp_path):
-    files = output.write_rows(tmp_path, "t", ROWS, *output.plain_columns(ROWS, ()))
+    files = output.write_rows(tmp_path, "t", ROWS, *output.all_columns(ROWS, ()))
     with files[0].open() as file:
         rows = list(csv.DictReader(file))
-    assert rows[0]["x"] == "0.125" and rows[1]["n"] == "" and rows[0]["thing"] == "a|b"
+    assert rows[0]["x"] == "0.125" and rows[1]["n"] == "" and rows[0]["aoi"] == "a|b"
     assert "| all |  | a\\|b | 3 | 0.125 |" in files[1].read_text()
     pq = pytest.importorskip("pyarrow.parquet")
     assert pq.read_table(files[2]).to_pylist() == ROWS
@@ -69,79 +69,102 @@ def test01_all_kinds(tmp_path):
 
 def test02_without_pyarrow(tmp_path, monkeypatch):
     monkeypatch.setattr(output, "find_spec", lambda name: None)
-    files = output.write_rows(tmp_path, "t", ROWS, *output.plain_columns(ROWS, ()))
+    files = output.write_rows(tmp_path, "t", ROWS, *output.all_columns(ROWS, ()))
     assert [f.suffix for f in files] == [".csv", ".md"]
 
 
 def test03_things_show_what_is_known():
-    row = {"cell": "cohort", "value": "x", "thing": "a", "source": "tracked", "people": None, "share": 0.5}
-    head, cells = output.thing_columns([row])
-    assert head == ["cell", "thing", "source", "people", "share of time"]
-    assert cells(row) == ["cohort x", "a", "tracked", "", "50.0 %"] and output.cell_name({"cell": "all"}) == "all"
+    row = {"cell": "cohort", "value": "x", "aoi": "a", "source": "measured", "participants": None, "share": 0.5}
+    head, cells = output.aoi_columns([row])
+    assert head == ["cell", "AOI", "source", "participants", "share of time"]
+    assert cells(row) == ["cohort x", "a", "measured", "", "50.0 %"] and output.format_cell({"cell": "all"}) == "all"
 
 
 def test04_what_a_field_foretells_with_its_spread_and_support():
-    row = {"cell": "all", "value": "", "thing": "a", "source": "field", "people": 5, "share": 0.5, "share_low": 0.4}
+    row = {
+        "cell": "all",
+        "value": "",
+        "aoi": "a",
+        "source": "predicted",
+        "participants": 5,
+        "share": 0.5,
+        "share_low": 0.4,
+    }
     row |= {"share_high": 0.6, "share_spread": 0.021, "support": 1234.0}
-    head, cells = output.thing_columns([row, row | {"source": "tracked"}])
-    assert head[-1] == "support [rays]"
+    head, cells = output.aoi_columns([row, row | {"source": "measured"}])
+    assert head[-1] == "support [samples]"
     assert cells(row)[-2:] == ["50.0 % [40.0, 60.0] ± 2.1", "1,234"]
     assert (
-        cells(row | {"support": None})[-1] == "not in the checkpoint" and cells(row | {"source": "tracked"})[-1] == ""
+        cells(row | {"support": None})[-1] == "not in the checkpoint" and cells(row | {"source": "measured"})[-1] == ""
     )
     assert cells(row | {"share": 0.0004, "share_low": 0, "share_high": 0.001})[-2] == "0.04 % [0.00, 0.10] ± 2.10"
 
 
 def test06_reach_from_few_places_is_marked_in_table_and_picture():
-    row = {"cell": "all", "value": "", "thing": "a", "source": "field", "people": 5, "share": 0.1, "reach": 0.45}
+    row = {
+        "cell": "all",
+        "value": "",
+        "aoi": "a",
+        "source": "predicted",
+        "participants": 5,
+        "share": 0.1,
+        "hit_ratio": 0.45,
+    }
     row |= {"dwell": 2.0, "support": 9.0}
     for places, low in ((2.56, True), (MIN_VIEWPOINTS - 0.01, True), (MIN_VIEWPOINTS, False), (None, False)):
-        one = row | {"places": places}
-        texts = output.thing_columns([one])[1](one)
-        said = [text for text in texts if "too low" in str(text)]
-        assert said == ([f"45.0 % (too low: {places:.1f} places a person)"] if low else [])
-        share, reach, dwell = things_figure([one]).axes
-        assert ("too low" in reach.get_xlabel()) == low and "low" not in share.get_xlabel() + dwell.get_xlabel()
+        one = row | {"viewpoints": places}
+        texts = output.aoi_columns([one])[1](one)
+        said = [text for text in texts if "biased low" in str(text)]
+        assert said == ([f"45.0 % (biased low: {places:.1f} viewpoints per participant)"] if low else [])
+        share, reach, dwell = aois_figure([one]).axes
+        assert ("biased low" in reach.get_xlabel()) == low and "low" not in share.get_xlabel() + dwell.get_xlabel()
         assert (reach.lines[0].get_markerfacecolor() == "white") == low
 
 
 def test05_what_a_change_does():
-    row = {"thing": "a", "measure": "share", "people": 5, "before": 0.5, "after": 0.25, "difference": -0.25}
+    row = {"aoi": "a", "measure": "share", "participants": 5, "before": 0.5, "after": 0.25, "difference": -0.25}
     row |= {"low": -0.3, "high": -0.2, "p": 0.0005, "p_adjusted": 0.001, "difference_spread": None, "support": None}
-    new = row | {"thing": "b", "measure": "visible", "before": None, "difference": None, "low": None, "p": None}
-    rows = [row | {"source": "field"}, new | {"source": "field", "p_adjusted": None, "support": 12.5}]
+    new = row | {"aoi": "b", "measure": "visible", "before": None, "difference": None, "low": None, "p": None}
+    rows = [row | {"source": "predicted"}, new | {"source": "predicted", "p_adjusted": None, "support": 12.5}]
     head, cells = output.what_if_columns(rows)
     assert head[3:6] == ["before [%]", "after [%]", "difference [points]"] and len(head) == len(cells(rows[0])) == 9
     told = ["50.00", "25.00", "-25.00 [-30.00, -20.00]", "0.0005", "0.001", "not in the checkpoint"]
-    assert cells(rows[0]) == ["a", "share of gaze", 5, *told]
+    assert cells(rows[0]) == ["a", "attention share", 5, *told]
     assert cells(rows[1]) == ["b", "visible share", 5, "", "25.00", "", "", "", "12.5"]
     spread = [r | {"difference_spread": 0.01} for r in rows]
     head, cells = output.what_if_columns(spread)
-    assert head[6] == "± members" and cells(spread[0])[6] == "1.00"
+    assert head[6] == "± ensemble" and cells(spread[0])[6] == "1.00"
 
 
 def test06_differences_in_their_units():
-    row = {"cell": "zone", "first": "front", "second": "back", "thing": "a", "measure": "share", "difference": -0.06}
-    row |= {"low": -0.08, "high": -0.04, "p": 0.001, "p_adjusted": 0.0014, "found": True}
+    row = {"cell": "zone", "first": "front", "second": "back", "aoi": "a", "measure": "share", "difference": -0.06}
+    row |= {"low": -0.08, "high": -0.04, "p": 0.001, "p_adjusted": 0.0014, "significant": True}
     head, cells = output.difference_columns([row])
     told = ["zone", "front", "back", "a", "share of time", "-6.00 points [-8.00, -4.00]", "0.001", "0.0014", "yes"]
     assert head[5] == "second - first" and cells(row) == told
-    blank = row | {"measure": "dwell", "difference": 1.5, "low": None, "p": None, "p_adjusted": None, "found": False}
-    assert cells(blank)[4:] == ["dwell", "+1.50 s", "", "", ""]
+    blank = row | {
+        "measure": "dwell",
+        "difference": 1.5,
+        "low": None,
+        "p": None,
+        "p_adjusted": None,
+        "significant": False,
+    }
+    assert cells(blank)[4:] == ["dwell time", "+1.50 s", "", "", ""]
 
 
 def test07_many_people_are_written_in_parts(tmp_path, monkeypatch):
     sums = VisitSums.empty(("x", "y"), (ALL,), [(ALL, f"p{k}") for k in range(5)])
     # The first part of the file knows no first look.
-    sums.looks[3:], sums.first_sum[3:], sums.first_count[3:] = 1, 2.5, 1
+    sums.visits[3:], sums.first_visit_sum[3:], sums.first_visit_count[3:] = 1, 2.5, 1
     rows = ParticipantRows(sums, {f"p{k}": f"p{k}" for k in range(5)}, False)
-    monkeypatch.setattr(output, "_PART", 3)
-    monkeypatch.setattr(output, "MOST_LINES", 4)
-    files = output.write_rows(tmp_path, "people", rows, *output.plain_columns(rows))
+    monkeypatch.setattr(output, "_PARQUET_BATCH", 3)
+    monkeypatch.setattr(output, "MAX_MARKDOWN_ROWS", 4)
+    files = output.write_rows(tmp_path, "people", rows, *output.all_columns(rows))
     with files[0].open() as file:
         told = list(csv.DictReader(file))
-    assert len(told) == 10 and told[0]["first_look"] == "" and told[9]["first_look"] == "2.5"
+    assert len(told) == 10 and told[0]["time_to_first_visit"] == "" and told[9]["time_to_first_visit"] == "2.5"
     text = files[1].read_text().splitlines()
-    assert len(text) == 8 and text[-1] == "The first 4 of 10 rows; all are in people.csv."
+    assert len(text) == 8 and "4 of 10 rows" in text[-1] and "people.csv" in text[-1]
     pq = pytest.importorskip("pyarrow.parquet")
     assert pq.read_table(files[2]).to_pylist() == list(rows)

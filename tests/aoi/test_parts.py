@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 from nerg_mi.aoi import measured
-from nerg_mi.aoi.measured import AoiContext, TimeWindow, ViewpointSampler, facing_directions, iter_blocks, count_block
+from nerg_mi.aoi.measured import AoiContext, TimeWindow, ViewpointSampler, count_block, facing_directions, iter_blocks
 from nerg_mi.aoi.options import PredictionOptions, StatisticsOptions
 from nerg_mi.aoi.parts import (
     ObserverPoses,
+    PlannedAoiScene,
     PlannedPrediction,
-    PlannedSetting,
-    _place_beside,
-    foretell_part,
-    read_foretold,
+    _geometry_files,
+    predict_part,
+    read_prediction,
     read_sums,
     write_sums,
 )
@@ -85,7 +85,9 @@ def test_two_processes_give_the_tables_of_one(place):
     asked = {"seen": True, "cell": 0.5, "windows": ("early=0,8",), "what_if": place / "changes.json"}
     whole, _ = count(place, "one", **asked)
     parts, told = count(place, "two", **asked, scheduler="local:2")
-    assert parts == whole and {"things.csv", "moves.csv", "people.csv", "what_if.csv", "about.json"} <= set(whole)
+    assert parts == whole and {"aois.csv", "transitions.csv", "participants.csv", "what_if.csv", "about.json"} <= set(
+        whole
+    )
     assert b"poster" in whole["what_if.csv"]
     account = account_for_store(place / "two.tasks", reporter=told)
     assert [(job.name.partition(" /")[0], job.remaining) for job in account.jobs] == [("nerg stats", 0)] * 3
@@ -133,11 +135,11 @@ def test_sums_come_back_one_by_one(tmp_path):
 def test_what_a_field_foretells_where_files_were_sent(place, tmp_path):
     options = PredictionOptions(aois=place / "areas.json", aoi_samples=4, directions=64, mode="llvm_ad_rgb")
     areas = FileGroup(options.aois, (options.aois,))
-    setting = PlannedSetting(options, PlannedScene.plan(place / "scene.xml"), None, None, areas)
+    setting = PlannedAoiScene(options, PlannedScene.plan(place / "scene.xml"), None, None, areas)
     common = lay_out(PlannedPrediction(setting, 120.0), tmp_path / "there")
     places = ObserverPoses(np.array([[1.0, 2, 1.6]] * 2), np.array([[1.0, 0, 0], [-1.0, 0, 0]]))
-    foretell_part(common, places, tmp_path / "f.npz")
-    found = read_foretold(tmp_path / "f.npz")
+    predict_part(common, places, tmp_path / "f.npz")
+    found = read_prediction(tmp_path / "f.npz")
     assert found.share.shape == (2, 3) and np.array_equal(found.share[0], found.share[1])
     assert found.visible[0].any() and not found.visible[1].any()
 
@@ -146,11 +148,11 @@ def test_a_gaze_field_brings_the_place_that_it_was_trained_in(tmp_path, rgb):
     field, (room, gaze) = fields.gaze(tmp_path / "g.safetensors"), (tmp_path / n for n in ("r.vol", "a.safetensors"))
     room.write_bytes(b"voxels")
     save_gaze(field, gaze, {"geometry_file": {"file": "r.vol", "sha256": file_sha256(room)}})
-    assert _place_beside(gaze, None) == [room]
+    assert _geometry_files(gaze, None) == [room]
     save_gaze(field, gaze, {"geometry": "none"})
-    assert _place_beside(gaze, None) == []
+    assert _geometry_files(gaze, None) == []
     save_gaze(field, gaze, {"field_file": {"file": "r.safetensors", "sha256": "0"}})
-    assert _place_beside(gaze, tmp_path / "elsewhere.safetensors") == []
+    assert _geometry_files(gaze, tmp_path / "elsewhere.safetensors") == []
 
 
 # ---- Rays in blocks that hold sittings as a whole, and what they are on ----
@@ -178,7 +180,7 @@ def test01_blocks_hold_sittings_as_a_whole_and_all_of_the_rays():
         for b in blocks:
             assert not (np.diff(b.person) < 0).any()
         found = merge_sums(count_block(b, counting()) for b in blocks)
-        for name in ("time", "on_time", "looks", "first_sum", "moves", "sittings"):
+        for name in ("time", "dwell_time", "visits", "first_visit_sum", "transitions", "sessions"):
             assert np.allclose(getattr(found, name), getattr(whole, name)), name
 
 
@@ -207,14 +209,14 @@ def test02_a_sitting_that_runs_over_two_parts_of_a_dataset_is_one(tmp_path):
         if rows == 50:
             assert len(dataset.RayDataset.open(name).parts) > 4 and dataset and dataset
     a, b = found.values()
-    for name in ("time", "on_time", "looks", "first_sum", "sittings"):
+    for name in ("time", "dwell_time", "visits", "first_visit_sum", "sessions"):
         order = [a.rows.index(row) for row in b.rows]
         assert np.allclose(getattr(a, name)[order], getattr(b, name)), name
-    assert a.sittings.sum() == 3
+    assert a.sessions.sum() == 3
 
 
 def test03_no_rays():
-    with pytest.raises(NergError, match="no rays to count"):
+    with pytest.raises(NergError, match="no gaze samples"):
         list(iter_blocks(people().select(np.zeros(0, int)), RULES))
 
 
@@ -246,7 +248,9 @@ def test05_rays_in_another_frame():
 def test06_cells():
     rays = people()
     made = counting(
-        windows=[TimeWindow("w", 1.0, 2.0)], zones=[Region.create("z", [0, 0, 9], [1, 4, 9.1])], cohort_names=("even", "x")
+        windows=[TimeWindow("w", 1.0, 2.0)],
+        zones=[Region.create("z", [0, 0, 9], [1, 4, 9.1])],
+        cohort_names=("even", "x"),
     )
     cells = dict(made.cell_masks(rays, rays.origin))
     assert cells[ALL] is None and not cells[Cell("cohort", "x")].any()
@@ -271,4 +275,4 @@ def test08_eyes_are_taken_evenly_and_of_everybody():
         picker.add(block, counting())
     eyes = picker.viewpoints()
     assert set(eyes.participants) == {f"name {k}" for k in range(5)} and 5 <= len(eyes.participants) <= 10
-    assert all(ALL in cells for cells in eyes.cells) and eyes.positions.shape == eyes.ahead.shape
+    assert all(ALL in cells for cells in eyes.cells) and eyes.positions.shape == eyes.facing.shape

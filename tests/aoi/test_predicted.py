@@ -15,19 +15,19 @@ from nerg_mi.aoi.predicted import (
     AoiScene,
     PredictedAttention,
     add_uncertainty,
-    subsample_participants,
-    predict_attention,
     aggregate_by_participant,
     isovist_rows,
-    place_observers_on_floor,
-    viewpoints_at,
     load_aoi_scene,
-    support_of,
+    median_support,
+    place_observers_on_floor,
+    predict_attention,
+    subsample_participants,
+    viewpoints_at,
     warn_few_viewpoints,
     warn_missing_support,
     what_if_rows,
 )
-from nerg_mi.aoi.scene import Changes, GazeScene, NewShape, surroundings_of_files, make_aois
+from nerg_mi.aoi.scene import Changes, GazeScene, NewShape, load_gaze_scene, make_aois
 from nerg_mi.errors import NergError
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.formats.areas import AreaSet, MeshPart, Region, read_areas
@@ -66,7 +66,10 @@ EYES = Viewpoints(
 
 def test01_shares_are_integrals():
     # A cube of which the eye sees a face of 2 x 2 at x = 1: a sixth of the sphere; of the hemisphere's gaze 2/3.
-    things = [BoxAoi(Region.create("ahead", [1, -1, -1], [2, 1, 1])), BoxAoi(Region.create("behind", [-2, -1, -1], [-1, 1, 1]))]
+    things = [
+        BoxAoi(Region.create("ahead", [1, -1, -1], [2, 1, 1])),
+        BoxAoi(Region.create("behind", [-2, -1, -1], [-1, 1, 1])),
+    ]
     found = predict_attention(AROUND, EYES, things, [(0,), (1,), (0, 1)], 0.0, 120.0, 24, 1 << 15, SILENT)
     assert np.allclose(found.share[0], [2 / 9, 1 / 9, 3 / 9], rtol=2e-3)
     # The mean distance to a square face, over its solid angle, by quadrature in its plane.
@@ -100,8 +103,13 @@ class Two(Law):
 
 
 def test03_members_of_an_ensemble():
-    things = [BoxAoi(Region.create("ahead", [1, -1, -1], [2, 1, 1])), BoxAoi(Region.create("behind", [-2, -1, -1], [-1, 1, 1]))]
-    found = predict_attention(Two(None, None, Similarity()), EYES, things, [(0,), (1,)], 0.0, 120.0, 24, 1 << 15, SILENT)
+    things = [
+        BoxAoi(Region.create("ahead", [1, -1, -1], [2, 1, 1])),
+        BoxAoi(Region.create("behind", [-2, -1, -1], [-1, 1, 1])),
+    ]
+    found = predict_attention(
+        Two(None, None, Similarity()), EYES, things, [(0,), (1,)], 0.0, 120.0, 24, 1 << 15, SILENT
+    )
     # A sixth of the sphere each: evenly of both, and 10/11 or 1/11 of a hemisphere's third by one.
     assert found.members.shape == (2, 3, 2) and np.allclose(found.share[0], 1 / 6, rtol=3e-3)
     assert np.allclose(found.members[:, 0], [[10 / 33, 1 / 33], [1 / 33, 10 / 33]], rtol=3e-3)
@@ -113,26 +121,34 @@ def test04_of_very_many_people_some_are_asked():
     many = Viewpoints(np.arange(1200.0).reshape(400, 3), np.ones((400, 3)), names, (frozenset([ALL]),) * 400)
     told = Recorder()
     some = subsample_participants(many, 50, told)
-    assert len(set(some.participants)) == 50 and len(some.participants) == 100 and len(some.positions) == len(some.cells) == 100
-    assert all((some.positions[k] == many.positions[names.index(n) + k % 2]).all() for k, n in enumerate(some.participants))
+    assert (
+        len(set(some.participants)) == 50
+        and len(some.participants) == 100
+        and len(some.positions) == len(some.cells) == 100
+    )
+    assert all(
+        (some.positions[k] == many.positions[names.index(n) + k % 2]).all() for k, n in enumerate(some.participants)
+    )
     back = np.arange(400)[::-1]
-    turned = subsample_participants(Viewpoints(many.positions[back], many.ahead, names[::-1], many.cells), 50, SILENT)
+    turned = subsample_participants(Viewpoints(many.positions[back], many.facing, names[::-1], many.cells), 50, SILENT)
     assert set(turned.participants) == set(some.participants) and subsample_participants(many, 200, SILENT) is many
-    assert "50 of 200 people" in told.messages[0]
+    assert "50 of 200 participants" in told.messages[0]
 
 
 # ---- Places on the floor where nobody was tracked ----
 
 
 def test01_on_the_floor_of_a_room(tmp_path):
-    around = surroundings_of_files(write_place(tmp_path, gaze=False), None, None, None, ns)
+    around = load_gaze_scene(write_place(tmp_path, gaze=False), None, None, None, ns)
     found = place_observers_on_floor(around, 1.6, 0.25, 0.0)
     inside = ((found[:, :2] > (2.5, 1.0)) & (found[:, :2] < (2.9, 2.0))).all(axis=1)
     assert 330 < len(found) < 24 * 16 and not inside.any() and np.allclose(found[:, 2], 1.6)
     with pytest.raises(NergError, match="--floor"):
         place_observers_on_floor(around, 1.6, 0.25, -2.0)
     rows = isovist_rows(
-        compute_isovists(found[:4], around.trace_depth, SamplePoints.sample([BoxAoi(Region.create("s", *SIGN))], 24), 0.01, 9.0),
+        compute_isovists(
+            found[:4], around.trace_depth, SamplePoints.sample([BoxAoi(Region.create("s", *SIGN))], 24), 0.01, 9.0
+        ),
         ("s", "g"),
         [(0,), (0,)],
     )
@@ -158,9 +174,9 @@ def test_cohorts_are_those_of_the_table_or_of_the_rays(tmp_path, rgb):
     (tmp_path / "who.csv").write_text("person,cohort\na,old\nb,new\n")
     found = setting(tmp_path)
     assert found.members == [(0,), (1,), (0, 1)] and found.margin == 0.03
-    assert found.make_context(False, ("x",)).cohort_names == ("x",) and found.make_context(True, ()).hits
+    assert found.make_context(False, ("x",)).cohort_names == ("x",) and found.make_context(True, ()).use_hit_points
     table = setting(tmp_path, cohorts=tmp_path / "who.csv").make_context(False, ("x",))
-    assert table.cohort_names == ("new", "old") and list(table.movable) == [0, 1]
+    assert table.cohort_names == ("new", "old") and list(table.transition_areas) == [0, 1]
 
 
 def test_where_no_place_is_known_things_hide_each_other(tmp_path, rgb):
@@ -170,7 +186,7 @@ def test_where_no_place_is_known_things_hide_each_other(tmp_path, rgb):
     )
     (tmp_path / "areas.json").write_text(areas)
     found = setting(tmp_path, scene=False, aoi_visibility=True)
-    depth = found._depth_or_things(np.array([[0.0, 1.6, 1.5], [0, 2.4, 1.5]]), np.array([[1.0, 0, 0]] * 2))
+    depth = found._trace_depth(np.array([[0.0, 1.6, 1.5], [0, 2.4, 1.5]]), np.array([[1.0, 0, 0]] * 2))
     assert np.allclose(depth, (2.5, 4.0))
 
 
@@ -201,8 +217,8 @@ def foretold(*members, support=(1.0, 8.0, 3.0)):
 
 def rows():
     both = [{"cell": "all", "value": ""}, {"cell": "zone", "value": "z"}]
-    made = [c | {"thing": "a", "source": s, "people": 2} for c in both for s in ("tracked", "field")]
-    return [row | {"share": 0.1, "dwell": 1.0, "reach": 0.5} for row in made]
+    made = [c | {"aoi": "a", "source": s, "participants": 2} for c in both for s in ("measured", "predicted")]
+    return [row | {"share": 0.1, "dwell": 1.0, "hit_ratio": 0.5} for row in made]
 
 
 def test01_spread_and_support_of_each_cell():
@@ -211,18 +227,18 @@ def test01_spread_and_support_of_each_cell():
     tracked, field, _, zone = found
     assert tracked["support"] is tracked["share_spread"] is None
     assert field["support"] == 3 and zone["support"] == 8
-    assert (field["places"], zone["places"], tracked["places"]) == (1.5, 1.0, None)
+    assert (field["viewpoints"], zone["viewpoints"], tracked["viewpoints"]) == (1.5, 1.0, None)
     # Ada's mean and Bo's, of the first member 0.3 over both, of the second 0.2.
     assert field["share_spread"] == pytest.approx(0.1 / np.sqrt(2))
     assert field["dwell_spread"] == pytest.approx((0.2 * 2 + 0.4 * 6 - 0.2 * 2 - 0.2 * 6) / 2 / np.sqrt(2))
-    assert zone["share_spread"] == pytest.approx(0.1 / np.sqrt(2)) and 0 < zone["reach_spread"] < 1
+    assert zone["share_spread"] == pytest.approx(0.1 / np.sqrt(2)) and 0 < zone["hit_ratio_spread"] < 1
 
 
 def test02_nothing_of_one_field_or_what_is_blank():
     found = rows()
     add_uncertainty(found, foretold([0.1, 0.3, 0.4]), TRUST_EYES, TIMES, 0.3)
     assert all(row["share_spread"] is None for row in found)
-    blank = [row | {"people": None, "share": None} for row in rows()]
+    blank = [row | {"participants": None, "share": None} for row in rows()]
     add_uncertainty(blank, foretold([0.1, 0.3, 0.4], [0.2, 0.2, 0.2]), TRUST_EYES, TIMES, 0.3)
     assert all(row["share_spread"] is row["support"] is None for row in blank)
     assert blank[1]["dwell_spread"] is not None
@@ -233,17 +249,23 @@ def test03_a_checkpoint_without_support_is_told_of():
     warn_missing_support(foretold([0.1, 0.3, 0.4]), told)
     assert told.messages == []
     none = foretold([0.1, 0.3, 0.4], support=(np.nan,) * 3)
-    assert support_of(none) is None and support_of(foretold([1, 1, 1]), np.zeros(3, bool)) is None
+    assert median_support(none) is None and median_support(foretold([1, 1, 1]), np.zeros(3, bool)) is None
     warn_missing_support(none, told)
-    assert "keeps no support" in told.messages[0] and "nerg train gaze" in told.messages[0]
+    assert "does not contain training support" in told.messages[0] and "nerg train gaze" in told.messages[0]
 
 
 def test_few_places_a_person_are_told():
     told = Recorder()
     warn_few_viewpoints(TRUST_EYES, told)
-    assert len(told.messages) == 1 and "1.5 places a person" in told.messages[0] and "--eyes 32 " in told.messages[0]
+    assert (
+        len(told.messages) == 1
+        and "1.5 viewpoints per participant" in told.messages[0]
+        and "--eyes 32 " in told.messages[0]
+    )
     count = 2 * MIN_VIEWPOINTS
-    many = Viewpoints(np.zeros((count, 3)), np.ones((count, 3)), ("Ada", "Bo") * MIN_VIEWPOINTS, (frozenset([ALL]),) * count)
+    many = Viewpoints(
+        np.zeros((count, 3)), np.ones((count, 3)), ("Ada", "Bo") * MIN_VIEWPOINTS, (frozenset([ALL]),) * count
+    )
     warn_few_viewpoints(many, told)
     warn_few_viewpoints(Viewpoints(np.zeros((0, 3)), np.zeros((0, 3)), (), ()), told)
     assert len(told.messages) == 1
@@ -276,7 +298,7 @@ def rows_what_if(tmp_path, changes, after, floor=None, members=1):
     found = what_if_rows(
         tmp_path / "c.json", setting, WHAT_IF_EYES, before, foretell, floor or MinParticipantsFilter(), 199, 0
     )
-    return {(r["thing"], r["measure"]): r for r in found}, asked[0]
+    return {(r["aoi"], r["measure"]): r for r in found}, asked[0]
 
 
 def test01_the_same_people_are_compared_with_themselves(tmp_path):
@@ -285,7 +307,7 @@ def test01_the_same_people_are_compared_with_themselves(tmp_path):
     share = found["a", "share"]
     assert share["before"] == pytest.approx(0.15) and share["after"] == pytest.approx(0.25)
     assert share["difference"] == pytest.approx(0.1) and 0.08 < share["low"] < 0.1 < share["high"] < 0.12
-    assert share["support"] == 5 and share["source"] == "field" and share["people"] == 5
+    assert share["support"] == 5 and share["source"] == "predicted" and share["participants"] == 5
     assert found["b", "visible"]["after"] == 1 and found["b", "visible"]["before"] == 0
     assert areas.boxes[0].lower[0] == 5 and eyes is WHAT_IF_EYES and len(things) == 2
 

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 
 from nerg_mi.aoi.scene import (
+    aoi_from_shape,
     apply_to_areas,
-    changed_scene,
+    apply_to_scene,
+    find_shape,
+    load_gaze_scene,
+    make_aois,
     read_changes,
     read_cohorts,
     read_meshes,
     scene_from_shapes,
-    shape_named,
     shapes_by_id,
-    surroundings_of_files,
-    thing_of_shape,
-    make_aois,
 )
 from nerg_mi.errors import NergError
 from nerg_mi.files.tables import write_csv
@@ -46,7 +46,7 @@ def written(tmp_path, **changes):
 def change(scene, tmp_path, **changes):
     """The changed scene, and its shapes."""
     made = written(tmp_path, **changes)
-    return changed_scene(scene, made, read_meshes(made.meshes))
+    return apply_to_scene(scene, made, read_meshes(made.meshes))
 
 
 def things(areas, shapes):
@@ -110,7 +110,7 @@ def test03_areas_follow(tmp_path):
 
 def test04_observers(tmp_path):
     found = written(tmp_path, observers=[[1, 2, 3]], shift=[0, 0, -0.5])
-    assert found.observers.tolist() == [[1, 2, 3]] and found.shift.tolist() == [0, 0, -0.5] and not found.of_shapes
+    assert found.observers.tolist() == [[1, 2, 3]] and found.shift.tolist() == [0, 0, -0.5] and not found.changes_shapes
 
 
 @pytest.mark.parametrize(
@@ -118,9 +118,9 @@ def test04_observers(tmp_path):
     [
         ({"remove": ["nobody"]}, 'no shape "nobody"'),
         ({"move": [{"shape": "nobody"}]}, 'no shape "nobody"'),
-        ({"remove": ["sign"], "move": [{"shape": "sign"}]}, "taken away"),
+        ({"remove": ["sign"], "move": [{"shape": "sign"}]}, "both moved and removed"),
         ({"add": [{"name": "sign", "min": [0, 0, 0], "max": [1, 1, 1]}]}, "already"),
-        ({"remove": ["sign", "stand", "room"]}, "no shape is left"),
+        ({"remove": ["sign", "stand", "room"]}, "keep at least one"),
     ],
 )
 def test05_what_cannot_be_done(scene_changes, tmp_path, changes, said):
@@ -129,7 +129,7 @@ def test05_what_cannot_be_done(scene_changes, tmp_path, changes, said):
 
 
 def test06_a_field_cannot_be_taken_apart(tmp_path):
-    with pytest.raises(NergError, match="give one"):
+    with pytest.raises(NergError, match="need a scene"):
         change(None, tmp_path, remove=["sign"])
 
 
@@ -201,7 +201,7 @@ def folder(tmp_path_factory):
 
 
 def test01_depths_are_those_of_the_shapes(folder):
-    around = surroundings_of_files(folder / "bare" / "scene.xml", None, None, None, ns)
+    around = load_gaze_scene(folder / "bare" / "scene.xml", None, None, None, ns)
     rays = people()
     expected = [first_box(o, d)[1] for o, d in zip(rays.origin, rays.direction)]
     assert np.allclose(around.trace_depth(rays.origin, rays.direction), expected, rtol=1e-4) and around.gaze is None
@@ -210,8 +210,8 @@ def test01_depths_are_those_of_the_shapes(folder):
 
 def test02_gaze_of_the_scene_or_beside_it(folder):
     d = np.array([[1.0, 0, 0], [0, 1, 0]])
-    own = surroundings_of_files(folder / "scene.xml", None, None, None, ns)
-    beside = surroundings_of_files(folder / "bare" / "scene.xml", None, folder / "gaze.safetensors", None, ns)
+    own = load_gaze_scene(folder / "scene.xml", None, None, None, ns)
+    beside = load_gaze_scene(folder / "bare" / "scene.xml", None, folder / "gaze.safetensors", None, ns)
     eye = np.array([1.0, 1.0, 1.5])
     found, other = own.query_from(eye)(d), beside.query_from(eye)(d)
     assert found[0].shape == (1, 2) and np.allclose(found[0], other[0], rtol=1e-4)
@@ -222,24 +222,24 @@ def test02_gaze_of_the_scene_or_beside_it(folder):
 def test03_frames(folder):
     matrix = np.diag([2.0, 2, 2, 1])
     matrix[:3, 3] = 1, 0, 0
-    around = surroundings_of_files(folder / "scene.xml", None, None, Similarity(matrix), ns)
+    around = load_gaze_scene(folder / "scene.xml", None, None, Similarity(matrix), ns)
     assert around.scale == pytest.approx(2) and np.allclose(around.transform_points(np.ones(3)), [3, 2, 2])
     assert np.allclose(around.transform_directions(np.array([0, 0, 1.0])), [0, 0, 1])
 
 
 def test04_nothing_is_known(folder):
-    around = surroundings_of_files(None, None, None, None, ns)
+    around = load_gaze_scene(None, None, None, None, ns)
     assert np.isinf(around.trace_depth(np.zeros((3, 3)), np.eye(3))).all()
-    with pytest.raises(NergError, match="no place"):
+    with pytest.raises(NergError, match="bounds of the scene"):
         around.bounds()
 
 
 def test05_two_places(folder):
-    with pytest.raises(NergError, match="both a place"):
-        surroundings_of_files(folder / "scene.xml", folder / "field.safetensors", None, None, ns)
+    with pytest.raises(NergError, match="both define the geometry"):
+        load_gaze_scene(folder / "scene.xml", folder / "field.safetensors", None, None, ns)
     (folder / "empty.xml").write_text('<scene version="3.0.0"><integrator type="path"/></scene>')
     with pytest.raises(NergError, match="neither shapes nor a field"):
-        surroundings_of_files(folder / "empty.xml", None, None, None, ns)
+        load_gaze_scene(folder / "empty.xml", None, None, None, ns)
 
 
 # ---- Areas as things: meshes, some of their faces, shapes of a scene ----
@@ -268,7 +268,7 @@ def test01_one_of_each(scene_things, tmp_path):
         True,
     ]
     o, d = np.array([[0.0, 0.2, 0.2], [0, 1.5, 1.5]]), np.tile([1.0, 0, 0], (2, 1))
-    near = np.array([t.interval(o, d)[0] for t in made])
+    near = np.array([t.intersect(o, d)[0] for t in made])
     assert np.allclose(near[1:], [[1.0, np.inf], [3.0, np.inf], [np.inf, 2.5]])
     # The scene's shapes have their names still.
     assert set(shapes_by_id(scene_things)) == {"room", "sign", "stand"}
@@ -276,7 +276,9 @@ def test01_one_of_each(scene_things, tmp_path):
 
 def test02_samples_lie_on_the_surface(scene_things, tmp_path):
     (tmp_path / "two.obj").write_text(TWO)
-    both, stand = things([MeshPart("m", tmp_path / "two.obj"), SceneShape("stand", "stand")], shapes_by_id(scene_things))
+    both, stand = things(
+        [MeshPart("m", tmp_path / "two.obj"), SceneShape("stand", "stand")], shapes_by_id(scene_things)
+    )
     points, normals = both.sample_points(64)
     assert points.shape == (64, 3) and not normals.any()
     assert (np.isclose(points[:, 0], 1) | np.isclose(points[:, 0], 3)).all() and 20 < np.isclose(
@@ -291,8 +293,8 @@ def test03_a_sphere():
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
-    ball = thing_of_shape("ball", mi.load_dict({"type": "sphere", "radius": 0.5, "center": [2, 0, 0]}))
-    near, far = ball.interval(np.zeros((1, 3)), np.array([[1.0, 0, 0]]))
+    ball = aoi_from_shape("ball", mi.load_dict({"type": "sphere", "radius": 0.5, "center": [2, 0, 0]}))
+    near, far = ball.intersect(np.zeros((1, 3)), np.array([[1.0, 0, 0]]))
     assert near == pytest.approx(1.5) and far == near
     points, _ = ball.sample_points(50)
     assert np.allclose(np.linalg.norm(points - (2, 0, 0), axis=1), 0.5, atol=1e-5)
@@ -300,9 +302,9 @@ def test03_a_sphere():
 
 def test04_what_there_is_not(scene_things, tmp_path):
     with pytest.raises(NergError, match='"x"'):
-        shape_named(shapes_by_id(scene_things), "x")
-    with pytest.raises(NergError, match="give a scene"):
-        shape_named(shapes_by_id(None), "x")
+        find_shape(shapes_by_id(scene_things), "x")
+    with pytest.raises(NergError, match="use a scene"):
+        find_shape(shapes_by_id(None), "x")
     with pytest.raises(NergError, match="there is no mesh"):
         things([MeshPart("m", tmp_path / "none.ply")], {})
     (tmp_path / "two.obj").write_text(TWO)

@@ -7,7 +7,7 @@ import pytest
 from matplotlib.collections import LineCollection, PatchCollection
 
 from nerg_mi.figures.maps import (
-    PEOPLE,
+    PARTICIPANT_COLORS,
     ParticipantPath,
     SightLines,
     Walls,
@@ -17,7 +17,7 @@ from nerg_mi.figures.maps import (
     floor_plan,
     layout_figure,
 )
-from nerg_mi.figures.statistics import map_figure, moves_figure, things_figure
+from nerg_mi.figures.statistics import aois_figure, map_figure, transitions_figure
 from nerg_mi.figures.style import DPI, encode, rasterize, save
 from nerg_mi.rays.rays import Rays
 
@@ -29,7 +29,7 @@ def test_four_plans_hold_what_they_show_before_and_after(place):
     points, heads = np.random.default_rng(1).uniform(0, 2, (2, 300, 3))
     shift = np.eye(4)
     shift[:3, 3] = 1, 2, 0
-    figure = alignment_figure(place, points, heads, shift, cut=3.0)
+    figure = alignment_figure(place, points, heads, shift, cut_height=3.0)
     assert [a.get_title(loc="left") for a in figure.axes] == [
         f"{when}, {view}" for when in ("before", "after") for view in ("from above", "from the side")
     ]
@@ -43,7 +43,7 @@ def test_four_plans_hold_what_they_show_before_and_after(place):
 
 def test_the_ceiling_is_cut_from_above_only():
     place = np.array([[0.0, 0, 0], [1, 1, 1], [0, 0, 3], [1, 0, 3]])
-    figure = alignment_figure(place, place, None, np.eye(4), cut=2.0)
+    figure = alignment_figure(place, place, None, np.eye(4), cut_height=2.0)
     assert [len(a.collections[0].get_offsets()) for a in figure.axes] == [2, 4, 2, 4]
 
 
@@ -110,7 +110,10 @@ def test_paths_have_gaps_where_nobody_was_recorded():
     line = next(l for l in page.axes[0].lines if len(l.get_xdata()) > 2)
     xy = np.stack([line.get_xdata(), line.get_ydata()], axis=1)
     np.testing.assert_array_equal(xy[~np.isnan(xy[:, 0])], places)
-    assert list(np.isnan(xy[:, 0])) == [True, False, False, True, False, False] and line.get_color() == PEOPLE[0]
+    assert (
+        list(np.isnan(xy[:, 0])) == [True, False, False, True, False, False]
+        and line.get_color() == PARTICIPANT_COLORS[0]
+    )
 
 
 def test_rays_and_fields_of_view():
@@ -207,12 +210,12 @@ def test_layout_says_how_far_the_rays_reach(rays):
 
 def row(thing, source, share):
     return dict(
-        thing=thing, source=source, share=share, share_low=share / 2, share_high=2 * share, reach=None, dwell=1.0
+        aoi=thing, source=source, share=share, share_low=share / 2, share_high=2 * share, hit_ratio=None, dwell=1.0
     )
 
 
 def test01_bars_are_as_long_as_shares_and_sorted():
-    page = things_figure([row("a", "tracked", 0.1), row("b", "tracked", 0.3), row("a", "field", 0.2)])
+    page = aois_figure([row("a", "measured", 0.1), row("b", "measured", 0.3), row("a", "predicted", 0.2)])
     axis = page.axes[0]
     assert [t.get_text() for t in axis.get_yticklabels()] == ["a", "b"]
     assert sorted(p.get_width() for p in axis.patches) == [10.0, 30.0]
@@ -222,7 +225,7 @@ def test01_bars_are_as_long_as_shares_and_sorted():
 
 
 def test02_moves_are_percent_of_their_row():
-    page = moves_figure(["a", "b"], np.array([[0, 3.0], [0, 0]]))
+    page = transitions_figure(["a", "b"], np.array([[0, 3.0], [0, 0]]))
     assert page.axes[0].images[0].get_array().filled(0).tolist() == [[0, 100], [0, 0]]
     assert rasterize(page).std() > 5
 
@@ -234,4 +237,4 @@ def test03_a_map():
 
 
 def test04_no_things():
-    assert rasterize(things_figure([])).shape[2] == 3
+    assert rasterize(aois_figure([])).shape[2] == 3

@@ -10,15 +10,15 @@ from nerg_mi.figures import overlay as figures
 from nerg_mi.figures.overlay import (
     Heat,
     OverlayLayers,
+    color_strip,
+    dim_background,
     find_overlay,
-    overlay,
     list_overlays,
-    scale_strip,
+    overlay,
+    robust_max,
     shared_limits,
     srgb,
     to_bytes,
-    robust_max,
-    underlay,
     write_png,
 )
 from nerg_mi.figures.style import save
@@ -36,8 +36,8 @@ def test01_nothing_where_nobody_looks_and_where_there_is_no_surface():
     mask = np.ones((6, 8), bool)
     mask[1] = False
     shown = overlay(COLOR, values, heat, mask)
-    assert np.allclose(shown[:2], underlay(COLOR, heat)[:2])
-    assert np.abs(shown[2:] - underlay(COLOR, heat)[2:]).min(axis=(0, 1)).max() > 0.05
+    assert np.allclose(shown[:2], dim_background(COLOR, heat)[:2])
+    assert np.abs(shown[2:] - dim_background(COLOR, heat)[2:]).min(axis=(0, 1)).max() > 0.05
 
 
 def test02_opacity_rises_and_ends_at_the_top():
@@ -50,12 +50,12 @@ def test02_opacity_rises_and_ends_at_the_top():
 def test03_equal_values_have_equal_heat_in_the_scale_and_in_the_picture():
     heat = Heat(vmax=3.0, opacity=1.0)
     shown = overlay(COLOR, np.full((6, 8), 3.0), heat)
-    assert np.allclose(shown, scale_strip(heat)[-1])
+    assert np.allclose(shown, color_strip(heat)[-1])
 
 
 def test04_lightness_of_the_scale_rises():
     for colors in ("inferno", "viridis"):
-        strip = scale_strip(Heat(vmax=1.0, colormap=colors, opacity=1.0, ramp=1e-6))
+        strip = color_strip(Heat(vmax=1.0, colormap=colors, opacity=1.0, ramp=1e-6))
         assert np.all(np.diff((strip**2.2 @ [0.2126, 0.7152, 0.0722])[1:]) > -1e-3)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nerg_mi.figures.overview import ViewScorer, PinholeFrame, SeenSurfaces, view_of_observer, view_of_scene
+from nerg_mi.figures.overview import PinholeFrame, SeenSurfaces, ViewScorer, view_of_observer, view_of_scene
 from nerg_mi.maths.geometry import intersect_box_numpy
 from nerg_mi.maths.sphere import fibonacci_directions
 
@@ -72,8 +72,12 @@ def test_a_camera_sees_what_the_observer_looks_at():
     trace = room(pillar=((5, 3.6, 0), (5.5, 5.9, 3)))
     seen = seen_from((2.5, 2.5, 1.6), trace, lambda d: np.exp(60 * (d @ towards - 1)))
     shot = view_of_observer(trace, FRAME, seen)
-    assert shot.opaque == 1 and shot.attention_share > 0.9
-    assert (shot.origin > 0).all() and (shot.origin < (8, 6, 3)).all() and np.linalg.norm(shot.origin - seen.observer) > 0.3
+    assert shot.surface_fraction == 1 and shot.attention_share > 0.9
+    assert (
+        (shot.origin > 0).all()
+        and (shot.origin < (8, 6, 3)).all()
+        and np.linalg.norm(shot.origin - seen.observer) > 0.3
+    )
     # The point that is looked at is in the picture, and not hidden.
     spot = np.array([8, 2.5, 1.6])
     way = spot - shot.origin
@@ -90,7 +94,7 @@ def test_attention_that_is_shown_is_counted():
     judge = ViewScorer(trace, FRAME, seen.median_depth, seen)
     origins = np.array([[4, 3, 1.5], [4, 3, 1.5], [0.5, 3, 1.5]])
     targets = origins + np.array([[1.0, 0, 0], [-1, 0, 0], [1, 0, 0]])
-    ahead, away, behind = judge.shots(origins, targets, (24, 16))
+    ahead, away, behind = judge.score_views(origins, targets, (24, 16))
     assert (ahead.attention_share, away.attention_share, behind.attention_share) == pytest.approx((1, 0, 1))
     assert ahead.score > 4 * away.score and behind.score > 4 * away.score
 
@@ -98,7 +102,7 @@ def test_attention_that_is_shown_is_counted():
 def test_a_room_is_shown_from_within():
     trace = room(pillar=((3, 2, 0), (4, 3, 2)))
     shot = view_of_scene(trace, FRAME, np.zeros(3), np.array([8.0, 6, 3]))
-    assert shot.opaque == 1 and (shot.origin > 0).all() and (shot.origin < (8, 6, 3)).all()
+    assert shot.surface_fraction == 1 and (shot.origin > 0).all() and (shot.origin < (8, 6, 3)).all()
     # Not in the pillar, nor right before the wall that it looks at.
     assert not ((shot.origin > (2.9, 1.9, 0)) & (shot.origin < (4.1, 3.1, 2.1))).all()
     d = (shot.target - shot.origin)[None] / np.linalg.norm(shot.target - shot.origin)
@@ -114,7 +118,7 @@ def test_an_object_is_shown_from_around():
         return np.where(hit, np.maximum(near, 0), 0), hit.astype(float)
 
     shot = view_of_scene(solid, FRAME, lower, upper)
-    assert np.abs(shot.origin).max() > 1 and shot.origin[2] > 0 and shot.opaque > 0.1
+    assert np.abs(shot.origin).max() > 1 and shot.origin[2] > 0 and shot.surface_fraction > 0.1
     np.testing.assert_allclose(shot.target, 0, atol=1e-12)
     assert view_of_scene(solid, FRAME, lower, upper, allow_outside=False) is None
 

@@ -18,7 +18,7 @@ import pytest
 
 import nerg_mi
 from nerg_mi.errors import NergError
-from nerg_mi.figures.overlay import Heat, add_scale, gaze_figure, overlay, scale_strip
+from nerg_mi.figures.overlay import Heat, add_scale, color_strip, gaze_figure, overlay
 from nerg_mi.figures.style import (
     DIVERGING,
     SEQUENTIAL,
@@ -27,17 +27,17 @@ from nerg_mi.figures.style import (
     apply_colormap,
     contact_sheet,
     encode,
-    round_up_to_even,
     existing_files,
     find_colormap,
     hatch,
     hatch_lines,
+    hatch_swatch,
     make_provenance,
     rasterize,
+    round_up_to_even,
     save,
+    scale_ticks,
     shrink,
-    hatch_swatch,
-    ticks_of,
     wrap,
 )
 from nerg_mi.workflows.scene_commands import BakeOptions, PictureOptions
@@ -248,7 +248,7 @@ def value(name, factor=""):
 @pytest.mark.parametrize("top", [1.0, 0.8, 1.37, 23.0, 9999.0, 12345.0, 3.3e-4, 7e-12, 4e15, 1e-3])
 @pytest.mark.parametrize("most", [3, 5, 9])
 def test_linear(top, most):
-    places, names, factor = ticks_of(0.0, top, most)
+    places, names, factor = scale_ticks(0.0, top, most)
     assert 2 <= len(places) <= most + 1 and len(set(names)) == len(names)
     for place, name in zip(places, names):
         assert -1e-9 <= place <= 1 + 1e-9
@@ -258,15 +258,15 @@ def test_linear(top, most):
 
 def test_from_one_value_to_another_and_around_zero():
     for low, high in ((2.0, 7.3), (-0.5, 0.5), (-3e-6, 3e-6), (100.0, 100.4)):
-        places, names, factor = ticks_of(low, high, 6)
+        places, names, factor = scale_ticks(low, high, 6)
         for place, name in zip(places, names):
             assert value(name, factor) == pytest.approx(low + place * (high - low), abs=1e-6 * max(abs(low), high))
-    assert "0.0" in ticks_of(-0.5, 0.5, 6)[1] and not any(n.startswith("−0.0") and float(n[1:]) == 0 for n in names)
+    assert "0.0" in scale_ticks(-0.5, 0.5, 6)[1] and not any(n.startswith("−0.0") and float(n[1:]) == 0 for n in names)
 
 
 @pytest.mark.parametrize("low, high", [(1e-4, 1.0), (3e-12, 0.3), (1e-20, 1e10), (0.05, 700.0)])
 def test_logarithmic(low, high):
-    places, names, factor = ticks_of(low, high, 5, log=True)
+    places, names, factor = scale_ticks(low, high, 5, log=True)
     assert factor == "" and 2 <= len(places) <= 6
     for place, name in zip(places, names):
         text = name.translate(SUPER)
@@ -275,7 +275,7 @@ def test_logarithmic(low, high):
 
 
 def test_less_than_a_decade():
-    places, names, _ = ticks_of(0.2, 0.8, 5, log=True)
+    places, names, _ = scale_ticks(0.2, 0.8, 5, log=True)
     assert places == [0.0, 0.5, 1.0] and names == ["0.2", "0.4", "0.8"]
 
 
@@ -343,7 +343,7 @@ def test_ticks_stand_at_the_colours_of_their_values(decades):
     page = gaze_figure(np.full((200, 200, 3), 0.2), np.zeros((200, 200)), np.ones((200, 200), bool), heat)
     bar = page.axes[-1]
     strip = bar.images[0].get_array()[:, 0]
-    np.testing.assert_allclose(strip, scale_strip(heat))
+    np.testing.assert_allclose(strip, color_strip(heat))
     names = [t.get_text() for t in bar.get_yticklabels()]
     power = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
     for place, name in zip(bar.get_yticks(), names):

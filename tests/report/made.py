@@ -9,7 +9,16 @@ import numpy as np
 from nerg_mi.evaluation.gaze_report import GazeResults
 from nerg_mi.formats.areas import Region
 from nerg_mi.rays.quality import summarise
-from nerg_mi.report.data import ObjectAttention, ReportCamera, ReportPicture, ReportProxy, Run, MeanShare, Stage, pack_stage
+from nerg_mi.report.data import (
+    MeanShare,
+    ObjectAttention,
+    ReportCamera,
+    ReportPicture,
+    ReportProxy,
+    Run,
+    Stage,
+    pack_stage,
+)
 from tests.evaluation.test_gaze import crowd
 from tests.evaluation.test_gaze_report import scored
 

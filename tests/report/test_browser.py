@@ -128,7 +128,7 @@ def test_the_scene_follows_mouse_and_choices(browser, tmp_path):
     assert changed(drag)
     assert changed(lambda: ActionChains(browser).scroll_from_origin(origin(canvas), 0, -300).perform())
     options = stage.find_elements(By.TAG_NAME, "option")
-    assert [o.text for o in options] == ["the mean of all 2", "observer 1", "observer 2"]
+    assert [o.text for o in options] == ["mean of all 2 observers", "observer 1", "observer 2"]
     # A list that opens over the page takes the mouse away from it.
     choose = lambda k: browser.execute_script(
         "const s = document.querySelector('#stage select'); s.value = arguments[0]; s.dispatchEvent(new "

@@ -20,20 +20,20 @@ from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.rays.rays import Rays
 from nerg_mi.report.data import (
-    ParticipantLabels,
     GazeSampler,
-    summarize_objects,
-    sample_eye_positions,
-    assign_ray_hits,
-    mean_over_people,
-    pack_stage,
-    make_proxy,
+    ParticipantLabels,
     anonymize_rays,
     anonymize_results,
-    smooth_normals,
-    farthest_point_sampling,
-    surface_normals,
+    assign_ray_hits,
     downsample_points,
+    estimate_normals,
+    farthest_point_sampling,
+    make_proxy,
+    mean_over_participants,
+    normals_from_image,
+    pack_stage,
+    sample_eye_positions,
+    summarize_objects,
 )
 from nerg_mi.statistics.shares import Shares
 from nerg_mi.statistics.visits import BoxAoi as Solid
@@ -260,7 +260,7 @@ def test_nobody_recorded():
 def test_the_interval_is_that_of_a_bootstrap_over_people():
     rng = np.random.default_rng(2)
     values = rng.beta(2, 9, 40)
-    found = mean_over_people(values)
+    found = mean_over_participants(values)
     means = [rng.choice(values, 40).mean() for _ in range(20_000)]
     assert found.mean == pytest.approx(values.mean())
     assert found.high - found.mean == pytest.approx(1.96 * np.std(means) * small_sample_factor(40), rel=0.02)
@@ -268,9 +268,9 @@ def test_the_interval_is_that_of_a_bootstrap_over_people():
 
 
 def test_shares_stay_shares_and_few_people_have_no_interval():
-    assert mean_over_people(np.array([0.0, 0.0, 0.0, 0.9])).low == 0.0
-    assert mean_over_people(np.array([1.0, 1.0, 1.0, 0.1])).high == 1.0
-    assert math.isnan(mean_over_people(np.array([0.2, 0.3])).low)
+    assert mean_over_participants(np.array([0.0, 0.0, 0.0, 0.9])).low == 0.0
+    assert mean_over_participants(np.array([1.0, 1.0, 1.0, 0.1])).high == 1.0
+    assert math.isnan(mean_over_participants(np.array([0.2, 0.3])).low)
 
 
 # ---- A place as points: on its surfaces, with normals that face who saw them ----
@@ -341,13 +341,13 @@ def test_normals_of_a_plane_and_an_edge():
     u, v = np.meshgrid(np.linspace(-1, 1, 20), np.linspace(-1, 1, 10))
     plane = np.stack([u, v, 0.5 * u + 2], axis=-1)
     expected = np.array([0.5, 0, -1]) / np.sqrt(1.25)
-    normals = surface_normals(plane, -plane)
+    normals = normals_from_image(plane, -plane)
     assert np.allclose(normals[:, 1:-1], expected, atol=1e-6)
     step = np.where(u[..., None] < 0, plane, plane + [0, 0, 5])
-    assert np.allclose(surface_normals(step, -step)[:, 1:-1], expected, atol=1e-6)
+    assert np.allclose(normals_from_image(step, -step)[:, 1:-1], expected, atol=1e-6)
     hole = plane.copy()
     hole[4, 7] = np.nan
-    assert np.isfinite(surface_normals(hole, -np.nan_to_num(hole, nan=1.0))).all()
+    assert np.isfinite(normals_from_image(hole, -np.nan_to_num(hole, nan=1.0))).all()
 
 
 def test_smooth_normals_of_a_noisy_ball():
@@ -355,18 +355,23 @@ def test_smooth_normals_of_a_noisy_ball():
     outward = rng.normal(size=(4000, 3))
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)
     points = outward * (2 + rng.normal(0, 0.003, (4000, 1)))
-    found = smooth_normals(points, [0.3, 0.1, 0.5] + 5 * outward)
+    found = estimate_normals(points, [0.3, 0.1, 0.5] + 5 * outward)
     assert np.percentile((found * outward).sum(axis=1), 5) > 0.97 and np.allclose(np.linalg.norm(found, axis=1), 1)
-    assert np.allclose(smooth_normals(points[:2], 3 * outward[:2]), outward[:2])
+    assert np.allclose(estimate_normals(points[:2], 3 * outward[:2]), outward[:2])
 
 
 def test_places_far_apart():
     line = np.linspace(0, 10, 11)[:, None] * [1.0, 0, 0]
-    assert sorted(farthest_point_sampling(line, 3, first=np.zeros(3)).tolist()) == [3, 5, 10] or farthest_point_sampling(
-        line, 2, first=np.zeros(3)
-    ).tolist() == [10, 5]
+    assert sorted(farthest_point_sampling(line, 3, first=np.zeros(3)).tolist()) == [
+        3,
+        5,
+        10,
+    ] or farthest_point_sampling(line, 2, first=np.zeros(3)).tolist() == [10, 5]
     assert farthest_point_sampling(line, 2).tolist() == [0, 10]
-    assert len(farthest_point_sampling(np.zeros((5, 3)), 3)) == 1 and len(farthest_point_sampling(np.zeros((0, 3)), 3)) == 0
+    assert (
+        len(farthest_point_sampling(np.zeros((5, 3)), 3)) == 1
+        and len(farthest_point_sampling(np.zeros((0, 3)), 3)) == 0
+    )
 
 
 # ---- A run judges its evaluations ----

@@ -175,8 +175,8 @@ def text_of(section, run) -> str:
 
 @pytest.mark.parametrize("section", SECTIONS, ids=lambda s: s.name)
 def test_shown_or_left_out_with_a_reason(section):
-    assert section.absent(whole()) is None and len(text_of(section, whole())) > 40
-    reason = section.absent(bare())
+    assert section.reason_absent(whole()) is None and len(text_of(section, whole())) > 40
+    reason = section.reason_absent(bare())
     assert (reason is not None) == (section.name in ABSENT)
     if reason is None:
         assert section.body(bare())
@@ -191,15 +191,18 @@ def test_names_are_apart():
 def test_what_is_said():
     said = {s.name: text_of(s, whole()) for s in SECTIONS}
     assert said["verdict"].startswith("Better than nearest rays, the strongest baseline, for new people at new places.")
-    assert "4.00 × 4.00 × 4.00" in said["place"] and "9 that it was trained on" in said["place"]
-    assert "400 of 400 rows" in said["data"] and "median number of people within 0.25 m is 3" in said["people"]
-    assert "The observer stands somewhere. Densities are in 1/sr" in said["gaze"]
-    assert "the mean of all 2" in said["stage"] and "people's paths" in said["stage"]
+    assert "4.00 × 4.00 × 4.00" in said["place"] and "training photos9" in said["place"]
+    assert (
+        "400 of 400 rows" in said["data"]
+        and "median number of participants within 0.25 m of a viewpoint" in said["people"]
+    )
+    assert "The observer stands somewhere. Gaze densities are in 1/sr" in said["gaze"]
+    assert "mean of all 2 observers" in said["stage"] and "participants' paths" in said["stage"]
     assert "25.00 [20.00, 30.00]" in said["objects"] and "3 of 4" in said["objects"]
-    assert "lead in KLD, nats" in said["scores"] and "A field is" not in said["scores"]
-    assert "mean of 2 fields" in said["uncertainty"] and "CC 0.700, KLD 0.400" in said["uncertainty"]
-    assert "3 positions, 1 people, and every ray within 0.5 m" in said["settings"]
-    assert "A head is not a gaze" in said["limits"] and "Places are static" in said["limits"]
+    assert "gain in KLD, nats" in said["scores"]
+    assert "mean of 2 members" in said["uncertainty"] and "CC 0.700, KLD 0.400" in said["uncertainty"]
+    assert "3 positions, 1 participants, and all samples within 0.5 m" in said["settings"]
+    assert "Head direction is not gaze direction" in said["limits"] and "scene is static" in said["limits"]
     assert "ab" * 32 in said["provenance"]
 
 
@@ -219,7 +222,7 @@ def test_without_people_there_are_no_intervals_of_shares():
     (first, *_) = whole().objects
     alone = replace(first, recorded=None, num_could_see=None, num_looked=None, num_participants=None)
     said = text_of(objects, replace(whole(), objects=(alone,), num_viewpoints=1))
-    assert "at 1 place" in said and "rays recorded" not in said
+    assert "over 1 viewpoint." in said and "share of samples" not in said
 
 
 def test_one_split_each():
@@ -227,5 +230,5 @@ def test_one_split_each():
     run = replace(whole(), results=(both, replace(both, split="pos", num_participants=3)))
     verdict, scores = (next(s for s in SECTIONS if s.name == n) for n in ("verdict", "scores"))
     assert "No verdict for known people at new places: 3 people" in text_of(verdict, run)
-    assert "Known people at new places (3 people, 60 places)" in text_of(scores, run)
+    assert "Known people at new places (3 participants, 60 positions)" in text_of(scores, run)
     assert HOSTILE not in scores.render(replace(run, results=(replace(both, split=HOSTILE),)))

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from nerg_mi.statistics.estimates import adjust_p_values, mid_p_interval, estimate_proportion_differences, estimate_proportions, estimate_ratio_differences, estimate_ratios
+from nerg_mi.statistics.estimates import (
+    adjust_p_values,
+    estimate_proportion_differences,
+    estimate_proportions,
+    estimate_ratio_differences,
+    estimate_ratios,
+    mid_p_interval,
+)
 
 # ---- p-values of many hypotheses, adjusted for the false discovery rate ----
 
@@ -220,13 +227,18 @@ def test13_groups_of_unequal_size_are_drawn_apart():
 def test14_a_p_value_is_no_less_than_draws_can_tell(resamples):
     rng = np.random.default_rng(11)
     x = rng.random((12, 5))
-    found = estimate_ratio_differences((x, ONES(x.shape)), (x + 100 + rng.random(x.shape), ONES(x.shape)), resamples=resamples)
+    found = estimate_ratio_differences(
+        (x, ONES(x.shape)), (x + 100 + rng.random(x.shape), ONES(x.shape)), resamples=resamples
+    )
     assert found.p == pytest.approx(1 / (resamples + 1))
 
 
 def test15_the_least_number_of_people():
     x = np.array([[0.1], [0.2], [0.4]])
-    assert np.isfinite(estimate_ratios(x, ONES(x.shape)).low).all() and np.isnan(estimate_ratios(x[:2], ONES((2, 1))).low).all()
+    assert (
+        np.isfinite(estimate_ratios(x, ONES(x.shape)).low).all()
+        and np.isnan(estimate_ratios(x[:2], ONES((2, 1))).low).all()
+    )
 
 
 def test16_half_of_the_people_are_few():

@@ -11,14 +11,14 @@ from nerg_mi.maths.geometry import intersect_box_numpy
 from nerg_mi.maths.sphere import fibonacci_directions, indices_in_cone
 from nerg_mi.statistics.shares import (
     INITIAL_DIRECTIONS,
-    VisibilityCache,
-    SamplePoints,
     QuadratureRule,
+    SamplePoints,
+    VisibilityCache,
+    compute_isovists,
+    compute_visibility,
+    find_standing_positions,
     gaze_shares,
     visible_in_fov,
-    compute_isovists,
-    find_standing_positions,
-    unhidden,
 )
 from nerg_mi.statistics.visits import BoxAoi, assign_hits
 
@@ -55,7 +55,7 @@ def exact(eye, region=None):
     """The integral of the gaze on a box, or of what escapes, and over everything, by sums over very many directions."""
     count, numbers = 1 << 18, None
     if region is not None:
-        center, radius = BoxAoi(region).ball
+        center, radius = BoxAoi(region).bounding_sphere
         away = center - eye
         # A few hundred thousand on the box, however small.
         count = 1 << 23 if radius < 0.2 else count
@@ -102,7 +102,9 @@ def test03_a_closer_tolerance_takes_more_directions():
     errors, asked = [], []
     for tolerance in (0.1, 0.01, 0.001):
         hall = Hall()
-        shares = gaze_shares(hall.make_gaze_evaluator, EYES[:1], [BoxAoi(BOXES[0])], [(0,)], 0.0, QuadratureRule(rtol=tolerance))
+        shares = gaze_shares(
+            hall.make_gaze_evaluator, EYES[:1], [BoxAoi(BOXES[0])], [(0,)], 0.0, QuadratureRule(rtol=tolerance)
+        )
         errors.append(shares.error[0, 0])
         asked.append(sum(hall.asked))
     assert errors[0] > errors[2] and asked[0] < asked[2] < 1 << 19
@@ -142,7 +144,7 @@ def test01_what_is_behind_a_pillar_is_hidden():
     things = [thing("near", [1.0, 1.9, 1], [1.2, 2.1, 1.2]), thing("behind", [4, 1.9, 1], [4.2, 2.1, 1.2])]
     targets = SamplePoints.sample(things, 24)
     eyes = np.array([[0.2, 2.0, 1.1], [3.5, 2.0, 1.1]])
-    seen = unhidden(targets, eyes, room_depth, 0.0)
+    seen = compute_visibility(targets, eyes, room_depth, 0.0)
     by_thing = [[seen[e, targets.aoi_index == k].any() for k in range(2)] for e in range(2)]
     assert by_thing == [[True, False], [False, True]]
     # A face that is turned away is not seen, whatever is between.
@@ -191,10 +193,13 @@ def test04_cells_are_traced_once_and_forgotten_without_harm():
     eyes = np.random.default_rng(1).uniform(0.1, 1.4, (50, 3))
     points, of = cells.get_visibility(eyes)
     middle = (np.floor(eyes / 0.1) + 0.5) * 0.1
-    assert np.array_equal(points[of], unhidden(targets, middle, room_depth, 0.0))
+    assert np.array_equal(points[of], compute_visibility(targets, middle, room_depth, 0.0))
     before = len(asked)
-    assert np.array_equal(cells.get_visibility(eyes[:9])[0][cells.get_visibility(eyes[:9])[1]], points[of][:9]) and len(asked) == before
-    cells.MOST = 0
+    assert (
+        np.array_equal(cells.get_visibility(eyes[:9])[0][cells.get_visibility(eyes[:9])[1]], points[of][:9])
+        and len(asked) == before
+    )
+    cells.MAX_BYTES = 0
     cells.get_visibility(eyes[:2])
     again, whose = cells.get_visibility(eyes)
     assert np.array_equal(again[whose], points[of]) and len(asked) > before
@@ -204,7 +209,9 @@ def test04_cells_are_traced_once_and_forgotten_without_harm():
 
 def test05_the_isovist_of_a_room_is_its_floor():
     empty = lambda o, d: intersect_box_numpy(o, d, *ROOM)[1]
-    found = compute_isovists(np.array([[1.0, 1, 1.6], [3, 2, 1.6]]), empty, SamplePoints.sample([], 4), 0.0, 100.0, directions=7200)
+    found = compute_isovists(
+        np.array([[1.0, 1, 1.6], [3, 2, 1.6]]), empty, SamplePoints.sample([], 4), 0.0, 100.0, num_directions=7200
+    )
     assert np.allclose(found.area, 24, rtol=2e-3) and np.allclose(found.perimeter, 20, rtol=2e-3)
     assert np.allclose(found.nearest, [1, 2], atol=1e-3)
     assert np.allclose(found.farthest, [np.hypot(5, 3), np.hypot(3, 2)], rtol=1e-3)
@@ -212,7 +219,9 @@ def test05_the_isovist_of_a_room_is_its_floor():
 
 def test06_a_pillar_takes_its_shadow():
     # From (1, 2): the pillar from y 1.5 to 2.5 at x = 2 hides the strip between the lines through its corners.
-    found = compute_isovists(np.array([[1.0, 2.0, 1.6]]), room_depth, SamplePoints.sample([], 4), 0.0, 100.0, directions=14400)
+    found = compute_isovists(
+        np.array([[1.0, 2.0, 1.6]]), room_depth, SamplePoints.sample([], 4), 0.0, 100.0, num_directions=14400
+    )
     # Lines of slope 1/2 from the eye meet the walls y = 0 and 4 at x = 5, and x = 6 beyond these: the shadow is the
     # region |y - 2| < (x - 1) / 2, 2 < x, within the room: a trapezium to x = 5 and a rectangle behind.
     shadow = (1 + 4) / 2 * 3 + 4 * 1

@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 
 from nerg_mi.statistics.tables import (
-    MEASURES_BY_NAME,
-    MEASURES,
     MEASURED,
+    MEASURES,
+    MEASURES_BY_NAME,
     MinParticipantsFilter,
-    Participants,
     ParticipantRows,
+    Participants,
+    aoi_rows,
     difference_rows,
     duration_rows,
-    transition_rows,
     format_measure,
-    aoi_rows,
+    transition_rows,
 )
 from nerg_mi.statistics.visits import ALL, BINS, Cell, VisitSums
 
@@ -31,21 +31,21 @@ PEOPLE = Participants(
     distance=np.array([[6.0, 0], [4, 3], [0, 0]]),
     visible_time=np.array([[5.0, 1], [4, 2], [0, 0]]),
     hit_probability=np.array([[1.0, 0], [1, 1], [0, 0]]),
-    looks=np.array([[3.0, 0], [1, 1], [0, 0]]),
-    first_sum=np.array([[4.0, 0], [6, 8], [0, 0]]),
-    first_count=np.array([[2.0, 0], [1, 1], [0, 0]]),
+    visits=np.array([[3.0, 0], [1, 1], [0, 0]]),
+    first_visit_sum=np.array([[4.0, 0], [6, 8], [0, 0]]),
+    first_visit_count=np.array([[2.0, 0], [1, 1], [0, 0]]),
 )
 
 EXPECTED = {
     "share": ([(0.2 + 0.2) / 2, (0 + 0.05) / 2], [2, 2]),
     "dwell": ([6 / 3, 1 / 3], [3, 3]),
-    "reach": ([2 / 3, 1 / 3], [3, 3]),
-    "first_look": ([(2 + 6) / 2, 8], [2, 1]),
-    "looks": ([4 / 3, 1 / 3], [3, 3]),
-    "returns": ([(2 + 0) / 2, 0], [2, 1]),
+    "hit_ratio": ([2 / 3, 1 / 3], [3, 3]),
+    "time_to_first_visit": ([(2 + 6) / 2, 8], [2, 1]),
+    "visits": ([4 / 3, 1 / 3], [3, 3]),
+    "revisits": ([(2 + 0) / 2, 0], [2, 1]),
     "distance": ([10 / 6, 3], [2, 1]),
     "visible": ([(0.5 + 0.2) / 2, (0.1 + 0.1) / 2], [2, 2]),
-    "given_visible": ([6 / 9, 1 / 3], [2, 2]),
+    "share_when_visible": ([6 / 9, 1 / 3], [2, 2]),
     "unseen": ([0, 1 / 2], [2, 2]),
 }
 
@@ -63,16 +63,18 @@ def test02_values_and_people(name):
 def test03_a_field_tells_less():
     told = Participants(PEOPLE.names, PEOPLE.time, PEOPLE.dwell_time, PEOPLE.distance, None, np.full((3, 2), 0.5))
     known = {m.name for m in MEASURES if m.estimate(told, 199, 0) is not None}
-    assert known == {"share", "dwell", "reach", "distance"}
-    assert MEASURES_BY_NAME["reach"].estimate(told, 199, 0).value == pytest.approx([0.5, 0.5])
+    assert known == {"share", "dwell", "hit_ratio", "distance"}
+    assert MEASURES_BY_NAME["hit_ratio"].estimate(told, 199, 0).value == pytest.approx([0.5, 0.5])
 
 
 def test04_those_who_are_not_there_count_for_nothing():
-    more = PEOPLE.aligned(["Ada", "Bo", "Cy", "Dee", "Eve"])
+    more = PEOPLE.align_to(["Ada", "Bo", "Cy", "Dee", "Eve"])
     assert more.is_in_cell.tolist() == [True, True, True, False, False]
     for measure in MEASURES:
         a, b = measure.estimate(PEOPLE, 199, 0), measure.estimate(more, 199, 0)
-        assert np.allclose(a.value, b.value, equal_nan=True) and a.participants.tolist() == b.participants.tolist(), measure.name
+        assert np.allclose(a.value, b.value, equal_nan=True) and a.participants.tolist() == b.participants.tolist(), (
+            measure.name
+        )
 
 
 def test05_nobody():
@@ -92,19 +94,27 @@ def sums():
     found.time[:] = 10, 5, 20
     found.rays[:] = 50, 25, 100
     found.dwell_time[:] = [[1, 2], [9, 9], [3, 0]]
-    found.looks[:] = [[1, 1], [1, 1], [2, 0]]
+    found.visits[:] = [[1, 1], [1, 1], [2, 0]]
     found.visible_time[:] = [[4, 5], [9, 9], [6, 7]]
-    found.first_sum[:], found.first_count[:] = [[4, 6], [0, 0], [1, 0]], [[1, 2], [1, 1], [1, 0]]
+    found.first_visit_sum[:], found.first_visit_count[:] = [[4, 6], [0, 0], [1, 0]], [[1, 2], [1, 1], [1, 0]]
     return found
 
 
 def test01_each_persons_own_in_the_order_of_their_names():
     rows = ParticipantRows(sums(), {"Ada": "p2", "Bo": "p1"}, True)
     assert len(rows) == 4 and list(rows) == rows[:] == [rows[k] for k in range(-4, 0)]
-    assert [(r["person"], r["thing"]) for r in rows] == [("p1", "x"), ("p1", "y"), ("p2", "x"), ("p2", "y")]
-    bo = {"person": "p1", "thing": "y", "time": 10.0, "rays": 50, "dwell": 2.0, "looks": 1, "first_look": 3.0}
+    assert [(r["participant"], r["aoi"]) for r in rows] == [("p1", "x"), ("p1", "y"), ("p2", "x"), ("p2", "y")]
+    bo = {
+        "participant": "p1",
+        "aoi": "y",
+        "time": 10.0,
+        "samples": 50,
+        "dwell": 2.0,
+        "visits": 1,
+        "time_to_first_visit": 3.0,
+    }
     assert rows[1] == bo | {"visible": 5.0} and tuple(rows[1]) == rows.columns
-    assert rows[3]["first_look"] is None and rows[2]["first_look"] == 1.0
+    assert rows[3]["time_to_first_visit"] is None and rows[2]["time_to_first_visit"] == 1.0
     with pytest.raises(IndexError):
         rows[4]
 
@@ -131,7 +141,7 @@ def people(n, share, seed, prefix="p"):
 def test01_a_row_for_each_cell_thing_and_source():
     cells = {ALL: {MEASURED: people(12, 0.2, 0)}, A: {MEASURED: people(2, 0.2, 1)}}
     rows = aoi_rows(("x", "y"), cells, MinParticipantsFilter(), **HOW)
-    assert [(r["cell"], r["value"], r["thing"]) for r in rows] == [
+    assert [(r["cell"], r["value"], r["aoi"]) for r in rows] == [
         ("all", "", "x"),
         ("all", "", "y"),
         ("cohort", "a", "x"),
@@ -139,7 +149,7 @@ def test01_a_row_for_each_cell_thing_and_source():
     ]
     mean = (cells[ALL][MEASURED].dwell_time[:, 0] / 100).mean()
     assert rows[0]["share"] == pytest.approx(mean) and rows[0]["share_low"] < mean < rows[0]["share_high"]
-    assert rows[0]["visible"] is None and rows[0]["people"] == 12
+    assert rows[0]["visible"] is None and rows[0]["participants"] == 12
     # Of two people there is no interval.
     assert rows[2]["share"] is not None and rows[2]["share_low"] is None
 
@@ -150,24 +160,26 @@ def test02_cells_of_few_people_are_blank_and_counted():
     rows = aoi_rows(("x", "y"), cells, floor, **HOW)
     assert rows[0]["share"] is not None
     blank = [k for k, v in rows[2].items() if v is not None]
-    assert blank == ["cell", "value", "thing", "source"]
+    assert blank == ["cell", "value", "aoi", "source"]
     # Of both things: the number of people, and the measures that rays tell.
     told = sum(measure.numerator_denominator(cells[A][MEASURED]) is not None for measure in MEASURES)
     assert floor.num_suppressed == 2 * (1 + told) and told >= 7
     nobody = MinParticipantsFilter(5)
-    assert nobody.passes(0) and nobody.passes(5) and not nobody.passes(4) and nobody.num_suppressed == 1
+    assert nobody.allows(0) and nobody.allows(5) and not nobody.allows(4) and nobody.num_suppressed == 1
 
 
 def test03_differences_are_found_where_they_are():
     cells = {A: {MEASURED: people(15, 0.2, 0, "a")}, B: {MEASURED: people(15, 0.4, 1, "b")}}
-    rows = difference_rows(("x", "y"), cells, MinParticipantsFilter(), compared=("share", "reach"), **HOW)
+    rows = difference_rows(("x", "y"), cells, MinParticipantsFilter(), measures=("share", "hit_ratio"), **HOW)
     shares = [r for r in rows if r["measure"] == "share"]
-    assert len(rows) == 4 and all(r["found"] and 0.1 < r["low"] < r["difference"] < r["high"] < 0.3 for r in shares)
-    assert not any(r["found"] for r in rows if r["measure"] == "reach")
+    assert len(rows) == 4 and all(
+        r["significant"] and 0.1 < r["low"] < r["difference"] < r["high"] < 0.3 for r in shares
+    )
+    assert not any(r["significant"] for r in rows if r["measure"] == "hit_ratio")
     assert all(r["p_adjusted"] >= r["p"] for r in rows)
     assert (rows[0]["first"], rows[0]["second"]) == ("a", "b")
-    blank = difference_rows(("x", "y"), cells, MinParticipantsFilter(16), compared=("share",), **HOW)
-    assert all(r["difference"] is None and r["p"] is None and not r["found"] for r in blank)
+    blank = difference_rows(("x", "y"), cells, MinParticipantsFilter(16), measures=("share",), **HOW)
+    assert all(r["difference"] is None and r["p"] is None and not r["significant"] for r in blank)
 
 
 def test04_one_value_has_nothing_to_be_compared_with():
@@ -179,25 +191,31 @@ def sums_tables():
     found.time[:] = 10, 20
     found.rays[:] = 50, 100
     found.dwell_time[:] = [[1, 2], [3, 0]]
-    found.looks[:] = [[1, 1], [2, 0]]
-    found.first_sum[:], found.first_count[:] = [[4, 6], [1, 0]], [[1, 2], [1, 0]]
+    found.visits[:] = [[1, 1], [2, 0]]
+    found.first_visit_sum[:], found.first_visit_count[:] = [[4, 6], [1, 0]], [[1, 2], [1, 0]]
     found.transitions[0] = [[0, 3], [1, 0]]
-    found.lasted[0, 0, 2] = 3
+    found.duration_counts[0, 0, 2] = 3
     return found
 
 
 def test05_moves_and_durations():
     rows = transition_rows(sums_tables(), MinParticipantsFilter())
-    assert [(r["from"], r["to"], r["moves"], r["share"]) for r in rows] == [("x", "y", 3, 1.0), ("y", "x", 1, 1.0)]
-    assert all(r["moves"] is None for r in transition_rows(sums_tables(), MinParticipantsFilter(3)))
+    assert [(r["from"], r["to"], r["transitions"], r["share"]) for r in rows] == [
+        ("x", "y", 3, 1.0),
+        ("y", "x", 1, 1.0),
+    ]
+    assert all(r["transitions"] is None for r in transition_rows(sums_tables(), MinParticipantsFilter(3)))
     lasted = duration_rows(sums_tables(), MinParticipantsFilter())
     assert len(lasted) == 2 and lasted[0]["0.2 to 0.5 s"] == 3 and len(lasted[0]) == 3 + len(BINS) - 1
 
 
 def test06_as_markdown_has_it():
     row = {"share": 0.1234, "share_low": 0.1, "share_high": 0.2, "dwell": 3.456, "dwell_low": None, "dwell_high": None}
-    assert format_measure(row, MEASURES_BY_NAME["share"]) == "12.3 % [10.0, 20.0]" and format_measure(row, MEASURES_BY_NAME["dwell"]) == "3.46"
-    assert format_measure(row, MEASURES_BY_NAME["reach"]) == ""
+    assert (
+        format_measure(row, MEASURES_BY_NAME["share"]) == "12.3 % [10.0, 20.0]"
+        and format_measure(row, MEASURES_BY_NAME["dwell"]) == "3.46"
+    )
+    assert format_measure(row, MEASURES_BY_NAME["hit_ratio"]) == ""
 
 
 def test09_nobody_is_compared_with_nobody():

@@ -19,15 +19,15 @@ from nerg_mi.statistics.visits import (
     HitAssignment,
     VisitRules,
     VisitSums,
-    concatenate_hits,
-    sample_cone,
     assign_hits,
-    looks_at,
+    concatenate_hits,
+    find_visits,
+    make_timeline,
+    merge_directions,
+    merge_members,
     merge_sums,
-    partial_sums,
-    regroup,
-    timeline,
-    unite,
+    sample_cone,
+    sum_visits,
 )
 
 # ---- Which things rays land on, against loops over rays and planes ----
@@ -114,7 +114,7 @@ def test04_a_box_that_is_grazed_or_behind_is_not_met():
 def test05_groups_are_unions_at_their_least_distance():
     things = [box("a", [1, -1, -1], [2, 1, 1]), box("b", [1.5, 0, -1], [4, 1, 1])]
     o, d = np.array([[0, 0.5, 0.0], [0, -0.5, 0], [3, 0.5, -5]]), np.array([[1.0, 0, 0], [1, 0, 0], [0, 0, 1]])
-    landed = regroup(assign_hits(things, o, d, np.array([1.6, 1.0, 5.0])), [(0,), (1,), (0, 1)])
+    landed = merge_members(assign_hits(things, o, d, np.array([1.6, 1.0, 5.0])), [(0,), (1,), (0, 1)])
     assert [rows.tolist() for rows in landed.rows] == [[0, 1], [0, 2], [0, 1, 2]]
     assert landed.distance[2].tolist() == [1.0, 1.0, 4.0]
 
@@ -124,7 +124,7 @@ def test06_parts_and_ways_are_put_together():
     o, d = np.zeros((2, 3)), np.array([[1.0, 0, 0], [0, 1, 0]])
     one, two = assign_hits(things, o, d, None), assign_hits(things, o, d[::-1], None)
     assert concatenate_hits([one, two]).rows[0].tolist() == [0, 3]
-    assert unite([one, two]).rows[0].tolist() == [0, 1]
+    assert merge_directions([one, two]).rows[0].tolist() == [0, 1]
 
 
 @pytest.mark.parametrize("degrees", [0.5, 2.0, 10.0])
@@ -167,16 +167,16 @@ def slow_weights(person, t, rules):
     n = len(t)
     sitting, weight = [0] * n, [0.0] * n
     for i in range(1, n):
-        goes_on = person[i] == person[i - 1] and t[i] - t[i - 1] <= rules.pause
+        goes_on = person[i] == person[i - 1] and t[i] - t[i - 1] <= rules.session_pause
         sitting[i] = sitting[i - 1] + (not goes_on)
     for i in range(n):
         steps = [
             t[j + 1] - t[j]
             for j in range(n - 1)
-            if sitting[j] == sitting[i] == sitting[j + 1] and 0 < t[j + 1] - t[j] <= rules.gap
+            if sitting[j] == sitting[i] == sitting[j + 1] and 0 < t[j + 1] - t[j] <= rules.max_gap
         ]
         usual = float(np.median(steps)) if steps else 0.0
-        near = i + 1 < n and sitting[i + 1] == sitting[i] and t[i + 1] - t[i] <= rules.gap
+        near = i + 1 < n and sitting[i + 1] == sitting[i] and t[i + 1] - t[i] <= rules.max_gap
         weight[i] = t[i + 1] - t[i] if near else usual
     return sitting, weight
 
@@ -192,7 +192,7 @@ def slow_looks(rows, t, weight, sitting, rules):
             if now is not None:
                 looks.append(now)
             now = (r, start, end)
-    return [found for found in [*looks, now] if found is not None and found[2] - found[1] >= rules.least - 1e-9]
+    return [found for found in [*looks, now] if found is not None and found[2] - found[1] >= rules.min_visit - 1e-9]
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -202,40 +202,42 @@ def test01_against_loops(seed):
     person = np.sort(rng.integers(0, 4, 120))
     step = rng.choice([0.0, 0.1, 0.2, 0.2, 0.3, 0.7, 6.0], 120)
     t = np.concatenate([np.cumsum(step[person == p]) for p in range(4)])
-    line = timeline(person, t, rules)
+    line = make_timeline(person, t, rules)
     sitting, weight = slow_weights(person, t, rules)
-    assert line.sitting.tolist() == sitting and np.allclose(line.weight, weight)
+    assert line.session.tolist() == sitting and np.allclose(line.weight, weight)
     rows = np.flatnonzero(rng.random(120) < 0.5)
-    looks = looks_at(rows, line, rules)
+    looks = find_visits(rows, line, rules)
     expected = slow_looks(rows, t, weight, sitting, rules)
     assert looks.first.tolist() == [e[0] for e in expected]
     assert np.allclose(looks.start, [e[1] for e in expected]) and np.allclose(looks.end, [e[2] for e in expected])
 
 
 def test02_one_ray_stands_for_no_time():
-    line = timeline(np.array([0, 1, 1]), np.array([5.0, 1.0, 1.2]), VisitRules())
+    line = make_timeline(np.array([0, 1, 1]), np.array([5.0, 1.0, 1.2]), VisitRules())
     assert np.allclose(line.weight, [0, 0.2, 0.2])
-    assert len(looks_at(np.array([0]), line, VisitRules())) == 0
-    assert len(looks_at(np.array([0]), line, VisitRules(min_visit=0.0))) == 1
-    assert len(looks_at(np.zeros(0, int), line, VisitRules())) == 0
+    assert len(find_visits(np.array([0]), line, VisitRules())) == 0
+    assert len(find_visits(np.array([0]), line, VisitRules(min_visit=0.0))) == 1
+    assert len(find_visits(np.zeros(0, int), line, VisitRules())) == 0
 
 
 def test03_equal_times_count_once():
-    line = timeline(np.zeros(4, int), np.array([0.0, 0.0, 0.2, 0.2]), VisitRules())
+    line = make_timeline(np.zeros(4, int), np.array([0.0, 0.0, 0.2, 0.2]), VisitRules())
     assert np.allclose(line.weight, [0, 0.2, 0, 0.2])
 
 
 def test04_no_rays():
-    assert len(timeline(np.zeros(0, int), np.zeros(0), VisitRules()).t) == 0
+    assert len(make_timeline(np.zeros(0, int), np.zeros(0), VisitRules()).t) == 0
 
 
 @pytest.mark.parametrize("t", [[0.0, np.nan], [1.0, 0.0], [0.0, np.inf]])
 def test05_times_that_are_none_or_unsorted(t):
     with pytest.raises(ValueError):
-        timeline(np.zeros(2, int), np.array(t), VisitRules())
+        make_timeline(np.zeros(2, int), np.array(t), VisitRules())
 
 
-@pytest.mark.parametrize("bad", [{"gap": 0}, {"gap": -1}, {"pause": 0.5}, {"merge": np.nan}, {"least": np.inf}])
+@pytest.mark.parametrize(
+    "bad", [{"max_gap": 0}, {"max_gap": -1}, {"session_pause": 0.5}, {"merge_gap": np.nan}, {"min_visit": np.inf}]
+)
 def test06_rules_that_are_none(bad):
     with pytest.raises(NergError, match="--"):
         VisitRules(**bad)
@@ -244,12 +246,12 @@ def test06_rules_that_are_none(bad):
 def test07_times_on_the_bounds():
     """A pause as long as it may be joins sittings, an interruption as long as it may be looks."""
     rules = VisitRules(max_gap=0.5, session_pause=4.0, merge_gap=0.25, min_visit=0.25)
-    line = timeline(np.zeros(4, int), np.array([0.0, 4.0, 8.0, 12.5]), rules)
-    assert line.sitting.tolist() == [0, 0, 0, 1]
-    line = timeline(np.zeros(6, int), np.arange(6) * 0.25, rules)
-    at = lambda *rows: looks_at(np.array(rows), line, rules).first.tolist()
+    line = make_timeline(np.zeros(4, int), np.array([0.0, 4.0, 8.0, 12.5]), rules)
+    assert line.session.tolist() == [0, 0, 0, 1]
+    line = make_timeline(np.zeros(6, int), np.arange(6) * 0.25, rules)
+    at = lambda *rows: find_visits(np.array(rows), line, rules).first.tolist()
     assert at(0, 2) == [0] and at(0, 3) == [0, 3] and at(1) == [1]
-    assert timeline(np.zeros(3, int), np.array([0.0, 0.5, 1.25]), rules).weight.tolist() == [0.5, 0.5, 0.5]
+    assert make_timeline(np.zeros(3, int), np.array([0.0, 0.5, 1.25]), rules).weight.tolist() == [0.5, 0.5, 0.5]
 
 
 # ---- Sums of blocks, against dictionaries filled ray by ray, and in any number of parts ----
@@ -292,16 +294,16 @@ def slow_sums(rays, on, far, visible, cells):
             who = rays.persons[person[k]]
             begin.setdefault(sitting[k], t[k])
             out["time", cell, who] += weight[k]
-            out["time2", cell, who] += weight[k] ** 2
+            out["squared_time", cell, who] += weight[k] ** 2
             out["rays", cell, who] += 1
             for a in range(3):
                 i = order[k]
                 if on[i, a]:
-                    out["on_time", cell, who, a] += weight[k]
-                    out["on_rays", cell, who, a] += 1
+                    out["dwell_time", cell, who, a] += weight[k]
+                    out["hit_rays", cell, who, a] += 1
                     out["distance", cell, who, a] += weight[k] * far[i, a]
                 if on[i, a] or visible[i, a]:
-                    out["visible", cell, who, a] += weight[k]
+                    out["visible_time", cell, who, a] += weight[k]
         every = []
         for a in range(3):
             rows = [k for k in range(len(order)) if on[order[k], a]]
@@ -311,15 +313,15 @@ def slow_sums(rays, on, far, visible, cells):
                 if not mine[first]:
                     continue
                 who = rays.persons[person[first]]
-                out["looks", cell, who, a] += 1
-                out["first", cell, who, a] = min(out.get(("first", cell, who, a), np.inf), start)
-                out["last", cell, who, a] = max(out.get(("last", cell, who, a), -np.inf), end)
+                out["visits", cell, who, a] += 1
+                out["first_start", cell, who, a] = min(out.get(("first_start", cell, who, a), np.inf), start)
+                out["last_end", cell, who, a] = max(out.get(("last_end", cell, who, a), -np.inf), end)
                 bin_ = max(b for b in range(len(BINS) - 1) if end - start >= BINS[b])
                 out["lasted", cell, a, bin_] += 1
                 if sitting[first] not in known:
                     known.add(sitting[first])
-                    out["first_sum", cell, who, a] += start - begin[sitting[first]]
-                    out["first_count", cell, who, a] += 1
+                    out["first_visit_sum", cell, who, a] += start - begin[sitting[first]]
+                    out["first_visit_count", cell, who, a] += 1
         every.sort()
         for one, two in zip(every[:-1], every[1:]):
             if one[0] == two[0] and one[2] != two[2] and mine[two[3]]:
@@ -335,22 +337,36 @@ def cells_of(rays):
 def test01_sums_against_loops(seed):
     rays, landed, on, far, visible = made(seed)
     cells = cells_of(rays)
-    sums = partial_sums(rays, landed, AREAS, cells, RULES, visible)
+    sums = sum_visits(rays, landed, AREAS, cells, RULES, visible)
     slow = slow_sums(rays, on, far, visible, cells)
     for r, (cell, who) in enumerate(sums.rows):
-        for name in ("time", "time2", "rays"):
+        for name in ("time", "squared_time", "rays"):
             assert getattr(sums, name)[r] == pytest.approx(slow[name, cell, who])
-        for name in ("on_time", "on_rays", "distance", "looks", "visible", "first_sum", "first_count"):
+        for name in (
+            "dwell_time",
+            "hit_rays",
+            "distance",
+            "visits",
+            "visible_time",
+            "first_visit_sum",
+            "first_visit_count",
+        ):
             assert getattr(sums, name)[r] == pytest.approx([slow[name, cell, who, a] for a in range(3)]), name
-        for name, none in (("first", np.inf), ("last", -np.inf)):
+        for name, none in (("first_start", np.inf), ("last_end", -np.inf)):
             expected = [slow.get((name, cell, who, a), none) for a in range(3)]
             assert getattr(sums, name)[r] == pytest.approx(expected), name
     for c, (cell, _) in enumerate(cells):
-        assert sums.lasted[c].tolist() == [[slow["lasted", cell, a, b] for b in range(len(BINS) - 1)] for a in range(3)]
+        assert sums.duration_counts[c].tolist() == [
+            [slow["lasted", cell, a, b] for b in range(len(BINS) - 1)] for a in range(3)
+        ]
         assert sums.transitions[c].tolist() == [[slow["moves", cell, a, b] for b in range(3)] for a in range(3)]
     assert {cell for cell, _ in sums.rows} == {ALL, Cell("window", "early")} and sums.transitions[0].sum() > 3
     # Nobody looks at c.
-    assert sums.dwell_time[:, 2].sum() == 0 and np.isinf(sums.first_start[:, 2]).all() and sums.visible_time[:, 2].sum() > 0
+    assert (
+        sums.dwell_time[:, 2].sum() == 0
+        and np.isinf(sums.first_start[:, 2]).all()
+        and sums.visible_time[:, 2].sum() > 0
+    )
 
 
 def pick(landed, rows):
@@ -362,11 +378,11 @@ def pick(landed, rows):
 
 def test02_in_parts_it_is_the_same():
     rays, landed, _, _, visible = made(7, 300, 6)
-    whole = partial_sums(rays, landed, AREAS, [(ALL, None)], RULES, visible)
+    whole = sum_visits(rays, landed, AREAS, [(ALL, None)], RULES, visible)
     parts = []
     for p in range(6):
         rows = np.flatnonzero(rays.person == p)
-        parts.append(partial_sums(rays.select(rows), pick(landed, rows), AREAS, [(ALL, None)], RULES, visible[rows]))
+        parts.append(sum_visits(rays.select(rows), pick(landed, rows), AREAS, [(ALL, None)], RULES, visible[rows]))
     merged = merge_sums(parts)
     assert merged.rows == whole.rows
     for f in fields(VisitSums):
@@ -375,23 +391,30 @@ def test02_in_parts_it_is_the_same():
             assert np.array_equal(getattr(merged, f.name), value), f.name
     # And so in parts of parts, to the bit, in the same order.
     again = merge_sums([merge_sums(parts[:1]), *parts[1:]])
-    assert all(np.array_equal(getattr(again, n), getattr(merged, n)) for n in ("time", "on_time", "moves", "first"))
+    assert all(
+        np.array_equal(getattr(again, n), getattr(merged, n))
+        for n in ("time", "dwell_time", "transitions", "first_start")
+    )
 
 
 def test03_somebody_who_comes_twice_is_one_person():
     rays, landed, _, _, visible = made(3)
-    one = partial_sums(rays, landed, AREAS, [(ALL, None)], RULES, visible)
+    one = sum_visits(rays, landed, AREAS, [(ALL, None)], RULES, visible)
     twice = merge_sums([one, one])
-    assert twice.rows == one.rows and np.allclose(twice.time, 2 * one.time) and np.array_equal(twice.first_start, one.first_start)
+    assert (
+        twice.rows == one.rows
+        and np.allclose(twice.time, 2 * one.time)
+        and np.array_equal(twice.first_start, one.first_start)
+    )
 
 
 def test04_others_cannot_be_added():
     rays, landed, *_ = made()
-    one = partial_sums(rays, landed, AREAS, [(ALL, None)], RULES)
-    other = partial_sums(rays, landed, ("x", "b", "c"), [(ALL, None)], RULES)
-    with pytest.raises(ValueError, match="other areas"):
+    one = sum_visits(rays, landed, AREAS, [(ALL, None)], RULES)
+    other = sum_visits(rays, landed, ("x", "b", "c"), [(ALL, None)], RULES)
+    with pytest.raises(ValueError, match="different areas"):
         merge_sums([one, other])
-    with pytest.raises(ValueError, match="nothing"):
+    with pytest.raises(ValueError, match="at least one sum"):
         merge_sums([])
 
 
@@ -402,15 +425,15 @@ def test03b_the_last_visit_ends_when_its_last_ray_does():
     rays = Rays(t, np.zeros(8, int), ("ann",), d, d, np.ones(8))
     on = np.array([1, 2, 5, 6])
     landed = HitAssignment(8, (on,), (np.ones(4),))
-    early = partial_sums(rays, landed, ("a",), [(ALL, None)], VisitRules())
-    assert early.looks[0, 0] == 2 and early.first_start[0, 0] == 0.25 and early.last_end[0, 0] == 1.75
-    late = partial_sums(replace(rays, t=t + 100), landed, ("a",), [(ALL, None)], VisitRules())
+    early = sum_visits(rays, landed, ("a",), [(ALL, None)], VisitRules())
+    assert early.visits[0, 0] == 2 and early.first_start[0, 0] == 0.25 and early.last_end[0, 0] == 1.75
+    late = sum_visits(replace(rays, t=t + 100), landed, ("a",), [(ALL, None)], VisitRules())
     for parts in ([early, late], [late, early]):
         assert merge_sums(parts).first_start[0, 0] == 0.25 and merge_sums(parts).last_end[0, 0] == 101.75
 
 
 def test05_no_rays_at_all():
     rays, landed, *_ = made()
-    none = partial_sums(rays.select(np.zeros(0, int)), pick(landed, []), AREAS, [(ALL, None)], RULES)
+    none = sum_visits(rays.select(np.zeros(0, int)), pick(landed, []), AREAS, [(ALL, None)], RULES)
     assert none.rows == () and none.time.shape == (0,) and none.transitions.sum() == 0
     assert none.find_participants(ALL)[1] == []

@@ -4,7 +4,16 @@ import numpy as np
 import pytest
 import trimesh
 
-from nerg_mi.surfaces.laplacian import Smoother, SurfaceSums, delaunay, deposit, heron, make_laplacian, merge_sums, twins
+from nerg_mi.surfaces.laplacian import (
+    Smoother,
+    SurfaceSums,
+    deposit,
+    find_twins,
+    flip_to_delaunay,
+    heron_area,
+    make_laplacian,
+    merge_sums,
+)
 from nerg_mi.surfaces.mesh import Mesh, weld_mesh
 from tests.surfaces.meshes import box, joined, plate
 
@@ -22,8 +31,8 @@ def angles_facing(lengths):
 
 @pytest.mark.parametrize("mesh", [joined(plate(21, 0.45)), joined(box((0, 0, 0), (5, 0.1, 1)))])
 def test01_no_edge_faces_more_than_two_right_angles(mesh):
-    faces, lengths = delaunay(mesh.faces, lengths_of(mesh))
-    assert np.isclose(heron(*lengths.T).sum(), mesh.area.sum(), rtol=1e-9)
+    faces, lengths = flip_to_delaunay(mesh.faces, lengths_of(mesh))
+    assert np.isclose(heron_area(*lengths.T).sum(), mesh.area.sum(), rtol=1e-9)
     assert np.allclose(angles_facing(lengths).sum(axis=1), np.pi)
     # In the plane flips are those of the points: SciPy's circles are empty, too.
     total = {}
@@ -38,16 +47,16 @@ def test01_no_edge_faces_more_than_two_right_angles(mesh):
 
 def test02_what_is_delaunay_stays():
     mesh = joined(plate(8))
-    faces, lengths = delaunay(mesh.faces, lengths_of(mesh))
+    faces, lengths = flip_to_delaunay(mesh.faces, lengths_of(mesh))
     assert np.array_equal(faces, mesh.faces) and np.array_equal(lengths, lengths_of(mesh))
 
 
 def test03_twins_are_those_of_sheets():
     two = np.array([(0, 1, 2), (2, 1, 3)])
-    assert twins(two).tolist() == [-1, 3, -1, 1, -1, -1]
+    assert find_twins(two).tolist() == [-1, 3, -1, 1, -1, -1]
     # Three faces at an edge, and two that see it alike, are none.
-    assert (twins(np.array([(0, 1, 2), (1, 0, 3), (0, 1, 4)])) == -1).all()
-    assert (twins(np.array([(0, 1, 2), (0, 1, 3)])) == -1).all()
+    assert (find_twins(np.array([(0, 1, 2), (1, 0, 3), (0, 1, 4)])) == -1).all()
+    assert (find_twins(np.array([(0, 1, 2), (0, 1, 3)])) == -1).all()
 
 
 # ---- The Laplacian of meshes, good and bad ----
@@ -175,7 +184,8 @@ def test02_sums_add_up_in_their_order():
     parts = [SurfaceSums(rng.random(3), rng.random(4), *rng.random(4), 1) for _ in range(5)]
     whole = merge_sums(parts)
     assert np.array_equal(
-        whole.face_sums, ((((parts[0].face_sums + parts[1].face_sums) + parts[2].face_sums) + parts[3].face_sums) + parts[4].face_sums)
+        whole.face_sums,
+        ((((parts[0].face_sums + parts[1].face_sums) + parts[2].face_sums) + parts[3].face_sums) + parts[4].face_sums),
     )
     assert whole.count == 5 and np.isclose(whole.weight, sum(p.weight for p in parts))
     assert np.isclose(whole.unaccounted, whole.total - whole.face_sums.sum() - whole.elsewhere - whole.escaped)

@@ -8,7 +8,7 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.surfaces import mesh
-from nerg_mi.surfaces.mesh import SurfaceTarget, refine, shape_triangles, iter_texture_rows, unwrap_uv, weld_mesh
+from nerg_mi.surfaces.mesh import SurfaceTarget, iter_texture_rows, refine, shape_triangles, unwrap_uv, weld_mesh
 from nerg_mi.transport.volume_medium import VolumeMedium
 from tests.surfaces.meshes import box, joined, longest_edge, plate
 
@@ -18,7 +18,7 @@ from tests.surfaces.meshes import box, joined, longest_edge, plate
 def test01_a_box_whose_sides_repeat_its_corners_is_one_surface():
     v, f = box((0, 0, 0), (1, 2, 3))
     mesh, index, repairs = weld_mesh(v[f].reshape(-1, 3), np.arange(f.size).reshape(-1, 3))
-    assert (len(mesh.vertices), len(mesh.faces), repairs.merged) == (8, 12, 28)
+    assert (len(mesh.vertices), len(mesh.faces), repairs.num_merged_vertices) == (8, 12, 28)
     assert np.array_equal(index, np.arange(12)) and np.isclose(mesh.area.sum(), 22)
     assert np.allclose(mesh.corners, v[f]) and np.isclose(mesh.vertex_area.sum(), 22)
     assert np.isclose(mesh.diagonal, np.sqrt(14))
@@ -35,7 +35,7 @@ def test02_a_hair_keeps_plates_apart_and_zeros_of_both_signs_are_one_place():
 def test03_flat_and_repeated_faces_are_left_out_at_any_scale(scale):
     v = scale * np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (2, 0, 0), (9, 9, 9)])
     mesh, index, repairs = weld_mesh(v, [(0, 1, 2), (0, 1, 3), (1, 1, 2), (2, 0, 1), (2, 1, 0)])
-    assert index.tolist() == [0] and (repairs.num_degenerate_faces, repairs.repeated) == (2, 2)
+    assert index.tolist() == [0] and (repairs.num_degenerate_faces, repairs.num_duplicate_faces) == (2, 2)
     assert repairs.summary == "2 faces without area left out, 2 faces that repeat others left out"
     assert len(mesh.vertices) == 3 and np.isclose(mesh.area[0], scale**2 / 2)
     assert weld_mesh(v, [(0, 1, 2)])[2].summary is None
@@ -95,7 +95,7 @@ def test02_what_is_fine_already_stays():
 
 
 def test03_too_many(monkeypatch):
-    monkeypatch.setattr(mesh, "MOST_REFINED_FACES", 1000)
+    monkeypatch.setattr(mesh, "MAX_REFINED_FACES", 1000)
     with pytest.raises(NergError, match="larger --detail"):
         refine(joined(box((0, 0, 0), (1, 1, 1))), 0.01)
 
@@ -162,7 +162,7 @@ def test01_a_texture_has_at_each_point_what_the_surface_has(rgb, scale, rows, mo
 def test02_what_does_not_fit(rgb, monkeypatch):
     pytest.importorskip("xatlas", reason="xatlas is not installed")
     cube = joined(box((0, 0, 0), (1, 1, 1)))
-    monkeypatch.setattr(mesh, "MOST_CHART_FACES", 4)
+    monkeypatch.setattr(mesh, "MAX_CHART_FACES", 4)
     with pytest.raises(NergError, match="leave out --texture"):
         unwrap_uv(cube, 64)
 

@@ -12,14 +12,14 @@ from nerg_mi.surfaces.sources import RaySettings, TrackedRays
 from nerg_mi.surfaces.splats import (
     MIN_VISIBLE_FRACTION,
     SplatSmoother,
-    integrate_gaze,
-    groups_of_hits,
-    shortest_axes,
-    sides_of,
     compute_splat_areas,
+    integrate_gaze,
+    iter_hit_groups,
+    shortest_axes,
     splat_densities,
     sum_rays_on_splats,
     unoccluded_areas,
+    visible_sides,
 )
 from nerg_mi.transport.geometry import SceneGeometry, default_march_settings
 from nerg_mi.transport.observer import ObserverSettings
@@ -42,7 +42,10 @@ def test01_one_that_nothing_hides_and_its_sides(rgb):
     expected = 2 * np.pi * 0.2 * 0.1 * 0.5 * (1 - np.exp(-4.5))
     assert np.allclose(areas(one), expected, rtol=1e-6) and np.allclose(unoccluded_areas(one, 3.0), expected)
     axis = shortest_axes(one)
-    assert np.allclose(axis[0], one.axes()[0, :, 1]) and list(sides_of(np.r_[axis, -axis], np.r_[axis, axis])) == [0, 1]
+    assert np.allclose(axis[0], one.axes()[0, :, 1]) and list(visible_sides(np.r_[axis, -axis], np.r_[axis, axis])) == [
+        0,
+        1,
+    ]
 
 
 def test02_overlapping_ones_share_what_there_is(rgb):
@@ -77,9 +80,9 @@ def some(n=80, seed=3):
 def shares(splats, o, d, **more):
     """Light that each Gaussian takes (R, N), what is left (R,), and how many groups there were."""
     taken, left, count = np.zeros((len(o), len(splats))), np.ones(len(o)), 0
-    for group in groups_of_hits(SplatArrays(splats, ns), o, d, **more):
+    for group in iter_hit_groups(SplatArrays(splats, ns), o, d, **more):
         ray, hit = np.nonzero(group.index >= 0)
-        taken[group.rows[ray], group.index[ray, hit]] += (group.arriving * group.alpha)[ray, hit]
+        taken[group.rows[ray], group.index[ray, hit]] += (group.transmittance * group.alpha)[ray, hit]
         left[group.rows] = group.remaining
         count += 1
     return taken, left, count
@@ -107,9 +110,9 @@ def test02_up_to_a_distance_and_no_farther_than_is_asked_for(rgb):
     assert np.allclose(taken.sum(axis=1), 1 - 0.9 ** np.array([5, 30]), atol=1e-6) and np.allclose(
         1 - left, taken.sum(1)
     )
-    groups = groups_of_hits(SplatArrays(splats, ns), o, d)
+    groups = iter_hit_groups(SplatArrays(splats, ns), o, d)
     first = next(groups)
-    assert list(first.rows) == [0, 1] and not first.through.any()
+    assert list(first.rows) == [0, 1] and not first.has_escaped.any()
     assert list(groups.send(np.array([1])).rows) == [1]
 
 
@@ -163,7 +166,10 @@ def test03_parts_give_the_same_as_often_as_they_are_made(rgb):
     parts = [every.select(a, a + 400) for a in range(0, 900, 400)]
     first, again = (merge_sums(sums(splats, part, CONE) for part in parts) for _ in range(2))
     assert np.array_equal(first.face_sums, again.face_sums) and first.count == 900 and first.escaped == again.escaped
-    assert not np.array_equal(sums(splats, parts[0], RaySettings(cone_sigma=CONE.cone_sigma, rays_per_cone=8, seed=6)).face_sums, first.face_sums)
+    assert not np.array_equal(
+        sums(splats, parts[0], RaySettings(cone_sigma=CONE.cone_sigma, rays_per_cone=8, seed=6)).face_sums,
+        first.face_sums,
+    )
 
 
 @pytest.mark.parametrize("cone", [0.0, 0.03])
