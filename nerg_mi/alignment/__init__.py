@@ -1,1 +1,1 @@
-"""From one coordinate system to another: the similarity that leads from tracking, or a twin, into a place."""
+"""Alignment: the similarity from the tracking frame to the scene."""

@@ -372,7 +372,8 @@ class AlignmentTarget:
         if self.points is not None:
             return surface_from_points(transform_points(self.to_z_up, self.points))
         raise NergError(
-            "this evidence needs the geometry of the scene: give --field FILE, --scene FILE or --surface FILE (a mesh or "
+            "this evidence needs the geometry of the scene: give --field FILE, --scene FILE or --surface FILE (a "
+            "mesh or "
             "points)"
         )
 

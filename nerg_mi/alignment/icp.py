@@ -467,7 +467,8 @@ def _warn_rivals(placements: list[_Placement], size: float) -> list[str]:
     for other in placements[1:]:
         if _is_distinct(best, other, size) and mean_distance(other) < _RIVAL_RATIO * mean_distance(best):
             return [
-                f"another placement fits almost as well ({100 * mean_distance(other):.2g} cm, the best {100 * mean_distance(best):.2g} "
+                f"another placement fits almost as well ({100 * mean_distance(other):.2g} cm, the best "
+                f"{100 * mean_distance(best):.2g} "
                 "cm): the scene may be symmetric; use three picked points (--pairs) to decide"
             ]
     return []

@@ -70,7 +70,8 @@ class Cameras:
         size = float(np.linalg.norm(np.ptp(x, axis=0)))
         if not size > 1e-6 * max(1.0, float(np.abs(x).max())):
             raise NergError(
-                f"{self.source} all have the same position, so the scale is undetermined; add photos from other positions"
+                f"{self.source} all have the same position, so the scale is undetermined; add photos from other "
+                "positions"
             )
         rotations = b[:, :3, :3] @ np.swapaxes(a[:, :3, :3], 1, 2)
         rotation = mean_rotation(rotations)
@@ -79,7 +80,8 @@ class Cameras:
         if np.median(angle) > _MAX_AXIS_ANGLE:
             warnings.append(
                 f"the cameras' axes disagree by {np.median(angle):.0f} degrees (median), and only their centres were "
-                "used: check that both models use the same convention (OpenGL poses in transforms.json, COLMAP's in a model)"
+                "used: check that both models use the same convention (OpenGL poses in transforms.json, COLMAP's "
+                "in a model)"
             )
             check_points(x, y, self.source)
             matrix = fit_similarity(x, y, scale=target.scale)
@@ -250,7 +252,10 @@ class Pairs:
             if len(finite)
             else "; too few for leave-one-out residuals"
         )
-        return f"{len(distance)} pairs, residual {100 * np.median(distance):.2g} cm (median), {100 * distance.max():.2g} cm (worst){cross_validation}"
+        return (
+            f"{len(distance)} pairs, residual {100 * np.median(distance):.2g} cm (median), "
+            f"{100 * distance.max():.2g} cm (worst){cross_validation}"
+        )
 
     def _warn_outlier(self, distance: np.ndarray, leave_one_out: np.ndarray) -> list[str]:
         """Warn about a pair that was probably picked wrong."""
@@ -265,7 +270,8 @@ class Pairs:
             return []
         name = f' ("{sanitize(self.names[worst], 60)}")' if self.names else ""
         return [
-            f"pair {worst + 1}{name} is {100 * finite[worst]:.0f} cm from the position predicted by the others, which agree to "
+            f"pair {worst + 1}{name} is {100 * finite[worst]:.0f} cm from the position predicted by the others, "
+            "which agree to "
             f"{100 * np.median(without):.2g} cm without it: check this pair"
         ]
 

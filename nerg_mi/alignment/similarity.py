@@ -17,7 +17,8 @@ from nerg_mi.maths.coordinates import check_coordinates
 
 MAX_LINE_RATIO = 0.01  # points are collinear below this ratio of their second to their first singular value
 MAX_PLANE_RATIO = 0.02
-"""Points are coplanar, so that a mirrored frame fits as well, below this ratio of the third to the first singular value."""
+"""Points are coplanar, so that a mirrored frame fits as well, below this ratio of the third to the first singular
+value."""
 
 MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0])
 """Mirror of the x axis. Mirroring another axis, or all three, equals this and a rotation."""

@@ -51,7 +51,8 @@ class AxisFlips:
         if cast("float", p_value) > _FLIP_P_VALUE:
             return None
         return (
-            f"the gaze passes {declared_median:.2g} degrees from the nearest point of the scene (median), but {best_median:.2g} with "
+            f"the gaze passes {declared_median:.2g} degrees from the nearest point of the scene (median), but "
+            f"{best_median:.2g} with "
             f"{best}: check the axes of the directions at the import (--hand, --forward, or a sign in --map)"
         )
 
@@ -288,12 +289,14 @@ class Tracking:
             return self._make_fit(_refine_sample(sample, target, coarse.matrix, 1.0, 60), sample, target, [], None)
         if not target.is_upright:
             raise NergError(
-                "an alignment from the tracking alone needs the up direction of the scene: give --up, or other evidence "
+                "an alignment from the tracking alone needs the up direction of the scene: give --up, or other "
+                "evidence "
                 "(--pairs, --tracking-surface, --tracking-cameras)"
             )
         if target.tracking_floor is None:
             raise NergError(
-                "an alignment from the tracking alone needs the height of the floor in the tracking; give it with --floor-height"
+                "an alignment from the tracking alone needs the height of the floor in the tracking; give it "
+                "with --floor-height"
             )
         if target.scale is None and not len(sample.hits):
             raise NergError(
@@ -312,14 +315,16 @@ class Tracking:
             is_same = is_close(placements[0].matrix, other.matrix, 0.05 * target.surface.diagonal)
             if not is_same and other.cost < _RIVAL_RATIO * placements[0].cost:
                 warnings.append(
-                    f"another placement agrees almost as well (cost {other.cost:.3f}, the best {placements[0].cost:.3f}): "
+                    f"another placement agrees almost as well (cost {other.cost:.3f}, the best "
+                    f"{placements[0].cost:.3f}): "
                     "the scene may be symmetric; use picked points (--pairs) to decide"
                 )
                 break
         mirror_warning = None
         if mirrored[0].cost < _MIRROR_RATIO * placements[0].cost:
             mirror_warning = (
-                f"the tracking agrees better with the scene if an axis is negated (cost {mirrored[0].cost:.3f}) than as "
+                f"the tracking agrees better with the scene if an axis is negated (cost {mirrored[0].cost:.3f}) "
+                "than as "
                 f"it is (cost {placements[0].cost:.3f})"
             )
         return self._make_fit(placements[0], sample, target, warnings, mirror_warning)
@@ -349,7 +354,8 @@ class Tracking:
             "heads_in_solids": float((solid_depth > 0.1).mean()),
         }
         notes = [
-            f"{len(sample.heads):,} heads, of which {100 * (solid_depth > 0.1).mean():.1f} % are more than 10 cm inside solid "
+            f"{len(sample.heads):,} heads, of which {100 * (solid_depth > 0.1).mean():.1f} % are more than 10 cm "
+            "inside solid "
             f"objects; {len(sample.hits):,} hit points"
         ]
         if not len(sample.hits):

@@ -1,1 +1,1 @@
-"""Areas of interest: attention on them, counted in tracked rays and predicted by a field, in parts, as tables."""
+"""Areas of interest: measured and predicted attention, partitioned computation, and tables."""

@@ -166,8 +166,8 @@ _ARRAYS = tuple(f.name for f in fields(VisitSums) if f.name not in ("areas", "ce
 
 # ---- Parts ----
 
-VIEWPOINTS_PER_PART = 32  # places of a part from which a field is asked
-_PROGRESS_COUNTED = 0.6  # of all, where a field is asked too
+VIEWPOINTS_PER_PART = 32  # number of viewpoints per part of a prediction
+_PROGRESS_COUNTED = 0.6  # progress after the count, if a prediction follows
 _PROGRESS_PREDICTED = 0.8
 _PROGRESS_INTERVALS, _PROGRESS_WHAT_IF = 0.9, 0.99  # when intervals are known, and after changes
 
@@ -253,7 +253,7 @@ class PartitionedStatistics:
             poses = ObserverPoses(
                 viewpoints.positions[a : a + VIEWPOINTS_PER_PART], viewpoints.facing[a : a + VIEWPOINTS_PER_PART]
             )
-            parts.append(Part(poses, f"places {a + 1} to {a + len(poses.positions)}"))
+            parts.append(Part(poses, f"viewpoints {a + 1} to {a + len(poses.positions)}"))
         plan = self._plan(job_name, predict_part, PlannedPrediction(setting, fov), parts)
         predictions = [read_prediction(made.path) for made in self.parts.run(plan, start, end)]
         arrays = {name: np.concatenate([getattr(f, name) for f in predictions]) for name in VIEWPOINT_ARRAYS}

@@ -218,7 +218,8 @@ def place_observers_on_floor(gaze_scene: GazeScene, height: float, step: float, 
     )
     if not len(positions):
         raise NergError(
-            f"no walkable floor was found at height {floor:g} (--floor-height) below eyes at {height:g} (--eye-height); "
+            f"no walkable floor was found at height {floor:g} (--floor-height) below eyes at {height:g} "
+            "(--eye-height); "
             "correct one of them"
         )
     return positions
@@ -440,8 +441,10 @@ def warn_few_viewpoints(viewpoints: Viewpoints, reporter: Reporter) -> None:
     num_participants = len(set(viewpoints.participants))
     if num_participants and len(viewpoints.participants) < MIN_VIEWPOINTS * num_participants:
         reporter.message(
-            f"the prediction uses {len(viewpoints.participants) / num_participants:.1f} viewpoints per participant, which biases "
-            f"the hit ratio low; use --viewpoints {MIN_VIEWPOINTS * num_participants} for {MIN_VIEWPOINTS} per participant"
+            f"the prediction uses {len(viewpoints.participants) / num_participants:.1f} viewpoints per "
+            "participant, which biases "
+            f"the hit ratio low; use --viewpoints {MIN_VIEWPOINTS * num_participants} for {MIN_VIEWPOINTS} per "
+            "participant"
         )
 
 

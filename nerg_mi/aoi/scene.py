@@ -195,7 +195,7 @@ def load_gaze_scene(
     if scene is not None:
         if field is not None:
             raise NergError(
-                f'"{scene}" and "{field}" both define the geometry; a scene file refers to its radiance field, so give the scene only'
+                f'"{scene}" and "{field}" both define the geometry; give the scene only, which refers to its field'
             )
         return load_scene_file(scene, gaze, align, ns)
     if gaze is not None:

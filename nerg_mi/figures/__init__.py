@@ -1,1 +1,1 @@
-"""Pictures for people: tone mapping, overlays of gaze, figures and floor plans."""
+"""Figures: heat maps over images, AOV figures, floor plans, and page layout."""

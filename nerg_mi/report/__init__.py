@@ -1,1 +1,1 @@
-"""A report on a gaze field: one HTML file that holds everything it shows and asks no network for anything."""
+"""Report on a gaze field as one self-contained HTML file."""

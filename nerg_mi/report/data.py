@@ -181,7 +181,7 @@ _MIN_SUBSTRING = 3
 
 
 class ParticipantLabels:
-    """Numbered labels, such as "person 1", in place of participants' names.
+    """Numbered labels, such as "participant 1", in place of participants' names.
 
     Participants are numbered by their number of samples, the largest first, followed by those that only occur in
     evaluations.
@@ -195,11 +195,11 @@ class ParticipantLabels:
         for result in results:
             names += [str(row["person"]) for row in result.participant_rows if "person" in row]
         self._number = {name: k + 1 for k, name in enumerate(dict.fromkeys(names))}
-        self._label = {name: f"person {number}" for name, number in self._number.items()}
+        self._label = {name: f"participant {number}" for name, number in self._number.items()}
 
     def label(self, name: str) -> str:
         """Return the label of the participant ``name``."""
-        return self._label.get(name, "a person")
+        return self._label.get(name, "a participant")
 
     def number(self, name: str) -> int:
         """Return the number of the participant ``name``, 0 if unknown."""
@@ -213,7 +213,7 @@ class ParticipantLabels:
         names = sorted((n for n in self._label if n), key=len, reverse=True)
         pattern = "|".join(re.escape(n) if len(n) >= _MIN_SUBSTRING else rf"(?<!\w){re.escape(n)}(?!\w)" for n in names)
         label_of = {name.lower(): label for name, label in self._label.items()}
-        replace_name = lambda found: label_of.get(found.group().lower(), "a person")
+        replace_name = lambda found: label_of.get(found.group().lower(), "a participant")
         return re.sub(pattern, replace_name, text, flags=re.IGNORECASE) if pattern else text
 
 

@@ -173,7 +173,8 @@ def _objects_text(run: Run, recorded: bool) -> str:
     if not recorded:
         return (
             f"Predicted share of an observer's gaze on each AOI, averaged over {run.num_viewpoints} "
-            f"{'viewpoint' if run.num_viewpoints == 1 else 'viewpoints'}. No gaze samples were given, so there are no participants "
+            f"{'viewpoint' if run.num_viewpoints == 1 else 'viewpoints'}. No gaze samples were given, so there "
+            "are no participants "
             "and no confidence intervals."
         )
     hidden_note = (
@@ -182,7 +183,8 @@ def _objects_text(run: Run, recorded: bool) -> str:
         else ""
     )
     return (
-        f"Predicted share of gaze on each AOI, averaged over {run.num_viewpoints} viewpoints of the participants, and the share "
+        f"Predicted share of gaze on each AOI, averaged over {run.num_viewpoints} viewpoints of the "
+        "participants, and the share "
         "of the recorded gaze samples that hit the AOI. Every participant has the same weight; brackets are 95 % "
         "confidence intervals over participants. A participant has a view of an AOI if it is visible from one of their "
         "viewpoints, or if one of their samples hits it. The field is smooth, so it may underestimate the share of "
@@ -220,7 +222,10 @@ def _nearby_text(run: Run) -> list[str]:
         sum(n <= 1 for n in run.nearby_participants),
         sorted(run.nearby_participants)[len(run.nearby_participants) // 2],
     )
-    words = f"The median number of participants within {within} of a viewpoint ({len(run.nearby_participants)} viewpoints) is"
+    words = (
+        f"The median number of participants within {within} of a viewpoint ({len(run.nearby_participants)} "
+        "viewpoints) is"
+    )
     if not alone:
         return [f"{words} {middle}; no viewpoint has fewer than two."]
     return [
@@ -558,7 +563,8 @@ def _show_uncertainty(run: Run) -> Html:
         shown.append(
             paragraph(
                 f"Early stopping used {validation['probes']} validation probes in {validation['zones']} zones: "
-                f"CC {validation['cc']:.3f}, KLD {validation['kld']:.3f}. These are not test scores, because the number "
+                f"CC {validation['cc']:.3f}, KLD {validation['kld']:.3f}. These are not test scores, because the "
+                "number "
                 "of training steps was selected on them."
             )
         )
@@ -576,7 +582,8 @@ def _show_verdict(run: Run) -> Html:
     shown = [element("div", verdict.sentence, class_=f"verdict {verdict.grade}") for _, verdict in run.verdicts]
     results = run.results[0]
     basis = (
-        f"Evaluated on {results.num_participants} held-out participants at {results.num_positions} held-out positions. A gain counts "
+        f"Evaluated on {results.num_participants} held-out participants at {results.num_positions} held-out "
+        "positions. A gain counts "
         "if its 95 % confidence interval over participants excludes zero. The verdict needs a gain in two of the three "
         f"scores (log score, CC, KLD) and a loss in none. {POSITION_BLIND.capitalize()} is a baseline that ignores the "
         "observer's position. The strongest baseline is the one with the highest log score."
@@ -586,7 +593,8 @@ def _show_verdict(run: Run) -> Html:
         ""
         if half is None
         else (
-            f" The field covers {100 * half:.0f} % of the difference in CC between the position-independent baseline and "
+            f" The field covers {100 * half:.0f} % of the difference in CC between the position-independent "
+            "baseline and "
             f"the split-half score{'' if half <= 1 else ', which is low because each half has few participants'}."
         )
     )

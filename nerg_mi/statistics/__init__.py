@@ -1,1 +1,1 @@
-"""Numbers of attention on things: looks, dwell, reach, intervals clustered by person; NumPy alone."""
+"""Attention statistics of AOIs: hits, visits, dwell time, hit ratio, and confidence intervals over participants."""

@@ -138,7 +138,8 @@ def estimate_ratio_differences(first: Pair, second: Pair, *, resamples: int = RE
             cross *= 2 * np.sqrt(factor_a * factor_b) / ((w @ y) * (w @ v))
             t[part] = _studentize(mb - ma - value, np.maximum(factor_a * sa + factor_b * sb - cross, 0.0), linear_error)
     contributors_first, contributors_second = (x != 0).sum(axis=0), (u != 0).sum(axis=0)
-    # If an estimate has no contributions, it is 0 for every participant; the difference then needs participants in both.
+    # If an estimate has no contributions, it is 0 for every participant; the difference then needs participants in
+    # both.
     contributors_both = (((x != 0) | (u != 0)) & (y > 0) & (v > 0)).sum(axis=0)
     is_sufficient = (
         np.minimum(
@@ -306,7 +307,8 @@ def estimate_proportion_differences(
     with np.errstate(divide="ignore", invalid="ignore"):
         value = u.sum(axis=0) / n - x.sum(axis=0) / m
         a, b = (x.sum(axis=0) + 1) / (m + 2), (u.sum(axis=0) + 1) / (n + 2)
-        # Covariance of the residuals; that of the added observations is weighted by the fraction of shared participants.
+        # Covariance of the residuals; that of the added observations is weighted by the fraction of shared
+        # participants.
         covariance_sum = ((x - a) * (u - b) * y * v).sum(axis=0) + num_both / np.maximum(m, n) * (2 * a * b - a - b)
         variance = a * (1 - a) / (m + 2) + b * (1 - b) / (n + 2) - 2 * covariance_sum / ((m + 2) * (n + 2))
         error = np.sqrt(np.maximum(variance, 0.0))

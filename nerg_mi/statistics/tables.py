@@ -282,7 +282,7 @@ MEASURED, PREDICTED = "measured", "predicted"
 MIN_VIEWPOINTS = 16
 """Number of viewpoints per participant below which the predicted hit ratio is biased low."""
 
-MAX_COMPARED_VALUES = 12  # so many values of a dimension are compared with each other
+MAX_COMPARED_VALUES = 12  # maximum number of values of a dimension that are compared
 Row = dict[str, Any]
 
 
@@ -440,8 +440,13 @@ def duration_rows(sums: VisitSums, min_participants: MinParticipantsFilter) -> l
 
 def is_underestimate(row: Row, measure: str) -> bool:
     """Return whether a value is biased low: a predicted hit ratio from too few viewpoints per participant."""
-    places = row.get("viewpoints")
-    return measure == "hit_ratio" and row.get(measure) is not None and places is not None and places < MIN_VIEWPOINTS
+    viewpoints = row.get("viewpoints")
+    return (
+        measure == "hit_ratio"
+        and row.get(measure) is not None
+        and viewpoints is not None
+        and viewpoints < MIN_VIEWPOINTS
+    )
 
 
 def format_measure(row: Row, measure: Measure) -> str:

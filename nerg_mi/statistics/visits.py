@@ -293,7 +293,8 @@ class VisitRules:
             check_number(value, SECONDS, option)
         if not self.session_pause >= self.max_gap > 0:
             raise NergError(
-                f"--session-gap ({self.session_pause:g} s) must be at least --max-gap ({self.max_gap:g} s), which must be positive"
+                f"--session-gap ({self.session_pause:g} s) must be at least --max-gap ({self.max_gap:g} s), "
+                "which must be positive"
             )
 
 
@@ -318,7 +319,7 @@ def make_timeline(person: np.ndarray, t: np.ndarray, rules: VisitRules) -> Timel
     step = np.diff(t)
     same_person = np.diff(person) == 0
     if np.any(np.diff(person) < 0) or np.any(step[same_person] < 0):
-        raise ValueError("rays must be in the order of persons and times")
+        raise ValueError("samples must be sorted by participant and time")
     # A relative tolerance for times that were stored in single precision.
     is_continued = same_person & (step <= rules.session_pause * (1 + 1e-9))
     session = np.cumsum(np.r_[np.zeros(min(len(t), 1), int), ~is_continued])

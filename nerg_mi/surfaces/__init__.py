@@ -1,1 +1,1 @@
-"""Gaze on surfaces: meshes, what observers and tracked rays leave on them, smoothing along them, and files of it."""
+"""Attention on surfaces: meshes and splats, attention of observers and gaze samples, and smoothing."""

@@ -37,18 +37,18 @@ def room():
     return SceneGeometry(None, scene)
 
 
-def test_people_in_their_place_give_no_doubts(room):
+def test_correct_alignment_has_no_warnings(room):
     found = check_alignment(room, RAYS, moved(0, 0, 0))
     assert found == AlignmentCheck(0.0, 0.0, 0.0) and not found.list_warnings() and not found.is_impossible
 
 
-def test_people_elsewhere_below_the_floor_and_in_walls_are_told(room):
+def test_wrong_alignments_are_reported(room):
     assert check_alignment(room, RAYS, moved(100, 0, 0)).is_impossible
     below = check_alignment(room, RAYS, moved(0, 0, -2.0))
     assert below.below > 0.9 and "below the floor" in " ".join(below.list_warnings())
 
 
-def test_heads_within_matter_are_inside_of_something():
+def test_heads_inside_a_medium_are_reported():
     solid = VolumeMedium(
         mi.load_dict({"type": "constvolume", "value": 500.0, "to_world": mi.ScalarTransform4f().scale([9, 9, 9])})
     )
@@ -56,11 +56,11 @@ def test_heads_within_matter_are_inside_of_something():
     assert found.inside > 0.9 and "inside solid objects" in " ".join(found.list_warnings())
 
 
-def test_no_rays_are_no_doubt(room):
+def test_no_samples_give_no_warnings(room):
     assert check_alignment(room, RAYS.select(np.zeros(len(RAYS), bool)), moved(0, 0, 0)).list_warnings() == []
 
 
-def test_gaze_that_would_meet_more_with_an_axis_negated_is_told():
+def test_negated_axis_is_reported():
     """A wall on one side: people who look at it, and the same in a mirror."""
     place = mi.ScalarTransform4f().translate([20, 0, 0]).scale([0.1, 60, 60])
     wall = SceneGeometry(None, mi.load_dict({"type": "scene", "wall": {"type": "cube", "to_world": place}}))
@@ -86,7 +86,7 @@ def written(path):
     return found
 
 
-def test_what_is_written_is_read_by_every_command(tmp_path):
+def test_record_is_read_by_every_command(tmp_path):
     path = tmp_path / "alignment.json"
     found = written(path)
     assert read_similarity(path, "--align", "rays to field").scale == pytest.approx(2)
@@ -107,7 +107,7 @@ def test_what_is_written_is_read_by_every_command(tmp_path):
         ({"matrix": np.diag([1.0, 2, 1, 1]).tolist()}, "--align"),
     ],
 )
-def test_other_files_are_refused(tmp_path, change, why):
+def test_invalid_files_are_refused(tmp_path, change, why):
     path = tmp_path / "alignment.json"
     written(path)
     path.write_text(json.dumps(json.loads(path.read_text()) | change))

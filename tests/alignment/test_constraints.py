@@ -29,12 +29,12 @@ from .rooms import carried, similarity
 # ---- Evidence ----
 
 
-def test_angles_are_seen_from_the_viewpoint():
+def test_angles_from_a_viewpoint():
     at, to = np.array([[1.0, 0, 0], [0, 2, 0]]), np.array([[1.0, 1, 0], [0, 2, 2e-7]])
     np.testing.assert_allclose(angles_between(np.zeros(3), at, to), [45, np.degrees(1e-7)], rtol=1e-6)
 
 
-def test_the_covariance_is_that_of_many_fits():
+def test_covariance_matches_many_fits():
     rng = np.random.default_rng(0)
     truth, x, noise = similarity(rng, scale=2.0), rng.normal(size=(12, 3)), 0.02
     exact = carried(truth, x)
@@ -51,7 +51,7 @@ def test_the_covariance_is_that_of_many_fits():
     assert pair_covariance(x[:2], y[:2], truth, FULL_BASIS) is None
 
 
-def test_a_place_is_needed_by_what_asks_for_it():
+def test_missing_geometry_is_refused():
     with pytest.raises(NergError, match="--field"):
         _ = AlignmentTarget().surface
 
@@ -61,7 +61,7 @@ def test_a_place_is_needed_by_what_asks_for_it():
 GRID = DistanceGrid(np.random.default_rng(0).random((6, 7, 5)), np.array([-1.0, 0, 2]), 0.5)
 
 
-def test_inside_it_is_the_trilinear_interpolation():
+def test_interpolation_is_trilinear():
     axes = [GRID.lower[a] + GRID.step * np.arange(n) for a, n in enumerate(GRID.values.shape)]
     p = np.random.default_rng(1).uniform(GRID.lower, GRID.upper, (300, 3))
     np.testing.assert_allclose(GRID.interpolate(p), RegularGridInterpolator(axes, GRID.values)(p), atol=1e-12)
@@ -74,7 +74,7 @@ def test_inside_it_is_the_trilinear_interpolation():
     assert value[0] == 1.5 and slope[0].tolist() == [1, 0, 0]
 
 
-def test_gradients_are_those_of_central_differences():
+def test_gradients_match_central_differences():
     p = np.random.default_rng(2).uniform(GRID.lower - 1, GRID.upper + 1, (500, 3))
     slope = GRID.interpolate_with_gradient(p)[1]
     for a, e in enumerate(1e-7 * np.eye(3)):
@@ -84,7 +84,7 @@ def test_gradients_are_those_of_central_differences():
 # ---- Point file ----
 
 
-def test_points_are_on_the_triangles_evenly_by_area(tmp_path):
+def test_points_are_uniform_on_triangles(tmp_path):
     v = np.array([[0.0, 0, 0], [3, 0, 0], [0, 3, 0], [10, 0, 0], [10.0, 1, 0], [10, 0, 1]])
     write_columns(tmp_path / "a.ply", dict(zip("xyz", v.T)), np.array([[0, 1, 2], [3, 4, 5]]))
     trimesh.Trimesh(v, [[0, 1, 2], [3, 4, 5]], process=False).export(tmp_path / "a.obj")
@@ -96,7 +96,7 @@ def test_points_are_on_the_triangles_evenly_by_area(tmp_path):
         np.testing.assert_array_equal(p, read_surface(tmp_path / name, 5000))
 
 
-def test_clouds_tables_and_arrays(tmp_path):
+def test_point_files_are_read(tmp_path):
     p = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
     write_columns(tmp_path / "a.ply", dict(zip("xyz", p.T)))
     np.save(tmp_path / "a.npy", p)
@@ -124,7 +124,7 @@ def test_clouds_tables_and_arrays(tmp_path):
         ("a/no.ply", None, "does not exist"),
     ],
 )
-def test_other_files_are_refused(tmp_path, name, data, why):
+def test_invalid_files_are_refused(tmp_path, name, data, why):
     if data is None:
         np.save(tmp_path / "a.npy", np.zeros((3, 2)))
     else:
@@ -149,22 +149,22 @@ def exact(points):
     return out
 
 
-def test_distances_are_those_to_walls_and_blocks(surface):
+def test_distances_to_surfaces(surface):
     p = np.random.default_rng(0).uniform(0, rooms.SIZE, (4000, 3))
     p = p[rooms.free(p)]
-    off = np.abs(surface.distance.at(p) - exact(p))
+    off = np.abs(surface.distance.interpolate(p) - exact(p))
     assert np.median(off) < 0.5 * surface.step and np.percentile(off, 95) < 1.5 * surface.step
 
 
-def test_solids_are_blocked_and_the_room_is_free(surface):
+def test_free_space_distance(surface):
     p = np.random.default_rng(1).uniform(0, rooms.SIZE, (4000, 3))
-    blocked = surface.free_space_distance.at(p)
+    blocked = surface.free_space_distance.interpolate(p)
     deep = ~rooms.free(p, -2 * surface.step)
     assert surface.has_free_space and (blocked[deep] > 0).mean() > 0.97
     assert (blocked[rooms.free(p, 1.5 * surface.step)] == 0).mean() > 0.99
 
 
-def test_the_inside_of_a_hollow_thing_is_no_free_space():
+def test_pockets_are_not_free_space():
     room, block = rooms.traces(80_000), rooms.BOXES[0]
     rng = np.random.default_rng(2)
     begin = rng.uniform(*block, (4000, 3))
@@ -180,21 +180,21 @@ def test_the_inside_of_a_hollow_thing_is_no_free_space():
     assert found.free_space_distance.interpolate(middle)[0] > 0.2
 
 
-def test_the_floor_is_found(surface):
+def test_floor_height_is_estimated(surface):
     assert surface.find_floor() == pytest.approx(0, abs=0.5 * surface.step)
 
 
-def test_bare_points_know_no_free_space_and_must_be_some():
+def test_bare_points_have_no_free_space():
     points = rooms.traces().end
     found = surface_from_points(points, 1 << 15)
     assert not found.has_free_space and found.distance.interpolate(points[:500]).max() < 2 * found.step
     with pytest.raises(NergError, match="99 points"):
         surface_from_points(np.zeros((99, 3)))
-    with pytest.raises(NergError, match="single point"):
+    with pytest.raises(NergError, match="coincide"):
         surface_from_points(np.zeros((200, 3)))
 
 
-def test_thinned_points_are_the_means_of_voxels():
+def test_downsampled_points_are_voxel_means():
     p = np.array([[0.0, 0, 0], [0.2, 0, 0], [1.1, 0, 0]])
     np.testing.assert_allclose(downsample(p, 1.0), [[0.1, 0, 0], [1.1, 0, 0]])
 
@@ -203,7 +203,7 @@ class _Nothing:
     pass
 
 
-def test_a_place_without_surfaces_is_refused(monkeypatch):
+def test_scene_without_surfaces_is_refused(monkeypatch):
     monkeypatch.setattr(
         "nerg_mi.alignment.constraints.trace_depth", lambda s, o, d: (np.zeros(len(o)), np.zeros(len(o)))
     )

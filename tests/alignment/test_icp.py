@@ -20,7 +20,7 @@ def quiet(share, text):
 
 
 @pytest.mark.nightly
-def test_a_twin_in_millimetres_is_placed_and_a_mirrored_one_named():
+def test_twin_in_millimetres_and_mirrored_twin():
     truth = rooms.similarity(np.random.default_rng(1), upright=True, scale=0.001)
     twin = rooms.carried(np.linalg.inv(truth), rooms.traces(9000).end)
     target = AlignmentTarget(points=PLACE, is_upright=True)
@@ -32,7 +32,7 @@ def test_a_twin_in_millimetres_is_placed_and_a_mirrored_one_named():
 
 
 @pytest.mark.parametrize("points, why", [(np.zeros((5, 3)), "5 usable points"), (np.ones((200, 3)), "coincide")])
-def test_a_twin_that_is_none_is_refused(points, why):
+def test_invalid_twins_are_refused(points, why):
     with pytest.raises(NergError, match=why):
         Twin(points).fit(AlignmentTarget(), quiet)
 
@@ -40,7 +40,7 @@ def test_a_twin_that_is_none_is_refused(points, why):
 # ---- Refine ----
 
 
-def test_a_near_start_comes_to_the_truth_and_says_how_sure_it_is():
+def test_refinement_converges_with_uncertainty():
     rays, truth = rooms.people(1500), rooms.similarity(np.random.default_rng(6))
     surface = surface_from_traces(rooms.traces().transform(truth), 1 << 18)
     nudge = np.eye(4)
@@ -62,7 +62,7 @@ def test_a_near_start_comes_to_the_truth_and_says_how_sure_it_is():
     assert found.covariance.shape == (7, 7) and (spread[:3] < 0.01).all() and 0 < spread[6] < 0.01
 
 
-def test_groups_are_people_or_stretches_of_few():
+def test_groups_are_participants_or_time_blocks():
     t, who = np.arange(0, 60, 0.5), np.zeros(120, int)
     assert len(np.unique(independent_groups(who, t))) == 6
     assert len(np.unique(independent_groups(np.arange(120) % 12, t))) == 12
@@ -90,7 +90,7 @@ def scores(surface):
 
 
 @pytest.mark.parametrize("which", range(4))
-def test_derivatives_are_those_of_central_differences(surface, which):
+def test_derivatives_match_central_differences(surface, which):
     score = scores(surface)[which]
     rng = np.random.default_rng(0)
     chart, q = (
@@ -106,7 +106,7 @@ def test_derivatives_are_those_of_central_differences(surface, which):
 
 
 @pytest.mark.parametrize("which", range(4))
-def test_all_is_well_in_the_right_place_and_not_elsewhere(surface, which):
+def test_residuals_vanish_at_the_correct_alignment(surface, which):
     score = scores(surface)[which]
     right = score.residuals(LocalSimilarity(np.eye(4), np.zeros(3)), np.zeros(7))[0]
     far = np.eye(4)
@@ -115,7 +115,7 @@ def test_all_is_well_in_the_right_place_and_not_elsewhere(surface, which):
     assert np.median(right) < 0.7 * surface.step and np.mean(wrong) > 10 * np.mean(right)
 
 
-def test_residuals_are_metres_of_the_tracking_whatever_the_scale_of_the_place(surface):
+def test_residuals_do_not_depend_on_the_scene_scale(surface):
     grown = surface_from_traces(rooms.traces().transform(np.diag([7.0, 7, 7, 1])), 1 << 16)
     for a, b in zip(scores(surface), scores(grown)):
         if isinstance(a, HeadHeight):

@@ -33,12 +33,12 @@ def quiet(share, text):
     pass
 
 
-def test_two_cameras_are_enough():
+def test_two_cameras_suffice():
     truth = similarity(np.random.default_rng(1))
     np.testing.assert_allclose(Cameras(*both(truth, 2)).fit(FREE, quiet).matrix, truth, atol=1e-8)
 
 
-def test_wrong_poses_do_no_harm():
+def test_outlier_poses_are_ignored():
     truth = similarity(np.random.default_rng(2))
     one, other = both(truth)
     other[:3, :3, 3] += 5
@@ -48,7 +48,7 @@ def test_wrong_poses_do_no_harm():
     assert fit.metadata == {"cameras": 12, "agreeing": 8}
 
 
-def test_a_mirrored_model_is_named():
+def test_mirrored_model_is_reported():
     truth = similarity(np.random.default_rng(3))
     one, other = both(truth)
     one[:, :3, 3] = carried(MIRROR, one[:, :3, 3])
@@ -59,22 +59,22 @@ def test_a_mirrored_model_is_named():
     assert "mirrored" in said or "axis negated" in said
 
 
-def test_another_convention_is_told():
+def test_other_camera_convention_is_reported():
     one, other = both(similarity(np.random.default_rng(4)), seed=5)
     other[:, :3, 1:3] *= -1
     assert any("convention" in d for d in Cameras(one, other).fit(FREE, quiet).warnings)
 
 
-def test_cameras_that_leave_it_open_are_refused():
+def test_degenerate_cameras_are_refused():
     one, other = both(np.eye(4))
     with pytest.raises(NergError, match="1 photos in common"):
         Cameras(one[:1], other[:1]).fit(FREE, quiet)
     one[:, :3, 3] = 1.0
-    with pytest.raises(NergError, match="all stand at one place"):
+    with pytest.raises(NergError, match="all have the same position"):
         Cameras(one, other).fit(FREE, quiet)
 
 
-def test_the_mean_rotation_is_the_median_of_most():
+def test_mean_rotation_is_robust():
     truth = Rotation.random(random_state=1)
     given = Rotation.concatenate([truth] * 7 + [Rotation.random(random_state=k) for k in range(2, 6)])
     np.testing.assert_allclose(mean_rotation(given.as_matrix()), truth.as_matrix(), atol=1e-3)
@@ -88,7 +88,7 @@ def write_model(folder, poses, names):
     (folder / "transforms.json").write_text(json.dumps({"fl_x": 10.0, "w": 8, "h": 6, "frames": frames}))
 
 
-def test_pictures_are_known_again_by_their_names(tmp_path):
+def test_photos_are_matched_by_name(tmp_path):
     truth = similarity(np.random.default_rng(6))
     one, other = both(truth, 5)
     write_model(tmp_path / "a", one, ["0.png", "1.png", "2.png", "3.png", "x.png"])
@@ -112,7 +112,7 @@ def made(count=6, seed=0, noise=0.01):
     return truth, x, carried(truth, x + rng.normal(0, noise, x.shape))
 
 
-def test_picked_points_give_the_alignment_its_errors_and_its_uncertainty():
+def test_pairs_give_alignment_and_uncertainty():
     truth, x, y = made()
     fit = Pairs(x, y).fit(FREE, quiet)
     assert residual_distances(fit.matrix, x, carried(truth, x)).max() < 0.03
@@ -120,26 +120,26 @@ def test_picked_points_give_the_alignment_its_errors_and_its_uncertainty():
     assert fit.covariance.shape == (7, 7) and fit.metadata["leave_one_out_cm"]["largest"] > max(fit.residuals_cm)
 
 
-def test_a_mirrored_frame_is_named():
+def test_mirrored_frame_is_reported():
     _, x, y = made()
     assert "the pairs meet to" in Pairs(carried(MIRROR, x), y).fit(FREE, quiet).mirrored
 
 
-def test_points_in_a_plane_do_not_tell_a_mirror():
+def test_coplanar_points_cannot_detect_a_mirror():
     truth, x, _ = made()
     flat = x * (1, 1, 0)
     fit = Pairs(flat, carried(truth @ MIRROR, flat)).fit(FREE, quiet)
     assert fit.mirrored is None and any("in a plane" in note for note in fit.notes)
 
 
-def test_a_pair_that_was_picked_wrong_is_named():
+def test_outlier_pair_is_reported():
     _, x, y = made(7, noise=0.001)
     y[3] += 2.0
     (doubt,) = Pairs(x, y, names=tuple("abcdefg")).fit(FREE, quiet).warnings
     assert 'pair 4 ("d")' in doubt and "check this pair" in doubt
 
 
-def test_two_pairs_and_up_that_is_another_axis():
+def test_two_pairs_with_another_up_axis():
     rng = np.random.default_rng(5)
     truth, x = similarity(rng, upright=True), rng.uniform(0, 4, (2, 3))
     turn = np.eye(4)[[0, 2, 1, 3]] * [[1], [-1], [1], [1]]
@@ -148,7 +148,7 @@ def test_two_pairs_and_up_that_is_another_axis():
     np.testing.assert_allclose(fit.matrix, np.linalg.inv(turn) @ truth, atol=1e-9)
 
 
-def test_files_are_read_as_they_are_described(tmp_path):
+def test_pair_files_are_read(tmp_path):
     rows = [[1, 2, 3, 4, 5, 6], [0, 0, 1, 1, 0, 0.5]]
     (tmp_path / "p.csv").write_text(HEAD + "".join(f"n{k},{','.join(map(str, r))}\n" for k, r in enumerate(rows)))
     pairs = [{"tracking": r[:3], "place": r[3:], "name": f"n{k}"} for k, r in enumerate(rows)]
@@ -172,13 +172,13 @@ def test_files_are_read_as_they_are_described(tmp_path):
         ("a.csv", "x,y,z,place_x,place_y,place_z\n0,5,1,5,0,1,1,2,3\n", "line 2: 9 cells, the header has 6; are these"),
     ],
 )
-def test_other_files_are_refused(tmp_path, name, text, why):
+def test_invalid_files_are_refused(tmp_path, name, text, why):
     (tmp_path / name).write_text(text)
     with pytest.raises(NergError, match=why):
         read_pairs(tmp_path / name)
 
 
-def test_empty_cells_are_no_coordinates(tmp_path):
+def test_empty_cells_are_refused(tmp_path):
     (tmp_path / "a.csv").write_text(HEAD + "a,1,2,3,4,5,\nb,0,0,0,0,0,0\nc,1,0,0,1,0,0\n")
     with pytest.raises(NergError, match="points in the frame"):
         read_pairs(tmp_path / "a.csv").fit(FREE, quiet)

@@ -31,7 +31,7 @@ def hat(w):
 
 
 @pytest.mark.parametrize("size", [1e-7, 0.3, 2.5])
-def test_right_jacobian_is_that_of_the_matrix_exponential(size):
+def test_right_jacobian_matches_the_matrix_exponential(size):
     w = size * np.array([0.6, -0.64, 0.48])
     step = 1e-6
     for k, e in enumerate(np.eye(3)):
@@ -40,7 +40,7 @@ def test_right_jacobian_is_that_of_the_matrix_exponential(size):
 
 
 @pytest.mark.parametrize("basis", [FULL_BASIS, FULL_BASIS[:, :-1], upright_basis(False), upright_basis(True)])
-def test_derivatives_are_those_of_central_differences(basis):
+def test_derivatives_match_central_differences(basis):
     rng = np.random.default_rng(0)
     chart = LocalSimilarity(similarity(rng), rng.normal(size=3), basis)
     x, q, slope = rng.normal(size=(20, 3)), rng.normal(0, 0.4, basis.shape[1]), rng.normal(size=(20, 3))
@@ -53,7 +53,7 @@ def test_derivatives_are_those_of_central_differences(basis):
     assert chart.scale(q) == pytest.approx(similarity_scale(chart.matrix(q)))
 
 
-def test_upright_charts_keep_up_and_the_floor():
+def test_upright_basis_keeps_up_and_floor():
     rng = np.random.default_rng(1)
     base = similarity(rng, upright=True)
     floor = base[2, 3]
@@ -74,7 +74,7 @@ def test_exact_points_give_the_similarity(upright):
         np.testing.assert_allclose(fit_similarity(x, carried(truth, x), upright=upright), truth, atol=1e-9)
 
 
-def test_noisy_points_give_the_least_squares_that_a_minimiser_finds():
+def test_noisy_points_match_a_minimiser():
     rng = np.random.default_rng(1)
     truth, x, w = similarity(rng), rng.normal(size=(7, 3)), rng.uniform(0.5, 2, 7)
     y = carried(truth, x) + rng.normal(0, 0.1, x.shape)
@@ -97,14 +97,14 @@ def test_known_scale_and_flat_points():
     assert np.linalg.det(fit_similarity(x, carried(truth @ MIRROR, x))[:3, :3]) > 0
 
 
-def test_two_points_are_enough_where_up_is_known():
+def test_two_points_suffice_with_known_up():
     rng = np.random.default_rng(3)
     truth, x = similarity(rng, True), rng.normal(size=(2, 3))
     check_points(x, x, "the pairs", upright=True)
     np.testing.assert_allclose(fit_similarity(x, carried(truth, x), upright=True), truth, atol=1e-9)
 
 
-def test_leave_one_out_is_the_error_of_the_fit_to_the_others():
+def test_leave_one_out_distances():
     rng = np.random.default_rng(4)
     truth, x = similarity(rng), rng.normal(size=(5, 3))
     y = carried(truth, x)
@@ -123,7 +123,7 @@ def test_leave_one_out_is_the_error_of_the_fit_to_the_others():
         (np.full((4, 3), np.nan), "points in the frame"),
     ],
 )
-def test_points_that_tell_nothing_are_refused(points, why):
+def test_degenerate_points_are_refused(points, why):
     with pytest.raises(NergError, match=why):
         check_points(points, points, "the pairs")
     with pytest.raises(NergError, match="above one another"):

@@ -36,7 +36,7 @@ def moved(points):
     return points @ TURN[:3, :3].T + TURN[:3, 3]
 
 
-def test_angles_are_those_of_a_loop():
+def test_angles_match_a_loop():
     origin, direction, _ = gaze(20, 0.05)
     found = compare_flips(moved(POINTS), TURN, origin, direction).degrees
     assert set(found) == {DECLARED, *(f"{a} of the directions negated" for a in "xyz")}
@@ -49,12 +49,12 @@ def test_angles_are_those_of_a_loop():
         assert np.allclose(np.sort(found[name]), np.sort(expected), atol=1e-5)
 
 
-def test_gaze_at_points_says_nothing():
+def test_correct_axes_give_no_warning():
     assert compare_flips(moved(POINTS), TURN, *gaze()).warning() is None
 
 
 @pytest.mark.parametrize("axis", range(3))
-def test_a_negated_axis_is_named(axis):
+def test_negated_axis_is_reported(axis):
     origin, direction, head = gaze()
     wrong = direction * np.where(np.arange(3) == axis, -1, 1)
     assert f"with {'xyz'[axis]} of the directions negated" in str(
@@ -63,7 +63,7 @@ def test_a_negated_axis_is_named(axis):
 
 
 @pytest.mark.parametrize("name", ["left and right", "up and down"])
-def test_exchanged_eyes_are_named(name):
+def test_exchanged_head_axes_are_reported(name):
     origin, direction, head = gaze()
     left = np.stack([-head[:, 1], head[:, 0], np.zeros(len(head))], axis=1)
     left /= np.linalg.norm(left, axis=1, keepdims=True)
@@ -74,7 +74,7 @@ def test_exchanged_eyes_are_named(name):
     )
 
 
-def test_few_rays_and_chance_are_no_evidence():
+def test_few_rays_and_chance_give_no_warning():
     origin, direction, head = gaze(20)
     assert compare_flips(POINTS, np.eye(4), origin, direction * (1, 1, -1), head).warning() is None
     origin, _, head = gaze()
@@ -83,7 +83,7 @@ def test_few_rays_and_chance_are_no_evidence():
     assert compare_flips(POINTS, np.eye(4), origin, anywhere, head).warning() is None
 
 
-def test_heads_that_nobody_knows_are_left_out():
+def test_unknown_heads_are_ignored():
     origin, direction, head = gaze()
     head[:, :] = np.nan
     found = compare_flips(POINTS, np.eye(4), origin, direction, head).degrees
@@ -93,7 +93,7 @@ def test_heads_that_nobody_knows_are_left_out():
 # ---- Search ----
 
 
-def test_turn_shift_and_scale_are_guessed_from_hit_points_and_heads():
+def test_search_finds_rotation_shift_and_scale():
     rays, truth = rooms.people(1500), rooms.similarity(np.random.default_rng(2), upright=True)
     surface = surface_from_traces(rooms.traces().transform(truth), 1 << 16)
     scales = candidate_scales(surface, rays.hit)
@@ -116,7 +116,7 @@ def quiet(share, text):
 
 
 @pytest.mark.nightly
-def test_the_tracking_alone_finds_its_place_and_a_mirrored_one_is_named():
+def test_tracking_alone_and_mirrored_tracking():
     truth = rooms.similarity(np.random.default_rng(7), upright=True)
     target = AlignmentTarget(traces=rooms.traces(25_000).transform(truth))
     fit = Tracking(RAYS).fit(target, quiet)
@@ -129,10 +129,10 @@ def test_the_tracking_alone_finds_its_place_and_a_mirrored_one_is_named():
         direction=RAYS.direction * (-1, 1, 1),
         hit=rooms.carried(MIRROR, RAYS.hit),
     )
-    assert "an axis of the tracking negated" in Tracking(flipped).fit(target, quiet).mirrored
+    assert "if an axis is negated" in Tracking(flipped).fit(target, quiet).mirrored
 
 
-def test_a_start_is_refined_to_any_rotation():
+def test_initial_similarity_is_refined():
     truth = rooms.similarity(np.random.default_rng(8))
     nudge = np.eye(4)
     nudge[:3, 3] = 0.08, -0.06, 0.05
@@ -145,13 +145,13 @@ def test_a_start_is_refined_to_any_rotation():
 @pytest.mark.parametrize(
     "changes, known, why",
     [
-        ({}, {"upright": False}, "needs the up direction"),
-        ({}, {"floor": None}, "give it with --floor"),
+        ({}, {"is_upright": False}, "needs the up direction"),
+        ({}, {"tracking_floor": None}, "give it with --floor-height"),
         ({"hit": None}, {}, "do not determine the scale"),
         (None, {}, "no gaze samples"),
     ],
 )
-def test_rays_that_leave_it_open_are_refused(changes, known, why):
+def test_undetermined_alignments_are_refused(changes, known, why):
     rays = RAYS.select(RAYS.t < 0) if changes is None else replace(RAYS, **changes)
     with pytest.raises(NergError, match=why):
         Tracking(rays).fit(AlignmentTarget(**known), quiet)
@@ -161,7 +161,7 @@ def test_rays_that_leave_it_open_are_refused(changes, known, why):
 
 
 @pytest.mark.parametrize("file", ["eye_gaze/generalized_eye_gaze.csv", "eye_gaze_vergence/generalized_gaze.csv"])
-def test_each_planted_mistake_is_named(file, recorded):
+def test_each_planted_flip_is_reported(file, recorded):
     sample = recorded("aria") / "gen1" / "mps_sample"
     rays, points = read_rays("aria", sample / file), read_semidense(sample / "trajectory" / "global_points.csv.gz")
     flips = compare_flips(points, np.eye(4), rays.origin, rays.direction, rays.head)

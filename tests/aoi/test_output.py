@@ -28,7 +28,7 @@ THING = {
 }
 
 
-def test01_what_there_is_and_nothing_else(tmp_path):
+def test_non_empty_tables_are_written(tmp_path):
     place = {"x": 0.0, "y": 0.0, "z": 1.6, "area": 2.0}
     recorder = Recorder()
     made = StatisticsResult(aois=[THING], isovists=[place, place | {"x": 0.25}], num_suppressed=2)
@@ -40,7 +40,7 @@ def test01_what_there_is_and_nothing_else(tmp_path):
     assert "2 values" in (tmp_path / "suppressed.txt").read_text() and recorder.messages
 
 
-def test02_equal_results_are_equal_files(tmp_path):
+def test_equal_results_give_equal_files(tmp_path):
     made = StatisticsResult(aois=[THING])
     for name in "ab":
         (tmp_path / name).mkdir()
@@ -57,7 +57,7 @@ ROWS = [
 ]
 
 
-def test01_all_kinds(tmp_path):
+def test_rows_are_written_in_all_formats(tmp_path):
     files = output.write_rows(tmp_path, "t", ROWS, *output.all_columns(ROWS, ()))
     with files[0].open() as file:
         rows = list(csv.DictReader(file))
@@ -67,20 +67,20 @@ def test01_all_kinds(tmp_path):
     assert pq.read_table(files[2]).to_pylist() == ROWS
 
 
-def test02_without_pyarrow(tmp_path, monkeypatch):
+def test_parquet_is_skipped_without_pyarrow(tmp_path, monkeypatch):
     monkeypatch.setattr(output, "find_spec", lambda name: None)
     files = output.write_rows(tmp_path, "t", ROWS, *output.all_columns(ROWS, ()))
     assert [f.suffix for f in files] == [".csv", ".md"]
 
 
-def test03_things_show_what_is_known():
+def test_aoi_table_omits_unknown_measures():
     row = {"cell": "cohort", "value": "x", "aoi": "a", "source": "measured", "participants": None, "share": 0.5}
     head, cells = output.aoi_columns([row])
     assert head == ["cell", "AOI", "source", "participants", "share of time"]
     assert cells(row) == ["cohort x", "a", "measured", "", "50.0 %"] and output.format_cell({"cell": "all"}) == "all"
 
 
-def test04_what_a_field_foretells_with_its_spread_and_support():
+def test_predictions_show_spread_and_support():
     row = {
         "cell": "all",
         "value": "",
@@ -100,7 +100,7 @@ def test04_what_a_field_foretells_with_its_spread_and_support():
     assert cells(row | {"share": 0.0004, "share_low": 0, "share_high": 0.001})[-2] == "0.04 % [0.00, 0.10] ± 2.10"
 
 
-def test06_reach_from_few_places_is_marked_in_table_and_picture():
+def test_hit_ratio_from_few_viewpoints_is_marked():
     row = {
         "cell": "all",
         "value": "",
@@ -121,7 +121,7 @@ def test06_reach_from_few_places_is_marked_in_table_and_picture():
         assert (reach.lines[0].get_markerfacecolor() == "white") == low
 
 
-def test05_what_a_change_does():
+def test_what_if_table():
     row = {"aoi": "a", "measure": "share", "participants": 5, "before": 0.5, "after": 0.25, "difference": -0.25}
     row |= {"low": -0.3, "high": -0.2, "p": 0.0005, "p_adjusted": 0.001, "difference_spread": None, "support": None}
     new = row | {"aoi": "b", "measure": "visible", "before": None, "difference": None, "low": None, "p": None}
@@ -136,7 +136,7 @@ def test05_what_a_change_does():
     assert head[6] == "± ensemble" and cells(spread[0])[6] == "1.00"
 
 
-def test06_differences_in_their_units():
+def test_differences_have_units():
     row = {"cell": "zone", "first": "front", "second": "back", "aoi": "a", "measure": "share", "difference": -0.06}
     row |= {"low": -0.08, "high": -0.04, "p": 0.001, "p_adjusted": 0.0014, "significant": True}
     head, cells = output.difference_columns([row])
@@ -153,7 +153,7 @@ def test06_differences_in_their_units():
     assert cells(blank)[4:] == ["dwell time", "+1.50 s", "", "", ""]
 
 
-def test07_many_people_are_written_in_parts(tmp_path, monkeypatch):
+def test_many_participants_are_written_in_batches(tmp_path, monkeypatch):
     sums = VisitSums.empty(("x", "y"), (ALL,), [(ALL, f"p{k}") for k in range(5)])
     # The first part of the file knows no first look.
     sums.visits[3:], sums.first_visit_sum[3:], sums.first_visit_count[3:] = 1, 2.5, 1

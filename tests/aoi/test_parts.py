@@ -41,7 +41,14 @@ from tests.workflows.recorder import Recorder
 
 from .place import SIGN, STAND, people, write_place
 
-FAST = {"resamples": 199, "eyes": 40, "directions": 128, "samples": 6, "names": True, "mode": "llvm_ad_rgb"}
+FAST = {
+    "resamples": 199,
+    "viewpoints": 40,
+    "directions": 128,
+    "aoi_samples": 6,
+    "show_names": True,
+    "mode": "llvm_ad_rgb",
+}
 
 
 @pytest.fixture(autouse=True)
@@ -78,11 +85,11 @@ def made(told):
 
 
 @pytest.mark.nightly
-def test_two_processes_give_the_tables_of_one(place):
+def test_parallel_tables_equal_serial_tables(place):
     (place / "poster.obj").write_text("v 5 1 1\nv 5 2 1\nv 5 1 2\nf 1 2 3\n")
     changes = {"move": [{"shape": "stand", "by": [0, 1.9, 0]}], "add": [{"name": "poster", "mesh": "poster.obj"}]}
     (place / "changes.json").write_text(json.dumps(changes | {"shift": [0, 0, 0.1]}))
-    asked = {"seen": True, "cell": 0.5, "windows": ("early=0,8",), "what_if": place / "changes.json"}
+    asked = {"aoi_visibility": True, "cell_size": 0.5, "windows": ("early=0,8",), "what_if": place / "changes.json"}
     whole, _ = count(place, "one", **asked)
     parts, told = count(place, "two", **asked, scheduler="local:2")
     assert parts == whole and {"aois.csv", "transitions.csv", "participants.csv", "what_if.csv", "about.json"} <= set(
@@ -95,7 +102,7 @@ def test_two_processes_give_the_tables_of_one(place):
     assert len(account.jobs[0].changed) == 0
 
 
-def test_what_changes_is_counted_again_and_nothing_else(place):
+def test_only_changed_parts_are_recomputed(place):
     parts = lambda: count(place, "out", store=place / "store")[1]
     assert made(parts()) == [6, 2] and made(parts()) == [0, 0]
     # A person's rays turn round; the field is asked where people stood, and nobody moved.
@@ -108,7 +115,7 @@ def test_what_changes_is_counted_again_and_nothing_else(place):
     assert made(parts()) == [6, 2]
 
 
-def test_parts_of_a_dataset_are_read_where_they_lie(place):
+def test_dataset_parts_are_read_in_place(place):
     pytest.importorskip("pyarrow")
     write_dataset(place, 2)
     whole, _ = count(place, "one", "shop.rays")
@@ -121,7 +128,7 @@ def test_parts_of_a_dataset_are_read_where_they_lie(place):
     assert 0 < made(more)[0] < made(told)[0]
 
 
-def test_sums_come_back_one_by_one(tmp_path):
+def test_sums_are_stored_per_block(tmp_path):
     cells = (ALL, Cell("window", "früh"))
     one = VisitSums.empty(("a", "b"), cells, [(cells[0], "p"), (cells[1], "p"), (cells[0], "q")])
     one.time[:] = (0.1, 1 / 3, 7)
@@ -132,7 +139,7 @@ def test_sums_come_back_one_by_one(tmp_path):
             assert np.array_equal(getattr(back, f.name), getattr(sums, f.name)), f.name
 
 
-def test_what_a_field_foretells_where_files_were_sent(place, tmp_path):
+def test_prediction_from_copied_files(place, tmp_path):
     options = PredictionOptions(aois=place / "areas.json", aoi_samples=4, directions=64, mode="llvm_ad_rgb")
     areas = FileGroup(options.aois, (options.aois,))
     setting = PlannedAoiScene(options, PlannedScene.plan(place / "scene.xml"), None, None, areas)
@@ -144,7 +151,7 @@ def test_what_a_field_foretells_where_files_were_sent(place, tmp_path):
     assert found.visible[0].any() and not found.visible[1].any()
 
 
-def test_a_gaze_field_brings_the_place_that_it_was_trained_in(tmp_path, rgb):
+def test_gaze_field_includes_its_training_geometry(tmp_path, rgb):
     field, (room, gaze) = fields.gaze(tmp_path / "g.safetensors"), (tmp_path / n for n in ("r.vol", "a.safetensors"))
     room.write_bytes(b"voxels")
     save_gaze(field, gaze, {"geometry_file": {"file": "r.vol", "sha256": file_sha256(room)}})
@@ -167,7 +174,7 @@ def counting(**changes):
     return replace(made, **changes)
 
 
-def test01_blocks_hold_sittings_as_a_whole_and_all_of_the_rays():
+def test_blocks_contain_whole_sessions_and_all_samples():
     rays = people(7, 60)
     # Two sittings each: a pause of two minutes in the middle.
     rays = replace(rays, t=rays.t + 120.0 * (rays.t >= 6))
@@ -184,7 +191,7 @@ def test01_blocks_hold_sittings_as_a_whole_and_all_of_the_rays():
             assert np.allclose(getattr(found, name), getattr(whole, name)), name
 
 
-def test02_a_sitting_that_runs_over_two_parts_of_a_dataset_is_one(tmp_path):
+def test_session_across_dataset_parts_is_one_session(tmp_path):
     pytest.importorskip("pyarrow")
     import nerg_mi as nerg
     from nerg_mi.rays import dataset, dataset_write
@@ -215,12 +222,12 @@ def test02_a_sitting_that_runs_over_two_parts_of_a_dataset_is_one(tmp_path):
     assert a.sessions.sum() == 3
 
 
-def test03_no_rays():
+def test_missing_samples_are_refused():
     with pytest.raises(NergError, match="no gaze samples"):
         list(iter_blocks(people().select(np.zeros(0, int)), RULES))
 
 
-def test04_a_tolerance_lets_rays_pass_by():
+def test_angular_tolerance_counts_near_misses():
     o = np.tile([1.0, 3.0, 1.5], (3, 1))
     # The sign's nearest edge, seen from there, lies at y = 2.5, x = 4.2.
     edge = np.arctan2(-0.5, 3.2)
@@ -231,13 +238,13 @@ def test04_a_tolerance_lets_rays_pass_by():
     assert counting(tolerance=2.0).assign_hits(rays).rows[0].tolist() == [0, 1]
 
 
-def test05_rays_in_another_frame():
+def test_samples_in_another_frame():
     align = np.diag([2.0, 2, 2, 1])
     align[:3, 3] = 1, 2, 3
     around = GazeScene(None, None, Similarity(align))
     moved = [BoxAoi(Region.create(n, *(2 * c + (1, 2, 3)))) for n, c in (("sign", SIGN), ("stand", STAND))]
     rays = people()
-    one, two = counting().assign_hits(rays), counting(around=around, things=moved).assign_hits(rays)
+    one, two = counting().assign_hits(rays), counting(gaze_scene=around, aois=moved).assign_hits(rays)
     for a, b in zip(one.rows, two.rows):
         assert a.tolist() == b.tolist()
     for a, b in zip(one.distance, two.distance):
@@ -245,7 +252,7 @@ def test05_rays_in_another_frame():
         assert np.allclose(a, b)
 
 
-def test06_cells():
+def test_cell_masks():
     rays = people()
     made = counting(
         windows=[TimeWindow("w", 1.0, 2.0)],
@@ -260,7 +267,7 @@ def test06_cells():
     assert np.array_equal(cells[Cell("zone", "z")], rays.origin[:, 0] <= 1)
 
 
-def test07_heads_tell_where_people_are_turned():
+def test_facing_directions_are_head_directions():
     rays = people(2, 3)
     head = np.tile(np.array([0, 1, 0], np.float32), (6, 1))
     head[0] = np.nan
@@ -269,7 +276,7 @@ def test07_heads_tell_where_people_are_turned():
     assert facing_directions(rays) is rays.direction
 
 
-def test08_eyes_are_taken_evenly_and_of_everybody():
+def test_viewpoints_cover_all_participants():
     picker = ViewpointSampler(100)
     for block in iter_blocks(people(5, 80), RULES, 100):
         picker.add(block, counting())

@@ -64,7 +64,7 @@ EYES = Viewpoints(
 )
 
 
-def test01_shares_are_integrals():
+def test_shares_are_integrals():
     # A cube of which the eye sees a face of 2 x 2 at x = 1: a sixth of the sphere; of the hemisphere's gaze 2/3.
     things = [
         BoxAoi(Region.create("ahead", [1, -1, -1], [2, 1, 1])),
@@ -81,7 +81,7 @@ def test01_shares_are_integrals():
     assert found.visible.tolist() == [[True, False, True]] * 3 and found.support.tolist() == [7, 7, 7]
 
 
-def test02_people():
+def test_prediction_is_aggregated_by_participant():
     things = [BoxAoi(Region.create("ahead", [1, -1, -1], [2, 1, 1]))]
     found = predict_attention(AROUND, EYES, things, [(0,)], 0.0, 120.0, 24, 4096, SILENT)
     people = aggregate_by_participant(found, EYES, ALL, {"Ada": 3.0, "Bo": 6.0}, 0.3)
@@ -102,7 +102,7 @@ class Two(Law):
         return lambda d: (np.array([np.where(s * d[:, 0] > 0, 10.0, 1.0) for s in (1, -1)]), None)
 
 
-def test03_members_of_an_ensemble():
+def test_ensemble_members():
     things = [
         BoxAoi(Region.create("ahead", [1, -1, -1], [2, 1, 1])),
         BoxAoi(Region.create("behind", [-2, -1, -1], [-1, 1, 1])),
@@ -116,7 +116,7 @@ def test03_members_of_an_ensemble():
     assert predict_attention(AROUND, EYES, things, [(0,), (1,)], 0.0, 120.0, 24, 64, SILENT).members.shape == (1, 3, 2)
 
 
-def test04_of_very_many_people_some_are_asked():
+def test_participants_are_subsampled():
     names = tuple(f"{k // 2:04d}" for k in range(400))
     many = Viewpoints(np.arange(1200.0).reshape(400, 3), np.ones((400, 3)), names, (frozenset([ALL]),) * 400)
     told = Recorder()
@@ -138,7 +138,7 @@ def test04_of_very_many_people_some_are_asked():
 # ---- Places on the floor where nobody was tracked ----
 
 
-def test01_on_the_floor_of_a_room(tmp_path):
+def test_observers_are_placed_on_the_floor(tmp_path):
     around = load_gaze_scene(write_place(tmp_path, gaze=False), None, None, None, ns)
     found = place_observers_on_floor(around, 1.6, 0.25, 0.0)
     inside = ((found[:, :2] > (2.5, 1.0)) & (found[:, :2] < (2.9, 2.0))).all(axis=1)
@@ -155,7 +155,7 @@ def test01_on_the_floor_of_a_room(tmp_path):
     assert len(rows) == 4 and rows[0]["sees s"] == rows[0]["sees g"] and 0 < rows[0]["area"] < 24.1
 
 
-def test02_observers_have_names():
+def test_observers_have_names():
     eyes = viewpoints_at(np.zeros((12, 3)))
     assert eyes.participants[0] == "observer 01" and len(set(eyes.participants)) == 12
 
@@ -169,7 +169,7 @@ def setting(folder, scene=True, **options):
     return load_aoi_scene(place, None, None, read_areas(folder / "areas.json"), asked, namespace("llvm_ad_rgb"))
 
 
-def test_cohorts_are_those_of_the_table_or_of_the_rays(tmp_path, rgb):
+def test_cohorts_come_from_the_table_or_the_samples(tmp_path, rgb):
     write_place(tmp_path)
     (tmp_path / "who.csv").write_text("person,cohort\na,old\nb,new\n")
     found = setting(tmp_path)
@@ -179,7 +179,7 @@ def test_cohorts_are_those_of_the_table_or_of_the_rays(tmp_path, rgb):
     assert table.cohort_names == ("new", "old") and list(table.transition_areas) == [0, 1]
 
 
-def test_where_no_place_is_known_things_hide_each_other(tmp_path, rgb):
+def test_aois_occlude_each_other_without_geometry(tmp_path, rgb):
     write_place(tmp_path)
     areas = (
         (tmp_path / "areas.json").read_text().replace('"shape": "stand"', '"min": [2.5, 1, 0], "max": [2.9, 2, 2.2]')
@@ -190,9 +190,9 @@ def test_where_no_place_is_known_things_hide_each_other(tmp_path, rgb):
     assert np.allclose(depth, (2.5, 4.0))
 
 
-def test_what_is_plainly_wrong_is_told_before_anything_is_loaded(tmp_path, rgb):
+def test_options_are_checked_before_loading(tmp_path, rgb):
     write_place(tmp_path)
-    with pytest.raises(NergError, match="--window is NAME=FROM,TO"):
+    with pytest.raises(NergError, match="--window needs NAME=FROM,TO"):
         setting(tmp_path, windows=("late",))
 
 
@@ -221,7 +221,7 @@ def rows():
     return [row | {"share": 0.1, "dwell": 1.0, "hit_ratio": 0.5} for row in made]
 
 
-def test01_spread_and_support_of_each_cell():
+def test_uncertainty_of_each_cell():
     found = rows()
     add_uncertainty(found, foretold([0.1, 0.3, 0.4], [0.2, 0.2, 0.2]), TRUST_EYES, TIMES, 0.3)
     tracked, field, _, zone = found
@@ -234,7 +234,7 @@ def test01_spread_and_support_of_each_cell():
     assert zone["share_spread"] == pytest.approx(0.1 / np.sqrt(2)) and 0 < zone["hit_ratio_spread"] < 1
 
 
-def test02_nothing_of_one_field_or_what_is_blank():
+def test_uncertainty_is_none_for_single_fields_and_suppressed_rows():
     found = rows()
     add_uncertainty(found, foretold([0.1, 0.3, 0.4]), TRUST_EYES, TIMES, 0.3)
     assert all(row["share_spread"] is None for row in found)
@@ -244,7 +244,7 @@ def test02_nothing_of_one_field_or_what_is_blank():
     assert blank[1]["dwell_spread"] is not None
 
 
-def test03_a_checkpoint_without_support_is_told_of():
+def test_missing_support_is_reported():
     told = Recorder()
     warn_missing_support(foretold([0.1, 0.3, 0.4]), told)
     assert told.messages == []
@@ -254,13 +254,13 @@ def test03_a_checkpoint_without_support_is_told_of():
     assert "does not contain training support" in told.messages[0] and "nerg train gaze" in told.messages[0]
 
 
-def test_few_places_a_person_are_told():
+def test_few_viewpoints_are_reported():
     told = Recorder()
     warn_few_viewpoints(TRUST_EYES, told)
     assert (
         len(told.messages) == 1
         and "1.5 viewpoints per participant" in told.messages[0]
-        and "--eyes 32 " in told.messages[0]
+        and "--viewpoints 32 " in told.messages[0]
     )
     count = 2 * MIN_VIEWPOINTS
     many = Viewpoints(
@@ -301,7 +301,7 @@ def rows_what_if(tmp_path, changes, after, floor=None, members=1):
     return {(r["aoi"], r["measure"]): r for r in found}, asked[0]
 
 
-def test01_the_same_people_are_compared_with_themselves(tmp_path):
+def test_what_if_pairs_participants(tmp_path):
     after = told([[0.2, 0.1], [0.3, 0.1], [0.21, 0.1], [0.29, 0.1], [0.25, 0.1]])
     found, (eyes, areas, things) = rows_what_if(tmp_path, {"move": [{"area": "a", "by": [5, 0, 0]}]}, after)
     share = found["a", "share"]
@@ -312,20 +312,20 @@ def test01_the_same_people_are_compared_with_themselves(tmp_path):
     assert areas.boxes[0].lower[0] == 5 and eyes is WHAT_IF_EYES and len(things) == 2
 
 
-def test02_other_observers_are_other_people(tmp_path):
+def test_what_if_with_other_observers(tmp_path):
     after = told([[0.5, 0.5]] * 2)
     found, (eyes, *_) = rows_what_if(tmp_path, {"observers": [[9, 9, 9], [8, 8, 8]], "shift": [0, 0, 1]}, after)
     assert eyes.positions.tolist() == [[9, 9, 10], [8, 8, 9]]
     assert found["a", "share"]["after"] == 0.5 and found["a", "share"]["before"] == pytest.approx(0.15)
 
 
-def test03_a_floor_on_people(tmp_path):
+def test_what_if_suppresses_few_participants(tmp_path):
     floor = MinParticipantsFilter(9)
     found, _ = rows_what_if(tmp_path, {"shift": [0, 0, 1]}, told([[0.2, 0.1]] * 5), floor)
     assert all(r["before"] is None and r["difference"] is None for r in found.values()) and floor.num_suppressed == 4
 
 
-def test04_members_of_an_ensemble(tmp_path):
+def test_what_if_spread_over_members(tmp_path):
     after = told([[0.2, 0.1]] * 5, members=2)
     found, _ = rows_what_if(tmp_path, {"shift": [0, 0, 1]}, after, members=2)
     # Both move alike, of which the mean says nothing; then only one of them.
@@ -339,7 +339,7 @@ def test04_members_of_an_ensemble(tmp_path):
     )
 
 
-def test_what_of_meshes_is_not_used_is_named_once(tmp_path):
+def test_unused_mesh_content_is_reported_once(tmp_path):
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
@@ -356,6 +356,6 @@ def test_what_of_meshes_is_not_used_is_named_once(tmp_path):
     assert setting.apply_changes(changes).warnings == [*setting.warnings, f"of {two}: statements that are not used: vp"]
 
 
-def test05_no_support(tmp_path):
+def test_what_if_without_support(tmp_path):
     found, _ = rows_what_if(tmp_path, {"shift": [0, 0, 1]}, told([[0.2, 0.1]] * 5, np.nan))
     assert all(row["support"] is None for row in found.values())

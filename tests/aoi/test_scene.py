@@ -63,7 +63,7 @@ def cast(scene, o, d):
 EYE, EAST = (1.0, 1.6, 1.6), (1.0, 0, 0)
 
 
-def test01_moved_and_turned(scene_changes, tmp_path):
+def test_shapes_are_moved_and_rotated(scene_changes, tmp_path):
     assert cast(scene_changes, EYE, EAST) == pytest.approx(1.5)
     moved, shapes = change(scene_changes, tmp_path, move=[{"shape": "stand", "by": [0.3, 0, 0]}])
     assert cast(moved, EYE, EAST) == pytest.approx(1.8, abs=1e-5) and set(shapes) == {"room", "sign", "stand"}
@@ -76,7 +76,7 @@ def test01_moved_and_turned(scene_changes, tmp_path):
     assert {s.id() for s in scene_changes.shapes()} == {"room", "sign", "stand"}
 
 
-def test02_removed_added_and_swapped(scene_changes, tmp_path):
+def test_shapes_are_removed_added_and_swapped(scene_changes, tmp_path):
     removed, shapes = change(scene_changes, tmp_path, remove=["stand"])
     assert cast(removed, EYE, EAST) == pytest.approx(3.0) and "stand" not in shapes
     wall = {"name": "wall", "min": [2, 0, 0], "max": [2.1, 4, 3]}
@@ -91,7 +91,7 @@ def test02_removed_added_and_swapped(scene_changes, tmp_path):
     assert cast(mesh, EYE, EAST) == pytest.approx(1.2)
 
 
-def test03_areas_follow(tmp_path):
+def test_areas_follow_shapes(tmp_path):
     box = Region.create("shelf", *SIGN)
     areas = AreaSet(
         (box, SceneShape("stand", "stand"), AreaGroup("all", ("shelf", "stand")), AreaGroup("g", ("stand",)))
@@ -108,7 +108,7 @@ def test03_areas_follow(tmp_path):
             apply_to_areas(areas, written(tmp_path, move=[{"area": wrong}]))
 
 
-def test04_observers(tmp_path):
+def test_observers_are_changed(tmp_path):
     found = written(tmp_path, observers=[[1, 2, 3]], shift=[0, 0, -0.5])
     assert found.observers.tolist() == [[1, 2, 3]] and found.shift.tolist() == [0, 0, -0.5] and not found.changes_shapes
 
@@ -123,12 +123,12 @@ def test04_observers(tmp_path):
         ({"remove": ["sign", "stand", "room"]}, "keep at least one"),
     ],
 )
-def test05_what_cannot_be_done(scene_changes, tmp_path, changes, said):
+def test_invalid_changes_are_refused(scene_changes, tmp_path, changes, said):
     with pytest.raises(NergError, match=said):
         change(scene_changes, tmp_path, **changes)
 
 
-def test06_a_field_cannot_be_taken_apart(tmp_path):
+def test_changes_need_a_scene(tmp_path):
     with pytest.raises(NergError, match="need a scene"):
         change(None, tmp_path, remove=["sign"])
 
@@ -159,7 +159,7 @@ def test06_a_field_cannot_be_taken_apart(tmp_path):
         {"shift": [1, 2, None]},
     ],
 )
-def test07_others_are_told_in_a_sentence(tmp_path, changes):
+def test_malformed_changes_are_refused(tmp_path, changes):
     with pytest.raises(NergError) as told:
         written(tmp_path, **changes)
     assert str(tmp_path) in str(told.value) and "\n" not in str(told.value)
@@ -168,12 +168,12 @@ def test07_others_are_told_in_a_sentence(tmp_path, changes):
 # ---- Cohorts of people from a table ----
 
 
-def test01_read(tmp_path):
+def test_cohorts_are_read(tmp_path):
     (tmp_path / "c.csv").write_text("cohort;person\nold;Ada\nyoung;Bo\nold;Ada\n")
     assert read_cohorts(tmp_path / "c.csv") == {"Ada": "old", "Bo": "young"}
 
 
-def test_names_come_back_as_they_were_written(tmp_path):
+def test_cohort_names_survive_a_round_trip(tmp_path):
     cohorts = {"=Ada": "-old", "@Bo": "+young", "'Cy": "old", "'=Di": "-1"}
     write_csv(tmp_path / "c.csv", [{"person": k, "cohort": v} for k, v in cohorts.items()])
     assert read_cohorts(tmp_path / "c.csv") == cohorts
@@ -182,7 +182,7 @@ def test_names_come_back_as_they_were_written(tmp_path):
 @pytest.mark.parametrize(
     "text", ["person,cohort\n", "person,group\nAda,old\n", "person,cohort\nAda,old\nAda,young\n", ""]
 )
-def test02_refused(tmp_path, text):
+def test_invalid_cohorts_are_refused(tmp_path, text):
     (tmp_path / "c.csv").write_text(text)
     with pytest.raises(NergError, match=r"c\.csv"):
         read_cohorts(tmp_path / "c.csv")
@@ -200,7 +200,7 @@ def folder(tmp_path_factory):
     return made
 
 
-def test01_depths_are_those_of_the_shapes(folder):
+def test_depths_match_the_shapes(folder):
     around = load_gaze_scene(folder / "bare" / "scene.xml", None, None, None, ns)
     rays = people()
     expected = [first_box(o, d)[1] for o, d in zip(rays.origin, rays.direction)]
@@ -208,7 +208,7 @@ def test01_depths_are_those_of_the_shapes(folder):
     assert np.allclose(around.bounds(), [[0, 0, 0], [6, 4, 3]], atol=1e-5)
 
 
-def test02_gaze_of_the_scene_or_beside_it(folder):
+def test_gaze_field_of_the_scene_or_of_a_file(folder):
     d = np.array([[1.0, 0, 0], [0, 1, 0]])
     own = load_gaze_scene(folder / "scene.xml", None, None, None, ns)
     beside = load_gaze_scene(folder / "bare" / "scene.xml", None, folder / "gaze.safetensors", None, ns)
@@ -219,7 +219,7 @@ def test02_gaze_of_the_scene_or_beside_it(folder):
     assert np.isnan(own.support_at(eye))
 
 
-def test03_frames(folder):
+def test_frames(folder):
     matrix = np.diag([2.0, 2, 2, 1])
     matrix[:3, 3] = 1, 0, 0
     around = load_gaze_scene(folder / "scene.xml", None, None, Similarity(matrix), ns)
@@ -227,18 +227,18 @@ def test03_frames(folder):
     assert np.allclose(around.transform_directions(np.array([0, 0, 1.0])), [0, 0, 1])
 
 
-def test04_nothing_is_known(folder):
+def test_scene_without_geometry(folder):
     around = load_gaze_scene(None, None, None, None, ns)
     assert np.isinf(around.trace_depth(np.zeros((3, 3)), np.eye(3))).all()
     with pytest.raises(NergError, match="bounds of the scene"):
         around.bounds()
 
 
-def test05_two_places(folder):
+def test_two_geometries_are_refused(folder):
     with pytest.raises(NergError, match="both define the geometry"):
         load_gaze_scene(folder / "scene.xml", folder / "field.safetensors", None, None, ns)
     (folder / "empty.xml").write_text('<scene version="3.0.0"><integrator type="path"/></scene>')
-    with pytest.raises(NergError, match="neither shapes nor a field"):
+    with pytest.raises(NergError, match="neither shapes nor a radiance field"):
         load_gaze_scene(folder / "empty.xml", None, None, None, ns)
 
 
@@ -252,7 +252,7 @@ def scene_things(tmp_path_factory):
     return load_scene(write_place(tmp_path_factory.mktemp("place"), gaze=False), merge=False)
 
 
-def test01_one_of_each(scene_things, tmp_path):
+def test_aois_of_each_kind(scene_things, tmp_path):
     (tmp_path / "two.obj").write_text(TWO)
     areas = [
         Region.create("box", *SIGN),
@@ -274,7 +274,7 @@ def test01_one_of_each(scene_things, tmp_path):
     assert set(shapes_by_id(scene_things)) == {"room", "sign", "stand"}
 
 
-def test02_samples_lie_on_the_surface(scene_things, tmp_path):
+def test_sample_points_lie_on_the_surface(scene_things, tmp_path):
     (tmp_path / "two.obj").write_text(TWO)
     both, stand = things(
         [MeshPart("m", tmp_path / "two.obj"), SceneShape("stand", "stand")], shapes_by_id(scene_things)
@@ -289,7 +289,7 @@ def test02_samples_lie_on_the_surface(scene_things, tmp_path):
     assert on.any(axis=1).all() and (points > STAND[0] - 1e-5).all() and (points < STAND[1] + 1e-5).all()
 
 
-def test03_a_sphere():
+def test_sphere_aoi():
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
@@ -300,7 +300,7 @@ def test03_a_sphere():
     assert np.allclose(np.linalg.norm(points - (2, 0, 0), axis=1), 0.5, atol=1e-5)
 
 
-def test04_what_there_is_not(scene_things, tmp_path):
+def test_missing_shapes_and_faces_are_refused(scene_things, tmp_path):
     with pytest.raises(NergError, match='"x"'):
         find_shape(shapes_by_id(scene_things), "x")
     with pytest.raises(NergError, match="use a scene"):
@@ -312,7 +312,7 @@ def test04_what_there_is_not(scene_things, tmp_path):
         things([MeshPart("m", tmp_path / "two.obj", ((0, 2),))], {})
 
 
-def test05_meshes_keep_their_names_in_a_scene():
+def test_meshes_keep_their_names_in_a_scene():
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")

@@ -25,7 +25,7 @@ from nerg_mi.rays.rays import Rays
 
 
 @pytest.mark.parametrize("place", [None, np.random.default_rng(0).uniform(0, 4, (500, 3))])
-def test_four_plans_hold_what_they_show_before_and_after(place):
+def test_alignment_figure_has_four_plans(place):
     points, heads = np.random.default_rng(1).uniform(0, 2, (2, 300, 3))
     shift = np.eye(4)
     shift[:3, 3] = 1, 2, 0
@@ -41,7 +41,7 @@ def test_four_plans_hold_what_they_show_before_and_after(place):
         np.testing.assert_allclose(np.sort(drawn[:, 1]), np.sort(moved[:, b]))
 
 
-def test_the_ceiling_is_cut_from_above_only():
+def test_ceiling_is_cut_in_views_from_above():
     place = np.array([[0.0, 0, 0], [1, 1, 1], [0, 0, 3], [1, 0, 3]])
     figure = alignment_figure(place, place, None, np.eye(4), cut_height=2.0)
     assert [len(a.collections[0].get_offsets()) for a in figure.axes] == [2, 4, 2, 4]
@@ -56,7 +56,7 @@ def poses() -> np.ndarray:
     return out
 
 
-def test_both_plans_show_every_camera_and_the_points(tmp_path):
+def test_camera_figure_shows_cameras_and_points(tmp_path):
     points = np.random.default_rng(0).uniform(-1, 6, (500, 3))
     points[0] = 1e6
     figure = camera_figure(poses(), points, np.full((500, 3), 90, np.uint8), "5 of 6 pictures")
@@ -70,7 +70,7 @@ def test_both_plans_show_every_camera_and_the_points(tmp_path):
     assert (tmp_path / "a.png").stat().st_size > 1000
 
 
-def test_wedges_open_to_where_cameras_look():
+def test_camera_wedges_open_in_viewing_direction():
     """OpenGL cameras look along -z, which is down from the side."""
     wedge = camera_figure(poses()[:1], np.zeros((0, 3)), np.zeros((0, 3), np.uint8), "").axes[1].lines[1]
     assert min(wedge.get_ydata()) <= 0 and max(wedge.get_ydata()) == 0
@@ -90,7 +90,7 @@ def walls():
     return Walls(LOW, HIGH, height, cut, 1.2)
 
 
-def test_walls_lie_where_they_are():
+def test_walls_are_drawn_in_place():
     page = floor_figure(LOW, HIGH, walls())
     (image,) = page.axes[0].images
     assert tuple(image.get_extent()) == (0, 4, 0, 3) and image.origin == "lower"
@@ -99,12 +99,12 @@ def test_walls_lie_where_they_are():
     assert np.all(grey[1:, 30:] == 1) and grey[15, 15] < grey[5, 5] < 1  # nothing is white; the higher, the darker
     assert [t.get_text() for t in page.axes[0].get_legend().get_texts()] == [
         "cut at 1.2 m",
-        "lower things",
-        "nothing below",
+        "lower objects",
+        "no surface below",
     ]
 
 
-def test_paths_have_gaps_where_nobody_was_recorded():
+def test_paths_have_gaps():
     places = np.array([[0.5, 0.5], [1, 0.5], [3, 2], [3.2, 2.2]])
     page = floor_figure(LOW, HIGH, paths=[ParticipantPath("Ada", places, np.array([True, False, True, False]))])
     line = next(l for l in page.axes[0].lines if len(l.get_xdata()) > 2)
@@ -116,7 +116,7 @@ def test_paths_have_gaps_where_nobody_was_recorded():
     )
 
 
-def test_rays_and_fields_of_view():
+def test_lines_of_sight_and_fields_of_view():
     origins, ends = np.array([[1.0, 1], [2, 2]]), np.array([[1.0, 2], [3, 2]])
     sight = SightLines(origins, ends, np.array([0, 1]))
     page = floor_figure(LOW, HIGH, rays=sight, fields=sight, fov=40)
@@ -131,17 +131,17 @@ def test_rays_and_fields_of_view():
         angle = np.degrees(np.arccos(np.clip((tip / np.linalg.norm(tip, axis=1)[:, None]) @ ((e - o) / reach), -1, 1)))
         assert angle.max() == pytest.approx(20, abs=1.5)
     names = [t.get_text() for t in page.axes[0].get_legend().get_texts()]
-    assert names == ["to what was looked at", "field of view, 40°"]
+    assert names == ["lines of sight", "field of view, 40°"]
 
 
-def test_many_people_share_a_legend_and_nothing_overlaps():
+def test_legend_of_many_participants():
     walk = lambda k: ParticipantPath(
         f"somebody with a rather long name {k}", np.array([[0.1 * k, 0.1], [1, 1]]), np.array([True, False])
     )
     page = floor_figure(LOW, HIGH, walls(), [walk(k) for k in range(20)], title="20 people")
     page.canvas.draw()
     texts = page.axes[0].get_legend().get_texts()
-    assert len(texts) == 12 and texts[-1].get_text() == "and 12 more people"
+    assert len(texts) == 12 and texts[-1].get_text() == "and 12 more participants"
     boxes = [t.get_window_extent().extents for t in (*texts, *page.texts)]
     for k, a in enumerate(boxes):
         assert a[0] >= 0 and a[3] <= page.bbox.height and a[2] <= page.bbox.width
@@ -149,7 +149,7 @@ def test_many_people_share_a_legend_and_nothing_overlaps():
             assert min(a[2], b[2]) - max(a[0], b[0]) <= 0.5 or min(a[3], b[3]) - max(a[1], b[1]) <= 0.5
 
 
-def test_equal_input_equal_file():
+def test_figures_are_reproducible():
     made = [encode(floor_figure(LOW, HIGH, walls()), suffix) for suffix in (".png", ".svg") for _ in range(2)]
     assert made[0] == made[1] and made[2] == made[3]
 
@@ -174,12 +174,15 @@ def rays():
     )
 
 
-def test_density_is_rays_a_square_metre(rays):
+def test_density_is_samples_per_square_metre(rays):
     figure = floor_plan(rays, cell=0.25)
     (mesh,) = [c for c in figure.axes[0].collections if hasattr(c, "_coordinates")]
     density = np.ma.filled(mesh.get_array(), 0.0)
     assert np.isclose(density.sum() * 0.25**2, 1000)
-    assert "1,000 rays of 3 people" in figure.axes[0].get_title(loc="left") and "rays/m²" in figure.axes[1].get_ylabel()
+    assert (
+        "1,000 samples of 3 participants" in figure.axes[0].get_title(loc="left")
+        and "samples/m²" in figure.axes[1].get_ylabel()
+    )
     (arrows,) = [c for c in figure.axes[0].collections if hasattr(c, "U")]
     assert (arrows.U > 0).all() and np.allclose(arrows.V, 0)
 
@@ -193,14 +196,14 @@ def test_axes_are_metres_of_equal_scale(rays):
         assert (np.array(figure.get_size_inches()) * DPI < 1000).all()
 
 
-def test_layout_says_how_far_the_rays_reach(rays):
+def test_layout_shows_dimensions(rays):
     texts = {t.get_text() for t in layout_figure(rays).axes[0].texts}
     x, y = np.ptp(rays.origin[:, 0]), np.ptp(rays.origin[:, 1])
     assert {f"{x:.2f} m", f"{y:.2f} m"} <= texts
     legend = [t.get_text() for t in layout_figure(rays, rays).axes[0].get_legend().get_texts()]
-    assert legend == ["training rays", "test rays", "what was looked at"]
+    assert legend == ["training samples", "test samples", "gaze hit points"]
     bare = Rays(rays.t, rays.person, rays.persons, rays.origin, rays.direction, rays.confidence)
-    assert [t.get_text() for t in layout_figure(bare).axes[0].get_legend().get_texts()] == ["rays"]
+    assert [t.get_text() for t in layout_figure(bare).axes[0].get_legend().get_texts()] == ["samples"]
     one = bare.select([0])
     floor_plan(one), layout_figure(one)  # a single place has no extent
 
@@ -214,7 +217,7 @@ def row(thing, source, share):
     )
 
 
-def test01_bars_are_as_long_as_shares_and_sorted():
+def test_bars_show_sorted_shares():
     page = aois_figure([row("a", "measured", 0.1), row("b", "measured", 0.3), row("a", "predicted", 0.2)])
     axis = page.axes[0]
     assert [t.get_text() for t in axis.get_yticklabels()] == ["a", "b"]
@@ -224,17 +227,17 @@ def test01_bars_are_as_long_as_shares_and_sorted():
     assert rasterize(page).std() > 5
 
 
-def test02_moves_are_percent_of_their_row():
+def test_transitions_are_row_percentages():
     page = transitions_figure(["a", "b"], np.array([[0, 3.0], [0, 0]]))
     assert page.axes[0].images[0].get_array().filled(0).tolist() == [[0, 100], [0, 0]]
     assert rasterize(page).std() > 5
 
 
-def test03_a_map():
+def test_grid_map():
     page = map_figure(np.array([[0.0, 0], [1, 0], [1, 1]]), np.array([1.0, 2, 3]), 1.0, "m²", "map")
     assert page.axes[0].collections[0].get_array().tolist() == [1, 2, 3]
     assert rasterize(page).std() > 5
 
 
-def test04_no_things():
+def test_figure_without_areas():
     assert rasterize(aois_figure([])).shape[2] == 3

@@ -29,7 +29,7 @@ from nerg_mi.transport.aovs import AOVS
 COLOR = np.random.default_rng(0).random((6, 8, 3))
 
 
-def test01_nothing_where_nobody_looks_and_where_there_is_no_surface():
+def test_no_heat_without_gaze_or_surface():
     heat = Heat(vmax=2.0)
     values = np.full((6, 8), 2.0)
     values[0] = 0
@@ -40,26 +40,26 @@ def test01_nothing_where_nobody_looks_and_where_there_is_no_surface():
     assert np.abs(shown[2:] - dim_background(COLOR, heat)[2:]).min(axis=(0, 1)).max() > 0.05
 
 
-def test02_opacity_rises_and_ends_at_the_top():
+def test_opacity_increases_to_the_maximum():
     heat = Heat(vmax=4.0, opacity=0.8, ramp=0.5)
     alpha = heat.alpha(np.linspace(0, 8, 50))
     assert alpha[0] == 0 and np.all(np.diff(alpha) >= 0)
     assert np.allclose(alpha[np.linspace(0, 8, 50) >= 2], 0.8)
 
 
-def test03_equal_values_have_equal_heat_in_the_scale_and_in_the_picture():
+def test_scale_and_image_have_equal_colours():
     heat = Heat(vmax=3.0, opacity=1.0)
     shown = overlay(COLOR, np.full((6, 8), 3.0), heat)
     assert np.allclose(shown, color_strip(heat)[-1])
 
 
-def test04_lightness_of_the_scale_rises():
+def test_scale_lightness_increases():
     for colors in ("inferno", "viridis"):
         strip = color_strip(Heat(vmax=1.0, colormap=colors, opacity=1.0, ramp=1e-6))
         assert np.all(np.diff((strip**2.2 @ [0.2126, 0.7152, 0.0722])[1:]) > -1e-3)
 
 
-def test05_top_from_a_percentile_of_the_surface():
+def test_robust_maximum_is_a_percentile():
     values = np.arange(100.0).reshape(10, 10)
     mask = values < 50
     assert robust_max(values, mask, 100) == 49
@@ -69,8 +69,8 @@ def test05_top_from_a_percentile_of_the_surface():
     assert robust_max(spot, np.ones_like(spot, bool)) == 2.5
 
 
-def test06_errors_are_sentences():
-    with pytest.raises(NergError, match="no gaze in this picture"):
+def test_invalid_scales_are_refused():
+    with pytest.raises(NergError, match="contains no gaze"):
         robust_max(np.zeros((3, 3)), np.ones((3, 3), bool))
     with pytest.raises(NergError, match="must be positive"):
         Heat(vmax=0.0)
@@ -85,7 +85,7 @@ LAYERS = OverlayLayers(np.repeat(X[..., None], 3, -1), 2 * Y, X > 0.1, (5.0, 4.0
 
 
 @pytest.mark.parametrize("name", [of.name for aov in AOVS.values() for of in list_overlays(aov)])
-def test_each_is_drawn(name, tmp_path):
+def test_each_overlay_is_drawn(name, tmp_path):
     overlay = find_overlay(name)
     limits = overlay.limits(LAYERS)
     assert overlay.name == name and (limits is None) == (not overlay.needs_limits)
@@ -93,25 +93,25 @@ def test_each_is_drawn(name, tmp_path):
     assert (tmp_path / "a.png").stat().st_size > 500
 
 
-def test_a_scale_for_all():
+def test_shared_scale():
     assert shared_limits([(0, 2.0), None, (0, 3.0)], None) == (0, 3.0)
     assert shared_limits([(1.0, 2.0), (0.5, 3.0)], 7.0) == (0.5, 7.0)
     assert shared_limits([(1.0, 2.0)], 0.5) == (0.0, 0.5)
     assert shared_limits([None, None], None) is None and shared_limits([None], 2.0) == (0.0, 2.0)
 
 
-def test_nothing_to_take_a_scale_from():
+def test_missing_values_for_a_scale_are_refused():
     dark = OverlayLayers(LAYERS.color, 0 * Y, LAYERS.mask)
     assert find_overlay("gaze").limits(dark) is None
     hidden = OverlayLayers(LAYERS.color, 2 * Y, X > 2)
     assert find_overlay("gaze").limits(hidden) is None
 
 
-def test_one_that_is_not_there():
-    with pytest.raises(NergError, match='no overlay "gase"; there are depth, opacity, position.X'):
+def test_unknown_overlay_is_refused():
+    with pytest.raises(NergError, match='unknown overlay "gase"; choose one of depth, opacity, position.X'):
         find_overlay("gase")
     for name in ("position", "position.W", "depth.Y", "features"):
-        with pytest.raises(NergError, match=f'"{name}" is no single channel'):
+        with pytest.raises(NergError, match=f'"{name}" has several channels'):
             find_overlay(name)
     assert find_overlay("depth.T") == find_overlay("depth") and find_overlay("features.12").name == "features.12"
 
@@ -129,7 +129,7 @@ def read(mi, path):
     return np.array(mi.Bitmap(str(path)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, srgb_gamma=True))
 
 
-def test01_pixel_for_pixel(rgb, tmp_path):
+def test_figures_show_images_pixel_for_pixel(rgb, tmp_path):
     save(figures.gaze_figure(PLOTS_COLOR, GAZE, MASK, HEAT), tmp_path / "gaze.png")
     page = read(rgb, tmp_path / "gaze.png").astype(float) / 255
     shown = overlay(PLOTS_COLOR, GAZE, HEAT, MASK)
@@ -143,7 +143,7 @@ def test01_pixel_for_pixel(rgb, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["depth", "gaze", "visibility", "occlusion"])
-def test02_equal_input_equal_file(tmp_path, name):
+def test_figures_are_reproducible(tmp_path, name):
     draw = dict(
         depth=lambda: figures.depth_figure(3 + GAZE, MASK),
         gaze=lambda: figures.gaze_figure(PLOTS_COLOR, GAZE, MASK, HEAT),
@@ -156,7 +156,7 @@ def test02_equal_input_equal_file(tmp_path, name):
     assert a == b and b"seed 1" in a
 
 
-def test02b_a_note_stands_below_and_moves_nothing():
+def test_note_does_not_move_panels():
     """The picture and its scale are where they are without it."""
     plain, noted = (
         figures.gaze_figure(PLOTS_COLOR, GAZE, MASK, HEAT, note=n) for n in ("", "made of 300 rays of 3 people")
@@ -172,12 +172,12 @@ def test02b_a_note_stands_below_and_moves_nothing():
     assert box.y1 <= min(a.get_window_extent().y0 for a in noted.axes) + 0.5
 
 
-def test03_depth_without_any_surface(tmp_path):
+def test_depth_without_surfaces(tmp_path):
     save(figures.depth_figure(np.zeros((8, 12)), np.zeros((8, 12), bool)), tmp_path / "a.png")
     assert (tmp_path / "a.png").stat().st_size > 0
 
 
-def test04_one_scale_for_the_three_panels_says_what_it_clips():
+def test_occlusion_figure_has_one_scale():
     figure = figures.occlusion_figure(
         (PLOTS_COLOR, GAZE, MASK), (PLOTS_COLOR, GAZE, MASK), (PLOTS_COLOR, 0 * GAZE, MASK), HEAT
     )
@@ -193,16 +193,16 @@ def test04_one_scale_for_the_three_panels_says_what_it_clips():
 # ---- Linear radiance as bytes ----
 
 
-def test01_srgb_against_known_values():
+def test_srgb_matches_reference_values():
     # IEC 61966-2-1: the knee, middle grey, white
     assert np.allclose(srgb([0, 0.0031308, 0.214041, 0.5, 1]), [0, 0.04045, 0.5, 0.735357, 1], atol=1e-5)
 
 
-def test02_out_of_range_is_clipped():
+def test_values_out_of_range_are_clipped():
     assert np.array_equal(to_bytes(srgb([-1.0, 7.0, np.nan, np.inf])), [0, 255, 0, 255])
 
 
-def test03_png_has_the_pixels_and_the_text(rgb, tmp_path):
+def test_png_contains_pixels_and_text(rgb, tmp_path):
     picture = np.random.default_rng(0).random((5, 7, 3))
     write_png(tmp_path / "a.png", picture, {"Comment": "seed 3"})
     assert np.array_equal(np.array(rgb.Bitmap(str(tmp_path / "a.png"))), to_bytes(picture))

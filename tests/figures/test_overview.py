@@ -40,7 +40,7 @@ def seen_from(eye, trace, attention):
     )
 
 
-def test_directions_are_those_of_the_pixels():
+def test_pixel_directions_round_trip():
     origin, ahead = np.array([1.0, -2, 3]), np.array([1.0, 2, -0.5]) / np.linalg.norm([1, 2, -0.5])
     d = FRAME.directions(ahead, 12, 8)
     assert d.shape == (96, 3) and np.allclose(np.linalg.norm(d, axis=1), 1)
@@ -56,7 +56,7 @@ def test_directions_are_those_of_the_pixels():
     assert (behind == -1).all()
 
 
-def test_where_attention_goes():
+def test_main_direction_and_mean_target():
     towards = np.array([0.6, 0.8, 0])
     seen = seen_from((4, 3, 1.5), room(), lambda d: np.exp(50 * (d @ towards - 1)) + 0.01)
     assert seen.main_direction @ towards > np.cos(np.radians(4))
@@ -66,7 +66,7 @@ def test_where_attention_goes():
     assert nothing.median_depth == 0 and nothing.mean_target() is None
 
 
-def test_a_camera_sees_what_the_observer_looks_at():
+def test_camera_shows_the_observers_attention():
     towards = np.array([1.0, 0, 0])
     # The pillar hides the wall that is looked at from whoever stands behind it.
     trace = room(pillar=((5, 3.6, 0), (5.5, 5.9, 3)))
@@ -87,7 +87,7 @@ def test_a_camera_sees_what_the_observer_looks_at():
     assert FRAME.pixels(shot.origin[None], ahead[None], spot[None], 48, 32)[0, 0] >= 0
 
 
-def test_attention_that_is_shown_is_counted():
+def test_attention_share_is_computed():
     trace = room()
     towards = np.array([1.0, 0, 0])
     seen = seen_from((4, 3, 1.5), trace, lambda d: (d @ towards > np.cos(np.radians(10))).astype(float))
@@ -99,7 +99,7 @@ def test_attention_that_is_shown_is_counted():
     assert ahead.score > 4 * away.score and behind.score > 4 * away.score
 
 
-def test_a_room_is_shown_from_within():
+def test_room_is_shown_from_inside():
     trace = room(pillar=((3, 2, 0), (4, 3, 2)))
     shot = view_of_scene(trace, FRAME, np.zeros(3), np.array([8.0, 6, 3]))
     assert shot.surface_fraction == 1 and (shot.origin > 0).all() and (shot.origin < (8, 6, 3)).all()
@@ -109,7 +109,7 @@ def test_a_room_is_shown_from_within():
     assert trace(shot.origin[None], d)[0][0] > 1
 
 
-def test_an_object_is_shown_from_around():
+def test_object_is_shown_from_outside():
     lower, upper = np.array([-1.0, -1, -1]), np.array([1.0, 1, 1])
 
     def solid(o, d):
@@ -123,7 +123,7 @@ def test_an_object_is_shown_from_around():
     assert view_of_scene(solid, FRAME, lower, upper, allow_outside=False) is None
 
 
-def test_nothing_has_no_picture():
+def test_empty_scene_has_no_view():
     void = lambda o, d: (np.zeros(len(o)), np.zeros(len(o)))
     assert view_of_scene(void, FRAME, np.zeros(3), np.ones(3)) is None
     assert view_of_observer(void, FRAME, seen_from((0, 0, 0), void, lambda d: np.ones(len(d)))) is None

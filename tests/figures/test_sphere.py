@@ -19,7 +19,7 @@ LONGITUDE, LATITUDE = RNG.uniform(-np.pi, np.pi, 200), np.arcsin(RNG.uniform(-1,
 
 
 @pytest.mark.parametrize("name", PROJECTIONS)
-def test_there_and_back(name):
+def test_projections_round_trip(name):
     of = find_projection(name)
     x, y = of.forward(LONGITUDE, LATITUDE)
     longitude, latitude, inside = of.inverse(x, y)
@@ -28,7 +28,7 @@ def test_there_and_back(name):
     np.testing.assert_allclose(latitude, LATITUDE, atol=1e-7)
 
 
-def test_mollweide_against_its_equation():
+def test_mollweide_satisfies_its_equation():
     """Snyder, p. 249: x = 2√2/π λ cos θ and y = √2 sin θ with 2θ + sin 2θ = π sin φ, here over 2√2 and √2."""
     x, y = PROJECTIONS["mollweide"].forward(LONGITUDE, LATITUDE)
     for λ, φ, a, b in zip(LONGITUDE, LATITUDE, x, y):
@@ -48,7 +48,7 @@ def test_mollweide_has_equal_areas():
         assert part.sum() / inside.sum() == pytest.approx(wanted, abs=1e-3)
 
 
-def test_resampled_pixels_are_the_panoramas():
+def test_resampling_uses_nearest_pixels():
     height, width = 20, 36
     panorama = np.arange(height * width, dtype=float).reshape(height, width)
     flat, inside = resample_panorama(panorama, PROJECTIONS["equirectangular"], width)
@@ -61,8 +61,8 @@ def test_resampled_pixels_are_the_panoramas():
     assert round_[50, 100] in panorama[9:11, 17:19]
 
 
-def test_one_that_is_not_there():
-    with pytest.raises(NergError, match="no projection"):
+def test_unknown_projection_is_refused():
+    with pytest.raises(NergError, match="unknown projection"):
         find_projection("Mollweide")
 
 
@@ -92,7 +92,7 @@ def spot(direction, half=0.15):
         ((0, -1, 0), (0.0, -1.0)),
     ],
 )
-def test_where_directions_lie(projection, direction, place):
+def test_directions_on_the_map(projection, direction, place):
     figure = sphere_figure(BLACK, spot(direction), ALL, HEAT, projection=projection)
     (image,) = figure.axes[0].images
     assert tuple(image.get_extent()) == (-1, 1, -1, 1)
@@ -106,7 +106,7 @@ def test_where_directions_lie(projection, direction, place):
     assert found == pytest.approx(place, abs=0.08)
 
 
-def test_hatched_where_nothing_is_known():
+def test_unknown_pixels_are_hatched():
     unknown = ALL & (np.arange(HEIGHT)[:, None] < HEIGHT // 2)
     plain = sphere_figure(BLACK, NOBODY, ALL, HEAT, projection="mollweide")
     hatched = sphere_figure(BLACK, NOBODY, ALL, HEAT, projection="mollweide", unknown=unknown)
@@ -117,11 +117,11 @@ def test_hatched_where_nothing_is_known():
     assert "no data" in [t.get_text() for axes in hatched.axes for t in axes.texts]
 
 
-def test_equal_input_equal_file():
+def test_figures_are_reproducible():
     made = [encode(sphere_figure(BLACK, spot((1, 1, 1)), ALL, HEAT), ".png", {"Comment": "seed 1"}) for _ in range(2)]
     assert made[0] == made[1] and b"seed 1" in made[0]
 
 
-def test_a_map_that_is_not_there():
+def test_figure_with_unknown_projection_is_refused():
     with pytest.raises(NergError, match='"mercator"'):
         sphere_figure(BLACK, NOBODY, ALL, HEAT, projection="mercator")

@@ -53,25 +53,25 @@ def lightness(colors):
 
 
 @pytest.mark.parametrize("name", SEQUENTIAL)
-def test_lightness_rises_evenly(name):
+def test_sequential_lightness_is_uniform(name):
     step = np.diff(lightness(apply_colormap(name, np.linspace(0, 1, 64))))
     assert np.all(step > 0)
     assert np.allclose(apply_colormap(f"{name}_r", [0.2]), apply_colormap(name, [0.8]), atol=0.02)
 
 
 @pytest.mark.parametrize("name", DIVERGING)
-def test_differences_darken_alike_to_both_sides(name):
+def test_diverging_lightness_is_symmetric(name):
     level = lightness(apply_colormap(name, np.linspace(0, 1, 65), kind="diverging"))
     assert level.argmax() in range(30, 35)
     assert np.all(np.diff(level[:30]) > 0) and np.all(np.diff(level[35:]) < 0)
     assert abs(level[0] - level[-1]) < 25
 
 
-def test_others_are_refused():
+def test_unknown_colormaps_are_refused():
     for name in ("jet", "hsv", "rainbow", "RdBu_r", "nothing", ""):
-        with pytest.raises(NergError, match="no perceptually uniform colour map: choose one of inferno"):
+        with pytest.raises(NergError, match="not a perceptually uniform colour map; choose one of inferno"):
             find_colormap(name)
-    with pytest.raises(NergError, match="no diverging colour map: choose one of RdBu_r"):
+    with pytest.raises(NergError, match="not a diverging colour map; choose one of RdBu_r"):
         find_colormap("viridis", kind="diverging")
 
 
@@ -82,20 +82,20 @@ UNKNOWN = np.zeros((40, 60), bool)
 UNKNOWN[5:30, 10:50] = True
 
 
-def test_only_what_is_unknown_changes_and_all_of_it():
+def test_only_unknown_pixels_are_hatched():
     drawn = hatch(SHOWN, UNKNOWN)
     np.testing.assert_array_equal(np.any(drawn != SHOWN, axis=-1), UNKNOWN)
     np.testing.assert_array_equal(hatch(SHOWN, ~UNKNOWN & UNKNOWN), SHOWN)
     assert drawn.min() >= 0 and drawn.max() <= 1
 
 
-def test_lines_are_a_quarter_and_run_along_diagonals():
+def test_hatch_lines_are_diagonal():
     on = hatch_lines(64, 64)
     assert on.mean() == 0.25 and np.array_equal(on[1:, :-1], on[:-1, 1:])
     assert hatch_lines(64, 64, 2)[::2, ::2].mean() == 0.25
 
 
-def test_it_looks_like_no_value():
+def test_hatching_differs_from_all_colours():
     """Grey lines beside pale ones: no place of any scale, over any picture, is grey and dark."""
     pale = hatch(np.zeros((16, 16, 3)), np.full((16, 16), True))
     assert np.ptp(np.unique(pale)) > 0.1 and np.allclose(pale[..., 0], pale[..., 2])
@@ -113,7 +113,7 @@ def test_the_swatch_is_hatched():
 # What pictures say of where they come from: inputs, seed, settings, versions, and nothing of the machine.
 
 
-def test_everything_is_said(tmp_path):
+def test_provenance_is_complete(tmp_path):
     (tmp_path / "scene.xml").write_text("<scene/>")
     about = make_provenance("nerg render", [tmp_path / "scene.xml"], 7, {"spp": 4})
     found = json.loads(about.text()["Comment"])
@@ -123,9 +123,9 @@ def test_everything_is_said(tmp_path):
     assert about.text()["Software"] == ", ".join(f"{k} {found['versions'][k]}" for k in ("nerg_mi", "mitsuba", "drjit"))
 
 
-def test_who_made_it_and_where_it_is_kept_is_not_said(tmp_path):
+def test_provenance_excludes_users_and_paths(tmp_path):
     options = BakeOptions(store=tmp_path, scheduler="local:2", max_edge=0.5, seed=4)
-    assert dict(make_provenance("x", [], 4, options).settings) == {"detail": 0.5}
+    assert dict(make_provenance("x", [], 4, options).settings) == {"max_edge": 0.5}
 
 
 def test_no_path_of_the_machine(tmp_path):
@@ -141,7 +141,7 @@ def test_no_path_of_the_machine(tmp_path):
     assert settings == {"frames": "a.csv", "defaults": {"field": "f.safetensors", "w": "b.ply"}, "spp": 2}
 
 
-def test_files_of_one_name_and_of_one_path(tmp_path):
+def test_files_with_equal_names(tmp_path):
     for k in "ab":
         (tmp_path / k).mkdir()
         (tmp_path / k / "day.csv").write_text(k)
@@ -152,12 +152,12 @@ def test_files_of_one_name_and_of_one_path(tmp_path):
     assert known[paths[0]] == found["day.csv"]
 
 
-def test_one_that_is_not_there(tmp_path):
+def test_missing_input_is_refused(tmp_path):
     with pytest.raises(NergError, match="gone.xml"):
         make_provenance("x", [tmp_path / "gone.xml"])
 
 
-def test_files_among_other_things(tmp_path):
+def test_existing_files_are_selected(tmp_path):
     (tmp_path / "a.csv").write_text("x")
     assert existing_files(tmp_path / "a.csv", str(tmp_path / "a.csv"), None, 3, tmp_path / "gone") == [
         tmp_path / "a.csv",
@@ -181,7 +181,7 @@ def figure():
     return gaze_figure(COLOR, GAZE, MASK, Heat(0.5))
 
 
-def test_png_by_another_library(tmp_path):
+def test_png_is_read_by_another_library(tmp_path):
     image = pytest.importorskip("PIL.Image", reason="Pillow is not installed")
     save(figure(), tmp_path / "a.png", ABOUT)
     with image.open(tmp_path / "a.png") as found:
@@ -189,7 +189,7 @@ def test_png_by_another_library(tmp_path):
         np.testing.assert_array_equal(np.asarray(found.convert("RGB")), rasterize(figure()))
 
 
-def test_svg_is_whole_in_itself(tmp_path):
+def test_svg_is_self_contained(tmp_path):
     save(figure(), tmp_path / "a.svg", ABOUT)
     root = ElementTree.parse(tmp_path / "a.svg").getroot()
     links = [v for e in root.iter() for k, v in e.attrib.items() if k in ("href", LINK, "src")]
@@ -203,7 +203,7 @@ def test_svg_is_whole_in_itself(tmp_path):
     assert not list(root.iter("{http://purl.org/dc/elements/1.1/}date"))
 
 
-def test_the_picture_in_an_svg_has_its_pixels(tmp_path):
+def test_svg_image_has_exact_pixels(tmp_path):
     image = pytest.importorskip("PIL.Image", reason="Pillow is not installed")
     text = encode(figure(), ".svg").decode()
     parts = [base64.b64decode(p) for p in re.findall(r'base64,\s*([^"]+)"', text)]
@@ -215,7 +215,7 @@ def test_the_picture_in_an_svg_has_its_pixels(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".png", ".svg"])
-def test_equal_figures_are_equal_files(suffix):
+def test_files_are_reproducible(suffix):
     assert encode(figure(), suffix, ABOUT.text()) == encode(figure(), suffix, ABOUT.text())
 
 
@@ -225,7 +225,7 @@ def test_other_formats_are_refused(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_notebooks_show_a_figure_by_itself():
+def test_notebooks_display_figures():
     assert figure()._repr_png_().startswith(b"\x89PNG")
 
 
@@ -247,7 +247,7 @@ def value(name, factor=""):
 
 @pytest.mark.parametrize("top", [1.0, 0.8, 1.37, 23.0, 9999.0, 12345.0, 3.3e-4, 7e-12, 4e15, 1e-3])
 @pytest.mark.parametrize("most", [3, 5, 9])
-def test_linear(top, most):
+def test_linear_ticks(top, most):
     places, names, factor = scale_ticks(0.0, top, most)
     assert 2 <= len(places) <= most + 1 and len(set(names)) == len(names)
     for place, name in zip(places, names):
@@ -256,7 +256,7 @@ def test_linear(top, most):
         assert len(name) <= 6
 
 
-def test_from_one_value_to_another_and_around_zero():
+def test_ticks_around_zero():
     for low, high in ((2.0, 7.3), (-0.5, 0.5), (-3e-6, 3e-6), (100.0, 100.4)):
         places, names, factor = scale_ticks(low, high, 6)
         for place, name in zip(places, names):
@@ -265,7 +265,7 @@ def test_from_one_value_to_another_and_around_zero():
 
 
 @pytest.mark.parametrize("low, high", [(1e-4, 1.0), (3e-12, 0.3), (1e-20, 1e10), (0.05, 700.0)])
-def test_logarithmic(low, high):
+def test_logarithmic_ticks(low, high):
     places, names, factor = scale_ticks(low, high, 5, log=True)
     assert factor == "" and 2 <= len(places) <= 6
     for place, name in zip(places, names):
@@ -274,7 +274,7 @@ def test_logarithmic(low, high):
         assert np.log10(found) == pytest.approx(np.log10(low) + place * np.log10(high / low), abs=1e-9)
 
 
-def test_less_than_a_decade():
+def test_logarithmic_ticks_within_a_decade():
     places, names, _ = scale_ticks(0.2, 0.8, 5, log=True)
     assert places == [0.0, 0.5, 1.0] and names == ["0.2", "0.4", "0.8"]
 
@@ -304,7 +304,7 @@ def overlap(a, b, slack=0.5):
 @pytest.mark.parametrize(
     "size, label", list(zip(SIZES, itertools.cycle(("gaze density [1/sr]", "training rays around the observer"))))
 )
-def test_no_label_lies_upon_another_or_leaves_the_page(size, label):
+def test_labels_do_not_overlap_or_leave_the_page(size, label):
     values = np.linspace(0, 2e-5, size[0] * size[1]).reshape(size)
     color, mask = np.zeros((*size, 3)), np.ones(size, bool)
     page = gaze_figure(color, values, mask, Heat(1.6e-5), "Where people looked", label, None, values < 1e-6)
@@ -326,7 +326,7 @@ def test_large_pictures_have_large_text():
     assert large.panels[0].title.get_fontsize() == pytest.approx(large.unit * small.panels[0].title.get_fontsize())
 
 
-def test_rows_and_columns():
+def test_sheet_rows_and_columns():
     sheet = Sheet([np.full((100, 160, 3), k / 5) for k in range(5)], list("abcde"), columns=2)
     at = [tuple(np.round(p.get_window_extent().extents)) for p in sheet.panels]
     assert len({a[0] for a in at}) == 2 and len({a[1] for a in at}) == 3
@@ -337,7 +337,7 @@ def test_rows_and_columns():
 
 
 @pytest.mark.parametrize("decades", [0.0, 6.0])
-def test_ticks_stand_at_the_colours_of_their_values(decades):
+def test_ticks_match_colours(decades):
     """A tick's place on the bar has the colour that a pixel of its value has."""
     heat = Heat(2.0, decades=decades)
     page = gaze_figure(np.full((200, 200, 3), 0.2), np.zeros((200, 200)), np.ones((200, 200), bool), heat)
@@ -364,7 +364,7 @@ def test_helpers():
 RANDOM = np.random.default_rng(0)
 
 
-def test_pictures_of_several_sizes():
+def test_contact_sheet_of_different_sizes():
     pictures = [RANDOM.random((90, 160, 3)), RANDOM.random((200, 100, 3)), RANDOM.random((50, 50, 3))]
     page = contact_sheet(pictures, ["first", "second", "third"])
     assert [a.get_title() for a in page.axes] == ["first", "second", "third"]
@@ -376,13 +376,13 @@ def test_pictures_of_several_sizes():
         assert np.count_nonzero(shown.min(axis=-1) < 1) == h * w
 
 
-def test_one_scale():
+def test_contact_sheet_with_one_scale():
     scale = lambda sheet: add_scale(sheet, Heat(2.0), "gaze [1/sr]", [(np.array([3.0]), np.ones(1, bool))])
     page = contact_sheet([RANDOM.random((90, 160, 3))] * 2, "ab", None, scale)
     assert len(page.axes) == 3 and page.axes[-1].get_ylabel() == "gaze [1/sr]" and len(page.axes[-1].patches) == 1
 
 
-def test_shrinking_takes_means_of_squares():
+def test_shrinking_averages_blocks():
     picture = RANDOM.random((95, 160, 3))
     assert shrink(picture, 160) is not None and np.array_equal(shrink(picture, 160), picture)
     small = shrink(picture, 50)
@@ -391,6 +391,6 @@ def test_shrinking_takes_means_of_squares():
     assert shrink(np.ones((1, 900, 3)), 100).shape == (1, 100, 3)
 
 
-def test_none():
+def test_empty_contact_sheet_is_refused():
     with pytest.raises(ValueError, match="at least one picture"):
         contact_sheet([], [])

@@ -92,7 +92,7 @@ def pixels(browser) -> tuple[int, int]:
 
 
 @pytest.mark.parametrize("name", ["shelf", HOSTILE], ids=["plain", "hostile"])
-def test_opens_from_disk_draws_and_asks_for_nothing(browser, tmp_path, name):
+def test_page_renders_offline(browser, tmp_path, name):
     path = opened(browser, tmp_path, whole(name))
     assert browser.execute_script("return document.querySelector('#stage').className") == "live"
     assert browser.execute_script("return document.querySelector('#stage canvas').dataset.drawn") == "true"
@@ -103,7 +103,7 @@ def test_opens_from_disk_draws_and_asks_for_nothing(browser, tmp_path, name):
     assert browser.execute_script("return document.querySelectorAll('img[onerror]').length") == 0
 
 
-def test_the_scene_follows_mouse_and_choices(browser, tmp_path):
+def test_3d_view_is_interactive(browser, tmp_path):
     from selenium.webdriver import ActionChains
     from selenium.webdriver.common.by import By
 
@@ -149,7 +149,7 @@ def origin(canvas):
     return ScrollOrigin.from_element(canvas)
 
 
-def test_without_scripts_and_on_paper_there_is_a_picture(browser, tmp_path):
+def test_fallback_image_without_scripts_and_in_print(browser, tmp_path):
     opened(browser, tmp_path, whole())
     shown = "return getComputedStyle(document.querySelector(arguments[0])).display"
     assert browser.execute_script(shown, "#stage .still") == "none"
@@ -167,7 +167,7 @@ def test_without_scripts_and_on_paper_there_is_a_picture(browser, tmp_path):
     assert browser.execute_script(shown, "#stage .still") != "none"
 
 
-def test_on_a_telephone_nothing_is_wider_than_the_screen(browser, tmp_path):
+def test_page_fits_a_narrow_screen(browser, tmp_path):
     size = {"width": 390, "height": 800, "deviceScaleFactor": 1, "mobile": False}
     browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
     try:
@@ -177,7 +177,7 @@ def test_on_a_telephone_nothing_is_wider_than_the_screen(browser, tmp_path):
         browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 
 
-def test_a_bare_report(browser, tmp_path):
+def test_bare_report_renders(browser, tmp_path):
     opened(browser, tmp_path, bare())
     assert [e for e in browser.get_log("browser") if e["level"] in ("SEVERE", "WARNING")] == []
     assert browser.execute_script("return document.querySelector('h1').textContent") == "Gaze"

@@ -70,16 +70,16 @@ def to_wall(o, d):
         return np.where(d == 0, np.inf, np.where(d > 0, (HIGH - o) / d, (LOW - o) / d)).min(axis=-1)
 
 
-def test_all_around_an_eye(hall):
+def test_gaze_query_covers_the_sphere(hall):
     onlooker, _ = hall
     d = fibonacci_directions(512)
     for eye in np.array([[0.3, -2.0, 1.6], [-1.0, 4.0, 1.5]]):
-        (gaze,), distance = onlooker.make_gaze_evaluator(eye)(d)
+        (gaze,), distance = onlooker.query_from(eye)(d)
         assert np.allclose(distance, to_wall(eye, d), atol=1e-4)
         assert np.allclose(gaze, onlooker.density(eye, d), rtol=1e-5) and np.ptp(gaze) > 0
 
 
-def test_gaze_on_points_is_the_density_where_nothing_hides_them(hall):
+def test_density_at_visible_and_hidden_points(hall):
     onlooker, _ = hall
     eye = np.array([0.3, -2.0, 1.6])
     on_wall, behind = np.array([2.0, 1.0, 1.0]), np.array([4.0, 4.0, 0.4])
@@ -91,13 +91,13 @@ def test_gaze_on_points_is_the_density_where_nothing_hides_them(hall):
     assert found[1] == 0
 
 
-def test_an_integral_of_few_directions_is_enough_for_a_picture(hall):
+def test_few_directions_suffice_for_normalization(hall):
     onlooker, _ = hall
     d = fibonacci_directions(8192)
     assert 4 * np.pi * onlooker.density(np.array([0.3, -2.0, 1.6]), d).mean() == pytest.approx(1, abs=0.02)
 
 
-def test_eyes_are_as_many_of_each_person(hall):
+def test_viewpoints_per_participant_are_equal(hall):
     _, place = hall
     rays = crowd(1000)
     eyes = sample_eye_positions(rays, place, 12)
@@ -108,7 +108,7 @@ def test_eyes_are_as_many_of_each_person(hall):
     assert len(few.positions) == 2 and len(set(few.participant)) == 2
 
 
-def test_eyes_are_spread_over_whole_visits(hall):
+def test_viewpoints_cover_whole_recordings(hall):
     """People walk from one end to the other: one eye of each must not be that in the middle of everybody's way."""
     _, place = hall
     people, each = 40, 50
@@ -122,7 +122,7 @@ def test_eyes_are_spread_over_whole_visits(hall):
         assert len(along) == most and np.abs(along - np.linspace(-5, 5, most)).max() < 0.5
 
 
-def test_rays_end_at_their_own_points_or_at_the_place(hall):
+def test_rays_end_at_hit_points_or_surfaces(hall):
     onlooker, place = hall
     rays = crowd(300)
     rows = np.linspace(0, 299, 100).round().astype(int)
@@ -138,7 +138,7 @@ def test_rays_end_at_their_own_points_or_at_the_place(hall):
         assert np.array_equal(np.intersect1d(found, inside), inside[box.contains(met[inside])])
 
 
-def test_rays_of_another_frame(hall, rgb):
+def test_rays_in_another_frame(hall, rgb):
     """Turned by 90 degrees about z, twice as large and moved."""
     onlooker, place = hall
     matrix = np.array([[0, -0.1, 0, 1], [0.1, 0, 0, 0], [0, 0, 0.1, 0.5], [0, 0, 0, 1.0]])
@@ -153,7 +153,7 @@ def test_rays_of_another_frame(hall, rgb):
     assert np.array_equal(landed.rows[0], expected) and 0 < len(expected) < 50
 
 
-def test_where_no_place_is_known_nothing_is_met(rgb):
+def test_rays_meet_nothing_without_geometry(rgb):
     box = Box((-2.0,) * 3, (2.0,) * 3)
     grid = HashGridConfig(levels=2, log2_rows=8, base=4, finest=8)
     field = GazeField.random(GazeConfig(grid=grid, width=16), box, namespace(rgb.variant()), 1)
@@ -180,37 +180,44 @@ def named():
     return replace(rays, persons=NAMES, metadata=about)
 
 
-def test_people_are_numbered_by_their_rays():
+def test_participants_are_numbered_by_sample_count():
     rays = named()
     count = np.bincount(rays.person)
     labels = ParticipantLabels(rays)
     order = [NAMES[i] for i in np.argsort(-count, kind="stable")]
-    assert [labels.label(name) for name in order] == ["person 1", "person 2", "person 3", "person 4"]
+    assert [labels.label(name) for name in order] == [
+        "participant 1",
+        "participant 2",
+        "participant 3",
+        "participant 4",
+    ]
     shown = anonymize_rays(rays, labels)
-    assert shown.persons == ("person 1", "person 2", "person 3", "person 4")
+    assert shown.persons == ("participant 1", "participant 2", "participant 3", "participant 4")
     assert [shown.persons[p] for p in shown.person] == [labels.label(rays.persons[p]) for p in rays.person]
     assert np.array_equal(shown.origin, rays.origin)
 
 
-def test_no_name_is_left():
+def test_all_names_are_replaced():
     shown = anonymize_rays(named(), ParticipantLabels(named()))
     text = repr(shown.metadata) + repr(shown.persons)
     assert "Ada" not in text and "Grace" not in text and shown.metadata["dropped"][0]["file"] == "file 1"
     assert shown.metadata["steps"] == [{"step": "filter", "kept": 9, "of": 10}]
 
 
-def test_names_of_files_and_evaluations():
+def test_names_in_files_and_evaluations_are_replaced():
     row = {"method": "gaze field", "person": "Ada", "bits": 1.0}
     found = GazeResults("g", "", "both", 1, 2, 20.0, (), (row, {**row, "person": "somebody else"}))
     labels = ParticipantLabels(named(), [found])
     shown = anonymize_results(found, labels)
-    assert [r["person"] for r in shown.participant_rows] == [labels.label("Ada"), "person 5"] and row["person"] == "Ada"
+    assert [r["person"] for r in shown.participant_rows] == [labels.label("Ada"), "participant 5"] and row[
+        "person"
+    ] == "Ada"
     assert labels.anonymize("ada_lovelace-ADA LOVELACE.npz") == (
         f"{labels.label('Ada')}_lovelace-{labels.label('Ada Lovelace')}.npz"
     )
     # A letter is hidden where it stands alone.
     assert labels.anonymize("X and axis") == f"{labels.label('X')} and axis"
-    assert ParticipantLabels(None).anonymize("a.b") == "a.b" and ParticipantLabels(None).label("Ada") == "a person"
+    assert ParticipantLabels(None).anonymize("a.b") == "a.b" and ParticipantLabels(None).label("Ada") == "a participant"
 
 
 # ---- Shares of attention on boxes, counted again another way; intervals by a bootstrap that is one ----
@@ -227,7 +234,7 @@ def on_rows(rows, count):
     return HitAssignment(count, (np.array(rows, int),), (np.ones(len(rows)),))
 
 
-def test_shares_of_people_count_alike():
+def test_participants_have_equal_weight():
     rng = np.random.default_rng(0)
     who, person = np.array([3, 3, 3, 5, 9, 9, 9, 9]), rng.choice([3, 5, 9], 300)
     share, rows = rng.random(len(who)), np.flatnonzero(rng.random(300) < 0.3)
@@ -242,7 +249,7 @@ def test_shares_of_people_count_alike():
     assert (found.num_could_see, found.num_looked, found.num_participants) == (3, 3, 3)
 
 
-def test_who_could_see_it():
+def test_participants_with_view_are_counted():
     # The second place of person 0 sees the box; no gaze goes there.
     field, who, person = of_field([0, 0, 0, 0], [False, True, False, False]), np.array([0, 0, 1, 2]), np.arange(4)
     (found,) = summarize_objects(["unit"], field, who, (on_rows([], 4), person))
@@ -252,12 +259,12 @@ def test_who_could_see_it():
     assert (found.num_could_see, found.num_looked) == (2, 2)
 
 
-def test_nobody_recorded():
+def test_objects_without_samples():
     (found,) = summarize_objects(["unit"], of_field([0.25]), np.zeros(1, int))
     assert found.recorded is None and found.num_participants is None and math.isnan(found.predicted.low)
 
 
-def test_the_interval_is_that_of_a_bootstrap_over_people():
+def test_interval_matches_the_bootstrap():
     rng = np.random.default_rng(2)
     values = rng.beta(2, 9, 40)
     found = mean_over_participants(values)
@@ -267,7 +274,7 @@ def test_the_interval_is_that_of_a_bootstrap_over_people():
     assert found.mean - found.low == pytest.approx(found.high - found.mean)
 
 
-def test_shares_stay_shares_and_few_people_have_no_interval():
+def test_intervals_stay_within_0_and_1():
     assert mean_over_participants(np.array([0.0, 0.0, 0.0, 0.9])).low == 0.0
     assert mean_over_participants(np.array([1.0, 1.0, 1.0, 0.1])).high == 1.0
     assert math.isnan(mean_over_participants(np.array([0.2, 0.3])).low)
@@ -293,7 +300,7 @@ def room(rgb):
     return scene.mitsuba
 
 
-def test_points_lie_on_the_walls_and_face_inwards(room):
+def test_proxy_points_lie_on_walls(room):
     eyes = np.array([[0.0, 0, 1.5], [1, 2, 1.0]])
     told = []
     gaze = lambda observer, points, spacing: np.linalg.norm(points - observer, axis=1)
@@ -316,7 +323,7 @@ def test_points_lie_on_the_walls_and_face_inwards(room):
             assert (np.abs(p[:, side] - end[side]) < found.spacing).any()
 
 
-def test_thinning_keeps_the_two_sides_of_a_wall_apart():
+def test_downsampling_separates_sides_of_a_wall():
     rng = np.random.default_rng(0)
     flat = np.concatenate([rng.uniform(0, 4, (4000, 2)), np.zeros((4000, 1))], axis=1)
     points = np.concatenate([flat, flat + [0, 0, 1e-4]])
@@ -329,7 +336,7 @@ def test_thinning_keeps_the_two_sides_of_a_wall_apart():
     assert apart.max() <= edge * np.sqrt(2) + 1e-9
 
 
-def test_thinning_leaves_few_points_alone():
+def test_downsampling_keeps_few_points():
     p = np.array([[0.0, 0, 0], [1, 1, 1]])
     found = downsample_points(p, np.array([[0.0, 0, 1]] * 2), np.ones((2, 3)), 10)
     assert np.allclose(found[0], p)
@@ -350,7 +357,7 @@ def test_normals_of_a_plane_and_an_edge():
     assert np.isfinite(normals_from_image(hole, -np.nan_to_num(hole, nan=1.0))).all()
 
 
-def test_smooth_normals_of_a_noisy_ball():
+def test_normals_of_a_noisy_sphere():
     rng = np.random.default_rng(1)
     outward = rng.normal(size=(4000, 3))
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)
@@ -360,7 +367,7 @@ def test_smooth_normals_of_a_noisy_ball():
     assert np.allclose(estimate_normals(points[:2], 3 * outward[:2]), outward[:2])
 
 
-def test_places_far_apart():
+def test_farthest_point_sampling():
     line = np.linspace(0, 10, 11)[:, None] * [1.0, 0, 0]
     assert sorted(farthest_point_sampling(line, 3, first=np.zeros(3)).tolist()) == [
         3,
@@ -398,7 +405,7 @@ def positions(about, array):
     return np.array(about["lower"]) + array.reshape(-1, 3) / 65535 * np.array(about["size"])
 
 
-def test_positions_normals_and_colours_come_back():
+def test_packed_arrays_round_trip():
     given = stage()
     about, arrays = unpacked(pack_stage(given))
     close = np.array(about["size"]).max() / 65535
@@ -412,7 +419,7 @@ def test_positions_normals_and_colours_come_back():
         assert np.abs(paths[first : first + count] - path).max() <= close
 
 
-def test_gaze_of_all_and_of_each():
+def test_packed_gaze_of_each_observer_and_mean():
     given = stage()
     about, arrays = unpacked(pack_stage(given))
     heat = (arrays["gaze"].reshape(3, -1) / 255) ** 2
@@ -422,7 +429,7 @@ def test_gaze_of_all_and_of_each():
     assert [who["marks"] for who in about["observers"]] == [[0, 1], [0], [1]]
 
 
-def test_boxes_are_their_twelve_edges():
+def test_boxes_are_packed_as_edges():
     about, arrays = unpacked(pack_stage(stage((Region.create("b", np.array([0.0, 1, 2]), np.array([1.0, 3, 4])),))))
     edges = positions(about, arrays["boxes"]).reshape(12, 2, 3)
     lengths = np.sort(np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1))
@@ -430,7 +437,7 @@ def test_boxes_are_their_twelve_edges():
     assert len(np.unique(edges.reshape(-1, 3).round(3), axis=0)) == 8
 
 
-def test_nothing_but_points():
+def test_pack_without_observers():
     given = stage(())
     empty = replace(given.proxy, gaze=np.zeros((0, len(given.proxy.vertices)), np.float32))
     text = pack_stage(replace(given, proxy=empty, observers=np.zeros((0, 3)), paths=[]))
@@ -438,5 +445,5 @@ def test_nothing_but_points():
     assert about["observers"] == [{"marks": [], "top": 0.0}] and not arrays["gaze"].any() and about["paths"] == []
 
 
-def test_equal_scenes_are_equal_bytes_and_safe_in_a_page():
+def test_packed_scene_is_reproducible_and_safe():
     assert pack_stage(stage()) == pack_stage(stage()) and "<" not in pack_stage(stage())

@@ -24,7 +24,7 @@ SVG = "{http://www.w3.org/2000/svg}"
 
 
 @pytest.mark.parametrize("low, high", [(0, 1), (-2.3, 0.01), (1e-7, 3e-7), (5, 5), (-1e6, 1e9), (0.97, 1.02)])
-def test_ticks_are_round_and_span(low, high):
+def test_ticks_are_round_and_span_the_range(low, high):
     ticks = nice_ticks(low, high)
     steps = np.diff(ticks)
     assert 2 <= len(ticks) <= 6 and np.allclose(steps, steps[0]) and ticks[0] <= low and ticks[-1] >= high
@@ -32,7 +32,7 @@ def test_ticks_are_round_and_span(low, high):
     assert float(digits) in (1, 2, 5)
 
 
-def test_values_lie_where_their_scale_says():
+def test_chart_positions_match_the_scale():
     points = [Point("a", 0.0, -1.0, 1.0, True), Point("b", 2.0), Point("c", math.nan, math.nan, math.nan)]
     root = ET.fromstring(interval_chart([("score", points), ("other", points)]))
     circles = root.findall(f"{SVG}circle")
@@ -44,7 +44,7 @@ def test_values_lie_where_their_scale_says():
     assert "a 0, b 2, c nan" in root.get("aria-label")
 
 
-def test_labels_are_text():
+def test_chart_labels_are_escaped():
     root = ET.fromstring(interval_chart([(HOSTILE, [Point(HOSTILE, 1.0)])]))
     assert {e.tag for e in root.iter()} == {f"{SVG}{t}" for t in ("svg", "text", "line", "circle")}
 
@@ -70,18 +70,18 @@ class Parsed(HTMLParser):
 
 
 @pytest.mark.parametrize("text", [HOSTILE, "a < b & c > d", "\"'", "]]>", "<!--", "</p>", "&lt;", "\u2067x\u2069"])
-def test_text_stays_text(text):
+def test_text_is_escaped(text):
     shown = "".join(c if c.isprintable() else "?" for c in text)
     found = Parsed(html.element("p", text, title=text, data_name=text))
     assert found.tags == [("p", {"title": shown, "data-name": shown})] and found.text == shown
 
 
-def test_what_cannot_be_seen_is_shown_as_such():
+def test_invisible_characters_are_replaced():
     assert html.markup("a\u202eb\u200fc\x00d\x1b[0m") == "a?b?c?d?[0m"
     assert html.markup("two\nlines") == "two lines"
 
 
-def test_markup_is_kept_and_lists_are_joined():
+def test_markup_is_not_escaped_twice():
     bold = html.element("b", "x")
     assert html.markup([bold, " & ", 3, None, ["<", bold]]) == "<b>x</b> &amp; 3&lt;<b>x</b>"
     assert html.element("input", type="checkbox", checked=True, disabled=False, name=None) == (
@@ -97,7 +97,7 @@ def test_tables():
     assert Parsed(html.key_value_table([("x", "<y>")])).text == "x<y>"
 
 
-def test_pictures_are_within_the_page():
+def test_images_are_embedded():
     ((_, attributes),) = Parsed(html.image(PNG, "a <picture>")).tags
     assert attributes["src"].startswith("data:image/png;base64,iVBOR") and attributes["alt"] == "a <picture>"
     assert Parsed(html.figure(html.image(PNG, ""), "<words>")).text == "<words>"
@@ -108,18 +108,18 @@ def test_pictures_are_within_the_page():
 SIZE = 6_000_000
 
 
-def test_every_section_is_there():
+def test_page_contains_every_section():
     for run in (whole(), bare()):
         tags = Parsed(render_page(run)).tags
         assert [a["id"] for t, a in tags if t == "section"] == [s.name for s in SECTIONS]
         assert [a["href"] for t, a in tags if t == "a"] == [f"#{s.name}" for s in SECTIONS]
 
 
-def test_equal_runs_give_equal_bytes():
+def test_page_is_reproducible():
     assert render_page(whole()) == render_page(whole()) and len(render_page(whole()).encode()) < SIZE
 
 
-def test_names_never_become_markup():
+def test_names_cannot_inject_markup():
     tame, hostile = (Parsed(render_page(whole(name))) for name in ("shelf", HOSTILE))
     assert [t for t, _ in hostile.tags] == [t for t, _ in tame.tags]
     keys = lambda found: [sorted(a) for _, a in found.tags]
@@ -129,7 +129,7 @@ def test_names_never_become_markup():
 
 
 @pytest.mark.parametrize("run", [whole(), bare(), whole(HOSTILE)], ids=["whole", "bare", "hostile"])
-def test_nothing_is_loaded(run):
+def test_page_loads_no_resources(run):
     text = render_page(run)
     for tag, attributes in Parsed(text).tags:
         assert tag not in ("link", "iframe", "object", "embed", "form", "base", "video", "audio", "source"), tag
@@ -139,7 +139,7 @@ def test_nothing_is_loaded(run):
     assert "url(" not in style and "@import" not in style
 
 
-def test_the_policy_allows_what_is_in_the_page_and_no_more():
+def test_content_security_policy_matches_the_page():
     text = render_page(whole())
     (policy,) = [a["content"] for t, a in Parsed(text).tags if a.get("http-equiv") == "Content-Security-Policy"]
     rules = dict(rule.strip().split(" ", 1) for rule in policy.split(";"))
@@ -154,12 +154,12 @@ def test_the_policy_allows_what_is_in_the_page_and_no_more():
     assert text.index("Content-Security-Policy") < min(text.index("<style>"), text.index("<title>"))
 
 
-def test_a_report_without_a_scene_has_no_script():
+def test_page_without_3d_view_has_no_script():
     text = render_page(bare())
     assert "<script" not in text and "script-src 'none'" in text.replace("&#x27;", "'")
 
 
-def test_the_scene_is_data():
+def test_3d_view_is_embedded_as_data():
     assert packed_scene(render_page(whole(HOSTILE)))["count"] == whole().stage_points
 
 
@@ -174,21 +174,21 @@ def text_of(section, run) -> str:
 
 
 @pytest.mark.parametrize("section", SECTIONS, ids=lambda s: s.name)
-def test_shown_or_left_out_with_a_reason(section):
+def test_empty_sections_state_a_reason(section):
     assert section.reason_absent(whole()) is None and len(text_of(section, whole())) > 40
     reason = section.reason_absent(bare())
     assert (reason is not None) == (section.name in ABSENT)
     if reason is None:
-        assert section.body(bare())
+        assert section.render(bare())
     else:
         assert reason.endswith(".") and len(reason) > 40 and reason.count(".") <= 2
 
 
-def test_names_are_apart():
+def test_section_names_and_titles_are_unique():
     assert len({s.name for s in SECTIONS}) == len({s.title for s in SECTIONS}) == len(SECTIONS)
 
 
-def test_what_is_said():
+def test_section_texts():
     said = {s.name: text_of(s, whole()) for s in SECTIONS}
     assert said["verdict"].startswith("Better than nearest rays, the strongest baseline, for new people at new places.")
     assert "4.00 × 4.00 × 4.00" in said["place"] and "training photos9" in said["place"]
@@ -206,18 +206,18 @@ def test_what_is_said():
     assert "ab" * 32 in said["provenance"]
 
 
-def test_who_was_held_out_is_counted_and_not_named():
+def test_held_out_participants_are_not_named():
     assert "Ada" not in text_of(SETTINGS, replace(whole(), gaze={"provenance": {"test": {"people": ["Ada"]}}}))
 
 
-def test_shares_that_few_people_could_see_are_hidden():
+def test_shares_of_few_participants_are_hidden():
     objects = next(s for s in SECTIONS if s.name == "objects")
     said = text_of(objects, replace(whole(), min_participants=3))
     assert "otherhidden" in said and "fewer than 3" in said and said.count("25.00") == 2
     assert "hidden" not in text_of(objects, whole())
 
 
-def test_without_people_there_are_no_intervals_of_shares():
+def test_shares_without_participants_have_no_intervals():
     objects = next(s for s in SECTIONS if s.name == "objects")
     (first, *_) = whole().objects
     alone = replace(first, recorded=None, num_could_see=None, num_looked=None, num_participants=None)
@@ -225,7 +225,7 @@ def test_without_people_there_are_no_intervals_of_shares():
     assert "over 1 viewpoint." in said and "share of samples" not in said
 
 
-def test_one_split_each():
+def test_each_split_has_a_verdict():
     both = whole().results[0]
     run = replace(whole(), results=(both, replace(both, split="pos", num_participants=3)))
     verdict, scores = (next(s for s in SECTIONS if s.name == n) for n in ("verdict", "scores"))

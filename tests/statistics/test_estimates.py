@@ -29,7 +29,7 @@ from nerg_mi.statistics.estimates import (
         ([], []),
     ],
 )
-def test_hypotheses_without_a_p_value_do_not_count(p, expected):
+def test_missing_p_values_are_ignored(p, expected):
     assert np.allclose(adjust_p_values(np.array(p)), expected, rtol=1e-12, equal_nan=True)
 
 
@@ -38,7 +38,7 @@ def test_hypotheses_without_a_p_value_do_not_count(p, expected):
 ONES = np.ones
 
 
-def test01_of_many_normal_people_it_is_that_of_student():
+def test_interval_approaches_students_t():
     x = np.random.default_rng(0).normal(5, 1, (60, 1))
     found = estimate_ratios(x, ONES(x.shape), resamples=4000)
     reach = stats.t.ppf(0.975, 59) * x.std(ddof=1) / np.sqrt(60)
@@ -47,7 +47,7 @@ def test01_of_many_normal_people_it_is_that_of_student():
     assert found.high[0] == pytest.approx(x.mean() + reach, abs=0.15 * reach)
 
 
-def test02_a_loop_over_draws_gives_the_same():
+def test_bootstrap_matches_a_loop():
     rng = np.random.default_rng(1)
     x, y = rng.gamma(1, 1, (9, 1)), rng.gamma(2, 1, (9, 1))
     found = estimate_ratios(x, y, resamples=500, seed=7)
@@ -67,14 +67,14 @@ def test02_a_loop_over_draws_gives_the_same():
     assert found.low[0] == pytest.approx(max(m - reach, 0)) and found.high[0] == pytest.approx(m + reach)
 
 
-def test03_people_hold_together():
+def test_participants_are_the_sampling_unit():
     # 4 people whose thousands of rays agree: as uncertain as 4 numbers.
     x = np.array([[0.1], [0.2], [0.3], [0.4]])
     found = estimate_ratios(x, ONES(x.shape))
     assert found.low[0] < 0.13 and found.high[0] > 0.37
 
 
-def test04_nobody_few_and_nothing():
+def test_too_few_participants_have_no_interval():
     x = np.array([[0.0, 0.2, 0.3], [0.0, 0.2, 0.1], [0.0, 0.2, 0.0], [0.0, 0.2, 0.0]])
     y = np.array([[1.0, 1, 1], [1, 1, 1], [1, 1, 0], [1, 1, 0]])
     found = estimate_ratios(x, y)
@@ -86,7 +86,7 @@ def test04_nobody_few_and_nothing():
     assert one.value == 1 and np.isnan(one.low).all()
 
 
-def test05_a_difference_of_the_same_people_is_of_their_differences():
+def test_paired_difference_matches_mean_of_differences():
     rng = np.random.default_rng(2)
     base = rng.normal(10, 5, (40, 1))
     after = base + rng.normal(1, 0.1, (40, 1))
@@ -103,7 +103,7 @@ def test05_a_difference_of_the_same_people_is_of_their_differences():
     assert apart.p == pytest.approx(welch.pvalue, abs=0.08)
 
 
-def test06_equal_groups_are_found_different_as_often_as_said():
+def test_false_positive_rate_of_ratio_differences():
     rng = np.random.default_rng(3)
     x = rng.exponential(1, (24, 600))
     first, second = np.zeros((24, 600)), np.zeros((24, 600))
@@ -116,7 +116,7 @@ def test06_equal_groups_are_found_different_as_often_as_said():
     assert (outside == (found.p <= 0.05))[abs(found.p - 0.05) > 0.005].all() and outside.any()
 
 
-def test07_few_people_hold_the_truth():
+def test_coverage_for_few_participants():
     # Shares of time of eight people that are far from normal, over goods that half of them look at for long.
     rng = np.random.default_rng(4)
     y = rng.gamma(3, 1, (8, 1200))
@@ -130,7 +130,7 @@ def test07_few_people_hold_the_truth():
     assert (abs(m - truth) <= stats.t.ppf(0.975, 7) * s).mean() < 0.92
 
 
-def test08_people_of_both_and_of_one_alone():
+def test_partly_paired_participants():
     # Without anybody in common, variances add; of the same people alone, those of their differences count.
     rng = np.random.default_rng(6)
     x, u, none, one = rng.gamma(2, 1, (9, 1)), rng.gamma(3, 1, (14, 1)), np.zeros, ONES
@@ -146,13 +146,13 @@ def test08_people_of_both_and_of_one_alone():
     assert same.value == pytest.approx((u[:9] - x).mean())
 
 
-def test09_equal_seeds_give_equal_intervals():
+def test_equal_seeds_give_equal_intervals():
     x = np.random.default_rng(5).random((12, 3))
     a, b = estimate_ratios(x, ONES(x.shape), seed=4), estimate_ratios(x, ONES(x.shape), seed=4)
     assert np.array_equal(a.low, b.low) and not np.array_equal(a.low, estimate_ratios(x, ONES(x.shape), seed=5).low)
 
 
-def test10_what_two_people_have_done_has_no_interval():
+def test_two_contributors_give_no_interval():
     x = np.zeros((40, 2))
     x[:2, 0], x[:3, 1] = 1, 1
     found = estimate_ratios(x, ONES(x.shape), resamples=99)
@@ -160,7 +160,7 @@ def test10_what_two_people_have_done_has_no_interval():
     assert np.isnan(found.low[0]) and np.isnan(found.high[0]) and found.high[1] > 0.075
 
 
-def test11_what_few_decide_is_as_uncertain_as_that():
+def test_dominated_estimates_use_students_t():
     """Means weighed by times of few of 40 people: most are near, and who is far looks for long."""
     rng = np.random.default_rng(8)
     looks = rng.random((40, 800)) < 0.17
@@ -175,7 +175,7 @@ def test11_what_few_decide_is_as_uncertain_as_that():
     assert held(by_draws) < 0.8 and held(found) > held(by_draws) + 0.05
 
 
-def test12_a_difference_from_what_one_has_done_has_no_interval():
+def test_difference_from_one_contributor_has_no_interval():
     # Ten people against ten others. Of the first, all add something; of the second, one, two, three, all and nobody.
     rng = np.random.default_rng(9)
     first, second = np.repeat([[1.0], [0]], 10, axis=0), np.repeat([[0.0], [1]], 10, axis=0)
@@ -201,7 +201,7 @@ def test12_a_difference_from_what_one_has_done_has_no_interval():
     assert np.isnan(two.low).all() and np.isnan(two.p).all()
 
 
-def test13_groups_of_unequal_size_are_drawn_apart():
+def test_groups_are_resampled_separately():
     """Against a loop: of each group as many are drawn as there are, whatever the other one does."""
     rng, few, many, resamples = np.random.default_rng(10), 4, 30, 300
     n = few + many
@@ -224,7 +224,7 @@ def test13_groups_of_unequal_size_are_drawn_apart():
 
 
 @pytest.mark.parametrize("resamples", [9, 99, 399])
-def test14_a_p_value_is_no_less_than_draws_can_tell(resamples):
+def test_p_value_is_limited_by_the_number_of_draws(resamples):
     rng = np.random.default_rng(11)
     x = rng.random((12, 5))
     found = estimate_ratio_differences(
@@ -233,7 +233,7 @@ def test14_a_p_value_is_no_less_than_draws_can_tell(resamples):
     assert found.p == pytest.approx(1 / (resamples + 1))
 
 
-def test15_the_least_number_of_people():
+def test_minimum_number_of_participants():
     x = np.array([[0.1], [0.2], [0.4]])
     assert (
         np.isfinite(estimate_ratios(x, ONES(x.shape)).low).all()
@@ -241,7 +241,7 @@ def test15_the_least_number_of_people():
     )
 
 
-def test16_half_of_the_people_are_few():
+def test_half_of_the_participants_count_as_few():
     """Twenty of forty, whose weights differ, have Student's t of the effective number of them; of thirty-nine they are
     more than half."""
     rng = np.random.default_rng(7)
@@ -259,7 +259,7 @@ def test16_half_of_the_people_are_few():
     assert reach[0] == pytest.approx(least) and reach[1] < 0.9 * least
 
 
-def test17_people_of_both_are_drawn_together():
+def test_shared_participants_are_drawn_together():
     """Against a loop: what is alike in both of a person's numbers leaves the spread of a draw as well."""
     rng, n, resamples = np.random.default_rng(12), 10, 300
     x = rng.gamma(2, 1, (n, 1))
@@ -282,7 +282,7 @@ def column(k, n):
     return np.array([[1.0]] * k + [[0.0]] * (n - k)), np.ones((n, 1))
 
 
-def test01_tails_of_the_binomial_distribution_at_the_ends():
+def test_mid_p_limits_match_binomial_tails():
     for k, n in ((1, 3), (3, 10), (9, 10), (17, 200), (0, 8), (8, 8)):
         (low,), (high,) = mid_p_interval(np.array([k]), np.array([n]))
         below, at = stats.binom.cdf(k - 1, n, high), stats.binom.pmf(k, n, high)
@@ -294,7 +294,7 @@ def test01_tails_of_the_binomial_distribution_at_the_ends():
 
 
 @pytest.mark.parametrize("n", [3, 5, 8, 16, 40])
-def test02_it_holds_whatever_the_truth(n):
+def test_mid_p_coverage(n):
     k = np.arange(n + 1)
     low, high = mid_p_interval(k, np.full(n + 1, n))
     inside = (low[:, None] <= P) & (P <= high[:, None])
@@ -302,7 +302,7 @@ def test02_it_holds_whatever_the_truth(n):
     assert held.min() > 0.92 and held.mean() < 0.99
 
 
-def test03_whom_it_concerns():
+def test_proportions_of_a_subset():
     x = np.array([[1.0, 0, 1, 0], [1, 0, 1, 1], [0, 0, 1, 0], [0, 0, 1, 0]])
     y = np.array([[1.0, 1, 1, 0], [1, 1, 1, 1], [1, 1, 1, 1], [1, 1, 1, 0]])
     found = estimate_proportions(x, y)
@@ -311,7 +311,7 @@ def test03_whom_it_concerns():
     assert np.isnan([found.low[3], found.high[3]]).all()
 
 
-def test04_differences_of_other_people():
+def test_independent_proportion_differences():
     # 2 of 12 and 9 of 15: Agresti and Caffo's, from their formula.
     (x, y), (u, v) = column(2, 12), column(9, 15)
     none = np.zeros
@@ -325,7 +325,7 @@ def test04_differences_of_other_people():
     assert found.p == pytest.approx(2 * stats.norm.sf((b - a) / s))
 
 
-def test05_differences_of_the_same_people():
+def test_paired_proportion_differences():
     # Bonett and Price: of 20 people 9 do both, 1 the first alone, 6 the second alone.
     x = np.array([[1.0]] * 10 + [[0.0]] * 10)
     u = np.array([[1.0]] * 9 + [[0.0]] + [[1.0]] * 6 + [[0.0]] * 4)
@@ -343,7 +343,7 @@ def test05_differences_of_the_same_people():
     assert found.high - found.low < 0.9 * (apart.high - apart.low)
 
 
-def test06_equal_groups_are_seldom_found_different():
+def test_false_positive_rate_of_proportion_differences():
     # All outcomes of 8 against 8, of the same probability.
     k = np.arange(9)
     a, b = (v.ravel() for v in np.meshgrid(k, k, indexing="ij"))
@@ -357,7 +357,7 @@ def test06_equal_groups_are_seldom_found_different():
     assert 0.03 < (weight * (found.p <= 0.05)[:, None]).sum(axis=0).max() < 0.06
 
 
-def test07_few_and_nobody():
+def test_proportions_of_few_participants():
     found = estimate_proportion_differences(column(1, 2), column(1, 2))
     assert np.isnan([found.low, found.high, found.p]).all() and found.value == 0
     nobody = estimate_proportions(np.zeros((0, 2)), np.zeros((0, 2)))
@@ -365,7 +365,7 @@ def test07_few_and_nobody():
 
 
 @pytest.mark.parametrize("m, n, known", [(3, 3, True), (2, 3, False), (3, 2, False)])
-def test08_three_people_have_an_interval_and_two_have_none(m, n, known):
+def test_three_participants_are_needed_for_an_interval(m, n, known):
     found = estimate_proportions(*column(1, m))
     assert np.isfinite(found.low).all() == np.isfinite(found.high).all() == (m == 3)
     first, second = np.r_[np.ones(m), np.zeros(n)][:, None], np.r_[np.zeros(m), np.ones(n)][:, None]

@@ -39,7 +39,7 @@ class Hall:
     def __init__(self):
         self.asked: list[int] = []
 
-    def make_gaze_evaluator(self, eye):
+    def query_from(self, eye):
         def look(d):
             self.asked.append(len(d))
             with np.errstate(divide="ignore"):
@@ -61,7 +61,7 @@ def exact(eye, region=None):
         count = 1 << 23 if radius < 0.2 else count
         numbers = indices_in_cone(count, away / np.linalg.norm(away), np.arcsin(min(radius / np.linalg.norm(away), 1)))
     d = fibonacci_directions(count, numbers)
-    (gaze,), depth = Hall().make_gaze_evaluator(eye)(d)
+    (gaze,), depth = Hall().query_from(eye)(d)
     if region is None:
         return gaze[~np.isfinite(depth)].sum() / gaze.sum(), gaze.mean()
     return gaze[assign_hits([BoxAoi(region)], np.broadcast_to(eye, d.shape), d, depth).rows[0]].sum() / count
@@ -71,10 +71,10 @@ def exact(eye, region=None):
 def found():
     hall = Hall()
     members = [(0,), (1,), (2,), (3,), (0, 1, 2)]
-    return hall, gaze_shares(hall.make_gaze_evaluator, EYES, [BoxAoi(r) for r in BOXES], members, 0.0)
+    return hall, gaze_shares(hall.query_from, EYES, [BoxAoi(r) for r in BOXES], members, 0.0)
 
 
-def test01_shares_are_integrals_and_errors_are_kept(found):
+def test_shares_are_integrals_within_the_error(found):
     hall, shares = found
     for e, eye in enumerate(EYES):
         escaped, whole = exact(eye)
@@ -82,7 +82,7 @@ def test01_shares_are_integrals_and_errors_are_kept(found):
             share = exact(eye, region) / whole
             assert abs(shares.share[e, k] - share) <= 1.5 * shares.error[e, k] + 1e-6 and share < 1
             assert shares.error[e, k] < 0.02 * share + 2e-5
-            assert shares.seen[e, k] == (share > 0)
+            assert shares.is_hit[e, k] == (share > 0)
         assert shares.escaped[e] == pytest.approx(escaped, rel=0.01)
     # A group is the union: the spot lies on the wall.
     assert np.allclose(shares.share[:, 4], shares.share[:, 0] + shares.share[:, 2], rtol=0.02)
@@ -90,30 +90,28 @@ def test01_shares_are_integrals_and_errors_are_kept(found):
     assert 0 < shares.share[1, 1] < 1e-4 and sum(hall.asked) < 2 * 6 * INITIAL_DIRECTIONS
 
 
-def test02_each_eye_is_by_itself(found):
+def test_observers_are_independent(found):
     _, shares = found
-    alone = gaze_shares(Hall().make_gaze_evaluator, EYES[1:], [BoxAoi(BOXES[0])], [(0,)], 0.0)
+    alone = gaze_shares(Hall().query_from, EYES[1:], [BoxAoi(BOXES[0])], [(0,)], 0.0)
     assert alone.share[0, 0] == shares.share[1, 0] and alone.error[0, 0] == shares.error[1, 0]
-    many = gaze_shares(Hall().make_gaze_evaluator, np.tile(EYES, (20, 1)), [BoxAoi(BOXES[0])], [(0,)], 0.0)
+    many = gaze_shares(Hall().query_from, np.tile(EYES, (20, 1)), [BoxAoi(BOXES[0])], [(0,)], 0.0)
     assert np.array_equal(many.share[:, 0], np.tile(shares.share[:, 0], 20))
 
 
-def test03_a_closer_tolerance_takes_more_directions():
+def test_smaller_tolerance_uses_more_directions():
     errors, asked = [], []
     for tolerance in (0.1, 0.01, 0.001):
         hall = Hall()
-        shares = gaze_shares(
-            hall.make_gaze_evaluator, EYES[:1], [BoxAoi(BOXES[0])], [(0,)], 0.0, QuadratureRule(rtol=tolerance)
-        )
+        shares = gaze_shares(hall.query_from, EYES[:1], [BoxAoi(BOXES[0])], [(0,)], 0.0, QuadratureRule(rtol=tolerance))
         errors.append(shares.error[0, 0])
         asked.append(sum(hall.asked))
     assert errors[0] > errors[2] and asked[0] < asked[2] < 1 << 19
 
 
-def test04_without_areas_eyes_or_gaze():
-    shares = gaze_shares(Hall().make_gaze_evaluator, EYES, [], [], 0.0)
+def test_empty_inputs():
+    shares = gaze_shares(Hall().query_from, EYES, [], [], 0.0)
     assert shares.share.shape == (2, 0) and (shares.integral > 0).all()
-    assert gaze_shares(Hall().make_gaze_evaluator, EYES[:0], [BoxAoi(BOXES[0])], [(0,)], 0.0).share.shape == (0, 1)
+    assert gaze_shares(Hall().query_from, EYES[:0], [BoxAoi(BOXES[0])], [(0,)], 0.0).share.shape == (0, 1)
     dark = lambda eye: lambda d: (np.zeros((1, len(d))), np.ones(len(d)))
     assert gaze_shares(dark, EYES[:1], [BoxAoi(BOXES[0])], [(0,)], 0.0).share.tolist() == [[0.0]]
     broken = lambda eye: lambda d: (np.full((1, len(d)), np.nan), np.ones(len(d)))
@@ -140,7 +138,7 @@ def thing(name, lower, upper):
     return BoxAoi(Region.create(name, lower, upper))
 
 
-def test01_what_is_behind_a_pillar_is_hidden():
+def test_points_behind_a_pillar_are_hidden():
     things = [thing("near", [1.0, 1.9, 1], [1.2, 2.1, 1.2]), thing("behind", [4, 1.9, 1], [4.2, 2.1, 1.2])]
     targets = SamplePoints.sample(things, 24)
     eyes = np.array([[0.2, 2.0, 1.1], [3.5, 2.0, 1.1]])
@@ -152,7 +150,7 @@ def test01_what_is_behind_a_pillar_is_hidden():
     assert back.any() and not seen[0, back].any()
 
 
-def test02_the_view_is_a_cone():
+def test_field_of_view_is_a_cone():
     targets = SamplePoints.sample([thing("a", [3.0, -0.05, -0.05], [3.1, 0.05, 0.05])], 6)
     eyes = np.zeros((4, 3))
     turns = np.radians([0, 29.0, 31.5, 180])
@@ -163,7 +161,7 @@ def test02_the_view_is_a_cone():
     assert not visible_in_fov(targets, eyes, ahead, ~seen, 360.0).any()
 
 
-def test03_against_a_loop():
+def test_visibility_matches_a_loop():
     rng = np.random.default_rng(0)
     things = [thing(str(k), c, c + 0.3) for k, c in enumerate(rng.uniform(0.2, 2.5, (5, 3)))]
     targets = SamplePoints.sample(things, 20)
@@ -181,7 +179,7 @@ def test03_against_a_loop():
             assert found[i, k] == expected
 
 
-def test04_cells_are_traced_once_and_forgotten_without_harm():
+def test_visibility_cache():
     targets = SamplePoints.sample([thing("a", [4, 1.9, 1], [4.2, 2.1, 1.2])], 24)
     asked = []
 
@@ -207,7 +205,7 @@ def test04_cells_are_traced_once_and_forgotten_without_harm():
         VisibilityCache(targets, depth, 0.0, 0.0)
 
 
-def test05_the_isovist_of_a_room_is_its_floor():
+def test_isovist_of_an_empty_room():
     empty = lambda o, d: intersect_box_numpy(o, d, *ROOM)[1]
     found = compute_isovists(
         np.array([[1.0, 1, 1.6], [3, 2, 1.6]]), empty, SamplePoints.sample([], 4), 0.0, 100.0, num_directions=7200
@@ -217,7 +215,7 @@ def test05_the_isovist_of_a_room_is_its_floor():
     assert np.allclose(found.farthest, [np.hypot(5, 3), np.hypot(3, 2)], rtol=1e-3)
 
 
-def test06_a_pillar_takes_its_shadow():
+def test_isovist_excludes_the_shadow_of_a_pillar():
     # From (1, 2): the pillar from y 1.5 to 2.5 at x = 2 hides the strip between the lines through its corners.
     found = compute_isovists(
         np.array([[1.0, 2.0, 1.6]]), room_depth, SamplePoints.sample([], 4), 0.0, 100.0, num_directions=14400
@@ -228,7 +226,7 @@ def test06_a_pillar_takes_its_shadow():
     assert found.area[0] == pytest.approx(24 - shadow, rel=3e-3)
 
 
-def test07_where_one_can_stand():
+def test_standing_positions():
     found = find_standing_positions(*ROOM, 0.5, 1.6, room_depth, 0.0)
     assert len(found) == 12 * 8 - 4 and np.allclose(found[:, 2], 1.6)
     inside = ((found[:, :2] > PILLAR[0, :2]) & (found[:, :2] < PILLAR[1, :2])).all(axis=1)
@@ -237,5 +235,5 @@ def test07_where_one_can_stand():
     low = lambda o, d: np.minimum(room_depth(o, d), np.where((d[:, 2] < 0) & (o[:, 0] < 1), o[:, 2] - 0.5, np.inf))
     assert (find_standing_positions(*ROOM, 0.5, 1.6, low, 0.0)[:, 0] > 1).all()
     assert len(find_standing_positions(*ROOM, 0.5, 1.6, room_depth, -1.0)) == 0
-    with pytest.raises(NergError, match="--step"):
+    with pytest.raises(NergError, match="--grid-step"):
         find_standing_positions(*ROOM, 1e-4, 1.6, room_depth, 0.0)

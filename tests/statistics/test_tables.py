@@ -50,24 +50,24 @@ EXPECTED = {
 }
 
 
-def test01_every_measure_is_written_out_here():
+def test_every_measure_has_an_expected_value():
     assert set(EXPECTED) == {m.name for m in MEASURES} == set(MEASURES_BY_NAME)
 
 
 @pytest.mark.parametrize("name", list(EXPECTED))
-def test02_values_and_people(name):
+def test_values_and_participants(name):
     found = MEASURES_BY_NAME[name].estimate(PEOPLE, 199, 0)
     assert found.value == pytest.approx(EXPECTED[name][0]) and found.participants.tolist() == EXPECTED[name][1]
 
 
-def test03_a_field_tells_less():
+def test_predictions_lack_time_course_measures():
     told = Participants(PEOPLE.names, PEOPLE.time, PEOPLE.dwell_time, PEOPLE.distance, None, np.full((3, 2), 0.5))
     known = {m.name for m in MEASURES if m.estimate(told, 199, 0) is not None}
     assert known == {"share", "dwell", "hit_ratio", "distance"}
     assert MEASURES_BY_NAME["hit_ratio"].estimate(told, 199, 0).value == pytest.approx([0.5, 0.5])
 
 
-def test04_those_who_are_not_there_count_for_nothing():
+def test_absent_participants_do_not_contribute():
     more = PEOPLE.align_to(["Ada", "Bo", "Cy", "Dee", "Eve"])
     assert more.is_in_cell.tolist() == [True, True, True, False, False]
     for measure in MEASURES:
@@ -77,7 +77,7 @@ def test04_those_who_are_not_there_count_for_nothing():
         )
 
 
-def test05_nobody():
+def test_no_participants():
     none = Participants((), np.zeros(0), *(np.zeros((0, 2)) for _ in range(7)))
     for measure in MEASURES:
         found = measure.estimate(none, 199, 0)
@@ -100,7 +100,7 @@ def sums():
     return found
 
 
-def test01_each_persons_own_in_the_order_of_their_names():
+def test_participant_rows_are_sorted_by_name():
     rows = ParticipantRows(sums(), {"Ada": "p2", "Bo": "p1"}, True)
     assert len(rows) == 4 and list(rows) == rows[:] == [rows[k] for k in range(-4, 0)]
     assert [(r["participant"], r["aoi"]) for r in rows] == [("p1", "x"), ("p1", "y"), ("p2", "x"), ("p2", "y")]
@@ -119,7 +119,7 @@ def test01_each_persons_own_in_the_order_of_their_names():
         rows[4]
 
 
-def test02_nobody_knows_what_was_visible():
+def test_participant_rows_without_visibility():
     assert [r["visible"] for r in ParticipantRows(sums(), {"Ada": "a", "Bo": "b"}, False)] == [None] * 4
 
 
@@ -138,7 +138,7 @@ def people(n, share, seed, prefix="p"):
     return Participants(names, time, on, on * 2, None, (looks > 0) * 1.0, looks, on, looks)
 
 
-def test01_a_row_for_each_cell_thing_and_source():
+def test_rows_by_cell_area_and_source():
     cells = {ALL: {MEASURED: people(12, 0.2, 0)}, A: {MEASURED: people(2, 0.2, 1)}}
     rows = aoi_rows(("x", "y"), cells, MinParticipantsFilter(), **HOW)
     assert [(r["cell"], r["value"], r["aoi"]) for r in rows] == [
@@ -154,7 +154,7 @@ def test01_a_row_for_each_cell_thing_and_source():
     assert rows[2]["share"] is not None and rows[2]["share_low"] is None
 
 
-def test02_cells_of_few_people_are_blank_and_counted():
+def test_few_participants_are_suppressed():
     floor = MinParticipantsFilter(5)
     cells = {ALL: {MEASURED: people(12, 0.2, 0)}, A: {MEASURED: people(4, 0.2, 1)}}
     rows = aoi_rows(("x", "y"), cells, floor, **HOW)
@@ -168,7 +168,7 @@ def test02_cells_of_few_people_are_blank_and_counted():
     assert nobody.allows(0) and nobody.allows(5) and not nobody.allows(4) and nobody.num_suppressed == 1
 
 
-def test03_differences_are_found_where_they_are():
+def test_differences_are_detected():
     cells = {A: {MEASURED: people(15, 0.2, 0, "a")}, B: {MEASURED: people(15, 0.4, 1, "b")}}
     rows = difference_rows(("x", "y"), cells, MinParticipantsFilter(), measures=("share", "hit_ratio"), **HOW)
     shares = [r for r in rows if r["measure"] == "share"]
@@ -182,7 +182,7 @@ def test03_differences_are_found_where_they_are():
     assert all(r["difference"] is None and r["p"] is None and not r["significant"] for r in blank)
 
 
-def test04_one_value_has_nothing_to_be_compared_with():
+def test_single_value_has_no_differences():
     assert difference_rows(("x", "y"), {ALL: {MEASURED: people(5, 0.2, 0)}}, MinParticipantsFilter(), **HOW) == []
 
 
@@ -198,7 +198,7 @@ def sums_tables():
     return found
 
 
-def test05_moves_and_durations():
+def test_transitions_and_durations():
     rows = transition_rows(sums_tables(), MinParticipantsFilter())
     assert [(r["from"], r["to"], r["transitions"], r["share"]) for r in rows] == [
         ("x", "y", 3, 1.0),
@@ -209,7 +209,7 @@ def test05_moves_and_durations():
     assert len(lasted) == 2 and lasted[0]["0.2 to 0.5 s"] == 3 and len(lasted[0]) == 3 + len(BINS) - 1
 
 
-def test06_as_markdown_has_it():
+def test_markdown_format():
     row = {"share": 0.1234, "share_low": 0.1, "share_high": 0.2, "dwell": 3.456, "dwell_low": None, "dwell_high": None}
     assert (
         format_measure(row, MEASURES_BY_NAME["share"]) == "12.3 % [10.0, 20.0]"
@@ -218,6 +218,6 @@ def test06_as_markdown_has_it():
     assert format_measure(row, MEASURES_BY_NAME["hit_ratio"]) == ""
 
 
-def test09_nobody_is_compared_with_nobody():
+def test_empty_cells_are_not_compared():
     cells = {A: {MEASURED: people(15, 0.2, 0, "a")}, B: {MEASURED: people(0, 0.4, 1, "b")}}
     assert difference_rows(("x", "y"), cells, MinParticipantsFilter(), **HOW) == []

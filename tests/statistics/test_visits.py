@@ -39,8 +39,8 @@ def box(name, lower, upper, turn=None):
 
 def brute(region, o, d):
     """Where a ray is inside of a box, by clipping it at six planes one after the other in the box's own frame."""
-    turn = region.matrix.T
-    o, d = turn @ (np.array(o, float) - region.middle), turn @ np.array(d, float)
+    turn = region.rotation_matrix.T
+    o, d = turn @ (np.array(o, float) - region.center), turn @ np.array(d, float)
     half = (region.corners[1] - region.corners[0]) / 2
     near, far = -np.inf, np.inf
     for axis in range(3):
@@ -60,7 +60,7 @@ def some_rays(n=2000, seed=0):
     return o, d / np.linalg.norm(d, axis=1, keepdims=True), rng.uniform(0.2, 6, n)
 
 
-def test01_surfaces_in_boxes():
+def test_hits_of_boxes():
     things = [
         box("a", [-1, -1, -1], [1, 0.5, 1]),
         box("b", [0, 0, 0], [2, 1, 1], 35),
@@ -81,7 +81,7 @@ def test01_surfaces_in_boxes():
     assert (inside & expected).any() and (inside & ~expected).any()
 
 
-def test02_distances_are_those_of_the_entrance_or_from_within_of_the_surface():
+def test_hit_distances():
     things = [box("a", [1, -1, -1], [2, 1, 1]), box("around", [-1, -1, -1], [3, 1, 1])]
     o, d = np.zeros((1, 3)), np.array([[1.0, 0, 0]])
     landed = assign_hits(things, o, d, np.array([1.7]))
@@ -92,7 +92,7 @@ def test02_distances_are_those_of_the_entrance_or_from_within_of_the_surface():
     assert [len(v) for v in assign_hits(things, o, d, np.array([np.inf])).rows] == [0, 0]
 
 
-def test03_without_surfaces_things_are_solid():
+def test_aois_are_solid_without_surfaces():
     front, behind, in_front = (
         box("f", [1, -1, -1], [2, 1, 1]),
         box("b", [3, -1, -1], [4, 1, 1]),
@@ -104,14 +104,14 @@ def test03_without_surfaces_things_are_solid():
     assert found.tolist() == [[True, False, True], [True, False, False], [False, False, False]]
 
 
-def test04_a_box_that_is_grazed_or_behind_is_not_met():
+def test_grazed_and_rear_boxes_are_missed():
     thing = box("a", [1, 0, 0], [2, 1, 1])
     o = np.array([[0.0, 1, 0.5], [3, 0.5, 0.5], [0, 0.5, 0.5]])
     d = np.array([[1.0, 0, 0], [1, 0, 0], [1, 0, 0]])
     assert assign_hits([thing], o, d, np.array([1.5, 0.5, 1.5])).to_matrix()[1:, 0].tolist() == [False, True]
 
 
-def test05_groups_are_unions_at_their_least_distance():
+def test_areas_merge_their_members():
     things = [box("a", [1, -1, -1], [2, 1, 1]), box("b", [1.5, 0, -1], [4, 1, 1])]
     o, d = np.array([[0, 0.5, 0.0], [0, -0.5, 0], [3, 0.5, -5]]), np.array([[1.0, 0, 0], [1, 0, 0], [0, 0, 1]])
     landed = merge_members(assign_hits(things, o, d, np.array([1.6, 1.0, 5.0])), [(0,), (1,), (0, 1)])
@@ -119,7 +119,7 @@ def test05_groups_are_unions_at_their_least_distance():
     assert landed.distance[2].tolist() == [1.0, 1.0, 4.0]
 
 
-def test06_parts_and_ways_are_put_together():
+def test_hits_are_concatenated_and_merged():
     things = [box("a", [1, -1, -1], [2, 1, 1])]
     o, d = np.zeros((2, 3)), np.array([[1.0, 0, 0], [0, 1, 0]])
     one, two = assign_hits(things, o, d, None), assign_hits(things, o, d[::-1], None)
@@ -128,7 +128,7 @@ def test06_parts_and_ways_are_put_together():
 
 
 @pytest.mark.parametrize("degrees", [0.5, 2.0, 10.0])
-def test07_a_cone_leaves_no_hole_wider_than_half_of_it(degrees):
+def test_cone_has_no_wide_gaps(degrees):
     d = np.array([[0, 0, 1.0], [0, 0, -1], [0.6, 0, 0.8], [0.36, -0.48, -0.8]])
     ways = np.stack(sample_cone(d, degrees))
     assert len(ways) == 19 and np.allclose(np.linalg.norm(ways, axis=2), 1)
@@ -148,7 +148,7 @@ def test07_a_cone_leaves_no_hole_wider_than_half_of_it(degrees):
         assert nearest.max() < 0.5 * degrees
 
 
-def test08_samples_cover_a_box_evenly():
+def test_sample_points_cover_a_box():
     thing = box("a", [0, 0, 0], [2, 1, 0.5], 20)
     points, normals = thing.sample_points(70)
     own = thing.region.to_local(points)
@@ -196,7 +196,7 @@ def slow_looks(rows, t, weight, sitting, rules):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test01_against_loops(seed):
+def test_visits_match_a_loop(seed):
     rng = np.random.default_rng(seed)
     rules = VisitRules(max_gap=0.5, session_pause=5.0, merge_gap=0.25, min_visit=0.15)
     person = np.sort(rng.integers(0, 4, 120))
@@ -212,7 +212,7 @@ def test01_against_loops(seed):
     assert np.allclose(looks.start, [e[1] for e in expected]) and np.allclose(looks.end, [e[2] for e in expected])
 
 
-def test02_one_ray_stands_for_no_time():
+def test_single_sample_represents_no_time():
     line = make_timeline(np.array([0, 1, 1]), np.array([5.0, 1.0, 1.2]), VisitRules())
     assert np.allclose(line.weight, [0, 0.2, 0.2])
     assert len(find_visits(np.array([0]), line, VisitRules())) == 0
@@ -220,17 +220,17 @@ def test02_one_ray_stands_for_no_time():
     assert len(find_visits(np.zeros(0, int), line, VisitRules())) == 0
 
 
-def test03_equal_times_count_once():
+def test_equal_times_count_once():
     line = make_timeline(np.zeros(4, int), np.array([0.0, 0.0, 0.2, 0.2]), VisitRules())
     assert np.allclose(line.weight, [0, 0.2, 0, 0.2])
 
 
-def test04_no_rays():
+def test_timeline_without_samples():
     assert len(make_timeline(np.zeros(0, int), np.zeros(0), VisitRules()).t) == 0
 
 
 @pytest.mark.parametrize("t", [[0.0, np.nan], [1.0, 0.0], [0.0, np.inf]])
-def test05_times_that_are_none_or_unsorted(t):
+def test_invalid_times_are_refused(t):
     with pytest.raises(ValueError):
         make_timeline(np.zeros(2, int), np.array(t), VisitRules())
 
@@ -238,12 +238,12 @@ def test05_times_that_are_none_or_unsorted(t):
 @pytest.mark.parametrize(
     "bad", [{"max_gap": 0}, {"max_gap": -1}, {"session_pause": 0.5}, {"merge_gap": np.nan}, {"min_visit": np.inf}]
 )
-def test06_rules_that_are_none(bad):
+def test_invalid_rules_are_refused(bad):
     with pytest.raises(NergError, match="--"):
         VisitRules(**bad)
 
 
-def test07_times_on_the_bounds():
+def test_durations_at_the_limits():
     """A pause as long as it may be joins sittings, an interruption as long as it may be looks."""
     rules = VisitRules(max_gap=0.5, session_pause=4.0, merge_gap=0.25, min_visit=0.25)
     line = make_timeline(np.zeros(4, int), np.array([0.0, 4.0, 8.0, 12.5]), rules)
@@ -334,7 +334,7 @@ def cells_of(rays):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test01_sums_against_loops(seed):
+def test_sums_match_loops(seed):
     rays, landed, on, far, visible = made(seed)
     cells = cells_of(rays)
     sums = sum_visits(rays, landed, AREAS, cells, RULES, visible)
@@ -376,7 +376,7 @@ def pick(landed, rows):
     return HitAssignment(len(rows), tuple(np.array(k, int) for k in keep), tuple(far))
 
 
-def test02_in_parts_it_is_the_same():
+def test_partition_does_not_change_sums():
     rays, landed, _, _, visible = made(7, 300, 6)
     whole = sum_visits(rays, landed, AREAS, [(ALL, None)], RULES, visible)
     parts = []
@@ -397,7 +397,7 @@ def test02_in_parts_it_is_the_same():
     )
 
 
-def test03_somebody_who_comes_twice_is_one_person():
+def test_returning_participant_is_counted_once():
     rays, landed, _, _, visible = made(3)
     one = sum_visits(rays, landed, AREAS, [(ALL, None)], RULES, visible)
     twice = merge_sums([one, one])
@@ -408,7 +408,7 @@ def test03_somebody_who_comes_twice_is_one_person():
     )
 
 
-def test04_others_cannot_be_added():
+def test_incompatible_sums_are_refused():
     rays, landed, *_ = made()
     one = sum_visits(rays, landed, AREAS, [(ALL, None)], RULES)
     other = sum_visits(rays, landed, ("x", "b", "c"), [(ALL, None)], RULES)
@@ -418,7 +418,7 @@ def test04_others_cannot_be_added():
         merge_sums([])
 
 
-def test03b_the_last_visit_ends_when_its_last_ray_does():
+def test_last_visit_ends_with_its_last_sample():
     """Not when that begins, nor when the look before it ended; of two parts it is the later one."""
     t = np.arange(8) * 0.25
     d = np.tile([1.0, 0, 0], (8, 1))
@@ -432,7 +432,7 @@ def test03b_the_last_visit_ends_when_its_last_ray_does():
         assert merge_sums(parts).first_start[0, 0] == 0.25 and merge_sums(parts).last_end[0, 0] == 101.75
 
 
-def test05_no_rays_at_all():
+def test_sums_without_samples():
     rays, landed, *_ = made()
     none = sum_visits(rays.select(np.zeros(0, int)), pick(landed, []), AREAS, [(ALL, None)], RULES)
     assert none.rows == () and none.time.shape == (0,) and none.transitions.sum() == 0

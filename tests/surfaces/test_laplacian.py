@@ -30,7 +30,7 @@ def angles_facing(lengths):
 
 
 @pytest.mark.parametrize("mesh", [joined(plate(21, 0.45)), joined(box((0, 0, 0), (5, 0.1, 1)))])
-def test01_no_edge_faces_more_than_two_right_angles(mesh):
+def test_opposite_angles_sum_to_at_most_180_degrees(mesh):
     faces, lengths = flip_to_delaunay(mesh.faces, lengths_of(mesh))
     assert np.isclose(heron_area(*lengths.T).sum(), mesh.area.sum(), rtol=1e-9)
     assert np.allclose(angles_facing(lengths).sum(axis=1), np.pi)
@@ -45,13 +45,13 @@ def test01_no_edge_faces_more_than_two_right_angles(mesh):
     assert len(faces) == len(mesh.faces) and set(np.unique(faces)) == set(np.unique(mesh.faces))
 
 
-def test02_what_is_delaunay_stays():
+def test_delaunay_mesh_is_unchanged():
     mesh = joined(plate(8))
     faces, lengths = flip_to_delaunay(mesh.faces, lengths_of(mesh))
     assert np.array_equal(faces, mesh.faces) and np.array_equal(lengths, lengths_of(mesh))
 
 
-def test03_twins_are_those_of_sheets():
+def test_twins_of_manifold_edges():
     two = np.array([(0, 1, 2), (2, 1, 3)])
     assert find_twins(two).tolist() == [-1, 3, -1, 1, -1, -1]
     # Three faces at an edge, and two that see it alike, are none.
@@ -70,14 +70,14 @@ def sound(matrix):
     return dense
 
 
-def test01_of_a_square_grid_it_is_the_five_point_stencil():
+def test_laplacian_of_a_grid_is_the_five_point_stencil():
     dense = sound(make_laplacian(joined(plate(7))))
     middle = 24
     assert np.isclose(dense[middle, middle], 4)
     assert sorted(np.flatnonzero(np.abs(dense[middle]) > 1e-12)) == [17, 23, 24, 25, 31]
 
 
-def test02_linear_functions_have_none_on_any_triangles_of_a_plane():
+def test_laplacian_of_linear_functions_is_zero():
     mesh = joined(plate(15, 0.3))
     inner = (np.abs(mesh.vertices[:, :2]) < 0.35).all(axis=1)
     for along in ((1, 0, 0), (0.3, -2, 0)):
@@ -85,7 +85,7 @@ def test02_linear_functions_have_none_on_any_triangles_of_a_plane():
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
-def test03_needles_books_and_components(scale):
+def test_laplacian_of_degenerate_meshes(scale):
     needle = Mesh(
         np.array([(0, 0, 0), (1, 0, 0), (0.5, 1e-13, 0), (0.5, 1, 0)]) * scale, np.array([(0, 1, 2), (0, 2, 3)])
     )
@@ -112,7 +112,7 @@ def spike(mesh, at=(0, 0, 0)):
 
 
 @pytest.mark.parametrize("jitter", [0.0, 0.3])
-def test01_on_a_plane_a_point_becomes_a_gaussian(jitter):
+def test_point_is_smoothed_to_a_gaussian(jitter):
     mesh, s = joined(plate(61, jitter)), 0.07
     start = spike(mesh)
     origin = mesh.vertices[start > 0][0]
@@ -125,7 +125,7 @@ def test01_on_a_plane_a_point_becomes_a_gaussian(jitter):
 
 
 @pytest.mark.parametrize("degree", [1, 2, 4])
-def test02_on_a_sphere_harmonics_decay(degree):
+def test_spherical_harmonics_decay(degree):
     ball = trimesh.creation.icosphere(4)
     mesh, s, steps = Mesh(np.array(ball.vertices), np.array(ball.faces)), 0.3, 8
     wave = np.polynomial.legendre.Legendre.basis(degree)(mesh.vertices[:, 2])
@@ -138,7 +138,7 @@ def test02_on_a_sphere_harmonics_decay(degree):
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
-def test03_nothing_crosses_a_gap_of_5_cm(scale):
+def test_smoothing_does_not_cross_gaps(scale):
     """Two plates 5 cm apart: what is on one stays there, all of it, and exactly nothing comes to the other."""
     v, f = plate(20, 0.3)
     mesh, _, _ = weld_mesh(scale * np.concatenate([v, v + [0, 0, 0.05]]), np.concatenate([f, f + len(v)]))
@@ -149,7 +149,7 @@ def test03_nothing_crosses_a_gap_of_5_cm(scale):
     assert found[~upper].min() > 0
 
 
-def test04_a_uniform_density_stays_and_none_becomes_negative_on_bad_meshes():
+def test_smoothing_keeps_uniform_densities_and_signs():
     needles = joined(box((0, 0, 0), (3, 1e-3, 1)), box((1, 2, 0), (4, 2 + 1e-7, 1e-4)))
     for mesh in (needles, joined(plate(12, 0.49))):
         smoother = Smoother(mesh, 0.2)
@@ -163,7 +163,7 @@ def test04_a_uniform_density_stays_and_none_becomes_negative_on_bad_meshes():
 
 
 @pytest.mark.parametrize("length, steps", [(0.0, 8), (np.nan, 8), (0.1, 0)])
-def test05_lengths_that_are_none(length, steps):
+def test_invalid_lengths_are_refused(length, steps):
     with pytest.raises(ValueError, match="positive length"):
         Smoother(joined(plate(3)), length, steps)
 
@@ -171,7 +171,7 @@ def test05_lengths_that_are_none(length, steps):
 # ---- Partial sums ----
 
 
-def test01_a_deposit_is_divided_among_corners_and_keeps_its_sum():
+def test_deposit_conserves_its_sum():
     faces = np.array([(0, 1, 2), (2, 1, 3)])
     place = np.array([(0.2, 0.3, 0.5), (1.0, 0, 0), (0, 0.25, 0.75)])
     on_faces, on_vertices = deposit(faces, 5, np.array([0, 1, 1]), place, np.array([1.0, 2.0, 4.0]))
@@ -179,7 +179,7 @@ def test01_a_deposit_is_divided_among_corners_and_keeps_its_sum():
     assert np.allclose(on_vertices, [0.2, 0.3 + 1.0, 0.5 + 2.0, 3.0, 0])
 
 
-def test02_sums_add_up_in_their_order():
+def test_sums_are_added_in_order():
     rng = np.random.default_rng(0)
     parts = [SurfaceSums(rng.random(3), rng.random(4), *rng.random(4), 1) for _ in range(5)]
     whole = merge_sums(parts)

@@ -15,7 +15,7 @@ from tests.surfaces.meshes import box, joined, longest_edge, plate
 # ---- Meshes made whole: vertices of one place are one, and faces that are none are left out ----
 
 
-def test01_a_box_whose_sides_repeat_its_corners_is_one_surface():
+def test_duplicate_corners_are_welded():
     v, f = box((0, 0, 0), (1, 2, 3))
     mesh, index, repairs = weld_mesh(v[f].reshape(-1, 3), np.arange(f.size).reshape(-1, 3))
     assert (len(mesh.vertices), len(mesh.faces), repairs.num_merged_vertices) == (8, 12, 28)
@@ -25,23 +25,23 @@ def test01_a_box_whose_sides_repeat_its_corners_is_one_surface():
     assert np.allclose(np.linalg.norm(mesh.normals, axis=1), 1)
 
 
-def test02_a_hair_keeps_plates_apart_and_zeros_of_both_signs_are_one_place():
+def test_only_equal_coordinates_are_welded():
     v = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (-0.0, 0, 0), (0, 1, 1e-9), (1, 0, 0)])
     mesh, _, _ = weld_mesh(v, [(0, 1, 2), (3, 4, 5)])
     assert len(mesh.vertices) == 4
 
 
 @pytest.mark.parametrize("scale", [1e-9, 1.0, 1e6])
-def test03_flat_and_repeated_faces_are_left_out_at_any_scale(scale):
+def test_degenerate_and_duplicate_faces_are_removed(scale):
     v = scale * np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (2, 0, 0), (9, 9, 9)])
     mesh, index, repairs = weld_mesh(v, [(0, 1, 2), (0, 1, 3), (1, 1, 2), (2, 0, 1), (2, 1, 0)])
     assert index.tolist() == [0] and (repairs.num_degenerate_faces, repairs.num_duplicate_faces) == (2, 2)
-    assert repairs.summary == "2 faces without area left out, 2 faces that repeat others left out"
+    assert repairs.summary == "2 faces without area removed, 2 duplicate faces removed"
     assert len(mesh.vertices) == 3 and np.isclose(mesh.area[0], scale**2 / 2)
     assert weld_mesh(v, [(0, 1, 2)])[2].summary is None
 
 
-def test04_what_is_no_surface():
+def test_meshes_without_area_are_refused():
     with pytest.raises(NergError, match="vertices of the wall"):
         weld_mesh([(0, 0, np.nan)], [(0, 0, 0)], "the wall")
     with pytest.raises(NergError, match="row 1 is"):
@@ -53,7 +53,7 @@ def test04_what_is_no_surface():
 # ---- Shapes of scenes as triangles ----
 
 
-def test01_shapes_of_scenes(rgb):
+def test_triangles_of_scene_shapes(rgb):
     flat = rgb.load_dict(
         {"type": "rectangle", "to_world": rgb.ScalarTransform4f().translate([1, 2, 3]).scale([2, 1, 1])}
     )
@@ -74,7 +74,7 @@ def edge_counts(faces):
 
 
 @pytest.mark.parametrize("longest", [3.0, 1.0, 0.37, 0.11])
-def test01_a_closed_box_stays_closed_and_its_area_what_it_is(longest):
+def test_refinement_preserves_area_and_closedness(longest):
     whole = joined(box((0, 0, 0), (1, 2, 3)))
     found = refine(whole, longest)
     assert set(edge_counts(found.mesh.faces)) == {2}
@@ -88,22 +88,22 @@ def test01_a_closed_box_stays_closed_and_its_area_what_it_is(longest):
     assert np.allclose(told, found.mesh.corners, atol=1e-12)
 
 
-def test02_what_is_fine_already_stays():
+def test_fine_mesh_is_unchanged():
     sheet = joined(plate(5, 0.3))
     found = refine(sheet, 10.0)
     assert np.array_equal(found.mesh.faces, sheet.faces) and np.array_equal(found.parent, np.arange(32))
 
 
-def test03_too_many(monkeypatch):
+def test_too_many_faces_are_refused(monkeypatch):
     monkeypatch.setattr(mesh, "MAX_REFINED_FACES", 1000)
-    with pytest.raises(NergError, match="larger --detail"):
+    with pytest.raises(NergError, match="larger --max-edge"):
         refine(joined(box((0, 0, 0), (1, 1, 1))), 0.01)
 
 
 # ---- Rays that end on a surface, at something else, or nowhere ----
 
 
-def test01_each_ray_ends_where_it_should(rgb):
+def test_ray_ends(rgb):
     room, inner = joined(box((0, 0, 0), (4, 3, 2), without=1)), box((2, 1, 0.5), (3, 2, 1.5))
     target = SurfaceTarget(room, [inner])
     d = fibonacci_directions(4000)[1:]
@@ -123,7 +123,7 @@ def test01_each_ray_ends_where_it_should(rgb):
     assert np.allclose(p, (eye + walls.min(1)[:, None] * d)[on], atol=1e-5)
 
 
-def test02_a_ray_may_end_in_a_medium_before(rgb):
+def test_rays_end_in_a_medium(rgb):
     fog = rgb.load_dict({"type": "constvolume", "value": 100.0, "to_world": rgb.ScalarTransform4f().scale(0.5)})
     sheet = (np.array([(-2.0, -2, 2), (2, -2, 2), (2, 2, 2), (-2, 2, 2)]), np.array([(0, 1, 2), (0, 2, 3)]))
     target = SurfaceTarget(joined(sheet), medium=VolumeMedium(fog))
@@ -137,7 +137,7 @@ def test02_a_ray_may_end_in_a_medium_before(rgb):
 
 @pytest.mark.parametrize("scale", [1e-5, 1e5])
 @pytest.mark.parametrize("rows", [3, 100, 256])
-def test01_a_texture_has_at_each_point_what_the_surface_has(rgb, scale, rows, monkeypatch):
+def test_texture_matches_the_surface(rgb, scale, rows, monkeypatch):
     pytest.importorskip("xatlas", reason="xatlas is not installed")
     monkeypatch.setattr("nerg_mi.surfaces.mesh.TEXTURE_ROWS", rows)
     mesh, pixels = joined(box((0, 0, 0), (scale, 2 * scale, 0.5 * scale))), 256
@@ -159,15 +159,15 @@ def test01_a_texture_has_at_each_point_what_the_surface_has(rgb, scale, rows, mo
     assert known[row, column].all() and np.abs(found[row, column] - there).max() < 0.06
 
 
-def test02_what_does_not_fit(rgb, monkeypatch):
+def test_oversized_textures_are_refused(rgb, monkeypatch):
     pytest.importorskip("xatlas", reason="xatlas is not installed")
     cube = joined(box((0, 0, 0), (1, 1, 1)))
     monkeypatch.setattr(mesh, "MAX_CHART_FACES", 4)
-    with pytest.raises(NergError, match="leave out --texture"):
+    with pytest.raises(NergError, match="omit --texture-size"):
         unwrap_uv(cube, 64)
 
 
-def test03_without_xatlas_the_extra_is_named(monkeypatch):
+def test_missing_xatlas_is_reported(monkeypatch):
     monkeypatch.setitem(sys.modules, "xatlas", None)
     with pytest.raises(ImportError, match=r'pip install "nerg-mi\[bake\]"'):
         unwrap_uv(joined(box((0, 0, 0), (1, 1, 1))), 64)

@@ -35,7 +35,7 @@ from tests.surfaces.meshes import box, joined, lookers_of_law, plate, vmf
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test01_a_harmonic_is_multiplied_by_a_number(rgb, degree):
+def test_cone_scales_spherical_harmonics(rgb, degree):
     sigma = 0.2
     d = rgb.Vector3f(fibonacci_directions(500).T.astype(np.float32))
     # Zonal harmonics about an axis of no symmetry; written out, since Dr.Jit has none.
@@ -57,7 +57,7 @@ def test01_a_harmonic_is_multiplied_by_a_number(rgb, degree):
     assert np.allclose(found, expected, atol=1e-5)
 
 
-def test02_it_is_heat_on_the_sphere_to_the_fourth_order():
+def test_cone_matches_heat_to_fourth_order():
     for sigma in (0.02, 0.04):
         for degree in (1, 5, 12):
             rule = 0.5 * (1 + eval_legendre(degree, np.cos(2 * sigma)))
@@ -65,7 +65,7 @@ def test02_it_is_heat_on_the_sphere_to_the_fourth_order():
             assert abs(rule - np.exp(-degree * (degree + 1) * sigma**2 / 2)) < 2 * (degree + 1) ** 4 * sigma**4 / 24
 
 
-def test03_bundles_are_gaussian_unit_and_the_same_for_a_seed():
+def test_cone_samples_are_gaussian_and_reproducible():
     d = fibonacci_directions(400)
     out = sample_cone(d, 0.05, 64, np.random.default_rng(3))
     assert out.shape == (400, 64, 3) and np.allclose(np.linalg.norm(out, axis=2), 1)
@@ -86,7 +86,7 @@ MEAN = np.array([0.84, 0.5, -0.2]) / np.linalg.norm([0.84, 0.5, -0.2])
 
 
 @pytest.mark.parametrize(("kappa", "eye"), [(1.0, (1.0, 0.7, 1.5)), (500.0, (0.001, 1.3, 1.2))])
-def test01_a_closed_room_receives_all(rgb, kappa, eye):
+def test_closed_room_receives_all_gaze(rgb, kappa, eye):
     """Also an observer a millimetre from a wall."""
     target = SurfaceTarget(refine(joined(ROOM, SHELF), 0.4).mesh)
     sums = sum_gaze(target, lookers_of_law(vmf(rgb, MEAN, kappa)), np.array([eye]), [1.0], SETTINGS)
@@ -96,7 +96,7 @@ def test01_a_closed_room_receives_all(rgb, kappa, eye):
 
 
 @pytest.mark.parametrize(("y", "kappa"), [(0.7, 500.0), (0.69, 5000.0)])
-def test02_surfaces_what_hides_them_and_what_escapes_are_what_they_are(rgb, y, kappa):
+def test_surface_occluder_and_escaped_shares(rgb, y, kappa):
     """Against a sum in double precision that shares no line with it, narrow laws on an outline that runs along the
     cuts of a wall included."""
     for without in (None, 1):
@@ -130,7 +130,7 @@ def _shares(kappa: float, eye: np.ndarray, window: bool, count: int = 1 << 17) -
     return np.array([1 - shelf.mean() - out.mean(), shelf.mean(), out.mean()])
 
 
-def test03_a_uniform_law_gives_solid_angles_and_a_cone_changes_nothing_of_it(rgb):
+def test_uniform_gaze_gives_solid_angles(rgb):
     uniform = lambda d: dr.full(rgb.Float, 1 / (4 * np.pi), dr.width(d))
     target, eye = SurfaceTarget(joined(ROOM)), np.array([(1.0, 0.7, 1.5)])
     for cone in (0.0, 0.03):
@@ -142,7 +142,7 @@ def test03_a_uniform_law_gives_solid_angles_and_a_cone_changes_nothing_of_it(rgb
         assert np.isclose(floor, exact / (4 * np.pi), rtol=1e-4)
 
 
-def test04_a_cone_widens_a_law_and_keeps_its_total(rgb):
+def test_cone_widens_gaze_and_keeps_its_total(rgb):
     target, eye = SurfaceTarget(refine(joined(ROOM), 0.2).mesh), np.array([(2.0, 1.5, 1.2)])
     law, cone = lookers_of_law(vmf(rgb, (1, 0.1, 0), 400.0)), 0.026
     plain = sum_gaze(target, law, eye, [1.0], SETTINGS)
@@ -153,7 +153,7 @@ def test04_a_cone_widens_a_law_and_keeps_its_total(rgb):
     assert np.abs(wide.face_sums - expected.face_sums).sum() < 0.03 < np.abs(plain.face_sums - expected.face_sums).sum()
 
 
-def test05_it_is_what_attention_says(rgb, tmp_path):
+def test_sums_match_surface_attention(rgb, tmp_path):
     from importlib.resources import files
 
     from nerg_mi.scenes import store
@@ -186,7 +186,7 @@ def test05_it_is_what_attention_says(rgb, tmp_path):
     assert np.isclose(sums.face_sums.sum() * there / without, expected.share[0], rtol=0.01)
 
 
-def test06_parts_add_up_to_the_whole_bit_by_bit(rgb):
+def test_parts_add_up_exactly(rgb):
     target, law, coarse = (
         SurfaceTarget(joined(ROOM)),
         lookers_of_law(vmf(rgb, (0, 1, 0), 5.0)),
@@ -203,7 +203,7 @@ def test06_parts_add_up_to_the_whole_bit_by_bit(rgb):
 FLOOR = (np.array([(-1.0, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)]), np.array([(0, 1, 2), (0, 2, 3)]))
 
 
-def test01_the_edge_of_a_shadow_along_the_cuts_of_a_face(rgb):
+def test_shadow_boundary_along_subdivisions(rgb):
     """A plate above the floor hides what lies beyond x, wherever that line falls between two cuts."""
     eye = np.array([0.0, 0.0, 2.0])
     for x in (0.07, 0.13, 0.51):
@@ -219,7 +219,7 @@ def test01_the_edge_of_a_shadow_along_the_cuts_of_a_face(rgb):
         assert abs(uncut - exact) > 1e-3
 
 
-def test02_a_narrow_density_is_integrated(rgb):
+def test_narrow_density_is_integrated(rgb):
     """Of a density that is narrower than a piece the pieces are cut, too."""
     target, eye = SurfaceTarget(joined(FLOOR)), np.array([0.13, 0.06, 0.5])
     pieces = subdivide_faces(target.mesh, eye, 0.4)
@@ -240,7 +240,7 @@ PIECES_ROOM = joined(box((0, 0, 0), (1.0, 1.0, 1.0)))
 
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
 @pytest.mark.parametrize("eye", [(0.5, 0.5, 0.5), (0.999, 0.3, 0.2), (1 - 1e-9, 0.9999, 0.5)])
-def test01_a_room_around_an_observer_is_the_whole_sphere(eye, scale):
+def test_room_subtends_the_whole_sphere(eye, scale):
     room = joined(box((0, 0, 0), (scale, scale, scale)))
     found = subdivide_faces(room, scale * np.array(eye), 0.2)
     assert np.isclose(found.solid_angle.sum(), 4 * np.pi, rtol=1e-9)
@@ -252,7 +252,7 @@ def test01_a_room_around_an_observer_is_the_whole_sphere(eye, scale):
     assert np.all(np.sqrt(found.solid_angle) < 0.2) and away.min() > 0
 
 
-def test02_an_octant_and_what_lies_far_away():
+def test_solid_angles_of_octant_and_distant_triangles():
     assert np.isclose(solid_angles(np.eye(3)[None])[0], np.pi / 2, rtol=1e-14)
     # A square metre that faces the observer a kilometre away, and one edge on.
     near = np.array([(1e3, 0, 0), (1e3, 1, 0), (1e3, 0, 1)])
@@ -260,21 +260,21 @@ def test02_an_octant_and_what_lies_far_away():
     assert solid_angles(np.array([[(1.0, 0, 0), (2, 0, 0), (1, 1, 0)]]))[0] == 0
 
 
-def test03_an_observer_on_a_face_ends():
+def test_subdivision_ends_for_observer_on_a_face():
     sheet = joined((np.array([(-1.0, -1, 0), (2, -1, 0), (-1, 2, 0)]), np.array([(0, 1, 2)])))
     found = subdivide_faces(sheet, np.zeros(3), 0.5)
     assert found.solid_angle.sum() == 0 and len(found.face) < 20_000
 
 
 @pytest.mark.parametrize("far", [1e155, 1e200, 1e308, np.inf, np.nan])
-def test04_an_observer_beyond_what_can_be_squared_ends(far):
+def test_subdivision_ends_for_overflowing_distances(far):
     with np.errstate(all="ignore"):
         assert len(subdivide_faces(PIECES_ROOM, np.array([far, 0, 0]), 0.03).face) == len(PIECES_ROOM.faces)
 
 
-def test05_pieces_are_counted_before_they_are_cut(monkeypatch):
+def test_too_many_pieces_are_refused(monkeypatch):
     monkeypatch.setattr("nerg_mi.surfaces.sources.MAX_PIECES", 1000)
-    with pytest.raises(NergError, match="1,000.*--angle"):
+    with pytest.raises(NergError, match="1,000.*--max-angle"):
         subdivide_faces(PIECES_ROOM, np.full(3, 0.5), 0.02)
 
 
@@ -286,7 +286,7 @@ def rays(t, person):
     return Rays(t, person, ("a", "b"), np.zeros((n, 3)), np.tile([1.0, 0, 0], (n, 1)), np.ones(n))
 
 
-def test01_a_ray_stands_for_the_time_until_the_next_of_its_person():
+def test_ray_durations():
     of = rays([0, 0.1, 0.3, 9.0, 9.1, 0.0, 0.2], [0, 0, 0, 0, 0, 1, 1])
     # Pauses count as half a second at most; the last of each as the median of theirs.
     assert np.allclose(ray_durations(of), [0.1, 0.2, 0.5, 0.1, 0.15, 0.2, 0.2])
@@ -295,13 +295,13 @@ def test01_a_ray_stands_for_the_time_until_the_next_of_its_person():
 
 
 @pytest.mark.parametrize("by, share", [("time", 1.05 / 1.45), ("person", 0.5), ("equal", 5 / 7)])
-def test02_weights_add_up_to_one(by, share):
+def test_weights_sum_to_one(by, share):
     of = rays([0, 0.1, 0.3, 9.0, 9.1, 0.0, 0.2], [0, 0, 0, 0, 0, 1, 1])
     w = ray_weights(of, by)
     assert np.isclose(w.sum(), 1) and np.isclose(w[:5].sum(), share)
 
 
-def test03_observers_stand_where_somebody_was_with_the_time_of_all_near():
+def test_clustered_observers_are_recorded_positions():
     rng = np.random.default_rng(0)
     places = np.array([(0, 0, 1.6), (4, 0, 1.6), (0, 5, 1.6)])
     which = rng.choice(3, 3000, p=(0.5, 0.3, 0.2))
@@ -320,7 +320,7 @@ def test03_observers_stand_where_somebody_was_with_the_time_of_all_near():
     assert np.array_equal(again.positions, found.positions)
 
 
-def test04_more_observers_are_nearer_and_fewer_places_than_observers_are_all_taken():
+def test_more_observers_are_closer():
     positions = np.random.default_rng(2).uniform(0, 5, (2000, 3))
     errors = [cluster_observers(positions, np.ones(2000), n).rms_distance for n in (4, 32, 256)]
     assert errors[0] > 1.5 * errors[1] > 2 * errors[2]
@@ -339,7 +339,7 @@ def rays_ray_source(n, spread=0.0, seed=0):
     return TrackedRays(np.zeros((n, 3)), d / np.linalg.norm(d, axis=1, keepdims=True), np.full(n, 1 / n))
 
 
-def test01_a_line_goes_through_a_gap_whole_and_a_cone_by_what_passes(rgb):
+def test_line_and_cone_through_a_gap(rgb):
     """Two plates with a slit of 5 cm between them, two metres away, and a wall behind."""
     slit = 0.025
     left = (np.array([(-3.0, -3, 2), (-slit, -3, 2), (-slit, 3, 2), (-3, 3, 2)]), np.array([(0, 1, 2), (0, 2, 3)]))
@@ -358,7 +358,7 @@ def test01_a_line_goes_through_a_gap_whole_and_a_cone_by_what_passes(rgb):
     assert np.isclose(cone.face_sums.sum() + cone.escaped + cone.elsewhere, cone.total)
 
 
-def test02_a_thin_edge_gets_its_part(rgb):
+def test_thin_edge_receives_its_share(rgb):
     """A rod of 1 cm, which hardly any line meets that is aimed at it with an error of a degree."""
     rod = joined(box((-0.005, -3, 2), (0.005, 3, 2.01)))
     sums = sum_rays(SurfaceTarget(rod), rays_ray_source(20_000), RaySettings(cone_sigma=SIGMA))
@@ -367,7 +367,7 @@ def test02_a_thin_edge_gets_its_part(rgb):
     assert np.isclose(sums.escaped, 1 - sums.face_sums.sum())
 
 
-def test03_parts_give_the_same_as_often_as_they_are_made(rgb):
+def test_ray_parts_are_reproducible(rgb):
     target, settings = (
         SurfaceTarget(joined(plate(9, side=4.0, z=2.0))),
         RaySettings(cone_sigma=SIGMA, rays_per_cone=8, seed=5),
@@ -383,7 +383,7 @@ def test03_parts_give_the_same_as_often_as_they_are_made(rgb):
 
 
 @pytest.mark.parametrize("cone", [0.0, SIGMA])
-def test04_on_elsewhere_and_escaped_add_up_where_something_hides_the_surface(rgb, cone):
+def test_ray_shares_add_up(rgb, cone):
     """A plate across x < 0 at z = 2, of which a shape at z = 1 hides y < 0 and reaches beyond it; the rest escapes."""
     plate_left = (np.array([(-9.0, -9, 2), (0, -9, 2), (0, 9, 2), (-9, 9, 2)]), np.array([(0, 1, 2), (0, 2, 3)]))
     hiding = (np.array([(-9.0, -9, 1), (9, -9, 1), (9, 0, 1), (-9, 0, 1)]), np.array([(0, 1, 2), (0, 2, 3)]))
@@ -407,7 +407,7 @@ def law(kappa):
 
 
 @pytest.mark.parametrize("kappa", [0.1, 40.0, 3000.0])
-def test01_totals_and_halves_of_laws(kappa):
+def test_quadrature_totals(kappa):
     directions, angles = sphere_quadrature(law(kappa), 1 << 15)
     assert np.isclose(angles.sum(), 4 * np.pi, rtol=1e-12)
     assert np.allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-14)
@@ -419,10 +419,10 @@ def test01_totals_and_halves_of_laws(kappa):
     assert np.allclose(sphere_quadrature(lambda d: np.zeros(len(d)), 1)[1].sum(), 4 * np.pi)
 
 
-def test02_upright_planes_cut_a_uniform_density_by_their_angle():
+def test_quadrature_of_vertical_half_spaces():
     directions, angles = sphere_quadrature(lambda d: np.ones(len(d)), 1 << 14)
     turn = np.arctan2(directions[:, 1], directions[:, 0])
     for edge in (0.1, 0.7, np.pi / 2):
         assert np.isclose(angles[(turn > 0) & (turn < edge)].sum(), 2 * edge, atol=0.004)
-    with pytest.raises(ValueError, match="a direction"):
+    with pytest.raises(ValueError, match="one direction"):
         sphere_quadrature(lambda d: np.ones(len(d)), 0)

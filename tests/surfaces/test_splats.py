@@ -36,7 +36,7 @@ def areas(splats, tolerance=0.002):
     return compute_splat_areas(splats, SplatArrays(splats, ns), tolerance)
 
 
-def test01_one_that_nothing_hides_and_its_sides(rgb):
+def test_area_of_a_single_gaussian(rgb):
     turn = [np.cos(0.4), np.sin(0.4), 0.1, 0]
     one = Splats([[1, 2, 3]], [[0.2, 0.01, 0.1]], [turn], [0.5], np.zeros((1, 1, 3)))
     expected = 2 * np.pi * 0.2 * 0.1 * 0.5 * (1 - np.exp(-4.5))
@@ -48,7 +48,7 @@ def test01_one_that_nothing_hides_and_its_sides(rgb):
     ]
 
 
-def test02_overlapping_ones_share_what_there_is(rgb):
+def test_overlapping_gaussians_share_area(rgb):
     """A wall that lets no light through has its area, however many Gaussians it is made of."""
     plain = wall(jitter=0.0005)
     found = areas(plain)
@@ -57,7 +57,7 @@ def test02_overlapping_ones_share_what_there_is(rgb):
     assert (found.sum(axis=1) > 0.99).all() and (found.sum(axis=1) < (1 + edge) ** 2).all()
 
 
-def test03_one_behind_another_is_hidden_from_there_and_what_stands_before_it_hides_nothing(rgb):
+def test_occluded_side_has_no_area(rgb):
     both = concatenate_splats([wall(0.0, 0.2), wall(0.003, 0.2, turned=TURN_X)])
     found, n = areas(both, 0.004), len(both) // 2
     # Along +z the first wall is seen: that is side 0 of it, whose axis is +z, and side 1 of the other.
@@ -88,9 +88,9 @@ def shares(splats, o, d, **more):
     return taken, left, count
 
 
-def test01_all_gaussians_in_double_precision(rgb):
+def test_hits_match_a_loop(rgb):
     splats, (o, d) = some(), rays(300)
-    taken, left, count = shares(splats, o, d, stop=1e-6)
+    taken, left, count = shares(splats, o, d, min_transmittance=1e-6)
     t, absorbed = peaks(splats, o, d)
     absorbed = np.where(t >= 0, absorbed, 0)
     order = np.argsort(t, axis=1)
@@ -103,10 +103,10 @@ def test01_all_gaussians_in_double_precision(rgb):
     assert np.abs(taken.sum(axis=1) + left - 1).max() < 1e-12
 
 
-def test02_up_to_a_distance_and_no_farther_than_is_asked_for(rgb):
+def test_hits_end_at_the_maximum_distance(rgb):
     splats = stack(np.arange(30.0), np.full(30, 0.1))
     o, d = np.array([[0, 0, -1.0], [0, 0, -1.0]]), np.array([[0, 0, 1.0], [0, 0, 1.0]])
-    taken, left, _ = shares(splats, o, d, before=np.array([5.5, np.inf]))
+    taken, left, _ = shares(splats, o, d, max_distance=np.array([5.5, np.inf]))
     assert np.allclose(taken.sum(axis=1), 1 - 0.9 ** np.array([5, 30]), atol=1e-6) and np.allclose(
         1 - left, taken.sum(1)
     )
@@ -133,7 +133,7 @@ def sums(splats, rays, settings=LINE):
     return sum_rays_on_splats(SplatArrays(splats, ns), shortest_axes(splats), rays, settings)
 
 
-def test01_all_is_found_again_and_each_has_its_share_of_the_ray(rgb):
+def test_ray_contributions_sum_to_one(rgb):
     splats, rays = some(), falling(500, 3.0)
     found = sums(splats, rays)
     taken, left, _ = shares(splats, rays.origins, rays.directions)
@@ -147,7 +147,7 @@ def test01_all_is_found_again_and_each_has_its_share_of_the_ray(rgb):
     assert abs(cone.on_surface + cone.escaped - 1) < 1e-3 and cone.count == 500
 
 
-def test02_per_area_it_is_what_falls_on_a_square_metre(rgb):
+def test_attention_per_area_matches_ray_density(rgb):
     """On a wall of overlapping Gaussians in two layers, whichever of them a ray ends at."""
     splats = concatenate_splats([wall(0.0, 0.6, 0.03, 0.0005), wall(0.004, 0.6, 0.05, turned=TURN_X, seed=1)])
     rays = falling(20_000, 1.2)
@@ -161,7 +161,7 @@ def test02_per_area_it_is_what_falls_on_a_square_metre(rgb):
     assert abs(np.median(of[front] / own[front]) * 1.2**2 - 1) < 0.05
 
 
-def test03_parts_give_the_same_as_often_as_they_are_made(rgb):
+def test_splat_parts_are_reproducible(rgb):
     splats, every = wall(1.0, 1.0, 0.05), falling(900)
     parts = [every.select(a, a + 400) for a in range(0, 900, 400)]
     first, again = (merge_sums(sums(splats, part, CONE) for part in parts) for _ in range(2))
@@ -173,7 +173,7 @@ def test03_parts_give_the_same_as_often_as_they_are_made(rgb):
 
 
 @pytest.mark.parametrize("cone", [0.0, 0.03])
-def test04_of_gaze_meets_none_what_comes_through(rgb, cone):
+def test_escaped_gaze(rgb, cone):
     """A density along z, most of which a wall stops, and the light of every ray by all Gaussians in float64."""
     splats, eye, kappa = some(), np.array([0.1, -0.2, -1.5]), 8.0
     looker = lookers_of_law(vmf(rgb, (0, 0, 1), kappa))(eye)
@@ -206,7 +206,7 @@ def spike(splats, at, side=0):
 
 
 @pytest.mark.parametrize("length", [0.03, 0.05, 0.1])
-def test01_a_point_becomes_a_gaussian_of_that_width(length):
+def test_point_is_smoothed_to_a_gaussian(length):
     rng = np.random.default_rng(0)
     plain = wall(side=1.2)
     plain.centers[:, :2] += rng.uniform(-0.004, 0.004, (len(plain), 2))
@@ -228,7 +228,7 @@ def test01_a_point_becomes_a_gaussian_of_that_width(length):
 
 @pytest.mark.parametrize("turned", [(1.0, 0.0, 0.0, 0.0), TURN_X])
 @pytest.mark.parametrize("length", [0.05, 0.2])
-def test02_walls_5_cm_apart_stay_apart(turned, length):
+def test_smoothing_does_not_cross_gaps(turned, length):
     """Parallel ones and such that face each other, whichever side is looked at."""
     both = concatenate_splats([wall(0.0, 0.8), wall(0.05, 0.8, turned=turned)])
     flow, _ = smoother(both, length)
@@ -238,7 +238,7 @@ def test02_walls_5_cm_apart_stay_apart(turned, length):
         assert np.isclose(found[side, :n].sum(), 1, rtol=1e-12) and not found[1 - side].any() and not found[:, n:].any()
 
 
-def test03_neither_through_a_board_nor_around_its_edge():
+def test_smoothing_does_not_cross_boards_or_edges():
     board = concatenate_splats([wall(0.0, 0.4), wall(0.001, 0.4, turned=TURN_X)])
     n = len(board) // 2
     front = spike(board, (0.1, 0.1, 0))
@@ -260,7 +260,7 @@ def test03_neither_through_a_board_nor_around_its_edge():
     assert not smoother(corner, 0.1)[0](spike(corner, (0.19, 0, 0)))[:, n:].any()
 
 
-def test04_many_in_one_cell_have_one_density_and_a_length_has_to_be_positive():
+def test_cells_share_one_density():
     many = wall(0.0, 0.1, apart=0.001)
     areas = np.full((2, len(many)), 0.001**2)
     flow, _ = smoother(many, 0.02, areas)
@@ -291,7 +291,7 @@ def uniform(rgb):
     return lambda d: dr.full(rgb.Float, 1 / (4 * np.pi), dr.width(d))
 
 
-def test01_a_ball_that_is_looked_at_and_one_behind_it(rgb):
+def test_occluded_ball_receives_no_gaze(rgb):
     """Kappa / 2 pi in the middle of a narrow law, by the square of the distance; nothing in the shadow."""
     balls = stack([0.0, 1.0], [0.95, 0.95])
     kappa = 300.0
@@ -304,7 +304,7 @@ def test01_a_ball_that_is_looked_at_and_one_behind_it(rgb):
     assert found(stack([0.0, 1.0], [0.2, 0.95]), uniform(rgb))[1] > 0
 
 
-def test02_a_disk_by_its_cosine_and_any_by_the_area_under_which_it_is_seen(rgb):
+def test_gaze_scales_with_projected_area(rgb):
     angles = np.radians([0, 30, 60, 80])
     turned = np.stack([np.cos(angles / 2), np.sin(angles / 2), 0 * angles, 0 * angles], axis=1)
     far = np.stack([40.0 * np.arange(4), 0 * angles, 0 * angles], axis=1)
@@ -320,7 +320,7 @@ def test02_a_disk_by_its_cosine_and_any_by_the_area_under_which_it_is_seen(rgb):
         assert np.isclose(found(make(scales), uniform(rgb), [eyes(k)])[k] * 16 * np.pi, area, rtol=1e-4)
 
 
-def test03_all_gaussians_in_double_precision(rgb):
+def test_gaze_matches_a_loop(rgb):
     """Visibility by the median depth of the ray to a point before the centre, by the thickness and the tolerance."""
     rng = np.random.default_rng(3)
     n = 60
@@ -349,9 +349,9 @@ def test03_all_gaussians_in_double_precision(rgb):
     assert np.allclose(there, expected, rtol=1e-4)
 
 
-def test04_a_cone_widens_a_law_and_within_a_gaussian_nothing_is_infinite(rgb):
+def test_cone_and_observer_inside_a_gaussian(rgb):
     ball, cone, kappa = stack([0.0], [0.9]), 0.03, 400.0
     wide = 1 / (1 / kappa + cone**2)
-    assert np.isclose(found(ball, vmf(rgb, ALONG, kappa), cone=cone)[0] * 8 * np.pi, wide, rtol=0.02)
+    assert np.isclose(found(ball, vmf(rgb, ALONG, kappa), cone_sigma=cone)[0] * 8 * np.pi, wide, rtol=0.02)
     inside = found(ball, uniform(rgb), [(0, 0, -0.01), (0, 0, -0.1)], [1.0, 0.0])
     assert np.isclose(inside[0], 1 / (4 * np.pi * 0.1**2), rtol=1e-5)
