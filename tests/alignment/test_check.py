@@ -38,8 +38,8 @@ def room():
 
 
 def test_correct_alignment_has_no_warnings(room):
-    found = check_alignment(room, RAYS, moved(0, 0, 0))
-    assert found == AlignmentCheck(0.0, 0.0, 0.0) and not found.list_warnings() and not found.is_impossible
+    result = check_alignment(room, RAYS, moved(0, 0, 0))
+    assert result == AlignmentCheck(0.0, 0.0, 0.0) and not result.list_warnings() and not result.is_impossible
 
 
 def test_wrong_alignments_are_reported(room):
@@ -52,8 +52,8 @@ def test_heads_inside_a_medium_are_reported():
     solid = VolumeMedium(
         mi.load_dict({"type": "constvolume", "value": 500.0, "to_world": mi.ScalarTransform4f().scale([9, 9, 9])})
     )
-    found = check_alignment(solid, RAYS, moved(0, 0, 0))
-    assert found.inside > 0.9 and "inside solid objects" in " ".join(found.list_warnings())
+    result = check_alignment(solid, RAYS, moved(0, 0, 0))
+    assert result.inside > 0.9 and "inside solid objects" in " ".join(result.list_warnings())
 
 
 def test_no_samples_give_no_warnings(room):
@@ -81,20 +81,20 @@ def written(path):
         np.diag([1e-4] * 3 + [4e-4] * 3 + [1e-4]),
         metadata={"pairs": 5},
     )
-    found = Alignment.from_fit("pairs", fit, {"rays": {"file": "a.npz", "sha256": "00"}}, False)
-    found.save(path)
-    return found
+    result = Alignment.from_fit("pairs", fit, {"rays": {"file": "a.npz", "sha256": "00"}}, False)
+    result.save(path)
+    return result
 
 
 def test_record_is_read_by_every_command(tmp_path):
     path = tmp_path / "alignment.json"
-    found = written(path)
+    result = written(path)
     assert read_similarity(path, "--align", "rays to field").scale == pytest.approx(2)
-    about = json.loads(path.read_text())
-    assert about["evidence"] == {"kind": "pairs", "pairs": 5} and about["residuals"]["median_cm"] == 2
-    assert about["uncertainty"]["cm"] == pytest.approx(100 * np.sqrt(12e-4) / 2)
-    assert about["uncertainty"]["scale_percent"] == pytest.approx(1) and found.residuals["median_degrees"] == 1
-    assert about["uncertainty"]["degrees"] == pytest.approx(np.degrees(np.sqrt(3e-4)))
+    metadata = json.loads(path.read_text())
+    assert metadata["evidence"] == {"kind": "pairs", "pairs": 5} and metadata["residuals"]["median_cm"] == 2
+    assert metadata["uncertainty"]["cm"] == pytest.approx(100 * np.sqrt(12e-4) / 2)
+    assert metadata["uncertainty"]["scale_percent"] == pytest.approx(1) and result.residuals["median_degrees"] == 1
+    assert metadata["uncertainty"]["degrees"] == pytest.approx(np.degrees(np.sqrt(3e-4)))
 
 
 @pytest.mark.parametrize(

@@ -175,9 +175,9 @@ def test_pockets_are_not_free_space():
         np.concatenate([room.end, begin + along * to_wall[:, None]]),
         np.ones(len(room.is_hit) + 4000, bool),
     )
-    found = surface_from_traces(both, 1 << 16)
+    result = surface_from_traces(both, 1 << 16)
     middle = block.mean(axis=0)[None]
-    assert found.free_space_distance.interpolate(middle)[0] > 0.2
+    assert result.free_space_distance.interpolate(middle)[0] > 0.2
 
 
 def test_floor_height_is_estimated(surface):
@@ -186,8 +186,8 @@ def test_floor_height_is_estimated(surface):
 
 def test_bare_points_have_no_free_space():
     points = rooms.traces().end
-    found = surface_from_points(points, 1 << 15)
-    assert not found.has_free_space and found.distance.interpolate(points[:500]).max() < 2 * found.step
+    result = surface_from_points(points, 1 << 15)
+    assert not result.has_free_space and result.distance.interpolate(points[:500]).max() < 2 * result.step
     with pytest.raises(NergError, match="99 points"):
         surface_from_points(np.zeros((99, 3)))
     with pytest.raises(NergError, match="coincide"):
@@ -199,7 +199,7 @@ def test_downsampled_points_are_voxel_means():
     np.testing.assert_allclose(downsample(p, 1.0), [[0.1, 0, 0], [1.1, 0, 0]])
 
 
-class _Nothing:
+class _EmptyGeometry:
     pass
 
 
@@ -208,4 +208,4 @@ def test_scene_without_surfaces_is_refused(monkeypatch):
         "nerg_mi.alignment.constraints.trace_depth", lambda s, o, d: (np.zeros(len(o)), np.zeros(len(o)))
     )
     with pytest.raises(NergError, match="meet no surface"):
-        trace_scene(_Nothing(), np.zeros(3), np.ones(3), 1000)  # pyright: ignore[reportArgumentType] # traced by nothing
+        trace_scene(_EmptyGeometry(), np.zeros(3), np.ones(3), 1000)  # pyright: ignore[reportArgumentType] # traced by nothing

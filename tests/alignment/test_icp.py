@@ -52,14 +52,14 @@ def test_refinement_converges_with_uncertainty():
         ZeroDistance(surface.free_space_distance, rays.origin, rays.person, "heads"),
     ]
     center = rooms.carried(truth, rays.origin).mean(axis=0)
-    found = refine(scores, start, center, FULL_BASIS)
+    result = refine(scores, start, center, FULL_BASIS)
     target = rooms.carried(truth, rays.origin)
     assert (
         residual_distances(start, rays.origin, target).max() > 0.1
-        and residual_distances(found.matrix, rays.origin, target).max() < 0.02
+        and residual_distances(result.matrix, rays.origin, target).max() < 0.02
     )
-    spread = np.sqrt(np.diag(found.covariance))
-    assert found.covariance.shape == (7, 7) and (spread[:3] < 0.01).all() and 0 < spread[6] < 0.01
+    spread = np.sqrt(np.diag(result.covariance))
+    assert result.covariance.shape == (7, 7) and (spread[:3] < 0.01).all() and 0 < spread[6] < 0.01
 
 
 def test_groups_are_participants_or_time_blocks():

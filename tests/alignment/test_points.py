@@ -76,8 +76,8 @@ def test_degenerate_cameras_are_refused():
 
 def test_mean_rotation_is_robust():
     truth = Rotation.random(random_state=1)
-    given = Rotation.concatenate([truth] * 7 + [Rotation.random(random_state=k) for k in range(2, 6)])
-    np.testing.assert_allclose(mean_rotation(given.as_matrix()), truth.as_matrix(), atol=1e-3)
+    value = Rotation.concatenate([truth] * 7 + [Rotation.random(random_state=k) for k in range(2, 6)])
+    np.testing.assert_allclose(mean_rotation(value.as_matrix()), truth.as_matrix(), atol=1e-3)
 
 
 def write_model(folder, poses, names):
@@ -93,9 +93,9 @@ def test_photos_are_matched_by_name(tmp_path):
     one, other = both(truth, 5)
     write_model(tmp_path / "a", one, ["0.png", "1.png", "2.png", "3.png", "x.png"])
     write_model(tmp_path / "b", other[::-1], ["y.png", "3.jpg", "2.jpg", "1.jpg", "0.jpg"])
-    found = read_cameras(tmp_path / "a", tmp_path / "b")
-    assert len(found.tracking) == 4
-    np.testing.assert_allclose(found.fit(FREE, quiet).matrix, truth, atol=1e-6)
+    result = read_cameras(tmp_path / "a", tmp_path / "b")
+    assert len(result.tracking) == 4
+    np.testing.assert_allclose(result.fit(FREE, quiet).matrix, truth, atol=1e-6)
     write_model(tmp_path / "c", one, [f"{k}.tif" for k in range(10, 15)])
     with pytest.raises(NergError, match="fewer than two photos"):
         read_cameras(tmp_path / "a", tmp_path / "c")
@@ -155,9 +155,9 @@ def test_pair_files_are_read(tmp_path):
     (tmp_path / "p.json").write_text(json.dumps(pairs))
     (tmp_path / "q.json").write_text(json.dumps({"pairs": pairs}))
     for name in ("p.csv", "p.json", "q.json"):
-        found = read_pairs(tmp_path / name)
-        np.testing.assert_array_equal(np.c_[found.tracking, found.place], rows)
-        assert found.names == ("n0", "n1")
+        result = read_pairs(tmp_path / name)
+        np.testing.assert_array_equal(np.c_[result.tracking, result.place], rows)
+        assert result.names == ("n0", "n1")
 
 
 @pytest.mark.parametrize(

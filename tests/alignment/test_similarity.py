@@ -83,10 +83,10 @@ def test_noisy_points_match_a_minimiser():
         moved = np.exp(p[6]) * Rotation.from_rotvec(p[:3]).apply(x) + p[3:6]
         return w @ np.sum((moved - y) ** 2, axis=1)
 
-    found = fit_similarity(x, y, w)
-    start = [*Rotation.from_matrix(found[:3, :3] / similarity_scale(found)).as_rotvec() + 0.1, *found[:3, 3], 0]
+    result = fit_similarity(x, y, w)
+    start = [*Rotation.from_matrix(result[:3, :3] / similarity_scale(result)).as_rotvec() + 0.1, *result[:3, 3], 0]
     best = minimize(cost, start, method="BFGS", options={"gtol": 1e-10})
-    assert w @ np.sum((carried(found, x) - y) ** 2, axis=1) == pytest.approx(best.fun, rel=1e-6)
+    assert w @ np.sum((carried(result, x) - y) ** 2, axis=1) == pytest.approx(best.fun, rel=1e-6)
 
 
 def test_known_scale_and_flat_points():

@@ -38,15 +38,15 @@ def moved(points):
 
 def test_angles_match_a_loop():
     origin, direction, _ = gaze(20, 0.05)
-    found = compare_flips(moved(POINTS), TURN, origin, direction).degrees
-    assert set(found) == {DECLARED, *(f"{a} of the directions negated" for a in "xyz")}
+    result = compare_flips(moved(POINTS), TURN, origin, direction).degrees
+    assert set(result) == {DECLARED, *(f"{a} of the directions negated" for a in "xyz")}
     for name, signs in ((DECLARED, (1, 1, 1)), ("y of the directions negated", (1, -1, 1))):
         expected = []
         for o, d in zip(origin, direction * signs):
             cosines = [(p - o) @ d / np.linalg.norm(p - o) for p in POINTS]
             expected.append(np.degrees(np.arccos(max(cosines))))
         # Rays are looked at in another order.
-        assert np.allclose(np.sort(found[name]), np.sort(expected), atol=1e-5)
+        assert np.allclose(np.sort(result[name]), np.sort(expected), atol=1e-5)
 
 
 def test_correct_axes_give_no_warning():
@@ -86,8 +86,8 @@ def test_few_rays_and_chance_give_no_warning():
 def test_unknown_heads_are_ignored():
     origin, direction, head = gaze()
     head[:, :] = np.nan
-    found = compare_flips(POINTS, np.eye(4), origin, direction, head).degrees
-    assert np.array_equal(found["up and down of the eyes exchanged"], found[DECLARED])
+    result = compare_flips(POINTS, np.eye(4), origin, direction, head).degrees
+    assert np.array_equal(result["up and down of the eyes exchanged"], result[DECLARED])
 
 
 # ---- Search ----
@@ -100,10 +100,10 @@ def test_search_finds_rotation_shift_and_scale():
     scale = np.cbrt(np.linalg.det(truth[:3, :3]))
     assert scales[0] > scale > scales[-1] and np.abs(np.log(scales / scale)).min() < 0.04
     near = scales[np.abs(np.log(scales / scale)) < 0.3]
-    best, *others = search_placements(surface, rays.hit, rays.origin, near, (0.0, truth[2, 3]))
+    best, *remaining = search_placements(surface, rays.hit, rays.origin, near, (0.0, truth[2, 3]))
     moved, right = (rooms.carried(m, rays.origin) for m in (best.matrix, truth))
     assert np.median(np.linalg.norm(moved - right, axis=1)) < 0.3 * scale
-    assert all(o.score <= best.score and not is_close(o.matrix, best.matrix, 0.02) for o in others)
+    assert all(o.score <= best.score and not is_close(o.matrix, best.matrix, 0.02) for o in remaining)
 
 
 # ---- Tracking ----
@@ -151,10 +151,10 @@ def test_initial_similarity_is_refined():
         (None, {}, "no gaze samples"),
     ],
 )
-def test_undetermined_alignments_are_refused(changes, known, why):
+def test_undetermined_alignments_are_refused(changes, expected, why):
     rays = RAYS.select(RAYS.t < 0) if changes is None else replace(RAYS, **changes)
     with pytest.raises(NergError, match=why):
-        Tracking(rays).fit(AlignmentTarget(**known), quiet)
+        Tracking(rays).fit(AlignmentTarget(**expected), quiet)
 
 
 # ---- Recorded gaze of Aria's glasses against the points that they triangulated ----

@@ -69,13 +69,13 @@ def people(count: int = 6, each: int = 80, seed: int = 0, cohorts: bool = True) 
 
 def first_box(o: np.ndarray, d: np.ndarray) -> tuple[str, float]:
     """What a ray meets first in the room, and where: plane by plane."""
-    found = ("room", np.inf)
+    result = ("room", np.inf)
     for name, box in (("room", ROOM), ("sign", SIGN), ("stand", STAND)):
         near, far = -np.inf, np.inf
         for axis in range(3):
             a, b = sorted((box[:, axis] - o[axis]) / d[axis])
             near, far = max(near, a), min(far, b)
         at = far if name == "room" else near
-        if near < far and at > 0 and at < found[1]:
-            found = name, float(at)
-    return found
+        if near < far and at > 0 and at < result[1]:
+            result = name, float(at)
+    return result

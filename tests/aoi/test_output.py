@@ -16,7 +16,7 @@ from tests.workflows.recorder import Recorder
 
 # ---- Results as a folder of files ----
 
-THING = {
+ROW_OF_AOI = {
     "cell": "all",
     "value": "",
     "aoi": "a",
@@ -31,7 +31,7 @@ THING = {
 def test_non_empty_tables_are_written(tmp_path):
     place = {"x": 0.0, "y": 0.0, "z": 1.6, "area": 2.0}
     recorder = Recorder()
-    made = StatisticsResult(aois=[THING], isovists=[place, place | {"x": 0.25}], num_suppressed=2)
+    made = StatisticsResult(aois=[ROW_OF_AOI], isovists=[place, place | {"x": 0.25}], num_suppressed=2)
     files = write_results(tmp_path, made, [], StatisticsOptions(), recorder)
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted(p.name for p in files)
     names = {p.name for p in files}
@@ -41,7 +41,7 @@ def test_non_empty_tables_are_written(tmp_path):
 
 
 def test_equal_results_give_equal_files(tmp_path):
-    made = StatisticsResult(aois=[THING])
+    made = StatisticsResult(aois=[ROW_OF_AOI])
     for name in "ab":
         (tmp_path / name).mkdir()
         write_results(tmp_path / name, made, [], StatisticsOptions(), Recorder())
@@ -116,9 +116,9 @@ def test_hit_ratio_from_few_viewpoints_is_marked():
         texts = output.aoi_columns([one])[1](one)
         said = [text for text in texts if "biased low" in str(text)]
         assert said == ([f"45.0 % (biased low: {places:.1f} viewpoints per participant)"] if low else [])
-        share, reach, dwell = aois_figure([one]).axes
-        assert ("biased low" in reach.get_xlabel()) == low and "low" not in share.get_xlabel() + dwell.get_xlabel()
-        assert (reach.lines[0].get_markerfacecolor() == "white") == low
+        share, extent, dwell = aois_figure([one]).axes
+        assert ("biased low" in extent.get_xlabel()) == low and "low" not in share.get_xlabel() + dwell.get_xlabel()
+        assert (extent.lines[0].get_markerfacecolor() == "white") == low
 
 
 def test_what_if_table():
@@ -128,8 +128,8 @@ def test_what_if_table():
     rows = [row | {"source": "predicted"}, new | {"source": "predicted", "p_adjusted": None, "support": 12.5}]
     head, cells = output.what_if_columns(rows)
     assert head[3:6] == ["before [%]", "after [%]", "difference [points]"] and len(head) == len(cells(rows[0])) == 9
-    told = ["50.00", "25.00", "-25.00 [-30.00, -20.00]", "0.0005", "0.001", "not in the checkpoint"]
-    assert cells(rows[0]) == ["a", "attention share", 5, *told]
+    texts = ["50.00", "25.00", "-25.00 [-30.00, -20.00]", "0.0005", "0.001", "not in the checkpoint"]
+    assert cells(rows[0]) == ["a", "attention share", 5, *texts]
     assert cells(rows[1]) == ["b", "visible share", 5, "", "25.00", "", "", "", "12.5"]
     spread = [r | {"difference_spread": 0.01} for r in rows]
     head, cells = output.what_if_columns(spread)
@@ -140,8 +140,8 @@ def test_differences_have_units():
     row = {"cell": "zone", "first": "front", "second": "back", "aoi": "a", "measure": "share", "difference": -0.06}
     row |= {"low": -0.08, "high": -0.04, "p": 0.001, "p_adjusted": 0.0014, "significant": True}
     head, cells = output.difference_columns([row])
-    told = ["zone", "front", "back", "a", "share of time", "-6.00 points [-8.00, -4.00]", "0.001", "0.0014", "yes"]
-    assert head[5] == "second - first" and cells(row) == told
+    texts = ["zone", "front", "back", "a", "share of time", "-6.00 points [-8.00, -4.00]", "0.001", "0.0014", "yes"]
+    assert head[5] == "second - first" and cells(row) == texts
     blank = row | {
         "measure": "dwell",
         "difference": 1.5,
@@ -162,8 +162,8 @@ def test_many_participants_are_written_in_batches(tmp_path, monkeypatch):
     monkeypatch.setattr(output, "MAX_MARKDOWN_ROWS", 4)
     files = output.write_rows(tmp_path, "people", rows, *output.all_columns(rows))
     with files[0].open() as file:
-        told = list(csv.DictReader(file))
-    assert len(told) == 10 and told[0]["time_to_first_visit"] == "" and told[9]["time_to_first_visit"] == "2.5"
+        texts = list(csv.DictReader(file))
+    assert len(texts) == 10 and texts[0]["time_to_first_visit"] == "" and texts[9]["time_to_first_visit"] == "2.5"
     text = files[1].read_text().splitlines()
     assert len(text) == 8 and "4 of 10 rows" in text[-1] and "people.csv" in text[-1]
     pq = pytest.importorskip("pyarrow.parquet")

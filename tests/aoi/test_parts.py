@@ -65,23 +65,23 @@ def place(tmp_path, rgb):
     return tmp_path
 
 
-def count(place, folder, rays="rays.npz", **more):
-    told = Recorder()
-    options = StatisticsOptions(aois=place / "areas.json", **{**FAST, **more})
-    statistics([place / "scene.xml", place / rays], place / folder, options, told)
-    return {p.name: p.read_bytes() for p in (place / folder).iterdir()}, told
+def count(place, folder, rays="rays.npz", **changes):
+    recorder = Recorder()
+    options = StatisticsOptions(aois=place / "areas.json", **{**FAST, **changes})
+    statistics([place / "scene.xml", place / rays], place / folder, options, recorder)
+    return {p.name: p.read_bytes() for p in (place / folder).iterdir()}, recorder
 
 
-def made(told):
+def made(recorder):
     """How many parts of the rays, and of the places, were not kept from before."""
-    found = []
-    for _, text in told.steps:
+    result = []
+    for _, text in recorder.steps:
         if " parts" in text:
             done, total = int(text.split()[0]), int(text.split()[2])
-            if not found or found[-1][0] != total:
-                found.append([total, done, done])
-            found[-1][2] = done
-    return [last - first for _, first, last in found]
+            if not result or result[-1][0] != total:
+                result.append([total, done, done])
+            result[-1][2] = done
+    return [last - first for _, first, last in result]
 
 
 @pytest.mark.nightly
@@ -89,14 +89,18 @@ def test_parallel_tables_equal_serial_tables(place):
     (place / "poster.obj").write_text("v 5 1 1\nv 5 2 1\nv 5 1 2\nf 1 2 3\n")
     changes = {"move": [{"shape": "stand", "by": [0, 1.9, 0]}], "add": [{"name": "poster", "mesh": "poster.obj"}]}
     (place / "changes.json").write_text(json.dumps(changes | {"shift": [0, 0, 0.1]}))
-    asked = {"aoi_visibility": True, "cell_size": 0.5, "windows": ("early=0,8",), "what_if": place / "changes.json"}
-    whole, _ = count(place, "one", **asked)
-    parts, told = count(place, "two", **asked, scheduler="local:2")
-    assert parts == whole and {"aois.csv", "transitions.csv", "participants.csv", "what_if.csv", "about.json"} <= set(
-        whole
-    )
-    assert b"poster" in whole["what_if.csv"]
-    account = account_for_store(place / "two.tasks", reporter=told)
+    requested = {"aoi_visibility": True, "cell_size": 0.5, "windows": ("early=0,8",), "what_if": place / "changes.json"}
+    whole_result, _ = count(place, "one", **requested)
+    parts, texts = count(place, "two", **requested, scheduler="local:2")
+    assert parts == whole_result and {
+        "aois.csv",
+        "transitions.csv",
+        "participants.csv",
+        "what_if.csv",
+        "about.json",
+    } <= set(whole_result)
+    assert b"poster" in whole_result["what_if.csv"]
+    account = account_for_store(place / "two.tasks", reporter=texts)
     assert [(job.name.partition(" /")[0], job.remaining) for job in account.jobs] == [("nerg stats", 0)] * 3
     assert sorted(job.total for job in account.jobs) == [2, 2, 6]
     assert len(account.jobs[0].changed) == 0
@@ -118,14 +122,14 @@ def test_only_changed_parts_are_recomputed(place):
 def test_dataset_parts_are_read_in_place(place):
     pytest.importorskip("pyarrow")
     write_dataset(place, 2)
-    whole, _ = count(place, "one", "shop.rays")
-    parts, told = count(place, "two", "shop.rays", store=place / "store")
-    assert parts == whole and made(told)[0] > 3 and not list((place / "store").glob(".scratch-*"))
+    whole_result, _ = count(place, "one", "shop.rays")
+    parts, texts = count(place, "two", "shop.rays", store=place / "store")
+    assert parts == whole_result and made(texts)[0] > 3 and not list((place / "store").glob(".scratch-*"))
     # Of another source those parts alone are new that are its own.
     write_source(place / "files" / "2.csv", 2, start=DAY)
     update_dataset(place / "shop.rays", [place / "files" / "2.csv"], recipe())
-    _, more = count(place, "two", "shop.rays", store=place / "store")
-    assert 0 < made(more)[0] < made(told)[0]
+    _, options = count(place, "two", "shop.rays", store=place / "store")
+    assert 0 < made(options)[0] < made(texts)[0]
 
 
 def test_sums_are_stored_per_block(tmp_path):
@@ -146,9 +150,9 @@ def test_prediction_from_copied_files(place, tmp_path):
     common = lay_out(PlannedPrediction(setting, 120.0), tmp_path / "there")
     places = ObserverPoses(np.array([[1.0, 2, 1.6]] * 2), np.array([[1.0, 0, 0], [-1.0, 0, 0]]))
     predict_part(common, places, tmp_path / "f.npz")
-    found = read_prediction(tmp_path / "f.npz")
-    assert found.share.shape == (2, 3) and np.array_equal(found.share[0], found.share[1])
-    assert found.visible[0].any() and not found.visible[1].any()
+    result = read_prediction(tmp_path / "f.npz")
+    assert result.share.shape == (2, 3) and np.array_equal(result.share[0], result.share[1])
+    assert result.visible[0].any() and not result.visible[1].any()
 
 
 def test_gaze_field_includes_its_training_geometry(tmp_path, rgb):
@@ -168,9 +172,9 @@ RULES = VisitRules()
 
 
 def counting(**changes):
-    things = [BoxAoi(Region.create("sign", *SIGN)), BoxAoi(Region.create("stand", *STAND))]
+    aois = [BoxAoi(Region.create("sign", *SIGN)), BoxAoi(Region.create("stand", *STAND))]
     around = GazeScene(None, None, Similarity())
-    made = AoiContext(around, things, ("sign", "stand", "both"), [(0,), (1,), (0, 1)], (0, 1), RULES, 0.0)
+    made = AoiContext(around, aois, ("sign", "stand", "both"), [(0,), (1,), (0, 1)], (0, 1), RULES, 0.0)
     return replace(made, **changes)
 
 
@@ -178,17 +182,17 @@ def test_blocks_contain_whole_sessions_and_all_samples():
     rays = people(7, 60)
     # Two sittings each: a pause of two minutes in the middle.
     rays = replace(rays, t=rays.t + 120.0 * (rays.t >= 6))
-    whole = merge_sums([count_block(rays, counting())])
-    for most in (1, 50, 100, 10_000):
-        blocks = list(iter_blocks(rays, RULES, most))
+    whole_result = merge_sums([count_block(rays, counting())])
+    for max_count in (1, 50, 100, 10_000):
+        blocks = list(iter_blocks(rays, RULES, max_count))
         assert sum(len(b) for b in blocks) == len(rays)
-        if most == 1:
+        if max_count == 1:
             assert [len(b) for b in blocks] == [30] * 14
         for b in blocks:
             assert not (np.diff(b.person) < 0).any()
-        found = merge_sums(count_block(b, counting()) for b in blocks)
+        result = merge_sums(count_block(b, counting()) for b in blocks)
         for name in ("time", "dwell_time", "visits", "first_visit_sum", "transitions", "sessions"):
-            assert np.allclose(getattr(found, name), getattr(whole, name)), name
+            assert np.allclose(getattr(result, name), getattr(whole_result, name)), name
 
 
 def test_session_across_dataset_parts_is_one_session(tmp_path):
@@ -203,7 +207,7 @@ def test_session_across_dataset_parts_is_one_session(tmp_path):
         lines.append(",".join([repr(float(rays.t[k])), rays.persons[rays.person[k]], *map(repr, numbers)]))
     (tmp_path / "day.csv").write_text("\n".join(lines))
     columns = "origin=x,y,z direction=a,b,c t=t person=p"
-    found = {}
+    result = {}
     for rows in (50, dataset_write.PART_ROWS):
         before = dataset_write.PART_ROWS
         dataset_write.PART_ROWS = rows
@@ -212,10 +216,10 @@ def test_session_across_dataset_parts_is_one_session(tmp_path):
             nerg.import_rays(tmp_path / "day.csv", columns=columns, output=name)
         finally:
             dataset_write.PART_ROWS = before
-        found[rows] = merge_sums(count_block(b, counting()) for b in iter_blocks(name, RULES))
+        result[rows] = merge_sums(count_block(b, counting()) for b in iter_blocks(name, RULES))
         if rows == 50:
             assert len(dataset.RayDataset.open(name).parts) > 4 and dataset and dataset
-    a, b = found.values()
+    a, b = result.values()
     for name in ("time", "dwell_time", "visits", "first_visit_sum", "sessions"):
         order = [a.rows.index(row) for row in b.rows]
         assert np.allclose(getattr(a, name)[order], getattr(b, name)), name
@@ -271,8 +275,8 @@ def test_facing_directions_are_head_directions():
     rays = people(2, 3)
     head = np.tile(np.array([0, 1, 0], np.float32), (6, 1))
     head[0] = np.nan
-    found = facing_directions(replace(rays, head=head))
-    assert np.array_equal(found[0], rays.direction[0]) and np.allclose(found[1:], [0, 1, 0])
+    result = facing_directions(replace(rays, head=head))
+    assert np.array_equal(result[0], rays.direction[0]) and np.allclose(result[1:], [0, 1, 0])
     assert facing_directions(rays) is rays.direction
 
 
@@ -280,6 +284,6 @@ def test_viewpoints_cover_all_participants():
     picker = ViewpointSampler(100)
     for block in iter_blocks(people(5, 80), RULES, 100):
         picker.add(block, counting())
-    eyes = picker.viewpoints()
-    assert set(eyes.participants) == {f"name {k}" for k in range(5)} and 5 <= len(eyes.participants) <= 10
-    assert all(ALL in cells for cells in eyes.cells) and eyes.positions.shape == eyes.facing.shape
+    observers = picker.viewpoints()
+    assert set(observers.participants) == {f"name {k}" for k in range(5)} and 5 <= len(observers.participants) <= 10
+    assert all(ALL in cells for cells in observers.cells) and observers.positions.shape == observers.facing.shape

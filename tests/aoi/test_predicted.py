@@ -56,7 +56,7 @@ class Law(GazeScene):
 
 AROUND = Law(None, None, Similarity())
 
-EYES = Viewpoints(
+OBSERVERS = Viewpoints(
     np.array([[0.0, 0, 0], [0, 0, 0.2], [0, 0, 0]]),
     np.tile([1.0, 0, 0], (3, 1)),
     ("Ada", "Ada", "Bo"),
@@ -66,33 +66,33 @@ EYES = Viewpoints(
 
 def test_shares_are_integrals():
     # A cube of which the eye sees a face of 2 x 2 at x = 1: a sixth of the sphere; of the hemisphere's gaze 2/3.
-    things = [
+    aois = [
         BoxAoi(Region.create("ahead", [1, -1, -1], [2, 1, 1])),
         BoxAoi(Region.create("behind", [-2, -1, -1], [-1, 1, 1])),
     ]
-    found = predict_attention(AROUND, EYES, things, [(0,), (1,), (0, 1)], 0.0, 120.0, 24, 1 << 15, SILENT)
-    assert np.allclose(found.share[0], [2 / 9, 1 / 9, 3 / 9], rtol=2e-3)
+    result = predict_attention(AROUND, OBSERVERS, aois, [(0,), (1,), (0, 1)], 0.0, 120.0, 24, 1 << 15, SILENT)
+    assert np.allclose(result.share[0], [2 / 9, 1 / 9, 3 / 9], rtol=2e-3)
     # The mean distance to a square face, over its solid angle, by quadrature in its plane.
     u = (np.arange(400) + 0.5) / 200 - 1
     y, z = np.meshgrid(u, u)
     r2 = 1 + y**2 + z**2
     mean = (r2**-1.5 * np.sqrt(r2)).sum() / (r2**-1.5).sum()
-    assert found.distance[0, 0] / found.share[0, 0] == pytest.approx(mean, rel=2e-3)
-    assert found.visible.tolist() == [[True, False, True]] * 3 and found.support.tolist() == [7, 7, 7]
+    assert result.distance[0, 0] / result.share[0, 0] == pytest.approx(mean, rel=2e-3)
+    assert result.visible.tolist() == [[True, False, True]] * 3 and result.support.tolist() == [7, 7, 7]
 
 
 def test_prediction_is_aggregated_by_participant():
-    things = [BoxAoi(Region.create("ahead", [1, -1, -1], [2, 1, 1]))]
-    found = predict_attention(AROUND, EYES, things, [(0,)], 0.0, 120.0, 24, 4096, SILENT)
-    people = aggregate_by_participant(found, EYES, ALL, {"Ada": 3.0, "Bo": 6.0}, 0.3)
+    aois = [BoxAoi(Region.create("ahead", [1, -1, -1], [2, 1, 1]))]
+    result = predict_attention(AROUND, OBSERVERS, aois, [(0,)], 0.0, 120.0, 24, 4096, SILENT)
+    people = aggregate_by_participant(result, OBSERVERS, ALL, {"Ada": 3.0, "Bo": 6.0}, 0.3)
     assert people.names == ("Ada", "Bo")
-    share = found.share[:2].mean(axis=0)
+    share = result.share[:2].mean(axis=0)
     assert people.dwell_time[0] == pytest.approx(3 * share)
     # Ten glances, five from each place.
-    missed = np.prod([(1 - s) ** 5 for s in found.share[:2, 0]])
+    missed = np.prod([(1 - s) ** 5 for s in result.share[:2, 0]])
     assert people.hit_probability[0, 0] == pytest.approx(1 - missed)
-    (bo,) = aggregate_by_participant(found, EYES, Cell("zone", "z"), {"Bo": 6.0}, 0.3).names
-    assert bo == "Bo" and aggregate_by_participant(found, EYES, Cell("zone", "other"), {"Bo": 6.0}, 0.3) is None
+    (bo,) = aggregate_by_participant(result, OBSERVERS, Cell("zone", "z"), {"Bo": 6.0}, 0.3).names
+    assert bo == "Bo" and aggregate_by_participant(result, OBSERVERS, Cell("zone", "other"), {"Bo": 6.0}, 0.3) is None
 
 
 class Two(Law):
@@ -103,24 +103,28 @@ class Two(Law):
 
 
 def test_ensemble_members():
-    things = [
+    aois = [
         BoxAoi(Region.create("ahead", [1, -1, -1], [2, 1, 1])),
         BoxAoi(Region.create("behind", [-2, -1, -1], [-1, 1, 1])),
     ]
-    found = predict_attention(
-        Two(None, None, Similarity()), EYES, things, [(0,), (1,)], 0.0, 120.0, 24, 1 << 15, SILENT
+    result = predict_attention(
+        Two(None, None, Similarity()), OBSERVERS, aois, [(0,), (1,)], 0.0, 120.0, 24, 1 << 15, SILENT
     )
     # A sixth of the sphere each: evenly of both, and 10/11 or 1/11 of a hemisphere's third by one.
-    assert found.members.shape == (2, 3, 2) and np.allclose(found.share[0], 1 / 6, rtol=3e-3)
-    assert np.allclose(found.members[:, 0], [[10 / 33, 1 / 33], [1 / 33, 10 / 33]], rtol=3e-3)
-    assert predict_attention(AROUND, EYES, things, [(0,), (1,)], 0.0, 120.0, 24, 64, SILENT).members.shape == (1, 3, 2)
+    assert result.members.shape == (2, 3, 2) and np.allclose(result.share[0], 1 / 6, rtol=3e-3)
+    assert np.allclose(result.members[:, 0], [[10 / 33, 1 / 33], [1 / 33, 10 / 33]], rtol=3e-3)
+    assert predict_attention(AROUND, OBSERVERS, aois, [(0,), (1,)], 0.0, 120.0, 24, 64, SILENT).members.shape == (
+        1,
+        3,
+        2,
+    )
 
 
 def test_participants_are_subsampled():
     names = tuple(f"{k // 2:04d}" for k in range(400))
     many = Viewpoints(np.arange(1200.0).reshape(400, 3), np.ones((400, 3)), names, (frozenset([ALL]),) * 400)
-    told = Recorder()
-    some = subsample_participants(many, 50, told)
+    recorder = Recorder()
+    some = subsample_participants(many, 50, recorder)
     assert (
         len(set(some.participants)) == 50
         and len(some.participants) == 100
@@ -132,7 +136,7 @@ def test_participants_are_subsampled():
     back = np.arange(400)[::-1]
     turned = subsample_participants(Viewpoints(many.positions[back], many.facing, names[::-1], many.cells), 50, SILENT)
     assert set(turned.participants) == set(some.participants) and subsample_participants(many, 200, SILENT) is many
-    assert "50 of 200 participants" in told.messages[0]
+    assert "50 of 200 participants" in recorder.messages[0]
 
 
 # ---- Places on the floor where nobody was tracked ----
@@ -140,14 +144,14 @@ def test_participants_are_subsampled():
 
 def test_observers_are_placed_on_the_floor(tmp_path):
     around = load_gaze_scene(write_place(tmp_path, gaze=False), None, None, None, ns)
-    found = place_observers_on_floor(around, 1.6, 0.25, 0.0)
-    inside = ((found[:, :2] > (2.5, 1.0)) & (found[:, :2] < (2.9, 2.0))).all(axis=1)
-    assert 330 < len(found) < 24 * 16 and not inside.any() and np.allclose(found[:, 2], 1.6)
+    result = place_observers_on_floor(around, 1.6, 0.25, 0.0)
+    inside = ((result[:, :2] > (2.5, 1.0)) & (result[:, :2] < (2.9, 2.0))).all(axis=1)
+    assert 330 < len(result) < 24 * 16 and not inside.any() and np.allclose(result[:, 2], 1.6)
     with pytest.raises(NergError, match="--floor"):
         place_observers_on_floor(around, 1.6, 0.25, -2.0)
     rows = isovist_rows(
         compute_isovists(
-            found[:4], around.trace_depth, SamplePoints.sample([BoxAoi(Region.create("s", *SIGN))], 24), 0.01, 9.0
+            result[:4], around.trace_depth, SamplePoints.sample([BoxAoi(Region.create("s", *SIGN))], 24), 0.01, 9.0
         ),
         ("s", "g"),
         [(0,), (0,)],
@@ -156,25 +160,25 @@ def test_observers_are_placed_on_the_floor(tmp_path):
 
 
 def test_observers_have_names():
-    eyes = viewpoints_at(np.zeros((12, 3)))
-    assert eyes.participants[0] == "observer 01" and len(set(eyes.participants)) == 12
+    observers = viewpoints_at(np.zeros((12, 3)))
+    assert observers.participants[0] == "observer 01" and len(set(observers.participants)) == 12
 
 
 # ---- What a count needs besides rays ----
 
 
 def setting(folder, scene=True, **options):
-    asked = StatisticsOptions(aois=folder / "areas.json", **options)
+    requested = StatisticsOptions(aois=folder / "areas.json", **options)
     place = folder / "scene.xml" if scene else None
-    return load_aoi_scene(place, None, None, read_areas(folder / "areas.json"), asked, namespace("llvm_ad_rgb"))
+    return load_aoi_scene(place, None, None, read_areas(folder / "areas.json"), requested, namespace("llvm_ad_rgb"))
 
 
 def test_cohorts_come_from_the_table_or_the_samples(tmp_path, rgb):
     write_place(tmp_path)
     (tmp_path / "who.csv").write_text("person,cohort\na,old\nb,new\n")
-    found = setting(tmp_path)
-    assert found.members == [(0,), (1,), (0, 1)] and found.margin == 0.03
-    assert found.make_context(False, ("x",)).cohort_names == ("x",) and found.make_context(True, ()).use_hit_points
+    result = setting(tmp_path)
+    assert result.members == [(0,), (1,), (0, 1)] and result.margin == 0.03
+    assert result.make_context(False, ("x",)).cohort_names == ("x",) and result.make_context(True, ()).use_hit_points
     table = setting(tmp_path, cohorts=tmp_path / "who.csv").make_context(False, ("x",))
     assert table.cohort_names == ("new", "old") and list(table.transition_areas) == [0, 1]
 
@@ -185,8 +189,8 @@ def test_aois_occlude_each_other_without_geometry(tmp_path, rgb):
         (tmp_path / "areas.json").read_text().replace('"shape": "stand"', '"min": [2.5, 1, 0], "max": [2.9, 2, 2.2]')
     )
     (tmp_path / "areas.json").write_text(areas)
-    found = setting(tmp_path, scene=False, aoi_visibility=True)
-    depth = found._trace_depth(np.array([[0.0, 1.6, 1.5], [0, 2.4, 1.5]]), np.array([[1.0, 0, 0]] * 2))
+    result = setting(tmp_path, scene=False, aoi_visibility=True)
+    depth = result._trace_depth(np.array([[0.0, 1.6, 1.5], [0, 2.4, 1.5]]), np.array([[1.0, 0, 0]] * 2))
     assert np.allclose(depth, (2.5, 4.0))
 
 
@@ -210,7 +214,7 @@ TRUST_EYES = Viewpoints(
 TIMES = {ALL: {"Ada": 2.0, "Bo": 6.0}, ZONE: {"Ada": 1.0}}
 
 
-def foretold(*members, support=(1.0, 8.0, 3.0)):
+def make_prediction(*members, support=(1.0, 8.0, 3.0)):
     each = np.array(members, float)[:, :, None]
     return PredictedAttention(each.mean(axis=0), each.mean(axis=0), each.mean(axis=0) > 0, np.array(support), each)
 
@@ -222,9 +226,9 @@ def rows():
 
 
 def test_uncertainty_of_each_cell():
-    found = rows()
-    add_uncertainty(found, foretold([0.1, 0.3, 0.4], [0.2, 0.2, 0.2]), TRUST_EYES, TIMES, 0.3)
-    tracked, field, _, zone = found
+    result = rows()
+    add_uncertainty(result, make_prediction([0.1, 0.3, 0.4], [0.2, 0.2, 0.2]), TRUST_EYES, TIMES, 0.3)
+    tracked, field, _, zone = result
     assert tracked["support"] is tracked["share_spread"] is None
     assert field["support"] == 3 and zone["support"] == 8
     assert (field["viewpoints"], zone["viewpoints"], tracked["viewpoints"]) == (1.5, 1.0, None)
@@ -235,40 +239,40 @@ def test_uncertainty_of_each_cell():
 
 
 def test_uncertainty_is_none_for_single_fields_and_suppressed_rows():
-    found = rows()
-    add_uncertainty(found, foretold([0.1, 0.3, 0.4]), TRUST_EYES, TIMES, 0.3)
-    assert all(row["share_spread"] is None for row in found)
+    result = rows()
+    add_uncertainty(result, make_prediction([0.1, 0.3, 0.4]), TRUST_EYES, TIMES, 0.3)
+    assert all(row["share_spread"] is None for row in result)
     blank = [row | {"participants": None, "share": None} for row in rows()]
-    add_uncertainty(blank, foretold([0.1, 0.3, 0.4], [0.2, 0.2, 0.2]), TRUST_EYES, TIMES, 0.3)
+    add_uncertainty(blank, make_prediction([0.1, 0.3, 0.4], [0.2, 0.2, 0.2]), TRUST_EYES, TIMES, 0.3)
     assert all(row["share_spread"] is row["support"] is None for row in blank)
     assert blank[1]["dwell_spread"] is not None
 
 
 def test_missing_support_is_reported():
-    told = Recorder()
-    warn_missing_support(foretold([0.1, 0.3, 0.4]), told)
-    assert told.messages == []
-    none = foretold([0.1, 0.3, 0.4], support=(np.nan,) * 3)
-    assert median_support(none) is None and median_support(foretold([1, 1, 1]), np.zeros(3, bool)) is None
-    warn_missing_support(none, told)
-    assert "does not contain training support" in told.messages[0] and "nerg train gaze" in told.messages[0]
+    recorder = Recorder()
+    warn_missing_support(make_prediction([0.1, 0.3, 0.4]), recorder)
+    assert recorder.messages == []
+    none = make_prediction([0.1, 0.3, 0.4], support=(np.nan,) * 3)
+    assert median_support(none) is None and median_support(make_prediction([1, 1, 1]), np.zeros(3, bool)) is None
+    warn_missing_support(none, recorder)
+    assert "does not contain training support" in recorder.messages[0] and "nerg train gaze" in recorder.messages[0]
 
 
 def test_few_viewpoints_are_reported():
-    told = Recorder()
-    warn_few_viewpoints(TRUST_EYES, told)
+    recorder = Recorder()
+    warn_few_viewpoints(TRUST_EYES, recorder)
     assert (
-        len(told.messages) == 1
-        and "1.5 viewpoints per participant" in told.messages[0]
-        and "--viewpoints 32 " in told.messages[0]
+        len(recorder.messages) == 1
+        and "1.5 viewpoints per participant" in recorder.messages[0]
+        and "--viewpoints 32 " in recorder.messages[0]
     )
     count = 2 * MIN_VIEWPOINTS
     many = Viewpoints(
         np.zeros((count, 3)), np.ones((count, 3)), ("Ada", "Bo") * MIN_VIEWPOINTS, (frozenset([ALL]),) * count
     )
-    warn_few_viewpoints(many, told)
-    warn_few_viewpoints(Viewpoints(np.zeros((0, 3)), np.zeros((0, 3)), (), ()), told)
-    assert len(told.messages) == 1
+    warn_few_viewpoints(many, recorder)
+    warn_few_viewpoints(Viewpoints(np.zeros((0, 3)), np.zeros((0, 3)), (), ()), recorder)
+    assert len(recorder.messages) == 1
 
 
 # ---- The table of a change, from foretold numbers that are known ----
@@ -277,7 +281,7 @@ AREAS = AreaSet((Region.create("a", [0, 0, 0], [1, 1, 1]), Region.create("b", [2
 WHAT_IF_EYES = viewpoints_at(np.arange(15.0).reshape(5, 3))
 
 
-def told(share, support=5.0, members=1):
+def texts(share, support=5.0, members=1):
     """Of an ensemble the members differ by 0.1 times their number from the first, at the first eye."""
     share = np.asarray(share, float)
     each = np.stack([share + 0.1 * k * (np.arange(len(share)) == 0)[:, None] for k in range(members)])
@@ -286,55 +290,55 @@ def told(share, support=5.0, members=1):
 
 def rows_what_if(tmp_path, changes, after, floor=None, members=1):
     (tmp_path / "c.json").write_text(json.dumps(changes))
-    asked = []
+    requested = []
 
-    def foretell(there, eyes):
-        asked.append((eyes, there.areas, there.aois))
+    def predict(expected, observers):
+        requested.append((observers, expected.areas, expected.aois))
         return after
 
-    before = told([[0.1, 0], [0.2, 0], [0.1, 0], [0.2, 0], [0.15, 0]], members=members)
-    around, things = GazeScene(None, None, Similarity()), make_aois(AREAS.elements, {}, {})
-    setting = AoiScene(around, AREAS, things, StatisticsOptions(), {})
-    found = what_if_rows(
-        tmp_path / "c.json", setting, WHAT_IF_EYES, before, foretell, floor or MinParticipantsFilter(), 199, 0
+    before = texts([[0.1, 0], [0.2, 0], [0.1, 0], [0.2, 0], [0.15, 0]], members=members)
+    around, aois = GazeScene(None, None, Similarity()), make_aois(AREAS.elements, {}, {})
+    setting = AoiScene(around, AREAS, aois, StatisticsOptions(), {})
+    result = what_if_rows(
+        tmp_path / "c.json", setting, WHAT_IF_EYES, before, predict, floor or MinParticipantsFilter(), 199, 0
     )
-    return {(r["aoi"], r["measure"]): r for r in found}, asked[0]
+    return {(r["aoi"], r["measure"]): r for r in result}, requested[0]
 
 
 def test_what_if_pairs_participants(tmp_path):
-    after = told([[0.2, 0.1], [0.3, 0.1], [0.21, 0.1], [0.29, 0.1], [0.25, 0.1]])
-    found, (eyes, areas, things) = rows_what_if(tmp_path, {"move": [{"area": "a", "by": [5, 0, 0]}]}, after)
-    share = found["a", "share"]
+    after = texts([[0.2, 0.1], [0.3, 0.1], [0.21, 0.1], [0.29, 0.1], [0.25, 0.1]])
+    result, (observers, areas, aois) = rows_what_if(tmp_path, {"move": [{"area": "a", "by": [5, 0, 0]}]}, after)
+    share = result["a", "share"]
     assert share["before"] == pytest.approx(0.15) and share["after"] == pytest.approx(0.25)
     assert share["difference"] == pytest.approx(0.1) and 0.08 < share["low"] < 0.1 < share["high"] < 0.12
     assert share["support"] == 5 and share["source"] == "predicted" and share["participants"] == 5
-    assert found["b", "visible"]["after"] == 1 and found["b", "visible"]["before"] == 0
-    assert areas.boxes[0].lower[0] == 5 and eyes is WHAT_IF_EYES and len(things) == 2
+    assert result["b", "visible"]["after"] == 1 and result["b", "visible"]["before"] == 0
+    assert areas.boxes[0].lower[0] == 5 and observers is WHAT_IF_EYES and len(aois) == 2
 
 
 def test_what_if_with_other_observers(tmp_path):
-    after = told([[0.5, 0.5]] * 2)
-    found, (eyes, *_) = rows_what_if(tmp_path, {"observers": [[9, 9, 9], [8, 8, 8]], "shift": [0, 0, 1]}, after)
-    assert eyes.positions.tolist() == [[9, 9, 10], [8, 8, 9]]
-    assert found["a", "share"]["after"] == 0.5 and found["a", "share"]["before"] == pytest.approx(0.15)
+    after = texts([[0.5, 0.5]] * 2)
+    result, (observers, *_) = rows_what_if(tmp_path, {"observers": [[9, 9, 9], [8, 8, 8]], "shift": [0, 0, 1]}, after)
+    assert observers.positions.tolist() == [[9, 9, 10], [8, 8, 9]]
+    assert result["a", "share"]["after"] == 0.5 and result["a", "share"]["before"] == pytest.approx(0.15)
 
 
 def test_what_if_suppresses_few_participants(tmp_path):
     floor = MinParticipantsFilter(9)
-    found, _ = rows_what_if(tmp_path, {"shift": [0, 0, 1]}, told([[0.2, 0.1]] * 5), floor)
-    assert all(r["before"] is None and r["difference"] is None for r in found.values()) and floor.num_suppressed == 4
+    result, _ = rows_what_if(tmp_path, {"shift": [0, 0, 1]}, texts([[0.2, 0.1]] * 5), floor)
+    assert all(r["before"] is None and r["difference"] is None for r in result.values()) and floor.num_suppressed == 4
 
 
 def test_what_if_spread_over_members(tmp_path):
-    after = told([[0.2, 0.1]] * 5, members=2)
-    found, _ = rows_what_if(tmp_path, {"shift": [0, 0, 1]}, after, members=2)
+    after = texts([[0.2, 0.1]] * 5, members=2)
+    result, _ = rows_what_if(tmp_path, {"shift": [0, 0, 1]}, after, members=2)
     # Both move alike, of which the mean says nothing; then only one of them.
-    assert found["a", "share"]["difference_spread"] == pytest.approx(0, abs=1e-12)
-    assert found["a", "visible"]["difference_spread"] is None
-    found, _ = rows_what_if(tmp_path, {"shift": [0, 0, 1]}, replace(after, members=after.members[[0, 0]]), members=2)
-    assert found["a", "share"]["difference_spread"] == pytest.approx(0.1 / 5 / np.sqrt(2))
+    assert result["a", "share"]["difference_spread"] == pytest.approx(0, abs=1e-12)
+    assert result["a", "visible"]["difference_spread"] is None
+    result, _ = rows_what_if(tmp_path, {"shift": [0, 0, 1]}, replace(after, members=after.members[[0, 0]]), members=2)
+    assert result["a", "share"]["difference_spread"] == pytest.approx(0.1 / 5 / np.sqrt(2))
     assert (
-        rows_what_if(tmp_path, {"shift": [0, 0, 1]}, told([[0.2, 0.1]] * 5))[0]["a", "share"]["difference_spread"]
+        rows_what_if(tmp_path, {"shift": [0, 0, 1]}, texts([[0.2, 0.1]] * 5))[0]["a", "share"]["difference_spread"]
         is None
     )
 
@@ -357,5 +361,5 @@ def test_unused_mesh_content_is_reported_once(tmp_path):
 
 
 def test_what_if_without_support(tmp_path):
-    found, _ = rows_what_if(tmp_path, {"shift": [0, 0, 1]}, told([[0.2, 0.1]] * 5, np.nan))
-    assert all(row["support"] is None for row in found.values())
+    result, _ = rows_what_if(tmp_path, {"shift": [0, 0, 1]}, texts([[0.2, 0.1]] * 5, np.nan))
+    assert all(row["support"] is None for row in result.values())

@@ -49,7 +49,7 @@ def change(scene, tmp_path, **changes):
     return apply_to_scene(scene, made, read_meshes(made.meshes))
 
 
-def things(areas, shapes):
+def aois(areas, shapes):
     return make_aois(areas, shapes, read_meshes(AreaSet(tuple(areas)).meshes))
 
 
@@ -96,21 +96,23 @@ def test_areas_follow_shapes(tmp_path):
     areas = AreaSet(
         (box, SceneShape("stand", "stand"), AreaGroup("all", ("shelf", "stand")), AreaGroup("g", ("stand",)))
     )
-    found = apply_to_areas(
+    result = apply_to_areas(
         areas, written(tmp_path, move=[{"area": "shelf", "by": [1, 0, 0], "turn": 90}], remove=["stand"])
     )
-    assert found.names == ("shelf", "all") and found.element_indices()["all"] == (0,)
-    assert np.allclose(found.boxes[0].bounds, [[4.6, 1.9, 1.0], [5.6, 2.1, 2.0]])
-    more = apply_to_areas(areas, written(tmp_path, add=[{"name": "x", "min": [0, 0, 0], "max": [1, 1, 1]}]))
-    assert more.areas[-1] == SceneShape("x", "x")
+    assert result.names == ("shelf", "all") and result.element_indices()["all"] == (0,)
+    assert np.allclose(result.boxes[0].bounds, [[4.6, 1.9, 1.0], [5.6, 2.1, 2.0]])
+    options = apply_to_areas(areas, written(tmp_path, add=[{"name": "x", "min": [0, 0, 0], "max": [1, 1, 1]}]))
+    assert options.areas[-1] == SceneShape("x", "x")
     for wrong in ("stand", "nobody"):
         with pytest.raises(NergError, match="cannot be moved as an area"):
             apply_to_areas(areas, written(tmp_path, move=[{"area": wrong}]))
 
 
 def test_observers_are_changed(tmp_path):
-    found = written(tmp_path, observers=[[1, 2, 3]], shift=[0, 0, -0.5])
-    assert found.observers.tolist() == [[1, 2, 3]] and found.shift.tolist() == [0, 0, -0.5] and not found.changes_shapes
+    result = written(tmp_path, observers=[[1, 2, 3]], shift=[0, 0, -0.5])
+    assert (
+        result.observers.tolist() == [[1, 2, 3]] and result.shift.tolist() == [0, 0, -0.5] and not result.changes_shapes
+    )
 
 
 @pytest.mark.parametrize(
@@ -160,9 +162,9 @@ def test_changes_need_a_scene(tmp_path):
     ],
 )
 def test_malformed_changes_are_refused(tmp_path, changes):
-    with pytest.raises(NergError) as told:
+    with pytest.raises(NergError) as texts:
         written(tmp_path, **changes)
-    assert str(tmp_path) in str(told.value) and "\n" not in str(told.value)
+    assert str(tmp_path) in str(texts.value) and "\n" not in str(texts.value)
 
 
 # ---- Cohorts of people from a table ----
@@ -210,13 +212,15 @@ def test_depths_match_the_shapes(folder):
 
 def test_gaze_field_of_the_scene_or_of_a_file(folder):
     d = np.array([[1.0, 0, 0], [0, 1, 0]])
-    own = load_gaze_scene(folder / "scene.xml", None, None, None, ns)
+    subset = load_gaze_scene(folder / "scene.xml", None, None, None, ns)
     beside = load_gaze_scene(folder / "bare" / "scene.xml", None, folder / "gaze.safetensors", None, ns)
     eye = np.array([1.0, 1.0, 1.5])
-    found, other = own.query_from(eye)(d), beside.query_from(eye)(d)
-    assert found[0].shape == (1, 2) and np.allclose(found[0], other[0], rtol=1e-4)
-    assert np.allclose(found[1], own.trace_depth(np.broadcast_to(eye, d.shape), d)) and np.allclose(found[1], other[1])
-    assert np.isnan(own.support_at(eye))
+    result, other = subset.query_from(eye)(d), beside.query_from(eye)(d)
+    assert result[0].shape == (1, 2) and np.allclose(result[0], other[0], rtol=1e-4)
+    assert np.allclose(result[1], subset.trace_depth(np.broadcast_to(eye, d.shape), d)) and np.allclose(
+        result[1], other[1]
+    )
+    assert np.isnan(subset.support_at(eye))
 
 
 def test_frames(folder):
@@ -260,7 +264,7 @@ def test_aois_of_each_kind(scene_things, tmp_path):
         MeshPart("far", tmp_path / "two.obj", ((1, 1),)),
         SceneShape("stand", "stand"),
     ]
-    made = things(areas, shapes_by_id(scene_things))
+    made = aois(areas, shapes_by_id(scene_things))
     assert [t.name for t in made] == ["box", "both", "far", "stand"] and [t.is_surface for t in made] == [
         False,
         True,
@@ -276,9 +280,7 @@ def test_aois_of_each_kind(scene_things, tmp_path):
 
 def test_sample_points_lie_on_the_surface(scene_things, tmp_path):
     (tmp_path / "two.obj").write_text(TWO)
-    both, stand = things(
-        [MeshPart("m", tmp_path / "two.obj"), SceneShape("stand", "stand")], shapes_by_id(scene_things)
-    )
+    both, stand = aois([MeshPart("m", tmp_path / "two.obj"), SceneShape("stand", "stand")], shapes_by_id(scene_things))
     points, normals = both.sample_points(64)
     assert points.shape == (64, 3) and not normals.any()
     assert (np.isclose(points[:, 0], 1) | np.isclose(points[:, 0], 3)).all() and 20 < np.isclose(
@@ -306,10 +308,10 @@ def test_missing_shapes_and_faces_are_refused(scene_things, tmp_path):
     with pytest.raises(NergError, match="use a scene"):
         find_shape(shapes_by_id(None), "x")
     with pytest.raises(NergError, match="there is no mesh"):
-        things([MeshPart("m", tmp_path / "none.ply")], {})
+        aois([MeshPart("m", tmp_path / "none.ply")], {})
     (tmp_path / "two.obj").write_text(TWO)
     with pytest.raises(NergError, match="face 2"):
-        things([MeshPart("m", tmp_path / "two.obj", ((0, 2),))], {})
+        aois([MeshPart("m", tmp_path / "two.obj", ((0, 2),))], {})
 
 
 def test_meshes_keep_their_names_in_a_scene():

@@ -125,10 +125,10 @@ def test_lines_of_sight_and_fields_of_view():
     (wedges,) = [c for c in page.axes[0].collections if isinstance(c, PatchCollection)]
     for path, o, e in zip(wedges.get_paths(), origins, ends):
         away = path.vertices - o
-        reach = np.linalg.norm(away, axis=1).max()
-        assert reach == pytest.approx(np.linalg.norm(e - o), rel=0.02)
-        tip = away[np.linalg.norm(away, axis=1) > 0.5 * reach]
-        angle = np.degrees(np.arccos(np.clip((tip / np.linalg.norm(tip, axis=1)[:, None]) @ ((e - o) / reach), -1, 1)))
+        extent = np.linalg.norm(away, axis=1).max()
+        assert extent == pytest.approx(np.linalg.norm(e - o), rel=0.02)
+        tip = away[np.linalg.norm(away, axis=1) > 0.5 * extent]
+        angle = np.degrees(np.arccos(np.clip((tip / np.linalg.norm(tip, axis=1)[:, None]) @ ((e - o) / extent), -1, 1)))
         assert angle.max() == pytest.approx(20, abs=1.5)
     names = [t.get_text() for t in page.axes[0].get_legend().get_texts()]
     assert names == ["lines of sight", "field of view, 40°"]
@@ -211,9 +211,9 @@ def test_layout_shows_dimensions(rays):
 # ---- Pictures of statistics: what is drawn is what the rows say ----
 
 
-def row(thing, source, share):
+def row(aoi, source, share):
     return dict(
-        aoi=thing, source=source, share=share, share_low=share / 2, share_high=2 * share, hit_ratio=None, dwell=1.0
+        aoi=aoi, source=source, share=share, share_low=share / 2, share_high=2 * share, hit_ratio=None, dwell=1.0
     )
 
 

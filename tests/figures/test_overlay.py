@@ -84,7 +84,7 @@ X, Y = np.meshgrid(np.linspace(0, 1, 24), np.linspace(0, 1, 16))
 LAYERS = OverlayLayers(np.repeat(X[..., None], 3, -1), 2 * Y, X > 0.1, (5.0, 4.0))
 
 
-@pytest.mark.parametrize("name", [of.name for aov in AOVS.values() for of in list_overlays(aov)])
+@pytest.mark.parametrize("name", [index.name for aov in AOVS.values() for index in list_overlays(aov)])
 def test_each_overlay_is_drawn(name, tmp_path):
     overlay = find_overlay(name)
     limits = overlay.limits(LAYERS)

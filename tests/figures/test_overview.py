@@ -62,8 +62,8 @@ def test_main_direction_and_mean_target():
     assert seen.main_direction @ towards > np.cos(np.radians(4))
     depth, _ = room()(np.array([[4, 3, 1.5]]), towards[None])
     assert np.linalg.norm(seen.mean_target() - (seen.observer + depth[0] * towards)) < 0.6
-    nothing = seen_from((4, 3, 1.5), lambda o, d: (np.zeros(len(d)), np.zeros(len(d))), lambda d: np.ones(len(d)))
-    assert nothing.median_depth == 0 and nothing.mean_target() is None
+    empty = seen_from((4, 3, 1.5), lambda o, d: (np.zeros(len(d)), np.zeros(len(d))), lambda d: np.ones(len(d)))
+    assert empty.median_depth == 0 and empty.mean_target() is None
 
 
 def test_camera_shows_the_observers_attention():
@@ -80,9 +80,9 @@ def test_camera_shows_the_observers_attention():
     )
     # The point that is looked at is in the picture, and not hidden.
     spot = np.array([8, 2.5, 1.6])
-    way = spot - shot.origin
-    depth, _ = trace(shot.origin[None], way[None] / np.linalg.norm(way))
-    assert depth[0] == pytest.approx(np.linalg.norm(way), abs=1e-6)
+    direction = spot - shot.origin
+    depth, _ = trace(shot.origin[None], direction[None] / np.linalg.norm(direction))
+    assert depth[0] == pytest.approx(np.linalg.norm(direction), abs=1e-6)
     ahead = (shot.target - shot.origin) / np.linalg.norm(shot.target - shot.origin)
     assert FRAME.pixels(shot.origin[None], ahead[None], spot[None], 48, 32)[0, 0] >= 0
 

@@ -20,10 +20,10 @@ LONGITUDE, LATITUDE = RNG.uniform(-np.pi, np.pi, 200), np.arcsin(RNG.uniform(-1,
 
 @pytest.mark.parametrize("name", PROJECTIONS)
 def test_projections_round_trip(name):
-    of = find_projection(name)
-    x, y = of.forward(LONGITUDE, LATITUDE)
-    longitude, latitude, inside = of.inverse(x, y)
-    assert inside.all() and of.summary and of.name == name
+    index = find_projection(name)
+    x, y = index.forward(LONGITUDE, LATITUDE)
+    longitude, latitude, inside = index.inverse(x, y)
+    assert inside.all() and index.summary and index.name == name
     np.testing.assert_allclose(longitude, LONGITUDE, atol=1e-9)
     np.testing.assert_allclose(latitude, LATITUDE, atol=1e-7)
 
@@ -99,11 +99,11 @@ def test_directions_on_the_map(projection, direction, place):
     bright = image.get_array()[..., 0] > 0.5
     paper = image.get_array().min(axis=-1) > 0.99
     y, x = np.nonzero(bright & ~paper)
-    found = (
+    result = (
         (x.mean() + 0.5) / image.get_array().shape[1] * 2 - 1,
         1 - 2 * (y.mean() + 0.5) / image.get_array().shape[0],
     )
-    assert found == pytest.approx(place, abs=0.08)
+    assert result == pytest.approx(place, abs=0.08)
 
 
 def test_unknown_pixels_are_hatched():

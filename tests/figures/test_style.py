@@ -115,12 +115,14 @@ def test_the_swatch_is_hatched():
 
 def test_provenance_is_complete(tmp_path):
     (tmp_path / "scene.xml").write_text("<scene/>")
-    about = make_provenance("nerg render", [tmp_path / "scene.xml"], 7, {"spp": 4})
-    found = json.loads(about.text()["Comment"])
-    assert found["inputs"] == {"scene.xml": hashlib.sha256(b"<scene/>").hexdigest()}
-    assert (found["what"], found["seed"], found["settings"]) == ("nerg render", 7, {"spp": 4})
-    assert found["versions"] == dict(nerg_mi=nerg_mi.__version__, mitsuba=mitsuba.__version__, drjit=drjit.__version__)
-    assert about.text()["Software"] == ", ".join(f"{k} {found['versions'][k]}" for k in ("nerg_mi", "mitsuba", "drjit"))
+    metadata = make_provenance("nerg render", [tmp_path / "scene.xml"], 7, {"spp": 4})
+    result = json.loads(metadata.text()["Comment"])
+    assert result["inputs"] == {"scene.xml": hashlib.sha256(b"<scene/>").hexdigest()}
+    assert (result["what"], result["seed"], result["settings"]) == ("nerg render", 7, {"spp": 4})
+    assert result["versions"] == dict(nerg_mi=nerg_mi.__version__, mitsuba=mitsuba.__version__, drjit=drjit.__version__)
+    assert metadata.text()["Software"] == ", ".join(
+        f"{k} {result['versions'][k]}" for k in ("nerg_mi", "mitsuba", "drjit")
+    )
 
 
 def test_provenance_excludes_users_and_paths(tmp_path):
@@ -146,10 +148,10 @@ def test_files_with_equal_names(tmp_path):
         (tmp_path / k).mkdir()
         (tmp_path / k / "day.csv").write_text(k)
     paths = [tmp_path / "a/day.csv", tmp_path / "b/day.csv", tmp_path / "a/day.csv"]
-    known = {paths[1]: "seen before"}
-    found = make_provenance("x", paths, checksums=known).inputs
-    assert found == {"day.csv": hashlib.sha256(b"a").hexdigest(), "day.csv (2)": "seen before"}
-    assert known[paths[0]] == found["day.csv"]
+    expected = {paths[1]: "seen before"}
+    result = make_provenance("x", paths, checksums=expected).inputs
+    assert result == {"day.csv": hashlib.sha256(b"a").hexdigest(), "day.csv (2)": "seen before"}
+    assert expected[paths[0]] == result["day.csv"]
 
 
 def test_missing_input_is_refused(tmp_path):
@@ -172,7 +174,7 @@ def test_existing_files_are_selected(tmp_path):
 RNG = np.random.default_rng(3)
 COLOR, GAZE = RNG.random((160, 200, 3)), RNG.random((160, 200))
 MASK = np.ones((160, 200), bool)
-ABOUT = Provenance("nerg render", {"scène.xml": "ab" * 32}, 5, {"spp": 2}, {"nerg_mi": "1"})
+METADATA = Provenance("nerg render", {"scène.xml": "ab" * 32}, 5, {"spp": 2}, {"nerg_mi": "1"})
 SVG = "{http://www.w3.org/2000/svg}"
 LINK = "{http://www.w3.org/1999/xlink}href"
 
@@ -183,14 +185,16 @@ def figure():
 
 def test_png_is_read_by_another_library(tmp_path):
     image = pytest.importorskip("PIL.Image", reason="Pillow is not installed")
-    save(figure(), tmp_path / "a.png", ABOUT)
-    with image.open(tmp_path / "a.png") as found:
-        assert json.loads(found.text["Comment"]) == json.loads(ABOUT.json()) and found.text["Software"] == "nerg_mi 1"
-        np.testing.assert_array_equal(np.asarray(found.convert("RGB")), rasterize(figure()))
+    save(figure(), tmp_path / "a.png", METADATA)
+    with image.open(tmp_path / "a.png") as result:
+        assert (
+            json.loads(result.text["Comment"]) == json.loads(METADATA.json()) and result.text["Software"] == "nerg_mi 1"
+        )
+        np.testing.assert_array_equal(np.asarray(result.convert("RGB")), rasterize(figure()))
 
 
 def test_svg_is_self_contained(tmp_path):
-    save(figure(), tmp_path / "a.svg", ABOUT)
+    save(figure(), tmp_path / "a.svg", METADATA)
     root = ElementTree.parse(tmp_path / "a.svg").getroot()
     links = [v for e in root.iter() for k, v in e.attrib.items() if k in ("href", LINK, "src")]
     assert links and all(v.startswith(("data:image/png;base64,", "#")) for v in links)
@@ -199,7 +203,7 @@ def test_svg_is_self_contained(tmp_path):
     texts = ["".join(e.itertext()) for e in root.iter(f"{SVG}text")]
     assert "Gaze" in texts and "gaze density [1/sr]" in texts and "0.5" in texts
     (said,) = [e.text for e in root.iter("{http://purl.org/dc/elements/1.1/}description")]
-    assert json.loads(said) == json.loads(ABOUT.json())
+    assert json.loads(said) == json.loads(METADATA.json())
     assert not list(root.iter("{http://purl.org/dc/elements/1.1/}date"))
 
 
@@ -208,15 +212,15 @@ def test_svg_image_has_exact_pixels(tmp_path):
     text = encode(figure(), ".svg").decode()
     parts = [base64.b64decode(p) for p in re.findall(r'base64,\s*([^"]+)"', text)]
     pictures = [np.asarray(image.open(io.BytesIO(p)).convert("RGB")) for p in parts]
-    (found,) = [p for p in pictures if p.shape[:2] == (160, 200)]
+    (result,) = [p for p in pictures if p.shape[:2] == (160, 200)]
     wanted = overlay(COLOR, GAZE, Heat(0.5), MASK)
     # Perhaps upside down, as matplotlib's transforms have it.
-    assert min(np.abs(v / 255 - wanted).max() for v in (found, found[::-1])) < 0.01
+    assert min(np.abs(v / 255 - wanted).max() for v in (result, result[::-1])) < 0.01
 
 
 @pytest.mark.parametrize("suffix", [".png", ".svg"])
 def test_files_are_reproducible(suffix):
-    assert encode(figure(), suffix, ABOUT.text()) == encode(figure(), suffix, ABOUT.text())
+    assert encode(figure(), suffix, METADATA.text()) == encode(figure(), suffix, METADATA.text())
 
 
 def test_other_formats_are_refused(tmp_path):
@@ -247,9 +251,9 @@ def value(name, factor=""):
 
 @pytest.mark.parametrize("top", [1.0, 0.8, 1.37, 23.0, 9999.0, 12345.0, 3.3e-4, 7e-12, 4e15, 1e-3])
 @pytest.mark.parametrize("most", [3, 5, 9])
-def test_linear_ticks(top, most):
-    places, names, factor = scale_ticks(0.0, top, most)
-    assert 2 <= len(places) <= most + 1 and len(set(names)) == len(names)
+def test_linear_ticks(top, max_count):
+    places, names, factor = scale_ticks(0.0, top, max_count)
+    assert 2 <= len(places) <= max_count + 1 and len(set(names)) == len(names)
     for place, name in zip(places, names):
         assert -1e-9 <= place <= 1 + 1e-9
         assert value(name, factor) == pytest.approx(place * top, abs=1e-6 * top)
@@ -270,8 +274,8 @@ def test_logarithmic_ticks(low, high):
     assert factor == "" and 2 <= len(places) <= 6
     for place, name in zip(places, names):
         text = name.translate(SUPER)
-        found = {"1": 1.0, "10": 10.0}.get(text) or 10.0 ** int(text[2:])
-        assert np.log10(found) == pytest.approx(np.log10(low) + place * np.log10(high / low), abs=1e-9)
+        result = {"1": 1.0, "10": 10.0}.get(text) or 10.0 ** int(text[2:])
+        assert np.log10(result) == pytest.approx(np.log10(low) + place * np.log10(high / low), abs=1e-9)
 
 
 def test_logarithmic_ticks_within_a_decade():

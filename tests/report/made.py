@@ -53,11 +53,11 @@ SHELF = Region.create("shelf", np.zeros(3), np.ones(3))
 def stage(boxes=(SHELF,)) -> Stage:
     path = np.stack([np.linspace(1, 3, 9), np.full(9, 2.0), np.full(9, 1.6)], axis=1)
     camera = ReportCamera(np.array([7.0, 6, 5]), np.array([2.0, 2, 1]))
-    eyes = np.array([[1.0, 2, 1.6], [3, 2, 1.6]])
-    return Stage(cube(), eyes, [path, path[:3]], boxes, np.array([0.0, 0, 1]), camera)
+    observers = np.array([[1.0, 2, 1.6], [3, 2, 1.6]])
+    return Stage(cube(), observers, [path, path[:3]], boxes, np.array([0.0, 0, 1]), camera)
 
 
-def whole(name: str = "shelf") -> Run:
+def whole_result(name: str = "shelf") -> Run:
     """Everything that can be shown; ``name``: what files, people and objects are called."""
     rays = crowd(400)
     picture = lambda words: ReportPicture(PNG, f"{words} {name}", f"{words} {name}.")

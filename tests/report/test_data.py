@@ -41,7 +41,7 @@ from nerg_mi.statistics.visits import HitAssignment
 from nerg_mi.train.geometry import TrainingGeometry
 from nerg_mi.transport.geometry import SceneGeometry
 from tests.evaluation.test_gaze import crowd
-from tests.report.made import bare, stage, whole
+from tests.report.made import bare, stage, whole_result
 
 # ---- What people could look at, in a hall of four walls where depths are known in closed form ----
 
@@ -60,7 +60,7 @@ def hall(rgb):
     return GazeSampler(field, place), place
 
 
-def things(boxes):
+def aois(boxes):
     return [Solid(box) for box in boxes], [(k,) for k in range(len(boxes))]
 
 
@@ -86,9 +86,9 @@ def test_density_at_visible_and_hidden_points(hall):
     points = np.array([on_wall, behind])
     away = points - eye
     direction = away / np.linalg.norm(away, axis=1, keepdims=True)
-    found = onlooker.density_at_points(eye, points, 0.02)
-    assert found[0] == pytest.approx(onlooker.density(eye, direction)[0], rel=1e-5) and found[0] > 0
-    assert found[1] == 0
+    result = onlooker.density_at_points(eye, points, 0.02)
+    assert result[0] == pytest.approx(onlooker.density(eye, direction)[0], rel=1e-5) and result[0] > 0
+    assert result[1] == 0
 
 
 def test_few_directions_suffice_for_normalization(hall):
@@ -100,9 +100,9 @@ def test_few_directions_suffice_for_normalization(hall):
 def test_viewpoints_per_participant_are_equal(hall):
     _, place = hall
     rays = crowd(1000)
-    eyes = sample_eye_positions(rays, place, 12)
-    assert np.bincount(eyes.participant).tolist() == [3, 3, 3, 3]
-    times = [np.flatnonzero((rays.origin == p).all(axis=1))[0] for p in eyes.positions[eyes.participant == 0]]
+    observers = sample_eye_positions(rays, place, 12)
+    assert np.bincount(observers.participant).tolist() == [3, 3, 3, 3]
+    times = [np.flatnonzero((rays.origin == p).all(axis=1))[0] for p in observers.positions[observers.participant == 0]]
     assert (np.diff(times) > 200).all()  # spread over the whole of the time
     few = sample_eye_positions(rays, place, 2)
     assert len(few.positions) == 2 and len(set(few.participant)) == 2
@@ -117,9 +117,9 @@ def test_viewpoints_cover_whole_recordings(hall):
     person, t = np.repeat(np.arange(people), each), np.tile(np.arange(each, dtype=float), people)
     names = tuple(f"p{k}" for k in range(people))
     rays = Rays(t, person, names, origin, np.tile([1.0, 0, 0], (len(t), 1)), np.ones(len(t)))
-    for most in (people, 3 * people):
-        along = np.sort(sample_eye_positions(rays, place, most).positions[:, 1])
-        assert len(along) == most and np.abs(along - np.linspace(-5, 5, most)).max() < 0.5
+    for max_count in (people, 3 * people):
+        along = np.sort(sample_eye_positions(rays, place, max_count).positions[:, 1])
+        assert len(along) == max_count and np.abs(along - np.linspace(-5, 5, max_count)).max() < 0.5
 
 
 def test_rays_end_at_hit_points_or_surfaces(hall):
@@ -127,15 +127,15 @@ def test_rays_end_at_hit_points_or_surfaces(hall):
     rays = crowd(300)
     rows = np.linspace(0, 299, 100).round().astype(int)
     boxes = [Region.create("left", (-9, -9, -9), (9, 0.1, 9)), Region.create("low", (-9, -9, -9), (9, 9, 1.2))]
-    landed, person = assign_ray_hits(rays, place, onlooker, 100, *things(boxes), 0.0)
+    landed, person = assign_ray_hits(rays, place, onlooker, 100, *aois(boxes), 0.0)
     assert landed.count == 100 and np.array_equal(person, rays.person[rows])
     expected = [np.flatnonzero(box.contains(rays.hit[rows])) for box in boxes]
     assert all(np.array_equal(a, b) and len(b) for a, b in zip(landed.rows, expected))
-    landed, _ = assign_ray_hits(replace(rays, hit=None), place, onlooker, 300, *things(boxes), 0.0)
+    landed, _ = assign_ray_hits(replace(rays, hit=None), place, onlooker, 300, *aois(boxes), 0.0)
     inside = np.flatnonzero(((rays.origin > LOW) & (rays.origin < HIGH)).all(axis=1))
-    met = rays.origin + to_wall(rays.origin, rays.direction)[:, None] * rays.direction
-    for box, found in zip(boxes, landed.rows):
-        assert np.array_equal(np.intersect1d(found, inside), inside[box.contains(met[inside])])
+    is_hit = rays.origin + to_wall(rays.origin, rays.direction)[:, None] * rays.direction
+    for box, result in zip(boxes, landed.rows):
+        assert np.array_equal(np.intersect1d(result, inside), inside[box.contains(is_hit[inside])])
 
 
 def test_rays_in_another_frame(hall, rgb):
@@ -144,11 +144,11 @@ def test_rays_in_another_frame(hall, rgb):
     matrix = np.array([[0, -0.1, 0, 1], [0.1, 0, 0, 0], [0, 0, 0.1, 0.5], [0, 0, 0, 1.0]])
     turned = TrainingGeometry(place.medium, place.box, "scene", align=Similarity(matrix))
     rays = crowd(50)
-    eyes = sample_eye_positions(rays, turned, 4)
+    observers = sample_eye_positions(rays, turned, 4)
     every = rays.origin @ matrix[:3, :3].T + matrix[:3, 3]
-    assert all(np.isclose(every, e).all(axis=1).any() for e in eyes.positions)
+    assert all(np.isclose(every, e).all(axis=1).any() for e in observers.positions)
     box = Region.create("some", (-9, -9, -9), (9, 9, 0.65))
-    landed, _ = assign_ray_hits(rays, turned, onlooker, 50, *things([box]), 0.0)
+    landed, _ = assign_ray_hits(rays, turned, onlooker, 50, *aois([box]), 0.0)
     expected = np.flatnonzero(box.contains(rays.hit @ matrix[:3, :3].T + matrix[:3, 3]))
     assert np.array_equal(landed.rows[0], expected) and 0 < len(expected) < 50
 
@@ -158,8 +158,8 @@ def test_rays_meet_nothing_without_geometry(rgb):
     grid = HashGridConfig(levels=2, log2_rows=8, base=4, finest=8)
     field = GazeField.random(GazeConfig(grid=grid, width=16), box, namespace(rgb.variant()), 1)
     onlooker = GazeSampler(field, TrainingGeometry(None, box, "none"))
-    depth, met = onlooker.trace(np.zeros((3, 3)), np.eye(3))
-    assert not met.any() and not depth.any()
+    depth, is_hit = onlooker.trace(np.zeros((3, 3)), np.eye(3))
+    assert not is_hit.any() and not depth.any()
 
 
 # ---- People without their names ----
@@ -169,7 +169,7 @@ NAMES = ("Grace", "Ada", "Ada Lovelace", "X")
 
 def named():
     rays = crowd(500)
-    about = dict(
+    metadata = dict(
         frame=rays.metadata["frame"],
         rows_read=600,
         sources=[{"file": "Ada.csv", "sha256": "0"}],
@@ -177,7 +177,7 @@ def named():
         steps=[{"step": "filter", "kept": 9, "of": 10, "persons": ["Ada"]}],
         remark="Ada was tired",
     )
-    return replace(rays, persons=NAMES, metadata=about)
+    return replace(rays, persons=NAMES, metadata=metadata)
 
 
 def test_participants_are_numbered_by_sample_count():
@@ -206,9 +206,9 @@ def test_all_names_are_replaced():
 
 def test_names_in_files_and_evaluations_are_replaced():
     row = {"method": "gaze field", "person": "Ada", "bits": 1.0}
-    found = GazeResults("g", "", "both", 1, 2, 20.0, (), (row, {**row, "person": "somebody else"}))
-    labels = ParticipantLabels(named(), [found])
-    shown = anonymize_results(found, labels)
+    result = GazeResults("g", "", "both", 1, 2, 20.0, (), (row, {**row, "person": "somebody else"}))
+    labels = ParticipantLabels(named(), [result])
+    shown = anonymize_results(result, labels)
     assert [r["person"] for r in shown.participant_rows] == [labels.label("Ada"), "participant 5"] and row[
         "person"
     ] == "Ada"
@@ -238,40 +238,40 @@ def test_participants_have_equal_weight():
     rng = np.random.default_rng(0)
     who, person = np.array([3, 3, 3, 5, 9, 9, 9, 9]), rng.choice([3, 5, 9], 300)
     share, rows = rng.random(len(who)), np.flatnonzero(rng.random(300) < 0.3)
-    (found,) = summarize_objects(["unit"], of_field(share), who, (on_rows(rows, 300), person))
+    (result,) = summarize_objects(["unit"], of_field(share), who, (on_rows(rows, 300), person))
     field, rays = {}, {}
     for value, one in zip(share, who.tolist()):
         field.setdefault(one, []).append(value)
     for k, one in enumerate(person.tolist()):
         rays.setdefault(one, []).append(k in rows)
     mean = lambda each: sum(sum(v) / len(v) for v in each.values()) / len(each)
-    assert found.predicted.mean == pytest.approx(mean(field)) and found.recorded.mean == pytest.approx(mean(rays))
-    assert (found.num_could_see, found.num_looked, found.num_participants) == (3, 3, 3)
+    assert result.predicted.mean == pytest.approx(mean(field)) and result.recorded.mean == pytest.approx(mean(rays))
+    assert (result.num_could_see, result.num_looked, result.num_participants) == (3, 3, 3)
 
 
 def test_participants_with_view_are_counted():
     # The second place of person 0 sees the box; no gaze goes there.
     field, who, person = of_field([0, 0, 0, 0], [False, True, False, False]), np.array([0, 0, 1, 2]), np.arange(4)
-    (found,) = summarize_objects(["unit"], field, who, (on_rows([], 4), person))
-    assert (found.num_could_see, found.num_looked, found.num_participants) == (1, 0, 4)
+    (result,) = summarize_objects(["unit"], field, who, (on_rows([], 4), person))
+    assert (result.num_could_see, result.num_looked, result.num_participants) == (1, 0, 4)
     # Somebody who looks at it could see it.
-    (found,) = summarize_objects(["unit"], field, who, (on_rows([1, 2], 4), person))
-    assert (found.num_could_see, found.num_looked) == (2, 2)
+    (result,) = summarize_objects(["unit"], field, who, (on_rows([1, 2], 4), person))
+    assert (result.num_could_see, result.num_looked) == (2, 2)
 
 
 def test_objects_without_samples():
-    (found,) = summarize_objects(["unit"], of_field([0.25]), np.zeros(1, int))
-    assert found.recorded is None and found.num_participants is None and math.isnan(found.predicted.low)
+    (result,) = summarize_objects(["unit"], of_field([0.25]), np.zeros(1, int))
+    assert result.recorded is None and result.num_participants is None and math.isnan(result.predicted.low)
 
 
 def test_interval_matches_the_bootstrap():
     rng = np.random.default_rng(2)
     values = rng.beta(2, 9, 40)
-    found = mean_over_participants(values)
+    result = mean_over_participants(values)
     means = [rng.choice(values, 40).mean() for _ in range(20_000)]
-    assert found.mean == pytest.approx(values.mean())
-    assert found.high - found.mean == pytest.approx(1.96 * np.std(means) * small_sample_factor(40), rel=0.02)
-    assert found.mean - found.low == pytest.approx(found.high - found.mean)
+    assert result.mean == pytest.approx(values.mean())
+    assert result.high - result.mean == pytest.approx(1.96 * np.std(means) * small_sample_factor(40), rel=0.02)
+    assert result.mean - result.low == pytest.approx(result.high - result.mean)
 
 
 def test_intervals_stay_within_0_and_1():
@@ -301,26 +301,26 @@ def room(rgb):
 
 
 def test_proxy_points_lie_on_walls(room):
-    eyes = np.array([[0.0, 0, 1.5], [1, 2, 1.0]])
-    told = []
+    observers = np.array([[0.0, 0, 1.5], [1, 2, 1.0]])
+    texts = []
     gaze = lambda observer, points, spacing: np.linalg.norm(points - observer, axis=1)
     up = np.array([0.0, 0, 1])
-    found = make_proxy(room, eyes, up, eyes[:1], gaze, 3000, (96, 48), lambda *done: told.append(done))
-    p = found.vertices
+    result = make_proxy(room, observers, up, observers[:1], gaze, 3000, (96, 48), lambda *done: texts.append(done))
+    p = result.vertices
     to_wall = np.minimum(np.abs(p - PROXY_LOW), np.abs(p - PROXY_HIGH)).min(axis=1)
-    assert 500 < len(p) <= 3000 and to_wall.max() < 0.5 * found.spacing + 1e-3 and told == [(1, 2), (2, 2)]
+    assert 500 < len(p) <= 3000 and to_wall.max() < 0.5 * result.spacing + 1e-3 and texts == [(1, 2), (2, 2)]
     # Close to an edge a point is of two walls.
-    flat = np.sort(np.minimum(np.abs(p - PROXY_LOW), np.abs(p - PROXY_HIGH)), axis=1)[:, 1] > 2 * found.spacing
+    flat = np.sort(np.minimum(np.abs(p - PROXY_LOW), np.abs(p - PROXY_HIGH)), axis=1)[:, 1] > 2 * result.spacing
     centre = (PROXY_LOW + PROXY_HIGH) / 2
-    inward = ((centre - p) * found.normals).sum(axis=1)
-    assert (inward[flat] > 0).all() and (np.abs(found.normals[flat]).max(axis=1) > 0.98).mean() > 0.95
-    assert np.allclose(np.linalg.norm(found.normals, axis=1), 1, atol=1e-4)
-    lit = found.colors[found.colors.max(axis=1) > 60]
+    inward = ((centre - p) * result.normals).sum(axis=1)
+    assert (inward[flat] > 0).all() and (np.abs(result.normals[flat]).max(axis=1) > 0.98).mean() > 0.95
+    assert np.allclose(np.linalg.norm(result.normals, axis=1), 1, atol=1e-4)
+    lit = result.colors[result.colors.max(axis=1) > 60]
     assert len(lit) > 100 and (lit[:, 0] > lit[:, 1]).all()  # a red room
-    assert np.allclose(found.gaze[0], np.linalg.norm(p - eyes[0], axis=1), atol=1e-4)
+    assert np.allclose(result.gaze[0], np.linalg.norm(p - observers[0], axis=1), atol=1e-4)
     for side in range(3):
         for end in (PROXY_LOW, PROXY_HIGH):
-            assert (np.abs(p[:, side] - end[side]) < found.spacing).any()
+            assert (np.abs(p[:, side] - end[side]) < result.spacing).any()
 
 
 def test_downsampling_separates_sides_of_a_wall():
@@ -332,14 +332,14 @@ def test_downsampling_separates_sides_of_a_wall():
     p, c, edge = downsample_points(points, normals, colors, 500)
     assert len(p) <= 500 and set(map(tuple, np.round(c, 6))) == {(1, 0, 0), (0, 0, 1)}
     # Every point has a representative in its cube.
-    apart = np.linalg.norm(points[:, None, :] - p[None], axis=2).min(axis=1)
-    assert apart.max() <= edge * np.sqrt(2) + 1e-9
+    offset = np.linalg.norm(points[:, None, :] - p[None], axis=2).min(axis=1)
+    assert offset.max() <= edge * np.sqrt(2) + 1e-9
 
 
 def test_downsampling_keeps_few_points():
     p = np.array([[0.0, 0, 0], [1, 1, 1]])
-    found = downsample_points(p, np.array([[0.0, 0, 1]] * 2), np.ones((2, 3)), 10)
-    assert np.allclose(found[0], p)
+    result = downsample_points(p, np.array([[0.0, 0, 1]] * 2), np.ones((2, 3)), 10)
+    assert np.allclose(result[0], p)
     alone = downsample_points(p[:1], np.array([[0.0, 0, 1]]), np.ones((1, 3)), 10)
     assert np.allclose(alone[0], p[:1]) and alone[2] > 0
 
@@ -362,8 +362,8 @@ def test_normals_of_a_noisy_sphere():
     outward = rng.normal(size=(4000, 3))
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)
     points = outward * (2 + rng.normal(0, 0.003, (4000, 1)))
-    found = estimate_normals(points, [0.3, 0.1, 0.5] + 5 * outward)
-    assert np.percentile((found * outward).sum(axis=1), 5) > 0.97 and np.allclose(np.linalg.norm(found, axis=1), 1)
+    result = estimate_normals(points, [0.3, 0.1, 0.5] + 5 * outward)
+    assert np.percentile((result * outward).sum(axis=1), 5) > 0.97 and np.allclose(np.linalg.norm(result, axis=1), 1)
     assert np.allclose(estimate_normals(points[:2], 3 * outward[:2]), outward[:2])
 
 
@@ -385,7 +385,7 @@ def test_farthest_point_sampling():
 
 
 def test_verdicts():
-    ((results, verdict),) = whole().verdicts
+    ((results, verdict),) = whole_result().verdicts
     assert results.split == "both" and verdict.grade == "use"
     assert bare().verdicts == [] and bare().provenance == {}
 
@@ -394,55 +394,55 @@ def test_verdicts():
 
 
 def unpacked(text):
-    about = json.loads(text)
-    data = base64.b64decode(about["data"])
+    metadata = json.loads(text)
+    data = base64.b64decode(metadata["data"])
     kinds = {"place": "<u2", "paths": "<u2", "boxes": "<u2", "marks": "<u2"}
-    arrays = {k: np.frombuffer(data[a : a + n], kinds.get(k, "u1")) for k, (a, n) in about["parts"].items()}
-    return about, arrays
+    arrays = {k: np.frombuffer(data[a : a + n], kinds.get(k, "u1")) for k, (a, n) in metadata["parts"].items()}
+    return metadata, arrays
 
 
-def positions(about, array):
-    return np.array(about["lower"]) + array.reshape(-1, 3) / 65535 * np.array(about["size"])
+def positions(metadata, array):
+    return np.array(metadata["lower"]) + array.reshape(-1, 3) / 65535 * np.array(metadata["size"])
 
 
 def test_packed_arrays_round_trip():
-    given = stage()
-    about, arrays = unpacked(pack_stage(given))
-    close = np.array(about["size"]).max() / 65535
-    assert np.abs(positions(about, arrays["place"]) - given.proxy.vertices).max() <= close
-    assert np.abs(arrays["normal"].reshape(-1, 3) / 255 * 2 - 1 - given.proxy.normals).max() <= 1 / 255 + 1e-6
-    assert np.array_equal(arrays["color"].reshape(-1, 3), given.proxy.colors)
-    assert np.abs(positions(about, arrays["marks"]) - given.observers).max() <= close
-    paths = positions(about, arrays["paths"])
-    assert [n for _, n in about["paths"]] == [9, 3]
-    for (first, count), path in zip(about["paths"], given.paths):
+    value = stage()
+    metadata, arrays = unpacked(pack_stage(value))
+    close = np.array(metadata["size"]).max() / 65535
+    assert np.abs(positions(metadata, arrays["place"]) - value.proxy.vertices).max() <= close
+    assert np.abs(arrays["normal"].reshape(-1, 3) / 255 * 2 - 1 - value.proxy.normals).max() <= 1 / 255 + 1e-6
+    assert np.array_equal(arrays["color"].reshape(-1, 3), value.proxy.colors)
+    assert np.abs(positions(metadata, arrays["marks"]) - value.observers).max() <= close
+    paths = positions(metadata, arrays["paths"])
+    assert [n for _, n in metadata["paths"]] == [9, 3]
+    for (first, count), path in zip(metadata["paths"], value.paths):
         assert np.abs(paths[first : first + count] - path).max() <= close
 
 
 def test_packed_gaze_of_each_observer_and_mean():
-    given = stage()
-    about, arrays = unpacked(pack_stage(given))
+    value = stage()
+    metadata, arrays = unpacked(pack_stage(value))
     heat = (arrays["gaze"].reshape(3, -1) / 255) ** 2
-    for values, shown, who in zip([given.proxy.gaze.mean(axis=0), *given.proxy.gaze], heat, about["observers"]):
+    for values, shown, who in zip([value.proxy.gaze.mean(axis=0), *value.proxy.gaze], heat, metadata["observers"]):
         assert who["top"] == pytest.approx(np.percentile(values, 99), rel=0.01)
         assert np.abs(np.minimum(values, who["top"]) / who["top"] - shown).max() < 0.015
-    assert [who["marks"] for who in about["observers"]] == [[0, 1], [0], [1]]
+    assert [who["marks"] for who in metadata["observers"]] == [[0, 1], [0], [1]]
 
 
 def test_boxes_are_packed_as_edges():
-    about, arrays = unpacked(pack_stage(stage((Region.create("b", np.array([0.0, 1, 2]), np.array([1.0, 3, 4])),))))
-    edges = positions(about, arrays["boxes"]).reshape(12, 2, 3)
+    metadata, arrays = unpacked(pack_stage(stage((Region.create("b", np.array([0.0, 1, 2]), np.array([1.0, 3, 4])),))))
+    edges = positions(metadata, arrays["boxes"]).reshape(12, 2, 3)
     lengths = np.sort(np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1))
     assert np.allclose(lengths, [1] * 4 + [2] * 8, atol=1e-3)
     assert len(np.unique(edges.reshape(-1, 3).round(3), axis=0)) == 8
 
 
 def test_pack_without_observers():
-    given = stage(())
-    empty = replace(given.proxy, gaze=np.zeros((0, len(given.proxy.vertices)), np.float32))
-    text = pack_stage(replace(given, proxy=empty, observers=np.zeros((0, 3)), paths=[]))
-    about, arrays = unpacked(text)
-    assert about["observers"] == [{"marks": [], "top": 0.0}] and not arrays["gaze"].any() and about["paths"] == []
+    value = stage(())
+    empty = replace(value.proxy, gaze=np.zeros((0, len(value.proxy.vertices)), np.float32))
+    text = pack_stage(replace(value, proxy=empty, observers=np.zeros((0, 3)), paths=[]))
+    metadata, arrays = unpacked(text)
+    assert metadata["observers"] == [{"marks": [], "top": 0.0}] and not arrays["gaze"].any() and metadata["paths"] == []
 
 
 def test_packed_scene_is_reproducible_and_safe():

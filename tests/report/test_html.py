@@ -16,7 +16,7 @@ import pytest
 from nerg_mi.report import html
 from nerg_mi.report.html import Point, interval_chart, nice_ticks
 from nerg_mi.report.sections import SECTIONS, SETTINGS, render_page
-from tests.report.made import HOSTILE, PNG, bare, packed_scene, whole
+from tests.report.made import HOSTILE, PNG, bare, packed_scene, whole_result
 
 # ---- Charts: values where their scale says, and scales of round numbers ----
 
@@ -72,8 +72,8 @@ class Parsed(HTMLParser):
 @pytest.mark.parametrize("text", [HOSTILE, "a < b & c > d", "\"'", "]]>", "<!--", "</p>", "&lt;", "\u2067x\u2069"])
 def test_text_is_escaped(text):
     shown = "".join(c if c.isprintable() else "?" for c in text)
-    found = Parsed(html.element("p", text, title=text, data_name=text))
-    assert found.tags == [("p", {"title": shown, "data-name": shown})] and found.text == shown
+    result = Parsed(html.element("p", text, title=text, data_name=text))
+    assert result.tags == [("p", {"title": shown, "data-name": shown})] and result.text == shown
 
 
 def test_invisible_characters_are_replaced():
@@ -90,8 +90,8 @@ def test_markup_is_not_escaped_twice():
 
 
 def test_tables():
-    found = html.table(["name", "value"], [["a<b", "1"], ["c", 2.5]], [1])
-    parsed = Parsed(found)
+    result = html.table(["name", "value"], [["a<b", "1"], ["c", 2.5]], [1])
+    parsed = Parsed(result)
     assert [t for t, _ in parsed.tags].count("tr") == 3 and parsed.text == "namevaluea<b1c2.5"
     assert [a for t, a in parsed.tags if t == "td"] == [{}, {"class": "number"}] * 2
     assert Parsed(html.key_value_table([("x", "<y>")])).text == "x<y>"
@@ -109,26 +109,28 @@ SIZE = 6_000_000
 
 
 def test_page_contains_every_section():
-    for run in (whole(), bare()):
+    for run in (whole_result(), bare()):
         tags = Parsed(render_page(run)).tags
         assert [a["id"] for t, a in tags if t == "section"] == [s.name for s in SECTIONS]
         assert [a["href"] for t, a in tags if t == "a"] == [f"#{s.name}" for s in SECTIONS]
 
 
 def test_page_is_reproducible():
-    assert render_page(whole()) == render_page(whole()) and len(render_page(whole()).encode()) < SIZE
+    assert (
+        render_page(whole_result()) == render_page(whole_result()) and len(render_page(whole_result()).encode()) < SIZE
+    )
 
 
 def test_names_cannot_inject_markup():
-    tame, hostile = (Parsed(render_page(whole(name))) for name in ("shelf", HOSTILE))
+    tame, hostile = (Parsed(render_page(whole_result(name))) for name in ("shelf", HOSTILE))
     assert [t for t, _ in hostile.tags] == [t for t, _ in tame.tags]
     keys = lambda found: [sorted(a) for _, a in found.tags]
     assert keys(hostile) == keys(tame)
     assert not any(key.startswith("on") for _, a in hostile.tags for key in a)
-    assert "alert(1)" in hostile.text and "\u202e" not in render_page(whole(HOSTILE))
+    assert "alert(1)" in hostile.text and "\u202e" not in render_page(whole_result(HOSTILE))
 
 
-@pytest.mark.parametrize("run", [whole(), bare(), whole(HOSTILE)], ids=["whole", "bare", "hostile"])
+@pytest.mark.parametrize("run", [whole_result(), bare(), whole_result(HOSTILE)], ids=["whole", "bare", "hostile"])
 def test_page_loads_no_resources(run):
     text = render_page(run)
     for tag, attributes in Parsed(text).tags:
@@ -140,7 +142,7 @@ def test_page_loads_no_resources(run):
 
 
 def test_content_security_policy_matches_the_page():
-    text = render_page(whole())
+    text = render_page(whole_result())
     (policy,) = [a["content"] for t, a in Parsed(text).tags if a.get("http-equiv") == "Content-Security-Policy"]
     rules = dict(rule.strip().split(" ", 1) for rule in policy.split(";"))
     hashed = lambda kind: [
@@ -160,7 +162,7 @@ def test_page_without_3d_view_has_no_script():
 
 
 def test_3d_view_is_embedded_as_data():
-    assert packed_scene(render_page(whole(HOSTILE)))["count"] == whole().stage_points
+    assert packed_scene(render_page(whole_result(HOSTILE)))["count"] == whole_result().stage_points
 
 
 # ---- Every section: shown from what there is, and told in one sentence where it is left out ----
@@ -175,7 +177,7 @@ def text_of(section, run) -> str:
 
 @pytest.mark.parametrize("section", SECTIONS, ids=lambda s: s.name)
 def test_empty_sections_state_a_reason(section):
-    assert section.reason_absent(whole()) is None and len(text_of(section, whole())) > 40
+    assert section.reason_absent(whole_result()) is None and len(text_of(section, whole_result())) > 40
     reason = section.reason_absent(bare())
     assert (reason is not None) == (section.name in ABSENT)
     if reason is None:
@@ -189,7 +191,7 @@ def test_section_names_and_titles_are_unique():
 
 
 def test_section_texts():
-    said = {s.name: text_of(s, whole()) for s in SECTIONS}
+    said = {s.name: text_of(s, whole_result()) for s in SECTIONS}
     assert said["verdict"].startswith("Better than nearest rays, the strongest baseline, for new people at new places.")
     assert "4.00 × 4.00 × 4.00" in said["place"] and "training photos9" in said["place"]
     assert (
@@ -207,27 +209,27 @@ def test_section_texts():
 
 
 def test_held_out_participants_are_not_named():
-    assert "Ada" not in text_of(SETTINGS, replace(whole(), gaze={"provenance": {"test": {"people": ["Ada"]}}}))
+    assert "Ada" not in text_of(SETTINGS, replace(whole_result(), gaze={"provenance": {"test": {"people": ["Ada"]}}}))
 
 
 def test_shares_of_few_participants_are_hidden():
     objects = next(s for s in SECTIONS if s.name == "objects")
-    said = text_of(objects, replace(whole(), min_participants=3))
+    said = text_of(objects, replace(whole_result(), min_participants=3))
     assert "otherhidden" in said and "fewer than 3" in said and said.count("25.00") == 2
-    assert "hidden" not in text_of(objects, whole())
+    assert "hidden" not in text_of(objects, whole_result())
 
 
 def test_shares_without_participants_have_no_intervals():
     objects = next(s for s in SECTIONS if s.name == "objects")
-    (first, *_) = whole().objects
+    (first, *_) = whole_result().objects
     alone = replace(first, recorded=None, num_could_see=None, num_looked=None, num_participants=None)
-    said = text_of(objects, replace(whole(), objects=(alone,), num_viewpoints=1))
+    said = text_of(objects, replace(whole_result(), objects=(alone,), num_viewpoints=1))
     assert "over 1 viewpoint." in said and "share of samples" not in said
 
 
 def test_each_split_has_a_verdict():
-    both = whole().results[0]
-    run = replace(whole(), results=(both, replace(both, split="pos", num_participants=3)))
+    both = whole_result().results[0]
+    run = replace(whole_result(), results=(both, replace(both, split="pos", num_participants=3)))
     verdict, scores = (next(s for s in SECTIONS if s.name == n) for n in ("verdict", "scores"))
     assert "No verdict for known people at new places: 3 people" in text_of(verdict, run)
     assert "Known people at new places (3 participants, 60 positions)" in text_of(scores, run)

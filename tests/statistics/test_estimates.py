@@ -40,17 +40,17 @@ ONES = np.ones
 
 def test_interval_approaches_students_t():
     x = np.random.default_rng(0).normal(5, 1, (60, 1))
-    found = estimate_ratios(x, ONES(x.shape), resamples=4000)
-    reach = stats.t.ppf(0.975, 59) * x.std(ddof=1) / np.sqrt(60)
-    assert found.value == pytest.approx(x.mean()) and found.participants.tolist() == [60]
-    assert found.low[0] == pytest.approx(x.mean() - reach, abs=0.15 * reach)
-    assert found.high[0] == pytest.approx(x.mean() + reach, abs=0.15 * reach)
+    result = estimate_ratios(x, ONES(x.shape), resamples=4000)
+    extent = stats.t.ppf(0.975, 59) * x.std(ddof=1) / np.sqrt(60)
+    assert result.value == pytest.approx(x.mean()) and result.participants.tolist() == [60]
+    assert result.low[0] == pytest.approx(x.mean() - extent, abs=0.15 * extent)
+    assert result.high[0] == pytest.approx(x.mean() + extent, abs=0.15 * extent)
 
 
 def test_bootstrap_matches_a_loop():
     rng = np.random.default_rng(1)
     x, y = rng.gamma(1, 1, (9, 1)), rng.gamma(2, 1, (9, 1))
-    found = estimate_ratios(x, y, resamples=500, seed=7)
+    result = estimate_ratios(x, y, resamples=500, seed=7)
     m = x.sum() / y.sum()
     linear = np.sqrt(((x - m * y) ** 2).sum() * 9 / 8) / y.sum()
     without = [np.delete(x, k).sum() / np.delete(y, k).sum() for k in range(9)]
@@ -63,23 +63,23 @@ def test_bootstrap_matches_a_loop():
         star = a.sum() / b.sum()
         spread = ((a - star * b) ** 2).sum() * 9 / 8 / b.sum() ** 2
         t.append(abs(star - m) / np.sqrt(0.99 * spread + 0.01 * linear**2))
-    reach = np.quantile(t, 0.95) * jackknife
-    assert found.low[0] == pytest.approx(max(m - reach, 0)) and found.high[0] == pytest.approx(m + reach)
+    extent = np.quantile(t, 0.95) * jackknife
+    assert result.low[0] == pytest.approx(max(m - extent, 0)) and result.high[0] == pytest.approx(m + extent)
 
 
 def test_participants_are_the_sampling_unit():
     # 4 people whose thousands of rays agree: as uncertain as 4 numbers.
     x = np.array([[0.1], [0.2], [0.3], [0.4]])
-    found = estimate_ratios(x, ONES(x.shape))
-    assert found.low[0] < 0.13 and found.high[0] > 0.37
+    result = estimate_ratios(x, ONES(x.shape))
+    assert result.low[0] < 0.13 and result.high[0] > 0.37
 
 
 def test_too_few_participants_have_no_interval():
     x = np.array([[0.0, 0.2, 0.3], [0.0, 0.2, 0.1], [0.0, 0.2, 0.0], [0.0, 0.2, 0.0]])
     y = np.array([[1.0, 1, 1], [1, 1, 1], [1, 1, 0], [1, 1, 0]])
-    found = estimate_ratios(x, y)
-    assert found.value == pytest.approx([0, 0.2, 0.2]) and found.participants.tolist() == [4, 4, 2]
-    assert np.isnan(found.low).all() and np.isnan(found.high).all()
+    result = estimate_ratios(x, y)
+    assert result.value == pytest.approx([0, 0.2, 0.2]) and result.participants.tolist() == [4, 4, 2]
+    assert np.isnan(result.low).all() and np.isnan(result.high).all()
     nobody = estimate_ratios(np.zeros((0, 2)), np.zeros((0, 2)))
     assert np.isnan(nobody.value).all() and nobody.participants.tolist() == [0, 0]
     one = estimate_ratios(ONES((1, 1)), ONES((1, 1)))
@@ -96,11 +96,11 @@ def test_paired_difference_matches_mean_of_differences():
     # Of others it is as wide as their spread.
     x = np.concatenate([base, 0 * after])
     z = np.concatenate([0 * base, after])
-    apart = estimate_ratio_differences((x, np.concatenate([y, 0 * y])), (z, np.concatenate([0 * y, y])))
+    offset = estimate_ratio_differences((x, np.concatenate([y, 0 * y])), (z, np.concatenate([0 * y, y])))
     welch = stats.ttest_ind(after[:, 0], base[:, 0], equal_var=False)
-    assert apart.value == pytest.approx(same.value)
-    assert apart.high - apart.low == pytest.approx(np.ptp(welch.confidence_interval()), rel=0.15)
-    assert apart.p == pytest.approx(welch.pvalue, abs=0.08)
+    assert offset.value == pytest.approx(same.value)
+    assert offset.high - offset.low == pytest.approx(np.ptp(welch.confidence_interval()), rel=0.15)
+    assert offset.p == pytest.approx(welch.pvalue, abs=0.08)
 
 
 def test_false_positive_rate_of_ratio_differences():
@@ -108,12 +108,12 @@ def test_false_positive_rate_of_ratio_differences():
     x = rng.exponential(1, (24, 600))
     first, second = np.zeros((24, 600)), np.zeros((24, 600))
     first[:12], second[12:] = 1, 1
-    found = estimate_ratio_differences((x * first, first), (x * second, second), resamples=399)
-    assert 0.01 < (found.p <= 0.05).mean() < 0.09
-    assert 0.92 < ((found.low <= 0) & (found.high >= 0)).mean() <= 0.995
+    result = estimate_ratio_differences((x * first, first), (x * second, second), resamples=399)
+    assert 0.01 < (result.p <= 0.05).mean() < 0.09
+    assert 0.92 < ((result.low <= 0) & (result.high >= 0)).mean() <= 0.995
     # What is found is what the interval does not hold, but for the p-values' own step.
-    outside = (found.low > 0) | (found.high < 0)
-    assert (outside == (found.p <= 0.05))[abs(found.p - 0.05) > 0.005].all() and outside.any()
+    outside = (result.low > 0) | (result.high < 0)
+    assert (outside == (result.p <= 0.05))[abs(result.p - 0.05) > 0.005].all() and outside.any()
 
 
 def test_coverage_for_few_participants():
@@ -122,8 +122,8 @@ def test_coverage_for_few_participants():
     y = rng.gamma(3, 1, (8, 1200))
     x = y * rng.beta(0.5, 2, (8, 1200))
     truth = 0.5 / 2.5
-    found = estimate_ratios(x, y, resamples=399)
-    assert 0.92 < ((found.low <= truth) & (truth <= found.high)).mean() < 0.98
+    result = estimate_ratios(x, y, resamples=399)
+    assert 0.92 < ((result.low <= truth) & (truth <= result.high)).mean() < 0.98
     # Student's t of the linearised residuals, which is as simple, holds it less often.
     m = x.sum(axis=0) / y.sum(axis=0)
     s = np.sqrt(((x - m * y) ** 2).sum(axis=0) * 8 / 7) / y.sum(axis=0)
@@ -136,10 +136,10 @@ def test_partly_paired_participants():
     x, u, none, one = rng.gamma(2, 1, (9, 1)), rng.gamma(3, 1, (14, 1)), np.zeros, ONES
     first = (np.concatenate([x, none((14, 1))]), np.concatenate([one((9, 1)), none((14, 1))]))
     second = (np.concatenate([none((9, 1)), u]), np.concatenate([none((9, 1)), one((14, 1))]))
-    apart = estimate_ratio_differences(first, second, resamples=4000)
+    offset = estimate_ratio_differences(first, second, resamples=4000)
     welch = stats.ttest_ind(u[:, 0], x[:, 0], equal_var=False)
     half = np.ptp(welch.confidence_interval()) / 2
-    assert (apart.high - apart.low) / 2 == pytest.approx(half, rel=0.2)
+    assert (offset.high - offset.low) / 2 == pytest.approx(half, rel=0.2)
     same = estimate_ratio_differences((x, one((9, 1))), (u[:9], one((9, 1))), resamples=4000)
     paired = stats.ttest_rel(u[:9, 0], x[:, 0])
     assert (same.high - same.low) / 2 == pytest.approx(np.ptp(paired.confidence_interval()) / 2, rel=0.2)
@@ -155,24 +155,24 @@ def test_equal_seeds_give_equal_intervals():
 def test_two_contributors_give_no_interval():
     x = np.zeros((40, 2))
     x[:2, 0], x[:3, 1] = 1, 1
-    found = estimate_ratios(x, ONES(x.shape), resamples=99)
-    assert found.value == pytest.approx([0.05, 0.075]) and found.participants.tolist() == [40, 40]
-    assert np.isnan(found.low[0]) and np.isnan(found.high[0]) and found.high[1] > 0.075
+    result = estimate_ratios(x, ONES(x.shape), resamples=99)
+    assert result.value == pytest.approx([0.05, 0.075]) and result.participants.tolist() == [40, 40]
+    assert np.isnan(result.low[0]) and np.isnan(result.high[0]) and result.high[1] > 0.075
 
 
 def test_dominated_estimates_use_students_t():
     """Means weighed by times of few of 40 people: most are near, and who is far looks for long."""
     rng = np.random.default_rng(8)
-    looks = rng.random((40, 800)) < 0.17
-    far = rng.random(looks.shape) < 0.1
-    y = looks * np.where(far, 1.0, 0.3) * rng.gamma(2, 1, looks.shape)
+    visits = rng.random((40, 800)) < 0.17
+    far = rng.random(visits.shape) < 0.1
+    y = visits * np.where(far, 1.0, 0.3) * rng.gamma(2, 1, visits.shape)
     x = y * np.where(far, 4.0, 1.0)
     truth = (0.1 * 4 + 0.9 * 0.3) / (0.1 + 0.9 * 0.3)
     held = lambda e: ((e.low <= truth) & (truth <= e.high))[np.isfinite(e.low)].mean()
-    found = estimate_ratios(x, y, resamples=199)
+    result = estimate_ratios(x, y, resamples=199)
     # As if most others were there too, and had hardly looked at it: then they are not few, and draws alone tell.
-    by_draws = estimate_ratios(x, np.where(looks, y, 1e-9), resamples=199)
-    assert held(by_draws) < 0.8 and held(found) > held(by_draws) + 0.05
+    by_draws = estimate_ratios(x, np.where(visits, y, 1e-9), resamples=199)
+    assert held(by_draws) < 0.8 and held(result) > held(by_draws) + 0.05
 
 
 def test_difference_from_one_contributor_has_no_interval():
@@ -184,20 +184,20 @@ def test_difference_from_one_contributor_has_no_interval():
         u[10 + some :, k] = 0
     pair = lambda v, who: (v, np.repeat(who, 5, axis=1))
     for a, b in ((pair(x, first), pair(u, second)), (pair(u, second), pair(x, first))):
-        found = estimate_ratio_differences(a, b, resamples=199)
-        assert np.isfinite(found.value).all()
-        for ends in (found.low, found.high, found.p):
+        result = estimate_ratio_differences(a, b, resamples=199)
+        assert np.isfinite(result.value).all()
+        for ends in (result.low, result.high, result.p):
             assert np.isfinite(ends).tolist() == [False, False, True, True, False]
     # The same people, of whom one or two add something to the second; of nobody it is the first, the other way round.
-    before, after, there = x[:10], np.zeros((10, 5)), ONES((10, 5))
+    before, after, expected = x[:10], np.zeros((10, 5)), ONES((10, 5))
     for some in (1, 2):
         after[:some] = 1
-        assert np.isnan(estimate_ratio_differences((before, there), (after, there), resamples=199).low).all()
-    gone = estimate_ratio_differences((before, there), (0 * after, there), resamples=199)
-    alone = estimate_ratios(before, there, resamples=199)
+        assert np.isnan(estimate_ratio_differences((before, expected), (after, expected), resamples=199).low).all()
+    gone = estimate_ratio_differences((before, expected), (0 * after, expected), resamples=199)
+    alone = estimate_ratios(before, expected, resamples=199)
     assert gone.value == pytest.approx(-alone.value) and gone.low == pytest.approx(-2 * alone.value - gone.high)
     assert (gone.high < 0).all() and (gone.p <= 0.05).all()
-    two = estimate_ratio_differences((after, there), (0 * after, there), resamples=199)
+    two = estimate_ratio_differences((after, expected), (0 * after, expected), resamples=199)
     assert np.isnan(two.low).all() and np.isnan(two.p).all()
 
 
@@ -207,30 +207,30 @@ def test_groups_are_resampled_separately():
     n = few + many
     first = (np.arange(n) < few).astype(float)[:, None]
     x, u = rng.gamma(2, 1, (n, 1)) * first, rng.gamma(3, 1, (n, 1)) * (1 - first)
-    found = estimate_ratio_differences((x, first), (u, 1 - first), resamples=resamples, seed=3)
+    result = estimate_ratio_differences((x, first), (u, 1 - first), resamples=resamples, seed=3)
     sides = x[:few, 0], u[few:, 0]
     error = lambda v: v.std(ddof=1) ** 2 / len(v)
-    value, whole = sides[1].mean() - sides[0].mean(), error(sides[0]) + error(sides[1])
+    value, whole_result = sides[1].mean() - sides[0].mean(), error(sides[0]) + error(sides[1])
     draws, t = np.random.default_rng(3), []
     counts = [draws.multinomial(len(v), np.full(len(v), 1 / len(v)), size=resamples) for v in sides]
     for one, two in zip(*counts):
         a, b = (np.repeat(v, k) for v, k in zip(sides, (one, two)))
         spread = a.var() / (few - 1) + b.var() / (many - 1)
-        t.append(abs(b.mean() - a.mean() - value) / np.sqrt(0.99 * spread + 0.01 * whole))
-    reach = np.quantile(t, 0.95) * np.sqrt(whole)
-    assert found.value[0] == pytest.approx(value)
-    assert found.low[0] == pytest.approx(value - reach) and found.high[0] == pytest.approx(value + reach)
-    assert found.p[0] == pytest.approx((1 + sum(v >= value / np.sqrt(whole) for v in t)) / (resamples + 1))
+        t.append(abs(b.mean() - a.mean() - value) / np.sqrt(0.99 * spread + 0.01 * whole_result))
+    extent = np.quantile(t, 0.95) * np.sqrt(whole_result)
+    assert result.value[0] == pytest.approx(value)
+    assert result.low[0] == pytest.approx(value - extent) and result.high[0] == pytest.approx(value + extent)
+    assert result.p[0] == pytest.approx((1 + sum(v >= value / np.sqrt(whole_result) for v in t)) / (resamples + 1))
 
 
 @pytest.mark.parametrize("resamples", [9, 99, 399])
 def test_p_value_is_limited_by_the_number_of_draws(resamples):
     rng = np.random.default_rng(11)
     x = rng.random((12, 5))
-    found = estimate_ratio_differences(
+    result = estimate_ratio_differences(
         (x, ONES(x.shape)), (x + 100 + rng.random(x.shape), ONES(x.shape)), resamples=resamples
     )
-    assert found.p == pytest.approx(1 / (resamples + 1))
+    assert result.p == pytest.approx(1 / (resamples + 1))
 
 
 def test_minimum_number_of_participants():
@@ -251,12 +251,12 @@ def test_half_of_the_participants_count_as_few():
     without = np.array([np.delete(x, k).sum() / np.delete(y, k).sum() for k in range(20)])
     parts = (x.sum() / y.sum() - without) * np.sqrt(19 / 20)
     people = (parts**2).sum() ** 2 / (parts**4).sum()
-    least = stats.t.ppf(0.975, max(people - 1, 1.0)) * np.sqrt((parts**2).sum())
-    reach = []
-    for others in (20, 19):
-        found = estimate_ratios(*(np.pad(v, (0, others))[:, None] for v in (x, y)), resamples=199)
-        reach.append(found.high[0] - found.value[0])
-    assert reach[0] == pytest.approx(least) and reach[1] < 0.9 * least
+    minimum = stats.t.ppf(0.975, max(people - 1, 1.0)) * np.sqrt((parts**2).sum())
+    extent = []
+    for remaining in (20, 19):
+        result = estimate_ratios(*(np.pad(v, (0, remaining))[:, None] for v in (x, y)), resamples=199)
+        extent.append(result.high[0] - result.value[0])
+    assert extent[0] == pytest.approx(minimum) and extent[1] < 0.9 * minimum
 
 
 def test_shared_participants_are_drawn_together():
@@ -264,13 +264,13 @@ def test_shared_participants_are_drawn_together():
     rng, n, resamples = np.random.default_rng(12), 10, 300
     x = rng.gamma(2, 1, (n, 1))
     u = x + rng.normal(0.3, 0.1, (n, 1))
-    found = estimate_ratio_differences((x, ONES(x.shape)), (u, ONES(x.shape)), resamples=resamples, seed=4)
-    apart = (u - x)[:, 0]
-    error, value, t = apart.std(ddof=1) / np.sqrt(n), apart.mean(), []
+    result = estimate_ratio_differences((x, ONES(x.shape)), (u, ONES(x.shape)), resamples=resamples, seed=4)
+    offset = (u - x)[:, 0]
+    error, value, t = offset.std(ddof=1) / np.sqrt(n), offset.mean(), []
     for draw in np.random.default_rng(4).multinomial(n, np.full(n, 1 / n), size=resamples):
-        star = np.repeat(apart, draw)
+        star = np.repeat(offset, draw)
         t.append(abs(star.mean() - value) / np.sqrt(0.99 * star.var() / (n - 1) + 0.01 * error**2))
-    assert found.high[0] - value == pytest.approx(np.quantile(t, 0.95) * error, rel=1e-6)
+    assert result.high[0] - value == pytest.approx(np.quantile(t, 0.95) * error, rel=1e-6)
 
 
 # ---- Shares of people: intervals and differences that hold for few ----
@@ -305,10 +305,10 @@ def test_mid_p_coverage(n):
 def test_proportions_of_a_subset():
     x = np.array([[1.0, 0, 1, 0], [1, 0, 1, 1], [0, 0, 1, 0], [0, 0, 1, 0]])
     y = np.array([[1.0, 1, 1, 0], [1, 1, 1, 1], [1, 1, 1, 1], [1, 1, 1, 0]])
-    found = estimate_proportions(x, y)
-    assert found.value.tolist() == [0.5, 0, 1, 0.5] and found.participants.tolist() == [4, 4, 4, 2]
-    assert found.low[1] == 0 and found.high[2] == 1 and found.high[1] > 0.4 and found.low[2] < 0.6
-    assert np.isnan([found.low[3], found.high[3]]).all()
+    result = estimate_proportions(x, y)
+    assert result.value.tolist() == [0.5, 0, 1, 0.5] and result.participants.tolist() == [4, 4, 4, 2]
+    assert result.low[1] == 0 and result.high[2] == 1 and result.high[1] > 0.4 and result.low[2] < 0.6
+    assert np.isnan([result.low[3], result.high[3]]).all()
 
 
 def test_independent_proportion_differences():
@@ -317,12 +317,12 @@ def test_independent_proportion_differences():
     none = np.zeros
     first = (np.concatenate([x, none((15, 1))]), np.concatenate([y, none((15, 1))]))
     second = (np.concatenate([none((12, 1)), u]), np.concatenate([none((12, 1)), v]))
-    found = estimate_proportion_differences(first, second)
+    result = estimate_proportion_differences(first, second)
     a, b = 3 / 14, 10 / 17
     s = np.sqrt(a * (1 - a) / 14 + b * (1 - b) / 17)
-    assert found.value == pytest.approx(9 / 15 - 2 / 12)
-    assert found.low == pytest.approx(b - a - 1.959964 * s) and found.high == pytest.approx(b - a + 1.959964 * s)
-    assert found.p == pytest.approx(2 * stats.norm.sf((b - a) / s))
+    assert result.value == pytest.approx(9 / 15 - 2 / 12)
+    assert result.low == pytest.approx(b - a - 1.959964 * s) and result.high == pytest.approx(b - a + 1.959964 * s)
+    assert result.p == pytest.approx(2 * stats.norm.sf((b - a) / s))
 
 
 def test_paired_proportion_differences():
@@ -330,17 +330,17 @@ def test_paired_proportion_differences():
     x = np.array([[1.0]] * 10 + [[0.0]] * 10)
     u = np.array([[1.0]] * 9 + [[0.0]] + [[1.0]] * 6 + [[0.0]] * 4)
     ones = np.ones((20, 1))
-    found = estimate_proportion_differences((x, ones), (u, ones))
+    result = estimate_proportion_differences((x, ones), (u, ones))
     alone, also = 2 / 22, 7 / 22
     s = np.sqrt((alone + also - (also - alone) ** 2) / 22)
-    assert found.low == pytest.approx(also - alone - 1.959964 * s)
-    assert found.high == pytest.approx(also - alone + 1.959964 * s)
+    assert result.low == pytest.approx(also - alone - 1.959964 * s)
+    assert result.high == pytest.approx(also - alone + 1.959964 * s)
     # That the same people are alike makes it narrower than of others.
-    apart = estimate_proportion_differences(
+    offset = estimate_proportion_differences(
         (np.concatenate([x, 0 * x]), np.concatenate([ones, 0 * ones])),
         (np.concatenate([0 * u, u]), np.concatenate([0 * ones, ones])),
     )
-    assert found.high - found.low < 0.9 * (apart.high - apart.low)
+    assert result.high - result.low < 0.9 * (offset.high - offset.low)
 
 
 def test_false_positive_rate_of_proportion_differences():
@@ -348,26 +348,26 @@ def test_false_positive_rate_of_proportion_differences():
     k = np.arange(9)
     a, b = (v.ravel() for v in np.meshgrid(k, k, indexing="ij"))
     spread = lambda counts: (np.arange(8)[:, None] < counts).astype(float)
-    here = np.concatenate([np.ones((8, 81)), np.zeros((8, 81))])
+    actual = np.concatenate([np.ones((8, 81)), np.zeros((8, 81))])
     none = np.zeros((8, 81))
     first, second = np.concatenate([spread(a), none]), np.concatenate([none, spread(b)])
-    found = estimate_proportion_differences((first, here), (second, 1 - here))
-    assert ((found.p <= 0.05) == ((found.low > 0) | (found.high < 0))).all()
+    result = estimate_proportion_differences((first, actual), (second, 1 - actual))
+    assert ((result.p <= 0.05) == ((result.low > 0) | (result.high < 0))).all()
     weight = stats.binom.pmf(a[:, None], 8, P) * stats.binom.pmf(b[:, None], 8, P)
-    assert 0.03 < (weight * (found.p <= 0.05)[:, None]).sum(axis=0).max() < 0.06
+    assert 0.03 < (weight * (result.p <= 0.05)[:, None]).sum(axis=0).max() < 0.06
 
 
 def test_proportions_of_few_participants():
-    found = estimate_proportion_differences(column(1, 2), column(1, 2))
-    assert np.isnan([found.low, found.high, found.p]).all() and found.value == 0
+    result = estimate_proportion_differences(column(1, 2), column(1, 2))
+    assert np.isnan([result.low, result.high, result.p]).all() and result.value == 0
     nobody = estimate_proportions(np.zeros((0, 2)), np.zeros((0, 2)))
     assert np.isnan(nobody.value).all() and np.isnan(nobody.high).all() and nobody.participants.tolist() == [0, 0]
 
 
 @pytest.mark.parametrize("m, n, known", [(3, 3, True), (2, 3, False), (3, 2, False)])
-def test_three_participants_are_needed_for_an_interval(m, n, known):
-    found = estimate_proportions(*column(1, m))
-    assert np.isfinite(found.low).all() == np.isfinite(found.high).all() == (m == 3)
+def test_three_participants_are_needed_for_an_interval(m, n, expected):
+    result = estimate_proportions(*column(1, m))
+    assert np.isfinite(result.low).all() == np.isfinite(result.high).all() == (m == 3)
     first, second = np.r_[np.ones(m), np.zeros(n)][:, None], np.r_[np.zeros(m), np.ones(n)][:, None]
     difference = estimate_proportion_differences((first * 0, first), (second, second))
-    assert [np.isfinite(v).all() for v in (difference.low, difference.high, difference.p)] == [known] * 3
+    assert [np.isfinite(v).all() for v in (difference.low, difference.high, difference.p)] == [expected] * 3

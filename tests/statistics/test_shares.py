@@ -24,7 +24,7 @@ from nerg_mi.statistics.visits import BoxAoi, assign_hits
 
 LOW, HIGH = np.array([-2.0, -6.0, 0.0]), np.array([2.0, 6.0, 3.0])
 AHEAD = np.array([0.6, 0.8, 0.0])
-EYES = np.array([[0.3, -2.0, 1.6], [-1.0, 4.0, 1.5]])
+OBSERVERS = np.array([[0.3, -2.0, 1.6], [-1.0, 4.0, 1.5]])
 BOXES = [
     Region.create("wall", (1.9, -3, 0), (2.1, 1, 2)),
     Region.create("a spot on it", (1.9, -0.01, 1), (2.1, 0.02, 1.03)),
@@ -34,14 +34,14 @@ BOXES = [
 
 
 class Hall:
-    """Observers who look ahead, mostly; ``asked``: in how many directions each look was."""
+    """Observers who look ahead, mostly; ``requested``: in how many directions each look was."""
 
     def __init__(self):
-        self.asked: list[int] = []
+        self.requested: list[int] = []
 
     def query_from(self, eye):
         def look(d):
-            self.asked.append(len(d))
+            self.requested.append(len(d))
             with np.errstate(divide="ignore"):
                 far = np.where(d > 0, (HIGH - eye) / d, np.where(d < 0, (LOW - eye) / d, np.inf)).min(axis=1)
             # The roof is open.
@@ -68,18 +68,18 @@ def exact(eye, region=None):
 
 
 @pytest.fixture(scope="module")
-def found():
+def result():
     hall = Hall()
     members = [(0,), (1,), (2,), (3,), (0, 1, 2)]
-    return hall, gaze_shares(hall.query_from, EYES, [BoxAoi(r) for r in BOXES], members, 0.0)
+    return hall, gaze_shares(hall.query_from, OBSERVERS, [BoxAoi(r) for r in BOXES], members, 0.0)
 
 
-def test_shares_are_integrals_within_the_error(found):
-    hall, shares = found
-    for e, eye in enumerate(EYES):
-        escaped, whole = exact(eye)
+def test_shares_are_integrals_within_the_error(result):
+    hall, shares = result
+    for e, eye in enumerate(OBSERVERS):
+        escaped, whole_result = exact(eye)
         for k, region in enumerate(BOXES):
-            share = exact(eye, region) / whole
+            share = exact(eye, region) / whole_result
             assert abs(shares.share[e, k] - share) <= 1.5 * shares.error[e, k] + 1e-6 and share < 1
             assert shares.error[e, k] < 0.02 * share + 2e-5
             assert shares.is_hit[e, k] == (share > 0)
@@ -87,36 +87,38 @@ def test_shares_are_integrals_within_the_error(found):
     # A group is the union: the spot lies on the wall.
     assert np.allclose(shares.share[:, 4], shares.share[:, 0] + shares.share[:, 2], rtol=0.02)
     # The spot, of 3 cm at up to six metres, took no more than what the whole sphere takes.
-    assert 0 < shares.share[1, 1] < 1e-4 and sum(hall.asked) < 2 * 6 * INITIAL_DIRECTIONS
+    assert 0 < shares.share[1, 1] < 1e-4 and sum(hall.requested) < 2 * 6 * INITIAL_DIRECTIONS
 
 
-def test_observers_are_independent(found):
-    _, shares = found
-    alone = gaze_shares(Hall().query_from, EYES[1:], [BoxAoi(BOXES[0])], [(0,)], 0.0)
+def test_observers_are_independent(result):
+    _, shares = result
+    alone = gaze_shares(Hall().query_from, OBSERVERS[1:], [BoxAoi(BOXES[0])], [(0,)], 0.0)
     assert alone.share[0, 0] == shares.share[1, 0] and alone.error[0, 0] == shares.error[1, 0]
-    many = gaze_shares(Hall().query_from, np.tile(EYES, (20, 1)), [BoxAoi(BOXES[0])], [(0,)], 0.0)
+    many = gaze_shares(Hall().query_from, np.tile(OBSERVERS, (20, 1)), [BoxAoi(BOXES[0])], [(0,)], 0.0)
     assert np.array_equal(many.share[:, 0], np.tile(shares.share[:, 0], 20))
 
 
 def test_smaller_tolerance_uses_more_directions():
-    errors, asked = [], []
+    errors, requested = [], []
     for tolerance in (0.1, 0.01, 0.001):
         hall = Hall()
-        shares = gaze_shares(hall.query_from, EYES[:1], [BoxAoi(BOXES[0])], [(0,)], 0.0, QuadratureRule(rtol=tolerance))
+        shares = gaze_shares(
+            hall.query_from, OBSERVERS[:1], [BoxAoi(BOXES[0])], [(0,)], 0.0, QuadratureRule(rtol=tolerance)
+        )
         errors.append(shares.error[0, 0])
-        asked.append(sum(hall.asked))
-    assert errors[0] > errors[2] and asked[0] < asked[2] < 1 << 19
+        requested.append(sum(hall.requested))
+    assert errors[0] > errors[2] and requested[0] < requested[2] < 1 << 19
 
 
 def test_empty_inputs():
-    shares = gaze_shares(Hall().query_from, EYES, [], [], 0.0)
+    shares = gaze_shares(Hall().query_from, OBSERVERS, [], [], 0.0)
     assert shares.share.shape == (2, 0) and (shares.integral > 0).all()
-    assert gaze_shares(Hall().query_from, EYES[:0], [BoxAoi(BOXES[0])], [(0,)], 0.0).share.shape == (0, 1)
+    assert gaze_shares(Hall().query_from, OBSERVERS[:0], [BoxAoi(BOXES[0])], [(0,)], 0.0).share.shape == (0, 1)
     dark = lambda eye: lambda d: (np.zeros((1, len(d))), np.ones(len(d)))
-    assert gaze_shares(dark, EYES[:1], [BoxAoi(BOXES[0])], [(0,)], 0.0).share.tolist() == [[0.0]]
+    assert gaze_shares(dark, OBSERVERS[:1], [BoxAoi(BOXES[0])], [(0,)], 0.0).share.tolist() == [[0.0]]
     broken = lambda eye: lambda d: (np.full((1, len(d)), np.nan), np.ones(len(d)))
     with pytest.raises(NergError, match="0.3.*2.0.*1.6"):
-        gaze_shares(broken, EYES[:1], [BoxAoi(BOXES[0])], [(0,)], 0.0)
+        gaze_shares(broken, OBSERVERS[:1], [BoxAoi(BOXES[0])], [(0,)], 0.0)
 
 
 # ---- What could be seen, and isovists, where both are known in closed form ----
@@ -127,22 +129,22 @@ PILLAR = np.array([[2.0, 1.5, 0], [3, 2.5, 2.0]])
 
 def room_depth(o, d):
     """A room with a pillar that reaches to 2 m."""
-    reach = intersect_box_numpy(o, d, *ROOM)[1]
+    extent = intersect_box_numpy(o, d, *ROOM)[1]
     near, far = intersect_box_numpy(o, d, *PILLAR)
-    reach = np.where((near < far) & (far > 0) & (near > 0), np.minimum(near, reach), reach)
+    extent = np.where((near < far) & (far > 0) & (near > 0), np.minimum(near, extent), extent)
     # From within one meets the pillar's inner faces.
-    return np.where((near < far) & (near <= 0) & (far > 0), np.minimum(far, reach), reach)
+    return np.where((near < far) & (near <= 0) & (far > 0), np.minimum(far, extent), extent)
 
 
-def thing(name, lower, upper):
+def aoi(name, lower, upper):
     return BoxAoi(Region.create(name, lower, upper))
 
 
 def test_points_behind_a_pillar_are_hidden():
-    things = [thing("near", [1.0, 1.9, 1], [1.2, 2.1, 1.2]), thing("behind", [4, 1.9, 1], [4.2, 2.1, 1.2])]
-    targets = SamplePoints.sample(things, 24)
-    eyes = np.array([[0.2, 2.0, 1.1], [3.5, 2.0, 1.1]])
-    seen = compute_visibility(targets, eyes, room_depth, 0.0)
+    aois = [aoi("near", [1.0, 1.9, 1], [1.2, 2.1, 1.2]), aoi("behind", [4, 1.9, 1], [4.2, 2.1, 1.2])]
+    targets = SamplePoints.sample(aois, 24)
+    observers = np.array([[0.2, 2.0, 1.1], [3.5, 2.0, 1.1]])
+    seen = compute_visibility(targets, observers, room_depth, 0.0)
     by_thing = [[seen[e, targets.aoi_index == k].any() for k in range(2)] for e in range(2)]
     assert by_thing == [[True, False], [False, True]]
     # A face that is turned away is not seen, whatever is between.
@@ -151,85 +153,87 @@ def test_points_behind_a_pillar_are_hidden():
 
 
 def test_field_of_view_is_a_cone():
-    targets = SamplePoints.sample([thing("a", [3.0, -0.05, -0.05], [3.1, 0.05, 0.05])], 6)
-    eyes = np.zeros((4, 3))
+    targets = SamplePoints.sample([aoi("a", [3.0, -0.05, -0.05], [3.1, 0.05, 0.05])], 6)
+    observers = np.zeros((4, 3))
     turns = np.radians([0, 29.0, 31.5, 180])
     ahead = np.column_stack([np.cos(turns), np.sin(turns), np.zeros(4)])
     seen = np.ones((4, len(targets.points)), bool)
-    assert visible_in_fov(targets, eyes, ahead, seen, 60.0)[:, 0].tolist() == [True, True, False, False]
-    assert visible_in_fov(targets, eyes, ahead, seen, 360.0).all()
-    assert not visible_in_fov(targets, eyes, ahead, ~seen, 360.0).any()
+    assert visible_in_fov(targets, observers, ahead, seen, 60.0)[:, 0].tolist() == [True, True, False, False]
+    assert visible_in_fov(targets, observers, ahead, seen, 360.0).all()
+    assert not visible_in_fov(targets, observers, ahead, ~seen, 360.0).any()
 
 
 def test_visibility_matches_a_loop():
     rng = np.random.default_rng(0)
-    things = [thing(str(k), c, c + 0.3) for k, c in enumerate(rng.uniform(0.2, 2.5, (5, 3)))]
-    targets = SamplePoints.sample(things, 20)
-    eyes, d = rng.uniform(0.2, 2.5, (30, 3)), rng.normal(size=(30, 3))
+    aois = [aoi(str(k), c, c + 0.3) for k, c in enumerate(rng.uniform(0.2, 2.5, (5, 3)))]
+    targets = SamplePoints.sample(aois, 20)
+    observers, d = rng.uniform(0.2, 2.5, (30, 3)), rng.normal(size=(30, 3))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     seen = rng.random((30, len(targets.points))) < 0.2
-    found = visible_in_fov(targets, eyes, d, seen, 100.0)
+    result = visible_in_fov(targets, observers, d, seen, 100.0)
     for i in range(30):
         for k in range(5):
             expected = False
             for s in np.flatnonzero(targets.aoi_index == k):
-                away = targets.points[s] - eyes[i]
+                away = targets.points[s] - observers[i]
                 angle = np.degrees(np.arccos(np.clip(away @ d[i] / np.linalg.norm(away), -1, 1)))
                 expected |= bool(seen[i, s]) and angle <= 50
-            assert found[i, k] == expected
+            assert result[i, k] == expected
 
 
 def test_visibility_cache():
-    targets = SamplePoints.sample([thing("a", [4, 1.9, 1], [4.2, 2.1, 1.2])], 24)
-    asked = []
+    targets = SamplePoints.sample([aoi("a", [4, 1.9, 1], [4.2, 2.1, 1.2])], 24)
+    requested = []
 
     def depth(o, d):
-        asked.append(len(o))
+        requested.append(len(o))
         return room_depth(o, d)
 
     cells = VisibilityCache(targets, depth, 0.1, 0.0)
-    eyes = np.random.default_rng(1).uniform(0.1, 1.4, (50, 3))
-    points, of = cells.get_visibility(eyes)
-    middle = (np.floor(eyes / 0.1) + 0.5) * 0.1
-    assert np.array_equal(points[of], compute_visibility(targets, middle, room_depth, 0.0))
-    before = len(asked)
+    observers = np.random.default_rng(1).uniform(0.1, 1.4, (50, 3))
+    points, index = cells.get_visibility(observers)
+    middle = (np.floor(observers / 0.1) + 0.5) * 0.1
+    assert np.array_equal(points[index], compute_visibility(targets, middle, room_depth, 0.0))
+    before = len(requested)
     assert (
-        np.array_equal(cells.get_visibility(eyes[:9])[0][cells.get_visibility(eyes[:9])[1]], points[of][:9])
-        and len(asked) == before
+        np.array_equal(
+            cells.get_visibility(observers[:9])[0][cells.get_visibility(observers[:9])[1]], points[index][:9]
+        )
+        and len(requested) == before
     )
     cells.MAX_BYTES = 0
-    cells.get_visibility(eyes[:2])
-    again, whose = cells.get_visibility(eyes)
-    assert np.array_equal(again[whose], points[of]) and len(asked) > before
+    cells.get_visibility(observers[:2])
+    again, whose = cells.get_visibility(observers)
+    assert np.array_equal(again[whose], points[index]) and len(requested) > before
     with pytest.raises(NergError, match="--cell"):
         VisibilityCache(targets, depth, 0.0, 0.0)
 
 
 def test_isovist_of_an_empty_room():
     empty = lambda o, d: intersect_box_numpy(o, d, *ROOM)[1]
-    found = compute_isovists(
+    result = compute_isovists(
         np.array([[1.0, 1, 1.6], [3, 2, 1.6]]), empty, SamplePoints.sample([], 4), 0.0, 100.0, num_directions=7200
     )
-    assert np.allclose(found.area, 24, rtol=2e-3) and np.allclose(found.perimeter, 20, rtol=2e-3)
-    assert np.allclose(found.nearest, [1, 2], atol=1e-3)
-    assert np.allclose(found.farthest, [np.hypot(5, 3), np.hypot(3, 2)], rtol=1e-3)
+    assert np.allclose(result.area, 24, rtol=2e-3) and np.allclose(result.perimeter, 20, rtol=2e-3)
+    assert np.allclose(result.nearest, [1, 2], atol=1e-3)
+    assert np.allclose(result.farthest, [np.hypot(5, 3), np.hypot(3, 2)], rtol=1e-3)
 
 
 def test_isovist_excludes_the_shadow_of_a_pillar():
     # From (1, 2): the pillar from y 1.5 to 2.5 at x = 2 hides the strip between the lines through its corners.
-    found = compute_isovists(
+    result = compute_isovists(
         np.array([[1.0, 2.0, 1.6]]), room_depth, SamplePoints.sample([], 4), 0.0, 100.0, num_directions=14400
     )
     # Lines of slope 1/2 from the eye meet the walls y = 0 and 4 at x = 5, and x = 6 beyond these: the shadow is the
     # region |y - 2| < (x - 1) / 2, 2 < x, within the room: a trapezium to x = 5 and a rectangle behind.
     shadow = (1 + 4) / 2 * 3 + 4 * 1
-    assert found.area[0] == pytest.approx(24 - shadow, rel=3e-3)
+    assert result.area[0] == pytest.approx(24 - shadow, rel=3e-3)
 
 
 def test_standing_positions():
-    found = find_standing_positions(*ROOM, 0.5, 1.6, room_depth, 0.0)
-    assert len(found) == 12 * 8 - 4 and np.allclose(found[:, 2], 1.6)
-    inside = ((found[:, :2] > PILLAR[0, :2]) & (found[:, :2] < PILLAR[1, :2])).all(axis=1)
+    result = find_standing_positions(*ROOM, 0.5, 1.6, room_depth, 0.0)
+    assert len(result) == 12 * 8 - 4 and np.allclose(result[:, 2], 1.6)
+    inside = ((result[:, :2] > PILLAR[0, :2]) & (result[:, :2] < PILLAR[1, :2])).all(axis=1)
     assert not inside.any()
     # Above a low thing nobody stands either, since the floor is not below; there is no floor at -1.
     low = lambda o, d: np.minimum(room_depth(o, d), np.where((d[:, 2] < 0) & (o[:, 0] < 1), o[:, 2] - 0.5, np.inf))

@@ -56,22 +56,22 @@ def test_every_measure_has_an_expected_value():
 
 @pytest.mark.parametrize("name", list(EXPECTED))
 def test_values_and_participants(name):
-    found = MEASURES_BY_NAME[name].estimate(PEOPLE, 199, 0)
-    assert found.value == pytest.approx(EXPECTED[name][0]) and found.participants.tolist() == EXPECTED[name][1]
+    result = MEASURES_BY_NAME[name].estimate(PEOPLE, 199, 0)
+    assert result.value == pytest.approx(EXPECTED[name][0]) and result.participants.tolist() == EXPECTED[name][1]
 
 
 def test_predictions_lack_time_course_measures():
-    told = Participants(PEOPLE.names, PEOPLE.time, PEOPLE.dwell_time, PEOPLE.distance, None, np.full((3, 2), 0.5))
-    known = {m.name for m in MEASURES if m.estimate(told, 199, 0) is not None}
-    assert known == {"share", "dwell", "hit_ratio", "distance"}
-    assert MEASURES_BY_NAME["hit_ratio"].estimate(told, 199, 0).value == pytest.approx([0.5, 0.5])
+    texts = Participants(PEOPLE.names, PEOPLE.time, PEOPLE.dwell_time, PEOPLE.distance, None, np.full((3, 2), 0.5))
+    expected = {m.name for m in MEASURES if m.estimate(texts, 199, 0) is not None}
+    assert expected == {"share", "dwell", "hit_ratio", "distance"}
+    assert MEASURES_BY_NAME["hit_ratio"].estimate(texts, 199, 0).value == pytest.approx([0.5, 0.5])
 
 
 def test_absent_participants_do_not_contribute():
-    more = PEOPLE.align_to(["Ada", "Bo", "Cy", "Dee", "Eve"])
-    assert more.is_in_cell.tolist() == [True, True, True, False, False]
+    options = PEOPLE.align_to(["Ada", "Bo", "Cy", "Dee", "Eve"])
+    assert options.is_in_cell.tolist() == [True, True, True, False, False]
     for measure in MEASURES:
-        a, b = measure.estimate(PEOPLE, 199, 0), measure.estimate(more, 199, 0)
+        a, b = measure.estimate(PEOPLE, 199, 0), measure.estimate(options, 199, 0)
         assert np.allclose(a.value, b.value, equal_nan=True) and a.participants.tolist() == b.participants.tolist(), (
             measure.name
         )
@@ -80,24 +80,24 @@ def test_absent_participants_do_not_contribute():
 def test_no_participants():
     none = Participants((), np.zeros(0), *(np.zeros((0, 2)) for _ in range(7)))
     for measure in MEASURES:
-        found = measure.estimate(none, 199, 0)
-        assert np.isnan(found.value).all() and found.participants.tolist() == [0, 0]
+        result = measure.estimate(none, 199, 0)
+        assert np.isnan(result.value).all() and result.participants.tolist() == [0, 0]
 
 
 # ---- The table of single people ----
 
 
 def sums():
-    found = VisitSums.empty(
+    result = VisitSums.empty(
         ("x", "y"), (ALL, Cell("zone", "z")), [(ALL, "Bo"), (Cell("zone", "z"), "Bo"), (ALL, "Ada")]
     )
-    found.time[:] = 10, 5, 20
-    found.rays[:] = 50, 25, 100
-    found.dwell_time[:] = [[1, 2], [9, 9], [3, 0]]
-    found.visits[:] = [[1, 1], [1, 1], [2, 0]]
-    found.visible_time[:] = [[4, 5], [9, 9], [6, 7]]
-    found.first_visit_sum[:], found.first_visit_count[:] = [[4, 6], [0, 0], [1, 0]], [[1, 2], [1, 1], [1, 0]]
-    return found
+    result.time[:] = 10, 5, 20
+    result.rays[:] = 50, 25, 100
+    result.dwell_time[:] = [[1, 2], [9, 9], [3, 0]]
+    result.visits[:] = [[1, 1], [1, 1], [2, 0]]
+    result.visible_time[:] = [[4, 5], [9, 9], [6, 7]]
+    result.first_visit_sum[:], result.first_visit_count[:] = [[4, 6], [0, 0], [1, 0]], [[1, 2], [1, 1], [1, 0]]
+    return result
 
 
 def test_participant_rows_are_sorted_by_name():
@@ -133,9 +133,9 @@ def people(n, share, seed, prefix="p"):
     rng = np.random.default_rng(seed)
     time = np.full(n, 100.0)
     on = 100 * np.clip(rng.normal(share, 0.03, (n, 2)), 0, 1)
-    looks = np.round(on / 2)
+    visits = np.round(on / 2)
     names = tuple(f"{prefix}{k:02d}" for k in range(n))
-    return Participants(names, time, on, on * 2, None, (looks > 0) * 1.0, looks, on, looks)
+    return Participants(names, time, on, on * 2, None, (visits > 0) * 1.0, visits, on, visits)
 
 
 def test_rows_by_cell_area_and_source():
@@ -162,8 +162,8 @@ def test_few_participants_are_suppressed():
     blank = [k for k, v in rows[2].items() if v is not None]
     assert blank == ["cell", "value", "aoi", "source"]
     # Of both things: the number of people, and the measures that rays tell.
-    told = sum(measure.numerator_denominator(cells[A][MEASURED]) is not None for measure in MEASURES)
-    assert floor.num_suppressed == 2 * (1 + told) and told >= 7
+    texts = sum(measure.numerator_denominator(cells[A][MEASURED]) is not None for measure in MEASURES)
+    assert floor.num_suppressed == 2 * (1 + texts) and texts >= 7
     nobody = MinParticipantsFilter(5)
     assert nobody.allows(0) and nobody.allows(5) and not nobody.allows(4) and nobody.num_suppressed == 1
 
@@ -187,15 +187,15 @@ def test_single_value_has_no_differences():
 
 
 def sums_tables():
-    found = VisitSums.empty(("x", "y"), (ALL,), [(ALL, "Bo"), (ALL, "Ada")])
-    found.time[:] = 10, 20
-    found.rays[:] = 50, 100
-    found.dwell_time[:] = [[1, 2], [3, 0]]
-    found.visits[:] = [[1, 1], [2, 0]]
-    found.first_visit_sum[:], found.first_visit_count[:] = [[4, 6], [1, 0]], [[1, 2], [1, 0]]
-    found.transitions[0] = [[0, 3], [1, 0]]
-    found.duration_counts[0, 0, 2] = 3
-    return found
+    result = VisitSums.empty(("x", "y"), (ALL,), [(ALL, "Bo"), (ALL, "Ada")])
+    result.time[:] = 10, 20
+    result.rays[:] = 50, 100
+    result.dwell_time[:] = [[1, 2], [3, 0]]
+    result.visits[:] = [[1, 1], [2, 0]]
+    result.first_visit_sum[:], result.first_visit_count[:] = [[4, 6], [1, 0]], [[1, 2], [1, 0]]
+    result.transitions[0] = [[0, 3], [1, 0]]
+    result.duration_counts[0, 0, 2] = 3
+    return result
 
 
 def test_transitions_and_durations():

@@ -61,35 +61,31 @@ def some_rays(n=2000, seed=0):
 
 
 def test_hits_of_boxes():
-    things = [
-        box("a", [-1, -1, -1], [1, 0.5, 1]),
-        box("b", [0, 0, 0], [2, 1, 1], 35),
-        box("c", [1.5, -2, -1], [2, 2, 0]),
-    ]
+    aois = [box("a", [-1, -1, -1], [1, 0.5, 1]), box("b", [0, 0, 0], [2, 1, 1], 35), box("c", [1.5, -2, -1], [2, 2, 0])]
     o, d, depth = some_rays()
-    found = assign_hits(things, o, d, depth, 0.03).to_matrix()
-    expected = np.zeros_like(found)
+    result = assign_hits(aois, o, d, depth, 0.03).to_matrix()
+    expected = np.zeros_like(result)
     for i in range(len(o)):
-        for k, thing in enumerate(things):
-            span = brute(thing.region, o[i], d[i])
+        for k, aoi in enumerate(aois):
+            span = brute(aoi.region, o[i], d[i])
             if span is None:
                 continue
             near, far = span
             expected[i, k] = near - 0.03 <= depth[i] < far + 0.03
-    assert np.array_equal(found, expected) and 20 < expected.sum() and not expected.all(axis=1).all()
-    inside = np.array([thing.region.contains(o) for thing in things]).T
+    assert np.array_equal(result, expected) and 20 < expected.sum() and not expected.all(axis=1).all()
+    inside = np.array([aoi.region.contains(o) for aoi in aois]).T
     assert (inside & expected).any() and (inside & ~expected).any()
 
 
 def test_hit_distances():
-    things = [box("a", [1, -1, -1], [2, 1, 1]), box("around", [-1, -1, -1], [3, 1, 1])]
+    aois = [box("a", [1, -1, -1], [2, 1, 1]), box("around", [-1, -1, -1], [3, 1, 1])]
     o, d = np.zeros((1, 3)), np.array([[1.0, 0, 0]])
-    landed = assign_hits(things, o, d, np.array([1.7]))
+    landed = assign_hits(aois, o, d, np.array([1.7]))
     assert [v.tolist() for v in landed.distance] == [[1.0], [1.7]]
     # Beyond a box, or nowhere: they look through it, or out of that in which they stand.
-    assert [len(v) for v in assign_hits(things, o, d, np.array([2.5])).rows] == [0, 1]
-    assert [len(v) for v in assign_hits(things, o, d, np.array([3.5])).rows] == [0, 0]
-    assert [len(v) for v in assign_hits(things, o, d, np.array([np.inf])).rows] == [0, 0]
+    assert [len(v) for v in assign_hits(aois, o, d, np.array([2.5])).rows] == [0, 1]
+    assert [len(v) for v in assign_hits(aois, o, d, np.array([3.5])).rows] == [0, 0]
+    assert [len(v) for v in assign_hits(aois, o, d, np.array([np.inf])).rows] == [0, 0]
 
 
 def test_aois_are_solid_without_surfaces():
@@ -99,30 +95,30 @@ def test_aois_are_solid_without_surfaces():
         box("i", [1.5, 0, 0], [2.5, 1, 1]),
     )
     o, d = np.array([[0, 0.5, 0.5], [0, -0.5, -0.5], [0, 5.0, 0]]), np.tile([1.0, 0, 0], (3, 1))
-    found = assign_hits([front, behind, in_front], o, d, None).to_matrix()
+    result = assign_hits([front, behind, in_front], o, d, None).to_matrix()
     # Overlapping ones share a look, what begins behind the end of another is hidden.
-    assert found.tolist() == [[True, False, True], [True, False, False], [False, False, False]]
+    assert result.tolist() == [[True, False, True], [True, False, False], [False, False, False]]
 
 
 def test_grazed_and_rear_boxes_are_missed():
-    thing = box("a", [1, 0, 0], [2, 1, 1])
+    aoi = box("a", [1, 0, 0], [2, 1, 1])
     o = np.array([[0.0, 1, 0.5], [3, 0.5, 0.5], [0, 0.5, 0.5]])
     d = np.array([[1.0, 0, 0], [1, 0, 0], [1, 0, 0]])
-    assert assign_hits([thing], o, d, np.array([1.5, 0.5, 1.5])).to_matrix()[1:, 0].tolist() == [False, True]
+    assert assign_hits([aoi], o, d, np.array([1.5, 0.5, 1.5])).to_matrix()[1:, 0].tolist() == [False, True]
 
 
 def test_areas_merge_their_members():
-    things = [box("a", [1, -1, -1], [2, 1, 1]), box("b", [1.5, 0, -1], [4, 1, 1])]
+    aois = [box("a", [1, -1, -1], [2, 1, 1]), box("b", [1.5, 0, -1], [4, 1, 1])]
     o, d = np.array([[0, 0.5, 0.0], [0, -0.5, 0], [3, 0.5, -5]]), np.array([[1.0, 0, 0], [1, 0, 0], [0, 0, 1]])
-    landed = merge_members(assign_hits(things, o, d, np.array([1.6, 1.0, 5.0])), [(0,), (1,), (0, 1)])
+    landed = merge_members(assign_hits(aois, o, d, np.array([1.6, 1.0, 5.0])), [(0,), (1,), (0, 1)])
     assert [rows.tolist() for rows in landed.rows] == [[0, 1], [0, 2], [0, 1, 2]]
     assert landed.distance[2].tolist() == [1.0, 1.0, 4.0]
 
 
 def test_hits_are_concatenated_and_merged():
-    things = [box("a", [1, -1, -1], [2, 1, 1])]
+    aois = [box("a", [1, -1, -1], [2, 1, 1])]
     o, d = np.zeros((2, 3)), np.array([[1.0, 0, 0], [0, 1, 0]])
-    one, two = assign_hits(things, o, d, None), assign_hits(things, o, d[::-1], None)
+    one, two = assign_hits(aois, o, d, None), assign_hits(aois, o, d[::-1], None)
     assert concatenate_hits([one, two]).rows[0].tolist() == [0, 3]
     assert merge_directions([one, two]).rows[0].tolist() == [0, 1]
 
@@ -130,9 +126,9 @@ def test_hits_are_concatenated_and_merged():
 @pytest.mark.parametrize("degrees", [0.5, 2.0, 10.0])
 def test_cone_has_no_wide_gaps(degrees):
     d = np.array([[0, 0, 1.0], [0, 0, -1], [0.6, 0, 0.8], [0.36, -0.48, -0.8]])
-    ways = np.stack(sample_cone(d, degrees))
-    assert len(ways) == 19 and np.allclose(np.linalg.norm(ways, axis=2), 1)
-    angle = np.degrees(np.arccos(np.clip((ways * d).sum(axis=2), -1, 1)))
+    directions = np.stack(sample_cone(d, degrees))
+    assert len(directions) == 19 and np.allclose(np.linalg.norm(directions, axis=2), 1)
+    angle = np.degrees(np.arccos(np.clip((directions * d).sum(axis=2), -1, 1)))
     assert np.allclose(angle[0], 0, atol=1e-5) and np.allclose(angle[1:7], degrees / 2, rtol=1e-3)
     assert np.allclose(angle[7:], degrees, rtol=1e-3)
     rng = np.random.default_rng(0)
@@ -144,18 +140,18 @@ def test_cone_has_no_wide_gaps(degrees):
         within = np.cos(r)[:, None] * d[k] + np.sin(r)[:, None] * (
             np.cos(turn)[:, None] * u + np.sin(turn)[:, None] * v
         )
-        nearest = np.degrees(np.arccos(np.clip(within @ ways[:, k].T, -1, 1)).min(axis=1))
+        nearest = np.degrees(np.arccos(np.clip(within @ directions[:, k].T, -1, 1)).min(axis=1))
         assert nearest.max() < 0.5 * degrees
 
 
 def test_sample_points_cover_a_box():
-    thing = box("a", [0, 0, 0], [2, 1, 0.5], 20)
-    points, normals = thing.sample_points(70)
-    own = thing.region.to_local(points)
-    lower, upper = thing.region.corners
-    on_face = np.isclose(own, lower) | np.isclose(own, upper)
-    assert (on_face.sum(axis=1) == 1).all() and ((own > lower - 1e-9) & (own < upper + 1e-9)).all()
-    assert np.allclose(((points - thing.region.center) * normals).sum(axis=1) > 0, True)
+    aoi = box("a", [0, 0, 0], [2, 1, 0.5], 20)
+    points, normals = aoi.sample_points(70)
+    subset = aoi.region.to_local(points)
+    lower, upper = aoi.region.corners
+    on_face = np.isclose(subset, lower) | np.isclose(subset, upper)
+    assert (on_face.sum(axis=1) == 1).all() and ((subset > lower - 1e-9) & (subset < upper + 1e-9)).all()
+    assert np.allclose(((points - aoi.region.center) * normals).sum(axis=1) > 0, True)
     assert 40 < len(points) < 110
 
 
@@ -181,18 +177,20 @@ def slow_weights(person, t, rules):
     return sitting, weight
 
 
-def slow_looks(rows, t, weight, sitting, rules):
+def find_visits_by_loop(rows, t, weight, sitting, rules):
     """Ray by ray."""
-    looks, now = [], None
+    visits, now = [], None
     for r in rows:
         start, end = t[r], t[r] + weight[r]
         if now is not None and sitting[now[0]] == sitting[r] and start - now[2] <= rules.merge_gap + 1e-9:
             now = (now[0], now[1], end)
         else:
             if now is not None:
-                looks.append(now)
+                visits.append(now)
             now = (r, start, end)
-    return [found for found in [*looks, now] if found is not None and found[2] - found[1] >= rules.min_visit - 1e-9]
+    return [
+        result for result in [*visits, now] if result is not None and result[2] - result[1] >= rules.min_visit - 1e-9
+    ]
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -206,10 +204,10 @@ def test_visits_match_a_loop(seed):
     sitting, weight = slow_weights(person, t, rules)
     assert line.session.tolist() == sitting and np.allclose(line.weight, weight)
     rows = np.flatnonzero(rng.random(120) < 0.5)
-    looks = find_visits(rows, line, rules)
-    expected = slow_looks(rows, t, weight, sitting, rules)
-    assert looks.first.tolist() == [e[0] for e in expected]
-    assert np.allclose(looks.start, [e[1] for e in expected]) and np.allclose(looks.end, [e[2] for e in expected])
+    visits = find_visits(rows, line, rules)
+    expected = find_visits_by_loop(rows, t, weight, sitting, rules)
+    assert visits.first.tolist() == [e[0] for e in expected]
+    assert np.allclose(visits.start, [e[1] for e in expected]) and np.allclose(visits.end, [e[2] for e in expected])
 
 
 def test_single_sample_represents_no_time():
@@ -267,8 +265,8 @@ def made(seed=0, n=150, people=3):
     step = rng.choice([0.1, 0.2, 0.2, 0.3, 0.7, 6.0], n)
     t = np.zeros(n)
     for p in range(people):
-        own = np.flatnonzero(person == p)
-        t[own] = rng.permutation(np.cumsum(step[own]))
+        subset = np.flatnonzero(person == p)
+        t[subset] = rng.permutation(np.cumsum(step[subset]))
     d = np.tile([1.0, 0, 0], (n, 1))
     names = tuple(f"person {k}" for k in range(people))
     rays = Rays(t, person, names, rng.random((n, 3)), d, np.ones(n))
@@ -307,8 +305,8 @@ def slow_sums(rays, on, far, visible, cells):
         every = []
         for a in range(3):
             rows = [k for k in range(len(order)) if on[order[k], a]]
-            known = set()
-            for first, start, end in slow_looks(rows, t, weight, sitting, RULES):
+            expected = set()
+            for first, start, end in find_visits_by_loop(rows, t, weight, sitting, RULES):
                 every.append((sitting[first], start, a, first))
                 if not mine[first]:
                     continue
@@ -318,8 +316,8 @@ def slow_sums(rays, on, far, visible, cells):
                 out["last_end", cell, who, a] = max(out.get(("last_end", cell, who, a), -np.inf), end)
                 bin_ = max(b for b in range(len(BINS) - 1) if end - start >= BINS[b])
                 out["lasted", cell, a, bin_] += 1
-                if sitting[first] not in known:
-                    known.add(sitting[first])
+                if sitting[first] not in expected:
+                    expected.add(sitting[first])
                     out["first_visit_sum", cell, who, a] += start - begin[sitting[first]]
                     out["first_visit_count", cell, who, a] += 1
         every.sort()
@@ -371,22 +369,24 @@ def test_sums_match_loops(seed):
 
 def pick(landed, rows):
     place = {int(r): k for k, r in enumerate(rows)}
-    keep = [[place[int(r)] for r in of if int(r) in place] for of in landed.rows]
-    far = [np.array([d for r, d in zip(of, ds) if int(r) in place]) for of, ds in zip(landed.rows, landed.distance)]
+    keep = [[place[int(r)] for r in index if int(r) in place] for index in landed.rows]
+    far = [
+        np.array([d for r, d in zip(index, ds) if int(r) in place]) for index, ds in zip(landed.rows, landed.distance)
+    ]
     return HitAssignment(len(rows), tuple(np.array(k, int) for k in keep), tuple(far))
 
 
 def test_partition_does_not_change_sums():
     rays, landed, _, _, visible = made(7, 300, 6)
-    whole = sum_visits(rays, landed, AREAS, [(ALL, None)], RULES, visible)
+    whole_result = sum_visits(rays, landed, AREAS, [(ALL, None)], RULES, visible)
     parts = []
     for p in range(6):
         rows = np.flatnonzero(rays.person == p)
         parts.append(sum_visits(rays.select(rows), pick(landed, rows), AREAS, [(ALL, None)], RULES, visible[rows]))
     merged = merge_sums(parts)
-    assert merged.rows == whole.rows
+    assert merged.rows == whole_result.rows
     for f in fields(VisitSums):
-        value = getattr(whole, f.name)
+        value = getattr(whole_result, f.name)
         if isinstance(value, np.ndarray):
             assert np.array_equal(getattr(merged, f.name), value), f.name
     # And so in parts of parts, to the bit, in the same order.

@@ -129,8 +129,8 @@ def test_spherical_harmonics_decay(degree):
     ball = trimesh.creation.icosphere(4)
     mesh, s, steps = Mesh(np.array(ball.vertices), np.array(ball.faces)), 0.3, 8
     wave = np.polynomial.legendre.Legendre.basis(degree)(mesh.vertices[:, 2])
-    found = Smoother(mesh, s, steps)(wave * mesh.vertex_area)
-    left = (found * wave).sum() / (wave * wave * mesh.vertex_area).sum()
+    result = Smoother(mesh, s, steps)(wave * mesh.vertex_area)
+    left = (result * wave).sum() / (wave * wave * mesh.vertex_area).sum()
     rate = degree * (degree + 1) * s * s / 2
     # Of steps backwards in time exactly, of heat to their order.
     assert np.isclose(left, (1 + rate / steps) ** -steps, rtol=6e-3)
@@ -144,9 +144,9 @@ def test_smoothing_does_not_cross_gaps(scale):
     mesh, _, _ = weld_mesh(scale * np.concatenate([v, v + [0, 0, 0.05]]), np.concatenate([f, f + len(v)]))
     upper = mesh.vertices[:, 2] > 0.02 * scale
     start = np.where(upper, 0, np.random.default_rng(0).random(len(upper)))
-    found = Smoother(mesh, 0.3 * scale)(start)
-    assert (found[upper] == 0).all() and np.isclose(found.sum(), start.sum(), rtol=1e-10)
-    assert found[~upper].min() > 0
+    result = Smoother(mesh, 0.3 * scale)(start)
+    assert (result[upper] == 0).all() and np.isclose(result.sum(), start.sum(), rtol=1e-10)
+    assert result[~upper].min() > 0
 
 
 def test_smoothing_keeps_uniform_densities_and_signs():
@@ -157,8 +157,8 @@ def test_smoothing_keeps_uniform_densities_and_signs():
         for k in range(0, len(mesh.vertices), 7):
             start = np.zeros(len(mesh.vertices))
             start[k] = 1.0
-            found = smoother(start)
-            assert found.min() >= 0 and np.isclose(found.sum(), 1, rtol=1e-9)
+            result = smoother(start)
+            assert result.min() >= 0 and np.isclose(result.sum(), 1, rtol=1e-9)
         assert not smoother(np.zeros(len(mesh.vertices))).any()
 
 
@@ -182,11 +182,14 @@ def test_deposit_conserves_its_sum():
 def test_sums_are_added_in_order():
     rng = np.random.default_rng(0)
     parts = [SurfaceSums(rng.random(3), rng.random(4), *rng.random(4), 1) for _ in range(5)]
-    whole = merge_sums(parts)
+    whole_result = merge_sums(parts)
     assert np.array_equal(
-        whole.face_sums,
+        whole_result.face_sums,
         ((((parts[0].face_sums + parts[1].face_sums) + parts[2].face_sums) + parts[3].face_sums) + parts[4].face_sums),
     )
-    assert whole.count == 5 and np.isclose(whole.weight, sum(p.weight for p in parts))
-    assert np.isclose(whole.unaccounted, whole.total - whole.face_sums.sum() - whole.elsewhere - whole.escaped)
+    assert whole_result.count == 5 and np.isclose(whole_result.weight, sum(p.weight for p in parts))
+    assert np.isclose(
+        whole_result.unaccounted,
+        whole_result.total - whole_result.face_sums.sum() - whole_result.elsewhere - whole_result.escaped,
+    )
     assert SurfaceSums.zeros(2, 3).on_surface == 0

@@ -75,23 +75,23 @@ def edge_counts(faces):
 
 @pytest.mark.parametrize("longest", [3.0, 1.0, 0.37, 0.11])
 def test_refinement_preserves_area_and_closedness(longest):
-    whole = joined(box((0, 0, 0), (1, 2, 3)))
-    found = refine(whole, longest)
-    assert set(edge_counts(found.mesh.faces)) == {2}
-    assert longest_edge(found.mesh) <= longest
-    assert np.allclose(np.bincount(found.parent, found.mesh.area), whole.area, rtol=1e-12)
+    whole_result = joined(box((0, 0, 0), (1, 2, 3)))
+    result = refine(whole_result, longest)
+    assert set(edge_counts(result.mesh.faces)) == {2}
+    assert longest_edge(result.mesh) <= longest
+    assert np.allclose(np.bincount(result.parent, result.mesh.area), whole_result.area, rtol=1e-12)
     # Outwards still: the flux of x is three times the volume, with the sign of the whole's.
     flux = lambda m: np.einsum("fi,fi->", m.corners.mean(1), m.normals * m.area[:, None])
-    assert np.isclose(flux(found.mesh), flux(whole)) and np.isclose(abs(flux(whole)), 18)
+    assert np.isclose(flux(result.mesh), flux(whole_result)) and np.isclose(abs(flux(whole_result)), 18)
     # Each corner is where its place in the parent says.
-    told = np.einsum("fij,fjk->fik", found.barycentric, whole.corners[found.parent])
-    assert np.allclose(told, found.mesh.corners, atol=1e-12)
+    texts = np.einsum("fij,fjk->fik", result.barycentric, whole_result.corners[result.parent])
+    assert np.allclose(texts, result.mesh.corners, atol=1e-12)
 
 
 def test_fine_mesh_is_unchanged():
     sheet = joined(plate(5, 0.3))
-    found = refine(sheet, 10.0)
-    assert np.array_equal(found.mesh.faces, sheet.faces) and np.array_equal(found.parent, np.arange(32))
+    result = refine(sheet, 10.0)
+    assert np.array_equal(result.mesh.faces, sheet.faces) and np.array_equal(result.parent, np.arange(32))
 
 
 def test_too_many_faces_are_refused(monkeypatch):
@@ -108,7 +108,7 @@ def test_ray_ends(rgb):
     target = SurfaceTarget(room, [inner])
     d = fibonacci_directions(4000)[1:]
     eye = np.array([1.0, 1.5, 1.0])
-    found = target.trace(np.broadcast_to(eye, d.shape), d)
+    result = target.trace(np.broadcast_to(eye, d.shape), d)
     # Slabs, in NumPy: the inner box first, then the open side, then the room.
     with np.errstate(divide="ignore"):
         t = (np.array([(2, 1, 0.5), (3, 2, 1.5)])[:, None] - eye) / d
@@ -116,10 +116,10 @@ def test_ray_ends(rgb):
         hits &= t.min(0).max(1) > 0
         walls = np.where(d > 0, (np.array([4, 3, 2]) - eye) / d, -eye / d)
     out = ~hits & (walls.argmin(1) == 0) & (d[:, 0] > 0)
-    assert np.array_equal(found.elsewhere, hits)
-    assert np.mean((found.face < 0) == (hits | out)) > 0.9995
-    on = found.face >= 0
-    p = np.einsum("pi,pik->pk", found.barycentric, room.corners[found.face])[on]
+    assert np.array_equal(result.elsewhere, hits)
+    assert np.mean((result.face < 0) == (hits | out)) > 0.9995
+    on = result.face >= 0
+    p = np.einsum("pi,pik->pk", result.barycentric, room.corners[result.face])[on]
     assert np.allclose(p, (eye + walls.min(1)[:, None] * d)[on], atol=1e-5)
 
 
@@ -128,8 +128,8 @@ def test_rays_end_in_a_medium(rgb):
     sheet = (np.array([(-2.0, -2, 2), (2, -2, 2), (2, 2, 2), (-2, 2, 2)]), np.array([(0, 1, 2), (0, 2, 3)]))
     target = SurfaceTarget(joined(sheet), medium=VolumeMedium(fog))
     origins = np.array([(0.25, 0.25, -1), (1.0, 1.0, -1)])
-    found = target.trace(origins, np.broadcast_to([0.0, 0, 1], (2, 3)))
-    assert found.elsewhere.tolist() == [True, False] and (found.face >= 0).tolist() == [False, True]
+    result = target.trace(origins, np.broadcast_to([0.0, 0, 1], (2, 3)))
+    assert result.elsewhere.tolist() == [True, False] and (result.face >= 0).tolist() == [False, True]
 
 
 # ---- Charts ----
@@ -147,16 +147,16 @@ def test_texture_matches_the_surface(rgb, scale, rows, monkeypatch):
     assert np.array_equal(charts.vertex[charts.faces], mesh.faces)
     values = refined.mesh.vertices @ [1.0, 2, 3] / scale
     blocks = list(iter_texture_rows(charts, refined, values, pixels))
-    found, known = (np.concatenate([block[k] for block in blocks]) for k in (1, 2))
+    result, expected = (np.concatenate([block[k] for block in blocks]) for k in (1, 2))
     assert [block[0].start for block in blocks] == list(range(0, pixels, rows))
-    assert found.shape == known.shape == (256, 256) and 0.3 < known.mean() < 1
+    assert result.shape == expected.shape == (256, 256) and 0.3 < expected.mean() < 1
     # At points drawn on the surface, by the nearest pixel.
     rng = np.random.default_rng(0)
     face, b = rng.integers(0, len(mesh.faces), 500), rng.dirichlet((2, 2, 2), 500)
     uv = np.einsum("ni,nik->nk", b, charts.uv[charts.faces[face]])
-    there = np.einsum("ni,nik->nk", b, mesh.corners[face]) @ [1.0, 2, 3] / scale
+    expected = np.einsum("ni,nik->nk", b, mesh.corners[face]) @ [1.0, 2, 3] / scale
     column, row = np.floor(uv * pixels).astype(int).T
-    assert known[row, column].all() and np.abs(found[row, column] - there).max() < 0.06
+    assert expected[row, column].all() and np.abs(result[row, column] - expected).max() < 0.06
 
 
 def test_oversized_textures_are_refused(rgb, monkeypatch):

@@ -52,9 +52,9 @@ def test_cone_scales_spherical_harmonics(rgb, degree):
         assert isinstance(u, rgb.Vector3f)
         return zonal[degree](dr.dot(u, axis))
 
-    found = np.array(blur_density(density, d, sigma))
+    result = np.array(blur_density(density, d, sigma))
     expected = 0.5 * (1 + eval_legendre(degree, np.cos(2 * sigma))) * np.array(zonal[degree](dr.dot(d, axis)))
-    assert np.allclose(found, expected, atol=1e-5)
+    assert np.allclose(result, expected, atol=1e-5)
 
 
 def test_cone_matches_heat_to_fourth_order():
@@ -109,8 +109,8 @@ def test_surface_occluder_and_escaped_shares(rgb, y, kappa):
             SETTINGS,
         )
         exact = _shares(kappa, np.array([1.0, y, 1.5]), without is not None)
-        found = np.array([sums.on_surface, sums.elsewhere, sums.escaped]) / 2
-        assert np.abs(found - exact).max() < 1.2e-3 and abs(sums.unaccounted) < 1e-3 * sums.total and sums.weight == 2
+        result = np.array([sums.on_surface, sums.elsewhere, sums.escaped]) / 2
+        assert np.abs(result - exact).max() < 1.2e-3 and abs(sums.unaccounted) < 1e-3 * sums.total and sums.weight == 2
 
 
 def _shares(kappa: float, eye: np.ndarray, window: bool, count: int = 1 << 17) -> np.ndarray:
@@ -161,29 +161,29 @@ def test_sums_match_surface_attention(rgb, tmp_path):
     import nerg_mi as nerg
     from tests.pictures import box_dict
 
-    here = files(store)
+    actual = files(store)
     eye = (4.4, 2.8, 1.6)
-    scene = nerg.make_scene(gaze=here / "shoppers.safetensors", shapes=here / "twin.ply", falloff=0.0)
-    thing = box((4.4, 4.65, 0.0), (4.9, 5.0, 1.45))
+    scene = nerg.make_scene(gaze=actual / "shoppers.safetensors", shapes=actual / "twin.ply", falloff=0.0)
+    aoi = box((4.4, 4.65, 0.0), (4.9, 5.0, 1.45))
     expected = nerg.attention(scene, box_dict(*np.array([(4.4, 4.65, 0.0), (4.9, 5.0, 1.45)])), [eye], divisions=24)
     from nerg_mi.formats.meshes import read_mesh_file
     from nerg_mi.surfaces.sources import observers_from_field
 
-    read = read_mesh_file(here / "twin.ply")
+    read = read_mesh_file(actual / "twin.ply")
     twin = read.vertices, read.faces
-    target = SurfaceTarget(joined(thing), [twin])
+    target = SurfaceTarget(joined(aoi), [twin])
     # Looked at as if it stood there: the goods in the box hide it, as they hide the box of `attention`.
     make = observers_from_field(scene.integrator.gaze, target.geometry, target.settings)
     sums = sum_gaze(target, make, np.array([eye]), [1.0], SETTINGS)
     assert expected.share[0] > 0.001
     # The field is normalised over what is seen: with the box there, and without it.
     gaze, at = scene.integrator.gaze, rgb.Point3f(eye)
-    there, without = (
+    reference, without = (
         float(gaze.for_observers([at], place, target.settings).integrals(at)[0][0])
         for place in (target.geometry, SurfaceTarget(joined(twin)).geometry)
     )
-    assert abs(there / without - 1) > 0.03
-    assert np.isclose(sums.face_sums.sum() * there / without, expected.share[0], rtol=0.01)
+    assert abs(reference / without - 1) > 0.03
+    assert np.isclose(sums.face_sums.sum() * reference / without, expected.share[0], rtol=0.01)
 
 
 def test_parts_add_up_exactly(rgb):
@@ -192,10 +192,10 @@ def test_parts_add_up_exactly(rgb):
         lookers_of_law(vmf(rgb, (0, 1, 0), 5.0)),
         GazeSumSettings(max_angle=0.2),
     )
-    eyes, weights = np.random.default_rng(0).uniform(0.5, 2, (3, 3)), np.array([0.2, 0.3, 0.5])
-    each = [sum_gaze(target, law, eyes[k : k + 1], weights[k : k + 1], coarse) for k in range(3)]
-    whole = sum_gaze(target, law, eyes, weights, coarse)
-    assert np.array_equal(merge_sums(each).vertex_sums, whole.vertex_sums) and whole.count == 3
+    observers, weights = np.random.default_rng(0).uniform(0.5, 2, (3, 3)), np.array([0.2, 0.3, 0.5])
+    each = [sum_gaze(target, law, observers[k : k + 1], weights[k : k + 1], coarse) for k in range(3)]
+    whole_result = sum_gaze(target, law, observers, weights, coarse)
+    assert np.array_equal(merge_sums(each).vertex_sums, whole_result.vertex_sums) and whole_result.count == 3
 
 
 # ---- Pieces that an outline crosses are cut until what is left out is little ----
@@ -211,10 +211,10 @@ def test_shadow_boundary_along_subdivisions(rgb):
         target = SurfaceTarget(joined(FLOOR), [(plate, FLOOR[1])])
         pieces = subdivide_faces(target.mesh, eye, 0.3)
         parts = list(iter_visible_pieces(target, pieces, lambda some: np.ones(len(some)), 2 * np.pi, 1 << 12))
-        found = sum(received.sum() for _, received in parts)
+        result = sum(received.sum() for _, received in parts)
         # Of the strip from -1 to x, by the four corners of half of each of its two parts.
         exact = sum(2 * np.arctan2(a, 2 * np.sqrt(a * a + 5)) for a in (1.0, x))
-        assert abs(found - exact) < 1e-3
+        assert abs(result - exact) < 1e-3
         uncut = pieces.solid_angle[target.is_visible(eye, pieces.centroids, pieces.face)].sum()
         assert abs(uncut - exact) > 1e-3
 
@@ -229,8 +229,8 @@ def test_narrow_density_is_integrated(rgb):
         cos = -d[:, 2] / np.linalg.norm(d, axis=1)
         return 60 / (2 * np.pi) * np.exp(60 * (cos - 1))
 
-    found = sum(received.sum() for _, received in iter_visible_pieces(target, pieces, law, 1.0, 1 << 12))
-    assert abs(found - 1) < 1e-3 and abs((pieces.solid_angle * law(pieces)).sum() - 1) > 1e-2
+    result = sum(received.sum() for _, received in iter_visible_pieces(target, pieces, law, 1.0, 1 << 12))
+    assert abs(result - 1) < 1e-3 and abs((pieces.solid_angle * law(pieces)).sum() - 1) > 1e-2
 
 
 # ---- Solid angles of pieces, however near the observer stands ----
@@ -242,14 +242,14 @@ PIECES_ROOM = joined(box((0, 0, 0), (1.0, 1.0, 1.0)))
 @pytest.mark.parametrize("eye", [(0.5, 0.5, 0.5), (0.999, 0.3, 0.2), (1 - 1e-9, 0.9999, 0.5)])
 def test_room_subtends_the_whole_sphere(eye, scale):
     room = joined(box((0, 0, 0), (scale, scale, scale)))
-    found = subdivide_faces(room, scale * np.array(eye), 0.2)
-    assert np.isclose(found.solid_angle.sum(), 4 * np.pi, rtol=1e-9)
-    center = np.einsum("pi,pik->pk", found.centroid_barycentric, room.corners[found.face])
-    assert np.allclose(center, found.centroids, atol=1e-9 * scale)
+    result = subdivide_faces(room, scale * np.array(eye), 0.2)
+    assert np.isclose(result.solid_angle.sum(), 4 * np.pi, rtol=1e-9)
+    center = np.einsum("pi,pik->pk", result.centroid_barycentric, room.corners[result.face])
+    assert np.allclose(center, result.centroids, atol=1e-9 * scale)
     # As many pieces as the sphere has room for, not as the nearness would ask.
-    assert len(found.face) < 50_000
-    away = np.linalg.norm(found.centroids - scale * np.array(eye), axis=1)
-    assert np.all(np.sqrt(found.solid_angle) < 0.2) and away.min() > 0
+    assert len(result.face) < 50_000
+    away = np.linalg.norm(result.centroids - scale * np.array(eye), axis=1)
+    assert np.all(np.sqrt(result.solid_angle) < 0.2) and away.min() > 0
 
 
 def test_solid_angles_of_octant_and_distant_triangles():
@@ -262,8 +262,8 @@ def test_solid_angles_of_octant_and_distant_triangles():
 
 def test_subdivision_ends_for_observer_on_a_face():
     sheet = joined((np.array([(-1.0, -1, 0), (2, -1, 0), (-1, 2, 0)]), np.array([(0, 1, 2)])))
-    found = subdivide_faces(sheet, np.zeros(3), 0.5)
-    assert found.solid_angle.sum() == 0 and len(found.face) < 20_000
+    result = subdivide_faces(sheet, np.zeros(3), 0.5)
+    assert result.solid_angle.sum() == 0 and len(result.face) < 20_000
 
 
 @pytest.mark.parametrize("far", [1e155, 1e200, 1e308, np.inf, np.nan])
@@ -287,17 +287,17 @@ def rays(t, person):
 
 
 def test_ray_durations():
-    of = rays([0, 0.1, 0.3, 9.0, 9.1, 0.0, 0.2], [0, 0, 0, 0, 0, 1, 1])
+    index = rays([0, 0.1, 0.3, 9.0, 9.1, 0.0, 0.2], [0, 0, 0, 0, 0, 1, 1])
     # Pauses count as half a second at most; the last of each as the median of theirs.
-    assert np.allclose(ray_durations(of), [0.1, 0.2, 0.5, 0.1, 0.15, 0.2, 0.2])
-    assert np.allclose(ray_durations(of, max_gap=0.05), 0.05)
+    assert np.allclose(ray_durations(index), [0.1, 0.2, 0.5, 0.1, 0.15, 0.2, 0.2])
+    assert np.allclose(ray_durations(index, max_gap=0.05), 0.05)
     assert np.allclose(ray_durations(rays([5.0], [0])), 0.5)
 
 
 @pytest.mark.parametrize("by, share", [("time", 1.05 / 1.45), ("person", 0.5), ("equal", 5 / 7)])
 def test_weights_sum_to_one(by, share):
-    of = rays([0, 0.1, 0.3, 9.0, 9.1, 0.0, 0.2], [0, 0, 0, 0, 0, 1, 1])
-    w = ray_weights(of, by)
+    index = rays([0, 0.1, 0.3, 9.0, 9.1, 0.0, 0.2], [0, 0, 0, 0, 0, 1, 1])
+    w = ray_weights(index, by)
     assert np.isclose(w.sum(), 1) and np.isclose(w[:5].sum(), share)
 
 
@@ -307,17 +307,17 @@ def test_clustered_observers_are_recorded_positions():
     which = rng.choice(3, 3000, p=(0.5, 0.3, 0.2))
     positions = places[which] + rng.normal(0, 0.05, (3000, 3))
     weights = rng.random(3000)
-    found = cluster_observers(positions, weights, 3, seed=1)
+    result = cluster_observers(positions, weights, 3, seed=1)
     expected = np.bincount(which, weights) / weights.sum()
-    order = np.argsort(-found.weights)
-    assert np.allclose(found.weights[order], expected[np.argsort(-expected)])
-    assert all((positions == p).all(axis=1).any() for p in found.positions)
+    order = np.argsort(-result.weights)
+    assert np.allclose(result.weights[order], expected[np.argsort(-expected)])
+    assert all((positions == p).all(axis=1).any() for p in result.positions)
     # The error that is told is that of the positions from the nearest observer.
-    near = np.linalg.norm(positions[:, None] - found.positions, axis=2).min(axis=1)
-    assert np.isclose(found.rms_distance, np.sqrt((weights * near**2).sum() / weights.sum()))
-    assert abs(np.mean(near <= found.p95_distance) - 0.95) < 0.02
+    near = np.linalg.norm(positions[:, None] - result.positions, axis=2).min(axis=1)
+    assert np.isclose(result.rms_distance, np.sqrt((weights * near**2).sum() / weights.sum()))
+    assert abs(np.mean(near <= result.p95_distance) - 0.95) < 0.02
     again = cluster_observers(positions, weights, 3, seed=1)
-    assert np.array_equal(again.positions, found.positions)
+    assert np.array_equal(again.positions, result.positions)
 
 
 def test_more_observers_are_closer():
@@ -392,9 +392,9 @@ def test_ray_shares_add_up(rgb, cone):
     sums = sum_rays(SurfaceTarget(joined(plate_left), [hiding]), some, RaySettings(cone_sigma=cone, rays_per_cone=8))
     hidden, left = some.directions[:, 1] < 0, some.directions[:, 0] < 0
     expected = [some.weights[rows].sum() for rows in (~hidden & left, hidden, ~hidden & ~left)]
-    found = [sums.on_surface, sums.elsewhere, sums.escaped]
-    assert np.allclose(found, expected, rtol=1e-9 if cone == 0 else 0.03)
-    assert sum(found) == pytest.approx(sums.weight, rel=1e-12) and sums.total == sums.weight == some.weights.sum()
+    result = [sums.on_surface, sums.elsewhere, sums.escaped]
+    assert np.allclose(result, expected, rtol=1e-9 if cone == 0 else 0.03)
+    assert sum(result) == pytest.approx(sums.weight, rel=1e-12) and sums.total == sums.weight == some.weights.sum()
 
 
 # ---- Directions over the sphere: all of it, and as exact for narrow densities as for wide ones ----

@@ -51,17 +51,17 @@ def test_area_of_a_single_gaussian(rgb):
 def test_overlapping_gaussians_share_area(rgb):
     """A wall that lets no light through has its area, however many Gaussians it is made of."""
     plain = wall(jitter=0.0005)
-    found = areas(plain)
+    result = areas(plain)
     edge = 4 * 0.014  # the last of the disks lie over the edge
     assert unoccluded_areas(plain, 3.0).sum() > 2.5
-    assert (found.sum(axis=1) > 0.99).all() and (found.sum(axis=1) < (1 + edge) ** 2).all()
+    assert (result.sum(axis=1) > 0.99).all() and (result.sum(axis=1) < (1 + edge) ** 2).all()
 
 
 def test_occluded_side_has_no_area(rgb):
     both = concatenate_splats([wall(0.0, 0.2), wall(0.003, 0.2, turned=TURN_X)])
-    found, n = areas(both, 0.004), len(both) // 2
+    result, n = areas(both, 0.004), len(both) // 2
     # Along +z the first wall is seen: that is side 0 of it, whose axis is +z, and side 1 of the other.
-    assert (found[0, :n] > 4 * found[1, n:]).mean() > 0.8 and found[1, n:].sum() < 0.3 * found[0, :n].sum()
+    assert (result[0, :n] > 4 * result[1, n:]).mean() > 0.8 and result[1, n:].sum() < 0.3 * result[0, :n].sum()
     far = concatenate_splats([wall(0.0, 0.2), wall(0.05, 0.2)])
     assert np.allclose(areas(far, 0.004)[:, :n], areas(wall(0.0, 0.2), 0.004)) and 0 < MIN_VISIBLE_FRACTION < 1
 
@@ -77,10 +77,10 @@ def some(n=80, seed=3):
     return Splats(centers, scales, rng.normal(size=(n, 4)), rng.uniform(0.05, 0.6, n), np.zeros((n, 1, 3)))
 
 
-def shares(splats, o, d, **more):
+def shares(splats, o, d, **options):
     """Light that each Gaussian takes (R, N), what is left (R,), and how many groups there were."""
     taken, left, count = np.zeros((len(o), len(splats))), np.ones(len(o)), 0
-    for group in iter_hit_groups(SplatArrays(splats, ns), o, d, **more):
+    for group in iter_hit_groups(SplatArrays(splats, ns), o, d, **options):
         ray, hit = np.nonzero(group.index >= 0)
         taken[group.rows[ray], group.index[ray, hit]] += (group.transmittance * group.alpha)[ray, hit]
         left[group.rows] = group.remaining
@@ -135,14 +135,14 @@ def sums(splats, rays, settings=LINE):
 
 def test_ray_contributions_sum_to_one(rgb):
     splats, rays = some(), falling(500, 3.0)
-    found = sums(splats, rays)
+    result = sums(splats, rays)
     taken, left, _ = shares(splats, rays.origins, rays.directions)
-    assert np.allclose(found.face_sums.reshape(2, -1).sum(axis=0), taken.mean(axis=0))
+    assert np.allclose(result.face_sums.reshape(2, -1).sum(axis=0), taken.mean(axis=0))
     axes = shortest_axes(splats)
-    assert not found.face_sums.reshape(2, -1)[np.where(axes[:, 2] > 0, 1, 0), np.arange(len(splats))].any()
+    assert not result.face_sums.reshape(2, -1)[np.where(axes[:, 2] > 0, 1, 0), np.arange(len(splats))].any()
     # What a march leaves behind where it ends is a ten-thousandth of a ray at most.
-    assert abs(found.unaccounted) < 1e-4 and 0.2 < found.escaped < 0.8 and np.isclose(found.total, 1)
-    assert np.isclose(found.escaped + found.unaccounted, left.mean())
+    assert abs(result.unaccounted) < 1e-4 and 0.2 < result.escaped < 0.8 and np.isclose(result.total, 1)
+    assert np.isclose(result.escaped + result.unaccounted, left.mean())
     cone = sums(splats, rays, CONE)
     assert abs(cone.on_surface + cone.escaped - 1) < 1e-3 and cone.count == 500
 
@@ -151,14 +151,14 @@ def test_attention_per_area_matches_ray_density(rgb):
     """On a wall of overlapping Gaussians in two layers, whichever of them a ray ends at."""
     splats = concatenate_splats([wall(0.0, 0.6, 0.03, 0.0005), wall(0.004, 0.6, 0.05, turned=TURN_X, seed=1)])
     rays = falling(20_000, 1.2)
-    found = sums(splats, rays).face_sums.reshape(2, -1)
+    result = sums(splats, rays).face_sums.reshape(2, -1)
     areas = compute_splat_areas(splats, SplatArrays(splats, ns), 0.006)
     inner = (np.abs(splats.centers[:, :2]) < 0.25).all(axis=1)
     side = (shortest_axes(splats)[:, 2] <= 0).astype(int)
-    of, own = found[side, np.arange(len(splats))], areas[side, np.arange(len(splats))]
-    assert np.isclose(of[inner].sum() / own[inner].sum() * 1.2**2, 1, rtol=0.03)
+    index, subset = result[side, np.arange(len(splats))], areas[side, np.arange(len(splats))]
+    assert np.isclose(index[inner].sum() / subset[inner].sum() * 1.2**2, 1, rtol=0.03)
     front = inner & (splats.centers[:, 2] < 0.003)
-    assert abs(np.median(of[front] / own[front]) * 1.2**2 - 1) < 0.05
+    assert abs(np.median(index[front] / subset[front]) * 1.2**2 - 1) < 0.05
 
 
 def test_splat_parts_are_reproducible(rgb):
@@ -212,15 +212,15 @@ def test_point_is_smoothed_to_a_gaussian(length):
     plain.centers[:, :2] += rng.uniform(-0.004, 0.004, (len(plain), 2))
     flow, areas = smoother(plain, length)
     start = spike(plain, (0, 0, 0))
-    found = flow(start)
-    assert np.isclose(found.sum(), 1, rtol=1e-12) and (found >= 0).all() and not found[1].any()
-    apart = plain.centers - plain.centers[start[0].argmax()]
+    result = flow(start)
+    assert np.isclose(result.sum(), 1, rtol=1e-12) and (result >= 0).all() and not result[1].any()
+    offset = plain.centers - plain.centers[start[0].argmax()]
     for axis in (0, 1):
-        width = np.sqrt((found[0] * apart[:, axis] ** 2).sum())
+        width = np.sqrt((result[0] * offset[:, axis] ** 2).sum())
         assert abs(width / length - 1) < 0.08
-    square = (apart**2).sum(axis=1)
+    square = (offset**2).sum(axis=1)
     exact = np.exp(-square / (2 * length**2)) / (2 * np.pi * length**2) * areas[0]
-    assert np.abs(found[0] - exact).sum() < 0.25
+    assert np.abs(result[0] - exact).sum() < 0.25
     # What is even stays even, whatever the areas.
     flow, areas = smoother(plain, length, rng.uniform(0.5, 1.5, (2, len(plain))) * areas)
     assert np.allclose(flow(areas), areas, rtol=1e-9)
@@ -234,21 +234,23 @@ def test_smoothing_does_not_cross_gaps(turned, length):
     flow, _ = smoother(both, length)
     n = len(both) // 2
     for side in (0, 1):
-        found = flow(spike(both, (0, 0, 0), side))
-        assert np.isclose(found[side, :n].sum(), 1, rtol=1e-12) and not found[1 - side].any() and not found[:, n:].any()
+        result = flow(spike(both, (0, 0, 0), side))
+        assert (
+            np.isclose(result[side, :n].sum(), 1, rtol=1e-12) and not result[1 - side].any() and not result[:, n:].any()
+        )
 
 
 def test_smoothing_does_not_cross_boards_or_edges():
     board = concatenate_splats([wall(0.0, 0.4), wall(0.001, 0.4, turned=TURN_X)])
     n = len(board) // 2
     front = spike(board, (0.1, 0.1, 0))
-    found = smoother(board, 0.05)[0](front)
+    result = smoother(board, 0.05)[0](front)
     # Seen along +z are side 0 of the first and side 1 of the other.
-    assert not found[1, :n].any() and not found[0, n:].any() and found[1, n:].sum() > 0.1
+    assert not result[1, :n].any() and not result[0, n:].any() and result[1, n:].sum() > 0.1
     hidden = np.full((2, len(board)), 0.02**2)
     hidden[1, n:] = hidden[1, :n] = 1e-7
-    found = smoother(board, 0.05, hidden)[0](front)
-    assert np.isclose(found[0, :n].sum(), 1)
+    result = smoother(board, 0.05, hidden)[0](front)
+    assert np.isclose(result[0, :n].sum(), 1)
     upright = Splats(
         wall(0.0, 0.4).centers[:, [2, 1, 0]] + [0.2, 0, 0.2],
         np.tile([1e-3, 0.014, 0.014], (n, 1)),
@@ -261,13 +263,13 @@ def test_smoothing_does_not_cross_boards_or_edges():
 
 
 def test_cells_share_one_density():
-    many = wall(0.0, 0.1, apart=0.001)
+    many = wall(0.0, 0.1, offset=0.001)
     areas = np.full((2, len(many)), 0.001**2)
     flow, _ = smoother(many, 0.02, areas)
     start = spike(many, (0, 0, 0))
     start[1] = 0.3
-    found = flow(start)
-    assert np.isclose(found.sum(), start.sum(), rtol=1e-12) and len(np.unique((found / areas)[0])) < len(many) / 2
+    result = flow(start)
+    assert np.isclose(result.sum(), start.sum(), rtol=1e-12) and len(np.unique((result / areas)[0])) < len(many) / 2
     with pytest.raises(ValueError, match="positive length"):
         smoother(many, 0.0, areas)
     none = SplatSmoother(many.centers, shortest_axes(many), areas, np.full(len(many), 1.0), 0.02, TOLERANCE)
@@ -280,11 +282,11 @@ EYE = np.array([[0.0, 0, -2]])
 ALONG = np.array([0.0, 0, 1])
 
 
-def found(splats, law, eyes=EYE, weights=(1.0,), **more):
+def result(splats, law, observers=EYE, weights=(1.0,), **options):
     place = SceneGeometry(medium_of(splats))
     settings = ObserverSettings(march=default_march_settings(place))
-    make, eyes, weights = lookers_of_law(law), np.asarray(eyes), np.asarray(weights)
-    return splat_densities(splats, place, make, eyes, weights, settings, **more).sum(axis=0)
+    make, observers, weights = lookers_of_law(law), np.asarray(observers), np.asarray(weights)
+    return splat_densities(splats, place, make, observers, weights, settings, **options).sum(axis=0)
 
 
 def uniform(rgb):
@@ -295,13 +297,13 @@ def test_occluded_ball_receives_no_gaze(rgb):
     """Kappa / 2 pi in the middle of a narrow law, by the square of the distance; nothing in the shadow."""
     balls = stack([0.0, 1.0], [0.95, 0.95])
     kappa = 300.0
-    there = found(balls, vmf(rgb, ALONG, kappa))
-    assert np.allclose(there, [kappa / (2 * np.pi) / 4, 0], rtol=1e-5)
+    expected = result(balls, vmf(rgb, ALONG, kappa))
+    assert np.allclose(expected, [kappa / (2 * np.pi) / 4, 0], rtol=1e-5)
     # From the other side it is the other one, and three of four look from there.
-    both = found(balls, uniform(rgb), [EYE[0], (0, 0, 4.0)], [0.25, 0.75])
+    both = result(balls, uniform(rgb), [EYE[0], (0, 0, 4.0)], [0.25, 0.75])
     assert np.allclose(both, [0.25 / (4 * np.pi * 4), 0.75 / (4 * np.pi * 9)], rtol=1e-5)
     # What a ball lets through reaches the next: half of a ray's opacity lies there.
-    assert found(stack([0.0, 1.0], [0.2, 0.95]), uniform(rgb))[1] > 0
+    assert result(stack([0.0, 1.0], [0.2, 0.95]), uniform(rgb))[1] > 0
 
 
 def test_gaze_scales_with_projected_area(rgb):
@@ -309,15 +311,15 @@ def test_gaze_scales_with_projected_area(rgb):
     turned = np.stack([np.cos(angles / 2), np.sin(angles / 2), 0 * angles, 0 * angles], axis=1)
     far = np.stack([40.0 * np.arange(4), 0 * angles, 0 * angles], axis=1)
     make = lambda scales: Splats(far, [scales] * 4, turned, [0.9] * 4, np.zeros((4, 1, 3)))
-    eyes = lambda k: far[k] - [0, 0, 2]
-    seen = [found(make((0.1, 0.1, 1e-4)), uniform(rgb), [eyes(k)])[k] for k in range(4)]
+    observers = lambda k: far[k] - [0, 0, 2]
+    seen = [result(make((0.1, 0.1, 1e-4)), uniform(rgb), [observers(k)])[k] for k in range(4)]
     assert np.allclose(np.array(seen) * 16 * np.pi, np.cos(angles), rtol=1e-4)
     # The outline of an ellipsoid has the area pi det(S) |S^-1 w| (of semi-axes S), and the largest one pi s0 s1.
     scales = np.array([0.1, 0.05, 0.02])
     for k in range(4):
         w = quaternions_to_matrices(turned[k : k + 1])[0].T @ [0, 0, 1]
         area = np.prod(scales) * np.linalg.norm(w / scales) / (scales[0] * scales[1])
-        assert np.isclose(found(make(scales), uniform(rgb), [eyes(k)])[k] * 16 * np.pi, area, rtol=1e-4)
+        assert np.isclose(result(make(scales), uniform(rgb), [observers(k)])[k] * 16 * np.pi, area, rtol=1e-4)
 
 
 def test_gaze_matches_a_loop(rgb):
@@ -337,21 +339,21 @@ def test_gaze_matches_a_loop(rgb):
     depth = np.sqrt(np.einsum("ni,nij,nj->n", normal, covariance, normal))
     tolerance = 2 * np.median(splats.scales.min(axis=1))
     before = c - (depth + tolerance)[:, None] * normal - eye
-    reach = np.linalg.norm(before, axis=1)
-    d = before / reach[:, None]
+    span = np.linalg.norm(before, axis=1)
+    d = before / span[:, None]
     opacity, _, _, median = reference.trace(splats, np.tile(eye, (n, 1)), d)
-    hidden = (opacity >= 0.5) & (median < reach - tolerance)
+    hidden = (opacity >= 0.5) & (median < span - tolerance)
     density = 4 / (2 * np.pi * (1 - np.exp(-8))) * np.exp(4 * (w @ ALONG - 1))
     area = np.sqrt(np.einsum("ni,nij,nj->n", w, inverse, w)) * splats.scales.min(axis=1)
     expected = np.where(hidden, 0, density * area / distance**2)
-    there = found(splats, law)
+    actual = result(splats, law)
     assert 10 < hidden.sum() < 50
-    assert np.allclose(there, expected, rtol=1e-4)
+    assert np.allclose(actual, expected, rtol=1e-4)
 
 
 def test_cone_and_observer_inside_a_gaussian(rgb):
     ball, cone, kappa = stack([0.0], [0.9]), 0.03, 400.0
     wide = 1 / (1 / kappa + cone**2)
-    assert np.isclose(found(ball, vmf(rgb, ALONG, kappa), cone_sigma=cone)[0] * 8 * np.pi, wide, rtol=0.02)
-    inside = found(ball, uniform(rgb), [(0, 0, -0.01), (0, 0, -0.1)], [1.0, 0.0])
+    assert np.isclose(result(ball, vmf(rgb, ALONG, kappa), cone_sigma=cone)[0] * 8 * np.pi, wide, rtol=0.02)
+    inside = result(ball, uniform(rgb), [(0, 0, -0.01), (0, 0, -0.1)], [1.0, 0.0])
     assert np.isclose(inside[0], 1 / (4 * np.pi * 0.1**2), rtol=1e-5)
