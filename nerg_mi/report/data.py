@@ -267,10 +267,10 @@ class MeanShare:
 class ObjectAttention:
     """Attention on one AOI.
 
-    ``name``: of the AOI; ``field`` / ``predicted``: predicted share of gaze at the participants' viewpoints;
-    ``recorded``: share of gaze samples that hit the AOI; ``num_could_see``: participants with a viewpoint from which it
-    is visible, or with a sample on it; ``num_looked``: participants with a sample on it; ``num_participants``: all
-    participants. Values that need gaze samples are None without them.
+    ``name``: of the AOI; ``predicted``: predicted share of gaze at the participants' viewpoints; ``recorded``: share of
+    gaze samples that hit the AOI; ``num_could_see``: participants with a viewpoint from which it is visible, or with a
+    sample on it; ``num_looked``: participants with a sample on it; ``num_participants``: all participants. Values that
+    need gaze samples are None without them.
     """
 
     name: str
@@ -550,7 +550,7 @@ class ReportPicture:
 class Run:
     """One gaze field with all data that a report shows; missing data is None or empty.
 
-    ``gaze``, ``radiance``: metadata of the checkpoints; ``place`` / ``geometry_description``: one sentence about the
+    ``gaze``, ``radiance``: metadata of the checkpoints; ``geometry_description``: one sentence about the
     scene, and its kind ("field", "scene", "hits", "mesh" or "none"). ``rays`` and ``results`` contain only names that
     may be shown. Keys of ``pictures``: "color", "gaze", "own", "sphere", "depth", "spread", "plan", "layout".
     ``stage``: packed 3D view (`pack_stage`). ``inputs``: role, name and SHA-256 of each file.

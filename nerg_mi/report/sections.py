@@ -25,9 +25,8 @@ from .html import Html, Point, element, figure, image, interval_chart, key_value
 class Section:
     """One section of the page.
 
-    ``name``: anchor of the section; ``title``: heading; ``body(run)`` / ``render(run)``: content as HTML;
-    ``absent(run)`` / ``reason_absent(run)``: sentence that explains why the section is empty, or None if it has
-    content.
+    ``name``: anchor; ``title``: heading; ``render(run)``: content as HTML; ``reason_absent(run)``: sentence that
+    explains why the section is empty, or None if it has content.
     """
 
     name: str

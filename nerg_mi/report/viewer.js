@@ -1,7 +1,7 @@
 "use strict";
-// The place in 3D: points with the gaze of observers baked into them, people's paths, boxes of objects, and a mark where
-// the observer stands. Drag turns, shift or the right button moves, the wheel comes closer. Draws only when something
-// has changed. Without WebGL the picture that is in its place stays.
+// 3D view of the scene: points with the observers' gaze, participants' paths, AOI boxes, and observer marks.
+// Drag rotates, Shift-drag or the right button pans, the wheel zooms. The view is drawn only after a change. Without
+// WebGL the fallback image stays visible.
 (function () {
   const stage = document.getElementById("stage");
   const about = JSON.parse(document.getElementById("stage-data").textContent);
@@ -78,7 +78,7 @@
     [gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE], [gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE]])
     gl.texParameteri(gl.TEXTURE_2D, key, value);
 
-  // The camera goes around a point; `up` is the place's, and the two axes beside it are any level ones.
+  // The camera orbits a point; `up` is the up axis of the scene, the other two axes are horizontal.
   const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
   const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
   const plus = (a, b, s) => a.map((v, k) => v + s * b[k]);

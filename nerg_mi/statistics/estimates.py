@@ -9,9 +9,8 @@ import numpy as np
 
 # ---- Estimates and differences ----
 
-MIN_PARTICIPANTS = (
-    3  # minimum number of participants, and of participants with non-zero values, for a confidence interval
-)
+MIN_PARTICIPANTS = 3
+"""Minimum number of participants, and of those with non-zero values, for a confidence interval."""
 
 
 @dataclass(frozen=True)

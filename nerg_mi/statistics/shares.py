@@ -411,7 +411,7 @@ class VisibilityCache:
     def visible_in_fov(
         self, is_visible: np.ndarray, observers: np.ndarray, facing: np.ndarray, fov: float
     ) -> np.ndarray:
-        """`in_view` of its things."""
+        """Apply `visible_in_fov` to the sample points of this cache."""
         return visible_in_fov(self._targets, observers, facing, is_visible, fov)
 
     def get_visibility(self, observers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -260,21 +260,28 @@ def sample_cone(
 
 # ---- Visits ----
 #
-# A *session* is a run of a participant's samples without a pause longer than `VisitRules.pause`. A sample represents
-# the time to the next sample of its session. If that time exceeds `VisitRules.max_gap`, and at the end of a session, a
-# sample represents the median step of the session (over the steps that do not exceed the gap), or zero if there is no
-# such step. A *visit* of an area is a run of samples that hit it, interrupted by nothing longer than
-# `VisitRules.merge`. Runs shorter than `VisitRules.least`, from the start of the first sample to the end of the last
-# one, are discarded.
+# A *session* is a run of a participant's samples without a pause longer than `VisitRules.session_pause`. A sample
+# represents the time to the next sample of its session. If that time exceeds `VisitRules.max_gap`, and at the end of a
+# session, a sample represents the median step of the session (over the steps that do not exceed the gap), or zero if
+# there is no such step. A *visit* of an area is a run of samples that hit it, interrupted by nothing longer than
+# `VisitRules.merge_gap`. Runs shorter than `VisitRules.min_visit`, from the start of the first sample to the end of the
+# last one, are discarded.
 
 
 @dataclass(frozen=True)
 class VisitRules:
     """Durations that define sessions and visits, in seconds. Raises `NergError` for invalid values.
 
-    ``gap``, ``pause``, ``merge`` and ``least`` are the values of the options of these names: the longest time that a
-    sample represents, the pause that separates sessions, the interruption that a visit may contain, and the shortest
-    visit.
+    Parameters
+    ----------
+    max_gap
+        Longest time that a sample represents.
+    session_pause
+        Pause that separates sessions.
+    merge_gap
+        Longest interruption of a visit.
+    min_visit
+        Shortest visit.
     """
 
     max_gap: float = 1.0

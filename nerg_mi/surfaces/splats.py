@@ -329,11 +329,23 @@ KERNEL_CUTOFF = 3.0  # cut-off of the kernel in standard deviations
 
 
 class SplatSmoother:
-    """Smoothing by ``length``, the standard deviation s along the surface, of what lies on sides of N Gaussians.
+    """Smooths attention on the sides of N Gaussians with standard deviation ``length`` along the surface.
 
-    They have ``centers`` and shortest ``axes`` (N, 3); the ``areas`` (2, N) of their sides (`splat_areas`), of which
-    those are hidden that are no larger than ``hidden`` (N,). ``tolerance``: how far apart two ideas of one surface may
-    be. All in scene units. ``steps``: that are taken."""
+    Lengths are in scene units. ``steps`` is the number of steps.
+
+    Parameters
+    ----------
+    centers, axes
+        Centres and shortest axes, (N, 3) each.
+    areas
+        Areas of the sides, (2, N), as from `compute_splat_areas`.
+    hidden_area
+        Area (N,) up to which a side counts as hidden.
+    length
+        Standard deviation of the smoothing.
+    tolerance
+        Distance between points that belong to one surface.
+    """
 
     def __init__(
         self,

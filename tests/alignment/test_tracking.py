@@ -143,7 +143,7 @@ def test_initial_similarity_is_refined():
 
 
 @pytest.mark.parametrize(
-    "changes, known, why",
+    "changes, expected, why",
     [
         ({}, {"is_upright": False}, "needs the up direction"),
         ({}, {"tracking_floor": None}, "give it with --floor-height"),

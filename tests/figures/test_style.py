@@ -250,7 +250,7 @@ def value(name, factor=""):
 
 
 @pytest.mark.parametrize("top", [1.0, 0.8, 1.37, 23.0, 9999.0, 12345.0, 3.3e-4, 7e-12, 4e15, 1e-3])
-@pytest.mark.parametrize("most", [3, 5, 9])
+@pytest.mark.parametrize("max_count", [3, 5, 9])
 def test_linear_ticks(top, max_count):
     places, names, factor = scale_ticks(0.0, top, max_count)
     assert 2 <= len(places) <= max_count + 1 and len(set(names)) == len(names)

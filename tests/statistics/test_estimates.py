@@ -364,7 +364,7 @@ def test_proportions_of_few_participants():
     assert np.isnan(nobody.value).all() and np.isnan(nobody.high).all() and nobody.participants.tolist() == [0, 0]
 
 
-@pytest.mark.parametrize("m, n, known", [(3, 3, True), (2, 3, False), (3, 2, False)])
+@pytest.mark.parametrize("m, n, expected", [(3, 3, True), (2, 3, False), (3, 2, False)])
 def test_three_participants_are_needed_for_an_interval(m, n, expected):
     result = estimate_proportions(*column(1, m))
     assert np.isfinite(result.low).all() == np.isfinite(result.high).all() == (m == 3)
