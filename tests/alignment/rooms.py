@@ -1,4 +1,4 @@
-"""A room with a block in it, and people who look about in it: small, and without symmetry."""
+"""Test scene: a small asymmetric room with a block, and participants in it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def cast(origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
 
 
 def free(points: np.ndarray, margin: float = 0.0) -> np.ndarray:
-    """Whether points (N, 3) are in the room and in no block."""
+    """Return whether points (N, 3) are in the room and outside all blocks."""
     inside = ((points > margin) & (points < SIZE - margin)).all(axis=1)
     for low, high in BOXES:
         inside &= ~((points > low - margin) & (points < high + margin)).all(axis=1)
@@ -37,7 +37,7 @@ def directions(count: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def traces(count: int = 40_000) -> SceneTraces:
-    """What rays from free space find."""
+    """Return traces of rays from free space."""
     rng = np.random.default_rng(3)
     begin = rng.uniform(0, SIZE, (2 * count, 3))
     begin = begin[free(begin)][:count]
@@ -46,7 +46,7 @@ def traces(count: int = 40_000) -> SceneTraces:
 
 
 def people(count: int = 3000, noise: float = 0.01) -> Rays:
-    """Heads in free space at 1.6 m that look about, with their hit points."""
+    """Return samples of heads in free space at 1.6 m, with hit points."""
     rng = np.random.default_rng(4)
     heads = rng.uniform((0, 0, 1.55), (*SIZE[:2], 1.7), (4 * count, 3))
     heads = heads[free(heads, 0.15)][:count]
@@ -58,7 +58,7 @@ def people(count: int = 3000, noise: float = 0.01) -> Rays:
 
 
 def similarity(rng: np.random.Generator, upright: bool = False, scale: float | None = None) -> np.ndarray:
-    """A random one (4, 4), by a quaternion written out."""
+    """Return a random similarity (4, 4)."""
     w, x, y, z = q = rng.normal(size=4) * ((1, 0, 0, 1) if upright else 1)
     n = q @ q
     rows = (
@@ -74,5 +74,5 @@ def similarity(rng: np.random.Generator, upright: bool = False, scale: float | N
 
 
 def carried(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Points by a matrix, in homogeneous coordinates."""
+    """Transform points by a matrix in homogeneous coordinates."""
     return (np.c_[points, np.ones(len(points))] @ matrix.T)[:, :3]

@@ -61,7 +61,7 @@ def test_no_samples_give_no_warnings(room):
 
 
 def test_negated_axis_is_reported():
-    """A wall on one side: people who look at it, and the same in a mirror."""
+    """A wall on one side, participants who look at it, and their mirror image."""
     place = mi.ScalarTransform4f().translate([20, 0, 0]).scale([0.1, 60, 60])
     wall = SceneGeometry(None, mi.load_dict({"type": "scene", "wall": {"type": "cube", "to_world": place}}))
     rays = replace(RAYS, direction=np.tile([0.8, 0.6, 0.0], (len(RAYS), 1)))

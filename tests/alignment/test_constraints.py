@@ -113,7 +113,7 @@ def test_point_files_are_read(tmp_path):
     "name, data, why",
     [
         ("a.txt", b"", "not a supported surface file"),
-        ("a.ply", b"ply\nno", "no header"),
+        ("a.ply", b"ply\nno", "no PLY header"),
         ("a.obj", b"", "no vertices"),
         ("a.csv", b"x,y,z\n", "no points"),
         ("a.csv", b"a,b\n1,2\n", "x"),

@@ -101,7 +101,7 @@ def test_derivatives_match_central_differences(surface, which):
     assert (r > 0).mean() > 0.05 and by.shape == (len(r), 7)
     for k, e in enumerate(1e-6 * np.eye(7)):
         numeric = (score.residuals(chart, q + e)[0] - score.residuals(chart, q - e)[0]) / 2e-6
-        # Where a point lies on an edge of a cell, or a ray has two nearest places, there are two slopes.
+        # Derivatives are ambiguous at cell edges, and for rays with two nearest positions.
         assert np.mean(np.abs(by[:, k] - numeric) > 1e-6) < 0.02
 
 

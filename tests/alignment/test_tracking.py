@@ -23,7 +23,7 @@ TURN = np.array([[0, -2, 0, 5], [2, 0, 0, -1], [0, 0, 2, 3], [0, 0, 0, 1.0]])  #
 
 
 def gaze(count=200, off=0.002):
-    """People who look at points, to about a tenth of a degree, by eyes 15 degrees or so from where the head points."""
+    """Participants who look at points to about a tenth of a degree, with heads about 15 degrees off."""
     origin = RNG.uniform([1, 1, 1.4], [5, 3, 1.8], (count, 3))
     to = POINTS[RNG.integers(0, len(POINTS), count)] - origin
     direction = to / np.linalg.norm(to, axis=1, keepdims=True) + RNG.normal(0, off, (count, 3))
@@ -45,7 +45,7 @@ def test_angles_match_a_loop():
         for o, d in zip(origin, direction * signs):
             cosines = [(p - o) @ d / np.linalg.norm(p - o) for p in POINTS]
             expected.append(np.degrees(np.arccos(max(cosines))))
-        # Rays are looked at in another order.
+        # Rays are processed in random order.
         assert np.allclose(np.sort(result[name]), np.sort(expected), atol=1e-5)
 
 

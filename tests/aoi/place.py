@@ -1,4 +1,4 @@
-"""A room of 6 x 4 x 3 m with a sign and a stand that hides it from one side, as shapes; and people in it."""
+"""Test scene: a room of 6 x 4 x 3 m with a sign and a stand that occludes it from one side, and participants."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def cube(name: str, corners: np.ndarray) -> str:
 
 
 def write_place(folder: Path, gaze: bool = True) -> Path:
-    """``scene.xml`` in ``folder`` with areas.json; and its gaze field, if any."""
+    """Write ``scene.xml``, areas.json and, optionally, a gaze field to ``folder``."""
     import mitsuba as mi
 
     from tests.plugins import fields
@@ -46,7 +46,7 @@ def write_place(folder: Path, gaze: bool = True) -> Path:
 
 
 def people(count: int = 6, each: int = 80, seed: int = 0, cohorts: bool = True) -> Rays:
-    """People who walk about the western half and look around, mostly to the east, five times a second."""
+    """Participants who walk in the western half and mostly look east, sampled five times a second."""
     rng = np.random.default_rng(seed)
     n = count * each
     person = np.repeat(np.arange(count), each)
@@ -68,7 +68,7 @@ def people(count: int = 6, each: int = 80, seed: int = 0, cohorts: bool = True) 
 
 
 def first_box(o: np.ndarray, d: np.ndarray) -> tuple[str, float]:
-    """What a ray meets first in the room, and where: plane by plane."""
+    """Return the first surface on a ray and its distance, plane by plane."""
     result = ("room", np.inf)
     for name, box in (("room", ROOM), ("sign", SIGN), ("stand", STAND)):
         near, far = -np.inf, np.inf

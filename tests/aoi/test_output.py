@@ -155,7 +155,7 @@ def test_differences_have_units():
 
 def test_many_participants_are_written_in_batches(tmp_path, monkeypatch):
     sums = VisitSums.empty(("x", "y"), (ALL,), [(ALL, f"p{k}") for k in range(5)])
-    # The first part of the file knows no first look.
+    # The first batch has no visits.
     sums.visits[3:], sums.first_visit_sum[3:], sums.first_visit_count[3:] = 1, 2.5, 1
     rows = ParticipantRows(sums, {f"p{k}": f"p{k}" for k in range(5)}, False)
     monkeypatch.setattr(output, "_PARQUET_BATCH", 3)

@@ -1,4 +1,4 @@
-"""Counts in parts: the tables of one go to the byte, whoever makes the parts, and only what has to be made."""
+"""Partitioned statistics: tables equal those of a single process, and only changed parts are recomputed."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ FAST = {
 @pytest.fixture(autouse=True)
 def engine(monkeypatch):
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
-    # Blocks of about a person each.
+    # Blocks of about one participant.
     monkeypatch.setattr(measured.iter_blocks, "__defaults__", (100,))
 
 
@@ -73,7 +73,7 @@ def count(place, folder, rays="rays.npz", **changes):
 
 
 def made(recorder):
-    """How many parts of the rays, and of the places, were not kept from before."""
+    """Return the numbers of computed parts of samples and of viewpoints."""
     result = []
     for _, text in recorder.steps:
         if " parts" in text:
@@ -109,12 +109,12 @@ def test_parallel_tables_equal_serial_tables(place):
 def test_only_changed_parts_are_recomputed(place):
     parts = lambda: count(place, "out", store=place / "store")[1]
     assert made(parts()) == [6, 2] and made(parts()) == [0, 0]
-    # A person's rays turn round; the field is asked where people stood, and nobody moved.
+    # One participant's samples are rotated; viewpoints do not change.
     rays = people()
     turned = np.where((rays.person == 3)[:, None], rays.direction * (-1, -1, 1), rays.direction)
     replace(rays, direction=turned).save(place / "rays.npz")
     assert made(parts())[0] == 1
-    # An area is another one: all is.
+    # A changed area affects all parts.
     (place / "areas.json").write_text((place / "areas.json").read_text().replace("1.5", "1.6"))
     assert made(parts()) == [6, 2]
 
@@ -125,7 +125,7 @@ def test_dataset_parts_are_read_in_place(place):
     whole_result, _ = count(place, "one", "shop.rays")
     parts, texts = count(place, "two", "shop.rays", store=place / "store")
     assert parts == whole_result and made(texts)[0] > 3 and not list((place / "store").glob(".scratch-*"))
-    # Of another source those parts alone are new that are its own.
+    # Only the parts of the other source are new.
     write_source(place / "files" / "2.csv", 2, start=DAY)
     update_dataset(place / "shop.rays", [place / "files" / "2.csv"], recipe())
     _, options = count(place, "two", "shop.rays", store=place / "store")
@@ -166,7 +166,7 @@ def test_gaze_field_includes_its_training_geometry(tmp_path, rgb):
     assert _geometry_files(gaze, tmp_path / "elsewhere.safetensors") == []
 
 
-# ---- Rays in blocks that hold sittings as a whole, and what they are on ----
+# ---- Blocks and hits ----
 
 RULES = VisitRules()
 
@@ -180,7 +180,7 @@ def counting(**changes):
 
 def test_blocks_contain_whole_sessions_and_all_samples():
     rays = people(7, 60)
-    # Two sittings each: a pause of two minutes in the middle.
+    # Two sessions per participant, separated by a pause of two minutes.
     rays = replace(rays, t=rays.t + 120.0 * (rays.t >= 6))
     whole_result = merge_sums([count_block(rays, counting())])
     for max_count in (1, 50, 100, 10_000):
@@ -233,7 +233,7 @@ def test_missing_samples_are_refused():
 
 def test_angular_tolerance_counts_near_misses():
     o = np.tile([1.0, 3.0, 1.5], (3, 1))
-    # The sign's nearest edge, seen from there, lies at y = 2.5, x = 4.2.
+    # The nearest edge of the sign is at y = 2.5, x = 4.2.
     edge = np.arctan2(-0.5, 3.2)
     angles = edge + np.radians([0.5, 1.9, 2.5])
     d = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(3)])
@@ -267,7 +267,7 @@ def test_cell_masks():
     assert cells[ALL] is None and not cells[Cell("cohort", "x")].any()
     assert np.array_equal(cells[Cell("cohort", "even")], rays.person % 2 == 0)
     assert np.array_equal(cells[Cell("window", "w")], (rays.t >= 1) & (rays.t < 2))
-    # Of a zone only the floor counts.
+    # Zones ignore the height.
     assert np.array_equal(cells[Cell("zone", "z")], rays.origin[:, 0] <= 1)
 
 

@@ -41,11 +41,11 @@ from tests.workflows.recorder import Recorder
 
 from .place import SIGN, write_place
 
-# ---- What a field foretells, against sums over directions that are written out ----
+# ---- Predictions against sums over directions ----
 
 
 class Law(GazeScene):
-    """A gaze that is known: twice as dense ahead (x > 0) as behind, and seven units of support."""
+    """Gaze that is twice as dense ahead (x > 0) as behind, with a support of seven samples."""
 
     def query_from(self, eye):
         return lambda d: (np.where(d[:, 0] > 0, 2.0, 1.0)[None], None)
@@ -65,14 +65,14 @@ OBSERVERS = Viewpoints(
 
 
 def test_shares_are_integrals():
-    # A cube of which the eye sees a face of 2 x 2 at x = 1: a sixth of the sphere; of the hemisphere's gaze 2/3.
+    # A cube with a visible face of 2 x 2 at x = 1: a sixth of the sphere, and 2/3 of the gaze of the hemisphere.
     aois = [
         BoxAoi(Region.create("ahead", [1, -1, -1], [2, 1, 1])),
         BoxAoi(Region.create("behind", [-2, -1, -1], [-1, 1, 1])),
     ]
     result = predict_attention(AROUND, OBSERVERS, aois, [(0,), (1,), (0, 1)], 0.0, 120.0, 24, 1 << 15, SILENT)
     assert np.allclose(result.share[0], [2 / 9, 1 / 9, 3 / 9], rtol=2e-3)
-    # The mean distance to a square face, over its solid angle, by quadrature in its plane.
+    # Mean distance to a square face over its solid angle, by quadrature in its plane.
     u = (np.arange(400) + 0.5) / 200 - 1
     y, z = np.meshgrid(u, u)
     r2 = 1 + y**2 + z**2
@@ -88,7 +88,7 @@ def test_prediction_is_aggregated_by_participant():
     assert people.names == ("Ada", "Bo")
     share = result.share[:2].mean(axis=0)
     assert people.dwell_time[0] == pytest.approx(3 * share)
-    # Ten glances, five from each place.
+    # Ten glances, five per viewpoint.
     missed = np.prod([(1 - s) ** 5 for s in result.share[:2, 0]])
     assert people.hit_probability[0, 0] == pytest.approx(1 - missed)
     (bo,) = aggregate_by_participant(result, OBSERVERS, Cell("zone", "z"), {"Bo": 6.0}, 0.3).names
@@ -96,7 +96,7 @@ def test_prediction_is_aggregated_by_participant():
 
 
 class Two(Law):
-    """Two members who look to opposite sides, ten times as long at one as at the other."""
+    """Two ensemble members that look in opposite directions, with densities in the ratio of ten to one."""
 
     def query_from(self, eye):
         return lambda d: (np.array([np.where(s * d[:, 0] > 0, 10.0, 1.0) for s in (1, -1)]), None)
@@ -110,7 +110,7 @@ def test_ensemble_members():
     result = predict_attention(
         Two(None, None, Similarity()), OBSERVERS, aois, [(0,), (1,)], 0.0, 120.0, 24, 1 << 15, SILENT
     )
-    # A sixth of the sphere each: evenly of both, and 10/11 or 1/11 of a hemisphere's third by one.
+    # A sixth of the sphere each: equal for the mean, and 10/11 or 1/11 of a third of a hemisphere for one member.
     assert result.members.shape == (2, 3, 2) and np.allclose(result.share[0], 1 / 6, rtol=3e-3)
     assert np.allclose(result.members[:, 0], [[10 / 33, 1 / 33], [1 / 33, 10 / 33]], rtol=3e-3)
     assert predict_attention(AROUND, OBSERVERS, aois, [(0,), (1,)], 0.0, 120.0, 24, 64, SILENT).members.shape == (
@@ -139,7 +139,7 @@ def test_participants_are_subsampled():
     assert "50 of 200 participants" in recorder.messages[0]
 
 
-# ---- Places on the floor where nobody was tracked ----
+# ---- Observers without recordings ----
 
 
 def test_observers_are_placed_on_the_floor(tmp_path):
@@ -164,7 +164,7 @@ def test_observers_have_names():
     assert observers.participants[0] == "observer 01" and len(set(observers.participants)) == 12
 
 
-# ---- What a count needs besides rays ----
+# ---- AOI scene ----
 
 
 def setting(folder, scene=True, **options):
@@ -200,7 +200,7 @@ def test_options_are_checked_before_loading(tmp_path, rgb):
         setting(tmp_path, windows=("late",))
 
 
-# ---- Support and the spread of an ensemble, from foretold numbers that are known ----
+# ---- Uncertainty ----
 
 ZONE = Cell("zone", "z")
 
@@ -275,14 +275,14 @@ def test_few_viewpoints_are_reported():
     assert len(recorder.messages) == 1
 
 
-# ---- The table of a change, from foretold numbers that are known ----
+# ---- What-if table ----
 
 AREAS = AreaSet((Region.create("a", [0, 0, 0], [1, 1, 1]), Region.create("b", [2, 0, 0], [3, 1, 1])))
 WHAT_IF_EYES = viewpoints_at(np.arange(15.0).reshape(5, 3))
 
 
 def texts(share, support=5.0, members=1):
-    """Of an ensemble the members differ by 0.1 times their number from the first, at the first eye."""
+    """Ensemble members differ from the first by 0.1 times their index at the first viewpoint."""
     share = np.asarray(share, float)
     each = np.stack([share + 0.1 * k * (np.arange(len(share)) == 0)[:, None] for k in range(members)])
     return PredictedAttention(share, share, share > 0, np.full(len(share), support), each)
@@ -332,7 +332,7 @@ def test_what_if_suppresses_few_participants(tmp_path):
 def test_what_if_spread_over_members(tmp_path):
     after = texts([[0.2, 0.1]] * 5, members=2)
     result, _ = rows_what_if(tmp_path, {"shift": [0, 0, 1]}, after, members=2)
-    # Both move alike, of which the mean says nothing; then only one of them.
+    # Equal changes of both members have no spread; a change of one member has.
     assert result["a", "share"]["difference_spread"] == pytest.approx(0, abs=1e-12)
     assert result["a", "visible"]["difference_spread"] is None
     result, _ = rows_what_if(tmp_path, {"shift": [0, 0, 1]}, replace(after, members=after.members[[0, 0]]), members=2)
@@ -353,7 +353,7 @@ def test_unused_mesh_content_is_reported_once(tmp_path):
     one, two = tmp_path / "one.obj", tmp_path / "two.obj"
     areas = AreaSet((MeshPart("a", one), MeshPart("b", one, ((0, 0),))))
     setting = load_aoi_scene(None, None, None, areas, StatisticsOptions(), ns)
-    assert setting.warnings == [f"of {one}: statements that are not used: usemtl"]
+    assert setting.warnings == [f"of {one}: unused statements: usemtl"]
     scene = mi.load_dict({"type": "scene", "s": {"type": "sphere"}})
     setting = replace(setting, gaze_scene=GazeScene(SceneGeometry(None, scene), None, Similarity(), scene))
     changes = Changes(add=(NewShape("c", one), NewShape("d", two)))

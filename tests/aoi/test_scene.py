@@ -30,7 +30,7 @@ from nerg_mi.surfaces.mesh import mitsuba_mesh
 
 from .place import SIGN, STAND, first_box, people, write_place
 
-# ---- Changes to a scene: read, and made ----
+# ---- Changes ----
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +44,7 @@ def written(tmp_path, **changes):
 
 
 def change(scene, tmp_path, **changes):
-    """The changed scene, and its shapes."""
+    """Return the changed scene and its shapes."""
     made = written(tmp_path, **changes)
     return apply_to_scene(scene, made, read_meshes(made.meshes))
 
@@ -67,11 +67,11 @@ def test_shapes_are_moved_and_rotated(scene_changes, tmp_path):
     assert cast(scene_changes, EYE, EAST) == pytest.approx(1.5)
     moved, shapes = change(scene_changes, tmp_path, move=[{"shape": "stand", "by": [0.3, 0, 0]}])
     assert cast(moved, EYE, EAST) == pytest.approx(1.8, abs=1e-5) and set(shapes) == {"room", "sign", "stand"}
-    # A quarter turn about its own middle: 0.4 x 1 m become 1 x 0.4 m.
+    # A quarter turn about its centre: 0.4 x 1 m become 1 x 0.4 m.
     turned, _ = change(scene_changes, tmp_path, move=[{"shape": "stand", "turn": 90}])
     assert cast(turned, EYE, EAST) == pytest.approx(2.7 - 0.5 - 1.0, abs=1e-5)
     assert cast(turned, (1.0, 1.9, 1.6), EAST) == pytest.approx(3.0, abs=1e-5)
-    # The scene that there was is as it was, and so are the names of its shapes.
+    # The original scene and the names of its shapes are unchanged.
     assert cast(scene_changes, EYE, EAST) == pytest.approx(1.5)
     assert {s.id() for s in scene_changes.shapes()} == {"room", "sign", "stand"}
 
@@ -167,7 +167,7 @@ def test_malformed_changes_are_refused(tmp_path, changes):
     assert str(tmp_path) in str(texts.value) and "\n" not in str(texts.value)
 
 
-# ---- Cohorts of people from a table ----
+# ---- Cohorts ----
 
 
 def test_cohorts_are_read(tmp_path):
@@ -190,7 +190,7 @@ def test_invalid_cohorts_are_refused(tmp_path, text):
         read_cohorts(tmp_path / "c.csv")
 
 
-# ---- What files say of a place: surfaces, gaze, frames ----
+# ---- Surfaces, gaze fields and frames ----
 
 
 @pytest.fixture(scope="module")
@@ -246,7 +246,7 @@ def test_two_geometries_are_refused(folder):
         load_gaze_scene(folder / "empty.xml", None, None, None, ns)
 
 
-# ---- Areas as things: meshes, some of their faces, shapes of a scene ----
+# ---- AOI geometry ----
 
 TWO = "v 1 0 0\nv 1 1 0\nv 1 0 1\nv 3 0 0\nv 3 1 0\nv 3 0 1\nf 1 2 3\nf 4 5 6\n"
 
@@ -274,7 +274,7 @@ def test_aois_of_each_kind(scene_things, tmp_path):
     o, d = np.array([[0.0, 0.2, 0.2], [0, 1.5, 1.5]]), np.tile([1.0, 0, 0], (2, 1))
     near = np.array([t.intersect(o, d)[0] for t in made])
     assert np.allclose(near[1:], [[1.0, np.inf], [3.0, np.inf], [np.inf, 2.5]])
-    # The scene's shapes have their names still.
+    # The shapes of the scene keep their names.
     assert set(shapes_by_id(scene_things)) == {"room", "sign", "stand"}
 
 

@@ -1,4 +1,4 @@
-"""Plans of a place, and figures of statistics."""
+"""Plans of a scene, and figures of statistics."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_camera_wedges_open_in_viewing_direction():
     assert min(wedge.get_ydata()) <= 0 and max(wedge.get_ydata()) == 0
 
 
-# ---- The floor plan: places in metres, walls where they are, and a legend of what is drawn ----
+# ---- Floor plan ----
 
 LOW, HIGH = np.array([0.0, 0.0]), np.array([4.0, 3.0])
 
@@ -159,7 +159,7 @@ def test_figures_are_reproducible():
 
 @pytest.fixture(scope="module")
 def rays():
-    """A crowd of 900 at (1, 1), a hundred over a 4 x 2 m floor; all look along +x at a wall at x = 6."""
+    """900 samples at (1, 1) and a hundred on a 4 x 2 m floor; all look along +x at a wall at x = 6."""
     rng = np.random.default_rng(0)
     origin = np.concatenate([rng.normal([1, 1, 1.6], 0.05, (900, 3)), rng.uniform([0, 0, 1.5], [4, 2, 1.7], (100, 3))])
     d = np.tile([1.0, 0, 0], (1000, 1))
@@ -208,7 +208,7 @@ def test_layout_shows_dimensions(rays):
     floor_plan(one), layout_figure(one)  # a single place has no extent
 
 
-# ---- Pictures of statistics: what is drawn is what the rows say ----
+# ---- Figures of statistics ----
 
 
 def row(aoi, source, share):

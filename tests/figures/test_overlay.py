@@ -78,7 +78,7 @@ def test_invalid_scales_are_refused():
         Heat(vmax=1.0, colormap="jet")
 
 
-# ---- The table of overlays: scales that are shared, and figures of each ----
+# ---- Overlays and shared scales ----
 
 X, Y = np.meshgrid(np.linspace(0, 1, 24), np.linspace(0, 1, 16))
 LAYERS = OverlayLayers(np.repeat(X[..., None], 3, -1), 2 * Y, X > 0.1, (5.0, 4.0))
@@ -116,7 +116,7 @@ def test_unknown_overlay_is_refused():
     assert find_overlay("depth.T") == find_overlay("depth") and find_overlay("features.12").name == "features.12"
 
 
-# ---- Figures show each pixel once, and are the same file for the same input ----
+# ---- Figures ----
 
 RNG = np.random.default_rng(0)
 PLOTS_COLOR, GAZE = RNG.random((24, 36, 3)), RNG.random((24, 36))
@@ -133,7 +133,7 @@ def test_figures_show_images_pixel_for_pixel(rgb, tmp_path):
     save(figures.gaze_figure(PLOTS_COLOR, GAZE, MASK, HEAT), tmp_path / "gaze.png")
     page = read(rgb, tmp_path / "gaze.png").astype(float) / 255
     shown = overlay(PLOTS_COLOR, GAZE, HEAT, MASK)
-    # It is so small that a pixel is shown as a square of 5 x 5.
+    # The image is so small that a pixel is magnified to 5 x 5.
     shown = np.repeat(np.repeat(shown, 5, axis=0), 5, axis=1)
     figure = figures.gaze_figure(PLOTS_COLOR, GAZE, MASK, HEAT)
     box = figure.axes[0].get_window_extent()
@@ -157,7 +157,7 @@ def test_figures_are_reproducible(tmp_path, name):
 
 
 def test_note_does_not_move_panels():
-    """The picture and its scale are where they are without it."""
+    """The note does not move the image or the scale."""
     plain, noted = (
         figures.gaze_figure(PLOTS_COLOR, GAZE, MASK, HEAT, note=n) for n in ("", "made of 300 rays of 3 people")
     )
@@ -190,7 +190,7 @@ def test_occlusion_figure_has_one_scale():
     assert not calm.axes[-1].patches
 
 
-# ---- Linear radiance as bytes ----
+# ---- Colour conversion ----
 
 
 def test_srgb_matches_reference_values():

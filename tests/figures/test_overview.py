@@ -1,4 +1,4 @@
-"""The choice of a camera: pixels against projections, and in places whose depths have closed forms."""
+"""Choice of a camera in scenes with closed-form depths."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def room(lower=(0, 0, 0), upper=(8, 6, 3), pillar=None):
 
 
 def seen_from(eye, trace, attention):
-    """What is met around ``eye``; ``attention`` of directions."""
+    """Surfaces around ``eye``; ``attention`` is a function of directions."""
     d = fibonacci_directions(4000)
     depth, opacity = trace(np.broadcast_to(eye, d.shape), d)
     return SeenSurfaces(
@@ -68,7 +68,7 @@ def test_main_direction_and_mean_target():
 
 def test_camera_shows_the_observers_attention():
     towards = np.array([1.0, 0, 0])
-    # The pillar hides the wall that is looked at from whoever stands behind it.
+    # The pillar occludes the attended wall from behind.
     trace = room(pillar=((5, 3.6, 0), (5.5, 5.9, 3)))
     seen = seen_from((2.5, 2.5, 1.6), trace, lambda d: np.exp(60 * (d @ towards - 1)))
     shot = view_of_observer(trace, FRAME, seen)
@@ -78,7 +78,7 @@ def test_camera_shows_the_observers_attention():
         and (shot.origin < (8, 6, 3)).all()
         and np.linalg.norm(shot.origin - seen.observer) > 0.3
     )
-    # The point that is looked at is in the picture, and not hidden.
+    # The attended point is in the image and visible.
     spot = np.array([8, 2.5, 1.6])
     direction = spot - shot.origin
     depth, _ = trace(shot.origin[None], direction[None] / np.linalg.norm(direction))
@@ -103,7 +103,7 @@ def test_room_is_shown_from_inside():
     trace = room(pillar=((3, 2, 0), (4, 3, 2)))
     shot = view_of_scene(trace, FRAME, np.zeros(3), np.array([8.0, 6, 3]))
     assert shot.surface_fraction == 1 and (shot.origin > 0).all() and (shot.origin < (8, 6, 3)).all()
-    # Not in the pillar, nor right before the wall that it looks at.
+    # The camera is neither in the pillar nor close to the wall it faces.
     assert not ((shot.origin > (2.9, 1.9, 0)) & (shot.origin < (4.1, 3.1, 2.1))).all()
     d = (shot.target - shot.origin)[None] / np.linalg.norm(shot.target - shot.origin)
     assert trace(shot.origin[None], d)[0][0] > 1

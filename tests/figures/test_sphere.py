@@ -12,7 +12,7 @@ from nerg_mi.figures.sphere import PROJECTIONS, find_projection, resample_panora
 from nerg_mi.figures.style import encode
 from nerg_mi.transport.geometry import pixel_directions
 
-# ---- Maps of the sphere against their closed forms, and their areas ----
+# ---- Projections ----
 
 RNG = np.random.default_rng(0)
 LONGITUDE, LATITUDE = RNG.uniform(-np.pi, np.pi, 200), np.arcsin(RNG.uniform(-1, 1, 200))
@@ -37,7 +37,7 @@ def test_mollweide_satisfies_its_equation():
 
 
 def test_mollweide_has_equal_areas():
-    """The share of the ellipse that a part of the sphere covers is that part's share of the sphere."""
+    """The area fraction of a part of the sphere equals its fraction of the map."""
     side = 1000
     axis = (np.arange(side) + 0.5) / side * 2 - 1
     longitude, latitude, inside = PROJECTIONS["mollweide"].inverse(*np.meshgrid(axis, axis))
@@ -66,7 +66,7 @@ def test_unknown_projection_is_refused():
         find_projection("Mollweide")
 
 
-# ---- The observer's sphere as a map: where its parts lie, and that each map shows what the panorama has ----
+# ---- Figure ----
 
 HEIGHT, WIDTH = 90, 180
 BLACK, NOBODY = np.zeros((HEIGHT, WIDTH, 3)), np.zeros((HEIGHT, WIDTH))

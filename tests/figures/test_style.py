@@ -42,7 +42,7 @@ from nerg_mi.figures.style import (
 )
 from nerg_mi.workflows.scene_commands import BakeOptions, PictureOptions
 
-# ---- Colour maps by name: what is let in, and that what is let in is even ----
+# ---- Colour maps ----
 
 
 def lightness(colors):
@@ -75,7 +75,7 @@ def test_unknown_colormaps_are_refused():
         find_colormap("viridis", kind="diverging")
 
 
-# ---- Hatching: exactly where nothing is known, and plainly not a value ----
+# ---- Hatching ----
 
 SHOWN = np.random.default_rng(0).random((40, 60, 3))
 UNKNOWN = np.zeros((40, 60), bool)
@@ -96,7 +96,7 @@ def test_hatch_lines_are_diagonal():
 
 
 def test_hatching_differs_from_all_colours():
-    """Grey lines beside pale ones: no place of any scale, over any picture, is grey and dark."""
+    """No position of any scale, over any image, has the greys of the hatching."""
     pale = hatch(np.zeros((16, 16, 3)), np.full((16, 16), True))
     assert np.ptp(np.unique(pale)) > 0.1 and np.allclose(pale[..., 0], pale[..., 2])
     for name in SEQUENTIAL[:4]:
@@ -165,11 +165,11 @@ def test_existing_files_are_selected(tmp_path):
         tmp_path / "a.csv",
         tmp_path / "a.csv",
     ]
-    # What has no name is told by its kind alone.
+    # Values without a JSON form are recorded by their type.
     assert make_provenance("x", settings={"rays": object()}).settings == {"rays": "object"}
 
 
-# ---- Figures as files: read back by other libraries, whole in themselves, and equal for equal input ----
+# ---- Files ----
 
 RNG = np.random.default_rng(3)
 COLOR, GAZE = RNG.random((160, 200, 3)), RNG.random((160, 200))
@@ -224,7 +224,7 @@ def test_files_are_reproducible(suffix):
 
 
 def test_other_formats_are_refused(tmp_path):
-    with pytest.raises(NergError, match=r"end in .png or .svg"):
+    with pytest.raises(NergError, match=r"ends in .png or .svg"):
         save(figure(), tmp_path / "a.jpg")
     assert not list(tmp_path.iterdir())
 
@@ -233,13 +233,13 @@ def test_notebooks_display_figures():
     assert figure()._repr_png_().startswith(b"\x89PNG")
 
 
-# ---- Ticks say the values of the places at which they stand ----
+# ---- Ticks ----
 
 SUPER = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹−", "-0123456789-")
 
 
 def value(name, factor=""):
-    """The number that a tick says, read as a person does."""
+    """Parse the number of a tick label."""
     name, factor = name.translate(SUPER), factor.translate(SUPER)
     power = lambda text: 1.0 if text in ("", "1") else 10.0 ** int(text[2:] or 1)
     return (
@@ -283,7 +283,7 @@ def test_logarithmic_ticks_within_a_decade():
     assert places == [0.0, 0.5, 1.0] and names == ["0.2", "0.4", "0.8"]
 
 
-# ---- The page: nothing lies upon anything else, whatever the pictures' sizes, and bars say what is shown ----
+# ---- Page layout ----
 
 SIZES = [(320, 480), (60, 1200), (500, 60), (16, 24), (1, 1), (900, 1600), (3, 400)]
 
@@ -342,7 +342,7 @@ def test_sheet_rows_and_columns():
 
 @pytest.mark.parametrize("decades", [0.0, 6.0])
 def test_ticks_match_colours(decades):
-    """A tick's place on the bar has the colour that a pixel of its value has."""
+    """The position of a tick has the colour of a pixel with its value."""
     heat = Heat(2.0, decades=decades)
     page = gaze_figure(np.full((200, 200, 3), 0.2), np.zeros((200, 200)), np.ones((200, 200), bool), heat)
     bar = page.axes[-1]
@@ -363,7 +363,7 @@ def test_helpers():
     assert wrap("one two three", 60, 10).count("\n") >= 1 and wrap("", 60, 10) == ""
 
 
-# ---- Several pictures on one page: each whole, in its place, on one scale ----
+# ---- Contact sheets ----
 
 RANDOM = np.random.default_rng(0)
 

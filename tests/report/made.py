@@ -1,4 +1,4 @@
-"""A run made by hand, with whatever a report can show, and names that are markup."""
+"""A report run with all kinds of data, and names that contain markup."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.evaluation.test_gaze import crowd
 from tests.evaluation.test_gaze_report import scored
 
 HOSTILE = "<script>alert(1)</script>\"'&\u202egnp.exe<img src=http://example.org/x onerror=alert(2)>"
-"""A name that is markup, breaks out of attributes and turns the direction of text."""
+"""A name that contains markup, breaks out of attributes and changes the text direction."""
 
 PNG = bytes.fromhex(
     "89504e470d0a1a0a0000000d4948445200000001000000010802000000907753de0000000c49444154789c63f8cfc000000301010018dd8db00000"
@@ -32,7 +32,7 @@ PNG = bytes.fromhex(
 
 
 def cube(side: int = 12) -> ReportProxy:
-    """The six faces of a room of 4 m, seen from within, and two observers' gaze."""
+    """The six faces of a room of 4 m, seen from inside, and the gaze of two observers."""
     axis = np.linspace(0, 4, side)
     u, v = (m.ravel() for m in np.meshgrid(axis, axis))
     points, normals = [], []
@@ -58,7 +58,7 @@ def stage(boxes=(SHELF,)) -> Stage:
 
 
 def whole_result(name: str = "shelf") -> Run:
-    """Everything that can be shown; ``name``: what files, people and objects are called."""
+    """A run with all data; ``name``: name of files, participants and AOIs."""
     rays = crowd(400)
     picture = lambda words: ReportPicture(PNG, f"{words} {name}", f"{words} {name}.")
     share = MeanShare(0.25, 0.2, 0.3)
@@ -76,7 +76,7 @@ def whole_result(name: str = "shelf") -> Run:
         validation={"cc": 0.7, "kld": 0.4, "zones": 3, "probes": 60},
         rays_file={"file": name},
     )
-    # Areas have no such names as turn text round.
+    # Names of areas cannot contain characters that change the text direction.
     packed = stage((Region.create(name.replace("\u202e", "")[:80], np.zeros(3), np.ones(3)),))
     return Run(
         f"Gaze of {name}",
@@ -106,11 +106,11 @@ def whole_result(name: str = "shelf") -> Run:
 
 
 def bare() -> Run:
-    """As little as a report can be made of."""
+    """A run with the minimum of data."""
     return Run("Gaze", {"kind": "gaze"}, "Nothing is known of the place.", "none")
 
 
 def packed_scene(text: str) -> dict:
-    """The 3D scene within a page."""
+    """Return the 3D view embedded in a page."""
     start = text.index(">", text.index('id="stage-data"')) + 1
     return json.loads(text[start : text.index("</script>", start)])

@@ -21,7 +21,7 @@ REQUIRED = os.environ.get("NERG_REQUIRE_BROWSER", "0") not in ("", "0")
 
 
 def missing(reason: str) -> None:
-    """Skip, or fail where a browser is required."""
+    """Skip, or fail if a browser is required."""
     if REQUIRED:
         pytest.fail(f"NERG_REQUIRE_BROWSER is set, and {reason}")
     pytest.skip(reason)
@@ -29,7 +29,7 @@ def missing(reason: str) -> None:
 
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory):
-    """A headless Chromium that keeps a record of every request."""
+    """A headless Chromium that records every request."""
     chromium = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     driver = shutil.which("chromedriver")
     if chromium is None or driver is None:
@@ -63,7 +63,7 @@ def opened(browser, tmp_path, run):
 
 
 def requests(browser) -> list[str]:
-    """Every address that was asked for since, but for those of the browser's own pages."""
+    """Return all requested addresses except those of the browser's own pages."""
     events = [json.loads(entry["message"])["message"] for entry in browser.get_log("performance")]
     requested = [e["params"]["request"]["url"] for e in events if e["method"] == "Network.requestWillBeSent"]
     return [url for url in requested if not url.startswith(("data:", "chrome:", "about:"))]
@@ -118,7 +118,7 @@ def test_3d_view_is_interactive(browser, tmp_path):
         end = time.monotonic() + 20
         while canvas_png(browser) == seen[-1] and time.monotonic() < end:
             time.sleep(0.05)
-        # Until it stands still.
+        # Wait until the view stops changing.
         while canvas_png(browser) != (last := canvas_png(browser)):
             pass
         seen.append(last)
@@ -129,7 +129,7 @@ def test_3d_view_is_interactive(browser, tmp_path):
     assert changed(lambda: ActionChains(browser).scroll_from_origin(origin(canvas), 0, -300).perform())
     options = stage.find_elements(By.TAG_NAME, "option")
     assert [o.text for o in options] == ["mean of all 2 observers", "observer 1", "observer 2"]
-    # A list that opens over the page takes the mouse away from it.
+    # An open list would cover the page.
     choose = lambda k: browser.execute_script(
         "const s = document.querySelector('#stage select'); s.value = arguments[0]; s.dispatchEvent(new "
         "Event('input'))",
@@ -155,7 +155,7 @@ def test_fallback_image_without_scripts_and_in_print(browser, tmp_path):
     assert browser.execute_script(shown, "#stage .still") == "none"
     browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
     assert browser.execute_script(shown, "#stage") == "none"
-    # The picture is in the section of the gaze, which is printed.
+    # The gaze section, which is printed, contains the image.
     assert browser.execute_script(shown, "#gaze img") != "none"
     browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": ""})
     browser.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": True})

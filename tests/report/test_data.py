@@ -43,14 +43,14 @@ from nerg_mi.transport.geometry import SceneGeometry
 from tests.evaluation.test_gaze import crowd
 from tests.report.made import bare, stage, whole_result
 
-# ---- What people could look at, in a hall of four walls where depths are known in closed form ----
+# ---- Viewpoints in a hall of four walls with closed-form depths ----
 
 LOW, HIGH = np.array([-2.0, -6.0, 0.0]), np.array([2.0, 6.0, 3.0])
 
 
 @pytest.fixture
 def hall(rgb):
-    """An onlooker, and the place: the inside of a box in metres, with a random field."""
+    """A gaze sampler with a random field, inside a box in metres."""
     to_world = rgb.ScalarTransform4f().translate((0.5 * (LOW + HIGH)).tolist()).scale((0.5 * (HIGH - LOW)).tolist())
     scene = rgb.load_dict({"type": "scene", "box": {"type": "cube", "to_world": to_world, "flip_normals": True}})
     box = Box(tuple(LOW), tuple(HIGH))
@@ -109,7 +109,7 @@ def test_viewpoints_per_participant_are_equal(hall):
 
 
 def test_viewpoints_cover_whole_recordings(hall):
-    """People walk from one end to the other: one eye of each must not be that in the middle of everybody's way."""
+    """Participants walk from one end to the other; single viewpoints must not all be at the middle of the path."""
     _, place = hall
     people, each = 40, 50
     walked = np.tile(np.linspace(-5, 5, each), people)
@@ -139,7 +139,7 @@ def test_rays_end_at_hit_points_or_surfaces(hall):
 
 
 def test_rays_in_another_frame(hall, rgb):
-    """Turned by 90 degrees about z, twice as large and moved."""
+    """Rotated by 90 degrees about z, scaled by two and translated."""
     onlooker, place = hall
     matrix = np.array([[0, -0.1, 0, 1], [0.1, 0, 0, 0], [0, 0, 0.1, 0.5], [0, 0, 0, 1.0]])
     turned = TrainingGeometry(place.medium, place.box, "scene", align=Similarity(matrix))
@@ -162,7 +162,7 @@ def test_rays_meet_nothing_without_geometry(rgb):
     assert not is_hit.any() and not depth.any()
 
 
-# ---- People without their names ----
+# ---- Anonymisation ----
 
 NAMES = ("Grace", "Ada", "Ada Lovelace", "X")
 
@@ -215,12 +215,12 @@ def test_names_in_files_and_evaluations_are_replaced():
     assert labels.anonymize("ada_lovelace-ADA LOVELACE.npz") == (
         f"{labels.label('Ada')}_lovelace-{labels.label('Ada Lovelace')}.npz"
     )
-    # A letter is hidden where it stands alone.
+    # A single letter is replaced as a whole word only.
     assert labels.anonymize("X and axis") == f"{labels.label('X')} and axis"
     assert ParticipantLabels(None).anonymize("a.b") == "a.b" and ParticipantLabels(None).label("Ada") == "a participant"
 
 
-# ---- Shares of attention on boxes, counted again another way; intervals by a bootstrap that is one ----
+# ---- Attention on AOIs, against direct counts and a bootstrap ----
 
 
 def of_field(share, seen=None):
@@ -250,11 +250,11 @@ def test_participants_have_equal_weight():
 
 
 def test_participants_with_view_are_counted():
-    # The second place of person 0 sees the box; no gaze goes there.
+    # The second viewpoint of participant 0 sees the box, without gaze on it.
     field, who, person = of_field([0, 0, 0, 0], [False, True, False, False]), np.array([0, 0, 1, 2]), np.arange(4)
     (result,) = summarize_objects(["unit"], field, who, (on_rows([], 4), person))
     assert (result.num_could_see, result.num_looked, result.num_participants) == (1, 0, 4)
-    # Somebody who looks at it could see it.
+    # A participant with a sample on the AOI counts as having a view.
     (result,) = summarize_objects(["unit"], field, who, (on_rows([1, 2], 4), person))
     assert (result.num_could_see, result.num_looked) == (2, 2)
 
@@ -280,7 +280,7 @@ def test_intervals_stay_within_0_and_1():
     assert math.isnan(mean_over_participants(np.array([0.2, 0.3])).low)
 
 
-# ---- A place as points: on its surfaces, with normals that face who saw them ----
+# ---- Scene proxy ----
 
 PROXY_LOW, PROXY_HIGH = np.array([-2.0, -3.0, 0.0]), np.array([2.0, 3.0, 3.0])
 
@@ -309,7 +309,7 @@ def test_proxy_points_lie_on_walls(room):
     p = result.vertices
     to_wall = np.minimum(np.abs(p - PROXY_LOW), np.abs(p - PROXY_HIGH)).min(axis=1)
     assert 500 < len(p) <= 3000 and to_wall.max() < 0.5 * result.spacing + 1e-3 and texts == [(1, 2), (2, 2)]
-    # Close to an edge a point is of two walls.
+    # Points near an edge mix two walls.
     flat = np.sort(np.minimum(np.abs(p - PROXY_LOW), np.abs(p - PROXY_HIGH)), axis=1)[:, 1] > 2 * result.spacing
     centre = (PROXY_LOW + PROXY_HIGH) / 2
     inward = ((centre - p) * result.normals).sum(axis=1)
@@ -381,7 +381,7 @@ def test_farthest_point_sampling():
     )
 
 
-# ---- A run judges its evaluations ----
+# ---- Verdicts ----
 
 
 def test_verdicts():
@@ -390,7 +390,7 @@ def test_verdicts():
     assert bare().verdicts == [] and bare().provenance == {}
 
 
-# ---- The packed 3D scene, unpacked again ----
+# ---- Packed 3D view ----
 
 
 def unpacked(text):

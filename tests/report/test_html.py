@@ -1,4 +1,4 @@
-"""The report's HTML: what may stand in it, its sections, and the whole page."""
+"""HTML of the report: escaping, sections and the page."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from nerg_mi.report.html import Point, interval_chart, nice_ticks
 from nerg_mi.report.sections import SECTIONS, SETTINGS, render_page
 from tests.report.made import HOSTILE, PNG, bare, packed_scene, whole_result
 
-# ---- Charts: values where their scale says, and scales of round numbers ----
+# ---- Charts ----
 
 SVG = "{http://www.w3.org/2000/svg}"
 
@@ -49,11 +49,11 @@ def test_chart_labels_are_escaped():
     assert {e.tag for e in root.iter()} == {f"{SVG}{t}" for t in ("svg", "text", "line", "circle")}
 
 
-# ---- Markup by hand: whatever text is given, it stays text ----
+# ---- Markup ----
 
 
 class Parsed(HTMLParser):
-    """Tags, attributes and text of a piece of markup, as a browser's parser takes them apart."""
+    """Tags, attributes and text of markup, as parsed by a browser's rules."""
 
     def __init__(self, text: str):
         super().__init__()
@@ -103,7 +103,7 @@ def test_images_are_embedded():
     assert Parsed(html.figure(html.image(PNG, ""), "<words>")).text == "<words>"
 
 
-# ---- The page: whole, bare, with hostile names, and loading nothing ----
+# ---- Page ----
 
 SIZE = 6_000_000
 
@@ -152,7 +152,7 @@ def test_content_security_policy_matches_the_page():
     assert rules["default-src"] == "'none'" and rules["img-src"] == "data:" and "connect-src" not in rules
     assert rules["script-src"].split() == hashed("script") and rules["style-src"].split() == hashed("style")
     assert len(hashed("script")) == 1
-    # Before anything that it governs.
+    # The policy must precede what it governs.
     assert text.index("Content-Security-Policy") < min(text.index("<style>"), text.index("<title>"))
 
 
@@ -165,7 +165,7 @@ def test_3d_view_is_embedded_as_data():
     assert packed_scene(render_page(whole_result(HOSTILE)))["count"] == whole_result().stage_points
 
 
-# ---- Every section: shown from what there is, and told in one sentence where it is left out ----
+# ---- Sections ----
 
 ABSENT = {"verdict", "data", "people", "gaze", "stage", "objects", "scores"}
 """Sections that need more than a gaze field."""

@@ -33,7 +33,7 @@ def test_missing_p_values_are_ignored(p, expected):
     assert np.allclose(adjust_p_values(np.array(p)), expected, rtol=1e-12, equal_nan=True)
 
 
-# ---- Intervals of ratios of sums over people, and of their differences ----
+# ---- Ratios and their differences ----
 
 ONES = np.ones
 
@@ -68,7 +68,7 @@ def test_bootstrap_matches_a_loop():
 
 
 def test_participants_are_the_sampling_unit():
-    # 4 people whose thousands of rays agree: as uncertain as 4 numbers.
+    # 4 participants with thousands of equal samples are as uncertain as 4 numbers.
     x = np.array([[0.1], [0.2], [0.3], [0.4]])
     result = estimate_ratios(x, ONES(x.shape))
     assert result.low[0] < 0.13 and result.high[0] > 0.37
@@ -93,7 +93,7 @@ def test_paired_difference_matches_mean_of_differences():
     y = ONES((40, 1))
     same = estimate_ratio_differences((base, y), (after, y))
     assert same.value == pytest.approx((after - base).mean()) and same.high - same.low < 0.1 and same.p < 0.01
-    # Of others it is as wide as their spread.
+    # For different participants the interval is as wide as their spread.
     x = np.concatenate([base, 0 * after])
     z = np.concatenate([0 * base, after])
     offset = estimate_ratio_differences((x, np.concatenate([y, 0 * y])), (z, np.concatenate([0 * y, y])))
@@ -111,27 +111,27 @@ def test_false_positive_rate_of_ratio_differences():
     result = estimate_ratio_differences((x * first, first), (x * second, second), resamples=399)
     assert 0.01 < (result.p <= 0.05).mean() < 0.09
     assert 0.92 < ((result.low <= 0) & (result.high >= 0)).mean() <= 0.995
-    # What is found is what the interval does not hold, but for the p-values' own step.
+    # An interval excludes 0 when the p-value is below 0.05, up to the resolution of the p-value.
     outside = (result.low > 0) | (result.high < 0)
     assert (outside == (result.p <= 0.05))[abs(result.p - 0.05) > 0.005].all() and outside.any()
 
 
 def test_coverage_for_few_participants():
-    # Shares of time of eight people that are far from normal, over goods that half of them look at for long.
+    # Shares of time of eight participants, far from normal, on AOIs that half of them look at for long.
     rng = np.random.default_rng(4)
     y = rng.gamma(3, 1, (8, 1200))
     x = y * rng.beta(0.5, 2, (8, 1200))
     truth = 0.5 / 2.5
     result = estimate_ratios(x, y, resamples=399)
     assert 0.92 < ((result.low <= truth) & (truth <= result.high)).mean() < 0.98
-    # Student's t of the linearised residuals, which is as simple, holds it less often.
+    # Student's t of the linearised residuals has lower coverage.
     m = x.sum(axis=0) / y.sum(axis=0)
     s = np.sqrt(((x - m * y) ** 2).sum(axis=0) * 8 / 7) / y.sum(axis=0)
     assert (abs(m - truth) <= stats.t.ppf(0.975, 7) * s).mean() < 0.92
 
 
 def test_partly_paired_participants():
-    # Without anybody in common, variances add; of the same people alone, those of their differences count.
+    # Variances add for independent participants; for paired ones the variance of the differences counts.
     rng = np.random.default_rng(6)
     x, u, none, one = rng.gamma(2, 1, (9, 1)), rng.gamma(3, 1, (14, 1)), np.zeros, ONES
     first = (np.concatenate([x, none((14, 1))]), np.concatenate([one((9, 1)), none((14, 1))]))
@@ -161,7 +161,7 @@ def test_two_contributors_give_no_interval():
 
 
 def test_dominated_estimates_use_students_t():
-    """Means weighed by times of few of 40 people: most are near, and who is far looks for long."""
+    """Time-weighted means of a few of 40 participants: most are near, and distant ones look for long."""
     rng = np.random.default_rng(8)
     visits = rng.random((40, 800)) < 0.17
     far = rng.random(visits.shape) < 0.1
@@ -170,13 +170,13 @@ def test_dominated_estimates_use_students_t():
     truth = (0.1 * 4 + 0.9 * 0.3) / (0.1 + 0.9 * 0.3)
     held = lambda e: ((e.low <= truth) & (truth <= e.high))[np.isfinite(e.low)].mean()
     result = estimate_ratios(x, y, resamples=199)
-    # As if most others were there too, and had hardly looked at it: then they are not few, and draws alone tell.
+    # With small weights for the other participants, the estimate no longer concerns few of them.
     by_draws = estimate_ratios(x, np.where(visits, y, 1e-9), resamples=199)
     assert held(by_draws) < 0.8 and held(result) > held(by_draws) + 0.05
 
 
 def test_difference_from_one_contributor_has_no_interval():
-    # Ten people against ten others. Of the first, all add something; of the second, one, two, three, all and nobody.
+    # Ten participants against ten others. All contribute to the first estimate; 1, 2, 3, 10 and 0 to the second.
     rng = np.random.default_rng(9)
     first, second = np.repeat([[1.0], [0]], 10, axis=0), np.repeat([[0.0], [1]], 10, axis=0)
     x, u = rng.gamma(2, 1, (20, 5)) * first, rng.gamma(2, 1, (20, 5)) * second
@@ -188,7 +188,7 @@ def test_difference_from_one_contributor_has_no_interval():
         assert np.isfinite(result.value).all()
         for ends in (result.low, result.high, result.p):
             assert np.isfinite(ends).tolist() == [False, False, True, True, False]
-    # The same people, of whom one or two add something to the second; of nobody it is the first, the other way round.
+    # The same participants, with one, two or no contributions to the second estimate, in both orders.
     before, after, expected = x[:10], np.zeros((10, 5)), ONES((10, 5))
     for some in (1, 2):
         after[:some] = 1
@@ -202,7 +202,7 @@ def test_difference_from_one_contributor_has_no_interval():
 
 
 def test_groups_are_resampled_separately():
-    """Against a loop: of each group as many are drawn as there are, whatever the other one does."""
+    """Against a loop: each group is resampled to its own size, independent of the other one."""
     rng, few, many, resamples = np.random.default_rng(10), 4, 30, 300
     n = few + many
     first = (np.arange(n) < few).astype(float)[:, None]
@@ -260,7 +260,7 @@ def test_half_of_the_participants_count_as_few():
 
 
 def test_shared_participants_are_drawn_together():
-    """Against a loop: what is alike in both of a person's numbers leaves the spread of a draw as well."""
+    """Against a loop: shared variation of paired participants also cancels in each draw."""
     rng, n, resamples = np.random.default_rng(12), 10, 300
     x = rng.gamma(2, 1, (n, 1))
     u = x + rng.normal(0.3, 0.1, (n, 1))
@@ -273,7 +273,7 @@ def test_shared_participants_are_drawn_together():
     assert result.high[0] - value == pytest.approx(np.quantile(t, 0.95) * error, rel=1e-6)
 
 
-# ---- Shares of people: intervals and differences that hold for few ----
+# ---- Proportions and their differences ----
 
 P = np.linspace(0.001, 0.999, 999)
 
@@ -289,7 +289,7 @@ def test_mid_p_limits_match_binomial_tails():
         assert high == 1 if k == n else below + at / 2 == pytest.approx(0.025, abs=1e-9)
         above, at = stats.binom.sf(k, n, low), stats.binom.pmf(k, n, low)
         assert low == 0 if k == 0 else above + at / 2 == pytest.approx(0.025, abs=1e-9)
-    # Nobody of 8: half of (1 - p)^8 is 0.025.
+    # 0 of 8: half of (1 - p)^8 is 0.025.
     assert mid_p_interval(np.array([0]), np.array([8]))[1] == pytest.approx(1 - 0.05 ** (1 / 8))
 
 
@@ -312,7 +312,7 @@ def test_proportions_of_a_subset():
 
 
 def test_independent_proportion_differences():
-    # 2 of 12 and 9 of 15: Agresti and Caffo's, from their formula.
+    # 2 of 12 and 9 of 15: the formula of Agresti and Caffo.
     (x, y), (u, v) = column(2, 12), column(9, 15)
     none = np.zeros
     first = (np.concatenate([x, none((15, 1))]), np.concatenate([y, none((15, 1))]))
@@ -326,7 +326,7 @@ def test_independent_proportion_differences():
 
 
 def test_paired_proportion_differences():
-    # Bonett and Price: of 20 people 9 do both, 1 the first alone, 6 the second alone.
+    # Bonett and Price: of 20 participants 9 do both, 1 only the first, 6 only the second.
     x = np.array([[1.0]] * 10 + [[0.0]] * 10)
     u = np.array([[1.0]] * 9 + [[0.0]] + [[1.0]] * 6 + [[0.0]] * 4)
     ones = np.ones((20, 1))
@@ -335,7 +335,7 @@ def test_paired_proportion_differences():
     s = np.sqrt((alone + also - (also - alone) ** 2) / 22)
     assert result.low == pytest.approx(also - alone - 1.959964 * s)
     assert result.high == pytest.approx(also - alone + 1.959964 * s)
-    # That the same people are alike makes it narrower than of others.
+    # Positive correlation of paired participants makes the interval narrower.
     offset = estimate_proportion_differences(
         (np.concatenate([x, 0 * x]), np.concatenate([ones, 0 * ones])),
         (np.concatenate([0 * u, u]), np.concatenate([0 * ones, ones])),
@@ -344,7 +344,7 @@ def test_paired_proportion_differences():
 
 
 def test_false_positive_rate_of_proportion_differences():
-    # All outcomes of 8 against 8, of the same probability.
+    # All outcomes of 8 against 8 with equal probability.
     k = np.arange(9)
     a, b = (v.ravel() for v in np.meshgrid(k, k, indexing="ij"))
     spread = lambda counts: (np.arange(8)[:, None] < counts).astype(float)

@@ -1,4 +1,4 @@
-"""Shares of gaze on areas, of a law in a hall whose depths are known in closed form."""
+"""Attention shares of analytic gaze densities in a hall with closed-form depths."""
 
 from __future__ import annotations
 
@@ -52,12 +52,12 @@ class Hall:
 
 
 def exact(eye, region=None):
-    """The integral of the gaze on a box, or of what escapes, and over everything, by sums over very many directions."""
+    """Integrals of the gaze on a box or of escaped gaze, and of all gaze, by sums over very many directions."""
     count, numbers = 1 << 18, None
     if region is not None:
         center, radius = BoxAoi(region).bounding_sphere
         away = center - eye
-        # A few hundred thousand on the box, however small.
+        # A few hundred thousand directions on the box.
         count = 1 << 23 if radius < 0.2 else count
         numbers = indices_in_cone(count, away / np.linalg.norm(away), np.arcsin(min(radius / np.linalg.norm(away), 1)))
     d = fibonacci_directions(count, numbers)
@@ -84,9 +84,9 @@ def test_shares_are_integrals_within_the_error(result):
             assert shares.error[e, k] < 0.02 * share + 2e-5
             assert shares.is_hit[e, k] == (share > 0)
         assert shares.escaped[e] == pytest.approx(escaped, rel=0.01)
-    # A group is the union: the spot lies on the wall.
+    # A group is a union: the spot is on the wall.
     assert np.allclose(shares.share[:, 4], shares.share[:, 0] + shares.share[:, 2], rtol=0.02)
-    # The spot, of 3 cm at up to six metres, took no more than what the whole sphere takes.
+    # The spot, 3 cm at up to six metres, needs no more directions than the whole sphere.
     assert 0 < shares.share[1, 1] < 1e-4 and sum(hall.requested) < 2 * 6 * INITIAL_DIRECTIONS
 
 
@@ -121,18 +121,18 @@ def test_empty_inputs():
         gaze_shares(broken, OBSERVERS[:1], [BoxAoi(BOXES[0])], [(0,)], 0.0)
 
 
-# ---- What could be seen, and isovists, where both are known in closed form ----
+# ---- Visibility and isovists ----
 
 ROOM = np.array([[0.0, 0, 0], [6, 4, 3]])
 PILLAR = np.array([[2.0, 1.5, 0], [3, 2.5, 2.0]])
 
 
 def room_depth(o, d):
-    """A room with a pillar that reaches to 2 m."""
+    """A room with a pillar of 2 m height."""
     extent = intersect_box_numpy(o, d, *ROOM)[1]
     near, far = intersect_box_numpy(o, d, *PILLAR)
     extent = np.where((near < far) & (far > 0) & (near > 0), np.minimum(near, extent), extent)
-    # From within one meets the pillar's inner faces.
+    # From the inside, rays meet the inner faces of the pillar.
     return np.where((near < far) & (near <= 0) & (far > 0), np.minimum(far, extent), extent)
 
 
@@ -147,7 +147,7 @@ def test_points_behind_a_pillar_are_hidden():
     seen = compute_visibility(targets, observers, room_depth, 0.0)
     by_thing = [[seen[e, targets.aoi_index == k].any() for k in range(2)] for e in range(2)]
     assert by_thing == [[True, False], [False, True]]
-    # A face that is turned away is not seen, whatever is between.
+    # Back faces are not visible.
     back = (targets.normals[:, 0] > 0.5) & (targets.aoi_index == 0)
     assert back.any() and not seen[0, back].any()
 
@@ -235,7 +235,7 @@ def test_standing_positions():
     assert len(result) == 12 * 8 - 4 and np.allclose(result[:, 2], 1.6)
     inside = ((result[:, :2] > PILLAR[0, :2]) & (result[:, :2] < PILLAR[1, :2])).all(axis=1)
     assert not inside.any()
-    # Above a low thing nobody stands either, since the floor is not below; there is no floor at -1.
+    # There is no standing position above a low object, and none for a floor at -1.
     low = lambda o, d: np.minimum(room_depth(o, d), np.where((d[:, 2] < 0) & (o[:, 0] < 1), o[:, 2] - 0.5, np.inf))
     assert (find_standing_positions(*ROOM, 0.5, 1.6, low, 0.0)[:, 0] > 1).all()
     assert len(find_standing_positions(*ROOM, 0.5, 1.6, room_depth, -1.0)) == 0

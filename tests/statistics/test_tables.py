@@ -20,10 +20,10 @@ from nerg_mi.statistics.tables import (
 )
 from nerg_mi.statistics.visits import ALL, BINS, Cell, VisitSums
 
-# ---- The numbers that are told, from sums that are written out ----
+# ---- Measures ----
 
 
-# Three people, two things: Ada looks at the first alone, Bo at both, Cy at none and has no time.
+# Three participants, two AOIs: Ada looks at the first only, Bo at both, Cy at none and has no recorded time.
 PEOPLE = Participants(
     ("Ada", "Bo", "Cy"),
     np.array([10.0, 20.0, 0.0]),
@@ -84,7 +84,7 @@ def test_no_participants():
         assert np.isnan(result.value).all() and result.participants.tolist() == [0, 0]
 
 
-# ---- The table of single people ----
+# ---- Participant rows ----
 
 
 def sums():
@@ -123,7 +123,7 @@ def test_participant_rows_without_visibility():
     assert [r["visible"] for r in ParticipantRows(sums(), {"Ada": "a", "Bo": "b"}, False)] == [None] * 4
 
 
-# ---- Tables of numbers, and the floor on people ----
+# ---- Tables and suppression ----
 
 A, B = Cell("cohort", "a"), Cell("cohort", "b")
 HOW = {"resamples": 299, "seed": 0}
@@ -150,7 +150,7 @@ def test_rows_by_cell_area_and_source():
     mean = (cells[ALL][MEASURED].dwell_time[:, 0] / 100).mean()
     assert rows[0]["share"] == pytest.approx(mean) and rows[0]["share_low"] < mean < rows[0]["share_high"]
     assert rows[0]["visible"] is None and rows[0]["participants"] == 12
-    # Of two people there is no interval.
+    # Two participants give no interval.
     assert rows[2]["share"] is not None and rows[2]["share_low"] is None
 
 
@@ -161,7 +161,7 @@ def test_few_participants_are_suppressed():
     assert rows[0]["share"] is not None
     blank = [k for k, v in rows[2].items() if v is not None]
     assert blank == ["cell", "value", "aoi", "source"]
-    # Of both things: the number of people, and the measures that rays tell.
+    # Both AOIs have the number of participants and the measures of samples.
     texts = sum(measure.numerator_denominator(cells[A][MEASURED]) is not None for measure in MEASURES)
     assert floor.num_suppressed == 2 * (1 + texts) and texts >= 7
     nobody = MinParticipantsFilter(5)

@@ -30,7 +30,7 @@ from nerg_mi.statistics.visits import (
     sum_visits,
 )
 
-# ---- Which things rays land on, against loops over rays and planes ----
+# ---- Hits, against loops over rays and planes ----
 
 
 def box(name, lower, upper, turn=None):
@@ -38,7 +38,7 @@ def box(name, lower, upper, turn=None):
 
 
 def brute(region, o, d):
-    """Where a ray is inside of a box, by clipping it at six planes one after the other in the box's own frame."""
+    """Interval of a ray in a box, by clipping at six planes in the frame of the box."""
     turn = region.rotation_matrix.T
     o, d = turn @ (np.array(o, float) - region.center), turn @ np.array(d, float)
     half = (region.corners[1] - region.corners[0]) / 2
@@ -82,7 +82,7 @@ def test_hit_distances():
     o, d = np.zeros((1, 3)), np.array([[1.0, 0, 0]])
     landed = assign_hits(aois, o, d, np.array([1.7]))
     assert [v.tolist() for v in landed.distance] == [[1.0], [1.7]]
-    # Beyond a box, or nowhere: they look through it, or out of that in which they stand.
+    # Rays that end behind a box or nowhere, from outside and from inside.
     assert [len(v) for v in assign_hits(aois, o, d, np.array([2.5])).rows] == [0, 1]
     assert [len(v) for v in assign_hits(aois, o, d, np.array([3.5])).rows] == [0, 0]
     assert [len(v) for v in assign_hits(aois, o, d, np.array([np.inf])).rows] == [0, 0]
@@ -96,7 +96,7 @@ def test_aois_are_solid_without_surfaces():
     )
     o, d = np.array([[0, 0.5, 0.5], [0, -0.5, -0.5], [0, 5.0, 0]]), np.tile([1.0, 0, 0], (3, 1))
     result = assign_hits([front, behind, in_front], o, d, None).to_matrix()
-    # Overlapping ones share a look, what begins behind the end of another is hidden.
+    # Overlapping AOIs are both hit; an AOI that starts behind the end of another is occluded.
     assert result.tolist() == [[True, False, True], [True, False, False], [False, False, False]]
 
 
@@ -155,11 +155,11 @@ def test_sample_points_cover_a_box():
     assert 40 < len(points) < 110
 
 
-# ---- How long rays stand for, and what is one look ----
+# ---- Represented time and visits ----
 
 
 def slow_weights(person, t, rules):
-    """Ray by ray."""
+    """Reference implementation, sample by sample."""
     n = len(t)
     sitting, weight = [0] * n, [0.0] * n
     for i in range(1, n):
@@ -178,7 +178,7 @@ def slow_weights(person, t, rules):
 
 
 def find_visits_by_loop(rows, t, weight, sitting, rules):
-    """Ray by ray."""
+    """Reference implementation, sample by sample."""
     visits, now = [], None
     for r in rows:
         start, end = t[r], t[r] + weight[r]
@@ -242,7 +242,7 @@ def test_invalid_rules_are_refused(bad):
 
 
 def test_durations_at_the_limits():
-    """A pause as long as it may be joins sittings, an interruption as long as it may be looks."""
+    """A pause of exactly the limit continues a session, and an interruption of exactly the limit a visit."""
     rules = VisitRules(max_gap=0.5, session_pause=4.0, merge_gap=0.25, min_visit=0.25)
     line = make_timeline(np.zeros(4, int), np.array([0.0, 4.0, 8.0, 12.5]), rules)
     assert line.session.tolist() == [0, 0, 0, 1]
@@ -252,14 +252,14 @@ def test_durations_at_the_limits():
     assert make_timeline(np.zeros(3, int), np.array([0.0, 0.5, 1.25]), rules).weight.tolist() == [0.5, 0.5, 0.5]
 
 
-# ---- Sums of blocks, against dictionaries filled ray by ray, and in any number of parts ----
+# ---- Sums, against dictionaries, and in any number of parts ----
 
 RULES = VisitRules(max_gap=0.5, session_pause=5.0, merge_gap=0.25, min_visit=0.15)
 AREAS = ("a", "b", "c")
 
 
 def made(seed=0, n=150, people=3):
-    """Rays in disorder, what they are on, and what could be seen."""
+    """Unsorted samples with hits and visibility."""
     rng = np.random.default_rng(seed)
     person = rng.integers(0, people, n)
     step = rng.choice([0.1, 0.2, 0.2, 0.3, 0.7, 6.0], n)
@@ -278,7 +278,7 @@ def made(seed=0, n=150, people=3):
 
 
 def slow_sums(rays, on, far, visible, cells):
-    """Ray by ray, look by look, in dictionaries."""
+    """Reference implementation with dictionaries."""
     order = sorted(range(len(rays)), key=lambda i: (rays.person[i], rays.t[i]))
     person, t = [int(rays.person[i]) for i in order], [float(rays.t[i]) for i in order]
     sitting, weight = slow_weights(person, t, RULES)
@@ -359,7 +359,7 @@ def test_sums_match_loops(seed):
         ]
         assert sums.transitions[c].tolist() == [[slow["moves", cell, a, b] for b in range(3)] for a in range(3)]
     assert {cell for cell, _ in sums.rows} == {ALL, Cell("window", "early")} and sums.transitions[0].sum() > 3
-    # Nobody looks at c.
+    # Area c has no visit.
     assert (
         sums.dwell_time[:, 2].sum() == 0
         and np.isinf(sums.first_start[:, 2]).all()
@@ -389,7 +389,7 @@ def test_partition_does_not_change_sums():
         value = getattr(whole_result, f.name)
         if isinstance(value, np.ndarray):
             assert np.array_equal(getattr(merged, f.name), value), f.name
-    # And so in parts of parts, to the bit, in the same order.
+    # Nested partitions give bitwise equal sums in the same order.
     again = merge_sums([merge_sums(parts[:1]), *parts[1:]])
     assert all(
         np.array_equal(getattr(again, n), getattr(merged, n))
@@ -419,7 +419,7 @@ def test_incompatible_sums_are_refused():
 
 
 def test_last_visit_ends_with_its_last_sample():
-    """Not when that begins, nor when the look before it ended; of two parts it is the later one."""
+    """The end of the last visit is that of its last sample, also across two parts."""
     t = np.arange(8) * 0.25
     d = np.tile([1.0, 0, 0], (8, 1))
     rays = Rays(t, np.zeros(8, int), ("ann",), d, d, np.ones(8))

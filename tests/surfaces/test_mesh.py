@@ -65,7 +65,7 @@ def test_triangles_of_scene_shapes(rgb):
     assert shape_triangles(rgb.load_dict({"type": "sphere"})) is None
 
 
-# ---- Triangles cut alike on both sides of every edge ----
+# ---- Refinement ----
 
 
 def edge_counts(faces):
@@ -80,10 +80,10 @@ def test_refinement_preserves_area_and_closedness(longest):
     assert set(edge_counts(result.mesh.faces)) == {2}
     assert longest_edge(result.mesh) <= longest
     assert np.allclose(np.bincount(result.parent, result.mesh.area), whole_result.area, rtol=1e-12)
-    # Outwards still: the flux of x is three times the volume, with the sign of the whole's.
+    # The faces still point outwards: the flux of x is three times the volume, with the same sign.
     flux = lambda m: np.einsum("fi,fi->", m.corners.mean(1), m.normals * m.area[:, None])
     assert np.isclose(flux(result.mesh), flux(whole_result)) and np.isclose(abs(flux(whole_result)), 18)
-    # Each corner is where its place in the parent says.
+    # Corners match their barycentric coordinates in the parent.
     texts = np.einsum("fij,fjk->fik", result.barycentric, whole_result.corners[result.parent])
     assert np.allclose(texts, result.mesh.corners, atol=1e-12)
 
@@ -100,7 +100,7 @@ def test_too_many_faces_are_refused(monkeypatch):
         refine(joined(box((0, 0, 0), (1, 1, 1))), 0.01)
 
 
-# ---- Rays that end on a surface, at something else, or nowhere ----
+# ---- Ray casts ----
 
 
 def test_ray_ends(rgb):

@@ -31,7 +31,7 @@ from nerg_mi.surfaces.sources import (
 )
 from tests.surfaces.meshes import box, joined, lookers_of_law, plate, vmf
 
-# ---- Cones: the rule on the sphere against Legendre polynomials, and bundles against Rayleigh's law ----
+# ---- Cones, against Legendre polynomials and the Rayleigh distribution ----
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
@@ -77,7 +77,7 @@ def test_cone_samples_are_gaussian_and_reproducible():
     assert np.array_equal(sample_cone(d, 0, 2, np.random.default_rng(0)), np.repeat(d[:, None], 2, axis=1))
 
 
-# ---- Gaze on surfaces: conserved, and what `nerg.attention` says of the same ----
+# ---- Gaze on surfaces: conservation, and agreement with `nerg.attention` ----
 
 ROOM = box((0, 0, 0), (4, 3, 2.5))
 SHELF = box((1.5, 2, 0), (3, 2.4, 1.8))
@@ -87,7 +87,7 @@ MEAN = np.array([0.84, 0.5, -0.2]) / np.linalg.norm([0.84, 0.5, -0.2])
 
 @pytest.mark.parametrize(("kappa", "eye"), [(1.0, (1.0, 0.7, 1.5)), (500.0, (0.001, 1.3, 1.2))])
 def test_closed_room_receives_all_gaze(rgb, kappa, eye):
-    """Also an observer a millimetre from a wall."""
+    """Also for an observer one millimetre from a wall."""
     target = SurfaceTarget(refine(joined(ROOM, SHELF), 0.4).mesh)
     sums = sum_gaze(target, lookers_of_law(vmf(rgb, MEAN, kappa)), np.array([eye]), [1.0], SETTINGS)
     assert abs(sums.total - 1) < 3e-4 and sums.escaped == 0 and sums.elsewhere == 0
@@ -198,13 +198,13 @@ def test_parts_add_up_exactly(rgb):
     assert np.array_equal(merge_sums(each).vertex_sums, whole_result.vertex_sums) and whole_result.count == 3
 
 
-# ---- Pieces that an outline crosses are cut until what is left out is little ----
+# ---- Occlusion boundaries ----
 
 FLOOR = (np.array([(-1.0, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)]), np.array([(0, 1, 2), (0, 2, 3)]))
 
 
 def test_shadow_boundary_along_subdivisions(rgb):
-    """A plate above the floor hides what lies beyond x, wherever that line falls between two cuts."""
+    """A plate above the floor occludes the part beyond x, for any position relative to the subdivision."""
     eye = np.array([0.0, 0.0, 2.0])
     for x in (0.07, 0.13, 0.51):
         plate = FLOOR[0] * [0.5, 1, 1] + [0.5 + x / 2, 0, 1]
@@ -220,7 +220,7 @@ def test_shadow_boundary_along_subdivisions(rgb):
 
 
 def test_narrow_density_is_integrated(rgb):
-    """Of a density that is narrower than a piece the pieces are cut, too."""
+    """Pieces are subdivided for a density narrower than a piece."""
     target, eye = SurfaceTarget(joined(FLOOR)), np.array([0.13, 0.06, 0.5])
     pieces = subdivide_faces(target.mesh, eye, 0.4)
 
@@ -233,7 +233,7 @@ def test_narrow_density_is_integrated(rgb):
     assert abs(result - 1) < 1e-3 and abs((pieces.solid_angle * law(pieces)).sum() - 1) > 1e-2
 
 
-# ---- Solid angles of pieces, however near the observer stands ----
+# ---- Solid angles of pieces ----
 
 PIECES_ROOM = joined(box((0, 0, 0), (1.0, 1.0, 1.0)))
 
@@ -246,7 +246,7 @@ def test_room_subtends_the_whole_sphere(eye, scale):
     assert np.isclose(result.solid_angle.sum(), 4 * np.pi, rtol=1e-9)
     center = np.einsum("pi,pik->pk", result.centroid_barycentric, room.corners[result.face])
     assert np.allclose(center, result.centroids, atol=1e-9 * scale)
-    # As many pieces as the sphere has room for, not as the nearness would ask.
+    # The number of pieces is limited by the solid angle of the sphere.
     assert len(result.face) < 50_000
     away = np.linalg.norm(result.centroids - scale * np.array(eye), axis=1)
     assert np.all(np.sqrt(result.solid_angle) < 0.2) and away.min() > 0
@@ -278,7 +278,7 @@ def test_too_many_pieces_are_refused(monkeypatch):
         subdivide_faces(PIECES_ROOM, np.full(3, 0.5), 0.02)
 
 
-# ---- Time of rays, and observers that stand for a crowd ----
+# ---- Represented time and clustered observers ----
 
 
 def rays(t, person):
@@ -288,7 +288,7 @@ def rays(t, person):
 
 def test_ray_durations():
     index = rays([0, 0.1, 0.3, 9.0, 9.1, 0.0, 0.2], [0, 0, 0, 0, 0, 1, 1])
-    # Pauses count as half a second at most; the last of each as the median of theirs.
+    # Pauses count as at most half a second; the last sample of a recording as the median step.
     assert np.allclose(ray_durations(index), [0.1, 0.2, 0.5, 0.1, 0.15, 0.2, 0.2])
     assert np.allclose(ray_durations(index, max_gap=0.05), 0.05)
     assert np.allclose(ray_durations(rays([5.0], [0])), 0.5)
@@ -312,7 +312,7 @@ def test_clustered_observers_are_recorded_positions():
     order = np.argsort(-result.weights)
     assert np.allclose(result.weights[order], expected[np.argsort(-expected)])
     assert all((positions == p).all(axis=1).any() for p in result.positions)
-    # The error that is told is that of the positions from the nearest observer.
+    # The reported distance is that of the positions to the nearest observer.
     near = np.linalg.norm(positions[:, None] - result.positions, axis=2).min(axis=1)
     assert np.isclose(result.rms_distance, np.sqrt((weights * near**2).sum() / weights.sum()))
     assert abs(np.mean(near <= result.p95_distance) - 0.95) < 0.02
@@ -328,7 +328,7 @@ def test_more_observers_are_closer():
     assert len(few.weights) == 2 and few.rms_distance == few.p95_distance == 0 and np.allclose(few.weights, 0.5)
 
 
-# ---- Tracked rays as cones: what passes a gap, and what parts of them add up to ----
+# ---- Gaze samples as cones ----
 
 SIGMA = np.radians(1.5)
 
@@ -340,7 +340,7 @@ def rays_ray_source(n, spread=0.0, seed=0):
 
 
 def test_line_and_cone_through_a_gap(rgb):
-    """Two plates with a slit of 5 cm between them, two metres away, and a wall behind."""
+    """Two plates with a slit of 5 cm between them at two metres, and a wall behind."""
     slit = 0.025
     left = (np.array([(-3.0, -3, 2), (-slit, -3, 2), (-slit, 3, 2), (-3, 3, 2)]), np.array([(0, 1, 2), (0, 2, 3)]))
     right = (-left[0] * [1, 1, -1], left[1])
@@ -350,7 +350,7 @@ def test_line_and_cone_through_a_gap(rgb):
     line = sum_rays(target, rays_ray_source(1000), RaySettings())
     assert line.face_sums[behind].sum() == np.float64(1000) * (1 / 1000) or np.isclose(line.face_sums[behind].sum(), 1)
     cone = sum_rays(target, rays_ray_source(4000), RaySettings(cone_sigma=SIGMA, rays_per_cone=16))
-    # One of the two angles of the Gaussian has to stay within the slit's.
+    # One of the two angles of the Gaussian has to be within the slit.
     passes = 2 * norm.cdf(np.arctan(slit / 2) / SIGMA) - 1
     assert abs(cone.face_sums[behind].sum() - passes) < 0.01 and 0.3 < passes < 0.4
     left_of = mesh.corners[:, :, 0].max(axis=1) < 0
@@ -359,7 +359,7 @@ def test_line_and_cone_through_a_gap(rgb):
 
 
 def test_thin_edge_receives_its_share(rgb):
-    """A rod of 1 cm, which hardly any line meets that is aimed at it with an error of a degree."""
+    """A rod of 1 cm, which single rays with an error of one degree mostly miss."""
     rod = joined(box((-0.005, -3, 2), (0.005, 3, 2.01)))
     sums = sum_rays(SurfaceTarget(rod), rays_ray_source(20_000), RaySettings(cone_sigma=SIGMA))
     expected = 2 * norm.cdf(np.arctan(0.005 / 2) / SIGMA) - 1
@@ -384,7 +384,7 @@ def test_ray_parts_are_reproducible(rgb):
 
 @pytest.mark.parametrize("cone", [0.0, SIGMA])
 def test_ray_shares_add_up(rgb, cone):
-    """A plate across x < 0 at z = 2, of which a shape at z = 1 hides y < 0 and reaches beyond it; the rest escapes."""
+    """A plate across x < 0 at z = 2; a shape at z = 1 occludes y < 0 and extends beyond it; the rest escapes."""
     plate_left = (np.array([(-9.0, -9, 2), (0, -9, 2), (0, 9, 2), (-9, 9, 2)]), np.array([(0, 1, 2), (0, 2, 3)]))
     hiding = (np.array([(-9.0, -9, 1), (9, -9, 1), (9, 0, 1), (-9, 0, 1)]), np.array([(0, 1, 2), (0, 2, 3)]))
     some = rays_ray_source(4000, spread=0.3, seed=2)
@@ -397,7 +397,7 @@ def test_ray_shares_add_up(rgb, cone):
     assert sum(result) == pytest.approx(sums.weight, rel=1e-12) and sums.total == sums.weight == some.weights.sum()
 
 
-# ---- Directions over the sphere: all of it, and as exact for narrow densities as for wide ones ----
+# ---- Quadrature over the sphere ----
 
 SPHERE_RULE_MEAN = np.array([0.3, -0.5, 0.81]) / np.linalg.norm([0.3, -0.5, 0.81])
 

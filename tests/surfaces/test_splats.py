@@ -29,7 +29,7 @@ from tests.reference.splats import peaks
 from tests.surfaces.meshes import TURN_X, lookers_of_law, vmf, wall
 from tests.transport.test_splat_medium import medium_of, rays, stack
 
-# ---- Areas of Gaussians: closed forms, and what they add up to where many overlap ----
+# ---- Splat areas ----
 
 
 def areas(splats, tolerance=0.002):
@@ -49,7 +49,7 @@ def test_area_of_a_single_gaussian(rgb):
 
 
 def test_overlapping_gaussians_share_area(rgb):
-    """A wall that lets no light through has its area, however many Gaussians it is made of."""
+    """An opaque wall has its geometric area for any number of Gaussians."""
     plain = wall(jitter=0.0005)
     result = areas(plain)
     edge = 4 * 0.014  # the last of the disks lie over the edge
@@ -78,7 +78,7 @@ def some(n=80, seed=3):
 
 
 def shares(splats, o, d, **options):
-    """Light that each Gaussian takes (R, N), what is left (R,), and how many groups there were."""
+    """Return the contribution of each Gaussian (R, N), the remaining transmittance (R,), and the number of groups."""
     taken, left, count = np.zeros((len(o), len(splats))), np.ones(len(o)), 0
     for group in iter_hit_groups(SplatArrays(splats, ns), o, d, **options):
         ray, hit = np.nonzero(group.index >= 0)
@@ -99,7 +99,7 @@ def test_hits_match_a_loop(rgb):
     expected = np.zeros_like(taken)
     np.put_along_axis(expected, order, np.concatenate([np.ones((300, 1)), through[:, :-1]], 1) * sorted_, 1)
     assert count >= 3 and np.abs(taken - expected).max() < 2e-5
-    # All that a ray brings is found, or goes on.
+    # All hits are found, or the ray continues.
     assert np.abs(taken.sum(axis=1) + left - 1).max() < 1e-12
 
 
@@ -116,14 +116,14 @@ def test_hits_end_at_the_maximum_distance(rgb):
     assert list(groups.send(np.array([1])).rows) == [1]
 
 
-# ---- Tracked rays on Gaussians: what is left where, to whom it adds up, and per area ----
+# ---- Gaze samples on splats ----
 
 LINE = RaySettings()
 CONE = RaySettings(cone_sigma=np.radians(1.5), rays_per_cone=8, seed=5)
 
 
 def falling(n, side=1.2, z=-1.0, seed=0):
-    """Rays along z that are spread evenly over a square."""
+    """Rays along z, uniform over a square."""
     at = np.random.default_rng(seed).uniform(-side / 2, side / 2, (n, 2))
     o = np.concatenate([at, np.full((n, 1), z)], axis=1)
     return TrackedRays(o, np.tile([0.0, 0, 1], (n, 1)), np.full(n, 1 / n))
@@ -140,7 +140,7 @@ def test_ray_contributions_sum_to_one(rgb):
     assert np.allclose(result.face_sums.reshape(2, -1).sum(axis=0), taken.mean(axis=0))
     axes = shortest_axes(splats)
     assert not result.face_sums.reshape(2, -1)[np.where(axes[:, 2] > 0, 1, 0), np.arange(len(splats))].any()
-    # What a march leaves behind where it ends is a ten-thousandth of a ray at most.
+    # The transmittance at the end of a march is at most 1e-4.
     assert abs(result.unaccounted) < 1e-4 and 0.2 < result.escaped < 0.8 and np.isclose(result.total, 1)
     assert np.isclose(result.escaped + result.unaccounted, left.mean())
     cone = sums(splats, rays, CONE)
@@ -148,7 +148,7 @@ def test_ray_contributions_sum_to_one(rgb):
 
 
 def test_attention_per_area_matches_ray_density(rgb):
-    """On a wall of overlapping Gaussians in two layers, whichever of them a ray ends at."""
+    """On a wall of two layers of overlapping Gaussians."""
     splats = concatenate_splats([wall(0.0, 0.6, 0.03, 0.0005), wall(0.004, 0.6, 0.05, turned=TURN_X, seed=1)])
     rays = falling(20_000, 1.2)
     result = sums(splats, rays).face_sums.reshape(2, -1)
@@ -174,7 +174,7 @@ def test_splat_parts_are_reproducible(rgb):
 
 @pytest.mark.parametrize("cone", [0.0, 0.03])
 def test_escaped_gaze(rgb, cone):
-    """A density along z, most of which a wall stops, and the light of every ray by all Gaussians in float64."""
+    """Gaze along z that is mostly blocked by a wall; reference by all Gaussians in float64."""
     splats, eye, kappa = some(), np.array([0.1, -0.2, -1.5]), 8.0
     looker = lookers_of_law(vmf(rgb, (0, 0, 1), kappa))(eye)
     total, escaped = integrate_gaze(SplatArrays(splats, ns), looker, eye, cone)
@@ -221,7 +221,7 @@ def test_point_is_smoothed_to_a_gaussian(length):
     square = (offset**2).sum(axis=1)
     exact = np.exp(-square / (2 * length**2)) / (2 * np.pi * length**2) * areas[0]
     assert np.abs(result[0] - exact).sum() < 0.25
-    # What is even stays even, whatever the areas.
+    # A uniform density stays uniform for any areas.
     flow, areas = smoother(plain, length, rng.uniform(0.5, 1.5, (2, len(plain))) * areas)
     assert np.allclose(flow(areas), areas, rtol=1e-9)
 
@@ -276,7 +276,7 @@ def test_cells_share_one_density():
     assert np.array_equal(none(start), start)
 
 
-# ---- Gaze on Gaussian splats: closed forms, and the sum that looks at all Gaussians in double precision ----
+# ---- Gaze of observers on splats ----
 
 EYE = np.array([[0.0, 0, -2]])
 ALONG = np.array([0.0, 0, 1])
@@ -294,7 +294,7 @@ def uniform(rgb):
 
 
 def test_occluded_ball_receives_no_gaze(rgb):
-    """Kappa / 2 pi in the middle of a narrow law, by the square of the distance; nothing in the shadow."""
+    """Kappa / 2 pi at the centre of a narrow density, divided by the squared distance; zero in the shadow."""
     balls = stack([0.0, 1.0], [0.95, 0.95])
     kappa = 300.0
     expected = result(balls, vmf(rgb, ALONG, kappa))
