@@ -357,7 +357,7 @@ def test_unused_mesh_content_is_reported_once(tmp_path):
     scene = mi.load_dict({"type": "scene", "s": {"type": "sphere"}})
     setting = replace(setting, gaze_scene=GazeScene(SceneGeometry(None, scene), None, Similarity(), scene))
     changes = Changes(add=(NewShape("c", one), NewShape("d", two)))
-    assert setting.apply_changes(changes).warnings == [*setting.warnings, f"of {two}: statements that are not used: vp"]
+    assert setting.apply_changes(changes).warnings == [*setting.warnings, f"of {two}: unused statements: vp"]
 
 
 def test_what_if_without_support(tmp_path):
