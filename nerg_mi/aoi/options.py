@@ -1,4 +1,4 @@
-"""Options of attention statistics, without heavy imports, so that the command line lists them quickly."""
+"""Options of attention statistics."""
 
 from __future__ import annotations
 
@@ -7,8 +7,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nerg_mi.errors import NergError, sanitize
-from nerg_mi.ranges import COORDINATES, SECONDS, SEEDS, THREADS, TIMES, Range, ValidatedDataclass
-from nerg_mi.workflows.options import PartOptions, option, parse_numbers, parse_point
+from nerg_mi.ranges import COORDINATES, SECONDS, TIMES, Range, ValidatedDataclass
+from nerg_mi.workflows.options import (
+    ALIGN_HELP,
+    ANALYSIS,
+    INPUT,
+    OUTPUT,
+    PartOptions,
+    best_variant,
+    cpu_threads,
+    option,
+    parse_numbers,
+    parse_point,
+    random_seed,
+)
 
 if TYPE_CHECKING:
     from nerg_mi.statistics.visits import VisitRules
@@ -16,58 +28,93 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class AoiOptions(ValidatedDataclass):
-    """Areas of interest and how they are traced. Positions are in scene coordinates."""
+    """The areas of interest (AOIs), and how visibility between observers and AOIs is traced."""
 
     aois: Path | None = option(
-        None, "JSON file of AOIs (boxes, meshes, shapes, groups), or a folder of Aria Digital Twin."
+        None,
+        "JSON file of areas of interest (AOIs): boxes, meshes, shapes of the scene, and groups of them; or a folder of "
+        "Aria Digital Twin.",
+        group=INPUT,
     )
-    align: Path | None = option(
-        None, "JSON file with the 4x4 similarity from the frame of the rays to the scene.  [default: the gaze field's]"
-    )
+    align: Path | None = option(None, ALIGN_HELP, group=INPUT)
     margin: float = option(
         0.03,
-        "Tolerance in metres: a surface this close to an AOI, in front of it or behind a box, counts as the AOI.",
+        "Depth tolerance in metres: a surface this far in front of an AOI, or behind a box, still belongs to it.",
         within=Range(0, 10**6),
+        group=ANALYSIS,
     )
-    aoi_samples: int = option(48, "Sample points per AOI, for visibility.", within=Range(1, 4096))
-    mode: str | None = option(
-        None, "Mitsuba variant.  [default: cuda_ad_rgb if it works, else llvm_ad_rgb]", "-m", "--mode"
+    aoi_samples: int = option(
+        48, "Number of sample points on each AOI that visibility is tested for.", within=Range(1, 4096), group=ANALYSIS
     )
+    mode: str | None = best_variant()
 
 
 @dataclass(frozen=True, kw_only=True)
 class CountOptions(AoiOptions):
-    """Options of the measurement; durations are in seconds."""
+    """How gaze samples are turned into visits. Times are in seconds."""
 
     tolerance: float = option(
         0.0,
-        "Angular tolerance in degrees: a sample counts if it passes this close to an unoccluded part of the AOI.",
+        "Angular tolerance in degrees: a gaze sample counts if it passes this close to an unoccluded part of the AOI.",
         within=Range(0, 20),
+        group=ANALYSIS,
     )
     max_gap: float = option(
-        1.0, "Longest time in seconds between two samples that the first one represents.", within=SECONDS
+        1.0,
+        "Longest gap between gaze samples in seconds. A sample lasts until the next one; across a longer gap it lasts "
+        "for the median sampling interval.",
+        within=SECONDS,
+        group=ANALYSIS,
     )
     session_gap: float = option(
-        60.0, "Pause in seconds after which a new session of a participant starts.", within=SECONDS
+        60.0,
+        "Pause in seconds after which the samples of a participant belong to a new session.",
+        within=SECONDS,
+        group=ANALYSIS,
     )
-    merge_gap: float = option(0.15, "Longest interruption of a visit in seconds.", within=SECONDS)
-    min_visit: float = option(0.1, "Shortest visit in seconds.", within=SECONDS)
+    merge_gap: float = option(
+        0.15,
+        "Longest interruption of a visit in seconds: samples on an AOI form one visit unless the gaze is elsewhere for "
+        "longer.",
+        within=SECONDS,
+        group=ANALYSIS,
+    )
+    min_visit: float = option(0.1, "Shortest visit to an AOI in seconds.", within=SECONDS, group=ANALYSIS)
     aoi_visibility: bool = option(
-        False, "Also compute visibility: visible share, share of visible time, AOIs that are visible but not visited."
+        False,
+        "Also report the visibility of AOIs: visible share of each AOI, attention while it is visible, and visible but "
+        "unseen AOIs.",
+        group=ANALYSIS,
     )
     fov: float = option(
         120.0,
-        "Field of view in degrees, centred on the head direction or, if unknown, on the gaze direction.",
+        "Width of the field of view in degrees, centred on the head direction, or on the gaze if there is none.",
         within=Range(1, 360),
+        group=ANALYSIS,
     )
     cell_size: float = option(
-        0.1, "Edge length in metres of the cells from whose centres visibility is traced.", within=Range(0.001, 10**6)
+        0.1,
+        "Edge length in metres of the grid cells from whose centres the visibility of AOIs is traced.",
+        within=Range(0.001, 10**6),
+        group=ANALYSIS,
     )
     windows: tuple[str, ...] = option(
-        (), "Time window NAME=FROM,TO in seconds on the clock of the rays. Repeatable.", "--window"
+        (),
+        "Time window NAME=FROM,TO in seconds of the rays' clock, reported separately; repeatable.",
+        "--window",
+        group=ANALYSIS,
     )
-    zones: Path | None = option(None, "JSON file of boxes that define zones of the floor.")
-    cohorts: Path | None = option(None, "CSV file with the columns person,cohort.  [default: the cohorts in the rays]")
+    zones: Path | None = option(
+        None,
+        "JSON file of boxes on the floor; attention is reported separately for observers in each box.",
+        group=INPUT,
+    )
+    cohorts: Path | None = option(
+        None,
+        "CSV file with columns person,cohort; attention is reported separately for each cohort.  "
+        "[default: the cohorts in the rays]",
+        group=INPUT,
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -75,7 +122,7 @@ class CountOptions(AoiOptions):
             parse_window(text)
 
     def visit_rules(self) -> VisitRules:
-        """Return the definition of visits. Raises `NergError` for contradictory durations."""
+        """Return the rules that define a visit. Raises `NergError` for contradictory times."""
         from nerg_mi.statistics.visits import VisitRules
 
         return VisitRules(self.max_gap, self.session_gap, self.merge_gap, self.min_visit)
@@ -83,41 +130,76 @@ class CountOptions(AoiOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class PredictionOptions(AoiOptions):
-    """Options of the prediction."""
+    """How a gaze field is evaluated from a viewpoint."""
 
-    directions: int = option(8192, "Initial number of directions around each viewpoint.", within=Range(64, 1 << 20))
+    directions: int = option(
+        8192,
+        "Number of directions around each viewpoint in which the gaze field is evaluated.",
+        within=Range(64, 1 << 20),
+        group=ANALYSIS,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
 class StatisticsOptions(CountOptions, PredictionOptions, PartOptions):
-    """Options of `nerg stats`."""
+    """Options of ``nerg stats``."""
 
-    viewpoints: int = option(256, "Approximate number of viewpoints for predictions.", within=Range(1, 100_000))
+    viewpoints: int = option(
+        256,
+        "Approximate number of recorded positions from which the gaze field is evaluated.",
+        within=Range(1, 100_000),
+        group=ANALYSIS,
+    )
     glance_duration: float = option(
         0.3,
         "Glance duration in seconds, used to predict the hit ratio; glances are assumed independent.",
         within=Range(0.001, 10**6),
+        group=ANALYSIS,
     )
-    what_if: Path | None = option(None, "JSON file of changes to shapes and observers whose effects are predicted.")
-    visibility: bool = option(False, "Compute isovists on a grid, without recordings.")
+    what_if: Path | None = option(
+        None, "JSON file of changes to shapes and observers; the gaze field predicts their effect.", group=INPUT
+    )
+    visibility: bool = option(
+        False, "Compute isovists on a grid: what is visible from each position. Needs no tracking.", group=ANALYSIS
+    )
     observers: tuple[str, ...] = option(
         (),
-        "Position x,y,z of an observer if there are no rays.  [default: the scene's observer, or a grid on the floor]",
+        "Position x,y,z of an observer, where there are no rays; repeatable.  "
+        "[default: the observer of the scene, or a grid on the floor]",
         "--observer",
+        group=INPUT,
     )
     eye_height: float = option(
-        1.6, "Eye height in metres above the floor, for observers on a grid.", within=Range(0.01, 10**6)
+        1.6, "Eye height above the floor of observers on a grid, in metres.", within=Range(0.01, 10**6), group=ANALYSIS
     )
-    floor_height: float = option(0.0, "Height of the floor in scene units.", within=COORDINATES)
-    grid_step: float = option(0.25, "Spacing of the grid in metres.", within=Range(0.01, 10**6))
-    min_participants: int = option(1, "Suppress values that rest on fewer participants.", within=Range(1, 10**6))
-    show_names: bool = option(False, "Write the names of participants instead of pseudonyms.")
+    floor_height: float = option(
+        0.0, "Height of the floor along the up axis, in scene units.", within=COORDINATES, group=ANALYSIS
+    )
+    grid_step: float = option(
+        0.25, "Distance between neighbouring positions of a grid, in metres.", within=Range(0.01, 10**6), group=ANALYSIS
+    )
+    min_participants: int = option(
+        1,
+        "Smallest number of participants that a reported number may rest on; other numbers are left blank.",
+        within=Range(1, 10**6),
+        group=OUTPUT,
+    )
+    show_names: bool = option(
+        False, "Write the names of participants into the tables. Without it, they get pseudonyms.", group=OUTPUT
+    )
     salt: Path | None = option(
-        None, "Secret file that pseudonyms are derived from.  [default: a random secret, which is not stored]"
+        None,
+        "Secret file from which pseudonyms are derived, so that several runs agree.  [default: random, not stored]",
+        group=OUTPUT,
     )
-    resamples: int = option(1999, "Number of bootstrap draws for confidence intervals.", within=Range(199, 100_000))
-    seed: int = option(0, "Seed of the bootstrap draws.", within=SEEDS)
-    threads: int | None = option(None, "CPU threads. Default: all.", within=THREADS, changes_result=False)
+    resamples: int = option(
+        1999,
+        "Number of bootstrap resamples of the participants for confidence intervals.",
+        within=Range(199, 100_000),
+        group=ANALYSIS,
+    )
+    seed: int = random_seed("viewpoints and bootstrap resamples")
+    threads: int | None = cpu_threads()
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -126,9 +208,9 @@ class StatisticsOptions(CountOptions, PredictionOptions, PartOptions):
 
 
 def parse_window(text: str) -> tuple[str, float, float]:
-    """Parse NAME=FROM,TO to a name, a start and an end. Raises `NergError` for other texts."""
+    """Parse NAME=FROM,TO into a name, a start and an end. Raises `NergError` for any other text."""
     name, sign, rest = text.partition("=")
     ends = parse_numbers(rest, "--window") if sign else ()
     if not name.strip() or len(ends) != 2 or not TIMES.low <= ends[0] < ends[1] <= TIMES.high:
-        raise NergError(f'--window needs NAME=FROM,TO in seconds, such as morning=0,3600; got "{sanitize(text, 60)}"')
+        raise NergError(f'--window must be NAME=FROM,TO in seconds, as in morning=0,3600, got "{sanitize(text, 60)}"')
     return name.strip(), ends[0], ends[1]

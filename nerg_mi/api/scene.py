@@ -30,6 +30,7 @@ from nerg_mi.registration import get_plugin_class
 from nerg_mi.rendering.bands import is_nerg
 from nerg_mi.rendering.scene_writer import compute_clip_distances
 from nerg_mi.transport.geometry import check_shape
+from nerg_mi.workflows.old_names import current_keywords
 
 from .arrays import Camera, Floats, as_points, join_names
 
@@ -399,7 +400,7 @@ def build_options(kind: type[Options], function: str, options: Options | None, o
     NergError
         An option or a file does not exist.
     """
-    types = {f.name: str(f.type) for f in fields(kind)}
+    types, overrides = {f.name: str(f.type) for f in fields(kind)}, current_keywords(kind, overrides)
     if "mode" in overrides:
         raise NergError(f"{function} uses the active variant; call mi.set_variant({overrides['mode']!r}) before it")
     check_names(function, overrides, [name for name in types if name != "mode"])

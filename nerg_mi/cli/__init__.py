@@ -1,6 +1,6 @@
-"""The command `nerg`: finds the sub-command, runs it, and tells an expected error in one sentence.
+"""The command ``nerg``: finds and runs the sub-command, and reports errors of the user in one sentence.
 
-Commands are declared in the modules of their workflows (`nerg_mi.workflows.base`), and found and built by `.building`.
+Commands are declared in the modules of their workflows (`nerg_mi.workflows.base`), and built by `.building`.
 """
 
 from __future__ import annotations
@@ -16,19 +16,18 @@ with quiet_ctrl_c():
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the command line `arguments` (default: that of the process) and end the process.
+    """Run the command line ``arguments`` (default: those of the process) and exit.
 
-    Exit codes: 0 done; 1 an error that the user can correct, told in one sentence; 2 a wrong command line; 70 a mistake
-    in the program itself, which is said to be one; 130 interrupted. With --debug (also: --traceback, or
-    NERG_TRACEBACK=1) the traceback is shown before. The reader of the output may go away at any time: nothing is said
-    about that. A command that ends early on Ctrl-C leaves its outputs whole or absent and raises `KeyboardInterrupt`,
-    whose message, where it has one, says how to go on.
+    The exit codes are 0 for success, 1 for an error that the user can correct, 2 for a wrong command line, 70 for a
+    bug, and 130 after an interruption. With --debug (also --traceback, or NERG_TRACEBACK=1) the traceback is printed,
+    too. If the reader of the output closes it, no error is reported. A command that Ctrl-C ends leaves its outputs
+    complete or absent, and may raise `KeyboardInterrupt` with a message on how to resume.
     """
     open_streams()
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     asked_by_environment = os.environ.get("NERG_TRACEBACK", "0") not in ("", "0")
     debug = asked_by_environment or not set(DEBUG).isdisjoint(arguments)
-    # Allowed anywhere on the line: it is added after something went wrong, at the end.
+    # Accepted anywhere, since users append it after an error.
     arguments = [a for a in arguments if a not in DEBUG]
     with CtrlC() as ctrl_c:
         try:
@@ -41,7 +40,7 @@ def main(arguments: list[str] | None = None) -> None:
             if interrupt is not None:
                 print(str(interrupt) or "Interrupted.", file=sys.stderr)
                 sys.exit(INTERRUPTED)
-            if not isinstance(error, Exception):  # the end of a command
+            if not isinstance(error, Exception):  # normal end of a command
                 raise
             if debug:
                 traceback.print_exception(error)

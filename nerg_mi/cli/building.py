@@ -1,6 +1,7 @@
-"""The parser of the command line: commands are found by the first lines of modules, and built of what they declare.
+"""The parser of the command line, built from the declarations of commands.
 
-Only the module of the command that is called is imported, so that ``nerg --help`` answers at once.
+Commands are found by the first lines of modules. Only the module of the called command is imported, so that ``nerg
+--help`` is fast.
 """
 
 from __future__ import annotations
@@ -8,7 +9,6 @@ from __future__ import annotations
 import importlib
 import inspect
 import re
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import Field, dataclass, fields
@@ -21,20 +21,22 @@ import typer.core
 from nerg_mi import __version__
 from nerg_mi.ranges import RANGE
 from nerg_mi.workflows.base import COMMANDS, Command, Parameter
+from nerg_mi.workflows.old_names import find_spelling
+from nerg_mi.workflows.options import GROUPS as GROUPS_OF_OPTIONS
 
 from .ending import shorten_values
 from .progress import TerminalReporter
 
 PACKAGES = ("nerg_mi.workflows", "nerg_mi.viewer", "nerg_mi.cli")
-"""Packages whose modules, and those below them, may be commands."""
+"""Packages whose modules and submodules may declare commands."""
 
 GROUPS = {
-    "rays": "Import tracking files as rays of attention, and look at what they hold.",
-    "train": "Train a radiance field on posed photos, or a gaze field on rays.",
-    "eval": "Score a trained radiance field on held-out views, or a gaze field on held-out rays.",
-    "export": "Write a radiance field as a mesh, points, Gaussian splats, grid volumes or a torch-ngp checkpoint.",
+    "rays": "Import tracking files as gaze rays, and check, filter, split and plot them.",
+    "train": "Train a radiance field on posed photos, or a gaze field on gaze rays.",
+    "eval": "Score a radiance field on held-out views, or a gaze field on held-out rays.",
+    "export": "Export a radiance field as a mesh, points, Gaussian splats, grid volumes or a torch-ngp checkpoint.",
 }
-"""First words of commands of several words, and what is said about them."""
+"""Help texts of the groups of commands, by their first word."""
 
 _ORDER = (
     "demo doctor scene view render draw rays poses align train eval report import export refine bake ablate stats jobs "
@@ -45,14 +47,14 @@ _LINES = re.compile(r"``nerg ([a-z -]+)``: (.*?)(?=\n``nerg |\Z)", re.S)
 
 @dataclass(frozen=True)
 class ListedCommand:
-    """A command in the list: what is said about it, and the module that declares it."""
+    """A command in the list of commands: its help line, and the module that declares it."""
 
     line: str
     module: str
 
 
 def find_commands() -> dict[str, ListedCommand]:
-    """All commands by name, those that are listed first at the beginning. No module is imported."""
+    """Return all commands by name, in the order of the list. Imports no module."""
     commands: dict[str, ListedCommand] = {}
     for package in PACKAGES:
         for folder in map(Path, importlib.import_module(package).__path__):
@@ -68,16 +70,15 @@ def find_commands() -> dict[str, ListedCommand]:
     return dict(sorted(commands.items(), key=lambda item: place.get(item[0].split()[0], len(place))))
 
 
-# That of the parser, which typer does not name.
+# The base class of errors about the command line, which typer does not export.
 _UsageError: Any = typer.BadParameter.__base__
 
 DEBUG = ("--debug", "--traceback")
-"""The option that shows where an error arose."""
+"""The option that prints the traceback of an error."""
 
 
 def build_app(arguments: Sequence[str] = ()) -> typer.Typer:
-    """All commands. Messages about a wrong command line repeat the beginning of what is long among its
-    ``arguments``."""
+    """Return the parser of all commands. Error messages shorten long values among ``arguments``."""
     help = "Neural radiance and gaze fields for Mitsuba 3."
     settings: dict[str, Any] = {"name": "nerg", "help": help, "pretty_exceptions_enable": False}
     return _group("", find_commands(), _global_options, arguments, **settings)
@@ -91,9 +92,11 @@ def _version(wanted: bool) -> None:
 
 def _global_options(
     version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
     ] = False,
-    debug: Annotated[bool, typer.Option(*DEBUG, help="Show where an error arose (also: NERG_TRACEBACK=1).")] = False,
+    debug: Annotated[
+        bool, typer.Option(*DEBUG, help="Print the traceback of an error (also: NERG_TRACEBACK=1).")
+    ] = False,
 ) -> None:
     pass
 
@@ -105,7 +108,7 @@ def _group(
     arguments: Sequence[str] = (),
     **settings: Any,
 ) -> typer.Typer:
-    """The commands ``entries``, whose names begin with ``prefix``: a line for each; one that is called is built."""
+    """Return the parser of ``entries``, whose names start with ``prefix``; a command is built when it is called."""
 
     class Commands(typer.core.TyperGroup):
         def resolve_command(self, ctx: Any, args: list[str]) -> Any:
@@ -132,17 +135,17 @@ def _group(
 
 
 def _about_group(name: str, entries: Mapping[str, ListedCommand]) -> str:
-    """The line about the commands that begin with ``name``: of a group that `GROUPS` has not, what they are called."""
+    """Return the help line of the group ``name``; groups that are not in `GROUPS` list their commands."""
     below = [other.removeprefix(f"{name} ") for other in entries if other.startswith(f"{name} ")]
     return GROUPS.get(name) or f"Commands: {', '.join(below)}."
 
 
 def _listed() -> None:
-    """Stands for a command in the list of commands; one that is called is built."""
+    """A placeholder for a command in the list; a command that is called is built."""
 
 
 def _build(name: str, entries: Mapping[str, ListedCommand]) -> Any:
-    """The parser of the command ``name``, or of the group of those that begin with it."""
+    """Return the parser of the command ``name``, or of the group of commands that start with it."""
     below = {other: entry for other, entry in entries.items() if other.startswith(f"{name} ")}
     if name in entries:
         entry = entries[name]
@@ -150,19 +153,19 @@ def _build(name: str, entries: Mapping[str, ListedCommand]) -> Any:
             importlib.import_module(entry.module)
         if name in COMMANDS:
             return build_command(COMMANDS[name], entry.line)
-        # Commands that have no lines of their own, as figures.
+        # Commands without their own line in a module docstring, such as figures.
         below = {
             c.name: ListedCommand(c.help, entry.module) for c in COMMANDS.values() if c.name.startswith(f"{name} ")
         } | below
         if not below:
-            raise LookupError(f'{entry.module} names a command "{name}" and declares none')
+            raise LookupError(f'{entry.module} lists the command "{name}" and does not declare it')
     help = entries[name].line if name in entries else _about_group(name, below)
     return typer.main.get_command(_group(f"{name} ", below, name=name, help=help, add_completion=False))
 
 
 @contextmanager
 def _shortened(arguments: Sequence[str]) -> Iterator[None]:
-    """A block whose errors about the command line repeat the ends of long ``arguments``."""
+    """Within this block, errors about the command line shorten long ``arguments``."""
     try:
         yield
     except _UsageError as error:
@@ -170,20 +173,52 @@ def _shortened(arguments: Sequence[str]) -> Iterator[None]:
         raise
 
 
+class _GroupedCommand(typer.core.TyperCommand):
+    """A command whose help lists its options in groups with headings."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        sections: dict[str, list[tuple[str, str]]] = {}
+        for parameter in self.get_params(ctx):
+            record = parameter.get_help_record(ctx)
+            if record is not None:
+                sections.setdefault(_heading(parameter), []).append(record)
+        for heading, records in sections.items():
+            with formatter.section(heading):
+                formatter.write_dl(records)
+
+
+def _heading(parameter: Any) -> str:
+    if parameter.param_type_name == "argument":
+        return "Arguments"
+    return f"{parameter.rich_help_panel} options" if parameter.rich_help_panel else "Other options"
+
+
+def _group_position(parameter: Any) -> int:
+    """Sort key: arguments first, then options by their groups."""
+    if parameter.param_type_name == "argument":
+        return -1
+    return GROUPS_OF_OPTIONS.index(parameter.rich_help_panel) if parameter.rich_help_panel else len(GROUPS_OF_OPTIONS)
+
+
 def build_command(command: Command, line: str = "") -> Any:
-    """The parser of ``command``, which the list of commands has a ``line`` about."""
+    """Return the parser of ``command``; ``line`` is its help line in the list of commands."""
     app = typer.Typer(add_completion=False, rich_markup_mode=None)
     help = "\n\n".join(text for text in (command.help or line, command.more) if text)
-    app.command(command.name.split()[-1], help=help)(make_callback(command))
-    return typer.main.get_command(app)
+    app.command(command.name.split()[-1], help=help, cls=_GroupedCommand)(make_callback(command))
+    parser = typer.main.get_command(app)
+    spellings = {spelling for p in parser.params for spelling in (*p.opts, *p.secondary_opts)}
+    # In the order of the help, also for the reference in the manual.
+    parser.params.sort(key=_group_position)
+    parser.context_settings["token_normalize_func"] = find_spelling(command.name, spellings)
+    return parser
 
 
 def make_callback(command: Command) -> Callable[..., None]:
-    """The function that typer calls, whose parameters are those of ``command`` and an option for each field of its
-    options.
+    """Return the function that typer calls: its parameters are those of ``command`` and one option for each field of
+    its options.
 
-    A field that is True or False and False by default is a flag that sets it; one that is True by default can be
-    unset by ``--no-``. A field of type ``tuple[X, ...]`` or ``Mapping`` may be given several times.
+    A boolean field that is False by default becomes a flag; one that is True by default gets a ``--no-`` form. A field
+    of type ``tuple[X, ...]`` or ``Mapping`` becomes a repeatable option.
     """
     kind = command.options
     every = {} if kind is None else {f.name: f for f in fields(kind)}
@@ -191,17 +226,8 @@ def make_callback(command: Command) -> Callable[..., None]:
     shown = {name: f for name, f in every.items() if name not in more and name not in command.without}
     parameters = {name: _parameter(name, p) for name, p in more.items()}
     parameters |= {name: _option(f, get_type_hints(kind)[name]) for name, f in shown.items()}
-    # The Mitsuba variant was called --variant, which means the factors of a gaze field elsewhere.
-    has_former = "mode" in shown and "variant" not in parameters
-    if has_former:
-        former = Parameter("Former name of --mode.", str, None, ("--variant",), {"hidden": True})
-        parameters["variant"] = _parameter("variant", former)
 
     def call(**values: Any) -> None:
-        variant = values.pop("variant") if has_former else None
-        if variant is not None:
-            print(f"note: --variant is now --mode (-m) here: write --mode {variant}.", file=sys.stderr)
-            values["mode"] = variant
         if kind is not None:
             settings = {name: _value(f, parameters[name], values.pop(name)) for name, f in shown.items()}
             settings |= {name: values.pop(name) for name in more if name in every}
@@ -215,7 +241,7 @@ def make_callback(command: Command) -> Callable[..., None]:
 
 
 def _parameter(name: str, declared: Parameter) -> inspect.Parameter:
-    """The parameter that typer makes an argument, or an option that is no field, of."""
+    """Return the parameter from which typer makes an argument, or an option that is not a field."""
     make = typer.Option if declared.names else typer.Argument
     default = inspect.Parameter.empty if declared.default is ... else declared.default
     hint = declared.kind | None if default is None else declared.kind
@@ -223,7 +249,7 @@ def _parameter(name: str, declared: Parameter) -> inspect.Parameter:
 
 
 def _option(field: Field, hint: Any) -> inspect.Parameter:
-    """The parameter that typer makes the option of ``field`` of."""
+    """Return the parameter from which typer makes the option of ``field``."""
     metadata, default, names = field.metadata, field.default, field.metadata["names"]
     more, within, is_parsed = metadata["more"], metadata[RANGE], metadata["parse"] is not None
     if is_parsed:
@@ -235,7 +261,7 @@ def _option(field: Field, hint: Any) -> inspect.Parameter:
     if hint is bool and default is False and not names:
         names = ("--" + field.name.replace("_", "-"),)
     if within is not None and not is_parsed and not _is_repeatable(hint):
-        # Shown in the help; the dataclass checks it, as for Python.
+        # Shown in the help; the dataclass checks the range, also for Python callers.
         more = more | {"min": within.low, "max": within.high}
     return _keyword(field.name, hint, default, typer.Option(*names, help=metadata["help"], **more))
 
@@ -249,7 +275,7 @@ def _is_repeatable(hint: Any) -> bool:
 
 
 def _value(field: Field, parameter: inspect.Parameter, value: Any) -> Any:
-    """The ``value`` of ``field`` that the command line has for its ``parameter``."""
+    """Convert the ``value`` of ``field`` from the command line."""
     parse, names = field.metadata["parse"], field.metadata["names"]
     value = tuple(value or ()) if _is_repeatable(get_args(parameter.annotation)[0]) else value
     if parse is None or value is None:

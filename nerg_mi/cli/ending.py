@@ -1,4 +1,4 @@
-"""How a command ends: done, with an error that is told in one sentence, or by Ctrl-C."""
+"""The end of a command: success, an error that is reported in one sentence, or Ctrl-C."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from nerg_mi.errors import is_user_error, format_error
+from nerg_mi.errors import format_error, is_user_error
 
 if TYPE_CHECKING:
     from typing_extensions import Buffer
@@ -21,19 +21,18 @@ USER_ERROR = 1
 """Exit code of an error that the user can correct."""
 
 INTERNAL_ERROR = 70
-"""Exit code of a mistake in the program (EX_SOFTWARE of sysexits.h)."""
+"""Exit code of a bug in the program (EX_SOFTWARE of sysexits.h)."""
 
 INTERRUPTED = 130
-"""Exit code of what was ended by Ctrl-C (128 and the signal's number, as a shell has it)."""
+"""Exit code after Ctrl-C (128 plus the number of the signal, as in a shell)."""
 
 
 MAX_ECHOED = 300
-"""Characters of a value on the command line that a message repeats."""
+"""Maximum number of characters of a command-line value in a message."""
 
 
 def shorten_values(text: str, arguments: Iterable[str]) -> str:
-    """``text`` with the middle left out of what it repeats of ``arguments``, values and parts of lists, beyond
-    `ECHOED` characters."""
+    """Shorten values of ``arguments``, and parts of lists, in ``text`` to `MAX_ECHOED` characters."""
     parts = {part for argument in arguments if len(argument) > MAX_ECHOED for part in _SEPARATORS.split(argument)}
     values = {argument.partition("=")[2] for argument in arguments} | set(arguments) | parts
     for value in sorted(values, key=len, reverse=True):
@@ -44,13 +43,13 @@ def shorten_values(text: str, arguments: Iterable[str]) -> str:
 
 
 def exit_code(error: Exception) -> tuple[int, str]:
-    """Exit code of ``error``, and what is said about it."""
+    """Return the exit code of ``error`` and the message about it."""
     if is_user_error(error):
         return USER_ERROR, format_error(error)
     text = " ".join(str(error).split())
     return INTERNAL_ERROR, (
-        f"internal error ({type(error).__name__}{': ' + text if text else ''}): this is a fault of nerg_mi and not of "
-        "your input; run again with --debug and report the traceback"
+        f"internal error ({type(error).__name__}{': ' + text if text else ''}): this is a bug in nerg_mi, not in "
+        "your input; run the command again with --debug and report the traceback"
     )
 
 
@@ -58,16 +57,16 @@ _SEPARATORS = re.compile(r"[=,;\s]")
 
 
 def open_streams() -> None:
-    """Make the standard streams safe to print to, whatever they lead to.
+    """Make the standard streams safe to use in all cases.
 
-    One that is closed (``nerg ... >&-``) leads to nothing: else an output file could get its number, and what is
-    printed would be written into it. A command goes on, and says nothing, where nobody reads its output any more
-    (``nerg ... | head -1``). A disk that is full is an `OSError`, once.
+    A closed stream (``nerg ... >&-``) is replaced by the null device; otherwise an output file could get its file
+    descriptor and receive the messages. If the reader closes a pipe (``nerg ... | head -1``), the command continues
+    silently. A full disk raises `OSError` once.
     """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         stream = getattr(sys, name)
         if stream is None:
-            # The lowest free number, which is that of the stream.
+            # The lowest free descriptor, which is that of the stream.
             setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_RDWR), "w" if number else "r", encoding="utf-8"))
         elif number and stream is getattr(sys, f"__{name}__"):
             stream.flush()
@@ -81,7 +80,7 @@ class _Output(io.FileIO):
         try:
             return super().write(data)
         except OSError as error:
-            # Also for what is left in buffers, which the interpreter writes at its end.
+            # Also for buffered data, which the interpreter writes at exit.
             os.dup2(os.open(os.devnull, os.O_WRONLY), self.fileno())
             if isinstance(error, BrokenPipeError):
                 return memoryview(data).nbytes
@@ -90,7 +89,7 @@ class _Output(io.FileIO):
 
 @contextmanager
 def quiet_ctrl_c() -> Iterator[None]:
-    """A block of imports, before a command runs: Ctrl-C ends the process as it ends a command."""
+    """Within this block of imports, Ctrl-C ends the process as it ends a command."""
     try:
         yield
     except KeyboardInterrupt:
@@ -102,16 +101,15 @@ _AGAIN = 0.02  # seconds
 
 
 class CtrlC:
-    """A context in which Ctrl-C raises `KeyboardInterrupt`, and that knows afterwards whether it ended a command.
+    """Context in which Ctrl-C raises `KeyboardInterrupt`, and that finds out afterwards whether it ended a command.
 
-    Python drops an exception that is raised in a finalizer or in the callback of a weak reference: such a Ctrl-C is
-    sent again.
+    Python discards exceptions in finalizers and callbacks of weak references; such a Ctrl-C is sent again.
     """
 
     def __enter__(self) -> CtrlC:
         self._heard = False
         self._report_unraisable, sys.unraisablehook = sys.unraisablehook, self._send_again
-        # Only where Python's own handler is at work: elsewhere Ctrl-C is somebody else's business.
+        # Only if Python's default handler is active: others handle Ctrl-C themselves.
         self._mine = (
             threading.current_thread() is threading.main_thread()
             and signal.getsignal(signal.SIGINT) is signal.default_int_handler
@@ -126,16 +124,16 @@ class CtrlC:
 
     def _send_again(self, unraisable: sys.UnraisableHookArgs, /) -> None:
         if issubclass(unraisable.exc_type, KeyboardInterrupt):
-            # From another thread and later: here it would be dropped as well.
+            # From another thread and later, because here it would be discarded again.
             threading.Timer(_AGAIN, os.kill, (os.getpid(), signal.SIGINT)).start()
         else:
             self._report_unraisable(unraisable)
 
     def find_interrupt(self, end: BaseException) -> KeyboardInterrupt | None:
-        """The interrupt that led to ``end``; None where it is another error, or the command was done.
+        """Return the interrupt that caused ``end``; None if it was another error, or if the command finished.
 
-        Typer makes an exit with code 130 of it, which has it as its cause. Mitsuba makes an error of its own of it
-        where it is raised in a plugin, with nothing but text.
+        Typer converts it to an exit with code 130, with the interrupt as its cause. Mitsuba converts it to an error
+        with text only, if it is raised in a plugin.
         """
         link: BaseException | None = end
         while link is not None and not isinstance(link, KeyboardInterrupt):

@@ -1,7 +1,7 @@
-"""``nerg doctor``: Say what works on this machine, and how to repair what does not.
-``nerg worker``: Run parts of long jobs for a cluster (dask).
+"""``nerg doctor``: Check the installation and suggest fixes.
+``nerg worker``: Run parts of jobs for a dask cluster.
 
-What these commands run is imported when they run: the doctor has to work where Mitsuba does not.
+The modules that these commands need are imported when they run, because ``nerg doctor`` must work without Mitsuba.
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ from dataclasses import dataclass
 
 import typer
 
-from nerg_mi.ranges import SECONDS, ValidatedDataclass, Range
+from nerg_mi.ranges import SECONDS, Range, ValidatedDataclass
 from nerg_mi.workflows.base import Reporter, argument, command
-from nerg_mi.workflows.options import option
+from nerg_mi.workflows.options import INPUT, PERFORMANCE, option
 
 
-@command("doctor", more="Ends with exit code 0 if some compiled variant of Mitsuba works, else with 1.")
+@command("doctor", more="The exit code is 0 if a compiled variant of Mitsuba works, else 1.")
 def diagnose(reporter: Reporter) -> None:
-    """Tell what works. Raises ``typer.Exit``."""
+    """Report the state of the installation. Raises ``typer.Exit``."""
     from nerg_mi.diagnosis import run_diagnosis
 
     diagnosis = run_diagnosis()
@@ -28,28 +28,35 @@ def diagnose(reporter: Reporter) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class WorkerOptions(ValidatedDataclass):
-    """What a worker has of its machine, and how long it waits."""
+    """Options of ``nerg worker``."""
 
-    threads: int = option(0, "Worker threads; 0: one a core.", "-t", "--threads", within=Range(0, 1024))
-    wait: float = option(600.0, "Seconds to wait for a scheduler that is not there, or is gone.", within=SECONDS)
-    name: str | None = option(None, "What the scheduler calls this worker.  [default: its address]")
+    threads: int = option(
+        0, "Number of CPU threads; 0: one per core.", "-t", "--threads", within=Range(0, 1024), group=PERFORMANCE
+    )
+    wait: float = option(
+        600.0,
+        "Time in seconds to wait for a scheduler that does not answer before the worker ends.",
+        within=SECONDS,
+        group=INPUT,
+    )
+    name: str | None = option(None, "Name of this worker at the scheduler.  [default: its address]", group=INPUT)
 
 
 @command(
     "worker",
-    "Run parts of jobs for a dask scheduler, one at a time, until that ends it or Ctrl-C does.",
-    more="One worker a machine, or a graphics card, has all of it. Jobs are sent there with --scheduler.",
+    "Run parts of jobs for a dask scheduler, one at a time, until the scheduler stops the worker or Ctrl-C is pressed.",
+    more="Start one worker per machine or GPU; it uses all of it. Jobs are sent there with --scheduler.",
     options=WorkerOptions,
-    address=argument("Of a dask scheduler: tcp://HOST:PORT or tls://HOST:PORT.", str),
+    address=argument("Address of the dask scheduler: tcp://HOST:PORT or tls://HOST:PORT.", str),
 )
 def work(address: str, options: WorkerOptions, reporter: Reporter) -> None:
-    """Join a cluster."""
-    from nerg_mi.tasks.engines import run_dask_worker, describe_exposure
+    """Connect to a dask scheduler and run the parts that it sends."""
+    from nerg_mi.tasks.engines import describe_exposure, run_dask_worker
     from nerg_mi.threads import THREADS_VARIABLE
 
     if options.threads:
         os.environ[THREADS_VARIABLE] = str(options.threads)
-    danger = describe_exposure(address)
-    if danger is not None:
-        reporter.warn(danger)
+    warning = describe_exposure(address)
+    if warning is not None:
+        reporter.warn(warning)
     run_dask_worker(address, options.wait, reporter.message, options.name)

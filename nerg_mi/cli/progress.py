@@ -1,4 +1,4 @@
-"""What a job tells, on the terminal: its messages, its warnings, and one bar for its progress, or lines in a log."""
+"""Messages, warnings and progress of a workflow on the terminal, or as lines in a log."""
 
 from __future__ import annotations
 
@@ -11,20 +11,19 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
 LOG_INTERVAL = 10.0
-"""Seconds between two lines of progress where no terminal shows a bar."""
+"""Seconds between two lines of progress if there is no progress bar."""
 
 ESTIMATE_AFTER = 2.0
-"""Seconds after which it is guessed how long the rest takes."""
+"""Seconds after which the remaining time is estimated."""
 
 
 class TerminalReporter:
-    """A `nerg_mi.workflows.base.Reporter`, and a context that takes the bar away again.
+    """A `nerg_mi.workflows.base.Reporter` for the terminal, used as a context.
 
-    Messages go to the standard output and warnings to the standard error. The bar is on the standard error, from the
-    first ``progress`` on and only where that is a terminal, so that neither a pipe nor a file ever holds it. Where it
-    is none, as in the log of a job that runs for hours, the standard error gets a line every ten seconds, also while a
-    long step tells nothing. What a job does not say itself is added: how many seconds are left, if the rest goes as
-    fast as what is done; how long it has taken, where that cannot be guessed.
+    Messages go to the standard output, and warnings to the standard error. The progress bar is on the standard error,
+    if that is a terminal; pipes and files never contain it. Otherwise the standard error gets a line every ten seconds,
+    also during a long step. The remaining time is added, extrapolated from the progress so far, or the elapsed time if
+    that is not possible.
     """
 
     def __enter__(self) -> TerminalReporter:
@@ -49,11 +48,11 @@ class TerminalReporter:
             self._begun = time.monotonic()
             self._bar = self._start()
             if self._bar is None:
-                # What computes for minutes without a word is spoken for.
+                # Also reports during long steps without progress.
                 self._pulse = threading.Thread(target=self._beat, name="progress", daemon=True)
                 self._pulse.start()
         if share <= 0:
-            # What is prepared is no measure of how fast the rest goes.
+            # Preparation does not count for the extrapolation.
             self._counted = time.monotonic()
         self._now = (share, text)
         if self._bar is not None:
@@ -63,7 +62,7 @@ class TerminalReporter:
             self.log_when_due()
 
     def line(self) -> str:
-        """What is being done, and how long the rest takes, or how long it has taken."""
+        """Return the current step with the remaining or elapsed time."""
         share, text = self._now
         elapsed = 0.0 if self._begun is None else time.monotonic() - self._begun
         if text.endswith(" left") or " left, " in text:
@@ -78,7 +77,7 @@ class TerminalReporter:
         return f"{text}, {rest}" if text else rest
 
     def log_when_due(self) -> None:
-        """A line of a log, if the last one is `EVERY` seconds ago."""
+        """Print a line to a log if the last one is `LOG_INTERVAL` seconds old."""
         with self._lock:
             if time.monotonic() - self._told < LOG_INTERVAL:
                 return
@@ -90,14 +89,14 @@ class TerminalReporter:
             self.log_when_due()
 
     def _start(self) -> Progress | None:
-        """The bar, with its one task; None where it would not be seen."""
+        """Return the progress bar, with one task; None without a terminal."""
         if not sys.stderr.isatty():
             return None
         from rich.console import Console
         from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
         columns = BarColumn(), TaskProgressColumn(), TimeElapsedColumn(), TextColumn("{task.description}", markup=False)
-        # The bar would else take what is printed to the standard output with it, which may be a file.
+        # Otherwise the bar would also capture the standard output, which may be a file.
         bar = Progress(
             *columns, console=Console(stderr=True), transient=True, redirect_stdout=False, redirect_stderr=False
         )
@@ -121,7 +120,7 @@ class TerminalReporter:
 
 
 def duration(seconds: float) -> str:
-    """A time as one says it: 40 s, 12 min, 3.5 h."""
+    """Format a duration: 40 s, 12 min, 3.5 h."""
     if seconds < 120:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"

@@ -78,7 +78,7 @@ def list_variants(has_radiance: bool, recipes: Sequence[str] = ("default", "pape
                 for kind in ("accumulated", "snapshot")
                 for own in (False, True)
             ]
-        if has_radiance and "begin" in recipe.supported_options:
+        if has_radiance and "init" in recipe.supported_options:
             out += [
                 Variant(name="begins as the field, frozen", recipe=recipe.name, init_from_field=True, frozen=True),
                 Variant(name="begins as the field", recipe=recipe.name, init_from_field=True),

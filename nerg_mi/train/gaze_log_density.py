@@ -301,7 +301,7 @@ register_recipe(
             "weights": "person",
         },
         views_only_settings={"steps": 200, "zones": 3, "patience": 10},
-        supported_options=frozenset({"mix-folds", "mix-kappa"}),
+        supported_options=frozenset({"prior-folds", "prior-kappa"}),
         is_quick=True,
     )
 )

@@ -236,7 +236,7 @@ def _make_product_config(size: str, activation: str) -> Callable[[FieldOptions],
     return config
 
 
-_PRODUCT_OPTIONS = frozenset({"activation", "size", "normalized", "semantic", "begin", "loss", "integral"})
+_PRODUCT_OPTIONS = frozenset({"activation", "size", "normalize", "semantic", "init", "loss", "integral-weight"})
 
 register_recipe(
     Recipe(

@@ -19,14 +19,6 @@ from .gaze_settings import GazeSettings, ProbeSettings
 from .gaze_trainer import GazePlan, GazeTrainer
 from .geometry import TrainingGeometry
 
-# Command-line options of supported options with another name.
-_SPELLING = {
-    "begin": "--init field",
-    "normalized": "--normalize",
-    "integral": "--integral-weight",
-    "mix-folds": "--prior-folds",
-    "mix-kappa": "--prior-kappa",
-}
 DEFAULT_RECIPE = "default"  # Recipe that is used if none is named
 
 
@@ -62,8 +54,8 @@ class Recipe:
     probes: Mapping[str, Any]  # Keywords of `ProbeSettings`
     # Changes of ``settings`` for training on views only, whose common structure is learned late, after a plateau.
     views_only_settings: Mapping[str, Any] = field(default_factory=lambda: {"patience": 10})
-    # Options that the recipe supports, among "activation", "size", "normalized", "semantic", "begin", "loss",
-    # "integral", "mix-folds", "mix-kappa".
+    # Options that the recipe supports, among "activation", "size", "normalize", "semantic", "init", "loss",
+    # "integral-weight", "prior-folds", "prior-kappa".
     supported_options: frozenset[str] = frozenset()
     is_quick: bool = False  # Whether a training is short enough for an ablation to repeat it with several seeds
 
@@ -104,7 +96,7 @@ class Recipe:
             option = "--init field" if init_from_field else "--semantic"
             if geometry.radiance is None:
                 raise NergError(f"{option} needs a radiance field; pass one with --field")
-            if ("begin" if init_from_field else "semantic") not in self.supported_options:
+            if ("init" if init_from_field else "semantic") not in self.supported_options:
                 raise NergError(f"the recipe {self.name} does not support {option}; leave it out")
             if init_from_field:
                 config, initial = self.trainer.init_from_radiance(geometry.radiance, config)
@@ -145,7 +137,7 @@ class Recipe:
         unsupported = [name for name in names if name not in self.supported_options]
         if not unsupported:
             return
-        spelling = ", ".join(_SPELLING.get(name, f"--{name}") for name in unsupported)
+        spelling = ", ".join("--init field" if name == "init" else f"--{name}" for name in unsupported)
         alternatives = [r.name for r in load_recipes().values() if r.supported_options.issuperset(names)]
         remedy = (
             f"add --recipe {alternatives[0]}"

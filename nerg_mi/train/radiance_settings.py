@@ -178,9 +178,11 @@ class RadianceSettings(RunSettings):
     Exactly one of ``steps`` and ``minutes`` is set.
     """
 
-    minutes: float | None = setting(None, "Train for this long. Default: 5.", allowed=MINUTES)
-    steps: int | None = setting(None, "Or: train for so many steps.", allowed=STEPS)
-    seed: int = setting(0, "Seed of the weights, rays and jitter.", allowed=SEEDS)
+    minutes: float | None = setting(
+        None, "Training time in minutes.  [default: 5, unless --steps is given]", allowed=MINUTES
+    )
+    steps: int | None = setting(None, "Number of training steps, in place of --minutes.", allowed=STEPS)
+    seed: int = setting(0, "Seed of initial weights, rays and jitter.", allowed=SEEDS)
     # Samples per step. Not a power of two: arrays with such distances in memory share cache sets, which costs a factor
     # of two.
     batch: int = range_field(2**14 + 240, Range(1, 1 << 26))
@@ -224,10 +226,10 @@ class RadianceSettings(RunSettings):
     # Weight of the mean square of the hash-grid features, which removes features shaped by few rays (Barron et al.
     # 2023, Zip-NeRF, there per level).
     grid_decay: float = range_field(0.1, LOSS_WEIGHTS)
-    photo_colors: bool = setting(True, "Learn the exposure and white balance of each photo.")
+    photo_colors: bool = setting(True, "Fit the exposure and white balance of each photo.")
     # Weight of the squared deviation of the photo colours from their average, a mean over the photos.
     photo_decay: float = range_field(0.01, LOSS_WEIGHTS)
-    depth_weight: float = setting(0.02, "Weight of the depth's loss, where depth is known.", allowed=LOSS_WEIGHTS)
+    depth_weight: float = setting(0.02, "Weight of the depth loss, for photos with depth.", allowed=LOSS_WEIGHTS)
     # Final ``depth_weight`` as a fraction of the initial one
     depth_weight_final_ratio: float = range_field(0.25, Range(0, 1e6))
     # Distance from the true surface, in march steps, within which light should be absorbed.
@@ -235,7 +237,9 @@ class RadianceSettings(RunSettings):
     # Fraction of the rays drawn from pixels with a large depth error
     hard_pixel_fraction: float = range_field(0.25, Range(0, 1))
     distortion_weight: float = setting(
-        0.0, "Weight of mip-NeRF 360's distortion loss, against fog; 0 is none.", allowed=LOSS_WEIGHTS
+        0.0,
+        "Weight of the distortion loss of mip-NeRF 360, which reduces floaters; 0 disables it.",
+        allowed=LOSS_WEIGHTS,
     )
 
     def __post_init__(self):

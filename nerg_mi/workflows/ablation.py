@@ -1,4 +1,4 @@
-"""Training every variant of a gaze field alike, in parts, and comparing them."""
+"""Train the variants of a gaze field under equal conditions, in parts or directly, and compare them."""
 
 from __future__ import annotations
 
@@ -37,18 +37,21 @@ from nerg_mi.train.geometry import TrainingGeometry
 
 from .base import SILENT, Reporter, select_backend
 from .gaze_commands import AblationOptions, GazeOptions
-from .geometry import check_geometry, make_geometry, geometry_kind
+from .geometry import check_geometry, geometry_kind, make_geometry
 from .options import exposed_options
 from .parts import PartRunner, PlannedScene
 from .train_gaze import plan_gaze, train_planned
 
-# ---- What the variants of an ablation have in common, and the training of one of them ----
+# ---- Inputs that all variants share, and the training of one variant ----
 
 
 @dataclass(frozen=True)
 class AblationBenchmark:
-    """What all variants have in common: the rays of training, tests at ``centres`` (T, 3) and so many ``people`` who
-    are held out, the place, and the ``folder`` of checkpoints."""
+    """Inputs that all variants share.
+
+    The training rays, the tests at ``centres`` (T, 3), the number of held-out participants (``people``), the geometry,
+    and the ``folder`` for checkpoints.
+    """
 
     train: Rays
     tests: dict[str, GazeTest]
@@ -60,29 +63,39 @@ class AblationBenchmark:
     options: AblationOptions
 
 
-def prepare_benchmark(data: Rays, options: AblationOptions, folder: Path, ns: ModuleType, reporter: Reporter) -> AblationBenchmark:
-    """What all variants have in common that are trained on some of the rays ``data`` and scored on the others; a place
-    of hit points is written into ``folder``."""
-    truth = load_ground_truth(options.law) if options.law else None
+def prepare_benchmark(
+    data: Rays, options: AblationOptions, folder: Path, ns: ModuleType, reporter: Reporter
+) -> AblationBenchmark:
+    """Split the rays ``data`` into training and test rays, and build the geometry and the tests.
+
+    A volume of hit points is written to ``folder``.
+    """
+    truth = load_ground_truth(options.ground_truth) if options.ground_truth else None
     _, account = hold_out(
-        data, options.radius, options.zones, options.positions, options.first, options.min_rays, options.people
+        data,
+        options.radius,
+        options.test_zones,
+        options.test_positions,
+        options.seed,
+        options.min_rays,
+        options.test_participants,
     )
-    train, scored, centres = select_held_out_rays(data, account, "both" if options.people else "pos")
+    train, scored, centres = select_held_out_rays(data, account, "both" if options.test_participants else "pos")
     place = make_geometry(options, train, (), folder / "place.vol", ns, reporter=reporter)
-    # Bad places are part of what may be compared: it is told, and no more.
+    # A wrong alignment is reported and not rejected: it may be what is compared.
     check_geometry(place, train, f"--{place.kind} FILE", True, reporter)
     tests = ablation.make_tests(scored, train, centres, options.radius, options.kappa, options.min_rays, truth)
     return AblationBenchmark(train, tests, np.asarray(centres), len(account["people"]), place, folder, ns, options)
 
 
 def train_variant(variant: Variant, seed: int, path: Path, bench: AblationBenchmark) -> dict:
-    """Scores and times of one training, whose checkpoint is written to ``path``."""
+    """Train one variant, write its checkpoint to ``path``, and return its scores and times."""
     made = {"recipe": variant.recipe, "variant": variant.name, "seed": seed}
     return _train(made, make_plan(variant, seed, bench), path, bench)
 
 
 def make_plan(variant: Variant, seed: int, bench: AblationBenchmark) -> GazePlan:
-    """How a variant is trained with a seed."""
+    """Return the training plan of a variant for one seed."""
     options, quick = bench.options, get_recipe(variant.recipe).is_quick
     plan = plan_gaze(
         GazeOptions(
@@ -96,19 +109,19 @@ def make_plan(variant: Variant, seed: int, bench: AblationBenchmark) -> GazePlan
             loss=variant.loss or None,
             steps=(options.default_steps if quick else options.steps) or None,
             refit=options.refit or quick,
-            # Heads are compared: what is mixed in besides would make them alike.
-            mix_folds=0,
+            # A prior would make the networks that are compared more alike.
+            prior_folds=0,
             seed=seed,
         ),
         bench.place,
     )
-    # Positions that validate are to be had wherever there are some that test.
+    # Validation probes exist wherever test positions exist.
     watched = plan.settings.validation_min_rays or plan.probes.min_rays
     return plan.with_settings(validation_min_rays=min(watched, options.min_rays))
 
 
 def _train(made: dict, plan: GazePlan, path: Path, bench: AblationBenchmark) -> dict:
-    """Train, write the checkpoint (``made``: what it is), and score. Raises ``KeyboardInterrupt`` after Ctrl-C."""
+    """Train, write the checkpoint with the metadata ``made``, and score. Raises ``KeyboardInterrupt`` after Ctrl-C."""
     started = time.perf_counter()
     result = train_planned(Supervision(bench.train), bench.place, plan, bench.ns)
     if result.interrupted:
@@ -121,20 +134,20 @@ def _train(made: dict, plan: GazePlan, path: Path, bench: AblationBenchmark) -> 
 
 
 def load_ground_truth(name: str) -> Baseline:
-    """The density of an instance of the class that ``MODULE:CLASS`` names."""
+    """Return the density of an instance of the class that ``MODULE:CLASS`` names. Raises `NergError`."""
     module, _, kind = name.partition(":")
     try:
         return getattr(importlib.import_module(module), kind)().density
     except (ImportError, AttributeError, ValueError) as error:
         raise NergError(
-            "--law needs MODULE:CLASS that can be imported, such as nerg_mi.scenes.store.attention_law:AttentionLaw, "
-            f'got "{name}"'
+            "--ground-truth must be an importable MODULE:CLASS, such as "
+            f'nerg_mi.scenes.store.attention_law:AttentionLaw, got "{name}"'
         ) from error
 
 
 # ---- Ablation ----
 #
-# The paper's ablation: every variant of a gaze field, trained alike, scored on what it saw and on what it did not.
+# The ablation of the paper: all variants are trained alike and scored on training and held-out data.
 
 
 _FIELD, _ROW = "gaze.safetensors", "row.json"
@@ -142,43 +155,43 @@ _FIELD, _ROW = "gaze.safetensors", "row.json"
 
 @dataclass(frozen=True)
 class AblationResult:
-    """What every variant scored."""
+    """Scores of all variants."""
 
-    # A row a variant and seed (`evaluation.ablation.COLUMNS`).
+    # One row per variant and seed (`evaluation.ablation.COLUMNS`).
     rows: list[dict]
-    # Tables and plot that were written.
+    # Written tables and plot.
     files: list[Path]
 
 
 def ablate(
     rays: Rays | str | Path, output: str | Path, options: AblationOptions | None = None, reporter: Reporter = SILENT
 ) -> AblationResult:
-    """Train and score every variant of the recipes in one place, on ``rays`` of attention or their file.
+    """Train and score all variants of the recipes on ``rays``, or on a file of rays.
 
-    Checkpoints go to the folder ``output``, each with its row: what an earlier run with the same rays, place, tests and
-    settings has left there is not trained again. With ``options.store`` or ``options.scheduler`` a training is a part,
-    which is kept with its row and may be run by others; frames are timed here all the same. Raises `NergError` for what
-    the user can mend.
+    Checkpoints are written to the folder ``output``, each with its row of the table. A variant is not trained again if
+    an earlier run with the same rays, geometry, tests and settings has written its checkpoint there. With
+    ``options.store`` or ``options.scheduler`` each training is a part that is stored and may run elsewhere; frames are
+    always timed in this process. Raises `NergError` for errors that the user can correct.
     """
     options, output = options or AblationOptions(), Path(output)
     geometry_kind(options)
-    width, height = _size(options.size)
+    width, height = _size(options.timing_size)
     recipes = options.recipes.split(",")
     radiance = options.field is not None and not is_splat_file(options.field)
-    known = ablation.list_variants(radiance, recipes)
-    variants = _chosen(known, options.variant)
-    if options.law:
-        load_ground_truth(options.law)
+    available = ablation.list_variants(radiance, recipes)
+    variants = _select_variants(available, options.variant)
+    if options.ground_truth:
+        load_ground_truth(options.ground_truth)
     check_folder(output)
     ns = select_backend(options.mode, options.threads)
     reporter.progress(0.0, "preparing")
     data = rays if isinstance(rays, Rays) else load_rays(rays)
     bench = prepare_benchmark(data, options, output, ns, reporter)
     timer = None
-    if options.cameras:
+    if options.timing_cameras:
         folder = output if options.field is None else Path(options.field).parent
-        timer = make_frame_timer(bench.place, bench.centres, folder, options.cameras, width, height)
-    seeds = lambda v: range(options.first, options.first + (options.seeds if get_recipe(v.recipe).is_quick else 1))
+        timer = make_frame_timer(bench.place, bench.centres, folder, options.timing_cameras, width, height)
+    seeds = lambda v: range(options.seed, options.seed + (options.seeds if get_recipe(v.recipe).is_quick else 1))
     due = [(v, seed) for v in variants for seed in seeds(v)]
     rows = []
     for (variant, seed), row in zip(due, _rows(due, bench, data, reporter)):
@@ -199,7 +212,7 @@ def ablate(
 
 
 def _rows(due: list[tuple[Variant, int]], bench: AblationBenchmark, data: Rays, reporter: Reporter) -> Iterator[dict]:
-    """The row of each training that is ``due``."""
+    """Yield the row of each of the trainings ``due``."""
     if bench.options.in_parts:
         yield from _rows_in_parts(due, bench, data, reporter)
         return
@@ -208,14 +221,20 @@ def _rows(due: list[tuple[Variant, int]], bench: AblationBenchmark, data: Rays, 
         yield _row(variant, seed, bench)
 
 
-def _rows_in_parts(due: list[tuple[Variant, int]], bench: AblationBenchmark, rays: Rays, reporter: Reporter) -> Iterator[dict]:
-    """The same from parts, of which some may have been kept; ``rays``: all of them. Checkpoints are copied into the
-    folder of ``bench``."""
+def _rows_in_parts(
+    due: list[tuple[Variant, int]], bench: AblationBenchmark, rays: Rays, reporter: Reporter
+) -> Iterator[dict]:
+    """Yield the rows from parts, some of which may be stored already.
+
+    ``rays`` are all rays. Checkpoints are copied to the folder of ``bench``.
+    """
     options, folder = bench.options, bench.folder
     scene = None if options.scene is None else PlannedScene.plan(options.scene)
     common = Ablation(training_options(options), rays, scene)
     tasks = [Part((v.recipe, v.name, seed), f"{v.recipe} {v.name}, seed {seed}") for v, seed in due]
-    plan = Plan(f"nerg ablate {os.path.abspath(folder)}", train_part, common, tasks, FOLDER_SUFFIX, (*RENDER_LIBRARIES, "scipy"))
+    plan = Plan(
+        f"nerg ablate {os.path.abspath(folder)}", train_part, common, tasks, FOLDER_SUFFIX, (*RENDER_LIBRARIES, "scipy")
+    )
     made = PartRunner(options, folder, reporter, options.threads).run(plan)
     for (variant, seed), part in zip(due, made):
         with replace_atomically(folder / variant.file_name(seed)) as temporary:
@@ -228,7 +247,7 @@ def _rows_in_parts(due: list[tuple[Variant, int]], bench: AblationBenchmark, ray
 
 @dataclass(frozen=True)
 class Ablation:
-    """What all trainings of an ablation have in common, wherever they run."""
+    """Inputs that all parts of an ablation share."""
 
     options: AblationOptions
     rays: Rays
@@ -236,15 +255,23 @@ class Ablation:
 
 
 def training_options(options: AblationOptions) -> AblationOptions:
-    """The ``options`` without what trainings are chosen by, and without how the command times frames."""
+    """Return ``options`` without those that select trainings and those that time frames."""
     plain = AblationOptions()
-    chosen = {name: getattr(plain, name) for name in ("recipes", "variant", "seeds", "cameras", "size")}
-    return replace(options, **chosen)
+    return replace(
+        options,
+        recipes=plain.recipes,
+        variant=plain.variant,
+        seeds=plain.seeds,
+        timing_cameras=plain.timing_cameras,
+        timing_size=plain.timing_size,
+    )
 
 
 def train_part(common: Ablation, value: tuple[str, str, int], output: Path) -> None:
-    """The checkpoint and the row (JSON) of one training, into the folder ``output``; ``value``: recipe, variant and
-    seed."""
+    """Write the checkpoint and the row (JSON) of one training to the folder ``output``.
+
+    ``value`` holds the recipe, the variant and the seed.
+    """
     options, (recipe, name, seed) = common.options, value
     ns = select_backend(options.mode)
     if common.scene is not None:
@@ -261,26 +288,26 @@ def train_part(common: Ablation, value: tuple[str, str, int], output: Path) -> N
 
 
 def _row(variant: Variant, seed: int, bench: AblationBenchmark) -> dict:
-    """Scores and times of one training, which an earlier run may have left."""
+    """Return the scores and times of one training, which may be stored by an earlier run."""
     path = bench.folder / variant.file_name(seed)
-    kept = path.with_suffix(".json")
-    found = read_json(kept, "kept row") if path.exists() and kept.exists() else None
+    row_file = path.with_suffix(".json")
+    stored = read_json(row_file, "row of an earlier run") if path.exists() and row_file.exists() else None
     same = json.loads(json.dumps(_identity(variant, seed, bench)))
-    if isinstance(found, dict) and "row" in found and found.get("same") == same:
-        return found["row"]
+    if isinstance(stored, dict) and "row" in stored and stored.get("same") == same:
+        return stored["row"]
     row = train_variant(variant, seed, path, bench)
     _keep(row, variant, seed, bench)
     return row
 
 
 def _keep(row: dict, variant: Variant, seed: int, bench: AblationBenchmark) -> None:
-    """Write ``row`` beside its checkpoint."""
+    """Write ``row`` next to its checkpoint."""
     path = (bench.folder / variant.file_name(seed)).with_suffix(".json")
     write_json(path, {"row": row, "same": _identity(variant, seed, bench)}, allow_nan=True)
 
 
 def _identity(variant: Variant, seed: int, bench: AblationBenchmark) -> dict:
-    """All that a row depends on, as JSON has it."""
+    """Return everything that a row depends on, as JSON."""
     plan = make_plan(variant, seed, bench)
     return {
         "architecture": plan.config.to_dict(),
@@ -293,11 +320,11 @@ def _identity(variant: Variant, seed: int, bench: AblationBenchmark) -> dict:
     }
 
 
-def _chosen(variants: list[Variant], names: tuple[str, ...]) -> list[Variant]:
-    """Those of ``variants`` that are called one of ``names``; all without any."""
-    known = list(dict.fromkeys(v.name for v in variants))
-    if unknown := sorted(set(names) - set(known)):
-        raise NergError(f'--variant must be one of {", ".join(known)} here, got "{unknown[0]}"')
+def _select_variants(variants: list[Variant], names: tuple[str, ...]) -> list[Variant]:
+    """Return those of ``variants`` whose name is in ``names``, or all if ``names`` is empty."""
+    available = list(dict.fromkeys(v.name for v in variants))
+    if unknown := sorted(set(names) - set(available)):
+        raise NergError(f'--variant must be one of {", ".join(available)} for these recipes, got "{unknown[0]}"')
     return [v for v in variants if not names or v.name in names]
 
 
@@ -305,19 +332,19 @@ def _size(text: str) -> tuple[int, int]:
     try:
         width, height = (int(x) for x in text.lower().split("x"))
     except ValueError as error:
-        raise NergError(f'--size needs WIDTHxHEIGHT, got "{text}"') from error
+        raise NergError(f'--timing-size must be WIDTHxHEIGHT, got "{text}"') from error
     return width, height
 
 
 def _notes(centres: int, people: int, count: tuple[int, int], options: AblationOptions, timed: bool) -> str:
-    """What the tables say, for whoever reads them later; ``count``: of the rays that were trained on, and of all."""
-    trained, whole = count
-    without = f", {people} people held out" if people else ""
-    source = f"that of {options.law}" if options.law else f"with kappa {options.kappa:g}"
-    width, height = _size(options.size)
-    frame = f" A frame: {width} x {height}, mean of {options.cameras} cameras." if timed else ""
+    """Return the text above the tables; ``count`` holds the number of training rays and of all rays."""
+    trained, total = count
+    without = f", {people} participants held out" if people else ""
+    source = f"analytic ({options.ground_truth})" if options.ground_truth else f"with kappa {options.kappa:g}"
+    width, height = _size(options.timing_size)
+    frame = f" Frame time: {width} x {height} pixels, mean of {options.timing_cameras} cameras." if timed else ""
     return (
-        f"{centres} held-out positions in {options.zones} zones{without}; {trained:,} of {whole:,} rays trained on. "
-        f"Losses: KLD + (1 - CC) + MAE over 2,048 directions, truth {source}; relative to emit_capture of the same "
-        f"recipe; ± is the standard deviation over seeds.{frame}"
+        f"{centres} held-out positions in {options.test_zones} zones{without}; {trained:,} of {total:,} rays used "
+        f"for training. Losses: KLD + (1 - CC) + MAE over 2,048 directions, reference {source}; relative to "
+        f"emit_capture of the same recipe; ± is the standard deviation over seeds.{frame}"
     )

@@ -1,4 +1,4 @@
-"""Attention on surfaces: from meshes, scenes or fields to files with attention, and the files themselves."""
+"""Bake gaze onto surfaces: from meshes, scenes or fields to files with gaze per unit area."""
 
 from __future__ import annotations
 
@@ -25,42 +25,61 @@ from nerg_mi.formats.splats import is_splat_file
 from nerg_mi.maths.color import decode_srgb
 from nerg_mi.rays.rays import Rays
 from nerg_mi.surfaces.laplacian import Smoother, SurfaceSums, merge_sums
-from nerg_mi.surfaces.mesh import Mesh, RefinedMesh, iter_texture_rows, unwrap_uv, import_xatlas
+from nerg_mi.surfaces.mesh import Mesh, RefinedMesh, import_xatlas, iter_texture_rows, unwrap_uv
 from nerg_mi.surfaces.sources import GazeSumSettings, RaySettings
 
 from .bake_chunks import (
     UNITS,
     BakeScene,
     BakeTarget,
-    load_alignment,
     check_values,
-    cone_radians,
-    refine_target,
-    describe_origin,
-    read_target,
-    select_source,
     compute_sums,
+    cone_radians,
+    describe_origin,
+    load_alignment,
     make_gaze_groups,
+    read_target,
+    refine_target,
+    select_source,
 )
 from .base import SILENT, Reporter, select_backend
 from .scene_commands import BakeOptions
 
-# ---- Files of a bake: meshes with colours (.ply, .glb), a table of faces (.csv), and a summary (.json) ----
+# ---- Output files: meshes with colours (.ply, .glb), a table of faces (.csv), and a summary (.json) ----
 
 if TYPE_CHECKING:
     from .bake_splats import SplatBake
 
 
 SUFFIXES = (".ply", ".glb", ".csv", ".json")
-"""Files that are written."""
+"""Suffixes of output files."""
 
-_BARE = 0.3  # linear grey of a surface that nobody looks at
+_BARE = 0.3  # linear grey of a surface without gaze
 
 
 @dataclass(frozen=True, eq=False)
 class BakeOutput:
-    """What is written: ``refined`` surface with ``density`` (V,) of its vertices in ``unit``, and ``share`` (F,) of its
-    faces; ``receivers`` as they were given; ``scale``: scene units a metre."""
+    """Content of the output files.
+
+    Attributes
+    ----------
+    receivers
+        Target surface as given.
+    refined
+        Subdivided target surface.
+    density
+        Gaze density (V,) at the vertices of ``refined``, in ``unit``.
+    share
+        Share of the gaze (F,) on the faces of ``refined``.
+    scale
+        Scene units per metre.
+    heat
+        Colour scale.
+    provenance
+        Provenance for file headers.
+    summary
+        Content of the JSON file.
+    """
 
     receivers: BakeTarget
     refined: RefinedMesh
@@ -69,16 +88,16 @@ class BakeOutput:
     unit: str
     scale: float
     heat: Heat
-    about: Provenance
+    provenance: Provenance
     summary: Mapping[str, Any]
 
     def input_face_shares(self) -> np.ndarray:
-        """Share (F',) of the faces that were given."""
+        """Return the share of the gaze (F',) on each face of the target surface as given."""
         return np.bincount(self.refined.parent, self.share, len(self.receivers.mesh.faces))
 
 
 def write_output(baked: BakeOutput, path: Path, pixels: int | None) -> None:
-    """Write ``baked`` to ``path``, by its suffix; ``pixels`` a side of a texture, None for none."""
+    """Write ``baked`` to ``path`` in the format of its suffix, with a texture of ``pixels`` per side, or none."""
     WRITERS[path.suffix.lower()](baked, path, pixels)
 
 
@@ -88,12 +107,12 @@ def _ply(baked: BakeOutput, path: Path, pixels: int | None) -> None:
     names = ("x", "y", "z", "nx", "ny", "nz", "red", "green", "blue")
     columns: dict[str, np.ndarray] = dict(zip(names, [*mesh.vertices.T, *normals.T, *colors.T]))
     columns["value"] = baked.density
-    comments = [f"value: {baked.unit}", f"nerg_mi {baked.about.json()}"]
+    comments = [f"value: {baked.unit}", f"nerg_mi {baked.provenance.json()}"]
     write_columns(path, columns, mesh.faces, comments=comments)
 
 
 def _glb(baked: BakeOutput, path: Path, pixels: int | None) -> None:
-    extras = {"unit": baked.unit, "top": baked.heat.vmax, "provenance": json.loads(baked.about.json())}
+    extras = {"unit": baked.unit, "top": baked.heat.vmax, "provenance": json.loads(baked.provenance.json())}
     mesh = baked.refined.mesh
     normals = vertex_normals(mesh)
     if pixels is None:
@@ -109,30 +128,30 @@ def _glb(baked: BakeOutput, path: Path, pixels: int | None) -> None:
         return
     import mitsuba as mi
 
-    whole = baked.receivers.mesh
-    charts = unwrap_uv(whole, pixels)
+    target_mesh = baked.receivers.mesh
+    charts = unwrap_uv(target_mesh, pixels)
     picture = np.zeros((pixels, pixels, 3), np.uint8)
-    for rows, values, known in iter_texture_rows(charts, baked.refined, baked.density, pixels):
-        picture[rows][known] = np.rint(255 * _shown(baked.heat, values[known]))
-    image = encode_png(mi.Bitmap(picture), {"Comment": baked.about.json()})
+    for rows, values, valid in iter_texture_rows(charts, baked.refined, baked.density, pixels):
+        picture[rows][valid] = np.rint(255 * _shown(baked.heat, values[valid]))
+    image = encode_png(mi.Bitmap(picture), {"Comment": baked.provenance.json()})
     attributes = [
-        ("POSITION", whole.vertices[charts.vertex].astype("<f4"), False),
-        ("NORMAL", vertex_normals(whole)[charts.vertex].astype("<f4"), False),
+        ("POSITION", target_mesh.vertices[charts.vertex].astype("<f4"), False),
+        ("NORMAL", vertex_normals(target_mesh)[charts.vertex].astype("<f4"), False),
         ("TEXCOORD_0", charts.uv.astype("<f4"), False),
     ]
     write_bytes(path, *encode_unlit_glb(attributes, charts.faces, extras=extras, image=image))
 
 
 def _csv(baked: BakeOutput, path: Path, pixels: int | None) -> None:
-    given, square = baked.receivers, baked.scale**2
-    shares, area, center = baked.input_face_shares(), given.mesh.area, given.mesh.corners.mean(axis=1)
+    target, square = baked.receivers, baked.scale**2
+    shares, area, center = baked.input_face_shares(), target.mesh.area, target.mesh.corners.mean(axis=1)
     factor = float(baked.summary["factor"])
     columns = ("shape", "face", "x", "y", "z", "area_m2", "value", "share")
 
     def row(k: int) -> tuple:
         value = factor * shares[k] / area[k] * square
         numbers = (f"{v:.9g}" for v in (*center[k], area[k] / square, value, shares[k]))
-        return given.names[given.shape[k]], int(given.index[k]), *numbers
+        return target.names[target.shape[k]], int(target.index[k]), *numbers
 
     write_csv(path, (dict(zip(columns, row(k))) for k in range(len(center))), columns)
 
@@ -145,7 +164,7 @@ WRITERS = {".ply": _ply, ".glb": _glb, ".csv": _csv, ".json": _json}
 
 
 def vertex_normals(mesh: Mesh) -> np.ndarray:
-    """Unit normals (V, 3): means of the faces' around each vertex, by area; of opposite ones any."""
+    """Return unit normals (V, 3): area-weighted means of the normals of adjacent faces."""
     weighted = mesh.normals * mesh.area[:, None]
     sums = np.stack([np.bincount(mesh.faces.ravel(), np.repeat(c, 3), len(mesh.vertices)) for c in weighted.T], axis=1)
     length = np.linalg.norm(sums, axis=1, keepdims=True)
@@ -153,7 +172,7 @@ def vertex_normals(mesh: Mesh) -> np.ndarray:
 
 
 def _colors(baked: BakeOutput, values: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """sRGB (V, 3) of vertices: heat over grey that shades by the normal, so that an unlit mesh shows its shape."""
+    """Return sRGB colours (V, 3) of vertices: heat map over a grey that is shaded by the normal."""
     shade = 0.75 + 0.25 * normals @ np.array([0.48, 0.36, 0.8])
     return _shown(baked.heat, values, shade)
 
@@ -166,29 +185,44 @@ def _shown(heat: Heat, values: np.ndarray, shade: np.ndarray | float = 1.0) -> n
 
 
 def check_texture(paths: list[Path], pixels: int | None) -> None:
-    """Raise `NergError` where a texture is asked for and no file takes one, `ImportError` where nothing makes it."""
+    """Raise `NergError` if no output file can hold the texture, `ImportError` if the unwrapping library is missing."""
     if pixels is None:
         return
     if not any(path.suffix.lower() == ".glb" for path in paths):
-        raise NergError("--texture belongs to glTF; let the name of an output end in .glb")
+        raise NergError("--texture-size needs a glTF output; add an output whose name ends in .glb")
     import_xatlas()
 
 
 # ---- Bake ----
 #
-# Gaze on surfaces: how much of it each square metre of a mesh receives, from a gaze field or from tracked rays.
+# Gaze per unit area of a surface, from a gaze field or from recorded rays.
 
 
-_ERROR = 2e-3  # of what there was; more is said to be too much
-_LARGEST = 1000.0  # metres; no place that people were tracked in measures more
+_ERROR = 2e-3  # relative; a larger error is reported
+_LARGEST = 1000.0  # metres; larger surfaces are probably not in metres
 
 
 @dataclass(frozen=True, eq=False)
 class Bake:
-    """``mesh``: the surface in scene units, cut as finely as gaze was put on it, with ``density`` (V,) of its vertices
-    per square metre, and ``share`` (F,) of gaze on its faces. ``on_surface``, ``elsewhere`` (at other shapes, or in a
-    field), ``escaped`` (at nothing): shares of all gaze, and ``total``, what that is. ``summary``: all that was found,
-    as the JSON file has it. ``files`` written."""
+    """Result of a bake.
+
+    Attributes
+    ----------
+    mesh
+        Target surface in scene units, subdivided.
+    density
+        Gaze density (V,) at the vertices, per square metre.
+    share
+        Share of the gaze (F,) on the faces.
+    on_surface, elsewhere, escaped
+        Shares of the gaze on the target, on other shapes or in a field, and on nothing.
+    total
+        Integral of the gaze.
+    summary
+        Content of the JSON file.
+    files
+        Written files.
+    """
 
     mesh: Mesh
     density: np.ndarray
@@ -202,7 +236,7 @@ class Bake:
 
     @property
     def unaccounted(self) -> float:
-        """Gaze that was found nowhere, as a share of all: the error of the bake."""
+        """Share of the gaze that was not assigned to anything: the numerical error of the bake."""
         return self.total - self.on_surface - self.elsewhere - self.escaped
 
 
@@ -213,12 +247,28 @@ def bake(
     reporter: Reporter = SILENT,
     rays: Rays | None = None,
 ) -> Bake:
-    """Put the gaze of ``options`` on ``surface``: a mesh (.ply, .obj, .glb), a scene (.xml), or a radiance field;
-    on Gaussian splats `bake_splats.bake_splats` puts it.
+    """Bake the gaze of ``options`` onto ``surface``: a mesh (.ply, .obj, .glb), a scene (.xml) or a radiance field.
 
-    ``outputs``: files to write, by their suffixes (.ply, .glb, .csv, .json). ``rays``: in memory, in place of the file
-    in ``options``. With ``options.store`` or ``options.scheduler`` some observers, or rays, at a time are a part, which
-    is kept and may be made by others; the sums are the same to the bit. Raises `NergError` for what the user can mend.
+    `bake_splats.bake_splats` does the same for Gaussian splats.
+
+    Parameters
+    ----------
+    surface
+        File of the target surface.
+    outputs
+        Files to write; the suffix selects the format (.ply, .glb, .csv, .json).
+    options
+        Source of the gaze, sampling and colours. With ``options.store`` or ``options.scheduler`` groups of observers or
+        rays are parts that are stored and may run elsewhere; the sums are bitwise the same.
+    reporter
+        Receives messages and progress.
+    rays
+        Rays in memory, in place of the file in ``options``.
+
+    Raises
+    ------
+    NergError
+        For errors that the user can correct.
     """
     options, surface, start = options or BakeOptions(), Path(surface), time.perf_counter()
     paths = [Path(path) for path in outputs]
@@ -230,24 +280,24 @@ def bake(
     across = receivers.mesh.diagonal / align.scale
     if across > _LARGEST:
         reporter.warn(
-            f"the surface measures {across:,.0f} m across; if its unit is not the metre, give --align with the scale "
-            "from metres to it"
+            f"the surface is {across:,.0f} m across; if its unit is not the metre, give --align with the scale "
+            "from metres to that unit"
         )
     refined = refine_target(receivers, options.max_edge, align.scale)
     mesh = refined.mesh
-    reporter.message(f"{len(receivers.mesh.faces):,} triangles, cut into {len(mesh.faces):,} to hold gaze")
+    reporter.message(f"{len(receivers.mesh.faces):,} triangles, subdivided into {len(mesh.faces):,}")
     cone = cone_radians(options, source)
     scene = BakeScene(
         mesh,
-        receivers.others,
+        receivers.occluders,
         options.gaze if source == "field" else None,
         surface.absolute() if surface.suffix.lower() == ".xml" else None,
         GazeSumSettings(max_angle=math.radians(options.max_angle), cone_sigma=cone),
         RaySettings(cone_sigma=cone, rays_per_cone=options.cone_samples, seed=options.seed),
     )
     groups, factor = make_gaze_groups(options, source, rays, align, reporter)
-    found = compute_sums(scene, groups, options, paths[0] if paths else surface, reporter)
-    sums = merge_sums(found)
+    group_sums = compute_sums(scene, groups, options, paths[0] if paths else surface, reporter)
+    sums = merge_sums(group_sums)
     reporter.progress(0.9, "smoothing")
     smoother = Smoother(mesh, options.smooth * align.scale) if options.smooth > 0 else None
     shares, amounts = _smoothed(mesh, sums, smoother)
@@ -255,12 +305,12 @@ def bake(
     share, amount = shares / weight, amounts / weight
     density = factor * amount / mesh.vertex_area * align.scale**2
     summary = _summary(receivers, refined.parent, sums, share, factor, options, source)
-    if len(found) == 2:
-        summary["halves_cc"] = _agreement(mesh, found, smoother)
-    heat = Heat(options.vmax or _top(mesh, density), options.cmap, decades=options.log_decades)
-    about, summary["provenance"] = describe_origin(surface, options)
-    baked = BakeOutput(receivers, refined, density, share, UNITS[options.unit], align.scale, heat, about, summary)
-    _tell(summary, reporter)
+    if len(group_sums) == 2:
+        summary["halves_cc"] = _agreement(mesh, group_sums, smoother)
+    heat = Heat(options.vmax or _percentile_density(mesh, density), options.cmap, decades=options.log_decades)
+    record, summary["provenance"] = describe_origin(surface, options)
+    baked = BakeOutput(receivers, refined, density, share, UNITS[options.unit], align.scale, heat, record, summary)
+    _report_summary(summary, reporter)
     for path in paths:
         reporter.progress(0.95, f"writing {path.name}")
         write_output(baked, path, options.texture_size)
@@ -272,14 +322,14 @@ def bake(
 def bake_any(
     surface: Path, output: Sequence[Path], options: BakeOptions, reporter: Reporter, rays: Rays | None = None
 ) -> Bake | SplatBake:
-    """`bake` on a mesh, and `bake_splats.bake_splats` on Gaussian splats."""
+    """Call `bake` for meshes, scenes and fields, and `bake_splats.bake_splats` for Gaussian splats."""
     from .bake_splats import bake_splats
 
     return (bake_splats if is_splat_file(surface) else bake)(surface, output, options, reporter, rays)
 
 
 def _check(surface: Path, paths: list[Path], options: BakeOptions, rays: Rays | None) -> str:
-    """Whose gaze it is, of `bake_chunks.SOURCES`. Raises `NergError` for options that contradict each other."""
+    """Return the source of the gaze, one of `bake_chunks.SOURCES`. Raises `NergError` for contradictory options."""
     for path in paths:
         check_writable(path, *SUFFIXES)
     check_texture(paths, options.texture_size)
@@ -288,7 +338,7 @@ def _check(surface: Path, paths: list[Path], options: BakeOptions, rays: Rays | 
 
 
 def _smoothed(mesh: Mesh, sums: SurfaceSums, smoother: Smoother | None) -> tuple[np.ndarray, np.ndarray]:
-    """Integrals over faces (F,) and over hat functions (V,), after smoothing."""
+    """Return the integrals over faces (F,) and over vertex hat functions (V,), smoothed."""
     if smoother is None:
         return sums.face_sums, sums.vertex_sums
     amount = smoother(sums.vertex_sums)
@@ -296,13 +346,13 @@ def _smoothed(mesh: Mesh, sums: SurfaceSums, smoother: Smoother | None) -> tuple
 
 
 def _agreement(mesh: Mesh, halves: list[SurfaceSums], smoother: Smoother | None) -> float:
-    """Correlation of two halves' densities over the surface."""
+    """Return the correlation between the densities of two halves of the participants."""
     first, second = (_smoothed(mesh, half, smoother)[0] / mesh.area for half in halves)
     return float(cc(first, second, mesh.area))
 
 
-def _top(mesh: Mesh, density: np.ndarray) -> float:
-    """The density that 99.5 % of the looked-at area stays below."""
+def _percentile_density(mesh: Mesh, density: np.ndarray) -> float:
+    """Return the 99.5th percentile of the density over the area with gaze."""
     seen = np.flatnonzero(density > 0)
     if not len(seen):
         return 1.0
@@ -336,19 +386,18 @@ def _summary(
     }
 
 
-def _tell(summary: dict[str, Any], reporter: Reporter) -> None:
+def _report_summary(summary: dict[str, Any], reporter: Reporter) -> None:
     whom = f"{summary['lookers']:,} {'rays' if summary['source'] == 'rays' else 'observers'}"
     reporter.message(
-        f"of the gaze of {whom} {summary['on_surface']:.2%} lies on the surface, {summary['elsewhere']:.2%} on what "
-        f"else is there, and {summary['escaped']:.2%} meets no surface; {abs(summary['unaccounted']):.1e} is "
-        "unaccounted for"
+        f"gaze of {whom}: {summary['on_surface']:.2%} on the surface, {summary['elsewhere']:.2%} on other "
+        f"objects, {summary['escaped']:.2%} hits no surface; {abs(summary['unaccounted']):.1e} unaccounted for"
     )
     if abs(summary["total"] - 1) > _ERROR:
         reporter.warn(
-            f"the gaze adds up to {summary['total']:.3f} over the sphere, for the field is not normalised: divide "
-            "shares by that to compare them"
+            f"the gaze integrates to {summary['total']:.3f} over the sphere, because the field is not normalised; "
+            "divide shares by this value to compare them"
         )
     if abs(summary["unaccounted"]) > _ERROR * summary["total"]:
-        reporter.warn("more than 0.2 % of the gaze is unaccounted for; a smaller --angle or --detail makes that less")
+        reporter.warn("more than 0.2 % of the gaze is unaccounted for; reduce --max-angle or --max-edge")
     if "halves_cc" in summary:
-        reporter.message(f"two halves of the people agree by CC {summary['halves_cc']:.3f}")
+        reporter.message(f"agreement between two halves of the participants: CC {summary['halves_cc']:.3f}")

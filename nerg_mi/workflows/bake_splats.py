@@ -1,4 +1,4 @@
-"""Attention on Gaussian splats, in chunks and tasks."""
+"""Bake gaze onto Gaussian splats."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from nerg_mi.files.tables import write_json
 from nerg_mi.formats.splats import read_splats, write_ply_splats
 from nerg_mi.maths.color import decode_srgb
 from nerg_mi.maths.sphere import SH_C0
+from nerg_mi.ranges import FLAG
 from nerg_mi.rays.rays import Rays
 from nerg_mi.surfaces.laplacian import SurfaceSums, merge_sums
 from nerg_mi.surfaces.sources import RaySettings
@@ -28,33 +29,45 @@ from .bake_chunks import (
     UNITS,
     SplatGeometry,
     SplatScene,
-    load_alignment,
     check_values,
+    compute_sums,
     cone_radians,
     describe_origin,
-    select_source,
-    make_splat_geometry,
-    compute_sums,
+    load_alignment,
     make_gaze_groups,
+    make_splat_geometry,
+    select_source,
 )
 from .base import SILENT, Reporter, select_backend
 from .scene_commands import BakeOptions
 
 COLUMN = "attention"
-"""The column of a file that holds what each Gaussian receives."""
+"""Column of the output file with the gaze per unit area of each Gaussian."""
 
 SUFFIXES = (".ply", ".json")
-"""Files that are written."""
+"""Suffixes of output files."""
 
-_OF_TRIANGLES = ("shapes", "detail", "angle", "texture", "resolution")
+_TRIANGLE_OPTIONS = ("shapes", "max_edge", "max_angle", "texture_size", "resolution")
 
 
 @dataclass(frozen=True, eq=False)
 class SplatBake:
-    """``splats``: those that were given, in colours of ``attention`` (N,), gaze per square metre, which is one of their
-    further columns, too. ``observers``: how many there were, or rays. ``summary``: all that was found, as the JSON file
-    has it, with what gaze adds up to, ``total``, and how much of it meets no Gaussian, ``escaped``; of rays also
-    ``on_splats`` and ``unaccounted``. ``files`` written."""
+    """Result of a bake of Gaussian splats.
+
+    Attributes
+    ----------
+    splats
+        The Gaussians, coloured by ``attention``, which is also an additional column.
+    attention
+        Gaze per square metre (N,).
+    observers
+        Number of observers or rays.
+    summary
+        Content of the JSON file: among others ``total``, the integral of the gaze, and ``escaped``, the share that hits
+        no Gaussian; for rays also ``on_splats`` and ``unaccounted``.
+    files
+        Written files.
+    """
 
     splats: Splats
     attention: np.ndarray
@@ -70,48 +83,63 @@ def bake_splats(
     reporter: Reporter = SILENT,
     rays: Rays | None = None,
 ) -> SplatBake:
-    """Put the gaze of ``options`` on the Gaussian splats of a file: of one observer, a path of them, or the people of
-    rays, who look with a gaze field; or of the rays themselves.
+    """Bake the gaze of ``options`` onto Gaussian splats.
 
-    ``outputs``: files to write, by their suffixes. .ply: 3DGS as any: the given Gaussians and columns, `f_dc_*` in the
-    colours of a heat map over their own, without further harmonics, and the column `COLUMN`; .json: the summary.
-    ``rays``: in memory, in place of the file in ``options``. With ``options.store`` or ``options.scheduler`` some
-    observers, or rays, at a time are a part, as of `bake.bake`. Raises `NergError` for what the user can mend.
+    Parameters
+    ----------
+    splats
+        File of the Gaussians.
+    outputs
+        Files to write. A .ply file holds the Gaussians and their columns, with `f_dc_*` set to a heat map over their
+        colours, no higher harmonics, and the additional column `COLUMN`. A .json file holds the summary.
+    options
+        Source of the gaze, sampling and colours. With ``options.store`` or ``options.scheduler`` parts are stored, as
+        in `bake.bake`.
+    reporter
+        Receives messages and progress.
+    rays
+        Rays in memory, in place of the file in ``options``.
+
+    Raises
+    ------
+    NergError
+        For errors that the user can correct.
     """
     options, path, start = options or BakeOptions(), Path(splats), time.perf_counter()
     paths = [Path(output) for output in outputs]
     source = _check(paths, options, rays)
     select_backend(options.mode, options.threads)
     reporter.progress(0.0, "reading")
-    given = read_splats(path)
-    for note in (*given.assumptions, *given.notes):
-        reporter.message(f"of {path}: {note}")
+    gaussians = read_splats(path)
+    for note in (*gaussians.assumptions, *gaussians.notes):
+        reporter.message(f"{path}: {note}")
     align, cone = load_alignment(options), cone_radians(options, source)
     of_rays = RaySettings(cone_sigma=cone, rays_per_cone=options.cone_samples, seed=options.seed)
     groups, factor = make_gaze_groups(options, source, rays, align, reporter)
     if source == "rays":
-        scene = SplatScene(path, len(given), ray_settings=of_rays)
+        scene = SplatScene(path, len(gaussians), ray_settings=of_rays)
     else:
-        scene = SplatScene(path, len(given), options.gaze, cone, of_rays)
-    found = compute_sums(scene, groups, options, paths[0] if paths else path, reporter)
-    sums = merge_sums(found)
+        scene = SplatScene(path, len(gaussians), options.gaze, cone, of_rays)
+    group_sums = compute_sums(scene, groups, options, paths[0] if paths else path, reporter)
+    sums = merge_sums(group_sums)
     reporter.progress(0.9, "areas of Gaussians")
-    spread = _SplatSpread(make_splat_geometry(given), source, options.smooth * align.scale)
+    spread = _SplatDensity(make_splat_geometry(gaussians), source, options.smooth * align.scale)
     density = spread.density(sums)
     if not (density > 0).any():
         raise NergError(
-            f'nobody who looks sees any of the Gaussians of "{path}"; place them in it by --observer, --path or --align'
+            f'no observer sees any of the Gaussians of "{path}"; move the observers with --observer, '
+            "--observer-file or --align"
         )
     attention = factor * density * align.scale**2
     unit = UNITS[options.unit].replace("²", "^2")
     summary = _summary(sums, source, unit, factor, attention)
-    if len(found) == 2:
-        summary["halves_cc"] = float(cc(spread.density(found[0]), spread.density(found[1]), spread.area))
+    if len(group_sums) == 2:
+        summary["halves_cc"] = float(cc(spread.density(group_sums[0]), spread.density(group_sums[1]), spread.area))
     heat = Heat(options.vmax or robust_max(attention, attention > 0), options.cmap, decades=options.log_decades)
-    about, summary["provenance"] = describe_origin(path, options)
-    baked = recolor_splats(given, attention, heat)
-    _tell(summary, heat.vmax, reporter)
-    comments = (f"{COLUMN}: {unit}", f"colours end at {heat.vmax:.6g}", f"nerg_mi {about.json()}")
+    record, summary["provenance"] = describe_origin(path, options)
+    baked = recolor_splats(gaussians, attention, heat)
+    _report_summary(summary, heat.vmax, reporter)
+    comments = (f"{COLUMN}: {unit}", f"colours end at {heat.vmax:.6g}", f"nerg_mi {record.json()}")
     for output in paths:
         if output.suffix.lower() == ".json":
             write_json(output, summary)
@@ -123,73 +151,80 @@ def bake_splats(
 
 
 def recolor_splats(splats: Splats, values: np.ndarray, heat: Heat) -> Splats:
-    """``splats`` in colours that are the same from everywhere: ``values`` (N,) as ``heat`` over their own, dimmed; the
-    values are their column `COLUMN`."""
-    own = np.clip(0.5 + SH_C0 * splats.harmonics[:, 0].astype(np.float64), 0, 1)
-    own = decode_srgb(own) if splats.color_space == "srgb" else own
-    shown = overlay(own[None], np.asarray(values)[None], heat)[0]
+    """Return ``splats`` with view-independent colours: ``values`` (N,) as ``heat`` over their own, dimmed colours.
+
+    The values are also stored in the column `COLUMN`.
+    """
+    base_color = np.clip(0.5 + SH_C0 * splats.harmonics[:, 0].astype(np.float64), 0, 1)
+    base_color = decode_srgb(base_color) if splats.color_space == "srgb" else base_color
+    shown = overlay(base_color[None], np.asarray(values)[None], heat)[0]
     extra = {**splats.extra, COLUMN: np.asarray(values, np.float32)}
     return replace(splats, harmonics=harmonics_from_colors(shown), extra=extra, color_space="srgb")
 
 
-class _SplatSpread:
-    """From sums of a ``source`` to densities of the Gaussians of ``there``, smoothed by ``length`` scene units, or not
-    if that is 0. ``area`` (N,): of both sides of each."""
+class _SplatDensity:
+    """Converts sums of a ``source`` to densities on Gaussians, smoothed by ``length`` scene units if it is not 0.
 
-    def __init__(self, there: SplatGeometry, source: str, length: float):
+    ``area`` (N,) is the area of both sides of each Gaussian.
+    """
+
+    def __init__(self, geometry: SplatGeometry, source: str, length: float):
         self._source, self._smoother = source, None
         if source == "field" and length == 0:
             return
-        self._areas = compute_splat_areas(there.splats, there.arrays, there.tolerance)
-        self.area, least = self._areas.sum(axis=0), MIN_VISIBLE_FRACTION * unoccluded_areas(there.splats, there.arrays.extent)
-        # A side that hardly anything is seen of has a share, which by its area would be any density.
-        self._divisor = np.maximum(self._areas, least)
+        self._areas = compute_splat_areas(geometry.splats, geometry.arrays, geometry.tolerance)
+        self.area, min_area = (
+            self._areas.sum(axis=0),
+            MIN_VISIBLE_FRACTION * unoccluded_areas(geometry.splats, geometry.arrays.extent),
+        )
+        # A side that is nearly hidden would get an arbitrary density from its small area.
+        self._divisor = np.maximum(self._areas, min_area)
         if length > 0:
             self._smoother = SplatSmoother(
-                there.splats.centers, there.axes, self._areas, least, length, there.tolerance
+                geometry.splats.centers, geometry.axes, self._areas, min_area, length, geometry.tolerance
             )
 
     def density(self, sums: SurfaceSums) -> np.ndarray:
-        """Gaze (N,) per square scene unit, as a share of all."""
-        found = sums.face_sums.reshape(2, -1) / sums.weight
+        """Return the gaze density (N,) per square scene unit, as a share of all gaze."""
+        shares = sums.face_sums.reshape(2, -1) / sums.weight
         if self._source == "field":
             if self._smoother is None:
-                return found.sum(axis=0)
-            found = found * self._areas
+                return shares.sum(axis=0)
+            shares = shares * self._areas
         if self._smoother is not None:
-            found = self._smoother(found)
-        # What is wholly transparent receives nothing.
-        return (found / np.where(self._divisor > 0, self._divisor, 1)).sum(axis=0)
+            shares = self._smoother(shares)
+        # A transparent Gaussian receives nothing.
+        return (shares / np.where(self._divisor > 0, self._divisor, 1)).sum(axis=0)
 
 
 def _summary(sums: SurfaceSums, source: str, unit: str, factor: float, attention: np.ndarray) -> dict[str, Any]:
-    found = {"source": source, "unit": unit, "factor": factor, "lookers": sums.count, "gaussians": len(attention)}
-    found["looked_at"] = int((attention > 0).sum())
+    summary = {"source": source, "unit": unit, "factor": factor, "lookers": sums.count, "gaussians": len(attention)}
+    summary["looked_at"] = int((attention > 0).sum())
     w = sums.weight
-    found |= {"total": sums.total / w, "escaped": sums.escaped / w}
+    summary |= {"total": sums.total / w, "escaped": sums.escaped / w}
     if source == "rays":
-        found |= {"on_splats": sums.on_surface / w, "unaccounted": sums.unaccounted / w}
-    return found
+        summary |= {"on_splats": sums.on_surface / w, "unaccounted": sums.unaccounted / w}
+    return summary
 
 
-def _tell(summary: dict[str, Any], top: float, reporter: Reporter) -> None:
+def _report_summary(summary: dict[str, Any], top: float, reporter: Reporter) -> None:
     count, kind = summary["lookers"], "ray" if summary["source"] == "rays" else "observer"
     reporter.message(
-        f"of {summary['gaussians']:,} Gaussians {summary['looked_at']:,} are looked at by {count:,} "
+        f"{summary['looked_at']:,} of {summary['gaussians']:,} Gaussians receive gaze from {count:,} "
         f"{kind}{'' if count == 1 else 's'}; colours end at {top:.3g} "
         f"{'1 / m^2' if summary['unit'].endswith('[1/m^2]') else 's / m^2'}"
     )
     if summary["source"] == "rays":
         reporter.message(
-            f"of their gaze {summary['on_splats']:.2%} lies on Gaussians, and {summary['escaped']:.2%} meets none; "
-            f"{abs(summary['unaccounted']):.1e} is unaccounted for"
+            f"{summary['on_splats']:.2%} of the gaze is on Gaussians, {summary['escaped']:.2%} hits none; "
+            f"{abs(summary['unaccounted']):.1e} unaccounted for"
         )
     else:
         reporter.message(
-            f"of each one's gaze, {summary['total']:.3f} in all, {summary['escaped']:.2%} meets no Gaussian"
+            f"the gaze integrates to {summary['total']:.3f}, of which {summary['escaped']:.2%} hits no Gaussian"
         )
     if "halves_cc" in summary:
-        reporter.message(f"two halves of the people agree by CC {summary['halves_cc']:.3f}")
+        reporter.message(f"agreement between two halves of the participants: CC {summary['halves_cc']:.3f}")
 
 
 def _check(paths: list[Path], options: BakeOptions, rays: Rays | None) -> str:
@@ -197,13 +232,13 @@ def _check(paths: list[Path], options: BakeOptions, rays: Rays | None) -> str:
         check_writable(path, *SUFFIXES)
     check_values(options)
     for entry in fields(options):
-        if entry.name in _OF_TRIANGLES and getattr(options, entry.name) != entry.default:
-            name = {"shapes": "shape"}.get(entry.name, entry.name)
-            raise NergError(f"--{name} is of surfaces with triangles; leave it out for Gaussian splats")
+        if entry.name in _TRIANGLE_OPTIONS and getattr(options, entry.name) != entry.default:
+            name = entry.metadata[FLAG] or "--" + entry.name.replace("_", "-")
+            raise NergError(f"{name} does not apply to Gaussian splats; leave it out")
     source = select_source(options, rays)
     if source == "field" and options.gaze is None:
         raise NergError(
-            "splats have no gaze of their own; name a field by --gaze, which "
-            '"nerg train gaze RAYS --field SPLATS" makes of rays, or take the gaze of the rays, --from rays'
+            'no gaze field is given: add --gaze FILE ("nerg train gaze RAYS --field SPLATS" trains one), or use '
+            "the recorded gaze with --source rays"
         )
     return source

@@ -1,5 +1,4 @@
-"""What workflows have in common: how commands are declared, the Mitsuba variant, the reporter of progress, and
-versions of libraries."""
+"""Basics of all workflows: backend selection, command declarations, progress reporters, and library versions."""
 
 from __future__ import annotations
 
@@ -14,14 +13,17 @@ from typing import Any, Protocol, TypeVar
 from nerg_mi import __version__, llvm
 from nerg_mi.threads import set_thread_count
 
-# ---- Where a job computes: the Mitsuba variant and the number of threads ----
+from .old_names import accept_old_keywords
+from .options import OUTPUT, PANEL
+
+# ---- Backend: the Mitsuba variant and the number of threads ----
 
 
 def select_backend(mode: str | None, threads: int | None = None) -> ModuleType:
-    """Make the Mitsuba variant ``mode`` the active one and return its Dr.Jit namespace, such as ``drjit.llvm.ad``.
+    """Activate the Mitsuba variant ``mode`` and return its Dr.Jit namespace, such as ``drjit.llvm.ad``.
 
-    ``mode``: None for the best that works here; ``threads``: of the CPU, None or 0 for all. Raises `NergError` for a
-    variant that does not exist or does not work.
+    ``mode`` None selects the fastest variant that works. ``threads`` is the number of CPU threads; None or 0 uses all
+    cores. Raises `NergError` for a variant that does not exist or does not work.
     """
     from nerg_mi.fields.mlp import namespace
     from nerg_mi.rendering.scene import activate_variant
@@ -34,47 +36,47 @@ def select_backend(mode: str | None, threads: int | None = None) -> ModuleType:
 
 # ---- Commands ----
 #
-# What the command line runs: functions of workflows, each declared as a command where it is defined, or by its name
-# in a module that loads quickly, since help and completion import that module alone.
+# A command is a function of a workflow. It is declared where it is defined, or by name in a module that is quick to
+# import, because help and completion import only that module.
 #
-# A module with commands begins with their names and their lines in the list of commands, as in "``nerg train gaze``:
-# Train a gaze field on rays of attention." The command line finds it by these lines, without importing it, so that a
-# further command is a further module and nothing else.
+# The module docstring starts with one line for each command, as in "``nerg train gaze``: Train a gaze field on gaze
+# rays ...". The command line finds commands by these lines without importing modules, so a new module adds a command
+# without any other change.
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """What a command takes besides the fields of its options."""
+    """A parameter of a command that is not a field of its options."""
 
     help: str
-    # Of its value: Path, str, list[Path] for several, ...
+    # Type of the value: Path, str, list[Path] for several values, ...
     kind: Any = Path
-    # ... where a value must be given.
+    # ... marks a required value.
     default: Any = ...
-    # How an option is spelled; an argument has no name.
+    # Spellings of an option; empty for an argument.
     names: tuple[str, ...] = ()
-    # What else typer.Option or typer.Argument takes, such as ``metavar``.
+    # Further parameters of typer.Option or typer.Argument, such as ``metavar``.
     more: Mapping[str, Any] = field(default_factory=dict)
 
 
 def argument(help: str, kind: Any = Path, *, required: bool = True, **more: Any) -> Parameter:
-    """An argument, by its position on the command line; of several values where ``kind`` is a list."""
+    """Declare a positional argument; ``kind`` list[...] takes several values."""
     return Parameter(help, kind, ... if required else None, more=more)
 
 
 def out(help: str, kind: Any = Path, *, default: Any = ...) -> Parameter:
-    """The option ``--output``, or ``-o``."""
-    return Parameter(help, kind, default, ("-o", "--output"))
+    """Declare the option ``-o``, ``--output``."""
+    return Parameter(help, kind, default, ("-o", "--output"), {PANEL: OUTPUT})
 
 
-def extra(default: Any, help: str, kind: Any, *names: str, **more: Any) -> Parameter:
-    """A further option that is no field of the command's options."""
-    return Parameter(help, kind, default, names, more)
+def extra(default: Any, help: str, kind: Any, *names: str, group: str = "", **more: Any) -> Parameter:
+    """Declare an option that is not a field of the command's options."""
+    return Parameter(help, kind, default, names, {**more, PANEL: group})
 
 
 @dataclass(frozen=True)
 class Command:
-    """A command as `command` declares it."""
+    """A command as declared by `command`."""
 
     name: str
     run: Callable[..., Any]
@@ -87,7 +89,7 @@ class Command:
 
 
 COMMANDS: dict[str, Command] = {}
-"""The commands of all modules that have been imported, by name."""
+"""Commands of all imported modules, by name."""
 
 Run = TypeVar("Run", bound=Callable[..., Any])
 
@@ -103,27 +105,31 @@ def command(
     further: Callable[[], Mapping[str, Parameter]] | None = None,
     **parameters: Parameter,
 ) -> Callable[[Run], Run]:
-    """Decorator of the function that ``nerg NAME`` runs, which stays as it is.
+    """Declare the decorated function as what ``nerg NAME`` runs. The function is not changed.
 
-    It is called with keywords: the values of its parameters, ``options`` where it has any, and ``reporter``.
+    The function is called with keyword arguments: the values of ``parameters``, ``options`` if there are any, and
+    ``reporter``.
 
     Parameters
     ----------
     name
-        Its words, as "train gaze".
+        Words of the command, as "train gaze".
     help
-        What ``--help`` says, where that is not the line at the beginning of the module.
+        Summary for ``--help``, if it differs from the line in the module docstring.
     more
-        Further paragraphs of that.
+        Further paragraphs for ``--help``.
     options
-        Dataclass of which each field is an option (`nerg_mi.workflows.options.option`).
+        Dataclass whose fields become options (`nerg_mi.workflows.options.option`).
     without
-        Fields of it that the command line does not set.
+        Fields that are not exposed on the command line.
     further
-        Gives more parameters when the command is called, for what others may register.
+        Returns additional parameters when the command is called, for options that plugins register.
     parameters
-        Arguments and options by the names of what they set: a field of ``options``, or a parameter of the function.
+        Arguments and options. The names are those of fields of ``options`` or of parameters of the function.
     """
+
+    if options is not None:
+        accept_old_keywords(options, name)
 
     def decorate(run: Run) -> Run:
         COMMANDS[name] = Command(name, run, help, more, options, without, further, parameters)
@@ -133,7 +139,7 @@ def command(
 
 
 def declare(name: str, function: str, help: str = "", /, **settings: Any) -> None:
-    """Declare the command ``name`` as `command` does; ``function``: what it runs, as "MODULE:NAME", imported then."""
+    """Declare the command ``name`` like `command`; ``function``, as "MODULE:NAME", is imported when it runs."""
 
     def run(**values: Any) -> Any:
         return import_function(function)(**values)
@@ -142,30 +148,33 @@ def declare(name: str, function: str, help: str = "", /, **settings: Any) -> Non
 
 
 def import_function(function: str) -> Callable[..., Any]:
-    """The function "MODULE:NAME"."""
+    """Import and return the function "MODULE:NAME"."""
     module, _, name = function.partition(":")
     return getattr(importlib.import_module(module), name)
 
 
-# ---- Whom a job tells how it goes: a command's terminal, a notebook, or nobody ----
+# ---- Reporters: a terminal, a notebook, or none ----
 
 
 class Reporter(Protocol):
-    """Listens to a job. Each method returns at once and raises nothing, but for `KeyboardInterrupt` in `progress`,
-    which ends the job as Ctrl-C does."""
+    """Receives messages and progress of a workflow.
+
+    Methods return immediately and do not raise, except that `progress` may raise `KeyboardInterrupt` to stop the
+    workflow like Ctrl-C.
+    """
 
     def message(self, text: str) -> None:
-        """A line about what was found or written."""
+        """Report a result or a written file, in one line."""
 
     def warn(self, text: str) -> None:
-        """A line about what may be wrong with the result."""
+        """Report a possible problem with the result, in one line."""
 
     def progress(self, share: float, text: str = "") -> None:
-        """How much of the work is done, from 0 to 1, and what is being done."""
+        """Report the completed fraction of the work, from 0 to 1, and the current step."""
 
 
 class SilentReporter:
-    """Listens to nothing."""
+    """A reporter that ignores everything."""
 
     def message(self, text: str) -> None:
         pass
@@ -178,14 +187,14 @@ class SilentReporter:
 
 
 SILENT = SilentReporter()
-"""The reporter of jobs that were given none."""
+"""The default reporter."""
 
 
-# ---- What a report says about the programs that made it ----
+# ---- Versions of libraries, for reports ----
 
 
 def versions(mode: str) -> dict[str, str]:
-    """Version of each program that has a part in the numbers, by name; ``mode``: the Mitsuba variant in use."""
+    """Return the versions of all libraries that affect results, by name; ``mode`` is the active Mitsuba variant."""
     import drjit
     import mitsuba
     import numpy

@@ -1,8 +1,8 @@
-"""The demo: every picture that shows what a gaze field is, rendered from a scene with an observer.
+"""The demo: images and figures of a gaze field, rendered from a scene with an observer.
 
-The scene has three sensors: 0 a camera that sees behind what hides it from the observer, 1 the observer's own view, 2
-the observer's sphere (a `panorama`); its integrator is `nerg` with a gaze field, and it has the `<default>`s of
-``scenes/store/scene.xml``. Equal seeds give equal pictures, byte for byte.
+The scene has three sensors: 0 is a camera that sees what is occluded from the observer, 1 is the observer's view, and 2
+is the observer's sphere (a `panorama`). Its integrator is `nerg` with a gaze field, and it has the `<default>`s of
+``scenes/store/scene.xml``. Equal seeds give bitwise equal images.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 from nerg_mi.errors import NergError, translate_mitsuba_errors
 from nerg_mi.evaluation.gaze_report import read_results
 from nerg_mi.figures import overlay as figures
-from nerg_mi.figures.overlay import Heat, srgb, robust_max, write_png
+from nerg_mi.figures.overlay import Heat, robust_max, srgb, write_png
 from nerg_mi.figures.sphere import sphere_figure
 from nerg_mi.figures.style import Provenance, make_provenance, save
 from nerg_mi.files.atomic import check_folder, file_sha256, write_bytes
@@ -40,30 +40,30 @@ from .report import RESULTS, make_report
 from .scene_commands import BakeOptions, DemoOptions, ReportOptions
 
 CAMERA, OWN, SPHERE = range(3)
-"""Index of each sensor."""
+"""Indices of the sensors."""
 
 CHECKPOINTS = {"field": "store.safetensors", "gaze": "shoppers.safetensors"}
 MAKE = "python -m nerg_mi.scenes.store.make"
 REPORT_POINTS = 60_000
-"""Points of the report's 3D scene."""
+"""Number of points in the 3D view of the report."""
 
 TRACKED = "shoppers.npz"
-"""A tenth of each visit of the tracked gaze that the store's field was trained on."""
+"""File with a tenth of each visit of the recorded gaze on which the store's gaze field was trained."""
 
 REPORT_VIEWPOINTS = 24
-"""Places of people that the report looks from: few, since a demo must be quick."""
+"""Number of viewpoints of the report; small, to keep the demo short."""
 
 STAGES = (
     *("load", "camera", "own view", "gaze sphere", "without occlusion", "pictures", "surfaces", "tracked gaze"),
     "report",
 )
 OBJECTS, TWIN = "regions.json", "twin.ply"
-"""Files of named objects and of the place as a mesh, where they stand beside the scene."""
+"""Files with the AOIs and the mesh of the scene, next to the scene file."""
 
 
 @dataclass(frozen=True)
 class DemoResult:
-    """``files`` written, in the order of interest; ``seconds`` of each stage; ``report``: what run.json holds."""
+    """Written ``files`` in the order of interest; ``seconds`` of each stage; ``report``, the content of run.json."""
 
     files: list[Path]
     seconds: dict[str, float]
@@ -71,15 +71,15 @@ class DemoResult:
 
 
 def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Reporter = SILENT) -> DemoResult:
-    """Render all pictures of the demo into the folder ``out``, which is made.
+    """Render all images of the demo to the folder ``out``, which is created.
 
-    The reporter's progress names each of `STAGES` as it begins. Raises `NergError` where a checkpoint is missing, and
-    ``KeyboardInterrupt``, between two steps of less than a second, after Ctrl-C.
+    Progress names each of `STAGES` when it starts. Raises `NergError` if a checkpoint is missing, and
+    ``KeyboardInterrupt`` within a second after Ctrl-C.
     """
     options = options or DemoOptions()
     width, spp, seed = options.width, options.spp, options.seed
     if width < 12 or spp < 1:
-        raise NergError(f"the demo needs pictures of at least 12 pixels and 1 sample a pixel, got {width} and {spp}")
+        raise NergError(f"the demo needs images at least 12 pixels wide and 1 sample per pixel, got {width} and {spp}")
     out = Path(out)
     check_folder(out)
     scene = find_store_scene() if options.scene is None else Path(options.scene)
@@ -94,38 +94,38 @@ def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Rep
     with Interruption() as stop:
         clock.start("load")
         seen = load_scene(scene, values)
-        unhidden = load_scene(scene, values | {"occlusion": "false", "radiance": "false", "aovs": "opacity,gaze"})
+        unoccluded = load_scene(scene, values | {"occlusion": "false", "radiance": "false", "aovs": "opacity,gaze"})
         if len(seen.sensors()) < 3:
             raise NergError(
-                f'"{scene}" has {len(seen.sensors())} sensor(s): give it a camera, the own view and a panorama'
+                f'"{scene}" has {len(seen.sensors())} sensor(s): it needs a camera, the observer\'s view and a panorama'
             )
 
-        def render(of: Any, index: int) -> Channels:
+        def render(loaded: Any, index: int) -> Channels:
             with translate_mitsuba_errors():
-                return render_channels(of, of.sensors()[index], spp, seed, lambda done, total: stop.check())
+                return render_channels(loaded, loaded.sensors()[index], spp, seed, lambda done, total: stop.check())
 
         clock.start("camera")
         camera = render(seen, CAMERA)
         clock.start("own view")
-        own = render(seen, OWN)
+        own_view = render(seen, OWN)
         clock.start("gaze sphere")
         sphere = render(seen, SPHERE)
         clock.start("without occlusion")
-        without = render(unhidden, CAMERA)
+        without = render(unoccluded, CAMERA)
         stop.check()
 
     clock.start("pictures")
-    about = make_provenance("nerg demo", inputs, seed, {"spp": spp, "mode": mode, **sizes, "defaults": defaults})
-    # One scale for all pictures of gaze, so that a colour means the same in each of them.
-    tops = [robust_max(r.aovs["gaze"], r.mask) for r in (own, camera, sphere, without) if np.any(r.aovs["gaze"] > 0)]
+    record = make_provenance("nerg demo", inputs, seed, {"spp": spp, "mode": mode, **sizes, "defaults": defaults})
+    # All images of gaze share one colour scale.
+    tops = [
+        robust_max(r.aovs["gaze"], r.mask) for r in (own_view, camera, sphere, without) if np.any(r.aovs["gaze"] > 0)
+    ]
     if not tops:
-        raise NergError(
-            f'the gaze is 0 in every picture: move the eye of "{scene}", or train its gaze field for longer'
-        )
+        raise NergError(f'the gaze is 0 in all images: move the observer of "{scene}", or train its gaze field longer')
     heat = Heat(max(tops))
-    pictures = {"own": own, "without": without, "camera": camera, "sphere": sphere}
-    files = _write_pictures(out, pictures, heat, observer_pixel(seen), describe_basis(seen), about)
-    for key, value in (about.text() | describe_bases(seen)).items():
+    pictures = {"own": own_view, "without": without, "camera": camera, "sphere": sphere}
+    files = _write_pictures(out, pictures, heat, observer_pixel(seen), describe_basis(seen), record)
+    for key, value in (record.text() | describe_bases(seen)).items():
         camera.bitmap.metadata()[key] = value
     write_bitmap_exr(out / "scene.exr", camera.bitmap)
     files.append(out / "scene.exr")
@@ -139,7 +139,7 @@ def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Rep
         tracked = [write_recording(out / TRACKED)]
         files += tracked
     clock.start("report")
-    # Named by the scene, or that beside it of which the demo is made.
+    # The AOIs are next to the scene file.
     objects = scene.parent / OBJECTS
     shown = ReportOptions(
         aois=objects if objects.is_file() else None,
@@ -152,7 +152,7 @@ def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Rep
         mode=mode,
         title="The demo store and its shoppers" if options.scene is None else None,
     )
-    rendered = {"camera": camera, "own": own, "sphere": sphere}
+    rendered = {"camera": camera, "own": own_view, "sphere": sphere}
     evaluation = find_evaluation(scene, inputs[2])
     made = make_report([*inputs[1:], *tracked, *evaluation], out / "report.html", shown, rendered=rendered)
     files.append(made.path)
@@ -186,23 +186,23 @@ def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Rep
 
 
 def make_demo_to_look_at(out: Path, options: DemoOptions, reporter: Reporter) -> None:
-    """`make_demo`, and how its pictures are looked at."""
+    """Call `make_demo`, and report how to view the images."""
     make_demo(out, options, reporter)
-    reporter.message(f"Look at them with: {_viewer(out)}")
+    reporter.message(f"View the images with: {_viewer(out)}")
 
 
 def _viewer(out: Path) -> str:
-    """The command with which this machine shows the pictures in ``out``."""
+    """Return the command that shows the images in ``out`` on this machine."""
     first = out / "occlusion.png"
     opener = "open" if sys.platform == "darwin" else "xdg-open"
     if shutil.which(opener):
         return f"{opener} {first}"
-    # A machine without a desktop: any browser that reaches it will do.
+    # Without a desktop: any browser with network access to this machine.
     return f"python3 -m http.server --bind 127.0.0.1 --directory {out} 8000, then http://127.0.0.1:8000/{first.name}"
 
 
 def find_store_scene() -> Path:
-    """The demo store's scene.xml, as installed."""
+    """Return the path of the installed scene.xml of the demo store."""
     import nerg_mi.scenes as scenes  # pyright: ignore[reportMissingImports] which lies at the root of a checkout
 
     return Path(scenes.__path__[0]).resolve() / "store" / "scene.xml"
@@ -218,34 +218,34 @@ def _inputs(scene: Path, defaults: Mapping[str, str]) -> list[Path]:
         raise NergError(f'there is no scene file "{scene}"')
     paths = [scene]
     for name, file in CHECKPOINTS.items():
-        path = scene.parent / defaults.get(name, file)  # an absolute name stays as it is
+        path = scene.parent / defaults.get(name, file)  # an absolute path stays as it is
         if not path.is_file():
-            raise NergError(f'the {name} checkpoint "{path}" is missing: make it with "{MAKE}" (about 20 minutes)')
+            raise NergError(f'the {name} checkpoint "{path}" is missing: create it with "{MAKE}" (about 20 minutes)')
         paths.append(path)
     return paths
 
 
 def find_evaluation(scene: Path, gaze: Path) -> list[Path]:
-    """The evaluation that stands beside ``scene``, if it is of this ``gaze`` field."""
+    """Return the evaluation next to ``scene`` if it is one of this ``gaze`` field."""
     path = scene.parent / RESULTS
     return [path] if path.is_file() and read_results(path).sha256 == file_sha256(gaze) else []
 
 
 def write_recording(path: Path) -> Path:
-    """Write the store's sample of the tracked gaze that its field was trained on as the file ``path`` of rays."""
+    """Write the store's sample of recorded gaze to the rays file ``path``."""
     write_bytes(path, (find_store_scene().parent / TRACKED).read_bytes())
     return path
 
 
 def _bake(twin: Path, gaze: Path, eye: tuple[float, ...], output: Path, mode: str, seed: int) -> Path:
-    """Write the gaze of the observer at ``eye`` on the mesh ``twin`` as ``output``, as fine as a glance at it needs."""
+    """Bake the gaze of the observer at ``eye`` onto the mesh ``twin`` at a coarse resolution, and write ``output``."""
     options = BakeOptions(gaze=gaze, observer=eye, max_angle=5.0, max_edge=0.2, mode=mode, seed=seed)
     bake(twin, [output], options)
     return output
 
 
 def _camera_of(sensor) -> dict:
-    """Where a perspective ``sensor`` is, what it looks at and how wide, as options of a report."""
+    """Return position, target and field of view of a perspective ``sensor`` as options of a report."""
     import mitsuba as mi
 
     pose = sensor.world_transform()
@@ -255,13 +255,15 @@ def _camera_of(sensor) -> dict:
 
 
 def observer_pixel(scene) -> tuple[float, float] | None:
-    """Where the observer of ``scene`` stands in the camera's picture: (x, y) in pixels, counted from the first one's
-    centre; None outside of it."""
+    """Return the pixel (x, y) of the observer of ``scene`` in the camera's image, or None if it is outside.
+
+    Pixels are counted from the centre of the first one.
+    """
     return project_to_pixel(scene.sensors()[CAMERA], sensor_center(scene.sensors()[OWN]))
 
 
 def sphere_integral(sphere: Channels) -> float:
-    """What the gaze density adds up to over the observer's sphere: 1 for a density that is one."""
+    """Return the integral of the gaze density over the observer's sphere: 1 for a normalised density."""
     height, width = sphere.aovs["gaze"].shape
     return float((sphere.aovs["gaze"].astype(np.float64) * pixel_solid_angles(width, height)).sum())
 
@@ -277,9 +279,9 @@ def _write_pictures(
     heat: Heat,
     marker: tuple[float, float] | None,
     note: str,
-    about: Provenance,
+    record: Provenance,
 ) -> list[Path]:
-    """Write the ``pictures`` "own", "without" and "camera" of `figures.occlusion_figure`, and the "sphere"."""
+    """Write the figures of the images "own", "without" and "camera", and of the "sphere"."""
     camera, sphere = pictures["camera"], pictures["sphere"]
     parts = [(seen.color, seen.aovs["gaze"], seen.mask) for seen in pictures.values()]
     total = sphere_integral(sphere)
@@ -303,14 +305,14 @@ def _write_pictures(
     files = []
     for name, draw in drawn.items():
         files.append(out / f"{name}.png")
-        save(draw(), files[-1], about)
+        save(draw(), files[-1], record)
     files.append(out / "color.png")
-    write_png(files[-1], srgb(camera.color), about.text())
+    write_png(files[-1], srgb(camera.color), record.text())
     return files
 
 
 class _Clock:
-    """Seconds of one stage after the other."""
+    """Measures the seconds of consecutive stages."""
 
     def __init__(self, reporter: Reporter):
         self.seconds: dict[str, float] = {}

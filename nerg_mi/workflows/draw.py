@@ -1,5 +1,4 @@
-"""Figures: of files that were rendered or baked before (contact sheets, differences, gaze on a mesh), and drawing and
-writing one of any kind."""
+"""Figures of existing files (contact sheets, differences, gaze on a mesh), and drawing a figure of any kind."""
 
 from __future__ import annotations
 
@@ -20,8 +19,8 @@ from nerg_mi.figures.overlay import (
     difference_figure,
     find_channel_overlay,
     gaze_figure,
-    shared_limits,
     robust_max,
+    shared_limits,
 )
 from nerg_mi.figures.style import FORMATS, contact_sheet, find_colormap, make_provenance, save, shrink
 from nerg_mi.files.atomic import check_writable
@@ -37,37 +36,40 @@ from nerg_mi.surfaces.mesh import Mesh, mitsuba_mesh
 
 from .base import SILENT, Reporter, import_function
 from .draw_scenes import Drawing
+from .old_names import current_keywords
 from .scene_cameras import check_point
 from .scene_commands import KINDS, BakedFigureOptions, DifferenceOptions, FigureKind, SheetOptions
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# ---- Pictures in files: colour, and quantities that were rendered with it ----
+# ---- Images in files: colour and AOVs ----
 
 
 EXR = ".exr"
 
 
 def shared_note(names: Sequence[str], basis: Sequence[str]) -> str:
-    """A line on what several pictures rest on: once where it is the same, otherwise by their names."""
+    """Return a line on the data behind several images: once if it is the same, else by their names."""
     if len(set(basis)) == 1:
         return basis[0]
-    return "; ".join(f"{name}: {words or 'not known'}" for name, words in zip(names, basis))
+    return "; ".join(f"{name}: {words or 'unknown'}" for name, words in zip(names, basis))
 
 
 def read_stored(path: Path, overlay: Overlay) -> OverlayLayers:
-    """The EXR file ``path`` with the quantity of ``overlay``; without opacity there are surfaces everywhere, and
-    nothing rests on rays where the file does not say so. Raises `NergError` for other files and for one that has no
-    such channel."""
+    """Read the AOV of ``overlay`` from the EXR file ``path``.
+
+    Without an opacity channel, all pixels count as surfaces. Raises `NergError` for other files, and if there is no
+    such channel.
+    """
     if path.suffix.lower() != EXR:
-        raise NergError(f'"{path}" holds no quantities, which an EXR file does; give one that "nerg render" wrote')
-    found = read_exr(path, "picture")
-    values = next((found[name] for name in found if overlay.name in (name, name.partition(".")[0])), None)
+        raise NergError(f'"{path}" is not an EXR file and has no AOVs; give one that "nerg render" has written')
+    channels = read_exr(path, "picture")
+    values = next((channels[name] for name in channels if overlay.name in (name, name.partition(".")[0])), None)
     if values is None:
-        raise NergError(f'"{path}" has no "{overlay.name}"; it has {", ".join(found)}')
-    color = [found[name] for name in "RGB"] if {"R", "G", "B"} <= set(found) else [np.zeros_like(values)] * 3
-    opacity = found.get("opacity.Y")
+        raise NergError(f'"{path}" has no channel "{overlay.name}"; it has {", ".join(channels)}')
+    color = [channels[name] for name in "RGB"] if {"R", "G", "B"} <= set(channels) else [np.zeros_like(values)] * 3
+    opacity = channels.get("opacity.Y")
     mask = np.ones(values.shape, bool) if opacity is None else opacity >= SURFACE_OPACITY
     as_floats = lambda array: np.nan_to_num(np.asarray(array, np.float32))
     part = overlay.quantity.data_source
@@ -75,36 +77,36 @@ def read_stored(path: Path, overlay: Overlay) -> OverlayLayers:
     return OverlayLayers(as_floats(np.stack(color, axis=-1)), np.asarray(values, np.float32), mask, support_note=basis)
 
 
-# ---- How two pictures differ in a quantity: the first less the second ----
+# ---- Difference of an AOV between two images ----
 
 
 def difference(files: Sequence[Path], options: DifferenceOptions, reporter: Reporter) -> Drawing:
-    """The first of two files less the second."""
+    """Draw the first of two files minus the second."""
     find_colormap(options.cmap, "diverging")
     if options.vmax is not None and not (np.isfinite(options.vmax) and options.vmax > 0):
-        raise NergError(f"--top must be positive, got {options.vmax}")
+        raise NergError(f"--vmax must be positive, got {options.vmax}")
     if len(files) != 2:
-        raise NergError(f"a difference is of two pictures, and {len(files)} were given; name two .exr files")
+        raise NergError(f"a difference needs two images, got {len(files)}; name two .exr files")
     overlay = find_channel_overlay(options.channel)
     if overlay.display.kind == "categorical":
-        raise NergError(f'"{overlay.name}" names classes, which have no difference; choose another --channel')
+        raise NergError(f'"{overlay.name}" is categorical and has no difference; choose another --channel')
     first, second = (read_stored(path, overlay) for path in files)
     if first.values.shape != second.values.shape:
         sizes = " and ".join(f"{v.shape[1]} x {v.shape[0]}" for v in (first.values, second.values))
-        raise NergError(f"pictures of {sizes} pixels cannot be compared; render both with one size")
+        raise NergError(f"images of {sizes} pixels cannot be compared; render both in the same size")
     mask, unit = first.mask & second.mask, overlay.quantity.unit
-    title = f"{files[0].stem} less {files[1].stem}"
+    title = f"{files[0].stem} minus {files[1].stem}"
     label = f"difference of {overlay.name}" + (f" [{unit}]" if unit else "")
     note = shared_note([path.stem for path in files], [first.support_note, second.support_note])
     figure = difference_figure(first.values, second.values, mask, title, label, options.vmax, options.cmap, note)
     return Drawing(figure, list(files))
 
 
-# ---- A contact sheet: several pictures on one page, with one scale where a quantity lies over them ----
+# ---- Contact sheets: several images on one page, with a common colour scale for an overlay ----
 
 
 def sheet(files: Sequence[Path], options: SheetOptions, reporter: Reporter) -> Drawing:
-    """The pictures of ``files``, named by their files."""
+    """Draw the images of ``files`` on one page, with their file names."""
     pictures = []
     names = [path.stem for path in files]
     if options.overlay is None:
@@ -129,7 +131,7 @@ def sheet(files: Sequence[Path], options: SheetOptions, reporter: Reporter) -> D
         unknown = ~seen if style.hatch_unknown else None
         hatched = hatched or (unknown is not None and bool(unknown.any()))
         pictures.append(shrink(overlay.paint(stored, ends, style, unknown), options.max_width))
-        # Of all values the outermost are enough for a scale.
+        # Two extreme values are enough for a scale.
         outermost = [stored.values[seen].min(), stored.values[seen].max()] if seen.any() else []
         explained.append(OverlayLayers(stored.color, np.array(outermost), np.ones(len(outermost), bool)))
     scale = lambda sheet: overlay.add_scale(sheet, explained, ends, style, hatched)
@@ -138,7 +140,7 @@ def sheet(files: Sequence[Path], options: SheetOptions, reporter: Reporter) -> D
 
 
 def _display(path: Path) -> np.ndarray:
-    """The picture as it is shown (h, w, 3), in 0..1."""
+    """Return the image as displayed (h, w, 3), in 0..1."""
     from nerg_mi.figures.overlay import srgb
     from nerg_mi.photos.images import read_image
     from nerg_mi.rendering.scene import activate_variant
@@ -146,9 +148,9 @@ def _display(path: Path) -> np.ndarray:
     if path.suffix.lower() == EXR:
         from nerg_mi.files.images import read_exr
 
-        found = read_exr(path, "picture")
-        if {"R", "G", "B"} <= set(found):
-            return srgb(np.stack([found[name] for name in "RGB"], axis=-1))
+        channels = read_exr(path, "picture")
+        if {"R", "G", "B"} <= set(channels):
+            return srgb(np.stack([channels[name] for name in "RGB"], axis=-1))
     activate_variant(None)
     image = read_image(path)
     shown = image / np.iinfo(image.dtype).max if image.dtype.kind == "u" else np.asarray(image, np.float64)
@@ -157,7 +159,7 @@ def _display(path: Path) -> np.ndarray:
     return shown[..., :3]
 
 
-# ---- A baked surface: gaze on a mesh, with its scale ----
+# ---- Baked surfaces: gaze on a mesh, with its colour scale ----
 
 
 _HEADER = 1 << 16
@@ -167,8 +169,10 @@ _FRAME = 1.04
 
 @dataclass(frozen=True, eq=False)
 class BakedSurface:
-    """``mesh`` with ``values`` (V,) of its vertices; ``label``: what they are, with their unit; ``made_of``: the names
-    of the files of its gaze."""
+    """A mesh with gaze.
+
+    ``values`` (V,) belong to its vertices, ``label`` names the quantity with its unit, and ``made_of`` the input files.
+    """
 
     mesh: Mesh
     values: np.ndarray
@@ -177,7 +181,7 @@ class BakedSurface:
 
 
 def surface(files: Sequence[Path], options: BakedFigureOptions, reporter: Reporter) -> Drawing:
-    """The picture of the surface that `nerg bake` has written."""
+    """Draw a surface that `nerg bake` has written."""
     style = options.style()
     (path,) = files
     activate_variant(options.mode)
@@ -185,31 +189,32 @@ def surface(files: Sequence[Path], options: BakedFigureOptions, reporter: Report
     up = _unit(check_point(options.up, "--up"), np.array([0.0, 0, 1]), "--up")
     mesh, values = baked.mesh, baked.values
     if options.clip_above is not None:
-        kept = (mesh.vertices[mesh.faces] @ up).min(axis=1) < options.clip_above
-        if not kept.any():
-            raise NergError(f'nothing of "{path}" is below {options.clip_above:g}; give a larger --below')
-        mesh = Mesh(mesh.vertices, mesh.faces[kept])
-    value, shade, met = _seen(mesh, values, up, options)
-    if not met.any():
-        raise NergError(f'nothing of "{path}" is in the picture; give another --camera or --target')
-    grey = np.where(met, _BARE + _LIT * shade, _PAPER)
-    heat = Heat(options.vmax or robust_max(value, met), style.colormap or "inferno", decades=style.decades)
+        below = (mesh.vertices[mesh.faces] @ up).min(axis=1) < options.clip_above
+        if not below.any():
+            raise NergError(f'no triangle of "{path}" is below {options.clip_above:g}; give a larger --clip-above')
+        mesh = Mesh(mesh.vertices, mesh.faces[below])
+    value, shade, hit = _trace_mesh(mesh, values, up, options)
+    if not hit.any():
+        raise NergError(f'no part of "{path}" is in the image; give another --camera or --target')
+    grey = np.where(hit, _BARE + _LIT * shade, _PAPER)
+    heat = Heat(options.vmax or robust_max(value, hit), style.colormap or "inferno", decades=style.decades)
     title = options.title or baked.label.partition("[")[0].strip().capitalize()
-    note = f"made of {', '.join(baked.gaze_files)}" if baked.gaze_files else ""
+    note = f"data: {', '.join(baked.gaze_files)}" if baked.gaze_files else ""
     color = np.repeat(grey[..., None], 3, axis=2)
-    # Beside the surface there is nothing that could be known: it is paper, and not hatched.
-    return Drawing(gaze_figure(color, value, met, heat, title, baked.label, note=note), [path])
+    # Pixels without a surface are not unknown: they are white and not hatched.
+    return Drawing(gaze_figure(color, value, hit, heat, title, baked.label, note=note), [path])
 
 
 def read_baked(path: Path) -> BakedSurface:
-    """A mesh with values in a PLY file, as `nerg bake` writes it. Raises `NergError` for any other file."""
+    """Read a mesh with gaze from a PLY file of `nerg bake`. Raises `NergError` for any other file."""
     if path.suffix.lower() != ".ply":
-        raise NergError(f'"{path}" is no baked surface that is drawn; give the .ply that "nerg bake" writes')
+        raise NergError(f'"{path}" is not a baked mesh; give the .ply file that "nerg bake" writes')
     if not path.exists():
         raise MissingFile(f'there is no file "{path}"; correct its name')
     if is_splat_file(path):
         raise NergError(
-            f'"{path}" holds Gaussian splats, which show their gaze as they are: nerg scene {path} -o a.xml'
+            f'"{path}" holds Gaussian splats, which already have the colours of their gaze: view them with nerg '
+            f"scene {path} -o a.xml"
         )
     body = read_mesh_file(path)
     with translate_read_errors(path, "baked surface"):
@@ -217,20 +222,22 @@ def read_baked(path: Path) -> BakedSurface:
             head = file.read(_HEADER).partition(b"end_header")[0].decode("utf-8", "replace").splitlines()
         columns = parse_ply(np.fromfile(path, np.uint8)).tables["vertex"].columns
         if "value" not in columns:
-            raise NergError(f'the vertices of "{path}" have no property value; give a .ply that "nerg bake" wrote')
+            raise NergError(
+                f'the vertices of "{path}" have no property "value"; give a .ply file that "nerg bake" has written'
+            )
         values = columns["value"]().astype(np.float64)
         mesh = Mesh(body.vertices, body.faces)
-    said = {key: rest for key, _, rest in (line.removeprefix("comment ").partition(" ") for line in head)}
-    label = said.get("value:", "value")
+    comments = {key: rest for key, _, rest in (line.removeprefix("comment ").partition(" ") for line in head)}
+    label = comments.get("value:", "value")
     try:
-        inputs = json.loads(said.get("nerg_mi", "{}")).get("inputs", {})
+        inputs = json.loads(comments.get("nerg_mi", "{}")).get("inputs", {})
     except ValueError as error:
         raise NergError(f'the header of "{path}" is damaged ({error}); bake it again') from error
     return BakedSurface(mesh, values, label, tuple(inputs))
 
 
-def _seen(mesh: Mesh, values: np.ndarray, up: np.ndarray, options: BakedFigureOptions) -> tuple[np.ndarray, ...]:
-    """Value, shade and whether there is a surface (h, w) for each pixel's middle."""
+def _trace_mesh(mesh: Mesh, values: np.ndarray, up: np.ndarray, options: BakedFigureOptions) -> tuple[np.ndarray, ...]:
+    """Return value, shading and whether there is a surface (h, w), for the centre of each pixel."""
     import mitsuba as mi
 
     w, h = options.width, options.height
@@ -239,26 +246,26 @@ def _seen(mesh: Mesh, values: np.ndarray, up: np.ndarray, options: BakedFigureOp
     x, y = np.meshgrid((np.arange(w) + 0.5) / w * 2 - 1, (1 - (np.arange(h) + 0.5) / h * 2) * h / w)
     d = (ahead + half * (x[..., None] * across + y[..., None] * rise)).reshape(-1, 3)
     d /= np.linalg.norm(d, axis=1, keepdims=True)
-    ours = mitsuba_mesh(mesh.vertices, mesh.faces, "surface")
-    scene: mi.Scene = mi.load_dict({"type": "scene", "surface": ours})
+    mesh_shape = mitsuba_mesh(mesh.vertices, mesh.faces, "surface")
+    scene: mi.Scene = mi.load_dict({"type": "scene", "surface": mesh_shape})
     ray = mi.Ray3f(mi.Point3f(*eye.tolist()), to_vector(mi.Vector3f, d))
-    found = scene.ray_intersect_preliminary(ray)
-    met = np.array(found.is_valid(), bool)
-    face = mesh.faces[np.where(met, np.array(found.prim_index, np.int64), 0)]
-    # Of rays that met nothing they hold anything.
-    u, v = np.where(met, np.array(found.prim_uv), 0).astype(np.float64)
+    intersection = scene.ray_intersect_preliminary(ray)
+    hit = np.array(intersection.is_valid(), bool)
+    face = mesh.faces[np.where(hit, np.array(intersection.prim_index, np.int64), 0)]
+    # Undefined for rays without a hit.
+    u, v = np.where(hit, np.array(intersection.prim_uv), 0).astype(np.float64)
     weights = np.stack([1 - u - v, u, v], axis=1)
     a, b, c = (mesh.vertices[face[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
-    # Both sides are lit, from above more than from the camera, so that floors and walls differ.
+    # Two-sided lighting, more from above than from the camera, so that floors and walls differ.
     shade = 0.6 * np.abs((normal * d).sum(axis=1)) + 0.4 * np.abs(normal @ up)
-    value = np.where(met, (weights * values[face]).sum(axis=1), 0.0)
-    return value.reshape(h, w), shade.reshape(h, w), met.reshape(h, w)
+    value = np.where(hit, (weights * values[face]).sum(axis=1), 0.0)
+    return value.reshape(h, w), shade.reshape(h, w), hit.reshape(h, w)
 
 
 def _camera(mesh: Mesh, up: np.ndarray, options: BakedFigureOptions) -> tuple[np.ndarray, ...]:
-    """Where the camera is, and its axes: to the right, up and ahead. Raises `NergError` for one that sees nothing."""
+    """Return position and axes (right, up, forward) of the camera. Raises `NergError` for a degenerate camera."""
     corners = mesh.vertices[np.unique(mesh.faces)]
     lower, upper = corners.min(axis=0), corners.max(axis=0)
     target = check_point(options.target, "--target")
@@ -267,9 +274,9 @@ def _camera(mesh: Mesh, up: np.ndarray, options: BakedFigureOptions) -> tuple[np
     if eye is None:
         side = np.cross(up, [1.0, 0, 0] if abs(up[0]) < 0.9 else [0, 1.0, 0])
         back = np.cross(side, up)
-        way = 0.9 * up - 0.8 * side / np.linalg.norm(side) + 0.4 * back / np.linalg.norm(back)
-        eye = target + way
-    ahead = _unit(target - eye, None, "--target, which has to be elsewhere than --camera,")
+        offset = 0.9 * up - 0.8 * side / np.linalg.norm(side) + 0.4 * back / np.linalg.norm(back)
+        eye = target + offset
+    ahead = _unit(target - eye, None, "--target, which must differ from --camera,")
     across = np.cross(ahead, up)
     if np.linalg.norm(across) < 1e-6:
         across = np.cross(ahead, np.roll(up, 1))
@@ -298,9 +305,9 @@ FileName = str | os.PathLike
 
 
 def find_kind(name: str) -> FigureKind:
-    """The kind ``name``. Raises `NergError` for one that is not known."""
+    """Return the kind of figure ``name``. Raises `NergError` for an unknown one."""
     if name not in KINDS:
-        raise NergError(f'there is no figure "{name}"; there are {", ".join(KINDS)}')
+        raise NergError(f'there is no figure "{name}"; choose one of {", ".join(KINDS)}')
     return KINDS[name]
 
 
@@ -311,12 +318,28 @@ def draw(
     reporter: Reporter = SILENT,
     **options: Any,
 ) -> Figure:
-    """The figure of matplotlib that the command ``nerg draw KIND FILES`` draws, with its options as keywords, in the
-    Mitsuba variant that is set.
+    """Draw the figure of ``nerg draw KIND FILES`` as a matplotlib figure, in the active Mitsuba variant.
 
-    ``output``: where it is written, too (.png or .svg). Raises `NergError` for another kind or option, and for files
-    that it cannot be drawn of.
+    Parameters
+    ----------
+    kind
+        Kind of the figure, such as "sphere".
+    files
+        Input file or files.
+    output
+        File to write (.png or .svg), or None.
+    reporter
+        Receives messages and progress.
+    options
+        Options of the command as keywords.
 
+    Raises
+    ------
+    NergError
+        For an unknown kind or option, and for unsuitable files.
+
+    Examples
+    --------
     >>> import nerg_mi as nerg
     >>> from importlib.resources import files
     >>> figure = nerg.draw("sphere", files("nerg_mi.scenes.store") / "scene.xml", width=64, spp=1)
@@ -325,56 +348,58 @@ def draw(
     """
     import mitsuba as mi
 
-    chosen = find_kind(kind)
-    types = {f.name: str(f.type) for f in fields(chosen.options)}
+    figure_kind = find_kind(kind)
+    options = current_keywords(figure_kind.options, options)
+    types = {f.name: str(f.type) for f in fields(figure_kind.options)}
     if "mode" in types and mi.variant() is not None:
         options.setdefault("mode", mi.variant())
     unknown = next((name for name in options if name not in types), None)
     if unknown is not None:
-        raise NergError(f'a figure "{kind}" has no option "{unknown}"; it has {", ".join(types)}')
+        raise NergError(f'the figure "{kind}" has no option "{unknown}"; it has {", ".join(types)}')
     options = {k: Path(v) if isinstance(v, str) and "Path" in types[k] else v for k, v in options.items()}
     several = [files] if isinstance(files, (str, os.PathLike)) else files
     return draw_kind(
-        chosen,
+        figure_kind,
         [Path(f) for f in several],
         None if output is None else Path(output),
-        chosen.options(**options),
+        figure_kind.options(**options),
         reporter,
     )
 
 
 def draw_files(files: Path | list[Path], output: Path, options: Any, reporter: Reporter) -> None:
-    """The figure of the kind whose ``options`` these are, written to ``output``."""
+    """Draw the figure whose kind has these ``options``, and write it to ``output``."""
     kind = next(kind for kind in KINDS.values() if kind.options is type(options))
     draw_kind(kind, files if isinstance(files, list) else [files], output, options, reporter)
 
 
-def draw_kind(kind: FigureKind, files: Sequence[Path], output: Path | None, options: Any, reporter: Reporter = SILENT) -> Any:
-    """The figure of ``kind`` of ``files``, with an object of its ``options``; written to ``output``, with its
-    provenance, where that is given."""
+def draw_kind(
+    kind: FigureKind, files: Sequence[Path], output: Path | None, options: Any, reporter: Reporter = SILENT
+) -> Any:
+    """Draw a figure of ``kind``; write it with its provenance to ``output`` if that is given."""
     if output is not None:
         check_writable(output, *FORMATS)
     if not 1 <= len(files) <= kind.max_files:
-        raise NergError(f'a figure "{kind.name}" is drawn of 1 to {kind.max_files} files, and {len(files)} were given')
+        raise NergError(f'the figure "{kind.name}" takes 1 to {kind.max_files} files, got {len(files)}')
     for path in files:
         if not path.exists():
             raise MissingFile(f'there is no file "{path}"')
-    made = import_function(kind.function)(files, options, reporter)
+    drawing = import_function(kind.function)(files, options, reporter)
     if output is not None:
-        about = make_provenance(f"nerg draw {kind.name}", _inputs(made.inputs, options), made.seed, options)
-        save(made.figure, output, about)
-        reporter.message(f"Wrote {output} ({' x '.join(f'{v:.0f}' for v in made.figure.bbox.size)}).")
-    return made.figure
+        record = make_provenance(f"nerg draw {kind.name}", _inputs(drawing.inputs, options), drawing.seed, options)
+        save(drawing.figure, output, record)
+        reporter.message(f"Wrote {output} ({' x '.join(f'{v:.0f}' for v in drawing.figure.bbox.size)}).")
+    return drawing.figure
 
 
 def _inputs(paths: Sequence[Path], options: Any) -> list[Path]:
-    """The files that were read: of a scene those that it names, too."""
+    """Return the input files, including those that a scene refers to."""
     from nerg_mi.rendering.scene import list_scene_files
 
-    found: list[Path] = []
+    inputs: list[Path] = []
     for path in paths:
         if path.suffix.lower() == ".xml":
-            found += list_scene_files(path, getattr(options, "defaults", None))
+            inputs += list_scene_files(path, getattr(options, "defaults", None))
         else:
-            found.append(path)
-    return found
+            inputs.append(path)
+    return inputs

@@ -1,4 +1,4 @@
-"""Fields as other files: meshes, points, splats, volumes and checkpoints of other programs; and fields from these."""
+"""Export of fields to meshes, points, splats, volumes and checkpoints of other programs, and import of these."""
 
 from __future__ import annotations
 
@@ -13,10 +13,25 @@ from nerg_mi.fields.occupancy import RefinedGrid, refine_occupancy
 from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.files.atomic import check_writable, file_sha256
 from nerg_mi.formats.checkpoint import read_checkpoint, write_checkpoint
-from nerg_mi.formats.fields import load_radiance, encode_occupancy, save_gaze, save_radiance
+from nerg_mi.formats.fields import encode_occupancy, load_radiance, save_gaze, save_radiance
 from nerg_mi.formats.splats import make_splats, write_ply_splats
-from nerg_mi.formats.surfaces import Surface, sample_density_and_color, extract_mesh, extract_points, write_glb, write_ply, write_volume
-from nerg_mi.formats.torch_ngp import ImportOptions, is_nerg_checkpoint, open_checkpoint, read_nerg, read_torch_ngp, write_torch_ngp
+from nerg_mi.formats.surfaces import (
+    Surface,
+    extract_mesh,
+    extract_points,
+    sample_density_and_color,
+    write_glb,
+    write_ply,
+    write_volume,
+)
+from nerg_mi.formats.torch_ngp import (
+    ImportOptions,
+    is_nerg_checkpoint,
+    open_checkpoint,
+    read_nerg,
+    read_torch_ngp,
+    write_torch_ngp,
+)
 
 from .base import SILENT, Reporter, argument, out, select_backend
 from .radiance_commands import (
@@ -29,13 +44,16 @@ from .radiance_commands import (
     VolumeOptions,
 )
 
-# ---- Fields that other programs have trained, as fields of our own ----
+# ---- Import of fields of other programs ----
 
 
 @dataclass(frozen=True)
 class ImportedFields:
-    """``field`` and ``gaze``, each None where the checkpoint holds none; ``origin``: where they are from (JSON);
-    ``files`` written."""
+    """Imported fields.
+
+    ``field`` and ``gaze`` are None if the checkpoint has none; ``origin`` is their provenance (JSON); ``files`` were
+    written.
+    """
 
     field: RadianceField | None
     gaze: AnyGazeField | None
@@ -50,53 +68,53 @@ def import_checkpoint(
     options: CheckpointImportOptions | None = None,
     reporter: Reporter = SILENT,
 ) -> ImportedFields:
-    """Read a checkpoint (.pth) of torch-ngp, or of the NeRG paper's authors; nothing in the file is run.
+    """Read a checkpoint (.pth) of torch-ngp, or of the NeRG paper's authors, without executing code in it.
 
-    ``output``, ``gaze``: files for the radiance and the gaze field (.safetensors), None: not written. Raises
-    `NergError` where the file does not hold what is to be written, and for what the user can mend.
+    ``output`` and ``gaze`` are files for the radiance and the gaze field (.safetensors); None writes none. Raises
+    `NergError` if the checkpoint lacks a field that is to be written, and for errors that the user can correct.
     """
     options = options or CheckpointImportOptions()
     output, gaze = (None if path is None else Path(path) for path in (output, gaze))
     for path in (output, gaze):
         if path is not None:
             check_writable(path, ".safetensors")
-    given = ImportOptions(options.color_space, options.finest_resolution, options.bg_radius)
+    settings = ImportOptions(options.color_space, options.finest_resolution, options.bg_radius)
     reporter.progress(0.0, f"converting {Path(file).name}")
     ns = select_backend(options.mode)
     if is_nerg_checkpoint(open_checkpoint(file)[1]):
-        field, attention, origin = read_nerg(file, ns, options.ema, given)
+        field, attention, origin = read_nerg(file, ns, options.ema, settings)
     else:
         if gaze is not None:
-            raise NergError(f'"{file}" holds no gaze field: leave out --gaze')
-        (field, origin), attention = read_torch_ngp(file, ns, options.ema, given), None
+            raise NergError(f'"{file}" contains no gaze field: leave out --gaze')
+        (field, origin), attention = read_torch_ngp(file, ns, options.ema, settings), None
     if field is not None:
         field.occupancy = refine_occupancy(field) or field.occupancy
     if output is not None:
         if field is None:
-            raise NergError(f'"{file}" holds a gaze field without its NeRF: import that from its own file')
+            raise NergError(f'"{file}" contains a gaze field without its NeRF: import the NeRF from its own file')
         save_radiance(field, output, origin, options.half)
-        reporter.message(_about(field, origin))
-        _tell(output, reporter)
+        reporter.message(_describe_field(field, origin))
+        _report_written(output, reporter)
     if attention is not None and gaze is not None:
         save_gaze(attention, gaze, origin, options.half)
         config = attention.config
         reporter.message(f"gaze: {config.variant}, trunk {config.trunk}, bound {attention.box.side / 2:g}")
-        _tell(gaze, reporter)
+        _report_written(gaze, reporter)
     elif attention is not None:
-        reporter.message(f'"{file}" also holds a gaze field: --gaze NAME.safetensors writes it')
+        reporter.message(f'"{file}" also contains a gaze field: write it with --gaze NAME.safetensors')
     return ImportedFields(field, attention, origin, [path for path in (output, gaze) if path is not None])
 
 
 def import_to_files(
     file: Path, output: Path | None, gaze: Path | None, options: CheckpointImportOptions, reporter: Reporter
 ) -> None:
-    """`import_checkpoint` to one file at least."""
+    """Call `import_checkpoint` with at least one output file."""
     if output is None and gaze is None:
-        raise NergError("nothing is asked for: give -o FIELD.safetensors, --gaze GAZE.safetensors, or both")
+        raise NergError("no output is given: add -o FIELD.safetensors, --gaze GAZE.safetensors, or both")
     import_checkpoint(file, output, gaze, options, reporter)
 
 
-def _about(field: RadianceField, origin: dict) -> str:
+def _describe_field(field: RadianceField, origin: dict) -> str:
     cells = "no occupancy grid (marching evaluates all of space)"
     if field.occupancy is not None:
         cells = f"{100 * field.occupancy.occupied_fraction:.1f} % of its box occupied"
@@ -104,14 +122,14 @@ def _about(field: RadianceField, origin: dict) -> str:
     return f"radiance: bound {field.box.side / 2:g}, {origin['weights']} weights, {cells}{behind}"
 
 
-def _tell(path: Path, reporter: Reporter) -> None:
+def _report_written(path: Path, reporter: Reporter) -> None:
     reporter.message(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB)")
 
 
 # ---- Export ----
 #
-# Radiance fields for other tools, in the field's own units: meshes, points, Gaussian splats, grid volumes, torch-ngp
-# checkpoints.
+# Radiance fields in the formats of other tools, in the units of the field: meshes, points, Gaussian splats, grid
+# volumes, torch-ngp checkpoints.
 
 
 _FIELD, _FILE = argument("Radiance field (.safetensors)."), out("File to write.")
@@ -119,7 +137,7 @@ _FIELD, _FILE = argument("Radiance field (.safetensors)."), out("File to write."
 
 @dataclass(frozen=True)
 class Export:
-    """``files`` written; ``surface``: what a mesh or a cloud of points holds, None for other kinds."""
+    """Written ``files``; ``surface`` is the exported mesh or point cloud, None for other formats."""
 
     files: list[Path]
     surface: Surface | None = None
@@ -133,32 +151,33 @@ def export_mesh(
 ) -> Export:
     """Write a mesh by marching cubes, with vertex colours: .ply or .glb. Needs scikit-image.
 
-    Raises `NergError` for what the user can mend.
+    Raises `NergError` for errors that the user can correct.
     """
     options, output, start = options or MeshOptions(), Path(output), time.perf_counter()
     write = _surface_writer(output, options.up)
-    found = extract_mesh(
+    surface = extract_mesh(
         _load(field, options.mode, reporter),
         options.resolution,
-        options.density,
+        options.density_threshold,
         options.fill_holes,
         options.min_component_area,
         options.keep_unseen,
     )
-    write(found, output)
-    r = found.report
+    write(surface, output)
+    r = surface.report
     reporter.message(
         f"surface at a density of {r['threshold']:.4g} / unit, cells of {r['cell']:.4g} units ({_by(r['lattice'])})"
     )
     reporter.message(
-        f"{r['cells_filled']:,} cells of holes filled; dropped {r['unseen_faces']:,} faces that training never looked "
-        f"at, and {r['floater_faces']:,} of {r['pieces'] - r['pieces_kept']:,} floaters; {r['pieces_kept']} pieces kept"
+        f"{r['cells_filled']:,} cells of holes filled; removed {r['unseen_faces']:,} faces that no training view "
+        f"saw, and {r['floater_faces']:,} faces in {r['pieces'] - r['pieces_kept']:,} small components; "
+        f"{r['pieces_kept']} components kept"
     )
     reporter.message(
-        f"{len(found.vertices):,} vertices, {found.face_count:,} faces; open edges: {r['edges_at_the_box']:,} where "
-        f"the box cuts, {r['edges_of_holes']:,} around holes"
+        f"{len(surface.vertices):,} vertices, {surface.face_count:,} faces; open edges: {r['edges_at_the_box']:,} at "
+        f"the bounding box, {r['edges_of_holes']:,} around holes"
     )
-    return _written([output], start, reporter, found)
+    return _written([output], start, reporter, surface)
 
 
 def export_points(
@@ -167,14 +186,18 @@ def export_points(
     options: PointOptions | None = None,
     reporter: Reporter = SILENT,
 ) -> Export:
-    """Write a cloud of surface points with normals and colours: .ply or .glb. Raises `NergError` for what the user can
-    mend."""
+    """Write surface points with normals and colours: .ply or .glb.
+
+    Raises `NergError` for errors that the user can correct.
+    """
     options, output, start = options or PointOptions(), Path(output), time.perf_counter()
     write = _surface_writer(output, options.up)
-    found = extract_points(_load(field, options.mode, reporter), options.resolution, options.density, options.max_points)
-    write(found, output)
-    reporter.message(f"{len(found.vertices):,} points, at a density of {found.report['threshold']:.4g} / unit")
-    return _written([output], start, reporter, found)
+    surface = extract_points(
+        _load(field, options.mode, reporter), options.resolution, options.density_threshold, options.max_points
+    )
+    write(surface, output)
+    reporter.message(f"{len(surface.vertices):,} points at a density of {surface.report['threshold']:.4g} / unit")
+    return _written([output], start, reporter, surface)
 
 
 def export_splats(
@@ -183,14 +206,14 @@ def export_splats(
     options: SplatOptions | None = None,
     reporter: Reporter = SILENT,
 ) -> Export:
-    """Write Gaussian splats on the field's surface: .ply. Raises `NergError` for what the user can mend."""
+    """Write Gaussian splats on the surface: .ply. Raises `NergError` for errors that the user can correct."""
     options, output, start = options or SplatOptions(), Path(output), time.perf_counter()
     check_writable(output, ".ply")
-    splats, done = make_splats(_load(field, options.mode, reporter), options.resolution, options.density)
+    splats, done = make_splats(_load(field, options.mode, reporter), options.resolution, options.density_threshold)
     write_ply_splats(output, splats, comments=("Gaussian splats of a radiance field, by nerg_mi",))
     reporter.message(
-        f"{len(splats):,} Gaussians, cells of {done['cell']:.4g} units; moved by {done['moved']:.2g} units (median) to "
-        "the depth that rays find"
+        f"{len(splats):,} Gaussians, cells of {done['cell']:.4g} units; moved by {done['moved']:.2g} units "
+        "(median) to the rendered depth"
     )
     return _written([output], start, reporter)
 
@@ -201,7 +224,8 @@ def export_volume(
     options: VolumeOptions | None = None,
     reporter: Reporter = SILENT,
 ) -> Export:
-    """Write density, and colour, as Mitsuba grid volumes (.vol). Raises `NergError` for what the user can mend."""
+    """Write density and colour as Mitsuba grid volumes (.vol). Raises `NergError` for errors that the user can correct.
+    Write density and colour as Mitsuba grid volumes (.vol). Raises `NergError` for errors that the user can correct."""
     options, output, start = options or VolumeOptions(), Path(output), time.perf_counter()
     files = [output] if options.color is None else [Path(options.color), output]
     for path in reversed(files):
@@ -229,8 +253,7 @@ def export_torch_ngp(
     options: TorchNgpOptions | None = None,
     reporter: Reporter = SILENT,
 ) -> Export:
-    """Write a torch-ngp checkpoint (.pth), of a field whose grid and networks have torch-ngp's shapes; raises
-    `NergError` for another."""
+    """Write a torch-ngp checkpoint (.pth). Raises `NergError` if the grid or networks do not fit its layout."""
     options, output, start = options or TorchNgpOptions(), Path(output), time.perf_counter()
     check_writable(output, ".pth")
     write_torch_ngp(_load(field, options.mode, reporter), output)
@@ -241,15 +264,15 @@ def _load(field: str | Path | RadianceField, mode: str, reporter: Reporter) -> R
     reporter.progress(0.0, "reading the field")
     ns = select_backend(mode)
     loaded = field if isinstance(field, RadianceField) else load_radiance(field, ns)[0]
-    reporter.progress(0.01, "looking through its volume")
+    reporter.progress(0.01, "sampling the field")
     if loaded.box.is_contracted:
-        reporter.message("the place has no end: written is the box that it resolves best, not what is around it")
+        reporter.message("the scene is unbounded: only the box that the field resolves best is exported")
     return loaded
 
 
 def _surface_writer(output: Path, up: str) -> Callable[[Surface, Path], None]:
     if up not in ("y", "z"):
-        raise NergError(f'--up must be z or y, not "{up}"')
+        raise NergError(f'--up must be z or y, got "{up}"')
     check_writable(output, ".ply", ".glb")
     if output.suffix.lower() == ".ply":
         return write_ply
@@ -271,13 +294,12 @@ def _corner(values) -> str:
     return "(" + ", ".join(f"{v:.4g}" for v in values) + ")"
 
 
-# ---- A finer bound on where a trained field holds matter, for checkpoints that were written without one ----
+# ---- A finer occupancy grid, for checkpoints without one ----
 
 
 @dataclass(frozen=True)
 class Refinement:
-    """``occupancy``: the finer bound; ``before``: share of the box's cells that the bound had before; ``output``: the
-    file."""
+    """The finer ``occupancy`` grid, the occupied fraction ``before``, and the written file."""
 
     occupancy: RefinedGrid
     before: float
@@ -287,29 +309,33 @@ class Refinement:
 def refine_checkpoint(
     field: str | Path, output: str | Path, options: RefineOptions | None = None, reporter: Reporter = SILENT
 ) -> Refinement:
-    """Write the radiance field in ``field`` to ``output`` with a finer bound, and everything else as it is.
+    """Write the radiance field in ``field`` to ``output`` with a finer occupancy grid, otherwise unchanged.
 
-    The new file names the checksum of the old one, so that gaze fields that were trained in that one know it. Raises
-    `NergError` for what the user can mend.
+    The new file stores the checksum of the old one, so that gaze fields that were trained in it accept the new file.
+    Raises `NergError` for errors that the user can correct.
     """
     options, field, output, start = options or RefineOptions(), Path(field), Path(output), time.perf_counter()
     check_writable(output, ".safetensors")
     ns = select_backend(options.mode)
     loaded, _ = load_radiance(field, ns)
     if loaded.occupancy is None:
-        raise NergError(f'"{field}" has no occupancy grid to refine: its field is marched through all of its box')
+        raise NergError(f'"{field}" has no occupancy grid to refine: rays are marched through its whole box')
     reporter.progress(0.0, f"refining {field.name}")
     before, grid = loaded.occupancy.coarse.occupied_fraction, refine_occupancy(loaded)
     if grid is None:
-        raise NergError(f'the occupancy of "{field}" is nested cubes, which are not refined: use the field as it is')
+        raise NergError(
+            f'the occupancy grid of "{field}" consists of nested cubes, which cannot be refined: use the field as it is'
+        )
     tensors, meta = read_checkpoint(field, "radiance")
-    arrays, about = encode_occupancy(grid)
+    arrays, grid_metadata = encode_occupancy(grid)
     origin = meta.get("refined_from") or file_sha256(field)
-    kept = {key: value for key, value in meta.items() if key not in ("format", "kind")}
-    write_checkpoint(output, "radiance", tensors | arrays, kept | {"occupancy": about, "refined_from": origin})
+    metadata = {key: value for key, value in meta.items() if key not in ("format", "kind")}
+    write_checkpoint(
+        output, "radiance", tensors | arrays, metadata | {"occupancy": grid_metadata, "refined_from": origin}
+    )
     reporter.message(
-        f"matter in {100 * grid.occupied_fraction:.2f} % of the box, where it was {100 * before:.2f} %; a random line misses an "
-        f"optical depth of {grid.missed_optical_depth:.1e}"
+        f"occupied: {100 * grid.occupied_fraction:.2f} % of the box, before {100 * before:.2f} %; a random line "
+        f"misses an optical depth of {grid.missed_optical_depth:.1e}"
     )
     seconds = time.perf_counter() - start
     reporter.message(f"wrote {output} ({output.stat().st_size / 1e6:.1f} MB) in {seconds:.1f} s")

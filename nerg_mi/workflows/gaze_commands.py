@@ -1,12 +1,10 @@
-"""``nerg train gaze``: Train a gaze field on rays of attention, and report its scores at positions that were held out.
-``nerg train prior``: Make a gaze field for a place where nobody was tracked: how high people looked in other places.
-``nerg eval gaze``: Scores beside uniform, position-blind, nearest probes, nearest rays and the other half of the
-people.
-``nerg eval folds``: Train and score a gaze field again and again, each time without other people and zones, and tell
-the means.
-``nerg ablate``: Train every variant of a gaze field alike, and compare them.
+"""``nerg train gaze``: Train a gaze field on gaze rays and score it at held-out positions.
+``nerg train prior``: Fit an elevation prior on recordings in other scenes, for a scene without tracking.
+``nerg eval gaze``: Score a gaze field on held-out data and compare it with baselines.
+``nerg eval folds``: Cross-validate a gaze field: train and score it several times on different splits.
+``nerg ablate``: Train the variants of a gaze field under equal conditions and compare them.
 
-What these commands take; their workflows run in `.train_gaze`, `.evaluate` and `.ablation`.
+Options of these commands. The workflows are in `.train_gaze`, `.evaluate` and `.ablation`.
 """
 
 from __future__ import annotations
@@ -16,8 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from nerg_mi.ranges import (
-    DIRECTIONS,
     BASE_SEEDS,
+    DIRECTIONS,
     KAPPAS,
     LENGTHS,
     RAYS,
@@ -25,78 +23,154 @@ from nerg_mi.ranges import (
     SEEDS,
     STEPS,
     TEST_FRACTIONS,
-    ValidatedDataclass,
     Range,
+    ValidatedDataclass,
 )
 from nerg_mi.train.gaze_settings import GazeSettings, ProbeSettings
 
 from .base import argument, declare, out
-from .options import DerivedOptions, PartOptions, GeometryOptions, cpu_threads, expose_settings, llvm_variant, option, repeat_options
+from .options import (
+    INPUT,
+    MODEL,
+    OUTPUT,
+    PERFORMANCE,
+    TEST,
+    TRAINING,
+    DerivedOptions,
+    GeometryOptions,
+    PartOptions,
+    cpu_threads,
+    expose_settings,
+    llvm_variant,
+    option,
+    random_seed,
+    repeat_options,
+)
+
+_BY_RECIPE = "[default: set by the recipe]"
 
 # ---- Training ----
 
 
 @dataclass(frozen=True, kw_only=True)
-@expose_settings(ProbeSettings, GazeSettings, default="Default: the recipe's.")
+@expose_settings(ProbeSettings, GazeSettings, default=_BY_RECIPE)
 class GazeOptions(DerivedOptions, GeometryOptions):
-    """How a gaze field is trained; what is None is the recipe's. Lengths are metres, in the rays' frame."""
+    """Options of ``nerg train gaze``; None is the recipe's value. Lengths are in metres, in the frame of the rays."""
 
     if TYPE_CHECKING:
-        # A dataclass's own would have the options below alone.
+        # The generated one would have the options below alone.
         def __init__(self, **options: Any) -> None: ...
 
-    views: Path | None = option(None, "Posed photos (folder or transforms file) with salience.")
-    salience: str | None = option(
-        None, "Folder of them, called as the photos are (.png, .exr, .npy), or spectral-residual."
+    views: Path | None = option(
+        None,
+        "Posed photos (folder or transforms file) that --salience has saliency maps for. With them, the rays may "
+        "be left out.",
+        group=INPUT,
     )
-    salience_unit: str = option("pixel", "What they count gaze per: pixel or steradian.")
-    align_views: Path | None = option(None, "JSON file with the 4x4 similarity from the photos' frame to the place's.")
+    salience: str | None = option(
+        None,
+        "Folder of saliency maps, one for each photo of --views and with its name (.png, .exr, .npy); or "
+        "spectral-residual to compute them.",
+        group=INPUT,
+    )
+    salience_unit: str = option("pixel", "What the saliency maps are densities over: pixel or steradian.", group=INPUT)
+    align_views: Path | None = option(
+        None,
+        "JSON file with the 4x4 similarity from the frame of the photos of --views to that of the scene.  "
+        "[default: identity]",
+        group=INPUT,
+    )
     allow_outside: bool = option(
-        False, "Read files outside of --views' folder and that of --salience too, where they name them."
+        False, "Also read files outside the folders of --views and --salience if these refer to them.", group=INPUT
     )
     recipe: str = option(
-        "default", "Word of docs/how-to/training.md; default generalises best. Sets what is not set below."
+        "default",
+        "Training recipe: default (log-density with a prior; generalises best), small (emit and capture networks of "
+        "small size) or paper (networks and losses of the NeRG paper). Options given explicitly override it.",
+        group=MODEL,
     )
     voxel_size: float | None = option(
         None,
-        "Edge of the voxels of --geometry hits in metres.  [default: 0.08, more in very large places]",
+        "Edge length of the voxels of --geometry hits in metres.  [default: 0.08, more in very large scenes]",
         within=LENGTHS,
+        group=INPUT,
     )
     align: Path | None = option(
-        None, "How the rays lie in the place: what nerg align writes, or JSON with the 4x4 similarity. Default: alike."
+        None,
+        "JSON file with the 4x4 similarity from the frame of the rays to that of the scene, as nerg align writes it.  "
+        "[default: identity]",
+        group=INPUT,
     )
-    force: bool = option(False, "Train even where no gaze meets a surface of the place.")
+    force: bool = option(
+        False, "Train even if no gaze ray hits a surface of the scene, a sign of a wrong alignment.", group=INPUT
+    )
     max_samples: int = option(
-        10_000_000, "Rays of a dataset at most; of more, a sample by --seed in which each is as likely.", within=RAYS
+        10_000_000,
+        "Maximum number of samples read from a dataset; larger datasets are subsampled uniformly with --seed.",
+        within=RAYS,
+        group=INPUT,
     )
     variant: str | None = option(
-        None, "emit, capture or emit_capture. Default: emit_capture; without any geometry folds choose it or capture."
+        None,
+        "Factors of the gaze field: emit, capture or emit_capture.  [default: emit_capture; without geometry, "
+        "cross-validation chooses emit_capture or capture]",
+        group=MODEL,
     )
-    activation: str | None = option(None, "Of the emit head of small and paper: softplus, exp or linear.")
-    size: str | None = option(None, "Of the field of small and paper: small or paper.")
-    normalize: bool = option(False, "Divide the field of small and paper by its integral over the sphere.")
+    activation: str | None = option(
+        None,
+        f"Output activation of the emit network (recipes small and paper): softplus, exp or linear.  {_BY_RECIPE}",
+        group=MODEL,
+    )
+    size: str | None = option(
+        None, f"Size of the networks (recipes small and paper): small or paper.  {_BY_RECIPE}", group=MODEL
+    )
+    normalize: bool = option(
+        False, "Divide the density by its integral over the sphere (recipes small and paper).", group=MODEL
+    )
     semantic: str = option(
-        "", "Give emit the features of --field: accumulated along the ray, or snapshot at the surface."
+        "",
+        "Give the features of the radiance field of --field to the emit network: accumulated along the ray, or "
+        "snapshot at the surface.  [default: no features]",
+        group=MODEL,
     )
-    semantic_concat: bool = option(False, "Besides the gaze field's own, not in their place.")
-    init: str = option("random", "Weights of the trunk to begin with: random, or those of the radiance field (field).")
+    semantic_concat: bool = option(
+        False,
+        "Concatenate the features of --semantic with the gaze field's own, in place of replacing them.",
+        group=MODEL,
+    )
+    init: str = option(
+        "random",
+        "Initial weights of the trunk: random, or field for those of the radiance field of --field.",
+        group=TRAINING,
+    )
     test_zones: int = option(
-        0, "Zones of test positions that are left out of everything; 0: none.", within=Range(0, 1000)
+        0,
+        "Number of zones whose positions are held out for testing; 0 holds out none.",
+        within=Range(0, 1000),
+        group=TEST,
     )
-    test_positions: int = option(64, "Test positions in them.", within=Range(1, 10**5))
-    test_participants: float = option(0.0, "Share of the people who are left out of everything besides.", within=TEST_FRACTIONS)
+    test_positions: int = option(64, "Number of test positions in these zones.", within=Range(1, 10**5), group=TEST)
+    test_participants: float = option(
+        0.0, "Fraction of the participants that are also held out for testing.", within=TEST_FRACTIONS, group=TEST
+    )
     ensemble: int = option(
         0,
-        "Train so many fields on resamples of the people and the images; the mean is the gaze, their spread its "
-        "uncertainty. 0: one field.",
+        "Number of ensemble members, each trained on a bootstrap resample of the participants and images; their "
+        "mean is the gaze, their spread its uncertainty. 0 trains a single field.",
         within=Range(0, 1000),
+        group=MODEL,
     )
-    resume: bool = option(False, "Go on with the interrupted run of this output.")
+    resume: bool = option(False, "Resume the interrupted training of this output file.", group=TRAINING)
     save_every: float = option(
-        60.0, "Seconds between two states for --resume; 0: only one, when it ends early.", within=SECONDS
+        60.0,
+        "Interval in seconds between two saved states for --resume; 0 saves only when training is interrupted.",
+        within=SECONDS,
+        group=TRAINING,
     )
-    seed: int = option(0, "Seed of probes, directions, weights, batches and splits.", within=SEEDS)
-    half: bool = option(False, "Store the weights in fp16.")
+    seed: int = option(
+        0, "Seed of probes, directions, initial weights, batches and splits.", within=SEEDS, group=TRAINING
+    )
+    half: bool = option(False, "Store the weights in half precision (fp16).", group=OUTPUT)
     threads: int | None = cpu_threads()
     mode: str = llvm_variant()
 
@@ -106,28 +180,36 @@ declare(
     "nerg_mi.workflows.train_gaze:train_gaze",
     options=GazeOptions,
     rays=argument(
-        "Rays file (.npz or .parquet) or dataset, as nerg rays import writes it. None: --views alone.", required=False
+        "Rays file (.npz or .parquet) or dataset (.rays), as nerg rays import writes it. Not needed with --views.",
+        required=False,
     ),
-    output=out("Checkpoint to write (.safetensors)."),
+    output=out("Gaze field to write (.safetensors)."),
 )
 
 
 @dataclass(frozen=True, kw_only=True)
 class PriorOptions(ValidatedDataclass):
-    """Which rays are read, and where the field is made."""
+    """Options of ``nerg train prior``."""
 
-    max_samples: int = option(10_000_000, "Rays of a dataset at most; of more, a sample by --seed.", within=RAYS)
-    seed: int = option(0, "Seed of that sample.", "-s", "--seed", within=SEEDS)
+    max_samples: int = option(
+        10_000_000,
+        "Maximum number of samples read from a dataset; larger datasets are subsampled uniformly with --seed.",
+        within=RAYS,
+        group=INPUT,
+    )
+    seed: int = option(0, "Seed of the subsampling.", "-s", "--seed", within=SEEDS, group=INPUT)
     mode: str = llvm_variant()
 
 
 declare(
     "train prior",
     "nerg_mi.workflows.train_gaze:learn_prior",
-    more="It stands in any place whose z axis points up. What it is worth: docs/explanation/accuracy.md.",
+    more="The prior is the distribution of gaze elevation over participants, the same at every position. It is "
+    "valid in any scene whose z axis points up. docs/explanation/accuracy.md compares it with fields trained on "
+    "tracking.",
     options=PriorOptions,
-    rays=argument("Rays files (.npz or .parquet) or datasets, one a place.", list[Path]),
-    output=out("Checkpoint to write (.safetensors)."),
+    rays=argument("Rays files (.npz or .parquet) or datasets (.rays), one for each scene.", list[Path]),
+    output=out("Gaze field to write (.safetensors)."),
 )
 
 
@@ -136,99 +218,179 @@ declare(
 
 @dataclass(frozen=True, kw_only=True)
 class GazeEvaluationOptions(ValidatedDataclass):
-    """What a gaze field is scored on. The place is the one that it was trained in."""
+    """Options of ``nerg eval gaze``. The scene is the one of the training."""
 
-    field: Path | None = option(None, "Radiance field, or splats, it was trained in. Default: its name, beside it.")
-    scene: Path | None = option(None, "Or: the Mitsuba scene.")
-    geometry: Path | None = option(None, "Or: the place of hit points (.vol).")
-    split: str | None = option(
-        None, "both: new positions and people; pos: new positions; people: new people. Default: both, or pos."
+    field: Path | None = option(
+        None,
+        "Radiance field or Gaussian splats that the gaze field was trained in.  [default: the file of the same name, "
+        "next to the gaze field]",
+        group=INPUT,
     )
-    kappa: float = option(20.0, "Concentration of the kernel of truth and baselines.", within=KAPPAS)
-    prior_kappa: float = option(50.0, "That of the blind density which bits are counted from.", within=KAPPAS)
-    directions: int = option(2048, "Directions that maps are compared in.", within=DIRECTIONS)
-    min_rays: int = option(64, "Rays at a test position at least.", within=Range(1, 10**6))
-    resamples: int = option(200, "Of the people, for the intervals.", within=Range(0, 10**5))
-    pictures: int = option(4, "Test positions to draw.", within=Range(0, 10000))
-    seed: int = option(0, "Seed of rays, resamples and halves.", within=SEEDS)
+    scene: Path | None = option(
+        None, "Mitsuba scene that the gaze field was trained in, in place of --field.", group=INPUT
+    )
+    geometry: Path | None = option(
+        None, "Volume of hit points (.vol) that the gaze field was trained in, in place of --field.", group=INPUT
+    )
+    split: str | None = option(
+        None,
+        "Held-out data to score on: both (new participants at new positions), pos (new positions) or people (new "
+        "participants).  [default: both if participants were held out, else pos]",
+        group=TEST,
+    )
+    kappa: float = option(
+        20.0,
+        "Concentration (unitless) of the von Mises-Fisher kernels that turn test rays into reference densities.",
+        within=KAPPAS,
+        group=TEST,
+    )
+    prior_kappa: float = option(
+        50.0,
+        "Concentration (unitless) of the kernels of the position-independent prior, against which information gain is "
+        "measured in bits.",
+        within=KAPPAS,
+        group=TEST,
+    )
+    directions: int = option(
+        2048, "Number of directions on the sphere at which densities are compared.", within=DIRECTIONS, group=TEST
+    )
+    min_rays: int = option(64, "Minimum number of rays around a test position.", within=Range(1, 10**6), group=TEST)
+    resamples: int = option(
+        200,
+        "Number of bootstrap resamples of the participants for confidence intervals; 0 computes none.",
+        within=Range(0, 10**5),
+        group=TEST,
+    )
+    pictures: int = option(4, "Number of test positions that are drawn.", within=Range(0, 10000), group=OUTPUT)
+    seed: int = random_seed("sampled rays, bootstrap resamples and split halves")
     threads: int | None = cpu_threads()
     mode: str = llvm_variant()
 
 
 @dataclass(frozen=True, kw_only=True)
-@expose_settings(ProbeSettings, GazeSettings, default="Default: the recipe's.", without=("seed", "freeze"))
+class HeldOutOptions(ValidatedDataclass):
+    """Which positions are held out for testing."""
+
+    test_zones: int = option(
+        3, "Number of zones whose positions are held out for testing.", within=Range(1, 1000), group=TEST
+    )
+    test_positions: int = option(60, "Number of test positions in these zones.", within=Range(1, 10**5), group=TEST)
+
+
+@dataclass(frozen=True, kw_only=True)
+@expose_settings(ProbeSettings, GazeSettings, default=_BY_RECIPE, without=("seed", "freeze", "validation_zones"))
 @repeat_options(GazeOptions, "recipe", "variant", "ensemble", "align", "mode")
 @repeat_options(GazeEvaluationOptions, "kappa", "directions", "min_rays")
-class FoldOptions(DerivedOptions, GeometryOptions, PartOptions):
-    """How many folds there are, what each holds out, and how its field is trained and scored. Lengths are metres."""
+class FoldOptions(DerivedOptions, HeldOutOptions, GeometryOptions, PartOptions):
+    """Options of ``nerg eval folds``. Lengths are in metres."""
 
-    folds: int = option(5, "Folds: each holds out other people and other zones.", within=Range(2, 10_000))
-    seed: int = option(0, "Seed of the first fold; the others have those that follow.", within=BASE_SEEDS)
-    splits: str = option(
-        "both,pos,people", "What is new, with commas between: both (people and positions), pos, people."
+    folds: int = option(
+        5, "Number of folds; each holds out other participants and other zones.", within=Range(2, 10_000), group=TEST
     )
-    zones: int = option(3, "Zones of test positions.", within=Range(1, 1000))
-    positions: int = option(60, "Test positions in them.", within=Range(1, 10**5))
-    test_participants: float = option(0.5, "Share of the people who are held out of a fold's training.", within=Range(0.01, 0.99))
-    max_samples: int = option(10_000_000, "Rays of a dataset at most; of more, a sample by --first.", within=RAYS)
-    threads: int | None = cpu_threads("; 1 makes a training repeat itself to the bit")
+    seed: int = option(
+        0, "Seed of the first fold; the following folds use the next seeds.", within=BASE_SEEDS, group=TEST
+    )
+    splits: str = option(
+        "both,pos,people",
+        "Comma-separated kinds of held-out data: both (new participants at new positions), pos (new positions), people "
+        "(new participants).",
+        group=TEST,
+    )
+    test_participants: float = option(
+        0.5, "Fraction of the participants that each fold holds out for testing.", within=Range(0.01, 0.99), group=TEST
+    )
+    max_samples: int = option(
+        10_000_000,
+        "Maximum number of samples read from a dataset; larger datasets are subsampled uniformly with --seed.",
+        within=RAYS,
+        group=INPUT,
+    )
+    threads: int | None = cpu_threads("; with 1, training is reproducible to the bit")
 
 
 declare(
     "eval gaze",
     "nerg_mi.workflows.evaluate:print_evaluation",
+    "Score a gaze field on held-out data and compare it with baselines: uniform, position-independent, nearest probes, "
+    "nearest rays, and the other half of the participants.",
     options=GazeEvaluationOptions,
-    gaze=argument("Checkpoint of a gaze field that was trained with --test-zones (.safetensors)."),
-    rays=argument("The rays file or dataset that it was trained on."),
-    output=out("Folder for tables and pictures. Default: GAZE.eval.", default=None),
+    gaze=argument("Gaze field that was trained with --test-zones (.safetensors)."),
+    rays=argument("Rays file or dataset that it was trained on."),
+    output=out("Folder for tables and figures.  [default: GAZE.eval]", default=None),
 )
 
 declare(
     "eval folds",
     "nerg_mi.workflows.evaluate:print_folds",
-    more="Each fold is kept when it is done, and the same command goes on where it ended.",
+    "Cross-validate a gaze field: train and score it several times, each time without some participants and zones, and "
+    "report the means.",
+    more="Each finished fold is stored; running the command again continues with the next one.",
     options=FoldOptions,
-    rays=argument("Rays file (.npz or .parquet) or dataset."),
+    rays=argument("Rays file (.npz or .parquet) or dataset (.rays)."),
     output=out("Folder for the table."),
 )
 
 
 @dataclass(frozen=True, kw_only=True)
-@expose_settings(ProbeSettings, GazeSettings, default="Default: the recipe's.", without=("seed", "freeze", "loss", "mix_folds"))
+@expose_settings(
+    ProbeSettings,
+    GazeSettings,
+    default=_BY_RECIPE,
+    without=("seed", "freeze", "validation_zones", "loss", "prior_folds"),
+)
 @repeat_options(GazeOptions, "threads", "mode")
 @repeat_options(GazeEvaluationOptions, "kappa", "min_rays")
-@repeat_options(FoldOptions, "zones", "positions")
-class AblationOptions(DerivedOptions, GeometryOptions, PartOptions):
-    """Which variants are trained, on what they are scored, and how a frame is timed. Lengths are metres."""
+class AblationOptions(DerivedOptions, HeldOutOptions, GeometryOptions, PartOptions):
+    """Options of ``nerg ablate``. Lengths are in metres."""
 
-    recipes: str = option("default,paper", "Recipes to ablate, separated by commas.")
+    recipes: str = option("default,paper", "Comma-separated recipes whose variants are compared.", group=MODEL)
     variant: tuple[str, ...] = option(
-        (), 'Only this one, such as emit_capture or "semantic snapshot"; may be given several times.'
+        (),
+        'Variant to train, such as emit_capture or "semantic snapshot"; repeatable.  [default: all variants]',
+        group=MODEL,
     )
-    seeds: int = option(3, "Seeds of the default recipe; the others have one.", within=Range(1, 1000))
-    seed: int = option(0, "Seed of what is held out, and of the first training.", within=BASE_SEEDS)
-    steps: int | None = option(None, "Steps of every recipe but the default one. Default: the recipe's.", within=STEPS)
-    default_steps: int | None = option(None, "Steps of the default recipe. Default: its own.", within=STEPS)
-    test_participants: float = option(0.0, "Share of the people who are held out besides.", within=TEST_FRACTIONS)
-    radius: float = option(0.25, "Radius of the test's probes in metres.", within=LENGTHS)
+    seeds: int = option(
+        3, "Number of seeds for the recipe default; other recipes use one.", within=Range(1, 1000), group=TRAINING
+    )
+    seed: int = option(0, "Seed of the held-out data and of the first training.", within=BASE_SEEDS, group=TRAINING)
+    steps: int | None = option(
+        None, f"Number of training steps of every recipe except default.  {_BY_RECIPE}", within=STEPS, group=TRAINING
+    )
+    default_steps: int | None = option(
+        None, f"Number of training steps of the recipe default.  {_BY_RECIPE}", within=STEPS, group=TRAINING
+    )
+    test_participants: float = option(
+        0.0, "Fraction of the participants that are also held out for testing.", within=TEST_FRACTIONS, group=TEST
+    )
+    radius: float = option(0.25, "Radius of the test probes in metres.", within=LENGTHS, group=TEST)
     ground_truth: str | None = option(
         None,
-        'Truth in closed form, where it is known: "MODULE:CLASS", whose instances have density(positions, directions) '
-        "in 1/sr.",
+        'Analytic gaze density for simulated data, as "MODULE:CLASS"; an instance has density(positions, '
+        "directions) in 1/sr.  [default: densities of the test rays]",
+        group=TEST,
     )
     refit: bool = option(
         True,
-        "Train every recipe but the default one, which always does, again on all rays for as many steps as were best "
-        "on some.",
+        "Train again on all rays, for the number of steps that validation found best. Applies to every recipe except "
+        "default, which always does.",
+        group=TRAINING,
     )
-    timing_cameras: int = option(4, "Cameras that a frame is timed over (the paper: 32); 0: none.", within=Range(0, 10000))
-    timing_size: str = option("320x180", "Of a frame (the paper: 1280x720).")
+    timing_cameras: int = option(
+        4,
+        "Number of cameras over which the time of a frame is measured (paper: 32); 0 measures none.",
+        within=Range(0, 10000),
+        group=PERFORMANCE,
+    )
+    timing_size: str = option(
+        "320x180", "Size of the timed frames in pixels, WIDTHxHEIGHT (paper: 1280x720).", group=PERFORMANCE
+    )
 
 
 declare(
     "ablate",
     "nerg_mi.workflows.ablation:ablate",
-    "Train every variant of a gaze field alike; losses on training and held-out positions, and the time of a frame.",
+    "Train the variants of a gaze field under equal conditions; report losses at training and held-out positions, and "
+    "the time of a frame.",
     options=AblationOptions,
     rays=argument("Rays file (.npz or .parquet), as nerg rays import writes it."),
     output=out("Folder for checkpoints, table and plot."),

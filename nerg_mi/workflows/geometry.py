@@ -1,4 +1,4 @@
-"""The place that gaze is tied to: of a training, and of a field that is evaluated."""
+"""The geometry of a gaze field: created for training, and loaded again for evaluation."""
 
 from __future__ import annotations
 
@@ -22,16 +22,17 @@ from .base import SILENT, Reporter
 from .gaze_commands import GazeEvaluationOptions
 from .options import GeometryOptions
 
-# ---- Gaze places ----
+# ---- Geometry of gaze workflows ----
 #
-# The places of jobs on gaze: made of a field, a scene, hit points or nothing, and found again for an evaluation.
+# Created from a field, a scene, hit points or nothing, and loaded again for an evaluation.
 
 
 def geometry_kind(options: GeometryOptions) -> str:
-    """Kind of the place (`GazePlace.kind`) that is asked for. Raises `NergError` unless it is exactly one."""
+    """Return the kind of geometry that is selected. Raises `NergError` unless it is exactly one."""
     if sum(v is not None for v in (options.field, options.scene, options.geometry)) != 1:
         raise NergError(
-            "say where people looked around: one of --field FILE, --scene FILE, --geometry hits, --geometry none"
+            "give the geometry that the participants saw: one of --field FILE, --scene FILE, --geometry hits, "
+            "--geometry none"
         )
     if options.geometry not in (None, "hits", "none"):
         raise NergError(f'--geometry must be "hits" or "none", got "{options.geometry}"')
@@ -47,24 +48,45 @@ def make_geometry(
     voxel: float | None = None,
     reporter: Reporter = SILENT,
 ) -> TrainingGeometry:
-    """The place that is asked for, with arrays of the backend ``ns``; one of hit points is written to ``volume``
-    (.vol), in voxels of edge ``voxel`` metres.
+    """Create the selected geometry.
 
-    Raises `NergError` for a file that cannot be used, and for rays without hits.
+    Parameters
+    ----------
+    options
+        Selection of the geometry.
+    rays
+        Rays whose hit points may form the geometry.
+    views
+        Views with saliency.
+    volume
+        File (.vol) for a geometry of hit points.
+    ns
+        Backend of its arrays.
+    voxel
+        Edge length of voxels in metres, for hit points.
+    reporter
+        Receives messages.
+
+    Raises
+    ------
+    NergError
+        For unsuitable files, and for rays without hit points.
     """
     kind = geometry_kind(options)
     if options.field is not None or options.scene is not None:
         path = Path(options.field or options.scene or "")
-        place = geometry.load_field_geometry(path, ns) if options.field is not None else geometry.load_scene_geometry(path)
+        place = (
+            geometry.load_field_geometry(path, ns) if options.field is not None else geometry.load_scene_geometry(path)
+        )
         for note in place.notes:
-            reporter.message(f"of {path}: {note}")
+            reporter.message(f"{path}: {note}")
         return place
     if kind == "none":
         origins = [v.camera.center[None] for v in views] + ([] if rays is None else [rays.origin])
         return geometry.no_geometry(np.concatenate(origins))
     if rays is None or volume is None:
         raise NergError(
-            "a place of hit points is made of rays and written beside the gaze field: give both, or a field"
+            "a geometry of hit points needs rays, and is written next to the gaze field: give both, or use --field"
         )
     place = geometry.make_hit_geometry(rays, volume, voxel)
     made = place.metadata["geometry_file"]
@@ -74,8 +96,8 @@ def make_geometry(
     )
     if made["beyond"]:
         reporter.message(
-            f"{100 * made['beyond']:.1f} % of the hit points lie beyond this box and stand on its shell, in their true "
-            "directions but too near"
+            f"{100 * made['beyond']:.1f} % of the hit points are outside this box and were moved to its boundary, "
+            "in their direction but too near"
         )
     return place
 
@@ -83,10 +105,10 @@ def make_geometry(
 def load_training_geometry(
     gaze: Path, provenance: dict, box: AnyBox, options: GazeEvaluationOptions, ns: ModuleType
 ) -> TrainingGeometry:
-    """What the field in the checkpoint ``gaze`` was trained in: the file that is named, or the one of the checkpoint's
-    beside it, with the alignment of the training.
+    """Load the geometry of the training of the checkpoint ``gaze``, with the alignment of the training.
 
-    ``box``: of the gaze field. Raises `NergError` for a file that is missing or another one.
+    The file is the one in ``options``, or the one with the stored name next to the checkpoint. ``box`` is that of the
+    gaze field. Raises `NergError` for a missing or a different file.
     """
     align = read_training_alignment(provenance)
     if provenance.get("geometry") == "none":
@@ -97,55 +119,60 @@ def load_training_geometry(
         "geometry_file": (options.geometry, "--geometry", geometry.load_volume_geometry),
     }
     key = geometry_key(gaze, provenance)
-    given, name, make = makers[key]
-    path = find_training_file(gaze, provenance, given, f"say where it is with {name}", f"give that one with {name}")
+    explicit, name, make = makers[key]
+    path = find_training_file(gaze, provenance, explicit, f"name it with {name}", f"give the right one with {name}")
     return replace(make(path), align=align)
 
 
 def read_training_alignment(provenance: dict) -> Similarity:
-    """From the rays that a gaze field was trained on to its place. Raises `NergError` for one that is damaged."""
+    """Return the transform from the training rays to the scene. Raises `NergError` for a damaged one."""
     return Similarity() if provenance.get("align") is None else Similarity(provenance["align"])
 
 
 def geometry_key(gaze: Path, provenance: dict) -> str:
-    """The entry of the ``provenance`` of the checkpoint ``gaze`` that names the file of its place: "field_file",
-    "scene_file" or "geometry_file". Raises `NergError` where there is none."""
+    """Return the key in ``provenance`` of the geometry file: "field_file", "scene_file" or "geometry_file".
+
+    Raises `NergError` if there is none.
+    """
     key = next((k for k in ("field_file", "scene_file", "geometry_file") if k in provenance), None)
     if key is None:
-        raise NergError(f'"{gaze}" does not say what it was trained in')
+        raise NergError(f'"{gaze}" does not store the geometry that it was trained in')
     return key
 
 
-def find_training_file(gaze: Path, provenance: dict, given: Path | None, where: str, other: str) -> Path:
-    """The file of the place that ``gaze`` was trained in: ``given``, or the one of its name beside the checkpoint.
+def find_training_file(gaze: Path, provenance: dict, explicit: Path | None, where: str, other: str) -> Path:
+    """Return the geometry file of the training of ``gaze``: ``given``, or the file with the stored name next to it.
 
-    Raises `NergError` for a file that is missing, which ends in ``where``, or is another one, which ends in ``other``.
+    Raises `NergError` for a missing file, with the remedy ``where``, and for a different one, with the remedy
+    ``other``.
     """
-    about = provenance[geometry_key(gaze, provenance)]
-    path = gaze.parent / about["file"] if given is None else Path(given)
+    entry = provenance[geometry_key(gaze, provenance)]
+    path = gaze.parent / entry["file"] if explicit is None else Path(explicit)
     if not path.exists():
         raise NergError(f'"{path}", which the field was trained in, does not exist; {where}')
-    if not matches_checksum(path, about["sha256"]):
+    if not matches_checksum(path, entry["sha256"]):
         raise NergError(f'"{path}" is not the file that "{gaze}" was trained in; {other}')
     return path
 
 
-def check_geometry(place: TrainingGeometry, rays: Rays | None, options: str, force: bool, reporter: Reporter = SILENT) -> None:
-    """Tell where ``rays`` do not lie in ``place`` as people do; ``options``: by which the place was given, for the
-    command that is named as the remedy.
+def check_geometry(
+    place: TrainingGeometry, rays: Rays | None, options: str, force: bool, reporter: Reporter = SILENT
+) -> None:
+    """Warn if ``rays`` do not fit the geometry: gaze without hits, or heads inside objects.
 
-    Raises `NergError` where (nearly) all their gaze meets no surface, unless ``force``. A place of hit points is in the
-    rays' own frame, and where there is no geometry nothing can be met.
+    ``options`` selects the geometry in the command that is suggested as a remedy. Raises `NergError` if (nearly) no
+    gaze hits a surface, unless ``force`` is set. A geometry of hit points always fits, and without geometry there are
+    no hits.
     """
     if rays is None or place.medium is None or place.kind == "hits":
         return
-    found = check_alignment(place.medium, rays, place.align)
-    remedy = f"find the alignment with: nerg align RAYS {options} -o alignment.json, and give it with --align"
-    if found.is_impossible and not force:
+    check = check_alignment(place.medium, rays, place.align)
+    remedy = f"find the alignment with: nerg align RAYS {options} -o alignment.json, and use it with --align"
+    if check.is_impossible and not force:
         raise NergError(
-            f"{100 * found.escaped:.1f} % of the gaze meets no surface of the place, so that the rays lie elsewhere; "
-            f"{remedy} (or go on all the same with --force)"
+            f"{100 * check.escaped:.1f} % of the gaze hits no surface, so the rays are not aligned with the "
+            f"scene; {remedy} (or add --force to continue anyway)"
         )
-    doubts = found.list_warnings()
+    doubts = check.list_warnings()
     if doubts:
-        reporter.warn(f"the rays may not lie where they belong: {', '.join(doubts)}; {remedy}")
+        reporter.warn(f"the rays may not be aligned with the scene: {', '.join(doubts)}; {remedy}")

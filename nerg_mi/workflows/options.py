@@ -1,7 +1,7 @@
-"""Options of workflows: how one is declared, which are settings, too, and those that several workflows share.
+"""Options of workflows: how an option is declared, options that come from settings, and options that workflows share.
 
-An option is a field that `option` makes of a dataclass, which stands where its command is declared: a notebook reads it
-there, and the command line makes its option of it.
+An option is a dataclass field that `option` creates. The dataclass is defined next to the declaration of its command.
+Python code reads the fields, and the command line makes an option of each of them.
 """
 
 from __future__ import annotations
@@ -12,17 +12,35 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from nerg_mi.errors import NergError, sanitize
-from nerg_mi.ranges import CHANGES_RESULT, COORDINATES, FLAG, RANGE, THREADS, ValidatedDataclass, Range, check_number
+from nerg_mi.ranges import (
+    CHANGES_RESULT,
+    COORDINATES,
+    FLAG,
+    RANGE,
+    SEEDS,
+    THREADS,
+    Range,
+    ValidatedDataclass,
+    check_number,
+)
 
-# Key in the metadata of a field that `exposes` made.
+# Key in the metadata of a field that `expose_settings` made.
 _EXPOSED = "nerg_mi.exposed"
+
+INPUT, VIEW, MODEL, TRAINING, TEST = "Input", "View", "Model", "Training", "Test"
+ANALYSIS, OUTPUT, PERFORMANCE = "Analysis", "Output", "Performance"
+GROUPS = (INPUT, VIEW, MODEL, TRAINING, TEST, ANALYSIS, OUTPUT, PERFORMANCE)
+"""Groups of options in the order in which help lists them; options without a group come last."""
+
+PANEL = "rich_help_panel"
+"""The parameter of ``typer.Option`` that holds the group."""
 
 Base = TypeVar("Base")
 Class = TypeVar("Class", bound=type)
 
 
 class DerivedOptions(ValidatedDataclass):
-    """Base of options of which some are declared elsewhere, by `exposes` or `repeats`."""
+    """Base of options some of which are declared elsewhere, by `expose_settings` or `repeat_options`."""
 
     if TYPE_CHECKING:
 
@@ -36,50 +54,69 @@ def option(
     within: Range | None = None,
     parse: Callable[[str, str], Any] | None = None,
     changes_result: bool = True,
+    group: str = "",
     **more: Any,
 ) -> Any:
-    """A field of a dataclass of options, which derives from `nerg_mi.ranges.Checked`.
+    """Create a field of a dataclass of options, which derives from `nerg_mi.ranges.ValidatedDataclass`.
 
-    ``default``: its value where none is given; ``help``: what it means, in one line. ``names``: how the command spells
-    it ("-s", "--seed"), where that is not ``--`` and the field's name; ``within``: the range of its numbers, which each
-    option that has any needs; ``parse(text, flag)``: its value from a word of the command line, where the type alone
-    does not tell; ``changes_result``: False for where, by whom or with how many threads something is computed, which
-    must not change what comes of it: parts of a job are kept without it, and run with the default; ``more``:
-    what else ``typer.Option`` takes, such as ``metavar``.
+    Parameters
+    ----------
+    default
+        Value of the option if it is not given.
+    help
+        What the value is, its unit and its default, in a sentence.
+    names
+        Spellings on the command line ("-s", "--seed"). Without any it is ``--`` and the name of the field.
+    within
+        Range of the number. Each numeric option needs one.
+    parse
+        ``parse(text, flag)`` converts a word of the command line to the value, where the type is not enough.
+    changes_result
+        False for options that set where, by whom or with how many threads something is computed. They must not change
+        the result: cached parts are identified without them, and computed with their defaults.
+    group
+        Heading under which help lists the option, one of `GROUPS`.
+    more
+        Further parameters of ``typer.Option``, such as ``metavar``.
     """
-    about = {"help": help, "names": names, "parse": parse, "more": more, CHANGES_RESULT: changes_result}
-    return field(default=default, metadata={**about, RANGE: within, FLAG: names[-1] if names else ""})
+    metadata = {"help": help, "names": names, "parse": parse, "more": {**more, PANEL: group}}
+    metadata |= {CHANGES_RESULT: changes_result, RANGE: within, FLAG: names[-1] if names else ""}
+    return field(default=default, metadata=metadata)
 
 
-def expose_settings(*kinds: type, default: str = "", without: Collection[str] = ()) -> Callable[[Class], Class]:
-    """Decorator of a class, under ``dataclass``: gives it an option for each `nerg_mi.ranges.setting` of ``kinds``.
-    `exposed_options` reads those that it gave.
+def expose_settings(
+    *kinds: type, default: str = "", without: Collection[str] = (), group: str = TRAINING
+) -> Callable[[Class], Class]:
+    """Class decorator, applied below ``dataclass``: adds an option for each `nerg_mi.ranges.setting` of ``kinds``.
 
     Parameters
     ----------
     kinds
-        Dataclasses of settings, for which `chosen_settings` reads the options again. A field that the class declares
-        itself stays as it is.
+        Dataclasses of settings. `explicit_settings` reads their options again. A field that the class declares itself
+        is not replaced.
     default
-        Ends the help of options that are None until they are set, where something else decides. Without it an option
-        has the default of its setting.
+        End of the help text of options that are None unless they are given. Without it, an option has the default
+        of its setting.
     without
-        Options that it leaves out.
+        Names of options that are not added.
+    group
+        Group of the options in the help.
     """
 
     def decorate(kind: Class) -> Class:
         for setting in (f for settings in kinds for f in fields(settings) if "help" in f.metadata):
-            about, name, hint = setting.metadata, setting.metadata["option"] or setting.name, str(setting.type)
+            metadata, name, hint = setting.metadata, setting.metadata["option"] or setting.name, str(setting.type)
             if name in kind.__annotations__ or name in without:
                 continue
-            names, value = about["names"], setting.default
+            names, value = metadata["names"], setting.default
             if default:
                 value, hint = None, f"{hint.removesuffix(' | None')} | None"
                 if "bool" in hint:
                     flag = (names[-1] if names else f"--{name.replace('_', '-')}").removeprefix("--")
                     names = (f"--{flag}/--no-{flag}",)
             kind.__annotations__[name] = hint
-            exposed = option(value, f"{about['help']} {default}".rstrip(), *names, within=about[RANGE])
+            help = f"{metadata['help']}  {default}".rstrip()
+            exposed = option(value, help, *names, within=metadata[RANGE], group=group)
             setattr(kind, name, field(default=value, metadata={**exposed.metadata, _EXPOSED: True}))
         return kind
 
@@ -87,22 +124,26 @@ def expose_settings(*kinds: type, default: str = "", without: Collection[str] = 
 
 
 def explicit_settings(options: Any, kind: type) -> dict[str, Any]:
-    """Keywords of the settings ``kind``, for those of its exposed fields that are set in ``options``."""
+    """Return keywords of the settings ``kind`` for its exposed fields that are set in ``options``."""
     exposed = {f.name: f.metadata["option"] or f.name for f in fields(kind) if "help" in f.metadata}
     values = {name: getattr(options, option) for name, option in exposed.items()}
     return {name: value for name, value in values.items() if value is not None}
 
 
 def exposed_options(options: Any) -> dict[str, Any]:
-    """Those of ``options`` that `exposes` gave their class, and that are set: keywords of other options that expose the
-    same settings."""
+    """Return those of ``options`` that `expose_settings` added to their class and that are set.
+
+    They are keywords of any other options that expose the same settings.
+    """
     names = [f.name for f in fields(options) if f.metadata.get(_EXPOSED)]
     return {name: value for name in names if (value := getattr(options, name)) is not None}
 
 
 def repeat_options(kind: type, *names: str) -> Callable[[Class], Class]:
-    """Decorator of a class, under ``dataclass``: gives it the options ``names`` of ``kind``, as they are there, which
-    `shared_options` reads again."""
+    """Class decorator, applied below ``dataclass``: adds the options ``names`` of ``kind`` unchanged.
+
+    `shared_options` reads them again.
+    """
 
     def decorate(derived: Class) -> Class:
         for name in names:
@@ -115,37 +156,39 @@ def repeat_options(kind: type, *names: str) -> Callable[[Class], Class]:
 
 
 def shared_options(options: Any, kind: type) -> dict[str, Any]:
-    """Keywords of the options ``kind``, for those that ``options`` repeat or have from the same base."""
+    """Return keywords of the options ``kind`` that ``options`` repeat or inherit from the same base."""
     declared = type(options).__dataclass_fields__
     return {f.name: getattr(options, f.name) for f in fields(kind) if declared.get(f.name) is f}
 
 
 def to_base(options: Any, kind: type[Base]) -> Base:
-    """The fields of ``options`` that the dataclass ``kind`` has, of which theirs is derived: who is given it cannot
-    depend on the others."""
+    """Return the fields of ``options`` that its base class ``kind`` declares, as an instance of ``kind``.
+
+    What receives them cannot depend on the other options.
+    """
     return kind(**{f.name: getattr(options, f.name) for f in fields(kind)})  # pyright: ignore[reportArgumentType]
 
 
 def parse_point(text: str, flag: str) -> tuple[float, ...]:
-    """Three coordinates with commas between them. Raises `NergError` naming ``flag`` for other texts."""
+    """Parse three comma-separated coordinates. Raises `NergError`, which names ``flag``, for any other text."""
     numbers = parse_numbers(text, flag)
     if len(numbers) != 3:
-        raise NergError(f"{flag} is three numbers x,y,z, got {sanitize(text, 60)!r}")
+        raise NergError(f"{flag} must be three numbers x,y,z, got {sanitize(text, 60)!r}")
     for number in numbers:
         check_number(number, COORDINATES, flag)
     return numbers
 
 
 def parse_numbers(text: str, flag: str) -> tuple[float, ...]:
-    """Numbers with commas, or spaces, between them. Raises `NergError` naming ``flag`` for other texts."""
+    """Parse numbers separated by commas or spaces. Raises `NergError`, which names ``flag``, for any other text."""
     try:
         return tuple(float(v) for v in (text.split(",") if "," in text or not text else text.split()))
     except ValueError:
-        raise NergError(f"{flag} is numbers with commas between them, got {sanitize(text, 60)!r}") from None
+        raise NergError(f"{flag} must be comma-separated numbers, got {sanitize(text, 60)!r}") from None
 
 
 def parse_definitions(pairs: Iterable[str], flag: str) -> dict[str, str]:
-    """``["spp=4", "name=a=b"]`` as ``{"spp": "4", "name": "a=b"}``.
+    """Parse ``["spp=4", "name=a=b"]`` into ``{"spp": "4", "name": "a=b"}``.
 
     Raises `NergError` for a pair without a key or without "=".
     """
@@ -153,74 +196,107 @@ def parse_definitions(pairs: Iterable[str], flag: str) -> dict[str, str]:
     for pair in pairs:
         key, equals, value = pair.partition("=")
         if not (key and equals):
-            raise NergError(f'"-D {pair}" is no definition: write -D key=value')
+            raise NergError(f'"-D {pair}" is not a definition: write -D KEY=VALUE')
         values[key] = value
     return values
 
 
-# ---- Options that many workflows have ----
+# ---- Options that many workflows share ----
+
+
+ALIGN_HELP = (
+    "JSON file with the 4x4 similarity from the frame of the rays to that of the scene, as nerg align writes it.  "
+    "[default: the alignment of the gaze field]"
+)
+"""Help of the option ``align``."""
 
 
 def definitions() -> Any:
-    """The field ``defaults`` of options of what renders a scene: a mapping of texts, or None."""
-    help = "Value for $KEY or a <default> of the scene; repeatable."
-    return option(None, help, "-D", "--define", parse=parse_definitions, metavar="KEY=VALUE")
+    """Declare the field ``defaults`` of workflows that render a scene: a mapping of strings, or None."""
+    help = "Value of a <default> of the scene file, or of $KEY; repeatable.  [default: as in the scene file]"
+    return option(None, help, "-D", "--define", parse=parse_definitions, metavar="KEY=VALUE", group=INPUT)
 
 
-def coordinates(help: str, *names: str) -> Any:
-    """A field of several coordinates, or None."""
-    return option(None, help, *names, parse=parse_numbers, within=COORDINATES)
+def coordinates(help: str, *names: str, group: str = VIEW) -> Any:
+    """Declare a field of several coordinates, or None."""
+    return option(None, help, *names, parse=parse_numbers, within=COORDINATES, group=group)
+
+
+def up_axis() -> Any:
+    """Declare the field ``up``: the upward direction of a scene, or None."""
+    return coordinates("Up direction of the scene, x,y,z.  [default: as its files state, else 0,0,1]", group=INPUT)
+
+
+def random_seed(use: str) -> Any:
+    """Declare the field ``seed`` of a workflow that draws random numbers for ``use``."""
+    return option(0, f"Seed of the random numbers for {use}.", within=SEEDS, group=PERFORMANCE)
 
 
 def best_variant() -> Any:
-    """The field ``mode`` of options: a Mitsuba variant, or None for the best that works."""
-    return option(None, "Mitsuba variant.  [default: cuda_ad_rgb if it works, else llvm_ad_rgb]", "-m", "--mode")
+    """Declare the field ``mode``: a Mitsuba variant, or None for the fastest that works."""
+    help = "Mitsuba variant.  [default: cuda_ad_rgb if it works, else llvm_ad_rgb]"
+    return option(None, help, "-m", "--mode", group=PERFORMANCE)
 
 
 def llvm_variant() -> Any:
-    """The field ``mode`` of options of what runs on the processor by default."""
-    return option("llvm_ad_rgb", "Mitsuba variant.", "-m", "--mode")
+    """Declare the field ``mode`` of workflows that run on the CPU by default."""
+    return option(
+        "llvm_ad_rgb", "Mitsuba variant, such as llvm_ad_rgb or cuda_ad_rgb.", "-m", "--mode", group=PERFORMANCE
+    )
 
 
-def cpu_threads(more: str = "") -> Any:
-    """The field ``threads`` of options."""
-    return option(None, f"CPU threads. Default: all{more}.", within=THREADS, changes_result=False)
+def cpu_threads(note: str = "") -> Any:
+    """Declare the field ``threads``; ``note`` is appended to its help."""
+    help = f"Number of CPU threads{note}.  [default: all cores]"
+    return option(None, help, within=THREADS, changes_result=False, group=PERFORMANCE)
 
 
-# ---- Options of jobs that are done in parts, each of which is kept ----
+# ---- Options of workflows that run in parts, each of which is stored ----
 
 
 @dataclass(frozen=True, kw_only=True)
 class PartOptions(ValidatedDataclass):
-    """Where finished parts of a job are kept, and who makes them."""
+    """Where finished parts of a job are stored, and what computes them."""
 
     store: Path | None = option(
         None,
-        "Keep finished parts in this folder, and go on from them.  [default: OUTPUT.tasks, with --scheduler]",
+        "Folder that stores finished parts; running the command again resumes from them.  "
+        "[default: OUTPUT.tasks if --scheduler is given, else nothing is stored]",
         changes_result=False,
+        group=PERFORMANCE,
     )
     scheduler: str | None = option(
         None,
-        "Who makes the parts: local, local:N for N processes, or a cluster at tcp://HOST:PORT or tls://HOST:PORT.  "
-        "[default: local, with --store]",
+        "What computes the parts: local, local:N for N processes, or a dask cluster at tcp://HOST:PORT or "
+        "tls://HOST:PORT.  [default: local if --store is given]",
         changes_result=False,
+        group=PERFORMANCE,
     )
 
     @property
     def in_parts(self) -> bool:
-        """Whether the job is to be done in parts at all."""
+        """Whether the job runs in parts."""
         return self.store is not None or self.scheduler is not None
 
 
-# ---- Options that say where people looked around ----
+# ---- Options that give the geometry around the participants ----
 
 
 @dataclass(frozen=True, kw_only=True)
 class GeometryOptions(ValidatedDataclass):
-    """Exactly one of them is given."""
+    """The geometry that the participants saw: exactly one of these options."""
 
-    field: Path | None = option(None, "Radiance field, or Gaussian splats, in which people looked around.")
-    scene: Path | None = option(None, "Or: a Mitsuba scene, or a mesh (.ply, .obj, .glb), whose shapes they looked at.")
+    field: Path | None = option(
+        None,
+        "Radiance field (.safetensors) or Gaussian splats of the environment that the participants saw.",
+        group=INPUT,
+    )
+    scene: Path | None = option(
+        None, "Mitsuba scene (.xml) or mesh (.ply, .obj, .glb) of that environment, in place of --field.", group=INPUT
+    )
     geometry: str | None = option(
-        None, 'Or: "hits" makes a place from the rays\' own hit points, "none" does without any.'
+        None,
+        'Without a model of the environment: "hits" builds a volume from the hit points of the rays, "none" uses no '
+        "geometry.",
+        group=INPUT,
     )

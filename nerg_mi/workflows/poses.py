@@ -1,4 +1,4 @@
-"""Photos without poses, or a video, made a capture that can be trained on."""
+"""Estimation of camera poses of photos or a video, for training a radiance field."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.figures.maps import camera_figure
 from nerg_mi.figures.style import make_provenance, save
-from nerg_mi.files.atomic import check_new_folder, make_folder, create_folder_atomically
+from nerg_mi.files.atomic import check_new_folder, create_folder_atomically, make_folder
 from nerg_mi.files.tables import write_json
 from nerg_mi.photos.colmap import read_colmap
 from nerg_mi.photos.posed import UnusedFrame, format_names
 from nerg_mi.photos.structure import (
-    PhotoFolders,
     PhotoCopy,
+    PhotoFolders,
     Reconstruction,
     StructureSettings,
     check_installed,
@@ -30,27 +30,40 @@ from nerg_mi.photos.video_frames import copy_frames
 from .base import SILENT, Reporter
 from .radiance_commands import PoseOptions
 
-# ---- Photos without poses, or a video, made a capture that can be trained on ----
+# ---- Pose estimation ----
 
 
 STAGES = {"pictures": 0.0, "features": 0.08, "matching": 0.25, "mapping": 0.65, "writing": 0.98}
-"""Stages -> the share of the work that is done when each begins."""
+"""Stages and the progress at which each begins."""
 
 MIN_PHOTOS = 3
-"""So many pictures are needed; a useful capture has dozens."""
+"""Minimum number of images; useful results need dozens."""
 
 _ADVICE = (
-    "take more of them, each sharing more than half of what it shows with its neighbours, sharp, from places some "
-    "steps apart (not by turning on the spot), of things that do not move, shine or look all alike"
+    "take more images, each overlapping its neighbours by more than half, sharp, from positions some steps apart "
+    "(not by rotating on the spot), of a static scene without glossy or uniform surfaces"
 )
 
 
 @dataclass(frozen=True)
 class PosesResult:
-    """``output``: the capture; ``registered``, ``unregistered``: names of the pictures with a pose, and without;
-    ``skipped``: files that were not used, each with its reason; ``error``: mean reprojection error in pixels, at the
-    size at which features were found; ``points``: how many were found on surfaces; ``report``: what poses.json
-    holds."""
+    """Result of a pose estimation.
+
+    Attributes
+    ----------
+    output
+        Written folder.
+    registered, unregistered
+        Names of the images with and without a pose.
+    skipped
+        Files that were not used, each with its reason.
+    error
+        Mean reprojection error in pixels, at the resolution of feature extraction.
+    points
+        Number of triangulated points.
+    report
+        Content of poses.json.
+    """
 
     output: Path
     registered: list[str]
@@ -64,11 +77,11 @@ class PosesResult:
 def find_poses(
     pictures: str | Path, output: str | Path, options: PoseOptions | None = None, reporter: Reporter = SILENT
 ) -> PosesResult:
-    """Find the poses of ``pictures``, a folder of photos or a video, and make the capture ``output``: a folder with
-    images/, a COLMAP model in sparse/0/, poses.png (cameras and points from above and from the side) and poses.json.
+    """Estimate the poses of ``pictures``, a folder of photos or a video, and write the folder ``output``.
 
-    Lengths are in units of the capture's own. The folder is finished or absent. Raises `NergError` for what the user
-    can mend, and ``ImportError`` where pycolmap, or for a video PyAV, is not installed.
+    The folder contains images/, a COLMAP model in sparse/0/, poses.png (cameras and points from above and from the
+    side) and poses.json. Lengths are in arbitrary units. The folder is written atomically. Raises `NergError` for
+    errors that the user can correct, and ``ImportError`` if pycolmap, or PyAV for a video, is not installed.
     """
     options = options or PoseOptions()
     pictures, output = Path(pictures), Path(output)
@@ -80,25 +93,33 @@ def find_poses(
     with create_folder_atomically(output) as folder, tempfile.TemporaryDirectory(prefix=".work-", dir=folder) as work:
         folders = PhotoFolders(make_folder(folder / "images"), make_folder(Path(work, "small")))
         copies, skipped = _copy(pictures, folders, options, reporter)
-        _tell_pictures(copies, skipped, reporter)
-        found = reconstruct(copies, Path(work), settings, lambda *now: _progress(reporter, *now))
-        if found is None:
-            raise NergError(f'no {MIN_PHOTOS} of the {len(copies)} pictures of "{pictures}" show the same place; {_ADVICE}')
+        _report_pictures(copies, skipped, reporter)
+        reconstruction = reconstruct(copies, Path(work), settings, lambda *now: _progress(reporter, *now))
+        if reconstruction is None:
+            raise NergError(
+                f'no {MIN_PHOTOS} of the {len(copies)} images in "{pictures}" show the same scene; {_ADVICE}'
+            )
         _progress(reporter, "writing", 0, 1)
-        registered = set(found.models[0])
+        registered = set(reconstruction.models[0])
         unregistered = [p.name for p in copies if p.name not in registered]
         for name in unregistered:
             (folders.images / name).unlink()
         Path(work, "sparse").rename(folder / "sparse")
-        # A disk that fills is not told of by COLMAP, whose files would then end too early.
+        # COLMAP does not report a full disk; truncated files are detected here.
         read_colmap(folder / "sparse" / "0", folders.images)
-        report = _report(copies, unregistered, skipped, found, options)
+        report = _report(copies, unregistered, skipped, reconstruction, options)
         write_json(folder / "poses.json", report)
-        title = f"{len(registered)} of {len(copies)} pictures, {found.num_points:,} points"
-        about = make_provenance("nerg poses", (folders.images / name for name in sorted(registered)), None, options)
-        save(camera_figure(found.to_world, found.point_positions, found.point_colors, title), folder / "poses.png", about)
-    result = PosesResult(output, found.models[0], unregistered, skipped, found.error, found.num_points, report)
-    _tell_result(result, found, options, reporter)
+        title = f"{len(registered)} of {len(copies)} images, {reconstruction.num_points:,} points"
+        record = make_provenance("nerg poses", (folders.images / name for name in sorted(registered)), None, options)
+        save(
+            camera_figure(reconstruction.to_world, reconstruction.point_positions, reconstruction.point_colors, title),
+            folder / "poses.png",
+            record,
+        )
+    result = PosesResult(
+        output, reconstruction.models[0], unregistered, skipped, reconstruction.error, reconstruction.num_points, report
+    )
+    _report_result(result, reconstruction, options, reporter)
     return result
 
 
@@ -108,89 +129,100 @@ def _copy(
     progress = lambda done, of: _progress(reporter, "pictures", done, of)
     skipped: list[UnusedFrame] = []
     if pictures.is_dir():
-        photos, others = list_photos(pictures)
+        photos, ignored = list_photos(pictures)
         copies, unused = copy_photos(photos, folders, options.max_image_size, progress, options.allow_outside)
-        skipped = [*others, *unused]
+        skipped = [*ignored, *unused]
     else:
         copies = copy_frames(pictures, options.num_frames, folders, options.max_image_size, options.threads, progress)
     if len(copies) < MIN_PHOTOS:
-        why = f"; of the others, {skipped[0]}" if skipped else ""
+        why = f"; {skipped[0]}" if skipped else ""
         raise NergError(
-            f'"{pictures}" has {len(copies)} pictures that can be used, and poses need {MIN_PHOTOS} or more of the same '
-            f"place{why}"
+            f'"{pictures}" has {len(copies)} usable images, and pose estimation needs at least {MIN_PHOTOS} of '
+            f"the same scene{why}"
         )
     return copies, skipped
 
 
-def _progress(reporter: Reporter, stage: str, done: int, of: int) -> None:
+def _progress(reporter: Reporter, stage: str, done: int, total: int) -> None:
     names = list(STAGES)
     after = [*STAGES.values(), 1.0][names.index(stage) + 1]
-    share = STAGES[stage] + (after - STAGES[stage]) * done / max(of, 1)
+    share = STAGES[stage] + (after - STAGES[stage]) * done / max(total, 1)
     text = {
-        "pictures": f"copying pictures, {done} of {of}",
-        "features": f"finding features, {done} of {of} pictures",
-        "matching": f"comparing pictures, {done} of {of} pairs",
-        "mapping": f"placing pictures, {done} of {of}",
+        "pictures": f"copying images, {done} of {total}",
+        "features": f"extracting features, {done} of {total} images",
+        "matching": f"matching images, {done} of {total} pairs",
+        "mapping": f"registering images, {done} of {total}",
         "writing": "writing",
     }
     reporter.progress(min(share, 1.0), text[stage])
 
 
-def _tell_pictures(copies: list[PhotoCopy], skipped: list[UnusedFrame], reporter: Reporter) -> None:
+def _report_pictures(copies: list[PhotoCopy], skipped: list[UnusedFrame], reporter: Reporter) -> None:
     for line in skipped:
         reporter.message(str(line))
     sizes = sorted({p.size for p in copies})
     shown = ", ".join(f"{w} x {h}" for w, h in sizes[:4]) + (", ..." if len(sizes) > 4 else "")
-    reporter.message(f"{len(copies)} pictures of {shown} pixels")
+    reporter.message(f"{len(copies)} images of {shown} pixels")
 
 
 def _report(
-    copies: list[PhotoCopy], unregistered: list[str], skipped: list[UnusedFrame], found: Reconstruction, options: PoseOptions
+    copies: list[PhotoCopy],
+    unregistered: list[str],
+    skipped: list[UnusedFrame],
+    reconstruction: Reconstruction,
+    options: PoseOptions,
 ) -> dict:
-    up = found.up
+    up = reconstruction.up
     return {
-        "registered": found.models[0],
+        "registered": reconstruction.models[0],
         "unregistered": unregistered,
         "skipped": {u.name: u.reason for u in skipped},
-        "other_parts": found.models[1:],
-        "reprojection_error_pixels": found.error,
+        "other_parts": reconstruction.models[1:],
+        "reprojection_error_pixels": reconstruction.error,
         "reprojection_error_at": options.max_image_size,
-        "points": found.num_points,
-        "cameras": found.lenses,
+        "points": reconstruction.num_points,
+        "cameras": reconstruction.lenses,
         "up": None
         if up is None
-        else {"roll_degrees": up.median_roll, "plane_share": up.plane_fraction, "plane_degrees_from_cameras": up.plane_angle},
+        else {
+            "roll_degrees": up.median_roll,
+            "plane_share": up.plane_fraction,
+            "plane_degrees_from_cameras": up.plane_angle,
+        },
         "seconds": {p.name: p.seconds for p in copies if p.seconds is not None},
         "seed": options.seed,
     }
 
 
-def _tell_result(result: PosesResult, found: Reconstruction, options: PoseOptions, reporter: Reporter) -> None:
+def _report_result(
+    result: PosesResult, reconstruction: Reconstruction, options: PoseOptions, reporter: Reporter
+) -> None:
     count = len(result.registered) + len(result.unregistered)
     reporter.message(
-        f"{len(result.registered)} of {count} pictures have a pose, {result.points:,} points; mean reprojection error "
-        f"{result.error:.2f} pixels, at a longer side of {options.max_image_size} at most"
+        f"{len(result.registered)} of {count} images have a pose, {result.points:,} points; mean reprojection "
+        f"error {result.error:.2f} pixels at a longer side of at most {options.max_image_size} pixels"
     )
     if result.unregistered:
         reporter.message(f"without a pose: {format_names(result.unregistered)}")
-    if found.up is None:
-        reporter.message("up was not looked for")
+    if reconstruction.up is None:
+        reporter.message("the up direction was not estimated")
     else:
-        reporter.message(f"turned so that up is +z: {found.up}")
-        if not found.up.is_reliable:
-            reporter.warn("the cameras do not agree on what is up; look at poses.png, or leave it with --no-orient")
-    spread = float(np.max(np.ptp(found.to_world[:, :3, 3], axis=0)))
+        reporter.message(f"rotated so that up is +z: {reconstruction.up}")
+        if not reconstruction.up.is_reliable:
+            reporter.warn("the cameras disagree on the up direction; check poses.png, or use --no-orient")
+    spread = float(np.max(np.ptp(reconstruction.to_world[:, :3, 3], axis=0)))
     reporter.message(
-        f"lengths have no unit (the cameras spread over {spread:.3g}); nerg train radiance gives them one by --scale"
+        f"lengths are in arbitrary units (the cameras span {spread:.3g}); set the scale with --scale of nerg "
+        "train radiance"
     )
-    others = [part for part in found.models[1:] if set(part) - set(result.registered)]
-    if others:
+    other_models = [part for part in reconstruction.models[1:] if set(part) - set(result.registered)]
+    if other_models:
         reporter.warn(
-            f"the pictures fall into parts that nothing connects; the largest was kept, another has {len(others[0])} "
-            f"({format_names(others[0])}); take pictures between them"
+            f"the images form several unconnected models; the largest was kept, another has {len(other_models[0])} "
+            f"images ({format_names(other_models[0])}); take images that connect them"
         )
     if 2 * len(result.registered) < count:
-        reporter.warn(f"less than half of the pictures have a pose; {_ADVICE}")
+        reporter.warn(f"less than half of the images have a pose; {_ADVICE}")
     reporter.message(
-        f"wrote {result.output} (poses.png shows it); next: nerg train radiance {result.output} -o FIELD.safetensors"
+        f"wrote {result.output} (see poses.png); next: nerg train radiance {result.output} -o FIELD.safetensors"
     )

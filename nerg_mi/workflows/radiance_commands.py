@@ -1,17 +1,15 @@
-"""``nerg poses``: Find out from where photos, or frames of a video, were taken.
-``nerg train radiance``: Train a radiance field on posed pictures, and report the error on those held out.
-``nerg eval radiance``: PSNR and SSIM on held-out views, and the error of depth where it is known, rendered by the
-integrator.
+"""``nerg poses``: Estimate the camera poses of photos or video frames.
+``nerg train radiance``: Train a radiance field on posed photos and report the error on held-out views.
+``nerg eval radiance``: Score a radiance field on held-out views: PSNR, SSIM and, where it is known, depth error.
 ``nerg import``: Convert checkpoints of torch-ngp and of the NeRG paper's authors.
-``nerg export mesh``: A mesh by marching cubes, with vertex colours: .ply or .glb.
-``nerg export points``: A cloud of surface points with normals and colours: .ply or .glb.
-``nerg export splats``: Gaussian splats on the surface, with its colours: .ply, for viewers of splats and the volume
-"splats".
-``nerg export volume``: Density, and colour, as Mitsuba grid volumes (.vol).
-``nerg export torch-ngp``: A torch-ngp checkpoint (.pth), of a field whose grid and networks have torch-ngp's shapes.
-``nerg refine``: Find more closely where a radiance field holds matter, so that it renders faster.
+``nerg export mesh``: Extract a mesh with vertex colours by marching cubes (.ply, .glb).
+``nerg export points``: Sample surface points with normals and colours (.ply, .glb).
+``nerg export splats``: Place Gaussian splats on the surface (.ply), for splat viewers and the volume "splats".
+``nerg export volume``: Sample density and colour on a grid, as Mitsuba grid volumes (.vol).
+``nerg export torch-ngp``: Write a torch-ngp checkpoint (.pth), for fields whose grid and networks fit its layout.
+``nerg refine``: Compute a finer occupancy grid of a radiance field, so that it renders faster.
 
-What these commands take; their workflows run in `.poses`, `.train_radiance` and `.export`.
+Options of these commands. The workflows are in `.poses`, `.train_radiance` and `.export`.
 """
 
 from __future__ import annotations
@@ -19,108 +17,170 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from nerg_mi.ranges import LENGTHS, SECONDS, SEEDS, SPP, POSITIVE_VALUES, ValidatedDataclass, Range
+from nerg_mi.ranges import LENGTHS, POSITIVE_VALUES, SECONDS, SPP, Range, ValidatedDataclass
 from nerg_mi.train.radiance_settings import RadianceSettings
 
 from .base import argument, declare, extra, out
-from .options import DerivedOptions, coordinates, cpu_threads, expose_settings, llvm_variant, option, repeat_options
+from .options import (
+    INPUT,
+    MODEL,
+    OUTPUT,
+    PERFORMANCE,
+    TEST,
+    TRAINING,
+    DerivedOptions,
+    coordinates,
+    cpu_threads,
+    expose_settings,
+    llvm_variant,
+    option,
+    random_seed,
+)
 
 # ---- From photos to a field ----
 
 
 @dataclass(frozen=True, kw_only=True)
 class PoseOptions(ValidatedDataclass):
-    """How the poses of photos are found."""
+    """Options of ``nerg poses``."""
 
     num_frames: int = option(
-        80, "Of a video: frames to take, each the sharpest of an equally long stretch.", within=Range(3, 10**6)
+        80,
+        "Number of frames taken from a video; each is the sharpest of an equally long interval.",
+        within=Range(3, 10**6),
+        group=INPUT,
     )
     max_image_size: int = option(
-        960, "Longer side, in pixels, of the copies that features are found in.", within=Range(64, 65536)
+        960,
+        "Length in pixels of the longer side to which images are reduced for feature extraction.",
+        within=Range(64, 65536),
+        group=PERFORMANCE,
     )
     matching: str = option(
-        "auto", "Pictures to compare: exhaustive (all), sequential (in order), auto (all up to 100, else in order)."
+        "auto",
+        "Which image pairs are matched: exhaustive (all pairs), sequential (neighbours), or auto (exhaustive up to 100 "
+        "images, else sequential).",
+        group=PERFORMANCE,
     )
     camera_model: str = option(
         "auto",
-        "What is found of a lens: radial (f, k1), opencv (fx, fy, k1, k2, p1, p2), auto (opencv from 10 photos on).",
+        "Lens parameters that are estimated: radial (f, k1), opencv (fx, fy, k1, k2, p1, p2), or auto (opencv from 10 "
+        "photos on, else radial).",
+        group=MODEL,
     )
     single_camera: bool = option(
-        True, "Photos of equal size (and maker, model, focal length, where told) share a camera; else each has its own."
+        True,
+        "Share one camera among photos of equal size, and of equal maker, model and focal length if these are stored; "
+        "else each photo has its own.",
+        group=MODEL,
     )
-    allow_outside: bool = option(False, "Follow links that lead out of the folder of photos.")
-    orient: bool = option(True, "Turn the place so that up is +z, as far as cameras and a floor tell.")
-    seed: int = option(0, "Seed of what is drawn at random.", within=SEEDS)
+    allow_outside: bool = option(False, "Follow links that lead outside the folder of photos.", group=INPUT)
+    orient: bool = option(
+        True, "Rotate the scene so that up is +z, estimated from the cameras and a floor plane.", group=OUTPUT
+    )
+    seed: int = random_seed("feature matching and reconstruction")
     threads: int | None = cpu_threads()
 
 
 declare(
     "poses",
     "nerg_mi.workflows.poses:find_poses",
-    "Find out from where photos were taken, or frames of a video, and write them as a capture for nerg train radiance.",
+    "Estimate the camera poses of photos or video frames, and write them as a folder for nerg train radiance.",
     more='Needs pycolmap, and PyAV for videos: pip install "nerg-mi[poses]".',
     options=PoseOptions,
     pictures=argument("Folder of photos (JPEG, PNG), or a video.", metavar="PHOTOS|VIDEO"),
-    output=out("Folder to make: a capture with poses."),
+    output=out("Folder to create: photos with their poses."),
 )
 
 
 @dataclass(frozen=True, kw_only=True)
 class PhotoOptions(ValidatedDataclass):
-    """How a posed image set is read."""
+    """How posed photos are read."""
 
     holdout: int | None = option(
-        None, "Hold out every so many frames, 0 none. Default: transforms_test.json, else 8.", within=Range(0, 10**6)
+        None,
+        "Hold out every N-th photo for testing; 0 holds out none.  [default: those of transforms_test.json, else 8]",
+        within=Range(0, 10**6),
+        group=TEST,
     )
     width: int | None = option(
-        None, "Width of the pictures in pixels. Default: as they are, or as it was trained.", within=Range(1, 65536)
+        None,
+        "Width in pixels to which photos are resized.  [default: their own width; for nerg eval, that of the training]",
+        within=Range(1, 65536),
+        group=INPUT,
     )
     scale: float = option(
-        1.0, "Multiply all lengths by this: what a unit of the data set measures, in metres.", within=LENGTHS
+        1.0,
+        "Length of one unit of the data set in metres; all lengths are multiplied by it.",
+        within=LENGTHS,
+        group=INPUT,
     )
     coordinates: str = option(
         "file",
-        "Of the field: file, upright (+z up), original (applied_transform undone), a dataparser_transforms.json.",
+        "Coordinate frame of the field: file (as in the data set), upright (+z up), original (without "
+        "applied_transform), or the path of a dataparser_transforms.json.",
+        group=INPUT,
     )
-    depth: bool = option(True, "Use the data set's depth, where it has any.")
-    allow_outside: bool = option(False, "Read files outside of the data set's folder too, where it names them.")
+    depth: bool = option(True, "Use the depth images of the data set, if there are any.", group=INPUT)
+    allow_outside: bool = option(
+        False, "Also read files outside the folder of the data set if it refers to them.", group=INPUT
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
 @expose_settings(RadianceSettings)
 class RadianceOptions(DerivedOptions, PhotoOptions):
-    """How a radiance field is trained."""
+    """Options of ``nerg train radiance``."""
 
-    size: str = option("small", "Size of the field: small, medium or paper.")
-    deferred: bool = option(False, "Ask the colour network once a ray, not at every sample: faster frames.")
+    size: str = option("small", "Size of the field: small, medium or paper.", group=MODEL)
+    deferred: bool = option(
+        False,
+        "Deferred shading: evaluate the colour network once per ray and not at each sample, for faster rendering.",
+        group=MODEL,
+    )
     downscale: float | None = option(
-        None, "In place of a width: divide the pictures' size by this.", within=Range(1, 1000)
+        None, "Factor by which photos are reduced, in place of --width.", within=Range(1, 1000), group=INPUT
     )
     aabb: tuple[float, ...] | None = coordinates(
-        "Bounds of what is seen: x0,y0,z0,x1,y1,z1, in the coordinates of the field."
+        "Axis-aligned bounding box of the scene, x0,y0,z0,x1,y1,z1, in the frame of the field.  [default: derived from "
+        "the points and cameras]",
+        group=MODEL,
     )
     unbounded: bool | None = option(
         None,
-        "Whether anything is to be seen beyond those bounds. Default: as the points tell, and no without any.",
+        "Whether there is anything to see beyond the bounding box.  [default: derived from the points; bounded without "
+        "any]",
         "--unbounded/--bounded",
+        group=MODEL,
     )
     threads: int | None = cpu_threads()
-    half: bool = option(False, "Store the weights in fp16.")
-    resume: bool = option(False, "Go on with the interrupted run of this output.")
+    half: bool = option(False, "Store the weights in half precision (fp16).", group=OUTPUT)
+    resume: bool = option(False, "Resume the interrupted training of this output file.", group=TRAINING)
     save_every: float = option(
-        60.0, "Seconds between two states for --resume; 0: only one, when it ends early.", within=SECONDS
+        60.0,
+        "Interval in seconds between two saved states for --resume; 0 saves only when training is interrupted.",
+        within=SECONDS,
+        group=TRAINING,
     )
     mode: str = llvm_variant()
 
 
 @dataclass(frozen=True, kw_only=True)
 class RadianceScoreOptions(PhotoOptions):
-    """On which views a radiance field is scored, and how they are rendered. The photos are read as in its training."""
+    """Options of ``nerg eval radiance``. Photos are read as in the training."""
 
-    train: bool = option(False, "Score the training views instead.")
-    spp: int = option(16, "Rays a pixel. The scatter of few is part of the score.", within=SPP)
-    pictures: Path | None = option(None, "Folder for the pictures, each beside its photo.", "-o", "--output")
-    json_file: Path | None = option(None, "Write the scores to this file.", "--json")
+    train: bool = option(False, "Score the training views in place of the held-out views.", group=TEST)
+    spp: int = option(
+        16, "Samples per pixel. The noise of few samples lowers the scores.", within=SPP, group=PERFORMANCE
+    )
+    pictures: Path | None = option(
+        None,
+        "Folder for the rendered images, each next to its photo.  [default: FIELD.eval]",
+        "-o",
+        "--output",
+        group=OUTPUT,
+    )
+    json_file: Path | None = option(None, "JSON file to write the scores to.", "--json", group=OUTPUT)
     threads: int | None = cpu_threads()
     mode: str = llvm_variant()
 
@@ -129,102 +189,132 @@ declare(
     "train radiance",
     "nerg_mi.workflows.train_radiance:train_radiance",
     options=RadianceOptions,
-    dataset=argument("Folder of posed photos, its transforms.json, or a COLMAP model."),
-    output=out("Checkpoint to write (.safetensors)."),
+    dataset=argument("Posed photos: their folder, its transforms.json, or a COLMAP model."),
+    output=out("Radiance field to write (.safetensors)."),
 )
 
 declare(
     "eval radiance",
     "nerg_mi.workflows.train_radiance:evaluate_beside",
-    more="The pictures are written into FIELD.eval where no other folder is given.",
     options=RadianceScoreOptions,
-    field=argument("Checkpoint of a radiance field (.safetensors)."),
-    dataset=argument("Posed image set with the views to compare with."),
+    field=argument("Radiance field (.safetensors)."),
+    dataset=argument("Posed photos to compare with: their folder, its transforms.json, or a COLMAP model."),
 )
 
 
-# ---- To and from other programs ----
+# ---- Conversion from and to other programs ----
 
 
 @dataclass(frozen=True, kw_only=True)
 class CheckpointImportOptions(ValidatedDataclass):
-    """What a checkpoint does not say of itself, and how its fields are stored."""
+    """Options of ``nerg import``: what a checkpoint does not store, and how fields are written."""
 
     ema: bool | None = option(
-        None, "Moving averages of the weights, or the weights.  [default: averages, if there are any]", "--ema/--no-ema"
+        None,
+        "Import the exponential moving averages of the weights, or the last weights.  [default: averages if there are "
+        "any]",
+        "--ema/--no-ema",
+        group=INPUT,
     )
-    color_space: str = option("srgb", "What --color_space was in training: srgb or linear.")
+    color_space: str = option("srgb", "Value of --color_space in the original training: srgb or linear.", group=INPUT)
     bg_radius: float | None = option(
         None,
-        "What --bg_radius was in training, where there is a background network; 0: leave it out.",
+        "Value of --bg_radius in the original training, needed if there is a background network; 0 leaves the network "
+        "out.",
         within=Range(0, 10**6),
+        group=INPUT,
     )
     finest_resolution: int | None = option(
-        None, "Finest resolution of the hash grid.  [default: 2048 x bound]", within=Range(2, 1 << 24)
+        None,
+        "Finest resolution of the hash grid in cells.  [default: 2048 times the bound]",
+        within=Range(2, 1 << 24),
+        group=INPUT,
     )
-    half: bool = option(False, "Store the weights in fp16.")
+    half: bool = option(False, "Store the weights in half precision (fp16).", group=OUTPUT)
     mode: str = llvm_variant()
 
 
 @dataclass(frozen=True, kw_only=True)
 class RefineOptions(ValidatedDataclass):
-    """On what a bound is refined."""
+    """Options of ``nerg refine``."""
 
     mode: str = llvm_variant()
 
 
 @dataclass(frozen=True, kw_only=True)
 class LatticeOptions(ValidatedDataclass):
-    """Where a radiance field is evaluated."""
+    """The grid on which a radiance field is sampled."""
 
-    resolution: int = option(256, "Lattice cells along the longest edge of the field's box.", within=Range(2, 2048))
+    resolution: int = option(
+        256,
+        "Number of grid cells along the longest edge of the field's bounding box.",
+        within=Range(2, 2048),
+        group=MODEL,
+    )
     mode: str = llvm_variant()
 
 
 @dataclass(frozen=True, kw_only=True)
-class IsosurfaceOptions(LatticeOptions):
-    """Where the surface of a field lies."""
+class ThresholdOptions(LatticeOptions):
+    """Density at which a surface is extracted."""
 
-    density: float | None = option(
+    density_threshold: float | None = option(
         None,
-        "Density, 1/unit, at which the surface lies.  [default: half of the light absorbed in a cell]",
+        "Density of the extracted surface in 1/unit.  [default: absorbs half of the light across a grid cell]",
         within=POSITIVE_VALUES,
+        group=MODEL,
     )
-    up: str = option("z", "Up axis of the field, for .glb: z or y.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class IsosurfaceOptions(ThresholdOptions):
+    """How a surface is extracted and written."""
+
+    up: str = option("z", "Up axis of the field, z or y. It is turned to +y in .glb files.", group=OUTPUT)
 
 
 @dataclass(frozen=True, kw_only=True)
 class MeshOptions(IsosurfaceOptions):
-    """What is left out of a mesh, and what is added to it."""
+    """Options of ``nerg export mesh``."""
 
-    fill_holes: int = option(1, "Close holes of up to twice so many cells; 0: none.", within=Range(0, 2048))
-    min_component_area: float = option(0.001, "Drop pieces with less than this share of the largest one's area.", within=Range(0, 1))
-    keep_unseen: bool = option(False, "Keep the backs and insides that training never looked at.")
+    fill_holes: int = option(
+        1, "Close holes of up to twice this number of grid cells; 0 closes none.", within=Range(0, 2048), group=MODEL
+    )
+    min_component_area: float = option(
+        0.001,
+        "Smallest area of a connected component, as a fraction of the largest one; smaller components are removed.",
+        within=Range(0, 1),
+        group=MODEL,
+    )
+    keep_unseen: bool = option(
+        False, "Keep surfaces that no training view saw, such as backs and insides.", group=MODEL
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
 class PointOptions(IsosurfaceOptions):
-    """Which points of a surface are written."""
+    """Options of ``nerg export points``."""
 
-    max_points: int | None = option(None, "Points at most.  [default: all]", within=Range(1, 10**9))
+    max_points: int | None = option(
+        None, "Maximum number of points.  [default: all]", within=Range(1, 10**9), group=OUTPUT
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
-@repeat_options(IsosurfaceOptions, "density")
-class SplatOptions(DerivedOptions, LatticeOptions):
-    """How many Gaussians a surface becomes, and where it lies."""
+class SplatOptions(ThresholdOptions):
+    """Options of ``nerg export splats``."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class VolumeOptions(LatticeOptions):
-    """What a grid volume holds."""
+    """Options of ``nerg export volume``."""
 
-    color: Path | None = option(None, "Also write the colour, to this .vol file.")
+    color: Path | None = option(None, "Second file (.vol), for the colour.  [default: not written]", group=OUTPUT)
 
 
 @dataclass(frozen=True, kw_only=True)
 class TorchNgpOptions(ValidatedDataclass):
-    """How a field is read that becomes a torch-ngp checkpoint."""
+    """Options of ``nerg export torch-ngp``."""
 
     mode: str = llvm_variant()
 
@@ -232,34 +322,63 @@ class TorchNgpOptions(ValidatedDataclass):
 declare(
     "import",
     "nerg_mi.workflows.export:import_to_files",
-    "Convert a checkpoint to the fields of the volumes `nerf` and `gazefield`. Nothing in the file is run.",
+    "Convert a checkpoint to radiance and gaze fields, for the volumes `nerf` and `gazefield`. No code in the file is "
+    "executed.",
     options=CheckpointImportOptions,
     file=argument("Checkpoint (.pth) of torch-ngp, or of the NeRG paper's authors."),
     output=out("Radiance field to write (.safetensors).", default=None),
-    gaze=extra(None, "Gaze field to write (.safetensors).", Path, "-g", "--gaze"),
+    gaze=extra(None, "Gaze field to write (.safetensors).", Path, "-g", "--gaze", group=OUTPUT),
 )
 
-_FIELD, _FILE = argument("Radiance field (.safetensors)."), out("File to write.")
-
-declare("export mesh", "nerg_mi.workflows.export:export_mesh", options=MeshOptions, field=_FIELD, output=_FILE)
-
-declare("export points", "nerg_mi.workflows.export:export_points", options=PointOptions, field=_FIELD, output=_FILE)
-
-declare("export splats", "nerg_mi.workflows.export:export_splats", options=SplatOptions, field=_FIELD, output=_FILE)
-
-declare("export volume", "nerg_mi.workflows.export:export_volume", options=VolumeOptions, field=_FIELD, output=_FILE)
+_FIELD = argument("Radiance field (.safetensors).")
 
 declare(
-    "export torch-ngp", "nerg_mi.workflows.export:export_torch_ngp", options=TorchNgpOptions, field=_FIELD, output=_FILE
+    "export mesh",
+    "nerg_mi.workflows.export:export_mesh",
+    options=MeshOptions,
+    field=_FIELD,
+    output=out("Mesh to write (.ply or .glb)."),
+)
+
+declare(
+    "export points",
+    "nerg_mi.workflows.export:export_points",
+    options=PointOptions,
+    field=_FIELD,
+    output=out("Point cloud to write (.ply or .glb)."),
+)
+
+declare(
+    "export splats",
+    "nerg_mi.workflows.export:export_splats",
+    options=SplatOptions,
+    field=_FIELD,
+    output=out("Gaussian splats to write (.ply)."),
+)
+
+declare(
+    "export volume",
+    "nerg_mi.workflows.export:export_volume",
+    options=VolumeOptions,
+    field=_FIELD,
+    output=out("Grid volume of the density to write (.vol)."),
+)
+
+declare(
+    "export torch-ngp",
+    "nerg_mi.workflows.export:export_torch_ngp",
+    options=TorchNgpOptions,
+    field=_FIELD,
+    output=out("Checkpoint to write (.pth)."),
 )
 
 declare(
     "refine",
     "nerg_mi.workflows.export:refine_checkpoint",
-    "Find more closely where a trained field holds matter, so that it renders with fewer evaluations.",
-    more="Fields that are trained or imported now have it. Weights stay as they are, and gaze fields know the new "
-    "file.",
+    "Compute a finer occupancy grid of a radiance field, so that it renders with fewer evaluations.",
+    more="Training and nerg import compute this grid already; the command is for older files. The weights do not "
+    "change, and gaze fields that were trained in the field accept the new file.",
     options=RefineOptions,
-    field=argument("Radiance field (.safetensors)."),
+    field=_FIELD,
     output=out("Radiance field to write (.safetensors)."),
 )

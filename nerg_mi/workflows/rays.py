@@ -1,4 +1,4 @@
-"""Tracking files to rays: importing, filtering, splitting and plotting sets and datasets of them."""
+"""Workflows of rays: import of tracking files, filtering, splitting and plotting of rays and datasets."""
 
 from __future__ import annotations
 
@@ -17,13 +17,22 @@ from nerg_mi.figures.style import existing_files, make_provenance
 from nerg_mi.files.atomic import check_new_folder, check_writable, create_folder_atomically
 from nerg_mi.files.tables import write_json
 from nerg_mi.rays import filters
-from nerg_mi.rays.dataset import MAX_LOADED_RAYS, BYTES_PER_RAY, UNKNOWN, Conditions, RayDataset, is_dataset, load_rays, write_dataset_manifest
-from nerg_mi.rays.dataset_write import ImportRecipe, SourceWriter, DatasetUpdate, update_dataset
+from nerg_mi.rays.dataset import (
+    BYTES_PER_RAY,
+    MAX_LOADED_RAYS,
+    UNKNOWN,
+    Conditions,
+    RayDataset,
+    is_dataset,
+    load_rays,
+    write_dataset_manifest,
+)
+from nerg_mi.rays.dataset_write import DatasetUpdate, ImportRecipe, SourceWriter, update_dataset
 from nerg_mi.rays.guess import Proposal, propose_imports
 from nerg_mi.rays.pseudonyms import pseudonymise, read_salt
 from nerg_mi.rays.quality import RaysSummary, format_quality_report, summarise, summarise_dataset
 from nerg_mi.rays.rays import SUFFIXES, Rays, merge_rays
-from nerg_mi.rays.readers.registry import TABLE, parse_options, read_rays, get_reader
+from nerg_mi.rays.readers.registry import TABLE, get_reader, parse_options, read_rays
 
 from .base import SILENT, Reporter
 from .rays_commands import DATASET, FilterOptions, PlotOptions, RaysImportOptions, SplitOptions
@@ -32,97 +41,104 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# ---- What a filter does to rays, step by step: conditions, fixations, thinning, a sample ----
+# ---- Steps of a filter: conditions, fixations, thinning, a sample ----
 
 
 @dataclass(frozen=True)
 class FilterStep:
-    """A step that was taken: what the metadata of rays keep of it."""
+    """A completed step, as stored in the metadata of rays."""
 
     name: str
     kept: int
     of: int
-    about: dict[str, Any]
+    settings: dict[str, Any]
 
 
 class FilterSteps:
-    """Rays to which one thing after the other is done.
+    """Applies filter steps to rays one after the other.
 
-    ``own``: whether nobody else holds the rays, which then lose them. ``strict``: whether a step that leaves none is an
-    error; without it what is left of nothing is nothing.
+    ``own`` tells whether the rays are not used elsewhere, so that they may be modified in place. ``strict`` makes a
+    step that selects no ray an error.
     """
 
-    def __init__(self, rays: Rays, *, own: bool, reporter: Reporter = SILENT, strict: bool = True) -> None:
+    def __init__(self, rays: Rays, *, in_place: bool, reporter: Reporter = SILENT, strict: bool = True) -> None:
         self.rays, self.taken = rays, list[FilterStep]()
-        self._own, self._reporter, self._strict = own, reporter, strict
+        self._in_place, self._reporter, self._strict = in_place, reporter, strict
 
     def select(self, conditions: dict[str, Any]) -> None:
-        """Keep what meets ``conditions``, those of `nerg_mi.rays.filters.select_mask`."""
-        self._keep(filters.select_mask(self.rays, **conditions), "filter", conditions)
+        """Select rays by ``conditions``, see `nerg_mi.rays.filters.select_mask`."""
+        self._select_mask(filters.select_mask(self.rays, **conditions), "filter", conditions)
 
     def follow(self, options: FilterOptions) -> int | None:
-        """Keep fixations, and fewer of those who stand still, as ``options`` say; how many fixations there are."""
+        """Select fixations and thin out stationary periods as in ``options``; return the number of fixations."""
         count = None
         if options.fixations is not None:
             count = self._fixations(options)
         if options.thin is not None:
-            about = {"seconds": options.thin, "distance": options.thin_distance}
-            there = len(self.rays) > 0
-            self._keep(filters.thin_mask(self.rays, **about) if there else np.zeros(0, bool), "thin", about)
+            settings = {"seconds": options.thin, "distance": options.thin_distance}
+            has_rays = len(self.rays) > 0
+            self._select_mask(
+                filters.thin_mask(self.rays, **settings) if has_rays else np.zeros(0, bool), "thin", settings
+            )
         return count
 
     def sample(self, n: int, seed: int) -> None:
-        """Keep ``n`` rays, each as likely as any other."""
-        lot = np.random.default_rng(seed).random(len(self.rays))
-        self._keep(smallest_mask(lot, n), "sample", {"seed": seed})
+        """Select ``n`` rays uniformly at random."""
+        numbers = np.random.default_rng(seed).random(len(self.rays))
+        self._select_mask(smallest_mask(numbers, n), "sample", {"seed": seed})
 
     def _fixations(self, options: FilterOptions) -> int:
         by_velocity = options.fixations == "ivt"
-        limit = {"velocity": options.velocity_threshold} if by_velocity else {"dispersion": options.dispersion_threshold}
-        limit |= {} if options.min_fixation is None else {"least": options.min_fixation}
+        detect = filters.detect_fixations_ivt if by_velocity else filters.detect_fixations_idt
+        threshold = {"velocity": options.velocity_threshold}
+        if not by_velocity:
+            threshold = {"dispersion": options.dispersion_threshold}
+        duration = {} if options.min_fixation is None else {"min_duration": options.min_fixation}
         label = np.zeros(0, np.int64)
         if len(self.rays):
-            label = (filters.detect_fixations_ivt if by_velocity else filters.detect_fixations_idt)(self.rays, **limit)
+            label = detect(self.rays, **threshold, **duration)
         count = len(np.unique(label[label >= 0]))
         self._reporter.message(f"{count:,} fixations ({options.fixations})")
-        about = {"by": options.fixations, **limit}
+        settings = {"by": options.fixations, **threshold}
+        # The key of the metadata.
+        settings |= {} if options.min_fixation is None else {"least": options.min_fixation}
         if options.merge_fixations:
-            self._replace(label, {**about, "one_ray": True})
+            self._replace(label, {**settings, "one_ray": True})
         else:
-            self._keep(label >= 0, "fixations", about)
+            self._select_mask(label >= 0, "fixations", settings)
         return count
 
-    def _replace(self, label: np.ndarray, about: dict[str, Any]) -> None:
-        """Go on with a ray for each fixation."""
+    def _replace(self, label: np.ndarray, settings: dict[str, Any]) -> None:
+        """Replace the rays by one ray for each fixation."""
         before = len(self.rays)
         rays = filters.average_fixations(self.rays, label)[0] if before else self.rays
-        self._reporter.message(f"fixations: one ray each, {len(rays):,} of {before:,} rays")
-        self._take(rays, FilterStep("fixations", len(rays), before, about))
+        self._reporter.message(f"fixations: mean rays, {len(rays):,} of {before:,} rays")
+        self._apply(rays, FilterStep("fixations", len(rays), before, settings))
 
-    def _keep(self, mask: np.ndarray, name: str, about: dict[str, Any]) -> None:
-        """Keep the rays of a mask (N,); in their own memory, if nobody else holds them."""
+    def _select_mask(self, mask: np.ndarray, name: str, settings: dict[str, Any]) -> None:
+        """Select the rays of a mask (N,), in place if the rays are not used elsewhere."""
         rays, count = self.rays, int(mask.sum())
         if not count and self._strict:
-            raise NergError(f"{name} leaves none of {len(rays):,} rays; widen its conditions")
+            raise NergError(f"{name} selects none of {len(rays):,} rays; widen its conditions")
         self._reporter.message(f"{name}: {count:,} of {len(rays):,} rays")
-        kept = rays.filter_in_place(mask) if self._own else rays.select(mask)
-        self._take(kept, FilterStep(name, count, len(rays), about))
+        selected = rays.filter_in_place(mask) if self._in_place else rays.select(mask)
+        self._apply(selected, FilterStep(name, count, len(rays), settings))
 
-    def _take(self, rays: Rays, step: FilterStep) -> None:
-        self.rays = rays.with_step(step=step.name, kept=step.kept, of=step.of, **step.about)
-        self._own = True
+    def _apply(self, rays: Rays, step: FilterStep) -> None:
+        self.rays = rays.with_step(step=step.name, kept=step.kept, of=step.of, **step.settings)
+        self._in_place = True
         self.taken.append(step)
 
 
-def smallest_mask(lot: np.ndarray, n: int) -> np.ndarray:
-    """The ``n`` least of the numbers ``lot`` (N,), as a mask; all, where there are no more."""
-    mask = np.ones(len(lot), bool)
-    if n < len(lot):
-        mask[np.argpartition(lot, n)[n:]] = False
+def smallest_mask(numbers: np.ndarray, n: int) -> np.ndarray:
+    """Return a mask of the ``n`` smallest of the numbers ``lot`` (N,), or of all if there are fewer."""
+    mask = np.ones(len(numbers), bool)
+    if n < len(numbers):
+        mask[np.argpartition(numbers, n)[n:]] = False
     return mask
 
 
-# ---- Datasets of rays: tracking files imported into one, its sanity cards, and some of its rays ----
+# ---- Datasets: import, data-quality reports, and filtering ----
 
 
 FileName = str | os.PathLike
@@ -130,9 +146,10 @@ Card = tuple[Rays, RaysSummary, tuple[tuple[str, str], ...]]
 
 
 def import_dataset(files: Sequence[FileName], options: RaysImportOptions, reporter: Reporter) -> Card:
-    """Import ``files`` into the dataset ``options.output``, each unless it is there unchanged; the card of their place.
+    """Import ``files`` into the dataset ``options.output``, except those that are there unchanged.
 
-    Raises `NergError` where some could not be imported, after the others were.
+    Returns the data-quality report of their environment. Raises `NergError` if some files could not be imported, after
+    all others were.
     """
     folder, place = Path(options.output or ""), options.environment or UNKNOWN
     key = None
@@ -153,26 +170,36 @@ def import_dataset(files: Sequence[FileName], options: RaysImportOptions, report
         done.append(name)
         reporter.progress(min(len(done) / len(files), 1.0), f"imported {name}")
 
-    found = update_dataset(folder, [Path(f) for f in files], recipe, options.workers or os.cpu_count() or 1, tell)
-    _tell(found, reporter)
-    if found.errors:
-        more = f" ({len(found.errors)} of {len(files)} could not be imported; the others are)" if len(files) > 1 else ""
-        raise NergError(found.errors[0] + more)
+    update = update_dataset(folder, [Path(f) for f in files], recipe, options.workers or os.cpu_count() or 1, tell)
+    _report_update(update, reporter)
+    if update.errors:
+        count_note = (
+            f" ({len(update.errors)} of {len(files)} files could not be imported; the others were)"
+            if len(files) > 1
+            else ""
+        )
+        raise NergError(update.errors[0] + count_note)
     return summarise_dataset(RayDataset.open(folder).select_place(place))
 
 
-def _tell(found: DatasetUpdate, reporter: Reporter) -> None:
-    """What an import came to, in a line."""
-    parts = [f"imported {found.num_imported:,} sources, {found.num_rays:,} rays" if found.num_imported else "nothing to import"]
-    parts += [
-        f"{count:,} {what}" for count, what in ((found.num_unchanged, "unchanged"), (found.num_duplicates, "given twice")) if count
+def _report_update(update: DatasetUpdate, reporter: Reporter) -> None:
+    """Report what was imported, in one line."""
+    parts = [
+        f"imported {update.num_imported:,} sources, {update.num_rays:,} rays"
+        if update.num_imported
+        else "nothing to import"
     ]
-    parts += [f"{found.num_replaced:,} replaced"] if found.num_replaced else []
+    parts += [
+        f"{count:,} {what}"
+        for count, what in ((update.num_unchanged, "unchanged"), (update.num_duplicates, "given twice"))
+        if count
+    ]
+    parts += [f"{update.num_replaced:,} replaced"] if update.num_replaced else []
     reporter.message("; ".join(parts))
 
 
 def make_dataset_reports(path: FileName) -> Iterator[tuple[str, Card]]:
-    """Of each place of a dataset what to call it, and its card."""
+    """Yield a title and the data-quality report for each environment of a dataset."""
     dataset = RayDataset.open(path)
     for place in dataset.places:
         title = str(path) if len(dataset.places) == 1 else f"{path}: {place}"
@@ -180,16 +207,16 @@ def make_dataset_reports(path: FileName) -> Iterator[tuple[str, Card]]:
 
 
 def filter_dataset(path: FileName, options: FilterOptions, reporter: Reporter) -> tuple[Rays | None, int | None]:
-    """Some rays of a dataset, block by block, written to a file or another dataset; and how many fixations there are.
+    """Filter a dataset block by block, and write the result to a file or another dataset; count fixations.
 
-    Fixations and stays end where a part does, with a day or a source. The rays are None where they were written to a
-    dataset. Raises `NergError` where none are left, and for more rays than a file is made of.
+    Fixations and stationary periods end at the end of a part, that is of a day or a source. The returned rays are None
+    if they were written to a dataset. Raises `NergError` if no rays are selected, or more than a file can hold.
     """
     dataset, output = RayDataset.open(path), options.output
     steps = _Totals(len(dataset))
     if output is not None and Path(output).suffix.lower() == DATASET:
         if options.sample is not None:
-            raise NergError("a --sample is written to a file; let the name of the output end in .npz or .parquet")
+            raise NergError("--sample needs a file as output; use an output name that ends in .npz or .parquet")
         check_new_folder(output)
         with create_folder_atomically(output) as folder:
             _write_filtered(dataset, options, steps, folder)
@@ -202,28 +229,32 @@ def filter_dataset(path: FileName, options: FilterOptions, reporter: Reporter) -
         rays = dataset.sample(options.sample, options.seed)
         reporter.message(f"sample: {len(rays):,} of {len(dataset):,} rays")
     else:
-        found = _sampled(dataset, options, steps) if options.sample is not None else _all(dataset, options, steps)
+        blocks = (
+            _draw_sample(dataset, options, steps)
+            if options.sample is not None
+            else _load_selected(dataset, options, steps)
+        )
         steps.tell(options, reporter)
-        rays = merge_rays(found, dataset.metadata)
+        rays = merge_rays(blocks, dataset.metadata)
         for step in steps.steps:
-            rays = rays.with_step(step=step.name, kept=step.kept, of=step.of, **step.about)
+            rays = rays.with_step(step=step.name, kept=step.kept, of=step.of, **step.settings)
     if output is not None:
         rays.save(output)
     return rays, steps.fixations
 
 
 class _Totals:
-    """The steps of all blocks together."""
+    """Sums of the steps over all blocks."""
 
     def __init__(self, count: int) -> None:
         self._count, self._steps, self.fixations = count, list[FilterStep](), None
 
     def filtered(self, dataset: RayDataset, options: FilterOptions) -> Iterator[Rays]:
-        """What is left of each part of ``dataset``."""
+        """Yield the selected rays of each part of ``dataset``."""
         conditions = Conditions(**options.conditions)
         selected = FilterStep("filter", 0, self._count, options.conditions)
         for block in dataset.scan(conditions, whole_parts=options.follows):
-            steps = FilterSteps(block, own=True, strict=False)
+            steps = FilterSteps(block, in_place=True, strict=False)
             count = steps.follow(options)
             if count is not None:
                 self.fixations = (self.fixations or 0) + count
@@ -238,39 +269,39 @@ class _Totals:
         self._steps = [replace(a, kept=a.kept + b.kept, of=a.of + b.of) for a, b in zip(before, taken)]
 
     def add_last(self, step: FilterStep) -> None:
-        """Add a step that was taken by all blocks together."""
+        """Add a step that was applied to all blocks together."""
         self._steps.append(step)
 
     @property
     def steps(self) -> list[FilterStep]:
-        """Those of all blocks; what met conditions is of all rays, of which many were not read."""
+        """The steps over all blocks; conditions count all rays, many of which were not read."""
         return [replace(step, of=self._count) if step.name == "filter" else step for step in self._steps]
 
     def tell(self, options: FilterOptions, reporter: Reporter) -> None:
-        """Say what was kept. Raises `NergError` where nothing was."""
+        """Report what was selected. Raises `NergError` if nothing was."""
         if not self._steps or not self._steps[-1].kept:
-            raise NergError(f"nothing is left of {self._count:,} rays; widen the conditions")
+            raise NergError(f"none of {self._count:,} rays are selected; widen the conditions")
         if self.fixations is not None:
             reporter.message(f"{self.fixations:,} fixations ({options.fixations})")
         for step in self.steps:
             reporter.message(f"{step.name}: {step.kept:,} of {step.of:,} rays")
 
 
-def _all(dataset: RayDataset, options: FilterOptions, steps: _Totals) -> list[Rays]:
-    found, count = [], 0
+def _load_selected(dataset: RayDataset, options: FilterOptions, steps: _Totals) -> list[Rays]:
+    blocks, count = [], 0
     for block in steps.filtered(dataset, options):
-        found.append(block)
+        blocks.append(block)
         count += len(block)
         if count > MAX_LOADED_RAYS:
             raise NergError(
-                f"more than {MAX_LOADED_RAYS:,} rays are left, {MAX_LOADED_RAYS * BYTES_PER_RAY / 1e9:.2g} GB: narrow the conditions, add "
-                f"--sample, or write another dataset (-o NAME{DATASET})"
+                f"more than {MAX_LOADED_RAYS:,} rays are selected, {MAX_LOADED_RAYS * BYTES_PER_RAY / 1e9:.2g} "
+                f"GB: narrow the conditions, add --sample, or write a dataset (-o NAME{DATASET})"
             )
-    return found
+    return blocks
 
 
-def _sampled(dataset: RayDataset, options: FilterOptions, steps: _Totals) -> list[Rays]:
-    """As many rays as are asked for, each as likely as any other: those of the least of random numbers."""
+def _draw_sample(dataset: RayDataset, options: FilterOptions, steps: _Totals) -> list[Rays]:
+    """Return a uniform random sample of the selected rays: those with the smallest random numbers."""
     n, rng = options.sample or 0, np.random.default_rng(options.seed)
     held, lots, count = list[Rays](), list[np.ndarray](), 0
     limit = 1.0
@@ -280,57 +311,58 @@ def _sampled(dataset: RayDataset, options: FilterOptions, steps: _Totals) -> lis
         held.append(block.select(lot < limit))
         lots.append(lot[lot < limit])
         if sum(map(len, lots)) > 2 * n:
-            held, lots = _least(held, lots, n)
+            held, lots = _select_smallest(held, lots, n)
             limit = max(float(lot.max()) for lot in lots if len(lot))
-    held, _ = _least(held, lots, n)
+    held, _ = _select_smallest(held, lots, n)
     steps.add_last(FilterStep("sample", min(n, count), count, {"seed": options.seed}))
     return held
 
 
-def _least(held: list[Rays], lots: list[np.ndarray], n: int) -> tuple[list[Rays], list[np.ndarray]]:
-    """The ``n`` rays with the least numbers, in their blocks."""
+def _select_smallest(held: list[Rays], lots: list[np.ndarray], n: int) -> tuple[list[Rays], list[np.ndarray]]:
+    """Return the ``n`` rays with the smallest numbers, in their blocks."""
     mask = smallest_mask(np.concatenate(lots) if lots else np.zeros(0), n)
     masks = np.split(mask, np.cumsum([len(lot) for lot in lots])[:-1]) if lots else []
     return [rays.select(m) for rays, m in zip(held, masks)], [lot[m] for lot, m in zip(lots, masks)]
 
 
 def _write_filtered(dataset: RayDataset, options: FilterOptions, steps: _Totals, folder: Path) -> None:
-    """Write what is left of each source to a new dataset; its accounts last, since they tell the steps of all."""
+    """Write the selected rays of each source to a new dataset; metadata last, because it holds the sums of all steps.
+    Write the selected rays of each source to a new dataset; metadata last, because it holds the sums of all steps."""
     write_dataset_manifest(folder, replace(dataset.manifest, closed=True))
     writers = {source.id: SourceWriter(folder, source.id, dataset.manifest.buckets) for source in dataset.sources}
     for source, part in dataset.parts:
         for block in steps.filtered(replace(dataset, parts=((source, part),)), options):
             writers[source.id].add(block, part.place, part.day)
     for source in dataset.sources:
-        done = [{"step": s.name, "kept": s.kept, "of": s.of, **s.about} for s in steps.steps]
+        done = [{"step": s.name, "kept": s.kept, "of": s.of, **s.settings} for s in steps.steps]
         metadata = {**source.metadata, "steps": [*source.metadata.get("steps", []), *done]}
-        kept = {name: getattr(source, name) for name in ("file", "where", "stamp", "recipe", "generation")}
-        writers[source.id].finish(metadata, **kept)
+        source_fields = {name: getattr(source, name) for name in ("file", "where", "stamp", "recipe", "generation")}
+        writers[source.id].finish(metadata, **source_fields)
 
 
-# ---- Rays of attention from tracking files, and what is done to them: imported, summed up, filtered, split, drawn ----
+# ---- Rays: import, data-quality report, filter, split and plot ----
 
 
 @dataclass(frozen=True, eq=False)
 class ImportResult:
-    """Rays, whose metadata hold the account of what was dropped, and their figures.
+    """Imported rays, whose metadata list what was dropped, and their summary.
 
-    Of a dataset of more than a million they are a sample, as its metadata say, and the figures are of all of them.
+    For a dataset of more than a million rays, ``rays`` is a sample, as its metadata state; the summary covers all rays.
     """
 
     rays: Rays
     summary: RaysSummary
-    # Further lines of the card, of a dataset: names and texts.
+    # Further lines of the report of a dataset: names and texts.
     lines: tuple[tuple[str, str], ...] = ()
 
 
 def import_rays(
     files: FileName | Sequence[FileName], options: RaysImportOptions | None = None, reporter: Reporter = SILENT
 ) -> ImportResult:
-    """Tracking files (or folders, by the reader) as rays: right-handed, z up, metres, seconds.
+    """Read tracking files (or folders, depending on the reader) as rays: right-handed, z up, metres, seconds.
 
-    Raises `NergError` for what the reader refuses, or an output that cannot be written, before anything is read; for an
-    alignment with files whose frame is the other hand's.
+    Raises `NergError` for files that the reader rejects, for an output that is not writable, before anything is read,
+    and for an alignment to files in a left-handed frame.
     """
     options = options or RaysImportOptions()
     files = [files] if isinstance(files, (str, os.PathLike)) else list(files)
@@ -349,20 +381,20 @@ def import_rays(
     rays = read_rays(options.reader, files, options.settings, skip_bad_lines=options.skip_bad_lines, on_source=progress)
     if options.pseudonyms:
         rays = pseudonymise(rays, salt)
-    align = None if options.align_output is None else _to_files(rays)
+    align = None if options.align_output is None else _transform_to_files(rays)
     _save(rays, options.output)
     if options.align_output is not None:
         write_json(options.align_output, align)
     return ImportResult(rays, summarise(rays))
 
 
-def _to_files(rays: Rays) -> list[list[float]]:
-    """The similarity (4 rows) from rays to the frame of the files that they were made of, for --align."""
+def _transform_to_files(rays: Rays) -> list[list[float]]:
+    """Return the similarity (4 rows) from the rays to the frame of the input files, for --align."""
     back = np.linalg.inv(np.array(rays.metadata["transform"], np.float64))
     if np.linalg.det(back[:3, :3]) < 0:
         raise NergError(
-            "the files' frame is left-handed and that of rays right-handed, so that no similarity leads from one to "
-            "the other; leave out --write-align, and align the rays with the place"
+            "the frame of the files is left-handed and that of rays right-handed, so no similarity connects "
+            "them; leave out --align-output, and align the rays with the scene"
         )
     return (back + 0.0).tolist()
 
@@ -370,44 +402,48 @@ def _to_files(rays: Rays) -> list[list[float]]:
 def import_files(
     files: list[Path], preset: str | None, options: RaysImportOptions, reporter: Reporter, **settings: Any
 ) -> None:
-    """`import_rays` by a preset, or by a column map, with the sanity card."""
+    """Call `import_rays` with a preset or a column map, and print the data-quality report."""
     settings = {name: value for name, value in settings.items() if value is not None and value is not False}
     if (preset is None) == ("columns" not in settings):
-        raise NergError("say what the files are: either --preset NAME or --map COLUMNS")
+        raise NergError("the format of the files is not given: add --preset NAME or --map COLUMNS")
     reader = preset or TABLE
     options = replace(options, reader=reader, settings=parse_options(reader, settings))
     result = import_rays(files, options, reporter)
     reporter.message(format_quality_report(result.rays, result.summary, str(options.output), result.lines))
     for path in (options.output, options.align_output):
-        _tell_tracking(path, reporter)
+        _report_written(path, reporter)
 
 
 def guess_imports(files: Sequence[FileName], reporter: Reporter = SILENT) -> list[Proposal]:
-    """What unknown tracking files, or folders of them, are likely to be, and the commands to import them by: one for
-    all that are alike. Nothing is applied or written.
+    """Return the likely formats of unknown tracking files or folders, with import commands.
 
-    Raises `NergError` for a file that is no table, or is damaged.
+    There is one proposal for all files of a format. Nothing is imported or written. Raises `NergError` for files that
+    are not tables, or damaged.
     """
     reporter.progress(0.0, f"reading {Path(files[0]).name}")
     return propose_imports([Path(file) for file in files])
 
 
 def print_guesses(files: list[Path], reporter: Reporter) -> None:
-    """`guess_imports` in words. Names of columns are printed without control characters of a terminal."""
+    """Print the proposals of `guess_imports`; column names are printed without control characters."""
     proposals = guess_imports(files, reporter)
     for k, proposal in enumerate(proposals):
         if len(proposals) > 1:
-            more = f" and {len(proposal.paths) - 1} more" if len(proposal.paths) > 1 else ""
-            reporter.message("\n" * (k > 0) + sanitize(f"{proposal.paths[0]}{more}", 2000))
-        for name, sentences in (("sure", proposal.certain), ("guess", proposal.assumptions), ("open", proposal.questions)):
+            count_note = f" and {len(proposal.paths) - 1} more" if len(proposal.paths) > 1 else ""
+            reporter.message("\n" * (k > 0) + sanitize(f"{proposal.paths[0]}{count_note}", 2000))
+        for name, sentences in (
+            ("sure", proposal.certain),
+            ("guess", proposal.guesses),
+            ("open", proposal.questions),
+        ):
             for sentence in sentences:
                 reporter.message(f"{name:6} {sanitize(sentence, 2000)}")
         reporter.message("")
-        reporter.message(sanitize(proposal.command or "nothing can be proposed", 100_000))
+        reporter.message(sanitize(proposal.command or "no command can be proposed", 100_000))
 
 
 def make_quality_report(path: FileName, reporter: Reporter = SILENT) -> list[tuple[str, ImportResult]]:
-    """Titles, figures and lines of the sanity cards of a file of rays, or of each place of a dataset."""
+    """Return titles and data-quality reports of a rays file, or of each environment of a dataset."""
     reporter.progress(0.0, f"reading {Path(path).name}")
     if not is_dataset(path):
         rays = Rays.load(path)
@@ -416,45 +452,45 @@ def make_quality_report(path: FileName, reporter: Reporter = SILENT) -> list[tup
 
 
 def print_cards(rays: Path, reporter: Reporter) -> None:
-    """`card_of` as tables."""
+    """Print the data-quality reports as tables."""
     for title, card in make_quality_report(rays, reporter):
         reporter.message(format_quality_report(card.rays, card.summary, title, card.lines))
 
 
 @dataclass(frozen=True, eq=False)
 class FilterResult:
-    """The rays that were kept, and how many fixations there were, if they were asked for."""
+    """The selected rays, and the number of fixations if they were detected."""
 
-    # None: they were written to another dataset.
+    # None if they were written to another dataset.
     rays: Rays | None
     fixations: int | None
 
 
 def filter_rays(rays: Rays | FileName, options: FilterOptions, reporter: Reporter = SILENT) -> FilterResult:
-    """Some of the rays; each step is noted in their metadata. ``rays``: those, or a file of them.
+    """Select rays; each step is recorded in their metadata. ``rays`` are rays or their file.
 
-    Raises `NergError` where a step leaves no ray, and for what `nerg_mi.rays.filters` and `.fixations` refuse.
+    Raises `NergError` if a step selects no ray, and for options that `nerg_mi.rays.filters` rejects.
     """
     reporter.progress(0.0, "reading rays")
     if not isinstance(rays, Rays) and is_dataset(rays):
         result = FilterResult(*filter_dataset(rays, options, reporter))
-        _tell_tracking(options.output, reporter)
+        _report_written(options.output, reporter)
         return result
     _check_outputs(options.output)
-    steps = FilterSteps(_load(rays), own=not isinstance(rays, Rays), reporter=reporter)
+    steps = FilterSteps(_load(rays), in_place=not isinstance(rays, Rays), reporter=reporter)
     if options.conditions:
         steps.select(options.conditions)
     count = steps.follow(options)
     if options.sample is not None:
         steps.sample(options.sample, options.seed)
     _save(steps.rays, options.output)
-    _tell_tracking(options.output, reporter)
+    _report_written(options.output, reporter)
     return FilterResult(steps.rays, count)
 
 
 @dataclass(frozen=True, eq=False)
 class SplitResult:
-    """Training and test rays that share none, and how many are used on neither side."""
+    """Disjoint training and test rays, and the number of rays that are in neither."""
 
     train: Rays
     test: Rays
@@ -462,21 +498,21 @@ class SplitResult:
 
 
 def split_rays(rays: Rays | FileName, options: SplitOptions, reporter: Reporter = SILENT) -> SplitResult:
-    """Training rays, which are on the training side of each split, and test rays, on the test side of each.
+    """Split rays into training rays, on the training side of each criterion, and test rays, on the test side of each.
 
-    ``rays``: those, or a file of them. Raises `NergError` for what `nerg_mi.rays.filters` refuses.
+    ``rays`` are rays or their file. Raises `NergError` for options that `nerg_mi.rays.filters` rejects.
     """
     _check_outputs(options.train_output, options.test_output)
     reporter.progress(0.0, "reading rays")
     data, seed = _load(rays), options.seed
     reporter.progress(0.01, "splitting")
     parts: list[tuple[np.ndarray, np.ndarray]] = []
-    about: dict[str, Any] = {}
+    criteria: dict[str, Any] = {}
     if options.test_zones:
-        where = {name: getattr(options, name) for name in ("zones", "zone_radius", "min_rays")}
+        where = {"zones": options.test_zones, "zone_radius": options.zone_radius, "min_rays": options.min_rays}
         held = filters.split_by_position(data, options.radius, test_probes=options.test_positions, seed=seed, **where)
         parts.append(held.masks)
-        about["position"] = {
+        criteria["position"] = {
             "radius": options.radius,
             "zones": options.test_zones,
             "zone_radius": options.zone_radius,
@@ -487,15 +523,15 @@ def split_rays(rays: Rays | FileName, options: SplitOptions, reporter: Reporter 
             data, test_fraction=options.test_participants or 0.5, test_persons=list(options.persons) or None, seed=seed
         )
         parts.append(sides)
-        about["person"] = {"test": sorted(data.persons[p] for p in np.unique(data.person[sides[1]]))}
+        criteria["person"] = {"test": sorted(data.persons[p] for p in np.unique(data.person[sides[1]]))}
     if options.test_time:
         parts.append(filters.split_by_time(data, test_fraction=options.test_time, gap=options.gap, clock=options.clock))
-        about["time"] = {"share": options.test_time, "gap": options.gap, "of": options.clock}
+        criteria["time"] = {"share": options.test_time, "gap": options.gap, "of": options.clock}
     train, test = filters.combine_splits(*parts)
     purged = int((~(train | test)).sum())
     reporter.message(f"{train.sum():,} training rays, {test.sum():,} test rays, {purged:,} purged of {len(data):,}")
     side = lambda name, mask: data.select(mask).with_step(
-        step="split", side=name, seed=seed, kept=int(mask.sum()), of=len(data), by=about
+        step="split", side=name, seed=seed, kept=int(mask.sum()), of=len(data), by=criteria
     )
     result = SplitResult(side("train", train), side("test", test), purged)
     _save(result.train, options.train_output)
@@ -504,15 +540,15 @@ def split_rays(rays: Rays | FileName, options: SplitOptions, reporter: Reporter 
 
 
 def split_file(rays: Path, output: Path, options: SplitOptions, reporter: Reporter) -> None:
-    """`split_rays` of a file, to two files beside each other."""
+    """Split a rays file into two files in the same folder."""
     train, test = (output.with_name(f"{output.stem}-{side}{output.suffix}") for side in ("train", "test"))
     split_rays(rays, replace(options, train_output=train, test_output=test), reporter)
-    _tell_tracking(train, reporter)
-    _tell_tracking(test, reporter)
+    _report_written(train, reporter)
+    _report_written(test, reporter)
 
 
 def plot_rays(rays: Rays | FileName, options: PlotOptions | None = None, reporter: Reporter = SILENT) -> Figure:
-    """The floor plan of rays, or of a file of them, as a figure of matplotlib."""
+    """Return the floor plan of rays, or of their file, as a matplotlib figure."""
     options = options or PlotOptions()
     reporter.progress(0.0, "drawing rays")
     if options.output is not None:
@@ -524,9 +560,9 @@ def plot_rays(rays: Rays | FileName, options: PlotOptions | None = None, reporte
         where = {} if test is None else filters.read_position_split(test)
         figure = maps.layout_figure(_load(rays), test, where.get("test_centres"), where.get("radius"))
     if options.output is not None:
-        about = make_provenance("nerg rays plot", existing_files(rays, options.test), None, options)
-        style.save(figure, options.output, about)
-        _tell_tracking(options.output, reporter)
+        record = make_provenance("nerg rays plot", existing_files(rays, options.test), None, options)
+        style.save(figure, options.output, record)
+        _report_written(options.output, reporter)
     return figure
 
 
@@ -535,7 +571,7 @@ def _load(rays: Rays | FileName) -> Rays:
 
 
 def _check_outputs(*outputs: FileName | None) -> None:
-    """Raise `NergError` where rays cannot be written: before minutes of reading."""
+    """Raise `NergError` for outputs that are not writable, before minutes of reading."""
     for path in outputs:
         if path is not None:
             check_writable(path, *SUFFIXES)
@@ -546,6 +582,6 @@ def _save(rays: Rays, output: FileName | None) -> None:
         rays.save(Path(output))
 
 
-def _tell_tracking(output: FileName | None, reporter: Reporter) -> None:
+def _report_written(output: FileName | None, reporter: Reporter) -> None:
     if output is not None:
         reporter.message(f"wrote {output}")

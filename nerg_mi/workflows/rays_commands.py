@@ -1,14 +1,12 @@
 """``nerg rays import``: Convert tracking files to rays: right-handed, z up, metres, seconds.
-``nerg rays guess``: Propose the preset or the column map of unknown files: what is sure, what is a guess, what no file
-says.
-``nerg rays show``: The sanity card: rays, persons, duration, rate, what was dropped, extent, eye height.
-``nerg rays filter``: Keep some rays: conditions first, then fixations, then thinning of those who stand still.
-``nerg rays split``: Split into training and test rays that share none: by position, person, time, or several of them at
-once.
-``nerg rays plot``: The floor plan: where people stood and how densely, or the layout.
-``nerg align``: Find how tracking lies in a place: from points, a twin, cameras, or the tracking alone.
+``nerg rays guess``: Propose the preset or the column map for unknown tracking files.
+``nerg rays show``: Print a data-quality report: rays, persons, duration, rate, dropped rows, extent, eye height.
+``nerg rays filter``: Select rays by conditions, detect fixations, and thin out stationary periods.
+``nerg rays split``: Split rays into disjoint training and test sets by position, participant or time.
+``nerg rays plot``: Plot a floor plan of recorded positions, as densities or as the layout of a split.
+``nerg align``: Register tracking with a scene: find the similarity from the rays' frame to the scene's.
 
-What these commands take; their workflows run in `.rays` and `.align`.
+Options of these commands. The workflows are in `.rays` and `.align`.
 """
 
 from __future__ import annotations
@@ -19,14 +17,25 @@ from pathlib import Path
 from typing import Any
 
 from nerg_mi.errors import NergError
-from nerg_mi.ranges import COORDINATES, LENGTHS, RAYS, SECONDS, SEEDS, THREADS, TIMES, ValidatedDataclass, Range
+from nerg_mi.ranges import COORDINATES, LENGTHS, RAYS, SECONDS, SEEDS, THREADS, TIMES, Range, ValidatedDataclass
 
 from .base import Parameter, argument, declare, extra, out
-from .options import coordinates, cpu_threads, llvm_variant, option
+from .options import (
+    ANALYSIS,
+    INPUT,
+    OUTPUT,
+    PERFORMANCE,
+    TEST,
+    coordinates,
+    cpu_threads,
+    llvm_variant,
+    option,
+    random_seed,
+)
 
 DETECTORS = ("ivt", "idt")
 DATASET = ".rays"
-"""How the name of a dataset ends where one is written; any other name is that of a file."""
+"""Suffix by which a written dataset is recognised; any other name is that of a file."""
 PLANS = ("density", "layout")
 
 
@@ -35,103 +44,174 @@ PLANS = ("density", "layout")
 
 @dataclass(frozen=True, kw_only=True)
 class RaysImportOptions(ValidatedDataclass):
-    """How tracking files become rays. Raises `NergError` for a salt without pseudonyms, and for what only a dataset
-    has."""
+    """How tracking files become rays.
 
-    reader: str = option("table", "Name of a registered reader (nerg_mi.rays.readers.registry).")
-    settings: Any = option(None, "An object of the reader's Options. Default: as they are by default.")
-    environment: str | None = option(None, "Of a dataset: the place of all files.  [default: unknown]")
+    Raises `NergError` for a salt without pseudonyms, and for options of datasets if the output is a file.
+    """
+
+    reader: str = option("table", "Name of a registered reader (nerg_mi.rays.readers.registry).", group=INPUT)
+    settings: Any = option(None, "Instance of the reader's Options.  [default: its defaults]", group=INPUT)
+    environment: str | None = option(
+        None,
+        "Name of the environment in which all files were recorded (datasets only).  [default: unknown]",
+        group=INPUT,
+    )
     day: str | None = option(
-        None, "Of a dataset: the day of all rays, as 2026-11-22.  [default: by their times, in UTC, else unknown]"
+        None,
+        "Day of all recordings, as 2026-11-22 (datasets only).  [default: from their times in UTC, else unknown]",
+        group=INPUT,
     )
     workers: int | None = option(
-        None, "Of a dataset: processes that import files beside each other.  [default: a core each]", within=THREADS
+        None,
+        "Number of processes that import files in parallel (datasets only).  [default: one per core]",
+        within=THREADS,
+        group=PERFORMANCE,
     )
     skip_bad_lines: bool = option(
-        False, "Leave out lines that cannot be read, with an account of them: at most 1 % of a file's."
+        False, "Skip and report lines that cannot be read, up to 1 % of the lines of a file.", group=INPUT
     )
-    pseudonyms: bool = option(False, "Replace the names of persons, also in the names of files, by salted hashes.")
+    pseudonyms: bool = option(
+        False, "Replace the names of persons, also within file names, by salted hashes.", group=OUTPUT
+    )
     salt: Path | str | None = option(
         None,
-        "--pseudonyms: file of 16 random bytes or more, so that several imports agree.  [default: random, not kept]",
+        "File of at least 16 random bytes for --pseudonyms, so that several imports agree.  [default: random, not "
+        "stored]",
+        group=OUTPUT,
     )
-    output: Path | str | None = option(None, "Rays file (.npz or .parquet) or dataset (.rays) to write.")
+    output: Path | str | None = option(None, "Rays file (.npz or .parquet) or dataset (.rays) to write.", group=OUTPUT)
     align_output: Path | str | None = option(
         None,
-        "JSON file to write: the similarity from the rays to the files' own frame, for --align where a place is in "
+        "JSON file to write: the similarity from the rays to the frame of the input files, for --align with a scene in "
         "that frame.",
-        "--write-align",
+        group=OUTPUT,
     )
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.salt is not None and not self.pseudonyms:
-            raise NergError("--salt belongs to --pseudonyms; add it, or leave out --salt")
-        given = [n for n in ("place_name", "day", "workers") if getattr(self, n) is not None]
+            raise NergError("--salt needs --pseudonyms; add it, or leave out --salt")
+        of_datasets = {"--environment": self.environment, "--day": self.day, "--workers": self.workers}
+        given = [flag for flag, value in of_datasets.items() if value is not None]
         if given and not self.into_dataset:
-            raise NergError(
-                f"--{given[0].replace('_', '-')} belongs to datasets; let the name of the output end in {DATASET}"
-            )
+            raise NergError(f"{given[0]} applies to datasets only; use an output name that ends in {DATASET}")
         if self.align_output is not None and self.into_dataset:
             raise NergError(
-                "--write-align belongs to files of rays; the sources of a dataset may differ in their frames"
+                "--align-output does not apply to datasets, whose sources may differ in their frames; write a rays file"
             )
 
     @property
     def into_dataset(self) -> bool:
-        """Whether a dataset is to be written."""
+        """Whether the output is a dataset."""
         return self.output is not None and Path(self.output).suffix.lower() == DATASET
 
 
 @dataclass(frozen=True, kw_only=True)
 class FilterOptions(ValidatedDataclass):
-    """Which rays to keep: conditions first, then fixations, then fewer of those who stand still.
+    """Which rays are selected: by conditions, then by fixations, then by thinning.
 
-    Raises `NergError` for an unknown word, or where nothing is said.
+    Raises `NergError` for an unknown detector, or if no option selects anything.
     """
 
-    start: float | None = option(None, "Rays from this time on, seconds.", "--from", within=TIMES)
-    end: float | None = option(None, "Rays before this time, seconds.", "--to", within=TIMES)
-    persons: tuple[str, ...] = option((), "Only this person; repeatable.", "--person")
-    without_persons: tuple[str, ...] = option((), "Not this person; repeatable.", "--without-person")
-    cohorts: tuple[str, ...] = option((), "Only this cohort; repeatable.", "--cohort")
-    box: tuple[float, ...] | None = coordinates("Origins in this box: x0,x1,y0,y1,z0,z1, metres.")
-    min_confidence: float | None = option(None, "Only rays of at least this confidence.", within=Range(0, 1))
-    with_hit: bool = option(False, "Only rays whose hit point is known.")
-    fixations: str | None = option(None, "Only rays of fixations: ivt (by velocity) or idt (by dispersion).")
-    velocity_threshold: float = option(100.0, "ivt: degrees a second that end a fixation.", within=Range(0, 10**6))
-    dispersion_threshold: float = option(3.0, "idt: degrees within which a fixation stays.", within=Range(0, 180))
-    min_fixation: float | None = option(None, "Shortest fixation, seconds.  [default: ivt 0.06, idt 0.1]", within=SECONDS)
-    merge_fixations: bool = option(False, "One ray a fixation, its mean.")
-    thin: float | None = option(None, "A stop counts as at most this many seconds of rays.", within=SECONDS)
-    thin_distance: float = option(0.1, "With --thin, a stop is a stay within this many metres.", within=Range(0, 10**6))
-    sample: int | None = option(None, "So many of the rays that are left, each as likely as any other.", within=RAYS)
-    seed: int = option(0, "Seed of --sample.", within=SEEDS)
+    start: float | None = option(
+        None,
+        "Time of the first selected ray, in seconds of the rays' clock.  [default: no limit]",
+        within=TIMES,
+        group=INPUT,
+    )
+    end: float | None = option(
+        None,
+        "Time before which selected rays lie, in seconds of the rays' clock.  [default: no limit]",
+        within=TIMES,
+        group=INPUT,
+    )
+    persons: tuple[str, ...] = option(
+        (), "Person whose rays are selected; repeatable.  [default: all]", "--person", group=INPUT
+    )
+    without_persons: tuple[str, ...] = option(
+        (), "Person whose rays are left out; repeatable.", "--without-person", group=INPUT
+    )
+    cohorts: tuple[str, ...] = option(
+        (), "Cohort whose rays are selected; repeatable.  [default: all]", "--cohort", group=INPUT
+    )
+    box: tuple[float, ...] | None = coordinates(
+        "Axis-aligned box that selected ray origins lie in: x0,x1,y0,y1,z0,z1 in metres.  [default: no limit]",
+        group=INPUT,
+    )
+    min_confidence: float | None = option(
+        None, "Minimum confidence of selected rays.  [default: no limit]", within=Range(0, 1), group=INPUT
+    )
+    with_hit: bool = option(False, "Select only rays with a hit point.", group=INPUT)
+    fixations: str | None = option(
+        None,
+        "Select only rays of fixations, detected by ivt (velocity threshold) or idt (dispersion threshold).",
+        group=ANALYSIS,
+    )
+    velocity_threshold: float = option(
+        100.0,
+        "Angular velocity in degrees per second above which a fixation ends (ivt).",
+        within=Range(0, 10**6),
+        group=ANALYSIS,
+    )
+    dispersion_threshold: float = option(
+        3.0, "Angular dispersion in degrees within which a fixation stays (idt).", within=Range(0, 180), group=ANALYSIS
+    )
+    min_fixation: float | None = option(
+        None,
+        "Minimum duration of a fixation in seconds.  [default: 0.06 for ivt, 0.1 for idt]",
+        within=SECONDS,
+        group=ANALYSIS,
+    )
+    merge_fixations: bool = option(False, "Replace the rays of each fixation by their mean ray.", group=ANALYSIS)
+    thin: float | None = option(
+        None,
+        "Maximum time in seconds that a stationary period contributes; its rays are thinned out evenly.  [default: no "
+        "thinning]",
+        within=SECONDS,
+        group=ANALYSIS,
+    )
+    thin_distance: float = option(
+        0.1,
+        "Distance in metres within which a person counts as stationary for --thin.",
+        within=Range(0, 10**6),
+        group=ANALYSIS,
+    )
+    sample: int | None = option(
+        None,
+        "Number of rays in a uniform random sample of the selected rays.  [default: all]",
+        within=RAYS,
+        group=ANALYSIS,
+    )
+    seed: int = option(0, "Seed of --sample.", within=SEEDS, group=ANALYSIS)
     output: Path | str | None = option(
-        None, "Rays file to write (.npz or .parquet), or of a dataset another (.rays).", "-o", "--output"
+        None,
+        "Rays file to write (.npz or .parquet); for a dataset, another dataset (.rays).",
+        "-o",
+        "--output",
+        group=OUTPUT,
     )
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.fixations not in (None, *DETECTORS):
-            raise NergError(f'--fixations is "{self.fixations}"; it is ivt or idt')
+            raise NergError(f'--fixations must be ivt or idt, got "{self.fixations}"')
         if self.merge_fixations and self.fixations is None:
-            raise NergError("--one-ray is of fixations; add --fixations ivt or --fixations idt")
+            raise NergError("--merge-fixations needs a detector; add --fixations ivt or --fixations idt")
         if not self.conditions and not self.follows and self.sample is None:
             raise NergError(
-                "say which rays to keep, for instance with --from, --person, --box, --fixations, --thin or --sample "
+                "no selection is given; add for instance --start, --person, --box, --fixations, --thin or --sample "
                 "(--help lists all)"
             )
 
     @property
     def follows(self) -> bool:
-        """Whether it is asked for what must see the rays of a person one after the other."""
+        """Whether a step needs the consecutive rays of a person."""
         return self.fixations is not None or self.thin is not None
 
     @property
     def conditions(self) -> dict[str, Any]:
-        """What was asked for, as `nerg_mi.rays.filters.select_mask` takes it."""
-        what = {
+        """The conditions that are set, as keywords of `nerg_mi.rays.filters.Conditions`."""
+        values = {
             "time": None if self.start is None and self.end is None else (self.start, self.end),
             "persons": list(self.persons) or None,
             "without_persons": list(self.without_persons) or None,
@@ -140,69 +220,107 @@ class FilterOptions(ValidatedDataclass):
             "min_confidence": self.min_confidence,
             "with_hit": self.with_hit or None,
         }
-        return {name: value for name, value in what.items() if value is not None}
+        return {name: value for name, value in values.items() if value is not None}
 
 
 @dataclass(frozen=True, kw_only=True)
 class SplitOptions(ValidatedDataclass):
-    """How training and test rays are parted: by position, person or time, or several of them at once.
+    """How training and test rays are separated. Raises `NergError` if no criterion is given."""
 
-    Raises `NergError` where nothing is said.
-    """
-
-    test_zones: int = option(0, "By position: zones held out; 0: not by position.", within=Range(0, 1000))
-    radius: float = option(
-        0.25, "By position: R of probes, metres; rays within 2R of a test position are purged.", within=LENGTHS
+    test_zones: int = option(
+        0, "Number of zones whose positions are held out; 0: no split by position.", within=Range(0, 1000), group=TEST
     )
-    zone_radius: float = option(0.2, "By position: radius of a zone, metres.", within=Range(0, 10**6))
-    test_positions: int = option(150, "By position: test positions in the zones.", within=Range(1, 10**5))
-    min_rays: int = option(64, "By position: rays that a test position has within R.", within=Range(1, 10**6))
-    test_participants: float = option(0.0, "By person: share held out, at random; 0: not by person.", within=Range(0, 1))
-    persons: tuple[str, ...] = option((), "By person: this one is held out; repeatable.", "--person")
-    test_time: float = option(0.0, "By time: share at the end that is held out; 0: not by time.", within=Range(0, 1))
-    gap: float = option(5.0, "By time: seconds purged before the end part.", within=SECONDS)
-    clock: str = option("all", "By time: all (one clock), or person (each their own).")
-    seed: int = option(0, "Seed of zones, positions and people.", within=SEEDS)
-    train_output: Path | str | None = option(None, "Rays file to write of the training rays (.npz or .parquet).")
-    test_output: Path | str | None = option(None, "The same of the test rays.")
+    radius: float = option(
+        0.25,
+        "Radius R of probes in metres; training rays within 2 R of a test position are purged.",
+        within=LENGTHS,
+        group=TEST,
+    )
+    zone_radius: float = option(0.2, "Radius of a zone in metres.", within=Range(0, 10**6), group=TEST)
+    test_positions: int = option(150, "Number of test positions in the zones.", within=Range(1, 10**5), group=TEST)
+    min_rays: int = option(
+        64, "Minimum number of rays within R of a test position.", within=Range(1, 10**6), group=TEST
+    )
+    test_participants: float = option(
+        0.0,
+        "Fraction of the participants that are held out, at random; 0: no split by participant.",
+        within=Range(0, 1),
+        group=TEST,
+    )
+    persons: tuple[str, ...] = option((), "Person that is held out; repeatable.", "--person", group=TEST)
+    test_time: float = option(
+        0.0,
+        "Fraction of the recording time that is held out, at its end; 0: no split by time.",
+        within=Range(0, 1),
+        group=TEST,
+    )
+    gap: float = option(
+        5.0, "Time in seconds before the held-out end whose rays are purged.", within=SECONDS, group=TEST
+    )
+    clock: str = option("all", "Clock of --test-time: all (one for all persons), or person (one for each).", group=TEST)
+    seed: int = option(0, "Seed of zones, positions and participants.", within=SEEDS, group=TEST)
+    train_output: Path | str | None = option(
+        None, "Rays file to write the training rays to (.npz or .parquet).", group=OUTPUT
+    )
+    test_output: Path | str | None = option(
+        None, "Rays file to write the test rays to (.npz or .parquet).", group=OUTPUT
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if not (self.test_zones or self.test_participants or self.persons or self.test_time):
-            raise NergError("say how to split: --zones 3, --people 0.5, --person NAME, --time 0.2, or several of them")
+            raise NergError(
+                "no criterion is given for the split; add --test-zones 3, --test-participants 0.5, --person NAME or "
+                "--test-time 0.2, or several of them"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlotOptions(ValidatedDataclass):
-    """What a floor plan shows. Raises `NergError` for an unknown word, or test rays beside densities."""
+    """What a floor plan shows. Raises `NergError` for an unknown kind, or test rays with densities."""
 
-    kind: str = option("density", "density: rays/m² with mean directions; layout: each ray's place, with dimensions.")
+    kind: str = option(
+        "density",
+        "What is plotted: density (rays per square metre, with mean directions) or layout (ray origins, with "
+        "dimensions).",
+        group=ANALYSIS,
+    )
     cell_size: float | None = option(
-        None, "density: edge of a cell, metres.  [default: a fiftieth of the plan]", within=LENGTHS
+        None,
+        "Edge length of a grid cell of the density in metres.  [default: a fiftieth of the plan]",
+        within=LENGTHS,
+        group=ANALYSIS,
     )
     # Or rays in memory.
-    test: Path | str | Any | None = option(None, "layout: the test rays of a split, drawn beside.")
-    output: Path | str | None = option(None, "Picture to write (.png or .svg).", "-o", "--output")
+    test: Path | str | Any | None = option(
+        None, "Rays file of the test rays of a split, drawn in the same layout.", group=INPUT
+    )
+    output: Path | str | None = option(None, "Image to write (.png or .svg).", "-o", "--output", group=OUTPUT)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.kind not in PLANS:
-            raise NergError(f'--kind is "{self.kind}"; it is density or layout')
+            raise NergError(f'--kind must be density or layout, got "{self.kind}"')
         if self.kind == "density" and self.test is not None:
-            raise NergError("--test is drawn in the layout; add --kind layout")
+            raise NergError("--test applies to layouts only; add --kind layout")
 
 
 def _reader_parameters() -> Mapping[str, Parameter]:
-    """The options of all readers that are registered now."""
-    from nerg_mi.rays.readers.registry import list_preset_names, collect_shared_options
+    """Return the options of all registered readers."""
+    from nerg_mi.rays.readers.registry import collect_shared_options, list_preset_names
 
-    parameters = {"preset": extra(None, f"Known recording: {', '.join(list_preset_names())}.", str, "--preset")}
+    presets = ", ".join(list_preset_names())
+    parameters = {
+        "preset": extra(
+            None, f"Format of the files: {presets}.  [default: a table, see --map]", str, "--preset", group=INPUT
+        )
+    }
     for o in collect_shared_options():
-        parameters[o.name] = extra(False if o.kind is bool else None, o.help, o.kind, o.flag)
+        parameters[o.name] = extra(False if o.kind is bool else None, o.help, o.kind, o.flag, group=INPUT)
     return parameters
 
 
-_RAYS_FILE = argument("Rays file (.npz or .parquet), or dataset (a folder).")
+_RAYS_FILE = argument("Rays file (.npz or .parquet) or dataset (.rays).")
 _OUTPUT = out("Rays file (.npz or .parquet) or dataset (.rays) to write.")
 
 declare(
@@ -211,22 +329,25 @@ declare(
     options=RaysImportOptions,
     without=("reader", "settings"),
     further=_reader_parameters,
-    files=argument("Tracking files (CSV, CSV.gz, Parquet or skeleton files; for pupil, folders).", list[Path]),
+    files=argument("Tracking files (CSV, CSV.gz, Parquet, skeleton files); for pupil, folders.", list[Path]),
     output=_OUTPUT,
 )
 
 declare(
     "rays guess",
     "nerg_mi.workflows.rays:print_guesses",
-    more="Nothing is imported: the whole command is printed, one for all files that are alike, for you to check and to "
-    "run.",
-    files=argument("Unknown tracking files, folders of them, or folders of recordings.", list[Path]),
+    "Propose the preset or the column map for unknown tracking files; say what is certain, what is a guess, and "
+    "what no file states.",
+    more="Nothing is imported. The complete import command is printed, once for all files of the same format, to be "
+    "checked and run.",
+    files=argument("Tracking files of unknown format, or folders of them.", list[Path]),
 )
 
 declare(
     "rays show",
     "nerg_mi.workflows.rays:print_cards",
-    more="Of a dataset one for each place; of very many rays some figures are of a sample, as it says.",
+    more="A dataset gets one report for each environment. For very large data some numbers are estimated from a "
+    "sample; the report says which.",
     rays=_RAYS_FILE,
 )
 
@@ -235,12 +356,12 @@ declare("rays filter", "nerg_mi.workflows.rays:filter_rays", options=FilterOptio
 declare(
     "rays split",
     "nerg_mi.workflows.rays:split_file",
-    more="Of several, training rays are on the training side of each and test rays on the test side of each; the rest "
-    "is purged.",
+    more="With several criteria, training rays are on the training side of each and test rays on the test side of "
+    "each; all other rays are purged.",
     options=SplitOptions,
     without=("train_output", "test_output"),
     rays=_RAYS_FILE,
-    output=out("Rays file; -train and -test are put before its ending."),
+    output=out("Rays file; -train and -test are inserted before its suffix."),
 )
 
 declare(
@@ -248,7 +369,7 @@ declare(
     "nerg_mi.workflows.rays:plot_rays",
     options=PlotOptions,
     rays=_RAYS_FILE,
-    output=out("Picture to write (.png or .svg)."),
+    output=out("Image to write (.png or .svg)."),
 )
 
 
@@ -257,36 +378,62 @@ declare(
 
 @dataclass(frozen=True, kw_only=True)
 class AlignOptions(ValidatedDataclass):
-    """What an alignment is found from, and what is known beforehand. Lengths of the tracking are metres."""
+    """Options of ``nerg align``. Lengths of the tracking are in metres."""
 
-    field: Path | None = option(None, "The place: a radiance field, or Gaussian splats.")
-    scene: Path | None = option(None, "Or: a Mitsuba scene.")
+    field: Path | None = option(None, "Radiance field (.safetensors) or Gaussian splats of the scene.", group=INPUT)
+    scene: Path | None = option(None, "Mitsuba scene (.xml), in place of --field.", group=INPUT)
     surface: Path | None = option(
-        None, "Or: a mesh or points on surfaces (.ply, .obj, .glb, .npy, .csv of x,y,z or of Aria)."
+        None,
+        "Surface of the scene, in place of --field: a mesh or points (.ply, .obj, .glb, .npy, .csv with x,y,z, or "
+        "points of Aria).",
+        group=INPUT,
     )
     pairs: Path | None = option(
-        None, "Evidence: picked points, CSV of x,y,z,place_x,place_y,place_z (three or more), or JSON."
+        None,
+        "Three or more point correspondences: CSV with columns x,y,z,place_x,place_y,place_z, or JSON.",
+        group=INPUT,
     )
-    tracking_surface: Path | None = option(None, "Or: a mesh or points (as --surface) in the tracking's frame.")
-    tracking_cameras: Path | None = option(None, "Or: posed photos in the tracking's frame (transforms.json, COLMAP), with ...")
-    scene_cameras: Path | None = option(None, "... the same photos' poses in the place's frame.")
-    init: Path | None = option(None, "Or: an alignment that is near, which the tracking refines.")
-    refine: bool = option(False, "Refine what the evidence gave by the tracking.")
+    tracking_surface: Path | None = option(
+        None,
+        "Surface in the frame of the tracking, a mesh or points as for --surface; it is registered by ICP.",
+        group=INPUT,
+    )
+    tracking_cameras: Path | None = option(
+        None, "Posed photos in the frame of the tracking (transforms.json, COLMAP); needs --scene-cameras.", group=INPUT
+    )
+    scene_cameras: Path | None = option(
+        None, "The same photos posed in the frame of the scene (transforms.json, COLMAP).", group=INPUT
+    )
+    init: Path | None = option(None, "Approximate alignment (.json) that the tracking refines.", group=INPUT)
+    refine: bool = option(
+        False, "Refine the alignment found from points, surfaces or cameras with the tracking.", group=ANALYSIS
+    )
     up: str | None = option(
-        None, "Axis of the place that is up (z, -y, ... or x,y,z): only turns about it are left. The tracking's is z."
+        None,
+        "Up axis of the scene: x, y, z, -x, -y, -z or x,y,z. Only rotations about it remain to be found; the tracking "
+        "is z up.",
+        group=ANALYSIS,
     )
-    floor_height: float = option(0.0, "Height of the floor in the tracking.", within=COORDINATES)
+    floor_height: float = option(
+        0.0, "Height of the floor in the frame of the tracking, in metres.", within=COORDINATES, group=ANALYSIS
+    )
     scene_floor_height: float | None = option(
-        None, "Height of the floor in the place, along --up. Default: found.", within=COORDINATES
+        None,
+        "Height of the floor in the scene along --up, in scene units.  [default: estimated]",
+        within=COORDINATES,
+        group=ANALYSIS,
     )
     scale: float | None = option(
-        None, "Units of the place a metre of the tracking, where that is known.", within=LENGTHS
+        None, "Scene units per metre of the tracking.  [default: estimated]", within=LENGTHS, group=ANALYSIS
     )
     max_residual: float = option(
-        10.0, "Centimetres of the median residual beyond which a fit is refused.", within=Range(0, 10**9)
+        10.0,
+        "Maximum median residual in centimetres; alignments with a larger one are rejected.",
+        within=Range(0, 10**9),
+        group=ANALYSIS,
     )
-    force: bool = option(False, "Write a fit that is refused, too.")
-    seed: int = option(0, "Seed of the rays by which the place is traced.", within=SEEDS)
+    force: bool = option(False, "Write the alignment even if it is rejected.", group=OUTPUT)
+    seed: int = random_seed("rays that sample the scene")
     threads: int | None = cpu_threads()
     mode: str = llvm_variant()
 
@@ -294,10 +441,13 @@ class AlignOptions(ValidatedDataclass):
 declare(
     "align",
     "nerg_mi.workflows.align:align",
-    "Find how tracking lies in a place: the similarity from the rays' frame to the place's.",
-    more="""From picked points, a twin, cameras known in both frames, or from the tracking alone: heads in free space,
-gaze that ends on surfaces. A mirrored frame is found and named.""",
+    "Register tracking with a scene: find the similarity transform from the frame of the rays to that of the scene.",
+    more="""The transform is found from point correspondences, two surfaces, cameras posed in both frames, or the
+tracking alone: heads are in free space, and gaze ends on surfaces. A mirrored frame is detected and reported.""",
     options=AlignOptions,
-    rays=argument("Rays file (.npz or .parquet). Not needed with --pairs, --twin or --cameras.", required=False),
-    output=out("Alignment to write (.json), which --align takes; beside it a picture."),
+    rays=argument(
+        "Rays file (.npz or .parquet). Not needed with --pairs, --tracking-surface or --tracking-cameras.",
+        required=False,
+    ),
+    output=out("Alignment to write (.json), for --align of other commands; a plot is written next to it."),
 )

@@ -1,4 +1,4 @@
-"""Rendering a scene file to one picture or a sequence, as frames or a video, with overlays, in one go or in parts."""
+"""Rendering of a scene file to an image, a sequence or a video, with overlays, directly or in parts."""
 
 from __future__ import annotations
 
@@ -40,51 +40,51 @@ if TYPE_CHECKING:
     from .parts import PartRunner, PlannedScene
 
 
-# ---- Pictures with a quantity laid over their colour, alone or as a sequence with one scale ----
+# ---- Images with an overlay, alone or as a sequence with a common colour scale ----
 
 BYTES_PER_PIXEL = 400
-"""Memory that drawing an overlay takes for a pixel, at most: matplotlib keeps colours in double precision."""
+"""Maximum memory per pixel for drawing an overlay: matplotlib stores colours in double precision."""
 
 
 @dataclass(frozen=True)
 class RenderedPicture:
-    """``size`` (width, height) in pixels, number of ``channels``, and why it was not divided, as `PictureResult` has
-    them."""
+    """Size (width, height) in pixels, number of channels, and why the image was not rendered in bands, see
+    `PictureResult`."""
 
     size: tuple[int, int]
     channels: int
-    whole: str | None = None
+    undivided_reason: str | None = None
 
 
 OVERLAY_FORMATS = (*style.FORMATS, ".mp4")
 
 OnBand = Callable[[int, int], None]
-"""Is told how many samples are done, and of how many."""
+"""Called with the number of completed samples and of all samples."""
 
 Make = Callable[[Any, Any, OnBand], RenderedPicture]
-"""Makes a picture of a scene, a sensor, and a function that is told of each strip."""
+"""Renders an image from a scene, a sensor, and a function that is called for each strip."""
 
 
-_OF_OVERLAYS = (("top", None), ("cmap", None), ("decades", 0.0), ("hatching", True))
+_OVERLAY_DEFAULTS = (("vmax", None), ("cmap", None), ("log_decades", 0.0), ("hatching", True))
 
 SUPPORT = 1.0
-"""Support, in rays, below which an observer's gaze counts as not known: nobody was recorded within five radii of a
+"""Support in rays below which the gaze of an observer counts as unknown: nothing was recorded within five radii of a
 probe (docs/explanation/accuracy.md)."""
 
 
 def check_overlay(output: Path, options: PictureOptions) -> None:
-    """Raise `NergError` for options of an overlay that contradict each other."""
+    """Raise `NergError` for contradictory options of an overlay."""
     if options.overlay is None:
-        for name, default in _OF_OVERLAYS:
+        for name, default in _OVERLAY_DEFAULTS:
             if getattr(options, name) != default:
-                flag = "--no-hatching" if name == "hatching" else f"--{name}"
-                raise NergError(f"{flag} is about an overlay, and there is none; give --overlay, too")
+                flag = "--no-hatching" if name == "hatching" else f"--{name.replace('_', '-')}"
+                raise NergError(f"{flag} applies to overlays only; add --overlay")
         return
     overlay = find_overlay(options.overlay)
     if output.suffix.lower() not in OVERLAY_FORMATS:
         raise NergError(
-            f'an overlay is a picture to look at, and "{output}" is none: let its name end in '
-            f"{' or '.join(OVERLAY_FORMATS)} (an .exr holds the quantity itself, if the scene's aovs name it)"
+            f'an overlay cannot be written to "{output}": use a name that ends in {" or ".join(OVERLAY_FORMATS)} '
+            "(an .exr file holds the AOV itself, if it is in the scene's aovs)"
         )
     if options.cmap is not None:
         find_colormap(options.cmap, overlay.colormap_kind)
@@ -98,18 +98,42 @@ def render_overlays(
     render: Callable[[Mapping[str, str], Make], RenderedPicture],
     stop: Interruption,
 ) -> tuple[RenderedPicture, float | None]:
-    """Give ``write`` a figure with the overlay of ``options`` for each of ``frames``, values of `<default>`s of the
-    scene file ``path``, one after the other. Gives the last one, and the upper end of the scale of all, None where
-    there is none.
+    """Draw the overlay of ``options`` for each of ``frames``, and pass the figures to ``write``.
 
-    ``render``: loads the scene of a frame and lets a picture be made of it. Pictures of a sequence wait on the disk
-    until the scale is known, and not at all where it is given. Raises `NergError` where the quantity is 0 everywhere.
+    Parameters
+    ----------
+    path
+        Scene file.
+    frames
+        Values of its `<default>`s for each frame.
+    write
+        Receives each figure.
+    options
+        Overlay, colour scale and sampling.
+    render
+        Loads the scene of a frame and renders an image of it.
+    stop
+        Raises ``KeyboardInterrupt`` after Ctrl-C.
+
+    Returns
+    -------
+    tuple
+        The last image, and the upper end of the colour scale, None if there is none.
+
+    Raises
+    ------
+    NergError
+        If the AOV is 0 everywhere.
+
+    Notes
+    -----
+    Images of a sequence are stored on disk until the common colour scale is known, unless it is given.
     """
     overlay = find_overlay(options.overlay or "")
     style = overlay_style(options)
     limits: list[Limits] = []
     last = RenderedPicture((0, 0), 0)
-    waits = uses_shared_scale(overlay, len(frames), options)
+    is_delayed = uses_shared_scale(overlay, len(frames), options)
 
     def finish(layers: OverlayLayers, ends: Limits) -> None:
         overlay.check_limits(ends)
@@ -117,18 +141,18 @@ def render_overlays(
         stop.check()
 
     with tempfile.TemporaryDirectory() as folder:
-        kept: list[tuple[Path, tuple[int, ...], Any, bool, str]] = []
+        stored: list[tuple[Path, tuple[int, ...], Any, bool, str]] = []
 
         def make(loaded: Any, camera: Any, on_strip: OnBand) -> RenderedPicture:
             check_memory(path, camera, options)
             layers = render_layers(path, loaded, camera, overlay, options.spp, options.seed, on_strip)
             limits.append(overlay.limits(layers))
             height, width = layers.mask.shape
-            if waits:
+            if is_delayed:
                 array = stack_layers(layers)
-                file = Path(folder, str(len(kept)))
+                file = Path(folder, str(len(stored)))
                 write_bytes(file, array.data)
-                kept.append((file, array.shape, layers.marker, layers.has_support, layers.support_note))
+                stored.append((file, array.shape, layers.marker, layers.has_support, layers.support_note))
             else:
                 finish(layers, shared_limits(limits[-1:], options.vmax))
             return RenderedPicture((width, height), 3)
@@ -136,72 +160,71 @@ def render_overlays(
         for frame in frames:
             last = render(frame, make)
         ends = shared_limits(limits, options.vmax)
-        for file, shape, marker, supported, basis in kept:
+        for file, shape, marker, supported, basis in stored:
             finish(unstack_layers(np.fromfile(file, np.float32).reshape(shape), marker, supported, basis), ends)
             file.unlink()
     return last, None if ends is None else ends[1]
 
 
 def overlay_style(options: PictureOptions) -> Style:
-    """How ``options`` have overlays drawn."""
+    """Return the style of overlays."""
     return Style(options.cmap, options.log_decades, options.hatching)
 
 
 def uses_shared_scale(overlay: Overlay, count: int, options: PictureOptions) -> bool:
-    """Whether none of ``count`` pictures can be drawn before all are rendered."""
+    """Return whether none of ``count`` images can be drawn before all are rendered."""
     return count > 1 and overlay.needs_limits and (options.vmax is None or not overlay.is_scaled_by_top)
 
 
 def stack_layers(layers: OverlayLayers) -> np.ndarray:
-    """Colour, values and mask of ``layers`` as one array (h, w, 5) of float32."""
+    """Stack colour, values and mask of ``layers`` into one array (h, w, 5) of float32."""
     array = np.concatenate([layers.color, layers.values[..., None], layers.mask[..., None]], axis=-1)
     return np.ascontiguousarray(array, np.float32)
 
 
 def unstack_layers(array: np.ndarray, marker: tuple[float, float] | None, supported: bool, basis: str) -> OverlayLayers:
-    """What `stacked` was given, with its ``marker``, whether it is ``supported``, and its ``basis`` in words."""
+    """Restore layers from `stack_layers`, with their ``marker``, ``supported`` flag and ``basis``."""
     return OverlayLayers(array[..., :3], array[..., 3], array[..., 4] > 0.5, marker, supported, basis)
 
 
 def check_memory(path: Path, camera: Any, options: PictureOptions) -> None:
-    """Raise `NergError` where drawing the overlay of a picture takes more than it may."""
+    """Raise `NergError` if drawing the overlay exceeds the memory limit."""
     width, height = map(int, camera.film().crop_size())
     needed = BYTES_PER_PIXEL * width * height / 1e9
     if needed > options.memory:
         raise NergError(
-            f"an overlay of {width:,} x {height:,} pixels is drawn in one piece, for which it takes {needed:.2g} GB; "
-            f'give --memory {needed:.1f}, or a smaller picture of "{path}"'
+            f"drawing an overlay of {width:,} x {height:,} pixels needs {needed:.2g} GB; increase --memory to "
+            f'{needed:.1f}, or reduce the size of "{path}"'
         )
 
 
 def render_layers(
     path: Path, loaded: Any, camera: Any, overlay: Overlay, spp: int = 0, seed: int = 0, on_strip: OnBand | None = None
 ) -> OverlayLayers:
-    """What ``camera`` sees of the scene ``loaded`` from ``path`` with the quantity of ``overlay``, and who is there."""
+    """Render ``camera`` with the AOV of ``overlay``; also return the observer's pixel and the data behind the AOV."""
     quantity = overlay.quantity
-    asked = list(dict.fromkeys([quantity.name, "opacity", "depth"]))
+    aovs = list(dict.fromkeys([quantity.name, "opacity", "depth"]))
     with translate_mitsuba_errors():
-        found = render_aovs(path, loaded, camera, asked, spp, seed, on_strip)
-    if overlay.name not in found.aovs:
-        raise NergError(f'"{path}" has no "{overlay.name}"; it has {", ".join(found.aovs)}')
-    marker = observer_pixel(loaded, camera, found.aovs["depth"])
+        channels = render_aovs(path, loaded, camera, aovs, spp, seed, on_strip)
+    if overlay.name not in channels.aovs:
+        raise NergError(f'"{path}" has no "{overlay.name}"; it has {", ".join(channels.aovs)}')
+    marker = observer_pixel(loaded, camera, channels.aovs["depth"])
     supported = not quantity.needs_support or is_supported(loaded, camera)
     basis = describe_basis(loaded, quantity.data_source)
-    return OverlayLayers(found.color, found.aovs[overlay.name], found.mask, marker, supported, basis)
+    return OverlayLayers(channels.color, channels.aovs[overlay.name], channels.mask, marker, supported, basis)
 
 
 def describe_basis(loaded: Any, part: str = "gaze") -> str:
-    """Rays and people that a ``part`` of the scene rests on, "gaze" or "kde", in words; "" where that is not known."""
+    """Describe the rays and participants behind a ``part`` of the scene, "gaze" or "kde"; "" if unknown."""
     volume = loaded.integrator().children.get(part)
     if volume is None:
         return ""
     basis = volume.kde_view().basis if part == "kde" else volume.field.basis
-    return "" if basis is None else f"made of {basis.words()}"
+    return "" if basis is None else f"data: {basis.words()}"
 
 
 def describe_bases(loaded: Any) -> dict[str, str]:
-    """The same for the header of a picture, by the names under which `workflows.draw` finds it: "gaze.basis" and
-    "kde.basis", as far as they are known."""
+    """Return these descriptions for image headers, under the keys "gaze.basis" and "kde.basis"."""
     if not is_nerg(loaded.integrator()):
         return {}
     parts = dict.fromkeys(aov.data_source for aov in AOVS.values() if aov.data_source)
@@ -210,61 +233,80 @@ def describe_bases(loaded: Any) -> dict[str, str]:
 
 
 def is_supported(loaded: Any, camera: Any) -> bool:
-    """Whether anybody was recorded around the observer, that of the scene or else the ``camera``: `SUPPORT` rays at
-    least. A gaze field that does not tell where it learnt counts as knowing."""
+    """Return whether at least `SUPPORT` rays were recorded around the observer of the scene, or else the ``camera``.
+
+    A gaze field that does not store its support counts as supported.
+    """
     integrator = loaded.integrator()
     gaze = integrator.gaze
     if gaze is None or gaze.field.support is None:
         return True
     eye = sensor_center(integrator.observer or camera)
-    return float(np.ravel(np.array(gaze.field.support.at(gaze.to_world.point_to_local(eye))))[0]) >= SUPPORT
+    return float(np.ravel(np.array(gaze.field.support.evaluate(gaze.to_world.point_to_local(eye))))[0]) >= SUPPORT
 
 
 def observer_pixel(loaded: Any, camera: Any, depth: np.ndarray) -> tuple[float, float] | None:
-    """The pixel at which the scene's observer stands, if the ``camera`` sees them."""
+    """Return the pixel of the scene's observer if it is visible from ``camera``, else None."""
     observer = loaded.integrator().observer
     if observer is None or camera.class_name() != "PerspectiveCamera":
         return None
     eye = sensor_center(observer)
-    found = project_to_pixel(camera, eye)
-    if found is None:
+    pixel = project_to_pixel(camera, eye)
+    if pixel is None:
         return None
-    column, row = (int(np.clip(round(v), 0, n - 1)) for v, n in zip(found, depth.shape[::-1]))
+    column, row = (int(np.clip(round(v), 0, n - 1)) for v, n in zip(pixel, depth.shape[::-1]))
     away = float(np.linalg.norm(np.ravel(np.array(eye - sensor_center(camera)))))
     before = depth[row, column]
-    return found if not 0 < before < away else None
+    return pixel if not 0 < before < away else None
 
 
-# ---- From a scene file to a picture file, with the integrator that the scene names ----
+# ---- Rendering a scene file to an image file ----
 
 VIDEO = ".mp4"
 
-_OF_PICTURES = ("overlay", "top", "cmap", "decades", "hatching")
+_RECORDED_OPTIONS = ("overlay", "vmax", "cmap", "log_decades", "hatching")
 
 RESERVE = 150e6
-"""Bytes kept free beside a band, for the strips in it and for the kernel that is compiled first."""
+"""Bytes reserved in addition to a band: for its strips and the first kernel compilation."""
 
 
 @dataclass(frozen=True)
 class PictureResult:
-    """The picture ``path``: ``size`` (width, height) in pixels, number of ``channels``, the variant ``mode`` and the
-    ``seconds`` that made it; ``whole``: why it could not be divided though it needed more than the memory, or None.
-    ``files``: all pictures, of which ``path`` is the first; ``top``: upper end of their overlay's scale, or None."""
+    """A rendered image or sequence.
+
+    Attributes
+    ----------
+    path
+        First written file.
+    size
+        Width and height in pixels.
+    channels
+        Number of channels.
+    mode
+        Mitsuba variant.
+    seconds
+        Run time.
+    undivided_reason
+        Why the image was not rendered in bands although it exceeded the memory limit, or None.
+    files
+        All written files.
+    top
+        Upper end of the colour scale of overlays, or None.
+    """
 
     path: Path
     size: tuple[int, int]
     channels: int
     mode: str
     seconds: float
-    whole: str | None
+    undivided_reason: str | None
     files: tuple[Path, ...] = ()
     vmax: float | None = None
 
 
 @dataclass(frozen=True)
 class RenderPlan:
-    """What is to be rendered: values of `<default>`s for each of ``frames``, and the ``files`` to write, or the one
-    ``video``."""
+    """Values of `<default>`s for each of ``frames``, and the ``files`` to write, or a single ``video``."""
 
     frames: Sequence[Mapping[str, str]]
     files: list[Path]
@@ -272,8 +314,10 @@ class RenderPlan:
 
 
 def plan_render(scene: Path, output: Path, options: PictureOptions) -> RenderPlan:
-    """What `render_file` would render. Raises `NergError` for options that contradict each other, and for files that
-    cannot be read or written, before any work."""
+    """Return what `render_file` would render.
+
+    Raises `NergError` for contradictory options, and for files that cannot be read or written, before any work.
+    """
     check_writable(output, *dict.fromkeys((*IMAGE_FORMATS, *OVERLAY_FORMATS)))
     if not scene.exists():
         raise NergError(f'there is no scene file "{scene}"')
@@ -292,29 +336,40 @@ def plan_render(scene: Path, output: Path, options: PictureOptions) -> RenderPla
 def render_file(
     scene: str | Path, output: str | Path, options: PictureOptions | None = None, reporter: Reporter = SILENT
 ) -> PictureResult:
-    """Render the scene file ``scene`` and write the picture ``output``, whose folder is made.
+    """Render the scene file ``scene`` to the image ``output``, whose folder is created.
 
-    ``output`` ends in .exr (all channels of the film, AOVs among them, as float32) or in .png (its colour, tonemapped
-    to sRGB). With ``options.overlay`` it is a .png or .svg of the colour with that quantity over it and a scale beside
-    it; the scene's list of AOVs need not have it. With ``options.frames`` there is a picture for each line of that
-    file, with a number added to its name, or one video where that ends in .mp4; one scale serves all overlays, for
-    which all are rendered before the first is drawn, unless ``options.top`` gives it. Each file says in its header what
-    it was made of (`nerg_mi.figures.style`).
+    Parameters
+    ----------
+    scene
+        Scene file.
+    output
+        Image: .exr holds all channels including AOVs as float32, .png the sRGB colour. With ``options.overlay``, a .png
+        or .svg of the colour with that AOV drawn over it and a colour scale; the AOV need not be in the scene's list.
+        With ``options.frames``, one image per line of that file with a number in its name, or one video (.mp4). A
+        sequence of overlays has a common colour scale, so all images are rendered before the first is drawn, unless
+        ``options.vmax`` is set. The header of each file holds its provenance (`nerg_mi.figures.style`).
+    options
+        Sampling, overlay and memory limit.
+    reporter
+        Receives messages and progress.
 
-    A picture that needs more than ``options.memory`` is rendered in bands of rows, as large as fit beside what the
-    scene itself takes. Its pixels do not depend on that where the film has a box filter; with wider filters they differ
-    by the rounding of single precision (`nerg_mi.rendering.bands`). Samplers other than `independent`, films other than
-    `hdrfilm`, scalar and spectral variants and Mitsuba's differentiable integrators are rendered in one piece, and the
-    message says so where that is more than ``memory``. An overlay is drawn in one piece, and refused where that needs
-    more.
+    Raises
+    ------
+    NergError
+        For errors that the user can correct.
+    KeyboardInterrupt
+        Within a second after Ctrl-C. Images of a sequence that have been written are complete.
 
-    Raises `NergError` for what the user can mend, and ``KeyboardInterrupt``, between two steps of less than a second,
-    after Ctrl-C; the pictures of a sequence that are there then are whole.
+    Notes ----- An image that exceeds ``options.memory`` is rendered in bands of rows. With a box filter its pixels do
+    not depend on the bands; with wider filters they differ by rounding in single precision (`nerg_mi.rendering.bands`).
+    Samplers other than `independent`, films other than `hdrfilm`, scalar and spectral variants, and Mitsuba's
+    differentiable integrators are rendered in one piece, and a message tells if that exceeds the limit. An overlay is
+    drawn in one piece, and rejected if that exceeds the limit.
     """
     options = options or PictureOptions()
     scene, output = Path(scene), Path(output)
-    asked = plan_render(scene, output, options)
-    frames, files, video = asked.frames, asked.files, asked.video
+    render_plan = plan_render(scene, output, options)
+    frames, files, video = render_plan.frames, render_plan.files, render_plan.video
     reporter.progress(0.0, "reading the scene")
     mode = activate_variant(options.mode)
     if options.threads:
@@ -348,36 +403,37 @@ def render_file(
             else:
                 for frame in frames:
                     picture = render(frame, partial(_picture, write, options, stop, pace))
-        # The picture is there, and yet whoever called this does not go on.
+        # The image is complete, but the caller must not continue.
         stop.check()
     seconds = time.perf_counter() - start
-    result = PictureResult(files[0], picture.size, picture.channels, mode, seconds, picture.whole, tuple(files), top)
-    reporter.message(summary_line(result, asked, options))
+    result = PictureResult(
+        files[0], picture.size, picture.channels, mode, seconds, picture.undivided_reason, tuple(files), top
+    )
+    reporter.message(summary_line(result, render_plan, options))
     return result
 
 
-def summary_line(result: PictureResult, asked: RenderPlan, options: PictureOptions) -> str:
-    """The line that says what was written."""
-    files, frames = asked.files, asked.frames
-    note = f" It was rendered in one piece, beyond {options.memory:g} GB, because of {result.whole}."
+def summary_line(result: PictureResult, render_plan: RenderPlan, options: PictureOptions) -> str:
+    """Return the line that reports what was written."""
+    files, frames = render_plan.files, render_plan.frames
+    note = f" It was rendered in one piece, above {options.memory:g} GB, because of {result.undivided_reason}."
     width, height = result.size
-    what = str(files[0]) if len(files) == 1 else f"{len(files)} pictures, {files[0]} to {files[-1]}"
-    what += f", {len(frames)} pictures at {options.fps:g} a second" if asked.video else ""
-    scale = "" if result.vmax is None else f", scale to {result.vmax:.4g}"
+    what = str(files[0]) if len(files) == 1 else f"{len(files)} images, {files[0]} to {files[-1]}"
+    what += f", {len(frames)} frames at {options.fps:g} per second" if render_plan.video else ""
+    scale = "" if result.vmax is None else f", colour scale up to {result.vmax:.4g}"
     return (
         f"Wrote {what} ({width} x {height}, {result.channels} channels, {result.mode}, {result.seconds:.1f} s{scale})."
-        f"{note if result.whole else ''}"
+        f"{note if result.undivided_reason else ''}"
     )
 
 
 Write = Callable[[Callable[[Path, Provenance], None], Callable[[], np.ndarray]], None]
-"""Writes the next picture: as a file by the first function, or as a frame of a video by the pixels that the second
-gives."""
+"""Writes the next image: to a file by the first function, or as a frame of a video with the pixels of the second."""
 
 
 @contextmanager
 def _writer(files: Sequence[Path], options: PictureOptions, each: Iterator[Provenance], video: bool) -> Iterator[Write]:
-    """What takes the pictures one after the other: ``files``, or the one video that they name."""
+    """Yield the function that writes images to ``files``, or to the single video."""
     if not video:
         remaining = iter(files)
         yield lambda store, pixels: store(next(remaining), next(each))
@@ -389,29 +445,34 @@ def _writer(files: Sequence[Path], options: PictureOptions, each: Iterator[Prove
 def make_provenances(
     scene: Path, frames: Sequence[Mapping[str, str]], options: PictureOptions, mode: str, video: bool
 ) -> Iterator[Provenance]:
-    """What each picture was made of, or the one video."""
-    known: dict[Path, str] = {}
-    given = {name: getattr(options, name) for name in _OF_PICTURES} if options.overlay else {}
-    given |= {"mode": mode, "sensor": options.sensor, "spp": options.spp}
+    """Yield the provenance of each image, or of the video."""
+    checksums: dict[Path, str] = {}
+    recorded = {name: getattr(options, name) for name in _RECORDED_OPTIONS} if options.overlay else {}
+    recorded |= {"mode": mode, "sensor": options.sensor, "spp": options.spp}
     for frame in frames[:1] if video else frames:
         values = {**(options.defaults or {}), **({} if video else frame)}
         inputs = list_scene_files(scene, {**values, **frame})
         if video and options.frames is not None:
-            inputs, given["fps"] = [*inputs, options.frames], options.fps
-        yield make_provenance("nerg render", inputs, options.seed, given | {"defaults": values}, known)
+            inputs, recorded["fps"] = [*inputs, options.frames], options.fps
+        yield make_provenance("nerg render", inputs, options.seed, recorded | {"defaults": values}, checksums)
 
 
 def _check_video(output: Path, options: PictureOptions) -> bool:
-    """Whether ``output`` is a video. Raises `NergError` for options that contradict that."""
+    """Return whether ``output`` is a video. Raises `NergError` for contradictory options."""
     if output.suffix.lower() == VIDEO:
         if options.frames is None:
-            raise NergError(f'"{output}" is a video, and there is one picture; give --frames, or another name (.png)')
+            raise NergError(
+                f'"{output}" is a video, and there is a single image; add --frames, or use another name (.png)'
+            )
         check_video_output(options.fps)
         return True
     if options.fps != PictureOptions().fps:
-        raise NergError(f'--fps is of a video, and "{output}" is none; let its name end in {VIDEO}')
+        raise NergError(f'--fps applies to videos only, and "{output}" is not one; use a name that ends in {VIDEO}')
     if options.overlay is None and output.suffix.lower() not in IMAGE_FORMATS:
-        raise NergError(f'"{output}" holds an overlay; give --overlay, or a name that ends in {" or ".join(IMAGE_FORMATS)}')
+        raise NergError(
+            f'"{output}" can only hold an overlay; add --overlay, or use a name that ends in '
+            f"{' or '.join(IMAGE_FORMATS)}"
+        )
     return False
 
 
@@ -424,10 +485,10 @@ def _picture(
     camera: Any,
     on_strip: OnBand,
 ) -> RenderedPicture:
-    """Render what ``camera`` sees, and ``write`` it."""
+    """Render ``camera`` and write the image."""
     width, height = map(int, camera.film().crop_size())
     rows = bands.fit_rows_to_memory(loaded, camera, 1e9 * options.memory - resident_bytes() - RESERVE)
-    whole = bands.undividable_reason(loaded, camera) if rows < height else None
+    undivided_reason = bands.undividable_reason(loaded, camera) if rows < height else None
     channels = 0
 
     def fill(add: Callable[[Any, int], None]) -> None:
@@ -441,8 +502,8 @@ def _picture(
             add(bitmap, band.rows)
             stop.check()
 
-    def to_file(path: Path, about: Provenance) -> None:
-        with open_image_rows(path, width, height, about.text() | describe_bases(loaded)) as add:
+    def to_file(path: Path, record: Provenance) -> None:
+        with open_image_rows(path, width, height, record.text() | describe_bases(loaded)) as add:
             fill(add)
 
     def pixels() -> np.ndarray:
@@ -452,27 +513,27 @@ def _picture(
 
     with translate_mitsuba_errors():
         write(to_file, pixels)
-    return RenderedPicture((width, height), channels, whole)
+    return RenderedPicture((width, height), channels, undivided_reason)
 
 
 def find_sensor(path: Path, scene, index: int):
-    """The sensor of ``scene`` with this ``index``. Raises `NergError` where there is none, or no integrator for it."""
+    """Return the sensor with this ``index``. Raises `NergError` if there is none, or no integrator."""
     if scene.integrator() is None:
-        raise NergError(f'the scene "{path}" has no integrator to render with; add one, as <integrator type="nerg"/>')
+        raise NergError(f'the scene "{path}" has no integrator; add one, such as <integrator type="nerg"/>')
     count = len(scene.sensors())
     if not 0 <= index < count:
-        raise NergError(f'"{path}" has {count} sensor(s) and number {index} was asked for: choose -s from 0 on')
+        raise NergError(f'"{path}" has {count} sensor(s), and index {index} is out of range: -s counts from 0')
     return scene.sensors()[index]
 
 
 def sample_count(camera: Any, spp: int) -> int:
-    """Samples of a picture of ``camera``: ``spp`` a pixel, 0 for those of its sampler."""
+    """Return the number of samples of an image: ``spp`` per pixel, or that of the sampler if it is 0."""
     width, height = map(int, camera.film().crop_size())
     return width * height * (spp or camera.sampler().sample_count())
 
 
 def resident_bytes() -> int:
-    """Bytes of memory that this process takes; where the system does not say, the most that it ever took."""
+    """Return the resident memory of this process in bytes, or its maximum where the system does not report it."""
     try:
         return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except OSError:
@@ -482,97 +543,109 @@ def resident_bytes() -> int:
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
-# ---- Rendering sequences of pictures, as frames or a video, whole or in parts ----
+# ---- Rendering sequences in parts ----
 
 
 _LAYERS_SHARE = 0.8
-"""How much of a film with a common scale is rendering; the rest is drawing."""
+"""Fraction of the work that is rendering, for a sequence with a common colour scale; the rest is drawing."""
 
 
 def render_film(
     scene: str | Path, output: str | Path, options: FilmOptions | None = None, reporter: Reporter = SILENT
 ) -> PictureResult:
-    """Render the scene file ``scene`` to ``output``, as `render_file` does, and to the same bytes.
+    """Render the scene file ``scene`` to ``output`` like `render_file`, with bitwise the same result.
 
-    With ``options.store`` or ``options.scheduler`` each picture of a sequence is a part, which is kept and not rendered
-    again: whatever ended the job, the same call goes on. A picture depends on the scene, on the files that it names, on
-    its own values and on the options, and on nothing else: those whose inputs have changed are rendered again. The
-    reporter hears the progress of either.
+    With ``options.store`` or ``options.scheduler`` each image of a sequence is a part, which is stored and not rendered
+    again: after any interruption, the same call resumes. A part depends on the scene, on the files that it refers to,
+    on its own values and on the options; parts whose inputs have changed are rendered again.
     """
     options = options or FilmOptions()
     if not options.in_parts:
         return render_file(scene, output, options, reporter)
-    # A single picture needs neither time nor memory for it.
+    # Imported here, because a single image does not need it.
     from .parts import PartRunner
 
     scene, output = Path(scene), Path(output)
-    asked = plan_render(scene, output, options)
+    render_plan = plan_render(scene, output, options)
     parts = PartRunner(options, output, reporter, options.threads)
     reporter.progress(0.0, "reading the scene")
     mode = activate_variant(options.mode)
     if options.threads:
         set_thread_count(options.threads)
     start = time.perf_counter()
-    first, top = _rendered(scene, asked, replace(options, mode=mode), parts)
+    first, top = _render_in_parts(scene, render_plan, replace(options, mode=mode), parts)
     size, channels = (int(first["size"][0]), int(first["size"][1])), int(first.get("channels", 3))
     seconds = time.perf_counter() - start
-    result = PictureResult(asked.files[0], size, channels, mode, seconds, first.get("whole"), tuple(asked.files), top)
-    reporter.message(summary_line(result, asked, options))
-    reporter.message(f"The parts are kept in {parts.store.folder}; nerg jobs says what they take.")
+    result = PictureResult(
+        render_plan.files[0], size, channels, mode, seconds, first.get("whole"), tuple(render_plan.files), top
+    )
+    reporter.message(summary_line(result, render_plan, options))
+    reporter.message(f"The parts are stored in {parts.store.folder}; nerg jobs shows their size.")
     return result
 
 
-def _rendered(
-    scene: Path, asked: RenderPlan, options: FilmOptions, parts: PartRunner
+def _render_in_parts(
+    scene: Path, render_plan: RenderPlan, options: FilmOptions, parts: PartRunner
 ) -> tuple[Mapping[str, Any], float | None]:
-    """Make all pictures. Gives the notes of the last, and the upper end of the overlays' scale."""
+    """Render all images. Returns the notes of the last part, and the upper end of the colour scale."""
     from nerg_mi.tasks.task import Part, Plan
 
     from .parts import PlannedScene
 
-    suffix = ".png" if asked.video else asked.files[0].suffix.lower()
-    what = f"nerg render {os.path.abspath(asked.files[0])}"
+    suffix = ".png" if render_plan.video else render_plan.files[0].suffix.lower()
+    what = f"nerg render {os.path.abspath(render_plan.files[0])}"
     get_or_compute_each = picture_options(options)
     frames = [
         Part(PlannedScene.plan(scene, {**(options.defaults or {}), **frame}), f"picture {k + 1}")
-        for k, frame in enumerate(asked.frames)
+        for k, frame in enumerate(render_plan.frames)
     ]
     overlay = None if options.overlay is None else find_overlay(options.overlay)
     if overlay is None or not uses_shared_scale(overlay, len(frames), options):
-        last = _write(scene, asked, options, parts, Plan(what, make_picture, get_or_compute_each, frames, suffix), 0.0)
+        last = _copy_outputs(
+            scene, render_plan, options, parts, Plan(what, make_picture, get_or_compute_each, frames, suffix), 0.0
+        )
         return last, last.get("top")
-    # All are rendered, then the scale of all is known, and each is drawn by it.
-    layers = list(parts.run(Plan(f"{what} (values)", make_layers, get_or_compute_each, frames, ".npy"), 0.0, _LAYERS_SHARE))
+    # Render all, then determine the common colour scale, then draw all.
+    layers = list(
+        parts.run(Plan(f"{what} (values)", make_layers, get_or_compute_each, frames, ".npy"), 0.0, _LAYERS_SHARE)
+    )
     limits = [None if made.notes["limits"] is None else tuple(made.notes["limits"]) for made in layers]
     ends = shared_limits(limits, options.vmax)
     overlay.check_limits(ends)
     drawings = []
-    for k, (frame, made) in enumerate(zip(asked.frames, layers)):
+    for k, (frame, made) in enumerate(zip(render_plan.frames, layers)):
         header = {}
-        if not asked.video:
+        if not render_plan.video:
             header = next(make_provenances(scene, [frame], options, str(options.mode), False)).text()
         notes = {name: made.notes[name] for name in ("marker", "supported", "basis")}
         drawings.append(Part(LayerDrawing(made.path, ends, **notes, header=header), f"drawing {k + 1}"))
-    _write(scene, asked, options, parts, Plan(what, draw_layers, get_or_compute_each, drawings, suffix), _LAYERS_SHARE)
+    _copy_outputs(
+        scene,
+        render_plan,
+        options,
+        parts,
+        Plan(what, draw_layers, get_or_compute_each, drawings, suffix),
+        _LAYERS_SHARE,
+    )
     return layers[-1].notes, None if ends is None else ends[1]
 
 
-def _write(
-    scene: Path, asked: RenderPlan, options: FilmOptions, parts: PartRunner, plan: Any, since: float
+def _copy_outputs(
+    scene: Path, render_plan: RenderPlan, options: FilmOptions, parts: PartRunner, plan: Any, since: float
 ) -> Mapping[str, Any]:
-    """Bring the outputs of ``plan`` to where they belong, one after the other. Gives the notes of the last."""
+    """Copy the outputs of ``plan`` to the output files, in order. Returns the notes of the last part."""
     last: Mapping[str, Any] = {}
     arriving = parts.run(plan, since)
-    if not asked.video:
-        for file, made in zip(asked.files, arriving):
+    if not render_plan.video:
+        for file, made in zip(render_plan.files, arriving):
             last = made.notes
             with replace_atomically(file) as temporary:
                 shutil.copyfile(made.path, temporary)
         return last
     import mitsuba as mi
 
-    headers = make_provenances(scene, asked.frames, options, str(options.mode), True)
-    with open_video_writer(asked.files[0], options.fps, next(headers).text()) as add:
+    headers = make_provenances(scene, render_plan.frames, options, str(options.mode), True)
+    with open_video_writer(render_plan.files[0], options.fps, next(headers).text()) as add:
         for made in arriving:
             last = made.notes
             add(np.array(mi.Bitmap(str(made.path)))[..., :3])
@@ -583,18 +656,18 @@ def _write(
 
 
 def picture_options(options: PictureOptions) -> PictureOptions:
-    """The ``options`` of a single picture: a part has the values of its frame itself, and belongs to any video."""
+    """Return the ``options`` of a single image: a part has its own values, and does not depend on the video."""
     return replace(to_base(options, PictureOptions), defaults=None, frames=None, fps=PictureOptions().fps)
 
 
 def make_picture(options: PictureOptions, scene: PlannedScene, output: Path) -> dict[str, Any]:
-    """A picture file, as `render_file` writes it."""
+    """Write an image file like `render_file`."""
     made = render_file(scene.checked_path(), output, replace(options, defaults=scene.defaults))
-    return {"size": made.size, "channels": made.channels, "whole": made.whole, "top": made.vmax}
+    return {"size": made.size, "channels": made.channels, "whole": made.undivided_reason, "top": made.vmax}
 
 
 def make_layers(options: PictureOptions, scene: PlannedScene, output: Path) -> dict[str, Any]:
-    """A picture's colour and overlay as they are before they are drawn (.npy), with what a scale is made of."""
+    """Write the colour and the AOV of an image (.npy), and return what its colour scale depends on."""
     path = scene.checked_path()
     activate_variant(options.mode)
     overlay = find_overlay(options.overlay or "")
@@ -618,7 +691,8 @@ def make_layers(options: PictureOptions, scene: PlannedScene, output: Path) -> d
 
 @dataclass(frozen=True)
 class LayerDrawing:
-    """``layers`` (.npy) that `make_layers` made, with its notes; ``ends`` of the scale; ``header`` of the file."""
+    """The ``layers`` (.npy) of `make_layers` with its notes, the ``ends`` of the colour scale, and the file ``header``.
+    The ``layers`` (.npy) of `make_layers` with its notes, the ``ends`` of the colour scale, and the file ``header``."""
 
     layers: Path
     ends: Limits
@@ -629,7 +703,7 @@ class LayerDrawing:
 
 
 def draw_layers(options: PictureOptions, drawing: LayerDrawing, output: Path) -> None:
-    """The figure of a picture's layers."""
+    """Draw the figure of the layers of an image."""
     marker = None if drawing.marker is None else (drawing.marker[0], drawing.marker[1])
     layers = unstack_layers(read_npy(drawing.layers, "layers"), marker, drawing.supported, drawing.basis)
     figure = find_overlay(options.overlay or "").draw(layers, drawing.ends, overlay_style(options))

@@ -1,4 +1,4 @@
-"""The report on a gaze field: its inputs, scores, pictures and surroundings, computed and written as HTML."""
+"""The report on a gaze field: inputs, scores, figures and a 3D view, written as HTML."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import MissingFile, NergError, translate_mitsuba_errors, sanitize
+from nerg_mi.errors import MissingFile, NergError, sanitize, translate_mitsuba_errors
 from nerg_mi.evaluation.gaze_report import GazeResults, read_results
 from nerg_mi.fields.gaze_base import AnyGazeField
 from nerg_mi.figures import maps, overlay
-from nerg_mi.figures.overlay import Heat, OverlayLayers, Style, find_overlay, srgb, to_bytes, robust_max, unknown_mask
+from nerg_mi.figures.overlay import Heat, OverlayLayers, Style, find_overlay, robust_max, srgb, to_bytes, unknown_mask
 from nerg_mi.figures.sphere import sphere_figure
 from nerg_mi.figures.style import Provenance, encode
 from nerg_mi.figures.style import versions as programs
@@ -27,7 +27,7 @@ from nerg_mi.formats.fields import load_gaze
 from nerg_mi.interruption import Interruption
 from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.rays.dataset import is_dataset, load_rays, hash_rays
+from nerg_mi.rays.dataset import hash_rays, is_dataset, load_rays
 from nerg_mi.rays.quality import summarise
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.bands import Channels, render_channels
@@ -36,21 +36,21 @@ from nerg_mi.rendering.scene_writer import free_default_name, project_to_pixel
 from nerg_mi.report.data import (
     MAX_PATH_POINTS,
     EyePositions,
-    ParticipantLabels,
-    ObjectAttention,
     GazeSampler,
+    ObjectAttention,
+    ParticipantLabels,
     ReportCamera,
     ReportPicture,
     Run,
     Stage,
-    summarize_objects,
-    sample_eye_positions,
-    assign_ray_hits,
-    pack_stage,
-    make_proxy,
     anonymize_rays,
     anonymize_results,
+    assign_ray_hits,
     farthest_point_sampling,
+    make_proxy,
+    pack_stage,
+    sample_eye_positions,
+    summarize_objects,
 )
 from nerg_mi.report.sections import render_page
 from nerg_mi.statistics.shares import COARSE, gaze_shares
@@ -68,18 +68,21 @@ from .scene_cameras import support_of_rays, to_scene_frame
 from .scene_commands import ReportOptions, SceneOptions
 from .scene_places import KINDS, PLACES, InputFiles, detect_kind, recognise
 
-# ---- What the files are that a report is made of, found from the files themselves ----
+# ---- Input files, recognised by their content ----
 
 RESULTS = "gaze.json"
-"""The file of an evaluation that is read."""
+"""Name of the file with the results of an evaluation."""
 
 _ROLES = {"field": "radiance field", "mesh": "mesh", "hits": "hit points", "scene": "scene"}
 
 
 @dataclass(frozen=True)
 class ReportFiles:
-    """``scene``: the place and the gaze field, as a scene is written for; ``gaze``; ``rays``: file or dataset, or None;
-    ``results``: files of evaluations."""
+    """Input files of a report.
+
+    ``scene`` holds the scene and the gaze field as `nerg scene` takes them; ``rays`` is a file, a dataset or None;
+    ``results`` are files of evaluations.
+    """
 
     scene: InputFiles
     gaze: Path
@@ -88,11 +91,11 @@ class ReportFiles:
 
     @property
     def shown(self) -> list[Path]:
-        """What `nerg scene` is given."""
+        """Files for `nerg scene`."""
         return [self.gaze] if self.scene.place is None else [self.scene.place, self.gaze]
 
     def inputs(self) -> list[tuple[str, str, str]]:
-        """Role, name and SHA-256 of each file."""
+        """Return role, name and SHA-256 of each file."""
         out = [("gaze field", self.gaze.name, file_sha256(self.gaze))]
         if self.scene.place is not None:
             role = "splats" if self.scene.splats else _ROLES[self.scene.kind]
@@ -103,32 +106,30 @@ class ReportFiles:
 
 
 def sort_files(files: Sequence[Path]) -> ReportFiles:
-    """What ``files`` are, in any order: a gaze field, its place (found beside it where it is not given), rays,
-    evaluations (``gaze.json``, or the folder that holds one). Any other folder stands for what lies in it.
+    """Recognise ``files`` in any order: a gaze field, its scene, rays, and evaluations (``gaze.json``, or its folder).
 
-    Raises `NergError` for what does not make a report.
+    The scene is looked up next to the gaze field if it is not given. Other folders are replaced by the files in them.
+    Raises `NergError` for files that do not make a report.
     """
-    found: dict[str, Path] = {}
+    by_role: dict[str, Path] = {}
     results: list[Path] = []
-    for path in _unfolded(files):
+    for path in _expand_folders(files):
         if path.suffix.lower() == ".json":
             results.append(path)
             continue
         kind = "rays" if is_dataset(path) else detect_kind(path)
         role = "place" if kind in PLACES else kind
-        if role in found and resolve_path(found[role]) != resolve_path(path):
-            raise NergError(
-                f'"{found[role]}" and "{path}" are both a {role}; a report is of one of them: name the files'
-            )
-        found.setdefault(role, path)
-    if "gaze" not in found:
-        raise NergError("a report is of a gaze field, and there is none among these files; name its checkpoint")
-    shown = [found[role] for role in ("place", "gaze") if role in found]
-    return ReportFiles(recognise(shown, None, SILENT), found["gaze"], found.get("rays"), tuple(results))
+        if role in by_role and resolve_path(by_role[role]) != resolve_path(path):
+            raise NergError(f'"{by_role[role]}" and "{path}" are both a {role}, and a report takes one; name the files')
+        by_role.setdefault(role, path)
+    if "gaze" not in by_role:
+        raise NergError("a report needs a gaze field, and there is none among these files; name its checkpoint")
+    shown = [by_role[role] for role in ("place", "gaze") if role in by_role]
+    return ReportFiles(recognise(shown, None, SILENT), by_role["gaze"], by_role.get("rays"), tuple(results))
 
 
-def _unfolded(files: Sequence[Path]) -> list[Path]:
-    """``files`` with what lies in folders in place of these."""
+def _expand_folders(files: Sequence[Path]) -> list[Path]:
+    """Return ``files`` with folders replaced by the files in them."""
     out: list[Path] = []
     for path in files:
         if not path.exists():
@@ -138,81 +139,94 @@ def _unfolded(files: Sequence[Path]) -> list[Path]:
         elif (path / RESULTS).is_file():
             out.append(path / RESULTS)
         else:
-            out += _within(path)
+            out += _list_inputs(path)
     return out
 
 
-def _within(folder: Path) -> list[Path]:
-    """What a folder holds of which a report is made, in the order of names: checkpoints, rays, evaluations."""
-    found = sorted(folder.iterdir())
-    kept = [p for p in found if p.suffix.lower() == ".safetensors" and p.is_file()]
-    kept += [p for p in found if KINDS.get(p.suffix.lower()) == "rays" and (p.is_file() or is_dataset(p))]
-    kept += [p / RESULTS for p in found if p.is_dir() and (p / RESULTS).is_file()]
-    if not kept:
-        raise NergError(f'the folder "{folder}" holds no checkpoint, rays or evaluation; name others')
-    return kept
+def _list_inputs(folder: Path) -> list[Path]:
+    """Return checkpoints, rays and evaluations in a folder, sorted by name."""
+    entries = sorted(folder.iterdir())
+    selected = [p for p in entries if p.suffix.lower() == ".safetensors" and p.is_file()]
+    selected += [p for p in entries if KINDS.get(p.suffix.lower()) == "rays" and (p.is_file() or is_dataset(p))]
+    selected += [p / RESULTS for p in entries if p.is_dir() and (p / RESULTS).is_file()]
+    if not selected:
+        raise NergError(f'the folder "{folder}" contains no checkpoint, rays or evaluation; name another one')
+    return selected
 
 
-# ---- The pictures of a report ----
+# ---- Images of a report ----
 
 
 @dataclass(frozen=True, eq=False)
 class RenderedViews:
-    """What was rendered: ``seen`` from the "camera", the observer's "own" view and the "sphere"; ``marker``: pixel of
-    the camera's picture at which the observer is; ``supported``: whether anybody was recorded around there; ``basis``:
-    rays and people that the gaze rests on, in words."""
+    """Rendered images.
 
-    seen: Mapping[str, Channels]
+    Attributes
+    ----------
+    images
+        Images of the "camera", the observer's "own" view and the "sphere".
+    marker
+        Pixel of the observer in the camera's image.
+    supported
+        Whether rays were recorded around the observer.
+    basis
+        Description of the data behind the gaze.
+    """
+
+    images: Mapping[str, Channels]
     marker: tuple[float, float] | None = None
     supported: bool = True
     basis: str = ""
 
     def layers(self, name: str, quantity: str = "gaze") -> OverlayLayers:
-        """A ``quantity`` over the picture ``name``."""
-        view, marker = self.seen[name], self.marker if name == "camera" else None
+        """Return a ``quantity`` over the image ``name``."""
+        view, marker = self.images[name], self.marker if name == "camera" else None
         return OverlayLayers(view.color, view.aovs[quantity], view.mask, marker, self.supported, self.basis)
 
 
 def gaze_vmax(views: Mapping[str, Channels]) -> float | None:
-    """One end of the scale (1/sr) for all pictures of gaze, so that a colour means the same in each; None where there
-    is no gaze."""
+    """Return the upper end of the common colour scale (1/sr) of all images of gaze; None if there is no gaze."""
     tops = [robust_max(v.aovs["gaze"], v.mask) for v in views.values() if np.any(v.aovs["gaze"][v.mask] > 0)]
     return max(tops) if tops else None
 
 
 def draw_views(
-    views: RenderedViews, top: float | None, place_known: bool, about: Provenance
+    views: RenderedViews, top: float | None, has_geometry: bool, record: Provenance
 ) -> dict[str, ReportPicture]:
-    """Colour and gaze from the camera, and the observer's own view and sphere, hatched where nothing is known;
-    ``about``: what the header of each says."""
-    out, text = {}, about.text()
-    camera = views.seen["camera"]
-    if place_known:
+    """Draw colour and gaze from the camera, and the observer's view and sphere, hatched where the gaze is unknown.
+
+    ``about`` is the provenance for image headers.
+    """
+    out, text = {}, record.text()
+    camera = views.images["camera"]
+    if has_geometry:
         out["color"] = ReportPicture(
-            _png(srgb(camera.color), text), "The place in colour.", "The place, as the camera sees it."
+            _png(srgb(camera.color), text), "The scene in colour.", "The scene from the camera."
         )
     if top is None:
         return out
     heat = Heat(top)
-    hatched = lambda of: unknown_mask(of, True) if place_known or not of.supported else None
+    hatched = lambda of: unknown_mask(of, True) if has_geometry or not of.has_support else None
 
     def draw(name: str, title: str) -> bytes:
-        of = views.layers(name)
-        arrays = of.color, of.values, of.mask
-        drawn = overlay.gaze_figure(*arrays, heat, title, marker=of.marker, unknown=hatched(of), note=of.support_note)
+        layers = views.layers(name)
+        arrays = layers.color, layers.values, layers.mask
+        drawn = overlay.gaze_figure(
+            *arrays, heat, title, marker=layers.marker, unknown=hatched(layers), note=layers.support_note
+        )
         return encode(drawn, ".png", text)
 
-    if place_known:
+    if has_geometry:
         out["gaze"] = ReportPicture(
             draw("camera", "Where the observer looks"),
-            "Gaze of the observer over the colours of the place.",
-            "The observer's gaze on the place. What the observer cannot see has none.",
+            "Gaze of the observer over the colours of the scene.",
+            "The observer's gaze on the scene. There is none where the observer's view is occluded.",
         )
         spread = camera.aovs.get("gaze_std")
         if spread is not None and np.any(spread[camera.mask] > 0):
             out["spread"] = _spread(views.layers("camera", "gaze_std"), text)
     out["own"] = ReportPicture(
-        draw("own", "The observer's own view"), "Gaze in the observer's own view.", "What the observer sees ahead."
+        draw("own", "The observer's own view"), "Gaze in the observer's own view.", "The view straight ahead."
     )
     sphere = views.layers("sphere")
     arrays = sphere.color, sphere.values, sphere.mask
@@ -220,33 +234,33 @@ def draw_views(
     out["sphere"] = ReportPicture(
         encode(drawn, ".png", text),
         "Gaze in all directions around the observer.",
-        "All that the observer could turn to.",
+        "All directions that the observer could turn to.",
     )
     return out
 
 
-def _spread(of: OverlayLayers, text: Mapping[str, str]) -> ReportPicture:
+def _spread(layers: OverlayLayers, text: Mapping[str, str]) -> ReportPicture:
     spread = find_overlay("gaze_std")
-    drawn = spread.draw(of, spread.limits(of), Style(colormap="viridis", title="Where the fields disagree"))
+    drawn = spread.draw(layers, spread.limits(layers), Style(colormap="viridis", title="Disagreement of the ensemble"))
     return ReportPicture(
         encode(drawn, ".png", text),
         "Standard deviation of the gaze of the ensemble's members.",
-        "How far the members of the ensemble are apart: where this is as large as the gaze itself, nothing is known.",
+        "Standard deviation of the ensemble members: where it is as large as the gaze itself, the gaze is unknown.",
     )
 
 
-def draw_rays(rays: Rays, test: Mapping[str, Any] | None, about: Provenance) -> dict[str, ReportPicture]:
-    """Plans of the floor. ``test``: what was held out of the training; ``about``: what the header of each says."""
-    plan = encode(maps.floor_plan(rays), ".png", about.text())
+def draw_rays(rays: Rays, test: Mapping[str, Any] | None, record: Provenance) -> dict[str, ReportPicture]:
+    """Draw floor plans. ``test`` describes the held-out data; ``about`` is the provenance for image headers."""
+    plan = encode(maps.floor_plan(rays), ".png", record.text())
     held_out = {}
-    words = "Each ray's place."
+    words = "Position of each ray."
     if test and test.get("centres"):
         held_out = {"centres": np.array(test["centres"], float), "radius": float(test.get("radius", 0.25))}
-        words += " Circles: positions that were held out of the training."
-    layout = encode(maps.layout_figure(rays, title="Rays", **held_out), ".png", about.text())
+        words += " Circles: held-out positions."
+    layout = encode(maps.layout_figure(rays, title="Rays", **held_out), ".png", record.text())
     return {
-        "plan": ReportPicture(plan, "Plan of how densely the floor is walked.", "How densely the floor is walked."),
-        "layout": ReportPicture(layout, "Plan of the places of all rays.", words),
+        "plan": ReportPicture(plan, "Plan of the density of recorded positions.", "Density of recorded positions."),
+        "layout": ReportPicture(layout, "Plan of the positions of all rays.", words),
     }
 
 
@@ -256,82 +270,81 @@ def _png(display: np.ndarray, text: Mapping[str, str]) -> bytes:
     return encode_png(mi.Bitmap(to_bytes(display)), text)
 
 
-# ---- The evaluations that a report shows: those that were given, and those that are made for it ----
+# ---- Evaluations: given files, and those that are computed ----
 
 
-def read_matching_results(given: ReportFiles) -> tuple[list[GazeResults], list[str]]:
-    """The evaluations that were given, and doubts about them. Raises `NergError` for those of another field."""
-    found, doubts, own = [], [], file_sha256(given.gaze)
-    for path in given.results:
+def read_matching_results(files: ReportFiles) -> tuple[list[GazeResults], list[str]]:
+    """Read the given evaluations; return them with warnings. Raises `NergError` for those of another field."""
+    evaluations, doubts, gaze_sha256 = [], [], file_sha256(files.gaze)
+    for path in files.results:
         results = read_results(path)
-        if results.sha256 and results.sha256 != own:
-            raise NergError(f'"{path}" is an evaluation of another gaze field than "{given.gaze}"; leave it out')
-        if not results.sha256 and results.gaze != given.gaze.name:
-            doubts.append(
-                f"An evaluation is of a field called {sanitize(results.gaze, 80)}; whether it is this one is not known."
-            )
-        found.append(results)
-    splits = [r.split for r in found]
+        if results.sha256 and results.sha256 != gaze_sha256:
+            raise NergError(f'"{path}" is an evaluation of a gaze field other than "{files.gaze}"; leave it out')
+        if not results.sha256 and results.gaze != files.gaze.name:
+            doubts.append(f"An evaluation is of a field named {sanitize(results.gaze, 80)}, which may be another one.")
+        evaluations.append(results)
+    splits = [r.split for r in evaluations]
     twice = next((s for s in splits if splits.count(s) > 1), None)
     if twice is not None:
-        raise NergError(f'two of the evaluations are of the split "{sanitize(twice, 40)}"; leave out one of them')
-    return found, doubts
+        raise NergError(f'two evaluations are of the split "{sanitize(twice, 40)}"; leave out one of them')
+    return evaluations, doubts
 
 
 def compute_results(
-    given: ReportFiles, options: ReportOptions, have: Sequence[GazeResults], reporter: Reporter
+    files: ReportFiles, options: ReportOptions, have: Sequence[GazeResults], reporter: Reporter
 ) -> list[GazeResults]:
-    """Evaluations of the splits that there are and that nobody ``have``."""
-    if given.rays is None:
-        raise NergError("--evaluate scores the field on rays, and there are none; name the file that it was trained on")
-    account = given.scene.about.get("test") or {}
-    wanted = ("both", "pos", "people") if account.get("people") else ("pos",)
-    place = {"field": "field", "scene": "scene", "hits": "geometry"}.get(given.scene.kind)
-    where = {} if place is None else {place: given.scene.place}
-    found = []
-    for split in wanted:
+    """Compute the evaluations of the splits that are not in ``have``."""
+    if files.rays is None:
+        raise NergError("--evaluate needs the rays of the training; name their file")
+    account = files.scene.gaze_provenance.get("test") or {}
+    splits = ("both", "pos", "people") if account.get("people") else ("pos",)
+    place = {"field": "field", "scene": "scene", "hits": "geometry"}.get(files.scene.kind)
+    where = {} if place is None else {place: files.scene.place}
+    evaluations = []
+    for split in splits:
         if split in {r.split for r in have}:
             continue
-        more = {"threads": options.threads, "seed": options.seed, "mode": options.mode or "llvm_ad_rgb"}
-        job = GazeEvaluationOptions(split=split, pictures=0, **where, **more)
+        common = {"threads": options.threads, "seed": options.seed, "mode": options.mode or "llvm_ad_rgb"}
+        job = GazeEvaluationOptions(split=split, pictures=0, **where, **common)
         reporter.message(f"scoring the split {split}")
-        scored = evaluate_gaze(given.gaze, given.rays, None, job, reporter)
-        about = given.gaze.name, file_sha256(given.gaze), split, scored.positions, scored.people, job.kappa
-        found.append(GazeResults(*about, tuple(scored.rows), tuple(scored.persons)))
-    return found
+        scored = evaluate_gaze(files.gaze, files.rays, None, job, reporter)
+        identity = files.gaze.name, file_sha256(files.gaze), split, scored.positions, scored.people, job.kappa
+        evaluations.append(GazeResults(*identity, tuple(scored.rows), tuple(scored.persons)))
+    return evaluations
 
 
-# ---- Surroundings ----
+# ---- Viewpoints and paths ----
 #
-# From where a report looks at its place: eyes of people, or, where nobody was recorded, places where people could
-# stand; and their paths.
+# The viewpoints of a report are recorded positions or, without rays, free positions in the scene.
 
 
 PANORAMAS = 8
-"""Panoramas that the 3D scene is made of."""
+"""Number of panoramas from which the 3D view is built."""
 
-# Cells along the longer side of the grid on which free places are looked for, and rays that look around each.
+# Grid cells along the longer side when looking for free positions, and rays around each position.
 _CELLS, _AROUND = 14, 64
-# A free place has nothing nearer than this share of the place's height at the eye's level.
+# Minimum distance of a free position to surfaces, as a fraction of the scene's height.
 _FREE = 0.1
-# Nobody is followed over a longer pause, in seconds, or step, in metres.
+# A path is interrupted by a longer pause, in seconds, or a longer step, in metres.
 _PAUSE, _STEP = 2.0, 2.0
-# Edge of the cubes by which a path is drawn, in metres.
+# Resolution of drawn paths in metres.
 _STRIDE = 0.15
 
 
 def panorama_positions(standing: np.ndarray, observer: np.ndarray, count: int = PANORAMAS) -> np.ndarray:
-    """Up to ``count`` eyes (K, 3): the ``observer`` (3,), and of the places where people stand (N, 3) those that are
+    """Return up to ``count`` viewpoints (K, 3): the ``observer`` (3,), and those of ``standing`` (N, 3) that are
     farthest apart."""
-    others = standing[farthest_point_sampling(standing, count - 1, first=observer)]
-    return np.concatenate([np.asarray(observer, float)[None], others])
+    farthest = standing[farthest_point_sampling(standing, count - 1, first=observer)]
+    return np.concatenate([np.asarray(observer, float)[None], farthest])
 
 
 def find_free_positions(
-    onlooker: GazeSampler, box: tuple[np.ndarray, np.ndarray], up: np.ndarray, observer: np.ndarray
+    sampler: GazeSampler, box: tuple[np.ndarray, np.ndarray], up: np.ndarray, observer: np.ndarray
 ) -> np.ndarray:
-    """Places (N, 3) on the level of the ``observer`` (3,) within a ``box`` (lower and upper corner) where there is
-    room, with surfaces in most directions: a grid of them."""
+    """Return free positions (N, 3) on a grid at the height of the ``observer`` (3,) within a ``box``.
+
+    A position is free if it is far enough from surfaces, and if there are surfaces in most directions.
+    """
     lower, upper = (np.asarray(c, float) for c in box)
     level = int(np.argmax(np.abs(up)))
     edges = upper - lower
@@ -340,34 +353,38 @@ def find_free_positions(
     axes[level] = np.array([np.asarray(observer, float)[level]])
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     directions = fibonacci_directions(_AROUND)
-    depth, met = onlooker.trace(np.repeat(grid, _AROUND, axis=0), np.tile(directions, (len(grid), 1)))
-    depth, met = depth.reshape(-1, _AROUND), met.reshape(-1, _AROUND)
-    near = np.where(met, depth, np.inf).min(axis=1)
-    return grid[(near > _FREE * edges[level]) & (met.mean(axis=1) > 0.5)]
+    depth, hit = sampler.trace(np.repeat(grid, _AROUND, axis=0), np.tile(directions, (len(grid), 1)))
+    depth, hit = depth.reshape(-1, _AROUND), hit.reshape(-1, _AROUND)
+    near = np.where(hit, depth, np.inf).min(axis=1)
+    return grid[(near > _FREE * edges[level]) & (hit.mean(axis=1) > 0.5)]
 
 
-def count_participants_near(rays: Rays, eyes: np.ndarray, place: TrainingGeometry, radius: float) -> tuple[int, ...]:
-    """How many people have a ray from within ``radius`` metres of each of the ``eyes`` (P, 3) of the place."""
+def count_participants_near(
+    rays: Rays, viewpoints: np.ndarray, place: TrainingGeometry, radius: float
+) -> tuple[int, ...]:
+    """Count the participants with a ray within ``radius`` metres of each of the viewpoints ``eyes`` (P, 3)."""
     from scipy.spatial import KDTree
 
-    found = KDTree(place.points_to_field(rays.origin)).query_ball_point(eyes, radius * place.align.scale)
-    return tuple(len(np.unique(rays.person[rows])) for rows in found)
+    neighbours = KDTree(place.points_to_field(rays.origin)).query_ball_point(viewpoints, radius * place.align.scale)
+    return tuple(len(np.unique(rays.person[rows])) for rows in neighbours)
 
 
 def collect_paths(rays: Rays, place: TrainingGeometry) -> list[np.ndarray]:
-    """People's paths, (n, 3) each, in the coordinates of the place, with gaps where nobody was followed: of more than a
-    page can hold evenly chosen ones."""
+    """Return the paths of participants, (n, 3) each, in scene coordinates, interrupted where there are no rays.
+
+    If there are more than a page can hold, evenly selected ones are returned.
+    """
     parts = []
     for person in np.unique(rays.person):
-        own = np.flatnonzero(rays.person == person)
-        own = own[np.argsort(rays.t[own], kind="stable")]
-        jump = np.diff(rays.t[own]) > _PAUSE
-        jump |= np.linalg.norm(np.diff(rays.origin[own], axis=0), axis=1) > _STEP
-        parts += [rows for rows in np.split(own, np.flatnonzero(jump) + 1) if len(rows) > 1]
-    walked = [path for path in (_walked(rays.origin[rows]) for rows in parts) if len(path) > 1]
+        person_rows = np.flatnonzero(rays.person == person)
+        person_rows = person_rows[np.argsort(rays.t[person_rows], kind="stable")]
+        jump = np.diff(rays.t[person_rows]) > _PAUSE
+        jump |= np.linalg.norm(np.diff(rays.origin[person_rows], axis=0), axis=1) > _STEP
+        parts += [rows for rows in np.split(person_rows, np.flatnonzero(jump) + 1) if len(rows) > 1]
+    walked = [path for path in (_simplify_path(rays.origin[rows]) for rows in parts) if len(path) > 1]
     total = sum(map(len, walked))
     if total > MAX_PATH_POINTS:
-        # As many whole ones as fit if all are alike, and no more than fit.
+        # Evenly selected paths, and no more than fit.
         count = max(1, len(walked) * MAX_PATH_POINTS // total)
         walked = [walked[k] for k in np.linspace(0, len(walked) - 1, count).astype(int)]
         ends = np.cumsum([len(path) for path in walked])
@@ -375,67 +392,66 @@ def collect_paths(rays: Rays, place: TrainingGeometry) -> list[np.ndarray]:
     return [place.points_to_field(path) for path in walked]
 
 
-def _walked(points: np.ndarray) -> np.ndarray:
-    """Those of ``points`` (N, 3) of a path at which it enters another cube of edge `_STRIDE`: somebody who stands is
-    one point."""
+def _simplify_path(points: np.ndarray) -> np.ndarray:
+    """Return those of ``points`` (N, 3) at which a path enters another cube of edge `_STRIDE`."""
     cell = np.floor(points / _STRIDE)
     return points[np.r_[True, (cell[1:] != cell[:-1]).any(axis=1)]]
 
 
-# ---- What a report says of its place, its observer and itself ----
+# ---- Texts on the scene, the observer and the settings ----
 
 
-def describe_scene(given: ReportFiles) -> str:
-    """The place, in a sentence."""
-    name = "" if given.scene.place is None else given.scene.place.name
-    if given.scene.splats:
+def describe_scene(files: ReportFiles) -> str:
+    """Describe the scene in a sentence."""
+    name = "" if files.scene.place is None else files.scene.place.name
+    if files.scene.splats:
         return f"Gaussian splats, {name}."
     return {
         "field": f"A radiance field trained on photos, {name}.",
         "mesh": f"The mesh {name}.",
         "scene": f"The Mitsuba scene {name}.",
-        "hits": f"No pictures of the place are at hand: it is made of what people looked at, {name}, in greys.",
-        "none": "Nothing is known of the place: directions alone are shown.",
-    }[given.scene.kind]
+        "hits": f"The scene consists of the hit points of rays, {name}, in grey; there are no photos of it.",
+        "none": "There is no geometry: only directions are shown.",
+    }[files.scene.kind]
 
 
-def describe_observer(scene: SceneResult, asked: bool) -> str:
-    """The observer, in a sentence; ``asked``: whether somebody said where."""
+def describe_observer(scene: SceneResult, is_given: bool) -> str:
+    """Describe the observer in a sentence; ``asked`` tells whether its position was given."""
     if scene.observer is None:
-        return "The camera is the observer, for nothing says where people were."
+        return "The camera is the observer, because no recorded positions are known."
     at = ", ".join(f"{v:.2f}" for v in scene.observer.origin)
-    where = "where it was asked for" if asked else "where most rays are"
-    return f"The observer stands {where}, at ({at})."
+    where = "at the given position" if is_given else "where the density of rays is highest"
+    return f"The observer is {where}, ({at})."
 
 
 def describe_settings(options: ReportOptions) -> dict[str, str]:
-    """What the report was made with, by what it is called."""
+    """Return the settings of the report by their names."""
     return {
         "width": f"{options.width} pixels",
-        "samples a pixel": str(options.spp),
+        "samples per pixel": str(options.spp),
         "seed": str(options.seed),
-        "places looked from": f"{options.viewpoints} at most",
-        "names of people": "shown" if options.show_names else "numbered",
-        "fewest people of a share": str(options.min_participants),
+        "viewpoints": f"at most {options.viewpoints}",
+        "names of participants": "shown" if options.show_names else "numbered",
+        "minimum number of participants": str(options.min_participants),
     }
 
 
-# ---- A report on a gaze field: one HTML file of its place, people, gaze, objects, scores, limits and provenance ----
+# ---- The report ----
 
 
 VIEWS = ("camera", "own", "sphere")
-"""The pictures, which are those of the written scene's sensors."""
+"""Names of the images of the sensors of the written scene."""
 
 OBSERVERS = 5
-"""Observers whose gaze the 3D scene has."""
+"""Number of observers with gaze in the 3D view."""
 
 RAYS = 50_000
-"""Rays of which it is found out what they end at, at most."""
+"""Maximum number of rays whose hits are assigned to AOIs."""
 
 
 @dataclass(frozen=True, eq=False)
 class ReportResult:
-    """``path`` of the report; ``run``: all that it shows."""
+    """``path`` of the report; ``run`` is its content."""
 
     path: Path
     run: Run
@@ -448,46 +464,63 @@ def make_report(
     reporter: Reporter = SILENT,
     rendered: Mapping[str, Channels] | None = None,
 ) -> ReportResult:
-    """Write the report ``output`` (.html) of a gaze field, of which ``files`` are the checkpoint and, in any order,
-    what there is besides: its place, rays, evaluations, or folders of these.
+    """Write the report ``output`` (.html) on a gaze field.
 
-    The place is found beside the gaze field where it is not given. ``rendered``: pictures with the gaze of the observer
-    that somebody has rendered already, of the "camera", of the observer's "own" view and of the "sphere"; they must be
-    of the observer and the camera in ``options``. Raises `NergError` for what the user can mend.
+    Parameters
+    ----------
+    files
+        The gaze field and, in any order, its scene, rays and evaluations, or folders of these. The scene is looked up
+        next to the gaze field if it is not given.
+    output
+        HTML file.
+    options
+        Content of the report.
+    reporter
+        Receives messages and progress.
+    rendered
+        Images that have been rendered already, for the observer and camera of ``options``: "camera", "own" and
+        "sphere".
+
+    Raises
+    ------
+    NergError
+        For errors that the user can correct.
     """
     options, output = options or ReportOptions(), Path(output)
     check_writable(output, ".html", ".htm")
-    given = sort_files([Path(file) for file in files])
-    areas = AreaSet(()) if options.aois is None else _objects(options.aois, reporter)
-    results, doubts = read_results(given)
+    report_files = sort_files([Path(file) for file in files])
+    areas = AreaSet(()) if options.aois is None else _load_aois(options.aois, reporter)
+    results, doubts = read_matching_results(report_files)
     ns = select_backend(options.mode, options.threads)
     if options.evaluate:
-        results += compute_results(given, options, results, reporter)
+        results += compute_results(report_files, options, results, reporter)
     with Interruption() as stop:
-        work = _ReportWork(given, ns, options, reporter, stop)
+        work = _ReportWork(report_files, ns, options, reporter, stop)
         run = work.run(areas, results, doubts, rendered)
     write_text(output, render_page(run))
     size = output.stat().st_size / 1e6
     for _, verdict in run.verdicts:
         reporter.message(verdict.sentence)
     if not run.results:
-        reporter.message("no evaluation is at hand, so that the report has no verdict; --evaluate makes one of rays")
+        reporter.message(
+            "there is no evaluation, so the report has no verdict; add --evaluate to compute one from rays"
+        )
     reporter.message(f"wrote {output} ({size:.1f} MB)")
     return ReportResult(output, run)
 
 
 class _ReportWork:
-    """What is computed for a report, with what its parts have in common: the scene, the field, its place, the rays."""
+    """Computes the content of a report, with shared scene, field, geometry and rays."""
 
     def __init__(
-        self, given: ReportFiles, ns: ModuleType, options: ReportOptions, reporter: Reporter, stop: Interruption
+        self, files: ReportFiles, ns: ModuleType, options: ReportOptions, reporter: Reporter, stop: Interruption
     ):
-        self.given, self.options, self.reporter, self.stop = given, options, reporter, stop
+        self.files, self.options, self.reporter, self.stop = files, options, reporter, stop
         self.field: AnyGazeField
-        self.field, self.about = load_gaze(given.gaze, ns)
+        self.field, self.metadata = load_gaze(files.gaze, ns)
         reporter.progress(0.0, "reading")
-        self.rays = None if given.rays is None else _load(given, given.rays)
-        self.align = given.scene.align
+        self.rays = None if files.rays is None else _load(files, files.rays)
+        self.align = files.scene.align
 
     def run(
         self,
@@ -496,10 +529,10 @@ class _ReportWork:
         doubts: Sequence[str],
         rendered: Mapping[str, Channels] | None,
     ) -> Run:
-        """All that is shown."""
+        """Compute all content."""
         import mitsuba as mi
 
-        given, options = self.given, self.options
+        files, options = self.files, self.options
         labels = ParticipantLabels(self.rays, results)
         rays = self.rays if self.rays is None or options.show_names else anonymize_rays(self.rays, labels)
         hide = (lambda text: text) if options.show_names else labels.anonymize
@@ -507,41 +540,43 @@ class _ReportWork:
             scene = self._scene(Path(folder))
             views = self._views(scene, rendered)
             place = self._place(scene)
-            onlooker = GazeSampler(self.field, place, self._kind())
-            eyes = self._eyes(place, scene)
-            objects = observed = self._objects(areas, onlooker, place, eyes, self.rays)
+            sampler = GazeSampler(self.field, place, self._kind())
+            viewpoints = self._viewpoints(place, scene)
+            objects = observed = self._aoi_attention(areas, sampler, place, viewpoints, self.rays)
             if self.rays is not None and options.observer is not None:
-                observed = self._objects(areas, onlooker, place, self._observer(scene), None)
-            top = gaze_vmax(views.seen)
-            stage, sizes = self._stage(scene, onlooker, place, eyes, areas.boxes)
-        known = given.scene.kind != "none"
+                observed = self._aoi_attention(areas, sampler, place, self._observer(scene), None)
+            top = gaze_vmax(views.images)
+            stage, sizes = self._stage(scene, sampler, place, viewpoints, areas.boxes)
+        has_geometry = files.scene.kind != "none"
         inputs = tuple((role, hide(name), digest) for role, name, digest in self._inputs())
         settings = describe_settings(options)
-        about = Provenance("nerg report", {n: d for _, n, d in inputs}, options.seed, settings, programs())
-        pictures: dict[str, ReportPicture] = draw_views(views, top, known, about)
+        record = Provenance("nerg report", {n: d for _, n, d in inputs}, options.seed, settings, programs())
+        pictures: dict[str, ReportPicture] = draw_views(views, top, has_geometry, record)
         self._step(0.95, "writing")
-        around: tuple[int, ...] = ()
+        participants_near: tuple[int, ...] = ()
         if rays is not None and self.rays is not None:
-            test = given.scene.about.get("test")
-            pictures |= draw_rays(rays, test if isinstance(test, dict) else None, about)
-            radius = (given.scene.about.get("probes") or {}).get("radius")
-            around = count_participants_near(self.rays, eyes.positions, place, radius if isinstance(radius, (int, float)) else 0.5)
+            test = files.scene.gaze_provenance.get("test")
+            pictures |= draw_rays(rays, test if isinstance(test, dict) else None, record)
+            radius = (files.scene.gaze_provenance.get("probes") or {}).get("radius")
+            participants_near = count_participants_near(
+                self.rays, viewpoints.positions, place, radius if isinstance(radius, (int, float)) else 0.5
+            )
         shown = results if options.show_names else [anonymize_results(r, labels) for r in results]
         return Run(
-            options.title or hide(f"The gaze field “{given.gaze.stem}”"),
-            self.about,
-            hide(describe_scene(given)),
-            given.scene.kind,
-            given.scene.field_about,
+            options.title or hide(f"The gaze field “{files.gaze.stem}”"),
+            self.metadata,
+            hide(describe_scene(files)),
+            files.scene.kind,
+            files.scene.field_metadata,
             describe_observer(scene, options.observer is not None),
             rays,
             None if rays is None else summarise(rays),
             tuple(shown),
             tuple(doubts),
             objects,
-            len(eyes.positions),
+            len(viewpoints.positions),
             options.min_participants,
-            around,
+            participants_near,
             pictures,
             stage,
             *sizes,
@@ -549,46 +584,46 @@ class _ReportWork:
             versions(str(mi.variant())),
             settings,
             views.basis,
-            about.json(),
+            record.json(),
             observed,
         )
 
     def _inputs(self) -> list[tuple[str, str, str]]:
-        found = self.given.inputs()
+        inputs = self.files.inputs()
         if self.options.aois is not None:
             path = Path(self.options.aois)
-            found.append(("objects", path.name, file_sha256(path)))
-        return found
+            inputs.append(("objects", path.name, file_sha256(path)))
+        return inputs
 
     def _step(self, share: float, text: str) -> None:
         self.stop.check()
         self.reporter.progress(share, text)
 
     def _kind(self) -> str:
-        return self.given.scene.about.get("probes", {}).get("depth", "median")
+        return self.files.scene.gaze_provenance.get("probes", {}).get("depth", "median")
 
     def _scene(self, folder: Path) -> SceneResult:
-        """The scene of the place and the gaze field, in ``folder``."""
+        """Write the scene of the geometry and the gaze field to ``folder``."""
         self._step(0.05, "looking for a camera")
         o = self.options
         observer = o.observer
         if observer is None and self.rays is not None:
             observer = tuple(to_scene_frame(support_of_rays(self.rays).find_densest_position(), self.align).tolist())
-        if observer is None and self.field.support is None and self.given.scene.kind != "none":
+        if observer is None and self.field.support is None and self.files.scene.kind != "none":
             self.reporter.message(
-                "nothing says where people were: the camera is the observer; --observer x,y,z places one"
+                "no recorded positions are known: the camera is the observer; use --observer x,y,z to place one"
             )
-        chosen = SceneOptions(
+        scene_options = SceneOptions(
             observer=observer, camera=o.camera, target=o.target, fov=o.fov, width=o.width, mode=o.mode
         )
-        return write_scene(self.given.shown, folder / "scene.xml", chosen, _Quiet(self.reporter))
+        return write_scene(self.files.shown, folder / "scene.xml", scene_options, _Quiet(self.reporter))
 
     def _load(self, scene: SceneResult, **values: object):
         named = {free_default_name(name, scene.taken): str(value) for name, value in values.items()}
         return load_scene(scene.path, named)
 
     def _views(self, scene: SceneResult, rendered: Mapping[str, Channels] | None) -> RenderedViews:
-        """The pictures of the camera, of the observer's own view and sphere, and what is known of the observer."""
+        """Render the camera, the observer's view and the sphere."""
         o = self.options
         spread = len(self.field.members) > 1
         aovs = "depth,opacity,gaze" + (",gaze_std" if spread else "")
@@ -605,21 +640,23 @@ class _ReportWork:
         marker = None
         if scene.observer is not None:
             camera, width = loaded.sensors()[0], views["camera"].mask.shape[1]
-            found = project_to_pixel(camera, sensor_center(loaded.sensors()[1]))
+            pixel = project_to_pixel(camera, sensor_center(loaded.sensors()[1]))
             share = width / camera.film().crop_size()[0]
-            marker = None if found is None else tuple((v + 0.5) * share - 0.5 for v in found)
+            marker = None if pixel is None else tuple((v + 0.5) * share - 0.5 for v in pixel)
         return RenderedViews(views, marker, is_supported(loaded, loaded.sensors()[0]), describe_basis(loaded))
 
     def _place(self, scene: SceneResult) -> TrainingGeometry:
-        """The place as the scene has it, in which depths are traced."""
-        kind = self.given.scene.kind
+        """Return the geometry of the scene, in which depths are traced."""
+        kind = self.files.scene.kind
         if kind == "none":
             return TrainingGeometry(None, self.field.box, kind, align=self.align)
         loaded = self._load(scene, radiance="false", aovs="opacity")
-        return TrainingGeometry(SceneGeometry(loaded.integrator().medium, loaded), self.field.box, kind, align=self.align)
+        return TrainingGeometry(
+            SceneGeometry(loaded.integrator().medium, loaded), self.field.box, kind, align=self.align
+        )
 
-    def _eyes(self, place: TrainingGeometry, scene: SceneResult) -> EyePositions:
-        """Where people stood, or where the observer is."""
+    def _viewpoints(self, place: TrainingGeometry, scene: SceneResult) -> EyePositions:
+        """Return recorded positions, or that of the observer."""
         if self.rays is not None:
             return sample_eye_positions(self.rays, place, self.options.viewpoints)
         return self._observer(scene)
@@ -628,54 +665,71 @@ class _ReportWork:
         at = scene.camera if scene.observer is None else scene.observer
         return EyePositions(np.asarray(at.origin, float)[None], np.zeros(1, int))
 
-    def _objects(
-        self, areas: AreaSet, onlooker: GazeSampler, place: TrainingGeometry, eyes: EyePositions, rays: Rays | None
+    def _aoi_attention(
+        self, areas: AreaSet, sampler: GazeSampler, place: TrainingGeometry, viewpoints: EyePositions, rays: Rays | None
     ) -> tuple[ObjectAttention, ...]:
-        if not areas.box_indices or self.given.scene.kind == "none":
+        if not areas.box_indices or self.files.scene.kind == "none":
             return ()
-        things, members = [BoxAoi(box) for box in areas.boxes], list(areas.box_indices.values())
-        count, margin = len(eyes.positions), MARGIN * self.align.scale
-        told = lambda done: self._step(0.55 + 0.2 * done / count, f"objects: place {done} of {count}")
-        shares = gaze_shares(onlooker.query_from, eyes.positions, things, members, margin, COARSE, told)
+        boxes, members = [BoxAoi(box) for box in areas.boxes], list(areas.box_indices.values())
+        count, margin = len(viewpoints.positions), MARGIN * self.align.scale
+        report_viewpoint = lambda done: self._step(0.55 + 0.2 * done / count, f"AOIs: viewpoint {done} of {count}")
+        shares = gaze_shares(sampler.query_from, viewpoints.positions, boxes, members, margin, COARSE, report_viewpoint)
         recorded = None
         if rays is not None:
-            recorded = assign_ray_hits(rays, place, onlooker, RAYS, things, members, margin)
-        return summarize_objects(list(areas.box_indices), shares, eyes.participant, recorded)
+            recorded = assign_ray_hits(rays, place, sampler, RAYS, boxes, members, margin)
+        return summarize_objects(list(areas.box_indices), shares, viewpoints.participant, recorded)
 
     def _stage(
-        self, scene: SceneResult, onlooker: GazeSampler, place: TrainingGeometry, eyes: EyePositions, boxes: Sequence[Region]
+        self,
+        scene: SceneResult,
+        sampler: GazeSampler,
+        place: TrainingGeometry,
+        viewpoints: EyePositions,
+        boxes: Sequence[Region],
     ) -> tuple[str | None, tuple[int, int, int, int]]:
-        """The packed 3D scene, None where there are no surfaces, and how many observers, paths, points and boxes it
-        has."""
-        nothing = None, (0, 0, 0, 0)
-        if self.given.scene.kind == "none":
-            return nothing
+        """Return the packed 3D view, None if there are no surfaces, and its numbers of observers, paths, points and
+        boxes."""
+        empty = None, (0, 0, 0, 0)
+        if self.files.scene.kind == "none":
+            return empty
         o, up = self.options, self._up()
         at = np.asarray((scene.observer or scene.camera).origin, float)
-        standing = eyes.positions
+        standing = viewpoints.positions
         if self.rays is None:
-            standing = np.concatenate([at[None], find_free_positions(onlooker, _corners(self.field.box), up, at)])
+            standing = np.concatenate([at[None], find_free_positions(sampler, _corners(self.field.box), up, at)])
         loaded = self._load(scene, aovs="opacity,position")
-        others = standing[farthest_point_sampling(standing, OBSERVERS - 1, first=at)] if self.rays is not None else at[None][:0]
-        observers = np.concatenate([at[None], others])
-        told = lambda done, total: self._step(0.75 + 0.15 * done / total, f"3D: panorama {done} of {total}")
+        farthest = (
+            standing[farthest_point_sampling(standing, OBSERVERS - 1, first=at)]
+            if self.rays is not None
+            else at[None][:0]
+        )
+        observers = np.concatenate([at[None], farthest])
+        report_panorama = lambda done, total: self._step(0.75 + 0.15 * done / total, f"3D: panorama {done} of {total}")
         with translate_mitsuba_errors():
-            looked_from = panorama_positions(standing, at)
-            proxy = make_proxy(loaded, looked_from, up, observers, onlooker.density_at_points, o.max_points, on_panorama=told)
+            panorama_origins = panorama_positions(standing, at)
+            proxy = make_proxy(
+                loaded,
+                panorama_origins,
+                up,
+                observers,
+                sampler.density_at_points,
+                o.max_points,
+                on_panorama=report_panorama,
+            )
         if proxy is None:
-            return nothing
+            return empty
         paths = collect_paths(self.rays, place) if self.rays is not None and o.paths else []
         camera = ReportCamera(np.asarray(scene.camera.origin, float), np.asarray(scene.camera.target, float))
         packed = pack_stage(Stage(proxy, observers, paths, boxes, up, camera))
         return packed, (len(observers), len(paths), len(proxy.vertices), len(boxes))
 
     def _up(self) -> np.ndarray:
-        """Which way is up in the place: that of the rays."""
+        """Return the up direction of the scene, which is that of the rays."""
         return self.align.matrix[:3, 2] / self.align.scale
 
 
 class _Quiet(SilentReporter):
-    """Passes on only what may be wrong: the lines of a job within this one name files that nobody keeps."""
+    """Passes on warnings only: messages would name temporary files."""
 
     def __init__(self, reporter: Reporter):
         self._reporter = reporter
@@ -684,19 +738,19 @@ class _Quiet(SilentReporter):
         self._reporter.warn(text)
 
 
-def _objects(path: Path, reporter: Reporter) -> AreaSet:
+def _load_aois(path: Path, reporter: Reporter) -> AreaSet:
     areas = read_areas(path)
     if len(areas.box_indices) < len(areas.areas):
         reporter.warn(
-            f"{len(areas.areas) - len(areas.box_indices)} of {len(areas.areas)} areas are no boxes and no groups of boxes, "
-            "and a report leaves them out; nerg stats counts them"
+            f"{len(areas.areas) - len(areas.box_indices)} of {len(areas.areas)} AOIs are not boxes or groups of "
+            "boxes and are left out of the report; nerg stats supports them"
         )
     return areas
 
 
-def _load(given: ReportFiles, path: Path) -> Rays:
-    """The rays; of a dataset the sample that the field was trained on."""
-    trained = given.scene.about.get("rays_file", {})
+def _load(files: ReportFiles, path: Path) -> Rays:
+    """Load the rays; from a dataset, the sample of the training."""
+    trained = files.scene.gaze_provenance.get("rays_file", {})
     return load_rays(path, trained.get("most"), trained.get("seed", 0))
 
 

@@ -1,15 +1,15 @@
-"""``nerg draw``: Draw a figure: a gaze sphere, occlusion, a floor plan, a contact sheet, a difference.
-``nerg demo``: Render the demo store: pictures of what a gaze field is.
+"""``nerg draw``: Draw a figure: a gaze sphere, occlusion, a floor plan, a contact sheet, a difference, a baked surface.
+``nerg demo``: Render the demo store: images, figures and a report of a gaze field.
 ``nerg scene``: Write a scene file for a field, a mesh, a gaze field or rays, with a camera and an observer.
-``nerg view``: Show a place with its gaze in the browser, where the observer is dragged.
-``nerg render``: Render a scene file to a picture or a video.
-``nerg bake``: Put gaze on surfaces: how much of it each square metre receives, as colours and tables.
-``nerg study``: Measure error against run time: a scene at many settings, compared with what is true.
-``nerg report``: Write a report on a gaze field: one HTML file with a verdict, pictures, scores and the place in 3D.
-``nerg stats``: Count attention on things, in rays and by a gaze field: numbers with intervals, and what if.
-``nerg jobs``: Say what is done of a long job, what is left and what is stale.
+``nerg view``: Show a scene with its gaze in the browser, with a movable observer.
+``nerg render``: Render a scene file to an image or a video.
+``nerg bake``: Compute the gaze per unit area of surfaces, as colours and tables.
+``nerg study``: Measure rendering error against run time over many settings of the integrator.
+``nerg report``: Write an HTML report on a gaze field: verdict, figures, scores and a 3D view in one file.
+``nerg stats``: Compute attention statistics of areas of interest, measured and predicted, with confidence intervals.
+``nerg jobs``: Show the progress of jobs that run in parts, and what in their store is stale.
 
-What these commands take; their workflows run in the modules that are named at each.
+Options of these commands. Each declaration names the module of its workflow.
 """
 
 from __future__ import annotations
@@ -17,33 +17,73 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from nerg_mi.aoi.options import StatisticsOptions
 from nerg_mi.ranges import (
     COORDINATES,
-    LOG_DECADES,
     FIELDS_OF_VIEW,
     LENGTHS,
+    LOG_DECADES,
+    POSITIVE_VALUES,
     RATES,
     RAYS,
     SECONDS,
-    SEEDS,
     SPP,
     TIMES,
-    POSITIVE_VALUES,
-    ValidatedDataclass,
     Range,
+    ValidatedDataclass,
 )
 
 from .base import argument, declare, extra, out
-from .options import PartOptions, best_variant, coordinates, cpu_threads, definitions, option, parse_numbers
+from .options import (
+    ALIGN_HELP,
+    ANALYSIS,
+    INPUT,
+    MODEL,
+    OUTPUT,
+    PERFORMANCE,
+    VIEW,
+    PartOptions,
+    best_variant,
+    coordinates,
+    cpu_threads,
+    definitions,
+    option,
+    parse_numbers,
+    random_seed,
+    up_axis,
+)
 
 if TYPE_CHECKING:
     from nerg_mi.figures.overlay import Style
 
 
-# ---- Pictures of a scene file ----
+def _samples(default: int) -> Any:
+    """Declare the field ``spp``, of which 0 means the value of the scene file."""
+    help = "Samples per pixel; 0: as in the scene file."
+    return option(default, help, within=Range(0, SPP.high), group=PERFORMANCE)
+
+
+def _sensor(help: str) -> Any:
+    """Declare the field ``sensor``."""
+    return option(0, help, "-s", "--sensor", within=Range(0, 65535), group=VIEW)
+
+
+def _vmax(what: str) -> Any:
+    """Declare the field ``vmax``: the upper end of ``what``, or None."""
+    return option(None, f"Upper end of {what}.  [default: the 99.5th percentile]", within=POSITIVE_VALUES, group=VIEW)
+
+
+def _log_decades(what: str) -> Any:
+    """Declare the field ``log_decades`` of ``what``."""
+    help = f"Number of decades that {what} spans if it is logarithmic; 0: linear."
+    return option(0.0, help, within=LOG_DECADES, group=VIEW)
+
+
+# ---- Images of a scene file ----
+
+_MAPS = "inferno, magma, plasma, viridis or cividis"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,57 +91,71 @@ class PictureOptions(ValidatedDataclass):
     """How a scene file is rendered."""
 
     defaults: Mapping[str, str] | None = definitions()
-    sensor: int = option(0, "Index of the sensor, counted from 0.", "-s", "--sensor", within=Range(0, 65535))
+    sensor: int = _sensor("Index of the sensor that is rendered, counted from 0.")
     mode: str | None = best_variant()
-    spp: int = option(0, "Samples a pixel; 0: as the scene says.", within=Range(0, SPP.high))
-    seed: int = option(0, "Seed of the random numbers.", within=SEEDS)
+    spp: int = _samples(0)
+    seed: int = random_seed("sampling")
     threads: int = option(
-        0, "Worker threads; 0: one a core.", "-t", "--threads", within=Range(0, 1024), changes_result=False
+        0,
+        "Number of CPU threads; 0: one per core.",
+        "-t",
+        "--threads",
+        within=Range(0, 1024),
+        changes_result=False,
+        group=PERFORMANCE,
     )
     memory: float = option(
-        1.0, "GB that rendering may take; larger pictures are made in bands.", within=Range(1e-6, 10**6)
+        1.0,
+        "Memory limit of rendering in GB; larger images are rendered in bands.",
+        within=Range(1e-6, 10**6),
+        group=PERFORMANCE,
     )
     overlay: str | None = option(
-        None, "AOV to lay over the colour, with its scale (.png, .svg, .mp4): gaze, kde, depth or any other."
+        None,
+        "AOV drawn over the colour with a colour scale (.png, .svg, .mp4): gaze, kde, depth or any other.  [default: "
+        "colour only]",
+        group=VIEW,
     )
-    vmax: float | None = option(
-        None, "Upper end of the overlay's scale, for gaze in 1/sr.  [default: the 99.5th percentile]", within=POSITIVE_VALUES
-    )
-    cmap: str | None = option(
-        None, "Colour map of the overlay: inferno, magma, plasma, viridis, cividis.  [default: the overlay's own]"
-    )
-    log_decades: float = option(0.0, "Powers of ten that the overlay's scale spans; 0: a linear scale.", within=LOG_DECADES)
-    hatching: bool = option(True, "Hatch the overlay where nothing is known.")
+    vmax: float | None = _vmax("the overlay's colour scale, for gaze in 1/sr")
+    cmap: str | None = option(None, f"Colour map of the overlay: {_MAPS}.  [default: depends on the AOV]", group=VIEW)
+    log_decades: float = _log_decades("the overlay's colour scale")
+    hatching: bool = option(True, "Hatch the overlay where its value is unknown.", group=VIEW)
     frames: Path | None = option(
-        None, "Render a sequence: CSV file whose header names <default>s, a line of values for each picture."
+        None,
+        "CSV file of an image sequence: the header names <default>s of the scene, each further line has their values "
+        "for one frame.",
+        group=INPUT,
     )
-    fps: float = option(25.0, "Pictures a second of an .mp4.", within=RATES)
+    fps: float = option(25.0, "Frame rate of an .mp4 video in frames per second.", within=RATES, group=OUTPUT)
 
 
 @dataclass(frozen=True, kw_only=True)
 class DemoOptions(ValidatedDataclass):
-    """Which pictures the demo makes."""
+    """Options of ``nerg demo``."""
 
-    scene: Path | None = option(None, "Scene file.  [default: the demo store's]")
+    scene: Path | None = option(None, "Scene file.  [default: the demo store]", group=INPUT)
     defaults: Mapping[str, str] | None = definitions()
-    width: int = option(600, "Width of a picture in pixels; pictures are 3:2.", within=Range(3, 16384))
-    spp: int = option(8, "Samples a pixel.", within=Range(0, SPP.high))
-    seed: int = option(0, "Seed of the random numbers.", within=SEEDS)
+    width: int = option(
+        600, "Width of the images in pixels; their aspect ratio is 3:2.", within=Range(3, 16384), group=VIEW
+    )
+    spp: int = _samples(8)
+    seed: int = random_seed("sampling")
     mode: str | None = best_variant()
 
 
 @dataclass(frozen=True, kw_only=True)
 class FilmOptions(PictureOptions, PartOptions):
-    """How a scene file is rendered, in one go or in parts."""
+    """Options of ``nerg render``."""
 
 
 declare(
     "demo",
     "nerg_mi.workflows.demo:make_demo_to_look_at",
-    "Render the demo store: colour, depth, gaze, visibility, the observer's gaze sphere, occlusion, EXR, a report.",
+    "Render the demo store: colour, depth, gaze, visibility, the observer's gaze sphere, occlusion, an EXR file and a "
+    "report.",
     options=DemoOptions,
     without=("scene",),
-    out=extra(Path("out/demo"), "Folder to write into; it is made.", Path, "-o", "--out"),
+    out=out("Folder to write to; it is created.", default=Path("out/demo")),
 )
 
 
@@ -110,39 +164,48 @@ declare(
 
 @dataclass(frozen=True, kw_only=True)
 class SceneOptions(ValidatedDataclass):
-    """Who looks, and from where it is shown. Positions are in the coordinates of the place."""
+    """Options of ``nerg scene``. Positions are in scene coordinates."""
 
     observer: tuple[float, ...] | None = coordinates(
-        "Position of the observer's eye, x,y,z.  [default: where most rays are]"
+        "Position of the observer's eye, x,y,z.  [default: where the density of rays is highest]"
     )
-    person: str | None = option(None, "Person of the rays whose eye the observer's is, at --time or --times.")
-    time: float | None = option(None, "When, in seconds of the rays' clock.", within=TIMES)
+    person: str | None = option(
+        None, "Person in the rays whose eye position the observer takes, at --time or over --time-range.", group=VIEW
+    )
+    time: float | None = option(None, "Time of that position in seconds of the rays' clock.", within=TIMES, group=VIEW)
     time_range: tuple[float, ...] | None = option(
         None,
-        "From when to when, A,B: also writes the frames of a walk, for nerg render --frames.",
+        "Start and end A,B of a walk in seconds of the rays' clock; also writes a CSV file for nerg render --frames.",
         parse=parse_numbers,
         within=TIMES,
+        group=VIEW,
     )
-    fps: float = option(10.0, "Frames a second of --times.", within=RATES)
-    max_gap: float = option(0.5, "Seconds without a ray of that person that are bridged.", within=SECONDS)
-    camera: tuple[float, ...] | None = coordinates(
-        "Position of the camera, x,y,z.  [default: the best overview]", "--from"
+    fps: float = option(10.0, "Frame rate of --time-range in frames per second.", within=RATES, group=VIEW)
+    max_gap: float = option(
+        0.5, "Longest gap between rays of the person in seconds that is interpolated over.", within=SECONDS, group=VIEW
     )
-    target: tuple[float, ...] | None = coordinates("Point that it looks at, x,y,z.", "--to")
-    first_person: bool = option(False, "The camera is the observer's own eye.")
-    photos: Path | None = option(None, "Photos that the radiance field was trained on: the camera is one of theirs.")
-    photo: str | None = option(None, "Which of them: its name, or its number from 0 on.  [default: the best]")
-    allow_outside: bool = option(False, "Read files outside of --photos' folder too, where it names them.")
+    camera: tuple[float, ...] | None = coordinates("Position of the camera, x,y,z.  [default: the best overview]")
+    target: tuple[float, ...] | None = coordinates("Point that the camera looks at, x,y,z.  [default: the attention]")
+    first_person: bool = option(False, "Place the camera at the observer's eye.", group=VIEW)
+    photos: Path | None = option(
+        None, "Photos that the radiance field was trained on; the camera is that of a photo.", group=VIEW
+    )
+    photo: str | None = option(
+        None, "Name or number (from 0) of that photo.  [default: the one with the best view]", group=VIEW
+    )
+    allow_outside: bool = option(
+        False, "Also read files outside the folder of --photos if it refers to them.", group=INPUT
+    )
     fov: float | None = option(
-        None, "Degrees between the left and right border of the picture.  [default: 70]", within=FIELDS_OF_VIEW
+        None, "Horizontal field of view in degrees.  [default: 70]", within=FIELDS_OF_VIEW, group=VIEW
     )
-    width: int = option(480, "Width of the picture in pixels.", within=Range(1, 16384))
-    up: tuple[float, ...] | None = coordinates("Which way is up in the place, x,y,z.  [default: as its files say]")
-    align: Path | None = option(
-        None, "JSON file with the 4x4 similarity from the rays' frame to the place's.  [default: the gaze field's]"
-    )
+    width: int = option(480, "Width of the image in pixels.", within=Range(1, 16384), group=VIEW)
+    up: tuple[float, ...] | None = up_axis()
+    align: Path | None = option(None, ALIGN_HELP, group=INPUT)
     geometry: str | None = option(
-        None, 'What rays alone are shown in: "hits", their hit points, or "none".  [default: hits if there are any]'
+        None,
+        'Geometry for rays alone: "hits" (a volume of their hit points) or "none".  [default: hits if there are any]',
+        group=INPUT,
     )
     mode: str | None = best_variant()
 
@@ -150,12 +213,12 @@ class SceneOptions(ValidatedDataclass):
 declare(
     "scene",
     "nerg_mi.workflows.scene:write_scene",
-    "Write a scene file for a place, a gaze field or rays, with a camera and an observer.",
-    more="""A gaze field alone is shown in the place that it was trained in, which is found beside it. The scene is
-commented; each of its defaults can be set when it is rendered (nerg render -D).""",
+    "Write a Mitsuba scene file for a field, a mesh, a gaze field or rays, with a camera and an observer.",
+    more="""A gaze field alone is shown in the scene that it was trained in, which must be in the same folder. The file
+is commented, and each <default> in it can be set when it is rendered (nerg render -D).""",
     options=SceneOptions,
     files=argument(
-        "In any order: a place (radiance field, splats, mesh, .xml scene, .vol), a gaze field, rays.",
+        "A scene (radiance field, splats, mesh, .xml, .vol), a gaze field and rays, or some of them, in any order.",
         list[Path],
         metavar="FILES",
     ),
@@ -168,34 +231,43 @@ commented; each of its defaults can be set when it is rendered (nerg render -D).
 
 @dataclass(frozen=True, kw_only=True)
 class ViewOptions(ValidatedDataclass):
-    """Where the page is, how fine its pictures are, and what is shown first."""
+    """Options of ``nerg view``."""
 
-    host: str = option("127.0.0.1", "Address to serve at; another than this machine's own asks pages for a token.")
-    port: int = option(8080, "Port to serve at; 0: any that is free.", within=Range(0, 65535))
-    hostnames: tuple[str, ...] = option((), "Name by which others reach this machine, beside its address.", "--name")
-    width: int = option(720, "Width of a refined picture in pixels.", within=Range(16, 8192))
-    spp: int = option(0, "Samples a pixel of it; 0: as the scene says.", within=Range(0, SPP.high))
-    observer: tuple[float, ...] | None = coordinates("Position of the observer's eye, x,y,z.  [default: the scene's]")
-    up: tuple[float, ...] | None = coordinates("Which way is up in the place, x,y,z.  [default: as its files say]")
-    aois: Path | None = option(None, "JSON file of areas of interest: boxes with names.")
-    align: Path | None = option(
-        None, "JSON file with the 4x4 similarity from the rays' frame to the place's.  [default: the gaze field's]"
+    host: str = option(
+        "127.0.0.1",
+        "Address to serve at. With an address other than the loopback address, the page needs a token.",
+        group=OUTPUT,
     )
+    port: int = option(8080, "Port to serve at; 0: any free port.", within=Range(0, 65535), group=OUTPUT)
+    hostnames: tuple[str, ...] = option(
+        (), "Further host name under which the page may be requested; repeatable.", "--hostname", group=OUTPUT
+    )
+    width: int = option(720, "Width of a refined image in pixels.", within=Range(16, 8192), group=VIEW)
+    spp: int = _samples(0)
+    observer: tuple[float, ...] | None = coordinates(
+        "Initial position of the observer's eye, x,y,z.  [default: as in the scene file]"
+    )
+    up: tuple[float, ...] | None = up_axis()
+    aois: Path | None = option(None, "JSON file of areas of interest (AOIs): boxes with names.", group=INPUT)
+    align: Path | None = option(None, ALIGN_HELP, group=INPUT)
     geometry: str | None = option(
-        None, 'What rays alone are shown in: "hits", their hit points, or "none".  [default: hits if there are any]'
+        None,
+        'Geometry for rays alone: "hits" (a volume of their hit points) or "none".  [default: hits if there are any]',
+        group=INPUT,
     )
-    open: bool = option(False, "Open the page in this machine's browser.")
+    open: bool = option(False, "Open the page in the browser of this machine.", group=OUTPUT)
     mode: str | None = best_variant()
 
 
 declare(
     "view",
     "nerg_mi.viewer.serve:view_files",
-    more="The page is served to this machine alone, until Ctrl-C; nothing is fetched from anywhere else. At another "
-    "--host its address has a token.",
+    more="The page is served to this machine only, until Ctrl-C, and loads nothing from other servers. With another "
+    "--host, its address contains a token.",
     options=ViewOptions,
     files=argument(
-        "A scene, or a place (radiance field, splats, mesh, .vol), a gaze field, rays; a folder.",
+        "A scene (.xml), or a radiance field, splats, mesh or .vol, a gaze field and rays, in any order; or "
+        "their folder.",
         list[Path],
         metavar="FILES",
     ),
@@ -205,26 +277,38 @@ declare(
 declare(
     "render",
     "nerg_mi.workflows.render:render_film",
-    "Render a scene file to a picture or a video, with the integrator that the scene names.",
-    more="""An EXR file holds all channels in float32, those of the AOVs among them; a PNG file holds the colour,
-tonemapped to sRGB, or an overlay with its scale, which an SVG file can hold, too. Pictures of a sequence have a number
-added to their names, or are the frames of an MP4 file.
+    "Render a scene file to an image or a video, with the integrator of the scene.",
+    more="""An EXR file holds all channels, including AOVs, in float32. A PNG file holds the sRGB colour, or an overlay
+with its colour scale, which can also be written as SVG. The images of a sequence get numbered names, or become the
+frames of an MP4 file.
 
-With --store or --scheduler each picture is kept when it is done, and the same command goes on where it ended.""",
+With --store or --scheduler each finished image is stored; running the command again continues with the next one.""",
     options=FilmOptions,
     scene=argument("Mitsuba scene file (.xml)."),
-    output=out("Picture to write: .exr (all channels), .png; .svg, .mp4."),
+    output=out("Image to write (.exr with all channels, .png, .svg) or video (.mp4)."),
 )
 
 
-# ---- One more is a `Kind` in the table, and the function that draws it ----
+# ---- Figures: another kind needs an entry in the table, and the function that draws it ----
 
 
 @dataclass(frozen=True)
 class FigureKind:
-    """``name`` and ``summary`` for people; ``takes``: what its files are; ``most``: how many of them at most;
-    ``options``: a dataclass, frozen and of keywords alone, whose fields ``option`` makes (`nerg_mi.workflows.options`);
-    ``function``: what draws it from ``(files, options, reporter)``, as "MODULE:NAME"."""
+    """A kind of figure.
+
+    Parameters
+    ----------
+    name, summary
+        Name of the command and its help.
+    inputs
+        Description of the input files.
+    max_files
+        Maximum number of input files.
+    options
+        Dataclass of options, see `nerg_mi.workflows.options.option`.
+    function
+        What draws the figure from ``(files, options, reporter)``, as "MODULE:NAME".
+    """
 
     name: str
     summary: str
@@ -236,17 +320,17 @@ class FigureKind:
 
 @dataclass(frozen=True, kw_only=True)
 class ColorOptions(ValidatedDataclass):
-    """The colours of a figure's values."""
+    """The colour scale of a figure."""
 
-    vmax: float | None = option(
-        None, "Upper end of the scale, in its unit.  [default: the 99.5th percentile]", within=POSITIVE_VALUES
-    )
-    cmap: str | None = option(None, "Colour map: inferno, magma, plasma, viridis, cividis.  [default: inferno]")
-    log_decades: float = option(0.0, "Powers of ten that the scale spans; 0: a linear scale.", within=LOG_DECADES)
+    vmax: float | None = _vmax("the colour scale, in the unit of the values")
+    cmap: str | None = option(None, f"Colour map: {_MAPS}.  [default: inferno]", group=VIEW)
+    log_decades: float = _log_decades("the colour scale")
 
     def style(self, title: str | None = None, kind: str = "sequential") -> Style:
-        """How overlays are drawn by these options, with colour maps of that ``kind`` (`find_colors`). Raises
-        `NergError` for what cannot be drawn."""
+        """Return the style of overlays, with a colour map of that ``kind`` (`find_colormap`).
+
+        Raises `NergError` for an unknown colour map.
+        """
         from nerg_mi.figures.overlay import Style
         from nerg_mi.figures.style import find_colormap
 
@@ -257,13 +341,12 @@ class ColorOptions(ValidatedDataclass):
 
 @dataclass(frozen=True, kw_only=True)
 class ScaleOptions(ColorOptions):
-    """The same of a figure that can be hatched."""
+    """The colour scale of a figure with unknown values."""
 
-    hatching: bool = option(True, "Hatch where nothing is known.")
+    hatching: bool = option(True, "Hatch areas whose value is unknown.", group=VIEW)
 
     def style(self, title: str | None = None, kind: str = "sequential") -> Style:
-        """How overlays are drawn by these options, with colour maps of that ``kind`` (`find_colors`). Raises
-        `NergError` for what cannot be drawn."""
+        """Return the style of overlays, see `ColorOptions.style`."""
         return replace(super().style(title, kind), hatch_unknown=self.hatching)
 
 
@@ -272,81 +355,102 @@ class SceneFigureOptions(ScaleOptions):
     """How a scene file is rendered for a figure."""
 
     defaults: Mapping[str, str] | None = definitions()
-    spp: int = option(0, "Samples a pixel; 0: as the scene says.", within=Range(0, SPP.high))
-    seed: int = option(0, "Seed of the random numbers.", within=SEEDS)
+    spp: int = _samples(0)
+    seed: int = random_seed("sampling")
     mode: str | None = best_variant()
 
 
 @dataclass(frozen=True, kw_only=True)
 class FloorOptions(ValidatedDataclass):
-    """What a floor plan shows."""
+    """Options of ``nerg draw floor``."""
 
-    scene: Path | None = option(None, "Scene file of the place, whose walls and furniture are drawn.")
+    scene: Path | None = option(
+        None, "Scene file whose walls and furniture are drawn.  [default: none are drawn]", group=INPUT
+    )
     defaults: Mapping[str, str] | None = definitions()
-    cut_height: float = option(1.2, "Height at which the place is cut, metres above its floor.", within=COORDINATES)
-    floor_height: float = option(0.0, "Height of the floor (z).", within=COORDINATES)
-    paths: bool = option(True, "Draw where people walked.")
-    num_rays: int = option(0, "Draw so many rays, from the eye to what was looked at.", within=Range(0, 20000))
-    num_views: int = option(0, "Draw so many fields of view of each person.", within=Range(0, 1000))
-    fov: float = option(60.0, "Degrees that a field of view is wide.", within=Range(1, 180))
-    participants: str | None = option(None, "Draw these people alone: names with commas between them.")
+    cut_height: float = option(
+        1.2, "Height above the floor in metres at which the scene is cut.", within=COORDINATES, group=VIEW
+    )
+    floor_height: float = option(0.0, "Height of the floor (z) in scene units.", within=COORDINATES, group=VIEW)
+    paths: bool = option(True, "Draw the paths of the participants.", group=VIEW)
+    num_rays: int = option(
+        0, "Number of rays to draw, from the eye to the hit point.", within=Range(0, 20000), group=VIEW
+    )
+    num_views: int = option(
+        0, "Number of fields of view to draw for each participant.", within=Range(0, 1000), group=VIEW
+    )
+    fov: float = option(60.0, "Width of these fields of view in degrees.", within=Range(1, 180), group=VIEW)
+    participants: str | None = option(
+        None, "Comma-separated names of the participants to draw.  [default: all]", group=INPUT
+    )
     mode: str | None = best_variant()
 
 
 @dataclass(frozen=True, kw_only=True)
 class SphereOptions(SceneFigureOptions):
-    """How an observer's sphere is drawn."""
+    """Options of ``nerg draw sphere``."""
 
-    sensor: int = option(
-        0, "Where no observer is: whose place it is, counted from 0.", "-s", "--sensor", within=Range(0, 65535)
+    sensor: int = _sensor("Index of the sensor whose position is used if the scene has no observer, counted from 0.")
+    projection: str = option("mollweide", "Map projection: mollweide (equal-area) or equirectangular.", group=VIEW)
+    width: int = option(
+        800, "Width of the map in pixels; its height is half of it.", within=Range(64, 2896), group=VIEW
     )
-    projection: str = option("mollweide", "Projection: mollweide (equal areas) or equirectangular.")
-    width: int = option(800, "Width of the map in pixels; it is half as high.", within=Range(64, 2896))
 
 
 @dataclass(frozen=True, kw_only=True)
 class TriptychOptions(SceneFigureOptions):
-    """How occlusion is shown."""
+    """Options of ``nerg draw triptych``."""
 
-    sensor: int = option(0, "The other camera, counted from 0.", "-s", "--sensor", within=Range(0, 65535))
+    sensor: int = _sensor("Index of the second camera, counted from 0.")
 
 
 @dataclass(frozen=True, kw_only=True)
 class DifferenceOptions(ValidatedDataclass):
-    """How a difference is drawn."""
+    """Options of ``nerg draw difference``."""
 
-    channel: str = option("gaze", "Channel of both files.")
-    vmax: float | None = option(None, "Both ends of the scale.  [default: the 99.5th percentile]", within=POSITIVE_VALUES)
-    cmap: str = option("RdBu_r", "Colour map: RdBu_r, PuOr_r, BrBG_r, PRGn_r.")
+    channel: str = option("gaze", "Name of the channel, which both files must have.", group=INPUT)
+    vmax: float | None = _vmax("the colour scale, which is symmetric about 0")
+    cmap: str = option("RdBu_r", "Diverging colour map: RdBu_r, PuOr_r, BrBG_r or PRGn_r.", group=VIEW)
 
 
 @dataclass(frozen=True, kw_only=True)
 class SheetOptions(ScaleOptions):
-    """How pictures are put together."""
+    """Options of ``nerg draw sheet``."""
 
     overlay: str | None = option(
-        None, "AOV of .exr files to lay over their colour, with one scale: gaze, kde, depth or any other."
+        None,
+        "AOV of .exr files drawn over their colour, with a common colour scale: gaze, kde, depth or any other.  "
+        "[default: colour only]",
+        group=VIEW,
     )
-    columns: int | None = option(None, "Pictures in a row.  [default: about as many as rows]", within=Range(1, 1000))
-    max_width: int = option(480, "Pixels that a picture is wide at most; larger ones are shrunk.", within=Range(16, 4096))
+    columns: int | None = option(
+        None, "Number of images in a row.  [default: about the number of rows]", within=Range(1, 1000), group=VIEW
+    )
+    max_width: int = option(
+        480, "Maximum width of an image in pixels; larger ones are reduced.", within=Range(16, 4096), group=VIEW
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
 class BakedFigureOptions(ColorOptions):
-    """From where a baked surface is drawn; positions in its own units."""
+    """Options of ``nerg draw surface``. Positions are in the units of the mesh."""
 
     camera: tuple[float, ...] | None = coordinates(
-        "Position of the camera, x,y,z.  [default: where all of it is seen from above]"
+        "Position of the camera, x,y,z.  [default: above the surface, with all of it in view]"
     )
-    target: tuple[float, ...] | None = coordinates("What the camera looks at, x,y,z.  [default: the middle]")
-    up: tuple[float, ...] | None = coordinates("Which way is up, x,y,z.  [default: 0,0,1]")
+    target: tuple[float, ...] | None = coordinates("Point that the camera looks at, x,y,z.  [default: the centre]")
+    up: tuple[float, ...] | None = coordinates("Up direction, x,y,z.  [default: 0,0,1]")
     clip_above: float | None = option(
-        None, "Leave out what is higher than this along up: a ceiling, for instance.", within=COORDINATES
+        None,
+        "Height along the up direction above which the mesh is not drawn, for instance to remove a ceiling.  [default: "
+        "no limit]",
+        within=COORDINATES,
+        group=VIEW,
     )
-    fov: float = option(50.0, "Degrees that the picture is wide.", within=Range(1.0, 170.0))
-    width: int = option(960, "Width of the picture in pixels.", within=Range(16, 4096))
-    height: int = option(640, "Height of the picture in pixels.", within=Range(16, 4096))
-    title: str | None = option(None, "Title.  [default: what its values are]")
+    fov: float = option(50.0, "Horizontal field of view in degrees.", within=Range(1.0, 170.0), group=VIEW)
+    width: int = option(960, "Width of the image in pixels.", within=Range(16, 4096), group=VIEW)
+    height: int = option(640, "Height of the image in pixels.", within=Range(16, 4096), group=VIEW)
+    title: str | None = option(None, "Title of the figure.  [default: the quantity]", group=VIEW)
     mode: str | None = best_variant()
 
 
@@ -354,36 +458,48 @@ _SCENE, _FILES = "nerg_mi.workflows.draw_scenes", "nerg_mi.workflows.draw"
 _TABLE = (
     FigureKind(
         "sphere",
-        "The gaze of an observer over all directions.",
+        "Draw the gaze of an observer over all directions.",
         "scene file (.xml)",
         1,
         SphereOptions,
         f"{_SCENE}:sphere",
     ),
     FigureKind(
-        "triptych", "Occlusion: three views of a gaze.", "scene file (.xml)", 1, TriptychOptions, f"{_SCENE}:triptych"
+        "triptych",
+        "Draw three views of a gaze that show its occlusion.",
+        "scene file (.xml)",
+        1,
+        TriptychOptions,
+        f"{_SCENE}:triptych",
     ),
-    FigureKind("floor", "The floor plan of rays in their place.", "file of rays (.npz)", 1, FloorOptions, f"{_SCENE}:floor"),
+    FigureKind(
+        "floor",
+        "Draw the floor plan of rays in their scene.",
+        "file of rays (.npz)",
+        1,
+        FloorOptions,
+        f"{_SCENE}:floor",
+    ),
     FigureKind(
         "sheet",
-        "Several pictures on one page, with one scale.",
-        "pictures (.png, .jpg, .exr)",
+        "Draw several images on one page, with a common colour scale.",
+        "images (.png, .jpg, .exr)",
         400,
         SheetOptions,
         f"{_FILES}:sheet",
     ),
     FigureKind(
         "difference",
-        "A quantity of one picture less that of another.",
-        "two pictures (.exr)",
+        "Draw the difference of a channel between two images.",
+        "two images (.exr), the second is subtracted from the first",
         2,
         DifferenceOptions,
         f"{_FILES}:difference",
     ),
     FigureKind(
         "surface",
-        "Gaze on a mesh, with its scale.",
-        "a baked surface (.ply)",
+        "Draw gaze on a mesh, with its colour scale.",
+        "mesh that nerg bake has written (.ply)",
         1,
         BakedFigureOptions,
         f"{_FILES}:surface",
@@ -400,7 +516,7 @@ for _kind in KINDS.values():
         _kind.summary,
         options=_kind.options,
         files=argument(f"{_kind.inputs[:1].upper()}{_kind.inputs[1:]}.", list[Path] if _kind.max_files > 1 else Path),
-        output=out("Picture to write: .png or .svg."),
+        output=out("Figure to write (.png or .svg)."),
     )
 
 
@@ -409,64 +525,104 @@ for _kind in KINDS.values():
 
 @dataclass(frozen=True, kw_only=True)
 class BakeOptions(PartOptions):
-    """Whose gaze is put on which surfaces, and how."""
+    """Options of ``nerg bake``."""
 
-    gaze: Path | None = option(None, "Gaze field (.safetensors).  [default: that of a scene file]")
-    rays: Path | None = option(None, "Rays of attention, a file or a dataset: where people were, and looked.")
+    gaze: Path | None = option(None, "Gaze field (.safetensors).  [default: that of a scene file]", group=INPUT)
+    rays: Path | None = option(
+        None, "Rays file or dataset: positions of the observers, or the gaze itself.", group=INPUT
+    )
     source: str | None = option(
-        None, "Whose gaze: of the field, or of the rays themselves.  [default: the field's if there is one]", "--from"
+        None,
+        "Source of the gaze: field (evaluate the gaze field) or rays (the recorded rays).  [default: field if there is "
+        "one]",
+        group=INPUT,
     )
     observer: tuple[float, ...] | None = coordinates(
-        "One observer's eye, x,y,z in the place, in place of the people of the rays."
+        "Position x,y,z of a single observer in scene coordinates, in place of those of --rays.", group=INPUT
     )
     observer_file: Path | None = option(
-        None, "Observers one by one: a CSV file with columns x, y, z in the place and, if they differ, weight."
+        None, "CSV file of observers with columns x, y, z in scene coordinates and, optionally, weight.", group=INPUT
     )
     num_observers: int = option(
-        64, "Observers that stand for all places of the people of --rays.", within=Range(1, 100_000)
+        64,
+        "Number of weighted observers that represent the recorded positions of --rays.",
+        within=Range(1, 100_000),
+        group=ANALYSIS,
     )
-    ray_weights: str = option("time", "What rays count by: time, person (all people alike), or equal (all rays alike).")
-    align: Path | None = option(
-        None, "JSON file with the 4x4 similarity from the rays' frame to the place's.  [default: the gaze field's]"
+    ray_weights: str = option(
+        "time",
+        "Weights of the rays: time (their duration), person (equal for each participant) or equal (equal for "
+        "each ray).",
+        group=ANALYSIS,
     )
+    align: Path | None = option(None, ALIGN_HELP, group=INPUT)
     shapes: tuple[str, ...] = option(
-        (), "Only this shape of a scene receives gaze, the others hide it; repeatable.", "--shape"
+        (),
+        "Name of a shape of the scene that receives gaze, while the other shapes only occlude; repeatable.  [default: "
+        "all shapes]",
+        "--shape",
+        group=INPUT,
     )
     cone: float | None = option(
         None,
-        "Degrees (standard deviation) of the cone of a look: error of the tracker and fovea.  "
-        "[default: 1.5 of rays, 0 of a field]",
+        "Standard deviation in degrees of the gaze cone, for tracker error and the fovea.  [default: 1.5 for rays, 0 "
+        "for a field]",
         within=Range(0, 30),
+        group=ANALYSIS,
     )
-    cone_samples: int = option(16, "Rays that stand for the cone of a tracked one.", within=Range(1, 1024))
+    cone_samples: int = option(
+        16, "Number of sample rays in the gaze cone of a recorded ray.", within=Range(1, 1024), group=ANALYSIS
+    )
     smooth: float = option(
-        0.0, "Metres (standard deviation) of smoothing along the surface; 0: none.", within=Range(0, 10**6)
+        0.0,
+        "Standard deviation in metres of smoothing along the surface; 0: no smoothing.",
+        within=Range(0, 10**6),
+        group=ANALYSIS,
     )
     max_edge: float | None = option(
         None,
-        "Longest edge of a triangle in metres; longer ones are cut.  [default: about 100,000 triangles]",
+        "Maximum edge length of a triangle in metres; longer edges are split.  [default: yields about 100,000 "
+        "triangles]",
         within=LENGTHS,
+        group=ANALYSIS,
     )
     max_angle: float = option(
         2.0,
-        "Degrees under which an observer sees a piece of a surface at most: less is exacter.",
+        "Maximum angle in degrees under which an observer sees a surface element; smaller is more accurate.",
         within=Range(0.2, 30),
+        group=PERFORMANCE,
     )
-    unit: str = option("share", "Values are: share (of gaze, 1/m²), or seconds (of the rays, s/m²).")
-    split_half: bool = option(False, "Say how well two halves of the people agree (of rays).")
+    unit: str = option(
+        "share",
+        "Unit of the values: share (fraction of the gaze, 1/m²) or seconds (of the rays, s/m²).",
+        group=ANALYSIS,
+    )
+    split_half: bool = option(
+        False, "Report the agreement between two halves of the participants (for rays).", group=ANALYSIS
+    )
     texture_size: int | None = option(
-        None, "Pixels a side of a texture in .glb, in place of colours of vertices.", within=Range(64, 8192)
+        None,
+        "Width and height in pixels of a texture in .glb files.  [default: vertex colours, no texture]",
+        within=Range(64, 8192),
+        group=OUTPUT,
     )
-    vmax: float | None = option(
-        None, "Upper end of the colours' scale.  [default: the 99.5th percentile]", within=POSITIVE_VALUES
-    )
-    cmap: str = option("inferno", "Colour map: inferno, magma, plasma, viridis, cividis.")
-    log_decades: float = option(0.0, "Powers of ten that the colours' scale spans; 0: a linear scale.", within=LOG_DECADES)
+    vmax: float | None = _vmax("the colour scale, in the unit of --unit")
+    cmap: str = option("inferno", f"Colour map: {_MAPS}.", group=VIEW)
+    log_decades: float = _log_decades("the colour scale")
     resolution: int = option(
-        256, "Of a radiance field, whose mesh is made: cells along its box's longest edge.", within=Range(8, 2048)
+        256,
+        "Number of grid cells along the longest edge of a radiance field, for extracting its mesh.",
+        within=Range(8, 2048),
+        group=MODEL,
     )
-    max_samples: int | None = option(None, "Rays of a dataset at most; of more, a sample by --seed.", within=RAYS)
-    seed: int = option(0, "Seed of what is drawn at random.", within=SEEDS)
+    max_samples: int | None = option(
+        None,
+        "Maximum number of samples read from a dataset; larger datasets are subsampled uniformly with --seed.  "
+        "[default: no limit]",
+        within=RAYS,
+        group=INPUT,
+    )
+    seed: int = random_seed("subsampling, observers and cones")
     threads: int | None = cpu_threads()
     mode: str | None = best_variant()
 
@@ -474,12 +630,12 @@ class BakeOptions(PartOptions):
 declare(
     "bake",
     "nerg_mi.workflows.bake:bake_any",
-    "Put gaze on surfaces: how much of it each square metre receives, from a gaze field or from tracked rays.",
+    "Compute how much gaze each square metre of a surface receives, from a gaze field or from recorded rays.",
     options=BakeOptions,
-    surface=argument("Mesh (.ply, .obj, .glb), scene (.xml), radiance field (.safetensors), or Gaussian splats."),
+    surface=argument("Mesh (.ply, .obj, .glb), scene (.xml), radiance field (.safetensors) or Gaussian splats."),
     output=out(
-        "Files to write, repeatable: .ply, .glb (with colours), .csv (of faces), .json (summary); of Gaussian splats "
-        ".ply and .json.",
+        "File to write, repeatable: .ply, .glb (with colours), .csv (table of faces), .json (summary); for Gaussian "
+        "splats .ply and .json.",
         list[Path],
     ),
 )
@@ -490,14 +646,23 @@ declare(
 
 @dataclass(frozen=True, kw_only=True)
 class StudyOptions(PartOptions):
-    """What a study renders, and how often."""
+    """Options of ``nerg study``."""
 
-    scene_kind: str = option("auto", "What SCENE is: auto, analytic or file.")
-    width: int = option(192, "Width of a picture in pixels.", within=Range(1, 16384))
-    height: int = option(128, "Height of a picture in pixels.", within=Range(1, 16384))
-    repeats: int = option(5, "Timed renders of each setting; their median counts.", within=Range(1, 10000))
-    quick: bool = option(False, "A few settings only, each timed once.")
-    only: str = option("", "Only the default, and settings whose name matches.", metavar="REGEX")
+    scene_kind: str = option(
+        "auto", "Kind of SCENE: analytic (a built-in scene), file, or auto (file if there is one).", group=INPUT
+    )
+    width: int = option(192, "Width of the images in pixels.", within=Range(1, 16384), group=VIEW)
+    height: int = option(128, "Height of the images in pixels.", within=Range(1, 16384), group=VIEW)
+    repeats: int = option(
+        5, "Number of timed renders of each setting; the median is reported.", within=Range(1, 10000), group=ANALYSIS
+    )
+    quick: bool = option(False, "Run a small subset of the settings, each timed once.", group=ANALYSIS)
+    only: str = option(
+        "",
+        "Regular expression: run only the default and settings whose names match.  [default: all settings]",
+        metavar="REGEX",
+        group=ANALYSIS,
+    )
     defaults: Mapping[str, str] | None = definitions()
     mode: str | None = best_variant()
 
@@ -505,42 +670,58 @@ class StudyOptions(PartOptions):
 declare(
     "study",
     "nerg_mi.workflows.study:run_study",
-    "Measure error against run time: render a scene at many settings, compare each with what is true, and plot it.",
-    more="""Writes study.csv (a row a setting), study.md (the same by factor), scaling.csv, study.json and two plots. A
-full study takes up to half an hour.""",
+    "Measure rendering error against run time: render a scene with many settings, compare with a reference, and plot.",
+    more="""Writes study.csv (one row per setting), study.md (grouped by parameter), scaling.csv, study.json and two
+plots. A full study takes up to half an hour.""",
     options=StudyOptions,
-    scene=argument("Scene file (.xml), or slab, sphere, sheets, fog or ramp.", str),
-    out=extra(..., "Folder to write into; it is made.", Path, "-o", "--out"),
+    scene=argument("Scene file (.xml), or a built-in scene: slab, sphere, sheets, fog or ramp.", str),
+    out=out("Folder to write to; it is created."),
 )
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReportOptions(ValidatedDataclass):
-    """What a report shows. Positions are in the coordinates of the place."""
+    """Options of ``nerg report``. Positions are in scene coordinates."""
 
-    aois: Path | None = option(None, 'JSON file of named objects: {"shelf": [[x0, y0, z0], [x1, y1, z1]], ...}.')
+    aois: Path | None = option(
+        None,
+        'JSON file of areas of interest (AOIs), boxes with names: {"shelf": [[x0, y0, z0], [x1, y1, z1]], ...}.',
+        group=INPUT,
+    )
     evaluate: bool = option(
-        False, "Score the field on the rays that were held out of its training (about a minute a split)."
+        False, "Score the field on the rays held out of its training (about a minute per split).", group=ANALYSIS
     )
-    show_names: bool = option(False, "Show the names of people. Without it they are numbered.")
-    min_participants: int = option(1, "Hide shares of objects that fewer people could see.", within=Range(1, 10**6))
-    paths: bool = option(True, "Draw people's paths in 3D. How somebody walks can tell who it is.")
-    title: str | None = option(None, "Title.  [default: the gaze field's name]")
+    show_names: bool = option(False, "Show the names of participants. Without it, they are numbered.", group=OUTPUT)
+    min_participants: int = option(
+        1,
+        "Minimum number of participants who could see an AOI; values of other AOIs are hidden.",
+        within=Range(1, 10**6),
+        group=OUTPUT,
+    )
+    paths: bool = option(
+        True, "Draw the paths of participants in the 3D view. Movement patterns can identify a person.", group=OUTPUT
+    )
+    title: str | None = option(None, "Title of the report.  [default: the name of the gaze field]", group=OUTPUT)
     observer: tuple[float, ...] | None = coordinates(
-        "Position of the observer in the pictures, x,y,z.  [default: where most rays are]"
+        "Position of the observer in the images, x,y,z.  [default: where the density of rays is highest]"
     )
-    camera: tuple[float, ...] | None = coordinates(
-        "Position of the camera, x,y,z.  [default: the best overview]", "--from"
-    )
-    target: tuple[float, ...] | None = coordinates("Point that it looks at, x,y,z.", "--to")
+    camera: tuple[float, ...] | None = coordinates("Position of the camera, x,y,z.  [default: the best overview]")
+    target: tuple[float, ...] | None = coordinates("Point that the camera looks at, x,y,z.  [default: the attention]")
     fov: float | None = option(
-        None, "Degrees between the left and right border of its picture.  [default: 70]", within=FIELDS_OF_VIEW
+        None, "Horizontal field of view in degrees.  [default: 70]", within=FIELDS_OF_VIEW, group=VIEW
     )
-    viewpoints: int = option(200, "Places of people from which objects are looked for.", within=Range(1, 10_000))
-    max_points: int = option(80_000, "Points of the 3D scene at most.", within=Range(100, 100_000))
-    width: int = option(480, "Width of the pictures in pixels.", within=Range(24, 1200))
-    spp: int = option(2, "Samples a pixel.", within=SPP)
-    seed: int = option(0, "Seed of the random numbers.", within=SEEDS)
+    viewpoints: int = option(
+        200,
+        "Number of recorded positions from which the attention on AOIs is evaluated.",
+        within=Range(1, 10_000),
+        group=ANALYSIS,
+    )
+    max_points: int = option(
+        80_000, "Maximum number of points in the 3D view.", within=Range(100, 100_000), group=OUTPUT
+    )
+    width: int = option(480, "Width of the images in pixels.", within=Range(24, 1200), group=VIEW)
+    spp: int = option(2, "Samples per pixel.", within=SPP, group=PERFORMANCE)
+    seed: int = random_seed("sampling")
     threads: int | None = cpu_threads()
     mode: str | None = best_variant()
 
@@ -549,13 +730,13 @@ declare(
     "report",
     "nerg_mi.workflows.report:make_report",
     "Write a report on a gaze field: one HTML file that opens from disk and needs no network.",
-    more="""It shows the place, the data, where people were, the gaze, named objects, the scores beside their baselines
-with a verdict in a sentence, uncertainty, settings, limits, provenance and the place in 3D. What is missing is left
-out, and said so.""",
+    more="""The report shows the scene, the data, recorded positions, the gaze, areas of interest, scores next to
+baselines with a verdict, uncertainty, settings, limits, provenance, and a 3D view. Sections without data are left out,
+with a note.""",
     options=ReportOptions,
     files=argument(
-        "In any order: a gaze field, and what there is of its place, rays, evaluations (gaze.json, or the folder of "
-        "nerg eval gaze); a folder stands for what lies in it.",
+        "A gaze field and, in any order, its scene, rays and evaluations (gaze.json, or the folder of nerg eval gaze); "
+        "or a folder with these files.",
         list[Path],
         metavar="RUN",
     ),
@@ -566,22 +747,23 @@ out, and said so.""",
 declare(
     "stats",
     "nerg_mi.workflows.statistics:statistics",
-    "Count attention on things: in rays, and as a gaze field predicts it, with intervals over people.",
-    more="""Share, dwell, reach, first looks, returns, distance, what could be seen; by cohort, time and zone;
-differences, moves from thing to thing, what if something stood elsewhere. --visibility tells what can be seen from
-where.""",
+    "Compute attention statistics of areas of interest (AOIs): measured from rays, and predicted by a gaze field, with "
+    "confidence intervals over participants.",
+    more="""Reports attention share, dwell time, hit ratio, time to first visit, revisits, viewing distance and
+visibility, by cohort, time window and zone; differences between AOIs, transitions, and the effect of changes to the
+scene. --visibility computes isovists, which need no tracking.""",
     options=StatisticsOptions,
-    files=argument("Rays or a dataset, a scene, a gaze field, a place; in any order.", list[Path]),
-    output=out("Folder for tables and pictures."),
+    files=argument("Rays or a dataset, a scene (.xml), a radiance field and a gaze field, in any order.", list[Path]),
+    output=out("Folder for tables and figures."),
 )
 
 
 declare(
     "jobs",
     "nerg_mi.workflows.parts:account_for_store",
-    "Say what is done of the jobs in a store, what is left, what it takes in bytes, and what is stale.",
-    more="Stale is what no job asks for any more as it was started last, and what was made of files that have changed "
-    "since.",
-    folder=argument("Store of a job: what was given as --store, or OUTPUT.tasks."),
-    remove=extra(False, "Take out what no job asks for any more, and what is left over.", bool, "--remove-stale"),
+    "Show which parts of the jobs in a store are finished, which remain, how many bytes they take, and which are "
+    "stale.",
+    more="Stale parts are those that the last run of no job uses, and those whose input files have changed since.",
+    folder=argument("Store of a job: the folder given as --store, or OUTPUT.tasks."),
+    remove=extra(False, "Remove stale parts and leftovers of interrupted runs.", bool, "--remove-stale", group=OUTPUT),
 )

@@ -1,4 +1,4 @@
-"""A study of the settings of a scene, in one go or in parts."""
+"""Study of rendering error against run time over many settings, directly or in parts."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ from .base import SILENT, Reporter, select_backend, versions
 from .parts import PartRunner, PlannedScene
 from .scene_commands import StudyOptions
 
-# ---- The study of error against run time: a scene at many settings, each compared with what is true ----
+# ---- Study: a scene rendered with many settings, compared with a reference ----
 
 
 ROWS = 4
-"""Settings of a part, besides the default."""
+"""Number of settings in a part, in addition to the default."""
 
 _TWIN = "twin.xml"
 _PROCESS = uuid.uuid4().hex
@@ -39,7 +39,7 @@ _PROCESS = uuid.uuid4().hex
 
 @dataclass(frozen=True)
 class StudyResult:
-    """``files`` written; ``report``: what study.json holds, ``rows`` and ``against_paper`` in it."""
+    """Written ``files``; ``report``, the content of study.json, with ``rows`` and ``against_paper``."""
 
     files: list[Path]
     report: dict
@@ -48,21 +48,21 @@ class StudyResult:
 def run_study(
     scene: str | Path, out: str | Path, options: StudyOptions | None = None, reporter: Reporter = SILENT
 ) -> StudyResult:
-    """Study ``scene``, a scene file or the name of an analytic scene, and write tables and plots into the folder
-    ``out``: study.csv (a row a setting), study.md (the same by factor), scaling.csv, study.json and two plots. With
-    ``options.store`` or ``options.scheduler`` a few settings are a part, which is kept and may be measured by others:
-    errors are the same, and times those of the process that took them, with its time of the default beside them.
+    """Study ``scene``, a scene file or the name of an analytic scene, and write tables and plots to the folder ``out``.
 
-    Raises `NergError` for what the user can mend, before anything is written.
+    The files are study.csv (one row per setting), study.md (grouped by parameter), scaling.csv, study.json and two
+    plots. With ``options.store`` or ``options.scheduler`` a few settings form a part, which is stored and may run
+    elsewhere: errors are the same, and times are those of the measuring process, with its time of the default setting
+    in the same row. Raises `NergError` for errors that the user can correct, before anything is written.
     """
     options = options or StudyOptions()
     width, height = options.width, options.height
     if min(width, height) < 4 or options.repeats < 1:
         raise NergError(
-            "a study needs pictures of at least 4 x 4 pixels and one timed render, "
-            f"got {width} x {height} and {options.repeats}"
+            f"a study needs images of at least 4 x 4 pixels and one timed render, got {width} x {height} and "
+            f"{options.repeats}"
         )
-    wanted = _expression(options.only)
+    pattern = _expression(options.only)
     out = Path(out)
     check_folder(out)
     mode = activate_variant(options.mode)
@@ -71,25 +71,25 @@ def run_study(
     begin = time.perf_counter()
     reporter.progress(0.0, "open")
     subject = open_subject(str(scene), options.scene_kind, width, height, options.defaults, find_reference_scene)
-    rows = _chosen(list_rows(subject, options.quick), wanted, options.only)
+    rows = _select_settings(list_rows(subject, options.quick), pattern, options.only)
     repeats, samples = effort(options)
     timed_by: list[dict] = []
     done = 0
 
     def step(name: str) -> None:
         nonlocal done
-        # The rows' first renders and their times, and the scaling, which is about a tenth of it.
+        # First and timed renders of each row, and the scaling, which is about a tenth of it.
         reporter.progress(min(done / (2.2 * len(rows)), 0.99), name)
         done += 1
 
     if options.in_parts:
         common = plan_study(subject, scene, replace(options, mode=mode))
-        table, scaling, timed_by = _measured_in_parts(common, subject, rows, PartRunner(options, out, reporter), out)
+        table, scaling, timed_by = _measure_in_parts(common, subject, rows, PartRunner(options, out, reporter), out)
     else:
         table = study.measure_rows(subject, rows, repeats, samples, step)
         scaling = study.measure_scaling(subject, min(repeats, 3), options.quick, step)
     study_tables.mark_pareto_fronts(table)
-    known = subject.get_truth(study.SEED, "expected", "depth")
+    reference = subject.get_truth(study.SEED, "expected", "depth")
     report = {
         "scene": subject.name,
         "variant": mode,
@@ -97,8 +97,8 @@ def run_study(
         "extent": subject.extent,
         "step": subject.step,
         "tolerance": subject.tolerance,
-        "reference": known.source,
-        "reference_change_when_step_halved": known.convergence,
+        "reference": reference.source,
+        "reference_change_when_step_halved": reference.convergence,
         "precision": study.describe_precision(),
         "gaze_kld_eps": study_truth.KLD_EPS,
         "repeats": repeats,
@@ -124,37 +124,36 @@ def _expression(only: str) -> re.Pattern:
     try:
         return re.compile(only)
     except re.error as error:
-        raise NergError(f'"{only}" is no regular expression ({error}): name settings as in "depth|paper"') from error
+        raise NergError(f'"{only}" is not a regular expression ({error}): name settings as in "depth|paper"') from error
 
 
-def _chosen(all_settings: list[StudyRow], wanted: re.Pattern, only: str) -> list[StudyRow]:
-    """The first of the settings, which is the default, and those whose names match."""
-    default, *others = all_settings
-    rows = [default, *(row for row in others if wanted.search(row.name))]
+def _select_settings(all_settings: list[StudyRow], pattern: re.Pattern, only: str) -> list[StudyRow]:
+    """Return the default setting, which is the first, and the settings whose names match."""
+    default, *other_settings = all_settings
+    rows = [default, *(row for row in other_settings if pattern.search(row.name))]
     if only and len(rows) == 1:
         raise NergError(
-            f'no setting matches "{only}"; their names are those of an earlier study.csv, such as "{others[0].name}"'
+            f'no setting matches "{only}"; names are those in study.csv, such as "{other_settings[0].name}"'
         )
     return rows
 
 
-def _write(out: Path, subject: StudySubject, report: dict, about: Provenance) -> list[Path]:
+def _write(out: Path, subject: StudySubject, report: dict, record: Provenance) -> list[Path]:
     files = study_tables.write_tables(out, report)
     width, height = report["size"]
     title = f"{subject.name}, {width} x {height}, {report['variant']}"
-    study_tables.plot_errors(out / "errors.png", report["rows"], f"Error against time: {title}", about)
-    study_tables.plot_scaling(out / "scaling.png", report["scaling"], f"Cost of the default: {title}", about)
+    study_tables.plot_errors(out / "errors.png", report["rows"], f"Error against time: {title}", record)
+    study_tables.plot_scaling(out / "scaling.png", report["scaling"], f"Cost of the default: {title}", record)
     return [*files, out / "errors.png", out / "scaling.png"]
 
 
 def effort(options: StudyOptions) -> tuple[int, int]:
-    """Timed renders of each setting, and samples of a pixel's truth."""
+    """Return the number of timed renders of each setting, and the samples per pixel of the reference."""
     return (1, 16) if options.quick else (options.repeats, study.PIXEL_SPP)
 
 
 def find_reference_scene(scene: Path) -> ExactSurfaces | None:
-    """The surfaces of the shapes in ``twin.xml`` beside a scene file, which its field stands for; None where there is
-    none."""
+    """Return the surfaces in ``twin.xml`` next to a scene file, the reference of its field; None if there is none."""
     file = scene.parent / _TWIN
     if not file.is_file():
         return None
@@ -166,65 +165,67 @@ def find_reference_scene(scene: Path) -> ExactSurfaces | None:
 
 # ---- Parts ----
 #
-# Settings, a few each, with the default beside them, measured wherever that is. Errors and evaluations are the same
-# wherever they are found. Times are those of the process that measured the row; its own times of the default, taken
-# in the same rounds, are in the row as well, so that rows of different machines compare.
+# A part measures a few settings and the default. Errors and evaluations do not depend on the machine. Times are those
+# of the measuring process; its times of the default setting, taken in the same rounds, are in the same row, so that
+# rows of different machines can be compared.
 
 
 @dataclass(frozen=True)
 class PlannedStudy:
-    """What all parts of a study have in common: ``scene``, a file or the name of an analytic scene."""
+    """Inputs that all parts share: ``options`` and ``scene``, a file or the name of an analytic scene."""
 
     options: StudyOptions
     scene: PlannedScene | str
 
 
 def plan_study(subject: StudySubject, scene: str | Path, options: StudyOptions) -> PlannedStudy:
-    """That of the ``subject`` of ``scene``: parts have numbers of settings, whatever names were chosen."""
+    """Return the inputs of parts for the ``subject`` of ``scene``; parts refer to settings by number."""
     kind = "file" if isinstance(subject, FileSubject) else "analytic"
     of_parts = replace(options, only="", defaults=None, scene_kind=kind)
     if kind == "analytic":
         return PlannedStudy(of_parts, str(scene))
     twin = Path(scene).parent / _TWIN
-    others = list_scene_files(twin) if twin.is_file() else ()
-    return PlannedStudy(of_parts, PlannedScene.plan(scene, options.defaults, *others))
+    extra_files = list_scene_files(twin) if twin.is_file() else ()
+    return PlannedStudy(of_parts, PlannedScene.plan(scene, options.defaults, *extra_files))
 
 
-def _measured_in_parts(
+def _measure_in_parts(
     common: PlannedStudy, subject: StudySubject, rows: Sequence[StudyRow], parts: PartRunner, out: Path
 ) -> tuple[list[dict], list[dict], list[dict]]:
-    """What `study.measure` finds of ``rows`` (the default first) and `study.scaling`, in parts; and who timed what:
-    of each process its ``processor``, ``threads``, ``rows`` and, of the default there, the least and most ``seconds``.
+    """Measure ``rows`` (the default first) and the scaling in parts.
 
-    Rows say in ``timed_by`` which process it was, counted from 1, and have ``default_seconds`` and
-    ``default_cpu_seconds`` of that one.
+    Returns the rows, the scaling, and for each process its ``processor``, ``threads``, number of ``rows`` and, for the
+    default setting, minimum and maximum ``seconds``. Rows name their process in ``timed_by``, counted from 1, and have
+    its ``default_seconds`` and ``default_cpu_seconds``.
     """
     place = {row.name: k for k, row in enumerate(list_rows(subject, common.options.quick))}
-    chosen = [place[row.name] for row in rows[1:]]
-    some = [tuple(chosen[k : k + ROWS]) for k in range(0, len(chosen), ROWS)]
+    numbers = [place[row.name] for row in rows[1:]]
+    some = [tuple(numbers[k : k + ROWS]) for k in range(0, len(numbers), ROWS)]
     tasks = [Part(numbers, f"{len(numbers)} settings from number {numbers[0]}") for numbers in some]
     tasks.append(Part(None, "cost against size"))
     plan = Plan(f"nerg study {out.absolute()}", measure_part, common, tasks, ".json")
-    return _joined([read_json(made.path, "part of a study") for made in parts.run(plan)])
+    return _join_parts([read_json(made.path, "part of a study") for made in parts.run(plan)])
 
 
 def measure_part(common: PlannedStudy, numbers: Sequence[int] | None, output: Path) -> None:
-    """The rows (JSON) of the settings with these ``numbers``, the default first, or, for None, of the cost against
-    size; and who timed them."""
+    """Write the rows (JSON) of the settings ``numbers``, the default first, or of the scaling if it is None.
+
+    The measuring process is stored, too.
+    """
     import drjit as dr
 
     o = common.options
     select_backend(o.mode)
     repeats, samples = effort(o)
 
-    def opened() -> StudySubject:
+    def open_planned() -> StudySubject:
         scene, defaults = common.scene, {}
         if isinstance(scene, PlannedScene):
             scene, defaults = scene.checked_path(), scene.defaults
         return open_subject(str(scene), o.scene_kind, o.width, o.height, defaults, find_reference_scene)
 
-    # Its truth may take longer than its settings.
-    subject = prepare_once(common, opened)
+    # Its reference may take longer than its settings.
+    subject = prepare_once(common, open_planned)
     if numbers is None:
         rows = study.measure_scaling(subject, min(repeats, 3), o.quick)
     else:
@@ -234,8 +235,8 @@ def measure_part(common: PlannedStudy, numbers: Sequence[int] | None, output: Pa
     write_json(output, {"rows": rows, "timed_by": timed_by}, allow_nan=True)
 
 
-def _joined(parts: Iterable[Any]) -> tuple[list[dict], list[dict], list[dict]]:
-    """The rows of all parts with a single default, the cost against size, and who timed them."""
+def _join_parts(parts: Iterable[Any]) -> tuple[list[dict], list[dict], list[dict]]:
+    """Return the rows of all parts with a single default, the scaling, and the measuring processes."""
     *of_settings, scaling = parts
     table: list[dict] = []
     who: dict[str, dict] = {}
@@ -244,8 +245,8 @@ def _joined(parts: Iterable[Any]) -> tuple[list[dict], list[dict], list[dict]]:
         of_process = who.setdefault(by["process"], {**by, "process": len(who) + 1, "rows": 0, "seconds": []})
         of_process["seconds"].append(default["seconds"])
         for row in rest if table else (default, *rest):
-            own = {f"default_{clock}": default[clock] for clock in ("seconds", "cpu_seconds")}
-            table.append(row | own | {"timed_by": of_process["process"]})
+            default_times = {f"default_{clock}": default[clock] for clock in ("seconds", "cpu_seconds")}
+            table.append(row | default_times | {"timed_by": of_process["process"]})
             of_process["rows"] += 1
     for found in who.values():
         found["seconds"] = [min(found["seconds"]), max(found["seconds"])]

@@ -1,4 +1,4 @@
-"""Radiance fields from posed photos: training, and scores on the photos that were held out."""
+"""Training of radiance fields on posed photos, and scores on held-out photos."""
 
 from __future__ import annotations
 
@@ -22,17 +22,28 @@ from .base import SILENT, Reporter, select_backend
 from .options import explicit_settings
 from .radiance_commands import RadianceOptions, RadianceScoreOptions
 
-# ---- Radiance fields from posed photos: training, and scores on the photos that were held out ----
+# ---- Training and evaluation of radiance fields ----
 
 
-# Photos whose exposures differ by less than this, which nobody sees, are not told of.
+# Smaller differences of exposure, in stops, are invisible and not reported.
 _STOPS = 0.05
 
 
 @dataclass(frozen=True)
 class RadianceResult:
-    """``field``, with its occupancy; ``provenance``: what its checkpoint says about the training (JSON); ``output``:
-    the checkpoint, None where none was asked for; ``interrupted``: the run was ended early."""
+    """A trained radiance field.
+
+    Attributes
+    ----------
+    field
+        Field with its occupancy grid.
+    provenance
+        Provenance in its checkpoint (JSON).
+    output
+        Checkpoint, or None.
+    interrupted
+        Whether training was interrupted.
+    """
 
     field: RadianceField
     provenance: dict
@@ -41,7 +52,7 @@ class RadianceResult:
 
     @property
     def psnr(self) -> float | None:
-        """Mean PSNR in dB on the held-out views; None where none are held out, or masks leave nothing of them."""
+        """Mean PSNR in dB on the held-out views; None if there are none, or if masks remove them completely."""
         held_out = self.provenance.get("psnr_held_out")
         return None if held_out is None else held_out["mean"]
 
@@ -52,13 +63,27 @@ def train_radiance(
     options: RadianceOptions | None = None,
     reporter: Reporter = SILENT,
 ) -> RadianceResult:
-    """Train a radiance field on the posed photos of ``dataset``: a folder, its transforms.json, or a COLMAP model.
+    """Train a radiance field on posed photos.
 
-    ``output``: checkpoint to write (.safetensors). Beside it a preview (.preview.png) is kept up to date, and while the
-    run is not done its state (.run), from which it can be resumed. After Ctrl-C the result so far and the state are
-    written and ``KeyboardInterrupt`` is raised; without ``output`` the result so far is returned, as ``interrupted``.
+    Parameters
+    ----------
+    dataset
+        Posed photos: their folder, its transforms.json, or a COLMAP model.
+    output
+        Checkpoint to write (.safetensors), or None. Next to it are stored a preview (.preview.png) and, until training
+        is finished, its state (.run), from which it can be resumed.
+    options
+        Size of the field, and settings.
+    reporter
+        Receives messages and progress.
 
-    Raises `NergError` for what the user can mend, before any time is spent on it.
+    Raises
+    ------
+    NergError
+        For errors that the user can correct, before any time is spent.
+    KeyboardInterrupt
+        After Ctrl-C, when the result so far and the state have been written. Without ``output`` the result so far is
+        returned with ``interrupted`` set.
     """
     with reserve_output(output):
         return _train(dataset, None if output is None else Path(output), options or RadianceOptions(), reporter)
@@ -74,10 +99,10 @@ def _train(photos: str | Path, output: Path | None, options: RadianceOptions, re
     ns = select_backend(options.mode, options.threads)
     settings = _settings(options)
     if options.resume and (state is None or not state.is_file()):
-        raise NergError(f'there is nothing to resume: "{state}" does not exist; leave out --resume to start')
+        raise NergError(f'there is no state to resume: "{state}" does not exist; leave out --resume to start')
     reporter.progress(0.0, "reading photos")
     data = _open(photos, options)
-    _tell_about(data, reporter)
+    _report_data(data, reporter)
     field, provenance = radiance_run.train_field(
         data,
         make_radiance_config(options.size, data.box, options.deferred),
@@ -92,17 +117,17 @@ def _train(photos: str | Path, output: Path | None, options: RadianceOptions, re
         write=None if output is None else lambda field, about: save_radiance(field, output, about, options.half),
     )
     result = RadianceResult(field, provenance, output, provenance["interrupted"])
-    _tell_result(result, reporter)
+    _report_result(result, reporter)
     if result.interrupted and output is not None:
-        raise KeyboardInterrupt(f"interrupted; go on with --resume (state in {state})")
+        raise KeyboardInterrupt(f"interrupted; continue with --resume (state in {state})")
     return result
 
 
 def _settings(options: RadianceOptions) -> RadianceSettings:
-    given = explicit_settings(options, RadianceSettings)
+    explicit = explicit_settings(options, RadianceSettings)
     if options.steps is None:
-        given.setdefault("minutes", 5.0)
-    return RadianceSettings(**given)
+        explicit.setdefault("minutes", 5.0)
+    return RadianceSettings(**explicit)
 
 
 def _open(photos: str | Path, options: RadianceOptions) -> Dataset:
@@ -121,17 +146,17 @@ def _open(photos: str | Path, options: RadianceOptions) -> Dataset:
         )
 
 
-def _tell_about(data: Dataset, reporter: Reporter) -> None:
+def _report_data(data: Dataset, reporter: Reporter) -> None:
     corner, core = lambda values: ", ".join(f"{x:.3g}" for x in values), data.box.core
     for line in (*data.unused, *data.notes):
         reporter.message(str(line))
-    reporter.message(f"taken for {data.kind_note}; --unbounded, --bounded or --aabb say otherwise")
+    reporter.message(f"assumed scene type: {data.kind_note}; change it with --unbounded, --bounded or --aabb")
     reporter.message(f"box: ({corner(core.lower)}) to ({corner(core.upper)}), {data.box_source}")
     reporter.message(data.unit_note)
     reporter.message(data.up_note)
     reporter.message(
-        f"{len(data.train)} views to train on, {len(data.held_out)} held out, "
-        f"{data.source['width']} x {data.source['height']} pixels"
+        f"{len(data.train)} training views, {len(data.held_out)} held out, {data.source['width']} x "
+        f"{data.source['height']} pixels"
     )
 
 
@@ -141,19 +166,23 @@ def _progress(now: radiance_run.RadianceProgress) -> str:
     return f"{left:.0f} s left, step {now.steps}{error}"
 
 
-def _tell_result(result: RadianceResult, reporter: Reporter) -> None:
-    about = result.provenance
-    speed = f"; {about['evaluations_a_second']:.3g} field evaluations a second" if about["steps"] else ""
-    reporter.message(f"{about['steps']} steps in {about['seconds']:.0f} s{speed}")
+def _report_result(result: RadianceResult, reporter: Reporter) -> None:
+    provenance = result.provenance
+    speed = f"; {provenance['evaluations_a_second']:.3g} field evaluations per second" if provenance["steps"] else ""
+    reporter.message(f"{provenance['steps']} steps in {provenance['seconds']:.0f} s{speed}")
     if result.psnr is not None:
-        fitted = about["psnr_held_out"]["mean_fitted"]
-        halves = "" if fitted is None else f"; of right halves, colours fitted on left ones: {fitted:.2f} dB"
+        fitted = provenance["psnr_held_out"]["mean_fitted"]
+        halves = "" if fitted is None else f"; on right halves, with colours fitted on left halves: {fitted:.2f} dB"
         reporter.message(f"held-out PSNR: {result.psnr:.2f} dB{halves}")
-    if about.get("photo_stops", 0) >= _STOPS:
-        reporter.message(f"the photos' exposures differ by {about['photo_stops']:.2f} stops (standard deviation)")
-    if "beyond_box" in about:
-        reporter.message(f"{about['beyond_box']:.0%} of the watched pixels show what lies beyond the box")
-    for complaint in about["complaints"]:
+    if provenance.get("photo_stops", 0) >= _STOPS:
+        reporter.message(
+            f"the exposures of the photos differ by {provenance['photo_stops']:.2f} stops (standard deviation)"
+        )
+    if "beyond_box" in provenance:
+        reporter.message(
+            f"{provenance['beyond_box']:.0%} of the validation pixels show what is beyond the bounding box"
+        )
+    for complaint in provenance["complaints"]:
         reporter.warn(complaint)
     if result.output is not None:
         reporter.message(f"wrote {result.output} ({result.output.stat().st_size / 1e6:.2f} MB)")
@@ -162,10 +191,10 @@ def _tell_result(result: RadianceResult, reporter: Reporter) -> None:
 def evaluate_radiance(
     field: str | Path, photos: str | Path, options: RadianceScoreOptions | None = None, reporter: Reporter = SILENT
 ) -> ViewScores:
-    """PSNR, SSIM and, where the ``photos`` have depth, its error, of the ``field`` in a checkpoint as rendered by the
+    """Compute PSNR, SSIM and, if the ``photos`` have depth, depth error of the radiance field as rendered by the
     integrator.
 
-    Raises `NergError` for what the user can mend, among it views that the field was trained on.
+    Raises `NergError` for errors that the user can correct, such as views that were used for training.
     """
     options = options or RadianceScoreOptions()
     pictures = None if options.pictures is None else Path(options.pictures)
@@ -174,8 +203,8 @@ def evaluate_radiance(
     if options.json_file is not None:
         check_writable(options.json_file)
     select_backend(options.mode, options.threads)
-    about = read_checkpoint(field, "radiance")[1].get("provenance", {})
-    trained_width = about.get("width") if isinstance(about.get("width"), int) else None
+    provenance = read_checkpoint(field, "radiance")[1].get("provenance", {})
+    trained_width = provenance.get("width") if isinstance(provenance.get("width"), int) else None
     data = open_dataset(
         photos,
         options.holdout,
@@ -190,7 +219,7 @@ def evaluate_radiance(
     for line in (*data.unused, *data.notes):
         reporter.message(str(line))
     if not options.train:
-        _refuse_trained(field, about, data)
+        _refuse_trained(field, provenance, data)
     views = data.train if options.train else data.held_out
     done = 0
 
@@ -209,11 +238,11 @@ def evaluate_radiance(
     scores = score_views(field, views, options.spp, pictures, scored)
     row("mean", scores.psnr_mean, scores.ssim_mean)
     if not math.isnan(scores.psnr_fitted_mean):
-        reporter.message(f"PSNR of right halves, their colours fitted on left ones: {scores.psnr_fitted_mean:.2f} dB")
+        reporter.message(f"PSNR of right halves, with colours fitted on left halves: {scores.psnr_fitted_mean:.2f} dB")
     if any(map(math.isnan, scores.ssim)):
         reporter.warn(
-            f"views of {scores.width} x {scores.height} pixels hold no whole window of 11 x 11, which SSIM needs; give "
-            "a larger --width"
+            f"views of {scores.width} x {scores.height} pixels are smaller than the 11 x 11 window of SSIM; "
+            "increase --width"
         )
     if scores.depth is not None:
         d = scores.depth
@@ -222,29 +251,29 @@ def evaluate_radiance(
             f"opacity {d.opacity:.3f}, {d.translucent_fraction:.1%} of the pixels below 0.9"
         )
     if pictures is not None:
-        reporter.message(f"wrote {len(views)} pictures to {pictures}")
+        reporter.message(f"wrote {len(views)} images to {pictures}")
     if options.json_file is not None:
-        about = {"field": Path(field).name, "dataset": data.source["dataset"]}
-        write_json(options.json_file, about | scores.to_dict())
+        provenance = {"field": Path(field).name, "dataset": data.source["dataset"]}
+        write_json(options.json_file, provenance | scores.to_dict())
         reporter.message(f"wrote {options.json_file}")
     return scores
 
 
 def evaluate_beside(field: Path, dataset: Path, options: RadianceScoreOptions, reporter: Reporter) -> None:
-    """`evaluate_radiance`, with pictures beside the ``field`` where no other folder is chosen."""
+    """Call `evaluate_radiance`, with images next to the ``field`` unless another folder is given."""
     options = replace(options, pictures=options.pictures or field.with_suffix(".eval"))
     evaluate_radiance(field, dataset, options, reporter)
 
 
-def _refuse_trained(field: str | Path, about: dict, data: Dataset) -> None:
-    """Raise `NergError` where views would be scored that the field in ``field`` was trained on."""
-    held_out = about.get("held_out")
+def _refuse_trained(field: str | Path, provenance: dict, data: Dataset) -> None:
+    """Raise `NergError` if views of the training would be scored."""
+    held_out = provenance.get("held_out")
     trained = held_out.get("frames") if isinstance(held_out, dict) else None
-    if trained is None or about.get("sha256") != data.source["sha256"]:
+    if trained is None or provenance.get("sha256") != data.source["sha256"]:
         return
     seen = sorted({v.name for v in data.held_out} - set(trained))
     if seen:
         raise NergError(
-            f'"{field}" was trained on {seen[0]} and {len(seen) - 1} other of the views that would be scored; '
-            "give --holdout as it was trained with"
+            f'"{field}" was trained on {seen[0]} and {len(seen) - 1} other views that would be scored; use the '
+            "same --holdout as in training"
         )

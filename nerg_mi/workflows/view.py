@@ -1,4 +1,4 @@
-"""From files and folders to the scene that a viewer shows."""
+"""The scene of the viewer, from files and folders."""
 
 from __future__ import annotations
 
@@ -29,17 +29,33 @@ from .scene_commands import SceneOptions, ViewOptions
 from .scene_places import KINDS, detect_kind, find_training_scene
 
 RAYS = 2_000_000
-"""Of larger datasets so many rays are shown, drawn at random."""
+"""Maximum number of rays that are shown; larger datasets are subsampled uniformly."""
 
 _SUFFIXES = {*KINDS, *READERS, ".safetensors", ".rays"}
 
 
 @dataclass(frozen=True, eq=False)
 class ViewerScene:
-    """``scene``: a scene file with the integrator `nerg`; ``made``: whether it was written for the viewer, and ends
-    with it; ``rays`` in their own frame, or None, and ``align`` from there to the place; ``up`` (3,), a unit vector;
-    ``name`` for people; ``variants``: scene files that differ in their gaze field alone, by its name, of which
-    ``scene`` is the first; none where there is nothing to choose."""
+    """Scene of the viewer.
+
+    Attributes
+    ----------
+    scene
+        Scene file with the integrator `nerg`.
+    made
+        Whether it is a temporary file of the viewer.
+    rays
+        Rays in their own frame, or None.
+    align
+        Transform from the rays to the scene.
+    up
+        Up direction (3,), a unit vector.
+    name
+        Display name.
+    variants
+        Scene files that differ in their gaze field only, by its name; the first is ``scene``. Empty if there is no
+        choice.
+    """
 
     scene: Path
     made: bool
@@ -53,44 +69,48 @@ class ViewerScene:
 def make_viewer_scene(
     files: Sequence[str | Path], folder: Path, options: ViewOptions | None = None, reporter: Reporter = SILENT
 ) -> ViewerScene:
-    """The scene of ``files``: a scene file with `nerg`, or whatever `write_scene` makes one of, in ``folder``.
+    """Return the scene of ``files``: a scene file with `nerg`, or one that `write_scene` writes to ``folder``.
 
-    A folder stands for the files in it, of which there must be one of a kind, or is a dataset of rays (.rays). Rays
-    beside a scene are shown in it. Several gaze fields, as `nerg ablate` trains them, are variants to choose among; a
-    scene's own is the first of them. Raises `NergError` for what the user can mend.
+    A folder is replaced by the files in it, at most one of a kind, or is a dataset of rays (.rays). Rays are shown in
+    the scene. Several gaze fields, such as those of `nerg ablate`, are variants to choose from; the gaze field of a
+    scene is the first of them. Raises `NergError` for errors that the user can correct.
     """
     options = options or ViewOptions()
     select_backend(options.mode)
-    found = [path for file in files for path in _expanded(Path(file))]
-    if not found:
+    paths = [path for file in files for path in _expanded(Path(file))]
+    if not paths:
         raise NergError(
-            "there is nothing to view; name a scene, a field, a mesh, a gaze field, rays, or a run's folder"
+            "there is nothing to view; name a scene, a field, a mesh, a gaze field, rays, or a folder of these"
         )
-    kinds = {path: detect_kind(path) for path in found}
+    kinds = {path: detect_kind(path) for path in paths}
     rays_files = [path for path, kind in kinds.items() if kind == "rays"]
     if len(rays_files) > 1:
-        raise NergError(f'"{rays_files[0]}" and "{rays_files[1]}" are both rays; a viewer shows one of them')
+        raise NergError(
+            f'"{rays_files[0]}" and "{rays_files[1]}" are both rays, and the viewer shows one; leave out one of them'
+        )
     rays = load_rays(rays_files[0], RAYS) if rays_files else None
-    name = " + ".join(path.name for path in found)
+    name = " + ".join(path.name for path in paths)
     scenes = [path for path, kind in kinds.items() if kind == "scene"]
     gaze = [path for path, kind in kinds.items() if kind == "gaze"]
     if len(scenes) == 1 and set(kinds.values()) <= {"scene", "rays", "gaze"} and _is_nerg(scenes[0]):
-        align = _given_align(options) or Similarity(np.eye(4))
-        own = find_gaze_file(scenes[0]) if gaze else None
-        variants = write_variants(scenes[0], [*([own] if own else []), *gaze], folder, reporter) if gaze else {}
+        align = _explicit_align(options) or Similarity(np.eye(4))
+        own_gaze = find_gaze_file(scenes[0]) if gaze else None
+        variants = (
+            write_variants(scenes[0], [*([own_gaze] if own_gaze else []), *gaze], folder, reporter) if gaze else {}
+        )
         scene = next(iter(variants.values()), scenes[0])
         return ViewerScene(scene, bool(gaze), rays, align, _up(options, np.array([0.0, 0, 1])), name, variants)
-    given = [path for path in found if not is_dataset(path) and path not in gaze[1:]]
-    if rays is not None and rays_files[0] not in given:
+    inputs = [path for path in paths if not is_dataset(path) and path not in gaze[1:]]
+    if rays is not None and rays_files[0] not in inputs:
         copy = folder / "rays.npz"
         rays.save(copy)
-        given.append(copy)
+        inputs.append(copy)
     output = folder / "scene.xml"
-    chosen = SceneOptions(
+    scene_options = SceneOptions(
         observer=options.observer, up=options.up, align=options.align, geometry=options.geometry, mode=options.mode
     )
-    write_scene(given, output, chosen, reporter)
-    align = _given_align(options)
+    write_scene(inputs, output, scene_options, reporter)
+    align = _explicit_align(options)
     if align is None:
         align = read_training_alignment(read_metadata(gaze[0]).get("provenance", {}) if gaze else {})
     variants = write_variants(output, gaze, folder, reporter) if len(gaze) > 1 else {}
@@ -98,48 +118,51 @@ def make_viewer_scene(
 
 
 def write_variants(scene: Path, gaze: Sequence[Path], folder: Path, reporter: Reporter = SILENT) -> dict[str, Path]:
-    """Copies of the file ``scene``, with each of the files ``gaze`` as its gaze field, into ``folder``: by the names of
-    these, which are their paths' last parts as far as they differ.
+    """Write copies of the file ``scene`` to ``folder``, one for each gaze field of ``gaze``; return them by distinct
+    names.
 
-    Warns of fields that were trained in other places than the first. Raises `NergError` for a scene that takes none.
+    Warns of fields that were trained in another scene than the first. Raises `NergError` for a scene that cannot have a
+    gaze field.
     """
     first = read_metadata(gaze[0]).get("provenance", {})
-    found: dict[str, Path] = {}
+    variants: dict[str, Path] = {}
     for number, path in enumerate(gaze):
         if find_training_scene(read_metadata(path).get("provenance", {})) != find_training_scene(first):
             reporter.warn(
-                f'"{path}" was trained in another place than "{gaze[0]}"; its gaze is right only where surfaces and '
+                f'"{path}" was trained in another scene than "{gaze[0]}"; its gaze is valid only if surfaces and '
                 "coordinates are the same"
             )
-        name = next(n for n in _names(path, number) if n not in found)
-        found[name] = folder / f"variant{number}.xml"
-        write_text(found[name], replace_gaze(scene, path))
-    return found
+        name = next(n for n in _names(path, number) if n not in variants)
+        variants[name] = folder / f"variant{number}.xml"
+        write_text(variants[name], replace_gaze(scene, path))
+    return variants
 
 
 def _names(path: Path, number: int) -> Iterator[str]:
-    """Names for the gaze field of a file, the shortest first."""
+    """Yield names for the gaze field of a file, the shortest first."""
     yield path.stem
     yield f"{path.parent.name}/{path.stem}"
     yield f"{path.stem} ({number})"
 
 
 def _expanded(path: Path) -> list[Path]:
-    """A file itself; of a folder the files in it that a viewer knows."""
+    """Return the file, or the files in a folder that the viewer can show."""
     if not path.exists():
         raise MissingFile(f'there is no file "{path}"; correct its name')
     if not path.is_dir() or is_dataset(path):
         return [path]
     inside = sorted(p for p in path.iterdir() if p.suffix.lower() in _SUFFIXES)
-    # Of glTF a viewer shows splats alone.
+    # Of glTF files, the viewer shows splats only.
     inside = [p for p in inside if p.suffix.lower() != ".glb" or is_splat_file(p)]
     if not inside:
-        raise NergError(f'the folder "{path}" holds nothing that a viewer shows; name a file, or another folder')
+        raise NergError(
+            f'the folder "{path}" contains nothing that the viewer can show; name a file, or another folder'
+        )
     ready = [p for p in inside if p.suffix.lower() == ".xml"]
     if len(ready) > 1:
         ready = [p for p in ready if p.name == "scene.xml"] or ready
     if len(ready) > 1:
-        raise NergError(f'the folder "{path}" has {len(ready)} scenes; name the one to view')
+        raise NergError(f'the folder "{path}" contains {len(ready)} scenes; name one of them')
     return ready or inside
 
 
@@ -147,7 +170,7 @@ def _is_nerg(path: Path) -> bool:
     return is_nerg(load_scene(path).integrator())
 
 
-def _given_align(options: ViewOptions) -> Similarity | None:
+def _explicit_align(options: ViewOptions) -> Similarity | None:
     return None if options.align is None else read_similarity(options.align, "--align", "rays to place")
 
 
@@ -161,7 +184,7 @@ def _up(options: ViewOptions, otherwise: np.ndarray) -> np.ndarray:
 
 
 def _up_of(written: Path) -> np.ndarray:
-    """Up in a scene that `write_scene` wrote."""
+    """Return the up direction of a scene that `write_scene` wrote."""
     defaults = {d.get("name"): d.get("value", "") for d in ElementTree.parse(written).getroot().iter("default")}
     text = defaults.get("nerg_up", defaults.get("up", "0, 0, 1"))
     return np.array([float(v) for v in text.split(",")])

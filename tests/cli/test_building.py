@@ -79,7 +79,7 @@ def test_help_tells_what_each_field_means(serve):
 def test_a_word_that_is_parsed_is_called_as_it_was_given(serve):
     assert serve("mug", "--from", "1,2.5")[1][1].origin == (1.0, 2.5)
     done, _ = serve("mug", "--from", "east")
-    assert "--from is numbers" in str(done.exception)
+    assert "--from must be comma-separated numbers" in str(done.exception)
 
 
 GREETING = '''"""``nerg greet kindly``: Say something kind.
@@ -93,11 +93,11 @@ from dataclasses import dataclass
 
 from nerg_mi.workflows.base import argument, command
 from nerg_mi.workflows.options import option
-from nerg_mi.ranges import Checked, Range
+from nerg_mi.ranges import Range, ValidatedDataclass
 
 
 @dataclass(frozen=True, kw_only=True)
-class GreetingOptions(Checked):
+class GreetingOptions(ValidatedDataclass):
     times: int = option(1, "How often.", within=Range(1, 9))
 
 
@@ -140,4 +140,4 @@ def test_a_line_without_a_command_is_a_mistake(monkeypatch, tmp_path, capsys):
     with pytest.raises(SystemExit) as end:
         nerg_mi.cli.main(["nothing"])
     sys.modules.pop("nerg_mi.workflows.nothing")
-    assert end.value.code == 70 and "nerg_mi.workflows.nothing names a command" in capsys.readouterr().err
+    assert end.value.code == 70 and "nerg_mi.workflows.nothing lists the command" in capsys.readouterr().err

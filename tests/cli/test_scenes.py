@@ -406,7 +406,9 @@ def test_a_store_is_told_of_and_swept(tmp_path, nerg):
 
 def test_a_worker_serves_an_address_and_warns_of_an_open_one(monkeypatch, nerg):
     served = []
-    monkeypatch.setattr(engines, "run_dask_worker", lambda *a: served.append((*a[:2], a[3], os.environ.get(THREADS_VARIABLE))))
+    monkeypatch.setattr(
+        engines, "run_dask_worker", lambda *a: served.append((*a[:2], a[3], os.environ.get(THREADS_VARIABLE)))
+    )
     # What the command sets is taken back after the test.
     monkeypatch.setenv(THREADS_VARIABLE, "")
     ended = nerg(*"worker tcp://127.0.0.1:8786 --threads 3 --wait 5 --name a".split())

@@ -109,7 +109,7 @@ def test_an_interrupted_run_with_an_output_can_be_resumed(cube):
 
 
 def test_nothing_to_resume_without_an_output(cube):
-    with pytest.raises(NergError, match="nothing to resume"):
+    with pytest.raises(NergError, match="does not exist; leave out --resume to start"):
         train_radiance(cube, options=RadianceOptions(steps=2, resume=True))
 
 
@@ -149,7 +149,7 @@ def test_fields_without_any_file(torch, tmp_path):
     found = import_checkpoint(path, reporter=told)
     assert found.field is not None and found.gaze.config.variant == "emit_capture" and found.files == []
     assert [p.name for p in tmp_path.iterdir()] == ["nerg.pth"]
-    assert told.messages == [f'"{path}" also holds a gaze field: --gaze NAME.safetensors writes it']
+    assert told.messages == [f'"{path}" also contains a gaze field: write it with --gaze NAME.safetensors']
 
 
 def test_files_in_their_order(torch, tmp_path):
@@ -222,7 +222,10 @@ def test_only_the_bound_is_another(files):
     # Of readers that know no parts the cells are what they were.
     assert {k: v for k, v in about["occupancy"].items() if k != "refined"} == meta["occupancy"]
     loaded = load_radiance(new, ns)[0].occupancy
-    assert np.array_equal(loaded.masks, found.occupancy.masks) and loaded.missed_optical_depth == found.occupancy.missed_optical_depth
+    assert (
+        np.array_equal(loaded.masks, found.occupancy.masks)
+        and loaded.missed_optical_depth == found.occupancy.missed_optical_depth
+    )
     assert 0 < loaded.occupied_fraction < found.before == loaded.coarse.occupied_fraction
 
 
@@ -318,7 +321,7 @@ def test_the_capture_is_read_as_it_was_found(photos, finds, tmp_path):
     options = PoseOptions(camera_model="radial", threads=1, seed=3, single_camera=False)
     result = find_poses(photos, tmp_path / "new" / "capture", options, told)
     (settings,) = asked
-    assert (settings.lens, settings.threads, settings.seed, settings.share) == ("radial", 1, 3, False)
+    assert (settings.camera_model, settings.threads, settings.seed, settings.share_cameras) == ("radial", 1, 3, False)
     assert sorted(os.listdir(result.output)) == ["images", "poses.json", "poses.png", "sparse"]
     assert os.listdir(tmp_path / "new") == ["capture"]
     data = open_dataset(result.output)
@@ -341,7 +344,7 @@ def test_progress_grows_through_all_stages(photos, finds, tmp_path):
     shares = [share for share, _ in told.steps]
     assert shares == sorted(shares) and 0 < shares[0] < STAGES["features"] and shares[-1] == STAGES["writing"]
     words = " ".join(text for _, text in told.steps)
-    for said in ("copying pictures, 9 of 9", "finding features", "comparing pictures", "placing pictures, 1 of 2"):
+    for said in ("copying images, 9 of 9", "extracting features", "matching images", "registering images, 1 of 2"):
         assert said in words
 
 
@@ -363,8 +366,8 @@ def test_too_few_and_parts_are_warned_of(photos, finds, tmp_path):
     told = Recorder()
     find_poses(photos, tmp_path / "capture", None, told)
     parts, few = told.warnings
-    assert "parts that nothing connects" in parts and "another has 5 (4.png, 5.png" in parts
-    assert "less than half" in few and "take more of them" in few
+    assert "unconnected models" in parts and "another has 5 images (4.png, 5.png" in parts
+    assert "less than half" in few and "take more images" in few
 
 
 def test_an_up_that_is_unsure_or_not_asked_for_is_told(photos, finds, tmp_path):
@@ -373,15 +376,15 @@ def test_an_up_that_is_unsure_or_not_asked_for_is_told(photos, finds, tmp_path):
     told = Recorder()
     finds(COUNT, lambda made: replace(made, up=UpEstimate(np.array([0, 0, 1.0]), 40.0)))
     find_poses(photos, tmp_path / "a", None, told)
-    assert "do not agree on what is up" in told.warnings[0] and "--no-orient" in told.warnings[0]
+    assert "disagree on the up direction" in told.warnings[0] and "--no-orient" in told.warnings[0]
     finds(COUNT, lambda made: replace(made, up=None))
     result = find_poses(photos, tmp_path / "b", PoseOptions(orient=False), told)
-    assert "up was not looked for" in told.messages and result.report["up"] is None
+    assert "the up direction was not estimated" in told.messages and result.report["up"] is None
 
 
 def test_nothing_found_is_an_error_and_leaves_nothing(photos, finds, tmp_path):
     finds(0)
-    with pytest.raises(NergError, match="no 3 of the 9 pictures .* show the same place; take more"):
+    with pytest.raises(NergError, match="show the same scene; take more images, each"):
         find_poses(photos, tmp_path / "capture")
     assert os.listdir(tmp_path) == ["photos"]
 
@@ -400,7 +403,7 @@ def test_a_model_that_was_cut_short_is_not_taken(photos, finds, tmp_path):
     assert os.listdir(tmp_path) == ["photos"]
 
 
-@pytest.mark.parametrize("stage", ["copying", "finding", "comparing", "placing", "writing"])
+@pytest.mark.parametrize("stage", ["copying", "extracting", "matching", "registering", "writing"])
 def test_ctrl_c_leaves_nothing(stage, photos, finds, tmp_path):
     class Interrupts(Recorder):
         def progress(self, share, text=""):
@@ -417,7 +420,7 @@ def test_photos_that_are_too_few(photos, finds, tmp_path):
     finds(COUNT)
     for k in range(2, COUNT):
         (photos / f"{k}.png").unlink()
-    with pytest.raises(NergError, match="has 2 pictures that can be used, and poses need 3 or more of the same place$"):
+    with pytest.raises(NergError, match="usable images, and pose estimation needs at"):
         find_poses(photos, tmp_path / "capture")
     for k in range(2, 6):
         (photos / f"{k}.png").write_bytes((photos / "0.png").read_bytes())

@@ -15,7 +15,15 @@ from nerg_mi.rays.rays import FRAME, Rays
 from nerg_mi.rays.readers.registry import make_options
 from nerg_mi.workflows import rays
 from nerg_mi.workflows.evaluate import evaluate_gaze
-from nerg_mi.workflows.rays import FilterSteps, make_quality_report, filter_rays, import_rays, smallest_mask, plot_rays, split_rays
+from nerg_mi.workflows.rays import (
+    FilterSteps,
+    make_quality_report,
+    filter_rays,
+    import_rays,
+    smallest_mask,
+    plot_rays,
+    split_rays,
+)
 from nerg_mi.workflows.rays_commands import FilterOptions, PlotOptions, RaysImportOptions, SplitOptions
 from nerg_mi.workflows.train_gaze import train_gaze
 from tests.cli.rays.running import write_walk
@@ -31,7 +39,7 @@ from .recorder import Recorder
 
 def test_steps_and_what_is_kept_of_them():
     rays = crowd()
-    steps = FilterSteps(rays, own=False)
+    steps = FilterSteps(rays, in_place=False)
     steps.select({"time": (10, 60)})
     steps.sample(100, seed=3)
     assert [(s.name, s.kept, s.of) for s in steps.taken] == [("filter", 500, 1000), ("sample", 100, 500)]
@@ -40,10 +48,10 @@ def test_steps_and_what_is_kept_of_them():
 
 
 def test_nothing_is_left():
-    steps = FilterSteps(crowd(), own=True)
-    with pytest.raises(NergError, match="filter leaves none of 1,000 rays"):
+    steps = FilterSteps(crowd(), in_place=True)
+    with pytest.raises(NergError, match="rays; widen its conditions"):
         steps.select({"time": (1e6, None)})
-    steps = FilterSteps(crowd().select(np.zeros(1000, bool)), own=True, strict=False)
+    steps = FilterSteps(crowd().select(np.zeros(1000, bool)), in_place=True, strict=False)
     for fixations, one_ray in (("ivt", False), ("idt", True)):
         assert steps.follow(FilterOptions(fixations=fixations, merge_fixations=one_ray, thin=2)) == 0
     assert [s.of for s in steps.taken] == [0] * 4
@@ -125,7 +133,7 @@ def test_import_under_pseudonyms(tmp_path):
         for _ in range(2)
     )
     assert one.rays.persons == two.rays.persons and not set(one.rays.persons) & {"ann", "bo"}
-    with pytest.raises(NergError, match="belongs to --pseudonyms"):
+    with pytest.raises(NergError, match="--salt needs --pseudonyms; add it, or leave out"):
         RaysImportOptions(settings=settings, salt=tmp_path / "salt")
 
 
@@ -156,7 +164,9 @@ def test_filter_leaves_the_rays_that_it_was_given(walk):
 
 
 def test_one_ray_a_fixation(walk):
-    found = filter_rays(walk, FilterOptions(fixations="ivt", velocity_threshold=300, min_fixation=0.1, merge_fixations=True))
+    found = filter_rays(
+        walk, FilterOptions(fixations="ivt", velocity_threshold=300, min_fixation=0.1, merge_fixations=True)
+    )
     (step,) = found.rays.metadata["steps"]
     assert len(found.rays) == found.fixations == step["kept"] and step["one_ray"] and step["velocity"] == 300
     assert step["least"] == 0.1 and step["of"] == 12_000
@@ -187,10 +197,10 @@ def test_plot(walk, tmp_path):
 @pytest.mark.parametrize(
     "make, message",
     [
-        (FilterOptions, "say which rays"),
+        (FilterOptions, "no selection is given; add for instance"),
         (lambda: FilterOptions(fixations="magic"), "ivt or idt"),
         (lambda: FilterOptions(merge_fixations=True), "add --fixations"),
-        (SplitOptions, "say how to split"),
+        (SplitOptions, "no criterion is given for the split; add"),
         (lambda: PlotOptions(kind="map"), "density or layout"),
         (lambda: PlotOptions(test="a.npz"), "add --kind layout"),
     ],
@@ -257,10 +267,10 @@ def test_pseudonyms(parquet, files, tmp_path):
 @pytest.mark.parametrize(
     "given, why",
     [
-        ({"place_name": "x"}, "--place-name belongs to datasets"),
-        ({"day": "2024-01-01", "output": "a.npz"}, "--day belongs to datasets"),
+        ({"place_name": "x"}, "--environment applies to datasets only; use an"),
+        ({"day": "2024-01-01", "output": "a.npz"}, "--day applies to datasets only; use an output"),
         ({"workers": 0, "output": "a.rays"}, "--workers must lie in"),
-        ({"align_output": "a.json", "output": "a.rays"}, "--write-align belongs to files"),
+        ({"align_output": "a.json", "output": "a.rays"}, "--align-output does not apply to datasets,"),
     ],
 )
 def test_options_of_datasets(parquet, given, why):
@@ -289,7 +299,7 @@ def test_filters_are_those_of_a_file(parquet, tmp_path, given):
     assert_same(Rays.load(tmp_path / "a.parquet"), whole.rays)
     assert heard.messages.pop() == f"wrote {tmp_path / 'a.parquet'}"
     assert found.fixations == whole.fixations and sorted(heard.messages) == sorted(
-        m.replace(": one ray each,", ":") for m in expected.messages
+        m.replace(": mean rays,", ":") for m in expected.messages
     )
     counts = lambda r: [(s["step"], s["kept"], s["of"]) for s in r.metadata["steps"]]
     assert counts(found.rays) == counts(whole.rays)
@@ -324,7 +334,7 @@ def test_samples(parquet, tmp_path):
 
 def test_filters_that_cannot_be(parquet, tmp_path, monkeypatch):
     dataset, _ = write_dataset(tmp_path)
-    with pytest.raises(NergError, match="nothing is left of 1,197 rays"):
+    with pytest.raises(NergError, match="rays are selected; widen the conditions"):
         filter_rays(dataset.folder, FilterOptions(start=0, end=1, output=tmp_path / "a.rays"))
     assert not (tmp_path / "a.rays").exists()
     monkeypatch.setattr(rays, "MAX_LOADED_RAYS", 500)

@@ -84,11 +84,18 @@ def test_everything_of_a_folder(run, tmp_path):
     assert wall.recorded.mean > 0.5 and wall.num_could_see == wall.num_participants == 4 and wall.predicted.mean > 0
     assert nothing.predicted.mean == 0 and nothing.num_could_see == nothing.num_looked == 0
     scene = packed_scene(text)
-    assert 100 < scene["count"] <= 600 and len(scene["observers"]) == 6 and found.nearby_participants and min(found.nearby_participants) >= 1
+    assert (
+        100 < scene["count"] <= 600
+        and len(scene["observers"]) == 6
+        and found.nearby_participants
+        and min(found.nearby_participants) >= 1
+    )
     # Nobody's name, neither of rays nor of evaluations.
     assert not any(name in text for name in NAMES) and "person 1" in text
     # How many rays of how many people the gaze rests on, and what all of it was made of.
-    assert re.fullmatch(r"made of [\d,]+ rays of [1-4] people", found.support_note) and text.count(found.support_note) >= 2
+    assert (
+        re.fullmatch(r"made of [\d,]+ rays of [1-4] people", found.support_note) and text.count(found.support_note) >= 2
+    )
     made = json.loads(found.provenance_json)
     assert made["what"] == "nerg report" and set(made["inputs"].values()) == {digest for *_, digest in found.inputs}
     assert found.provenance_json.encode("latin-1") in found.pictures["own"].png and 'name="provenance"' in text
@@ -158,7 +165,7 @@ def test_evaluations_of_others_are_refused_or_doubted(without_3d, run, tmp_path)
         return folder
 
     gaze = run / "gaze.safetensors"
-    with pytest.raises(NergError, match="evaluation of another gaze"):
+    with pytest.raises(NergError, match="is an evaluation of a gaze field other than"):
         make_report([gaze, evaluation(gaze_sha256="ab")], tmp_path / "a.html", SMALL)
     with pytest.raises(NergError, match='"pos"'):
         make_report([gaze, evaluation(), evaluation()], tmp_path / "a.html", SMALL)
@@ -360,8 +367,8 @@ def test_the_rays_that_it_rests_on_are_named():
 
 def test_plans():
     found = draw_rays(crowd(300), {"centres": [[-0.5, 0, 1.6]], "radius": 0.5}, ABOUT)
-    assert set(found) == {"plan", "layout"} and "held out" in found["layout"].caption
-    assert "held out" not in draw_rays(crowd(300), None, ABOUT)["layout"].caption
+    assert set(found) == {"plan", "layout"} and "held-out" in found["layout"].caption
+    assert "held-out" not in draw_rays(crowd(300), None, ABOUT)["layout"].caption
 
 
 # ---- Where a report looks from, and the paths that it draws ----
@@ -376,7 +383,7 @@ class Walls:
 
     BLOCK = np.array([[3.0, 2.0, 0.0], [5.0, 4.0, 3.0]])
 
-    def meet(self, o, d):
+    def trace(self, o, d):
         low, high = np.array(BOX.lower), np.array(BOX.upper)
         with np.errstate(divide="ignore", invalid="ignore"):
             out = np.where(d == 0, np.inf, np.where(d > 0, (high - o) / d, (low - o) / d)).min(axis=1)
@@ -396,7 +403,9 @@ def walkers(count=4, n=400):
 
 
 def test_free_places_are_in_the_room_and_not_in_the_block():
-    found = find_free_positions(Walls(), (np.zeros(3), np.array([8.0, 6, 3])), np.array([0.0, 0, 1]), np.array([1.0, 1, 1.6]))
+    found = find_free_positions(
+        Walls(), (np.zeros(3), np.array([8.0, 6, 3])), np.array([0.0, 0, 1]), np.array([1.0, 1, 1.6])
+    )
     assert len(found) > 30 and (found[:, 2] == 1.6).all()
     inside = ((found[:, :2] > [2.9, 1.9]) & (found[:, :2] < [5.1, 4.1])).all(axis=1)
     assert not inside.any() and (found > 0.1).all() and (found[:, 0] < 7.9).all()

@@ -42,8 +42,8 @@ def test01_counts_are_those_of_a_loop(folder):
     for name, kinds in (("the sign", {"sign"}), ("the stand", {"stand"}), ("both", {"sign", "stand"})):
         on = np.array([kind in kinds for kind, _ in met])
         shares = [on[rays.person == p].mean() for p in range(6)]
-        (row,) = table(found.aois, cell="all", thing=name)
-        assert row["source"] == "tracked" and row["people"] == 6
+        (row,) = table(found.aois, cell="all", aoi=name)
+        assert row["source"] == "tracked" and row["participants"] == 6
         assert row["share"] == pytest.approx(np.mean(shares)) and row["reach"] == np.mean([s > 0 for s in shares])
         # Every ray stands for 0.2 s, the last one too.
         assert row["dwell"] == pytest.approx(16 * np.mean(shares))
@@ -61,9 +61,9 @@ def test01_counts_are_those_of_a_loop(folder):
             reached += seen.any()
         assert row["looks"] == pytest.approx(looks / 6) and row["first_look"] == pytest.approx(firsts / reached)
         for cohort, code in (("even", 0), ("odd", 1)):
-            (row,) = table(found.aois, cell="cohort", value=cohort, thing=name)
+            (row,) = table(found.aois, cell="cohort", value=cohort, aoi=name)
             mine = [s for p, s in enumerate(shares) if p % 2 == code]
-            assert row["share"] == pytest.approx(np.mean(mine)) and row["people"] == 3
+            assert row["share"] == pytest.approx(np.mean(mine)) and row["participants"] == 3
     assert {r["cell"] for r in found.differences} == {"cohort"}
     assert sum(r["moves"] for r in found.transitions if r["cell"] == "all") > 5
 
@@ -71,8 +71,8 @@ def test01_counts_are_those_of_a_loop(folder):
 def test02_what_could_be_seen_contains_what_was(folder):
     options = StatisticsOptions(aois=folder / "areas.json", aoi_visibility=True, cell_size=0.05, **FAST)
     found = statistics([folder / "bare" / "scene.xml", people()], options=options)
-    (sign,) = table(found.aois, cell="all", thing="the sign")
-    (stand,) = table(found.aois, cell="all", thing="the stand")
+    (sign,) = table(found.aois, cell="all", aoi="the sign")
+    (stand,) = table(found.aois, cell="all", aoi="the stand")
     assert 0.05 < sign["share"] < sign["visible"] < stand["visible"] < 1
     sums = found.sums
     assert (sums.dwell_time <= sums.visible_time + 1e-9).all()
@@ -94,7 +94,7 @@ def test03_windows_zones_and_cohorts_of_a_file(folder, tmp_path):
     )
     rays, recorder = people(), Recorder()
     found = statistics([folder / "bare" / "scene.xml", rays], options=options, reporter=recorder)
-    assert [text for text in recorder.messages if "nobody is in the window never" in text]
+    assert [text for text in recorder.messages if "no participants in the window never" in text]
     on = np.array([first_box(o, d)[0] == "sign" for o, d in zip(rays.origin, rays.direction)])
     masks = {
         ("window", "early"): rays.t < 8,
@@ -103,7 +103,7 @@ def test03_windows_zones_and_cohorts_of_a_file(folder, tmp_path):
         ("cohort", "x"): rays.person < 3,
     }
     for (cell, value), mask in masks.items():
-        (row,) = table(found.aois, cell=cell, value=value, thing="the sign")
+        (row,) = table(found.aois, cell=cell, value=value, aoi="the sign")
         mine = [on[mask & (rays.person == p)].mean() for p in np.unique(rays.person[mask])]
         assert row["share"] == pytest.approx(np.mean(mine)), (cell, value)
     assert {r["cell"] for r in found.differences} == {"window", "cohort"}
@@ -121,13 +121,13 @@ def test04_the_field_beside_the_rays_and_what_if(folder, tmp_path):
     found = statistics([folder / "scene.xml", folder / "rays.npz"], tmp_path / "out", options, recorder)
     # A shape as a thing is still the scene's, by its name.
     assert found.what_if
-    field = table(found.aois, cell="all", source="field")
-    assert len(field) == 3 and all(0 < r["share"] < 1 and r["looks"] is None for r in field)
+    field = table(found.aois, cell="all", source="predicted")
+    assert len(field) == 3 and all(0 < r["share"] < 1 and r["visits"] is None for r in field)
     assert field[2]["share"] == pytest.approx(field[0]["share"] + field[1]["share"], rel=0.02)
-    rows = {(r["thing"], r["measure"]): r for r in found.what_if}
+    rows = {(r["aoi"], r["measure"]): r for r in found.what_if}
     # The stand stood before the sign.
     sign = rows["the sign", "visible"]
-    assert sign["source"] == "field" and sign["after"] > sign["before"] and sign["people"] == 6
+    assert sign["source"] == "field" and sign["after"] > sign["before"] and sign["participants"] == 6
     assert rows["new", "share"]["before"] is None and rows["new", "share"]["after"] > 0
     assert rows["the sign", "share"]["after"] != rows["the sign", "share"]["before"]
     assert recorder.messages.count(f"of {folder / 'tile.obj'}: statements that are not used: usemtl") == 1
@@ -149,9 +149,9 @@ def test05_names_salts_and_a_floor(folder, tmp_path):
     (tmp_path / "salt").write_bytes(b"0123456789abcdef")
     keep = StatisticsOptions(aois=folder / "areas.json", salt=tmp_path / "salt", **FAST)
     one, two = (statistics(given, options=keep).participants for _ in range(2))
-    assert list(one) == list(two) and all(r["person"].startswith("p") and len(r["person"]) == 17 for r in one)
+    assert list(one) == list(two) and all(r["participant"].startswith("p") and len(r["participant"]) == 17 for r in one)
     named = StatisticsOptions(aois=folder / "areas.json", show_names=True, **FAST)
-    assert {r["person"] for r in statistics(given, options=named).participants} == {f"name {k}" for k in range(6)}
+    assert {r["participant"] for r in statistics(given, options=named).participants} == {f"name {k}" for k in range(6)}
     recorder = Recorder()
     floor = StatisticsOptions(aois=folder / "areas.json", min_participants=5, **FAST)
     found = statistics(given, None, floor, recorder)
@@ -166,7 +166,7 @@ def test06_one_person_has_no_interval_and_that_is_said(folder):
         [folder / "bare" / "scene.xml", one], None, StatisticsOptions(aois=folder / "areas.json", **FAST), recorder
     )
     assert found.aois[0]["share"] is not None and found.aois[0]["share_low"] is None
-    assert any("no intervals" in text and "fewer than 3 people" in text for text in recorder.messages)
+    assert any("no confidence intervals" in text and "fewer than 3 participants" in text for text in recorder.messages)
 
 
 def test07_without_a_place(folder):
@@ -178,7 +178,7 @@ def test07_without_a_place(folder):
     (folder / "tile.obj").write_text("usemtl red\nv 5.9 0 0\nv 5.9 1 0\nv 5.9 0 1\nf 1 2 3\n")
     rays = people()
     statistics([rays], None, options, recorder)
-    assert any("things hide each other" in text for text in recorder.messages)
+    assert any("AOIs occlude each other" in text for text in recorder.messages)
     assert recorder.messages.count(f"of {folder / 'tile.obj'}: statements that are not used: usemtl") == 1
     hit = np.array([o + first_box(o, d)[1] * d for o, d in zip(rays.origin, rays.direction)])
     recorder = Recorder()
@@ -197,14 +197,14 @@ def test08_isovists_and_nobody_at_all(folder, tmp_path):
     north = [r for r in found.isovists if r["x"] < 2 and r["y"] > 3]
     assert np.mean([r["sees the sign"] for r in west]) < np.mean([r["sees the sign"] for r in north])
     assert all(0 < r["area"] < 24.01 for r in found.isovists) and (tmp_path / "out" / "isovists.png").is_file()
-    with pytest.raises(NergError, match="nobody to tell of"):
+    with pytest.raises(NergError, match="there are no observers: give rays or a gaze"):
         statistics([folder / "bare" / "scene.xml"], options=StatisticsOptions(aois=folder / "areas.json", **FAST))
 
 
 def test09_observers_who_were_not_tracked(folder):
     options = StatisticsOptions(aois=folder / "areas.json", observers=("1,1.5,1.6", "1,3.5,1.6", "1,0.5,1.6"), **FAST)
     found = statistics([folder / "scene.xml"], options=options)
-    assert {r["source"] for r in found.aois} == {"field"} and found.aois[0]["people"] == 3
+    assert {r["source"] for r in found.aois} == {"predicted"} and found.aois[0]["participants"] == 3
 
 
 def test10_datasets_count_as_files_do(folder, tmp_path):
@@ -234,15 +234,15 @@ def test10_datasets_count_as_files_do(folder, tmp_path):
     [
         ([], {}, "give rays"),
         (["rays.npz", "rays.npz"], {}, "both a rays"),
-        (["rays.npz"], {"areas": None}, "--areas"),
+        (["rays.npz"], {"areas": None}, "--aois"),
         (["rays.npz"], {"windows": ("x",)}, "--window"),
         (["rays.npz"], {"windows": ("x=2,1",)}, "--window"),
         (["bare/scene.xml", "rays.npz"], {"what_if": "changes"}, "gaze field"),
         (["scene.xml"], {"observers": ("1,2",)}, "--observer"),
         (["rays.npz"], {}, 'no shape "stand"'),
-        (["rays.npz"], {"pause": 0.1}, "--pause"),
-        (["rays.npz", "areas.json"], {}, "--areas"),
-        (["scene.xml", "rays.npz"], {"what_if": "changes"}, "holds no changes"),
+        (["rays.npz"], {"pause": 0.1}, "must be at least --max-gap"),
+        (["rays.npz", "areas.json"], {}, "--aois"),
+        (["scene.xml", "rays.npz"], {"what_if": "changes"}, "is not one of move, remove, add, swap,"),
     ],
 )
 def test11_what_cannot_be_done_is_told(folder, given, options, said):

@@ -158,7 +158,7 @@ def test_what_was_found_is_written_with_its_picture(tmp_path):
 
 def test_bad_and_mirrored_fits_are_refused_unless_forced(tmp_path):
     _, path = pairs(tmp_path, noise=0.5)
-    with pytest.raises(NergError, match=r"the residual is \d+.* cm \(median\), beyond --max-residual 10"):
+    with pytest.raises(NergError, match=r"give other evidence, or a larger limit; or add"):
         align(None, tmp_path / "a.json", AlignOptions(pairs=path))
     assert not (tmp_path / "a.json").exists()
     assert align(None, tmp_path / "a.json", AlignOptions(pairs=path, force=True)).alignment.forced
@@ -170,16 +170,16 @@ def test_bad_and_mirrored_fits_are_refused_unless_forced(tmp_path):
 @pytest.mark.parametrize(
     "options, rays, why",
     [
-        ({}, None, "say what to align by"),
-        ({}, RAYS, "the place is missing"),
-        ({"cameras": "a"}, None, "give both"),
-        ({"pairs": "a", "twin": "b"}, None, "different evidence"),
-        ({"pairs": "a", "start": "b"}, None, "different evidence"),
+        ({}, None, "or add --pairs FILE, --tracking-surface FILE,"),
+        ({}, RAYS, "no scene is given: add --field FILE, --scene"),
+        ({"cameras": "a"}, None, "--tracking-cameras and --scene-cameras must be"),
+        ({"pairs": "a", "twin": "b"}, None, "are alternatives"),
+        ({"pairs": "a", "start": "b"}, None, "are alternatives"),
         ({"pairs": "PAIRS", "refine": True}, None, "--refine needs the tracking"),
-        ({"pairs": "PAIRS", "up": "north"}, None, "--up is numbers"),
-        ({"pairs": "PAIRS", "up": "0,0,0"}, None, "--up is an axis"),
+        ({"pairs": "PAIRS", "up": "north"}, None, "--up must be comma-separated numbers, got"),
+        ({"pairs": "PAIRS", "up": "0,0,0"}, None, "or three numbers x,y,z that are not all"),
         ({"pairs": "PAIRS", "scale": -1.0}, None, "--scale must lie in"),
-        ({"pairs": "PAIRS", "field": "a", "scene": "b"}, None, "the place is one"),
+        ({"pairs": "PAIRS", "field": "a", "scene": "b"}, None, "only one scene can be given: use --field or"),
     ],
 )
 def test_options_that_do_not_go_together_are_refused(tmp_path, options, rays, why):
@@ -229,6 +229,5 @@ def test_what_of_a_mesh_is_not_used_is_named(tmp_path, option):
         alignment._evidence(options, None, reporter)
     else:
         alignment._target(options, "tracking", reporter)
-    assert [m for m in reporter.messages if "mtllib" in m] == [
-        f"of {tmp_path / 'a.obj'}: statements that are not used: mtllib"
-    ]
+    (note,) = [m for m in reporter.messages if "mtllib" in m]
+    assert str(tmp_path / "a.obj") in note and note.endswith(": mtllib")

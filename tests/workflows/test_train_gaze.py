@@ -80,8 +80,8 @@ def test_a_job_returns_the_field_and_says_how_it_went(rays):
     assert heard.shares[-1] == 1 and heard.texts[0].startswith("placing probes") and "fit: step 3" in heard.texts
     assert heard.texts[-1] == "folds: step 2" and about["mix"]["folds"] == 1
     told = [m.split(";")[0].split(":")[0] for m in heard.messages]
-    assert told[:3] == [f"{about['probes_made']} probes", "3 steps", "held out in 1 fold"]
-    assert told[3] == f"regions of {100 * about['mix']['regions']['80%']:.0f} % of the field's gaze held 80 % of theirs"
+    assert told[:3] == [f"{about['probes_made']} probes", "3 steps", "cross-validation (1 fold)"]
+    assert told[3] == f"regions with {100 * about['mix']['regions']['80%']:.0f} % of the field's gaze contain 80 % of the held-out gaze"
 
 
 def test_folds_choose_the_variant_where_no_surfaces_are_known(rays):
@@ -93,8 +93,8 @@ def test_folds_choose_the_variant_where_no_surfaces_are_known(rays):
     assert mix["mix"] == result.field.config.mix
     order = [text.split(":")[0] for text in heard.texts if "fold" in text or "fit" in text]
     assert list(dict.fromkeys(order))[-1] == "fit" and order[0].startswith("fold 1 of capture")
-    assert heard.messages[0].startswith("no surfaces are known: folds choose")
-    assert any(m.endswith(f"{mix['variant']} is trained") for m in heard.messages)
+    assert heard.messages[0].startswith("there is no geometry: cross-validation chooses")
+    assert any(m.endswith(f"the variant {mix['variant']} is trained") for m in heard.messages)
     # Without folds nothing chooses.
     heard = Listener()
     result = train_gaze(rays, options=replace(QUICK, mix_folds=0), reporter=heard)
@@ -110,7 +110,7 @@ def test_a_job_writes_what_the_command_writes(rays, tmp_path, capsys):
     code, said, _ = nerg(
         capsys, tmp_path / "rays.npz", "-o", tmp_path / "command" / "gaze.safetensors", *line.split(), "--threads", 1
     )
-    assert code == 0 and "meet no surface" in said and "gaze.vol: " in said and "MB)" in said
+    assert code == 0 and "hit no surface" in said and "gaze.vol: " in said and "MB)" in said
     fields, provenance = [], []
     for name in ("job", "command"):
         assert {p.name for p in (tmp_path / name).iterdir()} == {"gaze.safetensors", "gaze.vol"}
@@ -175,7 +175,7 @@ def test_one_more_recipe_trains_by_the_job_and_by_the_command(rays, tmp_path, mo
     assert code == 0, said
     field, meta = load_gaze(out, ns)
     assert field.config.escaped == "nearest" and len(meta["provenance"]["test"]["centres"]) == 4
-    with pytest.raises(NergError, match="coarse has no choice of --loss.*add --recipe small"):
+    with pytest.raises(NergError, match="the recipe coarse does not support --loss; add"):
         check_plan(GazeOptions(geometry="none", recipe="coarse", loss="paper"))
     test = {"zones": 1, "positions": 4, "min_rays": 8, "radius": 0.5, "cameras": 0}
     options = AblationOptions(geometry="none", recipes="coarse", variant=("emit",), seeds=2, **test)
@@ -190,7 +190,7 @@ def test_positions_and_people_are_held_out_and_told(tmp_path):
     result = train_gaze(RAYS, options=replace(options, min_rays=8), reporter=heard)
     test = result.provenance["test"]
     assert result.provenance["rays"] == test["rays_to_train"] < test["rays"] == len(RAYS) and len(test["people"]) == 1
-    assert heard.messages[0] == f"6 test positions held out, {test['rays_to_train']:,} of {test['rays']:,} rays left"
+    assert heard.messages[0] == f"6 test positions held out, {test['rays_to_train']:,} of {test['rays']:,} rays remain for training"
 
 
 def test_an_interrupted_job_returns_what_there_is_or_says_how_to_go_on(rays, tmp_path):
@@ -199,7 +199,7 @@ def test_an_interrupted_job_returns_what_there_is_or_says_how_to_go_on(rays, tmp
     result = train_gaze(rays, options=options, reporter=Listener(0.5))
     assert result.interrupted and result.provenance["steps"] == 4
     out = tmp_path / "gaze.safetensors"
-    with pytest.raises(KeyboardInterrupt, match="go on with --resume"):
+    with pytest.raises(KeyboardInterrupt, match="interrupted; continue with --resume"):
         train_gaze(rays, out, options, Listener(0.5))
     assert {p.name for p in tmp_path.iterdir()} == {"gaze.safetensors", "gaze.run"}
     assert load_gaze(out, ns)[1]["provenance"]["interrupted"]
@@ -220,7 +220,7 @@ def test_the_command_goes_on(tmp_path, monkeypatch, capsys):
     line = [tmp_path / "rays.npz", "-o", out, *"--geometry none --radius 0.5 --probes 6 --steps 8".split()]
     line += "--directions 64 --zones 0 --fresh-directions".split()
     code, _, said = nerg(capsys, *line, "--resume")
-    assert code == 1 and "nothing to resume" in said
+    assert code == 1 and "there is no state to resume" in said
     step = GazeTrainer.step
 
     def interrupted(trainer):
@@ -233,7 +233,7 @@ def test_the_command_goes_on(tmp_path, monkeypatch, capsys):
     with monkeypatch.context() as change:
         change.setattr(GazeTrainer, "step", interrupted)
         code, _, said = nerg(capsys, *line)
-    assert code == 130 and "go on with --resume" in said and out.is_file() and out.with_suffix(".run").is_file()
+    assert code == 130 and "interrupted; continue with --resume" in said and out.is_file() and out.with_suffix(".run").is_file()
     code, _, said = nerg(capsys, *line, "--resume")
     about = load_gaze(out, ns)[1]["provenance"]
     assert about["steps"] == 8 and not about["interrupted"] and about["probes"]["fresh"]
@@ -250,18 +250,18 @@ def test_an_ensemble_is_one_option(tmp_path):
     field, meta = load_gaze(out, ns)
     about = meta["provenance"]["ensemble"]
     assert len(field.members) == 2 and about["members"] == 2 and len(about["validation"]) == 2
-    assert any("held-out positions" in m for m in heard.messages)
+    assert any(m.startswith("validation:") for m in heard.messages)
     assert field.support.cells[:, 3].sum() == 1200 and [p.name for p in tmp_path.iterdir()] == ["gaze.safetensors"]
 
 
 def test_a_place_of_hits_needs_a_file(rays):
-    with pytest.raises(NergError, match="need a file"):
+    with pytest.raises(NergError, match="--resume and --geometry hits need an output"):
         train_gaze(rays, options=replace(QUICK, geometry="hits"))
 
 
 @pytest.mark.parametrize("train", [train_gaze, train_radiance])
 def test_an_output_is_trained_once_at_a_time(tmp_path, train):
-    with reserve_output(tmp_path / "a.safetensors"), pytest.raises(NergError, match="made by another process"):
+    with reserve_output(tmp_path / "a.safetensors"), pytest.raises(NergError, match="wait until it has finished, or choose another"):
         train(tmp_path / "nothing", tmp_path / "a.safetensors")
 
 
@@ -280,29 +280,29 @@ SCENE = TrainingGeometry(None, BOX, "scene")
         (GazeOptions(), False, "--field FILE.*--scene FILE.*--geometry"),
         (replace(HITS, scene=Path("a.xml")), False, "one of --field FILE"),
         (GazeOptions(geometry="hit"), False, '"hits".*"none".*"hit"'),
-        (GazeOptions(geometry="none"), True, "say what to learn from"),
-        (replace(VIEWS, geometry="hits"), True, "--geometry.*--align.*--semantic.*--mix-folds"),
-        (replace(VIEWS, mix_kappa=20.0), True, "--mix-kappa"),
-        (replace(VIEWS, mix_folds=2), True, "--mix-folds.*--mix-kappa"),
-        (replace(VIEWS, test_zones=1), True, "belong to rays"),
-        (replace(VIEWS, salience=None), False, "salience needs both"),
-        (replace(HITS, align_views=Path("a.json")), False, "salience needs both"),
+        (GazeOptions(geometry="none"), True, "there is no training data: give a rays file, or"),
+        (replace(VIEWS, geometry="hits"), True, "--test-zones, --geometry hits, --align,"),
+        (replace(VIEWS, mix_kappa=20.0), True, "--test-zones, --geometry hits, --align,"),
+        (replace(VIEWS, mix_folds=2), True, "--test-zones, --geometry hits, --align,"),
+        (replace(VIEWS, test_zones=1), True, "--test-zones, --geometry hits, --align,"),
+        (replace(VIEWS, salience=None), False, "saliency maps, or spectral-residual"),
+        (replace(HITS, align_views=Path("a.json")), False, "saliency maps, or spectral-residual"),
         (replace(HITS, align=Path("a.json")), False, "--align.*--field.*--scene"),
-        (replace(HITS, test_participants=0.5), False, "say where, with --test-zones"),
+        (replace(HITS, test_participants=0.5), False, "--test-participants needs test positions: add"),
         (replace(FIELD, init="nerf"), False, '"random".*"field"'),
         (replace(FIELD, freeze=True), False, "--freeze"),
-        (replace(HITS, recipe="small", init="field"), False, "--begin"),
+        (replace(HITS, recipe="small", init="field"), False, "--init field needs a radiance field: add --field"),
         (replace(HITS, recipe="small", semantic="snapshot"), False, "--semantic"),
         (replace(HITS, loss="paper"), False, "add --recipe small"),
-        (replace(HITS, integral=1.0), False, "no choice of --integral"),
-        (replace(HITS, recipe="small", mix_kappa=20.0), False, "--mix-kappa.*--recipe"),
-        (replace(HITS, recipe="small", mix_folds=2), False, "--mix-folds.*--recipe"),
-        (replace(HITS, mix_kappa=2000.0), False, "concentration of 2000 vanish; let it be at most 1660"),
-        (replace(HITS, activation="exp"), False, "no choice of --activation"),
+        (replace(HITS, integral=1.0), False, "the recipe default does not support"),
+        (replace(HITS, recipe="small", mix_kappa=20.0), False, "the recipe small does not support"),
+        (replace(HITS, recipe="small", mix_folds=2), False, "the recipe small does not support"),
+        (replace(HITS, mix_kappa=2000.0), False, "the position-independent prior is stored in a"),
+        (replace(HITS, activation="exp"), False, "the recipe default does not support"),
         (replace(FIELD, loss="likelihood"), False, '"likelihood"'),
         (replace(HITS, recipe="large"), False, "one of default, small, paper"),
         (replace(HITS, variant="both"), False, "--variant.*--activation"),
-        (replace(FIELD, semantic="glance"), False, "--semantic.*--variant.*--begin"),
+        (replace(FIELD, semantic="glance"), False, "of a gaze field must be one of accumulated,"),
         (GazeOptions(geometry="none", recipe="small"), False, "needs surfaces"),
     ],
 )
@@ -317,10 +317,12 @@ def test_what_goes_together_is_not_refused(options, alone):
 
 
 def test_every_option_of_settings_and_probes_arrives():
-    given = {"steps": 7, "seed": 3, "loss": "code", "zones": 1, "refit": False, "learning_rate": 0.5, "integral": 2.0}
-    given |= {"weight_decay": 0.25, "radius": 0.4, "probes": 9, "placement": "grid", "cap": 32, "min_rays": 4}
-    given |= {"kappa_rule": "silverman", "kappa": 11.0, "weights": "person", "directions": 33, "fresh": True}
-    of_field = {"variant": "emit", "activation": "exp", "size": "paper", "normalized": True}
+    given = {"steps": 7, "seed": 3, "loss": "code", "validation_zones": 1, "refit": False, "learning_rate": 0.5}
+    given |= {"integral_weight": 2.0}
+    given |= {"weight_decay": 0.25, "radius": 0.4, "probes": 9, "placement": "grid", "max_rays": 32, "min_rays": 4}
+    given |= {"kappa_rule": "silverman", "kappa": 11.0, "ray_weights": "person", "directions": 33}
+    given |= {"resample_directions": True}
+    of_field = {"variant": "emit", "activation": "exp", "size": "paper", "normalize": True}
     plan = plan_gaze(GazeOptions(scene=Path("a.xml"), recipe="small", **given, **of_field), SCENE)
     names = {}
     for settings in (plan.settings, plan.probes):

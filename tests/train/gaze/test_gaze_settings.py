@@ -231,10 +231,10 @@ def test_unsupported_options_are_refused(name, takes):
     recipe = get_recipe(name)
     recipe.check_options([])
     if takes:
-        recipe.check_options(["loss", "semantic", "begin"])
+        recipe.check_options(["loss", "semantic", "init"])
         return
     with pytest.raises(NergError, match="does not support --loss, --init field; add --recipe small"):
-        recipe.check_options(["loss", "begin"])
+        recipe.check_options(["loss", "init"])
 
 
 def test_features_and_weights_are_those_of_a_radiance_field():

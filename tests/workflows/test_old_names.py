@@ -1,0 +1,73 @@
+"""Old names of options: accepted on the command line and as keywords, and shown nowhere."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import pytest
+
+import nerg_mi as nerg
+from nerg_mi.cli.building import build_command
+from nerg_mi.errors import NergError
+from nerg_mi.workflows.base import COMMANDS, Command
+from nerg_mi.workflows.gaze_commands import AblationOptions, FoldOptions, GazeOptions
+from nerg_mi.workflows.old_names import ALL, OLD_NAMES, renamed_options
+from tools.command_pages import iter_commands
+
+PARSERS = {path.removeprefix("nerg "): command for path, command, _ in iter_commands()}
+
+
+def spellings(command):
+    return {name for p in PARSERS[command].params for name in (*p.opts, *p.secondary_opts)}
+
+
+def test_each_row_names_an_option_of_its_command():
+    assert {name for name in OLD_NAMES if name != ALL} <= PARSERS.keys()
+    for command, old, new in renamed_options(PARSERS):
+        where = PARSERS if command == ALL else (command,)
+        if new.startswith("--"):
+            assert any(new in spellings(name) for name in where), (command, new)
+            assert command == ALL or old not in spellings(command), (command, old)
+        else:
+            assert new in {f.name for f in fields(COMMANDS[command].options)}, (command, new)
+
+
+def run(kind, name, *line):
+    made = []
+    command = Command(name, lambda options, reporter: made.append(options), "", "", kind, (), None, {})
+    build_command(command).main(list(line), standalone_mode=False)
+    return made[0]
+
+
+def test_old_spellings_are_accepted_on_the_command_line():
+    line = "--cap 7 --weights=person --no-fresh-directions --zones 2 --variant emit --resume"
+    made = run(GazeOptions, "train gaze", *line.split())
+    assert (made.max_rays, made.ray_weights, made.resample_directions) == (7, "person", False)
+    assert (made.validation_zones, made.variant, made.resume) == (2, "emit", True)
+
+
+def test_a_value_that_looks_like_an_old_spelling_stays_as_it_is():
+    assert run(AblationOptions, "ablate", "--recipes", "--cap", "--size", "8x8").recipes == "--cap"
+
+
+def test_old_names_are_not_shown():
+    for name, parser in PARSERS.items():
+        with parser.make_context(name, [], resilient_parsing=True) as context:
+            words = parser.get_help(context).replace(",", " ").split()
+        assert not {old for _, old, _ in renamed_options([name])} & set(words) - spellings(name), name
+
+
+def test_old_keywords_are_accepted_in_python():
+    made = GazeOptions(cap=7, mix_folds=2, fresh=True)
+    assert (made.max_rays, made.prior_folds, made.resample_directions) == (7, 2, True)
+    assert replace(made, cap=8).max_rays == 8
+    assert FoldOptions(cap=3).max_rays == 3
+    with pytest.raises(TypeError):
+        GazeOptions(size_of_cap=1)
+
+
+def test_functions_of_the_library_accept_old_keywords(rgb, tmp_path):
+    with pytest.raises(NergError, match='no option "caps"'):
+        nerg.train_gaze(tmp_path / "none.npz", caps=1)
+    with pytest.raises(NergError, match="none.npz"):
+        nerg.train_gaze(tmp_path / "none.npz", cap=1, weights="person", geometry="none")
