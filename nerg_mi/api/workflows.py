@@ -57,7 +57,8 @@ def align(
         Receives the progress.
     **overrides
         Single options on top of ``options``: the environment (``field``, ``scene``, ``surface``), the evidence
-        (``pairs``, ``twin``, ``cameras`` with ``place_cameras``; by default the recordings alone), and known parts
+        (``pairs``, ``tracking_surface``, ``tracking_cameras`` with
+        ``scene_cameras``; by default the recordings alone), and known parts
         (``up``, ``scale``, ...).
 
     Returns
@@ -130,7 +131,7 @@ def bake(
     >>> import nerg_mi as nerg
     >>> from importlib.resources import files
     >>> store = files("nerg_mi.scenes.store")
-    >>> baked = nerg.bake(store / "twin.ply", gaze=store / "shoppers.safetensors", observer=(4.4, 2.8, 1.6), detail=1.0)
+    >>> baked = nerg.bake(store / "twin.ply", gaze=store / "shoppers.safetensors", observer=(4.4, 2.8, 1.6), max_edge=1.0)
     >>> 0.9 < baked.on_surface < 1, abs(baked.unaccounted) < 0.01
     (True, True)
     """
@@ -238,7 +239,7 @@ def evaluate_gaze(
     Examples
     --------
     >>> import nerg_mi as nerg
-    >>> held_out = {"test_zones": 1, "test_positions": 4, "geometry": "none", "zones": 0}
+    >>> held_out = {"test_zones": 1, "test_positions": 4, "geometry": "none", "validation_zones": 0}
     >>> small = {"steps": 2, "probes": 8, "directions": 64}
     >>> gaze = nerg.train_gaze(rays, **held_out, **small)
     >>> scores = nerg.evaluate_gaze(gaze, rays, directions=64, resamples=2, min_rays=8)
@@ -290,8 +291,8 @@ def ablate(
     Examples
     --------
     >>> import nerg_mi as nerg
-    >>> small = {"recipes": "default", "variant": ("emit",), "seeds": 1, "default_steps": 2, "probes": 8, "cameras": 0}
-    >>> test = {"zones": 1, "positions": 4, "min_rays": 8}
+    >>> small = {"recipes": "default", "variant": ("emit",), "seeds": 1, "default_steps": 2, "probes": 8, "timing_cameras": 0}
+    >>> test = {"test_zones": 1, "test_positions": 4, "min_rays": 8}
     >>> result = nerg.ablate(rays, folder / "ablation", geometry="none", **small, **test)
     >>> [row["variant"] for row in result.rows]
     ['emit']
@@ -395,15 +396,15 @@ def stats(
     >>> _ = (folder / "areas.json").write_text(json.dumps({"shelf": [[2, -1, 0], [3, 1, 2]]}))
     >>> eye, ahead = [[0.0, 0.0, 1.6]] * 3, [[1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
     >>> rays = nerg.Rays([0.0, 0.2, 0.4], [0, 0, 0], ("Ada",), origin=eye, direction=ahead, confidence=[1.0] * 3)
-    >>> row = nerg.stats(rays, folder / "areas.json").things[0]
-    >>> row["thing"], round(row["share"], 3), row["reach"], row["distance"]
+    >>> row = nerg.stats(rays, folder / "areas.json").aois[0]
+    >>> row["aoi"], round(row["share"], 3), row["hit_ratio"], row["distance"]
     ('shelf', 0.667, 1.0, 2.0)
     """
     from nerg_mi.workflows.statistics import statistics
 
     inputs = [files] if isinstance(files, (str, os.PathLike, Rays)) else list(files)
     if areas is not None:
-        options["areas"] = areas
+        options["aois"] = areas
     resolved = build_options(StatisticsOptions, "stats", None, options)
     paths = [f if isinstance(f, Rays) else resolve_file(f, "files") for f in inputs]
     return statistics(paths, None if output is None else Path(output), resolved, reporter)
@@ -583,7 +584,7 @@ def train_gaze(
     Examples
     --------
     >>> import nerg_mi as nerg
-    >>> gaze = nerg.train_gaze(rays, geometry="none", steps=2, zones=0, probes=8, directions=64)
+    >>> gaze = nerg.train_gaze(rays, geometry="none", steps=2, validation_zones=0, probes=8, directions=64)
     >>> gaze.kind, gaze.provenance["steps"]
     ('gaze', 2)
     """
