@@ -33,6 +33,12 @@ nb_execution_mode = "off"
 highlight_language = "none"
 default_role = "literal"
 
+# Types in docstrings are prose ("path, optional") and no names to be linked.
+napoleon_google_docstring = False
+napoleon_use_param = False
+napoleon_use_rtype = False
+napoleon_use_ivar = True
+
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
 autodoc_typehints_format = "short"
