@@ -290,16 +290,18 @@ class Twin:
 
     def fit(self, target: AlignmentTarget, progress: ProgressCallback) -> AlignmentFit:
         """Find the best placement. Raises `NergError` for too few points."""
-        twin, place = _downsample_evenly(self.points, self.source), target.surface
+        twin, surface = _downsample_evenly(self.points, self.source), target.surface
         placements: dict[bool, list[_Placement]] = {}
         for flip in (False, True):
             progress(0.1 + 0.4 * flip, "placing the mirrored twin" if flip else "placing the twin")
-            placements[flip] = _find_placements(transform_points(MIRROR, twin) if flip else twin, place, target)
+            placements[flip] = _find_placements(transform_points(MIRROR, twin) if flip else twin, surface, target)
         best = placements[False][0]
         scale = similarity_scale(best.matrix)
-        x, y, is_forward = _closest_pairs(twin, place.points, KDTree(place.points), KDTree(twin), best.matrix, _OVERLAP)
+        x, y, is_forward = _closest_pairs(
+            twin, surface.points, KDTree(surface.points), KDTree(twin), best.matrix, _OVERLAP
+        )
         basis = upright_basis(False) if target.is_upright else FULL_BASIS
-        distance = _query_tree(KDTree(place.points), transform_points(best.matrix, twin))[0] / scale
+        distance = _query_tree(KDTree(surface.points), transform_points(best.matrix, twin))[0] / scale
         residuals = np.sort(distance)[: int(_OVERLAP * len(distance))]
         notes = [
             f"{len(twin):,} points of the twin; {_OVERLAP:.0%} are within {100 * residuals[-1]:.2g} cm",
@@ -325,7 +327,7 @@ class Twin:
             None,
             metadata,
             notes,
-            _warn_rivals(placements[False], place.diagonal),
+            _warn_rivals(placements[False], surface.diagonal),
         )
 
 
@@ -347,39 +349,39 @@ def _downsample_evenly(points: np.ndarray, source: str) -> np.ndarray:
     return downsample(points, float(size) / 250)
 
 
-def _find_placements(twin: np.ndarray, place: SceneSurface, target: AlignmentTarget) -> list[_Placement]:
+def _find_placements(twin: np.ndarray, surface: SceneSurface, target: AlignmentTarget) -> list[_Placement]:
     """Return the best placements of the points ``twin``, best first."""
     twin_distance = surface_from_points(twin, 1 << 19).distance
     rng = np.random.default_rng(0)
     draw = lambda p, n: p[rng.permutation(len(p))[:n]]
-    x, y = draw(twin, _COARSE_POINTS), draw(place.points, _COARSE_POINTS)
-    x0, y0 = twin.mean(axis=0), place.points.mean(axis=0)
+    x, y = draw(twin, _COARSE_POINTS), draw(surface.points, _COARSE_POINTS)
+    x0, y0 = twin.mean(axis=0), surface.points.mean(axis=0)
     spread = lambda p, p0: float(np.sqrt(np.mean(np.sum((p - p0) ** 2, axis=1))))
-    ratio = spread(place.points, y0) / spread(twin, x0)
+    ratio = spread(surface.points, y0) / spread(twin, x0)
     scales = ratio * _SCALES if target.scale is None else np.array([target.scale])
-    width = 0.06 * place.diagonal
+    width = 0.06 * surface.diagonal
     starts = []
     for turn in _candidate_rotations(target.is_upright):
         # All scales at once.
         moved = scales[:, None, None] * ((x - x0) @ turn.T) + y0
         back = ((y - y0) @ turn) / scales[:, None, None] + x0
-        forward = place.distance.interpolate(moved.reshape(-1, 3)).reshape(len(scales), -1)
+        forward = surface.distance.interpolate(moved.reshape(-1, 3)).reshape(len(scales), -1)
         backward = twin_distance.interpolate(back.reshape(-1, 3)).reshape(len(scales), -1) * scales[:, None]
         score = np.exp(-0.5 * (forward / width) ** 2).mean(axis=1) + np.exp(-0.5 * (backward / width) ** 2).mean(axis=1)
         starts += [(n, s, turn) for n, s in zip(score.tolist(), scales)]
     starts.sort(key=lambda g: -g[0])
     placements = []
-    x, y = draw(twin, 500), draw(place.points, 500)
+    x, y = draw(twin, 500), draw(surface.points, 500)
     for _, s, turn in starts[:_NUM_STARTS]:
         matrix = np.eye(4)
         matrix[:3, :3] = s * turn
         matrix[:3, 3] = y0 - s * turn @ x0
         placements.append(_icp(x, y, matrix, target, 15))
     placements.sort(key=lambda f: f.cost / similarity_scale(f.matrix))
-    x, y = draw(twin, _FINE_POINTS), draw(place.points, 2 * _FINE_POINTS)
+    x, y = draw(twin, _FINE_POINTS), draw(surface.points, 2 * _FINE_POINTS)
     final = [
-        _refine_placement(x, y, f.matrix, place, twin_distance, target)
-        for f in _distinct_placements(placements, place.diagonal)[:_NUM_FINAL]
+        _refine_placement(x, y, f.matrix, surface, twin_distance, target)
+        for f in _distinct_placements(placements, surface.diagonal)[:_NUM_FINAL]
     ]
     return sorted(final, key=lambda f: f.cost / similarity_scale(f.matrix))
 
@@ -406,22 +408,22 @@ def _icp(x: np.ndarray, y: np.ndarray, matrix: np.ndarray, target: AlignmentTarg
 
 
 def _refine_placement(
-    x: np.ndarray, y: np.ndarray, matrix: np.ndarray, place: SceneSurface, twin: DistanceGrid, target: AlignmentTarget
+    x: np.ndarray, y: np.ndarray, matrix: np.ndarray, surface: SceneSurface, twin: DistanceGrid, target: AlignmentTarget
 ) -> _Placement:
     """Refine a placement by closest points, then on the distance field, whose gradient converges faster along surfaces.
 
     The cost is the mean distance in both directions, with large distances clipped.
     """
     matrix = _icp(x, y, matrix, target, 8).matrix
-    near_distance = _NEAR_FRACTION * place.diagonal / similarity_scale(matrix)
+    near_distance = _NEAR_FRACTION * surface.diagonal / similarity_scale(matrix)
     basis = upright_basis(False) if target.is_upright else FULL_BASIS
     basis = basis if target.scale is None else basis[:, :-1]
     center, index = transform_points(matrix, x).mean(axis=0), np.arange(len(x))
-    on_surface = ZeroDistance(place.distance, x, index, "points of the twin on surfaces", near_distance)
+    on_surface = ZeroDistance(surface.distance, x, index, "points of the twin on surfaces", near_distance)
     for factor in (3.0, 1.0):
         matrix = refine([on_surface], matrix, center, basis, factor, 30).matrix
-    s, max_distance = similarity_scale(matrix), _FAR_FRACTION * place.diagonal
-    forward = np.minimum(place.distance.interpolate(transform_points(matrix, x)), max_distance)
+    s, max_distance = similarity_scale(matrix), _FAR_FRACTION * surface.diagonal
+    forward = np.minimum(surface.distance.interpolate(transform_points(matrix, x)), max_distance)
     backward = np.minimum(twin.interpolate(transform_points(np.linalg.inv(matrix), y)) * s, max_distance)
     return _Placement(matrix, float(0.5 * (forward.mean() + backward.mean())))
 

@@ -348,7 +348,7 @@ class Tracking:
         solid_depth = surface.free_space_distance.interpolate(transform_points(best.matrix, sample.heads)) / scale
         metadata = {
             "rays": len(self.rays),
-            "looked_at": len(sample.heads),
+            "sampled_rays": len(sample.heads),
             "hits": len(sample.hits),
             "cost": best.cost,
             "heads_in_solids": float((solid_depth > 0.1).mean()),

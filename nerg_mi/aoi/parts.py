@@ -169,7 +169,7 @@ _ARRAYS = tuple(f.name for f in fields(VisitSums) if f.name not in ("areas", "ce
 VIEWPOINTS_PER_PART = 32  # number of viewpoints per part of a prediction
 _PROGRESS_COUNTED = 0.6  # progress after the count, if a prediction follows
 _PROGRESS_PREDICTED = 0.8
-_PROGRESS_INTERVALS, _PROGRESS_WHAT_IF = 0.9, 0.99  # when intervals are known, and after changes
+_PROGRESS_INTERVALS, _PROGRESS_WHAT_IF = 0.9, 0.99  # progress after intervals and after the what-if analysis
 
 
 @dataclass(frozen=True)
@@ -255,7 +255,7 @@ class PartitionedStatistics:
             )
             parts.append(Part(poses, f"viewpoints {a + 1} to {a + len(poses.positions)}"))
         plan = self._plan(job_name, predict_part, PlannedPrediction(setting, fov), parts)
-        predictions = [read_prediction(made.path) for made in self.parts.run(plan, start, end)]
+        predictions = [read_prediction(output.path) for output in self.parts.run(plan, start, end)]
         arrays = {name: np.concatenate([getattr(f, name) for f in predictions]) for name in VIEWPOINT_ARRAYS}
         return PredictedAttention(**arrays, members=np.concatenate([f.members for f in predictions], axis=1))
 

@@ -131,14 +131,14 @@ class GazeScene:
     def query_from(self, observer: np.ndarray) -> DirectionQuery:
         """Return the `DirectionQuery` of an observer at a position (3,), as `gaze_shares` needs it."""
         assert self.gaze is not None
-        place = self.geometry if self.geometry is not None else SceneGeometry(None)
+        geometry = self.geometry if self.geometry is not None else SceneGeometry(None)
         settings = self.settings or ObserverSettings(
-            march=default_march_settings(place), depth=self.depth_kind, surface_opacity=SURFACE_OPACITY
+            march=default_march_settings(geometry), depth=self.depth_kind, surface_opacity=SURFACE_OPACITY
         )
-        look = make_gaze_evaluator(self.gaze, place, settings, observer)
+        query = make_gaze_evaluator(self.gaze, geometry, settings, observer)
         if self.geometry is not None:
-            return look
-        return lambda directions: (look(directions)[0], None)
+            return query
+        return lambda directions: (query(directions)[0], None)
 
     def support_at(self, observer: np.ndarray) -> float:
         """Return the number of training samples around a position (3,); NaN if the field does not contain it."""
@@ -407,11 +407,11 @@ def read_changes(path: str | Path) -> Changes:
         lists = {key: _get_list(data, key) for key in _CHANGE_KEYS[:5]}
         observers = lists["observers"]
         return Changes(
-            tuple(_parse_move(one) for one in lists["move"]),
-            tuple(_parse_name(one, "remove") for one in lists["remove"]),
-            tuple(_parse_new_shape(one, "name", path) for one in lists["add"]),
-            tuple(_parse_new_shape(one, "shape", path) for one in lists["swap"]),
-            np.array([_parse_vector(one, "observers") for one in observers]) if observers else None,
+            tuple(_parse_move(entry) for entry in lists["move"]),
+            tuple(_parse_name(entry, "remove") for entry in lists["remove"]),
+            tuple(_parse_new_shape(entry, "name", path) for entry in lists["add"]),
+            tuple(_parse_new_shape(entry, "shape", path) for entry in lists["swap"]),
+            np.array([_parse_vector(entry, "observers") for entry in observers]) if observers else None,
             np.array(_parse_vector(data["shift"], "shift")) if "shift" in data else None,
         )
     except NergError as error:

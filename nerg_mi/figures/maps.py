@@ -67,20 +67,20 @@ def alignment_figure(
 
 
 def _draw_points(
-    axes, points: np.ndarray | None, at: tuple[int, int], color: str, size: float, name: str, mark="."
+    axes, points: np.ndarray | None, axis_pair: tuple[int, int], color: str, size: float, name: str, mark="."
 ) -> None:
     if points is None or not len(points):
         return
     subset = points[np.random.default_rng(0).permutation(len(points))[:_MAX_POINTS]]
     edge = 0 if mark == "." else 1
-    x, y = subset[:, at].T
+    x, y = subset[:, axis_pair].T
     axes.scatter(x, y, s=size, c=color, marker=mark, linewidths=edge, label=name, rasterized=True)
 
 
-def _set_limits(axes, parts: Sequence[np.ndarray], at: tuple[int, int]) -> None:
+def _set_limits(axes, parts: Sequence[np.ndarray], axis_pair: tuple[int, int]) -> None:
     """Set limits of equal scale that contain all parts except outliers."""
-    low = np.min([np.percentile(p[:, at], 1, axis=0) for p in parts], axis=0)
-    high = np.max([np.percentile(p[:, at], 99, axis=0) for p in parts], axis=0)
+    low = np.min([np.percentile(p[:, axis_pair], 1, axis=0) for p in parts], axis=0)
+    high = np.max([np.percentile(p[:, axis_pair], 99, axis=0) for p in parts], axis=0)
     edge = 0.06 * max(float(np.max(high - low)), 1e-9)
     axes.set_xlim(low[0] - edge, high[0] + edge)
     axes.set_ylim(low[1] - edge, high[1] + edge)
@@ -113,8 +113,8 @@ def camera_figure(to_world: np.ndarray, points: np.ndarray, colors: np.ndarray, 
     near = np.all((points >= low) & (points <= high), axis=1)
     points, colors = points[near], colors[near]
     if len(points) > _MAX_CAMERA_POINTS:
-        some = np.random.default_rng(0).choice(len(points), _MAX_CAMERA_POINTS, replace=False)
-        points, colors = points[some], colors[some]
+        subset = np.random.default_rng(0).choice(len(points), _MAX_CAMERA_POINTS, replace=False)
+        points, colors = points[subset], colors[subset]
     for axes, (a, b), name in zip(figure.subplots(1, 2), ((0, 1), (0, 2)), ("from above", "from the side")):
         axes.scatter(points[:, a], points[:, b], s=1.5, c=colors / 255.0, linewidths=0, rasterized=True)
         axes.plot(centers[:, a], centers[:, b], color=_PATH, linewidth=0.6)
@@ -472,15 +472,15 @@ def _describe_rays(rays, test=None) -> str:
 
 def _draw_arrows(axes, rays, low, high) -> None:
     step = float((high - low).max()) / 24
-    at = np.floor((rays.origin[:, :2] - low) / step).astype(int)
+    cell_index = np.floor((rays.origin[:, :2] - low) / step).astype(int)
     width = int(np.ceil((high - low)[0] / step)) + 1
-    _, cell, count = np.unique(at[:, 1] * width + at[:, 0], return_inverse=True, return_counts=True)
+    _, cell, count = np.unique(cell_index[:, 1] * width + cell_index[:, 0], return_inverse=True, return_counts=True)
     mean = lambda v: np.stack([np.bincount(cell, weights=c) for c in v.T], axis=1) / count[:, None]
-    place, level = mean(rays.origin[:, :2]), mean(rays.direction[:, :2])
+    mean_position, level = mean(rays.origin[:, :2]), mean(rays.direction[:, :2])
     is_sufficient = count >= max(20, len(rays) * 1e-4)
-    place, level = place[is_sufficient], level[is_sufficient]
+    mean_position, level = mean_position[is_sufficient], level[is_sufficient]
     axes.quiver(
-        *place.T,
+        *mean_position.T,
         *(level.T * step),
         angles="xy",
         scale_units="xy",
@@ -506,16 +506,18 @@ def _draw_dimensions(axes, low, high) -> None:
     y, x = y0 + 0.045 * (y1 - y0), x1 - 0.045 * (x1 - x0)
     axes.annotate("", (low[0], y), (high[0], y), **line)
     axes.annotate("", (x, low[1]), (x, high[1]), **line)
-    text = dict(fontsize=7, color=INK, ha="center", va="center", bbox=dict(facecolor=PAPER, edgecolor="none", pad=1))
-    axes.text(0.5 * (low[0] + high[0]), y, f"{high[0] - low[0]:.2f} m", **text)
-    axes.text(x, 0.5 * (low[1] + high[1]), f"{high[1] - low[1]:.2f} m", rotation=90, **text)
+    label_style = dict(
+        fontsize=7, color=INK, ha="center", va="center", bbox=dict(facecolor=PAPER, edgecolor="none", pad=1)
+    )
+    axes.text(0.5 * (low[0] + high[0]), y, f"{high[0] - low[0]:.2f} m", **label_style)
+    axes.text(x, 0.5 * (low[1] + high[1]), f"{high[1] - low[1]:.2f} m", rotation=90, **label_style)
 
 
 def _new_plan(low, high, title: str, bar: bool = False, pad: float = 0.0):
     """Create a figure with axes in metres of equal scale; ``bar`` adds axes for a colour bar."""
     # Margin for the dimension lines.
-    room = pad * (high - low).max()
-    low, high = low - (0, room), high + (room, 0)
+    margin = pad * (high - low).max()
+    low, high = low - (0, margin), high + (margin, 0)
     size = np.maximum((high - low) / (high - low).max() * _PLAN_SIDE, 160)
     left, foot, head, right = 48, 40, 46, 96 if bar else 14
     width, height = left + size[0] + right, foot + size[1] + head

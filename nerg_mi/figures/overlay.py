@@ -114,10 +114,10 @@ def robust_max(values, mask, percentile: float = 99.5) -> float:
 
     Raises NergError if no pixel is positive.
     """
-    inside = np.asarray(values)[np.asarray(mask, bool)]
-    top = float(np.percentile(inside, percentile)) if inside.size else 0.0
-    if top <= 0 and inside.size:
-        top = float(inside.max())  # the percentile may exclude all pixels with attention
+    masked = np.asarray(values)[np.asarray(mask, bool)]
+    top = float(np.percentile(masked, percentile)) if masked.size else 0.0
+    if top <= 0 and masked.size:
+        top = float(masked.max())  # the percentile may exclude all pixels with attention
     if not top > 0:
         raise NergError("this image contains no gaze to derive a scale from; move the camera or give a range")
     return top
@@ -558,8 +558,8 @@ class Overlay:
     def _color_limits(self, values, mask, limits: Limits) -> tuple[float, float]:
         """Return the ends of a colour scale."""
         if self.display.kind == "categorical":
-            seen = np.round(values[mask & np.isfinite(values)])
-            return (float(seen.min()), float(seen.max())) if seen.size else (0.0, 0.0)
+            classes = np.round(values[mask & np.isfinite(values)])
+            return (float(classes.min()), float(classes.max())) if classes.size else (0.0, 0.0)
         if self.display.kind == "diverging" and limits is not None:
             return -abs(limits[1]), abs(limits[1])
         return limits or self.display.limits or percentile_limits(values, mask)
@@ -580,8 +580,8 @@ def list_overlays(aov: Aov, channels: Sequence[str] | None = None) -> list[Overl
 
 
 def _channel_overlay(aov: Aov, channel: str) -> Overlay:
-    words = aov.label or aov.name.replace("_", " ")
-    return Overlay(replace(aov, title=f"{aov.heading} {channel}", label=f"{words} {channel}"), f"{aov.name}.{channel}")
+    label = aov.label or aov.name.replace("_", " ")
+    return Overlay(replace(aov, title=f"{aov.heading} {channel}", label=f"{label} {channel}"), f"{aov.name}.{channel}")
 
 
 def find_overlay(name: str) -> Overlay:

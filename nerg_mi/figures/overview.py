@@ -117,8 +117,8 @@ class SeenSurfaces:
         share = np.where(self.is_hit & towards, self.attention * self.solid_angle, 0)
         if not share.sum() > 0:
             return None
-        near = np.minimum(self.depth, 3 * self.median_depth)[:, None] * self.directions
-        return self.observer + share @ near / share.sum()
+        clipped = np.minimum(self.depth, 3 * self.median_depth)[:, None] * self.directions
+        return self.observer + share @ clipped / share.sum()
 
 
 class ViewScorer:
@@ -184,10 +184,10 @@ class ViewScorer:
             score = score * (0.02 + 0.98 * np.where(is_hit, clarity, 0).sum(axis=1) / np.maximum(is_hit.sum(axis=1), 1))
         attention: list[float | None] = [None] * len(origins)
         if self.seen is not None:
-            shown, covered = self._attention_shares(origins, ahead, directions, depth, is_hit, size)
+            attention_share, covered = self._attention_shares(origins, ahead, directions, depth, is_hit, size)
             # Attended surfaces should cover a third of the image; the rest shows the context.
-            score = score * (0.05 + 0.95 * shown) * (0.25 + 0.75 * np.minimum(covered / 0.3, 1))
-            attention = [float(x) for x in shown]
+            score = score * (0.05 + 0.95 * attention_share) * (0.25 + 0.75 * np.minimum(covered / 0.3, 1))
+            attention = [float(x) for x in attention_share]
         return [CameraView(*row) for row in zip(origins, targets, score.tolist(), surface_fraction.tolist(), attention)]
 
     def _attention_shares(
@@ -209,7 +209,7 @@ class ViewScorer:
         away = np.linalg.norm(points[None] - origins[:, None], axis=-1)
         depth_at_pixel = np.take_along_axis(np.where(is_hit, depth, np.inf), np.maximum(pixel, 0), axis=1)
         visible = (pixel >= 0) & (away < 1.1 * depth_at_pixel + 0.02 * self.typical_distance)
-        shown = (visible * share).sum(axis=1) / max(share.sum(), 1e-12)
+        attention_share = (visible * share).sum(axis=1) / max(share.sum(), 1e-12)
         if not share.any():
             return np.ones(len(origins)), np.ones(len(origins))
         # Pixels on attended surfaces that are visible to the observer.
@@ -226,7 +226,7 @@ class ViewScorer:
         is_attended = (seen.attention[nearest] > top) & (
             distance < 1.1 * seen.depth[nearest] + 0.02 * self.typical_distance
         )
-        return shown, (is_hit & is_attended).mean(axis=1)
+        return attention_share, (is_hit & is_attended).mean(axis=1)
 
     def best_index(self, origins: np.ndarray, targets: np.ndarray) -> int:
         """Return the index of the best of a few cameras."""
@@ -277,20 +277,20 @@ def view_of_observer(
     depth, opacity = trace(np.broadcast_to(seen.observer, along.shape).copy(), along)
     free_distance = np.where(opacity >= SURFACE_OPACITY, depth, np.inf)
     origins = []
-    for share in (0.85, 0.5):
+    for fraction in (0.85, 0.5):
         # Stay close to the attended surfaces.
-        away = np.minimum(share * free_distance, 2.5 * share * seen.median_depth)
+        away = np.minimum(fraction * free_distance, 2.5 * fraction * seen.median_depth)
         origins.append(seen.observer + along * away[:, None])
-    places = np.concatenate(origins)
-    is_far = np.linalg.norm(places - seen.observer, axis=1) > 0.3 * seen.median_depth
-    places = places[is_far]
-    if not len(places):
+    positions = np.concatenate(origins)
+    is_far = np.linalg.norm(positions - seen.observer, axis=1) > 0.3 * seen.median_depth
+    positions = positions[is_far]
+    if not len(positions):
         return None
     # Look at the target, or half way to it to include the observer's surroundings.
     targets = [target, 0.5 * (target + seen.observer)]
-    all_targets = np.concatenate([np.broadcast_to(t, places.shape) for t in targets])
+    all_targets = np.concatenate([np.broadcast_to(t, positions.shape) for t in targets])
     return ViewScorer(trace, frame, seen.median_depth, seen, trace_mean).find_best(
-        np.concatenate([places, places]), all_targets
+        np.concatenate([positions, positions]), all_targets
     )
 
 
@@ -337,7 +337,7 @@ def view_of_scene(
         origins.append(np.repeat(interior, len(along), axis=0))
         targets.append(origins[-1] + np.tile(along, (len(interior), 1)) * 0.5 * radius)
     # Captures often surround an object at the centre.
-    away = [share * 0.5 * float(size.max()) for share in (0.3, 0.5, 0.7)]
+    away = [fraction * 0.5 * float(size.max()) for fraction in (0.3, 0.5, 0.7)]
     away += [1.15 * radius / np.tan(np.radians(frame.fov / 2))] if allow_outside else []
     for distance in away:
         for elevation in np.radians([5, 18, 35]):
@@ -347,15 +347,15 @@ def view_of_scene(
         return None
     ends = np.concatenate(targets)
     if is_solid is not None:
-        places, which = np.unique(o, axis=0, return_inverse=True)
-        is_free = ~is_solid(places)[which.reshape(-1)]
+        positions, which = np.unique(o, axis=0, return_inverse=True)
+        is_free = ~is_solid(positions)[which.reshape(-1)]
         o, ends = o[is_free], ends[is_free]
     return ViewScorer(trace, frame, 0.5 * radius, trace_mean=trace_mean).find_best(o, ends) if len(o) else None
 
 
 def _clearance(trace: Trace, points: np.ndarray, default: float) -> np.ndarray:
     """Return the distance of surfaces from each of ``points`` (N, 3), the 10 % quantile over directions."""
-    around = fibonacci_directions(64)
-    depth, opacity = trace(np.repeat(points, len(around), axis=0), np.tile(around, (len(points), 1)))
+    directions = fibonacci_directions(64)
+    depth, opacity = trace(np.repeat(points, len(directions), axis=0), np.tile(directions, (len(points), 1)))
     depth = np.where(opacity >= SURFACE_OPACITY, depth, default).reshape(len(points), -1)
     return np.quantile(depth, 0.1, axis=1)

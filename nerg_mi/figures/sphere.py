@@ -184,9 +184,9 @@ def _draw_graticule(axes: Any, projection: Projection, step: int, unit: float) -
         axes.annotate(_format_degrees(degrees), (x, y), (-4 * unit, 0), fontsize=SMALL * unit, color=INK, **where)
     axes.tick_params(labelsize=SMALL * unit, colors=INK, length=2 * unit, pad=2 * unit)
     axes.set_xlabel("azimuth, to the right of the front", fontsize=SMALL * unit, color=INK, labelpad=2 * unit)
-    room = 30 * unit / 72 * axes.figure.dpi / axes.bbox.width
-    text = dict(rotation=90, ha="right", va="center", transform=axes.transAxes, fontsize=SMALL * unit, color=INK)
-    axes.text(-room, 0.5, "elevation", **text)
+    offset = 30 * unit / 72 * axes.figure.dpi / axes.bbox.width
+    label_style = dict(rotation=90, ha="right", va="center", transform=axes.transAxes, fontsize=SMALL * unit, color=INK)
+    axes.text(-offset, 0.5, "elevation", **label_style)
 
 
 def _format_degrees(value: int) -> str:

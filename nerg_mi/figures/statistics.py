@@ -85,10 +85,10 @@ def transitions_figure(names: Sequence[str], transitions: np.ndarray, title: str
     share = 100 * transitions / np.where(total > 0, total, 1)
     side = 26 * max(len(names), 4)
     short = [n if len(n) <= 30 else n[:29] + "…" for n in names]
-    room = 45 + 5.5 * max(map(len, short), default=0)
-    page = new_page(room + side + 120, room + side + 50)
+    label_space = 45 + 5.5 * max(map(len, short), default=0)
+    page = new_page(label_space + side + 120, label_space + side + 50)
     width, height = (100 * v for v in page.get_size_inches())
-    axis = page.add_axes((room / width, room / height, side / width, side / height))
+    axis = page.add_axes((label_space / width, label_space / height, side / width, side / height))
     image = axis.imshow(np.ma.masked_equal(share, 0), cmap="viridis", vmin=0, vmax=max(float(share.max()), 1.0))
     axis.set_xticks(range(len(names)), short, rotation=90, fontsize=7, color=INK)
     axis.set_yticks(range(len(names)), short, fontsize=7, color=INK)
@@ -96,7 +96,7 @@ def transitions_figure(names: Sequence[str], transitions: np.ndarray, title: str
     axis.set_ylabel("visit", fontsize=8, color=INK)
     axis.set_title(title, fontsize=10, color=INK, loc="left")
     bar = page.colorbar(
-        image, cax=page.add_axes(((room + side + 10) / width, room / height, 12 / width, side / height))
+        image, cax=page.add_axes(((label_space + side + 10) / width, label_space / height, 12 / width, side / height))
     )
     label_bar(bar, "% of the transitions from the area", 7)
     return page

@@ -50,9 +50,9 @@ def find_colormap(name: str, kind: str = "sequential") -> Any:
     """
     import matplotlib
 
-    names, words = _COLORS[kind]
+    names, description = _COLORS[kind]
     if name.removesuffix("_r") not in {known_name.removesuffix("_r") for known_name in names}:
-        raise NergError(f'"{name}" is not a {words} colour map; choose one of {", ".join(names)}')
+        raise NergError(f'"{name}" is not a {description} colour map; choose one of {", ".join(names)}')
     return matplotlib.colormaps[name]
 
 
@@ -86,8 +86,8 @@ def hatch(display: Any, unknown: Any, unit: int = 1) -> np.ndarray:
     where = np.asarray(unknown, bool)[..., None]
     pale = shown + _PALE_FRACTION * (PALE - shown)
     height, width = shown.shape[:2]
-    drawn = np.where(hatch_lines(height, width, unit)[..., None], LINE, pale)
-    return np.where(where, drawn, shown)
+    hatched = np.where(hatch_lines(height, width, unit)[..., None], LINE, pale)
+    return np.where(where, hatched, shown)
 
 
 def hatch_swatch(height: int, width: int, unit: int = 1) -> np.ndarray:
@@ -433,8 +433,8 @@ class Sheet:
             panel.set_title(title, fontsize=TITLE * unit, color=INK, pad=4 * unit)
             self.panels.append(panel)
         if note:
-            at = left / self.width, 0.6 * _EDGE * unit / self.height
-            self.page.text(*at, note, fontsize=SMALL * unit, color=INK, va="bottom")
+            position = left / self.width, 0.6 * _EDGE * unit / self.height
+            self.page.text(*position, note, fontsize=SMALL * unit, color=INK, va="bottom")
         content_height = rows * (head + slot_h + below) - head - below
         self._bar_position = (
             round(left + columns * step - (left if axes else gap) + gap),
@@ -488,16 +488,19 @@ class Sheet:
         axes.set_xticks([])
         axes.yaxis.tick_right()
         axes.yaxis.set_label_position("right")
-        places, names, factor = scale_ticks(low, high, int(np.clip(long / (26 * unit), 3, 9)), log)
-        axes.set_yticks(places, names)
+        positions, names, factor = scale_ticks(low, high, int(np.clip(long / (26 * unit), 3, 9)), log)
+        axes.set_yticks(positions, names)
         axes.tick_params(labelsize=SMALL * unit, colors=INK, length=2 * unit, width=0.6 * unit, pad=2 * unit)
         axes.set_ylabel(
             wrap(_insert_factor(label, factor), long, SMALL * unit), fontsize=SMALL * unit, color=INK, labelpad=4 * unit
         )
         for spine in axes.spines.values():
             spine.set_linewidth(0.6 * unit)
-        for shown, end, base, color in ((above, 1 + tip / long, 1.0, strip[-1]), (below, -tip / long, 0.0, strip[0])):
-            if shown:
+        for is_shown, end, base, color in (
+            (above, 1 + tip / long, 1.0, strip[-1]),
+            (below, -tip / long, 0.0, strip[0]),
+        ):
+            if is_shown:
                 axes.fill(
                     [0, 0.5, 1], [base, end, base], color=color, edgecolor=INK, clip_on=False, linewidth=0.6 * unit
                 )

@@ -642,17 +642,17 @@ def pack_stage(stage: Stage) -> str:
     """Serialise the 3D view to JSON that can be embedded in a page; arrays are base64-encoded."""
     proxy, M = stage.proxy, len(stage.observers)
     lower, size = _bounding_box(stage)
-    place = lambda points: _quantize((np.asarray(points, np.float64).reshape(-1, 3) - lower) / size, 16)
+    quantize_points = lambda points: _quantize((np.asarray(points, np.float64).reshape(-1, 3) - lower) / size, 16)
     corners = [b.vertices[a] for b in stage.boxes for e in _EDGES for a in e]
     mean = proxy.gaze.mean(axis=0, keepdims=True) if M > 1 else proxy.gaze[:0]
     gaze = np.concatenate([mean, proxy.gaze, np.zeros((int(M == 0), len(proxy.vertices)))])
     scale_tops = np.array([_scale_top(values) for values in gaze])
     heat = np.sqrt(np.clip(gaze / np.where(scale_tops > 0, scale_tops, 1)[:, None], 0, 1))
     arrays = {
-        "place": place(proxy.vertices),
-        "paths": place(np.concatenate([np.zeros((0, 3)), *stage.paths])),
-        "boxes": place(np.array(corners)),
-        "marks": place(stage.observers),
+        "place": quantize_points(proxy.vertices),
+        "paths": quantize_points(np.concatenate([np.zeros((0, 3)), *stage.paths])),
+        "boxes": quantize_points(np.array(corners)),
+        "marks": quantize_points(stage.observers),
         "normal": _quantize(proxy.normals * 0.5 + 0.5, 8),
         "color": np.ascontiguousarray(proxy.colors, np.uint8),
         "gaze": _quantize(heat, 8),
@@ -706,8 +706,8 @@ def _initial_orbit(stage: Stage) -> dict:
     east /= np.linalg.norm(east)
     # Ignore outliers.
     low, high = np.percentile(stage.proxy.vertices.astype(np.float64), [3, 97], axis=0)
-    back = np.subtract(stage.camera.origin, (low + high) / 2)
-    turn = math.atan2(float(back @ np.cross(up, east)), float(back @ east))
+    to_camera = np.subtract(stage.camera.origin, (low + high) / 2)
+    turn = math.atan2(float(to_camera @ np.cross(up, east)), float(to_camera @ east))
     away = 1.05 * float(np.linalg.norm(high - low))
     return {
         "turn": float(f"{turn:.6g}"),

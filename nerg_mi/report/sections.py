@@ -43,12 +43,12 @@ def _show_data(run: Run) -> Html:
     assert run.rays is not None and run.summary is not None
     lines = make_quality_report(run.rays, run.summary)
     warned = any(name == WARNING_LABEL for name, _ in lines)
-    words = (
+    message = (
         "Implausible values are marked below. Correct them before you use any other result of this report."
         if warned
         else "The data-quality checks found no implausible values."
     )
-    return markup([paragraph(words), key_value_table(lines)])
+    return markup([paragraph(message), key_value_table(lines)])
 
 
 def _explain_absent_data(run: Run) -> str | None:
@@ -67,15 +67,17 @@ DATA = Section("data", "The data", _show_data, _explain_absent_data)
 
 def _show_gaze(run: Run) -> Html:
     """Show the gaze in the overview, in the observer's view and on the observer's sphere."""
-    shown = lambda names: [
+    figures = lambda names: [
         figure(image(p.png, p.alt), p.caption) for p in (run.pictures.get(n) for n in names) if p is not None
     ]
     basis = f" The field is {run.support_note}." if run.support_note else ""
-    words = (
+    description = (
         f"{run.observer}{basis} Gaze densities are in 1/sr. A density times the solid angle of a region, as seen by "
         "the observer, is the probability that the observer looks at the region."
     )
-    return markup([paragraph(words), *shown(["gaze"]), element("div", shown(["own", "sphere"]), class_="side")])
+    return markup(
+        [paragraph(description), *figures(["gaze"]), element("div", figures(["own", "sphere"]), class_="side")]
+    )
 
 
 def _explain_absent_gaze(run: Run) -> str | None:
@@ -118,18 +120,21 @@ _MAX_CHART_ROWS = 24
 def _show_objects(run: Run) -> Html:
     """Show a table and a chart of the AOIs, sorted by attention share."""
     order = sorted(run.objects, key=lambda o: (-o.predicted.mean, o.name))
-    shown = [o for o in order if not _is_hidden(o, run.min_participants)]
+    visible_objects = [o for o in order if not _is_hidden(o, run.min_participants)]
     recorded = any(o.recorded is not None for o in order)
     shown_parts: list = [paragraph(_objects_text(run, recorded))]
-    if shown:
+    if visible_objects:
         shown_parts.append(
-            figure(_objects_chart(shown[:_MAX_CHART_ROWS], recorded), _chart_caption(len(shown), recorded))
+            figure(
+                _objects_chart(visible_objects[:_MAX_CHART_ROWS], recorded),
+                _chart_caption(len(visible_objects), recorded),
+            )
         )
     measured = ["share of samples, %", "participants with view", "participants with hits"] if recorded else []
     head = ["AOI", "predicted share of gaze, %", *measured]
     rows = [
         _object_row(o, run.min_participants, recorded)
-        for o in [*shown, *(o for o in order if _is_hidden(o, run.min_participants))]
+        for o in [*visible_objects, *(o for o in order if _is_hidden(o, run.min_participants))]
     ]
     shown_parts.append(table(head, rows, range(1, len(head))))
     return markup(shown_parts)
@@ -164,8 +169,8 @@ def _objects_chart(objects: list[ObjectAttention], recorded: bool) -> Html:
 
 
 def _chart_caption(count: int, recorded: bool) -> str:
-    some = f" The chart shows {_MAX_CHART_ROWS} of {count} AOIs." if count > _MAX_CHART_ROWS else ""
-    return f"Attention shares{' with 95 % confidence intervals over participants' if recorded else ''}.{some}"
+    note = f" The chart shows {_MAX_CHART_ROWS} of {count} AOIs." if count > _MAX_CHART_ROWS else ""
+    return f"Attention shares{' with 95 % confidence intervals over participants' if recorded else ''}.{note}"
 
 
 def _objects_text(run: Run, recorded: bool) -> str:
@@ -207,8 +212,8 @@ OBJECTS = Section("objects", "Areas of interest", _show_objects, _explain_absent
 
 def _show_people(run: Run) -> Html:
     """Show floor plans of the participants' positions."""
-    shown = [run.pictures[name] for name in ("plan", "layout") if name in run.pictures]
-    sides = [figure(image(p.png, p.alt), p.caption) for p in shown]
+    pictures = [run.pictures[name] for name in ("plan", "layout") if name in run.pictures]
+    sides = [figure(image(p.png, p.alt), p.caption) for p in pictures]
     return markup([element("div", sides, class_="side"), *(paragraph(w) for w in _nearby_text(run))])
 
 
@@ -216,20 +221,20 @@ def _nearby_text(run: Run) -> list[str]:
     if not run.nearby_participants:
         return []
     radius = (run.provenance.get("probes") or {}).get("radius")
-    within = f"{radius:g} m" if isinstance(radius, (int, float)) else "half a metre"
-    alone, middle = (
+    distance = f"{radius:g} m" if isinstance(radius, (int, float)) else "half a metre"
+    num_single, middle = (
         sum(n <= 1 for n in run.nearby_participants),
         sorted(run.nearby_participants)[len(run.nearby_participants) // 2],
     )
-    words = (
-        f"The median number of participants within {within} of a viewpoint ({len(run.nearby_participants)} "
+    sentence = (
+        f"The median number of participants within {distance} of a viewpoint ({len(run.nearby_participants)} "
         "viewpoints) is"
     )
-    if not alone:
-        return [f"{words} {middle}; no viewpoint has fewer than two."]
+    if not num_single:
+        return [f"{sentence} {middle}; no viewpoint has fewer than two."]
     return [
-        f"{words} {middle}; {alone} viewpoints have only one. Near such a viewpoint the field reproduces the gaze of a "
-        "single participant."
+        f"{sentence} {middle}; {num_single} viewpoints have only one. Near such a viewpoint the field reproduces "
+        "the gaze of a single participant."
     ]
 
 
@@ -245,11 +250,11 @@ PEOPLE = Section("people", "Participants' positions", _show_people, _explain_abs
 
 def _show_place(run: Run) -> Html:
     """Describe and show the scene."""
-    shown = [paragraph(run.geometry_description), key_value_table(_scene_facts(run))]
+    parts = [paragraph(run.geometry_description), key_value_table(_scene_facts(run))]
     picture = run.pictures.get("color")
     if picture is not None:
-        shown.append(figure(image(picture.png, picture.alt), picture.caption))
-    return markup(shown)
+        parts.append(figure(image(picture.png, picture.alt), picture.caption))
+    return markup(parts)
 
 
 def _scene_facts(run: Run) -> list[tuple[str, str]]:
@@ -260,9 +265,9 @@ def _scene_facts(run: Run) -> list[tuple[str, str]]:
         facts.append(("box", " × ".join(f"{e:.2f}" for e in edges) + " scene units (usually metres)"))
     if "training_frames" in provenance:
         facts.append(("training photos", f"{provenance['training_frames']}"))
-    held = provenance.get("psnr_held_out")
-    if isinstance(held, dict) and held.get("mean") is not None:
-        facts.append(("image quality", f"{held['mean']:.1f} dB PSNR on {len(held.get('views', ()))} held-out photos"))
+    psnr = provenance.get("psnr_held_out")
+    if isinstance(psnr, dict) and psnr.get("mean") is not None:
+        facts.append(("image quality", f"{psnr['mean']:.1f} dB PSNR on {len(psnr.get('views', ()))} held-out photos"))
     shape = (run.provenance.get("geometry_file") or {}).get("shape")
     if shape:
         facts.append(("hit points", " × ".join(map(str, shape)) + " voxels of the gaze hit points"))
@@ -277,18 +282,18 @@ PLACE = Section("place", "Scene", _show_place)
 
 def _show_provenance(run: Run) -> Html:
     """Show the input files with their checksums, and the software versions."""
-    shown = [
+    parts = [
         table(["", "file", "SHA-256"], [[role, name, element("code", digest)] for role, name, digest in run.inputs])
     ]
-    shown.append(key_value_table(list(run.versions.items())))
-    shown.append(
+    parts.append(key_value_table(list(run.versions.items())))
+    parts.append(
         paragraph(
             "The report is reproducible: the same files, settings and versions give the same bytes. The page is "
             "self-contained and makes no network requests.",
             kind="note",
         )
     )
-    return markup(shown)
+    return markup(parts)
 
 
 PROVENANCE = Section("provenance", "Provenance", _show_provenance)
@@ -320,16 +325,16 @@ def _show_scores(run: Run) -> Html:
 
 
 def _split_title(results: GazeResults) -> str:
-    words = SPLIT_LABELS.get(results.split, results.split)
+    title = SPLIT_LABELS.get(results.split, results.split)
     return (
-        f"{words[:1].upper()}{words[1:]} ({results.num_participants} participants, {results.num_positions} positions)"
+        f"{title[:1].upper()}{title[1:]} ({results.num_participants} participants, {results.num_positions} positions)"
     )
 
 
 def _render_split(results: GazeResults, verdict: Verdict) -> list[Html]:
-    shown = [element("div", verdict.sentence, class_=f"verdict {verdict.grade}")]
+    parts = [element("div", verdict.sentence, class_=f"verdict {verdict.grade}")]
     panels = [(COLUMNS[s], [_score_point(r, s, i == 0) for i, r in enumerate(results.rows)]) for s in _PANELS]
-    shown.append(
+    parts.append(
         figure(
             interval_chart(panels),
             "The field (blue) and the baselines, with 95 % confidence intervals over participants.",
@@ -337,7 +342,7 @@ def _render_split(results: GazeResults, verdict: Verdict) -> list[Html]:
     )
     columns = [c for c in COLUMNS if any(_is_finite(r.get(c)) for r in results.rows)]
     rows = [[str(r["method"]), *(_format_score(r, c) for c in columns)] for r in results.rows]
-    shown.append(table(["", *(COLUMNS[c] for c in columns)], rows, range(1, 1 + len(columns))))
+    parts.append(table(["", *(COLUMNS[c] for c in columns)], rows, range(1, 1 + len(columns))))
     if verdict.comparisons:
         comparison_table = table(
             ["baseline", *(f"gain in {COLUMNS[s]}" for s in _PANELS), "outcome"],
@@ -347,10 +352,10 @@ def _render_split(results: GazeResults, verdict: Verdict) -> list[Html]:
         note = (
             "A positive gain means that the field is better. Intervals are widened for small numbers of participants."
         )
-        shown += [comparison_table, paragraph(note, kind="note")]
+        parts += [comparison_table, paragraph(note, kind="note")]
     if results.participant_rows:
-        shown.append(_participants_table(results))
-    return shown
+        parts.append(_participants_table(results))
+    return parts
 
 
 def _participants_table(results: GazeResults) -> Html:
@@ -430,22 +435,22 @@ def _show_settings(run: Run) -> Html:
     """Show tables of settings. Participant names, such as those held out, are replaced by their number."""
     provenance = run.provenance
     facts = [
-        (words, _format_setting(provenance[key])) for key, words in _PROVENANCE_LABELS.items() if key in provenance
+        (label, _format_setting(provenance[key])) for key, label in _PROVENANCE_LABELS.items() if key in provenance
     ]
     test = provenance.get("test")
     if isinstance(test, dict):
         facts.append(("held out", _describe_held_out(test)))
-    shown = [element("h3", "Training"), key_value_table(facts)]
+    parts = [element("h3", "Training"), key_value_table(facts)]
     for key, title in (("settings", "Training settings"), ("probes", "Probes")):
         rows = _flatten_settings(provenance.get(key, {}))
         if rows:
-            shown.append(element("details", element("summary", title), key_value_table(rows)))
+            parts.append(element("details", element("summary", title), key_value_table(rows)))
     architecture = _flatten_settings(run.gaze.get("architecture", {}))
     if architecture:
-        shown.append(element("details", element("summary", "Field architecture"), key_value_table(architecture)))
+        parts.append(element("details", element("summary", "Field architecture"), key_value_table(architecture)))
     if run.settings:
-        shown += [element("h3", "This report"), key_value_table(list(run.settings.items()))]
-    return markup(shown)
+        parts += [element("h3", "This report"), key_value_table(list(run.settings.items()))]
+    return markup(parts)
 
 
 def _describe_held_out(test: Mapping[str, Any]) -> str:
@@ -500,8 +505,8 @@ def _show_stage(run: Run) -> Html:
     kinds = [("gaze", "gaze"), ("paths", "participants' paths"), ("boxes", "AOIs")]
     counts = {"gaze": run.stage_observers, "paths": run.stage_paths, "boxes": run.stage_boxes}
     switches = [
-        element("label", element("input", type="checkbox", name=name, checked=True), " ", words)
-        for name, words in kinds
+        element("label", element("input", type="checkbox", name=name, checked=True), " ", description)
+        for name, description in kinds
         if counts[name] or name == "gaze"
     ]
     controls = element(
@@ -514,13 +519,13 @@ def _show_stage(run: Run) -> Html:
     )
     canvas = element("canvas", aria_label="3D view of the scene with the observers' gaze", role="img")
     data = element("script", Html(run.stage), type="application/json", id="stage-data")
-    words = (
+    description = (
         f"{run.stage_points:,} surface points, sampled from panoramas at viewpoints. Drag to rotate, Shift-drag to "
         "pan, and use the wheel to zoom. Back faces are hidden, so that rooms can be seen from outside. Blue marks are "
         "observers. Browsers without scripts or WebGL show an image instead."
         f"{f' The gaze is {run.support_note}.' if run.support_note else ''}"
     )
-    return markup([paragraph(words), element("div", controls, canvas, picture, data)])
+    return markup([paragraph(description), element("div", controls, canvas, picture, data)])
 
 
 def _explain_absent_stage(run: Run) -> str | None:
@@ -536,7 +541,7 @@ STAGE = Section("stage", "3D view", _show_stage, _explain_absent_stage)
 def _show_uncertainty(run: Run) -> Html:
     """Explain the uncertainty of the scores and of the field."""
     members = len(run.gaze.get("architecture", {}).get("members", ()))
-    shown = [
+    parts = [
         paragraph(
             "Confidence intervals of scores and shares treat the participant as the sampling unit. They do not cover "
             "other scenes, other days or other populations."
@@ -544,14 +549,14 @@ def _show_uncertainty(run: Run) -> Html:
     ]
     spread = run.pictures.get("spread")
     if spread is not None:
-        shown.append(
+        parts.append(
             paragraph(
                 f"The field is the mean of {members} members, each trained on a bootstrap resample of the participants."
             )
         )
-        shown.append(figure(image(spread.png, spread.alt), spread.caption))
+        parts.append(figure(image(spread.png, spread.alt), spread.caption))
     else:
-        shown.append(
+        parts.append(
             paragraph(
                 "A single field does not report its own uncertainty. Train an ensemble (nerg train gaze --ensemble 5) "
                 "to estimate it."
@@ -559,7 +564,7 @@ def _show_uncertainty(run: Run) -> Html:
         )
     validation = run.provenance.get("validation")
     if isinstance(validation, dict) and {"cc", "kld", "zones", "probes"} <= set(validation):
-        shown.append(
+        parts.append(
             paragraph(
                 f"Early stopping used {validation['probes']} validation probes in {validation['zones']} zones: "
                 f"CC {validation['cc']:.3f}, KLD {validation['kld']:.3f}. These are not test scores, because the "
@@ -567,7 +572,7 @@ def _show_uncertainty(run: Run) -> Html:
                 "of training steps was selected on them."
             )
         )
-    return markup(shown)
+    return markup(parts)
 
 
 UNCERTAINTY = Section("uncertainty", "Uncertainty", _show_uncertainty)
@@ -578,7 +583,7 @@ UNCERTAINTY = Section("uncertainty", "Uncertainty", _show_uncertainty)
 
 def _show_verdict(run: Run) -> Html:
     """Show the verdict on each evaluation and the rule behind it."""
-    shown = [element("div", verdict.sentence, class_=f"verdict {verdict.grade}") for _, verdict in run.verdicts]
+    verdicts = [element("div", verdict.sentence, class_=f"verdict {verdict.grade}") for _, verdict in run.verdicts]
     results = run.results[0]
     basis = (
         f"Evaluated on {results.num_participants} held-out participants at {results.num_positions} held-out "
@@ -598,7 +603,7 @@ def _show_verdict(run: Run) -> Html:
         )
     )
     return markup(
-        [*shown, paragraph(basis, half_note, kind="note"), *(paragraph(d, kind="note") for d in run.warnings)]
+        [*verdicts, paragraph(basis, half_note, kind="note"), *(paragraph(d, kind="note") for d in run.warnings)]
     )
 
 

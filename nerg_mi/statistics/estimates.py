@@ -281,8 +281,8 @@ def _lower_limit(x: np.ndarray, n: np.ndarray) -> np.ndarray:
 
     def tail_probability(k: np.ndarray, p: np.ndarray) -> np.ndarray:
         """P(X >= k)."""
-        inside = betainc(np.maximum(k, 1), np.maximum(n - k + 1, 1), p)
-        return np.where(k <= 0, 1.0, np.where(k > n, 0.0, inside))
+        tail = betainc(np.maximum(k, 1), np.maximum(n - k + 1, 1), p)
+        return np.where(k <= 0, 1.0, np.where(k > n, 0.0, tail))
 
     low, high = np.zeros(x.shape), np.ones(x.shape)
     for _ in range(50):

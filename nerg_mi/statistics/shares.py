@@ -386,9 +386,9 @@ def visible_in_fov(
         # |s - p|² and (s - p) · f by products of matrices.
         along = f @ targets.points.T - np.einsum("nk,nk->n", f, block)[:, None]
         square = (targets.points**2).sum(axis=1) - 2 * block @ targets.points.T + (block**2).sum(axis=1)[:, None]
-        within = is_visible[part] & (along >= min_cosine * np.sqrt(np.maximum(square, 0)))
+        in_fov = is_visible[part] & (along >= min_cosine * np.sqrt(np.maximum(square, 0)))
         if len(starts):
-            out[part, targets.aoi_index[starts]] = np.logical_or.reduceat(within, starts, axis=1)
+            out[part, targets.aoi_index[starts]] = np.logical_or.reduceat(in_fov, starts, axis=1)
     return out
 
 

@@ -251,8 +251,8 @@ def sample_cone(
     d = np.asarray(d, float)
     u, v = tangent_frame(d)
     directions = [d]
-    for share, number in rings:
-        angle = np.radians(degrees * share)
+    for fraction, number in rings:
+        angle = np.radians(degrees * fraction)
         for turn in 2 * np.pi * np.arange(number) / number:
             directions.append(np.cos(angle) * d + np.sin(angle) * (np.cos(turn) * u + np.sin(turn) * v))
     return directions
@@ -531,8 +531,8 @@ class Total:
         """Return a view of the total so far."""
         n = len(self._row_of)
         arrays = {name: getattr(self._buffer, name)[:n] for name in (*_PER_ROW, *_PER_AREA)}
-        made = dict(duration_counts=self._buffer.duration_counts, transitions=self._buffer.transitions)
-        return VisitSums(self._areas, self._cells, tuple(self._row_of), **arrays, **made)
+        other_arrays = dict(duration_counts=self._buffer.duration_counts, transitions=self._buffer.transitions)
+        return VisitSums(self._areas, self._cells, tuple(self._row_of), **arrays, **other_arrays)
 
 
 def merge_sums(sums: Iterable[VisitSums]) -> VisitSums:

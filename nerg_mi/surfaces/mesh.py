@@ -474,7 +474,7 @@ def iter_texture_rows(
             distance, index = nearest
             out, hit = out[index[0], index[1]], np.asarray(distance) <= GUTTER_PIXELS
         rows = slice(start, stop)
-        inside = slice(start - first, stop - first)
-        yield rows, out[inside], hit[inside]
+        batch = slice(start - first, stop - first)
+        yield rows, out[batch], hit[batch]
     if is_empty:
         raise NergError(f"no pixel of a texture of {pixels} x {pixels} shows the surface; give a larger --texture-size")

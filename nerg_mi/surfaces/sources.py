@@ -307,8 +307,8 @@ def ray_weights(rays: Rays, weighting: str, max_gap: float = MAX_GAP) -> np.ndar
     """Return weights (N,) of samples that sum to one, by one of `WEIGHTINGS`."""
     seconds = np.ones(len(rays)) if weighting == "equal" else ray_durations(rays, max_gap)
     if weighting == "person":
-        each = np.bincount(rays.person, seconds)
-        seconds = seconds / np.where(each > 0, each, 1)[rays.person]
+        total = np.bincount(rays.person, seconds)
+        seconds = seconds / np.where(total > 0, total, 1)[rays.person]
     return seconds / seconds.sum()
 
 
@@ -497,10 +497,12 @@ def _ring_cells(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndar
     """Return the upper and lower height of each cell, its first azimuth, and its width in radians."""
     rings = max(1, round(np.sqrt(np.pi * count / 4)))
     z = np.cos(np.pi * np.arange(rings + 1) / rings)
-    around = np.maximum(1, np.rint(2 * rings * np.sin(np.pi * (np.arange(rings) + 0.5) / rings))).astype(np.int64)
-    ring = np.repeat(np.arange(rings), around)
-    number = np.arange(len(ring)) - np.repeat(np.cumsum(around) - around, around)
-    width = 2 * np.pi / around[ring]
+    cells_per_ring = np.maximum(1, np.rint(2 * rings * np.sin(np.pi * (np.arange(rings) + 0.5) / rings))).astype(
+        np.int64
+    )
+    ring = np.repeat(np.arange(rings), cells_per_ring)
+    number = np.arange(len(ring)) - np.repeat(np.cumsum(cells_per_ring) - cells_per_ring, cells_per_ring)
+    width = 2 * np.pi / cells_per_ring[ring]
     return z[ring], z[ring + 1], number * width, width
 
 
@@ -596,10 +598,10 @@ def _sum_one_observer(
     on_faces, on_vertices = np.zeros(len(mesh.faces)), np.zeros(len(mesh.vertices))
     for a in range(0, len(mesh.faces), FACES_PER_BATCH):
         pieces = subdivide_faces(mesh, position, settings.max_angle, slice(a, a + FACES_PER_BATCH))
-        for some, received in _iter_received_gaze(
+        for batch, received in _iter_received_gaze(
             target, observer, pieces, total / weight if weight else 0.0, settings.cone_sigma
         ):
-            sums = deposit(mesh.faces, len(mesh.vertices), some.face, some.centroid_barycentric, weight * received)
+            sums = deposit(mesh.faces, len(mesh.vertices), batch.face, batch.centroid_barycentric, weight * received)
             on_faces, on_vertices = on_faces + sums[0], on_vertices + sums[1]
     return SurfaceSums(on_faces, on_vertices, float(share[ends.elsewhere].sum()), escaped, total, weight, 1)
 

@@ -88,7 +88,7 @@ def iter_hit_groups(
     )
     light, last, tree_index = np.ones(len(origins)), np.full(len(origins), -1e-37), np.zeros(len(origins), np.int64)
     while len(rows):
-        t, absorbed, place = _next_hits(
+        t, absorbed, tree_places = _next_hits(
             hits, origins[rows], directions[rows], (last, tree_index), ends[rows], light, min_transmittance
         )
         is_hit = np.isfinite(t)
@@ -99,11 +99,11 @@ def iter_hit_groups(
         is_active = is_hit[:, -1] & (left > min_transmittance)
         # A group also ends when the transmittance is too low.
         through = ~is_active & (left > min_transmittance)
-        index = np.where(is_hit, order[np.where(is_hit, place, 0)], -1)
+        index = np.where(is_hit, order[np.where(is_hit, tree_places, 0)], -1)
         requested_rows = yield HitGroup(rows, index, arriving, absorbed, left, through)
         if requested_rows is not None:
             is_active &= np.isin(rows, requested_rows)
-        rows, light, last, tree_index = rows[is_active], left[is_active], t[is_active, -1], place[is_active, -1]
+        rows, light, last, tree_index = rows[is_active], left[is_active], t[is_active, -1], tree_places[is_active, -1]
 
 
 def _next_hits(hits, origins, directions, after, before, light, stop) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -366,19 +366,19 @@ class SplatSmoother:
         step = min(max(MIN_STEP_FRACTION * spacing, length / np.sqrt(MAX_STEPS)), length)
         step = length / np.sqrt(max(1, np.floor((length / step) ** 2)))
         # Normals of surfaces, which point to where they are seen from.
-        normals, places = sign[:, None] * axes[which], np.asarray(centers, np.float64)[which]
-        cells, self._cell = _make_cells(places, normals, step / 2)
+        normals, positions = sign[:, None] * axes[which], np.asarray(centers, np.float64)[which]
+        cells, self._cell = _make_cells(positions, normals, step / 2)
         self._area = np.bincount(self._cell, area, cells)
         mean = lambda rows: np.stack(
             [np.bincount(self._cell, area * c, cells).astype(np.float64) for c in rows.T], axis=1
         )
-        place, normal = mean(places) / self._area[:, None], mean(normals)
+        cell_positions, normal = mean(positions) / self._area[:, None], mean(normals)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         self._share, self.steps = area / self._area[self._cell], 1
-        i, j, square = _find_neighbours(place, normal, KERNEL_CUTOFF * step, tolerance)
+        i, j, square = _find_neighbours(cell_positions, normal, KERNEL_CUTOFF * step, tolerance)
         kernel = np.exp(-0.5 * square / step**2)
-        near = np.bincount(i, kernel * self._area[j], cells)
-        weight = kernel * self._area[i] * self._area[j] / np.maximum(near[i], near[j])
+        row_sums = np.bincount(i, kernel * self._area[j], cells)
+        weight = kernel * self._area[i] * self._area[j] / np.maximum(row_sums[i], row_sums[j])
         # By a step's own variance, for cells are apart, and the kernel is cut off.
         variance = float((weight * square).sum() / 2 / self._area.sum()) if cells else 0.0
         stays = self._area - np.bincount(i, np.where(i == j, 0, weight), cells)
@@ -398,9 +398,9 @@ class SplatSmoother:
         return out
 
 
-def _make_cells(places: np.ndarray, normals: np.ndarray, size: float) -> tuple[int, np.ndarray]:
+def _make_cells(positions: np.ndarray, normals: np.ndarray, size: float) -> tuple[int, np.ndarray]:
     """Return the number of cells of edge ``size`` and similar normals, and the cell of each row."""
-    key = np.concatenate([np.floor(places / size), np.rint(2 * normals)], axis=1).astype(np.int64)
+    key = np.concatenate([np.floor(positions / size), np.rint(2 * normals)], axis=1).astype(np.int64)
     if not len(key):
         return 0, np.zeros(0, np.int64)
     order = np.lexsort(key.T)
@@ -411,18 +411,18 @@ def _make_cells(places: np.ndarray, normals: np.ndarray, size: float) -> tuple[i
 
 
 def _find_neighbours(
-    place: np.ndarray, normal: np.ndarray, max_distance: float, tolerance: float
+    positions: np.ndarray, normal: np.ndarray, max_distance: float, tolerance: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return ``(i, j, squared distance)`` of neighbouring cells of one surface, in both orders and including each
     cell itself."""
     from scipy.spatial import KDTree
 
-    index = np.arange(len(place))
-    if not len(place):
+    index = np.arange(len(positions))
+    if not len(positions):
         return index, index, np.zeros(0)
-    pairs = KDTree(place).query_pairs(max_distance, output_type="ndarray")
+    pairs = KDTree(positions).query_pairs(max_distance, output_type="ndarray")
     i, j = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))].T
-    offset = place[j] - place[i]
+    offset = positions[j] - positions[i]
     square = np.einsum("ij,ij->i", offset, offset)
     max_height = MAX_PLANE_SINE * np.sqrt(square) + tolerance
     in_plane = lambda k: np.abs(np.einsum("ij,ij->i", offset, normal[k])) <= max_height
@@ -497,7 +497,7 @@ def splat_densities(
 
 def _observer_density(
     splats: Splats,
-    place: SceneGeometry,
+    geometry: SceneGeometry,
     observer: SurfaceObserver,
     position: np.ndarray,
     settings: ObserverSettings,
@@ -513,7 +513,7 @@ def _observer_density(
         )
         half_thickness = variant_types().Float(copy_aligned(depth))
         visibility = occluded_density(
-            place, observer, unit_density, centers, normals, falloff, settings, half_thickness
+            geometry, observer, unit_density, centers, normals, falloff, settings, half_thickness
         )
         rows = np.flatnonzero(visibility > 0)
         # Most surfaces are occluded, and evaluating gaze is more expensive than tracing.
