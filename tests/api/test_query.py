@@ -119,9 +119,9 @@ def test05_both_sides_of_an_open_surface(empty, rgb):
     [
         ("nothing", '"nothing"'),
         ("nothing.ply", 'there is no mesh "nothing.ply"'),
-        ([(0, 0, 0), (1, 1, -1)], "a box is a lower corner and an upper one"),
-        ([(0, 0, 0)], "a box is a lower corner and an upper one"),
-        ({"type": "sphere"}, "mesh; attention is received"),
+        ([(0, 0, 0), (1, 1, -1)], "a box must be a lower and an upper corner"),
+        ([(0, 0, 0)], "a box must be a lower and an upper corner"),
+        ({"type": "sphere"}, "is not a mesh"),
         (object(), "corners of a box"),
     ],
 )
@@ -134,14 +134,14 @@ def test07_errors_are_sentences(files, empty):
     with pytest.raises(nerg.NergError, match="make_scene"):
         nerg.attention(nerg.make_scene(files / "field.safetensors"), BOX, (0, 0, 0))
     for wrong in (0, 2.5, True):
-        with pytest.raises(nerg.NergError, match="divisions must be a whole number from 1"):
+        with pytest.raises(nerg.NergError, match="divisions must be an integer from 1"):
             nerg.attention(empty, box_dict(*np.array(BOX)), (0, 0, 0), divisions=wrong)
     for wrong in ({"margin": -1}, {"margin": "a"}, {"tolerance": 0}, {"tolerance": float("nan")}):
         with pytest.raises(nerg.NergError, match=f"{next(iter(wrong))} must"):
             nerg.attention(empty, BOX, (0, 0, 0), **wrong)
     with pytest.raises(nerg.NergError, match="two_sided"):
         nerg.attention(empty, BOX, (0, 0, 0), divisions=2)
-    with pytest.raises(nerg.NergError, match="no observer of its own"):
+    with pytest.raises(nerg.NergError, match="has no observer"):
         nerg.attention(empty, BOX)
 
 
@@ -256,14 +256,14 @@ def test14_statistics_viewer_and_report_agree(room):
     options = StatisticsOptions(
         aois=path.parent / "areas.json", observers=(",".join(map(str, EYE)),), resamples=199, mode="llvm_ad_rgb"
     )
-    messages = {row["thing"]: row["share"] for row in statistics([path], options=options).aois}
+    messages = {row["aoi"]: row["share"] for row in statistics([path], options=options).aois}
     assert options.margin == MARGIN
     assert messages["the sign"] == pytest.approx(position.share[0], rel=0.03)
     assert messages["the stand"] == pytest.approx(nerg.attention(scene, "stand", eye).share[0], rel=0.03)
     (viewer, *_) = iter_attention_shares(scene, eye, regions, [])
     assert viewer["the sign"] == pytest.approx(position.share[0], rel=0.03)
     field = scene.integrator.gaze.field
-    onlooker = GazeSampler(field, TrainingGeometry(scene.place, field.box, "scene"))
+    onlooker = GazeSampler(field, TrainingGeometry(scene.geometry, field.box, "scene"))
     things = [BoxAoi(region) for region in regions]
     report = gaze_shares(onlooker.query_from, eye[None], things, [(0,), (1,)], MARGIN, COARSE)
     assert report.share[0, 0] == pytest.approx(position.share[0], rel=0.03)
@@ -313,7 +313,7 @@ def ball(files):
 
 def pixel_rays(rgb, scene, camera):
     """Rays through the pixel centres of a camera."""
-    sensor = scene.sensor(camera)
+    sensor = scene.resolve_sensor(camera)
     x, y = np.meshgrid((np.arange(camera.width) + 0.5) / camera.width, (np.arange(camera.height) + 0.5) / camera.height)
     at = rgb.Point2f(np.float32(x.ravel()), np.float32(y.ravel()))
     ray, _ = sensor.sample_ray(0, 0, at, rgb.Point2f(0.5))
@@ -409,12 +409,12 @@ def test08_the_scenes_own_observer_sees(files):
     "call, said",
     [
         (lambda s: nerg.trace(s, (0, 0), (1, 0, 0)), "origins must have the shape"),
-        (lambda s: nerg.trace(s, (0, 0, 0), (0, 0, 0)), "directions must not be zero, and row 0 is"),
-        (lambda s: nerg.trace(s, np.zeros((2, 3)), np.ones((3, 3))), "one origin or as many as directions, 3, got 2"),
+        (lambda s: nerg.trace(s, (0, 0, 0), (0, 0, 0)), "directions must not be zero, but row 0 is"),
+        (lambda s: nerg.trace(s, np.zeros((2, 3)), np.ones((3, 3))), "number of origins must be 1 or that of the directions .3., got 2"),
         (lambda s: nerg.trace(s, (0, 0, 0), (0, 0, 1), "gazes"), "gazes"),
         (lambda s: nerg.observe(s, (0, 0, 0)), "scene has no observer"),
         (lambda s: nerg.observe(s, (0, 0, 0), (0, 0, 1), "color"), '"color"'),
-        (lambda s: nerg.observe(s, "there", (0, 0, 1)), "points must be numbers"),
+        (lambda s: nerg.observe(s, "there", (0, 0, 1)), "points must be x, y, z"),
     ],
 )
 def test09_errors_are_sentences(scene, call, said):
@@ -426,7 +426,7 @@ def test09_errors_are_sentences(scene, call, said):
 def test10_without_gaze_points_are_still_seen(files):
     scene = nerg.make_scene(files / "field.safetensors")
     assert nerg.observe(scene, (0, -2, 0), (0, -3, 0)).names == ("visibility", "distance", "depth")
-    with pytest.raises(nerg.NergError, match='no quantity "gaze" here'):
+    with pytest.raises(nerg.NergError, match='quantity "gaze" is not available'):
         nerg.observe(scene, (0, -2, 0), (0, -3, 0), "gaze")
 
 

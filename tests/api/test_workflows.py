@@ -133,7 +133,7 @@ def test01_options_reach_the_workflows(asked, job):
 def test02_invalid_options_are_refused(name):
     with pytest.raises(nerg.NergError, match=f'{name} has no option "nothing"'):
         getattr(nerg, name)("a", "b", nothing=3)
-    with pytest.raises(nerg.NergError, match=f"{name} works in the variant that is set"):
+    with pytest.raises(nerg.NergError, match=f"{name} uses the active variant"):
         getattr(nerg, name)("a", "b", mode="scalar_rgb")
 
 

@@ -69,7 +69,7 @@ LINES = {
     # Options that do not go together, or have other values.
     f"{GAZE} --variant both": "give other values by --variant and --activation",
     f"{GAZE} --mode scalar_rgb": 'not "scalar_rgb"',
-    f"{GAZE} --mode llvm_rgb": 'there is no variant "llvm_rgb"',
+    f"{GAZE} --mode llvm_rgb": 'there is no Mitsuba variant "llvm_rgb"',
     f"{GAZE} --ensemble 1": "at least two members",
     f"{PHOTOS} --salience no": "no folder",
     f"{PHOTOS} --salience photos": "in colours",
@@ -83,7 +83,7 @@ LINES = {
     "render scene.xml -o {o}/a.exr -s 7": r"has 2 sensor\(s\), and index 7 is out of range",
     "render scene.xml -o {o}/a.exr -D level": "write -D KEY=VALUE",
     "render scene.xml -o {o}/a.exr -D integrator=nope": '"nope" not found',
-    "render scene.xml -o {o}/a.exr -D levle=2": r'asks for no "\$levle": correct the name',
+    "render scene.xml -o {o}/a.exr -D levle=2": r'does not use "\$levle"; correct the name',
     "render scene.xml -o {o}/a.exr -m scalar_rgb -s 1": '"panorama" needs a variant that compiles its kernels',
     "render none.xml -o {o}/a.exr": "there is no scene file",
     # A plugin's sentence arrives through Mitsuba's own exception, which quotes the traceback of ours.
@@ -106,7 +106,7 @@ LINES = {
     "export points f.safetensors -o {o}/a.glb --up x": "--up must be z or y",
     "export splats f.safetensors -o {o}/a.splat": r"end in \.ply",
     "export volume f.safetensors -o {o}/a.exr": r"end in \.vol",
-    "export points f.safetensors -o {o}/a.ply --variant no": r"no variant \"no\"",
+    "export points f.safetensors -o {o}/a.ply --variant no": r"no Mitsuba variant \"no\"",
     "export torch-ngp f.safetensors -o {o}/a.pth": "no torch-ngp form",
     "import ngp.pth": "no output is given",
     "import ngp.pth -g {o}/g.safetensors": "contains no gaze field",

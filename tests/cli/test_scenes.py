@@ -302,7 +302,7 @@ def test_values_for_the_scene_of_a_figure(nerg, tmp_path):
         assert nerg(*line, tmp_path / f"{k}.png", *more).code == 0
     assert (tmp_path / "0.png").read_bytes() != (tmp_path / "1.png").read_bytes()
     ended = nerg(*line, tmp_path / "a.png", "-D", "tal=0.1")
-    assert ended.code == 1 and 'asks for no "$tal"' in ended.err
+    assert ended.code == 1 and 'does not use "$tal"' in ended.err
 
 
 def test_a_mesh_becomes_a_picture(nerg, tmp_path):
