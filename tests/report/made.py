@@ -57,7 +57,7 @@ def stage(boxes=(SHELF,)) -> Stage:
     return Stage(cube(), observers, [path, path[:3]], boxes, np.array([0.0, 0, 1]), camera)
 
 
-def whole_result(name: str = "shelf") -> Run:
+def full_run(name: str = "shelf") -> Run:
     """A run with all data; ``name``: name of files, participants and AOIs."""
     rays = crowd(400)
     picture = lambda words: ReportPicture(PNG, f"{words} {name}", f"{words} {name}.")
@@ -105,7 +105,7 @@ def whole_result(name: str = "shelf") -> Run:
     )
 
 
-def bare() -> Run:
+def minimal_run() -> Run:
     """A run with the minimum of data."""
     return Run("Gaze", {"kind": "gaze"}, "Nothing is known of the place.", "none")
 

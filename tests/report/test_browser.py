@@ -15,7 +15,7 @@ import time
 import pytest
 
 from nerg_mi.report.sections import render_page
-from tests.report.made import HOSTILE, bare, whole_result
+from tests.report.made import HOSTILE, full_run, minimal_run
 
 REQUIRED = os.environ.get("NERG_REQUIRE_BROWSER", "0") not in ("", "0")
 
@@ -93,7 +93,7 @@ def pixels(browser) -> tuple[int, int]:
 
 @pytest.mark.parametrize("name", ["shelf", HOSTILE], ids=["plain", "hostile"])
 def test_page_renders_offline(browser, tmp_path, name):
-    path = opened(browser, tmp_path, whole_result(name))
+    path = opened(browser, tmp_path, full_run(name))
     assert browser.execute_script("return document.querySelector('#stage').className") == "live"
     assert browser.execute_script("return document.querySelector('#stage canvas').dataset.drawn") == "true"
     colors, drawn = pixels(browser)
@@ -107,7 +107,7 @@ def test_3d_view_is_interactive(browser, tmp_path):
     from selenium.webdriver import ActionChains
     from selenium.webdriver.common.by import By
 
-    opened(browser, tmp_path, whole_result())
+    opened(browser, tmp_path, full_run())
     stage = browser.find_element(By.ID, "stage")
     canvas = stage.find_element(By.TAG_NAME, "canvas")
     browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", canvas)
@@ -150,7 +150,7 @@ def origin(canvas):
 
 
 def test_fallback_image_without_scripts_and_in_print(browser, tmp_path):
-    opened(browser, tmp_path, whole_result())
+    opened(browser, tmp_path, full_run())
     shown = "return getComputedStyle(document.querySelector(arguments[0])).display"
     assert browser.execute_script(shown, "#stage .still") == "none"
     browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
@@ -160,7 +160,7 @@ def test_fallback_image_without_scripts_and_in_print(browser, tmp_path):
     browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": ""})
     browser.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": True})
     try:
-        opened(browser, tmp_path, whole_result())
+        opened(browser, tmp_path, full_run())
     finally:
         browser.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": False})
     assert browser.execute_script(shown, "#stage canvas") == "none"
@@ -171,13 +171,13 @@ def test_page_fits_a_narrow_screen(browser, tmp_path):
     size = {"width": 390, "height": 800, "deviceScaleFactor": 1, "mobile": False}
     browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
     try:
-        opened(browser, tmp_path, whole_result())
+        opened(browser, tmp_path, full_run())
         assert browser.execute_script("return document.documentElement.scrollWidth") <= 390
     finally:
         browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 
 
 def test_bare_report_renders(browser, tmp_path):
-    opened(browser, tmp_path, bare())
+    opened(browser, tmp_path, minimal_run())
     assert [e for e in browser.get_log("browser") if e["level"] in ("SEVERE", "WARNING")] == []
     assert browser.execute_script("return document.querySelector('h1').textContent") == "Gaze"

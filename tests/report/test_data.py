@@ -41,7 +41,7 @@ from nerg_mi.statistics.visits import HitAssignment
 from nerg_mi.train.geometry import TrainingGeometry
 from nerg_mi.transport.geometry import SceneGeometry
 from tests.evaluation.test_gaze import crowd
-from tests.report.made import bare, stage, whole_result
+from tests.report.made import full_run, minimal_run, stage
 
 # ---- Viewpoints in a hall of four walls with closed-form depths ----
 
@@ -385,9 +385,9 @@ def test_farthest_point_sampling():
 
 
 def test_verdicts():
-    ((results, verdict),) = whole_result().verdicts
+    ((results, verdict),) = full_run().verdicts
     assert results.split == "both" and verdict.grade == "use"
-    assert bare().verdicts == [] and bare().provenance == {}
+    assert minimal_run().verdicts == [] and minimal_run().provenance == {}
 
 
 # ---- Packed 3D view ----

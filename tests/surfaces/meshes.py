@@ -50,7 +50,7 @@ def vmf(mi, mu, kappa: float):
     return lambda d: scale * dr.exp(kappa * (dr.dot(mean, d) - 1))
 
 
-def lookers_of_law(law):
+def observers_from_law(law):
     """Observers whose density depends on the direction alone: ``law`` of unit directions, in 1/sr."""
     import mitsuba as mi
 

@@ -29,7 +29,7 @@ from nerg_mi.surfaces.sources import (
     sum_gaze,
     sum_rays,
 )
-from tests.surfaces.meshes import box, joined, lookers_of_law, plate, vmf
+from tests.surfaces.meshes import box, joined, observers_from_law, plate, vmf
 
 # ---- Cones, against Legendre polynomials and the Rayleigh distribution ----
 
@@ -89,7 +89,7 @@ MEAN = np.array([0.84, 0.5, -0.2]) / np.linalg.norm([0.84, 0.5, -0.2])
 def test_closed_room_receives_all_gaze(rgb, kappa, eye):
     """Also for an observer one millimetre from a wall."""
     target = SurfaceTarget(refine(joined(ROOM, SHELF), 0.4).mesh)
-    sums = sum_gaze(target, lookers_of_law(vmf(rgb, MEAN, kappa)), np.array([eye]), [1.0], SETTINGS)
+    sums = sum_gaze(target, observers_from_law(vmf(rgb, MEAN, kappa)), np.array([eye]), [1.0], SETTINGS)
     assert abs(sums.total - 1) < 3e-4 and sums.escaped == 0 and sums.elsewhere == 0
     assert abs(sums.unaccounted) < 1e-3
     assert np.isclose(sums.vertex_sums.sum(), sums.face_sums.sum(), rtol=1e-12)
@@ -103,7 +103,7 @@ def test_surface_occluder_and_escaped_shares(rgb, y, kappa):
         room = joined(box((0, 0, 0), (4, 3, 2.5), without))
         sums = sum_gaze(
             SurfaceTarget(room, [SHELF]),
-            lookers_of_law(vmf(rgb, MEAN, kappa)),
+            observers_from_law(vmf(rgb, MEAN, kappa)),
             np.array([(1.0, y, 1.5)]),
             [2.0],
             SETTINGS,
@@ -134,7 +134,9 @@ def test_uniform_gaze_gives_solid_angles(rgb):
     uniform = lambda d: dr.full(rgb.Float, 1 / (4 * np.pi), dr.width(d))
     target, eye = SurfaceTarget(joined(ROOM)), np.array([(1.0, 0.7, 1.5)])
     for cone in (0.0, 0.03):
-        sums = sum_gaze(target, lookers_of_law(uniform), eye, [1.0], GazeSumSettings(max_angle=0.1, cone_sigma=cone))
+        sums = sum_gaze(
+            target, observers_from_law(uniform), eye, [1.0], GazeSumSettings(max_angle=0.1, cone_sigma=cone)
+        )
         floor = sums.face_sums[(target.mesh.corners[:, :, 2] == 0).all(axis=1)].sum()
         # Of a rectangle, by the four rectangles between the foot point and its corners.
         x, y, h = np.array([1.0, 3.0]), np.array([0.7, 2.3]), 1.5
@@ -144,11 +146,13 @@ def test_uniform_gaze_gives_solid_angles(rgb):
 
 def test_cone_widens_gaze_and_keeps_its_total(rgb):
     target, eye = SurfaceTarget(refine(joined(ROOM), 0.2).mesh), np.array([(2.0, 1.5, 1.2)])
-    law, cone = lookers_of_law(vmf(rgb, (1, 0.1, 0), 400.0)), 0.026
+    law, cone = observers_from_law(vmf(rgb, (1, 0.1, 0), 400.0)), 0.026
     plain = sum_gaze(target, law, eye, [1.0], SETTINGS)
     wide = sum_gaze(target, law, eye, [1.0], dataclasses.replace(SETTINGS, cone_sigma=cone))
     # A vMF law after a Gaussian is nearly one whose variance is the sum.
-    expected = sum_gaze(target, lookers_of_law(vmf(rgb, (1, 0.1, 0), 1 / (1 / 400 + cone**2))), eye, [1.0], SETTINGS)
+    expected = sum_gaze(
+        target, observers_from_law(vmf(rgb, (1, 0.1, 0), 1 / (1 / 400 + cone**2))), eye, [1.0], SETTINGS
+    )
     assert abs(wide.face_sums.sum() - 1) < 1e-3
     assert np.abs(wide.face_sums - expected.face_sums).sum() < 0.03 < np.abs(plain.face_sums - expected.face_sums).sum()
 
@@ -189,7 +193,7 @@ def test_sums_match_surface_attention(rgb, tmp_path):
 def test_parts_add_up_exactly(rgb):
     target, law, coarse = (
         SurfaceTarget(joined(ROOM)),
-        lookers_of_law(vmf(rgb, (0, 1, 0), 5.0)),
+        observers_from_law(vmf(rgb, (0, 1, 0), 5.0)),
         GazeSumSettings(max_angle=0.2),
     )
     observers, weights = np.random.default_rng(0).uniform(0.5, 2, (3, 3)), np.array([0.2, 0.3, 0.5])

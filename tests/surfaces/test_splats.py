@@ -26,7 +26,7 @@ from nerg_mi.transport.observer import ObserverSettings
 from nerg_mi.transport.splat_medium import SplatArrays
 from tests.reference import splats as reference
 from tests.reference.splats import peaks
-from tests.surfaces.meshes import TURN_X, lookers_of_law, vmf, wall
+from tests.surfaces.meshes import TURN_X, observers_from_law, vmf, wall
 from tests.transport.test_splat_medium import medium_of, rays, stack
 
 # ---- Splat areas ----
@@ -176,8 +176,8 @@ def test_splat_parts_are_reproducible(rgb):
 def test_escaped_gaze(rgb, cone):
     """Gaze along z that is mostly blocked by a wall; reference by all Gaussians in float64."""
     splats, eye, kappa = some(), np.array([0.1, -0.2, -1.5]), 8.0
-    looker = lookers_of_law(vmf(rgb, (0, 0, 1), kappa))(eye)
-    total, escaped = integrate_gaze(SplatArrays(splats, ns), looker, eye, cone)
+    observer = observers_from_law(vmf(rgb, (0, 0, 1), kappa))(eye)
+    total, escaped = integrate_gaze(SplatArrays(splats, ns), observer, eye, cone)
     d = fibonacci_directions(20_000)
     share = np.exp(kappa * (d[:, 2] - 1))
     left = shares(splats, np.broadcast_to(eye, d.shape), d)[1]
@@ -285,7 +285,7 @@ ALONG = np.array([0.0, 0, 1])
 def result(splats, law, observers=EYE, weights=(1.0,), **options):
     place = SceneGeometry(medium_of(splats))
     settings = ObserverSettings(march=default_march_settings(place))
-    make, observers, weights = lookers_of_law(law), np.asarray(observers), np.asarray(weights)
+    make, observers, weights = observers_from_law(law), np.asarray(observers), np.asarray(weights)
     return splat_densities(splats, place, make, observers, weights, settings, **options).sum(axis=0)
 
 
