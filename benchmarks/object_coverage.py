@@ -48,7 +48,7 @@ class Population:
                 np.savez(file, **{f"{w}_{k}": v for k, pair in result.items() for w, v in zip("xy", pair)})
         self.pairs = result
         self.truth = {k: x.sum(axis=0) / y.sum(axis=0) for k, (x, y) in result.items()}
-        self.common = self.truth["reach"] >= 0.5
+        self.common = self.truth["hit_ratio"] >= 0.5
         self.count = len(result["reach"][0])
 
     def draw(self, measure: str, who: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -313,7 +313,7 @@ def main() -> None:
     parser.add_argument("what", choices=("shares", "ratios", "few", "numbers", "differences"))
     parser.add_argument("--sets", type=int, default=1000, help="data sets (1000)")
     parser.add_argument("--people", type=int, nargs="+", default=[8, 16, 40], help="people of each (8 16 40)")
-    parser.add_argument("--of", nargs="+", default=["share", "given_visible", "distance"], help="numbers of the ratios")
+    parser.add_argument("--of", nargs="+", default=["share", "share_when_visible", "distance"], help="numbers of the ratios")
     parser.add_argument("--population", type=Path, help=".npz file of the sums, written where there is none")
     arguments = parser.parse_args()
     people = tuple(arguments.people)
@@ -321,7 +321,7 @@ def main() -> None:
         shares(people)
         return
     population = Population(arguments.population)
-    truth = population.truth["reach"]
+    truth = population.truth["hit_ratio"]
     print(
         f"{arguments.sets} data sets; hit ratio of {population.common.sum()} common AOIs "
         f"{truth[population.common].min():.2f}"

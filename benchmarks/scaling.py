@@ -75,7 +75,7 @@ def count(folder: Path, name: str, **overrides) -> tuple[int, bytes]:
         aois=folder / "areas.json", resamples=199, show_names=True, mode="llvm_ad_rgb", **overrides
     )
     stats([folder / "scene.xml", folder / "rays.npz"], folder / name, options)
-    return 0, (folder / name / "things.csv").read_bytes()
+    return 0, (folder / name / "aois.csv").read_bytes()
 
 
 def main() -> None:

@@ -342,8 +342,8 @@ def test14_a_shop(rgb, tmp_path, monkeypatch):
     fewer = 'output="numbers", viewpoints=5, directions=512, resamples=199, aoi_samples=8'
     names = run(block.text.replace('output="numbers"', fewer), block.page)
     assert set(names["counted"]) == set(read_areas(tmp_path / "areas.json").names)
-    assert names["weakest"] in names["counted"] and "display" in {r["thing"] for r in names["found"].what_if}
-    assert (tmp_path / "numbers" / "things.png").is_file()
+    assert names["weakest"] in names["counted"] and "display" in {r["aoi"] for r in names["found"].what_if}
+    assert (tmp_path / "numbers" / "aois.png").is_file()
 
 
 def test15_files_of_statistics(tmp_path):

@@ -36,10 +36,11 @@ ABLATION = (
     "default_emit_capture_0.safetensors default_emit_capture_0.json"
 )
 EVALUATION = "gaze.md gaze.csv persons.csv gaze.json positions.csv positions.png"
-STATS = "things.csv things.md moves.csv moves.md durations.csv durations.md people.csv people.md things.png moves.png "
+STATS = "aois.csv aois.md transitions.csv transitions.md durations.csv durations.md participants.csv participants.md "
+STATS += "aois.png transitions.png "
 STATS += "about.json"
 if has_parquet():
-    STATS += " things.parquet moves.parquet durations.parquet people.parquet"
+    STATS += " aois.parquet transitions.parquet durations.parquet participants.parquet"
 GAZE = "--radius 0.6 --probes 8 --steps 2 --directions 64 --zones 0 --min-rays 8 --seed 1"
 
 

@@ -362,7 +362,7 @@ def test_attention_is_counted(nerg, tmp_path):
     line = "stats {o}/rays.npz {o}/scene.xml --areas {o}/areas.json -o {o}/out --window early=0,8 --resamples 199"
     ended = nerg(*line.format(o=tmp_path).split(), *LLVM)
     assert ended.code == 0 and "480 rays of 6 people" in ended.out + ended.err
-    assert "| window early | the sign | tracked | 6 |" in (tmp_path / "out" / "things.md").read_text()
+    assert "| window early | the sign | measured | 6 |" in (tmp_path / "out" / "aois.md").read_text()
 
 
 @pytest.mark.nightly

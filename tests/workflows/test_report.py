@@ -91,7 +91,7 @@ def test_everything_of_a_folder(run, tmp_path):
         and min(found.nearby_participants) >= 1
     )
     # Nobody's name, neither of rays nor of evaluations.
-    assert not any(name in text for name in NAMES) and "person 1" in text
+    assert not any(name in text for name in NAMES) and "participant 1" in text
     # How many rays of how many people the gaze rests on, and what all of it was made of.
     assert (
         re.fullmatch(r"made of [\d,]+ rays of [1-4] people", found.support_note) and text.count(found.support_note) >= 2
@@ -120,10 +120,10 @@ def test_a_gaze_field_alone(run, tmp_path):
     result = make_report([run / "gaze.safetensors"], tmp_path / "a.html", SMALL, told)
     text = result.path.read_text(encoding="utf-8")
     for sentence in (
-        "There is no verdict, for no evaluation is at hand",
-        "The rays are not at hand, so that nothing is shown of who was recorded; the field was trained on",
-        "The rays are not at hand, so that it is not known where people were.",
-        "No objects are named: --objects FILE.json gives their boxes.",
+        "No evaluation was given",
+        "No gaze samples were given, so the report has no data-quality section. The field was trained on",
+        "No gaze samples were given, so the participants' positions are unknown.",
+        "No AOIs were given. Name a file of AOIs with --aois FILE.json.",
     ):
         assert sentence in text
     assert "no evaluation is at hand" in told.messages[0] and packed_scene(text)["marks"] == 1
@@ -182,7 +182,7 @@ def test_without_a_place(tmp_path):
     result = make_report([tmp_path / "gaze.safetensors", tmp_path / "rays.npz"], tmp_path / "a.html", options)
     text = result.path.read_text(encoding="utf-8")
     assert "Nothing is known of the place" in text and "There is no 3D scene" in text and result.run.objects == ()
-    assert "No objects are named, for nothing is known of the place." in text and "sphere" in result.run.pictures
+    assert "AOIs need the geometry of the scene, which was not given." in text and "sphere" in result.run.pictures
 
 
 @pytest.mark.nightly

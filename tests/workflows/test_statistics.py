@@ -43,8 +43,8 @@ def test01_counts_are_those_of_a_loop(folder):
         on = np.array([kind in kinds for kind, _ in met])
         shares = [on[rays.person == p].mean() for p in range(6)]
         (row,) = table(found.aois, cell="all", aoi=name)
-        assert row["source"] == "tracked" and row["participants"] == 6
-        assert row["share"] == pytest.approx(np.mean(shares)) and row["reach"] == np.mean([s > 0 for s in shares])
+        assert row["source"] == "measured" and row["participants"] == 6
+        assert row["share"] == pytest.approx(np.mean(shares)) and row["hit_ratio"] == np.mean([s > 0 for s in shares])
         # Every ray stands for 0.2 s, the last one too.
         assert row["dwell"] == pytest.approx(16 * np.mean(shares))
         far = np.array([at for _, at in met])
@@ -59,13 +59,13 @@ def test01_counts_are_those_of_a_loop(folder):
             looks += (seen & ~np.r_[False, seen[:-1]]).sum()
             firsts += 0.2 * np.argmax(seen) if seen.any() else 0
             reached += seen.any()
-        assert row["looks"] == pytest.approx(looks / 6) and row["first_look"] == pytest.approx(firsts / reached)
+        assert row["visits"] == pytest.approx(looks / 6) and row["time_to_first_visit"] == pytest.approx(firsts / reached)
         for cohort, code in (("even", 0), ("odd", 1)):
             (row,) = table(found.aois, cell="cohort", value=cohort, aoi=name)
             mine = [s for p, s in enumerate(shares) if p % 2 == code]
             assert row["share"] == pytest.approx(np.mean(mine)) and row["participants"] == 3
     assert {r["cell"] for r in found.differences} == {"cohort"}
-    assert sum(r["moves"] for r in found.transitions if r["cell"] == "all") > 5
+    assert sum(r["transitions"] for r in found.transitions if r["cell"] == "all") > 5
 
 
 def test02_what_could_be_seen_contains_what_was(folder):
@@ -78,7 +78,7 @@ def test02_what_could_be_seen_contains_what_was(folder):
     assert (sums.dwell_time <= sums.visible_time + 1e-9).all()
     rows = sums.find_participants(sums.cells[0])[0]
     on, could = sums.dwell_time[rows, 0].sum(), sums.visible_time[rows, 0].sum()
-    assert sign["given_visible"] == pytest.approx(on / could)
+    assert sign["share_when_visible"] == pytest.approx(on / could)
 
 
 def test03_windows_zones_and_cohorts_of_a_file(folder, tmp_path):
@@ -127,19 +127,19 @@ def test04_the_field_beside_the_rays_and_what_if(folder, tmp_path):
     rows = {(r["aoi"], r["measure"]): r for r in found.what_if}
     # The stand stood before the sign.
     sign = rows["the sign", "visible"]
-    assert sign["source"] == "field" and sign["after"] > sign["before"] and sign["participants"] == 6
+    assert sign["source"] == "predicted" and sign["after"] > sign["before"] and sign["participants"] == 6
     assert rows["new", "share"]["before"] is None and rows["new", "share"]["after"] > 0
     assert rows["the sign", "share"]["after"] != rows["the sign", "share"]["before"]
     assert recorder.messages.count(f"of {folder / 'tile.obj'}: statements that are not used: usemtl") == 1
     # Its checkpoint says nothing of what it learnt from.
-    assert any("keeps no support" in text for text in recorder.messages) and field[0]["support"] is None
+    assert any("does not contain training support" in text for text in recorder.messages) and field[0]["support"] is None
     assert "not in the checkpoint" in (tmp_path / "out" / "what_if.md").read_text()
     names = {p.name for p in found.files}
-    assert {"things.csv", "things.md", "what_if.csv", "things.png", "about.json", "people.csv"} <= names
+    assert {"aois.csv", "aois.md", "what_if.csv", "aois.png", "about.json", "participants.csv"} <= names
     assert all(p.is_file() for p in found.files)
-    with (tmp_path / "out" / "things.csv").open() as file:
+    with (tmp_path / "out" / "aois.csv").open() as file:
         first = next(csv.DictReader(file))
-    assert float(first["share"]) == found.aois[0]["share"] and first["thing"] == "the sign"
+    assert float(first["share"]) == found.aois[0]["share"] and first["aoi"] == "the sign"
     text = "".join(p.read_text() for p in found.files if p.suffix in (".csv", ".md", ".json"))
     assert "name 0" not in text
 

@@ -212,7 +212,7 @@ def test_gaze_that_meets_nothing_is_refused_and_doubts_are_told_with_the_next_co
         check_geometry(nowhere, RAYS, "--field f", False, reporter)
     check_geometry(nowhere, RAYS, "--field f", True, reporter)
     check_geometry(place(AlignmentCheck(0.4, 0.3, 0.2), monkeypatch), RAYS, "--scene s", False, reporter)
-    assert len(reporter.warnings) == 2 and "30 % of the heads are inside of something" in reporter.warnings[1]
+    assert len(reporter.warnings) == 2 and "30 % of the heads are inside solid objects" in reporter.warnings[1]
     assert "nerg align RAYS --scene s -o alignment.json" in reporter.warnings[1]
     check_geometry(place(AlignmentCheck(0.05, 0.0, 0.0), monkeypatch), RAYS, "--field f", False, reporter)
     for kind in ("hits", "none"):
