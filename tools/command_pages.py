@@ -61,7 +61,7 @@ def _lists(command: Any, context: Any) -> Iterator[str]:
 
 
 def _spell_range(meaning: str) -> str:
-    """A help text whose range "(0<=x<=1)" at the end reads "From 0 to 1."."""
+    """Spell a range at the end of a help text, "(0<=x<=1)", as "From 0 to 1."."""
     match = re.fullmatch(r"(.*?) \(([-+\w.]+)<=x<=([-+\w.]+)\)", meaning, re.S)
     if match is None:
         return meaning

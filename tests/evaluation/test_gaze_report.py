@@ -194,12 +194,28 @@ def scored(field, nearest=(0.4, 0.65, 0.55), **options):
 @pytest.mark.parametrize(
     "field, grade, words",
     [
-        ((0.9, 0.85, 0.3), "use", "Better than nearest rays, the strongest baseline, for held-out participants at held-out positions."),
+        (
+            (0.9, 0.85, 0.3),
+            "use",
+            "Better than nearest rays, the strongest baseline, for held-out participants at held-out positions.",
+        ),
         ((0.42, 0.66, 0.54), "limited", "the comparison with nearest rays is undecided with 30 participants"),
-        ((0.2, 0.5, 0.65), "limited", "worse than nearest rays for held-out participants at held-out positions: use the rays directly"),
+        (
+            (0.2, 0.5, 0.65),
+            "limited",
+            "worse than nearest rays for held-out participants at held-out positions: use the rays directly",
+        ),
         ((0.01, 0.41, 0.74), "unclear", "Not shown to be better than position-blind for held-out participants"),
-        ((-0.3, 0.2, 0.95), "reject", "Worse than position-blind for held-out participants at held-out positions: do not use."),
-        ((-0.9, -0.3, 1.6), "reject", "Worse than the uniform density for held-out participants at held-out positions: do not use."),
+        (
+            (-0.3, 0.2, 0.95),
+            "reject",
+            "Worse than position-blind for held-out participants at held-out positions: do not use.",
+        ),
+        (
+            (-0.9, -0.3, 1.6),
+            "reject",
+            "Worse than the uniform density for held-out participants at held-out positions: do not use.",
+        ),
     ],
 )
 def test_each_grade(field, grade, words):
