@@ -141,26 +141,6 @@ def test10_settings_of_the_study_are_the_studys():
     assert len(told) > 50 and told <= names
 
 
-# ---- Sizes: a page is read as it stands, too ----
-
-
-@pytest.mark.parametrize("page", [*PAGES, ROOT / "CHANGELOG.md"], ids=lambda p: p.name)
-def test_lines_have_at_most_100_columns(page):
-    """Prose and lists of every page; tables and code may be wider where a name or a number has no room."""
-    text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
-    lines = [line for line in text.splitlines() if not line.startswith("|") and "](" not in line]
-    assert not [line for line in lines if len(line) > 100 and " " in line.strip()]
-
-
-@pytest.mark.parametrize("page", sorted((ROOT / "docs" / "how-to").glob("*.md")), ids=lambda p: p.name)
-def test_a_task_has_at_most_150_lines(page):
-    assert len(page.read_text(encoding="utf-8").splitlines()) <= 150
-
-
-def test_the_readme_has_at_most_120_lines():
-    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 120
-
-
 # ---- The README and the pages at the root ----
 
 

@@ -22,7 +22,7 @@ from pathlib import Path
 
 import nerg_mi  # noqa: F401 (before Mitsuba, since it chooses the libLLVM)
 from tests.fuzz import cases, commands, readers, semantic
-from tests.fuzz.watch import BREACHES, CORPUS, kept, run_cases
+from tests.fuzz.watch import BREACHES, CORPUS, corpus_name, run_cases
 from tools.page import table, update_table
 
 HEADER = (
@@ -75,9 +75,9 @@ def main() -> int:
                 max_memory[name] = max(max_memory[name], report.memory)
                 if report.outcome in BREACHES:
                     broken += 1
-                    print(f"{kept(case)}: {report.outcome}: {report.said}", file=sys.stderr, flush=True)
+                    print(f"{corpus_name(case)}: {report.outcome}: {report.said}", file=sys.stderr, flush=True)
                     if options.keep and not case.special:
-                        (CORPUS / kept(case)).write_bytes(case.data)
+                        (CORPUS / corpus_name(case)).write_bytes(case.data)
         except KeyboardInterrupt:
             # Show the results so far, but do not update the page.
             interrupted = True

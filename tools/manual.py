@@ -48,7 +48,7 @@ class PluginManual:
 def convert_inline(text: str) -> str:
     """Convert inline reStructuredText to Markdown."""
     text = re.sub(r":math:`([^`]+)`", r"$\1$", text)
-    text = re.sub(r":ref:`([^`<]+?) <[^`>]+>`", r"`\1`", text)
+    text = re.sub(r":ref:`([^`<]+?)\s+<[^`>]+>`", r"`\1`", text)
     text = re.sub(r":(?:paramtype|monosp):`([^`]+)`", r"`\1`", text)
     text = re.sub(r"\|(\w+)\|", r"\1", text)
     text = re.sub(r"``([^`]+)``", r"`\1`", text)

@@ -17,7 +17,7 @@ from nerg_mi.formats.meshes import READERS
 from nerg_mi.maths.arrays import to_vector
 from nerg_mi.maths.types import variant_types
 from nerg_mi.ranges import MAX_COORDINATE, Range, check_number
-from nerg_mi.statistics.shares import QuadratureRule, Shares, gaze_shares
+from nerg_mi.statistics.shares import SummationRule, Shares, gaze_shares
 from nerg_mi.statistics.visits import MARGIN, BoxAoi
 from nerg_mi.workflows.base import SILENT, Reporter
 
@@ -404,7 +404,7 @@ def _to_array(value: Any, count: int) -> Floats:
 # on the surface.
 
 
-DEFAULT_SUM_RULE = QuadratureRule()
+DEFAULT_SUM_RULE = SummationRule()
 """Default accuracy of the attention share of a box."""
 
 PATCH_SIZE_RATIO = 4
@@ -548,7 +548,7 @@ def attention(
         if divisions is not None or two_sided:
             raise NergError("divisions and two_sided apply to meshes only, but the surface is a box; omit them")
         positions = resolve_observers(scene, observers)
-        rule = QuadratureRule(rtol=float(tolerance))
+        rule = SummationRule(rtol=float(tolerance))
         shares = compute_box_shares(scene, [region], positions, margin=float(margin), rule=rule, reporter=reporter)
         to_single = lambda v: np.ascontiguousarray(v, np.float32)
         return Attention(
@@ -580,7 +580,7 @@ def compute_box_shares(
     observers: Floats,
     *,
     margin: float = MARGIN,
-    rule: QuadratureRule = DEFAULT_SUM_RULE,
+    rule: SummationRule = DEFAULT_SUM_RULE,
     reporter: Reporter = SILENT,
 ) -> Shares:
     """Compute the attention shares of N boxes, which may be rotated, for M observers.

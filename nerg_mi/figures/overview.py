@@ -25,7 +25,7 @@ _ATTENTION_THRESHOLD = 0.15
 
 
 @dataclass(frozen=True)
-class CameraView:
+class ScoredView:
     """A camera at ``origin`` (3,) that looks at ``target`` (3,), its score (0..1), the fraction of pixels with a
     surface, and the share of the observer's attention in the image (None without an observer)."""
 
@@ -158,7 +158,7 @@ class ViewScorer:
             trace_mean,
         )
 
-    def score_views(self, origins: np.ndarray, targets: np.ndarray, size: tuple[int, int]) -> list[CameraView]:
+    def score_views(self, origins: np.ndarray, targets: np.ndarray, size: tuple[int, int]) -> list[ScoredView]:
         """Score cameras at ``origins`` that look at ``targets``, (N, 3) each, in images of the given size."""
         width, height = size
         ahead = targets - origins
@@ -188,7 +188,7 @@ class ViewScorer:
             # Attended surfaces should cover a third of the image; the rest shows the context.
             score = score * (0.05 + 0.95 * attention_share) * (0.25 + 0.75 * np.minimum(covered / 0.3, 1))
             attention = [float(x) for x in attention_share]
-        return [CameraView(*row) for row in zip(origins, targets, score.tolist(), surface_fraction.tolist(), attention)]
+        return [ScoredView(*row) for row in zip(origins, targets, score.tolist(), surface_fraction.tolist(), attention)]
 
     def _attention_shares(
         self,
@@ -232,7 +232,7 @@ class ViewScorer:
         """Return the index of the best of a few cameras."""
         return int(np.argmax([shot.score for shot in self.score_views(origins, targets, _COARSE_SIZE)]))
 
-    def find_best(self, origins: np.ndarray, targets: np.ndarray) -> CameraView | None:
+    def find_best(self, origins: np.ndarray, targets: np.ndarray) -> ScoredView | None:
         """Return the best of many cameras; None if no image shows a surface."""
         is_valid = np.linalg.norm(targets - origins, axis=1) > 1e-6 * max(self.typical_distance, 1e-12)
         if not is_valid.any():
@@ -254,7 +254,7 @@ def _depth_spread(depth: np.ndarray) -> float:
 
 def view_of_observer(
     trace: Trace, frame: PinholeFrame, seen: SeenSurfaces, trace_mean: Trace | None = None
-) -> CameraView | None:
+) -> ScoredView | None:
     """Return the camera that shows best where an observer looks, from a position visible to the observer; None without
     surfaces.
 
@@ -302,7 +302,7 @@ def view_of_scene(
     allow_outside: bool = True,
     trace_mean: Trace | None = None,
     is_solid: Callable[[np.ndarray], np.ndarray] | None = None,
-) -> CameraView | None:
+) -> ScoredView | None:
     """Return the camera that shows best the box between ``lower`` and ``upper`` (3,); None without surfaces.
 
     Parameters

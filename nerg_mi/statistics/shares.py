@@ -73,7 +73,7 @@ class Shares:
 
 
 @dataclass(frozen=True, kw_only=True)
-class QuadratureRule:
+class SummationRule:
     """Accuracy of the integrals: relative tolerance, absolute tolerance as a share of the gaze, and initial number
     of directions."""
 
@@ -82,7 +82,7 @@ class QuadratureRule:
     initial_directions: int = INITIAL_DIRECTIONS
 
 
-COARSE = QuadratureRule(rtol=0.02, atol=5e-5)  # for many areas, or for averages over many observers
+COARSE = SummationRule(rtol=0.02, atol=5e-5)  # for many areas, or for averages over many observers
 
 
 def gaze_shares(
@@ -91,7 +91,7 @@ def gaze_shares(
     aois: Sequence[Aoi],
     members: Sequence[tuple[int, ...]],
     margin: float,
-    rule: QuadratureRule | None = None,
+    rule: SummationRule | None = None,
     on_progress: Callable[[int], None] | None = None,
 ) -> Shares:
     """Compute the attention shares of areas in the gaze of observers.
@@ -118,7 +118,7 @@ def gaze_shares(
     NergError
         If the gaze density is not finite.
     """
-    rule = rule or QuadratureRule()
+    rule = rule or SummationRule()
     observers = np.asarray(observers, float)
     blocks: list[Shares] = []
     block_size = max(1, _RAY_BATCH // rule.initial_directions)
@@ -145,7 +145,7 @@ class _AdaptiveSums:
         aois: Sequence[Aoi],
         members: Sequence[tuple[int, ...]],
         margin: float,
-        rule: QuadratureRule,
+        rule: SummationRule,
     ):
         self.query_from, self.observers, self.aois, self.members = query_from, observers, aois, members
         self.queries: dict[int, DirectionQuery] = {}

@@ -433,7 +433,7 @@ def print_guesses(files: list[Path], reporter: Reporter) -> None:
             reporter.message("\n" * (k > 0) + sanitize(f"{proposal.paths[0]}{count_note}", 2000))
         for name, sentences in (
             ("sure", proposal.certain),
-            ("guess", proposal.guesses),
+            ("guess", proposal.assumptions),
             ("open", proposal.questions),
         ):
             for sentence in sentences:

@@ -10,7 +10,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError, sanitize, translate_mitsuba_errors
 from nerg_mi.fields.gaze_base import RaySupport
-from nerg_mi.figures.overview import CameraView, PinholeFrame, SeenSurfaces, ViewScorer, view_of_observer, view_of_scene
+from nerg_mi.figures.overview import ScoredView, PinholeFrame, SeenSurfaces, ViewScorer, view_of_observer, view_of_scene
 from nerg_mi.maths.geometry import Similarity, box_from_dict
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.rays.rays import Rays
@@ -132,7 +132,7 @@ def turn_to_attention(eye: LookAt, seen: SeenSurfaces) -> LookAt:
 
 def find_best_camera(
     probe: SceneProbe, seen: SeenSurfaces | None, frame: PinholeFrame, field_box: dict | None
-) -> CameraView | None:
+) -> ScoredView | None:
     """Return the best overview of what the observer of ``seen`` looks at, or of the whole scene.
 
     ``field_box`` is the stored box of a radiance field, None for other scenes.

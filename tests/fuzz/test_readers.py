@@ -13,7 +13,7 @@ import pytest
 from tests.fuzz import commands, semantic
 from tests.fuzz.cases import draw_cases, make_inputs
 from tests.fuzz.readers import ALL, READERS
-from tests.fuzz.watch import BREACHES, Case, corpus, is_kept, run_cases
+from tests.fuzz.watch import BREACHES, Case, corpus, corpus_name, run_cases
 
 CASES = 750
 
@@ -30,7 +30,7 @@ def breaches(cases: list[Case], inputs: Path) -> list[str]:
     names, out = [r.name for r in READERS], []
     for case, report in run_cases(cases, inputs, names):
         if report.outcome in BREACHES:
-            out.append(f"{is_kept(case)}: {report.outcome}: {report.said}")
+            out.append(f"{corpus_name(case)}: {report.outcome}: {report.said}")
     return out
 
 

@@ -155,7 +155,7 @@ def run_cases(
 CORPUS = Path(__file__).with_name("corpus")
 
 
-def is_kept(case: Case) -> str:
+def corpus_name(case: Case) -> str:
     """Return the name of the file in the corpus that contains ``case``; for a case without data, the content of
     the file.
     """

@@ -11,7 +11,7 @@ from nerg_mi.maths.geometry import intersect_box_numpy
 from nerg_mi.maths.sphere import fibonacci_directions, indices_in_cone
 from nerg_mi.statistics.shares import (
     INITIAL_DIRECTIONS,
-    QuadratureRule,
+    SummationRule,
     SamplePoints,
     VisibilityCache,
     compute_isovists,
@@ -103,7 +103,7 @@ def test_smaller_tolerance_uses_more_directions():
     for tolerance in (0.1, 0.01, 0.001):
         hall = Hall()
         shares = gaze_shares(
-            hall.query_from, OBSERVERS[:1], [BoxAoi(BOXES[0])], [(0,)], 0.0, QuadratureRule(rtol=tolerance)
+            hall.query_from, OBSERVERS[:1], [BoxAoi(BOXES[0])], [(0,)], 0.0, SummationRule(rtol=tolerance)
         )
         errors.append(shares.error[0, 0])
         requested.append(sum(hall.requested))
