@@ -313,7 +313,9 @@ def main() -> None:
     parser.add_argument("what", choices=("shares", "ratios", "few", "numbers", "differences"))
     parser.add_argument("--sets", type=int, default=1000, help="data sets (1000)")
     parser.add_argument("--people", type=int, nargs="+", default=[8, 16, 40], help="people of each (8 16 40)")
-    parser.add_argument("--of", nargs="+", default=["share", "share_when_visible", "distance"], help="numbers of the ratios")
+    parser.add_argument(
+        "--of", nargs="+", default=["share", "share_when_visible", "distance"], help="numbers of the ratios"
+    )
     parser.add_argument("--population", type=Path, help=".npz file of the sums, written where there is none")
     arguments = parser.parse_args()
     people = tuple(arguments.people)

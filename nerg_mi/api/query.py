@@ -17,7 +17,7 @@ from nerg_mi.formats.meshes import READERS
 from nerg_mi.maths.arrays import to_vector
 from nerg_mi.maths.types import variant_types
 from nerg_mi.ranges import MAX_COORDINATE, Range, check_number
-from nerg_mi.statistics.shares import SummationRule, Shares, gaze_shares
+from nerg_mi.statistics.shares import Shares, SummationRule, gaze_shares
 from nerg_mi.statistics.visits import MARGIN, BoxAoi
 from nerg_mi.workflows.base import SILENT, Reporter
 

@@ -112,9 +112,7 @@ class GazeSettings(RunSettings):
     # Final learning rate as a fraction of the initial one; the decay is exponential.
     lr_final_ratio: float = range_field(0.03, Range(0, 1))
     # Fraction of the run with constant learning rate, before it decays
-    lr_hold_fraction: float = range_field(
-        0.3, Range(0, 0.999)
-    )
+    lr_hold_fraction: float = range_field(0.3, Range(0, 0.999))
     # AdamW: fraction of the weights per step and unit of learning rate.
     weight_decay: float = setting(0.3, "Decoupled weight decay (AdamW).", allowed=WEIGHT_DECAYS)
     # Decay per step of the exponential moving average of the weights, which is the result

@@ -10,7 +10,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError, sanitize, translate_mitsuba_errors
 from nerg_mi.fields.gaze_base import RaySupport
-from nerg_mi.figures.overview import ScoredView, PinholeFrame, SeenSurfaces, ViewScorer, view_of_observer, view_of_scene
+from nerg_mi.figures.overview import PinholeFrame, ScoredView, SeenSurfaces, ViewScorer, view_of_observer, view_of_scene
 from nerg_mi.maths.geometry import Similarity, box_from_dict
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.rays.rays import Rays

@@ -176,7 +176,7 @@ def test03_directions_are_normalised_and_broadcast():
     assert d.shape == (5, 3) and np.allclose(d, (0, 0.6, 0.8))
     with pytest.raises(NergError, match="d must not be zero, but row 1 is"):
         as_unit_vectors([(1, 0, 0), (0, 0, 0)], 2, "d")
-    with pytest.raises(NergError, match="that of the origins \(3\), got 2"):
+    with pytest.raises(NergError, match=r"that of the origins \(3\), got 2"):
         as_unit_vectors([(1, 0, 0), (0, 1, 0)], 3, "d")
 
 

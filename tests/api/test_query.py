@@ -410,7 +410,10 @@ def test08_the_scenes_own_observer_sees(files):
     [
         (lambda s: nerg.trace(s, (0, 0), (1, 0, 0)), "origins must have the shape"),
         (lambda s: nerg.trace(s, (0, 0, 0), (0, 0, 0)), "directions must not be zero, but row 0 is"),
-        (lambda s: nerg.trace(s, np.zeros((2, 3)), np.ones((3, 3))), "number of origins must be 1 or that of the directions .3., got 2"),
+        (
+            lambda s: nerg.trace(s, np.zeros((2, 3)), np.ones((3, 3))),
+            "number of origins must be 1 or that of the directions .3., got 2",
+        ),
         (lambda s: nerg.trace(s, (0, 0, 0), (0, 0, 1), "gazes"), "gazes"),
         (lambda s: nerg.observe(s, (0, 0, 0)), "scene has no observer"),
         (lambda s: nerg.observe(s, (0, 0, 0), (0, 0, 1), "color"), '"color"'),

@@ -106,7 +106,10 @@ CALLS = [
     (lambda: nerg.train_gaze("no.npz", scene="no.xml", test_particpants=0.3), 'did you mean "test_participants"'),
     (lambda: nerg.train_gaze("no.npz", scene="no.xml", test_people=0.3), 'file "no.xml" of "scene" does not exist'),
     (lambda: nerg.train_gaze("no.npz", geometry="none"), 'file "no.npz" of "rays" does not exist'),
-    (lambda: nerg.train_gaze(np.zeros(3), geometry="none"), "rays must be a Rays object .* got ndarray; use import_rays"),
+    (
+        lambda: nerg.train_gaze(np.zeros(3), geometry="none"),
+        "rays must be a Rays object .* got ndarray; use import_rays",
+    ),
     (lambda: nerg.train_gaze(None, scene=cube()), '"scene" must be a file, .* got Scene'),
     (lambda: nerg.train_radiance(None), '"photos" must be a file, given as a string or a path, got NoneType'),
     (lambda: nerg.train_radiance("no"), 'file "no" of "photos" does not exist'),
@@ -323,7 +326,9 @@ def test10_a_file_with_values(tmp_path):
 
 def test11_cameras(scene, camera, rgb):
     other = nerg.Camera((0, -2, 0), (0, 0, 0), width=5, height=4)
-    assert tuple(scene.resolve_sensor(other).film().size()) == (5, 4) and tuple(scene.resolve_sensor().film().size()) == (12, 8)
+    assert tuple(scene.resolve_sensor(other).film().size()) == (5, 4) and tuple(
+        scene.resolve_sensor().film().size()
+    ) == (12, 8)
     assert scene.resolve_sensor(0) is scene.resolve_sensor() or tuple(scene.resolve_sensor(0).film().size()) == (12, 8)
     mine = rgb.load_dict(other.to_dict())
     assert scene.resolve_sensor(mine) is mine

@@ -13,7 +13,7 @@ import pytest
 
 from nerg_mi import diagnosis, llvm
 from nerg_mi.cli.building import GROUPS, find_commands
-from nerg_mi.errors import MissingFile, NergError, UnusableLLVM, blame_options, translate_mitsuba_errors, format_error
+from nerg_mi.errors import MissingFile, NergError, UnusableLLVM, blame_options, format_error, translate_mitsuba_errors
 from nerg_mi.workflows.base import COMMANDS
 from tests.conftest import ROOT
 from tools.command_pages import iter_commands

@@ -16,7 +16,7 @@ from typing import get_args, get_type_hints
 import pytest
 
 import nerg_mi.cli
-from nerg_mi.cli.building import make_callback, find_commands
+from nerg_mi.cli.building import find_commands, make_callback
 from nerg_mi.workflows.base import COMMANDS
 
 from .outputs import CASES, INPUTS, MAKES_A_FOLDER, OF_TORCH

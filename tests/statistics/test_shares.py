@@ -11,8 +11,8 @@ from nerg_mi.maths.geometry import intersect_box_numpy
 from nerg_mi.maths.sphere import fibonacci_directions, indices_in_cone
 from nerg_mi.statistics.shares import (
     INITIAL_DIRECTIONS,
-    SummationRule,
     SamplePoints,
+    SummationRule,
     VisibilityCache,
     compute_isovists,
     compute_visibility,

@@ -38,18 +38,18 @@ from nerg_mi.workflows.bake_chunks import (
     bake_part,
     check_values,
     cone_radians,
-    refine_target,
     make_observers,
+    make_splat_geometry,
+    make_tracked_rays,
+    read_observer_file,
+    read_sums,
+    read_target,
+    refine_target,
+    select_source,
     split_halves,
     split_into_parts,
-    read_observer_file,
-    read_target,
-    read_sums,
-    select_source,
-    make_splat_geometry,
     sum_directly,
     sum_in_parts,
-    make_tracked_rays,
 )
 from nerg_mi.workflows.bake_splats import COLUMN, bake_splats
 from nerg_mi.workflows.options import PartOptions
@@ -483,7 +483,10 @@ def test03_people_stand_in_the_place():
     found = make_observers(BakeOptions(num_observers=4), rays_lookers(), TURNED, told)
     assert len(found.weights) == 4 and np.allclose(found.positions[:, 0], 1) and np.allclose(found.positions[:, 2], 3.2)
     # Metres are told, of which the place has two units each.
-    assert f"{found.rms_distance / 2:.2f} m (root mean square)" in told.messages[0] and "1 participants in 20 samples" in told.messages[0]
+    assert (
+        f"{found.rms_distance / 2:.2f} m (root mean square)" in told.messages[0]
+        and "1 participants in 20 samples" in told.messages[0]
+    )
     who = make_tracked_rays(rays_lookers(), TURNED, "time")
     assert np.allclose(who.directions, [0, 1, 0]) and np.allclose(who.origins[:, 1], 2 * rays_lookers().origin[:, 0])
     assert np.isclose(who.weights.sum(), 1)
@@ -608,7 +611,9 @@ def test01_each_gaussian_has_what_the_field_says_and_all_else_is_kept(rgb, place
     told = Recorder()
     found = bake_place(place, reporter=told)
     given, back = read_splats(place / "place.ply"), read_splats(place / "out.ply")
-    assert found.files == (place / "out.ply",) and "30 of 30 Gaussians receive gaze from 1 observer;" in told.messages[1]
+    assert (
+        found.files == (place / "out.ply",) and "30 of 30 Gaussians receive gaze from 1 observer;" in told.messages[1]
+    )
     assert told.messages[0].endswith("place.ply: columns that are not used: label")
     to = given.centers - np.array(OPTIONS["observer"])
     distance = np.linalg.norm(to, axis=1)

@@ -14,11 +14,11 @@ from nerg_mi.errors import MissingFile, NergError
 from nerg_mi.figures.overlay import (
     Heat,
     Style,
-    find_overlay,
     find_channel_overlay,
+    find_overlay,
     overlay,
-    srgb,
     robust_max,
+    srgb,
     write_png,
 )
 from nerg_mi.figures.style import apply_colormap
@@ -251,7 +251,11 @@ def test_splats_show_their_gaze_themselves(tmp_path):
 
 def test_a_style_of_options():
     assert ScaleOptions(cmap="viridis", log_decades=3, hatching=False).style("a") == Style("viridis", 3, False, "a")
-    for given, said in (({"top": 0.0}, "--vmax must lie in"), ({"decades": -1}, "--decades"), ({"cmap": "jet"}, '"jet" is no')):
+    for given, said in (
+        ({"top": 0.0}, "--vmax must lie in"),
+        ({"decades": -1}, "--decades"),
+        ({"cmap": "jet"}, '"jet" is no'),
+    ):
         with pytest.raises(NergError, match=said):
             ScaleOptions(**given).style()
 
@@ -340,9 +344,7 @@ def test_it_shows_the_observers_gaze(rgb, scene_sphere):
     # The paper's pale hatching where nothing is met, dark or hot colours where something is.
     grey = np.ptp(shown, axis=-1) < 0.01
     rows = np.rint((np.arange(32) + 0.5) / 32 * 31).astype(int)
-    inner = lambda m: (
-        m & np.roll(m, 1, 0) & np.roll(m, -1, 0) & np.roll(m, 1, 1) & np.roll(m, -1, 1)
-    )
+    inner = lambda m: m & np.roll(m, 1, 0) & np.roll(m, -1, 0) & np.roll(m, 1, 1) & np.roll(m, -1, 1)
     assert grey[inner(void)[rows]].mean() > 0.95 and grey[inner(met)[rows]].mean() < 0.2
 
 

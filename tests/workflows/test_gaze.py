@@ -24,7 +24,7 @@ from nerg_mi.workflows import ablation, evaluate
 from nerg_mi.workflows.ablation import AblationBenchmark, ablate, load_ground_truth, make_plan
 from nerg_mi.workflows.evaluate import SCORED, evaluate_folds, evaluate_gaze
 from nerg_mi.workflows.gaze_commands import AblationOptions, FoldOptions, GazeEvaluationOptions, GazeOptions
-from nerg_mi.workflows.geometry import make_geometry, load_training_geometry
+from nerg_mi.workflows.geometry import load_training_geometry, make_geometry
 from nerg_mi.workflows.options import GeometryOptions
 from nerg_mi.workflows.parts import account_for_store
 from nerg_mi.workflows.train_gaze import learn_prior, train_gaze

@@ -34,7 +34,7 @@ from nerg_mi.workflows.gaze_commands import (
     GazeOptions,
     PriorOptions,
 )
-from nerg_mi.workflows.options import PartOptions, to_base, exposed_options, option, shared_options
+from nerg_mi.workflows.options import PartOptions, exposed_options, option, shared_options, to_base
 from nerg_mi.workflows.rays_commands import FilterOptions, SplitOptions
 from nerg_mi.workflows.render import picture_options
 from nerg_mi.workflows.scene_commands import FilmOptions, StudyOptions
@@ -210,7 +210,11 @@ STORE = {"store", "scheduler", "threads"}
 # and those by which the command chooses parts or makes something of their outputs, none of which a part sees.
 COMMANDS = {
     "render": (FilmOptions, picture_options, STORE | {"defaults", "frames", "fps"}),
-    "ablate": (AblationOptions, training_options, STORE | {"recipes", "variant", "seeds", "timing_cameras", "timing_size"}),
+    "ablate": (
+        AblationOptions,
+        training_options,
+        STORE | {"recipes", "variant", "seeds", "timing_cameras", "timing_size"},
+    ),
     "study": (
         StudyOptions,
         lambda o: plan_study(None, "sphere", o).options,
@@ -343,7 +347,9 @@ def test_variant_and_threads(rgb):
     assert dr.thread_count() == before
 
 
-@pytest.mark.parametrize("mode, said", [("llvm_rgb", "available variants: scalar_rgb,"), ("scalar_rgb", "need a JIT variant")])
+@pytest.mark.parametrize(
+    "mode, said", [("llvm_rgb", "available variants: scalar_rgb,"), ("scalar_rgb", "need a JIT variant")]
+)
 def test_what_no_field_can_be_computed_on(mode, said):
     with pytest.raises(NergError, match=said):
         select_backend(mode)

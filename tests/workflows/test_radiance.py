@@ -17,7 +17,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid
 from nerg_mi.files.atomic import file_sha256
 from nerg_mi.formats.checkpoint import read_checkpoint
-from nerg_mi.formats.fields import matches_checksum, load_radiance
+from nerg_mi.formats.fields import load_radiance, matches_checksum
 from nerg_mi.formats.splats import read_splats
 from nerg_mi.photos.colmap import UpEstimate
 from nerg_mi.photos.dataset import open_dataset

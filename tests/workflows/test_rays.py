@@ -17,11 +17,11 @@ from nerg_mi.workflows import rays
 from nerg_mi.workflows.evaluate import evaluate_gaze
 from nerg_mi.workflows.rays import (
     FilterSteps,
-    make_quality_report,
     filter_rays,
     import_rays,
-    smallest_mask,
+    make_quality_report,
     plot_rays,
+    smallest_mask,
     split_rays,
 )
 from nerg_mi.workflows.rays_commands import FilterOptions, PlotOptions, RaysImportOptions, SplitOptions

@@ -223,7 +223,11 @@ def test_ctrl_c_leaves_whole_pictures(rgb, scene_overlays, tmp_path):
         ("a.png", {"overlay": "gaze", "top": -1.0}, "--vmax must lie in"),
         ("a.png", {"overlay": "kde"}, '"kde", which needs'),
         ("a.png", {"overlay": "gaze", "memory": 1e-5}, "GB; increase --memory to"),
-        ("a.png", {"overlay": "gaze", "defaults": {"eye": "0, 0, 1e6"}}, "on all visible surfaces; move the camera or the"),
+        (
+            "a.png",
+            {"overlay": "gaze", "defaults": {"eye": "0, 0, 1e6"}},
+            "on all visible surfaces; move the camera or the",
+        ),
     ],
 )
 def test_what_is_refused(rgb, scene_overlays, tmp_path, output, options, said):

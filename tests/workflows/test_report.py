@@ -23,15 +23,15 @@ from nerg_mi.workflows import report
 from nerg_mi.workflows.gaze_commands import GazeOptions
 from nerg_mi.workflows.report import (
     RenderedViews,
+    collect_paths,
     count_participants_near,
+    describe_scene,
+    draw_rays,
+    draw_views,
     find_free_positions,
     gaze_vmax,
     make_report,
     panorama_positions,
-    collect_paths,
-    draw_rays,
-    draw_views,
-    describe_scene,
     sort_files,
 )
 from nerg_mi.workflows.scene_commands import ReportOptions

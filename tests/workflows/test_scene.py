@@ -313,7 +313,11 @@ def test_a_walk(rgb, folder, tmp_path):
         (["mesh.ply"], {"camera_to": (0, 0, 1)}, "the camera is set by --camera and --target, by"),
         (["mesh.ply"], {"photo": "1"}, "--photo needs the photos of the training; add"),
         (["mesh.ply"], {"observer": (1, 2)}, "--observer must be three numbers x,y,z, got"),
-        (["mesh.ply"], {"camera_from": (1, 2, 3), "camera_to": (1, 2, 3)}, "camera position and target are the same; choose"),
+        (
+            ["mesh.ply"],
+            {"camera_from": (1, 2, 3), "camera_to": (1, 2, 3)},
+            "camera position and target are the same; choose",
+        ),
         (["mesh.ply"], {"own": True}, "--first-person needs an observer; add"),
         (["mesh.ply"], {"up": (0, 0, 0)}, "up must be a direction"),
         (["mesh.ply"], {"fov": 200.0}, "--fov must lie in"),

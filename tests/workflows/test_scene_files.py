@@ -16,30 +16,30 @@ from nerg_mi.maths.color import encode_srgb
 from nerg_mi.maths.geometry import Similarity, intersect_box_numpy
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.scene import load_scene
-from nerg_mi.rendering.scene_writer import LookAt, GazeFiles, Lens, SceneContent, SceneText, format_document, element
+from nerg_mi.rendering.scene_writer import GazeFiles, Lens, LookAt, SceneContent, SceneText, element, format_document
 from nerg_mi.train.geometry import identify_file
 from nerg_mi.workflows.scene_cameras import (
     SceneProbe,
+    check_point,
     find_best_camera,
     find_best_photo,
     find_eye,
-    check_point,
+    interpolate_walk,
+    make_upright,
     probe_values,
     support_of_rays,
     to_scene_frame,
     turn_to_attention,
-    make_upright,
-    interpolate_walk,
 )
 from nerg_mi.workflows.scene_places import (
     InputFiles,
     PhotoCamera,
-    load_photo_camera,
-    load_photo_cameras,
     colors_path,
     detect_kind,
-    write_scene_geometry,
+    load_photo_camera,
+    load_photo_cameras,
     recognise,
+    write_scene_geometry,
 )
 from tests.formats.splats.writers import random_splats, write_inria
 from tests.workflows.recorder import Recorder
@@ -150,7 +150,11 @@ def test_the_nearest_ray_of_a_person(rays):
 
 @pytest.mark.parametrize(
     "person, time, said",
-    [("Eve", 0, '"Eve"'), ("Cy", 0, "has no rays; choose another person"), ("Ada", 5.0, "s; increase --max-gap to bridge longer pauses")],
+    [
+        ("Eve", 0, '"Eve"'),
+        ("Cy", 0, "has no rays; choose another person"),
+        ("Ada", 5.0, "s; increase --max-gap to bridge longer pauses"),
+    ],
 )
 def test_nobody_then(rays, person, time, said):
     with pytest.raises(NergError, match=said):

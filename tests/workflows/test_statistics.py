@@ -59,7 +59,9 @@ def test01_counts_are_those_of_a_loop(folder):
             looks += (seen & ~np.r_[False, seen[:-1]]).sum()
             firsts += 0.2 * np.argmax(seen) if seen.any() else 0
             reached += seen.any()
-        assert row["visits"] == pytest.approx(looks / 6) and row["time_to_first_visit"] == pytest.approx(firsts / reached)
+        assert row["visits"] == pytest.approx(looks / 6) and row["time_to_first_visit"] == pytest.approx(
+            firsts / reached
+        )
         for cohort, code in (("even", 0), ("odd", 1)):
             (row,) = table(found.aois, cell="cohort", value=cohort, aoi=name)
             mine = [s for p, s in enumerate(shares) if p % 2 == code]
@@ -132,7 +134,9 @@ def test04_the_field_beside_the_rays_and_what_if(folder, tmp_path):
     assert rows["the sign", "share"]["after"] != rows["the sign", "share"]["before"]
     assert recorder.messages.count(f"of {folder / 'tile.obj'}: statements that are not used: usemtl") == 1
     # Its checkpoint says nothing of what it learnt from.
-    assert any("does not contain training support" in text for text in recorder.messages) and field[0]["support"] is None
+    assert (
+        any("does not contain training support" in text for text in recorder.messages) and field[0]["support"] is None
+    )
     assert "not in the checkpoint" in (tmp_path / "out" / "what_if.md").read_text()
     names = {p.name for p in found.files}
     assert {"aois.csv", "aois.md", "what_if.csv", "aois.png", "about.json", "participants.csv"} <= names

@@ -11,7 +11,7 @@ import pytest
 
 from nerg_mi.alignment.check import AlignmentCheck
 from nerg_mi.errors import NergError
-from nerg_mi.evaluation.study import measure_rows, list_rows
+from nerg_mi.evaluation.study import list_rows, measure_rows
 from nerg_mi.evaluation.study_subject import open_subject
 from nerg_mi.maths.geometry import Box
 from nerg_mi.rays.rays import Rays
@@ -23,7 +23,7 @@ from nerg_mi.workflows.demo import STAGES, make_demo
 from nerg_mi.workflows.geometry import check_geometry
 from nerg_mi.workflows.rays_commands import AlignOptions
 from nerg_mi.workflows.scene_commands import DemoOptions, StudyOptions
-from nerg_mi.workflows.study import measure_part, plan_study, run_study, find_reference_scene
+from nerg_mi.workflows.study import find_reference_scene, measure_part, plan_study, run_study
 from tests.alignment import rooms
 from tests.evaluation.test_study_subject import SCENE, TWIN
 from tests.figures.standins import write_standins

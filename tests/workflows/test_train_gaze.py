@@ -81,7 +81,10 @@ def test_a_job_returns_the_field_and_says_how_it_went(rays):
     assert heard.texts[-1] == "folds: step 2" and about["mix"]["folds"] == 1
     told = [m.split(";")[0].split(":")[0] for m in heard.messages]
     assert told[:3] == [f"{about['probes_made']} probes", "3 steps", "cross-validation (1 fold)"]
-    assert told[3] == f"regions with {100 * about['mix']['regions']['80%']:.0f} % of the field's gaze contain 80 % of the held-out gaze"
+    assert (
+        told[3]
+        == f"regions with {100 * about['mix']['regions']['80%']:.0f} % of the field's gaze contain 80 % of the held-out gaze"
+    )
 
 
 def test_folds_choose_the_variant_where_no_surfaces_are_known(rays):
@@ -190,7 +193,10 @@ def test_positions_and_people_are_held_out_and_told(tmp_path):
     result = train_gaze(RAYS, options=replace(options, min_rays=8), reporter=heard)
     test = result.provenance["test"]
     assert result.provenance["rays"] == test["rays_to_train"] < test["rays"] == len(RAYS) and len(test["people"]) == 1
-    assert heard.messages[0] == f"6 test positions held out, {test['rays_to_train']:,} of {test['rays']:,} rays remain for training"
+    assert (
+        heard.messages[0]
+        == f"6 test positions held out, {test['rays_to_train']:,} of {test['rays']:,} rays remain for training"
+    )
 
 
 def test_an_interrupted_job_returns_what_there_is_or_says_how_to_go_on(rays, tmp_path):
@@ -233,7 +239,12 @@ def test_the_command_goes_on(tmp_path, monkeypatch, capsys):
     with monkeypatch.context() as change:
         change.setattr(GazeTrainer, "step", interrupted)
         code, _, said = nerg(capsys, *line)
-    assert code == 130 and "interrupted; continue with --resume" in said and out.is_file() and out.with_suffix(".run").is_file()
+    assert (
+        code == 130
+        and "interrupted; continue with --resume" in said
+        and out.is_file()
+        and out.with_suffix(".run").is_file()
+    )
     code, _, said = nerg(capsys, *line, "--resume")
     about = load_gaze(out, ns)[1]["provenance"]
     assert about["steps"] == 8 and not about["interrupted"] and about["probes"]["fresh"]
@@ -261,7 +272,10 @@ def test_a_place_of_hits_needs_a_file(rays):
 
 @pytest.mark.parametrize("train", [train_gaze, train_radiance])
 def test_an_output_is_trained_once_at_a_time(tmp_path, train):
-    with reserve_output(tmp_path / "a.safetensors"), pytest.raises(NergError, match="wait until it has finished, or choose another"):
+    with (
+        reserve_output(tmp_path / "a.safetensors"),
+        pytest.raises(NergError, match="wait until it has finished, or choose another"),
+    ):
         train(tmp_path / "nothing", tmp_path / "a.safetensors")
 
 
