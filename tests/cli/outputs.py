@@ -214,9 +214,9 @@ MAKES_A_FOLDER = {"poses"}
 
 INPUTS = {
     "scene": {"photos", "align"},
-    "view": {"regions", "align"},
+    "view": {"aois", "align"},
     "render": {"frames"},
-    "stats": {"areas", "align", "zones", "cohorts", "what_if", "salt"},
+    "stats": {"aois", "align", "zones", "cohorts", "what_if", "salt"},
     "draw floor": {"scene"},
     "align": {"field", "scene", "surface", "pairs", "twin", "cameras", "place_cameras", "start"},
     "rays import": {"salt", "poses", "place"},
@@ -225,7 +225,7 @@ INPUTS = {
     "eval folds": {"field", "scene", "align"},
     "eval gaze": {"field", "scene", "geometry"},
     "ablate": {"field", "scene"},
-    "report": {"objects"},
+    "report": {"aois"},
     "bake": {"gaze", "rays", "path", "align"},
 }
 """Options of commands that name what is read, as arguments do; all others that are paths are written."""

@@ -51,7 +51,7 @@ OUTSIDE = {
     "eval radiance": ("eval radiance {c}/cube.safetensors {c}/set --holdout 2 -o {c}/out.safetensors", r"PSNR"),
     "train gaze": (
         "train gaze -o {c}/out.safetensors --views {c}/set --salience spectral-residual --field {c}/cube.safetensors",
-        "no salience",
+        "no saliency",
     ),
 }
 
@@ -147,7 +147,9 @@ def test_a_field_from_salience_images(recipe, tmp_path, nerg, rgb):
     images = ["--views", tmp_path, "--salience", tmp_path / "maps"]
     ended = nerg("train", "gaze", *images, "--recipe", recipe, *place, *quick, "-o", out)
     assert ended.code == 0, ended.err
-    assert "5 views with salience; without: p0.png" in ended.out and "0 probes and 5 views" in ended.out
+    assert (
+        "5 views with saliency maps; without saliency map: p0.png" in ended.out and "0 probes and 5 views" in ended.out
+    )
     field, meta = load_gaze(out, ns)
     assert field.config.normalized and meta["provenance"]["salience"]["used"] == 5
     assert "rays_file" not in meta["provenance"]
@@ -191,7 +193,7 @@ def test_a_nerf_is_imported(tmp_path, nerg, torch):
 def test_a_nerf_and_its_gaze_are_imported(tmp_path, nerg, torch):
     path = save(tmp_path / "nerg.pth", small_gaze(), nerf=small_state())
     ended = nerg("import", path, "-o", tmp_path / "field.safetensors")
-    assert ended.code == 0 and "also holds a gaze field" in ended.out
+    assert ended.code == 0 and "also contains a gaze field" in ended.out
     ended = nerg("import", path, "-o", tmp_path / "f.safetensors", "-g", tmp_path / "g.safetensors", "--half")
     assert ended.code == 0 and "gaze: emit_capture, trunk layernorm, bound 1" in ended.out
     assert (tmp_path / "g.safetensors").stat().st_size < 0.6 * small_gaze()["encoder.embeddings"].nbytes + 1e5
@@ -219,6 +221,6 @@ def test_a_refined_field_says_so(tmp_path, nerg):
     occupancy = OccupancyGrid(np.ones((4, 4, 4), bool), ns, 0.1)
     radiance(tmp_path / "f.safetensors", density_scale=1e-2, occupancy=occupancy)
     ended = nerg("refine", tmp_path / "f.safetensors", "-o", tmp_path / "g.safetensors")
-    assert ended.code == 0 and "where it was 100.00 %" in ended.out
+    assert ended.code == 0 and "before 100.00 %" in ended.out
     refined = read_metadata(tmp_path / "g.safetensors")["occupancy"]["refined"]
     assert refined["threshold"] == pytest.approx(0.01) and refined["missed"] >= 0

@@ -100,7 +100,7 @@ def failing(monkeypatch, error):
         (ModuleNotFoundError("No module named 'torch'", name="torch"), "nerg: No module named 'torch'"),
         (
             MemoryError("Unable to allocate 9 GiB"),
-            "nerg: there is not enough memory: Unable to allocate 9 GiB; ask for less, or close other programs",
+            "nerg: not enough memory: Unable to allocate 9 GiB; reduce the size of the job, or close other programs",
         ),
     ],
 )
@@ -142,8 +142,8 @@ def test07_a_mistake_in_the_program_is_shown_as_one(monkeypatch, nerg, error, sa
     ended = nerg("doctor")
     assert ended.code == 70 and not ended.out
     assert ended.err == (
-        f"nerg: internal error ({said}): this is a fault of nerg_mi and not of your input; run again with --debug and "
-        "report the traceback\n"
+        f"nerg: internal error ({said}): this is a bug in nerg_mi, not in your input; run the command again with "
+        "--debug and report the traceback\n"
     )
 
 
@@ -252,7 +252,7 @@ def test10_unusable_llvm(tmp_path):
     assert f"LLVM 15 ({bad}) cannot run the kernels of Dr.Jit" in done.stdout
     assert "llvm_ad_rgb" not in done.stdout
     if not llvm.has_cuda():
-        assert done.returncode == 1 and "nothing can be rendered" in done.stdout
+        assert done.returncode == 1 and "cannot render" in done.stdout
 
 
 # ---- Shells complete sub-commands and options of the installed command ----

@@ -168,7 +168,7 @@ def test_one_piece_beyond_the_memory_is_said(tmp_path, nerg):
     other = tmp_path / "other.xml"
     other.write_text(SCENE.replace('type="independent"', 'type="multijitter"'))
     ended = nerg("render", other, "-o", tmp_path / "a.exr", *LLVM, "--memory", 1e-3)
-    words = "in one piece, beyond 0.001 GB, because of the sampler MultijitterSampler"
+    words = "in one piece, above 0.001 GB, because of the sampler MultijitterSampler"
     assert ended.code == 0 and words in ended.out.replace("\n", " ")
     ended = nerg("render", other, "-o", tmp_path / "b.exr", "--memory", 0)
     assert ended.code == 2 and "--memory" in ended.err
@@ -281,7 +281,7 @@ def test_help_names_every_kind_of_figure_and_its_options(nerg):
     said = nerg("draw", "--help").out
     assert all(name in said and kind.summary in said for name, kind in KINDS.items())
     said = nerg("draw", "sphere", "--help").out
-    assert all(flag in said for flag in ("--projection", "--top", "--cmap", "-D", "--output", "--width"))
+    assert all(flag in said for flag in ("--projection", "--vmax", "--cmap", "-D", "--output", "--width"))
     assert "-D" not in nerg("draw", "sheet", "--help").out
 
 
@@ -289,7 +289,7 @@ def test_a_difference(nerg, tmp_path):
     for k in (1.0, 2.0):
         write_exr(tmp_path / f"{k:.0f}.exr", {"gaze.Y": np.full((20, 30), k, np.float32)})
     out = tmp_path / "new" / "a.svg"
-    ended = nerg("draw", "difference", tmp_path / "1.exr", tmp_path / "2.exr", "-o", out, "--top", 3)
+    ended = nerg("draw", "difference", tmp_path / "1.exr", tmp_path / "2.exr", "-o", out, "--vmax", 3)
     assert ended.code == 0 and f"Wrote {out}" in ended.out and b"<svg" in out.read_bytes()
 
 
@@ -328,7 +328,7 @@ def test_options_reach_the_viewer_and_the_report(handed, nerg):
     assert nerg(*line.split(), "--to", "0,0,1", "--evaluate", "--title", "Mine").code == 0
     ((files, output, options),) = ((call["files"], call["output"], call["options"]) for call in given)
     assert files == [Path("gaze.safetensors"), Path("day.npz")] and output == Path("a.html")
-    assert options.objects == Path("o.json") and options.names and options.min_participants == 3 and not options.paths
+    assert options.aois == Path("o.json") and options.names and options.min_participants == 3 and not options.paths
     assert options.camera == (1, 2, 3) and options.target == (0, 0, 1)
     assert options.evaluate and options.title == "Mine"
 
@@ -352,7 +352,7 @@ def test_rays_on_a_room_without_a_wall(nerg, tmp_path):
     Rays(np.arange(4) / 10, np.zeros(4), ("a",), np.ones((4, 3)), d, np.ones(4)).save(tmp_path / "a.npz")
     line = f"bake {tmp_path}/room.ply --rays {tmp_path}/a.npz --cone 0 --detail 1 -o {tmp_path}/a.json -m llvm_ad_rgb"
     ended = nerg(*line.split(), "--weights", "equal")
-    assert not ended.code and "of the gaze of 4 rays 75.00% lies on the surface" in ended.out
+    assert not ended.code and "gaze of 4 rays: 75.00% on the surface" in ended.out
     assert "25.00% meets no surface" in ended.out and json.loads((tmp_path / "a.json").read_text())["escaped"] == 0.25
 
 
@@ -414,7 +414,7 @@ def test_a_worker_serves_an_address_and_warns_of_an_open_one(monkeypatch, nerg):
     ended = nerg(*"worker tcp://127.0.0.1:8786 --threads 3 --wait 5 --name a".split())
     assert ended.code == 0 and ended.err == ""
     assert served == [("tcp://127.0.0.1:8786", 5.0, "a", "3")]
-    assert "warning: nothing protects tcp://192.0.2.1:8786" in nerg("worker", "tcp://192.0.2.1:8786").err
+    assert "warning: tcp://192.0.2.1:8786 is not protected" in nerg("worker", "tcp://192.0.2.1:8786").err
 
 
 # ---- nerg poses ----
@@ -434,7 +434,7 @@ def test_links_are_followed_only_if_allowed(photos, nerg, monkeypatch, tmp_path)
     (photos / "2.png").rename(tmp_path / "2.png")
     (photos / "2.png").symlink_to(tmp_path / "2.png")
     ended = nerg("poses", photos, "-o", tmp_path / "capture")
-    assert ended.code == 1 and "has 2 pictures" in ended.err and "--allow-outside" in ended.err
+    assert ended.code == 1 and "has 2 usable images" in ended.err and "--allow-outside" in ended.err
     ended = nerg("poses", photos, "-o", tmp_path / "capture", "--allow-outside")
     assert ended.code == 1 and "no 3 of the 3 pictures" in ended.err
 
@@ -450,7 +450,7 @@ def test_photos_become_a_capture_that_can_be_trained_on(nerg, tmp_path):
         pytest.skip('pycolmap is not installed (pip install "nerg-mi[poses]")')
     photos = rendered.write_photos(tmp_path / "photos", 6)
     ended = nerg("poses", photos, "-o", tmp_path / "capture", "--threads", "1")
-    assert ended.code == 0 and "6 of 6 pictures have a pose" in ended.out and "warning" not in ended.err
+    assert ended.code == 0 and "6 of 6 images have a pose" in ended.out and "warning" not in ended.err
     assert sorted(os.listdir(tmp_path / "capture")) == ["images", "poses.json", "poses.png", "sparse"]
     ended = nerg("train", "radiance", tmp_path / "capture", "-o", tmp_path / "a.safetensors", "--steps", "2")
     assert not ended.code and "points on surfaces" in ended.out

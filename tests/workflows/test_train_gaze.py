@@ -83,7 +83,8 @@ def test_a_job_returns_the_field_and_says_how_it_went(rays):
     assert told[:3] == [f"{about['probes_made']} probes", "3 steps", "cross-validation (1 fold)"]
     assert (
         told[3]
-        == f"regions with {100 * about['mix']['regions']['80%']:.0f} % of the field's gaze contain 80 % of the held-out gaze"
+        == f"regions with {100 * about['mix']['regions']['80%']:.0f} % of the field's gaze contain 80 % "
+        "of the held-out gaze"
     )
 
 
@@ -102,7 +103,7 @@ def test_folds_choose_the_variant_where_no_surfaces_are_known(rays):
     heard = Listener()
     result = train_gaze(rays, options=replace(QUICK, mix_folds=0), reporter=heard)
     assert result.field.config.variant == "capture" and "mix" not in result.provenance
-    assert heard.messages[0] == "no surfaces are known: capture alone is trained"
+    assert heard.messages[0] == "there is no geometry: capture alone is trained"
 
 
 def test_a_job_writes_what_the_command_writes(rays, tmp_path, capsys):

@@ -25,7 +25,7 @@ def test_help_loads_no_renderer():
 def test_the_card(walk):
     done = run("show", walk)
     shown = " ".join(done.output.split())
-    assert done.exit_code == 0 and "12,000 of 12,000 rows" in shown and "at 50 rays a second" in shown
+    assert done.exit_code == 0 and "12,000 of 12,000 rows" in shown and "sampling rate 50 Hz" in shown
 
 
 # ---- ``nerg rays filter`` ----
@@ -55,15 +55,15 @@ def test_filter(walk, tmp_path):
 @pytest.mark.parametrize(
     "arguments, message",
     [
-        (["filter"], "say which rays"),
+        (["filter"], "no selection is given"),
         (["filter", "--one-ray"], "add --fixations"),
         (["filter", "--fixations", "magic"], "ivt or idt"),
-        (["filter", "--from", "1e9"], "leaves none"),
-        (["filter", "--box", "a,b"], "numbers with commas"),
-        (["split"], "say how to split"),
+        (["filter", "--from", "1e9"], "selects none"),
+        (["filter", "--box", "a,b"], "comma-separated numbers"),
+        (["split"], "no criterion is given"),
         (["plot", "--kind", "map"], "density or layout"),
         (["plot", "--test", "walk.npz"], "add --kind layout"),
-        (["plot", "--cell=0"], "Invalid value for '--cell'"),
+        (["plot", "--cell=0"], "Invalid value for '--cell-size'"),
         (["plot", "--cell=1e-5"], "more than 4,000,000 cells of 1e-05 m"),
     ],
 )
@@ -108,7 +108,7 @@ def test_split_shares_no_ray(walk, tmp_path, how):
 
 
 def test_plots_are_png(walk, tmp_path):
-    assert "end in .png" in str(run("plot", walk, "-o", tmp_path / "p.jpg").exception)
+    assert "ends in .png" in str(run("plot", walk, "-o", tmp_path / "p.jpg").exception)
 
 
 def test_no_rays(walk, tmp_path):

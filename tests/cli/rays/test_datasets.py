@@ -46,7 +46,7 @@ def test_what_stands_in_the_way(given, tmp_path, capsys):
     for output, why in (
         (tmp_path / "file.rays", "one of its parents is a file"),
         (tmp_path / "file.rays" / "a.rays", "one of its parents is a file"),
-        (tmp_path / "a.npz", "--place-name belongs to datasets"),
+        (tmp_path / "a.npz", "--environment applies to datasets only"),
     ):
         code, said = nerg(capsys, *given, "-o", output)
         assert told_in_a_sentence(code, said) and why in said, said
@@ -57,7 +57,7 @@ def test_no_room_and_ctrl_c(given, tmp_path, capsys, monkeypatch):
     arguments, output = [*given, "--workers", 1, "-o", tmp_path / "a.rays"], tmp_path / "a.rays"
     with largest_file(20_000):
         code, said = nerg(capsys, *arguments)
-    assert told_in_a_sentence(code, said) and "largest size" in said, said
+    assert told_in_a_sentence(code, said) and "too large" in said, said
     assert not list(output.rglob("*.parquet")) and not list(output.rglob(".*"))
     with monkeypatch.context() as change:
         calls = []
