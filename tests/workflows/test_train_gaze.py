@@ -82,8 +82,7 @@ def test_a_job_returns_the_field_and_says_how_it_went(rays):
     told = [m.split(";")[0].split(":")[0] for m in heard.messages]
     assert told[:3] == [f"{about['probes_made']} probes", "3 steps", "cross-validation (1 fold)"]
     assert (
-        told[3]
-        == f"regions with {100 * about['mix']['regions']['80%']:.0f} % of the field's gaze contain 80 % "
+        told[3] == f"regions with {100 * about['mix']['regions']['80%']:.0f} % of the field's gaze contain 80 % "
         "of the held-out gaze"
     )
 
