@@ -131,7 +131,8 @@ def bake(
     >>> import nerg_mi as nerg
     >>> from importlib.resources import files
     >>> store = files("nerg_mi.scenes.store")
-    >>> baked = nerg.bake(store / "twin.ply", gaze=store / "shoppers.safetensors", observer=(4.4, 2.8, 1.6), max_edge=1.0)
+    >>> gaze = store / "shoppers.safetensors"
+    >>> baked = nerg.bake(store / "twin.ply", gaze=gaze, observer=(4.4, 2.8, 1.6), max_edge=1.0)
     >>> 0.9 < baked.on_surface < 1, abs(baked.unaccounted) < 0.01
     (True, True)
     """
@@ -291,7 +292,8 @@ def ablate(
     Examples
     --------
     >>> import nerg_mi as nerg
-    >>> small = {"recipes": "default", "variant": ("emit",), "seeds": 1, "default_steps": 2, "probes": 8, "timing_cameras": 0}
+    >>> small = {"recipes": "default", "variant": ("emit",), "seeds": 1, "default_steps": 2}
+    >>> small |= {"probes": 8, "timing_cameras": 0}
     >>> test = {"test_zones": 1, "test_positions": 4, "min_rays": 8}
     >>> result = nerg.ablate(rays, folder / "ablation", geometry="none", **small, **test)
     >>> [row["variant"] for row in result.rows]

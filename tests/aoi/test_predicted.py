@@ -196,7 +196,7 @@ def test_aois_occlude_each_other_without_geometry(tmp_path, rgb):
 
 def test_options_are_checked_before_loading(tmp_path, rgb):
     write_place(tmp_path)
-    with pytest.raises(NergError, match="--window needs NAME=FROM,TO"):
+    with pytest.raises(NergError, match="NAME=FROM,TO"):
         setting(tmp_path, windows=("late",))
 
 

@@ -328,7 +328,7 @@ def test_options_reach_the_viewer_and_the_report(handed, nerg):
     assert nerg(*line.split(), "--to", "0,0,1", "--evaluate", "--title", "Mine").code == 0
     ((files, output, options),) = ((call["files"], call["output"], call["options"]) for call in given)
     assert files == [Path("gaze.safetensors"), Path("day.npz")] and output == Path("a.html")
-    assert options.aois == Path("o.json") and options.names and options.min_participants == 3 and not options.paths
+    assert options.aois == Path("o.json") and options.show_names and options.min_participants == 3 and not options.paths
     assert options.camera == (1, 2, 3) and options.target == (0, 0, 1)
     assert options.evaluate and options.title == "Mine"
 
@@ -436,7 +436,7 @@ def test_links_are_followed_only_if_allowed(photos, nerg, monkeypatch, tmp_path)
     ended = nerg("poses", photos, "-o", tmp_path / "capture")
     assert ended.code == 1 and "has 2 usable images" in ended.err and "--allow-outside" in ended.err
     ended = nerg("poses", photos, "-o", tmp_path / "capture", "--allow-outside")
-    assert ended.code == 1 and "no 3 of the 3 pictures" in ended.err
+    assert ended.code == 1 and "no 3 of the 3 images" in ended.err
 
 
 def test_ctrl_c_ends_poses_and_leaves_nothing(photos, nerg, monkeypatch, tmp_path):

@@ -252,7 +252,7 @@ def test_equal_frames_give_equal_files(av, tmp_path):
         write_video(tmp_path / f"{k}.mp4", metadata={"Comment": "x"})
         with av.open(tmp_path / f"{k}.mp4") as container:
             pictures.append(np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]))
-    assert pictures[0].shape == pictures[1].shape and np.abs(pictures[0].astype(int) - pictures[1]).max() <= 2
+    assert pictures[0].shape == pictures[1].shape and np.abs(pictures[0].astype(int) - pictures[1]).max() <= 8
     data = (tmp_path / "a.mp4").read_bytes()
     # No creation time.
     assert data[data.index(b"mvhd") + 8 :][:8] == bytes(8)

@@ -512,4 +512,4 @@ def test_the_command_is_printed_and_nothing_is_written(tmp_path):
     assert lines[-1].startswith(f"nerg rays import {path} -o log.npz --map 'origin=px,py,pz direction=dx,dy,dz t=t'")
     assert any(line.startswith("guess  y is up and the unit m") for line in lines)
     path.write_text("a,b\n1,2\n")
-    assert run("guess", path).output.splitlines()[-1] == "nothing can be proposed"
+    assert run("guess", path).output.splitlines()[-1] == "no command can be proposed"

@@ -502,7 +502,7 @@ def test04_one_observer_or_nobody():
         with pytest.raises(NergError, match=said):
             make_observers(options, None, TURNED, Recorder())
     for options, said in (
-        (BakeOptions(ray_weights="money"), "--weights"),
+        (BakeOptions(ray_weights="money"), "--ray-weights"),
         (BakeOptions(cmap="jet"), "no perceptually"),
     ):
         with pytest.raises(NergError, match=said):

@@ -74,7 +74,7 @@ def test_what_gaze_rests_on(tmp_path):
 def test_what_is_refused(tmp_path):
     with pytest.raises(NergError, match="it has R, G, B, gaze.Y"):
         read_stored(write(tmp_path / "a.exr"), find_channel_overlay("depth"))
-    with pytest.raises(NergError, match="holds no quantities"):
+    with pytest.raises(NergError, match="has no AOVs"):
         read_stored(tmp_path / "a.png", find_channel_overlay("gaze"))
 
 
@@ -99,7 +99,7 @@ def test_difference_what_is_refused(tmp_path):
     for files, given, said in (
         ([a], {}, "a difference needs two images, got"),
         ([a, tmp_path / "b.exr"], {}, "8 x 6 and 4 x 3 pixels cannot be compared"),
-        ([a, a], {"cmap": "viridis"}, "no diverging colour map"),
+        ([a, a], {"cmap": "viridis"}, "not a diverging colour map"),
         ([a, a], {"top": -1.0}, "--top must lie in"),
         ([a, a, a], {}, "1 to 2 files, and 3 were given"),
     ):
@@ -231,7 +231,7 @@ def test_surface_what_is_refused(tmp_path):
         (tmp_path / "bare.ply", {}, "give a .ply file that"),
         (tmp_path / "odd.ply", {}, "odd.ply"),
         (damaged, {}, "is damaged"),
-        (good, {"below": -1.0}, "larger --below"),
+        (good, {"below": -1.0}, "--clip-above"),
         (good, {"camera": (0.0, 0, 2), "target": (0.0, 0, 5)}, "in the picture"),
         (good, {"camera": (0.0, 0, 2), "target": (0.0, 0, 2)}, "elsewhere than --camera"),
         (good, {"up": (0.0, 0, 0)}, "--up must not be of length 0"),
@@ -253,7 +253,7 @@ def test_a_style_of_options():
     assert ScaleOptions(cmap="viridis", log_decades=3, hatching=False).style("a") == Style("viridis", 3, False, "a")
     for given, said in (
         ({"top": 0.0}, "--vmax must lie in"),
-        ({"decades": -1}, "--decades"),
+        ({"decades": -1}, "--log-decades"),
         ({"cmap": "jet"}, '"jet" is no'),
     ):
         with pytest.raises(NergError, match=said):

@@ -74,7 +74,7 @@ def test_what_cannot_be_scored_is_refused(trained, tmp_path):
     crowd(2000).save(tmp_path / "rays.npz")
     with pytest.raises(NergError, match=r"give the unchanged file rays.npz"):
         evaluate_gaze(gaze, tmp_path / "rays.npz", options=OPTIONS)
-    with pytest.raises(NergError, match="no people were held out"):
+    with pytest.raises(NergError, match="--test-participants"):
         evaluate_gaze(gaze, trained / "rays.npz", options=replace(OPTIONS, split="both"))
     train_gaze(crowd(1000), tmp_path / "gaze.safetensors", replace(TRAINING, test_zones=0))
     with pytest.raises(NergError, match="trained on all positions"):
@@ -452,7 +452,7 @@ def test_a_place_is_found_again_where_its_checkpoint_is(rays, tmp_path, kind):
     with pytest.raises(NergError, match=f"does not exist; name it with --{option}"):
         load_training_geometry(tmp_path / "gaze.safetensors", provenance, BOX, elsewhere, ns)
     (tmp_path / "other").write_bytes(b"something else")
-    with pytest.raises(NergError, match=f"is not the file .* give that one with --{option}"):
+    with pytest.raises(NergError, match=f"is not the file .*--{option}"):
         load_training_geometry(tmp_path / "gaze.safetensors", provenance, BOX, elsewhere, ns)
 
 

@@ -338,7 +338,7 @@ def test_filters_that_cannot_be(parquet, tmp_path, monkeypatch):
         filter_rays(dataset.folder, FilterOptions(start=0, end=1, output=tmp_path / "a.rays"))
     assert not (tmp_path / "a.rays").exists()
     monkeypatch.setattr(rays, "MAX_LOADED_RAYS", 500)
-    with pytest.raises(NergError, match="more than 500 rays are left"):
+    with pytest.raises(NergError, match="more than 500 rays"):
         filter_rays(dataset.folder, FilterOptions(with_hit=True))
     with pytest.raises(NergError, match="not empty"):
         filter_rays(dataset.folder, FilterOptions(with_hit=True, output=dataset.folder))

@@ -404,7 +404,7 @@ def test_one_picture_needs_nothing_of_it(scene, tmp_path):
 def test_options_that_contradict_are_told_before_any_work(scene, tmp_path):
     with pytest.raises(NergError, match="use local, local:N for N processes, tcp"):
         film_of(scene, "out", "a.png", scheduler="nowhere")
-    with pytest.raises(NergError, match=r"let its name end in"):
+    with pytest.raises(NergError, match=r"is not supported: choose a file name"):
         film_of(scene, "out", "a.jpg", store=tmp_path / "store")
     assert not (tmp_path / "store").exists() and not (tmp_path / "out").exists()
 

@@ -264,7 +264,7 @@ def test_what_makes_no_report(folder, tmp_path):
     cases = [
         ([folder / "rays.npz"], "there is none among these files; name its checkpoint"),
         ([folder / "nowhere"], "there is no file or folder"),
-        ([empty], "holds no checkpoint, rays or evaluation"),
+        ([empty], "contains no checkpoint, rays or evaluation"),
         ([folder, tmp_path / "again.safetensors"], "are both a gaze; a report is of one of them"),
         ([folder, folder / "notes.txt"], "is none of these"),
     ]

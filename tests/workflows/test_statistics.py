@@ -132,7 +132,7 @@ def test04_the_field_beside_the_rays_and_what_if(folder, tmp_path):
     assert sign["source"] == "predicted" and sign["after"] > sign["before"] and sign["participants"] == 6
     assert rows["new", "share"]["before"] is None and rows["new", "share"]["after"] > 0
     assert rows["the sign", "share"]["after"] != rows["the sign", "share"]["before"]
-    assert recorder.messages.count(f"of {folder / 'tile.obj'}: statements that are not used: usemtl") == 1
+    assert recorder.messages.count(f"of {folder / 'tile.obj'}: unused statements: usemtl") == 1
     # Its checkpoint says nothing of what it learnt from.
     assert (
         any("does not contain training support" in text for text in recorder.messages) and field[0]["support"] is None
@@ -183,7 +183,7 @@ def test07_without_a_place(folder):
     rays = people()
     statistics([rays], None, options, recorder)
     assert any("AOIs occlude each other" in text for text in recorder.messages)
-    assert recorder.messages.count(f"of {folder / 'tile.obj'}: statements that are not used: usemtl") == 1
+    assert recorder.messages.count(f"of {folder / 'tile.obj'}: unused statements: usemtl") == 1
     hit = np.array([o + first_box(o, d)[1] * d for o, d in zip(rays.origin, rays.direction)])
     recorder = Recorder()
     known = Rays(rays.t, rays.person, rays.persons, rays.origin, rays.direction, rays.confidence, hit)
