@@ -19,6 +19,8 @@ from .gaze_settings import GazeSettings, ProbeSettings
 from .gaze_trainer import GazePlan, GazeTrainer
 from .geometry import TrainingGeometry
 
+# Command-line options of supported options with another name.
+_SPELLING = {"init": "--init field"}
 DEFAULT_RECIPE = "default"  # Recipe that is used if none is named
 
 
@@ -137,7 +139,7 @@ class Recipe:
         unsupported = [name for name in names if name not in self.supported_options]
         if not unsupported:
             return
-        spelling = ", ".join("--init field" if name == "init" else f"--{name}" for name in unsupported)
+        spelling = ", ".join(_SPELLING.get(name, f"--{name}") for name in unsupported)
         alternatives = [r.name for r in load_recipes().values() if r.supported_options.issuperset(names)]
         remedy = (
             f"add --recipe {alternatives[0]}"
