@@ -1,28 +1,30 @@
 # Commands on a fresh clone (Debian or Ubuntu, Python 3.10 or newer):
 #
-#   make demo      set up, render the demo place into out/demo
-#   make test      set up with the test extras, run the tests; ARGS="-k panorama" chooses among them, JOBS=0 runs them in one process
-#   make test-all  the same, and the tests marked "nightly": long trainings, whole demos, kills, leaks, recorded data
+#   make demo      install, then render the demo scene into out/demo
+#   make test      install the test extras, then run the tests; ARGS="-k panorama" selects tests, JOBS=0 uses one process
+#   make test-all  also run the tests marked "nightly": long trainings, whole demos, kills, leaks, recorded data
 #
-# While working, and before a release:
+# During development and before a release:
 #
-#   make check     the quick tests of every part (a minute on two cores); ARGS as above
-#   make lint      format, style and import rules, all of which have to be right; nothing is changed
-#   make types     what a type checker finds
-#   make format    put right what of it can be put right by itself
-#   make docs      write what the pages say about the code: tables
+#   make check     run the quick tests of every package (one minute on two cores); ARGS as above
+#   make lint      check format, style, import rules, spelling and the words of names and sentences; change nothing
+#   make types     run the type checker
+#   make format    fix format and style where that can be automated
+#   make docs      regenerate the parts of the manual that are derived from the code
 #   make manual    build the manual into out/manual/html (Python 3.11 or newer); any warning is an error
-#   make onecore   the tests that render, write pictures and train, on one core, where Dr.Jit has one thread
-#   make coverage  all tests, and which lines and branches of the package they reach (into out/coverage/index.html too)
-#   make fuzz      damage what every reader reads, 20,000 times, and count what comes of it (some ten minutes)
-#   make faults    kill commands at moments spread over their run: nothing may be lost
-#   make soak      thousands of frames and steps: memory may not grow
-#   make bench     frames, stages, growth, memory and start beside peers (under ten minutes); ARGS=--long for more
-#   make bench-gpu the same on a CUDA device, where there is one
-#   make packages  build the packages, install and try them with every Python that is here (nox)
+#   make onecore   run the tests that render, write images and train on one core, where Dr.Jit has one thread
+#   make coverage  measure line and branch coverage of all tests (also as out/coverage/index.html)
+#   make fuzz      pass 20,000 damaged files to the readers and count the outcomes (about ten minutes)
+#   make faults    kill commands at moments spread over their run and check that nothing is lost
+#   make soak      render and train for thousands of frames and steps and check that memory does not grow
+#   make bench     time frames and stages, and measure memory and start-up next to peers (under ten minutes);
+#                  ARGS=--long adds more
+#   make bench-gpu the same on a CUDA device, if there is one
+#   make packages  build the packages, then install and test them with every Python found (nox)
 #
-# Set-up is done once: the second run of any of these only does its own work. `make fuzz`, `make faults` and `make bench` print
-# tables; ARGS="--update docs/explanation/robustness.md" puts those of the first two there, ARGS="--page docs/explanation/performance.md" those of the third.
+# The set-up runs once; later calls only do their own work. `make fuzz`, `make faults` and `make bench` print tables;
+# ARGS="--update docs/explanation/robustness.md" writes those of the first two into that page, and
+# ARGS="--page docs/explanation/performance.md" those of the third.
 
 # Tests start many processes: byte code that is kept spares each of them compiling the package, and pytest its rewriting.
 export PYTHONDONTWRITEBYTECODE =
@@ -61,6 +63,8 @@ lint: setup
 	$(RUN) -m ruff check
 	$(RUN) -m ruff format --check
 	$(RUN) -m tools.import_rules
+	git ls-files -z | xargs -0 $(RUN) -m codespell_lib
+	$(RUN) -m tools.words
 
 types: setup
 	$(RUN) -m basedpyright --project pyproject.toml

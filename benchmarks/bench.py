@@ -296,7 +296,7 @@ def kde(run: Run) -> None:
         )
         rows[-1].append(f"{difference:.0e}")
     head = ["rays", "nerg, CPU ms (quartiles)", "SciPy, CPU ms (quartiles)", "times", "largest difference"]
-    run.table("Kernel densities beside SciPy", head, rows, "kde")
+    run.table("Kernel densities next to SciPy", head, rows, "kde")
 
 
 def volume(run: Run) -> None:
@@ -318,7 +318,7 @@ def volume(run: Run) -> None:
         for name, cost in costs.items()
     ]
     head = ["renderer", "CPU ms", "quartiles", "error (rms)", "times at equal error"]
-    run.table("A cloud that absorbs, beside `volpath`", head, rows, "volume")
+    run.table("A cloud that absorbs, next to `volpath`", head, rows, "volume")
 
 
 def growth(run: Run) -> None:

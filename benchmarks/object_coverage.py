@@ -70,7 +70,7 @@ def _visits() -> dict[str, tuple[np.ndarray, np.ndarray]]:
         half = np.where(size == size.min(), size / 2, np.minimum(size / 2, 0.06))
         labels.append(Region.create(f"label of {box.name}", middle - half, middle + half))
     areas = AreaSet((*goods.areas, *labels))
-    counting = counting_of(around, areas, make_aois(areas.elements, {}))
+    counting = counting_of(around, areas, make_aois(areas.elements, {}, {}))
     walks, rng = Walks(WALKS), np.random.default_rng(3)
     result: dict[str, list] = defaultdict(list)
     for _ in range(VISITS):

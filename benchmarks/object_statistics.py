@@ -30,7 +30,7 @@ def made_store():
     folder = find_store_scene().parent
     around = load_scene_file(folder / "shapes.xml", None, None, None)
     areas = read_areas(folder / "regions.json")
-    return around, areas, make_aois(areas.elements, shapes_by_id(around.scene))
+    return around, areas, make_aois(areas.elements, shapes_by_id(around.scene), {})
 
 
 def counting_of(around, areas, shapes, seen: bool = True):

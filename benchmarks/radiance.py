@@ -89,7 +89,7 @@ def fields(data, stops: list[float], args: argparse.Namespace, name: str, depth:
         row = {"minutes": stop, "steps": trainer.steps, "ms a step": 1e3 * seconds / trainer.steps}
         yield trainer, path, row | {"load": os.getloadavg()[0]}
         # Evaluation does not count as training time.
-        trainer.restore(seconds, trainer.hard_pixels)
+        trainer.set_seconds(seconds)
     speed = trainer.clock.summary()
     print(f"{speed['evaluations_a_second']:.3g} field evaluations a second; step in ms: {speed['step_ms']}")
 
@@ -159,7 +159,7 @@ def tabletop(args: argparse.Namespace) -> tuple[str, list[str], list[list[str]],
     metadata, box = result.provenance, result.field.box.core
     held_out = open_dataset(args.data / DEPTH_FILE).held_out
     if [v.name.rpartition("/")[2] for v in held_out] != metadata["held_out"]["frames"]:
-        raise SystemExit(f"{args.data / DEPTH_FILE} holds out other photos than the capture beside it")
+        raise SystemExit(f"{args.data / DEPTH_FILE} holds out other photos than the capture next to it")
     for line in metadata["complaints"]:
         print(line)
     s = score_depths(path, held_out, box, OBJECT_CENTER, args.spp, args.out / "pictures")

@@ -111,7 +111,7 @@ def test08_commands_are_right_as_they_stand(page):
         module = words[0] == "-m"
         script = words[1].removeprefix("nerg_mi.").replace(".", "/") + ".py" if module else words[0]
         text = (ROOT / script).read_text(encoding="utf-8")
-        # Options that several scripts have come from a parser in a module beside them.
+        # Options that several scripts have come from a parser in a module next to them.
         for sibling in re.findall(r"^from (\w+) import .*_parser\b", text, re.M):
             text += (ROOT / script).with_name(f"{sibling}.py").read_text(encoding="utf-8")
         known = re.findall(r'"(--[a-z][a-z0-9-]*)"', text)

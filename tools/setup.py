@@ -132,7 +132,7 @@ def provide_package(python: Path, extras: set[str]) -> None:
 
 def main(extras: list[str]) -> int:
     try:
-        if sys.version_info < (3, 10):  # noqa: UP036 (whoever runs this has not read what the package requires)
+        if sys.version_info < (3, 10):  # noqa: UP036 (the user may not know the required version)
             version = sys.version.split()[0]
             raise Stop(
                 f"Python 3.10 or newer is needed and this is {version}: use another one with make PYTHON=python3.12."

@@ -47,6 +47,10 @@ class Trainer:
         """Wall time of the run, excluding the time between an interruption and its resumption."""
         return time.perf_counter() - self._started
 
+    def set_seconds(self, seconds: float) -> None:
+        """Continue the clock at ``seconds``, so that evaluation in between does not count as training time."""
+        self._started = time.perf_counter() - seconds
+
     @property
     def progress(self) -> float:
         """Completed fraction of the schedule, 0..1."""
@@ -92,7 +96,7 @@ class Trainer:
             self.averaged[name] = new["averaged"]
         dr.eval(optimiser.state, self.averaged)
         self.steps = int(read_count(meta, "steps"))
-        self._started = time.perf_counter() - read_count(meta, "seconds")
+        self.set_seconds(read_count(meta, "seconds"))
         self.rng.bit_generator.state = meta["random"]
 
 

@@ -185,9 +185,9 @@ TABLES = {
     "unity, named units": gaze_in_world("y left", 1.0, 1e-3, time="timestamp (ms)", eye="Origin.", gaze="Dir."),
     "centimetres, nanoseconds": gaze_in_world("y left", 1e-2, 1e-9, time="time", eye="o_pos", gaze="d"),
     "unity, local": gaze_in_head("y left"),
-    "unity, world beside the head": gaze_in_head("y left", local=False),
+    "unity, world next to the head": gaze_in_head("y left", local=False),
     "openxr, local": gaze_in_head("y right", head="pos", turn="q", gaze="gaze_vec_"),
-    "openxr, world beside the head": gaze_in_head("y right", local=False),
+    "openxr, world next to the head": gaze_in_head("y right", local=False),
     "ros, local": gaze_in_head("z right", head="camera.position.", turn="camera.orientation."),
 }
 

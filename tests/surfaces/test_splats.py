@@ -68,7 +68,7 @@ def test_occluded_side_has_no_area(rgb):
 
 # ---- Splat hits ----
 #
-# Hits of rays as arrays: all of them, in their order, beside a look at every Gaussian in double precision.
+# Hits of rays as arrays: all of them, in their order, next to a look at every Gaussian in double precision.
 
 
 def some(n=80, seed=3):
