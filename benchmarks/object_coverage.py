@@ -187,11 +187,11 @@ class Held:
     """Coverage of the ``truth`` (K,) by intervals, per AOI."""
 
     def __init__(self, truth: np.ndarray, common: np.ndarray, maximum: float):
-        self.truth, self.common, self.most = truth, common, maximum
+        self.truth, self.common, self.max_error = truth, common, maximum
         self.rows: list[np.ndarray] = []
 
     def add(self, low: np.ndarray, high: np.ndarray, expected: np.ndarray) -> None:
-        low, high = np.clip(low, 0, self.most), np.clip(high, 0, self.most)
+        low, high = np.clip(low, 0, self.max_error), np.clip(high, 0, self.max_error)
         inside = expected & (low <= self.truth + 1e-12) & (self.truth <= high + 1e-12)
         self.rows.append(np.stack([inside, expected, np.where(expected, (high - low) / self.truth, np.nan)]))
 
@@ -226,7 +226,7 @@ def compare(
                 x, y = population.draw(name, rng.integers(0, population.count, n))
                 with np.errstate(all="ignore"):
                     made = variants(x, y, int(rng.integers(1 << 30)))
-                expected = np.isfinite(next(ends for way, ends in made.items() if "kept" in way)[0])
+                expected = np.isfinite(next(ends for method, ends in made.items() if "kept" in method)[0])
                 for direction, (low, high) in made.items():
                     held = Held(population.truth[name], population.common, MEASURES_BY_NAME[name].upper_limit)
                     result.setdefault(direction, held).add(low, high, expected)

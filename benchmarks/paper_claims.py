@@ -16,7 +16,7 @@ from __future__ import annotations
 from dataclasses import fields
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
-from places import asked_places, interval, parse, place_parser, write_place
+from places import interval, parse, parse_environments, place_parser, write_place
 from timing import print_table, write_rows
 
 import numpy as np
@@ -40,7 +40,7 @@ def main(argv=None) -> None:
     args = parse(parser, argv)
     select_backend("llvm_ad_rgb", args.threads)
     expected, each = {f.name for f in fields(AblationOptions)}, []
-    for name, make in asked_places(args).items():
+    for name, make in parse_environments(args).items():
         folder, rays, where = write_place(name, make, args)
         for fold in range(args.folds):
             options = AblationOptions(
@@ -72,9 +72,9 @@ def summarise(rows: list[dict]) -> list[list[str]]:
     for recipe, variant in dict.fromkeys((r["recipe"], r["variant"]) for r in rows):
         separate = [r for r in rows if (r["recipe"], r["variant"]) == (recipe, variant)]
         cells = [recipe, variant, f"{np.mean([r['train_loss'] for r in separate]):.3f}"]
-        cells.append(told([r["test_loss"] - r["train_loss"] for r in separate]))
+        cells.append(print_row([r["test_loss"] - r["train_loss"] for r in separate]))
         for key in ("test_KLD", "test_CC"):
-            above = "" if variant == WHOLE else told(less(rows, recipe, variant, key))
+            above = "" if variant == WHOLE else print_row(less(rows, recipe, variant, key))
             cells += [f"{np.mean([r[key] for r in separate]):.3f}", above]
         out.append(cells)
     return out
@@ -88,7 +88,7 @@ def order(rows: list[dict]) -> list[list[str]]:
         full = [r for r in separate if (r["recipe"], r["variant"]) == (recipe, WHOLE)]
         cc = f"{np.mean([r['test_CC'] for r in full]):.3f}" if full else ""
         seconds = f"{np.median([r['train_seconds'] for r in full]):.0f}" if full else ""
-        above = (told(less(separate, recipe, variant, "test_CC")) for variant in ORDER)
+        above = (print_row(less(separate, recipe, variant, "test_CC")) for variant in ORDER)
         out.append([place, recipe, cc, *above, seconds])
     return out
 
@@ -100,7 +100,7 @@ def less(rows: list[dict], recipe: str, variant: str, key: str) -> list[float]:
     return [result[variant, fold] - result[WHOLE, fold] for fold in folds]
 
 
-def told(values: list[float]) -> str:
+def print_row(values: list[float]) -> str:
     """Mean of ``values`` with its interval; empty without values."""
     return f"{np.mean(values):+.3f} ± {interval(values):.3f}" if values else ""
 

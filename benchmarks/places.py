@@ -58,7 +58,7 @@ def parse(parser: argparse.ArgumentParser, argv=None) -> argparse.Namespace:
     return args
 
 
-def asked_places(args: argparse.Namespace) -> dict[str, Make]:
+def parse_environments(args: argparse.Namespace) -> dict[str, Make]:
     """The generators of the requested scenes, by name. Raises ``SystemExit`` for unknown ones."""
     expected = makers(args.data)
     names = args.only.split(",") if args.only else list(expected)
@@ -148,7 +148,7 @@ def main(argv=None) -> None:
         parser.error(f'"{args.against}" is not there; it is written by a run whose --out is its folder')
     each: list[dict] = []
     unsure: list[dict] = []
-    for name, make in asked_places(args).items():
+    for name, make in parse_environments(args).items():
         result = evaluate(name, make, args)
         each += [
             {"place": name, **{key: row[key] for key in ("fold", "split", "method", *SCORES)}} for row in result.each

@@ -34,7 +34,7 @@ from timing import median, print_table, spread
 SIZES = ((320, 180), (1280, 720), (1920, 1080))
 WAYS = ("mi.render", "nerg render")
 HEADS = {
-    "memory": ("frame", *(f"`{way}`, MB resident (MB of arrays)" for way in WAYS)),
+    "memory": ("frame", *(f"`{mode}`, MB resident (MB of arrays)" for mode in WAYS)),
     "start": ("what", "s", "quartiles", "CPU s"),
 }
 COMMAND = [str(Path(sys.executable).with_name("nerg"))]

@@ -97,7 +97,7 @@ class Pictures:
         rendered = self._render(mi.Point3f(*map(float, position)), sensors or self.sensors, seed)
         return np.array([np.array(image, float) for image in rendered])
 
-    def given(self, position, seed: int) -> np.ndarray:
+    def reference(self, position, seed: int) -> np.ndarray:
         """The pictures as they are given: with the noise of 16 random samples a pixel."""
         return self.at(position, self._make_sensors({"type": "independent", "sample_count": 16}), seed)
 
@@ -137,9 +137,9 @@ def distance(a, b, levels=(2, 4, 8)) -> np.ndarray:
     return sum(((np.sqrt(pooled(a, k)) - np.sqrt(pooled(b, k))) ** 2).mean((-3, -2, -1)) for k in levels)
 
 
-def loss(pictures, given, scale: float = SCALES[1]) -> float:
+def loss(pictures, reference, scale: float = SCALES[1]) -> float:
     """Compute the mean over all pixels of a robust (Cauchy) function of the difference of log densities."""
-    r = np.log(pictures + FLOOR) - np.log(given + FLOOR)
+    r = np.log(pictures + FLOOR) - np.log(reference + FLOOR)
     return float(np.mean(np.log1p((r / scale) ** 2)))
 
 
@@ -148,11 +148,11 @@ def loss(pictures, given, scale: float = SCALES[1]) -> float:
 # ----------------------------------------------------------------------------
 
 
-def gauss_newton_step(pictures, derivatives, given, scale: float) -> np.ndarray:
+def gauss_newton_step(pictures, derivatives, reference, scale: float) -> np.ndarray:
     """Compute the Gauss-Newton step (3,) in metres, from pixels with gaze in both pictures."""
-    r = np.log(pictures + FLOOR) - np.log(given + FLOOR)
+    r = np.log(pictures + FLOOR) - np.log(reference + FLOOR)
     J = derivatives / (pictures + FLOOR)[..., None]
-    w = ((pictures > DARK) & (given > DARK)) / (1 + (r / scale) ** 2)
+    w = ((pictures > DARK) & (reference > DARK)) / (1 + (r / scale) ** 2)
     J, wJ = J.reshape(-1, 3), (w[..., None] * J).reshape(-1, 3)
     A = J.T @ wJ
     step = np.linalg.solve(A + np.diag(1e-2 * np.diag(A) + 1e-9), -wJ.T @ r.ravel())
@@ -171,7 +171,7 @@ class Descent:
         return self.path[-1], self.losses[-1]
 
 
-def descend(pictures: Pictures, given, start, steps: int) -> Descent:
+def descend(pictures: Pictures, reference, start, steps: int) -> Descent:
     """Run Gauss-Newton from ``start`` with at most ``steps`` steps; the scale of the robust loss decreases along the
     way.
     """
@@ -179,11 +179,11 @@ def descend(pictures: Pictures, given, start, steps: int) -> Descent:
     for step in range(steps + 1):
         present = pictures.at(p)
         descent.path.append(p)
-        descent.losses.append(loss(present, given))
+        descent.losses.append(loss(present, reference))
         if step == steps or (step and np.linalg.norm(p - descent.path[-2]) < ENOUGH):
             break
         scale = SCALES[0] * (SCALES[1] / SCALES[0]) ** min(1, step / (0.6 * steps))
-        p = np.clip(p + gauss_newton_step(present, pictures.derivatives(p), given, scale), LOW, HIGH)
+        p = np.clip(p + gauss_newton_step(present, pictures.derivatives(p), reference, scale), LOW, HIGH)
     return descent
 
 
@@ -214,10 +214,10 @@ def true_observers(count: int, seed: int) -> np.ndarray:
     return np.column_stack([floor[standing(floor, shoppers.BODY_RADIUS)][:count], heights])
 
 
-def search(pictures: Pictures, given, guesses, known, settings: Settings) -> list:
+def search(pictures: Pictures, reference, guesses, truth, settings: Settings) -> list:
     """Run descents from the guesses (N, 3) with the pictures nearest to the target, sorted by loss."""
-    order = np.argsort(distance(known, given))[: settings.starts]
-    descents = [descend(pictures, given, guesses[k], settings.steps) for k in order]
+    order = np.argsort(distance(truth, reference))[: settings.starts]
+    descents = [descend(pictures, reference, guesses[k], settings.steps) for k in order]
     return sorted(descents, key=lambda d: d.answer()[1])
 
 

@@ -23,7 +23,7 @@ from nerg_mi.workflows.scene_commands import PictureOptions
 import numpy as np
 
 SCENE = Path(__file__).resolve().parents[1] / "scenes" / "store" / "scene.xml"
-WAY = np.array([(2.4, 2.8, 1.6), (6.6, 2.8, 1.6)])  # path of the shopper's eye, metres
+PATH = np.array([(2.4, 2.8, 1.6), (6.6, 2.8, 1.6)])  # path of the shopper's eye, metres
 CAMERA = {"camera": "7.4, 3.4, 2.2", "target": "4.8, 4.2, 1.0"}
 
 
@@ -33,7 +33,7 @@ def render_walk(out: Path, frames: int, width: int, spp: int) -> Path:
 
     # Slow at both ends, as a person would walk.
     along = 0.5 - 0.5 * np.cos(np.linspace(0, np.pi, frames // 2 + 1))
-    positions = WAY[0] + along[:, None] * (WAY[1] - WAY[0])
+    positions = PATH[0] + along[:, None] * (PATH[1] - PATH[0])
     rows = [{"eye": ", ".join(f"{x:.3f}" for x in eye), "ahead": f"{eye[0] + 0.3:.3f}, 4.4, 1.2"} for eye in positions]
     with tempfile.TemporaryDirectory() as folder:
         walk = Path(folder) / "walk.csv"

@@ -32,16 +32,16 @@ NUMBERS = "zero one two three four five six seven eight nine ten".split()
 @functools.cache
 def options() -> set[str]:
     """Every option of every command and of every script."""
-    found = {"--help"}
+    spellings = {"--help"}
 
     root = typer.main.get_command(nerg_mi.cli.build_app())
     for command in (root, *(command for _, command, _ in command_pages.iter_commands())):
         for parameter in command.params:
-            found.update(parameter.opts + parameter.secondary_opts)
+            spellings.update(parameter.opts + parameter.secondary_opts)
     for folder in ("benchmarks", "examples", "tools", "scenes/store", "scenes/tabletop", "tests/renders"):
         for script in (ROOT / folder).glob("*.py"):
-            found.update(re.findall(r'"(--[a-z][a-z0-9-]*)"', script.read_text()))
-    return found
+            spellings.update(re.findall(r'"(--[a-z][a-z0-9-]*)"', script.read_text()))
+    return spellings
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
@@ -114,9 +114,9 @@ def test08_commands_are_right_as_they_stand(page):
         # Options that several scripts have come from a parser in a module next to them.
         for sibling in re.findall(r"^from (\w+) import .*_parser\b", text, re.M):
             text += (ROOT / script).with_name(f"{sibling}.py").read_text(encoding="utf-8")
-        known = re.findall(r'"(--[a-z][a-z0-9-]*)"', text)
-        asked = [word.strip("[") for word in words if word.strip("[").startswith("--")]
-        assert set(asked) <= set(known), (script, asked)
+        valid = re.findall(r'"(--[a-z][a-z0-9-]*)"', text)
+        flags = [word.strip("[") for word in words if word.strip("[").startswith("--")]
+        assert set(flags) <= set(valid), (script, flags)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
@@ -133,12 +133,12 @@ def test10_settings_of_the_study_are_the_studys():
         is_marched=True, has_splats=False, extent=1.0, has_gaze=True, is_normalized=True, can_resample=True
     )
     names = {setting.name for setting in study_settings.list_rows(subject)}
-    told = set()
+    listed = set()
     for table in re.findall(
         r"^\| setting .*\n\|.*\n((?:\|.*\n)+)", (ROOT / "docs/explanation/error-and-time.md").read_text(), re.M
     ):
-        told |= {line.split("|")[1].strip() for line in table.splitlines()}
-    assert len(told) > 50 and told <= names
+        listed |= {line.split("|")[1].strip() for line in table.splitlines()}
+    assert len(listed) > 50 and listed <= names
 
 
 # ---- The README and the pages at the root ----
@@ -222,12 +222,12 @@ def test22_what_is_public_is_documented(path):
 
 def test23_what_functions_give_is_listed():
     """The classes of results, by the annotations of what returns them."""
-    given = set()
+    returned = set()
     for function in filter(inspect.isfunction, PUBLIC):
-        given |= set(re.findall(r"\b[A-Z]\w+", str(inspect.signature(function).return_annotation)))
+        returned |= set(re.findall(r"\b[A-Z]\w+", str(inspect.signature(function).return_annotation)))
     names = {path.rpartition(".")[2] for path in LISTED}
     # The networks within a TrainedField, and a figure of matplotlib.
-    assert given - names <= {"RadianceField", "AnyGazeField", "Figure", "None"}
+    assert returned - names <= {"RadianceField", "AnyGazeField", "Figure", "None"}
 
 
 # ---- Parts of pages that are made of the code ----

@@ -74,12 +74,12 @@ def run(text: str, page: str, names: dict | None = None) -> dict:
 
 def blocks(*languages: str, page: str = "") -> list[Block]:
     """The blocks of the pages, of these languages or all, of this page or all."""
-    found = []
+    matches = []
     for path in PAGES:
         for _, language, text in re.findall(r"^( *)```([^\n`]*)\n(.*?)^ *```", path.read_text("utf-8"), re.M | re.S):
             if (not languages or language in languages) and page in ("", path.name):
-                found.append(Block(path.name, language, text))
-    return found
+                matches.append(Block(path.name, language, text))
+    return matches
 
 
 def test01_no_block_is_left_out():
@@ -106,7 +106,7 @@ def test03_every_line_of_a_shell_is_known():
             if first == "make":
                 assert words[1] in targets, line
             if first == "pip":
-                assert {e for found in re.findall(r"\[([\w,]+)\]", line) for e in found.split(",")} <= extras, line
+                assert {e for match in re.findall(r"\[([\w,]+)\]", line) for e in match.split(",")} <= extras, line
 
 
 def test04_areas_are_read(tmp_path):
@@ -231,8 +231,8 @@ def write_photos(folder: Path, nerg) -> None:
         mi.util.write_bitmap(str(folder / f"{i}.png"), mi.TensorXf(np.ascontiguousarray(color)), write_async=False)
         pose = np.array(mi.ScalarTransform4f().look_at(list(eye), [4.8, 4.9, 1.2], [0, 0, 1]).matrix)
         frames.append({"file_path": f"{i}.png", "transform_matrix": (pose @ np.diag([-1, 1, -1, 1])).tolist()})
-    about = {"camera_angle_x": float(np.radians(70)), "w": 24, "h": 16, "frames": frames}
-    (folder / "transforms.json").write_text(json.dumps(about))
+    metadata = {"camera_angle_x": float(np.radians(70)), "w": 24, "h": 16, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(metadata))
 
 
 # ---- Pages whose blocks lead from one to the next, on the store's own files or on stand-ins of its fields ----
@@ -264,9 +264,9 @@ def with_smaller_image(text: str) -> str:
 @pytest.fixture
 def readme(clone):
     """The scene and the checkpoints; random ones where the store has none."""
-    own = list(demo.CHECKPOINTS.values())
-    has_own = all(demo.find_store_scene().with_name(name).is_file() for name in own)
-    store = clone("scene.xml", *(own if has_own else ()))
+    block = list(demo.CHECKPOINTS.values())
+    has_own = all(demo.find_store_scene().with_name(name).is_file() for name in block)
+    store = clone("scene.xml", *(block if has_own else ()))
     if not has_own:
         write_standins(store)
     return store
@@ -351,8 +351,8 @@ def test15_files_of_statistics(tmp_path):
     (tmp_path / "a.json").write_text(areas)
     (tmp_path / "c.json").write_text(changes)
     assert len(read_areas(tmp_path / "a.json").areas) == len(json.loads(areas)["regions"])
-    found = read_changes(tmp_path / "c.json")
-    assert found.move and found.remove and found.add and found.swap and found.observers is not None
+    names = read_changes(tmp_path / "c.json")
+    assert names.move and names.remove and names.add and names.swap and names.observers is not None
 
 
 def test16_pictures(tmp_path, rgb, monkeypatch):

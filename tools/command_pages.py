@@ -76,14 +76,14 @@ def split_default(text: str) -> tuple[str, str]:
     """Split the help of a parameter into its text with the range, and its default or "required", which the parser
     appends in brackets.
     """
-    found = re.fullmatch(r"(.*?)\s*\[([^\[\]]*)\]", text, re.S)
-    notes = [note.strip() for note in found[2].split(";")] if found else []
+    match = re.fullmatch(r"(.*?)\s*\[([^\[\]]*)\]", text, re.S)
+    notes = [note.strip() for note in match[2].split(";")] if match else []
     ranges = [note for note in notes if _RANGE.fullmatch(note)]
     rest = [note for note in notes if note not in ranges and note != "required"]
-    if found is None or not (ranges or "required" in notes or (rest and rest[0].startswith("default:"))):
+    if match is None or not (ranges or "required" in notes or (rest and rest[0].startswith("default:"))):
         return text, ""
     # A default in words is part of the help text, in its own brackets.
-    meaning, default = split_default(found[1]) if not rest else (found[1], "; ".join(rest).removeprefix("default:"))
+    meaning, default = split_default(match[1]) if not rest else (match[1], "; ".join(rest).removeprefix("default:"))
     meaning += "".join(f" ({note})" for note in ranges)
     return meaning, default.strip() or ("required" if "required" in notes else "")
 

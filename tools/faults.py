@@ -176,14 +176,14 @@ def kill_at(pid: int, seconds: float) -> int:
 def kill_while_writing(pid: int, folder: Path, turn: random.Random, skip: int) -> int:
     """Kill ``pid`` during a later write, after ``skip`` writes, or a few milliseconds after it; returns its exit
     code."""
-    known_files, seen = set(filter(is_partial, folder.rglob("*"))), 0
+    files_before, seen = set(filter(is_partial, folder.rglob("*"))), 0
     end = time.monotonic() + _LIMIT
     while time.monotonic() < end:
         done, status = os.waitpid(pid, os.WNOHANG)
         if done:
             return os.waitstatus_to_exitcode(status)
-        new = set(filter(is_partial, folder.rglob("*"))) - known_files
-        known_files |= new
+        new = set(filter(is_partial, folder.rglob("*"))) - files_before
+        files_before |= new
         seen += len(new)
         if seen > skip:
             return kill_at(pid, turn.choice((0, 0.001, 0.003, 0.01)))

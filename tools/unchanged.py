@@ -236,7 +236,7 @@ def select_commands(folder: Path, only: list[str]) -> list[tuple[str, list[str]]
     selected = []
     for name, line in reversed(list(iter_commands(folder))):
         out = folder / name
-        reads = lambda given, out=out: str(out) in given or (out.parent != folder and given == str(out.parent))
+        reads = lambda argument, out=out: str(out) in argument or (out.parent != folder and argument == str(out.parent))
         if not only or any(o in name for o in only) or any(reads(g) for _, other in selected for g in other):
             selected.append((name, line))
     return selected[::-1]

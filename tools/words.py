@@ -69,7 +69,7 @@ _ALLOWED = "words: ok"
 def find_name(name: str) -> str | None:
     """The word of ``NAMES`` that ``name`` uses, or None.
 
-    Predicates (``is_known``), counts (``num_found``) and the sentences that tests are named by use them as ordinary words.
+    Predicates (``is_known``), counts (``num_found``) and names of tests use them as ordinary words.
     """
     plain = name.strip("_").lower()
     if plain.startswith(("is_", "num_", "test")):

@@ -25,8 +25,8 @@ def main(arguments: list[str] | None = None) -> None:
     """
     open_streams()
     arguments = list(sys.argv[1:] if arguments is None else arguments)
-    asked_by_environment = os.environ.get("NERG_TRACEBACK", "0") not in ("", "0")
-    debug = asked_by_environment or not set(DEBUG).isdisjoint(arguments)
+    requested_by_environment = os.environ.get("NERG_TRACEBACK", "0") not in ("", "0")
+    debug = requested_by_environment or not set(DEBUG).isdisjoint(arguments)
     # Accepted anywhere, since users append it after an error.
     arguments = [a for a in arguments if a not in DEBUG]
     with CtrlC() as ctrl_c:

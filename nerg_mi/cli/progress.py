@@ -29,9 +29,9 @@ class TerminalReporter:
     def __enter__(self) -> TerminalReporter:
         self._bar: Progress | None = None
         self._lock = threading.Lock()
-        self._told = time.monotonic()
+        self._printed = time.monotonic()
         self._begun: float | None = None
-        self._counted = self._told
+        self._counted = self._printed
         self._now = (0.0, "")
         self._ended = threading.Event()
         self._pulse: threading.Thread | None = None
@@ -79,9 +79,9 @@ class TerminalReporter:
     def log_when_due(self) -> None:
         """Print a line to a log if the last one is `LOG_INTERVAL` seconds old."""
         with self._lock:
-            if time.monotonic() - self._told < LOG_INTERVAL:
+            if time.monotonic() - self._printed < LOG_INTERVAL:
                 return
-            self._told = time.monotonic()
+            self._printed = time.monotonic()
             print(f"{self._now[0]:4.0%} {self.line()}".rstrip(), file=sys.stderr, flush=True)
 
     def _beat(self) -> None:

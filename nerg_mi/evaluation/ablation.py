@@ -74,9 +74,14 @@ def list_variants(has_radiance: bool, recipes: Sequence[str] = ("default", "pape
         ]
         if has_radiance and "semantic" in recipe.supported_options:
             out += [
-                Variant(name=f"semantic {kind}{', own too' * own}", recipe=recipe.name, semantic=kind, semantic_own=own)
+                Variant(
+                    name=f"semantic {kind}{', own too' * with_own}",
+                    recipe=recipe.name,
+                    semantic=kind,
+                    semantic_own=with_own,
+                )
                 for kind in ("accumulated", "snapshot")
-                for own in (False, True)
+                for with_own in (False, True)
             ]
         if has_radiance and "init" in recipe.supported_options:
             out += [

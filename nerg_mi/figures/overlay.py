@@ -611,10 +611,12 @@ def find_channel_overlay(name: str) -> Overlay:
 
 def shared_limits(all_limits: Sequence[Limits], vmax: float | None) -> Limits:
     """Return one scale for several images from the limits of each; the upper end may be given."""
-    given_limits = [limits for limits in all_limits if limits is not None]
+    explicit_limits = [limits for limits in all_limits if limits is not None]
     if vmax is not None:
-        low = min((limits[0] for limits in given_limits), default=0.0)
+        low = min((limits[0] for limits in explicit_limits), default=0.0)
         return min(low, 0.0) if low >= vmax else low, vmax
     return (
-        (min(limits[0] for limits in given_limits), max(limits[1] for limits in given_limits)) if given_limits else None
+        (min(limits[0] for limits in explicit_limits), max(limits[1] for limits in explicit_limits))
+        if explicit_limits
+        else None
     )

@@ -51,7 +51,7 @@ def find_colormap(name: str, kind: str = "sequential") -> Any:
     import matplotlib
 
     names, description = _COLORS[kind]
-    if name.removesuffix("_r") not in {known_name.removesuffix("_r") for known_name in names}:
+    if name.removesuffix("_r") not in {n.removesuffix("_r") for n in names}:
         raise NergError(f'"{name}" is not a {description} colour map; choose one of {", ".join(names)}')
     return matplotlib.colormaps[name]
 

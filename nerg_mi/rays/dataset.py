@@ -365,7 +365,7 @@ class Conditions:
         """The rays that match. Names that do not occur in ``rays`` are not an error here."""
         if not self.has_any:
             return rays
-        keep_present = lambda names, known: None if names is None else [name for name in names if name in known]
+        keep_present = lambda names, available: None if names is None else [name for name in names if name in available]
         applicable = replace(
             self,
             persons=keep_present(self.persons, rays.persons),

@@ -201,7 +201,7 @@ def find_preset_by_columns(table: ColumnFinder) -> tuple[Reader[Any], str] | Non
         if available.issuperset(columns)
     ]
     if matches:
-        columns, reader = max(matches, key=lambda found: len(found[0]))
+        columns, reader = max(matches, key=lambda match: len(match[0]))
         return reader, f"it has the columns {', '.join(columns)}"
     return next(((reader, reason) for reader in iterate_readers() if (reason := reader.signature.table(table))), None)
 

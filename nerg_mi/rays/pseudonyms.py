@@ -102,7 +102,7 @@ def _replace_names(metadata: dict, persons: tuple[str, ...], person: Callable, d
         if value in replacements:
             return replacements[value]
         # Some letters match case-insensitively, but differ in lower case.
-        replace_match = lambda found: folded.get(found.group().lower()) or person(found.group())
+        replace_match = lambda match: folded.get(match.group().lower()) or person(match.group())
         return pattern.sub(replace_match, value) if pattern else value
 
     unchanged = {k: metadata[k] for k in _PLAIN_KEYS if k in metadata}

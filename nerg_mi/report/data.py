@@ -213,7 +213,7 @@ class ParticipantLabels:
         names = sorted((n for n in self._label if n), key=len, reverse=True)
         pattern = "|".join(re.escape(n) if len(n) >= _MIN_SUBSTRING else rf"(?<!\w){re.escape(n)}(?!\w)" for n in names)
         label_of = {name.lower(): label for name, label in self._label.items()}
-        replace_name = lambda found: label_of.get(found.group().lower(), "a participant")
+        replace_name = lambda match: label_of.get(match.group().lower(), "a participant")
         return re.sub(pattern, replace_name, text, flags=re.IGNORECASE) if pattern else text
 
 

@@ -115,16 +115,12 @@ def _next_hits(hits, origins, directions, after, before, light, stop) -> tuple[n
     ray = LocalRay(o, d, d, mi.Float(0), mi.Float(dr.inf))
     last = LastHit(to_float(after[0]), mi.UInt32(copy_aligned(after[1], np.uint32).ravel()))
     with dr.suspend_grad():
-        hits_found = hits.find_next(
+        hit_mask = hits.find_next(
             ray, last, to_float(before), to_float(light), dr.opaque(mi.Float, stop), dr.full(mi.Bool, True, count)
         )
-        dr.eval(hits_found.t, hits_found.absorbed, hits_found.index)
+        dr.eval(hit_mask.t, hit_mask.absorbed, hit_mask.index)
     stacked = lambda values, kind: np.stack([np.array(v).astype(kind) for v in values], axis=1)
-    return (
-        stacked(hits_found.t, np.float64),
-        stacked(hits_found.absorbed, np.float64),
-        stacked(hits_found.index, np.int64),
-    )
+    return (stacked(hit_mask.t, np.float64), stacked(hit_mask.absorbed, np.float64), stacked(hit_mask.index, np.int64))
 
 
 # ---- Splat areas ----

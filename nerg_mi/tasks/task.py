@@ -94,19 +94,19 @@ class Checksums:
     """
 
     def __init__(self) -> None:
-        self._known_digests: dict[str, tuple[tuple[int, ...], str]] = {}
+        self._digests: dict[str, tuple[tuple[int, ...], str]] = {}
 
     def compute(self, path: str | os.PathLike) -> str:
         """Return the SHA-256 (hex) of the file ``path``. Raises `NergError` if it cannot be read."""
         name = os.path.abspath(path)
         signature = _read_signature(name)
-        previous = self._known_digests.get(name)
+        previous = self._digests.get(name)
         if previous is not None and previous[0] == signature:
             return previous[1]
         digest = file_sha256(name)
         # A file that changed during the read is not cached.
         if signature is not None and _read_signature(name) == signature:
-            self._known_digests[name] = (signature, digest)
+            self._digests[name] = (signature, digest)
         return digest
 
     def is_unchanged(self, file: InputFile) -> bool:

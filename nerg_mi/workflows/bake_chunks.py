@@ -468,7 +468,7 @@ class SplatScene:
             densities = splat_densities(
                 geometry.splats,
                 geometry.place,
-                lambda _, own=observer: own,
+                lambda _, bound=observer: bound,
                 eye,
                 np.array([weight]),
                 geometry.settings,

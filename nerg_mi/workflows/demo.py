@@ -39,7 +39,7 @@ from .render import describe_bases, describe_basis
 from .report import RESULTS, make_report
 from .scene_commands import BakeOptions, DemoOptions, ReportOptions
 
-CAMERA, OWN, SPHERE = range(3)
+CAMERA, FIRST_PERSON, SPHERE = range(3)
 """Indices of the sensors."""
 
 CHECKPOINTS = {"field": "store.safetensors", "gaze": "shoppers.safetensors"}
@@ -107,7 +107,7 @@ def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Rep
         clock.start("camera")
         camera = render(seen, CAMERA)
         clock.start("own view")
-        own_view = render(seen, OWN)
+        own_view = render(seen, FIRST_PERSON)
         clock.start("gaze sphere")
         sphere = render(seen, SPHERE)
         clock.start("without occlusion")
@@ -130,7 +130,7 @@ def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Rep
     write_bitmap_exr(out / "scene.exr", camera.bitmap)
     files.append(out / "scene.exr")
     clock.start("surfaces")
-    eye = tuple(float(v) for v in np.ravel(np.array(sensor_center(seen.sensors()[OWN]))))
+    eye = tuple(float(v) for v in np.ravel(np.array(sensor_center(seen.sensors()[FIRST_PERSON]))))
     if (scene.parent / TWIN).is_file():
         files.append(_bake(scene.parent / TWIN, inputs[2], eye, out / "heatmap.glb", mode, seed))
     clock.start("tracked gaze")
@@ -259,7 +259,7 @@ def observer_pixel(scene) -> tuple[float, float] | None:
 
     Pixels are counted from the centre of the first one.
     """
-    return project_to_pixel(scene.sensors()[CAMERA], sensor_center(scene.sensors()[OWN]))
+    return project_to_pixel(scene.sensors()[CAMERA], sensor_center(scene.sensors()[FIRST_PERSON]))
 
 
 def sphere_integral(sphere: Channels) -> float:

@@ -315,10 +315,10 @@ def triptych(files: Sequence[Path], options: TriptychOptions, reporter: Reporter
             nerg.occlusion = with_occlusion
         seen = opened.render(camera, overlay)
         marker = project_to_pixel(camera, sensor_center(nerg.observer))
-    limits = shared_limits([overlay.limits(of) for of in (own_view, without, seen)], options.vmax)
+    limits = shared_limits([overlay.limits(view) for view in (own_view, without, seen)], options.vmax)
     overlay.check_limits(limits)
     heat = overlay.heat(limits, style)
-    first, second, third = ((of.color, of.values, of.mask) for of in (own_view, without, seen))
+    first, second, third = ((view.color, view.values, view.mask) for view in (own_view, without, seen))
     figure = occlusion_figure(first, second, third, heat, marker, style.hatch_unknown, seen.support_note)
     return Drawing(figure, [path], options.seed)
 

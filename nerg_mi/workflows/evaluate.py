@@ -342,25 +342,25 @@ def evaluate_folds(
     each, fields, by_split = [], [], {split: [] for split in splits}
     positions, regions = [], {split: [] for split in splits}
     for seed, made in zip(seeds, parts.run(plan)):
-        found: Any = read_json(made.path / SCORED, "scores of a fold")
+        results: Any = read_json(made.path / SCORED, "scores of a fold")
         fields.append(made.path / FIELD)
         for split in splits:
-            by_split[split].append(found[split]["rows"])
-            each += [{"fold": seed, "split": split, **row} for row in found[split]["rows"]]
+            by_split[split].append(results[split]["rows"])
+            each += [{"fold": seed, "split": split, **row} for row in results[split]["rows"]]
             # Zones of different folds, and participants of different splits, are different groups.
             group_key = lambda row, seed=seed, split=split: {"group": f"{seed} {split} {row['group']}"}
             positions += [
-                {"fold": seed, "split": split, **row, **group_key(row)} for row in found[split]["by_position"]
+                {"fold": seed, "split": split, **row, **group_key(row)} for row in results[split]["by_position"]
             ]
-            regions[split].append(found[split]["calibration"])
+            regions[split].append(results[split]["calibration"])
         score = by_split[splits[0]][-1][0]
         reporter.message(f"fold {seed}, {splits[0]}: KLD {score['KLD']:.3f}, CC {score['CC']:.3f}")
-    rows = [{"split": split, **row} for split, found in by_split.items() for row in summarise_folds(found)]
+    rows = [{"split": split, **row} for split, scores in by_split.items() for row in summarise_folds(scores)]
     populations = {split: [p for p in positions if p["split"] == split] for split in splits}
     if len(splits) > 1:
         populations["anywhere"] = positions
-    ranks = [{"split": split, **row} for split, found in populations.items() for row in correlate_uncertainty(found)]
-    held = [{"split": split, **row} for split, found in regions.items() for row in average_folds(found, _LEVELS)]
+    ranks = [{"split": split, **row} for split, scores in populations.items() for row in correlate_uncertainty(scores)]
+    held = [{"split": split, **row} for split, scores in regions.items() for row in average_folds(scores, _LEVELS)]
     written = _write(output, rows, each, options, positions, ranks, held)
     for path in written:
         reporter.message(f"wrote {path}")

@@ -126,7 +126,7 @@ def find_poses(
 def _copy(
     pictures: Path, folders: PhotoFolders, options: PoseOptions, reporter: Reporter
 ) -> tuple[list[PhotoCopy], list[UnusedFrame]]:
-    progress = lambda done, of: _progress(reporter, "pictures", done, of)
+    progress = lambda done, total: _progress(reporter, "pictures", done, total)
     skipped: list[UnusedFrame] = []
     if pictures.is_dir():
         photos, ignored = list_photos(pictures)

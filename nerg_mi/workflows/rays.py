@@ -49,8 +49,8 @@ class FilterStep:
     """A completed step, as stored in the metadata of rays."""
 
     name: str
-    kept: int
-    of: int
+    kept: int  # words: ok, a key of the metadata
+    of: int  # words: ok, a key of the metadata
     settings: dict[str, Any]
 
 

@@ -92,9 +92,9 @@ class RaysImportOptions(ValidatedDataclass):
         if self.salt is not None and not self.pseudonyms:
             raise NergError("--salt needs --pseudonyms; add it, or leave out --salt")
         of_datasets = {"--environment": self.environment, "--day": self.day, "--workers": self.workers}
-        given = [flag for flag, value in of_datasets.items() if value is not None]
-        if given and not self.into_dataset:
-            raise NergError(f"{given[0]} applies to datasets only; use an output name that ends in {DATASET}")
+        explicit = [flag for flag, value in of_datasets.items() if value is not None]
+        if explicit and not self.into_dataset:
+            raise NergError(f"{explicit[0]} applies to datasets only; use an output name that ends in {DATASET}")
         if self.align_output is not None and self.into_dataset:
             raise NergError(
                 "--align-output does not apply to datasets, whose sources may differ in their frames; write a rays file"

@@ -398,7 +398,9 @@ def render_file(
         each = make_provenances(scene, frames, options, mode, video)
         with _writer(files, options, each, video) as write:
             if options.overlay is not None:
-                drawn = lambda figure: write(lambda path, about: save(figure, path, about), lambda: rasterize(figure))
+                drawn = lambda figure: write(
+                    lambda path, metadata: save(figure, path, metadata), lambda: rasterize(figure)
+                )
                 picture, top = render_overlays(scene, frames, drawn, options, render, stop)
             else:
                 for frame in frames:

@@ -206,7 +206,7 @@ def draw_views(
     if top is None:
         return out
     heat = Heat(top)
-    hatched = lambda of: unknown_mask(of, True) if has_geometry or not of.has_support else None
+    hatched = lambda values: unknown_mask(values, True) if has_geometry or not values.has_support else None
 
     def draw(name: str, title: str) -> bytes:
         layers = views.layers(name)

@@ -94,8 +94,8 @@ def statistics(
     ns = select_backend(options.mode, options.threads)
     result = _StatisticsWork(input_files, areas, options, ns, reporter, output).run()
     if output is not None:
-        given = (input_files.scene, input_files.field, input_files.gaze, input_files.rays)
-        inputs = [path for path in given if isinstance(path, Path)]
+        geometry_options = (input_files.scene, input_files.field, input_files.gaze, input_files.rays)
+        inputs = [path for path in geometry_options if isinstance(path, Path)]
         inputs += [p for p in (options.aois, options.what_if) if p is not None and p.is_file()]
         result.files.extend(write_results(make_folder(output), result, inputs, options, reporter))
     return result
@@ -174,9 +174,9 @@ class _StatisticsWork:
             predicted = self._predict(viewpoints)
             warn_missing_support(predicted, self.reporter)
             for cell in cells:
-                found = aggregate_by_participant(predicted, viewpoints, cell, times[cell], o.glance_duration)
-                if found is not None:
-                    people[cell][PREDICTED] = found
+                statistics = aggregate_by_participant(predicted, viewpoints, cell, times[cell], o.glance_duration)
+                if statistics is not None:
+                    people[cell][PREDICTED] = statistics
         self._report_small_groups(people)
         names = self.areas.names
         self.reporter.progress(0.9, "confidence intervals")
@@ -342,12 +342,15 @@ class _StatisticsWork:
         return ParticipantRows(sums, named, seen)
 
     def _report_small_groups(self, people: Mapping[Cell, Mapping[str, Participants]]) -> None:
-        for cell in (c for c, found in people.items() if MEASURED in found and not found[MEASURED].names):
+        for cell in (c for c, by_source in people.items() if MEASURED in by_source and not by_source[MEASURED].names):
             self.reporter.message(
                 f"there are no participants in the {cell.dimension} {cell.value}; time windows are on the rays' clock"
             )
         few = [
-            cell for cell, found in people.items() for p in found.values() if 0 < p.is_in_cell.sum() < MIN_PARTICIPANTS
+            cell
+            for cell, by_source in people.items()
+            for p in by_source.values()
+            if 0 < p.is_in_cell.sum() < MIN_PARTICIPANTS
         ]
         if few:
             which = "the whole recording" if few[0] == ALL else f"{few[0].dimension} {few[0].value}"

@@ -248,6 +248,6 @@ def _join_parts(parts: Iterable[Any]) -> tuple[list[dict], list[dict], list[dict
             default_times = {f"default_{clock}": default[clock] for clock in ("seconds", "cpu_seconds")}
             table.append(row | default_times | {"timed_by": of_process["process"]})
             of_process["rows"] += 1
-    for found in who.values():
-        found["seconds"] = [min(found["seconds"]), max(found["seconds"])]
+    for results in who.values():
+        results["seconds"] = [min(results["seconds"]), max(results["seconds"])]
     return table, scaling["rows"], list(who.values())

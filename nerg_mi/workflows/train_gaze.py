@@ -115,7 +115,7 @@ def _check(options: GazeOptions, recipe: Recipe, views_alone: bool) -> None:
         "prior-folds": bool(options.prior_folds),
         "prior-kappa": options.prior_kappa is not None,
     }
-    recipe.check_options([name for name, given in explicit.items() if given])
+    recipe.check_options([name for name, is_set in explicit.items() if is_set])
     if options.loss and options.loss not in recipe.losses:
         raise NergError(f'the loss must be one of {", ".join(recipe.losses)}, got "{options.loss}"')
 
@@ -451,7 +451,7 @@ def learn_prior(
     }
     if output is not None:
         save_gaze(field, output, provenance)
-        people = sum(of["persons"] for of in files)
+        people = sum(entry["persons"] for entry in files)
         scene_count = f"{len(files)} scene{'' if len(files) == 1 else 's'}"
         reporter.message(
             f"wrote {output}: distribution of gaze elevation of {people} participants in {scene_count}, independent of "

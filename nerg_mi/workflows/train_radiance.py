@@ -114,7 +114,7 @@ def _train(photos: str | Path, output: Path | None, options: RadianceOptions, re
         resume=options.resume,
         save_every=options.save_every or float("inf"),
         preview=preview,
-        write=None if output is None else lambda field, about: save_radiance(field, output, about, options.half),
+        write=None if output is None else lambda field, metadata: save_radiance(field, output, metadata, options.half),
     )
     result = RadianceResult(field, provenance, output, provenance["interrupted"])
     _report_result(result, reporter)

@@ -129,7 +129,7 @@ def test09_progress_is_reported(scene):
 
 
 @pytest.mark.parametrize(
-    "given, said",
+    "arguments, said",
     [
         ({"quantities": "gazes"}, '"aovs".*"gazes"'),
         ({"quantities": "kde"}, 'needs a "kde" volume'),
@@ -141,9 +141,9 @@ def test09_progress_is_reported(scene):
         ({"camera": 3}, "no camera 3"),
     ],
 )
-def test10_errors_are_sentences(scene, given, said):
+def test10_errors_are_sentences(scene, arguments, said):
     with pytest.raises(nerg.NergError, match=said) as error:
-        nerg.render(scene, **{"spp": 1, **given})
+        nerg.render(scene, **{"spp": 1, **arguments})
     assert "\n" not in str(error.value)
 
 

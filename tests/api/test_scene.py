@@ -287,13 +287,13 @@ def test06_a_volume_in_place_of_a_field():
         ({"field": "GAZE"}, "contains a gaze field"),
     ],
 )
-def test07_errors_are_sentences(files, given, said):
-    given = {
+def test07_errors_are_sentences(files, arguments, said):
+    arguments = {
         key: files / "gaze.safetensors" if isinstance(value, str) and value == "GAZE" else value
-        for key, value in given.items()
+        for key, value in arguments.items()
     }
     with pytest.raises(nerg.NergError, match=said) as error:
-        nerg.make_scene(**given)
+        nerg.make_scene(**arguments)
     assert "\n" not in str(error.value)
 
 

@@ -66,7 +66,7 @@ def test02_rays_in_memory_and_in_a_file_are_one(rgb, tmp_path):
 # ---- Options are passed on to the jobs; that these work is shown by the examples (test_names) ----
 
 
-class Asked(Exception):
+class Request(Exception):
     """Ends a job before it begins, with what it was asked."""
 
 
@@ -106,23 +106,23 @@ JOBS = {
 
 
 @pytest.fixture
-def asked(monkeypatch, tmp_path):
+def captured(monkeypatch, tmp_path):
     """Workflows that raise with their options, and the files that they need."""
     monkeypatch.chdir(tmp_path)
     for name in ("f.safetensors", "g.safetensors", "r.npz", "photos"):
         Path(name).touch()
 
     def raise_it(*arguments):
-        raise Asked(*arguments)
+        raise Request(*arguments)
 
     for job, (module, *_) in JOBS.items():
         monkeypatch.setattr(module, job, raise_it)
 
 
 @pytest.mark.parametrize("job", JOBS)
-def test01_options_reach_the_workflows(asked, job):
+def test01_options_reach_the_workflows(captured, job):
     _, call, expected = JOBS[job]
-    with pytest.raises(Asked) as result:
+    with pytest.raises(Request) as result:
         call()
     assert result.value.args[:-1] == expected
 
@@ -137,8 +137,8 @@ def test02_invalid_options_are_refused(name):
         getattr(nerg, name)("a", "b", mode="scalar_rgb")
 
 
-def test03_active_variant_is_kept(mono, asked):
-    with pytest.raises(Asked) as result:
+def test03_active_variant_is_kept(mono, captured):
+    with pytest.raises(Request) as result:
         nerg.train_radiance("photos")
     assert result.value.args[2].mode == "llvm_ad_mono" and mono.variant() == "llvm_ad_mono"
 

@@ -237,15 +237,15 @@ def test_intervals_are_a_bootstrap_over_persons():
     assert row["MAE.less"] - row["MAE.less.low"] == pytest.approx(1.96 * np.std(less), rel=0.1)
 
 
-@pytest.mark.parametrize("persons, known", [(2, False), (3, True), (4, True)])
-def test_fewer_than_three_persons_have_no_interval(persons, known):
+@pytest.mark.parametrize("persons, has_interval", [(2, False), (3, True), (4, True)])
+def test_fewer_than_three_persons_have_no_interval(persons, has_interval):
     for row in gaze.evaluate_gaze(
         by_hand(persons),
         {"a": make_uniform_baseline(), "b": make_uniform_baseline()},
         make_uniform_baseline(),
         resamples=5,
     ):
-        assert all((f"{k}.low" in row) == known and (f"{k}.high" in row) == known for k in gaze.SCORES)
+        assert all((f"{k}.low" in row) == has_interval and (f"{k}.high" in row) == has_interval for k in gaze.SCORES)
 
 
 def test_ray_scores_by_hand():
@@ -306,8 +306,8 @@ def test_split_half_uses_positions_of_both_halves(rays_evaluation, test_set):
         min_rays=20,
     )
     assert row["method"] == "split half" and 0 < row["CC"] < 1 and row["KLD"] > 0
-    nobody = np.array([[40.0, 0, 0]])
-    assert gaze.score_split_half(rays_evaluation, nobody, 0.6, 20.0, make_uniform_baseline(), min_rays=20) is None
+    nowhere = np.array([[40.0, 0, 0]])
+    assert gaze.score_split_half(rays_evaluation, nowhere, 0.6, 20.0, make_uniform_baseline(), min_rays=20) is None
     two = gaze.score_split_half(
         rays_evaluation.select(rays_evaluation.person < 2),
         test_set.centres,

@@ -119,11 +119,11 @@ RESULTS_ROWS = [
 ]
 
 PERSONS = [{"method": "gaze field", "person": "Ada", "rays": 4, "bits": 0.1}]
-ABOUT = {"gaze": "g.safetensors", "split": "both", "kappa": 20.0, "positions": 12}
+METADATA = {"gaze": "g.safetensors", "split": "both", "kappa": 20.0, "positions": 12}
 
 
 def test_results_are_read_back(tmp_path):
-    write_report(tmp_path, RESULTS_ROWS, PERSONS, {**ABOUT, "people": 7, "gaze_sha256": "ab"}, "# notes")
+    write_report(tmp_path, RESULTS_ROWS, PERSONS, {**METADATA, "people": 7, "gaze_sha256": "ab"}, "# notes")
     result = read_results(tmp_path / "gaze.json")
     assert (result.gaze, result.split, result.num_positions, result.num_participants, result.sha256) == (
         "g.safetensors",
@@ -156,7 +156,7 @@ def test_results_are_read_back(tmp_path):
 )
 def test_invalid_results_are_refused(tmp_path, change):
     path = tmp_path / "gaze.json"
-    full = {**ABOUT, "methods": RESULTS_ROWS[1:], "persons": PERSONS}
+    full = {**METADATA, "methods": RESULTS_ROWS[1:], "persons": PERSONS}
     path.write_text(json.dumps(change if isinstance(change, list) else {**full, **change}))
     with pytest.raises(NergError, match='"nerg eval gaze"'):
         read_results(path)
@@ -365,7 +365,7 @@ def row_uncertainty(support, error, group, **options):
 
 
 @pytest.fixture(scope="module")
-def asked():
+def evaluation():
     """Test data of four participants, and two methods: a map and the uniform density."""
     centres = np.array([[-0.5, 0, 1.6], [-0.5, 3, 1.6], [-0.5, -3, 1.6]])
     test = gaze.make_test(crowd(), centres, 0.6, 20.0, 256, min_rays=20)
@@ -394,8 +394,8 @@ def test_spread_correlates_with_errors_and_few_groups_have_no_interval():
     assert math.isnan(same["rho"]) and same["25%"] == same["100%"] == 5.5
 
 
-def test_position_rows_have_their_errors(asked):
-    test, maps, uniform = asked
+def test_position_rows_have_their_errors(evaluation):
+    test, maps, uniform = evaluation
     rows = uncertainty.score_positions(test, maps, uniform, support=np.array([1, 2, 3]), groups=["a", "a", "b"])
     assert [r["group"] for r in rows] == ["a", "a", "b"] and [r["support"] for r in rows] == [1, 2, 3]
     expected = metrics.kld(test.truth, maps, eps=1e-6)
@@ -416,9 +416,9 @@ def test_equal_halves_agree():
     assert distances[0] > 0.05
 
 
-def test_calibrated_regions_have_nominal_coverage(asked):
+def test_calibrated_regions_have_nominal_coverage(evaluation):
     """Regions of a density that is too narrow have too little coverage; calibrated levels restore it."""
-    test, _, _ = asked
+    test, _, _ = evaluation
     rng = np.random.default_rng(1)
     selected = np.stack([rng.choice(256, 4000, p=row / row.sum()) for row in test.truth])
     drawn = type(test)(**{**vars(test), "sample_participants": rng.integers(0, 4, selected.shape)})

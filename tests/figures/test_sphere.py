@@ -69,7 +69,7 @@ def test_unknown_projection_is_refused():
 # ---- Figure ----
 
 HEIGHT, WIDTH = 90, 180
-BLACK, NOBODY = np.zeros((HEIGHT, WIDTH, 3)), np.zeros((HEIGHT, WIDTH))
+BLACK, NO_GAZE = np.zeros((HEIGHT, WIDTH, 3)), np.zeros((HEIGHT, WIDTH))
 ALL = np.ones((HEIGHT, WIDTH), bool)
 HEAT = Heat(vmax=1.0, ramp=1e-6, opacity=1.0)
 
@@ -108,8 +108,8 @@ def test_directions_on_the_map(projection, direction, place):
 
 def test_unknown_pixels_are_hatched():
     unknown = ALL & (np.arange(HEIGHT)[:, None] < HEIGHT // 2)
-    plain = sphere_figure(BLACK, NOBODY, ALL, HEAT, projection="mollweide")
-    hatched = sphere_figure(BLACK, NOBODY, ALL, HEAT, projection="mollweide", unknown=unknown)
+    plain = sphere_figure(BLACK, NO_GAZE, ALL, HEAT, projection="mollweide")
+    hatched = sphere_figure(BLACK, NO_GAZE, ALL, HEAT, projection="mollweide", unknown=unknown)
     a, b = (f.axes[0].images[0].get_array() for f in (plain, hatched))
     differ = np.any(a != b, axis=-1)
     inside = a.max(axis=-1) < 0.99
@@ -124,4 +124,4 @@ def test_figures_are_reproducible():
 
 def test_figure_with_unknown_projection_is_refused():
     with pytest.raises(NergError, match='"mercator"'):
-        sphere_figure(BLACK, NOBODY, ALL, HEAT, projection="mercator")
+        sphere_figure(BLACK, NO_GAZE, ALL, HEAT, projection="mercator")

@@ -83,7 +83,7 @@ _WORDS = (
 def mutate(data: bytes, kinds: tuple[str, ...]) -> st.SearchStrategy[bytes]:
     """Damage ``data``: one to three times in its bytes, or equally often for each of ``kinds``, in its structure."""
     mutations = [_bytes, *(_STRUCTURES[k] for k in kinds for _ in range(2))]
-    return st.sampled_from(mutations).flatmap(lambda way: way(data))
+    return st.sampled_from(mutations).flatmap(lambda mutate: mutate(data))
 
 
 @st.composite
@@ -233,7 +233,7 @@ def _gzip(draw, data: bytes) -> bytes:
     inner = gzip.decompress(data)
     if draw(st.integers(0, 20)) == 0:
         inner += b"0" * draw(st.sampled_from([10**6, 30 * 10**6]))
-    return gzip.compress(draw(st.sampled_from([_text, _bytes]).flatmap(lambda way: way(inner))), 1, mtime=0)
+    return gzip.compress(draw(st.sampled_from([_text, _bytes]).flatmap(lambda mutate: mutate(inner))), 1, mtime=0)
 
 
 @st.composite

@@ -58,9 +58,9 @@ def test_breaches_are_detected(tmp_path):
     inputs = make_inputs(misbehaving.READERS, tmp_path)
     names = [r.name for r in misbehaving.READERS]
     cases = [Case(name, "a.bin", b"damaged") for name in names]
-    breaches_found = [r.outcome for _, r in run_cases(cases, inputs, names, "tests.fuzz.misbehaving")]
+    breaches = [r.outcome for _, r in run_cases(cases, inputs, names, "tests.fuzz.misbehaving")]
     # Each reader is named by its breach.
-    assert breaches_found == [name.partition(":")[0] for name in names]
+    assert breaches == [name.partition(":")[0] for name in names]
 
 
 @pytest.mark.slow
@@ -74,8 +74,8 @@ def test_pairs_of_options_give_a_result_or_one_sentence(tmp_path):
     lines = make_inputs(commands.READERS, tmp_path)
     cases = list(commands.draw_cases(commands.READERS, lines, 80))
     names = [r.name for r in commands.READERS]
-    breaches_found = [(case.data, report) for case, report in run_cases(cases, lines, names, commands.__name__)]
-    assert [(data, report) for data, report in breaches_found if report.outcome in BREACHES] == []
+    breaches = [(case.data, report) for case, report in run_cases(cases, lines, names, commands.__name__)]
+    assert [(data, report) for data, report in breaches if report.outcome in BREACHES] == []
     # Most lines pass the checks of single options, which refuse with these words.
     single = re.compile("Usage:|must lie in|must be ")
-    assert sum(single.search(report.said) is None for _, report in breaches_found) > 0.7 * len(breaches_found)
+    assert sum(single.search(report.said) is None for _, report in breaches) > 0.7 * len(breaches)

@@ -237,7 +237,7 @@ def test_damaged_segment_is_skipped(film, tmp_path):
 
 
 def test_narrow_frames_are_compared():
-    frame = lambda w, h: SimpleNamespace(width=w, height=h, to_ndarray=lambda **given: given)
+    frame = lambda w, h: SimpleNamespace(width=w, height=h, to_ndarray=lambda **size: size)
     for size, frames in (((1, 9), (3, 27)), ((2, 2), (3, 3)), ((3840, 2160), (480, 270)), ((64, 90_000), (64, 1920))):
         sizes = module._to_gray(frame(*size))
         assert (sizes["width"], sizes["height"]) == frames

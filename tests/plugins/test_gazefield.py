@@ -299,14 +299,14 @@ def semantic_scene(files, tmp_path, aovs, **config):
 
 
 @pytest.mark.parametrize(
-    "semantic, own, aligned",
+    "semantic, with_own_features, aligned",
     [("accumulated", False, True), ("accumulated", True, False), ("snapshot", False, False), ("snapshot", True, True)],
 )
-def test01_emit_uses_features_of_the_radiance_field(rgb, files, tmp_path, semantic, own, aligned):
+def test01_emit_uses_features_of_the_radiance_field(rgb, files, tmp_path, semantic, with_own_features, aligned):
     """Against a separate evaluation of equation 1, with features from AOVs of a camera at the observer."""
     eye = (0.5, 0.4, -3)
     aovs = "position,gaze,emit,capture,visibility,opacity"
-    integrator = semantic_scene(files, tmp_path, aovs, semantic=semantic, semantic_own=own)
+    integrator = semantic_scene(files, tmp_path, aovs, semantic=semantic, semantic_own=with_own_features)
     sensor = camera(rgb, eye)
     if not aligned:
         # An observer slightly off the camera sees the same, by a separate pass.

@@ -267,8 +267,9 @@ def test04_ceiling_depth_derivatives(rgb):
 
 
 @pytest.mark.parametrize(
-    "given, why", [({"ceiling": "high"}, "ceiling"), ({"up": [0.0] * 3, "ceiling": 1.0}, "up"), ({"up": 1.0}, "three")]
+    "parameters, why",
+    [({"ceiling": "high"}, "ceiling"), ({"up": [0.0] * 3, "ceiling": 1.0}, "up"), ({"up": 1.0}, "three")],
 )
-def test05_invalid_ceiling_is_refused(rgb, given, why):
+def test05_invalid_ceiling_is_refused(rgb, parameters, why):
     with pytest.raises(RuntimeError, match=why):
-        rgb.load_dict({"type": "nerg", **given})
+        rgb.load_dict({"type": "nerg", **parameters})

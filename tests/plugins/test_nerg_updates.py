@@ -65,12 +65,12 @@ def test01_voxels_are_read_only_when_changed(rgb, reads):
     assert (seen(rgb, scene) == 0).all()
 
 
-@pytest.mark.parametrize("of", ["scene", "integrator"])
-def test01b_moving_observer_reuses_the_kernel(rgb, of):
+@pytest.mark.parametrize("owner", ["scene", "integrator"])
+def test01b_moving_observer_reuses_the_kernel(rgb, owner):
     """Otherwise each position would be compiled, which takes longer than any frame."""
     scene = behind_a_wall(rgb)
-    params = rgb.traverse(scene if of == "scene" else scene.integrator())
-    name = "integrator.observer.to_world" if of == "scene" else "observer.to_world"
+    params = rgb.traverse(scene if owner == "scene" else scene.integrator())
+    name = "integrator.observer.to_world" if owner == "scene" else "observer.to_world"
     put(params, name, rgb.Transform4f().translate([0.2, 0, -0.8]))
     center = observer.sensor_center(scene.integrator().observer)
     assert np.allclose(np.ravel(np.array(center)), [0.2, 0, -0.8])

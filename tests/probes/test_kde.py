@@ -161,12 +161,12 @@ def gazes(n, kappa=30.0, seed=0):
     return vmf.sample(np.broadcast_to([0, 0.6, 0.8], (n, 3)), kappa, rng)
 
 
-@pytest.mark.parametrize("most", [2.0, 30.0, 1000.0])
-def test_kappa_grid_bounds_and_steps(most):
-    grid = make_kappa_grid(most)
-    assert grid[0] == 1 and grid[-1] == pytest.approx(most)
+@pytest.mark.parametrize("max_kappa", [2.0, 30.0, 1000.0])
+def test_kappa_grid_bounds_and_steps(max_kappa):
+    grid = make_kappa_grid(max_kappa)
+    assert grid[0] == 1 and grid[-1] == pytest.approx(max_kappa)
     # The number of equal steps nearest to 25 % each.
-    assert abs(len(grid) - 1 - np.log(most) / np.log(1.25)) <= 0.5
+    assert abs(len(grid) - 1 - np.log(max_kappa) / np.log(1.25)) <= 0.5
     assert np.allclose(np.diff(np.log(grid)), np.log(grid[1] / grid[0]))
     assert len(make_kappa_grid(1.01)) == 2
 

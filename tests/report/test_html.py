@@ -122,7 +122,7 @@ def test_page_is_reproducible():
 def test_names_cannot_inject_markup():
     tame, hostile = (Parsed(render_page(full_run(name))) for name in ("shelf", HOSTILE))
     assert [t for t, _ in hostile.tags] == [t for t, _ in tame.tags]
-    keys = lambda found: [sorted(a) for _, a in found.tags]
+    keys = lambda page: [sorted(a) for _, a in page.tags]
     assert keys(hostile) == keys(tame)
     assert not any(key.startswith("on") for _, a in hostile.tags for key in a)
     assert "alert(1)" in hostile.text and "\u202e" not in render_page(full_run(HOSTILE))

@@ -80,8 +80,8 @@ def test_too_few_participants_have_no_interval():
     result = estimate_ratios(x, y)
     assert result.value == pytest.approx([0, 0.2, 0.2]) and result.participants.tolist() == [4, 4, 2]
     assert np.isnan(result.low).all() and np.isnan(result.high).all()
-    nobody = estimate_ratios(np.zeros((0, 2)), np.zeros((0, 2)))
-    assert np.isnan(nobody.value).all() and nobody.participants.tolist() == [0, 0]
+    empty = estimate_ratios(np.zeros((0, 2)), np.zeros((0, 2)))
+    assert np.isnan(empty.value).all() and empty.participants.tolist() == [0, 0]
     one = estimate_ratios(ONES((1, 1)), ONES((1, 1)))
     assert one.value == 1 and np.isnan(one.low).all()
 
@@ -360,8 +360,8 @@ def test_false_positive_rate_of_proportion_differences():
 def test_proportions_of_few_participants():
     result = estimate_proportion_differences(column(1, 2), column(1, 2))
     assert np.isnan([result.low, result.high, result.p]).all() and result.value == 0
-    nobody = estimate_proportions(np.zeros((0, 2)), np.zeros((0, 2)))
-    assert np.isnan(nobody.value).all() and np.isnan(nobody.high).all() and nobody.participants.tolist() == [0, 0]
+    empty = estimate_proportions(np.zeros((0, 2)), np.zeros((0, 2)))
+    assert np.isnan(empty.value).all() and np.isnan(empty.high).all() and empty.participants.tolist() == [0, 0]
 
 
 @pytest.mark.parametrize("m, n, expected", [(3, 3, True), (2, 3, False), (3, 2, False)])

@@ -164,8 +164,13 @@ def test_few_participants_are_suppressed():
     # Both AOIs have the number of participants and the measures of samples.
     texts = sum(measure.numerator_denominator(cells[A][MEASURED]) is not None for measure in MEASURES)
     assert floor.num_suppressed == 2 * (1 + texts) and texts >= 7
-    nobody = MinParticipantsFilter(5)
-    assert nobody.allows(0) and nobody.allows(5) and not nobody.allows(4) and nobody.num_suppressed == 1
+    suppressing = MinParticipantsFilter(5)
+    assert (
+        suppressing.allows(0)
+        and suppressing.allows(5)
+        and not suppressing.allows(4)
+        and suppressing.num_suppressed == 1
+    )
 
 
 def test_differences_are_detected():

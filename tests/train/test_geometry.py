@@ -66,7 +66,7 @@ def looks_out(origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
     return ((through > WINDOW[0]) & (through < WINDOW[1])).all(axis=1)
 
 
-MOST = 1 << 19  # A box around everything would be a hundred times as large
+MAX_CELLS = 1 << 19  # A box around everything would be a hundred times as large
 
 
 @pytest.fixture(scope="module")
@@ -76,14 +76,14 @@ def rays_hit_extent():
 
 @pytest.fixture(scope="module")
 def extent(rays_hit_extent):
-    return compute_hit_extent(rays_hit_extent, max_voxels=MOST)
+    return compute_hit_extent(rays_hit_extent, max_voxels=MAX_CELLS)
 
 
 def test_the_box_of_an_office_is_the_room(rays_hit_extent, extent):
     """With the default voxel edge, although the outside hits would extend it to 45 x 60 m."""
     spread = np.ptp(np.quantile(rays_hit_extent.hit, [0.005, 0.995], axis=0), axis=0)
-    assert np.prod(spread / DEFAULT_VOXEL) > 16 * MOST
-    assert extent.is_cut and extent.voxel == DEFAULT_VOXEL and np.prod(extent.shape) <= MOST
+    assert np.prod(spread / DEFAULT_VOXEL) > 16 * MAX_CELLS
+    assert extent.is_cut and extent.voxel == DEFAULT_VOXEL and np.prod(extent.shape) <= MAX_CELLS
     low, high = extent.shell
     assert np.abs(low - ROOM[0]).max() < DEFAULT_VOXEL and np.abs(high - ROOM[1]).max() < 1.5 * DEFAULT_VOXEL
     assert extent.outside_fraction == pytest.approx(
@@ -148,16 +148,16 @@ def test_voxels_grow_if_the_box_cannot_be_cut():
 def test_tracking_outliers_do_not_enlarge_the_box(rays_hit_extent):
     origin = rays_hit_extent.origin.copy()
     origin[7] = [900.0, -900.0, 50.0]
-    extent = compute_hit_extent(replace(rays_hit_extent, origin=origin), max_voxels=MOST)
+    extent = compute_hit_extent(replace(rays_hit_extent, origin=origin), max_voxels=MAX_CELLS)
     assert extent.voxel == DEFAULT_VOXEL and np.abs(extent.shell[1] - ROOM[1]).max() < 2 * DEFAULT_VOXEL
 
 
 def test_a_given_voxel_size_is_used(rays_hit_extent):
-    assert compute_hit_extent(rays_hit_extent, 0.2, MOST).voxel == 0.2
+    assert compute_hit_extent(rays_hit_extent, 0.2, MAX_CELLS).voxel == 0.2
     fine = compute_hit_extent(rays_hit_extent, 0.05, 1 << 21)
     assert fine.voxel == 0.05 and fine.is_cut
     with pytest.raises(NergError, match="--voxel-size"):
-        compute_hit_extent(rays_hit_extent, 0.005, MOST)
+        compute_hit_extent(rays_hit_extent, 0.005, MAX_CELLS)
     for bad in (0.0, -1.0, np.nan, np.inf):
         with pytest.raises(NergError, match="--voxel-size"):
             compute_hit_extent(rays_hit_extent, bad)

@@ -423,8 +423,8 @@ def place(rgb):
     return SceneGeometry(FieldMedium(field, Similarity(np.diag([2.0, 2, 2, 1])))), field
 
 
-def asked(rgb, place, kind, p, active=True):
-    vector = lambda of, v: of(*map(float, v))
+def evaluate_medium(rgb, place, kind, p, active=True):
+    vector = lambda make, v: make(*map(float, v))
     settings = MarchSettings(1 / 128, stop=0.0, color_cutoff=1e-2)
     result = features_for_observer(
         kind, place, vector(rgb.Point3f, p), vector(rgb.Point3f, O), vector(rgb.Vector3f, D), rgb.Bool(active), settings
@@ -441,8 +441,11 @@ def features(field, p):
 def test_features_at_a_point(rgb, place):
     place, field = place
     p = np.array([0.3, 0.5, 0.2])
-    assert np.allclose(asked(rgb, place, "snapshot", p), features(field, p[None])[1][0], atol=1e-5)
-    assert not asked(rgb, place, "snapshot", p, active=False).any() and asked(rgb, place, "", p) is None
+    assert np.allclose(evaluate_medium(rgb, place, "snapshot", p), features(field, p[None])[1][0], atol=1e-5)
+    assert (
+        not evaluate_medium(rgb, place, "snapshot", p, active=False).any()
+        and evaluate_medium(rgb, place, "", p) is None
+    )
 
 
 def test_composited_features(rgb, place):
@@ -452,10 +455,10 @@ def test_composited_features(rgb, place):
     sigma, f = features(field, p)
     tau = sigma * np.diff(t) * (np.abs(p).max(axis=1) < 2)
     weight = np.exp(-(np.cumsum(tau) - tau)) * -np.expm1(-tau)
-    result = asked(rgb, place, "accumulated", (0.3, 0.5, 0.2))
+    result = evaluate_medium(rgb, place, "accumulated", (0.3, 0.5, 0.2))
     assert result.shape == (3,) and np.allclose(result, weight @ f, atol=5e-3 * np.abs(f).max())
-    assert not asked(rgb, place, "accumulated", (0.3, 0.5, 0.2), active=False).any()
-    assert np.abs(result - asked(rgb, place, "snapshot", (0.3, 0.5, 0.2))).max() > 0.01
+    assert not evaluate_medium(rgb, place, "accumulated", (0.3, 0.5, 0.2), active=False).any()
+    assert np.abs(result - evaluate_medium(rgb, place, "snapshot", (0.3, 0.5, 0.2))).max() > 0.01
 
 
 def test_deferred_color_uses_composited_features(rgb, place):

@@ -66,7 +66,7 @@ def test_entries_are_cached_by_position(rgb, made):
 
 def test_scalars_of_other_observers_are_kept(rgb, made):
     (calls, make), full = made, ObserverCache()
-    separate = lambda known: make(known.center)
+    separate = lambda entry: make(entry.center)
     at = lambda x: [CacheEntry(rgb.Point3f(x, 0, 0), None)]
     assert [values(full.get_or_compute_scalar("n", at(x), 0, separate)) for x in (1, 2, 1)] == [[1], [2], [1]]
     # A short-lived cache shares scalars with its parent; other values are its own.

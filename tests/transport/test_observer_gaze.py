@@ -252,7 +252,7 @@ def test_cache_distinguishes_integral_tolerances(rgb):
 #
 # Integrals over the sphere against closed forms: with as few directions as possible, within the estimated error.
 
-MOST = 1 << 17
+MAX_DIRECTIONS = 1 << 17
 
 
 def cap(direction, cos: float, background: float):
@@ -278,14 +278,14 @@ def test_discontinuous_integrands_meet_the_tolerance(turned, tolerance):
     off, share, counts = [], [], []
     for k, direction in enumerate(turned):
         values, exact = cap(direction, np.cos(0.2 + 0.1 * k), 0.1)
-        result = integrate_sphere(values, MOST, tolerance)
+        result = integrate_sphere(values, MAX_DIRECTIONS, tolerance)
         off.append(abs(result.value / exact - 1))
         share.append(off[-1] / result.error)
         counts.append(result.directions)
-        assert result.error <= tolerance or result.directions == MOST
+        assert result.error <= tolerance or result.directions == MAX_DIRECTIONS
     # Several sums: the error of four in five is below the estimate, and that of all below twice the tolerance.
     assert max(off) <= 2 * tolerance and np.mean(off) < tolerance / 2 and np.mean(np.array(share) < 1) >= 0.75
-    assert np.median(counts) < MOST / 4
+    assert np.median(counts) < MAX_DIRECTIONS / 4
     if tolerance == 1e-2:
         assert max(counts) <= FIRST_DIRECTIONS
 
@@ -317,7 +317,7 @@ def test_larger_tolerance_starts_with_fewer_directions(tolerance, first):
         requested.append(count)
         return np.ones(count)
 
-    assert integrate_sphere(even, MOST, tolerance).value == pytest.approx(4 * np.pi) and requested == [first]
+    assert integrate_sphere(even, MAX_DIRECTIONS, tolerance).value == pytest.approx(4 * np.pi) and requested == [first]
     assert integrate_sphere(even, 1000, tolerance).directions == 1000
 
 
@@ -329,14 +329,16 @@ def test_zero_tolerance_uses_all_directions(turned):
     assert result.value == pytest.approx(exact, rel=1e-6)
 
 
-@pytest.mark.parametrize("most", [1, 5, 64, FIRST_DIRECTIONS])
-def test_number_of_directions_is_limited(most):
-    result = integrate_sphere(lambda count: np.arange(count) % 2 + 1.0, most, 1e-9)
-    assert result.directions == most and result.value == pytest.approx(4 * np.pi * np.mean(np.arange(most) % 2 + 1))
+@pytest.mark.parametrize("max_directions", [1, 5, 64, FIRST_DIRECTIONS])
+def test_number_of_directions_is_limited(max_directions):
+    result = integrate_sphere(lambda count: np.arange(count) % 2 + 1.0, max_directions, 1e-9)
+    assert result.directions == max_directions and result.value == pytest.approx(
+        4 * np.pi * np.mean(np.arange(max_directions) % 2 + 1)
+    )
 
 
 def test_zero_integrand():
-    result = integrate_sphere(np.zeros, MOST, 1e-3)
+    result = integrate_sphere(np.zeros, MAX_DIRECTIONS, 1e-3)
     assert result.value == 0 and result.error == 0 and result.directions == FIRST_DIRECTIONS
 
 

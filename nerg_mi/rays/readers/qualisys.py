@@ -62,7 +62,7 @@ def iterate_gaze_vectors(path: Path, on_bad_line: BadLineCallback | None = None)
     layout, count, sample = _read_layout(path), 0, 0
     with closing(read_line_blocks(path, _FILE_KIND, _BLOCK)) as blocks:
         for lines in blocks:
-            samples_found: list[tuple[float, list[float], int, int]] = []
+            num_samples: list[tuple[float, list[float], int, int]] = []
             for number, line in enumerate(lines, count + 1):
                 if number < layout.first or not line.strip("\r\n "):
                     continue
@@ -75,7 +75,7 @@ def iterate_gaze_vectors(path: Path, on_bad_line: BadLineCallback | None = None)
                         if layout.time is None
                         else _parse_number(cells[layout.time])
                     )
-                    samples_found.append((time, [_parse_number(cells[i]) for i in layout.cells], sample, number))
+                    num_samples.append((time, [_parse_number(cells[i]) for i in layout.cells], sample, number))
                 except ValueError as error:
                     reason = f": {sanitize(line, 60)!r} is not a sample ({sanitize(error)}); correct or remove the line"
                     if on_bad_line is None:
@@ -85,8 +85,8 @@ def iterate_gaze_vectors(path: Path, on_bad_line: BadLineCallback | None = None)
                     on_bad_line(number, reason)
                 sample += 1
             count += len(lines)
-            if samples_found:
-                times, vectors, samples, numbers = zip(*samples_found)
+            if num_samples:
+                times, vectors, samples, numbers = zip(*num_samples)
                 yield GazeVectors(np.array(times), np.array(vectors), np.array(samples), np.array(numbers))
 
 

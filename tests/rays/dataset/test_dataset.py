@@ -47,7 +47,7 @@ def test_scan_returns_all_rays_of_the_files(made):
 
 
 @pytest.mark.parametrize(
-    "conditions_given",
+    "conditions",
     [
         {"persons": ["p0_1", "p2_0"]},
         {"without_persons": ["p0_1"]},
@@ -59,12 +59,12 @@ def test_scan_returns_all_rays_of_the_files(made):
         {"cohorts": ["y"], "box": [0, 3, 0, 6, 0, 3], "time": (None, DAY + 5), "persons": ["p0_0"]},
     ],
 )
-def test_conditions_match_select_mask(made, conditions_given):
+def test_conditions_match_select_mask(made, conditions):
     dataset, rays = made
-    result = dataset.load(Conditions(**conditions_given))
+    result = dataset.load(Conditions(**conditions))
     assert 0 < len(result) < len(rays)
-    assert_same(result, rays.select(select_mask(rays, **conditions_given)))
-    complete = list(dataset.scan(Conditions(**conditions_given), whole_parts=True))
+    assert_same(result, rays.select(select_mask(rays, **conditions)))
+    complete = list(dataset.scan(Conditions(**conditions), whole_parts=True))
     assert sum(map(len, complete)) == len(result)
     for block in complete:
         names = [block.persons[k] for k in block.person]
@@ -214,7 +214,7 @@ def test_damaged_parts(tmp_path):
 def test_row_groups_have_first_rows_and_bounds(tmp_path, monkeypatch):
     monkeypatch.setattr(dataset_write, "GROUP_ROWS", 50)
     dataset, _ = write_dataset(tmp_path, 1)
-    source, part = max(dataset.parts, key=lambda found: found[1].rays)
+    source, part = max(dataset.parts, key=lambda entry: entry[1].rays)
     seen = []
 
     def wanted(first, count, bounds):

@@ -356,9 +356,9 @@ class Example:
                 (folder / name).write_bytes(gzip.compress(content.encode(), mtime=0))
             else:
                 (folder / name).write_text(content)
-        return self.given(folder)
+        return self.path_in(folder)
 
-    def given(self, folder: Path) -> Path:
+    def path_in(self, folder: Path) -> Path:
         """The path for the reader, of files in ``folder``."""
         return folder / list(self.files)[-1]
 

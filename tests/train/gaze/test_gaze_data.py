@@ -97,15 +97,15 @@ def test_a_batch_gathers_probes_and_directions(drawn):
     np.testing.assert_array_equal(features, data.semantic[probe[:, None], which].reshape(-1, 2))
 
 
-@pytest.mark.parametrize("known", [False, True])
-def test_only_views_are_conditioned(drawn, known):
+@pytest.mark.parametrize("has_prior", [False, True])
+def test_only_views_are_conditioned(drawn, has_prior):
     """A part of the sphere has the integral of the truth, or one; the whole sphere and zeros are unchanged."""
     data, arrays = drawn
     batch = arrays.gather_batch(np.arange(3), np.tile(np.arange(4), (3, 1)))
     density = np.array([[1.0, 2, 3, 4], [0, 1, 0, 2], [0, 0, 0, 0]])
     flat = lambda v: ns.Float(v.ravel().astype(np.float32))
-    got = batch.condition_on_view(flat(density), flat(data.truth) if known else None).numpy().reshape(3, 4)
-    goal = data.truth[1].mean() * 1.5 if known else 1.0
+    got = batch.condition_on_view(flat(density), flat(data.truth) if has_prior else None).numpy().reshape(3, 4)
+    goal = data.truth[1].mean() * 1.5 if has_prior else 1.0
     np.testing.assert_allclose(got, [density[0], density[1] * goal / (0.75 * 1.5), density[2]], rtol=1e-5)
 
 
@@ -283,10 +283,10 @@ def test01_the_trunk_gives_the_fields_features(radiance):
         extract_initial_weights(radiance, replace(gaze.config, geometry=6))
 
 
-@pytest.mark.parametrize("own", [False, True])
-def test02_the_fast_path_is_the_field(radiance, own):
+@pytest.mark.parametrize("with_own_features", [False, True])
+def test02_the_fast_path_is_the_field(radiance, with_own_features):
     ns, rng = namespace("llvm"), np.random.default_rng(3)
-    config = gaze_config(radiance, semantic="snapshot", semantic_own=own)
+    config = gaze_config(radiance, semantic="snapshot", semantic_own=with_own_features)
     gaze = GazeField.random(config, BOX, ns, 3)
     gaze.set_parameters({"grid.table": ns.Float(rng.normal(size=len(gaze.grid.table)).astype(np.float32))})
     B, D = 3, 32

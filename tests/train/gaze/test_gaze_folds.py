@@ -91,8 +91,8 @@ def test02_the_largest_of_equivalent_weights_is_selected():
         assert _select_weight(curves).prior_weight == mix
 
 
-@pytest.mark.parametrize(("law", "kept"), [(1.0, True), (0.0, False)])
-def test04_the_field_has_weight_if_position_is_informative(law, kept, rgb):
+@pytest.mark.parametrize(("law", "has_weight"), [(1.0, True), (0.0, False)])
+def test04_the_field_has_weight_if_position_is_informative(law, has_weight, rgb):
     """If all look at one point, the field is not mixed; if each participant has an individual direction, position is
     not informative.
     """
@@ -100,7 +100,7 @@ def test04_the_field_has_weight_if_position_is_informative(law, kept, rgb):
     result = evaluate_folds(Supervision(people(law)), NOWHERE, plan_of(), ns, messages.append).select_weight()
     assert result is not None and messages[-1].stage.startswith("fold") and 0 < messages[-1].fraction <= 1
     assert result.regions is not None and 0 < result.regions["50%"] < result.regions["80%"] < result.regions["95%"] < 1
-    if kept:
+    if has_weight:
         assert result.prior_weight < 0.3 and result.kld < result.kld_prior and result.folds <= 3
     else:
         assert result.prior_weight > 0.6 and result.kld <= result.kld_field and result.folds == 3

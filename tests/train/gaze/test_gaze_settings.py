@@ -219,10 +219,10 @@ def test_options_reach_the_plan():
 
 
 @pytest.mark.parametrize(
-    "given, steps, minutes", [({}, 600, None), ({"minutes": 2.0}, None, 2.0), ({"steps": 5}, 5, None)]
+    "options, steps, minutes", [({}, 600, None), ({"minutes": 2.0}, None, 2.0), ({"steps": 5}, 5, None)]
 )
-def test_minutes_and_steps_override_each_other(given, steps, minutes):
-    settings = get_recipe("small").make_gaze_settings(given)
+def test_minutes_and_steps_override_each_other(options, steps, minutes):
+    settings = get_recipe("small").make_gaze_settings(options)
     assert (settings.steps, settings.minutes) == (steps, minutes)
 
 

@@ -123,7 +123,7 @@ MOVED = replace(NOWHERE, align=Similarity(np.diag([2.0, 2, 2, 1])))
 
 
 @pytest.mark.parametrize(
-    "name, plan, supervision, place, about",
+    "name, plan, supervision, place, identity",
     [
         ("settings", planned(SMALL, replace(PRODUCT, seed=1)), None, NOWHERE, {}),
         ("probes", planned(SMALL, PRODUCT, replace(PROBES, kappa=9.0)), None, NOWHERE, {}),
@@ -135,10 +135,10 @@ MOVED = replace(NOWHERE, align=Similarity(np.diag([2.0, 2, 2, 1])))
         ("place", None, None, NOWHERE, {"place": "elsewhere"}),
     ],
 )
-def test_run_identities_differ(name, plan, supervision, place, about):
+def test_run_identities_differ(name, plan, supervision, place, identity):
     base = planned(SMALL, PRODUCT).make_identity(Supervision(RAYS), NOWHERE, StateSettings())
     other = (plan or planned(SMALL, PRODUCT)).make_identity(
-        supervision or Supervision(RAYS), place, StateSettings(identity=about)
+        supervision or Supervision(RAYS), place, StateSettings(identity=identity)
     )
     assert {k for k in other if other[k] != base.get(k)} == {name}
 

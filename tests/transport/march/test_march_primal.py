@@ -96,12 +96,12 @@ def test_opaque_gaussian_occludes(rgb):
     assert penetration_depth("median", result, result.median_depth)[0] == 0
 
 
-@pytest.mark.parametrize(("before", "hides", "known", "far"), [(1.5, 1.4, True, True), (3, 2.9, True, False)])
-def test_occlusion_query_ends_the_march(rgb, before, hides, known, far):
+@pytest.mark.parametrize(("before", "hides", "decided", "far"), [(1.5, 1.4, True, True), (3, 2.9, True, False)])
+def test_occlusion_query_ends_the_march(rgb, before, hides, decided, far):
     medium = medium_of(stack([2, 4], [0.9, 0.9]))
     question = OcclusionQuery(rgb.Float(before), rgb.Float(hides), 0.5)
     result, _ = marched(rgb, medium, (0, 0, 0), (0, 0, 1), kinds=(), occlusion=question)
-    assert result.decided[0] == known and np.isinf(result.median_depth[0]) == far
+    assert result.decided[0] == decided and np.isinf(result.median_depth[0]) == far
 
 
 def test_default_stop_of_splats(rgb):
