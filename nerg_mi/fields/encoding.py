@@ -338,7 +338,7 @@ class HashGrid(Encoding):
             steps = _PRIMES
         else:
             stride = int(np.ceil(self._scales[level])) + 2
-            steps = (1, stride, stride * stride)  # as many as there are axes
+            steps = (1, stride, stride * stride)  # one per axis
         lo = [c * s for c, s in zip(cell, steps)]
         return lo, [a + s for a, s in zip(lo, steps)]
 

@@ -270,7 +270,7 @@ def test06_a_volume_in_place_of_a_field():
 
 
 @pytest.mark.parametrize(
-    "given, said",
+    "arguments, said",
     [
         ({}, "make_scene"),
         ({"field": "nowhere.safetensors"}, 'file "nowhere.safetensors" of "field" does not exist'),

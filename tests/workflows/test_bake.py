@@ -503,7 +503,7 @@ def test04_one_observer_or_nobody():
             make_observers(options, None, TURNED, Recorder())
     for options, said in (
         (BakeOptions(ray_weights="money"), "--ray-weights"),
-        (BakeOptions(cmap="jet"), "no perceptually"),
+        (BakeOptions(cmap="jet"), "not a perceptually"),
     ):
         with pytest.raises(NergError, match=said):
             check_values(options)

@@ -100,7 +100,7 @@ def test_difference_what_is_refused(tmp_path):
         ([a], {}, "a difference needs two images, got"),
         ([a, tmp_path / "b.exr"], {}, "8 x 6 and 4 x 3 pixels cannot be compared"),
         ([a, a], {"cmap": "viridis"}, "not a diverging colour map"),
-        ([a, a], {"top": -1.0}, "--top must lie in"),
+        ([a, a], {"top": -1.0}, "--vmax must lie in"),
         ([a, a, a], {}, "1 to 2 files, and 3 were given"),
     ):
         with pytest.raises(NergError, match=said):
@@ -232,7 +232,7 @@ def test_surface_what_is_refused(tmp_path):
         (tmp_path / "odd.ply", {}, "odd.ply"),
         (damaged, {}, "is damaged"),
         (good, {"below": -1.0}, "--clip-above"),
-        (good, {"camera": (0.0, 0, 2), "target": (0.0, 0, 5)}, "in the picture"),
+        (good, {"camera": (0.0, 0, 2), "target": (0.0, 0, 5)}, "in the image"),
         (good, {"camera": (0.0, 0, 2), "target": (0.0, 0, 2)}, "elsewhere than --camera"),
         (good, {"up": (0.0, 0, 0)}, "--up must not be of length 0"),
     ):

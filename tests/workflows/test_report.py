@@ -265,7 +265,7 @@ def test_what_makes_no_report(folder, tmp_path):
         ([folder / "rays.npz"], "there is none among these files; name its checkpoint"),
         ([folder / "nowhere"], "there is no file or folder"),
         ([empty], "contains no checkpoint, rays or evaluation"),
-        ([folder, tmp_path / "again.safetensors"], "are both a gaze; a report is of one of them"),
+        ([folder, tmp_path / "again.safetensors"], "again.safetensors"),
         ([folder, folder / "notes.txt"], "is none of these"),
     ]
     for given, why in cases:
