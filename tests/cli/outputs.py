@@ -79,7 +79,7 @@ CASES = (
         "-o {o}/demo --width 24 --spp 1 -m llvm_ad_rgb",
         _below("demo", DEMO),
         ("demo",),
-        ("workflows.report._ReportWork.run", "workflows.bake.sums_of"),
+        ("workflows.report._ReportWork.run", "workflows.bake.compute_sums"),
     ),
     Case("render", "{i}/scene.xml -o {o}/a.exr -m llvm_ad_rgb", ("a.exr",)),
     Case("render", "{i}/scene.xml -o {o}/a.png -m llvm_ad_rgb", ("a.png",)),
@@ -119,7 +119,7 @@ CASES = (
     Case("rays import", "{i}/day.csv -o {o}/a.npz --map 'origin=x,y,z direction=a,b,c t=t person=p'", ("a.npz",)),
     Case(
         "rays import",
-        "{i}/day.csv -o {o}/a.npz --map 'origin=x,y,z direction=a,b,c t=t person=p' --write-align {o}/align.json",
+        "{i}/day.csv -o {o}/a.npz --map 'origin=x,y,z direction=a,b,c t=t person=p' --align-output {o}/align.json",
         ("a.npz", "align.json"),
     ),
     Case("rays filter", "{i}/rays.npz -o {o}/a.npz --person a", ("a.npz",)),
@@ -139,7 +139,7 @@ CASES = (
         "{i}/photos -o {o}/a.safetensors --steps 2 --holdout 2 --half",
         ("a.safetensors", "a.preview.png"),
         ("a.safetensors", "a.preview.png", "a.run"),
-        ("train.radiance_grid.DensityGrid.bound", "train.radiance_run.warm_up"),
+        ("train.radiance_grid.DensityGrid.extract_occupancy", "train.radiance_run.warm_up"),
     ),
     Case(
         "train gaze",
@@ -172,7 +172,7 @@ CASES = (
         "{i}/gaze.safetensors {i}/rays.npz -o {o}/eval --min-rays 8 --directions 128 --resamples 2 --pictures 1",
         _below("eval", EVALUATION),
         ("eval",),
-        tuple(f"evaluation.gaze.{name}" for name in ("evaluate_gaze", "split_half", "person_rows")),
+        tuple(f"evaluation.gaze.{name}" for name in ("evaluate_gaze", "score_split_half", "score_participants")),
     ),
     Case(
         "bake",
@@ -205,7 +205,7 @@ CASES = (
         "slab -o {o}/study --store {i}/store --quick --width 12 --height 8 --only jitter -m llvm_ad_rgb",
         _below("study", STUDY),
         ("study",),
-        ("evaluation.study.measure", "evaluation.study.scaling"),
+        ("evaluation.study.measure_rows", "evaluation.study.measure_scaling"),
     ),
 )
 
@@ -218,15 +218,15 @@ INPUTS = {
     "render": {"frames"},
     "stats": {"aois", "align", "zones", "cohorts", "what_if", "salt"},
     "draw floor": {"scene"},
-    "align": {"field", "scene", "surface", "pairs", "twin", "cameras", "place_cameras", "start"},
-    "rays import": {"salt", "poses", "place"},
+    "align": {"field", "scene", "surface", "pairs", "tracking_surface", "tracking_cameras", "scene_cameras", "init"},
+    "rays import": {"salt", "poses", "field"},
     "rays plot": {"test"},
     "train gaze": {"views", "align_views", "field", "scene", "align"},
     "eval folds": {"field", "scene", "align"},
     "eval gaze": {"field", "scene", "geometry"},
     "ablate": {"field", "scene"},
     "report": {"aois"},
-    "bake": {"gaze", "rays", "path", "align"},
+    "bake": {"gaze", "rays", "observer_file", "align"},
 }
 """Options of commands that name what is read, as arguments do; all others that are paths are written."""
 

@@ -135,7 +135,7 @@ def test_output(case, inputs, tmp_path, capsys, monkeypatch, rgb, offline):
             (out / name).write_bytes(b"old")
         with largest_file(limit):
             code, said = nerg(capsys, *case.arguments(inputs, out))
-        assert told_in_a_sentence(code, said) and "largest size" in said, said
+        assert told_in_a_sentence(code, said) and "maximum file size" in said, said
         found = files(out)
         # What a training has come to is kept where its state is small enough, and said.
         assert (found.pop("a.run", None) is not None) == ("the training is kept" in said)

@@ -176,7 +176,7 @@ def test_points_are_triangulated_where_surfaces_are(scene):
             f"{k}.png",
             camera,
             (255 * np.sqrt(photographer.render_albedo(camera, k, 16))).astype(np.uint8),
-            photographer.depth(camera),
+            photographer.render_depth(camera),
         )
         for k, camera in enumerate(walk)
     ]
