@@ -43,7 +43,7 @@ class TerminalReporter:
     def warn(self, text: str) -> None:
         self._print(f"warning: {text}", sys.stderr)
 
-    def progress(self, share: float, text: str = "") -> None:
+    def progress(self, fraction: float, text: str = "") -> None:
         if self._begun is None:
             self._begun = time.monotonic()
             self._bar = self._start()
@@ -51,13 +51,13 @@ class TerminalReporter:
                 # Also reports during long steps without progress.
                 self._pulse = threading.Thread(target=self._beat, name="progress", daemon=True)
                 self._pulse.start()
-        if share <= 0:
+        if fraction <= 0:
             # Preparation does not count for the extrapolation.
             self._counted = time.monotonic()
-        self._now = (share, text)
+        self._now = (fraction, text)
         if self._bar is not None:
             (task,) = self._bar.task_ids
-            self._bar.update(task, completed=share, description=self.line())
+            self._bar.update(task, completed=fraction, description=self.line())
         else:
             self.log_when_due()
 

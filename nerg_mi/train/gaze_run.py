@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from types import ModuleType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -96,9 +96,9 @@ class PriorWeightSelection:
         return {_KEYS.get(k, k): _round_values(v) for k, v in asdict(self).items()}
 
     @staticmethod
-    def from_dict(data: dict) -> PriorWeightSelection:
+    def from_dict(data: dict[str, Any]) -> PriorWeightSelection:
         """Restore a selection from `to_dict`. Raises ``TypeError`` or ``ValueError`` for invalid data."""
-        names = {key: name for name, key in _KEYS.items()}
+        names: dict[str, str] = {key: name for name, key in _KEYS.items()}
         selection = PriorWeightSelection(**{names.get(k, k): v for k, v in dict(data).items()})
         if not 0 <= selection.prior_weight <= 1:
             raise ValueError(f'its "mix" must be from 0 to 1, got {selection.prior_weight}')

@@ -553,7 +553,7 @@ class GazeFit:
         }
 
     @staticmethod
-    def from_dict(data: dict, trainer: GazeTrainer | None = None, weights: dict | None = None) -> GazeFit:
+    def from_dict(data: dict[str, Any], trainer: GazeTrainer | None = None, weights: dict | None = None) -> GazeFit:
         """Restore a fit from `to_dict`."""
         names = {"since": "evaluations_since_best", "next_look": "next_evaluation"}
         values = {names.get(k, k): v for k, v in data.items()}

@@ -169,7 +169,7 @@ class Reporter(Protocol):
     def warn(self, text: str) -> None:
         """Report a possible problem with the result, in one line."""
 
-    def progress(self, share: float, text: str = "") -> None:
+    def progress(self, fraction: float, text: str = "") -> None:
         """Report the completed fraction of the work, from 0 to 1, and the current step."""
 
 
@@ -182,7 +182,7 @@ class SilentReporter:
     def warn(self, text: str) -> None:
         pass
 
-    def progress(self, share: float, text: str = "") -> None:
+    def progress(self, fraction: float, text: str = "") -> None:
         pass
 
 

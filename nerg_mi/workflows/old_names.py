@@ -199,7 +199,7 @@ def accept_old_keywords(kind: type, command: str) -> None:
     for base in kind.__mro__:
         if not is_dataclass(base) or "__init__" not in vars(base):
             continue
-        renamed = find_keywords(command, _spellings(base))
+        renamed = find_keywords(command, get_spellings(base))
         if not renamed:
             continue
         if _KEYWORDS in vars(base):
@@ -209,7 +209,7 @@ def accept_old_keywords(kind: type, command: str) -> None:
         base.__init__ = _renaming(base.__init__, renamed)
 
 
-def _spellings(kind: Any) -> dict[str, str]:
+def get_spellings(kind: Any) -> dict[str, str]:
     """Keyword -> spelling on the command line, for the fields of the dataclass of options ``kind``."""
     return {f.name: f.metadata.get(FLAG) or "--" + f.name.replace("_", "-") for f in fields(kind)}
 
@@ -233,16 +233,6 @@ def rename_keywords(renamed: Mapping[str, str], keywords: Mapping[str, Any]) -> 
 def current_keywords(kind: type, keywords: Mapping[str, Any]) -> dict[str, Any]:
     """Return ``keywords`` of the dataclass of options ``kind`` by their current names."""
     return rename_keywords(vars(kind).get(_KEYWORDS, {}), keywords)
-
-
-def current_import_keywords(keywords: Mapping[str, Any]) -> dict[str, Any]:
-    """Return ``keywords`` of `import_rays`, those of its command and of all readers, by their current names."""
-    from nerg_mi.rays.readers.registry import collect_shared_options
-
-    from .rays_commands import RaysImportOptions
-
-    spellings = {option.name: option.flag for option in collect_shared_options()} | _spellings(RaysImportOptions)
-    return rename_keywords(find_keywords("rays import", spellings), keywords)
 
 
 def renamed_options(commands: Iterable[str]) -> list[tuple[str, str, str]]:

@@ -91,7 +91,7 @@ LINES = {
     "demo -o {o}/a --width 4": "at least 12 pixels",
     "draw sheet gone.png -o {o}/a.png": "there is no file",
     "draw sphere gone.xml -o {o}/a.gif": r"ends in \.png or \.svg",
-    "study nowhere -o {o}/a": 'is neither a scene file',
+    "study nowhere -o {o}/a": "is neither a scene file",
     "study nowhere -o {o}/a --scene-kind analytic": "choose one of slab, sphere",
     "study slab -o {o}/a --scene-kind shapes": 'got "shapes"',
     "study slab -o {o}/a --width 2": "at least 4 x 4 pixels",
