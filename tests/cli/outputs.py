@@ -281,6 +281,6 @@ def make_inputs(folder: Path) -> Path:
         pose[:3, 3] = 0.05 * k, 0, 3
         frames.append({"file_path": f"{k}.png", "transform_matrix": pose.tolist()})
     lens = {"w": 16, "h": 14, "fl_x": 60.0, "fl_y": 60.0, "cx": 8.0, "cy": 7.0}
-    about = {**lens, "frames": frames, "aabb": [[-1, -1, -1], [1, 1, 1]]}
-    (photos / "transforms.json").write_text(json.dumps(about))
+    metadata = {**lens, "frames": frames, "aabb": [[-1, -1, -1], [1, 1, 1]]}
+    (photos / "transforms.json").write_text(json.dumps(metadata))
     return folder

@@ -45,15 +45,15 @@ def test_ctrl_c_within_a_finalizer_is_not_lost(monkeypatch):
         def __del__(self):
             signal.raise_signal(signal.SIGINT)
 
-    others = []
-    monkeypatch.setattr(sys, "unraisablehook", others.append)
-    thing = Interrupted()
+    unraisable = []
+    monkeypatch.setattr(sys, "unraisablehook", unraisable.append)
+    instance = Interrupted()
     with CtrlC() as ctrl_c:
         with pytest.raises(KeyboardInterrupt):
-            del thing
+            del instance
             time.sleep(10)
-        assert not others
-    assert ctrl_c.find_interrupt(RuntimeError()) is not None and sys.unraisablehook == others.append
+        assert not unraisable
+    assert ctrl_c.find_interrupt(RuntimeError()) is not None and sys.unraisablehook == unraisable.append
 
 
 @pytest.mark.parametrize("name", ["stdout", "stderr"])
@@ -242,12 +242,12 @@ owner, _, function = name.rpartition(".")
 owner = pkgutil.resolve_name(owner)
 original, left = getattr(owner, function), int(calls)
 
-def interrupted(*given, **more):
+def interrupted(*args, **kwargs):
     global left
     left -= 1
     if left == 0:
         os.kill(os.getpid(), signal.SIGINT)
-    return original(*given, **more)
+    return original(*args, **kwargs)
 
 setattr(owner, function, interrupted)
 nerg_mi.cli.main(arguments)
@@ -336,5 +336,5 @@ def test_a_command_ends_at_once(name, inputs, tmp_path):
     function, calls, line = ENDS[name]
     done = interrupted(function, calls, *shlex.split(line.format(i=inputs, o=tmp_path / "out")))
     assert done.returncode == 130 and "Interrupted." in done.stderr and "Traceback" not in done.stderr, done.stderr
-    found = sorted(p.name for p in tmp_path.rglob("*") if p.is_file())
-    assert found == (["0.png"] if name == "eval" else [])
+    written_files = sorted(p.name for p in tmp_path.rglob("*") if p.is_file())
+    assert written_files == (["0.png"] if name == "eval" else [])

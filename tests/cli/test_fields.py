@@ -40,9 +40,9 @@ def test_the_machine_s_speed_and_what_is_wrong_are_told(cube, nerg):
     ended = nerg("train", "radiance", cube, "-o", cube / "a.safetensors", "--steps", 3, "--holdout", 3)
     assert not ended.code and "warning: only 3 steps" in ended.err
     assert float(re.search(r"3 steps in \d+ s; (\S+) field evaluations a second", ended.out)[1]) > 0
-    about = read_checkpoint(cube / "a.safetensors", "radiance")[1]["provenance"]
-    assert about["evaluations_a_second"] > 0 and about["step_ms"]["max"] >= about["step_ms"]["median"]
-    assert [x for x in about["complaints"] if x.startswith("only 3 steps")]
+    provenance = read_checkpoint(cube / "a.safetensors", "radiance")[1]["provenance"]
+    assert provenance["evaluations_a_second"] > 0 and provenance["step_ms"]["max"] >= provenance["step_ms"]["median"]
+    assert [x for x in provenance["complaints"] if x.startswith("only 3 steps")]
 
 
 # The command, and what it says once the photos may be read: of the gaze, that photos of one grey have no salience.
@@ -94,7 +94,7 @@ def other_value(f):
 
 def test_the_workflow_is_given_what_is_said(handed, nerg):
     """Every option there is, and none of them."""
-    given = handed("train gaze")
+    calls = handed("train gaze")
     options = GazeOptions(**{f.name: other_value(f) for f in fields(GazeOptions)})
     line = []
     for f in fields(GazeOptions):
@@ -107,7 +107,7 @@ def test_the_workflow_is_given_what_is_said(handed, nerg):
     assert nerg("train", "gaze", "rays.npz", "-o", "out.safetensors", *line).code == 0
     assert nerg("train", "gaze", "-o", "out.safetensors").code == 0
     output = Path("out.safetensors")
-    assert given == [
+    assert calls == [
         {"rays": Path("rays.npz"), "output": output, "options": options},
         {"rays": None, "output": output, "options": GazeOptions()},
     ]
@@ -121,8 +121,8 @@ def test_a_field_takes_over_features_and_weights(tmp_path, nerg):
     line += "--semantic snapshot --probes 6 --radius 0.5 --min-rays 8 --directions 32 --zones 0 --begin field --freeze"
     ended = nerg(*line.format(o=tmp_path).split())
     assert ended.code == 0, ended.err
-    trained, about = load_gaze(tmp_path / "gaze.safetensors", ns)
-    assert trained.config.semantic == "snapshot" and about["provenance"]["begins_as"] == "field.safetensors"
+    trained, metadata = load_gaze(tmp_path / "gaze.safetensors", ns)
+    assert trained.config.semantic == "snapshot" and metadata["provenance"]["begins_as"] == "field.safetensors"
     np.testing.assert_array_equal(np.array(trained.grid.table), np.array(taken.grid.table))
 
 
@@ -167,10 +167,10 @@ def test_a_field_is_scored_as_it_was_trained(tmp_path, nerg):
     assert nerg(*train, "--test-zones", "2", "--test-positions", "6", "--test-people", "0.5").code == 0
     line = "--min-rays 16 --resamples 4 --directions 256 --pictures 1"
     assert nerg("eval", "gaze", gaze, tmp_path / "rays.npz", *line.split()).code == 0
-    found = json.loads((tmp_path / "gaze.eval" / "gaze.json").read_text())
-    names = [r["method"] for r in found["methods"]]
-    assert names[:2] == ["gaze field", "uniform"] and "4,096 nearest rays" in names and found["split"] == "both"
-    assert found["methods"][0]["integral"] == pytest.approx(1, abs=0.02)
+    scores = json.loads((tmp_path / "gaze.eval" / "gaze.json").read_text())
+    names = [r["method"] for r in scores["methods"]]
+    assert names[:2] == ["gaze field", "uniform"] and "4,096 nearest rays" in names and scores["split"] == "both"
+    assert scores["methods"][0]["integral"] == pytest.approx(1, abs=0.02)
     for name in ("gaze.md", "gaze.csv", "persons.csv", "positions.png"):
         assert (tmp_path / "gaze.eval" / name).stat().st_size > 100
     crowd(seed=1).save(tmp_path / "others.npz")
@@ -202,8 +202,8 @@ def test_a_nerf_and_its_gaze_are_imported(tmp_path, nerg, torch):
 def test_forms_of_an_exported_field(tmp_path, nerg):
     radiance(tmp_path / "f.safetensors")
 
-    def export(kind, name, *more):
-        ended = nerg("export", kind, tmp_path / "f.safetensors", "-o", tmp_path / name, *more)
+    def export(kind, name, *arguments):
+        ended = nerg("export", kind, tmp_path / "f.safetensors", "-o", tmp_path / name, *arguments)
         assert ended.code == 0, ended.err
         return ended.out
 

@@ -44,7 +44,7 @@ def largest_file(size: int):
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
-def told_in_a_sentence(code: int, said: str) -> bool:
+def is_one_sentence(code: int, said: str) -> bool:
     last = said.strip().splitlines()[-1:] or [""]
     return code == 1 and last[0].startswith("nerg: ") and "Traceback" not in said
 
@@ -53,21 +53,21 @@ def interrupting(function):
     """``function`` with a Ctrl-C during its first call."""
     calls = []
 
-    def interrupted(*given):
-        calls.append(given)
+    def interrupted(*arguments):
+        calls.append(arguments)
         if len(calls) == 1:
             signal.raise_signal(signal.SIGINT)
-        return function(*given)
+        return function(*arguments)
 
     return interrupted
 
 
 def remember(monkeypatch, name: str) -> None:
     """A function is called once, and later gives what it gave then: what a command computes is not the matter here."""
-    found = []
+    cached = []
     original = pkgutil.resolve_name(name)
     monkeypatch.setattr(
-        name, lambda *given, **more: found[0] if found else found.append(original(*given, **more)) or found[0]
+        name, lambda *args, **kwargs: cached[0] if cached else cached.append(original(*args, **kwargs)) or cached[0]
     )
 
 
@@ -120,11 +120,11 @@ def test_output(case, inputs, tmp_path, capsys, monkeypatch, rgb, offline):
             reason = "one of its parents is a file"
         before = files(out)
         code, said = nerg(capsys, *case.arguments(inputs, out))
-        assert told_in_a_sentence(code, said) and reason in said and str(out / name) in " ".join(said.split()), said
+        assert is_one_sentence(code, said) and reason in said and str(out / name) in " ".join(said.split()), said
         assert files(out) == before
     (tmp_path / "file").write_bytes(b"old")
     code, said = nerg(capsys, *case.arguments(inputs, tmp_path / "file" / "below"))
-    assert told_in_a_sentence(code, said) and "one of its parents is a file" in said
+    assert is_one_sentence(code, said) and "one of its parents is a file" in said
 
     # Where there is no room each file is the old one or the new one, and there is no other.
     for share in (0, 0.5) if len(made) > 1 and not case.once else (0.5,):
@@ -135,13 +135,13 @@ def test_output(case, inputs, tmp_path, capsys, monkeypatch, rgb, offline):
             (out / name).write_bytes(b"old")
         with largest_file(limit):
             code, said = nerg(capsys, *case.arguments(inputs, out))
-        assert told_in_a_sentence(code, said) and "maximum file size" in said, said
-        found = files(out)
+        assert is_one_sentence(code, said) and "maximum file size" in said, said
+        contents = files(out)
         # What a training has come to is kept where its state is small enough, and said.
-        assert (found.pop("a.run", None) is not None) == ("the training is kept" in said)
-        assert set(found) == set(case.files), "a leftover, or a loss"
-        assert all(content == b"old" or limit >= len(content) > 3 for content in found.values())
-        assert any(content == b"old" for content in found.values())
+        assert (contents.pop("a.run", None) is not None) == ("the training is kept" in said)
+        assert set(contents) == set(case.files), "a leftover, or a loss"
+        assert all(content == b"old" or limit >= len(content) > 3 for content in contents.values())
+        assert any(content == b"old" for content in contents.values())
 
     # Ctrl-C in the middle of the first file.
     out = tmp_path / "interrupted"
@@ -152,9 +152,9 @@ def test_output(case, inputs, tmp_path, capsys, monkeypatch, rgb, offline):
     if case.name == "train radiance":  # in the preview's: between two steps, with a result to be gone on from
         assert set(files(out)) == {*case.files, "a.run"} and "go on with --resume" in said
     elif case.name == "render":  # heard between steps, of which writing is the last
-        kept = set(files(out))
+        remaining = set(files(out))
         # Of a sequence the pictures that were there already; of one that waits for its scale none.
-        assert kept == set(case.files) if "--frames" not in case.line else kept < set(case.files)
+        assert remaining == set(case.files) if "--frames" not in case.line else remaining < set(case.files)
     else:  # what a training has come to by then is kept
         assert set(files(out)) <= {"a.run"} and ("--resume" in said or not files(out))
 
@@ -169,7 +169,7 @@ def test_filtering_in_place_keeps_its_input_where_there_is_no_room(inputs, tmp_p
         before = (tmp_path / name).read_bytes()
         with largest_file(1000):
             code, said = nerg(capsys, "rays", "filter", tmp_path / name, "-o", tmp_path / name, "--person", "a")
-        assert told_in_a_sentence(code, said) and (tmp_path / name).read_bytes() == before
+        assert is_one_sentence(code, said) and (tmp_path / name).read_bytes() == before
         assert name in os.listdir(tmp_path)
         code, _ = nerg(capsys, "rays", "filter", tmp_path / name, "-o", tmp_path / name, "--person", "a")
         assert code == 0 and set(Rays.load(tmp_path / name).person) == {0}
@@ -187,10 +187,10 @@ def path_options(name: str, command) -> dict[str, tuple]:
     out = {}
     arguments = {key for key, parameter in COMMANDS[name].parameters.items() if not parameter.names}
     for key, hint in get_type_hints(command, include_extras=True).items():
-        kind, *more = get_args(hint) or (hint,)
+        kind, *annotations = get_args(hint) or (hint,)
         if key not in arguments and Path in (kind, *get_args(kind)):
-            given = [d for info in more for d in (getattr(info, "default", None), *(info.param_decls or ()))]
-            out[key] = tuple(d for d in given if isinstance(d, str) and d.startswith("-")) or (
+            names = [d for info in annotations for d in (getattr(info, "default", None), *(info.param_decls or ()))]
+            out[key] = tuple(d for d in names if isinstance(d, str) and d.startswith("-")) or (
                 "--" + key.replace("_", "-"),
             )
     return out
@@ -199,15 +199,15 @@ def path_options(name: str, command) -> dict[str, tuple]:
 def test_every_output_is_tried(tmp_path):
     """Each option that takes a path belongs into `outputs.CASES`, or among what is read."""
     (tmp_path / "demo.json").write_text("{}")
-    found = commands()
-    assert set(found) >= {c.name for c in CASES} | set(MAKES_A_FOLDER) | set(INPUTS)
-    for name, command in found.items():
+    commands_by_name = commands()
+    assert set(commands_by_name) >= {c.name for c in CASES} | set(MAKES_A_FOLDER) | set(INPUTS)
+    for name, command in commands_by_name.items():
         if name in MAKES_A_FOLDER:
             continue
-        given = [c.arguments(tmp_path, tmp_path) for c in CASES if c.name == name]
+        lines = [c.arguments(tmp_path, tmp_path) for c in CASES if c.name == name]
         options, read = path_options(name, command), INPUTS.get(name, set())
         assert read <= set(options), f"{name} has no such option"
         for parameter in set(options) - read:
-            assert any(option in line for line in given for option in options[parameter]), (
+            assert any(option in line for line in lines for option in options[parameter]), (
                 f"{name}: {options[parameter]}"
             )

@@ -298,8 +298,8 @@ def test_values_for_the_scene_of_a_figure(nerg, tmp_path):
     text = WALLS_SCENE.replace('<scene version="3.0.0">', '<scene version="3.0.0"><default name="tall" value="1"/>')
     (tmp_path / "scene.xml").write_text(text.replace('y="0.2" z="1"', 'y="0.2" z="$tall"'))
     line = ("draw", "floor", tmp_path / "rays.npz", "--scene", tmp_path / "scene.xml", *LLVM, "-o")
-    for k, more in enumerate(((), ("-D", "tall=0.1"))):
-        assert nerg(*line, tmp_path / f"{k}.png", *more).code == 0
+    for k, defines in enumerate(((), ("-D", "tall=0.1"))):
+        assert nerg(*line, tmp_path / f"{k}.png", *defines).code == 0
     assert (tmp_path / "0.png").read_bytes() != (tmp_path / "1.png").read_bytes()
     ended = nerg(*line, tmp_path / "a.png", "-D", "tal=0.1")
     assert ended.code == 1 and 'does not use "$tal"' in ended.err
@@ -316,17 +316,17 @@ def test_a_mesh_becomes_a_picture(nerg, tmp_path):
 
 
 def test_options_reach_the_viewer_and_the_report(handed, nerg):
-    given = handed("view")
+    calls = handed("view")
     line = "view a.xml b.npz --port 0 --observer=1,2,3 --host ::1 --name lab --width 320"
     assert nerg(*line.split()).code == 0
-    ((files, options),) = ((call["files"], call["options"]) for call in given)
+    ((files, options),) = ((call["files"], call["options"]) for call in calls)
     assert [f.name for f in files] == ["a.xml", "b.npz"] and options.observer == (1, 2, 3)
     assert (options.host, options.port, options.hostnames, options.width) == ("::1", 0, ("lab",), 320)
 
-    given = handed("report")
+    calls = handed("report")
     line = "report gaze.safetensors day.npz -o a.html --objects o.json --names --min-persons 3 --no-paths --from 1,2,3"
     assert nerg(*line.split(), "--to", "0,0,1", "--evaluate", "--title", "Mine").code == 0
-    ((files, output, options),) = ((call["files"], call["output"], call["options"]) for call in given)
+    ((files, output, options),) = ((call["files"], call["output"], call["options"]) for call in calls)
     assert files == [Path("gaze.safetensors"), Path("day.npz")] and output == Path("a.html")
     assert options.aois == Path("o.json") and options.show_names and options.min_participants == 3 and not options.paths
     assert options.camera == (1, 2, 3) and options.target == (0, 0, 1)
@@ -430,7 +430,7 @@ def photos(tmp_path, monkeypatch) -> Path:
 
 
 def test_links_are_followed_only_if_allowed(photos, nerg, monkeypatch, tmp_path):
-    monkeypatch.setattr(posing, "reconstruct", lambda *given: None)
+    monkeypatch.setattr(posing, "reconstruct", lambda *args: None)
     (photos / "2.png").rename(tmp_path / "2.png")
     (photos / "2.png").symlink_to(tmp_path / "2.png")
     ended = nerg("poses", photos, "-o", tmp_path / "capture")
@@ -440,7 +440,7 @@ def test_links_are_followed_only_if_allowed(photos, nerg, monkeypatch, tmp_path)
 
 
 def test_ctrl_c_ends_poses_and_leaves_nothing(photos, nerg, monkeypatch, tmp_path):
-    monkeypatch.setattr(posing, "reconstruct", lambda *given: signal.raise_signal(signal.SIGINT))
+    monkeypatch.setattr(posing, "reconstruct", lambda *args: signal.raise_signal(signal.SIGINT))
     ended = nerg("poses", photos, "-o", tmp_path / "capture")
     assert ended.code == 130 and "Interrupted" in ended.err and os.listdir(tmp_path) == ["photos"]
 

@@ -82,13 +82,13 @@ def rays(n=40, people=2):
 
 
 def test01_the_field_of_people_where_they_were(rgb, room):
-    told = Recorder()
+    recorder = Recorder()
     options = BakeOptions(gaze=GAZE, num_observers=2, max_angle=6.0, max_edge=2.0, mode="llvm_ad_rgb")
-    found = bake(room, (), options, told, rays=rays())
-    assert found.summary["source"] == "field" and found.summary["lookers"] == 1
-    assert abs(found.unaccounted) < 1e-3 and found.escaped < 1e-6
-    assert np.isclose((found.density * found.mesh.vertex_area).sum(), found.on_surface)
-    assert any("unaccounted" in m for m in told.messages) and told.steps[0][0] == 0
+    result = bake(room, (), options, recorder, rays=rays())
+    assert result.summary["source"] == "field" and result.summary["lookers"] == 1
+    assert abs(result.unaccounted) < 1e-3 and result.escaped < 1e-6
+    assert np.isclose((result.density * result.mesh.vertex_area).sum(), result.on_surface)
+    assert any("unaccounted" in m for m in recorder.messages) and recorder.steps[0][0] == 0
 
 
 def test02_rays_alone_in_shares_and_seconds(rgb, room):
@@ -119,7 +119,7 @@ def test06_what_is_not_asked_for_is_not_made(rgb, room, monkeypatch):
     from nerg_mi.surfaces import laplacian
     from nerg_mi.workflows import bake as outputs
 
-    def never(*given, **more):
+    def never(*args, **kwargs):
         raise AssertionError("nobody asked for this")
 
     monkeypatch.setattr(laplacian, "make_laplacian", never)
@@ -133,13 +133,13 @@ def test07_a_mesh_in_millimetres_is_told(rgb, tmp_path):
     v, f = box((0, 0, 0), (8000, 6000, 3000))
     write_columns(tmp_path / "mm.ply", dict(zip("xyz", v.T)), f)
     (tmp_path / "align.json").write_text("[[1e3,0,0,0],[0,1e3,0,0],[0,0,1e3,0],[0,0,0,1]]")
-    told, mended = Recorder(), Recorder()
+    recorder, aligned_recorder = Recorder(), Recorder()
     options = {"detail": 5e3, "cone": 0.0, "mode": "llvm_ad_rgb"}
-    bake(tmp_path / "mm.ply", (), BakeOptions(**options), told, rays=rays(4))
-    assert any("10,440 m across" in said and "--align" in said for said in told.warnings)
+    bake(tmp_path / "mm.ply", (), BakeOptions(**options), recorder, rays=rays(4))
+    assert any("10,440 m across" in said and "--align" in said for said in recorder.warnings)
     options["detail"] = 5.0
-    bake(tmp_path / "mm.ply", (), BakeOptions(**options, align=tmp_path / "align.json"), mended, rays=rays(4))
-    assert not mended.warnings
+    bake(tmp_path / "mm.ply", (), BakeOptions(**options, align=tmp_path / "align.json"), aligned_recorder, rays=rays(4))
+    assert not aligned_recorder.warnings
 
 
 # ---- What is asked for, and what contradicts it ----
@@ -239,9 +239,13 @@ def test02_the_table_adds_up_and_the_summary_says_what_was_done(baked):
     assert np.isclose(share.sum(), result.on_surface) and np.isclose(result.on_surface, 1, atol=1e-6)
     assert np.allclose([float(r["value"]) * float(r["area_m2"]) for r in rows], share, rtol=1e-6)
     assert np.isclose(sum(float(r["area_m2"]) for r in rows), 2 * (12 + 10 + 7.5))
-    told = json.loads((folder / "a.json").read_text())
-    assert told["lookers"] == 300 and 0.3 < told["halves_cc"] <= 1 and told["shapes"] == {"room": pytest.approx(1)}
-    assert list(told["provenance"]["inputs"]) == ["room.ply"] and told["provenance"]["settings"]["smooth"] == 0.1
+    summary = json.loads((folder / "a.json").read_text())
+    assert (
+        summary["lookers"] == 300
+        and 0.3 < summary["halves_cc"] <= 1
+        and summary["shapes"] == {"room": pytest.approx(1)}
+    )
+    assert list(summary["provenance"]["inputs"]) == ["room.ply"] and summary["provenance"]["settings"]["smooth"] == 0.1
     raw = (folder / "a.glb").read_bytes()
     document = json.loads(raw[20 : 20 + struct.unpack_from("<I", raw, 12)[0]])
     assert document["asset"]["extras"]["provenance"]["what"] == "nerg bake"
@@ -254,9 +258,9 @@ def test03_a_texture(baked, tmp_path):
     rays = Rays([0.0, 0.1], [0, 0], ("a",), np.ones((2, 3)), np.array([[1.0, 0, 0], [0, 1, 0]]), np.ones(2))
     options = BakeOptions(max_edge=0.4, texture_size=128, mode="llvm_ad_rgb")
     bake(folder / "room.ply", [tmp_path / "t.glb"], options, rays=rays)
-    found = trimesh.load(tmp_path / "t.glb", process=False, force="mesh")
-    picture = np.asarray(found.visual.material.baseColorTexture)
-    assert picture.shape[:2] == (128, 128) and len(found.faces) == 12
+    loaded = trimesh.load(tmp_path / "t.glb", process=False, force="mesh")
+    picture = np.asarray(loaded.visual.material.baseColorTexture)
+    assert picture.shape[:2] == (128, 128) and len(loaded.faces) == 12
     # Where somebody looks it is brighter than where nobody does.
     assert picture[..., 0].max() > picture[..., 0][picture[..., 0] > 0].min() + 50
 
@@ -295,13 +299,13 @@ def directed(n, seed=0):
     return TrackedRays(np.full((n, 3), 1.5), d / np.linalg.norm(d, axis=1, keepdims=True), np.full(n, 1 / n))
 
 
-def parts(folder, told=None, **options):
-    return PartRunner(PartOptions(store=folder, **options), folder / "a.ply", told or Recorder(), 1)
+def parts(folder, reporter=None, **options):
+    return PartRunner(PartOptions(store=folder, **options), folder / "a.ply", reporter or Recorder(), 1)
 
 
-def made(told):
+def made(recorder):
     """How many parts were not kept from before."""
-    return int(told.steps[-1][1].split()[0]) - int(told.steps[0][1].split()[0])
+    return int(recorder.steps[-1][1].split()[0]) - int(recorder.steps[0][1].split()[0])
 
 
 def equal(one, other):
@@ -320,21 +324,21 @@ def test_two_processes_give_the_sums_of_one_and_what_is_kept_is_not_made_again(t
         ROOM, gaze=GAZE, gaze_settings=GazeSumSettings(max_angle=0.5, directions=1024), ray_settings=OF_RAYS
     )
     groups = [crowd(3), directed(500)]
-    whole = sum_directly(scene, groups, Recorder())
-    assert equal(sum_in_parts(scene, groups, parts(tmp_path, scheduler="local:2"), "a bake"), whole)
+    expected = sum_directly(scene, groups, Recorder())
+    assert equal(sum_in_parts(scene, groups, parts(tmp_path, scheduler="local:2"), "a bake"), expected)
     # Started again with two observers more: one part is another one, and one is new.
-    told = Recorder()
-    more = [WeightedObservers(np.r_[groups[0].positions, groups[0].positions[:2]], np.full(5, 1 / 3)), groups[1]]
-    sum_in_parts(scene, more, parts(tmp_path, told), "a bake")
-    assert told.steps[-1][1].startswith("5 of 5 parts") and made(told) == 2
+    recorder = Recorder()
+    extended = [WeightedObservers(np.r_[groups[0].positions, groups[0].positions[:2]], np.full(5, 1 / 3)), groups[1]]
+    sum_in_parts(scene, extended, parts(tmp_path, recorder), "a bake")
+    assert recorder.steps[-1][1].startswith("5 of 5 parts") and made(recorder) == 2
 
 
 @pytest.mark.usefixtures("engine")
 def test_a_part_depends_on_what_it_reads_and_on_nothing_else(tmp_path):
     def bake_rays(scene, who):
-        told = Recorder()
-        sum_in_parts(scene, [who], parts(tmp_path, told), "a bake")
-        return made(told)
+        recorder = Recorder()
+        sum_in_parts(scene, [who], parts(tmp_path, recorder), "a bake")
+        return made(recorder)
 
     scene = BakeScene(ROOM, ray_settings=OF_RAYS)
     who = directed(900)
@@ -362,10 +366,10 @@ def test_files_that_were_sent_serve_as_those_that_lie_there(tmp_path):
         ),
         (SplatScene(tmp_path / "wall.ply", len(plain), ray_settings=OF_RAYS), falling(100)),
     ):
-        there = lay_out(PlannedBake.plan(scene), tmp_path / "there")
-        notes = bake_part(there, who, tmp_path / "a.npy")
-        found = read_sums(TaskOutput(tmp_path / "a.npy", notes), len(scene.empty_sums.face_sums))
-        assert there != PlannedBake.plan(scene) and equal([found], sum_directly(scene, [who], Recorder()))
+        copied = lay_out(PlannedBake.plan(scene), tmp_path / "there")
+        notes = bake_part(copied, who, tmp_path / "a.npy")
+        sums = read_sums(TaskOutput(tmp_path / "a.npy", notes), len(scene.empty_sums.face_sums))
+        assert copied != PlannedBake.plan(scene) and equal([sums], sum_directly(scene, [who], Recorder()))
 
 
 @pytest.mark.usefixtures("engine")
@@ -376,20 +380,20 @@ def test_two_processes_give_the_sums_of_splats(tmp_path):
     fields.gaze(tmp_path / "gaze.safetensors")
     scene = SplatScene(tmp_path / "wall.ply", len(plain), tmp_path / "gaze.safetensors", ray_settings=OF_RAYS)
     groups = [falling(500, 0.5), crowd(2)]
-    there = sum_in_parts(scene, groups, parts(tmp_path, scheduler="local:2"), "a bake")
-    assert equal(there, sum_directly(scene, groups, Recorder()))
+    in_parts = sum_in_parts(scene, groups, parts(tmp_path, scheduler="local:2"), "a bake")
+    assert equal(in_parts, sum_directly(scene, groups, Recorder()))
 
 
 @pytest.mark.usefixtures("engine")
 def test_halves_are_of_people():
     n = 40
-    given = Rays(
+    rays = Rays(
         np.arange(n) / 10, np.arange(n) % 4, tuple("abcd"), np.ones((n, 3)), np.eye(3)[np.arange(n) % 3], np.ones(n)
     )
-    first, second = split_halves(directed(n), given, 0)
+    first, second = split_halves(directed(n), rays, 0)
     assert len(first) == len(second) == 20 and (first.first_index, second.first_index) == (0, 20)
     with pytest.raises(NergError, match="--split-half needs at least two participants,"):
-        split_halves(directed(n), replace(given, person=np.zeros(n, int)), 0)
+        split_halves(directed(n), replace(rays, person=np.zeros(n, int)), 0)
 
 
 @pytest.mark.usefixtures("engine")
@@ -398,12 +402,12 @@ def test_the_files_of_a_bake_have_the_same_bytes(tmp_path):
     write_columns(tmp_path / "room.ply", dict(zip("xyz", v.T)), f)
     n = 1000
     d = directed(n).directions
-    given = Rays(np.arange(n) / 10, np.arange(n) % 2, ("a", "b"), np.full((n, 3), 1.5), d, np.ones(n))
-    given.save(tmp_path / "rays.npz")
+    rays = Rays(np.arange(n) / 10, np.arange(n) % 2, ("a", "b"), np.full((n, 3), 1.5), d, np.ones(n))
+    rays.save(tmp_path / "rays.npz")
     common = {"rays": tmp_path / "rays.npz", "detail": 2.0, "halves": True, "mode": "llvm_ad_rgb"}
-    for folder, more in (("one", {}), ("parts", {"store": tmp_path / "store"})):
+    for folder, extra in (("one", {}), ("parts", {"store": tmp_path / "store"})):
         outputs = [tmp_path / folder / f"a{suffix}" for suffix in (".ply", ".glb", ".csv", ".json")]
-        bake(tmp_path / "room.ply", outputs, BakeOptions(**common, **more))
+        bake(tmp_path / "room.ply", outputs, BakeOptions(**common, **extra))
     names = sorted(p.name for p in (tmp_path / "one").iterdir())
     assert len(names) == 4 and names == sorted(p.name for p in (tmp_path / "parts").iterdir())
     for name in names:
@@ -430,8 +434,8 @@ def test02_observers_of_a_field(rgb):
     crowd = WeightedObservers(np.array([(4.4, 2.8, 1.6)] * 5), np.full(5, 0.2))
     parts = list(split_into_parts(crowd))
     assert [len(p.weights) for p in parts] == [4, 1]
-    found = scene.sums(parts[1])
-    assert 0.5 < found.on_surface / found.weight < 1.5 and found.count == 1 and abs(found.escaped) < 1e-6
+    sums = scene.sums(parts[1])
+    assert 0.5 < sums.on_surface / sums.weight < 1.5 and sums.count == 1 and abs(sums.escaped) < 1e-6
 
 
 def test03_without_a_field_nobody_looks(rgb):
@@ -453,8 +457,8 @@ def rays_lookers():
 
 def test01_a_path(tmp_path):
     (tmp_path / "a.csv").write_text("x,y,z\n1,2,3\n4,5,6\n")
-    found = read_observer_file(tmp_path / "a.csv")
-    assert found.positions.tolist() == [[1, 2, 3], [4, 5, 6]] and found.weights.tolist() == [0.5, 0.5]
+    observers = read_observer_file(tmp_path / "a.csv")
+    assert observers.positions.tolist() == [[1, 2, 3], [4, 5, 6]] and observers.weights.tolist() == [0.5, 0.5]
     (tmp_path / "b.csv").write_text("weight;x;y;z\n3;1;2;3\n1;4;5;6\n")
     assert read_observer_file(tmp_path / "b.csv").weights.tolist() == [0.75, 0.25]
 
@@ -479,13 +483,17 @@ def test02_paths_that_are_none(tmp_path, text, said):
 
 
 def test03_people_stand_in_the_place():
-    told = Recorder()
-    found = make_observers(BakeOptions(num_observers=4), rays_lookers(), TURNED, told)
-    assert len(found.weights) == 4 and np.allclose(found.positions[:, 0], 1) and np.allclose(found.positions[:, 2], 3.2)
+    recorder = Recorder()
+    observers = make_observers(BakeOptions(num_observers=4), rays_lookers(), TURNED, recorder)
+    assert (
+        len(observers.weights) == 4
+        and np.allclose(observers.positions[:, 0], 1)
+        and np.allclose(observers.positions[:, 2], 3.2)
+    )
     # Metres are told, of which the place has two units each.
     assert (
-        f"{found.rms_distance / 2:.2f} m (root mean square)" in told.messages[0]
-        and "1 participants in 20 samples" in told.messages[0]
+        f"{observers.rms_distance / 2:.2f} m (root mean square)" in recorder.messages[0]
+        and "1 participants in 20 samples" in recorder.messages[0]
     )
     who = make_tracked_rays(rays_lookers(), TURNED, "time")
     assert np.allclose(who.directions, [0, 1, 0]) and np.allclose(who.origins[:, 1], 2 * rays_lookers().origin[:, 0])
@@ -523,13 +531,13 @@ SCENE = """<scene version="3.0.0">
 def test01_a_mesh_is_cut_as_finely_as_asked_in_metres(rgb, tmp_path):
     v, f = box((0, 0, 0), (2, 2, 2))
     write_columns(tmp_path / "a.ply", dict(zip("xyz", v.T)), np.concatenate([f, f[:2, ::-1]]))
-    told = Recorder()
-    found = read_target(tmp_path / "a.ply", (), 16, ns, told)
-    assert found.names == ("a",) and found.index.tolist() == list(range(12)) and not found.occluders
-    assert len(told.messages) == 1 and told.messages[0].startswith("a.ply: 2 ")
+    recorder = Recorder()
+    target = read_target(tmp_path / "a.ply", (), 16, ns, recorder)
+    assert target.names == ("a",) and target.index.tolist() == list(range(12)) and not target.occluders
+    assert len(recorder.messages) == 1 and recorder.messages[0].startswith("a.ply: 2 ")
     # Two scene units a metre.
-    assert longest_edge(refine_target(found, 0.25, 2.0).mesh) <= 0.5
-    assert 50_000 < len(refine_target(found, None, 1.0).mesh.faces) < 250_000
+    assert longest_edge(refine_target(target, 0.25, 2.0).mesh) <= 0.5
+    assert 50_000 < len(refine_target(target, None, 1.0).mesh.faces) < 250_000
 
 
 def test02_shapes_of_a_scene_receive_or_hide(rgb, tmp_path):
@@ -551,8 +559,8 @@ def test02_shapes_of_a_scene_receive_or_hide(rgb, tmp_path):
 def test03_a_field_gives_its_surface(rgb, tmp_path):
     pytest.importorskip("skimage", reason="scikit-image is not installed")
     fields.radiance(tmp_path / "f.safetensors")
-    found = read_target(tmp_path / "f.safetensors", (), 8, ns, Recorder())
-    assert found.names == ("f",) and len(found.mesh.faces) > 10
+    target = read_target(tmp_path / "f.safetensors", (), 8, ns, Recorder())
+    assert target.names == ("f",) and len(target.mesh.faces) > 10
     with pytest.raises(NergError, match="--shape"):
         read_target(tmp_path / "f.safetensors", ("a",), 8, ns, Recorder())
 
@@ -602,35 +610,36 @@ def place(tmp_path):
     return tmp_path
 
 
-def bake_place(place, output="out.ply", reporter=None, **more):
-    options = BakeOptions(gaze=place / "gaze.safetensors", **(OPTIONS | more))
+def bake_place(place, output="out.ply", reporter=None, **changes):
+    options = BakeOptions(gaze=place / "gaze.safetensors", **(OPTIONS | changes))
     return bake_splats(place / "place.ply", [place / output], options, reporter or Recorder())
 
 
 def test01_each_gaussian_has_what_the_field_says_and_all_else_is_kept(rgb, place):
-    told = Recorder()
-    found = bake_place(place, reporter=told)
-    given, back = read_splats(place / "place.ply"), read_splats(place / "out.ply")
+    recorder = Recorder()
+    result = bake_place(place, reporter=recorder)
+    original, back = read_splats(place / "place.ply"), read_splats(place / "out.ply")
     assert (
-        found.files == (place / "out.ply",) and "30 of 30 Gaussians receive gaze from 1 observer;" in told.messages[1]
+        result.files == (place / "out.ply",)
+        and "30 of 30 Gaussians receive gaze from 1 observer;" in recorder.messages[1]
     )
-    assert told.messages[0].endswith("place.ply: columns that are not used: label")
-    to = given.centers - np.array(OPTIONS["observer"])
+    assert recorder.messages[0].endswith("place.ply: columns that are not used: label")
+    to = original.centers - np.array(OPTIONS["observer"])
     distance = np.linalg.norm(to, axis=1)
     w = to / distance[:, None]
-    own = np.einsum("nji,nj->ni", given.axes(), w) / given.scales
-    area = np.linalg.norm(own, axis=1) * given.scales.min(axis=1)
+    scaled = np.einsum("nji,nj->ni", original.axes(), w) / original.scales
+    area = np.linalg.norm(scaled, axis=1) * original.scales.min(axis=1)
     field = load_gaze(place / "gaze.safetensors", ns)[0]
     array = lambda rows: ns.Array3f(np.ascontiguousarray(np.asarray(rows, np.float32).T))
     origins = array(np.tile(OPTIONS["observer"], (30, 1)))
-    gaze = np.array(field.evaluate(array(given.centers), origins, array(w), ns.Bool(True))[0])
-    assert np.allclose(found.attention, gaze * area / distance**2, rtol=1e-3)
-    assert np.allclose(back.extra[COLUMN], found.attention, rtol=1e-6)
-    assert np.array_equal(back.extra["label"], given.extra["label"]) and back.degree == 0
+    gaze = np.array(field.evaluate(array(original.centers), origins, array(w), ns.Bool(True))[0])
+    assert np.allclose(result.attention, gaze * area / distance**2, rtol=1e-3)
+    assert np.allclose(back.extra[COLUMN], result.attention, rtol=1e-6)
+    assert np.array_equal(back.extra["label"], original.extra["label"]) and back.degree == 0
     for name in ("centers", "scales", "rotations", "opacities"):
-        assert np.allclose(getattr(back, name), getattr(given, name), rtol=1e-5, atol=1e-6)
+        assert np.allclose(getattr(back, name), getattr(original, name), rtol=1e-5, atol=1e-6)
     # The hottest is nine tenths of the map's last colour.
-    hot = 0.5 + SH_C0 * back.harmonics[found.attention.argmax(), 0]
+    hot = 0.5 + SH_C0 * back.harmonics[result.attention.argmax(), 0]
     assert np.abs(hot - apply_colormap("inferno", np.ones(1))[0]).max() < 0.1
 
 
@@ -651,15 +660,15 @@ def test02_people_on_a_path_and_places_in_other_units(rgb, place):
     ],
 )
 def test03_what_splats_have_not(rgb, place, options, said):
-    given = BakeOptions(**({"gaze": place / "gaze.safetensors"} | OPTIONS | options))
+    bake_options = BakeOptions(**({"gaze": place / "gaze.safetensors"} | OPTIONS | options))
     with pytest.raises(NergError, match=said):
-        bake_splats(place / "place.ply", [place / "out.ply"], given)
+        bake_splats(place / "place.ply", [place / "out.ply"], bake_options)
     with pytest.raises(NergError, match=".ply"):
         bake_place(place, "out.glb")
     assert not (place / "out.ply").exists()
 
 
-def looks(n=600):
+def make_wall_rays(n=600):
     """Rays of two people from before a wall of a square metre, at it."""
     rng = np.random.default_rng(0)
     d = np.concatenate([rng.normal(0, 0.12, (n, 2)), np.ones((n, 1))], axis=1)
@@ -671,24 +680,24 @@ def test04_rays_themselves_in_parts_and_in_one_go(rgb, tmp_path, monkeypatch):
     """Shares, seconds, halves, smoothed; the files are the same to the byte."""
     monkeypatch.setattr(bake_chunks, "RAYS", 200)
     write_ply_splats(tmp_path / "wall.ply", wall(0.0, 1.0, 0.03, 0.0005))
-    looks().save(tmp_path / "rays.npz")
+    make_wall_rays().save(tmp_path / "rays.npz")
     common = {"rays": tmp_path / "rays.npz", "mode": "llvm_ad_rgb", "bundle": 4, "halves": True, "smooth": 0.05}
-    for folder, more in (("one", {}), ("parts", {"store": tmp_path / "store"})):
-        told = Recorder()
+    for folder, extra in (("one", {}), ("parts", {"store": tmp_path / "store"})):
+        recorder = Recorder()
         outputs = [tmp_path / folder / f"a{suffix}" for suffix in (".ply", ".json")]
-        found = bake_splats(tmp_path / "wall.ply", outputs, BakeOptions(**common, **more), told)
+        result = bake_splats(tmp_path / "wall.ply", outputs, BakeOptions(**common, **extra), recorder)
     for name in ("a.ply", "a.json"):
         assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "parts" / name).read_bytes(), name
     summary = json.loads((tmp_path / "one" / "a.json").read_text())
     assert abs(summary["on_splats"] + summary["escaped"] - 1) < 1e-3 and summary["on_splats"] > 0.9
     assert 0.7 < summary["halves_cc"] <= 1 and summary["lookers"] == 600
-    assert any("of the gaze is on Gaussians" in line for line in told.messages)
+    assert any("of the gaze is on Gaussians" in line for line in recorder.messages)
     # Where they look most: a Gaussian of the law, the cone and the smoothing.
-    most = 1 / (2 * np.pi * (0.12**2 + np.radians(1.5) ** 2 + 0.05**2))
-    middle = np.linalg.norm(found.splats.centers[:, :2], axis=1) < 0.06
-    assert np.isclose(np.median(found.attention[middle]), most, rtol=0.15)
+    peak = 1 / (2 * np.pi * (0.12**2 + np.radians(1.5) ** 2 + 0.05**2))
+    middle = np.linalg.norm(result.splats.centers[:, :2], axis=1) < 0.06
+    assert np.isclose(np.median(result.attention[middle]), peak, rtol=0.15)
     seconds = bake_splats(tmp_path / "wall.ply", (), BakeOptions(**common, unit="seconds", store=tmp_path / "store"))
-    assert np.allclose(seconds.attention, 120 * found.attention, rtol=0.01) and seconds.summary["unit"].endswith(
+    assert np.allclose(seconds.attention, 120 * result.attention, rtol=0.01) and seconds.summary["unit"].endswith(
         "[s/m^2]"
     )
 

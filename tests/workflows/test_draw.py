@@ -46,16 +46,16 @@ COLOR, GAZE = RNG.random((6, 8, 3)).astype(np.float32), RNG.random((6, 8)).astyp
 OPACITY = np.where(np.arange(8) < 3, 0.2, 0.9).astype(np.float32) * np.ones((6, 1), np.float32)
 
 
-def write(path, text=None, **more):
-    write_exr(path, {name: COLOR[..., k] for k, name in enumerate("RGB")} | {"gaze.Y": GAZE} | more, text)
+def write(path, text=None, **channels):
+    write_exr(path, {name: COLOR[..., k] for k, name in enumerate("RGB")} | {"gaze.Y": GAZE} | channels, text)
     return path
 
 
 def test_colour_values_and_mask(tmp_path):
-    found = read_stored(write(tmp_path / "a.exr", **{"opacity.Y": OPACITY}), find_channel_overlay("gaze"))
-    np.testing.assert_array_equal(found.color, COLOR)
-    np.testing.assert_array_equal(found.values, GAZE)
-    np.testing.assert_array_equal(found.mask, np.tile(np.arange(8) >= 3, (6, 1)))
+    stored = read_stored(write(tmp_path / "a.exr", **{"opacity.Y": OPACITY}), find_channel_overlay("gaze"))
+    np.testing.assert_array_equal(stored.color, COLOR)
+    np.testing.assert_array_equal(stored.values, GAZE)
+    np.testing.assert_array_equal(stored.mask, np.tile(np.arange(8) >= 3, (6, 1)))
     assert read_stored(write(tmp_path / "b.exr"), find_channel_overlay("gaze.Y")).mask.all()
 
 
@@ -96,7 +96,7 @@ def test_the_first_less_the_second(tmp_path):
 def test_difference_what_is_refused(tmp_path):
     a = write(tmp_path / "a.exr")
     write_exr(tmp_path / "b.exr", {"gaze.Y": np.ones((3, 4), np.float32)})
-    for files, given, said in (
+    for files, options, said in (
         ([a], {}, "a difference needs two images, got"),
         ([a, tmp_path / "b.exr"], {}, "8 x 6 and 4 x 3 pixels cannot be compared"),
         ([a, a], {"cmap": "viridis"}, "not a diverging colour map"),
@@ -104,7 +104,7 @@ def test_difference_what_is_refused(tmp_path):
         ([a, a, a], {}, "1 to 2 files, and 3 were given"),
     ):
         with pytest.raises(NergError, match=said):
-            draw("difference", files, **given)
+            draw("difference", files, **options)
 
 
 # ---- Contact sheets of files ----
@@ -225,19 +225,19 @@ def test_surface_what_is_refused(tmp_path):
     (tmp_path / "a.glb").write_bytes(b"x")
     (tmp_path / "odd.ply").write_bytes(b"ply\nformat ascii 1.0\nelement vertex 3\n")
     damaged = write_surface(tmp_path / "damaged.ply", [1, 2, 3, 4], comments=("nerg_mi {",))
-    for path, given, said in (
+    for path, options, said in (
         (tmp_path / "a.glb", {}, "give the .ply"),
         (tmp_path / "none.ply", {}, "there is no file"),
         (tmp_path / "bare.ply", {}, "give a .ply file that"),
         (tmp_path / "odd.ply", {}, "odd.ply"),
         (damaged, {}, "is damaged"),
         (good, {"below": -1.0}, "--clip-above"),
-        (good, {"camera": (0.0, 0, 2), "target": (0.0, 0, 5)}, "in the image"),
+        (good, {"camera": (0.0, 0, 2), "target": (0.0, 0, 5)}, "is in the image"),
         (good, {"camera": (0.0, 0, 2), "target": (0.0, 0, 2)}, "elsewhere than --camera"),
         (good, {"up": (0.0, 0, 0)}, "--up must not be of length 0"),
     ):
         with pytest.raises(NergError, match=said):
-            draw("surface", path, mode="llvm_ad_rgb", width=32, height=32, **given)
+            draw("surface", path, mode="llvm_ad_rgb", width=32, height=32, **options)
 
 
 def test_splats_show_their_gaze_themselves(tmp_path):
@@ -251,13 +251,13 @@ def test_splats_show_their_gaze_themselves(tmp_path):
 
 def test_a_style_of_options():
     assert ScaleOptions(cmap="viridis", log_decades=3, hatching=False).style("a") == Style("viridis", 3, False, "a")
-    for given, said in (
+    for options, said in (
         ({"top": 0.0}, "--vmax must lie in"),
         ({"decades": -1}, "--log-decades"),
         ({"cmap": "jet"}, '"jet" is no'),
     ):
         with pytest.raises(NergError, match=said):
-            ScaleOptions(**given).style()
+            ScaleOptions(**options).style()
 
 
 def test_a_scale_is_needed():
@@ -335,28 +335,28 @@ def test_it_shows_the_observers_gaze(rgb, scene_sphere):
     ahead = -eye * (1, 0, 1)
     ahead /= np.linalg.norm(ahead)
     up = np.array([0.0, 1.0, 0.0])
-    own = pixel_directions(64, 32)
-    world = own[..., :1] * np.cross(up, ahead) + own[..., 1:2] * up + own[..., 2:] * ahead
+    local = pixel_directions(64, 32)
+    world = local[..., :1] * np.cross(up, ahead) + local[..., 1:2] * up + local[..., 2:] * ahead
     seen = nerg.trace(nerg.Scene.load(str(scene_sphere)), eye, world.reshape(-1, 3), ["depth", "opacity", "gaze"])
-    met = (seen.opacity.reshape(32, 64) > 0.9) & (seen.gaze.reshape(32, 64) > 0.3)
+    hit = (seen.opacity.reshape(32, 64) > 0.9) & (seen.gaze.reshape(32, 64) > 0.3)
     void = seen.opacity.reshape(32, 64) < 0.1
-    assert met.sum() > 20 and void.sum() > 500
+    assert hit.sum() > 20 and void.sum() > 500
     # The paper's pale hatching where nothing is met, dark or hot colours where something is.
     grey = np.ptp(shown, axis=-1) < 0.01
     rows = np.rint((np.arange(32) + 0.5) / 32 * 31).astype(int)
     inner = lambda m: m & np.roll(m, 1, 0) & np.roll(m, -1, 0) & np.roll(m, 1, 1) & np.roll(m, -1, 1)
-    assert grey[inner(void)[rows]].mean() > 0.95 and grey[inner(met)[rows]].mean() < 0.2
+    assert grey[inner(void)[rows]].mean() > 0.95 and grey[inner(hit)[rows]].mean() < 0.2
 
 
 def test_what_a_scene_figure_refuses(scene_sphere):
-    for given, said in (
+    for options, said in (
         ({"projection": "globe"}, "choose one of mollweide, equirectangular"),
         ({"sensor": 7}, "has 1 sensor"),
         ({"cmap": "jet"}, '"jet" is no'),
         ({"color": 1}, 'has no option "color"'),
     ):
         with pytest.raises(NergError, match=said):
-            draw("sphere", scene_sphere, mode=MODE, width=64, **given)
+            draw("sphere", scene_sphere, mode=MODE, width=64, **options)
 
 
 # ---- Occlusion of any scene with an observer ----
@@ -371,21 +371,21 @@ def test_three_pictures_with_one_scale(rgb, scene_triptych, monkeypatch):
     seen = []
     see = scenes.OpenScene.render
     monkeypatch.setattr(scenes.OpenScene, "render", lambda self, *of: seen.append(see(self, *of)) or seen[-1])
-    told = Recorder()
+    recorder = Recorder()
     behind = {"eye": "0.2, 0.1, 2.5"}
-    figure = draw("triptych", scene_triptych, reporter=told, mode=MODE, spp=2, defaults=behind)
+    figure = draw("triptych", scene_triptych, reporter=recorder, mode=MODE, spp=2, defaults=behind)
     # Three pictures, the scale, and the swatch for what is not known.
-    assert len(figure.axes) == 5 and [s for s, _ in told.steps] == sorted(s for s, _ in told.steps)
-    own, without, with_ = seen
+    assert len(figure.axes) == 5 and [s for s, _ in recorder.steps] == sorted(s for s, _ in recorder.steps)
+    observer_view, without, with_ = seen
     # Occlusion takes away, and only that; what is seen itself stays.
     assert (without.values >= with_.values - 1e-6).all() and (without.values > with_.values + 1e-3).any()
-    assert (without.color == with_.color).all() and own.values.shape == with_.values.shape
+    assert (without.color == with_.color).all() and observer_view.values.shape == with_.values.shape
     # The first is what a camera at the observer's place sees, with its own gaze.
-    with scenes.open_scene(scene_triptych, SceneFigureOptions(mode=MODE, spp=2, defaults=behind), told) as opened:
+    with scenes.open_scene(scene_triptych, SceneFigureOptions(mode=MODE, spp=2, defaults=behind), recorder) as opened:
         plain = opened.render(opened.camera(0), find_overlay("gaze"))
         again = render_aovs(scene_triptych, opened.scene, opened.camera(0), ["gaze", "opacity"], spp=2)
     assert (plain.values == with_.values).all() and (again.aovs["gaze"] == with_.values).all()
-    assert own.values.max() > 0
+    assert observer_view.values.max() > 0
 
 
 def test_a_scene_whose_camera_is_the_observer(rgb, scene_triptych, tmp_path):
@@ -482,11 +482,11 @@ def test_over_a_place(rgb, rays, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "given, said", [({"people": "Eve"}, "the rays have no person"), ({"cut": 0.0}, "--cut-height must be above")]
+    "options, said", [({"people": "Eve"}, "the rays have no person"), ({"cut": 0.0}, "--cut-height must be above")]
 )
-def test_what_a_floor_plan_refuses(rays, given, said):
+def test_what_a_floor_plan_refuses(rays, options, said):
     with pytest.raises(NergError, match=said):
-        draw("floor", rays, **given)
+        draw("floor", rays, **options)
 
 
 # ---- Figures drawn and written, with where they come from ----
@@ -494,16 +494,16 @@ def test_what_a_floor_plan_refuses(rays, given, said):
 
 def test_a_file_says_where_it_comes_from(tmp_path):
     image = pytest.importorskip("PIL.Image", reason="Pillow is not installed")
-    told = Recorder()
+    recorder = Recorder()
     a = write(tmp_path / "a.exr")
-    figure = draw("sheet", str(a), str(tmp_path / "new" / "b.png"), told, overlay="gaze", decades=2.0)
+    figure = draw("sheet", str(a), str(tmp_path / "new" / "b.png"), recorder, overlay="gaze", decades=2.0)
     width, height = (round(v) for v in figure.bbox.size)
-    assert told.messages == [f"Wrote {tmp_path / 'new' / 'b.png'} ({width} x {height})."]
-    with image.open(tmp_path / "new" / "b.png") as found:
-        assert found.size == (width, height)
-        about = json.loads(found.text["Comment"])
-    assert about["what"] == "nerg draw sheet" and about["settings"] == {"overlay": "gaze", "log_decades": 2.0}
-    assert about["inputs"] == {"a.exr": hashlib.sha256(a.read_bytes()).hexdigest()} and about["seed"] is None
+    assert recorder.messages == [f"Wrote {tmp_path / 'new' / 'b.png'} ({width} x {height})."]
+    with image.open(tmp_path / "new" / "b.png") as stored:
+        assert stored.size == (width, height)
+        metadata = json.loads(stored.text["Comment"])
+    assert metadata["what"] == "nerg draw sheet" and metadata["settings"] == {"overlay": "gaze", "log_decades": 2.0}
+    assert metadata["inputs"] == {"a.exr": hashlib.sha256(a.read_bytes()).hexdigest()} and metadata["seed"] is None
 
 
 def test_what_any_figure_refuses(tmp_path):

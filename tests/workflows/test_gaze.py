@@ -46,27 +46,27 @@ TRAINING = GazeOptions(
 
 
 def test_scores_stand_beside_the_baselines(trained, tmp_path):
-    found = evaluate_gaze(trained / "gaze.safetensors", trained / "rays.npz", tmp_path / "eval", OPTIONS)
-    names = [row["method"] for row in found.rows]
-    assert names[0] == "gaze field" and "uniform" in names and "4,096 nearest rays" in names and found.split == "pos"
-    assert all(set(SCORES) <= set(row) for row in found.rows) and 1 <= found.positions <= 3 and found.people >= 2
-    assert {row["method"] for row in found.persons} == {"gaze field", "4,096 nearest rays"}
+    result = evaluate_gaze(trained / "gaze.safetensors", trained / "rays.npz", tmp_path / "eval", OPTIONS)
+    names = [row["method"] for row in result.rows]
+    assert names[0] == "gaze field" and "uniform" in names and "4,096 nearest rays" in names and result.split == "pos"
+    assert all(set(SCORES) <= set(row) for row in result.rows) and 1 <= result.positions <= 3 and result.people >= 2
+    assert {row["method"] for row in result.persons} == {"gaze field", "4,096 nearest rays"}
     files = {"gaze.md", "gaze.csv", "persons.csv", "gaze.json", "positions.png", "positions.csv"}
-    assert {p.name for p in found.files} == files
+    assert {p.name for p in result.files} == files
     # All stand in one zone; a field of no support would say so at each.
-    assert len(found.by_position) == found.positions and {row["group"] for row in found.by_position} == {"0"}
-    assert all(row["support"] >= 0 and row["KLD"] > 0 for row in found.by_position)
-    assert {row["method"] for row in found.calibration} >= {"gaze field", "4,096 nearest rays"}
+    assert len(result.by_position) == result.positions and {row["group"] for row in result.by_position} == {"0"}
+    assert all(row["support"] >= 0 and row["KLD"] > 0 for row in result.by_position)
+    assert {row["method"] for row in result.calibration} >= {"gaze field", "4,096 nearest rays"}
     # By what the folds of the training held out.
-    assert found.calibration[1]["method"] == "gaze field, calibrated"
-    assert json.loads((tmp_path / "eval" / "gaze.json").read_text())["methods"][0]["KLD"] == found.rows[0]["KLD"]
+    assert result.calibration[1]["method"] == "gaze field, calibrated"
+    assert json.loads((tmp_path / "eval" / "gaze.json").read_text())["methods"][0]["KLD"] == result.rows[0]["KLD"]
     assert "directions of equal area" in (tmp_path / "eval" / "gaze.md").read_text()
 
 
 def test_without_a_folder_nothing_is_written(trained):
     before = set(trained.iterdir())
-    found = evaluate_gaze(trained / "gaze.safetensors", Rays.load(trained / "rays.npz"), options=OPTIONS)
-    assert found.files == [] and set(trained.iterdir()) == before and found.rows[0]["method"] == "gaze field"
+    result = evaluate_gaze(trained / "gaze.safetensors", Rays.load(trained / "rays.npz"), options=OPTIONS)
+    assert result.files == [] and set(trained.iterdir()) == before and result.rows[0]["method"] == "gaze field"
 
 
 def test_what_cannot_be_scored_is_refused(trained, tmp_path):
@@ -105,23 +105,26 @@ def test_two_workers_of_which_one_is_killed_score_as_this_process_does(tmp_path,
     pytest.importorskip("distributed", reason="dask is not installed (extra cluster)")
     crowd(3000).save(tmp_path / "rays.npz")
     with ClusterOfProcesses(tmp_path) as cluster:
-        told = Killer(cluster)
+        recorder = Killer(cluster)
         cluster.start_worker(), cluster.start_worker()
         wait_until(lambda: all("works for" in cluster.log(f"worker{k}") for k in (0, 1)), "both workers are there")
         options = FoldOptions(**SMALL | {"folds": 3}, scheduler=cluster.address)
-        found = evaluate_folds(tmp_path / "rays.npz", tmp_path / "out", options, told)
+        result = evaluate_folds(tmp_path / "rays.npz", tmp_path / "out", options, recorder)
         assert cluster.workers[0].poll() is not None and cluster.workers[1].poll() is None
-    assert {p.name for p in found.files} == {"folds.md", "folds.csv", "positions.csv", "folds.json"}
-    assert {row["fold"] for row in found.each} == {0, 1, 2} and {row["split"] for row in found.rows} == {"both", "pos"}
+    assert {p.name for p in result.files} == {"folds.md", "folds.csv", "positions.csv", "folds.json"}
+    assert {row["fold"] for row in result.each} == {0, 1, 2} and {row["split"] for row in result.rows} == {
+        "both",
+        "pos",
+    }
     # Each fold's zone is a group of its own, and all positions together are asked too.
-    assert {row["group"].split()[0] for row in found.by_position} == {"0", "1", "2"}
-    assert {row["split"] for row in found.uncertainty} == {"both", "pos", "anywhere"}
-    assert found.calibration[0]["folds"] == 3 and 0 <= found.calibration[0]["80%"] <= 1
-    ours = [row["KLD"] for row in found.each if row["split"] == "both" and row["method"] == "gaze field"]
-    assert found.rows[0]["KLD"] == pytest.approx(sum(ours) / 3) and ours[0] != ours[1]
-    assert found.rows[0]["KLD.low"] < found.rows[0]["KLD"] and all(field.is_file() for field in found.fields)
-    here = evaluate_folds(tmp_path / "rays.npz", tmp_path / "here", FoldOptions(**SMALL | {"folds": 3}))
-    assert [f.read_bytes() for f in here.files] == [f.read_bytes() for f in found.files]
+    assert {row["group"].split()[0] for row in result.by_position} == {"0", "1", "2"}
+    assert {row["split"] for row in result.uncertainty} == {"both", "pos", "anywhere"}
+    assert result.calibration[0]["folds"] == 3 and 0 <= result.calibration[0]["80%"] <= 1
+    ours = [row["KLD"] for row in result.each if row["split"] == "both" and row["method"] == "gaze field"]
+    assert result.rows[0]["KLD"] == pytest.approx(sum(ours) / 3) and ours[0] != ours[1]
+    assert result.rows[0]["KLD.low"] < result.rows[0]["KLD"] and all(field.is_file() for field in result.fields)
+    expected = evaluate_folds(tmp_path / "rays.npz", tmp_path / "here", FoldOptions(**SMALL | {"folds": 3}))
+    assert [f.read_bytes() for f in expected.files] == [f.read_bytes() for f in result.files]
 
 
 @pytest.fixture(autouse=True)
@@ -152,11 +155,11 @@ def folds_trained(monkeypatch):
 
 
 def test_folds_that_are_kept_are_not_trained_again(tmp_path, folds_trained):
-    def go(rays=None, **more):
+    def go(rays=None, **changes):
         folds_trained.clear()
-        told = Recorder()
+        recorder = Recorder()
         rays = crowd(300) if rays is None else rays
-        evaluate_folds(rays, tmp_path / "out", FoldOptions(**SMALL | more, store=tmp_path / "store"), told)
+        evaluate_folds(rays, tmp_path / "out", FoldOptions(**SMALL | changes, store=tmp_path / "store"), recorder)
         return list(folds_trained)
 
     assert go() == [0, 1] and go() == [] and go(folds=4) == [2, 3] and go(first=2, folds=3) == [4]
@@ -175,9 +178,9 @@ def test_what_is_plainly_wrong(tmp_path):
 
 @pytest.mark.nightly
 def test_the_spread_of_an_ensemble_is_judged_as_support_is(tmp_path):
-    found = evaluate_folds(crowd(3000), tmp_path / "out", FoldOptions(**SMALL | {"ensemble": 2, "splits": "both"}))
-    assert {(row["signal"], row["error"]) for row in found.uncertainty} >= {("support", "KLD"), ("spread", "KLD")}
-    assert all(row["spread"] > 0 for row in found.by_position)
+    result = evaluate_folds(crowd(3000), tmp_path / "out", FoldOptions(**SMALL | {"ensemble": 2, "splits": "both"}))
+    assert {(row["signal"], row["error"]) for row in result.uncertainty} >= {("support", "KLD"), ("spread", "KLD")}
+    assert all(row["spread"] > 0 for row in result.by_position)
     assert "spread" in (tmp_path / "out" / "folds.md").read_text()
 
 
@@ -210,16 +213,16 @@ class Uniform:
 @pytest.mark.nightly
 def test_rows_are_made_once(tmp_path, monkeypatch):
     """With two variants, for the time that compiling takes; the trainers know all of them."""
-    found = ablate(crowd(3000), tmp_path, ABLATION_OPTIONS)
-    assert len(found.rows) == 4 and {r["seed"] for r in found.rows} == {0, 1}
-    whole = [r["test_relative"] for r in found.rows if r["variant"] == "emit_capture"]
-    assert np.mean(whole) == pytest.approx(1)
-    assert all(r["frame_seconds"] > 0 and np.isfinite(r["test_loss"]) for r in found.rows)
-    assert (tmp_path / "default_capture_0.safetensors").exists() and all(p.is_file() for p in found.files)
-    assert json.loads((tmp_path / "ablation.json").read_text())["rows"] == found.rows
+    result = ablate(crowd(3000), tmp_path, ABLATION_OPTIONS)
+    assert len(result.rows) == 4 and {r["seed"] for r in result.rows} == {0, 1}
+    relative_losses = [r["test_relative"] for r in result.rows if r["variant"] == "emit_capture"]
+    assert np.mean(relative_losses) == pytest.approx(1)
+    assert all(r["frame_seconds"] > 0 and np.isfinite(r["test_loss"]) for r in result.rows)
+    assert (tmp_path / "default_capture_0.safetensors").exists() and all(p.is_file() for p in result.files)
+    assert json.loads((tmp_path / "ablation.json").read_text())["rows"] == result.rows
     # What is there already is not trained again; what would be another training is.
     trained = []
-    monkeypatch.setattr(ablation, "_train", lambda made, plan, path, bench: trained.append(path.stem) or found.rows[0])
+    monkeypatch.setattr(ablation, "_train", lambda made, plan, path, bench: trained.append(path.stem) or result.rows[0])
     ablate(crowd(3000), tmp_path, ABLATION_OPTIONS)
     assert trained == []
     other = replace(ABLATION_OPTIONS, ground_truth="tests.workflows.test_gaze:Uniform", seeds=1, variant=("capture",))
@@ -246,11 +249,11 @@ def test_what_is_wrong_is_told_before_any_work(tmp_path, change, said):
 
 def test_splats_have_no_features_of_a_radiance_field(tmp_path):
     write_inria(tmp_path / "place.ply", random_splats(5))
-    given = replace(
+    options = replace(
         ABLATION_OPTIONS, geometry=None, field=tmp_path / "place.ply", recipes="small", variant=("semantic snapshot",)
     )
     with pytest.raises(NergError, match="--variant must be one of emit, capture,"):
-        ablate(crowd(100), tmp_path / "new", given)
+        ablate(crowd(100), tmp_path / "new", options)
 
 
 @pytest.mark.parametrize("recipe, seeds, steps, refit", [("default", [0, 1], 2, True), ("small", [0], 5, False)])
@@ -259,12 +262,12 @@ def test_only_quick_recipes_are_repeated(tmp_path, monkeypatch, recipe, seeds, s
     plans = {}
     row = {"test_KLD": 1.0, "test_CC": 0.5, "train_seconds": 1.0, "test_loss": 1.0, "train_loss": 1.0, "steps": 1}
 
-    def kept(made, plan, path, bench):
+    def record_training(made, plan, path, bench):
         plans[made["seed"]] = plan
         path.write_bytes(b"")
         return {**made, **row}
 
-    monkeypatch.setattr(ablation, "_train", kept)
+    monkeypatch.setattr(ablation, "_train", record_training)
     options = replace(ABLATION_OPTIONS, recipes=recipe, variant=("emit",), steps=5, refit=False, timing_cameras=0)
     ablate(crowd(1000), tmp_path, options)
     assert sorted(plans) == seeds
@@ -277,12 +280,12 @@ def test_only_quick_recipes_are_repeated(tmp_path, monkeypatch, recipe, seeds, s
 def test_another_first_seed_holds_others_out(tmp_path, monkeypatch):
     made = []
 
-    def kept(row, plan, path, bench):
+    def record_training(row, plan, path, bench):
         made.append((row["seed"], plan.settings.seed, bench.centres.tobytes()))
         path.write_bytes(b"")
         return {**row, "test_KLD": 1.0, "test_CC": 0.5, "train_seconds": 1.0, "test_loss": 1.0, "train_loss": 1.0}
 
-    monkeypatch.setattr(ablation, "_train", kept)
+    monkeypatch.setattr(ablation, "_train", record_training)
     monkeypatch.setattr(scoring, "write_ablation", lambda *args: [])
     for first in (0, 5):
         ablate(
@@ -334,17 +337,17 @@ TIMES = ("train_seconds", "frame_seconds")
 ONE = replace(ABLATION_OPTIONS, variant=("emit_capture",), seeds=1, timing_cameras=0, threads=1)
 
 
-def scores(found):
-    return [{k: v for k, v in row.items() if k not in TIMES} for row in found.rows]
+def scores(result):
+    return [{k: v for k, v in row.items() if k not in TIMES} for row in result.rows]
 
 
 @pytest.fixture
 def trainings(monkeypatch):
     """What was trained in this process."""
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
-    found, original = [], ablation.train_variant
-    monkeypatch.setattr(ablation, "train_variant", lambda *given: found.append(given[:2]) or original(*given))
-    return found
+    calls, original = [], ablation.train_variant
+    monkeypatch.setattr(ablation, "train_variant", lambda *args: calls.append(args[:2]) or original(*args))
+    return calls
 
 
 @pytest.mark.nightly
@@ -352,15 +355,15 @@ def test_a_training_elsewhere_scores_as_one_here_and_is_kept(tmp_path, rgb, trai
     rays = crowd(3000)
     elsewhere = ablate(rays, tmp_path / "a", replace(ONE, scheduler="local:1"))
     assert trainings == []
-    here = ablate(rays, tmp_path / "b", ONE)
-    assert scores(elsewhere) == scores(here)
+    local = ablate(rays, tmp_path / "b", ONE)
+    assert scores(elsewhere) == scores(local)
     trainings.clear()
     assert (tmp_path / "a" / "default_emit_capture_0.safetensors").is_file()
     # One seed more: that one is trained, whoever does it.
     ablate(rays, tmp_path / "a", replace(ONE, seeds=2, store=tmp_path / "a.tasks"))
     assert [seed for _, seed in trainings] == [1]
-    told = Recorder()
-    (job,) = account_for_store(tmp_path / "a.tasks", reporter=told).jobs
+    recorder = Recorder()
+    (job,) = account_for_store(tmp_path / "a.tasks", reporter=recorder).jobs
     assert (job.name, job.total, job.remaining) == (f"nerg ablate {tmp_path / 'a'}", 2, 0)
 
 
@@ -380,13 +383,13 @@ def test_its_checkpoint_is_the_density_of_other_places_anywhere(tmp_path, rgb):
     for k, rays in enumerate(places):
         rays.save(tmp_path / f"{k}.npz")
     path = tmp_path / "prior.safetensors"
-    found = learn_prior([tmp_path / "0.npz", tmp_path / "1.npz"], path)
-    assert [(p["file"], p["rays"], p["persons"]) for p in found.provenance["places"]] == [
+    result = learn_prior([tmp_path / "0.npz", tmp_path / "1.npz"], path)
+    assert [(p["file"], p["rays"], p["persons"]) for p in result.provenance["places"]] == [
         ("0.npz", 200, 2),
         ("1.npz", 200, 2),
     ]
-    field, metadata = load_gaze(path, found.field.ns)
-    assert metadata["provenance"] == found.provenance
+    field, metadata = load_gaze(path, result.field.ns)
+    assert metadata["provenance"] == result.provenance
     ns, sine = field.ns, np.array([-0.9, -0.56, 0.0, 0.2, 0.8])
     r = ns.Array3f(np.stack([np.sqrt(1 - sine**2), 0 * sine, sine]).astype(np.float32))
     gaze = np.array(field.evaluate(r, ns.Array3f(30.0, 4.0, 1.6), r, integral=ns.Float(1.0))[0])
@@ -394,7 +397,7 @@ def test_its_checkpoint_is_the_density_of_other_places_anywhere(tmp_path, rgb):
     np.testing.assert_allclose(gaze, compute_elevation_density(places, sine), atol=0.006)
     with pytest.raises(NergError, match="is a prior from other scenes, for which no rays"):
         evaluate_gaze(path, places[0])
-    assert learn_prior(tmp_path / "1.npz").provenance["places"] == found.provenance["places"][1:]
+    assert learn_prior(tmp_path / "1.npz").provenance["places"] == result.provenance["places"][1:]
     # A notebook has the rays at hand.
     same = learn_prior(places)
     assert same.output is None and "file" not in same.provenance["places"][0]
@@ -463,10 +466,10 @@ def test_a_checkpoint_that_does_not_say_where_it_was_trained():
 
 def test_without_geometry_the_box_holds_whoever_looked(rays):
     views = around(5)
-    for given, seen in ((rays, ()), (None, views), (rays, views)):
-        place = make_geometry(GeometryOptions(geometry="none"), given, seen, None, ns)
-        eyes = np.concatenate(([given.origin] if given else []) + [v.camera.center[None] for v in seen])
-        np.testing.assert_allclose(place.box.lower, eyes.min(axis=0) - 2)
+    for samples, seen in ((rays, ()), (None, views), (rays, views)):
+        place = make_geometry(GeometryOptions(geometry="none"), samples, seen, None, ns)
+        positions = np.concatenate(([samples.origin] if samples else []) + [v.camera.center[None] for v in seen])
+        np.testing.assert_allclose(place.box.lower, positions.min(axis=0) - 2)
     with pytest.raises(NergError, match="a geometry of hit points needs rays, and is"):
         make_geometry(GeometryOptions(geometry="hits"), None, views, None, ns)
 

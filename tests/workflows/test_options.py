@@ -71,8 +71,8 @@ def test_options_are_frozen_and_told(kind):
     with pytest.raises(TypeError):
         kind(1)
     for f in fields(kind):
-        own = "--" + f.name.replace("_", "-")
-        assert f.metadata["help"].strip() and not f.metadata["help"].startswith(own), f.name
+        option = "--" + f.name.replace("_", "-")
+        assert f.metadata["help"].strip() and not f.metadata["help"].startswith(option), f.name
         with pytest.raises(FrozenInstanceError):
             setattr(made, f.name, None)
     assert set(get_type_hints(kind)) == {f.name for f in fields(kind)}
@@ -134,7 +134,7 @@ def test_options_that_are_repeated_are_read_again_and_those_of_one_name_are_not(
 
 FIELDS = [f for kind in (ProbeSettings, TrainingSettings) for f in fields(kind) if "help" in f.metadata]
 SETTINGS = {f.metadata["option"] or f.name for f in FIELDS}
-CHOSEN = {"learning_rate": 0.5, "max_rays": 7, "placement": "grid", "resample_directions": True}
+CHANGED_SETTINGS = {"learning_rate": 0.5, "max_rays": 7, "placement": "grid", "resample_directions": True}
 
 
 class Stop(Exception):
@@ -156,26 +156,26 @@ def training(monkeypatch):
 
 
 def test_folds_have_them(training, tmp_path):
-    options = FoldOptions(geometry="hits", **CHOSEN)
+    options = FoldOptions(geometry="hits", **CHANGED_SETTINGS)
     with pytest.raises(Stop):
         evaluate.train_and_score(evaluate.FoldInputs(options, ("both",), None, None), 3, tmp_path)
-    assert {name: getattr(training[0], name) for name in CHOSEN} == CHOSEN and training[0].seed == 3
+    assert {name: getattr(training[0], name) for name in CHANGED_SETTINGS} == CHANGED_SETTINGS and training[0].seed == 3
     # What tests are made by has the same words, and is left out.
     assert training[0].kappa is training[0].radius is None
 
 
 def test_ablations_have_them(training):
-    bench = SimpleNamespace(options=AblationOptions(**CHOSEN, default_steps=3), place=None)
+    bench = SimpleNamespace(options=AblationOptions(**CHANGED_SETTINGS, default_steps=3), place=None)
     with pytest.raises(Stop):
         ablation.make_plan(Variant(name="emit", recipe="default", field_variant="emit"), 3, bench)
-    assert {name: getattr(training[0], name) for name in CHOSEN} == CHOSEN
+    assert {name: getattr(training[0], name) for name in CHANGED_SETTINGS} == CHANGED_SETTINGS
     assert training[0].kappa is training[0].radius is None and training[0].steps == 3
 
 
 @pytest.mark.parametrize("kind", [FoldOptions, AblationOptions])
 def test_none_is_forgotten(kind):
     assert {f.name for f in fields(kind)} | {"seed", "freeze", "validation_zones", "loss", "prior_folds"} >= SETTINGS
-    assert exposed_options(kind()) == {} and set(exposed_options(kind(**CHOSEN))) == set(CHOSEN)
+    assert exposed_options(kind()) == {} and set(exposed_options(kind(**CHANGED_SETTINGS))) == set(CHANGED_SETTINGS)
 
 
 # ---- Options of filtering and splitting; what they do to rays is tried in tests/workflows/test_rays.py ----
@@ -266,7 +266,7 @@ def key(value):
 
 @pytest.mark.parametrize("command", list(COMMANDS))
 def test_each_option_changes_the_key_of_a_part_exactly_when_it_changes_its_work(command, tmp_path):
-    kind, of_parts, others = COMMANDS[command]
+    kind, of_parts, excluded = COMMANDS[command]
     options = kind()
     before, left_out = key(of_parts(options)), set()
     for f in fields(kind):
@@ -275,7 +275,7 @@ def test_each_option_changes_the_key_of_a_part_exactly_when_it_changes_its_work(
         assert (key(changed) == before) == same_work, f.name
         if same_work:
             left_out.add(f.name)
-    assert left_out == others
+    assert left_out == excluded
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -327,8 +327,8 @@ def test_it_says_nothing(capsys):
 
 
 def test_versions_of_what_has_a_part():
-    found = versions("llvm_ad_rgb")
-    assert set(found) == {"nerg_mi", "mitsuba", "drjit", "numpy", "python", "libLLVM"} and all(found.values())
+    installed = versions("llvm_ad_rgb")
+    assert set(installed) == {"nerg_mi", "mitsuba", "drjit", "numpy", "python", "libLLVM"} and all(installed.values())
     assert "libLLVM" not in versions("scalar_rgb")
 
 

@@ -73,15 +73,15 @@ class Impatient(Recorder):
 
 
 def test_a_result_without_any_file(cube):
-    before, told = set(cube.iterdir()), Recorder()
-    result = train_radiance(cube, options=RadianceOptions(steps=3, holdout=3), reporter=told)
+    before, recorder = set(cube.iterdir()), Recorder()
+    result = train_radiance(cube, options=RadianceOptions(steps=3, holdout=3), reporter=recorder)
     assert set(cube.iterdir()) == before and result.output is None and not result.interrupted
     assert result.provenance["steps"] == 3 and result.psnr == result.provenance["psnr_held_out"]["mean"]
     assert result.field.box.lower == pytest.approx((-1.025,) * 3) and result.field.occupancy is not None
-    assert "2 views to train on, 1 held out, 16 x 14 pixels" in told.messages
-    assert told.warnings == result.provenance["complaints"] and told.warnings
-    shares = [share for share, _ in told.steps]
-    assert shares == sorted(shares) and shares[-1] == 1 and told.steps[1][1].endswith("step 1")
+    assert "2 views to train on, 1 held out, 16 x 14 pixels" in recorder.messages
+    assert recorder.warnings == result.provenance["complaints"] and recorder.warnings
+    shares = [share for share, _ in recorder.steps]
+    assert shares == sorted(shares) and shares[-1] == 1 and recorder.steps[1][1].endswith("step 1")
 
 
 def test_a_deferred_field(cube, tmp_path):
@@ -114,23 +114,23 @@ def test_nothing_to_resume_without_an_output(cube):
 
 
 def test_scores_without_any_file(cube):
-    before, told = set(cube.iterdir()), Recorder()
-    scores = evaluate_radiance(cube / "cube.safetensors", cube, RadianceScoreOptions(holdout=2, spp=4), told)
+    before, recorder = set(cube.iterdir()), Recorder()
+    scores = evaluate_radiance(cube / "cube.safetensors", cube, RadianceScoreOptions(holdout=2, spp=4), recorder)
     assert set(cube.iterdir()) == before
     assert scores.psnr_mean == pytest.approx(np.mean(scores.psnr)) and scores.depth is None and scores.spp == 4
-    assert len(told.messages) == len(scores.views) + 3 and told.messages[-2].startswith("mean")
-    assert told.messages[-1].endswith(f"{np.mean(scores.psnr_fitted):.2f} dB")
+    assert len(recorder.messages) == len(scores.views) + 3 and recorder.messages[-2].startswith("mean")
+    assert recorder.messages[-1].endswith(f"{np.mean(scores.psnr_fitted):.2f} dB")
 
 
 def test_views_too_small_for_a_score_have_none(cube, tmp_path):
     """One pixel has no right half to fit colours for, and no window of structural similarity."""
-    told, out, table = Recorder(), tmp_path / "f.safetensors", tmp_path / "s.json"
-    result = train_radiance(cube, out, RadianceOptions(steps=2, holdout=3, width=1), told)
+    recorder, out, table = Recorder(), tmp_path / "f.safetensors", tmp_path / "s.json"
+    result = train_radiance(cube, out, RadianceOptions(steps=2, holdout=3, width=1), recorder)
     assert result.provenance["psnr_held_out"]["mean_fitted"] is None and np.isfinite(result.psnr)
-    evaluate_radiance(out, cube, RadianceScoreOptions(holdout=3, width=1, spp=1, json_file=table), told)
+    evaluate_radiance(out, cube, RadianceScoreOptions(holdout=3, width=1, spp=1, json_file=table), recorder)
     scores = json.loads(table.read_text())
     assert scores["ssim"] == scores["psnr_fitted"] == [None] and scores["psnr_mean"] > 0
-    assert not any("nan" in text for text in told.messages) and "11 x 11" in told.warnings[-1]
+    assert not any("nan" in text for text in recorder.messages) and "11 x 11" in recorder.warnings[-1]
 
 
 def test_views_that_were_trained_on_are_no_held_out_views(cube):
@@ -145,18 +145,18 @@ def test_views_that_were_trained_on_are_no_held_out_views(cube):
 
 
 def test_fields_without_any_file(torch, tmp_path):
-    path, told = save(tmp_path / "nerg.pth", small_gaze(), nerf=small_state()), Recorder()
-    found = import_checkpoint(path, reporter=told)
-    assert found.field is not None and found.gaze.config.variant == "emit_capture" and found.files == []
+    path, recorder = save(tmp_path / "nerg.pth", small_gaze(), nerf=small_state()), Recorder()
+    result = import_checkpoint(path, reporter=recorder)
+    assert result.field is not None and result.gaze.config.variant == "emit_capture" and result.files == []
     assert [p.name for p in tmp_path.iterdir()] == ["nerg.pth"]
-    assert told.messages == [f'"{path}" also contains a gaze field: write it with --gaze NAME.safetensors']
+    assert recorder.messages == [f'"{path}" also contains a gaze field: write it with --gaze NAME.safetensors']
 
 
 def test_files_in_their_order(torch, tmp_path):
     path = save(tmp_path / "nerg.pth", small_gaze(), nerf=small_state())
     outputs = tmp_path / "f.safetensors", tmp_path / "g.safetensors"
-    found = import_checkpoint(path, *outputs, CheckpointImportOptions(half=True))
-    assert tuple(found.files) == outputs and all(p.is_file() for p in outputs)
+    result = import_checkpoint(path, *outputs, CheckpointImportOptions(half=True))
+    assert tuple(result.files) == outputs and all(p.is_file() for p in outputs)
 
 
 # ---- Exports by jobs: from a file and from a field that is loaded ----
@@ -169,20 +169,22 @@ def field(tmp_path):
 
 
 def test_a_field_and_its_file_are_exported_alike(field, tmp_path):
-    options, told = PointOptions(resolution=16, density=3.0, max_points=50), Recorder()
-    first = export_points(field, tmp_path / "a.ply", options, told)
+    options, recorder = PointOptions(resolution=16, density=3.0, max_points=50), Recorder()
+    first = export_points(field, tmp_path / "a.ply", options, recorder)
     second = export_points(load_radiance(field, ns)[0], tmp_path / "b.ply", options)
     assert first.files == [tmp_path / "a.ply"] and len(first.surface.vertices) == 50
     assert np.array_equal(first.surface.vertices, second.surface.vertices)
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
-    assert told.messages[0].startswith("50 points") and told.messages[1].startswith(f"wrote {tmp_path / 'a.ply'}")
+    assert recorder.messages[0].startswith("50 points") and recorder.messages[1].startswith(
+        f"wrote {tmp_path / 'a.ply'}"
+    )
 
 
 def test_splats_lie_on_the_surface(field, tmp_path):
-    told = Recorder()
-    done = export_splats(field, tmp_path / "a.ply", SplatOptions(resolution=16, density=3.0), told)
+    recorder = Recorder()
+    done = export_splats(field, tmp_path / "a.ply", SplatOptions(resolution=16, density=3.0), recorder)
     splats = read_splats(tmp_path / "a.ply")
-    assert done.files == [tmp_path / "a.ply"] and told.messages[0].startswith(f"{len(splats):,} Gaussians")
+    assert done.files == [tmp_path / "a.ply"] and recorder.messages[0].startswith(f"{len(splats):,} Gaussians")
     assert (np.abs(splats.centers) < 1.3).all()
 
 
@@ -205,34 +207,34 @@ def files(tmp_path_factory):
     folder = tmp_path_factory.mktemp("refined")
     bits = np.random.default_rng(0).random((6, 6, 6)) < 0.4
     radiance(folder / "old.safetensors", density_scale=8e-3, occupancy=OccupancyGrid(bits, ns, 0.05))
-    found = refine_checkpoint(folder / "old.safetensors", folder / "new.safetensors")
-    return folder / "old.safetensors", folder / "new.safetensors", found
+    result = refine_checkpoint(folder / "old.safetensors", folder / "new.safetensors")
+    return folder / "old.safetensors", folder / "new.safetensors", result
 
 
 def test_only_the_bound_is_another(files):
-    old, new, found = files
-    (tensors, meta), (again, about) = (read_checkpoint(p, "radiance") for p in (old, new))
+    old, new, result = files
+    (tensors, meta), (again, refined_meta) = (read_checkpoint(p, "radiance") for p in (old, new))
     assert set(again) - set(tensors) == {"occupancy.parts"}
     assert all(
         np.array_equal(again[name], tensors[name]) and again[name].dtype == tensors[name].dtype for name in tensors
     )
-    assert {k: v for k, v in about.items() if k not in ("occupancy", "refined_from")} == {
+    assert {k: v for k, v in refined_meta.items() if k not in ("occupancy", "refined_from")} == {
         k: v for k, v in meta.items() if k != "occupancy"
     }
     # Of readers that know no parts the cells are what they were.
-    assert {k: v for k, v in about["occupancy"].items() if k != "refined"} == meta["occupancy"]
+    assert {k: v for k, v in refined_meta["occupancy"].items() if k != "refined"} == meta["occupancy"]
     loaded = load_radiance(new, ns)[0].occupancy
     assert (
-        np.array_equal(loaded.masks, found.occupancy.masks)
-        and loaded.missed_optical_depth == found.occupancy.missed_optical_depth
+        np.array_equal(loaded.masks, result.occupancy.masks)
+        and loaded.missed_optical_depth == result.occupancy.missed_optical_depth
     )
-    assert 0 < loaded.occupied_fraction < found.before == loaded.coarse.occupied_fraction
+    assert 0 < loaded.occupied_fraction < result.before == loaded.coarse.occupied_fraction
 
 
 def test_a_gaze_field_knows_it(files, tmp_path):
     old, new, _ = files
-    known = file_sha256(old)
-    assert matches_checksum(old, known) and matches_checksum(new, known)
+    checksum = file_sha256(old)
+    assert matches_checksum(old, checksum) and matches_checksum(new, checksum)
     assert not matches_checksum(new, "0" * 64) and not matches_checksum(new, None)
     refine_checkpoint(new, tmp_path / "again.safetensors")
     assert (tmp_path / "again.safetensors").read_bytes() == new.read_bytes()
@@ -300,27 +302,27 @@ def finds(monkeypatch):
     """`finds(keep)` lets so many pictures have a pose; gives a list of the settings that were asked for."""
 
     def choose(keep: int, change=lambda made: made) -> list:
-        asked = []
+        calls = []
 
         def stand_in(pictures, work, settings, progress):
-            asked.append(settings)
+            calls.append(settings)
             for stage in ("features", "matching", "mapping"):
                 progress(stage, 1, 2)
             return change(written(pictures, Path(work), keep)) if keep else None
 
         monkeypatch.setattr(job, "reconstruct", stand_in)
-        return asked
+        return calls
 
     monkeypatch.setattr(job, "check_installed", lambda: None)
     return choose
 
 
 def test_the_capture_is_read_as_it_was_found(photos, finds, tmp_path):
-    asked = finds(COUNT)
-    told = Recorder()
+    calls = finds(COUNT)
+    recorder = Recorder()
     options = PoseOptions(camera_model="radial", threads=1, seed=3, single_camera=False)
-    result = find_poses(photos, tmp_path / "new" / "capture", options, told)
-    (settings,) = asked
+    result = find_poses(photos, tmp_path / "new" / "capture", options, recorder)
+    (settings,) = calls
     assert (settings.lens, settings.threads, settings.seed, settings.share_cameras) == ("radial", 1, 3, False)
     assert sorted(os.listdir(result.output)) == ["images", "poses.json", "poses.png", "sparse"]
     assert os.listdir(tmp_path / "new") == ["capture"]
@@ -331,41 +333,41 @@ def test_the_capture_is_read_as_it_was_found(photos, finds, tmp_path):
     assert "points on surfaces" in data.box_source and not data.unused
     for k in range(COUNT):
         assert (result.output / "images" / f"{k}.png").read_bytes() == (photos / f"{k}.png").read_bytes()
-    assert result.unregistered == [] and result.points == 400 and not told.warnings
-    text = "\n".join(told.messages)
+    assert result.unregistered == [] and result.points == 400 and not recorder.warnings
+    text = "\n".join(recorder.messages)
     assert "9 of 9 pictures have a pose, 400 points; mean reprojection error 0.40 pixels" in text
     assert "up is +z: the cameras are held level to 0.5 degrees" in text and "nerg train radiance" in text
 
 
 def test_progress_grows_through_all_stages(photos, finds, tmp_path):
     finds(COUNT)
-    told = Recorder()
-    find_poses(photos, tmp_path / "capture", None, told)
-    shares = [share for share, _ in told.steps]
+    recorder = Recorder()
+    find_poses(photos, tmp_path / "capture", None, recorder)
+    shares = [share for share, _ in recorder.steps]
     assert shares == sorted(shares) and 0 < shares[0] < STAGES["features"] and shares[-1] == STAGES["writing"]
-    words = " ".join(text for _, text in told.steps)
+    words = " ".join(text for _, text in recorder.steps)
     for said in ("copying images, 9 of 9", "extracting features", "matching images", "registering images, 1 of 2"):
         assert said in words
 
 
 def test_pictures_without_a_pose_are_named_and_left_out(photos, finds, tmp_path):
     finds(7)
-    told = Recorder()
+    recorder = Recorder()
     (photos / "bad.jpg").write_bytes(b"\xff\xd8 no photo")
-    result = find_poses(photos, tmp_path / "capture", None, told)
+    result = find_poses(photos, tmp_path / "capture", None, recorder)
     assert result.unregistered == ["7.png", "8.png"] and [u.name for u in result.skipped] == ["bad.jpg"]
     assert sorted(os.listdir(result.output / "images")) == [f"{k}.png" for k in range(7)]
-    text = "\n".join(told.messages)
-    assert "7.png" in text and 'not used: "bad.jpg"' in text and not told.warnings
+    text = "\n".join(recorder.messages)
+    assert "7.png" in text and 'not used: "bad.jpg"' in text and not recorder.warnings
     report = json.loads((result.output / "poses.json").read_text())
     assert report == result.report and report["unregistered"] == ["7.png", "8.png"] and "bad.jpg" in report["skipped"]
 
 
 def test_too_few_and_parts_are_warned_of(photos, finds, tmp_path):
     finds(4)
-    told = Recorder()
-    find_poses(photos, tmp_path / "capture", None, told)
-    parts, few = told.warnings
+    recorder = Recorder()
+    find_poses(photos, tmp_path / "capture", None, recorder)
+    parts, few = recorder.warnings
     assert "unconnected models" in parts and "another has 5 images (4.png, 5.png" in parts
     assert "less than half" in few and "take more images" in few
 
@@ -373,13 +375,13 @@ def test_too_few_and_parts_are_warned_of(photos, finds, tmp_path):
 def test_an_up_that_is_unsure_or_not_asked_for_is_told(photos, finds, tmp_path):
     from dataclasses import replace
 
-    told = Recorder()
+    recorder = Recorder()
     finds(COUNT, lambda made: replace(made, up=UpEstimate(np.array([0, 0, 1.0]), 40.0)))
-    find_poses(photos, tmp_path / "a", None, told)
-    assert "disagree on the up direction" in told.warnings[0] and "--no-orient" in told.warnings[0]
+    find_poses(photos, tmp_path / "a", None, recorder)
+    assert "disagree on the up direction" in recorder.warnings[0] and "--no-orient" in recorder.warnings[0]
     finds(COUNT, lambda made: replace(made, up=None))
-    result = find_poses(photos, tmp_path / "b", PoseOptions(orient=False), told)
-    assert "the up direction was not estimated" in told.messages and result.report["up"] is None
+    result = find_poses(photos, tmp_path / "b", PoseOptions(orient=False), recorder)
+    assert "the up direction was not estimated" in recorder.messages and result.report["up"] is None
 
 
 def test_nothing_found_is_an_error_and_leaves_nothing(photos, finds, tmp_path):

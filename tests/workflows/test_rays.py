@@ -96,40 +96,40 @@ def columns(rays):
 
 
 def test_import(tmp_path):
-    given, heard = EXAMPLES["table"].make(tmp_path), Heard()
-    (tmp_path / "more.csv").write_text(given.read_text())
+    source, heard = EXAMPLES["table"].make(tmp_path), Heard()
+    (tmp_path / "more.csv").write_text(source.read_text())
     settings = make_options("table", EXAMPLES["table"].options)
     options = RaysImportOptions(settings=settings, output=tmp_path / "rays.npz")
-    result = import_rays([given, tmp_path / "more.csv"], options, heard)
+    result = import_rays([source, tmp_path / "more.csv"], options, heard)
     assert len(result.rays) == 40 == result.summary.rays and result.rays.persons == ("ann", "bo")
     assert heard.shares == [(0.0, "reading gaze.csv"), (0.5, "reading more.csv")] and heard.messages == []
-    kept = Rays.load(tmp_path / "rays.npz")
-    assert all(np.array_equal(a, b, equal_nan=True) for a, b in zip(columns(kept), columns(result.rays)))
-    assert len(import_rays(given, RaysImportOptions(settings=settings)).rays) == 20
+    saved = Rays.load(tmp_path / "rays.npz")
+    assert all(np.array_equal(a, b, equal_nan=True) for a, b in zip(columns(saved), columns(result.rays)))
+    assert len(import_rays(source, RaysImportOptions(settings=settings)).rays) == 20
 
 
 def test_the_way_back_to_the_files(tmp_path):
     """The matrix that training is given takes rays to where they stood in the file."""
-    given, align = EXAMPLES["table"].make(tmp_path), tmp_path / "align.json"
+    source, align = EXAMPLES["table"].make(tmp_path), tmp_path / "align.json"
     table = EXAMPLES["table"].options
     settings = make_options("table", {**table, "up": "-y", "units": "mm"})
-    rays = import_rays(given, RaysImportOptions(settings=settings, align_output=align)).rays
+    rays = import_rays(source, RaysImportOptions(settings=settings, align_output=align)).rays
     back = read_similarity(align, "--align", "rays to field")
-    plain = import_rays(given, RaysImportOptions(settings=make_options("table", table))).rays
+    plain = import_rays(source, RaysImportOptions(settings=make_options("table", table))).rays
     assert np.isclose(back.scale, 1000.0)
     assert np.allclose(rays.origin @ back.matrix[:3, :3].T + back.matrix[:3, 3], plain.origin)
     with pytest.raises(NergError, match="left-handed"):
         left = make_options("table", {**table, "up": "y", "handedness": "left"})
-        import_rays(given, RaysImportOptions(settings=left, align_output=align, output=tmp_path / "none.npz"))
+        import_rays(source, RaysImportOptions(settings=left, align_output=align, output=tmp_path / "none.npz"))
     assert not (tmp_path / "none.npz").exists()
 
 
 def test_import_under_pseudonyms(tmp_path):
-    given = EXAMPLES["table"].make(tmp_path)
+    source = EXAMPLES["table"].make(tmp_path)
     settings = make_options("table", EXAMPLES["table"].options)
     (tmp_path / "salt").write_bytes(bytes(range(32)))
     one, two = (
-        import_rays(given, RaysImportOptions(settings=settings, pseudonyms=True, salt=tmp_path / "salt"))
+        import_rays(source, RaysImportOptions(settings=settings, pseudonyms=True, salt=tmp_path / "salt"))
         for _ in range(2)
     )
     assert one.rays.persons == two.rays.persons and not set(one.rays.persons) & {"ann", "bo"}
@@ -153,22 +153,22 @@ def test_filter_leaves_the_rays_that_it_was_given(walk):
     rays, heard = Rays.load(walk), Heard()
     before = [column.copy() for column in columns(rays)]
     options = FilterOptions(persons=["a", "c"], start=10, end=30, fixations="idt", dispersion_threshold=30, thin=1)
-    found = filter_rays(rays, options, heard)
+    result = filter_rays(rays, options, heard)
     assert all(np.array_equal(a, b, equal_nan=True) for a, b in zip(before, columns(rays))) and len(rays) == 12_000
-    assert [s["step"] for s in found.rays.metadata["steps"]] == ["filter", "fixations", "thin"]
-    assert found.fixations > 0 and heard.messages[1] == f"{found.fixations:,} fixations (idt)"
-    assert heard.messages[0] == f"filter: {found.rays.metadata['steps'][0]['kept']:,} of 12,000 rays"
+    assert [s["step"] for s in result.rays.metadata["steps"]] == ["filter", "fixations", "thin"]
+    assert result.fixations > 0 and heard.messages[1] == f"{result.fixations:,} fixations (idt)"
+    assert heard.messages[0] == f"filter: {result.rays.metadata['steps'][0]['kept']:,} of 12,000 rays"
     from_file = filter_rays(walk, options)
-    assert all(np.array_equal(a, b, equal_nan=True) for a, b in zip(columns(from_file.rays), columns(found.rays)))
+    assert all(np.array_equal(a, b, equal_nan=True) for a, b in zip(columns(from_file.rays), columns(result.rays)))
     assert filter_rays(rays, FilterOptions(start=10)).fixations is None
 
 
 def test_one_ray_a_fixation(walk):
-    found = filter_rays(
+    result = filter_rays(
         walk, FilterOptions(fixations="ivt", velocity_threshold=300, min_fixation=0.1, merge_fixations=True)
     )
-    (step,) = found.rays.metadata["steps"]
-    assert len(found.rays) == found.fixations == step["kept"] and step["one_ray"] and step["velocity"] == 300
+    (step,) = result.rays.metadata["steps"]
+    assert len(result.rays) == result.fixations == step["kept"] and step["one_ray"] and step["velocity"] == 300
     assert step["least"] == 0.1 and step["of"] == 12_000
 
 
@@ -176,14 +176,14 @@ def test_split(walk, tmp_path):
     heard = Heard()
     rays = Rays.load(walk)
     options = SplitOptions(test_participants=0.5, test_time=0.3, gap=1, seed=2, train_output=tmp_path / "train.npz")
-    found = split_rays(rays, options, heard)
-    assert len(found.train) + len(found.test) + found.purged == len(rays) and found.purged > 0
-    assert not set(found.train.t) & set(found.test.t) and not (tmp_path / "test.npz").exists()
-    assert len(Rays.load(tmp_path / "train.npz")) == len(found.train)
-    (step,) = found.test.metadata["steps"]
+    result = split_rays(rays, options, heard)
+    assert len(result.train) + len(result.test) + result.purged == len(rays) and result.purged > 0
+    assert not set(result.train.t) & set(result.test.t) and not (tmp_path / "test.npz").exists()
+    assert len(Rays.load(tmp_path / "train.npz")) == len(result.train)
+    (step,) = result.test.metadata["steps"]
     assert step["side"] == "test" and step["seed"] == 2 and step["by"]["time"] == {"share": 0.3, "gap": 1, "of": "all"}
     assert heard.messages == [
-        f"{len(found.train):,} training rays, {len(found.test):,} test rays, {found.purged:,} purged of 12,000"
+        f"{len(result.train):,} training rays, {len(result.test):,} test rays, {result.purged:,} purged of 12,000"
     ]
 
 
@@ -218,8 +218,8 @@ def parquet():
     pytest.importorskip("pyarrow", reason="datasets need the extra parquet")
 
 
-def options(**given) -> RaysImportOptions:
-    return RaysImportOptions(**{"settings": settings(), "workers": 1, **given})
+def options(**changes) -> RaysImportOptions:
+    return RaysImportOptions(**{"settings": settings(), "workers": 1, **changes})
 
 
 @pytest.fixture
@@ -229,15 +229,15 @@ def files(tmp_path):
 
 def test_import_into_a_dataset(parquet, files, tmp_path):
     heard, output = Recorder(), tmp_path / "shop.rays"
-    found = import_rays(files, options(output=output, environment="shop"), heard)
+    result = import_rays(files, options(output=output, environment="shop"), heard)
     at_once = import_rays(files, options(workers=None))
-    assert_same(found.rays, at_once.rays)
-    assert found.summary.rays == 597 and found.lines[0][0] == "dataset" and at_once.lines == ()
+    assert_same(result.rays, at_once.rays)
+    assert result.summary.rays == 597 and result.lines[0][0] == "dataset" and at_once.lines == ()
     assert heard.messages == ["imported 3 sources, 597 rays"]
     import_rays(files, options(output=output, place_name="shop"), heard)
     assert heard.messages[1] == "nothing to import; 3 unchanged"
-    more = write_source(tmp_path / "north.csv", 5, 100)
-    card = import_rays([more], options(output=output, place_name="north"), heard)
+    north = write_source(tmp_path / "north.csv", 5, 100)
+    card = import_rays([north], options(output=output, place_name="north"), heard)
     assert card.summary.rays == 99 and len(RayDataset.open(output)) == 696
     assert [(title, c.summary.rays) for title, c in make_quality_report(output)] == [
         (f"{output}: north", 99),
@@ -256,16 +256,16 @@ def test_what_could_not_be_imported_is_told_in_the_end(parquet, files, tmp_path)
 def test_pseudonyms(parquet, files, tmp_path):
     (tmp_path / "salt").write_bytes(bytes(range(32)))
     salted = {"pseudonyms": True, "salt": tmp_path / "salt"}
-    found = import_rays(files, options(output=tmp_path / "a.rays", **salted))
-    assert found.rays.persons == import_rays(files, RaysImportOptions(settings=settings(), **salted)).rays.persons
+    result = import_rays(files, options(output=tmp_path / "a.rays", **salted))
+    assert result.rays.persons == import_rays(files, RaysImportOptions(settings=settings(), **salted)).rays.persons
     random = import_rays(files, options(output=tmp_path / "b.rays", pseudonyms=True))
-    assert len(random.rays.persons) == 9 and not set(random.rays.persons) & set(found.rays.persons)
+    assert len(random.rays.persons) == 9 and not set(random.rays.persons) & set(result.rays.persons)
     with pytest.raises(NergError, match="random salt"):
         import_rays(files, options(output=tmp_path / "b.rays", pseudonyms=True))
 
 
 @pytest.mark.parametrize(
-    "given, why",
+    "arguments, why",
     [
         ({"place_name": "x"}, "--environment applies to datasets only; use an"),
         ({"day": "2024-01-01", "output": "a.npz"}, "--day applies to datasets only; use an output"),
@@ -273,13 +273,13 @@ def test_pseudonyms(parquet, files, tmp_path):
         ({"align_output": "a.json", "output": "a.rays"}, "--align-output does not apply to datasets,"),
     ],
 )
-def test_options_of_datasets(parquet, given, why):
+def test_options_of_datasets(parquet, arguments, why):
     with pytest.raises(NergError, match=why):
-        RaysImportOptions(**given)
+        RaysImportOptions(**arguments)
 
 
 @pytest.mark.parametrize(
-    "given",
+    "options",
     [
         {"persons": ("p0_0", "p2_1")},
         {"start": DAY + 1, "end": DAY + 2, "with_hit": True},
@@ -288,26 +288,26 @@ def test_options_of_datasets(parquet, given, why):
         {"thin": 0.5, "thin_distance": 9.0, "box": (0, 4, 0, 4, 0, 3)},
     ],
 )
-def test_filters_are_those_of_a_file(parquet, tmp_path, given):
+def test_filters_are_those_of_a_file(parquet, tmp_path, options):
     dataset, rays = write_dataset(tmp_path)
     heard, expected = Recorder(), Recorder()
-    found = filter_rays(dataset.folder, FilterOptions(**given, output=tmp_path / "a.parquet"), heard)
+    result = filter_rays(dataset.folder, FilterOptions(**options, output=tmp_path / "a.parquet"), heard)
     # What is found of a person may depend on the rounding of places.
     rays = dataset.load()
-    whole = filter_rays(rays, FilterOptions(**given), expected)
-    assert_same(found.rays, whole.rays)
-    assert_same(Rays.load(tmp_path / "a.parquet"), whole.rays)
+    in_memory = filter_rays(rays, FilterOptions(**options), expected)
+    assert_same(result.rays, in_memory.rays)
+    assert_same(Rays.load(tmp_path / "a.parquet"), in_memory.rays)
     assert heard.messages.pop() == f"wrote {tmp_path / 'a.parquet'}"
-    assert found.fixations == whole.fixations and sorted(heard.messages) == sorted(
+    assert result.fixations == in_memory.fixations and sorted(heard.messages) == sorted(
         m.replace(": mean rays,", ":") for m in expected.messages
     )
     counts = lambda r: [(s["step"], s["kept"], s["of"]) for s in r.metadata["steps"]]
-    assert counts(found.rays) == counts(whole.rays)
+    assert counts(result.rays) == counts(in_memory.rays)
     # Into another dataset: the same rays.
-    other = filter_rays(dataset.folder, FilterOptions(**given, output=tmp_path / "b.rays"))
-    assert other.rays is None and other.fixations == whole.fixations
-    assert_same(load_rays(tmp_path / "b.rays"), whole.rays)
-    assert counts(load_rays(tmp_path / "b.rays")) == counts(whole.rays)
+    other = filter_rays(dataset.folder, FilterOptions(**options, output=tmp_path / "b.rays"))
+    assert other.rays is None and other.fixations == in_memory.fixations
+    assert_same(load_rays(tmp_path / "b.rays"), in_memory.rays)
+    assert counts(load_rays(tmp_path / "b.rays")) == counts(in_memory.rays)
     with pytest.raises(NergError, match="was filtered from another"):
         import_rays([tmp_path / "files" / "0.csv"], options(output=tmp_path / "b.rays"))
 
@@ -356,22 +356,26 @@ def crowded(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize("most", [10_000, 2500])
-def test_training_and_scores_are_of_the_same_rays(parquet, crowded, tmp_path, most):
+@pytest.mark.parametrize("max_samples", [10_000, 2500])
+def test_training_and_scores_are_of_the_same_rays(parquet, crowded, tmp_path, max_samples):
     heard, gaze = Recorder(), tmp_path / "gaze.safetensors"
-    trained = train_gaze(crowded, gaze, replace(TRAINING, max_samples=most, seed=3), heard)
-    about = trained.provenance["rays_file"]
-    count = min(most, 3000)
-    assert about["file"] == "corridor.rays" and (about["rays"], about["most"], about["seed"]) == (count, most, 3)
+    trained = train_gaze(crowded, gaze, replace(TRAINING, max_samples=max_samples, seed=3), heard)
+    metadata = trained.provenance["rays_file"]
+    count = min(max_samples, 3000)
+    assert metadata["file"] == "corridor.rays" and (metadata["rays"], metadata["most"], metadata["seed"]) == (
+        count,
+        max_samples,
+        3,
+    )
     assert trained.provenance["test"]["rays"] == count and f"{count:,} rays of {crowded}" in heard.messages
-    found = evaluate_gaze(gaze, crowded, options=OPTIONS)
+    result = evaluate_gaze(gaze, crowded, options=OPTIONS)
     # As of the rays themselves.
-    rays = load_rays(crowded, most, 3)
+    rays = load_rays(crowded, max_samples, 3)
     alone = train_gaze(rays, tmp_path / "alone.safetensors", replace(TRAINING, seed=3))
     assert alone.provenance["test"] == trained.provenance["test"]
     # Two threads add up a gradient in an order of their own, so that two fits agree to rounding alone.
     scored = evaluate_gaze(tmp_path / "alone.safetensors", rays, options=OPTIONS)
-    assert [row["KLD"] for row in scored.rows] == pytest.approx([row["KLD"] for row in found.rows], rel=1e-6)
+    assert [row["KLD"] for row in scored.rows] == pytest.approx([row["KLD"] for row in result.rows], rel=1e-6)
 
 
 def test_another_dataset_is_not_scored(parquet, crowded, tmp_path):

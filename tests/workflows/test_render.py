@@ -73,16 +73,16 @@ def scene_overlays(tmp_path_factory):
 
 
 def test_a_quantity_that_the_scene_does_not_name(rgb, scene_overlays, tmp_path):
-    told = Recorder()
-    made = render_file(scene_overlays, tmp_path / "a.png", PictureOptions(overlay="gaze", mode=MODE), told)
+    recorder = Recorder()
+    made = render_file(scene_overlays, tmp_path / "a.png", PictureOptions(overlay="gaze", mode=MODE), recorder)
     loaded = load_scene(scene_overlays)
-    found = render_aovs(scene_overlays, loaded, loaded.sensors()[0], ["gaze", "opacity"])
-    assert made.vmax == pytest.approx(robust_max(found.aovs["gaze"], found.mask)) and made.files == (
+    rendered = render_aovs(scene_overlays, loaded, loaded.sensors()[0], ["gaze", "opacity"])
+    assert made.vmax == pytest.approx(robust_max(rendered.aovs["gaze"], rendered.mask)) and made.files == (
         tmp_path / "a.png",
     )
     # The picture, pixel for pixel, and the scale beside it.
     width, height = mitsuba_bitmap(made.path).size()
-    assert width > 18 + 60 and height > 12 and f"scale up to {made.vmax:.4g}" in told.messages[0]
+    assert width > 18 + 60 and height > 12 and f"scale up to {made.vmax:.4g}" in recorder.messages[0]
     fixed = render_file(scene_overlays, tmp_path / "b.png", PictureOptions(overlay="gaze", vmax=9.0, mode=MODE))
     assert fixed.vmax == 9.0 and (tmp_path / "b.png").read_bytes() != (tmp_path / "a.png").read_bytes()
 
@@ -108,39 +108,39 @@ def test_a_sequence_has_one_scale(rgb, scene_overlays, tmp_path):
 
 
 def test_a_sequence_without_an_overlay(rgb, scene_overlays, tmp_path):
-    told = Recorder()
+    recorder = Recorder()
     options = PictureOptions(frames=scene_overlays.with_name("walk.csv"), mode=MODE)
-    made = render_file(scene_overlays, tmp_path / "walk.exr", options, told)
+    made = render_file(scene_overlays, tmp_path / "walk.exr", options, recorder)
     alone = render_file(scene_overlays, tmp_path / "one.exr", PictureOptions(mode=MODE))
     first, other = (np.array(mitsuba_bitmap(p)) for p in (made.files[0], alone.path))
     np.testing.assert_array_equal(first, other)
-    shares = [share for share, _ in told.steps]
-    assert shares == sorted(shares) and shares[-1] == 1 and "2 images" in told.messages[0]
+    shares = [share for share, _ in recorder.steps]
+    assert shares == sorted(shares) and shares[-1] == 1 and "2 images" in recorder.messages[0]
 
 
 def decoded(av, path):
-    with av.open(str(path)) as found:
-        frames = [f.reformat(format="rgb24", src_colorspace="ITU709").to_ndarray() for f in found.decode(video=0)]
-        return found.metadata, float(found.streams.video[0].average_rate), frames
+    with av.open(str(path)) as container:
+        frames = [f.reformat(format="rgb24", src_colorspace="ITU709").to_ndarray() for f in container.decode(video=0)]
+        return container.metadata, float(container.streams.video[0].average_rate), frames
 
 
 @pytest.mark.parametrize("top", [None, 3.0])
 def test_a_video_has_the_pictures_of_the_sequence(rgb, scene_overlays, tmp_path, top, monkeypatch):
     av = pytest.importorskip("av", reason='PyAV is not installed (pip install "nerg-mi[video]")')
-    kept = []
-    monkeypatch.setattr(render, "write_bytes", lambda path, *parts: kept.append(path) or write_bytes(path, *parts))
+    written = []
+    monkeypatch.setattr(render, "write_bytes", lambda path, *parts: written.append(path) or write_bytes(path, *parts))
     options = PictureOptions(overlay="gaze", frames=scene_overlays.with_name("walk.csv"), vmax=top, mode=MODE)
     render_file(scene_overlays, tmp_path / "walk.png", options)
     # With a scale that is given no picture waits for the others.
-    assert len(kept) == (0 if top else 2)
+    assert len(written) == (0 if top else 2)
     made = render_file(scene_overlays, tmp_path / "walk.mp4", replace(options, fps=5.0))
     metadata, rate, frames = decoded(av, made.path)
     assert made.files == (tmp_path / "walk.mp4",) and rate == 5 and len(frames) == 2
     for k, frame in enumerate(frames):
         picture = np.array(mitsuba_bitmap(tmp_path / f"walk_000{k + 1}.png").convert(rgb.Bitmap.PixelFormat.RGB))
         assert frame.shape == picture.shape and np.abs(frame.astype(int) - picture).mean() < 3
-    about = json.loads(metadata["comment"])
-    assert about["settings"]["fps"] == 5.0 and set(about["inputs"]) == {
+    comment = json.loads(metadata["comment"])
+    assert comment["settings"]["fps"] == 5.0 and set(comment["inputs"]) == {
         "scene.xml",
         "walk.csv",
         "field.safetensors",
@@ -164,11 +164,11 @@ def test_each_picture_of_a_sequence_says_its_own_values(rgb, scene_overlays, tmp
     made = render_file(
         scene_overlays, tmp_path / "walk.png", PictureOptions(frames=scene_overlays.with_name("walk.csv"), mode=MODE)
     )
-    eyes = []
+    positions = []
     for path in made.files:
-        with image.open(path) as found:
-            eyes.append(json.loads(found.text["Comment"])["settings"]["defaults"]["eye"])
-    assert eyes == ["0.2, 0.1, -2.5", "-1.5, 0.4, -2"]
+        with image.open(path) as stored:
+            positions.append(json.loads(stored.text["Comment"])["settings"]["defaults"]["eye"])
+    assert positions == ["0.2, 0.1, -2.5", "-1.5, 0.4, -2"]
 
 
 def test_hatched_where_no_surface_is(rgb, scene_overlays, tmp_path):
@@ -185,12 +185,12 @@ def test_hatched_where_no_surface_is(rgb, scene_overlays, tmp_path):
     differ = np.any(a != b, axis=-1)[:, : 10 + 9 * 18]
     rows, columns = np.nonzero(differ)
     shown = differ[rows.min() :, 10:]
-    found = np.zeros(mask.shape, bool)
+    hatched = np.zeros(mask.shape, bool)
     first = int(np.flatnonzero((~mask).any(axis=1))[0])
     for y in range(first, mask.shape[0]):
         for x in range(mask.shape[1]):
-            found[y, x] = shown[9 * (y - first) : 9 * (y - first) + 9, 9 * x : 9 * x + 9].mean() > 0.5
-    np.testing.assert_array_equal(found, ~mask)
+            hatched[y, x] = shown[9 * (y - first) : 9 * (y - first) + 9, 9 * x : 9 * x + 9].mean() > 0.5
+    np.testing.assert_array_equal(hatched, ~mask)
 
 
 def test_ctrl_c_leaves_whole_pictures(rgb, scene_overlays, tmp_path):
@@ -246,14 +246,14 @@ def scene_pictures(tmp_path):
 
 
 def test_the_result_is_what_was_written(scene_pictures, tmp_path):
-    told = Recorder()
+    recorder = Recorder()
     options = PicturesPictureOptions(defaults={"level": "0.5"}, sensor=0, spp=2, mode="llvm_ad_rgb")
-    result = render_file(scene_pictures, tmp_path / "new" / "a.exr", options, told)
+    result = render_file(scene_pictures, tmp_path / "new" / "a.exr", options, recorder)
     bitmap = mitsuba_bitmap(result.path)
     assert tuple(bitmap.size()) == result.size == (16, 8) and bitmap.channel_count() == result.channels
     assert result.mode == "llvm_ad_rgb" and result.undivided_reason is None
-    assert told.steps[-1][0] == 1 and "samples/s" in told.steps[-1][1]
-    (line,) = told.messages
+    assert recorder.steps[-1][0] == 1 and "samples/s" in recorder.steps[-1][1]
+    (line,) = recorder.messages
     assert line.startswith(f"Wrote {result.path} (16 x 8, {result.channels} channels, llvm_ad_rgb")
 
 
@@ -316,9 +316,9 @@ def files(folder):
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
-def film_of(scene, folder, name, told=None, **options):
-    given = {"frames": scene.parent / "frames.csv", "mode": "llvm_ad_rgb", "seed": 3} | options
-    return render_film(scene, scene.parent / folder / name, FilmOptions(**given), told or Recorder())
+def film_of(scene, folder, name, reporter=None, **options):
+    settings = {"frames": scene.parent / "frames.csv", "mode": "llvm_ad_rgb", "seed": 3} | options
+    return render_film(scene, scene.parent / folder / name, FilmOptions(**settings), reporter or Recorder())
 
 
 @pytest.mark.parametrize(
@@ -335,22 +335,22 @@ def film_of(scene, folder, name, told=None, **options):
 def test_parts_give_the_bytes_of_one_go(scene, name, overlay):
     if name.endswith("mp4"):
         pytest.importorskip("av")
-    whole = film_of(scene, "whole", name, **overlay)
+    expected = film_of(scene, "whole", name, **overlay)
     parts = film_of(scene, "parts", name, store=scene.parent / "store", **overlay)
-    found = files(scene.parent / "parts")
-    assert found == files(scene.parent / "whole") and found
-    assert (parts.size, parts.vmax, len(parts.files)) == (whole.size, whole.vmax, len(whole.files))
+    part_files = files(scene.parent / "parts")
+    assert part_files == files(scene.parent / "whole") and part_files
+    assert (parts.size, parts.vmax, len(parts.files)) == (expected.size, expected.vmax, len(expected.files))
 
 
 def test_pictures_that_are_kept_are_not_rendered_again(scene, monkeypatch):
     store, rendered = scene.parent / "store", []
     original = render.render_file
-    monkeypatch.setattr(render, "render_file", lambda *given: rendered.append(given) or original(*given))
+    monkeypatch.setattr(render, "render_file", lambda *args: rendered.append(args) or original(*args))
     film_of(scene, "one", "a.png", store=store)
-    told = Recorder()
-    film_of(scene, "two", "a.png", told, store=store)
+    recorder = Recorder()
+    film_of(scene, "two", "a.png", recorder, store=store)
     assert len(rendered) == 3 and files(scene.parent / "one") == files(scene.parent / "two")
-    assert told.steps[-1] == (1.0, "3 of 3 parts") and "parts are stored in" in told.messages[-1]
+    assert recorder.steps[-1] == (1.0, "3 of 3 parts") and "parts are stored in" in recorder.messages[-1]
     # One picture's values change: that one is rendered, and the video of the pictures takes all from the store.
     (scene.parent / "frames.csv").write_text("level\n0.25\n0.6\n0.75\n")
     film_of(scene, "three", "a.png", store=store)
@@ -370,9 +370,9 @@ def test_ctrl_c_says_where_it_goes_on_from(scene):
 
     with pytest.raises(KeyboardInterrupt, match=r"Interrupted; finished parts are stored in"):
         film_of(scene, "out", "a.png", Impatient(), scheduler="local")
-    told = Recorder()
-    film_of(scene, "out", "a.png", told, scheduler="local")
-    assert ("1 of 3 parts" in text for _, text in told.steps) and told.steps[1][1] == "1 of 3 parts"
+    recorder = Recorder()
+    film_of(scene, "out", "a.png", recorder, scheduler="local")
+    assert ("1 of 3 parts" in text for _, text in recorder.steps) and recorder.steps[1][1] == "1 of 3 parts"
 
 
 def test_files_of_the_scene_are_the_same_wherever_it_lies(scene, tmp_path):
@@ -383,9 +383,9 @@ def test_files_of_the_scene_are_the_same_wherever_it_lies(scene, tmp_path):
     moved, store = tmp_path / "moved" / "scene.xml", tmp_path / "store"
     first = film_of(moved, "out", "a.png", store=store)
     os.rename(tmp_path / "moved", tmp_path / "again")
-    told = Recorder()
-    second = film_of(tmp_path / "again" / "scene.xml", "out", "a.png", told, store=store)
-    assert (0.0, "3 of 3 parts") in told.steps or (1.0, "3 of 3 parts") in told.steps
+    recorder = Recorder()
+    second = film_of(tmp_path / "again" / "scene.xml", "out", "a.png", recorder, store=store)
+    assert (0.0, "3 of 3 parts") in recorder.steps or (1.0, "3 of 3 parts") in recorder.steps
     assert first.files[0].name == second.files[0].name
 
 
@@ -413,19 +413,19 @@ def test_options_that_contradict_are_told_before_any_work(scene, tmp_path):
 
 
 def test_the_store_is_beside_the_output_unless_it_is_named(tmp_path):
-    beside = PartRunner(PartOptions(scheduler="local:2"), tmp_path / "walk.mp4", Recorder())
-    assert beside.store.folder == tmp_path / "walk.tasks" and isinstance(beside.engine, ProcessEngine)
+    runner = PartRunner(PartOptions(scheduler="local:2"), tmp_path / "walk.mp4", Recorder())
+    assert runner.store.folder == tmp_path / "walk.tasks" and isinstance(runner.engine, ProcessEngine)
     named = PartRunner(PartOptions(store=tmp_path / "s"), tmp_path / "walk.mp4", Recorder())
     assert named.store.folder == tmp_path / "s"
 
 
 def test_progress_of_a_share_of_the_job(tmp_path):
-    told = Recorder()
-    parts = PartRunner(PartOptions(store=tmp_path / "s"), tmp_path / "a", told)
+    recorder = Recorder()
+    parts = PartRunner(PartOptions(store=tmp_path / "s"), tmp_path / "a", recorder)
     assert len(list(parts.run(works.make_plan(2), 0.0, 0.8))) == 2
     assert len(list(parts.run(works.make_small_plan(*"abcd"), 0.8))) == 4
-    assert [round(share, 2) for share, _ in told.steps] == [0.0, 0.4, 0.8, 0.8, 0.85, 0.9, 0.95, 1.0]
-    texts = [text for _, text in told.steps]
+    assert [round(share, 2) for share, _ in recorder.steps] == [0.0, 0.4, 0.8, 0.8, 0.85, 0.9, 0.95, 1.0]
+    texts = [text for _, text in recorder.steps]
     assert all(" left" not in text for text in texts[:3]) and texts[0] == "0 of 2 parts"
     assert texts[-1].startswith("4 of 4 parts") and texts[-1].endswith("0 s left")
 
@@ -447,13 +447,13 @@ def test_a_scene_that_reads_another_file_than_was_planned_is_refused(tmp_path):
     scene.write_text(f'<scene version="3.0.0"><include filename="{tmp_path / "more.xml"}"/></scene>')
     planned = PlannedScene.plan(scene)
     assert planned.checked_path() == scene and len(planned.files.members) == 2
-    there = works.lay_out(planned, tmp_path / "worker")
+    copied = works.lay_out(planned, tmp_path / "worker")
     with pytest.raises(NergError, match="is not the file that the job was planned with"):
-        make_picture(PictureOptions(), there, tmp_path / "a.png")
+        make_picture(PictureOptions(), copied, tmp_path / "a.png")
     scene.write_text('<scene version="3.0.0"><include filename="more.xml"/></scene>')
-    there = works.lay_out(PlannedScene.plan(scene), tmp_path / "relative")
+    copied = works.lay_out(PlannedScene.plan(scene), tmp_path / "relative")
     shutil.move(tmp_path / "more.xml", tmp_path / "gone.xml")
-    assert there.checked_path().read_text() == scene.read_text() and there.checked_path() != scene
+    assert copied.checked_path().read_text() == scene.read_text() and copied.checked_path() != scene
 
 
 # ---- What is said of a store ----
@@ -467,17 +467,17 @@ def test_lines_and_removal(tmp_path):
     arriving.close()
     list(run_plan(works.make_plan(2, (tmp_path / "a",), what="another"), store, LocalEngine()))
     (tmp_path / "a").write_text("after")
-    told = Recorder()
-    account = account_for_store(store.folder, reporter=told)
-    lines = told.messages[0].splitlines()
+    recorder = Recorder()
+    account = account_for_store(store.folder, reporter=recorder)
+    lines = recorder.messages[0].splitlines()
     assert lines[2].startswith("| another | 2 | 2 | 0 | 130 bytes | 0 s | 2 |")
     assert lines[3].startswith("| nerg render walk.mp4 | 5 | 2 | 3 | 130 bytes |")
-    assert told.messages[1] == f"changed since another: {tmp_path / 'a'}"
-    assert told.messages[2].startswith("260 bytes in total; stale: 2 outputs, 130 bytes;")
-    assert "--remove-stale" in told.messages[3] and len(account.stale) == 2
-    told = Recorder()
-    account_for_store(store.folder, True, told)
-    assert told.messages[-1] == "Removed 130 bytes." and len(list(store.iter_manifests())) == 2
+    assert recorder.messages[1] == f"changed since another: {tmp_path / 'a'}"
+    assert recorder.messages[2].startswith("260 bytes in total; stale: 2 outputs, 130 bytes;")
+    assert "--remove-stale" in recorder.messages[3] and len(account.stale) == 2
+    recorder = Recorder()
+    account_for_store(store.folder, True, recorder)
+    assert recorder.messages[-1] == "Removed 130 bytes." and len(list(store.iter_manifests())) == 2
 
 
 def test_a_folder_that_is_not_there(tmp_path):

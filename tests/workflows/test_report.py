@@ -56,9 +56,9 @@ def run(trained, tmp_path_factory):
     shutil.copytree(trained, folder)
     rows = scored((0.9, 0.85, 0.3), reach=0.02)
     persons = [{"method": "gaze field", "person": "Ada", "rays": 9, "bits": 0.1}]
-    about = {"gaze": "gaze.safetensors", "split": "both", "kappa": 20.0, "positions": 60, "people": 30}
+    metadata = {"gaze": "gaze.safetensors", "split": "both", "kappa": 20.0, "positions": 60, "people": 30}
     (folder / "gaze.eval").mkdir()
-    write_report(folder / "gaze.eval", rows, persons, about, "# notes")
+    write_report(folder / "gaze.eval", rows, persons, metadata, "# notes")
     wall = {"the wall": [[1.2, -0.5, 0.0], [1.8, 0.5, 2.2]], "nothing there": [[-9, -9, -9], [-8, -8, -8]]}
     (folder / "objects.json").write_text(json.dumps(wall))
     return folder
@@ -71,34 +71,39 @@ def without_3d(monkeypatch):
 
 
 def test_everything_of_a_folder(run, tmp_path):
-    told = Recorder()
+    recorder = Recorder()
     options = replace(SMALL, aois=run / "objects.json")
-    result = make_report([run], tmp_path / "a.html", options, told)
+    result = make_report([run], tmp_path / "a.html", options, recorder)
     text = result.path.read_text(encoding="utf-8")
-    assert told.messages[0] == "Better than nearest rays, the strongest baseline, for new people at new places." in text
-    assert told.messages[-1].startswith(f"wrote {tmp_path / 'a.html'} (") and len(text) < 6_000_000
-    found = result.run
-    assert {"color", "own", "sphere", "plan", "layout"} <= set(found.pictures)
-    assert {role for role, *_ in found.inputs} == {"gaze field", "hit points", "rays", "evaluation", "objects"}
-    wall, nothing = found.objects
+    assert (
+        recorder.messages[0]
+        == "Better than nearest rays, the strongest baseline, for new people at new places."
+        in text
+    )
+    assert recorder.messages[-1].startswith(f"wrote {tmp_path / 'a.html'} (") and len(text) < 6_000_000
+    contents = result.run
+    assert {"color", "own", "sphere", "plan", "layout"} <= set(contents.pictures)
+    assert {role for role, *_ in contents.inputs} == {"gaze field", "hit points", "rays", "evaluation", "objects"}
+    wall, unseen = contents.objects
     assert wall.recorded.mean > 0.5 and wall.num_could_see == wall.num_participants == 4 and wall.predicted.mean > 0
-    assert nothing.predicted.mean == 0 and nothing.num_could_see == nothing.num_looked == 0
+    assert unseen.predicted.mean == 0 and unseen.num_could_see == unseen.num_looked == 0
     scene = packed_scene(text)
     assert (
         100 < scene["count"] <= 600
         and len(scene["observers"]) == 6
-        and found.nearby_participants
-        and min(found.nearby_participants) >= 1
+        and contents.nearby_participants
+        and min(contents.nearby_participants) >= 1
     )
     # Nobody's name, neither of rays nor of evaluations.
     assert not any(name in text for name in NAMES) and "participant 1" in text
     # How many rays of how many people the gaze rests on, and what all of it was made of.
     assert (
-        re.fullmatch(r"made of [\d,]+ rays of [1-4] people", found.support_note) and text.count(found.support_note) >= 2
+        re.fullmatch(r"made of [\d,]+ rays of [1-4] people", contents.support_note)
+        and text.count(contents.support_note) >= 2
     )
-    made = json.loads(found.provenance_json)
-    assert made["what"] == "nerg report" and set(made["inputs"].values()) == {digest for *_, digest in found.inputs}
-    assert found.provenance_json.encode("latin-1") in found.pictures["own"].png and 'name="provenance"' in text
+    made = json.loads(contents.provenance_json)
+    assert made["what"] == "nerg report" and set(made["inputs"].values()) == {digest for *_, digest in contents.inputs}
+    assert contents.provenance_json.encode("latin-1") in contents.pictures["own"].png and 'name="provenance"' in text
 
 
 @pytest.mark.nightly
@@ -116,8 +121,8 @@ def test_names_where_they_are_asked_for(run, tmp_path):
 
 
 def test_a_gaze_field_alone(run, tmp_path):
-    told = Recorder()
-    result = make_report([run / "gaze.safetensors"], tmp_path / "a.html", SMALL, told)
+    recorder = Recorder()
+    result = make_report([run / "gaze.safetensors"], tmp_path / "a.html", SMALL, recorder)
     text = result.path.read_text(encoding="utf-8")
     for sentence in (
         "No evaluation was given",
@@ -126,42 +131,42 @@ def test_a_gaze_field_alone(run, tmp_path):
         "No AOIs were given. Name a file of AOIs with --aois FILE.json.",
     ):
         assert sentence in text
-    assert "no evaluation is at hand" in told.messages[0] and packed_scene(text)["marks"] == 1
+    assert "no evaluation is at hand" in recorder.messages[0] and packed_scene(text)["marks"] == 1
     assert result.run.rays is None and result.run.results == ()
 
 
 def test_objects_without_rays(without_3d, run, tmp_path):
     options = replace(SMALL, aois=run / "objects.json", observer=(-0.5, 0.0, 1.6))
-    found = make_report([run / "gaze.safetensors"], tmp_path / "a.html", options).run
-    assert found.objects[0].recorded is None and 0 < found.objects[0].predicted.mean < 1
-    assert "where it was asked for, at (-0.50, 0.00, 1.60)" in found.observer
+    contents = make_report([run / "gaze.safetensors"], tmp_path / "a.html", options).run
+    assert contents.objects[0].recorded is None and 0 < contents.objects[0].predicted.mean < 1
+    assert "where it was asked for, at (-0.50, 0.00, 1.60)" in contents.observer
 
 
 def test_evaluations_are_made(without_3d, run, tmp_path, monkeypatch):
     from nerg_mi.workflows import report
 
-    asked = []
+    splits = []
     evaluate = report.evaluate_gaze
 
     def quick(gaze, rays, output, job, reporter):
-        asked.append(job.split)
+        splits.append(job.split)
         return evaluate(gaze, rays, output, replace(job, directions=64, resamples=2, min_rays=8), reporter)
 
     monkeypatch.setattr(report, "evaluate_gaze", quick)
     files = [run / "gaze.safetensors", run / "rays.npz"]
-    found = make_report(files, tmp_path / "a.html", replace(SMALL, evaluate=True)).run
-    assert asked == ["pos"] and found.results[0].rows[0]["method"] == "gaze field"
-    assert found.verdicts[0][1].grade == "none"  # of three positions
+    contents = make_report(files, tmp_path / "a.html", replace(SMALL, evaluate=True)).run
+    assert splits == ["pos"] and contents.results[0].rows[0]["method"] == "gaze field"
+    assert contents.verdicts[0][1].grade == "none"  # of three positions
     with pytest.raises(NergError, match="--evaluate"):
         make_report(files[:1], tmp_path / "a.html", replace(SMALL, evaluate=True))
 
 
 def test_evaluations_of_others_are_refused_or_doubted(without_3d, run, tmp_path):
     def evaluation(**changes):
-        about = {"gaze": "gaze.safetensors", "split": "pos", "kappa": 20.0, "positions": 60, "people": 30}
+        metadata = {"gaze": "gaze.safetensors", "split": "pos", "kappa": 20.0, "positions": 60, "people": 30}
         folder = tmp_path / f"e{len(list(tmp_path.iterdir()))}"
         folder.mkdir()
-        write_report(folder, scored((0.9, 0.85, 0.3)), [], {**about, **changes}, "# notes")
+        write_report(folder, scored((0.9, 0.85, 0.3)), [], {**metadata, **changes}, "# notes")
         return folder
 
     gaze = run / "gaze.safetensors"
@@ -169,8 +174,8 @@ def test_evaluations_of_others_are_refused_or_doubted(without_3d, run, tmp_path)
         make_report([gaze, evaluation(gaze_sha256="ab")], tmp_path / "a.html", SMALL)
     with pytest.raises(NergError, match='"pos"'):
         make_report([gaze, evaluation(), evaluation()], tmp_path / "a.html", SMALL)
-    found = make_report([gaze, evaluation(gaze="other.safetensors")], tmp_path / "a.html", SMALL).run
-    assert "a field called other.safetensors" in found.warnings[0]
+    contents = make_report([gaze, evaluation(gaze="other.safetensors")], tmp_path / "a.html", SMALL).run
+    assert "a field called other.safetensors" in contents.warnings[0]
 
 
 def test_without_a_place(tmp_path):
@@ -189,12 +194,12 @@ def test_without_a_place(tmp_path):
 def test_pictures_that_are_there_are_not_rendered_again(run, tmp_path, monkeypatch):
     first, rendered = report.render_channels, {}
 
-    def kept(scene, sensor, *rest):
+    def count_rendering(scene, sensor, *rest):
         made = first(scene, sensor, *rest)
         rendered[report.VIEWS[len(rendered)]] = made
         return made
 
-    monkeypatch.setattr(report, "render_channels", kept)
+    monkeypatch.setattr(report, "render_channels", count_rendering)
     one = make_report([run / "gaze.safetensors"], tmp_path / "a.html", SMALL).path.read_bytes()
     assert set(rendered) == set(report.VIEWS)
 
@@ -237,11 +242,11 @@ def folder(standins, tmp_path_factory):
 
 def test_in_any_order_and_in_folders(folder):
     files = [folder / n for n in ("shoppers.safetensors", "store.safetensors", "rays.npz", "gaze.eval")]
-    for given in (files, files[::-1], [folder], [*files[:2], files[2], files[3] / "gaze.json"]):
-        found = sort_files(given)
-        assert found.gaze == files[0] and found.scene.place == files[1] and found.rays == files[2]
-        assert found.results == (files[3] / "gaze.json",) and found.scene.kind == "field"
-        assert found.shown == [files[1], files[0]]
+    for paths in (files, files[::-1], [folder], [*files[:2], files[2], files[3] / "gaze.json"]):
+        sorted_files = sort_files(paths)
+        assert sorted_files.gaze == files[0] and sorted_files.scene.place == files[1] and sorted_files.rays == files[2]
+        assert sorted_files.results == (files[3] / "gaze.json",) and sorted_files.scene.kind == "field"
+        assert sorted_files.shown == [files[1], files[0]]
 
 
 def test_inputs_have_their_checksums(folder):
@@ -252,8 +257,8 @@ def test_inputs_have_their_checksums(folder):
 
 def test_splats_are_called_so(folder, tmp_path):
     write_inria(tmp_path / "place.ply", random_splats(5))
-    found = sort_files([folder / "shoppers.safetensors", tmp_path / "place.ply"])
-    assert found.inputs()[1][0] == "splats" and describe_scene(found) == "Gaussian splats, place.ply."
+    sorted_files = sort_files([folder / "shoppers.safetensors", tmp_path / "place.ply"])
+    assert sorted_files.inputs()[1][0] == "splats" and describe_scene(sorted_files) == "Gaussian splats, place.ply."
     assert describe_scene(sort_files([folder])).startswith("A radiance field")
 
 
@@ -265,12 +270,12 @@ def test_what_makes_no_report(folder, tmp_path):
         ([folder / "rays.npz"], "there is none among these files; name its checkpoint"),
         ([folder / "nowhere"], "there is no file or folder"),
         ([empty], "contains no checkpoint, rays or evaluation"),
-        ([folder, tmp_path / "again.safetensors"], "again.safetensors"),
+        ([folder, tmp_path / "again.safetensors"], "are both a gaze, and a report takes one"),
         ([folder, folder / "notes.txt"], "is none of these"),
     ]
-    for given, why in cases:
+    for paths, why in cases:
         with pytest.raises(NergError, match=why):
-            sort_files(given)
+            sort_files(paths)
 
 
 def test_what_is_named_twice_is_one(folder):
@@ -288,15 +293,15 @@ def view(gaze, **aovs):
     return SimpleNamespace(color=np.full((32, 48, 3), 0.3), aovs={"gaze": gaze, **aovs}, mask=mask)
 
 
-def three(own=0.5):
-    return {"camera": view(0.2), "own": view(own), "sphere": view(0.1)}
+def three(observer_value=0.5):
+    return {"camera": view(0.2), "own": view(observer_value), "sphere": view(0.1)}
 
 
-def drawn(seen, top=0.5, known=True, **about):
-    return draw_views(RenderedViews(seen, **about), top, known, ABOUT)
+def drawn(seen, top=0.5, has_geometry=True, **fields):
+    return draw_views(RenderedViews(seen, **fields), top, has_geometry, PROVENANCE)
 
 
-ABOUT = make_provenance("nerg report", seed=7, settings={"width": 48})
+PROVENANCE = make_provenance("nerg report", seed=7, settings={"width": 48})
 
 
 def test_one_scale_for_all():
@@ -308,7 +313,7 @@ def test_one_scale_for_all():
 
 def test_which_pictures_there_are():
     assert set(drawn(three())) == {"color", "gaze", "own", "sphere"}
-    assert set(drawn(three(), known=False)) == {"own", "sphere"}
+    assert set(drawn(three(), has_geometry=False)) == {"own", "sphere"}
     assert set(drawn(three(), None)) == {"color"}
     spread = {**three(), "camera": view(0.2, gaze_std=np.full((32, 48), 0.05))}
     assert "spread" in drawn(spread, marker=(3.0, 4.0))
@@ -322,10 +327,10 @@ def test_they_are_png_files_with_words_and_the_same_again():
 
 
 def test_each_says_in_its_header_what_it_was_made_of():
-    every = drawn(three()) | draw_rays(crowd(300), None, ABOUT)
+    every = drawn(three()) | draw_rays(crowd(300), None, PROVENANCE)
     assert set(every) == {"color", "gaze", "own", "sphere", "plan", "layout"}
     for name, picture in every.items():
-        assert ABOUT.json().encode("latin-1") in picture.png, name
+        assert PROVENANCE.json().encode("latin-1") in picture.png, name
 
 
 def hatched(pictures, name):
@@ -352,23 +357,23 @@ def test_what_is_not_known_is_hatched(name):
     every = {k: view(0.3) for k in ("camera", "own", "sphere")}
     for seen in every.values():
         seen.color[...] = (0.6, 0.1, 0.1)
-    known, alone = (hatched(drawn(every, supported=s), name) for s in (True, False))
-    assert alone > 1.5 * known > 0
+    supported, alone = (hatched(drawn(every, supported=s), name) for s in (True, False))
+    assert alone > 1.5 * supported > 0
 
 
 def test_the_rays_that_it_rests_on_are_named():
-    plain, told = (drawn(three(), basis=b) for b in ("", "made of 300 rays of 3 people"))
+    plain, with_basis = (drawn(three(), basis=b) for b in ("", "made of 300 rays of 3 people"))
     for name in ("gaze", "own", "sphere"):
-        a, b = (pixels(p[name].png) for p in (plain, told))
+        a, b = (pixels(p[name].png) for p in (plain, with_basis))
         # A line more, below the picture.
         assert b.shape[0] > a.shape[0] and b.shape[1] == a.shape[1]
         assert (b[-16:] < 128).any() and b[-16:].shape == (16, *b.shape[1:])
 
 
 def test_plans():
-    found = draw_rays(crowd(300), {"centres": [[-0.5, 0, 1.6]], "radius": 0.5}, ABOUT)
-    assert set(found) == {"plan", "layout"} and "held-out" in found["layout"].caption
-    assert "held-out" not in draw_rays(crowd(300), None, ABOUT)["layout"].caption
+    plans = draw_rays(crowd(300), {"centres": [[-0.5, 0, 1.6]], "radius": 0.5}, PROVENANCE)
+    assert set(plans) == {"plan", "layout"} and "held-out" in plans["layout"].caption
+    assert "held-out" not in draw_rays(crowd(300), None, PROVENANCE)["layout"].caption
 
 
 # ---- Where a report looks from, and the paths that it draws ----
@@ -403,30 +408,30 @@ def walkers(count=4, n=400):
 
 
 def test_free_places_are_in_the_room_and_not_in_the_block():
-    found = find_free_positions(
+    positions = find_free_positions(
         Walls(), (np.zeros(3), np.array([8.0, 6, 3])), np.array([0.0, 0, 1]), np.array([1.0, 1, 1.6])
     )
-    assert len(found) > 30 and (found[:, 2] == 1.6).all()
-    inside = ((found[:, :2] > [2.9, 1.9]) & (found[:, :2] < [5.1, 4.1])).all(axis=1)
-    assert not inside.any() and (found > 0.1).all() and (found[:, 0] < 7.9).all()
+    assert len(positions) > 30 and (positions[:, 2] == 1.6).all()
+    inside = ((positions[:, :2] > [2.9, 1.9]) & (positions[:, :2] < [5.1, 4.1])).all(axis=1)
+    assert not inside.any() and (positions > 0.1).all() and (positions[:, 0] < 7.9).all()
 
 
 def test_panoramas_begin_with_the_observer():
     standing = np.stack([np.linspace(0, 8, 50), np.zeros(50), np.full(50, 1.6)], axis=1)
-    eyes = panorama_positions(standing, np.array([4.0, 0, 1.6]), 3)
-    assert np.allclose(eyes, [[4, 0, 1.6], [0, 0, 1.6], [8, 0, 1.6]]) or np.allclose(
-        eyes, [[4, 0, 1.6], [8, 0, 1.6], [0, 0, 1.6]]
+    positions = panorama_positions(standing, np.array([4.0, 0, 1.6]), 3)
+    assert np.allclose(positions, [[4, 0, 1.6], [0, 0, 1.6], [8, 0, 1.6]]) or np.allclose(
+        positions, [[4, 0, 1.6], [8, 0, 1.6], [0, 0, 1.6]]
     )
     assert len(panorama_positions(standing[:0], np.zeros(3))) == 1
 
 
 def test_company_counts_people_and_not_rays():
     rays = walkers()
-    eyes = np.array([[2.0, 1.0, 1.6], [2.0, 1.5, 1.6], [2.0, 9.0, 1.6]])
-    assert count_participants_near(rays, eyes, PLACE, 0.55) == (1, 2, 0)
+    positions = np.array([[2.0, 1.0, 1.6], [2.0, 1.5, 1.6], [2.0, 9.0, 1.6]])
+    assert count_participants_near(rays, positions, PLACE, 0.55) == (1, 2, 0)
     # In a place of other units the radius is still in metres.
     scaled = replace(PLACE, align=Similarity(np.diag([0.1, 0.1, 0.1, 1.0])))
-    assert count_participants_near(rays, 0.1 * eyes, scaled, 0.55) == (1, 2, 0)
+    assert count_participants_near(rays, 0.1 * positions, scaled, 0.55) == (1, 2, 0)
 
 
 def test_paths_follow_people_with_gaps():

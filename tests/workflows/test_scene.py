@@ -80,12 +80,12 @@ def rays():
     return Rays(np.arange(n) / 50, np.arange(n) % 2, ("Ada", "Bob"), origin, direction, np.ones(n), hit)
 
 
-def trained(folder, name, about):
+def trained(folder, name, metadata):
     """The gaze field with another provenance."""
     import drjit.llvm.ad as ns
 
     field = load_gaze(folder / "gaze.safetensors", ns)[0]
-    save_gaze(field, folder / name, about)
+    save_gaze(field, folder / name, metadata)
     return folder / name
 
 
@@ -108,28 +108,28 @@ def test_a_place_with_gaze_and_an_observer(rgb, folder, tmp_path, place):
     options = SceneOptions(observer=(0.3, 0.2, 0.1), mode=MODE)
     result = write_scene([folder / "gaze.safetensors", folder / place], tmp_path / "a.xml", options)
     assert result.quantity == "gaze" and result.path.is_file()
-    scene, found = shown(result.path)
+    scene, image = shown(result.path)
     np.testing.assert_allclose(
         np.ravel(scene.integrator().observer.world_transform().translation()), (0.3, 0.2, 0.1), atol=1e-6
     )
     np.testing.assert_allclose(position(scene.sensors()[1]), (0.3, 0.2, 0.1), atol=1e-6)
     np.testing.assert_allclose(position(scene.sensors()[0]), result.camera.origin, atol=1e-6)
-    assert found.mask.mean() > 0.5 and found.aovs["gaze"].max() > 0 and found.color.max() > 0.01
+    assert image.mask.mean() > 0.5 and image.aovs["gaze"].max() > 0 and image.color.max() > 0.01
     # The observer's own view hides nothing from them.
-    _, own = shown(result.path, 1)
-    assert own.mask.any() and own.aovs["visibility"][own.mask].min() == 1
+    _, observer_image = shown(result.path, 1)
+    assert observer_image.mask.any() and observer_image.aovs["visibility"][observer_image.mask].min() == 1
     # What is written is relative to the folder of the scene.
     named = defaults(result.path)["gaze"]
     assert not named.startswith("/") and (tmp_path / named).samefile(folder / "gaze.safetensors")
 
 
 def test_a_place_alone_is_shown_from_where_it_can_be_seen(rgb, folder, tmp_path):
-    told = Recorder()
-    result = write_scene([folder / "mesh.ply"], tmp_path / "a.xml", SceneOptions(mode=MODE), told)
-    scene, found = shown(result.path)
+    recorder = Recorder()
+    result = write_scene([folder / "mesh.ply"], tmp_path / "a.xml", SceneOptions(mode=MODE), recorder)
+    scene, image = shown(result.path)
     assert result.observer is None and result.quantity is None and scene.integrator().observer is None
-    assert found.mask.mean() > 0.5 and found.color[found.mask].mean() > 0.05
-    assert f"wrote {result.path}" in told.messages and any("best overview" in line for line in told.messages)
+    assert image.mask.mean() > 0.5 and image.color[image.mask].mean() > 0.05
+    assert f"wrote {result.path}" in recorder.messages and any("best overview" in line for line in recorder.messages)
 
 
 def written_place(folder, kind, scale):
@@ -159,15 +159,15 @@ def written_place(folder, kind, scale):
 @pytest.mark.parametrize("kind", ["mesh", "scene", "field", "splats", "hits"])
 def test_places_of_any_unit(rgb, tmp_path, kind, scale):
     path, corner = written_place(tmp_path, kind, scale)
-    told, eye = Recorder(), tuple(0.1 * corner)
-    result = write_scene([path], tmp_path / "a.xml", SceneOptions(observer=eye, mode=MODE), told)
+    recorder, eye = Recorder(), tuple(0.1 * corner)
+    result = write_scene([path], tmp_path / "a.xml", SceneOptions(observer=eye, mode=MODE), recorder)
     for sensor in (0, 1):
-        _, found = shown(result.path, sensor)
-        assert found.mask.mean() > 0.9 and found.color.mean() > 0.1
+        _, image = shown(result.path, sensor)
+        assert image.mask.mean() > 0.9 and image.color.mean() > 0.1
     # Own eyes see all that is visible, whatever the unit; and near what is seen gaze fades within the place.
-    assert found.aovs["visibility"][found.mask].min() == 1
+    assert image.aovs["visibility"][image.mask].min() == 1
     assert 1e-4 * np.linalg.norm(corner) < float(defaults(result.path)["falloff"]) < 0.1 * np.linalg.norm(corner)
-    assert any("light leaks" in line for line in told.warnings) == (kind in ("mesh", "scene") and scale < 1)
+    assert any("light leaks" in line for line in recorder.warnings) == (kind in ("mesh", "scene") and scale < 1)
 
 
 def test_a_picture_that_would_be_empty_is_refused(rgb, folder, tmp_path):
@@ -185,23 +185,23 @@ def test_a_field_without_an_end(rgb, tmp_path):
     result = write_scene([tmp_path / "far.safetensors"], tmp_path / "a.xml", SceneOptions(mode=MODE))
     # The camera stands in the inner cube, and up is what the photos said.
     assert np.abs(result.camera.origin).max() <= 2 and defaults(result.path)["up"] == "0, 1, 0"
-    _, found = shown(result.path)
-    assert found.mask.mean() > 0.5
+    _, image = shown(result.path)
+    assert image.mask.mean() > 0.5
 
 
 def test_gaze_alone_finds_its_place_by_its_name_and_sum(rgb, folder, tmp_path):
     place = make_geometry(GeometryOptions(field=folder / "field.safetensors"), None, (), None, _ns())
     gaze = trained(folder, "of_field.safetensors", place.metadata)
     result = write_scene([gaze], tmp_path / "a.xml", SceneOptions(observer=(0, 0, 0), mode=MODE))
-    _, found = shown(result.path)
-    assert found.mask.any() and found.aovs["gaze"].max() > 0
+    _, image = shown(result.path)
+    assert image.mask.any() and image.aovs["gaze"].max() > 0
     other = trained(folder, "of_other.safetensors", {"field_file": {"file": "gaze.safetensors", "sha256": "0"}})
     with pytest.raises(NergError, match="was trained in; name the right file: nerg scene"):
         write_scene([other], tmp_path / "b.xml", SceneOptions(mode=MODE))
-    told = Recorder()
+    recorder = Recorder()
     options = SceneOptions(observer=(0, 0, 0), mode=MODE)
-    write_scene([other, folder / "field.safetensors"], tmp_path / "c.xml", options, told)
-    assert any("was trained in another file" in line for line in told.warnings)
+    write_scene([other, folder / "field.safetensors"], tmp_path / "c.xml", options, recorder)
+    assert any("was trained in another file" in line for line in recorder.warnings)
     with pytest.raises(NergError, match="does not say"):
         write_scene([folder / "gaze.safetensors"], tmp_path / "d.xml", SceneOptions(mode=MODE))
 
@@ -218,11 +218,11 @@ def test_hit_points_are_a_place_with_colours(rgb, folder, tmp_path):
     result = write_scene([gaze, folder / "rays.npz"], tmp_path / "a.xml", SceneOptions(mode=MODE))
     assert [path.name for path in result.files] == ["a.xml", "a.color.vol"]
     np.testing.assert_allclose(result.observer.origin, (0.3, 0.2, 0.1), atol=0.1)
-    _, own = shown(result.path, 1)
+    _, observer_image = shown(result.path, 1)
     # The wall fills what they look at, at its distance, in the grey of walls along x.
-    middle = own.mask[4:8, 7:11]
-    assert middle.all() and own.aovs["depth"][6, 9] == pytest.approx(1.7, abs=0.25)
-    assert own.color[6, 9, 0] == pytest.approx(0.34, abs=0.03)
+    middle = observer_image.mask[4:8, 7:11]
+    assert middle.all() and observer_image.aovs["depth"][6, 9] == pytest.approx(1.7, abs=0.25)
+    assert observer_image.color[6, 9, 0] == pytest.approx(0.34, abs=0.03)
 
 
 @pytest.mark.parametrize("geometry", [None, "none"])
@@ -261,23 +261,23 @@ def test_rays_in_another_frame_than_the_place(rgb, folder, tmp_path):
     ahead = result.observer.target - result.observer.origin
     np.testing.assert_allclose(ahead, matrix[:3, :3] @ rays().direction[200], atol=1e-6)
     # Up of the rays, +z, is +x of the place, and a metre two units.
-    given = defaults(result.path)
-    assert given["up"] == "1, 0, 0" and given["falloff"] == "0.1"
-    _, own = shown(result.path, 1)
-    assert own.aovs["kde"].max() > 0.5
+    values = defaults(result.path)
+    assert values["up"] == "1, 0, 0" and values["falloff"] == "0.1"
+    _, observer_image = shown(result.path, 1)
+    assert observer_image.aovs["kde"].max() > 0.5
 
 
 def test_cameras_that_are_given(rgb, folder, tmp_path):
     files, at = [folder / "mesh.ply"], tmp_path / "a.xml"
-    given = SceneOptions(camera=(0, 0, 1.5), target=(0, 0, -1), fov=50, width=30, mode=MODE)
-    result = write_scene(files, at, given)
+    options = SceneOptions(camera=(0, 0, 1.5), target=(0, 0, -1), fov=50, width=30, mode=MODE)
+    result = write_scene(files, at, options)
     np.testing.assert_allclose(result.camera.target, (0, 0, -1))
     # It looks straight down, and has an up all the same.
     scene = load_scene(at)
     assert np.isfinite(np.array(scene.sensors()[0].world_transform().matrix)).all()
     assert tuple(scene.sensors()[0].film().crop_size()) == (30, 20)
-    own = write_scene(files, at, SceneOptions(observer=(0.5, 0, 0), first_person=True, mode=MODE))
-    np.testing.assert_allclose(own.camera.origin, (0.5, 0, 0))
+    first_person = write_scene(files, at, SceneOptions(observer=(0.5, 0, 0), first_person=True, mode=MODE))
+    np.testing.assert_allclose(first_person.camera.origin, (0.5, 0, 0))
 
 
 def test_a_walk(rgb, folder, tmp_path):
@@ -287,9 +287,9 @@ def test_a_walk(rgb, folder, tmp_path):
     frames = read_frames(result.files[-1])
     assert [set(frame) for frame in frames] == [{"eye", "ahead", "camera", "target"}] * 3
     bob = rays()
-    own = np.flatnonzero(bob.person == 1)
+    indices = np.flatnonzero(bob.person == 1)
     eye = np.array([float(x) for x in frames[0]["eye"].split(",")])
-    wanted = [np.interp(2.0, bob.t[own], bob.origin[own, axis]) for axis in range(3)]
+    wanted = [np.interp(2.0, bob.t[indices], bob.origin[indices, axis]) for axis in range(3)]
     np.testing.assert_allclose(eye, wanted, atol=1e-6)
     pictures = PictureOptions(overlay="kde", frames=result.files[-1], defaults=SMALL, mode=MODE)
     made = render_file(result.path, tmp_path / "walk.png", pictures)
@@ -334,8 +334,8 @@ def test_a_gaze_field_without_anything_needs_an_observer(rgb, folder, tmp_path):
     with pytest.raises(NergError, match="--observer"):
         write_scene([gaze], tmp_path / "a.xml", SceneOptions(mode=MODE))
     result = write_scene([gaze], tmp_path / "a.xml", SceneOptions(observer=(0.1, 0, 0), mode=MODE))
-    _, found = shown(result.path)
-    assert found.mask.all() and found.aovs["gaze"].max() > 0 and len(np.unique(found.color.round(3))) > 1
+    _, image = shown(result.path)
+    assert image.mask.all() and image.aovs["gaze"].max() > 0 and len(np.unique(image.color.round(3))) > 1
 
 
 # ---- Rays of a file and of a dataset, as a scene shows them ----
@@ -349,9 +349,11 @@ def parquet():
 def test_a_file_is_shown_as_it_is(tmp_path):
     rays = Rays(np.zeros(1), np.zeros(1, int), ("Ada",), np.zeros((1, 3)), np.eye(3)[:1], np.ones(1))
     rays.save(tmp_path / "rays.npz")
-    found = scene.load_scene_rays(tmp_path / "rays.npz", tmp_path / "a.xml", Recorder())
+    loaded = scene.load_scene_rays(tmp_path / "rays.npz", tmp_path / "a.xml", Recorder())
     assert (
-        found.file == tmp_path / "rays.npz" and found.written_files == () and found.select_person("Ada") is found.rays
+        loaded.file == tmp_path / "rays.npz"
+        and loaded.written_files == ()
+        and loaded.select_person("Ada") is loaded.rays
     )
     none = scene.load_scene_rays(None, tmp_path / "a.xml", Recorder())
     assert none.rays is None and none.file is None and none.select_person("Ada") is None
@@ -361,16 +363,16 @@ def test_a_sample_of_a_dataset_is_kept_beside_the_scene(parquet, tmp_path, monke
     """A sample misses most moments of a person, all of whose rays are read for an eye."""
     _, rays = write_dataset(tmp_path)
     recorder = Recorder()
-    whole = scene.load_scene_rays(tmp_path / "shop.rays", tmp_path / "a.xml", recorder)
-    assert whole.file == tmp_path / "a.rays.npz" and whole.written_files == (whole.file,)
-    assert_same(Rays.load(whole.file), rays)
+    loaded = scene.load_scene_rays(tmp_path / "shop.rays", tmp_path / "a.xml", recorder)
+    assert loaded.file == tmp_path / "a.rays.npz" and loaded.written_files == (loaded.file,)
+    assert_same(Rays.load(loaded.file), rays)
     assert any(f"{len(rays):,} rays" in line for line in recorder.messages)
     monkeypatch.setattr(scene, "MAX_SCENE_RAYS", 100)
     some = scene.load_scene_rays(tmp_path / "shop.rays", tmp_path / "a.xml", recorder)
-    assert some.rays is not None and len(some.rays) == 100 == len(Rays.load(whole.file))
-    own = some.select_person("p1_0")
-    assert own is not None and own.persons == ("p1_0",)
-    assert len(own) == int((rays.person == rays.persons.index("p1_0")).sum())
+    assert some.rays is not None and len(some.rays) == 100 == len(Rays.load(loaded.file))
+    person_rays = some.select_person("p1_0")
+    assert person_rays is not None and person_rays.persons == ("p1_0",)
+    assert len(person_rays) == int((rays.person == rays.persons.index("p1_0")).sum())
 
 
 def test_a_scene_of_a_dataset(parquet, rgb, tmp_path):
@@ -414,8 +416,8 @@ def test01_a_scene_with_nerg_is_taken_as_it_is(rgb, tmp_path, rays_file):
 
 def test02_of_others_a_scene_is_made(rgb, tmp_path):
     (tmp_path / "a.obj").write_text(MESH)
-    told = Recorder()
-    place = make_viewer_scene([tmp_path / "a.obj"], tmp_path, ViewOptions(up=(0, 1, 0)), told)
+    recorder = Recorder()
+    place = make_viewer_scene([tmp_path / "a.obj"], tmp_path, ViewOptions(up=(0, 1, 0)), recorder)
     assert place.made and place.rays is None and np.allclose(place.up, [0, 1, 0])
     assert type(nerg.Scene.load(place.scene)).__name__ == "Scene"
 
@@ -468,21 +470,25 @@ def test05_a_place_of_a_dataset(parquet, rgb, tmp_path):
 @pytest.mark.nightly
 def test06_several_gaze_fields_are_variants(rgb, tmp_path):
     store = demo.find_store_scene()
-    run, told = tmp_path / "run", Recorder()
+    run, recorder = tmp_path / "run", Recorder()
     run.mkdir()
     for name in ("a", "b"):
         shutil.copy(store.parent / "shoppers.safetensors", run / f"{name}.safetensors")
-    place = make_viewer_scene([store, run], tmp_path, reporter=told)
+    place = make_viewer_scene([store, run], tmp_path, reporter=recorder)
     assert list(place.variants) == ["shoppers", "a", "b"] and place.scene == place.variants["shoppers"]
-    assert find_gaze_file(place.variants["b"]) == (run / "b.safetensors").resolve() and place.made and not told.warnings
+    assert (
+        find_gaze_file(place.variants["b"]) == (run / "b.safetensors").resolve()
+        and place.made
+        and not recorder.warnings
+    )
     # Where a name is taken, the folder's is put before it; a field of another place is told.
     shutil.copy(run / "a.safetensors", tmp_path / "a.safetensors")
     metadata = {"provenance": {"field_file": {"file": "x", "sha256": "y"}}}
     write_checkpoint(tmp_path / "c.safetensors", "gaze", {"a": np.zeros(1, np.float32)}, metadata)
     files = [run / "a.safetensors", tmp_path / "a.safetensors", tmp_path / "c.safetensors"]
-    found = write_variants(store, files, tmp_path, told)
-    assert list(found) == ["a", f"{tmp_path.name}/a", "c"]
-    assert len(told.warnings) == 1 and "another scene" in told.warnings[0]
+    variants = write_variants(store, files, tmp_path, recorder)
+    assert list(variants) == ["a", f"{tmp_path.name}/a", "c"]
+    assert len(recorder.warnings) == 1 and "another scene" in recorder.warnings[0]
     # Of fields alone a scene is made, in the place of their training.
     shutil.copy(store.parent / "store.safetensors", run / "store.safetensors")
     place = make_viewer_scene([run], tmp_path)

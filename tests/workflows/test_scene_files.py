@@ -100,9 +100,9 @@ def test_points_and_ups():
 
 def test_the_best_photo(probe):
     # Of three cameras in the cube one has the whole of it before it, one a wall, and one looks out of it.
-    looks = [((0.9, 0, 0), (1, 0, 0)), ((-0.9, 0.1, 0.1), (0, 0.1, 0.1)), ((3, 0, 0), (4, 0, 0))]
-    eyes = [LookAt(np.array(o, float), np.array(t, float)) for o, t in looks]
-    cameras = [PhotoCamera(str(k), eye, Lens(), False) for k, eye in enumerate(eyes)]
+    poses = [((0.9, 0, 0), (1, 0, 0)), ((-0.9, 0.1, 0.1), (0, 0.1, 0.1)), ((3, 0, 0), (4, 0, 0))]
+    views = [LookAt(np.array(o, float), np.array(t, float)) for o, t in poses]
+    cameras = [PhotoCamera(str(k), eye, Lens(), False) for k, eye in enumerate(views)]
     assert find_best_photo(probe, None, cameras).name == "1"
 
 
@@ -233,7 +233,7 @@ def test_kinds(folder):
     for name, said in (
         ("odd.safetensors", "contains a sound field; a scene can show"),
         ("a.pth", '"nerg import"'),
-        ("a.jpg", "cannot be shown"),
+        ("a.jpg", "cannot be shown in a scene"),
         ("a.png", "there is no file"),
     ):
         with pytest.raises(NergError, match=said):
@@ -242,32 +242,32 @@ def test_kinds(folder):
 
 def test_splats_are_a_field_and_a_mesh_is_not(folder):
     write_inria(folder / "place.ply", random_splats(3))
-    given = recognise([folder / "place.ply", folder / "nowhere.safetensors"], None, Recorder())
-    assert given.kind == "field" and given.field_metadata == {}
-    place = write_scene_geometry(given, folder / "scene.xml")
+    recognised = recognise([folder / "place.ply", folder / "nowhere.safetensors"], None, Recorder())
+    assert recognised.kind == "field" and recognised.field_metadata == {}
+    place = write_scene_geometry(recognised, folder / "scene.xml")
     (volume,) = place.make(folder, {}).integrator_children
     assert place.words == "The Gaussian splats place.ply" and 'type="splats"' in format_document([volume], "h")
     assert detect_kind(folder / "a.ply") == "mesh"
 
 
 def test_the_place_of_a_gaze_field_is_beside_it(folder):
-    given = recognise([folder / "gaze.safetensors"], None, Recorder())
-    assert (given.kind, given.place) == ("field", folder / "field.safetensors")
-    assert given.align.scale == pytest.approx(2) and given.field_metadata["provenance"] == {"up": [0, 0, 1]}
+    recognised = recognise([folder / "gaze.safetensors"], None, Recorder())
+    assert (recognised.kind, recognised.place) == ("field", folder / "field.safetensors")
+    assert recognised.align.scale == pytest.approx(2) and recognised.field_metadata["provenance"] == {"up": [0, 0, 1]}
     assert recognise([folder / "nowhere.safetensors"], None, Recorder()).kind == "none"
     (folder / "field.safetensors").rename(folder / "moved.safetensors")
     with pytest.raises(NergError, match="which the field was trained in, does not exist;"):
         recognise([folder / "gaze.safetensors"], None, Recorder())
-    told = Recorder()
-    given = recognise([folder / "gaze.safetensors", folder / "moved.safetensors"], None, told)
-    assert given.place == folder / "moved.safetensors" and not told.warnings
+    recorder = Recorder()
+    recognised = recognise([folder / "gaze.safetensors", folder / "moved.safetensors"], None, recorder)
+    assert recognised.place == folder / "moved.safetensors" and not recorder.warnings
 
 
 def test_another_place_is_warned_of(folder):
     for gaze, said in (("gaze", "was not trained in"), ("nowhere", "without geometry")):
-        told = Recorder()
-        recognise([folder / "a.ply", folder / f"{gaze}.safetensors"], None, told)
-        assert said in told.warnings[0]
+        recorder = Recorder()
+        recognise([folder / "a.ply", folder / f"{gaze}.safetensors"], None, recorder)
+        assert said in recorder.warnings[0]
 
 
 def test_rays_alone(folder):
@@ -276,9 +276,9 @@ def test_rays_alone(folder):
 
 
 def test_provenance_is_not_believed(folder):
-    for about in ({"field_file": {"file": "a.ply", "sha256": "0"}}, {}):
-        write_checkpoint(folder / "b.safetensors", "gaze", ONE, {"provenance": json.loads(json.dumps(about))})
-        with pytest.raises(NergError, match="is not the file|does not store the geometry"):
+    for provenance in ({"field_file": {"file": "a.ply", "sha256": "0"}}, {}):
+        write_checkpoint(folder / "b.safetensors", "gaze", ONE, {"provenance": json.loads(json.dumps(provenance))})
+        with pytest.raises(NergError, match="does not store the geometry"):
             recognise([folder / "b.safetensors"], None, Recorder())
 
 
@@ -303,23 +303,23 @@ def photos(rgb, tmp_path):
 
 @pytest.mark.parametrize("photo", ["1", "p1", "p1.png"])
 def test_pose_and_lens(photos, photo):
-    found = load_photo_camera(photos, photo, {})
-    assert found.name == "p1.png" and not found.has_distortion
-    np.testing.assert_allclose(found.eye.origin, [1.5, -3, 1.2])
-    np.testing.assert_allclose(found.eye.target - found.eye.origin, [0, 1, 0], atol=1e-12)
-    np.testing.assert_allclose(found.eye.up, [0, 0, 1], atol=1e-12)
-    assert found.lens.fov == pytest.approx(np.degrees(2 * np.arctan(15 / 25))) and found.lens.aspect == 1.5
-    assert found.lens.offset == pytest.approx((0.1, 0))
+    camera = load_photo_camera(photos, photo, {})
+    assert camera.name == "p1.png" and not camera.has_distortion
+    np.testing.assert_allclose(camera.eye.origin, [1.5, -3, 1.2])
+    np.testing.assert_allclose(camera.eye.target - camera.eye.origin, [0, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(camera.eye.up, [0, 0, 1], atol=1e-12)
+    assert camera.lens.fov == pytest.approx(np.degrees(2 * np.arctan(15 / 25))) and camera.lens.aspect == 1.5
+    assert camera.lens.offset == pytest.approx((0.1, 0))
 
 
 def test_coordinates_of_the_training(photos):
     # The field is twice as large as the file, and moved.
     to_file = np.diag([0.5, 0.5, 0.5, 1.0])
     to_file[:3, 3] = -1
-    about = {"sha256": file_sha256(photos / "transforms.json"), "to_file": to_file.tolist()}
-    found = load_photo_camera(photos, "0", about)
-    np.testing.assert_allclose(to_file[:3, :3] @ found.eye.origin + to_file[:3, 3], POSE[:3, 3])
-    np.testing.assert_allclose(found.eye.target - found.eye.origin, [0, 1, 0], atol=1e-12)
+    metadata = {"sha256": file_sha256(photos / "transforms.json"), "to_file": to_file.tolist()}
+    camera = load_photo_camera(photos, "0", metadata)
+    np.testing.assert_allclose(to_file[:3, :3] @ camera.eye.origin + to_file[:3, 3], POSE[:3, 3])
+    np.testing.assert_allclose(camera.eye.target - camera.eye.origin, [0, 1, 0], atol=1e-12)
 
 
 def test_other_photos(photos):
@@ -357,12 +357,12 @@ end_header
 """
 
 
-def given(path, kind):
+def write_input(path, kind):
     return InputFiles(path, kind, None, None, {}, {})
 
 
 def text_of(folder, path, kind, lamps=None):
-    place = write_scene_geometry(given(path, kind), folder / "out.xml").make(
+    place = write_scene_geometry(write_input(path, kind), folder / "out.xml").make(
         folder, lamps or {"eye": 3.0, "camera": 1.5}
     )
     return place, format_document([*place.integrator_children, *place.scene_children], "h")
@@ -410,7 +410,7 @@ def test_colours_of_a_mesh(rgb, tmp_path, names, values, said):
 )
 def test_a_mesh_that_mitsuba_does_not_show_is_written_again(rgb, tmp_path, name, text):
     (tmp_path / name).write_text(text)
-    written = write_scene_geometry(given(tmp_path / name, "mesh"), tmp_path / "out.xml")
+    written = write_scene_geometry(write_input(tmp_path / name, "mesh"), tmp_path / "out.xml")
     place, xml = text_of(tmp_path, tmp_path / name, "mesh")
     assert written.files == (tmp_path / "out.mesh.ply",) and place.files == {"place": "out.mesh.ply"}
     assert '"vertex_color"' in xml and 'type="ply"' in xml
@@ -424,14 +424,14 @@ def test_the_given_mesh_is_not_written_over(tmp_path):
     text = PLY.format(colors="comment grey", a="").replace("3 0 1 2", "4 0 1 2 0")
     (tmp_path / "out.mesh.ply").write_text(text)
     with pytest.raises(NergError, match="another name"):
-        write_scene_geometry(given(tmp_path / "out.mesh.ply", "mesh"), tmp_path / "out.xml")
+        write_scene_geometry(write_input(tmp_path / "out.mesh.ply", "mesh"), tmp_path / "out.xml")
     assert (tmp_path / "out.mesh.ply").read_text() == text
 
 
 @pytest.mark.parametrize("shape", [(1, 6, 8), (6, 1, 8), (6, 8, 1), (2, 2, 2), (1, 1, 1)])
 def test_hit_points_of_one_cell_are_shaded(tmp_path, shape):
     write_volume(tmp_path / "a.vol", np.full(shape, 100.0), (0, 0, 0), (1, 1, 1))
-    write_scene_geometry(given(tmp_path / "a.vol", "hits"), tmp_path / "out.xml")
+    write_scene_geometry(write_input(tmp_path / "a.vol", "hits"), tmp_path / "out.xml")
     colors = np.fromfile(colors_path(tmp_path / "out.xml"), "<f4", offset=48)
     assert np.isfinite(colors).all() and (colors > 0.1).all()
     if shape.count(1) == 1:
@@ -444,7 +444,7 @@ def test_splats_that_cannot_be_read_are_refused_by_their_own_name(tmp_path):
     splats.centers[0] = np.nan
     write_inria(tmp_path / "a.ply", splats)
     with pytest.raises(NergError, match=r'"[^"]*a\.ply" cannot be read: some of the centers'):
-        write_scene_geometry(given(tmp_path / "a.ply", "field"), tmp_path / "out.xml")
+        write_scene_geometry(write_input(tmp_path / "a.ply", "field"), tmp_path / "out.xml")
 
 
 def test_hit_points_get_colours_beside_the_scene(rgb, tmp_path):
@@ -457,7 +457,7 @@ def test_hit_points_get_colours_beside_the_scene(rgb, tmp_path):
     assert tuple(np.array(rgb.traverse(colors)["data"]).shape) == (3, 4, 5, 3)
     write_volume(tmp_path / "rgb.vol", np.zeros((2, 2, 2, 3)), (0, 0, 0), (1, 1, 1))
     with pytest.raises(NergError, match="is not a volume of hit points; give one that"):
-        write_scene_geometry(given(tmp_path / "rgb.vol", "hits"), tmp_path / "out.xml")
+        write_scene_geometry(write_input(tmp_path / "rgb.vol", "hits"), tmp_path / "out.xml")
 
 
 def test_a_sphere_where_nothing_is_known(tmp_path):

@@ -33,50 +33,50 @@ def table(rows, **which):
 
 
 def test01_counts_are_those_of_a_loop(folder):
-    found = statistics(
+    result = statistics(
         [folder / "bare" / "scene.xml", folder / "rays.npz"],
         options=StatisticsOptions(aois=folder / "areas.json", margin=0.001, min_visit=0.0, **FAST),
     )
     rays = people()
-    met = [first_box(o, d) for o, d in zip(rays.origin, rays.direction)]
+    hits = [first_box(o, d) for o, d in zip(rays.origin, rays.direction)]
     for name, kinds in (("the sign", {"sign"}), ("the stand", {"stand"}), ("both", {"sign", "stand"})):
-        on = np.array([kind in kinds for kind, _ in met])
+        on = np.array([kind in kinds for kind, _ in hits])
         shares = [on[rays.person == p].mean() for p in range(6)]
-        (row,) = table(found.aois, cell="all", aoi=name)
+        (row,) = table(result.aois, cell="all", aoi=name)
         assert row["source"] == "measured" and row["participants"] == 6
         assert row["share"] == pytest.approx(np.mean(shares)) and row["hit_ratio"] == np.mean([s > 0 for s in shares])
         # Every ray stands for 0.2 s, the last one too.
         assert row["dwell"] == pytest.approx(16 * np.mean(shares))
-        far = np.array([at for _, at in met])
+        far = np.array([at for _, at in hits])
         assert row["distance"] == pytest.approx(far[on].mean(), rel=1e-5)
         # Looks that are one ray apart or more are two, since a fifth of a second lies between.
-        looks = firsts = 0.0
+        visits = firsts = 0.0
         reached = 0
         for p in range(6):
-            own = np.flatnonzero(rays.person == p)
-            own = own[np.argsort(rays.t[own])]
-            seen = on[own]
-            looks += (seen & ~np.r_[False, seen[:-1]]).sum()
+            indices = np.flatnonzero(rays.person == p)
+            indices = indices[np.argsort(rays.t[indices])]
+            seen = on[indices]
+            visits += (seen & ~np.r_[False, seen[:-1]]).sum()
             firsts += 0.2 * np.argmax(seen) if seen.any() else 0
             reached += seen.any()
-        assert row["visits"] == pytest.approx(looks / 6) and row["time_to_first_visit"] == pytest.approx(
+        assert row["visits"] == pytest.approx(visits / 6) and row["time_to_first_visit"] == pytest.approx(
             firsts / reached
         )
         for cohort, code in (("even", 0), ("odd", 1)):
-            (row,) = table(found.aois, cell="cohort", value=cohort, aoi=name)
+            (row,) = table(result.aois, cell="cohort", value=cohort, aoi=name)
             mine = [s for p, s in enumerate(shares) if p % 2 == code]
             assert row["share"] == pytest.approx(np.mean(mine)) and row["participants"] == 3
-    assert {r["cell"] for r in found.differences} == {"cohort"}
-    assert sum(r["transitions"] for r in found.transitions if r["cell"] == "all") > 5
+    assert {r["cell"] for r in result.differences} == {"cohort"}
+    assert sum(r["transitions"] for r in result.transitions if r["cell"] == "all") > 5
 
 
 def test02_what_could_be_seen_contains_what_was(folder):
     options = StatisticsOptions(aois=folder / "areas.json", aoi_visibility=True, cell_size=0.05, **FAST)
-    found = statistics([folder / "bare" / "scene.xml", people()], options=options)
-    (sign,) = table(found.aois, cell="all", aoi="the sign")
-    (stand,) = table(found.aois, cell="all", aoi="the stand")
+    result = statistics([folder / "bare" / "scene.xml", people()], options=options)
+    (sign,) = table(result.aois, cell="all", aoi="the sign")
+    (stand,) = table(result.aois, cell="all", aoi="the stand")
     assert 0.05 < sign["share"] < sign["visible"] < stand["visible"] < 1
-    sums = found.sums
+    sums = result.sums
     assert (sums.dwell_time <= sums.visible_time + 1e-9).all()
     rows = sums.find_participants(sums.cells[0])[0]
     on, could = sums.dwell_time[rows, 0].sum(), sums.visible_time[rows, 0].sum()
@@ -95,7 +95,7 @@ def test03_windows_zones_and_cohorts_of_a_file(folder, tmp_path):
         **FAST,
     )
     rays, recorder = people(), Recorder()
-    found = statistics([folder / "bare" / "scene.xml", rays], options=options, reporter=recorder)
+    result = statistics([folder / "bare" / "scene.xml", rays], options=options, reporter=recorder)
     assert [text for text in recorder.messages if "no participants in the window never" in text]
     on = np.array([first_box(o, d)[0] == "sign" for o, d in zip(rays.origin, rays.direction)])
     masks = {
@@ -105,10 +105,10 @@ def test03_windows_zones_and_cohorts_of_a_file(folder, tmp_path):
         ("cohort", "x"): rays.person < 3,
     }
     for (cell, value), mask in masks.items():
-        (row,) = table(found.aois, cell=cell, value=value, aoi="the sign")
+        (row,) = table(result.aois, cell=cell, value=value, aoi="the sign")
         mine = [on[mask & (rays.person == p)].mean() for p in np.unique(rays.person[mask])]
         assert row["share"] == pytest.approx(np.mean(mine)), (cell, value)
-    assert {r["cell"] for r in found.differences} == {"window", "cohort"}
+    assert {r["cell"] for r in result.differences} == {"window", "cohort"}
 
 
 def test04_the_field_beside_the_rays_and_what_if(folder, tmp_path):
@@ -120,13 +120,13 @@ def test04_the_field_beside_the_rays_and_what_if(folder, tmp_path):
     (folder / "changes.json").write_text(json.dumps(changes))
     options = StatisticsOptions(aois=folder / "areas.json", what_if=folder / "changes.json", **FAST)
     recorder = Recorder()
-    found = statistics([folder / "scene.xml", folder / "rays.npz"], tmp_path / "out", options, recorder)
+    result = statistics([folder / "scene.xml", folder / "rays.npz"], tmp_path / "out", options, recorder)
     # A shape as a thing is still the scene's, by its name.
-    assert found.what_if
-    field = table(found.aois, cell="all", source="predicted")
+    assert result.what_if
+    field = table(result.aois, cell="all", source="predicted")
     assert len(field) == 3 and all(0 < r["share"] < 1 and r["visits"] is None for r in field)
     assert field[2]["share"] == pytest.approx(field[0]["share"] + field[1]["share"], rel=0.02)
-    rows = {(r["aoi"], r["measure"]): r for r in found.what_if}
+    rows = {(r["aoi"], r["measure"]): r for r in result.what_if}
     # The stand stood before the sign.
     sign = rows["the sign", "visible"]
     assert sign["source"] == "predicted" and sign["after"] > sign["before"] and sign["participants"] == 6
@@ -138,38 +138,38 @@ def test04_the_field_beside_the_rays_and_what_if(folder, tmp_path):
         any("does not contain training support" in text for text in recorder.messages) and field[0]["support"] is None
     )
     assert "not in the checkpoint" in (tmp_path / "out" / "what_if.md").read_text()
-    names = {p.name for p in found.files}
+    names = {p.name for p in result.files}
     assert {"aois.csv", "aois.md", "what_if.csv", "aois.png", "about.json", "participants.csv"} <= names
-    assert all(p.is_file() for p in found.files)
+    assert all(p.is_file() for p in result.files)
     with (tmp_path / "out" / "aois.csv").open() as file:
         first = next(csv.DictReader(file))
-    assert float(first["share"]) == found.aois[0]["share"] and first["aoi"] == "the sign"
-    text = "".join(p.read_text() for p in found.files if p.suffix in (".csv", ".md", ".json"))
+    assert float(first["share"]) == result.aois[0]["share"] and first["aoi"] == "the sign"
+    text = "".join(p.read_text() for p in result.files if p.suffix in (".csv", ".md", ".json"))
     assert "name 0" not in text
 
 
 def test05_names_salts_and_a_floor(folder, tmp_path):
-    given = [folder / "bare" / "scene.xml", people()]
+    files = [folder / "bare" / "scene.xml", people()]
     (tmp_path / "salt").write_bytes(b"0123456789abcdef")
     keep = StatisticsOptions(aois=folder / "areas.json", salt=tmp_path / "salt", **FAST)
-    one, two = (statistics(given, options=keep).participants for _ in range(2))
+    one, two = (statistics(files, options=keep).participants for _ in range(2))
     assert list(one) == list(two) and all(r["participant"].startswith("p") and len(r["participant"]) == 17 for r in one)
     named = StatisticsOptions(aois=folder / "areas.json", show_names=True, **FAST)
-    assert {r["participant"] for r in statistics(given, options=named).participants} == {f"name {k}" for k in range(6)}
+    assert {r["participant"] for r in statistics(files, options=named).participants} == {f"name {k}" for k in range(6)}
     recorder = Recorder()
     floor = StatisticsOptions(aois=folder / "areas.json", min_participants=5, **FAST)
-    found = statistics(given, None, floor, recorder)
-    assert not found.participants and found.num_suppressed > 0
-    assert all(r["share"] is None for r in table(found.aois, cell="cohort")) and found.aois[0]["share"] is not None
+    result = statistics(files, None, floor, recorder)
+    assert not result.participants and result.num_suppressed > 0
+    assert all(r["share"] is None for r in table(result.aois, cell="cohort")) and result.aois[0]["share"] is not None
 
 
 def test06_one_person_has_no_interval_and_that_is_said(folder):
     recorder = Recorder()
     one = people(1, cohorts=False)
-    found = statistics(
+    result = statistics(
         [folder / "bare" / "scene.xml", one], None, StatisticsOptions(aois=folder / "areas.json", **FAST), recorder
     )
-    assert found.aois[0]["share"] is not None and found.aois[0]["share_low"] is None
+    assert result.aois[0]["share"] is not None and result.aois[0]["share_low"] is None
     assert any("no confidence intervals" in text and "fewer than 3 participants" in text for text in recorder.messages)
 
 
@@ -186,29 +186,29 @@ def test07_without_a_place(folder):
     assert recorder.messages.count(f"of {folder / 'tile.obj'}: unused statements: usemtl") == 1
     hit = np.array([o + first_box(o, d)[1] * d for o, d in zip(rays.origin, rays.direction)])
     recorder = Recorder()
-    known = Rays(rays.t, rays.person, rays.persons, rays.origin, rays.direction, rays.confidence, hit)
-    found = statistics([known], None, options, recorder)
+    with_hits = Rays(rays.t, rays.person, rays.persons, rays.origin, rays.direction, rays.confidence, hit)
+    result = statistics([with_hits], None, options, recorder)
     assert any("hit points" in text for text in recorder.messages)
     on = np.array([first_box(o, d)[0] == "sign" for o, d in zip(rays.origin, rays.direction)])
     expected = np.mean([on[rays.person == p].mean() for p in range(6)])
-    assert found.aois[0]["share"] == pytest.approx(expected, abs=0.01)
+    assert result.aois[0]["share"] == pytest.approx(expected, abs=0.01)
 
 
 def test08_isovists_and_nobody_at_all(folder, tmp_path):
     options = StatisticsOptions(aois=folder / "areas.json", visibility=True, grid_step=0.5, **FAST)
-    found = statistics([folder / "bare" / "scene.xml"], tmp_path / "out", options)
-    west = [r for r in found.isovists if r["x"] < 2 and 1 < r["y"] < 2]
-    north = [r for r in found.isovists if r["x"] < 2 and r["y"] > 3]
+    result = statistics([folder / "bare" / "scene.xml"], tmp_path / "out", options)
+    west = [r for r in result.isovists if r["x"] < 2 and 1 < r["y"] < 2]
+    north = [r for r in result.isovists if r["x"] < 2 and r["y"] > 3]
     assert np.mean([r["sees the sign"] for r in west]) < np.mean([r["sees the sign"] for r in north])
-    assert all(0 < r["area"] < 24.01 for r in found.isovists) and (tmp_path / "out" / "isovists.png").is_file()
+    assert all(0 < r["area"] < 24.01 for r in result.isovists) and (tmp_path / "out" / "isovists.png").is_file()
     with pytest.raises(NergError, match="there are no observers: give rays or a gaze"):
         statistics([folder / "bare" / "scene.xml"], options=StatisticsOptions(aois=folder / "areas.json", **FAST))
 
 
 def test09_observers_who_were_not_tracked(folder):
     options = StatisticsOptions(aois=folder / "areas.json", observers=("1,1.5,1.6", "1,3.5,1.6", "1,0.5,1.6"), **FAST)
-    found = statistics([folder / "scene.xml"], options=options)
-    assert {r["source"] for r in found.aois} == {"predicted"} and found.aois[0]["participants"] == 3
+    result = statistics([folder / "scene.xml"], options=options)
+    assert {r["source"] for r in result.aois} == {"predicted"} and result.aois[0]["participants"] == 3
 
 
 def test10_datasets_count_as_files_do(folder, tmp_path):
@@ -234,7 +234,7 @@ def test10_datasets_count_as_files_do(folder, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("given", "options", "said"),
+    ("names", "options", "said"),
     [
         ([], {}, "give rays"),
         (["rays.npz", "rays.npz"], {}, "both a rays"),
@@ -249,9 +249,9 @@ def test10_datasets_count_as_files_do(folder, tmp_path):
         (["scene.xml", "rays.npz"], {"what_if": "changes"}, "is not one of move, remove, add, swap,"),
     ],
 )
-def test11_what_cannot_be_done_is_told(folder, given, options, said):
+def test11_what_cannot_be_done_is_told(folder, names, options, said):
     made = {"areas": folder / "areas.json", **FAST, **options}
     if "what_if" in options:
         made["what_if"] = folder / "areas.json"
     with pytest.raises(NergError, match=said):
-        statistics([folder / name for name in given], options=StatisticsOptions(**made))
+        statistics([folder / name for name in names], options=StatisticsOptions(**made))

@@ -36,17 +36,17 @@ from tests.workflows.recorder import Recorder
 
 @pytest.mark.nightly
 def test_only_some_settings(tmp_path):
-    told = Recorder()
+    recorder = Recorder()
     options = StudyOptions(width=12, height=8, quick=True, only="jitter|paper, 1024 steps$", mode="llvm_ad_rgb")
-    result = run_study("slab", tmp_path, options, told)
+    result = run_study("slab", tmp_path, options, recorder)
     report = result.report
     assert [r["setting"] for r in report["rows"]] == ["default", "jitter", "paper, 1024 steps"]
     # Of the share done the first renders have as much as the times, and the cost against size the rest.
-    shares = [share for share, _ in told.steps]
+    shares = [share for share, _ in recorder.steps]
     assert shares == sorted(shares) and shares[0] == 0 and shares[-1] < 1
-    assert 0.4 < told.share_at("time of default") < 0.5 and 0.8 < told.share_at("pixels 16") < 1
-    assert told.messages[-len(result.files) :] == [f"wrote {path}" for path in result.files]
-    assert all(path.is_file() for path in result.files) and told.messages[0].startswith("default: ")
+    assert 0.4 < recorder.share_at("time of default") < 0.5 and 0.8 < recorder.share_at("pixels 16") < 1
+    assert recorder.messages[-len(result.files) :] == [f"wrote {path}" for path in result.files]
+    assert all(path.is_file() for path in result.files) and recorder.messages[0].startswith("default: ")
 
 
 # ---- A study in parts: errors of two workers are those of this process, and who took the times is said ----
@@ -55,36 +55,36 @@ def test_only_some_settings(tmp_path):
 SMALL = {"width": 12, "height": 8, "quick": True, "mode": "llvm_ad_rgb"}
 SMALL |= {"only": "jitter|spp 2|no colour|visibility transmittance|paper, 64 steps$"}
 TIMES = {"seconds", "cpu_seconds", "peak_mb", "pareto"}
-BESIDE = {"default_seconds", "default_cpu_seconds", "timed_by"}
+TIMING_COLUMNS = {"default_seconds", "default_cpu_seconds", "timed_by"}
 
 
 def errors(report):
-    rows = [{k: v for k, v in row.items() if k not in TIMES | BESIDE} for row in report["rows"]]
+    rows = [{k: v for k, v in row.items() if k not in TIMES | TIMING_COLUMNS} for row in report["rows"]]
     return json.dumps([rows, [{**row, "seconds": 0} for row in report["scaling"]]])
 
 
 def test_two_workers_find_the_errors_of_this_process(tmp_path, rgb, monkeypatch):
     pytest.importorskip("distributed", reason="dask is not installed (extra cluster)")
     monkeypatch.setattr(study, "ROWS", 2)
-    here = run_study("sphere", tmp_path / "here", StudyOptions(**SMALL)).report
+    local = run_study("sphere", tmp_path / "here", StudyOptions(**SMALL)).report
     with ClusterOfProcesses(tmp_path) as cluster:
         cluster.start_worker(), cluster.start_worker()
         wait_until(lambda: all("works for" in cluster.log(f"worker{k}") for k in (0, 1)), "both workers are there")
         options = StudyOptions(**SMALL, scheduler=cluster.address)
-        there = run_study("sphere", tmp_path / "there", options).report
-    assert errors(there) == errors(here) and len(here["rows"]) == 6
-    who = there["timed_by"]
+        distributed = run_study("sphere", tmp_path / "there", options).report
+    assert errors(distributed) == errors(local) and len(local["rows"]) == 6
+    who = distributed["timed_by"]
     # Dask may give one worker the scaling, and the other one all settings.
-    assert [w["process"] for w in who] == [1, 2][: len(who)] and sum(w["rows"] for w in who) == len(there["rows"])
+    assert [w["process"] for w in who] == [1, 2][: len(who)] and sum(w["rows"] for w in who) == len(distributed["rows"])
     assert all(w["threads"] == 1 and w["processor"] and 0 < w["seconds"][0] <= w["seconds"][1] for w in who)
-    assert {row["timed_by"] for row in there["rows"]} == {w["process"] for w in who} and here["timed_by"] == []
-    assert all(row["default_seconds"] > 0 for row in there["rows"])
+    assert {row["timed_by"] for row in distributed["rows"]} == {w["process"] for w in who} and local["timed_by"] == []
+    assert all(row["default_seconds"] > 0 for row in distributed["rows"])
     heads = [set((tmp_path / k / "study.csv").read_text().split("\n")[0].split(",")) for k in ("here", "there")]
-    assert heads[1] - heads[0] == BESIDE
+    assert heads[1] - heads[0] == TIMING_COLUMNS
     assert "Times are those of whoever measured a setting: process 1 (" in (tmp_path / "there" / "study.md").read_text()
     # Started again, all of it is there, times as well.
     again = run_study("sphere", tmp_path / "there", StudyOptions(**SMALL, store=tmp_path / "there.tasks")).report
-    assert again["rows"] == there["rows"] and again["scaling"] == there["scaling"]
+    assert again["rows"] == distributed["rows"] and again["scaling"] == distributed["scaling"]
 
 
 def test_a_scene_file_is_measured_with_its_twin_where_a_worker_has_laid_them(rgb, tmp_path):
@@ -96,9 +96,9 @@ def test_a_scene_file_is_measured_with_its_twin_where_a_worker_has_laid_them(rgb
     options = StudyOptions(**SMALL, defaults={"height": "3"})
     common = plan_study(subject, tmp_path / "scene.xml", options)
     measure_part(lay_out(common, tmp_path / "elsewhere"), (number,), tmp_path / "rows.json")
-    found = json.loads((tmp_path / "rows.json").read_text())
-    here = {"rows": measure_rows(subject, [every[0], every[number]], 1, 16), "scaling": []}
-    assert errors(found | {"scaling": []}) == errors(here) and found["rows"][1]["surface_mae"] > 0
+    measured = json.loads((tmp_path / "rows.json").read_text())
+    expected = {"rows": measure_rows(subject, [every[0], every[number]], 1, 16), "scaling": []}
+    assert errors(measured | {"scaling": []}) == errors(expected) and measured["rows"][1]["surface_mae"] > 0
 
 
 # ---- The demo as a job: its stages, and its result. `tests/cli/test_scenes` looks at the pictures ----
@@ -106,13 +106,13 @@ def test_a_scene_file_is_measured_with_its_twin_where_a_worker_has_laid_them(rgb
 
 @pytest.mark.nightly
 def test_every_stage_is_told_and_every_file_is_there(tmp_path):
-    told = Recorder()
+    recorder = Recorder()
     options = DemoOptions(defaults=write_standins(tmp_path), width=24, spp=1, mode="llvm_ad_rgb")
-    result = make_demo(tmp_path / "demo", options, told)
-    assert [text for _, text in told.steps] == list(STAGES) == list(result.seconds)
-    assert [share for share, _ in told.steps] == [k / len(STAGES) for k in range(len(STAGES))]
+    result = make_demo(tmp_path / "demo", options, recorder)
+    assert [text for _, text in recorder.steps] == list(STAGES) == list(result.seconds)
+    assert [share for share, _ in recorder.steps] == [k / len(STAGES) for k in range(len(STAGES))]
     assert set(result.files) == set((tmp_path / "demo").iterdir()) and result.report["variant"] == "llvm_ad_rgb"
-    assert told.messages == [f"wrote {path}" for path in result.files]
+    assert recorder.messages == [f"wrote {path}" for path in result.files]
 
 
 @pytest.mark.nightly
@@ -151,8 +151,8 @@ def test_what_was_found_is_written_with_its_picture(tmp_path):
     reporter = Recorder()
     result = align(None, tmp_path / "a.json", AlignOptions(pairs=path), reporter)
     np.testing.assert_allclose(result.alignment.matrix, truth, atol=1e-6)
-    about = json.loads((tmp_path / "a.json").read_text())
-    assert about["files"]["pairs"]["file"] == "pairs.csv" and about["forced"] is False
+    metadata = json.loads((tmp_path / "a.json").read_text())
+    assert metadata["files"]["pairs"]["file"] == "pairs.csv" and metadata["forced"] is False
     assert (tmp_path / "a.png").is_file() and "--align" in reporter.messages[-1]
 
 
@@ -184,9 +184,9 @@ def test_bad_and_mirrored_fits_are_refused_unless_forced(tmp_path):
 )
 def test_options_that_do_not_go_together_are_refused(tmp_path, options, rays, why):
     _, path = pairs(tmp_path)
-    given = {k: path if v == "PAIRS" else v for k, v in options.items()}
+    settings = {k: path if v == "PAIRS" else v for k, v in options.items()}
     with pytest.raises(NergError, match=why):
-        align(rays, None, AlignOptions(**given))
+        align(rays, None, AlignOptions(**settings))
 
 
 def test_another_up_axis_and_a_start_lead_to_the_same_frame(tmp_path, monkeypatch):
@@ -200,8 +200,8 @@ def test_another_up_axis_and_a_start_lead_to_the_same_frame(tmp_path, monkeypatc
     assert alignment._turn("-y")[:3, :3] @ [0, -1, 0] == pytest.approx([0, 0, 1])
 
 
-def place(found, monkeypatch):
-    monkeypatch.setattr(geometry, "check_alignment", lambda *_: found)
+def place(alignment_check, monkeypatch):
+    monkeypatch.setattr(geometry, "check_alignment", lambda *_: alignment_check)
     return TrainingGeometry(object(), Box((0, 0, 0), (1, 1, 1)), "field")  # pyright: ignore[reportArgumentType] # not asked
 
 

@@ -74,15 +74,16 @@ def test_a_job_returns_the_field_and_says_how_it_went(rays):
     heard = Listener()
     result = train_gaze(rays, options=replace(QUICK, variant="capture"), reporter=heard)
     assert result.output is None and not result.interrupted and result.field.config.geometry == "none"
-    about = result.provenance
-    assert about["recipe"] == "default" and about["steps"] == 3 and about["geometry"] == "none"
-    assert "rays_file" not in about and about["rays"] == len(rays)
+    provenance = result.provenance
+    assert provenance["recipe"] == "default" and provenance["steps"] == 3 and provenance["geometry"] == "none"
+    assert "rays_file" not in provenance and provenance["rays"] == len(rays)
     assert heard.shares[-1] == 1 and heard.texts[0].startswith("placing probes") and "fit: step 3" in heard.texts
-    assert heard.texts[-1] == "folds: step 2" and about["mix"]["folds"] == 1
-    told = [m.split(";")[0].split(":")[0] for m in heard.messages]
-    assert told[:3] == [f"{about['probes_made']} probes", "3 steps", "cross-validation (1 fold)"]
+    assert heard.texts[-1] == "folds: step 2" and provenance["mix"]["folds"] == 1
+    summaries = [m.split(";")[0].split(":")[0] for m in heard.messages]
+    assert summaries[:3] == [f"{provenance['probes_made']} probes", "3 steps", "cross-validation (1 fold)"]
     assert (
-        told[3] == f"regions with {100 * about['mix']['regions']['80%']:.0f} % of the field's gaze contain 80 % "
+        summaries[3]
+        == f"regions with {100 * provenance['mix']['regions']['80%']:.0f} % of the field's gaze contain 80 % "
         "of the held-out gaze"
     )
 
@@ -122,10 +123,10 @@ def test_a_job_writes_what_the_command_writes(rays, tmp_path, capsys):
         provenance.append(meta["provenance"])
     for name, value in fields[0].items():
         np.testing.assert_array_equal(value, fields[1][name], err_msg=name)
-    for about in provenance:
-        assert about["steps"] == 3 and len(about["rays_file"]["sha256"]) == len(about["geometry_file"]["sha256"]) == 64
+    for entry in provenance:
+        assert entry["steps"] == 3 and len(entry["rays_file"]["sha256"]) == len(entry["geometry_file"]["sha256"]) == 64
         for name in ("made", "seconds", "seconds_preparing"):
-            about.pop(name)
+            entry.pop(name)
     assert provenance[0] == provenance[1]
 
 
@@ -183,8 +184,8 @@ def test_one_more_recipe_trains_by_the_job_and_by_the_command(rays, tmp_path, mo
     test = {"zones": 1, "positions": 4, "min_rays": 8, "radius": 0.5, "cameras": 0}
     options = AblationOptions(geometry="none", recipes="coarse", variant=("emit",), seeds=2, **test)
     rows = ablate(RAYS, tmp_path / "rows", options).rows
-    found = [(r["recipe"], r["variant"], r["seed"], r["steps"]) for r in rows]
-    assert found == [("coarse", "emit", 0, 3), ("coarse", "emit", 1, 3)]
+    trained = [(r["recipe"], r["variant"], r["seed"], r["steps"]) for r in rows]
+    assert trained == [("coarse", "emit", 0, 3), ("coarse", "emit", 1, 3)]
 
 
 def test_positions_and_people_are_held_out_and_told(tmp_path):
@@ -209,10 +210,10 @@ def test_an_interrupted_job_returns_what_there_is_or_says_how_to_go_on(rays, tmp
         train_gaze(rays, out, options, Listener(0.5))
     assert {p.name for p in tmp_path.iterdir()} == {"gaze.safetensors", "gaze.run"}
     assert load_gaze(out, ns)[1]["provenance"]["interrupted"]
-    whole = train_gaze(rays, options=options)
+    complete = train_gaze(rays, options=options)
     resumed = train_gaze(rays, out, replace(options, resume=True))
     assert not out.with_suffix(".run").exists() and not resumed.interrupted and resumed.provenance["steps"] == 8
-    for name, value in arrays(whole.field).items():
+    for name, value in arrays(complete.field).items():
         np.testing.assert_array_equal(value, arrays(resumed.field)[name], err_msg=name)
     with pytest.raises(NergError, match="nothing to resume"):
         train_gaze(rays, out, replace(options, resume=True))
@@ -246,8 +247,8 @@ def test_the_command_goes_on(tmp_path, monkeypatch, capsys):
         and out.with_suffix(".run").is_file()
     )
     code, _, said = nerg(capsys, *line, "--resume")
-    about = load_gaze(out, ns)[1]["provenance"]
-    assert about["steps"] == 8 and not about["interrupted"] and about["probes"]["fresh"]
+    provenance = load_gaze(out, ns)[1]["provenance"]
+    assert provenance["steps"] == 8 and not provenance["interrupted"] and provenance["probes"]["fresh"]
     assert code == 0 and "go on" not in said and not out.with_suffix(".run").exists()
 
 
@@ -259,8 +260,8 @@ def test_an_ensemble_is_one_option(tmp_path):
     heard = Listener()
     train_gaze(crowd(), out, options, heard)
     field, meta = load_gaze(out, ns)
-    about = meta["provenance"]["ensemble"]
-    assert len(field.members) == 2 and about["members"] == 2 and len(about["validation"]) == 2
+    ensemble = meta["provenance"]["ensemble"]
+    assert len(field.members) == 2 and ensemble["members"] == 2 and len(ensemble["validation"]) == 2
     assert any(m.startswith("validation:") for m in heard.messages)
     assert field.support.cells[:, 3].sum() == 1200 and [p.name for p in tmp_path.iterdir()] == ["gaze.safetensors"]
 
@@ -331,18 +332,18 @@ def test_what_goes_together_is_not_refused(options, alone):
 
 
 def test_every_option_of_settings_and_probes_arrives():
-    given = {"steps": 7, "seed": 3, "loss": "code", "validation_zones": 1, "refit": False, "learning_rate": 0.5}
-    given |= {"integral_weight": 2.0}
-    given |= {"weight_decay": 0.25, "radius": 0.4, "probes": 9, "placement": "grid", "max_rays": 32, "min_rays": 4}
-    given |= {"kappa_rule": "silverman", "kappa": 11.0, "ray_weights": "person", "directions": 33}
-    given |= {"resample_directions": True}
+    settings = {"steps": 7, "seed": 3, "loss": "code", "validation_zones": 1, "refit": False, "learning_rate": 0.5}
+    settings |= {"integral_weight": 2.0}
+    settings |= {"weight_decay": 0.25, "radius": 0.4, "probes": 9, "placement": "grid", "max_rays": 32, "min_rays": 4}
+    settings |= {"kappa_rule": "silverman", "kappa": 11.0, "ray_weights": "person", "directions": 33}
+    settings |= {"resample_directions": True}
     of_field = {"variant": "emit", "activation": "exp", "size": "paper", "normalize": True}
-    plan = plan_gaze(GazeOptions(scene=Path("a.xml"), recipe="small", **given, **of_field), SCENE)
+    plan = plan_gaze(GazeOptions(scene=Path("a.xml"), recipe="small", **settings, **of_field), SCENE)
     names = {}
-    for settings in (plan.settings, plan.probes):
-        names |= {f.metadata.get("option") or f.name: getattr(settings, f.name) for f in fields(settings)}
+    for part in (plan.settings, plan.probes):
+        names |= {f.metadata.get("option") or f.name: getattr(part, f.name) for f in fields(part)}
     # Directions of a batch are another setting than those of a probe.
-    assert {name: names[name] for name in given} == given and plan.probes.directions == 33
+    assert {name: names[name] for name in settings} == settings and plan.probes.directions == 33
     c = plan.config
     assert (c.variant, c.activation, c.grid.levels, c.normalized) == ("emit", "exp", 16, True)
 

@@ -9,26 +9,26 @@ import pytest
 from nerg_mi.rays.dataset import RayDataset
 from nerg_mi.rays.rays import Rays
 from tests.cli.rays.running import run
-from tests.cli.test_outputs import interrupting, largest_file, nerg, told_in_a_sentence
+from tests.cli.test_outputs import interrupting, is_one_sentence, largest_file, nerg
 from tests.rays.dataset.making import MAP, write_source
 
 pytest.importorskip("pyarrow")
 
 
 @pytest.fixture
-def given(tmp_path):
+def import_arguments(tmp_path):
     """The arguments of an import of two files, without the output."""
     files = [write_source(tmp_path / "files" / f"{k}.csv", k, 2000) for k in range(2)]
     return ["rays", "import", *files, "--map", MAP, "--place-name", "shop"]
 
 
-def test_in_and_out(given, tmp_path):
+def test_in_and_out(import_arguments, tmp_path):
     output = tmp_path / "a.rays"
-    done = run(*given[1:], "-o", output, "--workers", 1, "--day", "2024-05-06")
+    done = run(*import_arguments[1:], "-o", output, "--workers", 1, "--day", "2024-05-06")
     shown = " ".join(done.output.split())
     assert done.exit_code == 0 and "imported 2 sources, 3,998 rays" in shown and "3,998 of 4,000 rows" in shown
     assert "2 sources in" in shown and "place shop, day 2024-05-06" in shown
-    assert "nothing to import; 2 unchanged" in run(*given[1:], "-o", output, "--day", "2024-05-06").output
+    assert "nothing to import; 2 unchanged" in run(*import_arguments[1:], "-o", output, "--day", "2024-05-06").output
     for path in (output, output / "place=shop" / "day=2024-05-06"):
         shown = run("show", path)
         assert shown.exit_code == 0 and "3,998 of 4,000 rows" in shown.output
@@ -41,23 +41,23 @@ def test_in_and_out(given, tmp_path):
     assert len(Rays.load(tmp_path / "c-train.npz")) + len(Rays.load(tmp_path / "c-test.npz")) == 3998
 
 
-def test_what_stands_in_the_way(given, tmp_path, capsys):
+def test_what_stands_in_the_way(import_arguments, tmp_path, capsys):
     (tmp_path / "file.rays").write_text("x")
     for output, why in (
         (tmp_path / "file.rays", "one of its parents is a file"),
         (tmp_path / "file.rays" / "a.rays", "one of its parents is a file"),
         (tmp_path / "a.npz", "--environment applies to datasets only"),
     ):
-        code, said = nerg(capsys, *given, "-o", output)
-        assert told_in_a_sentence(code, said) and why in said, said
+        code, said = nerg(capsys, *import_arguments, "-o", output)
+        assert is_one_sentence(code, said) and why in said, said
 
 
-def test_no_room_and_ctrl_c(given, tmp_path, capsys, monkeypatch):
+def test_no_room_and_ctrl_c(import_arguments, tmp_path, capsys, monkeypatch):
     """What is finished is kept, and the next import goes on to the same end."""
-    arguments, output = [*given, "--workers", 1, "-o", tmp_path / "a.rays"], tmp_path / "a.rays"
+    arguments, output = [*import_arguments, "--workers", 1, "-o", tmp_path / "a.rays"], tmp_path / "a.rays"
     with largest_file(20_000):
         code, said = nerg(capsys, *arguments)
-    assert told_in_a_sentence(code, said) and "too large" in said, said
+    assert is_one_sentence(code, said) and "too large" in said, said
     assert not list(output.rglob("*.parquet")) and not list(output.rglob(".*"))
     with monkeypatch.context() as change:
         calls = []
@@ -73,7 +73,7 @@ def test_no_room_and_ctrl_c(given, tmp_path, capsys, monkeypatch):
     assert not [p for p in output.rglob(".*") if p.is_file()]
     code, _ = nerg(capsys, *arguments)
     assert code == 0 and len(RayDataset.open(output).load()) == 3998
-    code, _ = nerg(capsys, *given, "-o", tmp_path / "b.rays")
+    code, _ = nerg(capsys, *import_arguments, "-o", tmp_path / "b.rays")
     parts = lambda folder: {p.relative_to(folder): p.read_bytes() for p in folder.rglob("*.parquet")}
     assert code == 0 and parts(output) == parts(tmp_path / "b.rays")
     # A filter writes all or nothing.
