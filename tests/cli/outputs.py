@@ -1,5 +1,5 @@
-"""Every command that writes, on inputs so small that it takes a second: what it is asked for, and the files that it
-makes."""
+"""Every command that writes, on inputs so small that it takes a second: its command line, and the files that it
+writes."""
 
 from __future__ import annotations
 

@@ -64,19 +64,19 @@ def test_every_option_arrives(serve):
 
 
 @pytest.mark.parametrize("wrong", [("--secret", "1"), ("--no-sugar",), ("--minutes", "4"), ("--time", "0.1")])
-def test_what_is_no_option_is_refused(serve, wrong):
+def test_an_unknown_option_is_refused(serve, wrong):
     done, handed = serve("mug", *wrong)
     assert done.exit_code == 2 and handed is None
 
 
-def test_help_tells_what_each_field_means(serve):
+def test_help_describes_each_field(serve):
     shown = " ".join(serve("--help")[0].stdout.split())
     assert "Make tea." in shown and "Where it is served." in shown
     for f in fields(Brew):
         assert (f.metadata["help"] in shown) == (f.name != "secret")
 
 
-def test_a_word_that_is_parsed_is_called_as_it_was_given(serve):
+def test_a_parse_error_names_the_option_as_typed(serve):
     assert serve("mug", "--from", "1,2.5")[1][1].origin == (1.0, 2.5)
     done, _ = serve("mug", "--from", "east")
     assert "--from must be comma-separated numbers" in str(done.exception)
@@ -134,7 +134,7 @@ def test_a_command_is_one_module(monkeypatch, tmp_path, capsys):
         COMMANDS.pop("greet kindly", None)
 
 
-def test_a_line_without_a_command_is_a_mistake(monkeypatch, tmp_path, capsys):
+def test_a_command_line_without_a_command_is_refused(monkeypatch, tmp_path, capsys):
     (tmp_path / "nothing.py").write_text('"""``nerg nothing``: Do nothing."""\n')
     monkeypatch.setattr(nerg_mi.workflows, "__path__", [*nerg_mi.workflows.__path__, str(tmp_path)])
     with pytest.raises(SystemExit) as end:

@@ -1,4 +1,4 @@
-"""How a command ends, on Ctrl-C too, and what it tells until then."""
+"""How a command ends, on Ctrl-C too, and its messages until then."""
 
 import io
 import os
@@ -17,13 +17,13 @@ from nerg_mi.errors import NergError
 from nerg_mi.formats.checkpoint import read_checkpoint
 
 
-def test_what_the_user_can_mend_and_what_not():
+def test_user_errors_and_internal_errors_have_exit_codes():
     assert exit_code(NergError("write y")) == (USER_ERROR, "write y")
     code, text = exit_code(KeyError("x"))
     assert code == INTERNAL_ERROR and text.startswith("internal error (KeyError: 'x')")
 
 
-def test_ctrl_c_is_found_behind_what_others_made_of_it():
+def test_ctrl_c_is_detected_behind_another_exception():
     with CtrlC() as ctrl_c:
         assert ctrl_c.find_interrupt(ValueError("x")) is None
         with pytest.raises(RuntimeError) as raised:
@@ -57,7 +57,7 @@ def test_ctrl_c_within_a_finalizer_is_not_lost(monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["stdout", "stderr"])
-def test_output_that_nobody_reads_is_given_up(monkeypatch, name):
+def test_a_closed_pipe_ends_the_output(monkeypatch, name):
     read, write = os.pipe()
     os.close(read)
     stream = io.TextIOWrapper(os.fdopen(write, "wb"), encoding="utf-8")
@@ -68,7 +68,7 @@ def test_output_that_nobody_reads_is_given_up(monkeypatch, name):
         print("a line", file=getattr(sys, name), flush=True)
 
 
-def test_a_disk_that_is_full_is_told_once(monkeypatch):
+def test_a_full_disk_is_reported_once(monkeypatch):
     stream = open("/dev/full", "w", encoding="utf-8")
     monkeypatch.setattr(sys, "stdout", stream)
     monkeypatch.setattr(sys, "__stdout__", stream)
@@ -79,13 +79,13 @@ def test_a_disk_that_is_full_is_told_once(monkeypatch):
 
 
 @pytest.mark.parametrize("closed", [">&-", ">&- 2>&-", "<&- >&- 2>&-", "| true"])
-def test_a_command_without_standard_streams(closed):
+def test_a_command_runs_without_standard_streams(closed):
     line = f'"{sys.executable}" -c "from nerg_mi.cli import main; main([\'--version\'])" {closed}'
     done = subprocess.run(["bash", "-o", "pipefail", "-c", line], capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_ctrl_c_while_the_command_line_is_imported():
+def test_ctrl_c_during_the_import_is_handled():
     child = """
 import sys
 
@@ -102,7 +102,7 @@ import nerg_mi.cli
 
 
 @pytest.mark.parametrize("long", ["x" * 1500, "1 " * 750, "a" * 700 + "=" + "b" * 800, "it's " * 300, "z,9" * 500])
-def test_messages_repeat_the_ends_of_long_values(capsys, long):
+def test_messages_abbreviate_long_values(capsys, long):
     with pytest.raises(SystemExit):
         main(["bake", "a.ply", "-o", "b.ply", "--observer", f"x{long}"])
     with pytest.raises(SystemExit):
@@ -115,7 +115,7 @@ def test_messages_repeat_the_ends_of_long_values(capsys, long):
     assert shorten_values("got red", ["--up=red"]) == "got red"
 
 
-# ---- What a job tells, on a terminal and elsewhere ----
+# ---- Messages of a job, on a terminal and elsewhere ----
 
 
 class Terminal(io.StringIO):
@@ -133,7 +133,7 @@ def replace_streams(monkeypatch):
     return out, err
 
 
-def test_the_bar_is_on_the_terminal_and_messages_are_where_they_are_piped(monkeypatch):
+def test_the_bar_is_on_the_terminal_and_messages_are_in_the_pipe(monkeypatch):
     out, err = replace_streams(monkeypatch)
     with TerminalReporter() as reporter:
         reporter.message("[before]")
@@ -149,7 +149,7 @@ def test_the_bar_is_on_the_terminal_and_messages_are_where_they_are_piped(monkey
     assert "\x1b[2K" in shown
 
 
-def test_nothing_but_messages_where_there_is_no_terminal(capsys):
+def test_without_a_terminal_only_messages_are_printed(capsys):
     with TerminalReporter() as reporter:
         reporter.progress(0.5, "half")
         reporter.message("done")
@@ -158,7 +158,7 @@ def test_nothing_but_messages_where_there_is_no_terminal(capsys):
 
 
 class Clock:
-    """A clock that moves when it is told to."""
+    """A clock that the test advances."""
 
     def __init__(self, monkeypatch):
         self.now = 1000.0
@@ -177,7 +177,7 @@ def test_a_log_gets_a_line_every_ten_seconds(capsys, monkeypatch):
     assert capsys.readouterr() == ("", "\n".join(lines) + "\n")
 
 
-def test_what_a_job_does_not_say_is_added(capsys, monkeypatch):
+def test_progress_adds_elapsed_and_remaining_time(capsys, monkeypatch):
     clock = Clock(monkeypatch)
     with TerminalReporter() as reporter:
         reporter.progress(0.0, "reading")
@@ -192,7 +192,7 @@ def test_what_a_job_does_not_say_is_added(capsys, monkeypatch):
     assert capsys.readouterr().err.splitlines() == said
 
 
-def test_what_is_prepared_is_no_measure_of_the_rest(capsys, monkeypatch):
+def test_preparation_does_not_affect_the_time_estimate(capsys, monkeypatch):
     clock = Clock(monkeypatch)
     with TerminalReporter() as reporter:
         reporter.progress(0.0, "reading")
@@ -203,7 +203,7 @@ def test_what_is_prepared_is_no_measure_of_the_rest(capsys, monkeypatch):
     assert capsys.readouterr().err.splitlines() == [" 10% steps, 81 s left"]
 
 
-def test_a_long_step_that_tells_nothing_is_spoken_for(capsys, monkeypatch):
+def test_a_long_silent_step_is_reported(capsys, monkeypatch):
     monkeypatch.setattr(progress, "LOG_INTERVAL", 0.2)
     with TerminalReporter() as reporter:
         reporter.progress(0.5, "integrating")
@@ -214,7 +214,7 @@ def test_a_long_step_that_tells_nothing_is_spoken_for(capsys, monkeypatch):
     assert not reporter._pulse.is_alive()
 
 
-def test_the_bar_says_how_long_the_rest_takes(monkeypatch):
+def test_the_bar_shows_the_remaining_time(monkeypatch):
     clock = Clock(monkeypatch)
     _, err = replace_streams(monkeypatch)
     with TerminalReporter() as reporter:
@@ -232,7 +232,7 @@ def test_durations(seconds, said):
     assert progress.duration(seconds) == said
 
 
-# ---- Ctrl-C in a process of its own: exit code 130, outputs whole or absent, trainings to be gone on with ----
+# ---- Ctrl-C in a process of its own: exit code 130, outputs complete or absent, trainings resumable ----
 
 _CHILD = """
 import os, pkgutil, signal, sys
@@ -255,7 +255,7 @@ nerg_mi.cli.main(arguments)
 
 
 def interrupted(name: str, calls: int, *arguments) -> subprocess.CompletedProcess:
-    """`nerg` in a process that gets SIGINT as a function is called for the so-many-th time."""
+    """`nerg` in a process that gets SIGINT at a given call of a function."""
     command = [sys.executable, "-c", _CHILD, f"nerg_mi.{name}", str(calls), *map(str, arguments)]
     return subprocess.run(
         command, capture_output=True, text=True, timeout=300, env={**os.environ, "PYTHONPATH": os.getcwd()}
@@ -270,7 +270,7 @@ GAZE = "--geometry none --radius 0.6 --probes 8 --directions 64 --zones 0 --min-
 WARM_UP = 5
 
 
-def test_a_gaze_training_keeps_its_state_and_its_result(inputs, tmp_path):
+def test_an_interrupted_gaze_training_saves_state_and_result(inputs, tmp_path):
     line = f"train gaze {inputs}/rays.npz -o {tmp_path}/a.safetensors {GAZE} --variant capture {ENDLESS}"
     done = interrupted("train.gaze_log_density.LikelihoodTrainer.step", 4, *line.split())
     assert done.returncode == 130 and "go on with --resume" in done.stderr, done.stderr
@@ -280,14 +280,14 @@ def test_a_gaze_training_keeps_its_state_and_its_result(inputs, tmp_path):
     assert read_checkpoint(tmp_path / "a.safetensors", "gaze")[1]["provenance"]["interrupted"]
 
 
-def test_a_gaze_training_whose_variant_is_not_chosen_yet_says_that_nothing_was_kept(inputs, tmp_path):
+def test_a_gaze_training_interrupted_before_variant_selection_saves_nothing(inputs, tmp_path):
     line = f"train gaze {inputs}/rays.npz -o {tmp_path}/a.safetensors {GAZE} {ENDLESS}"
     done = interrupted("train.gaze_log_density.LikelihoodTrainer.step", 4, *line.split())
     assert done.returncode == 130 and "nothing was kept" in done.stderr and "--resume" not in done.stderr, done.stderr
     assert not os.listdir(tmp_path)
 
 
-def test_a_radiance_training_keeps_its_state_and_its_result(inputs, tmp_path):
+def test_an_interrupted_radiance_training_saves_state_and_result(inputs, tmp_path):
     line = f"train radiance {inputs}/photos -o {tmp_path}/a.safetensors {ENDLESS}"
     done = interrupted("train.radiance_trainer.RadianceTrainer.step", WARM_UP + 4, *line.split())
     assert done.returncode == 130 and "go on with --resume" in done.stderr, done.stderr
@@ -296,7 +296,7 @@ def test_a_radiance_training_keeps_its_state_and_its_result(inputs, tmp_path):
     assert read_checkpoint(tmp_path / "a.safetensors", "radiance")[1]["provenance"]["interrupted"]
 
 
-def test_an_ensemble_keeps_its_members_and_its_state(inputs, tmp_path):
+def test_an_interrupted_ensemble_saves_members_and_state(inputs, tmp_path):
     some = "--variant capture --steps 3 --ensemble 2 --save-every 0"
     line = f"train gaze {inputs}/rays.npz -o {tmp_path}/a.safetensors {GAZE} {some}"
     done = interrupted("train.gaze_log_density.LikelihoodTrainer.step", 5, *line.split())
@@ -332,7 +332,7 @@ ENDS = {
 
 
 @pytest.mark.parametrize("name", ENDS)
-def test_a_command_ends_at_once(name, inputs, tmp_path):
+def test_an_interrupted_command_exits_immediately(name, inputs, tmp_path):
     function, calls, line = ENDS[name]
     done = interrupted(function, calls, *shlex.split(line.format(i=inputs, o=tmp_path / "out")))
     assert done.returncode == 130 and "Interrupted." in done.stderr and "Traceback" not in done.stderr, done.stderr

@@ -26,7 +26,7 @@ from tests.train.gaze.looks import looking_at
 # ---- Radiance fields ----
 
 
-def test_scores_and_files(cube, nerg):
+def test_training_and_evaluation_write_scores_and_files(cube, nerg):
     ended = nerg("eval", "radiance", cube / "cube.safetensors", cube, "--holdout", 2, "--json", cube / "s.json")
     assert not ended.code
     scores = json.loads((cube / "s.json").read_text())
@@ -36,7 +36,7 @@ def test_scores_and_files(cube, nerg):
 
 
 @pytest.mark.nightly
-def test_the_machine_s_speed_and_what_is_wrong_are_told(cube, nerg):
+def test_speed_and_complaints_are_reported(cube, nerg):
     ended = nerg("train", "radiance", cube, "-o", cube / "a.safetensors", "--steps", 3, "--holdout", 3)
     assert not ended.code and "warning: only 3 steps" in ended.err
     assert float(re.search(r"3 steps in \d+ s; (\S+) field evaluations a second", ended.out)[1]) > 0
@@ -92,7 +92,7 @@ def other_value(f):
     return value if value != f.default else value + 1
 
 
-def test_the_workflow_is_given_what_is_said(handed, nerg):
+def test_the_workflow_receives_the_options(handed, nerg):
     """Every option there is, and none of them."""
     calls = handed("train gaze")
     options = GazeOptions(**{f.name: other_value(f) for f in fields(GazeOptions)})
@@ -113,7 +113,7 @@ def test_the_workflow_is_given_what_is_said(handed, nerg):
     ]
 
 
-def test_a_field_takes_over_features_and_weights(tmp_path, nerg):
+def test_a_field_starts_from_features_and_weights(tmp_path, nerg):
     radiance(tmp_path / "field.safetensors", density_scale=30.0)
     taken = load_radiance(tmp_path / "field.safetensors", ns)[0]
     looking_at((0.5, 0.1, 0.2), 300).save(tmp_path / "rays.npz")
@@ -127,7 +127,7 @@ def test_a_field_takes_over_features_and_weights(tmp_path, nerg):
 
 
 @pytest.mark.parametrize("recipe", ["default", "small"])
-def test_a_field_from_salience_images(recipe, tmp_path, nerg, rgb):
+def test_a_field_is_trained_from_salience_images(recipe, tmp_path, nerg, rgb):
     """Six photos from places a metre apart, of which five have salience images."""
     frames, rng = [], np.random.default_rng(0)
     (tmp_path / "maps").mkdir()
@@ -199,7 +199,7 @@ def test_a_nerf_and_its_gaze_are_imported(tmp_path, nerg, torch):
     assert (tmp_path / "g.safetensors").stat().st_size < 0.6 * small_gaze()["encoder.embeddings"].nbytes + 1e5
 
 
-def test_forms_of_an_exported_field(tmp_path, nerg):
+def test_a_field_is_exported_in_each_format(tmp_path, nerg):
     radiance(tmp_path / "f.safetensors")
 
     def export(kind, name, *arguments):
@@ -217,7 +217,7 @@ def test_forms_of_an_exported_field(tmp_path, nerg):
     assert len(trimesh.load(tmp_path / "m.glb", force="mesh").faces) > 100
 
 
-def test_a_refined_field_says_so(tmp_path, nerg):
+def test_a_refined_field_is_reported(tmp_path, nerg):
     occupancy = OccupancyGrid(np.ones((4, 4, 4), bool), ns, 0.1)
     radiance(tmp_path / "f.safetensors", density_scale=1e-2, occupancy=occupancy)
     ended = nerg("refine", tmp_path / "f.safetensors", "-o", tmp_path / "g.safetensors")

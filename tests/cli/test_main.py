@@ -104,7 +104,7 @@ def failing(monkeypatch, error):
         ),
     ],
 )
-def test05_expected_error_is_one_sentence(monkeypatch, nerg, error, said):
+def test05_user_error_is_one_sentence(monkeypatch, nerg, error, said):
     failing(monkeypatch, error)
     ended = nerg("doctor")
     assert ended.code == 1 and ended.err.strip() == said
@@ -137,7 +137,7 @@ def test06_traceback_on_request(monkeypatch, nerg, error, code, ask):
         ),
     ],
 )
-def test07_a_mistake_in_the_program_is_shown_as_one(monkeypatch, nerg, error, said):
+def test07_an_internal_error_is_reported_as_one(monkeypatch, nerg, error, said):
     failing(monkeypatch, error)
     ended = nerg("doctor")
     assert ended.code == 70 and not ended.out
@@ -148,7 +148,7 @@ def test07_a_mistake_in_the_program_is_shown_as_one(monkeypatch, nerg, error, sa
 
 
 @pytest.mark.parametrize("lines", [1, 100_000])
-def test07b_nothing_is_said_where_nobody_reads(lines):
+def test07b_a_closed_output_stream_is_ignored(lines):
     """Neither in the middle of the output nor at its end, which is written when the interpreter stops."""
     code = (
         "import sys, dataclasses\nimport nerg_mi.cli.machine\nfrom nerg_mi.workflows.base import COMMANDS\n"
@@ -164,7 +164,7 @@ def test07b_nothing_is_said_where_nobody_reads(lines):
     assert said == "" and process.returncode in (0, 1)
 
 
-def test07c_what_a_contract_refuses_is_the_users_where_they_chose_it():
+def test07c_a_contract_violation_by_an_option_is_a_user_error():
     with pytest.raises(NergError, match="^the corner is wrong; give other values by --aabb$") as raised:
         with blame_options("--aabb"):
             raise ValueError("the corner is wrong.")
@@ -191,7 +191,7 @@ QUOTED = (
         QUOTED + 'ValueError: "x" must\n be 3',
     ],
 )
-def test07d_what_mitsuba_says_of_a_scene_is_the_users(said):
+def test07d_a_mitsuba_error_about_a_scene_is_a_user_error(said):
     with pytest.raises(NergError):
         with translate_mitsuba_errors():
             raise RuntimeError(said)
@@ -206,14 +206,14 @@ def test07d_what_mitsuba_says_of_a_scene_is_the_users(said):
         QUOTED + "a.b.Odd: x",
     ],
 )
-def test07e_a_mistake_in_a_plugin_is_not(said):
+def test07e_a_bug_in_a_plugin_is_an_internal_error(said):
     with pytest.raises(RuntimeError) as raised:
         with translate_mitsuba_errors():
             raise RuntimeError(said)
     assert not isinstance(raised.value, NergError)
 
 
-def test07f_a_plugin_with_a_mistake(rgb, tmp_path, nerg, monkeypatch):
+def test07f_an_error_in_a_plugin_constructor_is_internal(rgb, tmp_path, nerg, monkeypatch):
     """From its constructor through Mitsuba to the command line."""
     scene = tmp_path / "a.xml"
     scene.write_text('<scene version="3.0.0"><integrator type="nerg"/><sensor type="perspective"/></scene>')
@@ -237,14 +237,14 @@ def test08_sentence_of_a_mitsuba_error():
 # ---- nerg doctor, on this machine and on one whose libLLVM is unusable ----
 
 
-def test09_this_machine():
+def test09_doctor_passes_on_this_machine():
     done = in_a_process("doctor")
     assert done.returncode == 0, done.stdout + done.stderr
     for word in ("libLLVM", "CUDA", "llvm_ad_rgb", "threads", *diagnosis.EXTRAS, "ready to render"):
         assert word in done.stdout
 
 
-def test10_unusable_llvm(tmp_path):
+def test10_doctor_reports_an_unusable_llvm(tmp_path):
     bad = tmp_path / "libLLVM-15.so.1"
     bad.touch()
     done = in_a_process("doctor", **{llvm.PATH_VARIABLE: str(bad)})
@@ -270,7 +270,7 @@ def ask(shell: str, line: str) -> subprocess.CompletedProcess[str]:
 
 
 @needs_command
-def test_bash_is_given_commands_and_those_below():
+def test_bash_completes_commands_and_subcommands():
     assert set(ask("bash", "nerg ").stdout.split()) == {name.split()[0] for name in find_commands()}
     assert ask("bash", "nerg tr").stdout.split() == ["train"]
     assert set(ask("bash", "nerg train ").stdout.split()) == {"radiance", "gaze", "prior"}
@@ -279,7 +279,7 @@ def test_bash_is_given_commands_and_those_below():
 
 @needs_command
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_options_are_those_of_the_command(shell):
+def test_bash_completes_the_options_of_a_command(shell):
     done = ask(shell, "nerg train gaze --resa")
     assert done.returncode == 0 and done.stderr == ""
     assert "--resample-directions" in done.stdout and "--seed" not in done.stdout
@@ -296,7 +296,7 @@ def test_the_script_that_a_shell_reads_is_printed(shell):
 
 @needs_command
 @pytest.mark.skipif(shutil.which("bash") is None, reason="bash is not installed")
-def test_bash_completes_by_that_script(tmp_path):
+def test_the_printed_script_completes_in_bash(tmp_path):
     """As a shell does it: the script is read, its function called, what it leaves in COMPREPLY looked at."""
     script = "\n".join(
         [
@@ -311,7 +311,7 @@ def test_bash_completes_by_that_script(tmp_path):
 
 
 @needs_command
-def test_it_is_installed_into_the_home_it_is_given(tmp_path):
+def test_completion_is_installed_in_the_home_folder(tmp_path):
     environment = {**os.environ, "HOME": str(tmp_path), "_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1"}
     command = [NERG, "--install-completion", "bash"]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)

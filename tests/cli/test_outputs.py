@@ -1,5 +1,5 @@
-"""Every output of every command: parents are made, what stands in the way is told before work, and neither a full disk
-nor Ctrl-C loses anything."""
+"""Every output of every command: parents are made, unwritable outputs are reported before any work, and neither a
+full disk nor Ctrl-C loses anything."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def interrupting(function):
 
 
 def remember(monkeypatch, name: str) -> None:
-    """A function is called once, and later gives what it gave then: what a command computes is not the matter here."""
+    """Call a function once and return its first result again later; the computed values do not matter here."""
     cached = []
     original = pkgutil.resolve_name(name)
     monkeypatch.setattr(
@@ -88,7 +88,7 @@ def offline(monkeypatch):
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda c: f"{c.name} {Path(c.files[0]).suffix}")
-def test_output(case, inputs, tmp_path, capsys, monkeypatch, rgb, offline):
+def test_an_output_is_written_atomically(case, inputs, tmp_path, capsys, monkeypatch, rgb, offline):
     if case.name in OF_TORCH:
         pytest.importorskip("torch")
     if case.name == "export mesh":
@@ -101,14 +101,14 @@ def test_output(case, inputs, tmp_path, capsys, monkeypatch, rgb, offline):
     for name in case.once:
         remember(monkeypatch, f"nerg_mi.{name}")
 
-    # A parent that is missing is made, and nothing is left beside what was asked for.
+    # A parent that is missing is made, and no other file is left.
     out = tmp_path / "new" / "deeper"
     code, said = nerg(capsys, *case.arguments(inputs, out))
     made = files(out)
     assert code == 0 and set(made) == set(case.files), said
     assert all(made.values())
 
-    # What stands in the way is found before any work: nothing is written.
+    # Unwritable outputs are reported before any work: nothing is written.
     for k, name in enumerate(case.targets):
         out = tmp_path / f"blocked{k}"
         if Path(name).suffix:
@@ -159,7 +159,7 @@ def test_output(case, inputs, tmp_path, capsys, monkeypatch, rgb, offline):
         assert set(files(out)) <= {"a.run"} and ("--resume" in said or not files(out))
 
 
-def test_filtering_in_place_keeps_its_input_where_there_is_no_room(inputs, tmp_path, capsys):
+def test_filtering_in_place_on_a_full_disk_keeps_the_input(inputs, tmp_path, capsys):
     for name in ("rays.npz", "rays.parquet"):
         if name.endswith(".parquet"):
             pytest.importorskip("pyarrow")
@@ -176,7 +176,7 @@ def test_filtering_in_place_keeps_its_input_where_there_is_no_room(inputs, tmp_p
 
 
 def commands() -> dict:
-    """Every command of `nerg`, a function, by its whole name."""
+    """Every command of `nerg`, a function, by its full name."""
     for entry in find_commands().values():
         importlib.import_module(entry.module)
     return {name: make_callback(command) for name, command in COMMANDS.items()}
@@ -196,7 +196,7 @@ def path_options(name: str, command) -> dict[str, tuple]:
     return out
 
 
-def test_every_output_is_tried(tmp_path):
+def test_every_output_option_has_a_case(tmp_path):
     """Each option that takes a path belongs into `outputs.CASES`, or among what is read."""
     (tmp_path / "demo.json").write_text("{}")
     commands_by_name = commands()

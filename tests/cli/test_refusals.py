@@ -129,7 +129,7 @@ WITHOUT = {
 
 
 @pytest.mark.parametrize("line", LINES)
-def test_one_sentence(line, small, nerg, tmp_path, monkeypatch):
+def test_a_user_error_is_one_sentence(line, small, nerg, tmp_path, monkeypatch):
     if line.startswith(("import", "export torch")):
         pytest.importorskip("torch")
     for module in (poses, structure):
@@ -145,7 +145,7 @@ def test_one_sentence(line, small, nerg, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("line", WITHOUT)
-def test_without_an_extra(line, small, nerg, tmp_path, monkeypatch):
+def test_a_missing_extra_is_named(line, small, nerg, tmp_path, monkeypatch):
     module, said = WITHOUT[line]
     monkeypatch.setitem(sys.modules, module, None)
     monkeypatch.chdir(small)
@@ -244,7 +244,7 @@ def pipes(tmp_path_factory, small):
 
 
 @pytest.mark.parametrize("line", PIPES)
-def test_a_pipe_as_a_file_of_a_command(pipes, tmp_path, nerg, in_time, line):
+def test_a_pipe_as_an_input_file_is_refused(pipes, tmp_path, nerg, in_time, line):
     # Commands look first whether an extra is there, without which there is nothing to check.
     for beginning, extra in (("view", "viser"), ("poses", "pycolmap")):
         if line.startswith(beginning):
@@ -260,7 +260,7 @@ def test_a_pipe_as_a_file_of_a_command(pipes, tmp_path, nerg, in_time, line):
 
 @pytest.mark.parametrize("kind", NAMED)
 @pytest.mark.parametrize("name", ["pipes/a.ply", "pipes", "/dev/zero"])
-def test_what_a_scene_names(pipes, in_time, kind, name):
+def test_pipes_referenced_by_a_scene_are_refused(pipes, in_time, kind, name):
     path = pipes / "named.xml"
     path.write_text(f'<scene version="3.0.0">{NAMED[kind].replace("NAME", name)}</scene>')
     with pytest.raises(NergError, match="is a (pipe|device|folder)"):

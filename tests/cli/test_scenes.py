@@ -110,7 +110,7 @@ def test_define_sensor_spp_and_seed(render):
     assert np.array_equal(a, b) and not np.array_equal(a, c)
 
 
-def test_a_mistake_of_the_program_while_it_renders_is_told_as_one(scene, tmp_path, monkeypatch, nerg):
+def test_an_internal_error_during_rendering_is_reported_as_one(scene, tmp_path, monkeypatch, nerg):
     def broken(*args, **options):
         raise RuntimeError(
             'in a plugin:\nTraceback (most recent call last):\n  File "x.py", line 1, in f\nTypeError: no len()'
@@ -130,7 +130,7 @@ def test_one_thread_is_enough(scene, tmp_path, name):
 
 
 @pytest.mark.parametrize("name", ["out.exr", "out.png"])
-def test_a_picture_takes_the_place_of_another_whole(scene, tmp_path, monkeypatch, nerg, render, name):
+def test_an_image_replaces_another_atomically(scene, tmp_path, monkeypatch, nerg, render, name):
     out = tmp_path / name
     out.write_bytes(b"what was there")
     before = set(tmp_path.iterdir())
@@ -146,7 +146,7 @@ def test_a_picture_takes_the_place_of_another_whole(scene, tmp_path, monkeypatch
 
 
 @pytest.mark.parametrize("name", ["out.exr", "out.png"])
-def test_ctrl_c_ends_it_and_leaves_nothing(tmp_path, name):
+def test_ctrl_c_ends_a_rendering_and_leaves_no_file(tmp_path, name):
     folder = tmp_path / "pictures"
     large = tmp_path / "large.xml"
     large.write_text(SCENE.replace('value="16"', 'value="3000"').replace('value="8"', 'value="3000"'))
@@ -164,7 +164,7 @@ def test_memory_changes_no_pixel(rgb, scene, render, memory):
     assert np.array_equal(np.array(render("a.png", *options)), np.array(render("b.png", "--spp", 3)))
 
 
-def test_one_piece_beyond_the_memory_is_said(tmp_path, nerg):
+def test_a_tile_beyond_the_memory_limit_is_reported(tmp_path, nerg):
     other = tmp_path / "other.xml"
     other.write_text(SCENE.replace('type="independent"', 'type="multijitter"'))
     ended = nerg("render", other, "-o", tmp_path / "a.exr", *LLVM, "--memory", 1e-3)
@@ -174,7 +174,7 @@ def test_one_piece_beyond_the_memory_is_said(tmp_path, nerg):
     assert ended.code == 2 and "--memory" in ended.err
 
 
-# ---- nerg demo, the whole way: on random fields always, on the store's own where they are present ----
+# ---- nerg demo, end to end: on random fields always, on the store's own where they are present ----
 
 PICTURES = {"occlusion.png", "gaze.png", "gaze_sphere.png", "depth.png", "visibility.png", "color.png", "scene.exr"}
 NAMES = PICTURES | {"heatmap.glb", "report.html", "aoi.csv", "run.json"}
@@ -204,7 +204,7 @@ def test_the_demo_writes_and_names_everything(rgb, standins, tmp_path, nerg):
     # Every object of the store, with its share of what this observer looks at.
     shares = {row["object"]: float(row["observer_share"]) for row in csv.DictReader((out / "aoi.csv").open())}
     assert len(shares) == 30 and all(share >= 0 for share in shares.values()) and 0 < sum(shares.values()) < 1.01
-    # Inputs and the seed stand in every picture, and rays and people in the page.
+    # Each image records inputs and seed; the page records rays and participants.
     header = (out / "heatmap.glb").read_bytes()
     assert header[:4] == b"glTF" and report["inputs"]["shoppers.safetensors"].encode() in header
     for name in PICTURES:
@@ -216,7 +216,7 @@ def test_the_demo_writes_and_names_everything(rgb, standins, tmp_path, nerg):
 
 
 @pytest.mark.nightly
-def test_equal_seeds_equal_files_of_the_demo(rgb, standins, tmp_path):
+def test_equal_seeds_give_equal_demo_files(rgb, standins, tmp_path):
     def outputs(name, seed):
         options = DemoOptions(defaults=standins, seed=seed, mode="llvm_ad_rgb", width=36, spp=1)
         return demo.make_demo(tmp_path / name, options).report["outputs"]
@@ -235,7 +235,7 @@ def test_a_missing_checkpoint_names_the_command(standins, tmp_path, nerg, name):
 
 
 @pytest.mark.nightly
-def test_the_store_itself(rgb):
+def test_the_committed_store_renders_with_occlusion(rgb):
     """Committed checkpoints: the shelf hides what lies behind it, and gaze is what occlusion leaves of it."""
     missing = [f for f in demo.CHECKPOINTS.values() if not (demo.find_store_scene().parent / f).is_file()]
     if missing:
@@ -255,11 +255,11 @@ def test_the_store_itself(rgb):
     assert 0.7 < demo.sphere_integral(sphere) < 1.3  # a density over the sphere
 
 
-def test_the_demo_s_evaluation_is_of_the_field_that_it_carries(standins):
+def test_the_demo_evaluation_matches_its_field(standins):
     store = demo.find_store_scene()
     gaze = store.parent / demo.CHECKPOINTS["gaze"]
     assert demo.find_evaluation(store, gaze) == [store.parent / "gaze.json"], "run make --stage evaluation"
-    # And of no other one.
+    # The evaluation does not match another field.
     assert demo.find_evaluation(store, Path(standins["gaze"])) == []
     results = read_results(store.parent / "gaze.json")
     verdict = compute_verdict(results.rows, results.split, results.num_participants, results.num_positions)
@@ -267,7 +267,7 @@ def test_the_demo_s_evaluation_is_of_the_field_that_it_carries(standins):
     assert verdict.sentence.startswith("Better than position-blind, the strongest baseline, and than nearest rays")
 
 
-def test_ctrl_c_ends_the_demo_and_leaves_nothing(standins, tmp_path):
+def test_ctrl_c_ends_the_demo_and_leaves_no_file(standins, tmp_path):
     large = ["demo", "--out", tmp_path / "out", "--width", 2000, "--spp", 1000, *LLVM, *defines(standins)]
     said, code = interrupt(large, b"camera")
     assert code == 130 and b"Interrupted." in said
@@ -285,7 +285,7 @@ def test_help_names_every_kind_of_figure_and_its_options(nerg):
     assert "-D" not in nerg("draw", "sheet", "--help").out
 
 
-def test_a_difference(nerg, tmp_path):
+def test_a_difference_of_two_images_is_drawn(nerg, tmp_path):
     for k in (1.0, 2.0):
         write_exr(tmp_path / f"{k:.0f}.exr", {"gaze.Y": np.full((20, 30), k, np.float32)})
     out = tmp_path / "new" / "a.svg"
@@ -293,7 +293,7 @@ def test_a_difference(nerg, tmp_path):
     assert ended.code == 0 and f"Wrote {out}" in ended.out and b"<svg" in out.read_bytes()
 
 
-def test_values_for_the_scene_of_a_figure(nerg, tmp_path):
+def test_a_figure_accepts_scene_parameters(nerg, tmp_path):
     walk().save(tmp_path / "rays.npz")
     text = WALLS_SCENE.replace('<scene version="3.0.0">', '<scene version="3.0.0"><default name="tall" value="1"/>')
     (tmp_path / "scene.xml").write_text(text.replace('y="0.2" z="1"', 'y="0.2" z="$tall"'))
@@ -356,7 +356,7 @@ def test_rays_on_a_room_without_a_wall(nerg, tmp_path):
     assert "25.00% meets no surface" in ended.out and json.loads((tmp_path / "a.json").read_text())["escaped"] == 0.25
 
 
-def test_attention_is_counted(nerg, tmp_path):
+def test_stats_writes_attention_tables(nerg, tmp_path):
     write_place(tmp_path, gaze=False)
     people().save(tmp_path / "rays.npz")
     line = "stats {o}/rays.npz {o}/scene.xml --areas {o}/areas.json -o {o}/out --window early=0,8 --resamples 199"
@@ -366,7 +366,7 @@ def test_attention_is_counted(nerg, tmp_path):
 
 
 @pytest.mark.nightly
-def test_a_quick_study(tmp_path, nerg):
+def test_a_quick_study_runs(tmp_path, nerg):
     out = tmp_path / "new"
     ended = nerg(*"study slab --quick --width 24 --height 16 -m llvm_ad_rgb --out".split(), out)
     assert not ended.code
@@ -393,7 +393,7 @@ def test_a_quick_study(tmp_path, nerg):
 # ---- nerg jobs, nerg worker ----
 
 
-def test_a_store_is_told_of_and_swept(tmp_path, nerg):
+def test_a_store_is_summarised_and_cleaned(tmp_path, nerg):
     store = Store(tmp_path / "store")
     for count in (3, 1):
         list(run_plan(works.make_plan(count, what="a film"), store, LocalEngine()))
@@ -439,7 +439,7 @@ def test_links_are_followed_only_if_allowed(photos, nerg, monkeypatch, tmp_path)
     assert ended.code == 1 and "no 3 of the 3 images" in ended.err
 
 
-def test_ctrl_c_ends_poses_and_leaves_nothing(photos, nerg, monkeypatch, tmp_path):
+def test_ctrl_c_ends_poses_and_leaves_no_file(photos, nerg, monkeypatch, tmp_path):
     monkeypatch.setattr(posing, "reconstruct", lambda *args: signal.raise_signal(signal.SIGINT))
     ended = nerg("poses", photos, "-o", tmp_path / "capture")
     assert ended.code == 130 and "Interrupted" in ended.err and os.listdir(tmp_path) == ["photos"]

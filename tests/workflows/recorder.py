@@ -1,4 +1,4 @@
-"""A reporter that keeps what it is told."""
+"""A reporter that records its messages."""
 
 from __future__ import annotations
 
@@ -19,5 +19,5 @@ class Recorder:
         self.steps.append((share, text))
 
     def share_at(self, text: str) -> float:
-        """The share that was told with ``text`` last."""
+        """Return the last progress fraction reported with ``text``."""
         return {t: share for share, t in self.steps}[text]

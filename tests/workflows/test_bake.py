@@ -81,7 +81,7 @@ def rays(n=40, people=2):
     return Rays(np.arange(n) / 10, np.arange(n) % people, tuple("abc"[:people]), np.full((n, 3), 1.5), d, np.ones(n))
 
 
-def test01_the_field_of_people_where_they_were(rgb, room):
+def test01_a_field_is_baked_at_recorded_positions(rgb, room):
     recorder = Recorder()
     options = BakeOptions(gaze=GAZE, num_observers=2, max_angle=6.0, max_edge=2.0, mode="llvm_ad_rgb")
     result = bake(room, (), options, recorder, rays=rays())
@@ -91,18 +91,18 @@ def test01_the_field_of_people_where_they_were(rgb, room):
     assert any("unaccounted" in m for m in recorder.messages) and recorder.steps[0][0] == 0
 
 
-def test02_rays_alone_in_shares_and_seconds(rgb, room):
+def test02_rays_are_baked_in_fractions_and_seconds(rgb, room):
     share = bake(room, (), BakeOptions(cone=0.0, max_edge=2.0, mode="llvm_ad_rgb"), rays=rays())
     assert share.summary["source"] == "rays" and np.isclose(share.on_surface, 1) and share.escaped == 0
     seconds = bake(room, (), BakeOptions(cone=0.0, max_edge=2.0, unit="seconds", mode="llvm_ad_rgb"), rays=rays())
     # Of two people twenty rays each, 0.2 seconds apart.
     assert np.isclose((seconds.density * seconds.mesh.vertex_area).sum(), 8.0)
     assert np.allclose(seconds.density, 8 * share.density)
-    # All of it lies on the wall that is looked at.
+    # All attention is on the wall.
     assert np.isclose(share.share[(share.mesh.corners[:, :, 0] == 8).all(axis=1)].sum(), 1)
 
 
-def test03_units_of_the_place_are_not_metres(rgb, tmp_path):
+def test03_scene_units_are_converted_to_metres(rgb, tmp_path):
     """Twice as many units a metre: the same share on the same square metres."""
     (tmp_path / "align.json").write_text("[[2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]]")
     v, f = box((0, 0, 0), (8, 6, 3))
@@ -114,7 +114,7 @@ def test03_units_of_the_place_are_not_metres(rgb, tmp_path):
     assert np.allclose(first.density, second.density, rtol=1e-4, atol=1e-6)
 
 
-def test06_what_is_not_asked_for_is_not_made(rgb, room, monkeypatch):
+def test06_unused_outputs_are_not_computed(rgb, room, monkeypatch):
     """No smoothing, no Laplacian; no texture, no xatlas."""
     from nerg_mi.surfaces import laplacian
     from nerg_mi.workflows import bake as outputs
@@ -129,7 +129,7 @@ def test06_what_is_not_asked_for_is_not_made(rgb, room, monkeypatch):
         bake(room, (), BakeOptions(max_edge=3.0, smooth=0.1, mode="llvm_ad_rgb"), rays=rays())
 
 
-def test07_a_mesh_in_millimetres_is_told(rgb, tmp_path):
+def test07_a_mesh_in_millimetres_causes_a_warning(rgb, tmp_path):
     v, f = box((0, 0, 0), (8000, 6000, 3000))
     write_columns(tmp_path / "mm.ply", dict(zip("xyz", v.T)), f)
     (tmp_path / "align.json").write_text("[[1e3,0,0,0],[0,1e3,0,0],[0,0,1e3,0],[0,0,0,1]]")
@@ -142,7 +142,7 @@ def test07_a_mesh_in_millimetres_is_told(rgb, tmp_path):
     assert not aligned_recorder.warnings
 
 
-# ---- What is asked for, and what contradicts it ----
+# ---- Options and contradictions ----
 
 
 GAZE_FILE, RAYS_FILE = Path("gaze.safetensors"), Path("rays.npz")
@@ -157,7 +157,7 @@ GAZE_FILE, RAYS_FILE = Path("gaze.safetensors"), Path("rays.npz")
         ({}, True, "field"),
     ],
 )
-def test01_whose_gaze(options, with_gaze, source):
+def test01_the_source_of_gaze_is_selected(options, with_gaze, source):
     assert select_source(BakeOptions(**options), None, with_gaze) == source
 
 
@@ -171,7 +171,7 @@ def test01_whose_gaze(options, with_gaze, source):
         ({"rays": RAYS_FILE, "observer": (0.0, 0.0, 0.0)}, "--observer and --observer-file need a gaze"),
     ],
 )
-def test02_what_contradicts_itself(options, said):
+def test02_contradictory_options_are_refused(options, said):
     with pytest.raises(NergError, match=said):
         select_source(BakeOptions(**options), None)
 
@@ -220,7 +220,7 @@ def test01_ply_and_glb_are_the_same_to_trimesh(baked):
     )
     values = ply.metadata["_ply_raw"]["vertex"]["data"]["value"]
     assert np.allclose(np.ravel(values), result.density, rtol=1e-6)
-    # Of a mesh with a material trimesh keeps the colours beside it; they are linear, those of a PLY are as shown.
+    # Of a mesh with a material trimesh stores the colours separately; they are linear, those of a PLY are as shown.
     (inner,) = trimesh.load(folder / "a.glb", process=False).geometry.values()
     linear = np.array(inner.visual.vertex_attributes["color"], float)[:, :3] / 65535
     shown = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
@@ -229,7 +229,7 @@ def test01_ply_and_glb_are_the_same_to_trimesh(baked):
     assert len(np.unique(ply.visual.vertex_colors, axis=0)) > 20
 
 
-def test02_the_table_adds_up_and_the_summary_says_what_was_done(baked):
+def test02_the_table_adds_up_and_the_summary_records_the_options(baked):
     folder, result = baked
     rows = list(csv.DictReader(io.StringIO((folder / "a.csv").read_text())))
     assert (
@@ -252,7 +252,7 @@ def test02_the_table_adds_up_and_the_summary_says_what_was_done(baked):
     assert b"comment nerg_mi" in (folder / "a.ply").read_bytes()[:4000]
 
 
-def test03_a_texture(baked, tmp_path):
+def test03_a_texture_is_written(baked, tmp_path):
     pytest.importorskip("xatlas", reason="xatlas is not installed")
     folder, _ = baked
     rays = Rays([0.0, 0.1], [0, 0], ("a",), np.ones((2, 3)), np.array([[1.0, 0, 0], [0, 1, 0]]), np.ones(2))
@@ -261,11 +261,11 @@ def test03_a_texture(baked, tmp_path):
     loaded = trimesh.load(tmp_path / "t.glb", process=False, force="mesh")
     picture = np.asarray(loaded.visual.material.baseColorTexture)
     assert picture.shape[:2] == (128, 128) and len(loaded.faces) == 12
-    # Where somebody looks it is brighter than where nobody does.
+    # Surfaces with gaze are brighter than surfaces without.
     assert picture[..., 0].max() > picture[..., 0][picture[..., 0] > 0].min() + 50
 
 
-def test04_normals_and_textures_that_go_nowhere(tmp_path):
+def test04_normals_and_unsupported_textures(tmp_path):
     mesh = joined(box((0, 0, 0), (1, 1, 1)))
     normals = vertex_normals(mesh)
     # Of a cube's corners they point along the diagonals.
@@ -304,7 +304,7 @@ def parts(folder, reporter=None, **options):
 
 
 def made(recorder):
-    """How many parts were not kept from before."""
+    """Return the number of parts that were computed, not read from the store."""
     return int(recorder.steps[-1][1].split()[0]) - int(recorder.steps[0][1].split()[0])
 
 
@@ -319,7 +319,7 @@ def equal(one, other):
 
 @pytest.mark.usefixtures("engine")
 @pytest.mark.nightly
-def test_two_processes_give_the_sums_of_one_and_what_is_kept_is_not_made_again(tmp_path):
+def test_two_processes_give_equal_sums_and_reuse_stored_parts(tmp_path):
     scene = BakeScene(
         ROOM, gaze=GAZE, gaze_settings=GazeSumSettings(max_angle=0.5, directions=1024), ray_settings=OF_RAYS
     )
@@ -334,7 +334,7 @@ def test_two_processes_give_the_sums_of_one_and_what_is_kept_is_not_made_again(t
 
 
 @pytest.mark.usefixtures("engine")
-def test_a_part_depends_on_what_it_reads_and_on_nothing_else(tmp_path):
+def test_a_part_depends_only_on_its_inputs(tmp_path):
     def bake_rays(scene, who):
         recorder = Recorder()
         sum_in_parts(scene, [who], parts(tmp_path, recorder), "a bake")
@@ -353,7 +353,7 @@ def test_a_part_depends_on_what_it_reads_and_on_nothing_else(tmp_path):
 
 
 @pytest.mark.usefixtures("engine")
-def test_files_that_were_sent_serve_as_those_that_lie_there(tmp_path):
+def test_transferred_files_give_equal_sums(tmp_path):
     """A worker of another machine has what it was sent in a folder of its own."""
     plain = wall(0.0, 0.4, 0.05)
     write_ply_splats(tmp_path / "wall.ply", plain)
@@ -374,7 +374,7 @@ def test_files_that_were_sent_serve_as_those_that_lie_there(tmp_path):
 
 @pytest.mark.usefixtures("engine")
 @pytest.mark.nightly
-def test_two_processes_give_the_sums_of_splats(tmp_path):
+def test_two_processes_give_equal_sums_of_splats(tmp_path):
     plain = wall(0.0, 0.4, 0.05)
     write_ply_splats(tmp_path / "wall.ply", plain)
     fields.gaze(tmp_path / "gaze.safetensors")
@@ -385,7 +385,7 @@ def test_two_processes_give_the_sums_of_splats(tmp_path):
 
 
 @pytest.mark.usefixtures("engine")
-def test_halves_are_of_people():
+def test_halves_split_participants():
     n = 40
     rays = Rays(
         np.arange(n) / 10, np.arange(n) % 4, tuple("abcd"), np.ones((n, 3)), np.eye(3)[np.arange(n) % 3], np.ones(n)
@@ -397,7 +397,7 @@ def test_halves_are_of_people():
 
 
 @pytest.mark.usefixtures("engine")
-def test_the_files_of_a_bake_have_the_same_bytes(tmp_path):
+def test_baked_files_are_byte_identical_in_parts(tmp_path):
     v, f = box((0, 0, 0), (8, 6, 3))
     write_columns(tmp_path / "room.ply", dict(zip("xyz", v.T)), f)
     n = 1000
@@ -417,7 +417,7 @@ def test_the_files_of_a_bake_have_the_same_bytes(tmp_path):
 # ---- Parts of a bake: the same wherever and however often they are computed ----
 
 
-def test01_parts_are_cut_alike_and_a_pickled_scene_gives_the_same(rgb, monkeypatch):
+def test01_parts_are_reproducible_and_scenes_can_be_pickled(rgb, monkeypatch):
     monkeypatch.setattr(bake_chunks, "RAYS", 300)
     scene = BakeScene(ROOM, ray_settings=RaySettings(cone_sigma=0.03, rays_per_cone=4))
     parts = list(split_into_parts(directed(1000)))
@@ -438,12 +438,12 @@ def test02_observers_of_a_field(rgb):
     assert 0.5 < sums.on_surface / sums.weight < 1.5 and sums.count == 1 and abs(sums.escaped) < 1e-6
 
 
-def test03_without_a_field_nobody_looks(rgb):
+def test03_without_a_field_there_are_no_observers(rgb):
     with pytest.raises(NergError, match="there is no gaze field"):
         BakeScene(ROOM).sums(WeightedObservers(np.ones((1, 3)), np.ones(1)))
 
 
-# ---- Who looks ----
+# ---- Observers ----
 
 
 TURNED = Similarity(np.array([[0, -2, 0, 1], [2, 0, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1.0]]))
@@ -455,7 +455,7 @@ def rays_lookers():
     return Rays(t, np.zeros(n), ("a",), np.stack([t, 0 * t, 0 * t + 1.6], 1), np.tile([1.0, 0, 0], (n, 1)), np.ones(n))
 
 
-def test01_a_path(tmp_path):
+def test01_an_observer_file_is_read(tmp_path):
     (tmp_path / "a.csv").write_text("x,y,z\n1,2,3\n4,5,6\n")
     observers = read_observer_file(tmp_path / "a.csv")
     assert observers.positions.tolist() == [[1, 2, 3], [4, 5, 6]] and observers.weights.tolist() == [0.5, 0.5]
@@ -476,13 +476,13 @@ def test01_a_path(tmp_path):
         ("x,y,z,weight\n1,2,3,-1\n", "negative"),
     ],
 )
-def test02_paths_that_are_none(tmp_path, text, said):
+def test02_invalid_observer_files_are_refused(tmp_path, text, said):
     (tmp_path / "a.csv").write_text(text)
     with pytest.raises(NergError, match=said):
         read_observer_file(tmp_path / "a.csv")
 
 
-def test03_people_stand_in_the_place():
+def test03_observers_are_in_scene_coordinates():
     recorder = Recorder()
     observers = make_observers(BakeOptions(num_observers=4), rays_lookers(), TURNED, recorder)
     assert (
@@ -490,7 +490,7 @@ def test03_people_stand_in_the_place():
         and np.allclose(observers.positions[:, 0], 1)
         and np.allclose(observers.positions[:, 2], 3.2)
     )
-    # Metres are told, of which the place has two units each.
+    # Messages are in metres; the scene has two units per metre.
     assert (
         f"{observers.rms_distance / 2:.2f} m (root mean square)" in recorder.messages[0]
         and "1 participants in 20 samples" in recorder.messages[0]
@@ -500,7 +500,7 @@ def test03_people_stand_in_the_place():
     assert np.isclose(who.weights.sum(), 1)
 
 
-def test04_one_observer_or_nobody():
+def test04_one_observer_is_required():
     assert make_observers(BakeOptions(observer=(1, 2, 3)), None, TURNED, Recorder()).positions.tolist() == [[1, 2, 3]]
     for options, said in (
         (BakeOptions(), "there is no observer: give --observer x,y,z, an"),
@@ -528,7 +528,7 @@ SCENE = """<scene version="3.0.0">
 """
 
 
-def test01_a_mesh_is_cut_as_finely_as_asked_in_metres(rgb, tmp_path):
+def test01_a_mesh_is_refined_to_an_edge_length_in_metres(rgb, tmp_path):
     v, f = box((0, 0, 0), (2, 2, 2))
     write_columns(tmp_path / "a.ply", dict(zip("xyz", v.T)), np.concatenate([f, f[:2, ::-1]]))
     recorder = Recorder()
@@ -540,7 +540,7 @@ def test01_a_mesh_is_cut_as_finely_as_asked_in_metres(rgb, tmp_path):
     assert 50_000 < len(refine_target(target, None, 1.0).mesh.faces) < 250_000
 
 
-def test02_shapes_of_a_scene_receive_or_hide(rgb, tmp_path):
+def test02_shapes_of_a_scene_receive_gaze_or_occlude(rgb, tmp_path):
     (tmp_path / "a.xml").write_text(SCENE.format(more=""))
     both = read_target(tmp_path / "a.xml", (), 16, ns, Recorder())
     assert both.names == ("sign", "wall") and np.bincount(both.shape).tolist() == [12, 2]
@@ -556,7 +556,7 @@ def test02_shapes_of_a_scene_receive_or_hide(rgb, tmp_path):
         read_target(tmp_path / "c.xml", (), 16, ns, Recorder())
 
 
-def test03_a_field_gives_its_surface(rgb, tmp_path):
+def test03_the_surface_of_a_field_is_extracted(rgb, tmp_path):
     pytest.importorskip("skimage", reason="scikit-image is not installed")
     fields.radiance(tmp_path / "f.safetensors")
     target = read_target(tmp_path / "f.safetensors", (), 8, ns, Recorder())
@@ -575,7 +575,7 @@ def scene(tmp_path, rgb):
     return SplatScene(tmp_path / "wall.ply", len(plain), ray_settings=OF_RAYS)
 
 
-def test01_a_pickled_scene_gives_the_same_and_another_file_is_another_scene(scene):
+def test01_scenes_can_be_pickled_and_are_identified_by_file(scene):
     rays = falling(100, 0.5)
     first = scene.sums(rays)
     again = pickle.loads(pickle.dumps(scene))
@@ -586,12 +586,12 @@ def test01_a_pickled_scene_gives_the_same_and_another_file_is_another_scene(scen
     assert not np.array_equal(moved.sums(rays).face_sums, first.face_sums)
 
 
-def test02_without_a_field_nobody_looks(scene):
+def test02_without_a_field_there_are_no_observers(scene):
     with pytest.raises(NergError, match="there is no gaze field"):
         scene.sums(WeightedObservers(np.ones((1, 3)), np.ones(1)))
 
 
-def test03_how_far_apart_two_ideas_of_a_surface_may_be(rgb):
+def test03_the_surface_tolerance_of_splats(rgb):
     assert np.isclose(make_splat_geometry(wall(0.0, 0.2)).tolerance, 2 * 1e-3)
 
 
@@ -615,7 +615,7 @@ def bake_place(place, output="out.ply", reporter=None, **changes):
     return bake_splats(place / "place.ply", [place / output], options, reporter or Recorder())
 
 
-def test01_each_gaussian_has_what_the_field_says_and_all_else_is_kept(rgb, place):
+def test01_each_gaussian_gets_its_attention_and_keeps_other_columns(rgb, place):
     recorder = Recorder()
     result = bake_place(place, reporter=recorder)
     original, back = read_splats(place / "place.ply"), read_splats(place / "out.ply")
@@ -643,7 +643,7 @@ def test01_each_gaussian_has_what_the_field_says_and_all_else_is_kept(rgb, place
     assert np.abs(hot - apply_colormap("inferno", np.ones(1))[0]).max() < 0.1
 
 
-def test02_people_on_a_path_and_places_in_other_units(rgb, place):
+def test02_observer_paths_and_other_units(rgb, place):
     (place / "walk.csv").write_text("x,y,z,weight\n0,0,-3,1\n0,0,-3,3\n0,3,0,0\n")
     (place / "align.json").write_text("[[2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]]")
     one = bake_place(place)
@@ -659,7 +659,7 @@ def test02_people_on_a_path_and_places_in_other_units(rgb, place):
         ({"source": "field", "gaze": None}, "--field SPLATS"),
     ],
 )
-def test03_what_splats_have_not(rgb, place, options, said):
+def test03_unsupported_options_of_splats_are_refused(rgb, place, options, said):
     bake_options = BakeOptions(**({"gaze": place / "gaze.safetensors"} | OPTIONS | options))
     with pytest.raises(NergError, match=said):
         bake_splats(place / "place.ply", [place / "out.ply"], bake_options)
@@ -676,7 +676,7 @@ def make_wall_rays(n=600):
     return Rays(np.arange(n) / 10, np.arange(n) % 2, ("a", "b"), np.tile([0.0, 0, -1], (n, 1)), d, np.ones(n))
 
 
-def test04_rays_themselves_in_parts_and_in_one_go(rgb, tmp_path, monkeypatch):
+def test04_rays_give_equal_files_with_and_without_parts(rgb, tmp_path, monkeypatch):
     """Shares, seconds, halves, smoothed; the files are the same to the byte."""
     monkeypatch.setattr(bake_chunks, "RAYS", 200)
     write_ply_splats(tmp_path / "wall.ply", wall(0.0, 1.0, 0.03, 0.0005))
@@ -702,11 +702,11 @@ def test04_rays_themselves_in_parts_and_in_one_go(rgb, tmp_path, monkeypatch):
     )
 
 
-def test05_a_field_smoothed_and_in_parts(rgb, place):
+def test05_a_smoothed_field_in_parts(rgb, place):
     (place / "walk.csv").write_text("x,y,z\n0,0,-3\n0,1,-3\n1,0,-3\n")
     common = {"observer": None, "path": place / "walk.csv"}
     one, parts = (bake_place(place, "one.ply", **common), bake_place(place, "two.ply", store=place / "store", **common))
     assert np.array_equal(one.attention, parts.attention)
-    # Balls that are apart and turned anyhow have nobody to share with.
+    # Separate balls have no neighbours to share attention with.
     smoothed = bake_place(place, "three.ply", smooth=0.01, **common)
     assert np.median(np.abs(smoothed.attention / one.attention - 1)) < 0.01

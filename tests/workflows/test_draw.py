@@ -59,7 +59,7 @@ def test_colour_values_and_mask(tmp_path):
     assert read_stored(write(tmp_path / "b.exr"), find_channel_overlay("gaze.Y")).mask.all()
 
 
-def test_what_gaze_rests_on(tmp_path):
+def test_the_basis_of_the_gaze_is_read(tmp_path):
     text = {"gaze.basis": "made of 5 rays of 2 people", "kde.basis": "made of 3 rays of 1 person"}
     path = write(tmp_path / "a.exr", text, **{"kde.Y": GAZE, "depth.T": GAZE})
     bases = [read_stored(path, find_channel_overlay(channel)).support_note for channel in ("gaze", "kde.Y", "depth")]
@@ -71,7 +71,7 @@ def test_what_gaze_rests_on(tmp_path):
     assert shared_note("ab", ["x", ""]) == "a: x; b: unknown"
 
 
-def test_what_is_refused(tmp_path):
+def test_unusable_exr_files_are_refused(tmp_path):
     with pytest.raises(NergError, match="it has R, G, B, gaze.Y"):
         read_stored(write(tmp_path / "a.exr"), find_channel_overlay("depth"))
     with pytest.raises(NergError, match="has no AOVs"):
@@ -81,7 +81,7 @@ def test_what_is_refused(tmp_path):
 # ---- Differences of two files ----
 
 
-def test_the_first_less_the_second(tmp_path):
+def test_the_second_image_is_subtracted_from_the_first(tmp_path):
     other = GAZE[::-1].copy()
     a = write(tmp_path / "a.exr", **{"opacity.Y": OPACITY})
     b = write(tmp_path / "b.exr", **{"opacity.Y": OPACITY, "gaze.Y": other})
@@ -93,7 +93,7 @@ def test_the_first_less_the_second(tmp_path):
     assert np.ptp(shown[~mask], axis=-1).max() < 1e-9 and figure.axes[0].get_title() == "a minus b"
 
 
-def test_difference_what_is_refused(tmp_path):
+def test_differences_that_cannot_be_drawn_are_refused(tmp_path):
     a = write(tmp_path / "a.exr")
     write_exr(tmp_path / "b.exr", {"gaze.Y": np.ones((3, 4), np.float32)})
     for files, options, said in (
@@ -101,7 +101,7 @@ def test_difference_what_is_refused(tmp_path):
         ([a, tmp_path / "b.exr"], {}, "8 x 6 and 4 x 3 pixels cannot be compared"),
         ([a, a], {"cmap": "viridis"}, "not a diverging colour map"),
         ([a, a], {"top": -1.0}, "--vmax must lie in"),
-        ([a, a, a], {}, "1 to 2 files, and 3 were given"),
+        ([a, a, a], {}, "takes 1 to 2 files, got 3"),
     ):
         with pytest.raises(NergError, match=said):
             draw("difference", files, **options)
@@ -110,7 +110,7 @@ def test_difference_what_is_refused(tmp_path):
 # ---- Contact sheets of files ----
 
 
-def test_one_scale_for_all(tmp_path):
+def test_all_images_share_one_scale(tmp_path):
     bright = np.where(OPACITY > 0.5, 3 * GAZE, 100)
     files = [
         write(tmp_path / "first.exr", **{"opacity.Y": OPACITY}),
@@ -126,7 +126,7 @@ def test_one_scale_for_all(tmp_path):
     assert "no data" in [t.get_text() for a in figure.axes for t in a.texts]
 
 
-def test_pictures_as_they_are(rgb, tmp_path):
+def test_images_are_shown_unchanged(rgb, tmp_path):
     write_png(tmp_path / "a.png", COLOR)
     write(tmp_path / "b.exr")
     figure = draw("sheet", [tmp_path / "a.png", tmp_path / "b.exr"], tmp_path / "out.png", columns=2)
@@ -136,14 +136,14 @@ def test_pictures_as_they_are(rgb, tmp_path):
     assert (tmp_path / "out.png").is_file()
 
 
-def test_nothing_to_take_a_scale_from(tmp_path):
+def test_a_sheet_without_values_needs_a_scale(tmp_path):
     dark = write(tmp_path / "a.exr", **{"gaze.Y": 0 * GAZE})
     with pytest.raises(NergError, match='"gaze" is 0'):
         draw("sheet", dark, overlay="gaze")
     assert draw("sheet", dark, overlay="gaze", top=1.0).axes
 
 
-def test_what_the_pictures_rest_on_is_said_below(tmp_path):
+def test_the_basis_of_the_gaze_is_printed_below_the_images(tmp_path):
     texts = [{"gaze.basis": f"made of {n} rays of 2 people"} for n in (5, 6)]
     a, b = (write(tmp_path / f"{name}.exr", text) for name, text in zip("ab", texts))
     said = lambda *files: {t.get_text().replace("\n", " ") for t in draw("sheet", list(files), overlay="gaze").texts}
@@ -175,7 +175,7 @@ def bar(figure):
     return next(axes for axes in figure.axes if axes.get_ylabel())
 
 
-def test_values_lie_where_they_are(tmp_path):
+def test_values_are_drawn_at_their_positions(tmp_path):
     """From 2 above, a view of 90 degrees is 4 wide: the square fills the middle half, brighter to the right."""
     path = write_surface(tmp_path / "a.ply", [0, 4, 4, 0])
     figure = draw("surface", path, mode="llvm_ad_rgb", width=80, height=80, top=4.0, **ABOVE)
@@ -191,13 +191,13 @@ def test_values_lie_where_they_are(tmp_path):
     assert bar(figure).get_ylabel().replace("\n", " ") == "share of gaze per square metre [1/m²]"
 
 
-def test_what_is_above_is_left_out_and_all_is_seen_at_first(tmp_path):
+def test_geometry_above_the_cut_is_hidden_and_the_default_view_shows_everything(tmp_path):
     lid = SQUARE + [0, 0, 1]
     path = write_surface(tmp_path / "a.ply", [1] * 4 + [9] * 4, np.concatenate([SQUARE, lid]))
     size = {"width": 60, "height": 60, "top": 9.0, "mode": "llvm_ad_rgb"}
     level = {"up": (0.0, 0.0, 1.0)}
     closed, opened = (
-        picture(draw("surface", path, **size, **(ABOVE | more))) for more in (level, level | {"below": 0.5})
+        picture(draw("surface", path, **size, **(ABOVE | changes))) for changes in (level, level | {"below": 0.5})
     )
     assert closed[30, 30].sum() > opened[30, 30].sum() + 0.3
     seen = picture(draw("surface", path, **size))
@@ -207,7 +207,7 @@ def test_what_is_above_is_left_out_and_all_is_seen_at_first(tmp_path):
     assert max(np.ptp(rows), np.ptp(columns)) > 50, "it fills the picture"
 
 
-def test_the_header_says_what_it_is_made_of(tmp_path):
+def test_the_header_records_the_inputs(tmp_path):
     comments = ("value: seconds per square metre [s/m²]", 'nerg_mi {"inputs": {"day.npz": "ab", "shop.ply": "cd"}}')
     path = write_surface(tmp_path / "a.ply", [1, 2, 3, 4], comments=comments)
     baked = read_baked(path)
@@ -218,7 +218,7 @@ def test_the_header_says_what_it_is_made_of(tmp_path):
     assert figure.texts[0].get_text().replace("\n", " ") == "data: day.npz, shop.ply"
 
 
-def test_surface_what_is_refused(tmp_path):
+def test_surfaces_that_cannot_be_drawn_are_refused(tmp_path):
     good = write_surface(tmp_path / "a.ply", [1, 2, 3, 4])
     columns = dict(zip("xyz", SQUARE.astype(np.float32).T))
     write_columns(tmp_path / "bare.ply", columns, np.array([[0, 1, 2]]))
@@ -233,14 +233,14 @@ def test_surface_what_is_refused(tmp_path):
         (damaged, {}, "is damaged"),
         (good, {"below": -1.0}, "--clip-above"),
         (good, {"camera": (0.0, 0, 2), "target": (0.0, 0, 5)}, "is in the image"),
-        (good, {"camera": (0.0, 0, 2), "target": (0.0, 0, 2)}, "elsewhere than --camera"),
+        (good, {"camera": (0.0, 0, 2), "target": (0.0, 0, 2)}, "must differ from --camera"),
         (good, {"up": (0.0, 0, 0)}, "--up must not be of length 0"),
     ):
         with pytest.raises(NergError, match=said):
             draw("surface", path, mode="llvm_ad_rgb", width=32, height=32, **options)
 
 
-def test_splats_show_their_gaze_themselves(tmp_path):
+def test_splats_are_drawn_with_their_gaze(tmp_path):
     write_ply_splats(tmp_path / "splats.ply", wall(0.0, 0.4, 0.05))
     with pytest.raises(NergError, match="holds Gaussian splats"):
         read_baked(tmp_path / "splats.ply")
@@ -249,7 +249,7 @@ def test_splats_show_their_gaze_themselves(tmp_path):
 # ---- Options that kinds of figures share ----
 
 
-def test_a_style_of_options():
+def test_wrong_scale_options_are_refused():
     assert ScaleOptions(cmap="viridis", log_decades=3, hatching=False).style("a") == Style("viridis", 3, False, "a")
     for options, said in (
         ({"top": 0.0}, "--vmax must lie in"),
@@ -289,12 +289,12 @@ def test_a_level_pose(rgb, target, up, level, heading):
     np.testing.assert_allclose(matrix[:3, 2], heading, atol=1e-6)
 
 
-def test_straight_down_there_is_some_heading(rgb):
+def test_a_camera_looking_straight_down_has_a_heading(rgb):
     matrix = np.array(upright_pose(camera(rgb, (0, 0, 3), (0, 0, 0), (0, 1, 0))).matrix, float)
     assert np.allclose(matrix[:3, :3] @ matrix[:3, :3].T, np.eye(3), atol=1e-6)
 
 
-def test_a_film_that_is_too_large():
+def test_a_film_that_is_too_large_is_refused():
     assert make_film(30, 20)["rfilter"] == {"type": "box"}
     with pytest.raises(NergError, match="4,096.*4,096"):
         make_film(4096, 4096)
@@ -321,7 +321,7 @@ def scene_sphere(tmp_path_factory):
     return write_scene(tmp_path_factory.mktemp("scene"))
 
 
-def test_it_shows_the_observers_gaze(rgb, scene_sphere):
+def test_the_sphere_shows_the_gaze_of_the_observer(rgb, scene_sphere):
     """Against the API's rays from the observer's eye, in directions of the panorama that it has turned itself."""
     import nerg_mi as nerg
 
@@ -341,14 +341,14 @@ def test_it_shows_the_observers_gaze(rgb, scene_sphere):
     hit = (seen.opacity.reshape(32, 64) > 0.9) & (seen.gaze.reshape(32, 64) > 0.3)
     void = seen.opacity.reshape(32, 64) < 0.1
     assert hit.sum() > 20 and void.sum() > 500
-    # The paper's pale hatching where nothing is met, dark or hot colours where something is.
+    # The paper's pale hatching where no surface is hit, and dark or saturated colours on surfaces.
     grey = np.ptp(shown, axis=-1) < 0.01
     rows = np.rint((np.arange(32) + 0.5) / 32 * 31).astype(int)
     inner = lambda m: m & np.roll(m, 1, 0) & np.roll(m, -1, 0) & np.roll(m, 1, 1) & np.roll(m, -1, 1)
     assert grey[inner(void)[rows]].mean() > 0.95 and grey[inner(hit)[rows]].mean() < 0.2
 
 
-def test_what_a_scene_figure_refuses(scene_sphere):
+def test_wrong_options_of_a_scene_figure_are_refused(scene_sphere):
     for options, said in (
         ({"projection": "globe"}, "choose one of mollweide, equirectangular"),
         ({"sensor": 7}, "has 1 sensor"),
@@ -367,7 +367,7 @@ def scene_triptych(tmp_path_factory):
     return write_scene(tmp_path_factory.mktemp("scene"))
 
 
-def test_three_pictures_with_one_scale(rgb, scene_triptych, monkeypatch):
+def test_a_triptych_has_one_scale(rgb, scene_triptych, monkeypatch):
     seen = []
     see = scenes.OpenScene.render
     monkeypatch.setattr(scenes.OpenScene, "render", lambda self, *of: seen.append(see(self, *of)) or seen[-1])
@@ -388,7 +388,7 @@ def test_three_pictures_with_one_scale(rgb, scene_triptych, monkeypatch):
     assert observer_view.values.max() > 0
 
 
-def test_a_scene_whose_camera_is_the_observer(rgb, scene_triptych, tmp_path):
+def test_a_scene_whose_camera_is_the_observer_is_refused(rgb, scene_triptych, tmp_path):
     text = scene_triptych.read_text()
     a, b = text.index("        <sensor name"), text.index('        <string name="aovs"')
     alone = scene_triptych.with_name("alone.xml")
@@ -409,7 +409,7 @@ WALLS_SCENE = """<scene version="3.0.0"><integrator type="nerg"/>
   <translate x="1" y="0.3" z="1"/></transform></shape></scene>"""
 
 
-def test_boxes(rgb, tmp_path):
+def test_boxes_are_cut_at_a_height(rgb, tmp_path):
     (tmp_path / "scene.xml").write_text(WALLS_SCENE)
     scene = rgb.load_file(str(tmp_path / "scene.xml"))
     plan = cut_scene(scene.integrator(), scene, LOW, HIGH, 1.2, 0.0)
@@ -451,7 +451,7 @@ def paths(figure):
     return [line for line in figure.axes[0].lines if line.get_linestyle() == "-" and len(line.get_xdata()) > 1]
 
 
-def test_paths_break_where_nobody_was_recorded(rays):
+def test_paths_break_at_recording_gaps(rays):
     figure = draw("floor", rays)
     assert figure.texts[0].get_text() == "45 rays of 2 people"
     assert [t.get_text() for t in figure.axes[0].get_legend().get_texts()] == ["Ada", "Bob"]
@@ -463,7 +463,7 @@ def test_paths_break_where_nobody_was_recorded(rays):
     assert np.all(first[:, 1] == 0) and np.all(second[:, 1] == 0.4) and len(first) == len(second) == 20
 
 
-def test_one_person_and_what_they_looked_at(rays):
+def test_one_participant_and_their_hit_points_are_drawn(rays):
     figure = draw("floor", rays, people="Bob", rays=3, views=2)
     lines, wedges = (c for c in figure.axes[0].collections if type(c).__name__ in ("LineCollection", "PatchCollection"))
     if type(lines).__name__ == "PatchCollection":
@@ -473,7 +473,7 @@ def test_one_person_and_what_they_looked_at(rays):
     assert len(wedges.get_paths()) == 2
 
 
-def test_over_a_place(rgb, rays, tmp_path):
+def test_a_floor_plan_is_drawn_over_geometry(rgb, rays, tmp_path):
     (tmp_path / "scene.xml").write_text(WALLS_SCENE)
     figure = draw("floor", rays, tmp_path / "a.svg", scene=str(tmp_path / "scene.xml"), mode="llvm_ad_rgb")
     assert len(figure.axes[0].images) == 1
@@ -484,7 +484,7 @@ def test_over_a_place(rgb, rays, tmp_path):
 @pytest.mark.parametrize(
     "options, said", [({"people": "Eve"}, "the rays have no person"), ({"cut": 0.0}, "--cut-height must be above")]
 )
-def test_what_a_floor_plan_refuses(rays, options, said):
+def test_wrong_options_of_a_floor_plan_are_refused(rays, options, said):
     with pytest.raises(NergError, match=said):
         draw("floor", rays, **options)
 
@@ -492,7 +492,7 @@ def test_what_a_floor_plan_refuses(rays, options, said):
 # ---- Figures drawn and written, with where they come from ----
 
 
-def test_a_file_says_where_it_comes_from(tmp_path):
+def test_a_figure_file_records_its_provenance(tmp_path):
     image = pytest.importorskip("PIL.Image", reason="Pillow is not installed")
     recorder = Recorder()
     a = write(tmp_path / "a.exr")
@@ -506,7 +506,7 @@ def test_a_file_says_where_it_comes_from(tmp_path):
     assert metadata["inputs"] == {"a.exr": hashlib.sha256(a.read_bytes()).hexdigest()} and metadata["seed"] is None
 
 
-def test_what_any_figure_refuses(tmp_path):
+def test_wrong_files_and_options_of_figures_are_refused(tmp_path):
     a = write(tmp_path / "a.exr")
     with pytest.raises(NergError, match="is not supported: choose a file name that ends"):
         draw("sheet", a, tmp_path / "b.pdf")
@@ -523,12 +523,12 @@ def test_what_any_figure_refuses(tmp_path):
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_each_tells_what_it_is(name):
+def test_each_kind_of_figure_has_a_description(name):
     kind = find_kind(name)
     assert kind.name == name and kind.summary.endswith(".") and kind.max_files >= 1
     assert kind.options() is not None and all(f.metadata["help"] for f in dataclasses.fields(kind.options))
 
 
-def test_one_that_is_not_there():
+def test_an_unknown_kind_of_figure_is_refused():
     with pytest.raises(NergError, match="choose one of sphere, triptych, floor, sheet,"):
         find_kind("pie")

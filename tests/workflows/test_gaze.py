@@ -45,7 +45,7 @@ TRAINING = GazeOptions(
 )
 
 
-def test_scores_stand_beside_the_baselines(trained, tmp_path):
+def test_scores_are_listed_with_the_baselines(trained, tmp_path):
     result = evaluate_gaze(trained / "gaze.safetensors", trained / "rays.npz", tmp_path / "eval", OPTIONS)
     names = [row["method"] for row in result.rows]
     assert names[0] == "gaze field" and "uniform" in names and "4,096 nearest rays" in names and result.split == "pos"
@@ -63,13 +63,13 @@ def test_scores_stand_beside_the_baselines(trained, tmp_path):
     assert "directions of equal area" in (tmp_path / "eval" / "gaze.md").read_text()
 
 
-def test_without_a_folder_nothing_is_written(trained):
+def test_without_an_output_folder_nothing_is_written(trained):
     before = set(trained.iterdir())
     result = evaluate_gaze(trained / "gaze.safetensors", Rays.load(trained / "rays.npz"), options=OPTIONS)
     assert result.files == [] and set(trained.iterdir()) == before and result.rows[0]["method"] == "gaze field"
 
 
-def test_what_cannot_be_scored_is_refused(trained, tmp_path):
+def test_unusable_inputs_are_refused(trained, tmp_path):
     gaze = trained / "gaze.safetensors"
     crowd(2000).save(tmp_path / "rays.npz")
     with pytest.raises(NergError, match=r"give the unchanged file rays.npz"):
@@ -81,7 +81,7 @@ def test_what_cannot_be_scored_is_refused(trained, tmp_path):
         evaluate_gaze(tmp_path / "gaze.safetensors", crowd(1000), options=OPTIONS)
 
 
-# ---- Folds: trained and scored by workers of which one is killed, kept, and the same in this process ----
+# ---- Folds: trained and scored in workers, of which one is killed, with stored parts, and in this process ----
 
 
 SMALL = {"geometry": "none", "folds": 2, "zones": 1, "positions": 3, "radius": 0.6, "probes": 8, "steps": 2}
@@ -89,7 +89,7 @@ SMALL |= {"directions": 128, "min_rays": 8, "splits": "both,pos", "threads": 1}
 
 
 class Killer(Recorder):
-    """Ends the first worker when the first fold is told of: it has another one in hand then."""
+    """Kills the first worker when the first fold is reported, while it computes another one."""
 
     def __init__(self, cluster):
         super().__init__()
@@ -101,7 +101,7 @@ class Killer(Recorder):
             self.cluster.workers[0].kill()
 
 
-def test_two_workers_of_which_one_is_killed_score_as_this_process_does(tmp_path, rgb):
+def test_two_workers_give_equal_scores_although_one_is_killed(tmp_path, rgb):
     pytest.importorskip("distributed", reason="dask is not installed (extra cluster)")
     crowd(3000).save(tmp_path / "rays.npz")
     with ClusterOfProcesses(tmp_path) as cluster:
@@ -116,7 +116,7 @@ def test_two_workers_of_which_one_is_killed_score_as_this_process_does(tmp_path,
         "both",
         "pos",
     }
-    # Each fold's zone is a group of its own, and all positions together are asked too.
+    # Each fold's zone is a group of its own, and all positions together form one more group.
     assert {row["group"].split()[0] for row in result.by_position} == {"0", "1", "2"}
     assert {row["split"] for row in result.uncertainty} == {"both", "pos", "anywhere"}
     assert result.calibration[0]["folds"] == 3 and 0 <= result.calibration[0]["80%"] <= 1
@@ -154,7 +154,7 @@ def folds_trained(monkeypatch):
     return seeds
 
 
-def test_folds_that_are_kept_are_not_trained_again(tmp_path, folds_trained):
+def test_stored_folds_are_not_trained_again(tmp_path, folds_trained):
     def go(rays=None, **changes):
         folds_trained.clear()
         recorder = Recorder()
@@ -169,7 +169,7 @@ def test_folds_that_are_kept_are_not_trained_again(tmp_path, folds_trained):
     assert (job.name, job.total, job.remaining) == (f"nerg eval folds {tmp_path / 'out'}", 2, 0)
 
 
-def test_what_is_plainly_wrong(tmp_path):
+def test_wrong_fold_options_are_refused(tmp_path):
     with pytest.raises(NergError, match="--splits"):
         evaluate_folds(crowd(300), tmp_path / "out", FoldOptions(**SMALL | {"splits": "both,time"}))
     with pytest.raises(NergError, match="give the geometry that the participants saw:"):
@@ -177,7 +177,7 @@ def test_what_is_plainly_wrong(tmp_path):
 
 
 @pytest.mark.nightly
-def test_the_spread_of_an_ensemble_is_judged_as_support_is(tmp_path):
+def test_ensemble_spread_is_evaluated_like_support(tmp_path):
     result = evaluate_folds(crowd(3000), tmp_path / "out", FoldOptions(**SMALL | {"ensemble": 2, "splits": "both"}))
     assert {(row["signal"], row["error"]) for row in result.uncertainty} >= {("support", "KLD"), ("spread", "KLD")}
     assert all(row["spread"] > 0 for row in result.by_position)
@@ -211,7 +211,7 @@ class Uniform:
 
 
 @pytest.mark.nightly
-def test_rows_are_made_once(tmp_path, monkeypatch):
+def test_rows_are_computed_once(tmp_path, monkeypatch):
     """With two variants, for the time that compiling takes; the trainers know all of them."""
     result = ablate(crowd(3000), tmp_path, ABLATION_OPTIONS)
     assert len(result.rows) == 4 and {r["seed"] for r in result.rows} == {0, 1}
@@ -241,7 +241,7 @@ def test_rows_are_made_once(tmp_path, monkeypatch):
         ({"geometry": None}, "one of --field FILE"),
     ],
 )
-def test_what_is_wrong_is_told_before_any_work(tmp_path, change, said):
+def test_wrong_options_are_refused_before_training(tmp_path, change, said):
     with pytest.raises(NergError, match=said):
         ablate(crowd(100), tmp_path / "new", replace(ABLATION_OPTIONS, **change))
     assert not (tmp_path / "new").exists()
@@ -257,7 +257,7 @@ def test_splats_have_no_features_of_a_radiance_field(tmp_path):
 
 
 @pytest.mark.parametrize("recipe, seeds, steps, refit", [("default", [0, 1], 2, True), ("small", [0], 5, False)])
-def test_only_quick_recipes_are_repeated(tmp_path, monkeypatch, recipe, seeds, steps, refit):
+def test_only_fast_recipes_are_repeated(tmp_path, monkeypatch, recipe, seeds, steps, refit):
     """And have steps of their own."""
     plans = {}
     row = {"test_KLD": 1.0, "test_CC": 0.5, "train_seconds": 1.0, "test_loss": 1.0, "train_loss": 1.0, "steps": 1}
@@ -277,7 +277,7 @@ def test_only_quick_recipes_are_repeated(tmp_path, monkeypatch, recipe, seeds, s
         assert s.validation_min_rays == 8
 
 
-def test_another_first_seed_holds_others_out(tmp_path, monkeypatch):
+def test_another_first_seed_changes_the_hold_out(tmp_path, monkeypatch):
     made = []
 
     def record_training(row, plan, path, bench):
@@ -300,7 +300,7 @@ def test_another_first_seed_holds_others_out(tmp_path, monkeypatch):
 # ---- How variants are planned, and the laws that are named ----
 
 
-def test_a_semantic_variant_is_planned_with_the_features_of_the_place(tmp_path):
+def test_a_semantic_variant_is_planned_with_the_features_of_its_geometry(tmp_path):
     import drjit.llvm.ad as ns
 
     from nerg_mi.train.geometry import load_field_geometry
@@ -323,7 +323,7 @@ def test_a_semantic_variant_is_planned_with_the_features_of_the_place(tmp_path):
             assert c.geometry == place.radiance.config.geometry
 
 
-def test_a_law_is_that_of_the_class_that_is_named():
+def test_a_recipe_selects_its_log_density_class():
     assert load_ground_truth("tests.workflows.test_gaze:Uniform")([[0, 0, 0]], [[1, 0, 0]] * 3).shape == (1, 3)
     for name in ("nowhere:Law", "tests.workflows.test_gaze:Nobody", "tests.workflows.test_gaze"):
         with pytest.raises(NergError, match="MODULE:CLASS"):
@@ -351,7 +351,7 @@ def trainings(monkeypatch):
 
 
 @pytest.mark.nightly
-def test_a_training_elsewhere_scores_as_one_here_and_is_kept(tmp_path, rgb, trainings):
+def test_a_training_in_a_worker_gives_equal_scores_and_is_stored(tmp_path, rgb, trainings):
     rays = crowd(3000)
     elsewhere = ablate(rays, tmp_path / "a", replace(ONE, scheduler="local:1"))
     assert trainings == []
@@ -371,14 +371,14 @@ def test_a_training_elsewhere_scores_as_one_here_and_is_kept(tmp_path, rgb, trai
 
 
 def looking(elevation: float, count: int = 200, seed: int = 0) -> Rays:
-    """Two people who look at about one ``elevation`` (radians), to all sides."""
+    """Two participants looking at one ``elevation`` (radians) in all azimuths."""
     rng = np.random.default_rng(seed)
     up, around = elevation + 0.1 * rng.normal(size=count), rng.uniform(0, 2 * np.pi, count)
     d = np.stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)], axis=1)
     return Rays(np.arange(count), np.arange(count) % 2, ("a", "b"), rng.normal(size=(count, 3)), d, np.ones(count))
 
 
-def test_its_checkpoint_is_the_density_of_other_places_anywhere(tmp_path, rgb):
+def test_a_prior_checkpoint_is_the_density_of_other_scenes(tmp_path, rgb):
     places = [looking(-0.6), looking(0.2, seed=1)]
     for k, rays in enumerate(places):
         rays.save(tmp_path / f"{k}.npz")
@@ -398,13 +398,13 @@ def test_its_checkpoint_is_the_density_of_other_places_anywhere(tmp_path, rgb):
     with pytest.raises(NergError, match="is a prior from other scenes, for which no rays"):
         evaluate_gaze(path, places[0])
     assert learn_prior(tmp_path / "1.npz").provenance["places"] == result.provenance["places"][1:]
-    # A notebook has the rays at hand.
+    # Rays in memory are accepted.
     same = learn_prior(places)
     assert same.output is None and "file" not in same.provenance["places"][0]
     np.testing.assert_array_equal(np.array(same.field.prior.array), np.array(field.prior.array))
 
 
-def test_what_is_refused(tmp_path):
+def test_wrong_prior_inputs_are_refused(tmp_path):
     with pytest.raises(NergError, match="at least one file"):
         learn_prior([])
     with pytest.raises(NergError, match="safetensors"):
@@ -440,7 +440,7 @@ def made(folder, kind, rays):
 
 
 @pytest.mark.parametrize("kind", ["field", "scene", "hits", "none"])
-def test_a_place_is_found_again_where_its_checkpoint_is(rays, tmp_path, kind):
+def test_geometry_is_located_next_to_its_checkpoint(rays, tmp_path, kind):
     place = made(tmp_path, kind, rays)
     assert place.kind == kind and (place.radiance is not None) == (kind == "field")
     matrix = np.diag([2.0, 2, 2, 1])
@@ -459,12 +459,12 @@ def test_a_place_is_found_again_where_its_checkpoint_is(rays, tmp_path, kind):
         load_training_geometry(tmp_path / "gaze.safetensors", provenance, BOX, elsewhere, ns)
 
 
-def test_a_checkpoint_that_does_not_say_where_it_was_trained():
+def test_a_checkpoint_without_stored_geometry_is_refused():
     with pytest.raises(NergError, match="does not store the geometry that it was trained"):
         load_training_geometry(Path("gaze.safetensors"), {}, BOX, GazeEvaluationOptions(), ns)
 
 
-def test_without_geometry_the_box_holds_whoever_looked(rays):
+def test_without_geometry_the_box_contains_all_observers(rays):
     views = around(5)
     for samples, seen in ((rays, ()), (None, views), (rays, views)):
         place = make_geometry(GeometryOptions(geometry="none"), samples, seen, None, ns)
@@ -474,7 +474,7 @@ def test_without_geometry_the_box_holds_whoever_looked(rays):
         make_geometry(GeometryOptions(geometry="hits"), None, views, None, ns)
 
 
-def test_a_similarity_is_four_rows_of_a_file(tmp_path):
+def test_an_alignment_file_contains_a_similarity(tmp_path):
     path = tmp_path / "align.json"
     path.write_text(json.dumps(np.diag([3.0, 3, 3, 1]).tolist()))
     assert read_similarity(path, "--align", "rays to field").scale == pytest.approx(3)

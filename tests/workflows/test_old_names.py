@@ -46,7 +46,7 @@ def test_old_spellings_are_accepted_on_the_command_line():
     assert (made.validation_zones, made.variant, made.resume) == (2, "emit", True)
 
 
-def test_a_value_that_looks_like_an_old_spelling_stays_as_it_is():
+def test_a_value_equal_to_an_old_spelling_is_unchanged():
     assert run(AblationOptions, "ablate", "--recipes", "--cap", "--size", "8x8").recipes == "--cap"
 
 

@@ -66,7 +66,7 @@ def test_there_are_options():
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda k: k.__name__)
-def test_options_are_frozen_and_told(kind):
+def test_options_are_frozen_and_documented(kind):
     made = kind(**SAID.get(kind.__name__, {}))
     with pytest.raises(TypeError):
         kind(1)
@@ -78,7 +78,7 @@ def test_options_are_frozen_and_told(kind):
     assert set(get_type_hints(kind)) == {f.name for f in fields(kind)}
 
 
-def test_numbers():
+def test_number_ranges_are_checked():
     for text in ("1,-2.5,3e2", "1 -2.5 3e2"):
         assert options.parse_numbers(text, "--box") == (1.0, -2.5, 300.0)
     for text in ("", "1,,2", "a"):
@@ -87,14 +87,14 @@ def test_numbers():
 
 
 @pytest.mark.parametrize("text", ["1,2", "1,2,1.1e7", "nan,0,0", "1" + 400 * "0" + ",0,0", "x" * 1500])
-def test_points(text):
+def test_points_are_parsed(text):
     assert options.parse_point("1,-2,1e7", "--up") == (1.0, -2.0, 1e7)
     for refused in (options.parse_point, lambda text, flag: StatisticsOptions(observers=(text,))):
         with pytest.raises(NergError, match="--observer (is|must)"):
             refused(text, "--observer")
 
 
-def test_definitions():
+def test_definitions_are_parsed():
     pairs = ["spp=4", "name=a=b", "empty="]
     assert options.parse_definitions(pairs, "--define") == {"spp": "4", "name": "a=b", "empty": ""}
     assert options.parse_definitions((), "--define") == {}
@@ -103,10 +103,10 @@ def test_definitions():
             options.parse_definitions([pair], "--define")
 
 
-# ---- Options of the field for a place where nobody was tracked ----
+# ---- Options of the prior field for scenes without tracking ----
 
 
-def test_a_sample_is_drawn_of_datasets_alone():
+def test_only_datasets_are_sampled():
     options = PriorOptions()
     assert (options.max_samples, options.seed, options.mode) == (10_000_000, 0, "llvm_ad_rgb")
 
@@ -114,13 +114,13 @@ def test_a_sample_is_drawn_of_datasets_alone():
 # ---- Options of folds: those of places and of parts among them ----
 
 
-def test_they_say_a_place_and_who_makes_parts():
+def test_folds_include_geometry_and_part_options():
     options = FoldOptions(geometry="hits", store=Path("kept"))
     assert options.in_parts and (options.folds, options.seed, options.test_participants) == (5, 0, 0.5)
     assert set(options.splits.split(",")) == {"both", "pos", "people"}
 
 
-def test_options_that_are_repeated_are_read_again_and_those_of_one_name_are_not():
+def test_repeated_options_are_read_again_and_equal_names_are_not():
     folds = FoldOptions(geometry="none", recipe="small", kappa=9.0)
     shared = shared_options(folds, GazeOptions)
     assert shared["recipe"] == "small" and shared["geometry"] == "none"
@@ -155,7 +155,7 @@ def training(monkeypatch):
     return seen
 
 
-def test_folds_have_them(training, tmp_path):
+def test_folds_have_the_training_settings(training, tmp_path):
     options = FoldOptions(geometry="hits", **CHANGED_SETTINGS)
     with pytest.raises(Stop):
         evaluate.train_and_score(evaluate.FoldInputs(options, ("both",), None, None), 3, tmp_path)
@@ -164,7 +164,7 @@ def test_folds_have_them(training, tmp_path):
     assert training[0].kappa is training[0].radius is None
 
 
-def test_ablations_have_them(training):
+def test_ablations_have_the_training_settings(training):
     bench = SimpleNamespace(options=AblationOptions(**CHANGED_SETTINGS, default_steps=3), place=None)
     with pytest.raises(Stop):
         ablation.make_plan(Variant(name="emit", recipe="default", field_variant="emit"), 3, bench)
@@ -173,7 +173,7 @@ def test_ablations_have_them(training):
 
 
 @pytest.mark.parametrize("kind", [FoldOptions, AblationOptions])
-def test_none_is_forgotten(kind):
+def test_every_training_setting_is_covered(kind):
     assert {f.name for f in fields(kind)} | {"seed", "freeze", "validation_zones", "loss", "prior_folds"} >= SETTINGS
     assert exposed_options(kind()) == {} and set(exposed_options(kind(**CHANGED_SETTINGS))) == set(CHANGED_SETTINGS)
 
@@ -181,27 +181,27 @@ def test_none_is_forgotten(kind):
 # ---- Options of filtering and splitting; what they do to rays is tried in tests/workflows/test_rays.py ----
 
 
-def test_options_that_ask_for_nothing_say_what_can_be_asked():
+def test_empty_options_are_refused():
     with pytest.raises(NergError, match="no selection is given"):
         FilterOptions()
     with pytest.raises(NergError, match="no criterion is given"):
         SplitOptions()
 
 
-def test_a_detector_is_a_known_one():
+def test_an_unknown_detector_is_refused():
     with pytest.raises(NergError, match='"dbscan"'):
         FilterOptions(fixations="dbscan")
     with pytest.raises(NergError, match="add --fixations"):
         FilterOptions(merge_fixations=True, thin=1.0)
 
 
-def test_conditions_are_what_was_asked_for():
+def test_conditions_list_the_selected_options():
     assert FilterOptions(end=2.0, persons=("Ada",), thin=1.0).conditions == {"time": (None, 2.0), "persons": ["Ada"]}
     assert FilterOptions(thin=1.0).conditions == {}
     assert FilterOptions(box=(0, 1, 0, 1, 0, 1)).conditions == {"box": [0, 1, 0, 1, 0, 1]}
 
 
-# ---- What parts of a job are kept by ----
+# ---- Keys of stored parts ----
 
 
 STORE = {"store", "scheduler", "threads"}
@@ -265,7 +265,7 @@ def key(value):
 
 
 @pytest.mark.parametrize("command", list(COMMANDS))
-def test_each_option_changes_the_key_of_a_part_exactly_when_it_changes_its_work(command, tmp_path):
+def test_an_option_changes_the_part_key_only_if_it_changes_the_result(command, tmp_path):
     kind, of_parts, excluded = COMMANDS[command]
     options = kind()
     before, left_out = key(of_parts(options)), set()
@@ -286,12 +286,12 @@ class Later(CountOptions):
     processes: int = option(1, "One that changes no result.", changes_result=False)
 
 
-def test_a_new_option_is_in_the_key_and_one_of_the_schedule_is_not():
+def test_new_options_are_in_the_key_and_scheduling_options_are_not():
     assert key(Later(weight=2.0)) != key(Later()) and key(Later(processes=2)) == key(Later())
     assert rebuild_value(Later(processes=2)).processes == 1
 
 
-def test_a_file_is_its_bytes_wherever_it_lies(tmp_path):
+def test_a_file_is_identified_by_its_content(tmp_path):
     def options(folder, text):
         (tmp_path / folder).mkdir(exist_ok=True)
         (tmp_path / folder / "zones.json").write_text(text)
@@ -301,12 +301,12 @@ def test_a_file_is_its_bytes_wherever_it_lies(tmp_path):
     assert key(options("b", "one")) == before != key(options("a", "two"))
 
 
-def test_parts_are_asked_for_by_either_option():
+def test_either_option_enables_parts():
     assert not PartOptions().in_parts
     assert PartOptions(store=Path("s")).in_parts and PartOptions(scheduler="local").in_parts
 
 
-def test_what_runs_has_what_cannot_change_a_result_at_its_default():
+def test_parts_run_with_default_scheduling_options():
     (task,) = Plan(
         "p", works.write_mixture, None, [Part(PartOptions(store=Path("s"), scheduler="tcp://a:1"))], ".txt"
     ).tasks
@@ -316,7 +316,7 @@ def test_what_runs_has_what_cannot_change_a_result_at_its_default():
 # ---- The reporter of jobs that were given none ----
 
 
-def test_it_says_nothing(capsys):
+def test_the_default_reporter_is_silent(capsys):
     SILENT.message("a")
     SILENT.warn("b")
     SILENT.progress(0.5, "c")
@@ -326,7 +326,7 @@ def test_it_says_nothing(capsys):
 # ---- What a report says about the programs that made it ----
 
 
-def test_versions_of_what_has_a_part():
+def test_versions_of_all_components_are_listed():
     installed = versions("llvm_ad_rgb")
     assert set(installed) == {"nerg_mi", "mitsuba", "drjit", "numpy", "python", "libLLVM"} and all(installed.values())
     assert "libLLVM" not in versions("scalar_rgb")
@@ -350,6 +350,6 @@ def test_variant_and_threads(rgb):
 @pytest.mark.parametrize(
     "mode, said", [("llvm_rgb", "available variants: scalar_rgb,"), ("scalar_rgb", "need a JIT variant")]
 )
-def test_what_no_field_can_be_computed_on(mode, said):
+def test_unsupported_variants_are_refused(mode, said):
     with pytest.raises(NergError, match=said):
         select_backend(mode)

@@ -50,7 +50,7 @@ from tests.plugins import fields
 from tests.plugins.fields import radiance
 from tests.workflows.recorder import Recorder
 
-# ---- Radiance fields by jobs: what a notebook gets, and what it is told ----
+# ---- Radiance fields by jobs: results and messages ----
 
 
 @pytest.fixture(autouse=True)
@@ -65,14 +65,14 @@ def coarse(monkeypatch):
 
 
 class Impatient(Recorder):
-    """Presses Ctrl-C when it is told of the first step."""
+    """Raises an interrupt when the first step is reported."""
 
     def progress(self, share, text=""):
         if "step" in text:
             raise KeyboardInterrupt
 
 
-def test_a_result_without_any_file(cube):
+def test_training_without_an_output_returns_a_result(cube):
     before, recorder = set(cube.iterdir()), Recorder()
     result = train_radiance(cube, options=RadianceOptions(steps=3, holdout=3), reporter=recorder)
     assert set(cube.iterdir()) == before and result.output is None and not result.interrupted
@@ -84,7 +84,7 @@ def test_a_result_without_any_file(cube):
     assert shares == sorted(shares) and shares[-1] == 1 and recorder.steps[1][1].endswith("step 1")
 
 
-def test_a_deferred_field(cube, tmp_path):
+def test_a_deferred_field_is_trained_and_evaluated(cube, tmp_path):
     """As trained, as written, and as evaluated by the integrator."""
     out, options = tmp_path / "f.safetensors", RadianceOptions(steps=3, holdout=3, deferred=True)
     result = train_radiance(cube, out, options)
@@ -93,12 +93,12 @@ def test_a_deferred_field(cube, tmp_path):
     assert np.isfinite(scores.psnr_mean)
 
 
-def test_an_interrupted_run_without_any_file_is_a_result(cube):
+def test_an_interrupted_training_without_an_output_returns_a_result(cube):
     result = train_radiance(cube, options=RadianceOptions(steps=10**6, holdout=0), reporter=Impatient())
     assert result.interrupted and result.provenance["steps"] == 1 and result.psnr is None
 
 
-def test_an_interrupted_run_with_an_output_can_be_resumed(cube):
+def test_an_interrupted_training_with_an_output_can_be_resumed(cube):
     out = cube / "a.safetensors"
     with pytest.raises(KeyboardInterrupt, match="go on with --resume"):
         train_radiance(cube, out, RadianceOptions(steps=2, holdout=3), Impatient())
@@ -108,12 +108,12 @@ def test_an_interrupted_run_with_an_output_can_be_resumed(cube):
     assert read_checkpoint(out, "radiance")[1]["provenance"]["steps"] == 2
 
 
-def test_nothing_to_resume_without_an_output(cube):
+def test_resuming_without_an_output_is_refused(cube):
     with pytest.raises(NergError, match="does not exist; leave out --resume to start"):
         train_radiance(cube, options=RadianceOptions(steps=2, resume=True))
 
 
-def test_scores_without_any_file(cube):
+def test_evaluation_without_an_output_returns_scores(cube):
     before, recorder = set(cube.iterdir()), Recorder()
     scores = evaluate_radiance(cube / "cube.safetensors", cube, RadianceScoreOptions(holdout=2, spp=4), recorder)
     assert set(cube.iterdir()) == before
@@ -122,7 +122,7 @@ def test_scores_without_any_file(cube):
     assert recorder.messages[-1].endswith(f"{np.mean(scores.psnr_fitted):.2f} dB")
 
 
-def test_views_too_small_for_a_score_have_none(cube, tmp_path):
+def test_small_views_have_no_scores(cube, tmp_path):
     """One pixel has no right half to fit colours for, and no window of structural similarity."""
     recorder, out, table = Recorder(), tmp_path / "f.safetensors", tmp_path / "s.json"
     result = train_radiance(cube, out, RadianceOptions(steps=2, holdout=3, width=1), recorder)
@@ -133,7 +133,7 @@ def test_views_too_small_for_a_score_have_none(cube, tmp_path):
     assert not any("nan" in text for text in recorder.messages) and "11 x 11" in recorder.warnings[-1]
 
 
-def test_views_that_were_trained_on_are_no_held_out_views(cube):
+def test_training_views_are_refused_as_held_out_views(cube):
     out = cube / "a.safetensors"
     train_radiance(cube, out, RadianceOptions(steps=2, holdout=3))
     with pytest.raises(NergError, match="was trained on"):
@@ -144,7 +144,7 @@ def test_views_that_were_trained_on_are_no_held_out_views(cube):
 # ---- Checkpoints of other programs by jobs: the fields themselves, with and without files ----
 
 
-def test_fields_without_any_file(torch, tmp_path):
+def test_import_without_an_output_returns_fields(torch, tmp_path):
     path, recorder = save(tmp_path / "nerg.pth", small_gaze(), nerf=small_state()), Recorder()
     result = import_checkpoint(path, reporter=recorder)
     assert result.field is not None and result.gaze.config.variant == "emit_capture" and result.files == []
@@ -152,7 +152,7 @@ def test_fields_without_any_file(torch, tmp_path):
     assert recorder.messages == [f'"{path}" also contains a gaze field: write it with --gaze NAME.safetensors']
 
 
-def test_files_in_their_order(torch, tmp_path):
+def test_import_returns_files_in_order(torch, tmp_path):
     path = save(tmp_path / "nerg.pth", small_gaze(), nerf=small_state())
     outputs = tmp_path / "f.safetensors", tmp_path / "g.safetensors"
     result = import_checkpoint(path, *outputs, CheckpointImportOptions(half=True))
@@ -168,7 +168,7 @@ def field(tmp_path):
     return tmp_path / "f.safetensors"
 
 
-def test_a_field_and_its_file_are_exported_alike(field, tmp_path):
+def test_a_field_and_its_file_give_equal_exports(field, tmp_path):
     options, recorder = PointOptions(resolution=16, density=3.0, max_points=50), Recorder()
     first = export_points(field, tmp_path / "a.ply", options, recorder)
     second = export_points(load_radiance(field, ns)[0], tmp_path / "b.ply", options)
@@ -180,7 +180,7 @@ def test_a_field_and_its_file_are_exported_alike(field, tmp_path):
     )
 
 
-def test_splats_lie_on_the_surface(field, tmp_path):
+def test_exported_splats_are_on_the_surface(field, tmp_path):
     recorder = Recorder()
     done = export_splats(field, tmp_path / "a.ply", SplatOptions(resolution=16, density=3.0), recorder)
     splats = read_splats(tmp_path / "a.ply")
@@ -188,18 +188,18 @@ def test_splats_lie_on_the_surface(field, tmp_path):
     assert (np.abs(splats.centers) < 1.3).all()
 
 
-def test_a_volume_with_its_colour(field, tmp_path):
+def test_a_volume_is_exported_with_its_colour(field, tmp_path):
     done = export_volume(field, tmp_path / "d.vol", VolumeOptions(resolution=8, color=tmp_path / "c.vol"))
     assert done.files == [tmp_path / "c.vol", tmp_path / "d.vol"] and done.surface is None
     assert all(path.is_file() for path in done.files)
 
 
-def test_an_axis_that_is_none(field, tmp_path):
+def test_a_wrong_axis_is_refused(field, tmp_path):
     with pytest.raises(NergError, match="must be z or y"):
         export_points(field, tmp_path / "a.glb", PointOptions(up="x"))
 
 
-# ---- Checkpoints with a finer bound: the same field, known to those who name the old file ----
+# ---- Checkpoints with a finer bound: the same field, compatible with the checksum of the old file ----
 
 
 @pytest.fixture(scope="module")
@@ -211,7 +211,7 @@ def files(tmp_path_factory):
     return folder / "old.safetensors", folder / "new.safetensors", result
 
 
-def test_only_the_bound_is_another(files):
+def test_refinement_changes_only_the_bound(files):
     old, new, result = files
     (tensors, meta), (again, refined_meta) = (read_checkpoint(p, "radiance") for p in (old, new))
     assert set(again) - set(tensors) == {"occupancy.parts"}
@@ -221,7 +221,7 @@ def test_only_the_bound_is_another(files):
     assert {k: v for k, v in refined_meta.items() if k not in ("occupancy", "refined_from")} == {
         k: v for k, v in meta.items() if k != "occupancy"
     }
-    # Of readers that know no parts the cells are what they were.
+    # Readers without refinement see the original cells.
     assert {k: v for k, v in refined_meta["occupancy"].items() if k != "refined"} == meta["occupancy"]
     loaded = load_radiance(new, ns)[0].occupancy
     assert (
@@ -231,7 +231,7 @@ def test_only_the_bound_is_another(files):
     assert 0 < loaded.occupied_fraction < result.before == loaded.coarse.occupied_fraction
 
 
-def test_a_gaze_field_knows_it(files, tmp_path):
+def test_a_gaze_field_accepts_the_refined_checkpoint(files, tmp_path):
     old, new, _ = files
     checksum = file_sha256(old)
     assert matches_checksum(old, checksum) and matches_checksum(new, checksum)
@@ -240,7 +240,7 @@ def test_a_gaze_field_knows_it(files, tmp_path):
     assert (tmp_path / "again.safetensors").read_bytes() == new.read_bytes()
 
 
-def test_new_weights_drop_it(files):
+def test_new_weights_discard_the_refinement(files):
     field, _ = load_radiance(files[1], ns)
     refined = field.occupancy
     field.set_parameters({"density_net.0": field.parameters()["density_net.0"]})
@@ -251,7 +251,7 @@ def test_new_weights_drop_it(files):
     "occupancy, what",
     [(None, "no occupancy grid to refine"), (CascadeGrid(np.ones((2, 4, 4, 4), bool), 2.0, ns, 0.1), "nested cubes")],
 )
-def test_fields_without_such_a_grid(tmp_path, occupancy, what):
+def test_fields_without_an_occupancy_grid_are_refused(tmp_path, occupancy, what):
     radiance(tmp_path / "f.safetensors", occupancy=occupancy)
     with pytest.raises(NergError, match=what):
         refine_checkpoint(tmp_path / "f.safetensors", tmp_path / "g.safetensors")
@@ -317,7 +317,7 @@ def finds(monkeypatch):
     return choose
 
 
-def test_the_capture_is_read_as_it_was_found(photos, finds, tmp_path):
+def test_the_written_capture_is_readable(photos, finds, tmp_path):
     calls = finds(COUNT)
     recorder = Recorder()
     options = PoseOptions(camera_model="radial", threads=1, seed=3, single_camera=False)
@@ -339,7 +339,7 @@ def test_the_capture_is_read_as_it_was_found(photos, finds, tmp_path):
     assert "up is +z: the cameras are held level to 0.5 degrees" in text and "nerg train radiance" in text
 
 
-def test_progress_grows_through_all_stages(photos, finds, tmp_path):
+def test_progress_increases_through_all_stages(photos, finds, tmp_path):
     finds(COUNT)
     recorder = Recorder()
     find_poses(photos, tmp_path / "capture", None, recorder)
@@ -350,7 +350,7 @@ def test_progress_grows_through_all_stages(photos, finds, tmp_path):
         assert said in words
 
 
-def test_pictures_without_a_pose_are_named_and_left_out(photos, finds, tmp_path):
+def test_photos_without_a_pose_are_reported_and_skipped(photos, finds, tmp_path):
     finds(7)
     recorder = Recorder()
     (photos / "bad.jpg").write_bytes(b"\xff\xd8 no photo")
@@ -363,7 +363,7 @@ def test_pictures_without_a_pose_are_named_and_left_out(photos, finds, tmp_path)
     assert report == result.report and report["unregistered"] == ["7.png", "8.png"] and "bad.jpg" in report["skipped"]
 
 
-def test_too_few_and_parts_are_warned_of(photos, finds, tmp_path):
+def test_few_poses_and_separate_models_cause_warnings(photos, finds, tmp_path):
     finds(4)
     recorder = Recorder()
     find_poses(photos, tmp_path / "capture", None, recorder)
@@ -372,7 +372,7 @@ def test_too_few_and_parts_are_warned_of(photos, finds, tmp_path):
     assert "less than half" in few and "take more images" in few
 
 
-def test_an_up_that_is_unsure_or_not_asked_for_is_told(photos, finds, tmp_path):
+def test_an_uncertain_or_disabled_up_direction_is_reported(photos, finds, tmp_path):
     from dataclasses import replace
 
     recorder = Recorder()
@@ -384,15 +384,15 @@ def test_an_up_that_is_unsure_or_not_asked_for_is_told(photos, finds, tmp_path):
     assert "the up direction was not estimated" in recorder.messages and result.report["up"] is None
 
 
-def test_nothing_found_is_an_error_and_leaves_nothing(photos, finds, tmp_path):
+def test_a_failed_reconstruction_is_refused_and_leaves_no_file(photos, finds, tmp_path):
     finds(0)
     with pytest.raises(NergError, match="show the same scene; take more images, each"):
         find_poses(photos, tmp_path / "capture")
     assert os.listdir(tmp_path) == ["photos"]
 
 
-def test_a_model_that_was_cut_short_is_not_taken(photos, finds, tmp_path):
-    """A disk that fills is not told of by COLMAP."""
+def test_a_truncated_model_is_refused(photos, finds, tmp_path):
+    """COLMAP does not report a full disk."""
 
     def cut(made):
         (work,) = (tmp_path).glob(".capture*.part/.work-*")
@@ -406,7 +406,7 @@ def test_a_model_that_was_cut_short_is_not_taken(photos, finds, tmp_path):
 
 
 @pytest.mark.parametrize("stage", ["copying", "extracting", "matching", "registering", "writing"])
-def test_ctrl_c_leaves_nothing(stage, photos, finds, tmp_path):
+def test_ctrl_c_leaves_no_file(stage, photos, finds, tmp_path):
     class Interrupts(Recorder):
         def progress(self, share, text=""):
             if text.startswith(stage):
@@ -418,7 +418,7 @@ def test_ctrl_c_leaves_nothing(stage, photos, finds, tmp_path):
     assert os.listdir(tmp_path) == ["photos"]
 
 
-def test_photos_that_are_too_few(photos, finds, tmp_path):
+def test_too_few_photos_are_refused(photos, finds, tmp_path):
     finds(COUNT)
     for k in range(2, COUNT):
         (photos / f"{k}.png").unlink()
@@ -431,7 +431,7 @@ def test_photos_that_are_too_few(photos, finds, tmp_path):
     assert os.listdir(tmp_path) == ["photos"]
 
 
-def test_frames_of_a_video(finds, tmp_path):
+def test_frames_of_a_video_are_extracted(finds, tmp_path):
     av = pytest.importorskip("av", reason='PyAV is not installed (pip install "nerg-mi[poses]")')
     with av.open(str(tmp_path / "film.mp4"), "w") as out:
         stream = out.add_stream("mpeg4", rate=10)

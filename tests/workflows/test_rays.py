@@ -34,10 +34,10 @@ from tests.workflows.test_gaze import OPTIONS, TRAINING
 
 from .recorder import Recorder
 
-# ---- The steps of a filter, of rays that nobody else holds and of those that somebody does ----
+# ---- The steps of a filter, in place and on a copy ----
 
 
-def test_steps_and_what_is_kept_of_them():
+def test_filter_steps_are_recorded_in_order():
     rays = crowd()
     steps = FilterSteps(rays, in_place=False)
     steps.select({"time": (10, 60)})
@@ -47,7 +47,7 @@ def test_steps_and_what_is_kept_of_them():
     assert len(rays) == 1000 and "steps" not in rays.metadata and len(set(steps.rays.t)) == 100
 
 
-def test_nothing_is_left():
+def test_a_filter_that_removes_all_rays_is_refused():
     steps = FilterSteps(crowd(), in_place=True)
     with pytest.raises(NergError, match="rays; widen its conditions"):
         steps.select({"time": (1e6, None)})
@@ -57,7 +57,7 @@ def test_nothing_is_left():
     assert [s.of for s in steps.taken] == [0] * 4
 
 
-def test_the_least_numbers_are_any_as_likely():
+def test_random_keys_select_samples_uniformly():
     counts = np.zeros(20)
     for seed in range(2000):
         mask = smallest_mask(np.random.default_rng(seed).random(20), 5)
@@ -67,11 +67,11 @@ def test_the_least_numbers_are_any_as_likely():
     assert smallest_mask(np.zeros(3), 5).all() and not smallest_mask(np.arange(3.0), 0).any()
 
 
-# ---- Jobs on tracking, as a notebook calls them: rays or files in, results out, the reporter told ----
+# ---- Jobs on tracking, as a notebook calls them: rays or files in, results out, progress reported ----
 
 
 class Heard:
-    """A reporter that keeps what it is told."""
+    """A reporter that records its messages."""
 
     def __init__(self):
         self.messages, self.shares = [], []
@@ -95,7 +95,7 @@ def columns(rays):
     return [rays.t, rays.person, rays.origin, rays.direction, rays.confidence, rays.hit]
 
 
-def test_import(tmp_path):
+def test_files_are_imported(tmp_path):
     source, heard = EXAMPLES["table"].make(tmp_path), Heard()
     (tmp_path / "more.csv").write_text(source.read_text())
     settings = make_options("table", EXAMPLES["table"].options)
@@ -108,8 +108,8 @@ def test_import(tmp_path):
     assert len(import_rays(source, RaysImportOptions(settings=settings)).rays) == 20
 
 
-def test_the_way_back_to_the_files(tmp_path):
-    """The matrix that training is given takes rays to where they stood in the file."""
+def test_alignment_maps_rays_to_file_coordinates(tmp_path):
+    """The alignment matrix maps training rays to file coordinates."""
     source, align = EXAMPLES["table"].make(tmp_path), tmp_path / "align.json"
     table = EXAMPLES["table"].options
     settings = make_options("table", {**table, "up": "-y", "units": "mm"})
@@ -124,7 +124,7 @@ def test_the_way_back_to_the_files(tmp_path):
     assert not (tmp_path / "none.npz").exists()
 
 
-def test_import_under_pseudonyms(tmp_path):
+def test_a_salt_makes_pseudonyms_reproducible(tmp_path):
     source = EXAMPLES["table"].make(tmp_path)
     settings = make_options("table", EXAMPLES["table"].options)
     (tmp_path / "salt").write_bytes(bytes(range(32)))
@@ -137,7 +137,7 @@ def test_import_under_pseudonyms(tmp_path):
         RaysImportOptions(settings=settings, salt=tmp_path / "salt")
 
 
-def test_an_output_that_cannot_be_written_is_found_first(tmp_path, walk):
+def test_an_unwritable_output_is_refused_before_the_import(tmp_path, walk):
     (tmp_path / "folder.npz").mkdir()
     for output in (tmp_path / "rays.txt", tmp_path / "folder.npz"):
         for job in (
@@ -149,7 +149,7 @@ def test_an_output_that_cannot_be_written_is_found_first(tmp_path, walk):
                 job()
 
 
-def test_filter_leaves_the_rays_that_it_was_given(walk):
+def test_filter_does_not_modify_its_input(walk):
     rays, heard = Rays.load(walk), Heard()
     before = [column.copy() for column in columns(rays)]
     options = FilterOptions(persons=["a", "c"], start=10, end=30, fixations="idt", dispersion_threshold=30, thin=1)
@@ -163,7 +163,7 @@ def test_filter_leaves_the_rays_that_it_was_given(walk):
     assert filter_rays(rays, FilterOptions(start=10)).fixations is None
 
 
-def test_one_ray_a_fixation(walk):
+def test_filter_selects_one_ray_per_fixation(walk):
     result = filter_rays(
         walk, FilterOptions(fixations="ivt", velocity_threshold=300, min_fixation=0.1, merge_fixations=True)
     )
@@ -172,7 +172,7 @@ def test_one_ray_a_fixation(walk):
     assert step["least"] == 0.1 and step["of"] == 12_000
 
 
-def test_split(walk, tmp_path):
+def test_split_separates_training_and_test_rays(walk, tmp_path):
     heard = Heard()
     rays = Rays.load(walk)
     options = SplitOptions(test_participants=0.5, test_time=0.3, gap=1, seed=2, train_output=tmp_path / "train.npz")
@@ -187,7 +187,7 @@ def test_split(walk, tmp_path):
     ]
 
 
-def test_plot(walk, tmp_path):
+def test_plots_are_written(walk, tmp_path):
     split = split_rays(walk, SplitOptions(test_zones=2, min_rays=8, test_positions=10))
     figure = plot_rays(split.train, PlotOptions(kind="layout", test=split.test, output=tmp_path / "p.png"))
     assert figure.axes and (tmp_path / "p.png").read_bytes().startswith(b"\x89PNG")
@@ -205,7 +205,7 @@ def test_plot(walk, tmp_path):
         (lambda: PlotOptions(test="a.npz"), "add --kind layout"),
     ],
 )
-def test_options_that_contradict_each_other(make, message):
+def test_contradictory_options_are_refused(make, message):
     with pytest.raises(NergError, match=message):
         make()
 
@@ -227,7 +227,7 @@ def files(tmp_path):
     return [write_source(tmp_path / "files" / f"{k}.csv", k, 200, start=DAY) for k in range(3)]
 
 
-def test_import_into_a_dataset(parquet, files, tmp_path):
+def test_files_are_imported_into_a_dataset(parquet, files, tmp_path):
     heard, output = Recorder(), tmp_path / "shop.rays"
     result = import_rays(files, options(output=output, environment="shop"), heard)
     at_once = import_rays(files, options(workers=None))
@@ -246,14 +246,14 @@ def test_import_into_a_dataset(parquet, files, tmp_path):
     assert [title for title, _ in make_quality_report(output / "place=north")] == [str(output / "place=north")]
 
 
-def test_what_could_not_be_imported_is_told_in_the_end(parquet, files, tmp_path):
+def test_failed_sources_are_reported_at_the_end(parquet, files, tmp_path):
     files[1].write_text("t\n")
     with pytest.raises(NergError, match=r"1\.csv.*1.*3"):
         import_rays(files, options(output=tmp_path / "shop.rays"))
     assert len(RayDataset.open(tmp_path / "shop.rays")) == 398
 
 
-def test_pseudonyms(parquet, files, tmp_path):
+def test_pseudonyms_of_datasets_match_those_of_files(parquet, files, tmp_path):
     (tmp_path / "salt").write_bytes(bytes(range(32)))
     salted = {"pseudonyms": True, "salt": tmp_path / "salt"}
     result = import_rays(files, options(output=tmp_path / "a.rays", **salted))
@@ -273,7 +273,7 @@ def test_pseudonyms(parquet, files, tmp_path):
         ({"align_output": "a.json", "output": "a.rays"}, "--align-output does not apply to datasets,"),
     ],
 )
-def test_options_of_datasets(parquet, arguments, why):
+def test_wrong_dataset_options_are_refused(parquet, arguments, why):
     with pytest.raises(NergError, match=why):
         RaysImportOptions(**arguments)
 
@@ -288,11 +288,11 @@ def test_options_of_datasets(parquet, arguments, why):
         {"thin": 0.5, "thin_distance": 9.0, "box": (0, 4, 0, 4, 0, 3)},
     ],
 )
-def test_filters_are_those_of_a_file(parquet, tmp_path, options):
+def test_filters_of_datasets_match_those_of_files(parquet, tmp_path, options):
     dataset, rays = write_dataset(tmp_path)
     heard, expected = Recorder(), Recorder()
     result = filter_rays(dataset.folder, FilterOptions(**options, output=tmp_path / "a.parquet"), heard)
-    # What is found of a person may depend on the rounding of places.
+    # Fixations of a participant may depend on the rounding of positions.
     rays = dataset.load()
     in_memory = filter_rays(rays, FilterOptions(**options), expected)
     assert_same(result.rays, in_memory.rays)
@@ -312,7 +312,7 @@ def test_filters_are_those_of_a_file(parquet, tmp_path, options):
         import_rays([tmp_path / "files" / "0.csv"], options(output=tmp_path / "b.rays"))
 
 
-def test_samples(parquet, tmp_path):
+def test_samples_of_a_dataset_are_uniform(parquet, tmp_path):
     dataset, rays = write_dataset(tmp_path)
     plain = filter_rays(dataset.folder, FilterOptions(sample=50, seed=2)).rays
     assert np.array_equal(plain.t, dataset.sample(50, 2).t)
@@ -323,7 +323,7 @@ def test_samples(parquet, tmp_path):
         assert len(some) == 40 and some.cohorts == ("x",)
         assert [s["step"] for s in some.metadata["steps"]] == ["filter", "sample"]
         counts[[place[t, x] for t, x in zip(some.t.tolist(), some.origin[:, 0].tolist())]] += 1
-    # In all blocks as likely: a third of the rays is of each source.
+    # Samples are uniform over blocks: each source has a third of the rays.
     thirds = np.array(
         [counts[np.array(rays.persons)[rays.person] == f"p{k}_{j}"].sum() for k in range(3) for j in range(3)]
     )
@@ -332,7 +332,7 @@ def test_samples(parquet, tmp_path):
         filter_rays(dataset.folder, FilterOptions(sample=4, output=tmp_path / "c.rays"))
 
 
-def test_filters_that_cannot_be(parquet, tmp_path, monkeypatch):
+def test_impossible_filters_of_datasets_are_refused(parquet, tmp_path, monkeypatch):
     dataset, _ = write_dataset(tmp_path)
     with pytest.raises(NergError, match="rays are selected; widen the conditions"):
         filter_rays(dataset.folder, FilterOptions(start=0, end=1, output=tmp_path / "a.rays"))
@@ -357,7 +357,7 @@ def crowded(tmp_path_factory):
 
 
 @pytest.mark.parametrize("max_samples", [10_000, 2500])
-def test_training_and_scores_are_of_the_same_rays(parquet, crowded, tmp_path, max_samples):
+def test_training_and_evaluation_use_the_same_rays(parquet, crowded, tmp_path, max_samples):
     heard, gaze = Recorder(), tmp_path / "gaze.safetensors"
     trained = train_gaze(crowded, gaze, replace(TRAINING, max_samples=max_samples, seed=3), heard)
     metadata = trained.provenance["rays_file"]
@@ -369,7 +369,7 @@ def test_training_and_scores_are_of_the_same_rays(parquet, crowded, tmp_path, ma
     )
     assert trained.provenance["test"]["rays"] == count and f"{count:,} rays of {crowded}" in heard.messages
     result = evaluate_gaze(gaze, crowded, options=OPTIONS)
-    # As of the rays themselves.
+    # The same scores as for the rays in memory.
     rays = load_rays(crowded, max_samples, 3)
     alone = train_gaze(rays, tmp_path / "alone.safetensors", replace(TRAINING, seed=3))
     assert alone.provenance["test"] == trained.provenance["test"]
@@ -378,7 +378,7 @@ def test_training_and_scores_are_of_the_same_rays(parquet, crowded, tmp_path, ma
     assert [row["KLD"] for row in scored.rows] == pytest.approx([row["KLD"] for row in result.rows], rel=1e-6)
 
 
-def test_another_dataset_is_not_scored(parquet, crowded, tmp_path):
+def test_evaluation_refuses_another_dataset(parquet, crowded, tmp_path):
     train_gaze(crowded, tmp_path / "gaze.safetensors", TRAINING)
     dataset, _ = write_dataset(tmp_path, 1)
     with pytest.raises(NergError, match=r"corridor\.rays"):

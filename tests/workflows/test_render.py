@@ -72,7 +72,7 @@ def scene_overlays(tmp_path_factory):
     return folder / "scene.xml"
 
 
-def test_a_quantity_that_the_scene_does_not_name(rgb, scene_overlays, tmp_path):
+def test_an_overlay_adds_its_quantity_to_the_scene(rgb, scene_overlays, tmp_path):
     recorder = Recorder()
     made = render_file(scene_overlays, tmp_path / "a.png", PictureOptions(overlay="gaze", mode=MODE), recorder)
     loaded = load_scene(scene_overlays)
@@ -80,7 +80,7 @@ def test_a_quantity_that_the_scene_does_not_name(rgb, scene_overlays, tmp_path):
     assert made.vmax == pytest.approx(robust_max(rendered.aovs["gaze"], rendered.mask)) and made.files == (
         tmp_path / "a.png",
     )
-    # The picture, pixel for pixel, and the scale beside it.
+    # The picture, pixel for pixel, and the scale next to it.
     width, height = mitsuba_bitmap(made.path).size()
     assert width > 18 + 60 and height > 12 and f"scale up to {made.vmax:.4g}" in recorder.messages[0]
     fixed = render_file(scene_overlays, tmp_path / "b.png", PictureOptions(overlay="gaze", vmax=9.0, mode=MODE))
@@ -88,12 +88,12 @@ def test_a_quantity_that_the_scene_does_not_name(rgb, scene_overlays, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["visibility", "depth", "emit"])
-def test_other_quantities(rgb, scene_overlays, tmp_path, name):
+def test_other_overlays_are_rendered(rgb, scene_overlays, tmp_path, name):
     made = render_file(scene_overlays, tmp_path / "a.png", PictureOptions(overlay=name, mode=MODE))
     assert made.path.stat().st_size > 500 and (made.vmax is None) == (name == "visibility")
 
 
-def test_a_sequence_has_one_scale(rgb, scene_overlays, tmp_path):
+def test_a_sequence_shares_one_scale(rgb, scene_overlays, tmp_path):
     options = PictureOptions(overlay="gaze", frames=scene_overlays.with_name("walk.csv"), mode=MODE)
     both = render_file(scene_overlays, tmp_path / "walk.png", options)
     tops = []
@@ -125,7 +125,7 @@ def decoded(av, path):
 
 
 @pytest.mark.parametrize("top", [None, 3.0])
-def test_a_video_has_the_pictures_of_the_sequence(rgb, scene_overlays, tmp_path, top, monkeypatch):
+def test_a_video_contains_the_images_of_the_sequence(rgb, scene_overlays, tmp_path, top, monkeypatch):
     av = pytest.importorskip("av", reason='PyAV is not installed (pip install "nerg-mi[video]")')
     written = []
     monkeypatch.setattr(render, "write_bytes", lambda path, *parts: written.append(path) or write_bytes(path, *parts))
@@ -149,7 +149,7 @@ def test_a_video_has_the_pictures_of_the_sequence(rgb, scene_overlays, tmp_path,
     assert str(tmp_path) not in str(metadata) and str(scene_overlays.parent) not in str(metadata)
 
 
-def test_a_video_of_the_colour(rgb, scene_overlays, tmp_path):
+def test_a_video_without_an_overlay(rgb, scene_overlays, tmp_path):
     av = pytest.importorskip("av", reason='PyAV is not installed (pip install "nerg-mi[video]")')
     options = PictureOptions(frames=scene_overlays.with_name("walk.csv"), mode=MODE, defaults={"size": "16"})
     with pytest.raises(NergError, match="pixels, but widely supported videos need even"):
@@ -159,7 +159,7 @@ def test_a_video_of_the_colour(rgb, scene_overlays, tmp_path):
     assert rate == 25 and [f.shape for f in frames] == [(16, 18, 3)] * 2
 
 
-def test_each_picture_of_a_sequence_says_its_own_values(rgb, scene_overlays, tmp_path):
+def test_each_image_of_a_sequence_records_its_parameters(rgb, scene_overlays, tmp_path):
     image = pytest.importorskip("PIL.Image", reason="Pillow is not installed")
     made = render_file(
         scene_overlays, tmp_path / "walk.png", PictureOptions(frames=scene_overlays.with_name("walk.csv"), mode=MODE)
@@ -171,7 +171,7 @@ def test_each_picture_of_a_sequence_says_its_own_values(rgb, scene_overlays, tmp
     assert positions == ["0.2, 0.1, -2.5", "-1.5, 0.4, -2"]
 
 
-def test_hatched_where_no_surface_is(rgb, scene_overlays, tmp_path):
+def test_pixels_without_a_surface_are_hatched(rgb, scene_overlays, tmp_path):
     """The picture within the page, against the opacity that the scene itself renders."""
     made = render_file(scene_overlays, tmp_path / "a.png", PictureOptions(overlay="gaze", vmax=1.0, mode=MODE))
     plain = render_file(
@@ -193,7 +193,7 @@ def test_hatched_where_no_surface_is(rgb, scene_overlays, tmp_path):
     np.testing.assert_array_equal(hatched, ~mask)
 
 
-def test_ctrl_c_leaves_whole_pictures(rgb, scene_overlays, tmp_path):
+def test_ctrl_c_leaves_complete_images(rgb, scene_overlays, tmp_path):
     class Impatient(Recorder):
         def progress(self, share, text=""):
             if share > 0.5:
@@ -230,13 +230,13 @@ def test_ctrl_c_leaves_whole_pictures(rgb, scene_overlays, tmp_path):
         ),
     ],
 )
-def test_what_is_refused(rgb, scene_overlays, tmp_path, output, options, said):
+def test_wrong_options_are_refused(rgb, scene_overlays, tmp_path, output, options, said):
     with pytest.raises(NergError, match=said):
         render_file(scene_overlays, tmp_path / output, PictureOptions(mode=MODE, **options))
     assert not list(tmp_path.iterdir())
 
 
-# ---- A scene file rendered by a job: the result, and what is told meanwhile ----
+# ---- A scene file rendered by a job: the result, and its messages ----
 
 
 @pytest.fixture
@@ -245,7 +245,7 @@ def scene_pictures(tmp_path):
     return tmp_path / "scene.xml"
 
 
-def test_the_result_is_what_was_written(scene_pictures, tmp_path):
+def test_the_result_matches_the_written_file(scene_pictures, tmp_path):
     recorder = Recorder()
     options = PicturesPictureOptions(defaults={"level": "0.5"}, sensor=0, spp=2, mode="llvm_ad_rgb")
     result = render_file(scene_pictures, tmp_path / "new" / "a.exr", options, recorder)
@@ -257,7 +257,7 @@ def test_the_result_is_what_was_written(scene_pictures, tmp_path):
     assert line.startswith(f"Wrote {result.path} (16 x 8, {result.channels} channels, llvm_ad_rgb")
 
 
-def test_a_reporter_may_end_it(scene_pictures, tmp_path):
+def test_a_reporter_can_stop_the_rendering(scene_pictures, tmp_path):
     class Impatient(Recorder):
         def progress(self, share, text=""):
             raise KeyboardInterrupt
@@ -267,13 +267,13 @@ def test_a_reporter_may_end_it(scene_pictures, tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["scene.xml"]
 
 
-def test_a_sensor_that_is_not_there(scene_pictures, tmp_path):
+def test_an_unknown_sensor_is_refused(scene_pictures, tmp_path):
     with pytest.raises(NergError, match="has 2 sensor"):
         render_file(scene_pictures, tmp_path / "a.exr", PicturesPictureOptions(sensor=2, mode="llvm_ad_rgb"))
 
 
 @pytest.mark.slow
-def test_the_header_says_what_the_gaze_rests_on(tmp_path):
+def test_the_header_records_the_basis_of_the_gaze(tmp_path):
     small = {"width": "12", "height": "8"}
     options = PicturesPictureOptions(defaults=small, spp=1, mode="llvm_ad_rgb")
     text = read_exr_attributes(render_file(find_store_scene(), tmp_path / "a.exr", options).path)
@@ -283,7 +283,7 @@ def test_the_header_says_what_the_gaze_rests_on(tmp_path):
 
 @pytest.mark.nightly
 @pytest.mark.slow
-def test_long_renders_are_prepared_and_the_same_to_the_byte(tmp_path, monkeypatch):
+def test_prepared_renderings_are_byte_identical(tmp_path, monkeypatch):
     options = PicturesPictureOptions(defaults={"width": "24", "height": "16"}, spp=2, mode="llvm_ad_rgb")
     render_file(find_store_scene(), tmp_path / "a.png", options)
     prepared = []
@@ -332,7 +332,7 @@ def film_of(scene, folder, name, reporter=None, **options):
         ("a.mp4", {"overlay": "depth"}),
     ],
 )
-def test_parts_give_the_bytes_of_one_go(scene, name, overlay):
+def test_a_film_in_parts_is_byte_identical(scene, name, overlay):
     if name.endswith("mp4"):
         pytest.importorskip("av")
     expected = film_of(scene, "whole", name, **overlay)
@@ -342,7 +342,7 @@ def test_parts_give_the_bytes_of_one_go(scene, name, overlay):
     assert (parts.size, parts.vmax, len(parts.files)) == (expected.size, expected.vmax, len(expected.files))
 
 
-def test_pictures_that_are_kept_are_not_rendered_again(scene, monkeypatch):
+def test_stored_images_are_not_rendered_again(scene, monkeypatch):
     store, rendered = scene.parent / "store", []
     original = render.render_file
     monkeypatch.setattr(render, "render_file", lambda *args: rendered.append(args) or original(*args))
@@ -361,7 +361,7 @@ def test_pictures_that_are_kept_are_not_rendered_again(scene, monkeypatch):
     assert len(rendered) == 7 and files(scene.parent / "four") != files(scene.parent / "three")
 
 
-def test_ctrl_c_says_where_it_goes_on_from(scene):
+def test_ctrl_c_reports_how_to_resume(scene):
     class Impatient(Recorder):
         def progress(self, share, text=""):
             super().progress(share, text)
@@ -375,7 +375,7 @@ def test_ctrl_c_says_where_it_goes_on_from(scene):
     assert ("1 of 3 parts" in text for _, text in recorder.steps) and recorder.steps[1][1] == "1 of 3 parts"
 
 
-def test_files_of_the_scene_are_the_same_wherever_it_lies(scene, tmp_path):
+def test_scene_files_are_identified_by_content(scene, tmp_path):
     """A picture's name does not depend on folders: a moved project finds its parts."""
     (tmp_path / "moved").mkdir()
     os.rename(scene, tmp_path / "moved" / "scene.xml")
@@ -389,8 +389,8 @@ def test_files_of_the_scene_are_the_same_wherever_it_lies(scene, tmp_path):
     assert first.files[0].name == second.files[0].name
 
 
-def test_one_picture_needs_nothing_of_it(scene, tmp_path):
-    """Neither the engine nor dask is loaded where no parts are asked for."""
+def test_a_single_image_loads_no_engine(scene, tmp_path):
+    """Without parts, neither the engine nor dask is loaded."""
     code = (
         "import sys\nfrom nerg_mi.workflows.render import render_film\n"
         "from nerg_mi.workflows.scene_commands import FilmOptions\n"
@@ -401,7 +401,7 @@ def test_one_picture_needs_nothing_of_it(scene, tmp_path):
     assert done.stdout.strip() == "[]", done.stderr
 
 
-def test_options_that_contradict_are_told_before_any_work(scene, tmp_path):
+def test_contradictory_options_are_refused_before_rendering(scene, tmp_path):
     with pytest.raises(NergError, match="use local, local:N for N processes, tcp"):
         film_of(scene, "out", "a.png", scheduler="nowhere")
     with pytest.raises(NergError, match=r"is not supported: choose a file name"):
@@ -412,14 +412,14 @@ def test_options_that_contradict_are_told_before_any_work(scene, tmp_path):
 # ---- From options to a store and an engine, and what is said of a store ----
 
 
-def test_the_store_is_beside_the_output_unless_it_is_named(tmp_path):
+def test_the_default_store_is_next_to_the_output(tmp_path):
     runner = PartRunner(PartOptions(scheduler="local:2"), tmp_path / "walk.mp4", Recorder())
     assert runner.store.folder == tmp_path / "walk.tasks" and isinstance(runner.engine, ProcessEngine)
     named = PartRunner(PartOptions(store=tmp_path / "s"), tmp_path / "walk.mp4", Recorder())
     assert named.store.folder == tmp_path / "s"
 
 
-def test_progress_of_a_share_of_the_job(tmp_path):
+def test_progress_of_a_stage_is_scaled(tmp_path):
     recorder = Recorder()
     parts = PartRunner(PartOptions(store=tmp_path / "s"), tmp_path / "a", recorder)
     assert len(list(parts.run(works.make_plan(2), 0.0, 0.8))) == 2
@@ -430,7 +430,7 @@ def test_progress_of_a_share_of_the_job(tmp_path):
     assert texts[-1].startswith("4 of 4 parts") and texts[-1].endswith("0 s left")
 
 
-def test_ctrl_c_says_where_the_parts_are(tmp_path):
+def test_ctrl_c_reports_the_store(tmp_path):
     class Impatient(Recorder):
         def progress(self, share, text=""):
             raise KeyboardInterrupt
@@ -440,8 +440,8 @@ def test_ctrl_c_says_where_the_parts_are(tmp_path):
         list(parts.run(works.make_plan(2)))
 
 
-def test_a_scene_that_reads_another_file_than_was_planned_is_refused(tmp_path):
-    """As on a worker where a whole path leads to somebody else's file."""
+def test_a_scene_that_reads_an_unplanned_file_is_refused(tmp_path):
+    """As on a worker where an absolute path refers to another file."""
     (tmp_path / "more.xml").write_text('<scene version="3.0.0"/>')
     scene = tmp_path / "scene.xml"
     scene.write_text(f'<scene version="3.0.0"><include filename="{tmp_path / "more.xml"}"/></scene>')
@@ -459,7 +459,7 @@ def test_a_scene_that_reads_another_file_than_was_planned_is_refused(tmp_path):
 # ---- What is said of a store ----
 
 
-def test_lines_and_removal(tmp_path):
+def test_a_store_is_summarised_and_stale_outputs_removed(tmp_path):
     (tmp_path / "a").write_text("before")
     store = Store(tmp_path / "store")
     arriving = run_plan(works.make_plan(5, what="nerg render walk.mp4"), store, LocalEngine())
@@ -480,12 +480,12 @@ def test_lines_and_removal(tmp_path):
     assert recorder.messages[-1] == "Removed 130 bytes." and len(list(store.iter_manifests())) == 2
 
 
-def test_a_folder_that_is_not_there(tmp_path):
+def test_a_missing_store_is_refused(tmp_path):
     with pytest.raises(NergError, match="there is no folder"):
         account_for_store(tmp_path / "none")
 
 
-def test_sizes():
+def test_sizes_are_formatted():
     counts = (0, 999, 1200, 34_000, 5_600_000, 7.8e9, 2e12)
     assert [format_bytes(n) for n in counts] == [
         "0 bytes",

@@ -66,11 +66,11 @@ def run(trained, tmp_path_factory):
 
 @pytest.fixture
 def without_3d(monkeypatch):
-    """No 3D scene is made, where it is not the matter."""
+    """Skip the 3D scene where a test does not need it."""
     monkeypatch.setattr(report._ReportWork, "_stage", lambda *_: (None, (0, 0, 0, 0)))
 
 
-def test_everything_of_a_folder(run, tmp_path):
+def test_a_report_of_all_files_in_a_folder(run, tmp_path):
     recorder = Recorder()
     options = replace(SMALL, aois=run / "objects.json")
     result = make_report([run], tmp_path / "a.html", options, recorder)
@@ -94,7 +94,7 @@ def test_everything_of_a_folder(run, tmp_path):
         and contents.nearby_participants
         and min(contents.nearby_participants) >= 1
     )
-    # Nobody's name, neither of rays nor of evaluations.
+    # No names, neither from rays nor from evaluations.
     assert not any(name in text for name in NAMES) and "participant 1" in text
     # How many rays of how many people the gaze rests on, and what all of it was made of.
     assert (
@@ -107,20 +107,20 @@ def test_everything_of_a_folder(run, tmp_path):
 
 
 @pytest.mark.nightly
-def test_equal_files_make_an_equal_report(run, tmp_path):
+def test_equal_inputs_give_an_equal_report(run, tmp_path):
     files = [run / "gaze.safetensors", run / "rays.npz", run / "gaze.eval"]
     one = make_report(files, tmp_path / "a.html", SMALL).path.read_bytes()
     two = make_report(files[::-1], tmp_path / "b.html", SMALL).path.read_bytes()
     assert one == two and str(tmp_path).encode() not in one
 
 
-def test_names_where_they_are_asked_for(run, tmp_path):
+def test_names_are_shown_only_on_request(run, tmp_path):
     options = replace(SMALL, show_names=True, paths=False)
     text = make_report([run], tmp_path / "a.html", options).path.read_text(encoding="utf-8")
     assert "Ada" in text and packed_scene(text)["paths"] == []
 
 
-def test_a_gaze_field_alone(run, tmp_path):
+def test_a_report_of_a_gaze_field_alone(run, tmp_path):
     recorder = Recorder()
     result = make_report([run / "gaze.safetensors"], tmp_path / "a.html", SMALL, recorder)
     text = result.path.read_text(encoding="utf-8")
@@ -135,14 +135,14 @@ def test_a_gaze_field_alone(run, tmp_path):
     assert result.run.rays is None and result.run.results == ()
 
 
-def test_objects_without_rays(without_3d, run, tmp_path):
+def test_a_report_of_objects_without_rays(without_3d, run, tmp_path):
     options = replace(SMALL, aois=run / "objects.json", observer=(-0.5, 0.0, 1.6))
     contents = make_report([run / "gaze.safetensors"], tmp_path / "a.html", options).run
     assert contents.objects[0].recorded is None and 0 < contents.objects[0].predicted.mean < 1
     assert "where it was asked for, at (-0.50, 0.00, 1.60)" in contents.observer
 
 
-def test_evaluations_are_made(without_3d, run, tmp_path, monkeypatch):
+def test_missing_evaluations_are_computed(without_3d, run, tmp_path, monkeypatch):
     from nerg_mi.workflows import report
 
     splits = []
@@ -161,7 +161,7 @@ def test_evaluations_are_made(without_3d, run, tmp_path, monkeypatch):
         make_report(files[:1], tmp_path / "a.html", replace(SMALL, evaluate=True))
 
 
-def test_evaluations_of_others_are_refused_or_doubted(without_3d, run, tmp_path):
+def test_evaluations_of_another_field_are_refused_or_warned_about(without_3d, run, tmp_path):
     def evaluation(**changes):
         metadata = {"gaze": "gaze.safetensors", "split": "pos", "kappa": 20.0, "positions": 60, "people": 30}
         folder = tmp_path / f"e{len(list(tmp_path.iterdir()))}"
@@ -178,7 +178,7 @@ def test_evaluations_of_others_are_refused_or_doubted(without_3d, run, tmp_path)
     assert "a field called other.safetensors" in contents.warnings[0]
 
 
-def test_without_a_place(tmp_path):
+def test_a_report_without_geometry(tmp_path):
     job = GazeOptions(geometry="none", radius=0.5, probes=8, steps=2, directions=64, zones=0, min_rays=8)
     crowd(600).save(tmp_path / "rays.npz")
     train_gaze(tmp_path / "rays.npz", tmp_path / "gaze.safetensors", job)
@@ -191,7 +191,7 @@ def test_without_a_place(tmp_path):
 
 
 @pytest.mark.nightly
-def test_pictures_that_are_there_are_not_rendered_again(run, tmp_path, monkeypatch):
+def test_existing_images_are_not_rendered_again(run, tmp_path, monkeypatch):
     first, rendered = report.render_channels, {}
 
     def count_rendering(scene, sensor, *rest):
@@ -212,13 +212,13 @@ def test_pictures_that_are_there_are_not_rendered_again(run, tmp_path, monkeypat
 
 
 @pytest.mark.parametrize("name", ["report.pdf", "folder"])
-def test_what_cannot_be_written_is_told_first(run, tmp_path, name):
+def test_an_unwritable_output_is_refused_first(run, tmp_path, name):
     (tmp_path / "folder").mkdir()
     with pytest.raises(NergError):
         make_report([run], tmp_path / name, SMALL)
 
 
-def test_damaged_rays_are_a_sentence(run, tmp_path):
+def test_damaged_rays_are_refused(run, tmp_path):
     (tmp_path / "rays.npz").write_bytes(b"PK\x03\x04 no")
     with pytest.raises(NergError, match=r"rays\.npz"):
         make_report([run / "gaze.safetensors", tmp_path / "rays.npz"], tmp_path / "a.html", SMALL)
@@ -240,7 +240,7 @@ def folder(standins, tmp_path_factory):
     return folder
 
 
-def test_in_any_order_and_in_folders(folder):
+def test_files_are_sorted_in_any_order_and_in_folders(folder):
     files = [folder / n for n in ("shoppers.safetensors", "store.safetensors", "rays.npz", "gaze.eval")]
     for paths in (files, files[::-1], [folder], [*files[:2], files[2], files[3] / "gaze.json"]):
         sorted_files = sort_files(paths)
@@ -255,14 +255,14 @@ def test_inputs_have_their_checksums(folder):
     assert set(roles) == {"gaze field", "radiance field", "rays", "evaluation"}
 
 
-def test_splats_are_called_so(folder, tmp_path):
+def test_splats_are_described(folder, tmp_path):
     write_inria(tmp_path / "place.ply", random_splats(5))
     sorted_files = sort_files([folder / "shoppers.safetensors", tmp_path / "place.ply"])
     assert sorted_files.inputs()[1][0] == "splats" and describe_scene(sorted_files) == "Gaussian splats, place.ply."
     assert describe_scene(sort_files([folder])).startswith("A radiance field")
 
 
-def test_what_makes_no_report(folder, tmp_path):
+def test_files_that_make_no_report_are_refused(folder, tmp_path):
     empty = tmp_path / "empty"
     empty.mkdir()
     shutil.copy(folder / "shoppers.safetensors", tmp_path / "again.safetensors")
@@ -271,14 +271,14 @@ def test_what_makes_no_report(folder, tmp_path):
         ([folder / "nowhere"], "there is no file or folder"),
         ([empty], "contains no checkpoint, rays or evaluation"),
         ([folder, tmp_path / "again.safetensors"], "are both a gaze, and a report takes one"),
-        ([folder, folder / "notes.txt"], "is none of these"),
+        ([folder, folder / "notes.txt"], "cannot be shown in a scene"),
     ]
     for paths, why in cases:
         with pytest.raises(NergError, match=why):
             sort_files(paths)
 
 
-def test_what_is_named_twice_is_one(folder):
+def test_duplicate_files_are_used_once(folder):
     assert sort_files([folder, folder / "shoppers.safetensors"]).gaze == folder / "shoppers.safetensors"
     assert json.loads((folder / "gaze.eval" / "gaze.json").read_text()) == {}
 
@@ -304,14 +304,14 @@ def drawn(seen, top=0.5, has_geometry=True, **fields):
 PROVENANCE = make_provenance("nerg report", seed=7, settings={"width": 48})
 
 
-def test_one_scale_for_all():
+def test_all_images_share_one_scale():
     assert gaze_vmax(three()) == pytest.approx(0.5)
     assert gaze_vmax({"camera": view(0.0)}) is None
     # Where there is no surface gaze does not count.
     assert gaze_vmax({"camera": view(np.where(np.arange(32)[:, None] < 4, 9.0, 0.0))}) is None
 
 
-def test_which_pictures_there_are():
+def test_images_depend_on_the_rendered_views():
     assert set(drawn(three())) == {"color", "gaze", "own", "sphere"}
     assert set(drawn(three(), has_geometry=False)) == {"own", "sphere"}
     assert set(drawn(three(), None)) == {"color"}
@@ -319,14 +319,14 @@ def test_which_pictures_there_are():
     assert "spread" in drawn(spread, marker=(3.0, 4.0))
 
 
-def test_they_are_png_files_with_words_and_the_same_again():
+def test_images_are_reproducible_png_files_with_captions():
     one, two = (drawn(three(), marker=(3.0, 4.0)) for _ in range(2))
     for name, picture in one.items():
         assert picture.png.startswith(b"\x89PNG") and picture.png == two[name].png
         assert picture.alt.endswith(".") and picture.caption.endswith(".")
 
 
-def test_each_says_in_its_header_what_it_was_made_of():
+def test_each_image_records_its_provenance():
     every = drawn(three()) | draw_rays(crowd(300), None, PROVENANCE)
     assert set(every) == {"color", "gaze", "own", "sphere", "plan", "layout"}
     for name, picture in every.items():
@@ -352,8 +352,8 @@ def pixels(png):
 
 
 @pytest.mark.parametrize("name", ["gaze", "own", "sphere"])
-def test_what_is_not_known_is_hatched(name):
-    """More of it where nobody was recorded around the observer: then nothing of the gaze is known."""
+def test_unknown_gaze_is_hatched(name):
+    """More pixels are hatched where no participant was recorded near the observer."""
     every = {k: view(0.3) for k in ("camera", "own", "sphere")}
     for seen in every.values():
         seen.color[...] = (0.6, 0.1, 0.1)
@@ -361,7 +361,7 @@ def test_what_is_not_known_is_hatched(name):
     assert alone > 1.5 * supported > 0
 
 
-def test_the_rays_that_it_rests_on_are_named():
+def test_the_basis_of_the_gaze_is_printed():
     plain, with_basis = (drawn(three(), basis=b) for b in ("", "made of 300 rays of 3 people"))
     for name in ("gaze", "own", "sphere"):
         a, b = (pixels(p[name].png) for p in (plain, with_basis))
@@ -370,7 +370,7 @@ def test_the_rays_that_it_rests_on_are_named():
         assert (b[-16:] < 128).any() and b[-16:].shape == (16, *b.shape[1:])
 
 
-def test_plans():
+def test_floor_plans_are_drawn():
     plans = draw_rays(crowd(300), {"centres": [[-0.5, 0, 1.6]], "radius": 0.5}, PROVENANCE)
     assert set(plans) == {"plan", "layout"} and "held-out" in plans["layout"].caption
     assert "held-out" not in draw_rays(crowd(300), None, PROVENANCE)["layout"].caption
@@ -407,7 +407,7 @@ def walkers(count=4, n=400):
     return Rays(t, person, tuple("abcdefgh"[:count]), origin, ahead, np.ones(n * count))
 
 
-def test_free_places_are_in_the_room_and_not_in_the_block():
+def test_free_positions_are_inside_the_room_and_outside_the_block():
     positions = find_free_positions(
         Walls(), (np.zeros(3), np.array([8.0, 6, 3])), np.array([0.0, 0, 1]), np.array([1.0, 1, 1.6])
     )
@@ -416,7 +416,7 @@ def test_free_places_are_in_the_room_and_not_in_the_block():
     assert not inside.any() and (positions > 0.1).all() and (positions[:, 0] < 7.9).all()
 
 
-def test_panoramas_begin_with_the_observer():
+def test_panoramas_start_at_the_observer():
     standing = np.stack([np.linspace(0, 8, 50), np.zeros(50), np.full(50, 1.6)], axis=1)
     positions = panorama_positions(standing, np.array([4.0, 0, 1.6]), 3)
     assert np.allclose(positions, [[4, 0, 1.6], [0, 0, 1.6], [8, 0, 1.6]]) or np.allclose(
@@ -425,7 +425,7 @@ def test_panoramas_begin_with_the_observer():
     assert len(panorama_positions(standing[:0], np.zeros(3))) == 1
 
 
-def test_company_counts_people_and_not_rays():
+def test_participants_nearby_are_counted_instead_of_rays():
     rays = walkers()
     positions = np.array([[2.0, 1.0, 1.6], [2.0, 1.5, 1.6], [2.0, 9.0, 1.6]])
     assert count_participants_near(rays, positions, PLACE, 0.55) == (1, 2, 0)
@@ -434,7 +434,7 @@ def test_company_counts_people_and_not_rays():
     assert count_participants_near(rays, 0.1 * positions, scaled, 0.55) == (1, 2, 0)
 
 
-def test_paths_follow_people_with_gaps():
+def test_paths_follow_participants_with_gaps():
     rays = walkers(2)
     gap = rays.select(~((rays.person == 0) & (rays.t > 10) & (rays.t < 14)))
     paths = collect_paths(gap, PLACE)
@@ -445,12 +445,12 @@ def test_paths_follow_people_with_gaps():
     assert max(path[:, 0].max() for path in paths) == pytest.approx(7.98, abs=0.16)
 
 
-def test_somebody_who_stands_is_no_path():
+def test_a_standing_participant_has_no_path():
     rays = walkers(1)
     assert collect_paths(replace(rays, origin=np.tile([1.0, 1, 1.6], (len(rays), 1))), PLACE) == []
 
 
-def test_no_more_of_paths_than_fits():
+def test_paths_are_limited_in_size():
     rays = walkers(8, 40_000)
     paths = collect_paths(rays, PLACE)
     assert 0 < sum(map(len, paths)) <= MAX_PATH_POINTS and all(len(p) > 1 for p in paths)

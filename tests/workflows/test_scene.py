@@ -81,7 +81,7 @@ def rays():
 
 
 def trained(folder, name, metadata):
-    """The gaze field with another provenance."""
+    """Save the gaze field with other provenance."""
     import drjit.llvm.ad as ns
 
     field = load_gaze(folder / "gaze.safetensors", ns)[0]
@@ -104,7 +104,7 @@ def defaults(path):
 
 
 @pytest.mark.parametrize("place", ["field.safetensors", "room.xml"])
-def test_a_place_with_gaze_and_an_observer(rgb, folder, tmp_path, place):
+def test_geometry_with_gaze_and_an_observer(rgb, folder, tmp_path, place):
     options = SceneOptions(observer=(0.3, 0.2, 0.1), mode=MODE)
     result = write_scene([folder / "gaze.safetensors", folder / place], tmp_path / "a.xml", options)
     assert result.quantity == "gaze" and result.path.is_file()
@@ -123,7 +123,7 @@ def test_a_place_with_gaze_and_an_observer(rgb, folder, tmp_path, place):
     assert not named.startswith("/") and (tmp_path / named).samefile(folder / "gaze.safetensors")
 
 
-def test_a_place_alone_is_shown_from_where_it_can_be_seen(rgb, folder, tmp_path):
+def test_geometry_alone_has_the_best_overview_camera(rgb, folder, tmp_path):
     recorder = Recorder()
     result = write_scene([folder / "mesh.ply"], tmp_path / "a.xml", SceneOptions(mode=MODE), recorder)
     scene, image = shown(result.path)
@@ -157,7 +157,7 @@ def written_place(folder, kind, scale):
 @pytest.mark.nightly
 @pytest.mark.parametrize("scale", [1e-4, 1e6])
 @pytest.mark.parametrize("kind", ["mesh", "scene", "field", "splats", "hits"])
-def test_places_of_any_unit(rgb, tmp_path, kind, scale):
+def test_geometry_of_any_unit_is_visible(rgb, tmp_path, kind, scale):
     path, corner = written_place(tmp_path, kind, scale)
     recorder, eye = Recorder(), tuple(0.1 * corner)
     result = write_scene([path], tmp_path / "a.xml", SceneOptions(observer=eye, mode=MODE), recorder)
@@ -170,14 +170,14 @@ def test_places_of_any_unit(rgb, tmp_path, kind, scale):
     assert any("light leaks" in line for line in recorder.warnings) == (kind in ("mesh", "scene") and scale < 1)
 
 
-def test_a_picture_that_would_be_empty_is_refused(rgb, folder, tmp_path):
+def test_an_empty_image_is_refused(rgb, folder, tmp_path):
     away = SceneOptions(camera=(9, 0, 0), target=(20, 0, 0), mode=MODE)
     with pytest.raises(NergError, match="the image of the camera would be empty; choose"):
         write_scene([folder / "mesh.ply"], tmp_path / "a.xml", away)
     assert not (tmp_path / "a.xml").exists()
 
 
-def test_a_field_without_an_end(rgb, tmp_path):
+def test_an_unbounded_field_is_shown(rgb, tmp_path):
     config = RadianceConfig(fields.GRID, width=16, geometry=3, sh_degree=2, density_scale=1.0)
     box = ContractedBox(Box((-2, -2, -2), (2, 2, 2)), 16)
     field = RadianceField.random(config, box, _ns(), march_step=0.1, march_growth=1 / 64)
@@ -189,7 +189,7 @@ def test_a_field_without_an_end(rgb, tmp_path):
     assert image.mask.mean() > 0.5
 
 
-def test_gaze_alone_finds_its_place_by_its_name_and_sum(rgb, folder, tmp_path):
+def test_gaze_alone_locates_its_geometry_by_name_and_checksum(rgb, folder, tmp_path):
     place = make_geometry(GeometryOptions(field=folder / "field.safetensors"), None, (), None, _ns())
     gaze = trained(folder, "of_field.safetensors", place.metadata)
     result = write_scene([gaze], tmp_path / "a.xml", SceneOptions(observer=(0, 0, 0), mode=MODE))
@@ -212,7 +212,7 @@ def _ns():
     return ns
 
 
-def test_hit_points_are_a_place_with_colours(rgb, folder, tmp_path):
+def test_hit_points_become_coloured_geometry(rgb, folder, tmp_path):
     place = make_geometry(GeometryOptions(geometry="hits"), rays(), (), folder / "hits.vol", _ns(), 0.1)
     gaze = trained(folder, "of_hits.safetensors", {**place.metadata, "rays_file": {}})
     result = write_scene([gaze, folder / "rays.npz"], tmp_path / "a.xml", SceneOptions(mode=MODE))
@@ -226,7 +226,7 @@ def test_hit_points_are_a_place_with_colours(rgb, folder, tmp_path):
 
 
 @pytest.mark.parametrize("geometry", [None, "none"])
-def test_rays_alone_show_where_people_looked(rgb, folder, tmp_path, geometry):
+def test_rays_alone_show_attention(rgb, folder, tmp_path, geometry):
     options = SceneOptions(geometry=geometry, mode=MODE)
     result = write_scene([folder / "rays.npz"], tmp_path / "a.xml", options)
     assert result.quantity == "kde"
@@ -238,11 +238,11 @@ def test_rays_alone_show_where_people_looked(rgb, folder, tmp_path, geometry):
     if geometry == "none":
         np.testing.assert_allclose(sphere.aovs["depth"], 2, atol=1e-3)
         np.testing.assert_allclose(result.camera.origin, result.observer.origin)
-    # Attention is where they looked, the middle of the sphere's picture, and not behind them.
+    # Attention is at the viewed point, the middle of the sphere's picture, and not behind them.
     assert sphere.aovs["kde"][3:5, 7:9].min() > 10 * max(sphere.aovs["kde"][:, 0].max(), 1e-6)
 
 
-def test_an_observer_who_looks_along_up(rgb, folder, tmp_path):
+def test_an_observer_facing_along_up_is_valid(rgb, folder, tmp_path):
     """Until they are turned to the gaze, and then as well: up is where all of it goes."""
     options = SceneOptions(geometry="none", up=(1.0, 0.0, 0.0), mode=MODE)
     result = write_scene([folder / "rays.npz"], tmp_path / "a.xml", options)
@@ -250,7 +250,7 @@ def test_an_observer_who_looks_along_up(rgb, folder, tmp_path):
     assert ahead[0] / np.linalg.norm(ahead) > 0.97 and shown(result.path, 1)[0] is not None
 
 
-def test_rays_in_another_frame_than_the_place(rgb, folder, tmp_path):
+def test_rays_in_another_frame_are_aligned(rgb, folder, tmp_path):
     matrix = np.array([[0, 0, 2, 0.5], [2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 0, 1]], float)
     align = tmp_path / "align.json"
     align.write_text(json.dumps(matrix.tolist()))
@@ -267,7 +267,7 @@ def test_rays_in_another_frame_than_the_place(rgb, folder, tmp_path):
     assert observer_image.aovs["kde"].max() > 0.5
 
 
-def test_cameras_that_are_given(rgb, folder, tmp_path):
+def test_explicit_cameras_are_used(rgb, folder, tmp_path):
     files, at = [folder / "mesh.ply"], tmp_path / "a.xml"
     options = SceneOptions(camera=(0, 0, 1.5), target=(0, 0, -1), fov=50, width=30, mode=MODE)
     result = write_scene(files, at, options)
@@ -280,7 +280,7 @@ def test_cameras_that_are_given(rgb, folder, tmp_path):
     np.testing.assert_allclose(first_person.camera.origin, (0.5, 0, 0))
 
 
-def test_a_walk(rgb, folder, tmp_path):
+def test_a_walk_writes_frames(rgb, folder, tmp_path):
     options = SceneOptions(person="Bob", time_range=(2.0, 2.4), fps=5, first_person=True, mode=MODE)
     result = write_scene([folder / "mesh.ply", folder / "rays.npz"], tmp_path / "a.xml", options)
     assert result.frames == 3 and result.files[-1].name == "a.frames.csv"
@@ -323,13 +323,13 @@ def test_a_walk(rgb, folder, tmp_path):
         (["mesh.ply"], {"fov": 200.0}, "--fov must lie in"),
     ],
 )
-def test_what_makes_no_scene(rgb, folder, tmp_path, names, options, said):
+def test_files_that_make_no_scene_are_refused(rgb, folder, tmp_path, names, options, said):
     with pytest.raises(NergError, match=said):
         write_scene([folder / name for name in names], tmp_path / "a.xml", SceneOptions(mode=MODE, **options))
     assert not (tmp_path / "a.xml").exists()
 
 
-def test_a_gaze_field_without_anything_needs_an_observer(rgb, folder, tmp_path):
+def test_a_gaze_field_alone_needs_an_observer(rgb, folder, tmp_path):
     gaze = trained(folder, "of_nothing.safetensors", {"geometry": "none"})
     with pytest.raises(NergError, match="--observer"):
         write_scene([gaze], tmp_path / "a.xml", SceneOptions(mode=MODE))
@@ -346,7 +346,7 @@ def parquet():
     pytest.importorskip("pyarrow", reason="datasets need the extra parquet")
 
 
-def test_a_file_is_shown_as_it_is(tmp_path):
+def test_rays_of_a_file_are_used_unchanged(tmp_path):
     rays = Rays(np.zeros(1), np.zeros(1, int), ("Ada",), np.zeros((1, 3)), np.eye(3)[:1], np.ones(1))
     rays.save(tmp_path / "rays.npz")
     loaded = scene.load_scene_rays(tmp_path / "rays.npz", tmp_path / "a.xml", Recorder())
@@ -359,7 +359,7 @@ def test_a_file_is_shown_as_it_is(tmp_path):
     assert none.rays is None and none.file is None and none.select_person("Ada") is None
 
 
-def test_a_sample_of_a_dataset_is_kept_beside_the_scene(parquet, tmp_path, monkeypatch):
+def test_a_sample_of_a_dataset_is_stored_next_to_the_scene(parquet, tmp_path, monkeypatch):
     """A sample misses most moments of a person, all of whose rays are read for an eye."""
     _, rays = write_dataset(tmp_path)
     recorder = Recorder()
@@ -375,7 +375,7 @@ def test_a_sample_of_a_dataset_is_kept_beside_the_scene(parquet, tmp_path, monke
     assert len(person_rays) == int((rays.person == rays.persons.index("p1_0")).sum())
 
 
-def test_a_scene_of_a_dataset(parquet, rgb, tmp_path):
+def test_a_scene_is_written_from_a_dataset(parquet, rgb, tmp_path):
     """Named by its place as well; the scene renders, and a person is found in it."""
     write_dataset(tmp_path)
     options = SceneOptions(person="p2_1", time=DAY + 2 * 43_200 + 3.0, geometry="none")
@@ -386,7 +386,7 @@ def test_a_scene_of_a_dataset(parquet, rgb, tmp_path):
         write_scene([tmp_path / "shop.rays"], tmp_path / "b.xml", SceneOptions(person="Eve", time=1.0))
 
 
-def test_a_name_that_is_taken_by_a_folder(parquet, tmp_path):
+def test_a_folder_with_the_output_name_is_refused(parquet, tmp_path):
     write_dataset(tmp_path, files=1)
     (tmp_path / "a.rays.npz").mkdir()
     with pytest.raises(NergError, match=r"a\.rays\.npz"):
@@ -407,14 +407,14 @@ def rays_file(tmp_path):
     return path
 
 
-def test01_a_scene_with_nerg_is_taken_as_it_is(rgb, tmp_path, rays_file):
+def test01_a_scene_with_nerg_is_used_unchanged(rgb, tmp_path, rays_file):
     store = demo.find_store_scene()
     place = make_viewer_scene([store, rays_file], tmp_path / "new", ViewOptions(up=(0, 0, 2)))
     assert place.scene == store and not place.made and len(place.rays) == 3
     assert np.array_equal(place.up, [0, 0, 1]) and place.name == f"{store.name} + rays.npz"
 
 
-def test02_of_others_a_scene_is_made(rgb, tmp_path):
+def test02_other_files_get_a_new_scene(rgb, tmp_path):
     (tmp_path / "a.obj").write_text(MESH)
     recorder = Recorder()
     place = make_viewer_scene([tmp_path / "a.obj"], tmp_path, ViewOptions(up=(0, 1, 0)), recorder)
@@ -422,7 +422,7 @@ def test02_of_others_a_scene_is_made(rgb, tmp_path):
     assert type(nerg.Scene.load(place.scene)).__name__ == "Scene"
 
 
-def test03_a_folder_stands_for_what_is_in_it(rgb, tmp_path, rays_file):
+def test03_a_folder_is_replaced_by_its_files(rgb, tmp_path, rays_file):
     run = tmp_path / "run"
     run.mkdir()
     with pytest.raises(NergError, match="contains nothing that the viewer can show; name"):
@@ -440,7 +440,7 @@ def test03_a_folder_stands_for_what_is_in_it(rgb, tmp_path, rays_file):
         make_viewer_scene([run], tmp_path)
 
 
-def test03_splats_in_a_folder(rgb, tmp_path):
+def test03_splats_in_a_folder_are_recognised(rgb, tmp_path):
     run = tmp_path / "run"
     run.mkdir()
     write_spz(run / "a.spz", random_splats(9))
@@ -448,7 +448,7 @@ def test03_splats_in_a_folder(rgb, tmp_path):
     assert place.made and place.name == "a.spz" and 'type="splats"' in place.scene.read_text()
 
 
-def test04_two_of_a_kind_are_told(rgb, tmp_path, rays_file):
+def test04_two_files_of_one_kind_are_reported(rgb, tmp_path, rays_file):
     shutil.copy(rays_file, tmp_path / "more.npz")
     with pytest.raises(NergError, match="both rays"):
         make_viewer_scene([rays_file, tmp_path / "more.npz"], tmp_path)
@@ -458,7 +458,7 @@ def test04_two_of_a_kind_are_told(rgb, tmp_path, rays_file):
         make_viewer_scene([demo.find_store_scene()], tmp_path, ViewOptions(up=(0, 0, 0)))
 
 
-def test05_a_place_of_a_dataset(parquet, rgb, tmp_path):
+def test05_one_place_of_a_dataset_is_shown(parquet, rgb, tmp_path):
     """As everywhere, a dataset is named by its folder, or by that of a place in it."""
     _, rays = write_dataset(tmp_path)
     (tmp_path / "a.obj").write_text(MESH)
@@ -481,7 +481,7 @@ def test06_several_gaze_fields_are_variants(rgb, tmp_path):
         and place.made
         and not recorder.warnings
     )
-    # Where a name is taken, the folder's is put before it; a field of another place is told.
+    # Where a name is taken, the folder's is put before it; a field of other geometry is reported.
     shutil.copy(run / "a.safetensors", tmp_path / "a.safetensors")
     metadata = {"provenance": {"field_file": {"file": "x", "sha256": "y"}}}
     write_checkpoint(tmp_path / "c.safetensors", "gaze", {"a": np.zeros(1, np.float32)}, metadata)

@@ -59,7 +59,7 @@ def probe(rgb, tmp_path):
     return SceneProbe(load_scene(tmp_path / "a.xml", probe_values()), None, up)
 
 
-def test_what_is_met_around(probe):
+def test_the_probe_measures_its_surroundings(probe):
     seen = probe.around(EYE)
     _, far = intersect_box_numpy(
         np.broadcast_to(EYE.origin, seen.directions.shape), seen.directions, -np.ones(3), np.ones(3)
@@ -76,7 +76,7 @@ def test_what_is_met_around(probe):
 
 
 @pytest.mark.parametrize("depths, length", [((0, 0), 1), ((0, 4), 4), ((3, 5), 3)], ids=["within", "beside", "before"])
-def test_observers_within_matter_are_turned_ahead(depths, length):
+def test_observers_inside_matter_face_a_positive_distance(depths, length):
     """They meet it at once; what they are turned to still lies before them, at a distance of what is met elsewhere."""
     directions = np.array([[0.6, 0.8, 0], *[[0, 0, 1.0]] * 3])
     depth = np.array([depths[0], *[depths[1]] * 3], float)
@@ -84,7 +84,7 @@ def test_observers_within_matter_are_turned_ahead(depths, length):
     np.testing.assert_allclose(turn_to_attention(EYE, seen).target, EYE.origin + length * directions[0])
 
 
-def test_points_and_ups():
+def test_points_and_up_axes():
     assert check_point(None, "--to") is None and check_point((1, 2, 3), "--to").tolist() == [1, 2, 3]
     with pytest.raises(NergError, match="--to must be three numbers x,y,z, got"):
         check_point((1.0, 2.0), "--to")
@@ -98,7 +98,7 @@ def test_points_and_ups():
         make_upright(LookAt(np.ones(3), np.ones(3)), up)
 
 
-def test_the_best_photo(probe):
+def test_the_best_photo_is_selected(probe):
     # Of three cameras in the cube one has the whole of it before it, one a wall, and one looks out of it.
     poses = [((0.9, 0, 0), (1, 0, 0)), ((-0.9, 0.1, 0.1), (0, 0.1, 0.1)), ((3, 0, 0), (4, 0, 0))]
     views = [LookAt(np.array(o, float), np.array(t, float)) for o, t in poses]
@@ -107,7 +107,7 @@ def test_the_best_photo(probe):
 
 
 @pytest.mark.parametrize("room", [False, True], ids=["a thing", "a room"])
-def test_a_thing_is_seen_from_outside_and_a_room_from_within(rgb, tmp_path, room):
+def test_objects_are_viewed_from_outside_and_rooms_from_inside(rgb, tmp_path, room):
     """A cube whose faces look outwards is a thing, one whose faces look inwards a room."""
     place = SceneContent(
         scene_children=(element("shape", element("boolean", name="flip_normals", value=str(room)), type="cube"),)
@@ -125,7 +125,7 @@ def test_a_thing_is_seen_from_outside_and_a_room_from_within(rgb, tmp_path, room
     assert (np.abs(shot.origin).max() < 1) == room and shot.surface_fraction > 0.2
 
 
-# ---- Who looks: people at a time, walks, and where most rays are ----
+# ---- Observers: participants at a time, walks, and where most rays are ----
 
 
 # Half as large, turned by 90 degrees about z, moved.
@@ -156,7 +156,7 @@ def test_the_nearest_ray_of_a_person(rays):
         ("Ada", 5.0, "s; increase --max-gap to bridge longer pauses"),
     ],
 )
-def test_nobody_then(rays, person, time, said):
+def test_a_time_without_participants_is_refused(rays, person, time, said):
     with pytest.raises(NergError, match=said):
         find_eye(rays, person, time, 0.5, Similarity())
 
@@ -185,7 +185,7 @@ def test_pauses_have_no_frames(rays):
         interpolate_walk(rays, "Ada", 0, 11, 1e5, 1.0, Similarity())
 
 
-def test_where_most_rays_are():
+def test_the_densest_viewpoint_is_selected():
     rng = np.random.default_rng(0)
     origin = np.concatenate([rng.normal((1, 2, 1.6), 0.1, (300, 3)), rng.normal((5, 5, 1.6), 0.1, (900, 3))])
     n = len(origin)
@@ -219,7 +219,7 @@ def folder(tmp_path):
     return tmp_path
 
 
-def test_kinds(folder):
+def test_files_are_recognised_by_kind(folder):
     kinds = {
         "field.safetensors": "field",
         "gaze.safetensors": "gaze",
@@ -250,7 +250,7 @@ def test_splats_are_a_field_and_a_mesh_is_not(folder):
     assert detect_kind(folder / "a.ply") == "mesh"
 
 
-def test_the_place_of_a_gaze_field_is_beside_it(folder):
+def test_the_geometry_of_a_gaze_field_is_next_to_it(folder):
     recognised = recognise([folder / "gaze.safetensors"], None, Recorder())
     assert (recognised.kind, recognised.place) == ("field", folder / "field.safetensors")
     assert recognised.align.scale == pytest.approx(2) and recognised.field_metadata["provenance"] == {"up": [0, 0, 1]}
@@ -263,22 +263,26 @@ def test_the_place_of_a_gaze_field_is_beside_it(folder):
     assert recognised.place == folder / "moved.safetensors" and not recorder.warnings
 
 
-def test_another_place_is_warned_of(folder):
+def test_another_geometry_causes_a_warning(folder):
     for gaze, said in (("gaze", "was not trained in"), ("nowhere", "without geometry")):
         recorder = Recorder()
         recognise([folder / "a.ply", folder / f"{gaze}.safetensors"], None, recorder)
         assert said in recorder.warnings[0]
 
 
-def test_rays_alone(folder):
+def test_rays_alone_have_hit_points_or_no_geometry(folder):
     kind = lambda name, geometry=None: recognise([folder / name], geometry, Recorder()).kind
     assert (kind("hits.npz"), kind("rays.npz"), kind("hits.npz", "none")) == ("hits", "none", "none")
 
 
-def test_provenance_is_not_believed(folder):
-    for provenance in ({"field_file": {"file": "a.ply", "sha256": "0"}}, {}):
+def test_wrong_provenance_is_refused(folder):
+    cases = (
+        ({"field_file": {"file": "a.ply", "sha256": "0"}}, "is not the file that"),
+        ({}, "does not store the geometry"),
+    )
+    for provenance, said in cases:
         write_checkpoint(folder / "b.safetensors", "gaze", ONE, {"provenance": json.loads(json.dumps(provenance))})
-        with pytest.raises(NergError, match="does not store the geometry"):
+        with pytest.raises(NergError, match=said):
             recognise([folder / "b.safetensors"], None, Recorder())
 
 
@@ -302,7 +306,7 @@ def photos(rgb, tmp_path):
 
 
 @pytest.mark.parametrize("photo", ["1", "p1", "p1.png"])
-def test_pose_and_lens(photos, photo):
+def test_pose_and_lens_of_a_photo_are_read(photos, photo):
     camera = load_photo_camera(photos, photo, {})
     assert camera.name == "p1.png" and not camera.has_distortion
     np.testing.assert_allclose(camera.eye.origin, [1.5, -3, 1.2])
@@ -312,7 +316,7 @@ def test_pose_and_lens(photos, photo):
     assert camera.lens.offset == pytest.approx((0.1, 0))
 
 
-def test_coordinates_of_the_training(photos):
+def test_photo_cameras_are_in_training_coordinates(photos):
     # The field is twice as large as the file, and moved.
     to_file = np.diag([0.5, 0.5, 0.5, 1.0])
     to_file[:3, 3] = -1
@@ -322,7 +326,7 @@ def test_coordinates_of_the_training(photos):
     np.testing.assert_allclose(camera.eye.target - camera.eye.origin, [0, 1, 0], atol=1e-12)
 
 
-def test_other_photos(photos):
+def test_photos_without_a_pose_are_refused(photos):
     with pytest.raises(NergError, match="give the photos of its training with --photos"):
         load_photo_camera(photos, "0", {"sha256": "0" * 64})
     for photo in ("3", "p9", "-1"):
@@ -330,7 +334,7 @@ def test_other_photos(photos):
             load_photo_camera(photos, photo, {})
 
 
-def test_all_of_them(photos):
+def test_all_photo_cameras_are_loaded(photos):
     assert [c.name for c in load_photo_cameras(photos, {})] == ["p0.png", "p1.png", "p2.png"]
     assert [c.name for c in load_photo_cameras(photos, {}, max_count=2)] == ["p0.png", "p2.png"]
     for k, camera in enumerate(load_photo_cameras(photos, {})):
@@ -377,7 +381,7 @@ def text_of(folder, path, kind, lamps=None):
     ],
     ids=["grey", "rgb", "of Mitsuba"],
 )
-def test_colours_of_a_mesh(rgb, tmp_path, names, values, said):
+def test_vertex_colours_of_a_mesh_are_used(rgb, tmp_path, names, values, said):
     colors = "\n".join(f"property float {name}" for name in names) or "comment grey"
     (tmp_path / "a.ply").write_text(PLY.format(colors=colors, a=values))
     place, text = text_of(tmp_path, tmp_path / "a.ply", "mesh")
@@ -408,7 +412,7 @@ def test_colours_of_a_mesh(rgb, tmp_path, names, values, said):
     ],
     ids=["RGBA", "quads", "RGB", "negative", "continued"],
 )
-def test_a_mesh_that_mitsuba_does_not_show_is_written_again(rgb, tmp_path, name, text):
+def test_a_mesh_that_mitsuba_cannot_show_is_converted(rgb, tmp_path, name, text):
     (tmp_path / name).write_text(text)
     written = write_scene_geometry(write_input(tmp_path / name, "mesh"), tmp_path / "out.xml")
     place, xml = text_of(tmp_path, tmp_path / name, "mesh")
@@ -420,7 +424,7 @@ def test_a_mesh_that_mitsuba_does_not_show_is_written_again(rgb, tmp_path, name,
     assert np.array(params["faces"])[:3].tolist() == [0, 1, 2]
 
 
-def test_the_given_mesh_is_not_written_over(tmp_path):
+def test_the_input_mesh_is_not_overwritten(tmp_path):
     text = PLY.format(colors="comment grey", a="").replace("3 0 1 2", "4 0 1 2 0")
     (tmp_path / "out.mesh.ply").write_text(text)
     with pytest.raises(NergError, match="another name"):
@@ -439,7 +443,7 @@ def test_hit_points_of_one_cell_are_shaded(tmp_path, shape):
         assert np.allclose(colors, [0.55, 0.16, 0.34][shape.index(1)], atol=0.02)
 
 
-def test_splats_that_cannot_be_read_are_refused_by_their_own_name(tmp_path):
+def test_an_error_about_splats_names_their_file(tmp_path):
     splats = random_splats(degree=0)
     splats.centers[0] = np.nan
     write_inria(tmp_path / "a.ply", splats)
@@ -447,7 +451,7 @@ def test_splats_that_cannot_be_read_are_refused_by_their_own_name(tmp_path):
         write_scene_geometry(write_input(tmp_path / "a.ply", "field"), tmp_path / "out.xml")
 
 
-def test_hit_points_get_colours_beside_the_scene(rgb, tmp_path):
+def test_coloured_hit_points_are_written_next_to_the_scene(rgb, tmp_path):
     density = np.zeros((6, 8, 10), np.float32)
     density[2:4] = 100
     write_volume(tmp_path / "a.vol", density, (0, 0, 0), (1, 0.8, 0.6))
@@ -460,6 +464,6 @@ def test_hit_points_get_colours_beside_the_scene(rgb, tmp_path):
         write_scene_geometry(write_input(tmp_path / "rgb.vol", "hits"), tmp_path / "out.xml")
 
 
-def test_a_sphere_where_nothing_is_known(tmp_path):
+def test_without_geometry_the_scene_is_a_sphere(tmp_path):
     place, text = text_of(tmp_path, None, "none")
     assert 'name="center" value="$eye"' in text and 'name="radius" value="2"' in text and not place.files

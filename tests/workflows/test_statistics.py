@@ -32,7 +32,7 @@ def table(rows, **which):
     return [r for r in rows if all(r[k] == v for k, v in which.items())]
 
 
-def test01_counts_are_those_of_a_loop(folder):
+def test01_statistics_match_a_loop_over_rays(folder):
     result = statistics(
         [folder / "bare" / "scene.xml", folder / "rays.npz"],
         options=StatisticsOptions(aois=folder / "areas.json", margin=0.001, min_visit=0.0, **FAST),
@@ -70,7 +70,7 @@ def test01_counts_are_those_of_a_loop(folder):
     assert sum(r["transitions"] for r in result.transitions if r["cell"] == "all") > 5
 
 
-def test02_what_could_be_seen_contains_what_was(folder):
+def test02_visible_aois_include_visited_aois(folder):
     options = StatisticsOptions(aois=folder / "areas.json", aoi_visibility=True, cell_size=0.05, **FAST)
     result = statistics([folder / "bare" / "scene.xml", people()], options=options)
     (sign,) = table(result.aois, cell="all", aoi="the sign")
@@ -83,7 +83,7 @@ def test02_what_could_be_seen_contains_what_was(folder):
     assert sign["share_when_visible"] == pytest.approx(on / could)
 
 
-def test03_windows_zones_and_cohorts_of_a_file(folder, tmp_path):
+def test03_windows_zones_and_cohorts_are_read_from_a_file(folder, tmp_path):
     (tmp_path / "zones.json").write_text(json.dumps({"south": [[0, 0, 0], [6, 2, 0.1]]}))
     (tmp_path / "cohorts.csv").write_text("person,cohort\n" + "".join(f"name {k},{'xy'[k // 3]}\n" for k in range(6)))
     options = StatisticsOptions(
@@ -111,7 +111,7 @@ def test03_windows_zones_and_cohorts_of_a_file(folder, tmp_path):
     assert {r["cell"] for r in result.differences} == {"window", "cohort"}
 
 
-def test04_the_field_beside_the_rays_and_what_if(folder, tmp_path):
+def test04_predicted_and_recorded_statistics_and_what_if(folder, tmp_path):
     changes = {
         "move": [{"shape": "stand", "by": [0, 1.9, 0]}],
         "add": [{"name": "new", "min": [1, 3.5, 1], "max": [2, 3.8, 2]}, {"name": "tile", "mesh": "tile.obj"}],
@@ -148,7 +148,7 @@ def test04_the_field_beside_the_rays_and_what_if(folder, tmp_path):
     assert "name 0" not in text
 
 
-def test05_names_salts_and_a_floor(folder, tmp_path):
+def test05_names_salts_and_a_minimum_of_participants(folder, tmp_path):
     files = [folder / "bare" / "scene.xml", people()]
     (tmp_path / "salt").write_bytes(b"0123456789abcdef")
     keep = StatisticsOptions(aois=folder / "areas.json", salt=tmp_path / "salt", **FAST)
@@ -163,7 +163,7 @@ def test05_names_salts_and_a_floor(folder, tmp_path):
     assert all(r["share"] is None for r in table(result.aois, cell="cohort")) and result.aois[0]["share"] is not None
 
 
-def test06_one_person_has_no_interval_and_that_is_said(folder):
+def test06_one_participant_has_no_interval_and_a_warning(folder):
     recorder = Recorder()
     one = people(1, cohorts=False)
     result = statistics(
@@ -173,7 +173,7 @@ def test06_one_person_has_no_interval_and_that_is_said(folder):
     assert any("no confidence intervals" in text and "fewer than 3 participants" in text for text in recorder.messages)
 
 
-def test07_without_a_place(folder):
+def test07_statistics_without_geometry(folder):
     recorder = Recorder()
     options = StatisticsOptions(aois=folder / "boxes.json", **FAST)
     (folder / "boxes.json").write_text(
@@ -194,7 +194,7 @@ def test07_without_a_place(folder):
     assert result.aois[0]["share"] == pytest.approx(expected, abs=0.01)
 
 
-def test08_isovists_and_nobody_at_all(folder, tmp_path):
+def test08_isovists_without_participants(folder, tmp_path):
     options = StatisticsOptions(aois=folder / "areas.json", visibility=True, grid_step=0.5, **FAST)
     result = statistics([folder / "bare" / "scene.xml"], tmp_path / "out", options)
     west = [r for r in result.isovists if r["x"] < 2 and 1 < r["y"] < 2]
@@ -205,13 +205,13 @@ def test08_isovists_and_nobody_at_all(folder, tmp_path):
         statistics([folder / "bare" / "scene.xml"], options=StatisticsOptions(aois=folder / "areas.json", **FAST))
 
 
-def test09_observers_who_were_not_tracked(folder):
+def test09_predicted_observers_without_tracking(folder):
     options = StatisticsOptions(aois=folder / "areas.json", observers=("1,1.5,1.6", "1,3.5,1.6", "1,0.5,1.6"), **FAST)
     result = statistics([folder / "scene.xml"], options=options)
     assert {r["source"] for r in result.aois} == {"predicted"} and result.aois[0]["participants"] == 3
 
 
-def test10_datasets_count_as_files_do(folder, tmp_path):
+def test10_datasets_give_the_statistics_of_files(folder, tmp_path):
     pytest.importorskip("pyarrow")
     from nerg_mi.workflows import rays as tracking
 
@@ -249,7 +249,7 @@ def test10_datasets_count_as_files_do(folder, tmp_path):
         (["scene.xml", "rays.npz"], {"what_if": "changes"}, "is not one of move, remove, add, swap,"),
     ],
 )
-def test11_what_cannot_be_done_is_told(folder, names, options, said):
+def test11_impossible_requests_are_refused(folder, names, options, said):
     made = {"areas": folder / "areas.json", **FAST, **options}
     if "what_if" in options:
         made["what_if"] = folder / "areas.json"

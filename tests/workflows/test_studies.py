@@ -31,11 +31,11 @@ from tests.tasks.clusters import ClusterOfProcesses, wait_until
 from tests.tasks.works import lay_out
 from tests.workflows.recorder import Recorder
 
-# ---- The study as a job: which settings it takes, and what it tells meanwhile ----
+# ---- The study as a job: which settings it takes, and its messages ----
 
 
 @pytest.mark.nightly
-def test_only_some_settings(tmp_path):
+def test_a_study_can_run_some_settings(tmp_path):
     recorder = Recorder()
     options = StudyOptions(width=12, height=8, quick=True, only="jitter|paper, 1024 steps$", mode="llvm_ad_rgb")
     result = run_study("slab", tmp_path, options, recorder)
@@ -63,7 +63,7 @@ def errors(report):
     return json.dumps([rows, [{**row, "seconds": 0} for row in report["scaling"]]])
 
 
-def test_two_workers_find_the_errors_of_this_process(tmp_path, rgb, monkeypatch):
+def test_two_workers_measure_equal_errors(tmp_path, rgb, monkeypatch):
     pytest.importorskip("distributed", reason="dask is not installed (extra cluster)")
     monkeypatch.setattr(study, "ROWS", 2)
     local = run_study("sphere", tmp_path / "here", StudyOptions(**SMALL)).report
@@ -82,12 +82,12 @@ def test_two_workers_find_the_errors_of_this_process(tmp_path, rgb, monkeypatch)
     heads = [set((tmp_path / k / "study.csv").read_text().split("\n")[0].split(",")) for k in ("here", "there")]
     assert heads[1] - heads[0] == TIMING_COLUMNS
     assert "Times are those of whoever measured a setting: process 1 (" in (tmp_path / "there" / "study.md").read_text()
-    # Started again, all of it is there, times as well.
+    # A second run reads all results, including times, from the store.
     again = run_study("sphere", tmp_path / "there", StudyOptions(**SMALL, store=tmp_path / "there.tasks")).report
     assert again["rows"] == distributed["rows"] and again["scaling"] == distributed["scaling"]
 
 
-def test_a_scene_file_is_measured_with_its_twin_where_a_worker_has_laid_them(rgb, tmp_path):
+def test_a_worker_measures_a_scene_and_its_mesh_in_its_folder(rgb, tmp_path):
     (tmp_path / "scene.xml").write_text(SCENE.format(eye="-2, -1, $height"))
     (tmp_path / "twin.xml").write_text(TWIN)
     subject = open_subject(str(tmp_path / "scene.xml"), "auto", 12, 8, {"height": "3"}, find_reference_scene)
@@ -105,7 +105,7 @@ def test_a_scene_file_is_measured_with_its_twin_where_a_worker_has_laid_them(rgb
 
 
 @pytest.mark.nightly
-def test_every_stage_is_told_and_every_file_is_there(tmp_path):
+def test_the_demo_reports_each_stage_and_writes_each_file(tmp_path):
     recorder = Recorder()
     options = DemoOptions(defaults=write_standins(tmp_path), width=24, spp=1, mode="llvm_ad_rgb")
     result = make_demo(tmp_path / "demo", options, recorder)
@@ -116,7 +116,7 @@ def test_every_stage_is_told_and_every_file_is_there(tmp_path):
 
 
 @pytest.mark.nightly
-def test_its_report_has_the_tracked_gaze(tmp_path):
+def test_the_demo_report_contains_the_tracked_gaze(tmp_path):
     """Of the store's own field; what is written of the observer is theirs alone, as without."""
     result = make_demo(tmp_path, DemoOptions(width=24, spp=1, mode="llvm_ad_rgb"))
     text = (tmp_path / "report.html").read_text("utf-8")
@@ -146,7 +146,7 @@ def pairs(folder, noise=0.0, mirror=1.0):
     return truth, path
 
 
-def test_what_was_found_is_written_with_its_picture(tmp_path):
+def test_an_alignment_is_written_with_its_figure(tmp_path):
     truth, path = pairs(tmp_path)
     reporter = Recorder()
     result = align(None, tmp_path / "a.json", AlignOptions(pairs=path), reporter)
@@ -182,14 +182,14 @@ def test_bad_and_mirrored_fits_are_refused_unless_forced(tmp_path):
         ({"pairs": "PAIRS", "field": "a", "scene": "b"}, None, "only one scene can be given: use --field or"),
     ],
 )
-def test_options_that_do_not_go_together_are_refused(tmp_path, options, rays, why):
+def test_contradictory_options_are_refused(tmp_path, options, rays, why):
     _, path = pairs(tmp_path)
     settings = {k: path if v == "PAIRS" else v for k, v in options.items()}
     with pytest.raises(NergError, match=why):
         align(rays, None, AlignOptions(**settings))
 
 
-def test_another_up_axis_and_a_start_lead_to_the_same_frame(tmp_path, monkeypatch):
+def test_up_axis_and_initial_alignment_give_the_same_frame(tmp_path, monkeypatch):
     truth, path = pairs(tmp_path)
     np.save(tmp_path / "points.npy", rooms.carried(truth, rooms.traces(8000).end))
     aligned = align(None, tmp_path / "a.json", AlignOptions(pairs=path))
@@ -205,7 +205,7 @@ def place(alignment_check, monkeypatch):
     return TrainingGeometry(object(), Box((0, 0, 0), (1, 1, 1)), "field")  # pyright: ignore[reportArgumentType] # not asked
 
 
-def test_gaze_that_meets_nothing_is_refused_and_doubts_are_told_with_the_next_command(monkeypatch):
+def test_gaze_that_hits_no_surface_is_refused_and_doubts_are_reported(monkeypatch):
     reporter = Recorder()
     nowhere = place(AlignmentCheck(1.0, 0.0, 0.0), monkeypatch)
     with pytest.raises(NergError, match="100.0.*--field.*--force"):
@@ -222,7 +222,7 @@ def test_gaze_that_meets_nothing_is_refused_and_doubts_are_told_with_the_next_co
 
 
 @pytest.mark.parametrize("option", ["surface", "scene", "twin"])
-def test_what_of_a_mesh_is_not_used_is_named(tmp_path, option):
+def test_unused_parts_of_a_mesh_are_reported(tmp_path, option):
     (tmp_path / "a.obj").write_text("mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\n")
     options, reporter = AlignOptions(**{option: tmp_path / "a.obj"}), Recorder()
     if option == "twin":

@@ -25,7 +25,7 @@ from nerg_mi.workflows.train_gaze import check_plan, plan_gaze, train_gaze
 from nerg_mi.workflows.train_radiance import train_radiance
 from tests.train.gaze.looks import BOX, RAYS, looking_at
 
-# ---- The training of a gaze field, and by its command: places, recipes, hold-out, resumption, what is told ----
+# ---- The training of a gaze field, and by its command: places, recipes, hold-out, resumption, messages ----
 
 
 QUICK = GazeOptions(geometry="none", radius=0.5, probes=6, min_rays=8, steps=3, directions=64, zones=0)
@@ -34,7 +34,7 @@ WALL = """<scene version="3.0.0"><shape type="rectangle"><transform name="to_wor
 
 
 class Listener:
-    """A reporter that keeps what it is told, and ends a job at a share of its progress."""
+    """A reporter that records its messages and stops a training at a fraction of its progress."""
 
     def __init__(self, ends_at: float = 2.0):
         self.messages, self.shares, self.texts, self.ends_at = [], [], [], ends_at
@@ -69,8 +69,8 @@ def arrays(field):
     return {name: np.array(value) for name, value in field.parameters().items()}
 
 
-def test_a_job_returns_the_field_and_says_how_it_went(rays):
-    """Of rays in memory, without any file."""
+def test_a_training_returns_the_field_and_reports_progress(rays):
+    """The rays are in memory; no file is read or written."""
     heard = Listener()
     result = train_gaze(rays, options=replace(QUICK, variant="capture"), reporter=heard)
     assert result.output is None and not result.interrupted and result.field.config.geometry == "none"
@@ -88,8 +88,8 @@ def test_a_job_returns_the_field_and_says_how_it_went(rays):
     )
 
 
-def test_folds_choose_the_variant_where_no_surfaces_are_known(rays):
-    """Before the fit; what they chose is told, and is what was trained."""
+def test_without_geometry_folds_select_the_variant(rays):
+    """Folds run before the fit; their choice is reported and trained."""
     heard = Listener()
     result = train_gaze(rays, options=QUICK, reporter=heard)
     mix = result.provenance["mix"]
@@ -99,14 +99,14 @@ def test_folds_choose_the_variant_where_no_surfaces_are_known(rays):
     assert list(dict.fromkeys(order))[-1] == "fit" and order[0].startswith("fold 1 of capture")
     assert heard.messages[0].startswith("there is no geometry: cross-validation chooses")
     assert any(m.endswith(f"the variant {mix['variant']} is trained") for m in heard.messages)
-    # Without folds nothing chooses.
+    # Without folds the variant is not selected.
     heard = Listener()
     result = train_gaze(rays, options=replace(QUICK, mix_folds=0), reporter=heard)
     assert result.field.config.variant == "capture" and "mix" not in result.provenance
     assert heard.messages[0] == "there is no geometry: capture alone is trained"
 
 
-def test_a_job_writes_what_the_command_writes(rays, tmp_path, capsys):
+def test_function_and_command_write_equal_files(rays, tmp_path, capsys):
     rays.save(tmp_path / "rays.npz")
     options = replace(QUICK, geometry="hits", voxel_size=0.2, half=True, threads=1)
     train_gaze(tmp_path / "rays.npz", tmp_path / "job" / "gaze.safetensors", options)
@@ -150,7 +150,7 @@ def test_recipes_in_a_scene_of_shapes(rays, tmp_path, recipe):
     assert escaped.tolist() == [[False, False, True]]
 
 
-def test_one_more_recipe_trains_by_the_job_and_by_the_command(rays, tmp_path, monkeypatch, capsys):
+def test_a_registered_recipe_trains_from_function_and_command(rays, tmp_path, monkeypatch, capsys):
     """A second log density, which is one entry: hold-out, ensembles and ablation know it by that."""
     from nerg_mi.workflows.ablation import ablate
     from nerg_mi.workflows.gaze_commands import AblationOptions
@@ -188,7 +188,7 @@ def test_one_more_recipe_trains_by_the_job_and_by_the_command(rays, tmp_path, mo
     assert trained == [("coarse", "emit", 0, 3), ("coarse", "emit", 1, 3)]
 
 
-def test_positions_and_people_are_held_out_and_told(tmp_path):
+def test_held_out_positions_and_participants_are_reported(tmp_path):
     heard = Listener()
     options = replace(QUICK, test_zones=2, test_positions=6, test_participants=0.5)
     result = train_gaze(RAYS, options=replace(options, min_rays=8), reporter=heard)
@@ -200,7 +200,7 @@ def test_positions_and_people_are_held_out_and_told(tmp_path):
     )
 
 
-def test_an_interrupted_job_returns_what_there_is_or_says_how_to_go_on(rays, tmp_path):
+def test_an_interrupted_training_returns_a_result_or_reports_how_to_resume(rays, tmp_path):
     """Without a file it is all that can be had; with one, a script must not go on as if it were done."""
     options = replace(QUICK, steps=8, fresh=True, threads=1, variant="capture")
     result = train_gaze(rays, options=options, reporter=Listener(0.5))
@@ -219,7 +219,7 @@ def test_an_interrupted_job_returns_what_there_is_or_says_how_to_go_on(rays, tmp
         train_gaze(rays, out, replace(options, resume=True))
 
 
-def test_the_command_goes_on(tmp_path, monkeypatch, capsys):
+def test_the_command_resumes_a_training(tmp_path, monkeypatch, capsys):
     from nerg_mi.train.gaze_trainer import GazeTrainer
 
     RAYS.save(tmp_path / "rays.npz")
@@ -266,13 +266,13 @@ def test_an_ensemble_is_one_option(tmp_path):
     assert field.support.cells[:, 3].sum() == 1200 and [p.name for p in tmp_path.iterdir()] == ["gaze.safetensors"]
 
 
-def test_a_place_of_hits_needs_a_file(rays):
+def test_hit_point_geometry_needs_a_file(rays):
     with pytest.raises(NergError, match="--resume and --geometry hits need an output"):
         train_gaze(rays, options=replace(QUICK, geometry="hits"))
 
 
 @pytest.mark.parametrize("train", [train_gaze, train_radiance])
-def test_an_output_is_trained_once_at_a_time(tmp_path, train):
+def test_an_output_is_locked_during_training(tmp_path, train):
     with (
         reserve_output(tmp_path / "a.safetensors"),
         pytest.raises(NergError, match="wait until it has finished, or choose another"),
@@ -321,17 +321,17 @@ SCENE = TrainingGeometry(None, BOX, "scene")
         (GazeOptions(geometry="none", recipe="small"), False, "needs surfaces"),
     ],
 )
-def test_what_does_not_go_together_is_told_in_a_sentence(options, alone, said):
+def test_contradictory_options_are_refused(options, alone, said):
     with pytest.raises(NergError, match=said):
         check_plan(options, alone)
 
 
 @pytest.mark.parametrize("options, alone", [(HITS, False), (FIELD, False), (VIEWS, True), (VIEWS, False)])
-def test_what_goes_together_is_not_refused(options, alone):
+def test_compatible_options_are_accepted(options, alone):
     assert check_plan(options, alone).radius == 0.25
 
 
-def test_every_option_of_settings_and_probes_arrives():
+def test_every_option_reaches_the_plan():
     settings = {"steps": 7, "seed": 3, "loss": "code", "validation_zones": 1, "refit": False, "learning_rate": 0.5}
     settings |= {"integral_weight": 2.0}
     settings |= {"weight_decay": 0.25, "radius": 0.4, "probes": 9, "placement": "grid", "max_rays": 32, "min_rays": 4}
@@ -349,7 +349,7 @@ def test_every_option_of_settings_and_probes_arrives():
 
 
 def test_views_alone_make_a_normalised_field():
-    """They do not say how much is looked altogether."""
+    """Views have no total amount of gaze."""
     options = GazeOptions(scene=Path("a.xml"), recipe="small")
     assert plan_gaze(options, SCENE, views_alone=True).config.normalized
     assert not plan_gaze(options, SCENE).config.normalized

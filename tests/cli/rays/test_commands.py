@@ -22,7 +22,7 @@ def test_help_loads_no_renderer():
 # ---- ``nerg rays show`` ----
 
 
-def test_the_card(walk):
+def test_show_prints_the_quality_report(walk):
     done = run("show", walk)
     shown = " ".join(done.output.split())
     assert done.exit_code == 0 and "12,000 of 12,000 rows" in shown and "sampling rate 50 Hz" in shown
@@ -67,7 +67,7 @@ def test_filter(walk, tmp_path):
         (["plot", "--cell=1e-5"], "more than 4,000,000 cells of 1e-05 m"),
     ],
 )
-def test_what_is_refused(walk, tmp_path, monkeypatch, arguments, message):
+def test_wrong_arguments_are_refused(walk, tmp_path, monkeypatch, arguments, message):
     monkeypatch.chdir(tmp_path)
     command, *options = arguments
     output = "x.png" if command == "plot" else "x.npz"
@@ -111,7 +111,7 @@ def test_plots_are_png(walk, tmp_path):
     assert "ends in .png" in str(run("plot", walk, "-o", tmp_path / "p.jpg").exception)
 
 
-def test_no_rays(walk, tmp_path):
+def test_a_file_without_rays_is_refused(walk, tmp_path):
     rays = Rays.load(walk)
     rays.select(rays.t < rays.t).save(tmp_path / "none.npz")
     for kind in ("density", "layout"):

@@ -1,4 +1,4 @@
-"""``nerg rays`` on datasets: a name that ends in .rays, and whatever may happen while one is written."""
+"""``nerg rays`` on datasets: a name that ends in .rays, and failures while one is written."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def import_arguments(tmp_path):
     return ["rays", "import", *files, "--map", MAP, "--place-name", "shop"]
 
 
-def test_in_and_out(import_arguments, tmp_path):
+def test_a_dataset_is_imported_shown_filtered_and_split(import_arguments, tmp_path):
     output = tmp_path / "a.rays"
     done = run(*import_arguments[1:], "-o", output, "--workers", 1, "--day", "2024-05-06")
     shown = " ".join(done.output.split())
@@ -41,7 +41,7 @@ def test_in_and_out(import_arguments, tmp_path):
     assert len(Rays.load(tmp_path / "c-train.npz")) + len(Rays.load(tmp_path / "c-test.npz")) == 3998
 
 
-def test_what_stands_in_the_way(import_arguments, tmp_path, capsys):
+def test_outputs_that_cannot_be_written_are_refused(import_arguments, tmp_path, capsys):
     (tmp_path / "file.rays").write_text("x")
     for output, why in (
         (tmp_path / "file.rays", "one of its parents is a file"),
@@ -52,8 +52,8 @@ def test_what_stands_in_the_way(import_arguments, tmp_path, capsys):
         assert is_one_sentence(code, said) and why in said, said
 
 
-def test_no_room_and_ctrl_c(import_arguments, tmp_path, capsys, monkeypatch):
-    """What is finished is kept, and the next import goes on to the same end."""
+def test_a_full_disk_and_ctrl_c_keep_finished_work(import_arguments, tmp_path, capsys, monkeypatch):
+    """Finished parts are kept; the next import resumes with the same result."""
     arguments, output = [*import_arguments, "--workers", 1, "-o", tmp_path / "a.rays"], tmp_path / "a.rays"
     with largest_file(20_000):
         code, said = nerg(capsys, *arguments)

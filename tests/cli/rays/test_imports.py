@@ -48,7 +48,7 @@ def test_import_by_map(tmp_path):
         (["--preset", "skeleton", "--tick", "nan"], "--tick"),
     ],
 )
-def test_contradictions(tmp_path, arguments, message):
+def test_contradictory_options_are_refused(tmp_path, arguments, message):
     (tmp_path / "a.csv").write_text("x\n")
     done = run("import", tmp_path / "a.csv", "-o", tmp_path / "r.npz", *arguments)
     assert done.exit_code != 0 and message in str(done.exception)
@@ -64,7 +64,7 @@ def test_import_of_heads_and_their_options(tmp_path):
     assert "new 1, old 1" in " ".join(done.output.split())
 
 
-def test_pseudonyms(tmp_path):
+def test_pseudonyms_replace_names(tmp_path):
     for name in ("anna", "bo"):
         (tmp_path / f"{name}.csv").write_text(ROWS)
     (tmp_path / "salt").write_bytes(bytes(range(32)))
@@ -78,7 +78,7 @@ def test_pseudonyms(tmp_path):
     assert len(hidden[0].persons) == 2 and hidden[1].persons[0] in hidden[0].persons
 
 
-def test_one_line_that_was_cut_off_among_many_files(tmp_path):
+def test_one_truncated_line_in_many_files_is_allowed(tmp_path):
     files = [tmp_path / f"p{i}.csv" for i in range(4)]
     rows = "t,x,y,z,a,b,c\n" + "".join(f"{k * 0.02},1,1.6,2,0,0,1\n" for k in range(150))
     for path in files:
@@ -102,7 +102,7 @@ def test_one_line_that_was_cut_off_among_many_files(tmp_path):
 
 
 @pytest.mark.parametrize("tick, words", [(1, "would be 50 Hz (--tick 0.001)"), (1e-6, "(--tick 0.001)"), (0.001, "")])
-def test_a_wrong_tick_is_told_and_nothing_is_nan(tmp_path, tick, words):
+def test_a_wrong_tick_is_reported_and_no_output_is_nan(tmp_path, tick, words):
     rows = "".join(f"{20 * i},{0.01 * i},0,1.6,1,0,0\n" for i in range(300))
     (tmp_path / "ms.csv").write_text("t,x,y,z,a,b,c\n" + rows)
     done = run("import", tmp_path / "ms.csv", "-o", tmp_path / "r.npz", *MAP, "--tick", tick)
@@ -113,8 +113,8 @@ def test_a_wrong_tick_is_told_and_nothing_is_nan(tmp_path, tick, words):
     assert ("(--tick" in said) == bool(words)
 
 
-def test_names_are_not_markup(tmp_path):
-    """Somebody's name is not a command to the terminal, and none of the table's."""
+def test_names_are_not_interpreted_as_markup(tmp_path):
+    """Names are interpreted neither by the terminal nor by the table."""
     (tmp_path / "m.csv").write_text("t,x,y,z,a,b,c,who\n0,0,0,1.6,1,0,0,[/bold]\n1,0,0,1.6,1,0,0,x\x1b[31m\n")
     done = run("import", tmp_path / "m.csv", "-o", tmp_path / "r.npz", "--map", f"{MAP[1]} person=who")
     assert done.exit_code == 0 and "[/bold]" in done.output and "\x1b[31m" not in done.output, done.output
