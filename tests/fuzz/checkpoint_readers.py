@@ -117,7 +117,7 @@ def _trainer(kind):
         samples=1000,
         _started=0.0,
         stride=4,
-        looked=10.0,
+        prepass_samples_per_ray=10.0,
         extraction=SimpleNamespace(
             pieces_done=0,
             dense_cells=ns.UInt8([0] * 8),

@@ -151,7 +151,7 @@ def test05_new_aov_is_displayed_everywhere(rgb, table, tmp_path, kind):
     said = [axes.get_ylabel().replace("\n", " ") for axes in draw("sheet", [file], overlay="rows").axes]
     assert "row of the shelf [rows]" in said
     if kind == "categorical":
-        with pytest.raises(NergError, match='"rows" names classes'):
+        with pytest.raises(NergError, match='"rows" is categorical'):
             draw("difference", [file, file], channel="rows")
     else:
         said = [axes.get_ylabel() for axes in draw("difference", [file, file], channel="rows").axes]

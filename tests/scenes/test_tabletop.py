@@ -187,7 +187,7 @@ def test_points_are_triangulated_where_surfaces_are(scene):
         assert len(p.track) >= 2 and len({j for j, _ in p.track}) == len(p.track)
         j, m = p.track[0]
         x, y = result[j][m].astype(int)
-        gaps.append(abs(np.linalg.norm(p.place - taken[j].camera.center) / taken[j].depth[y, x] - 1))
+        gaps.append(abs(np.linalg.norm(p.position - taken[j].camera.center) / taken[j].depth[y, x] - 1))
     assert np.median(gaps) < 0.02
 
 

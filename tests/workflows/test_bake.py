@@ -623,7 +623,7 @@ def test01_each_gaussian_gets_its_attention_and_keeps_other_columns(rgb, place):
         result.files == (place / "out.ply",)
         and "30 of 30 Gaussians receive gaze from 1 observer;" in recorder.messages[1]
     )
-    assert recorder.messages[0].endswith("place.ply: columns that are not used: label")
+    assert recorder.messages[0].endswith("place.ply: unused columns: label")
     to = original.centers - np.array(OPTIONS["observer"])
     distance = np.linalg.norm(to, axis=1)
     w = to / distance[:, None]

@@ -78,7 +78,7 @@ def test_training_without_an_output_returns_a_result(cube):
     assert set(cube.iterdir()) == before and result.output is None and not result.interrupted
     assert result.provenance["steps"] == 3 and result.psnr == result.provenance["psnr_held_out"]["mean"]
     assert result.field.box.lower == pytest.approx((-1.025,) * 3) and result.field.occupancy is not None
-    assert "2 views to train on, 1 held out, 16 x 14 pixels" in recorder.messages
+    assert "2 training views, 1 held out, 16 x 14 pixels" in recorder.messages
     assert recorder.warnings == result.provenance["complaints"] and recorder.warnings
     shares = [share for share, _ in recorder.steps]
     assert shares == sorted(shares) and shares[-1] == 1 and recorder.steps[1][1].endswith("step 1")
@@ -100,7 +100,7 @@ def test_an_interrupted_training_without_an_output_returns_a_result(cube):
 
 def test_an_interrupted_training_with_an_output_can_be_resumed(cube):
     out = cube / "a.safetensors"
-    with pytest.raises(KeyboardInterrupt, match="go on with --resume"):
+    with pytest.raises(KeyboardInterrupt, match="--resume"):
         train_radiance(cube, out, RadianceOptions(steps=2, holdout=3), Impatient())
     assert out.is_file() and out.with_suffix(".run").is_file()
     result = train_radiance(cube, out, RadianceOptions(steps=2, holdout=3, resume=True))
@@ -330,7 +330,7 @@ def test_the_written_capture_is_readable(photos, finds, tmp_path):
     assert [v.name for v in data.held_out] == ["0.png", "8.png"] and len(data.train) == 7
     poses = {v.name: v.camera.to_world for v in (*data.train, *data.held_out)}
     assert np.allclose([poses[f"{k}.png"] for k in range(COUNT)], rendered.poses(COUNT), atol=1e-9)
-    assert "points on surfaces" in data.box_source and not data.unused
+    assert "surface points" in data.box_source and not data.unused
     for k in range(COUNT):
         assert (result.output / "images" / f"{k}.png").read_bytes() == (photos / f"{k}.png").read_bytes()
     assert result.unregistered == [] and result.points == 400 and not recorder.warnings

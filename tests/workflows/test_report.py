@@ -77,7 +77,7 @@ def test_a_report_of_all_files_in_a_folder(run, tmp_path):
     text = result.path.read_text(encoding="utf-8")
     assert (
         recorder.messages[0]
-        == "Better than nearest rays, the strongest baseline, for new people at new places."
+        == "Better than nearest rays, the strongest baseline, for held-out participants at held-out positions."
         in text
     )
     assert recorder.messages[-1].startswith(f"wrote {tmp_path / 'a.html'} (") and len(text) < 6_000_000
@@ -139,7 +139,7 @@ def test_a_report_of_objects_without_rays(without_3d, run, tmp_path):
     options = replace(SMALL, aois=run / "objects.json", observer=(-0.5, 0.0, 1.6))
     contents = make_report([run / "gaze.safetensors"], tmp_path / "a.html", options).run
     assert contents.objects[0].recorded is None and 0 < contents.objects[0].predicted.mean < 1
-    assert "where it was asked for, at (-0.50, 0.00, 1.60)" in contents.observer
+    assert "at the given position, (-0.50, 0.00, 1.60)" in contents.observer
 
 
 def test_missing_evaluations_are_computed(without_3d, run, tmp_path, monkeypatch):
@@ -175,7 +175,7 @@ def test_evaluations_of_another_field_are_refused_or_warned_about(without_3d, ru
     with pytest.raises(NergError, match='"pos"'):
         make_report([gaze, evaluation(), evaluation()], tmp_path / "a.html", SMALL)
     contents = make_report([gaze, evaluation(gaze="other.safetensors")], tmp_path / "a.html", SMALL).run
-    assert "a field called other.safetensors" in contents.warnings[0]
+    assert "a field named other.safetensors" in contents.warnings[0]
 
 
 def test_a_report_without_geometry(tmp_path):

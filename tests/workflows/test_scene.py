@@ -436,7 +436,7 @@ def test03_a_folder_is_replaced_by_its_files(rgb, tmp_path, rays_file):
     for name in ("twin.ply", "twin_lights.ply", "display.xml"):
         shutil.copy(demo.find_store_scene().parent / name, run / name)
     (run / "scene.xml").unlink()
-    with pytest.raises(NergError, match="name the one to view"):
+    with pytest.raises(NergError, match="name one of them"):
         make_viewer_scene([run], tmp_path)
 
 

@@ -215,7 +215,7 @@ def test_an_interrupted_training_returns_a_result_or_reports_how_to_resume(rays,
     assert not out.with_suffix(".run").exists() and not resumed.interrupted and resumed.provenance["steps"] == 8
     for name, value in arrays(complete.field).items():
         np.testing.assert_array_equal(value, arrays(resumed.field)[name], err_msg=name)
-    with pytest.raises(NergError, match="nothing to resume"):
+    with pytest.raises(NergError, match="no state to resume"):
         train_gaze(rays, out, replace(options, resume=True))
 
 

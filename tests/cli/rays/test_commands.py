@@ -116,7 +116,7 @@ def test_a_file_without_rays_is_refused(walk, tmp_path):
     rays.select(rays.t < rays.t).save(tmp_path / "none.npz")
     for kind in ("density", "layout"):
         done = run("plot", tmp_path / "none.npz", "-o", tmp_path / "p.png", "--kind", kind)
-        assert isinstance(done.exception, NergError) and "no rays to draw" in str(done.exception)
+        assert isinstance(done.exception, NergError) and "no gaze samples to draw" in str(done.exception)
 
 
 def test_plot_density(walk, tmp_path):
