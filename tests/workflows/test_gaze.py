@@ -107,7 +107,7 @@ def test_two_workers_give_equal_scores_although_one_is_killed(tmp_path, rgb):
     with ClusterOfProcesses(tmp_path) as cluster:
         recorder = Killer(cluster)
         cluster.start_worker(), cluster.start_worker()
-        wait_until(lambda: all("works for" in cluster.log(f"worker{k}") for k in (0, 1)), "both workers are there")
+        wait_until(lambda: all("connected to" in cluster.log(f"worker{k}") for k in (0, 1)), "both workers are there")
         options = FoldOptions(**SMALL | {"folds": 3}, scheduler=cluster.address)
         result = evaluate_folds(tmp_path / "rays.npz", tmp_path / "out", options, recorder)
         assert cluster.workers[0].poll() is not None and cluster.workers[1].poll() is None

@@ -201,8 +201,8 @@ def test_gaze_alone_locates_its_geometry_by_name_and_checksum(rgb, folder, tmp_p
     recorder = Recorder()
     options = SceneOptions(observer=(0, 0, 0), mode=MODE)
     write_scene([other, folder / "field.safetensors"], tmp_path / "c.xml", options, recorder)
-    assert any("was trained in another file" in line for line in recorder.warnings)
-    with pytest.raises(NergError, match="does not say"):
+    assert any("was not trained in" in line for line in recorder.warnings)
+    with pytest.raises(NergError, match="does not store the geometry"):
         write_scene([folder / "gaze.safetensors"], tmp_path / "d.xml", SceneOptions(mode=MODE))
 
 

@@ -69,7 +69,7 @@ def test_two_workers_measure_equal_errors(tmp_path, rgb, monkeypatch):
     local = run_study("sphere", tmp_path / "here", StudyOptions(**SMALL)).report
     with ClusterOfProcesses(tmp_path) as cluster:
         cluster.start_worker(), cluster.start_worker()
-        wait_until(lambda: all("works for" in cluster.log(f"worker{k}") for k in (0, 1)), "both workers are there")
+        wait_until(lambda: all("connected to" in cluster.log(f"worker{k}") for k in (0, 1)), "both workers are there")
         options = StudyOptions(**SMALL, scheduler=cluster.address)
         distributed = run_study("sphere", tmp_path / "there", options).report
     assert errors(distributed) == errors(local) and len(local["rows"]) == 6
