@@ -61,9 +61,9 @@ class InputFiles:
         Its kind: "field", "mesh", "hits", "scene", or "none" without geometry.
     gaze, rays
         Files, or None.
-    about
+    gaze_provenance
         Provenance of the gaze field.
-    field_about
+    field_metadata
         Metadata of the radiance field; empty for Gaussian splats.
     """
 
@@ -114,7 +114,8 @@ def detect_kind(path: Path) -> str:
 
 
 def recognise(files: Sequence[Path], geometry: str | None, reporter: Reporter) -> InputFiles:
-    """Recognise ``files``; look up the geometry of a gaze field without one next to it.
+    """Detect the kind of each of ``files``. If they contain a gaze field and no geometry, use the geometry file of its
+    training, which must be in the folder of the gaze field.
 
     ``geometry`` is "hits" or "none" for rays alone; None uses hit points if there are any. A geometry of hit points
     that still has to be built has kind "hits" and no file. Raises `NergError` for files that do not make a scene.
@@ -135,6 +136,10 @@ def recognise(files: Sequence[Path], geometry: str | None, reporter: Reporter) -
     kind, place = by_role.get("place", ("none", None))
     if place is not None and geometry is not None:
         raise NergError(f'--geometry applies to rays alone, and there is "{place}"; leave out one of them')
+    if gaze is not None and geometry is not None:
+        raise NergError(
+            f'--geometry applies to rays alone, and "{gaze}" is shown in the geometry of its training; leave it out'
+        )
     if place is not None and gaze is not None:
         _compare(place, gaze, provenance, reporter)
     elif gaze is not None:
@@ -182,7 +187,7 @@ def _compare(place: Path, gaze: Path, provenance: dict, reporter: Reporter) -> N
 
 
 def find_training_scene(provenance: dict) -> str | None:
-    """Return the checksum of the geometry file of a gaze field with the provenance ``about``, or None."""
+    """Return the checksum of the geometry file of a gaze field with this ``provenance``, or None."""
     trained_file = _place_file(provenance)
     return None if trained_file is None else trained_file.get("sha256")
 
@@ -205,7 +210,7 @@ def _have_hits(rays: Path | None) -> bool:
 
 @dataclass(frozen=True)
 class PhotoCamera:
-    """``eye`` and ``lens`` of the photo ``name``; ``bent`` tells whether its lens has distortion, which is ignored."""
+    """``eye`` and ``lens`` of the photo ``name``. ``has_distortion``: its lens has distortion, which is ignored."""
 
     name: str
     eye: LookAt
@@ -225,7 +230,7 @@ def load_photo_camera(photos: Path, photo: str, provenance: dict, allow_outside:
 def load_photo_cameras(
     photos: Path, provenance: dict, allow_outside: bool = False, max_count: int = 200
 ) -> list[PhotoCamera]:
-    """Return the cameras of at most ``most`` evenly selected photos, otherwise like `load_photo_camera`."""
+    """Return the cameras of at most ``max_count`` evenly selected photos, otherwise like `load_photo_camera`."""
     frames = _posed(photos, provenance, allow_outside).frames
     return [_camera(f) for f in frames[:: -(-len(frames) // max_count)]]
 
@@ -302,7 +307,7 @@ class WrittenGeometry:
 
 
 def write_scene_geometry(inputs: InputFiles, output: Path) -> WrittenGeometry:
-    """Return the scene elements of the geometry in ``given``.
+    """Return the scene elements of the geometry in ``inputs``.
 
     Additional files are written next to ``output``: the colours of hit points, and a mesh that Mitsuba cannot show as
     it is. Raises `NergError` for unusable files.

@@ -263,6 +263,13 @@ def test_the_geometry_of_a_gaze_field_is_next_to_it(folder):
     assert recognised.place == folder / "moved.safetensors" and not recorder.warnings
 
 
+@pytest.mark.parametrize("geometry", ["hits", "none"])
+@pytest.mark.parametrize("gaze", ["gaze", "nowhere"])
+def test_a_gaze_field_is_not_shown_in_another_geometry(folder, gaze, geometry):
+    with pytest.raises(NergError, match=f'^--geometry .*"{folder}/{gaze}.safetensors" is shown .* leave it out$'):
+        recognise([folder / f"{gaze}.safetensors", folder / "hits.npz"], geometry, Recorder())
+
+
 def test_another_geometry_causes_a_warning(folder):
     for gaze, said in (("gaze", "was not trained in"), ("nowhere", "without geometry")):
         recorder = Recorder()
