@@ -28,9 +28,9 @@ Kernel density of tracked rays (:monosp:`gazekde`)
 
 Where participants near the observer looked, as a density in 1/sr: the ground truth for a gaze field (NeRG, Section
 5.3). It is the ``kde`` of the integrator :ref:`nerg <integrator-nerg>`, whose AOV ``kde`` shows it on the surfaces that
-the camera sees; it cannot be evaluated as a plain volume. Rays are collected once per observer. Images of at least
-4,096 pixels (and of at least 165 kappa pixels) interpolate the density in a table (within 1e-4 of the maximum density
-of one ray's kernel); smaller ones sum all rays for each pixel.
+the camera sees; it cannot be evaluated as a plain volume. Rays are collected once per observer. Images with at
+least max(4,096, 165 x ``kappa``) pixels interpolate the density in a table (within 1e-4 of the maximum density of one
+ray's kernel); smaller ones sum all rays for each pixel.
 
 .. tabs::
     .. code-tab:: xml

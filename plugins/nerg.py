@@ -247,19 +247,18 @@ PARAMETER_TEXTS = {
     "ceiling": "Height of a clipping plane for cameras above it, so that a roof does not hide the rooms below: rays "
     "that start above the plane begin where they cross it; depths are still measured from the camera. Observer rays "
     "are not clipped. (Default: none)",
-    "depth_tolerance": "Depth tolerance between the camera's and the observer's surface, in scene units; 0: two march "
-    "steps, "
-    "or, without a field, 1e-4 of the scene's diagonal (or of twice the larger distance of surface and observer from "
-    "the origin, if that is less, so that a distant sky dome does not blur shadows). The target of the observer's ray "
-    "lies in front of the camera's surface by this distance plus the penetration depth of light (at most 1/64 of the "
-    "depth), so that no surface hides itself. Limited to 1e18.",
-    "integral_tolerance": "Relative error of that integral below which fewer directions are used; estimated from the "
-    "scatter of partial sums, usually too high. 0: always use the maximum number, which also applies to functions that "
-    "``dr.freeze`` records.",
+    "depth_tolerance": "Depth tolerance of the occlusion test, in scene units; at most 1e18. 0: two march steps "
+    "(longer with ``dt_gamma``). Without a field: 1e-4 of the smaller of the scene's diagonal and twice the larger "
+    "distance of surface and observer from the origin. The target of the observer's ray lies in front of the camera's "
+    "surface by the tolerance plus the penetration depth of light (at most 1/64 of the depth), so that no surface "
+    "hides itself.",
+    "integral_tolerance": "Relative error of that integral below which fewer directions are used. The error is "
+    "estimated from the variation of partial sums; the estimate is usually larger than the true error. 0: always use "
+    "the maximum number, which also applies to functions that ``dr.freeze`` records.",
     "dt_gamma": "Minimum step as a fraction of the distance travelled: for wide views, whose distant parts need no "
     "short steps. (Default: 0, i.e. uniform steps; for an unbounded field the value of its training)",
-    "stop": "Transmittance below which the march ends; the error of an expected depth is 16 times this value, in mean "
-    "free paths.",
+    "stop": "Transmittance below which the march ends. With ``depth`` = ``expected``, the depth error is about 16 x "
+    "``stop`` mean free paths.",
     "refined": "Skip the parts of a field's occupied cells in which its training or ``nerg refine`` found no density; "
     "false: skip only its empty cells.",
 }
@@ -483,7 +482,7 @@ class NergIntegrator(mi.SamplingIntegrator):
 
     @contextmanager
     def rendering_from(self, sensor, scene):
-        """Context in which the rays that ``sample`` receives come from ``sensor``."""
+        """Return a context manager. Inside it, the integrator traces camera rays of ``sensor``."""
         self.context().check_scene(scene)
         if 0 in sensor.film().crop_size():
             raise NergError("the film's crop window is empty; give it a crop_width and a crop_height of at least 1")

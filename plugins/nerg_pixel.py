@@ -296,7 +296,7 @@ class Pixel:
 
     @cached_property
     def distance_and_direction(self) -> tuple[Float, Vector3f]:
-        """From the observer to the surface."""
+        """Distance and unit direction from the observer to the surface."""
         return observer.distance_and_direction(self.observer.p_o, self.camera.p_d)
 
     @property

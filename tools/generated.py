@@ -51,7 +51,9 @@ def checks() -> str:
 def _relisted(text: str) -> str:
     """A Markdown table as a list where its lines are too long to be read."""
     head, _, *rows = map(cells, text.strip().split("\n"))
-    return table_or_list(head, rows)
+    listed = table_or_list(head, rows)
+    # Only a cell of a table needs a backslash in front of a bar.
+    return listed if listed.startswith("|") else listed.replace("\\|", "|")
 
 
 def recipes() -> str:

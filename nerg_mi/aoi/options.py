@@ -146,7 +146,8 @@ class StatisticsOptions(CountOptions, PredictionOptions, PartOptions):
 
     viewpoints: int = option(
         256,
-        "Approximate number of recorded positions from which the gaze field is evaluated.",
+        "Approximate number of viewpoints from which the gaze field is evaluated: recorded positions, or positions on "
+        "the floor if there are no recordings. Each participant has at least one, up to this number of participants.",
         within=Range(1, 100_000),
         group=ANALYSIS,
     )

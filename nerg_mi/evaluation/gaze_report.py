@@ -94,7 +94,9 @@ def write_report(
 
 
 def format_uncertainty(ranks: list[dict], regions: list[dict]) -> str:
-    """Format rows of `uncertainty.correlate_uncertainty` and `uncertainty.measure_calibration` as Markdown."""
+    """Format two tables as Markdown: ``ranks``, correlations of uncertainty with error, and ``regions``, coverage of
+    highest-density regions.
+    """
     text = ""
     if ranks:
         shares = tuple(f"{share:.0%}" for share in RETAINED_FRACTIONS)

@@ -415,23 +415,23 @@ def open_member(
 ) -> tuple[IO[bytes], int]:
     """Open the member ``name``. Returns ``(stream, size)``, where size is the claimed size.
 
-    Raises `NergError` if the compressed bytes cannot inflate to the claimed size.
+    Raises `NergError` if the member extends beyond the end of the file, or its compressed bytes cannot inflate to the
+    claimed size.
     """
     with translate_read_errors(path, file_kind):
         info = archive.getinfo(name)
         stream = archive.open(info)
         file: Any = archive.fp
         archive_bytes = os.fstat(file.fileno()).st_size
-    if (
-        info.file_size > _MAX_DEFLATE_RATIO * info.compress_size + _MAX_DEFLATE_RATIO
-        or info.header_offset + info.compress_size > archive_bytes
-    ):
+    member = f'the member "{sanitize(info.filename)}"'
+    if info.header_offset + info.compress_size > archive_bytes:
+        stream.close()
+        raise NergError(f'the {file_kind} "{path}" is truncated: {member} extends beyond its end; copy the file again')
+    if info.file_size > _MAX_DEFLATE_RATIO * info.compress_size + _MAX_DEFLATE_RATIO:
         stream.close()
         raise NergError(
-            f'the member "{sanitize(info.filename)}" of the {file_kind} "{path}" claims {info.file_size:,} bytes, but '
-            "its "
-            f"{min(info.compress_size, archive_bytes):,} compressed bytes cannot inflate to that size; copy the file "
-            "again"
+            f'{member} of the {file_kind} "{path}" claims {info.file_size:,} bytes, but its {info.compress_size:,} '
+            "compressed bytes cannot inflate to that size; copy the file again"
         )
     return stream, info.file_size
 

@@ -112,8 +112,9 @@ def undistort(xy: np.ndarray, lens: Intrinsics) -> np.ndarray:
 
 
 def undistort_with_mask(xy: np.ndarray, lens: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
-    """Invert `distort`. Returns the coordinates (..., 2) and a mask (...) of the valid ones, for which an inverse
-    exists.
+    """Invert `distort` for normalised image coordinates of a pinhole lens.
+
+    Returns the coordinates (..., 2) and a mask (...) that is true where an inverse exists.
     """
     target = np.asarray(xy, np.float64)
     if not any(lens.distortion):

@@ -219,7 +219,10 @@ def read_image_poses(folder: str | Path) -> tuple[Path, str, list[tuple[str, np.
         try:
             poses.append((name, _make_pose(q, t)))
         except NergError as error:
-            raise NergError(f'image "{sanitize(name)}" of "{path}": {error}; copy the model again') from error
+            raise NergError(
+                f'the pose of image "{sanitize(name)}" in the COLMAP file "{path}" is invalid ({error}); copy the '
+                "COLMAP model again"
+            ) from error
     notes = _check_stated_count(path, len(poses)) if path.suffix == ".txt" else []
     return path, _compute_digest(files), poses, notes
 
@@ -261,7 +264,11 @@ def _make_frame(
         if not existing:
             raise NergError(f'its mask "{sanitize(paths[0])}" does not exist')
         mask = MaskFile(existing[0])
-    return PosedFrame(name, image, _make_pose(q, t), lens, mask=mask, ignores_exif=True)
+    try:
+        pose = _make_pose(q, t)
+    except NergError as error:
+        raise NergError(f"its pose is {error}") from error
+    return PosedFrame(name, image, pose, lens, mask=mask, ignores_exif=True)
 
 
 def _make_pose(q, t) -> np.ndarray:
@@ -269,7 +276,7 @@ def _make_pose(q, t) -> np.ndarray:
 
     norm = float(np.linalg.norm(q))
     if not (1e-6 < norm <= MAX_POSITION and np.abs(t).max() <= MAX_POSITION):
-        raise NergError("its pose is not finite, or its quaternion is zero")
+        raise NergError("not finite, or its quaternion is zero")
     back = Rotation.from_quat(np.roll(np.asarray(q, np.float64), -1)).as_matrix().T
     out = np.eye(4)
     out[:3, :3], out[:3, 3] = back, -back @ np.asarray(t, np.float64)

@@ -49,17 +49,21 @@ def read_metadata(document: str | bytes, path: str | os.PathLike) -> dict[str, A
         raise NergError(
             f'the rays file "{path}" was written by another version of the format; import the tracking files again'
         )
-    for key, (holds, what) in _METADATA_CHECKS.items():
-        if key in metadata and not holds(metadata[key]):
-            raise invalid_rays_file(path, f'"{key}" of its metadata is not {what}')
-    for key in ("persons", "frame"):
-        if key not in metadata:
-            raise invalid_rays_file(path, f'its metadata lack "{key}"')
+    if problem := _find_metadata_problem(metadata):
+        raise invalid_rays_file(path, f"in its metadata, {problem}")
     return metadata
 
 
+def _find_metadata_problem(metadata: dict[str, Any]) -> str | None:
+    """Return what is wrong with the values of ``metadata``, or None."""
+    for key, (holds, what) in _METADATA_CHECKS.items():
+        if key in metadata and not holds(metadata[key]):
+            return f'"{key}" is not {what}'
+    return next((f'"{key}" is missing' for key in ("persons", "frame") if key not in metadata), None)
+
+
 def invalid_rays_file(path: str | os.PathLike, reason: str) -> NergError:
-    """Make the error for a file ``path`` that is not a rays file, with the reason ``why``."""
+    """Make the error for a file ``path`` that is not a rays file, with the ``reason``."""
     return NergError(f"\"{path}\" is not a rays file ({reason}); make one with 'nerg rays import'")
 
 
@@ -180,12 +184,12 @@ def write_rays_file(path: str | os.PathLike, columns: dict[str, np.ndarray], met
     ``head``. Raises `NergError` for an unsupported suffix and for metadata that `read_rays_file` would reject, and
     ``ImportError`` for Parquet without pyarrow.
     """
-    document = json.dumps({"version": VERSION, **metadata})
-    try:
-        read_metadata(document, path)
-    except NergError as error:
-        # Only write what can be read again.
-        raise NergError(f"these rays cannot be saved: {error}") from error
+    document = json.dumps({**metadata, "version": VERSION})
+    # Only write what can be read again.
+    written = parse_json(document, path, "rays file")
+    assert isinstance(written, dict)
+    if problem := _find_metadata_problem(written):
+        raise NergError(f"the metadata of these rays are invalid: {problem}")
     if _check_suffix(path) == ".npz":
         # Like savez_compressed, but with a faster level of zlib, and without compression where it has little effect:
         # takes seconds for millions of rays.

@@ -69,17 +69,20 @@ def read_frames(path: str | Path) -> list[dict[str, str]]:
                 continue
             if len(cells) != len(names):
                 raise NergError(
-                    f'"{path}" (line {lines.line_num}) has {len(cells)} values for {len(names)} columns; values with '
-                    'commas, such as positions, need quotes: "1, 2, 3"'
+                    f'the frames file "{path}" (line {lines.line_num}) has {len(cells)} values for {len(names)} '
+                    'columns; values with commas, such as positions, need quotes: "1, 2, 3"'
                 )
             if len(frames) == MAX_FRAMES:
-                raise NergError(f'"{path}" has more than {MAX_FRAMES:,} frames; split the file')
+                raise NergError(f'the frames file "{path}" has more than {MAX_FRAMES:,} frames; split the file')
             frames.append(dict(zip(names, cells)))
     except csv.Error as error:
-        raise NergError(f'"{path}" (line {lines.line_num}) is not valid CSV: {sanitize(error)}') from error
+        raise NergError(
+            f'the frames file "{path}" (line {lines.line_num}) is not valid CSV: {sanitize(error)}'
+        ) from error
     if not frames:
         raise NergError(
-            f'"{path}" contains no frames; it needs a header with names of <default>s and one line per frame'
+            f'the frames file "{path}" contains no frames; it needs a header with names of <default>s and one line '
+            "per frame"
         )
     return frames
 

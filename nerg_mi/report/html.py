@@ -80,7 +80,7 @@ def table(header: Sequence[Content], rows: Iterable[Sequence[Content]], numeric_
 
 
 def key_value_table(rows: Iterable[tuple[Content, Content]]) -> Html:
-    """Return a table of labels and values."""
+    """Return an HTML table with one row per (label, value) pair."""
     lines = [element("tr", element("th", name, scope="row"), element("td", value)) for name, value in rows]
     return element("div", element("table", element("tbody", lines), class_="pairs"), class_="scroll")
 

@@ -39,7 +39,8 @@ def compute_outside_fraction(
 ) -> float:
     """Return the fraction of the pixels of ``views`` that show something outside ``core``, or nothing.
 
-    ``render`` returns the depths; every ``every``-th pixel is used, starting at ``every // 2``.
+    ``render`` returns the depths and opacities of every ``every``-th row and column, starting at ``every // 2``. A
+    pixel with an opacity of at most 0.5 shows nothing.
     """
     is_outside = []
     for view in views:

@@ -347,7 +347,10 @@ class SplatMedium:
 
     @property
     def default_step(self) -> float | None:
-        """The median thickness of a Gaussian, a typical depth difference of one surface."""
+        """Median thickness (smallest standard deviation) of the Gaussians in scene units.
+
+        Sets the depth tolerance of occlusion; splats are not marched.
+        """
         return self.arrays.thickness * self.to_world.scale
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:

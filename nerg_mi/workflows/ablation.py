@@ -179,7 +179,7 @@ def ablate(
     recipes = options.recipes.split(",")
     radiance = options.field is not None and not is_splat_file(options.field)
     available = ablation.list_variants(radiance, recipes)
-    variants = _select_variants(available, options.variant)
+    variants = _select_variants(available, options.variant, options.recipes)
     if options.ground_truth:
         load_ground_truth(options.ground_truth)
     check_folder(output)
@@ -320,11 +320,14 @@ def _identity(variant: Variant, seed: int, bench: AblationBenchmark) -> dict:
     }
 
 
-def _select_variants(variants: list[Variant], names: tuple[str, ...]) -> list[Variant]:
-    """Return those of ``variants`` whose name is in ``names``, or all if ``names`` is empty."""
+def _select_variants(variants: list[Variant], names: tuple[str, ...], recipes: str) -> list[Variant]:
+    """Return those of ``variants`` of the ``recipes`` whose name is in ``names``, or all if ``names`` is empty."""
     available = list(dict.fromkeys(v.name for v in variants))
     if unknown := sorted(set(names) - set(available)):
-        raise NergError(f'--variant must be one of {", ".join(available)} for these recipes, got "{unknown[0]}"')
+        raise NergError(
+            f'the training recipes "{recipes}" have no variant "{unknown[0]}"; --variant must be one of '
+            f"{', '.join(available)}"
+        )
     return [v for v in variants if not names or v.name in names]
 
 

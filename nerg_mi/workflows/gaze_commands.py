@@ -149,7 +149,9 @@ class GazeOptions(DerivedOptions, GeometryOptions):
         within=Range(0, 1000),
         group=TEST,
     )
-    test_positions: int = option(64, "Number of test positions in these zones.", within=Range(1, 10**5), group=TEST)
+    test_positions: int = option(
+        64, "Maximum number of test positions, in all held-out zones together.", within=Range(1, 10**5), group=TEST
+    )
     test_participants: float = option(
         0.0, "Fraction of the participants that are also held out for testing.", within=TEST_FRACTIONS, group=TEST
     )
@@ -261,7 +263,12 @@ class GazeEvaluationOptions(ValidatedDataclass):
         within=Range(0, 10**5),
         group=TEST,
     )
-    pictures: int = option(4, "Number of test positions that are drawn.", within=Range(0, 10000), group=OUTPUT)
+    pictures: int = option(
+        4,
+        "Number of test positions in the figure that compares reference and predicted densities; 0 draws no figure.",
+        within=Range(0, 10000),
+        group=OUTPUT,
+    )
     seed: int = random_seed("sampled rays, bootstrap resamples and split halves")
     threads: int | None = cpu_threads()
     mode: str = llvm_variant()
@@ -274,7 +281,9 @@ class HeldOutOptions(ValidatedDataclass):
     test_zones: int = option(
         3, "Number of zones whose positions are held out for testing.", within=Range(1, 1000), group=TEST
     )
-    test_positions: int = option(60, "Number of test positions in these zones.", within=Range(1, 10**5), group=TEST)
+    test_positions: int = option(
+        60, "Maximum number of test positions, in all held-out zones together.", within=Range(1, 10**5), group=TEST
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

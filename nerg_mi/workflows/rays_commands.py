@@ -237,7 +237,9 @@ class SplitOptions(ValidatedDataclass):
         group=TEST,
     )
     zone_radius: float = option(0.2, "Radius of a zone in metres.", within=Range(0, 10**6), group=TEST)
-    test_positions: int = option(150, "Number of test positions in the zones.", within=Range(1, 10**5), group=TEST)
+    test_positions: int = option(
+        150, "Maximum number of test positions, in all held-out zones together.", within=Range(1, 10**5), group=TEST
+    )
     min_rays: int = option(
         64, "Minimum number of rays within R of a test position.", within=Range(1, 10**6), group=TEST
     )

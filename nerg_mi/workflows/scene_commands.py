@@ -374,7 +374,11 @@ class FloorOptions(ValidatedDataclass):
     floor_height: float = option(0.0, "Height of the floor (z) in scene units.", within=COORDINATES, group=VIEW)
     paths: bool = option(True, "Draw the paths of the participants.", group=VIEW)
     num_rays: int = option(
-        0, "Number of rays to draw, from the eye to the hit point.", within=Range(0, 20000), group=VIEW
+        0,
+        "Number of recorded rays to draw, evenly selected, from the eye to the hit point (or a point ahead where no "
+        "hit point is recorded).",
+        within=Range(0, 20000),
+        group=VIEW,
     )
     num_views: int = option(
         0, "Number of fields of view to draw for each participant.", within=Range(0, 1000), group=VIEW
@@ -551,8 +555,8 @@ class BakeOptions(PartOptions):
     )
     ray_weights: str = option(
         "time",
-        "Weights of the rays: time (their duration), person (equal for each participant) or equal (equal for "
-        "each ray).",
+        "Weights of the rays: time (duration of each ray), person (duration, with equal totals for all participants) "
+        "or equal (the same for each ray).",
         group=ANALYSIS,
     )
     align: Path | None = option(None, ALIGN_HELP, group=INPUT)

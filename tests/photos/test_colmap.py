@@ -196,7 +196,7 @@ def test_zero_quaternion_is_listed(tmp_path):
     (tmp_path / "images.txt").write_text("\n".join(text))
     posed = read_colmap(tmp_path, tmp_path)
     assert [f.name for f in posed.frames] == ["b.png"] and "quaternion" in posed.unused[0].reason
-    with pytest.raises(NergError, match='image "a.png" of .*its quaternion is zero'):
+    with pytest.raises(NergError, match='the pose of image "a.png" in .* is invalid .*its quaternion is zero'):
         read_named_poses(tmp_path)
 
 

@@ -235,7 +235,7 @@ def test_rows_are_computed_once(tmp_path, monkeypatch):
     [
         ({"law": "nowhere"}, "MODULE:CLASS"),
         ({"law": "tests.workflows.test_gaze:Nobody"}, "MODULE:CLASS"),
-        ({"variant": ("emitt",)}, "--variant must be one of emit, capture,"),
+        ({"variant": ("emitt",)}, '"default" have no variant "emitt"; --variant must be one of emit, capture,'),
         ({"size": "320"}, "WIDTHxHEIGHT"),
         ({"recipes": "default,best"}, '"best"'),
         ({"geometry": None}, "one of --field FILE"),
@@ -252,7 +252,7 @@ def test_splats_have_no_features_of_a_radiance_field(tmp_path):
     options = replace(
         ABLATION_OPTIONS, geometry=None, field=tmp_path / "place.ply", recipes="small", variant=("semantic snapshot",)
     )
-    with pytest.raises(NergError, match="--variant must be one of emit, capture,"):
+    with pytest.raises(NergError, match='"small" have no variant "semantic snapshot"; --variant must be one of emit, '):
         ablate(crowd(100), tmp_path / "new", options)
 
 
