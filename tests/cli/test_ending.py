@@ -326,7 +326,11 @@ ENDS = {
         1,
         "rays import {i}/day.csv -o {o}/a.npz --map 'origin=x,y,z direction=a,b,c t=t person=p'",
     ),
-    "export": ("fields.extraction.FieldSampler.density_on", 1, "export points {i}/field.safetensors -o {o}/a.ply --resolution 16"),
+    "export": (
+        "fields.extraction.FieldSampler.density_on",
+        1,
+        "export points {i}/field.safetensors -o {o}/a.ply --resolution 16",
+    ),
 }
 """Function during whose so-many-th call Ctrl-C comes, and the command line with its folders of inputs and outputs."""
 
