@@ -419,13 +419,13 @@ def check_names(function: str, names: Iterable[str], allowed: Collection[str], n
 
     Parameters
     ----------
-    job : str
+    function : str
         Name of the API function, for messages.
-    given : iterable of str
+    names : iterable of str
         Names to check.
-    known : collection of str
+    allowed : collection of str
         Allowed names.
-    what : str
+    noun : str
         What the names stand for, for messages.
 
     Raises
@@ -805,7 +805,7 @@ def _make_observer_sensor(position: ArrayLike) -> dict:
 def make_aov_context(scene: Scene, quantities: Sequence[str]) -> Any:
     """Return the context that computes ``quantities`` of the scene.
 
-    Its ``own`` quantities depend on the observer, its ``shared`` ones do not. Raises `NergError` for quantities that
+    Its ``observer_aovs`` depend on the observer, its ``shared_aovs`` do not. Raises `NergError` for quantities that
     the scene cannot compute.
     """
     return scene.integrator.make_context([name for name in quantities if name != COLOR], COLOR in quantities)
@@ -820,7 +820,7 @@ def resolve_quantities(scene: Scene, names: object, allowed: tuple[str, ...] | N
         The scene.
     names : str, sequence of str or None
         Requested quantities; None selects the default.
-    known : tuple of str, optional
+    allowed : tuple of str, optional
         Allowed quantities. None: the integrator checks them later.
 
     Returns

@@ -567,7 +567,7 @@ def _evaluate_methods(
 ) -> list[tuple[str, np.ndarray, dict[str, np.ndarray]]]:
     """Evaluate each method: ``(name, maps (P, D), ray scores (P, K) by name)``.
 
-    ``on_part`` is called with the completed fraction.
+    ``on_progress`` is called with the completed fraction.
     """
     K = test.sample_directions.shape[1]
     evaluate_method = lambda method: [
@@ -653,7 +653,7 @@ def compute_ray_scores(
         Densities (P, K) at the rays.
     other_densities : numpy.ndarray
         Densities (P, M) at rays of other positions.
-    log_blind : numpy.ndarray
+    log_prior : numpy.ndarray
         Log of the reference density (P, K) at the rays.
 
     Notes

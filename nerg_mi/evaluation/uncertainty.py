@@ -201,7 +201,7 @@ def _bootstrap_interval(
 
 
 def _mean_certain_error(uncertainty: np.ndarray, error: np.ndarray, fraction: float) -> float:
-    """Return the mean ``error`` of the most certain ``share``; ties have equal weight."""
+    """Return the mean ``error`` of the most certain ``fraction``; ties have equal weight."""
     _, rank = np.unique(uncertainty, return_inverse=True)
     tied_mean = (np.bincount(rank, weights=error) / np.bincount(rank))[rank]
     most_certain = np.argsort(rank, kind="stable")[: max(1, round(fraction * len(error)))]

@@ -183,8 +183,7 @@ class ParticipantPath:
 
 @dataclass(frozen=True, eq=False)
 class SightLines:
-    """``origins`` (N, 2), unit ``directions`` (N, 2) or ``ends`` (N, 2) on the floor, and the index of the
-    participant of each (N,)."""
+    """``origins`` and ``ends`` (N, 2) on the floor, and the index of the ``participant`` of each (N,)."""
 
     origins: np.ndarray
     ends: np.ndarray

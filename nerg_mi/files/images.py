@@ -160,7 +160,7 @@ _SEGMENT = re.compile(rb"\xff([^\x00\x01\xff\xd0-\xd8])", re.DOTALL)
 
 
 def _count_jpeg_scans(data: bytes, position: int) -> int:
-    """Count the scans of the JPEG ``data`` from position ``at``.
+    """Count the scans of the JPEG ``data`` from ``position``.
 
     Other segments, such as EXIF data, and the bytes after the end of the image, where telephones append a video, may
     contain any bytes and are not counted.

@@ -16,7 +16,7 @@ _SAMPLE, _STRAY = 100_000, 0.01
 
 
 def check_coordinates(points: np.ndarray, name: str) -> None:
-    """Raise `NergError` for coordinates of ``points`` (N, 3) that are NaN or exceed `FARTHEST`; ``name``: for the
+    """Raise `NergError` for coordinates of ``points`` (N, 3) that are NaN or exceed `MAX_COORDINATE`; ``name``: for the
     message."""
     within = np.abs(points) <= MAX_COORDINATE
     if not within.all():

@@ -294,7 +294,7 @@ class Similarity:
 
     ``matrix``: (4, 4), local (field) to world (scene); default: the identity. ``scale``: length in the scene of one
     unit of the field. Raises ``NergError`` for a shear, a reflection or a non-uniform scale, for which densities and
-    directions have no single scale, and for a translation beyond `FARTHEST`.
+    directions have no single scale, and for a translation beyond `MAX_COORDINATE`.
     """
 
     def __init__(self, matrix: np.ndarray | None = None):

@@ -368,8 +368,8 @@ class Rays:
     """N gaze samples as rays, validated on construction.
 
     Raises `NergError` naming the first invalid ray for NaN, zero or non-unit directions, origins that are not finite,
-    origins and hit points beyond `FARTHEST`, non-finite times, and codes out of range; ``ValueError`` for arrays of
-    different lengths.
+    origins and hit points beyond `MAX_COORDINATE`, non-finite times, and codes out of range; ``ValueError`` for arrays
+    of different lengths.
 
     >>> import nerg_mi as nerg
     >>> eye, ahead = [[1.0, 1.0, 1.6], [1.0, 1.0, 1.6]], [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]

@@ -236,7 +236,7 @@ def find_surface_depth(
     settings: MarchSettings,
     ends_opaque: Bool | None = None,
 ) -> Float:
-    """Depth of ``kind`` (a name in ``DEPTHS``) from the result of a march: `DepthKind.find_in_medium`."""
+    """Depth of ``kind`` (a name in ``DEPTHS``) from the result of a march: `DepthKind.inside`."""
     return DEPTHS.find(kind).inside(MarchContext(result, medium, ray, t0, t1, active, settings, ends_opaque))
 
 

@@ -245,7 +245,7 @@ def as_scene_geometry(subject: Medium | SceneGeometry) -> SceneGeometry:
 
 
 def check_shape(shape: Any, context: str = "", check_merged: bool = False) -> None:
-    """Raise `NergError` for a mesh without faces, and for a shape that is not finite or extends beyond `FARTHEST`.
+    """Raise `NergError` for a mesh without faces, or a shape that is not finite or extends beyond `MAX_COORDINATE`.
 
     ``context``: suffix of the message that names the scene. ``check_merged``: whether meshes that Mitsuba has merged,
     which have no bounding box, are checked by their vertices, which are computed for this purpose.

@@ -108,8 +108,8 @@ class SplatArrays:
 
     ``ns``: array namespace of the backend. The attributes ``centers``, ``scales``, ``rotations`` (w first),
     ``opacities`` and ``harmonics`` are flat Floats in the order of ``splats``; call `pack` after changing them. It
-    derives, differentiably, what kernels read, in tree order: ``shapes`` and ``colors``; ``nodes`` and ``leaf_boxes``:
-    see `BoxTree`; ``bounds_jit``: lower and upper corner of all Gaussians, 6 one-lane Floats.
+    derives, differentiably, what kernels read, in tree order: ``shapes`` and ``colors``; ``nodes`` and ``places``: see
+    `BoxTree`; ``corners``: lower and upper corner of all Gaussians, 6 one-lane Floats.
     """
 
     # Lets Dr.Jit find the arrays in frozen functions.

@@ -126,8 +126,8 @@ class BakeScene:
     ----------
     mesh
         Target surface.
-    others
-        Occluders.
+    occluders
+        Meshes that only occlude.
     gaze
         Checkpoint of the gaze field. None: that of ``scene``, or of rays.
     scene
@@ -214,7 +214,7 @@ def read_observer_file(path: Path) -> WeightedObservers:
 
 
 def load_bake_rays(options: BakeOptions, rays: Rays | None) -> Rays | None:
-    """Return the rays ``given``, or those of --rays, or None. Raises `NergError` if there are none in the file."""
+    """Return ``rays``, or those of --rays, or None. Raises `NergError` if there are none in the file."""
     loaded = rays
     if loaded is None and options.rays is not None:
         loaded = load_rays(options.rays, options.max_samples, options.seed)
@@ -324,7 +324,7 @@ class BakeTarget:
         Index (F,) into ``names`` for each face.
     index
         Number (F,) of each face within its shape.
-    others
+    occluders
         Shapes that only occlude.
     """
 
@@ -366,7 +366,7 @@ def read_target(path: Path, shapes: tuple[str, ...], resolution: int, ns: Module
 
 
 def refine_target(receivers: BakeTarget, longest: float | None, scale: float) -> RefinedMesh:
-    """Subdivide the target to edges of at most ``longest`` metres, or to about `FACES` triangles.
+    """Subdivide the target to edges of at most ``longest`` metres, or to about `TARGET_FACES` triangles.
 
     ``scale`` is the number of scene units per metre.
     """
@@ -451,9 +451,9 @@ class SplatScene:
     def sums(self, part: WeightedObservers | TrackedRays) -> SurfaceSums:
         """Return the partial sums of the observers or rays in ``part``.
 
-        For rays, ``face`` holds shares of gaze on both sides of the Gaussians. For observers it holds densities, which
-        are not part of ``total``. A Mitsuba variant must be active. Loaded files are cached for the next part. Raises
-        `NergError`.
+        For rays, ``face_sums`` holds shares of gaze on both sides of the Gaussians. For observers it holds densities,
+        which are not part of ``total``. A Mitsuba variant must be active. Loaded files are cached for the next part.
+        Raises `NergError`.
         """
         geometry, make = prepare_once(self, self._load)
         if isinstance(part, TrackedRays):
@@ -564,7 +564,7 @@ class PlannedBake:
 def sum_in_parts(
     scene: BakeScene | SplatScene, groups: Sequence[WeightedObservers | TrackedRays], parts: PartRunner, job: str
 ) -> list[SurfaceSums]:
-    """Return the sums of each of ``groups`` from stored parts; ``what`` names the job."""
+    """Return the sums of each of ``groups`` from stored parts; ``job`` is its name."""
     all_parts: list[Part] = []
     for group in groups:
         kind, start = "rays" if isinstance(group, TrackedRays) else "observers", 0

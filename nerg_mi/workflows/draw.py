@@ -171,7 +171,8 @@ _FRAME = 1.04
 class BakedSurface:
     """A mesh with gaze.
 
-    ``values`` (V,) belong to its vertices, ``label`` names the quantity with its unit, and ``made_of`` the input files.
+    ``values`` (V,) belong to its vertices, ``label`` names the quantity with its unit, and ``gaze_files`` the input
+    files.
     """
 
     mesh: Mesh

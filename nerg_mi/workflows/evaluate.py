@@ -292,7 +292,7 @@ class FoldResult:
     Attributes
     ----------
     rows
-        One row per split and method: means over folds (`uncertainty.mean_rows`).
+        One row per split and method: means over folds (`uncertainty.summarise_folds`).
     each
         One row per fold, split and method.
     fields

@@ -141,7 +141,7 @@ def geometry_key(gaze: Path, provenance: dict) -> str:
 
 
 def find_training_file(gaze: Path, provenance: dict, explicit: Path | None, where: str, other: str) -> Path:
-    """Return the geometry file of the training of ``gaze``: ``given``, or the file with the stored name next to it.
+    """Return the geometry file of the training of ``gaze``: ``explicit``, or the file with the stored name next to it.
 
     Raises `NergError` for a missing file, with the remedy ``where``, and for a different one, with the remedy
     ``other``.

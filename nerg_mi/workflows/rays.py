@@ -58,7 +58,7 @@ class FilterStep:
 class FilterSteps:
     """Applies filter steps to rays one after the other.
 
-    ``own`` tells whether the rays are not used elsewhere, so that they may be modified in place. ``strict`` makes a
+    ``in_place`` tells whether the rays are not used elsewhere, so that they may be modified in place. ``strict`` makes a
     step that selects no ray an error.
     """
 
@@ -132,7 +132,7 @@ class FilterSteps:
 
 
 def smallest_mask(numbers: np.ndarray, n: int) -> np.ndarray:
-    """Return a mask of the ``n`` smallest of the numbers ``lot`` (N,), or of all if there are fewer."""
+    """Return a mask of the ``n`` smallest of the ``numbers`` (N,), or of all if there are fewer."""
     mask = np.ones(len(numbers), bool)
     if n < len(numbers):
         mask[np.argpartition(numbers, n)[n:]] = False

@@ -195,7 +195,7 @@ def draw_views(
 ) -> dict[str, ReportPicture]:
     """Draw colour and gaze from the camera, and the observer's view and sphere, hatched where the gaze is unknown.
 
-    ``about`` is the provenance for image headers.
+    ``record`` is the provenance for image headers.
     """
     out, text = {}, record.text()
     camera = views.images["camera"]
@@ -250,7 +250,7 @@ def _spread(layers: OverlayLayers, text: Mapping[str, str]) -> ReportPicture:
 
 
 def draw_rays(rays: Rays, test: Mapping[str, Any] | None, record: Provenance) -> dict[str, ReportPicture]:
-    """Draw floor plans. ``test`` describes the held-out data; ``about`` is the provenance for image headers."""
+    """Draw floor plans. ``test`` describes the held-out data; ``record`` is the provenance for image headers."""
     plan = encode(maps.floor_plan(rays), ".png", record.text())
     held_out = {}
     words = "Position of each ray."
@@ -362,7 +362,7 @@ def find_free_positions(
 def count_participants_near(
     rays: Rays, viewpoints: np.ndarray, place: TrainingGeometry, radius: float
 ) -> tuple[int, ...]:
-    """Count the participants with a ray within ``radius`` metres of each of the viewpoints ``eyes`` (P, 3)."""
+    """Count the participants with a ray within ``radius`` metres of each of the ``viewpoints`` (P, 3)."""
     from scipy.spatial import KDTree
 
     neighbours = KDTree(place.points_to_field(rays.origin)).query_ball_point(viewpoints, radius * place.align.scale)
@@ -416,7 +416,7 @@ def describe_scene(files: ReportFiles) -> str:
 
 
 def describe_observer(scene: SceneResult, is_given: bool) -> str:
-    """Describe the observer in a sentence; ``asked`` tells whether its position was given."""
+    """Describe the observer in a sentence; ``is_given`` tells whether its position was given."""
     if scene.observer is None:
         return "The camera is the observer, because no recorded positions are known."
     at = ", ".join(f"{v:.2f}" for v in scene.observer.origin)

@@ -76,7 +76,7 @@ class SceneRays:
         The rays, or None.
     file
         Their file, which the scene refers to, or None.
-    made
+    written_files
         Written files.
     dataset
         The dataset of which ``rays`` are a sample, or None.
@@ -101,7 +101,7 @@ def check_rays(rays_file: Path | None, scene: Path) -> None:
 
 
 def load_scene_rays(rays_file: Path | None, scene: Path, reporter: Reporter) -> SceneRays:
-    """Load the rays of the file or dataset ``given``.
+    """Load the rays of the file or dataset ``rays_file``.
 
     Of a dataset, a uniform sample of at most `MAX_SCENE_RAYS` is written next to the ``scene``, which can only read
     files.
@@ -176,9 +176,11 @@ def write_scene(
     NergError
         For errors that the user can correct.
 
-    Notes ----- The scene has the sensors and `<default>`s of the demo store: sensor 0 is a camera, 1 the observer's
-    view, 2 the observer's sphere. File names are relative to the folder of the scene where possible. Of a dataset of
-    rays, a uniform sample of at most a million is written next to the scene.
+    Notes
+    -----
+    The scene has the sensors and `<default>`s of the demo store: sensor 0 is a camera, 1 the observer's view, 2 the
+    observer's sphere. File names are relative to the folder of the scene where possible. Of a dataset of rays, a
+    uniform sample of at most a million is written next to the scene.
     """
     options, output = options or SceneOptions(), Path(output)
     check_writable(output, ".xml")

@@ -529,7 +529,7 @@ def option(
     default_text
         Default in words, if the value is not self-explanatory.
     within
-        Range of a number. Required for numbers, together with `Checked` as a base of the dataclass.
+        Range of a number. Required for numbers, together with `ValidatedDataclass` as a base of the dataclass.
     parse
         Converts the text of the command line to the value; raises `NergError` naming the flag. Without it, the field
         is a str, float, int, bool or Path, or None.

@@ -22,8 +22,8 @@ class PoseTrack:
 
     @classmethod
     def from_samples(cls, times: np.ndarray, rotation_vectors: np.ndarray, positions: np.ndarray) -> PoseTrack | None:
-        """Make a track from samples in any order. Drops samples with missing values or values beyond `FARTHEST`, and of
-        samples with equal times all but the first. Returns None if fewer than two remain."""
+        """Make a track from samples in any order. Drops samples with missing values or values beyond `MAX_COORDINATE`,
+        and of samples with equal times all but the first. Returns None if fewer than two remain."""
         within = lambda v: (np.abs(v) <= MAX_COORDINATE).all(axis=1)
         is_valid = (np.abs(times) <= TIMES.high) & within(rotation_vectors) & within(positions)
         rows = np.flatnonzero(is_valid)
