@@ -41,17 +41,17 @@ class DataSummary:
     images: int = 0
 
     def words(self) -> str:
-        """In words, such as "81,751 rays of 80 people"; "" without data."""
+        """In words, such as "81,751 rays of 80 participants"; "" without data."""
         rays = _count(self.rays, "ray", "rays")
         if rays and self.people:
-            rays += " of " + _count(self.people, "person", "people")
+            rays += " of " + _count(self.people, "person", "participants")
         return " and ".join(filter(None, [rays, _count(self.images, "salience image", "salience images")]))
 
 
 def summarize_provenance(provenance: Mapping[str, Any]) -> DataSummary | None:
     """The amount of data in a checkpoint's ``provenance``; None if it is not recorded, as in checkpoints of other
     programs."""
-    rays, people, images = (_number(provenance.get(name)) for name in ("rays", "people", "salience_views"))
+    rays, people, images = (_number(provenance.get(name)) for name in ("rays", "participants", "salience_views"))
     return DataSummary(rays or 0, people or None, images or 0) if rays or images else None
 
 

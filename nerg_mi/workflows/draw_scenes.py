@@ -74,7 +74,7 @@ def floor(files: Sequence[Path], options: FloorOptions, reporter: Reporter) -> D
         inputs.append(options.scene)
     number = {person: k for k, person in enumerate(np.unique(rays.person))}
     walks = _walks(rays, number) if options.paths else []
-    people = f"{len(number)} {'person' if len(number) == 1 else 'people'}"
+    people = f"{len(number)} {'participant' if len(number) == 1 else 'participants'}"
     figure = floor_figure(
         low,
         high,

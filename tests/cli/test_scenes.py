@@ -210,7 +210,7 @@ def test_the_demo_writes_and_names_everything(rgb, standins, tmp_path, nerg):
     for name in PICTURES:
         header = (out / name).read_bytes()
         assert all(digest.encode() in header for digest in report["inputs"].values()) and b'"seed": 0' in header, name
-    assert "made of 4,321 rays of 12 people" in (out / "report.html").read_text("utf-8")
+    assert "data: 4,321 rays of 12 participants" in (out / "report.html").read_text("utf-8")
     for name, digest in report["outputs"].items():
         assert hashlib.sha256((out / name).read_bytes()).hexdigest() == digest
 

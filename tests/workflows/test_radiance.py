@@ -335,7 +335,7 @@ def test_the_written_capture_is_readable(photos, finds, tmp_path):
         assert (result.output / "images" / f"{k}.png").read_bytes() == (photos / f"{k}.png").read_bytes()
     assert result.unregistered == [] and result.points == 400 and not recorder.warnings
     text = "\n".join(recorder.messages)
-    assert "9 of 9 pictures have a pose, 400 points; mean reprojection error 0.40 pixels" in text
+    assert "9 of 9 images have a pose, 400 points; mean reprojection error 0.40 pixels" in text
     assert "up is +z: the cameras are held level to 0.5 degrees" in text and "nerg train radiance" in text
 
 

@@ -98,7 +98,7 @@ def test_a_report_of_all_files_in_a_folder(run, tmp_path):
     assert not any(name in text for name in NAMES) and "participant 1" in text
     # How many rays of how many people the gaze rests on, and what all of it was made of.
     assert (
-        re.fullmatch(r"made of [\d,]+ rays of [1-4] people", contents.support_note)
+        re.fullmatch(r"data: [\d,]+ rays of [1-4] participants", contents.support_note)
         and text.count(contents.support_note) >= 2
     )
     made = json.loads(contents.provenance_json)
@@ -131,7 +131,7 @@ def test_a_report_of_a_gaze_field_alone(run, tmp_path):
         "No AOIs were given. Name a file of AOIs with --aois FILE.json.",
     ):
         assert sentence in text
-    assert "no evaluation is at hand" in recorder.messages[0] and packed_scene(text)["marks"] == 1
+    assert "there is no evaluation" in recorder.messages[0] and packed_scene(text)["marks"] == 1
     assert result.run.rays is None and result.run.results == ()
 
 
