@@ -44,7 +44,7 @@ class DataSummary:
         """In words, such as "81,751 rays of 80 participants"; "" without data."""
         rays = _count(self.rays, "ray", "rays")
         if rays and self.people:
-            rays += " of " + _count(self.people, "person", "participants")
+            rays += " of " + _count(self.people, "participant", "participants")
         return " and ".join(filter(None, [rays, _count(self.images, "salience image", "salience images")]))
 
 

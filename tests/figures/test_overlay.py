@@ -159,7 +159,7 @@ def test_figures_are_reproducible(tmp_path, name):
 def test_note_does_not_move_panels():
     """The note does not move the image or the scale."""
     plain, noted = (
-        figures.gaze_figure(PLOTS_COLOR, GAZE, MASK, HEAT, note=n) for n in ("", "made of 300 rays of 3 people")
+        figures.gaze_figure(PLOTS_COLOR, GAZE, MASK, HEAT, note=n) for n in ("", "made of 300 rays of 3 participants")
     )
     assert noted.bbox.height > plain.bbox.height and noted.bbox.width == plain.bbox.width
     for a, b in zip(plain.axes, noted.axes):

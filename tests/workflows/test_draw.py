@@ -60,7 +60,7 @@ def test_colour_values_and_mask(tmp_path):
 
 
 def test_the_basis_of_the_gaze_is_read(tmp_path):
-    text = {"gaze.basis": "made of 5 rays of 2 people", "kde.basis": "made of 3 rays of 1 person"}
+    text = {"gaze.basis": "made of 5 rays of 2 participants", "kde.basis": "made of 3 rays of 1 participant"}
     path = write(tmp_path / "a.exr", text, **{"kde.Y": GAZE, "depth.T": GAZE})
     bases = [read_stored(path, find_channel_overlay(channel)).support_note for channel in ("gaze", "kde.Y", "depth")]
     assert (
@@ -144,7 +144,7 @@ def test_a_sheet_without_values_needs_a_scale(tmp_path):
 
 
 def test_the_basis_of_the_gaze_is_printed_below_the_images(tmp_path):
-    texts = [{"gaze.basis": f"made of {n} rays of 2 people"} for n in (5, 6)]
+    texts = [{"gaze.basis": f"made of {n} rays of 2 participants"} for n in (5, 6)]
     a, b = (write(tmp_path / f"{name}.exr", text) for name, text in zip("ab", texts))
     said = lambda *files: {t.get_text().replace("\n", " ") for t in draw("sheet", list(files), overlay="gaze").texts}
     assert said(a, a) == {texts[0]["gaze.basis"]}
@@ -453,7 +453,7 @@ def paths(figure):
 
 def test_paths_break_at_recording_gaps(rays):
     figure = draw("floor", rays)
-    assert figure.texts[0].get_text() == "45 rays of 2 people"
+    assert figure.texts[0].get_text() == "45 rays of 2 participants"
     assert [t.get_text() for t in figure.axes[0].get_legend().get_texts()] == ["Ada", "Bob"]
     ada = paths(figure)[0]
     xy = np.stack([ada.get_xdata(), ada.get_ydata()], axis=1)

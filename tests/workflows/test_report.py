@@ -362,7 +362,7 @@ def test_unknown_gaze_is_hatched(name):
 
 
 def test_the_basis_of_the_gaze_is_printed():
-    plain, with_basis = (drawn(three(), basis=b) for b in ("", "made of 300 rays of 3 people"))
+    plain, with_basis = (drawn(three(), basis=b) for b in ("", "made of 300 rays of 3 participants"))
     for name in ("gaze", "own", "sphere"):
         a, b = (pixels(p[name].png) for p in (plain, with_basis))
         # A line more, below the picture.

@@ -23,10 +23,10 @@ from tests.fields.gaze.test_log_density import BOX, GRID, SMALL, made
 @pytest.mark.parametrize(
     ("basis", "words"),
     [
-        (DataSummary(81_751, 100), "81,751 rays of 100 people"),
+        (DataSummary(81_751, 100), "81,751 rays of 100 participants"),
         (DataSummary(1, 1), "1 ray of 1 person"),
         (DataSummary(300), "300 rays"),
-        (DataSummary(300, 3, 1), "300 rays of 3 people and 1 salience image"),
+        (DataSummary(300, 3, 1), "300 rays of 3 participants and 1 salience image"),
         (DataSummary(0, None, 12), "12 salience images"),
         (DataSummary(0), ""),
     ],
