@@ -243,7 +243,11 @@ def test02_optional_parts_of_radiance_fields(tmp_path):
 
 def test02b_support_and_provenance_of_gaze_fields(tmp_path):
     """Read from the provenance of the training; None without it."""
-    for metadata, words in (({"rays": 300, "people": 7}, "300 rays of 7 participants"), ({"rays": -3}, None), ({}, None)):
+    for metadata, words in (
+        ({"rays": 300, "people": 7}, "300 rays of 7 participants"),
+        ({"rays": -3}, None),
+        ({}, None),
+    ):
         save_gaze(make_gaze(), tmp_path / "g.safetensors", metadata)
         basis = load_gaze(tmp_path / "g.safetensors", ns)[0].basis
         assert (None if basis is None else basis.words()) == words
