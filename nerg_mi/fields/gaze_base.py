@@ -51,7 +51,7 @@ class DataSummary:
 def summarize_provenance(provenance: Mapping[str, Any]) -> DataSummary | None:
     """The amount of data in a checkpoint's ``provenance``; None if it is not recorded, as in checkpoints of other
     programs."""
-    rays, people, images = (_number(provenance.get(name)) for name in ("rays", "participants", "salience_views"))
+    rays, people, images = (_number(provenance.get(name)) for name in ("rays", "people", "salience_views"))
     return DataSummary(rays or 0, people or None, images or 0) if rays or images else None
 
 

@@ -100,7 +100,7 @@ def extract_mesh(
         if len(faces) == 0:
             raise NergError(
                 "no face of this surface has free space in front of it: the occupancy grid ends inside of the surface "
-                "everywhere; keep all faces with --unseen"
+                "everywhere; keep all faces with --keep-unseen"
             )
     num_visible = len(faces)
     body = trimesh.Trimesh(

@@ -157,7 +157,7 @@ def infer_grid_config(state: StateDict, name: str, finest: float, dimensions: in
         raise NergError(
             f'the levels of "{state.prefix}{name}" in "{state.path}" start at rows {offsets}, which does not match a '
             "grid "
-            f"from 16 to {finest:g}: set its finest resolution with --finest"
+            f"from 16 to {finest:g}: set its finest resolution with --finest-resolution"
         )
     return config
 

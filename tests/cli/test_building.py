@@ -28,7 +28,7 @@ class Brew:
     minutes: float = option(3.0, "How long.", "-t", "--time", min=0.5)
     guests: tuple[str, ...] = option((), "Who drinks it; may be given several times.")
     origin: tuple[float, ...] | None = option(None, "Where it grew.", "--from", parse=parse_numbers)
-    secret: int = option(7, "Nobody's business.")
+    secret: int = option(7, "A secret number.")
 
 
 @pytest.fixture

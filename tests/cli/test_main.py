@@ -258,7 +258,7 @@ def test10_doctor_reports_an_unusable_llvm(tmp_path):
 # ---- Shells complete sub-commands and options of the installed command ----
 
 NERG = Path(sys.executable).with_name("nerg")
-needs_command = pytest.mark.skipif(not NERG.exists(), reason="the command nerg is not installed beside this Python")
+needs_command = pytest.mark.skipif(not NERG.exists(), reason="the command nerg is not installed next to this Python")
 
 
 def ask(shell: str, line: str) -> subprocess.CompletedProcess[str]:

@@ -275,7 +275,7 @@ def test04_normals_and_unsupported_textures(tmp_path):
         check_texture([tmp_path / "a.ply"], 64)
 
 
-# ---- Bakes in parts: the sums of one go to the bit, whoever makes the parts, and only what has to be made ----
+# ---- Bakes in parts: equal to the bit to a bake in one piece, for any worker, without repeated work ----
 
 
 ROOM = joined(box((0, 0, 0), (8, 6, 3)))

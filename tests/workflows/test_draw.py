@@ -370,7 +370,7 @@ def scene_triptych(tmp_path_factory):
 def test_a_triptych_has_one_scale(rgb, scene_triptych, monkeypatch):
     seen = []
     see = scenes.OpenScene.render
-    monkeypatch.setattr(scenes.OpenScene, "render", lambda self, *of: seen.append(see(self, *of)) or seen[-1])
+    monkeypatch.setattr(scenes.OpenScene, "render", lambda self, *args: seen.append(see(self, *args)) or seen[-1])
     recorder = Recorder()
     behind = {"eye": "0.2, 0.1, 2.5"}
     figure = draw("triptych", scene_triptych, reporter=recorder, mode=MODE, spp=2, defaults=behind)

@@ -359,7 +359,7 @@ def test_a_training_in_a_worker_gives_equal_scores_and_is_stored(tmp_path, rgb, 
     assert scores(elsewhere) == scores(local)
     trainings.clear()
     assert (tmp_path / "a" / "default_emit_capture_0.safetensors").is_file()
-    # One seed more: that one is trained, whoever does it.
+    # One seed more: any worker trains that one.
     ablate(rays, tmp_path / "a", replace(ONE, seeds=2, store=tmp_path / "a.tasks"))
     assert [seed for _, seed in trainings] == [1]
     recorder = Recorder()

@@ -298,7 +298,7 @@ def test_prepared_renderings_are_byte_identical(tmp_path, monkeypatch):
     assert mitsuba_bitmap(tmp_path / "a.png") == mitsuba_bitmap(tmp_path / "b.png")
 
 
-# ---- Films in parts: the bytes of one go, whoever makes the parts, and only what has to be made ----
+# ---- Films in parts: equal bytes for any worker, without repeated work ----
 
 
 AOV = 'type="aov"><string name="aovs" value="dd:depth"/>'

@@ -75,7 +75,7 @@ def test_the_probe_measures_its_surroundings(probe):
     assert np.abs(turned.target).max() == pytest.approx(1, abs=0.1)
 
 
-@pytest.mark.parametrize("depths, length", [((0, 0), 1), ((0, 4), 4), ((3, 5), 3)], ids=["within", "beside", "before"])
+@pytest.mark.parametrize("depths, length", [((0, 0), 1), ((0, 4), 4), ((3, 5), 3)], ids=["within", "next to", "before"])
 def test_observers_inside_matter_face_a_positive_distance(depths, length):
     """They meet it at once; what they are turned to still lies before them, at a distance of what is met elsewhere."""
     directions = np.array([[0.6, 0.8, 0], *[[0, 0, 1.0]] * 3])

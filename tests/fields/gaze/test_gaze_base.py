@@ -24,7 +24,7 @@ from tests.fields.gaze.test_log_density import BOX, GRID, SMALL, made
     ("basis", "words"),
     [
         (DataSummary(81_751, 100), "81,751 rays of 100 participants"),
-        (DataSummary(1, 1), "1 ray of 1 person"),
+        (DataSummary(1, 1), "1 ray of 1 participant"),
         (DataSummary(300), "300 rays"),
         (DataSummary(300, 3, 1), "300 rays of 3 participants and 1 salience image"),
         (DataSummary(0, None, 12), "12 salience images"),
