@@ -437,7 +437,7 @@ def import_rays(
     reporter : Reporter
         Receives the progress.
     **options
-        Options of the reader; ``skip_bad_lines``, ``pseudonyms`` and ``salt``; and for a dataset ``place_name``,
+        Options of the reader; ``skip_bad_lines``, ``pseudonyms`` and ``salt``; and for a dataset ``environment``,
         ``day`` and ``workers`` (`nerg_mi.workflows.rays_commands.RaysImportOptions`).
 
     Returns

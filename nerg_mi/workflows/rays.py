@@ -58,8 +58,8 @@ class FilterStep:
 class FilterSteps:
     """Applies filter steps to rays one after the other.
 
-    ``in_place`` tells whether the rays are not used elsewhere, so that they may be modified in place. ``strict`` makes a
-    step that selects no ray an error.
+    ``in_place`` tells whether the rays are not used elsewhere, so that they may be modified in place. ``strict`` makes
+    a step that selects no ray an error.
     """
 
     def __init__(self, rays: Rays, *, in_place: bool, reporter: Reporter = SILENT, strict: bool = True) -> None:
