@@ -219,7 +219,7 @@ INPUTS = {
     "stats": {"aois", "align", "zones", "cohorts", "what_if", "salt"},
     "draw floor": {"scene"},
     "align": {"field", "scene", "surface", "pairs", "tracking_surface", "tracking_cameras", "scene_cameras", "init"},
-    "rays import": {"salt", "poses"},
+    "rays import": {"salt", "poses", "place"},
     "rays plot": {"test"},
     "train gaze": {"views", "align_views", "field", "scene", "align"},
     "eval folds": {"field", "scene", "align"},

@@ -103,7 +103,7 @@ def _recording(name: str, example: Example, kind: str = "") -> Reader:
         from nerg_mi.rays.readers.registry import make_options, read_rays
 
         options = make_options(name, example.options_in(folder))
-        _shown(read_rays(name, example.given(folder), options, skip_bad_lines=skip))
+        _shown(read_rays(name, example.path_in(folder), options, skip_bad_lines=skip))
 
     columns = {".gz": ("gzip",), ".json": ("json",), ".g3": ("json",), ".mp4": ("boxes",), ".c3d": ()}
     kinds = {file: columns.get(Path(file).suffix, ("text",)) for file in example.files}
