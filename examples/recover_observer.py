@@ -295,7 +295,7 @@ def main(argv=None) -> dict:
     print("observer [m]        initial error [cm]  result [m]          error [cm]  loss   steps  CPU [s]")
     searches, errors, shown = [], [], None
     for n, truth in enumerate(truths):
-        target, began = pictures.given(truth, args.seed + n + 1), time.process_time()
+        target, began = pictures.reference(truth, args.seed + n + 1), time.process_time()
         descents = search(pictures, target, guesses, initial_pictures, settings)
         best = descents[0]
         end, min_loss = best.answer()

@@ -94,7 +94,7 @@ def test07_observer_is_recovered(rgb):
     assert np.abs(differences[smooth]).max() > 0.1 and smooth.mean() > 0.5
     assert np.linalg.norm((derivatives - differences)[smooth]) < 0.1 * np.linalg.norm(differences[smooth])
 
-    descent = example.descend(pictures, pictures.given(truth, seed=1), start, 5)
+    descent = example.descend(pictures, pictures.reference(truth, seed=1), start, 5)
     end, min_loss = descent.answer()
     assert np.linalg.norm(end - truth) < 0.06 and min_loss < descent.losses[0]
 

@@ -177,7 +177,7 @@ def _translate_video_errors(video: str | Path) -> Iterator[None]:
             # EINVAL refers to the list of formats, which the user does not know. FFmpeg returns ENOMEM above 2 GB.
             message = {
                 errno.EINVAL: "its video format is not supported",
-                errno.ENOMEM: "it needs more memory than is available",
+                errno.ENOMEM: "its header claims a size that exceeds the available memory",
             }.get(error.errno, message[:1].lower() + message[1:])
             raise ValueError(message) from error
 
