@@ -39,7 +39,7 @@ def test_training_and_evaluation_write_scores_and_files(cube, nerg):
 def test_speed_and_complaints_are_reported(cube, nerg):
     ended = nerg("train", "radiance", cube, "-o", cube / "a.safetensors", "--steps", 3, "--holdout", 3)
     assert not ended.code and "warning: only 3 steps" in ended.err
-    assert float(re.search(r"3 steps in \d+ s; (\S+) field evaluations a second", ended.out)[1]) > 0
+    assert float(re.search(r"3 steps in \d+ s; (\S+) field evaluations per second", ended.out)[1]) > 0
     provenance = read_checkpoint(cube / "a.safetensors", "radiance")[1]["provenance"]
     assert provenance["evaluations_a_second"] > 0 and provenance["step_ms"]["max"] >= provenance["step_ms"]["median"]
     assert [x for x in provenance["complaints"] if x.startswith("only 3 steps")]
@@ -175,7 +175,7 @@ def test_a_field_is_scored_as_it_was_trained(tmp_path, nerg):
         assert (tmp_path / "gaze.eval" / name).stat().st_size > 100
     crowd(seed=1).save(tmp_path / "others.npz")
     ended = nerg("eval", "gaze", gaze, tmp_path / "others.npz")
-    assert ended.code == 1 and "trained on other rays" in " ".join(ended.err.split())
+    assert ended.code == 1 and "was not trained on" in " ".join(ended.err.split())
 
 
 # ---- To and from other programs ----
