@@ -406,7 +406,9 @@ def import_files(
     """Call `import_rays` with a preset or a column map, and print the data-quality report."""
     settings = {name: value for name, value in settings.items() if value is not None and value is not False}
     if (preset is None) == ("columns" not in settings):
-        raise NergError("the format of the files is not given: add --preset NAME or --map COLUMNS")
+        raise NergError(
+            "the format of the files is not given: add --preset NAME or --map COLUMNS; nerg rays guess FILE proposes them"
+        )
     reader = preset or TABLE
     options = replace(options, reader=reader, settings=parse_options(reader, settings))
     result = import_rays(files, options, reporter)
