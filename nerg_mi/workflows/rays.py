@@ -407,7 +407,7 @@ def import_files(
     settings = {name: value for name, value in settings.items() if value is not None and value is not False}
     if (preset is None) == ("columns" not in settings):
         raise NergError(
-            "the format of the files is not given: add --preset NAME or --map COLUMNS; nerg rays guess FILE proposes them"
+            "the format of the files is not given: add --preset NAME or --map COLUMNS; nerg rays guess proposes one"
         )
     reader = preset or TABLE
     options = replace(options, reader=reader, settings=parse_options(reader, settings))
