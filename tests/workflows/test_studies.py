@@ -122,7 +122,11 @@ def test_the_demo_report_contains_the_tracked_gaze(tmp_path):
     text = (tmp_path / "report.html").read_text("utf-8")
     rays = Rays.load(tmp_path / demo.TRACKED)
     assert tmp_path / demo.TRACKED in result.files and len(rays.persons) == 100 and len(rays) > 10_000
-    assert "positions" in text and f"{len(rays):,} of 150,021 rows" in text
+    assert (
+        'id="people"' in text
+        and "median number of participants within" in text
+        and f"{len(rays):,} of 150,021 rows" in text
+    )
     with (tmp_path / "aoi.csv").open() as file:
         shares = np.array([float(row["observer_share"]) for row in csv.DictReader(file)])
     # Of one observer, who sees some of the shelves: of three people together hardly any would have none.
