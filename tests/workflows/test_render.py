@@ -277,7 +277,7 @@ def test_the_header_records_the_basis_of_the_gaze(tmp_path):
     small = {"width": "12", "height": "8"}
     options = PicturesPictureOptions(defaults=small, spp=1, mode="llvm_ad_rgb")
     text = read_exr_attributes(render_file(find_store_scene(), tmp_path / "a.exr", options).path)
-    assert text["gaze.basis"].startswith("data: ") and text["gaze.basis"].endswith(" people")
+    assert text["gaze.basis"].startswith("data: ") and text["gaze.basis"].endswith(" participants")
     assert "nerg render" in text["Comment"] and "kde.basis" not in text
 
 
