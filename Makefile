@@ -32,9 +32,9 @@ PYTHON ?= python3
 ARGS ?=
 RUN = .venv/bin/python
 # One process a core, four at most since each takes a gigabyte; a file's tests share what they have made. Files come in the
-# order of tests/conftest.py.
+# order of tests/conftest.py. A process that ends during a test is not replaced: pytest-xdist would wait forever at the end.
 JOBS ?= auto
-PYTEST = $(RUN) -m pytest -n $(JOBS) --maxprocesses 4 --dist loadfile --no-loadscope-reorder
+PYTEST = $(RUN) -m pytest -n $(JOBS) --maxprocesses 4 --max-worker-restart 0 --dist loadfile --no-loadscope-reorder
 ONE_CORE = tests/cli/test_scenes.py tests/cli/test_ending.py tests/files/test_images.py tests/files/test_images.py \
 	tests/test_runtime.py tests/renders
 

@@ -11,12 +11,14 @@ THREADS_VARIABLE = "NERG_THREADS"
 def set_thread_count(count: int) -> None:
     """Use ``count`` threads from now on.
 
-    Waits for running kernels first. Dr.Jit queues its kernels, and resizing the thread pool while some are running can
-    leave them unfinished, so that arrays contain uninitialized memory.
+    Finishes queued kernels and pending scatters first. If Dr.Jit's thread pool is resized in between, they can remain
+    unfinished, so that arrays contain uninitialized memory; and a scatter that was recorded for fewer threads writes
+    outside its buffer, which can end the process.
     """
     import drjit as dr
 
     if dr.thread_count() != count:
+        dr.eval()
         dr.sync_thread()
         dr.set_thread_count(count)
 

@@ -124,6 +124,21 @@ def test_arrays_survive_thread_changes(rgb):
         set_thread_count(before)
 
 
+def test_pending_scatters_survive_thread_changes(rgb):
+    before = dr.thread_count()
+    try:
+        for count in (1, 3) * 3:
+            index = dr.arange(rgb.UInt32, 1 << 18) % 60
+            x = dr.zeros(rgb.Float, 240)
+            set_thread_count(1)
+            dr.scatter_add(x, dr.llvm.ad.Array4f(1, 2, 3, 4), index)
+            set_thread_count(count)
+            expected = np.bincount(np.arange(1 << 18) % 60)[:, None] * [1, 2, 3, 4]
+            np.testing.assert_array_equal(x.numpy().reshape(60, 4), expected)
+    finally:
+        set_thread_count(before)
+
+
 def test_worker_limits_threads_to_available():
     assert (limit_threads(4, 2), limit_threads(2, 4), limit_threads(0, 3), limit_threads(3, 0)) == (
         2,

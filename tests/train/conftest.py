@@ -4,6 +4,7 @@ import drjit as dr
 import numpy as np
 import pytest
 
+from nerg_mi.threads import set_thread_count
 from nerg_mi.train.geometry import TrainingGeometry
 from nerg_mi.transport.volume_medium import VolumeMedium
 from tests.train.gaze.looks import BOX, looking_at
@@ -20,9 +21,9 @@ def dataset():
 def one_thread():
     """Use one thread, so that sums have a fixed order and equal runs are equal bit for bit."""
     threads = dr.thread_count()
-    dr.set_thread_count(1)
+    set_thread_count(1)
     yield
-    dr.set_thread_count(threads)
+    set_thread_count(threads)
 
 
 @pytest.fixture
@@ -45,5 +46,5 @@ def wall(rgb):
 def threads():
     """Set the number of threads, and restore it at the end."""
     before = dr.thread_count()
-    yield dr.set_thread_count
-    dr.set_thread_count(before)
+    yield set_thread_count
+    set_thread_count(before)

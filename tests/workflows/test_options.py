@@ -21,6 +21,7 @@ from nerg_mi.evaluation.ablation import Variant
 from nerg_mi.ranges import ValidatedDataclass
 from nerg_mi.surfaces.sources import GazeSumSettings, RaySettings
 from nerg_mi.tasks.task import Part, Plan, rebuild_value
+from nerg_mi.threads import set_thread_count
 from nerg_mi.train.gaze_settings import GazeSettings as TrainingSettings
 from nerg_mi.train.gaze_settings import ProbeSettings
 from nerg_mi.workflows import ablation, evaluate, options
@@ -342,7 +343,7 @@ def test_variant_and_threads(rgb):
         assert select_backend("llvm_ad_rgb", 1).__name__ == "drjit.llvm.ad"
         assert rgb.variant() == "llvm_ad_rgb" and dr.thread_count() == 1
     finally:
-        dr.set_thread_count(before)
+        set_thread_count(before)
     select_backend("llvm_ad_rgb")
     assert dr.thread_count() == before
 
