@@ -11,15 +11,16 @@ THREADS_VARIABLE = "NERG_THREADS"
 def set_thread_count(count: int) -> None:
     """Use ``count`` threads from now on.
 
-    Finishes queued kernels and pending scatters first. If Dr.Jit's thread pool is resized in between, they can remain
-    unfinished, so that arrays contain uninitialized memory; and a scatter that was recorded for fewer threads writes
-    outside its buffer, which can end the process.
+    Finishes the queued kernels of all threads and the pending scatters of this one first. If Dr.Jit's thread pool is
+    resized in between, they can remain unfinished, so that arrays contain uninitialized memory; and a scatter that was
+    recorded for fewer threads writes outside its buffer, which can end the process.
     """
     import drjit as dr
 
     if dr.thread_count() != count:
         dr.eval()
-        dr.sync_thread()
+        # It waits for the kernels of all threads; `dr.sync_thread` would wait for those of this thread only.
+        dr.flush_malloc_cache()
         dr.set_thread_count(count)
 
 

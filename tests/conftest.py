@@ -13,6 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from nerg_mi.threads import set_thread_count
+
 ROOT = Path(__file__).resolve().parents[1]
 TORCH_REQUIRED = os.environ.get("NERG_REQUIRE_TORCH", "0") not in ("", "0")
 
@@ -30,6 +32,16 @@ def rgb():
     if mi.variant() != "llvm_ad_rgb":
         mi.set_variant("llvm_ad_rgb")
     return mi
+
+
+@pytest.fixture(autouse=True)
+def _restore_thread_count(rgb):
+    """Restore the number of threads, which a command with ``--threads`` changes for the whole process."""
+    import drjit as dr
+
+    before = dr.thread_count()
+    yield
+    set_thread_count(before)
 
 
 @pytest.fixture

@@ -279,7 +279,7 @@ def test_wrong_dataset_options_are_refused(parquet, arguments, why):
 
 
 @pytest.mark.parametrize(
-    "options",
+    "changes",
     [
         {"persons": ("p0_0", "p2_1")},
         {"start": DAY + 1, "end": DAY + 2, "with_hit": True},
@@ -288,13 +288,13 @@ def test_wrong_dataset_options_are_refused(parquet, arguments, why):
         {"thin": 0.5, "thin_distance": 9.0, "box": (0, 4, 0, 4, 0, 3)},
     ],
 )
-def test_filters_of_datasets_match_those_of_files(parquet, tmp_path, options):
+def test_filters_of_datasets_match_those_of_files(parquet, tmp_path, changes):
     dataset, rays = write_dataset(tmp_path)
     heard, expected = Recorder(), Recorder()
-    result = filter_rays(dataset.folder, FilterOptions(**options, output=tmp_path / "a.parquet"), heard)
+    result = filter_rays(dataset.folder, FilterOptions(**changes, output=tmp_path / "a.parquet"), heard)
     # Fixations of a participant may depend on the rounding of positions.
     rays = dataset.load()
-    in_memory = filter_rays(rays, FilterOptions(**options), expected)
+    in_memory = filter_rays(rays, FilterOptions(**changes), expected)
     assert_same(result.rays, in_memory.rays)
     assert_same(Rays.load(tmp_path / "a.parquet"), in_memory.rays)
     assert heard.messages.pop() == f"wrote {tmp_path / 'a.parquet'}"
@@ -304,7 +304,7 @@ def test_filters_of_datasets_match_those_of_files(parquet, tmp_path, options):
     counts = lambda r: [(s["step"], s["kept"], s["of"]) for s in r.metadata["steps"]]
     assert counts(result.rays) == counts(in_memory.rays)
     # Into another dataset: the same rays.
-    other = filter_rays(dataset.folder, FilterOptions(**options, output=tmp_path / "b.rays"))
+    other = filter_rays(dataset.folder, FilterOptions(**changes, output=tmp_path / "b.rays"))
     assert other.rays is None and other.fixations == in_memory.fixations
     assert_same(load_rays(tmp_path / "b.rays"), in_memory.rays)
     assert counts(load_rays(tmp_path / "b.rays")) == counts(in_memory.rays)
