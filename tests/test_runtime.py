@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-import threading
 
 import drjit as dr
 import numpy as np
@@ -136,27 +135,6 @@ def test_pending_scatters_survive_thread_changes(rgb):
             set_thread_count(count)
             expected = np.bincount(np.arange(1 << 18) % 60)[:, None] * [1, 2, 3, 4]
             np.testing.assert_array_equal(x.numpy().reshape(60, 4), expected)
-    finally:
-        set_thread_count(before)
-
-
-def test_kernels_of_another_thread_survive_thread_changes(rgb):
-    before, results = dr.thread_count(), []
-
-    def scatter():
-        x = dr.zeros(rgb.Float, 240)
-        dr.scatter_add(x, dr.llvm.ad.Array4f(1, 2, 3, 4), dr.arange(rgb.UInt32, 1 << 22) % 60)
-        dr.eval(x)  # returns before the kernel ends
-        results.append(x)
-
-    try:
-        set_thread_count(1)
-        other = threading.Thread(target=scatter)
-        other.start()
-        other.join()
-        set_thread_count(3)
-        expected = np.bincount(np.arange(1 << 22) % 60)[:, None] * [1, 2, 3, 4]
-        np.testing.assert_allclose(results[0].numpy().reshape(60, 4), expected, rtol=1e-6)
     finally:
         set_thread_count(before)
 

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 
 import drjit as dr
@@ -17,6 +18,7 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.formats.checkpoint import read_checkpoint
 from nerg_mi.formats.fields import save_radiance
+from nerg_mi.threads import set_thread_count
 from nerg_mi.train import trainer as shared
 from nerg_mi.train.radiance_run import load_run, save_run, train_field
 from nerg_mi.train.radiance_trainer import RadianceTrainer
@@ -260,3 +262,28 @@ def test_the_result_reports_speed_and_problems(dataset):
     # The last evaluation is that of the result.
     assert provenance["psnr_watched"]["history"][-1]["steps"] == 8
     assert provenance["psnr_held_out"]["every_pixel"] == 1
+
+
+# ---- Number of threads ----
+
+
+def test_another_thread_may_change_the_number_of_threads_after_a_step(dataset, one_thread):
+    """A kernel of the step may still be queued, whose scatters were recorded for one thread."""
+    make = lambda: RadianceTrainer(dataset.train, BOX, TINY, settings(), ns, depth=False)
+    expected = make()
+    expected.step()
+    expected = state(expected)
+    for _ in range(12):
+        set_thread_count(1)
+        made = make()
+        made.step()
+        other = threading.Thread(target=_use_three_threads)
+        other.start()
+        other.join()
+        for name, value in state(made).items():
+            np.testing.assert_allclose(value, expected[name], rtol=1e-4, atol=1e-6, err_msg=name)
+
+
+def _use_three_threads():
+    set_thread_count(3)
+    assert dr.all(dr.arange(ns.Float, 100) >= 0)
