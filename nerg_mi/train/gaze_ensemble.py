@@ -19,15 +19,15 @@ from nerg_mi.photos.salience import SalienceView
 from nerg_mi.rays.rays import Rays
 
 from .gaze_data import Supervision
-from .gaze_run import (
+from .gaze_folds import (
     FOLD_TIME_FRACTION,
     SELECTION_KEY,
     evaluate_folds,
     scale_progress,
     select_variant,
     selects_prior_weight,
-    train_gaze,
 )
+from .gaze_run import train_gaze
 from .gaze_settings import GazeSettings
 from .gaze_trainer import KIND as RUN
 from .gaze_trainer import GazePlan, ProgressCallback, StateSettings, read_run_identity

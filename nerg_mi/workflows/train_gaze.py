@@ -24,9 +24,9 @@ from nerg_mi.rays.rays import Rays
 from nerg_mi.train import gaze_run
 from nerg_mi.train.gaze_data import Supervision, TargetRequirements, check_prior_kappa, hold_out, select_far_views
 from nerg_mi.train.gaze_ensemble import train_ensemble
+from nerg_mi.train.gaze_folds import selects_prior_weight
 from nerg_mi.train.gaze_log_density import ELEVATION_KAPPA, make_elevation_prior
 from nerg_mi.train.gaze_recipes import FieldOptions, Recipe, get_recipe
-from nerg_mi.train.gaze_run import selects_prior_weight
 from nerg_mi.train.gaze_settings import GazeSettings, ProbeSettings
 from nerg_mi.train.gaze_trainer import GazePlan, GazeProgress, StateSettings
 from nerg_mi.train.geometry import TrainingGeometry

@@ -1,4 +1,4 @@
-"""Tests of `nerg_mi.train.gaze_run`."""
+"""Tests of `nerg_mi.train.gaze_folds`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from nerg_mi.formats.checkpoint import read_checkpoint, write_checkpoint
 from nerg_mi.rays.rays import Rays
 from nerg_mi.train.gaze_data import Supervision
 from nerg_mi.train.gaze_ensemble import train_ensemble
-from nerg_mi.train.gaze_run import (
+from nerg_mi.train.gaze_folds import (
     PRIOR_WEIGHTS,
     SELECTION_KEY,
     FoldResults,
@@ -24,8 +24,8 @@ from nerg_mi.train.gaze_run import (
     _select_weight,
     evaluate_folds,
     iter_folds,
-    train_gaze,
 )
+from nerg_mi.train.gaze_run import train_gaze
 from nerg_mi.train.gaze_settings import ProbeSettings
 from nerg_mi.train.gaze_trainer import KIND, StateSettings
 
@@ -225,7 +225,7 @@ def test04_a_resumed_run_keeps_its_selection(members, tmp_path, rgb, monkeypatch
         assert trained(state=state, on_progress=stop).provenance["interrupted"]
     selected = read_checkpoint(path, KIND)[1]["about"][SELECTION_KEY]
     # Folds are not evaluated again.
-    monkeypatch.setattr("nerg_mi.train.gaze_run.evaluate_folds", None)
+    monkeypatch.setattr("nerg_mi.train.gaze_folds.evaluate_folds", None)
     tensors, meta = read_checkpoint(path, KIND)
     for wrong in ({"mix": 2.0, "folds": 1}, {"colour": 1}, "capture"):
         write_checkpoint(path, KIND, tensors, {**meta, "about": {**meta["about"], SELECTION_KEY: wrong}})
