@@ -232,7 +232,10 @@ class GazeEvaluationOptions(ValidatedDataclass):
         None, "Mitsuba scene that the gaze field was trained in, in place of --field.", group=INPUT
     )
     geometry: Path | None = option(
-        None, "Volume of hit points (.vol) that the gaze field was trained in, in place of --field.", group=INPUT
+        None,
+        "Volume of hit points (.vol) that the gaze field was trained in, in place of --field; hits or none, as in the "
+        "training, select what is stored.  [default: the file of the same name, next to the gaze field]",
+        group=INPUT,
     )
     split: str | None = option(
         None,

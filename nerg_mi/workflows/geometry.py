@@ -107,10 +107,14 @@ def load_training_geometry(
 ) -> TrainingGeometry:
     """Load the geometry of the training of the checkpoint ``gaze``, with the alignment of the training.
 
-    The file is the one in ``options``, or the one with the stored name next to the checkpoint. ``box`` is that of the
-    gaze field. Raises `NergError` for a missing or a different file.
+    The file is the one in ``options``, or the one with the stored name next to the checkpoint. As in training,
+    ``options.geometry`` may also be "hits" or "none", if that is how the gaze field was trained. ``box`` is that of the
+    gaze field. Raises `NergError` for a missing or a different file, and for another kind of geometry.
     """
     align = read_training_alignment(provenance)
+    if options.geometry is not None and str(options.geometry) in ("hits", "none"):
+        _check_trained_kind(gaze, provenance, str(options.geometry))
+        options = replace(options, geometry=None)
     if provenance.get("geometry") == "none":
         return TrainingGeometry(None, box, "none", align=align)
     makers: dict[str, tuple[Path | None, str, Callable[[Path], TrainingGeometry]]] = {
@@ -122,6 +126,18 @@ def load_training_geometry(
     explicit, name, make = makers[key]
     path = find_training_file(gaze, provenance, explicit, f"name it with {name}", f"give the right one with {name}")
     return replace(make(path), align=align)
+
+
+def _check_trained_kind(gaze: Path, provenance: dict, kind: str) -> None:
+    """Raise `NergError` unless ``gaze`` was trained with ``--geometry kind``."""
+    trained_options = {"field_file": "--field", "scene_file": "--scene", "geometry_file": "--geometry hits"}
+    is_without = provenance.get("geometry") == "none"
+    trained = "--geometry none" if is_without else trained_options[geometry_key(gaze, provenance)]
+    if trained != f"--geometry {kind}":
+        raise NergError(
+            f'--geometry is "{kind}", but "{gaze}" was trained with {trained}, and is evaluated in the geometry of its '
+            "training; leave out --geometry"
+        )
 
 
 def read_training_alignment(provenance: dict) -> Similarity:

@@ -459,6 +459,22 @@ def test_geometry_is_located_next_to_its_checkpoint(rays, tmp_path, kind):
         load_training_geometry(tmp_path / "gaze.safetensors", provenance, BOX, elsewhere, ns)
 
 
+@pytest.mark.parametrize("kind", ["scene", "hits", "none"])
+@pytest.mark.parametrize("word", ["hits", "none"])
+def test_an_evaluation_takes_the_words_of_its_training(rays, tmp_path, kind, word):
+    gaze, provenance = tmp_path / "gaze.safetensors", json.loads(json.dumps(made(tmp_path, kind, rays).metadata))
+    options = GazeEvaluationOptions(geometry=Path(word))
+    if word == kind:
+        again = load_training_geometry(gaze, provenance, BOX, options, ns)
+        assert again.kind == kind
+    else:
+        with pytest.raises(NergError, match="--geometry") as refusal:
+            load_training_geometry(gaze, provenance, BOX, options, ns)
+        trained = {"scene": "--scene", "hits": "--geometry hits", "none": "--geometry none"}[kind]
+        assert f'"{word}"' in str(refusal.value) and trained in str(refusal.value)
+        assert "does not exist" not in str(refusal.value)
+
+
 def test_a_checkpoint_without_stored_geometry_is_refused():
     with pytest.raises(NergError, match="does not store the geometry that it was trained"):
         load_training_geometry(Path("gaze.safetensors"), {}, BOX, GazeEvaluationOptions(), ns)
