@@ -13,7 +13,7 @@ from nerg_mi.errors import NergError, sanitize
 from nerg_mi.files.safe_read import check_regular_file, read_json
 from nerg_mi.photos.colmap import find_pose_source
 from nerg_mi.photos.images import read_posed_images
-from nerg_mi.photos.posed import PosedImages
+from nerg_mi.photos.posed import PosedImages, describe_unused
 from nerg_mi.rays.readers.tables import iterate_table, read_table_columns
 
 from .constraints import (
@@ -164,7 +164,7 @@ def read_cameras(tracking: Path, place: Path) -> Cameras:
         common = sorted(set(tables[0]) & set(tables[1]))
         if len(common) >= 2:
             a, b = (np.stack([t[name] for name in common]) for t in tables)
-            notes = tuple(note for model in models for note in (*map(str, model.unused), *model.notes))
+            notes = tuple(note for model in models for note in (*describe_unused(model.unused), *model.notes))
             return Cameras(a, b, f'the cameras of "{tracking}" and "{place}"', notes)
     raise NergError(
         f'"{tracking}" and "{place}" have fewer than two photos with the same name; give two models of the same photos'

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import unicodedata
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
@@ -233,6 +234,23 @@ class UnusedFrame:
 
     def __str__(self) -> str:
         return f'not used: "{sanitize(self.name)}": {sanitize(self.reason, 1000)}'
+
+
+def describe_unused(unused: Iterable[UnusedFrame]) -> list[str]:
+    """Describe unused frames in one line for each reason, with their number and first names.
+
+    Reasons that differ only in quoted names, such as those of missing files, are the same; the first one is shown.
+    """
+    groups: dict[str, list[UnusedFrame]] = {}
+    for frame in unused:
+        groups.setdefault(re.sub(r'"[^"]*"', '""', frame.reason), []).append(frame)
+    return [
+        str(first)
+        if not others
+        else f"{len(others) + 1} frames are not used: {format_names(u.name for u in (first, *others))}; the first: "
+        f"{sanitize(first.reason, 1000)}"
+        for first, *others in groups.values()
+    ]
 
 
 @dataclass(frozen=True)

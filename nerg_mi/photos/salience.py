@@ -17,7 +17,7 @@ from . import cameras
 from .cameras import Intrinsics, PosedCamera, make_area_weights, resize_by_area, resize_mask, resize_nearest
 from .colmap import find_pose_source
 from .images import open_bitmap, read_mask, read_photo, read_posed_images
-from .posed import MaskFile, PosedFrame, check_inside
+from .posed import MaskFile, PosedFrame, check_inside, describe_unused
 
 # ---- Solid angles of pixels for any lens ----
 #
@@ -299,7 +299,9 @@ def open_salience(
         "used": len(views),
         "missing": len(frames_without_map),
     }
-    return SalienceSet(views, frames_without_map, unmatched_files, [*map(str, posed.unused), *posed.notes], provenance)
+    return SalienceSet(
+        views, frames_without_map, unmatched_files, [*describe_unused(posed.unused), *posed.notes], provenance
+    )
 
 
 def read_salience(path: str | Path) -> np.ndarray:

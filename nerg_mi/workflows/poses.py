@@ -14,7 +14,7 @@ from nerg_mi.figures.style import make_provenance, save
 from nerg_mi.files.atomic import check_new_folder, create_folder_atomically, make_folder
 from nerg_mi.files.tables import write_json
 from nerg_mi.photos.colmap import read_colmap
-from nerg_mi.photos.posed import UnusedFrame, format_names
+from nerg_mi.photos.posed import UnusedFrame, describe_unused, format_names
 from nerg_mi.photos.structure import (
     PhotoCopy,
     PhotoFolders,
@@ -158,8 +158,8 @@ def _progress(reporter: Reporter, stage: str, done: int, total: int) -> None:
 
 
 def _report_pictures(copies: list[PhotoCopy], skipped: list[UnusedFrame], reporter: Reporter) -> None:
-    for line in skipped:
-        reporter.message(str(line))
+    for line in describe_unused(skipped):
+        reporter.message(line)
     sizes = sorted({p.size for p in copies})
     shown = ", ".join(f"{w} x {h}" for w, h in sizes[:4]) + (", ..." if len(sizes) > 4 else "")
     reporter.message(f"{len(copies)} images of {shown} pixels")

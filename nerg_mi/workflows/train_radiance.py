@@ -15,6 +15,7 @@ from nerg_mi.files.tables import write_json
 from nerg_mi.formats.checkpoint import read_checkpoint
 from nerg_mi.formats.fields import save_radiance
 from nerg_mi.photos.dataset import Dataset, open_dataset
+from nerg_mi.photos.posed import describe_unused
 from nerg_mi.train import radiance_run
 from nerg_mi.train.radiance_settings import RadianceSettings, make_radiance_config
 
@@ -148,8 +149,8 @@ def _open(photos: str | Path, options: RadianceOptions) -> Dataset:
 
 def _report_data(data: Dataset, reporter: Reporter) -> None:
     corner, core = lambda values: ", ".join(f"{x:.3g}" for x in values), data.box.core
-    for line in (*data.unused, *data.notes):
-        reporter.message(str(line))
+    for line in (*describe_unused(data.unused), *data.notes):
+        reporter.message(line)
     reporter.message(f"assumed scene type: {data.kind_note}; change it with --unbounded, --bounded or --aabb")
     reporter.message(f"box: ({corner(core.lower)}) to ({corner(core.upper)}), {data.box_source}")
     reporter.message(data.unit_note)
@@ -216,8 +217,8 @@ def evaluate_radiance(
         options.coordinates,
         options.allow_outside,
     )
-    for line in (*data.unused, *data.notes):
-        reporter.message(str(line))
+    for line in (*describe_unused(data.unused), *data.notes):
+        reporter.message(line)
     if not options.train:
         _refuse_trained(field, provenance, data)
     views = data.train if options.train else data.held_out

@@ -8,7 +8,7 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.photos import posed
-from nerg_mi.photos.posed import PosedFrame, drop_duplicates, read_semidense, rigid_pose
+from nerg_mi.photos.posed import PosedFrame, UnusedFrame, describe_unused, drop_duplicates, read_semidense, rigid_pose
 from nerg_mi.photos.transforms import read_transforms
 from tests.photos.written_sets import frame
 
@@ -87,6 +87,15 @@ def test_duplicate_image_counts_once(tmp_path):
     again = PosedFrame("b.png", tmp_path / "b.png", np.diag([1.0, -1, -1, 1]), {})
     unique, unused = drop_duplicates([first, again])
     assert unique == [first] and "a different pose" in unused[0].reason
+
+
+def test_unused_frames_are_described_once_for_each_reason():
+    missing = [UnusedFrame(f"{k:02}.png", f'its image "images/{k:02}.png" does not exist') for k in range(17)]
+    assert describe_unused([]) == [] and describe_unused(missing[:1]) == [str(missing[0])]
+    other = UnusedFrame("99.png", "its pose is singular")
+    many, one = describe_unused([*missing[:9], other, *missing[9:]])
+    assert "17" in many and "00.png" in many and missing[0].reason in many and "16.png" not in many
+    assert one == str(other)
 
 
 # ---- Semi-dense points of Project Aria ----
