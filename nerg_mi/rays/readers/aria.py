@@ -264,7 +264,7 @@ _GENERAL = ("general_eye_gaze", "generalized_eye_gaze", "generalized_gaze", "eye
 _TRAJECTORIES = ("closed_loop_trajectory", "aria_trajectory")
 _GAZE_FOLDERS = ("eye_gaze", "eye_gaze_vergence", ".")
 _POSE_FOLDERS = (".", "slam", "trajectory", "../slam", "../trajectory", "..")
-_OTHER_WORLD = "the pose is in another world (graph_uid)"
+_OTHER_WORLD = "the pose is in another world, by its graph_uid (option --world)"
 _MAX_LISTED_WORLDS = 20
 
 

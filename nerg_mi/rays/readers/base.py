@@ -224,7 +224,8 @@ class RaysBuilder:
             )
         if bad:
             self._record_dropped(
-                "the line is incomplete, has too many cells, or a cell that is not a number", np.array(self._bad_lines)
+                "the line is incomplete, has too many cells, or a cell that is not a number (option --skip-bad-lines)",
+                np.array(self._bad_lines),
             )
             self._rows_read += bad
         if self._sources and "sha256" not in self._sources[-1]:
@@ -293,8 +294,9 @@ class RaysBuilder:
         eye_distance
             (n,) distance between the eyes, in the units of the origins, NaN if an eye was not tracked.
         drop
-            Reasons of the format, with masks (n,) of the rows to drop. They precede those of the builder: values that
-            are NaN, and zero directions.
+            Reasons of the format, with masks (n,) of the rows to drop; a reason names the option that controls it, as
+            in "confidence below 0.5 (option --min-confidence)". They precede those of the builder: values that are
+            NaN, and zero directions.
         recorded_origin, recorded_direction
             (n, 3) values in the file, if ``origin`` and ``direction`` are computed from these; exact fill values such
             as 0, 0, 0 or -1, -1, -1 are detected in them.

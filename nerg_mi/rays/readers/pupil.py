@@ -80,7 +80,8 @@ class Pupil:
                     confidence=v[:, 1],
                     head=rotation[:, :, 2],
                     drop={
-                        f"confidence below {options.min_confidence:g}": v[:, 1] < options.min_confidence,
+                        f"confidence below {options.min_confidence:g} (option --min-confidence)": v[:, 1]
+                        < options.min_confidence,
                         "there is no head pose at that time": has_no_pose,
                     },
                 )

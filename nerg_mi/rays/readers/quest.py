@@ -92,7 +92,10 @@ class Quest(FixedFrameReader):
                     rows=lines,
                     confidence=confidence,
                     recorded_origin=poses_read[:, : len(eye_columns), :3].mean(axis=1),
-                    drop={f"confidence below {options.min_confidence:g}": confidence < options.min_confidence},
+                    drop={
+                        f"confidence below {options.min_confidence:g} (option --min-confidence)": confidence
+                        < options.min_confidence
+                    },
                 )
 
 

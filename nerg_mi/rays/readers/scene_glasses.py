@@ -466,7 +466,7 @@ class SceneGaze:
             with np.errstate(invalid="ignore"):
                 angles = angles_between(direction, block.other_direction)
             self._angles.append(angles[np.isfinite(angles) & ~np.any(list(drop.values()), axis=0)])
-        drop["no frame of the scene camera near that time has a pose"] = has_no_pose
+        drop["no frame of the scene camera near that time has a pose (option --max-gap)"] = has_no_pose
         ray = poses.rotate(rotation, direction)
         self._builder.add(block.t, self._person, position, ray, rows=block.rows, head=rotation[:, :, 2], drop=drop)
 

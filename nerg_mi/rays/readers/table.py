@@ -188,10 +188,11 @@ class MappedRows:
         origin, direction, head = self._compute_geometry(vector)
         pose = vector(self.pose_columns) if columns.pose == "matrix" else None
         drop = {} if pose is None else {poses.MIRRORED_MATRIX: poses.is_mirrored(pose)}
-        drop |= {f"confidence below {options.min_confidence:g}": confidence < options.min_confidence}
+        is_uncertain = confidence < options.min_confidence
+        drop |= {f"confidence below {options.min_confidence:g} (option --min-confidence)": is_uncertain}
         for name, words in self.valid.items():
             values_text = " or ".join(dict.fromkeys(w.lower() for w in words)) or "valid"
-            drop[f"{name} is not {values_text}"] = ~mark_valid(word[name], words)
+            drop[f"{name} is not {values_text} (option --valid)"] = ~mark_valid(word[name], words)
         builder.add(
             t * options.tick,
             word[self.person] if self.person else person_from_filename(path),

@@ -127,7 +127,7 @@ def test_dropped_rows(neon):
     assert dropped(rays) == {
         "the glasses were not worn": [[3, 4]],
         "a blink": [[5, 5]],
-        "no frame of the scene camera near that time has a pose": [[8, 8]],
+        "no frame of the scene camera near that time has a pose (option --max-gap)": [[8, 8]],
     }
     assert rays.persons == ("ann",) and np.allclose(rays.t, (ns[[0, 4, 5]] - START) * 1e-9, atol=1e-6)
     assert [s["file"] for s in rays.metadata["sources"]][-1] == "ann/gaze.csv"
@@ -142,7 +142,7 @@ def test_gaps_between_frames_are_not_interpolated(neon):
     # Frames 2 and 6 at 30 Hz are 0.133 s apart.
     assert len(read("neon", folder, **options)) == 7
     rays = read("neon", folder, **options, gap=0.1)
-    assert dropped(rays) == {"no frame of the scene camera near that time has a pose": [[3, 6]]}
+    assert dropped(rays) == {"no frame of the scene camera near that time has a pose (option --max-gap)": [[3, 6]]}
 
 
 def test_differing_gaze_representations_give_a_warning(neon):
@@ -334,7 +334,9 @@ def test_samples_without_gaze_and_invalid_lines(tobii):
     assert len(rays) == 1 and dropped(rays) == {
         "there is no gaze": [[2, 2]],
         "gaze lies beyond the scene camera's picture": [[4, 4]],
-        "the line is incomplete, has too many cells, or a cell that is not a number": [[6, 6]],
+        "the line is incomplete, has too many cells, or a cell that is not a number (option --skip-bad-lines)": [
+            [6, 6]
+        ],
     }
 
 
@@ -366,7 +368,7 @@ def test_rays_follow_the_pixels(glasses):
     assert np.abs(rays.origin - origin).max() < 1e-5 and np.abs(rays.direction - direction).max() < 1e-5
     assert dropped(rays) == {
         "there is no gaze": [[32, 32]],
-        "no frame of the scene camera near that time has a pose": [[33, 33]],
+        "no frame of the scene camera near that time has a pose (option --max-gap)": [[33, 33]],
     }
     assert rays.metadata["frames"] == "scene/frame_{frame1}"
 
@@ -431,7 +433,10 @@ def test_pupil(tmp_path):
         1e-3 * np.array([[-10, 10, -20], [-40, 10, -20]])
     )
     assert np.allclose(rays.origin, want)
-    assert dropped(rays) == {"confidence below 0.6": [[3, 3]], "there is no head pose at that time": [[5, 5]]}
+    assert dropped(rays) == {
+        "confidence below 0.6 (option --min-confidence)": [[3, 3]],
+        "there is no head pose at that time": [[5, 5]],
+    }
     with pytest.raises(NergError, match="length in metres"):
         read("pupil", folder)
     (folder / "head_pose_tracker_poses.csv").unlink()

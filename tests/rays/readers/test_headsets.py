@@ -118,7 +118,9 @@ def test_quest_both_eyes_in_the_world(tmp_path, rig):
     assert np.allclose(rays.origin, origin[selected][:, UNITY]) and np.allclose(
         rays.direction, direction[selected][:, UNITY]
     )
-    assert np.allclose(rays.confidence, [0.9, *[0.8] * (N - 2)]) and dropped(rays) == {"confidence below 0.5": [[3, 3]]}
+    assert np.allclose(rays.confidence, [0.9, *[0.8] * (N - 2)]) and dropped(rays) == {
+        "confidence below 0.5 (option --min-confidence)": [[3, 3]]
+    }
     assert len(read("quest", path, min_confidence=0.1)) == N
 
 
@@ -420,7 +422,7 @@ def test_supermarket_frame_eyes_and_openness(tmp_path):
     assert np.allclose(rays.head, (turn @ (0, 0, -1))[[0, 2, 1]])
     assert np.allclose(rays.origin, ((1, 1.6, 2) + turn @ (0.01, 0, -0.1))[[0, 2, 1]])
     assert dropped(rays) == {
-        "an eye is closed (openness at most 0.5)": [[3, 3]],
+        "an eye is closed: openness at most 0.5 (option --min-openness)": [[3, 3]],
         "confidence is missing or outside [0, 1]": [[5, 5]],
     }
     assert len(read("vr_supermarket", path, min_openness=0.4)) == 3

@@ -31,7 +31,7 @@ def test_table_of_another_frame(tmp_path):
     assert np.allclose(rays.t, [0, 1]) and [rays.persons[p] for p in rays.person] == ["bo", "ann"]
     assert {d["reason"]: d["rows"] for d in rays.metadata["dropped"]} == {
         "direction is missing": [[5, 5]],
-        "confidence below 0.5": [[3, 3]],
+        "confidence below 0.5 (option --min-confidence)": [[3, 3]],
     }
     assert rays.metadata["source_frame"] == {"up": "y", "handedness": "left", "units": "cm"}
     by_file = read_table(path, mapping, person_from="filename")
@@ -122,7 +122,7 @@ def test_cohorts_persons_and_validity(tmp_path):
     assert rays.persons == ("ann", "bo") and list(rays.person) == [1, 0]
     assert rays.cohorts == ("unknown", "new") and list(rays.cohort) == [1, 0]
     assert {d["reason"]: d["rows"] for d in rays.metadata["dropped"]} == {
-        "ok is not valid": [[5, 5]],
+        "ok is not valid (option --valid)": [[5, 5]],
         "person is missing": [[4, 4]],
     }
     again = tmp_path / "rays.npz"
