@@ -149,6 +149,7 @@ class EyeNavGS(FixedFrameReader):
         recordings = [path for file in files for path in _find_recordings(file)]
         setting, settings_by_path = None, {}
         for path in recordings:
+            _check_columns(path)
             settings = _find_settings(path)
             if settings not in settings_by_path:
                 builder.begin_source(settings)
@@ -270,9 +271,22 @@ def _split_file_name(path: Path) -> tuple[str, str]:
     return person, _PLACE_ALIASES.get(place, place)
 
 
-def _find_settings(path: Path) -> Path:
+def _check_columns(path: Path) -> None:
+    """Raise `NergError` for a file without the columns of a recording."""
     if not path.is_file():
         raise NergError(f"{path} does not exist; correct its name")
+    columns = read_table_columns(path)
+    missing = [name for name in _COLUMNS if name not in columns]
+    if not any(name in columns for name in _TIMES):
+        missing.append(" or ".join(_TIMES))
+    if missing:
+        raise NergError(
+            f"{path} is not a recording of EyeNavGS: it has no column {', '.join(missing)}; find its format with nerg "
+            "rays guess"
+        )
+
+
+def _find_settings(path: Path) -> Path:
     for folder in list(resolve_path(path).parents)[: _MAX_PARENTS + 1]:
         if (folder / _SETTINGS_FILE).is_file():
             return folder / _SETTINGS_FILE

@@ -207,6 +207,17 @@ def test_invalid_input_is_refused(tmp_path):
         read("eyenavgs", path, eye="third")
 
 
+def test_the_columns_of_another_format_are_checked_first(tmp_path):
+    """Before the settings of the scene, which do not exist either."""
+    path = tmp_path / "log.csv"
+    path.write_text("t,PositionX,PositionY,PositionZ\n0,1,2,3\n")
+    with pytest.raises(NergError, match="log.csv") as refusal:
+        read("eyenavgs", path)
+    text = str(refusal.value)
+    assert "ViewIndex" in text and "Timestamp" in text and "nerg rays guess" in text
+    assert "PositionX" not in text and "scene_setting" not in text
+
+
 # ---- Scene settings of EyeNavGS ----
 
 
