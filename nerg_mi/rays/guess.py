@@ -317,6 +317,8 @@ class Proposal:
     certain: list[str] = field(default_factory=list)
     assumptions: list[str] = field(default_factory=list)
     questions: list[str] = field(default_factory=list)
+    # Folder that was named in place of the paths; the output is named after it.
+    folder: Path | None = None
 
     @property
     def command(self) -> str | None:
@@ -324,7 +326,8 @@ class Proposal:
         if self.preset is None and self.columns is None:
             return None
         what = ["--preset", self.preset] if self.preset else ["--map", str(self.columns)]
-        stem = resolve_path(self.paths[0]).name.split(".")[0] or "rays"
+        stem = resolve_path(self.paths[0]).name.split(".")[0] if self.folder is None else resolve_path(self.folder).name
+        stem = stem or "rays"
         words = ["nerg", "rays", "import", *map(str, self.paths), "-o", f"{stem}.npz", *what]
         for flag, value in self.options.items():
             words += [flag, value] if value else [flag]
@@ -337,19 +340,56 @@ _TABLE_SUFFIXES = (".csv", ".csv.gz", ".tsv", ".txt", ".parquet")
 def propose_imports(paths: Sequence[str | Path]) -> list[Proposal]:
     """Propose imports of tracking files or folders of recordings; one proposal for all files that are imported alike.
 
-    A folder that is not a recording is replaced by the tables in it. Raises `NergError` as `propose_import` does, and
-    for a folder without tables.
+    A folder that is not a recording is replaced by the tables in it, and its subfolders with recordings or tables are
+    named. Raises `NergError` as `propose_import` does, and for a folder without tables.
     """
     out: list[Proposal] = []
-    for path in (table for source in paths for table in _find_tables(Path(source))):
-        proposal = propose_import(path)
-        settings = proposal.preset, proposal.columns, proposal.options
-        existing = next((p for p in out if proposal.command and (p.preset, p.columns, p.options) == settings), None)
-        if existing is None:
-            out.append(proposal)
-        else:
-            existing.paths += proposal.paths
+    for source in map(Path, paths):
+        for path in _find_tables(source):
+            proposal = propose_import(path)
+            proposal.folder = source if path != source else None
+            settings = proposal.preset, proposal.columns, proposal.options
+            existing = next((p for p in out if proposal.command and (p.preset, p.columns, p.options) == settings), None)
+            if existing is None:
+                out.append(proposal)
+            else:
+                existing.paths += proposal.paths
+                existing.folder = existing.folder if existing.folder == proposal.folder else None
+    _finish_folders(out)
     return out
+
+
+def _finish_folders(proposals: Sequence[Proposal]) -> None:
+    """Name the subfolders of the folders of ``proposals``, and the outputs of several proposals of one folder after
+    their files."""
+    folders = [p.folder for p in proposals if p.folder is not None]
+    for folder in dict.fromkeys(folders):
+        first = next(p for p in proposals if p.folder == folder)
+        if usable := _find_usable_subfolders(folder):
+            first.questions.append(
+                f"only the tables directly in {folder} were read; recordings or tables are also in its subfolders "
+                f"{_list_names(usable)}: nerg rays guess {shlex.quote(str(usable[0]))}"
+            )
+    for proposal in proposals:
+        if folders.count(proposal.folder) > 1:
+            proposal.folder = None
+
+
+_MAX_SUBFOLDERS = 1000  # subfolders that are inspected
+
+
+def _find_usable_subfolders(folder: Path) -> list[Path]:
+    """The subfolders that are a recording, or contain tables."""
+    return [p for p in _list_subfolders(folder)[:_MAX_SUBFOLDERS] if _find_tables(p) != [p] or find_preset_by_files(p)]
+
+
+def _list_subfolders(folder: Path) -> list[Path]:
+    return sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith("."))
+
+
+def _list_names(paths: Sequence[Path], max_names: int = 4) -> str:
+    more = f" and {len(paths) - max_names} more" if len(paths) > max_names else ""
+    return ", ".join(p.name for p in paths[:max_names]) + more
 
 
 def _find_tables(path: Path) -> list[Path]:
@@ -369,12 +409,7 @@ def propose_import(path: str | Path) -> Proposal:
     match = find_preset_by_files(path)
     if match is None:
         if path.is_dir():
-            names = ", ".join(
-                f"{file} and {companion}" for reader in iterate_readers() for file, companion in reader.signature.files
-            )
-            raise NergError(
-                f"the folder {path} is not a recording of a known format ({names}); name a file in it instead"
-            )
+            raise _make_folder_error(path)
         match = find_preset_by_first_line(path) if path.suffix.lower() != ".parquet" else None
     table = ColumnFinder(path) if match is None else None
     if table is not None:
@@ -387,6 +422,20 @@ def propose_import(path: str | Path) -> Proposal:
         raise NergError(f"the first line of {path} contains no column names; add a header to the table")
     _propose_columns(out, TableSample(path, table.columns), find_roles(table.columns))
     return out
+
+
+def _make_folder_error(path: Path) -> NergError:
+    """The error for a folder that is neither a recording nor contains tables."""
+    if usable := _find_usable_subfolders(path):
+        subfolders = _list_subfolders(path)
+        return NergError(
+            f"the folder {path} is not a recording of a known format and has no table; of its subfolders "
+            f"({_list_names(subfolders)}) use one with recordings: nerg rays guess {shlex.quote(str(usable[0]))}"
+        )
+    names = ", ".join(
+        f"{file} and {companion}" for reader in iterate_readers() for file, companion in reader.signature.files
+    )
+    return NergError(f"the folder {path} is not a recording of a known format ({names}); name a file in it instead")
 
 
 def _is_name(column: str) -> bool:
@@ -471,6 +520,8 @@ def _propose_columns(out: Proposal, sample: TableSample, roles: Roles) -> None:
     elif quaternion is not None:
         rotations = poses.rotations_from_quaternions(sample.stack_columns(quaternions[quaternion]))
     gaze = sample.stack_columns(vectors[direction]) if direction else None
+    if direction and gaze is not None and not is_unit(gaze):
+        _question_lengths(out, vectors[direction], gaze)
     is_local = _propose_pose(out, settings, rotations, gaze, head_positions, time[1])
     if rotations is not None and gaze is not None and is_local is False:
         quaternion = matrix = rotations = None
@@ -490,6 +541,18 @@ def _propose_columns(out: Proposal, sample: TableSample, roles: Roles) -> None:
     _propose_angles(out, sample, roles, mapping)
     _propose_validity(out, sample)
     _finish_proposal(out, sample, roles, mapping)
+
+
+def _question_lengths(out: Proposal, names: Sequence[str], vectors: np.ndarray) -> None:
+    """Ask whether ``vectors`` (n, 3) of other lengths than 1 are directions."""
+    lengths = np.linalg.norm(vectors, axis=1)
+    lengths = lengths[np.isfinite(lengths)]
+    if lengths.size:
+        low, high = np.percentile(lengths, [5, 95])
+        out.questions.append(
+            f"whether {', '.join(names)} is a direction: its length is {low:.3g} to {high:.3g} (5 to 95 %) instead of "
+            "1; the import normalises it; a point is mapped with hit= instead"
+        )
 
 
 def _side_penalty(parts: set[str]) -> int:

@@ -431,7 +431,7 @@ def print_guesses(files: list[Path], reporter: Reporter) -> None:
     """Print the proposals of `guess_imports`; column names are printed without control characters."""
     proposals = guess_imports(files, reporter)
     for k, proposal in enumerate(proposals):
-        if len(proposals) > 1:
+        if len(proposals) > 1 or proposal.paths[0] not in files:
             count_note = f" and {len(proposal.paths) - 1} more" if len(proposal.paths) > 1 else ""
             reporter.message("\n" * (k > 0) + sanitize(f"{proposal.paths[0]}{count_note}", 2000))
         for name, sentences in (

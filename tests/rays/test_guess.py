@@ -394,6 +394,45 @@ def test_several_files_and_folders(tmp_path):
         propose_imports([tmp_path / "empty"])
 
 
+def test_outputs_are_named_after_the_folder(tmp_path):
+    eye, gaze, _ = frame(WALK, "y left")
+    (tmp_path / "room.a").mkdir()
+    for name in ("a.csv", "b.csv"):
+        (tmp_path / "room.a" / name).write_text(alike(eye, gaze))
+    output = lambda p: (words := shlex.split(p.command))[words.index("-o") + 1]
+    (proposal,) = propose_imports([tmp_path / "room.a"])
+    assert output(proposal) == "room.a.npz"
+    (proposal,) = propose_imports([tmp_path / "room.a" / "a.csv"])
+    assert output(proposal) == "a.npz"
+    (tmp_path / "room.a" / "c.csv").write_text(alike(100 * WALK.eye, WALK.gaze))
+    assert [output(p) for p in propose_imports([tmp_path / "room.a"])] == ["a.npz", "c.npz"]
+
+
+def test_a_parent_folder_names_its_subfolders(tmp_path):
+    for name in ("empty", "ann", "room"):
+        (tmp_path / name).mkdir()
+    EXAMPLES["neon"].make(tmp_path / "ann")
+    (tmp_path / "room" / "b.csv").write_text("x,y\n1,2\n")
+    with pytest.raises(NergError) as refusal:
+        propose_imports([tmp_path])
+    assert f"nerg rays guess {tmp_path / 'ann'}" in str(refusal.value) and "room" in str(refusal.value)
+    # A table that is no recording, next to the recordings.
+    (tmp_path / "settings.csv").write_text("name,scale\nroom,2\n")
+    lines = run("guess", tmp_path).output
+    assert str(tmp_path / "settings.csv") in lines and f"nerg rays guess {tmp_path / 'ann'}" in lines
+    assert "ann, room" in lines
+
+
+def test_directions_of_other_lengths_are_named(tmp_path):
+    table = gaze_in_world("z right", 1.0, 1.0)
+    (tmp_path / "unit.csv").write_text(csv(**table))
+    (tmp_path / "log.csv").write_text(csv(**{k: 3 * v if "direction" in k else v for k, v in table.items()}))
+    names = [name for name in table if "direction" in name]
+    doubts = [q for q in propose_import(tmp_path / "log.csv").questions if all(name in q for name in names)]
+    assert len(doubts) == 1 and "3 to 3" in doubts[0]
+    assert not any(names[0] in q for q in propose_import(tmp_path / "unit.csv").questions)
+
+
 # ---- Evidence from rows ----
 
 OTHER_WALK = walk(3)
