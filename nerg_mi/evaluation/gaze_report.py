@@ -21,7 +21,7 @@ from nerg_mi.probes.probes import REGION_LEVELS, format_level
 from .gaze import SCORES, Baseline, GazeTest
 from .uncertainty import RETAINED_FRACTIONS
 
-# ---- Reports of an evaluation: tables as Markdown, CSV and JSON, and pictures of truth and prediction ----
+# ---- Reports of an evaluation: tables as Markdown, CSV and JSON, and pictures of reference and prediction ----
 
 _DIGITS = {"MAE": 4}  # Digits of scores, if not three
 _TEXT_COLUMNS = ("method", "person", "signal", "error")  # Columns of text
@@ -123,31 +123,37 @@ def draw_comparison(
     height: int = 48,
     provenance: Provenance | None = None,
 ) -> None:
-    """Draw the truth and each of ``methods`` at ``count`` test positions as panoramas (z up) in 1/sr.
+    """Draw the reference and each of ``methods`` at ``count`` test positions as panoramas (z up) in 1/sr.
 
-    Each row has one colour scale and names the number of samples and participants of its truth.
+    Each row has one colour scale and names the number of samples and participants of its reference. Azimuths increase
+    clockwise, seen from above, from +y at the left edge.
     """
     d, _ = latlong_grid(2 * height, height, Z_UP)
     positions = np.unique(np.linspace(0, len(test.centres) - 1, count).astype(int))
-    near = np.argmax(test.directions @ d.T, axis=0)  # the truth is smooth at the scale of its directions
-    pictures = [("truth", test.truth[positions][:, near])] + [
+    near = np.argmax(test.directions @ d.T, axis=0)  # the reference is smooth at the scale of its directions
+    pictures = [("reference", test.truth[positions][:, near])] + [
         (k, np.asarray(m(test.centres[positions], d))) for k, m in methods.items()
     ]
-    figure = new_page(374 * len(pictures), 209 * len(positions))
+    figure = new_page(374 * len(pictures), 209 * len(positions) + 40)
     figure.set_layout_engine("constrained")
     axes = figure.subplots(len(positions), len(pictures), squeeze=False)
     for i, row in enumerate(axes):
         top, images = np.quantile(pictures[0][1][i], 0.995), []
         for (name, maps), axis in zip(pictures, row):
             shown = maps[i].reshape(height, 2 * height)
-            images.append(axis.imshow(shown, vmin=0, vmax=top, cmap=find_colormap("inferno")))
-            axis.set(xticks=[], yticks=[])
+            images.append(axis.imshow(shown, vmin=0, vmax=top, cmap=find_colormap("inferno"), extent=(0, 360, -90, 90)))
+            axis.set(xticks=range(0, 361, 90), yticks=(-90, 0, 90))
+            axis.tick_params(labelsize=7, labelbottom=i == len(axes) - 1, labelleft=axis is row[0])
+            if i == len(axes) - 1:
+                axis.set_xlabel("azimuth (degrees, clockwise from +y)", fontsize=8)
             if i == 0:
                 axis.set_title(name, fontsize=10)
         rays = test.counts[positions[i]]
         label = f"{rays.sum():,.0f} samples of {np.count_nonzero(rays)} participants"
-        row[0].set_ylabel(", ".join(f"{x:.1f}" for x in test.centres[positions[i]]) + f" m\n{label}", fontsize=8)
-        figure.colorbar(images[-1], ax=row.tolist(), shrink=0.9).set_label("1/sr", fontsize=8)
+        row[0].set_ylabel(
+            ", ".join(f"{x:.1f}" for x in test.centres[positions[i]]) + f" m\n{label}\nelevation (degrees)", fontsize=7
+        )
+        figure.colorbar(images[-1], ax=row.tolist(), shrink=0.9).set_label("gaze density (1/sr)", fontsize=8)
     save(figure, path, provenance)
 
 

@@ -80,7 +80,7 @@ def test_files(tmp_path):
     assert provenance["methods"][0]["KLD"] == 0.51234 and provenance["persons"][0]["rays"] == 3
 
 
-def test_pictures_are_on_the_scale_of_the_truth(tmp_path, monkeypatch):
+def test_pictures_are_on_the_scale_of_the_reference(tmp_path, monkeypatch):
     d = fibonacci_directions(500)
     centres = np.arange(15.0).reshape(5, 3)
     truth = np.exp(3 * d @ np.array([1.0, 0, 0])) * np.arange(1, 6)[:, None]
@@ -97,11 +97,23 @@ def test_pictures_are_on_the_scale_of_the_truth(tmp_path, monkeypatch):
     images = [a for a in drawn[0].axes if a.images]
     # Each row has its own scale with a colour bar.
     scales = [a for a in drawn[0].axes if a not in images]
-    assert [a.get_ylabel() for a in scales] == ["1/sr", "1/sr"]
+    assert len(scales) == 2 and all("1/sr" in a.get_ylabel() for a in scales)
     assert [tuple(a.get_ylim()) for a in scales] == [images[k].images[0].get_clim() for k in (0, 2)]
-    assert np.array_equal(calls[0], centres[[0, 4]]) and [a.get_title() for a in images] == ["truth", "twice", "", ""]
-    assert images[0].get_ylabel() == "0.0, 1.0, 2.0 m\n7 samples of 2 participants"
-    assert images[2].get_ylabel() == "12.0, 13.0, 14.0 m\n1,500 samples of 2 participants"
+    assert np.array_equal(calls[0], centres[[0, 4]]) and [a.get_title() for a in images] == [
+        "reference",
+        "twice",
+        "",
+        "",
+    ]
+    assert "0.0, 1.0, 2.0 m\n7 samples of 2 participants" in images[0].get_ylabel()
+    assert "12.0, 13.0, 14.0 m\n1,500 samples of 2 participants" in images[2].get_ylabel()
+    assert all("elevation" in a.get_ylabel() and "degrees" in a.get_ylabel() for a in images[::2])
+    assert ["azimuth" in a.get_xlabel() and "degrees" in a.get_xlabel() for a in images] == [False, False, True, True]
+    # The brightest direction of the reference, +x, is at its azimuth and elevation.
+    row, column = np.unravel_index(np.argmax(images[0].images[0].get_array()), (8, 16))
+    left, right, bottom, top = images[0].images[0].get_extent()
+    assert abs(left + (column + 0.5) / 16 * (right - left) - 90) < 25
+    assert abs(top - (row + 0.5) / 8 * (top - bottom)) < 25
     for a, b in (images[:2], images[2:]):
         # One scale per row.
         assert a.images[0].get_clim() == b.images[0].get_clim() and a.images[0].get_clim()[0] == 0
