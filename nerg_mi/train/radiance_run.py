@@ -129,7 +129,8 @@ def find_problems(
             f"the run ended with steps {stride} times coarser than those of rendering, because fog was not cleared "
             f"yet; use {remedy}"
         )
-    if len(history) > 1:
+    # With too few steps, a lower PSNR is noise of an unfinished training, which another seed does not improve.
+    if steps >= _MIN_STEPS and len(history) > 1:
         best = max(history[:-1], key=lambda x: x["psnr"])
         drop = best["psnr"] - history[-1]["psnr"]
         if drop > _MAX_DROP:

@@ -152,6 +152,12 @@ def test_a_drop_below_an_earlier_evaluation_is_reported():
     assert find_problems(make_history(18, 24.2, 22, 23.3), 2000, 1, 2.0, 120.0) == []
 
 
+def test_a_drop_in_a_short_training_is_not_blamed_on_the_seed():
+    (said,) = find_problems(make_history(18, 24.31, 22), 499, 1, 1.0, 60.0)
+    assert "--seed" not in said and "499 steps" in said
+    assert any("--seed" in said for said in find_problems(make_history(18, 24.31, 22), 500, 1, 1.0, 60.0))
+
+
 def test_a_coarse_final_stride_is_reported():
     (said,) = find_problems([], 2000, 4, None)
     assert "4 times coarser" in said and "--steps" in said and "--minutes" not in said
