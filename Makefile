@@ -41,7 +41,7 @@ ONE_CORE = tests/cli/test_scenes.py tests/cli/test_ending.py tests/files/test_im
 .PHONY: demo test test-all check lint types format docs manual onecore coverage fuzz faults soak packages bench bench-gpu setup
 
 demo: setup
-	.venv/bin/nerg demo --out out/demo
+	.venv/bin/nerg demo --output out/demo
 
 test test-all check onecore coverage fuzz faults soak: EXTRAS = test
 

@@ -36,6 +36,6 @@ def package(session: nox.Session, versions: str) -> None:
         shutil.rmtree(source / name)
     session.chdir(source)
     session.run("nerg", "doctor")
-    session.run("nerg", "demo", "--out", str(folder / "demo"))
+    session.run("nerg", "demo", "--output", str(folder / "demo"))
     paths = [f"tests/{name}" for name in TESTS]
     session.run("pytest", "-q", "-m", "not slow and not nightly", *(session.posargs or paths))

@@ -1,6 +1,6 @@
 """One protocol for gaze in several scenes: where is a field better than simpler baselines, and where is it worse?
 
-    python benchmarks/places.py [--only room,office] [--folds 4] [--first 0] [--mix-folds N] [--mix-kappa K]
+    python benchmarks/places.py [--only room,office] [--folds 4] [--seed 0] [--prior-folds N] [--prior-kappa K]
         [--recipe default] [--variant VARIANT] [--no-surfaces] [--against FOLDS.csv] [--out out/benchmarks/places]
     python benchmarks/places.py --uncertainty --folds 3 --zones 6 [--ensemble 5] [--out out/benchmarks/uncertainty]
 
@@ -10,7 +10,7 @@ each fold half of the participants train the field, and the others are scored at
 training data is excluded within 2R. Baselines: uniform, position-independent, nearest probes and nearest rays, and the
 split-half agreement of the held-out participants. `rank` is among the methods other than the split half; `less` is the
 field minus the best baseline, fold by fold, with 95 % of Student's t; `way` is the field's position between the
-position-independent prior and the split half in CC, where the latter is better. `--mix-folds 0` trains without a
+position-independent prior and the split half in CC, where the latter is better. `--prior-folds 0` trains without a
 selected weight of the prior, `--no-surfaces` without geometry even if it is known. `--against` prints the field minus
 that of another run, fold by fold, from its folds.csv.
 
@@ -135,10 +135,10 @@ def main(argv=None) -> None:
     parser = place_parser(__doc__, "places", folds=4)
     parser.add_argument("--recipe", default="default")
     parser.add_argument("--variant", help="emit, capture or emit_capture. Default: the recipe's.")
-    parser.add_argument("--first", type=int, default=0, help="seed of the first fold")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the first fold")
     parser.add_argument("--zones", type=int, default=3, help="zones of test positions of a fold")
-    parser.add_argument("--mix-folds", type=int, help="Default: the recipe's.")
-    parser.add_argument("--mix-kappa", type=float, help="Default: the recipe's.")
+    parser.add_argument("--prior-folds", type=int, help="Default: the recipe's.")
+    parser.add_argument("--prior-kappa", type=float, help="Default: the recipe's.")
     parser.add_argument("--no-surfaces", action="store_true", help="ignore known surfaces in all scenes")
     parser.add_argument("--against", type=Path, help="folds.csv of a run whose field this one is compared with")
     parser.add_argument("--uncertainty", action="store_true", help="whether fields know what they do not know")
@@ -180,12 +180,12 @@ def evaluate(name: str, make: Make, args: argparse.Namespace):
         recipe=args.recipe,
         variant=args.variant,
         folds=args.folds,
-        seed=args.first,
-        zones=args.zones,
+        seed=args.seed,
+        test_zones=args.zones,
         splits="both,people" if args.uncertainty else "both",
         ensemble=args.ensemble,
-        mix_folds=args.mix_folds,
-        mix_kappa=args.mix_kappa,
+        prior_folds=args.prior_folds,
+        prior_kappa=args.prior_kappa,
         threads=args.threads,
     )
     with TerminalReporter() as reporter:

@@ -48,7 +48,7 @@ class Command:
         return [w.replace("IN", str(inputs)).replace("OUT", str(output)) for w in self.line.split()]
 
 
-_GAZE = "--geometry none --zones 0 --radius 0.5 --probes 16 --min-rays 8 --directions 64"
+_GAZE = "--geometry none --validation-zones 0 --radius 0.5 --probes 16 --min-rays 8 --directions 64"
 COMMANDS = (
     Command(
         "train radiance",

@@ -49,14 +49,14 @@ VIEWS = [
 TARGET = (4.8, 4.2, 1.0)
 GAZE = {
     "default": ["--recipe", "default", "--steps", "12", "--test-zones", "2", "--test-positions", "8"],
-    "small": ["--recipe", "small", "--steps", "12", "--zones", "0"],
-    "paper": ["--recipe", "paper", "--size", "small", "--steps", "6", "--zones", "0"],
+    "small": ["--recipe", "small", "--steps", "12", "--validation-zones", "0"],
+    "paper": ["--recipe", "paper", "--size", "small", "--steps", "6", "--validation-zones", "0"],
     "emit": ["--recipe", "default", "--variant", "emit", "--steps", "6"],
-    "capture": ["--recipe", "small", "--variant", "capture", "--steps", "6", "--zones", "0"],
-    "zones": ["--recipe", "default", "--zones", "2", "--steps", "10"],
-    "snapshot": ["--recipe", "small", "--semantic", "snapshot", "--steps", "6", "--zones", "0"],
-    "accumulated": ["--recipe", "small", "--semantic", "accumulated", "--semantic-own", "--steps", "6", "--zones", "0"],
-    "normalized": ["--recipe", "small", "--normalized", "--steps", "6", "--zones", "0"],
+    "capture": ["--recipe", "small", "--variant", "capture", "--steps", "6", "--validation-zones", "0"],
+    "zones": ["--recipe", "default", "--validation-zones", "2", "--steps", "10"],
+    "snapshot": ["--recipe", "small", "--semantic", "snapshot", "--steps", "6", "--validation-zones", "0"],
+    "accumulated": "--recipe small --semantic accumulated --semantic-concat --steps 6 --validation-zones 0".split(),
+    "normalized": ["--recipe", "small", "--normalize", "--steps", "6", "--validation-zones", "0"],
     "ensemble": ["--recipe", "default", "--ensemble", "2", "--steps", "6"],
 }
 """Gaze fields by name, and the options that train them."""

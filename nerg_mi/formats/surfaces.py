@@ -89,8 +89,7 @@ def extract_mesh(
     if not volume.min() < level < volume.max():
         raise NergError(
             f"the density does not cross {threshold:g} per unit (its range is {density.min():g} .. {density.max():g} "
-            "on "
-            f"{lattice.shape} points): choose another --density"
+            f"on {lattice.shape} points): choose another --density-threshold"
         )
     index, faces, _, _ = measure.marching_cubes(volume.transpose(2, 1, 0), level, allow_degenerate=False)
     index, is_hidden = find_crossings(sampler, lattice, index.astype(np.float64), threshold)
@@ -213,7 +212,8 @@ def extract_points(
     index = np.concatenate(index)
     if len(index) == 0:
         raise NergError(
-            f"the density does not cross {threshold:g} per unit on {lattice.shape} points: choose another --density"
+            f"the density does not cross {threshold:g} per unit on {lattice.shape} points: "
+            "choose another --density-threshold"
         )
     if count is not None and count < len(index):
         index = index[np.sort(np.random.default_rng(seed).choice(len(index), count, replace=False))]

@@ -513,7 +513,7 @@ def _explain_exit(code: int, error_output: str, work: Path) -> str:
     if shutil.disk_usage(work).free < 1 << 20:
         return f'COLMAP failed because the disk of "{work.parent.parent}" is full; free some space'
     if code == -signal.SIGKILL:
-        return "COLMAP was killed, probably because memory was short; use a smaller --size or fewer images"
+        return "COLMAP was killed, probably because memory was short; use a smaller --max-image-size or fewer images"
     lines = [line for line in error_output.splitlines() if line.strip()]
     # The message precedes the stack trace if a library aborts, and follows it if Python raises.
     message = next((line for line in lines if "Check failed" in line or "] " in line[:80]), lines[-1] if lines else "")

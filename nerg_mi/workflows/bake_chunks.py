@@ -155,7 +155,7 @@ class BakeScene:
         if isinstance(part, TrackedRays):
             return sum_rays(target, part, self.ray_settings)
         if make is None:
-            raise NergError("there is no gaze field: name one by --gaze, or take the gaze of the rays, --from rays")
+            raise NergError("there is no gaze field: name one by --gaze, or take the gaze of the rays, --source rays")
         return sum_gaze(target, make, part.positions, part.weights, self.gaze_settings)
 
     def _load(self) -> tuple[SurfaceTarget, MakeObserver | None]:
@@ -227,7 +227,7 @@ def make_observers(options: BakeOptions, rays: Rays | None, align: Similarity, r
     """Return the observers of a gaze field, in scene coordinates. Raises `NergError` for none or several kinds."""
     kinds = [
         name
-        for name, value in (("--observer", options.observer), ("--path", options.observer_file))
+        for name, value in (("--observer", options.observer), ("--observer-file", options.observer_file))
         if value is not None
     ]
     if len(kinds) > 1:
@@ -459,7 +459,7 @@ class SplatScene:
         if isinstance(part, TrackedRays):
             return sum_rays_on_splats(geometry.arrays, geometry.axes, part, self.ray_settings)
         if make is None:
-            raise NergError("there is no gaze field: name one by --gaze, or take the gaze of the rays, --from rays")
+            raise NergError("there is no gaze field: name one by --gaze, or take the gaze of the rays, --source rays")
         sums = self.empty_sums
         for k, weight in enumerate(part.weights.tolist()):
             eye = part.positions[k : k + 1]

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import ast
+import re
 from dataclasses import fields, replace
+from pathlib import Path
 
 import pytest
 
 import nerg_mi as nerg
-from nerg_mi.cli.building import build_command
+from nerg_mi.cli.building import DEBUG, build_command
 from nerg_mi.errors import NergError
 from nerg_mi.workflows.base import COMMANDS, Command
 from nerg_mi.workflows.gaze_commands import AblationOptions, FoldOptions, GazeOptions
 from nerg_mi.workflows.old_names import ALL, OLD_NAMES, renamed_options
 from tools.command_pages import iter_commands
 
+# Options of colmap, pip, Python's server and torch-ngp, and the prefix of negated flags.
+FOREIGN = set("--output_type --force-reinstall --bind --directory --tcnn --ff --color_space --bg_radius --no-".split())
 PARSERS = {path.removeprefix("nerg "): command for path, command, _ in iter_commands()}
 
 
@@ -30,6 +35,20 @@ def test_each_row_names_an_option_of_its_command():
             assert command == ALL or old not in spellings(command), (command, old)
         else:
             assert new in {f.name for f in fields(COMMANDS[command].options)}, (command, new)
+
+
+def test_texts_name_current_options():
+    current = {"--help", "--version", *DEBUG, *FOREIGN}.union(*map(spellings, PARSERS))
+    package = Path(nerg.__file__).parent
+    unknown = []
+    for path in sorted(package.rglob("*.py")):
+        if path.name == "old_names.py" or path.relative_to(package).parts[0] == "scenes":  # scripts with own options
+            continue
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                named = re.findall(r"(?<![\w-])--[a-z][\w-]*", node.value)
+                unknown += [(str(path.relative_to(package)), name) for name in named if name not in current]
+    assert not unknown
 
 
 def run(kind, name, *line):
