@@ -39,7 +39,10 @@ from scipy.spatial.transform import Rotation
 
 ROOT = Path(__file__).resolve().parents[1]
 TITLE, FOX = "Alignment by evidence, in the store", "Fox, from five picked points"
-HEAD = "evidence|known besides|right|error cm|95 %|degrees|scale %|residual cm|mirror named|s".split("|")
+HEAD = (
+    "evidence|also known|correct|error, cm|95 % quantile, cm|rotation error, degrees|scale error, %|residual, cm"
+    "|mirroring detected|time, s"
+).split("|")
 
 
 @dataclass(frozen=True)
@@ -273,8 +276,8 @@ def main(argv=None) -> None:
         write_rows(args.out, rows)
     fox = measure_fox(args.trials) if "fox" in requested else None
     if fox is not None:
-        head = "trials|error, % of the cameras' spread|95 %|degrees|95 %|residual, %".split("|")
-        print_table(FOX, head, fox, args.update)
+        head = "trials|error, % of the cameras' spread|95 % quantile|rotation error, degrees|95 % quantile|residual, %"
+        print_table(FOX, head.split("|"), fox, args.update)
 
 
 if __name__ == "__main__":

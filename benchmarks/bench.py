@@ -158,8 +158,9 @@ class Run:
         """Seconds of each run: CPU time, or wall-clock time on a device."""
         return [wall if self.cuda else cpu for wall, cpu in times]
 
-    def table(self, title: str, head, rows: list[list[str]], name: str) -> None:
-        print_table(title, head, rows, self.page)
+    def table(self, title: str, head: dict[str, str], rows: list[list[str]], name: str) -> None:
+        """Print the table, and write it as CSV; ``head``: name of a column in the CSV file -> its title."""
+        print_table(title, list(head.values()), rows, self.page)
         write_rows(self.out / f"{name}.csv", [dict(zip(head, row)) for row in rows])
 
     def figure(self, figure, name: str) -> None:
@@ -185,7 +186,7 @@ def the_run(run: Run) -> None:
         ["programs", ", ".join(programs)],
         ["runs of each", str(run.runs)],
     ]
-    run.table("The run", ["what", "with"], rows, "run")
+    run.table("The run", {"what": "property", "with": "value"}, rows, "run")
 
 
 def peers_of(run: Run, compiled: bool) -> dict[str, torch_frames.TorchRenderer]:
@@ -228,7 +229,10 @@ def frames(run: Run) -> None:
             works |= {name: partial(peer.frame, o, d, (4.4, 2.8, 1.6)) for name, peer in peers.items()}
         runs = run.runs if width < 640 else max(run.runs // 3, 1)
         rows += torch_frames.measure(works, f"{width} x {height}", runs)
-    run.table("Frames", list(rows[0]), [list(map(str, r.values())) for r in rows], "frames")
+    titles = {"frame": "image size", "s": "time, s", "quartiles": "quartiles, s", "CPU s": "CPU time, s"}
+    titles["times nerg"] = "relative to nerg"
+    head = {key: titles.get(key, key) for key in rows[0]}
+    run.table("Frames", head, [list(map(str, r.values())) for r in rows], "frames")
 
 
 def stages(run: Run) -> None:
@@ -250,7 +254,13 @@ def stages(run: Run) -> None:
         cells = [f"{peer / clock:.0f}"] if peer else [""]
         rows.append([name, f"{median(each):.2f}", spread(each), overrides, *cells])
     unit = "us" if run.cuda else "us of CPU"
-    head = ["what", f"{unit} a pixel", "quartiles", "more than above", "times faster than eager PyTorch"]
+    head = {
+        "what": "computed quantities",
+        f"{unit} a pixel": f"{'time' if run.cuda else 'CPU time'} per pixel, µs",
+        "quartiles": "quartiles, µs",
+        "more than above": "increase over the row above, µs",
+        "times faster than eager PyTorch": "speed-up over eager PyTorch",
+    }
     run.table("Stages", head, rows, "stages")
 
 
@@ -295,7 +305,13 @@ def kde(run: Run) -> None:
             [f"{rays:,}", *(f"{1e3 * median(c):.3g} ({spread(1e3 * t for t in c)})" for c in (ours, theirs)), times]
         )
         rows[-1].append(f"{difference:.0e}")
-    head = ["rays", "nerg, CPU ms (quartiles)", "SciPy, CPU ms (quartiles)", "times", "largest difference"]
+    head = {
+        "rays": "rays",
+        "nerg, CPU ms (quartiles)": "nerg: CPU time (quartiles), ms",
+        "SciPy, CPU ms (quartiles)": "SciPy: CPU time (quartiles), ms",
+        "times": "speed-up",
+        "largest difference": "maximum difference",
+    }
     run.table("Kernel densities next to SciPy", head, rows, "kde")
 
 
@@ -317,7 +333,13 @@ def volume(run: Run) -> None:
         ]
         for name, cost in costs.items()
     ]
-    head = ["renderer", "CPU ms", "quartiles", "error (rms)", "times at equal error"]
+    head = {
+        "renderer": "renderer",
+        "CPU ms": "CPU time, ms",
+        "quartiles": "quartiles, ms",
+        "error (rms)": "RMS error",
+        "times at equal error": "relative cost at equal error",
+    }
     run.table("A cloud that absorbs, next to `volpath`", head, rows, "volume")
 
 
@@ -347,7 +369,14 @@ def growth(run: Run) -> None:
         last = f"{at_the_end(counts, middle):.2f}"
         rows.append([result.what, result.axis, steps, f"{fitted:.2f}", last, result.aim])
     unit = "ms" if run.cuda else "CPU ms"
-    head = ["cost", "against", f"{unit} by size", "exponent", "between the two largest", "aim"]
+    head = {
+        "cost": "computation",
+        "against": "size",
+        f"{unit} by size": f"{'time' if run.cuda else 'CPU time'} by size, ms",
+        "exponent": "exponent",
+        "between the two largest": "exponent between the two largest",
+        "aim": "target exponent",
+    }
     run.table("Growth", head, rows, "growth")
     run.figure(sizes.growth_figure(curves), "growth")
 

@@ -76,10 +76,10 @@ def main(argv=None) -> None:
         rows.append({"x": p[0], "y": p[1], "z": p[2], "integral": fine / ours, "seconds": seconds})
     off = np.abs([r["integral"] - 1 for r in rows])
     print(
-        f"{len(rows)} positions: off by {off.mean():.1e} in the mean, {np.quantile(off, 0.99):.1e} for 99 %, "
-        f"{off.max():.1e} at most; "
+        f"{len(rows)} positions: mean error {off.mean():.1e}, 99 % quantile {np.quantile(off, 0.99):.1e}, "
+        f"maximum {off.max():.1e}; "
         f"{np.mean(off <= 1e-3):.1%} within 1e-3; "
-        f"{np.median([r['seconds'] for r in rows]):.3f} s an integral of {COUNT:,} directions (median)"
+        f"{np.median([r['seconds'] for r in rows]):.3f} s per integral of {COUNT:,} directions (median)"
     )
     write_rows(args.out, rows)
 
@@ -105,7 +105,9 @@ def sweep(integral, positions: list[list[float]]) -> None:
         off, (wall, cpu) = np.abs(result[:, 0] / true - 1), 1e3 * np.median(result[:, 1:], axis=0)
         errors = (f"{v:.1e}" for v in (off.mean(), np.quantile(off, 0.99), off.max()))
         rows.append((name, *errors, f"{wall:.0f} ms", f"{cpu:.0f} ms"))
-    print(format_markdown_table(("directions", "mean", "99 %", "most", "time", "CPU"), rows))
+    print(
+        format_markdown_table(("directions", "mean error", "99 % quantile", "maximum error", "time", "CPU time"), rows)
+    )
 
 
 if __name__ == "__main__":

@@ -402,7 +402,7 @@ def errors(mi, only: str, depth: str):
     for name, reason in EXCLUDED.items():
         if only in name:
             rows.append([name, *(reason.get(q, "") for q in QUANTITIES), "", "", ""])
-    head = ["with respect to", *QUANTITIES, "reverse against forward", "differences", "left out"]
+    head = ["with respect to", *QUANTITIES, "reverse against forward mode", "central differences", "pixels excluded"]
     yield "Errors of derivatives", head, rows
 
 

@@ -84,7 +84,7 @@ def _visits() -> dict[str, tuple[np.ndarray, np.ndarray]]:
 def shares(people: tuple[int, ...]) -> None:
     """Coverage for all probabilities, from the binomial distribution."""
     p = np.linspace(0.001, 0.999, 1997)
-    print("| interval of a share of people | people | held | least | below 90 % | mean width |")
+    print("| interval of a proportion | participants | mean coverage | minimum | coverage below 90 % | mean width |")
     print("| --- | ---: | ---: | ---: | ---: | ---: |")
     for name, interval in _share_intervals().items():
         for n in people:
@@ -210,7 +210,8 @@ class Held:
 
 
 HEAD = (
-    "| people | held | least of a thing | width | without | held, rare | least | width | without |\n"
+    "| participants | coverage | minimum over AOIs | median width | without interval "
+    "| coverage, rare AOIs | minimum over AOIs | median width | without interval |\n"
     "| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |"
 )
 
@@ -262,7 +263,7 @@ def few_intervals(x: np.ndarray, y: np.ndarray, seed: int) -> dict:
 def numbers(population: Population, sets: int, people: tuple[int, ...]) -> None:
     from nerg_mi.statistics.estimates import estimate_proportions, estimate_ratios
 
-    print(f"\n| number {HEAD}")
+    print(f"\n| statistic {HEAD}")
     for n in people:
         rng = np.random.default_rng(n)
         result = {m.name: Held(population.truth[m.name], population.common, m.upper_limit) for m in MEASURES}
@@ -284,7 +285,10 @@ def differences(population: Population, sets: int, pairs: tuple[tuple[int, int],
     """Rate at which two groups of one population are found to differ, p <= 0.05, before and after the adjustment."""
     from nerg_mi.statistics.estimates import estimate_proportion_differences, estimate_ratio_differences
 
-    print("\n| people | number | p <= 0.05 | most of a thing | rare | most | a set has a false discovery |")
+    print(
+        "\n| participants | statistic | p <= 0.05 | maximum over AOIs | p <= 0.05, rare AOIs | maximum over AOIs "
+        "| sets with a false discovery |"
+    )
     print("| --- | --- | ---: | ---: | ---: | ---: | ---: |")
     for m, n in pairs:
         rng, result, wrong = np.random.default_rng([m, n]), defaultdict(list), []

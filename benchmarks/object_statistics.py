@@ -123,10 +123,10 @@ def errors() -> None:
             if near < far and far > 0 and near - 0.03 <= depth[i] < far + 0.03:
                 dwell[rays.person[i], k] += weight
                 reached[rays.person[i], k] = 1
-    print("| number | against | largest error |\n| --- | --- | ---: |")
+    print("| statistic | reference | maximum error |\n| --- | --- | ---: |")
     largest = np.abs(people.dwell_time - dwell).max()
-    print(f"| dwell [s], each person and thing | plain loops, ray casts to the twin | {largest:.2g} |")
-    print(f"| reach, each person and thing | the same | {np.abs(people.hit_probability - reached).max():.2g} |")
+    print(f"| dwell time [s] per participant and AOI | plain loops, ray casts to the twin | {largest:.2g} |")
+    print(f"| hit ratio per participant and AOI | the same | {np.abs(people.hit_probability - reached).max():.2g} |")
     # Fractions of the law, by quadrature over the sphere at some positions, next to the field's and a large sample.
     rows = np.linspace(0, len(walks.origin) - 1, 160).round().astype(int)
     d = fibonacci_directions(8192)
@@ -160,10 +160,11 @@ def errors() -> None:
     counted = np.array([len(at) for at in landed.rows]) / len(many)
     shares = law.mean(axis=0)
     sigma = np.sqrt(shares * (1 - shares) / len(many))
-    worst = np.abs(counted - shares) / sigma
+    off = np.abs(counted - shares)
+    worst = off / sigma
     print(
-        f"| share of {draws * len(rows):,} rays | the law by quadrature | {np.abs(counted - shares).max():.2g} of "
-        f"{shares.max():.2g}, {worst.max():.1f} standard errors (median {np.median(worst):.1f}) |"
+        f"| share of {draws * len(rows):,} rays | quadrature of the ground truth | {off.max():.2g} "
+        f"of {shares.max():.2g}, {worst.max():.1f} standard errors (median {np.median(worst):.1f}) |"
     )
     mean = far.sum(axis=0) / law.sum(axis=0)
     near = np.array([v.mean() for v in landed.distance])
@@ -202,9 +203,10 @@ def errors() -> None:
         exact[n] = np.bincount(targets.aoi_index, weights=free, minlength=exact.shape[1]) > 0
     agree = (seen == exact).mean()
     print(
-        f"| visible or not, {seen.size:,} pairs | ray casts from where they stood | {100 * (1 - agree):.2f} % differ |"
+        f"| visible or not, {seen.size:,} pairs | ray casts from the recorded positions | {100 * (1 - agree):.2f} % "
+        "differ |"
     )
-    print(f"| visible share, each thing | the same | {np.abs(seen.mean(axis=0) - exact.mean(axis=0)).max():.2g} |")
+    print(f"| visible share per AOI | the same | {np.abs(seen.mean(axis=0) - exact.mean(axis=0)).max():.2g} |")
 
 
 def main() -> None:

@@ -120,7 +120,15 @@ def main() -> None:
     ]
     print(
         format_markdown_table(
-            ["what", "operations traced", "density evals", "colour evals", "gaze evals", "CPU s"], shown
+            [
+                "configuration",
+                "traced operations",
+                "density evaluations",
+                "colour evaluations",
+                "gaze evaluations",
+                "CPU time, s",
+            ],
+            shown,
         )
     )
     names = ("what", "operations", "density_evals", "color_evals", "gaze_evals", "seconds")

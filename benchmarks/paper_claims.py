@@ -59,11 +59,12 @@ def main(argv=None) -> None:
                 result = ablate(rays, folder / f"fold{fold}", options, reporter)
             each += [{"place": name, "fold": fold, **row} for row in result.rows]
         separate = [row for row in each if row["place"] == name]
-        heads = ("recipe", "variant", "loss, training", "rises by", "KLD", "less", "CC", "less")
+        heads = ("recipe", "variant", "training loss", "test minus training loss")
+        heads += ("KLD", "minus product", "CC", "minus product")
         print_table(f"The paper's variants: {name}", heads, summarise(separate))
         write_rows(args.out / "folds.csv", each)
-    heads = ("place", "recipe", "product", *(f"{v} less it" for v in ORDER), "s")
-    print_table("CC in all places", heads, order(each))
+    heads = ("scene", "recipe", "product", *(f"{v} minus product" for v in ORDER), "training time, s")
+    print_table("CC in all scenes", heads, order(each))
 
 
 def summarise(rows: list[dict]) -> list[list[str]]:

@@ -238,7 +238,7 @@ def show_change(each: list[dict], before: Path) -> None:
 
     with before.open() as file:
         expected = {(r["place"], int(r["fold"])): r for r in csv.DictReader(file) if r["method"] == OURS}
-    print(f"\nfield less that of {before}")
+    print(f"\nfield minus field of {before}")
     separate = [r for r in each if r["method"] == OURS and (r["place"], r["fold"]) in expected]
     for name in dict.fromkeys(r["place"] for r in separate):
         folds = [r for r in separate if r["place"] == name]
@@ -258,13 +258,17 @@ def show(rows: list[dict]) -> None:
             ]
             for r in rows
         ]
-        print_table(f"{s} in all places", (s, "blind", "field", "less best", "split half"), table)
-    print("means over places: " + ", ".join(f"{s} {sum(r[s] for r in rows) / len(rows):.3f}" for s in SCORES))
+        head = (s, "position-blind", "field", "field minus best baseline", "split half")
+        print_table(f"{s} in all scenes", head, table)
+    print("means over scenes: " + ", ".join(f"{s} {sum(r[s] for r in rows) / len(rows):.3f}" for s in SCORES))
     ranks = [r[f"{s} rank"] for r in rows for s in SCORES]
     worst = max(rows, key=lambda r: r["KLD less"])
-    print(f"mean rank {sum(ranks) / len(ranks):.2f}; worst place in KLD: {worst['place']}, {worst['KLD less']:+.3f}")
+    print(f"mean rank {sum(ranks) / len(ranks):.2f}; worst scene in KLD: {worst['place']}, {worst['KLD less']:+.3f}")
     far = [r for r in rows if not isnan(r["way"])]
-    print("way from blind to split half in CC: " + ", ".join(f"{r['place']} {r['way']:.0%}" for r in far))
+    print(
+        "CC of the field between position-blind (0 %) and split half (100 %): "
+        + ", ".join(f"{r['place']} {r['way']:.0%}" for r in far)
+    )
 
 
 def uncertainty(name: str, result) -> list[dict]:
@@ -294,14 +298,16 @@ def show_uncertainty(rows: list[dict]) -> None:
         ranks = [rho(place, split, error) for split in populations.values() for error in ("KLD", "excess")]
         regions = [f"{r[key]:.0%}" for key in ("of 80%", "of 80%, calibrated")]
         table.append([place, *ranks, f"{r['100%']:.2f}, {r['50%']:.2f}", *regions])
-    head = ["place", *(f"{name}, {error}" for name in populations for error in ("KLD", "excess"))]
-    head += ["KLD at any: all, surest half", "regions of 80 % hold", "calibrated"]
-    print_table("Little support and errors", head, table)
+    head = ["scene", *(f"{name} positions: {error}" for name in populations for error in ("KLD", "excess KLD"))]
+    head += ["KLD at any positions: all, half with most support", "coverage of 80 % regions", "calibrated"]
+    print_table("Rank correlation of low support and error", head, table)
     if any(r["signal"] == "spread" for r in rows):
         pairs = [(name, signal) for name in populations for signal in ("support", "spread")]
         rhos = [[f"{by[p, signal, populations[name], 'KLD']['rho']:+.2f}" for name, signal in pairs] for p in places]
-        head = ["place", *(f"{name}: {signal}" for name, signal in pairs)]
-        print_table("Support and spread", head, [[p, *row] for p, row in zip(places, rhos)])
+        head = ["scene", *(f"{name} positions: {signal}" for name, signal in pairs)]
+        print_table(
+            "Rank correlation with the error: low support and spread", head, [[p, *row] for p, row in zip(places, rhos)]
+        )
 
 
 if __name__ == "__main__":

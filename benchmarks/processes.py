@@ -34,9 +34,13 @@ from timing import median, print_table, spread
 SIZES = ((320, 180), (1280, 720), (1920, 1080))
 WAYS = ("mi.render", "nerg render")
 HEADS = {
-    "memory": ("frame", *(f"`{mode}`, MB resident (MB of arrays)" for mode in WAYS)),
-    "start": ("what", "s", "quartiles", "CPU s"),
+    "memory": {
+        "frame": "image size",
+        **{f"`{mode}`, MB resident (MB of arrays)": f"`{mode}`: peak memory (arrays), MB" for mode in WAYS},
+    },
+    "start": {"what": "command", "s": "time, s", "quartiles": "quartiles, s", "CPU s": "CPU time, s"},
 }
+"""Name of a column in a CSV file -> its title in the table, by benchmark."""
 COMMAND = [str(Path(sys.executable).with_name("nerg"))]
 VARIANT = 'import nerg_mi, mitsuba; mitsuba.set_variant("llvm_ad_rgb")'
 
@@ -147,7 +151,7 @@ def main(argv=None) -> None:
         print(json.dumps(peak(args.one, *sizes[0])))
         return
     rows = memory(sizes) if args.what == "memory" else start(args.runs)
-    print_table(args.what.capitalize(), HEADS[args.what], rows, args.update)
+    print_table(args.what.capitalize(), list(HEADS[args.what].values()), rows, args.update)
 
 
 if __name__ == "__main__":

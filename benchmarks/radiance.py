@@ -48,7 +48,15 @@ NEAR, FAR = 1.5, 4.0
 """Metres: maximum distance from the object's centre, and minimum distance from the camera."""
 OFF = 0.1
 """Relative error above which a depth counts as wrong."""
-SCORES = ("minutes", "steps", "ms a step", "PSNR, dB", "fitted, dB", "SSIM")
+SCORES = {
+    "minutes": "training time, min",
+    "steps": "steps",
+    "ms a step": "time per step, ms",
+    "PSNR, dB": "PSNR, dB",
+    "fitted, dB": "PSNR, colours fitted, dB",
+    "SSIM": "SSIM",
+}
+"""Name of a column in the CSV file -> its title in the table."""
 
 
 def open_views(folder: Path, args: argparse.Namespace, width: int | None = None):
@@ -92,7 +100,7 @@ def fields(data, stops: list[float], args: argparse.Namespace, name: str, depth:
         # Evaluation does not count as training time.
         trainer.set_seconds(seconds)
     speed = trainer.clock.summary()
-    print(f"{speed['evaluations_a_second']:.3g} field evaluations a second; step in ms: {speed['step_ms']}")
+    print(f"{speed['evaluations_a_second']:.3g} field evaluations per second; step in ms: {speed['step_ms']}")
 
 
 def scored(path: Path, held_out: list, spp: int):
@@ -122,7 +130,7 @@ def fox(args: argparse.Namespace) -> tuple[str, list[str], list[list[str]], list
     for row in rows:
         row |= scored(row["file"], data.held_out, args.spp)[1]
     table = [[*cells(row), f"{row['training views, dB']:.1f}"] for row in rows]
-    return "The fox", [*SCORES, "training views, dB"], table, rows
+    return "The fox", [*SCORES.values(), "PSNR of training views, dB"], table, rows
 
 
 def store(args: argparse.Namespace) -> tuple[str, list[str], list[list[str]], list[dict]]:
@@ -141,7 +149,8 @@ def store(args: argparse.Namespace) -> tuple[str, list[str], list[list[str]], li
             name = "images alone" if source == "images" else "images and depth"
             overrides = [f"{100 * depth.median:.2f} cm", f"{depth.outlier_fraction:.1%}", f"{depth.opacity:.4f}"]
             table.append([name, *cells(row), *overrides])
-    return "The store", ["from", *SCORES, "depth off, median", "by more than a tenth", "opacity"], table, rows
+    head = ["training data", *SCORES.values(), "median depth error", "depth errors above 10 %", "opacity"]
+    return "The store", head, table, rows
 
 
 def tabletop(args: argparse.Namespace) -> tuple[str, list[str], list[list[str]], list[dict]]:
@@ -175,8 +184,8 @@ def tabletop(args: argparse.Namespace) -> tuple[str, list[str], list[list[str]],
     ]
     table += [f"{s['psnr_within']:.2f}, {s['psnr_beyond']:.2f}", f"{s['beyond']:.1%}"]
     table += [f"{100 * s['near_median']:.2f} cm, {s['near_off']:.1%}", f"{s['far_median']:.1%}, {s['far_off']:.1%}"]
-    head = ["minutes", "seconds", "steps", "PSNR, dB", "SSIM", "within, beyond", "pixels beyond"]
-    head += ["near: median, off", "far: median, off", "box"]
+    head = ["training time, min", "elapsed time, s", "steps", "PSNR, dB", "SSIM", "PSNR within, beyond, dB"]
+    head += ["pixels beyond", *(f"{name}: median depth error, outliers" for name in ("near", "far")), "box"]
     row = {"minutes": minutes, "seconds": metadata["seconds"], "steps": metadata["steps"], **s, "box": size}
     return "An unbounded capture", head, [[*table, size]], [row]
 

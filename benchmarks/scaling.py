@@ -126,7 +126,15 @@ def main() -> None:
                     }
                     rows.append(row)
                     print(row, flush=True)
-    print_table("Measured", list(rows[0]), [list(row.values()) for row in rows])
+    titles = {
+        "work": "workload",
+        "parts": "tasks",
+        "waited": "wall-clock time",
+        "computed a part": "computation per task",
+        "besides a part": "overhead per task",
+        "output of a part": "output per task",
+    }
+    print_table("Measured", [titles.get(key, key) for key in rows[0]], [list(row.values()) for row in rows])
     write_rows(args.out / "scaling.csv", rows)
 
 

@@ -30,11 +30,11 @@ DEEPEST = 6.0
 PAIR = "demo"
 PEER = "volprim_rf_basic"
 COLUMNS = {
-    "median cm": "depth, median error",
-    "p90 cm": "90 % of errors below",
-    "within 5 cm": "within 5 cm",
-    "agree": "visibility right, away from silhouettes",
-    "agree all": "everywhere",
+    "median cm": "median depth error",
+    "p90 cm": "90 % quantile",
+    "within 5 cm": "errors below 5 cm",
+    "agree": "correct visibility away from silhouettes",
+    "agree all": "correct visibility everywhere",
 }
 """Columns of `store_visibility.measure`, and their titles."""
 
@@ -207,7 +207,7 @@ def main(argv=None) -> None:
     )
     speed = times(scenes["splats"][0], files, args.runs)
     rows = [[r["what"], f"{r['s']:.2f}", f"{r['CPU s']:.2f} s", f"{r['of volprim']:.2g}"] for r in speed]
-    print_table(f"Time for {SIZE[0]} x {SIZE[1]} pixels", ("", "seconds", "processor time", f"of `{PEER}`'s"), rows)
+    print_table(f"Time for {SIZE[0]} x {SIZE[1]} pixels", ("", "time, s", "CPU time", f"relative to `{PEER}`"), rows)
     write_rows(args.out, speed)
     write_rows(args.out.with_name("splats_exact.csv"), exact)
 

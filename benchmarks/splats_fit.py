@@ -226,7 +226,9 @@ def main(argv=None) -> None:
     tried = {factor: fitted(disturbed(splats), photos, args, factor, 0) for factor in FACTORS}
     factor = max(tried, key=lambda f: tried[f]["choosing"])
     rows = [[f"{f:g}", f"{row['choosing']:.2f}"] for f, row in tried.items()]
-    print_table("Learning rates, by other photos", ["times", "PSNR, dB"], rows, args.update)
+    print_table(
+        "PSNR of validation photos by learning rate", ["factor of the learning rate", "PSNR, dB"], rows, args.update
+    )
     kinds = {"as they are": lambda seed: splats, "disturbed": lambda seed: disturbed(splats, seed)}
     rows = []
     for name, of_seed in kinds.items():
@@ -236,15 +238,15 @@ def main(argv=None) -> None:
             for seed in range(args.seeds)
         ]
         rows.append([name, *summary(result)])
-    head = ["splats", "held-out photos, before", "after", "photos fitted to, before", "after"]
-    head += ["s", "CPU ms a step", "MB at most"]
+    head = ["splats", "held-out photos, before", "after", "training photos, before", "after"]
+    head += ["time, s", "CPU time per step, ms", "peak memory, MB"]
     print_table("PSNR of photos, dB", head, rows, args.update)
     rows = []
     for hits in HITS:
         command = [sys.executable, __file__, "--hits", str(hits)]
         result = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout.strip()
         rows.append([f"{hits:,}", result])
-    print_table("Memory of a derivative", ["hits a ray", "MB at most"], rows, args.update)
+    print_table("Memory of a derivative", ["hits per ray", "peak memory, MB"], rows, args.update)
 
 
 if __name__ == "__main__":

@@ -111,7 +111,8 @@ def main(argv=None) -> None:
     for name, method in methods.items():
         maps = method(positions, directions)
         rows.append({"method": name, **compute_map_scores(truth, maps), "integral": float(4 * np.pi * np.mean(maps))})
-    title = f"{len(positions)} held-out positions against the law ({len(train):,} of {len(rays):,} rays trained on)"
+    title = f"{len(positions)} held-out positions against the ground truth"
+    title += f" (trained on {len(train):,} of {len(rays):,} rays)"
     table = [[r["method"], *(f"{r[k]:.3f}" for k in ("KLD", "CC", "SIM")), f"{r['MAE']:.4f}"] for r in rows]
     print_table(title, ("", "KLD", "CC", "SIM", "MAE, 1/sr"), table)
     integral = 4 * np.pi * methods["gaze field"](positions, directions).mean(axis=1)

@@ -37,7 +37,11 @@ PAIRS = {
     "coolers, from the south": ("6.3, 1.0, 2.3", "3.6, 5.6, 1.2", "3.6, 4.8, 1.6"),
     "door, level": ("6.3, 4.9, 1.6", "5.6, 1.0, 1.1", "5.6, 0.7, 1.6"),
 }
-CENTIMETRES = ("median cm", "p90 cm", "p90 cm away")
+CENTIMETRES = {
+    "median cm": "median depth error, cm",
+    "p90 cm": "90 % quantile, cm",
+    "p90 cm away": "90 % quantile away from silhouettes, cm",
+}
 KINDS = ("expected", "median", "refined")
 
 
@@ -162,7 +166,8 @@ def main(argv=None) -> None:
         for kind in args.kinds.split(",")
         for pair in args.pair or PAIRS
     ]
-    head = ("depth", "visibility", "wrong %, away", "wrong %, all", "kept", *CENTIMETRES)
+    head = ("depth", "visibility", "wrong visibility away from silhouettes, %", "wrong visibility, %")
+    head += ("pixels away from silhouettes", *CENTIMETRES.values())
     print_table("Visibility and depth against exact ray casts", head, table(rows))
     write_rows(args.out, rows)
 

@@ -42,10 +42,11 @@ def take_turns(ours, peer, turns: int, steps: int = 8, before: int = 100) -> Non
     for name, times in taken.items():
         wall, cpu = (median(t) / steps for t in zip(*times))
         print(
-            f"{name}: {1e3 * cpu:.1f} ms of CPU a step ({1e3 * wall:.1f} ms; {spread(c / steps for _, c in times)} s)"
+            f"{name}: {1e3 * cpu:.1f} ms of CPU time per step "
+            f"({1e3 * wall:.1f} ms; {spread(c / steps for _, c in times)} s)"
         )
     ratios = [median(t[k] for t in taken["PyTorch"]) / median(t[k] for t in taken["nerg_mi"]) for k in (1, 0)]
-    print(f"PyTorch takes {ratios[0]:.1f} times our CPU, {ratios[1]:.1f} times our time")
+    print(f"PyTorch takes {ratios[0]:.1f} times our CPU time, {ratios[1]:.1f} times our wall-clock time")
 
 
 _PRIMES = (1, 2654435761, 805459861)
@@ -365,7 +366,7 @@ def main(argv=None) -> None:
             }
         )
         print(rows[-1], flush=True)
-    print(f"steps a second: {rows[0]['steps_per_s'] / rows[1]['steps_per_s']:.1f} times PyTorch's")
+    print(f"steps per second: {rows[0]['steps_per_s'] / rows[1]['steps_per_s']:.1f} times PyTorch's")
     write_rows(args.out / "torch_radiance.csv", rows)
 
 
