@@ -1,4 +1,4 @@
-"""Running `nerg` in this process, and what several files of tests run it on."""
+"""Fixtures that run `nerg` in this process, and the inputs of several test files."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.cli.outputs import make_inputs
 
 
 class Ended(NamedTuple):
-    """How a command ended: its exit code, and what it printed."""
+    """The exit code of a command, and its output."""
 
     code: int
     out: str
@@ -24,7 +24,7 @@ class Ended(NamedTuple):
 
 @pytest.fixture
 def nerg(capsys):
-    """Runs a command."""
+    """A function that runs a command."""
 
     def run(*arguments) -> Ended:
         capsys.readouterr()
@@ -37,7 +37,7 @@ def nerg(capsys):
 
 @pytest.fixture
 def handed(monkeypatch):
-    """``handed(name)``: the keywords of each call of a command's workflow, which does not run, but for the reporter."""
+    """``handed(name)``: the keywords, except the reporter, of each call of a workflow, which does not run."""
 
     def keep(name: str) -> list[dict]:
         importlib.import_module(find_commands()[name].module)
@@ -51,7 +51,7 @@ def handed(monkeypatch):
 
 @pytest.fixture(scope="session")
 def inputs(tmp_path_factory):
-    """What the commands of `outputs.CASES` read."""
+    """The inputs of the commands of `outputs.CASES`."""
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")

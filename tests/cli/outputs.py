@@ -46,9 +46,11 @@ GAZE = "--radius 0.6 --probes 8 --steps 2 --directions 64 --zones 0 --min-rays 8
 
 @dataclass(frozen=True)
 class Case:
-    """``line``: the command line, with the folders ``{i}`` of the inputs and ``{o}`` of the outputs; ``files``: all
-    that it makes below the latter; ``blocked``: what of it a file or folder may stand in the way of, and is found
-    before any work; ``once``: functions that take seconds and write nothing."""
+    """A command that writes files.
+
+    ``line``: the command line, with the folders ``{i}`` of the inputs and ``{o}`` of the outputs. ``files``: all files
+    that it writes to ``{o}``. ``blocked``: outputs that an existing file or folder can block, which is reported before
+    any work. ``once``: functions that take seconds and write nothing."""
 
     name: str
     line: str
@@ -232,7 +234,7 @@ INPUTS = {
 
 
 def make_inputs(folder: Path) -> Path:
-    """Write what `CASES` read into ``folder``."""
+    """Write the inputs of `CASES` to ``folder``."""
     import drjit.llvm.ad as ns
     import mitsuba as mi
 
@@ -268,7 +270,7 @@ def make_inputs(folder: Path) -> Path:
     write_inria(folder / "splats.ply", random_splats(9))
     if HAS_TORCH:
         save(folder / "nerg.pth", small_gaze(), nerf=small_state())
-    # Of the sizes that torch-ngp has.
+    # These are the sizes of torch-ngp.
     cells = OccupancyGrid(np.random.default_rng(1).random((128, 128, 128)) < 0.3, ns, 0.01)
     ngp = RadianceField.random(RadianceConfig(HashGridConfig()), Box((-1, -1, -1), (1, 1, 1)), ns, occupancy=cells)
     save_radiance(ngp, folder / "ngp.safetensors", {}, half=True)

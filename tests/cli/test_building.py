@@ -1,4 +1,4 @@
-"""Commands built of what is declared: names, defaults, flags, help, what is handed on; a command in a new module."""
+"""Commands built from declarations: names, defaults, flags, help and passed values; a command in a new module."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from nerg_mi.workflows.options import option, parse_numbers
 
 @dataclass(frozen=True, kw_only=True)
 class Brew:
-    """Of a job that makes tea."""
+    """Options of a job that makes tea."""
 
     leaves: str = option("green", "Which leaves.")
     kettle_file: Path | None = option(None, "Where the kettle is.")
@@ -33,7 +33,7 @@ class Brew:
 
 @pytest.fixture
 def serve():
-    """Runs a command with the options of `Brew`, and gives what it was handed."""
+    """A function that runs a command with the options of `Brew` and returns the values that it receives."""
     handed = []
 
     def tea(cup, table, options, reporter):
@@ -109,7 +109,7 @@ def greet(name, options, reporter):
 
 
 def test_a_command_is_one_module(monkeypatch, tmp_path, capsys):
-    """It is listed, has its help and runs, as soon as its file is there."""
+    """The command is listed, has a help text and runs as soon as its file exists."""
 
     def nerg(*line):
         with pytest.raises(SystemExit) as end:

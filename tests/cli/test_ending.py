@@ -1,4 +1,4 @@
-"""How a command ends, on Ctrl-C too, and its messages until then."""
+"""The end of a command, including Ctrl-C, and its messages."""
 
 import io
 import os
@@ -32,14 +32,14 @@ def test_ctrl_c_is_detected_behind_another_exception():
             except KeyboardInterrupt as error:
                 raise RuntimeError("of Mitsuba") from error
         assert isinstance(ctrl_c.find_interrupt(raised.value), KeyboardInterrupt)
-        # Also where only the text is left of it; but a command that was done is done.
+        # The same holds if only its text remains; a command that has finished stays finished.
         assert isinstance(ctrl_c.find_interrupt(RuntimeError("of Mitsuba")), KeyboardInterrupt)
         assert ctrl_c.find_interrupt(SystemExit(0)) is None
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_ctrl_c_within_a_finalizer_is_not_lost(monkeypatch):
-    """Python drops what is raised there."""
+    """Python ignores exceptions that are raised there."""
 
     class Interrupted:
         def __del__(self):
@@ -124,7 +124,7 @@ class Terminal(io.StringIO):
 
 
 def replace_streams(monkeypatch):
-    """Another standard output and error, of which only the latter is a terminal."""
+    """Replace standard output and error; only standard error is a terminal."""
     out, err = io.StringIO(), Terminal()
     monkeypatch.setattr(sys, "stdout", out)
     monkeypatch.setattr(sys, "stderr", err)
@@ -145,7 +145,7 @@ def test_the_bar_is_on_the_terminal_and_messages_are_in_the_pipe(monkeypatch):
     shown = err.getvalue()
     assert out.getvalue() == "[before]\na line with [brackets] of " + 40 * "words " + "\n"
     assert "50%" in shown and "2 s left [x]" in shown and "warning: thin" in shown
-    # The bar is taken away again: its line is erased.
+    # The line of the progress bar is erased at the end.
     assert "\x1b[2K" in shown
 
 
@@ -163,7 +163,7 @@ class Clock:
     def __init__(self, monkeypatch):
         self.now = 1000.0
         monkeypatch.setattr(progress.time, "monotonic", lambda: self.now)
-        # The beat of a real second would read this clock at any moment; the tests beat themselves.
+        # A real timer would read this clock at any moment, so the tests trigger updates themselves.
         monkeypatch.setattr(TerminalReporter, "_beat", lambda self: None)
 
 
@@ -187,7 +187,7 @@ def test_progress_adds_elapsed_and_remaining_time(capsys, monkeypatch):
         reporter.progress(0.25, "scores")
         clock.now += 200
         reporter.progress(0.25, "scores")
-    # A quarter took 40 s, so that the rest takes 120; then 240 s, so that it takes twelve minutes.
+    # A quarter took 40 s, so the rest takes 120 s; later a quarter took 240 s, so the rest takes twelve minutes.
     said = ["  0% reading, 20 s so far", " 25% scores, 2 min left", " 25% scores, 12 min left"]
     assert capsys.readouterr().err.splitlines() == said
 
@@ -266,7 +266,7 @@ ENDLESS = "--steps 1000000 --save-every 0"
 GAZE = "--geometry none --radius 0.6 --probes 8 --directions 64 --zones 0 --min-rays 8"
 
 
-# Steps that a radiance training takes, and forgets, before its first.
+# A radiance training makes and discards these steps before its first one.
 WARM_UP = 5
 
 
@@ -275,7 +275,7 @@ def test_an_interrupted_gaze_training_saves_state_and_result(inputs, tmp_path):
     done = interrupted("train.gaze_log_density.LikelihoodTrainer.step", 4, *line.split())
     assert done.returncode == 130 and "--resume" in done.stderr, done.stderr
     assert sorted(os.listdir(tmp_path)) == ["a.run", "a.safetensors"]
-    # The step during which it came is finished.
+    # The step in which the signal arrived is completed.
     assert read_checkpoint(tmp_path / "a.run", "gaze run")[1]["steps"] == 4
     assert read_checkpoint(tmp_path / "a.safetensors", "gaze")[1]["provenance"]["interrupted"]
 

@@ -1,4 +1,4 @@
-"""Commands that train, score and convert fields: what reaches their workflows, and what they write and say."""
+"""Commands that train, score and convert fields: arguments of their workflows, output files and messages."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_speed_and_complaints_are_reported(cube, nerg):
     assert [x for x in provenance["complaints"] if x.startswith("only 3 steps")]
 
 
-# The command, and what it says once the photos may be read: of the gaze, that photos of one grey have no salience.
+# The command, and its message if the photos can be read; photos of a single grey have no saliency.
 OUTSIDE = {
     "train radiance": ("train radiance {c}/set -o {c}/out.safetensors --steps 2 --holdout 3", r"2 steps in"),
     "eval radiance": ("eval radiance {c}/cube.safetensors {c}/set --holdout 2 -o {c}/out.safetensors", r"PSNR"),
@@ -77,7 +77,7 @@ PATHS = {"field": "place.safetensors", "scene": "room.xml", "views": "photos", "
 
 
 def other_value(f):
-    """A value of the option ``f``, other than its default."""
+    """A value of the option ``f`` that differs from its default."""
     if f.name in PATHS:
         return Path(PATHS[f.name])
     if f.name == "mode":
@@ -93,7 +93,7 @@ def other_value(f):
 
 
 def test_the_workflow_receives_the_options(handed, nerg):
-    """Every option there is, and none of them."""
+    """All options, and no options."""
     calls = handed("train gaze")
     options = GazeOptions(**{f.name: other_value(f) for f in fields(GazeOptions)})
     line = []
@@ -128,7 +128,7 @@ def test_a_field_starts_from_features_and_weights(tmp_path, nerg):
 
 @pytest.mark.parametrize("recipe", ["default", "small"])
 def test_a_field_is_trained_from_salience_images(recipe, tmp_path, nerg, rgb):
-    """Six photos from places a metre apart, of which five have salience images."""
+    """Six photos from positions a metre apart; five of them have saliency maps."""
     frames, rng = [], np.random.default_rng(0)
     (tmp_path / "maps").mkdir()
     for k in range(6):
@@ -139,7 +139,7 @@ def test_a_field_is_trained_from_salience_images(recipe, tmp_path, nerg, rgb):
             np.save(tmp_path / "maps" / f"p{k}.npy", rng.uniform(size=(12, 16)))
         frames.append({"file_path": f"p{k}.png", "transform_matrix": pose.tolist()})
     (tmp_path / "transforms.json").write_text(json.dumps({"camera_angle_x": 1.0, "frames": frames}))
-    # A place, which small needs, is a scene of one wall.
+    # The recipe small needs a geometry: a scene of one wall.
     scene, out = tmp_path / "wall.xml", tmp_path / "out.safetensors"
     scene.write_text('<scene version="3.0.0"><shape type="cube"/></scene>')
     place = ["--geometry", "none"] if recipe == "default" else ["--scene", scene]
@@ -178,7 +178,7 @@ def test_a_field_is_scored_as_it_was_trained(tmp_path, nerg):
     assert ended.code == 1 and "was not trained on" in " ".join(ended.err.split())
 
 
-# ---- To and from other programs ----
+# ---- Import and export ----
 
 
 def test_a_nerf_is_imported(tmp_path, nerg, torch):

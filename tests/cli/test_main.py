@@ -1,4 +1,4 @@
-"""The frame of the command: what it lists, what it imports, what shells complete, how it fails, and `nerg doctor`."""
+"""The command `nerg`: its list of commands, imports, shell completion, failures, and `nerg doctor`."""
 
 import os
 import re
@@ -47,7 +47,7 @@ def test02_help_imports_nothing_heavy():
 
 
 def test03_no_help_of_a_command_imports_anything_heavy():
-    """But for that of imports, whose options are those of the readers of tables."""
+    """The exception is import, which has the options of the readers of tables."""
     code = (
         "import importlib, sys\nfrom nerg_mi.cli import building\n"
         "for entry in building.find_commands().values(): importlib.import_module(entry.module)\n"
@@ -71,7 +71,7 @@ def test05_mode_is_the_variant_of_commands_that_compute():
         options = {option: p for p in command.params for option in p.opts}
         having |= {name} if "--mode" in options else set()
         assert ("-m" in options) == ("--mode" in options)
-        # The factors of a gaze field; elsewhere it is an old name of --mode, which is no option by itself.
+        # These commands select the factors of a gaze field; in others it is a hidden old name of --mode.
         assert ("--variant" in options) == (name in ("train gaze", "eval folds", "ablate")), name
     assert having >= {"align", "bake", "demo", "refine", "render", "report", "scene", "stats", "study", "view"}
     assert all(any(name.startswith(f"{group} ") for name in having) for group in ("train", "eval", "export", "draw"))
@@ -84,7 +84,7 @@ def failing(monkeypatch, error):
     def command(reporter):
         raise error
 
-    import_module("nerg_mi.cli.machine")  # which declares it
+    import_module("nerg_mi.cli.machine")  # this package declares it
     monkeypatch.setitem(COMMANDS, "doctor", replace(COMMANDS["doctor"], run=command))
 
 
@@ -149,7 +149,7 @@ def test07_an_internal_error_is_reported_as_one(monkeypatch, nerg, error, said):
 
 @pytest.mark.parametrize("lines", [1, 100_000])
 def test07b_a_closed_output_stream_is_ignored(lines):
-    """Neither in the middle of the output nor at its end, which is written when the interpreter stops."""
+    """No error in the middle of the output, nor at its end, which is written when the interpreter stops."""
     code = (
         "import sys, dataclasses\nimport nerg_mi.cli.machine\nfrom nerg_mi.workflows.base import COMMANDS\n"
         f"def run(reporter):\n    for i in range({lines}): print('a line of output')\n"
@@ -214,7 +214,7 @@ def test07e_a_bug_in_a_plugin_is_an_internal_error(said):
 
 
 def test07f_an_error_in_a_plugin_constructor_is_internal(rgb, tmp_path, nerg, monkeypatch):
-    """From its constructor through Mitsuba to the command line."""
+    """An error passes from the constructor through Mitsuba to the command line."""
     scene = tmp_path / "a.xml"
     scene.write_text('<scene version="3.0.0"><integrator type="nerg"/><sensor type="perspective"/></scene>')
     rgb.set_variant("llvm_ad_rgb")
@@ -262,7 +262,7 @@ needs_command = pytest.mark.skipif(not NERG.exists(), reason="the command nerg i
 
 
 def ask(shell: str, line: str) -> subprocess.CompletedProcess[str]:
-    """What the installed command answers a shell in which `line` was typed up to Tab."""
+    """The reply of the installed command to a shell in which `line` was typed, followed by Tab."""
     words = line.split(" ")
     how = {"COMP_WORDS": line, "COMP_CWORD": str(len(words) - 1)} if shell == "bash" else {"_TYPER_COMPLETE_ARGS": line}
     how |= {"_NERG_COMPLETE": f"complete_{shell}", "_TYPER_COMPLETE_FISH_ACTION": "get-args"}
@@ -297,7 +297,7 @@ def test_the_script_that_a_shell_reads_is_printed(shell):
 @needs_command
 @pytest.mark.skipif(shutil.which("bash") is None, reason="bash is not installed")
 def test_the_printed_script_completes_in_bash(tmp_path):
-    """As a shell does it: the script is read, its function called, what it leaves in COMPREPLY looked at."""
+    """As in a shell: evaluate the script, call its function, and read COMPREPLY."""
     script = "\n".join(
         [
             'eval "$(_NERG_COMPLETE=source_bash nerg)"',

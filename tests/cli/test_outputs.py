@@ -1,4 +1,4 @@
-"""Every output of every command: parents are made, unwritable outputs are reported before any work, and neither a
+"""Outputs of all commands: parents are created, unwritable outputs are reported before any work, and neither a
 full disk nor Ctrl-C loses anything."""
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from .outputs import CASES, INPUTS, MAKES_A_FOLDER, OF_TORCH
 
 
 def nerg(capsys, *arguments) -> tuple[int, str]:
-    """Exit code of a command, and what it said on stderr."""
+    """Exit code of a command, and its output on stderr."""
     with pytest.raises(SystemExit) as end:
         nerg_mi.cli.main(list(map(str, arguments)))
     return end.value.code or 0, capsys.readouterr().err
@@ -35,7 +35,7 @@ def files(folder: Path) -> dict[str, bytes]:
 
 @contextmanager
 def largest_file(size: int):
-    """As if the disk were full: no file of this process may grow beyond ``size`` bytes."""
+    """Simulate a full disk: no file of this process may grow beyond ``size`` bytes."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
     try:
@@ -50,7 +50,7 @@ def is_one_sentence(code: int, said: str) -> bool:
 
 
 def interrupting(function):
-    """``function`` with a Ctrl-C during its first call."""
+    """Wrap ``function`` so that Ctrl-C arrives during its first call."""
     calls = []
 
     def interrupted(*arguments):
@@ -73,7 +73,7 @@ def remember(monkeypatch, name: str) -> None:
 
 @pytest.fixture
 def offline(monkeypatch):
-    """No connection to another machine can be opened, and no port listened at."""
+    """Block connections to other machines and listening on ports."""
 
     def refuse(name):
         original = getattr(socket.socket, name)
@@ -101,7 +101,7 @@ def test_an_output_is_written_atomically(case, inputs, tmp_path, capsys, monkeyp
     for name in case.once:
         remember(monkeypatch, f"nerg_mi.{name}")
 
-    # A parent that is missing is made, and no other file is left.
+    # A missing parent is created, and no other file remains.
     out = tmp_path / "new" / "deeper"
     code, said = nerg(capsys, *case.arguments(inputs, out))
     made = files(out)
@@ -126,7 +126,7 @@ def test_an_output_is_written_atomically(case, inputs, tmp_path, capsys, monkeyp
     code, said = nerg(capsys, *case.arguments(inputs, tmp_path / "file" / "below"))
     assert is_one_sentence(code, said) and "one of its parents is a file" in said
 
-    # Where there is no room each file is the old one or the new one, and there is no other.
+    # On a full disk each file is the old one or the new one, and no other file remains.
     for share in (0, 0.5) if len(made) > 1 and not case.once else (0.5,):
         limit = int(share * max(map(len, made.values())))
         out = tmp_path / f"full{share}"
@@ -137,7 +137,7 @@ def test_an_output_is_written_atomically(case, inputs, tmp_path, capsys, monkeyp
             code, said = nerg(capsys, *case.arguments(inputs, out))
         assert is_one_sentence(code, said) and "maximum file size" in said, said
         contents = files(out)
-        # What a training has come to is kept where its state is small enough, and said.
+        # The state of a training is kept and reported if it is small enough.
         assert (contents.pop("a.run", None) is not None) == ("the training is saved" in said)
         assert set(contents) == set(case.files), "a leftover, or a loss"
         assert all(content == b"old" or limit >= len(content) > 3 for content in contents.values())
@@ -149,13 +149,13 @@ def test_an_output_is_written_atomically(case, inputs, tmp_path, capsys, monkeyp
         change.setattr(os, "fsync", interrupting(os.fsync))
         code, said = nerg(capsys, *case.arguments(inputs, out))
     assert code == 130 and said.strip(), said
-    if case.name == "train radiance":  # in the preview's: between two steps, with a result to be gone on from
+    if case.name == "train radiance":  # in the preview: between two steps, with a state from which to resume
         assert set(files(out)) == {*case.files, "a.run"} and "--resume" in said
-    elif case.name == "render":  # heard between steps, of which writing is the last
+    elif case.name == "render":  # handled between steps; writing is the last step
         remaining = set(files(out))
-        # Of a sequence the pictures that were there already; of one that waits for its scale none.
+        # Finished images of a sequence remain; a sequence that waits for its common scale has none.
         assert remaining == set(case.files) if "--frames" not in case.line else remaining < set(case.files)
-    else:  # what a training has come to by then is kept
+    else:  # the state of a training is kept
         assert set(files(out)) <= {"a.run"} and ("--resume" in said or not files(out))
 
 
@@ -176,14 +176,14 @@ def test_filtering_in_place_on_a_full_disk_keeps_the_input(inputs, tmp_path, cap
 
 
 def commands() -> dict:
-    """Every command of `nerg`, a function, by its full name."""
+    """The function of each command of `nerg`, by its full name."""
     for entry in find_commands().values():
         importlib.import_module(entry.module)
     return {name: make_callback(command) for name, command in COMMANDS.items()}
 
 
 def path_options(name: str, command) -> dict[str, tuple]:
-    """Parameters of a command that are paths, and the options by which they are given; arguments name what is read."""
+    """Path parameters of a command, and their options; arguments are inputs."""
     out = {}
     arguments = {key for key, parameter in COMMANDS[name].parameters.items() if not parameter.names}
     for key, hint in get_type_hints(command, include_extras=True).items():
@@ -197,7 +197,7 @@ def path_options(name: str, command) -> dict[str, tuple]:
 
 
 def test_every_output_option_has_a_case(tmp_path):
-    """Each option that takes a path belongs into `outputs.CASES`, or among what is read."""
+    """Each option with a path is an output in `outputs.CASES`, or an input."""
     (tmp_path / "demo.json").write_text("{}")
     commands_by_name = commands()
     assert set(commands_by_name) >= {c.name for c in CASES} | set(MAKES_A_FOLDER) | set(INPUTS)

@@ -1,4 +1,4 @@
-"""What users get wrong ends in one sentence and exit code 1, from whatever depth it is refused, and writes nothing."""
+"""Mistakes of users end in one sentence and exit code 1, wherever they are detected, and nothing is written."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ GAZE = "train gaze rays.npz -o {o}/a.safetensors --geometry none --steps 1"
 VIEWS = "train gaze -o {o}/a.safetensors --steps 2 --directions 64 --zones 0"
 PHOTOS = f"{VIEWS} --geometry none --views photos"
 LINES = {
-    # Options that do not go together, or have other values.
+    # Options that contradict each other, or have invalid values.
     f"{GAZE} --variant both": "give other values by --variant and --activation",
     f"{GAZE} --mode scalar_rgb": 'not "scalar_rgb"',
     f"{GAZE} --mode llvm_rgb": 'there is no Mitsuba variant "llvm_rgb"',
@@ -86,7 +86,7 @@ LINES = {
     "render scene.xml -o {o}/a.exr -D levle=2": r'does not use "\$levle"; correct the name',
     "render scene.xml -o {o}/a.exr -m scalar_rgb -s 1": '"panorama" needs a variant with',
     "render none.xml -o {o}/a.exr": "there is no scene file",
-    # A plugin's sentence arrives through Mitsuba's own exception, which quotes the traceback of ours.
+    # The message of a plugin arrives in an exception of Mitsuba, which quotes the traceback of the original.
     "render deep.xml -o {o}/a.exr -m llvm_ad_rgb": "\"depth\" must be one of expected, median, refined, got 'deep'$",
     "demo -o {o}/a --width 4": "at least 12 pixels",
     "draw sheet gone.png -o {o}/a.png": "there is no file",
@@ -153,7 +153,7 @@ def test_a_missing_extra_is_named(line, small, nerg, tmp_path, monkeypatch):
     assert ended.code == 1 and said in " ".join(ended.err.split()) and not list(tmp_path.iterdir())
 
 
-# ---- A pipe or a device in the place of a file: opened, it would block, or fill the memory ----
+# ---- A pipe or a device in place of a file: reading it would block, or fill the memory ----
 
 
 SUFFIXES = "xml ply obj vol glb spz splat safetensors npz npy exr parquet json csv pth mp4 svs.csv.gz".split()
@@ -213,12 +213,12 @@ NAMED = {
 
 
 class Blocked(BaseException):
-    """A file was opened that keeps its reader waiting; no error of a file, which readers would catch."""
+    """A file that blocks its reader was opened. This is not an ``OSError``, which readers would catch."""
 
 
 @pytest.fixture
 def in_time():
-    """Ends a test that blocks."""
+    """End a test that blocks."""
 
     def end(*_):
         raise Blocked
@@ -232,7 +232,7 @@ def in_time():
 
 @pytest.fixture(scope="module")
 def pipes(tmp_path_factory, small):
-    """A folder of pipes, and of the files that commands need besides."""
+    """A folder of pipes, and of the other files that commands need."""
     folder = tmp_path_factory.mktemp("special")
     (folder / "pipes").mkdir()
     for suffix in SUFFIXES:
@@ -245,7 +245,7 @@ def pipes(tmp_path_factory, small):
 
 @pytest.mark.parametrize("line", PIPES)
 def test_a_pipe_as_an_input_file_is_refused(pipes, tmp_path, nerg, in_time, line):
-    # Commands look first whether an extra is there, without which there is nothing to check.
+    # Commands first check whether an extra is installed; without it, there is nothing to test.
     for beginning, extra in (("view", "viser"), ("poses", "pycolmap")):
         if line.startswith(beginning):
             pytest.importorskip(extra)

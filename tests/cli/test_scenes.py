@@ -1,4 +1,4 @@
-"""Commands that render, draw and measure: what reaches their workflows, and what they write and say."""
+"""Commands that render, draw and measure: arguments of their workflows, output files and messages."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ LLVM = ("-m", "llvm_ad_rgb")
 
 
 def interrupt(arguments, sign: bytes) -> tuple[bytes, int]:
-    """Run a command on a terminal, press Ctrl-C when it shows `sign`, and give what it showed and its exit code."""
+    """Run a command on a terminal, press Ctrl-C when it shows `sign`, and return its output and its exit code."""
     ours, theirs = os.openpty()
     environment = {**os.environ, "TERM": "xterm-256color", "COLUMNS": "120"}
     command = [*NERG, *map(str, arguments)]
@@ -77,7 +77,7 @@ def scene(tmp_path):
 
 @pytest.fixture
 def render(scene, tmp_path, nerg):
-    """Renders the scene to a file of a name, and gives what is in it."""
+    """A function that renders the scene to a file and returns its content."""
 
     def picture(name, *options, mode="llvm_ad_rgb", path=scene):
         ended = nerg("render", path, "-o", tmp_path / name, "-m", mode, *options)
@@ -123,7 +123,7 @@ def test_an_internal_error_during_rendering_is_reported_as_one(scene, tmp_path, 
 
 @pytest.mark.parametrize("name", ["out.exr", "out.png"])
 def test_one_thread_is_enough(scene, tmp_path, name):
-    # Mitsuba's EXR writer never returns where Dr.Jit has one thread.
+    # Mitsuba's EXR writer never returns if Dr.Jit has one thread.
     out = tmp_path / name
     subprocess.run([*NERG, "render", scene, "-o", out, *LLVM, "-t", "1"], check=True, timeout=180)
     assert tuple(mitsuba_bitmap(out).size()) == (16, 8)
@@ -174,7 +174,7 @@ def test_a_tile_beyond_the_memory_limit_is_reported(tmp_path, nerg):
     assert ended.code == 2 and "--memory" in ended.err
 
 
-# ---- nerg demo, end to end: on random fields always, on the store's own where they are present ----
+# ---- nerg demo, end to end: on random fields, and on the trained fields of the store if they exist ----
 
 PICTURES = {"occlusion.png", "gaze.png", "gaze_sphere.png", "depth.png", "visibility.png", "color.png", "scene.exr"}
 NAMES = PICTURES | {"heatmap.glb", "report.html", "aoi.csv", "run.json"}
@@ -201,7 +201,7 @@ def test_the_demo_writes_and_names_everything(rgb, standins, tmp_path, nerg):
     assert {"nerg_mi", "mitsuba", "drjit", "numpy", "libLLVM"} <= set(report["versions"])
     assert set(report["seconds"]) == set(demo.STAGES)
     assert set(report["inputs"]) == {"scene.xml", "store.safetensors", "shoppers.safetensors"}
-    # Every object of the store, with its share of what this observer looks at.
+    # Every object of the store, with its share of the gaze of this observer.
     shares = {row["object"]: float(row["observer_share"]) for row in csv.DictReader((out / "aoi.csv").open())}
     assert len(shares) == 30 and all(share >= 0 for share in shares.values()) and 0 < sum(shares.values()) < 1.01
     # Each image records inputs and seed; the page records rays and participants.
@@ -236,7 +236,7 @@ def test_a_missing_checkpoint_names_the_command(standins, tmp_path, nerg, name):
 
 @pytest.mark.nightly
 def test_the_committed_store_renders_with_occlusion(rgb):
-    """Committed checkpoints: the shelf hides what lies behind it, and gaze is what occlusion leaves of it."""
+    """Committed checkpoints: the shelf hides the surfaces behind it, where gaze is zero."""
     missing = [f for f in demo.CHECKPOINTS.values() if not (demo.find_store_scene().parent / f).is_file()]
     if missing:
         pytest.skip(f"{', '.join(missing)} of the store are not made yet: {demo.MAKE}")
@@ -246,7 +246,7 @@ def test_the_committed_store_renders_with_occlusion(rgb):
     assert hidden.mask.mean() > 0.99
     seen = hidden.aovs["visibility"]
     assert 0.15 < seen.mean() < 0.6
-    # The observer's point and the camera's agree where it is seen; elsewhere gaze is gone.
+    # The points of observer and camera agree on visible surfaces; elsewhere gaze is zero.
     assert np.all(hidden.aovs["gaze"][seen == 0] == 0) and plain.aovs["gaze"][seen == 0].max() > 0
     x, y = demo.observer_pixel(scene)
     assert 0 < x < 60 and 0 < y < 40
@@ -379,7 +379,7 @@ def test_a_quick_study_runs(tmp_path, nerg):
     default = by_name["default"]
     assert float(default["seconds"]) > 0 and float(default["density_evals"]) > 100 and float(default["peak_mb"]) > 0
     assert float(default["depth_mae"]) < 1e-5
-    # Evaluations that are not needed are not made.
+    # Unneeded evaluations are not run.
     assert float(by_name["no colour"]["color_evals"]) == 0 and by_name["no colour"]["color_rmse"] == ""
     assert float(by_name["no observer"]["density_evals"]) < 0.8 * float(default["density_evals"])
     assert any("depth" in r["pareto"] for r in rows)
@@ -409,7 +409,7 @@ def test_a_worker_serves_an_address_and_warns_of_an_open_one(monkeypatch, nerg):
     monkeypatch.setattr(
         engines, "run_dask_worker", lambda *a: served.append((*a[:2], a[3], os.environ.get(THREADS_VARIABLE)))
     )
-    # What the command sets is taken back after the test.
+    # Settings of the command are restored after the test.
     monkeypatch.setenv(THREADS_VARIABLE, "")
     ended = nerg(*"worker tcp://127.0.0.1:8786 --threads 3 --wait 5 --name a".split())
     assert ended.code == 0 and ended.err == ""

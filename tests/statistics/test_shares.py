@@ -34,7 +34,7 @@ BOXES = [
 
 
 class Hall:
-    """Observers who look ahead, mostly; ``requested``: in how many directions each look was."""
+    """Observers who mostly look ahead; ``requested``: the number of directions of each evaluation."""
 
     def __init__(self):
         self.requested: list[int] = []

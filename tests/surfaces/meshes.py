@@ -1,4 +1,4 @@
-"""Meshes and laws that tests put gaze on."""
+"""Meshes and gaze densities for tests of gaze on surfaces."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _QUADS = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), 
 
 
 def box(lower, upper, without: int | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Corners and triangles of a box; ``without``: the side that is left out, of x, x, y, y, z, z."""
+    """Corners and triangles of a box; ``without``: index of the omitted side, in the order x, x, y, y, z, z."""
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
     corners = np.asarray(lower) + corners * (np.asarray(upper, float) - lower)
     quads = [q for k, q in enumerate(_QUADS) if k != without]
@@ -31,7 +31,7 @@ def longest_edge(mesh: Mesh) -> float:
 
 
 def plate(n: int, jitter: float = 0.0, side: float = 1.0, z: float = 0.0, seed: int = 0) -> tuple:
-    """A square sheet of n x n vertices around the origin, those within moved by ``jitter`` cells at most."""
+    """A square sheet of n x n vertices around the origin; inner vertices are moved by at most ``jitter`` cells."""
     x = np.linspace(-side / 2, side / 2, n)
     p = np.stack([*np.meshgrid(x, x, indexing="ij"), np.full((n, n), z)], axis=-1).reshape(-1, 3)
     inner = (np.abs(p[:, :2]) < side / 2 - 1e-9).all(axis=1)
@@ -42,7 +42,7 @@ def plate(n: int, jitter: float = 0.0, side: float = 1.0, z: float = 0.0, seed: 
 
 
 def vmf(mi, mu, kappa: float):
-    """The density of a von Mises-Fisher law, in 1/sr, of directions of Dr.Jit."""
+    """The von Mises-Fisher density, in 1/sr, of Dr.Jit directions."""
     import drjit as dr
 
     mean = mi.Vector3f(*(np.asarray(mu, float) / np.linalg.norm(mu)).tolist())
@@ -51,7 +51,7 @@ def vmf(mi, mu, kappa: float):
 
 
 def observers_from_law(law):
-    """Observers whose density depends on the direction alone: ``law`` of unit directions, in 1/sr."""
+    """Observers with a density ``law`` of unit directions, in 1/sr, that does not depend on the position."""
     import mitsuba as mi
 
     def make(eye):
@@ -68,7 +68,7 @@ TURN_X = (0.0, 1.0, 0.0, 0.0)
 
 
 def wall(z=0.0, side=1.0, offset=0.02, jitter=0.0, opacity=0.9, turned=(1.0, 0.0, 0.0, 0.0), seed=0) -> Splats:
-    """A square wall in the plane ``z`` around the axis, of disks that are ``offset`` and 0.7 of that wide."""
+    """A square wall in the plane ``z`` around the axis, of disks with the spacing ``offset`` and 0.7 of it as scale."""
     rng = np.random.default_rng(seed)
     x = np.arange(-side / 2 + offset / 2, side / 2, offset)
     p = np.stack([*np.meshgrid(x, x, indexing="ij"), np.full((len(x), len(x)), z)], axis=-1).reshape(-1, 3)

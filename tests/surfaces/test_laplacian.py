@@ -17,7 +17,7 @@ from nerg_mi.surfaces.laplacian import (
 from nerg_mi.surfaces.mesh import Mesh, weld_mesh
 from tests.surfaces.meshes import box, joined, plate
 
-# ---- Intrinsic flips: no weight is negative any more, and the surface is what it was ----
+# ---- Intrinsic flips: all weights become non-negative, and the surface does not change ----
 
 
 def lengths_of(mesh):
@@ -34,13 +34,13 @@ def test_opposite_angles_sum_to_at_most_180_degrees(mesh):
     faces, lengths = flip_to_delaunay(mesh.faces, lengths_of(mesh))
     assert np.isclose(heron_area(*lengths.T).sum(), mesh.area.sum(), rtol=1e-9)
     assert np.allclose(angles_facing(lengths).sum(axis=1), np.pi)
-    # In the plane flips are those of the points: SciPy's circles are empty, too.
+    # The two angles opposite an edge sum to at most 180 degrees.
     total = {}
     for face, angle in zip(faces, angles_facing(lengths)):
         for k in range(3):
             edge = tuple(sorted((face[k], face[(k + 1) % 3])))
             total.setdefault(edge, []).append(angle[k])
-    # Of pairs; an edge that two flips made twice is counted with its own two.
+    # Two vertices can share several edges, which are not distinguished here and are skipped.
     assert all(sum(v) < np.pi + 1e-6 for v in total.values() if len(v) == 2)
     assert len(faces) == len(mesh.faces) and set(np.unique(faces)) == set(np.unique(mesh.faces))
 
@@ -54,12 +54,12 @@ def test_delaunay_mesh_is_unchanged():
 def test_twins_of_manifold_edges():
     two = np.array([(0, 1, 2), (2, 1, 3)])
     assert find_twins(two).tolist() == [-1, 3, -1, 1, -1, -1]
-    # Three faces at an edge, and two that see it alike, are none.
+    # Edges with three faces, or with two faces of the same orientation, are excluded.
     assert (find_twins(np.array([(0, 1, 2), (1, 0, 3), (0, 1, 4)])) == -1).all()
     assert (find_twins(np.array([(0, 1, 2), (0, 1, 3)])) == -1).all()
 
 
-# ---- The Laplacian of meshes, good and bad ----
+# ---- The Laplacian of regular and degenerate meshes ----
 
 
 def sound(matrix):
@@ -89,20 +89,20 @@ def test_laplacian_of_degenerate_meshes(scale):
     needle = Mesh(
         np.array([(0, 0, 0), (1, 0, 0), (0.5, 1e-13, 0), (0.5, 1, 0)]) * scale, np.array([(0, 1, 2), (0, 2, 3)])
     )
-    # Three pages of a book at one edge, and a triangle apart.
+    # Three triangles at one edge, and a separate triangle.
     book = np.array([(0, 0, 0), (0, 0, 1), (1, 0, 0), (0, 1, 0), (-1, -1, 0), (5, 5, 5), (6, 5, 5), (5, 6, 5)]) * scale
     pages = Mesh(book, np.array([(0, 1, 2), (0, 1, 3), (0, 1, 4), (5, 6, 7)]))
     for mesh in (needle, pages, joined(box((0, 0, 0), (1, 1, 1e-4)))):
         dense = sound(make_laplacian(mesh))
     dense = sound(make_laplacian(pages))
     assert (dense[:5, 5:] == 0).all() and dense[0, 1] < 0
-    # Free of the unit of length.
+    # The result does not depend on the unit of length.
     assert np.allclose(dense, make_laplacian(Mesh(book / scale, pages.faces)).toarray(), rtol=1e-6, atol=1e-9)
 
 
 # ---- Smoothing ----
 #
-# Heat on surfaces against closed forms: a plane's Gaussian, a sphere's harmonics; and what it never does.
+# Heat on surfaces against closed forms: Gaussians on a plane, harmonics on a sphere; and its invariants.
 
 
 def spike(mesh, at=(0, 0, 0)):
@@ -132,14 +132,14 @@ def test_spherical_harmonics_decay(degree):
     result = Smoother(mesh, s, steps)(wave * mesh.vertex_area)
     left = (result * wave).sum() / (wave * wave * mesh.vertex_area).sum()
     rate = degree * (degree + 1) * s * s / 2
-    # Of steps backwards in time exactly, of heat to their order.
+    # Exact for backward Euler steps, and for heat up to their order.
     assert np.isclose(left, (1 + rate / steps) ** -steps, rtol=6e-3)
     assert np.isclose(left, np.exp(-rate), rtol=rate**2 / steps + 6e-3)
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
 def test_smoothing_does_not_cross_gaps(scale):
-    """Two plates 5 cm apart: what is on one stays there, all of it, and exactly nothing comes to the other."""
+    """Two plates 5 cm apart: all heat of one stays there, and none reaches the other."""
     v, f = plate(20, 0.3)
     mesh, _, _ = weld_mesh(scale * np.concatenate([v, v + [0, 0, 0.05]]), np.concatenate([f, f + len(v)]))
     upper = mesh.vertices[:, 2] > 0.02 * scale

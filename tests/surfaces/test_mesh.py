@@ -12,7 +12,7 @@ from nerg_mi.surfaces.mesh import SurfaceTarget, iter_texture_rows, refine, shap
 from nerg_mi.transport.volume_medium import VolumeMedium
 from tests.surfaces.meshes import box, joined, longest_edge, plate
 
-# ---- Meshes made whole: vertices of one place are one, and faces that are none are left out ----
+# ---- Clean meshes: vertices at one position are merged, and degenerate faces removed ----
 
 
 def test_duplicate_corners_are_welded():

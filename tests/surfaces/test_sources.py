@@ -38,7 +38,7 @@ from tests.surfaces.meshes import box, joined, observers_from_law, plate, vmf
 def test_cone_scales_spherical_harmonics(rgb, degree):
     sigma = 0.2
     d = rgb.Vector3f(fibonacci_directions(500).T.astype(np.float32))
-    # Zonal harmonics about an axis of no symmetry; written out, since Dr.Jit has none.
+    # Zonal harmonics about an arbitrary axis, written out because Dr.Jit lacks them.
     zonal = {
         0: lambda x: x * 0 + 1,
         1: lambda x: x,
@@ -48,7 +48,7 @@ def test_cone_scales_spherical_harmonics(rgb, degree):
     axis = dr.normalize(rgb.Vector3f(0.3, -0.5, 0.8))
 
     def density(u):
-        # Fields gather single precision only.
+        # Fields use single precision only.
         assert isinstance(u, rgb.Vector3f)
         return zonal[degree](dr.dot(u, axis))
 
@@ -61,7 +61,7 @@ def test_cone_matches_heat_to_fourth_order():
     for sigma in (0.02, 0.04):
         for degree in (1, 5, 12):
             rule = 0.5 * (1 + eval_legendre(degree, np.cos(2 * sigma)))
-            # In the tangent plane the harmonic of degree l is a wave of the number l + 1/2, about.
+            # In the tangent plane the harmonic of degree l is approximately a wave with the wave number l + 1/2.
             assert abs(rule - np.exp(-degree * (degree + 1) * sigma**2 / 2)) < 2 * (degree + 1) ** 4 * sigma**4 / 24
 
 
@@ -97,7 +97,7 @@ def test_closed_room_receives_all_gaze(rgb, kappa, eye):
 
 @pytest.mark.parametrize(("y", "kappa"), [(0.7, 500.0), (0.69, 5000.0)])
 def test_surface_occluder_and_escaped_shares(rgb, y, kappa):
-    """Against a sum in double precision that shares no line with it, narrow laws on an outline that runs along the
+    """Compared with an independent sum in double precision, also for narrow densities on an outline along the
     cuts of a wall included."""
     for without in (None, 1):
         room = joined(box((0, 0, 0), (4, 3, 2.5), without))
@@ -114,7 +114,7 @@ def test_surface_occluder_and_escaped_shares(rgb, y, kappa):
 
 
 def _shares(kappa: float, eye: np.ndarray, window: bool, count: int = 1 << 17) -> np.ndarray:
-    """Of the law on room, shelf and window: slab tests along directions that each have as much of it."""
+    """The share of the density on room, shelf and window: slab tests along directions of equal probability."""
     i, side = np.arange(count), np.cross(MEAN, [0, 0, 1]) / np.linalg.norm(np.cross(MEAN, [0, 0, 1]))
     cos = 1 + np.log1p((i + 0.5) / count * np.expm1(-2 * kappa)) / kappa
     turn, sin = 2 * np.pi * (i * (np.sqrt(5) - 1) / 2 % 1), np.sqrt(1 - cos**2)
@@ -138,7 +138,7 @@ def test_uniform_gaze_gives_solid_angles(rgb):
             target, observers_from_law(uniform), eye, [1.0], GazeSumSettings(max_angle=0.1, cone_sigma=cone)
         )
         floor = sums.face_sums[(target.mesh.corners[:, :, 2] == 0).all(axis=1)].sum()
-        # Of a rectangle, by the four rectangles between the foot point and its corners.
+        # Solid angle of a rectangle, by the four rectangles between the foot point and its corners.
         x, y, h = np.array([1.0, 3.0]), np.array([0.7, 2.3]), 1.5
         exact = sum(np.arctan2(a * b, h * np.sqrt(a * a + b * b + h * h)) for a in x for b in y)
         assert np.isclose(floor, exact / (4 * np.pi), rtol=1e-4)
@@ -149,7 +149,7 @@ def test_cone_widens_gaze_and_keeps_its_total(rgb):
     law, cone = observers_from_law(vmf(rgb, (1, 0.1, 0), 400.0)), 0.026
     plain = sum_gaze(target, law, eye, [1.0], SETTINGS)
     wide = sum_gaze(target, law, eye, [1.0], dataclasses.replace(SETTINGS, cone_sigma=cone))
-    # A vMF law after a Gaussian is nearly one whose variance is the sum.
+    # A vMF density convolved with a Gaussian is nearly a vMF density with the sum of the variances.
     expected = sum_gaze(
         target, observers_from_law(vmf(rgb, (1, 0.1, 0), 1 / (1 / 400 + cone**2))), eye, [1.0], SETTINGS
     )
@@ -176,11 +176,11 @@ def test_sums_match_surface_attention(rgb, tmp_path):
     read = read_mesh_file(actual / "twin.ply")
     twin = read.vertices, read.faces
     target = SurfaceTarget(joined(aoi), [twin])
-    # Looked at as if it stood there: the goods in the box hide it, as they hide the box of `attention`.
+    # The box is evaluated as if it were in the scene: the goods in it occlude it, as in `attention`.
     make = observers_from_field(scene.integrator.gaze, target.geometry, target.settings)
     sums = sum_gaze(target, make, np.array([eye]), [1.0], SETTINGS)
     assert expected.share[0] > 0.001
-    # The field is normalised over what is seen: with the box there, and without it.
+    # The field is normalised over the visible surfaces, with the box and without it.
     gaze, at = scene.integrator.gaze, rgb.Point3f(eye)
     reference, without = (
         float(gaze.for_observers([at], place, target.settings).integrals(at)[0][0])
@@ -216,7 +216,7 @@ def test_shadow_boundary_along_subdivisions(rgb):
         pieces = subdivide_faces(target.mesh, eye, 0.3)
         parts = list(iter_visible_pieces(target, pieces, lambda some: np.ones(len(some)), 2 * np.pi, 1 << 12))
         result = sum(received.sum() for _, received in parts)
-        # Of the strip from -1 to x, by the four corners of half of each of its two parts.
+        # Solid angle of the strip from -1 to x, by the corners of the halves of its two parts.
         exact = sum(2 * np.arctan2(a, 2 * np.sqrt(a * a + 5)) for a in (1.0, x))
         assert abs(result - exact) < 1e-3
         uncut = pieces.solid_angle[target.is_visible(eye, pieces.centroids, pieces.face)].sum()
@@ -354,7 +354,7 @@ def test_line_and_cone_through_a_gap(rgb):
     line = sum_rays(target, rays_ray_source(1000), RaySettings())
     assert line.face_sums[behind].sum() == np.float64(1000) * (1 / 1000) or np.isclose(line.face_sums[behind].sum(), 1)
     cone = sum_rays(target, rays_ray_source(4000), RaySettings(cone_sigma=SIGMA, rays_per_cone=16))
-    # One of the two angles of the Gaussian has to be within the slit.
+    # One of the two angles of the Gaussian must be within the slit.
     passes = 2 * norm.cdf(np.arctan(slit / 2) / SIGMA) - 1
     assert abs(cone.face_sums[behind].sum() - passes) < 0.01 and 0.3 < passes < 0.4
     left_of = mesh.corners[:, :, 0].max(axis=1) < 0

@@ -52,7 +52,7 @@ def test_overlapping_gaussians_share_area(rgb):
     """An opaque wall has its geometric area for any number of Gaussians."""
     plain = wall(jitter=0.0005)
     result = areas(plain)
-    edge = 4 * 0.014  # the last of the disks lie over the edge
+    edge = 4 * 0.014  # the outer disks extend beyond the edge
     assert unoccluded_areas(plain, 3.0).sum() > 2.5
     assert (result.sum(axis=1) > 0.99).all() and (result.sum(axis=1) < (1 + edge) ** 2).all()
 
@@ -60,7 +60,7 @@ def test_overlapping_gaussians_share_area(rgb):
 def test_occluded_side_has_no_area(rgb):
     both = concatenate_splats([wall(0.0, 0.2), wall(0.003, 0.2, turned=TURN_X)])
     result, n = areas(both, 0.004), len(both) // 2
-    # Along +z the first wall is seen: that is side 0 of it, whose axis is +z, and side 1 of the other.
+    # Rays along +z hit side 0 of the first wall, whose axis is +z, and side 1 of the other.
     assert (result[0, :n] > 4 * result[1, n:]).mean() > 0.8 and result[1, n:].sum() < 0.3 * result[0, :n].sum()
     far = concatenate_splats([wall(0.0, 0.2), wall(0.05, 0.2)])
     assert np.allclose(areas(far, 0.004)[:, :n], areas(wall(0.0, 0.2), 0.004)) and 0 < MIN_VISIBLE_FRACTION < 1
@@ -68,7 +68,7 @@ def test_occluded_side_has_no_area(rgb):
 
 # ---- Splat hits ----
 #
-# Hits of rays as arrays: all of them, in their order, next to a look at every Gaussian in double precision.
+# All hits of rays as arrays, in order, compared with a loop over all Gaussians in double precision.
 
 
 def some(n=80, seed=3):
@@ -187,7 +187,7 @@ def test_escaped_gaze(rgb, cone):
 
 # ---- Splat smoothing ----
 #
-# Smoothing over Gaussians: as wide as is said, nothing lost, nothing through the air, around an edge or a board.
+# Smoothing over Gaussians: its width, conservation, and no transfer through air, around an edge or a board.
 
 TOLERANCE = 0.002
 
@@ -229,7 +229,7 @@ def test_point_is_smoothed_to_a_gaussian(length):
 @pytest.mark.parametrize("turned", [(1.0, 0.0, 0.0, 0.0), TURN_X])
 @pytest.mark.parametrize("length", [0.05, 0.2])
 def test_smoothing_does_not_cross_gaps(turned, length):
-    """Parallel ones and such that face each other, whichever side is looked at."""
+    """Parallel Gaussians and Gaussians that face each other, for either side."""
     both = concatenate_splats([wall(0.0, 0.8), wall(0.05, 0.8, turned=turned)])
     flow, _ = smoother(both, length)
     n = len(both) // 2
@@ -245,7 +245,7 @@ def test_smoothing_does_not_cross_boards_or_edges():
     n = len(board) // 2
     front = spike(board, (0.1, 0.1, 0))
     result = smoother(board, 0.05)[0](front)
-    # Seen along +z are side 0 of the first and side 1 of the other.
+    # Rays along +z hit side 0 of the first and side 1 of the other.
     assert not result[1, :n].any() and not result[0, n:].any() and result[1, n:].sum() > 0.1
     hidden = np.full((2, len(board)), 0.02**2)
     hidden[1, n:] = hidden[1, :n] = 1e-7
@@ -299,10 +299,10 @@ def test_occluded_ball_receives_no_gaze(rgb):
     kappa = 300.0
     expected = result(balls, vmf(rgb, ALONG, kappa))
     assert np.allclose(expected, [kappa / (2 * np.pi) / 4, 0], rtol=1e-5)
-    # From the other side it is the other one, and three of four look from there.
+    # From the other side the other Gaussian is hit, and three of four observers are there.
     both = result(balls, uniform(rgb), [EYE[0], (0, 0, 4.0)], [0.25, 0.75])
     assert np.allclose(both, [0.25 / (4 * np.pi * 4), 0.75 / (4 * np.pi * 9)], rtol=1e-5)
-    # What a ball lets through reaches the next: half of a ray's opacity lies there.
+    # Light that a ball transmits reaches the next one, where half of the ray's opacity is reached.
     assert result(stack([0.0, 1.0], [0.2, 0.95]), uniform(rgb))[1] > 0
 
 

@@ -1,4 +1,4 @@
-"""Gaze on surfaces: what a bake is asked for, its chunks and sums, on meshes and splats, and its files."""
+"""Gaze on surfaces: options of a bake, its chunks and sums, on meshes and splats, and its files."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ from tests.surfaces.test_splats import falling
 from tests.tasks.works import lay_out
 from tests.workflows.recorder import Recorder
 
-# ---- Bakes from files to sums: a field's people, rays, units, and options that contradict each other ----
+# ---- Bakes from files to sums: observers of a field, rays, units, and contradictory options ----
 
 
 GAZE = files(store) / "shoppers.safetensors"
@@ -95,7 +95,7 @@ def test02_rays_are_baked_in_fractions_and_seconds(rgb, room):
     share = bake(room, (), BakeOptions(cone=0.0, max_edge=2.0, mode="llvm_ad_rgb"), rays=rays())
     assert share.summary["source"] == "rays" and np.isclose(share.on_surface, 1) and share.escaped == 0
     seconds = bake(room, (), BakeOptions(cone=0.0, max_edge=2.0, unit="seconds", mode="llvm_ad_rgb"), rays=rays())
-    # Of two people twenty rays each, 0.2 seconds apart.
+    # Two participants with twenty rays each, 0.2 seconds apart.
     assert np.isclose((seconds.density * seconds.mesh.vertex_area).sum(), 8.0)
     assert np.allclose(seconds.density, 8 * share.density)
     # All attention is on the wall.
@@ -103,7 +103,7 @@ def test02_rays_are_baked_in_fractions_and_seconds(rgb, room):
 
 
 def test03_scene_units_are_converted_to_metres(rgb, tmp_path):
-    """Twice as many units a metre: the same share on the same square metres."""
+    """Twice as many units per metre: the same share on the same square metres."""
     (tmp_path / "align.json").write_text("[[2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]]")
     v, f = box((0, 0, 0), (8, 6, 3))
     for name, scale in (("a", 1), ("b", 2)):
@@ -115,7 +115,7 @@ def test03_scene_units_are_converted_to_metres(rgb, tmp_path):
 
 
 def test06_unused_outputs_are_not_computed(rgb, room, monkeypatch):
-    """No smoothing, no Laplacian; no texture, no xatlas."""
+    """Without smoothing no Laplacian is imported, and without a texture no xatlas."""
     from nerg_mi.surfaces import laplacian
     from nerg_mi.workflows import bake as outputs
 
@@ -220,7 +220,7 @@ def test01_ply_and_glb_are_the_same_to_trimesh(baked):
     )
     values = ply.metadata["_ply_raw"]["vertex"]["data"]["value"]
     assert np.allclose(np.ravel(values), result.density, rtol=1e-6)
-    # Of a mesh with a material trimesh stores the colours separately; they are linear, those of a PLY are as shown.
+    # For a mesh with a material, trimesh stores linear colours separately; colours of a PLY are display values.
     (inner,) = trimesh.load(folder / "a.glb", process=False).geometry.values()
     linear = np.array(inner.visual.vertex_attributes["color"], float)[:, :3] / 65535
     shown = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
@@ -268,14 +268,14 @@ def test03_a_texture_is_written(baked, tmp_path):
 def test04_normals_and_unsupported_textures(tmp_path):
     mesh = joined(box((0, 0, 0), (1, 1, 1)))
     normals = vertex_normals(mesh)
-    # Of a cube's corners they point along the diagonals.
+    # At the corners of a cube they point along the diagonals.
     assert np.allclose(np.linalg.norm(normals, axis=1), 1)
     assert np.all(np.abs(np.abs((normals * np.sign(mesh.vertices - 0.5)).sum(axis=1))) > 1.6)
     with pytest.raises(NergError, match=r"\.glb"):
         check_texture([tmp_path / "a.ply"], 64)
 
 
-# ---- Bakes in parts: equal to the bit to a bake in one piece, for any worker, without repeated work ----
+# ---- Bakes in parts: bit-identical to a bake in one piece, for any worker, without repeated work ----
 
 
 ROOM = joined(box((0, 0, 0), (8, 6, 3)))
@@ -326,7 +326,7 @@ def test_two_processes_give_equal_sums_and_reuse_stored_parts(tmp_path):
     groups = [crowd(3), directed(500)]
     expected = sum_directly(scene, groups, Recorder())
     assert equal(sum_in_parts(scene, groups, parts(tmp_path, scheduler="local:2"), "a bake"), expected)
-    # Started again with two observers more: one part is another one, and one is new.
+    # With two more observers one part changes, and one is new.
     recorder = Recorder()
     extended = [WeightedObservers(np.r_[groups[0].positions, groups[0].positions[:2]], np.full(5, 1 / 3)), groups[1]]
     sum_in_parts(scene, extended, parts(tmp_path, recorder), "a bake")
@@ -343,10 +343,10 @@ def test_a_part_depends_only_on_its_inputs(tmp_path):
     scene = BakeScene(ROOM, ray_settings=OF_RAYS)
     who = directed(900)
     assert bake_rays(scene, who) == 3 and bake_rays(scene, who) == 0
-    # Some rays of the second part are others.
+    # Some rays of the second part change.
     who.directions[400:500] *= -1
     assert bake_rays(scene, who) == 1
-    # The mesh is another one.
+    # The mesh changes.
     higher = replace(ROOM, vertices=ROOM.vertices * (1, 1, 1.5))
     assert bake_rays(replace(scene, mesh=higher), who) == 3
     assert bake_rays(replace(scene, ray_settings=RaySettings(cone_sigma=0.02, rays_per_cone=4)), who) == 3
@@ -354,7 +354,7 @@ def test_a_part_depends_only_on_its_inputs(tmp_path):
 
 @pytest.mark.usefixtures("engine")
 def test_transferred_files_give_equal_sums(tmp_path):
-    """A worker of another machine has what it was sent in a folder of its own."""
+    """A worker on another machine has its inputs in its own folder."""
     plain = wall(0.0, 0.4, 0.05)
     write_ply_splats(tmp_path / "wall.ply", plain)
     for scene, who in (
@@ -414,7 +414,7 @@ def test_baked_files_are_byte_identical_in_parts(tmp_path):
         assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "parts" / name).read_bytes(), name
 
 
-# ---- Parts of a bake: the same wherever and however often they are computed ----
+# ---- Parts of a bake: equal on any worker and in any repetition ----
 
 
 def test01_parts_are_reproducible_and_scenes_can_be_pickled(rgb, monkeypatch):
@@ -517,7 +517,7 @@ def test04_one_observer_is_required():
             check_values(options)
 
 
-# ---- What receives gaze ----
+# ---- Target surfaces ----
 
 
 SCENE = """<scene version="3.0.0">
@@ -535,7 +535,7 @@ def test01_a_mesh_is_refined_to_an_edge_length_in_metres(rgb, tmp_path):
     target = read_target(tmp_path / "a.ply", (), 16, ns, recorder)
     assert target.names == ("a",) and target.index.tolist() == list(range(12)) and not target.occluders
     assert len(recorder.messages) == 1 and recorder.messages[0].startswith("a.ply: 2 ")
-    # Two scene units a metre.
+    # Two scene units per metre.
     assert longest_edge(refine_target(target, 0.25, 2.0).mesh) <= 0.5
     assert 50_000 < len(refine_target(target, None, 1.0).mesh.faces) < 250_000
 
@@ -565,7 +565,7 @@ def test03_the_surface_of_a_field_is_extracted(rgb, tmp_path):
         read_target(tmp_path / "f.safetensors", ("a",), 8, ns, Recorder())
 
 
-# ---- Parts of a bake of splats: the same wherever and however often they are computed ----
+# ---- Parts of a bake of splats: equal on any worker and in any repetition ----
 
 
 @pytest.fixture
@@ -595,7 +595,7 @@ def test03_the_surface_tolerance_of_splats(rgb):
     assert np.isclose(make_splat_geometry(wall(0.0, 0.2)).tolerance, 2 * 1e-3)
 
 
-# ---- Gaze that is written back to Gaussian splats: from files to a file ----
+# ---- Gaze per Gaussian: from files to a file ----
 
 
 OPTIONS = {"mode": "llvm_ad_rgb", "observer": (0.0, 0.0, -3.0)}
@@ -603,7 +603,7 @@ OPTIONS = {"mode": "llvm_ad_rgb", "observer": (0.0, 0.0, -3.0)}
 
 @pytest.fixture
 def place(tmp_path):
-    """A few balls that do not hide each other, and a gaze field."""
+    """A few balls that do not occlude each other, and a gaze field."""
     splats = random_splats(30, size=0.02)
     write_inria(tmp_path / "place.ply", splats, shuffled=True)
     fields.gaze(tmp_path / "gaze.safetensors")
@@ -638,7 +638,7 @@ def test01_each_gaussian_gets_its_attention_and_keeps_other_columns(rgb, place):
     assert np.array_equal(back.extra["label"], original.extra["label"]) and back.degree == 0
     for name in ("centers", "scales", "rotations", "opacities"):
         assert np.allclose(getattr(back, name), getattr(original, name), rtol=1e-5, atol=1e-6)
-    # The hottest is nine tenths of the map's last colour.
+    # The maximum has nine tenths of the last colour of the map.
     hot = 0.5 + SH_C0 * back.harmonics[result.attention.argmax(), 0]
     assert np.abs(hot - apply_colormap("inferno", np.ones(1))[0]).max() < 0.1
 
@@ -669,7 +669,7 @@ def test03_unsupported_options_of_splats_are_refused(rgb, place, options, said):
 
 
 def make_wall_rays(n=600):
-    """Rays of two people from before a wall of a square metre, at it."""
+    """Rays of two participants in front of a wall of one square metre, towards it."""
     rng = np.random.default_rng(0)
     d = np.concatenate([rng.normal(0, 0.12, (n, 2)), np.ones((n, 1))], axis=1)
     d /= np.linalg.norm(d, axis=1, keepdims=True)
@@ -677,7 +677,7 @@ def make_wall_rays(n=600):
 
 
 def test04_rays_give_equal_files_with_and_without_parts(rgb, tmp_path, monkeypatch):
-    """Shares, seconds, halves, smoothed; the files are the same to the byte."""
+    """Shares, seconds, split halves and smoothing; the files are byte-identical."""
     monkeypatch.setattr(bake_chunks, "RAYS", 200)
     write_ply_splats(tmp_path / "wall.ply", wall(0.0, 1.0, 0.03, 0.0005))
     make_wall_rays().save(tmp_path / "rays.npz")
@@ -692,7 +692,7 @@ def test04_rays_give_equal_files_with_and_without_parts(rgb, tmp_path, monkeypat
     assert abs(summary["on_splats"] + summary["escaped"] - 1) < 1e-3 and summary["on_splats"] > 0.9
     assert 0.7 < summary["halves_cc"] <= 1 and summary["lookers"] == 600
     assert any("of the gaze is on Gaussians" in line for line in recorder.messages)
-    # Where they look most: a Gaussian of the law, the cone and the smoothing.
+    # The maximum: a Gaussian of the gaze density, the cone and the smoothing.
     peak = 1 / (2 * np.pi * (0.12**2 + np.radians(1.5) ** 2 + 0.05**2))
     middle = np.linalg.norm(result.splats.centers[:, :2], axis=1) < 0.06
     assert np.isclose(np.median(result.attention[middle]), peak, rtol=0.15)

@@ -1,4 +1,4 @@
-"""Figures: of files, of scenes, and floor plans; any kind of them, drawn and written."""
+"""Figures of files and scenes, and floor plans; each kind is drawn and written."""
 
 from __future__ import annotations
 
@@ -153,7 +153,7 @@ def test_the_basis_of_the_gaze_is_printed_below_the_images(tmp_path):
     assert figure.texts[0].get_text().replace("\n", " ") == texts[0]["gaze.basis"]
 
 
-# ---- Baked surfaces: what is seen of them where, in the colours of their values ----
+# ---- Baked surfaces: visible parts, in the colours of their values ----
 
 
 SQUARE = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
@@ -182,11 +182,11 @@ def test_values_are_drawn_at_their_positions(tmp_path):
     shown = picture(figure)
     paper = shown[2, 2]
     assert np.allclose(shown[:19], paper) and np.allclose(shown[:, :19], paper) and np.allclose(shown[61:], paper)
-    # From 0 at the left to 4 at the right, over grey that is lit from the camera and from above.
+    # Values from 0 at the left to 4 at the right, over grey that is lit from the camera and from above.
     x = (np.arange(20, 60) + 0.5) / 20 - 2
     grey = 0.18 + 0.3 * (0.6 * 2 / np.sqrt(4 + x**2 + 0.025**2) + 0.4 * 0)
     wanted = overlay(np.repeat(grey[None, :, None], 3, axis=2), 2 * (x + 1)[None], Heat(4.0))
-    # To a step of the colour map, between whose colours single precision may decide otherwise.
+    # Within one step of the colour map, since single precision can round to a neighbouring colour.
     np.testing.assert_allclose(shown[40, 20:60], wanted[0], atol=0.02)
     assert bar(figure).get_ylabel().replace("\n", " ") == "share of gaze per square metre [1/m²]"
 
@@ -298,7 +298,7 @@ def test_a_film_that_is_too_large_is_refused():
     assert make_film(30, 20)["rfilter"] == {"type": "box"}
     with pytest.raises(NergError, match="4,096.*4,096"):
         make_film(4096, 4096)
-    # What the widest sphere needs, a gigabyte to draw, is allowed.
+    # The widest sphere, which takes a gigabyte to draw, is allowed.
     (width,) = (f.metadata[RANGE].high for f in fields(SphereOptions) if f.name == "width")
     assert make_film(width, width // 2)["width"] == width
 
@@ -322,7 +322,7 @@ def scene_sphere(tmp_path_factory):
 
 
 def test_the_sphere_shows_the_gaze_of_the_observer(rgb, scene_sphere):
-    """Against the API's rays from the observer's eye, in directions of the panorama that it has turned itself."""
+    """Compared with rays of the API from the observer's eye, in directions of the panorama that the test rotates."""
     import nerg_mi as nerg
 
     figure = draw("sphere", scene_sphere, width=64, spp=1, mode=MODE, projection="equirectangular", top=0.5)
@@ -331,7 +331,7 @@ def test_the_sphere_shows_the_gaze_of_the_observer(rgb, scene_sphere):
     shown = figure.axes[0].images[0].get_array()
     assert shown.shape == (32, 64, 3)
     eye = np.array([0.2, 0.1, -2.5])
-    # Level, towards the middle of the place: up is y. Right of a camera of Mitsuba's is -x of its own.
+    # The view is level, towards the middle of the scene, and up is y. The right of a Mitsuba camera is its -x.
     ahead = -eye * (1, 0, 1)
     ahead /= np.linalg.norm(ahead)
     up = np.array([0.0, 1.0, 0.0])
@@ -374,13 +374,13 @@ def test_a_triptych_has_one_scale(rgb, scene_triptych, monkeypatch):
     recorder = Recorder()
     behind = {"eye": "0.2, 0.1, 2.5"}
     figure = draw("triptych", scene_triptych, reporter=recorder, mode=MODE, spp=2, defaults=behind)
-    # Three pictures, the scale, and the swatch for what is not known.
+    # Three pictures, the scale, and the swatch for unknown values.
     assert len(figure.axes) == 5 and [s for s, _ in recorder.steps] == sorted(s for s, _ in recorder.steps)
     observer_view, without, with_ = seen
-    # Occlusion takes away, and only that; what is seen itself stays.
+    # Occlusion only decreases gaze; visible surfaces keep their gaze.
     assert (without.values >= with_.values - 1e-6).all() and (without.values > with_.values + 1e-3).any()
     assert (without.color == with_.color).all() and observer_view.values.shape == with_.values.shape
-    # The first is what a camera at the observer's place sees, with its own gaze.
+    # The first picture is that of a camera at the observer, with its own gaze.
     with scenes.open_scene(scene_triptych, SceneFigureOptions(mode=MODE, spp=2, defaults=behind), recorder) as opened:
         plain = opened.render(opened.camera(0), find_overlay("gaze"))
         again = render_aovs(scene_triptych, opened.scene, opened.camera(0), ["gaze", "opacity"], spp=2)
@@ -397,7 +397,7 @@ def test_a_scene_whose_camera_is_the_observer_is_refused(rgb, scene_triptych, tm
         draw("triptych", alone, mode=MODE, defaults={})
 
 
-# ---- A place cut at a height: boxes whose walls and heights are known ----
+# ---- A scene cut at a height: boxes with known walls and heights ----
 
 
 LOW, HIGH = np.array([-2.0, -1.0]), np.array([2.0, 1.0])
@@ -422,12 +422,12 @@ def test_boxes_are_cut_at_a_height(rgb, tmp_path):
     tall_box = (np.abs(x - 1) < 0.5) & (np.abs(y - 0.3) < 0.2)
     np.testing.assert_allclose(plan.height[low_box], 0.5, atol=1e-4)
     np.testing.assert_allclose(plan.height[~low_box & ~tall_box], 0.0, atol=1e-4)
-    # The cut goes along the walls of the tall box, a cell wide to each side, and nowhere else.
+    # The cut follows only the walls of the tall box, one cell wide on each side.
     edge = np.maximum(np.abs(x - 1) - 0.5, np.abs(y - 0.3) - 0.2)
     assert plan.is_cut[np.abs(edge) < 0.4 * side[0]].all() and not plan.is_cut[np.abs(edge) > 1.01 * side[0]].any()
 
 
-# ---- Floor plans of rays: paths by person and recording, sights, fields of view ----
+# ---- Floor plans of rays: paths by participant and recording, lines of sight, fields of view ----
 
 
 def walk(hits=True):
@@ -489,7 +489,7 @@ def test_wrong_options_of_a_floor_plan_are_refused(rays, options, said):
         draw("floor", rays, **options)
 
 
-# ---- Figures drawn and written, with where they come from ----
+# ---- Figures are drawn and written with their provenance ----
 
 
 def test_a_figure_file_records_its_provenance(tmp_path):

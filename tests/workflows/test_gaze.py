@@ -1,4 +1,4 @@
-"""Evaluations of gaze fields, folds, ablations, priors, and the places of all of these."""
+"""Evaluations of gaze fields, folds, ablations and priors, and their geometries."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from tests.tasks.clusters import ClusterOfProcesses, wait_until
 from tests.train.gaze.looks import BOX, around, looking_at
 from tests.workflows.recorder import Recorder
 
-# ---- The evaluation of a gaze field as a job: its rows, files, and what it refuses ----
+# ---- The evaluation of a gaze field as a job: rows, files and refused input ----
 
 
 OPTIONS = GazeEvaluationOptions(min_rays=8, directions=128, resamples=2, pictures=1)
@@ -53,11 +53,11 @@ def test_scores_are_listed_with_the_baselines(trained, tmp_path):
     assert {row["method"] for row in result.persons} == {"gaze field", "4,096 nearest rays"}
     files = {"gaze.md", "gaze.csv", "persons.csv", "gaze.json", "positions.png", "positions.csv"}
     assert {p.name for p in result.files} == files
-    # All stand in one zone; a field of no support would say so at each.
+    # All participants are in one zone; a field without support would warn at each position.
     assert len(result.by_position) == result.positions and {row["group"] for row in result.by_position} == {"0"}
     assert all(row["support"] >= 0 and row["KLD"] > 0 for row in result.by_position)
     assert {row["method"] for row in result.calibration} >= {"gaze field", "4,096 nearest rays"}
-    # By what the folds of the training held out.
+    # Calibrated on the data that the folds of the training held out.
     assert result.calibration[1]["method"] == "gaze field, calibrated"
     assert json.loads((tmp_path / "eval" / "gaze.json").read_text())["methods"][0]["KLD"] == result.rows[0]["KLD"]
     assert "directions of equal area" in (tmp_path / "eval" / "gaze.md").read_text()
@@ -81,7 +81,7 @@ def test_unusable_inputs_are_refused(trained, tmp_path):
         evaluate_gaze(tmp_path / "gaze.safetensors", crowd(1000), options=OPTIONS)
 
 
-# ---- Folds: trained and scored in workers, of which one is killed, with stored parts, and in this process ----
+# ---- Folds: in workers, one of which is killed, with stored parts, and in this process ----
 
 
 SMALL = {"geometry": "none", "folds": 2, "zones": 1, "positions": 3, "radius": 0.6, "probes": 8, "steps": 2}
@@ -116,7 +116,7 @@ def test_two_workers_give_equal_scores_although_one_is_killed(tmp_path, rgb):
         "both",
         "pos",
     }
-    # Each fold's zone is a group of its own, and all positions together form one more group.
+    # The zone of each fold is a separate group, and all positions together form another group.
     assert {row["group"].split()[0] for row in result.by_position} == {"0", "1", "2"}
     assert {row["split"] for row in result.uncertainty} == {"both", "pos", "anywhere"}
     assert result.calibration[0]["folds"] == 3 and 0 <= result.calibration[0]["80%"] <= 1
@@ -129,7 +129,7 @@ def test_two_workers_give_equal_scores_although_one_is_killed(tmp_path, rgb):
 
 @pytest.fixture(autouse=True)
 def threads():
-    """What a job sets is the process's: it is set back."""
+    """Settings of the process that a job changes are restored."""
     before = dr.thread_count()
     yield
     set_thread_count(before)
@@ -137,7 +137,7 @@ def threads():
 
 @pytest.fixture
 def folds_trained(monkeypatch):
-    """The seeds of the folds that were trained and scored with one thread, which cost nothing here."""
+    """The seeds of the folds that are trained and scored with one thread; the work itself is skipped."""
     seeds = []
 
     def score(common, seed, output):
@@ -163,7 +163,7 @@ def test_stored_folds_are_not_trained_again(tmp_path, folds_trained):
         return list(folds_trained)
 
     assert go() == [0, 1] and go() == [] and go(folds=4) == [2, 3] and go(first=2, folds=3) == [4]
-    # Other rays, and another recipe, are another evaluation; a change of how it is computed is none.
+    # Other rays or another recipe start another evaluation; a change of the schedule does not.
     assert go(crowd(301)) == [0, 1] and go(steps=3) == [0, 1] and go(threads=2) == []
     (job,) = account_for_store(tmp_path / "store").jobs
     assert (job.name, job.total, job.remaining) == (f"nerg eval folds {tmp_path / 'out'}", 2, 0)
@@ -184,7 +184,7 @@ def test_ensemble_spread_is_evaluated_like_support(tmp_path):
     assert "spread" in (tmp_path / "out" / "folds.md").read_text()
 
 
-# ---- The ablation as a job: rows that are kept and found again, frames, laws, what is refused ----
+# ---- The ablation as a job: cached rows, frames, ground truths and refused input ----
 
 
 ABLATION_OPTIONS = AblationOptions(
@@ -204,7 +204,7 @@ ABLATION_OPTIONS = AblationOptions(
 
 
 class Uniform:
-    """A law under which people look anywhere."""
+    """A ground truth with uniform gaze."""
 
     def density(self, positions, directions):
         return np.full((len(positions), len(directions)), 1 / (4 * np.pi))
@@ -212,7 +212,7 @@ class Uniform:
 
 @pytest.mark.nightly
 def test_rows_are_computed_once(tmp_path, monkeypatch):
-    """With two variants, for the time that compiling takes; the trainers know all of them."""
+    """With two variants only, because compiling takes long; tests of the trainers cover all variants."""
     result = ablate(crowd(3000), tmp_path, ABLATION_OPTIONS)
     assert len(result.rows) == 4 and {r["seed"] for r in result.rows} == {0, 1}
     relative_losses = [r["test_relative"] for r in result.rows if r["variant"] == "emit_capture"]
@@ -220,7 +220,7 @@ def test_rows_are_computed_once(tmp_path, monkeypatch):
     assert all(r["frame_seconds"] > 0 and np.isfinite(r["test_loss"]) for r in result.rows)
     assert (tmp_path / "default_capture_0.safetensors").exists() and all(p.is_file() for p in result.files)
     assert json.loads((tmp_path / "ablation.json").read_text())["rows"] == result.rows
-    # What is there already is not trained again; what would be another training is.
+    # Existing rows are not trained again; a changed training is.
     trained = []
     monkeypatch.setattr(ablation, "_train", lambda made, plan, path, bench: trained.append(path.stem) or result.rows[0])
     ablate(crowd(3000), tmp_path, ABLATION_OPTIONS)
@@ -258,7 +258,7 @@ def test_splats_have_no_features_of_a_radiance_field(tmp_path):
 
 @pytest.mark.parametrize("recipe, seeds, steps, refit", [("default", [0, 1], 2, True), ("small", [0], 5, False)])
 def test_only_fast_recipes_are_repeated(tmp_path, monkeypatch, recipe, seeds, steps, refit):
-    """And have steps of their own."""
+    """Variants can have their own number of steps."""
     plans = {}
     row = {"test_KLD": 1.0, "test_CC": 0.5, "train_seconds": 1.0, "test_loss": 1.0, "train_loss": 1.0, "steps": 1}
 
@@ -297,7 +297,7 @@ def test_another_first_seed_changes_the_hold_out(tmp_path, monkeypatch):
     assert made[0][2] == made[1][2] != made[2][2] == made[3][2]
 
 
-# ---- How variants are planned, and the laws that are named ----
+# ---- Plans of variants, and named ground truths ----
 
 
 def test_a_semantic_variant_is_planned_with_the_features_of_its_geometry(tmp_path):
@@ -330,7 +330,7 @@ def test_a_recipe_selects_its_log_density_class():
             load_ground_truth(name)
 
 
-# ---- Trainings of an ablation in parts: kept, and run by a process of its own as by this one ----
+# ---- Trainings of an ablation in parts: stored, and equal in a separate process ----
 
 
 TIMES = ("train_seconds", "frame_seconds")
@@ -343,7 +343,7 @@ def scores(result):
 
 @pytest.fixture
 def trainings(monkeypatch):
-    """What was trained in this process."""
+    """The trainings of this process."""
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     calls, original = [], ablation.train_variant
     monkeypatch.setattr(ablation, "train_variant", lambda *args: calls.append(args[:2]) or original(*args))
@@ -359,7 +359,7 @@ def test_a_training_in_a_worker_gives_equal_scores_and_is_stored(tmp_path, rgb, 
     assert scores(elsewhere) == scores(local)
     trainings.clear()
     assert (tmp_path / "a" / "default_emit_capture_0.safetensors").is_file()
-    # One seed more: any worker trains that one.
+    # With one more seed, any worker trains only that one.
     ablate(rays, tmp_path / "a", replace(ONE, seeds=2, store=tmp_path / "a.tasks"))
     assert [seed for _, seed in trainings] == [1]
     recorder = Recorder()
@@ -367,7 +367,7 @@ def test_a_training_in_a_worker_gives_equal_scores_and_is_stored(tmp_path, rgb, 
     assert (job.name, job.total, job.remaining) == (f"nerg ablate {tmp_path / 'a'}", 2, 0)
 
 
-# ---- A gaze field of other places: what it says, what its checkpoint holds, and what is refused ----
+# ---- The prior field of other environments: messages, content of its checkpoint, and refused input ----
 
 
 def looking(elevation: float, count: int = 200, seed: int = 0) -> Rays:
@@ -414,7 +414,7 @@ def test_wrong_prior_inputs_are_refused(tmp_path):
         learn_prior([looking(0.0), none])
 
 
-# ---- Places of jobs: one of each kind, found again for an evaluation, and alignments read from files ----
+# ---- Geometries of jobs: one of each kind, opened again for an evaluation, and alignments from files ----
 
 
 WALL = '<scene version="3.0.0"><shape type="cube"/></scene>'
@@ -426,7 +426,7 @@ def rays():
 
 
 def made(folder, kind, rays):
-    """A place of a ``kind``, whose files are in ``folder``."""
+    """A geometry of a ``kind``, with files in ``folder``."""
     if kind == "field":
         fields.radiance(folder / "place.safetensors")
     (folder / "place.xml").write_text(WALL)

@@ -1,4 +1,4 @@
-"""Typed options of every workflow, what parts of a job are kept by, and where a workflow computes."""
+"""Typed options of every workflow, keys of stored parts, and the backend of a workflow."""
 
 from __future__ import annotations
 
@@ -42,14 +42,14 @@ from nerg_mi.workflows.scene_commands import FilmOptions, StudyOptions
 from nerg_mi.workflows.study import plan_study
 from tests.tasks import works
 
-# ---- Typed options of every workflow: frozen, of keywords alone, each with its help ----
+# ---- Typed options of every workflow: frozen, keyword-only, each with a help text ----
 
 
 MODULES = [
     importlib.import_module(f"nerg_mi.workflows.{m.name}") for m in pkgutil.iter_modules(nerg_mi.workflows.__path__)
 ]
 MODULES.append(importlib.import_module(StatisticsOptions.__module__))
-# What has to be said where the defaults alone mean nothing.
+# Required options, if the defaults alone are not valid.
 SAID = {"FilterOptions": {"thin": 1.0}, "SplitOptions": {"zones": 3}}
 KINDS = [
     kind
@@ -112,7 +112,7 @@ def test_only_datasets_are_sampled():
     assert (options.max_samples, options.seed, options.mode) == (10_000_000, 0, "llvm_ad_rgb")
 
 
-# ---- Options of folds: those of places and of parts among them ----
+# ---- Options of folds, including those of geometries and of parts ----
 
 
 def test_folds_include_geometry_and_part_options():
@@ -131,7 +131,7 @@ def test_repeated_options_are_read_again_and_equal_names_are_not():
     assert FoldOptions(ensemble=1000).ensemble == 1000, "with the range that it has in a training"
 
 
-# ---- A setting of gaze trainings is an option of all that trains: of folds and of ablations, too ----
+# ---- A setting of gaze trainings is also an option of folds and of ablations ----
 
 FIELDS = [f for kind in (ProbeSettings, TrainingSettings) for f in fields(kind) if "help" in f.metadata]
 SETTINGS = {f.metadata["option"] or f.name for f in FIELDS}
@@ -144,7 +144,7 @@ class Stop(Exception):
 
 @pytest.fixture
 def training(monkeypatch):
-    """The options that a training is begun with, which is then ended."""
+    """The options with which a training starts, before it is stopped."""
     seen = []
 
     def begin(*arguments):
@@ -161,7 +161,7 @@ def test_folds_have_the_training_settings(training, tmp_path):
     with pytest.raises(Stop):
         evaluate.train_and_score(evaluate.FoldInputs(options, ("both",), None, None), 3, tmp_path)
     assert {name: getattr(training[0], name) for name in CHANGED_SETTINGS} == CHANGED_SETTINGS and training[0].seed == 3
-    # What tests are made by has the same words, and is left out.
+    # Options of the test probes have the same names, and are not passed to the training.
     assert training[0].kappa is training[0].radius is None
 
 
@@ -179,7 +179,7 @@ def test_every_training_setting_is_covered(kind):
     assert exposed_options(kind()) == {} and set(exposed_options(kind(**CHANGED_SETTINGS))) == set(CHANGED_SETTINGS)
 
 
-# ---- Options of filtering and splitting; what they do to rays is tried in tests/workflows/test_rays.py ----
+# ---- Options of filtering and splitting; tests/workflows/test_rays.py tests their effect on rays ----
 
 
 def test_empty_options_are_refused():
@@ -207,8 +207,8 @@ def test_conditions_list_the_selected_options():
 
 STORE = {"store", "scheduler", "threads"}
 
-# Of each command, what its parts are given of its options, and which options that leaves out: those of the schedule,
-# and those by which the command chooses parts or makes something of their outputs, none of which a part sees.
+# For each command: its options, the function that returns the options of its parts, and the options that the parts do
+# not receive. These concern the schedule, the selection of parts, or the processing of their outputs.
 COMMANDS = {
     "render": (FilmOptions, picture_options, STORE | {"defaults", "frames", "fps"}),
     "ablate": (
@@ -234,7 +234,7 @@ COMMANDS["bake, rays"] = (RaySettings, lambda o: o, set())
 
 
 def other_value(kind, f, options, folder):
-    """A valid value of the field ``f`` of options, other than that of ``options``."""
+    """A valid value of the field ``f`` that differs from that of ``options``."""
     hint, old = typing.get_type_hints(kind)[f.name], getattr(options, f.name)
     kinds = [k for k in typing.get_args(hint) if k is not type(None)] if is_union(hint) else [hint]
     for k in kinds:
@@ -281,7 +281,7 @@ def test_an_option_changes_the_part_key_only_if_it_changes_the_result(command, t
 
 @dataclass(frozen=True, kw_only=True)
 class Later(CountOptions):
-    """Options to which some were added."""
+    """Options with additional fields."""
 
     weight: float = option(1.0, "A new option.")
     processes: int = option(1, "One that changes no result.", changes_result=False)
@@ -314,7 +314,7 @@ def test_parts_run_with_default_scheduling_options():
     assert task.value == PartOptions() and not task.files
 
 
-# ---- The reporter of jobs that were given none ----
+# ---- The default reporter of jobs ----
 
 
 def test_the_default_reporter_is_silent(capsys):
@@ -324,7 +324,7 @@ def test_the_default_reporter_is_silent(capsys):
     assert capsys.readouterr() == ("", "")
 
 
-# ---- What a report says about the programs that made it ----
+# ---- Versions of programs in a report ----
 
 
 def test_versions_of_all_components_are_listed():
@@ -333,7 +333,7 @@ def test_versions_of_all_components_are_listed():
     assert "libLLVM" not in versions("scalar_rgb")
 
 
-# ---- Where a job computes ----
+# ---- The backend of a job ----
 
 
 def test_variant_and_threads(rgb):

@@ -1,4 +1,4 @@
-"""Radiance fields: poses of photos, trainings and scores, and fields of and for other programs."""
+"""Radiance fields: poses of photos, trainings and scores, and exchange with other programs."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ from tests.workflows.recorder import Recorder
 
 @pytest.fixture(autouse=True)
 def coarse(monkeypatch):
-    """A density grid of 32 cells an edge, and not of 128, most of which is looked through at the end of a training."""
+    """A density grid of 32 cells per edge instead of 128, whose extraction at the end of a training takes long."""
 
     @dataclass(frozen=True)
     class Coarse(RadianceSettings):
@@ -65,7 +65,7 @@ def coarse(monkeypatch):
 
 
 class Impatient(Recorder):
-    """Raises an interrupt when the first step is reported."""
+    """A reporter that raises ``KeyboardInterrupt`` at the first step."""
 
     def progress(self, share, text=""):
         if "step" in text:
@@ -123,7 +123,7 @@ def test_evaluation_without_an_output_returns_scores(cube):
 
 
 def test_small_views_have_no_scores(cube, tmp_path):
-    """One pixel has no right half to fit colours for, and no window of structural similarity."""
+    """A single pixel has no right half for fitted colours, and no window for SSIM."""
     recorder, out, table = Recorder(), tmp_path / "f.safetensors", tmp_path / "s.json"
     result = train_radiance(cube, out, RadianceOptions(steps=2, holdout=3, width=1), recorder)
     assert result.provenance["psnr_held_out"]["mean_fitted"] is None and np.isfinite(result.psnr)
@@ -141,7 +141,7 @@ def test_training_views_are_refused_as_held_out_views(cube):
     assert evaluate_radiance(out, cube, RadianceScoreOptions(holdout=2, train=True, spp=1)).views
 
 
-# ---- Checkpoints of other programs by jobs: the fields themselves, with and without files ----
+# ---- Imported checkpoints of other programs, with and without files ----
 
 
 def test_import_without_an_output_returns_fields(torch, tmp_path):
@@ -159,7 +159,7 @@ def test_import_returns_files_in_order(torch, tmp_path):
     assert tuple(result.files) == outputs and all(p.is_file() for p in outputs)
 
 
-# ---- Exports by jobs: from a file and from a field that is loaded ----
+# ---- Exports from a file and from a loaded field ----
 
 
 @pytest.fixture
@@ -258,7 +258,7 @@ def test_fields_without_an_occupancy_grid_are_refused(tmp_path, occupancy, what)
     assert not (tmp_path / "g.safetensors").exists()
 
 
-# ---- Photos made a capture ----
+# ---- Poses of photos ----
 
 
 COUNT = 9
@@ -299,7 +299,7 @@ def written(pictures, work: Path, keep: int) -> Reconstruction:
 
 @pytest.fixture
 def finds(monkeypatch):
-    """`finds(keep)` lets so many pictures have a pose; gives a list of the settings that were asked for."""
+    """`finds(keep)` poses ``keep`` pictures; returns a list of the requested settings."""
 
     def choose(keep: int, change=lambda made: made) -> list:
         calls = []

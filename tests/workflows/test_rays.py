@@ -67,7 +67,7 @@ def test_random_keys_select_samples_uniformly():
     assert smallest_mask(np.zeros(3), 5).all() and not smallest_mask(np.arange(3.0), 0).any()
 
 
-# ---- Jobs on tracking, as a notebook calls them: rays or files in, results out, progress reported ----
+# ---- Jobs on tracking data from a notebook: rays or files, results, and progress ----
 
 
 class Heard:
@@ -210,7 +210,7 @@ def test_contradictory_options_are_refused(make, message):
         make()
 
 
-# ---- Jobs on datasets: imported, summed up and filtered as files are, and trained and scored on ----
+# ---- Jobs on datasets: import, summary, filters, training and evaluation, as for files ----
 
 
 @pytest.fixture
@@ -346,7 +346,7 @@ def test_impossible_filters_of_datasets_are_refused(parquet, tmp_path, monkeypat
 
 @pytest.fixture(scope="module")
 def crowded(tmp_path_factory):
-    """A dataset of 3,000 rays of four people in a corridor."""
+    """A dataset of 3,000 rays of four participants in a corridor."""
     pytest.importorskip("pyarrow", reason="datasets need the extra parquet")
     folder = tmp_path_factory.mktemp("crowded") / "corridor.rays"
     write_dataset_manifest(folder, DatasetManifest(2))
@@ -373,7 +373,7 @@ def test_training_and_evaluation_use_the_same_rays(parquet, crowded, tmp_path, m
     rays = load_rays(crowded, max_samples, 3)
     alone = train_gaze(rays, tmp_path / "alone.safetensors", replace(TRAINING, seed=3))
     assert alone.provenance["test"] == trained.provenance["test"]
-    # Two threads add up a gradient in an order of their own, so that two fits agree to rounding alone.
+    # The order in which two threads sum gradients varies, so two fits agree up to rounding only.
     scored = evaluate_gaze(tmp_path / "alone.safetensors", rays, options=OPTIONS)
     assert [row["KLD"] for row in scored.rows] == pytest.approx([row["KLD"] for row in result.rows], rel=1e-6)
 

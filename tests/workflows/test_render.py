@@ -1,4 +1,4 @@
-"""Pictures and films of a scene, in one go and in parts."""
+"""Pictures and films of a scene, at once and in parts."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from tests.plugins import fields
 from tests.tasks import works
 from tests.workflows.recorder import Recorder
 
-# ---- Pictures with a quantity over them: what is asked for, their scale, sequences, and what is refused ----
+# ---- Overlays: requests, scales, sequences, and refused input ----
 
 
 MODE = "llvm_ad_rgb"
@@ -102,7 +102,7 @@ def test_a_sequence_shares_one_scale(rgb, scene_overlays, tmp_path):
         tops.append(render_file(scene_overlays, tmp_path / f"one{k}.png", one).vmax)
     assert tops[0] != tops[1] and both.vmax == max(tops)
     assert [p.name for p in both.files] == ["walk_0001.png", "walk_0002.png"]
-    # The one whose scale it is looks as it does alone; the other does not.
+    # The image that sets the scale equals its single rendering; the other one does not.
     alone = [(tmp_path / f"one{k}.png").read_bytes() == p.read_bytes() for k, p in enumerate(both.files)]
     assert alone == [t == both.vmax for t in tops]
 
@@ -131,7 +131,7 @@ def test_a_video_contains_the_images_of_the_sequence(rgb, scene_overlays, tmp_pa
     monkeypatch.setattr(render, "write_bytes", lambda path, *parts: written.append(path) or write_bytes(path, *parts))
     options = PictureOptions(overlay="gaze", frames=scene_overlays.with_name("walk.csv"), vmax=top, mode=MODE)
     render_file(scene_overlays, tmp_path / "walk.png", options)
-    # With a scale that is given no picture waits for the others.
+    # With an explicit scale, no picture waits for the others.
     assert len(written) == (0 if top else 2)
     made = render_file(scene_overlays, tmp_path / "walk.mp4", replace(options, fps=5.0))
     metadata, rate, frames = decoded(av, made.path)
@@ -351,11 +351,11 @@ def test_stored_images_are_not_rendered_again(scene, monkeypatch):
     film_of(scene, "two", "a.png", recorder, store=store)
     assert len(rendered) == 3 and files(scene.parent / "one") == files(scene.parent / "two")
     assert recorder.steps[-1] == (1.0, "3 of 3 parts") and "parts are stored in" in recorder.messages[-1]
-    # One picture's values change: that one is rendered, and the video of the pictures takes all from the store.
+    # If the values of one picture change, only it is rendered again; the video takes all others from the store.
     (scene.parent / "frames.csv").write_text("level\n0.25\n0.6\n0.75\n")
     film_of(scene, "three", "a.png", store=store)
     assert len(rendered) == 4
-    # The scene changes: all are.
+    # If the scene changes, all pictures are rendered again.
     scene.write_text(BALL.replace("0.3", "0.31"))
     film_of(scene, "four", "a.png", store=store)
     assert len(rendered) == 7 and files(scene.parent / "four") != files(scene.parent / "three")
@@ -409,7 +409,7 @@ def test_contradictory_options_are_refused_before_rendering(scene, tmp_path):
     assert not (tmp_path / "store").exists() and not (tmp_path / "out").exists()
 
 
-# ---- From options to a store and an engine, and what is said of a store ----
+# ---- From options to a store and an engine ----
 
 
 def test_the_default_store_is_next_to_the_output(tmp_path):
@@ -456,7 +456,7 @@ def test_a_scene_that_reads_an_unplanned_file_is_refused(tmp_path):
     assert copied.checked_path().read_text() == scene.read_text() and copied.checked_path() != scene
 
 
-# ---- What is said of a store ----
+# ---- Messages about a store ----
 
 
 def test_a_store_is_summarised_and_stale_outputs_removed(tmp_path):

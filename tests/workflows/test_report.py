@@ -42,7 +42,7 @@ from tests.formats.splats.writers import random_splats, write_inria
 from tests.report.made import packed_scene
 from tests.workflows.recorder import Recorder
 
-# ---- The report as a job: from files to a page, with what is missing left out ----
+# ---- The report as a job: from files to a page, without missing sections ----
 
 
 SMALL = ReportOptions(width=24, spp=1, max_points=600, viewpoints=4, mode="llvm_ad_rgb")
@@ -51,7 +51,7 @@ NAMES = ("Ada", "Grace", "Mary", "Edsger")
 
 @pytest.fixture(scope="module")
 def run(trained, tmp_path_factory):
-    """A folder with rays, a gaze field of them in their hit points, an evaluation and objects."""
+    """A folder with rays, a gaze field trained on them and their hit points, an evaluation and AOIs."""
     folder = tmp_path_factory.mktemp("run") / "files"
     shutil.copytree(trained, folder)
     rows = scored((0.9, 0.85, 0.3), reach=0.02)
@@ -66,7 +66,7 @@ def run(trained, tmp_path_factory):
 
 @pytest.fixture
 def without_3d(monkeypatch):
-    """Skip the 3D scene where a test does not need it."""
+    """Skip the 3D scene in tests that do not need it."""
     monkeypatch.setattr(report._ReportWork, "_stage", lambda *_: (None, (0, 0, 0, 0)))
 
 
@@ -94,9 +94,9 @@ def test_a_report_of_all_files_in_a_folder(run, tmp_path):
         and contents.nearby_participants
         and min(contents.nearby_participants) >= 1
     )
-    # No names, neither from rays nor from evaluations.
+    # There are no names, neither from rays nor from evaluations.
     assert not any(name in text for name in NAMES) and "participant 1" in text
-    # How many rays of how many people the gaze rests on, and what all of it was made of.
+    # The numbers of rays and participants of the gaze field, and all sources of the report.
     assert (
         re.fullmatch(r"data: [\d,]+ rays of [1-4] participants", contents.support_note)
         and text.count(contents.support_note) >= 2
@@ -225,7 +225,7 @@ def test_damaged_rays_are_refused(run, tmp_path):
     assert not (tmp_path / "a.html").exists()
 
 
-# ---- What files are, found from the files: in any order, in folders, and what makes no report ----
+# ---- Types of files, detected from their content: in any order, in folders, and unusable ones ----
 
 
 @pytest.fixture(scope="module")
@@ -283,7 +283,7 @@ def test_duplicate_files_are_used_once(folder):
     assert json.loads((folder / "gaze.eval" / "gaze.json").read_text()) == {}
 
 
-# ---- Pictures of a report: one scale, and none where there is nothing to show ----
+# ---- Pictures of a report: one scale, and no picture if there is nothing to show ----
 
 
 def view(gaze, **aovs):
@@ -307,7 +307,7 @@ PROVENANCE = make_provenance("nerg report", seed=7, settings={"width": 48})
 def test_all_images_share_one_scale():
     assert gaze_vmax(three()) == pytest.approx(0.5)
     assert gaze_vmax({"camera": view(0.0)}) is None
-    # Where there is no surface gaze does not count.
+    # Gaze does not count if there is no surface.
     assert gaze_vmax({"camera": view(np.where(np.arange(32)[:, None] < 4, 9.0, 0.0))}) is None
 
 
@@ -334,7 +334,7 @@ def test_each_image_records_its_provenance():
 
 
 def hatched(pictures, name):
-    """How many of the picture's pixels are grey: the colours of its place are not, nor those of gaze."""
+    """Number of grey pixels in the picture; the colours of the scene and of gaze are not grey."""
     return sum(1 for row in pixels(pictures[name].png) for p in row if p.max() - p.min() < 3 and 60 < p.max() < 240)
 
 
@@ -365,7 +365,7 @@ def test_the_basis_of_the_gaze_is_printed():
     plain, with_basis = (drawn(three(), basis=b) for b in ("", "made of 300 rays of 3 participants"))
     for name in ("gaze", "own", "sphere"):
         a, b = (pixels(p[name].png) for p in (plain, with_basis))
-        # A line more, below the picture.
+        # One more line below the picture.
         assert b.shape[0] > a.shape[0] and b.shape[1] == a.shape[1]
         assert (b[-16:] < 128).any() and b[-16:].shape == (16, *b.shape[1:])
 
@@ -376,7 +376,7 @@ def test_floor_plans_are_drawn():
     assert "held-out" not in draw_rays(crowd(300), None, PROVENANCE)["layout"].caption
 
 
-# ---- Where a report looks from, and the paths that it draws ----
+# ---- Viewpoints of a report, and paths of participants ----
 
 
 BOX = Box((0.0, 0.0, 0.0), (8.0, 6.0, 3.0))
@@ -384,7 +384,7 @@ PLACE = TrainingGeometry(None, BOX, "none")
 
 
 class Walls:
-    """Meets the walls of the box, and a block in its middle, as an onlooker does."""
+    """A gaze sampler in a box with a block in its middle."""
 
     BLOCK = np.array([[3.0, 2.0, 0.0], [5.0, 4.0, 3.0]])
 
@@ -399,7 +399,7 @@ class Walls:
 
 
 def walkers(count=4, n=400):
-    """People who walk along x for n steps of 2 cm, ten a second."""
+    """Participants who walk along x for n steps of 2 cm, ten per second."""
     t = np.tile(np.arange(n) * 0.1, count)
     person = np.repeat(np.arange(count), n)
     origin = np.stack([np.tile(np.arange(n) * 0.02, count), 1.0 + person, np.full(n * count, 1.6)], axis=1)
@@ -429,7 +429,7 @@ def test_participants_nearby_are_counted_instead_of_rays():
     rays = walkers()
     positions = np.array([[2.0, 1.0, 1.6], [2.0, 1.5, 1.6], [2.0, 9.0, 1.6]])
     assert count_participants_near(rays, positions, PLACE, 0.55) == (1, 2, 0)
-    # In a place of other units the radius is still in metres.
+    # In a scene with another unit the radius is still in metres.
     scaled = replace(PLACE, align=Similarity(np.diag([0.1, 0.1, 0.1, 1.0])))
     assert count_participants_near(rays, 0.1 * positions, scaled, 0.55) == (1, 2, 0)
 

@@ -38,7 +38,7 @@ from tests.plugins import fields
 from tests.rays.dataset.making import DAY, assert_same, write_dataset
 from tests.workflows.recorder import Recorder
 
-# ---- Scenes written for every kind of place, each rendered as it stands ----
+# ---- Scenes written for every kind of geometry, each rendered without changes ----
 
 
 MODE = "llvm_ad_rgb"
@@ -55,7 +55,7 @@ ROOM = """<scene version="3.0.0">
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Places of all kinds around the origin, a gaze field, and rays of two people."""
+    """Geometries of all kinds around the origin, a gaze field, and rays of two participants."""
     import mitsuba as mi
 
     mi.set_variant(MODE)
@@ -70,7 +70,7 @@ def folder(tmp_path_factory):
 
 
 def rays():
-    """Two people near (0.3, 0.2, 0.1), who look at the wall x = 2 from inside of a cube of ±2."""
+    """Two participants near (0.3, 0.2, 0.1), who look at the wall x = 2 from inside a cube of ±2."""
     rng = np.random.default_rng(0)
     n = 800
     origin = rng.normal((0.3, 0.2, 0.1), 0.05, (n, 3))
@@ -81,7 +81,7 @@ def rays():
 
 
 def trained(folder, name, metadata):
-    """Save the gaze field with other provenance."""
+    """Save the gaze field with a different provenance."""
     import drjit.llvm.ad as ns
 
     field = load_gaze(folder / "gaze.safetensors", ns)[0]
@@ -90,7 +90,7 @@ def trained(folder, name, metadata):
 
 
 def shown(path, sensor=0, **values):
-    """What a sensor of a written scene shows."""
+    """The image of a sensor of a written scene."""
     scene = load_scene(path, {**SMALL, **values})
     return scene, render_channels(scene, scene.sensors()[sensor])
 
@@ -115,10 +115,10 @@ def test_geometry_with_gaze_and_an_observer(rgb, folder, tmp_path, place):
     np.testing.assert_allclose(position(scene.sensors()[1]), (0.3, 0.2, 0.1), atol=1e-6)
     np.testing.assert_allclose(position(scene.sensors()[0]), result.camera.origin, atol=1e-6)
     assert image.mask.mean() > 0.5 and image.aovs["gaze"].max() > 0 and image.color.max() > 0.01
-    # The observer's own view hides nothing from them.
+    # Nothing is occluded in the observer's own view.
     _, observer_image = shown(result.path, 1)
     assert observer_image.mask.any() and observer_image.aovs["visibility"][observer_image.mask].min() == 1
-    # What is written is relative to the folder of the scene.
+    # Written paths are relative to the folder of the scene.
     named = defaults(result.path)["gaze"]
     assert not named.startswith("/") and (tmp_path / named).samefile(folder / "gaze.safetensors")
 
@@ -164,7 +164,7 @@ def test_geometry_of_any_unit_is_visible(rgb, tmp_path, kind, scale):
     for sensor in (0, 1):
         _, image = shown(result.path, sensor)
         assert image.mask.mean() > 0.9 and image.color.mean() > 0.1
-    # Own eyes see all that is visible, whatever the unit; and near what is seen gaze fades within the place.
+    # The observer's own view sees all visible surfaces in any unit; gaze fades within the scene.
     assert image.aovs["visibility"][image.mask].min() == 1
     assert 1e-4 * np.linalg.norm(corner) < float(defaults(result.path)["falloff"]) < 0.1 * np.linalg.norm(corner)
     assert any("light leaks" in line for line in recorder.warnings) == (kind in ("mesh", "scene") and scale < 1)
@@ -183,7 +183,7 @@ def test_an_unbounded_field_is_shown(rgb, tmp_path):
     field = RadianceField.random(config, box, _ns(), march_step=0.1, march_growth=1 / 64)
     save_radiance(field, tmp_path / "far.safetensors", {"up": [0, 1, 0]})
     result = write_scene([tmp_path / "far.safetensors"], tmp_path / "a.xml", SceneOptions(mode=MODE))
-    # The camera stands in the inner cube, and up is what the photos said.
+    # The camera is in the inner cube, and up is the direction from the photos.
     assert np.abs(result.camera.origin).max() <= 2 and defaults(result.path)["up"] == "0, 1, 0"
     _, image = shown(result.path)
     assert image.mask.mean() > 0.5
@@ -219,7 +219,7 @@ def test_hit_points_become_coloured_geometry(rgb, folder, tmp_path):
     assert [path.name for path in result.files] == ["a.xml", "a.color.vol"]
     np.testing.assert_allclose(result.observer.origin, (0.3, 0.2, 0.1), atol=0.1)
     _, observer_image = shown(result.path, 1)
-    # The wall fills what they look at, at its distance, in the grey of walls along x.
+    # The wall fills the view, at its distance, in the grey of walls along x.
     middle = observer_image.mask[4:8, 7:11]
     assert middle.all() and observer_image.aovs["depth"][6, 9] == pytest.approx(1.7, abs=0.25)
     assert observer_image.color[6, 9, 0] == pytest.approx(0.34, abs=0.03)
@@ -238,12 +238,12 @@ def test_rays_alone_show_attention(rgb, folder, tmp_path, geometry):
     if geometry == "none":
         np.testing.assert_allclose(sphere.aovs["depth"], 2, atol=1e-3)
         np.testing.assert_allclose(result.camera.origin, result.observer.origin)
-    # Attention is at the viewed point, the middle of the sphere's picture, and not behind them.
+    # Attention is at the viewed point, the centre of the panorama, and not behind the observer.
     assert sphere.aovs["kde"][3:5, 7:9].min() > 10 * max(sphere.aovs["kde"][:, 0].max(), 1e-6)
 
 
 def test_an_observer_facing_along_up_is_valid(rgb, folder, tmp_path):
-    """Until they are turned to the gaze, and then as well: up is where all of it goes."""
+    """Before and after the observer is turned to the gaze, which all points up."""
     options = SceneOptions(geometry="none", up=(1.0, 0.0, 0.0), mode=MODE)
     result = write_scene([folder / "rays.npz"], tmp_path / "a.xml", options)
     ahead = result.observer.target - result.observer.origin
@@ -260,7 +260,7 @@ def test_rays_in_another_frame_are_aligned(rgb, folder, tmp_path):
     np.testing.assert_allclose(result.observer.origin, matrix[:3, :3] @ nearest + matrix[:3, 3], atol=1e-6)
     ahead = result.observer.target - result.observer.origin
     np.testing.assert_allclose(ahead, matrix[:3, :3] @ rays().direction[200], atol=1e-6)
-    # Up of the rays, +z, is +x of the place, and a metre two units.
+    # The up direction +z of the rays is +x of the scene, and a metre is two units.
     values = defaults(result.path)
     assert values["up"] == "1, 0, 0" and values["falloff"] == "0.1"
     _, observer_image = shown(result.path, 1)
@@ -272,7 +272,7 @@ def test_explicit_cameras_are_used(rgb, folder, tmp_path):
     options = SceneOptions(camera=(0, 0, 1.5), target=(0, 0, -1), fov=50, width=30, mode=MODE)
     result = write_scene(files, at, options)
     np.testing.assert_allclose(result.camera.target, (0, 0, -1))
-    # It looks straight down, and has an up all the same.
+    # It looks straight down, and still has an up direction.
     scene = load_scene(at)
     assert np.isfinite(np.array(scene.sensors()[0].world_transform().matrix)).all()
     assert tuple(scene.sensors()[0].film().crop_size()) == (30, 20)
@@ -338,7 +338,7 @@ def test_a_gaze_field_alone_needs_an_observer(rgb, folder, tmp_path):
     assert image.mask.all() and image.aovs["gaze"].max() > 0 and len(np.unique(image.color.round(3))) > 1
 
 
-# ---- Rays of a file and of a dataset, as a scene shows them ----
+# ---- Rays of a file and of a dataset in a scene ----
 
 
 @pytest.fixture
@@ -360,7 +360,7 @@ def test_rays_of_a_file_are_used_unchanged(tmp_path):
 
 
 def test_a_sample_of_a_dataset_is_stored_next_to_the_scene(parquet, tmp_path, monkeypatch):
-    """A sample misses most moments of a person, all of whose rays are read for an eye."""
+    """All rays of a participant are read for the eye position, since a sample would miss most times."""
     _, rays = write_dataset(tmp_path)
     recorder = Recorder()
     loaded = scene.load_scene_rays(tmp_path / "shop.rays", tmp_path / "a.xml", recorder)
@@ -376,7 +376,7 @@ def test_a_sample_of_a_dataset_is_stored_next_to_the_scene(parquet, tmp_path, mo
 
 
 def test_a_scene_is_written_from_a_dataset(parquet, rgb, tmp_path):
-    """Named by its place as well; the scene renders, and a person is found in it."""
+    """The dataset can also be named by a path in it; the scene renders, and contains a participant."""
     write_dataset(tmp_path)
     options = SceneOptions(person="p2_1", time=DAY + 2 * 43_200 + 3.0, geometry="none")
     made = write_scene([tmp_path / "shop.rays" / "place=shop"], tmp_path / "a.xml", options)
@@ -393,7 +393,7 @@ def test_a_folder_with_the_output_name_is_refused(parquet, tmp_path):
         scene.check_rays(tmp_path / "shop.rays", tmp_path / "a.xml")
 
 
-# ---- From files and folders to the scene that a viewer shows ----
+# ---- From files and folders to the scene of the viewer ----
 
 
 MESH = "v -1 -1 0\nv 1 -1 0\nv 0 1 0\nf 1 2 3\n"
@@ -459,7 +459,7 @@ def test04_two_files_of_one_kind_are_reported(rgb, tmp_path, rays_file):
 
 
 def test05_one_place_of_a_dataset_is_shown(parquet, rgb, tmp_path):
-    """As everywhere, a dataset is named by its folder, or by that of a place in it."""
+    """As in all commands, a dataset is named by its folder, or by a folder of an environment in it."""
     _, rays = write_dataset(tmp_path)
     (tmp_path / "a.obj").write_text(MESH)
     for name in ("shop.rays", "shop.rays/place=shop"):
@@ -481,7 +481,7 @@ def test06_several_gaze_fields_are_variants(rgb, tmp_path):
         and place.made
         and not recorder.warnings
     )
-    # Where a name is taken, the folder's is put before it; a field of other geometry is reported.
+    # A repeated name gets the folder's name as a prefix; a field with another geometry is reported.
     shutil.copy(run / "a.safetensors", tmp_path / "a.safetensors")
     metadata = {"provenance": {"field_file": {"file": "x", "sha256": "y"}}}
     write_checkpoint(tmp_path / "c.safetensors", "gaze", {"a": np.zeros(1, np.float32)}, metadata)
@@ -489,7 +489,7 @@ def test06_several_gaze_fields_are_variants(rgb, tmp_path):
     variants = write_variants(store, files, tmp_path, recorder)
     assert list(variants) == ["a", f"{tmp_path.name}/a", "c"]
     assert len(recorder.warnings) == 1 and "another scene" in recorder.warnings[0]
-    # Of fields alone a scene is made, in the place of their training.
+    # For fields alone a scene is made with the geometry of their training.
     shutil.copy(store.parent / "store.safetensors", run / "store.safetensors")
     place = make_viewer_scene([run], tmp_path)
     assert place.made and list(place.variants) == ["a", "b"]

@@ -1,4 +1,4 @@
-"""Cameras, observers and places of scene files that are written."""
+"""Cameras, observers and geometries of written scene files."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ from nerg_mi.workflows.scene_places import (
 from tests.formats.splats.writers import random_splats, write_inria
 from tests.workflows.recorder import Recorder
 
-# ---- What is looked around with before a camera is chosen: directions, depths and bounds of a known room ----
+# ---- Panoramas from which a camera is chosen: directions, depths and bounds of a known room ----
 
 
 EYE = LookAt(np.array([0.3, -0.2, 0.1]), np.array([1.0, 0.6, 0.4]))
@@ -52,7 +52,7 @@ EYE = LookAt(np.array([0.3, -0.2, 0.1]), np.array([1.0, 0.6, 0.4]))
 
 @pytest.fixture
 def probe(rgb, tmp_path):
-    """A cube of ±1, whose up is +y."""
+    """A cube of ±1, with +y up."""
     up = np.array([0.0, 1, 0])
     place = SceneContent(scene_children=(element("shape", type="cube"),))
     (tmp_path / "a.xml").write_text(SceneText(place, GazeFiles(), EYE, EYE, up).to_xml())
@@ -65,7 +65,7 @@ def test_the_probe_measures_its_surroundings(probe):
         np.broadcast_to(EYE.origin, seen.directions.shape), seen.directions, -np.ones(3), np.ones(3)
     )
     assert seen.is_hit.all() and np.sum(seen.solid_angle) == pytest.approx(4 * np.pi)
-    # Pixels are sampled anywhere in them: a few degrees.
+    # Pixels are sampled at random positions, so directions vary by a few degrees.
     assert np.quantile(np.abs(seen.depth - far) / far, 0.95) < 0.08
     depth, opacity = probe.trace(EYE.origin[None], np.array([[1.0, 0, 0]]))
     assert depth[0] == pytest.approx(0.7) and opacity[0] == 1
@@ -77,7 +77,7 @@ def test_the_probe_measures_its_surroundings(probe):
 
 @pytest.mark.parametrize("depths, length", [((0, 0), 1), ((0, 4), 4), ((3, 5), 3)], ids=["within", "next to", "before"])
 def test_observers_inside_matter_face_a_positive_distance(depths, length):
-    """They meet it at once; what they are turned to still lies before them, at a distance of what is met elsewhere."""
+    """Their rays hit at once; the target is still in front of them, at a distance of hits in other directions."""
     directions = np.array([[0.6, 0.8, 0], *[[0, 0, 1.0]] * 3])
     depth = np.array([depths[0], *[depths[1]] * 3], float)
     seen = SeenSurfaces(EYE.origin, directions, depth, np.ones(4, bool), np.array([9.0, 0, 0, 0]), np.ones(4))
@@ -99,7 +99,7 @@ def test_points_and_up_axes():
 
 
 def test_the_best_photo_is_selected(probe):
-    # Of three cameras in the cube one has the whole of it before it, one a wall, and one looks out of it.
+    # Of three cameras in the cube, one sees all of it, one a wall, and one looks out of it.
     poses = [((0.9, 0, 0), (1, 0, 0)), ((-0.9, 0.1, 0.1), (0, 0.1, 0.1)), ((3, 0, 0), (4, 0, 0))]
     views = [LookAt(np.array(o, float), np.array(t, float)) for o, t in poses]
     cameras = [PhotoCamera(str(k), eye, Lens(), False) for k, eye in enumerate(views)]
@@ -108,7 +108,7 @@ def test_the_best_photo_is_selected(probe):
 
 @pytest.mark.parametrize("room", [False, True], ids=["a thing", "a room"])
 def test_objects_are_viewed_from_outside_and_rooms_from_inside(rgb, tmp_path, room):
-    """A cube whose faces look outwards is a thing, one whose faces look inwards a room."""
+    """A cube with outward faces is an object, one with inward faces a room."""
     place = SceneContent(
         scene_children=(element("shape", element("boolean", name="flip_normals", value=str(room)), type="cube"),)
     )
@@ -125,7 +125,7 @@ def test_objects_are_viewed_from_outside_and_rooms_from_inside(rgb, tmp_path, ro
     assert (np.abs(shot.origin).max() < 1) == room and shot.surface_fraction > 0.2
 
 
-# ---- Observers: participants at a time, walks, and where most rays are ----
+# ---- Observers: participants at a time, walks, and the position with most rays ----
 
 
 # Half as large, turned by 90 degrees about z, moved.
@@ -193,7 +193,7 @@ def test_the_densest_viewpoint_is_selected():
     assert np.linalg.norm(support_of_rays(rays).find_densest_position() - (5, 5, 1.6)) < 0.15
 
 
-# ---- What files are, by what is in them, and what goes together ----
+# ---- Types of files by their content, and valid combinations ----
 
 
 ONE = {"a": np.zeros(1, np.float32)}
@@ -348,7 +348,7 @@ def test_all_photo_cameras_are_loaded(photos):
         np.testing.assert_array_equal(camera.eye.origin, load_photo_camera(photos, str(k), {}).eye.origin)
 
 
-# ---- Places as parts of a scene: colours of meshes, lamps, and files that are no such place ----
+# ---- Geometries as parts of a scene: colours of meshes, lamps, and files of other types ----
 
 
 PLY = """ply
@@ -446,7 +446,7 @@ def test_hit_points_of_one_cell_are_shaded(tmp_path, shape):
     colors = np.fromfile(colors_path(tmp_path / "out.xml"), "<f4", offset=48)
     assert np.isfinite(colors).all() and (colors > 0.1).all()
     if shape.count(1) == 1:
-        # A sheet faces along the axis in which it has no extent.
+        # The normal of a sheet is along the axis in which it has no extent.
         assert np.allclose(colors, [0.55, 0.16, 0.34][shape.index(1)], atol=0.02)
 
 

@@ -45,11 +45,11 @@ def test01_statistics_match_a_loop_over_rays(folder):
         (row,) = table(result.aois, cell="all", aoi=name)
         assert row["source"] == "measured" and row["participants"] == 6
         assert row["share"] == pytest.approx(np.mean(shares)) and row["hit_ratio"] == np.mean([s > 0 for s in shares])
-        # Every ray stands for 0.2 s, the last one too.
+        # Each ray represents 0.2 s, including the last one.
         assert row["dwell"] == pytest.approx(16 * np.mean(shares))
         far = np.array([at for _, at in hits])
         assert row["distance"] == pytest.approx(far[on].mean(), rel=1e-5)
-        # Looks that are one ray apart or more are two, since a fifth of a second lies between.
+        # Hits separated by at least one ray are two visits, because the gap is at least 0.2 s.
         visits = firsts = 0.0
         reached = 0
         for p in range(6):
@@ -121,19 +121,19 @@ def test04_predicted_and_recorded_statistics_and_what_if(folder, tmp_path):
     options = StatisticsOptions(aois=folder / "areas.json", what_if=folder / "changes.json", **FAST)
     recorder = Recorder()
     result = statistics([folder / "scene.xml", folder / "rays.npz"], tmp_path / "out", options, recorder)
-    # A shape as a thing is still the scene's, by its name.
+    # A shape that is an AOI keeps its name in the scene.
     assert result.what_if
     field = table(result.aois, cell="all", source="predicted")
     assert len(field) == 3 and all(0 < r["share"] < 1 and r["visits"] is None for r in field)
     assert field[2]["share"] == pytest.approx(field[0]["share"] + field[1]["share"], rel=0.02)
     rows = {(r["aoi"], r["measure"]): r for r in result.what_if}
-    # The stand stood before the sign.
+    # The stand occluded the sign.
     sign = rows["the sign", "visible"]
     assert sign["source"] == "predicted" and sign["after"] > sign["before"] and sign["participants"] == 6
     assert rows["new", "share"]["before"] is None and rows["new", "share"]["after"] > 0
     assert rows["the sign", "share"]["after"] != rows["the sign", "share"]["before"]
     assert recorder.messages.count(f"of {folder / 'tile.obj'}: unused statements: usemtl") == 1
-    # Its checkpoint says nothing of what it learnt from.
+    # Its checkpoint has no training provenance.
     assert (
         any("does not contain training support" in text for text in recorder.messages) and field[0]["support"] is None
     )
@@ -229,7 +229,7 @@ def test10_datasets_give_the_statistics_of_files(folder, tmp_path):
     scene = folder / "bare" / "scene.xml"
     a = statistics([scene, tmp_path / "day.rays"], options=options).aois
     b = statistics([scene, nerg.import_rays(tmp_path / "day.csv", columns=columns)], options=options).aois
-    # Origins in a dataset are of single precision.
+    # A dataset stores origins in single precision.
     assert [r["share"] for r in a] == pytest.approx([r["share"] for r in b], abs=0.01) and tracking
 
 

@@ -31,7 +31,7 @@ from tests.tasks.clusters import ClusterOfProcesses, wait_until
 from tests.tasks.works import lay_out
 from tests.workflows.recorder import Recorder
 
-# ---- The study as a job: which settings it takes, and its messages ----
+# ---- The study as a job: its settings and messages ----
 
 
 @pytest.mark.nightly
@@ -41,7 +41,7 @@ def test_a_study_can_run_some_settings(tmp_path):
     result = run_study("slab", tmp_path, options, recorder)
     report = result.report
     assert [r["setting"] for r in report["rows"]] == ["default", "jitter", "paper, 1024 steps"]
-    # Of the share done the first renders have as much as the times, and the cost against size the rest.
+    # The first renders and the timings have equal shares of the progress, and the scaling has the rest.
     shares = [share for share, _ in recorder.steps]
     assert shares == sorted(shares) and shares[0] == 0 and shares[-1] < 1
     assert 0.4 < recorder.share_at("time of default") < 0.5 and 0.8 < recorder.share_at("pixels 16") < 1
@@ -49,7 +49,7 @@ def test_a_study_can_run_some_settings(tmp_path):
     assert all(path.is_file() for path in result.files) and recorder.messages[0].startswith("default: ")
 
 
-# ---- A study in parts: errors of two workers are those of this process, and who took the times is said ----
+# ---- A study in parts: errors of two workers equal those of this process, and the timing machine is reported ----
 
 
 SMALL = {"width": 12, "height": 8, "quick": True, "mode": "llvm_ad_rgb"}
@@ -101,7 +101,7 @@ def test_a_worker_measures_a_scene_and_its_mesh_in_its_folder(rgb, tmp_path):
     assert errors(measured | {"scaling": []}) == errors(expected) and measured["rows"][1]["surface_mae"] > 0
 
 
-# ---- The demo as a job: its stages, and its result. `tests/cli/test_scenes` looks at the pictures ----
+# ---- The demo as a job: its stages and its result; `tests/cli/test_scenes` tests the pictures ----
 
 
 @pytest.mark.nightly
@@ -117,7 +117,7 @@ def test_the_demo_reports_each_stage_and_writes_each_file(tmp_path):
 
 @pytest.mark.nightly
 def test_the_demo_report_contains_the_tracked_gaze(tmp_path):
-    """Of the store's own field; what is written of the observer is theirs alone, as without."""
+    """With the field of the store; the values of an observer do not depend on other observers."""
     result = make_demo(tmp_path, DemoOptions(width=24, spp=1, mode="llvm_ad_rgb"))
     text = (tmp_path / "report.html").read_text("utf-8")
     rays = Rays.load(tmp_path / demo.TRACKED)
@@ -129,11 +129,11 @@ def test_the_demo_report_contains_the_tracked_gaze(tmp_path):
     )
     with (tmp_path / "aoi.csv").open() as file:
         shares = np.array([float(row["observer_share"]) for row in csv.DictReader(file)])
-    # Of one observer, who sees some of the shelves: of three people together hardly any would have none.
+    # For one observer, who sees some of the shelves; three observers together would see almost all.
     assert len(shares) == 30 and (shares == 0).sum() > 8 and 0 < shares.sum() < 1
 
 
-# ---- The job: which evidence is taken, what is refused, what is written ----
+# ---- The alignment as a job: evidence, refused input and output files ----
 
 
 RAYS = rooms.people(300)
@@ -205,7 +205,7 @@ def test_up_axis_and_initial_alignment_give_the_same_frame(tmp_path, monkeypatch
 
 def place(alignment_check, monkeypatch):
     monkeypatch.setattr(geometry, "check_alignment", lambda *_: alignment_check)
-    return TrainingGeometry(object(), Box((0, 0, 0), (1, 1, 1)), "field")  # pyright: ignore[reportArgumentType] # not asked
+    return TrainingGeometry(object(), Box((0, 0, 0), (1, 1, 1)), "field")  # pyright: ignore[reportArgumentType] # unused argument
 
 
 def test_gaze_that_hits_no_surface_is_refused_and_doubts_are_reported(monkeypatch):

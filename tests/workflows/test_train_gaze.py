@@ -25,7 +25,7 @@ from nerg_mi.workflows.train_gaze import check_plan, plan_gaze, train_gaze
 from nerg_mi.workflows.train_radiance import train_radiance
 from tests.train.gaze.looks import BOX, RAYS, looking_at
 
-# ---- The training of a gaze field, and by its command: places, recipes, hold-out, resumption, messages ----
+# ---- The training of a gaze field, also by its command: geometries, recipes, hold-out, resuming, messages ----
 
 
 QUICK = GazeOptions(geometry="none", radius=0.5, probes=6, min_rays=8, steps=3, directions=64, zones=0)
@@ -58,7 +58,7 @@ def rays():
 
 
 def nerg(capsys, *arguments):
-    """Exit code of a command, and what it said on the standard output and on the standard error."""
+    """Exit code of a command, and its standard output and standard error."""
     with pytest.raises(SystemExit) as end:
         main(["train", "gaze", *map(str, arguments)])
     said = capsys.readouterr()
@@ -132,7 +132,7 @@ def test_function_and_command_write_equal_files(rays, tmp_path, capsys):
 
 @pytest.mark.parametrize("recipe", ["default", "small", "paper"])
 def test_recipes_in_a_scene_of_shapes(rays, tmp_path, recipe):
-    """The wall as a shape: its exact distance, and what looks past it escapes."""
+    """The wall as a shape: its distance is exact, and rays that miss it escape."""
     (tmp_path / "scene.xml").write_text(WALL)
     size = "small" if recipe == "paper" else None
     options = replace(QUICK, geometry=None, scene=tmp_path / "scene.xml", recipe=recipe, size=size, steps=2)
@@ -151,7 +151,7 @@ def test_recipes_in_a_scene_of_shapes(rays, tmp_path, recipe):
 
 
 def test_a_registered_recipe_trains_from_function_and_command(rays, tmp_path, monkeypatch, capsys):
-    """A second log density, which is one entry: hold-out, ensembles and ablation know it by that."""
+    """A second log density in the registry: hold-out, ensembles and ablation find it by its entry."""
     from nerg_mi.workflows.ablation import ablate
     from nerg_mi.workflows.gaze_commands import AblationOptions
 
@@ -201,7 +201,7 @@ def test_held_out_positions_and_participants_are_reported(tmp_path):
 
 
 def test_an_interrupted_training_returns_a_result_or_reports_how_to_resume(rays, tmp_path):
-    """Without a file it is all that can be had; with one, a script must not go on as if it were done."""
+    """Without an output file an interrupted field is returned; with one, the interrupt stops the script."""
     options = replace(QUICK, steps=8, fresh=True, threads=1, variant="capture")
     result = train_gaze(rays, options=options, reporter=Listener(0.5))
     assert result.interrupted and result.provenance["steps"] == 4
@@ -280,7 +280,7 @@ def test_an_output_is_locked_during_training(tmp_path, train):
         train(tmp_path / "nothing", tmp_path / "a.safetensors")
 
 
-# ---- Options of a gaze training: what goes together, and what of it arrives in the plan ----
+# ---- Options of a gaze training: valid combinations, and their values in the plan ----
 
 
 HITS = GazeOptions(geometry="hits")
@@ -342,7 +342,7 @@ def test_every_option_reaches_the_plan():
     names = {}
     for part in (plan.settings, plan.probes):
         names |= {f.metadata.get("option") or f.name: getattr(part, f.name) for f in fields(part)}
-    # Directions of a batch are another setting than those of a probe.
+    # The directions of a batch and of a probe are different settings.
     assert {name: names[name] for name in settings} == settings and plan.probes.directions == 33
     c = plan.config
     assert (c.variant, c.activation, c.grid.levels, c.normalized) == ("emit", "exp", 16, True)

@@ -1,4 +1,4 @@
-"""A scene with a field, a gaze and an observer, so small that a picture takes a second."""
+"""A scene with a field, a gaze field and an observer, small enough to render in a second."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ MODE = "llvm_ad_rgb"
 
 
 def write_scene(folder: Path, name: str = "scene.xml") -> Path:
-    """Write it into ``folder``, which is made, with its fields."""
+    """Create ``folder``, and write the scene and its fields to it."""
     import mitsuba as mi
 
     mi.set_variant(MODE)

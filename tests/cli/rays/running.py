@@ -14,7 +14,7 @@ def run(*arguments):
 
 
 def write_walk(path):
-    """Four people on a 4 x 3 m floor, a minute each, who look at something two metres away; a stop at the end."""
+    """Four participants on a 4 x 3 m floor, a minute each, who look at a target two metres away and stop at the end."""
     rng = np.random.default_rng(0)
     n = 3000
     origin = np.concatenate(
@@ -22,7 +22,9 @@ def write_walk(path):
     )
     d = rng.normal(size=(4 * n, 3)) * 0.02 + np.repeat(np.eye(3)[[0, 1, 0, 1]], n, axis=0)
     d /= np.linalg.norm(d, axis=1, keepdims=True)
-    t = np.tile(np.arange(n) * 0.02, 4) + np.repeat(np.arange(4) * 1e-5, n)  # no two times alike: a ray is known by it
+    t = np.tile(np.arange(n) * 0.02, 4) + np.repeat(
+        np.arange(4) * 1e-5, n
+    )  # all times differ, so that they identify rays
     rays = Rays(t, np.repeat(np.arange(4), n), tuple("abcd"), origin, d, np.ones(4 * n), origin + 2 * d)
     rays.save(path)
     return path

@@ -108,7 +108,7 @@ def test_a_wrong_tick_is_reported_and_no_output_is_nan(tmp_path, tick, words):
     done = run("import", tmp_path / "ms.csv", "-o", tmp_path / "r.npz", *MAP, "--tick", tick)
     said = " ".join(done.output.split())
     assert done.exit_code == 0 and "nan" not in said and words in said, said
-    # People have rays at many times, however far apart these are taken to be.
+    # Participants have rays at many times for any assumed unit of time.
     assert f"{1 / (20 * tick):.4g} Hz" in said and "at two times" not in said, said
     assert ("(--tick" in said) == bool(words)
 
