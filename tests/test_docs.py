@@ -1,4 +1,4 @@
-"""What the pages say of options, defaults, names and versions is what the code has."""
+"""Options, defaults, names and versions in the pages agree with the code."""
 
 from __future__ import annotations
 
@@ -69,13 +69,13 @@ def test06_tests_that_are_named_exist():
 
 
 def _first_round(line: str) -> str:
-    """A line of a shell, where it is a loop what it does first."""
+    """A line of a shell; for a loop, the commands of its first iteration."""
     loop = re.fullmatch(r"for (\w+) in (\S+).*?; do (.*); done", line)
     return loop[3].replace(f"${loop[1]}", loop[2]) if loop else line
 
 
 def commands(text: str) -> list[list[str]]:
-    """The words of each command of nerg and of Python that stands in a block of a page, or in a line as a whole."""
+    """The words of each command of nerg or Python in the code blocks of a page, or in inline code."""
     fenced = re.findall(r"^```sh\n(.*?)^```", text, re.M | re.S)
     prose = re.sub(r"^```.*?^```", "", text, flags=re.M | re.S)
     blocks = "\n".join([*fenced, *re.findall(r"^ {4}(.*)", prose, re.M)])
@@ -98,7 +98,7 @@ def test07_commands_are_found():
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
 def test08_commands_are_right_as_they_stand(page):
     for program, *words in commands(page.read_text(encoding="utf-8")):
-        if program == "nerg" and words[0].startswith("-"):  # what the program does at once is not done here
+        if program == "nerg" and words[0].startswith("-"):  # an option such as --version, which is not run here
             assert len(words) == 1 and words[0] in options(), words
             continue
         if program == "nerg":
@@ -111,7 +111,7 @@ def test08_commands_are_right_as_they_stand(page):
         module = words[0] == "-m"
         script = words[1].removeprefix("nerg_mi.").replace(".", "/") + ".py" if module else words[0]
         text = (ROOT / script).read_text(encoding="utf-8")
-        # Options that several scripts have come from a parser in a module next to them.
+        # Options that several scripts share are defined in a module next to them.
         for sibling in re.findall(r"^from (\w+) import .*_parser\b", text, re.M):
             text += (ROOT / script).with_name(f"{sibling}.py").read_text(encoding="utf-8")
         valid = re.findall(r'"(--[a-z][a-z0-9-]*)"', text)
@@ -167,7 +167,7 @@ def test13_every_network_connection_is_named(page):
 
 
 def said(file: str, pattern: str) -> str:
-    """What the first line of ``file`` that matches ``pattern`` says."""
+    """The first match of ``pattern`` in ``file``."""
     match = re.search(pattern, (ROOT / file).read_text(encoding="utf-8"), re.M)
     assert match, f"{file} has no line {pattern}"
     return match[1]
@@ -221,7 +221,7 @@ def test22_what_is_public_is_documented(path):
 
 
 def test23_what_functions_give_is_listed():
-    """The classes of results, by the annotations of what returns them."""
+    """The classes of results, from the annotations of functions that return them."""
     returned = set()
     for function in filter(inspect.isfunction, PUBLIC):
         returned |= set(re.findall(r"\b[A-Z]\w+", str(inspect.signature(function).return_annotation)))
@@ -230,11 +230,11 @@ def test23_what_functions_give_is_listed():
     assert returned - names <= {"RadianceField", "AnyGazeField", "Figure", "None"}
 
 
-# ---- Parts of pages that are made of the code ----
+# ---- Generated parts of pages ----
 
 
 def test_every_page_is_up_to_date():
-    # In a process of its own: other tests register what is made up.
+    # In a separate process, because other tests register fictitious entries.
     done = subprocess.run(
         [sys.executable, "-m", "tools.generated", "--check"], cwd=ROOT, capture_output=True, text=True
     )

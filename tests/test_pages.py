@@ -60,7 +60,7 @@ class Block:
 
     @property
     def lines(self) -> list[str]:
-        """The lines of a shell, those that go on joined, a loop as what it repeats."""
+        """The commands of a shell block: continued lines are joined, and a loop is replaced by its body."""
         joined = re.sub(r"\\\n\s*", " ", self.text).splitlines()
         return [re.sub(r"^for \w+ in .*?; do (.*); done$", r"\1", line.strip()) for line in joined if line.strip()]
 
@@ -73,7 +73,7 @@ def run(text: str, page: str, names: dict | None = None) -> dict:
 
 
 def blocks(*languages: str, page: str = "") -> list[Block]:
-    """The blocks of the pages, of these languages or all, of this page or all."""
+    """The code blocks of one page or all pages, in some languages or all."""
     matches = []
     for path in PAGES:
         for _, language, text in re.findall(r"^( *)```([^\n`]*)\n(.*?)^ *```", path.read_text("utf-8"), re.M | re.S):
@@ -122,7 +122,7 @@ XML_PAGES = ("figures.md", "performance.md", "plugins.md", "environments.md")
 
 @pytest.fixture
 def place(rgb, standins, tmp_path, monkeypatch):
-    """A folder with what snippets name: stand-ins of the store's fields, a scene of them, rays."""
+    """A folder with the files that snippets name: stand-ins of the store's fields, a scene with them, and rays."""
     from tests.evaluation.test_gaze import crowd
     from tests.formats.splats.writers import random_splats, write_inria
 
@@ -137,7 +137,7 @@ def place(rgb, standins, tmp_path, monkeypatch):
 
 
 def as_scene(text: str) -> str:
-    """A snippet within what it stands in."""
+    """A snippet within its context."""
     if text.lstrip().startswith("<scene"):
         return text
     if text.lstrip().startswith("<volume"):
@@ -235,12 +235,12 @@ def write_photos(folder: Path, nerg) -> None:
     (folder / "transforms.json").write_text(json.dumps(metadata))
 
 
-# ---- Pages whose blocks lead from one to the next, on the store's own files or on stand-ins of its fields ----
+# ---- Pages with consecutive blocks, on the files of the store or on stand-ins of its fields ----
 
 
 @pytest.fixture
 def clone(rgb, tmp_path, monkeypatch):
-    """``clone(name, ...)``: a folder with these files of the demo store, as a clone has them, where code runs."""
+    """``clone(name, ...)``: a working folder with these files of the demo store, as in a clone."""
 
     def make(*names: str) -> Path:
         store = tmp_path / "scenes" / "store"
@@ -263,7 +263,7 @@ def with_smaller_image(text: str) -> str:
 
 @pytest.fixture
 def readme(clone):
-    """The scene and the checkpoints; random ones where the store has none."""
+    """The scene and the checkpoints; random ones if the store has none."""
     block = list(demo.CHECKPOINTS.values())
     has_own = all(demo.find_store_scene().with_name(name).is_file() for name in block)
     store = clone("scene.xml", *(block if has_own else ()))
@@ -298,7 +298,7 @@ def test12_a_sign(clone, capsys):
     assert len(said) == 6 and said[0].endswith("see more than half of it")
     seen, share = names["seen"], names["share"]
     assert len(share) == 12 and np.all((share >= 0) & (share < 0.2)) and share.max() > 1e-4
-    # The third aisle sees it best, and what nobody can see attracts nobody.
+    # It is seen best from the third aisle; an invisible object attracts no gaze.
     assert seen.reshape(4, 3).mean(axis=1).argmax() == 2
     assert np.all(share[seen == 0] < 0.3 * share.max())
 
@@ -320,7 +320,7 @@ def test13_gradients(clone):
 
 
 def shoppers(people: int = 5, each: int = 60) -> Rays:
-    """People in the aisles who look about."""
+    """Participants in the aisles who look around."""
     rng = np.random.default_rng(0)
     n = people * each
     origin = np.column_stack([rng.choice([2.75, 4.55, 6.3], n), rng.uniform(0.8, 4.8, n), np.full(n, 1.6)])
@@ -331,7 +331,7 @@ def shoppers(people: int = 5, each: int = 60) -> Rays:
 
 
 def test14_a_shop(rgb, tmp_path, monkeypatch):
-    """The page's own settings, on fewer people, places and directions."""
+    """The settings of the page, with fewer participants, positions and directions."""
     monkeypatch.chdir(tmp_path)
     for name in ("shapes.xml", "twin.ply", "twin_lights.ply", "shoppers.safetensors"):
         shutil.copy(demo.find_store_scene().with_name(name), tmp_path)
@@ -379,7 +379,7 @@ def test17_clusters(capsys):
 
 
 def test18_python(rgb, tmp_path, monkeypatch):
-    """Thirty lines lead from loading to a plotted share of attention; then fields are saved, and asked."""
+    """Thirty lines lead from loading to a plot of attention shares; then fields are saved and evaluated."""
     import matplotlib
 
     import nerg_mi as nerg
@@ -395,7 +395,7 @@ def test18_python(rgb, tmp_path, monkeypatch):
         if text is texts[0]:
             share = np.array(list(names["share"].values()))
             assert share.shape == (4, 8) and (share >= 0).all() and (share.sum(axis=0) < 1.1).all()
-            # Those who come nearer to the coolers look at them more.
+            # Participants who come nearer to the coolers look at them more.
             assert share.max() > 0.01 and share[3, -1] > share[3, 0]
             assert names["view"].gaze.shape == (2, 16, 24)
     assert (tmp_path / "attention.png").stat().st_size > 10_000
@@ -419,7 +419,7 @@ SMALLER = {
 
 
 def quick_start() -> list[str]:
-    """The commands of the page; the viewer serves until somebody ends it: tests/viewer tries it."""
+    """The commands of the page, without the viewer, which runs until it is stopped; see tests/viewer."""
     lines = [line for block in blocks("sh", page="quickstart.md") for line in block.lines]
     return [line for line in lines if line.startswith("nerg ") and not line.startswith("nerg view")]
 
@@ -450,5 +450,5 @@ def test21_commands_of_the_quick_start(rgb, clone, tmp_path, capsys):
         assert not end.value.code, (line, capsys.readouterr().err)
         for name in re.findall(r"-o (\S+)", line):
             assert (tmp_path / name).stat().st_size > 0, line
-    # What the guess prints stands on the page.
+    # The page contains the output of the guess.
     assert "preset skeleton" in (ROOT / "docs" / "tutorials" / "quickstart.md").read_text(encoding="utf-8")

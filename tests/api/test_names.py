@@ -122,7 +122,7 @@ def test07_examples_run(name, tmp_path, request):
     assert results.failed == 0, "".join(said)
 
 
-# ---- The API takes the variant that is set, and sets one only where there is none ----
+# ---- The API uses the active variant, and sets one only if there is none ----
 
 
 def test01_default_variant_is_set():
@@ -144,7 +144,7 @@ def test03_scalar_variants_are_refused(rgb):
         activate_mitsuba()
 
 
-# ---- What comes in from NumPy and what goes out to it ----
+# ---- Conversion from and to NumPy ----
 
 
 def test01_points_of_every_shape():
@@ -216,7 +216,7 @@ def test07_copies():
     assert np.array_equal(pickle.loads(pickle.dumps(result)).color, result.color)
 
 
-# ---- A camera in a few numbers, and what is refused ----
+# ---- Cameras from a few numbers, and refused values ----
 
 
 def test01_the_middle_of_the_picture_is_the_target(rgb):

@@ -18,7 +18,7 @@ from tests.pictures import box_dict
 from tests.plugins import fields
 from tests.workflows.recorder import Recorder
 
-# ---- Attention on boxes, meshes and shapes: what it adds up to, and what hides it ----
+# ---- Attention on boxes, meshes and shapes: sums and occlusion ----
 
 
 BOX = [(-0.2, 1.8, -0.1), (0.2, 2.2, 0.1)]
@@ -270,7 +270,7 @@ def test14_statistics_viewer_and_report_agree(room):
     assert report.share[0, 1] == pytest.approx(viewer["corner"], rel=0.03) and viewer["corner"] > 1e-3
 
 
-# ---- One observer of a scene: what is known of them, and the density of their gaze ----
+# ---- One observer of a scene, and the density of their gaze ----
 
 
 def test01_the_density_is_the_fields(scene, rgb):
@@ -299,7 +299,7 @@ def test03_without_a_gaze_field_there_is_no_density(files):
         observer.eval_gaze(None, None, None, True)
 
 
-# ---- What rays meet and what observers see of points: against pictures, and where the answer is known ----
+# ---- Hits of rays and visibility of points: compared with pictures and closed forms ----
 
 
 BALL = {"type": "sphere", "radius": 0.5}

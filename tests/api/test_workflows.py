@@ -63,11 +63,11 @@ def test02_rays_in_memory_and_in_a_file_are_one(rgb, tmp_path):
         bake(tmp_path / "room.ply", rays=rays, smoth=0.1)
 
 
-# ---- Options are passed on to the jobs; that these work is shown by the examples (test_names) ----
+# ---- Options are passed on to the jobs; the examples (test_names) run the jobs ----
 
 
 class Request(Exception):
-    """Ends a job before it begins, with what it was asked."""
+    """Ends a job before it starts; holds its options."""
 
 
 LLVM = {"mode": "llvm_ad_rgb"}
@@ -203,7 +203,7 @@ def test04_progress_is_reported(table):
     assert any("day.csv" in text for text in messages)
 
 
-# ---- What comes back of a training is a field in memory with its provenance ----
+# ---- A training returns a field in memory with its provenance ----
 
 
 @pytest.mark.nightly

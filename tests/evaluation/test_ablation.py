@@ -91,7 +91,7 @@ def test_the_loss_is_the_papers():
     assert row["test_MAE"] == pytest.approx(np.abs(truth - result).mean()) and row["test_KLD"] > 0
 
 
-# ---- The time of a frame: of what there is to render, and without the first one, which compiles ----
+# ---- The time of a frame, without the first one, which compiles ----
 
 BOX = Box((-1, -1, -1), (1, 1, 1))
 CENTRES = np.array([[0.1, 0, 0.2], [-0.2, 0.1, 0]])

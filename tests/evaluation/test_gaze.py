@@ -113,7 +113,7 @@ def test_cached_baseline_evaluates_equal_arrays_once():
         first[0] = 0
 
 
-# ---- Evaluation of gaze: truth from persons, scores against closed forms, what is held out ----
+# ---- Evaluation of gaze: truth from participants, scores against closed forms, held-out data ----
 
 
 def crowd(n=3000, people=4, seed=0):

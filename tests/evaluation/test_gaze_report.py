@@ -33,7 +33,7 @@ from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.probes.probes import REGION_LEVELS, calibrate_levels, compute_region_levels, format_level
 from tests.evaluation.test_gaze import crowd
 
-# ---- What an evaluation of gaze writes: cells by hand, files that are valid, and pictures of what was asked for ----
+# ---- Output of an evaluation of gaze: cells computed by hand, valid files, and requested pictures ----
 
 ROWS = [
     {
@@ -123,7 +123,7 @@ def test_pictures_are_on_the_scale_of_the_reference(tmp_path, monkeypatch):
         assert shown[0].shape == (8, 16) and np.allclose(2 * shown[0], row * shown[1], rtol=0.6)
 
 
-# ---- Results are read as they were written, and what is none is a sentence ----
+# ---- Results are read as written, and other files are refused with one sentence ----
 
 RESULTS_ROWS = [
     {"method": "gaze field", "bits": 0.5, "KLD": float("nan")},

@@ -39,7 +39,7 @@ def test_compilation_of_the_second_frame_is_not_timed(monkeypatch):
     assert calls == ["render"] * 4 + ["timed"] * 2
 
 
-# ---- What is counted: operations that are traced, whatever the machine ----
+# ---- Counts of traced operations, on any machine ----
 
 
 def test_operation_count_grows_with_work_but_not_lanes():
@@ -55,7 +55,7 @@ def test_earlier_computations_are_not_counted():
     assert count_traced_operations(lambda: y) == 0
 
 
-# ---- The paper's marching: what it counts, what it paints, and that leaving empty cells loses nothing ----
+# ---- The paper's marching: counts, images, and skipping of empty cells without loss ----
 
 
 @pytest.fixture
@@ -96,7 +96,7 @@ def test_the_picture_tends_to_the_true_one_and_is_black_without_radiance(seen):
 
 
 def test_deferred_fields_evaluate_colour_once_per_ray(rgb, tmp_path):
-    """And its picture converges to that of ``nerg``."""
+    """The picture converges to that of ``nerg``."""
     fields.radiance(tmp_path / "f.safetensors", deferred=True)
     field = {"type": "nerf", "filename": str(tmp_path / "f.safetensors")}
     made = rgb.load_dict({"type": "nerg", "field": field, "aovs": "depth,opacity,color_evals", "step": 2e-3})
@@ -180,7 +180,7 @@ def test_the_papers_depth_is_unnormalised_and_at_the_steps_end():
     assert half.any() and np.all(seen["depth"][half] < 0.95 * truth.depth[half])
 
 
-# ---- The rows of a study: sweeps that are even on log axes, and what a row's name promises ----
+# ---- The rows of a study: sweeps with even steps on log axes, and settings that match the names of rows ----
 
 
 @pytest.fixture(scope="module")

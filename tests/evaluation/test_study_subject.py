@@ -56,7 +56,7 @@ def test_settings_round_trip(rgb):
     assert named - NONE_OF_A_STUDY == set(options) and NONE_OF_A_STUDY < named and np.isfinite(result["step"])
 
 
-# ---- What a study knows of its subjects: where surfaces are, and the limit that a scene file is compared with ----
+# ---- Subjects of a study: their surfaces, and the reference of a scene file ----
 
 SCENE = """<scene version="3.0.0">
   <integrator type="nerg"><volume name="density" type="constvolume"><float name="value" value="40"/></volume>

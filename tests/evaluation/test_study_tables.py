@@ -11,7 +11,7 @@ from matplotlib.colors import to_rgba
 from nerg_mi.evaluation import study_tables
 from nerg_mi.evaluation import study_tables as study_plots
 
-# ---- The pictures of a study: what is drawn, asked of matplotlib's figures ----
+# ---- The figures of a study: content of matplotlib's figures ----
 
 
 @pytest.fixture
@@ -76,7 +76,7 @@ def test_cost_is_drawn_over_named_axes_with_the_exponent(drawn):
     assert [a.get_title() for a in drawn[1].axes] == [a.get_title() for a in panels]
 
 
-# ---- What follows from a study's rows: Pareto fronts, and the comparison with the paper's marching ----
+# ---- Results from the rows of a study: Pareto fronts, and the comparison with the paper's marching ----
 
 
 def test_pareto():

@@ -161,7 +161,7 @@ def test_a_grid_tends_to_its_density():
     assert off[1] < off[0] / 6 < 1e-2
 
 
-# ---- The study of a scene of shapes alone: its reference, and what it finds ----
+# ---- The study of a scene of shapes alone: its reference and its results ----
 
 SCENE = """<scene version="3.0.0">
   <integrator type="nerg">
@@ -236,7 +236,7 @@ def test05_shapes_without_triangles_are_refused(tmp_path, scene, capsys):
     )
 
 
-# ---- Gaussian splats as a subject of a study: what is set of them, and what they are compared with ----
+# ---- Gaussian splats as a subject of a study: their settings and their reference ----
 
 SPLATS_SCENE = """<scene version="3.0.0"><integrator type="nerg"><volume name="field" type="splats">
     <string name="filename" value="a.ply"/><string name="color_space" value="linear"/>

@@ -1,4 +1,4 @@
-"""Fields to run the demo on where the store's own are not made yet: the store's walls and furniture in random
+"""Fields for the demo without trained fields of the store: the store's walls and furniture in random
 colours."""
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ CELLS = 64
 
 
 def solid_cells() -> np.ndarray:
-    """Cells (z, y, x), bool, that walls or furniture fill: 13 cm wide, on the unit cube of the store's box."""
+    """Cells (z, y, x), bool, of walls or furniture: 13 cm wide, on the unit cube of the store's box."""
     from nerg_mi.scenes.store import layout
 
     from nerg_mi.maths.geometry import Box

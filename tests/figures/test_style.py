@@ -110,7 +110,7 @@ def test_the_swatch_is_hatched():
 
 # ---- Provenance ----
 #
-# What pictures say of where they come from: inputs, seed, settings, versions, and nothing of the machine.
+# Provenance of pictures: inputs, seed, settings and versions, but nothing about the machine.
 
 
 def test_provenance_is_complete(tmp_path):

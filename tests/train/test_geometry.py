@@ -36,7 +36,7 @@ from nerg_mi.transport.volume_medium import VolumeMedium
 from tests.formats.splats.writers import random_splats
 from tests.train.gaze.looks import looking_at
 
-# ---- Places of hit points that reach far: an office with windows, in closed form ----
+# ---- Geometries of distant hit points: an office with windows, in closed form ----
 
 ROOM = np.array([[0.0, 0.0, 0.0], [8.0, 6.0, 3.0]])
 WINDOW = np.array([[1.0, 0.8], [5.0, 2.4]])
@@ -177,7 +177,7 @@ def test_hits_seen_from_outside_of_the_box_are_left_out(rays_hit_extent, extent)
     assert not density.any()
 
 
-# ---- Places made of hit points: their surfaces are where rays ended ----
+# ---- Geometries of hit points: surfaces are where rays ended ----
 
 
 @pytest.fixture
@@ -238,7 +238,7 @@ def test_odd_and_empty_volumes():
     np.testing.assert_allclose(upper, [5, 6, 9])  # A voxel is 1 wide
 
 
-# ---- Places: frames and boxes, and damaged files of hit points (Mitsuba believes their headers) ----
+# ---- Geometries: frames and boxes, and damaged files of hit points (Mitsuba trusts their headers) ----
 
 
 @pytest.fixture

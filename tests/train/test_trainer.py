@@ -25,7 +25,7 @@ from nerg_mi.train.radiance_trainer import RadianceTrainer
 from nerg_mi.train.trainer import StepClock
 from tests.train.radiance.ball import BOX, TINY, settings, state, trainer
 
-# ---- A training that is killed and resumed comes to what an uninterrupted one comes to ----
+# ---- A killed and resumed training equals an uninterrupted one ----
 
 
 def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(dataset, one_thread, tmp_path):
@@ -169,7 +169,7 @@ def test_a_damaged_state_is_reported_with_its_name(dataset, tmp_path, change):
         load_run(t, tmp_path / "b.run", {"sha": 1})
 
 
-# ---- The clock of a training's steps: what it gives to a state, and which states are none of its own ----
+# ---- The clock of a training: stored times, and states of other runs ----
 
 
 def timed(*seconds):
@@ -202,7 +202,7 @@ def test_steps_without_durations_and_durations_without_steps_are_refused(change)
         StepClock().restore({**timed(0.5, 0.25).to_dict(), **change})
 
 
-# ---- What a machine's speed changes: nothing at equal steps ----
+# ---- The speed of a machine changes nothing for equal steps ----
 
 
 def test_a_run_by_minutes_equals_a_run_by_steps(dataset, one_thread, monkeypatch):

@@ -1,4 +1,4 @@
-"""A user-defined gaze field: what a surface attracts, times how often a direction is looked in."""
+"""A user-defined gaze field: the attraction of a surface times the frequency of a direction."""
 
 from dataclasses import dataclass, field
 from typing import ClassVar

@@ -63,7 +63,7 @@ from tests.plugins.scenes import camera, look_at, with_gaze
 from .looks import BOX, LENS, NOWHERE, PROBES, RAYS, around, lobe, looking_at, train, view
 from .looks import SMALL as PLAIN
 
-# ---- Batches: what is gathered of which probe, integrals, and densities given a view ----
+# ---- Batches: gathered probes, integrals, and densities within a view ----
 
 
 @pytest.fixture
@@ -115,7 +115,7 @@ def test_targets_without_observers_are_refused():
         TargetArrays(GazeTargets(np.zeros((0, 3)), np.zeros((0, 4, 3)), none, none, none.astype(bool)), ns)
 
 
-# ---- The blind density: of rays by person or by ray, and put together from views ----
+# ---- The position-independent prior: from rays, by participant or by ray, and from views ----
 
 
 def test_prior_weights_participants_or_rays():
@@ -244,7 +244,7 @@ def test_prior_is_only_made_if_required(rays, wall):
     assert narrow.max() > wide.max() + 0.5
 
 
-# ---- Gaze fields that learn on a radiance field's features, and such that begin as its trunk ----
+# ---- Gaze fields with features of a radiance field, or initialised from it ----
 
 
 def gaze_config(radiance, variant="emit_capture", **options):
@@ -356,7 +356,7 @@ def test_features_of_training_are_those_of_rendering(rgb, radiance, tmp_path, mo
     np.testing.assert_allclose(rendered[hits], trained, atol=2e-3 * np.abs(trained).max())
 
 
-# ---- What a training leaves out: positions and people of a test, zones of a validation, views near either ----
+# ---- Held-out data: test positions and participants, validation zones, and views near them ----
 
 
 def test_held_out_positions_are_purged():
@@ -434,7 +434,7 @@ def test_views_alone_are_split_for_validation():
     assert split.views_held_out == 80 - len(split.training.views) >= len(split.validation.views) > 0
 
 
-# ---- What is learnt from: at least something, told apart by digests, and its support ----
+# ---- Training data: non-empty, identified by digests, with support ----
 
 
 def test_the_support_is_of_all_rays_in_the_frame_of_the_place():
@@ -449,7 +449,7 @@ def test_the_support_is_of_all_rays_in_the_frame_of_the_place():
     assert Supervision(None, around(1)).make_support(0.5, NOWHERE) is None
 
 
-# ---- Targets: what escapes, features for those who need them, two sets in one ----
+# ---- Targets: escaping rays, features if needed, and merged sets ----
 
 
 def test_misses_are_counted_by_directions_and_by_gaze():
@@ -474,7 +474,7 @@ def test_features_are_those_of_a_radiance_field():
         )
 
 
-# ---- Views as targets: what they hold, likelihood and losses given a view, a law learnt from views ----
+# ---- Views as targets: content, likelihood and losses within a view, and training from views ----
 
 VIEW_TARGETS_PROBES = ProbeSettings(directions=512, radius=0.25, min_rays=1)
 
@@ -587,7 +587,7 @@ def test_rays_and_views_train_one_field():
         assert all(np.isfinite(np.array(v)).all() for v in field.parameters().values())
 
 
-# ---- Where observers meet surfaces: what escapes ends on the box, or at the depth around it ----
+# ---- Hits of observers' rays: escaping rays end on the box, or at the neighbouring depth ----
 
 
 def test_misses_end_at_the_box(wall):

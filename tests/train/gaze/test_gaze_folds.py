@@ -31,7 +31,7 @@ from nerg_mi.train.gaze_trainer import KIND, StateSettings
 
 from .looks import LIKELIHOOD, LOG, NOWHERE, planned
 
-# ---- The share of the blind density: chosen by people and places that are held out ----
+# ---- The prior weight: selected by held-out participants and positions ----
 
 PROBES_HERE = ProbeSettings(radius=0.3, count=48, min_rays=1, kappa=20.0, directions=128, weights="person")
 

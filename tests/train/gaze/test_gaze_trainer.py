@@ -38,7 +38,7 @@ from .looks import (
     train,
 )
 
-# ---- Fits: what is kept of them, when they end, how long the second one is ----
+# ---- Fits: selected weights, early stopping, and the length of the refit ----
 
 NO_FILE = GazeRunFile(None, {})
 
@@ -117,7 +117,7 @@ def test_a_schedule_in_minutes_is_converted_to_steps(targets_fit, monkeypatch, s
     assert fit.schedule == 5 and fit.best_step == min(stopped, 5)
 
 
-# ---- Plans: what a run must agree on to be gone on with ----
+# ---- Plans: settings that must match to resume a run ----
 
 MOVED = replace(NOWHERE, align=Similarity(np.diag([2.0, 2, 2, 1])))
 
@@ -143,7 +143,7 @@ def test_run_identities_differ(name, plan, supervision, place, identity):
     assert {k for k in other if other[k] != base.get(k)} == {name}
 
 
-# ---- A gaze training that is interrupted and resumed comes to what an uninterrupted one comes to ----
+# ---- An interrupted and resumed gaze training equals an uninterrupted one ----
 
 
 @pytest.mark.parametrize(
@@ -261,7 +261,7 @@ def test_a_result_that_cannot_be_written_is_saved(wall, refit, threads, tmp_path
         np.testing.assert_array_equal(np.array(value), np.array(expected[name]), err_msg=name)
 
 
-# ---- What is kept of the weights ----
+# ---- Averaged weights ----
 
 
 @pytest.fixture
@@ -287,7 +287,7 @@ def test_the_result_is_the_average_of_the_weights(targets_trainer, average):
     assert average == 0 or np.abs(expected["emit_head.0"] - trainer.optimiser["emit_head.0"].numpy()).max() > 1e-4
 
 
-# ---- The field for a place where nobody was tracked: how high people look elsewhere ----
+# ---- The elevation prior for a scene without tracking, from other scenes ----
 
 
 def looking(directions, person=None) -> Rays:
@@ -338,7 +338,7 @@ def test_elevation_prior_does_not_depend_on_position():
     assert not field.config.needs_surfaces
 
 
-# ---- Whole runs: fresh directions, the blind density ----
+# ---- Whole runs: resampled directions, the position-independent prior ----
 
 
 def test_directions_are_fresh_in_every_epoch(wall, monkeypatch):

@@ -64,7 +64,7 @@ def test_transparent_pixels_count_as_outside():
     assert compute_outside_fraction([view], lambda v: seen, Box((-9, -9, -9), (9, 9, 0))) == 1
 
 
-# ---- The error on views that are not learnt from: of which pixels, of which colours ----
+# ---- The error on held-out views: evaluated pixels and colours ----
 
 
 def test_masked_pixels_do_not_count(dataset):
@@ -96,7 +96,7 @@ def test_both_errors_are_those_of_the_rendered_view(dataset):
         assert error.psnr_fitted[k] == pytest.approx(color_corrected_psnr(seen, truth, alpha), rel=1e-6)
 
 
-# ---- Whole radiance trainings: they learn, and show how they do ----
+# ---- Whole radiance trainings: they converge, and report their progress ----
 
 
 @pytest.mark.slow
@@ -139,7 +139,7 @@ def test_resuming_needs_a_state(dataset):
         train_field(dataset, TINY, settings(steps=1), ns, resume=True)
 
 
-# ---- A training says when its result is worse than it might be ----
+# ---- Warnings about poor results of a training ----
 
 
 def make_history(*psnr):
@@ -229,7 +229,7 @@ def test_nothing_is_compiled_once_fog_has_cleared(dataset):
     assert not kernels_of_a_run(t)
 
 
-# ---- A place without an end: a ball before a far wall ----
+# ---- An unbounded scene: a ball in front of a far wall ----
 
 FAR = 6.0
 

@@ -124,7 +124,7 @@ def test_empty_cells_and_empty_pictures():
     assert not seen.color.any() and not seen.opacity.any() and not seen.depth.any() and seen.color.shape == (9, 13, 3)
 
 
-# ---- The radiance trainer on a tiny place: it repeats itself, and its gradients are right ----
+# ---- The radiance trainer on a tiny scene: reproducibility, and correct gradients ----
 
 DEFERRED = replace(TINY, deferred=True)
 
@@ -333,7 +333,7 @@ def test_incomplete_rays_do_not_count(dataset, monkeypatch):
     assert 0 < covered < count and trainer.loss.numpy()[0] == pytest.approx(1, rel=1e-5)
 
 
-# ---- How much a training step takes on follows samples, within its bounds ----
+# ---- The number of rays per step follows the number of samples, within limits ----
 
 STRIDES = (16, 8, 4, 2)
 
@@ -411,7 +411,7 @@ def test_stride_refinement_waits_for_clearing():
     assert refine_stride(16, (16,), 1, 0.99 * fits / 8, limit) == 1
 
 
-# ---- What a radiance training is asked for: sizes, schedules, and what is refused ----
+# ---- Settings of a radiance training: sizes, schedules, and refused values ----
 
 
 def test_settings_and_sizes_are_checked():
