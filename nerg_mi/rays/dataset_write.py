@@ -401,7 +401,7 @@ def _write_parts(task: ImportTask, digests: SourceDigests) -> tuple[SourceWriter
     `_Unchanged`.
     """
     recipe = task.recipe
-    # A known path is likely unchanged: hash it first. A new file may be no recording: read its first rays first.
+    # A known path is likely unchanged: hash it first. A new file may not be a recording: read its first rays first.
     writer = None if task.previous is None else _make_writer(task, digests)
 
     def write_block(rays: Rays) -> None:

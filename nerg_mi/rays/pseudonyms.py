@@ -61,7 +61,7 @@ def pseudonymise(rays: Rays, salt: bytes | None = None) -> Rays:
     """Replace the name of each participant by a pseudonym (``p`` and 16 hexadecimal digits).
 
     Rays are sorted by pseudonym, since their former order would reveal that of the names. In the metadata, files get
-    aliases (``f`` and digits, suffixes kept) and HMACs instead of checksums, and names of participants are replaced
+    aliases (``f``, digits and the suffix) and HMACs instead of checksums, and names of participants are replaced
     wherever they occur, also within words. Cohorts, times, origins, directions and hit points are not changed.
 
     Parameters

@@ -241,7 +241,7 @@ class DensityGrid:
         -----
         A cell with a point above the threshold is occupied, and so are its neighbours, so that a bump between the
         probes of a face is not cut. The threshold, in 1/unit, is the density that absorbs ``self.threshold`` in one
-        training step. Of these cells those are kept that contribute, or touch one that does. All others are empty by
+        training step. Of these cells, only those that contribute or touch such a cell remain. All others are empty by
         definition, because no picture constrains them.
         """
         dense_cells = dr.zeros(self.ns.UInt8, self.resolution**3)

@@ -40,7 +40,7 @@ class CacheEntry:
     value: Any
 
 
-# Observers whose scalars are kept.
+# Maximum number of observers whose scalars are cached.
 _MAX_SCALARS = 256
 _Position = tuple[float, float, float]
 
