@@ -1,7 +1,7 @@
 """Radiance fields trained on photos: PSNR, SSIM and depth of held-out views, rendered by the integrator.
 
     python benchmarks/radiance.py fox [--minutes 1,2,4,7,10] [--width 135] [--deferred] [--validate]
-                                       [--set lr_hold_fraction=0.5]
+        [--set lr_hold_fraction=0.5]
     python -m nerg_mi.scenes.store.make --stage views          # once: images of the store, rendered from the twin
     python benchmarks/radiance.py store [--minutes 10] [--size medium] [--only images|depth]
     python -m nerg_mi.scenes.tabletop.make                     # once: photos, rendered from a generated scene

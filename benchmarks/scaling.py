@@ -61,8 +61,10 @@ def bake(folder: Path, detail: float, name: str, **overrides) -> tuple[int, byte
 
     out = folder / f"{name}.ply"
     gaze = files(store) / "shoppers.safetensors"
-    arguments = {"gaze": gaze, "path": folder / "path.csv", "detail": detail, "angle": 2.0, "mode": "llvm_ad_rgb"}
-    result = bake(folder / "room.ply", [out], BakeOptions(**arguments, **overrides))
+    options = BakeOptions(
+        gaze=gaze, observer_file=folder / "path.csv", max_edge=detail, max_angle=2.0, mode="llvm_ad_rgb", **overrides
+    )
+    result = bake(folder / "room.ply", [out], options)
     return len(result.mesh.faces), out.read_bytes()
 
 

@@ -163,7 +163,7 @@ class TorchTrainer:
             o.append(np.broadcast_to(v.camera.center.astype(np.float32), e.shape))
             c.append(v.color[..., :3].reshape(-1, 3))
         self.o, self.d, self.c = (torch.from_numpy(np.concatenate(a).astype(np.float32)) for a in (o, d, c))
-        self.edges = {k: torch.from_numpy(np.array(ours.table(k).edges.numpy())) for k in (*self.s.strides, 1)}
+        self.edges = {k: torch.from_numpy(np.array(ours.get_step_table(k).edges.numpy())) for k in (*self.s.strides, 1)}
         g = ours.grid
         self.seen, self.value, self.bits = (torch.from_numpy(np.array(x.numpy())) for x in (g.seen, g.value, g.bits))
         self.bits, self.turn, self.r = self.bits.bool(), 0, g.resolution
@@ -218,7 +218,7 @@ class TorchTrainer:
         t, length = start[ray, k], length[ray, k]
         with torch.no_grad():
             tau = (self.model.sigma(p) * length).clamp(max=60)
-        selected = (-self.before(tau, ray)).exp() > s.stop
+        selected = (-self.before(tau, ray)).exp() > s.min_transmittance
         return ray[selected], t[selected], length[selected], p[selected]
 
     def before(self, x, ray):
@@ -236,7 +236,7 @@ class TorchTrainer:
             self.update()
         index = torch.randint(len(self.o), (self.rays,), generator=self.generator)
         o, d, truth = self.o[index], self.d[index], self.c[index]
-        ray, _, length, p = self.samples(o, d, s.stride(self.progress))
+        ray, _, length, p = self.samples(o, d, s.stride_at(self.progress))
         self.steps += 1
         covered = self.rays
         if len(ray) > s.batch:
@@ -265,7 +265,7 @@ class TorchTrainer:
         self.optimiser.zero_grad()
         loss.backward()
         for group in self.optimiser.param_groups:
-            group["lr"] = s.rate(self.progress)
+            group["lr"] = s.learning_rate_at(self.progress)
         self.optimiser.step()
         if self.steps % 4 == 0:
             decay = min(s.ema_decay, (1 + self.steps) / (10 + self.steps)) ** 4
