@@ -102,8 +102,8 @@ COMMANDS = (
 class Tally:
     """Results of the tries of a command.
 
-    ``landed`` of the ``tried`` kills hit it while it ran; ``lost`` counts missing or damaged files, ``started``
-    successful starts, ``left`` hidden files of killed writers.
+    ``hit`` of the ``tried`` kills hit it while it ran; ``lost`` counts missing or damaged files, ``restarted``
+    successful restarts, ``left`` hidden files of killed writers.
     """
 
     tried: int = 0
@@ -335,7 +335,7 @@ def run_kills(work: Path, inputs: Path, tries: int, only: str) -> list[list[obje
         tallies.append(tally)
         rows.append(_make_row(f"SIGKILL: `nerg {command.name}`", tally))
         print(" | ".join(map(str, rows[-1])), file=sys.stderr, flush=True)
-    every = Tally(*(sum(getattr(t, n) for t in tallies) for n in ("tried", "landed", "lost", "started", "left")))
+    every = Tally(*(sum(getattr(t, n) for t in tallies) for n in ("tried", "hit", "lost", "restarted", "left")))
     return [*rows, _make_row("SIGKILL, all", every)]
 
 
@@ -362,7 +362,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _write_inputs_in_process(inputs: Path) -> None:
-    """Run `prepare` in its own process, because it initialises Mitsuba."""
+    """Run `write_inputs` in its own process, because it initialises Mitsuba."""
     inputs.mkdir()
     pid = os.fork()
     if pid == 0:
