@@ -49,7 +49,7 @@ class Population:
         self.pairs = result
         self.truth = {k: x.sum(axis=0) / y.sum(axis=0) for k, (x, y) in result.items()}
         self.common = self.truth["hit_ratio"] >= 0.5
-        self.count = len(result["reach"][0])
+        self.count = len(result["hit_ratio"][0])
 
     def draw(self, measure: str, who: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         x, y = self.pairs[measure]
@@ -210,8 +210,7 @@ class Held:
 
 
 HEAD = (
-    "| participants | coverage | minimum over AOIs | median width | without interval "
-    "| coverage, rare AOIs | minimum over AOIs | median width | without interval |\n"
+    "| people | held | worst AOI | width | without | held, rare | worst | width | without |\n"
     "| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |"
 )
 
@@ -241,8 +240,8 @@ def few_intervals(x: np.ndarray, y: np.ndarray, seed: int) -> dict:
     from nerg_mi.statistics.estimates import estimate_ratios
 
     selected = estimate_ratios(x, y, resamples=RESAMPLES, seed=seed)
-    value, _, people = estimates._linear(x, y)
-    difference = estimates._left_out(x, y, value, people)
+    value, _, people = estimates._linearize(x, y)
+    difference = estimates._jackknife(x, y, value, people)
     error, square = np.sqrt((difference**2).sum(axis=0)), difference**2
     c = (selected.high - value) / error
     few = (people <= len(x) / 2) & (np.where(y > 0, y, np.inf).min(axis=0) < y.max(axis=0))
@@ -285,10 +284,7 @@ def differences(population: Population, sets: int, pairs: tuple[tuple[int, int],
     """Rate at which two groups of one population are found to differ, p <= 0.05, before and after the adjustment."""
     from nerg_mi.statistics.estimates import estimate_proportion_differences, estimate_ratio_differences
 
-    print(
-        "\n| participants | statistic | p <= 0.05 | maximum over AOIs | p <= 0.05, rare AOIs | maximum over AOIs "
-        "| sets with a false discovery |"
-    )
+    print("\n| people | statistic | p <= 0.05 | worst AOI | rare | worst | a set has a false discovery |")
     print("| --- | --- | ---: | ---: | ---: | ---: | ---: |")
     for m, n in pairs:
         rng, result, wrong = np.random.default_rng([m, n]), defaultdict(list), []
