@@ -210,7 +210,8 @@ class Held:
 
 
 HEAD = (
-    "| people | held | worst AOI | width | without | held, rare | worst | width | without |\n"
+    "| participants | coverage | minimum over AOIs | median width | without interval "
+    "| coverage, rare AOIs | minimum over AOIs | median width | without interval |\n"
     "| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |"
 )
 
@@ -284,7 +285,10 @@ def differences(population: Population, sets: int, pairs: tuple[tuple[int, int],
     """Rate at which two groups of one population are found to differ, p <= 0.05, before and after the adjustment."""
     from nerg_mi.statistics.estimates import estimate_proportion_differences, estimate_ratio_differences
 
-    print("\n| people | statistic | p <= 0.05 | worst AOI | rare | worst | a set has a false discovery |")
+    print(
+        "\n| participants | statistic | p <= 0.05 | maximum over AOIs | p <= 0.05, rare AOIs | maximum over AOIs "
+        "| sets with a false discovery |"
+    )
     print("| --- | --- | ---: | ---: | ---: | ---: | ---: |")
     for m, n in pairs:
         rng, result, wrong = np.random.default_rng([m, n]), defaultdict(list), []

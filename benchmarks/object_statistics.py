@@ -123,10 +123,10 @@ def errors() -> None:
             if near < far and far > 0 and near - 0.03 <= depth[i] < far + 0.03:
                 dwell[rays.person[i], k] += weight
                 reached[rays.person[i], k] = 1
-    print("| statistic | against | largest error |\n| --- | --- | ---: |")
+    print("| statistic | reference | maximum error |\n| --- | --- | ---: |")
     largest = np.abs(people.dwell_time - dwell).max()
-    print(f"| dwell [s], each participant and AOI | plain loops, ray casts to the twin | {largest:.2g} |")
-    print(f"| hit ratio, each participant and AOI | the same | {np.abs(people.hit_probability - reached).max():.2g} |")
+    print(f"| dwell time [s] per participant and AOI | plain loops, ray casts to the twin | {largest:.2g} |")
+    print(f"| hit ratio per participant and AOI | the same | {np.abs(people.hit_probability - reached).max():.2g} |")
     # Fractions of the law, by quadrature over the sphere at some positions, next to the field's and a large sample.
     rows = np.linspace(0, len(walks.origin) - 1, 160).round().astype(int)
     d = fibonacci_directions(8192)
@@ -203,9 +203,10 @@ def errors() -> None:
         exact[n] = np.bincount(targets.aoi_index, weights=free, minlength=exact.shape[1]) > 0
     agree = (seen == exact).mean()
     print(
-        f"| visible or not, {seen.size:,} pairs | ray casts from the eye positions | {100 * (1 - agree):.2f} % differ |"
+        f"| visible or not, {seen.size:,} pairs | ray casts from the recorded positions | {100 * (1 - agree):.2f} % "
+        "differ |"
     )
-    print(f"| visible share, each AOI | the same | {np.abs(seen.mean(axis=0) - exact.mean(axis=0)).max():.2g} |")
+    print(f"| visible share per AOI | the same | {np.abs(seen.mean(axis=0) - exact.mean(axis=0)).max():.2g} |")
 
 
 def main() -> None:
