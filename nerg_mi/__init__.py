@@ -5,8 +5,8 @@
     scene = nerg.make_scene("store.safetensors", "shoppers.safetensors", camera=nerg.Camera((7, 3, 2), (5, 4, 1)))
     pictures = nerg.render(scene, observers=[(4.4, 2.8, 1.6)])
 
-`docs/python.md` introduces the interface; each name of `__all__` has an example in its docstring. A Mitsuba variant
-that is already set is kept. Otherwise the first call that needs a variant sets ``cuda_ad_rgb`` if it works, and
+`docs/reference/python.md` introduces the interface; each name of `__all__` has an example in its docstring. A Mitsuba
+variant that is already set is kept. Otherwise the first call that needs a variant sets ``cuda_ad_rgb`` if it works, and
 ``llvm_ad_rgb`` if not.
 
 Importing this package makes its plugins available to Mitsuba: before or after `import mitsuba`, before or after

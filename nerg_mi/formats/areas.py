@@ -582,7 +582,7 @@ def _parse_non_box(entry: AreaEntry, path: Path) -> list[Area]:
         return _read_objects(entry, path)
     name = entry.name
     if not isinstance(name, str):
-        raise NergError(f"an area needs a name, as in {_READING_EXAMPLE}")
+        raise NergError(f'an area without "adt" needs a name, as in {_READING_EXAMPLE}')
     check_area_name(name)
     if "mesh" in definition:
         file = resolve_mesh_path(definition["mesh"], path)

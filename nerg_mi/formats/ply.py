@@ -38,7 +38,7 @@ _DTYPES = {
 
 @dataclass(frozen=True, eq=False)
 class PlyTable:
-    """An element of a file.
+    """An element of a PLY file.
 
     Attributes
     ----------

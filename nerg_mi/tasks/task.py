@@ -177,10 +177,10 @@ def _iter_members(value: Any) -> Iterator[tuple[str, Any]]:
 
 
 def find_inputs(value: Any, checksums: Checksums, prefix: str = "value") -> dict[str, InputFile]:
-    """Find the files of all paths in ``value``, by absolute path.
+    """Return the files of all `Path` and `FileGroup` objects in ``value``, by absolute path; strings are ignored.
 
-    Members of a `FileGroup` get names relative to the group; another file is named by its position in the value. Raises
-    `NergError` for a file that cannot be read.
+    Members of a `FileGroup` get names relative to the group; another file is named by its position in ``value``. All
+    names begin with ``prefix``. Raises `NergError` for a file that cannot be read.
     """
     groups: list[tuple[str, FileGroup]] = []
     single_paths: list[tuple[str, Path]] = []

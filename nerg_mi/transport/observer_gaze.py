@@ -470,9 +470,11 @@ class ObservedGaze:
     def evaluate_with_distance(
         self, p_o: Point3f, r_o: Vector3f, miss_depths: MissDepths | None = None
     ) -> tuple[list[Float], Float]:
-        """`evaluate_members_along`, and the distance of the surface along each direction, infinite without one.
+        """`evaluate_members_along`, and the distance of the surface in each direction, infinite where there is no
+        surface.
 
-        ``miss_depths``: those of the observer, if they have been traced.
+        ``miss_depths``: depths for directions without a surface, from `ObserverTracer.trace_miss_depths`; None traces
+        them if the field needs them.
         """
         gaze, distance, escaped = self._look(p_o, r_o, miss_depths)
         if not self._instance.field.config.needs_surfaces:

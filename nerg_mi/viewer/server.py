@@ -114,8 +114,8 @@ class RequestGuard:
     def response_headers(self, path: str, host_header: str, port: int) -> dict[str, str]:
         """Return headers to add to a response to ``path``.
 
-        They stop the page from contacting other machines, and set the token as a cookie. ``host_header`` is the Host
-        header of the request.
+        They stop the page from contacting other machines and the browser from caching, and set the token as a cookie if
+        the query of ``path`` contains it. ``host_header`` is the Host header of the request.
         """
         headers = {
             "Content-Security-Policy": _POLICY.format(sockets=f"ws://{host_header} wss://{host_header}"),

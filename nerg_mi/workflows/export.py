@@ -91,7 +91,10 @@ def import_checkpoint(
         field.occupancy = refine_occupancy(field) or field.occupancy
     if output is not None:
         if field is None:
-            raise NergError(f'"{file}" contains a gaze field without its NeRF: import the NeRF from its own file')
+            raise NergError(
+                f'"{file}" contains a gaze field but no NeRF: write it with --gaze alone, without -o, and import the '
+                "NeRF from its own file"
+            )
         save_radiance(field, output, origin, options.half)
         reporter.message(_describe_field(field, origin))
         _report_written(output, reporter)

@@ -110,7 +110,7 @@ LINES = {
     "export torch-ngp f.safetensors -o {o}/a.pth": "torch-ngp cannot represent this field",
     "import ngp.pth": "no output is given",
     "import ngp.pth -g {o}/g.safetensors": "contains no gaze field",
-    "import nerg.pth -o {o}/a.safetensors": "without its NeRF",
+    "import nerg.pth -o {o}/a.safetensors": "a gaze field but no NeRF",
     "import ngp.pth -o {o}/a.safetensors --ema": "no moving averages",
     "import ngp.pth -o {o}/a.safetensors --color-space xyz": "color_space",
     "poses photos/0.png -o {o}/a": "is a single photo",

@@ -96,5 +96,7 @@ def _read_frame_times(folder: Path, builder: RaysBuilder) -> np.ndarray | None:
     builder.begin_source(path)
     rows = builder.read_all(path, ["frame_idx", "timestamp"])
     if not np.array_equal(rows[:, 0], np.arange(len(rows))):
-        raise NergError(f'the frames in "{path}" are not numbered 0, 1, 2, ...; convert the recording again')
+        raise NergError(
+            f'the frames in "{path}" are not numbered 0, 1, 2, ...; convert the recording with glassesTools again'
+        )
     return rows[:, 1] * _MILLISECOND
