@@ -75,7 +75,7 @@ class ProbeSettings(ValidatedDataclass):
     # participants.
     mix_kappa: float = setting(
         10.0,
-        "Concentration (unitless) of the kernels of the position-independent prior (recipe default).",
+        "Only for the recipe named default: concentration (unitless) of the kernels of the position-independent prior.",
         allowed=KAPPAS,
         option="prior_kappa",
     )
@@ -96,12 +96,13 @@ class GazeSettings(RunSettings):
     seed: int = setting(0, "Seed of probes, directions, weights, batches and splits.", allowed=SEEDS)
     # "likelihood" is the loss of the log density.
     loss: str = setting(
-        "paper", "Loss (recipes small and paper): paper is KLD + (1 - CC) + MAE, code is MAE + 0.1 (1 - CC)."
+        "paper",
+        "Only for the recipes small and paper: loss; paper is KLD + (1 - CC) + MAE, code is MAE + 0.1 (1 - CC).",
     )
     # KLD and CC do not depend on the integral. MAE alone pulls it to the median.
     integral: float = setting(
         1.0,
-        "Weight of the squared error of the integral over the sphere in the loss (recipes small and paper).",
+        "Only for the recipes small and paper: weight of the squared error of the integral over the sphere.",
         allowed=LOSS_WEIGHTS,
         option="integral_weight",
     )
@@ -132,8 +133,8 @@ class GazeSettings(RunSettings):
     refit: bool = setting(True, "Train again on all rays, for the number of steps that validation found best.")
     mix_folds: int = setting(
         0,
-        "Number of cross-validation folds over participants and positions that choose the weight of the "
-        "position-independent prior (recipe default); 0: the weight is 0.05.",
+        "Only for the recipe named default: number of cross-validation folds over participants and positions that "
+        "choose the weight of the position-independent prior; 0: no folds, the weight is 0.05.",
         allowed=Range(0, 1000),
         option="prior_folds",
     )

@@ -118,14 +118,15 @@ class GazeOptions(DerivedOptions, GeometryOptions):
     )
     activation: str | None = option(
         None,
-        f"Output activation of the emit network (recipes small and paper): softplus, exp or linear.  {_BY_RECIPE}",
+        f"Only for the recipes small and paper: output activation of the emit network, softplus, exp or linear.  "
+        f"{_BY_RECIPE}",
         group=MODEL,
     )
     size: str | None = option(
-        None, f"Size of the networks (recipes small and paper): small or paper.  {_BY_RECIPE}", group=MODEL
+        None, f"Only for the recipes small and paper: size of the networks, small or paper.  {_BY_RECIPE}", group=MODEL
     )
     normalize: bool = option(
-        False, "Divide the density by its integral over the sphere (recipes small and paper).", group=MODEL
+        False, "Only for the recipes small and paper: divide the density by its integral over the sphere.", group=MODEL
     )
     semantic: str = option(
         "",

@@ -296,7 +296,10 @@ class PointOptions(IsosurfaceOptions):
     """Options of ``nerg export points``."""
 
     max_points: int | None = option(
-        None, "Maximum number of points.  [default: all]", within=Range(1, 10**9), group=OUTPUT
+        None,
+        "Maximum number of points; if there are more, a random selection is kept.  [default: all]",
+        within=Range(1, 10**9),
+        group=OUTPUT,
     )
 
 

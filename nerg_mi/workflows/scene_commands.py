@@ -185,7 +185,9 @@ class SceneOptions(ValidatedDataclass):
         0.5, "Longest gap between rays of the person in seconds that is interpolated over.", within=SECONDS, group=VIEW
     )
     camera: tuple[float, ...] | None = coordinates("Position of the camera, x,y,z.  [default: the best overview]")
-    target: tuple[float, ...] | None = coordinates("Point that the camera looks at, x,y,z.  [default: the attention]")
+    target: tuple[float, ...] | None = coordinates(
+        "Point that the camera at --camera looks at, x,y,z.  [default: the centre of what the observer looks at]"
+    )
     first_person: bool = option(False, "Place the camera at the observer's eye.", group=VIEW)
     photos: Path | None = option(
         None, "Photos that the radiance field was trained on; the camera is that of a photo.", group=VIEW
@@ -710,7 +712,9 @@ class ReportOptions(ValidatedDataclass):
         "Position of the observer in the images, x,y,z.  [default: where the density of rays is highest]"
     )
     camera: tuple[float, ...] | None = coordinates("Position of the camera, x,y,z.  [default: the best overview]")
-    target: tuple[float, ...] | None = coordinates("Point that the camera looks at, x,y,z.  [default: the attention]")
+    target: tuple[float, ...] | None = coordinates(
+        "Point that the camera at --camera looks at, x,y,z.  [default: the centre of what the observer looks at]"
+    )
     fov: float | None = option(
         None, "Horizontal field of view in degrees.  [default: 70]", within=FIELDS_OF_VIEW, group=VIEW
     )
