@@ -65,22 +65,33 @@ def integrate_sphere(values: Callable[[int], np.ndarray], max_directions: int, t
     tolerance : float
         Relative error at which the sum ends; 0: use ``max_directions``.
     """
-    count_first = (
+    count = first_direction_count(max_directions, tolerance)
+    while True:
+        integral = sum_sphere(values(count))
+        if count == max_directions or integral.error <= tolerance:
+            return integral
+        count = next_direction_count(integral, max_directions, tolerance)
+
+
+def first_direction_count(max_directions: int, tolerance: float) -> int:
+    """Directions of the first attempt of `integrate_sphere`."""
+    count = (
         FIRST_DIRECTIONS >> max(0, math.floor(math.log2(tolerance / USUAL_TOLERANCE) / ERROR_EXPONENT))
         if tolerance > 0
         else max_directions
     )
-    count = min(max(count_first, MIN_DIRECTIONS), max_directions)
-    while True:
-        integral = _sum(values(count))
-        if count == max_directions or integral.error <= tolerance:
-            return integral
-        # The estimated error decreases almost in proportion to the number of directions.
-        factor = min(integral.error / tolerance, max_directions / count)
-        count = min(max_directions, count << max(math.ceil(math.log2(factor)), 1))
+    return min(max(count, MIN_DIRECTIONS), max_directions)
 
 
-def _sum(values: np.ndarray) -> SphereIntegral:
+def next_direction_count(integral: SphereIntegral, max_directions: int, tolerance: float) -> int:
+    """Directions of the attempt of `integrate_sphere` that follows ``integral``, whose error exceeds the tolerance."""
+    # The estimated error decreases almost in proportion to the number of directions.
+    factor = min(integral.error / tolerance, max_directions / integral.directions)
+    return min(max_directions, integral.directions << max(math.ceil(math.log2(factor)), 1))
+
+
+def sum_sphere(values: np.ndarray) -> SphereIntegral:
+    """The integral of ``values`` (N,) in N directions of equal area, in the order of the spiral."""
     values = np.asarray(values, np.float64)
     mean = float(values.mean())
     parts = [values[k::ERROR_PARTS].mean() for k in range(min(ERROR_PARTS, len(values)))]
@@ -93,7 +104,7 @@ def _sum(values: np.ndarray) -> SphereIntegral:
 #
 # The surfaces around an observer in all directions, over which a gaze field is integrated.
 
-_MISS_DIRECTIONS = 1 << 14
+MISS_DIRECTIONS = 1 << 14
 """Directions whose depths replace those of rays that escape. A fixed number: depths taken from an integral's own
 directions would make the integral depend on their number, by several per cent where half of the rays escape."""
 
@@ -141,11 +152,16 @@ class MissDepths:
     directions: np.ndarray
     distance: np.ndarray
 
+    def fill(self, depth: np.ndarray, escaped: np.ndarray, directions: np.ndarray) -> None:
+        """Replace ``depth`` (M,) of ``directions`` (M, 3) where ``escaped`` (M,); unchanged if all rays escape."""
+        if len(self.distance) and escaped.any():
+            depth[escaped] = interpolate_nearest_depth(self.directions, self.distance, directions[escaped])
+
 
 @dataclass(frozen=True, eq=False)
 class ObserverTracer:
-    """Traces the rays of the observer at ``center`` (one lane) through ``geometry`` with ``settings``, to the points at
-    which ``field``, placed in the scene by ``to_world``, is evaluated."""
+    """Traces the rays of the observer at ``center`` (one lane, or one per ray) through ``geometry`` with ``settings``,
+    to the points at which ``field``, placed in the scene by ``to_world``, is evaluated."""
 
     field: AnyGazeField
     to_world: Similarity
@@ -175,24 +191,21 @@ class ObserverTracer:
         width = dr.width(directions)
         if not self.field.config.needs_surfaces:
             return dr.ones(mi.Float, width), dr.full(mi.Bool, False, width)
-        has_surface, depth = self.trace_surfaces(directions, self._beyond(directions))
+        has_surface, depth = self.trace_surfaces(directions, self.miss_distance(directions))
         if self.field.config.fills_escaped:
             escaped = ~np.array(has_surface)
             if escaped.any():
+                depth = np.array(depth)
                 filled = miss_depths or self.trace_miss_depths()
-                if len(filled.distance):
-                    depth = np.array(depth)
-                    depth[escaped] = interpolate_nearest_depth(
-                        filled.directions, filled.distance, np.array(directions).T[escaped]
-                    )
-                    depth = mi.Float(depth)
+                filled.fill(depth, escaped, np.array(directions).T)
+                depth = mi.Float(depth)
         return depth, ~has_surface
 
     def trace_miss_depths(self) -> MissDepths:
         """Trace the depths for rays that escape."""
-        directions = fibonacci_directions_jit(_MISS_DIRECTIONS)
+        directions = fibonacci_directions_jit(MISS_DIRECTIONS)
         with dr.suspend_grad():
-            results = self.trace_surfaces(directions, self._beyond(directions))
+            results = self.trace_surfaces(directions, self.miss_distance(directions))
         has_surface, distance = (np.array(v) for v in results)
         return MissDepths(np.array(directions).T[has_surface], distance[has_surface])
 
@@ -207,7 +220,7 @@ class ObserverTracer:
             "Float", dr.select(has_surface, ray_hit.depth(settings.depth, has_surface), miss_distance)
         )
 
-    def _beyond(self, directions: Vector3f) -> Float:
+    def miss_distance(self, directions: Vector3f) -> Float:
         """End of a ray without a surface: on the bounding box of the gaze field, or at a distance of its diagonal."""
         box, local = self.field.box, self.to_world
         o, d = local.point_to_local(self.center), local.vector_to_local(directions)
