@@ -26,9 +26,10 @@ from . import registration as _registration
 
 if TYPE_CHECKING:
     from .api.arrays import Camera
+    from .api.gaze import load_gaze
     from .api.query import attention, observe, trace
     from .api.render import render
-    from .api.scene import Scene, load_field, load_gaze, load_rays, make_scene
+    from .api.scene import Scene, load_field, load_rays, make_scene
     from .api.workflows import (
         ablate,
         align,
@@ -65,7 +66,7 @@ _MODULES = {
     "evaluate_radiance": "nerg_mi.api.workflows",
     "import_rays": "nerg_mi.api.workflows",
     "load_field": "nerg_mi.api.scene",
-    "load_gaze": "nerg_mi.api.scene",
+    "load_gaze": "nerg_mi.api.gaze",
     "load_rays": "nerg_mi.api.scene",
     "make_scene": "nerg_mi.api.scene",
     "observe": "nerg_mi.api.query",

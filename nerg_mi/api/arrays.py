@@ -84,6 +84,33 @@ def as_unit_vectors(values: ArrayLike, count: int, name: str) -> Floats:
     return np.ascontiguousarray(np.broadcast_to(array / length, (count, 3)), np.float32)
 
 
+def as_rays(origins: ArrayLike, directions: ArrayLike) -> tuple[Floats, Floats]:
+    """Convert rays to origins and unit directions, broadcast against each other.
+
+    Parameters
+    ----------
+    origins : array_like of shape (3,) or (N, 3)
+        Origins in scene units; a single one is repeated.
+    directions : array_like of shape (3,) or (N, 3)
+        Directions of any length except zero; a single one is repeated.
+
+    Returns
+    -------
+    origins, directions : ndarray of shape (N, 3), float32
+        The rays.
+
+    Raises
+    ------
+    NergError
+        The numbers of origins and directions differ, or a value is invalid.
+    """
+    o, d = as_points(origins, "origins"), as_points(directions, "directions")
+    count = max(len(o), len(d))
+    if len(o) not in (1, count):
+        raise NergError(f"the number of origins must be 1 or that of the directions ({count}), got {len(o)}")
+    return np.ascontiguousarray(np.broadcast_to(o, (count, 3))), as_unit_vectors(directions, count, "directions")
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class LabelledArrays:
     """Arrays by name: ``result["gaze"]`` and ``result.gaze`` return the same array.

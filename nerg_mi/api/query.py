@@ -174,7 +174,8 @@ def trace(
     Returns
     -------
     TraceResult
-        Arrays (M, N, ...), or (N, ...) without ``observers``.
+        Arrays (M, N, ...), or (N, ...) without ``observers``. ``gaze`` is 0 where a ray meets no surface; the method
+        ``density`` of a gaze field is not (`load_gaze`).
 
     Raises
     ------
@@ -201,7 +202,7 @@ def trace(
     scene = Scene.coerce(scene)
     activate_mitsuba()
     requested = resolve_quantities(scene, quantities)
-    o, d = _as_rays(origins, directions)
+    o, d = arrays.as_rays(origins, directions)
     with translate_mitsuba_errors():
         tracer = _Tracer(scene, requested, seed, reporter)
         if observers is None:
@@ -380,15 +381,6 @@ def _observe_points(observer: SceneObserver, p: Floats, with_gaze: bool) -> dict
         for name, value in values.items():
             parts.setdefault(name, []).append(_to_array(value, len(part)))
     return {name: np.concatenate(values) for name, values in parts.items()}
-
-
-def _as_rays(origins: ArrayLike, directions: ArrayLike) -> tuple[Floats, Floats]:
-    o = arrays.as_points(origins, "origins")
-    d = arrays.as_points(directions, "directions")
-    count = max(len(o), len(d))
-    if len(o) not in (1, count):
-        raise NergError(f"the number of origins must be 1 or that of the directions ({count}), got {len(o)}")
-    return np.ascontiguousarray(np.broadcast_to(o, (count, 3))), arrays.as_unit_vectors(directions, count, "directions")
 
 
 def _to_array(value: Any, count: int) -> Floats:

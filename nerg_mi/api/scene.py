@@ -21,7 +21,6 @@ from nerg_mi.errors import MissingFile, NergError, translate_mitsuba_errors
 from nerg_mi.fields.gaze_base import AnyGazeField
 from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.fields.splats import Splats
-from nerg_mi.formats.fields import load_gaze as read_gaze
 from nerg_mi.formats.fields import load_radiance, save_gaze, save_radiance
 from nerg_mi.formats.meshes import read_mesh_file
 from nerg_mi.formats.splats import choose_plugin
@@ -292,38 +291,7 @@ def load_field(path: FilePath) -> TrainedField[RadianceField]:
     >>> field.bounds.tolist()
     [[-0.1, -0.1, -0.1], [8.1, 6.1, 3.1]]
     """
-    network, metadata = load_radiance(_as_path(path), get_array_module())
-    return TrainedField(network, metadata.get("provenance", {}), Path(path).name, Path(path))
-
-
-def load_gaze(path: FilePath) -> TrainedField[AnyGazeField]:
-    """Load a gaze field or an ensemble of gaze fields.
-
-    Parameters
-    ----------
-    path : path
-        A checkpoint written by ``nerg train gaze``, `train_gaze` or ``nerg import``.
-
-    Returns
-    -------
-    TrainedField
-        The field, for `make_scene`.
-
-    Raises
-    ------
-    NergError
-        The file does not exist, is damaged, or contains something else.
-
-    Examples
-    --------
-    >>> import nerg_mi as nerg
-    >>> from importlib.resources import files
-    >>> store = files("nerg_mi.scenes.store")
-    >>> gaze = nerg.load_gaze(store / "shoppers.safetensors")
-    >>> gaze.kind
-    'gaze'
-    """
-    network, metadata = read_gaze(_as_path(path), get_array_module())
+    network, metadata = load_radiance(as_path(path), get_array_module())
     return TrainedField(network, metadata.get("provenance", {}), Path(path).name, Path(path))
 
 
@@ -357,10 +325,11 @@ def load_rays(path: FilePath) -> Rays:
     """
     from nerg_mi.rays.dataset import load_rays as load
 
-    return load(_as_path(path))
+    return load(as_path(path))
 
 
-def _as_path(path: FilePath) -> Path:
+def as_path(path: FilePath) -> Path:
+    """Return ``path`` as a `Path`. Raises `NergError` for anything but a string or a path."""
     try:
         return Path(path)
     except TypeError as error:

@@ -17,19 +17,20 @@ from nerg_mi.workflows.radiance_commands import RadianceOptions, RadianceScoreOp
 from nerg_mi.workflows.rays_commands import AlignOptions, RaysImportOptions
 from nerg_mi.workflows.scene_commands import BakeOptions, StudyOptions
 
+from .gaze import TrainedGazeField
 from .scene import FilePath, TrainedField, build_options, check_names, resolve_checkpoint, resolve_file, resolve_rays
 
 if TYPE_CHECKING:
     from nerg_mi.alignment.check import Alignment
     from nerg_mi.aoi.output import StatisticsResult
     from nerg_mi.evaluation.metrics import ViewScores
-    from nerg_mi.fields.gaze_base import AnyGazeField
     from nerg_mi.fields.radiance import RadianceField
     from nerg_mi.workflows.ablation import AblationResult
     from nerg_mi.workflows.bake import Bake
     from nerg_mi.workflows.bake_splats import SplatBake
     from nerg_mi.workflows.evaluate import GazeEvaluation
     from nerg_mi.workflows.study import StudyResult
+    from nerg_mi.workflows.train_gaze import GazeResult
 
 
 # ---- Alignment ----
@@ -202,7 +203,7 @@ def evaluate_radiance(
 
 
 def evaluate_gaze(
-    gaze: FilePath | TrainedField[AnyGazeField],
+    gaze: FilePath | TrainedGazeField,
     rays: Rays | FilePath,
     output: FilePath | None = None,
     *,
@@ -543,7 +544,9 @@ def train_radiance(
 
     resolved = build_options(RadianceOptions, "train_radiance", options, overrides)
     result = radiance.train_radiance(resolve_file(photos, "photos"), output, resolved, reporter)
-    return _make_trained_field(result.field, result.provenance, output)
+    if output is None:
+        return TrainedField(result.field, result.provenance)
+    return TrainedField(result.field, result.provenance, Path(output).name, Path(output))
 
 
 def train_gaze(
@@ -553,7 +556,7 @@ def train_gaze(
     options: GazeOptions | None = None,
     reporter: Reporter = SILENT,
     **overrides: Any,
-) -> TrainedField[AnyGazeField]:
+) -> TrainedGazeField:
     """Train a gaze field on recordings, on salience images of posed photos, or on both.
 
     Parameters
@@ -573,8 +576,9 @@ def train_gaze(
 
     Returns
     -------
-    TrainedField
-        The gaze field. Its ``provenance`` contains the scores on held-out positions.
+    TrainedGazeField
+        The gaze field. Its ``provenance`` contains the scores on held-out positions, and its method ``density`` returns
+        densities of rays.
 
     Raises
     ------
@@ -594,7 +598,7 @@ def train_gaze(
 
     resolved = build_options(GazeOptions, "train_gaze", options, overrides)
     result = gaze.train_gaze(None if rays is None else resolve_rays(rays), output, resolved, reporter)
-    return _make_trained_field(result.field, result.provenance, output)
+    return _make_gaze_field(result, output, resolved.field or resolved.scene)
 
 
 def train_prior(
@@ -604,7 +608,7 @@ def train_prior(
     options: PriorOptions | None = None,
     reporter: Reporter = SILENT,
     **overrides: Any,
-) -> TrainedField[AnyGazeField]:
+) -> TrainedGazeField:
     """Fit a gaze field for an environment without recordings: the distribution of gaze elevations in other
     environments.
 
@@ -623,7 +627,7 @@ def train_prior(
 
     Returns
     -------
-    TrainedField
+    TrainedGazeField
         The gaze field.
 
     Raises
@@ -644,10 +648,10 @@ def train_prior(
     environments = [rays] if isinstance(rays, (str, os.PathLike, Rays)) else rays
     inputs = [item if isinstance(item, Rays) else resolve_file(item, "rays") for item in environments]
     result = gaze.learn_prior(inputs, output, resolved, reporter)
-    return _make_trained_field(result.field, result.provenance, output)
+    return _make_gaze_field(result, output, None)
 
 
-def _make_trained_field(network: Any, provenance: dict[str, Any], output: FilePath | None) -> TrainedField[Any]:
-    if output is None:
-        return TrainedField(network, provenance)
-    return TrainedField(network, provenance, Path(output).name, Path(output))
+def _make_gaze_field(result: GazeResult, output: FilePath | None, geometry_file: Path | None) -> TrainedGazeField:
+    path = None if output is None else Path(output)
+    name = "in memory" if path is None else path.name
+    return TrainedGazeField(result.field, result.provenance, name, path, geometry_file)
