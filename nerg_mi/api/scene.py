@@ -678,7 +678,8 @@ def make_scene(
     ----------
     field : TrainedField, RadianceField, Splats or path, optional
         The environment: a radiance field (`load_field`, `train_radiance`) or Gaussian splats
-        (`nerg_mi.formats.splats.read_splats`), in memory or as a file.
+        (`nerg_mi.formats.splats.read_splats`), in memory or as a file, or a file of hit points (.vol) as written by
+        `train_gaze` with ``geometry="hits"``. Hit points are grey, shaded by the orientation of their surfaces.
     gaze : TrainedField, gaze field or path, optional
         The gaze field (`load_gaze`, `train_gaze`), in memory or as a file.
     shapes : object, optional
@@ -730,7 +731,9 @@ def make_scene(
     )
     integrator: dict[str, Any] = {"type": "nerg", **settings}
     transform = None if to_world is None else _as_transform(to_world)
-    if field is not None:
+    if isinstance(field, (str, os.PathLike)) and Path(field).suffix.lower() == ".vol":
+        integrator = _make_hit_volumes(resolve_file(field, "field"), transform) | integrator
+    elif field is not None:
         integrator["field"] = _make_volume(field, "field", transform)
     if gaze is not None:
         integrator["gaze"] = _make_volume(gaze, "gaze", transform)
@@ -826,6 +829,25 @@ def _make_volume(field: object, role: str, to_world: Any) -> Any:
     if isinstance(field, TrainedField):
         return volume.from_network(field.network, to_world, field.name)
     return volume.from_network(field, to_world)
+
+
+def _make_hit_volumes(path: Path, to_world: Any) -> dict[str, Any]:
+    """Make the density and the colour of a volume of hit points, as properties of the integrator."""
+    import mitsuba as mi
+
+    from nerg_mi.train.geometry import make_volume_dict
+    from nerg_mi.workflows.scene_places import shade_hit_volume
+
+    color, lower, upper = shade_hit_volume(path)
+    world: Any = mi.ScalarTransform4d() if to_world is None else to_world
+    in_box = world @ mi.ScalarTransform4d().translate(lower.tolist()).scale((upper - lower).tolist())
+    density = make_volume_dict(os.path.abspath(path))
+    if to_world is not None:
+        density["to_world"] = to_world
+    return {
+        "density": density,
+        "color": {"type": "gridvolume", "grid": mi.VolumeGrid(color), "raw": True, "to_world": in_box},
+    }
 
 
 def _as_transform(matrix: ArrayLike) -> Any:

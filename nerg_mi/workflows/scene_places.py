@@ -415,9 +415,12 @@ def colors_path(output: Path) -> Path:
     return output.with_name(f"{output.stem}.color.vol")
 
 
-def _hits(path: Path, output: Path, words: str) -> WrittenGeometry:
+def shade_hit_volume(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the colours (z, y, x, 3) of the hit-point volume ``path``, and the lower and upper corner of their box.
+
+    Raises `NergError` for other files.
+    """
     check_vol(path)
-    colors = colors_path(output)
     with translate_read_errors(path, "volume of hit points"):
         shape = np.fromfile(path, "<i4", 4, offset=8)
         lower, upper = np.fromfile(path, "<f4", 6, offset=24).astype(float).reshape(2, 3)
@@ -427,6 +430,12 @@ def _hits(path: Path, output: Path, words: str) -> WrittenGeometry:
             f'"{path}" is not a volume of hit points; give one that "nerg train gaze --geometry hits" has written'
         )
     color, end = shade_hits(density.reshape(shape[2], shape[1], shape[0]), lower, upper)
+    return color, lower, end
+
+
+def _hits(path: Path, output: Path, words: str) -> WrittenGeometry:
+    color, lower, end = shade_hit_volume(path)
+    colors = colors_path(output)
     write_volume(colors, color, lower, end)
 
     def make(folder: Path, lamps: dict[str, float]) -> SceneContent:

@@ -10,6 +10,7 @@ import nerg_mi as nerg
 from nerg_mi.api.scene import TrainedField, build_options, load_mesh_child, resolve_quantities, to_scene_children
 from nerg_mi.api.workflows import bake, stats
 from nerg_mi.errors import NergError
+from nerg_mi.formats.surfaces import write_volume
 from tests.formats.splats.writers import random_splats, write_inria
 
 # ---- Fields and rays in memory, from files and back ----
@@ -454,3 +455,33 @@ def test_colours_of_files_are_used_and_other_content_is_reported(rgb, monkeypatc
     assert said in note and str(tmp_path / name) in note
     si = rgb.load_dict({"type": "scene", "a": shape}).ray_intersect(rgb.Ray3f((0.2, 0.2, 1), (0, 0, -1)))
     assert np.allclose(np.ravel(si.bsdf().eval_diffuse_reflectance(si)), (1, 0, 0), atol=1e-4)
+
+
+# ---- Hit points ----
+
+
+def test01_hit_points_are_a_field(rgb, tmp_path):
+    """A floor of two layers and a wall: depths to the faces of their voxels, in the place of the volume."""
+    density = np.zeros((8, 10, 12), np.float32)
+    density[:2] = density[:, :, 10:] = 400.0
+    write_volume(tmp_path / "hits.vol", density, (0, 0, 0), (1.2, 1.0, 0.8))
+    to_world = np.array([[0, -2, 0, 1.0], [2, 0, 0, 2], [0, 0, 2, 3], [0, 0, 0, 1]])
+    eye, directions = np.array([0.5, 0.5, 0.5]), np.array([(0, 0, -1), (1, 0, 0), (0, 0, 1)])
+    local = nerg.make_scene(tmp_path / "hits.vol")
+    world = nerg.make_scene(str(tmp_path / "hits.vol"), to_world=to_world)
+    first = nerg.trace(local, eye, directions, ["depth", "color", "opacity"])
+    turned = directions @ (to_world[:3, :3] / 2).T
+    second = nerg.trace(world, to_world[:3, :3] @ eye + to_world[:3, 3], turned, ["depth", "color", "opacity"])
+    for scale, result in ((1, first), (2, second)):
+        np.testing.assert_allclose(result.opacity, [1, 1, 0], atol=1e-4)
+        np.testing.assert_allclose(result.depth[:2], [0.3 * scale, 0.5 * scale], atol=0.005 * scale)
+        # Grey by orientation: a floor is brighter than a wall.
+        assert np.ptp(result.color, axis=1).max() < 1e-4 and result.color[0, 0] > result.color[1, 0] > 0.1
+
+
+def test02_other_volumes_are_refused(rgb, tmp_path):
+    write_volume(tmp_path / "color.vol", np.zeros((2, 2, 2, 3)), (0, 0, 0), (1, 1, 1))
+    with pytest.raises(nerg.NergError, match="not a volume of hit points"):
+        nerg.make_scene(tmp_path / "color.vol")
+    with pytest.raises(nerg.NergError, match='file ".*no.vol" of "field" does not exist'):
+        nerg.make_scene(tmp_path / "no.vol")
