@@ -99,7 +99,7 @@ class TrainedGazeField(TrainedField[AnyGazeField]):
         The integral over all directions is 1 for a field that is normalised over the sphere, as those of the default
         recipe. Other fields only approximate it.
 
-        Distinct origins share kernel launches. In the demo store, 2,000 samples with distinct origins take 20 s of CPU
+        Distinct origins share kernel launches. In the demo store, 400 samples with distinct origins take 4 s of CPU
         time, and twice this time with ``tolerance=0.005``, the accuracy of `trace`.
 
         Examples
