@@ -52,7 +52,7 @@ class TerminalReporter:
                 self._pulse = threading.Thread(target=self._beat, name="progress", daemon=True)
                 self._pulse.start()
         if fraction <= 0:
-            # Preparation does not count for the extrapolation.
+            # Preparation and earlier phases do not count for the extrapolation.
             self._counted = time.monotonic()
         self._now = (fraction, text)
         if self._bar is not None:
@@ -68,7 +68,8 @@ class TerminalReporter:
         if text.endswith(" left") or " left, " in text:
             return text
         counted = time.monotonic() - self._counted
-        if share > 0.01 and counted >= ESTIMATE_AFTER:
+        # At 1 the last step still runs, for a time that the fraction does not tell.
+        if 0.01 < share < 1 and counted >= ESTIMATE_AFTER:
             rest = f"{duration(counted * (1 - share) / share)} left"
         elif elapsed >= LOG_INTERVAL and self._bar is None:
             rest = f"{duration(elapsed)} so far"

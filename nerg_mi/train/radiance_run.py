@@ -76,15 +76,21 @@ class HeldOutError:
 
 
 def evaluate_views(
-    trainer: RadianceTrainer, views: list[PhotoView], every: int = 1, field: RadianceField | None = None
+    trainer: RadianceTrainer,
+    views: list[PhotoView],
+    every: int = 1,
+    field: RadianceField | None = None,
+    on_view: Callable[[int], None] = lambda number: None,
 ) -> HeldOutError:
     """Compute the error on ``views``, on every ``every``-th unmasked pixel.
 
-    Renders ``field`` with its own occupancy, or by default the averaged weights of the trainer.
+    Renders ``field`` with its own occupancy, or by default the averaged weights of the trainer. ``on_view`` is called
+    with the number of finished views before each view.
     """
     field, pixels = field or trainer.make_field(with_occupancy=False), (slice(every // 2, None, every),) * 2
     errors = HeldOutError([], [])
-    for view in views:
+    for number, view in enumerate(views):
+        on_view(number)
         color, truth = trainer.render(view, every, field).color, view.composite_over(0)[pixels]
         mask = None if view.mask is None else view.mask[pixels]
         alpha = view.color[pixels][..., 3] if view.has_alpha else None
@@ -213,8 +219,9 @@ _EVALUATION_SAMPLES, _FINAL_SAMPLES = 2**20, 2**24
 class RadianceProgress:
     """Progress of a run.
 
-    ``fraction`` is the completed fraction, ``seconds`` the time so far, ``psnr`` the last held-out error in dB or None;
-    ``rays`` and ``samples`` are those of the last step.
+    ``phase`` is "training", "scoring" (of the held-out views) or "writing", and ``fraction`` its completed fraction.
+    ``seconds`` is the time of training so far, ``psnr`` the last held-out error in dB or None; ``rays`` and ``samples``
+    are those of the last step.
     """
 
     fraction: float
@@ -223,6 +230,7 @@ class RadianceProgress:
     rays: int
     samples: int
     psnr: float | None
+    phase: str = "training"
 
 
 def train_field(
@@ -255,7 +263,8 @@ def train_field(
     depth : bool
         Use depth supervision if the photos have depth.
     on_progress : callable, optional
-        Called with `RadianceProgress` after each step.
+        Called with `RadianceProgress` after each step, and while the result of an uninterrupted run is scored and
+        written.
     state : Path, optional
         State file of the run, written every ``save_every`` seconds and when the run is interrupted.
     resume : bool
@@ -302,6 +311,11 @@ def train_field(
         if state is not None:
             save_run(trainer, state, identity, history)
 
+    def report(fraction: float, phase: str = "training") -> None:
+        if on_progress is not None and not interrupted:
+            now = trainer.steps, trainer.seconds, trainer.rays, trainer.samples
+            on_progress(RadianceProgress(fraction, *now, last_psnr, phase))
+
     with Interruption() as stop:
         while trainer.progress < 1 and not interrupted:
             trainer.step()
@@ -319,12 +333,7 @@ def train_field(
                 save()
                 saved = trainer.seconds
             try:
-                if on_progress is not None:
-                    on_progress(
-                        RadianceProgress(
-                            trainer.progress, trainer.steps, trainer.seconds, trainer.rays, trainer.samples, last_psnr
-                        )
-                    )
+                report(trainer.progress)
                 stop.check()
             except KeyboardInterrupt:
                 # Ctrl-C is only handled between two steps, because within a step weights and random numbers are
@@ -338,8 +347,10 @@ def train_field(
     if interrupted:
         save()
     with saving_on_failure(state, save, is_done=write is not None and not interrupted):
-        field, provenance = _make_result(trainer, dataset, validation_views, history, seconds, interrupted)
+        score = lambda fraction: report(fraction, "scoring")
+        field, provenance = _make_result(trainer, dataset, validation_views, history, seconds, interrupted, score)
         if write is not None:
+            report(0.0, "writing")
             write(field, provenance)
     return field, provenance
 
@@ -374,8 +385,12 @@ def _make_result(
     history: list,
     seconds: float,
     interrupted: bool,
+    on_progress: Callable[[float], None],
 ) -> tuple[RadianceField, dict]:
-    """Return the final field and its provenance with the error on all held-out views."""
+    """Return the final field and its provenance with the error on all held-out views.
+
+    ``on_progress`` is called with the fraction of the scored views.
+    """
     field = trainer.make_field()
     provenance = {
         **dataset.source,
@@ -390,8 +405,11 @@ def _make_result(
     if trainer.photos is not None:
         provenance["photo_stops"] = round(trainer.photos.compute_exposure_spread(trainer.averaged[PHOTO_PARAMETER]), 3)
     if dataset.held_out:
+        on_progress(0.0)
         every = trainer.choose_pixel_stride(dataset.held_out, _FINAL_SAMPLES)
-        error = evaluate_views(trainer, dataset.held_out, every, field)
+        count = len(dataset.held_out)
+        error = evaluate_views(trainer, dataset.held_out, every, field, lambda number: on_progress(number / count))
+        on_progress(1.0)
         provenance["psnr_held_out"] = {
             "mean": _round_decibels(error.mean),
             "mean_fitted": _round_decibels(error.mean_fitted),

@@ -170,7 +170,10 @@ class Reporter(Protocol):
         """Report a possible problem with the result, in one line."""
 
     def progress(self, fraction: float, text: str = "") -> None:
-        """Report the completed fraction of the work, from 0 to 1, and the current step."""
+        """Report the completed fraction of the work, from 0 to 1, and the current step.
+
+        A phase whose duration does not depend on the one before, such as scoring after training, begins at 0 again.
+        """
 
 
 class SilentReporter:

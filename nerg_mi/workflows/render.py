@@ -383,7 +383,12 @@ def render_file(
             share = (done + part / total) / len(frames)
             seconds = max(time.perf_counter() - start, 1e-9)
             speed = f"{part / seconds:,.0f} samples/s" if len(frames) == 1 else f"{done} of {len(frames)} pictures"
-            reporter.progress(share, f"{speed}, {seconds * (1 - share) / share:.0f} s left")
+            if share >= 1:
+                reporter.progress(
+                    1.0, f"writing {files[-1].name}" if options.overlay is None else "drawing the overlay"
+                )
+            else:
+                reporter.progress(share, f"rendering, {speed}, {seconds * (1 - share) / share:.0f} s left")
 
         def render(frame: Mapping[str, str], make: Make) -> RenderedPicture:
             nonlocal done

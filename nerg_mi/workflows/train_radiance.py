@@ -162,9 +162,11 @@ def _report_data(data: Dataset, reporter: Reporter) -> None:
 
 
 def _progress(now: radiance_run.RadianceProgress) -> str:
+    if now.phase != "training":
+        return {"scoring": "scoring the held-out views", "writing": "writing the field"}[now.phase]
     left = now.seconds * (1 - now.fraction) / max(now.fraction, 1e-6)
     error = f", held out {now.psnr:.2f} dB" if now.psnr is not None else ""
-    return f"{left:.0f} s left, step {now.steps}{error}"
+    return f"training, {left:.0f} s left, step {now.steps}{error}"
 
 
 def _report_result(result: RadianceResult, reporter: Reporter) -> None:

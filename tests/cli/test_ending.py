@@ -203,6 +203,20 @@ def test_preparation_does_not_affect_the_time_estimate(capsys, monkeypatch):
     assert capsys.readouterr().err.splitlines() == [" 10% steps, 81 s left"]
 
 
+def test_a_phase_has_an_estimate_of_its_own(capsys, monkeypatch):
+    """A finished phase that still works has no remaining time, and the next phase begins at 0."""
+    clock = Clock(monkeypatch)
+    with TerminalReporter() as reporter:
+        reporter.progress(0.0, "training")
+        clock.now += 20
+        reporter.progress(1.0, "training")
+        reporter.progress(0.0, "scoring")
+        clock.now += 30
+        reporter.progress(0.5, "scoring")
+    first, last = capsys.readouterr().err.splitlines()
+    assert "left" not in first and last.endswith("scoring, 30 s left")
+
+
 def test_a_long_silent_step_is_reported(capsys, monkeypatch):
     monkeypatch.setattr(progress, "LOG_INTERVAL", 0.2)
     with TerminalReporter() as reporter:

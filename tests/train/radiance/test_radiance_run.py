@@ -106,6 +106,7 @@ def test_held_out_views_of_a_ball(dataset, tmp_path):
     field, provenance = train_field(dataset, TINY, settings(), ns, on_progress=seen.append)
     assert provenance["psnr_held_out"]["mean"] > 20
     assert provenance["depth_supervision"] and provenance["steps"] == 300 and seen[-1].fraction == 1
+    assert {now.phase for now in seen} == {"training", "scoring"}
     save_radiance(field, tmp_path / "ball.safetensors", provenance, half=True)
     loaded, meta = load_radiance(tmp_path / "ball.safetensors", ns)
     assert meta["provenance"]["settings"]["seed"] == 1
