@@ -143,8 +143,8 @@ def test07_missing_geometry_is_an_error_that_names_the_option(folder, tmp_path):
     in_memory = TrainedGazeField(gaze.network, gaze.provenance)
     with pytest.raises(nerg.NergError, match=r'geometry of its training, "room.xml", .* with geometry='):
         in_memory.density(o, d)
-    known = TrainedGazeField(gaze.network, gaze.provenance, geometry_file=folder / "room.xml")
-    np.testing.assert_array_equal(known.density(o, d), gaze.density(o, d))
+    located = TrainedGazeField(gaze.network, gaze.provenance, geometry_file=folder / "room.xml")
+    np.testing.assert_array_equal(located.density(o, d), gaze.density(o, d))
 
 
 def test08_other_objects_are_no_geometry(folder):
