@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from nerg_mi.workflows.bake_splats import SplatBake
     from nerg_mi.workflows.evaluate import GazeEvaluation
     from nerg_mi.workflows.study import StudyResult
-    from nerg_mi.workflows.train_gaze import GazeResult
+    from nerg_mi.workflows.train_gaze import GazeResult, PriorResult
 
 
 # ---- Alignment ----
@@ -651,7 +651,9 @@ def train_prior(
     return _make_gaze_field(result, output, None)
 
 
-def _make_gaze_field(result: GazeResult, output: FilePath | None, geometry_file: Path | None) -> TrainedGazeField:
+def _make_gaze_field(
+    result: GazeResult | PriorResult, output: FilePath | None, geometry_file: Path | None
+) -> TrainedGazeField:
     path = None if output is None else Path(output)
     name = "in memory" if path is None else path.name
     return TrainedGazeField(result.field, result.provenance, name, path, geometry_file)

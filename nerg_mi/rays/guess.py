@@ -371,7 +371,7 @@ def _finish_folders(proposals: Sequence[Proposal]) -> None:
                 f"{_list_names(usable)}: nerg rays guess {shlex.quote(str(usable[0]))}"
             )
     for proposal in proposals:
-        if folders.count(proposal.folder) > 1:
+        if proposal.folder is not None and folders.count(proposal.folder) > 1:
             proposal.folder = None
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from nerg_mi.fields.gaze_base import GazeHead
 from nerg_mi.maths.arrays import to_vector
 from nerg_mi.maths.sphere import fibonacci_directions_jit, morton_order
-from nerg_mi.maths.types import Bool, Float, Point3f, Vector3f, variant_types
+from nerg_mi.maths.types import Bool, Float, Point3f, UInt32, Vector3f, variant_types
 
 from .field_medium import features_for_observer
 from .geometry import SceneGeometry
@@ -232,7 +232,7 @@ class _Block:
         return self._instance.make_tracer(self._geometry, center, self._settings)
 
 
-def _launches(observers: np.ndarray, count: int) -> Iterator[tuple[np.ndarray, object, object]]:
+def _launches(observers: np.ndarray, count: int) -> Iterator[tuple[np.ndarray, UInt32, UInt32]]:
     """Groups of ``observers`` with ``count`` rays each: their indices, and for each ray that of its observer and its
     own (UInt32)."""
     mi = variant_types()
