@@ -375,7 +375,8 @@ class SplatSmoother:
         kernel = np.exp(-0.5 * square / step**2)
         row_sums = np.bincount(i, kernel * self._area[j], cells)
         weight = kernel * self._area[i] * self._area[j] / np.maximum(row_sums[i], row_sums[j])
-        # By a step's own variance, for cells are apart, and the kernel is cut off.
+        # The variance of one step is computed from its weights: with discrete cells and a cut-off kernel it is not
+        # that of the Gaussian.
         variance = float((weight * square).sum() / 2 / self._area.sum()) if cells else 0.0
         stays = self._area - np.bincount(i, np.where(i == j, 0, weight), cells)
         flow = np.where(i == j, stays[i], weight) / self._area[j]

@@ -394,10 +394,7 @@ def _report_result(result: GazeResult, reporter: Reporter) -> None:
         reporter.message(f"wrote {result.output} ({result.output.stat().st_size / 1e6:.2f} MB)")
 
 
-# ---- A gaze field for a place where nobody was tracked: what people in other places say of it ----
-
-
-# ---- A gaze field for a place where nobody was tracked: what people in other places say of it ----
+# ---- A gaze field for a scene without tracking, from recordings in other scenes ----
 
 
 PRIOR = "prior"
