@@ -39,7 +39,7 @@ def counting_of(around, areas, shapes, seen: bool = True):
     from nerg_mi.statistics.visits import VisitRules
 
     in_view = VisibilityCache(SamplePoints.sample(shapes, 48), around.trace_depth, 0.1, 0.03) if seen else None
-    members = list(areas.members().values())
+    members = list(areas.element_indices().values())
     rules = VisitRules(max_gap=2.0, session_pause=60.0, merge_gap=0.15, min_visit=0.1)
     return AoiContext(
         around, shapes, areas.names, members, range(len(members)), rules, 0.03, fov=120.0, visibility_cache=in_view
@@ -66,7 +66,7 @@ class Walks:
         self.start = np.r_[0, np.cumsum(self.lengths)]
         self.origin = np.concatenate(self.heads)
         self.time = np.concatenate(self.times)
-        self.lobes = self.law.lobes(self.origin)
+        self.lobes = self.law.compute_lobes(self.origin)
 
     def draw(self, rows: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Directions at the positions ``rows``: the law's own sampling, from a precomputed mixture."""
@@ -74,11 +74,11 @@ class Walks:
 
         lobes = self.lobes
         some = Lobes(lobes.weights[rows], lobes.mu[rows], lobes.kappa[rows], lobes.visible[rows])
-        self.law.lobes = lambda positions: some
+        self.law.compute_lobes = lambda positions: some
         try:
             return self.law.sample(self.origin[rows], rng)
         finally:
-            del self.law.lobes
+            del self.law.compute_lobes
 
     def rays(self, who: np.ndarray, rng: np.random.Generator):
         """Rays of these walks, each of one participant."""
