@@ -197,8 +197,9 @@ def kill_while_writing(pid: int, folder: Path, turn: random.Random, skip: int) -
 
 
 def hash_files(*folders: Path) -> dict[Path, str]:
-    """Return the SHA-256 of every file in ``folders``, without the hidden files of killed writers."""
-    paths = (p for folder in folders for p in folder.rglob("*") if p.is_file() and not is_partial(p))
+    """Return the SHA-256 of every file in ``folders``, without the hidden files and locks of killed writers."""
+    is_output = lambda path: path.is_file() and not is_partial(path) and path.suffix != ".lock"
+    paths = (p for folder in folders for p in folder.rglob("*") if is_output(p))
     return {p: hashlib.sha256(p.read_bytes()).hexdigest() for p in paths}
 
 
