@@ -202,7 +202,7 @@ def score_depths(field: Path, views: list, box, center, spp: int, pictures: Path
     make_folder(pictures)
     render, rows, parts = FieldRenderer(field, spp), [], []
     for k, view in enumerate(views):
-        seen, truth = render(view.camera, k), view.over(0)
+        seen, truth = render(view.camera, k), view.composite_over(0)
         rows.append((psnr(seen.color, truth), ssim(seen.color, truth)))
         write_png(pictures / f"{Path(view.name).stem}.png", np.concatenate([seen.color, truth], axis=1))
         directions = pixel_directions(view.camera.intrinsics) @ view.camera.to_world[:3, :3].T
