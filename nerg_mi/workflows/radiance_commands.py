@@ -111,7 +111,8 @@ class PhotoOptions(ValidatedDataclass):
     )
     scale: float = option(
         1.0,
-        "Length of one unit of the data set in metres; all lengths are multiplied by it.",
+        "Length of one unit of the data set in metres; all lengths are multiplied by it. For nerg eval, give that of "
+        "the training, which is not stored.",
         within=LENGTHS,
         group=INPUT,
     )

@@ -287,7 +287,7 @@ frames of an MP4 file.
 With --store or --scheduler each finished image is stored; running the command again continues with the next one.""",
     options=FilmOptions,
     scene=argument("Mitsuba scene file (.xml)."),
-    output=out("Image to write (.exr with all channels, .png, .svg) or video (.mp4)."),
+    output=out("Image (.exr with all channels, .png; .svg needs --overlay) or video (.mp4, needs --frames) to write."),
 )
 
 
@@ -345,7 +345,9 @@ class ColorOptions(ValidatedDataclass):
 class ScaleOptions(ColorOptions):
     """The colour scale of a figure with unknown values."""
 
-    hatching: bool = option(True, "Hatch areas whose value is unknown.", group=VIEW)
+    hatching: bool = option(
+        True, "Hatch areas whose value is unknown: no surface, or gaze far from all recorded positions.", group=VIEW
+    )
 
     def style(self, title: str | None = None, kind: str = "sequential") -> Style:
         """Return the style of overlays, see `ColorOptions.style`."""
