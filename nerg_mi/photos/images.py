@@ -238,8 +238,8 @@ def _select_depth_channel(channels: dict[str, np.ndarray], path: Path) -> np.nda
     if {"R", "G", "B"} <= set(names) and all(np.array_equal(channels["R"], channels[n], True) for n in "GB"):
         return channels["R"]
     raise NergError(
-        f'the depth file "{path}" has the channels {format_names(names)}; save it with one channel, or name one of '
-        "them Z"
+        f'the depth file "{path}" has the channels {format_names(names)}; save it with one channel, or name the '
+        'depth Z and no other channel Z or "depth"'
     )
 
 

@@ -277,7 +277,7 @@ def _camera(mesh: Mesh, up: np.ndarray, options: BakedFigureOptions) -> tuple[np
         back = np.cross(side, up)
         offset = 0.9 * up - 0.8 * side / np.linalg.norm(side) + 0.4 * back / np.linalg.norm(back)
         eye = target + offset
-    ahead = _unit(target - eye, None, "--target, which must differ from --camera,")
+    ahead = _unit(target - eye, None, "the vector from --camera to --target")
     across = np.cross(ahead, up)
     if np.linalg.norm(across) < 1e-6:
         across = np.cross(ahead, np.roll(up, 1))

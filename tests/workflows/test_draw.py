@@ -233,7 +233,7 @@ def test_surfaces_that_cannot_be_drawn_are_refused(tmp_path):
         (damaged, {}, "is damaged"),
         (good, {"below": -1.0}, "--clip-above"),
         (good, {"camera": (0.0, 0, 2), "target": (0.0, 0, 5)}, "is in the image"),
-        (good, {"camera": (0.0, 0, 2), "target": (0.0, 0, 2)}, "must differ from --camera"),
+        (good, {"camera": (0.0, 0, 2), "target": (0.0, 0, 2)}, "from --camera to --target must not be"),
         (good, {"up": (0.0, 0, 0)}, "--up must not be of length 0"),
     ):
         with pytest.raises(NergError, match=said):
