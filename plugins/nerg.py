@@ -482,7 +482,7 @@ class NergIntegrator(mi.SamplingIntegrator):
 
     @contextmanager
     def rendering_from(self, sensor, scene):
-        """Return a context manager. Inside it, the integrator traces camera rays of ``sensor``."""
+        """Return a context manager. Inside it, rays passed to the integrator are camera rays of ``sensor``."""
         self.context().check_scene(scene)
         if 0 in sensor.film().crop_size():
             raise NergError("the film's crop window is empty; give it a crop_width and a crop_height of at least 1")

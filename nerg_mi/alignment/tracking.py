@@ -34,7 +34,7 @@ _MIN_FLIP_RAYS = 30
 
 @dataclass(frozen=True, eq=False)
 class AxisFlips:
-    """Angles in degrees (N,) from each ray to the nearest point, by the name of the flip."""
+    """Angles in degrees (N,) from each ray to the scene point nearest in angle, by the name of the flip or none."""
 
     degrees: dict[str, np.ndarray]
 
@@ -237,8 +237,11 @@ def _levels_first(values: np.ndarray) -> np.ndarray:
 
 
 def is_close(a: np.ndarray, b: np.ndarray, distance: float) -> bool:
-    """Return whether two similarities are the same placement: within ``distance`` in the scene, and within a fifth
-    in rotation and scale."""
+    """Return whether two similarities (4, 4) are the same placement.
+
+    Their translations differ by less than ``distance``, and their 3 x 3 parts, rotation and scale together, by less
+    than 20 % of that of ``b`` in the Frobenius norm.
+    """
     is_same_rotation = np.linalg.norm(a[:3, :3] - b[:3, :3]) < 0.2 * np.linalg.norm(b[:3, :3])
     return bool(is_same_rotation and np.linalg.norm(a[:3, 3] - b[:3, 3]) < distance)
 

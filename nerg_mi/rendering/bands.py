@@ -227,7 +227,7 @@ class ObserverIntegrator(Protocol):
     """A Python integrator that renders like `mi.SamplingIntegrator`, within a context of its own."""
 
     def rendering_from(self, sensor, scene) -> AbstractContextManager:
-        """Return a context manager. Inside it, the integrator traces camera rays of ``sensor``."""
+        """Return a context manager. Inside it, rays passed to the integrator are camera rays of ``sensor``."""
         ...
 
 

@@ -166,7 +166,7 @@ def _horner(coefficients: Sequence[Float] | Sequence[float], x: Float) -> Float:
 
 
 class RegistryEntry(Protocol):
-    """An object that can be registered."""
+    """An object with a name and a one-sentence summary, which a `Registry` can hold."""
 
     @property
     def name(self) -> str:
