@@ -24,7 +24,7 @@
 #
 # The set-up runs once; later calls only do their own work. `make fuzz`, `make faults` and `make bench` print tables;
 # ARGS="--update docs/explanation/robustness.md" writes those of the first two into that page, and
-# ARGS="--page docs/explanation/performance.md" those of the third.
+# ARGS="--update docs/explanation/performance.md" those of the third.
 
 # Tests start many processes: byte code that is kept spares each of them compiling the package, and pytest its rewriting.
 export PYTHONDONTWRITEBYTECODE =
@@ -35,7 +35,7 @@ RUN = .venv/bin/python
 # order of tests/conftest.py. A process that ends during a test is not replaced: pytest-xdist would wait forever at the end.
 JOBS ?= auto
 PYTEST = $(RUN) -m pytest -n $(JOBS) --maxprocesses 4 --max-worker-restart 0 --dist loadfile --no-loadscope-reorder
-ONE_CORE = tests/cli/test_scenes.py tests/cli/test_ending.py tests/files/test_images.py tests/files/test_images.py \
+ONE_CORE = tests/cli/test_scenes.py tests/cli/test_ending.py tests/files/test_images.py \
 	tests/test_runtime.py tests/renders
 
 .PHONY: demo test test-all check lint types format docs manual onecore coverage fuzz faults soak packages bench bench-gpu setup
