@@ -346,7 +346,9 @@ class ScaleOptions(ColorOptions):
     """The colour scale of a figure with unknown values."""
 
     hatching: bool = option(
-        True, "Hatch areas whose value is unknown: no surface, or gaze far from all recorded positions.", group=VIEW
+        True,
+        "Hatch areas whose value is unknown: no surface or, for gaze, far from all recorded positions.",
+        group=VIEW,
     )
 
     def style(self, title: str | None = None, kind: str = "sequential") -> Style:
