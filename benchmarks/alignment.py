@@ -102,7 +102,7 @@ def twin(upright: bool) -> Maker:
     def make(world, truth, rng, mirrored):
         mesh = world.mesh + rng.normal(0, 0.005, world.mesh.shape)
         return Twin(transform_points(MIRROR, mesh) if mirrored else mesh), AlignmentTarget(
-            traces=world.traces.moved(truth), is_upright=upright
+            traces=world.traces.transform(truth), is_upright=upright
         )
 
     return make
@@ -138,7 +138,7 @@ def tracking(hits: bool) -> Maker:
                 hit=None if rays.hit is None else transform_points(MIRROR, rays.hit),
             )
         return Tracking(rays), AlignmentTarget(
-            traces=world.traces.moved(truth), scale=None if hits else similarity_scale(truth)
+            traces=world.traces.transform(truth), scale=None if hits else similarity_scale(truth)
         )
 
     return make

@@ -80,7 +80,7 @@ class Photos:
         self.fitted, self.choosing, self.held_out = (
             (
                 [mi.load_dict(sensor | {"to_world": mi.ScalarTransform4f(views.to_mitsuba_pose(p))}) for p in group],
-                [srgb(photographer.picture(pose, seed, spp)) for seed, pose in enumerate(group)],
+                [srgb(photographer.render_picture(pose, seed, spp)) for seed, pose in enumerate(group)],
             )
             for group, spp in zip(poses, (16, 64, 64))
         )
