@@ -422,12 +422,13 @@ def main(argv=None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--case", default="", help="only cases whose name contains this")
     parser.add_argument("--depth", default="median", help="median, expected or refined")
+    parser.add_argument("-m", "--mode", default="llvm_ad_rgb", help="Mitsuba variant")
     parser.add_argument("--update", type=Path, help="a document whose tables are replaced, heading by heading")
     args = parser.parse_args(argv)
 
     import mitsuba as mi
 
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(args.mode)
     # Mitsuba declares a sensor's pose as not differentiable and warns on each update.
     mi.set_log_level(mi.LogLevel.Error)
     for title, head, rows in errors(mi, args.case, args.depth):

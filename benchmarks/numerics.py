@@ -499,11 +499,12 @@ GROUPS = {
 
 def main(argv=None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("-m", "--mode", default="llvm_ad_rgb", help="Mitsuba variant")
     parser.add_argument("--update", type=Path, help="a document whose tables are replaced, heading by heading")
     args = parser.parse_args(argv)
     import mitsuba as mi
 
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(args.mode)
     for title, head, rows in tables(mi):
         print_table(title, head, rows, args.update)
 

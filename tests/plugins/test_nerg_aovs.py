@@ -304,7 +304,7 @@ def test08_empty_space_is_skipped(rgb, thickness):
 
 
 def test10_missing_rays_cost_nothing(rgb, files):
-    out = channels(rgb, with_gaze(files, "density_evals,color_evals,gaze_evals"), camera(rgb, (0, 0, -3), (0, 5, -3)))
+    out = channels(rgb, with_gaze(files, "density_evals,color_evals,gaze_evals"), camera(rgb, (0, 0, -3), (0, 5, -2)))
     assert not any(c.any() for c in out.values())
 
 
