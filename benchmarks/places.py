@@ -126,7 +126,7 @@ def generated(place, folder: Path) -> tuple[Path, dict]:
     return path, {"scene": scene}
 
 
-OURS, BLIND, HALF = "gaze field", "position-blind", "split half"
+OURS, PRIOR, HALF = "gaze field", "position-independent prior", "split half"
 # Higher is better.
 SCORES = {"KLD": False, "CC": True, "bits": True}
 
@@ -208,14 +208,14 @@ def summarise(each: list[dict]) -> list[dict]:
             best = next(m for m in order if m != OURS)
             less = values[OURS] - values[best]
             scale = interval(less)
-            row |= {s: means[OURS], f"{s} blind": means[BLIND], f"{s} best": means[best], f"{s} best is": best}
+            row |= {s: means[OURS], f"{s} prior": means[PRIOR], f"{s} best": means[best], f"{s} best is": best}
             row |= {f"{s} rank": order.index(OURS) + 1, f"{s} less": less.mean(), f"{s} reach": scale}
             half = [r[s] for r in separate if r["method"] == HALF]
             row[f"{s} half"] = float(np.mean(half)) if half else np.nan
         # With few participants one half predicts the other worse than the position-independent prior does: the fraction
         # is undefined.
-        further = row["CC half"] - row["CC blind"]
-        row["way"] = (row["CC"] - row["CC blind"]) / further if further > 0 else np.nan
+        further = row["CC half"] - row["CC prior"]
+        row["way"] = (row["CC"] - row["CC prior"]) / further if further > 0 else np.nan
         out.append(row)
     return out
 
@@ -251,14 +251,14 @@ def show(rows: list[dict]) -> None:
         table = [
             [
                 r["place"],
-                f"{r[f'{s} blind']:.3f}",
+                f"{r[f'{s} prior']:.3f}",
                 f"{r[s]:.3f}",
                 f"{r[f'{s} less']:+.3f} ± {r[f'{s} reach']:.3f}",
                 "" if isnan(r[f"{s} half"]) else f"{r[f'{s} half']:.2f}",
             ]
             for r in rows
         ]
-        head = (s, "position-blind", "field", "field minus best baseline", "split half")
+        head = (s, "position-independent prior", "field", "field minus best baseline", "split half")
         print_table(f"{s} in all scenes", head, table)
     print("means over scenes: " + ", ".join(f"{s} {sum(r[s] for r in rows) / len(rows):.3f}" for s in SCORES))
     ranks = [r[f"{s} rank"] for r in rows for s in SCORES]
@@ -266,7 +266,7 @@ def show(rows: list[dict]) -> None:
     print(f"mean rank {sum(ranks) / len(ranks):.2f}; worst scene in KLD: {worst['place']}, {worst['KLD less']:+.3f}")
     far = [r for r in rows if not isnan(r["way"])]
     print(
-        "CC of the field between position-blind (0 %) and split half (100 %): "
+        "CC of the field between the position-independent prior (0 %) and split half (100 %): "
         + ", ".join(f"{r['place']} {r['way']:.0%}" for r in far)
     )
 

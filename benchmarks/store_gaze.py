@@ -49,7 +49,7 @@ def main(argv=None) -> None:
         compute_map_scores,
         make_nearest_probes_baseline,
         make_nearest_rays_baseline,
-        make_position_blind_baseline,
+        make_prior_baseline,
     )
     from nerg_mi.fields.mlp import namespace
     from nerg_mi.formats.fields import load_gaze, load_radiance
@@ -86,7 +86,7 @@ def main(argv=None) -> None:
     narrow = probe_settings["kappa"]
     methods = {
         "gaze field": FieldDensity(gaze, medium, depth_kind=probe_settings["depth"]),
-        "position-blind, kappa 50": make_position_blind_baseline(train, kappa=50),
+        "position-independent prior, kappa 50": make_prior_baseline(train, kappa=50),
     }
     for kappa in (narrow, args.wide):
         probes = place_probes(

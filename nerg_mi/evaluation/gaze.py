@@ -71,7 +71,7 @@ def make_uniform_baseline() -> Baseline:
     return evaluate
 
 
-def make_position_blind_baseline(rays: Rays, *, kappa: float = 50.0, backend: Backend = None) -> Baseline:
+def make_prior_baseline(rays: Rays, *, kappa: float = 50.0, backend: Backend = None) -> Baseline:
     """Return the kernel density of all training rays with concentration ``kappa``, independent of the position."""
     # Runs of rays are separate mixtures, averaged in float64: one float32 sum of 10^5 terms would lose precision and
     # run in a single lane.
@@ -136,21 +136,21 @@ def make_nearest_rays_baseline(rays: Rays, k: int = 4096, *, kappa: float = 20.0
 
 
 def make_standard_baselines(
-    rays: Rays, radius: float, kappa: float = 20.0, blind_kappa: float = 50.0, seed: int = 0, count: int = 2048
+    rays: Rays, radius: float, kappa: float = 20.0, prior_kappa: float = 50.0, seed: int = 0, count: int = 2048
 ) -> tuple[Baseline, dict[str, Baseline]]:
     """Make the baselines that a gaze field is compared with from the training ``rays``.
 
-    Returns ``(blind, baselines)``: the reference density of the information gain, and the baselines by name (uniform,
-    position-blind, nearest probes and nearest rays, with kernels of concentration ``kappa``).
+    Returns ``(prior, baselines)``: the reference density of the information gain, and the baselines by name (uniform,
+    position-independent prior, nearest probes and nearest rays, with kernels of concentration ``kappa``).
     """
     probes = place_probes(
         rays, radius, count=count, min_rays=min(64, len(rays)), kappa_rule="fixed", kappa=kappa, seed=seed
     )
-    blind = make_position_blind_baseline(rays, kappa=blind_kappa)
-    return blind, {
+    prior = make_prior_baseline(rays, kappa=prior_kappa)
+    return prior, {
         "uniform": make_uniform_baseline(),
-        "position-blind": make_position_blind_baseline(rays, kappa=kappa),
-        f"position-blind, kappa {blind_kappa:g}": blind,
+        "position-independent prior": make_prior_baseline(rays, kappa=kappa),
+        f"position-independent prior, kappa {prior_kappa:g}": prior,
         "nearest probe": make_nearest_probes_baseline(probes, 1),
         "16 nearest probes": make_nearest_probes_baseline(probes, 16),
         "4,096 nearest rays": make_nearest_rays_baseline(rays, 4096, kappa=kappa),
@@ -288,7 +288,7 @@ SPLITS = ("both", "pos", "people")  # Held-out data: positions and participants,
 MAP_SCORES, RAY_SCORES = ("KLD", "CC", "SIM", "MAE"), ("NSS", "AUC", "sAUC", "bits", "loglik")
 SCORES = MAP_SCORES + RAY_SCORES
 """KLD in nats, CC and SIM of densities normalised over the sphere; MAE in 1/sr of unnormalised densities; NSS;
-AUC-Judd; sAUC against rays of other test positions; information gain over the position-blind baseline in bits per
+AUC-Judd; sAUC against rays of other test positions; information gain over the position-independent prior in bits per
 ray; mean log density (nats of 1/sr).
 """
 # Fraction of the progress for evaluating the methods; the rest is for the bootstrap.
@@ -479,7 +479,7 @@ def _has_enough_rays(rays: Rays, centres: np.ndarray, radius: float, min_rays: i
 def evaluate_gaze(
     test: GazeTest,
     methods: dict[str, Baseline],
-    blind: Baseline,
+    prior: Baseline,
     resamples: int = 200,
     seed: int = 0,
     on_progress: Callable[[float], None] | None = None,
@@ -492,7 +492,7 @@ def evaluate_gaze(
         Test data.
     methods : dict of str to Baseline
         Methods by name. The first is compared with each of the others.
-    blind : Baseline
+    prior : Baseline
         Reference density of the information gain.
     resamples : int
         Number of bootstrap resamples of the participants. With fewer than three participants there are no intervals.
@@ -515,7 +515,7 @@ def evaluate_gaze(
     """
     rng, N = np.random.default_rng(seed), len(test.participants)
     report = on_progress or (lambda share: None)
-    evaluated = _evaluate_methods(test, methods, blind, lambda share: report(_EVALUATION_FRACTION * share))
+    evaluated = _evaluate_methods(test, methods, prior, lambda share: report(_EVALUATION_FRACTION * share))
     rows = [
         {"method": name, **compute_map_scores(test.truth, maps), **{k: float(v.mean()) for k, v in values.items()}}
         for name, maps, values in evaluated
@@ -563,7 +563,7 @@ def _make_difference(name: str, value: float, resampled: list[float]) -> dict[st
 
 
 def _evaluate_methods(
-    test: GazeTest, methods: dict[str, Baseline], blind: Baseline, on_progress: Callable[[float], None] | None = None
+    test: GazeTest, methods: dict[str, Baseline], prior: Baseline, on_progress: Callable[[float], None] | None = None
 ) -> list[tuple[str, np.ndarray, dict[str, np.ndarray]]]:
     """Evaluate each method: ``(name, maps (P, D), ray scores (P, K) by name)``.
 
@@ -573,7 +573,7 @@ def _evaluate_methods(
     evaluate_method = lambda method: [
         np.asarray(method(test.centres, v), np.float64) for v in (test.directions, test.query_directions)
     ]
-    maps, at = evaluate_method(blind)
+    maps, at = evaluate_method(prior)
     log_prior, out = _log_density(at[:, :K], maps), []
     for name, method in methods.items():
         maps, at = evaluate_method(method)
@@ -583,12 +583,12 @@ def _evaluate_methods(
     return out
 
 
-def score_participants(test: GazeTest, methods: dict[str, Baseline], blind: Baseline, min_rays: int = 64) -> list[dict]:
+def score_participants(test: GazeTest, methods: dict[str, Baseline], prior: Baseline, min_rays: int = 64) -> list[dict]:
     """Score each method on each participant: ray scores, and map scores at positions with ``min_rays`` rays of the
     participant.
     """
     rows = []
-    for name, maps, values in _evaluate_methods(test, methods, blind):
+    for name, maps, values in _evaluate_methods(test, methods, prior):
         for i, person in enumerate(test.participants):
             is_participant, has_enough = test.sample_participants == i, test.counts[:, i] >= min_rays
             scores = dict.fromkeys(MAP_SCORES, float("nan"))
@@ -606,7 +606,7 @@ def score_split_half(
     centres: np.ndarray,
     radius: float,
     kappa: float,
-    blind: Baseline,
+    prior: Baseline,
     min_rays: int = 64,
     seed: int = 0,
 ) -> dict | None:
@@ -626,7 +626,7 @@ def score_split_half(
         halves[1], radius, queries=first.centres, min_rays=1, kappa_rule="fixed", kappa=kappa, centre="query"
     )
     predicted = lambda positions, directions: probes.density(directions)
-    row = evaluate_gaze(first, {"split half": predicted}, blind, resamples=0)[0]
+    row = evaluate_gaze(first, {"split half": predicted}, prior, resamples=0)[0]
     return {k: v for k, v in row.items() if "." not in k}
 
 

@@ -233,7 +233,7 @@ def _check_rows(rows: object, path: str | Path, name: str) -> tuple[dict[str, An
                 else value is None or _is_number(value)
             ):
                 raise _make_error(path, f'"{sanitize(key, 40)}" of a row of its "{name}" is {sanitize(value, 40)}')
-    return tuple(rows)
+    return tuple({**row, "method": row["method"].replace(_OLD_PRIOR, PRIOR)} for row in rows)
 
 
 def _is_number(value: object) -> bool:
@@ -253,14 +253,14 @@ def _make_error(path: str | Path, why: str) -> NergError:
 # Rules, for one split:
 #
 # 1. With fewer than `MIN_PARTICIPANTS` participants or `MIN_POSITIONS` positions there is no verdict.
-# 2. The field is compared with three baselines: the uniform density; the position-blind density, with the kernel that
-#   has the higher log score; and the nearest rays. If another baseline has a higher log score than all of these, it is
+# 2. The field is compared with three baselines: the uniform density; the position-independent prior, with the kernel
+#   that has the higher log score; and the nearest rays. If another baseline has a higher log score than these, it is
 #   compared with that, too. The scores are the log score (bits per ray), CC and KLD. A score is decisive if the 95 %
 #   confidence interval of the difference excludes zero.
 # 3. The field is better if at least two of the three scores are decisive for it and none against it, worse if two are
 #   decisive against it and none for it, and undecided otherwise.
-# 4. Worse than uniform or position-blind: do not use. Undecided against position-blind: not shown to be useful. Better
-#   than position-blind: useful, and the comparison with the nearest rays and any stronger baseline decides whether it
+# 4. Worse than uniform or the prior: do not use. Undecided against the prior: not shown to be useful. Better
+#   than the prior: useful, and the comparison with the nearest rays and any stronger baseline decides whether it
 #   is worth a field. The sentence names the strongest baseline, the one with the highest log score.
 #
 # The intervals are those of the bootstrap over participants (`workflows.evaluate_gaze`), widened for small samples: by
@@ -273,8 +273,11 @@ MIN_PARTICIPANTS, MIN_POSITIONS = 5, 10  # Minimum sizes for a verdict
 
 VERDICT_SCORES = {"bits": 1, "CC": 1, "KLD": -1}  # Scores of the verdict; 1: higher is better, -1: lower is better
 
-UNIFORM, POSITION_BLIND, NEAREST_RAYS, SPLIT_HALF = "uniform", "position-blind", "4,096 nearest rays", "split half"
+UNIFORM, PRIOR, NEAREST_RAYS, SPLIT_HALF = "uniform", "position-independent prior", "4,096 nearest rays", "split half"
 """Names of the methods that a field is compared with."""
+
+_BASELINE_NAMES = {UNIFORM: "the uniform density", PRIOR: f"the {PRIOR}", NEAREST_RAYS: "the nearest rays"}
+_OLD_PRIOR = "position-blind"  # In files of earlier versions
 
 SPLIT_LABELS = {
     "both": "held-out participants at held-out positions",
@@ -335,7 +338,8 @@ class Verdict:
     comparisons : tuple of Comparison
         Comparisons with the baselines.
     split_half_fraction : float or None
-        CC gain over position-blind as a fraction of the gain of the other half of the participants; None if unknown.
+        CC gain over the position-independent prior as a fraction of the gain of the other half of the participants;
+        None if unknown.
     """
 
     grade: str
@@ -360,16 +364,16 @@ def compute_verdict(
             f"{_format_count(num_positions, 'position', 'positions')} are too few; at least "
             f"{MIN_PARTICIPANTS} participants and {MIN_POSITIONS} positions are needed.",
         )
-    field, blind, strongest = rows[0], _find_position_blind(rows), _find_strongest(rows)
+    field, prior, strongest = rows[0], _find_prior(rows), _find_strongest(rows)
     baselines = {name: _find_row(rows, name) for name in (UNIFORM, NEAREST_RAYS)}
     compare = lambda name, row: Comparison(
         name, tuple(compare_scores(field, row, score, num_participants) for score in VERDICT_SCORES)
     )
-    pairs = [(UNIFORM, baselines[UNIFORM]), (POSITION_BLIND, blind), (NEAREST_RAYS, baselines[NEAREST_RAYS])]
+    pairs = [(UNIFORM, baselines[UNIFORM]), (PRIOR, prior), (NEAREST_RAYS, baselines[NEAREST_RAYS])]
     if strongest not in ("", *(name for name, _ in pairs)):
         pairs.append((strongest, _find_row(rows, strongest)))
     comparisons = tuple(compare(name, row) for name, row in pairs if row is not None)
-    split_half_fraction = _compute_split_half_fraction(field, blind, _find_row(rows, SPLIT_HALF))
+    split_half_fraction = _compute_split_half_fraction(field, prior, _find_row(rows, SPLIT_HALF))
     grade, sentence = _write_verdict(comparisons, strongest, label, num_participants)
     return Verdict(grade, sentence, comparisons, split_half_fraction)
 
@@ -400,52 +404,52 @@ def _write_verdict(
     comparisons: Sequence[Comparison], strongest: str, label: str, num_participants: int
 ) -> tuple[str, str]:
     outcome = {c.reference: c.outcome for c in comparisons}
-    if POSITION_BLIND not in outcome:
-        return "none", f"No verdict for {label}: the evaluation has no position-blind baseline."
-    for name, words in ((UNIFORM, "worse than the uniform density"), (POSITION_BLIND, "worse than position-blind")):
+    name_baseline = lambda name: _BASELINE_NAMES.get(name, name)
+    if PRIOR not in outcome:
+        return "none", f"No verdict for {label}: the evaluation has no {PRIOR}."
+    for name in (UNIFORM, PRIOR):
         if outcome.get(name) == WORSE:
-            return "reject", f"{words.capitalize()} for {label}: do not use."
-    if outcome[POSITION_BLIND] == UNDECIDED:
+            return "reject", f"Worse than {name_baseline(name)} for {label}: do not use."
+    if outcome[PRIOR] == UNDECIDED:
         return (
             "unclear",
-            f"Not shown to be better than position-blind for {label}: record more participants before relying on the "
-            "position.",
+            f"Not shown to be better than {name_baseline(PRIOR)} for {label}: record more participants before relying "
+            "on the position.",
         )
+    better = f"Better than {name_baseline(PRIOR)}"
     if NEAREST_RAYS not in outcome:
-        return "limited", f"Better than position-blind for {label}; not compared with the nearest rays."
-    other_outcomes = {name: result for name, result in outcome.items() if name not in (UNIFORM, POSITION_BLIND)}
-    short_names = {NEAREST_RAYS: "nearest rays"}
+        return "limited", f"{better} for {label}; not compared with {name_baseline(NEAREST_RAYS)}."
+    other_outcomes = {name: result for name, result in outcome.items() if name not in (UNIFORM, PRIOR)}
     for name, result in other_outcomes.items():
         if result == WORSE:
-            worse = short_names.get(name, name)
-            return "limited", f"Better than position-blind, but worse than {worse} for {label}: use the rays directly."
+            return "limited", f"{better}, but worse than {name_baseline(name)} for {label}: use the rays directly."
     for name, result in other_outcomes.items():
         if result == UNDECIDED:
             return (
                 "limited",
-                f"Better than position-blind for {label}; the comparison with {short_names.get(name, name)} is "
-                f"undecided with {num_participants} participants.",
+                f"{better} for {label}; the comparison with {name_baseline(name)} is undecided with {num_participants} "
+                "participants.",
             )
     if not strongest:
-        return "use", f"Better than nearest rays for {label}."
-    rest = "" if strongest == NEAREST_RAYS else "and than nearest rays "
-    return "use", f"Better than {short_names.get(strongest, strongest)}, the strongest baseline, {rest}for {label}."
+        return "use", f"Better than {name_baseline(NEAREST_RAYS)} for {label}."
+    rest = "" if strongest == NEAREST_RAYS else f"and than {name_baseline(NEAREST_RAYS)} "
+    return "use", f"Better than {name_baseline(strongest)}, the strongest baseline, {rest}for {label}."
 
 
 def _find_strongest(rows: Sequence[Mapping[str, Any]]) -> str:
     """Return the name of the baseline with the highest log score; "" if none has one.
 
-    The split half is not a baseline, and all position-blind kernels share one name.
+    The split half is not a baseline, and all kernels of the prior share one name.
     """
     scored = [r for r in rows[1:] if r.get("method") != SPLIT_HALF and not math.isnan(_read_number(r, "bits"))]
     best = max(scored, key=lambda r: _read_number(r, "bits"), default={})
     name = str(best.get("method", ""))
-    return POSITION_BLIND if name.startswith(POSITION_BLIND) else name
+    return PRIOR if name.startswith(PRIOR) else name
 
 
-def _find_position_blind(rows: Sequence[Mapping[str, Any]]) -> Mapping[str, Any] | None:
-    """Return the row of the position-blind density with the highest log score."""
-    candidates = [r for r in rows[1:] if str(r.get("method", "")).startswith(POSITION_BLIND)]
+def _find_prior(rows: Sequence[Mapping[str, Any]]) -> Mapping[str, Any] | None:
+    """Return the row of the position-independent prior with the highest log score."""
+    candidates = [r for r in rows[1:] if str(r.get("method", "")).startswith(PRIOR)]
     scored = [r for r in candidates if not math.isnan(_read_number(r, "bits"))]
     return max(scored or candidates, key=lambda r: _read_number(r, "bits"), default=None)
 
@@ -455,12 +459,12 @@ def _find_row(rows: Sequence[Mapping[str, Any]], name: str) -> Mapping[str, Any]
 
 
 def _compute_split_half_fraction(
-    field: Mapping[str, Any], blind: Mapping[str, Any] | None, half: Mapping[str, Any] | None
+    field: Mapping[str, Any], prior: Mapping[str, Any] | None, half: Mapping[str, Any] | None
 ):
-    if blind is None or half is None:
+    if prior is None or half is None:
         return None
-    half_gain = _read_number(half, "CC") - _read_number(blind, "CC")
-    fraction = (_read_number(field, "CC") - _read_number(blind, "CC")) / half_gain if half_gain > 0 else math.nan
+    half_gain = _read_number(half, "CC") - _read_number(prior, "CC")
+    fraction = (_read_number(field, "CC") - _read_number(prior, "CC")) / half_gain if half_gain > 0 else math.nan
     return fraction if math.isfinite(fraction) else None
 
 

@@ -18,16 +18,16 @@ SIGNALS = {"support": True, "spread": False}
 ERRORS = ("KLD", "excess")
 """Errors at a position: KLD (nats), and its excess over the split-half KLD."""
 RETAINED_FRACTIONS = (1.0, 0.75, 0.5, 0.25)  # Fractions of the most certain positions whose mean error is reported
-# Random halves of the participants, minimum rays of each half at a position, and the weight of the position-blind
-# density in the prediction of one half from the other, so that unseen directions have non-zero probability.
-_NUM_HALVES, _MIN_RAYS, _BLIND_WEIGHT = 8, 32, 0.2
+# Random halves of the participants, minimum rays of each half at a position, and the weight of the prior in the
+# prediction of one half from the other, so that unseen directions have non-zero probability.
+_NUM_HALVES, _MIN_RAYS, _PRIOR_WEIGHT = 8, 32, 0.2
 _MIN_GROUPS = 5  # Minimum number of position groups for a confidence interval
 
 
 def score_positions(
     test: GazeTest,
     maps: np.ndarray,
-    blind: np.ndarray,
+    prior: np.ndarray,
     *,
     support: np.ndarray | None = None,
     spread: np.ndarray | None = None,
@@ -40,8 +40,8 @@ def score_positions(
     ----------
     test : GazeTest
         Test data.
-    maps, blind : numpy.ndarray
-        Densities (P, D) of the field and of the position-blind baseline.
+    maps, prior : numpy.ndarray
+        Densities (P, D) of the field and of the position-independent prior.
     support : numpy.ndarray, optional
         Number of nearby training rays (P,).
     spread : numpy.ndarray, optional
@@ -55,16 +55,16 @@ def score_positions(
     -------
     list of dict
         Position (m), ``group``, numbers of rays and participants (``people``), KLD of the field and of the baseline
-        (``blind``), the split-half KLD (``half``) and the ``excess`` over it if there is enough data, ``support`` and
+        (``prior``), the split-half KLD (``half``) and the ``excess`` over it if there is enough data, ``support`` and
         ``spread``.
     """
-    error, blind_error = (metrics.kld(test.truth, m, eps=EPS) for m in (maps, blind))
-    half = compute_split_half_errors(test, blind, seed)
+    error, prior_error = (metrics.kld(test.truth, m, eps=EPS) for m in (maps, prior))
+    half = compute_split_half_errors(test, prior, seed)
     rows = []
     for i, (x, y, z) in enumerate(test.centres.tolist()):
         row = {"x": x, "y": y, "z": z, "group": str(i if groups is None else groups[i])}
         row |= {"rays": int(test.counts[i].sum()), "people": int(np.count_nonzero(test.counts[i]))}
-        row |= {"KLD": float(error[i]), "blind": float(blind_error[i])}
+        row |= {"KLD": float(error[i]), "prior": float(prior_error[i])}
         if np.isfinite(half[i]):
             row |= {"half": float(half[i]), "excess": float(error[i] - half[i])}
         row |= {k: float(v[i]) for k, v in (("support", support), ("spread", spread)) if v is not None}
@@ -72,8 +72,8 @@ def score_positions(
     return rows
 
 
-def compute_split_half_errors(test: GazeTest, blind: np.ndarray, seed: int = 0) -> np.ndarray:
-    """Compute the KLD (P,) of one half of the participants under the other half, mixed with a fifth of ``blind`` (P,
+def compute_split_half_errors(test: GazeTest, prior: np.ndarray, seed: int = 0) -> np.ndarray:
+    """Compute the KLD (P,) of one half of the participants under the other half, mixed with a fifth of ``prior`` (P,
     D).
 
     The result is the mean over both directions and several random halves; NaN if no split leaves 32 rays in both
@@ -88,8 +88,8 @@ def compute_split_half_errors(test: GazeTest, blind: np.ndarray, seed: int = 0) 
         error = np.full(len(test.truth), np.nan)
         shares = [c[has_both] / c[has_both].sum(axis=1, keepdims=True) for c in counts]
         a, b = (np.einsum("pn,pnd->pd", share, test.participant_densities[has_both]) for share in shares)
-        mix_blind = lambda maps, both=has_both: (1 - _BLIND_WEIGHT) * maps + _BLIND_WEIGHT * blind[both]
-        error[has_both] = (metrics.kld(a, mix_blind(b), eps=EPS) + metrics.kld(b, mix_blind(a), eps=EPS)) / 2
+        mix_prior = lambda maps, both=has_both: (1 - _PRIOR_WEIGHT) * maps + _PRIOR_WEIGHT * prior[both]
+        error[has_both] = (metrics.kld(a, mix_prior(b), eps=EPS) + metrics.kld(b, mix_prior(a), eps=EPS)) / 2
         errors.append(error)
     stacked = np.array(errors).reshape(-1, len(test.truth))
     is_known = np.isfinite(stacked)

@@ -12,7 +12,7 @@ from importlib.resources import files
 from typing import Any
 
 from nerg_mi import __version__
-from nerg_mi.evaluation.gaze_report import POSITION_BLIND, SPLIT_HALF, SPLIT_LABELS, Comparison, GazeResults, Verdict
+from nerg_mi.evaluation.gaze_report import PRIOR, SPLIT_HALF, SPLIT_LABELS, Comparison, GazeResults, Verdict
 from nerg_mi.rays.quality import WARNING_LABEL, make_quality_report
 
 from .data import MeanShare, ObjectAttention, Run
@@ -589,7 +589,7 @@ def _show_verdict(run: Run) -> Html:
         f"Evaluated on {results.num_participants} held-out participants at {results.num_positions} held-out "
         "positions. A gain counts "
         "if its 95 % confidence interval over participants excludes zero. The verdict needs a gain in two of the three "
-        f"scores (log score, CC, KLD) and a loss in none. {POSITION_BLIND.capitalize()} is a baseline that ignores the "
+        f"scores (log score, CC, KLD) and a loss in none. The {PRIOR} is a baseline that ignores the "
         "observer's position. The strongest baseline is the one with the highest log score."
     )
     half = next((v.split_half_fraction for _, v in run.verdicts if v.split_half_fraction is not None), None)

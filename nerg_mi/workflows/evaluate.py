@@ -57,9 +57,9 @@ from .train_gaze import PRIOR, train_gaze
 
 # Methods that are scored for each participant, and those that are drawn.
 _BY_PERSON = ("gaze field", "4,096 nearest rays")
-_DRAWN = ("gaze field", "position-blind", "16 nearest probes", "4,096 nearest rays")
+_DRAWN = ("gaze field", "position-independent prior", "16 nearest probes", "4,096 nearest rays")
 # Methods whose highest-density regions are calibrated.
-_PRIOR = "position-blind"
+_PRIOR = "position-independent prior"
 _CALIBRATED = ("gaze field", _PRIOR, "4,096 nearest rays")
 
 
@@ -207,7 +207,7 @@ def _positions(
     loaded: AnyGazeField,
     place: TrainingGeometry,
     members_of: Baseline,
-    blind: Baseline,
+    prior: Baseline,
     groups: list[str] | None,
     seed: int,
 ) -> list[dict[str, Any]]:
@@ -222,9 +222,9 @@ def _positions(
         support = np.array([np.ravel(loaded.support.evaluate(loaded.ns.Array3f(*map(float, p))))[0] for p in points])
     if len(members) > 1:
         spread = 4 * np.pi * members.std(axis=0, ddof=1).mean(axis=1)
-    of_blind = np.asarray(blind(test.centres, test.directions))
+    of_prior = np.asarray(prior(test.centres, test.directions))
     maps = members.mean(axis=0)
-    return score_positions(test, maps, of_blind, support=support, spread=spread, groups=groups, seed=seed)
+    return score_positions(test, maps, of_prior, support=support, spread=spread, groups=groups, seed=seed)
 
 
 def _groups(account: dict, split: str, centres: np.ndarray) -> list[str] | None:

@@ -264,7 +264,9 @@ def test_the_demo_evaluation_matches_its_field(standins):
     results = read_results(store.parent / "gaze.json")
     verdict = compute_verdict(results.rows, results.split, results.num_participants, results.num_positions)
     assert results.num_participants == 100 and results.num_positions == 64
-    assert verdict.sentence.startswith("Better than position-blind, the strongest baseline, and than nearest rays")
+    assert verdict.sentence.startswith(
+        "Better than the position-independent prior, the strongest baseline, and than the nearest rays"
+    )
 
 
 def test_ctrl_c_ends_the_demo_and_leaves_no_file(standins, tmp_path):

@@ -24,8 +24,8 @@ def made(kind: str, box: Box, seed: int = 4, **options):
     rng = np.random.default_rng(seed)
     if kind == "default recipe":
         config = LogGazeConfig(grid=GRID, width=16, prior=16, heads=(box.lower, box.upper), mix=0.2, **options)
-        blind = make_prior_table(np.exp(0.5 * rng.normal(size=512)) / 14.2, 16, ns, fibonacci_directions(1 << 14))
-        field = LogGazeField.random(config, box, ns, seed, blind)
+        prior = make_prior_table(np.exp(0.5 * rng.normal(size=512)) / 14.2, 16, ns, fibonacci_directions(1 << 14))
+        field = LogGazeField.random(config, box, ns, seed, prior)
         steep = {k: 8 * v for k, v in field.parameters().items() if k in ("emit_net.2", "capture_net.2")} | {
             "escaped": ns.Float(0.4)
         }

@@ -10,12 +10,7 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation import gaze, metrics
-from nerg_mi.evaluation.gaze import (
-    FieldDensity,
-    compute_map_scores,
-    make_position_blind_baseline,
-    make_uniform_baseline,
-)
+from nerg_mi.evaluation.gaze import FieldDensity, compute_map_scores, make_prior_baseline, make_uniform_baseline
 from nerg_mi.maths import vmf
 from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
@@ -44,11 +39,11 @@ def rays_baselines():
     return Rays(np.arange(n) * 1.0, np.zeros(n), ("a",), origin, vmf.sample(mu, 40.0, rng), np.ones(n))
 
 
-def test_position_blind_is_the_kde_of_all(rays_baselines):
-    density = gaze.make_position_blind_baseline(rays_baselines, kappa=30.0, backend="llvm")(np.zeros((3, 3)), X)
+def test_prior_is_the_kde_of_all(rays_baselines):
+    density = gaze.make_prior_baseline(rays_baselines, kappa=30.0, backend="llvm")(np.zeros((3, 3)), X)
     want = reference(X, rays_baselines.direction, [0, len(rays_baselines)], [30.0])
     assert density.shape == (3, 1024) and np.allclose(density, want, rtol=2e-4)
-    individual = gaze.make_position_blind_baseline(rays_baselines, kappa=30.0, backend="llvm")(
+    individual = gaze.make_prior_baseline(rays_baselines, kappa=30.0, backend="llvm")(
         np.zeros((2, 3)), np.stack([X, X[::-1]])
     )
     assert np.allclose(individual[0], individual[1, ::-1], rtol=1e-5)
@@ -261,8 +256,8 @@ def test_ray_scores_by_hand():
 
 
 def test_participants_are_scored_on_their_own_rays(rays_evaluation, test_set):
-    blind = make_position_blind_baseline(rays_evaluation, kappa=50)
-    rows = gaze.score_participants(test_set, {"blind": blind}, blind, min_rays=10)
+    prior = make_prior_baseline(rays_evaluation, kappa=50)
+    rows = gaze.score_participants(test_set, {"prior": prior}, prior, min_rays=10)
     assert [r["person"] for r in rows] == list(test_set.participants)
     assert sum(r["rays"] for r in rows) == test_set.counts.sum()
     assert all(r["bits"] == pytest.approx(0) for r in rows)

@@ -149,6 +149,13 @@ def test_results_are_read_back(tmp_path):
     )
 
 
+def test_old_names_of_methods_are_read(tmp_path):
+    rows = [RESULTS_ROWS[0], {"method": "position-blind"}, {"method": "position-blind, kappa 50"}]
+    write_report(tmp_path, rows, [], METADATA, "")
+    methods = [row["method"] for row in read_results(tmp_path / "gaze.json").rows]
+    assert methods == ["gaze field", "position-independent prior", "position-independent prior, kappa 50"]
+
+
 @pytest.mark.parametrize(
     "change",
     [
@@ -196,8 +203,8 @@ def scored(field, nearest=(0.4, 0.65, 0.55), **options):
     return [
         row("gaze field", *field, **options),
         row("uniform", -0.5, 0.0, 1.0, **options),
-        row("position-blind", 0.0, 0.4, 0.75, **options),
-        row("position-blind, kappa 50", -0.1, 0.38, 0.8, **options),
+        row("position-independent prior", 0.0, 0.4, 0.75, **options),
+        row("position-independent prior, kappa 50", -0.1, 0.38, 0.8, **options),
         row("4,096 nearest rays", *nearest, **options),
         {"method": "split half", "bits": 0.1, "CC": 0.7, "KLD": 0.9},
     ]
@@ -209,19 +216,23 @@ def scored(field, nearest=(0.4, 0.65, 0.55), **options):
         (
             (0.9, 0.85, 0.3),
             "use",
-            "Better than nearest rays, the strongest baseline, for held-out participants at held-out positions.",
+            "Better than the nearest rays, the strongest baseline, for held-out participants at held-out positions.",
         ),
-        ((0.42, 0.66, 0.54), "limited", "the comparison with nearest rays is undecided with 30 participants"),
+        ((0.42, 0.66, 0.54), "limited", "the comparison with the nearest rays is undecided with 30 participants"),
         (
             (0.2, 0.5, 0.65),
             "limited",
-            "worse than nearest rays for held-out participants at held-out positions: use the rays directly",
+            "worse than the nearest rays for held-out participants at held-out positions: use the rays directly",
         ),
-        ((0.01, 0.41, 0.74), "unclear", "Not shown to be better than position-blind for held-out participants"),
+        (
+            (0.01, 0.41, 0.74),
+            "unclear",
+            "Not shown to be better than the position-independent prior for held-out participants",
+        ),
         (
             (-0.3, 0.2, 0.95),
             "reject",
-            "Worse than position-blind for held-out participants at held-out positions: do not use.",
+            "Worse than the position-independent prior for held-out participants at held-out positions: do not use.",
         ),
         (
             (-0.9, -0.3, 1.6),
@@ -264,11 +275,17 @@ def test_contradicting_scores_are_undecided():
 @pytest.mark.parametrize(
     "strongest, words",
     [
-        ("position-blind", "Better than position-blind, the strongest baseline, and than nearest rays for"),
-        ("position-blind, kappa 50", "Better than position-blind, the strongest baseline, and than nearest rays for"),
-        ("uniform", "Better than uniform, the strongest baseline, and than nearest rays for"),
-        ("16 nearest probes", "Better than 16 nearest probes, the strongest baseline, and than nearest rays for"),
-        ("4,096 nearest rays", "Better than nearest rays, the strongest baseline, for"),
+        (
+            "position-independent prior",
+            "Better than the position-independent prior, the strongest baseline, and than the nearest rays for",
+        ),
+        (
+            "position-independent prior, kappa 50",
+            "Better than the position-independent prior, the strongest baseline, and than the nearest rays for",
+        ),
+        ("uniform", "Better than the uniform density, the strongest baseline, and than the nearest rays for"),
+        ("16 nearest probes", "Better than 16 nearest probes, the strongest baseline, and than the nearest rays for"),
+        ("4,096 nearest rays", "Better than the nearest rays, the strongest baseline, for"),
     ],
 )
 def test_the_strongest_baseline_is_named(strongest, words):
@@ -287,12 +304,12 @@ def test_a_stronger_baseline_is_also_compared():
     assert better.grade == "limited" and "worse than 16 nearest probes for" in better.sentence
     level = compute_verdict(rows(0.91, (0.84, 0.31, 0.2)), "both", 30, 60)
     assert level.grade == "limited" and "the comparison with 16 nearest probes is undecided" in level.sentence
-    assert {c.reference for c in level.comparisons} >= {"uniform", "position-blind", "16 nearest probes"}
+    assert {c.reference for c in level.comparisons} >= {"uniform", "position-independent prior", "16 nearest probes"}
 
 
-def test_the_stronger_of_the_blind_densities_is_the_reference():
+def test_the_stronger_of_the_priors_is_the_reference():
     rows = scored((0.2, 0.5, 0.65), reach=0.02)
-    rows[3] |= row("position-blind, kappa 50", 0.35, 0.6, 0.6, 0.02)
+    rows[3] |= row("position-independent prior, kappa 50", 0.35, 0.6, 0.6, 0.02)
     assert compute_verdict(rows, "both", 30, 60).grade == "reject"
 
 
@@ -413,7 +430,7 @@ def test_position_rows_have_their_errors(evaluation):
     expected = metrics.kld(test.truth, maps, eps=1e-6)
     assert [r["KLD"] for r in rows] == pytest.approx(expected.tolist()) and "spread" not in rows[0]
     # The four participants look at different heights, so one half predicts the other worse than itself.
-    assert all(0 < r["half"] < r["blind"] and r["excess"] == r["KLD"] - r["half"] for r in rows)
+    assert all(0 < r["half"] < r["prior"] and r["excess"] == r["KLD"] - r["half"] for r in rows)
     alone = gaze.make_test(crowd(people=1), test.centres, 0.6, 20.0, 256, min_rays=20)
     assert "half" not in uncertainty.score_positions(alone, maps, uniform)[0]
 

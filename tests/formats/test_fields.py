@@ -363,7 +363,7 @@ def test_contracted_box_round_trips(tmp_path):
 
 
 @pytest.mark.parametrize("value", [1e30, 81.0, 1e5])
-def test_a_blind_density_that_single_precision_cannot_hold_is_refused(tmp_path, value):
+def test_a_prior_that_single_precision_cannot_hold_is_refused(tmp_path, value):
     save_gaze(LogGazeField.random(LogGazeConfig(FIELDS_GRID, prior=4), BOX, ns), tmp_path / "g.safetensors", {})
     load_gaze(tmp_path / "g.safetensors", ns)
     rewrite(tmp_path / "g.safetensors", lambda tensors, meta: tensors["prior"].fill(value))

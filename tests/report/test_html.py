@@ -190,7 +190,7 @@ def test_section_names_and_titles_are_unique():
 
 def test_section_texts():
     said = {s.name: text_of(s, full_run()) for s in SECTIONS}
-    assert said["verdict"].startswith("Better than nearest rays, the strongest baseline, for held-out participants")
+    assert said["verdict"].startswith("Better than the nearest rays, the strongest baseline, for held-out participants")
     assert "4.00 × 4.00 × 4.00" in said["place"] and "training photos9" in said["place"]
     assert (
         "400 of 400 rows" in said["data"]

@@ -77,7 +77,7 @@ def test_a_report_of_all_files_in_a_folder(run, tmp_path):
     text = result.path.read_text(encoding="utf-8")
     assert (
         recorder.messages[0]
-        == "Better than nearest rays, the strongest baseline, for held-out participants at held-out positions."
+        == "Better than the nearest rays, the strongest baseline, for held-out participants at held-out positions."
         in text
     )
     assert recorder.messages[-1].startswith(f"wrote {tmp_path / 'a.html'} (") and len(text) < 6_000_000

@@ -68,13 +68,13 @@ def test_density_matches_its_formula():
             )[0]
         )
     )
-    blind = np.exp(np.array(field.log_prior(jit(r)), np.float64))
+    prior = np.exp(np.array(field.log_prior(jit(r)), np.float64))
     gaze, e, c = (np.array(v) for v in field.evaluate(jit(p_od), jit(p_o), jit(r), integral=2.0))
-    np.testing.assert_allclose(e, np.exp(emit) * blind / 2, rtol=1e-4)
+    np.testing.assert_allclose(e, np.exp(emit) * prior / 2, rtol=1e-4)
     np.testing.assert_allclose(c, capture, rtol=1e-4)
-    np.testing.assert_allclose(gaze, 0.8 * e * c + 0.2 * blind, rtol=1e-5)
+    np.testing.assert_allclose(gaze, 0.8 * e * c + 0.2 * prior, rtol=1e-5)
     gone = field.unnormalized(jit(p_od), jit(p_o), jit(r), escaped=namespace("llvm").Bool(True))[0]
-    np.testing.assert_allclose(np.array(gone), np.exp(0.7) * blind, rtol=1e-4)
+    np.testing.assert_allclose(np.array(gone), np.exp(0.7) * prior, rtol=1e-4)
 
 
 def test_without_geometry_density_ignores_the_surface():

@@ -136,9 +136,9 @@ def test07_regions_are_those_of_the_mixture():
     """Rays are in three of four directions, and the levels are quantiles: half of the rays are in the region of the
     second.
     """
-    field, blind = np.array([[0.8, 0.4, 0.2, 0.0]]), np.array([[0.0, 0.2, 0.2, 0.4]])
+    field, prior = np.array([[0.8, 0.4, 0.2, 0.0]]), np.array([[0.0, 0.2, 0.2, 0.4]])
     # Half of each: 0.4, 0.3, 0.2, 0.2.
-    judgement = _FoldDensities(field, blind, np.array([0, 1, 3]), np.array([0, 3]))
+    judgement = _FoldDensities(field, prior, np.array([0, 1, 3]), np.array([0, 3]))
     result = _calibrate_regions([judgement], 0.5)
     np.testing.assert_allclose([result[k] for k in ("50%", "80%", "95%")], [0.55 / 1.1, 0.9 / 1.1, 0.9 / 1.1])
     # The prior alone prefers the third direction, and the second as much as the direction without rays.
