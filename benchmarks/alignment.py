@@ -3,15 +3,21 @@
     python benchmarks/alignment.py [--trials 50] [--only KIND] [--seed 0] [--shoppers 12] [--update
     docs/explanation/accuracy.md]
 
-The scene is the demo store's trained field, transformed by a random similarity: scale from 0.14 to 7.4, a translation
-of about ten metres, and any rotation, or, if the up axis must be known, any rotation about it. The tracking is of
-generated shoppers, in metres; their hit points are those of rays cast at the store's mesh, with a noise of 2 cm.
-`right`: trials with an accepted fit within 10 cm (of the tracking) and 2 degrees of the truth. Errors are medians over
-these, of the median head of each; `95 %`: of all heads' errors in centimetres. `mirror named`: the rate of detection
-after negating the tracking's x axis. `residual cm`: the median that the fit reports.
+The scene is the trained radiance field of the demo store. Each trial transforms it by a random similarity: a scale
+from 0.14 to 7.4, a translation of about ten metres, and any rotation, or a rotation about the up axis for methods that
+need to know this axis. The tracking data are those of simulated shoppers, in metres. Their hit points are computed by
+ray casts at the mesh of the store, with a noise of 2 cm. The first table has one row per kind of evidence:
 
-Second table, if `../shared/data/fox` (or NERG_DATA) exists: participants who look around between the cameras of the fox
-photos, in a random other frame, from five picked points with errors of 1 % of the cameras' spread.
+- ``right``: the number of trials with an accepted fit whose errors are below 10 cm (in the tracking data) and 2
+  degrees;
+- errors of position, rotation and scale: medians over these trials, where the position error of a trial is the median
+  over head positions; ``95 %``: the 95 % quantile of the position errors of all heads, in centimetres;
+- ``residual cm``: the median residual that the fit reports;
+- ``mirror named``: how often mirrored tracking data (the x axis negated) are detected.
+
+The second table needs the photos of the fox (`../shared/data/fox`, or the folder of the variable NERG_DATA). It
+simulates participants who stand between the cameras of the photos, in a random other frame, and aligns them by five
+picked points with errors of 1 % of the extent of the camera positions.
 """
 
 from __future__ import annotations
@@ -249,18 +255,49 @@ def measure_fox(trials: int) -> list[list[str]] | None:
 
 
 def main(argv=None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--trials", type=int, default=50, help="random similarities a kind of evidence")
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
-        "--searches", type=int, help="trials of kinds that search, some ten seconds each (default: all)"
+        "--trials",
+        type=int,
+        default=50,
+        help="Number of trials, each with a random similarity, for each kind of evidence. Default: %(default)s.",
     )
-    parser.add_argument("--mirrors", type=int, help="additional trials with mirrored tracking (default: a fifth)")
-    parser.add_argument("--only", action="append", choices=[*KINDS, "fox"], help="only this kind; repeatable")
-    parser.add_argument("--seed", type=int, default=0, help="of the random similarities")
-    parser.add_argument("--shoppers", type=int, default=12, help="people who are tracked")
-    parser.add_argument("--rays", type=int, default=150_000, help="rays by which the place is traced")
-    parser.add_argument("--out", type=Path, default=Path("out/benchmarks/alignment.csv"), help="CSV file to write")
-    parser.add_argument("--update", type=Path, help="page of the documentation to put the tables into")
+    parser.add_argument(
+        "--searches",
+        type=int,
+        help=f"Number of trials for the kinds that search ({', '.join(SEARCHED)}), which take about ten seconds each. "
+        "Default: --trials.",
+    )
+    parser.add_argument(
+        "--mirrors",
+        type=int,
+        help="Number of additional trials with mirrored tracking data. Default: a fifth of the trials.",
+    )
+    parser.add_argument(
+        "--only",
+        action="append",
+        choices=[*KINDS, "fox"],
+        help="Kind of evidence to measure; can be repeated. Default: all.",
+    )
+    parser.add_argument("--seed", type=int, default=0, help="Seed of the random similarities. Default: %(default)s.")
+    parser.add_argument("--shoppers", type=int, default=12, help="Number of simulated shoppers. Default: %(default)s.")
+    parser.add_argument(
+        "--rays",
+        type=int,
+        default=150_000,
+        help="Number of rays by which the surfaces of the scene are sampled. Default: %(default)s.",
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("out/benchmarks/alignment.csv"),
+        help="CSV file to write. Default: %(default)s.",
+    )
+    parser.add_argument(
+        "--update",
+        type=Path,
+        help="Page of the manual whose tables below the same headings are replaced. Default: none.",
+    )
     args = parser.parse_args(argv)
 
     requested = args.only or [*KINDS, "fox"]

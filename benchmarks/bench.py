@@ -1,14 +1,22 @@
-"""All speed measurements in one run: frames and their stages against PyTorch, densities against SciPy, volumes against
-`volpath`, and the scaling of each cost.
+"""All speed measurements in one run: frames, densities, volumes, scaling, memory and start-up time.
 
     python benchmarks/bench.py [--only PARTS] [--long] [--mode llvm_ad_rgb] [--update docs/explanation/performance.md]
     [--out out/benchmarks/bench]
 
-Parts: ``frames``, ``stages``, ``kde``, ``volume``, ``growth``, ``memory``, ``start``; default: all. Programs that are
-compared do the same work, which is checked first, and alternate; figures are medians with quartiles. Prints tables,
-writes them as CSV and a figure, and updates the given page. ``--long``: more runs, larger sizes, and PyTorch at 1280 x
-720. With a CUDA variant, parts without a reference program are measured in wall-clock seconds; without a device the
-benchmark ends with a message.
+The parts are:
+
+- ``frames``: a frame of the demo store, compared with a renderer in PyTorch;
+- ``stages``: the stages of that frame;
+- ``kde``: kernel densities on the sphere, compared with SciPy;
+- ``volume``: the transmittance of a volume, compared with Mitsuba's `volpath`;
+- ``growth``: the growth of each cost with its size;
+- ``memory``: the peak memory of a frame;
+- ``start``: the time until a command has started.
+
+Programs that are compared do the same work, which is checked first, and their runs alternate. The figures are medians
+with quartiles. The benchmark prints tables, writes them as CSV files and a figure, and updates a page of the manual.
+With a CUDA variant, parts without a reference program are measured in wall-clock seconds. Without a CUDA device, the
+benchmark prints a message and ends.
 """
 
 from __future__ import annotations
@@ -393,14 +401,35 @@ PARTS = {part.__name__: part for part in (frames, stages, kde, volume, growth, m
 
 
 def main(argv=None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--only", default=",".join(PARTS), help=f"parts, comma-separated: {', '.join(PARTS)}")
-    parser.add_argument("--long", action="store_true")
-    parser.add_argument("--runs", type=int, default=0)
-    parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("-m", "--mode", default="llvm_ad_rgb", help="Mitsuba variant")
-    parser.add_argument("--update", type=Path, help="page of the documentation to put the tables into")
-    parser.add_argument("--out", type=Path, default=Path("out/benchmarks/bench"))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(
+        "--only",
+        default=",".join(PARTS),
+        help=f"Parts to measure, separated by commas. Default: all ({', '.join(PARTS)}).",
+    )
+    parser.add_argument(
+        "--long",
+        action="store_true",
+        help="Measure more runs, larger sizes, and the PyTorch renderer at 1280 x 720 pixels.",
+    )
+    parser.add_argument(
+        "--runs", type=int, default=0, help="Number of runs of each program. Default: 5; with --long 9."
+    )
+    parser.add_argument(
+        "--threads",
+        type=int,
+        default=os.cpu_count() or 1,
+        help="Number of CPU threads. Default: all cores (%(default)s).",
+    )
+    parser.add_argument("-m", "--mode", default="llvm_ad_rgb", help="Mitsuba variant. Default: %(default)s.")
+    parser.add_argument(
+        "--update",
+        type=Path,
+        help="Page of the manual whose tables below the same headings are replaced. Default: none.",
+    )
+    parser.add_argument(
+        "--out", type=Path, default=Path("out/benchmarks/bench"), help="Folder for the results. Default: %(default)s."
+    )
     args = parser.parse_args(argv)
     requested = args.only.split(",")
     if unknown := [name for name in requested if name not in PARTS]:

@@ -1,10 +1,11 @@
-"""Density evaluations of a frame, and the cost in time and error of each way to save them.
+"""Density evaluations of a frame, and the time and error of each setting that saves some of them.
 
     python benchmarks/evaluations.py SCENE.xml [-D KEY=VALUE] [--width 640] [--height 360] [--repeats 7]
     [--out out/benchmarks/evaluations.csv] [--update docs/explanation/error-and-time.md]
 
-Each row is the scene with some parameters, against the first row: all occupied cells are marched, and each observer ray
-to its end. Times are CPU time of both passes, colour and gaze, medians of rounds over all rows in turn.
+Each row of the table is the scene with some parameters of the integrator. Errors and speed-ups are relative to the
+first row, which marches all occupied cells and each observer ray to its end. Times are CPU times for colour and gaze
+together, medians over rounds in which all rows take turns.
 """
 
 from __future__ import annotations
@@ -53,14 +54,32 @@ def main(argv=None) -> None:
     mi.set_variant("llvm_ad_rgb")
     from nerg_mi.evaluation.study_subject import load_subject
 
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("scene", type=Path)
-    parser.add_argument("-D", "--define", action="append", default=[])
-    parser.add_argument("--width", type=int, default=640)
-    parser.add_argument("--height", type=int, default=360)
-    parser.add_argument("--repeats", type=int, default=7)
-    parser.add_argument("--out", type=Path, default=Path("out/benchmarks/evaluations.csv"))
-    parser.add_argument("--update", type=Path, help="page of the documentation to put the tables into")
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scene", type=Path, help="Scene file with the integrator nerg.")
+    parser.add_argument(
+        "-D",
+        "--define",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="Value of a parameter of the scene file; can be repeated. Default: the values in the file.",
+    )
+    parser.add_argument("--width", type=int, default=640, help="Width of the image in pixels. Default: %(default)s.")
+    parser.add_argument("--height", type=int, default=360, help="Height of the image in pixels. Default: %(default)s.")
+    parser.add_argument(
+        "--repeats", type=int, default=7, help="Number of timed frames of each row. Default: %(default)s."
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("out/benchmarks/evaluations.csv"),
+        help="CSV file to write. Default: %(default)s.",
+    )
+    parser.add_argument(
+        "--update",
+        type=Path,
+        help="Page of the manual whose tables below the same headings are replaced. Default: none.",
+    )
     args = parser.parse_args(argv)
     defaults = dict(word.split("=", 1) for word in args.define)
     subject = load_subject(args.scene, args.width, args.height, defaults)

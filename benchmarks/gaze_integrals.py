@@ -1,13 +1,14 @@
-"""Whether a normalised gaze field integrates to one: the integrator's integral against a finer one, at random
-positions.
+"""Integral of a normalised gaze field over the sphere, compared with a finer integral at random positions.
 
     python benchmarks/gaze_integrals.py GAZE PLACE.vol|FIELD.safetensors [--positions 1000] [--out
     out/benchmarks/gaze_integrals.csv]
 
-Positions are uniform in the box of training heads. The finer integral uses twice as many, other directions. Prints the
-maximum and the mean difference from one, the fraction within 1e-3, and the cost of an integral. ``--sweep``: the same
-for fewer and more directions, where the largest number serves as the reference, and for tolerances that determine their
-number.
+A normalised field is divided by the integral that the integrator computes for each observer. If this integral is
+accurate, the normalised density integrates to one. The benchmark computes it again with twice as many and other
+directions, at positions that are uniform in the bounding box of the training's head positions. It prints the maximum
+and the mean difference from one, the fraction of positions with a difference of at most 1e-3, and the time of an
+integral. ``--sweep`` prints the same for other numbers of directions, with the largest number as the reference, and for
+tolerances that determine the number of directions.
 """
 
 from __future__ import annotations
@@ -38,12 +39,25 @@ def main(argv=None) -> None:
     from nerg_mi.transport.observer import ObserverSettings
     from nerg_mi.transport.observer_gaze import GazeFieldInstance
 
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("gaze", type=Path)
-    parser.add_argument("place", type=Path)
-    parser.add_argument("--positions", type=int, default=1000)
-    parser.add_argument("--out", type=Path, default=Path("out/benchmarks/gaze_integrals.csv"))
-    parser.add_argument("--sweep", action="store_true")
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("gaze", type=Path, help="Checkpoint of the gaze field.")
+    parser.add_argument(
+        "place", type=Path, help="Geometry of the environment: a volume (.vol) or the checkpoint of a radiance field."
+    )
+    parser.add_argument(
+        "--positions", type=int, default=1000, help="Number of random observer positions. Default: %(default)s."
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("out/benchmarks/gaze_integrals.csv"),
+        help="CSV file to write. Default: %(default)s.",
+    )
+    parser.add_argument(
+        "--sweep",
+        action="store_true",
+        help="Print errors and times for several numbers of directions and tolerances instead, without a CSV file.",
+    )
     args = parser.parse_args(argv)
     ns = namespace("llvm_ad_rgb")
     field, _ = load_gaze(args.gaze, ns)

@@ -1,8 +1,8 @@
 """Generated scenes of boxes whose participants follow known laws of attention: a gallery, an office with windows, a
 corridor, a stage.
 
-Unlike the demo store's shoppers, who share one law, these participants differ: each has an individual preference for
-each target. Gaze is held for a while, like a fixation. Everything follows from a seed.
+All shoppers of the demo store follow one law. The participants of these scenes differ: each has an individual
+preference for each target. Gaze stays on a target for a while, like a fixation. All data are determined by a seed.
 """
 
 from __future__ import annotations

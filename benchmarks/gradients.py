@@ -1,11 +1,12 @@
-"""Derivatives of images against central differences, for all quantities and parameters.
+"""Derivatives of images compared with central differences, for all quantities and parameters.
 
     python benchmarks/gradients.py [--depth median] [--case NAME] [--update docs/explanation/numerics.md]
 
-One number moves each parameter along a fixed line. Forward: derivatives of all pixels at once, as computed by
-``mi.render``. Reverse: derivative of one weighted sum of the pixels of one quantity. Both are compared with central
-differences of images at two distances, extrapolated (Richardson); reverse also with the weighted sum of the forward
-derivatives, the dot-product test, which holds to rounding. Prints markdown; the benchmark does not pass or fail.
+Each case moves one parameter, or all weights of one kind together, along a fixed line. Forward mode gives the
+derivatives of all pixels, as computed by ``mi.render``. Reverse mode gives the derivative of one weighted sum of the
+pixels of one quantity. Both are compared with central differences of images at two distances, extrapolated (Richardson
+extrapolation). Reverse mode is also compared with the weighted sum of the forward derivatives, the dot-product test,
+which holds up to rounding. The benchmark prints Markdown and does not pass or fail.
 """
 
 from __future__ import annotations
@@ -279,7 +280,8 @@ def cases() -> list[Case]:
     ]
 
 
-# Derivatives that miss a discontinuity: (1), (2), ... refer to the notes below the table in docs/how-to/derivatives.md.
+# Derivatives that miss a discontinuity: (1), (2), ... refer to the list above the table in
+# docs/explanation/numerics.md.
 EXCLUDED = {
     "shape: its silhouette": dict.fromkeys(
         ("colour", "depth", "opacity", "position", "gaze", "emit", "capture", "visibility", "observer depth"),
@@ -420,10 +422,18 @@ def summary(result: dict) -> list[str]:
 
 def main(argv=None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--case", default="", help="only cases whose name contains this")
-    parser.add_argument("--depth", default="median", help="median, expected or refined")
-    parser.add_argument("-m", "--mode", default="llvm_ad_rgb", help="Mitsuba variant")
-    parser.add_argument("--update", type=Path, help="a document whose tables are replaced, heading by heading")
+    parser.add_argument(
+        "--case", default="", help="Text that the names of the measured cases contain. Default: all cases."
+    )
+    parser.add_argument(
+        "--depth", default="median", help="Depth of surfaces: median, expected or refined. Default: %(default)s."
+    )
+    parser.add_argument("-m", "--mode", default="llvm_ad_rgb", help="Mitsuba variant. Default: %(default)s.")
+    parser.add_argument(
+        "--update",
+        type=Path,
+        help="Page of the manual whose tables below the same headings are replaced. Default: none.",
+    )
     args = parser.parse_args(argv)
 
     import mitsuba as mi

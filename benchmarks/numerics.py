@@ -2,10 +2,9 @@
 
     python benchmarks/numerics.py [--update docs/explanation/numerics.md]
 
-Each case is compared with a closed form or with float64, for values and derivatives, and gives one row: case, range,
-quantity, largest error, reference. Prints markdown; `--update` replaces the tables under the same headings of a
-document. Errors are relative unless the row states otherwise. The benchmark does not pass or fail; the tests enforce
-bounds.
+Values and derivatives of each case are compared with a closed form or with a computation in float64. A row of the
+tables has the case, its range, the quantity, the largest error, and the reference. Errors are relative unless the row
+states otherwise. The benchmark prints Markdown and does not pass or fail; the tests enforce bounds.
 """
 
 from __future__ import annotations
@@ -499,8 +498,12 @@ GROUPS = {
 
 def main(argv=None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("-m", "--mode", default="llvm_ad_rgb", help="Mitsuba variant")
-    parser.add_argument("--update", type=Path, help="a document whose tables are replaced, heading by heading")
+    parser.add_argument("-m", "--mode", default="llvm_ad_rgb", help="Mitsuba variant. Default: %(default)s.")
+    parser.add_argument(
+        "--update",
+        type=Path,
+        help="Page of the manual whose tables below the same headings are replaced. Default: none.",
+    )
     args = parser.parse_args(argv)
     import mitsuba as mi
 

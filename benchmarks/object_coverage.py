@@ -1,14 +1,14 @@
 """Coverage of 95 % intervals of AOI statistics, and the rate at which equal groups are found to differ.
 
-    python benchmarks/object_coverage.py shares        # intervals of fractions of participants, exact
+    python benchmarks/object_coverage.py shares        # intervals of fractions of participants, computed exactly
     python benchmarks/object_coverage.py ratios        # methods for intervals of ratios of sums over participants
-    python benchmarks/object_coverage.py numbers       # each number of `nerg stats` as it is
-    python benchmarks/object_coverage.py few           # candidates for numbers that depend on few participants
-    python benchmarks/object_coverage.py differences   # differences of two groups of the same participants
+    python benchmarks/object_coverage.py numbers       # the interval of each statistic of `nerg stats`
+    python benchmarks/object_coverage.py few           # methods for statistics that depend on few participants
+    python benchmarks/object_coverage.py differences   # differences between two groups of one population
 
-The population consists of the sums of 8,000 visits of the demo store's shoppers: 200 walks, each with 40 independent
-draws of gaze from the store's law. Its numbers are the exact truth; a data set is a sample of visits with replacement.
-AOIs are the store's 30 goods, which almost everybody looks at, and 15 labels of 12 cm on them, which few look at.
+The population consists of 8,000 visits of the demo store's shoppers: 200 walks, each with 40 independent draws of gaze
+from the store's law. Its statistics are the true values. A data set is a sample of visits with replacement. The AOIs
+are the store's 30 goods, which almost all shoppers look at, and 15 labels of 12 cm on them, which few look at.
 """
 
 from __future__ import annotations
@@ -314,13 +314,28 @@ def differences(population: Population, sets: int, pairs: tuple[tuple[int, int],
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("shares", "ratios", "few", "numbers", "differences"))
-    parser.add_argument("--sets", type=int, default=1000, help="data sets (1000)")
-    parser.add_argument("--people", type=int, nargs="+", default=[8, 16, 40], help="people of each (8 16 40)")
     parser.add_argument(
-        "--of", nargs="+", default=["share", "share_when_visible", "distance"], help="numbers of the ratios"
+        "what", choices=("shares", "ratios", "few", "numbers", "differences"), help="Table to compute; see above."
     )
-    parser.add_argument("--population", type=Path, help=".npz file of the sums, written where there is none")
+    parser.add_argument("--sets", type=int, default=1000, help="Number of data sets. Default: %(default)s.")
+    parser.add_argument(
+        "--people",
+        type=int,
+        nargs="+",
+        default=[8, 16, 40],
+        help="Numbers of participants in a data set. Default: 8 16 40.",
+    )
+    parser.add_argument(
+        "--of",
+        nargs="+",
+        default=["share", "share_when_visible", "distance"],
+        help="Statistics for the tables ratios and few. Default: share share_when_visible distance.",
+    )
+    parser.add_argument(
+        "--population",
+        type=Path,
+        help="File (.npz) of the population, which is written if it does not exist. Default: none.",
+    )
     arguments = parser.parse_args()
     people = tuple(arguments.people)
     if arguments.what == "shares":

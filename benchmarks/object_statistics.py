@@ -1,10 +1,11 @@
-"""AOI statistics against the truth: errors (coverage of intervals: object_coverage.py).
+"""Errors of AOI statistics, compared with the ground truth of the demo store.
 
-    python benchmarks/object_statistics.py errors      # the store's law and brute-force ray casts
-    python benchmarks/object_statistics.py shop        # the rays of docs/tutorials/store.md, as shop.npz in this folder
+    python benchmarks/object_statistics.py errors      # errors against the store's law and brute-force ray casts
+    python benchmarks/object_statistics.py shop        # writes shop.npz, the rays of docs/tutorials/store.md
 
-Walks are those of the demo store's shoppers (`nerg_mi.scenes.store.shoppers`), each tracked every 0.8 s (five times a
-second for the shop); gaze directions are drawn from the store's law.
+The walks are those of the demo store's shoppers (`nerg_mi.scenes.store.shoppers`), with a position every 0.8 s (five
+per second for ``shop``). Gaze directions are drawn from the store's law. Coverage of the confidence intervals:
+object_coverage.py.
 """
 
 from __future__ import annotations
@@ -211,7 +212,7 @@ def errors() -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("errors", "shop"))
+    parser.add_argument("what", choices=("errors", "shop"), help="Table to print, or file to write; see above.")
     if parser.parse_args().what == "errors":
         errors()
         return

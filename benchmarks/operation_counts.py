@@ -2,8 +2,8 @@
 
     python benchmarks/operation_counts.py [--width 240] [--runs 5]
 
-Prints the table of docs/explanation/performance.md and writes it as CSV. Counts do not depend on the machine; CPU
-seconds are medians of several runs, and only their ratios are meaningful.
+Prints a table for docs/explanation/performance.md and writes it as out/benchmarks/operation_counts.csv. The counts do
+not depend on the machine. CPU times are medians over several runs, and only their ratios are meaningful.
 """
 
 from __future__ import annotations
@@ -92,10 +92,10 @@ def evaluations(width: int, options: dict) -> list[float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--width", type=int, default=240)
-    parser.add_argument("--runs", type=int, default=5)
-    parser.add_argument("-m", "--mode", default="llvm_ad_rgb", help="Mitsuba variant")
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--width", type=int, default=240, help="Width of the image in pixels. Default: %(default)s.")
+    parser.add_argument("--runs", type=int, default=5, help="Number of timed frames of each row. Default: %(default)s.")
+    parser.add_argument("-m", "--mode", default="llvm_ad_rgb", help="Mitsuba variant. Default: %(default)s.")
     args = parser.parse_args()
     mi.set_variant(args.mode)
 

@@ -1,14 +1,17 @@
-"""The paper's claims about its variants, over participants, positions and seeds: their order, losses, features,
-initialisation.
+"""Claims of the paper about its variants, tested over participants, positions and seeds.
 
     python benchmarks/paper_claims.py [--only supermarket,store] [--folds 4] [--steps 800] [--recipes default,paper]
 
-One ablation (`nerg ablate`) per fold, with other participants (half), other positions (60 in three zones) and another
-seed held out. The table of a scene has one row per recipe and variant: means over folds of the paper's loss, KLD + (1 -
-CC) + MAE, on training positions and its increase on held-out ones, and of held-out KLD and CC; `less` is a variant
-minus the product of emit and capture of the same recipe, fold by fold, with 95 % of Student's t. The last table has the
-CC of all scenes, one row per scene and recipe: of the product, of the variants minus it, and the median training time
-of the product in seconds. Rows are cached, and trained once.
+The benchmark runs one ablation (`nerg ablate`) per fold, in which other participants (half), other positions (60 in
+three zones) and another seed are held out. It compares emit, capture and their product, the losses, the semantic
+features, and the initialisations of the paper.
+
+The table of a scene has one row per recipe and variant. Its columns are means over folds: the paper's loss, KLD + (1 -
+CC) + MAE, on training positions; its increase on held-out positions; KLD and CC on held-out positions, and their
+difference from the product of the same recipe, computed fold by fold, with 95 % intervals of Student's t. The last
+table has the CC of all scenes, one row per scene and recipe: the CC of the product, the differences of the variants
+from it, and the median training time of the product in seconds. Results are stored in the output folder, and a second
+run does not train them again.
 """
 
 from __future__ import annotations
@@ -32,11 +35,21 @@ def main(argv=None) -> None:
     from nerg_mi.workflows.base import select_backend
     from nerg_mi.workflows.gaze_commands import AblationOptions
 
-    parser = place_parser(__doc__, "paper_claims", folds=4)
-    parser.set_defaults(only="supermarket,store")
-    parser.add_argument("--steps", type=int, default=800, help="of the recipes but the default one")
-    parser.add_argument("--recipes", default="default,paper")
-    parser.add_argument("--variant", action="append", default=[], help="only this one; can be repeated")
+    parser = place_parser(__doc__, "paper_claims", folds=4, only="supermarket,store")
+    parser.add_argument(
+        "--steps",
+        type=int,
+        default=800,
+        help="Number of training steps of all recipes but the default one. Default: %(default)s.",
+    )
+    parser.add_argument(
+        "--recipes",
+        default="default,paper",
+        help="Training recipes to compare, separated by commas: default, small, paper. Default: %(default)s.",
+    )
+    parser.add_argument(
+        "--variant", action="append", default=[], help="Name of a variant to train; can be repeated. Default: all."
+    )
     args = parse(parser, argv)
     select_backend("llvm_ad_rgb", args.threads)
     expected, each = {f.name for f in fields(AblationOptions)}, []

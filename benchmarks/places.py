@@ -1,25 +1,27 @@
-"""One protocol for gaze in several scenes: where is a field better than simpler baselines, and where is it worse?
+"""Gaze fields compared with simpler baselines by one protocol in several scenes.
 
     python benchmarks/places.py [--only room,office] [--folds 4] [--seed 0] [--prior-folds N] [--prior-kappa K]
         [--recipe default] [--variant VARIANT] [--no-surfaces] [--against FOLDS.csv] [--out out/benchmarks/places]
     python benchmarks/places.py --uncertainty --folds 3 --zones 6 [--ensemble 5] [--out out/benchmarks/uncertainty]
 
-Recordings of a supermarket (surfaces from hit points) and of three scenes of EyeNavGS (no geometry), the demo store's
-shoppers in its field, and four generated scenes with their own laws of attention (`generated_places.py`) and walls. In
-each fold half of the participants train the field, and the others are scored at 60 positions in three zones from which
-training data is excluded within 2R. Baselines: uniform, position-independent, nearest probes and nearest rays, and the
-split-half agreement of the held-out participants. `rank` is among the methods other than the split half; `less` is the
-field minus the best baseline, fold by fold, with 95 % of Student's t; `way` is the field's position between the
-position-independent prior and the split half in CC, where the latter is better. `--prior-folds 0` trains without a
-selected weight of the prior, `--no-surfaces` without geometry even if it is known. `--against` prints the field minus
-that of another run, fold by fold, from its folds.csv.
+The scenes are recordings of a supermarket (with surfaces from hit points), recordings of three EyeNavGS scenes (without
+geometry), the demo store's shoppers in its radiance field, and four generated scenes with walls and their own laws of
+attention (`generated_places.py`). In each fold, one half of the participants trains the field. The other half is scored
+at 60 positions in three zones. Training data within 2R of these positions are excluded. The baselines are a uniform
+density, a position-independent density, the nearest probes, and the nearest rays. The agreement between two halves of
+the held-out participants (split half) is a reference.
 
-`--uncertainty` evaluates in the same folds whether a field estimates its own error; use more zones then, since
-positions of a zone are neighbours. One row per scene: Spearman's rho of low support with the error, at new positions
-and at all held-out ones, with 95 % of resampled zones; the mean error of all positions and of the most certain half;
-and the fraction of held-out rays in the smallest regions that contain 80 % of the gaze, and in those calibrated on
-held-out training data. With `--ensemble` fields are means of several members, and their standard deviation (AOV
-`gaze_std`) is ranked next to support.
+Columns of places.csv: ``rank`` is the rank of the field among all methods but the split half. ``less`` is the field
+minus the best baseline, fold by fold, and ``reach`` the half width of its 95 % interval (Student's t). ``way`` is the
+position of the field's CC between the position-independent density (0) and the split half (1), where the latter is
+better.
+
+``--uncertainty`` evaluates in the same folds whether a field estimates its own error. Use more zones for it, since the
+positions of a zone are neighbours. The table has one row per scene: Spearman's rank correlation of low support with the
+error, at new positions and at all held-out positions, with 95 % intervals from resampled zones; the mean error at all
+positions and at the half with the most support; and the fraction of held-out rays in the smallest regions that contain
+80 % of the predicted gaze, before and after calibration on held-out training data. With ``--ensemble``, the spread of
+the members (AOV `gaze_std`) is ranked in the same way.
 """
 
 from __future__ import annotations
@@ -38,15 +40,28 @@ Make = Callable[[Path], tuple[Path, dict]]
 """Writes the rays of a scene into a folder; returns their file and the location of the geometry: options of a fold."""
 
 
-def place_parser(what: str, out: str, folds: int) -> argparse.ArgumentParser:
-    """Options of the benchmark: scenes, number of ``folds``, and the output folder (below out/benchmarks)."""
-    parser = argparse.ArgumentParser(description=what.splitlines()[0])
+def place_parser(what: str, out: str, folds: int, only: str | None = None) -> argparse.ArgumentParser:
+    """Options of a benchmark: scenes (``only``, default: all), number of ``folds``, and the output folder (below
+    out/benchmarks)."""
+    parser = argparse.ArgumentParser(description=what, formatter_class=argparse.RawDescriptionHelpFormatter)
     data = Path(os.environ.get("NERG_DATA", ROOT.parent / "shared" / "data"))
-    parser.add_argument("--data", type=Path, default=data, help="folder of vr_supermarket and eyenavgs")
-    parser.add_argument("--only", help="names of places, with commas between. Default: all that there are.")
-    parser.add_argument("--folds", type=int, default=folds)
-    parser.add_argument("--threads", type=int)
-    parser.add_argument("--out", type=Path, default=Path("out/benchmarks") / out)
+    parser.add_argument(
+        "--data",
+        type=Path,
+        default=data,
+        help="Folder with the recordings vr_supermarket and eyenavgs. Default: the variable NERG_DATA, else "
+        "../shared/data.",
+    )
+    parser.add_argument(
+        "--only",
+        default=only,
+        help=f"Names of the scenes, separated by commas. Default: {only or 'all that are available'}.",
+    )
+    parser.add_argument("--folds", type=int, default=folds, help="Number of folds. Default: %(default)s.")
+    parser.add_argument("--threads", type=int, help="Number of CPU threads. Default: all cores.")
+    parser.add_argument(
+        "--out", type=Path, default=Path("out/benchmarks") / out, help="Folder for the results. Default: %(default)s."
+    )
     return parser
 
 
@@ -133,16 +148,45 @@ SCORES = {"KLD": False, "CC": True, "bits": True}
 
 def main(argv=None) -> None:
     parser = place_parser(__doc__, "places", folds=4)
-    parser.add_argument("--recipe", default="default")
-    parser.add_argument("--variant", help="emit, capture or emit_capture. Default: the recipe's.")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the first fold")
-    parser.add_argument("--zones", type=int, default=3, help="zones of test positions of a fold")
-    parser.add_argument("--prior-folds", type=int, help="Default: the recipe's.")
-    parser.add_argument("--prior-kappa", type=float, help="Default: the recipe's.")
-    parser.add_argument("--no-surfaces", action="store_true", help="ignore known surfaces in all scenes")
-    parser.add_argument("--against", type=Path, help="folds.csv of a run whose field this one is compared with")
-    parser.add_argument("--uncertainty", action="store_true", help="whether fields know what they do not know")
-    parser.add_argument("--ensemble", type=int, default=0, help="members of each fold's field")
+    parser.add_argument(
+        "--recipe", default="default", help="Training recipe: default, small or paper. Default: %(default)s."
+    )
+    parser.add_argument(
+        "--variant", help="Variant of the field: emit, capture or emit_capture. Default: set by the recipe."
+    )
+    parser.add_argument("--seed", type=int, default=0, help="Seed of the first fold. Default: %(default)s.")
+    parser.add_argument(
+        "--zones", type=int, default=3, help="Number of zones of test positions in a fold. Default: %(default)s."
+    )
+    parser.add_argument(
+        "--prior-folds",
+        type=int,
+        help="Number of folds that select the weight of the position-independent prior; 0: no prior. Default: set by "
+        "the recipe.",
+    )
+    parser.add_argument(
+        "--prior-kappa",
+        type=float,
+        help="Concentration (unitless) of the kernel of the position-independent prior. Default: set by the recipe.",
+    )
+    parser.add_argument("--no-surfaces", action="store_true", help="Train and score without geometry in all scenes.")
+    parser.add_argument(
+        "--against",
+        type=Path,
+        help="File folds.csv of another run; prints the scores of this run minus those of the other, fold by fold. "
+        "Default: none.",
+    )
+    parser.add_argument(
+        "--uncertainty",
+        action="store_true",
+        help="Evaluate whether support and spread predict the error of the field. Default: compare it with baselines.",
+    )
+    parser.add_argument(
+        "--ensemble",
+        type=int,
+        default=0,
+        help="Number of members of an ensemble in each fold; 0: a single field. Default: %(default)s.",
+    )
     args = parse(parser, argv)
     if args.against is not None and not args.against.is_file():
         parser.error(f'"{args.against}" is not there; it is written by a run whose --out is its folder')

@@ -1,18 +1,19 @@
-"""Measurements in separate processes, for `bench.py`: the memory of a frame, and start-up times.
+"""Measurements in separate processes, for `bench.py`: the peak memory of a frame, and start-up times.
 
     python benchmarks/processes.py memory [--sizes 640x360,1280x720,1920x1080] [--update
     docs/explanation/performance.md]
     python benchmarks/processes.py start [--runs 5] [--update docs/explanation/performance.md]
 
-Memory: the demo store, colour, depth and gaze of an observer who is not at the camera, one sample per pixel. Resident:
-the peak memory of the process (high-water mark of its resident set) beyond its size with the package imported and the
-variant set; it includes the field, the compiled kernels and the image. Arrays: the maximum that Dr.Jit held in arrays.
-In one piece by ``mi.render``, and in strips by `nerg render`. Kernels come from the cache: a first process, which does
-not count, compiles them.
+``memory`` measures a frame of the demo store with colour, depth and the gaze of an observer who is not at the camera,
+at one sample per pixel. The image is rendered in one piece by ``mi.render``, and in strips by `nerg render`. Resident
+memory is the peak of the process (the high-water mark of its resident set) minus its size after the package is imported
+and the variant is set. It includes the field, the compiled kernels and the image. The memory of arrays is the maximum
+that Dr.Jit held in arrays. Kernels come from the cache: a first process, which is not measured, compiles them.
 
-Start: time until imports, the command's help, the first image and the demo are done, alternating; medians of wall-clock
-seconds with quartiles, and CPU seconds. Files are in the system's cache after the first round, which does not count.
-"Cold" has no compiled kernels, "warm" those of the previous runs.
+``start`` measures the time until the package is imported, until the help of the command is printed, and until the first
+image and the demo are finished. The commands alternate. The table has medians and quartiles of wall-clock seconds, and
+medians of CPU seconds. A first round, which is not measured, loads the files into the cache of the system. "Cold" runs
+start without compiled kernels, "warm" runs with those of previous runs.
 """
 
 from __future__ import annotations
@@ -139,12 +140,26 @@ def start(runs: int) -> list[list[str]]:
 
 
 def main(argv=None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("what", choices=HEADS)
-    parser.add_argument("--sizes", default=",".join(f"{w}x{h}" for w, h in SIZES), help="of the frames")
-    parser.add_argument("--runs", type=int, default=5, help="of each start")
-    parser.add_argument("--one", choices=WAYS, help="print the memory of one frame, measured in this process")
-    parser.add_argument("--update", type=Path, help="page of the documentation to put the tables into")
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=HEADS, help="Measurement; see above.")
+    parser.add_argument(
+        "--sizes",
+        default=",".join(f"{w}x{h}" for w, h in SIZES),
+        help="Sizes of the images in pixels, WIDTHxHEIGHT, separated by commas (memory). Default: %(default)s.",
+    )
+    parser.add_argument(
+        "--runs", type=int, default=5, help="Number of runs of each command (start). Default: %(default)s."
+    )
+    parser.add_argument(
+        "--one",
+        choices=WAYS,
+        help="Print the memory of one frame, measured in this process, by the given renderer. Default: none.",
+    )
+    parser.add_argument(
+        "--update",
+        type=Path,
+        help="Page of the manual whose tables below the same headings are replaced. Default: none.",
+    )
     args = parser.parse_args(argv)
     sizes = [tuple(map(int, size.split("x"))) for size in args.sizes.split(",")]
     if args.one:

@@ -7,23 +7,23 @@
     python -m nerg_mi.scenes.tabletop.make                     # once: photos, rendered from a generated scene
     python benchmarks/radiance.py tabletop [--minutes 4] [--bounded]
 
-fox: real photos, every 8th held out. One training for the last of the ``--minutes``, with its learning-rate schedule
-over the whole time; at each of them the current weights are written, with the clock stopped, and scored like `nerg eval
-radiance` after training. A row for a shorter time is therefore an intermediate state of a longer run, not the result of
-a run of that length. "fitted" is the PSNR of right halves after a colour correction fitted on left ones, since the
-exposure of held-out photos is unknown. ``--data`` uses another posed image set.
+``fox``: real photos, of which every 8th is held out. There is one training, for the last of the ``--minutes``, whose
+learning-rate schedule covers the whole time. After each of the ``--minutes``, the clock stops and the current weights
+are written. They are scored after the training, like by `nerg eval radiance`. A row for a shorter time is therefore an
+intermediate state of a longer training, not the result of a training of that length. "PSNR, colours fitted" is the PSNR
+of the right halves of the images after a colour correction that is fitted to the left halves, because the exposure of
+the held-out photos is unknown.
 
-store: a room seen from inside, from its images alone and with their depth; depth and the opacity of the walls are
-compared with exact ray casts to the twin.
+``store``: a room seen from inside, trained from its images alone and from images with depth. Depth and the opacity of
+the walls are compared with exact ray casts at the store's mesh.
 
-tabletop: an unbounded scene, photos around a table in a room with a view, with the defaults of `nerg train radiance`.
-The photos are read like a user's: COLMAP's model, every 8th held out, the box from its points. Depth is compared with
-exact ray casts. "near": within 1.5 m of the object; "far": more than 4 m from the camera, without the sky; "beyond":
-outside the field's box, or the core of a contracted one, with the sky. ``--bounded``: as if nothing were visible beyond
-that box.
+``tabletop``: an unbounded scene, with photos taken around a table in a room with a view through a window, and the
+defaults of `nerg train radiance`. The photos are read as a COLMAP model, with every 8th photo held out and the box
+determined from its points. Depth is compared with exact ray casts. "Near" is within 1.5 m of the object. "Far" is more
+than 4 m from the camera, without the sky. "Beyond" is outside of the field's box, or of the core of a contracted field,
+with the sky.
 
-``--validate`` never reads the held-out views: every 8th of the *training* views replaces them, for choosing settings.
-Each subcommand writes a CSV next to the printed table.
+Each training writes a CSV file and prints a table.
 """
 
 from __future__ import annotations
@@ -238,21 +238,64 @@ SETS = {
 def main(argv=None) -> None:
     from timing import print_table, write_rows
 
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("what", choices=SETS)
-    parser.add_argument("--data", type=Path, help="folder of the views")
-    parser.add_argument("--minutes", help="of the training; of the fox several, at which it is looked at")
-    parser.add_argument("--width", type=int, default=135, help="of the fox's photos in pixels")
-    parser.add_argument("--size", default="small", help="of the fields of the fox and of the store")
-    parser.add_argument("--deferred", action="store_true", help="fox: ask the colour network once a ray")
-    parser.add_argument("--only", choices=("images", "depth"), help="what the store's field is trained on")
-    parser.add_argument("--bounded", action="store_true", help="tabletop: as of nerg train radiance")
-    parser.add_argument("--validate", action="store_true", help="fox, store: leave the held-out views alone")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="fox, store: a setting")
-    parser.add_argument("--spp", type=int, default=16, help="rays a pixel; the default is that of nerg eval radiance")
-    parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, default=Path("out/benchmarks/radiance"))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=SETS, help="Training to measure; see above.")
+    parser.add_argument(
+        "--data",
+        type=Path,
+        help="Folder of the posed images. Default: the fox of NERG_DATA, or the generated images of the scene.",
+    )
+    parser.add_argument(
+        "--minutes",
+        help="Training time in minutes; for the fox several, separated by commas, after which the field is scored. "
+        "Default: 1,2,4,7,10 (fox), 10 (store), 4 (tabletop).",
+    )
+    parser.add_argument(
+        "--width", type=int, default=135, help="Width of the photos of the fox in pixels. Default: %(default)s."
+    )
+    parser.add_argument(
+        "--size", default="small", help="Size of the field: small, medium or paper (fox, store). Default: %(default)s."
+    )
+    parser.add_argument(
+        "--deferred", action="store_true", help="Evaluate the colour network once per ray, not per sample (fox)."
+    )
+    parser.add_argument(
+        "--only",
+        choices=("images", "depth"),
+        help="Train on images alone, or on images with depth (store). Default: both.",
+    )
+    parser.add_argument(
+        "--bounded",
+        action="store_true",
+        help="Train as if nothing were visible beyond the box of the field (tabletop).",
+    )
+    parser.add_argument(
+        "--validate",
+        action="store_true",
+        help="Score every 8th training view, which is then not trained on, instead of the held-out views; for choosing "
+        "settings (fox, store).",
+    )
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="Value of a field of RadianceSettings (fox, store); can be repeated. Default: none.",
+    )
+    parser.add_argument(
+        "--spp",
+        type=int,
+        default=16,
+        help="Number of samples per pixel of the scored images. Default: %(default)s, as for nerg eval radiance.",
+    )
+    parser.add_argument("--threads", type=int, default=2, help="Number of CPU threads. Default: %(default)s.")
+    parser.add_argument("--seed", type=int, default=0, help="Seed of the training. Default: %(default)s.")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("out/benchmarks/radiance"),
+        help="Folder for the results. Default: %(default)s.",
+    )
     args = parser.parse_args(argv)
     work, folder, minutes = SETS[args.what]
     args.data, args.minutes = args.data or folder, args.minutes or minutes

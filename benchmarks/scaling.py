@@ -1,11 +1,12 @@
-"""Bakes and counts with one worker and with two: throughput, cost of a part, and a model of both.
+"""Run time of bakes and AOI statistics on a cluster of one and of two workers, compared with a single process.
 
     python benchmarks/scaling.py [--observers 48] [--rays 1500000] [--out out/benchmarks/scaling]
 
-A room of 8 x 6 x 3 m with the gaze field of the demo store. Bakes of a path of observers on a coarse and on a fine
-mesh, and counts of synthetic rays, by dask with one worker and with two of one thread each, after a warm-up run. Each
-result is compared with that of a single process. The manifest of a part states its computing time; its overhead is the
-rest of the elapsed time.
+The environment is a room of 8 x 6 x 3 m with the gaze field of the demo store. The workloads are bakes of a path of
+observers on a coarse and on a fine mesh, and AOI statistics of synthetic rays. Each runs on dask with one worker and
+with two, of one thread each, after a run that warms up. The benchmark ends with an error if a result differs from that
+of a single process. The manifest of each task states its computing time. The overhead of a task is the rest of the
+elapsed time, per task.
 """
 
 from __future__ import annotations
@@ -85,10 +86,16 @@ def main() -> None:
 
     from tests.tasks.clusters import ClusterOfProcesses
 
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--observers", type=int, default=48)
-    parser.add_argument("--rays", type=int, default=1_500_000)
-    parser.add_argument("--out", type=Path, default=Path("out/benchmarks/scaling"))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(
+        "--observers", type=int, default=48, help="Number of observers of a bake. Default: %(default)s."
+    )
+    parser.add_argument(
+        "--rays", type=int, default=1_500_000, help="Number of gaze samples of the statistics. Default: %(default)s."
+    )
+    parser.add_argument(
+        "--out", type=Path, default=Path("out/benchmarks/scaling"), help="Folder for the results. Default: %(default)s."
+    )
     args = parser.parse_args()
     os.environ["PYTHONPATH"] = str(ROOT)
     rows: list[dict] = []

@@ -1,6 +1,6 @@
-"""Scaling of costs, for `bench.py`: pixels, samples, observers, rays, extent of the scene, rows of a field's table.
+"""Growth of costs for `bench.py`: with pixels, samples, observers, rays, scene extent, and rows of a field's table.
 
-Each is a `Growth`: programs by size, for the demo store unless stated otherwise.
+Each `Growth` has programs by size. They use the demo store unless stated otherwise.
 """
 
 from __future__ import annotations

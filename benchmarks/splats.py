@@ -1,16 +1,18 @@
-"""The demo store as Gaussian splats against the store as a field and as shapes; speed against Mitsuba's own renderer.
+"""The demo store as Gaussian splats, compared with its field and its shapes, and their speed with Mitsuba's renderer.
 
     python benchmarks/splats.py [--resolution 208] [--width 180] [--runs 5] [--picture FILE.png]
     [--out out/benchmarks/splats.csv]
 
-Splats are made of the trained field as by `nerg export splats` (or read with `--splats FILE`). First table: field and
-splats against exact ray casts to the twin, as in store_visibility.py, and the fraction of pixels with equal visibility.
-Second table: seconds for 320 x 180 pixels of one ray each, median of `--runs` alternating runs, and CPU seconds of all
-threads, which are less affected by other programs; kernels are compiled before. `volprim_rf_basic` is Mitsuba's
-renderer of splats, which computes colour alone, in the order of shells, and stops at a hundredth of the light, like the
-row "colour, stop 0.01".
+The splats are made of the trained field as by `nerg export splats`, or read from ``--splats``. The first table compares
+field and splats with exact ray casts at the store's mesh, as store_visibility.py does. A line below it has the
+difference of their depths and the fraction of pixels with equal visibility.
 
-The image: rows field, splats, shapes; columns colour, depth, gaze, visibility.
+The second table has the time for 320 x 180 pixels with one sample each: medians of ``--runs`` alternating runs, in
+wall-clock seconds and in CPU seconds of all threads, which other programs affect less. Kernels are compiled before.
+`volprim_rf_basic` is Mitsuba's renderer of splats. It computes colour alone, orders Gaussians by shells, and stops at a
+transmittance of a hundredth, like the row "colour, stop 0.01".
+
+The image of ``--picture`` has the rows field, splats, shapes and the columns colour, depth, gaze, visibility.
 """
 
 from __future__ import annotations
@@ -158,13 +160,25 @@ def picture(path: Path, scenes: dict[str, tuple[Path, dict]]) -> None:
 
 
 def main(argv=None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--splats", type=Path, help="file of splats (default: made of the field)")
-    parser.add_argument("--resolution", type=int, default=208, help="lattice cells of what is made")
-    parser.add_argument("--width", type=int, default=180, help="width of a picture of the first table in pixels (3:2)")
-    parser.add_argument("--runs", type=int, default=5)
-    parser.add_argument("--picture", type=Path, help="PNG file to write")
-    parser.add_argument("--out", type=Path, default=Path("out/benchmarks/splats.csv"), help="CSV file to write")
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--splats", type=Path, help="File of splats. Default: made of the store's field.")
+    parser.add_argument(
+        "--resolution",
+        type=int,
+        default=208,
+        help="Number of lattice cells along the longest side from which splats are made. Default: %(default)s.",
+    )
+    parser.add_argument(
+        "--width",
+        type=int,
+        default=180,
+        help="Width of the images of the first table in pixels; their aspect ratio is 3:2. Default: %(default)s.",
+    )
+    parser.add_argument("--runs", type=int, default=5, help="Number of timed runs. Default: %(default)s.")
+    parser.add_argument("--picture", type=Path, help="PNG file to write. Default: none.")
+    parser.add_argument(
+        "--out", type=Path, default=Path("out/benchmarks/splats.csv"), help="CSV file to write. Default: %(default)s."
+    )
     args = parser.parse_args(argv)
 
     import mitsuba as mi

@@ -3,19 +3,21 @@
     python benchmarks/splats_fit.py [--resolution 96] [--views 24] [--width 96] [--steps 150] [--rays 8192] [--seeds 3]
     [--update docs/explanation/environment-accuracy.md]
 
-Photos are renderings of the demo store's twin from a photographer's cameras, chosen as for the store's field. Eight
-other photos, from a shopper's eye, select the learning rates (`RATES` times one of `FACTORS`, by the disturbed splats
-of seed 0), and eight more, unused otherwise, are reported. Seeds determine the disturbance, the order of the rays and
-their samples; ± is the standard deviation over seeds. The initial splats are those that `nerg export splats` makes of
-the field (or `--splats FILE`), as they are and disturbed: centres moved by 2 cm per axis, scales changed by a third,
-axes rotated by some 10 degrees, opacities cut by 3 tenths, colours changed by a tenth (standard deviations). All
-parameters of Gaussians are optimised: Adam over the centre, log scales, the quaternion, the logit of the opacity and
-the harmonics; rays are random pixels of all photos, errors are squared differences of sRGB values. None is added or
-removed.
+The photos are renderings of the demo store's mesh from a photographer's cameras, chosen as for the store's field. Eight
+other photos, from a shopper's eye, select the learning rates: `RATES` times one of `FACTORS`, for the disturbed splats
+of seed 0. Eight more photos, unused otherwise, give the reported PSNR. Seeds determine the disturbance, the order of
+the rays, and their samples; ± is the standard deviation over seeds.
 
-Last table: maximum memory that Dr.Jit allocates during one derivative, beyond what was allocated before, against the
-number of hits per ray: the same 4,096 rays through stacks of walls, each figure in its own process. The benchmark does
-not pass or fail.
+The initial splats are those that `nerg export splats` makes of the field, or those of ``--splats``. They are fitted as
+they are, and disturbed: opacities are multiplied by 0.7, and the other parameters change randomly, with standard
+deviations of 2 cm per axis for centres, a third for scales, about 10 degrees for axes, and a tenth for colours. Adam
+optimises all parameters of the Gaussians: the centre, the logarithms of the scales, the quaternion, the logit of the
+opacity, and the spherical harmonics. The rays are random pixels of all photos. The loss is the squared difference of
+sRGB values. No Gaussian is added or removed.
+
+The last table has the memory of a derivative against the number of hits per ray: the maximum that Dr.Jit allocates
+during one derivative, beyond what was allocated before. The same 4,096 rays pass through stacks of walls, and each
+number is measured in its own process. The benchmark does not pass or fail.
 """
 
 from __future__ import annotations
@@ -201,15 +203,35 @@ def summary(result: list[dict[str, float]]) -> list[str]:
 
 def main(argv=None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--splats", type=Path, help="file of splats (default: made of the store's field)")
-    parser.add_argument("--resolution", type=int, default=96, help="lattice cells of what is made")
-    parser.add_argument("--views", type=int, default=24, help="photos to fit to")
-    parser.add_argument("--width", type=int, default=96, help="of a photo in pixels (4:3)")
-    parser.add_argument("--steps", type=int, default=150, help="of Adam")
-    parser.add_argument("--rays", type=int, default=8192, help="rays a step")
-    parser.add_argument("--seeds", type=int, default=3, help="fits of each kind, two at least")
-    parser.add_argument("--hits", type=int, help="print the memory for this number of hits, measured in this process")
-    parser.add_argument("--update", type=Path, help="a document whose tables are replaced")
+    parser.add_argument("--splats", type=Path, help="File of splats. Default: made of the store's field.")
+    parser.add_argument(
+        "--resolution",
+        type=int,
+        default=96,
+        help="Number of lattice cells along the longest side from which splats are made. Default: %(default)s.",
+    )
+    parser.add_argument("--views", type=int, default=24, help="Number of training photos. Default: %(default)s.")
+    parser.add_argument(
+        "--width",
+        type=int,
+        default=96,
+        help="Width of the photos in pixels; their aspect ratio is 4:3. Default: %(default)s.",
+    )
+    parser.add_argument("--steps", type=int, default=150, help="Number of steps of Adam. Default: %(default)s.")
+    parser.add_argument("--rays", type=int, default=8192, help="Number of rays per step. Default: %(default)s.")
+    parser.add_argument(
+        "--seeds", type=int, default=3, help="Number of fits of each kind, at least 2. Default: %(default)s."
+    )
+    parser.add_argument(
+        "--hits",
+        type=int,
+        help="Print only the memory in MB for this number of hits per ray, measured in this process. Default: none.",
+    )
+    parser.add_argument(
+        "--update",
+        type=Path,
+        help="Page of the manual whose tables below the same headings are replaced. Default: none.",
+    )
     args = parser.parse_args(argv)
     mi.set_variant("llvm_ad_rgb")
     if args.hits:

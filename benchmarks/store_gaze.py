@@ -1,16 +1,16 @@
-"""The store's trained gaze against the true law, at positions without nearby training rays.
+"""The store's trained gaze field compared with the true law, at positions without nearby training rays.
 
     python benchmarks/store_gaze.py [--gaze FILE] [--field FILE] [--rays FILE] [--out out/benchmarks/store_gaze.csv]
 
-The test positions are those that the gaze checkpoint lists as held out (`nerg train gaze --test-zones`): shoppers were
+The test positions are those that the gaze checkpoint lists as held out (`nerg train gaze --test-zones`). Shoppers were
 there, and all rays within 2R were excluded from the training. The truth is the attention law in closed form, in 2,048
-directions of equal area. Baselines use the field's training rays: the density of all rays for any position, the
-densities of the nearest probes, and that of the 4,096 nearest rays; each with two kernels, the training's and a wider
-one.
+directions of equal area. The baselines use the field's training rays: the density of all rays for any position, the
+densities of the nearest probes, and that of the 4,096 nearest rays. Probes and rays are evaluated with two kernels,
+that of the training and a wider one.
 
-KLD is of densities normalised over the sphere, with 1e-6 of the uniform density added to both; MAE and `integral` are
-of the densities as they are. `law, seen by as many rays` is the kernel density of new samples of the law itself at the
-test position, as many as in a probe: the score of a probe with perfect data.
+KLD compares densities that are normalised over the sphere, with 1e-6 of the uniform density added to both. MAE and
+`integral` use the densities without normalisation. `law, seen by as many rays` is the kernel density of new samples of
+the law at the test position, as many as in a probe. It is the score of a probe with perfect data.
 """
 
 from __future__ import annotations
@@ -62,12 +62,37 @@ def main(argv=None) -> None:
     from nerg_mi.transport.field_medium import FieldMedium
 
     local = Path(store.__file__).resolve().parent
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--gaze", type=Path, default=local / "shoppers.safetensors")
-    parser.add_argument("--field", type=Path, default=local / "store.safetensors")
-    parser.add_argument("--rays", type=Path, default=local / "build" / "rays.npz")
-    parser.add_argument("--wide", type=float, default=20.0, help="kappa of the baselines' wider kernel")
-    parser.add_argument("--out", type=Path, default=Path("out/benchmarks/store_gaze.csv"))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(
+        "--gaze",
+        type=Path,
+        default=local / "shoppers.safetensors",
+        help="Checkpoint of the gaze field. Default: that of the store.",
+    )
+    parser.add_argument(
+        "--field",
+        type=Path,
+        default=local / "store.safetensors",
+        help="Checkpoint of the radiance field. Default: that of the store.",
+    )
+    parser.add_argument(
+        "--rays",
+        type=Path,
+        default=local / "build" / "rays.npz",
+        help="Gaze samples of the training. Default: those of the store's shoppers.",
+    )
+    parser.add_argument(
+        "--wide",
+        type=float,
+        default=20.0,
+        help="Concentration (unitless) of the wider kernel of the baselines. Default: %(default)s.",
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("out/benchmarks/store_gaze.csv"),
+        help="CSV file to write. Default: %(default)s.",
+    )
     args = parser.parse_args(argv)
 
     ns = namespace("llvm_ad_rgb")

@@ -1,19 +1,21 @@
-"""Visibility and depth of the store's field against exact ray casts to its twin.
+"""Visibility and depth of the store's field, compared with exact ray casts at its mesh (the twin).
 
     python benchmarks/store_visibility.py [--field FILE] [--width 240] [--out out/benchmarks/store_visibility.csv]
 
-For several pairs of a camera and an observer, the integrator `nerg` renders depth, position and visibility (falloff 0,
-one ray per pixel). The same rays are cast at the twin. A pixel agrees if visibility is 1 where the observer sees the
-twin's surface along this pixel's ray, and 0 where not.
+For several pairs of a camera and an observer, the integrator `nerg` renders depth, position and visibility (fall-off 0,
+one ray per pixel). The same rays are cast at the twin. A pixel is correct if its visibility is 1 where the observer
+sees the twin's surface along the ray of the pixel, and 0 elsewhere.
 
-Away from silhouettes: pixels within `--margin` pixels of a discontinuity of the exact depth or of the exact visibility
-are excluded; there a centimetre decides, and a field has no edges finer than its grid. A column gives their number.
+Pixels within `--margin` pixels of a discontinuity of the exact depth or of the exact visibility are counted separately.
+At such silhouettes a centimetre decides about visibility, and a field has no edges finer than its grid. The other
+pixels are called "away from silhouettes", and `kept` is their fraction.
 
-Prints means over the pairs: the fraction of pixels that disagree, away from silhouettes and in total; the fraction
-`kept` away from silhouettes; depth errors in cm over all pixels with a surface, `p90 cm away` over those away from
-silhouettes. The CSV has one row per pair: `agree` away from silhouettes, split into `wrongly seen` and `wrongly
-hidden`; `agree all` with silhouettes; `agree own`: the exact test at the field's own surface point instead of the
-twin's (the last 5 cm are not tested); `visible`: fraction of exactly visible pixels.
+The benchmark prints means over the pairs: the fraction of pixels with a wrong visibility, away from silhouettes and in
+total; the fraction of pixels away from silhouettes; the depth errors in cm over all pixels with a surface, and their
+90 % quantile away from silhouettes. The CSV file has one row per pair. `agree` is the fraction of correct pixels away
+from silhouettes; the others are `wrongly seen` or `wrongly hidden`. `agree all` includes silhouettes. `agree own` tests
+the field's own surface point instead of the twin's, without the last 5 cm. `visible` is the fraction of pixels that the
+observer sees.
 """
 
 from __future__ import annotations
@@ -139,18 +141,46 @@ def table(rows: list[dict]) -> list[list[str]]:
 def main(argv=None) -> None:
     from timing import print_table, write_rows
 
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--field", type=Path, help="checkpoint (default: that of the store)")
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--field", type=Path, help="Checkpoint of the radiance field. Default: that of the store.")
     parser.add_argument(
-        "--gaze", type=Path, help="checkpoint of the scene's gaze field (default: the store's; not evaluated)"
+        "--gaze",
+        type=Path,
+        help="Checkpoint of the gaze field, which is loaded but not evaluated. Default: that of the store.",
     )
-    parser.add_argument("--width", type=int, default=240, help="width of a picture in pixels (3:2)")
-    parser.add_argument("--margin", type=int, default=2, help="pixels left out around silhouettes")
-    parser.add_argument("--kinds", default="expected,median", help=f"kinds of depth, of {', '.join(KINDS)}")
-    parser.add_argument("--visibility", default="depth", help="kinds of visibility: depth, transmittance, map")
-    parser.add_argument("--pair", action="append", choices=list(PAIRS), help="only this one; can be repeated")
     parser.add_argument(
-        "--out", type=Path, default=Path("out/benchmarks/store_visibility.csv"), help="CSV file to write"
+        "--width",
+        type=int,
+        default=240,
+        help="Width of the images in pixels; their aspect ratio is 3:2. Default: %(default)s.",
+    )
+    parser.add_argument(
+        "--margin",
+        type=int,
+        default=2,
+        help="Distance from a silhouette in pixels within which pixels are left out. Default: %(default)s.",
+    )
+    parser.add_argument(
+        "--kinds",
+        default="expected,median",
+        help=f"Kinds of depth, separated by commas, of {', '.join(KINDS)}. Default: %(default)s.",
+    )
+    parser.add_argument(
+        "--visibility",
+        default="depth",
+        help="Kinds of visibility, separated by commas, of depth, transmittance, map. Default: %(default)s.",
+    )
+    parser.add_argument(
+        "--pair",
+        action="append",
+        choices=list(PAIRS),
+        help="Pair of camera and observer; can be repeated. Default: all.",
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("out/benchmarks/store_visibility.csv"),
+        help="CSV file to write. Default: %(default)s.",
     )
     args = parser.parse_args(argv)
 

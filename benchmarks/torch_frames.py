@@ -1,12 +1,15 @@
-"""A frame of the demo store against a plain PyTorch renderer of the same checkpoints, steps and camera, for `bench.py`.
+"""A frame of the demo store compared with a plain PyTorch renderer of the same checkpoints, steps and camera.
 
-Colour, depth and gaze of an observer who is not at the camera, after occlusion. The reference is eager PyTorch as
-commonly used for radiance fields: uniform steps of the field's own length in slabs, empty cells of its occupancy grid
-skipped, samples and rays compacted, the density net first and the colour net where the weight exceeds 1e-3, rays ended
-at T < 1e-4; then the observer's rays to the surfaces, which end once they are opaque or at the surface; then gaze. The
-integral over the observer's sphere is kept between frames, as in nerg. Its grid is evaluated like torch-ngp's fallback,
-eight gathers per level, in a second row with less memory traffic, and in a third with the encoding and the networks in
-torch.compile. nerg's first frame is timed without compiled kernels.
+Used by `bench.py`. The frame has colour, depth and the gaze of an observer who is not at the camera, with occlusion.
+The reference is eager PyTorch as commonly used for radiance fields. It marches in uniform steps of the field's own
+length, in slabs, and skips the empty cells of the occupancy grid. Samples and rays are compacted. The density network
+is evaluated first, and the colour network where the weight exceeds 1e-3. Rays end at a transmittance below 1e-4. Then
+follow the observer's rays to the surfaces, which end at the surface or once they are opaque, and the gaze field. The
+integral over the observer's sphere is kept between frames, as in nerg.
+
+The hash grid is evaluated like by torch-ngp's fallback, with eight gathers per level. A second row needs less memory
+traffic, and a third has the encoding and the networks in torch.compile. The first frame of nerg is timed without
+compiled kernels.
 """
 
 from __future__ import annotations

@@ -1,14 +1,13 @@
-"""nerg's trainer against a plain PyTorch trainer of the same model: steps per second, and PSNR after equal time.
+"""Training of a radiance field compared with a plain PyTorch trainer: steps per second, and PSNR after equal time.
 
     python benchmarks/torch_radiance.py [--minutes 2] [--width 135] [--validate] [--data DIR] [--turns 0]
 
-Same grid, networks, initial weights, rays, step table, occupancy grid, density pre-pass, losses, optimiser and
-schedule, on the same machine in the same run, one after the other; the reference is eager PyTorch with gathers, sums
-and autograd. Both first evaluate the same random points, and the program stops if they differ. Extras of nerg's trainer
-are disabled in both: thinned samples, damped derivatives near cameras, cleared cells, per-photo colours, and occupancy
-extraction. Both fields are scored by the integrator, with occupancy found in the same way. ``--turns``: instead, both
-alternate this many times for 8 steps each, after 100 that clear the initial fog, with fine steps from the start, and
-the time per step is printed.
+Both trainers have the same grid, networks, initial weights, rays, steps along a ray, occupancy grid, density pre-pass,
+losses, optimiser and schedule. They run one after the other on the same machine. The reference is eager PyTorch with
+gathers, sums and autograd. Both first evaluate the same random points, and the program stops if the results differ.
+Additional features of nerg's trainer are disabled: thinned samples, damped derivatives near cameras, cleared cells,
+per-photo colours, and occupancy extraction. The integrator scores both fields, with the same method to find occupied
+cells.
 """
 
 from __future__ import annotations
@@ -301,15 +300,37 @@ def same_model(trainer, peer) -> float:
 def main(argv=None) -> None:
     from timing import write_rows
 
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", type=Path, default=FOX)
-    parser.add_argument("--minutes", type=float, default=2.0)
-    parser.add_argument("--width", type=int, default=135)
-    parser.add_argument("--size", default="small")
-    parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--validate", action="store_true")
-    parser.add_argument("--turns", type=int, default=0, help="only compare what a step takes, so often, in turns")
-    parser.add_argument("--out", type=Path, default=Path("out/benchmarks/torch_radiance"))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(
+        "--data", type=Path, default=FOX, help="Folder of the posed images. Default: the fox of NERG_DATA."
+    )
+    parser.add_argument(
+        "--minutes", type=float, default=2.0, help="Training time of each trainer in minutes. Default: %(default)s."
+    )
+    parser.add_argument("--width", type=int, default=135, help="Width of the photos in pixels. Default: %(default)s.")
+    parser.add_argument(
+        "--size", default="small", help="Size of the field: small, medium or paper. Default: %(default)s."
+    )
+    parser.add_argument("--threads", type=int, default=2, help="Number of CPU threads. Default: %(default)s.")
+    parser.add_argument(
+        "--validate",
+        action="store_true",
+        help="Score every 8th training view, which is then not trained on, instead of the held-out views.",
+    )
+    parser.add_argument(
+        "--turns",
+        type=int,
+        default=0,
+        help="Compare only the time per step: both trainers alternate this many times for 8 steps each, after 100 "
+        "steps that clear the initial fog, with fine steps along the ray from the start. Default: %(default)s (train "
+        "and score).",
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("out/benchmarks/torch_radiance"),
+        help="Folder for the results. Default: %(default)s.",
+    )
     args = parser.parse_args(argv)
 
     from nerg_mi.evaluation.metrics import score_views
