@@ -88,7 +88,7 @@ def evaluate_kde_frame(
     method : str
         ``exact`` sums all rays at all pixels in one kernel. ``table`` interpolates a table of the visible part of the
         sphere, with an error below 1e-4 of the maximum of a single kernel (:mod:`nerg_mi.probes.kde`). ``auto`` uses a
-        table from 4,096 pixels on. Run times: docs/rays.md.
+        table from 4,096 pixels on.
     backend : Backend
         Where the density is evaluated.
 
