@@ -61,6 +61,13 @@ def adjust_p_values(p: np.ndarray) -> np.ndarray:
 # al. (2001). Without shrinkage, draws with hardly any spread would make the interval arbitrarily wide for few
 # participants.
 #
+# Shares of attention are skewed: a sample without any of the few participants who look for long has a low estimate and
+# a low standard error, and its draws cannot contain them. The upper limit is therefore m + c' s, where c' >= c is the
+# quantile for draws of a smoothed bootstrap (Silverman and Young 1987; Polansky and Schucany 1997): each drawn x_p is
+# multiplied by log-normal noise of mean 1, which extends the tail in proportion to the values. The standard deviation
+# of the noise's logarithm is 2.2 n^(-1/5) times that of a log-normal distribution with the coefficient of variation
+# that x_p / y_p has over the n participants with x_p > 0. If participants vary little, c' is close to c.
+#
 # An estimate with fewer than three non-zero contributions has no interval. A difference from such an estimate has none
 # either, except that a difference from zero over the same participants is allowed if none of them contributes to one of
 # the estimates. If an estimate concerns at most half of the participants with unequal weights y_p, such as the mean
@@ -70,6 +77,8 @@ def adjust_p_values(p: np.ndarray) -> np.ndarray:
 
 RESAMPLES = 1999  # draws of participants
 SHRINKAGE = 0.01  # shrinkage λ of the bootstrap's standard error
+BANDWIDTH = 2.2  # bandwidth of the smoothed draws, relative to n**-0.2 times the spread of n contributors
+_NOISE_STEP = 0.1  # the standard deviation of the noise is rounded up to a multiple, so that areas share draws
 _CONFIDENCE = 0.95
 _MAX_DRAWS = 1 << 22
 Pair = tuple[np.ndarray, np.ndarray]
@@ -83,7 +92,7 @@ def estimate_ratios(
     Parameters
     ----------
     x, y
-        Numerators and denominators, (P, K) each, with y >= 0.
+        Numerators and denominators, (P, K) each, x >= 0 and y >= 0.
     resamples
         Number of bootstrap draws.
     seed
@@ -107,7 +116,8 @@ def estimate_ratios(
     c = np.where(
         (x != 0).sum(axis=0) >= MIN_PARTICIPANTS, np.maximum(_bootstrap_quantile(t, error), min_quantile), np.nan
     )
-    low, high = value - c * error, value + c * error
+    c_high = np.fmax(c, _smoothed_quantile(x, y, value, (linear_error, error), resamples, seed))
+    low, high = value - c * error, value + c_high * error
     return Estimates(value, np.clip(low, 0.0, upper_limit), np.clip(high, 0.0, upper_limit), num_participants)
 
 
@@ -206,12 +216,16 @@ def _iter_draws(
         yield slice(a, min(a + block_size, resamples)), _draw_counts(rng, strata, min(block_size, resamples - a))
 
 
-def _weighted_moments(w: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the ratios of the draws, and the sums of squared residuals over the squared sum of y, (B, K) each."""
-    sx, sy = w @ x, w @ y
+def _weighted_moments(
+    w: np.ndarray, x: np.ndarray, y: np.ndarray, wx: np.ndarray | None = None, wxx: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the ratios of the draws, and the sums of squared residuals over the squared sum of y, (B, K) each. ``wx``
+    and ``wxx`` are the weights (B, P) of x and of its square; None: ``w``."""
+    wx, wxx = w if wx is None else wx, w if wxx is None else wxx
+    sx, sy = wx @ x, w @ y
     with np.errstate(divide="ignore", invalid="ignore"):
         m = sx / sy
-        variance = (w @ x**2 - 2 * m * (w @ (x * y)) + m**2 * (w @ y**2)) / sy**2
+        variance = (wxx @ x**2 - 2 * m * (wx @ (x * y)) + m**2 * (w @ y**2)) / sy**2
     return m, np.maximum(variance, 0.0)
 
 
@@ -236,6 +250,45 @@ def _bootstrap_quantile(t: np.ndarray, error: np.ndarray) -> np.ndarray:
     for k in np.flatnonzero(mostly_finite):
         quantile[k] = np.quantile(t[np.isfinite(t[:, k]), k], _CONFIDENCE)
     return quantile
+
+
+def _smoothed_quantile(
+    x: np.ndarray, y: np.ndarray, value: np.ndarray, errors: Pair, resamples: int, seed: int
+) -> np.ndarray:
+    """Return the factor c (K,) from draws whose numerators are multiplied by log-normal noise; NaN without noise.
+
+    ``errors`` are the linearised and the jackknife's standard error (K,).
+    """
+    num, factor, rng = len(x), _bessel_factor((y > 0).sum(axis=0)), np.random.default_rng((seed, 1))
+    t, noise_sd = np.full((resamples, x.shape[1]), np.nan), np.ceil(_noise_sd(x, y) / _NOISE_STEP) * _NOISE_STEP
+    block_size = max(1, min(resamples, _MAX_DRAWS // max(num, 1)))
+    for a in range(0, resamples, block_size):
+        shape = (min(block_size, resamples - a), num)
+        bins, noise = rng.integers(0, num, shape) + num * np.arange(shape[0])[:, None], rng.standard_normal(shape)
+        w = _sum_bins(bins, np.ones(shape))
+        for sd in np.unique(noise_sd[noise_sd > 0]):
+            k, scale = noise_sd == sd, np.exp(sd * noise - sd**2 / 2)  # of mean 1
+            with np.errstate(divide="ignore", invalid="ignore"):
+                m, variance = _weighted_moments(w, x[:, k], y[:, k], _sum_bins(bins, scale), _sum_bins(bins, scale**2))
+                t[a : a + block_size, k] = _studentize(m - value[k], variance * factor[k], errors[0][k])
+    return _bootstrap_quantile(t, errors[1])
+
+
+def _sum_bins(bins: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return the sum of the weights in each bin; bins, weights and sums have the same shape."""
+    return np.bincount(bins.ravel(), weights.ravel(), weights.size).reshape(weights.shape)
+
+
+def _noise_sd(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return the standard deviation (K,) of the logarithm of the noise; 0 for fewer than three contributors."""
+    rate, is_contributor = np.divide(x, y, out=np.zeros(x.shape), where=y > 0), x > 0
+    n = is_contributor.sum(axis=0).astype(float)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        mean = rate.sum(axis=0) / n
+        variance = (np.where(is_contributor, rate - mean, 0.0) ** 2).sum(axis=0) / (n - 1)
+        # A log-normal distribution has this standard deviation of the logarithm for the coefficient of variation.
+        spread = np.sqrt(np.log1p(variance / mean**2))
+        return np.where(n >= MIN_PARTICIPANTS, BANDWIDTH * n**-0.2 * spread, 0.0)
 
 
 # ---- Proportions ----

@@ -47,6 +47,16 @@ def test_interval_approaches_students_t():
     assert result.high[0] == pytest.approx(x.mean() + extent, abs=0.15 * extent)
 
 
+def _studentize_loop(draws, value, error):
+    """Studentised deviations of draws, pairs of numerators and denominators (9,), in absolute value."""
+    t = []
+    for a, b in draws:
+        star = a.sum() / b.sum()
+        spread = ((a - star * b) ** 2).sum() * 9 / 8 / b.sum() ** 2
+        t.append(abs(star - value) / np.sqrt(0.99 * spread + 0.01 * error**2))
+    return t
+
+
 def test_bootstrap_matches_a_loop():
     rng = np.random.default_rng(1)
     x, y = rng.gamma(1, 1, (9, 1)), rng.gamma(2, 1, (9, 1))
@@ -55,16 +65,20 @@ def test_bootstrap_matches_a_loop():
     linear = np.sqrt(((x - m * y) ** 2).sum() * 9 / 8) / y.sum()
     without = [np.delete(x, k).sum() / np.delete(y, k).sum() for k in range(9)]
     jackknife = np.sqrt(8 / 9 * sum((v - m) ** 2 for v in without))
-    draws = np.random.default_rng(7).multinomial(9, np.full(9, 1 / 9), size=500)
-    t = []
-    for draw in draws:
-        rows = np.repeat(np.arange(9), draw)
-        a, b = x[rows, 0], y[rows, 0]
-        star = a.sum() / b.sum()
-        spread = ((a - star * b) ** 2).sum() * 9 / 8 / b.sum() ** 2
-        t.append(abs(star - m) / np.sqrt(0.99 * spread + 0.01 * linear**2))
-    extent = np.quantile(t, 0.95) * jackknife
-    assert result.low[0] == pytest.approx(max(m - extent, 0)) and result.high[0] == pytest.approx(m + extent)
+    counts = np.random.default_rng(7).multinomial(9, np.full(9, 1 / 9), size=500)
+    rows = [np.repeat(np.arange(9), draw) for draw in counts]
+    c = np.quantile(_studentize_loop([(x[r, 0], y[r, 0]) for r in rows], m, linear), 0.95)
+    # The upper limit's draws have log-normal noise of mean 1.
+    rate = (x / y)[:, 0]
+    sd = 2.2 * 9**-0.2 * np.sqrt(np.log(1 + (rate.std(ddof=1) / rate.mean()) ** 2))
+    sd = np.ceil(sd / 0.1) * 0.1
+    generator = np.random.default_rng((7, 1))
+    drawn, z = generator.integers(0, 9, (500, 9)), generator.standard_normal((500, 9))
+    smoothed = [(x[r, 0] * np.exp(sd * e - sd**2 / 2), y[r, 0]) for r, e in zip(drawn, z)]
+    c_high = np.quantile(_studentize_loop(smoothed, m, linear), 0.95)
+    assert c_high > c
+    assert result.low[0] == pytest.approx(max(m - c * jackknife, 0))
+    assert result.high[0] == pytest.approx(m + c_high * jackknife)
 
 
 def test_participants_are_the_sampling_unit():
@@ -123,11 +137,31 @@ def test_coverage_for_few_participants():
     x = y * rng.beta(0.5, 2, (8, 1200))
     truth = 0.5 / 2.5
     result = estimate_ratios(x, y, resamples=399)
-    assert 0.92 < ((result.low <= truth) & (truth <= result.high)).mean() < 0.98
+    assert 0.92 < ((result.low <= truth) & (truth <= result.high)).mean() < 0.99
     # Student's t of the linearised residuals has lower coverage.
     m = x.sum(axis=0) / y.sum(axis=0)
     s = np.sqrt(((x - m * y) ** 2).sum(axis=0) * 8 / 7) / y.sum(axis=0)
     assert (abs(m - truth) <= stats.t.ppf(0.975, 7) * s).mean() < 0.92
+
+
+@pytest.mark.parametrize("hit_ratio", [1.0, 0.4])
+def test_coverage_of_heavy_tails(hit_ratio):
+    """Log-normal values of 16 participants whose logarithm has the standard deviation 1.5, of mean 1."""
+    rng = np.random.default_rng(12)
+    x = np.exp(rng.normal(-1.125, 1.5, (16, 1500))) * (rng.random((16, 1500)) < hit_ratio)
+    result = estimate_ratios(x, ONES(x.shape), resamples=399)
+    has_interval = np.isfinite(result.low)
+    covered = (result.low <= hit_ratio) & (hit_ratio <= result.high)
+    assert 0.91 < covered[has_interval].mean() < 0.98
+    m, s = x.mean(axis=0), x.std(axis=0, ddof=1) / 4
+    assert (abs(m - hit_ratio) <= stats.t.ppf(0.975, 15) * s).mean() < 0.85
+
+
+def test_upper_limit_of_similar_participants_is_hardly_higher():
+    x = np.random.default_rng(13).gamma(100, 0.01, (16, 300))
+    result = estimate_ratios(x, ONES(x.shape), resamples=399)
+    ratio = (result.high - result.value) / (result.value - result.low)
+    assert 1.0 - 1e-9 < ratio.min() and ratio.mean() < 1.1
 
 
 def test_partly_paired_participants():
