@@ -2,9 +2,10 @@
 
     python benchmarks/object_coverage.py shares        # intervals of fractions of participants, computed exactly
     python benchmarks/object_coverage.py ratios        # methods for intervals of ratios of sums over participants
-    python benchmarks/object_coverage.py numbers       # the interval of each statistic of `nerg stats`
-    python benchmarks/object_coverage.py few           # methods for statistics that depend on few participants
-    python benchmarks/object_coverage.py differences   # differences between two groups of one population
+    python benchmarks/object_coverage.py numbers       # each number of `nerg stats` as it is
+    python benchmarks/object_coverage.py few           # candidates for numbers that depend on few participants
+    python benchmarks/object_coverage.py differences   # differences of two groups of the same participants
+    python benchmarks/object_coverage.py tails         # means of skewed values, with and without smoothed draws
 
 The population consists of 8,000 visits of the demo store's shoppers: 200 walks, each with 40 independent draws of gaze
 from the store's law. Its statistics are the true values. A data set is a sample of visits with replacement. The AOIs
@@ -312,8 +313,63 @@ def differences(population: Population, sets: int, pairs: tuple[tuple[int, int],
             print(f"| {m} and {n} | {name} | {' | '.join(cells)} | {100 * np.mean(wrong):.1f} % |", flush=True)
 
 
+def _draw_lognormal(spread: float):
+    return lambda rng, shape: np.exp(rng.normal(-(spread**2) / 2, spread, shape))
+
+
+# Distributions of mean 1. The first group chose the bandwidth of the smoothed draws, the second judges it.
+TAILS = {
+    "normal, spread 0.3 (tuned)": lambda rng, shape: np.maximum(rng.normal(1, 0.3, shape), 0),
+    "gamma, shape 2 (tuned)": lambda rng, shape: rng.gamma(2, 1 / 2, shape),
+    "exponential (tuned)": lambda rng, shape: rng.gamma(1, 1, shape),
+    "log-normal, spread 1 (tuned)": _draw_lognormal(1.0),
+    "log-normal, spread 1.5 (tuned)": _draw_lognormal(1.5),
+    "gamma, shape 3": lambda rng, shape: rng.gamma(3, 1 / 3, shape),
+    "gamma, shape 0.5": lambda rng, shape: rng.gamma(0.5, 2, shape),
+    "log-normal, spread 0.7": _draw_lognormal(0.7),
+    "log-normal, spread 1.2": _draw_lognormal(1.2),
+    "log-normal, spread 2": _draw_lognormal(2.0),
+    "Pareto from 0, exponent 3": lambda rng, shape: 2 * rng.pareto(3, shape),
+    "Pareto from 0.6, exponent 2.5": lambda rng, shape: 0.6 * (1 + rng.pareto(2.5, shape)),
+}
+
+
+def tails(sets: int, people: tuple[int, ...]) -> None:
+    """Coverage of the mean of skewed values that all or 40 % of the participants have, and of a ratio of sums."""
+    from nerg_mi.statistics import estimates
+
+    def measure(x: np.ndarray, y: np.ndarray, truth: float, bandwidth: float) -> tuple[float, float]:
+        estimates.BANDWIDTH = bandwidth
+        e = estimates.estimate_ratios(x, y, resamples=RESAMPLES)
+        has_interval = np.isfinite(e.low)
+        covered = (e.low <= truth) & (truth <= e.high)
+        return covered[has_interval].mean(), (e.high - e.low)[has_interval].mean()
+
+    kept = estimates.BANDWIDTH
+    print("\n| distribution | participants | statistic | coverage without smoothing | coverage | width ratio |")
+    print("| --- | ---: | --- | ---: | ---: | ---: |")
+    for name, draw in TAILS.items():
+        for n in people:
+            rng, result = np.random.default_rng([n, *name.encode()]), {}
+            x, y = draw(rng, (n, sets)), np.ones((n, sets))
+            result["mean"] = x, y, 1.0
+            result["mean, 40 % contribute"] = x * (rng.random(x.shape) < 0.4), y, 0.4
+            time = _draw_lognormal(1.5)(rng, x.shape)
+            result["ratio, times of spread 1.5"] = x * time, time, 1.0
+            for what, case in result.items():
+                (before, width), (now, new_width) = measure(*case, 0.0), measure(*case, kept)
+                print(
+                    f"| {name} | {n} | {what} | {100 * before:.1f} % | {100 * now:.1f} % | {new_width / width:.2f} |",
+                    flush=True,
+                )
+    estimates.BANDWIDTH = kept
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("shares", "ratios", "few", "numbers", "differences", "tails"))
+    parser.add_argument("--sets", type=int, default=1000, help="data sets (1000)")
+    parser.add_argument("--people", type=int, nargs="+", default=[8, 16, 40], help="people of each (8 16 40)")
     parser.add_argument(
         "what", choices=("shares", "ratios", "few", "numbers", "differences"), help="Table to compute; see above."
     )
@@ -340,6 +396,9 @@ def main() -> None:
     people = tuple(arguments.people)
     if arguments.what == "shares":
         shares(people)
+        return
+    if arguments.what == "tails":
+        tails(arguments.sets, people)
         return
     population = Population(arguments.population)
     truth = population.truth["hit_ratio"]
