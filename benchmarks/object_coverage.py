@@ -345,7 +345,7 @@ def tails(sets: int, people: tuple[int, ...]) -> None:
         covered = (e.low <= truth) & (truth <= e.high)
         return covered[has_interval].mean(), (e.high - e.low)[has_interval].mean()
 
-    kept = estimates.BANDWIDTH
+    default = estimates.BANDWIDTH
     print("\n| distribution | participants | statistic | coverage without smoothing | coverage | width ratio |")
     print("| --- | ---: | --- | ---: | ---: | ---: |")
     for name, draw in TAILS.items():
@@ -357,12 +357,12 @@ def tails(sets: int, people: tuple[int, ...]) -> None:
             time = _draw_lognormal(1.5)(rng, x.shape)
             result["ratio, times of spread 1.5"] = x * time, time, 1.0
             for what, case in result.items():
-                (before, width), (now, new_width) = measure(*case, 0.0), measure(*case, kept)
+                (before, width), (now, new_width) = measure(*case, 0.0), measure(*case, default)
                 print(
                     f"| {name} | {n} | {what} | {100 * before:.1f} % | {100 * now:.1f} % | {new_width / width:.2f} |",
                     flush=True,
                 )
-    estimates.BANDWIDTH = kept
+    estimates.BANDWIDTH = default
 
 
 def main() -> None:

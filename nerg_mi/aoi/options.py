@@ -199,6 +199,13 @@ class StatisticsOptions(CountOptions, PredictionOptions, PartOptions):
         within=Range(199, 100_000),
         group=ANALYSIS,
     )
+    power: float | None = option(
+        None,
+        "Relative difference between two cells, such as 0.3 for 30 %. The table `power` then reports how often the "
+        "test of differences detects it, by number of participants.  [default: no table]",
+        within=Range(0.01, 100),
+        group=ANALYSIS,
+    )
     seed: int = random_seed("viewpoints and bootstrap resamples")
     threads: int | None = cpu_threads()
 

@@ -228,6 +228,8 @@ class StatisticsResult:
         Measures by cell, area and source.
     differences
         Differences between cells.
+    power
+        Power of these differences by number of participants.
     transitions
         Transitions between areas.
     durations
@@ -248,6 +250,7 @@ class StatisticsResult:
 
     aois: list[Row] = field(default_factory=list)
     differences: list[Row] = field(default_factory=list)
+    power: list[Row] = field(default_factory=list)
     transitions: list[Row] = field(default_factory=list)
     durations: list[Row] = field(default_factory=list)
     participants: Sequence[Row] = ()
@@ -267,6 +270,7 @@ def write_results(
     tables: dict[str, Sequence[Row]] = {
         "aois": result.aois,
         "differences": result.differences,
+        "power": result.power,
         "transitions": result.transitions,
         "durations": result.durations,
         "participants": result.participants,

@@ -43,6 +43,7 @@ from nerg_mi.interruption import Interruption
 from nerg_mi.rays.pseudonyms import make_pseudonyms, read_salt
 from nerg_mi.rays.rays import Rays
 from nerg_mi.statistics.estimates import MIN_PARTICIPANTS
+from nerg_mi.statistics.power import power_rows
 from nerg_mi.statistics.shares import Isovists, SamplePoints
 from nerg_mi.statistics.tables import (
     MEASURED,
@@ -145,6 +146,8 @@ class _StatisticsWork:
             reporter.message(note)
         if options.what_if is not None and self.around.gaze is None:
             raise NergError("--what-if needs a gaze field; give one, or a scene that has one")
+        if options.power is not None and inputs.rays is None:
+            raise NergError("--power needs recorded participants; give rays")
         if options.what_if is not None:
             # Errors in the file are reported before anything is counted.
             read_changes(options.what_if)
@@ -183,23 +186,21 @@ class _StatisticsWork:
         rows = aoi_rows(names, people, floor, resamples=o.resamples, seed=o.seed)
         if predicted is not None:
             add_uncertainty(rows, predicted, viewpoints, times, o.glance_duration)
+        source = MEASURED if sums is not None else PREDICTED
+        power = []
+        if o.power is not None:
+            self.reporter.progress(0.95, "power of differences")
+            power = power_rows(names, people, floor, o.power, seed=o.seed)
         result = StatisticsResult(
-            rows,
-            difference_rows(
-                names,
-                people,
-                floor,
-                source=MEASURED if sums is not None else PREDICTED,
-                resamples=o.resamples,
-                seed=o.seed,
-            ),
-            [] if sums is None else transition_rows(sums, floor),
-            [] if sums is None else duration_rows(sums, floor),
-            self._people(sums, seen),
-            [] if o.what_if is None else self._what_if(viewpoints, predicted, floor),
-            [],
-            sums,
-            floor.num_suppressed,
+            aois=rows,
+            differences=difference_rows(names, people, floor, source=source, resamples=o.resamples, seed=o.seed),
+            power=power,
+            transitions=[] if sums is None else transition_rows(sums, floor),
+            durations=[] if sums is None else duration_rows(sums, floor),
+            participants=self._people(sums, seen),
+            what_if=[] if o.what_if is None else self._what_if(viewpoints, predicted, floor),
+            sums=sums,
+            num_suppressed=floor.num_suppressed,
         )
         if floor.num_suppressed:
             self.reporter.message(

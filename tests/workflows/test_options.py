@@ -225,7 +225,7 @@ COMMANDS = {
 }
 AFTER_COUNTS = {"viewpoints", "glance_duration", "what_if", "visibility", "observers", "eye_height", "floor_height"}
 AFTER_COUNTS |= {"grid_step", "min_participants"}
-AFTER_COUNTS |= {"show_names", "salt", "resamples", "seed"} | STORE
+AFTER_COUNTS |= {"show_names", "salt", "resamples", "power", "seed"} | STORE
 OF_COUNTS = {f.name for f in fields(CountOptions)} - {f.name for f in fields(PredictionOptions)}
 COMMANDS["stats, counts"] = (StatisticsOptions, lambda o: to_base(o, CountOptions), AFTER_COUNTS | {"directions"})
 COMMANDS["stats, a field"] = (StatisticsOptions, lambda o: to_base(o, PredictionOptions), AFTER_COUNTS | OF_COUNTS)

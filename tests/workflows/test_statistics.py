@@ -111,6 +111,18 @@ def test03_windows_zones_and_cohorts_are_read_from_a_file(folder, tmp_path):
     assert {r["cell"] for r in result.differences} == {"window", "cohort"}
 
 
+def test_power_is_a_table_of_the_output(folder, tmp_path):
+    options = StatisticsOptions(aois=folder / "areas.json", power=0.5, **FAST)
+    scene = folder / "bare" / "scene.xml"
+    result = statistics([scene, people()], tmp_path / "out", options)
+    (row,) = table(result.power, aoi="the sign", measure="share")
+    assert (row["cell"], row["effect"]) == ("cohort", 0.5) and 0 <= row["power_8"] <= row["power_96"] <= 1
+    assert {tmp_path / "out" / "power.csv", tmp_path / "out" / "power.md"} <= set(result.files)
+    assert "power_96" in (tmp_path / "out" / "power.md").read_text()
+    with pytest.raises(NergError, match="--power"):
+        statistics([scene], options=options)
+
+
 def test04_predicted_and_recorded_statistics_and_what_if(folder, tmp_path):
     changes = {
         "move": [{"shape": "stand", "by": [0, 1.9, 0]}],
