@@ -38,7 +38,22 @@ from .readers.tables import iterate_table, parse_clock_seconds
 _MIN_EYE_HEIGHT, _MAX_EYE_HEIGHT = 0.7, 2.3  # metres; range of eye heights of sitting and standing people
 _MAX_HEIGHT_RANGE = 1.2  # metres; maximum range of the height of one head
 _DEVICE_RATES = 5.0, 2100.0  # sampling rates of existing devices, Hz
-_TIME_UNITS = (1.0, 1e-3, 1e-6, 1e-9, 1e-7)
+_USUAL_RATE = 25.0  # Hz; slower devices are less likely than another unit of time
+_PLAUSIBLE_RATES = 1.0, 2020.0  # Hz; from this to the fastest eye trackers (2,000 Hz) with their jitter
+_TIME_UNITS = {
+    1.0: "seconds",
+    1e-3: "milliseconds",
+    1e-6: "microseconds",
+    1e-9: "nanoseconds",
+    1e-7: "ticks of 100 ns (.NET, Windows)",
+}
+_CLOCKS = (
+    *((unit, 0.0, "Unix times") for unit in (1.0, 1e-3, 1e-6, 1e-9)),
+    (1e-7, -62_135_596_800.0, ".NET ticks since the year 1"),
+    (1e-7, -11_644_473_600.0, "Windows file times since 1601"),
+)
+"""Unit in seconds, Unix time of the origin in seconds, and name of clocks that count from a date."""
+_CLOCK_RANGE = 946_684_800.0, 4_102_444_800.0  # Unix times of the years 2000 to 2100
 _STEP_SECONDS = 0.5  # duration of a walking step for the comparison with gaze
 _WALKING_SPEEDS = 0.3, 3.0  # m/s
 _MIN_COSINE = 0.3  # minimum mean cosine between the forward axis and walking
@@ -81,13 +96,38 @@ def find_up_axis(positions: np.ndarray) -> UpAxis | None:
 
 
 def find_time_unit(times: np.ndarray) -> float | None:
-    """Find the unit of ``times`` (n,) in seconds that gives the sampling rate of a device; None if none does."""
+    """Find the unit of ``times`` (n,) in seconds that gives the sampling rate of a device; None if none does.
+
+    Steps of 166,667 are 60 Hz in ticks of 100 ns, but 6 Hz in microseconds: units that give a usual rate come first.
+    """
+    units = _find_time_units(times)
+    return units[0] if units else None
+
+
+def find_clock(times: np.ndarray) -> tuple[float, str] | None:
+    """Find the unit in seconds and the name of a clock for which ``times`` (n,) are dates of this century."""
+    median = np.median(times[np.isfinite(times)]) if np.isfinite(times).any() else np.nan
+    for unit, origin, name in _CLOCKS:
+        if _CLOCK_RANGE[0] <= median * unit + origin <= _CLOCK_RANGE[1]:
+            return unit, name
+    return None
+
+
+def _find_time_units(times: np.ndarray) -> list[float]:
+    """Units of ``times`` in seconds that give the sampling rate of a device, the most likely first."""
+    rate = _find_rate(times)
+    units = [t for t in _TIME_UNITS if _DEVICE_RATES[0] <= rate / t <= _DEVICE_RATES[1]]
+    return sorted(units, key=lambda t: rate / t < _USUAL_RATE)
+
+
+def _is_plausible_rate(rate: float) -> bool:
+    return _PLAUSIBLE_RATES[0] <= rate <= _PLAUSIBLE_RATES[1]
+
+
+def _find_rate(times: np.ndarray) -> float:
+    """Samples per unit of ``times`` (n,), from the median step; NaN without steps."""
     step = np.diff(times[np.isfinite(times)])
-    step = step[step > 0]
-    if not step.size:
-        return None
-    median_step = float(np.median(step))
-    return next((t for t in _TIME_UNITS if _DEVICE_RATES[0] <= 1 / (median_step * t) <= _DEVICE_RATES[1]), None)
+    return 1 / float(np.median(step[step > 0])) if (step > 0).any() else np.nan
 
 
 def is_unit(vectors: np.ndarray, tolerance: float = 0.02) -> bool:
@@ -577,26 +617,47 @@ def _find_time(out: Proposal, sample: TableSample, roles: Roles) -> tuple[str | 
             reason = f"{unreadable!r} contains {cell!r}, which is neither a number nor like 2024-05-01T12:00:00.25"
         out.questions.append(f"the time: {reason}; without t= rows are numbered, and --tick is the sampling interval")
         return None, None
+    times = sample.numbers[name]
+    rate = _find_rate(times)
     if name in sample.clocks:
         out.certain.append(f"{name!r} contains times of day, or dates with times (in UTC without an offset)")
-        return name, sample.numbers[name]
-    named_unit, detected = parse_time_unit(name), find_time_unit(sample.numbers[name])
+        _question_rate(out, name, rate, "seconds")
+        return name, times
+    named_unit, clock, units = parse_time_unit(name), find_clock(times), _find_time_units(times)
+    if clock and units and not _is_plausible_rate(rate / clock[0]):
+        clock = None  # the clock of a device that started some time ago, in another unit
+    detected = clock[0] if clock else units[0] if units else None
     tick = named_unit or detected
     if named_unit:
-        out.certain.append(f"{name!r} is the time, in units of {named_unit:g} s by its name")
+        out.certain.append(f"{name!r} is the time, in {_TIME_UNITS[named_unit]} by its name")
+    elif clock:
+        out.assumptions.append(f"{name!r} is the time, in {_TIME_UNITS[clock[0]]}: its values are {clock[1]}")
     elif detected:
-        out.assumptions.append(f"{name!r} is the time, in units of {detected:g} s by its sampling interval")
+        others = [f"{_TIME_UNITS[t]} ({rate / t:.3g} Hz, --tick {t:g})" for t in units[1:]]
+        out.assumptions.append(
+            f"{name!r} is the time, in {_TIME_UNITS[detected]}: the sampling rate is {rate / detected:.3g} Hz"
+            + (f"; it may also be in {' or '.join(others)}" if others else "")
+        )
     else:
         out.questions.append(
             f"the unit of the time {name!r}: no unit gives the sampling rate of a device (--tick, seconds)"
         )
-    if named_unit and detected and not np.isclose(named_unit, detected):
-        out.assumptions.append(
-            f"by its sampling interval {name!r} would be in units of {detected:g} s: is its name right?"
-        )
+    if named_unit and detected and named_unit not in (detected, *units):
+        evidence = "values" if clock else "sampling rate"
+        out.assumptions.append(f"by its {evidence} {name!r} would be in {_TIME_UNITS[detected]}: is its name right?")
+    _question_rate(out, name, rate / (tick or 1.0), _TIME_UNITS[tick or 1.0])
     if tick and tick != 1.0:
         out.options["--tick"] = f"{tick:g}"
-    return name, sample.numbers[name] * (tick or 1.0)
+    return name, times * (tick or 1.0)
+
+
+def _question_rate(out: Proposal, name: str, rate: float, unit: str) -> None:
+    """Ask whether the time is right if its sampling rate in Hz is implausible."""
+    if np.isfinite(rate) and not _is_plausible_rate(rate):
+        out.questions.append(
+            f"whether {name!r} is the time, in {unit}: the sampling rate is {rate:.3g} Hz, which trackers do not have "
+            "(--tick, or another column as t=)"
+        )
 
 
 def _find_gravity_up(sample: TableSample, roles: Roles) -> str | None:

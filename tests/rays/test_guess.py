@@ -140,6 +140,10 @@ def test_units_of_time(name, unit):
     assert parse_time_unit(name) == unit
 
 
+def test_ticks_are_a_time():
+    assert find_roles(["ticks", "x"]).times == ["ticks"] and find_roles(["device_ticks", "time"]).times[0] == "time"
+
+
 def test_units_of_angles():
     assert are_degrees(["yaw_deg", "pitch"]) is True and are_degrees(["yaw_rads"]) is False
     assert are_degrees(["yaw"]) is None
@@ -457,14 +461,60 @@ def test_rows_without_evidence():
     assert rows.find_up_axis(still) is None
 
 
-@pytest.mark.parametrize("rate", [11.0, 50.0, 200.0, 1000.0])
-@pytest.mark.parametrize("tick", [1e-3, 1e-6, 1e-9])
+@pytest.mark.parametrize("rate", [30.0, 50.0, 200.0, 1000.0])
+@pytest.mark.parametrize("tick", [1.0, 1e-3, 1e-6, 1e-9])
 def test_unit_of_time(rate, tick):
     result = rows.find_time_unit(np.arange(100) / rate / tick)
     # At 11 to 2,100 Hz only one of two units a factor of thousand apart can match.
     assert result == tick
     assert rows.find_time_unit(np.zeros(9)) is None and rows.find_time_unit(np.array([1.0])) is None
     assert rows.find_time_unit(np.arange(9) * 3.6e8) is None
+
+
+@pytest.mark.parametrize("rate", [50.0, 72.0, 90.0, 120.0, 200.0])
+def test_ticks_of_100_ns_are_not_microseconds(rate):
+    assert rows.find_time_unit(np.arange(100) / rate / 1e-7) == 1e-7
+    # At 11 Hz in milliseconds there is no other unit.
+    assert rows.find_time_unit(np.arange(100) / 11 / 1e-3) == 1e-3
+
+
+@pytest.mark.parametrize(
+    "start, unit", [(6.37e17, 1e-7), (1.33e17, 1e-7), (1.7e9, 1.0), (1.7e12, 1e-3), (1.7e15, 1e-6), (1.7e18, 1e-9)]
+)
+def test_clocks_that_count_from_a_date(start, unit):
+    clock = rows.find_clock(start + np.arange(50) / 7 / unit)
+    assert clock is not None and clock[0] == unit
+    for times in (np.arange(50.0), 1e6 + np.arange(50.0), np.full(3, np.nan)):
+        assert rows.find_clock(times) is None
+
+
+@pytest.mark.parametrize("start", [0, 637_134_336_000_000_000])
+def test_dotnet_ticks_are_proposed_and_named(tmp_path, monkeypatch, start):
+    table = gaze_in_world("y left", 1.0, 1.0) | {"time": start + np.arange(N) * 200_000}
+    (tmp_path / "log.csv").write_text(csv(**table))
+    proposal = propose_import(tmp_path / "log.csv")
+    assert proposal.options["--tick"] == "1e-07" and any("ticks" in line for line in proposal.assumptions)
+    rays = imported(tmp_path / "log.csv", monkeypatch)
+    assert np.allclose(np.diff(rays.t), 0.02, atol=1e-4)
+    if not start:
+        assert any("microseconds" in line for line in proposal.assumptions), "the other unit is named"
+
+
+def test_clocks_of_devices_are_not_dates(tmp_path):
+    """Half an hour in microseconds has the values of Unix times in seconds."""
+    table = gaze_in_world("y left", 1.0, 1.0) | {"time": 1_800_000_000 + np.arange(N) * 16_667}
+    (tmp_path / "log.csv").write_text(csv(**table))
+    assert propose_import(tmp_path / "log.csv").options["--tick"] == "1e-06"
+
+
+@pytest.mark.parametrize("name, step", [("time_s", 5.0), ("time_s", 1e-4), ("time [ns]", 100.0), ("time", 5e4)])
+def test_implausible_rates_are_questions(tmp_path, name, step):
+    """5 s, 10 kHz and 10 MHz are implausible; 50,000 of an unknown unit are 200 Hz in ticks."""
+    table = gaze_in_world("y left", 1.0, 1.0)
+    del table["time"]
+    (tmp_path / "log.csv").write_text(csv(**{name.replace(" ", "__"): 7 + np.arange(N) * step}, **table))
+    proposal = propose_import(tmp_path / "log.csv")
+    assert any("sampling rate" in line for line in proposal.questions) == (name != "time")
 
 
 @pytest.mark.parametrize("to", FORWARD)

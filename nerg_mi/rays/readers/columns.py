@@ -499,6 +499,6 @@ def _rank_time_name(words: str) -> int | None:
     if words in exact:
         return exact.index(words)
     parts = words.split("_")
-    if not any(p in ("time", "timestamp", "timestamps", "clock", "utc") for p in parts):
+    if not any(p in ("time", "timestamp", "timestamps", "ticks", "clock", "utc") for p in parts):
         return None
     return 20 + 5 * len({"relative", "frame", "device", "raw", "duration", "delta", "dt"} & set(parts)) + len(parts)
