@@ -17,6 +17,7 @@ from __future__ import annotations
 import argparse
 from collections import defaultdict
 from pathlib import Path
+from unittest import mock
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 from nerg_mi.statistics.estimates import adjust_p_values
@@ -140,8 +141,6 @@ def _share_intervals() -> dict:
 
 def ratio_intervals(x: np.ndarray, y: np.ndarray, seed: int) -> dict:
     """Ends of the intervals (K,) of Σ x / Σ y by several methods."""
-    from nerg_mi.statistics.estimates import estimate_ratios
-
     n, count = (y > 0).sum(axis=0), len(x)
     m = x.sum(axis=0) / y.sum(axis=0)
     wider = n / (n - 1)
@@ -165,9 +164,18 @@ def ratio_intervals(x: np.ndarray, y: np.ndarray, seed: int) -> dict:
     out["bootstrap, percentiles"] = tuple(np.nanquantile(star, (0.025, 0.975), axis=0))
     out["BCa bootstrap"] = _bca(star, m, without)
     out["bootstrap-t, two tails"] = (m - high * s, m - low * s)
-    selected = estimate_ratios(x, y, resamples=RESAMPLES, seed=seed)
-    out["symmetric bootstrap-t, jackknife (kept)"] = (selected.low, selected.high)
+    for name, bandwidth in (("symmetric bootstrap-t, jackknife", 0.0), ("the same, smoothed upper limit (kept)", None)):
+        selected = _estimate_with(bandwidth, x, y, seed)
+        out[name] = (selected.low, selected.high)
     return out
+
+
+def _estimate_with(bandwidth: float | None, x: np.ndarray, y: np.ndarray, seed: int = 0):
+    """Estimates whose upper limit is from draws smoothed by ``bandwidth``; None: the default's."""
+    from nerg_mi.statistics import estimates
+
+    with mock.patch.object(estimates, "BANDWIDTH", estimates.BANDWIDTH if bandwidth is None else bandwidth):
+        return estimates.estimate_ratios(x, y, resamples=RESAMPLES, seed=seed)
 
 
 def _bca(star: np.ndarray, m: np.ndarray, without: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -239,9 +247,8 @@ def compare(
 def few_intervals(x: np.ndarray, y: np.ndarray, seed: int) -> dict:
     """Ends of the intervals (K,) with other factors of the error where few participants determine a number."""
     from nerg_mi.statistics import estimates
-    from nerg_mi.statistics.estimates import estimate_ratios
 
-    selected = estimate_ratios(x, y, resamples=RESAMPLES, seed=seed)
+    selected = _estimate_with(0.0, x, y, seed)
     value, _, people = estimates._linearize(x, y)
     difference = estimates._jackknife(x, y, value, people)
     error, square = np.sqrt((difference**2).sum(axis=0)), difference**2
@@ -251,14 +258,16 @@ def few_intervals(x: np.ndarray, y: np.ndarray, seed: int) -> dict:
     effective = square.sum(axis=0) ** 2 / (square**2).sum(axis=0)
     adds = (x != 0).sum(axis=0)
     factors = {
-        "kept": c,
+        "symmetric": c,
         "at least t of half the freedom": np.where(few, np.maximum(c, t((effective - 1) / 2)), c),
         "at least t of all by the largest": np.where(few, np.maximum(c, t(square.sum(0) / square.max(0) - 1)), c),
         "at least t, two thirds": np.where(people <= len(x) * 2 / 3, np.maximum(c, t(effective - 1)), c),
         "t alone": np.where(adds <= len(x) / 2, t(effective - 1), c),
         "at most t of those who add": np.where(adds <= len(x) / 2, np.minimum(c, t(adds - 1)), c),
     }
-    return {name: (value - factor * error, value + factor * error) for name, factor in factors.items()}
+    made = {name: (value - factor * error, value + factor * error) for name, factor in factors.items()}
+    smoothed = _estimate_with(None, x, y, seed)
+    return made | {"smoothed upper limit (kept)": (smoothed.low, smoothed.high)}
 
 
 def numbers(population: Population, sets: int, people: tuple[int, ...]) -> None:
@@ -336,16 +345,13 @@ TAILS = {
 
 def tails(sets: int, people: tuple[int, ...]) -> None:
     """Coverage of the mean of skewed values that all or 40 % of the participants have, and of a ratio of sums."""
-    from nerg_mi.statistics import estimates
 
-    def measure(x: np.ndarray, y: np.ndarray, truth: float, bandwidth: float) -> tuple[float, float]:
-        estimates.BANDWIDTH = bandwidth
-        e = estimates.estimate_ratios(x, y, resamples=RESAMPLES)
+    def measure(x: np.ndarray, y: np.ndarray, truth: float, bandwidth: float | None) -> tuple[float, float]:
+        e = _estimate_with(bandwidth, x, y)
         has_interval = np.isfinite(e.low)
         covered = (e.low <= truth) & (truth <= e.high)
         return covered[has_interval].mean(), (e.high - e.low)[has_interval].mean()
 
-    default = estimates.BANDWIDTH
     print("\n| distribution | participants | statistic | coverage without smoothing | coverage | width ratio |")
     print("| --- | ---: | --- | ---: | ---: | ---: |")
     for name, draw in TAILS.items():
@@ -357,12 +363,11 @@ def tails(sets: int, people: tuple[int, ...]) -> None:
             time = _draw_lognormal(1.5)(rng, x.shape)
             result["ratio, times of spread 1.5"] = x * time, time, 1.0
             for what, case in result.items():
-                (before, width), (now, new_width) = measure(*case, 0.0), measure(*case, default)
+                (before, width), (now, new_width) = measure(*case, 0.0), measure(*case, None)
                 print(
                     f"| {name} | {n} | {what} | {100 * before:.1f} % | {100 * now:.1f} % | {new_width / width:.2f} |",
                     flush=True,
                 )
-    estimates.BANDWIDTH = default
 
 
 def main() -> None:
