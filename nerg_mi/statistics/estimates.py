@@ -65,8 +65,9 @@ def adjust_p_values(p: np.ndarray) -> np.ndarray:
 # a low standard error, and its draws cannot contain them. The upper limit is therefore m + c' s, where c' >= c is the
 # quantile for draws of a smoothed bootstrap (Silverman and Young 1987; Polansky and Schucany 1997): each drawn x_p is
 # multiplied by log-normal noise of mean 1, which extends the tail in proportion to the values. The standard deviation
-# of the noise's logarithm is 2.2 n^(-1/5) times that of a log-normal distribution with the coefficient of variation
-# that x_p / y_p has over the n participants with x_p > 0. If participants vary little, c' is close to c.
+# of the noise's logarithm is 2.2 n^(-1/5) times the smaller of 1 and that of a log-normal distribution with the
+# coefficient of variation that x_p / y_p has over the n participants with x_p > 0. If participants vary little, c' is
+# close to c.
 #
 # An estimate with fewer than three non-zero contributions has no interval. A difference from such an estimate has none
 # either, except that a difference from zero over the same participants is allowed if none of them contributes to one of
@@ -78,6 +79,7 @@ def adjust_p_values(p: np.ndarray) -> np.ndarray:
 RESAMPLES = 1999  # draws of participants
 SHRINKAGE = 0.01  # shrinkage λ of the bootstrap's standard error
 BANDWIDTH = 2.2  # bandwidth of the smoothed draws, relative to n**-0.2 times the spread of n contributors
+_MAX_SPREAD = 1.0  # limit of that spread: a sample that shows its tail has a large standard error already
 _NOISE_STEP = 0.1  # the standard deviation of the noise is rounded up to a multiple, so that areas share draws
 _CONFIDENCE = 0.95
 _MAX_DRAWS = 1 << 22
@@ -287,7 +289,7 @@ def _noise_sd(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         mean = rate.sum(axis=0) / n
         variance = (np.where(is_contributor, rate - mean, 0.0) ** 2).sum(axis=0) / (n - 1)
         # A log-normal distribution has this standard deviation of the logarithm for the coefficient of variation.
-        spread = np.sqrt(np.log1p(variance / mean**2))
+        spread = np.minimum(np.sqrt(np.log1p(variance / mean**2)), _MAX_SPREAD)
         return np.where(n >= MIN_PARTICIPANTS, BANDWIDTH * n**-0.2 * spread, 0.0)
 
 
