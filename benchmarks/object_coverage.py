@@ -2,9 +2,9 @@
 
     python benchmarks/object_coverage.py shares        # intervals of fractions of participants, computed exactly
     python benchmarks/object_coverage.py ratios        # methods for intervals of ratios of sums over participants
-    python benchmarks/object_coverage.py numbers       # each number of `nerg stats` as it is
-    python benchmarks/object_coverage.py few           # candidates for numbers that depend on few participants
-    python benchmarks/object_coverage.py differences   # differences of two groups of the same participants
+    python benchmarks/object_coverage.py numbers       # the interval of each statistic of `nerg stats`
+    python benchmarks/object_coverage.py few           # methods for statistics that depend on few participants
+    python benchmarks/object_coverage.py differences   # differences between two groups of one population
     python benchmarks/object_coverage.py tails         # means of skewed values, with and without smoothed draws
 
 The population consists of 8,000 visits of the demo store's shoppers: 200 walks, each with 40 independent draws of gaze
@@ -372,11 +372,10 @@ def tails(sets: int, people: tuple[int, ...]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("shares", "ratios", "few", "numbers", "differences", "tails"))
-    parser.add_argument("--sets", type=int, default=1000, help="data sets (1000)")
-    parser.add_argument("--people", type=int, nargs="+", default=[8, 16, 40], help="people of each (8 16 40)")
     parser.add_argument(
-        "what", choices=("shares", "ratios", "few", "numbers", "differences"), help="Table to compute; see above."
+        "what",
+        choices=("shares", "ratios", "few", "numbers", "differences", "tails"),
+        help="Table to compute; see above.",
     )
     parser.add_argument("--sets", type=int, default=1000, help="Number of data sets. Default: %(default)s.")
     parser.add_argument(
