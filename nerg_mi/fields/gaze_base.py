@@ -256,6 +256,8 @@ class GazeHeadConfig:
     semantic: Any = ""  # Features of a radiance field that emit takes: accumulated, snapshot or none ("")
     prior: Any = 0  # Rows of the table of the position-independent prior; 0 for a field without one
     mix: Any = 0.0  # Weight of the position-independent prior
+    # Whether the prior is also a factor of the density that it is mixed into, so that it cannot be replaced
+    prior_factor: Any = True
 
     @property
     def features(self) -> int:
@@ -406,8 +408,15 @@ class GazeHead(AnyGazeField):
         ``prior``."""
         return interpolate_table(self.prior.array, self.config.prior, r_o)
 
-    def set_prior_weight(self, weight: float) -> None:
-        """Set the weight of the position-independent prior."""
+    def set_prior(self, weight: float, table: np.ndarray | None = None) -> None:
+        """Set the weight of the position-independent prior, and its ``table`` (`make_prior_table`) unless it is None.
+
+        Raises ``ValueError`` for a table if the prior is a factor of the density.
+        """
+        if table is not None:
+            if self.config.prior_factor:
+                raise ValueError("the prior is a factor of this gaze field's density and cannot be replaced")
+            self.prior = self.ns.TensorXf(np.asarray(table, np.float32))
         self.config = replace(self.config, mix=weight)
 
 
@@ -476,6 +485,11 @@ def table_directions(rows: int) -> np.ndarray:
     return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1).reshape(-1, 3)
 
 
+def add_prior_floor(density: np.ndarray) -> np.ndarray:
+    """Replace a thousandth of a ``density`` (1/sr) by the uniform density, so that its logarithm is finite."""
+    return (1 - _FLOOR) * density + _FLOOR / (4 * np.pi)
+
+
 def make_prior_table(density: np.ndarray, rows: int, ns: ModuleType, directions: np.ndarray) -> np.ndarray:
     """Log table (rows, 2 rows) of a position-independent ``density`` (1/sr) in the directions
     ``table_directions(rows)``.
@@ -483,8 +497,7 @@ def make_prior_table(density: np.ndarray, rows: int, ns: ModuleType, directions:
     A thousandth of it is uniform. Scaled so that its interpolant integrates to one over ``directions`` (N, 3), a fine
     set of equal area.
     """
-    density = np.asarray(density, np.float64)
-    log = np.log((1 - _FLOOR) * density + _FLOOR / (4 * np.pi))
+    log = np.log(add_prior_floor(np.asarray(density, np.float64)))
     d = to_vector(ns.Array3f, directions)
     values = np.asarray(dr.exp(interpolate_table(ns.Float(log.astype(np.float32)), rows, d)), np.float64)
     return (log - np.log(4 * np.pi * values.mean())).reshape(rows, 2 * rows).astype(np.float32)

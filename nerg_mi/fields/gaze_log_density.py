@@ -1,12 +1,11 @@
 """The gaze field as a log density that is normalised over the observer's sphere.
 
-gaze(p_o, r_o) = (1 - m) emit(p_od, -r_o, log |p_od - p_o|) * sigmoid(F_c(p_o, r_o)) * prior(r_o) / Z(p_o) + m
-prior(r_o)
+gaze(p_o, r_o) = (1 - m) emit(p_od, -r_o, log |p_od - p_o|) * sigmoid(F_c(p_o, r_o)) / Z(p_o) + m prior(r_o)
 
 Z(p_o) is the integral of the product over all directions, so that gaze integrates to one for any weights: a softmax
 over the sphere. ``prior`` is the position-independent density of gaze directions, m its weight. The factors are those
 of :mod:`nerg_mi.fields.gaze_product`, but emit and capture have separate networks: one over the surfaces, the other
-over the positions of observers.
+over the positions of observers. Fields of earlier versions have the prior as a third factor of the product.
 """
 
 from __future__ import annotations
@@ -51,6 +50,8 @@ class LogGazeConfig(GazeHeadConfig):
     # Corners of the bounding box of observers, over which capture encodes positions; others are clamped to it.
     heads: tuple = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
     mix: float = 0.0  # Weight m of the position-independent prior
+    # Whether the prior is also a factor of the product; checkpoints without this entry were trained so.
+    prior_factor: bool = True
     prior: int = 64  # Rows of the prior's latitude-longitude table
     # surface, or none without a known geometry: p_od is then ``reach`` away from p_o in every direction.
     geometry: str = "surface"
@@ -58,6 +59,11 @@ class LogGazeConfig(GazeHeadConfig):
     # points) emit at the depth of the nearest directions with a surface.
     escaped: str = "constant"
     reach: float = 2.0  # Distance of p_od without a known geometry, in the field's units
+
+    def to_dict(self) -> dict:
+        """As a JSON object. Fields of earlier versions, which have the prior as a factor, lack this entry."""
+        entries = super().to_dict()
+        return {k: v for k, v in entries.items() if k != "prior_factor" or not v}
 
     def __post_init__(self):
         object.__setattr__(self, "heads", tuple(tuple(float(x) for x in corner) for corner in self.heads))
@@ -151,6 +157,10 @@ class LogGazeField(GazeHead):
             arrays.ns.TensorXf(arrays.get_array("prior", config.prior, 2 * config.prior, max_value=_MAX_LOG_PRIOR)),
         )
 
+    def log_base(self, r_o):
+        """Log of the density that the factors multiply: the prior, or 1."""
+        return self.log_prior(r_o) if self.config.prior_factor else dr.zeros(type(r_o.x), dr.width(r_o))
+
     def emit_inputs(self, p_od, p_o, r_o, active: Bool | bool = True) -> list:
         """Inputs of the emit network (list of Floats): a bias, the log distance, the direction, the encoded
         position."""
@@ -186,7 +196,7 @@ class LogGazeField(GazeHead):
         """``(emit * prior, capture)``, whose product has the integral ``Z``. ``escaped``: mask of directions without a
         surface; ``semantic`` is not used."""
         c, one = self.config, type(p_od.x)(1)
-        logit = self.log_prior(r_o)
+        logit = self.log_base(r_o)
         if c.variant != "capture":
             emit = self.emit_net(self.emit_inputs(p_od, p_o, r_o, active))[0]
             logit += emit if c.fills_escaped else dr.select(escaped, self.escaped, emit)

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from nerg_mi.errors import NergError
-from nerg_mi.fields.gaze_base import GazeHeadConfig, RaySupport, make_prior_table, table_directions
+from nerg_mi.fields.gaze_base import GazeHeadConfig, RaySupport, add_prior_floor, make_prior_table, table_directions
 from nerg_mi.maths.arrays import to_vector
 from nerg_mi.maths.geometry import AnyBox, intersect_box_numpy
 from nerg_mi.maths.sphere import fibonacci_directions
@@ -32,6 +32,11 @@ from .geometry import DEFAULT_DEPTH, TrainingGeometry
 
 # ---- Position-independent prior: the gaze density averaged over all positions ----
 
+DEFAULT_PRIOR_KAPPA = 30.0  # Concentration of its kernels
+PRIOR_KAPPAS = (2.0, 5.0, 10.0, 20.0, 30.0, 50.0, 100.0)
+"""Candidate concentrations of the prior's kernels."""
+# Maximum numbers of rays in a prior, and of a participant's rays that it predicts, while its kernels are selected
+_MAX_SELECTION_RAYS, _MAX_PARTICIPANT_RAYS = 1 << 14, 512
 _MAX_PRIOR_RAYS = 1 << 16  # Maximum number of rays in the prior
 _VIEWS_KAPPA = 50.0  # Concentration of the kernels that smooth a prior estimated from views
 _LEAF_SIZE = 16  # Points per leaf of a KD-tree. The value decides ties between equally distant directions.
@@ -39,11 +44,11 @@ _ITERATIONS = 100  # Iterations of the estimate from views
 _QUADRATURE_DIRECTIONS = 1 << 16  # Directions of the quadrature that normalises the table
 
 
-def check_prior_kappa(rows: int, kappa: float) -> None:
+def check_prior_kappa(rows: int, kappa: float | None) -> None:
     """Raise `NergError` if kernels of concentration ``kappa`` are narrower than half a texel of a table of ``rows``
     rows.
     """
-    if kappa > (max_kappa := (2 * rows / np.pi) ** 2):
+    if kappa is not None and kappa > (max_kappa := (2 * rows / np.pi) ** 2):
         raise NergError(
             f"the position-independent prior is stored in a table of {rows} rows, which does not resolve kernels of "
             f"concentration {kappa:g}; use a concentration of at most {max_kappa:.0f}"
@@ -56,7 +61,7 @@ def make_prior_from_rays(
     geometry: TrainingGeometry | None = None,
     seed: int = 0,
     weights: str = "equal",
-    kappa: float = 10.0,
+    kappa: float | None = None,
 ) -> np.ndarray:
     """Estimate the position-independent prior from gaze rays by kernel density estimation.
 
@@ -72,7 +77,7 @@ def make_prior_from_rays(
         Seed of the subsample of rays.
     weights : str
         ``"person"`` gives each participant the same total weight; other values weight each ray equally.
-    kappa : float
+    kappa : float, optional
         Concentration of each ray's kernel; see `check_prior_kappa`.
 
     Returns
@@ -83,10 +88,43 @@ def make_prior_from_rays(
     check_prior_kappa(rows, kappa)
     subset = np.random.default_rng(seed).permutation(len(rays))[:_MAX_PRIOR_RAYS]
     ray_weights = compute_participant_weights(rays)[subset] if weights == "person" else None
+    kappa = DEFAULT_PRIOR_KAPPA if kappa is None else kappa
     kde = SphericalKde(rays.direction[subset], np.array([0, len(subset)]), kappa, ray_weights)
     directions = table_directions(rows)
     density = kde.evaluate(directions if geometry is None else geometry.directions_to_rays(directions))[0]
     return make_prior_table(density, rows, kde.ns, fibonacci_directions(_QUADRATURE_DIRECTIONS))
+
+
+def select_prior_kappa(rays: Rays, weights: str = "equal", seed: int = 0) -> float:
+    """Select the concentration of the prior's kernels by leaving out participants.
+
+    The prior of the other participants predicts each participant; with one, the first half of the rays in time predicts
+    the second. The result is the geometric mean of the best of `PRIOR_KAPPAS` and `DEFAULT_PRIOR_KAPPA`: the best one
+    alone varies with the training participants more than with those who are predicted.
+
+    Parameters
+    ----------
+    rays : Rays
+        Training rays.
+    weights : str
+        Weights of the rays in the prior (`make_prior_from_rays`).
+    seed : int
+        Seed of the subsamples.
+    """
+    participants, rng = np.unique(rays.person), np.random.default_rng(seed)
+    tests = [rays.person == p for p in participants] if len(participants) > 1 else [rays.t > np.median(rays.t)]
+    scores = []
+    for test in tests:
+        if test.all() or not test.any():
+            continue
+        held_out = rays.direction[rng.permutation(np.flatnonzero(test))[:_MAX_PARTICIPANT_RAYS]]
+        train = rays.select(np.sort(rng.permutation(np.flatnonzero(~test))[:_MAX_SELECTION_RAYS]))
+        ray_weights = compute_participant_weights(train) if weights == "person" else None
+        mixture = np.array([0, len(train)])
+        density = [SphericalKde(train.direction, mixture, k, ray_weights).evaluate(held_out)[0] for k in PRIOR_KAPPAS]
+        scores.append(np.log(add_prior_floor(np.array(density, np.float64))).mean(axis=1))
+    best = PRIOR_KAPPAS[int(np.mean(scores, axis=0).argmax())] if scores else DEFAULT_PRIOR_KAPPA
+    return float(np.sqrt(best * DEFAULT_PRIOR_KAPPA))
 
 
 def make_prior_from_views(views: Sequence[SalienceView], rows: int) -> np.ndarray:
@@ -449,6 +487,22 @@ def compute_surface_distances(
                 directions[p, is_hit], distance[p, is_hit], directions[p, misses[p]]
             )
     return distance, misses
+
+
+def find_hit_points(rays: Rays, geometry: TrainingGeometry, depth: str = "median") -> np.ndarray | None:
+    """Find the points that ``rays`` hit: the recorded ones, otherwise those on the surfaces of ``geometry``.
+
+    Returns points (N, 3) in metres in the frame of the rays, NaN for a ray without one; None if no surface is known.
+    ``depth`` is a depth estimator (``transport.depth``).
+    """
+    if rays.hit is not None and np.isfinite(rays.hit).any():
+        return rays.hit
+    if geometry.medium is None:
+        return None
+    origins, directions = geometry.points_to_field(rays.origin), geometry.directions_to_field(rays.direction)
+    distance, misses = compute_surface_distances(geometry, origins, directions[:, None], depth)
+    distance[misses] = np.nan
+    return rays.origin + rays.direction * (distance / geometry.align.scale)
 
 
 def compute_box_exit(box: AnyBox, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:

@@ -167,10 +167,10 @@ def train_ensemble(
         fields.append(field)
         provenances.append(provenance)
     if selects_weight and selection is None:
-        selection = evaluate_folds(supervision, geometry, full_plan, ns, on_progress).select_weight()
+        selection = evaluate_folds(supervision, geometry, full_plan, ns, on_progress).select()
     if selection is not None:
         for field in fields:
-            field.set_prior_weight(selection.prior_weight)
+            selection.apply(field, supervision.rays, geometry, plan)
     ensemble = GazeEnsemble(fields, supervision.make_support(plan.probes.radius, geometry))
     ensemble.basis = summarize_provenance(supervision.count_data())
     provenance = _combine_provenances(provenances, plan.settings, supervision, kind) | (

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -12,64 +11,75 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.fields.gaze_base import GazeHeadConfig
+from nerg_mi.fields.gaze_base import GazeHead, GazeHeadConfig, interpolate_table
 from nerg_mi.interruption import Interruption
-from nerg_mi.probes.probes import Probes, calibrate_levels, compute_region_levels
-from nerg_mi.rays.filters import purge, split_by_position
+from nerg_mi.maths.arrays import to_vector
+from nerg_mi.probes.probes import calibrate_levels, compute_region_levels
+from nerg_mi.ranges import KAPPAS
+from nerg_mi.rays.folds import iter_folds, sample_participants_equally
 from nerg_mi.rays.rays import Rays
 
 from .gaze_data import (
     Supervision,
     TargetRequirements,
     compute_observer_bounds,
-    make_probes,
-    make_targets_from_probes,
+    make_observer_targets,
+    make_prior_from_rays,
+    make_rotated_directions,
     make_targets_from_rays,
+    select_prior_kappa,
 )
-from .gaze_trainer import GazePlan, GazeProgress, ProgressCallback
+from .gaze_trainer import GazePlan, GazeProgress, GazeTrainer, ProgressCallback
 from .geometry import TrainingGeometry
 
-# ---- Selection of the prior weight ----
+# ---- Selection of the prior ----
 #
-# The weight of the position-independent prior, so that a field is not worse than the prior alone.
+# The kernels and the weight of the position-independent prior, so that a field is not worse than the prior alone.
 #
-# With few or stationary participants a field overfits and scores below the position-independent prior. The weight is
-# therefore chosen by cross-validation on the training rays: each fold holds out some participants at held-out positions
-# and trains a field on the others. The weight is the one whose mixture predicts the held-out rays best (stacking;
-# Wolpert 1992, Smyth and Wolpert 1999). Among weights within half a standard error of the best, the largest is taken,
-# that is, the simpler density; the full standard error of Breiman et al. (1984) would cost too much where the field is
-# reliable. If the field needs no prior in the first folds, the others are skipped. The held-out rays also calibrate the
-# highest-density regions of the mixture.
+# With few or stationary participants a field overfits and scores below the position-independent prior. The weight of
+# the prior is therefore the one whose mixture predicts held-out rays best (stacking; Wolpert 1992, Smyth and Wolpert
+# 1999): each fold holds out some participants at held-out positions and trains a field on the others with the same
+# number of steps. Densities are those at the rays' own origins, averaged over each participant's rays. Few held-out
+# participants say little about others, and a field that is better for them by chance is worse for the next. So the
+# weight of the best mean only counts where the field is clearly better than the prior: by _CLEAR_GAIN after a
+# deduction of standard errors over participants. Elsewhere the best mean after that deduction counts; it is zero for
+# the prior alone, so where nothing can be learned from position the weight is one. Without surfaces a field can only
+# interpolate between positions, and the deduction is larger. If the field needs no prior in the first folds, the
+# others are skipped. The held-out rays also calibrate the highest-density regions of the mixture.
 
-PRIOR_WEIGHTS = np.linspace(0.05, 1.0, 20)
+PRIOR_WEIGHTS = np.array([0.01, 0.02, *(0.05 * np.arange(1, 21))])
 """Candidate weights of the prior. Zero is excluded, so that no density is zero."""
 FOLD_TIME_FRACTION = 0.5  # Fraction of a training's time limit that the folds take
-# Zones, positions in all zones and minimum rays per position that a fold holds out; directions per validation probe.
-_NUM_ZONES, _NUM_POSITIONS, _MIN_RAYS, _NUM_DIRECTIONS = 3, 48, 16, 1024
-# Number of folds after which the smallest weight is accepted if each fold prefers it; maximum number of probes of a
-# fold; its steps as a fraction of the training's. Fewer probes and steps select the same weight.
-_MIN_FOLDS, _MAX_PROBES, _STEP_FRACTION = 2, 512, 0.5
-_SE_FACTOR = 0.5  # Standard errors by which a weight may be worse than the best
+# Maximum number of held-out rays of a fold, and directions over which the density at their origins is integrated
+_MAX_RAYS, _NUM_DIRECTIONS = 320, 1024
+_CLEAR_GAIN = 0.1  # Nats per ray
+# Standard errors over participants that are deducted from a gain, with and without surfaces
+_CAUTION, _CAUTION_WITHOUT_SURFACES = 1.0, 2.0
+# Number of folds after which a small weight is accepted, if the mean of each fold is best with a weight up to
+# _SMALL_WEIGHT and exceeds the prior by _CLEAR_GAIN
+_MIN_FOLDS, _SMALL_WEIGHT = 2, 0.1
+_SE_FACTOR = 0.5  # Standard errors by which the first variant may be worse than the best
 _MIN_DENSITY = 1e-9  # Minimum density (1/sr), so that its logarithm is finite
 
 
-_KEYS = {"prior_weight": "mix", "kld_prior": "kld_blind"}  # Fields with another name in checkpoints
+_KEYS = {"prior_weight": "mix"}  # Fields with another name in checkpoints
 
 
 @dataclass(frozen=True)
-class PriorWeightSelection:
-    """The selected prior weight and the scores behind it. Without folds it is the default weight."""
+class PriorSelection:
+    """The selected prior and the scores behind it. Without folds it is the default prior."""
 
     prior_weight: float  # Selected weight
     folds: int  # Number of folds with enough participants and positions
-    # KLD (nats) of the held-out data, means over folds: with the selected weight, of the field alone (with the smallest
-    # candidate weight), and of the prior alone. Each is computed from kernel densities, so that none reaches zero.
-    kld: float | None = None
-    kld_field: float | None = None
-    kld_prior: float | None = None
+    # Concentration of the prior's kernels; None if it was not selected.
+    prior_kappa: float | None = None
+    # Mean log density of the held-out rays over that of the prior alone, in bits: with the selected weight, and of the
+    # field alone (with the smallest candidate weight).
+    bits: float | None = None
+    bits_field: float | None = None
     # Nominal levels at which the regions hold `probes.probes.REGION_LEVELS` of the held-out gaze, by level name.
     regions: dict[str, float] | None = None
-    # The variant selected by `select_variant`, and the KLD of each variant with its own weight in the common folds.
+    # The variant selected by `select_variant`, and the bits of each variant with its own weight in the common folds.
     variant: str | None = None
     variants: dict[str, float] | None = None
 
@@ -78,29 +88,39 @@ class PriorWeightSelection:
         return {_KEYS.get(k, k): _round_values(v) for k, v in asdict(self).items()}
 
     @staticmethod
-    def from_dict(data: dict[str, Any]) -> PriorWeightSelection:
+    def from_dict(data: dict[str, Any]) -> PriorSelection:
         """Restore a selection from `to_dict`. Raises ``TypeError`` or ``ValueError`` for invalid data."""
         names: dict[str, str] = {key: name for name, key in _KEYS.items()}
-        selection = PriorWeightSelection(**{names.get(k, k): v for k, v in dict(data).items()})
+        selection = PriorSelection(**{names.get(k, k): v for k, v in dict(data).items()})
         if not 0 <= selection.prior_weight <= 1:
             raise ValueError(f'its "mix" must be from 0 to 1, got {selection.prior_weight}')
+        if selection.prior_kappa is not None and selection.prior_kappa not in KAPPAS:
+            raise ValueError(f'its "prior_kappa" must be positive, got {selection.prior_kappa}')
         return selection
+
+    def apply(self, field: GazeHead, rays: Rays | None, geometry: TrainingGeometry, plan: GazePlan) -> None:
+        """Set the prior of a ``field`` that was trained on ``rays``."""
+        table = None
+        if self.prior_kappa is not None and rays is not None:
+            table = make_prior_from_rays(
+                rays, field.config.prior, geometry, plan.settings.seed, plan.probes.weights, self.prior_kappa
+            )
+        field.set_prior(self.prior_weight, table)
 
 
 def selects_prior_weight(plan: GazePlan) -> bool:
-    """Return whether ``plan`` selects the prior weight by folds."""
+    """Return whether ``plan`` selects the prior by folds."""
     return plan.settings.mix_folds > 0 and plan.config.prior > 0
 
 
-class _FoldDensities(NamedTuple):
-    """Densities of a fold (P, D): of the field and of the prior, and for each held-out ray the index of its nearest
-    direction (n,), probe by probe according to ``offsets`` (P + 1,).
-    """
+class FoldDensities(NamedTuple):
+    """Densities (1/sr) of a fold at n held-out rays, each at its own origin."""
 
-    field: np.ndarray
-    prior: np.ndarray
-    bins: np.ndarray
-    offsets: np.ndarray
+    person: np.ndarray  # Participant of each ray (n,)
+    field: np.ndarray  # Of the field in the direction of each ray (n,)
+    prior: np.ndarray  # Of the prior (n,)
+    field_maps: np.ndarray  # Of the field in D directions of equal area (n, D)
+    prior_maps: np.ndarray  # Of the prior (n, D)
 
 
 @dataclass(frozen=True)
@@ -108,15 +128,33 @@ class FoldResults:
     """Scores of one architecture in the folds."""
 
     default_weight: float  # Default prior weight of the architecture
-    kld_curves: np.ndarray  # KLD (F, S) in each fold with each of ``PRIOR_WEIGHTS``
-    densities: list[_FoldDensities]  # Densities of each fold
+    kappa: float | None  # Concentration of the prior's kernels; None if it was not selected
+    folds: list[FoldDensities]
+    caution: float = _CAUTION  # Standard errors over participants that are deducted from a gain
 
-    def select_weight(self) -> PriorWeightSelection:
-        """Select the prior weight; the default weight if there are no folds."""
-        if not len(self.kld_curves):
-            return PriorWeightSelection(self.default_weight, 0)
-        selection = _select_weight(self.kld_curves)
-        return replace(selection, regions=_calibrate_regions(self.densities, selection.prior_weight))
+    def select(self) -> PriorSelection:
+        """Select the weight of the prior; the default weight if there are no folds."""
+        if not self.folds:
+            return PriorSelection(self.default_weight, 0)
+        gains = self.compute_gains()
+        index = _select_weight(gains, self.caution)
+        weight, mean = float(PRIOR_WEIGHTS[index]), gains.mean(axis=0) / np.log(2)
+        regions = _calibrate_regions(self.folds, weight)
+        return PriorSelection(weight, len(self.folds), self.kappa, float(mean[index]), float(mean[0]), regions)
+
+    def compute_gains(self, folds: int | None = None) -> np.ndarray:
+        """Return the mean log density over that of the prior alone, in nats, of each held-out participant and with
+        each of `PRIOR_WEIGHTS` (N, S), in the first ``folds`` folds."""
+        gains = []
+        for fold in self.folds[:folds]:
+            mixed = (1 - PRIOR_WEIGHTS) * fold.field[:, None] + PRIOR_WEIGHTS * fold.prior[:, None]
+            gain = _log(mixed) - _log(fold.prior)[:, None]
+            gains += [gain[fold.person == p].mean(axis=0) for p in np.unique(fold.person)]
+        return np.array(gains)
+
+
+def _log(density: np.ndarray) -> np.ndarray:
+    return np.log(np.maximum(density, _MIN_DENSITY))
 
 
 def evaluate_folds(
@@ -126,7 +164,7 @@ def evaluate_folds(
     ns: ModuleType,
     on_progress: ProgressCallback = lambda progress: None,
 ) -> FoldResults:
-    """Train and score a field in each fold, with each candidate weight of the prior.
+    """Train a field in each fold, and evaluate it and the prior at held-out rays.
 
     Parameters
     ----------
@@ -147,27 +185,23 @@ def evaluate_folds(
     KeyboardInterrupt
         After Ctrl-C, or if ``on_progress`` raises it.
     """
-    rays, config, curves, densities = supervision.rays, plan.config, [], []
+    rays, config, folds = supervision.rays, plan.config, []
     if rays is None or not config.prior:
         raise ValueError("folds need rays and a field with a position-independent prior")
     if plan.settings.minutes is not None:
         plan = plan.with_settings(minutes=FOLD_TIME_FRACTION * plan.settings.minutes / plan.settings.mix_folds)
     settings, needs = plan.settings, TargetRequirements.from_config(plan.config)
-    probes = replace(plan.probes, count=min(plan.probes.count, _MAX_PROBES), fresh=False)
-    if settings.steps is not None:
-        settings = replace(settings, steps=math.ceil(_STEP_FRACTION * settings.steps))
+    probes, kappa = replace(plan.probes, fresh=False), plan.probes.mix_kappa
+    if kappa is None and not config.prior_factor:
+        kappa = select_prior_kappa(rays, probes.weights, settings.seed)
+    plan = replace(plan, probes=replace(probes, mix_kappa=kappa))
     box = compute_observer_bounds(geometry.points_to_field(rays.origin), geometry.box)
-    for k, (train, held_out, centres) in enumerate(iter_folds(rays, plan)):
+    for k, (train, held_out) in enumerate(iter_folds(rays, probes.radius, settings.mix_folds, settings.seed)):
         try:
             targets = make_targets_from_rays(train, geometry, probes, needs, seed=settings.seed)
         except NergError:
             # The remaining participants make no probe: skip this fold.
             continue
-        validation_settings = replace(probes, directions=_NUM_DIRECTIONS, min_rays=1)
-        validation_probes = make_probes(held_out, validation_settings, centres, settings.seed + 3)
-        truth = make_targets_from_probes(
-            validation_probes, geometry, _NUM_DIRECTIONS, validation_settings.depth, needs, settings.seed + 3
-        )
         trainer = plan.trainer(replace(targets, observer_bounds=box), geometry.box, config, settings, ns)
         with Interruption() as stop:
             while trainer.progress < 1:
@@ -175,60 +209,43 @@ def evaluate_folds(
                 fraction = (k + trainer.progress) / settings.mix_folds
                 on_progress(GazeProgress(f"fold {k + 1}", fraction, trainer.steps, trainer.seconds, None))
                 stop.check()
-        field, prior = trainer.evaluate_densities(truth)
-        curves.append([_mean_kld(truth.truth, (1 - m) * field + m * prior) for m in PRIOR_WEIGHTS])
-        densities.append(
-            _FoldDensities(
-                field,
-                prior,
-                _find_nearest_directions(validation_probes, geometry, truth.directions),
-                validation_probes.offsets,
-            )
-        )
-        if len(curves) == _MIN_FOLDS and all(int(np.argmin(curve)) == 0 for curve in curves):
+        test = sample_participants_equally(held_out, _MAX_RAYS, settings.seed + 3)
+        folds.append(_evaluate_fold(trainer, train, test, geometry, plan, needs))
+        if len(folds) == _MIN_FOLDS and all(map(_needs_no_prior, folds)):
             break
     on_progress(GazeProgress("folds", 1.0, settings.steps or 0, 0.0, None))
-    return FoldResults(config.mix, np.array(curves), densities)
+    caution = _CAUTION_WITHOUT_SURFACES if geometry.medium is None else _CAUTION
+    return FoldResults(config.mix, None if config.prior_factor else kappa, folds, caution)
 
 
-def iter_folds(rays: Rays, plan: GazePlan) -> Iterator[tuple[Rays, Rays, np.ndarray]]:
-    """Yield ``(training rays, held-out rays, centres)`` of each fold.
-
-    Each fold holds out a group of participants at test positions ``centres`` (T, 3) and removes other rays near these
-    positions from the training rays. With one participant, only positions are held out. Folds without enough rays are
-    skipped.
-    """
-    settings, radius = plan.settings, plan.probes.radius
-    rng = np.random.default_rng(settings.seed + 7)
-    participants = rng.permutation(np.unique(rays.person))
-    is_single = len(participants) == 1
-    groups = (
-        [participants] * settings.mix_folds
-        if is_single
-        else np.array_split(participants, min(settings.mix_folds, len(participants)))
+def _evaluate_fold(
+    trainer: GazeTrainer, train: Rays, test: Rays, geometry: TrainingGeometry, plan: GazePlan, needs: TargetRequirements
+) -> FoldDensities:
+    """Evaluate the field of ``trainer``, and the prior of the rays ``train``, at the rays ``test``."""
+    seed, rows, ns = plan.settings.seed, plan.config.prior, trainer.ns
+    maps = make_rotated_directions(_NUM_DIRECTIONS, len(test), np.random.default_rng(seed + 3))
+    directions = geometry.directions_to_field(np.concatenate([maps, test.direction[:, None]], axis=1))
+    targets = make_observer_targets(
+        geometry.points_to_field(test.origin),
+        directions,
+        np.zeros(directions.shape[:2]),
+        geometry,
+        plan.probes.depth,
+        needs,
     )
-    for k, group in enumerate(groups):
-        mask = np.isin(rays.person, group)
-        held_out = rays.select(mask)
-        try:
-            # The other participants provide the training rays, so no minimum applies to those who hardly moved.
-            split = split_by_position(
-                held_out,
-                radius,
-                zones=_NUM_ZONES,
-                test_probes=_NUM_POSITIONS,
-                min_rays=_MIN_RAYS,
-                min_train=0,
-                seed=1000 * settings.seed + k,
-            )
-        except NergError:
-            # These participants have no zones with enough rays.
-            continue
-        is_training = purge(rays, split.test_centres, 2 * radius)
-        if not is_single:
-            is_training &= ~mask
-        if is_training.any():
-            yield rays.select(is_training), held_out, split.test_centres
+    field = trainer.evaluate_densities(targets).astype(np.float64)
+    # The trainer normalises over all directions, among which that of the ray is one too many.
+    field /= 4 * np.pi * field[:, :-1].mean(axis=1, keepdims=True)
+    table = make_prior_from_rays(train, rows, geometry, seed, plan.probes.weights, plan.probes.mix_kappa)
+    log = interpolate_table(ns.Float(table.ravel()), rows, to_vector(ns.Array3f, directions.reshape(-1, 3)))
+    prior = np.exp(np.asarray(log, np.float64)).reshape(field.shape)
+    return FoldDensities(test.person, field[:, -1], prior[:, -1], field[:, :-1], prior[:, :-1])
+
+
+def _needs_no_prior(fold: FoldDensities) -> bool:
+    """Return whether a small weight of the prior is best by far in this fold."""
+    gains = FoldResults(0.0, None, [fold]).compute_gains().mean(axis=0)
+    return PRIOR_WEIGHTS[gains.argmax()] <= _SMALL_WEIGHT and gains.max() > _CLEAR_GAIN
 
 
 def _round_values(value):
@@ -238,48 +255,34 @@ def _round_values(value):
     return round(value, 4) if isinstance(value, float) else value
 
 
-def _mean_kld(truth: np.ndarray, density: np.ndarray) -> float:
-    """Return the mean KLD (nats) of densities (P, D) in directions of equal area, each normalised."""
-    p = truth / truth.sum(axis=1, keepdims=True, dtype=np.float64)
-    q = np.maximum(density, _MIN_DENSITY)
-    q = q / q.sum(axis=1, keepdims=True, dtype=np.float64)
-    return float((p * np.log(np.maximum(p, _MIN_DENSITY / p.shape[1]) / q)).sum(axis=1).mean())
+def _calibrate_regions(folds: Sequence[FoldDensities], weight: float) -> dict[str, float]:
+    """Calibrate the region levels on the held-out rays of all folds."""
+    levels = []
+    for fold in folds:
+        maps = (1 - weight) * fold.field_maps + weight * fold.prior_maps
+        at_rays = (1 - weight) * fold.field + weight * fold.prior
+        levels.append(compute_region_levels(maps, at_rays[:, None])[:, 0])
+    return calibrate_levels(np.concatenate(levels), np.ones(sum(map(len, levels))))
 
 
-def _find_nearest_directions(probes: Probes, place: TrainingGeometry, directions: np.ndarray) -> np.ndarray:
-    """Return the index of the nearest of its probe's ``directions`` (P, D, 3) for each ray of ``probes``, (n,)."""
-    along, o = place.directions_to_field(probes.directions), probes.offsets
-    return np.concatenate([np.argmax(along[a:b] @ d.T, axis=1) for a, b, d in zip(o[:-1], o[1:], directions)])
+def within_half_se(losses: np.ndarray) -> np.ndarray:
+    """Return the columns of ``losses`` (N, S), one row per held-out participant, whose mean is within half a standard
+    error of the smallest.
 
-
-def _calibrate_regions(densities: Sequence[_FoldDensities], mix: float) -> dict[str, float]:
-    """Calibrate the region levels on the held-out rays of all folds, with equal weight for each position."""
-    levels, weights = [], []
-    for fold in densities:
-        density = (1 - mix) * fold.field + mix * fold.prior
-        for p, (a, b) in enumerate(zip(fold.offsets[:-1], fold.offsets[1:])):
-            levels.append(compute_region_levels(density[p : p + 1], density[p : p + 1, fold.bins[a:b]])[0])
-            weights.append(np.full(b - a, 1 / (b - a)))
-    return calibrate_levels(np.concatenate(levels), np.concatenate(weights))
-
-
-def within_half_se(curves: np.ndarray) -> np.ndarray:
-    """Return the columns of ``curves`` (F, S), one row per fold, whose mean is within half a standard error of the
-    smallest.
-
-    The standard error is that of the difference to the best column, over folds.
+    The standard error is that of the difference to the best column, over participants.
     """
-    excess = curves - curves[:, [int(curves.mean(axis=0).argmin())]]
-    error = excess.std(axis=0, ddof=1) / np.sqrt(len(curves)) if len(curves) > 1 else np.zeros(curves.shape[1])
+    excess = losses - losses[:, [int(losses.mean(axis=0).argmin())]]
+    error = excess.std(axis=0, ddof=1) / np.sqrt(len(losses)) if len(losses) > 1 else np.zeros(losses.shape[1])
     return np.flatnonzero(excess.mean(axis=0) <= _SE_FACTOR * error)
 
 
-def _select_weight(curves: np.ndarray) -> PriorWeightSelection:
-    """Select the largest of `PRIOR_WEIGHTS` that is within half a standard error of the best over folds (F, S)."""
-    mean, index = curves.mean(axis=0), int(within_half_se(curves)[-1])
-    return PriorWeightSelection(
-        float(PRIOR_WEIGHTS[index]), len(curves), float(mean[index]), float(mean[0]), float(mean[-1])
-    )
+def _select_weight(gains: np.ndarray, caution: float = _CAUTION) -> int:
+    """Return the index of the best of `PRIOR_WEIGHTS` for the ``gains`` (N, S) of N participants over the prior, from
+    which ``caution`` standard errors are deducted."""
+    mean = gains.mean(axis=0)
+    error = gains.std(axis=0, ddof=1) / np.sqrt(len(gains)) if len(gains) > 1 else np.zeros_like(mean)
+    cautious = mean - caution * error
+    return int((mean if cautious.max() > _CLEAR_GAIN else cautious).argmax())
 
 
 # ---- Selection of the variant ----
@@ -299,7 +302,7 @@ def select_variant(
     ns: ModuleType,
     on_progress: ProgressCallback = lambda progress: None,
     resumed_identity: dict | None = None,
-) -> tuple[GazePlan, PriorWeightSelection | None]:
+) -> tuple[GazePlan, PriorSelection | None]:
     """Select one architecture of ``plan``, and its prior weight, by folds.
 
     ``GazePlan.config`` is kept unless one of the ``alternatives`` predicts the held-out participants better by half a
@@ -316,7 +319,7 @@ def select_variant(
     -------
     plan : GazePlan
         Plan with one architecture.
-    selection : PriorWeightSelection or None
+    selection : PriorSelection or None
         Prior weight, if it was selected.
 
     Raises
@@ -344,7 +347,7 @@ def select_variant(
 
 def _restore_selection(
     plan: GazePlan, configs: tuple[GazeHeadConfig, ...], identity: dict
-) -> tuple[GazePlan, PriorWeightSelection | None]:
+) -> tuple[GazePlan, PriorSelection | None]:
     """Return the selection of the run to resume. A selection of another run is detected when the identities are
     compared.
     """
@@ -353,24 +356,27 @@ def _restore_selection(
     if SELECTION_KEY not in identity:
         return plan, None
     try:
-        return plan, PriorWeightSelection.from_dict(identity[SELECTION_KEY])
+        return plan, PriorSelection.from_dict(identity[SELECTION_KEY])
     except (TypeError, ValueError) as error:
         raise NergError(f"the saved selection of the run is damaged ({error}); start again without --resume") from error
 
 
 def _select_best(
     plan: GazePlan, configs: tuple[GazeHeadConfig, ...], results: list[FoldResults]
-) -> tuple[GazePlan, PriorWeightSelection | None]:
+) -> tuple[GazePlan, PriorSelection | None]:
     """Return the plan with the best of ``configs`` and its prior weight, given the fold results of each."""
-    selections = [judged.select_weight() for judged in results]
+    selections = [scored.select() for scored in results]
     # Folds stop early for a field that needs no prior.
-    folds = min(len(judged.kld_curves) for judged in results)
-    if not folds:
+    count = min(len(scored.folds) for scored in results)
+    if not count:
         return plan, selections[0]
-    weight_indices = [int(np.abs(PRIOR_WEIGHTS - choice.prior_weight).argmin()) for choice in selections]
-    curves = np.stack([judged.kld_curves[:folds, s] for judged, s in zip(results, weight_indices)], axis=1)
-    k = int(within_half_se(curves)[0])
-    variants = {config.variant: float(kld) for config, kld in zip(configs, curves.mean(axis=0))}
+    gains = []
+    for scored, selection in zip(results, selections):
+        index = int(np.abs(PRIOR_WEIGHTS - selection.prior_weight).argmin())
+        gains.append(scored.compute_gains(count)[:, index])
+    losses = -np.stack(gains, axis=1)
+    k = int(within_half_se(losses)[0])
+    variants = {c.variant: float(-loss / np.log(2)) for c, loss in zip(configs, losses.mean(axis=0))}
     return replace(plan, config=configs[k]), replace(selections[k], variant=configs[k].variant, variants=variants)
 
 

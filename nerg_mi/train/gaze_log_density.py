@@ -62,7 +62,7 @@ def evaluate_log_density(
         config, box, encoding_from_parameters(config.grid, parameters, mode=dr.ReduceMode.Expand), parameters["prior"]
     )
     repeats = dr.width(r_o) // dr.width(p_o)
-    logit = field.log_prior(r_o)
+    logit = field.log_base(r_o)
     each = dr.gather(type(p_o), p_o, dr.arange(ns.UInt32, dr.width(r_o)) // repeats)
     if config.variant != "capture":
         inputs = field.emit_inputs(p_od, each, r_o)
@@ -245,6 +245,7 @@ def _make_log_density_config(options: FieldOptions) -> LogGazeConfig:
         variant=options.variant,
         sh_degree=3,
         mix=0.05,
+        prior_factor=False,
         **get_geometry_options(options.geometry_kind),
     )
 
@@ -295,8 +296,7 @@ register_recipe(
             "spacing": 0.08,
             "count": 1024,
             "min_rays": 1,
-            "kappa": 30.0,
-            "mix_kappa": 10.0,
+            "kappa": 200.0,
             "directions": 2048,
             "weights": "person",
         },

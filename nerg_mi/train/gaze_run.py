@@ -101,7 +101,7 @@ def train_gaze(
     Zones of positions are held out for validation, and training data within 2R of them are removed. The best weights on
     the validation data count, and the run stops early when they no longer improve. With ``refit``, a second fit uses
     all data for the best number of steps; the reported scores remain those of the first fit. With
-    ``plan.settings.mix_folds`` and rays, folds select the prior weight of a log density (`evaluate_folds`), and before
+    ``plan.settings.mix_folds`` and rays, folds select the prior of a log density (`evaluate_folds`), and before
     that the variant, if there are several (`select_variant`).
     """
     on_progress, state, started = on_progress or (lambda progress: None), state or StateSettings(), time.perf_counter()
@@ -139,12 +139,12 @@ def train_gaze(
     interrupted = first.interrupted or last.interrupted
     if selects_weight and selection is None and not interrupted:
         try:
-            selection = evaluate_folds(supervision, geometry, plan, ns, on_progress).select_weight()
+            selection = evaluate_folds(supervision, geometry, plan, ns, on_progress).select()
         except KeyboardInterrupt:
             interrupted = True
     field = trainer.make_field(last.weights)
     if selection is not None:
-        field.set_prior_weight(selection.prior_weight)
+        selection.apply(field, training.rays, geometry, plan)
     field.support = training.make_support(plan.probes.radius, geometry)
     field.basis = summarize_provenance(supervision.count_data())
     provenance = _make_provenance(supervision, geometry, plan, targets) | {

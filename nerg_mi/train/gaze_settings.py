@@ -54,7 +54,10 @@ class ProbeSettings(ValidatedDataclass):
         "(leave-one-out likelihood).",
     )
     kappa: float = setting(
-        50.0, "Concentration of the von Mises-Fisher kernel (unitless), for --kappa-rule fixed.", allowed=KAPPAS
+        50.0,
+        "Concentration of the von Mises-Fisher kernel (unitless), for --kappa-rule fixed; its standard deviation is "
+        "57.3 / sqrt(kappa) degrees.",
+        allowed=KAPPAS,
     )
     # Directions of equal area, randomly rotated and fixed, so that depths are traced once.
     directions: int = setting(
@@ -71,11 +74,10 @@ class ProbeSettings(ValidatedDataclass):
         "Weights of the rays in a probe: equal, distance (1 - d/R), or person (equal for each participant).",
         option="ray_weights",
     )
-    # Wide kernels: the field can learn missing detail from many probes, but it cannot remove the peaks of a few
-    # participants.
-    mix_kappa: float = setting(
-        10.0,
-        "Only for the recipe named default: concentration (unitless) of the kernels of the position-independent prior.",
+    mix_kappa: float | None = setting(
+        None,
+        "Only for the recipe named default: concentration (unitless) of the kernels of the position-independent "
+        "prior. Default: chosen by the cross-validation of --prior-folds, or 30 without it.",
         allowed=KAPPAS,
         option="prior_kappa",
     )

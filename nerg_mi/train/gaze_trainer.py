@@ -316,17 +316,14 @@ class GazeTrainer(Trainer, ABC):
             )
         return density
 
-    def evaluate_densities(self, targets: GazeTargets) -> tuple[np.ndarray, np.ndarray]:
-        """Evaluate the field, without the mixed-in prior, and the prior in the directions of ``targets``, each (P,
-        D)."""
-        parts, D = [], targets.truth.shape[1]
+    def evaluate_densities(self, targets: GazeTargets) -> np.ndarray:
+        """Evaluate the field, without the mixed-in prior, in the directions of ``targets`` (P, D)."""
+        parts = []
         with dr.suspend_grad():
             for batch in self.iter_batches(targets):
                 density = self.evaluate_density(batch, {**self.constant, **self.averaged})
-                prior = dr.exp(self.initial_field.log_prior(batch.r_o))
-                parts.append([np.asarray(v).reshape(-1, D) for v in (density, prior)])
-        field, prior = (np.concatenate(v) for v in zip(*parts))
-        return field, prior
+                parts.append(np.asarray(density).reshape(-1, targets.truth.shape[1]))
+        return np.concatenate(parts)
 
     def iter_batches(self, targets: GazeTargets) -> Iterator[GazeBatch]:
         """Yield all of ``targets`` in all of their directions, some observers at a time."""

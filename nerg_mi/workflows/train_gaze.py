@@ -369,13 +369,13 @@ def _report_result(result: GazeResult, reporter: Reporter) -> None:
     if "mix" in provenance:
         m = provenance["mix"]
         if m["variant"]:
-            klds = ", ".join(f"{kld:.3f} of {name}" for name, kld in m["variants"].items())
-            reporter.message(f"held-out KLD {klds}: the variant {m['variant']} is trained")
+            bits = ", ".join(f"{gain:.3f} of {name}" for name, gain in m["variants"].items())
+            reporter.message(f"bits per held-out sample {bits}: the variant {m['variant']} is trained")
         if m["folds"]:
             folds = f"{m['folds']} fold{'' if m['folds'] == 1 else 's'}"
             reporter.message(
-                f"cross-validation ({folds}): KLD {m['kld_field']:.3f} of the field, {m['kld_blind']:.3f} of the "
-                f"position-independent prior; weight of the prior: {100 * m['mix']:.0f} %"
+                f"cross-validation ({folds}): {m['bits_field']:+.3f} bits per sample of the field above the "
+                f"position-independent prior, {m['bits']:+.3f} with a weight of {100 * m['mix']:.0f} % of the prior"
             )
             reporter.message(
                 f"regions with {100 * m['regions']['80%']:.0f} % of the field's gaze contain 80 % of the held-out gaze"
@@ -386,8 +386,9 @@ def _report_result(result: GazeResult, reporter: Reporter) -> None:
                 "others is unknown"
             )
         if m["mix"] >= _DOMINANT_PRIOR:
+            kind = "only" if m["mix"] == 1 else "mostly"
             reporter.warn(
-                "position hardly predicts the gaze of other participants: the gaze field is mostly the "
+                f"position hardly predicts the gaze of other participants: the gaze field is {kind} the "
                 "position-independent prior; record more participants, or provide the geometry of the scene"
             )
     if result.output is not None:

@@ -69,7 +69,7 @@ def test_it_is_stored_rendered_and_a_torch_module(rgb, trained, tmp_path):
     from nerg_mi.interop.torch import GazeModule
 
     # The networks have influence, whatever the folds select.
-    again.set_prior_weight(0.1)
+    again.set_prior(0.1)
     module, rng, box = GazeModule(again), np.random.default_rng(0), again.box
     p_od, p_o, r_o = (rng.uniform(box.lower, box.upper, size=(20, 3)).astype(np.float32) for _ in range(3))
     r_o /= np.linalg.norm(r_o, axis=1, keepdims=True)

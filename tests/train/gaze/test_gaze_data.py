@@ -17,6 +17,7 @@ from nerg_mi.fields.gaze_product import GazeField
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.fields.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import save_gaze, save_radiance
+from nerg_mi.maths import vmf
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.photos.salience import pixel_solid_angles
@@ -41,6 +42,7 @@ from nerg_mi.train.gaze_data import (
     make_targets_from_rays,
     make_targets_from_views,
     select_far_views,
+    select_prior_kappa,
     split_validation,
     split_views,
 )
@@ -136,6 +138,23 @@ def test_kernels_too_narrow_for_the_table_are_refused():
     assert np.exp(make_prior_from_rays(rays, 64, kappa=400.0)).max() > 40  # 1/sr; its peak is 400 / 2π
     with pytest.raises(NergError, match="64.*1660"):
         make_prior_from_rays(rays, 64, kappa=1700.0)
+
+
+def test_kernels_of_the_prior_are_those_that_predict_other_participants():
+    """All look around one direction with a concentration of 100, or each around an own direction; the result lies
+    between the best candidate and the default."""
+    rng = np.random.default_rng(0)
+    n = 1200
+    person = np.arange(n) % 6
+    common = np.tile([1.0, 0.0, 0.0], (n, 1))
+    individual = fibonacci_directions(6)[person]
+    make = lambda mu, count=6: Rays(
+        np.arange(n), person % count, tuple("abcdef"[:count]), np.zeros((n, 3)), vmf.sample(mu, 100.0, rng), np.ones(n)
+    )
+    assert select_prior_kappa(make(common)) == pytest.approx(np.sqrt(100 * 30))
+    assert select_prior_kappa(make(individual)) == pytest.approx(np.sqrt(2 * 30))
+    # The halves in time of a single participant.
+    assert select_prior_kappa(make(common, 1), "person") == pytest.approx(np.sqrt(100 * 30))
 
 
 def test_prior_is_in_the_frame_of_the_geometry():

@@ -16,14 +16,13 @@ from nerg_mi.train.gaze_ensemble import train_ensemble
 from nerg_mi.train.gaze_folds import (
     PRIOR_WEIGHTS,
     SELECTION_KEY,
+    FoldDensities,
     FoldResults,
-    PriorWeightSelection,
+    PriorSelection,
     _calibrate_regions,
-    _FoldDensities,
     _select_best,
     _select_weight,
     evaluate_folds,
-    iter_folds,
 )
 from nerg_mi.train.gaze_run import train_gaze
 from nerg_mi.train.gaze_settings import ProbeSettings
@@ -31,8 +30,9 @@ from nerg_mi.train.gaze_trainer import KIND, StateSettings
 
 from .looks import LIKELIHOOD, LOG, NOWHERE, planned
 
-# ---- The prior weight: selected by held-out participants and positions ----
+# ---- Selection of the prior by held-out participants and positions ----
 
+PLAIN = replace(LOG, prior_factor=False)
 PROBES_HERE = ProbeSettings(radius=0.3, count=48, min_rays=1, kappa=20.0, directions=128, weights="person")
 
 
@@ -57,38 +57,35 @@ def plan_of(**changes):
     settings = replace(
         LIKELIHOOD, **{"mix_folds": 3, "zones": 0, "steps": 300, "probes": 16, "weight_decay": 0.0, **changes}
     )
-    return planned(LOG, settings, PROBES_HERE)
+    return planned(PLAIN, settings, PROBES_HERE)
 
 
-def test01_held_out_participants_are_not_trained_on():
-    rays = people(1.0)
-    folds = list(iter_folds(rays, plan_of()))
-    assert len(folds) == 3
-    for learn, held, centres in folds:
-        assert not set(learn.person) & set(held.person) and len(np.unique(held.person)) == 2
-        assert np.linalg.norm(learn.origin[:, None] - centres[None], axis=2).min() > 2 * PROBES_HERE.radius
-    assert set(np.concatenate([np.unique(held.person) for _, held, _ in folds])) == set(range(6))
-    # Seated participants: the zones contain all of their rays.
-    seated = people(1.0)
-    seated = replace(seated, origin=np.column_stack([seated.person, 0 * seated.person, 1.2 + 0 * seated.person]))
-    assert [len(learn) for learn, _, _ in iter_folds(seated, plan_of())] == [1600] * 3
-    for learn, held, _ in iter_folds(people(1.0, count=1), plan_of()):
-        assert len(held) == 400 and 0 < len(learn) < 400
+def test02_the_best_weight_is_selected_where_the_field_is_clearly_better():
+    rising, last = np.linspace(-1, 0, len(PRIOR_WEIGHTS)), len(PRIOR_WEIGHTS) - 1
+    assert _select_weight(np.array([rising, rising])) == last
+    falling = -rising
+    assert _select_weight(np.array([falling, falling])) == 0 == _select_weight(falling[None])
+    # The gain over the prior is 0.5 or 0.3, with a standard error of 0.1 or 0.01.
+    gains = np.full((2, len(PRIOR_WEIGHTS)), -1.0)
+    gains[:, last] = 0
+    gains[:, 2], gains[:, 8] = (0.4, 0.6), (0.29, 0.31)
+    assert _select_weight(gains) == 2
+    # After two standard errors nothing is left of 0.15, and 0.04 of 0.05.
+    gains[:, 2], gains[:, 8] = (0.05, 0.25), (0.045, 0.055)
+    assert _select_weight(gains, caution=2.0) == 8
+    gains[:, 8] = (-0.05, 0.15)
+    assert _select_weight(gains, caution=2.0) == last and _select_weight(gains, caution=0.0) == 2
 
 
-def test02_the_largest_of_equivalent_weights_is_selected():
-    low = np.linspace(1, 2, len(PRIOR_WEIGHTS))
-    assert _select_weight(np.array([low, low])).prior_weight == PRIOR_WEIGHTS[0]
-    assert _select_weight(np.array([low[::-1], low[::-1]])).prior_weight == 1.0
-    # One fold prefers the field as much as the other prefers the prior.
-    unsure = _select_weight(np.array([low, 3.01 - low]))
-    assert unsure.prior_weight == 1.0 and unsure.folds == 2 and np.isclose(unsure.kld_prior, (2 + 1.01) / 2)
-    assert np.isclose(_select_weight(low[None]).kld, 1)
-    # The prior alone is worse by 0.1 in KLD, with a standard error of 0.1, 0.15 and 0.25.
-    for error, mix in ((0.1, PRIOR_WEIGHTS[0]), (0.15, PRIOR_WEIGHTS[0]), (0.25, 1.0)):
-        curves = np.stack([low * 0 + 2, low * 0 + 2])
-        curves[:, 1:], curves[:, -1] = 3, (2.1 - error, 2.1 + error)
-        assert _select_weight(curves).prior_weight == mix
+def test03_the_weight_maximises_the_held_out_likelihood():
+    """The field holds for half of the rays of each participant, and the prior for the others."""
+    field, prior = np.tile([1.0, 0.01], 50), np.tile([0.02, 0.3], 50)
+    uniform = np.full((100, 8), 1 / (4 * np.pi))
+    fold = FoldDensities(np.repeat([0, 1], 50), field, prior, uniform, uniform)
+    result = FoldResults(0.1, 20.0, [fold, fold]).select()
+    expected = max(PRIOR_WEIGHTS, key=lambda m: np.log((1 - m) * field + m * prior).mean())
+    assert result.prior_weight == expected and result.bits > max(0, result.bits_field)
+    assert result.folds == 2 and result.prior_kappa == 20.0
 
 
 @pytest.mark.parametrize(("law", "has_weight"), [(1.0, True), (0.0, False)])
@@ -97,13 +94,13 @@ def test04_the_field_has_weight_if_position_is_informative(law, has_weight, rgb)
     not informative.
     """
     messages = []
-    result = evaluate_folds(Supervision(people(law)), NOWHERE, plan_of(), ns, messages.append).select_weight()
+    result = evaluate_folds(Supervision(people(law)), NOWHERE, plan_of(), ns, messages.append).select()
     assert result is not None and messages[-1].stage.startswith("fold") and 0 < messages[-1].fraction <= 1
     assert result.regions is not None and 0 < result.regions["50%"] < result.regions["80%"] < result.regions["95%"] < 1
     if has_weight:
-        assert result.prior_weight < 0.3 and result.kld < result.kld_prior and result.folds <= 3
+        assert result.prior_weight < 0.3 and result.bits > 0.1 and result.folds <= 3
     else:
-        assert result.prior_weight > 0.6 and result.kld <= result.kld_field and result.folds == 3
+        assert result.prior_weight > 0.6 and result.bits >= max(0, result.bits_field) and result.folds == 3
 
 
 def test05_of_a_training_and_of_an_ensemble(rgb):
@@ -121,7 +118,7 @@ def test05_of_a_training_and_of_an_ensemble(rgb):
     few, provenance = train_gaze(Supervision(people(0.0, each=12)), NOWHERE, plan, ns)
     assert few.config.mix == LOG.mix and provenance["mix"]["mix"] == LOG.mix and provenance["mix"]["folds"] == 0
     assert provenance["mix"]["regions"] is None
-    assert PriorWeightSelection(0.5, 1, regions={"80%": 0.71234}).to_dict()["regions"] == {"80%": 0.7123}
+    assert PriorSelection(0.5, 1, regions={"80%": 0.71234}).to_dict()["regions"] == {"80%": 0.7123}
 
     # After Ctrl-C the field exists, without a selected weight.
     def stop(progress):
@@ -138,11 +135,13 @@ def test07_regions_are_those_of_the_mixture():
     """
     field, prior = np.array([[0.8, 0.4, 0.2, 0.0]]), np.array([[0.0, 0.2, 0.2, 0.4]])
     # Half of each: 0.4, 0.3, 0.2, 0.2.
-    judgement = _FoldDensities(field, prior, np.array([0, 1, 3]), np.array([0, 3]))
-    result = _calibrate_regions([judgement], 0.5)
+    rays = [0, 1, 3]
+    maps = (np.repeat(v, 3, axis=0) for v in (field, prior))
+    fold = FoldDensities(np.zeros(3, int), field[0, rays], prior[0, rays], *maps)
+    result = _calibrate_regions([fold], 0.5)
     np.testing.assert_allclose([result[k] for k in ("50%", "80%", "95%")], [0.55 / 1.1, 0.9 / 1.1, 0.9 / 1.1])
     # The prior alone prefers the third direction, and the second as much as the direction without rays.
-    np.testing.assert_allclose(_calibrate_regions([judgement], 1.0)["50%"], 1 - 0.5 * (0.2 + 0.2) / 0.8)
+    np.testing.assert_allclose(_calibrate_regions([fold], 1.0)["50%"], 1 - 0.5 * (0.2 + 0.2) / 0.8)
 
 
 # ---- Variants ----
@@ -156,31 +155,33 @@ def two(**changes):
     return replace(plan_of(**changes), config=CAPTURE, alternatives=(BOTH,))
 
 
-def judged(*klds, mix=0.1):
-    """Folds in which a field has these KLD with the smallest weight, and is worse with any other."""
-    look = _FoldDensities(np.ones((1, 4)), np.ones((1, 4)), np.array([0]), np.array([0, 1]))
-    curves = np.array([k + np.linspace(0, 1, len(PRIOR_WEIGHTS)) for k in klds])
-    return FoldResults(mix, curves, [look] * len(klds))
+def scored(*gains):
+    """Folds in which a field exceeds the prior by ``gains`` nats with the smallest weight."""
+    uniform = np.ones((1, 4))
+    scale = lambda gain: (np.exp(gain) - PRIOR_WEIGHTS[0]) / (1 - PRIOR_WEIGHTS[0])
+    make = lambda gain: FoldDensities(np.zeros(1, int), np.full(1, scale(gain)), np.ones(1), uniform, uniform)
+    return FoldResults(0.1, None, [make(gain) for gain in gains])
 
 
 def test01_the_first_variant_is_kept_unless_another_is_better():
     plan = replace(two(), alternatives=())
     for first, second, selected in (
-        ((1.0, 1.0), (0.9, 0.9), BOTH),
-        ((0.9, 0.9), (1.0, 1.0), CAPTURE),
+        ((1.0, 1.0), (1.1, 1.1), BOTH),
+        ((1.1, 1.1), (1.0, 1.0), CAPTURE),
         # Better by 0.1, with a standard error of 0.3, and of 0.15.
-        ((1.0, 1.0), (0.6, 1.2), CAPTURE),
-        ((1.0, 1.0), (0.75, 1.05), BOTH),
+        ((1.0, 1.0), (1.4, 0.8), CAPTURE),
+        ((1.0, 1.0), (1.25, 0.95), BOTH),
         # Over the common folds.
-        ((1.0, 1.0, 0.1), (0.9, 0.9), BOTH),
+        ((1.0, 1.0, 1.9), (1.1, 1.1), BOTH),
     ):
-        result, choice = _select_best(plan, (CAPTURE, BOTH), [judged(*first), judged(*second)])
+        result, choice = _select_best(plan, (CAPTURE, BOTH), [scored(*first), scored(*second)])
         assert (
             result.config == selected and choice.variant == selected.variant and choice.prior_weight == PRIOR_WEIGHTS[0]
         )
-        assert choice.variants == pytest.approx({"capture": np.mean(first[:2]), "emit_capture": np.mean(second)})
-    result, choice = _select_best(plan, (CAPTURE, BOTH), [FoldResults(0.1, np.empty(0), [])] * 2)
-    assert result.config == CAPTURE and choice == PriorWeightSelection(0.1, 0)
+        bits = {"capture": np.mean(first[:2]) / np.log(2), "emit_capture": np.mean(second) / np.log(2)}
+        assert choice.variants == pytest.approx(bits)
+    result, choice = _select_best(plan, (CAPTURE, BOTH), [FoldResults(0.1, None, [])] * 2)
+    assert result.config == CAPTURE and choice == PriorSelection(0.1, 0)
 
 
 @pytest.mark.nightly
@@ -192,9 +193,9 @@ def test02_the_variant_that_predicts_held_out_participants_is_trained(rgb):
     flat = replace(CAPTURE, sh_degree=1)
     plan = replace(two(), config=flat, alternatives=(replace(BOTH, reach=1.9, sh_degree=1),))
     field, provenance = train_gaze(Supervision(people(1.0)), NOWHERE, plan, ns, on_progress=messages.append)
-    klds = provenance["mix"]["variants"]
+    bits = provenance["mix"]["variants"]
     assert provenance["mix"]["variant"] == field.config.variant == "emit_capture"
-    assert klds["emit_capture"] < klds["capture"] and field.config.mix == provenance["mix"]["mix"]
+    assert bits["emit_capture"] > bits["capture"] and field.config.mix == provenance["mix"]["mix"]
     stages = [state.stage for state in messages]
     assert stages.index("fit") > max(i for i, s in enumerate(stages) if s.startswith("fold"))
     assert {"fold 1 of capture", "fold 1 of emit_capture"} <= set(stages)
