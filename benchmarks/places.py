@@ -4,12 +4,12 @@
         [--recipe default] [--variant VARIANT] [--no-surfaces] [--against FOLDS.csv] [--out out/benchmarks/places]
     python benchmarks/places.py --uncertainty --folds 3 --zones 6 [--ensemble 5] [--out out/benchmarks/uncertainty]
 
-The scenes are recordings of a supermarket (with surfaces from hit points), recordings of three EyeNavGS scenes (without
+The scenes are recordings of a supermarket (with surfaces from hit points), recordings of EyeNavGS scenes (without
 geometry), the demo store's shoppers in its radiance field, and four generated scenes with walls and their own laws of
 attention (`generated_places.py`). In each fold, one half of the participants trains the field. The other half is scored
-at 60 positions in three zones. Training data within 2R of these positions are excluded. The baselines are a uniform
-density, a position-independent density, the nearest probes, and the nearest rays. The agreement between two halves of
-the held-out participants (split half) is a reference.
+at 60 positions in three zones. Training data within 2R of these positions are excluded. The baselines are those of
+`nerg eval gaze`, tuned on the training rays. The agreement between two halves of the held-out participants (split half)
+is a reference.
 
 Columns of places.csv: ``rank`` is the rank of the field among all methods but the split half. ``less`` is the field
 minus the best baseline, fold by fold, and ``reach`` the half width of its 95 % interval (Student's t). ``way`` is the
@@ -99,9 +99,9 @@ def makers(data: Path) -> dict[str, Make]:
     out: dict[str, Make] = {}
     if shop := sorted((data / "vr_supermarket").glob("*.csv.gz")):
         out["supermarket"] = lambda folder: (recorded(shop, "vr_supermarket", folder), {"geometry": "hits"})
-    for scene in ("room", "playroom", "truck"):
-        if files := sorted((data / "eyenavgs" / scene).glob("*.csv.gz")):
-            out[scene] = lambda folder, files=files: (recorded(files, "eyenavgs", folder), {"geometry": "none"})
+    for scene in sorted(path for path in (data / "eyenavgs").glob("*") if path.is_dir()):
+        if files := sorted(scene.glob("*.csv.gz")):
+            out[scene.name] = lambda folder, files=files: (recorded(files, "eyenavgs", folder), {"geometry": "none"})
     out["store"] = store
     for make in PLACES:
         place = make()
@@ -143,7 +143,7 @@ def generated(place, folder: Path) -> tuple[Path, dict]:
 
 OURS, PRIOR, HALF = "gaze field", "position-independent prior", "split half"
 # Higher is better.
-SCORES = {"KLD": False, "CC": True, "bits": True}
+SCORES = {"KLD": False, "CC": True, "bits at own origin": True}
 
 
 def main(argv=None) -> None:

@@ -4,9 +4,8 @@
 
 The test positions are those that the gaze checkpoint lists as held out (`nerg train gaze --test-zones`). Shoppers were
 there, and all rays within 2R were excluded from the training. The truth is the attention law in closed form, in 2,048
-directions of equal area. The baselines use the field's training rays: the density of all rays for any position, the
-densities of the nearest probes, and that of the 4,096 nearest rays. Probes and rays are evaluated with two kernels,
-that of the training and a wider one.
+directions of equal area. The baselines use the field's training rays and are those of `nerg eval gaze`
+(`nerg_mi.evaluation.baselines`), tuned on folds of them.
 
 KLD compares densities that are normalised over the sphere, with 1e-6 of the uniform density added to both. MAE and
 `integral` use the densities without normalisation. `law, seen by as many rays` is the kernel density of new samples of
@@ -43,23 +42,17 @@ def main(argv=None) -> None:
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
-    from nerg_mi.evaluation.gaze import (
-        EPS,
-        FieldDensity,
-        compute_map_scores,
-        make_nearest_probes_baseline,
-        make_nearest_rays_baseline,
-        make_prior_baseline,
-    )
+    from nerg_mi.evaluation.baselines import make_tuned_baselines
+    from nerg_mi.evaluation.gaze import EPS, FieldDensity, compute_map_scores
     from nerg_mi.fields.mlp import namespace
-    from nerg_mi.formats.fields import load_gaze, load_radiance
+    from nerg_mi.formats.fields import load_gaze
     from nerg_mi.maths.sphere import fibonacci_directions
-    from nerg_mi.probes.probes import place_probes
     from nerg_mi.rays.filters import purge
     from nerg_mi.rays.rays import Rays
     from nerg_mi.scenes import store
     from nerg_mi.scenes.store.attention_law import AttentionLaw
-    from nerg_mi.transport.field_medium import FieldMedium
+    from nerg_mi.train.gaze_data import find_hit_points
+    from nerg_mi.train.geometry import load_field_geometry
 
     local = Path(store.__file__).resolve().parent
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -82,12 +75,6 @@ def main(argv=None) -> None:
         help="Gaze samples of the training. Default: those of the store's shoppers.",
     )
     parser.add_argument(
-        "--wide",
-        type=float,
-        default=20.0,
-        help="Concentration (unitless) of the wider kernel of the baselines. Default: %(default)s.",
-    )
-    parser.add_argument(
         "--out",
         type=Path,
         default=Path("out/benchmarks/store_gaze.csv"),
@@ -100,7 +87,8 @@ def main(argv=None) -> None:
     metadata = meta["provenance"]
     if "test" not in metadata:
         raise SystemExit(f'"{args.gaze}" was trained without held-out positions; train it with --test-zones 8')
-    medium, rays, law = FieldMedium(load_radiance(args.field, ns)[0]), Rays.load(args.rays), AttentionLaw()
+    rays, law = Rays.load(args.rays), AttentionLaw()
+    geometry = load_field_geometry(args.field, ns)
     positions, radius = np.array(metadata["test"]["centres"]), metadata["test"]["radius"]
     train = rays.select(purge(rays, positions, metadata["test"]["purged_within"]))
     directions = fibonacci_directions(DIRECTIONS)
@@ -109,26 +97,9 @@ def main(argv=None) -> None:
     probe_settings = metadata["probes"]
     # The silverman and loo rules have no single kappa; the default is used instead.
     narrow = probe_settings["kappa"]
-    methods = {
-        "gaze field": FieldDensity(gaze, medium, depth_kind=probe_settings["depth"]),
-        "position-independent prior, kappa 50": make_prior_baseline(train, kappa=50),
-    }
-    for kappa in (narrow, args.wide):
-        probes = place_probes(
-            train,
-            radius,
-            count=probe_settings["count"],
-            max_rays=probe_settings["cap"],
-            min_rays=probe_settings["min_rays"],
-            kappa_rule="fixed",
-            kappa=kappa,
-            seed=0,
-        )
-        methods |= {
-            f"{k} nearest probe{'s' * (k > 1)}, kappa {kappa:g}": make_nearest_probes_baseline(probes, k)
-            for k in (1, 16)
-        }
-        methods[f"4,096 nearest rays, kappa {kappa:g}"] = make_nearest_rays_baseline(train, 4096, kappa=kappa)
+    methods = {"gaze field": FieldDensity(gaze, geometry.medium, depth_kind=probe_settings["depth"])}
+    tuned = make_tuned_baselines(train, radius, find_hit_points(train, geometry), participants=False)
+    methods |= {name: baseline.density for name, baseline in tuned.items()}
     methods[f"law, seen by {probe_settings['cap']:,} rays, kappa {narrow:g}"] = fresh_draws(
         law, probe_settings["cap"], narrow
     )

@@ -20,7 +20,8 @@ from nerg_mi.train.gaze_recipes import get_recipe
 from nerg_mi.train.geometry import TrainingGeometry, make_volume_dict
 from nerg_mi.transport.geometry import SceneGeometry
 
-from .gaze import Baseline, GazeTest, compute_map_scores, make_test
+from .baselines import Baseline
+from .gaze import GazeTest, compute_map_scores, make_test
 from .study_scenes import make_sensor
 
 # ---- Ablation ----
@@ -121,7 +122,8 @@ def make_tests(
         "test": make_test(rays, centres, radius, kappa, min_rays=min_rays),
     }
     if truth is not None:
-        tests = {k: replace(t, truth=truth(t.centres, t.directions)) for k, t in tests.items()}
+        # A known density is not smoothed.
+        tests = {k: replace(t, truth=truth(t.centres, t.directions), kappa=None) for k, t in tests.items()}
     return tests
 
 
@@ -129,7 +131,7 @@ def score_density(tests: dict[str, GazeTest], density: Baseline) -> dict[str, fl
     """Score ``density(positions, directions)`` in 1/sr on each of ``tests``, including the loss of the paper."""
     row = {}
     for side, test in tests.items():
-        scores = compute_map_scores(test.truth, density(test.centres, test.directions))
+        scores = compute_map_scores(test.truth, test.smooth(density(test.centres, test.directions)))
         row |= {f"{side}_{k}": scores[k] for k in ("KLD", "CC", "MAE")}
         row[f"{side}_loss"] = scores["KLD"] + 1 - scores["CC"] + scores["MAE"]
     return row

@@ -1,11 +1,11 @@
-"""Scores of a gaze field at held-out positions, and baselines to compare it with."""
+"""Scores of a gaze field and of baselines on held-out rays."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,31 +15,19 @@ from nerg_mi.maths.arrays import to_vector
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.maths.types import variant_types
-from nerg_mi.probes.kde import Backend, SphericalKde
-from nerg_mi.probes.probes import Probes, place_probes
+from nerg_mi.probes.kde import SphericalKde
+from nerg_mi.probes.probes import place_probes
 from nerg_mi.rays.filters import purge, split_by_person
+from nerg_mi.rays.folds import sample_participants_equally
 from nerg_mi.rays.rays import Rays
 from nerg_mi.train.gaze_data import SURFACE_OPACITY
 from nerg_mi.transport.geometry import SceneGeometry, default_march_settings
 from nerg_mi.transport.observer import ObserverSettings
+from nerg_mi.transport.observer_batch import evaluate_densities
 from nerg_mi.transport.observer_gaze import GazeFieldInstance, ObservedGaze
 
 from . import metrics
-
-# ---- Baselines ----
-#
-# Densities without a field, which a gaze field must outperform.
-#
-# Each baseline is a function ``(positions (P, 3), directions) -> (P, D)`` that returns densities in 1/sr, which
-# integrate to one; ``directions`` is (D, 3) for all positions or (P, D, 3). All baselines use the kernels of
-# :mod:`nerg_mi.probes.kde`.
-
-Baseline = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""Densities (P, D), 1/sr, of positions (P, 3) in directions (D, 3) or (P, D, 3)."""
-
-UNIFORM_DENSITY = 1.0 / (4.0 * np.pi)  # 1/sr
-# Points per leaf of a KD-tree. The value decides the order of equally distant points, and so the last bits of sums.
-_LEAF_SIZE = 16
+from .baselines import Baseline
 
 
 class CachedBaseline:
@@ -60,120 +48,6 @@ class CachedBaseline:
         answer.setflags(write=False)
         self._answers.append((positions, directions, answer))
         return answer
-
-
-def make_uniform_baseline() -> Baseline:
-    """Return the uniform density, 1/(4π)."""
-
-    def evaluate(positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        return np.full((len(np.atleast_2d(positions)), np.shape(directions)[-2]), UNIFORM_DENSITY)
-
-    return evaluate
-
-
-def make_prior_baseline(rays: Rays, *, kappa: float = 50.0, backend: Backend = None) -> Baseline:
-    """Return the kernel density of all training rays with concentration ``kappa``, independent of the position."""
-    # Runs of rays are separate mixtures, averaged in float64: one float32 sum of 10^5 terms would lose precision and
-    # run in a single lane.
-    runs = np.array_split(np.arange(len(rays)), max(1, len(rays) // 4096))
-    offsets = np.concatenate([[0], np.cumsum([len(r) for r in runs])])
-    kde = SphericalKde(rays.direction, offsets, kappa, backend=backend)
-    share = np.diff(offsets) / len(rays)
-
-    def evaluate(positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        P = len(np.atleast_2d(positions))
-        directions = np.asarray(directions)
-        density = share @ kde.evaluate(directions.reshape(-1, 3)).astype(np.float64)
-        return np.broadcast_to(density, (P, len(density))) if directions.ndim == 2 else density.reshape(P, -1)
-
-    return evaluate
-
-
-def make_nearest_probes_baseline(probes: Probes, k: int = 16, *, backend: Backend = None) -> Baseline:
-    """Return the mean density of the ``k`` training probes nearest to a position (or of all, if there are fewer)."""
-    from scipy.spatial import KDTree
-
-    tree = KDTree(probes.positions, leafsize=_LEAF_SIZE)
-    k = min(k, len(probes))
-    rays = [np.arange(a, b) for a, b in zip(probes.offsets[:-1], probes.offsets[1:])]
-
-    def evaluate(positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        nearest = _find_nearest(tree, np.atleast_2d(positions), k)
-        # With common directions each probe is evaluated only once.
-        if np.ndim(directions) == 2:
-            used_probes, back = np.unique(nearest, return_inverse=True)
-            density = _select_probes(probes, rays, used_probes, backend).evaluate(directions)
-            return _average_rows(density, back.reshape(nearest.shape))
-        density = [
-            _select_probes(probes, rays, near, backend).evaluate(d).mean(axis=0, dtype=np.float64)
-            for near, d in zip(nearest, directions)
-        ]
-        return np.stack(density)
-
-    return evaluate
-
-
-def make_nearest_rays_baseline(rays: Rays, k: int = 4096, *, kappa: float = 20.0, backend: Backend = None) -> Baseline:
-    """Return the kernel density of the ``k`` training rays with the origins nearest to a position.
-
-    This is a probe without a radius, and a strong baseline for dense data.
-    """
-    from scipy.spatial import KDTree
-
-    tree = KDTree(rays.origin, leafsize=_LEAF_SIZE)
-    k = min(k, len(rays))
-
-    def evaluate(positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        positions, directions = np.atleast_2d(positions), np.asarray(directions)
-        out = []
-        for start in range(0, len(positions), 64):  # 64 x 4,096 rays at a time
-            nearest = _find_nearest(tree, positions[start : start + 64], k)
-            kde = SphericalKde(rays.direction[nearest.ravel()], np.arange(len(nearest) + 1) * k, kappa, backend=backend)
-            out.append(kde.evaluate(directions if directions.ndim == 2 else directions[start : start + 64]))
-        return np.concatenate(out)
-
-    return evaluate
-
-
-def make_standard_baselines(
-    rays: Rays, radius: float, kappa: float = 20.0, prior_kappa: float = 50.0, seed: int = 0, count: int = 2048
-) -> tuple[Baseline, dict[str, Baseline]]:
-    """Make the baselines that a gaze field is compared with from the training ``rays``.
-
-    Returns ``(prior, baselines)``: the reference density of the information gain, and the baselines by name (uniform,
-    position-independent prior, nearest probes and nearest rays, with kernels of concentration ``kappa``).
-    """
-    probes = place_probes(
-        rays, radius, count=count, min_rays=min(64, len(rays)), kappa_rule="fixed", kappa=kappa, seed=seed
-    )
-    prior = make_prior_baseline(rays, kappa=prior_kappa)
-    return prior, {
-        "uniform": make_uniform_baseline(),
-        "position-independent prior": make_prior_baseline(rays, kappa=kappa),
-        f"position-independent prior, kappa {prior_kappa:g}": prior,
-        "nearest probe": make_nearest_probes_baseline(probes, 1),
-        "16 nearest probes": make_nearest_probes_baseline(probes, 16),
-        "4,096 nearest rays": make_nearest_rays_baseline(rays, 4096, kappa=kappa),
-    }
-
-
-def _find_nearest(tree: Any, positions: np.ndarray, k: int) -> np.ndarray:
-    """Return the indices (P, k) of the ``k`` points of a KD-tree that are nearest to each of ``positions`` (P, 3)."""
-    return tree.query(positions, k=np.arange(1, k + 1))[1]
-
-
-def _select_probes(probes: Probes, rays: list[np.ndarray], which: np.ndarray, backend: Backend) -> SphericalKde:
-    """Return the densities of a subset of the probes, whose ray indices are ``rays``."""
-    runs = [rays[p] for p in which]
-    offsets = np.concatenate([[0], np.cumsum([len(r) for r in runs])])
-    flat = np.concatenate(runs)
-    weights = None if probes.weights is None else probes.weights[flat]
-    return SphericalKde(probes.directions[flat], offsets, probes.kappa[which], weights, backend)
-
-
-def _average_rows(density: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Return the mean (P, D) of the ``rows`` (P, k) of ``density`` (n, D)."""
-    return np.stack([density[r].mean(axis=0, dtype=np.float64) for r in rows])
 
 
 # ---- Densities of a trained gaze field at positions, and the table of scores ----
@@ -245,6 +119,10 @@ class FieldDensity:
         positions = np.atleast_2d(np.asarray(positions, np.float64)) @ align.matrix[:3, :3].T + align.matrix[:3, 3]
         directions = np.asarray(directions, np.float64) @ (align.matrix[:3, :3] / align.scale).T
         directions = np.broadcast_to(directions, (len(positions), *directions.shape[-2:]))
+        if directions.shape[1] == 1:
+            # About as many observers as directions share their launches.
+            density = evaluate_densities(self._gaze, self._place, self._settings, positions, directions[:, 0])
+            return density[:, :, None]
         return np.stack([self._evaluate_members(p, d) for p, d in zip(positions, directions)], axis=1)
 
     def _evaluate_members(self, position: np.ndarray, directions: np.ndarray) -> np.ndarray:
@@ -281,19 +159,26 @@ def format_score_table(rows: list[dict], title: str) -> str:
 # ---- Evaluation at held-out positions and on held-out participants ----
 #
 # The truth at a test position is the kernel density of the rays within R. Maps are compared over directions of equal
-# area, rays individually. The confidence intervals treat participants as the sampling unit: a bootstrap draws whole
-# participants with all of their rays (Efron and Tibshirani 1993).
+# area. A density is smoothed with the kernel of the truth before it is compared as a map, because a density that
+# predicts single rays best is sharper than the map that resembles a smoothed truth most (Kümmerer, Wallis and Bethge,
+# Saliency Benchmarking Made Easy, 2018). Rays are compared individually: at the centre of their position and, "at own
+# origin", at the origin of each ray. The confidence intervals treat participants as the sampling unit: a bootstrap
+# draws whole participants with all of their rays (Efron and Tibshirani 1993).
 
 SPLITS = ("both", "pos", "people")  # Held-out data: positions and participants, positions only, or participants only
 MAP_SCORES, RAY_SCORES = ("KLD", "CC", "SIM", "MAE"), ("NSS", "AUC", "sAUC", "bits", "loglik")
-SCORES = MAP_SCORES + RAY_SCORES
+OWN_SCORES = ("bits at own origin",)
+SCORES = MAP_SCORES + RAY_SCORES + OWN_SCORES
 """KLD in nats, CC and SIM of densities normalised over the sphere; MAE in 1/sr of unnormalised densities; NSS;
 AUC-Judd; sAUC against rays of other test positions; information gain over the position-independent prior in bits per
-ray; mean log density (nats of 1/sr).
+ray; mean log density (nats of 1/sr); information gain with each density evaluated at the ray's own origin, not at the
+centre of its position.
 """
 # Fraction of the progress for evaluating the methods; the rest is for the bootstrap.
 _EVALUATION_FRACTION = 0.2
 _RAYS_PER_POSITION = 128  # Rays drawn at each test position for the ray scores
+_SMOOTHED_DIRECTIONS = 2048  # Directions that are smoothed together
+_MAX_OWN_RAYS = 512  # Rays that are scored at their own origins, with about as many of each participant
 
 
 @dataclass(frozen=True, eq=False)
@@ -309,6 +194,22 @@ class GazeTest:
     sample_directions: np.ndarray  # Directions of rays drawn at each position (P, K, 3)
     sample_participants: np.ndarray  # Their participants (P, K)
     other_directions: np.ndarray  # Directions of rays drawn at other positions (P, K, 3)
+    own_origins: np.ndarray  # Origins (n, 3) of rays near the positions, which are scored there
+    own_directions: np.ndarray  # Their directions (n, 1, 3)
+    own_participants: np.ndarray  # Their participants (n,)
+    kappa: float | None = None  # Concentration of the kernels of the truth, which smooth a map; None: no smoothing
+
+    def smooth(self, maps: np.ndarray) -> np.ndarray:
+        """Return densities (P, D) in the directions of the test, smoothed with the kernel of the truth."""
+        if self.kappa is None:
+            return maps
+        kde = SphericalKde(self.directions, np.arange(len(self.directions) + 1), self.kappa)
+        parts = []
+        for start in range(0, len(self.directions), _SMOOTHED_DIRECTIONS):
+            # Double precision, so that a constant map remains constant.
+            kernel = kde.evaluate(self.directions[start : start + _SMOOTHED_DIRECTIONS]).astype(np.float64)
+            parts.append(maps @ (kernel / kernel.sum(axis=0)))
+        return np.concatenate(parts, axis=1)
 
     @cached_property
     def query_directions(self) -> np.ndarray:
@@ -455,6 +356,8 @@ def make_test(
         ]
     )
     truth = np.einsum("pn,pnd->pd", counts / counts.sum(axis=1, keepdims=True), participant_densities)
+    near = rays.select(~purge(rays, centres[has_enough], radius) & np.isin(rays.person, present))
+    drawn = sample_participants_equally(near, _MAX_OWN_RAYS, seed)
     names = tuple(rays.persons[i] for i in present)
     return GazeTest(
         centres[has_enough],
@@ -466,6 +369,10 @@ def make_test(
         sample_directions,
         np.searchsorted(present, person[drawn_rays]),
         other_directions,
+        drawn.origin,
+        drawn.direction[:, None],
+        np.searchsorted(present, drawn.person),
+        kappa,
     )
 
 
@@ -516,10 +423,7 @@ def evaluate_gaze(
     rng, N = np.random.default_rng(seed), len(test.participants)
     report = on_progress or (lambda share: None)
     evaluated = _evaluate_methods(test, methods, prior, lambda share: report(_EVALUATION_FRACTION * share))
-    rows = [
-        {"method": name, **compute_map_scores(test.truth, maps), **{k: float(v.mean()) for k, v in values.items()}}
-        for name, maps, values in evaluated
-    ]
+    rows = [{"method": m.name, **compute_map_scores(test.truth, m.maps), **m.average_rays()} for m in evaluated]
     bootstrap = [[] for _ in evaluated]
     for number in range(resamples if N >= 3 else 0):
         report(_EVALUATION_FRACTION + (1 - _EVALUATION_FRACTION) * number / resamples)
@@ -527,22 +431,15 @@ def evaluate_gaze(
         share = test.counts * times
         has_rays = share.sum(axis=1) > 0
         share = share[has_rays] / share[has_rays].sum(axis=1, keepdims=True)
-        truth, weight = (
-            np.einsum("pn,pnd->pd", share, test.participant_densities[has_rays]),
-            times[test.sample_participants].astype(float),
-        )
-        for resampled, (_, maps, values) in zip(bootstrap, evaluated):
-            resampled.append(
-                {
-                    **compute_map_scores(truth, maps[has_rays]),
-                    **{k: float((v * weight).sum() / weight.sum()) for k, v in values.items()},
-                }
-            )
-    for row, resampled, (_, maps, _) in zip(rows, bootstrap, evaluated):
+        truth = np.einsum("pn,pnd->pd", share, test.participant_densities[has_rays])
+        weights = times[test.sample_participants].astype(float), times[test.own_participants].astype(float)
+        for resampled, m in zip(bootstrap, evaluated):
+            resampled.append({**compute_map_scores(truth, m.maps[has_rays]), **m.average_rays(*weights)})
+    for row, resampled, m in zip(rows, bootstrap, evaluated):
         for k in SCORES if resampled else ():
             half_width = 1.96 * np.std([b[k] for b in resampled])
             row[f"{k}.low"], row[f"{k}.high"] = float(row[k] - half_width), float(row[k] + half_width)
-        row["integral"] = float(4 * np.pi * maps.mean())
+        row["integral"] = float(4 * np.pi * m.maps.mean())
     for other, resampled in zip(rows[1:], bootstrap[1:]):
         for k in SCORES:
             other |= _make_difference(
@@ -562,22 +459,52 @@ def _make_difference(name: str, value: float, resampled: list[float]) -> dict[st
     return {name: value, f"{name}.low": float(value - half_width), f"{name}.high": float(value + half_width)}
 
 
+class _EvaluatedMethod(NamedTuple):
+    """A method's smoothed maps (P, D), its scores of rays (P, K) by name, and those at own origins (n,) by name."""
+
+    name: str
+    maps: np.ndarray
+    rays: dict[str, np.ndarray]
+    own_rays: dict[str, np.ndarray]
+
+    def average_rays(
+        self, weights: np.ndarray | None = None, own_weights: np.ndarray | None = None
+    ) -> dict[str, float]:
+        """Return the mean of each score of rays, with ``weights`` (P, K) and ``own_weights`` (n,)."""
+        return {
+            **{k: float(np.average(v, weights=weights)) for k, v in self.rays.items()},
+            **{k: _average(v, own_weights) for k, v in self.own_rays.items()},
+        }
+
+
+def _average(values: np.ndarray, weights: np.ndarray | None) -> float:
+    """Return the weighted mean of ``values`` (n,); not a number if nothing has weight."""
+    if not len(values) or (weights is not None and not weights.any()):
+        return float("nan")
+    return float(np.average(values, weights=weights))
+
+
 def _evaluate_methods(
     test: GazeTest, methods: dict[str, Baseline], prior: Baseline, on_progress: Callable[[float], None] | None = None
-) -> list[tuple[str, np.ndarray, dict[str, np.ndarray]]]:
-    """Evaluate each method: ``(name, maps (P, D), ray scores (P, K) by name)``.
-
-    ``on_progress`` is called with the completed fraction.
-    """
+) -> list[_EvaluatedMethod]:
+    """Evaluate each method; ``on_progress`` is called with the completed fraction."""
     K = test.sample_directions.shape[1]
-    evaluate_method = lambda method: [
-        np.asarray(method(test.centres, v), np.float64) for v in (test.directions, test.query_directions)
-    ]
-    maps, at = evaluate_method(prior)
+
+    def evaluate(method: Baseline) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        maps, at = (np.asarray(method(test.centres, v), np.float64) for v in (test.directions, test.query_directions))
+        at_own = np.empty(0)
+        if len(test.own_origins):
+            at_own = np.asarray(method(test.own_origins, test.own_directions), np.float64)[:, 0]
+        return maps, at, np.log(np.maximum(at_own, 0) + np.finfo(float).eps)
+
+    maps, at, log_own_prior = evaluate(prior)
     log_prior, out = _log_density(at[:, :K], maps), []
     for name, method in methods.items():
-        maps, at = evaluate_method(method)
-        out.append((name, maps, compute_ray_scores(maps, at[:, :K], at[:, K:], log_prior)))
+        maps, at, log_own = evaluate(method)
+        values = compute_ray_scores(maps, at[:, :K], at[:, K:], log_prior)
+        out.append(
+            _EvaluatedMethod(name, test.smooth(maps), values, {OWN_SCORES[0]: (log_own - log_own_prior) / np.log(2)})
+        )
         if on_progress is not None:
             on_progress(len(out) / len(methods))
     return out
@@ -588,16 +515,17 @@ def score_participants(test: GazeTest, methods: dict[str, Baseline], prior: Base
     participant.
     """
     rows = []
-    for name, maps, values in _evaluate_methods(test, methods, prior):
+    for method in _evaluate_methods(test, methods, prior):
         for i, person in enumerate(test.participants):
-            is_participant, has_enough = test.sample_participants == i, test.counts[:, i] >= min_rays
+            has_enough = test.counts[:, i] >= min_rays
             scores = dict.fromkeys(MAP_SCORES, float("nan"))
             if has_enough.any():
-                scores = compute_map_scores(test.participant_densities[has_enough, i], maps[has_enough])
-            rays = {
-                k: float(v[is_participant].mean()) if is_participant.any() else float("nan") for k, v in values.items()
-            }
-            rows.append({"method": name, "person": person, "rays": int(test.counts[:, i].sum()), **scores, **rays})
+                scores = compute_map_scores(test.participant_densities[has_enough, i], method.maps[has_enough])
+            at_centre, at_own = (which == i for which in (test.sample_participants, test.own_participants))
+            averages = {k: _average(v[at_centre], None) for k, v in method.rays.items()}
+            averages |= {k: _average(v[at_own], None) for k, v in method.own_rays.items()}
+            row = {"method": method.name, "person": person, "rays": int(test.counts[:, i].sum())}
+            rows.append({**row, **scores, **averages})
     return rows
 
 
@@ -621,9 +549,14 @@ def score_split_half(
     has_both = np.logical_and(*(_has_enough_rays(half, centres, radius, min_rays) for half in halves))
     if not has_both.any():
         return None
-    first = make_test(halves[0], centres[has_both], radius, kappa, min_rays=min_rays)
+    # The prediction is a kernel density of the same concentration, so it is as smooth as the truth.
+    first = replace(make_test(halves[0], centres[has_both], radius, kappa, min_rays=min_rays), kappa=None)
     probes = place_probes(
         halves[1], radius, queries=first.centres, min_rays=1, kappa_rule="fixed", kappa=kappa, centre="query"
+    )
+    # The probes are at the centres of the positions, so nothing is predicted at other origins.
+    first = replace(
+        first, own_origins=np.empty((0, 3)), own_directions=np.empty((0, 1, 3)), own_participants=np.empty(0, int)
     )
     predicted = lambda positions, directions: probes.density(directions)
     row = evaluate_gaze(first, {"split half": predicted}, prior, resamples=0)[0]

@@ -18,7 +18,8 @@ from nerg_mi.files.tables import format_markdown_table, write_csv, write_json
 from nerg_mi.maths.sphere import Z_UP, latlong_grid
 from nerg_mi.probes.probes import REGION_LEVELS, format_level
 
-from .gaze import SCORES, Baseline, GazeTest
+from .baselines import CONDITIONAL_KDE, NEAREST_RAYS, PRIOR, REAIMED_HITS, UNIFORM, Baseline
+from .gaze import SCORES, GazeTest
 from .uncertainty import RETAINED_FRACTIONS
 
 # ---- Reports of an evaluation: tables as Markdown, CSV and JSON, and pictures of reference and prediction ----
@@ -233,7 +234,14 @@ def _check_rows(rows: object, path: str | Path, name: str) -> tuple[dict[str, An
                 else value is None or _is_number(value)
             ):
                 raise _make_error(path, f'"{sanitize(key, 40)}" of a row of its "{name}" is {sanitize(value, 40)}')
-    return tuple({**row, "method": row["method"].replace(_OLD_PRIOR, PRIOR)} for row in rows)
+    return tuple({**row, "method": _rename_method(row["method"])} for row in rows)
+
+
+def _rename_method(name: str) -> str:
+    """Return the present name of a method in a file of any version."""
+    for old, new in _OLD_METHODS.items():
+        name = name.replace(old, new)
+    return name
 
 
 def _is_number(value: object) -> bool:
@@ -273,11 +281,16 @@ MIN_PARTICIPANTS, MIN_POSITIONS = 5, 10  # Minimum sizes for a verdict
 
 VERDICT_SCORES = {"bits": 1, "CC": 1, "KLD": -1}  # Scores of the verdict; 1: higher is better, -1: lower is better
 
-UNIFORM, PRIOR, NEAREST_RAYS, SPLIT_HALF = "uniform", "position-independent prior", "4,096 nearest rays", "split half"
-"""Names of the methods that a field is compared with."""
+SPLIT_HALF = "split half"  # The other half of the participants, a reference and no baseline
 
-_BASELINE_NAMES = {UNIFORM: "the uniform density", PRIOR: f"the {PRIOR}", NEAREST_RAYS: "the nearest rays"}
-_OLD_PRIOR = "position-blind"  # In files of earlier versions
+_BASELINE_NAMES = {
+    UNIFORM: "the uniform density",
+    PRIOR: f"the {PRIOR}",
+    NEAREST_RAYS: "the nearest rays",
+    CONDITIONAL_KDE: f"the {CONDITIONAL_KDE}",
+    REAIMED_HITS: f"the {REAIMED_HITS}",
+}
+_OLD_METHODS = {"position-blind": PRIOR, "4,096 nearest rays": NEAREST_RAYS}  # In files of earlier versions
 
 SPLIT_LABELS = {
     "both": "held-out participants at held-out positions",

@@ -58,6 +58,7 @@ def score_positions(
         (``prior``), the split-half KLD (``half``) and the ``excess`` over it if there is enough data, ``support`` and
         ``spread``.
     """
+    maps, prior = test.smooth(maps), test.smooth(prior)
     error, prior_error = (metrics.kld(test.truth, m, eps=EPS) for m in (maps, prior))
     half = compute_split_half_errors(test, prior, seed)
     rows = []

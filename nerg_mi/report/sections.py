@@ -12,7 +12,8 @@ from importlib.resources import files
 from typing import Any
 
 from nerg_mi import __version__
-from nerg_mi.evaluation.gaze_report import PRIOR, SPLIT_HALF, SPLIT_LABELS, Comparison, GazeResults, Verdict
+from nerg_mi.evaluation.baselines import PRIOR
+from nerg_mi.evaluation.gaze_report import SPLIT_HALF, SPLIT_LABELS, Comparison, GazeResults, Verdict
 from nerg_mi.rays.quality import WARNING_LABEL, make_quality_report
 
 from .data import MeanShare, ObjectAttention, Run

@@ -19,7 +19,8 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation import ablation
 from nerg_mi.evaluation.ablation import Variant, make_frame_timer
-from nerg_mi.evaluation.gaze import Baseline, FieldDensity, GazeTest, select_held_out_rays
+from nerg_mi.evaluation.baselines import Baseline
+from nerg_mi.evaluation.gaze import FieldDensity, GazeTest, select_held_out_rays
 from nerg_mi.figures.style import existing_files, make_provenance
 from nerg_mi.files.atomic import check_folder, replace_atomically
 from nerg_mi.files.safe_read import read_json

@@ -12,16 +12,16 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation import gaze as evaluation
-from nerg_mi.evaluation.gaze import (
-    EPS,
-    SCORES,
-    SPLITS,
+from nerg_mi.evaluation.baselines import (
+    CONDITIONAL_KDE,
+    NEAREST_RAYS,
+    REAIMED_HITS,
     Baseline,
-    CachedBaseline,
-    FieldDensity,
-    format_score_table,
-    make_standard_baselines,
+    format_settings,
+    make_tuned_baselines,
 )
+from nerg_mi.evaluation.baselines import PRIOR as PRIOR_BASELINE
+from nerg_mi.evaluation.gaze import EPS, SCORES, SPLITS, CachedBaseline, FieldDensity, format_score_table
 from nerg_mi.evaluation.gaze_report import draw_comparison, format_table, format_uncertainty, write_report
 from nerg_mi.evaluation.uncertainty import (
     average_folds,
@@ -41,6 +41,7 @@ from nerg_mi.rays.dataset import hash_rays, is_dataset, load_rays
 from nerg_mi.rays.rays import Rays
 from nerg_mi.tasks.task import FOLDER_SUFFIX, RENDER_LIBRARIES, Part, Plan
 from nerg_mi.threads import set_thread_count
+from nerg_mi.train.gaze_data import find_hit_points
 from nerg_mi.train.geometry import TrainingGeometry
 
 from .base import SILENT, Reporter, select_backend
@@ -55,12 +56,14 @@ from .train_gaze import PRIOR, train_gaze
 # Evaluation of a gaze field at held-out positions and of held-out participants, compared with baselines.
 
 
-# Methods that are scored for each participant, and those that are drawn.
-_BY_PERSON = ("gaze field", "4,096 nearest rays")
-_DRAWN = ("gaze field", "position-independent prior", "16 nearest probes", "4,096 nearest rays")
-# Methods whose highest-density regions are calibrated.
-_PRIOR = "position-independent prior"
-_CALIBRATED = ("gaze field", _PRIOR, "4,096 nearest rays")
+_FIELD = "gaze field"  # Name of the method that is compared with the baselines
+# Methods that are scored for each participant, those that are drawn, and those whose highest-density regions are
+# calibrated; re-aimed hits only with surfaces.
+_BY_PERSON = (_FIELD, NEAREST_RAYS, REAIMED_HITS)
+_DRAWN = (_FIELD, PRIOR_BASELINE, NEAREST_RAYS, CONDITIONAL_KDE, REAIMED_HITS)
+_CALIBRATED = (_FIELD, PRIOR_BASELINE, NEAREST_RAYS)
+# Scores in the terminal; the files have all of them.
+_PRINTED = tuple(score for score in SCORES if score not in ("SIM", "MAE", "loglik"))
 
 
 @dataclass(frozen=True)
@@ -95,8 +98,8 @@ def evaluate_gaze(
 ) -> GazeEvaluation:
     """Score the gaze field in the checkpoint ``gaze`` and compare it with baselines.
 
-    The baselines are a uniform density, the position-independent prior, the nearest probes, the nearest rays, and the
-    other half of the participants.
+    The baselines are a uniform density, the position-independent prior, the nearest rays, a conditional kernel density,
+    with surfaces the re-aimed hits, and the other half of the participants (`nerg_mi.evaluation.baselines`).
 
     Parameters
     ----------
@@ -135,7 +138,16 @@ def evaluate_gaze(
     option = f"--{place.kind} {options.field or options.scene or 'FILE'}"
     # A field that was trained with --force is scored, with a warning.
     check_geometry(place, scored, option, True, reporter)
-    prior, baselines = make_standard_baselines(train, account["radius"], options.kappa, options.prior_kappa, seed)
+    reporter.progress(0.02, "baselines")
+    baselines = make_tuned_baselines(
+        train,
+        account["radius"],
+        find_hit_points(train, place),
+        participants=split != "pos",
+        positions=split != "people",
+        prior_kappa=options.prior_kappa,
+        seed=seed,
+    )
     depth, count = training.get("probes", {}).get("depth", "median"), len(test.centres)
     # Most of the time is spent on evaluating the field.
     report_position = lambda number: reporter.progress(
@@ -144,27 +156,26 @@ def evaluate_gaze(
     # All tables use the same densities.
     members = CachedBaseline(FieldDensity(loaded, place.medium, place.align, depth, report_position).members)
     field_density = lambda positions, directions: members(positions, directions).mean(axis=0)
-    cached_prior = CachedBaseline(prior)
-    methods = {"gaze field": field_density} | {
-        k: cached_prior if m is prior else CachedBaseline(m) for k, m in baselines.items()
-    }
+    methods = {_FIELD: field_density, **{name: CachedBaseline(b.density) for name, b in baselines.items()}}
+    prior = methods[PRIOR_BASELINE]
     reporter.progress(0.05, "scores")
     report_share = lambda share: reporter.progress(0.65 + 0.2 * share, "scores") if share > 0 else None
-    rows = evaluation.evaluate_gaze(test, methods, cached_prior, options.resamples, seed, report_share)
+    rows = evaluation.evaluate_gaze(test, methods, prior, options.resamples, seed, report_share)
     half = evaluation.score_split_half(
         scored, test.centres, account["radius"], options.kappa, prior, options.min_rays, seed
     )
     rows += [half] if half else []
     reporter.progress(0.86, "participants")
-    persons = evaluation.score_participants(test, {k: methods[k] for k in _BY_PERSON}, cached_prior, options.min_rays)
+    select = lambda names: {name: methods[name] for name in names if name in methods}
+    persons = evaluation.score_participants(test, select(_BY_PERSON), prior, options.min_rays)
     reporter.progress(0.9, "uncertainty")
-    places = _positions(test, loaded, place, members, methods[_PRIOR], _groups(account, split, test.centres), seed)
+    places = _positions(test, loaded, place, members, prior, _groups(account, split, test.centres), seed)
     ranks = correlate_uncertainty(places, options.resamples, seed)
     at = lambda method: method(test.centres, test.query_directions)[:, : test.sample_directions.shape[1]]
-    calibrated = {k: (methods[k](test.centres, test.directions), at(methods[k])) for k in _CALIBRATED}
+    calibrated = {k: (m(test.centres, test.directions), at(m)) for k, m in select(_CALIBRATED).items()}
     stored_regions = training.get("mix", {}).get("regions")
     regions = measure_calibration(
-        test, calibrated, options.resamples, seed, {"gaze field": stored_regions} if stored_regions else None
+        test, calibrated, options.resamples, seed, {_FIELD: stored_regions} if stored_regions else None
     )
     files = []
     if output is not None:
@@ -178,13 +189,14 @@ def evaluate_gaze(
             "resamples": options.resamples,
         }
         notes = _notes(gaze.name, split, test, (len(train), len(data)), account["radius"], options)
+        notes += f" {format_settings(baselines)}"
         files = write_report(output, rows, persons, summary, notes, places, ranks, regions)
         if options.pictures:
             reporter.progress(0.95, "pictures")
             files.append(output / "positions.png")
             sources = existing_files(gaze, rays, options.field, options.scene)
             record = make_provenance("nerg eval gaze", sources, seed, options)
-            draw_comparison(test, {k: methods[k] for k in _DRAWN}, files[-1], options.pictures, provenance=record)
+            draw_comparison(test, select(_DRAWN), files[-1], options.pictures, provenance=record)
     return GazeEvaluation(
         rows, persons, split, len(test.centres), len(test.participants), files, places, ranks, regions
     )
@@ -195,7 +207,7 @@ def print_evaluation(
 ) -> None:
     """Call `evaluate_gaze`, and print the scores as a table."""
     result = evaluate_gaze(gaze, rays, output or gaze.with_suffix(".eval"), options, reporter)
-    rows = [{k: row[k] for k in ("method", *evaluation.SCORES, "integral")} for row in result.rows]
+    rows = [{k: row[k] for k in ("method", *_PRINTED, "integral")} for row in result.rows]
     title = f"{gaze.name}, {result.split}: {result.positions} positions, {result.people} participants"
     reporter.message(evaluation.format_score_table(rows, title))
     for path in result.files:
@@ -269,8 +281,9 @@ def _notes(
         f"# {name}: {split}\n\n{len(test.centres)} positions, {len(test.participants)} participants; {trained:,} of "
         f"{total:,} rays used for training. Reference: rays within {radius:g} m, kappa {options.kappa:g}, "
         f"{options.directions} directions of equal area; KLD in nats with {EPS:g} of the uniform density added; "
-        "MAE in 1/sr; AUC against all directions, sAUC against rays of other positions; bits per ray above the "
-        f"position-independent prior with kappa {options.prior_kappa:g}; loglik in nats of 1/sr. Brackets: ± 1.96 "
+        "MAE in 1/sr; densities are smoothed with the kernel of the reference before these; AUC against all "
+        "directions, sAUC against rays of other positions; bits per ray above the position-independent prior, at the "
+        "centres of the positions and at the origin of each ray; loglik in nats of 1/sr. Brackets: ± 1.96 "
         f"standard errors from {options.resamples} resamples of the participants. Split half: one half of the "
         "participants predicts the other, where both have enough rays; a reference, not a bound."
     )
@@ -372,7 +385,9 @@ def print_folds(rays: Path, output: Path, options: FoldOptions, reporter: Report
     """Call `evaluate_folds`, and print the means as a table for each split."""
     result = evaluate_folds(rays, output, options, reporter)
     for split in options.splits.split(","):
-        rows = [{k: row.get(k, math.nan) for k in ("method", *SCORES)} for row in result.rows if row["split"] == split]
+        rows = [
+            {k: row.get(k, math.nan) for k in ("method", *_PRINTED)} for row in result.rows if row["split"] == split
+        ]
         reporter.message(format_score_table(rows, f"{split}: means of {options.folds} folds"))
 
 

@@ -250,10 +250,10 @@ class GazeEvaluationOptions(ValidatedDataclass):
         within=KAPPAS,
         group=TEST,
     )
-    prior_kappa: float = option(
-        50.0,
+    prior_kappa: float | None = option(
+        None,
         "Concentration (unitless) of the kernels of the position-independent prior, against which information gain is "
-        "measured in bits.",
+        "measured in bits. Default: tuned on folds of the training rays.",
         within=KAPPAS,
         group=TEST,
     )
@@ -324,8 +324,8 @@ class FoldOptions(DerivedOptions, HeldOutOptions, GeometryOptions, PartOptions):
 declare(
     "eval gaze",
     "nerg_mi.workflows.evaluate:print_evaluation",
-    "Score a gaze field on held-out data and compare it with baselines: uniform, position-independent, nearest probes, "
-    "nearest rays, and the other half of the participants.",
+    "Score a gaze field on held-out data and compare it with baselines: uniform, position-independent, nearest "
+    "rays, conditional kernel density, re-aimed hits, and the other half of the participants.",
     options=GazeEvaluationOptions,
     gaze=argument("Gaze field that was trained with --test-zones (.safetensors)."),
     rays=argument("Rays file or dataset that it was trained on."),

@@ -85,7 +85,7 @@ def test_the_loss_is_the_papers():
 
     rng = np.random.default_rng(0)
     truth, result = rng.random((2, 3, 50)) / 8
-    test = SimpleNamespace(truth=truth, centres=None, directions=None)
+    test = SimpleNamespace(truth=truth, centres=None, directions=None, smooth=lambda maps: maps)
     row = score_density({"test": test}, lambda centres, directions: result)
     assert row["test_loss"] == pytest.approx(row["test_KLD"] + 1 - row["test_CC"] + row["test_MAE"])
     assert row["test_MAE"] == pytest.approx(np.abs(truth - result).mean()) and row["test_KLD"] > 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import drjit.llvm.ad as ns
 import numpy as np
@@ -10,10 +11,11 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation import gaze, metrics
-from nerg_mi.evaluation.gaze import FieldDensity, compute_map_scores, make_prior_baseline, make_uniform_baseline
-from nerg_mi.maths import vmf
+from nerg_mi.evaluation.baselines import make_prior_baseline, make_uniform_baseline
+from nerg_mi.evaluation.gaze import FieldDensity, compute_map_scores
 from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.probes.kde import SphericalKde
 from nerg_mi.probes.probes import place_probes
 from nerg_mi.rays.rays import Rays
 from nerg_mi.train.gaze_data import hold_out
@@ -21,83 +23,13 @@ from nerg_mi.train.geometry import load_field_geometry, load_scene_geometry
 from tests.evaluation.gaze_fields import KINDS, made, saved
 from tests.plugins import fields
 from tests.plugins.scenes import camera, channels
-from tests.reference.kde import kde as reference
 
-# ---- Baselines ----
-
-X = fibonacci_directions(1024)
-
-
-@pytest.fixture(scope="module")
-def rays_baselines():
-    """Participants who look at one object in the middle of the room."""
-    rng = np.random.default_rng(1)
-    origin = rng.uniform([0, 0, 1.5], [4, 4, 1.6], (9000, 3))
-    to = np.array([2.0, 2.0, 1.0]) - origin
-    mu = to / np.linalg.norm(to, axis=1, keepdims=True)
-    n = len(mu)
-    return Rays(np.arange(n) * 1.0, np.zeros(n), ("a",), origin, vmf.sample(mu, 40.0, rng), np.ones(n))
-
-
-def test_prior_is_the_kde_of_all(rays_baselines):
-    density = gaze.make_prior_baseline(rays_baselines, kappa=30.0, backend="llvm")(np.zeros((3, 3)), X)
-    want = reference(X, rays_baselines.direction, [0, len(rays_baselines)], [30.0])
-    assert density.shape == (3, 1024) and np.allclose(density, want, rtol=2e-4)
-    individual = gaze.make_prior_baseline(rays_baselines, kappa=30.0, backend="llvm")(
-        np.zeros((2, 3)), np.stack([X, X[::-1]])
-    )
-    assert np.allclose(individual[0], individual[1, ::-1], rtol=1e-5)
-
-
-def test_nearest_probes(rays_baselines):
-    probes = place_probes(rays_baselines, 0.4, count=50, kappa_rule="fixed", kappa=20.0)
-    density = probes.density(X, "llvm")
-    one = gaze.make_nearest_probes_baseline(probes, 1, backend="llvm")(probes.positions[:5], X)
-    assert np.allclose(one, density[:5], rtol=1e-5)
-    at = np.array([[1.0, 1.0, 1.55]])
-    near = np.argsort(np.linalg.norm(probes.positions - at, axis=1))[:4]
-    four = gaze.make_nearest_probes_baseline(probes, 4, backend="llvm")
-    assert np.allclose(four(at, X)[0], density[near].mean(axis=0), rtol=1e-5)
-    assert np.allclose(four(at, X[None])[0], four(at, X)[0], rtol=1e-5)
-    # Both averages are in float64, because float32 would lose precision.
-    assert four(at, X).dtype == four(at, X[None]).dtype == np.float64
-
-
-def test_nearest_rays(rays_baselines):
-    at = np.array([[1.0, 1.0, 1.55], [3.0, 2.0, 1.55]])
-    density = gaze.make_nearest_rays_baseline(rays_baselines, 300, kappa=20.0, backend="llvm")(at, X)
-    near = np.argsort(np.linalg.norm(rays_baselines.origin - at[1], axis=1))[:300]
-    assert np.allclose(density[1], reference(X, rays_baselines.direction[near], [0, 300], [20.0])[0], rtol=2e-4)
-
-
-@pytest.mark.parametrize("weights", ["distance", "person"])
-def test_probes_keep_their_weights(rays_baselines, weights):
-    """The ray weights of a probe are part of its density, for one probe and for several."""
-    one = lambda w: np.concatenate([np.zeros(8000), np.arange(1, 1001) % 7]).astype(int) if w else np.zeros(9000, int)
-    people = Rays(
-        rays_baselines.t, one(True), tuple("abcdefg"), rays_baselines.origin, rays_baselines.direction, np.ones(9000)
-    )
-    probes = place_probes(people, 0.4, count=50, kappa_rule="fixed", kappa=20.0, weights=weights)
-    assert probes.weights is not None and np.ptp(probes.weights) > 0
-    density = probes.density(X, "llvm")
-    plain = place_probes(people, 0.4, count=50, kappa_rule="fixed", kappa=20.0).density(X, "llvm")
-    assert np.abs(density - plain).max() > 0.02
-    at = probes.positions[:4]
-    assert np.allclose(
-        gaze.make_nearest_probes_baseline(probes, 1, backend="llvm")(at, X), density[:4], rtol=1e-4, atol=1e-5
-    )
-    near = np.argsort(np.linalg.norm(probes.positions - at[0], axis=1))[:3]
-    assert np.allclose(
-        gaze.make_nearest_probes_baseline(probes, 3, backend="llvm")(at[:1], X)[0],
-        density[near].mean(axis=0),
-        rtol=1e-4,
-        atol=1e-5,
-    )
+# ---- Cache ----
 
 
 def test_cached_baseline_evaluates_equal_arrays_once():
     calls = []
-    method = gaze.CachedBaseline(lambda *options: calls.append(1) or gaze.make_uniform_baseline()(*options))
+    method = gaze.CachedBaseline(lambda *options: calls.append(1) or make_uniform_baseline()(*options))
     positions, directions = np.zeros((2, 3)), fibonacci_directions(8)
     first = method(positions, directions)
     assert method(positions, directions) is first and len(calls) == 1
@@ -158,6 +90,7 @@ def test_truth_is_the_probes(rays_evaluation, test_set):
 
 
 def test_scores_of_the_truth_and_of_the_uniform_density(test_set):
+    test_set = replace(test_set, kappa=None)
     rows = gaze.evaluate_gaze(
         test_set,
         {
@@ -211,7 +144,8 @@ def by_hand(persons: int) -> gaze.GazeTest:
     parts = 16 / (4 * np.pi) * np.eye(16)[None, :persons]
     who = np.arange(4 * persons)[None] % persons
     at, counts, names = np.zeros((1, 4 * persons, 3)), np.full((1, persons), 4.0), tuple("abcdefgh"[:persons])
-    return gaze.GazeTest(np.zeros((1, 3)), d, parts.mean(axis=1), parts, counts, names, at, who, at)
+    rays = np.zeros((4 * persons, 3)), np.zeros((4 * persons, 1, 3)), who[0]
+    return gaze.GazeTest(np.zeros((1, 3)), d, parts.mean(axis=1), parts, counts, names, at, who, at, *rays)
 
 
 def test_intervals_are_a_bootstrap_over_persons():
@@ -241,6 +175,38 @@ def test_fewer_than_three_persons_have_no_interval(persons, has_interval):
         resamples=5,
     ):
         assert all((f"{k}.low" in row) == has_interval and (f"{k}.high" in row) == has_interval for k in gaze.SCORES)
+
+
+def test_maps_are_smoothed_with_the_kernel_of_the_truth(test_set, rays_evaluation):
+    """A sharp density of the rays themselves resembles the truth only after the smoothing."""
+    near = [np.linalg.norm(rays_evaluation.origin - c, axis=1) <= 0.6 for c in test_set.centres]
+    offsets = np.cumsum([0, *map(np.count_nonzero, near)])
+    directions = np.concatenate([rays_evaluation.direction[n] for n in near])
+    sharp = SphericalKde(directions, offsets, 400.0).evaluate(test_set.directions)
+    error = lambda maps: compute_map_scores(test_set.truth, maps)["KLD"]
+    assert error(test_set.smooth(sharp)) < 0.03 < 0.1 < error(sharp)
+    assert replace(test_set, kappa=None).smooth(sharp) is sharp
+    flat = np.full((1, len(test_set.directions)), 1 / (4 * np.pi))
+    np.testing.assert_allclose(test_set.smooth(flat), flat, rtol=1e-12)
+
+
+def test_rays_are_also_scored_at_their_own_origins(test_set, rays_evaluation):
+    """A density of the hit points seen from an observer is sharper there than at the centre of a position."""
+    assert 0 < len(test_set.own_origins) <= len(rays_evaluation)
+    away = np.linalg.norm(test_set.own_origins[:, None] - test_set.centres[None], axis=2).min(axis=1)
+    assert away.max() <= 0.6 and away.min() > 0
+
+    def towards_the_wall(positions, directions):
+        """One where a ray meets the square below the middle of the wall, as seen from the position."""
+        hit = positions[:, None] + directions * ((1.5 - positions[:, :1]) / directions[..., 0])[..., None]
+        return np.where(np.abs(hit[..., 1]) < 0.25, 2.0, 1e-3)
+
+    (row,) = gaze.evaluate_gaze(test_set, {"wall": towards_the_wall}, make_uniform_baseline(), resamples=20)
+    assert row["bits at own origin"] > 0 and "bits at own origin.low" in row
+    rows = gaze.score_participants(test_set, {"wall": towards_the_wall}, make_uniform_baseline())
+    counts = np.bincount(test_set.own_participants)
+    mean = np.average([r["bits at own origin"] for r in rows], weights=counts)
+    assert mean == pytest.approx(row["bits at own origin"])
 
 
 def test_ray_scores_by_hand():
