@@ -74,6 +74,34 @@ LEARNING_RATES = Range(0, 1)
 WEIGHT_DECAYS = Range(0, 1000)
 
 
+def parse_kappa(value: str, name: str) -> float:
+    """Return the concentration of a kernel from text: a number, or a standard deviation in degrees such as "4deg".
+
+    For the von Mises-Fisher kernel of concentration kappa, the standard deviation along each axis is 1 / sqrt(kappa)
+    radians, to 3 % for less than 20 degrees.
+
+    Parameters
+    ----------
+    value
+        The text.
+    name
+        Name of the value in the error message.
+
+    Raises
+    ------
+    NergError
+        If the text is neither, or the angle is not positive.
+    """
+    number, is_angle = value.strip().removesuffix("deg"), value.strip().endswith("deg")
+    try:
+        kappa = float(number)
+        return math.degrees(1.0 / kappa) * math.degrees(1.0 / kappa) if is_angle else kappa
+    except (ValueError, ZeroDivisionError):
+        raise NergError(
+            f'{name} must be a number, or a standard deviation in degrees such as "4deg", got {sanitize(value, 60)}'
+        ) from None
+
+
 def check_number(value: Any, allowed: Range, name: str, is_integer: bool = False) -> None:
     """Raise `NergError` unless ``value`` is a number in the range ``allowed``.
 
@@ -124,7 +152,7 @@ class ValidatedDataclass:
     """Base class of dataclasses that validate their numbers on construction.
 
     A field with a `Range` in its metadata holds one number or several numbers in that range, or None if its type allows
-    None. Other values raise `NergError`.
+    None. Other values raise `NergError`. A concentration (`KAPPAS`) may be text with an angle (`parse_kappa`).
     """
 
     def __post_init__(self) -> None:
@@ -132,6 +160,9 @@ class ValidatedDataclass:
         for field in dataclasses.fields(self):
             allowed, annotation = field.metadata.get(RANGE), str(field.type)
             value: Any = getattr(self, field.name)
+            if allowed is KAPPAS and isinstance(value, str):
+                value = parse_kappa(value, _describe_field(field))
+                object.__setattr__(self, field.name, value)
             if allowed is None or (value is None and "None" in annotation):
                 continue
             numbers = (value,)

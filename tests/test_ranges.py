@@ -24,13 +24,25 @@ from nerg_mi.errors import NergError
 from nerg_mi.evaluation.ablation import make_frame_timer
 from nerg_mi.evaluation.metrics import FieldRenderer
 from nerg_mi.formats.surfaces import write_volume
+from nerg_mi.maths import vmf
 from nerg_mi.photos.cameras import Intrinsics, PosedCamera
-from nerg_mi.ranges import FLAG, MAX_COORDINATE, RANGE, Range, ValidatedDataclass, check_number, range_field
+from nerg_mi.ranges import (
+    FLAG,
+    KAPPAS,
+    MAX_COORDINATE,
+    RANGE,
+    Range,
+    ValidatedDataclass,
+    check_number,
+    parse_kappa,
+    range_field,
+)
 from nerg_mi.rays.readers.registry import collect_shared_options
 from nerg_mi.train import gaze_settings, radiance_settings
 from nerg_mi.train.geometry import load_scene_geometry, load_volume_geometry
 from nerg_mi.workflows import rays
 from nerg_mi.workflows.base import Command
+from nerg_mi.workflows.gaze_commands import GazeEvaluationOptions
 from nerg_mi.workflows.scene_commands import KINDS as FIGURES
 from tools.command_pages import iter_commands
 
@@ -106,7 +118,9 @@ def test_numbers_are_refused_outside_their_range(kind):
             number = type(value) is int or (type(value) is float and not is_integer)
             none = value is None and "None" in str(field.type) and "tuple" not in str(field.type)
             said = _fault(kind, field, value)
-            assert (said is None) == (none or (number and within.low <= value <= within.high)), (field.name, value)
+            # A concentration may be text, because it may be an angle.
+            text = within is KAPPAS and value == "1"
+            assert (said is None) == (none or text or (number and within.low <= value <= within.high)), field.name
             name = field.metadata.get(FLAG) or field.name.replace("_", "-" if FLAG in field.metadata else "_")
             assert said is None or (name in said and len(said) < 200)
 
@@ -135,6 +149,20 @@ def test_help_shows_ranges():
     numbers = [p for p in options if p.type_descriptor.annotation in (int, float) and p.name not in of_readers]
     limits = {(p.name, (i := p.type_descriptor.parameter_info).min, i.max) for p in numbers}
     assert len(limits) > 80 and [limit for limit in limits if None in limit] == []
+
+
+def test_a_concentration_may_be_an_angle():
+    assert parse_kappa("200", "--kappa") == 200
+    # The standard deviation of a kernel of concentration 200, measured.
+    mu = np.tile([0.0, 0.0, 1.0], (20_000, 1))
+    spread = np.degrees(vmf.sample(mu, 200.0, np.random.default_rng(0))[:, :2].std())
+    assert parse_kappa(f"{spread:.3f}deg", "--kappa") == pytest.approx(200, rel=0.03)
+    assert GazeEvaluationOptions(kappa="4deg").kappa == pytest.approx(205.2, abs=0.1)
+    for wrong in ("4 degrees", "0deg", "", "deg"):
+        with pytest.raises(NergError, match="--kappa.*4deg"):
+            GazeEvaluationOptions(kappa=wrong)
+    with pytest.raises(NergError, match="--kappa"):
+        GazeEvaluationOptions(kappa="-1")
 
 
 def test_each_of_several_numbers_is_checked():

@@ -19,7 +19,7 @@ import typer
 import typer.core
 
 from nerg_mi import __version__
-from nerg_mi.ranges import RANGE
+from nerg_mi.ranges import KAPPAS, RANGE
 from nerg_mi.workflows.base import COMMANDS, Command, Parameter
 from nerg_mi.workflows.old_names import find_spelling
 from nerg_mi.workflows.options import GROUPS as GROUPS_OF_OPTIONS
@@ -252,7 +252,11 @@ def _option(field: Field, hint: Any) -> inspect.Parameter:
     """Return the parameter from which typer makes the option of ``field``."""
     metadata, default, names = field.metadata, field.default, field.metadata["names"]
     more, within, is_parsed = metadata["more"], metadata[RANGE], metadata["parse"] is not None
-    if is_parsed:
+    if within is KAPPAS and not is_parsed:
+        # The dataclass converts an angle and checks the range.
+        hint, default = str | None, None if default is None else f"{default:g}"
+        more, is_parsed = more | {"metavar": "<number or angle>"}, True
+    elif is_parsed:
         hint = list[str] | None if any(get_origin(kind) is Mapping for kind in get_args(hint)) else str | None
     elif get_origin(hint) is tuple:
         hint, default = list[get_args(hint)[0]] | None, None

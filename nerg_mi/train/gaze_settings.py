@@ -55,8 +55,8 @@ class ProbeSettings(ValidatedDataclass):
     )
     kappa: float = setting(
         50.0,
-        "Concentration of the von Mises-Fisher kernel (unitless), for --kappa-rule fixed; its standard deviation is "
-        "57.3 / sqrt(kappa) degrees.",
+        "Concentration of the von Mises-Fisher kernel (unitless), or its standard deviation such as 4deg, for "
+        "--kappa-rule fixed.",
         allowed=KAPPAS,
     )
     # Directions of equal area, randomly rotated and fixed, so that depths are traced once.
@@ -76,8 +76,9 @@ class ProbeSettings(ValidatedDataclass):
     )
     mix_kappa: float | None = setting(
         None,
-        "Only for the recipe named default: concentration (unitless) of the kernels of the position-independent "
-        "prior. Default: chosen by the cross-validation of --prior-folds, or 30 without it.",
+        "Only for the recipe named default: concentration (unitless), or standard deviation such as 10deg, of the "
+        "kernels of the position-independent prior. Default: chosen by leaving out participants, or 30 without "
+        "--prior-folds.",
         allowed=KAPPAS,
         option="prior_kappa",
     )

@@ -246,14 +246,15 @@ class GazeEvaluationOptions(ValidatedDataclass):
     )
     kappa: float = option(
         20.0,
-        "Concentration (unitless) of the von Mises-Fisher kernels that turn test rays into reference densities.",
+        "Concentration (unitless), or standard deviation such as 13deg, of the von Mises-Fisher kernels that turn test "
+        "rays into reference densities.",
         within=KAPPAS,
         group=TEST,
     )
     prior_kappa: float | None = option(
         None,
-        "Concentration (unitless) of the kernels of the position-independent prior, against which information gain is "
-        "measured in bits. Default: tuned on folds of the training rays.",
+        "Concentration (unitless), or standard deviation such as 10deg, of the kernels of the position-independent "
+        "prior, against which information gain is measured in bits. Default: chosen by leaving out participants.",
         within=KAPPAS,
         group=TEST,
     )
