@@ -147,7 +147,8 @@ class StatisticsOptions(CountOptions, PredictionOptions, PartOptions):
     viewpoints: int = option(
         256,
         "Approximate number of viewpoints from which the gaze field is evaluated: recorded positions, or positions on "
-        "the floor if there are no recordings. Each participant has at least one, up to this number of participants.",
+        "the floor if there are no recordings. Each participant gets at least one. If there are more participants than "
+        "this number, the prediction uses that many of them.",
         within=Range(1, 100_000),
         group=ANALYSIS,
     )

@@ -124,14 +124,16 @@ def point_features(outputs: list[Float], deferred: bool) -> list[Float]:
 
 
 def mean_features(sums: list[Float], opacity: Float) -> list[Float]:
-    """Mean features Σ w g / α of rays with opacity α and composited ``sums`` Σ w g; 0 without absorption."""
+    """Mean features Σ w g / α of rays, from their composited features ``sums`` Σ w g and their ``opacity`` α; 0 for
+    rays of opacity 0."""
     # The derivative contains the square, which must stay finite.
     per = 1 / dr.maximum(opacity, 1e-12)
     return [s * per for s in sums]
 
 
 def color_network_inputs(features: list[Float], deferred: bool) -> list[Float]:
-    """Inputs of the colour net for ``features``, behind the direction."""
+    """Inputs of the colour net behind the encoded direction, from ``features`` (`point_features`, or `mean_features` of
+    rays if ``deferred``). For a ``deferred`` field, the diffuse colour is replaced by its logits."""
     if not deferred:
         return features
     # Not clipped: clipping would have no gradient at black and white.
@@ -140,7 +142,24 @@ def color_network_inputs(features: list[Float], deferred: bool) -> list[Float]:
 
 
 def decode_color(outputs: list[Float], inputs: list[Float], deferred: bool) -> list[Float]:
-    """Colour (3 Floats in 0..1) from the colour net's ``outputs`` and its ``inputs`` (`color_network_inputs`)."""
+    """Colour of points or, for a deferred field, of rays.
+
+    Parameters
+    ----------
+    outputs
+        The 3 outputs of the colour net, before the sigmoid.
+    inputs
+        Inputs of the colour net behind the direction, as `color_network_inputs` returns them. Only used if
+        ``deferred``: the first three are the logits of the diffuse colour, to which the outputs are added.
+    deferred
+        Whether the field is deferred (`RadianceConfig.deferred`).
+
+    Returns
+    -------
+    list of Float
+        Red, green and blue in 0..1, in the colour space of the training: sRGB or linear, as the field's ``color_space``
+        states.
+    """
     return [sigmoid(c + x) for c, x in zip(outputs, inputs)] if deferred else [sigmoid(c) for c in outputs]
 
 

@@ -462,11 +462,16 @@ class Overlay:
         return self.display.kind in ("heat", "diverging")
 
     def limits(self, layers: OverlayLayers) -> Limits:
-        """Return the ends of the scale of one image; None if it shows no values, or needs no scale."""
+        """Return the lower and upper end of the colour scale of the image ``layers``, from its values on surfaces.
+
+        None if the scale does not depend on the values (fixed ends, or categories), or if a heat map has no value above
+        0.
+        """
         return self.limits_of(layers.values, layers.mask)
 
     def limits_of(self, values, mask) -> Limits:
-        """Return the ends of the scale for ``values`` (h, w) in ``mask`` (h, w)."""
+        """Return the ends of the colour scale for ``values`` (h, w) at the pixels in ``mask`` (h, w); None as for
+        `limits`."""
         if not self.needs_limits:
             return None
         values, mask = np.nan_to_num(values), np.asarray(mask, bool)

@@ -222,7 +222,11 @@ _METADATA_KEYS = {"Software": "artist", "Comment": "comment", "Title": "title"}
 
 
 def check_video_output(fps: float) -> None:
-    """Raise `NergError` for an invalid frame rate, and `ImportError` if PyAV is missing. Call this before long work."""
+    """Check before long work that a video can be written.
+
+    Raises `NergError` if ``fps``, in frames per second, is not above 0 and at most 1000, and `ImportError` if PyAV is
+    missing.
+    """
     _import_pyav()
     if not (np.isfinite(fps) and 0 < fps <= _MAX_FPS):
         raise NergError(f"a video has at most {_MAX_FPS:.0f} frames per second, got {fps}; use for example --fps 25")

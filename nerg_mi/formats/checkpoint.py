@@ -79,8 +79,8 @@ def _check_header(path: Path) -> None:
                 f'"{path}" is not a checkpoint of a field; specify a .safetensors file that "nerg train" has written'
             )
         raise NergError(
-            f'"{path}" is not a readable safetensors file: its header claims {header:,} bytes but the file has '
-            f"{size:,}; copy it again, or create it again"
+            f'"{path}" is not a readable safetensors file: it states that its header has {header:,} bytes, but the '
+            f"whole file has {size:,} bytes; copy it again, or create it again"
         )
     if header > MAX_HEADER_BYTES:
         raise NergError(f'the header of "{path}" has {header:,} bytes; the limit is {MAX_HEADER_BYTES:,}')
@@ -106,8 +106,8 @@ def _parse_metadata(file: Any, path: Path, kind: str | None = None) -> dict:
         )
     if metadata.get("format") != FORMAT:
         raise NergError(
-            f'"{path}" has checkpoint format {sanitize(metadata.get("format"), 40)}, but this version reads '
-            f"format {FORMAT}: use a newer nerg_mi, or train the field again"
+            f'"{path}" has checkpoint format {sanitize(metadata.get("format"), 40)}, but this version of nerg_mi reads '
+            f"format {FORMAT}: use a newer nerg_mi if the format of the file is higher; else train the field again"
         )
     if not isinstance(metadata.get("provenance", {}), dict):
         raise NergError(f'the metadata of "{path}" is damaged: "provenance" must be a JSON object; copy it again')

@@ -336,8 +336,8 @@ def _read_lens(data: dict) -> dict:
         raise NergError("its intrinsics are not finite")
     if not fisheye and model != "FULL_OPENCV" and any(lens.get(k) for k in ("k4", "k5", "k6")):
         raise NergError(
-            'its k4, k5, k6 have different meanings in different programs; set "camera_model": "FULL_OPENCV" if '
-            "they belong to OpenCV's rational model, or undistort the images"
+            "its k4, k5, k6 have different meanings in different programs; in the transforms file, set "
+            '"camera_model": "FULL_OPENCV" if they belong to OpenCV\'s rational model, or undistort the images'
         )
     return {**lens, "fisheye": 1.0} if fisheye else lens
 

@@ -174,7 +174,7 @@ class SphericalKde:
     weights : numpy.ndarray, optional
         Non-negative weights (n,), normalised per probe. Default: equal.
     backend : Backend
-        Where the densities are evaluated.
+        Dr.Jit backend (LLVM or CUDA) on which the densities are evaluated. Default: that of Mitsuba's variant.
 
     Raises
     ------
@@ -233,11 +233,11 @@ class SphericalKde:
 
     @property
     def kappa(self) -> np.ndarray:
-        """Concentrations of the kernels, (P,) float32."""
+        """Concentration κ of the von Mises-Fisher kernel of each of the P probes, (P,) float32."""
         return np.array(self._kappa)
 
     def select_range(self, first: int, last: int) -> SphericalKde:
-        """Return the densities of probes ``first`` to ``last`` - 1."""
+        """Return the kernel density estimates of the probes with indices ``first`` to ``last`` - 1."""
         if (first, last) == (0, self.count):
             return self
         offsets = np.array(self._offsets)[first : last + 1].astype(np.int64)
@@ -245,9 +245,24 @@ class SphericalKde:
         return SphericalKde(packed[:, :3], offsets - offsets[0], self.kappa[first:last], packed[:, 3], self.ns)
 
     def density(self, probe: UInt32, direction: Array3f) -> Float:
-        """Density in 1/sr of ``probe`` (M lanes) in unit ``direction`` (M lanes); traced, not evaluated.
+        """Evaluate M densities of single probes in single directions. The computation is traced, not started.
 
-        Lanes of one probe should be adjacent, because they then share their loop.
+        Parameters
+        ----------
+        probe
+            Index of the probe, 0 to P - 1, of each of M lanes.
+        direction
+            Unit direction of each lane.
+
+        Returns
+        -------
+        Float
+            Density in 1/sr of each lane.
+
+        Notes
+        -----
+        The order of the lanes does not change the result. It is faster if lanes of the same probe are adjacent: lanes
+        of one SIMD packet or warp loop over the rays of their probes together.
         """
         ns = self.ns
         first = dr.gather(ns.UInt32, self._offsets, probe)
@@ -423,7 +438,8 @@ class SphericalKdeTable:
         return (face * self.padded_resolution + j) * self.padded_resolution + i, [p - w for p, w in zip(position, base)]
 
     def density(self, direction: Array3f) -> Float:
-        """Density in 1/sr in unit ``direction``: traced, not evaluated, differentiable."""
+        """Density in 1/sr in the unit ``direction`` of each lane. The computation is traced, not started, and is
+        differentiable."""
         first, (s, t) = self._locate(direction)
         ws, wt = _cubic_weights(s), _cubic_weights(t)
         total: Any = 0
@@ -437,7 +453,7 @@ class SphericalKdeTable:
         return dr.maximum(total, 0)  # Interpolation errors may make the density negative
 
     def evaluate(self, directions: np.ndarray) -> np.ndarray:
-        """Evaluate the densities (N,) in 1/sr, float32, in ``directions`` (N, 3)."""
+        """Evaluate the density of the tabulated probe in unit ``directions`` (N, 3); returns (N,) float32 in 1/sr."""
         d = to_vector(self.ns.Array3f, directions)
         return np.array(self.density(d))
 

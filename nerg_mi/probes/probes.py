@@ -105,7 +105,11 @@ CENTRES = ("mean", "query")
 
 @dataclass(frozen=True, eq=False)
 class Probes:
-    """P probes and the n rays that they hold, probe after probe, in metres in the frame of the rays."""
+    """P probes and the n rays that they hold, probe after probe, in metres in the frame of the rays.
+
+    The parameter ``backend`` of functions below is the Dr.Jit backend (LLVM or CUDA) on which densities are evaluated;
+    None: that of Mitsuba's variant.
+    """
 
     positions: np.ndarray  # (P, 3) positions to which the densities are assigned
     queries: np.ndarray  # (P, 3) centres of the balls that collect the rays
@@ -121,17 +125,27 @@ class Probes:
 
     @property
     def counts(self) -> np.ndarray:
-        """Number of rays in each probe, (P,)."""
+        """Number of rays in each of the P probes, (P,)."""
         return np.diff(self.offsets)
 
     def kde(self, backend: Backend = None) -> SphericalKde:
-        """Return the densities as a Dr.Jit object for evaluation in kernels."""
+        """Return the densities of all probes as an object of the Dr.Jit ``backend``, for evaluation in kernels."""
         return SphericalKde(self.directions, self.offsets, self.kappa, self.weights, backend)
 
     def density(self, directions: np.ndarray, backend: Backend = None) -> np.ndarray:
-        """Evaluate the densities (P, D) in 1/sr, float32, at unit ``directions`` (D, 3) or (P, D, 3).
+        """Evaluate the densities of all P probes in D directions.
 
-        Each density integrates to one over the sphere.
+        Parameters
+        ----------
+        directions
+            Unit directions: (D, 3), common to all probes, or (P, D, 3).
+        backend
+            Dr.Jit backend (LLVM or CUDA) on which the densities are evaluated; None: that of Mitsuba's variant.
+
+        Returns
+        -------
+        np.ndarray
+            Densities (P, D) in 1/sr, float32. Each integrates to one over the sphere.
         """
         return self.kde(backend).evaluate(directions)
 

@@ -70,12 +70,17 @@ STRIP_SECONDS = 0.5
 class SamplePace:
     """Chooses the number of samples in a strip from the time of previous strips.
 
-    An object can be used for several images in turn, in one variant.
+    A strip is a range of the samples of an image that is rendered in one kernel. A sample is one camera ray, so a pixel
+    has ``spp`` samples. Strips are to take between half of `STRIP_SECONDS` and `STRIP_SECONDS`: a strip that takes
+    longer halves the number of samples of the next one, and a shorter one doubles it.
+
+    An object can be used for several images in turn, as long as the Mitsuba variant stays the same: the initial and
+    maximum number of samples depend on it.
 
     Parameters
     ----------
     fixed : int
-        Constant number of samples in a strip; 0 adapts the number to the time.
+        Constant number of samples in a strip, over all its pixels; 0 adapts the number to the time.
     """
 
     def __init__(self, fixed: int = 0):
@@ -96,7 +101,8 @@ class SamplePace:
         Parameters
         ----------
         start, stop : int
-            Range of samples. The first strip starts at a multiple of `PACKET_SIZE`, possibly before ``start``.
+            Range of sample indices within the image, in which the samples of a pixel are adjacent. The first strip
+            starts at a multiple of `PACKET_SIZE`, possibly before ``start``.
         spp : int
             Samples per pixel.
 

@@ -44,10 +44,19 @@ class Aoi(Protocol):
         ...
 
     def intersect(self, o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the entry and exit distances ``(near, far)``, (N,) each, of rays (N, 3).
+        """Intersect rays with the AOI.
 
-        ``near`` >= ``far`` means a miss; ``near`` < 0 means that the ray starts inside. For a surface both are the
-        distance to it, infinite for a miss.
+        Parameters
+        ----------
+        o, d
+            Origins and unit directions of the rays, (N, 3) each, in scene coordinates.
+
+        Returns
+        -------
+        near, far
+            Distances (N,) along the rays. For a solid: where the line of the ray enters and leaves it; ``near`` < 0 <
+            ``far`` if the ray starts inside, and ``near`` >= ``far`` if the line misses it. For a surface
+            (``is_surface``): ``near`` and ``far`` are both the distance to its first intersection, infinite for a miss.
         """
         ...
 
@@ -57,7 +66,8 @@ class Aoi(Protocol):
         ...
 
     def hits_bounds(self, o: np.ndarray, d: np.ndarray) -> np.ndarray:
-        """Return whether rays (N, 3) intersect a bounding box of the AOI, (N,)."""
+        """Return whether rays with origins ``o`` and unit directions ``d``, (N, 3) each, intersect a bounding box of
+        the AOI, (N,)."""
         ...
 
     def sample_points(self, count: int) -> tuple[np.ndarray, np.ndarray]:

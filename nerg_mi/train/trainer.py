@@ -227,7 +227,7 @@ class StepClock:
     Attributes
     ----------
     evaluations : int
-        Field evaluations within steps.
+        Field evaluations within steps: number of positions at which the density, or density and colour, was evaluated.
     steps, seconds : int, float
         Number and total duration of all steps.
     extremes : list of float
@@ -267,8 +267,10 @@ class StepClock:
             self.evaluations += evaluations
 
     def summary(self) -> dict:
-        """Return ``evaluations_a_second`` and ``step_ms`` with ``min``, ``median`` and ``max``; empty before the first
-        step.
+        """Return statistics of the steps so far; empty before the first step.
+
+        ``evaluations_a_second`` is the number of positions per second at which the field was evaluated within steps.
+        ``step_ms`` is a dictionary with the ``min``, ``median`` and ``max`` duration of a step in milliseconds.
         """
         if not self.steps:
             return {}

@@ -214,8 +214,8 @@ def read_baked(path: Path) -> BakedSurface:
         raise MissingFile(f'there is no file "{path}"; correct its name')
     if is_splat_file(path):
         raise NergError(
-            f'"{path}" holds Gaussian splats, which already have the colours of their gaze: view them with nerg '
-            f"scene {path} -o a.xml"
+            f'"{path}" holds Gaussian splats, whose colours show the gaze already: create a scene with nerg scene '
+            f"{path} -o a.xml, and view it with nerg view a.xml"
         )
     body = read_mesh_file(path)
     with translate_read_errors(path, "baked surface"):

@@ -130,13 +130,14 @@ class GazeOptions(DerivedOptions, GeometryOptions):
     )
     semantic: str = option(
         "",
-        "Give the features of the radiance field of --field to the emit network: accumulated along the ray, or "
-        "snapshot at the surface.  [default: no features]",
+        "Give the emit network the features that the density network of the radiance field of --field computes: "
+        "accumulated (integrated along the ray from the observer) or snapshot (at the surface). They replace the "
+        "features of emit's own hash grid, unless --semantic-concat is set.  [default: no features]",
         group=MODEL,
     )
     semantic_concat: bool = option(
         False,
-        "Concatenate the features of --semantic with the gaze field's own, in place of replacing them.",
+        "Add the features of --semantic to those of emit's own hash grid, in place of replacing these.",
         group=MODEL,
     )
     init: str = option(

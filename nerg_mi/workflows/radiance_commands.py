@@ -105,7 +105,7 @@ class PhotoOptions(ValidatedDataclass):
     )
     width: int | None = option(
         None,
-        "Width in pixels to which photos are resized.  [default: their own width; for nerg eval, that of the training]",
+        "Width in pixels to which photos are resized.  [default: the width of the photos]",
         within=Range(1, 65536),
         group=INPUT,
     )
@@ -170,6 +170,12 @@ class RadianceOptions(DerivedOptions, PhotoOptions):
 class RadianceScoreOptions(PhotoOptions):
     """Options of ``nerg eval radiance``. Photos are read as in the training."""
 
+    width: int | None = option(
+        None,
+        "Width in pixels to which photos are resized.  [default: the width in the training of the field]",
+        within=Range(1, 65536),
+        group=INPUT,
+    )
     train: bool = option(False, "Score the training views in place of the held-out views.", group=TEST)
     spp: int = option(
         16, "Samples per pixel. The noise of few samples lowers the scores.", within=SPP, group=PERFORMANCE

@@ -177,13 +177,21 @@ def uses_shared_scale(overlay: Overlay, count: int, options: PictureOptions) -> 
 
 
 def stack_layers(layers: OverlayLayers) -> np.ndarray:
-    """Stack colour, values and mask of ``layers`` into one array (h, w, 5) of float32."""
+    """Stack the images of ``layers`` into one array (h, w, 5) of float32.
+
+    The channels are linear red, green and blue, the values of the overlaid quantity (an AOV), and the mask: 1 where the
+    pixel has a surface, 0 elsewhere.
+    """
     array = np.concatenate([layers.color, layers.values[..., None], layers.mask[..., None]], axis=-1)
     return np.ascontiguousarray(array, np.float32)
 
 
 def unstack_layers(array: np.ndarray, marker: tuple[float, float] | None, supported: bool, basis: str) -> OverlayLayers:
-    """Restore layers from `stack_layers`, with their ``marker``, ``supported`` flag and ``basis``."""
+    """Restore layers from an ``array`` of `stack_layers`.
+
+    ``marker``, ``supported`` and ``basis`` become `OverlayLayers.marker`, ``has_support`` and ``support_note``, which
+    are not in the array.
+    """
     return OverlayLayers(array[..., :3], array[..., 3], array[..., 4] > 0.5, marker, supported, basis)
 
 

@@ -537,21 +537,30 @@ for _kind in KINDS.values():
 class BakeOptions(PartOptions):
     """Options of ``nerg bake``."""
 
-    gaze: Path | None = option(None, "Gaze field (.safetensors).  [default: that of a scene file]", group=INPUT)
+    gaze: Path | None = option(
+        None,
+        "Gaze field (.safetensors). Required unless the surface is a scene (.xml) whose integrator has a gaze field, "
+        "or --rays gives the gaze.  [default: the gaze field of that scene]",
+        group=INPUT,
+    )
     rays: Path | None = option(
         None, "Rays file or dataset: positions of the observers, or the gaze itself.", group=INPUT
     )
     source: str | None = option(
         None,
-        "Source of the gaze: field (evaluate the gaze field) or rays (the recorded rays).  [default: field if there is "
-        "one]",
+        "Source of the gaze: field (evaluate the gaze field) or rays (the recorded rays).  [default: field with "
+        "--gaze, or if the scene has a gaze field and --rays is not given; else rays]",
         group=INPUT,
     )
     observer: tuple[float, ...] | None = coordinates(
         "Position x,y,z of a single observer in scene coordinates, in place of those of --rays.", group=INPUT
     )
     observer_file: Path | None = option(
-        None, "CSV file of observers with columns x, y, z in scene coordinates and, optionally, weight.", group=INPUT
+        None,
+        "CSV file of observers with columns x, y, z in scene coordinates and, optionally, weight: the relative weight "
+        "of the observer's gaze in the sum over observers, 0 or more, in every row if the column exists. Without the "
+        "column all weights are equal. Without the file, observers are those of --observer or --rays.",
+        group=INPUT,
     )
     num_observers: int = option(
         64,
