@@ -133,8 +133,8 @@ def measures() -> str:
     """The statistics of `nerg stats` with their definitions."""
     from nerg_mi.statistics.tables import MEASURES
 
-    rows = [(m.title.partition(" [")[0], m.definition, m.population, "yes" if m.is_compared else "") for m in MEASURES]
-    return table_or_list(("statistic", "definition", "over", "differences"), rows)
+    rows = [(m.title, m.definition, m.population, "yes" if m.is_compared else "") for m in MEASURES]
+    return table_or_list(("statistic", "definition", "over", "compared"), rows)
 
 
 PARTS: dict[str, Callable[[], str]] = {

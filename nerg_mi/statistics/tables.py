@@ -234,7 +234,8 @@ MEASURES = (
     Measure(
         name="distance",
         title="distance [m]",
-        definition="Σ w_i d_i / Σ w_i, from the observer to the point where the ray enters the AOI",
+        definition="Σ w_i d_i / Σ w_i, where d_i is the distance from the observer to the point where the ray of "
+        "sample i enters the AOI",
         population="samples on the AOI",
         numerator_denominator=lambda p: (p.distance, p.dwell_time),
     ),
