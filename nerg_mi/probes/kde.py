@@ -93,7 +93,8 @@ def select_loo_kappa(
     max_rays: int = 256,
     rng: np.random.Generator | None = None,
 ) -> float:
-    """Select κ between 1 and ``kappa_max`` by leave-one-out likelihood; 1 for a single ray."""
+    """Select κ of one probe, between 1 and ``kappa_max``, by leave-one-out likelihood; 1 for a single ray. The other
+    arguments are those of `compute_loo_scores`."""
     if len(directions) < 2:
         return KAPPA_MIN
     grid = make_kappa_grid(kappa_max)
@@ -108,10 +109,11 @@ def select_loo_kappas(
     shared: bool,
     rng: np.random.Generator,
 ) -> np.ndarray:
-    """Select κ (P,) of each probe by leave-one-out likelihood.
+    """Select the concentration κ of each of P probes by leave-one-out likelihood, (P,).
 
-    Probe p holds ``directions[offsets[p]:offsets[p + 1]]``. With ``shared`` one κ maximises the joint likelihood of 256
-    random probes.
+    Probe p holds the unit directions ``directions[offsets[p]:offsets[p + 1]]`` of the participants ``persons`` (n,). A
+    ray is compared with those of other participants, or with all others if there is one participant. κ is between 1
+    and ``kappa_max``. With ``shared`` one κ maximises the joint likelihood of 256 probes that are drawn with ``rng``.
     """
     runs = [slice(a, b) for a, b in zip(offsets[:-1], offsets[1:])]
     if not shared:
@@ -127,10 +129,11 @@ def select_loo_kappas(
 def compute_silverman_kappas(
     directions: np.ndarray, weights: np.ndarray | None, offsets: np.ndarray, kappa_max: float, shared: bool
 ) -> np.ndarray:
-    """Compute κ (P,) by the rule of the published code, at most ``kappa_max``.
+    """Compute the concentration κ of each of P probes by the rule of the published code, at most ``kappa_max``, (P,).
 
-    With ``weights`` (n,) the rule uses the weighted mean resultant length and the effective count (Σw)²/Σw². With
-    ``shared`` all probes have one κ, 1 over the mean of 1/κ.
+    Probe p holds the unit directions ``directions[offsets[p]:offsets[p + 1]]``. With ``weights`` (n,) the rule uses the
+    weighted mean resultant length and the effective count (Σw)²/Σw². With ``shared`` all probes have one κ, 1 over the
+    mean of 1/κ.
     """
     w = np.ones(len(directions)) if weights is None else weights
     total = np.add.reduceat(w, offsets[:-1])
@@ -146,8 +149,8 @@ def compute_silverman_kappas(
 # κ_p), where f is the von Mises-Fisher density (NeRG, Section 5.1). It integrates to one over the sphere for any κ.
 
 Backend = str | ModuleType | dr.ArrayBase | None
-"""Where a density is evaluated: a name such as ``"llvm"``, a Dr.Jit namespace, a Dr.Jit array, or None for the backend
-of Mitsuba's variant (:func:`get_default_backend`).
+"""Dr.Jit backend (LLVM or CUDA) on which a density is evaluated: a name such as ``"llvm"``, a Dr.Jit namespace, a
+Dr.Jit array of that backend, or None for the backend of Mitsuba's variant (:func:`get_default_backend`).
 """
 
 DIRECTIONS_PER_LANE = 16  # Directions evaluated by one lane of `SphericalKde.evaluate`

@@ -90,7 +90,7 @@ def evaluate_kde_frame(
         sphere, with an error below 1e-4 of the maximum of a single kernel (:mod:`nerg_mi.probes.kde`). ``auto`` uses a
         table from 4,096 pixels on.
     backend : Backend
-        Where the density is evaluated.
+        Dr.Jit backend (LLVM or CUDA) on which the density is evaluated. Default: that of Mitsuba's variant.
 
     Returns
     -------
@@ -158,7 +158,7 @@ class KdeView:
     to_world : Similarity, optional
         Similarity from the frame of the rays to the scene.
     backend : Backend
-        Where the density is evaluated.
+        Dr.Jit backend (LLVM or CUDA) on which the density is evaluated. Default: that of Mitsuba's variant.
 
     Raises
     ------

@@ -105,11 +105,7 @@ CENTRES = ("mean", "query")
 
 @dataclass(frozen=True, eq=False)
 class Probes:
-    """P probes and the n rays that they hold, probe after probe, in metres in the frame of the rays.
-
-    The parameter ``backend`` of functions below is the Dr.Jit backend (LLVM or CUDA) on which densities are evaluated;
-    None: that of Mitsuba's variant.
-    """
+    """P probes and the n rays that they hold, probe after probe, in metres in the frame of the rays."""
 
     positions: np.ndarray  # (P, 3) positions to which the densities are assigned
     queries: np.ndarray  # (P, 3) centres of the balls that collect the rays
@@ -129,7 +125,8 @@ class Probes:
         return np.diff(self.offsets)
 
     def kde(self, backend: Backend = None) -> SphericalKde:
-        """Return the densities of all probes as an object of the Dr.Jit ``backend``, for evaluation in kernels."""
+        """Return the densities of all P probes as an object of the Dr.Jit ``backend`` (`kde.Backend`), for evaluation
+        in kernels."""
         return SphericalKde(self.directions, self.offsets, self.kappa, self.weights, backend)
 
     def density(self, directions: np.ndarray, backend: Backend = None) -> np.ndarray:
@@ -335,25 +332,27 @@ def count_resolving_directions(kappa: float) -> int:
 
 
 def compute_integral(probes: Probes, count: int | None = None, backend: Backend = None) -> np.ndarray:
-    """Integrate the density of each probe over the sphere by quadrature, (P,).
+    """Integrate the density of each of the P ``probes`` over the sphere by quadrature, (P,).
 
     The result is one up to the quadrature error. ``count`` is the number of directions; None:
-    `count_resolving_directions` of the largest κ.
+    `count_resolving_directions` of the largest κ. ``backend`` is the Dr.Jit backend on which the densities are
+    evaluated (`kde.Backend`).
     """
     return _integrate(probes, count, backend, lambda p: p)
 
 
 def compute_entropy(probes: Probes, count: int | None = None, backend: Backend = None) -> np.ndarray:
-    """Compute the differential entropy -∫ p log p of each probe in nats by quadrature, (P,).
+    """Compute the differential entropy -∫ p log p of the density p of each of the P ``probes``, in nats, (P,).
 
-    The maximum is log 4π = 2.53, that of the uniform density.
+    It is computed by quadrature with ``count`` directions on ``backend``, as in `compute_integral`. The maximum is
+    log 4π = 2.53, that of the uniform density.
     """
     return -_integrate(probes, count, backend, lambda p: p * np.log(np.where(p > 0, p, 1.0)))
 
 
 def count_effective_participants(probes: Probes, rays: Rays) -> np.ndarray:
-    """Compute the effective number of participants of each probe, (Σw)²/Σw² of the summed weights of each participant,
-    (P,).
+    """Compute the effective number of participants of each of the P ``probes``, (P,): (Σw)²/Σw² over participants,
+    where w is the sum of the weights of the rays of a participant.
 
     Successive rays of one participant are redundant, so this number, not the number of rays, determines the uncertainty
     of a probe. ``rays`` are those from which the probes were made.
@@ -368,7 +367,8 @@ def count_effective_participants(probes: Probes, rays: Rays) -> np.ndarray:
 
 
 def sample_directions(probes: Probes, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Draw ``count`` independent directions from each probe's density, (P, count, 3)."""
+    """Draw ``count`` independent unit directions from the density of each of the P ``probes``, (P, count, 3), with the
+    random numbers of ``rng``."""
     w = np.ones(len(probes.indices)) if probes.weights is None else probes.weights
     cumulative = np.concatenate([[0.0], np.cumsum(w)])
     low, high = cumulative[probes.offsets[:-1]], cumulative[probes.offsets[1:]]
