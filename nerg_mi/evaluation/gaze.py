@@ -125,6 +125,17 @@ class FieldDensity:
             return density[:, :, None]
         return np.stack([self._evaluate_members(p, d) for p, d in zip(positions, directions)], axis=1)
 
+    def evaluate_rays(self, origins: np.ndarray, directions: np.ndarray, tolerance: float = 0.05) -> np.ndarray:
+        """Evaluate the densities (N,) of rays with ``origins`` and unit ``directions`` (N, 3), for many origins.
+
+        ``tolerance`` is the relative error of the integral at each origin, which is not cached.
+        """
+        matrix = self._align.matrix[:3, :3]
+        origins = np.asarray(origins, np.float64) @ matrix.T + self._align.matrix[:3, 3]
+        directions = np.asarray(directions, np.float64) @ (matrix / self._align.scale).T
+        settings = replace(self._settings, integral_tolerance=tolerance)
+        return evaluate_densities(self._gaze, self._place, settings, origins, directions).mean(axis=0)
+
     def _evaluate_members(self, position: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Evaluate the densities (M, D) of one observer (3,), both in the frame of the field."""
         mi = variant_types()
