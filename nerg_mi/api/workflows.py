@@ -12,7 +12,13 @@ from nerg_mi.aoi.options import StatisticsOptions
 from nerg_mi.errors import NergError
 from nerg_mi.rays.rays import Rays
 from nerg_mi.workflows.base import SILENT, Reporter
-from nerg_mi.workflows.gaze_commands import AblationOptions, GazeEvaluationOptions, GazeOptions, PriorOptions
+from nerg_mi.workflows.gaze_commands import (
+    AblationOptions,
+    GazeEvaluationOptions,
+    GazeOptions,
+    NextLookOptions,
+    PriorOptions,
+)
 from nerg_mi.workflows.radiance_commands import RadianceOptions, RadianceScoreOptions
 from nerg_mi.workflows.rays_commands import AlignOptions, RaysImportOptions
 from nerg_mi.workflows.scene_commands import BakeOptions, StudyOptions
@@ -29,6 +35,7 @@ if TYPE_CHECKING:
     from nerg_mi.workflows.bake import Bake
     from nerg_mi.workflows.bake_splats import SplatBake
     from nerg_mi.workflows.evaluate import GazeEvaluation
+    from nerg_mi.workflows.next_look import NextLookEvaluation
     from nerg_mi.workflows.study import StudyResult
     from nerg_mi.workflows.train_gaze import GazeResult, PriorResult
 
@@ -254,6 +261,67 @@ def evaluate_gaze(
     data = resolve_rays(rays)
     with resolve_checkpoint(gaze, "gaze") as path:
         return evaluate.evaluate_gaze(path, data, output, resolved, reporter)
+
+
+def next_look(
+    gaze: FilePath | TrainedGazeField,
+    rays: Rays | FilePath,
+    output: FilePath | None = None,
+    *,
+    options: NextLookOptions | None = None,
+    reporter: Reporter = SILENT,
+    **overrides: Any,
+) -> NextLookEvaluation:
+    """Fit the density of a participant's next look, given the last looks, the elapsed time and a gaze field.
+
+    The weights of the density are fitted to training participants at held-out positions. It is scored on held-out
+    participants there, and compared with the last look alone and the field alone.
+
+    Parameters
+    ----------
+    gaze : TrainedGazeField or path
+        The gaze field, trained with ``test_zones`` and ``test_participants``.
+    rays : Rays or path
+        The recordings of its training.
+    output : path, optional
+        Folder for tables and weights; it is created.
+    options : NextLookOptions, optional
+        Base options (`nerg_mi.workflows.gaze_commands.NextLookOptions`).
+    reporter : Reporter
+        Receives the progress.
+    **overrides
+        Single options on top of ``options``, such as ``elapsed=(0.5, 1, 2)``, and the geometry as for `evaluate_gaze`.
+
+    Returns
+    -------
+    NextLookEvaluation
+        Scores (``rows``), and the ``model`` (`nerg_mi.evaluation.next_look.NextLook`), whose method ``sample``
+        simulates the looks of a participant along a trajectory.
+
+    Raises
+    ------
+    NergError
+        An option or a file is invalid.
+
+    Examples
+    --------
+    >>> import nerg_mi as nerg
+    >>> held_out = {"test_zones": 1, "test_positions": 4, "test_participants": 0.5}
+    >>> small = {"geometry": "none", "validation_zones": 0, "steps": 2, "probes": 8, "directions": 64, "min_rays": 8}
+    >>> gaze = nerg.train_gaze(rays, **held_out, **small)
+    >>> result = nerg.next_look(gaze, rays, elapsed=(1.0, 4.0), earlier=5, max_looks=32)
+    >>> result.rows[0]["method"], result.model.knots.tolist()
+    ('next look', [1.0, 4.0])
+    >>> walk = [(1.0 + 0.5 * t, 2.0, 1.6) for t in range(4)]
+    >>> result.model.sample(range(4), walk, gaze.density).shape
+    (4, 3)
+    """
+    from nerg_mi.workflows import next_look
+
+    resolved = build_options(NextLookOptions, "next_look", options, overrides)
+    data = resolve_rays(rays)
+    with resolve_checkpoint(gaze, "gaze") as path:
+        return next_look.evaluate_next_look(path, data, output, resolved, reporter)
 
 
 def ablate(

@@ -25,7 +25,7 @@ from .uncertainty import RETAINED_FRACTIONS
 # ---- Reports of an evaluation: tables as Markdown, CSV and JSON, and pictures of reference and prediction ----
 
 _DIGITS = {"MAE": 4}  # Digits of scores, if not three
-_TEXT_COLUMNS = ("method", "person", "signal", "error")  # Columns of text
+_TEXT_COLUMNS = ("method", "person", "signal", "error", "component")  # Columns of text
 _HEADINGS = {"person": "participant", "rays": "samples"}  # Headings that differ from the keys of rows
 
 

@@ -126,7 +126,7 @@ def evaluate_gaze(
     ns = select_backend(options.mode, options.threads)
     loaded, metadata = load_gaze(gaze, ns)
     training = metadata["provenance"]
-    data = _load_training_rays(gaze, training, rays)
+    data = load_training_rays(gaze, training, rays)
     account, seed = training["test"], options.seed
     split = options.split or ("both" if account.get("people") else "pos")
     reporter.progress(0.0, "test")
@@ -250,7 +250,7 @@ def _groups(account: dict, split: str, centres: np.ndarray) -> list[str] | None:
     return [str(account["zone"][int(np.argmin(((all_centres - c) ** 2).sum(axis=1)))]) for c in centres]
 
 
-def _load_training_rays(gaze: Path, training: dict, rays: Rays | str | Path) -> Rays:
+def load_training_rays(gaze: Path, training: dict, rays: Rays | str | Path) -> Rays:
     """Return the rays of the training. Raises `NergError` for others, and if none were held out."""
     if training.get("recipe") == PRIOR:
         raise NergError(f'"{gaze}" is a prior from other scenes, for which no rays of this scene were held out')

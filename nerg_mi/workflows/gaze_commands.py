@@ -1,10 +1,11 @@
 """``nerg train gaze``: Train a gaze field on gaze rays and score it at held-out positions.
 ``nerg train prior``: Fit an elevation prior on recordings in other scenes, for a scene without tracking.
 ``nerg eval gaze``: Score a gaze field on held-out data and compare it with baselines.
+``nerg eval next``: Predict the next look from the last looks and a gaze field; score it on held-out participants.
 ``nerg eval folds``: Cross-validate a gaze field: train and score it several times on different splits.
 ``nerg ablate``: Train the variants of a gaze field under equal conditions and compare them.
 
-Options of these commands. The workflows are in `.train_gaze`, `.evaluate` and `.ablation`.
+Options of these commands. The workflows are in `.train_gaze`, `.evaluate`, `.next_look` and `.ablation`.
 """
 
 from __future__ import annotations
@@ -43,6 +44,7 @@ from .options import (
     expose_settings,
     llvm_variant,
     option,
+    parse_numbers,
     random_seed,
     repeat_options,
 )
@@ -332,6 +334,46 @@ declare(
     gaze=argument("Gaze field that was trained with --test-zones (.safetensors)."),
     rays=argument("Rays file or dataset that it was trained on."),
     output=out("Folder for tables and figures.  [default: GAZE.eval]", default=None),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+@repeat_options(GazeEvaluationOptions, "field", "scene", "geometry", "resamples", "threads", "mode")
+class NextLookOptions(DerivedOptions):
+    """Options of ``nerg eval next``. The scene is the one of the training."""
+
+    elapsed: tuple[float, ...] | None = option(
+        None,
+        "Comma-separated times in seconds between the last look and the next one, increasing.  [default: 0.2,1,2,5]",
+        parse=parse_numbers,
+        within=Range(1e-3, 1e4),
+        group=TEST,
+    )
+    earlier: int = option(
+        120,
+        "Number of looks before the last one that a participant may return to, half a second apart.",
+        within=Range(0, 10_000),
+        group=MODEL,
+    )
+    max_looks: int = option(
+        500,
+        "Maximum number of looks that determine the weights, and of looks that are scored.",
+        within=Range(16, 10**6),
+        group=TEST,
+    )
+    seed: int = random_seed("selected looks and bootstrap resamples")
+
+
+declare(
+    "eval next",
+    "nerg_mi.workflows.next_look:print_next_look",
+    "Predict where a participant looks next from the last looks, the elapsed time and a gaze field; score held-out "
+    "participants at held-out positions.",
+    more="The weights of the prediction are fitted to training participants at held-out positions.",
+    options=NextLookOptions,
+    gaze=argument("Gaze field that was trained with --test-zones and --test-participants (.safetensors)."),
+    rays=argument("Rays file or dataset that it was trained on."),
+    output=out("Folder for tables and weights.  [default: GAZE.next]", default=None),
 )
 
 declare(

@@ -15,8 +15,8 @@ from nerg_mi.api.workflows import bake
 from nerg_mi.errors import NergError
 from nerg_mi.formats.ply import write_columns
 from nerg_mi.rays.rays import Rays
-from nerg_mi.workflows import ablation, evaluate, study, train_gaze, train_radiance
-from nerg_mi.workflows.gaze_commands import AblationOptions, GazeEvaluationOptions, GazeOptions
+from nerg_mi.workflows import ablation, evaluate, next_look, study, train_gaze, train_radiance
+from nerg_mi.workflows.gaze_commands import AblationOptions, GazeEvaluationOptions, GazeOptions, NextLookOptions
 from nerg_mi.workflows.radiance_commands import RadianceOptions, RadianceScoreOptions
 from nerg_mi.workflows.scene_commands import StudyOptions
 from tests.surfaces.meshes import box
@@ -82,6 +82,11 @@ JOBS = {
         lambda: nerg.evaluate_gaze("g.safetensors", "r.npz", "out", split="pos"),
         (Path("g.safetensors"), Path("r.npz"), "out", GazeEvaluationOptions(split="pos", **LLVM)),
     ),
+    "evaluate_next_look": (
+        next_look,
+        lambda: nerg.next_look("g.safetensors", "r.npz", "out", earlier=5),
+        (Path("g.safetensors"), Path("r.npz"), "out", NextLookOptions(earlier=5, **LLVM)),
+    ),
     "ablate": (
         ablation,
         lambda: nerg.ablate("r.npz", "out", options=AblationOptions(seeds=2), recipes="small"),
@@ -128,7 +133,7 @@ def test01_options_reach_the_workflows(captured, job):
 
 
 @pytest.mark.parametrize(
-    "name", ["evaluate_radiance", "evaluate_gaze", "ablate", "study", "train_gaze", "train_radiance"]
+    "name", ["evaluate_radiance", "evaluate_gaze", "next_look", "ablate", "study", "train_gaze", "train_radiance"]
 )
 def test02_invalid_options_are_refused(name):
     with pytest.raises(nerg.NergError, match=f'{name} has no option "nothing"'):

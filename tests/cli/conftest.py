@@ -57,8 +57,9 @@ def inputs(tmp_path_factory):
     mi.set_variant("llvm_ad_rgb")
     folder = make_inputs(tmp_path_factory.mktemp("inputs"))
     place = "--geometry hits --radius 0.5 --probes 8 --steps 2 --directions 64 --zones 0 --min-rays 8"
-    line = f"train gaze {folder}/rays.npz -o {folder}/gaze.safetensors {place} --test-zones 1 --test-positions 3"
-    with pytest.raises(SystemExit) as end:
-        main(line.split())
-    assert not end.value.code
+    line = f"train gaze {folder}/rays.npz {place} --test-zones 1 --test-positions 3"
+    for more in ("-o gaze.safetensors", "--test-participants 0.5 -o participants.safetensors"):
+        with pytest.raises(SystemExit) as end:
+            main([*line.split(), *more.replace("-o ", f"-o {folder}/").split()])
+        assert not end.value.code
     return folder

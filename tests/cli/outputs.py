@@ -177,6 +177,13 @@ CASES = (
         tuple(f"evaluation.gaze.{name}" for name in ("evaluate_gaze", "score_split_half", "score_participants")),
     ),
     Case(
+        "eval next",
+        "{i}/participants.safetensors {i}/rays.npz -o {o}/next --elapsed 12 --earlier 3 --max-looks 64 --resamples 2",
+        _below("next", "next.md next.csv next.json"),
+        ("next",),
+        ("workflows.next_look.evaluate_on_grid",),
+    ),
+    Case(
         "bake",
         "{i}/room.ply --rays {i}/rays.npz --detail 2 -m llvm_ad_rgb -o {o}/a.ply -o {o}/a.csv -o {o}/a.json",
         ("a.ply", "a.csv", "a.json"),

@@ -15,6 +15,7 @@ from nerg_mi.alignment.check import read_similarity
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation import ablation as scoring
 from nerg_mi.evaluation.gaze import SCORES
+from nerg_mi.evaluation.next_look import NextLook
 from nerg_mi.files.tables import write_json
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.rays.rays import Rays
@@ -23,8 +24,15 @@ from nerg_mi.train.gaze_log_density import compute_elevation_density
 from nerg_mi.workflows import ablation, evaluate
 from nerg_mi.workflows.ablation import AblationBenchmark, ablate, load_ground_truth, make_plan
 from nerg_mi.workflows.evaluate import SCORED, evaluate_folds, evaluate_gaze
-from nerg_mi.workflows.gaze_commands import AblationOptions, FoldOptions, GazeEvaluationOptions, GazeOptions
+from nerg_mi.workflows.gaze_commands import (
+    AblationOptions,
+    FoldOptions,
+    GazeEvaluationOptions,
+    GazeOptions,
+    NextLookOptions,
+)
 from nerg_mi.workflows.geometry import load_training_geometry, make_geometry
+from nerg_mi.workflows.next_look import evaluate_next_look, make_ray_distance
 from nerg_mi.workflows.options import GeometryOptions
 from nerg_mi.workflows.parts import account_for_store
 from nerg_mi.workflows.train_gaze import learn_prior, train_gaze
@@ -79,6 +87,40 @@ def test_unusable_inputs_are_refused(trained, tmp_path):
     train_gaze(crowd(1000), tmp_path / "gaze.safetensors", replace(TRAINING, test_zones=0))
     with pytest.raises(NergError, match="trained on all positions"):
         evaluate_gaze(tmp_path / "gaze.safetensors", crowd(1000), options=OPTIONS)
+
+
+# ---- The next look: fit, files and refused input ----
+
+
+def test_the_next_look_is_fitted_and_scored(tmp_path, rgb):
+    rays = crowd(3000)
+    # Each participant has a sample per second.
+    rays = replace(rays, t=np.sum(np.tril(rays.person[:, None] == rays.person), axis=1))
+    held_out = replace(TRAINING, test_participants=0.5, geometry="hits", voxel_size=0.3)
+    gaze = tmp_path / "gaze.safetensors"
+    train_gaze(rays, gaze, held_out)
+    options = NextLookOptions(elapsed=(1.0, 3.0), earlier=3, max_looks=64, resamples=10)
+    result = evaluate_next_look(gaze, rays, tmp_path / "next", options)
+    assert {row["elapsed"] for row in result.rows} == {1.0, 3.0} and (result.fitted, result.scored) == (2, 2)
+    assert [path.name for path in result.files] == ["next.md", "next.csv", "next.json"]
+    written = json.loads((tmp_path / "next" / "next.json").read_text())
+    assert NextLook.from_json(written["model"]).weights == pytest.approx(result.model.weights)
+    assert written["rows"][0]["bits"] == result.rows[0]["bits"] and result.rows[0]["looks"] <= 64
+    # Looks without hit points end at the surfaces of the geometry.
+    place = load_training_geometry(gaze, load_gaze(gaze, ns)[1]["provenance"], BOX, GazeEvaluationOptions(), ns)
+    distance = make_ray_distance(place)
+    assert distance is not None and rays.hit is not None
+    recorded = np.linalg.norm(rays.hit - rays.origin, axis=1)
+    assert np.median(np.abs(distance(rays.origin, rays.direction) - recorded)) < 0.3
+    with pytest.raises(NergError, match="--elapsed"):
+        evaluate_next_look(gaze, rays, None, replace(options, elapsed=(3.0, 1.0)))
+    with pytest.raises(NergError, match="0.001 s before"):
+        evaluate_next_look(gaze, rays, None, replace(options, elapsed=(0.001,)))
+
+
+def test_the_next_look_needs_held_out_participants(trained):
+    with pytest.raises(NergError, match="--test-participants"):
+        evaluate_next_look(trained / "gaze.safetensors", trained / "rays.npz")
 
 
 # ---- Folds: in workers, one of which is killed, with stored parts, and in this process ----

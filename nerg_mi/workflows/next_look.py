@@ -1,0 +1,244 @@
+"""Fit and evaluation of the density of a participant's next look."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerg_mi.errors import NergError
+from nerg_mi.evaluation.baselines import UNIFORM_DENSITY, Baseline, make_prior_baseline
+from nerg_mi.evaluation.gaze import EPS, FieldDensity, format_score_table
+from nerg_mi.evaluation.gaze_report import format_table
+from nerg_mi.evaluation.next_look import (
+    GRID_DIRECTIONS,
+    LookSample,
+    NextLook,
+    PastLooks,
+    RayDistance,
+    evaluate_on_grid,
+    find_past_looks,
+    score_next_look,
+)
+from nerg_mi.files.atomic import check_folder, file_sha256, write_text
+from nerg_mi.files.tables import write_csv, write_json
+from nerg_mi.formats.fields import load_gaze
+from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.rays.filters import split_by_person
+from nerg_mi.rays.rays import Rays
+from nerg_mi.train.gaze_data import SURFACE_OPACITY
+from nerg_mi.train.geometry import TrainingGeometry
+from nerg_mi.transport.geometry import trace_depth
+
+from .base import SILENT, Reporter, select_backend
+from .evaluate import load_training_rays
+from .gaze_commands import GazeEvaluationOptions, NextLookOptions
+from .geometry import load_training_geometry
+from .options import shared_options
+
+_ELAPSED = (0.2, 1.0, 2.0, 5.0)  # seconds
+_PRIOR_KAPPAS = (5.0, 10.0, 20.0, 50.0, 100.0)  # candidates for the kernels of the position-independent prior
+_NOWHERE = np.zeros((1, 3))  # the position of a density that does not depend on it
+_MIN_LOOKS = 16  # per elapsed time
+_COLUMNS = ("elapsed", "method", "looks", "bits", "gap")
+
+
+@dataclass(frozen=True)
+class NextLookEvaluation:
+    """A fitted model of the next look, and its scores."""
+
+    model: NextLook
+    # One row for each elapsed time and method (`evaluation.next_look.score_next_look`).
+    rows: list[dict[str, Any]]
+    # Number of participants that the weights were fitted to, and of held-out participants.
+    fitted: int
+    scored: int
+    # Concentration of the kernels of the position-independent prior.
+    prior_kappa: float
+    # Written tables and weights.
+    files: list[Path]
+
+
+def evaluate_next_look(
+    gaze: str | Path,
+    rays: Rays | str | Path,
+    output: str | Path | None = None,
+    options: NextLookOptions | None = None,
+    reporter: Reporter = SILENT,
+) -> NextLookEvaluation:
+    """Fit the density of the next look to training participants, and score it on held-out participants.
+
+    Both are looks near held-out positions, which the field was not trained on: its weight would be too high elsewhere.
+    Scores in a zone of held-out positions use weights that were fitted in the other zones, the model uses all.
+    The looks that precede them are those of the same recording, anywhere. Looks without a recorded hit point end at the
+    first surface of the geometry, if there is one.
+
+    Parameters
+    ----------
+    gaze
+        Checkpoint of a gaze field that was trained with held-out positions and participants.
+    rays
+        Rays of its training, or their file.
+    output
+        Folder for tables and weights; None writes nothing.
+    options
+        Elapsed times, and numbers of looks.
+    reporter
+        Receives messages and progress.
+
+    Raises
+    ------
+    NergError
+        If no positions or no participants were held out, if there are too few looks, and for rays or a scene other than
+        those of the training.
+    """
+    options, gaze = options or NextLookOptions(), Path(gaze)
+    knots = _ELAPSED if options.elapsed is None else options.elapsed
+    if not knots or not (np.diff(knots) > 0).all():
+        raise NergError(f"--elapsed needs increasing times in seconds, as 0.2,1,5, got {list(knots)}")
+    if output is not None:
+        check_folder(Path(output))
+    from scipy.spatial import KDTree
+
+    ns = select_backend(options.mode, options.threads)
+    loaded, metadata = load_gaze(gaze, ns)
+    training = metadata["provenance"]
+    data = load_training_rays(gaze, training, rays)
+    holdout = training["test"]
+    if not holdout.get("people"):
+        raise NergError(f'"{gaze}" held out no participants to score; train with --test-participants 0.5')
+    geometry_options = GazeEvaluationOptions(**shared_options(options, GazeEvaluationOptions))
+    place = load_training_geometry(gaze, training, loaded.box, geometry_options, ns)
+    field = FieldDensity(loaded, place.medium, place.align, training.get("probes", {}).get("depth", "median"))
+    is_held_out = split_by_person(data, test_persons=holdout["people"])[1]
+    distance_to_centre, centre = KDTree(holdout["centres"]).query(data.origin)
+    # The training of the field has no rays of anybody in the larger range.
+    is_near = distance_to_centre <= holdout["purged_within"]
+    zone = np.array(holdout.get("zone", np.zeros(len(holdout["centres"]))), int)[centre]
+    rng = np.random.default_rng(options.seed)
+    rows = [
+        np.sort(rng.permutation(np.flatnonzero(mask))[: options.max_looks])
+        for mask in (~is_held_out & is_near, is_held_out & (distance_to_centre <= holdout["radius"]))
+    ]
+    if min(map(len, rows)) < _MIN_LOOKS:
+        raise NergError(
+            f"only {len(rows[0])} looks of training participants and {len(rows[1])} of others are near held-out "
+            "positions; train with more --test-zones or a larger --radius"
+        )
+    if len(np.unique(zone[rows[0]])) < 2:
+        reporter.warn(
+            "the weights are fitted in the only zone of held-out positions and scored there; for scores in new zones, "
+            "train with --test-zones 3"
+        )
+    reporter.progress(0.0, "prior")
+    kappa, prior = _select_prior(data.select(~is_held_out & ~is_near), data.direction[rows[0]])
+    distance = make_ray_distance(place)
+    samples = []
+    for number, selected in enumerate(rows):
+        reporter.progress(0.1 + 0.4 * number, "looks")
+        samples.append(_sample_looks(data, selected, zone[selected], field, prior, distance, knots, options.earlier))
+    reporter.progress(0.9, "scores")
+    fit, scored = samples
+    model, table = score_next_look(fit, scored, knots, options.resamples, options.seed)
+    people = [len(np.unique(sample.person)) for sample in samples]
+    result = NextLookEvaluation(model, table, people[0], people[1], kappa, [])
+    return result if output is None else replace(result, files=_write(Path(output), gaze, result))
+
+
+def _select_prior(train: Rays, directions: np.ndarray) -> tuple[float, Baseline]:
+    """Return the position-independent prior of the rays ``train`` with the kernels that are most likely for
+    ``directions`` (N, 3), and their concentration."""
+    priors = {kappa: make_prior_baseline(train, kappa=kappa) for kappa in _PRIOR_KAPPAS}
+    kappa = max(priors, key=lambda k: np.log(priors[k](_NOWHERE, directions) + EPS * UNIFORM_DENSITY).mean())
+    return kappa, priors[kappa]
+
+
+def _sample_looks(
+    rays: Rays,
+    rows: np.ndarray,
+    zone: np.ndarray,
+    field: FieldDensity,
+    prior: Baseline,
+    distance: RayDistance | None,
+    knots: Sequence[float],
+    earlier: int,
+) -> LookSample:
+    """Collect the rays ``rows`` (N,) in ``zone`` (N,) for each elapsed time of ``knots``, with what precedes them and
+    the densities of the field and the prior."""
+    pasts, parts, numbers = [], [], []
+    for number, elapsed in enumerate(knots):
+        past, matched = find_past_looks(rays, rows, elapsed, earlier=earlier, distance=distance)
+        if len(matched) < _MIN_LOOKS:
+            raise NergError(
+                f"only {len(matched)} of {len(rows)} looks have another one {elapsed:g} s before; change --elapsed"
+            )
+        pasts.append(past)
+        parts.append(matched)
+        numbers.append(np.full(len(matched), number))
+    density = field.evaluate_rays(rays.origin[rows], rays.direction[rows])
+    on_grid = evaluate_on_grid(field.evaluate_rays, rays.origin[rows])
+    prior_density = prior(_NOWHERE, rays.direction[rows])[0] + EPS * UNIFORM_DENSITY
+    prior_on_grid = prior(_NOWHERE, fibonacci_directions(GRID_DIRECTIONS))
+    at = np.searchsorted(rows, np.concatenate(parts))
+    return LookSample(
+        PastLooks.concatenate(pasts),
+        rays.direction[rows[at]],
+        rays.person[rows[at]],
+        np.concatenate(numbers),
+        zone[at],
+        (density[at], on_grid[at]),
+        (prior_density[at], np.broadcast_to(prior_on_grid, (len(at), GRID_DIRECTIONS))),
+    )
+
+
+def make_ray_distance(place: TrainingGeometry) -> RayDistance | None:
+    """Return the distance in metres to the first surface of a geometry along rays; None without geometry."""
+    medium = place.medium
+    if medium is None:
+        return None
+
+    def measure(origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        points, vectors = place.points_to_field(origins), place.directions_to_field(directions)
+        depth, opacity = trace_depth(medium, points, vectors)
+        return np.where(opacity >= SURFACE_OPACITY, depth / place.align.scale, np.inf)
+
+    return measure
+
+
+def _write(folder: Path, gaze: Path, result: NextLookEvaluation) -> list[Path]:
+    files = [folder / name for name in ("next.md", "next.csv", "next.json")]
+    weights = [
+        {"component": str(component), **{f"{t:g} s": float(w) for t, w in zip(result.model.knots, row)}}
+        for component, row in zip(result.model.components, result.model.weights.T)
+        if row.max() >= 0.01
+    ]
+    notes = (
+        f"# {gaze.name}: the next look\n\nWeights fitted to {result.fitted} participants, scores of {result.scored} "
+        "others, at held-out positions; each zone of these is scored with weights from the other zones. Elapsed times "
+        "in seconds; bits per look above the position-independent prior with kappa "
+        f"{result.prior_kappa:g}; gap: bits of the next look above the method. Brackets: ± 1.96 standard errors from "
+        "resampled participants.\n\n"
+    )
+    table = format_table([{**row, "elapsed": f"{row['elapsed']:g} s"} for row in result.rows], _COLUMNS)
+    columns = tuple(weights[0])
+    write_text(files[0], f"{notes}{table}\n## Weights of at least 1 %\n\n{format_table(weights, columns)}")
+    write_csv(files[1], result.rows)
+    summary = {"gaze": gaze.name, "gaze_sha256": file_sha256(gaze), "fitted": result.fitted, "scored": result.scored}
+    summary |= {"prior_kappa": result.prior_kappa, "rows": result.rows, "model": result.model.to_json()}
+    write_json(files[2], summary)
+    return files
+
+
+def print_next_look(gaze: Path, rays: Path, output: Path | None, options: NextLookOptions, reporter: Reporter) -> None:
+    """Call `evaluate_next_look`, and print the scores as a table."""
+    result = evaluate_next_look(gaze, rays, output or gaze.with_suffix(".next"), options, reporter)
+    rows = [
+        {"elapsed": f"{row['elapsed']:g} s", **{k: row.get(k, math.nan) for k in _COLUMNS[1:]}} for row in result.rows
+    ]
+    reporter.message(format_score_table(rows, f"{gaze.name}: {result.scored} held-out participants"))
+    for path in result.files:
+        reporter.message(f"wrote {path}")
