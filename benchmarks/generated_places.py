@@ -20,9 +20,14 @@ Box = tuple[tuple[float, float, float], tuple[float, float, float]]
 # Standard deviation of the log preference of a participant, and of the angular error of gaze (radians).
 _TASTE, _JITTER = 0.5, np.radians(8.0)
 # Probability per sample of a new target: five samples per second, and about 0.6 s per fixation.
-_NEW_LOOK = 0.33
-_RATE = 5.0
+NEW_TARGET_PROBABILITY = 0.33
+RATE = 5.0
 _SPEED = 0.7
+
+
+def draw_preferences(rng: np.random.Generator, count: int) -> np.ndarray:
+    """Preferences (count,) of a participant for each target, factors of its attraction."""
+    return np.exp(_TASTE * rng.normal(size=count))
 
 
 @dataclass(frozen=True)
@@ -67,15 +72,17 @@ class GeneratedPlace:
         )
         return path
 
-    def record(self, scene: Path, people: int = 16, seconds: float = 240.0, seed: int = 0):
-        """Rays of ``people`` participants in ``scene`` (its file), ``seconds`` each."""
+    def record(self, scene: Path, people: int = 16, seconds: float = 240.0, seed: int = 0, targets: list | None = None):
+        """Rays of ``people`` participants in ``scene`` (its file), ``seconds`` each. ``targets`` receives, for each
+        participant, the weights (N, K) of the targets without preferences, the preferences (K,) and the selected
+        targets (N,)."""
         from nerg_mi.rays.rays import Rays
 
         import mitsuba as mi
 
         twin = mi.load_file(str(scene))
         rng = np.random.default_rng(seed)
-        count = round(seconds * _RATE)
+        count = round(seconds * RATE)
         middles = np.array([t.middle for t in self.things])
         halves = np.array([t.half for t in self.things])
         normals = np.eye(3)[np.argmin(halves, axis=1)]
@@ -83,14 +90,16 @@ class GeneratedPlace:
         origins, directions, who, times = [], [], [], []
         for person in range(people):
             p, direction = self._walk(rng, count)
-            taste = np.exp(_TASTE * rng.normal(size=len(draws)))
+            taste = np.r_[draw_preferences(rng, len(draws)), 1.0, 1.0]
             offset = middles[None] - p[:, None]
             distance = np.linalg.norm(offset, axis=2)
             cosine = np.abs(np.einsum("nkc,kc->nk", offset / distance[..., None], normals))
             seen = self._seen(twin, p, middles)
-            weight = draws * taste * cosine * seen / (1 + (distance / self.falloff) ** 2)
+            weight = draws * cosine * seen / (1 + (distance / self.falloff) ** 2)
             weight = np.concatenate([weight, np.full((count, 1), self.ahead), np.full((count, 1), self.around)], axis=1)
-            selected = self._look(rng, weight)
+            selected = self._look(rng, weight * taste)
+            if targets is not None:
+                targets.append((weight, taste, selected))
             d = np.empty((count, 3))
             spot = rng.uniform(-1, 1, (count, 3))
             for i, k in enumerate(selected):
@@ -105,7 +114,7 @@ class GeneratedPlace:
             origins.append(p)
             directions.append(d / np.linalg.norm(d, axis=1, keepdims=True))
             who.append(np.full(count, person))
-            times.append(np.arange(count) / _RATE)
+            times.append(np.arange(count) / RATE)
         joined = [np.concatenate(v) for v in (times, who, origins, directions)]
         names = tuple(f"{self.name}-{k:02d}" for k in range(people))
         return Rays(joined[0], joined[1], names, joined[2], joined[3], np.ones(len(joined[0])))
@@ -129,11 +138,11 @@ class GeneratedPlace:
             far = np.linalg.norm(away)
             if rest:
                 rest -= 1
-            elif far < _SPEED / _RATE:
+            elif far < _SPEED / RATE:
                 goal, rest = point(home), int(rng.integers(5, 40))
             else:
                 direction = away / far
-                ahead = at + direction * _SPEED / _RATE
+                ahead = at + direction * _SPEED / RATE
                 if self.free(ahead[None])[0]:
                     at = ahead
                 else:
@@ -146,7 +155,7 @@ class GeneratedPlace:
         drawn = (np.cumsum(weight, axis=1) / weight.sum(axis=1, keepdims=True) < rng.random((len(weight), 1))).sum(
             axis=1
         )
-        new, out = rng.random(len(weight)) < _NEW_LOOK, drawn.copy()
+        new, out = rng.random(len(weight)) < NEW_TARGET_PROBABILITY, drawn.copy()
         for i in range(1, len(out)):
             # A target that is no longer visible is dropped.
             if not new[i] and weight[i, out[i - 1]] > 0:
