@@ -233,6 +233,7 @@ INPUTS = {
     "train gaze": {"views", "align_views", "field", "scene", "align"},
     "eval folds": {"field", "scene", "align"},
     "eval gaze": {"field", "scene", "geometry"},
+    "eval next": {"field", "scene", "geometry"},
     "ablate": {"field", "scene"},
     "report": {"aois"},
     "bake": {"gaze", "rays", "observer_file", "align"},
