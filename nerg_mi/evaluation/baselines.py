@@ -106,6 +106,15 @@ def make_prior_baseline(
     return evaluate
 
 
+def aim(points: np.ndarray, directions: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    """Return unit directions (..., 3) from ``origin`` to ``points``, or ``directions`` where a point is not finite or
+    nearer than 0.15 m."""
+    offset = points - origin
+    length = np.linalg.norm(offset, axis=-1, keepdims=True)
+    is_aimed = np.isfinite(length) & (length > _MIN_DISTANCE)
+    return np.where(is_aimed, np.where(is_aimed, offset, 0) / np.where(is_aimed, length, 1), directions)
+
+
 class Neighbours:
     """The training rays nearest to a position, as seen from it.
 
@@ -131,10 +140,7 @@ class Neighbours:
         distance, index = self._tree.query(positions, k=np.arange(1, k + 1))
         directions = self._directions[index]
         if self._hits is not None:
-            offset = self._hits[index] - positions[:, None]
-            length = np.linalg.norm(offset, axis=2, keepdims=True)
-            with np.errstate(invalid="ignore", divide="ignore"):
-                directions = np.where(length > _MIN_DISTANCE, offset / length, directions)
+            directions = aim(self._hits[index], directions, positions[:, None])
         return distance, directions
 
 

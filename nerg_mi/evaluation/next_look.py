@@ -31,7 +31,7 @@ from nerg_mi.maths.sphere import fibonacci_directions, sample_uniform_directions
 from nerg_mi.rays.filters import find_sessions
 from nerg_mi.rays.rays import Rays
 
-from .baselines import UNIFORM_DENSITY
+from .baselines import UNIFORM_DENSITY, aim
 from .gaze import EPS
 
 RayDensity = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -47,7 +47,6 @@ EARLIER_LOOKS, EARLIER_INTERVAL = 120, 0.5
 """Number of looks before the last one that a participant may return to, and the seconds between them."""
 
 _WALKING_SPEED = 0.5  # m/s; a slower displacement is a less certain walking direction
-_MIN_DISTANCE = 0.15  # metres; nearer surface points are not aimed at
 _BLOCK = 128  # looks whose kernels on the grid are held at the same time
 
 
@@ -174,15 +173,6 @@ def _trace(distance: RayDistance, origins: np.ndarray, directions: np.ndarray) -
     """Surface points (N, 3) along rays; NaN where there is none."""
     length = np.asarray(distance(origins, directions))
     return origins + np.where(np.isfinite(length), length, np.nan)[:, None] * directions
-
-
-def aim(points: np.ndarray, directions: np.ndarray, origin: np.ndarray) -> np.ndarray:
-    """Unit directions (..., 3) from ``origin`` to ``points``, or ``directions`` where a point is not finite or nearer
-    than 0.15 m."""
-    offset = points - origin
-    length = np.linalg.norm(offset, axis=-1, keepdims=True)
-    is_aimed = np.isfinite(length) & (length > _MIN_DISTANCE)
-    return np.where(is_aimed, np.where(is_aimed, offset, 0) / np.where(is_aimed, length, 1), directions)
 
 
 def find_heading(displacement: np.ndarray, elapsed: np.ndarray) -> np.ndarray:
