@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -131,12 +131,14 @@ class Neighbours:
         from scipy.spatial import KDTree
 
         self._directions, self._hits = np.asarray(rays.direction, np.float64), hits
-        self._tree = KDTree(rays.origin, leafsize=_LEAF_SIZE)
+        # SciPy's stubs lack sequences of ranks.
+        self._tree: Any = KDTree(rays.origin, leafsize=_LEAF_SIZE)
 
     def find(self, positions: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Find up to ``count`` rays of each of ``positions`` (P, 3): distances (P, k) in metres, nearest first, and
         directions (P, k, 3)."""
         k = min(count, len(self._directions))
+        # A sequence of ranks, so that one neighbour also has an axis of its own.
         distance, index = self._tree.query(positions, k=np.arange(1, k + 1))
         directions = self._directions[index]
         if self._hits is not None:

@@ -151,7 +151,7 @@ class FieldDensity:
 
 
 def format_score_table(rows: list[dict], title: str) -> str:
-    """Format ``rows`` as a table for the terminal."""
+    """Format ``rows`` as a table for the terminal; a score that is not defined is left out."""
     from rich.console import Console
     from rich.table import Table
 
@@ -159,7 +159,7 @@ def format_score_table(rows: list[dict], title: str) -> str:
     for k in rows[0]:
         out.add_column(k, justify="left" if isinstance(rows[0][k], str) else "right")
     for row in rows:
-        out.add_row(*(v if isinstance(v, str) else f"{v:.4f}" if k == "MAE" else f"{v:.3f}" for k, v in row.items()))
+        out.add_row(*(v if isinstance(v, str) else "" if np.isnan(v) else f"{v:.3f}" for v in row.values()))
     # Fixed width, so that a table in a file or pipe is not folded.
     console = Console(width=120)
     with console.capture() as text:

@@ -245,7 +245,7 @@ def _evaluate_fold(
 def _needs_no_prior(fold: FoldDensities) -> bool:
     """Return whether a small weight of the prior is best by far in this fold."""
     gains = FoldResults(0.0, None, [fold]).compute_gains().mean(axis=0)
-    return PRIOR_WEIGHTS[gains.argmax()] <= _SMALL_WEIGHT and gains.max() > _CLEAR_GAIN
+    return bool(PRIOR_WEIGHTS[gains.argmax()] <= _SMALL_WEIGHT and gains.max() > _CLEAR_GAIN)
 
 
 def _round_values(value):
