@@ -11,7 +11,7 @@ import pytest
 from nerg_mi.cli import main
 from nerg_mi.cli.building import find_commands
 from nerg_mi.workflows.base import COMMANDS
-from tests.cli.outputs import make_inputs
+from tests.cli.outputs import list_trainings, make_inputs
 
 
 class Ended(NamedTuple):
@@ -56,10 +56,8 @@ def inputs(tmp_path_factory):
 
     mi.set_variant("llvm_ad_rgb")
     folder = make_inputs(tmp_path_factory.mktemp("inputs"))
-    place = "--geometry hits --radius 0.5 --probes 8 --steps 2 --directions 64 --zones 0 --min-rays 8"
-    line = f"train gaze {folder}/rays.npz {place} --test-zones 1 --test-positions 3"
-    for more in ("-o gaze.safetensors", "--test-participants 0.5 -o participants.safetensors"):
+    for line in list_trainings(folder):
         with pytest.raises(SystemExit) as end:
-            main([*line.split(), *more.replace("-o ", f"-o {folder}/").split()])
+            main(line)
         assert not end.value.code
     return folder

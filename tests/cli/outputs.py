@@ -294,3 +294,12 @@ def make_inputs(folder: Path) -> Path:
     metadata = {**lens, "frames": frames, "aabb": [[-1, -1, -1], [1, 1, 1]]}
     (photos / "transforms.json").write_text(json.dumps(metadata))
     return folder
+
+
+def list_trainings(folder: Path) -> list[list[str]]:
+    """Command lines that train the gaze fields of `CASES` on the inputs in ``folder``, without and with held-out
+    participants."""
+    line = f"train gaze {folder}/rays.npz --geometry hits --radius 0.5 --probes 8 --steps 2 --directions 64 --zones 0"
+    line += " --min-rays 8 --test-zones 1 --test-positions 3"
+    more = f"-o {folder}/gaze.safetensors", f"--test-participants 0.5 -o {folder}/participants.safetensors"
+    return [[*line.split(), *words.split()] for words in more]

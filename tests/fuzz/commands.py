@@ -82,11 +82,9 @@ def _inputs() -> Path:
 
     mi.set_variant("llvm_ad_rgb")
     folder = outputs.make_inputs(Path(tempfile.mkdtemp(prefix="nerg-commands-")))
-    line = (
-        f"train gaze {folder}/rays.npz -o {folder}/gaze.safetensors --geometry hits --radius 0.5 --probes 8 --steps 2"
-    )
-    with contextlib.suppress(SystemExit):
-        nerg_mi.cli.main([*line.split(), *"--directions 64 --zones 0 --min-rays 8 --test-zones 1".split()])
+    for line in outputs.list_trainings(folder):
+        with contextlib.suppress(SystemExit):
+            nerg_mi.cli.main(line)
     (folder / "align.json").write_text(json.dumps(np.eye(4).tolist()))
     return folder
 
