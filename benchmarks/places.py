@@ -254,6 +254,7 @@ def summarise(each: list[dict]) -> list[dict]:
             scale = interval(less)
             row |= {s: means[OURS], f"{s} prior": means[PRIOR], f"{s} best": means[best], f"{s} best is": best}
             row |= {f"{s} rank": order.index(OURS) + 1, f"{s} less": less.mean(), f"{s} reach": scale}
+            row[f"{s} each"] = ", ".join(f"{v:+.3f}" for v in less)
             half = [r[s] for r in separate if r["method"] == HALF]
             row[f"{s} half"] = float(np.mean(half)) if half else np.nan
         # With few participants one half predicts the other worse than the position-independent prior does: the fraction
@@ -295,14 +296,17 @@ def show(rows: list[dict]) -> None:
         table = [
             [
                 r["place"],
+                r["folds"],
                 f"{r[f'{s} prior']:.3f}",
+                r[f"{s} best is"],
+                f"{r[f'{s} best']:.3f}",
                 f"{r[s]:.3f}",
-                f"{r[f'{s} less']:+.3f} ± {r[f'{s} reach']:.3f}",
-                "" if isnan(r[f"{s} half"]) else f"{r[f'{s} half']:.2f}",
+                f"{r[f'{s} less']:+.3f} ± {r[f'{s} reach']:.3f}" if r["folds"] > 2 else r[f"{s} each"],
             ]
             for r in rows
         ]
-        head = (s, "position-independent prior", "field", "field minus best baseline", "split half")
+        head = (s, "folds", "position-independent prior", "best baseline", "its value", "field")
+        head = (*head, "field minus best baseline")
         print_table(f"{s} in all scenes", head, table)
     print("means over scenes: " + ", ".join(f"{s} {sum(r[s] for r in rows) / len(rows):.3f}" for s in SCORES))
     ranks = [r[f"{s} rank"] for r in rows for s in SCORES]
