@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import shutil
@@ -43,9 +44,11 @@ def write_hash(common: Settings, value: Run, output: Path) -> None:
     """Write a line with the number and the content of the inputs."""
     if value.runs:
         Path(value.runs, f"{value.number}-{os.getpid()}-{time.time_ns()}").touch()
-    if value.die and Path(value.die).exists():
-        Path(value.die).unlink()
-        os.kill(os.getpid(), signal.SIGKILL)
+    if value.die:
+        # Another process may remove the file at the same time: the one that removes it is killed.
+        with contextlib.suppress(FileNotFoundError):
+            Path(value.die).unlink()
+            os.kill(os.getpid(), signal.SIGKILL)
     time.sleep(value.seconds + common.seconds)
     text = "".join(path.read_text() for path in common.files)
     write_text(output, hashlib.sha256(f"{value.number} {text}".encode()).hexdigest() + "\n")
