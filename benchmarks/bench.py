@@ -36,9 +36,9 @@ from collections.abc import Callable
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 import processes
 import torch_frames
+from nerg_mi.fields.kde import SphericalKde
 from nerg_mi.figures.style import save
 from nerg_mi.llvm import has_cuda
-from nerg_mi.probes.kde import SphericalKde
 from nerg_mi.workflows.demo import find_store_scene
 from timing import at_the_end, exponent, in_turns, median, print_table, spread, write_rows
 

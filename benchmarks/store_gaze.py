@@ -26,7 +26,7 @@ DIRECTIONS = 2048
 
 def fresh_draws(law, count: int, kappa: float):
     """Baseline: kernel densities of ``count`` samples of ``law`` at each position."""
-    from nerg_mi.probes.kde import SphericalKde
+    from nerg_mi.fields.kde import SphericalKde
 
     def evaluate(positions, directions):
         rng = np.random.default_rng(1)

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from nerg_mi.fields.kde import Backend, SphericalKde
 from nerg_mi.maths.vmf import log_normaliser
-from nerg_mi.probes.kde import Backend, SphericalKde
 from nerg_mi.probes.probes import compute_participant_weights
 from nerg_mi.rays.folds import iter_folds, sample_participants_equally
 from nerg_mi.rays.rays import Rays

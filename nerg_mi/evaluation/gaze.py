@@ -11,11 +11,11 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.fields.gaze_base import AnyGazeField
+from nerg_mi.fields.kde import SphericalKde
 from nerg_mi.maths.arrays import to_vector
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.maths.types import variant_types
-from nerg_mi.probes.kde import SphericalKde
 from nerg_mi.probes.probes import place_probes
 from nerg_mi.rays.filters import purge, split_by_person
 from nerg_mi.rays.folds import sample_participants_equally

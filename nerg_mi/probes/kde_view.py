@@ -9,11 +9,11 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.fields.gaze_base import DataSummary
+from nerg_mi.fields.kde import Backend, SphericalKde, SphericalKdeTable
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.types import Float, Point3f, Vector3f
 from nerg_mi.rays.rays import RayIndex, Rays
 
-from .kde import Backend, SphericalKde, SphericalKdeTable
 from .probes import Probes, place_probes
 
 # ---- Frame ----
@@ -87,7 +87,7 @@ def evaluate_kde_frame(
         Pixels (...) that show a surface; others are 0.
     method : str
         ``exact`` sums all rays at all pixels in one kernel. ``table`` interpolates a table of the visible part of the
-        sphere, with an error below 1e-4 of the maximum of a single kernel (:mod:`nerg_mi.probes.kde`). ``auto`` uses a
+        sphere, with an error below 1e-4 of the maximum of a single kernel (:mod:`nerg_mi.fields.kde`). ``auto`` uses a
         table from 4,096 pixels on.
     backend : Backend
         Dr.Jit backend (LLVM or CUDA) on which the density is evaluated. Default: that of Mitsuba's variant.
@@ -141,7 +141,7 @@ def evaluate_kde_frame(
 #
 # The density is estimated from the rays with the nearest origins (NeRG, Section 5.3, and the baseline of ``nerg eval
 # gaze``). The rays are selected once per observer; the density is summed at every pixel or tabulated
-# (:mod:`nerg_mi.probes.kde`).
+# (:mod:`nerg_mi.fields.kde`).
 
 
 class KdeView:

@@ -8,11 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from nerg_mi.errors import NergError
+from nerg_mi.fields.kde import Backend, SphericalKde, compute_silverman_kappas, select_loo_kappas
 from nerg_mi.maths import vmf
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.rays.rays import Neighbours, RayIndex, Rays
-
-from .kde import Backend, SphericalKde, compute_silverman_kappas, select_loo_kappas
 
 # ---- Placement of probes: on a lattice, at random, at ray origins, or at evenly spaced ray origins (blue noise) ----
 
@@ -198,7 +197,7 @@ def place_probes(
         Concentration of ``fixed``, and upper bound of the other rules: a participant who stares causes a peak that a
         few thousand directions cannot resolve.
     kappa_shared : bool
-        Use one κ for all probes (:mod:`nerg_mi.probes.kde`).
+        Use one κ for all probes (:mod:`nerg_mi.fields.kde`).
     eye_kappa : float, optional
         Concentration of the eye-in-head distribution to convolve with, see :meth:`Probes.widen`.
     weights : str

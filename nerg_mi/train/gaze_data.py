@@ -14,12 +14,12 @@ from scipy.spatial.transform import Rotation
 
 from nerg_mi.errors import NergError
 from nerg_mi.fields.gaze_base import GazeHeadConfig, RaySupport, add_prior_floor, make_prior_table, table_directions
+from nerg_mi.fields.kde import SphericalKde
 from nerg_mi.maths.arrays import to_vector
 from nerg_mi.maths.geometry import AnyBox, intersect_box_numpy
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.maths.types import variant_types
 from nerg_mi.photos.salience import SalienceView
-from nerg_mi.probes.kde import SphericalKde
 from nerg_mi.probes.probes import Probes, compute_participant_weights, place_probes
 from nerg_mi.rays.filters import purge, split_by_person, split_by_position
 from nerg_mi.rays.rays import Rays

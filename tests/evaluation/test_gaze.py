@@ -13,9 +13,9 @@ from nerg_mi.errors import NergError
 from nerg_mi.evaluation import gaze, metrics
 from nerg_mi.evaluation.baselines import make_prior_baseline, make_uniform_baseline
 from nerg_mi.evaluation.gaze import FieldDensity, compute_map_scores
+from nerg_mi.fields.kde import SphericalKde
 from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.probes.kde import SphericalKde
 from nerg_mi.probes.probes import place_probes
 from nerg_mi.rays.rays import Rays
 from nerg_mi.train.gaze_data import hold_out

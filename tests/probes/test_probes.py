@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from nerg_mi.fields.kde import select_loo_kappa
 from nerg_mi.maths import vmf
 from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.probes.kde import select_loo_kappa
 from nerg_mi.probes.probes import (
     REGION_LEVELS,
     calibrate_levels,

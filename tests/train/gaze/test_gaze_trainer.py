@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
+from nerg_mi.fields.kde import SphericalKde
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.probes.kde import SphericalKde
 from nerg_mi.probes.probes import place_probes
 from nerg_mi.rays.rays import Rays
 from nerg_mi.train.gaze_data import Supervision, TargetRequirements, make_targets_from_probes, make_targets_from_rays

@@ -12,11 +12,12 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.fields.mlp import namespace
 from nerg_mi.maths import vmf
 from nerg_mi.maths.arrays import to_vector
 from nerg_mi.maths.types import Array3f, Float, UInt32
 from nerg_mi.maths.vmf import log_normaliser
+
+from .mlp import namespace
 
 # ---- Bandwidth ----
 #

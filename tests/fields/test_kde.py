@@ -1,12 +1,10 @@
-"""Tests of `nerg_mi.probes.kde`."""
+"""Tests of `nerg_mi.fields.kde`."""
 
 import drjit as dr
 import numpy as np
 import pytest
 
-from nerg_mi.maths import vmf
-from nerg_mi.maths.sphere import fibonacci_directions, sample_uniform_directions
-from nerg_mi.probes.kde import (
+from nerg_mi.fields.kde import (
     SphericalKde,
     SphericalKdeTable,
     compute_loo_scores,
@@ -15,6 +13,8 @@ from nerg_mi.probes.kde import (
     select_loo_kappa,
     select_loo_kappas,
 )
+from nerg_mi.maths import vmf
+from nerg_mi.maths.sphere import fibonacci_directions, sample_uniform_directions
 from tests.reference.kde import kde as reference
 
 # ---- Estimate ----
