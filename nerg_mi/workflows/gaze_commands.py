@@ -157,7 +157,10 @@ class GazeOptions(DerivedOptions, GeometryOptions):
         64, "Maximum number of test positions, in all held-out zones together.", within=Range(1, 10**5), group=TEST
     )
     test_participants: float = option(
-        0.0, "Fraction of the participants that are also held out for testing.", within=TEST_FRACTIONS, group=TEST
+        0.0,
+        "Fraction of the participants that are held out for testing, in addition to the positions of --test-zones.",
+        within=TEST_FRACTIONS,
+        group=TEST,
     )
     ensemble: int = option(
         0,
@@ -417,7 +420,10 @@ class AblationOptions(DerivedOptions, HeldOutOptions, GeometryOptions, PartOptio
         None, f"Number of training steps of the recipe default.  {_BY_RECIPE}", within=STEPS, group=TRAINING
     )
     test_participants: float = option(
-        0.0, "Fraction of the participants that are also held out for testing.", within=TEST_FRACTIONS, group=TEST
+        0.0,
+        "Fraction of the participants that are held out for testing, in addition to the positions of --test-zones.",
+        within=TEST_FRACTIONS,
+        group=TEST,
     )
     radius: float = option(0.25, "Radius of the test probes in metres.", within=LENGTHS, group=TEST)
     ground_truth: str | None = option(

@@ -112,8 +112,8 @@ class PictureOptions(ValidatedDataclass):
     )
     overlay: str | None = option(
         None,
-        "AOV drawn over the colour with a colour scale (.png, .svg, .mp4): gaze, kde, depth or any other.  [default: "
-        "colour only]",
+        "Name of the AOV that is drawn over the colour, with a colour scale: gaze, kde, depth or any other. The output "
+        "must be .png, .svg or .mp4.  [default: colour only]",
         group=VIEW,
     )
     vmax: float | None = _vmax("the overlay's colour scale, for gaze in 1/sr")
@@ -206,7 +206,8 @@ class SceneOptions(ValidatedDataclass):
     align: Path | None = option(None, ALIGN_HELP, group=INPUT)
     geometry: str | None = option(
         None,
-        'Geometry for rays alone: "hits" (a volume of their hit points) or "none".  [default: hits if there are any]',
+        'Geometry if gaze rays are shown without an environment model: "hits" (a volume of their hit points) or '
+        '"none".  [default: hits if there are any]',
         group=INPUT,
     )
     mode: str | None = best_variant()
@@ -254,7 +255,8 @@ class ViewOptions(ValidatedDataclass):
     align: Path | None = option(None, ALIGN_HELP, group=INPUT)
     geometry: str | None = option(
         None,
-        'Geometry for rays alone: "hits" (a volume of their hit points) or "none".  [default: hits if there are any]',
+        'Geometry if gaze rays are shown without an environment model: "hits" (a volume of their hit points) or '
+        '"none".  [default: hits if there are any]',
         group=INPUT,
     )
     open: bool = option(False, "Open the page in the browser of this machine.", group=OUTPUT)
@@ -600,8 +602,8 @@ class BakeOptions(PartOptions):
     )
     max_edge: float | None = option(
         None,
-        "Maximum edge length of a triangle in metres; longer edges are split.  [default: yields about 100,000 "
-        "triangles]",
+        "Maximum edge length of a triangle in metres; longer edges are split.  [default: a length that "
+        "yields about 100,000 triangles]",
         within=LENGTHS,
         group=ANALYSIS,
     )

@@ -371,8 +371,9 @@ class SceneCameraOptions(ValidatedDataclass):
 
     poses: Path | None = option(  # required
         None,
-        "Model with frames of the scene video and the photos of the environment: its transforms.json, or the folder of "
-        "a COLMAP model; or aligned_poses.csv of tag-aligner, camera_pose.json of the Reference Image Mapper.",
+        "Poses of the scene camera: the transforms.json or the COLMAP folder of a structure-from-motion model of the "
+        "environment's photos and frames of the scene video; for recordings of Neon also aligned_poses.csv (written by "
+        "tag-aligner) or camera_pose.json (by the Reference Image Mapper).",
     )
     frames: FrameNames | None = option(
         None,

@@ -32,10 +32,10 @@ class TableOptions(ValidatedDataclass):
         parse=ColumnMap.parse,
         is_recorded=False,
     )
-    units: str = option("m", "Unit of length of a mapped table: m, cm or mm.", is_recorded=False)
+    units: str = option("m", "Unit of length of a table read with --map: m, cm or mm.", is_recorded=False)
     up: str = option("z", "Up axis: x, y, z, -x, -y or -z.", is_recorded=False)
     handedness: str = option(
-        "right", "Handedness of a mapped table: right, or left (Unity).", flag="--hand", is_recorded=False
+        "right", "Handedness of a table read with --map: right, or left (Unity).", flag="--hand", is_recorded=False
     )
     forward: str | None = option(
         None,
@@ -43,9 +43,11 @@ class TableOptions(ValidatedDataclass):
         default_text="y up: z (left-handed) or -z, otherwise x",
         is_recorded=False,
     )
-    radians: bool = option(False, "Angles of a mapped table are in radians.", is_recorded=False)
+    radians: bool = option(
+        False, "Angles of a table read with --map are in radians instead of degrees.", is_recorded=False
+    )
     person_from: str = option(
-        "column", "Source of the participants of a mapped table: column or filename.", is_recorded=False
+        "column", "Source of the participants' names in a table read with --map: column or filename.", is_recorded=False
     )
     min_confidence: float = option(0.0, "Drop rows below this confidence.", within=Range(0, 1))
     valid: str | None = valid_option()
