@@ -110,13 +110,13 @@ def check_points(source: np.ndarray, target: np.ndarray, label: str, *, upright:
 
     ``label`` names the points in the message, such as 'the file "pairs.csv"'.
     """
-    for points, frame in ((source, "tracking"), (target, "place")):
+    for points, frame in ((source, "tracking"), (target, "environment")):
         check_coordinates(points, f"{label}: points in the frame of the {frame}")
-    for points, frame in ((source, "tracking"), (target, "place")):
+    for points, frame in ((source, "tracking"), (target, "environment")):
         reason = _degeneracy(points, upright)
         if reason:
             raise NergError(
-                f"{label}: {reason} in the frame of the {frame}, so the alignment is undetermined; pick other points"
+                f"{label}: in the frame of the {frame}, {reason}, so the alignment is undetermined; pick other points"
             )
 
 

@@ -58,9 +58,9 @@ def ssim(picture: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None)
 class DepthScore:
     """Depth errors over pixels with known depth.
 
-    ``median`` and ``mean`` are absolute errors in scene units, ``outlier_fraction`` the fraction of pixels with an
-    error above 10 % (or without a surface), ``opacity`` the mean, and ``translucent_fraction`` the fraction of pixels
-    with opacity below 0.9.
+    ``median`` and ``mean`` are absolute errors in scene units. ``outlier_fraction`` is the fraction of pixels whose
+    error exceeds 10 % of the known depth, or which have no surface. ``opacity`` is the mean opacity, and
+    ``translucent_fraction`` the fraction of pixels with an opacity below 0.9.
     """
 
     median: float

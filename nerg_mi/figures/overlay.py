@@ -86,7 +86,10 @@ class Heat:
 
     def __post_init__(self):
         if not (np.isfinite(self.vmax) and self.vmax > 0):
-            raise NergError(f"the top of a heat map's scale must be positive, got {self.vmax}; give a range")
+            raise NergError(
+                f"the upper end of a heat map's scale must be positive, got {self.vmax}; set --vmax to a positive "
+                "number, or use data that are not 0 everywhere"
+            )
         if not 0 <= self.decades <= MAX_DECADES:
             raise NergError(f"a scale has 0 (linear) to {MAX_DECADES:.0f} decades, got {self.decades}")
         find_colormap(self.colormap)
@@ -119,7 +122,7 @@ def robust_max(values, mask, percentile: float = 99.5) -> float:
     if top <= 0 and masked.size:
         top = float(masked.max())  # the percentile may exclude all pixels with attention
     if not top > 0:
-        raise NergError("this image contains no gaze to derive a scale from; move the camera or give a range")
+        raise NergError("this image contains no gaze to derive a scale from; move the camera or set --vmax")
     return top
 
 

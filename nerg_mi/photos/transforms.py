@@ -348,7 +348,10 @@ def _read_distortion(data: dict) -> dict[str, float]:
     if values is None:
         return {}
     if not isinstance(values, list) or len(values) != len(_DISTORTION):
-        raise NergError(f'its "distortion_params" must be the numbers {", ".join(_DISTORTION)}')
+        raise NergError(
+            f'its "distortion_params" are not a list of {len(_DISTORTION)} numbers; list {", ".join(_DISTORTION)} in '
+            "this order, or leave them out"
+        )
     numbers = dict(zip(_DISTORTION, values))
     return {k: _read_number(numbers, k) for k in _DISTORTION}
 

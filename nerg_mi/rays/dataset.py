@@ -340,7 +340,8 @@ class Conditions:
         return self._overlaps_time(part.start, part.end) and self._overlaps_box(part.low, part.high)
 
     def may_match_group(self, bounds: dict[str, tuple[Any, Any]]) -> bool:
-        """Whether rays of a row group may match; ``bounds`` are the minimum and maximum of its columns, if recorded."""
+        """Whether rays of a row group may match. ``bounds`` are the minimum and maximum of its columns; a column
+        without recorded bounds excludes nothing."""
         axes = [bounds.get(f"origin_{axis}") for axis in "xyz"]
         if all(axes) and not self._overlaps_box([a[0] for a in axes if a], [a[1] for a in axes if a]):
             return False

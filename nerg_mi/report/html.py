@@ -86,7 +86,7 @@ def key_value_table(rows: Iterable[tuple[Content, Content]]) -> Html:
 
 
 def image(png: bytes, alt: str, kind: str | None = None) -> Html:
-    """Return an embedded PNG image with the alternative text ``alt``."""
+    """Return an HTML image of the CSS class ``kind`` that embeds the file ``png``; ``alt`` is its alternative text."""
     return element("img", src=f"data:image/png;base64,{base64.b64encode(png).decode()}", alt=alt, class_=kind)
 
 

@@ -51,13 +51,15 @@ def evaluate_gaze_density(
     box : AnyBox
         Bounds of the field.
     parameters : dict
-        Parameter arrays by their names in the field. Gradients reach every entry that the variant uses.
+        Parameter arrays by their names in the field. Gradients reach every entry that ``config.variant`` uses.
     p_od : Array3f
         Surface points (B * D lanes).
     p_o : Array3f
         Observer positions (B lanes).
     r_o : Array3f
-        Unit viewing directions (B * D lanes), D for each observer in turn.
+        Unit vectors from the observers to the surface points (B * D lanes), D for each observer in turn.
+    ns : module
+        Dr.Jit backend of the arrays, such as ``drjit.llvm.ad``.
     semantic : list of Float, optional
         Radiance-field features (B * D lanes) if ``config`` uses them.
 

@@ -111,7 +111,7 @@ def refine_stride(
     max_prepass_samples: int,
     wait_for_clearing: bool = True,
 ) -> int:
-    """Return the march stride of the next step: ``stride``, or the next finer one of ``strides`` and 1.
+    """Return the march stride of the next step: ``stride``, or the largest smaller value among ``strides`` and 1.
 
     The stride is refined if the schedule (``scheduled``) is finer and free space is cleared far enough that the density
     pass has room for ``MIN_RAYS_TO_REFINE`` rays.

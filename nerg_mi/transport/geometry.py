@@ -51,10 +51,10 @@ class Ceiling:
         dr.make_opaque(self._height, self._up)
 
     def clip_ray(self, ray: Any) -> tuple[Any, Float]:
-        """``ray`` (unit direction) from its intersection with the plane on, and the distance of that intersection from
-        its origin.
+        """Move the origin of ``ray`` to the plane x · up = height, if it starts above (x · up > height) and crosses it.
 
-        The distance is 0 for a ray that starts below the plane or never crosses it. Differentiable in the ray.
+        Returns the ray (unit direction) and the distance by which its origin was moved: 0 for a ray that starts below
+        the plane or never crosses it. Differentiable in the ray.
         """
         over, fall = dr.dot(ray.o, self._up) - self._height, -dr.dot(ray.d, self._up)
         cuts = (over > 0) & (fall > _MIN_FALL)

@@ -158,7 +158,8 @@ class ColumnMap:
             )
         if self.eye is not None and not poses:
             raise NergError(
-                "column map: eye is in the head's frame and needs a pose; add one (xyzw, wxyz, ypr or matrix)"
+                "column map: \"eye\" is a position in the head's frame and needs the head's orientation; add one of "
+                "the keys xyzw, wxyz, ypr and matrix"
             )
         if self.head is not None and (poses or not (self.direction or self.angles)):
             raise NergError(

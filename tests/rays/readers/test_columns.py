@@ -104,7 +104,7 @@ def test_round_trip(text):
         ("origin=x,y,z azel=d,e yawpitch=f,g", "azel and yawpitch are two directions"),
         ("origin=x,y,z azel=d", "azel needs 2"),
         ("origin=x,y,z matrix=" + ",".join("abcdefghijkl"), "leave out origin"),
-        ("origin=x,y,z direction=a,b,c eye=e,f,g", "needs a pose"),
+        ("origin=x,y,z direction=a,b,c eye=e,f,g", "orientation; add one of"),
         ("origin=x,y,z direction=a,b,c xyzw=d,e,f,g head=h,i,j", "leave out head or xyzw"),
         ("origin=x,y,z xyzw=d,e,f,g head=h,i,j", "leave out head"),
         ("origin=x,y,x direction=a,b,c", "'x' has two roles"),
