@@ -46,7 +46,9 @@ the integrator's ``field``.
 
 For an ensemble (``nerg train gaze --ensemble``) gaze is the mean of the members, each normalised separately if it is
 normalised; the AOV ``gaze_std`` of the integrator shows their standard deviation. The checkpoint also stores the number
-of training rays near a position (AOV ``support``).
+of training rays near a position (AOV ``support``), and may store re-aimed hits (``nerg train gaze --reaimed-hits``):
+hit points of training rays, whose kernel density around the observer is mixed into ``gaze``. It is differentiable in
+the observer's position and in directions to first order; ``dr.freeze`` cannot record it.
 
 .. tabs::
     .. code-tab:: xml

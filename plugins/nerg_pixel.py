@@ -331,7 +331,9 @@ class Pixel:
     @cached_property
     def gaze(self) -> ObservedGaze:
         """The gaze field for the observer."""
-        return self.observer.gaze(self.context, self.camera.geometry)
+        gaze = self.observer.gaze(self.context, self.camera.geometry)
+        gaze.prepare(dr.width(self.r_o))
+        return gaze
 
     @property
     def _can_use_gaze_map(self) -> bool:

@@ -18,6 +18,7 @@ from nerg_mi.maths.types import Bool, Float, Point3f, Vector3f
 from nerg_mi.ranges import MAX_COORDINATE
 
 from .encoding import Encoding, EncodingConfig, config_from_dict
+from .gaze_hits import ReaimedHits
 from .mlp import MLP, namespace
 from .radiance import assign_parameters
 
@@ -200,6 +201,7 @@ class AnyGazeField:
     config: Any
     box: AnyBox
     support: RaySupport | None = None  # Number of training rays near a position, if known
+    hits: ReaimedHits | None = None  # Re-aimed hits, whose density is mixed into that of the networks
     basis: DataSummary | None = None  # Total number of training rays and participants, if known
 
     @property

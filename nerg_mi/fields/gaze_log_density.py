@@ -3,7 +3,8 @@
 gaze(p_o, r_o) = (1 - m) emit(p_od, -r_o, log |p_od - p_o|) * sigmoid(F_c(p_o, r_o)) / Z(p_o) + m prior(r_o)
 
 Z(p_o) is the integral of the product over all directions, so that gaze integrates to one for any weights: a softmax
-over the sphere. ``prior`` is the position-independent density of gaze directions, m its weight. The factors are those
+over the sphere. ``prior`` is the position-independent density of gaze directions, m its weight; re-aimed hits
+(:mod:`nerg_mi.fields.gaze_hits`) may be mixed in as well. The factors are those
 of :mod:`nerg_mi.fields.gaze_product`, but emit and capture have separate networks: one over the surfaces, the other
 over the positions of observers. Fields of earlier versions have the prior as a third factor of the product.
 """

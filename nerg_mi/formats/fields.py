@@ -22,13 +22,14 @@ from nerg_mi.fields.gaze_base import (
     max_sizes_of,
     summarize_provenance,
 )
+from nerg_mi.fields.gaze_hits import ReaimedHits
 from nerg_mi.fields.mlp import MLP
 from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid, RefinedGrid, unpack_bits
 from nerg_mi.fields.radiance import Background, BackgroundConfig, RadianceConfig, RadianceField
 from nerg_mi.files.atomic import file_sha256
 from nerg_mi.maths.arrays import copy_aligned
 from nerg_mi.maths.geometry import box_from_dict
-from nerg_mi.ranges import POSITIVE_VALUES
+from nerg_mi.ranges import MAX_COORDINATE, POSITIVE_VALUES
 
 from .checkpoint import read_checkpoint, read_metadata, write_checkpoint
 
@@ -329,8 +330,14 @@ def matches_checksum(path: str | Path, sha256: object) -> bool:
     )
 
 
+_HIT_PARAMETERS = ("weight", "bandwidth", "kappa")  # Numbers of `ReaimedHits` in the metadata
+
+
 def save_gaze(field: AnyGazeField, path: str | Path, provenance: dict, half: bool = False) -> None:
-    """Write ``field`` with its support, if any. ``provenance`` (JSON) describes the training data and settings."""
+    """Write ``field`` with its support and its re-aimed hits, if any.
+
+    ``provenance`` (JSON) describes the training data and settings.
+    """
     config, tensors = field.config, to_stored_arrays(field.parameters(), half)
     metadata = {
         "architecture": field.architecture(),
@@ -342,11 +349,21 @@ def save_gaze(field: AnyGazeField, path: str | Path, provenance: dict, half: boo
     if field.support is not None:
         # Counts and positions are never stored as fp16.
         tensors["support.cells"], metadata["support"] = field.support.cells, {"radius": field.support.radius}
+    if field.hits is not None:
+        tensors["hits.origins"], tensors["hits.points"] = field.hits.origins, field.hits.points
+        metadata["hits"] = {name: getattr(field.hits, name) for name in _HIT_PARAMETERS}
     write_checkpoint(path, "gaze", tensors, metadata)
 
 
+def _read_hits(arrays: StoredArrays, parameters: object) -> ReaimedHits:
+    get = lambda name: arrays.get_array(f"hits.{name}", None, 3, max_value=MAX_COORDINATE)
+    values = {name: read_number(parameters, name, "re-aimed hits") for name in _HIT_PARAMETERS}
+    return ReaimedHits(get("origins"), get("points"), **values)
+
+
 def load_gaze(path: str | Path, ns: ModuleType) -> tuple[AnyGazeField, dict[str, Any]]:
-    """Read the gaze field in ``path`` on the backend ``ns``, with its support, and its metadata.
+    """Read the gaze field in ``path`` on the backend ``ns``, with its support and its re-aimed hits, and its
+    metadata.
 
     Raises `NergError` if the file contains no gaze field.
     """
@@ -361,5 +378,9 @@ def load_gaze(path: str | Path, ns: ModuleType) -> tuple[AnyGazeField, dict[str,
             field.support = RaySupport(
                 arrays.get_array("support.cells", None, 5, max_value=POSITIVE_VALUES.high), meta["support"]["radius"]
             )
+        if "hits" in meta:
+            field.hits = _read_hits(arrays, meta["hits"])
+            if not field.config.normalized:
+                raise ValueError("it has re-aimed hits, but its gaze field is not normalised")
         field.basis = summarize_provenance(meta["provenance"]) if isinstance(meta.get("provenance"), dict) else None
     return field, meta

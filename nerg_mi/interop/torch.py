@@ -32,6 +32,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.fields.gaze_base import AnyGazeField, GazeEnsemble
 from nerg_mi.fields.mlp import is_cuda
 from nerg_mi.fields.radiance import RadianceField
+from nerg_mi.maths.arrays import to_vector
 
 
 class _FieldModule(torch.nn.Module):
@@ -191,6 +192,7 @@ class GazeModule(_FieldModule):
         r_o: torch.Tensor,
         integral: torch.Tensor | float | None = None,
         misses: torch.Tensor | None = None,
+        hits: torch.Tensor | None = None,
     ) -> torch.Tensor:
         """Evaluate the gaze density (N,) in 1/sr.
 
@@ -206,11 +208,14 @@ class GazeModule(_FieldModule):
             Integral of a normalised field over the sphere of each observer, (N,) or one number for all; see `integral`.
         misses
             Boolean mask (N,) of the directions that hit no surface. Default: none.
+        hits
+            For a field with re-aimed hits, their density (N,), which `evaluate_hits` computes.
 
         Raises
         ------
         ValueError
-            For a normalised field without its integral, and for tensors of the wrong shape.
+            For a normalised field without its integral, a field with re-aimed hits without their density, and tensors
+            of the wrong shape.
         """
         if self._field.config.normalized and integral is None:
             raise ValueError(
@@ -219,7 +224,13 @@ class GazeModule(_FieldModule):
             )
         extra = self._make_extra_rows(len(p_od), 1.0 if integral is None else integral, misses)
         evaluate = lambda field, p, o, r, e: [field.evaluate(p, o, r, integral=e.x, escaped=e.y > 0.5)[0]]
-        return self._evaluate(evaluate, *self._check_rows(p_od=p_od, p_o=p_o, r_o=r_o), extra)[0]
+        gaze = self._evaluate(evaluate, *self._check_rows(p_od=p_od, p_o=p_o, r_o=r_o), extra)[0]
+        return _mix_hits(self._field, gaze, hits)
+
+    def evaluate_hits(self, p_o: torch.Tensor, r_o: torch.Tensor) -> torch.Tensor:
+        """Evaluate the density (N,) in 1/sr of the field's re-aimed hits, without gradients. Arguments as for
+        `forward`."""
+        return _evaluate_hits(self._field, p_o, r_o)
 
     def evaluate_unnormalized(
         self, p_od: torch.Tensor, p_o: torch.Tensor, r_o: torch.Tensor, misses: torch.Tensor | None = None
@@ -279,7 +290,7 @@ class GazeEnsembleModule(torch.nn.Module):
     def field(self) -> GazeEnsemble:
         """Return a copy of the ensemble with the current weights."""
         ensemble = GazeEnsemble([member.field() for member in self._get_members()], self._field.support)
-        ensemble.basis = self._field.basis
+        ensemble.basis, ensemble.hits = self._field.basis, self._field.hits
         return ensemble
 
     def _get_members(self) -> list[GazeModule]:
@@ -292,6 +303,7 @@ class GazeEnsembleModule(torch.nn.Module):
         r_o: torch.Tensor,
         integral: torch.Tensor | None = None,
         misses: torch.Tensor | None = None,
+        hits: torch.Tensor | None = None,
     ) -> torch.Tensor:
         """Evaluate the gaze density (members, N) of each member.
 
@@ -303,7 +315,12 @@ class GazeEnsembleModule(torch.nn.Module):
                 f"integral must have one entry for each of the {len(self.members)} members, got {len(integral)}"
             )
         integrals = [None] * len(self.members) if integral is None else integral
-        return torch.stack([member(p_od, p_o, r_o, z, misses) for member, z in zip(self._get_members(), integrals)])
+        gaze = torch.stack([member(p_od, p_o, r_o, z, misses) for member, z in zip(self._get_members(), integrals)])
+        return _mix_hits(self._field, gaze, hits)
+
+    def evaluate_hits(self, p_o: torch.Tensor, r_o: torch.Tensor) -> torch.Tensor:
+        """Evaluate the density (N,) of the re-aimed hits; see `GazeModule.evaluate_hits`."""
+        return _evaluate_hits(self._field, p_o, r_o)
 
     def forward(
         self,
@@ -312,15 +329,39 @@ class GazeEnsembleModule(torch.nn.Module):
         r_o: torch.Tensor,
         integral: torch.Tensor | None = None,
         misses: torch.Tensor | None = None,
+        hits: torch.Tensor | None = None,
     ) -> torch.Tensor:
         """Evaluate the gaze density (N,) in 1/sr, the mean over the members."""
-        return self.forward_members(p_od, p_o, r_o, integral, misses).mean(0)
+        return self.forward_members(p_od, p_o, r_o, integral, misses, hits).mean(0)
 
     def integral(
         self, p_od: torch.Tensor, p_o: torch.Tensor, r_o: torch.Tensor, misses: torch.Tensor | None = None
     ) -> torch.Tensor:
         """Compute the integral of each member (members,) over the sphere of one observer; see `GazeModule.integral`."""
         return torch.stack([member.integral(p_od, p_o, r_o, misses) for member in self._get_members()])
+
+
+def _mix_hits(field: AnyGazeField, gaze: torch.Tensor, hits: torch.Tensor | None) -> torch.Tensor:
+    """Mix the density ``hits`` (N,) of the re-aimed hits into ``gaze`` (..., N), if the field has them."""
+    if field.hits is None:
+        return gaze
+    if hits is None:
+        raise ValueError('this gaze field has re-aimed hits: pass "hits", which the method evaluate_hits computes')
+    if hits.shape != gaze.shape[-1:]:
+        raise ValueError(
+            f"hits must be a tensor of length {gaze.shape[-1]}, one value per row, got {tuple(hits.shape)}"
+        )
+    return (1 - field.hits.weight) * gaze + field.hits.weight * hits
+
+
+def _evaluate_hits(field: AnyGazeField, p_o: torch.Tensor, r_o: torch.Tensor) -> torch.Tensor:
+    if field.hits is None:
+        raise ValueError("this gaze field has no re-aimed hits")
+    positions, observer = np.unique(p_o.detach().cpu().numpy(), axis=0, return_inverse=True)
+    kde = field.hits.make_kde(field.hits.find(positions), field.ns)
+    directions = to_vector(field.ns.Array3f, r_o.detach().cpu().numpy())
+    density = kde.density(field.ns.UInt32(observer.ravel().astype(np.uint32)), directions)
+    return torch.as_tensor(np.array(density), device=p_o.device)
 
 
 def _to_columns(ns, p):

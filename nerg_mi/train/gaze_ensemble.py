@@ -170,8 +170,10 @@ def train_ensemble(
         selection = evaluate_folds(supervision, geometry, full_plan, ns, on_progress).select()
     if selection is not None:
         for field in fields:
-            selection.apply(field, supervision.rays, geometry, plan)
+            selection.apply_prior(field, supervision.rays, geometry, plan)
     ensemble = GazeEnsemble(fields, supervision.make_support(plan.probes.radius, geometry))
+    if selection is not None:
+        ensemble.hits = selection.make_hits(supervision.rays, geometry, plan)
     ensemble.basis = summarize_provenance(supervision.count_data())
     provenance = _combine_provenances(provenances, plan.settings, supervision, kind) | (
         {"mix": selection.to_dict()} if selection else {}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -12,10 +12,12 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.fields.gaze_base import GazeHead, GazeHeadConfig, interpolate_table
+from nerg_mi.fields.gaze_hits import MAX_HITS, ReaimedHits, place_missing_points
 from nerg_mi.interruption import Interruption
 from nerg_mi.maths.arrays import to_vector
+from nerg_mi.maths.vmf import log_normaliser
 from nerg_mi.probes.probes import calibrate_levels, compute_region_levels
-from nerg_mi.ranges import KAPPAS
+from nerg_mi.ranges import KAPPAS, LENGTHS
 from nerg_mi.rays.folds import iter_folds, sample_participants_equally
 from nerg_mi.rays.rays import Rays
 
@@ -23,12 +25,14 @@ from .gaze_data import (
     Supervision,
     TargetRequirements,
     compute_observer_bounds,
+    find_hit_points,
     make_observer_targets,
     make_prior_from_rays,
     make_rotated_directions,
     make_targets_from_rays,
     select_prior_kappa,
 )
+from .gaze_settings import GazeSettings
 from .gaze_trainer import GazePlan, GazeProgress, GazeTrainer, ProgressCallback
 from .geometry import TrainingGeometry
 
@@ -46,6 +50,10 @@ from .geometry import TrainingGeometry
 # the prior alone, so where nothing can be learned from position the weight is one. Without surfaces a field can only
 # interpolate between positions, and the deduction is larger. If the field needs no prior in the first folds, the
 # others are skipped. The held-out rays also calibrate the highest-density regions of the mixture.
+#
+# Re-aimed hits (`fields.gaze_hits`) are mixed in, too: their kernels, bandwidth and weight are those with the best mean
+# over the same participants, if they improve it by _HITS_CAUTION standard errors; otherwise their weight is zero, and
+# nothing of them is stored.
 
 PRIOR_WEIGHTS = np.array([0.01, 0.02, *(0.05 * np.arange(1, 21))])
 """Candidate weights of the prior. Zero is excluded, so that no density is zero."""
@@ -55,11 +63,19 @@ _MAX_RAYS, _NUM_DIRECTIONS = 320, 1024
 _CLEAR_GAIN = 0.1  # Nats per ray
 # Standard errors over participants that are deducted from a gain, with and without surfaces
 _CAUTION, _CAUTION_WITHOUT_SURFACES = 1.0, 2.0
-# Number of folds after which a small weight is accepted, if the mean of each fold is best with a weight up to
-# _SMALL_WEIGHT and exceeds the prior by _CLEAR_GAIN
-_MIN_FOLDS, _SMALL_WEIGHT = 2, 0.1
+# Numbers of folds and of held-out participants after which a small weight is accepted, if the mean of each fold is best
+# with a weight up to _SMALL_WEIGHT and exceeds the prior by _CLEAR_GAIN
+_MIN_FOLDS, _MIN_PARTICIPANTS, _SMALL_WEIGHT = 2, 12, 0.1
 _SE_FACTOR = 0.5  # Standard errors by which the first variant may be worse than the best
 _MIN_DENSITY = 1e-9  # Minimum density (1/sr), so that its logarithm is finite
+
+HIT_WEIGHTS = np.array([0.0, 0.05, *(0.1 * np.arange(1, 10)), 0.95])
+"""Candidate weights of the re-aimed hits."""
+HIT_KERNELS = tuple((bandwidth, kappa) for bandwidth in (0.2, 0.4, 0.8, 1.6) for kappa in (50.0, 100.0, 200.0))
+"""Candidate bandwidths (metres) and concentrations of the re-aimed hits."""
+_HITS_CAUTION = 1.0
+# Pairs of candidate weights: of the prior and of the re-aimed hits
+_WEIGHT_PAIRS = np.array([(m, h) for m in PRIOR_WEIGHTS for h in HIT_WEIGHTS if m + h <= 1 + 1e-9])
 
 
 _KEYS = {"prior_weight": "mix"}  # Fields with another name in checkpoints
@@ -82,6 +98,10 @@ class PriorSelection:
     # The variant selected by `select_variant`, and the bits of each variant with its own weight in the common folds.
     variant: str | None = None
     variants: dict[str, float] | None = None
+    # Weight, bandwidth (metres) and concentration of the re-aimed hits; a weight of zero: none.
+    hits_weight: float = 0.0
+    hits_bandwidth: float | None = None
+    hits_kappa: float | None = None
 
     def to_dict(self) -> dict:
         """Return the selection as JSON, for the provenance."""
@@ -96,16 +116,33 @@ class PriorSelection:
             raise ValueError(f'its "mix" must be from 0 to 1, got {selection.prior_weight}')
         if selection.prior_kappa is not None and selection.prior_kappa not in KAPPAS:
             raise ValueError(f'its "prior_kappa" must be positive, got {selection.prior_kappa}')
+        if not 0 <= selection.hits_weight <= 1 - selection.prior_weight + 1e-6:
+            raise ValueError(f'its "hits_weight" must be from 0 to 1, got {selection.hits_weight}')
+        bandwidth, kappa = selection.hits_bandwidth, selection.hits_kappa
+        if selection.hits_weight and (
+            bandwidth is None or kappa is None or bandwidth not in LENGTHS or kappa not in KAPPAS
+        ):
+            raise ValueError('its "hits_bandwidth" and "hits_kappa" must be positive')
         return selection
 
-    def apply(self, field: GazeHead, rays: Rays | None, geometry: TrainingGeometry, plan: GazePlan) -> None:
+    def apply_prior(self, field: GazeHead, rays: Rays | None, geometry: TrainingGeometry, plan: GazePlan) -> None:
         """Set the prior of a ``field`` that was trained on ``rays``."""
         table = None
         if self.prior_kappa is not None and rays is not None:
             table = make_prior_from_rays(
                 rays, field.config.prior, geometry, plan.settings.seed, plan.probes.weights, self.prior_kappa
             )
-        field.set_prior(self.prior_weight, table)
+        # The hits are mixed into the mixture of field and prior.
+        rest = 1 - self.hits_weight
+        field.set_prior(round(min(self.prior_weight / rest, 1.0), 6) if rest else 1.0, table)
+
+    def make_hits(self, rays: Rays | None, geometry: TrainingGeometry, plan: GazePlan) -> ReaimedHits | None:
+        """Make the re-aimed hits of ``rays`` for the field; None if their weight is zero."""
+        if not self.hits_weight or rays is None or self.hits_bandwidth is None or self.hits_kappa is None:
+            return None
+        rays = sample_participants_equally(rays, MAX_HITS, plan.settings.seed + 5)
+        rays = replace(rays, hit=find_hit_points(rays, geometry, plan.probes.depth))
+        return _make_hits(rays, geometry, self.hits_bandwidth, self.hits_kappa, self.hits_weight)
 
 
 def selects_prior_weight(plan: GazePlan) -> bool:
@@ -121,6 +158,10 @@ class FoldDensities(NamedTuple):
     prior: np.ndarray  # Of the prior (n,)
     field_maps: np.ndarray  # Of the field in D directions of equal area (n, D)
     prior_maps: np.ndarray  # Of the prior (n, D)
+    # Of the re-aimed hits (n, C) with each of `HIT_KERNELS`; C is 0 if they are not used.
+    hits: np.ndarray
+    # Maps (n, D) of the re-aimed hits with one of `HIT_KERNELS`
+    make_hit_maps: Callable[[int], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -133,24 +174,65 @@ class FoldResults:
     caution: float = _CAUTION  # Standard errors over participants that are deducted from a gain
 
     def select(self) -> PriorSelection:
-        """Select the weight of the prior; the default weight if there are no folds."""
+        """Select the weights of the prior and of the re-aimed hits; the default weight if there are no folds."""
         if not self.folds:
             return PriorSelection(self.default_weight, 0)
         gains = self.compute_gains()
         index = _select_weight(gains, self.caution)
-        weight, mean = float(PRIOR_WEIGHTS[index]), gains.mean(axis=0) / np.log(2)
-        regions = _calibrate_regions(self.folds, weight)
-        return PriorSelection(weight, len(self.folds), self.kappa, float(mean[index]), float(mean[0]), regions)
+        selection = PriorSelection(float(PRIOR_WEIGHTS[index]), len(self.folds), self.kappa)
+        selected, kernel = gains[:, index], None
+        candidates = [self._compute_mixed_gains(k) for k in range(self.folds[0].hits.shape[1])]
+        columns = [gains[:, _select_weight(gains, self.caution)] for gains in candidates]
+        if candidates:
+            best = int(np.argmax([column.mean() for column in columns]))
+            gain = columns[best] - selected
+            if gain.mean() > _HITS_CAUTION * _standard_error(gain):
+                selected, kernel = columns[best], best
+                pair = _WEIGHT_PAIRS[_select_weight(candidates[best], self.caution)]
+                (weight, hits), (bandwidth, kappa) = pair.tolist(), HIT_KERNELS[best]
+                selection = replace(
+                    selection, prior_weight=weight, hits_weight=hits, hits_bandwidth=bandwidth, hits_kappa=kappa
+                )
+        to_bits = lambda nats: float(nats.mean() / np.log(2))
+        regions = _calibrate_regions(self.folds, selection, kernel)
+        return replace(selection, bits=to_bits(selected), bits_field=to_bits(gains[:, 0]), regions=regions)
 
     def compute_gains(self, folds: int | None = None) -> np.ndarray:
         """Return the mean log density over that of the prior alone, in nats, of each held-out participant and with
         each of `PRIOR_WEIGHTS` (N, S), in the first ``folds`` folds."""
-        gains = []
-        for fold in self.folds[:folds]:
-            mixed = (1 - PRIOR_WEIGHTS) * fold.field[:, None] + PRIOR_WEIGHTS * fold.prior[:, None]
-            gain = _log(mixed) - _log(fold.prior)[:, None]
-            gains += [gain[fold.person == p].mean(axis=0) for p in np.unique(fold.person)]
-        return np.array(gains)
+        mix = lambda fold: (1 - PRIOR_WEIGHTS) * fold.field[:, None] + PRIOR_WEIGHTS * fold.prior[:, None]
+        return _average_gains(self.folds[:folds], mix)
+
+    def compute_selected_gains(self, selection: PriorSelection, folds: int) -> np.ndarray:
+        """Return the same (N,) with the weights of ``selection``."""
+        m, h = selection.prior_weight, selection.hits_weight
+        kernel = HIT_KERNELS.index((selection.hits_bandwidth, selection.hits_kappa)) if h else None
+        mix = lambda fold: _mix(fold.field, fold.prior, 0 if kernel is None else fold.hits[:, kernel], m, h)[:, None]
+        return _average_gains(self.folds[:folds], mix)[:, 0]
+
+    def _compute_mixed_gains(self, kernel: int) -> np.ndarray:
+        """Return the same (N, W) with each of `_WEIGHT_PAIRS` and the re-aimed hits of one of `HIT_KERNELS`."""
+        m, h = _WEIGHT_PAIRS.T
+        mix = lambda fold: _mix(fold.field[:, None], fold.prior[:, None], fold.hits[:, kernel, None], m, h)
+        return _average_gains(self.folds, mix)
+
+
+def _mix(field: Any, prior: Any, hits: Any, prior_weight: Any, hits_weight: Any) -> np.ndarray:
+    return (1 - prior_weight - hits_weight) * field + prior_weight * prior + hits_weight * hits
+
+
+def _average_gains(folds: Sequence[FoldDensities], mix: Callable[[FoldDensities], np.ndarray]) -> np.ndarray:
+    """Return the mean log of the densities ``mix`` (n, S) over the prior, of each held-out participant (N, S)."""
+    gains = []
+    for fold in folds:
+        gain = _log(mix(fold)) - _log(fold.prior)[:, None]
+        gains += [gain[fold.person == p].mean(axis=0) for p in np.unique(fold.person)]
+    return np.array(gains)
+
+
+def _standard_error(values: np.ndarray) -> np.ndarray:
+    """Return the standard error of the means of the rows of ``values`` (N, ...); zero for one row."""
+    return values.std(axis=0, ddof=1) / np.sqrt(len(values)) if len(values) > 1 else np.zeros_like(values[0])
 
 
 def _log(density: np.ndarray) -> np.ndarray:
@@ -196,6 +278,8 @@ def evaluate_folds(
         kappa = select_prior_kappa(rays, probes.weights, settings.seed)
     plan = replace(plan, probes=replace(probes, mix_kappa=kappa))
     box = compute_observer_bounds(geometry.points_to_field(rays.origin), geometry.box)
+    if settings.reaimed_hits:
+        rays = replace(rays, hit=find_hit_points(rays, geometry, probes.depth))
     for k, (train, held_out) in enumerate(iter_folds(rays, probes.radius, settings.mix_folds, settings.seed)):
         try:
             targets = make_targets_from_rays(train, geometry, probes, needs, seed=settings.seed)
@@ -211,7 +295,7 @@ def evaluate_folds(
                 stop.check()
         test = sample_participants_equally(held_out, _MAX_RAYS, settings.seed + 3)
         folds.append(_evaluate_fold(trainer, train, test, geometry, plan, needs))
-        if len(folds) == _MIN_FOLDS and all(map(_needs_no_prior, folds)):
+        if len(folds) == _MIN_FOLDS and _has_enough_participants(folds, settings) and all(map(_needs_no_prior, folds)):
             break
     on_progress(GazeProgress("folds", 1.0, settings.steps or 0, 0.0, None))
     caution = _CAUTION_WITHOUT_SURFACES if geometry.medium is None else _CAUTION
@@ -221,17 +305,13 @@ def evaluate_folds(
 def _evaluate_fold(
     trainer: GazeTrainer, train: Rays, test: Rays, geometry: TrainingGeometry, plan: GazePlan, needs: TargetRequirements
 ) -> FoldDensities:
-    """Evaluate the field of ``trainer``, and the prior of the rays ``train``, at the rays ``test``."""
+    """Evaluate the field of ``trainer``, and the prior and the hits of the rays ``train``, at the rays ``test``."""
     seed, rows, ns = plan.settings.seed, plan.config.prior, trainer.ns
     maps = make_rotated_directions(_NUM_DIRECTIONS, len(test), np.random.default_rng(seed + 3))
     directions = geometry.directions_to_field(np.concatenate([maps, test.direction[:, None]], axis=1))
+    positions = geometry.points_to_field(test.origin)
     targets = make_observer_targets(
-        geometry.points_to_field(test.origin),
-        directions,
-        np.zeros(directions.shape[:2]),
-        geometry,
-        plan.probes.depth,
-        needs,
+        positions, directions, np.zeros(directions.shape[:2]), geometry, plan.probes.depth, needs
     )
     field = trainer.evaluate_densities(targets).astype(np.float64)
     # The trainer normalises over all directions, among which that of the ray is one too many.
@@ -239,7 +319,49 @@ def _evaluate_fold(
     table = make_prior_from_rays(train, rows, geometry, seed, plan.probes.weights, plan.probes.mix_kappa)
     log = interpolate_table(ns.Float(table.ravel()), rows, to_vector(ns.Array3f, directions.reshape(-1, 3)))
     prior = np.exp(np.asarray(log, np.float64)).reshape(field.shape)
-    return FoldDensities(test.person, field[:, -1], prior[:, -1], field[:, :-1], prior[:, :-1])
+    hits = np.empty((len(test), 0))
+    if plan.settings.reaimed_hits:
+        train = sample_participants_equally(train, MAX_HITS, seed + 5)
+        hits = _evaluate_hit_kernels(train, geometry, positions, directions[:, -1])
+
+    def make_hit_maps(kernel: int) -> np.ndarray:
+        bandwidth, kappa = HIT_KERNELS[kernel]
+        kernels = _make_hits(train, geometry, bandwidth, kappa)
+        return kernels.make_kde(kernels.find(positions), ns).evaluate(directions[:, :-1])
+
+    return FoldDensities(test.person, field[:, -1], prior[:, -1], field[:, :-1], prior[:, :-1], hits, make_hit_maps)
+
+
+def _make_hits(
+    rays: Rays, geometry: TrainingGeometry, bandwidth: float, kappa: float, weight: float = 1.0
+) -> ReaimedHits:
+    """Make the re-aimed hits of ``rays`` with hit points, if any; ``bandwidth`` is in metres."""
+    bandwidth *= geometry.align.scale
+    origins, directions = geometry.points_to_field(rays.origin), geometry.directions_to_field(rays.direction)
+    points = None if rays.hit is None else geometry.points_to_field(rays.hit)
+    points = place_missing_points(origins, directions, points, bandwidth)
+    return ReaimedHits(origins, points, weight, bandwidth, kappa)
+
+
+def _evaluate_hit_kernels(
+    rays: Rays, geometry: TrainingGeometry, positions: np.ndarray, directions: np.ndarray
+) -> np.ndarray:
+    """Evaluate the re-aimed hits of ``rays`` with each of `HIT_KERNELS` (n, C) in ``directions`` from ``positions``
+    (n, 3)."""
+    columns, neighbours = [], {}
+    for bandwidth, kappa in HIT_KERNELS:
+        if bandwidth not in neighbours:
+            neighbours[bandwidth] = _make_hits(rays, geometry, bandwidth, kappa).find(positions)
+        near = neighbours[bandwidth]
+        cosine = np.einsum("nkc,nc->nk", near.directions, directions)
+        kernel = np.exp(kappa * (cosine - 1) + log_normaliser(kappa))
+        columns.append((near.weights * kernel).sum(axis=1) / near.weights.sum(axis=1))
+    return np.stack(columns, axis=1)
+
+
+def _has_enough_participants(folds: Sequence[FoldDensities], settings: GazeSettings) -> bool:
+    """Return whether the ``folds`` hold out enough participants to select the re-aimed hits, if they are used."""
+    return not settings.reaimed_hits or sum(len(np.unique(fold.person)) for fold in folds) >= _MIN_PARTICIPANTS
 
 
 def _needs_no_prior(fold: FoldDensities) -> bool:
@@ -255,12 +377,18 @@ def _round_values(value):
     return round(value, 4) if isinstance(value, float) else value
 
 
-def _calibrate_regions(folds: Sequence[FoldDensities], weight: float) -> dict[str, float]:
-    """Calibrate the region levels on the held-out rays of all folds."""
-    levels = []
+def _calibrate_regions(
+    folds: Sequence[FoldDensities], selection: PriorSelection, kernel: int | None = None
+) -> dict[str, float]:
+    """Calibrate the region levels of the mixture ``selection`` on the held-out rays of all folds.
+
+    ``kernel`` is the index of its re-aimed hits in `HIT_KERNELS`.
+    """
+    levels, weights = [], (selection.prior_weight, selection.hits_weight)
     for fold in folds:
-        maps = (1 - weight) * fold.field_maps + weight * fold.prior_maps
-        at_rays = (1 - weight) * fold.field + weight * fold.prior
+        hit_maps, hits = (0.0, 0.0) if kernel is None else (fold.make_hit_maps(kernel), fold.hits[:, kernel])
+        maps = _mix(fold.field_maps, fold.prior_maps, hit_maps, *weights)
+        at_rays = _mix(fold.field, fold.prior, hits, *weights)
         levels.append(compute_region_levels(maps, at_rays[:, None])[:, 0])
     return calibrate_levels(np.concatenate(levels), np.ones(sum(map(len, levels))))
 
@@ -272,16 +400,16 @@ def within_half_se(losses: np.ndarray) -> np.ndarray:
     The standard error is that of the difference to the best column, over participants.
     """
     excess = losses - losses[:, [int(losses.mean(axis=0).argmin())]]
-    error = excess.std(axis=0, ddof=1) / np.sqrt(len(losses)) if len(losses) > 1 else np.zeros(losses.shape[1])
-    return np.flatnonzero(excess.mean(axis=0) <= _SE_FACTOR * error)
+    return np.flatnonzero(excess.mean(axis=0) <= _SE_FACTOR * _standard_error(excess))
 
 
 def _select_weight(gains: np.ndarray, caution: float = _CAUTION) -> int:
-    """Return the index of the best of `PRIOR_WEIGHTS` for the ``gains`` (N, S) of N participants over the prior, from
-    which ``caution`` standard errors are deducted."""
+    """Return the index of the best of S mixtures by their ``gains`` (N, S) over the prior for N participants.
+
+    ``caution`` standard errors are deducted from the gains.
+    """
     mean = gains.mean(axis=0)
-    error = gains.std(axis=0, ddof=1) / np.sqrt(len(gains)) if len(gains) > 1 else np.zeros_like(mean)
-    cautious = mean - caution * error
+    cautious = mean - caution * _standard_error(gains)
     return int((mean if cautious.max() > _CLEAR_GAIN else cautious).argmax())
 
 
@@ -370,10 +498,7 @@ def _select_best(
     count = min(len(scored.folds) for scored in results)
     if not count:
         return plan, selections[0]
-    gains = []
-    for scored, selection in zip(results, selections):
-        index = int(np.abs(PRIOR_WEIGHTS - selection.prior_weight).argmin())
-        gains.append(scored.compute_gains(count)[:, index])
+    gains = [scored.compute_selected_gains(selection, count) for scored, selection in zip(results, selections)]
     losses = -np.stack(gains, axis=1)
     k = int(within_half_se(losses)[0])
     variants = {c.variant: float(-loss / np.log(2)) for c, loss in zip(configs, losses.mean(axis=0))}

@@ -287,6 +287,7 @@ register_recipe(
             "ema_decay": 0.95,
             "validation_min_rays": 64,
             "mix_folds": 5,
+            "reaimed_hits": True,
         },
         # Probes are spaced evenly over the observer positions; a density proportional to the rays would follow where
         # people linger. Participants are weighted equally, because a long stay of one participant says little about
@@ -301,7 +302,7 @@ register_recipe(
             "weights": "person",
         },
         views_only_settings={"steps": 200, "zones": 3, "patience": 10},
-        supported_options=frozenset({"prior-folds", "prior-kappa"}),
+        supported_options=frozenset({"prior-folds", "prior-kappa", "reaimed-hits"}),
         is_quick=True,
     )
 )

@@ -57,7 +57,7 @@ class Recipe:
     # Changes of ``settings`` for training on views only, whose common structure is learned late, after a plateau.
     views_only_settings: Mapping[str, Any] = field(default_factory=lambda: {"patience": 10})
     # Options that the recipe supports, among "activation", "size", "normalize", "semantic", "init", "loss",
-    # "integral-weight", "prior-folds", "prior-kappa".
+    # "integral-weight", "prior-folds", "prior-kappa", "reaimed-hits".
     supported_options: frozenset[str] = frozenset()
     is_quick: bool = False  # Whether a training is short enough for an ablation to repeat it with several seeds
 

@@ -144,7 +144,8 @@ def train_gaze(
             interrupted = True
     field = trainer.make_field(last.weights)
     if selection is not None:
-        selection.apply(field, training.rays, geometry, plan)
+        selection.apply_prior(field, training.rays, geometry, plan)
+        field.hits = selection.make_hits(training.rays, geometry, plan)
     field.support = training.make_support(plan.probes.radius, geometry)
     field.basis = summarize_provenance(supervision.count_data())
     provenance = _make_provenance(supervision, geometry, plan, targets) | {

@@ -141,6 +141,12 @@ class GazeSettings(RunSettings):
         allowed=Range(0, 1000),
         option="prior_folds",
     )
+    reaimed_hits: bool = setting(
+        False,
+        "Only for the recipe named default: mix a kernel density of the samples' hit points, seen from the observer, "
+        "into the field, with a weight chosen by --prior-folds. The file then contains up to 32,768 samples without "
+        "names and times.",
+    )
     frozen: bool = setting(False, "Keep the weights of --init field fixed.", option="freeze")
 
     def __post_init__(self) -> None:

@@ -4,14 +4,17 @@ them."""
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import cast
 
 import drjit as dr
 import numpy as np
 
+from nerg_mi.errors import NergError
 from nerg_mi.fields.gaze_base import AnyGazeField, GazeHead, mean_over_members, std_over_members
+from nerg_mi.fields.gaze_hits import ObservedHits
+from nerg_mi.fields.mlp import namespace
 from nerg_mi.maths.arrays import to_vector
 from nerg_mi.maths.geometry import Similarity, intersect_box
 from nerg_mi.maths.sphere import fibonacci_directions_jit, morton_order
@@ -310,7 +313,22 @@ class GazeFieldInstance:
                 of_member = (made_of, Fingerprint(parameters))
                 entries = cache.get_or_compute_scalar((self, "integral", member), samples, of_member, integral.detached)
             integrals.append([integral.moving(k, p_o) for k, p_o in zip(entries, observers)])
-        return ObservedGaze(self, geometry, settings, integrals)
+        hits = []
+        if self.field.hits is not None:
+            hits = cache.get_or_compute_each((self, "hits"), observers, self.field.hits, self._observe_hits)
+        return ObservedGaze(self, geometry, settings, integrals, hits)
+
+    def _observe_hits(self, center: Point3f) -> ObservedHits:
+        """The density of re-aimed hits for the observer at ``center``."""
+        hits = self.field.hits
+        assert hits is not None
+        if is_recording():
+            raise NergError(
+                "dr.freeze cannot record a gaze field with re-aimed hits, whose neighbours are found outside of "
+                "kernels; train it with --no-reaimed-hits"
+            )
+        position = np.array(self.to_world.point_to_local(center), np.float64).ravel()
+        return hits.observe(position, namespace(center.x))
 
     def unnormalized(
         self,
@@ -413,8 +431,10 @@ class ObservedGaze:
         geometry: SceneGeometry,
         settings: ObserverSettings,
         integrals: list[list[CacheEntry]],
+        hits: Sequence[CacheEntry] = (),
     ):
         self._instance, self._geometry, self._settings, self._integrals = placed, geometry, settings, integrals
+        self._hits = list(hits)
 
     @property
     def field(self) -> AnyGazeField:
@@ -428,6 +448,11 @@ class ObservedGaze:
     def dependencies(self) -> tuple:
         """What densities depend on besides the geometry and the observers, comparable with ``==``."""
         return self._instance, self._settings, Fingerprint(self.parameters())
+
+    def prepare(self, lanes: int) -> None:
+        """Compute what the evaluation of ``lanes`` directions reads, which a recorded branch cannot compute."""
+        for entry in self._hits:
+            entry.value.prepare(lanes)
 
     def integrals(self, p_o: Point3f) -> list[Float]:
         """For each member the integral over the sphere of the observer nearest to ``p_o``, lane by lane; empty for a
@@ -532,18 +557,19 @@ class ObservedGaze:
             march = self._settings.march
             semantic = features_for_observer(field.config.semantic, self._geometry, p_od, p_o, r_o, active, march)
         integrals = self.integrals(p_o) or [None] * len(field.members)
-        return [
-            member.evaluate(
-                local.point_to_local(p_od),
-                local.point_to_local(p_o),
-                local.direction_to_local(r_o),
-                active,
-                semantic,
-                integral,
-                escaped,
-            )
+        p_od, position, direction = (
+            local.point_to_local(p_od),
+            local.point_to_local(p_o),
+            local.direction_to_local(r_o),
+        )
+        values = [
+            member.evaluate(p_od, position, direction, active, semantic, integral, escaped)
             for member, integral in zip(field.members, integrals)
         ]
+        if field.hits is None:
+            return values
+        hits = select_nearest(self._hits, p_o, lambda observed: observed.density(direction, position))
+        return [(field.hits.mix(gaze, hits), *factors) for gaze, *factors in values]
 
 
 # ---- Gaze of one observer in arbitrary directions ----

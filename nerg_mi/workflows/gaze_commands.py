@@ -396,7 +396,7 @@ declare(
     ProbeSettings,
     GazeSettings,
     default=_BY_RECIPE,
-    without=("seed", "freeze", "validation_zones", "loss", "prior_folds"),
+    without=("seed", "freeze", "validation_zones", "loss", "prior_folds", "reaimed_hits"),
 )
 @repeat_options(GazeOptions, "threads", "mode")
 @repeat_options(GazeEvaluationOptions, "kappa", "min_rays")

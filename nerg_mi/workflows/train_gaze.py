@@ -81,12 +81,12 @@ def _check(options: GazeOptions, recipe: Recipe, views_alone: bool) -> None:
     kind = geometry_kind(options)
     if views_alone and options.views is None:
         raise NergError("there is no training data: give a rays file, or --views with --salience, or both")
-    mixed = options.prior_folds or options.prior_kappa is not None
+    mixed = options.prior_folds or options.prior_kappa is not None or options.reaimed_hits
     if views_alone and (options.test_zones or kind == "hits" or options.align or options.semantic or mixed):
         raise NergError(
-            "--test-zones, --geometry hits, --align, --semantic, --prior-folds and --prior-kappa need rays; give "
-            "a rays file in addition to --views (to hold out views, remove their images from the folder; to "
-            "align views, use --align-views)"
+            "--test-zones, --geometry hits, --align, --semantic, --prior-folds, --prior-kappa and --reaimed-hits need "
+            "rays; give a rays file in addition to --views (to hold out views, remove their images from the folder; "
+            "to align views, use --align-views)"
         )
     if options.geometry is not None and options.align is not None:
         raise NergError("--align applies to --field and --scene; a geometry of hit points is in the frame of the rays")
@@ -114,6 +114,7 @@ def _check(options: GazeOptions, recipe: Recipe, views_alone: bool) -> None:
         "normalize": options.normalize,
         "prior-folds": bool(options.prior_folds),
         "prior-kappa": options.prior_kappa is not None,
+        "reaimed-hits": options.reaimed_hits is not None,
     }
     recipe.check_options([name for name, is_set in explicit.items() if is_set])
     if options.loss and options.loss not in recipe.losses:
@@ -375,7 +376,7 @@ def _report_result(result: GazeResult, reporter: Reporter) -> None:
             folds = f"{m['folds']} fold{'' if m['folds'] == 1 else 's'}"
             reporter.message(
                 f"cross-validation ({folds}): {m['bits_field']:+.3f} bits per sample of the field above the "
-                f"position-independent prior, {m['bits']:+.3f} with a weight of {100 * m['mix']:.0f} % of the prior"
+                f"position-independent prior, {m['bits']:+.3f} with {_describe_weights(m)}"
             )
             reporter.message(
                 f"regions with {100 * m['regions']['80%']:.0f} % of the field's gaze contain 80 % of the held-out gaze"
@@ -393,6 +394,17 @@ def _report_result(result: GazeResult, reporter: Reporter) -> None:
             )
     if result.output is not None:
         reporter.message(f"wrote {result.output} ({result.output.stat().st_size / 1e6:.2f} MB)")
+
+
+def _describe_weights(selection: dict) -> str:
+    """Describe the weights of a mixture that cross-validation has selected."""
+    prior = f"a weight of {100 * selection['mix']:.0f} % of the prior"
+    if not selection["hits_weight"]:
+        return prior
+    return (
+        f"{prior} and {100 * selection['hits_weight']:.0f} % of the re-aimed hits of observers nearby "
+        f"(bandwidth {selection['hits_bandwidth']:g} m, kappa {selection['hits_kappa']:g})"
+    )
 
 
 # ---- A gaze field for a scene without tracking, from recordings in other scenes ----

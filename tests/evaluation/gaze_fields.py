@@ -7,20 +7,26 @@ import numpy as np
 
 from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.gaze_base import GazeEnsemble, make_prior_table
+from nerg_mi.fields.gaze_hits import ReaimedHits
 from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
 from nerg_mi.fields.gaze_product import GazeConfig, GazeField
 from nerg_mi.formats.fields import save_gaze
 from nerg_mi.maths.geometry import Box
 from nerg_mi.maths.sphere import fibonacci_directions
 
-KINDS = ("linear", "normalised", "default recipe", "ensemble")
+KINDS = ("linear", "normalised", "default recipe", "re-aimed hits", "ensemble")
 GRID = HashGridConfig(levels=2, log2_rows=10, base=2, finest=4)
 
 
 def made(kind: str, box: Box, seed: int = 4, **options):
     """Make a field of ``kind`` with strong variation, so that evaluation errors are detected."""
-    if kind == "ensemble":
-        return GazeEnsemble([made("default recipe", box, s, **options) for s in (seed, seed + 1)])
+    if kind in ("ensemble", "re-aimed hits"):
+        members = [made("default recipe", box, s, **options) for s in (seed, seed + 1)]
+        field = GazeEnsemble(members) if kind == "ensemble" else members[0]
+        corners, rng = np.array([box.lower, box.upper]), np.random.default_rng(seed)
+        origins, points = rng.uniform(*corners, (2, 50, 3))
+        field.hits = ReaimedHits(origins, points, 0.4, 0.3 * box.side, 30.0)
+        return field
     rng = np.random.default_rng(seed)
     if kind == "default recipe":
         config = LogGazeConfig(grid=GRID, width=16, prior=16, heads=(box.lower, box.upper), mix=0.2, **options)

@@ -11,11 +11,13 @@ from safetensors.numpy import save_file
 from nerg_mi.errors import NergError
 from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.gaze_base import max_sizes_of
+from nerg_mi.fields.gaze_hits import ReaimedHits
 from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
 from nerg_mi.fields.gaze_product import GazeConfig, GazeField
 from nerg_mi.fields.mlp import MLP
 from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid, cascades_from_contracted
 from nerg_mi.fields.radiance import RadianceConfig, RadianceField
+from nerg_mi.formats.checkpoint import read_checkpoint, write_checkpoint
 from nerg_mi.formats.fields import (
     MAX_GRID_RESOLUTION,
     MAX_OCCUPANCY_CELLS,
@@ -34,6 +36,7 @@ from nerg_mi.formats.fields import (
 from nerg_mi.maths.geometry import Box, ContractedBox
 from nerg_mi.rays.rays import Rays
 from tests.conftest import ROOT
+from tests.evaluation import gaze_fields
 
 # ---- Sizes in checkpoints: within limits, or an error that names the file ----
 
@@ -251,6 +254,31 @@ def test02b_support_and_provenance_of_gaze_fields(tmp_path):
         save_gaze(make_gaze(), tmp_path / "g.safetensors", metadata)
         basis = load_gaze(tmp_path / "g.safetensors", ns)[0].basis
         assert (None if basis is None else basis.words()) == words
+
+
+def test02c_reaimed_hits_of_gaze_fields(tmp_path):
+    """Stored exactly, also with fp16 weights; damaged ones are refused in a sentence."""
+    path, rng = tmp_path / "g.safetensors", np.random.default_rng(0)
+    field = gaze_fields.made("default recipe", BOX)
+    field.hits = ReaimedHits(rng.normal(size=(9, 3)), rng.normal(size=(9, 3)), 0.25, 0.4, 60.0)
+    save_gaze(field, path, {}, half=True)
+    hits = load_gaze(path, ns)[0].hits
+    assert (hits.weight, hits.bandwidth, hits.kappa) == (0.25, 0.4, 60.0)
+    assert np.array_equal(hits.origins, field.hits.origins) and np.array_equal(hits.points, field.hits.points)
+    for change, message in (
+        (without("hits.points"), "lacks"),
+        (array("hits.points", (8, 3)), "one point for each"),
+        (array("hits.origins", (9, 2)), "has shape"),
+        (metadata(2.0, "hits", "weight"), "weight"),
+        (metadata("near", "hits", "bandwidth"), "bandwidth"),
+        (metadata(0, "hits", "kappa"), "concentration"),
+        (metadata([], "hits"), ""),
+    ):
+        tensors, meta = read_checkpoint(path, "gaze")
+        change(tensors, meta)
+        write_checkpoint(tmp_path / "h.safetensors", "gaze", tensors, meta)
+        with pytest.raises(NergError, match=message):
+            load_gaze(tmp_path / "h.safetensors", ns)
 
 
 RADIANCE_NAMES = ("grid.table", "density_net.0", "color_net.1", "occupancy.bits")

@@ -13,6 +13,7 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.gaze_base import GazeEnsemble
+from nerg_mi.fields.gaze_hits import ReaimedHits
 from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
 from nerg_mi.fields.gaze_product import GazeConfig, GazeField
 from nerg_mi.fields.radiance import Background, BackgroundConfig, RadianceConfig, RadianceField
@@ -286,6 +287,34 @@ def test04b_a_normalised_gaze_field(torch, interop, rgb, kind, tmp_path):
         module(p_od, p_o, r_o)
     with pytest.raises(ValueError, match="integral must be one number or a tensor of length 4096"):
         module(p_od, p_o, r_o, torch.ones(7))
+
+
+@pytest.mark.parametrize("members", [1, 2])
+def test04e_reaimed_hits(torch, interop, rgb, members):
+    """Their density is an argument, as the integral is."""
+    field = normalised("log") if members == 1 else GazeEnsemble([normalised("log") for _ in range(members)])
+    field.hits = ReaimedHits(RNG.uniform(-1, 1, (40, 3)), RNG.uniform(-1, 1, (40, 3)), 0.4, 0.3, 30.0)
+    module = (interop.GazeModule if members == 1 else interop.GazeEnsembleModule)(field)
+    place, eyes = SceneGeometry(None, rgb.load_dict({"type": "scene"})), torch.tensor([[0.1, -0.2, 0.3], [-0.5, 0, 0]])
+    observers = [rgb.Point3f(*eye) for eye in eyes.tolist()]
+    observed = GazeFieldInstance(field).for_observers(observers, place, ObserverSettings(march=MarchSettings(step=1)))
+    directions = torch.nn.functional.normalize(torch.tensor(RNG.normal(size=(50, 3)).astype(np.float32)), dim=1)
+    integrals = torch.tensor([float(z[0]) for z in observed.integrals(observers[0])])
+    p_o = eyes[:1].expand(50, 3).contiguous()
+    p_od = p_o + directions
+    hits = module.evaluate_hits(p_o, directions)
+    gaze = module(p_od, p_o, directions, integrals, None, hits)
+    points = [rgb.Point3f(p_od.numpy().T), rgb.Point3f(p_o.numpy().T.copy()), rgb.Vector3f(directions.numpy().T)]
+    np.testing.assert_allclose(gaze.detach().numpy(), np.array(observed.evaluate(*points, True)[0]), rtol=1e-4)
+    both = module.evaluate_hits(torch.cat([eyes[1:], eyes[:1]]), directions[:2])
+    assert both[1] == pytest.approx(float(module.evaluate_hits(eyes[:1], directions[1:2])[0]))
+    assert module.field().hits is field.hits
+    with pytest.raises(ValueError, match='pass "hits"'):
+        module(p_od, p_o, directions, integrals)
+    with pytest.raises(ValueError, match="hits must be a tensor of length 50"):
+        module(p_od, p_o, directions, integrals, None, hits[:3])
+    with pytest.raises(ValueError, match="no re-aimed hits"):
+        interop.GazeModule(normalised("log")).evaluate_hits(p_o, directions)
 
 
 @pytest.mark.parametrize("kind", ["product", "mixed"])

@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from nerg_mi.errors import NergError
 from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.gaze_log_density import LogGazeField
 from nerg_mi.fields.gaze_product import GazeConfig, GazeField
@@ -29,6 +30,7 @@ from nerg_mi.transport.observer_gaze import (
     interpolate_nearest_depth,
 )
 from nerg_mi.transport.occlusion import trace_from_observer
+from tests.evaluation.gaze_fields import made
 from tests.fields.gaze.test_log_density import BOX, SMALL
 from tests.plugins.scenes import plugin
 
@@ -106,6 +108,43 @@ def normalized():
     table = namespace("llvm_ad_rgb").Float(3 * rng.normal(size=len(field.grid.table)).astype(np.float32))
     field.set_parameters({"grid.table": table})
     return field
+
+
+def test_recorded_frames_refuse_reaimed_hits(rgb):
+    """Their neighbours are found outside of kernels."""
+    gaze, geometry, d = GazeFieldInstance(made("re-aimed hits", BOX)), room(rgb), rgb.Vector3f(0, 0, 1)
+
+    @dr.freeze
+    def look(p_o):
+        return gaze.for_observers([p_o], geometry, SETTINGS).evaluate_along(p_o, d)
+
+    with pytest.raises(RuntimeError) as caught:
+        look(rgb.Point3f(0.1, 0, 1))
+    assert isinstance(caught.value.__cause__, NergError) and "--no-reaimed-hits" in str(caught.value.__cause__)
+
+
+def test_gradients_include_reaimed_hits(rgb):
+    """With the networks' weight near zero, they are those of the hits."""
+    field = made("re-aimed hits", BOX)
+    field.hits.weight = 1.0
+    gaze, geometry = GazeFieldInstance(field, Similarity(np.diag([2.0, 2, 2, 1]))), room(rgb)
+    d = rgb.Vector3f(fibonacci_directions(30).T.astype(np.float32))
+
+    def total(p):
+        p_o = rgb.Point3f(*p.tolist())
+        dr.enable_grad(p_o)
+        lanes = p_o + dr.zeros(rgb.Point3f, 30)
+        observed = gaze.for_observers([p_o], geometry, replace(SETTINGS, directions=1 << 10))
+        value = dr.sum(observed.evaluate(lanes + d, lanes, d, rgb.Bool(True))[0])
+        dr.backward(value)
+        return value[0], np.array(dr.grad(p_o)).ravel()
+
+    p, step = np.array((0.2, -0.1, 0.9)), 1e-2
+    _, gradient = total(p)
+    for axis, slope in zip(np.eye(3), gradient):
+        difference = (total(p + step * axis)[0] - total(p - step * axis)[0]) / (2 * step)
+        assert slope == pytest.approx(difference, rel=0.02, abs=0.05)
+    assert np.abs(gradient).max() > 0.2
 
 
 def test_unnormalised_instance_and_missing_observers_are_refused(rgb):

@@ -94,7 +94,8 @@ def test_without_geometry_folds_select_the_variant(rays):
     result = train_gaze(rays, options=QUICK, reporter=heard)
     mix = result.provenance["mix"]
     assert set(mix["variants"]) == {"capture", "emit_capture"} and mix["variant"] == result.field.config.variant
-    assert mix["mix"] == result.field.config.mix
+    assert mix["mix"] == pytest.approx((1 - mix["hits_weight"]) * result.field.config.mix)
+    assert (mix["hits_weight"] > 0) == (result.field.hits is not None)
     order = [text.split(":")[0] for text in heard.texts if "fold" in text or "fit" in text]
     assert list(dict.fromkeys(order))[-1] == "fit" and order[0].startswith("fold 1 of capture")
     assert heard.messages[0].startswith("there is no geometry: cross-validation chooses")

@@ -10,16 +10,21 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.formats.checkpoint import read_checkpoint, write_checkpoint
+from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.rays.rays import Rays
 from nerg_mi.train.gaze_data import Supervision
 from nerg_mi.train.gaze_ensemble import train_ensemble
 from nerg_mi.train.gaze_folds import (
+    HIT_KERNELS,
     PRIOR_WEIGHTS,
     SELECTION_KEY,
     FoldDensities,
     FoldResults,
     PriorSelection,
     _calibrate_regions,
+    _evaluate_hit_kernels,
+    _make_hits,
+    _round_values,
     _select_best,
     _select_weight,
     evaluate_folds,
@@ -60,6 +65,12 @@ def plan_of(**changes):
     return planned(PLAIN, settings, PROBES_HERE)
 
 
+def make_fold(person, field, prior, field_maps, prior_maps, hits=None, hit_maps=None):
+    """Densities of a fold; ``hits`` (n, C) and ``hit_maps`` (n, D) are those of re-aimed hits."""
+    hits = np.empty((len(person), 0)) if hits is None else hits
+    return FoldDensities(person, field, prior, field_maps, prior_maps, hits, lambda kernel: hit_maps)
+
+
 def test02_the_best_weight_is_selected_where_the_field_is_clearly_better():
     rising, last = np.linspace(-1, 0, len(PRIOR_WEIGHTS)), len(PRIOR_WEIGHTS) - 1
     assert _select_weight(np.array([rising, rising])) == last
@@ -81,11 +92,51 @@ def test03_the_weight_maximises_the_held_out_likelihood():
     """The field holds for half of the rays of each participant, and the prior for the others."""
     field, prior = np.tile([1.0, 0.01], 50), np.tile([0.02, 0.3], 50)
     uniform = np.full((100, 8), 1 / (4 * np.pi))
-    fold = FoldDensities(np.repeat([0, 1], 50), field, prior, uniform, uniform)
+    fold = make_fold(np.repeat([0, 1], 50), field, prior, uniform, uniform)
     result = FoldResults(0.1, 20.0, [fold, fold]).select()
     expected = max(PRIOR_WEIGHTS, key=lambda m: np.log((1 - m) * field + m * prior).mean())
     assert result.prior_weight == expected and result.bits > max(0, result.bits_field)
     assert result.folds == 2 and result.prior_kappa == 20.0
+
+
+def test03b_hits_have_weight_only_if_they_improve_the_mixture():
+    """Field, prior and the hits with one of the kernels hold for a third of the rays each."""
+    third = np.tile(np.eye(3), (20, 1)) + 0.01
+    person, uniform = np.repeat(np.arange(4), 15), np.full((60, 8), 1 / (4 * np.pi))
+    hits = np.tile(third[:, :1] * 0.5, len(HIT_KERNELS))
+    useless = make_fold(person, third[:, 0], third[:, 1], uniform, uniform, hits, uniform)
+    selection = FoldResults(0.1, 20.0, [useless]).select()
+    assert selection.hits_weight == 0 and selection.hits_kappa is None
+    assert selection.prior_weight == FoldResults(0.1, 20.0, [useless._replace(hits=hits[:, :0])]).select().prior_weight
+    hits = hits.copy()
+    hits[:, 4] = third[:, 2]
+    results = FoldResults(0.1, 20.0, [useless._replace(hits=hits)])
+    selection = results.select()
+    assert (selection.hits_bandwidth, selection.hits_kappa) == HIT_KERNELS[4]
+    assert selection.hits_weight == pytest.approx(1 / 3, abs=0.06)
+    assert selection.prior_weight == pytest.approx(1 / 3, abs=0.06)
+    gains = results.compute_selected_gains(selection, 1)
+    assert gains.mean() / np.log(2) == pytest.approx(selection.bits) and selection.bits > selection.bits_field
+    assert PriorSelection.from_dict(selection.to_dict()) == PriorSelection(
+        **{k: _round_values(v) for k, v in vars(selection).items()}
+    )
+    for change in ({"hits_weight": 0.9}, {"hits_bandwidth": None}, {"hits_kappa": -1.0}):
+        with pytest.raises(ValueError, match="hits_"):
+            PriorSelection.from_dict({**selection.to_dict(), **change})
+
+
+def test03c_hits_are_seen_from_the_observer():
+    """The column of each kernel is the density of the re-aimed hits."""
+    rng = np.random.default_rng(2)
+    rays = people(0.5, each=30)
+    positions, directions = rng.uniform(0, 2, (7, 3)), fibonacci_directions(7)
+    for hit in (None, rays.origin + 3 * rays.direction):
+        rays = replace(rays, hit=hit)
+        columns = _evaluate_hit_kernels(rays, NOWHERE, positions, directions)
+        for column, (bandwidth, kappa) in zip(columns.T, HIT_KERNELS):
+            hits = _make_hits(rays, NOWHERE, bandwidth, kappa)
+            kde = hits.make_kde(hits.find(positions), ns)
+            np.testing.assert_allclose(column, np.diag(kde.evaluate(directions)), rtol=1e-3, atol=1e-5)
 
 
 @pytest.mark.parametrize(("law", "has_weight"), [(1.0, True), (0.0, False)])
@@ -137,11 +188,11 @@ def test07_regions_are_those_of_the_mixture():
     # Half of each: 0.4, 0.3, 0.2, 0.2.
     rays = [0, 1, 3]
     maps = (np.repeat(v, 3, axis=0) for v in (field, prior))
-    fold = FoldDensities(np.zeros(3, int), field[0, rays], prior[0, rays], *maps)
-    result = _calibrate_regions([fold], 0.5)
+    fold = make_fold(np.zeros(3, int), field[0, rays], prior[0, rays], *maps)
+    result = _calibrate_regions([fold], PriorSelection(0.5, 1))
     np.testing.assert_allclose([result[k] for k in ("50%", "80%", "95%")], [0.55 / 1.1, 0.9 / 1.1, 0.9 / 1.1])
     # The prior alone prefers the third direction, and the second as much as the direction without rays.
-    np.testing.assert_allclose(_calibrate_regions([fold], 1.0)["50%"], 1 - 0.5 * (0.2 + 0.2) / 0.8)
+    np.testing.assert_allclose(_calibrate_regions([fold], PriorSelection(1.0, 1))["50%"], 1 - 0.5 * (0.2 + 0.2) / 0.8)
 
 
 # ---- Variants ----
@@ -159,7 +210,7 @@ def scored(*gains):
     """Folds in which a field exceeds the prior by ``gains`` nats with the smallest weight."""
     uniform = np.ones((1, 4))
     scale = lambda gain: (np.exp(gain) - PRIOR_WEIGHTS[0]) / (1 - PRIOR_WEIGHTS[0])
-    make = lambda gain: FoldDensities(np.zeros(1, int), np.full(1, scale(gain)), np.ones(1), uniform, uniform)
+    make = lambda gain: make_fold(np.zeros(1, int), np.full(1, scale(gain)), np.ones(1), uniform, uniform)
     return FoldResults(0.1, None, [make(gain) for gain in gains])
 
 
