@@ -52,8 +52,8 @@ from .geometry import TrainingGeometry
 # others are skipped. The held-out rays also calibrate the highest-density regions of the mixture.
 #
 # Re-aimed hits (`fields.gaze_hits`) are mixed in, too: their kernels, bandwidth and weight are those with the best mean
-# over the same participants, if they improve it by _HITS_CAUTION standard errors; otherwise their weight is zero, and
-# nothing of them is stored.
+# over the same participants, if they improve it by _MIN_HITS_GAIN, which pays for their evaluation, and without
+# surfaces also by two standard errors. Otherwise their weight is zero, and nothing of them is stored.
 
 PRIOR_WEIGHTS = np.array([0.01, 0.02, *(0.05 * np.arange(1, 21))])
 """Candidate weights of the prior. Zero is excluded, so that no density is zero."""
@@ -71,9 +71,9 @@ _MIN_DENSITY = 1e-9  # Minimum density (1/sr), so that its logarithm is finite
 
 HIT_WEIGHTS = np.array([0.0, 0.05, *(0.1 * np.arange(1, 10)), 0.95])
 """Candidate weights of the re-aimed hits."""
-HIT_KERNELS = tuple((bandwidth, kappa) for bandwidth in (0.2, 0.4, 0.8, 1.6) for kappa in (50.0, 100.0, 200.0))
+HIT_KERNELS = tuple((bandwidth, kappa) for bandwidth in (0.2, 0.4, 0.8, 1.6) for kappa in (50.0, 100.0, 200.0, 400.0))
 """Candidate bandwidths (metres) and concentrations of the re-aimed hits."""
-_HITS_CAUTION = 1.0
+_MIN_HITS_GAIN = 0.02  # Nats per ray
 # Pairs of candidate weights: of the prior and of the re-aimed hits
 _WEIGHT_PAIRS = np.array([(m, h) for m in PRIOR_WEIGHTS for h in HIT_WEIGHTS if m + h <= 1 + 1e-9])
 
@@ -172,6 +172,7 @@ class FoldResults:
     kappa: float | None  # Concentration of the prior's kernels; None if it was not selected
     folds: list[FoldDensities]
     caution: float = _CAUTION  # Standard errors over participants that are deducted from a gain
+    hits_caution: float = 0.0  # Standard errors by which the re-aimed hits must improve the mixture
 
     def select(self) -> PriorSelection:
         """Select the weights of the prior and of the re-aimed hits; the default weight if there are no folds."""
@@ -186,7 +187,7 @@ class FoldResults:
         if candidates:
             best = int(np.argmax([column.mean() for column in columns]))
             gain = columns[best] - selected
-            if gain.mean() > _HITS_CAUTION * _standard_error(gain):
+            if gain.mean() > max(_MIN_HITS_GAIN, self.hits_caution * _standard_error(gain)):
                 selected, kernel = columns[best], best
                 pair = _WEIGHT_PAIRS[_select_weight(candidates[best], self.caution)]
                 (weight, hits), (bandwidth, kappa) = pair.tolist(), HIT_KERNELS[best]
@@ -298,8 +299,8 @@ def evaluate_folds(
         if len(folds) == _MIN_FOLDS and _has_enough_participants(folds, settings) and all(map(_needs_no_prior, folds)):
             break
     on_progress(GazeProgress("folds", 1.0, settings.steps or 0, 0.0, None))
-    caution = _CAUTION_WITHOUT_SURFACES if geometry.medium is None else _CAUTION
-    return FoldResults(config.mix, None if config.prior_factor else kappa, folds, caution)
+    cautions = (_CAUTION_WITHOUT_SURFACES,) * 2 if geometry.medium is None else ()
+    return FoldResults(config.mix, None if config.prior_factor else kappa, folds, *cautions)
 
 
 def _evaluate_fold(
