@@ -12,7 +12,8 @@ at 60 positions in three zones. Training data within 2R of these positions are e
 is a reference.
 
 Columns of places.csv: ``rank`` is the rank of the field among all methods but the split half. ``less`` is the field
-minus the best baseline, fold by fold, and ``reach`` the half width of its 95 % interval (Student's t). ``way`` is the
+minus the best baseline, fold by fold, and ``reach`` the half width of its 95 % interval over participants: folds share
+participants, so that it is that of one fold (root mean square over folds). ``way`` is the
 position of the field's CC between the position-independent density (0) and the split half (1), where the latter is
 better.
 
@@ -195,7 +196,8 @@ def main(argv=None) -> None:
     for name, make in parse_environments(args).items():
         result = evaluate(name, make, args)
         each += [
-            {"place": name, **{key: row[key] for key in ("fold", "split", "method", *SCORES)}} for row in result.each
+            {"place": name, **{key: row[key] for key in ("fold", "split", "method", *SCORES)}, **half_widths(row)}
+            for row in result.each
         ]
         unsure += uncertainty(name, result)
     write_rows(args.out / "folds.csv", each)
@@ -251,7 +253,8 @@ def summarise(each: list[dict]) -> list[dict]:
             order = sorted(methods, key=lambda m: -means[m] if high else means[m])
             best = next(m for m in order if m != OURS)
             less = values[OURS] - values[best]
-            scale = interval(less)
+            widths = np.array([r[f"{s} gap half width"] for r in separate if r["method"] == best], float)
+            scale = float(np.sqrt(np.mean(widths**2)))
             row |= {s: means[OURS], f"{s} prior": means[PRIOR], f"{s} best": means[best], f"{s} best is": best}
             row |= {f"{s} rank": order.index(OURS) + 1, f"{s} less": less.mean(), f"{s} reach": scale}
             row[f"{s} each"] = ", ".join(f"{v:+.3f}" for v in less)
@@ -263,6 +266,12 @@ def summarise(each: list[dict]) -> list[dict]:
         row["way"] = (row["CC"] - row["CC prior"]) / further if further > 0 else np.nan
         out.append(row)
     return out
+
+
+def half_widths(row: dict) -> dict:
+    """Half widths of the 95 % intervals, over participants, of the field's scores minus those of ``row``."""
+    ends = lambda score: (row.get(f"{score}.gap.high", nan), row.get(f"{score}.gap.low", nan))
+    return {f"{score} gap half width": (ends(score)[0] - ends(score)[1]) / 2 for score in SCORES}
 
 
 def interval(values) -> float:
@@ -301,12 +310,13 @@ def show(rows: list[dict]) -> None:
                 r[f"{s} best is"],
                 f"{r[f'{s} best']:.3f}",
                 f"{r[s]:.3f}",
-                f"{r[f'{s} less']:+.3f} ± {r[f'{s} reach']:.3f}" if r["folds"] > 2 else r[f"{s} each"],
+                f"{r[f'{s} less']:+.3f} ± {r[f'{s} reach']:.3f}",
+                r[f"{s} each"],
             ]
             for r in rows
         ]
         head = (s, "folds", "position-independent prior", "best baseline", "its value", "field")
-        head = (*head, "field minus best baseline")
+        head = (*head, "field minus best baseline", "by fold")
         print_table(f"{s} in all scenes", head, table)
     print("means over scenes: " + ", ".join(f"{s} {sum(r[s] for r in rows) / len(rows):.3f}" for s in SCORES))
     ranks = [r[f"{s} rank"] for r in rows for s in SCORES]

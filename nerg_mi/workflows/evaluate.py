@@ -295,6 +295,7 @@ def _notes(
 FIELD, SCORED = "gaze.safetensors", "scores.json"
 """Files of a fold: its gaze field, and the rows of each split."""
 
+_FOLD_RESAMPLES = 100  # Resamples of the participants of a fold, for the intervals of its rows
 _LEVELS = tuple(format_level(level) for level in REGION_LEVELS)
 
 
@@ -307,7 +308,7 @@ class FoldResult:
     rows
         One row per split and method: means over folds (`uncertainty.summarise_folds`).
     each
-        One row per fold, split and method.
+        One row per fold, split and method, as of `evaluate_gaze`: its intervals are over the fold's participants.
     fields
         Checkpoint of each fold in the store.
     files
@@ -431,7 +432,7 @@ def train_and_score(common: FoldInputs, seed: int, output: Path) -> None:
             scene=o.scene,
             split=split,
             **shared_options(o, GazeEvaluationOptions),
-            resamples=0,
+            resamples=_FOLD_RESAMPLES,
             seed=seed,
             mode=o.mode,
         )
