@@ -28,9 +28,10 @@ from nerg_mi.files.atomic import check_folder, file_sha256, write_text
 from nerg_mi.files.tables import write_csv, write_json
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.probes.probes import compute_participant_weights
 from nerg_mi.rays.filters import split_by_person
 from nerg_mi.rays.rays import Rays
-from nerg_mi.train.gaze_data import SURFACE_OPACITY
+from nerg_mi.train.gaze_data import SURFACE_OPACITY, select_prior_kappa
 from nerg_mi.train.geometry import TrainingGeometry
 from nerg_mi.transport.geometry import trace_depth
 
@@ -41,7 +42,6 @@ from .geometry import load_training_geometry
 from .options import shared_options
 
 _ELAPSED = (0.2, 1.0, 2.0, 5.0)  # seconds
-_PRIOR_KAPPAS = (5.0, 10.0, 20.0, 50.0, 100.0)  # candidates for the kernels of the position-independent prior
 _NOWHERE = np.zeros((1, 3))  # the position of a density that does not depend on it
 _MIN_LOOKS = 16  # per elapsed time
 _COLUMNS = ("elapsed", "method", "looks", "bits", "gap")
@@ -135,7 +135,9 @@ def evaluate_next_look(
             "train with --test-zones 3"
         )
     reporter.progress(0.0, "prior")
-    kappa, prior = _select_prior(data.select(~is_held_out & ~is_near), data.direction[rows[0]])
+    train = data.select(~is_held_out & ~is_near)
+    kappa = select_prior_kappa(train, "person", options.seed)
+    prior = make_prior_baseline(train, kappa=kappa, weights=compute_participant_weights(train))
     distance = make_ray_distance(place)
     samples = []
     for number, selected in enumerate(rows):
@@ -147,14 +149,6 @@ def evaluate_next_look(
     people = [len(np.unique(sample.person)) for sample in samples]
     result = NextLookEvaluation(model, table, people[0], people[1], kappa, [])
     return result if output is None else replace(result, files=_write(Path(output), gaze, result))
-
-
-def _select_prior(train: Rays, directions: np.ndarray) -> tuple[float, Baseline]:
-    """Return the position-independent prior of the rays ``train`` with the kernels that are most likely for
-    ``directions`` (N, 3), and their concentration."""
-    priors = {kappa: make_prior_baseline(train, kappa=kappa) for kappa in _PRIOR_KAPPAS}
-    kappa = max(priors, key=lambda k: np.log(priors[k](_NOWHERE, directions) + EPS * UNIFORM_DENSITY).mean())
-    return kappa, priors[kappa]
 
 
 def _sample_looks(
