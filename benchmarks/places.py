@@ -322,11 +322,8 @@ def show(rows: list[dict]) -> None:
     ranks = [r[f"{s} rank"] for r in rows for s in SCORES]
     worst = max(rows, key=lambda r: r["KLD less"])
     print(f"mean rank {sum(ranks) / len(ranks):.2f}; worst scene in KLD: {worst['place']}, {worst['KLD less']:+.3f}")
-    far = [r for r in rows if not isnan(r["way"])]
-    print(
-        "CC of the field between the position-independent prior (0 %) and split half (100 %): "
-        + ", ".join(f"{r['place']} {r['way']:.0%}" for r in far)
-    )
+    if far := [f"{r['place']} {r['way']:.0%}" for r in rows if not isnan(r["way"])]:
+        print(f"CC of the field between the position-independent prior (0 %) and split half (100 %): {', '.join(far)}")
 
 
 def uncertainty(name: str, result) -> list[dict]:
