@@ -110,9 +110,7 @@ def make_gaze(job: Job) -> list[Path]:
     path = job.store / "shoppers.safetensors"
     options = GazeOptions(
         field=field_path,
-        # Heads are sampled from the law at 5 Hz: rays are exact and independent, so narrow kernels are not noisy and
-        # more steps do not overfit.
-        kappa=200.0,
+        # Heads are sampled from the law at 5 Hz: rays are exact and independent, so more steps do not overfit.
         steps=640,
         test_zones=8,
         test_positions=64,
