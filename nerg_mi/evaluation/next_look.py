@@ -13,6 +13,9 @@ known surface point is aimed at this point from the current position.
 The shapes of the components are fixed, and kernels of several widths are included, so that only the weights are fitted.
 They are piecewise linear in log τ, and maximise the likelihood by expectation maximisation (Dempster et al. 1977). The
 log likelihood is concave in the weights: there are no local maxima.
+
+Where heads are tracked and eyes are not, the mean gaze direction of a head takes the place of the last look, at the
+same time (`PastLooks.from_heads`).
 """
 
 from __future__ import annotations
@@ -28,6 +31,8 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.maths import vmf
 from nerg_mi.maths.sphere import fibonacci_directions, sample_uniform_directions
+from nerg_mi.probes.probes import compute_participant_weights
+from nerg_mi.rays.direction_checks import compute_head_frames
 from nerg_mi.rays.filters import find_sessions
 from nerg_mi.rays.rays import Rays
 
@@ -83,6 +88,21 @@ class PastLooks:
     def select(self, rows: slice | np.ndarray) -> PastLooks:
         """Select looks by a slice, an index or a mask."""
         return PastLooks(*(getattr(self, f.name)[rows] for f in fields(self)))
+
+    @classmethod
+    def from_heads(cls, origin: np.ndarray, head: np.ndarray, gaze_in_head: np.ndarray) -> PastLooks:
+        """Take the mean gaze direction of each head as the last look, without walking directions and earlier looks.
+
+        Parameters
+        ----------
+        origin, head : numpy.ndarray
+            Positions (N, 3) in metres, and unit directions (N, 3) of the heads.
+        gaze_in_head : numpy.ndarray
+            Mean direction (3,) of gaze in the head's frame (`measure_gaze_in_head`).
+        """
+        look = np.einsum("nij,i->nj", compute_head_frames(np.asarray(head, np.float64)), gaze_in_head)
+        nothing = np.empty((len(look), 0, 3))
+        return cls(np.asarray(origin, np.float64), np.ones(len(look)), look, np.zeros_like(look), nothing)
 
     @classmethod
     def concatenate(cls, parts: Sequence[PastLooks]) -> PastLooks:
@@ -182,6 +202,23 @@ def find_heading(displacement: np.ndarray, elapsed: np.ndarray) -> np.ndarray:
     return velocity / np.maximum(np.linalg.norm(velocity, axis=1, keepdims=True), _WALKING_SPEED)
 
 
+def measure_gaze_in_head(rays: Rays) -> np.ndarray:
+    """Measure the mean direction (3,) of gaze in the frame (ahead, right, up) of heads without roll. Participants have
+    equal weights. Raises `NergError` if no ray has a head direction.
+    """
+    if not (has_head := find_heads(rays)).any():
+        raise NergError("the rays have no directions of heads; import them with a reader or column map that names head")
+    rays = rays.select(has_head)
+    in_head = np.einsum("nij,nj->ni", compute_head_frames(np.asarray(rays.head, np.float64)), rays.direction)
+    mean = compute_participant_weights(rays) @ in_head
+    return mean / np.linalg.norm(mean)
+
+
+def find_heads(rays: Rays) -> np.ndarray:
+    """Find the rays with a head direction: mask (N,)."""
+    return np.zeros(len(rays), bool) if rays.head is None else np.isfinite(rays.head[:, 0])
+
+
 # ---- Components ----
 
 
@@ -239,6 +276,10 @@ COMPONENTS = (
     *(Component(True, earlier=k) for k in (4, 16, 64)),
 )
 """All components."""
+HEAD = (Component(), *(Component(last=k) for k in (8, 16, 32, 64, 128, 256)))
+"""A uniform floor, and kernels around the mean gaze direction of the head."""
+HEAD_COMPONENTS = (*HEAD, FIELD, *(Component(True, k) for k in (4, 8, 16, 32, 64)))
+"""All components given the head."""
 
 
 def evaluate_components(
@@ -313,11 +354,15 @@ class NextLook:
         Elapsed times (B,) in seconds, increasing, at which weights are given.
     weights
         Weights (B, C); each row sums to one.
+    gaze_in_head
+        Mean direction (3,) of gaze in the head, if the head takes the place of the last look (`PastLooks.from_heads`);
+        None otherwise.
     """
 
     components: tuple[Component, ...]
     knots: np.ndarray
     weights: np.ndarray
+    gaze_in_head: np.ndarray | None = None
 
     def weights_at(self, elapsed: np.ndarray) -> np.ndarray:
         """Weights (N, C) after ``elapsed`` (N,) seconds, constant outside of the knots."""
@@ -385,8 +430,10 @@ class NextLook:
         Raises
         ------
         NergError
-            If the times do not increase.
+            If the times do not increase, or the model is one given the head.
         """
+        if self.gaze_in_head is not None:
+            raise NergError("this model predicts gaze from heads and simulates no looks; fit one without --head")
         times, positions = np.asarray(times, float), np.asarray(positions, float)
         if len(times) != len(positions) or not (np.diff(times) > 0).all():
             raise NergError(
@@ -428,13 +475,17 @@ class NextLook:
             "components": [asdict(c) for c in self.components],
             "elapsed": self.knots.tolist(),
             "weights": self.weights.tolist(),
+            "gaze_in_head": None if self.gaze_in_head is None else self.gaze_in_head.tolist(),
         }
 
     @classmethod
     def from_json(cls, document: Mapping[str, Any]) -> NextLook:
         """Read the object of `to_json`."""
         components = tuple(Component(**c) for c in document["components"])
-        return cls(components, np.array(document["elapsed"]), np.array(document["weights"]))
+        # Files of earlier versions do not have it.
+        in_head = document.get("gaze_in_head")
+        in_head = None if in_head is None else np.array(in_head)
+        return cls(components, np.array(document["elapsed"]), np.array(document["weights"]), in_head)
 
 
 def interpolation_weights(knots: np.ndarray, elapsed: np.ndarray) -> np.ndarray:
@@ -508,14 +559,17 @@ class LookSample:
     field: tuple[np.ndarray, np.ndarray]  # Gaze field: densities (N,) at the looks and (N, S) on the grid
     prior: tuple[np.ndarray, np.ndarray]  # Position-independent prior: (N,) and (N, S)
 
-    def evaluate(self, factor: str) -> np.ndarray:
-        """Densities (N, C) of all components at the looks; ``factor``, "field" or "prior", is what products contain."""
+    def evaluate(self, components: Sequence[Component], factor: str) -> np.ndarray:
+        """Densities (N, C) of ``components`` at the looks; ``factor``, "field" or "prior", is what products contain."""
         density, on_grid = getattr(self, factor)
-        return evaluate_components(COMPONENTS, self.past, self.direction[:, None], density[:, None], on_grid)[:, 0]
+        return evaluate_components(components, self.past, self.direction[:, None], density[:, None], on_grid)[:, 0]
 
 
 NEXT_LOOK = "next look"
-METHODS: Mapping[str, tuple[Sequence[Component], str]] = {
+Methods = Mapping[str, tuple[Sequence[Component], str]]
+"""Components of each method, and the density that takes the place of the field. The first method has all components,
+and the field."""
+METHODS: Methods = {
     NEXT_LOOK: (COMPONENTS, "field"),
     "next look without products": (MIXTURE, "field"),
     "next look without heading": ([c for c in COMPONENTS if not c.heading], "field"),
@@ -523,12 +577,23 @@ METHODS: Mapping[str, tuple[Sequence[Component], str]] = {
     "last look": ((*LAST_LOOK, FIELD), "prior"),
     "gaze field": ((FIELD,), "field"),
 }
-"""Some of `COMPONENTS` for each method, and the density that takes the place of the field. The last look alone includes
-the position-independent prior."""
+"""Methods given the last looks. The last look alone includes the position-independent prior."""
+HEAD_METHODS: Methods = {
+    "head and field": (HEAD_COMPONENTS, "field"),
+    "head and prior": (HEAD_COMPONENTS, "prior"),
+    "head": (HEAD, "prior"),
+    "gaze field": ((FIELD,), "field"),
+}
+"""Methods given the head."""
 
 
 def score_next_look(
-    train: LookSample, test: LookSample, knots: Sequence[float], resamples: int = 200, seed: int = 0
+    train: LookSample,
+    test: LookSample,
+    knots: Sequence[float],
+    resamples: int = 200,
+    seed: int = 0,
+    methods: Methods = METHODS,
 ) -> tuple[NextLook, list[dict[str, Any]]]:
     """Fit the methods to some looks, and score them on others.
 
@@ -543,23 +608,28 @@ def score_next_look(
         Number of bootstrap resamples of the participants. With fewer than three there are no intervals.
     seed : int
         Seed of the bootstrap.
+    methods : mapping
+        `METHODS`, or `HEAD_METHODS` for looks given the head.
 
     Returns
     -------
     model : NextLook
-        The model of the method "next look", fitted in all zones.
+        The model of the first method, fitted in all zones.
     rows : list of dict
         A row for each elapsed time and method: the information gain ``bits`` per look over the position-independent
         prior and, except for the first method, ``gap``, the gain of the first method over this one. Both have 95 %
         intervals (± 1.96 standard errors), which treat participants as the sampling unit.
     """
-    gains = {name: np.empty(len(test.person)) for name in METHODS}
-    densities = {factor: (train.evaluate(factor), test.evaluate(factor)) for factor in ("field", "prior")}
+    gains = {name: np.empty(len(test.person)) for name in methods}
+    first, (all_components, _) = next(iter(methods.items()))
+    densities = {
+        factor: [sample.evaluate(all_components, factor) for sample in (train, test)] for factor in ("field", "prior")
+    }
     is_crossed = len(np.unique(train.zone)) > 1
     for zone in np.unique(test.zone):
         fitted, scored = (train.zone != zone) | (not is_crossed), test.zone == zone
-        for name, (components, factor) in METHODS.items():
-            columns = [COMPONENTS.index(component) for component in components]
+        for name, (components, factor) in methods.items():
+            columns = [all_components.index(component) for component in components]
             observed, predicted = (values[:, columns] for values in densities[factor])
             model = fit_next_look(components, observed[fitted], train.past.elapsed[fitted], knots)
             density = np.einsum("nc,nc->n", predicted, model.weights_at(test.past.elapsed))
@@ -572,7 +642,7 @@ def score_next_look(
         counts = np.bincount(person[mask], minlength=len(people))
         for name, gain in gains.items():
             row: dict[str, Any] = {"elapsed": float(elapsed), "method": name, "looks": int(mask.sum())}
-            scores = {"bits": gain} | ({} if name == NEXT_LOOK else {"gap": gains[NEXT_LOOK] - gain})
+            scores = {"bits": gain} | ({} if name == first else {"gap": gains[first] - gain})
             for key, values in scores.items():
                 row[key] = float(values[mask].mean())
                 if len(people) >= 3 and resamples:
@@ -580,4 +650,4 @@ def score_next_look(
                     half_width = 1.96 * float(np.std(sums[total > 0] / total[total > 0]))
                     row |= {f"{key}.low": row[key] - half_width, f"{key}.high": row[key] + half_width}
             rows.append(row)
-    return fit_next_look(COMPONENTS, densities["field"][0], train.past.elapsed, knots), rows
+    return fit_next_look(all_components, densities["field"][0], train.past.elapsed, knots), rows

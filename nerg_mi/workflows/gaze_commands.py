@@ -358,6 +358,9 @@ class NextLookOptions(DerivedOptions):
         within=Range(0, 10_000),
         group=MODEL,
     )
+    head: bool = option(
+        False, "Predict gaze from the direction of the head at the same time, in place of earlier looks.", group=MODEL
+    )
     max_looks: int = option(
         500,
         "Maximum number of looks that determine the weights, and of looks that are scored.",

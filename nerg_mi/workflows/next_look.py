@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,12 +16,16 @@ from nerg_mi.evaluation.gaze import EPS, FieldDensity, format_score_table
 from nerg_mi.evaluation.gaze_report import format_table
 from nerg_mi.evaluation.next_look import (
     GRID_DIRECTIONS,
+    HEAD_METHODS,
+    METHODS,
     LookSample,
     NextLook,
     PastLooks,
     RayDistance,
     evaluate_on_grid,
+    find_heads,
     find_past_looks,
+    measure_gaze_in_head,
     score_next_look,
 )
 from nerg_mi.files.atomic import check_folder, file_sha256, write_text
@@ -75,7 +79,8 @@ def evaluate_next_look(
     Both are looks near held-out positions, which the field was not trained on: its weight would be too high elsewhere.
     Scores in a zone of held-out positions use weights that were fitted in the other zones, the model uses all.
     The looks that precede them are those of the same recording, anywhere. Looks without a recorded hit point end at the
-    first surface of the geometry, if there is one.
+    first surface of the geometry, if there is one. With ``options.head``, the direction of the head at the same time
+    takes the place of the looks that precede.
 
     Parameters
     ----------
@@ -93,11 +98,13 @@ def evaluate_next_look(
     Raises
     ------
     NergError
-        If no positions or no participants were held out, if there are too few looks, and for rays or a scene other than
-        those of the training.
+        If no positions or no participants were held out, if there are too few looks or no heads, and for rays or a
+        scene other than those of the training.
     """
     options, gaze = options or NextLookOptions(), Path(gaze)
-    knots = _ELAPSED if options.elapsed is None else options.elapsed
+    if options.head and options.elapsed is not None:
+        raise NergError("--head predicts gaze at the same time, so that --elapsed does not apply; leave out one")
+    knots = (1.0,) if options.head else _ELAPSED if options.elapsed is None else options.elapsed
     if not knots or not (np.diff(knots) > 0).all():
         raise NergError(f"--elapsed needs increasing times in seconds, as 0.2,1,5, got {list(knots)}")
     if output is not None:
@@ -118,10 +125,13 @@ def evaluate_next_look(
     distance_to_centre, centre = KDTree(holdout["centres"]).query(data.origin)
     # The training of the field has no rays of anybody in the larger range.
     is_near = distance_to_centre <= holdout["purged_within"]
+    train = data.select(~is_held_out & ~is_near)
+    gaze_in_head = measure_gaze_in_head(train) if options.head else None
+    is_usable = find_heads(data) if options.head else np.ones(len(data), bool)
     zone = np.array(holdout.get("zone", np.zeros(len(holdout["centres"]))), int)[centre]
     rng = np.random.default_rng(options.seed)
     rows = [
-        np.sort(rng.permutation(np.flatnonzero(mask))[: options.max_looks])
+        np.sort(rng.permutation(np.flatnonzero(mask & is_usable))[: options.max_looks])
         for mask in (~is_held_out & is_near, is_held_out & (distance_to_centre <= holdout["radius"]))
     ]
     if min(map(len, rows)) < _MIN_LOOKS:
@@ -135,17 +145,25 @@ def evaluate_next_look(
             "train with --test-zones 3"
         )
     reporter.progress(0.0, "prior")
-    train = data.select(~is_held_out & ~is_near)
     kappa = select_prior_kappa(train, "person", options.seed)
     prior = make_prior_baseline(train, kappa=kappa, weights=compute_participant_weights(train))
     distance = make_ray_distance(place)
+
+    def find_past(selected: np.ndarray, elapsed: float) -> tuple[PastLooks, np.ndarray]:
+        if gaze_in_head is None:
+            return find_past_looks(data, selected, elapsed, earlier=options.earlier, distance=distance)
+        return PastLooks.from_heads(data.origin[selected], np.asarray(data.head)[selected], gaze_in_head), selected
+
     samples = []
     for number, selected in enumerate(rows):
         reporter.progress(0.1 + 0.4 * number, "looks")
-        samples.append(_sample_looks(data, selected, zone[selected], field, prior, distance, knots, options.earlier))
+        samples.append(_sample_looks(data, selected, zone[selected], field, prior, find_past, knots))
     reporter.progress(0.9, "scores")
     fit, scored = samples
-    model, table = score_next_look(fit, scored, knots, options.resamples, options.seed)
+    methods = HEAD_METHODS if options.head else METHODS
+    model, table = score_next_look(fit, scored, knots, options.resamples, options.seed, methods)
+    if options.head:
+        model, table = replace(model, gaze_in_head=gaze_in_head), [{**row, "elapsed": 0.0} for row in table]
     people = [len(np.unique(sample.person)) for sample in samples]
     result = NextLookEvaluation(model, table, people[0], people[1], kappa, [])
     return result if output is None else replace(result, files=_write(Path(output), gaze, result))
@@ -157,15 +175,14 @@ def _sample_looks(
     zone: np.ndarray,
     field: FieldDensity,
     prior: Baseline,
-    distance: RayDistance | None,
+    find_past: Callable[[np.ndarray, float], tuple[PastLooks, np.ndarray]],
     knots: Sequence[float],
-    earlier: int,
 ) -> LookSample:
     """Collect the rays ``rows`` (N,) in ``zone`` (N,) for each elapsed time of ``knots``, with what precedes them and
     the densities of the field and the prior."""
     pasts, parts, numbers = [], [], []
     for number, elapsed in enumerate(knots):
-        past, matched = find_past_looks(rays, rows, elapsed, earlier=earlier, distance=distance)
+        past, matched = find_past(rows, elapsed)
         if len(matched) < _MIN_LOOKS:
             raise NergError(
                 f"only {len(matched)} of {len(rows)} looks have another one {elapsed:g} s before; change --elapsed"
@@ -210,12 +227,13 @@ def _write(folder: Path, gaze: Path, result: NextLookEvaluation) -> list[Path]:
         for component, row in zip(result.model.components, result.model.weights.T)
         if row.max() >= 0.01
     ]
+    title = "the next look" if result.model.gaze_in_head is None else "gaze given the direction of the head"
     notes = (
-        f"# {gaze.name}: the next look\n\nWeights fitted to {result.fitted} participants, scores of {result.scored} "
+        f"# {gaze.name}: {title}\n\nWeights fitted to {result.fitted} participants, scores of {result.scored} "
         "others, at held-out positions; each zone of these is scored with weights from the other zones. Elapsed times "
         "in seconds; bits per look above the position-independent prior with kappa "
-        f"{result.prior_kappa:g}; gap: bits of the next look above the method. Brackets: ± 1.96 standard errors from "
-        "resampled participants.\n\n"
+        f"{result.prior_kappa:g}; gap: bits of the first method above the method. Brackets: ± 1.96 standard errors "
+        "from resampled participants.\n\n"
     )
     table = format_table([{**row, "elapsed": f"{row['elapsed']:g} s"} for row in result.rows], _COLUMNS)
     columns = tuple(weights[0])

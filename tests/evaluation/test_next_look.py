@@ -13,6 +13,7 @@ from nerg_mi.evaluation.gaze import EPS
 from nerg_mi.evaluation.next_look import (
     COMPONENTS,
     FIELD,
+    HEAD_METHODS,
     METHODS,
     NEXT_LOOK,
     Component,
@@ -25,6 +26,7 @@ from nerg_mi.evaluation.next_look import (
     find_heading,
     find_past_looks,
     fit_next_look,
+    measure_gaze_in_head,
     score_next_look,
 )
 from nerg_mi.maths import vmf
@@ -198,6 +200,8 @@ def test10_simulated_looks_stay_at_surface_points_and_return():
     assert (looks[4:] @ looks[:4].T).max(axis=1) == pytest.approx(np.ones(56), abs=1e-3)
     with pytest.raises(NergError, match="increasing"):
         stay.sample(times[::-1], positions, ahead)
+    with pytest.raises(NergError, match="head"):
+        replace(stay, gaze_in_head=np.array([1.0, 0, 0])).sample(times, positions, ahead)
 
 
 def test11_a_model_round_trips_as_json():
@@ -256,3 +260,55 @@ def test13_a_zone_is_scored_with_weights_of_the_others():
     bits = lambda train, test: score_next_look(train, test, [1.0], resamples=0)[1][0]["bits"]
     assert bits(both, zones[0]) == pytest.approx(bits(zones[1], zones[0]), abs=1e-6)
     assert bits(both, zones[0]) < bits(zones[0], zones[0]) - 0.5
+
+
+# ---- Heads ----
+
+
+def make_head_rays(pitch: float, count: int = 3000) -> Rays:
+    """Gaze around a direction below the heads of three participants; a tenth of the heads is unknown."""
+    rng = np.random.default_rng(0)
+    azimuth, elevation = rng.uniform(-np.pi, np.pi, count), rng.uniform(-0.5, 0.5, count)
+    ahead = lambda e: np.stack([np.cos(e) * np.cos(azimuth), np.cos(e) * np.sin(azimuth), np.sin(e)], axis=1)
+    gaze, head = vmf.sample(ahead(elevation + pitch), 40.0, rng), ahead(elevation)
+    head[::10] = np.nan
+    person = np.repeat([0, 1, 2], [count // 2, count // 4, count // 4])
+    return Rays(np.arange(count), person, ("a", "b", "c"), np.zeros((count, 3)), gaze, np.ones(count), head=head)
+
+
+def test14_the_mean_direction_of_gaze_in_the_head_is_recovered():
+    rays = make_head_rays(np.radians(-10))
+    in_head = measure_gaze_in_head(rays)
+    assert np.degrees(np.arcsin(in_head[[1, 2]])) == pytest.approx([0, -10], abs=0.5)
+    a, b = np.radians(-10), np.arctan2(0.8, 0.6) - np.radians(10)
+    past = PastLooks.from_heads(np.zeros((2, 3)), np.array([[0.0, 1, 0], [0.6, 0, 0.8]]), in_head)
+    assert past.last == pytest.approx(np.array([[0, np.cos(a), np.sin(a)], [np.cos(b), 0, np.sin(b)]]), abs=0.01)
+    with pytest.raises(NergError, match="head"):
+        measure_gaze_in_head(replace(rays, head=None))
+
+
+def test15_gaze_given_the_head_uses_the_head_and_the_field():
+    """Gaze is drawn from the product of the field and a kernel around the head."""
+    rng, grid = np.random.default_rng(1), fibonacci_directions(1024)
+    heads = sample_uniform_directions(900, rng)
+    past = PastLooks.from_heads(rng.normal(size=(900, 3)), heads, np.array([1.0, 0, 0]))
+    assert past.last == pytest.approx(heads)
+    on_grid = evaluate_on_grid(field, past.origin)
+    truth = on_grid * Component(last=16).kernel(past, grid)
+    looks = np.stack([grid[rng.choice(1024, p=row / row.sum())] for row in truth])
+    uniform = np.full(900, 1 / (4 * np.pi)), np.full((900, 1024), 1 / (4 * np.pi))
+    sample = LookSample(
+        past,
+        looks,
+        np.arange(900) % 6,
+        np.zeros(900, int),
+        np.arange(900) % 2,
+        (field(past.origin, looks) / 2, on_grid / 2),
+        uniform,
+    )
+    model, rows = score_next_look(sample, sample, [1.0], resamples=50, methods=HEAD_METHODS)
+    bits = {row["method"]: row["bits"] for row in rows}
+    assert list(bits) == list(HEAD_METHODS)
+    assert bits["head and field"] > max(bits["head"], bits["gaze field"], bits["head and prior"]) + 0.3
+    assert model.weights[0, model.components.index(Component(True, 16))] > 0.5
+    assert NextLook.from_json(replace(model, gaze_in_head=np.array([1.0, 0, 0])).to_json()).gaze_in_head[0] == 1

@@ -15,7 +15,7 @@ from nerg_mi.alignment.check import read_similarity
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation import ablation as scoring
 from nerg_mi.evaluation.gaze import SCORES
-from nerg_mi.evaluation.next_look import NextLook
+from nerg_mi.evaluation.next_look import HEAD_METHODS, NextLook
 from nerg_mi.files.tables import write_json
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.rays.rays import Rays
@@ -116,6 +116,18 @@ def test_the_next_look_is_fitted_and_scored(tmp_path, rgb):
         evaluate_next_look(gaze, rays, None, replace(options, elapsed=(3.0, 1.0)))
     with pytest.raises(NergError, match="0.001 s before"):
         evaluate_next_look(gaze, rays, None, replace(options, elapsed=(0.001,)))
+    # The rays of a training are recognised by what it uses, without heads.
+    heads = replace(rays, head=rays.direction)
+    head_options = NextLookOptions(head=True, max_looks=64, resamples=10)
+    result = evaluate_next_look(gaze, heads, tmp_path / "head", head_options)
+    assert [row["method"] for row in result.rows] == list(HEAD_METHODS) and {r["elapsed"] for r in result.rows} == {0}
+    assert result.model.gaze_in_head == pytest.approx(np.array([1.0, 0, 0]), abs=1e-6)
+    # Gaze is the direction of the head.
+    assert result.rows[0]["bits"] > 3
+    with pytest.raises(NergError, match="--elapsed"):
+        evaluate_next_look(gaze, heads, None, replace(head_options, elapsed=(1.0,)))
+    with pytest.raises(NergError, match="heads"):
+        evaluate_next_look(gaze, rays, None, head_options)
 
 
 def test_the_next_look_needs_held_out_participants(trained):
