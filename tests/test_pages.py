@@ -8,8 +8,9 @@ import os
 import re
 import shlex
 import shutil
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ import pytest
 import nerg_mi.cli
 from nerg_mi.aoi.scene import read_changes
 from nerg_mi.formats.areas import read_areas
+from nerg_mi.maths.sphere import sample_uniform_directions
 from nerg_mi.rays.rays import Rays
 from nerg_mi.workflows import demo
 from tests.conftest import ROOT
@@ -85,7 +87,7 @@ def blocks(*languages: str, page: str = "") -> list[Block]:
 def test01_no_block_is_left_out():
     here = {"sh", ("README.md", "python"), ("figures.md", "py"), ("python.md", "py")}
     here |= {(f"{page}.md", "json") for page in ("viewer", "store", "statistics")}
-    here |= {(f"{page}.md", "python") for page in "derivatives exchange python store recordings".split()}
+    here |= {(f"{page}.md", "python") for page in "derivatives exchange python store recordings training".split()}
     here |= {(b.page, b.language) for b in blocks("xml", "python") if b.page in ("plugins.md", *XML_PAGES)}
     for block in blocks():
         key = (block.page, block.language)
@@ -193,6 +195,24 @@ def test08_datasets(tmp_path, monkeypatch):
         run(text, block.page, names)
     assert len(names["some"]) == len(rays) == names["seen"].count_rows()
     assert len(names["rays"]) > 0 and set(np.array(names["rays"].persons)[names["rays"].person]) == {"p0_1"}
+
+
+def test_heads_are_turned_to_gaze(tmp_path, monkeypatch):
+    """The block of training on heads, without the training itself."""
+    import nerg_mi as nerg
+
+    monkeypatch.chdir(tmp_path)
+    head = sample_uniform_directions(400, np.random.default_rng(0))
+    head[:, 2] = 0
+    head /= np.linalg.norm(head, axis=1, keepdims=True)
+    below = [0.0, 0.0, np.sin(np.radians(-9))] + np.cos(np.radians(9)) * head
+    eyes = nerg.Rays(np.arange(400), np.zeros(400, int), ("a",), head * 0, below, np.ones(400), head=head)
+    eyes.save("eyes.npz")
+    trained = {}
+    names = {"nerg": SimpleNamespace(Rays=nerg.Rays, train_gaze=lambda rays, **options: trained.update(rays=rays))}
+    (text,) = [block.text for block in blocks("python", page="training.md")]
+    run(text, "training.md", names | {"rays": replace(eyes, direction=head)})
+    assert trained["rays"].direction == pytest.approx(below, abs=1e-6)
 
 
 @pytest.mark.nightly
