@@ -37,7 +37,7 @@ def main(argv=None) -> None:
     from nerg_mi.workflows.base import select_backend
 
     ns = select_backend("llvm_ad_rgb", args.threads)
-    given_head: list[dict] = []
+    scores_of_head: list[dict] = []
     fields: list[dict] = []
     for name, make in parse_environments(args).items():
         folder, path, where = write_place(name, make, args)
@@ -49,13 +49,13 @@ def main(argv=None) -> None:
             # The last field has no surfaces, as that of heads.
             for surfaces in dict.fromkeys([where["geometry"], "none"]):
                 gaze = train(folder, path, surfaces, seed, args.threads)
-                scores = score_given_head(gaze, rays, args.threads)
-                given_head += [{"scene": name, "surfaces": surfaces, **row} for row in scores]
+                scores = score_head(gaze, rays, args.threads)
+                scores_of_head += [{"scene": name, "surfaces": surfaces, **row} for row in scores]
             of_heads = train(folder, heads, "none", seed, args.threads)
             fields += [{"scene": name, **row} for row in compare_fields(gaze, of_heads, rays, ns)]
-    write_rows(args.out / "given_head.csv", given_head)
+    write_rows(args.out / "head.csv", scores_of_head)
     write_rows(args.out / "fields.csv", fields)
-    show_given_head(given_head)
+    show_head(scores_of_head)
     show_fields(fields)
 
 
@@ -73,7 +73,7 @@ def train(folder: Path, rays: Path, geometry: str, seed: int, threads: int | Non
     return gaze
 
 
-def score_given_head(gaze: Path, rays, threads: int | None) -> list[dict]:
+def score_head(gaze: Path, rays, threads: int | None) -> list[dict]:
     """Scores of `nerg eval next --head`, each with the mean direction of gaze in the head in degrees."""
     from nerg_mi.workflows.gaze_commands import NextLookOptions
     from nerg_mi.workflows.next_look import evaluate_next_look
@@ -137,14 +137,19 @@ def average(rows: list[dict], score: str) -> str:
     return f"{mean.mean():+.3f} ± {half_width:.3f}" if np.isfinite(half_width) else f"{mean.mean():.3f}"
 
 
-def show_given_head(each: list[dict]) -> None:
+def show_head(each: list[dict]) -> None:
     table = []
     for scene, surfaces in dict.fromkeys((row["scene"], row["surfaces"]) for row in each):
         rows = [row for row in each if (row["scene"], row["surfaces"]) == (scene, surfaces)]
-        of = {m: [row for row in rows if row["method"] == m] for m in dict.fromkeys(row["method"] for row in rows)}
+        by_method = {
+            m: [row for row in rows if row["method"] == m] for m in dict.fromkeys(row["method"] for row in rows)
+        }
         angles = [f"{np.mean([row[key] for row in rows]):+.1f}" for key in ("right", "up")]
-        bits = [f"{np.mean([row['bits'] for row in of[m]]):.2f}" for m in ("gaze field", HEAD, "head and prior", BOTH)]
-        table.append([scene, surfaces, *angles, *bits, average(of[HEAD], "gap")])
+        bits = [
+            f"{np.mean([row['bits'] for row in by_method[m]]):.2f}"
+            for m in ("gaze field", HEAD, "head and prior", BOTH)
+        ]
+        table.append([scene, surfaces, *angles, *bits, average(by_method[HEAD], "gap")])
     head = ["scene", "surfaces", "right", "up", "field", HEAD, "head and prior", BOTH, "more"]
     print_table("Bits given the direction of the head", head, table)
 
@@ -154,10 +159,10 @@ def show_fields(each: list[dict]) -> None:
         table = []
         for scene in dict.fromkeys(row["scene"] for row in each):
             rows = [row for row in each if row["scene"] == scene]
-            of = {m: [row for row in rows if row["method"] == m] for m in (PRIOR, OURS, HEADS, WIDENED)}
-            means = [f"{np.mean([row[score] for row in of[m]]):.3f}" for m in of]
+            by_method = {m: [row for row in rows if row["method"] == m] for m in (PRIOR, OURS, HEADS, WIDENED)}
+            means = [f"{np.mean([row[score] for row in by_method[m]]):.3f}" for m in by_method]
             kappa = f"{np.mean([row['kappa'] for row in rows]):.0f}"
-            table.append([scene, kappa, *means, *(average(of[m], f"{score}.gap") for m in (HEADS, WIDENED))])
+            table.append([scene, kappa, *means, *(average(by_method[m], f"{score}.gap") for m in (HEADS, WIDENED))])
         head = ["scene", "kappa", "prior", "gaze", HEADS, WIDENED, "gaze minus heads", "gaze minus widened"]
         print_table(f"{score} of fields of gaze and of heads", head, table)
 
