@@ -175,7 +175,14 @@ def test_ablations_have_the_training_settings(training):
 
 @pytest.mark.parametrize("kind", [FoldOptions, AblationOptions])
 def test_every_training_setting_is_covered(kind):
-    assert {f.name for f in fields(kind)} | {"seed", "freeze", "validation_zones", "loss", "prior_folds"} >= SETTINGS
+    assert {f.name for f in fields(kind)} | {
+        "seed",
+        "freeze",
+        "validation_zones",
+        "loss",
+        "prior_folds",
+        "reaimed_hits",
+    } >= SETTINGS
     assert exposed_options(kind()) == {} and set(exposed_options(kind(**CHANGED_SETTINGS))) == set(CHANGED_SETTINGS)
 
 
