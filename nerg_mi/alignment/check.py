@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,8 @@ from nerg_mi.rays.rays import Rays
 from nerg_mi.transport.geometry import SceneGeometry, trace_depth
 from nerg_mi.transport.medium import Medium
 
-from .constraints import AlignmentFit
+from .constraints import AlignmentFit, Interval
+from .profile import LEVEL
 from .similarity import similarity_scale, transform_points
 
 # ---- Check ----
@@ -119,7 +120,8 @@ class Alignment:
     residuals
         Median and 95th percentile in centimetres and degrees.
     uncertainty
-        Standard deviation of position (cm), rotation (degrees) and scale (percent); None if unknown.
+        Standard deviation of position (cm), rotation (degrees) and scale (percent), or the `Interval` of samples
+        without hit points; None if unknown.
     files
         Names and checksums of the input files.
     forced
@@ -129,7 +131,7 @@ class Alignment:
     matrix: np.ndarray
     evidence: dict[str, Any]
     residuals: dict[str, Any]
-    uncertainty: dict[str, float] | None
+    uncertainty: dict[str, Any] | None
     files: dict[str, Any] = field(default_factory=dict)
     forced: bool = False
 
@@ -161,7 +163,9 @@ class Alignment:
         write_json(path, data, allow_nan=False)
 
 
-def read_similarity(path: Path, option: str, frames: str) -> Similarity:
+def read_similarity(
+    path: Path, option: str, frames: str, on_doubt: Callable[[str], None] = lambda reason: None
+) -> Similarity:
     """Read a similarity from a JSON file, an alignment or four rows.
 
     Parameters
@@ -172,6 +176,8 @@ def read_similarity(path: Path, option: str, frames: str) -> Similarity:
         Option that named the file, for messages.
     frames
         Source and target frame, such as "rays to field", for messages.
+    on_doubt
+        Called with a message if the evidence of the alignment did not determine it.
 
     Raises
     ------
@@ -191,6 +197,7 @@ def read_similarity(path: Path, option: str, frames: str) -> Similarity:
                 f'the alignment "{path}" has version {sanitize(version, 40)}, but at most {VERSION} is supported; '
                 "update nerg_mi"
             )
+        _report_doubt(data.get("uncertainty"), path, on_doubt)
         data = data["matrix"]
     try:
         return Similarity(np.array([[float(x) for x in row] for row in data]))
@@ -200,13 +207,30 @@ def read_similarity(path: Path, option: str, frames: str) -> Similarity:
         ) from error
 
 
+def _report_doubt(uncertainty: Any, path: Path, on_doubt: Callable[[str], None]) -> None:
+    if not isinstance(uncertainty, dict) or "turn_degrees" not in uncertainty:
+        return
+    try:
+        turn, scale = ((float(low), float(high)) for low, high in (uncertainty[k] for k in ("turn_degrees", "scale")))
+        reason = Interval(turn, scale, float(uncertainty["shift_cm"]) / 100).rejection_reason()
+    except (TypeError, ValueError, KeyError, OverflowError) as error:
+        raise NergError(
+            f'the uncertainty in "{path}" is not an interval of "nerg align" ({sanitize(error)}); run it again'
+        ) from error
+    if reason:
+        on_doubt(f'in "{path}", {reason}, and run "nerg align" again')
+
+
 def _percentiles(values: np.ndarray, unit: str) -> dict[str, float | None]:
     finite = values[np.isfinite(values)]
     percentile = lambda percent: float(np.percentile(finite, percent)) if len(finite) else None
     return {f"median_{unit}": percentile(50), f"p95_{unit}": percentile(95)}
 
 
-def _uncertainty(fit: AlignmentFit) -> dict[str, float] | None:
+def _uncertainty(fit: AlignmentFit) -> dict[str, Any] | None:
+    if (interval := fit.interval) is not None:
+        turn, scale = list(interval.turn), list(interval.scale)
+        return {"level": LEVEL, "turn_degrees": turn, "scale": scale, "shift_cm": 100 * interval.shift}
     covariance = fit.covariance
     if covariance is None or not np.isfinite(covariance).all():
         return None

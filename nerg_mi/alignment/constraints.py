@@ -21,7 +21,7 @@ from nerg_mi.rays.readers.tables import iterate_table, read_table_columns
 from nerg_mi.transport.geometry import SceneGeometry, trace_depth
 from nerg_mi.transport.medium import Medium
 
-from .similarity import LocalSimilarity, transform_points
+from .similarity import FULL_BASIS, LocalSimilarity, similarity_scale, transform_points, vertical_rotation
 
 # ---- Distance grid ----
 
@@ -354,6 +354,10 @@ class AlignmentTarget:
         Height of the floor in the scene, along its up direction; None to estimate it.
     scale
         Scene units per unit of the tracking; None to estimate it.
+    turn
+        Rotation about z from the tracking to the z-up frame, in radians; None to estimate it.
+    shift
+        Position (3,) of the tracking's origin in the z-up frame; None to estimate it.
     """
 
     traces: SceneTraces | None = None
@@ -363,6 +367,39 @@ class AlignmentTarget:
     tracking_floor: float | None = 0.0
     scene_floor: float | None = None
     scale: float | None = None
+    turn: float | None = None
+    shift: np.ndarray | None = None
+
+    @property
+    def constraints(self) -> dict[str, Any]:
+        """Constraints, as keywords of `nerg_mi.alignment.similarity.fit_similarity`."""
+        return {"upright": self.is_upright, "scale": self.scale, "turn": self.turn, "shift": self.shift}
+
+    def parametrize(self, base: np.ndarray, center: np.ndarray, fix_floor: bool = False) -> LocalSimilarity:
+        """Return the similarities near ``base`` (4, 4) that satisfy the constraints.
+
+        ``center`` (3,), z up, is a centre of rotation and scale; with ``fix_floor`` it lies on the floor, and the floor
+        stays in place. The constraints must hold for ``base`` (`constrain`).
+        """
+        free = [0, 1, 2] if not self.is_upright else [2] if self.turn is None else []
+        if self.shift is None:
+            free += [3, 4] if fix_floor else [3, 4, 5]
+        free += [6] if self.scale is None else []
+        return LocalSimilarity(base, center if self.shift is None else self.shift, FULL_BASIS[:, free])
+
+    def constrain(self, matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Return ``matrix`` (4, 4) with the given scale, turn and shift, which keeps the mean of ``points`` (N, 3) in
+        place if the shift is free."""
+        scale = similarity_scale(matrix) if self.scale is None else self.scale
+        rotation = matrix[:3, :3] / similarity_scale(matrix)
+        if self.turn is not None:
+            rotation = vertical_rotation(self.turn)
+        out = np.eye(4)
+        out[:3, :3] = scale * rotation
+        center = points.mean(axis=0)
+        at = transform_points(matrix, center) - out[:3, :3] @ center
+        out[:3, 3] = at if self.shift is None else self.shift
+        return out
 
     @cached_property
     def surface(self) -> SceneSurface:
@@ -377,7 +414,7 @@ class AlignmentTarget:
             "points)"
         )
 
-    @property
+    @cached_property
     def floor_height(self) -> float:
         """Height of the floor of the scene, z up."""
         return self.surface.find_floor() if self.scene_floor is None else self.scene_floor
@@ -385,6 +422,50 @@ class AlignmentTarget:
     def to_scene_frame(self, matrix: np.ndarray) -> np.ndarray:
         """Convert a similarity to the z-up frame into one to the frame of the scene."""
         return np.linalg.inv(self.to_z_up) @ matrix
+
+
+MAX_TURN, MAX_SCALE, MAX_SHIFT = 10.0, 1.1, 1.0
+"""Maximum widths of the intervals of a determined alignment: degrees, ratio of the scales, and metres between head
+positions."""
+
+
+@dataclass(frozen=True)
+class Interval:
+    """What the samples leave open about an alignment.
+
+    ``turn``: smallest and largest rotation about the vertical axis in degrees, relative to the result; ``scale``:
+    smallest and largest scale; ``shift``: largest distance in metres (median over the heads) between the head positions
+    of the result and those of another placement that fits.
+    """
+
+    turn: tuple[float, float]
+    scale: tuple[float, float]
+    shift: float
+
+    def describe(self) -> str:
+        """Return the interval in words."""
+        return (
+            f"turns from {self.turn[0]:+.3g} to {self.turn[1]:+.3g} degrees about the result, scales from "
+            f"{self.scale[0]:.3g} to {self.scale[1]:.3g}, and heads {self.shift:.2g} m from it agree with the samples "
+            "about equally well"
+        )
+
+    def rejection_reason(self) -> str:
+        """Return what is not determined, with a remedy, or an empty string."""
+        names = []
+        if self.turn[1] - self.turn[0] > MAX_TURN:
+            names.append("turn")
+        if self.scale[1] > MAX_SCALE * self.scale[0]:
+            names.append("scale")
+        if self.shift > MAX_SHIFT:
+            names.append("shift")
+        if not names:
+            return ""
+        remedies = ", ".join(f"--{name}" for name in names)
+        return (
+            f"the samples do not determine the {' and the '.join(names)}: {self.describe()}; give {remedies} if you "
+            "know the value, picked points (--pairs), or samples with hit points"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -407,6 +488,8 @@ class AlignmentFit:
         Further JSON values of the record.
     notes, warnings
         Messages for the user.
+    interval
+        What samples without hit points leave open; None with other evidence.
     """
 
     matrix: np.ndarray
@@ -419,6 +502,7 @@ class AlignmentFit:
     metadata: dict[str, Any] = field(default_factory=dict)
     notes: Sequence[str] = ()
     warnings: Sequence[str] = ()
+    interval: Interval | None = None
 
 
 class Evidence(Protocol):
@@ -456,13 +540,13 @@ def angles_between(viewpoint: np.ndarray, at: np.ndarray, to: np.ndarray) -> np.
     return np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.sum(a * b, axis=1)))
 
 
-def pair_covariance(source: np.ndarray, target: np.ndarray, matrix: np.ndarray, basis: np.ndarray) -> np.ndarray | None:
-    """Return the covariance (7, 7) of a least-squares fit of point pairs from its normal equations, about the mean of
-    the points.
+def pair_covariance(source: np.ndarray, target: np.ndarray, chart: LocalSimilarity) -> np.ndarray | None:
+    """Return the covariance (7, 7) of a least-squares fit of point pairs, the base of ``chart``, from its normal
+    equations.
 
     The result is None if there are no more residuals than parameters.
     """
-    chart = LocalSimilarity(matrix, transform_points(matrix, source).mean(axis=0), basis)
+    basis = chart.basis
     zero = np.zeros(chart.size)
     moved = chart.transform(zero, source)
     jacobian = np.concatenate([chart.gradient(zero, moved, np.broadcast_to(e, moved.shape)) for e in np.eye(3)])

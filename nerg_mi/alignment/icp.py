@@ -26,15 +26,7 @@ from .constraints import (
     pair_covariance,
     surface_from_points,
 )
-from .similarity import (
-    FULL_BASIS,
-    MIRROR,
-    LocalSimilarity,
-    fit_similarity,
-    similarity_scale,
-    transform_points,
-    upright_basis,
-)
+from .similarity import MIRROR, LocalSimilarity, fit_similarity, similarity_scale, transform_points, vertical_rotation
 
 # ---- Scores ----
 #
@@ -46,7 +38,8 @@ from .similarity import (
 # these methods.
 
 MIN_GAZE_LENGTH, MAX_GAZE_LENGTH, GAZE_STEPS = 0.3, 12.0, 32
-"""Range of the length of gaze without a hit point, in metres, and the number of positions tested along it."""
+"""Range of the length of gaze without a hit point, in metres, and the number of positions tested along it. In scenes
+with a longer diagonal, the diagonal is the maximum."""
 
 HEAD_HEIGHT_RANGE = 0.9, 2.05
 """Plausible heights of a head above the floor in metres, from sitting to tall standing persons."""
@@ -98,11 +91,13 @@ class GazeEnds:
     origins: np.ndarray
     directions: np.ndarray
     group: np.ndarray
-    scale: float = 0.5
+    # Gaze leaves through windows and holes of a reconstruction, by which it passes surfaces at a metre or so.
+    scale: float = 2.0
     name: str = "gaze ends on surfaces"
 
     def residuals(self, chart: LocalSimilarity, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        lengths = np.geomspace(MIN_GAZE_LENGTH, MAX_GAZE_LENGTH, GAZE_STEPS)
+        max_length = max(MAX_GAZE_LENGTH, self.surface.diagonal / similarity_scale(chart.base))
+        lengths = np.geomspace(MIN_GAZE_LENGTH, max_length, GAZE_STEPS)
         points = self.origins[:, None] + lengths[:, None] * self.directions[:, None]
         distance = self.surface.distance.interpolate(chart.transform(q, points.reshape(-1, 3))).reshape(
             len(points), GAZE_STEPS
@@ -166,12 +161,7 @@ class RefinedAlignment:
 
 
 def refine(
-    scores: Sequence[Score],
-    base: np.ndarray,
-    center: np.ndarray,
-    basis: np.ndarray,
-    scale_factor: float = 1.0,
-    max_evaluations: int = 60,
+    scores: Sequence[Score], chart: LocalSimilarity, scale_factor: float = 1.0, max_evaluations: int = 60
 ) -> RefinedAlignment:
     """Minimise the robust residuals of ``scores`` by Gauss-Newton steps in a trust region (SciPy's least_squares,
     Cauchy loss).
@@ -180,16 +170,13 @@ def refine(
     ----------
     scores
         Scores; each has the same total weight.
-    base
-        Initial similarity (4, 4).
-    center, basis
-        Centre and parameter basis of the `LocalSimilarity`.
+    chart
+        Similarities near the initial one.
     scale_factor
         Factor of the scores' scales, larger for a coarse fit.
     max_evaluations
         Maximum number of evaluations.
     """
-    chart = LocalSimilarity(base, center, basis)
     weight = [1 / (scale_factor * s.scale * np.sqrt(max(len(s.group), 1))) for s in scores]
 
     def stack_residuals(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -211,7 +198,7 @@ def refine(
         return r * factor, jacobian * slope[:, None]
 
     q = np.zeros(chart.size)
-    if len(counts):
+    if len(counts) and chart.size:
         cache: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
 
         def evaluate(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -228,7 +215,7 @@ def refine(
     group = np.concatenate([s.group for s in scores])
     covariance = _sandwich_covariance(r, jacobian, 1 / (1 + z), group)
     return RefinedAlignment(
-        chart.matrix(q), float(np.sum(np.log1p(z) / counts)), chart.basis @ covariance @ chart.basis.T, center
+        chart.matrix(q), float(np.sum(np.log1p(z) / counts)), chart.basis @ covariance @ chart.basis.T, chart.center
     )
 
 
@@ -238,6 +225,8 @@ def _sandwich_covariance(r: np.ndarray, jacobian: np.ndarray, weight: np.ndarray
 
     Reference: K.-Y. Liang, S. Zeger, Longitudinal data analysis using generalized linear models, 1986.
     """
+    if not jacobian.shape[1]:
+        return np.zeros((0, 0))
     hessian = (jacobian * weight[:, None]).T @ jacobian
     gradient = jacobian * (weight * r)[:, None]
     _, where = np.unique(group, return_inverse=True)
@@ -300,7 +289,6 @@ class Twin:
         x, y, is_forward = _closest_pairs(
             twin, surface.points, KDTree(surface.points), KDTree(twin), best.matrix, _OVERLAP
         )
-        basis = upright_basis(False) if target.is_upright else FULL_BASIS
         distance = _query_tree(KDTree(surface.points), transform_points(best.matrix, twin))[0] / scale
         residuals = np.sort(distance)[: int(_OVERLAP * len(distance))]
         notes = [
@@ -312,7 +300,8 @@ class Twin:
             flipped = placements[True][0].cost / similarity_scale(placements[True][0].matrix)
             mirrored = describe_mirror("the twin fits the scene", flipped, best.cost / scale)
         metadata = {"points": len(twin), "overlap": _OVERLAP, "mean_cm": 100 * best.cost / scale}
-        covariance = pair_covariance(x[is_forward], y[is_forward], best.matrix, basis)
+        chart = target.parametrize(best.matrix, transform_points(best.matrix, x[is_forward]).mean(axis=0))
+        covariance = pair_covariance(x[is_forward], y[is_forward], chart)
         return AlignmentFit(
             target.to_scene_frame(best.matrix),
             100 * residuals,
@@ -361,7 +350,7 @@ def _find_placements(twin: np.ndarray, surface: SceneSurface, target: AlignmentT
     scales = ratio * _SCALES if target.scale is None else np.array([target.scale])
     width = 0.06 * surface.diagonal
     starts = []
-    for turn in _candidate_rotations(target.is_upright):
+    for turn in _candidate_rotations(target):
         # All scales at once.
         moved = scales[:, None, None] * ((x - x0) @ turn.T) + y0
         back = ((y - y0) @ turn) / scales[:, None, None] + x0
@@ -375,7 +364,7 @@ def _find_placements(twin: np.ndarray, surface: SceneSurface, target: AlignmentT
     for _, s, turn in starts[:_NUM_STARTS]:
         matrix = np.eye(4)
         matrix[:3, :3] = s * turn
-        matrix[:3, 3] = y0 - s * turn @ x0
+        matrix[:3, 3] = y0 - s * turn @ x0 if target.shift is None else target.shift
         placements.append(_icp(x, y, matrix, target, 15))
     placements.sort(key=lambda f: f.cost / similarity_scale(f.matrix))
     x, y = draw(twin, _FINE_POINTS), draw(surface.points, 2 * _FINE_POINTS)
@@ -386,8 +375,10 @@ def _find_placements(twin: np.ndarray, surface: SceneSurface, target: AlignmentT
     return sorted(final, key=lambda f: f.cost / similarity_scale(f.matrix))
 
 
-def _candidate_rotations(is_upright: bool) -> list[np.ndarray]:
-    if is_upright:
+def _candidate_rotations(target: AlignmentTarget) -> list[np.ndarray]:
+    if target.turn is not None:
+        return [vertical_rotation(target.turn)]
+    if target.is_upright:
         return [Rotation.from_rotvec([0, 0, a]).as_matrix() for a in 2 * np.pi * np.arange(60) / 60]
     return list(Rotation.from_quat(np.random.default_rng(0).normal(size=(_NUM_ROTATIONS, 4))).as_matrix())
 
@@ -399,7 +390,7 @@ def _icp(x: np.ndarray, y: np.ndarray, matrix: np.ndarray, target: AlignmentTarg
         # Increase the assumed overlap as the fit improves.
         fraction = 0.6 + (_OVERLAP - 0.6) * min(1.0, 2 * k / max_iterations)
         a, b, _ = _closest_pairs(x, y, tree, source_tree, matrix, fraction)
-        matrix = fit_similarity(a, b, upright=target.is_upright, scale=target.scale)
+        matrix = fit_similarity(a, b, **target.constraints)
         new_cost = float(np.mean(np.linalg.norm(transform_points(matrix, a) - b, axis=1)))
         if 2 * k > max_iterations and abs(cost - new_cost) < 1e-5 * max(new_cost, 1e-300):
             break
@@ -416,12 +407,10 @@ def _refine_placement(
     """
     matrix = _icp(x, y, matrix, target, 8).matrix
     near_distance = _NEAR_FRACTION * surface.diagonal / similarity_scale(matrix)
-    basis = upright_basis(False) if target.is_upright else FULL_BASIS
-    basis = basis if target.scale is None else basis[:, :-1]
     center, index = transform_points(matrix, x).mean(axis=0), np.arange(len(x))
     on_surface = ZeroDistance(surface.distance, x, index, "points of the twin on surfaces", near_distance)
     for factor in (3.0, 1.0):
-        matrix = refine([on_surface], matrix, center, basis, factor, 30).matrix
+        matrix = refine([on_surface], target.parametrize(matrix, center), factor, 30).matrix
     s, max_distance = similarity_scale(matrix), _FAR_FRACTION * surface.diagonal
     forward = np.minimum(surface.distance.interpolate(transform_points(matrix, x)), max_distance)
     backward = np.minimum(twin.interpolate(transform_points(np.linalg.inv(matrix), y)) * s, max_distance)

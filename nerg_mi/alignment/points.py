@@ -25,15 +25,14 @@ from .constraints import (
     pair_covariance,
 )
 from .similarity import (
-    FULL_BASIS,
     MIRROR,
+    LocalSimilarity,
     check_points,
     fit_similarity,
     is_planar,
     leave_one_out_distances,
     residual_distances,
     transform_points,
-    upright_basis,
 )
 
 # ---- Cameras ----
@@ -64,6 +63,10 @@ class Cameras:
     def fit(self, target: AlignmentTarget, progress: ProgressCallback) -> AlignmentFit:
         """Fit the similarity robustly. Raises `NergError` if all cameras have the same position."""
         a, b = self.tracking, self.place
+        if target.turn is not None or target.shift is not None:
+            raise NergError(
+                "--turn and --shift do not apply to --tracking-cameras, which determine both; leave them out"
+            )
         if len(a) < 2:
             raise NergError(f"{self.source} have {len(a)} photos in common, but at least two are needed; add photos")
         x, y = a[:, :3, 3], b[:, :3, 3]
@@ -104,7 +107,8 @@ class Cameras:
                 mirrored = describe_mirror("the centres meet", np.median(distance_flipped), np.median(distance))
         metadata = {"cameras": len(a), "agreeing": int(inliers.sum())}
         mask = inliers if inliers.sum() > 2 else np.ones(len(x), bool)
-        covariance = pair_covariance(x[mask], y[mask], matrix, FULL_BASIS)
+        center = transform_points(matrix, x[mask]).mean(axis=0)
+        covariance = pair_covariance(x[mask], y[mask], LocalSimilarity(matrix, center))
         return AlignmentFit(matrix, 100 * distance, angle, covariance, mirrored, x, y, metadata, notes, warnings)
 
 
@@ -209,24 +213,22 @@ class Pairs:
         """Fit the similarity by Umeyama's method. Raises `NergError` for too few or degenerate points."""
         x, y = self.tracking, transform_points(target.to_z_up, self.place)
         check_points(x, y, self.source, upright=target.is_upright)
-        options: dict[str, Any] = {"upright": target.is_upright, "scale": target.scale}
+        options = target.constraints
         matrix = fit_similarity(x, y, **options)
         distance, leave_one_out = residual_distances(matrix, x, y), leave_one_out_distances(x, y, **options)
         flipped = transform_points(MIRROR, x)
-        mirrored_matrix = fit_similarity(flipped, y, **options)
+        # A mirrored frame is compared with turn and shift free, which refer to the declared frame.
+        free: dict[str, Any] = {"upright": target.is_upright, "scale": target.scale}
+        free_distance = residual_distances(fit_similarity(x, y, **free), x, y)
+        mirrored_distance = residual_distances(fit_similarity(flipped, y, **free), flipped, y)
         notes = [self._describe(distance, leave_one_out)]
         mirrored = None
         if not target.is_upright and is_planar(x):
             notes.append(
                 "the points lie in a plane, so a mirrored frame cannot be detected; add a point outside the plane"
             )
-        elif _rms(residual_distances(mirrored_matrix, flipped, y)) < _MIRROR_RATIO * _rms(distance):
-            mirrored = describe_mirror(
-                "the pairs meet", _rms(residual_distances(mirrored_matrix, flipped, y)), _rms(distance)
-            )
-        basis = upright_basis(False) if target.is_upright else FULL_BASIS
-        if target.scale is not None:
-            basis = basis[:, :-1]
+        elif _rms(mirrored_distance) < _MIRROR_RATIO * _rms(free_distance):
+            mirrored = describe_mirror("the pairs meet", _rms(mirrored_distance), _rms(free_distance))
         finite = leave_one_out[np.isfinite(leave_one_out)]
         metadata = {
             "pairs": len(x),
@@ -236,7 +238,7 @@ class Pairs:
             target.to_scene_frame(matrix),
             100 * distance,
             angles_between(y.mean(axis=0), transform_points(matrix, x), y),
-            pair_covariance(x, y, matrix, basis),
+            pair_covariance(x, y, target.parametrize(matrix, transform_points(matrix, x).mean(axis=0))),
             mirrored,
             x,
             self.place,

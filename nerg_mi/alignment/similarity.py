@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -31,6 +32,8 @@ def fit_similarity(
     *,
     upright: bool = False,
     scale: float | None = None,
+    turn: float | None = None,
+    shift: np.ndarray | None = None,
 ) -> np.ndarray:
     """Fit the proper similarity (4, 4) from ``source`` to ``target``, (N, 3) each, with the smallest weighted sum of
     squares.
@@ -45,15 +48,32 @@ def fit_similarity(
         Whether z is up in both frames and stays up.
     scale
         Fixed scale. None: estimated.
+    turn
+        Fixed rotation about z in radians. None: estimated.
+    shift
+        Fixed image (3,) of the origin. None: estimated.
+
+    Raises
+    ------
+    NergError
+        If no positive scale agrees with the points and a fixed turn or shift.
     """
     w = np.full(len(source), 1 / len(source)) if weights is None else np.asarray(weights) / np.sum(weights)
-    x0, y0 = w @ source, w @ target
+    x0, y0 = (w @ source, w @ target) if shift is None else (np.zeros(3), shift)
     x, y = source - x0, target - y0
     covariance = (y * w[:, None]).T @ x
-    rotation = _fit_vertical_rotation(covariance) if upright else _fit_rotation(covariance)
+    if turn is not None:
+        rotation = vertical_rotation(turn)
+    else:
+        rotation = _fit_vertical_rotation(covariance) if upright else _fit_rotation(covariance)
     spread = float(w @ np.sum(x * x, axis=1))
     if scale is None:
         scale = float(np.sum(covariance * rotation)) / spread if spread > 0 else 1.0
+        if not scale > 0 and (turn is not None or shift is not None):
+            raise NergError(
+                "no positive scale agrees with the points and the given turn or shift: correct --turn or --shift, or "
+                "leave them out"
+            )
     matrix = np.eye(4)
     matrix[:3, :3] = scale * rotation
     matrix[:3, 3] = y0 - matrix[:3, :3] @ x0
@@ -70,7 +90,11 @@ def _fit_rotation(covariance: np.ndarray) -> np.ndarray:
 
 def _fit_vertical_rotation(covariance: np.ndarray) -> np.ndarray:
     c = covariance
-    angle = np.arctan2(c[1, 0] - c[0, 1], c[0, 0] + c[1, 1])
+    return vertical_rotation(np.arctan2(c[1, 0] - c[0, 1], c[0, 0] + c[1, 1]))
+
+
+def vertical_rotation(angle: float) -> np.ndarray:
+    """Return the rotation (3, 3) about z by ``angle`` in radians, anticlockwise as seen from above."""
     cos, sin = np.cos(angle), np.sin(angle)
     return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
@@ -85,21 +109,28 @@ def similarity_scale(matrix: np.ndarray) -> float:
     return float(np.cbrt(abs(np.linalg.det(matrix[:3, :3]))))
 
 
+def turn_between(a: np.ndarray, b: np.ndarray) -> float:
+    """Return the rotation about z, in radians from -pi to pi, that brings the rotation of ``a`` closest to that of
+    ``b``, (4, 4) each."""
+    c = b[:3, :3] @ a[:3, :3].T
+    return float(np.arctan2(c[1, 0] - c[0, 1], c[0, 0] + c[1, 1]))
+
+
 def residual_distances(matrix: np.ndarray, source: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Return the distances (N,) between the transformed ``source`` and ``target``, in units of the source."""
     return np.linalg.norm(transform_points(matrix, source) - target, axis=1) / similarity_scale(matrix)
 
 
 def leave_one_out_distances(
-    source: np.ndarray, target: np.ndarray, *, upright: bool = False, scale: float | None = None
+    source: np.ndarray, target: np.ndarray, *, upright: bool = False, **constraints: Any
 ) -> np.ndarray:
     """Return the distance of each point from the fit to the others, (N,) in units of the source; NaN if the others
-    are degenerate."""
+    are degenerate. ``constraints`` are those of `fit_similarity`."""
     out = np.full(len(source), np.nan)
     for k in range(len(source)):
         others = np.arange(len(source)) != k
         if not _degeneracy(source[others], upright) and not _degeneracy(target[others], upright):
-            matrix = fit_similarity(source[others], target[others], upright=upright, scale=scale)
+            matrix = fit_similarity(source[others], target[others], upright=upright, **constraints)
             if similarity_scale(matrix) > 0:
                 out[k] = residual_distances(matrix, source[k : k + 1], target[k : k + 1])[0]
     return out
@@ -149,12 +180,7 @@ def is_planar(points: np.ndarray) -> bool:
 FULL_BASIS = np.eye(7)  # all parameters (w, t, l)
 
 
-def upright_basis(fix_floor: bool) -> np.ndarray:
-    """Return columns (7, k) of the parameters that keep z up and, with ``fix_floor``, keep the floor in place.
-
-    For a fixed floor, the centre of the parametrisation must lie on the floor.
-    """
-    return FULL_BASIS[:, [2, 3, 4, 6]] if fix_floor else FULL_BASIS[:, [2, 3, 4, 5, 6]]
+TURN, LOG_SCALE = 2, 6  # index of the rotation about z and of the logarithm of the scale
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,8 @@ from nerg_mi.rays.rays import Rays
 
 from .constraints import AlignmentFit, AlignmentTarget, ProgressCallback, SceneSurface
 from .icp import GazeEnds, HeadHeight, RefinedAlignment, Score, ZeroDistance, independent_groups, refine
-from .similarity import FULL_BASIS, MIRROR, similarity_scale, transform_points, upright_basis
+from .profile import Profile, evaluate_by_group, make_profile
+from .similarity import MIRROR, similarity_scale, transform_points, vertical_rotation
 
 # ---- Flipped axes ----
 #
@@ -109,7 +110,8 @@ def compare_flips(
 # proximity to free space.
 
 HIT_DISTANCE = 0.25  # tolerance in metres of hit points on surfaces during the search
-_NUM_ROTATIONS, _NUM_CELLS, _MAX_GUESSES = 36, 48, 16
+_TURNS = 2 * np.pi * np.arange(36) / 36
+_NUM_CELLS, _MAX_GUESSES = 48, 16
 _MAX_SEARCH_POINTS = 4000
 
 
@@ -121,15 +123,15 @@ class Guess:
     score: float
 
 
-def candidate_scales(surface: SceneSurface, points: np.ndarray) -> np.ndarray:
+def candidate_scales(surface: SceneSurface, points: np.ndarray, count: int = 15) -> np.ndarray:
     """Return candidate scales for ``points`` (N, 3) on surfaces.
 
-    They range from the scale at which the points fill the scene down to a third of it, in steps of eight percent, since
-    participants may have visited only a part of the scene.
+    They range from the scale at which the points fill the scene down to a third of it, in ``count`` steps of eight
+    percent, since participants may have visited only a part of the scene.
     """
     size = lambda p: float(np.linalg.norm(np.subtract(*np.percentile(p, [98, 2], axis=0))[:2]))
     max_scale = 1.25 * size(surface.points) / max(size(points), 1e-9)
-    return max_scale / 1.08 ** np.arange(15)
+    return max_scale / 1.08 ** np.arange(count)
 
 
 def search_placements(
@@ -138,7 +140,7 @@ def search_placements(
     free_points: np.ndarray,
     scales: Sequence[float] | np.ndarray,
     floor_heights: tuple[float, float],
-    num_rotations: int = _NUM_ROTATIONS,
+    turns: Sequence[float] | np.ndarray = _TURNS,
     max_guesses: int = _MAX_GUESSES,
 ) -> list[Guess]:
     """Return the best placements, best first.
@@ -153,8 +155,8 @@ def search_placements(
         Candidate scales.
     floor_heights
         Height of the floor in the tracking and in the scene.
-    num_rotations
-        Number of rotations about the vertical axis.
+    turns
+        Candidate rotations about the vertical axis, in radians.
     max_guesses
         Maximum number of results.
     """
@@ -165,7 +167,7 @@ def search_placements(
     low, high = surface.distance.lower, surface.distance.upper
     for scale in scales:
         maps = _CorrelationMaps(surface, low, high, scale)
-        for angle in 2 * np.pi * np.arange(num_rotations) / num_rotations:
+        for angle in turns:
             guesses += maps.best(hits, free_points, angle, floor_heights)
     guesses.sort(key=lambda g: -g.score)
     return _distinct_guesses(guesses, max_guesses, 0.05 * surface.diagonal)
@@ -191,8 +193,7 @@ class _CorrelationMaps:
 
     def best(self, hits: np.ndarray, free: np.ndarray, angle: float, floor: tuple[float, float]) -> list[Guess]:
         """Return the best shifts for one rotation."""
-        cos, sin = np.cos(angle), np.sin(angle)
-        rotation = self.scale * np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
+        rotation = self.scale * vertical_rotation(angle)
         offset_z = floor[1] - self.scale * floor[0]
         corner = None
         total = np.zeros(self.size)
@@ -263,7 +264,9 @@ def _distinct_guesses(guesses: list[Guess], count: int, distance: float) -> list
 # surfaces.
 
 MAX_SAMPLES = 4000  # maximum number of samples
-_NUM_COARSE = 400
+_NUM_COARSE, _NUM_PROFILED = 400, 600
+# Number of candidate scales, down to a tenth, for heads, which visit a small part of a scene.
+_NUM_HEAD_SCALES = 30
 # Stride of the samples without hit points, which are expensive and carry little information.
 _GAZE_STRIDE = 5
 # Fractions of the path to a hit point that are tested for free space; the last part may graze the surface.
@@ -288,8 +291,11 @@ class Tracking:
         sample = _draw_sample(self.rays)
         if self.initial is not None:
             progress(0.5, "refining")
-            coarse = _refine_sample(sample, target, target.to_z_up @ self.initial, 3.0, 30)
-            return self._make_fit(_refine_sample(sample, target, coarse.matrix, 1.0, 60), sample, target, [], None)
+            initial = target.constrain(target.to_z_up @ self.initial, sample.heads)
+            coarse = _refine_sample(sample, target, initial, 3.0, 30)
+            best = _refine_sample(sample, target, coarse.matrix, 1.0, 60)
+            profile = None if len(sample.hits) else profile_sample(sample, target, best.matrix, [])
+            return self._make_fit(best, sample, target, [], None, profile)
         if not target.is_upright:
             raise NergError(
                 "an alignment from the tracking alone needs the up direction of the scene: give --up, or other "
@@ -301,18 +307,20 @@ class Tracking:
                 "an alignment from the tracking alone needs the height of the floor in the tracking; give it "
                 "with --floor-height"
             )
-        if target.scale is None and not len(sample.hits):
+        if target.scale is None and target.turn is None and not len(sample.hits):
             raise NergError(
-                "samples without hit points do not determine the scale: give --scale (1 if the scene is in metres), or "
-                "other evidence (--pairs)"
+                "samples without hit points do not determine turn and scale: give --scale (1 if the scene is in "
+                "metres), --turn, or other evidence (--pairs)"
             )
         progress(0.1, "searching the placement of the tracking")
-        placements = _search_and_refine(sample, target)
+        placements, starts = _search_and_refine(sample, target)
         if not len(sample.hits):
             # Heads alone do not distinguish a placement from its mirror image.
-            return self._make_fit(placements[0], sample, target, [], None)
+            progress(0.5, "profiling the turn, the scale and the shift")
+            best, profile = _profile_and_improve(sample, target, placements[0], starts)
+            return self._make_fit(best, sample, target, [], None, profile)
         progress(0.55, "searching the placement of the mirrored tracking")
-        mirrored = _search_and_refine(sample.mirrored(), target)
+        mirrored, _ = _search_and_refine(sample.mirrored(), target)
         warnings = []
         for other in placements[1:]:
             is_same = is_close(placements[0].matrix, other.matrix, 0.05 * target.surface.diagonal)
@@ -330,7 +338,7 @@ class Tracking:
                 "than as "
                 f"it is (cost {placements[0].cost:.3f})"
             )
-        return self._make_fit(placements[0], sample, target, warnings, mirror_warning)
+        return self._make_fit(placements[0], sample, target, warnings, mirror_warning, None)
 
     def _make_fit(
         self,
@@ -339,15 +347,16 @@ class Tracking:
         target: AlignmentTarget,
         warnings: list[str],
         mirrored: str | None,
+        profile: Profile | None,
     ) -> AlignmentFit:
         surface, scale = target.surface, similarity_scale(best.matrix)
-        points = sample.hits if len(sample.hits) else sample.heads
-        grid = surface.distance if len(sample.hits) else surface.free_space_distance
-        distance = grid.interpolate(transform_points(best.matrix, points)) / scale
-        degrees = np.zeros(0)
+        # Heads and gaze have residuals of zero for many placements, so that only those of hit points are reported.
+        distance, degrees = np.zeros(0), np.zeros(0)
         if len(sample.hits):
+            distance = surface.distance.interpolate(transform_points(best.matrix, sample.hits)) / scale
             length = np.linalg.norm(sample.hits - sample.hit_heads, axis=1)
             degrees = np.degrees(np.arctan2(distance, np.maximum(length, 1e-6)))
+        interval = None if profile is None else profile.find_interval(sample.heads)
         solid_depth = surface.free_space_distance.interpolate(transform_points(best.matrix, sample.heads)) / scale
         metadata = {
             "rays": len(self.rays),
@@ -361,8 +370,8 @@ class Tracking:
             "inside solid "
             f"objects; {len(sample.hits):,} hit points"
         ]
-        if not len(sample.hits):
-            warnings = [*warnings, "without hit points the alignment rests on head positions only: check the figure"]
+        if interval is not None:
+            notes.append(f"without hit points: {interval.describe()}; mirroring is not detected, so check the figure")
         return AlignmentFit(
             target.to_scene_frame(best.matrix),
             100 * distance,
@@ -370,11 +379,12 @@ class Tracking:
             # Heads can move in free space at no cost, which derivatives do not show.
             best.covariance if len(sample.hits) else None,
             mirrored,
-            points,
+            sample.hits if len(sample.hits) else sample.heads,
             None,
             metadata,
             notes,
             warnings,
+            interval,
         )
 
 
@@ -464,29 +474,75 @@ def _draw_sample(rays: Rays) -> _Sample:
     return _Sample(heads, directions, group, hits, hit_rows, np.concatenate(free_points), free_head_index)
 
 
-def _search_and_refine(sample: _Sample, target: AlignmentTarget) -> list[RefinedAlignment]:
-    """Return the best placements, best first."""
-    assert target.tracking_floor is not None
-    surface, floor = target.surface, (target.tracking_floor, target.floor_height)
-    free = np.concatenate([sample.heads, sample.free_points]) if surface.has_free_space else sample.heads
-    scales = np.array([target.scale]) if target.scale is not None else candidate_scales(surface, sample.hits)
-    guesses: list[Guess] = search_placements(surface, sample.hits, free, scales, floor)
+def _search_and_refine(sample: _Sample, target: AlignmentTarget) -> tuple[list[RefinedAlignment], list[np.ndarray]]:
+    """Return the best placements, best first, and the candidates (4, 4) from which they were refined."""
+    guesses = _find_candidates(sample, target)
     subsample = sample.subsample(_NUM_COARSE)
-    placements = [_refine_sample(subsample, target, g.matrix, 4.0, 12) for g in guesses]
+    placements = [_refine_sample(subsample, target, m, 4.0, 12) for m in guesses[:_MAX_GUESSES]]
     placements = [
         _refine_sample(subsample, target, f.matrix, 1.5, 20) for f in sorted(placements, key=lambda f: f.cost)[:6]
     ]
     final = [_refine_sample(sample, target, f.matrix, 1.0, 30) for f in sorted(placements, key=lambda f: f.cost)[:2]]
-    return sorted(final, key=lambda f: f.cost)
+    return sorted(final, key=lambda f: f.cost), [*(f.matrix for f in placements), *guesses]
+
+
+def _find_candidates(sample: _Sample, target: AlignmentTarget) -> list[np.ndarray]:
+    """Return candidate placements (4, 4), best first."""
+    assert target.tracking_floor is not None
+    surface, floor = target.surface, (target.tracking_floor, target.floor_height)
+    free = np.concatenate([sample.heads, sample.free_points]) if surface.has_free_space else sample.heads
+    turns = _TURNS if target.turn is None else np.array([target.turn])
+    if target.scale is not None:
+        scales = np.array([target.scale])
+    elif len(sample.hits):
+        scales = candidate_scales(surface, sample.hits)
+    else:
+        scales = candidate_scales(surface, sample.heads, _NUM_HEAD_SCALES)
+    if target.shift is None:
+        count = _MAX_GUESSES if len(sample.hits) else 2 * len(turns) * len(scales)
+        return [g.matrix for g in search_placements(surface, sample.hits, free, scales, floor, turns, count)]
+    matrices = np.tile(np.eye(4), (len(turns) * len(scales), 1, 1))
+    matrices[:, :3, :3] = [scale * vertical_rotation(turn) for scale in scales for turn in turns]
+    matrices[:, :3, 3] = target.shift
+    scores = sample.subsample(_NUM_COARSE // 4).scores(target)
+    return list(matrices[np.argsort([evaluate_by_group(scores, m).sum() for m in matrices])])
+
+
+def _fixes_floor(target: AlignmentTarget) -> bool:
+    return target.is_upright and target.tracking_floor is not None
+
+
+def _find_center(sample: _Sample, target: AlignmentTarget) -> np.ndarray:
+    """Return the centre (3,) of the heads, on the floor if its height is known."""
+    center = np.median(sample.heads, axis=0)
+    if _fixes_floor(target):
+        center[2] = target.tracking_floor
+    return center
 
 
 def _refine_sample(
     sample: _Sample, target: AlignmentTarget, base: np.ndarray, scale_factor: float, max_evaluations: int
 ) -> RefinedAlignment:
-    center = transform_points(base, np.median(sample.heads, axis=0))
-    if target.is_upright and target.tracking_floor is not None:
-        center[2] = target.floor_height
-    basis = upright_basis(target.tracking_floor is not None) if target.is_upright else FULL_BASIS
-    if target.scale is not None:
-        basis = basis[:, :-1]
-    return refine(sample.scores(target), base, center, basis, scale_factor, max_evaluations)
+    center = transform_points(base, _find_center(sample, target))
+    return refine(
+        sample.scores(target), target.parametrize(base, center, _fixes_floor(target)), scale_factor, max_evaluations
+    )
+
+
+def profile_sample(sample: _Sample, target: AlignmentTarget, best: np.ndarray, starts: list[np.ndarray]) -> Profile:
+    """Profile the objective of a part of the sample about ``best``; without ``starts``, only near it."""
+    subsample = sample.subsample(_NUM_PROFILED)
+    center = _find_center(subsample, target)
+    return make_profile(subsample.scores(target), best, starts, target, center, _fixes_floor(target))
+
+
+def _profile_and_improve(
+    sample: _Sample, target: AlignmentTarget, best: RefinedAlignment, starts: list[np.ndarray]
+) -> tuple[RefinedAlignment, Profile]:
+    """Profile the objective about ``best``, and return the better of it and the smallest minimum of the profile."""
+    profile = profile_sample(sample, target, best.matrix, starts)
+    other = _refine_sample(sample, target, profile.matrices[int(np.argmin(profile.costs.sum(axis=1)))], 1.0, 30)
+    if other.cost >= best.cost:
+        return best, profile
+    scores = sample.subsample(_NUM_PROFILED).scores(target)
+    return other, profile.with_result(other.matrix, evaluate_by_group(scores, other.matrix))

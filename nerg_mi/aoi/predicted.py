@@ -266,6 +266,8 @@ class AoiScene:
         Options of the measurement (`CountOptions`), of the prediction (`PredictionOptions`), or of both.
     meshes
         Meshes of AOIs and changes, by file.
+    alignment_doubts
+        Messages about an alignment that its evidence did not determine.
     """
 
     gaze_scene: GazeScene
@@ -273,11 +275,15 @@ class AoiScene:
     aois: Sequence[Aoi]
     options: AoiOptions
     meshes: Mapping[Path, MeshFile]
+    alignment_doubts: tuple[str, ...] = ()
 
     @property
     def warnings(self) -> list[str]:
-        """Warnings about unused content of the meshes."""
-        return [f"of {file}: {note}" for file, mesh in self.meshes.items() for note in mesh.notes]
+        """Warnings about the alignment and about unused content of the meshes."""
+        return [
+            *self.alignment_doubts,
+            *(f"of {file}: {note}" for file, mesh in self.meshes.items() for note in mesh.notes),
+        ]
 
     @cached_property
     def members(self) -> list[tuple[int, ...]]:
@@ -368,12 +374,14 @@ def load_aoi_scene(
     if isinstance(options, CountOptions):
         # Fail before files are read.
         options.visit_rules()
-    align = None if options.align is None else read_similarity(options.align, "--align", "rays to scene")
+    doubts: list[str] = []
+    align = None
+    if options.align is not None:
+        align = read_similarity(options.align, "--align", "rays to scene", doubts.append)
     gaze_scene = load_gaze_scene(scene, field, gaze, align, ns)
     meshes = read_meshes(areas.meshes)
-    return AoiScene(
-        gaze_scene, areas, make_aois(areas.elements, shapes_by_id(gaze_scene.scene), meshes), options, meshes
-    )
+    aois = make_aois(areas.elements, shapes_by_id(gaze_scene.scene), meshes)
+    return AoiScene(gaze_scene, areas, aois, options, meshes, tuple(doubts))
 
 
 # ---- Uncertainty ----

@@ -31,6 +31,8 @@ from .rays_commands import AlignOptions
 # ---- Alignment of tracking with a scene ----
 
 
+MAX_IN_SOLIDS = 0.5  # maximum share of heads that are more than 10 cm inside solid objects
+
 _AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1)}
 
 
@@ -144,15 +146,24 @@ def _target(options: AlignOptions, kind: str, reporter: Reporter) -> tuple[Train
     kinds = [n for n in ("field", "scene", "surface") if getattr(options, n) is not None]
     if len(kinds) > 1:
         raise NergError(f"only one scene can be given: use --{' or --'.join(kinds)}")
-    up = "z" if options.up is None and kind == Tracking.kind and options.init is None else options.up
+    is_upright = (kind == Tracking.kind and options.init is None) or options.turn is not None
+    up = "z" if options.up is None and is_upright else options.up
     if up is not None and options.up is None:
         reporter.message("the scene is assumed to be z up; use --up for another axis")
+    to_z_up = _turn(up)
+    scene_floor, shift = options.scene_floor_height, None
+    if options.shift is not None:
+        shift = to_z_up[:3, :3] @ parse_point(options.shift, "--shift")
+        if scene_floor is None and (options.scale is not None or not options.floor_height):
+            scene_floor = shift[2] + (options.scale or 1) * options.floor_height
     common = {
-        "to_z_up": _turn(up),
+        "to_z_up": to_z_up,
         "is_upright": up is not None,
         "tracking_floor": options.floor_height,
-        "scene_floor": options.scene_floor_height,
+        "scene_floor": scene_floor,
         "scale": options.scale,
+        "turn": None if options.turn is None else np.radians(options.turn),
+        "shift": shift,
     }
     if not kinds:
         if kind in (Tracking.kind, Twin.kind) or options.refine:
@@ -210,6 +221,14 @@ def _rejection_reason(fit: AlignmentFit, options: AlignOptions) -> str:
             f"the tracking is mirrored: {fit.mirrored}; import it again with the other --hand, or correct the "
             "negated axis in the evidence"
         )
+    if fit.interval is not None:
+        if reason := fit.interval.rejection_reason():
+            return reason
+        if fit.metadata["heads_in_solids"] > MAX_IN_SOLIDS:
+            return (
+                f"{100 * fit.metadata['heads_in_solids']:.0f} % of the heads are inside solid objects: check --up, "
+                "--scale and --floor-height, or give other evidence"
+            )
     median = float(np.median(fit.residuals_cm)) if len(fit.residuals_cm) else 0.0
     if not median <= options.max_residual:
         return (
@@ -234,8 +253,9 @@ def _report_alignment(alignment: Alignment, reporter: Reporter) -> None:
         if r[f"median_{unit}"] is not None
     ]
     matrix = alignment.matrix
-    reporter.message(f"residuals: {', '.join(parts)} (median); scale {Similarity(matrix).scale:.5g}")
-    if u is not None:
+    residuals = f"residuals: {', '.join(parts)} (median)" if parts else "no residuals, since there are no hit points"
+    reporter.message(f"{residuals}; scale {Similarity(matrix).scale:.5g}")
+    if u is not None and "cm" in u:
         reporter.message(
             f"uncertainty (one standard deviation): {u['cm']:.2g} cm, {u['degrees']:.2g} degrees, "
             f"{u['scale_percent']:.2g} % of the scale"

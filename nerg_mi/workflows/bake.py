@@ -275,7 +275,7 @@ def bake(
     source = _check(surface, paths, options, rays)
     ns = select_backend(options.mode, options.threads)
     reporter.progress(0.0, "reading")
-    align = load_alignment(options)
+    align = load_alignment(options, reporter)
     receivers = read_target(surface, options.shapes, options.resolution, ns, reporter)
     across = receivers.mesh.diagonal / align.scale
     if across > _LARGEST:

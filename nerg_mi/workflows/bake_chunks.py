@@ -292,10 +292,10 @@ def check_values(options: BakeOptions) -> None:
     find_colormap(options.cmap)
 
 
-def load_alignment(options: BakeOptions) -> Similarity:
+def load_alignment(options: BakeOptions, reporter: Reporter) -> Similarity:
     """Return the transform from the rays to the scene: --align, or that of the gaze field's training."""
     if options.align is not None:
-        return read_similarity(options.align, "--align", "rays to place")
+        return read_similarity(options.align, "--align", "rays to place", reporter.warn)
     return (
         Similarity()
         if options.gaze is None

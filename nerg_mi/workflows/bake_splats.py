@@ -113,7 +113,7 @@ def bake_splats(
     gaussians = read_splats(path)
     for note in (*gaussians.assumptions, *gaussians.notes):
         reporter.message(f"{path}: {note}")
-    align, cone = load_alignment(options), cone_radians(options, source)
+    align, cone = load_alignment(options, reporter), cone_radians(options, source)
     of_rays = RaySettings(cone_sigma=cone, rays_per_cone=options.cone_samples, seed=options.seed)
     groups, factor = make_gaze_groups(options, source, rays, align, reporter)
     if source == "rays":

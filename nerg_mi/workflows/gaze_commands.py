@@ -104,7 +104,10 @@ class GazeOptions(DerivedOptions, GeometryOptions):
         group=INPUT,
     )
     force: bool = option(
-        False, "Train even if no gaze ray hits a surface of the scene, a sign of a wrong alignment.", group=INPUT
+        False,
+        "Train even if no gaze ray hits a surface of the scene, a sign of a wrong alignment, or if the alignment is "
+        "undetermined.",
+        group=INPUT,
     )
     max_samples: int = option(
         10_000_000,

@@ -428,6 +428,18 @@ class AlignOptions(ValidatedDataclass):
     scale: float | None = option(
         None, "Scene units per metre of the tracking.  [default: estimated]", within=LENGTHS, group=ANALYSIS
     )
+    turn: float | None = option(
+        None,
+        "Rotation about --up from the frame of the tracking to that of the scene, turned to z up, in degrees, "
+        "anticlockwise as seen from above.  [default: estimated]",
+        within=Range(-360, 360),
+        group=ANALYSIS,
+    )
+    shift: str | None = option(
+        None,
+        "Position of the origin of the tracking in the scene, x,y,z in scene units.  [default: estimated]",
+        group=ANALYSIS,
+    )
     max_residual: float = option(
         10.0,
         "Maximum median residual in centimetres; alignments with a larger one are rejected.",
@@ -445,7 +457,8 @@ declare(
     "nerg_mi.workflows.align:align",
     "Register tracking with a scene: find the similarity transform from the frame of the rays to that of the scene.",
     more="""The transform is found from point correspondences, two surfaces, cameras posed in both frames, or the
-tracking alone: heads are in free space, and gaze ends on surfaces. A mirrored frame is detected and reported.""",
+tracking alone: heads are in free space, and gaze ends on surfaces. A mirrored frame is detected and reported. Without
+hit points, the ranges of turns, scales and shifts that fit are reported, and wide ones are rejected.""",
     options=AlignOptions,
     rays=argument(
         "Rays file (.npz or .parquet). Not needed with --pairs, --tracking-surface or --tracking-cameras.",

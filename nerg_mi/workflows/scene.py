@@ -195,7 +195,11 @@ def write_scene(
         check_writable(colors_path(output))
         check_writable(output.with_suffix(".vol") if inputs.place is None else output)
     ns = select_backend(options.mode)
-    align = inputs.align if options.align is None else read_similarity(options.align, "--align", "rays to place")
+    align = (
+        inputs.align
+        if options.align is None
+        else read_similarity(options.align, "--align", "rays to place", reporter.warn)
+    )
     scene_rays = load_scene_rays(inputs.rays, output, reporter)
     inputs, rays = replace(inputs, rays=scene_rays.file), scene_rays.rays
     inputs, made = _with_hits(inputs, rays, output, reporter)

@@ -203,7 +203,7 @@ def _train(rays: Rays | str | Path | None, output: Path | None, options: GazeOpt
     ns = select_backend(options.mode, options.threads)
     if options.resume and not options.ensemble and (state is None or not state.is_file()):
         raise NergError(f'there is no state to resume: "{state}" does not exist; leave out --resume to start')
-    align = Similarity() if options.align is None else read_similarity(options.align, "--align", "rays to field")
+    align = Similarity() if options.align is None else _read_alignment(options.align, options.force, reporter)
     if not isinstance(rays, Rays):
         reporter.progress(0.0, "reading rays")
     supervision, metadata = _supervision(rays, options, probes, align, reporter)
@@ -320,6 +320,17 @@ def _supervision(
         centres = np.array(test["centres"]) @ align.matrix[:3, :3].T + align.matrix[:3, 3]
         views = select_far_views(views, centres, 2 * probes.radius * align.scale)
     return Supervision(data, tuple(views)), metadata
+
+
+def _read_alignment(path: Path, force: bool, reporter: Reporter) -> Similarity:
+    """Read an alignment. Raises `NergError` for one that its evidence did not determine, unless ``force`` is set."""
+
+    def reject(reason: str) -> None:
+        if not force:
+            raise NergError(f"{reason} (or add --force to train anyway)")
+        reporter.warn(reason)
+
+    return read_similarity(path, "--align", "rays to field", reject)
 
 
 def _open_views(options: GazeOptions, photos: Path, salience: str) -> tuple[SalienceSet, dict]:

@@ -93,7 +93,7 @@ def make_viewer_scene(
     scenes = [path for path, kind in kinds.items() if kind == "scene"]
     gaze = [path for path, kind in kinds.items() if kind == "gaze"]
     if len(scenes) == 1 and set(kinds.values()) <= {"scene", "rays", "gaze"} and _is_nerg(scenes[0]):
-        align = _explicit_align(options) or Similarity(np.eye(4))
+        align = _explicit_align(options, reporter) or Similarity(np.eye(4))
         own_gaze = find_gaze_file(scenes[0]) if gaze else None
         variants = (
             write_variants(scenes[0], [*([own_gaze] if own_gaze else []), *gaze], folder, reporter) if gaze else {}
@@ -110,7 +110,7 @@ def make_viewer_scene(
         observer=options.observer, up=options.up, align=options.align, geometry=options.geometry, mode=options.mode
     )
     write_scene(inputs, output, scene_options, reporter)
-    align = _explicit_align(options)
+    align = _explicit_align(options, reporter)
     if align is None:
         align = read_training_alignment(read_metadata(gaze[0]).get("provenance", {}) if gaze else {})
     variants = write_variants(output, gaze, folder, reporter) if len(gaze) > 1 else {}
@@ -170,8 +170,8 @@ def _is_nerg(path: Path) -> bool:
     return is_nerg(load_scene(path).integrator())
 
 
-def _explicit_align(options: ViewOptions) -> Similarity | None:
-    return None if options.align is None else read_similarity(options.align, "--align", "rays to place")
+def _explicit_align(options: ViewOptions, reporter: Reporter) -> Similarity | None:
+    return None if options.align is None else read_similarity(options.align, "--align", "rays to place", reporter.warn)
 
 
 def _up(options: ViewOptions, otherwise: np.ndarray) -> np.ndarray:

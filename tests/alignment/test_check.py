@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.alignment.check import Alignment, AlignmentCheck, check_alignment, read_similarity
-from nerg_mi.alignment.constraints import AlignmentFit
+from nerg_mi.alignment.constraints import AlignmentFit, Interval
 from nerg_mi.errors import NergError
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.transport.geometry import SceneGeometry
@@ -71,6 +71,29 @@ def test_negated_axis_is_reported():
 
 
 # ---- The record of an alignment ----
+
+
+def test_undetermined_alignments_are_reported_when_they_are_read(tmp_path):
+    path, doubts = tmp_path / "alignment.json", []
+    for turn in ((-4.0, 5.0), (-50.0, 130.0)):
+        fit = AlignmentFit(np.eye(4), np.zeros(0), np.zeros(0), interval=Interval(turn, (1.0, 1.02), 0.4))
+        result = Alignment.from_fit("tracking", fit, {}, False)
+        assert result.residuals["median_cm"] is None
+        result.save(path)
+        read_similarity(path, "--align", "rays to field", doubts.append)
+    (doubt,) = doubts
+    assert str(path) in doubt and "+130" in doubt and "--turn" in doubt
+    stored = json.loads(path.read_text())
+    assert stored["uncertainty"] == {
+        "level": 0.95,
+        "turn_degrees": [-50, 130],
+        "scale": [1, 1.02],
+        "shift_cm": pytest.approx(40),
+    }
+    stored["uncertainty"]["scale"] = "wide"
+    path.write_text(json.dumps(stored))
+    with pytest.raises(NergError, match="not an interval"):
+        read_similarity(path, "--align", "rays to field")
 
 
 def written(path):

@@ -19,7 +19,7 @@ from nerg_mi.alignment.constraints import (
     surface_from_traces,
     trace_scene,
 )
-from nerg_mi.alignment.similarity import FULL_BASIS, fit_similarity, similarity_scale
+from nerg_mi.alignment.similarity import LocalSimilarity, fit_similarity, similarity_scale, turn_between
 from nerg_mi.errors import NergError
 from nerg_mi.formats.ply import write_columns
 
@@ -42,13 +42,38 @@ def test_covariance_matches_many_fits():
     scales = np.log([similarity_scale(m) for m in draws])
     middle = np.array([carried(m, x.mean(axis=0)[None])[0] for m in draws])
     y = exact + rng.normal(0, noise, x.shape)
+    matrix = fit_similarity(x, y)
+    center = carried(matrix, x.mean(axis=0)[None])[0]
     stated = [
-        pair_covariance(x, exact + rng.normal(0, noise, x.shape), fit_similarity(x, y), FULL_BASIS) for _ in range(50)
+        pair_covariance(x, exact + rng.normal(0, noise, x.shape), LocalSimilarity(matrix, center)) for _ in range(50)
     ]
     mean = np.mean(stated, axis=0)
     assert np.sqrt(mean[6, 6]) == pytest.approx(scales.std(), rel=0.25)
     np.testing.assert_allclose(np.sqrt(np.diag(mean)[3:6]), middle.std(axis=0), rtol=0.3)
-    assert pair_covariance(x[:2], y[:2], truth, FULL_BASIS) is None
+    assert pair_covariance(x[:2], y[:2], LocalSimilarity(truth, center)) is None
+
+
+def test_constraints_hold_near_a_constrained_similarity():
+    rng = np.random.default_rng(1)
+    base, x = similarity(rng, upright=True), rng.normal(size=(5, 3))
+    on_floor = np.array([1.0, 2.0, base[2, 3]])
+    m = AlignmentTarget().parametrize(base, on_floor, True)
+    m = m.matrix(rng.normal(size=m.size))
+    np.testing.assert_allclose(m[:3, 2] / similarity_scale(m), [0, 0, 1], atol=1e-12)
+    assert m[2, 3] == pytest.approx(base[2, 3])
+    shift = np.array([3.0, -1, 2])
+    for constraints in ({"turn": 0.4}, {"scale": 1.5, "shift": shift}, {"turn": -0.4, "shift": shift}):
+        target = AlignmentTarget(**constraints)
+        start = target.constrain(base, x)
+        chart = target.parametrize(start, np.ones(3))
+        for m in (start, chart.matrix(rng.normal(0, 0.5, chart.size))):
+            assert target.scale in (None, pytest.approx(similarity_scale(m)))
+            assert target.turn in (None, pytest.approx(turn_between(np.eye(4), m)))
+            assert target.shift is None or np.allclose(m[:3, 3], shift)
+    assert np.allclose(
+        carried(AlignmentTarget(turn=0.4).constrain(base, x), x).mean(axis=0), carried(base, x).mean(axis=0)
+    )
+    assert np.allclose(AlignmentTarget().constrain(base, x), base)
 
 
 def test_missing_geometry_is_refused():

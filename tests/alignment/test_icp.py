@@ -52,7 +52,7 @@ def test_refinement_converges_with_uncertainty():
         ZeroDistance(surface.free_space_distance, rays.origin, rays.person, "heads"),
     ]
     center = rooms.carried(truth, rays.origin).mean(axis=0)
-    result = refine(scores, start, center, FULL_BASIS)
+    result = refine(scores, LocalSimilarity(start, center))
     target = rooms.carried(truth, rays.origin)
     assert (
         residual_distances(start, rays.origin, target).max() > 0.1

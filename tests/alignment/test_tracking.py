@@ -147,7 +147,7 @@ def test_initial_similarity_is_refined():
     [
         ({}, {"is_upright": False}, "needs the up direction"),
         ({}, {"tracking_floor": None}, "give it with --floor-height"),
-        ({"hit": None}, {}, "do not determine the scale"),
+        ({"hit": None}, {}, "do not determine turn and scale"),
         (None, {}, "no gaze samples"),
     ],
 )

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from nerg_mi.alignment import profile
 from nerg_mi.alignment.check import AlignmentCheck
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation.study import list_rows, measure_rows
@@ -20,10 +21,12 @@ from nerg_mi.workflows import align as alignment
 from nerg_mi.workflows import demo, geometry, study
 from nerg_mi.workflows.align import align
 from nerg_mi.workflows.demo import STAGES, make_demo
+from nerg_mi.workflows.gaze_commands import GazeOptions
 from nerg_mi.workflows.geometry import check_geometry
 from nerg_mi.workflows.rays_commands import AlignOptions
 from nerg_mi.workflows.scene_commands import DemoOptions, StudyOptions
 from nerg_mi.workflows.study import find_reference_scene, measure_part, plan_study, run_study
+from nerg_mi.workflows.train_gaze import train_gaze
 from tests.alignment import rooms
 from tests.evaluation.test_study_subject import SCENE, TWIN
 from tests.figures.standins import write_standins
@@ -201,6 +204,37 @@ def test_up_axis_and_initial_alignment_give_the_same_frame(tmp_path, monkeypatch
     off = rooms.carried(again.matrix, RAYS.origin) - rooms.carried(aligned.alignment.matrix, RAYS.origin)
     assert np.linalg.norm(off, axis=1).max() < 0.1 and again.evidence["kind"] == "tracking"
     assert alignment._turn("-y")[:3, :3] @ [0, -1, 0] == pytest.approx([0, 0, 1])
+
+
+def test_undetermined_turn_is_refused_unless_forced(tmp_path, monkeypatch):
+    monkeypatch.setattr(profile, "_TURNS", np.radians([10, 90, 180]))
+    np.save(tmp_path / "points.npy", rooms.traces(8000).end)
+    gaze, out = replace(RAYS, hit=None), tmp_path / "a.json"
+    options, reporter = AlignOptions(surface=tmp_path / "points.npy", scale=1.0), Recorder()
+    with pytest.raises(NergError, match=r"do not determine the turn.*--turn.*--force"):
+        align(gaze, out, options)
+    assert not out.exists()
+    forced = align(gaze, out, replace(options, force=True), reporter).alignment
+    low, high = forced.uncertainty["turn_degrees"]
+    assert forced.forced and high - low > 10 and not any(line.startswith("residuals") for line in reporter.messages)
+    with pytest.raises(NergError, match=r"a\.json.*do not determine the turn.*--force"):
+        train_gaze(gaze, tmp_path / "gaze.safetensors", GazeOptions(align=out, scene=tmp_path / "a.xml", mode="llvm_ad_rgb"))
+    fixed = align(gaze, out, replace(options, turn=0.0, shift="0,0,0")).alignment
+    assert np.allclose(fixed.matrix, np.eye(4)) and fixed.uncertainty["shift_cm"] == 0
+
+
+def test_turn_and_shift_hold_with_pairs(tmp_path):
+    truth, path = pairs(tmp_path)
+    shift = ",".join(map(str, truth[:3, 3]))
+    options = AlignOptions(pairs=path, up="y", shift=shift, force=True)
+    free = alignment._turn("y") @ align(None, None, options).alignment.matrix
+    degrees = np.degrees(np.arctan2(free[1, 0], free[0, 0])) + 10
+    result = align(None, None, replace(options, turn=degrees)).alignment
+    fixed = alignment._turn("y") @ result.matrix
+    assert np.degrees(np.arctan2(fixed[1, 0], fixed[0, 0])) == pytest.approx(degrees)
+    np.testing.assert_allclose(result.matrix[:3, 3], truth[:3, 3], atol=1e-9)
+    with pytest.raises(NergError, match="no positive scale"):
+        align(None, None, replace(options, turn=degrees + 180))
 
 
 def place(alignment_check, monkeypatch):
