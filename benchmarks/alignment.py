@@ -15,7 +15,12 @@ ray casts at the mesh of the store, with a noise of 2 cm. The first table has on
 - ``residual cm``: the median residual that the fit reports;
 - ``mirror named``: how often mirrored tracking data (the x axis negated) are detected.
 
-The second table needs the photos of the fox (`../shared/data/fox`, or the folder of the variable NERG_DATA). It
+The table ``hidden`` has recordings whose hit points are hidden, of eight participants each: shoppers of the store,
+participants of the places of ``generated_places.py``, and, with NERG_DATA, half of the participants of the VR
+supermarket, whose surface is what the gaze of the other half meets. Up and floor are given, and the scale, the
+turn, or both.
+
+The last table needs the photos of the fox (`../shared/data/fox`, or the folder of the variable NERG_DATA). It
 simulates participants who stand between the cameras of the photos, in a random other frame, and aligns them by five
 picked points with errors of 1 % of the extent of the camera positions.
 """
@@ -25,25 +30,32 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import tempfile
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 from nerg_mi.alignment.constraints import AlignmentTarget, Evidence, SceneTraces, read_surface, trace_scene
 from nerg_mi.alignment.icp import Twin
 from nerg_mi.alignment.points import Cameras, Pairs
-from nerg_mi.alignment.similarity import MIRROR, residual_distances, similarity_scale, transform_points
+from nerg_mi.alignment.similarity import MIRROR, residual_distances, similarity_scale, transform_points, turn_between
 from nerg_mi.alignment.tracking import Tracking
 from nerg_mi.errors import NergError
-from nerg_mi.rays.rays import Rays
+from nerg_mi.rays.rays import Rays, merge_rays
 from timing import print_table, write_rows
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 ROOT = Path(__file__).resolve().parents[1]
+DATA = Path(os.environ.get("NERG_DATA", ROOT.parent / "shared" / "data"))
+HIDDEN = "Alignment without hit points"
+HIDDEN_HEAD = (
+    "environment|given|turn before, degrees|turn error, degrees|turn interval, degrees|scale error, %"
+    "|scale interval, ratio|error of heads, m|interval contains the truth|accepted|accepted and wrong"
+).split("|")
 TITLE, FOX = "Alignment by evidence, in the store", "Fox, from five picked points"
 HEAD = (
     "evidence|also known|correct|error, cm|95 % quantile, cm|rotation error, degrees|scale error, %|residual, cm"
@@ -131,23 +143,16 @@ def cameras(world, truth, rng, mirrored):
     return Cameras(poses, other), AlignmentTarget(is_upright=False)
 
 
-def tracking(hits: bool) -> Maker:
-    def make(world, truth, rng, mirrored):
-        from dataclasses import replace
-
-        rays = world.rays if hits else replace(world.rays, hit=None)
-        if mirrored:
-            rays = replace(
-                rays,
-                origin=transform_points(MIRROR, rays.origin),
-                direction=transform_points(MIRROR, rays.direction),
-                hit=None if rays.hit is None else transform_points(MIRROR, rays.hit),
-            )
-        return Tracking(rays), AlignmentTarget(
-            traces=world.traces.transform(truth), scale=None if hits else similarity_scale(truth)
+def tracking(world, truth, rng, mirrored):
+    rays = world.rays
+    if mirrored:
+        rays = replace(
+            rays,
+            origin=transform_points(MIRROR, rays.origin),
+            direction=transform_points(MIRROR, rays.direction),
+            hit=transform_points(MIRROR, rays.hit),
         )
-
-    return make
+    return Tracking(rays), AlignmentTarget(traces=world.traces.transform(truth))
 
 
 # Name, further known quantities, whether up is known, and the generator.
@@ -157,12 +162,11 @@ KINDS: dict[str, tuple[str, str, bool, Maker]] = {
     "twin": ("twin: the store's mesh", "", False, twin(False)),
     "upright-twin": ("twin: the store's mesh", "up", True, twin(True)),
     "cameras": ("40 cameras, 4 of them wrong", "", False, cameras),
-    "tracking": ("tracking with hit points", "up, floor", True, tracking(True)),
-    "heads": ("tracking without hit points", "up, floor, scale", True, tracking(False)),
+    "tracking": ("tracking with hit points", "up, floor", True, tracking),
 }
 
 
-SEARCHED = ("twin", "upright-twin", "tracking", "heads")
+SEARCHED = ("twin", "upright-twin", "tracking")
 
 
 def measure(world: World, kind: str, trials: int, mirrors: int, seed: int = 0) -> dict:
@@ -193,7 +197,7 @@ def measure(world: World, kind: str, trials: int, mirrors: int, seed: int = 0) -
             result.append((np.median(each), angle, scale, residual))
             off.append(each)
     seconds = (time.perf_counter() - began) / trials
-    for k in range(mirrors if kind not in ("floor", "heads") else 0):
+    for k in range(mirrors if kind != "floor" else 0):
         rng = np.random.default_rng([k, seed])
         evidence, target = make(world, random_similarity(rng, upright), rng, True)
         try:
@@ -227,9 +231,77 @@ def cells(row: dict) -> list[str]:
     return [row["evidence"], row["known besides"], right, *numbers, named, f"{row['s']:.2g}"]
 
 
+def list_hidden(world: World, folder: Path) -> Iterator[tuple[str, SceneTraces | None, Rays]]:
+    """Names, traces and recordings. Without traces, the surface is what the gaze of other participants meets."""
+    import generated_places
+    from nerg_mi.rays.readers.registry import read_rays
+    from nerg_mi.train.geometry import load_scene_geometry
+
+    yield "demo store", world.traces, world.rays
+    for make in generated_places.PLACES:
+        place = make()
+        scene = place.write(folder / f"{place.name}.xml")
+        core = load_scene_geometry(scene)
+        assert core.medium is not None
+        traces = trace_scene(core.medium, np.array(core.box.core.lower), np.array(core.box.core.upper), 100_000)
+        yield place.name, traces, place.record(scene, seconds=120.0, seed=1)
+    files = sorted((DATA / "vr_supermarket").glob("*.csv.gz"))
+    if files:
+        rays = merge_rays([read_rays("vr_supermarket", file) for file in files])
+        yield "VR supermarket", None, rays.select(np.isfinite(np.asarray(rays.hit)).all(axis=1))
+
+
+def _traces_of_gaze(rays: Rays) -> SceneTraces:
+    assert rays.hit is not None
+    return SceneTraces(rays.origin, rays.hit, np.ones(len(rays), bool))
+
+
+def measure_hidden(name: str, traces: SceneTraces | None, rays: Rays, fixed: str, trials: int, seed: int) -> list[str]:
+    """One row: errors and intervals of recordings whose hit points are hidden; ``fixed`` names what is given."""
+    rows = []
+    for k in range(trials):
+        rng = np.random.default_rng([k, seed, 3])
+        chosen = np.isin(rays.person, rng.permutation(np.unique(rays.person))[: 5 if traces is None else 8])
+        truth = random_similarity(rng, True)
+        surface = _traces_of_gaze(rays.select(~chosen)) if traces is None else traces
+        values = {"scale": similarity_scale(truth), "turn": turn_between(np.eye(4), truth)}
+        target = AlignmentTarget(
+            traces=surface.transform(truth),
+            scale=values["scale"] if "scale" in fixed else None,
+            turn=values["turn"] if "turn" in fixed else None,
+        )
+        tracked = replace(rays.select(chosen), hit=None)
+        fit = Tracking(tracked).fit(target, lambda *_: None)
+        assert fit.interval is not None
+        turn, (low, high) = np.degrees(turn_between(fit.matrix, truth)), fit.interval.scale
+        heads = residual_distances(fit.matrix, tracked.origin, transform_points(truth, tracked.origin))
+        tiny = 1e-6  # rounding
+        inside = (
+            any(fit.interval.turn[0] - tiny <= turn + c <= fit.interval.turn[1] + tiny for c in (-360, 0, 360))
+            and low <= values["scale"] * (1 + tiny)
+            and values["scale"] <= high * (1 + tiny)
+        )
+        if fixed == "scale, turn":
+            inside = bool(np.median(heads) <= fit.interval.shift)
+        width = min(float(np.ptp(fit.interval.turn)), 360.0)
+        scale_error = 100 * abs(similarity_scale(fit.matrix) / values["scale"] - 1)
+        accepted = not fit.interval.rejection_reason()
+        wrong = accepted and (abs(turn) > 10 or np.median(heads) > 1)
+        initial = abs(np.degrees(values["turn"]))
+        rows.append((initial, abs(turn), width, scale_error, high / low, np.median(heads), inside, accepted, wrong))
+        print(
+            name, fixed, k, low / values["scale"], high / values["scale"], *(f"{v:.3g}" for v in rows[-1]), flush=True
+        )
+    table = np.array(rows, float)
+    median = np.median(table, axis=0)
+    numbers = ["" if ("scale" if j > 2 else "turn") in fixed else f"{median[j]:.3g}" for j in range(5)]
+    counts = [f"{int(table[:, j].sum())} of {trials}" for j in (6, 7, 8)]
+    return [name, fixed, *numbers, f"{median[5]:.2g}", *counts]
+
+
 def measure_fox(trials: int) -> list[list[str]] | None:
     """Participants around the fox, from five points; None without the photos."""
-    path = Path(os.environ.get("NERG_DATA", ROOT.parent / "shared" / "data")) / "fox" / "transforms.json"
+    path = DATA / "fox" / "transforms.json"
     if not path.is_file():
         return None
     poses = np.array([f["transform_matrix"] for f in json.loads(path.read_text())["frames"]], float)
@@ -276,8 +348,14 @@ def main(argv=None) -> None:
     parser.add_argument(
         "--only",
         action="append",
-        choices=[*KINDS, "fox"],
+        choices=[*KINDS, "hidden", "fox"],
         help="Kind of evidence to measure; can be repeated. Default: all.",
+    )
+    parser.add_argument(
+        "--hidden",
+        type=int,
+        default=2,
+        help="Number of trials for each environment without hit points. Default: %(default)s.",
     )
     parser.add_argument("--seed", type=int, default=0, help="Seed of the random similarities. Default: %(default)s.")
     parser.add_argument("--shoppers", type=int, default=12, help="Number of simulated shoppers. Default: %(default)s.")
@@ -300,10 +378,18 @@ def main(argv=None) -> None:
     )
     args = parser.parse_args(argv)
 
-    requested = args.only or [*KINDS, "fox"]
+    requested = args.only or [*KINDS, "hidden", "fox"]
     counts = {kind: args.searches or args.trials if kind in SEARCHED else args.trials for kind in KINDS}
-    if [kind for kind in requested if kind != "fox"]:
-        world = make_world(args.shoppers, args.rays)
+    world = make_world(args.shoppers, args.rays) if requested != ["fox"] else None
+    if world is not None and "hidden" in requested:
+        with tempfile.TemporaryDirectory() as folder:
+            hidden = [
+                measure_hidden(*place, fixed, args.hidden, args.seed)
+                for place in list_hidden(world, Path(folder))
+                for fixed in ("scale", "turn", "scale, turn")
+            ]
+        print_table(HIDDEN, HIDDEN_HEAD, hidden, args.update)
+    if world is not None and [kind for kind in requested if kind in KINDS]:
         rows = []
         for kind in (k for k in KINDS if k in requested):
             mirrors = max(1, counts[kind] // 5) if args.mirrors is None else args.mirrors

@@ -25,8 +25,8 @@ resamples."""
 MARGIN = 0.002
 """Margin of the objective, the sum over the scores of the mean of log(1 + (residual / scale)^2).
 
-It is the smallest of a few values with which the intervals contain the true turn in the office, the gallery, the
-corridor and the stage of ``benchmarks/generated_places.py`` and in the demo store, with eight participants each.
+It is the smallest of a few values with which 17 intervals contain the true turn, in the places of
+``benchmarks/generated_places.py``, the demo store and the VR supermarket, with eight participants each.
 """
 
 _TURNS = np.radians([0.5, 1, 2, 3, 5, 7, *range(10, 30, 5), *range(30, 181, 10)])

@@ -2,6 +2,7 @@
 
 import importlib
 
+import numpy as np
 import pytest
 
 from tests.conftest import ROOT
@@ -47,6 +48,20 @@ def test03_alignment_tables(benchmark):
         cells = alignment.cells(alignment.measure(world, kind, 2, 1))
         assert cells[2] == "2 of 2" and cells[-2] == "1 of 1"
         assert any(line.startswith(f"| {cells[0]} |") for line in moved)
+
+
+def test_alignment_without_hit_points(benchmark, monkeypatch):
+    from nerg_mi.alignment import profile
+    from tests.alignment import rooms
+
+    monkeypatch.setattr(profile, "_TURNS", np.radians([45, 90, 180]))
+    alignment = benchmark("alignment")
+    assert f"| {' | '.join(alignment.HIDDEN_HEAD)} |" in page("accuracy.md")
+    row = dict(
+        zip(alignment.HIDDEN_HEAD, alignment.measure_hidden("room", rooms.traces(), rooms.people(300), "scale", 1, 0))
+    )
+    assert row["interval contains the truth"] == "1 of 1" and row["accepted and wrong"] == "0 of 1"
+    assert float(row["turn interval, degrees"]) > 0 and row["scale error, %"] == ""
 
 
 SCRIPTS = sorted(p.stem for p in (ROOT / "benchmarks").glob("*.py") if "__main__" in p.read_text(encoding="utf-8"))

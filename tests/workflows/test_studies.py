@@ -218,7 +218,8 @@ def test_undetermined_turn_is_refused_unless_forced(tmp_path, monkeypatch):
     low, high = forced.uncertainty["turn_degrees"]
     assert forced.forced and high - low > 10 and not any(line.startswith("residuals") for line in reporter.messages)
     with pytest.raises(NergError, match=r"a\.json.*do not determine the turn.*--force"):
-        train_gaze(gaze, tmp_path / "gaze.safetensors", GazeOptions(align=out, scene=tmp_path / "a.xml", mode="llvm_ad_rgb"))
+        plan = GazeOptions(align=out, scene=tmp_path / "a.xml", mode="llvm_ad_rgb")
+        train_gaze(gaze, tmp_path / "gaze.safetensors", plan)
     fixed = align(gaze, out, replace(options, turn=0.0, shift="0,0,0")).alignment
     assert np.allclose(fixed.matrix, np.eye(4)) and fixed.uncertainty["shift_cm"] == 0
 
