@@ -116,7 +116,7 @@ class LobeField:
     """exp(sharpness axis . r_o), like another recipe of log densities."""
 
     kind = "lobe"
-    networks, support, max_sizes = 1, None, {}
+    networks, support, hits, max_sizes = 1, None, None, {}
     DRJIT_STRUCT: ClassVar[dict] = {"axis": None}
 
     def __init__(self, config, box, axis):
