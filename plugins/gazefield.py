@@ -22,6 +22,11 @@ Gaze field (:monosp:`gazefield`)
      seconds of compilation for each image size (docs/explanation/performance.md, "Weights as constants"). For many
      large frames of one field; only on CPUs, without derivatives, and for weights that rarely change. (Default: false)
 
+ * - reaimed_hits
+   - |bool|
+   - Mix in the re-aimed hits of the checkpoint, if it has any. Without them gaze is the mixture of networks and prior;
+     functions that ``dr.freeze`` records need this. (Default: true)
+
  * - grid.table, position_net.0, ..., direction_net.0, ..., emit_head.0, capture_head.0
    - |tensor|
    - Features of the grid and weight matrices of the trunk and of both heads.
@@ -48,7 +53,7 @@ For an ensemble (``nerg train gaze --ensemble``) gaze is the mean of the members
 normalised; the AOV ``gaze_std`` of the integrator shows their standard deviation. The checkpoint also stores the number
 of training rays near a position (AOV ``support``), and may store re-aimed hits (``nerg train gaze --reaimed-hits``):
 hit points of training rays, whose kernel density around the observer is mixed into ``gaze``. It is differentiable in
-the observer's position and in directions to first order; ``dr.freeze`` cannot record it.
+the observer's position and in directions to first order.
 
 .. tabs::
     .. code-tab:: xml
@@ -67,6 +72,8 @@ the observer's position and in directions to first order; ``dr.freeze`` cannot r
 """
 
 from __future__ import annotations
+
+from copy import copy
 
 import mitsuba as mi
 
@@ -88,6 +95,10 @@ class GazeFieldVolume(make_volume_class()):
         # ``network``: a field in memory instead of a file; see ``of``.
         super().__init__(props)
         self.field, self.metadata, self.filename = load_network(props, network, load_gaze, namespace(mi.Float))
+        if not read_boolean(props, "reaimed_hits", True) and self.field.hits is not None:
+            # A copy, because the field in memory may be used elsewhere.
+            self.field = copy(self.field)
+            self.field.hits = None
         self._similarity = Similarity(read_transform(props, "to_world"))
         if read_boolean(props, "constant_weights", False):
             set_constant_weights(self.field)

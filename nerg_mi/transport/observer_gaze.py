@@ -297,6 +297,11 @@ class GazeFieldInstance:
             return ObservedGaze(self, geometry, settings, [])
         if not observers:
             raise ValueError("a gaze field that is normalised over the observer's sphere needs at least one observer")
+        if self.field.hits is not None and is_recording():
+            raise NergError(
+                "dr.freeze cannot record a gaze field with re-aimed hits, whose neighbours are found outside of "
+                "kernels; set its property reaimed_hits to false"
+            )
         cache = cache or ObserverCache()
         made_of = (fingerprint_geometry(geometry), settings.surface_settings)
         samples = cache.get_or_compute_each(
@@ -322,11 +327,6 @@ class GazeFieldInstance:
         """The density of re-aimed hits for the observer at ``center``."""
         hits = self.field.hits
         assert hits is not None
-        if is_recording():
-            raise NergError(
-                "dr.freeze cannot record a gaze field with re-aimed hits, whose neighbours are found outside of "
-                "kernels; train it with --no-reaimed-hits"
-            )
         position = np.array(self.to_world.point_to_local(center), np.float64).ravel()
         return hits.observe(position, namespace(center.x))
 

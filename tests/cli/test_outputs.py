@@ -137,8 +137,9 @@ def test_an_output_is_written_atomically(case, inputs, tmp_path, capsys, monkeyp
             code, said = nerg(capsys, *case.arguments(inputs, out))
         assert is_one_sentence(code, said) and "maximum file size" in said, said
         contents = files(out)
-        # The state of a training is kept and reported if it is small enough.
-        assert (contents.pop("a.run", None) is not None) == ("the training is saved" in said)
+        # The state of a training, or the members of an ensemble, are kept and reported if they are small enough.
+        saved = [contents.pop(name) for name in list(contents) if name == "a.run" or ".member" in name]
+        assert bool(saved) == ("the training is saved" in said)
         assert set(contents) == set(case.files), "a leftover, or a loss"
         assert all(content == b"old" or limit >= len(content) > 3 for content in contents.values())
         assert any(content == b"old" for content in contents.values())

@@ -265,7 +265,7 @@ def test_the_demo_evaluation_matches_its_field(standins):
     verdict = compute_verdict(results.rows, results.split, results.num_participants, results.num_positions)
     assert results.num_participants == 100 and results.num_positions == 64
     assert verdict.sentence.startswith(
-        "Better than the position-independent prior, the strongest baseline, and than the nearest rays"
+        "Better than the re-aimed hits, the strongest baseline, and than the nearest rays"
     )
 
 

@@ -15,6 +15,7 @@ from nerg_mi.fields.gaze_base import CUTOFF_RADII, GazeEnsemble, RaySupport
 from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
 from nerg_mi.formats.fields import load_gaze, save_gaze
 from nerg_mi.transport.geometry import SceneGeometry
+from tests.evaluation import gaze_fields
 from tests.reference import fields_numpy
 
 from . import fields
@@ -55,6 +56,18 @@ def saved(path, field):
 def ask(mi, gaze, p_od, p_o, r_o):
     p_od, p_o, r_o = (mi.Vector3f(np.asarray(x, float).tolist()) for x in (p_od, p_o, r_o))
     return [v.numpy()[0] for v in observed(mi, gaze, mi.Point3f(p_o)).evaluate(p_od, p_o, r_o, True)]
+
+
+@pytest.mark.parametrize("kind", ["re-aimed hits", "ensemble"])
+def test02b_reaimed_hits_are_mixed_in_unless_left_out(rgb, tmp_path, kind):
+    path = tmp_path / "g.safetensors"
+    hits = gaze_fields.saved(path, kind, fields.BOX).hits
+    p_o, r_o = np.array([0.2, -0.3, 0.1]), np.array([0.6, 0.0, 0.8])
+    volumes = [stored("gazefield", path, reaimed_hits=value) for value in (True, False)]
+    mixed, plain = (ask(rgb, volume, p_o + 0.3 * r_o, p_o, r_o)[0] for volume in volumes)
+    density = hits.make_kde(hits.find(p_o), ns).evaluate(r_o[None])[0, 0]
+    assert mixed == pytest.approx((1 - hits.weight) * plain + hits.weight * density, rel=1e-4)
+    assert abs(mixed / plain - 1) > 0.01
 
 
 @pytest.mark.parametrize("variant", ["emit", "capture", "emit_capture"])

@@ -168,6 +168,9 @@ def test_sums_match_surface_attention(rgb, tmp_path):
     actual = files(store)
     eye = (4.4, 2.8, 1.6)
     scene = nerg.make_scene(gaze=actual / "shoppers.safetensors", shapes=actual / "twin.ply", falloff=0.0)
+    field = scene.integrator.gaze.field
+    field.set_prior(0.0)
+    field.hits = None
     aoi = box((4.4, 4.65, 0.0), (4.9, 5.0, 1.45))
     expected = nerg.attention(scene, box_dict(*np.array([(4.4, 4.65, 0.0), (4.9, 5.0, 1.45)])), [eye], divisions=24)
     from nerg_mi.formats.meshes import read_mesh_file
@@ -180,7 +183,7 @@ def test_sums_match_surface_attention(rgb, tmp_path):
     make = observers_from_field(scene.integrator.gaze, target.geometry, target.settings)
     sums = sum_gaze(target, make, np.array([eye]), [1.0], SETTINGS)
     assert expected.share[0] > 0.001
-    # The field is normalised over the visible surfaces, with the box and without it.
+    # The networks are normalised over the visible surfaces, with the box and without it.
     gaze, at = scene.integrator.gaze, rgb.Point3f(eye)
     reference, without = (
         float(gaze.for_observers([at], place, target.settings).integrals(at)[0][0])
