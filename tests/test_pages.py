@@ -87,7 +87,7 @@ def blocks(*languages: str, page: str = "") -> list[Block]:
 def test01_no_block_is_left_out():
     here = {"sh", ("README.md", "python"), ("figures.md", "py"), ("python.md", "py")}
     here |= {(f"{page}.md", "json") for page in ("viewer", "store", "statistics")}
-    here |= {(f"{page}.md", "python") for page in "derivatives exchange python store recordings training".split()}
+    here |= {(f"{page}.md", "python") for page in "derivatives exchange python store recordings next-look".split()}
     here |= {(b.page, b.language) for b in blocks("xml", "python") if b.page in ("plugins.md", *XML_PAGES)}
     for block in blocks():
         key = (block.page, block.language)
@@ -210,8 +210,8 @@ def test_heads_are_turned_to_gaze(tmp_path, monkeypatch):
     eyes.save("eyes.npz")
     trained = {}
     names = {"nerg": SimpleNamespace(Rays=nerg.Rays, train_gaze=lambda rays, **options: trained.update(rays=rays))}
-    (text,) = [block.text for block in blocks("python", page="training.md")]
-    run(text, "training.md", names | {"rays": replace(eyes, direction=head)})
+    (text,) = [block.text for block in blocks("python", page="next-look.md")]
+    run(text, "next-look.md", names | {"rays": replace(eyes, direction=head)})
     assert trained["rays"].direction == pytest.approx(below, abs=1e-6)
 
 
