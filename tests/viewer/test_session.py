@@ -209,7 +209,8 @@ def test07_shares_equal_api(make_session, store):
     scene = nerg.Scene.load(store)
     for region in session.regions:
         true = nerg.attention(scene, region.corners, observers=[(4.6, 3.0, 1.6)]).share[0]
-        assert session.shares[region.name] == pytest.approx(float(true), rel=0.03)
+        # Hardly any gaze falls on the floor.
+        assert session.shares[region.name] == pytest.approx(float(true), rel=0.03, abs=1e-4)
     assert "rays of" in session.basis and "participants" in session.basis
     shown = session.points()
     assert shown.colors.shape == shown.points.shape == session.proxy.points.shape
