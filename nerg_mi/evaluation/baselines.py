@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from nerg_mi.fields.kde import Backend, SphericalKde
+from nerg_mi.maths.sphere import aim
 from nerg_mi.maths.vmf import log_normaliser
 from nerg_mi.probes.probes import compute_participant_weights
 from nerg_mi.rays.folds import iter_folds, sample_participants_equally
@@ -43,7 +44,7 @@ DEFAULT_SETTINGS: Mapping[str, Mapping[str, float]] = {
 """Settings of the baselines where there are too few rays to tune them."""
 _FOLDS = 4  # Folds of the training rays
 _MAX_TEST_RAYS = 400  # Held-out rays of a fold
-_MIN_DISTANCE = 0.15  # Metres below which the direction to a hit point is not used: the recorded one is
+MIN_AIM_DISTANCE = 0.15  # Metres below which the direction to a hit point is not used: the recorded one is
 _MIN_DENSITY = 1e-9  # 1/sr, so that logarithms are finite
 _BLOCK = 32  # Positions that are evaluated together
 # Points per leaf of a KD-tree. The value decides the order of equally distant points, and so the last bits of sums.
@@ -106,15 +107,6 @@ def make_prior_baseline(
     return evaluate
 
 
-def aim(points: np.ndarray, directions: np.ndarray, origin: np.ndarray) -> np.ndarray:
-    """Return unit directions (..., 3) from ``origin`` to ``points``, or ``directions`` where a point is not finite or
-    nearer than 0.15 m."""
-    offset = points - origin
-    length = np.linalg.norm(offset, axis=-1, keepdims=True)
-    is_aimed = np.isfinite(length) & (length > _MIN_DISTANCE)
-    return np.where(is_aimed, np.where(is_aimed, offset, 0) / np.where(is_aimed, length, 1), directions)
-
-
 class Neighbours:
     """The training rays nearest to a position, as seen from it.
 
@@ -142,7 +134,7 @@ class Neighbours:
         distance, index = self._tree.query(positions, k=np.arange(1, k + 1))
         directions = self._directions[index]
         if self._hits is not None:
-            directions = aim(self._hits[index], directions, positions[:, None])
+            directions = aim(self._hits[index], directions, positions[:, None], MIN_AIM_DISTANCE)
         return distance, directions
 
 

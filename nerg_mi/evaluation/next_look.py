@@ -30,13 +30,13 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.maths import vmf
-from nerg_mi.maths.sphere import fibonacci_directions, sample_uniform_directions
+from nerg_mi.maths.sphere import aim, fibonacci_directions, sample_uniform_directions
 from nerg_mi.probes.probes import compute_participant_weights
 from nerg_mi.rays.direction_checks import compute_head_frames
 from nerg_mi.rays.filters import find_sessions
 from nerg_mi.rays.rays import Rays
 
-from .baselines import UNIFORM_DENSITY, aim
+from .baselines import MIN_AIM_DISTANCE, UNIFORM_DENSITY
 from .gaze import EPS
 
 RayDensity = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -174,7 +174,7 @@ def find_past_looks(
     origin = rays.origin[rows]
     used, index = np.unique(looks, return_inverse=True)
     points = _find_points(rays, used, distance)[index.reshape(looks.shape)]
-    directions = aim(points, rays.direction[looks], origin[:, None])
+    directions = aim(points, rays.direction[looks], origin[:, None], MIN_AIM_DISTANCE)
     directions = np.where(is_look[..., None], directions, np.nan)
     heading = find_heading(origin - rays.origin[looks[:, 0]], actual)
     return PastLooks(origin, actual, directions[:, 0], heading, directions[:, 1:]), rows
@@ -453,7 +453,7 @@ class NextLook:
                 # As in the fit: the looks are an interval apart, and that long before the last one.
                 count = bisect_right(spaced, times[t - 1] - interval, key=times.__getitem__)
                 looks = [t - 1, *spaced[max(0, count - earlier) : count]]
-                aimed = aim(points[looks], directions[looks], position)
+                aimed = aim(points[looks], directions[looks], position, MIN_AIM_DISTANCE)
                 past = PastLooks(position[None], steps[t - 1 : t], aimed[:1], heading[t - 1 : t], aimed[None, 1:])
                 component = self.components[rng.choice(len(self.components), p=weights[t - 1])]
                 if not spaced or times[t - 1] - times[spaced[-1]] >= interval:

@@ -529,6 +529,11 @@ class GazeEnsemble(AnyGazeField):
             raise ValueError(f"an ensemble of gaze fields needs at least two members, got {len(self.members)}")
         if any(len(m.members) > 1 for m in self.members):
             raise ValueError("a member of an ensemble of gaze fields is an ensemble itself; give its members instead")
+        if any(m.hits is not None for m in self.members):
+            raise ValueError(
+                "a member of an ensemble of gaze fields has re-aimed hits, which belong to the whole ensemble; train "
+                "the members with --no-reaimed-hits"
+            )
         if any(_common(m) != _common(self.members[0]) for m in self.members):
             raise ValueError(
                 "the members of an ensemble of gaze fields differ in kind, variant, output or box; train them alike"

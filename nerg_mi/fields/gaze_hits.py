@@ -11,12 +11,14 @@ predicts held-out gaze better than either (docs/explanation/accuracy.md).
 
 from __future__ import annotations
 
+from functools import cached_property
 from types import ModuleType
 from typing import Any, NamedTuple
 
 import drjit as dr
 import numpy as np
 
+from nerg_mi.maths.sphere import aim
 from nerg_mi.maths.types import Float, Point3f, Vector3f
 from nerg_mi.maths.vmf import log_normaliser
 from nerg_mi.ranges import KAPPAS, LENGTHS, MAX_COORDINATE
@@ -30,7 +32,7 @@ FAR = 1e4  # Distance, in bandwidths, at which the point of a sample without a h
 # a nearby point says nothing about observers next to it.
 _MIN_DISTANCE = 0.25
 _TABLE_SPACING = 0.2  # Texels of a table in units of 1/sqrt(κ): errors below 3e-4 of the maximum of a kernel
-_MIN_TABLE_LANES = 8192  # Number of directions from which a table is faster than the sum of all kernels
+_MIN_TABLE_LANES = 8192  # Number of directions below which a table is not considered
 
 
 class HitNeighbours(NamedTuple):
@@ -65,8 +67,6 @@ class ReaimedHits:
     """
 
     def __init__(self, origins: np.ndarray, points: np.ndarray, weight: float, bandwidth: float, kappa: float):
-        from scipy.spatial import KDTree
-
         self.origins, self.points = (np.ascontiguousarray(a, np.float32).reshape(-1, 3) for a in (origins, points))
         self.weight, self.bandwidth, self.kappa = float(weight), float(bandwidth), float(kappa)
         if not 0 < len(self.origins) == len(self.points) <= MAX_HITS:
@@ -81,7 +81,12 @@ class ReaimedHits:
                 "re-aimed hits need a weight from 0 to 1, a positive bandwidth and a positive concentration, got "
                 f"{weight}, {bandwidth} and {kappa}"
             )
-        self._tree: Any = KDTree(self.origins.astype(np.float64))
+
+    @cached_property
+    def _tree(self) -> Any:
+        from scipy.spatial import KDTree
+
+        return KDTree(self.origins.astype(np.float64))
 
     def find(self, positions: np.ndarray) -> HitNeighbours:
         """Find the samples nearest to each of ``positions`` (P, 3), in the field's frame."""
@@ -91,16 +96,16 @@ class ReaimedHits:
         # Relative to the nearest sample, so that the weights do not vanish far from all samples.
         weights = np.exp(0.5 * (distance[:, :1] ** 2 - distance**2) / self.bandwidth**2)
         origins, points = self.origins[index].astype(np.float64), self.points[index].astype(np.float64)
-        sight, recorded = points - positions[:, None], points - origins
-        length = np.linalg.norm(sight, axis=-1)
-        is_near = length < _MIN_DISTANCE * self.bandwidth
-        vector = np.where(is_near[..., None], recorded, sight)
-        norm = np.linalg.norm(vector, axis=-1, keepdims=True)
         # A point at the observer who looked at it has no direction.
-        directions = np.where(norm > 0, vector / np.where(norm > 0, norm, 1), (0.0, 0.0, 1.0))
-        weights = np.where(norm[..., 0] > 0, weights, 0)
-        weights[~(weights > 0).any(axis=1), 0] = 1
-        inverse = np.where(is_near, 0, 1 / np.where(is_near, 1, length))
+        recorded = aim(points, np.zeros(3), origins, 0.0)
+        min_distance = _MIN_DISTANCE * self.bandwidth
+        directions = aim(points, recorded, positions[:, None], min_distance)
+        weights = np.where(directions.any(axis=-1), weights, 0)
+        # If no sample has a direction, there is nothing to aim at; the density must still be one.
+        is_lost = ~weights.any(axis=1)
+        directions[is_lost, 0], weights[is_lost, 0] = (0, 0, 1), 1
+        length = np.linalg.norm(points - positions[:, None], axis=-1)
+        inverse = np.where(length > min_distance, 1 / np.maximum(length, min_distance), 0)
         return HitNeighbours(directions, weights, inverse, origins - positions[:, None])
 
     def make_kde(self, neighbours: HitNeighbours, ns: ModuleType) -> SphericalKde:
@@ -156,7 +161,8 @@ class ObservedHits:
 
     def prepare(self, lanes: int) -> None:
         """Tabulate the density if that is faster for ``lanes`` directions."""
-        if self._table is None and lanes >= _MIN_TABLE_LANES:
+        is_worthwhile = lanes >= _MIN_TABLE_LANES and SphericalKdeTable.is_worthwhile(self._kde, lanes)
+        if self._table is None and is_worthwhile:
             self._table = SphericalKdeTable(self._kde, spacing=_TABLE_SPACING)
 
     def density(self, r_o: Vector3f, p_o: Point3f) -> Float:

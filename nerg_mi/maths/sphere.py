@@ -91,6 +91,15 @@ def sample_uniform_directions(count: int, rng: np.random.Generator) -> np.ndarra
     return _from_height(1.0 - 2.0 * rng.random(count), 2.0 * np.pi * rng.random(count))
 
 
+def aim(points: np.ndarray, directions: np.ndarray, origins: np.ndarray, min_distance: float) -> np.ndarray:
+    """Return unit directions (..., 3) from ``origins`` to ``points``, or ``directions`` where a point is not finite or
+    not farther than ``min_distance``."""
+    offset = points - origins
+    length = np.linalg.norm(offset, axis=-1, keepdims=True)
+    is_aimed = np.isfinite(length) & (length > min_distance)
+    return np.where(is_aimed, np.where(is_aimed, offset, 0) / np.where(is_aimed, length, 1), directions)
+
+
 def latlong_to_direction(u: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Direction (..., 3) that Mitsuba's ``envmap`` shows at the texture position ``u``, ``v`` in [0, 1], in the map's
     own frame (y up).

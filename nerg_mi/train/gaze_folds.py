@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, replace
 from types import ModuleType
 from typing import Any, NamedTuple
 
+import drjit as dr
 import numpy as np
 
 from nerg_mi.errors import NergError
@@ -15,7 +16,6 @@ from nerg_mi.fields.gaze_base import GazeHead, GazeHeadConfig, interpolate_table
 from nerg_mi.fields.gaze_hits import MAX_HITS, ReaimedHits, place_missing_points
 from nerg_mi.interruption import Interruption
 from nerg_mi.maths.arrays import to_vector
-from nerg_mi.maths.vmf import log_normaliser
 from nerg_mi.probes.probes import calibrate_levels, compute_region_levels
 from nerg_mi.ranges import KAPPAS, LENGTHS
 from nerg_mi.rays.folds import iter_folds, sample_participants_equally
@@ -182,17 +182,22 @@ class FoldResults:
         index = _select_weight(gains, self.caution)
         selection = PriorSelection(float(PRIOR_WEIGHTS[index]), len(self.folds), self.kappa)
         selected, kernel = gains[:, index], None
-        candidates = [self._compute_mixed_gains(k) for k in range(self.folds[0].hits.shape[1])]
-        columns = [gains[:, _select_weight(gains, self.caution)] for gains in candidates]
+        candidates = []
+        for k in range(self.folds[0].hits.shape[1]):
+            mixed = self._compute_gains(*_WEIGHT_PAIRS.T, k)
+            index = _select_weight(mixed, self.caution)
+            candidates.append((mixed[:, index], _WEIGHT_PAIRS[index], k))
         if candidates:
-            best = int(np.argmax([column.mean() for column in columns]))
-            gain = columns[best] - selected
+            best, (weight, hits), k = max(candidates, key=lambda candidate: candidate[0].mean())
+            gain = best - selected
             if gain.mean() > max(_MIN_HITS_GAIN, self.hits_caution * _standard_error(gain)):
-                selected, kernel = columns[best], best
-                pair = _WEIGHT_PAIRS[_select_weight(candidates[best], self.caution)]
-                (weight, hits), (bandwidth, kappa) = pair.tolist(), HIT_KERNELS[best]
+                selected, kernel, (bandwidth, kappa) = best, k, HIT_KERNELS[k]
                 selection = replace(
-                    selection, prior_weight=weight, hits_weight=hits, hits_bandwidth=bandwidth, hits_kappa=kappa
+                    selection,
+                    prior_weight=float(weight),
+                    hits_weight=float(hits),
+                    hits_bandwidth=bandwidth,
+                    hits_kappa=kappa,
                 )
         to_bits = lambda nats: float(nats.mean() / np.log(2))
         regions = _calibrate_regions(self.folds, selection, kernel)
@@ -201,34 +206,29 @@ class FoldResults:
     def compute_gains(self, folds: int | None = None) -> np.ndarray:
         """Return the mean log density over that of the prior alone, in nats, of each held-out participant and with
         each of `PRIOR_WEIGHTS` (N, S), in the first ``folds`` folds."""
-        mix = lambda fold: (1 - PRIOR_WEIGHTS) * fold.field[:, None] + PRIOR_WEIGHTS * fold.prior[:, None]
-        return _average_gains(self.folds[:folds], mix)
+        return self._compute_gains(PRIOR_WEIGHTS, np.zeros_like(PRIOR_WEIGHTS), None, folds)
 
     def compute_selected_gains(self, selection: PriorSelection, folds: int) -> np.ndarray:
         """Return the same (N,) with the weights of ``selection``."""
-        m, h = selection.prior_weight, selection.hits_weight
+        h = selection.hits_weight
         kernel = HIT_KERNELS.index((selection.hits_bandwidth, selection.hits_kappa)) if h else None
-        mix = lambda fold: _mix(fold.field, fold.prior, 0 if kernel is None else fold.hits[:, kernel], m, h)[:, None]
-        return _average_gains(self.folds[:folds], mix)[:, 0]
+        return self._compute_gains(np.array([selection.prior_weight]), np.array([h]), kernel, folds)[:, 0]
 
-    def _compute_mixed_gains(self, kernel: int) -> np.ndarray:
-        """Return the same (N, W) with each of `_WEIGHT_PAIRS` and the re-aimed hits of one of `HIT_KERNELS`."""
-        m, h = _WEIGHT_PAIRS.T
-        mix = lambda fold: _mix(fold.field[:, None], fold.prior[:, None], fold.hits[:, kernel, None], m, h)
-        return _average_gains(self.folds, mix)
+    def _compute_gains(
+        self, prior_weights: np.ndarray, hits_weights: np.ndarray, kernel: int | None, folds: int | None = None
+    ) -> np.ndarray:
+        """Return the same (N, W) with pairs of weights (W,), and the re-aimed hits of one of `HIT_KERNELS`."""
+        gains = []
+        for fold in self.folds[:folds]:
+            hits = 0.0 if kernel is None else fold.hits[:, kernel, None]
+            mixed = _mix(fold.field[:, None], fold.prior[:, None], hits, prior_weights, hits_weights)
+            gain = _log(mixed) - _log(fold.prior)[:, None]
+            gains += [gain[fold.person == p].mean(axis=0) for p in np.unique(fold.person)]
+        return np.array(gains)
 
 
 def _mix(field: Any, prior: Any, hits: Any, prior_weight: Any, hits_weight: Any) -> np.ndarray:
     return (1 - prior_weight - hits_weight) * field + prior_weight * prior + hits_weight * hits
-
-
-def _average_gains(folds: Sequence[FoldDensities], mix: Callable[[FoldDensities], np.ndarray]) -> np.ndarray:
-    """Return the mean log of the densities ``mix`` (n, S) over the prior, of each held-out participant (N, S)."""
-    gains = []
-    for fold in folds:
-        gain = _log(mix(fold)) - _log(fold.prior)[:, None]
-        gains += [gain[fold.person == p].mean(axis=0) for p in np.unique(fold.person)]
-    return np.array(gains)
 
 
 def _standard_error(values: np.ndarray) -> np.ndarray:
@@ -323,7 +323,7 @@ def _evaluate_fold(
     hits = np.empty((len(test), 0))
     if plan.settings.reaimed_hits:
         train = sample_participants_equally(train, MAX_HITS, seed + 5)
-        hits = _evaluate_hit_kernels(train, geometry, positions, directions[:, -1])
+        hits = _evaluate_hit_kernels(train, geometry, positions, directions[:, -1], ns)
 
     def make_hit_maps(kernel: int) -> np.ndarray:
         bandwidth, kappa = HIT_KERNELS[kernel]
@@ -345,18 +345,17 @@ def _make_hits(
 
 
 def _evaluate_hit_kernels(
-    rays: Rays, geometry: TrainingGeometry, positions: np.ndarray, directions: np.ndarray
+    rays: Rays, geometry: TrainingGeometry, positions: np.ndarray, directions: np.ndarray, ns: ModuleType
 ) -> np.ndarray:
     """Evaluate the re-aimed hits of ``rays`` with each of `HIT_KERNELS` (n, C) in ``directions`` from ``positions``
     (n, 3)."""
     columns, neighbours = [], {}
+    probe, d = dr.arange(ns.UInt32, len(positions)), to_vector(ns.Array3f, directions)
     for bandwidth, kappa in HIT_KERNELS:
+        hits = _make_hits(rays, geometry, bandwidth, kappa)
         if bandwidth not in neighbours:
-            neighbours[bandwidth] = _make_hits(rays, geometry, bandwidth, kappa).find(positions)
-        near = neighbours[bandwidth]
-        cosine = np.einsum("nkc,nc->nk", near.directions, directions)
-        kernel = np.exp(kappa * (cosine - 1) + log_normaliser(kappa))
-        columns.append((near.weights * kernel).sum(axis=1) / near.weights.sum(axis=1))
+            neighbours[bandwidth] = hits.find(positions)
+        columns.append(np.array(hits.make_kde(neighbours[bandwidth], ns).density(probe, d), np.float64))
     return np.stack(columns, axis=1)
 
 

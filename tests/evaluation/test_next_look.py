@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
+from nerg_mi.evaluation.baselines import MIN_AIM_DISTANCE
 from nerg_mi.evaluation.gaze import EPS
 from nerg_mi.evaluation.next_look import (
     COMPONENTS,
@@ -20,7 +21,6 @@ from nerg_mi.evaluation.next_look import (
     LookSample,
     NextLook,
     PastLooks,
-    aim,
     evaluate_components,
     evaluate_on_grid,
     find_heading,
@@ -30,7 +30,7 @@ from nerg_mi.evaluation.next_look import (
     score_next_look,
 )
 from nerg_mi.maths import vmf
-from nerg_mi.maths.sphere import fibonacci_directions, sample_uniform_directions
+from nerg_mi.maths.sphere import aim, fibonacci_directions, sample_uniform_directions
 from nerg_mi.rays.rays import Rays
 
 TARGETS = np.array([[1.0, 0, 0], [0, 0.8, 0.6], [-0.6, 0, -0.8]])
@@ -158,7 +158,7 @@ def test07_looks_at_known_points_are_aimed_at_them():
     missed, _ = find_past_looks(rays, rows, 2.0, earlier=1, interval=1.0, distance=lambda o, d: np.full(len(o), np.inf))
     assert missed.last == pytest.approx(rays.direction[[80]])
     # A point next to the eye has no direction.
-    assert aim(np.array([0, 0, 0.01]), np.array([1.0, 0, 0]), np.zeros(3)) == pytest.approx([1, 0, 0])
+    assert aim(np.array([0, 0, 0.01]), np.array([1.0, 0, 0]), np.zeros(3), MIN_AIM_DISTANCE) == pytest.approx([1, 0, 0])
 
 
 def test08_slow_displacements_are_short_headings():

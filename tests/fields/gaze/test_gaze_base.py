@@ -10,6 +10,7 @@ import pytest
 
 from nerg_mi.fields import gaze_base
 from nerg_mi.fields.gaze_base import CUTOFF_RADII, DataSummary, GazeEnsemble, RaySupport, summarize_provenance
+from nerg_mi.fields.gaze_hits import ReaimedHits
 from nerg_mi.fields.gaze_log_density import LogGazeField
 from nerg_mi.fields.gaze_product import GazeConfig, GazeField
 from nerg_mi.fields.mlp import namespace
@@ -194,6 +195,14 @@ def test_nested_ensembles_are_refused(tmp_path):
         metadata = {"kind": "ensemble", "members": [metadata, metadata]}
     with pytest.raises(ValueError, match="is an ensemble itself, which this version does not read"):
         gaze_base.build_gaze_field(metadata, pair.box, NoArrays())
+
+
+def test_members_have_no_hits_of_their_own():
+    """They would be lost, because an ensemble mixes in its own."""
+    member = made()
+    member.hits = ReaimedHits(np.zeros((1, 3)), np.ones((1, 3)), 0.5, 0.4, 50.0)
+    with pytest.raises(ValueError, match="--no-reaimed-hits"):
+        GazeEnsemble([member, made(seed=1)])
 
 
 class NoArrays:

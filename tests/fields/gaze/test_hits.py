@@ -72,6 +72,9 @@ def test_extreme_positions_are_finite():
     for p in (origins[0], points[1], origins[0] + 1e-9, (1e6, 0, 0), (0, 0, 0)):
         value = evaluate(hits, p, d)
         assert np.isfinite(value).all() and (value >= 0).all()
+    # Too narrow for a table, however many directions there are
+    narrow = ReaimedHits(origins, points, 0.5, 0.4, 1e8)
+    assert np.isfinite(evaluate(narrow, (0, 0, 0), fibonacci_directions(20_000))).all()
     # Only the sample at the eye, of which nothing is known
     assert np.isfinite(evaluate(ReaimedHits(origins[:1], points[:1], 1.0, 0.4, 50.0), origins[0], d)).all()
 

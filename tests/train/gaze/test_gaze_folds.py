@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
+from nerg_mi.fields.gaze_hits import FAR
 from nerg_mi.formats.checkpoint import read_checkpoint, write_checkpoint
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.rays.rays import Rays
@@ -23,7 +24,6 @@ from nerg_mi.train.gaze_folds import (
     PriorSelection,
     _calibrate_regions,
     _evaluate_hit_kernels,
-    _make_hits,
     _round_values,
     _select_best,
     _select_weight,
@@ -32,6 +32,7 @@ from nerg_mi.train.gaze_folds import (
 from nerg_mi.train.gaze_run import train_gaze
 from nerg_mi.train.gaze_settings import ProbeSettings
 from nerg_mi.train.gaze_trainer import KIND, StateSettings
+from tests.fields.gaze.test_hits import reference
 
 from .looks import LIKELIHOOD, LOG, NOWHERE, planned
 
@@ -132,11 +133,12 @@ def test03c_hits_are_seen_from_the_observer():
     positions, directions = rng.uniform(0, 2, (7, 3)), fibonacci_directions(7)
     for hit in (None, rays.origin + 3 * rays.direction):
         rays = replace(rays, hit=hit)
-        columns = _evaluate_hit_kernels(rays, NOWHERE, positions, directions)
+        columns = _evaluate_hit_kernels(rays, NOWHERE, positions, directions, ns)
         for column, (bandwidth, kappa) in zip(columns.T, HIT_KERNELS):
-            hits = _make_hits(rays, NOWHERE, bandwidth, kappa)
-            kde = hits.make_kde(hits.find(positions), ns)
-            np.testing.assert_allclose(column, np.diag(kde.evaluate(directions)), rtol=1e-3, atol=1e-5)
+            far = rays.origin + FAR * bandwidth * rays.direction
+            points = far if hit is None else hit
+            expected = [reference(rays.origin, points, bandwidth, kappa, p, d) for p, d in zip(positions, directions)]
+            np.testing.assert_allclose(column, expected, rtol=5e-3, atol=1e-5)
 
 
 @pytest.mark.parametrize(("law", "has_weight"), [(1.0, True), (0.0, False)])
