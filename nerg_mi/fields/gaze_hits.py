@@ -27,7 +27,7 @@ from .kde import SphericalKde, SphericalKdeTable
 
 MAX_HITS = 1 << 15  # Maximum number of samples that a field stores, 24 bytes each
 MAX_NEIGHBOURS = 1024  # Maximum number of samples that an observer's density is the sum of: the nearest
-FAR = 1e4  # Distance, in bandwidths, at which the point of a sample without a hit is placed
+FAR = 1e4  # Maximum distance, in bandwidths, at which the point of a sample without a hit is placed
 # Distance from the observer, in bandwidths, below which the direction to a point is that of the recording: the gaze on
 # a nearby point says nothing about observers next to it.
 _MIN_DISTANCE = 0.25
@@ -145,9 +145,10 @@ def place_missing_points(
     Returns
     -------
     array (n, 3)
-        Hit points, the missing ones `FAR` away.
+        Hit points, the missing ones `FAR` away, or less where coordinates would be too large.
     """
-    far = origins + FAR * bandwidth * directions
+    distance = min(FAR * bandwidth, MAX_COORDINATE - np.abs(origins).max())
+    far = origins + distance * directions
     return far if points is None else np.where(np.isfinite(points).all(axis=1, keepdims=True), points, far)
 
 

@@ -182,9 +182,9 @@ class FoldResults:
         index = _select_weight(gains, self.caution)
         selection = PriorSelection(float(PRIOR_WEIGHTS[index]), len(self.folds), self.kappa)
         selected, kernel = gains[:, index], None
-        candidates = []
+        candidates, (prior_weights, hits_weights) = [], _WEIGHT_PAIRS.T
         for k in range(self.folds[0].hits.shape[1]):
-            mixed = self._compute_gains(*_WEIGHT_PAIRS.T, k)
+            mixed = self._compute_gains(prior_weights, hits_weights, k)
             index = _select_weight(mixed, self.caution)
             candidates.append((mixed[:, index], _WEIGHT_PAIRS[index], k))
         if candidates:

@@ -62,6 +62,9 @@ def test_samples_without_a_hit_keep_their_direction():
     rows = [order.index(k) for k in range(1, 5)]
     np.testing.assert_allclose(near.directions[0][rows], directions[1:], atol=1e-3)
     assert np.array_equal(place_missing_points(origins, directions, None, 0.4)[1:], placed[1:])
+    # In millimetres, with a bandwidth of several metres
+    far = place_missing_points(1e3 * origins, directions, None, 5e3)
+    assert ReaimedHits(1e3 * origins, far, 0.5, 5e3, 50.0).find(origins).directions.shape == (5, 5, 3)
 
 
 def test_extreme_positions_are_finite():
