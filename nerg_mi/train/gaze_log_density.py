@@ -283,7 +283,7 @@ register_recipe(
             "learning_rate": 3e-3,
             "lr_final_ratio": 0.1,
             "lr_hold_fraction": 0.5,
-            "weight_decay": 4.0,
+            "weight_decay": 1.0,
             "ema_decay": 0.95,
             "validation_min_rays": 64,
             "mix_folds": 5,
