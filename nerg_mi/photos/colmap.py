@@ -9,7 +9,7 @@ import re
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import BinaryIO
 
@@ -19,6 +19,7 @@ from nerg_mi.errors import MissingFile, NergError, format_error, sanitize
 from nerg_mi.files.atomic import file_sha256
 from nerg_mi.files.safe_read import check_regular_file, is_regular_file, open_file, resolve_path
 
+from .observed import MatchedImage, PointTable
 from .posed import MAX_POSITION, FileFinder, MaskFile, PosedFrame, PosedImages, UnusedFrame, format_names, sort_frames
 from .transforms import read_frame_poses
 
@@ -73,6 +74,9 @@ _HEADER_BYTES = 1 << 12
 _MAX_NAME_BYTES = 1 << 12
 # Points per chunk.
 _BLOCK = 1 << 16
+_NO_POINTS = np.zeros(0, np.int64)
+# An observation in images.bin: position in the image, and number of its point, -1 for none.
+_OBSERVATION = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
 
 
 @dataclass(frozen=True)
@@ -111,6 +115,19 @@ class _Camera:
         if self.model.endswith("FISHEYE"):
             lens["fisheye"] = 1.0
         return {"w": float(self.width), "h": float(self.height), **lens}
+
+
+@dataclass(frozen=True)
+class _ImageRecord:
+    """A record of ``images``: name, number of the camera, world-to-camera quaternion (w, x, y, z) and translation, and
+    the numbers of its observed points.
+    """
+
+    name: str
+    camera: int
+    quaternion: tuple
+    translation: tuple
+    points: np.ndarray = field(default_factory=lambda: _NO_POINTS)
 
 
 def find_model_files(folder: str | Path) -> dict[str, Path] | None:
@@ -158,25 +175,26 @@ def read_colmap(
     files = _require_model(folder)
     binary = files["cameras"].suffix == ".bin"
     cameras = (_read_cameras_bin if binary else _read_cameras_txt)(files["cameras"])
-    poses = (_read_images_bin if binary else _read_images_txt)(files["images"])
+    records = (_read_images_bin if binary else _read_images_txt)(files["images"], with_points="points3D" in files)
+    counts, points, table = {"cameras": len(cameras), "images": len(records)}, None, None
+    if "points3D" in files:
+        counts["points3D"], points, numbers = _select_surface_points(
+            (_read_points_bin if binary else _read_points_txt)(files["points3D"])
+        )
+        table = PointTable(numbers, points, _iter_matches(records, cameras))
     frames, unused = [], []
     limit = None if allow_outside else images.parent
     finder, mask_finder = FileFinder(images, limit), None if masks is None else FileFinder(Path(masks), limit)
     listed_images = set()
-    for name, camera, q, t in poses:
+    for record in records:
         try:
-            image = finder.find(name, "image")
+            image = finder.find(record.name, "image")
             listed_images.add(image)
-            frames.append(_make_frame(name, cameras.get(camera), camera, q, t, image, mask_finder))
+            frames.append(_make_frame(record, cameras.get(record.camera), image, mask_finder, table))
         except (ValueError, OverflowError, OSError) as e:
             # A name may be too long for the system, or contain invalid characters.
-            unused.append(UnusedFrame(name, format_error(e)))
+            unused.append(UnusedFrame(record.name, format_error(e)))
     frames, unused = sort_frames(files["images"], frames, unused)
-    counts, points = {"cameras": len(cameras), "images": len(poses)}, None
-    if "points3D" in files:
-        counts["points3D"], points = _select_surface_points(
-            (_read_points_bin if binary else _read_points_txt)(files["points3D"])
-        )
     notes = [] if binary else [n for k, c in counts.items() for n in _check_stated_count(files[k], c)]
     digest = _compute_digest(files)
     folders = frozenset([images, *(p for p in images.rglob("*") if p.is_dir())])
@@ -215,13 +233,13 @@ def read_image_poses(folder: str | Path) -> tuple[Path, str, list[tuple[str, np.
     """
     files = _require_model(Path(folder))
     path, poses = files["images"], []
-    for name, _, q, t in (_read_images_bin if path.suffix == ".bin" else _read_images_txt)(path):
+    for record in (_read_images_bin if path.suffix == ".bin" else _read_images_txt)(path):
         try:
-            poses.append((name, _make_pose(q, t)))
+            poses.append((record.name, _make_pose(record)))
         except NergError as error:
             raise NergError(
-                f'the pose of image "{sanitize(name)}" in the COLMAP file "{path}" is invalid ({error}); copy the '
-                "COLMAP model again"
+                f'the pose of image "{sanitize(record.name)}" in the COLMAP file "{path}" is invalid ({error}); copy '
+                "the COLMAP model again"
             ) from error
     notes = _check_stated_count(path, len(poses)) if path.suffix == ".txt" else []
     return path, _compute_digest(files), poses, notes
@@ -249,11 +267,23 @@ def _compute_digest(files: dict[str, Path]) -> str:
     return hashlib.sha256(b"".join(digests)).hexdigest()
 
 
+def _iter_matches(records: list[_ImageRecord], cameras: dict[int, _Camera]) -> Iterator[MatchedImage]:
+    """Iterate over the images that have a valid pose and lens; the others are reported as unused frames."""
+    for record in records:
+        try:
+            center, lens = _make_pose(record)[:3, 3], cameras[record.camera].to_lens()
+        except (NergError, KeyError):
+            continue
+        if lens["fl_x"] > 0:
+            yield MatchedImage(center, lens["fl_x"], record.points)
+
+
 def _make_frame(
-    name: str, camera: _Camera | None, number: int, q, t, image: Path, masks: FileFinder | None
+    record: _ImageRecord, camera: _Camera | None, image: Path, masks: FileFinder | None, table: PointTable | None
 ) -> PosedFrame:
+    name = record.name
     if camera is None:
-        raise NergError(f"the model has no camera {number}")
+        raise NergError(f"the model has no camera {record.camera}")
     if not image.is_file():
         raise NergError(f'its image "{sanitize(image)}" does not exist')
     lens, mask = camera.to_lens(), None
@@ -265,15 +295,17 @@ def _make_frame(
             raise NergError(f'its mask "{sanitize(paths[0])}" does not exist')
         mask = MaskFile(existing[0])
     try:
-        pose = _make_pose(q, t)
+        pose = _make_pose(record)
     except NergError as error:
         raise NergError(f"its pose is {error}") from error
-    return PosedFrame(name, image, pose, lens, mask=mask, ignores_exif=True)
+    points = None if table is None else table.select(record.points)
+    return PosedFrame(name, image, pose, lens, mask=mask, ignores_exif=True, points=points)
 
 
-def _make_pose(q, t) -> np.ndarray:
+def _make_pose(record: _ImageRecord) -> np.ndarray:
     from scipy.spatial.transform import Rotation
 
+    q, t = record.quaternion, record.translation
     norm = float(np.linalg.norm(q))
     if not (1e-6 < norm <= MAX_POSITION and np.abs(t).max() <= MAX_POSITION):
         raise NergError("not finite, or its quaternion is zero")
@@ -283,8 +315,8 @@ def _make_pose(q, t) -> np.ndarray:
     return out @ _FLIP
 
 
-_Point = tuple[float, float, float, float, int]
-"""Position (x, y, z), reprojection error and track length of a point."""
+_Point = tuple[float, float, float, float, int, int]
+"""Position (x, y, z), reprojection error, track length and number of a point."""
 
 
 class _RecordReader:
@@ -308,6 +340,12 @@ class _RecordReader:
     def check_remaining(self, size: int, record: str) -> None:
         if self.offset + size > self.size:
             raise NergError(f'"{self.path}" ends within {record} (byte {self.offset} of {self.size}); copy it again')
+
+    def read_array(self, dtype: np.dtype, count: int, record: str) -> np.ndarray:
+        size = dtype.itemsize * count
+        self.check_remaining(size, record)
+        self.offset += size
+        return np.frombuffer(self.file.read(size), dtype)
 
     def skip(self, size: int, record: str) -> None:
         self.check_remaining(size, record)
@@ -358,7 +396,7 @@ def _read_cameras_bin(path: Path) -> dict[int, _Camera]:
     return out
 
 
-def _read_images_bin(path: Path) -> list[tuple]:
+def _read_images_bin(path: Path, with_points: bool = False) -> list[_ImageRecord]:
     out = []
     with _open_model_file(path) as file:
         r = _RecordReader(path, file)
@@ -366,11 +404,24 @@ def _read_images_bin(path: Path) -> list[tuple]:
             record = f"image record {k + 1}"
             values = r.read_values("i7di", record)
             name = r.read_name(record)
-            # Each observation has x and y as doubles, and the index of its point.
-            r.skip(24 * r.read_values("Q", record)[0], record)
-            out.append((name, values[8], values[1:5], values[5:8]))
+            count, points = r.read_values("Q", record)[0], _NO_POINTS
+            if with_points:
+                points = _read_observed_points(r, count, record)
+            else:
+                r.skip(_OBSERVATION.itemsize * count, record)
+            out.append(_ImageRecord(name, values[8], values[1:5], values[5:8], points))
         r.check_end(len(out))
     return out
+
+
+def _read_observed_points(r: _RecordReader, count: int, record: str) -> np.ndarray:
+    """Read the numbers of the points of ``count`` observations, most of which usually have none."""
+    points = [_NO_POINTS]
+    while count > 0:
+        block = r.read_array(_OBSERVATION, min(count, _BLOCK), record)["point"]
+        points.append(np.unique(block[block >= 0]))
+        count -= len(block)
+    return np.concatenate(points)
 
 
 def _read_points_bin(path: Path) -> Iterator[_Point]:
@@ -381,7 +432,7 @@ def _read_points_bin(path: Path) -> Iterator[_Point]:
             record = f"point record {k + 1}"
             values = r.read_values("Q3d3BdQ", record)
             r.skip(8 * values[8], record)
-            yield *values[1:4], values[7], values[8]
+            yield *values[1:4], values[7], values[8], values[0]
         r.check_end(count)
 
 
@@ -432,17 +483,19 @@ def _read_cameras_txt(path: Path) -> dict[int, _Camera]:
     return out
 
 
-def _read_images_txt(path: Path) -> list[tuple]:
+def _read_images_txt(path: Path, with_points: bool = False) -> list[_ImageRecord]:
     out, follows_image = [], False
     for number, line in _iter_lines(path):
         words = line[:_MAX_LINE].split()
         # The line after an image lists its observations. It may be empty, and some writers omit it.
         if not words or (follows_image and (len(line) > _MAX_LINE or _are_observations(words))):
+            if with_points and follows_image and words:
+                out[-1] = replace(out[-1], points=_parse_points(path, number, line))
             follows_image = False
             continue
         try:
             q, t = tuple(map(float, words[1:5])), tuple(map(float, words[5:8]))
-            out.append((" ".join(words[9:]), int(words[8]), q, t))
+            out.append(_ImageRecord(" ".join(words[9:]), int(words[8]), q, t))
             if len(q) != 4 or len(t) != 3 or not words[9:]:
                 raise ValueError
         except (ValueError, IndexError) as e:
@@ -450,6 +503,14 @@ def _read_images_txt(path: Path) -> list[tuple]:
         _check_count(path, len(out), MAX_IMAGES, "images")
         follows_image = True
     return out
+
+
+def _parse_points(path: Path, number: int, line: str) -> np.ndarray:
+    """Return the numbers of the points in a line of observations; -1 for none."""
+    try:
+        return np.array(line.split()[2::3], np.int64)
+    except (ValueError, OverflowError) as e:
+        raise NergError(f'line {number} of "{path}" is not a list of "X Y POINT3D_ID"') from e
 
 
 def _are_observations(words: list[str]) -> bool:
@@ -463,22 +524,25 @@ def _are_observations(words: list[str]) -> bool:
 def _read_points_txt(path: Path) -> Iterator[_Point]:
     for number, words in _iter_rows(path, MAX_POINTS, "points"):
         try:
-            yield float(words[1]), float(words[2]), float(words[3]), float(words[7]), (len(words) - 8) // 2
+            position = float(words[1]), float(words[2]), float(words[3])
+            yield *position, float(words[7]), (len(words) - 8) // 2, int(words[0])
         except (ValueError, IndexError) as e:
             raise NergError(f'line {number} of "{path}" is not "POINT3D_ID X Y Z R G B ERROR TRACK"') from e
 
 
-def _select_surface_points(points: Iterator[_Point]) -> tuple[int, np.ndarray]:
-    """Return the number of ``points``, and the positions (N, 3) of the reliable ones."""
-    count, selected = 0, [np.empty((0, 3))]
+def _select_surface_points(points: Iterator[_Point]) -> tuple[int, np.ndarray, np.ndarray]:
+    """Return the number of ``points``, and the positions (N, 3) and numbers (N,) of the reliable ones."""
+    count, selected, numbers = 0, [np.empty((0, 3))], [np.zeros(0, np.int64)]
     while block := list(itertools.islice(points, _BLOCK)):
-        table = np.array(block, np.float64)
+        table = np.array([point[:5] for point in block], np.float64)
         is_reliable = (
             np.all(np.abs(table) <= MAX_POSITION, axis=1) & (table[:, 3] <= _MAX_ERROR) & (table[:, 4] >= _MIN_TRACK)
         )
         selected.append(table[is_reliable, :3])
+        # 64 bits, which float64 does not hold. As in the observations, the largest number becomes -1, for none.
+        numbers.append(np.array([point[5] % 2**64 for point in block], np.uint64).view(np.int64)[is_reliable])
         count += len(block)
-    return count, np.concatenate(selected)
+    return count, np.concatenate(selected), np.concatenate(numbers)
 
 
 # ---- Poses by image name; the images may be missing ----

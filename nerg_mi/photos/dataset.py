@@ -23,8 +23,9 @@ from .posed import PosedImages, UnusedFrame
 # unbounded. Depth is checked against the cameras.
 
 
-# Cameras look at a common point if the median angle between their axes and the point is below this.
-_MAX_CONVERGENCE_ANGLE = np.radians(30)
+MAX_CONVERGENCE_ANGLE = float(np.radians(30))
+"""Cameras look at a common point if the median angle between their axes and the point is below this."""
+
 # Minimum number of points for an estimate, and the fraction of outliers at either end of an axis.
 _MIN_POINTS, _OUTLIER_FRACTION = 100, 0.005
 # Points within this fraction of the longest edge outside of the outlier-free box still count, because plain surfaces
@@ -159,10 +160,9 @@ def estimate_box(
     edge.
     """
     centers = np.array([c.center for c in cameras])
-    axes = np.array([c.axis for c in cameras])
-    focus, angle = _find_focus(centers, axes)
+    focus, angle = find_focus(cameras)
     bounds = None
-    if len(cameras) >= 2 and np.median(angle) < _MAX_CONVERGENCE_ANGLE:
+    if len(cameras) >= 2 and np.median(angle) < MAX_CONVERGENCE_ANGLE:
         distance = np.linalg.norm(centers - focus, axis=1)
         if object_only:
             half_side = float(np.max(distance * [_half_angle_tangent(c) for c in cameras]))
@@ -199,8 +199,9 @@ def _bound_without_strays(points: np.ndarray) -> np.ndarray:
     return np.quantile(near, [_MIN_TAIL_FRACTION, 1 - _MIN_TAIL_FRACTION], axis=0)
 
 
-def _find_focus(centers: np.ndarray, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def find_focus(cameras: list[PosedCamera]) -> tuple[np.ndarray, np.ndarray]:
     """Return the point nearest to all viewing axes (least squares), and the angle of each camera to it in radians."""
+    centers, axes = np.array([c.center for c in cameras]), np.array([c.axis for c in cameras])
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     # Parallel axes have no unique nearest point; lstsq then returns the one with minimum norm, at large angles.
     focus = np.linalg.lstsq(across.sum(axis=0), np.einsum("nij,nj->i", across, centers), rcond=1e-6)[0]

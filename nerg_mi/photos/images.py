@@ -31,6 +31,7 @@ from .cameras import (
     resize_nearest,
 )
 from .colmap import UpEstimate, describe_other_models, estimate_up, find_pose_source, read_colmap, rotation_to_z
+from .observed import ObservedPoints
 from .posed import DepthFile, MaskFile, PosedFrame, PosedImages, UnusedFrame, format_names
 from .transforms import read_dataparser, read_transforms
 
@@ -264,6 +265,8 @@ class PhotoView:
         (h, w) bool, the pixels that are used; None for all.
     masked_fraction
         Fraction of the pixels that the mask file excludes; None without a mask file.
+    points
+        Surface points that a reconstruction matched in the image; None if unknown.
     """
 
     name: str
@@ -272,6 +275,7 @@ class PhotoView:
     depth: np.ndarray | None = None
     mask: np.ndarray | None = None
     masked_fraction: float | None = None
+    points: ObservedPoints | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -369,7 +373,8 @@ def load_view(
     if pixels.dtype == np.float32:
         # 16 bits are more precise than the photo and take half the memory of floats.
         pixels = np.round(pixels * 65535).astype(np.uint16)
-    return PhotoView(frame.name, PosedCamera(intrinsics, frame.to_world), pixels, distance, mask, left_out)
+    camera = PosedCamera(intrinsics, frame.to_world)
+    return PhotoView(frame.name, camera, pixels, distance, mask, left_out, frame.points)
 
 
 def _to_float(pixels: np.ndarray) -> np.ndarray:

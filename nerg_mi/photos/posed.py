@@ -18,6 +18,7 @@ from nerg_mi.files.safe_read import is_regular_file, read_line_blocks, resolve_p
 from nerg_mi.maths.coordinates import check_near_origin
 
 from .cameras import Intrinsics
+from .observed import ObservedPoints
 
 # ---- Posed image sets ----
 #
@@ -162,6 +163,8 @@ class PosedFrame:
         Mask file, or None.
     ignores_exif
         Whether pose and lens refer to the stored pixels, regardless of the EXIF orientation.
+    points
+        Surface points that a reconstruction matched in the image, or None.
     """
 
     name: str
@@ -171,6 +174,7 @@ class PosedFrame:
     depth: DepthFile | None = None
     mask: MaskFile | None = None
     ignores_exif: bool = False
+    points: ObservedPoints | None = None
 
     def matches_shape(self, width: int, height: int) -> bool:
         """Return whether the camera has the aspect ratio of an image of ``width`` x ``height`` pixels, to one
@@ -294,7 +298,8 @@ class PosedImages:
             pose[:3, :3] = rotation @ f.to_world[:3, :3]
             pose[:3, 3] = similarity[:3, :3] @ f.to_world[:3, 3] + similarity[:3, 3]
             depth = None if f.depth is None else replace(f.depth, unit=f.depth.unit * scale)
-            frames.append(replace(f, to_world=pose, depth=depth))
+            points = None if f.points is None else f.points.transform(similarity)
+            frames.append(replace(f, to_world=pose, depth=depth, points=points))
         return replace(
             self,
             frames=frames,

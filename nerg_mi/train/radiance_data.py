@@ -10,7 +10,8 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.maths.types import Array3f, Float, UInt32
-from nerg_mi.photos.cameras import Intrinsics, find_fisheye_limit
+from nerg_mi.photos.cameras import Intrinsics, find_fisheye_limit, project
+from nerg_mi.photos.dataset import MAX_CONVERGENCE_ANGLE, find_focus
 from nerg_mi.photos.images import PhotoView
 
 # ---- Pixel directions on the device: the float32 counterpart of `photos.cameras.image_to_directions` ----
@@ -164,6 +165,7 @@ class PixelBank:
             )
         self._store_colors(views, used)
         self._store_depth(views, used)
+        self.points = PointPixels.find(views, used)
 
     def _store_colors(self, views: list[PhotoView], used: list[int]) -> None:
         self._channels = 4 if any(v.has_alpha for v in views) else 3
@@ -239,6 +241,115 @@ class PixelBank:
             if pixels.depth is not None:
                 has_depth: Any = dr.compress(pixels.depth > 0)
                 yield dr.gather(self.ns.Array3f, pixels.o + pixels.d * pixels.depth, has_depth)
+
+
+# ---- Points of a reconstruction: pixels whose distance is known, and space that the cameras see through ----
+
+
+# Points whose distance has a larger relative standard error are not used.
+_MAX_POINT_ERROR = 0.1
+# Minimum number of points of a photo, and the fraction of them that may be outliers in front of everything else.
+_MIN_CLEARING_POINTS, _NEAR_OUTLIERS = 50, 0.02
+# Maximum distance of empty space relative to the nearest point in view.
+_CLEAR_MARGIN = 0.8
+
+
+@dataclass(frozen=True)
+class PointPixels:
+    """Pixels that show a point of the reconstruction.
+
+    Attributes
+    ----------
+    index
+        (N,) uint32 index into the pixels of a `PixelBank`.
+    distance
+        (N,) float32 distance of the point along the ray of the pixel, in scene units.
+    error
+        (N,) float32 standard error of the distance, in scene units.
+    """
+
+    index: np.ndarray
+    distance: np.ndarray
+    error: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    @staticmethod
+    def find(views: list[PhotoView], counts: list[int]) -> PointPixels:
+        """Find the pixels in ``views``, of which the bank has ``counts`` pixels each."""
+        parts, first = [np.zeros((3, 0))], 0
+        for view, count in zip(views, counts):
+            if view.points is not None:
+                pixel, distance, error = _locate_points(view)
+                rank = np.cumsum(_get_mask(view).ravel()) - 1
+                parts.append(np.stack([first + rank[pixel], distance, error]))
+            first += count
+        index, distance, error = np.concatenate(parts, axis=1)
+        return PointPixels(index.astype(np.uint32), distance.astype(np.float32), error.astype(np.float32))
+
+
+def _locate_points(view: PhotoView) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return pixel (row by row), distance and error of the precise points of ``view`` that its mask admits."""
+    assert view.points is not None
+    (height, width), positions, relative = view.shape, view.points.positions, view.points.relative_errors
+    pixels, selected = project(positions, view.camera)
+    selected &= np.all((pixels >= 0) & (pixels < [width, height]), axis=1) & (relative <= _MAX_POINT_ERROR)
+    column, row = pixels[selected].astype(int).T
+    distance = np.linalg.norm(positions[selected] - view.camera.center, axis=1)
+    unmasked = _get_mask(view)[row, column]
+    return (row * width + column)[unmasked], distance[unmasked], (distance * relative[selected])[unmasked]
+
+
+@dataclass(frozen=True)
+class FreeSpace:
+    """Empty space near the cameras, where fog would otherwise explain single photos.
+
+    Attributes
+    ----------
+    near
+        (V,) float32 distance from each camera within which all space is empty, in scene units.
+    clear
+        (V,) float32 distance from each camera within which the space that it sees is empty; at least ``near``.
+    """
+
+    near: np.ndarray
+    clear: np.ndarray
+
+    @staticmethod
+    def find(views: list[PhotoView], near: float, fraction: float) -> FreeSpace:
+        """Find the empty space of the cameras of ``views``.
+
+        Parameters
+        ----------
+        views : list of PhotoView
+            The training photos.
+        near : float
+            Minimum distance in scene units.
+        fraction : float
+            With points of a reconstruction, a camera sees through empty space up to this fraction of the distance to
+            the nearest points of its photo, except outliers, and not up to any point in its view. Without points and
+            depth, cameras that look at a common point are surrounded by empty space up to this fraction of their
+            distance to it.
+        """
+        radius = np.full(len(views), near, np.float32)
+        if all(view.points is None and view.depth is None for view in views):
+            focus, angles = find_focus([view.camera for view in views])
+            if len(views) > 1 and np.median(angles) < MAX_CONVERGENCE_ANGLE:
+                distances = np.linalg.norm([view.camera.center - focus for view in views], axis=1)
+                radius = np.maximum(radius, fraction * distances).astype(np.float32)
+        clear, points = radius.copy(), [view.points.positions for view in views if view.points is not None]
+        distinct = np.unique(np.concatenate([np.zeros((0, 3)), *points]), axis=0)
+        for k, view in enumerate(views):
+            if view.points is not None and len(view.points) >= _MIN_CLEARING_POINTS:
+                center, (height, width) = view.camera.center, view.shape
+                own = np.linalg.norm(view.points.positions - center, axis=1)
+                pixels, is_visible = project(distinct, view.camera)
+                is_visible &= np.all((pixels >= 0) & (pixels < [width, height]), axis=1)
+                nearest = np.min(np.linalg.norm(distinct[is_visible] - center, axis=1), initial=np.inf)
+                distance = min(fraction * float(np.quantile(own, _NEAR_OUTLIERS)), _CLEAR_MARGIN * float(nearest))
+                clear[k] = max(clear[k], distance)
+        return FreeSpace(radius, clear)
 
 
 def _get_mask(view: PhotoView) -> np.ndarray:

@@ -14,6 +14,8 @@ from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.maths.types import Array3f
 from nerg_mi.photos.cameras import PosedCamera, find_view_tangents
 
+from .radiance_data import FreeSpace
+
 # ---- Density grid during training, and the occupancy that is stored ----
 #
 # A cubic grid over the unit cube of the field, x varying fastest, as in instant-ngp: each cell stores a decaying
@@ -45,8 +47,8 @@ class DensityGrid:
     threshold : float
         Optical depth of a step above which a cell is occupied. It is lowered to half of the mean while the field is
         thin.
-    near : float
-        Distance from each camera within which cells are empty.
+    free_space : FreeSpace, optional
+        Empty space near the cameras.
     growth : float
         In a contracted box, a step is at least ``growth`` times the distance from the centre, so that steps and cells
         grow alike.
@@ -61,14 +63,16 @@ class DensityGrid:
         cameras: list[PosedCamera],
         min_views: int,
         threshold: float = 0.01,
-        near: float = 0.0,
+        free_space: FreeSpace | None = None,
         growth: float = 0.0,
     ):
         self.ns, self.box, self.resolution, self.step, self.threshold = ns, box, resolution, step, threshold
         self.growth = growth if box.is_contracted else 0.0
         cells = resolution**3
         self.index = dr.arange(ns.UInt32, cells)
-        self._restrict_to(self._find_seen_cells(cameras, min_views, near))
+        if free_space is None:
+            free_space = FreeSpace(np.zeros(len(cameras), np.float32), np.zeros(len(cameras), np.float32))
+        self._restrict_to(self._find_seen_cells(cameras, min_views, free_space))
         if self.seen_count == 0:
             raise NergError(
                 f"no cell of the scene box {box.lower} to {box.upper} is seen by {min_views} cameras; "
@@ -105,10 +109,10 @@ class DensityGrid:
         inner = 2 if self.box.is_contracted else 1
         return self.box.distance_scale(p) * (inner * self.box.side / self.resolution)
 
-    def _find_seen_cells(self, cameras: list[PosedCamera], min_views: int, near: float):
-        """Return the cells whose centre is in the box and in at least ``min_views`` pictures.
+    def _find_seen_cells(self, cameras: list[PosedCamera], min_views: int, free_space: FreeSpace):
+        """Return the cells whose centre is in the box and in at least ``min_views`` pictures, and not in free space.
 
-        Occlusion is ignored, and the frusta are widened by 10 %.
+        Occlusion is ignored, and the frusta are widened by 10 %, or narrowed by 5 % for free space.
         """
         Float, UInt32 = self.ns.Float, self.ns.UInt32
         p = self._to_world(self._get_corner(self.index) + 0.5 / self.resolution)
@@ -117,7 +121,7 @@ class DensityGrid:
         inside = dr.all(dr.abs(p - self.ns.Array3f(*self.box.center)) < self.ns.Array3f(*half))
         count = dr.zeros(UInt32, self.resolution**3)
         dr.eval(p, inside)
-        for camera in cameras:
+        for camera, near, clear in zip(cameras, free_space.near.tolist(), free_space.clear.tolist()):
             rows = [Float(v) for v in camera.to_world[:3, :3].T.ravel()]
             origin = [Float(v) for v in camera.center]
             edge = [Float(v) for v in find_view_tangents(camera.intrinsics)]
@@ -125,10 +129,16 @@ class DensityGrid:
             dr.make_opaque(rows, origin, edge)
             d = [p[k] - origin[k] for k in range(3)]
             x, y, z = (rows[3 * k] * d[0] + rows[3 * k + 1] * d[1] + rows[3 * k + 2] * d[2] for k in range(3))
-            left, right, up, down = (e * 1.1 for e in edge)
-            is_in_view = (z < 0) & (x > left * z) & (x < -right * z) & (-y > up * z) & (-y < -down * z)
-            count += dr.select(is_in_view, UInt32(1), 0)
-            inside &= d[0] * d[0] + d[1] * d[1] + d[2] * d[2] > near * near
+
+            def is_in_view(scale, x=x, y=y, z=z, edge=edge):
+                left, right, up, down = (e * scale for e in edge)
+                return (z < 0) & (x > left * z) & (x < -right * z) & (-y > up * z) & (-y < -down * z)
+
+            count += dr.select(is_in_view(1.1), UInt32(1), 0)
+            squared_distance = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
+            inside &= squared_distance > dr.opaque(Float, near * near)
+            if clear > near:
+                inside &= ~is_in_view(0.95) | (squared_distance > dr.opaque(Float, clear * clear))
             dr.eval(count, inside)
         return inside & (count >= min(min_views, len(cameras)))
 

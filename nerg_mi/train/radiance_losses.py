@@ -73,16 +73,32 @@ def depth_loss(weight: Float, tau: Float, samples: RaySamples, depth: Float, mar
     places the surface within the step.
     """
     s = samples.segments
-    truth = dr.gather(type(weight), depth, s.ray, s.active)
-    if not isinstance(margin, float):
-        margin = dr.gather(type(weight), margin, s.ray, s.active)
-    near = (samples.t < truth + margin) & (samples.t + samples.length > truth - margin)
-    absorbed = sum_along_rays(dr.select(near, weight, 0), s)
+    truth, near = _find_near_samples(samples, depth, margin)
     # Only absorption near the surface is moved: a floater should vanish, not drag the surface along.
     offset = samples.t + samples.length * mean_depth_fraction(tau) - truth
     shift = sum_along_rays(dr.select(near, weight * offset, 0), s)
-    loss = (1 - absorbed) + dr.minimum(dr.abs(shift) / scale, 10)
-    return dr.select(depth > 0, loss, 0)
+    return dr.select(depth > 0, surface_loss(weight, samples, depth, margin) + dr.minimum(dr.abs(shift) / scale, 10), 0)
+
+
+def surface_loss(weight: Float, samples: RaySamples, depth: Float, margin: float | Float) -> Float:
+    """Fraction of the light of each ray that is not absorbed near its true ``depth``; 0 where the depth is unknown.
+
+    Parameters
+    ----------
+    weight, samples, depth, margin
+        As for `depth_loss`.
+    """
+    _, near = _find_near_samples(samples, depth, margin)
+    return dr.select(depth > 0, 1 - sum_along_rays(dr.select(near, weight, 0), samples.segments), 0)
+
+
+def _find_near_samples(samples: RaySamples, depth: Float, margin: float | Float) -> tuple[Float, Any]:
+    """Return the true depth of each sample's ray, and the mask of the samples that reach within ``margin`` of it."""
+    s = samples.segments
+    truth = dr.gather(type(depth), depth, s.ray, s.active)
+    if not isinstance(margin, float):
+        margin = dr.gather(type(depth), margin, s.ray, s.active)
+    return truth, (samples.t < truth + margin) & (samples.t + samples.length > truth - margin)
 
 
 def feature_decay_loss(features):

@@ -396,6 +396,7 @@ def _make_result(
         **dataset.source,
         "settings": trainer.settings.to_dict(),
         "depth_supervision": trainer.use_depth,
+        "point_supervision": len(trainer.pixels.points) if trainer.use_points else 0,
         "steps": trainer.steps,
         "seconds": round(seconds, 1),
         "interrupted": interrupted,

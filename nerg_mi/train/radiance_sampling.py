@@ -224,8 +224,8 @@ class CameraRays:
     count: int
 
 
-def clip_rays(o, d, box: AnyBox, near: float) -> CameraRays:
-    """Clip rays to ``box``, starting at distance ``near``."""
+def clip_rays(o, d, box: AnyBox, near: float | Float) -> CameraRays:
+    """Clip rays to ``box``, starting at distance ``near``, one value or one per ray."""
     # Not maths.ray_box: training may lose rays along a face, and saves the selects that keep them.
     Float = type(d.x)
     t0: Any = Float(near)

@@ -21,7 +21,7 @@ from nerg_mi.photos.cameras import pixel_directions
 from nerg_mi.photos.images import PhotoView
 from nerg_mi.transport.quadrature import mean_depth_fraction
 
-from .radiance_data import PixelBank
+from .radiance_data import FreeSpace, PixelBank
 from .radiance_grid import GRID_STATE, DensityGrid, OccupancyExtraction
 from .radiance_losses import (
     PHOTO_PARAMETER,
@@ -35,6 +35,7 @@ from .radiance_losses import (
     evaluate_ray_color,
     evaluate_samples,
     feature_decay_loss,
+    surface_loss,
 )
 from .radiance_sampling import (
     RussianRoulette,
@@ -194,6 +195,7 @@ class RadianceTrainer(Trainer):
         self.config, self.box, self.clock = config, box, StepClock()
         self.pixels = PixelBank(ns, views)
         self.use_depth = depth and self.pixels.has_depth
+        self.use_points = not self.use_depth and settings.point_weight > 0 and len(self.pixels.points) > 0
         self.current_field = RadianceField.random(config, box, ns, settings.seed)
         # One photo has nothing to differ from.
         self.photos = PhotoColors(ns, len(views)) if settings.photo_colors and len(views) > 1 else None
@@ -202,6 +204,8 @@ class RadianceTrainer(Trainer):
         )
         self.start(Adam(settings.learning_rate, start, beta_2=0.99, epsilon=1e-15))
         self.march_step = settings.march_step * box.side
+        free_space = FreeSpace.find(views, settings.near * box.side, settings.clear_fraction)
+        self._ray_starts = ns.Float(free_space.clear)
         self.grid = DensityGrid(
             ns,
             box,
@@ -209,7 +213,7 @@ class RadianceTrainer(Trainer):
             self.march_step,
             [v.camera for v in views],
             settings.min_views,
-            near=settings.near * box.side,
+            free_space=free_space,
             growth=settings.step_growth,
         )
         # With exact depth everywhere the free space is known from the start, and there is no fog to clear.
@@ -299,8 +303,9 @@ class RadianceTrainer(Trainer):
             self.rays, self.prepass_samples_per_ray, table.steps, max_prepass_samples, _MAX_CANDIDATES * s.batch
         )
         index = self._draw_pixels()
+        point_depth = self._draw_points(index) if self.use_points else None
         pixels = self.pixels.gather_batch(ns.UInt32(copy_aligned(index, np.uint32)))
-        rays = clip_rays(pixels.o, pixels.d, self.box, s.near * self.box.side)
+        rays = clip_rays(pixels.o, pixels.d, self.box, dr.gather(ns.Float, self._ray_starts, pixels.frame))
         offset = ns.Float(copy_aligned(self.rng.random(self.rays, np.float32)))
         thinning = (
             RussianRoulette(s.rr_weight, s.rr_min_probability, int(self.rng.integers(2**63)))
@@ -324,7 +329,7 @@ class RadianceTrainer(Trainer):
             self.rays = adapt_ray_count(self.rays, 0, 0, s.batch, max_prepass_samples)
             return
         background = ns.Array3f(*[ns.Float(copy_aligned(self.rng.random(self.rays, np.float32))) for _ in range(3)])
-        depth_errors = self._optimize_step(samples, pixels, background, covered, self.stride)
+        depth_errors = self._optimize_step(samples, pixels, background, covered, self.stride, point_depth)
         if depth_errors is not None:
             self._update_hard_pixels(index[:covered], depth_errors)
         self.prepass_samples_per_ray = samples.prepass_samples_per_ray
@@ -376,13 +381,34 @@ class RadianceTrainer(Trainer):
             self.rng.shuffle(index)  # Shuffle, because the last rays of a batch may be dropped
         return index
 
+    def _draw_points(self, index: np.ndarray) -> tuple[Float, Float]:
+        """Replace a fraction of the pixel indices of a batch by pixels that show a point of the reconstruction.
+
+        Returns the distance of each ray's point, 0 for other rays, and its standard error, both in scene units.
+        """
+        points = self.pixels.points
+        is_point = self.rng.random(len(index)) < self.settings.point_fraction
+        drawn = self.rng.integers(0, len(points), np.count_nonzero(is_point))
+        distance, error = np.zeros((2, len(index)), np.float32)
+        index[is_point], distance[is_point], error[is_point] = (
+            points.index[drawn],
+            points.distance[drawn],
+            points.error[drawn],
+        )
+        return self.ns.Float(copy_aligned(distance)), self.ns.Float(copy_aligned(error))
+
     def _update_hard_pixels(self, index: np.ndarray, depth_errors: Float) -> None:
         """Add the pixels of this batch with a large depth error to the buffer, replacing the oldest."""
         is_hard = depth_errors.numpy()[: len(index)] > _MIN_DEPTH_LOSS
         self.hard_pixels = np.concatenate([self.hard_pixels, index[is_hard]])[-_MAX_HARD_PIXELS:]
 
-    def _optimize_step(self, samples, pixels, background, covered: int, stride: int) -> Float | None:
-        """Update the weights once; returns the depth loss of each ray, or None without depth supervision."""
+    def _optimize_step(
+        self, samples, pixels, background, covered: int, stride: int, point_depth: tuple[Float, Float] | None
+    ) -> Float | None:
+        """Update the weights once; returns the depth loss of each ray, or None without depth supervision.
+
+        ``point_depth`` has the distance of each ray's point, and its error, as `_draw_points` returns them.
+        """
         s, ns, depth_errors = self.settings, self.ns, None
         d = dr.gather(ns.Array3f, pixels.d, samples.ray)
         parameters = self._get_parameters()
@@ -412,6 +438,12 @@ class RadianceTrainer(Trainer):
             # Depth matters most at first; later colour provides more information.
             loss += dr.opaque(ns.Float, s.depth_weight * s.depth_weight_final_ratio**self.progress) * depth_term
             depth_errors = dr.detach(depth_term)
+        if point_depth is not None:
+            distance, error = point_depth
+            step = dr.maximum(s.step_growth * distance, self.march_step) * dr.opaque(ns.Float, stride)
+            margin = dr.maximum(s.point_margin * error, s.depth_margin * step)
+            scale = s.point_weight * s.point_weight_final_ratio**self.progress / s.point_fraction
+            loss += dr.opaque(ns.Float, scale) * surface_loss(weight, samples, distance, margin)
         if s.distortion_weight > 0:
             loss += s.distortion_weight * distortion_loss(weight, samples, self.box.side)
         complete = dr.arange(ns.UInt32, self.rays) < dr.opaque(ns.UInt32, covered)

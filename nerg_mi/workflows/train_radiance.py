@@ -153,6 +153,8 @@ def _report_data(data: Dataset, reporter: Reporter) -> None:
         reporter.message(line)
     reporter.message(f"assumed scene type: {data.kind_note}; change it with --unbounded, --bounded or --aabb")
     reporter.message(f"box: ({corner(core.lower)}) to ({corner(core.upper)}), {data.box_source}")
+    if points := sum(len(view.points) for view in data.train if view.points is not None):
+        reporter.message(f"the COLMAP model has {points:,} observations of points in the training views")
     reporter.message(data.unit_note)
     reporter.message(data.up_note)
     reporter.message(

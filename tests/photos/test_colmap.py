@@ -74,6 +74,11 @@ TRACKS, ERRORS = [4, 3, 2, 5, 3, 7], [0.5, 1.0, 0.5, 9.0, 2.0, 0.1]
 TRUSTED = [0, 1, 4, 5]
 
 
+def observed_point(k):
+    """Number of the point of an image's observation ``k``: every third has none, and one number is unknown."""
+    return -1 if k % 3 == 0 else 99 if k == 7 else k % len(POINTS) + 1
+
+
 def write_bin(folder, names, cameras=CAMERAS):
     rotations, translations = poses(len(names))
     out = struct.pack("<Q", len(cameras))
@@ -85,7 +90,7 @@ def write_bin(folder, names, cameras=CAMERAS):
         out += struct.pack("<i", k + 1) + struct.pack("<7d", *quaternion(rotations[k]), *translations[k])
         out += struct.pack("<i", k + 1) + name.encode() + b"\0"
         # Observations (x, y, point); their number is the index of the image.
-        out += struct.pack("<Q", k) + b"".join(struct.pack("<ddq", 1.5, 2.5, -1) for _ in range(k))
+        out += struct.pack("<Q", k) + b"".join(struct.pack("<ddq", 1.5, 2.5, observed_point(j)) for j in range(k))
     (folder / "images.bin").write_bytes(out)
     out = struct.pack("<Q", len(POINTS))
     for k, p in enumerate(POINTS):
@@ -103,7 +108,7 @@ def write_txt(folder, names, cameras=CAMERAS):
     for k, name in enumerate(names):
         lines += [
             f"{k + 1} {show(quaternion(rotations[k]))} {show(translations[k])} {k + 1} {name}",
-            " ".join("1.5 2.5 -1" for _ in range(k)),
+            " ".join(f"1.5 2.5 {observed_point(j)}" for j in range(k)),
         ]
     (folder / "images.txt").write_text("\n".join(lines) + "\n")
     lines = ["# 3D point list"]
@@ -125,6 +130,18 @@ def model(request, tmp_path):
     folder.mkdir(parents=True)
     {"bin": write_bin, "txt": write_txt}[request.param](folder, NAMES)
     return folder
+
+
+def test_frames_have_their_reliable_points(model):
+    posed = read_colmap(model, model.parents[1] / "images")
+    for frame in posed.frames:
+        k = NAMES.index(frame.name)
+        expected = sorted({observed_point(j) - 1 for j in range(k)} & set(TRUSTED))
+        assert np.allclose(frame.points.positions, POINTS[expected]), frame.name
+    moved = posed.transform(np.array([[0, -2, 0, 1], [2, 0, 0, 2], [0, 0, 2, 3], [0, 0, 0, 1.0]]))
+    before, after = posed.frames[-1].points, moved.frames[-1].points
+    assert np.allclose(after.positions, before.positions[:, [1, 0, 2]] * [-2, 2, 2] + [1, 2, 3])
+    assert np.array_equal(after.relative_errors, before.relative_errors) and len(before)
 
 
 def test_cameras_poses_and_points(model):

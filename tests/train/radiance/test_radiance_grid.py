@@ -7,6 +7,7 @@ import pytest
 
 from nerg_mi.maths.geometry import Box, ContractedBox
 from nerg_mi.photos.cameras import Intrinsics, PosedCamera
+from nerg_mi.train.radiance_data import FreeSpace
 from nerg_mi.train.radiance_grid import DensityGrid, OccupancyExtraction
 
 # ---- Density grid ----
@@ -73,10 +74,24 @@ def test_cells_that_enough_cameras_see_are_sampled():
 
 def test_cells_near_a_camera_are_not_sampled():
     near = 0.9
-    grid = DensityGrid(ns, BOX, R, 0.1, [camera_at(0, 0, 1.5)], 1, near=near)
+    grid = DensityGrid(
+        ns, BOX, R, 0.1, [camera_at(0, 0, 1.5)], 1, free_space=FreeSpace(*np.full((2, 1), near, np.float32))
+    )
     free = DensityGrid(ns, BOX, R, 0.1, [camera_at(0, 0, 1.5)], 1)
     far = np.linalg.norm(centres() - [0, 0, 1.5], axis=-1) > near
     assert np.array_equal(cube(grid.seen), cube(free.seen) & far) and (cube(free.seen) & ~far).any()
+
+
+def test_free_space_in_view_of_a_camera_is_not_sampled():
+    cameras = [camera_at(0, 0, 0.5), camera_at(0, 0, 30)]
+    free_space = FreeSpace(np.float32([0.1, 0.1]), np.float32([0.8, 0.1]))
+    seen = cube(DensityGrid(ns, BOX, R, 0.1, cameras, 1, free_space=free_space).seen)
+    d = centres() - [0, 0, 0.5]
+    is_in_view = np.abs(d[..., :2]).max(axis=-1) < -0.95 * d[..., 2]
+    near = np.linalg.norm(d, axis=-1) < 0.8
+    assert not seen[is_in_view & near].any() and seen[~is_in_view & near].any()
+    everything = cube(DensityGrid(ns, BOX, R, 0.1, cameras, 1).seen)
+    assert np.array_equal(seen[~(is_in_view & near)], everything[~(is_in_view & near)])
 
 
 def test_cells_outside_a_non_cubic_box_are_empty():

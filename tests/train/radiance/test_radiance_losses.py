@@ -20,6 +20,7 @@ from nerg_mi.train.radiance_losses import (
     evaluate_samples,
     huber_loss,
     stack,
+    surface_loss,
     unstack,
 )
 from nerg_mi.train.radiance_sampling import RaySamples, Segments
@@ -65,6 +66,8 @@ def test_depth_loss(margin):
     got = depth_loss(ns.Float(weight), ns.Float(TAU), samples(), ns.Float(truth), margin, scale).numpy()
     assert np.allclose(got, want, rtol=1e-5, atol=1e-6)
     assert want[2] == 0 and (want[:2] > 0.01).all()
+    missed = surface_loss(ns.Float(weight), samples(), ns.Float(truth), ns.Float([margin] * 3)).numpy()
+    assert np.allclose(missed, np.where(truth > 0, 1 - caught, 0), rtol=1e-5, atol=1e-6)
 
 
 def test_depth_loss_is_bounded_where_all_is_at_the_wrong_place():

@@ -11,7 +11,9 @@ from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.radiance import RadianceConfig, RadianceField
 from nerg_mi.maths.geometry import Box, ContractedBox
 from nerg_mi.photos.cameras import Intrinsics, PosedCamera, pixel_directions
+from nerg_mi.photos.dataset import depth_points
 from nerg_mi.photos.images import PhotoView
+from nerg_mi.photos.observed import ObservedPoints
 from nerg_mi.train import radiance_trainer
 from nerg_mi.train.radiance_data import PixelBank
 from nerg_mi.train.radiance_losses import (
@@ -21,6 +23,7 @@ from nerg_mi.train.radiance_losses import (
     evaluate_ray_color,
     evaluate_samples,
     feature_decay_loss,
+    surface_loss,
 )
 from nerg_mi.train.radiance_run import evaluate_views
 from nerg_mi.train.radiance_sampling import (
@@ -313,6 +316,42 @@ def test_depth_weight_decays(dataset, monkeypatch):
         trainer.steps = steps
         trainer.step()
         assert float(trainer.loss[0]) == pytest.approx(0.3 * 0.04 ** ((steps + 1) / 100), rel=1e-4)
+
+
+def with_points(view):
+    """``view`` without depth, with its surface as points of a reconstruction that are off by a thousandth."""
+    points = depth_points(view.camera, view.depth, 200)
+    return replace(view, depth=None, points=ObservedPoints(points, np.full(len(points), 1e-3)))
+
+
+def test_point_weight_decays(dataset, monkeypatch):
+    """The loss of points alone, one per ray: its weight over the fraction of the rays that have a point."""
+    from nerg_mi.train import radiance_trainer as radiance
+
+    monkeypatch.setattr(radiance, "color_loss", lambda *options: 0 * color_loss(*options))
+    monkeypatch.setattr(radiance, "surface_loss", lambda *options: 0 * surface_loss(*options) + 1)
+    views = [with_points(v) for v in dataset.train]
+    for steps in (0, 49, 99):
+        options = settings(steps=100, point_weight=0.3, point_weight_final_ratio=0.04, point_fraction=0.25)
+        trainer = RadianceTrainer(views, BOX, TINY, options, ns)
+        trainer.steps = steps
+        trainer.step()
+        assert float(trainer.loss[0]) == pytest.approx(0.3 * 0.04 ** ((steps + 1) / 100) / 0.25, rel=1e-4)
+    assert not RadianceTrainer(dataset.train, BOX, TINY, settings(), ns).use_points
+
+
+def test_points_place_the_surface(dataset):
+    """With the same steps, the expected depth on held-out views is better with points than without."""
+    errors = {}
+    for weight in (0.0, 0.1):
+        options = settings(steps=60, point_weight=weight, clear_fraction=0.0)
+        trainer = RadianceTrainer([with_points(v) for v in dataset.train], BOX, TINY, options, ns)
+        while trainer.progress < 1:
+            trainer.step()
+        field = trainer.make_field()
+        pairs = [(trainer.render(v, 1, field), v.depth) for v in dataset.held_out]
+        errors[weight] = np.mean([np.abs(r.depth - d)[d > 0].mean() for r, d in pairs])
+    assert errors[0.1] < 0.7 * errors[0.0]
 
 
 def test_incomplete_rays_do_not_count(dataset, monkeypatch):
