@@ -6,6 +6,7 @@ import math
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -288,6 +289,8 @@ def load_radiance(path: str | Path, ns: ModuleType) -> tuple[RadianceField, dict
     Raises `NergError` if the file contains no radiance field.
     """
     tensors, meta = read_checkpoint(path, "radiance")
+    if meta.get("provenance", {}).get("quality") == "poor":
+        _warn_of_poor_field(str(path))
     with translate_build_errors(path):
         arrays, config = StoredArrays(tensors, ns), RadianceConfig.from_dict(check_sizes(meta["architecture"]))
         step = meta["march_step"]
@@ -317,6 +320,19 @@ def load_radiance(path: str | Path, ns: ModuleType) -> tuple[RadianceField, dict
             growth,
         )
     return field, meta
+
+
+@cache
+def _warn_of_poor_field(path: str) -> None:
+    """Warn of a field that its training found to be of poor quality, once per process."""
+    import mitsuba as mi
+
+    log: Any = mi.Log  # missing in the stubs
+    log(
+        mi.LogLevel.Warn,
+        f'the radiance field "{path}" predicts photos badly that it was not trained on (quality "poor" in its '
+        "provenance): its surfaces may be wrong; see the warnings of its training",
+    )
 
 
 def matches_checksum(path: str | Path, sha256: object) -> bool:

@@ -262,7 +262,13 @@ class DensityGrid:
             self.mark_dense_cells(
                 dense_cells, index, density, rng, (k % probes, k // probes % probes, k // probes**2), probes
             )
-        dense = self.dilate_cells(dense_cells)
+        return self.select_contributing(self.dilate_cells(dense_cells), density, contributing_points)
+
+    def select_contributing(self, dense: np.ndarray, density, contributing_points) -> OccupancyGrid | CascadeGrid:
+        """Return the occupancy of the cells ``dense`` (R, R, R) that contribute to training rays, or touch such a cell.
+
+        The other parameters are those of `extract_occupancy`.
+        """
         bits = self.ns.UInt8(dense.ravel())
         contributing = self._find_cells_with(
             contributing_points(density, lambda p, active: self.is_within(bits, p, active))

@@ -26,6 +26,7 @@ from nerg_mi.photos.cameras import pixel_directions
 from nerg_mi.photos.dataset import Dataset
 from nerg_mi.photos.images import PhotoView
 
+from .radiance_diagnosis import Outcome, find_causes, find_problems
 from .radiance_losses import PHOTO_PARAMETER
 from .radiance_settings import RadianceSettings
 from .radiance_trainer import Preview, RadianceTrainer
@@ -99,54 +100,6 @@ def evaluate_views(
     return errors
 
 
-# ---- Problems of a finished training ----
-
-_MAX_DROP = 1.0  # dB. Evaluations on a few views vary by some tenths of a dB
-_MIN_STEPS = 500  # Below this, each doubling of the steps still gains several dB on photos
-
-
-def find_problems(
-    history: list[dict], steps: int, stride: int, minutes: float | None, seconds: float = 0.0
-) -> list[str]:
-    """Describe problems of a training in one sentence each; empty for a sound run.
-
-    Parameters
-    ----------
-    history : list of dict
-        Evaluations on the validation views in order, each with ``steps`` and ``psnr`` in dB. The last one is that of
-        the result.
-    steps : int
-        Number of steps.
-    stride : int
-        March stride at the end of the run, relative to rendering.
-    minutes : float or None
-        Time limit, or None for a run by steps.
-    seconds : float
-        Duration of the run.
-    """
-    out = []
-    remedy = "more --steps" if minutes is None else "more --minutes, or --steps"
-    if steps < _MIN_STEPS:
-        timed = minutes is not None and seconds > 0
-        rate = f" ({steps / seconds:.2g} per second: this machine is slow or busy)" if timed else ""
-        out.append(f"only {steps} steps{rate}, but a usable field needs at least {_MIN_STEPS}; use {remedy}")
-    if stride > 1:
-        out.append(
-            f"the run ended with steps {stride} times coarser than those of rendering, because fog was not cleared "
-            f"yet; use {remedy}"
-        )
-    # With too few steps, a lower PSNR is noise of an unfinished training, which another seed does not improve.
-    if steps >= _MIN_STEPS and len(history) > 1:
-        best = max(history[:-1], key=lambda x: x["psnr"])
-        drop = best["psnr"] - history[-1]["psnr"]
-        if drop > _MAX_DROP:
-            out.append(
-                f"the result has {history[-1]['psnr']:.2f} dB on the validation views, {drop:.1f} dB less than the "
-                f"{best['psnr']:.2f} dB at step {best['steps']}; try another --seed, or {remedy}"
-            )
-    return out
-
-
 # ---- Compiling the kernels of a training before its clock starts ----
 
 
@@ -207,8 +160,10 @@ def _restoring_state(trainer):
 
 KIND = "radiance run"
 # Fractions of the run at which the held-out error is evaluated.
-_EVALUATION_TIMES = (0.05, 0.1, 0.2, 0.4, 0.6, 0.8)
-_NUM_VALIDATION_VIEWS = 4
+_EVALUATION_TIMES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
+_NUM_VALIDATION_VIEWS, _NUM_TRAINING_VIEWS = 4, 2
+# An earlier state replaces the last one if it is better on the validation views by more than this, in dB.
+_MIN_IMPROVEMENT = 0.2
 # Minimum number of steps between two evaluations, each of which takes as long as several steps
 MIN_EVALUATION_INTERVAL = 50
 # Maximum samples of an evaluation or preview, and of the final error: in fog a ray has hundreds.
@@ -247,7 +202,7 @@ def train_field(
     preview: Path | None = None,
     write: Callable[[RadianceField, dict], None] | None = None,
 ) -> tuple[RadianceField, dict]:
-    """Train a radiance field on ``dataset``.
+    """Train a radiance field on ``dataset``, and return its best state on the validation views.
 
     Parameters
     ----------
@@ -291,10 +246,7 @@ def train_field(
     """
     trainer = RadianceTrainer(dataset.train, dataset.box, config, settings, ns, depth)
     warm_up(trainer)
-    indices = (
-        np.linspace(0, len(dataset.held_out) - 1, min(_NUM_VALIDATION_VIEWS, len(dataset.held_out))).round().astype(int)
-    )
-    validation_views = [dataset.held_out[i] for i in indices]
+    watched = WatchedViews.choose(dataset)
     identity = {
         **{k: dataset.source.get(k) for k in ("sha256", "training_frames", "width", "height")},
         "settings": settings.to_dict(),
@@ -304,7 +256,7 @@ def train_field(
     }
     history = load_run(trainer, state, identity) if resume else []
     last_psnr = history[-1]["psnr"] if history else None
-    evaluation_times = [x for x in _EVALUATION_TIMES if x > trainer.progress] if validation_views else []
+    evaluation_times = [x for x in _EVALUATION_TIMES if x > trainer.progress] if watched.held_out else []
     last_evaluation, saved, interrupted = history[-1]["steps"] if history else 0, trainer.seconds, False
 
     def save() -> None:
@@ -325,10 +277,10 @@ def train_field(
                 and trainer.steps >= last_evaluation + MIN_EVALUATION_INTERVAL
             ):
                 evaluation_times, last_evaluation = [x for x in evaluation_times if x > trainer.progress], trainer.steps
-                _append_evaluation(trainer, validation_views, history)
+                _append_evaluation(trainer, watched, history)
                 last_psnr = history[-1]["psnr"] if history else None
                 if preview is not None:
-                    write_preview(trainer, validation_views[0], preview)
+                    write_preview(trainer, watched.held_out[0], preview)
             if state is not None and trainer.seconds - saved > save_every:
                 save()
                 saved = trainer.seconds
@@ -339,16 +291,16 @@ def train_field(
                 # Ctrl-C is only handled between two steps, because within a step weights and random numbers are
                 # inconsistent.
                 interrupted = True
-        if preview is not None and validation_views:
+        if preview is not None and watched.held_out:
             with saving_on_failure(state, save, is_done=False):
-                write_preview(trainer, validation_views[0], preview)
+                write_preview(trainer, watched.held_out[0], preview)
         interrupted = interrupted or stop.is_requested  # Ctrl-C during the last preview
     seconds = trainer.seconds
     if interrupted:
         save()
     with saving_on_failure(state, save, is_done=write is not None and not interrupted):
         score = lambda fraction: report(fraction, "scoring")
-        field, provenance = _make_result(trainer, dataset, validation_views, history, seconds, interrupted, score)
+        field, provenance = _make_result(trainer, dataset, watched, history, seconds, interrupted, score)
         if write is not None:
             report(0.0, "writing")
             write(field, provenance)
@@ -381,17 +333,17 @@ def load_run(trainer: RadianceTrainer, path: Path | None, identity: dict) -> lis
 def _make_result(
     trainer: RadianceTrainer,
     dataset: Dataset,
-    validation_views: list[PhotoView],
+    watched: WatchedViews,
     history: list,
     seconds: float,
     interrupted: bool,
     on_progress: Callable[[float], None],
 ) -> tuple[RadianceField, dict]:
-    """Return the final field and its provenance with the error on all held-out views.
+    """Return the best field and its provenance with the error on all held-out views.
 
     ``on_progress`` is called with the fraction of the scored views.
     """
-    field = trainer.make_field()
+    field, result = _choose_state(trainer, watched, history)
     provenance = {
         **dataset.source,
         "settings": trainer.settings.to_dict(),
@@ -417,17 +369,37 @@ def _make_result(
             "every_pixel": every,
             "views": {v.name: _round_decibels(p) for v, p in zip(dataset.held_out, error.psnr)},
         }
-        _append_evaluation(trainer, validation_views, history, field)
         if field.box.is_contracted:
-            every = trainer.choose_pixel_stride(validation_views, _EVALUATION_SAMPLES)
+            every = trainer.choose_pixel_stride(watched.held_out, _EVALUATION_SAMPLES)
             outside_fraction = compute_outside_fraction(
-                validation_views, lambda view: trainer.render(view, every, field), field.box.core, every
+                watched.held_out, lambda view: trainer.render(view, every, field), field.box.core, every
             )
             provenance["beyond_box"] = round(outside_fraction, 4)
-    provenance["psnr_watched"] = {"views": [v.name for v in validation_views], "history": history}
-    minutes = trainer.settings.minutes
-    provenance["complaints"] = find_problems(history, trainer.steps, trainer.stride, minutes, seconds)
+    provenance["psnr_watched"] = {"views": [v.name for v in watched.held_out], "history": history, "result": result}
+    outcome = Outcome(history, result, trainer.steps, trainer.stride, trainer.settings.minutes, seconds)
+    provenance["quality"] = "poor" if outcome.is_poor else "usable"
+    causes = []
+    if outcome.is_poor:
+        causes = find_causes(dataset.train, provenance.get("photo_stops", 0.0), provenance.get("beyond_box", 0.0))
+    provenance["complaints"] = find_problems(outcome, causes)
     return field, provenance
+
+
+def _choose_state(trainer: RadianceTrainer, watched: WatchedViews, history: list) -> tuple[RadianceField, dict | None]:
+    """Return the field of the last state, or of the best one if that is better as a result, and its evaluation.
+
+    The last state is appended to ``history``.
+    """
+    field = trainer.make_field()
+    last = _append_evaluation(trainer, watched, history, field)
+    best = trainer.best
+    if last is None or best is None or best.row["psnr"] <= last["psnr"] + _MIN_IMPROVEMENT:
+        return field, last
+    earlier = trainer.make_field(snapshot=best)
+    row = {**best.row, **_evaluate(trainer, watched, earlier)}
+    if row["psnr"] <= last["psnr"] + _MIN_IMPROVEMENT:
+        return field, last
+    return earlier, row
 
 
 def _round_decibels(decibels: float) -> float | None:
@@ -435,18 +407,51 @@ def _round_decibels(decibels: float) -> float | None:
     return None if math.isnan(decibels) else round(decibels, 3)
 
 
-def _append_evaluation(
-    trainer: RadianceTrainer, validation_views: list[PhotoView], history: list, field: RadianceField | None = None
-) -> None:
-    """Append the error on the validation views to ``history``, on a subset of the pixels that takes little time.
+@dataclass(frozen=True)
+class WatchedViews:
+    """A few views that are evaluated during training: ``held_out`` ones, and ones of the ``training``."""
 
-    Nothing is appended if all pixels are masked.
+    held_out: list[PhotoView]
+    training: list[PhotoView]
+
+    @staticmethod
+    def choose(dataset: Dataset) -> WatchedViews:
+        """Choose views at equal intervals."""
+        return WatchedViews(
+            _pick_evenly(dataset.held_out, _NUM_VALIDATION_VIEWS), _pick_evenly(dataset.train, _NUM_TRAINING_VIEWS)
+        )
+
+
+def _pick_evenly(views: list[PhotoView], count: int) -> list[PhotoView]:
+    return [views[int(k)] for k in np.linspace(0, len(views) - 1, min(count, len(views))).round()]
+
+
+def _append_evaluation(
+    trainer: RadianceTrainer, watched: WatchedViews, history: list, field: RadianceField | None = None
+) -> dict | None:
+    """Append an evaluation to ``history``, keep the state if it is the best, and return the evaluation.
+
+    None, and nothing is appended, without held-out views, or if all of their pixels are masked.
     """
-    every, seconds = trainer.choose_pixel_stride(validation_views, _EVALUATION_SAMPLES), trainer.seconds
-    psnr = evaluate_views(trainer, validation_views, every, field).mean
-    if not math.isnan(psnr):
-        row = {"steps": trainer.steps, "seconds": round(seconds, 1), "psnr": round(psnr, 2), "every_pixel": every}
-        history.append(row)
+    seconds = trainer.seconds
+    row = {"steps": trainer.steps, "seconds": round(seconds, 1), **_evaluate(trainer, watched, field)}
+    if row["psnr"] is None:
+        return None
+    history.append(row)
+    if field is None and (trainer.best is None or row["psnr"] > trainer.best.row["psnr"]):
+        trainer.best = trainer.take_snapshot(row)
+    return row
+
+
+def _evaluate(trainer: RadianceTrainer, watched: WatchedViews, field: RadianceField | None) -> dict:
+    """Return the PSNR of held-out and training views, on a subset of the pixels that takes little time."""
+    if not watched.held_out:
+        return {"psnr": None}
+    every = trainer.choose_pixel_stride(watched.held_out, _EVALUATION_SAMPLES)
+    shown = field or trainer.make_field(with_occupancy=False)
+    held_out, training = (evaluate_views(trainer, v, every, shown).mean for v in (watched.held_out, watched.training))
+    as_number = lambda x: None if math.isnan(x) else round(x, 2)
+    return {"psnr": as_number(held_out), "psnr_train": as_number(training), "every_pixel": every}
 
 
 def write_preview(trainer: RadianceTrainer, view: PhotoView, path: Path) -> None:

@@ -154,6 +154,19 @@ _NUMBERS = {
 }  # Numbers in the run state
 
 
+@dataclass(frozen=True)
+class Snapshot:
+    """State of a training that can be made into a field later.
+
+    ``weights`` are the averaged weights by name, ``bits`` (UInt8 per cell of the density grid) the sampled cells, and
+    ``row`` its evaluation (JSON).
+    """
+
+    weights: dict[str, Any]
+    bits: Any
+    row: dict
+
+
 class RadianceTrainer(Trainer):
     """Trainer of a radiance field: its state, `step`, and `make_field` for the result.
 
@@ -225,6 +238,8 @@ class RadianceTrainer(Trainer):
         self.extraction = OccupancyExtraction(self.grid)
         self.hard_pixels = np.zeros(0, np.uint32)
         self.rays, self.loss, self.samples = 256, 0.0, 0
+        # State with the best evaluation so far
+        self.best: Snapshot | None = None
         # March stride in units of `march_step`, and samples per ray of the last density pass.
         self.stride, self.prepass_samples_per_ray = 1 if self.is_carved else max(settings.strides, default=1), 0.0
         self.start()
@@ -239,7 +254,14 @@ class RadianceTrainer(Trainer):
         }
         meta |= {key: getattr(self, name) for key, name in _NUMBERS.items()}
         meta |= {"settling": settling.pieces_done, "turn": self.grid.turn, "clock": self.clock.to_dict()}
+        if self.best is not None:
+            tensors |= {f"best.{name}": value.numpy() for name, value in self.best.weights.items()}
+            tensors["best_cells"], meta["best"] = self.best.bits.numpy(), self.best.row
         return {**tensors, "hard": self.hard_pixels}, meta
+
+    def take_snapshot(self, row: dict) -> Snapshot:
+        """Return the state of now with its evaluation ``row``. Arrays are replaced, never modified, during training."""
+        return Snapshot(dict(self.averaged), self.grid.bits, row)
 
     def restore(self, tensors: dict, meta: dict) -> None:
         counts = {name: read_count(meta, key) for key, name in _NUMBERS.items()}
@@ -252,6 +274,12 @@ class RadianceTrainer(Trainer):
         self.grid.restore(**{name: tensors[f"grid.{name}"] for name in GRID_STATE}, turn=int(read_count(meta, "turn")))
         self.extraction.restore(int(read_number(meta, "settling", "state")), dense, contributing)
         self.clock.restore(meta["clock"])
+        if "best" in meta:
+            for name, value in {**self.averaged, "cells": self.grid.bits}.items():
+                check_shape(tensors, "best_cells" if name == "cells" else f"best.{name}", value)
+            read_number(meta["best"], "psnr", "state"), read_count(meta["best"], "steps")
+            weights = {name: type(value)(tensors[f"best.{name}"]) for name, value in self.averaged.items()}
+            self.best = Snapshot(weights, self.ns.UInt8(tensors["best_cells"]), dict(meta["best"]))
         self.hard_pixels = tensors["hard"]
         for name, value in counts.items():
             setattr(self, name, value)
@@ -536,15 +564,25 @@ class RadianceTrainer(Trainer):
             field, occupied, self.get_step_table(), view, self.settings.near * self.box.side, every=every
         )
 
-    def make_field(self, with_occupancy: bool = True) -> RadianceField:
-        """Return the field with averaged weights, and its occupancy for rendering if ``with_occupancy``."""
+    def make_field(self, with_occupancy: bool = True, snapshot: Snapshot | None = None) -> RadianceField:
+        """Return the field with averaged weights, and its occupancy for rendering if ``with_occupancy``.
+
+        With a ``snapshot``, it is the field of that state, sampled in the cells that were sampled then.
+        """
         growth = self.settings.step_growth if self.box.is_contracted else 0.0
         out = RadianceField.random(self.config, self.box, self.ns, 0, march_step=self.march_step, march_growth=growth)
-        out.set_parameters({k: type(v)(v) for k, v in self.averaged.items() if k != PHOTO_PARAMETER})
-        if with_occupancy:
-            with dr.suspend_grad():
-                out.occupancy = self.grid.extract_occupancy(
-                    out.density, np.random.default_rng(self.settings.seed), self._contributing_samples
-                )
-            out.occupancy = refine_occupancy(out) or out.occupancy
+        weights = self.averaged if snapshot is None else snapshot.weights
+        out.set_parameters({k: type(v)(v) for k, v in weights.items() if k != PHOTO_PARAMETER})
+        if not with_occupancy:
+            return out
+        with dr.suspend_grad():
+            if snapshot is None:
+                rng = np.random.default_rng(self.settings.seed)
+                out.occupancy = self.grid.extract_occupancy(out.density, rng, self._contributing_samples)
+            else:
+                # A young field is thin fog, of which a threshold, or a refined occupancy, would leave nothing.
+                cells = snapshot.bits.numpy().reshape((self.grid.resolution,) * 3) > 0
+                out.occupancy = self.grid.select_contributing(cells, out.density, self._contributing_samples)
+                return out
+        out.occupancy = refine_occupancy(out) or out.occupancy
         return out

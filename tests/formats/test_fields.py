@@ -244,6 +244,18 @@ def test02_optional_parts_of_radiance_fields(tmp_path):
     assert again.config.deferred
 
 
+def test02a_fields_of_poor_quality_are_named_once(tmp_path, monkeypatch):
+    import mitsuba as mi
+
+    lines = []
+    monkeypatch.setattr(mi, "Log", lambda level, line: lines.append(line))
+    for quality, count in (("usable", 0), ("poor", 1), ("poor", 1)):
+        save_radiance(make_radiance(), tmp_path / f"{quality}.safetensors", {"quality": quality})
+        load_radiance(tmp_path / f"{quality}.safetensors", ns)
+        assert len(lines) == count
+    assert "poor.safetensors" in lines[0]
+
+
 def test02b_support_and_provenance_of_gaze_fields(tmp_path):
     """Read from the provenance of the training; None without it."""
     for metadata, words in (
