@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 THREADS_VARIABLE = "NERG_THREADS"
 """Environment variable that passes the number of threads from `nerg worker` to the process that computes."""
@@ -22,6 +23,22 @@ def set_thread_count(count: int) -> None:
         # It waits for the kernels of all threads; `dr.sync_thread` would wait for those of this thread only.
         dr.flush_malloc_cache()
         dr.set_thread_count(count)
+
+
+def measure_processor_time() -> tuple[float, float] | None:
+    """Return the seconds that all threads of this process ran, and that they were ready but waited for a processor.
+
+    None where the system does not tell (it is Linux that does).
+    """
+    total = [0, 0]
+    for path in Path("/proc/self/task").glob("*/schedstat"):
+        try:
+            running, waiting = path.read_text().split()[:2]
+        except OSError:  # The thread has ended
+            continue
+        total[0] += int(running)
+        total[1] += int(waiting)
+    return (total[0] * 1e-9, total[1] * 1e-9) if total[0] else None
 
 
 def get_worker_threads() -> int:

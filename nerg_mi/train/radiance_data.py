@@ -343,11 +343,11 @@ class FreeSpace:
         for k, view in enumerate(views):
             if view.points is not None and len(view.points) >= _MIN_CLEARING_POINTS:
                 center, (height, width) = view.camera.center, view.shape
-                own = np.linalg.norm(view.points.positions - center, axis=1)
+                distances = np.linalg.norm(view.points.positions - center, axis=1)
                 pixels, is_visible = project(distinct, view.camera)
                 is_visible &= np.all((pixels >= 0) & (pixels < [width, height]), axis=1)
                 nearest = np.min(np.linalg.norm(distinct[is_visible] - center, axis=1), initial=np.inf)
-                distance = min(fraction * float(np.quantile(own, _NEAR_OUTLIERS)), _CLEAR_MARGIN * float(nearest))
+                distance = min(fraction * float(np.quantile(distances, _NEAR_OUTLIERS)), _CLEAR_MARGIN * float(nearest))
                 clear[k] = max(clear[k], distance)
         return FreeSpace(radius, clear)
 

@@ -11,7 +11,7 @@ from nerg_mi.photos.posed import format_names
 
 # ---- Problems of a finished training ----
 
-_MIN_STEPS = 500  # Below this, each doubling of the steps still gains several dB on photos
+MIN_STEPS = 500  # Below this, each doubling of the steps still gains several dB on photos
 # Evaluations on a few views vary by some tenths of a dB
 _MAX_DROP = 1.0
 # Difference of training and held-out views in dB above which a field explains photos rather than the scene. Sound
@@ -37,6 +37,8 @@ class Outcome:
         March stride at its end, relative to rendering.
     minutes
         Time limit, or None for a run by steps.
+    waiting_fraction
+        Fraction of the processor time that other programs used.
     """
 
     history: list[dict]
@@ -45,6 +47,7 @@ class Outcome:
     stride: int
     minutes: float | None
     seconds: float = 0.0
+    waiting_fraction: float = 0.0
 
     @property
     def gap(self) -> float:
@@ -66,17 +69,17 @@ def find_problems(outcome: Outcome, causes: list[str]) -> list[str]:
     """
     out, steps, history = [], outcome.steps, outcome.history
     remedy = "more --steps" if outcome.minutes is None else "more --minutes, or --steps"
-    if steps < _MIN_STEPS:
+    if steps < MIN_STEPS:
         timed = outcome.minutes is not None and outcome.seconds > 0
-        rate = f" ({steps / outcome.seconds:.2g} per second: this machine is slow or busy)" if timed else ""
-        out.append(f"only {steps} steps{rate}, but a usable field needs at least {_MIN_STEPS}; use {remedy}")
+        rate = f" ({describe_pace(steps / outcome.seconds, outcome.waiting_fraction)})" if timed else ""
+        out.append(f"only {steps} steps{rate}, but a usable field needs at least {MIN_STEPS}; use {remedy}")
     if outcome.stride > 1:
         out.append(
             f"the run ended with steps {outcome.stride} times coarser than those of rendering, because fog was not "
             f"cleared yet; use {remedy}"
         )
     # With too few steps, a lower PSNR is noise of an unfinished training.
-    if steps < _MIN_STEPS or outcome.result is None:
+    if steps < MIN_STEPS or outcome.result is None:
         return out
     best, last = outcome.result, history[-1]["psnr"]
     if best["psnr"] - last > _MAX_DROP:
@@ -89,6 +92,17 @@ def find_problems(outcome: Outcome, causes: list[str]) -> list[str]:
         likely = f"; likely causes: {'; '.join(causes)}" if causes else ""
         out.append(f"held-out views have {best['psnr']:.1f} dB{training}: this field is of poor quality{likely}")
     return out
+
+
+# Fraction of the processor time that other programs use on a busy machine.
+_MAX_WAITING = 0.1
+
+
+def describe_pace(steps_per_second: float, waiting_fraction: float) -> str:
+    """Describe a low pace and its cause, in a few words."""
+    busy = waiting_fraction > _MAX_WAITING
+    cause = f"other programs used {waiting_fraction:.0%} of the processor time" if busy else "this machine is slow"
+    return f"{steps_per_second:.2g} per second: {cause}"
 
 
 # ---- Likely causes in the photos ----
@@ -119,7 +133,7 @@ def find_causes(views: list[PhotoView], exposure_stops: float = 0.0, outside_fra
     for view in views:
         grey = view.composite_over(0.5).mean(axis=2)
         blank.append(_measure_blank(grey))
-        sharpness.append(float(np.abs(np.diff(grey, 2, axis=0)).mean() + np.abs(np.diff(grey, 2, axis=1)).mean()))
+        sharpness.append(_measure_sharpness(grey))
     if np.mean(blank) > _MAX_BLANK:
         out.append(
             f"{np.mean(blank):.0%} of the photos' area has hardly any texture: if an object was turned in front of its "
@@ -141,6 +155,11 @@ def find_causes(views: list[PhotoView], exposure_stops: float = 0.0, outside_fra
     if len(blurred) > _MAX_BLURRED * len(views):
         out.append(f"{len(blurred)} photos are blurred: remove {format_names(blurred, 3)}")
     return out
+
+
+def _measure_sharpness(grey: np.ndarray) -> float:
+    """Return the mean absolute second difference of ``grey`` (h, w) across rows and columns; 0 for tiny pictures."""
+    return float(sum(np.abs(np.diff(grey, 2, axis=k)).sum() for k in (0, 1))) / max(grey.size, 1)
 
 
 def _measure_blank(grey: np.ndarray) -> float:

@@ -25,8 +25,9 @@ from nerg_mi.maths.geometry import Box
 from nerg_mi.photos.cameras import pixel_directions
 from nerg_mi.photos.dataset import Dataset
 from nerg_mi.photos.images import PhotoView
+from nerg_mi.threads import measure_processor_time
 
-from .radiance_diagnosis import Outcome, find_causes, find_problems
+from .radiance_diagnosis import MIN_STEPS, Outcome, describe_pace, find_causes, find_problems
 from .radiance_losses import PHOTO_PARAMETER
 from .radiance_settings import RadianceSettings
 from .radiance_trainer import Preview, RadianceTrainer
@@ -162,6 +163,8 @@ KIND = "radiance run"
 # Fractions of the run at which the held-out error is evaluated.
 _EVALUATION_TIMES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
 _NUM_VALIDATION_VIEWS, _NUM_TRAINING_VIEWS = 4, 2
+# Fraction of the run after which its pace is judged.
+_PACE_TIME = 0.1
 # An earlier state replaces the last one if it is better on the validation views by more than this, in dB.
 _MIN_IMPROVEMENT = 0.2
 # Minimum number of steps between two evaluations, each of which takes as long as several steps
@@ -201,6 +204,7 @@ def train_field(
     save_every: float = 60.0,
     preview: Path | None = None,
     write: Callable[[RadianceField, dict], None] | None = None,
+    on_warning: Callable[[str], None] = lambda text: None,
 ) -> tuple[RadianceField, dict]:
     """Train a radiance field on ``dataset``, and return its best state on the validation views.
 
@@ -231,6 +235,8 @@ def train_field(
     write : callable, optional
         Called with the field and its provenance to store them. The run state is removed after it returns; if it raises,
         the final state is saved. Without ``write`` the state remains.
+    on_warning : callable
+        Called with a sentence after a tenth of the run if its pace is too low for a usable field.
 
     Returns
     -------
@@ -268,9 +274,12 @@ def train_field(
             now = trainer.steps, trainer.seconds, trainer.rays, trainer.samples
             on_progress(RadianceProgress(fraction, *now, last_psnr, phase))
 
+    pace = Pace(trainer)
     with Interruption() as stop:
         while trainer.progress < 1 and not interrupted:
             trainer.step()
+            if (line := pace.judge()) is not None:
+                on_warning(line)
             if (
                 evaluation_times
                 and trainer.progress >= evaluation_times[0]
@@ -300,11 +309,44 @@ def train_field(
         save()
     with saving_on_failure(state, save, is_done=write is not None and not interrupted):
         score = lambda fraction: report(fraction, "scoring")
-        field, provenance = _make_result(trainer, dataset, watched, history, seconds, interrupted, score)
+        duration = seconds, pace.waiting_fraction
+        field, provenance = _make_result(trainer, dataset, watched, history, duration, interrupted, score)
         if write is not None:
             report(0.0, "writing")
             write(field, provenance)
     return field, provenance
+
+
+class Pace:
+    """Pace of a run, and the fraction of the processor time that other programs use meanwhile."""
+
+    def __init__(self, trainer: RadianceTrainer):
+        self._trainer, self._time, self._is_judged = trainer, measure_processor_time(), False
+        self._begin = trainer.steps, trainer.seconds
+
+    @property
+    def waiting_fraction(self) -> float:
+        """Fraction of the time since the start in which threads were ready but waited for a processor; 0 if unknown."""
+        now = measure_processor_time()
+        if now is None or self._time is None:
+            return 0.0
+        running, waiting = (after - before for after, before in zip(now, self._time))
+        return max(0.0, waiting / max(running + waiting, 1e-9))
+
+    def judge(self) -> str | None:
+        """Return a warning, once after a tenth of the run, if it will have too few steps."""
+        t = self._trainer
+        if self._is_judged or t.progress < _PACE_TIME or t.settings.minutes is None:
+            return None
+        self._is_judged = True
+        per_second = (t.steps - self._begin[0]) / max(t.seconds - self._begin[1], 1e-9)
+        expected = t.steps + per_second * (1 - t.progress) * 60 * t.settings.minutes
+        if expected >= MIN_STEPS:
+            return None
+        return (
+            f"at this pace ({describe_pace(per_second, self.waiting_fraction)}) the training will have about "
+            f"{expected:.0f} steps, but a usable field needs at least {MIN_STEPS}: give it more --minutes"
+        )
 
 
 def save_run(trainer: RadianceTrainer, path: Path, identity: dict, history: list) -> None:
@@ -335,14 +377,16 @@ def _make_result(
     dataset: Dataset,
     watched: WatchedViews,
     history: list,
-    seconds: float,
+    duration: tuple[float, float],
     interrupted: bool,
     on_progress: Callable[[float], None],
 ) -> tuple[RadianceField, dict]:
     """Return the best field and its provenance with the error on all held-out views.
 
+    ``duration`` is the time in seconds and the fraction of it in which other programs had the processors;
     ``on_progress`` is called with the fraction of the scored views.
     """
+    seconds, waiting_fraction = duration
     field, result = _choose_state(trainer, watched, history)
     provenance = {
         **dataset.source,
@@ -351,6 +395,7 @@ def _make_result(
         "point_supervision": len(trainer.pixels.points) if trainer.use_points else 0,
         "steps": trainer.steps,
         "seconds": round(seconds, 1),
+        "waiting_fraction": round(waiting_fraction, 3),
         "interrupted": interrupted,
         "made": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         **trainer.clock.summary(),
@@ -376,7 +421,9 @@ def _make_result(
             )
             provenance["beyond_box"] = round(outside_fraction, 4)
     provenance["psnr_watched"] = {"views": [v.name for v in watched.held_out], "history": history, "result": result}
-    outcome = Outcome(history, result, trainer.steps, trainer.stride, trainer.settings.minutes, seconds)
+    outcome = Outcome(
+        history, result, trainer.steps, trainer.stride, trainer.settings.minutes, seconds, waiting_fraction
+    )
     provenance["quality"] = "poor" if outcome.is_poor else "usable"
     causes = []
     if outcome.is_poor:

@@ -177,6 +177,12 @@ class RadianceScoreOptions(PhotoOptions):
         group=INPUT,
     )
     train: bool = option(False, "Score the training views in place of the held-out views.", group=TEST)
+    views: int | None = option(
+        None,
+        "Score this number of views, evenly spaced in the order of their names.  [default: all]",
+        within=Range(1, 10**6),
+        group=TEST,
+    )
     spp: int = option(
         16, "Samples per pixel. The noise of few samples lowers the scores.", within=SPP, group=PERFORMANCE
     )

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import math
+import time
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
+
+import numpy as np
 
 from nerg_mi.errors import NergError, blame_options
 from nerg_mi.evaluation.metrics import ViewScores, score_views
@@ -26,6 +29,8 @@ from .radiance_commands import RadianceOptions, RadianceScoreOptions
 # ---- Training and evaluation of radiance fields ----
 
 
+# Seconds of an evaluation whose duration is announced.
+_LONG = 90
 # Smaller differences of exposure, in stops, are invisible and not reported.
 _STOPS = 0.05
 
@@ -110,12 +115,13 @@ def _train(photos: str | Path, output: Path | None, options: RadianceOptions, re
         settings,
         ns,
         options.depth,
-        lambda now: reporter.progress(now.fraction, _progress(now)),
+        lambda now: reporter.progress(*_progress(now)),
         state=state,
         resume=options.resume,
         save_every=options.save_every or float("inf"),
         preview=preview,
         write=None if output is None else lambda field, metadata: save_radiance(field, output, metadata, options.half),
+        on_warning=reporter.warn,
     )
     result = RadianceResult(field, provenance, output, provenance["interrupted"])
     _report_result(result, reporter)
@@ -163,12 +169,19 @@ def _report_data(data: Dataset, reporter: Reporter) -> None:
     )
 
 
-def _progress(now: radiance_run.RadianceProgress) -> str:
+# Start and length of each phase on the scale of the whole command.
+_PHASES = {"training": (0.0, 0.9), "scoring": (0.9, 0.09), "writing": (0.99, 0.01)}
+
+
+def _progress(now: radiance_run.RadianceProgress) -> tuple[float, str]:
+    """Return the completed fraction of the command, and the present phase in words."""
+    start, length = _PHASES[now.phase]
+    fraction = start + length * now.fraction
     if now.phase != "training":
-        return {"scoring": "scoring the held-out views", "writing": "writing the field"}[now.phase]
+        return fraction, {"scoring": "scoring the held-out views", "writing": "writing the field"}[now.phase]
     left = now.seconds * (1 - now.fraction) / max(now.fraction, 1e-6)
     error = f", held out {now.psnr:.2f} dB" if now.psnr is not None else ""
-    return f"training, {left:.0f} s left, step {now.steps}{error}"
+    return fraction, f"training, {left:.0f} s left, step {now.steps}{error}"
 
 
 def _report_result(result: RadianceResult, reporter: Reporter) -> None:
@@ -226,7 +239,9 @@ def evaluate_radiance(
     if not options.train:
         _refuse_trained(field, provenance, data)
     views = data.train if options.train else data.held_out
-    done = 0
+    if options.views is not None and options.views < len(views):
+        views = [views[int(k)] for k in np.linspace(0, len(views) - 1, options.views).round()]
+    done, start = 0, time.perf_counter()
 
     def row(name: str, psnr: float, ssim: float) -> None:
         similarity = "-" if math.isnan(ssim) else f"{ssim:.4f}"
@@ -237,6 +252,11 @@ def evaluate_radiance(
         nonlocal done
         done += 1
         row(name, psnr, ssim)
+        expected = (time.perf_counter() - start) * len(views)
+        if done == 1 and expected > _LONG:
+            reporter.message(
+                f"scoring {len(views)} views will take about {expected / 60:.0f} minutes; --views 8 scores 8 of them"
+            )
         reporter.progress(done / len(views), f"{done} of {len(views)} views")
 
     reporter.message(f"{'view':32s} {'PSNR dB':>8s} {'SSIM':>7s}")

@@ -82,8 +82,8 @@ def test_training_without_an_output_returns_a_result(cube):
     assert recorder.warnings == result.provenance["complaints"] and recorder.warnings
     texts = [text for _, text in recorder.steps]
     assert texts[1].endswith("step 1") and "training" in texts[1] and "scoring" in texts[-1]
-    phases = [[share for share, text in recorder.steps if word in text] for word in ("training", "scoring")]
-    assert all(shares == sorted(shares) and shares[-1] == 1 for shares in phases) and phases[1][0] == 0
+    shares = [share for share, _ in recorder.steps]
+    assert shares == sorted(shares) and shares[0] == 0 and 0.9 < shares[-1] <= 1
 
 
 def test_a_deferred_field_is_trained_and_evaluated(cube, tmp_path):

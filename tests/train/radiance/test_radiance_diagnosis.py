@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
@@ -35,7 +37,9 @@ def test_a_coarse_final_stride_is_reported():
 
 def test_too_few_steps_are_reported_with_the_rate():
     (line,) = find_problems(make_outcome(10, 12.6, steps=44), [])
-    assert "only 44 steps (0.37 per second: this machine is slow or busy)" in line and "--minutes" in line
+    assert "only 44 steps (0.37 per second: this machine is slow)" in line and "--minutes" in line
+    (line,) = find_problems(replace(make_outcome(10, 12.6, steps=44), waiting_fraction=0.45), [])
+    assert "other programs used 45% of the processor time" in line
     (line,) = find_problems(make_outcome(10, 12.6, steps=40, minutes=None), [])
     assert "only 40 steps," in line and "machine" not in line and "--minutes" not in line
     assert find_problems(make_outcome(steps=500, minutes=None), []) == []
