@@ -6,6 +6,7 @@
     python benchmarks/radiance.py store [--minutes 10] [--size medium] [--only images|depth]
     python -m nerg_mi.scenes.tabletop.make                     # once: photos, rendered from a generated scene
     python benchmarks/radiance.py tabletop [--minutes 4] [--bounded]
+    python benchmarks/radiance.py captures --data FOLDER [--minutes 2,10] [--width 400] [--set point_weight=0]
 
 ``fox``: real photos, of which every 8th is held out. There is one training, for the last of the ``--minutes``, whose
 learning-rate schedule covers the whole time. After each of the ``--minutes``, the clock stops and the current weights
@@ -22,6 +23,10 @@ defaults of `nerg train radiance`. The photos are read as a COLMAP model, with e
 determined from its points. Depth is compared with exact ray casts. "Near" is within 1.5 m of the object. "Far" is more
 than 4 m from the camera, without the sky. "Beyond" is outside of the field's box, or of the core of a contracted field,
 with the sky.
+
+``captures``: each posed image set in the folder ``--data``, with the defaults of `nerg train radiance`: one training
+for each of the ``--minutes``, whose best state is scored on at most eight held-out views. "Fall" is the PSNR of the
+best evaluation on the watched views minus that of the result.
 
 Each training writes a CSV file and prints a table.
 """
@@ -190,6 +195,50 @@ def tabletop(args: argparse.Namespace) -> tuple[str, list[str], list[list[str]],
     return "An unbounded capture", head, [[*table, size]], [row]
 
 
+def captures(args: argparse.Namespace) -> tuple[str, list[str], list[list[str]], list[dict]]:
+    from nerg_mi.photos.colmap import find_pose_source
+    from nerg_mi.photos.dataset import open_dataset
+    from nerg_mi.workflows.radiance_commands import RadianceOptions
+    from nerg_mi.workflows.train_radiance import train_radiance
+
+    settings = {key: ast.literal_eval(value) for key, value in (pair.split("=", 1) for pair in args.set)}
+    rows = []
+    for folder in sorted(p for p in args.data.iterdir() if p.is_dir()):
+        find_pose_source(folder)
+        width = min(args.width, *(view.shape[1] for view in open_dataset(folder).train))
+        for minutes in sorted(float(m) for m in args.minutes.split(",")):
+            path = args.out / f"{folder.name}_{minutes:g}.safetensors"
+            options = RadianceOptions(
+                minutes=minutes, width=width, size=args.size, threads=args.threads, seed=args.seed, **settings
+            )
+            made = train_radiance(folder, path, options).provenance
+            held_out = open_dataset(folder, width=width).held_out
+            held_out = [held_out[int(k)] for k in np.linspace(0, len(held_out) - 1, min(8, len(held_out))).round()]
+            watched, result = made["psnr_watched"]["history"], made["psnr_watched"]["result"]
+            row = {"capture": folder.name, "photos": made["training_frames"], "minutes": minutes}
+            row |= {"steps": made["steps"], **scored(path, held_out, args.spp)[1], "train": result["psnr_train"]}
+            row |= {"fall": max(r["psnr"] for r in watched) - result["psnr"], "result step": result["steps"]}
+            rows.append(row | {"quality": made["quality"], "load": os.getloadavg()[0]})
+            print(rows[-1], flush=True)
+    titles = {
+        "capture": "capture",
+        "photos": "training photos",
+        "minutes": "training time, min",
+        "steps": "steps",
+        **{key: SCORES[key] for key in ("PSNR, dB", "fitted, dB", "SSIM")},
+        "train": "PSNR of training views, dB",
+        "fall": "fall, dB",
+        "quality": "quality",
+    }
+    formats = ("", "d", "g", ",", ".2f", ".2f", ".3f", ".1f", ".2f", "")
+    return (
+        "Captures",
+        list(titles.values()),
+        [[f"{row[key]:{f}}" for key, f in zip(titles, formats)] for row in rows],
+        rows,
+    )
+
+
 def score_depths(field: Path, views: list, box, center, spp: int, pictures: Path) -> dict[str, float]:
     """Means over ``views`` of PSNR in dB and SSIM, and over all of their pixels: PSNR inside and ``beyond`` the
     ``box``, and depth errors near ``center`` and far."""
@@ -231,6 +280,7 @@ SETS = {
     "fox": (fox, FOX, "1,2,4,7,10"),
     "store": (store, ROOT / "scenes" / "store" / "build", "10"),
     "tabletop": (tabletop, ROOT / "scenes" / "tabletop" / "build", "4"),
+    "captures": (captures, Path("captures"), "2,10"),
 }
 """Training and scoring functions, the folder of the views, and the minutes, by name."""
 
@@ -247,14 +297,17 @@ def main(argv=None) -> None:
     )
     parser.add_argument(
         "--minutes",
-        help="Training time in minutes; for the fox several, separated by commas, after which the field is scored. "
-        "Default: 1,2,4,7,10 (fox), 10 (store), 4 (tabletop).",
+        help="Training time in minutes; for the fox several, separated by commas, after which the field is scored; for "
+        "captures the lengths of several trainings. Default: 1,2,4,7,10 (fox), 10 (store), 4 (tabletop), 2,10 "
+        "(captures).",
     )
     parser.add_argument(
-        "--width", type=int, default=135, help="Width of the photos of the fox in pixels. Default: %(default)s."
+        "--width", type=int, default=135, help="Width of the photos in pixels (fox, captures). Default: %(default)s."
     )
     parser.add_argument(
-        "--size", default="small", help="Size of the field: small, medium or paper (fox, store). Default: %(default)s."
+        "--size",
+        default="small",
+        help="Size of the field: small, medium or paper (fox, store, captures). Default: %(default)s.",
     )
     parser.add_argument(
         "--deferred", action="store_true", help="Evaluate the colour network once per ray, not per sample (fox)."
@@ -280,7 +333,8 @@ def main(argv=None) -> None:
         action="append",
         default=[],
         metavar="KEY=VALUE",
-        help="Value of a field of RadianceSettings (fox, store); can be repeated. Default: none.",
+        help="Value of a field of RadianceSettings (fox, store), or of an option (captures); can be repeated. "
+        "Default: none.",
     )
     parser.add_argument(
         "--spp",
