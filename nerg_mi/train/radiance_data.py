@@ -250,7 +250,9 @@ class PixelBank:
 _MAX_POINT_ERROR = 0.1
 # Minimum number of points of a photo, and the fraction of them that may be outliers in front of everything else.
 _MIN_CLEARING_POINTS, _NEAR_OUTLIERS = 50, 0.02
-# Maximum distance of empty space relative to the nearest point in view.
+# Empty space around a camera that looks at a point in common with the others, relative to its distance from that point.
+_SURROUNDING = 0.35
+# Maximum distance of empty space relative to the nearest point.
 _CLEAR_MARGIN = 0.8
 
 
@@ -328,28 +330,41 @@ class FreeSpace:
             Minimum distance in scene units.
         fraction : float
             With points of a reconstruction, a camera sees through empty space up to this fraction of the distance to
-            the nearest points of its photo, except outliers, and not up to any point in its view. Without points and
-            depth, cameras that look at a common point are surrounded by empty space up to this fraction of their
-            distance to it.
+            the nearest points of its photo, except outliers.
+
+        Notes
+        -----
+        Cameras that look at a common point are surrounded by empty space, because nobody photographs an object from
+        within another one. No empty space contains a point of the reconstruction.
         """
-        radius = np.full(len(views), near, np.float32)
-        if all(view.points is None and view.depth is None for view in views):
-            focus, angles = find_focus([view.camera for view in views])
-            if len(views) > 1 and np.median(angles) < MAX_CONVERGENCE_ANGLE:
-                distances = np.linalg.norm([view.camera.center - focus for view in views], axis=1)
-                radius = np.maximum(radius, fraction * distances).astype(np.float32)
-        clear, points = radius.copy(), [view.points.positions for view in views if view.points is not None]
+        points = [view.points.positions for view in views if view.points is not None]
         distinct = np.unique(np.concatenate([np.zeros((0, 3)), *points]), axis=0)
+        surrounding = _find_surroundings(views)
+        radius, clear = np.full((2, len(views)), near, np.float32)
         for k, view in enumerate(views):
+            center, (height, width) = view.camera.center, view.shape
+            distances = np.linalg.norm(distinct - center, axis=1)
+            radius[k] = max(near, min(surrounding[k], _CLEAR_MARGIN * np.min(distances, initial=np.inf)))
+            clear[k] = radius[k]
             if view.points is not None and len(view.points) >= _MIN_CLEARING_POINTS:
-                center, (height, width) = view.camera.center, view.shape
-                distances = np.linalg.norm(view.points.positions - center, axis=1)
                 pixels, is_visible = project(distinct, view.camera)
                 is_visible &= np.all((pixels >= 0) & (pixels < [width, height]), axis=1)
-                nearest = np.min(np.linalg.norm(distinct[is_visible] - center, axis=1), initial=np.inf)
-                distance = min(fraction * float(np.quantile(distances, _NEAR_OUTLIERS)), _CLEAR_MARGIN * float(nearest))
-                clear[k] = max(clear[k], distance)
+                matched = np.linalg.norm(view.points.positions - center, axis=1)
+                distance = fraction * np.quantile(matched, _NEAR_OUTLIERS)
+                clear[k] = max(radius[k], min(distance, _CLEAR_MARGIN * np.min(distances[is_visible], initial=np.inf)))
         return FreeSpace(radius, clear)
+
+
+def _find_surroundings(views: list[PhotoView]) -> np.ndarray:
+    """Return the radius (V,) of the empty space around cameras that look at a common point; 0 for others, and with
+    depth, which tells more.
+    """
+    if len(views) < 2 or any(view.depth is not None for view in views):
+        return np.zeros(len(views))
+    focus, angles = find_focus([view.camera for view in views])
+    if np.median(angles) >= MAX_CONVERGENCE_ANGLE:
+        return np.zeros(len(views))
+    return _SURROUNDING * np.linalg.norm([view.camera.center - focus for view in views], axis=1)
 
 
 def _get_mask(view: PhotoView) -> np.ndarray:

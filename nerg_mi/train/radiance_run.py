@@ -330,7 +330,7 @@ class Pace:
         now = measure_processor_time()
         if now is None or self._time is None:
             return 0.0
-        running, waiting = (after - before for after, before in zip(now, self._time))
+        running, waiting = now[0] - self._time[0], now[1] - self._time[1]
         return max(0.0, waiting / max(running + waiting, 1e-9))
 
     def judge(self) -> str | None:

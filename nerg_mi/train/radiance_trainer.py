@@ -277,9 +277,9 @@ class RadianceTrainer(Trainer):
         if "best" in meta:
             for name, value in {**self.averaged, "cells": self.grid.bits}.items():
                 check_shape(tensors, "best_cells" if name == "cells" else f"best.{name}", value)
-            read_number(meta["best"], "psnr", "state"), read_count(meta["best"], "steps")
+            row = {**meta["best"], "psnr": read_number(meta["best"], "psnr", "state")}
             weights = {name: type(value)(tensors[f"best.{name}"]) for name, value in self.averaged.items()}
-            self.best = Snapshot(weights, self.ns.UInt8(tensors["best_cells"]), dict(meta["best"]))
+            self.best = Snapshot(weights, self.ns.UInt8(tensors["best_cells"]), row)
         self.hard_pixels = tensors["hard"]
         for name, value in counts.items():
             setattr(self, name, value)
