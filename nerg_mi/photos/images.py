@@ -405,7 +405,7 @@ COORDINATES = ("file", "upright", "original")
 # Suffixes of photos, in lower case.
 _PHOTO_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr")
 # Suffixes of files that trainings write, possibly into the folder of the data set.
-_OUTPUT_SUFFIXES = (".safetensors", ".run", ".preview.png")
+_OUTPUT_SUFFIXES = (".safetensors", ".run", ".preview.png", ".curves.csv", ".curves.png")
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,6 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.fields.radiance import RadianceConfig, RadianceField
-from nerg_mi.figures.style import make_provenance
-from nerg_mi.files.images import write_png
 from nerg_mi.formats.checkpoint import read_checkpoint, write_checkpoint
 from nerg_mi.interruption import Interruption
 from nerg_mi.maths.color import color_corrected_psnr, mean_ignoring_nan, psnr
@@ -29,6 +27,13 @@ from nerg_mi.threads import measure_processor_time
 
 from .radiance_diagnosis import MIN_STEPS, Outcome, describe_pace, find_causes, find_problems
 from .radiance_losses import PHOTO_PARAMETER
+from .radiance_monitor import (
+    PreviewWriter,
+    TrainingObserver,
+    get_curves_figure,
+    write_curves_figure,
+    write_curves_table,
+)
 from .radiance_settings import RadianceSettings
 from .radiance_trainer import Preview, RadianceTrainer
 from .trainer import StepClock, check_same_run, reading_run_state, saving_on_failure
@@ -169,7 +174,7 @@ _PACE_TIME = 0.1
 _MIN_IMPROVEMENT = 0.2
 # Minimum number of steps between two evaluations, each of which takes as long as several steps
 MIN_EVALUATION_INTERVAL = 50
-# Maximum samples of an evaluation or preview, and of the final error: in fog a ray has hundreds.
+# Maximum samples of an evaluation, and of the final error: in fog a ray has hundreds.
 _EVALUATION_SAMPLES, _FINAL_SAMPLES = 2**20, 2**24
 
 
@@ -203,6 +208,8 @@ def train_field(
     resume: bool = False,
     save_every: float = 60.0,
     preview: Path | None = None,
+    curves: Path | None = None,
+    observer: TrainingObserver | None = None,
     write: Callable[[RadianceField, dict], None] | None = None,
     on_warning: Callable[[str], None] = lambda text: None,
 ) -> tuple[RadianceField, dict]:
@@ -231,7 +238,12 @@ def train_field(
     save_every : float
         Seconds between two states.
     preview : Path, optional
-        PNG of the first validation view, with the photo to its right, updated at each evaluation and at the end.
+        PNG of the first validation view, with the photo to its right, updated at evaluations, as far as its time allows
+        (`PreviewWriter`), and at the end.
+    curves : Path, optional
+        CSV file of the evaluations, updated at each of them. At the end, a figure of it is written (.png).
+    observer : TrainingObserver, optional
+        Called before the first step and after each step. Its errors end the training, see `GuardedObserver`.
     write : callable, optional
         Called with the field and its provenance to store them. The run state is removed after it returns; if it raises,
         the final state is saved. Without ``write`` the state remains.
@@ -264,6 +276,7 @@ def train_field(
     last_psnr = history[-1]["psnr"] if history else None
     evaluation_times = [x for x in _EVALUATION_TIMES if x > trainer.progress] if watched.held_out else []
     last_evaluation, saved, interrupted = history[-1]["steps"] if history else 0, trainer.seconds, False
+    previews = PreviewWriter(preview, watched.held_out[0]) if preview is not None and watched.held_out else None
 
     def save() -> None:
         if state is not None:
@@ -275,6 +288,8 @@ def train_field(
             on_progress(RadianceProgress(fraction, *now, last_psnr, phase))
 
     pace = Pace(trainer)
+    if observer is not None:
+        observer.on_start(trainer, dataset)
     with Interruption() as stop:
         while trainer.progress < 1 and not interrupted:
             trainer.step()
@@ -288,11 +303,16 @@ def train_field(
                 evaluation_times, last_evaluation = [x for x in evaluation_times if x > trainer.progress], trainer.steps
                 _append_evaluation(trainer, watched, history)
                 last_psnr = history[-1]["psnr"] if history else None
-                if preview is not None:
-                    write_preview(trainer, watched.held_out[0], preview)
+                with saving_on_failure(state, save, is_done=False):
+                    if curves is not None and history:
+                        write_curves_table(curves, history)
+                    if previews is not None:
+                        previews.write_if_affordable(trainer)
             if state is not None and trainer.seconds - saved > save_every:
                 save()
                 saved = trainer.seconds
+            if observer is not None:
+                observer.on_step(trainer, history)
             try:
                 report(trainer.progress)
                 stop.check()
@@ -300,10 +320,6 @@ def train_field(
                 # Ctrl-C is only handled between two steps, because within a step weights and random numbers are
                 # inconsistent.
                 interrupted = True
-        if preview is not None and watched.held_out:
-            with saving_on_failure(state, save, is_done=False):
-                write_preview(trainer, watched.held_out[0], preview)
-        interrupted = interrupted or stop.is_requested  # Ctrl-C during the last preview
     seconds = trainer.seconds
     if interrupted:
         save()
@@ -311,6 +327,11 @@ def train_field(
         score = lambda fraction: report(fraction, "scoring")
         duration = seconds, pace.waiting_fraction
         field, provenance = _make_result(trainer, dataset, watched, history, duration, interrupted, score)
+        if previews is not None:
+            previews.write(trainer, field)
+        if curves is not None and history:
+            write_curves_table(curves, history)
+            write_curves_figure(get_curves_figure(curves), history, provenance["psnr_watched"]["result"])
         if write is not None:
             report(0.0, "writing")
             write(field, provenance)
@@ -387,7 +408,7 @@ def _make_result(
     ``on_progress`` is called with the fraction of the scored views.
     """
     seconds, waiting_fraction = duration
-    field, result = _choose_state(trainer, watched, history)
+    field, result = _choose_state(trainer, watched, history, seconds)
     provenance = {
         **dataset.source,
         "settings": trainer.settings.to_dict(),
@@ -432,13 +453,15 @@ def _make_result(
     return field, provenance
 
 
-def _choose_state(trainer: RadianceTrainer, watched: WatchedViews, history: list) -> tuple[RadianceField, dict | None]:
+def _choose_state(
+    trainer: RadianceTrainer, watched: WatchedViews, history: list, seconds: float
+) -> tuple[RadianceField, dict | None]:
     """Return the field of the last state, or of the best one if that is better as a result, and its evaluation.
 
-    The last state is appended to ``history``.
+    The last state is appended to ``history``; ``seconds`` is the time of its training.
     """
     field = trainer.make_field()
-    last = _append_evaluation(trainer, watched, history, field)
+    last = _append_evaluation(trainer, watched, history, field, seconds)
     best = trainer.best
     if last is None or best is None or best.row["psnr"] <= last["psnr"] + _MIN_IMPROVEMENT:
         return field, last
@@ -474,13 +497,18 @@ def _pick_evenly(views: list[PhotoView], count: int) -> list[PhotoView]:
 
 
 def _append_evaluation(
-    trainer: RadianceTrainer, watched: WatchedViews, history: list, field: RadianceField | None = None
+    trainer: RadianceTrainer,
+    watched: WatchedViews,
+    history: list,
+    field: RadianceField | None = None,
+    seconds: float | None = None,
 ) -> dict | None:
     """Append an evaluation to ``history``, keep the state if it is the best, and return the evaluation.
 
-    None, and nothing is appended, without held-out views, or if all of their pixels are masked.
+    ``seconds`` is the time of the training, by default until now. None, and nothing is appended, without held-out
+    views, or if all of their pixels are masked.
     """
-    seconds = trainer.seconds
+    seconds = trainer.seconds if seconds is None else seconds
     row = {"steps": trainer.steps, "seconds": round(seconds, 1), **_evaluate(trainer, watched, field)}
     if row["psnr"] is None:
         return None
@@ -499,17 +527,3 @@ def _evaluate(trainer: RadianceTrainer, watched: WatchedViews, field: RadianceFi
     held_out, training = (evaluate_views(trainer, v, every, shown).mean for v in (watched.held_out, watched.training))
     as_number = lambda x: None if math.isnan(x) else round(x, 2)
     return {"psnr": as_number(held_out), "psnr_train": as_number(training), "every_pixel": every}
-
-
-def write_preview(trainer: RadianceTrainer, view: PhotoView, path: Path) -> None:
-    """Write a PNG of ``view`` as rendered now, with the photo to its right, on a subset of the pixels that takes little
-    time.
-    """
-    import mitsuba as mi
-
-    every = trainer.choose_pixel_stride([view], _EVALUATION_SAMPLES)
-    rendered = trainer.render(view, every)
-    both = np.concatenate(
-        [np.clip(rendered.color, 0, 1), view.composite_over(0)[every // 2 :: every, every // 2 :: every]], axis=1
-    )
-    write_png(path, mi.Bitmap((255 * both + 0.5).astype(np.uint8)), make_provenance("nerg train radiance").text())

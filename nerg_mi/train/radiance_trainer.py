@@ -551,8 +551,13 @@ class RadianceTrainer(Trainer):
         rays = sum(v.pixels.shape[0] * v.pixels.shape[1] for v in views)
         return max(1, int(np.ceil((rays * max(self.prepass_samples_per_ray * self.stride, 1) / max_samples) ** 0.5)))
 
-    def render(self, view: PhotoView, every: int = 1, field: RadianceField | None = None) -> Preview:
-        """Render every ``every``-th pixel of ``view`` with the trainer's march.
+    def estimate_samples(self, view: PhotoView, stride: int = 1) -> float:
+        """Estimate the number of samples of all pixels of ``view`` at a march ``stride``, based on the last step."""
+        height, width = view.shape
+        return height * width * max(self.prepass_samples_per_ray * self.stride / stride, 1.0)
+
+    def render(self, view: PhotoView, every: int = 1, field: RadianceField | None = None, stride: int = 1) -> Preview:
+        """Render every ``every``-th pixel of ``view`` with the trainer's march at a march ``stride``.
 
         Renders ``field`` with its own occupancy, or by default the averaged weights.
         """
@@ -561,7 +566,7 @@ class RadianceTrainer(Trainer):
         if bound is not None:
             occupied = lambda p, active: active & (bound.distance_to_occupied(self.box.to_cube(p), active) == 0)
         return render_view(
-            field, occupied, self.get_step_table(), view, self.settings.near * self.box.side, every=every
+            field, occupied, self.get_step_table(stride), view, self.settings.near * self.box.side, every=every
         )
 
     def make_field(self, with_occupancy: bool = True, snapshot: Snapshot | None = None) -> RadianceField:

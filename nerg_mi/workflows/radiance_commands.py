@@ -163,6 +163,20 @@ class RadianceOptions(DerivedOptions, PhotoOptions):
         within=SECONDS,
         group=TRAINING,
     )
+    view: bool = option(
+        False,
+        "Show the field in the browser while it trains, for up to a tenth of the time. The page is served to this "
+        'machine only. Needs viser: pip install "nerg-mi[viewer]".',
+        changes_result=False,
+        group=OUTPUT,
+    )
+    port: int = option(
+        8080,
+        "Port to serve the page of --view at; 0: any free port.",
+        within=Range(0, 65535),
+        changes_result=False,
+        group=OUTPUT,
+    )
     mode: str = llvm_variant()
 
 

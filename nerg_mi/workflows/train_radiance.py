@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from contextlib import nullcontext
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -20,9 +21,10 @@ from nerg_mi.formats.fields import save_radiance
 from nerg_mi.photos.dataset import Dataset, open_dataset
 from nerg_mi.photos.posed import describe_unused
 from nerg_mi.train import radiance_run
+from nerg_mi.train.radiance_monitor import GuardedObserver, TrainingObserver, get_curves_figure
 from nerg_mi.train.radiance_settings import RadianceSettings, make_radiance_config
 
-from .base import SILENT, Reporter, select_backend
+from .base import SILENT, Reporter, import_function, select_backend
 from .options import explicit_settings
 from .radiance_commands import RadianceOptions, RadianceScoreOptions
 
@@ -76,8 +78,9 @@ def train_radiance(
     dataset
         Posed photos: their folder, its transforms.json, or a COLMAP model.
     output
-        Checkpoint to write (.safetensors), or None. Next to it are stored a preview (.preview.png) and, until training
-        is finished, its state (.run), from which it can be resumed.
+        Checkpoint to write (.safetensors), or None. Next to it are stored a preview (.preview.png), the evaluations on
+        held-out views (.curves.csv and .curves.png) and, until training is finished, its state (.run), from which it
+        can be resumed.
     options
         Size of the field, and settings.
     reporter
@@ -91,17 +94,25 @@ def train_radiance(
         After Ctrl-C, when the result so far and the state have been written. Without ``output`` the result so far is
         returned with ``interrupted`` set.
     """
-    with reserve_output(output):
-        return _train(dataset, None if output is None else Path(output), options or RadianceOptions(), reporter)
+    options = options or RadianceOptions()
+    with reserve_output(output), _open_page(options, reporter) as observer:
+        return _train(dataset, None if output is None else Path(output), options, reporter, observer)
 
 
-def _train(photos: str | Path, output: Path | None, options: RadianceOptions, reporter: Reporter) -> RadianceResult:
-    state = preview = None
+def _train(
+    photos: str | Path,
+    output: Path | None,
+    options: RadianceOptions,
+    reporter: Reporter,
+    observer: TrainingObserver | None,
+) -> RadianceResult:
+    state = preview = curves = None
     if output is not None:
         state, preview = output.with_suffix(".run"), output.with_suffix(".preview.png")
+        curves = output.with_suffix(".curves.csv")
         check_writable(output, ".safetensors")
-        check_writable(state)
-        check_writable(preview)
+        for path in (state, preview, curves, get_curves_figure(curves)):
+            check_writable(path)
     ns = select_backend(options.mode, options.threads)
     settings = _settings(options)
     if options.resume and (state is None or not state.is_file()):
@@ -120,6 +131,8 @@ def _train(photos: str | Path, output: Path | None, options: RadianceOptions, re
         resume=options.resume,
         save_every=options.save_every or float("inf"),
         preview=preview,
+        curves=curves,
+        observer=observer,
         write=None if output is None else lambda field, metadata: save_radiance(field, output, metadata, options.half),
         on_warning=reporter.warn,
     )
@@ -128,6 +141,17 @@ def _train(photos: str | Path, output: Path | None, options: RadianceOptions, re
     if result.interrupted and output is not None:
         raise KeyboardInterrupt(f"interrupted; continue with --resume (state in {state})")
     return result
+
+
+@contextmanager
+def _open_page(options: RadianceOptions, reporter: Reporter) -> Iterator[TrainingObserver | None]:
+    """Yield the observer that shows the training in the browser, or None without the option ``view``."""
+    if not options.view:
+        yield None
+        return
+    open_training_page = import_function("nerg_mi.viewer.training:open_training_page")
+    with open_training_page(options.port, reporter) as page:
+        yield GuardedObserver(page, reporter.warn)
 
 
 def _settings(options: RadianceOptions) -> RadianceSettings:
@@ -204,6 +228,10 @@ def _report_result(result: RadianceResult, reporter: Reporter) -> None:
         reporter.warn(complaint)
     if result.output is not None:
         reporter.message(f"wrote {result.output} ({result.output.stat().st_size / 1e6:.2f} MB)")
+        if provenance["psnr_watched"]["history"]:
+            curves = result.output.with_suffix(".curves.csv")
+            reporter.message(f"wrote {result.output.with_suffix('.preview.png')}")
+            reporter.message(f"wrote {curves} and {get_curves_figure(curves)}")
 
 
 def evaluate_radiance(

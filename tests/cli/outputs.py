@@ -139,8 +139,8 @@ CASES = (
     Case(
         "train radiance",
         "{i}/photos -o {o}/a.safetensors --steps 2 --holdout 2 --half",
-        ("a.safetensors", "a.preview.png"),
-        ("a.safetensors", "a.preview.png", "a.run"),
+        ("a.safetensors", "a.preview.png", "a.curves.csv", "a.curves.png"),
+        ("a.safetensors", "a.preview.png", "a.curves.csv", "a.curves.png", "a.run"),
         ("train.radiance_grid.DensityGrid.extract_occupancy", "train.radiance_run.warm_up"),
     ),
     Case(

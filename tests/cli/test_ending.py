@@ -305,7 +305,8 @@ def test_an_interrupted_radiance_training_saves_state_and_result(inputs, tmp_pat
     line = f"train radiance {inputs}/photos -o {tmp_path}/a.safetensors {ENDLESS}"
     done = interrupted("train.radiance_trainer.RadianceTrainer.step", WARM_UP + 4, *line.split())
     assert done.returncode == 130 and "--resume" in done.stderr, done.stderr
-    assert sorted(os.listdir(tmp_path)) == ["a.preview.png", "a.run", "a.safetensors"]
+    curves = ["a.curves.csv", "a.curves.png"]
+    assert sorted(os.listdir(tmp_path)) == [*curves, "a.preview.png", "a.run", "a.safetensors"]
     assert read_checkpoint(tmp_path / "a.run", "radiance run")[1]["steps"] == 4
     assert read_checkpoint(tmp_path / "a.safetensors", "radiance")[1]["provenance"]["interrupted"]
 

@@ -1,5 +1,6 @@
 """Tests of `nerg_mi.train.radiance_run`."""
 
+import csv
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -15,14 +16,7 @@ from nerg_mi.maths.geometry import Box, ContractedBox
 from nerg_mi.photos.cameras import Intrinsics, PosedCamera, pixel_directions
 from nerg_mi.photos.images import PhotoView
 from nerg_mi.train import radiance_run
-from nerg_mi.train.radiance_run import (
-    Pace,
-    compute_outside_fraction,
-    evaluate_views,
-    train_field,
-    warm_up,
-    write_preview,
-)
+from nerg_mi.train.radiance_run import Pace, compute_outside_fraction, evaluate_views, train_field, warm_up
 from nerg_mi.train.radiance_trainer import Preview, RadianceTrainer
 from nerg_mi.transport.field_medium import FieldMedium
 from nerg_mi.transport.geometry import trace_depth
@@ -113,26 +107,56 @@ def test_held_out_views_of_a_ball(dataset, tmp_path):
     assert loaded.color_space == "srgb" and loaded.march_step == pytest.approx(2 / 64)
 
 
-def test_previews_clamp_colours_and_show_the_photo(dataset, tmp_path, rgb):
-    """Colours above white are white and do not wrap around."""
-    seen = np.zeros((12, 12, 3), np.float32)
-    seen[:, :4], seen[:, 4:8], seen[:, 8:] = 1.7, -0.4, 0.5
-    result = SimpleNamespace(color=seen)
-    trainer = SimpleNamespace(choose_pixel_stride=lambda views, limit: 2, render=lambda view, every: result)
-    write_preview(trainer, dataset.held_out[0], tmp_path / "a.png")
-    picture = np.array(rgb.Bitmap(str(tmp_path / "a.png")))
-    assert picture.shape == (12, 24, 3)
-    assert (picture[:, :4] == 255).all() and (picture[:, 4:8] == 0).all() and (picture[:, 8:12] == 128).all()
-    truth = 255 * dataset.held_out[0].composite_over(0)[1::2, 1::2]
-    assert np.abs(picture[:, 12:] - truth).max() <= 1
+def test_an_observer_does_not_change_the_weights(dataset, one_thread):
+    """An observer that renders a view after each step, compared with none, bit for bit."""
+    steps = []
+
+    class Renders:
+        def on_start(self, trainer, data):
+            assert trainer.steps == 0 and data is dataset
+
+        def on_step(self, trainer, history):
+            steps.append(trainer.steps)
+            trainer.render(dataset.held_out[0], 2, stride=trainer.stride)
+
+    plain, observed = (train_field(dataset, TINY, settings(steps=24), ns, observer=o)[0] for o in (None, Renders()))
+    assert steps == list(range(1, 25))
+    for name, value in plain.parameters().items():
+        assert np.array_equal(value.numpy(), observed.parameters()[name].numpy()), name
+    assert np.array_equal(plain.occupancy.masks, observed.occupancy.masks)
 
 
-def test_previews_show_the_first_validation_view(dataset, tmp_path, monkeypatch):
-    shown = []
-    monkeypatch.setattr(radiance_run, "write_preview", lambda trainer, view, path: shown.append(view))
+def test_outputs_are_updated_at_each_evaluation(dataset, tmp_path, monkeypatch):
     monkeypatch.setattr(radiance_run, "MIN_EVALUATION_INTERVAL", 1)
-    train_field(dataset, TINY, settings(steps=3), ns, preview=tmp_path / "a.png")
-    assert len(shown) > 1 and all(view is dataset.held_out[0] for view in shown)
+    curves, preview, lengths = tmp_path / "a.curves.csv", tmp_path / "a.preview.png", []
+
+    class Reads:
+        def on_start(self, trainer, data):
+            assert not curves.exists()
+
+        def on_step(self, trainer, history):
+            if history:
+                lengths.append(len(curves.read_text().splitlines()) - 1)
+                assert lengths[-1] == len(history)
+
+    files = {"curves": curves, "preview": preview}
+    _, provenance = train_field(dataset, TINY, settings(steps=12), ns, observer=Reads(), **files)
+    history = provenance["psnr_watched"]["history"]
+    assert len(set(lengths)) > 3 and lengths[-1] == len(history) - 1
+    with curves.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [int(row["steps"]) for row in rows] == [row["steps"] for row in history]
+    assert [float(row["psnr"]) for row in rows] == [row["psnr"] for row in history]
+    assert set(rows[0]) == {"steps", "seconds", "psnr", "psnr_train", "every_pixel"}
+    # The last evaluation has the time of the last step, and not that of the occupancy extraction after it.
+    assert float(rows[-1]["seconds"]) == provenance["seconds"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.curves.csv", "a.curves.png", "a.preview.png"]
+
+
+def test_there_are_no_outputs_without_held_out_views(dataset, tmp_path):
+    files = {"curves": tmp_path / "a.csv", "preview": tmp_path / "a.png"}
+    train_field(replace(dataset, held_out=[]), TINY, settings(steps=2), ns, **files)
+    assert not list(tmp_path.iterdir())
 
 
 def test_resuming_needs_a_state(dataset):
