@@ -83,6 +83,10 @@ Against a stride of 1, strides of 2, 4 and 8 lose 0.01, 0.1 to 0.3, and 0.5 to 0
 
 # Early previews may use a part of the time for later ones.
 _ADVANCE = 0.2
+# Seconds that the last preview may take in a short run.
+_LAST_SECONDS = 5.0
+# Pixel strides of renderings that are enlarged, if full ones take too long.
+_PIXEL_STRIDES = (2, 4)
 
 
 class PreviewWriter:
@@ -103,7 +107,8 @@ class PreviewWriter:
     Notes
     -----
     In the fog of an early training a ray has hundreds of samples. Therefore a preview is rendered with the finest march
-    stride that is affordable, at most `PICTURE_STRIDE` or that of the training, and is left out if none is.
+    stride that is affordable, at most `PICTURE_STRIDE` or that of the training; else with every second or fourth pixel,
+    enlarged; else it is left out.
     """
 
     def __init__(self, path: Path, view: PhotoView):
@@ -114,43 +119,45 @@ class PreviewWriter:
         """Write a preview of the averaged weights unless it would take too long; return whether it was written."""
         run_seconds = trainer.seconds / max(trainer.progress, 1e-6)
         allowed = MAX_PREVIEW_FRACTION * run_seconds * min(1.0, trainer.progress + _ADVANCE)
-        stride = self._choose_stride(trainer, allowed - self.seconds)
-        if stride is not None:
-            self._write(trainer, None, stride)
-        return stride is not None
+        strides = self._choose_strides(trainer, allowed - self.seconds)
+        if strides is not None:
+            self._write(trainer, None, *strides)
+        return strides is not None
 
     def write(self, trainer: RadianceTrainer, field: RadianceField) -> None:
         """Write the preview of ``field``, the result of the training."""
-        stride = self._choose_stride(trainer, MAX_PREVIEW_FRACTION * trainer.seconds)
-        self._write(trainer, field, stride or _list_strides(trainer)[-1])
+        strides = self._choose_strides(trainer, max(MAX_PREVIEW_FRACTION * trainer.seconds, _LAST_SECONDS))
+        self._write(trainer, field, *(strides or _list_strides(trainer)[-1]))
 
-    def _choose_stride(self, trainer: RadianceTrainer, allowed: float) -> int | None:
-        """Return the finest march stride that takes at most ``allowed`` seconds, or None."""
-        return next((s for s in _list_strides(trainer) if self._estimate_seconds(trainer, s) <= allowed), None)
+    def _choose_strides(self, trainer: RadianceTrainer, allowed: float) -> tuple[int, int] | None:
+        """Return the finest pixel stride and march stride that take at most ``allowed`` seconds, or None."""
+        return next((s for s in _list_strides(trainer) if self._estimate_seconds(trainer, *s) <= allowed), None)
 
-    def _estimate_seconds(self, trainer: RadianceTrainer, stride: int) -> float:
+    def _estimate_seconds(self, trainer: RadianceTrainer, every: int, stride: int) -> float:
         per_sample = self._seconds_per_sample
         if per_sample is None:
             # Steps also compute derivatives, so that the first estimate is too high.
             per_sample = trainer.clock.seconds / max(trainer.clock.evaluations, 1)
-        return per_sample * trainer.estimate_samples(self.view, stride)
+        return per_sample * trainer.estimate_samples(self.view, stride) / every**2
 
-    def _write(self, trainer: RadianceTrainer, field: RadianceField | None, stride: int) -> None:
+    def _write(self, trainer: RadianceTrainer, field: RadianceField | None, every: int, stride: int) -> None:
         import mitsuba as mi
 
         start = time.perf_counter()
-        rendered = np.clip(trainer.render(self.view, field=field, stride=stride).color, 0, 1)
-        both = np.concatenate([rendered, self.view.composite_over(0)], axis=1)
+        rendered = np.clip(trainer.render(self.view, every, field, stride).color, 0, 1)
+        rows, columns = (np.minimum(np.arange(n) // every, m - 1) for n, m in zip(self.view.shape, rendered.shape))
+        both = np.concatenate([rendered[np.ix_(rows, columns)], self.view.composite_over(0)], axis=1)
         write_png(self.path, mi.Bitmap((255 * both + 0.5).astype(np.uint8)), make_provenance(_COMMAND).text())
         seconds = time.perf_counter() - start
         self.seconds += seconds
-        self._seconds_per_sample = seconds / trainer.estimate_samples(self.view, stride)
+        self._seconds_per_sample = seconds * every**2 / trainer.estimate_samples(self.view, stride)
 
 
-def _list_strides(trainer: RadianceTrainer) -> list[int]:
-    """Return the march strides of a preview, the finest first."""
+def _list_strides(trainer: RadianceTrainer) -> list[tuple[int, int]]:
+    """Return the pixel strides and march strides of a preview, the finest first."""
     coarsest = max(PICTURE_STRIDE, trainer.stride)
-    return [*(1 << k for k in range(coarsest.bit_length()) if 1 << k < coarsest), coarsest]
+    strides = [*(1 << k for k in range(coarsest.bit_length()) if 1 << k < coarsest), coarsest]
+    return [*((1, stride) for stride in strides), *((every, coarsest) for every in _PIXEL_STRIDES)]
 
 
 def _reduce_view(view: PhotoView, width: int) -> PhotoView:

@@ -193,6 +193,7 @@ class TrainingPage:
             scales={"x": {"time": False}},
             axes=({"label": "training time [s]"}, {"label": "PSNR [dB]"}),
             aspect=1.2,
+            padding=(12, 12, 0, 0),
         )
 
     # Visitors and their pictures

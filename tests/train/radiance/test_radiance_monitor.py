@@ -27,9 +27,11 @@ from .ball import LENS, trainer
 def stand_in(color, samples_per_ray=1.0, **values):
     """A trainer in the middle of a run of 100 s, with 1e6 evaluations a second, that renders ``color``."""
 
-    def render(view, field=None, stride=1):
-        t.rendered.append((view, stride))
-        return SimpleNamespace(color=np.broadcast_to(np.asarray(color, np.float32), (*view.shape, 3)))
+    def render(view, every, field, stride):
+        t.rendered.append((view, every, stride))
+        part = slice(every // 2, None, every)
+        full = np.broadcast_to(np.asarray(color, np.float32), (*view.shape, 3))
+        return SimpleNamespace(color=full[part, part])
 
     t = SimpleNamespace(
         seconds=50.0,
@@ -81,20 +83,36 @@ def test_colours_are_clamped(value, stored, tmp_path, rgb):
 
 
 def test_the_stride_follows_the_cost(tmp_path):
-    """Of 4e4 pixels, at 1e6 samples a second and 2.1 s: the finest stride that is affordable, or no preview."""
+    """Of 4e4 pixels, at 1e6 samples a second and 2.1 s: the finest strides that are affordable, or no preview."""
     path = tmp_path / "a.png"
-    cases = (50, 1, 1), (100, 1, 2), (200, 1, 4), (250, 1, None), (250, 16, 8), (900, 16, None)
-    for samples_per_ray, coarsest, stride in cases:
+    cases = [(50, 1, (1, 1)), (100, 1, (1, 2)), (200, 1, (1, 4)), (250, 1, (2, 4)), (2000, 1, (4, 4)), (4000, 1, None)]
+    cases += [(250, 16, (1, 8)), (9000, 16, (4, 16)), (20000, 16, None)]
+    for samples_per_ray, coarsest, strides in cases:
         t = stand_in([0, 0, 0], samples_per_ray, stride=coarsest)
-        assert PreviewWriter(path, photo(200, 200)).write_if_affordable(t) == (stride is not None)
-        assert [s for _, s in t.rendered] == ([] if stride is None else [stride])
-        assert path.exists() == (stride is not None)
+        assert PreviewWriter(path, photo(200, 200)).write_if_affordable(t) == (strides is not None)
+        assert [tuple(rest) for _, *rest in t.rendered] == ([] if strides is None else [strides])
+        assert path.exists() == (strides is not None)
         path.unlink(missing_ok=True)
     # The last preview is always written.
-    for coarsest, stride in ((1, 4), (16, 16)):
-        t = stand_in([0, 0, 0], 2000, seconds=100.0, progress=1.0, stride=coarsest)
+    for samples_per_ray, coarsest, strides in ((250, 1, (1, 2)), (20000, 1, (4, 4)), (90000, 16, (4, 16))):
+        t = stand_in([0, 0, 0], samples_per_ray, seconds=100.0, progress=1.0, stride=coarsest)
         PreviewWriter(path, photo(200, 200)).write(t, "field")
-        assert [s for _, s in t.rendered] == [stride] and path.exists()
+        assert [tuple(rest) for _, *rest in t.rendered] == [strides] and path.exists()
+
+
+@pytest.mark.parametrize("size", [(9, 6), (10, 7), (11, 8)])
+def test_a_coarse_rendering_is_enlarged(size, tmp_path, rgb):
+    """The rendering is the photo itself, each of whose pixels is at most three columns and rows away."""
+    view = photo(*size)
+    t = stand_in(view.pixels, 4000 * 4e4 / np.prod(size) / 1.5)
+    assert PreviewWriter(tmp_path / "a.png", view).write_if_affordable(t) and t.rendered[0][1:] == (4, 4)
+    picture = read(rgb, tmp_path / "a.png").astype(float) / 255
+    rendered, truth = picture[:, : size[0]], picture[:, size[0] :]
+    assert picture.shape == (size[1], 2 * size[0], 3)
+    assert np.abs(rendered[..., 0] - truth[..., 0]).max() <= 3.1 / (size[0] - 1)
+    assert np.abs(rendered[..., 1] - truth[..., 1]).max() <= 3.1 / (size[1] - 1)
+    # Blocks of pixels have one colour.
+    assert (rendered[:4, :4] == rendered[0, 0]).all()
 
 
 def test_previews_take_a_fraction_of_the_run(dataset, tmp_path):
