@@ -11,6 +11,7 @@ predicts held-out gaze better than either (docs/explanation/accuracy.md).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -153,67 +154,81 @@ def place_missing_points(
 
 
 class ObservedHits:
-    """The density of re-aimed hits for one observer."""
+    """The density of re-aimed hits for one observer, or for several without a table."""
 
     def __init__(self, hits: ReaimedHits, neighbours: HitNeighbours, ns: ModuleType):
         self._kde = hits.make_kde(neighbours, ns)
         self._table: SphericalKdeTable | None = None
         self._hits, self._neighbours = hits, neighbours
 
+    @classmethod
+    def merge(cls, observed: Sequence[ObservedHits]) -> ObservedHits:
+        """The density for all observers of ``observed``, in their order."""
+        first = observed[0]
+        neighbours = HitNeighbours(*(np.concatenate(arrays) for arrays in zip(*(o._neighbours for o in observed))))
+        return cls(first._hits, neighbours, first._kde.ns)
+
+    @property
+    def is_tabulated(self) -> bool:
+        return self._table is not None
+
     def prepare(self, lanes: int) -> None:
-        """Tabulate the density if that is faster for ``lanes`` directions."""
-        is_worthwhile = lanes >= _MIN_TABLE_LANES and SphericalKdeTable.is_worthwhile(self._kde, lanes)
+        """Tabulate the density of a single observer if that is faster for ``lanes`` directions."""
+        is_single = self._kde.count == 1
+        is_worthwhile = is_single and lanes >= _MIN_TABLE_LANES and SphericalKdeTable.is_worthwhile(self._kde, lanes)
         if self._table is None and is_worthwhile:
             self._table = SphericalKdeTable(self._kde, spacing=_TABLE_SPACING)
 
-    def density(self, r_o: Vector3f, p_o: Point3f) -> Float:
-        """Density (1/sr) in unit directions ``r_o``, in the field's frame.
+    def density(self, r_o: Vector3f, p_o: Point3f, observer: Any = None) -> Float:
+        """Density (1/sr) in unit directions ``r_o``, in the field's frame, for the observers with the indices
+        ``observer`` (UInt32; None: the first).
 
         Differentiable in ``r_o`` and in the position ``p_o`` of the observer (one lane or one per direction), to first
         order and for constant neighbours.
         """
         ns, lanes = self._kde.ns, dr.width(r_o)
         d = ns.Array3f(*(dr.detach(c) for c in (r_o.x, r_o.y, r_o.z)))
+        observer = dr.zeros(ns.UInt32, lanes) if observer is None else ns.UInt32(observer)
         with dr.suspend_grad():
             # Within a recorded branch or loop nothing can be evaluated.
             if not dr.flag(dr.JitFlag.SymbolicScope):
                 self.prepare(lanes)
-            value = self._table.density(d) if self._table else self._kde.density(dr.zeros(ns.UInt32, lanes), d)
+            value = self._table.density(d) if self._table else self._kde.density(observer, d)
         if not dr.grad_enabled(r_o, p_o):
             return value
         with dr.suspend_grad():
-            slope_r, slope_p = self._compute_slopes(d, value)
+            slope_r, slope_p = self._compute_slopes(d, value, observer)
         moved = lambda v: type(v)(v - dr.detach(v))
         attach = lambda slope, v: slope.x * v.x + slope.y * v.y + slope.z * v.z
         return value + attach(slope_r, moved(r_o)) + attach(slope_p, moved(p_o))
 
-    def _compute_slopes(self, d: Any, value: Any) -> tuple[Any, Any]:
+    def _compute_slopes(self, d: Any, value: Any, observer: Any) -> tuple[Any, Any]:
         """Derivatives of the density ``value`` in directions ``d`` with respect to ``d`` and to the position."""
         ns, near, kappa = self._kde.ns, self._neighbours, self._hits.kappa
         size = near.weights.shape[1]
-        offsets = near.offsets[0] / self._hits.bandwidth**2
-        weights = near.weights[0] / near.weights[0].sum()
+        offsets = near.offsets / self._hits.bandwidth**2
+        weights = near.weights / near.weights.sum(axis=1, keepdims=True)
         packed = np.concatenate(
-            [near.directions[0], weights[:, None], offsets, near.inverse_distance[0][:, None]], axis=1
+            [near.directions, weights[..., None], offsets, near.inverse_distance[..., None]], axis=2
         )
         rows = ns.Float(packed.astype(np.float32).ravel())
         peak = float(np.exp(log_normaliser(kappa)))
 
-        def body(i, by_r, by_p, d, value):
-            at = lambda k: dr.gather(ns.Float, rows, i * 8 + k)
+        def body(i, by_r, by_p, d, value, first):
+            at = lambda k: dr.gather(ns.Float, rows, (first + i) * 8 + k)
             aim, offset = ns.Array3f(at(0), at(1), at(2)), ns.Array3f(at(4), at(5), at(6))
             weight, inverse = at(3), at(7)
             kernel = peak * dr.exp(-0.5 * kappa * dr.squared_norm(d - aim))
             slope = weight * kernel * kappa
             by_p += weight * (kernel - value) * offset - slope * inverse * (d - dr.dot(d, aim) * aim)
-            return i + 1, by_r + slope * aim, by_p, d, value
+            return i + 1, by_r + slope * aim, by_p, d, value, first
 
         zero = dr.zeros(ns.Array3f, dr.width(d))
         _, by_r, by_p, *_ = dr.while_loop(
-            state=(dr.zeros(ns.UInt32, dr.width(d)), zero, ns.Array3f(zero), d, value),
-            cond=lambda i, by_r, by_p, d, value: i < size,
+            state=(dr.zeros(ns.UInt32, dr.width(d)), zero, ns.Array3f(zero), d, value, observer * size),
+            cond=lambda i, by_r, by_p, d, value, first: i < size,
             body=body,
-            labels=("i", "by_r", "by_p", "d", "value"),
+            labels=("i", "by_r", "by_p", "d", "value", "first"),
             label="slopes of re-aimed hits",
         )
         return by_r, by_p

@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import cast
 
 import drjit as dr
@@ -452,7 +453,9 @@ class ObservedGaze:
     def prepare(self, lanes: int) -> None:
         """Compute what the evaluation of ``lanes`` directions reads, which a recorded branch cannot compute."""
         for entry in self._hits:
-            entry.value.prepare(lanes)
+            entry.value.prepare(lanes // len(self._hits))
+        if len(self._hits) > 1 and not self._is_tabulated:
+            _ = self._merged_hits
 
     def integrals(self, p_o: Point3f) -> list[Float]:
         """For each member the integral over the sphere of the observer nearest to ``p_o``, lane by lane; empty for a
@@ -568,8 +571,28 @@ class ObservedGaze:
         ]
         if field.hits is None:
             return values
-        hits = select_nearest(self._hits, p_o, lambda observed: observed.density(direction, position))
+        hits = self._evaluate_hits(p_o, position, direction)
         return [(field.hits.mix(gaze, hits), *factors) for gaze, *factors in values]
+
+    def _evaluate_hits(self, p_o: Point3f, position: Point3f, direction: Vector3f) -> Float:
+        """Density of the re-aimed hits of the observer nearest to ``p_o``, lane by lane."""
+        if len(self._hits) == 1:
+            return self._hits[0].value.density(direction, position)
+        if not dr.flag(dr.JitFlag.SymbolicScope):
+            self.prepare(dr.width(direction))
+        # Without tables and for derivatives each lane reads the samples of its own observer only.
+        if self._is_tabulated and not dr.grad_enabled(position, direction):
+            return select_nearest(self._hits, p_o, lambda observed: observed.density(direction, position))
+        index = select_nearest([CacheEntry(e.center, k) for k, e in enumerate(self._hits)], p_o, variant_types().UInt32)
+        return self._merged_hits.density(direction, position, index + dr.zeros(type(index), dr.width(direction)))
+
+    @property
+    def _is_tabulated(self) -> bool:
+        return all(entry.value.is_tabulated for entry in self._hits)
+
+    @cached_property
+    def _merged_hits(self) -> ObservedHits:
+        return ObservedHits.merge([entry.value for entry in self._hits])
 
 
 # ---- Gaze of one observer in arbitrary directions ----

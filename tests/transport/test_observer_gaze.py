@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
+from nerg_mi.fields import gaze_hits
 from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.gaze_log_density import LogGazeField
 from nerg_mi.fields.gaze_product import GazeConfig, GazeField
@@ -123,6 +124,24 @@ def test_recorded_frames_refuse_reaimed_hits(rgb):
     with pytest.raises(RuntimeError) as caught:
         look(rgb.Point3f(0.1, 0, 1))
     assert isinstance(caught.value.__cause__, NergError) and "reaimed_hits" in str(caught.value.__cause__)
+
+
+@pytest.mark.parametrize("min_table_lanes", [1 << 13, 1])
+def test_several_observers_equal_single_ones_with_reaimed_hits(rgb, monkeypatch, min_table_lanes):
+    """With tables (from one lane) and without; each lane has the hits of its own observer."""
+    monkeypatch.setattr(gaze_hits, "_MIN_TABLE_LANES", min_table_lanes)
+    monkeypatch.setattr(gaze_hits.SphericalKdeTable, "is_worthwhile", lambda kde, lanes: True)
+    gaze, geometry = GazeFieldInstance(made("re-aimed hits", BOX)), room(rgb)
+    eyes = [rgb.Point3f(0.1, 0, 1), rgb.Point3f(-0.3, 0.2, 0.8)]
+    settings, d = replace(SETTINGS, directions=1 << 10), rgb.Vector3f(fibonacci_directions(40).T.astype(np.float32))
+    index = dr.arange(rgb.UInt32, 40) % 2
+    lanes = dr.select(index == 0, eyes[0], eyes[1])
+    look = lambda observers, p_o: (
+        gaze.for_observers(observers, geometry, settings).evaluate(p_o + d, p_o, d, rgb.Bool(True))[0].numpy()
+    )
+    single = [look([eye], eye + dr.zeros(rgb.Point3f, 40)) for eye in eyes]
+    np.testing.assert_allclose(look(eyes, lanes), np.where(index.numpy() == 0, *single), rtol=1e-4)
+    assert np.abs(single[0] - single[1]).max() > 1e-3
 
 
 def test_gradients_include_reaimed_hits(rgb):

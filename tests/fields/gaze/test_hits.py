@@ -7,7 +7,7 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.fields.gaze_hits import FAR, MAX_NEIGHBOURS, ReaimedHits, place_missing_points
+from nerg_mi.fields.gaze_hits import FAR, MAX_NEIGHBOURS, ObservedHits, ReaimedHits, place_missing_points
 from nerg_mi.maths.arrays import to_vector
 from nerg_mi.maths.sphere import fibonacci_directions
 
@@ -115,6 +115,28 @@ def test_gradients_equal_finite_differences():
             rtol=5e-3,
             atol=2e-3,
         )
+
+
+def test_merged_observers_equal_single_ones():
+    origins, points = sample(60, 5)
+    hits = ReaimedHits(origins, points, 0.5, 0.5, 20.0)
+    positions, d = np.array([(0.1, -0.2, 0.3), (0.4, 0.1, -0.2)]), fibonacci_directions(40)
+    single = [hits.observe(p, ns) for p in positions]
+    index = np.arange(40) % 2
+
+    def derive(observed, keep, *observer):
+        r_o = to_vector(ns.Array3f, d[keep])
+        p_o = to_vector(ns.Array3f, positions[index[keep]])
+        dr.enable_grad(r_o, p_o)
+        density = observed.density(r_o, p_o, *observer)
+        dr.backward(dr.sum(density))
+        return [np.array(a) for a in (density, dr.grad(r_o), dr.grad(p_o))]
+
+    merged = derive(ObservedHits.merge(single), slice(None), ns.UInt32(index.astype(np.uint32)))
+    for k in range(2):
+        keep = index == k
+        for expected, result in zip(derive(single[k], keep), merged):
+            np.testing.assert_allclose(result[..., keep], expected, rtol=1e-5, atol=1e-6)
 
 
 def _radial(at, p, d, step):
