@@ -124,7 +124,7 @@ class PreviewWriter:
             self._write(trainer, None, *strides)
         return strides is not None
 
-    def write(self, trainer: RadianceTrainer, field: RadianceField) -> None:
+    def write_result(self, trainer: RadianceTrainer, field: RadianceField) -> None:
         """Write the preview of ``field``, the result of the training."""
         strides = self._choose_strides(trainer, max(MAX_PREVIEW_FRACTION * trainer.seconds, _LAST_SECONDS))
         self._write(trainer, field, *(strides or _list_strides(trainer)[-1]))

@@ -328,7 +328,7 @@ def train_field(
         duration = seconds, pace.waiting_fraction
         field, provenance = _make_result(trainer, dataset, watched, history, duration, interrupted, score)
         if previews is not None:
-            previews.write(trainer, field)
+            previews.write_result(trainer, field)
         if curves is not None and history:
             write_curves_table(curves, history)
             write_curves_figure(get_curves_figure(curves), history, provenance["psnr_watched"]["result"])

@@ -279,7 +279,7 @@ class RadianceTrainer(Trainer):
                 check_shape(tensors, "best_cells" if name == "cells" else f"best.{name}", value)
             row = {**meta["best"], "psnr": read_number(meta["best"], "psnr", "state")}
             weights = {name: type(value)(tensors[f"best.{name}"]) for name, value in self.averaged.items()}
-            self.best = Snapshot(weights, self.ns.UInt8(tensors["best_cells"]), row)
+            self.best = Snapshot(weights, type(self.grid.bits)(tensors["best_cells"]), row)
         self.hard_pixels = tensors["hard"]
         for name, value in counts.items():
             setattr(self, name, value)

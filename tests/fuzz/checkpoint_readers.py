@@ -118,6 +118,7 @@ def _trainer(kind):
         _started=0.0,
         stride=4,
         prepass_samples_per_ray=10.0,
+        best=None,
         extraction=SimpleNamespace(
             pieces_done=0,
             dense_cells=ns.UInt8([0] * 8),
@@ -133,7 +134,9 @@ def _make_radiance_run(folder: Path) -> None:
     from nerg_mi.train.radiance_run import save_run
     from nerg_mi.train.radiance_trainer import RadianceTrainer
 
-    save_run(_trainer(RadianceTrainer), folder / "field.run", _METADATA, [{"psnr": 20.0}])
+    trainer, row = _trainer(RadianceTrainer), {"steps": 3, "psnr": 20.0}
+    trainer.best = trainer.take_snapshot(row)
+    save_run(trainer, folder / "field.run", _METADATA, [row])
 
 
 def _read_radiance_run(folder: Path) -> object:

@@ -96,7 +96,7 @@ def test_the_stride_follows_the_cost(tmp_path):
     # The last preview is always written.
     for samples_per_ray, coarsest, strides in ((250, 1, (1, 2)), (20000, 1, (4, 4)), (90000, 16, (4, 16))):
         t = stand_in([0, 0, 0], samples_per_ray, seconds=100.0, progress=1.0, stride=coarsest)
-        PreviewWriter(path, photo(200, 200)).write(t, "field")
+        PreviewWriter(path, photo(200, 200)).write_result(t, "field")
         assert [tuple(rest) for _, *rest in t.rendered] == [strides] and path.exists()
 
 
