@@ -343,15 +343,16 @@ class Pace:
 
     def __init__(self, trainer: RadianceTrainer):
         self._trainer, self._time, self._is_judged = trainer, measure_processor_time(), False
-        self._begin = trainer.steps, trainer.seconds
+        self._first_step: int = trainer.steps
+        self._begin: float = trainer.seconds
 
     @property
     def waiting_fraction(self) -> float:
         """Fraction of the time since the start in which threads were ready but waited for a processor; 0 if unknown."""
-        now = measure_processor_time()
-        if now is None or self._time is None:
+        before, now = self._time, measure_processor_time()
+        if before is None or now is None:
             return 0.0
-        running, waiting = now[0] - self._time[0], now[1] - self._time[1]
+        running, waiting = now[0] - before[0], now[1] - before[1]
         return max(0.0, waiting / max(running + waiting, 1e-9))
 
     def judge(self) -> str | None:
@@ -360,7 +361,7 @@ class Pace:
         if self._is_judged or t.progress < _PACE_TIME or t.settings.minutes is None:
             return None
         self._is_judged = True
-        per_second = (t.steps - self._begin[0]) / max(t.seconds - self._begin[1], 1e-9)
+        per_second = (t.steps - self._first_step) / max(t.seconds - self._begin, 1e-9)
         expected = t.steps + per_second * (1 - t.progress) * 60 * t.settings.minutes
         if expected >= MIN_STEPS:
             return None
