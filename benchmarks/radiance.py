@@ -6,7 +6,7 @@
     python benchmarks/radiance.py store [--minutes 10] [--size medium] [--only images|depth]
     python -m nerg_mi.scenes.tabletop.make                     # once: photos, rendered from a generated scene
     python benchmarks/radiance.py tabletop [--minutes 4] [--bounded]
-    python benchmarks/radiance.py captures --data FOLDER [--minutes 2,10] [--width 400] [--set point_weight=0]
+    python benchmarks/radiance.py captures --data FOLDER [--minutes 2,10 | --steps 1000] [--width 240]
 
 ``fox``: real photos, of which every 8th is held out. There is one training, for the last of the ``--minutes``, whose
 learning-rate schedule covers the whole time. After each of the ``--minutes``, the clock stops and the current weights
@@ -25,8 +25,8 @@ than 4 m from the camera, without the sky. "Beyond" is outside of the field's bo
 with the sky.
 
 ``captures``: each posed image set in the folder ``--data``, with the defaults of `nerg train radiance`: one training
-for each of the ``--minutes``, whose best state is scored on at most eight held-out views. "Fall" is the PSNR of the
-best evaluation on the watched views minus that of the result.
+for each of the ``--minutes``, or of ``--steps``, whose best state is scored on at most eight held-out views. "Fall" is
+the PSNR of the best evaluation on the watched views minus that of the result.
 
 Each training writes a CSV file and prints a table.
 """
@@ -196,26 +196,27 @@ def tabletop(args: argparse.Namespace) -> tuple[str, list[str], list[list[str]],
 
 
 def captures(args: argparse.Namespace) -> tuple[str, list[str], list[list[str]], list[dict]]:
-    from nerg_mi.photos.colmap import find_pose_source
     from nerg_mi.photos.dataset import open_dataset
+    from nerg_mi.photos.images import pick_evenly
     from nerg_mi.workflows.radiance_commands import RadianceOptions
     from nerg_mi.workflows.train_radiance import train_radiance
 
+    lengths = [{"minutes": float(minutes)} for minutes in args.minutes.split(",")]
+    if args.steps is not None:
+        lengths = [{"steps": args.steps}]
     settings = {key: ast.literal_eval(value) for key, value in (pair.split("=", 1) for pair in args.set)}
     rows = []
     for folder in sorted(p for p in args.data.iterdir() if p.is_dir()):
-        find_pose_source(folder)
         width = min(args.width, *(view.shape[1] for view in open_dataset(folder).train))
-        for minutes in sorted(float(m) for m in args.minutes.split(",")):
-            path = args.out / f"{folder.name}_{minutes:g}.safetensors"
+        for length in lengths:
+            path = args.out / f"{folder.name}_{next(iter(length.values())):g}.safetensors"
             options = RadianceOptions(
-                minutes=minutes, width=width, size=args.size, threads=args.threads, seed=args.seed, **settings
+                width=width, size=args.size, threads=args.threads, seed=args.seed, **length, **settings
             )
             made = train_radiance(folder, path, options).provenance
-            held_out = open_dataset(folder, width=width).held_out
-            held_out = [held_out[int(k)] for k in np.linspace(0, len(held_out) - 1, min(8, len(held_out))).round()]
+            held_out = pick_evenly(open_dataset(folder, width=width).held_out, 8)
             watched, result = made["psnr_watched"]["history"], made["psnr_watched"]["result"]
-            row = {"capture": folder.name, "photos": made["training_frames"], "minutes": minutes}
+            row = {"capture": folder.name, "photos": made["training_frames"], "minutes": made["seconds"] / 60}
             row |= {"steps": made["steps"], **scored(path, held_out, args.spp)[1], "train": result["psnr_train"]}
             row |= {"fall": max(r["psnr"] for r in watched) - result["psnr"], "result step": result["steps"]}
             rows.append(row | {"quality": made["quality"], "load": os.getloadavg()[0]})
@@ -230,7 +231,7 @@ def captures(args: argparse.Namespace) -> tuple[str, list[str], list[list[str]],
         "fall": "fall, dB",
         "quality": "quality",
     }
-    formats = ("", "d", "g", ",", ".2f", ".2f", ".3f", ".1f", ".2f", "")
+    formats = ("", "d", ".1f", ",", ".2f", ".2f", ".3f", ".1f", ".2f", "")
     return (
         "Captures",
         list(titles.values()),
@@ -301,6 +302,7 @@ def main(argv=None) -> None:
         "captures the lengths of several trainings. Default: 1,2,4,7,10 (fox), 10 (store), 4 (tabletop), 2,10 "
         "(captures).",
     )
+    parser.add_argument("--steps", type=int, help="Training steps in place of minutes (captures). Default: by minutes.")
     parser.add_argument(
         "--width", type=int, default=135, help="Width of the photos in pixels (fox, captures). Default: %(default)s."
     )

@@ -45,6 +45,12 @@ def _restore_thread_count(rgb):
 
 
 @pytest.fixture
+def one_thread():
+    """Use one thread, so that sums have a fixed order and equal runs are equal bit for bit."""
+    set_thread_count(1)
+
+
+@pytest.fixture
 def mono(rgb):
     """Run the test in llvm_ad_mono; return the module `mitsuba`."""
     rgb.set_variant("llvm_ad_mono")

@@ -300,6 +300,11 @@ class PhotoView:
         return color[..., :3] * alpha + (1 - alpha) * background
 
 
+def pick_evenly(views: list[PhotoView], count: int) -> list[PhotoView]:
+    """Return at most ``count`` of ``views``, evenly spaced, with the first and the last."""
+    return [views[int(k)] for k in np.linspace(0, len(views) - 1, min(count, len(views))).round()]
+
+
 def split_holdout(frames: list[PosedFrame], every: int) -> tuple[list[PosedFrame], list[PosedFrame]]:
     """Split ``frames``, sorted by file name, into training and held-out frames.
 

@@ -250,8 +250,6 @@ class PixelBank:
 _MAX_POINT_ERROR = 0.1
 # Minimum number of points of a photo, and the fraction of them that may be outliers in front of everything else.
 _MIN_CLEARING_POINTS, _NEAR_OUTLIERS = 50, 0.02
-# Empty space around a camera that looks at a point in common with the others, relative to its distance from that point.
-_SURROUNDING = 0.35
 # Maximum distance of empty space relative to the nearest point.
 _CLEAR_MARGIN = 0.8
 
@@ -294,13 +292,19 @@ class PointPixels:
 def _locate_points(view: PhotoView) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return pixel (row by row), distance and error of the precise points of ``view`` that its mask admits."""
     assert view.points is not None
-    (height, width), positions, relative = view.shape, view.points.positions, view.points.relative_errors
-    pixels, selected = project(positions, view.camera)
-    selected &= np.all((pixels >= 0) & (pixels < [width, height]), axis=1) & (relative <= _MAX_POINT_ERROR)
+    positions, relative = view.points.positions, view.points.relative_errors
+    pixels, selected = _project_inside(view, positions)
+    selected &= relative <= _MAX_POINT_ERROR
     column, row = pixels[selected].astype(int).T
     distance = np.linalg.norm(positions[selected] - view.camera.center, axis=1)
-    unmasked = _get_mask(view)[row, column]
-    return (row * width + column)[unmasked], distance[unmasked], (distance * relative[selected])[unmasked]
+    unmasked, pixel = _get_mask(view)[row, column], row * view.shape[1] + column
+    return pixel[unmasked], distance[unmasked], (distance * relative[selected])[unmasked]
+
+
+def _project_inside(view: PhotoView, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pixel coordinates (N, 2) of ``points`` and the mask (N,) of those that are within the image."""
+    pixels, is_visible = project(points, view.camera)
+    return pixels, is_visible & np.all((pixels >= 0) & (pixels < view.shape[::-1]), axis=1)
 
 
 @dataclass(frozen=True)
@@ -319,8 +323,8 @@ class FreeSpace:
     clear: np.ndarray
 
     @staticmethod
-    def find(views: list[PhotoView], near: float, fraction: float) -> FreeSpace:
-        """Find the empty space of the cameras of ``views``.
+    def find(views: list[PhotoView], near: float, in_view: float, around: float) -> FreeSpace:
+        """Find the empty space of the cameras of ``views``. It contains no point of the reconstruction.
 
         Parameters
         ----------
@@ -328,43 +332,46 @@ class FreeSpace:
             The training photos.
         near : float
             Minimum distance in scene units.
-        fraction : float
-            With points of a reconstruction, a camera sees through empty space up to this fraction of the distance to
-            the nearest points of its photo, except outliers.
-
-        Notes
-        -----
-        Cameras that look at a common point are surrounded by empty space, because nobody photographs an object from
-        within another one. No empty space contains a point of the reconstruction.
+        in_view : float
+            Fraction of the distance to the nearest points of a photo, except outliers, up to which its camera sees
+            through empty space.
+        around : float
+            Radius of the empty space around cameras that look at a common point, as a fraction of their distance to
+            it. With depth, which tells more, it is not used.
         """
         points = [view.points.positions for view in views if view.points is not None]
         distinct = np.unique(np.concatenate([np.zeros((0, 3)), *points]), axis=0)
-        surrounding = _find_surroundings(views)
-        radius, clear = np.full((2, len(views)), near, np.float32)
+        radius = np.maximum(near, around * _find_focus_distances(views)).astype(np.float32)
+        clear = np.zeros_like(radius)
         for k, view in enumerate(views):
-            center, (height, width) = view.camera.center, view.shape
-            distances = np.linalg.norm(distinct - center, axis=1)
-            radius[k] = max(near, min(surrounding[k], _CLEAR_MARGIN * np.min(distances, initial=np.inf)))
-            clear[k] = radius[k]
-            if view.points is not None and len(view.points) >= _MIN_CLEARING_POINTS:
-                pixels, is_visible = project(distinct, view.camera)
-                is_visible &= np.all((pixels >= 0) & (pixels < [width, height]), axis=1)
-                matched = np.linalg.norm(view.points.positions - center, axis=1)
-                distance = fraction * np.quantile(matched, _NEAR_OUTLIERS)
-                clear[k] = max(radius[k], min(distance, _CLEAR_MARGIN * np.min(distances[is_visible], initial=np.inf)))
+            distances = np.linalg.norm(distinct - view.camera.center, axis=1)
+            radius[k] = max(near, min(radius[k], _CLEAR_MARGIN * np.min(distances, initial=np.inf)))
+            clear[k] = max(radius[k], _find_clear_distance(view, distinct, distances, in_view))
         return FreeSpace(radius, clear)
 
 
-def _find_surroundings(views: list[PhotoView]) -> np.ndarray:
-    """Return the radius (V,) of the empty space around cameras that look at a common point; 0 for others, and with
-    depth, which tells more.
+def _find_clear_distance(view: PhotoView, points: np.ndarray, distances: np.ndarray, fraction: float) -> float:
+    """Return how far the camera of ``view`` sees through empty space, with the reconstruction's ``points`` at
+    ``distances``; 0 if its photo has too few points.
     """
+    if view.points is None or len(view.points) < _MIN_CLEARING_POINTS:
+        return 0.0
+    matched = np.linalg.norm(view.points.positions - view.camera.center, axis=1)
+    distance = fraction * float(np.quantile(matched, _NEAR_OUTLIERS))
+    # Points of other photos count if they are in view, and only if they are nearer.
+    near = distances < distance / _CLEAR_MARGIN
+    is_visible = _project_inside(view, points[near])[1]
+    return min(distance, _CLEAR_MARGIN * float(np.min(distances[near][is_visible], initial=np.inf)))
+
+
+def _find_focus_distances(views: list[PhotoView]) -> np.ndarray:
+    """Return the distance (V,) of cameras that look at a common point from it; 0 for others, and with depth."""
     if len(views) < 2 or any(view.depth is not None for view in views):
         return np.zeros(len(views))
     focus, angles = find_focus([view.camera for view in views])
     if np.median(angles) >= MAX_CONVERGENCE_ANGLE:
         return np.zeros(len(views))
-    return _SURROUNDING * np.linalg.norm([view.camera.center - focus for view in views], axis=1)
+    return np.linalg.norm([view.camera.center - focus for view in views], axis=1)
 
 
 def _get_mask(view: PhotoView) -> np.ndarray:

@@ -22,7 +22,7 @@ from nerg_mi.maths.color import color_corrected_psnr, mean_ignoring_nan, psnr
 from nerg_mi.maths.geometry import Box
 from nerg_mi.photos.cameras import pixel_directions
 from nerg_mi.photos.dataset import Dataset
-from nerg_mi.photos.images import PhotoView
+from nerg_mi.photos.images import PhotoView, pick_evenly
 from nerg_mi.threads import measure_processor_time
 
 from .radiance_diagnosis import MIN_STEPS, Outcome, describe_pace, find_causes, find_problems
@@ -175,7 +175,7 @@ _MIN_IMPROVEMENT = 0.2
 # Minimum number of steps between two evaluations, each of which takes as long as several steps
 MIN_EVALUATION_INTERVAL = 50
 # Maximum samples of an evaluation, and of the final error: in fog a ray has hundreds.
-_EVALUATION_SAMPLES, _FINAL_SAMPLES = 2**20, 2**24
+_EVALUATION_SAMPLES, _FINAL_SAMPLES = 2**19, 2**24
 
 
 @dataclass(frozen=True)
@@ -343,8 +343,10 @@ class Pace:
 
     def __init__(self, trainer: RadianceTrainer):
         self._trainer, self._time, self._is_judged = trainer, measure_processor_time(), False
+        # Those of a resumed run are not 0.
         self._first_step: int = trainer.steps
         self._begin: float = trainer.seconds
+        self._first_progress: float = trainer.progress
 
     @property
     def waiting_fraction(self) -> float:
@@ -356,9 +358,9 @@ class Pace:
         return max(0.0, waiting / max(running + waiting, 1e-9))
 
     def judge(self) -> str | None:
-        """Return a warning, once after a tenth of the run, if it will have too few steps."""
+        """Return a warning, once a tenth of the run after the start, if it will have too few steps."""
         t = self._trainer
-        if self._is_judged or t.progress < _PACE_TIME or t.settings.minutes is None:
+        if self._is_judged or t.progress - self._first_progress < _PACE_TIME or t.settings.minutes is None:
             return None
         self._is_judged = True
         per_second = (t.steps - self._first_step) / max(t.seconds - self._begin, 1e-9)
@@ -446,7 +448,8 @@ def _make_result(
     outcome = Outcome(
         history, result, trainer.steps, trainer.stride, trainer.settings.minutes, seconds, waiting_fraction
     )
-    provenance["quality"] = "poor" if outcome.is_poor else "usable"
+    if result is not None:
+        provenance["quality"] = "poor" if outcome.is_poor else "usable"
     causes = []
     if outcome.is_poor:
         causes = find_causes(dataset.train, provenance.get("photo_stops", 0.0), provenance.get("beyond_box", 0.0))
@@ -489,12 +492,8 @@ class WatchedViews:
     def choose(dataset: Dataset) -> WatchedViews:
         """Choose views at equal intervals."""
         return WatchedViews(
-            _pick_evenly(dataset.held_out, _NUM_VALIDATION_VIEWS), _pick_evenly(dataset.train, _NUM_TRAINING_VIEWS)
+            pick_evenly(dataset.held_out, _NUM_VALIDATION_VIEWS), pick_evenly(dataset.train, _NUM_TRAINING_VIEWS)
         )
-
-
-def _pick_evenly(views: list[PhotoView], count: int) -> list[PhotoView]:
-    return [views[int(k)] for k in np.linspace(0, len(views) - 1, min(count, len(views))).round()]
 
 
 def _append_evaluation(
@@ -514,8 +513,8 @@ def _append_evaluation(
     if row["psnr"] is None:
         return None
     history.append(row)
-    if field is None and (trainer.best is None or row["psnr"] > trainer.best.row["psnr"]):
-        trainer.best = trainer.take_snapshot(row)
+    if field is None:
+        trainer.keep_if_best(row)
     return row
 
 

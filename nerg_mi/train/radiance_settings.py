@@ -230,6 +230,10 @@ class RadianceSettings(RunSettings):
     # Weight of the squared deviation of the photo colours from their average, a mean over the photos.
     photo_decay: float = range_field(0.01, LOSS_WEIGHTS)
     depth_weight: float = setting(0.02, "Weight of the depth loss, for photos with depth.", allowed=LOSS_WEIGHTS)
+    # Final ``depth_weight`` as a fraction of the initial one
+    depth_weight_final_ratio: float = range_field(0.25, Range(0, 1e6))
+    # Distance from the true surface, in march steps, within which light should be absorbed.
+    depth_margin: float = range_field(1.5, Range(0, 1e6))
     # Weight of the mean loss over rays to points of the reconstruction (Deng et al. 2022, "Depth-supervised NeRF", with
     # the loss of line-of-sight depth), if the photos have no depth.
     point_weight: float = setting(
@@ -242,12 +246,20 @@ class RadianceSettings(RunSettings):
     point_fraction: float = range_field(1 / 8, Range(0, 0.9))  # Fraction of the rays that are drawn from points
     # Distance from a point, in standard errors of its distance, within which light should be absorbed
     point_margin: float = range_field(3.0, Range(0, 1000))
-    # Fraction of the distance from a camera to its nearest points within which its view is empty
-    clear_fraction: float = range_field(0.25, Range(0, 1))
-    # Final ``depth_weight`` as a fraction of the initial one
-    depth_weight_final_ratio: float = range_field(0.25, Range(0, 1e6))
-    # Distance from the true surface, in march steps, within which light should be absorbed.
-    depth_margin: float = range_field(1.5, Range(0, 1e6))
+    # Empty space, as `FreeSpace` describes: in view of the cameras up to this fraction of the distance to the nearest
+    # points of their photos, and around cameras up to this fraction of their distance to the point that they look at
+    clear_fraction: float = setting(
+        0.25,
+        "Fraction of the distance to the nearest points of the COLMAP model in a photo up to which the view of its "
+        "camera is empty; 0 disables it.",
+        allowed=Range(0, 1),
+    )
+    surrounding_fraction: float = setting(
+        0.35,
+        "Fraction of the distance to a common point of all views up to which the space around a camera is empty; 0 "
+        "disables it.",
+        allowed=Range(0, 1),
+    )
     # Fraction of the rays drawn from pixels with a large depth error
     hard_pixel_fraction: float = range_field(0.25, Range(0, 1))
     distortion_weight: float = setting(

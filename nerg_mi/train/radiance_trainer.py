@@ -217,7 +217,9 @@ class RadianceTrainer(Trainer):
         )
         self.start(Adam(settings.learning_rate, start, beta_2=0.99, epsilon=1e-15))
         self.march_step = settings.march_step * box.side
-        free_space = FreeSpace.find(views, settings.near * box.side, settings.clear_fraction)
+        free_space = FreeSpace.find(
+            views, settings.near * box.side, settings.clear_fraction, settings.surrounding_fraction
+        )
         self._ray_starts = ns.Float(free_space.clear)
         self.grid = DensityGrid(
             ns,
@@ -255,13 +257,16 @@ class RadianceTrainer(Trainer):
         meta |= {key: getattr(self, name) for key, name in _NUMBERS.items()}
         meta |= {"settling": settling.pieces_done, "turn": self.grid.turn, "clock": self.clock.to_dict()}
         if self.best is not None:
-            tensors |= {f"best.{name}": value.numpy() for name, value in self.best.weights.items()}
-            tensors["best_cells"], meta["best"] = self.best.bits.numpy(), self.best.row
+            best = {**self.best.weights, "cells": self.best.bits}
+            tensors |= {f"best.{name}": value.numpy() for name, value in best.items()}
+            meta["best"] = self.best.row
         return {**tensors, "hard": self.hard_pixels}, meta
 
-    def take_snapshot(self, row: dict) -> Snapshot:
-        """Return the state of now with its evaluation ``row``. Arrays are replaced, never modified, during training."""
-        return Snapshot(dict(self.averaged), self.grid.bits, row)
+    def keep_if_best(self, row: dict) -> None:
+        """Keep the present state if its evaluation ``row`` has the largest PSNR so far."""
+        if self.best is None or row["psnr"] > self.best.row["psnr"]:
+            # Not copied, because training replaces these arrays and never modifies them.
+            self.best = Snapshot(dict(self.averaged), self.grid.bits, row)
 
     def restore(self, tensors: dict, meta: dict) -> None:
         counts = {name: read_count(meta, key) for key, name in _NUMBERS.items()}
@@ -275,11 +280,12 @@ class RadianceTrainer(Trainer):
         self.extraction.restore(int(read_number(meta, "settling", "state")), dense, contributing)
         self.clock.restore(meta["clock"])
         if "best" in meta:
+            best = {}
             for name, value in {**self.averaged, "cells": self.grid.bits}.items():
-                check_shape(tensors, "best_cells" if name == "cells" else f"best.{name}", value)
+                check_shape(tensors, f"best.{name}", value)
+                best[name] = type(value)(tensors[f"best.{name}"])
             row = {**meta["best"], "psnr": read_number(meta["best"], "psnr", "state")}
-            weights = {name: type(value)(tensors[f"best.{name}"]) for name, value in self.averaged.items()}
-            self.best = Snapshot(weights, type(self.grid.bits)(tensors["best_cells"]), row)
+            self.best = Snapshot(best, best.pop("cells"), row)
         self.hard_pixels = tensors["hard"]
         for name, value in counts.items():
             setattr(self, name, value)

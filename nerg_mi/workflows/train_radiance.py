@@ -9,8 +9,6 @@ from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
 from nerg_mi.errors import NergError, blame_options
 from nerg_mi.evaluation.metrics import ViewScores, score_views
 from nerg_mi.fields.radiance import RadianceField
@@ -19,6 +17,7 @@ from nerg_mi.files.tables import write_json
 from nerg_mi.formats.checkpoint import read_checkpoint
 from nerg_mi.formats.fields import save_radiance
 from nerg_mi.photos.dataset import Dataset, open_dataset
+from nerg_mi.photos.images import pick_evenly
 from nerg_mi.photos.posed import describe_unused
 from nerg_mi.train import radiance_run
 from nerg_mi.train.radiance_monitor import GuardedObserver, TrainingObserver, get_curves_figure
@@ -267,8 +266,8 @@ def evaluate_radiance(
     if not options.train:
         _refuse_trained(field, provenance, data)
     views = data.train if options.train else data.held_out
-    if options.views is not None and options.views < len(views):
-        views = [views[int(k)] for k in np.linspace(0, len(views) - 1, options.views).round()]
+    if options.views is not None:
+        views = pick_evenly(views, options.views)
     done, start = 0, time.perf_counter()
 
     def row(name: str, psnr: float, ssim: float) -> None:

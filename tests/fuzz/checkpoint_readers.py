@@ -135,7 +135,7 @@ def _make_radiance_run(folder: Path) -> None:
     from nerg_mi.train.radiance_trainer import RadianceTrainer
 
     trainer, row = _trainer(RadianceTrainer), {"steps": 3, "psnr": 20.0}
-    trainer.best = trainer.take_snapshot(row)
+    trainer.keep_if_best(row)
     save_run(trainer, folder / "field.run", _METADATA, [row])
 
 

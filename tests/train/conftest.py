@@ -18,15 +18,6 @@ def dataset():
 
 
 @pytest.fixture
-def one_thread():
-    """Use one thread, so that sums have a fixed order and equal runs are equal bit for bit."""
-    threads = dr.thread_count()
-    set_thread_count(1)
-    yield
-    set_thread_count(threads)
-
-
-@pytest.fixture
 def rays():
     """Rays of two participants who look at a point of the wall."""
     return looking_at((1.5, 0.4, 1.2))

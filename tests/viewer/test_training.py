@@ -7,7 +7,6 @@ import sys
 from dataclasses import dataclass
 from types import SimpleNamespace
 
-import drjit as dr
 import drjit.llvm.ad as ns
 import numpy as np
 import pytest
@@ -16,7 +15,6 @@ from scipy.spatial.transform import Rotation
 from nerg_mi.errors import NergError
 from nerg_mi.maths.color import psnr
 from nerg_mi.photos.cameras import pixel_directions
-from nerg_mi.threads import set_thread_count
 from nerg_mi.train.radiance_run import train_field
 from nerg_mi.train.radiance_settings import RadianceSettings
 from nerg_mi.viewer import training
@@ -107,15 +105,6 @@ def _eager(monkeypatch):
     for name in ("MIN_INTERVAL", "REFRESH_INTERVAL", "_STATUS_INTERVAL", "_REST_SECONDS"):
         monkeypatch.setattr(training, name, 0.0)
     monkeypatch.setattr(training, "MAX_FRACTION", math.inf)
-
-
-@pytest.fixture
-def one_thread():
-    """Use one thread, so that sums have a fixed order and equal runs are equal bit for bit."""
-    threads = dr.thread_count()
-    set_thread_count(1)
-    yield
-    set_thread_count(threads)
 
 
 @pytest.mark.usefixtures("_eager")

@@ -176,6 +176,7 @@ def test_a_low_pace_is_reported_after_a_tenth(steps, warns):
     assert pace.judge() is None
     t.steps, t.seconds, t.progress = steps, 6.0, 0.1
     line = pace.judge()
+    assert Pace(t).judge() is None  # It has just been resumed
     assert pace.judge() is None and 0 <= pace.waiting_fraction < 1
     assert (line is not None) == warns
     if warns:

@@ -344,7 +344,7 @@ def test_points_place_the_surface(dataset):
     """With the same steps, the expected depth on held-out views is better with points than without."""
     errors = {}
     for weight in (0.0, 0.1):
-        options = settings(steps=60, point_weight=weight, clear_fraction=0.0)
+        options = settings(steps=60, point_weight=weight, clear_fraction=0.0, surrounding_fraction=0.0)
         trainer = RadianceTrainer([with_points(v) for v in dataset.train], BOX, TINY, options, ns)
         while trainer.progress < 1:
             trainer.step()
