@@ -328,13 +328,17 @@ def test_depths_are_those_of_the_scene(trained):
 
 @pytest.mark.slow
 def test_occupancy_contains_all_visible_surfaces(trained):
-    """The renderer, which skips by cascades, compared with the trainer, which samples the cells of its own grid."""
+    """The renderer, which skips by cascades, compared with the trainer, which samples the cells of its own grid.
+
+    The renderer may absorb more: after so few steps, fog is left in cells that the trainer does not sample.
+    """
     field, _, trainer = trained
     view = before_a_wall(next(poses(1)))
     d = (pixel_directions(LENS) @ view.camera.to_world[:3, :3].T).reshape(-1, 3)
     depth, opacity = trace_depth(FieldMedium(field), np.tile(view.camera.center, (len(d), 1)), d, kind="expected")
     trained_in = trainer.render(view)
-    assert np.mean(np.abs(opacity - trained_in.opacity.ravel()) < 0.05) > 0.95
+    excess = opacity - trained_in.opacity.ravel()
+    assert excess.min() > -0.01 and excess.mean() < 0.1
     np.testing.assert_allclose(np.median(depth / trained_in.depth.ravel()), 1, atol=0.02)
     assert field.march_growth == trainer.settings.step_growth and field.occupancy.bound == 32
     assert field.occupancy.bits.mean() < 0.6
