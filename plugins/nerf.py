@@ -33,6 +33,12 @@ Radiance field (:monosp:`nerf`)
    - Features of the grid and weight matrices of both networks.
    - |exposed|, |differentiable|
 
+ * - voxels.log_density
+   - |tensor|
+   - Log densities of a compiled field (``nerg compile``), which replace the density of its networks. They are discarded
+     when the grid or the density network changes.
+   - |exposed|, |differentiable|
+
 Density and view-dependent colour of a scene: a multiresolution hash grid with two small networks. The colour network is
 evaluated at each sample of a ray; for a checkpoint with deferred shading (``nerg train radiance --deferred``) once per
 ray, on the mean features of its samples (Hedman et al. 2021). The volume is meant as the ``field`` of the integrator
@@ -114,6 +120,9 @@ class NerfVolume(make_volume_class()):
             )
         return self.max_density
 
+    def parameters_changed(self, keys=()):
+        self.field.pack(keys)
+
     def resolution(self):
         cells = int(self.field.config.grid.finest)
         return mi.ScalarVector3i(cells, cells, cells)
@@ -126,6 +135,7 @@ class NerfVolume(make_volume_class()):
             "networks": f"{c.density_sizes}, {c.color_sizes}{' (once per ray)' if c.deferred else ''}",
             "bbox": f"{lower.round(4).tolist()} to {upper.round(4).tolist()}",
             "color_space": self.field.color_space,
+            **({} if self.field.voxels is None else {"voxels": f"{self.field.voxels.resolution} along an edge"}),
         }
 
 

@@ -125,7 +125,8 @@ Neural radiance and gaze fields (:monosp:`nerg`)
 
  * - color_cutoff
    - |float|
-   - Minimum weight of a sample for which colour is evaluated. (Default: 1e-3)
+   - Minimum weight of a sample for which colour is evaluated. (Default: 1e-3; for a compiled field, whose colour takes
+     most of the time, 0.1)
 
  * - refined
    - |bool|
@@ -232,7 +233,13 @@ from nerg_mi.transport import observer
 from nerg_mi.transport.depth import DEPTHS
 from nerg_mi.transport.geometry import Ceiling, Shading
 from nerg_mi.transport.jit import gc_paused, is_recording
-from nerg_mi.transport.march_primal import MarchSettings, default_dt_gamma, default_step, default_stop
+from nerg_mi.transport.march_primal import (
+    MarchSettings,
+    default_color_cutoff,
+    default_dt_gamma,
+    default_step,
+    default_stop,
+)
 from nerg_mi.transport.medium import Medium
 from nerg_mi.transport.observer import VISIBILITIES, ObserverCache, ObserverSettings, check_center, sensor_center
 from nerg_mi.transport.observer_gaze import GazeFieldInstance
@@ -347,7 +354,7 @@ def read_march_settings(props, medium: Medium | None) -> MarchSettings:
         step=step or default_step(medium),
         dt_gamma=read_number(props, "dt_gamma", default_dt_gamma(medium), Range(0, 1)),
         stop=read_number(props, "stop", default_stop(medium), Range(0, 1)),
-        color_cutoff=read_number(props, "color_cutoff", MarchSettings.color_cutoff, Range(0, 1)),
+        color_cutoff=read_number(props, "color_cutoff", default_color_cutoff(medium), Range(0, 1)),
         quadrature=read_choice(props, "quadrature", MarchSettings.quadrature, RULES.names()),
         coarse=read_number(props, "coarse", MarchSettings.coarse, Range(1, 1e6)),
         refined=read_boolean(props, "refined", MarchSettings.refined),

@@ -226,7 +226,8 @@ class TrainedField(Generic[Network]):
     @property
     def num_weights(self) -> int:
         """Number of trained weights."""
-        return sum(int(np.prod(value.shape)) for value in self.network.parameters().values())
+        parameters = self.network.parameters()
+        return sum(int(np.prod(value.shape)) for name, value in parameters.items() if not name.startswith("voxels."))
 
     def save(self, path: FilePath, half: bool = False) -> Path:
         """Write a checkpoint (.safetensors) atomically.

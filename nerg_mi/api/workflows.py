@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,12 +19,21 @@ from nerg_mi.workflows.gaze_commands import (
     NextLookOptions,
     PriorOptions,
 )
-from nerg_mi.workflows.radiance_commands import RadianceOptions, RadianceScoreOptions
+from nerg_mi.workflows.radiance_commands import CompileOptions, RadianceOptions, RadianceScoreOptions
 from nerg_mi.workflows.rays_commands import AlignOptions, RaysImportOptions
 from nerg_mi.workflows.scene_commands import BakeOptions, StudyOptions
 
 from .gaze import TrainedGazeField
-from .scene import FilePath, TrainedField, build_options, check_names, resolve_checkpoint, resolve_file, resolve_rays
+from .scene import (
+    FilePath,
+    TrainedField,
+    build_options,
+    check_names,
+    load_field,
+    resolve_checkpoint,
+    resolve_file,
+    resolve_rays,
+)
 
 if TYPE_CHECKING:
     from nerg_mi.alignment.check import Alignment
@@ -615,6 +624,62 @@ def train_radiance(
     if output is None:
         return TrainedField(result.field, result.provenance)
     return TrainedField(result.field, result.provenance, Path(output).name, Path(output))
+
+
+def compile_field(
+    field: TrainedField[RadianceField] | FilePath,
+    output: FilePath | None = None,
+    *,
+    options: CompileOptions | None = None,
+    reporter: Reporter = SILENT,
+    **overrides: Any,
+) -> TrainedField[RadianceField]:
+    """Evaluate the density of a radiance field on voxels once, so that frames take about half the time.
+
+    Colour still comes from the networks of the field. Gaze fields that were trained in the field accept the result.
+
+    Parameters
+    ----------
+    field : TrainedField or path
+        The field. The object is not changed.
+    output : path, optional
+        Checkpoint to write (.safetensors).
+    options : CompileOptions, optional
+        Base options (`nerg_mi.workflows.radiance_commands.CompileOptions`).
+    reporter : Reporter
+        Receives the progress, and the errors, the size and the speed of each resolution.
+    **overrides
+        Single options on top of ``options``, such as ``resolution=512``, ``min_psnr=35`` or ``memory=100`` (MB).
+
+    Returns
+    -------
+    TrainedField
+        The compiled field. ``provenance["compiled"]`` has its resolution, its size in bytes, its depth errors in scene
+        units, the PSNR of its colour in dB and the speed-up, along random rays.
+
+    Raises
+    ------
+    NergError
+        An option is invalid, the field is compiled already, or the voxels would exceed ``memory``.
+
+    Examples
+    --------
+    >>> import nerg_mi as nerg
+    >>> from importlib.resources import files
+    >>> field = nerg.load_field(files("nerg_mi.scenes.store") / "store.safetensors")
+    >>> small = nerg.compile_field(field, resolution=128)
+    >>> small.provenance["compiled"]["resolution"]
+    128
+    """
+    from nerg_mi.workflows.compile import compile_field as compile_network
+
+    resolved = build_options(CompileOptions, "compile_field", options, overrides)
+    original = load_field(field) if isinstance(field, (str, os.PathLike)) else field
+    result = compile_network(original.network, resolved, reporter)
+    compiled = TrainedField(result.field, {**original.provenance, "compiled": asdict(result.error)})
+    if output is None:
+        return compiled
+    return TrainedField(compiled.network, compiled.provenance, Path(output).name, compiled.save(output))
 
 
 def train_gaze(

@@ -39,8 +39,8 @@ GROUPS = {
 """Help texts of the groups of commands, by their first word."""
 
 _ORDER = (
-    "demo doctor scene view render draw rays poses align train eval report import export refine bake ablate stats jobs "
-    "worker study"
+    "demo doctor scene view render draw rays poses align train eval report import export refine compile bake ablate "
+    "stats jobs worker study"
 ).split()
 _LINES = re.compile(r"``nerg ([a-z -]+)``: (.*?)(?=\n``nerg |\Z)", re.S)
 

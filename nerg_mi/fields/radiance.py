@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import asdict, dataclass, field
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -17,6 +18,7 @@ from nerg_mi.ranges import MAX_COORDINATE, POSITIVE_VALUES
 from .encoding import Encoding, EncodingConfig, HashGridConfig, config_from_dict, encode_direction, init_encoding
 from .mlp import MLP, namespace
 from .occupancy import CascadeGrid, OccupancyGrid, RefinedGrid
+from .voxels import VoxelGrid
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -258,6 +260,12 @@ class RadianceField:
         Colour behind the field: a ray shows C + (1 - α) background(o, d) in ``color_space``.
     march_growth : float
         Minimum step of the training as a fraction of the distance, for a contracted box.
+
+    Attributes
+    ----------
+    voxels : VoxelGrid or None
+        Densities of a compiled field (`fields.compilation.compile_density`), which are evaluated in place of the
+        networks, of whose outputs only the features are then used. None for a field that is not compiled.
     """
 
     DRJIT_STRUCT: ClassVar[dict[str, Any]] = {
@@ -267,6 +275,7 @@ class RadianceField:
         "_head": None,
         "occupancy": None,
         "background": None,
+        "voxels": None,
     }
 
     def __init__(
@@ -292,6 +301,7 @@ class RadianceField:
         self.march_step, self.background = march_step, background
         self.march_growth = march_growth
         self.occupancy: OccupancyGrid | RefinedGrid | CascadeGrid | None = None
+        self.voxels: VoxelGrid | None = None
         self.pack()
         self.occupancy = occupancy
 
@@ -313,6 +323,8 @@ class RadianceField:
         owners = ["grid", "density_net", "color_net"]
         if self.background is not None:
             owners += ["background_grid", "background_net"]
+        if self.voxels is not None:
+            owners += ["voxels"]
         return {f"{name}.{key}": value for name in owners for key, value in getattr(self, name).named().items()}
 
     @property
@@ -339,16 +351,23 @@ class RadianceField:
     def set_parameters(self, values: dict) -> None:
         """Replace arrays by name (any subset of ``parameters()``) and repack the networks."""
         assign_parameters(self, values)
-        self.pack()
+        self.pack(list(values))
 
-    def pack(self) -> None:
+    def pack(self, names: Collection[str] = ()) -> None:
         """Update what the kernels read; call it after any change of the weights.
 
-        A refined occupancy grid is replaced by the grid that it refines: it is only valid for the weights that it was
-        computed from.
+        If the density may have changed, a refined occupancy grid is replaced by the grid that it refines, and voxels
+        are discarded: both are only valid for the weights that they were computed from.
+
+        Parameters
+        ----------
+        names : collection of str
+            Names of the changed parameters. Default: all.
         """
-        if self.occupancy is not None:
-            self.occupancy = self.occupancy.coarse
+        if not names or any(name.startswith(("grid.", "density_net.")) for name in names):
+            self.voxels = None
+            if self.occupancy is not None:
+                self.occupancy = self.occupancy.coarse
         for part in (self.grid, self.density_net, self.color_net):
             part.pack()
         # Depth passes need one output of the last layer, not 1 + geometry of them.
@@ -362,13 +381,21 @@ class RadianceField:
 
     def kernel_parameters(self) -> list:
         """The arrays that evaluations read: the encoding's and the packed networks, attached to ``parameters()``."""
-        return [*self.grid.kernel_parameters(), self.density_net.buffer, self.color_net.buffer, self._head.buffer]
+        networks = [*self.grid.kernel_parameters(), self.density_net.buffer, self.color_net.buffer, self._head.buffer]
+        return networks if self.voxels is None else [*networks, *self.voxels.kernel_parameters()]
 
     def density(self, p, active: Bool | bool = True):
         """Density in 1/unit at ``p`` (Array3f, the field's units); 0 outside the box."""
-        inside = active & self.box.contains(p)
-        h = self._head(self.grid(self.box.to_unit(p), inside))
-        return dr.select(inside, self._density(h[0], p), 0)
+        inside, u = active & self.box.contains(p), self.box.to_unit(p)
+        if self.voxels is None:
+            h = self.log_density(u, inside)
+        else:
+            h, inside = self.voxels.evaluate(u, inside)
+        return dr.select(inside, self._density(h, p), 0)
+
+    def log_density(self, u, active: Bool | bool = True):
+        """First output of the density net at ``u`` (Array3f in the unit cube), also of a compiled field."""
+        return self._head(self.grid(u, active))[0]
 
     def _density(self, h, p):
         """Density (1/unit) at ``p`` for the first output ``h`` of the density net."""
@@ -378,6 +405,8 @@ class RadianceField:
         """Density (1/unit) at ``p`` and the ``geometry`` features (list of Floats) that ``color`` needs."""
         inside = active & self.box.contains(p)
         h = self.density_net(self.grid(self.box.to_unit(p), inside))
+        if self.voxels is not None:
+            return self.density(p, active), point_features(h[1:], self.config.deferred)
         return dr.select(inside, self._density(h[0], p), 0), point_features(h[1:], self.config.deferred)
 
     def color(self, features: list, d):

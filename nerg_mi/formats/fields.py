@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -27,6 +27,7 @@ from nerg_mi.fields.gaze_hits import ReaimedHits
 from nerg_mi.fields.mlp import MLP
 from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid, RefinedGrid, unpack_bits
 from nerg_mi.fields.radiance import Background, BackgroundConfig, RadianceConfig, RadianceField
+from nerg_mi.fields.voxels import VoxelArrays, VoxelGrid
 from nerg_mi.files.atomic import file_sha256
 from nerg_mi.maths.arrays import copy_aligned
 from nerg_mi.maths.geometry import box_from_dict
@@ -261,11 +262,31 @@ def encode_occupancy(grid: OccupancyGrid | RefinedGrid | CascadeGrid) -> tuple[d
     return tensors, config
 
 
+_VOXEL_ARRAYS = ("blocks", "masks", "log_density")
+
+
+def encode_voxels(voxels: VoxelGrid) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Convert ``voxels`` to arrays of a checkpoint by name, and its metadata."""
+    arrays = {f"voxels.{name}": getattr(voxels.arrays, name) for name in _VOXEL_ARRAYS}
+    # The grid's own densities may have been optimised.
+    arrays["voxels.log_density"] = voxels.log_density.numpy().reshape(voxels.arrays.log_density.shape)
+    return arrays, {"resolution": voxels.resolution}
+
+
+def _decode_voxels(arrays: StoredArrays, config: dict) -> VoxelGrid:
+    resolution = read_number(config, "resolution", "voxels")
+    blocks, masks, log_density = (arrays.get_raw(f"voxels.{name}") for name in _VOXEL_ARRAYS)
+    if (blocks.dtype, masks.dtype, log_density.dtype) != (np.uint32, np.uint32, np.float16):
+        raise ValueError("the arrays of its voxels have other types than uint32 and float16")
+    return VoxelGrid(VoxelArrays(cast("int", resolution), blocks, masks, log_density), arrays.ns)
+
+
 def save_radiance(field: RadianceField, path: str | Path, provenance: dict, half: bool = False) -> None:
     """Write ``field``. ``provenance`` (JSON) describes the training data and settings; ``half`` stores the
     weights as fp16.
     """
-    tensors = to_stored_arrays(field.parameters(), half)
+    parameters = {name: value for name, value in field.parameters().items() if not name.startswith("voxels.")}
+    tensors = to_stored_arrays(parameters, half)
     metadata = {
         "architecture": field.config.to_dict(),
         "box": field.box.to_dict(),
@@ -277,6 +298,9 @@ def save_radiance(field: RadianceField, path: str | Path, provenance: dict, half
     }
     if field.occupancy is not None:
         arrays, metadata["occupancy"] = encode_occupancy(field.occupancy)
+        tensors |= arrays
+    if field.voxels is not None:
+        arrays, metadata["voxels"] = encode_voxels(field.voxels)
         tensors |= arrays
     if field.background is not None:
         metadata["background"] = field.background.config.to_dict()
@@ -319,6 +343,8 @@ def load_radiance(path: str | Path, ns: ModuleType) -> tuple[RadianceField, dict
             background,
             growth,
         )
+        if "voxels" in meta:
+            field.voxels = _decode_voxels(arrays, meta["voxels"])
     return field, meta
 
 
@@ -336,8 +362,8 @@ def _warn_of_poor_field(path: str) -> None:
 
 
 def matches_checksum(path: str | Path, sha256: object) -> bool:
-    """Return whether ``path`` has this checksum, or is a radiance field that was refined from the file with this
-    checksum.
+    """Return whether ``path`` has this checksum, or is a radiance field that was refined or compiled from the file
+    with this checksum.
     """
     if file_sha256(path) == sha256:
         return True

@@ -136,8 +136,14 @@ class FieldMedium:
 
     @property
     def occupancy(self) -> Occupancy | None:
-        """The field's occupancy grid, which changes with its weights."""
+        """The field's occupancy grid, which changes with its weights; the voxels of a compiled field in a box."""
+        if self.field.voxels is not None and not self.field.box.is_contracted:
+            return self.field.voxels
         return self.field.occupancy
+
+    @property
+    def is_density_separate(self) -> bool:
+        return self.field.voxels is not None
 
     @property
     def feature_count(self) -> int:

@@ -13,7 +13,7 @@ from nerg_mi.maths.arrays import log1p, quotient
 from nerg_mi.maths.types import Bool, Color, Float, UInt32
 
 from .medium import Hits, LastHit, LocalRay, Medium, Occupancy, SampleShader, VoxelCells
-from .quadrature import RULES, absorbed_fraction, cells_for_rule
+from .quadrature import RULES, absorbed_fraction, cells_for_rule, shade_point
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -65,6 +65,10 @@ DEFAULT_HITS_STOP = 1e-4
 """Transmittance at which the rasteriser of Gaussian splats stops (Kerbl et al. 2023)."""
 
 
+SEPARATE_COLOR_CUTOFF = 0.1
+"""Default colour cut-off of a medium whose density takes much less time than its colour: a compiled field."""
+
+
 @dataclass(frozen=True)
 class MarchSettings:
     """Settings of a march; lengths in scene units. The defaults are those of the integrator ``nerg``."""
@@ -108,6 +112,13 @@ def default_dt_gamma(medium: Medium | None) -> float:
 def default_stop(medium: Medium | None) -> float:
     """Default of `MarchSettings.stop`; media of discrete hits use the value of 3DGS renderers and trainers."""
     return MarchSettings.stop if medium is None or medium.hits is None else DEFAULT_HITS_STOP
+
+
+def default_color_cutoff(medium: Medium | None) -> float:
+    """Default of `MarchSettings.color_cutoff`: higher for a medium whose colour takes most of the time."""
+    if medium is None or not medium.is_density_separate:
+        return MarchSettings.color_cutoff
+    return SEPARATE_COLOR_CUTOFF
 
 
 def kahan_add(total: Float, compensation: Float, term: Float) -> tuple[Float, Float]:
@@ -313,6 +324,9 @@ def skip_empty_cells(
         Length of that step as a fraction of a full one.
     """
     o, d = medium.to_unit(ray.o), medium.vector_to_unit(ray.d)
+    # Cells per distance and their inverse along each axis: divisions would take most of the time of a skip.
+    rates = [c * n for c, n in zip((d.x, d.y, d.z), grid.cells)]
+    inverses = [dr.select(rate != 0, dr.rcp(dr.select(rate != 0, rate, 1)), 0) for rate in rates]
 
     def body(seeking, t, share):
         full = step_length(t, settings, fine_from)
@@ -323,10 +337,10 @@ def skip_empty_cells(
         # All cells at a chessboard distance below k are empty: a box of 2k - 1 cells.
         radius = type(t)(k) - 1
         gap = type(t)(dr.inf)
-        for uc, dc, cells in zip((u.x, u.y, u.z), (d.x, d.y, d.z), grid.cells):
-            low = dr.floor(uc * cells) - radius
-            wall = dr.select(dc > 0, low + 2 * radius + 1, low) - uc * cells
-            gap = dr.minimum(gap, dr.select(dc != 0, wall / dr.select(dc != 0, dc * cells, 1), dr.inf))
+        for c, n, rate, inverse in zip((u.x, u.y, u.z), grid.cells, rates, inverses):
+            low = dr.floor(c * n) - radius
+            wall = dr.select(rate > 0, dr.fma(2, radius, low) + 1, low) - c * n
+            gap = dr.minimum(gap, dr.select(rate != 0, wall * inverse, dr.inf))
         # Skip every step whose midpoint certainly lies in that box. The midpoint of the next step is half a step behind
         # the end of this one; at least this step is skipped.
         num_skipped = dr.maximum(dr.floor((middle + gap - t - step) / full + 0.5), 0)
@@ -397,6 +411,51 @@ class _StepState:
     # Weight of the samples that have not been shaded yet; None without a shader.
     pending: Any
     result: MarchResult
+    # Samples to shade behind the march; None if each one is shaded in its step.
+    samples: Any = None
+
+
+_SLOTS = 4  # Samples of a ray that are shaded behind the march; 98 of 100 rays of the demo store have no more
+
+
+@dataclass
+class _ShadedSamples:
+    """Samples of rays whose colour takes much more time than their density.
+
+    Neighbouring rays reach their surfaces in different steps. Shaded in its step, a sample takes the time of a packet
+    of samples; behind the march, the first samples of all rays are shaded together, then the second ones, and so on.
+    """
+
+    count: UInt32
+    distance: list[Float]
+    weight: list[Float]
+
+    @staticmethod
+    def zero(Float: type) -> _ShadedSamples:
+        UInt32: Any = dr.uint32_array_t(Float)
+        return _ShadedSamples(UInt32(0), [Float(0)] * _SLOTS, [Float(0)] * _SLOTS)
+
+    def add(self, active: Bool, distance: Float, weight: Float) -> _ShadedSamples:
+        """Add a sample; the last slot collects the weights of all further ones."""
+        slot = dr.minimum(self.count, _SLOTS - 1)
+        distances, weights = [], []
+        for k, (d, w) in enumerate(zip(self.distance, self.weight)):
+            here = active & (slot == k)
+            distances.append(dr.select(here & (w == 0), distance, d))
+            weights.append(w + dr.select(here, weight, 0))
+        return _ShadedSamples(dr.select(active, slot + 1, self.count), distances, weights)
+
+    def shade(self, medium: Medium, ray: LocalRay, shader: SampleShader) -> Color:
+        """Weighted sum of the contributions of all samples."""
+
+        def body(k: UInt32, total: Color) -> tuple[UInt32, Color]:
+            lit = k < self.count
+            pick = lambda values: cast("Float", sum(dr.select(k == i, v, 0) for i, v in enumerate(values)))
+            color = shade_point(medium, ray, pick(self.distance), shader, lit)
+            return k + 1, total + dr.select(lit, pick(self.weight) * color, 0)
+
+        first = dr.zeros(type(self.count), dr.width(self.count))
+        return dr.while_loop((first, shader.zero()), lambda k, _: k < self.count, body, label="colours")[1]
 
 
 def march_primal(ray: LocalRay, t0: Float, t1: Float, request: MarchRequest) -> MarchResult:
@@ -415,7 +474,7 @@ def march_primal(ray: LocalRay, t0: Float, t1: Float, request: MarchRequest) -> 
         active, t, delta, t_next = next_step(
             medium, ray, state.t, t1, fraction, settings, state.active, cells, fine_from
         )
-        result, tau, pending = replace(state.result), state.result.tau, state.pending
+        result, tau, pending, samples = replace(state.result), state.result.tau, state.pending, state.samples
         if occlusion is not None:
             active = result.record_decided(occlusion.is_clear(t, tau), active)
         step = quadrature.step(medium, ray, t, delta, t_next, state.carry, active, color is not None)
@@ -427,10 +486,13 @@ def march_primal(ray: LocalRay, t0: Float, t1: Float, request: MarchRequest) -> 
             shader = color
             pending = pending + weight
             shaded = active & (pending > settings.color_cutoff)
-            contribution = dr.if_stmt(
-                (shaded,), shaded, lambda lit: step.shade(shader, lit), lambda lit: shader.zero(), label="colour"
-            )
-            result.color = result.color + pending * contribution
+            if samples is None:
+                contribution = dr.if_stmt(
+                    (shaded,), shaded, lambda lit: step.shade(shader, lit), lambda lit: shader.zero(), label="colour"
+                )
+                result.color = result.color + pending * contribution
+            else:
+                samples = samples.add(shaded, step.color_distance, pending)
             pending = dr.select(shaded, 0, pending)
             if result.color_evals is not None:
                 result.color_evals = result.color_evals + dr.select(shaded, 1, 0)
@@ -439,7 +501,8 @@ def march_primal(ray: LocalRay, t0: Float, t1: Float, request: MarchRequest) -> 
         if occlusion is not None:
             active = result.record_decided(occlusion.is_hidden(t_next, result.tau), active)
         active = active & (t_next < t1) & (result.tau < end)
-        return (_StepState(active, t_next, None if state.fraction is None else Float(1), step.carry, pending, result),)
+        fraction = None if state.fraction is None else Float(1)
+        return (_StepState(active, t_next, fraction, step.carry, pending, result, samples),)
 
     start = _StepState(
         request.active,
@@ -449,10 +512,13 @@ def march_primal(ray: LocalRay, t0: Float, t1: Float, request: MarchRequest) -> 
         quadrature.init_carry(Float),
         None if color is None else Float(0),
         request.init_result(Float),
+        _ShadedSamples.zero(Float) if color is not None and medium.is_density_separate else None,
     )
     (state,) = dr.while_loop((start,), lambda state: state.active, body, label="march")
     result = state.result
     if color is not None:
+        if state.samples is not None:
+            result.color = state.samples.shade(medium, ray, color)
         # Samples whose total weight stayed below the cut-off take the mean colour of the others.
         shaded_weight = absorbed_fraction(result.tau) - state.pending
         result.color *= dr.select(

@@ -268,6 +268,12 @@ class Medium(Protocol):
         ...
 
     @property
+    def is_density_separate(self) -> bool:
+        """Whether ``density`` takes much less time than ``density_features``. Features are then only evaluated at the
+        samples that are shaded."""
+        ...
+
+    @property
     def length_scale(self) -> float:
         """Diagonal of the bounding box in scene units."""
         ...

@@ -248,6 +248,8 @@ class MarchStep:
     carry: Any
     # Number of density evaluations.
     evals: Float
+    # Distance in scene units of the point whose colour `shade` takes.
+    color_distance: Float
 
 
 class QuadratureRule(Protocol):
@@ -358,14 +360,22 @@ def _step_along_line(
 ) -> MarchStep:
     """A step of optical depth ``dtau`` whose density changes linearly from ``first`` to ``last``."""
     share = linear_mean_depth_fraction(first * delta, last * delta)
-
-    def paint(painter, lit):
-        p = ray.o + ray.d * dr.fma(delta, color_sample_fraction(first, last, share), t)
-        return painter.shade(medium, medium.density_features(p, lit)[1], p, ray.w, lit)
-
+    color_distance = dr.fma(delta, color_sample_fraction(first, last, share), t)
     return MarchStep(
-        dtau, share, lambda missing: find_linear_crossing(first, last, delta, missing), paint, carry, evaluations
+        dtau,
+        share,
+        lambda missing: find_linear_crossing(first, last, delta, missing),
+        lambda painter, lit: shade_point(medium, ray, color_distance, painter, lit),
+        carry,
+        evaluations,
+        color_distance,
     )
+
+
+def shade_point(medium: Medium, ray: LocalRay, distance: Float, shader: SampleShader, active: Bool) -> Color:
+    """Contribution of the point at ``distance`` on ``ray``, whose features are evaluated for it alone."""
+    p = ray.o + ray.d * distance
+    return shader.shade(medium, medium.density_features(p, active)[1], p, ray.w, active)
 
 
 class Constant:
@@ -379,11 +389,15 @@ class Constant:
         return None
 
     def step(self, medium, ray, t, delta, t_next, carry, active, needs_color) -> MarchStep:
-        p = ray.o + ray.d * (t + 0.5 * delta)
-        sigma, features = medium.density_features(p, active) if needs_color else (medium.density(p, active), [])
+        middle = t + 0.5 * delta
+        p = ray.o + ray.d * middle
+        together = needs_color and not medium.is_density_separate
+        sigma, features = medium.density_features(p, active) if together else (medium.density(p, active), None)
         dtau = dr.select(active, sigma * delta, 0)
 
         def paint(painter, lit):
+            if features is None:
+                return shade_point(medium, ray, middle, painter, lit)
             return painter.shade(medium, features, p, ray.w, lit)
 
         return MarchStep(
@@ -393,6 +407,7 @@ class Constant:
             paint,
             None,
             dr.select(active, type(dtau)(1), 0),
+            middle,
         )
 
 

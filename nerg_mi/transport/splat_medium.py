@@ -333,6 +333,7 @@ class SplatMedium:
     has_color = True
     is_deferred = False
     feature_count = 0
+    is_density_separate = False
     default_dt_gamma = 0.0
     occupancy = None
     cells = None

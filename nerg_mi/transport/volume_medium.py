@@ -31,6 +31,7 @@ class VolumeMedium:
 
     color_space = "spectrum"
     feature_count = 0
+    is_density_separate = False
     hits = None
 
     def __init__(self, density: mi.Volume, color: mi.Volume | None = None):

@@ -196,6 +196,7 @@ CASES = (
     ),
     Case("import", "{i}/nerg.pth -o {o}/a.safetensors -g {o}/g.safetensors", ("a.safetensors", "g.safetensors")),
     Case("refine", "{i}/full.safetensors -o {o}/a.safetensors", ("a.safetensors",)),
+    Case("compile", "{i}/full.safetensors -o {o}/a.safetensors --resolution 16", ("a.safetensors",)),
     Case("export mesh", "{i}/field.safetensors -o {o}/a.ply --resolution 8 --density 3", ("a.ply",)),
     Case("export mesh", "{i}/field.safetensors -o {o}/a.glb --resolution 8 --density 3", ("a.glb",)),
     Case("export points", "{i}/field.safetensors -o {o}/a.ply --resolution 8 --density 3", ("a.ply",)),

@@ -13,8 +13,9 @@ import pytest
 import trimesh
 
 from nerg_mi.fields.occupancy import OccupancyGrid
+from nerg_mi.files.atomic import file_sha256
 from nerg_mi.formats.checkpoint import read_checkpoint, read_metadata
-from nerg_mi.formats.fields import load_gaze, load_radiance
+from nerg_mi.formats.fields import load_gaze, load_radiance, matches_checksum
 from nerg_mi.formats.torch_files import write_torch
 from nerg_mi.workflows.gaze_commands import GazeOptions
 from tests.evaluation.test_gaze import crowd
@@ -215,6 +216,34 @@ def test_a_field_is_exported_in_each_format(tmp_path, nerg):
     pytest.importorskip("skimage")
     assert "around holes" in export("mesh", "m.glb", "--resolution", 16, "--density", 3)
     assert len(trimesh.load(tmp_path / "m.glb", force="mesh").faces) > 100
+
+
+def test_a_compiled_field_states_its_errors(tmp_path, nerg):
+    radiance(tmp_path / "f.safetensors", density_scale=5.0)
+    ended = nerg("compile", tmp_path / "f.safetensors", "-o", tmp_path / "g.safetensors", "--resolution", "64")
+    assert ended.code == 0 and "64 cells" in ended.out and " dB" in ended.out
+    meta = read_metadata(tmp_path / "g.safetensors")
+    assert meta["provenance"]["compiled"]["resolution"] == meta["voxels"]["resolution"] == 64
+    assert matches_checksum(tmp_path / "g.safetensors", file_sha256(tmp_path / "f.safetensors"))
+    for options, words in (
+        (["--resolution", "60"], "multiple of 8"),
+        (["--resolution", "256", "--memory", "1"], "--memory"),
+    ):
+        ended = nerg("compile", tmp_path / "f.safetensors", "-o", tmp_path / "h.safetensors", *options)
+        assert ended.code == 1 and words in ended.err and not (tmp_path / "h.safetensors").exists()
+    ended = nerg("compile", tmp_path / "g.safetensors", "-o", tmp_path / "h.safetensors")
+    assert ended.code == 1 and "compiled already" in ended.err
+
+
+def test_a_compiled_field_is_as_accurate_as_requested(tmp_path, nerg):
+    radiance(tmp_path / "f.safetensors", density_scale=5.0)
+    loose, strict = (
+        nerg("compile", tmp_path / "f.safetensors", "-o", tmp_path / "g.safetensors", *options)
+        for options in (["--min-psnr", "10", "--max-depth-error", "1"], ["--memory", "300", "--min-psnr", "100"])
+    )
+    assert loose.code == strict.code == 0
+    assert "256 cells" in loose.out and "512 cells" not in loose.out
+    assert "512 cells" in strict.out or "256" in strict.err
 
 
 def test_a_refined_field_is_reported(tmp_path, nerg):

@@ -337,6 +337,7 @@ class Colored:
     """Density and colour that depend on z only: ``density(z, x)``, ``color(z)``; ``x`` carries the gradients."""
 
     occupancy = cells = step = hits = None
+    is_density_separate = False
 
     def __init__(self, density, color, x):
         self._density, self._color, self.x = density, color, x
@@ -538,6 +539,7 @@ class Simpson:
             lambda painter, lit: painter.shade(medium, medium.density_features(p, lit)[1], p, ray.w, lit),
             None,
             dr.select(active, 3.0, 0.0),
+            t + 0.5 * delta,
         )
 
 
