@@ -20,9 +20,12 @@ from nerg_mi.statistics.visits import (
     Cell,
     HitAssignment,
     VisitRules,
+    Visits,
     VisitSums,
     assign_hits,
     concatenate_hits,
+    find_visits,
+    make_timeline,
     merge_directions,
     merge_members,
     sample_cone,
@@ -177,6 +180,16 @@ def count_block(rays: Rays, context: AoiContext) -> VisitSums:
     return sum_visits(
         rays, hits, context.names, cells, context.rules, context.visibility(rays), context.transition_areas
     )
+
+
+def find_area_visits(rays: Rays, context: AoiContext) -> dict[str, Visits]:
+    """Return the visits of each area by its name; ``first`` are indices of ``rays``."""
+    order = argsort_by_person_time(rays)
+    sorted_rays = rays if order is None else rays.select(order)
+    timeline = make_timeline(sorted_rays.person, sorted_rays.t, context.rules)
+    hits = context.assign_hits(sorted_rays)
+    visits = [find_visits(np.sort(rows), timeline, context.rules) for rows in hits.rows]
+    return {name: v if order is None else replace(v, first=order[v.first]) for name, v in zip(context.names, visits)}
 
 
 def iter_blocks(

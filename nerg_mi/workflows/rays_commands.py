@@ -3,10 +3,11 @@
 ``nerg rays show``: Print a data-quality report: rays, persons, duration, rate, dropped rows, extent, eye height.
 ``nerg rays filter``: Select rays by conditions, detect fixations, and thin out stationary periods.
 ``nerg rays split``: Split rays into disjoint training and test sets by position, participant or time.
+``nerg rays export``: Write rays in a format of other programs: a BIDS dataset with gaze, fixations and visits.
 ``nerg rays plot``: Plot a floor plan of recorded positions, as densities or as the layout of a split.
 ``nerg align``: Register tracking with a scene: find the similarity from the rays' frame to the scene's.
 
-Options of these commands. The workflows are in `.rays` and `.align`.
+Options of these commands. The workflows are in `.rays`, `.rays_export` and `.align`.
 """
 
 from __future__ import annotations
@@ -21,11 +22,13 @@ from nerg_mi.ranges import COORDINATES, LENGTHS, RAYS, SECONDS, SEEDS, THREADS, 
 
 from .base import Parameter, argument, declare, extra, out
 from .options import (
+    ALIGN_HELP,
     ANALYSIS,
     INPUT,
     OUTPUT,
     PERFORMANCE,
     TEST,
+    best_variant,
     coordinates,
     cpu_threads,
     llvm_variant,
@@ -34,6 +37,7 @@ from .options import (
 )
 
 DETECTORS = ("ivt", "idt")
+EXPORT_FORMATS = ("bids",)
 DATASET = ".rays"
 """Suffix by which a written dataset is recognised; any other name is that of a file."""
 PLANS = ("density", "layout")
@@ -307,6 +311,41 @@ class PlotOptions(ValidatedDataclass):
             raise NergError("--test applies to layouts only; add --kind layout")
 
 
+@dataclass(frozen=True, kw_only=True)
+class RaysExportOptions(ValidatedDataclass):
+    """What is written next to the rays. Raises `NergError` for an unknown format or detector."""
+
+    format: str = option("bids", "Format: bids (a folder, BIDS 1.11).", group=OUTPUT)
+    task: str = option("gaze", "Label of the task in the file names: letters and digits.", group=OUTPUT)
+    title: str = option("Gaze in the world", "Name of the dataset.", group=OUTPUT)
+    fixations: str = option(
+        "ivt",
+        "Detector of the fixations among the events: ivt (velocity threshold), idt (dispersion threshold) or none.",
+        group=ANALYSIS,
+    )
+    aois: Path | None = option(
+        None,
+        "JSON file of areas of interest (AOIs), whose visits are among the events.  [default: no visits]",
+        group=INPUT,
+    )
+    scene: Path | None = option(
+        None,
+        "Scene (.xml) whose surfaces rays end on, for the visits.  [default: rays end at their hit points]",
+        group=INPUT,
+    )
+    align: Path | None = option(None, ALIGN_HELP, group=INPUT)
+    mode: str | None = best_variant()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.format not in EXPORT_FORMATS:
+            raise NergError(f'--format must be {" or ".join(EXPORT_FORMATS)}, got "{self.format}"')
+        if self.fixations not in (*DETECTORS, "none"):
+            raise NergError(f'--fixations must be ivt, idt or none, got "{self.fixations}"')
+        if self.aois is None and (self.scene is not None or self.align is not None):
+            raise NergError("--scene and --align are for the visits of AOIs; add --aois, or leave them out")
+
+
 def _reader_parameters() -> Mapping[str, Parameter]:
     """Return the options of all registered readers."""
     from nerg_mi.rays.readers.registry import collect_shared_options, list_preset_names
@@ -364,6 +403,14 @@ declare(
     without=("train_output", "test_output"),
     rays=_RAYS_FILE,
     output=out("Rays file; -train and -test are inserted before its suffix."),
+)
+
+declare(
+    "rays export",
+    "nerg_mi.workflows.rays_export:export_rays",
+    options=RaysExportOptions,
+    rays=_RAYS_FILE,
+    output=out("Folder of the BIDS dataset to write; it must not exist or be empty."),
 )
 
 declare(

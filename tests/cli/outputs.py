@@ -35,6 +35,10 @@ ABLATION = (
     "ablation.md ablation.csv ablation.json ablation.png place.vol "
     "default_emit_capture_0.safetensors default_emit_capture_0.json"
 )
+BIDS = "README dataset_description.json participants.json participants.tsv task-gaze_physio.json "
+BIDS += " ".join(
+    f"sub-{p}/beh/sub-{p}_task-gaze_recording-eye1_physio{suffix}" for p in "abcd" for suffix in (".json", ".tsv.gz")
+)
 EVALUATION = "gaze.md gaze.csv persons.csv gaze.json positions.csv positions.png"
 STATS = "aois.csv aois.md transitions.csv transitions.md durations.csv durations.md participants.csv participants.md "
 STATS += "aois.png transitions.png "
@@ -50,13 +54,15 @@ class Case:
 
     ``line``: the command line, with the folders ``{i}`` of the inputs and ``{o}`` of the outputs. ``files``: all files
     that it writes to ``{o}``. ``blocked``: outputs that an existing file or folder can block, which is reported before
-    any work. ``once``: functions that take seconds and write nothing."""
+    any work. ``once``: functions that take seconds and write nothing. ``needs_new_folder``: whether the output is a
+    folder that must not have any files."""
 
     name: str
     line: str
     files: tuple[str, ...]
     blocked: tuple[str, ...] = ()
     once: tuple[str, ...] = ()
+    needs_new_folder: bool = False
 
     def arguments(self, inputs: Path, out: Path) -> list[str]:
         """The command line for these folders."""
@@ -126,6 +132,7 @@ CASES = (
     ),
     Case("rays filter", "{i}/rays.npz -o {o}/a.npz --person a", ("a.npz",)),
     Case("rays filter", "{i}/rays.npz -o {o}/a.parquet --person a", ("a.parquet",)),
+    Case("rays export", "{i}/rays.npz -o {o}/bids", _below("bids", BIDS), ("bids",), needs_new_folder=True),
     Case("rays split", "{i}/rays.npz -o {o}/a.npz --people 0.5", ("a-train.npz", "a-test.npz")),
     Case("rays plot", "{i}/rays.npz -o {o}/a.png", ("a.png",)),
     Case(

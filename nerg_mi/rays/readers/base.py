@@ -175,6 +175,7 @@ class RaysBuilder:
         also_used: Sequence[str] = (),
         header: Sequence[str] | None = None,
         first_line: int = 1,
+        separator: str = ",",
         clocks: Mapping[str, float] | None = None,
     ) -> Iterator[TableBlock]:
         """Read a table of the current source in blocks (`iterate_table`); records unreadable lines and unused columns.
@@ -184,7 +185,7 @@ class RaysBuilder:
         used = {*numbers, *texts, *also_used}
         available = read_table_columns(path) if header is None else header
         self.add_unused_columns(name for name in available if name and name not in used)
-        settings = {"first_line": first_line, "clocks": clocks, "on_note": self.add_metadata}
+        settings = {"first_line": first_line, "separator": separator, "clocks": clocks, "on_note": self.add_metadata}
         return iterate_table(path, numbers, texts, header, self.on_bad_line, **settings)
 
     def read_all(self, path: Path, numbers: Sequence[str]) -> np.ndarray:

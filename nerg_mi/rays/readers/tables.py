@@ -59,6 +59,7 @@ def iterate_table(
     on_bad_line: BadLineCallback | None = None,
     *,
     first_line: int = 1,
+    separator: str = ",",
     clocks: Mapping[str, float] | None = None,
     on_note: Callable[..., None] | None = None,
 ) -> Iterator[TableBlock]:
@@ -74,6 +75,8 @@ def iterate_table(
         Columns to read as numbers and as text.
     header
         Names of the columns of a CSV without a header, whose data start at ``first_line``.
+    separator
+        Separator of a CSV without a header.
     on_bad_line
         Called with each unreadable line, which is skipped. Without it such a line is an error.
     clocks
@@ -100,8 +103,9 @@ def iterate_table(
         skip = max(0, first_line - 1 - count)
         raw, count = raw[skip:], count + min(skip, len(raw))
         if layout is None and raw:
-            columns, separator = (list(header), ",") if header is not None else _parse_header(path, raw[0])
+            columns = list(header or ())
             if header is None:
+                columns, separator = _parse_header(path, raw[0])
                 raw, count = raw[1:], count + 1
             check_columns(path, [*numbers, *texts], columns)
             number_at, text_at = ([columns.index(name) for name in names] for names in (numbers, texts))
@@ -278,12 +282,13 @@ def _convert(
     too_long = layout.text_at and len(rows) * max(map(len, rows)) > _MAX_TEXT_BLOCK
     if too_long or layout.decimal != "." or layout.clocks or not all(_has_all_cells(row, layout) for row in rows):
         return _convert_slowly(path, rows, lines, layout, on_bad_line)
-    # Empty cells are common (gaze without a hit), but NumPy's fast parser rejects them: write nan into them first.
+    # Empty cells and n/a are common (gaze without a hit), but NumPy's fast parser rejects them: write nan instead.
     gap = layout.separator * 2
     completed_rows = rows
     if any(gap in row for row in rows):
         spelt = f"{layout.separator}nan{layout.separator}"
         completed_rows = [r.replace(gap, spelt).replace(gap, spelt) if gap in r else r for r in rows]
+    completed_rows = [r.replace("n/a", "nan") if "n/a" in r else r for r in completed_rows]
     load = lambda lines, places, kind: np.loadtxt(
         lines, usecols=places, dtype=kind, delimiter=layout.separator, comments=None, quotechar='"', ndmin=2
     )

@@ -379,6 +379,7 @@ def write_walk(path: Path) -> None:
     write_skeleton(path, ["ann", "bo"] * 3, np.arange(6), body, decimals=2)
 
 
+BIDS_RAY = [f"{name}_{axis}" for name in ("origin", "direction") for axis in "xyz"]
 MAP = "origin=x,y,z direction=a,b,c t=t person=who confidence=conf hit=h,i,j"
 TABLE = lines(
     "t,who,x,y,z,a,b,c,conf,h,i,j".split(","),
@@ -418,6 +419,22 @@ _ARIA_VARIANTS = {
     "generalized_gaze.csv": lines(_ARIA_VERGENCE, lambda k: [9000 * k, 0.1, 0.12, -0.2, 1.5]),
     "eyegaze.csv": lines(
         [*_ARIA_GEN2, *_ARIA_EYES], lambda k: [9000 * k, 0.1, -0.2, -0.2, -0.2, 0.03, 0, 0, -0.03, 0, 0]
+    ),
+}
+_BIDS_GAZE = {
+    "PhysioType": "eyetrack",
+    "RecordedEye": "cyclopean",
+    "SampleCoordinateSystem": "gaze-in-world",
+    "WorldCoordinateSystem": {"UpAxis": "y", "Handedness": "left", "FloorHeight": 0},
+    "timestamp": {"Units": "ms"},
+    "origin_x": {"Units": "mm"},
+    "Columns": ["timestamp", "x_coordinate", "y_coordinate", *BIDS_RAY, "confidence", "pupil_size"],
+}
+BIDS = {
+    "dataset_description.json": json.dumps({"Name": "Walk", "BIDSVersion": "1.11.1"}),
+    "task-walk_physio.json": json.dumps(_BIDS_GAZE),
+    "sub-ann_task-walk_recording-eye1_physio.tsv.gz": lines(
+        None, lambda k: [20 * k, "n/a", "n/a", 10 * k, 1600, 0, 0, 0.1, 1, 0.9, "n/a"], "\t"
     ),
 }
 VARIANTS = {"aria": [Example(_ARIA_POSES | {name: text}) for name, text in _ARIA_VARIANTS.items()]}
@@ -494,6 +511,7 @@ EXAMPLES = {
             )
         }
     ),
+    "bids": Example(BIDS),
     "neon": Example(NEON, _SCENE),
     "tobii3": Example(TOBII, _SCENE),
     "glassestools": Example(GLASSESTOOLS, _SCENE),

@@ -149,7 +149,8 @@ def test_options_of_another_reader():
 
 def test_options_of_several_readers(made_up):
     shared = {o.name: o for o in registry.collect_shared_options()}
-    assert shared["up"].help == "Up axis: x, y, z, -x, -y or -z.  [default: z; c3d: the file's, or z; motive, pupil: y]"
+    defaults = "z; bids: that of the dataset; c3d: the file's, or z; motive, pupil: y"
+    assert shared["up"].help == f"Up axis: x, y, z, -x, -y or -z.  [default: {defaults}]"
     confidence = shared["min_confidence"].help
     assert confidence.startswith("Drop rows below this confidence.  [default: 0; ") and "pupil: 0.6" in confidence
     assert shared["marker"].help == "pupil: Edge of a tracking marker in metres."
