@@ -16,7 +16,7 @@ from nerg_mi.figures import maps, style
 from nerg_mi.figures.style import existing_files, make_provenance
 from nerg_mi.files.atomic import check_new_folder, check_writable, create_folder_atomically
 from nerg_mi.files.tables import write_json
-from nerg_mi.rays import filters
+from nerg_mi.rays import events, filters
 from nerg_mi.rays.dataset import (
     BYTES_PER_RAY,
     MAX_LOADED_RAYS,
@@ -90,7 +90,7 @@ class FilterSteps:
 
     def _fixations(self, options: FilterOptions) -> int:
         by_velocity = options.fixations == "ivt"
-        detect = filters.detect_fixations_ivt if by_velocity else filters.detect_fixations_idt
+        detect = events.detect_fixations_ivt if by_velocity else events.detect_fixations_idt
         threshold = {"velocity": options.velocity_threshold}
         if not by_velocity:
             threshold = {"dispersion": options.dispersion_threshold}
@@ -112,7 +112,7 @@ class FilterSteps:
     def _replace(self, label: np.ndarray, settings: dict[str, Any]) -> None:
         """Replace the rays by one ray for each fixation."""
         before = len(self.rays)
-        rays = filters.average_fixations(self.rays, label)[0] if before else self.rays
+        rays = events.average_fixations(self.rays, label)[0] if before else self.rays
         self._reporter.message(f"fixations: mean rays, {len(rays):,} of {before:,} rays")
         self._apply(rays, FilterStep("fixations", len(rays), before, settings))
 

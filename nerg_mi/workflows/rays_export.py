@@ -17,7 +17,7 @@ from nerg_mi.aoi.predicted import load_aoi_scene
 from nerg_mi.errors import NergError
 from nerg_mi.files.atomic import check_new_folder
 from nerg_mi.formats.areas import read_areas
-from nerg_mi.rays import filters
+from nerg_mi.rays import events as detection
 from nerg_mi.rays.bids import BidsEvents, write_bids
 from nerg_mi.rays.dataset import load_rays
 from nerg_mi.rays.rays import Rays
@@ -79,11 +79,11 @@ def export_rays(
 
 def _find_fixations(rays: Rays, detector: str) -> BidsEvents:
     """Fixations, with the mean point of regard and the mean direction."""
-    detect = filters.detect_fixations_ivt if detector == "ivt" else filters.detect_fixations_idt
+    detect = detection.detect_fixations_ivt if detector == "ivt" else detection.detect_fixations_idt
     label = detect(rays)
     if not (label >= 0).any():
         return _events(rays, np.zeros(0, np.int64), np.zeros(0), np.zeros(0), "fixation")
-    means, duration = filters.average_fixations(rays, label)
+    means, duration = detection.average_fixations(rays, label)
     rows = np.flatnonzero(label >= 0)
     rows = rows[np.lexsort((rays.t[rows], label[rows]))]
     first = rows[np.unique(label[rows], return_index=True)[1]]

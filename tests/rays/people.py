@@ -1,4 +1,4 @@
-"""Synthetic participants for tests of the checks of rays."""
+"""Synthetic participants for tests of the checks, filters and events of rays."""
 
 from dataclasses import replace
 
@@ -63,3 +63,10 @@ def change(rays, rows, **columns):
         new[name] = getattr(rays, name).copy()
         new[name][rows] = value(new[name][rows]) if callable(value) else value
     return replace(rays, **new)
+
+
+def some_rays(n, **columns):
+    """Rays of one person at the origin who looks along x, except for ``columns``."""
+    ahead = np.tile([1.0, 0, 0], (n, 1))
+    values = {"t": np.arange(n) * 0.1, "person": np.zeros(n), "origin": np.zeros((n, 3)), "direction": ahead}
+    return Rays(**{**values, "persons": ("ann", "bo"), "confidence": np.ones(n), **columns})

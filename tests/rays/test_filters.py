@@ -1,6 +1,5 @@
 """Tests of `nerg_mi.rays.filters`."""
 
-import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -12,10 +11,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.probes.probes import place_probes
 from nerg_mi.rays import filters
 from nerg_mi.rays.filters import (
-    average_fixations,
     combine_splits,
-    detect_fixations_idt,
-    detect_fixations_ivt,
     find_frozen_gaze,
     find_sessions,
     label_stays,
@@ -28,16 +24,9 @@ from nerg_mi.rays.filters import (
     thin_mask,
 )
 from nerg_mi.rays.rays import Rays
-from tests.rays.people import change, watch
+from tests.rays.people import change, some_rays, watch
 
 # ---- Filters ----
-
-
-def some_rays(n, **columns):
-    """Rays of one person at the origin who looks along x, except for ``columns``."""
-    ahead = np.tile([1.0, 0, 0], (n, 1))
-    values = {"t": np.arange(n) * 0.1, "person": np.zeros(n), "origin": np.zeros((n, 3)), "direction": ahead}
-    return Rays(**{**values, "persons": ("ann", "bo"), "confidence": np.ones(n), **columns})
 
 
 def walk(origin, **columns):
@@ -128,141 +117,6 @@ def test_stays_at_the_limits():
     t = np.array([0, 1, 2, 3.25])
     assert label_stays(walk(line(np.zeros(4)), t=t), gap=1.0).tolist() == [0, 0, 0, 1]
     assert label_stays(walk(line(np.array([0, 0.5, -0.5, 0.75])), t=t * 0), distance=0.5).tolist() == [0, 0, 0, 1]
-
-
-# ---- Fixations ----
-
-
-def gaze(azimuth, elevation=0.0, dt=0.02, **columns):
-    """Rays of a person whose gaze turns by degrees at steps of ``dt`` seconds."""
-    a, e = np.broadcast_arrays(np.radians(np.asarray(azimuth, float)), np.radians(elevation))
-    d = np.stack([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)], axis=1)
-    return some_rays(len(d), **{"t": np.arange(len(d)) * dt, "direction": d, **columns})
-
-
-# Ten rays at 0 degrees, a saccade of two, ten at 20, one at 40, ten at 60: 50 Hz.
-SEQUENCE = [*[0] * 10, 8, 16, *[20] * 10, 40, *[60] * 10]
-
-WANT = np.array([*[0] * 10, -1, -1, *[1] * 10, -1, *[2] * 10])
-
-
-def test_ivt_by_hand():
-    label = detect_fixations_ivt(gaze(SEQUENCE), velocity=100)
-    # A ray belongs to the run that its step leads to: the first of a run follows a fast step.
-    assert label.tolist() == WANT.tolist()
-    # 8 degrees in 0.02 s are 400 per second: a higher limit joins the first two.
-    assert len(set(detect_fixations_ivt(gaze(SEQUENCE), velocity=450)) - {-1}) == 2
-    # Nine steps of 0.02 s are 0.18 s.
-    assert (detect_fixations_ivt(gaze(SEQUENCE), velocity=100, min_duration=0.19) == -1).all()
-
-
-def test_idt_by_hand():
-    assert detect_fixations_idt(gaze(SEQUENCE), dispersion=1.0).tolist() == WANT.tolist()
-    # Within five degrees, 16 joins 20.
-    assert detect_fixations_idt(gaze(SEQUENCE), dispersion=5.0).tolist() == [*WANT[:11], 1, *WANT[12:]]
-    # A slow drift of half a degree per ray: I-VT finds no end, I-DT ends it every seven rays (3 degrees).
-    drift = gaze(0.5 * np.arange(28))
-    assert (
-        detect_fixations_idt(drift, dispersion=3.01).tolist() == [k // 7 for k in range(28)]
-        and (detect_fixations_ivt(drift) == 0).all()
-    )
-    # Horizontal and vertical ranges are added.
-    both = gaze(0.5 * np.arange(28), 0.5 * np.arange(28))
-    assert detect_fixations_idt(both, dispersion=3.05, min_duration=0.04).tolist() == [k // 4 for k in range(28)]
-
-
-@pytest.mark.parametrize("degrees, parts", [(2.9, 1), (3.1, 2)])
-def test_dispersion_at_the_zenith(degrees, parts):
-    """Dispersion also works for vertical gaze, which has no horizontal axis of its own."""
-    up = gaze(np.zeros(10), 90 - np.r_[np.zeros(5), np.full(5, degrees)])
-    assert len(set(detect_fixations_idt(up, dispersion=3.0, min_duration=0.04))) == parts
-
-
-@pytest.mark.parametrize("elevation", [0.0, 60.0, -85.0])
-def test_dispersion_is_measured_on_the_sphere(elevation):
-    # For steep gaze a degree of azimuth is shorter: 3 degrees of arc are one fixation, 4 are not.
-    arc = lambda degrees: gaze(np.linspace(0, degrees / np.cos(np.radians(elevation)), 12), elevation)
-    assert (detect_fixations_idt(arc(2.0), dispersion=3.0) == 0).all() and len(
-        set(detect_fixations_idt(arc(6.0), dispersion=3.0, min_duration=0.04))
-    ) > 1
-
-
-@settings(max_examples=30, deadline=None)
-@given(st.integers(0, 2**32 - 1))
-def test_idt_by_definition(seed):
-    rng = np.random.default_rng(seed)
-    n = int(rng.integers(1, 120))
-    azimuth = np.cumsum(rng.choice([0.2, 6.0], n, p=[0.9, 0.1]) * rng.choice([-1, 1], n))
-    label = detect_fixations_idt(gaze(azimuth), dispersion=2.1)  # no sum of steps
-    # The loop of Salvucci and Goldberg, for gaze that only turns horizontally.
-    want, s, number = np.full(n, -1), 0, 0
-    while s < n:
-        e = s + 5  # 0.1 s
-        if e >= n:
-            break
-        if np.ptp(azimuth[s : e + 1]) <= 2.1:
-            while e + 1 < n and np.ptp(azimuth[s : e + 2]) <= 2.1:
-                e += 1
-            want[s : e + 1] = number
-            number, s = number + 1, e + 1
-        else:
-            s += 1
-    assert label.tolist() == want.tolist()
-
-
-def test_one_ray_per_fixation():
-    rays = gaze([*[0, 2] * 5, *[40] * 10])
-    hit, head = np.full((20, 3), np.nan), np.tile([1.0, 0, 0], (20, 1))
-    hit[:4] = rays.origin[:4] + 2 * rays.direction[:4]
-    head[1], head[2], head[10:] = [0, 1, 0], [np.nan] * 3, np.nan
-    rays = replace(rays, hit=hit, head=head)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")  # a fixation without a hit must not warn
-        one, seconds = average_fixations(rays, detect_fixations_idt(rays))
-    assert len(one) == 2 and np.allclose(seconds, 0.18) and np.allclose(one.t, [0.09, 0.29])
-    assert np.allclose(np.degrees(np.arctan2(one.direction[:, 1], one.direction[:, 0])), [1, 40])
-    assert np.allclose(one.hit[0], hit[:4].mean(axis=0)) and np.isnan(one.hit[1]).all()
-    want = np.array([8.0, 1, 0])
-    assert np.allclose(one.head[0], want / np.linalg.norm(want)) and np.isnan(one.head[1]).all()
-    with pytest.raises(NergError, match="no fixation"):
-        average_fixations(rays, np.full(20, -1))
-    with pytest.raises(NergError, match="velocity must be positive"):
-        detect_fixations_ivt(rays, velocity=0)
-
-
-@pytest.mark.parametrize("find", [detect_fixations_ivt, detect_fixations_idt])
-@pytest.mark.parametrize("gap", [0.02, -0.1, 0.0, -1000.0])
-def test_fixations_do_not_span_participants(find, gap):
-    """The first ray of a participant may follow the last one of another at any time, in the same direction."""
-    t = np.arange(20) * 0.02
-    still = gaze([0] * 40, person=np.r_[np.zeros(20), np.ones(20)], t=np.r_[t, t + t[-1] + gap])
-    assert find(still).tolist() == [0] * 20 + [1] * 20
-    # Each stay is too short by itself; joined they would not be.
-    assert (find(still, min_duration=0.5) == -1).all()
-
-
-@pytest.mark.parametrize("find", [detect_fixations_ivt, detect_fixations_idt])
-def test_fixations_do_not_depend_on_the_order_of_rays(find):
-    still = gaze([0] * 40, person=np.arange(40) // 20, t=np.tile(np.arange(20) * 0.02 + (np.arange(20) >= 10), 2))
-    order = np.random.default_rng(0).permutation(40)
-    assert find(still).tolist() == [0] * 10 + [1] * 10 + [2] * 10 + [3] * 10
-    assert np.array_equal(find(still.select(order)), find(still)[order])
-
-
-@pytest.mark.parametrize("find", [detect_fixations_ivt, detect_fixations_idt])
-@pytest.mark.parametrize(
-    "count, dt, limits, expected",
-    [
-        (9, 0.09, {}, 0),
-        (9, 0.11, {}, -1),  # a pause of a tenth of a second ends a fixation
-        (9, 0.11, {"gap": 0.12}, 0),
-        (9, 0.125, {"gap": 0.125}, 0),  # one as long as it may be does not
-        (3, 0.125, {"min_duration": 0.25, "gap": 0.2}, 0),  # as short as a fixation may be
-        (3, 0.125, {"min_duration": 0.251, "gap": 0.2}, -1),
-    ],
-)
-def test_pauses_and_durations_at_the_limits(find, count, dt, limits, expected):
-    assert (find(gaze([0] * count, dt=dt), **limits) == expected).all()
 
 
 # ---- Frozen ----
