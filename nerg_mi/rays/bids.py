@@ -110,10 +110,10 @@ def write_bids(
             place = root / f"sub-{labels[person]}" / "beh"
             path = place / f"{stem}_physio.tsv.gz"
             _write_table(path, _stack(rays, rows, columns), [fmt for _, fmt in columns.values()])
-            own = {"SamplingFrequency": _measure_rate(rays.t[rows]) or rate, "StartTime": 0}
+            sidecar = {"SamplingFrequency": _measure_rate(rays.t[rows]) or rate, "StartTime": 0}
             if rays.cohort is not None:
-                own["Cohort"] = rays.cohorts[rays.cohort[rows[0]]]
-            write_json(place / f"{stem}_physio.json", own)
+                sidecar["Cohort"] = rays.cohorts[rays.cohort[rows[0]]]
+            write_json(place / f"{stem}_physio.json", sidecar)
             if events is not None:
                 _write_events(place / f"{stem}_physioevents.tsv.gz", events, run_of_row[events.row] == k)
             files.append(path.relative_to(root))

@@ -1,15 +1,16 @@
-"""Fixations of gaze samples."""
+"""Fixations, saccades and other events of gaze samples in the world, from the motion of gaze and head."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.maths import vmf
 
-from .filters import group_by_person
+from .event_settings import KINDS, MAX_STEP, EventRules
+from .filters import MAX_PAUSE, group_by_person
 from .rays import Rays
 
 # ---- Fixations ----
@@ -19,11 +20,9 @@ from .rays import Rays
 # Angles are in degrees, times in seconds. A pause of a participant longer than ``gap`` ends a fixation. Both functions
 # return the number of the fixation of each ray, or -1; numbers increase by participant and time.
 
-_MAX_GAP = 0.1
-
 
 def detect_fixations_ivt(
-    rays: Rays, velocity: float = 100.0, min_duration: float = 0.06, gap: float = _MAX_GAP
+    rays: Rays, velocity: float = 100.0, min_duration: float = 0.06, gap: float = MAX_STEP
 ) -> np.ndarray:
     """Detect fixations by velocity (I-VT): runs of rays that turn at most by ``velocity`` degrees per second and last
     at least ``min_duration`` seconds.
@@ -33,20 +32,17 @@ def detect_fixations_ivt(
     stationary head. Returns (N,) int64.
     """
     _require_positive(velocity=velocity, min_duration=min_duration, gap=gap)
-    order, starts = group_by_person(rays)
-    t, d = rays.t[order], rays.direction[order]
-    step = np.diff(t)
-    joined = (step > 0) & (step <= gap)
-    joined[starts[1:-1] - 1] = False
-    with np.errstate(divide="ignore", invalid="ignore"):
-        slow = joined & (_angles(d[1:], d[:-1]) <= velocity * step)
-    # Slow steps join rays into a run; a ray after a fast step starts a new one.
-    run = np.cumsum(np.r_[True, ~slow]) - 1
-    return _number_long_runs(run, t, order, min_duration)
+    order, step, gaze = _measure_steps(rays)
+    with np.errstate(invalid="ignore"):
+        runs = _select_long(_find_runs((step > 0) & (step <= gap) & ~(gaze > velocity)), rays.t[order], min_duration)
+    run, sample = expand_runs(runs, 1)
+    label = np.full(len(rays), -1, np.int64)
+    label[order[sample]] = run
+    return label
 
 
 def detect_fixations_idt(
-    rays: Rays, dispersion: float = 3.0, min_duration: float = 0.1, gap: float = _MAX_GAP
+    rays: Rays, dispersion: float = 3.0, min_duration: float = 0.1, gap: float = MAX_STEP
 ) -> np.ndarray:
     """Detect fixations by dispersion (I-DT): a window of ``min_duration`` seconds with a dispersion of at most
     ``dispersion`` degrees grows as long as this holds; otherwise the window starts one ray later.
@@ -112,11 +108,14 @@ def average_fixations(rays: Rays, label: np.ndarray) -> tuple[Rays, np.ndarray]:
     return fixations, last - first
 
 
-def _nanmean_by_group(values: np.ndarray, number: np.ndarray) -> np.ndarray:
-    """Means (F, C) of the finite rows of ``values`` (N, C) per ``number`` (N,); NaN for groups without finite rows."""
+def _nanmean_by_group(values: np.ndarray, number: np.ndarray, count: int = 0) -> np.ndarray:
+    """Means (F, C) of the finite rows of ``values`` (N, C) per ``number`` (N,); NaN for groups without finite rows.
+    ``count`` is the least F."""
     is_finite = np.isfinite(values).all(axis=1)
-    weight = np.bincount(number, weights=is_finite.astype(float))
-    sums = np.stack([np.bincount(number, weights=np.where(is_finite, c, 0.0)) for c in values.T], axis=1)
+    weight = np.bincount(number, weights=is_finite.astype(float), minlength=count)
+    sums = np.stack(
+        [np.bincount(number, weights=np.where(is_finite, c, 0.0), minlength=count) for c in values.T], axis=1
+    )
     with np.errstate(invalid="ignore"):
         return sums / weight[:, None]
 
@@ -124,16 +123,6 @@ def _nanmean_by_group(values: np.ndarray, number: np.ndarray) -> np.ndarray:
 def _angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Angles in degrees between unit vectors."""
     return np.degrees(2.0 * np.arcsin(np.minimum(1.0, np.sqrt(0.5 * vmf.one_minus_cosine(a, b)))))
-
-
-def _number_long_runs(run: np.ndarray, t: np.ndarray, order: np.ndarray, min_duration: float) -> np.ndarray:
-    counts = np.bincount(run)
-    first = np.r_[0, np.cumsum(counts)[:-1]]
-    long = t[first + counts - 1] - t[first] >= min_duration - 1e-9
-    number = np.where(long, np.cumsum(long) - 1, -1)
-    out = np.empty(len(t), np.int64)
-    out[order] = number[run]
-    return out
 
 
 def _project_to_plane(d: np.ndarray, first: np.ndarray) -> np.ndarray:
@@ -187,3 +176,237 @@ def _require_positive(**values: float) -> None:
     for name, value in values.items():
         if not value > 0:
             raise NergError(f"{name} must be positive, got {value}")
+
+
+# ---- Events: fixations, pursuit, saccades and pauses ----
+#
+# Gaze moves in the world by the eye in the head and by the head. Both velocities together tell what happens, as for
+# people who watch 360-degree videos (Agtzidis, Startsev and Dorr 2019) and who walk (Kothari et al. 2020): gaze rests
+# in the world although the eye turns in the head (vestibulo-ocular reflex), is carried along by the head, or jumps.
+
+_CODES = {name: code for code, name in enumerate(KINDS)}
+_MIN_STRAIGHTNESS = 0.5  # of a pursuit: its net angle relative to the sum of its steps
+_MIN_HIT_FRACTION = 0.5  # of the samples of a run, for a fixed point
+_MIN_POINT_DISTANCE = 0.1  # metres between an eye and a fixed point
+
+
+@dataclass(frozen=True, eq=False)
+class Events:
+    """E events by participant and time. Consecutive ones share a sample: the last of one is the first of the next."""
+
+    first: np.ndarray  # (E,) index of the ray with which the event begins
+    last: np.ndarray  # (E,) index of the ray with which it ends
+    kind: np.ndarray  # (E,) names, of `KINDS`
+    onset: np.ndarray  # (E,) seconds on the clock of the rays
+    duration: np.ndarray  # (E,) seconds
+    amplitude: np.ndarray  # (E,) degrees between the first and the last direction in the world
+    peak_velocity: np.ndarray  # (E,) degrees per second of gaze in the world; NaN for pauses
+    direction: np.ndarray  # (E, 3) mean direction of fixations and pursuits, unit; NaN for others
+    point: np.ndarray  # (E, 3) mean hit point of fixations and pursuits, metres; NaN if unknown, and for others
+
+    def __len__(self) -> int:
+        return len(self.first)
+
+    def count(self) -> dict[str, int]:
+        """The number of events by kind, of kinds with any."""
+        return {kind: n for kind in KINDS if (n := int(np.count_nonzero(self.kind == kind)))}
+
+
+@dataclass(frozen=True, eq=False)
+class Velocities:
+    """Angular velocities between consecutive rays in ``order``, by participant and time: N - 1 steps."""
+
+    order: np.ndarray  # (N,) indices of rays
+    step: np.ndarray  # (N - 1,) seconds; NaN between participants
+    gaze: np.ndarray  # (N - 1,) degrees per second of gaze in the world; NaN where no time passes
+    head: np.ndarray  # (N - 1,) of the head in the world; NaN if unknown
+    eye: np.ndarray  # (N - 1,) of gaze in the head; NaN if the head is unknown
+
+
+def measure_velocities(rays: Rays) -> Velocities:
+    """Measure the velocities of gaze in the world, of the head, and of gaze in the head.
+
+    The rotation of the head between two samples is the smallest one between its directions: its roll is not recorded.
+    """
+    order, step, gaze = _measure_steps(rays)
+    if rays.head is None:
+        unknown = np.full(len(step), np.nan)
+        return Velocities(order, step, gaze, unknown, unknown)
+    d, h = rays.direction[order], rays.head[order].astype(np.float64)
+    step_or_nan = np.where(step > 0, step, np.nan)
+    carried = _rotate_between(h[:-1], h[1:], d[:-1])
+    with np.errstate(invalid="ignore"):
+        return Velocities(
+            order, step, gaze, _angles(h[1:], h[:-1]) / step_or_nan, _angles(d[1:], carried) / step_or_nan
+        )
+
+
+def _measure_steps(rays: Rays) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Order, steps and velocities of gaze, as in `Velocities`."""
+    order, _ = group_by_person(rays)
+    step = np.where(np.diff(rays.person[order]) == 0, np.diff(rays.t[order]), np.nan)
+    d = rays.direction[order]
+    return order, step, _angles(d[1:], d[:-1]) / np.where(step > 0, step, np.nan)
+
+
+def _rotate_between(a: np.ndarray, b: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Rotate ``v`` (N, 3) by the smallest rotations from unit vectors ``a`` to ``b`` (N, 3)."""
+    dot = lambda x, y: np.einsum("ij,ij->i", x, y)[:, None]
+    middle = a + b
+    with np.errstate(invalid="ignore", divide="ignore"):
+        rotated = v - middle * dot(middle, v) / (1 + dot(a, b)) + 2 * b * dot(a, v)
+        return rotated / np.linalg.norm(rotated, axis=1, keepdims=True)
+
+
+def angles_about(direction: np.ndarray, ahead: np.ndarray) -> np.ndarray:
+    """Azimuth and elevation (N, 2) in degrees (Fick angles) of unit directions (N, 3), as seen by somebody who faces
+    ``ahead`` (N, 3) with the head upright (z up). Both are 0 for ``ahead`` itself."""
+    level = np.hypot(ahead[:, 0], ahead[:, 1])
+    is_steep = level < 1e-9  # a vertical direction has no horizontal axis of its own
+    x, y = (np.where(is_steep, steep, v / np.where(is_steep, 1.0, level)) for steep, v in zip((0, 1), ahead.T))
+    right = np.stack([y, -x, np.zeros_like(x)], axis=1)
+    up = np.cross(right, ahead)
+    r, u, f = (np.einsum("ij,ij->i", direction, axis) for axis in (right, up, ahead))
+    return np.degrees(np.stack([np.arctan2(r, f), np.arctan2(u, np.hypot(r, f))], axis=1))
+
+
+def detect_events(rays: Rays, rules: EventRules | None = None) -> Events:
+    """Divide the samples of each participant into events by the velocities of gaze and head.
+
+    Steps between samples are fast or slow, by ``rules.velocity``. A run of fast steps, and slow ones between them for
+    up to ``rules.merge_gap``, is a saccade or visual scanning.
+    A run of slow steps is a fixation or pursuit, if it lasts ``rules.min_fixation``: a pursuit if gaze drifts steadily
+    away both from its mean direction and, where hit points are known, from their mean, which is fixed also for somebody
+    who walks past. Shorter slow runs are no event. A pause longer than a minute separates recordings.
+    """
+    rules = rules or EventRules()
+    v = measure_velocities(rays)
+    with np.errstate(invalid="ignore"):
+        is_joined = (v.step > 0) & (v.step <= rules.max_step)
+        is_fast = is_joined & (v.gaze > rules.velocity)
+        is_pause = (v.step > rules.max_step) & (v.step <= MAX_PAUSE)
+        is_blink = is_pause & (v.step <= rules.max_blink)
+    is_fast = _fill_interruptions(is_fast, is_joined, rays.t[v.order], rules.merge_gap)
+    fast, slow = _find_runs(is_fast), _find_runs(is_joined & ~is_fast)
+    slow = _select_long(slow, rays.t[v.order], rules.min_fixation)
+    pauses = np.flatnonzero(is_pause)
+    peak_eye = _peak(v.eye, fast)
+    slow_kinds, direction, point = _classify_slow(rays, v, slow, rules)
+    runs = np.concatenate([fast, slow, np.stack([pauses, pauses + 1], axis=1)])
+    codes = np.concatenate(
+        [
+            np.where(
+                np.isnan(peak_eye) | (peak_eye > rules.eye_velocity), _CODES["saccade"], _CODES["visual_scanning"]
+            ),
+            slow_kinds,
+            np.where(is_blink[pauses], _CODES["blink"], _CODES["loss"]),
+        ]
+    ).astype(np.int64)
+    peak = np.concatenate([_peak(v.gaze, fast), _peak(v.gaze, slow), np.full(len(pauses), np.nan)])
+    unknown = lambda n: np.full((n, 3), np.nan)
+    direction, point = (np.concatenate([unknown(len(fast)), m, unknown(len(pauses))]) for m in (direction, point))
+    by_time = np.argsort(runs[:, 0], kind="stable")
+    runs, first, last = runs[by_time], v.order[runs[by_time, 0]], v.order[runs[by_time, 1]]
+    return Events(
+        first,
+        last,
+        np.array(list(KINDS))[codes[by_time]],
+        rays.t[first],
+        rays.t[last] - rays.t[first],
+        _angles(rays.direction[first], rays.direction[last]),
+        peak[by_time],
+        direction[by_time],
+        point[by_time],
+    )
+
+
+def _find_runs(mask: np.ndarray) -> np.ndarray:
+    """Runs (R, 2) of true steps: their first sample, and their last sample, which follows the last step."""
+    edges = np.flatnonzero(np.diff(np.r_[False, mask, False].astype(np.int8)))
+    return edges.reshape(-1, 2)
+
+
+def _fill_interruptions(is_fast: np.ndarray, is_joined: np.ndarray, t: np.ndarray, max_gap: float) -> np.ndarray:
+    """Mark slow runs of at most ``max_gap`` seconds between fast steps as fast, such as repeated samples."""
+    runs = _find_runs(is_joined & ~is_fast)
+    around = np.r_[False, is_fast, False]
+    is_short = around[runs[:, 0]] & around[runs[:, 1] + 1] & (t[runs[:, 1]] - t[runs[:, 0]] <= max_gap + 1e-9)
+    filled = is_fast.copy()
+    filled[expand_runs(runs[is_short], 0)[1]] = True
+    return filled
+
+
+def _select_long(runs: np.ndarray, t: np.ndarray, min_duration: float) -> np.ndarray:
+    """Those of ``runs`` that last at least ``min_duration`` seconds."""
+    return runs[t[runs[:, 1]] - t[runs[:, 0]] >= min_duration - 1e-9]
+
+
+def _peak(values: np.ndarray, runs: np.ndarray) -> np.ndarray:
+    """Maximum (R,) of the finite ``values`` of steps in each of the ``runs``; NaN without any."""
+    out = np.full(len(runs), -np.inf)
+    run, step = expand_runs(runs, 0)
+    np.fmax.at(out, run, values[step])
+    return np.where(np.isinf(out), np.nan, out)
+
+
+def expand_runs(runs: np.ndarray, extra: int) -> tuple[np.ndarray, np.ndarray]:
+    """Number of the run, and index, of all steps (``extra`` 0) or samples (1) of ``runs``."""
+    count = runs[:, 1] - runs[:, 0] + extra
+    run = np.repeat(np.arange(len(runs)), count)
+    return run, np.arange(len(run)) - np.repeat(np.cumsum(count) - count, count) + runs[run, 0]
+
+
+def _classify_slow(
+    rays: Rays, v: Velocities, runs: np.ndarray, rules: EventRules
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Codes (R,) of runs of slow steps, and their mean directions and hit points (R, 3)."""
+    run, sample = expand_runs(runs, 1)
+    rows, count = v.order[sample], len(runs)
+    mean = lambda values: _nanmean_by_group(values, run, count)
+    d, o = rays.direction[rows], rays.origin[rows]
+    direction = mean(d)
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    speed, is_steady = _measure_drift(angles_about(d, direction[run]), rays.t[rows], run, runs, rules)
+    point = np.full((count, 3), np.nan)
+    if rays.hit is not None:
+        hit = rays.hit[rows]
+        point = mean(hit)
+        share = mean(np.isfinite(hit).all(axis=1, keepdims=True).astype(float))[:, 0]
+        to_point = point[run] - o
+        distance = np.linalg.norm(to_point, axis=1)
+        is_near = np.bincount(run, weights=~(distance > _MIN_POINT_DISTANCE), minlength=count) > 0
+        has_point = (share >= _MIN_HIT_FRACTION) & ~is_near
+        with np.errstate(invalid="ignore", divide="ignore"):
+            ahead = np.where(has_point[run, None], to_point / distance[:, None], d)
+        of_point, is_steady_about = _measure_drift(angles_about(d, ahead), rays.t[rows], run, runs, rules)
+        is_steady &= ~has_point | is_steady_about
+        speed = np.where(has_point, np.minimum(speed, of_point), speed)
+    codes = np.full(count, _CODES["fixation"])
+    _, step = expand_runs(runs, 0)
+    step_run = np.repeat(np.arange(count), runs[:, 1] - runs[:, 0])
+    with np.errstate(invalid="ignore"):
+        codes[_nanmean_by_group(v.head[step, None], step_run, count)[:, 0] > rules.head_velocity] = _CODES[
+            "vor_fixation"
+        ]
+    codes[is_steady & (speed > rules.pursuit_velocity)] = _CODES["smooth_pursuit"]
+    return codes, direction, point
+
+
+def _measure_drift(
+    angles: np.ndarray, t: np.ndarray, run: np.ndarray, runs: np.ndarray, rules: EventRules
+) -> tuple[np.ndarray, np.ndarray]:
+    """Speed (R,) of the linear drift of ``angles`` (n, 2) in degrees per second, and whether it is steady and long
+    enough for a pursuit, (R,) bool."""
+    count = len(runs)
+    total = lambda values: np.bincount(run, weights=values, minlength=count)
+    n = np.maximum(total(np.ones(len(run))), 1)
+    t = t - (total(t) / n)[run]
+    variance = total(t * t)
+    slopes = np.stack([total(t * a) / np.where(variance > 0, variance, 1) for a in angles.T], axis=1)
+    speed = np.hypot(*slopes.T)
+    steps = np.hypot(*np.diff(angles, axis=0).T) * (np.diff(run) == 0) if len(run) else np.zeros(0)
+    path = np.bincount(run[1:], weights=steps, minlength=count)
+    first = np.cumsum(np.r_[0, np.bincount(run, minlength=count)])
+    duration = t[first[1:] - 1] - t[first[:-1]] if count else np.zeros(0)
+    net = speed * duration
+    return speed, (net >= rules.pursuit_angle) & (net >= _MIN_STRAIGHTNESS * path)

@@ -14,7 +14,8 @@ from nerg_mi.files.safe_read import sanitize
 from .checks import RECORDING_CHECKS, RayStatistics
 from .dataset import RayDataset
 from .direction_checks import DIRECTION_CHECKS
-from .filters import argsort_by_person_time
+from .events import Events, angles_about, detect_events, expand_runs
+from .filters import argsort_by_person_time, find_sessions
 from .rays import Rays
 
 # ---- The list of checks, and the warnings of all of them ----
@@ -283,3 +284,120 @@ def _format_extent(dataset: RayDataset) -> str:
         f"{format_count(dataset.sources, 'source')} in {format_count(dataset.parts, 'part')} "
         f"({dataset.bytes / 1e6:,.1f} MB), place {', '.join(dataset.places)}, day {day_range}"
     )
+
+
+# ---- Data quality of each recording ----
+#
+# Accuracy, precision (RMS-S2S, STD), data loss and effective frequency as ETDQualitizer defines them (Niehorster et al.
+# 2026), with Fick angles about the target or the mean direction of a fixation, which is straight ahead.
+
+
+@dataclass(frozen=True)
+class GazeTarget:
+    """A point that participants looked at from ``start`` to ``end``. Raises `NergError` if it ends before it starts."""
+
+    start: float  # seconds on the clock of the rays
+    end: float
+    point: tuple[float, float, float]  # metres, in the frame of rays
+    participant: str | None = None  # None: all participants
+
+    def __post_init__(self) -> None:
+        if not self.end > self.start:
+            raise NergError(f"a target must end after it starts, got {self.start:g} to {self.end:g} s")
+
+
+@dataclass(frozen=True)
+class RecordingQuality:
+    """Data quality of one recording of a participant."""
+
+    participant: str
+    start: float  # seconds on the clock of the rays
+    duration: float  # seconds, up to the end of the last sample
+    samples: int  # valid ones: the import dropped the others
+    frequency: float  # Hz, from the median interval; NaN for fewer than two times
+    effective_frequency: float  # Hz: samples by duration
+    data_loss: float  # percent of the samples at ``frequency`` that are missing
+    fixations: int  # of which the precision is the median
+    rms_s2s: float  # degrees: root mean square of the angles between successive samples of a fixation
+    std: float  # degrees: standard deviation of the samples of a fixation
+    targets: int  # targets with samples
+    accuracy: float  # degrees: mean over targets of the angle from the target to the mean gaze; NaN without targets
+
+
+def measure_recordings(
+    rays: Rays, targets: Sequence[GazeTarget] = (), events: Events | None = None
+) -> list[RecordingQuality]:
+    """Measure the data quality of each recording (`nerg_mi.rays.filters.find_sessions`).
+
+    Precision is the median over fixations and vestibulo-ocular fixations of ``events`` (default: `detect_events`), and
+    includes what the eye and the head move during these. Angles are those of gaze in the world.
+    """
+    events = detect_events(rays) if events is None else events
+    sessions = find_sessions(rays)
+    rows_of = [np.arange(len(rays))[sessions.rows(slice(a, b))] for a, b in zip(sessions.starts, sessions.starts[1:])]
+    session_of = np.empty(len(rays), np.int64)
+    for k, rows in enumerate(rows_of):
+        session_of[rows] = k
+    is_fixation = np.isin(events.kind, ("fixation", "vor_fixation"))
+    precision = _measure_precision(rays, events, is_fixation)
+    fixation_session = session_of[events.first[is_fixation]]
+    out = []
+    for k, (rows, person) in enumerate(zip(rows_of, sessions.person.tolist())):
+        name = rays.persons[person]
+        t = np.sort(rays.t[rows])
+        interval = float(np.median(np.diff(t))) if len(t) > 1 else float("nan")
+        duration = float(t[-1] - t[0] + interval) if interval > 0 else float("nan")
+        of_fixations = precision[fixation_session == k]
+        medians = np.median(of_fixations, axis=0) if len(of_fixations) else np.full(2, np.nan)
+        offsets = [
+            offset
+            for target in targets
+            if target.participant in (None, name) and (offset := _measure_accuracy(rays, rows, target)) is not None
+        ]
+        out.append(
+            RecordingQuality(
+                participant=name,
+                start=float(t[0]),
+                duration=duration,
+                samples=len(rows),
+                frequency=1 / interval if interval > 0 else float("nan"),
+                effective_frequency=len(rows) / duration,
+                data_loss=100 * (1 - len(rows) * interval / duration),
+                fixations=len(of_fixations),
+                rms_s2s=float(medians[0]),
+                std=float(medians[1]),
+                targets=len(offsets),
+                accuracy=float(np.mean(offsets)) if offsets else float("nan"),
+            )
+        )
+    return out
+
+
+def _measure_precision(rays: Rays, events: Events, mask: np.ndarray) -> np.ndarray:
+    """RMS-S2S and STD (F, 2) in degrees of the events in ``mask`` (E,), about their mean directions."""
+    order = argsort_by_person_time(rays)
+    order = np.arange(len(rays)) if order is None else order
+    position = np.empty(len(rays), np.int64)
+    position[order] = np.arange(len(rays))
+    run, sample = expand_runs(np.stack([position[events.first[mask]], position[events.last[mask]]], axis=1), 1)
+    angles = angles_about(rays.direction[order[sample]], events.direction[mask][run])
+    count = int(mask.sum())
+    mean = lambda values, group: np.bincount(group, values, count) / np.bincount(group, minlength=count)
+    is_step = np.diff(run) == 0
+    steps = np.sum(np.diff(angles, axis=0)[is_step] ** 2, axis=1)
+    deviations = angles - np.stack([mean(column, run) for column in angles.T], axis=1)[run]
+    return np.sqrt(np.stack([mean(steps, run[1:][is_step]), mean(np.sum(deviations**2, axis=1), run)], axis=1))
+
+
+def _measure_accuracy(rays: Rays, rows: np.ndarray, target: GazeTarget) -> float | None:
+    """Angle in degrees from the target to the mean gaze, each as seen from the eye; None without samples."""
+    rows = rows[(rays.t[rows] >= target.start) & (rays.t[rows] <= target.end)]
+    to_target = np.asarray(target.point) - rays.origin[rows]
+    distance = np.linalg.norm(to_target, axis=1, keepdims=True)
+    if not len(rows) or not (distance > 0).all():
+        return None
+    azimuth, elevation = np.radians(angles_about(rays.direction[rows], to_target / distance)).T
+    right, up, ahead = (
+        v.mean() for v in (np.cos(elevation) * np.sin(azimuth), np.sin(elevation), np.cos(elevation) * np.cos(azimuth))
+    )
+    return float(np.degrees(np.arctan2(np.hypot(right, up), ahead)))

@@ -3,11 +3,12 @@
 ``nerg rays show``: Print a data-quality report: rays, persons, duration, rate, dropped rows, extent, eye height.
 ``nerg rays filter``: Select rays by conditions, detect fixations, and thin out stationary periods.
 ``nerg rays split``: Split rays into disjoint training and test sets by position, participant or time.
-``nerg rays export``: Write rays in a format of other programs: a BIDS dataset with gaze, fixations and visits.
+``nerg rays events``: Detect fixations, saccades, pursuits and pauses, and measure data quality, per recording.
+``nerg rays export``: Write rays in a format of other programs: a BIDS dataset with gaze, events and visits.
 ``nerg rays plot``: Plot a floor plan of recorded positions, as densities or as the layout of a split.
 ``nerg align``: Register tracking with a scene: find the similarity from the rays' frame to the scene's.
 
-Options of these commands. The workflows are in `.rays`, `.rays_export` and `.align`.
+Options of these commands. The workflows are in `.rays`, `.rays_events`, `.rays_export` and `.align`.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from typing import Any
 
 from nerg_mi.errors import NergError
 from nerg_mi.ranges import COORDINATES, LENGTHS, RAYS, SECONDS, SEEDS, THREADS, TIMES, Range, ValidatedDataclass
+from nerg_mi.rays.event_settings import EventRules
 
 from .base import Parameter, argument, declare, extra, out
 from .options import (
@@ -28,9 +30,12 @@ from .options import (
     OUTPUT,
     PERFORMANCE,
     TEST,
+    DerivedOptions,
     best_variant,
     coordinates,
     cpu_threads,
+    explicit_settings,
+    expose_settings,
     llvm_variant,
     option,
     random_seed,
@@ -312,16 +317,39 @@ class PlotOptions(ValidatedDataclass):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RaysExportOptions(ValidatedDataclass):
-    """What is written next to the rays. Raises `NergError` for an unknown format or detector."""
+@expose_settings(EventRules, group=ANALYSIS)
+class EventOptions(DerivedOptions):
+    """How events are told apart (`nerg_mi.rays.event_settings.EventRules`)."""
+
+    def event_rules(self) -> EventRules:
+        """Return the limits between the kinds of events. Raises `NergError` for values out of range."""
+        return EventRules(**explicit_settings(self, EventRules))
+
+
+@dataclass(frozen=True, kw_only=True)
+class RaysEventsOptions(EventOptions):
+    """What is measured and written next to the events."""
+
+    targets: Path | None = option(
+        None,
+        "CSV file of points that participants looked at, for the accuracy: columns start,end (seconds), x,y,z (metres, "
+        "in the frame of the rays) and optionally person.  [default: no accuracy]",
+        group=INPUT,
+    )
+    quality: Path | None = option(
+        None, "CSV file to write: data quality of each recording.  [default: none]", group=OUTPUT
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class RaysExportOptions(EventOptions):
+    """What is written next to the rays. Raises `NergError` for an unknown format, and for a scene without AOIs."""
 
     format: str = option("bids", "Format: bids (a folder, BIDS 1.11).", group=OUTPUT)
     task: str = option("gaze", "Label of the task in the file names: letters and digits.", group=OUTPUT)
     title: str = option("Gaze in the world", "Name of the dataset.", group=OUTPUT)
-    fixations: str = option(
-        "ivt",
-        "Detector of the fixations among the events: ivt (velocity threshold), idt (dispersion threshold) or none.",
-        group=ANALYSIS,
+    events: bool = option(
+        True, "Write fixations, saccades and other events of gaze.", "--events/--no-events", group=OUTPUT
     )
     aois: Path | None = option(
         None,
@@ -340,8 +368,6 @@ class RaysExportOptions(ValidatedDataclass):
         super().__post_init__()
         if self.format not in EXPORT_FORMATS:
             raise NergError(f'--format must be {" or ".join(EXPORT_FORMATS)}, got "{self.format}"')
-        if self.fixations not in (*DETECTORS, "none"):
-            raise NergError(f'--fixations must be ivt, idt or none, got "{self.fixations}"')
         if self.aois is None and (self.scene is not None or self.align is not None):
             raise NergError("--scene and --align are for the visits of AOIs; add --aois, or leave them out")
 
@@ -403,6 +429,14 @@ declare(
     without=("train_output", "test_output"),
     rays=_RAYS_FILE,
     output=out("Rays file; -train and -test are inserted before its suffix."),
+)
+
+declare(
+    "rays events",
+    "nerg_mi.workflows.rays_events:write_events",
+    options=RaysEventsOptions,
+    rays=_RAYS_FILE,
+    output=out("CSV file to write: one event per row."),
 )
 
 declare(

@@ -17,14 +17,16 @@ from nerg_mi.aoi.predicted import load_aoi_scene
 from nerg_mi.errors import NergError
 from nerg_mi.files.atomic import check_new_folder
 from nerg_mi.formats.areas import read_areas
-from nerg_mi.rays import events as detection
 from nerg_mi.rays.bids import BidsEvents, write_bids
 from nerg_mi.rays.dataset import load_rays
+from nerg_mi.rays.event_settings import KINDS
+from nerg_mi.rays.events import Events, detect_events
 from nerg_mi.rays.rays import Rays
 from nerg_mi.statistics.visits import Visits
 
 from .base import SILENT, Reporter, select_backend
 from .rays_commands import RaysExportOptions
+from .rays_events import warn_slow_sampling
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +43,7 @@ def export_rays(
     options: RaysExportOptions | None = None,
     reporter: Reporter = SILENT,
 ) -> RaysExport:
-    """Write ``rays`` (or their file or dataset) to the folder ``output`` as a BIDS dataset, with fixations and visits.
+    """Write ``rays`` (or their file or dataset) to the folder ``output`` as a BIDS dataset, with events and visits.
 
     Raises `NergError` for a folder that is not empty, and for rays without times.
     """
@@ -49,7 +51,7 @@ def export_rays(
     check_new_folder(output)
     reporter.progress(0.0, "reading rays")
     data = rays if isinstance(rays, Rays) else load_rays(rays)
-    parts = [] if options.fixations == "none" else [_find_fixations(data, options.fixations)]
+    parts = [_find_events(data, options, reporter)] if options.events else []
     if options.aois is not None:
         reporter.progress(0.2, "finding visits")
         parts.append(_find_visits(data, options, reporter))
@@ -62,7 +64,7 @@ def export_rays(
         task=options.task,
         name=options.title,
         events=events,
-        event_columns=_describe(events, options),
+        event_columns=_describe(events),
         provenance=provenance,
     )
     kinds, counts = ((), ()) if events is None else np.unique(events.kind, return_counts=True)
@@ -77,17 +79,11 @@ def export_rays(
 # ---- Events ----
 
 
-def _find_fixations(rays: Rays, detector: str) -> BidsEvents:
-    """Fixations, with the mean point of regard and the mean direction."""
-    detect = detection.detect_fixations_ivt if detector == "ivt" else detection.detect_fixations_idt
-    label = detect(rays)
-    if not (label >= 0).any():
-        return _events(rays, np.zeros(0, np.int64), np.zeros(0), np.zeros(0), "fixation")
-    means, duration = detection.average_fixations(rays, label)
-    rows = np.flatnonzero(label >= 0)
-    rows = rows[np.lexsort((rays.t[rows], label[rows]))]
-    first = rows[np.unique(label[rows], return_index=True)[1]]
-    return _events(rays, first, means.t - 0.5 * duration, duration, "fixation", means)
+def _find_events(rays: Rays, options: RaysExportOptions, reporter: Reporter) -> BidsEvents:
+    """Events of gaze, with their mean directions and points of regard."""
+    events = detect_events(rays, options.event_rules())
+    warn_slow_sampling(rays, options, reporter)
+    return _events(events.first, events.onset, events.duration, events.kind, events)
 
 
 def _find_visits(rays: Rays, options: RaysExportOptions, reporter: Reporter) -> BidsEvents:
@@ -99,30 +95,30 @@ def _find_visits(rays: Rays, options: RaysExportOptions, reporter: Reporter) -> 
         reporter.message(note)
     has_hits = rays.hit is not None and bool(np.isfinite(rays.hit).any())
     context = scene.make_context(scene.gaze_scene.geometry is None and has_hits, ())
-    return _join([_visit_events(rays, name, visits) for name, visits in find_area_visits(rays, context).items()])
+    return _join([_visit_events(name, visits) for name, visits in find_area_visits(rays, context).items()])
 
 
-def _visit_events(rays: Rays, name: str, visits: Visits) -> BidsEvents:
-    return _events(rays, visits.first, visits.start, visits.duration, "visit", area=name)
+def _visit_events(name: str, visits: Visits) -> BidsEvents:
+    return _events(visits.first, visits.start, visits.duration, np.full(len(visits), "visit"), area=name)
 
 
 def _events(
-    rays: Rays,
     rows: np.ndarray,
     onset: np.ndarray,
     duration: np.ndarray,
-    kind: str,
-    means: Rays | None = None,
+    kind: np.ndarray,
+    events: Events | None = None,
     area: str = "",
 ) -> BidsEvents:
-    """Events of one ``kind`` with the columns of all kinds."""
+    """Events with the columns of all kinds."""
     unknown = np.full((len(rows), 3), np.nan)
-    point = unknown if means is None or means.hit is None else means.hit
-    direction = unknown if means is None else means.direction
     columns: dict[str, np.ndarray] = {"area": np.full(len(rows), area)}
+    for name in ("amplitude", "peak_velocity"):
+        columns[name] = unknown[:, 0] if events is None else getattr(events, name)
+    point, direction = (unknown, unknown) if events is None else (events.point, events.direction)
     columns |= {f"{axis}_coordinate": point[:, k] for k, axis in enumerate("xyz")}
     columns |= {f"direction_{axis}": direction[:, k] for k, axis in enumerate("xyz")}
-    return BidsEvents(rows, onset, duration, np.full(len(rows), kind), columns)
+    return BidsEvents(rows, onset, duration, kind, columns)
 
 
 def _join(parts: Sequence[BidsEvents]) -> BidsEvents:
@@ -138,17 +134,20 @@ def _join(parts: Sequence[BidsEvents]) -> BidsEvents:
     )
 
 
-def _describe(events: BidsEvents | None, options: RaysExportOptions) -> dict[str, dict[str, Any]]:
+def _describe(events: BidsEvents | None) -> dict[str, dict[str, Any]]:
     """Descriptions of the columns of events."""
     if events is None:
         return {}
-    detectors = {"ivt": "velocity below 100 degrees per second (I-VT)", "idt": "dispersion below 3 degrees (I-DT)"}
-    levels = {"visit": "Gaze on an area of interest."}
-    if options.fixations != "none":
-        levels["fixation"] = f"Gaze in the world rests: {detectors[options.fixations]}."
+    levels = {**KINDS, "visit": "gaze on an area of interest"}
+    present = {str(kind) for kind in np.unique(events.kind)}
     out: dict[str, dict[str, Any]] = {
-        "trial_type": {"Description": "Kind of event.", "Levels": levels},
+        "trial_type": {
+            "Description": "Kind of event.",
+            "Levels": {kind: f"{text[:1].upper()}{text[1:]}." for kind, text in levels.items() if kind in present},
+        },
         "area": {"Description": "Name of the area of interest of a visit."},
+        "amplitude": {"Description": "Angle between the first and the last direction in the world.", "Units": "deg"},
+        "peak_velocity": {"Description": "Peak angular velocity of gaze in the world.", "Units": "deg/s"},
     }
     for axis in "xyz":
         out[f"{axis}_coordinate"] = {"Description": f"Mean point of regard in the world, {axis}.", "Units": "m"}

@@ -132,6 +132,7 @@ CASES = (
     ),
     Case("rays filter", "{i}/rays.npz -o {o}/a.npz --person a", ("a.npz",)),
     Case("rays filter", "{i}/rays.npz -o {o}/a.parquet --person a", ("a.parquet",)),
+    Case("rays events", "{i}/rays.npz -o {o}/a.csv --quality {o}/b.csv", ("a.csv", "b.csv")),
     Case("rays export", "{i}/rays.npz -o {o}/bids", _below("bids", BIDS), ("bids",), needs_new_folder=True),
     Case("rays split", "{i}/rays.npz -o {o}/a.npz --people 0.5", ("a-train.npz", "a-test.npz")),
     Case("rays plot", "{i}/rays.npz -o {o}/a.png", ("a.png",)),

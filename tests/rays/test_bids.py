@@ -186,10 +186,10 @@ def watched(tmp_path) -> tuple[Rays, Path]:
 BOXES = [("shelf", [1.5, -0.5, 0.5], [2.5, 0.5, 1.5]), ("till", [-0.5, 1.5, 0.5], [0.5, 2.5, 1.5])]
 
 
-def test_export_with_fixations_and_visits(watched, tmp_path):
+def test_export_with_events_and_visits(watched, tmp_path):
     rays, areas = watched
     result = export_rays(rays, tmp_path / "set", RaysExportOptions(aois=areas))
-    assert result.events["visit"] == 6 and result.events["fixation"] == 6
+    assert result.events == {"visit": 6, "fixation": 6, "saccade": 5}
     meta = json.loads((tmp_path / "set" / "task-gaze_physioevents.json").read_text())
     rows = [dict(zip(meta["Columns"], cells)) for cells in read_events(tmp_path / "set")]
     visits = [row for row in rows if row["trial_type"] == "visit"]
@@ -198,13 +198,17 @@ def test_export_with_fixations_and_visits(watched, tmp_path):
     fixations = [row for row in rows if row["trial_type"] == "fixation"]
     assert [round(float(row["x_coordinate"])) for row in fixations] == [2, 0] * 3
     assert np.allclose([float(row["duration"]) for row in fixations], 0.98)
-    assert set(meta["trial_type"]["Levels"]) == {"fixation", "visit"}
+    saccades = [row for row in rows if row["trial_type"] == "saccade"]
+    assert len({row["amplitude"] for row in saccades}) == 1 and saccades[0]["x_coordinate"] == "n/a"
+    assert set(meta["trial_type"]["Levels"]) == {"fixation", "saccade", "visit"}
     assert_equal(rays, read("bids", tmp_path / "set"))
+    export_rays(rays, tmp_path / "plain", RaysExportOptions(events=False))
+    assert read_events(tmp_path / "plain") == []
 
 
-@pytest.mark.parametrize("options", [{"format": "xlsx"}, {"fixations": "magic"}, {"align": Path("a.json")}])
+@pytest.mark.parametrize("options", [{"format": "xlsx"}, {"pursuit_angle": -1.0}, {"align": Path("a.json")}])
 def test_wrong_options(options):
-    with pytest.raises(NergError, match="--"):
+    with pytest.raises(NergError, match=f"--{next(iter(options)).replace('_', '-')}"):
         RaysExportOptions(**options)
 
 

@@ -7,9 +7,19 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from nerg_mi.errors import NergError
-from nerg_mi.rays.events import average_fixations, detect_fixations_idt, detect_fixations_ivt
+from nerg_mi.rays.event_settings import KINDS, EventRules
+from nerg_mi.rays.events import (
+    angles_about,
+    average_fixations,
+    detect_events,
+    detect_fixations_idt,
+    detect_fixations_ivt,
+    measure_velocities,
+)
+from nerg_mi.rays.rays import Rays
 from tests.rays.people import some_rays
 
 # ---- Fixations ----
@@ -145,3 +155,147 @@ def test_fixations_do_not_depend_on_the_order_of_rays(find):
 )
 def test_pauses_and_durations_at_the_limits(find, count, dt, limits, expected):
     assert (find(gaze([0] * count, dt=dt), **limits) == expected).all()
+
+
+# ---- Events ----
+
+RATE = 100.0
+
+
+def directions(azimuth, elevation=0.0) -> np.ndarray:
+    a, e = np.broadcast_arrays(np.radians(azimuth), np.radians(elevation))
+    return np.stack([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)], axis=1)
+
+
+def scene(azimuth, head=None, elevation=0.0, **columns) -> Rays:
+    """Gaze at 100 Hz that turns by degrees, with a head that turns by degrees."""
+    d = directions(np.asarray(azimuth, float), elevation)
+    heads = {} if head is None else {"head": directions(np.broadcast_to(np.asarray(head, float), len(d)))}
+    return some_rays(len(d), **{"t": np.arange(len(d)) / RATE, "direction": d, **heads, **columns})
+
+
+def spread(*parts) -> np.ndarray:
+    """Angles whose steps are constant: (degrees per second, number of steps), starting at 0."""
+    steps = np.concatenate([np.full(n, speed / RATE) for speed, n in parts])
+    return np.r_[0, np.cumsum(steps)]
+
+
+@pytest.mark.parametrize(
+    "gaze_parts, head_parts, kinds",
+    [
+        ([(0, 30)], [(0, 30)], ["fixation"]),
+        ([(0, 30)], [(40, 30)], ["vor_fixation"]),
+        ([(0, 30), (300, 4), (0, 30)], None, ["fixation", "saccade", "fixation"]),
+        ([(0, 30), (300, 4), (0, 30)], [(0, 64)], ["fixation", "saccade", "fixation"]),
+        # A head that turns by 150 degrees a second, and carries gaze along.
+        ([(0, 30), (150, 10), (0, 30)], [(0, 30), (150, 10), (0, 30)], ["fixation", "visual_scanning", "fixation"]),
+        # Gaze ahead of the head.
+        ([(0, 30), (300, 5), (0, 30)], [(0, 30), (150, 10), (0, 25)], ["fixation", "saccade", "vor_fixation"]),
+        ([(20, 30)], [(0, 30)], ["smooth_pursuit"]),
+        ([(20, 30)], [(20, 30)], ["smooth_pursuit"]),
+        ([(4, 60)], [(0, 60)], ["fixation"]),  # too slow
+        ([(20, 9)], [(0, 9)], ["fixation"]),  # too small
+        ([(60, 5), (-60, 5)] * 3, [(0, 30)], ["fixation"]),  # back and forth
+        # A slow interruption of 0.02 s, as of repeated samples; one of 0.05 s is too short for a fixation.
+        ([(0, 30), (300, 2), (0, 2), (300, 2), (0, 30)], None, ["fixation", "saccade", "fixation"]),
+        ([(0, 30), (300, 2), (0, 5), (300, 2), (0, 30)], None, ["fixation", "saccade", "saccade", "fixation"]),
+    ],
+)
+def test_kinds(gaze_parts, head_parts, kinds):
+    rays = scene(spread(*gaze_parts), None if head_parts is None else spread(*head_parts))
+    events = detect_events(rays)
+    assert events.kind.tolist() == kinds
+    assert events.count() == {kind: kinds.count(kind) for kind in KINDS if kind in kinds}
+
+
+def test_events_by_hand():
+    rays = scene(spread((0, 30), (250, 4), (0, 20)))
+    events = detect_events(rays)
+    np.testing.assert_allclose(events.onset, [0, 0.30, 0.34])
+    np.testing.assert_allclose(events.duration, [0.30, 0.04, 0.20])
+    np.testing.assert_allclose(events.amplitude, [0, 10, 0], atol=1e-6)
+    np.testing.assert_allclose(events.peak_velocity, [0, 250, 0], atol=1e-4)
+    assert events.first.tolist() == [0, 30, 34] and events.last.tolist() == [30, 34, 54]
+    np.testing.assert_allclose(events.direction[[0, 2]], directions([0.0, 10.0]), atol=1e-9)
+    assert np.isnan(events.direction[1]).all() and np.isnan(events.point).all()
+
+
+def test_somebody_who_walks_past_a_point():
+    """The direction to a fixed point turns: a fixation if hit points tell, otherwise a pursuit."""
+    n = 60
+    origin = np.c_[np.arange(n) * 0.01, np.zeros(n), np.full(n, 1.6)]
+    point = np.array([0.3, 1.0, 1.2])
+    d = (point - origin) / np.linalg.norm(point - origin, axis=1, keepdims=True)
+    rays = some_rays(n, t=np.arange(n) / RATE, origin=origin, direction=d, hit=np.tile(point, (n, 1)))
+    events = detect_events(rays)
+    assert events.kind.tolist() == ["fixation"]
+    np.testing.assert_allclose(events.point, [point])
+    assert detect_events(replace(rays, hit=None)).kind.tolist() == ["smooth_pursuit"]
+    # A point that moves is pursued.
+    moving = point + np.c_[np.arange(n) * 0.02, np.zeros((n, 2))]
+    d = (moving - origin) / np.linalg.norm(moving - origin, axis=1, keepdims=True)
+    assert detect_events(replace(rays, direction=d, hit=moving)).kind.tolist() == ["smooth_pursuit"]
+
+
+def test_pauses():
+    """A blink, a loss, and another recording after more than a minute."""
+    t = np.arange(80) / RATE
+    t[20:] += 0.2
+    t[40:] += 3
+    t[60:] += 100
+    events = detect_events(scene(np.zeros(80), t=t))
+    assert events.kind.tolist() == ["fixation", "blink", "fixation", "loss", "fixation", "fixation"]
+    np.testing.assert_allclose(events.duration[[1, 3]], [0.21, 3.01])
+    assert detect_events(scene(np.zeros(80), t=t), EventRules(max_blink=0.1)).count()["loss"] == 2
+
+
+def test_events_do_not_span_participants_or_depend_on_the_order():
+    azimuth = np.random.default_rng(0).normal(0, 1, 300).cumsum()
+    rays = scene(azimuth, 0.5 * azimuth, person=np.arange(300) % 2)
+    events = detect_events(rays)
+    assert (rays.person[events.first] == rays.person[events.last]).all() and set(rays.person[events.first]) == {0, 1}
+    shuffled = np.random.default_rng(1).permutation(300)
+    again = detect_events(rays.select(shuffled))
+    assert again.kind.tolist() == events.kind.tolist() and (shuffled[again.first] == events.first).all()
+    np.testing.assert_allclose(again.amplitude, events.amplitude)
+
+
+def test_no_rays_and_single_rays():
+    rays = scene(np.zeros(3))
+    assert len(detect_events(rays.select(np.zeros(3, bool)))) == 0 and len(detect_events(rays.select([0]))) == 0
+
+
+def test_velocities_of_the_eye_in_the_head():
+    """Independent: with heads that turn about the vertical only, the eye in the head is the difference of azimuths."""
+    rng = np.random.default_rng(2)
+    gaze, head = rng.normal(0, 0.5, (2, 200)).cumsum(axis=1)
+    v = measure_velocities(scene(gaze, head))
+    np.testing.assert_allclose(v.gaze, np.abs(np.diff(gaze)) * RATE, rtol=1e-6, atol=1e-3)
+    np.testing.assert_allclose(v.head, np.abs(np.diff(head)) * RATE, rtol=1e-3, atol=1e-2)
+    np.testing.assert_allclose(v.eye, np.abs(np.diff(gaze - head)) * RATE, rtol=1e-3, atol=1e-2)
+    # Gaze that is fixed in a head of which only the direction is known is at rest in it.
+    turn = Rotation.from_rotvec(np.radians([3.0, -5.0, 4.0])[None] * np.arange(40)[:, None] / 40)
+    heads = turn.apply([1.0, 0, 0])
+    step = Rotation.concatenate([Rotation.align_vectors(b[None], a[None])[0] for a, b in zip(heads, heads[1:])])
+    d = [np.array([0.8, 0.6, 0])]
+    for rotation in step:
+        d.append(rotation.apply(d[-1]))
+    rays = some_rays(40, t=np.arange(40) / RATE, direction=np.array(d), head=heads)
+    assert np.abs(measure_velocities(rays).eye).max() < 0.01
+
+
+@given(st.floats(-170, 170), st.floats(-80, 80), st.floats(-40, 40), st.floats(-40, 40))
+@settings(max_examples=30, deadline=None)
+def test_angles_about(azimuth, elevation, a, e):
+    """Turning the head's axes by hand gives back the angles."""
+    ahead = directions([azimuth], elevation)
+    turn = Rotation.from_euler("ZY", [azimuth, -elevation], degrees=True)
+    # Right is clockwise from above.
+    direction = turn.apply(directions([-a], e))
+    np.testing.assert_allclose(angles_about(direction, ahead), [[a, e]], atol=1e-9)
+    np.testing.assert_allclose(angles_about(ahead, ahead), 0, atol=1e-9)
+
+
+def test_rules_are_validated():
+    with pytest.raises(NergError, match="max_blink"):
+        EventRules(max_blink=-1.0)

@@ -5,8 +5,17 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.rays import quality
-from nerg_mi.rays.quality import WARNING_LABEL, format_quality_report, make_quality_report, summarise
+from nerg_mi.rays.events import angles_about, detect_events
+from nerg_mi.rays.quality import (
+    WARNING_LABEL,
+    GazeTarget,
+    format_quality_report,
+    make_quality_report,
+    measure_recordings,
+    summarise,
+)
 from nerg_mi.rays.rays import FRAME, Rays
+from tests.rays.people import some_rays
 
 # ---- Quality report as text ----
 
@@ -140,3 +149,88 @@ def test_sampling_rate_of_sparse_rays():
         and alone.duplicates == 0
         and not any("tick" in w or "t=" in w for w in alone.warnings)
     )
+
+
+# ---- Data quality of each recording ----
+
+
+def noisy(n: int = 900, seed: int = 0) -> Rays:
+    """Two participants at 100 Hz, who look at a point for a second each, with noise and missing samples."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(n) / 100
+    t = t[rng.random(n) > 0.1]
+    azimuth, elevation = 20 * np.floor(t), 5 * (np.floor(t) % 3)
+    angles = np.radians(np.stack([azimuth, elevation]) + rng.normal(0, 0.05, (2, len(t))))
+    d = np.stack([np.cos(angles[0]) * np.cos(angles[1]), np.sin(angles[0]) * np.cos(angles[1]), np.sin(angles[1])], 1)
+    person = np.r_[np.zeros(len(t)), np.ones(len(t))]
+    return some_rays(2 * len(t), t=np.r_[t, t + 2], person=person, direction=np.r_[d, d[:, [1, 0, 2]]])
+
+
+TARGETS = [GazeTarget(0, 0.9, (2.0, 0.02, 0.1)), GazeTarget(3.1, 3.8, (2.0, 4.0, 1.0), "ann")]
+
+
+def test_recordings_as_etdqualitizer_measures_them():
+    etd = pytest.importorskip("ETDQualitizer")
+    rays = noisy()
+    events = detect_events(rays)
+    first, second = measure_recordings(rays, TARGETS, events)
+    for person, one in enumerate((first, second)):
+        rows = np.flatnonzero(rays.person == person)
+        d, t = rays.direction[rows], rays.t[rows]
+        recording = etd.DataQuality(d[:, 0], d[:, 1], t, "degrees")
+        assert np.isclose(one.effective_frequency, recording.effective_frequency(), rtol=1e-12)
+        assert np.isclose(one.data_loss, recording.data_loss_from_expected(one.frequency), rtol=1e-9)
+        assert np.isclose(one.duration, recording.get_duration()) and one.samples == len(rows)
+        precision = []
+        for k in np.flatnonzero(np.isin(events.first, rows) & (events.kind == "fixation")):
+            span = slice(events.first[k], events.last[k] + 1)
+            angles = angles_about(rays.direction[span], np.tile(events.direction[k], (span.stop - span.start, 1)))
+            fixation = etd.DataQuality(*angles.T, rays.t[span], "degrees")
+            precision.append([fixation.precision_RMS_S2S()[0], fixation.precision_STD()[0]])
+        assert one.fixations == len(precision) >= 8
+        np.testing.assert_allclose([one.rms_s2s, one.std], np.median(precision, axis=0), rtol=1e-9)
+        # Both targets are as seen from the origin, where the eyes are.
+        offsets = []
+        for target in TARGETS[: 2 - person]:
+            at = (t >= target.start) & (t <= target.end)
+            if at.any():
+                ahead = np.tile(np.array(target.point) / np.linalg.norm(target.point), (at.sum(), 1))
+                offsets.append(etd.accuracy(*angles_about(d[at], ahead).T, 0, 0)[0])
+        assert one.targets == len(offsets)
+        if offsets:
+            assert np.isclose(one.accuracy, np.mean(offsets), rtol=1e-9)
+
+
+def test_recordings_by_hand():
+    """Noise of 0.05 degrees: its STD over both axes, and RMS-S2S, which is the square root of 2 larger."""
+    first, second = measure_recordings(noisy(6000))
+    assert first.participant == "ann" and second.start == pytest.approx(2.0, abs=0.05)
+    assert first.frequency == pytest.approx(100) and first.data_loss == pytest.approx(10, abs=1.5)
+    assert first.effective_frequency == pytest.approx(90, abs=1.5)
+    assert first.std == pytest.approx(0.05 * np.sqrt(2), rel=0.05)
+    assert first.rms_s2s == pytest.approx(0.1, rel=0.05)
+    assert first.targets == 0 and np.isnan(first.accuracy)
+
+
+def test_accuracy_by_hand():
+    """An eye that moves, and gaze that passes a point at 3 degrees to the right and 4 above."""
+    n, rng = 50, np.random.default_rng(0)
+    origin = rng.normal(0, 1, (n, 3)) + [0, 0, 20.0]
+    point = (10.0, 3.0, 21.0)
+    ahead = np.array(point) - origin
+    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
+    right = np.cross(ahead, [0, 0, 1.0])
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    a, e = np.radians([3.0, 4.0])
+    d = np.cos(e) * (np.cos(a) * ahead + np.sin(a) * right) + np.sin(e) * np.cross(right, ahead)
+    (quality,) = measure_recordings(some_rays(n, origin=origin, direction=d), [GazeTarget(-1, 10, point)])
+    assert quality.targets == 1
+    assert quality.accuracy == pytest.approx(np.degrees(np.arccos(np.cos(a) * np.cos(e))))
+
+
+def test_quality_of_recordings_that_are_too_short():
+    one, two = (measure_recordings(some_rays(n))[0] for n in (1, 2))
+    assert np.isnan([one.frequency, one.duration, one.data_loss, one.rms_s2s]).all() and one.samples == 1
+    assert two.frequency == pytest.approx(10) and two.data_loss == pytest.approx(0, abs=1e-9)
+    with pytest.raises(NergError, match="target"):
+        GazeTarget(2, 1, (0, 0, 0))

@@ -224,10 +224,10 @@ def test_metadata_are_inherited(dataset):
     dataset.gaze(IN_WORLD, "sub-a/ses-1/beh/sub-a_ses-1_task-look_recording-eye1", **SYSTEM)
     dataset.gaze(IN_WORLD, "sub-a/ses-2/beh/sub-a_ses-2_task-look_recording-eye1", **SYSTEM)
     for k in (1, 2):
-        own = dataset.folder / f"sub-a/ses-{k}/beh/sub-a_ses-{k}_task-look_recording-eye1_physio.json"
-        content = json.loads(own.read_text())
+        sidecar = dataset.folder / f"sub-a/ses-{k}/beh/sub-a_ses-{k}_task-look_recording-eye1_physio.json"
+        content = json.loads(sidecar.read_text())
         del content["timestamp"], content["Columns"]
-        own.write_text(json.dumps(content))
+        sidecar.write_text(json.dumps(content))
     dataset.json("task-look_physio.json", {"timestamp": {"Units": "s"}, "Columns": list(IN_WORLD), "Cohort": "all"})
     dataset.json("sub-a/ses-2/sub-a_ses-2_physio.json", {"timestamp": {"Units": "ms"}, "Cohort": "second"})
     dataset.json("task-other_physio.json", {"Columns": ["timestamp"]})

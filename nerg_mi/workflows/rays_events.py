@@ -1,0 +1,136 @@
+"""Events of gaze and data quality of recordings, as tables."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerg_mi.errors import NergError
+from nerg_mi.files.atomic import check_writable
+from nerg_mi.files.tables import unescape_formula, write_csv
+from nerg_mi.rays.dataset import load_rays
+from nerg_mi.rays.events import Events, detect_events
+from nerg_mi.rays.quality import GazeTarget, RecordingQuality, measure_recordings
+from nerg_mi.rays.rays import Rays
+from nerg_mi.rays.readers.tables import iterate_table, read_table_columns
+
+from .base import SILENT, Reporter
+from .rays_commands import EventOptions, RaysEventsOptions
+
+
+@dataclass(frozen=True, eq=False)
+class EventsResult:
+    """Events, and the data quality of each recording."""
+
+    events: Events
+    quality: list[RecordingQuality]
+
+
+def measure_events(
+    rays: Rays | str | os.PathLike, options: RaysEventsOptions | None = None, reporter: Reporter = SILENT
+) -> EventsResult:
+    """Detect the events of ``rays`` (or of their file or dataset), and measure the data quality of each recording.
+
+    Raises `NergError` for targets that are not a table of points and times.
+    """
+    options = options or RaysEventsOptions()
+    if options.quality is not None:
+        check_writable(options.quality, ".csv")
+    reporter.progress(0.0, "reading rays")
+    data = rays if isinstance(rays, Rays) else load_rays(rays)
+    targets = [] if options.targets is None else read_targets(options.targets, data.persons)
+    reporter.progress(0.2, "detecting events")
+    warn_slow_sampling(data, options, reporter)
+    events = detect_events(data, options.event_rules())
+    result = EventsResult(events, measure_recordings(data, targets, events))
+    for kind, count in events.count().items():
+        mask = events.kind == kind
+        reporter.message(f"{count:,} {kind}: {events.duration[mask].sum():,.1f} s, median {_median(events, mask)}")
+    reporter.message(_format_quality(result.quality))
+    if options.quality is not None:
+        write_csv(options.quality, [asdict(recording) for recording in result.quality])
+        reporter.message(f"wrote {options.quality}")
+    return result
+
+
+def write_events(rays: Path, output: Path, options: RaysEventsOptions, reporter: Reporter) -> None:
+    """Call `measure_events` and write the events to a table."""
+    check_writable(output, ".csv")
+    data = load_rays(rays)
+    result = measure_events(data, options, reporter)
+    write_csv(output, _iterate_rows(data, result.events), _COLUMNS)
+    reporter.message(f"wrote {output}")
+
+
+_VECTORS = ("direction", "point")
+_COLUMNS = ["participant", "onset", "duration", "kind", "amplitude", "peak_velocity"]
+_COLUMNS += [f"{name}_{axis}" for name in _VECTORS for axis in "xyz"]
+
+
+def _iterate_rows(rays: Rays, events: Events) -> Iterator[dict[str, Any]]:
+    """Rows of the table: seconds, degrees, and metres in the frame of rays."""
+    values = np.column_stack(
+        [events.onset, events.duration, events.amplitude, events.peak_velocity, events.direction, events.point]
+    )
+    names = [name for name in _COLUMNS if name not in ("participant", "kind")]
+    persons = rays.person[events.first].tolist()
+    for person, kind, row in zip(persons, events.kind.tolist(), values.tolist()):
+        yield {"participant": rays.persons[person], "kind": kind, **dict(zip(names, row))}
+
+
+def read_targets(path: Path, participants: Sequence[str]) -> list[GazeTarget]:
+    """Read targets from the columns start, end, x, y, z and optionally person of a CSV file. Raises `NergError` for a
+    table without these columns, for missing numbers, and for an unknown participant."""
+    texts = [name for name in ("person",) if name in read_table_columns(path)]
+    targets = []
+    for block in iterate_table(path, ("start", "end", "x", "y", "z"), texts):
+        for row, words, line in zip(block.numbers.tolist(), block.texts.tolist(), block.lines.tolist()):
+            name = unescape_formula(words[0]) if words and words[0] else None
+            if not np.isfinite(row).all():
+                raise NergError(f"{path}, line {line}: a target needs start, end, x, y and z; complete or remove it")
+            if name is not None and name not in participants:
+                raise NergError(f"{path}, line {line}: no person of the rays is called {name!r}; correct the name")
+            try:
+                targets.append(GazeTarget(row[0], row[1], (row[2], row[3], row[4]), name))
+            except NergError as error:
+                raise NergError(f"{path}, line {line}: {error}; correct it") from error
+    if not targets:
+        raise NergError(f"{path} has no targets; add rows, or leave out --targets")
+    return targets
+
+
+def warn_slow_sampling(rays: Rays, options: EventOptions, reporter: Reporter) -> None:
+    """Warn of rays whose intervals are mostly pauses by the options."""
+    steps = np.diff(rays.t)[np.diff(rays.person) == 0]
+    interval = float(np.median(steps[steps > 0])) if (steps > 0).any() else float("nan")
+    longest = options.event_rules().max_step
+    if interval > longest * (1 - 1e-6):
+        reporter.warn(
+            f"samples are {interval:.3g} s apart in the median, and intervals above {longest:g} s are pauses: raise "
+            "--max-step; saccades, which last 0.02 to 0.1 s, are not resolved"
+        )
+
+
+def _median(events: Events, mask: np.ndarray) -> str:
+    return f"{np.median(events.duration[mask]):.3f} s, {np.median(events.amplitude[mask]):.1f} degrees"
+
+
+def _format_quality(quality: Sequence[RecordingQuality]) -> str:
+    """Medians over recordings, in one line."""
+
+    def median(name: str) -> str:
+        values = np.array([getattr(recording, name) for recording in quality], float)
+        values = values[np.isfinite(values)]
+        return f"{np.median(values):.3g}" if len(values) else "unknown"
+
+    accuracy = "" if not any(q.targets for q in quality) else f", accuracy {median('accuracy')} degrees"
+    return (
+        f"median of {len(quality):,} recordings: data loss {median('data_loss')} %, "
+        f"{median('effective_frequency')} of {median('frequency')} Hz, RMS-S2S {median('rms_s2s')} and STD "
+        f"{median('std')} degrees{accuracy}"
+    )

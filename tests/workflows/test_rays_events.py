@@ -1,0 +1,81 @@
+"""Tests of `nerg_mi.workflows.rays_events`."""
+
+from __future__ import annotations
+
+import csv
+
+import numpy as np
+import pytest
+
+from nerg_mi.errors import NergError
+from nerg_mi.rays.rays import Rays
+from nerg_mi.workflows.rays_commands import RaysEventsOptions
+from nerg_mi.workflows.rays_events import measure_events, write_events
+from tests.rays.people import some_rays
+
+from .recorder import Recorder
+
+
+@pytest.fixture
+def looks() -> Rays:
+    """Two participants at 100 Hz, each of whom looks along x for half a second, and then along y."""
+    n = 100
+    along_x = np.arange(n) < n // 2
+    d = np.where(along_x[:, None], [1.0, 0, 0], [0, 1.0, 0])
+    point = np.where(along_x[:, None], [2.0, 0, 0], [0, 3.0, 0])
+    t = np.arange(n) / 100
+    person = np.r_[np.zeros(n), np.ones(n)]
+    return some_rays(2 * n, t=np.r_[t, t], person=person, direction=np.r_[d, d], hit=np.r_[point, point])
+
+
+def test_tables(looks, tmp_path):
+    looks.save(tmp_path / "rays.npz")
+    (tmp_path / "targets.csv").write_text("start,end,x,y,z,person\n0,0.4,2,0,0,ann\n0.6,1,0,1,1,\n")
+    options = RaysEventsOptions(targets=tmp_path / "targets.csv", quality=tmp_path / "quality.csv")
+    reporter = Recorder()
+    write_events(tmp_path / "rays.npz", tmp_path / "events.csv", options, reporter)
+    with open(tmp_path / "events.csv") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["kind"] for row in rows] == ["fixation", "saccade", "fixation"] * 2
+    assert [row["participant"] for row in rows] == ["ann"] * 3 + ["bo"] * 3
+    assert float(rows[1]["amplitude"]) == pytest.approx(90) and float(rows[1]["onset"]) == pytest.approx(0.49)
+    assert [float(rows[2][f"{name}_y"]) for name in ("direction", "point")] == pytest.approx([1, 3])
+    assert rows[1]["direction_x"] == ""
+    with open(tmp_path / "quality.csv") as file:
+        first, second = csv.DictReader(file)
+    # One target is met, the other one is 45 degrees above; bo has the second one only.
+    assert (first["targets"], second["targets"]) == ("2", "1")
+    assert float(first["accuracy"]) == pytest.approx(22.5) and float(second["accuracy"]) == pytest.approx(45)
+    assert float(first["effective_frequency"]) == pytest.approx(100) and float(first["rms_s2s"]) == pytest.approx(0)
+    assert any("4 fixation" in message for message in reporter.messages)
+
+
+def test_options_are_used(looks):
+    options = RaysEventsOptions(velocity_threshold=10_000.0)
+    assert "saccade" not in measure_events(looks, options).events.count()
+
+
+def test_slow_samples_are_reported(looks):
+    slow = some_rays(20, t=0.5 * np.arange(20))
+    reporter = Recorder()
+    assert set(measure_events(slow, reporter=reporter).events.count()) == {"blink"}
+    assert any("--max-step" in warning for warning in reporter.warnings)
+    reporter = Recorder()
+    assert set(measure_events(slow, RaysEventsOptions(max_step=1.0), reporter).events.count()) == {"fixation"}
+    assert not reporter.warnings
+
+
+@pytest.mark.parametrize(
+    "text, message",
+    [
+        ("start,end,x,y,z\n", "no targets"),
+        ("start,end,x,y\n0,1,2,3\n", "column z"),
+        ("start,end,x,y,z\n0,1,2,3,\n", "line 2"),
+        ("start,end,x,y,z\n2,1,2,3,4\n", "line 2"),
+        ("start,end,x,y,z,person\n0,1,2,3,4,zoe\n", "zoe"),
+    ],
+)
+def test_wrong_targets_are_refused(looks, tmp_path, text, message):
+    (tmp_path / "targets.csv").write_text(text)
+    with pytest.raises(NergError, match=message):
+        measure_events(looks, RaysEventsOptions(targets=tmp_path / "targets.csv"))
