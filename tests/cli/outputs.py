@@ -36,8 +36,11 @@ ABLATION = (
     "default_emit_capture_0.safetensors default_emit_capture_0.json"
 )
 BIDS = "README dataset_description.json participants.json participants.tsv task-gaze_physio.json "
+BIDS += "task-gaze_physioevents.json "
 BIDS += " ".join(
-    f"sub-{p}/beh/sub-{p}_task-gaze_recording-eye1_physio{suffix}" for p in "abcd" for suffix in (".json", ".tsv.gz")
+    f"sub-{p}/beh/sub-{p}_task-gaze_recording-eye1_physio{suffix}"
+    for p in "abcd"
+    for suffix in (".json", ".tsv.gz", "events.tsv.gz")
 )
 EVALUATION = "gaze.md gaze.csv persons.csv gaze.json positions.csv positions.png"
 STATS = "aois.csv aois.md transitions.csv transitions.md durations.csv durations.md participants.csv participants.md "

@@ -238,6 +238,6 @@ def test_valid(watched, tmp_path):
 )
 def test_recordings(recorded, tmp_path, preset, folder, pattern):
     rays = read(preset, *sorted(recorded(folder).glob(pattern)))
-    write_bids(tmp_path / "set", rays)
+    export_rays(rays, tmp_path / "set")
     assert_equal(rays, read("bids", tmp_path / "set"))
     assert find_errors(tmp_path / "set") == []

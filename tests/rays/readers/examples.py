@@ -437,7 +437,40 @@ BIDS = {
         None, lambda k: [20 * k, "n/a", "n/a", 10 * k, 1600, 0, 0, 0.1, 1, 0.9, "n/a"], "\t"
     ),
 }
-VARIANTS = {"aria": [Example(_ARIA_POSES | {name: text}) for name, text in _ARIA_VARIANTS.items()]}
+_MOTION = "sub-ann_task-walk_tracksys-vr"
+_CHANNELS = [("x", "POS", "m"), ("y", "POS", "m"), ("z", "POS", "m"), *((f"quat_{a}", "ORNT", "n/a") for a in "xyzw")]
+_MOTION_FILES = {
+    "dataset_description.json": BIDS["dataset_description.json"],
+    f"{_MOTION}_channels.json": json.dumps({"reference_frame": {"Levels": {"w": {"SpatialAxes": "RSA"}}}}),
+    f"{_MOTION}_channels.tsv": lines(
+        "name component type tracked_point units reference_frame".split(),
+        lambda k: [f"c{k}", *_CHANNELS[k][:2], "Head", _CHANNELS[k][2], "w"],
+        "\t",
+        len(_CHANNELS),
+    ),
+    f"{_MOTION}_motion.json": json.dumps({"SamplingFrequency": 50}),
+    f"{_MOTION}_motion.tsv": lines(None, lambda k: [0.01 * k, 1.6, 0, 0, 0, 0, 1], "\t"),
+}
+_EYE_IN_HEAD = {
+    "PhysioType": "eyetrack",
+    "RecordedEye": "left",
+    "SampleCoordinateSystem": "eye-in-head",
+    "StartTime": 0.0,
+    "timestamp": {"Units": "ms"},
+    "x_coordinate": {"Units": "deg"},
+    "Columns": ["timestamp", "x_coordinate", "y_coordinate"],
+}
+_BIDS_VARIANT = {
+    **_MOTION_FILES,
+    "sub-ann_scans.tsv": "filename\tacq_time\na.tsv\t2026-01-01T10:00:00\n",
+    "participants.tsv": "participant_id\tgroup\nsub-ann\tfirst\n",
+    "task-walk_physio.json": json.dumps(_EYE_IN_HEAD),
+    "sub-ann_task-walk_recording-eye1_physio.tsv.gz": lines(None, lambda k: [20 * k, 0.5 * k, -5], "\t"),
+}
+VARIANTS = {
+    "aria": [Example(_ARIA_POSES | {name: text}) for name, text in _ARIA_VARIANTS.items()],
+    "bids": [Example(_BIDS_VARIANT)],
+}
 """Further recordings that readers distinguish by their content, for the fuzzer in addition to `EXAMPLES`."""
 
 _SCENE = {"poses": Path("transforms.json"), "frames": FRAMES}
