@@ -110,13 +110,13 @@ def _candidate_blocks(field: RadianceField, resolution: int, start: VoxelGrid | 
         return np.arange(n**3, dtype=np.uint32)
     # Points along an edge of a block, so that each cell of the occupancy grid contains one.
     count = max(1, math.ceil(BLOCK_EDGE * grid.resolution / resolution)) * (2 if field.box.is_contracted else 1)
-    index, found = dr.arange(ns.UInt32, n**3), dr.zeros(ns.Bool, n**3)
+    index, occupied = dr.arange(ns.UInt32, n**3), dr.zeros(ns.Bool, n**3)
     corner = _corner(index, n, ns)
     for k in range(count**3):
         offset = ns.Array3f(*[dr.opaque(ns.Float, (k // count**axis % count + 0.5) / count) for axis in range(3)])
-        found |= _is_occupied(field, (corner + offset) / n)
-        dr.eval(found)
-    blocks = found.numpy().reshape(n, n, n)
+        occupied |= _is_occupied(field, (corner + offset) / n)
+        dr.eval(occupied)
+    blocks = occupied.numpy().reshape(n, n, n)
     if field.box.is_contracted:
         blocks = dilate(blocks)
     return np.flatnonzero(blocks).astype(np.uint32)

@@ -68,7 +68,7 @@ def assert_equal(rays: Rays, again: Rays, atol: float = 1e-6) -> None:
 
 
 def find_validator() -> str | None:
-    """The validator of the extra `test`, next to the interpreter or on the path."""
+    """The validator of the extra `bids`, next to the interpreter or on the path."""
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
     return shutil.which("bids-validator-deno", path=path)
 
@@ -77,7 +77,7 @@ def find_errors(folder: Path) -> list[str]:
     """What the validator of BIDS refuses in all rows, by the schema that it contains."""
     validator = find_validator()
     if validator is None:
-        pytest.skip("bids-validator-deno is not installed (extra test)")
+        pytest.skip("bids-validator-deno is not installed (extra bids)")
     # Its runtime, Deno, refuses folders below /dev, such as those of tests in memory.
     with tempfile.TemporaryDirectory() as copy:
         shutil.copytree(folder, copy, dirs_exist_ok=True)
