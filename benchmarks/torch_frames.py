@@ -22,6 +22,7 @@ import sys
 import tempfile
 import time
 from functools import partial
+from pathlib import Path
 
 # First frames must not find a compiled kernel. Once Dr.Jit is loaded this cannot be set.
 if "drjit" not in sys.modules:
@@ -273,15 +274,17 @@ def agreement(scene, peer: TorchRenderer, width: int = 160, height: int = 90) ->
 
 class Ours:
     """A function that renders frames of the demo store with these ``values`` of its scene; ``constant``: with constant
-    weights of its networks. ``first``: seconds of the first frame, with compilation."""
+    weights of its networks; ``moves``: of an observer at another position in each frame. ``first``: seconds of the
+    first frame, with compilation."""
 
-    def __init__(self, values: dict, visibility: str, constant: bool = False):
+    def __init__(self, values: dict, visibility: str, constant: bool = False, moves: bool = False):
         import mitsuba as mi
 
         scene = nerg.Scene.load(find_store_scene(), **values, visibility=visibility)
         if constant:
             scene.set_constant_weights()
         self.render = partial(mi.render, scene.mitsuba, sensor=0, spp=1)
+        self.params, self.moves, self.frames = mi.traverse(scene.integrator), moves, 0
         start = time.perf_counter()
         self()
         self.first = time.perf_counter() - start
@@ -289,20 +292,34 @@ class Ours:
         self()
 
     def __call__(self) -> np.ndarray:
+        if self.moves:
+            import mitsuba as mi
+
+            self.frames += 1
+            eye = mi.ScalarPoint3f(4.4, 2.8 + 0.002 * self.frames, 1.6)
+            self.params["observer.to_world"] = mi.Transform4f().look_at(eye, [4.8, 4.4, 1.2], [0, 0, 1])
+            self.params.update()
         return np.array(self.render())
 
 
-def our_frames(values: dict) -> dict[str, Ours]:
-    """nerg's programs by name, with these ``values`` of the scene; those with constant weights give bit-identical
-    images, which is checked."""
-    frames = {
-        f"{name}{overrides}": Ours(values, visibility, constant)
-        for constant, overrides in ((False, ""), (True, ", constant weights"))
-        for name, visibility in (("nerg", "depth"), ("nerg, same observer again", "map"))
-    }
-    for name in ("nerg", "nerg, same observer again"):
-        if not np.array_equal(frames[name](), frames[f"{name}, constant weights"]()):
-            raise SystemExit("constant weights give another picture")
+def our_frames(values: dict, compiled: Path) -> dict[str, Ours]:
+    """nerg's programs by name, with these ``values`` of the scene and with the ``compiled`` field in place of its own.
+
+    Those with constant weights give bit-identical images, and those of the compiled field images of at least 40 dB,
+    which is checked.
+    """
+    frames, names = {}, (("", "depth"), (", same observer again", "map"))
+    for field, changed in (("nerg", {}), ("nerg, compiled field", {"field": str(compiled)})):
+        for constant, overrides in ((False, ""), (True, ", constant weights")):
+            for name, visibility in names:
+                frames[f"{field}{name}{overrides}"] = Ours({**values, **changed}, visibility, constant)
+        for name, _ in names:
+            if not np.array_equal(frames[field + name](), frames[f"{field}{name}, constant weights"]()):
+                raise SystemExit("constant weights give another picture")
+        frames[f"{field}, observer moves"] = Ours({**values, **changed}, "depth", moves=True)
+    ours, other = (np.clip(frames[name]()[..., :3], 0, 1) for name in ("nerg", "nerg, compiled field"))
+    if not np.mean((ours - other) ** 2) < 1e-4:
+        raise SystemExit("the compiled field gives another picture")
     return frames
 
 
