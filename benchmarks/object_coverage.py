@@ -20,8 +20,8 @@ from pathlib import Path
 from unittest import mock
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
-from nerg_mi.statistics.estimates import adjust_p_values
-from nerg_mi.statistics.tables import COMPARED_MEASURES, MEASURES, MEASURES_BY_NAME
+from nerg_mi.measures.estimates import adjust_p_values
+from nerg_mi.measures.tables import COMPARED_MEASURES, MEASURES, MEASURES_BY_NAME
 from object_statistics import Walks, counting_of, made_store
 
 import numpy as np
@@ -62,8 +62,8 @@ def _visits() -> dict[str, tuple[np.ndarray, np.ndarray]]:
     from nerg_mi.aoi.measured import count_block
     from nerg_mi.aoi.scene import make_aois
     from nerg_mi.formats.areas import AreaSet, Region
-    from nerg_mi.statistics.tables import Participants
-    from nerg_mi.statistics.visits import ALL
+    from nerg_mi.measures.tables import Participants
+    from nerg_mi.measures.visits import ALL
 
     around, goods, _ = made_store()
     labels = []
@@ -102,7 +102,7 @@ def shares(people: tuple[int, ...]) -> None:
 
 
 def _share_intervals() -> dict:
-    from nerg_mi.statistics.estimates import mid_p_interval
+    from nerg_mi.measures.estimates import mid_p_interval
 
     z = stats.norm.ppf(0.975)
     cut = lambda low, high: (np.maximum(low, 0), np.minimum(high, 1))
@@ -172,7 +172,7 @@ def ratio_intervals(x: np.ndarray, y: np.ndarray, seed: int) -> dict:
 
 def _estimate_with(bandwidth: float | None, x: np.ndarray, y: np.ndarray, seed: int = 0):
     """Estimates whose upper limit is from draws smoothed by ``bandwidth``; None: the default's."""
-    from nerg_mi.statistics import estimates
+    from nerg_mi.measures import estimates
 
     with mock.patch.object(estimates, "BANDWIDTH", estimates.BANDWIDTH if bandwidth is None else bandwidth):
         return estimates.estimate_ratios(x, y, resamples=RESAMPLES, seed=seed)
@@ -246,7 +246,7 @@ def compare(
 
 def few_intervals(x: np.ndarray, y: np.ndarray, seed: int) -> dict:
     """Ends of the intervals (K,) with other factors of the error where few participants determine a number."""
-    from nerg_mi.statistics import estimates
+    from nerg_mi.measures import estimates
 
     selected = _estimate_with(0.0, x, y, seed)
     value, _, people = estimates._linearize(x, y)
@@ -271,7 +271,7 @@ def few_intervals(x: np.ndarray, y: np.ndarray, seed: int) -> dict:
 
 
 def numbers(population: Population, sets: int, people: tuple[int, ...]) -> None:
-    from nerg_mi.statistics.estimates import estimate_proportions, estimate_ratios
+    from nerg_mi.measures.estimates import estimate_proportions, estimate_ratios
 
     print(f"\n| statistic {HEAD}")
     for n in people:
@@ -293,7 +293,7 @@ def numbers(population: Population, sets: int, people: tuple[int, ...]) -> None:
 
 def differences(population: Population, sets: int, pairs: tuple[tuple[int, int], ...]) -> None:
     """Rate at which two groups of one population are found to differ, p <= 0.05, before and after the adjustment."""
-    from nerg_mi.statistics.estimates import estimate_proportion_differences, estimate_ratio_differences
+    from nerg_mi.measures.estimates import estimate_proportion_differences, estimate_ratio_differences
 
     print(
         "\n| participants | statistic | p <= 0.05 | maximum over AOIs | p <= 0.05, rare AOIs | maximum over AOIs "

@@ -36,8 +36,8 @@ def made_store():
 
 def counting_of(around, areas, shapes, seen: bool = True):
     from nerg_mi.aoi.measured import AoiContext
-    from nerg_mi.statistics.shares import SamplePoints, VisibilityCache
-    from nerg_mi.statistics.visits import VisitRules
+    from nerg_mi.measures.shares import SamplePoints, VisibilityCache
+    from nerg_mi.measures.visits import VisitRules
 
     in_view = VisibilityCache(SamplePoints.sample(shapes, 48), around.trace_depth, 0.1, 0.03) if seen else None
     members = list(areas.element_indices().values())
@@ -96,10 +96,10 @@ def errors() -> None:
     from nerg_mi.aoi.measured import Viewpoints, count_block
     from nerg_mi.aoi.predicted import predict_attention
     from nerg_mi.maths.sphere import fibonacci_directions
+    from nerg_mi.measures.shares import SamplePoints
+    from nerg_mi.measures.tables import Participants
+    from nerg_mi.measures.visits import ALL, assign_hits
     from nerg_mi.scenes.store import twin
-    from nerg_mi.statistics.shares import SamplePoints
-    from nerg_mi.statistics.tables import Participants
-    from nerg_mi.statistics.visits import ALL, assign_hits
     from nerg_mi.workflows.base import SILENT
 
     around, areas, shapes = made_store()

@@ -100,8 +100,8 @@ def registered() -> str:
     _choose_variant()
     from nerg_mi.fields import encoding as encodings
     from nerg_mi.fields import gaze_base as gaze_fields
+    from nerg_mi.measures.tables import MEASURES_BY_NAME
     from nerg_mi.rays.readers.registry import list_reader_names
-    from nerg_mi.statistics.tables import MEASURES_BY_NAME
     from nerg_mi.train import gaze_recipes
     from nerg_mi.transport.aovs import AOVS
     from nerg_mi.transport.depth import DEPTHS
@@ -114,7 +114,7 @@ def registered() -> str:
         ("depth", "nerg_mi/transport/depth.py", DEPTHS.names()),
         ("AOV", "nerg_mi/transport/aovs.py", AOVS),
         ("tracking reader", "nerg_mi/rays/readers/base.py", list_reader_names()),
-        ("statistic", "nerg_mi/statistics/tables.py", MEASURES_BY_NAME),
+        ("statistic", "nerg_mi/measures/tables.py", MEASURES_BY_NAME),
         ("gaze recipe", "nerg_mi/train/gaze_recipes.py", gaze_recipes.load_recipes()),
     )
     rows = [(what, f"`{file}`", ", ".join(f"`{name}`" for name in names)) for what, file, names in rows]
@@ -131,7 +131,7 @@ def _choose_variant() -> None:
 
 def measures() -> str:
     """The statistics of `nerg stats` with their definitions."""
-    from nerg_mi.statistics.tables import MEASURES
+    from nerg_mi.measures.tables import MEASURES
 
     rows = [(m.title, m.definition, m.population, "yes" if m.is_compared else "") for m in MEASURES]
     return table_or_list(("statistic", "definition", "over", "compared"), rows)

@@ -10,11 +10,8 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.formats.areas import Region
-from nerg_mi.rays.dataset import RayDataset, is_dataset
-from nerg_mi.rays.filters import argsort_by_person_time
-from nerg_mi.rays.rays import Rays, merge_rays
-from nerg_mi.statistics.shares import VisibilityCache
-from nerg_mi.statistics.visits import (
+from nerg_mi.measures.shares import VisibilityCache
+from nerg_mi.measures.visits import (
     ALL,
     Aoi,
     Cell,
@@ -31,6 +28,9 @@ from nerg_mi.statistics.visits import (
     sample_cone,
     sum_visits,
 )
+from nerg_mi.rays.dataset import RayDataset, is_dataset
+from nerg_mi.rays.filters import argsort_by_person_time
+from nerg_mi.rays.rays import Rays, merge_rays
 
 from .scene import GazeScene
 
@@ -172,7 +172,7 @@ def facing_directions(rays: Rays) -> np.ndarray:
 def count_block(rays: Rays, context: AoiContext) -> VisitSums:
     """Sum the visits of a block of samples that contains whole sessions.
 
-    The result depends on the arguments only. `nerg_mi.statistics.visits.merge_sums` adds the results of the blocks in
+    The result depends on the arguments only. `nerg_mi.measures.visits.merge_sums` adds the results of the blocks in
     order.
     """
     hits = context.assign_hits(rays)

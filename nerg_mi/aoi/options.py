@@ -23,7 +23,7 @@ from nerg_mi.workflows.options import (
 )
 
 if TYPE_CHECKING:
-    from nerg_mi.statistics.visits import VisitRules
+    from nerg_mi.measures.visits import VisitRules
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,7 +123,7 @@ class CountOptions(AoiOptions):
 
     def visit_rules(self) -> VisitRules:
         """Return the rules that define a visit. Raises `NergError` for contradictory times."""
-        from nerg_mi.statistics.visits import VisitRules
+        from nerg_mi.measures.visits import VisitRules
 
         return VisitRules(self.max_gap, self.session_gap, self.merge_gap, self.min_visit)
 

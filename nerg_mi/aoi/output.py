@@ -14,9 +14,9 @@ from nerg_mi.figures.statistics import aois_figure, map_figure, transitions_figu
 from nerg_mi.figures.style import make_provenance, save
 from nerg_mi.files.atomic import replace_atomically, write_text
 from nerg_mi.files.tables import format_markdown_table, write_csv
+from nerg_mi.measures.tables import MEASURES, MEASURES_BY_NAME, PREDICTED, ParticipantRows, Row, format_measure
+from nerg_mi.measures.visits import VisitSums
 from nerg_mi.rays.rays import import_pyarrow
-from nerg_mi.statistics.tables import MEASURES, MEASURES_BY_NAME, PREDICTED, ParticipantRows, Row, format_measure
-from nerg_mi.statistics.visits import VisitSums
 from nerg_mi.workflows.base import Reporter
 
 from .options import StatisticsOptions

@@ -15,6 +15,7 @@ from nerg_mi.files.atomic import replace_atomically
 from nerg_mi.files.safe_read import read_npz
 from nerg_mi.formats.areas import AreaSet, list_area_files, read_areas
 from nerg_mi.formats.checkpoint import read_metadata
+from nerg_mi.measures.visits import Cell, VisitSums
 from nerg_mi.rays.dataset import (
     DATASET_MANIFEST,
     RayDataset,
@@ -25,7 +26,6 @@ from nerg_mi.rays.dataset import (
 )
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.scene import list_scene_files
-from nerg_mi.statistics.visits import Cell, VisitSums
 from nerg_mi.tasks.engines import prepare_once
 from nerg_mi.tasks.task import RENDER_LIBRARIES, FileGroup, Part, Plan
 from nerg_mi.workflows.base import select_backend

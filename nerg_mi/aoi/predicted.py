@@ -16,8 +16,8 @@ from nerg_mi.alignment.check import read_similarity
 from nerg_mi.errors import NergError
 from nerg_mi.formats.areas import AreaGroup, AreaSet, read_regions
 from nerg_mi.formats.meshes import MeshFile
-from nerg_mi.statistics.estimates import adjust_p_values, estimate_ratio_differences
-from nerg_mi.statistics.shares import (
+from nerg_mi.measures.estimates import adjust_p_values, estimate_ratio_differences
+from nerg_mi.measures.shares import (
     COARSE,
     Isovists,
     SamplePoints,
@@ -27,7 +27,7 @@ from nerg_mi.statistics.shares import (
     gaze_shares,
     visible_in_fov,
 )
-from nerg_mi.statistics.tables import (
+from nerg_mi.measures.tables import (
     MEASURES_BY_NAME,
     MIN_VIEWPOINTS,
     PREDICTED,
@@ -35,7 +35,7 @@ from nerg_mi.statistics.tables import (
     Participants,
     Row,
 )
-from nerg_mi.statistics.visits import ALL, Aoi, Cell
+from nerg_mi.measures.visits import ALL, Aoi, Cell
 from nerg_mi.workflows.base import SILENT, Reporter
 
 from .measured import AoiContext, TimeWindow, Viewpoints

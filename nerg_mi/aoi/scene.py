@@ -31,12 +31,12 @@ from nerg_mi.formats.fields import load_gaze
 from nerg_mi.formats.meshes import MeshFile, read_mesh_file
 from nerg_mi.maths.geometry import Similarity, intersect_box_numpy
 from nerg_mi.maths.types import variant_types
+from nerg_mi.measures.shares import DirectionQuery
+from nerg_mi.measures.visits import Aoi, BoxAoi
 from nerg_mi.ranges import COORDINATES
 from nerg_mi.rays.readers.tables import iterate_table
 from nerg_mi.rendering.bands import is_nerg
 from nerg_mi.rendering.scene import load_scene
-from nerg_mi.statistics.shares import DirectionQuery
-from nerg_mi.statistics.visits import Aoi, BoxAoi
 from nerg_mi.surfaces.mesh import mitsuba_mesh
 from nerg_mi.train import geometry
 from nerg_mi.train.gaze_data import SURFACE_OPACITY

@@ -16,9 +16,9 @@ from nerg_mi.formats.areas import Region
 from nerg_mi.formats.meshes import READERS
 from nerg_mi.maths.arrays import to_vector
 from nerg_mi.maths.types import variant_types
+from nerg_mi.measures.shares import Shares, SummationRule, gaze_shares
+from nerg_mi.measures.visits import MARGIN, BoxAoi
 from nerg_mi.ranges import MAX_COORDINATE, Range, check_number
-from nerg_mi.statistics.shares import Shares, SummationRule, gaze_shares
-from nerg_mi.statistics.visits import MARGIN, BoxAoi
 from nerg_mi.workflows.base import SILENT, Reporter
 
 from . import arrays
@@ -393,7 +393,7 @@ def _to_array(value: Any, count: int) -> Floats:
 # ---- Attention ----
 #
 # The attention share of a box is the fraction of the gaze whose first surface is in the box, summed over directions
-# (`nerg_mi.statistics.shares`). Statistics, reports and the viewer use this definition. The attention share of a mesh
+# (`nerg_mi.measures.shares`). Statistics, reports and the viewer use this definition. The attention share of a mesh
 # or shape is the integral over its own surface (`nerg_mi.probes.surface_attention`), which also yields its distribution
 # on the surface.
 

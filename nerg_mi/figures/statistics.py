@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.statistics.tables import is_underestimate
+from nerg_mi.measures.tables import is_underestimate
 
 from .style import INK, label_axes, label_bar, new_page
 

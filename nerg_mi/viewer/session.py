@@ -17,11 +17,11 @@ from nerg_mi.api.scene import COLOR, Scene, activate_mitsuba
 from nerg_mi.errors import NergError, translate_mitsuba_errors
 from nerg_mi.formats.areas import AreaSet, Region, read_areas
 from nerg_mi.maths.geometry import Similarity
+from nerg_mi.measures.shares import COARSE
 from nerg_mi.probes.probes import place_probes
 from nerg_mi.ranges import MAX_COORDINATE
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.scene import load_scene
-from nerg_mi.statistics.shares import COARSE
 from nerg_mi.transport.geometry import Ceiling
 from nerg_mi.workflows.render import describe_basis
 from nerg_mi.workflows.scene_cameras import check_point

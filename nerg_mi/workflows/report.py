@@ -27,13 +27,15 @@ from nerg_mi.formats.fields import load_gaze
 from nerg_mi.interruption import Interruption
 from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.measures.shares import COARSE, gaze_shares
+from nerg_mi.measures.visits import MARGIN, BoxAoi
 from nerg_mi.rays.dataset import hash_rays, is_dataset, load_rays
 from nerg_mi.rays.quality import summarise
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.bands import Channels, render_channels
 from nerg_mi.rendering.scene import load_scene
 from nerg_mi.rendering.scene_writer import free_default_name, project_to_pixel
-from nerg_mi.report.data import (
+from nerg_mi.reports.data import (
     MAX_PATH_POINTS,
     EyePositions,
     GazeSampler,
@@ -52,9 +54,7 @@ from nerg_mi.report.data import (
     sample_eye_positions,
     summarize_objects,
 )
-from nerg_mi.report.sections import render_page
-from nerg_mi.statistics.shares import COARSE, gaze_shares
-from nerg_mi.statistics.visits import MARGIN, BoxAoi
+from nerg_mi.reports.sections import render_page
 from nerg_mi.train.geometry import TrainingGeometry
 from nerg_mi.transport.geometry import SceneGeometry
 from nerg_mi.transport.observer import sensor_center

@@ -40,12 +40,10 @@ from nerg_mi.errors import NergError
 from nerg_mi.files.atomic import check_folder, make_folder
 from nerg_mi.formats.areas import AreaSet, read_areas
 from nerg_mi.interruption import Interruption
-from nerg_mi.rays.pseudonyms import make_pseudonyms, read_salt
-from nerg_mi.rays.rays import Rays
-from nerg_mi.statistics.estimates import MIN_PARTICIPANTS
-from nerg_mi.statistics.power import power_rows
-from nerg_mi.statistics.shares import Isovists, SamplePoints
-from nerg_mi.statistics.tables import (
+from nerg_mi.measures.estimates import MIN_PARTICIPANTS
+from nerg_mi.measures.power import power_rows
+from nerg_mi.measures.shares import Isovists, SamplePoints
+from nerg_mi.measures.tables import (
     MEASURED,
     PREDICTED,
     MinParticipantsFilter,
@@ -57,7 +55,9 @@ from nerg_mi.statistics.tables import (
     duration_rows,
     transition_rows,
 )
-from nerg_mi.statistics.visits import ALL, Cell, Total, VisitSums
+from nerg_mi.measures.visits import ALL, Cell, Total, VisitSums
+from nerg_mi.rays.pseudonyms import make_pseudonyms, read_salt
+from nerg_mi.rays.rays import Rays
 
 from .base import SILENT, Reporter, select_backend
 from .options import parse_point
@@ -297,7 +297,7 @@ class _StatisticsWork:
         return self.parts.predict(viewpoints, self._view)
 
     def _isovists(self) -> Isovists:
-        from nerg_mi.statistics.shares import compute_isovists
+        from nerg_mi.measures.shares import compute_isovists
 
         o = self.options
         points = place_observers_on_floor(self.around, o.eye_height, o.grid_step, o.floor_height)

@@ -10,8 +10,8 @@ from nerg_mi.aoi import output
 from nerg_mi.aoi.options import StatisticsOptions
 from nerg_mi.aoi.output import StatisticsResult, write_results
 from nerg_mi.figures.statistics import aois_figure
-from nerg_mi.statistics.tables import MIN_VIEWPOINTS, ParticipantRows
-from nerg_mi.statistics.visits import ALL, VisitSums
+from nerg_mi.measures.tables import MIN_VIEWPOINTS, ParticipantRows
+from nerg_mi.measures.visits import ALL, VisitSums
 from tests.workflows.recorder import Recorder
 
 # ---- Results as a folder of files ----

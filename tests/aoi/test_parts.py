@@ -28,8 +28,8 @@ from nerg_mi.files.atomic import file_sha256
 from nerg_mi.formats.areas import Region
 from nerg_mi.formats.fields import save_gaze
 from nerg_mi.maths.geometry import Similarity
+from nerg_mi.measures.visits import ALL, BoxAoi, Cell, VisitRules, VisitSums, merge_sums
 from nerg_mi.rays.rays import Rays
-from nerg_mi.statistics.visits import ALL, BoxAoi, Cell, VisitRules, VisitSums, merge_sums
 from nerg_mi.tasks.task import FileGroup
 from nerg_mi.workflows.parts import PlannedScene, account_for_store
 from nerg_mi.workflows.statistics import statistics

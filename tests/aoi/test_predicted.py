@@ -32,9 +32,9 @@ from nerg_mi.errors import NergError
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.formats.areas import AreaSet, MeshPart, Region, read_areas
 from nerg_mi.maths.geometry import Similarity
-from nerg_mi.statistics.shares import SamplePoints, compute_isovists
-from nerg_mi.statistics.tables import MIN_VIEWPOINTS, MinParticipantsFilter
-from nerg_mi.statistics.visits import ALL, BoxAoi, Cell
+from nerg_mi.measures.shares import SamplePoints, compute_isovists
+from nerg_mi.measures.tables import MIN_VIEWPOINTS, MinParticipantsFilter
+from nerg_mi.measures.visits import ALL, BoxAoi, Cell
 from nerg_mi.transport.geometry import SceneGeometry
 from nerg_mi.workflows.base import SILENT
 from tests.workflows.recorder import Recorder

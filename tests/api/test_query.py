@@ -8,9 +8,9 @@ import nerg_mi as nerg
 from nerg_mi.aoi.options import StatisticsOptions
 from nerg_mi.api.query import SceneObserver, compute_box_shares
 from nerg_mi.formats.areas import Region
-from nerg_mi.report.data import GazeSampler
-from nerg_mi.statistics.shares import COARSE, gaze_shares
-from nerg_mi.statistics.visits import MARGIN, BoxAoi
+from nerg_mi.measures.shares import COARSE, gaze_shares
+from nerg_mi.measures.visits import MARGIN, BoxAoi
+from nerg_mi.reports.data import GazeSampler
 from nerg_mi.train.geometry import TrainingGeometry
 from nerg_mi.workflows.statistics import statistics
 from tests.aoi.place import SIGN, STAND, write_place

@@ -266,8 +266,8 @@ def _make_results(folder: Path) -> None:
 
 def _read_results(folder: Path) -> None:
     from nerg_mi.evaluation.gaze_report import read_results
-    from nerg_mi.report.data import Run
-    from nerg_mi.report.sections import render_page
+    from nerg_mi.reports.data import Run
+    from nerg_mi.reports.sections import render_page
 
     results = read_results(folder / "gaze.json")
     render_page(Run("Gaze", {}, "A place.", "none", results=(results,)))

@@ -17,7 +17,7 @@ from nerg_mi.figures.style import make_provenance
 from nerg_mi.files.atomic import file_sha256
 from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.rays.rays import Rays
-from nerg_mi.report.data import MAX_PATH_POINTS
+from nerg_mi.reports.data import MAX_PATH_POINTS
 from nerg_mi.train.geometry import TrainingGeometry
 from nerg_mi.workflows import report
 from nerg_mi.workflows.gaze_commands import GazeOptions
@@ -39,7 +39,7 @@ from nerg_mi.workflows.train_gaze import train_gaze
 from tests.evaluation.test_gaze import crowd
 from tests.evaluation.test_gaze_report import scored
 from tests.formats.splats.writers import random_splats, write_inria
-from tests.report.made import packed_scene
+from tests.reports.made import packed_scene
 from tests.workflows.recorder import Recorder
 
 # ---- The report as a job: from files to a page, without missing sections ----

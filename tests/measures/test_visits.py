@@ -1,4 +1,4 @@
-"""Tests of `nerg_mi.statistics.visits`."""
+"""Tests of `nerg_mi.measures.visits`."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.formats.areas import Region
-from nerg_mi.rays.rays import Rays
-from nerg_mi.statistics.visits import (
+from nerg_mi.measures.visits import (
     ALL,
     BINS,
     BoxAoi,
@@ -29,6 +28,7 @@ from nerg_mi.statistics.visits import (
     sample_cone,
     sum_visits,
 )
+from nerg_mi.rays.rays import Rays
 
 # ---- Hits, against loops over rays and planes ----
 

@@ -1,4 +1,4 @@
-"""Tests of `nerg_mi.report.data`."""
+"""Tests of `nerg_mi.reports.data`."""
 
 from __future__ import annotations
 
@@ -18,8 +18,11 @@ from nerg_mi.fields.mlp import namespace
 from nerg_mi.formats.areas import Region
 from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.measures.shares import Shares
+from nerg_mi.measures.visits import BoxAoi as Solid
+from nerg_mi.measures.visits import HitAssignment
 from nerg_mi.rays.rays import Rays
-from nerg_mi.report.data import (
+from nerg_mi.reports.data import (
     GazeSampler,
     ParticipantLabels,
     anonymize_rays,
@@ -35,13 +38,10 @@ from nerg_mi.report.data import (
     sample_eye_positions,
     summarize_objects,
 )
-from nerg_mi.statistics.shares import Shares
-from nerg_mi.statistics.visits import BoxAoi as Solid
-from nerg_mi.statistics.visits import HitAssignment
 from nerg_mi.train.geometry import TrainingGeometry
 from nerg_mi.transport.geometry import SceneGeometry
 from tests.evaluation.test_gaze import crowd
-from tests.report.made import full_run, minimal_run, stage
+from tests.reports.made import full_run, minimal_run, stage
 
 # ---- Viewpoints in a hall of four walls with closed-form depths ----
 

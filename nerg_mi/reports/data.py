@@ -19,11 +19,11 @@ from nerg_mi.figures.overlay import srgb, to_bytes
 from nerg_mi.formats.areas import Region
 from nerg_mi.maths.arrays import to_vector
 from nerg_mi.maths.types import variant_types
+from nerg_mi.measures.shares import DirectionQuery, Shares
+from nerg_mi.measures.visits import Aoi, HitAssignment, assign_hits, merge_members
 from nerg_mi.rays.quality import RaysSummary
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.bands import render_channels
-from nerg_mi.statistics.shares import DirectionQuery, Shares
-from nerg_mi.statistics.visits import Aoi, HitAssignment, assign_hits, merge_members
 from nerg_mi.train.gaze_data import SURFACE_OPACITY
 from nerg_mi.train.geometry import TrainingGeometry
 from nerg_mi.transport.geometry import SceneGeometry, default_march_settings, trace_depth
@@ -154,7 +154,7 @@ def assign_ray_hits(
     members
         Indices into ``aois`` of each area.
     margin
-        Tolerance in scene units, as for `nerg_mi.statistics.visits.assign_hits`.
+        Tolerance in scene units, as for `nerg_mi.measures.visits.assign_hits`.
     """
     subset = rays if len(rays) <= max_rays else rays.select(np.linspace(0, len(rays) - 1, max_rays).round().astype(int))
     origins, directions = geometry.points_to_field(subset.origin), geometry.directions_to_field(subset.direction)

@@ -9,7 +9,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.formats.areas import Region
 from nerg_mi.maths.geometry import intersect_box_numpy
 from nerg_mi.maths.sphere import fibonacci_directions, indices_in_cone
-from nerg_mi.statistics.shares import (
+from nerg_mi.measures.shares import (
     INITIAL_DIRECTIONS,
     SamplePoints,
     SummationRule,
@@ -20,7 +20,7 @@ from nerg_mi.statistics.shares import (
     gaze_shares,
     visible_in_fov,
 )
-from nerg_mi.statistics.visits import BoxAoi, assign_hits
+from nerg_mi.measures.visits import BoxAoi, assign_hits
 
 LOW, HIGH = np.array([-2.0, -6.0, 0.0]), np.array([2.0, 6.0, 3.0])
 AHEAD = np.array([0.6, 0.8, 0.0])

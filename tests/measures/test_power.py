@@ -1,4 +1,4 @@
-"""Tests of `nerg_mi.statistics.power`."""
+"""Tests of `nerg_mi.measures.power`."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from nerg_mi.statistics.power import PARTICIPANT_COUNTS, estimate_power, power_rows
-from nerg_mi.statistics.tables import MEASURED, MinParticipantsFilter, Participants
-from nerg_mi.statistics.visits import ALL, Cell
+from nerg_mi.measures.power import PARTICIPANT_COUNTS, estimate_power, power_rows
+from nerg_mi.measures.tables import MEASURED, MinParticipantsFilter, Participants
+from nerg_mi.measures.visits import ALL, Cell
 
 COUNTS = (8, 16, 32)
 

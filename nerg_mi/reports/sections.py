@@ -692,7 +692,7 @@ def _render_section(section, run: Run) -> Html:
 
 
 def _read_asset(name: str) -> str:
-    return files("nerg_mi.report").joinpath(name).read_text(encoding="utf-8")
+    return files("nerg_mi.reports").joinpath(name).read_text(encoding="utf-8")
 
 
 def _csp_hash(text: str) -> str:

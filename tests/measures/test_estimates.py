@@ -1,4 +1,4 @@
-"""Tests of `nerg_mi.statistics.estimates`."""
+"""Tests of `nerg_mi.measures.estimates`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from nerg_mi.statistics.estimates import (
+from nerg_mi.measures.estimates import (
     adjust_p_values,
     estimate_proportion_differences,
     estimate_proportions,

@@ -1,11 +1,11 @@
-"""Tests of `nerg_mi.statistics.tables`."""
+"""Tests of `nerg_mi.measures.tables`."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from nerg_mi.statistics.tables import (
+from nerg_mi.measures.tables import (
     MEASURED,
     MEASURES,
     MEASURES_BY_NAME,
@@ -18,7 +18,7 @@ from nerg_mi.statistics.tables import (
     format_measure,
     transition_rows,
 )
-from nerg_mi.statistics.visits import ALL, BINS, Cell, VisitSums
+from nerg_mi.measures.visits import ALL, BINS, Cell, VisitSums
 
 # ---- Measures ----
 

@@ -14,8 +14,8 @@ import time
 
 import pytest
 
-from nerg_mi.report.sections import render_page
-from tests.report.made import HOSTILE, full_run, minimal_run
+from nerg_mi.reports.sections import render_page
+from tests.reports.made import HOSTILE, full_run, minimal_run
 
 REQUIRED = os.environ.get("NERG_REQUIRE_BROWSER", "0") not in ("", "0")
 

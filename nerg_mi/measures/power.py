@@ -107,7 +107,7 @@ def power_rows(
     """Return the power of the differences between recorded cells, for each area and measure.
 
     Without two cells of a dimension, the table is for two independent groups of which each is like all participants. A
-    row has the first keys of those of `nerg_mi.statistics.tables.difference_rows`, the ``effect``, and ``power_N`` for
+    row has the first keys of those of `nerg_mi.measures.tables.difference_rows`, the ``effect``, and ``power_N`` for
     N participants; None if the power is undefined or suppressed.
     """
     pairs = []

@@ -1,7 +1,7 @@
 """Attention shares of AOIs in an observer's gaze, and visibility of AOIs.
 
 An attention share is the part of the integral of the gaze density over all directions that hits an area. A direction
-hits an AOI by the rule of `nerg_mi.statistics.visits.assign_hits`.
+hits an AOI by the rule of `nerg_mi.measures.visits.assign_hits`.
 
 Integrals use equal-area directions on a Fibonacci (golden-angle) spiral. The number of directions is increased for each
 area until its estimated error meets the tolerance. On a finer spiral only the directions that may hit the area are

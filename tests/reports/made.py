@@ -9,7 +9,7 @@ import numpy as np
 from nerg_mi.evaluation.gaze_report import GazeResults
 from nerg_mi.formats.areas import Region
 from nerg_mi.rays.quality import summarise
-from nerg_mi.report.data import (
+from nerg_mi.reports.data import (
     MeanShare,
     ObjectAttention,
     ReportCamera,
