@@ -25,70 +25,86 @@ from . import llvm as _llvm
 from . import registration as _registration
 
 if TYPE_CHECKING:
+    from .api.analysis import (
+        bake,
+        draw,
+        export,
+        find_poses,
+        import_checkpoint,
+        render_film,
+        report,
+        statistics,
+        write_scene,
+    )
     from .api.arrays import Camera
+    from .api.contents import DensityGrid
+    from .api.evaluation import ablate, evaluate_gaze, evaluate_radiance, folds, next_look, study
+    from .api.fields import load_field, load_rays
     from .api.gaze import load_gaze
     from .api.query import attention, observe, trace
+    from .api.recordings import align, check_rays, filter_rays, guess, import_rays, plot_rays, split_rays
     from .api.render import render
-    from .api.scene import Scene, load_field, load_rays, make_scene
-    from .api.workflows import (
-        ablate,
-        align,
-        bake,
-        compile_field,
-        evaluate_gaze,
-        evaluate_radiance,
-        import_rays,
-        next_look,
-        stats,
-        study,
-        train_gaze,
-        train_prior,
-        train_radiance,
-    )
+    from .api.scene import Scene, make_scene
+    from .api.training import compile_field, train_gaze, train_prior, train_radiance
     from .errors import NergError
     from .rays.rays import Rays
     from .rays.readers.registry import register_reader
     from .train.gaze_recipes import register_recipe
     from .transport.quadrature import register_quadrature
-    from .workflows.draw import draw
+    from .viewer.serve import view
 
 __version__ = "0.1.0"
 
 _MODULES = {
     "Camera": "nerg_mi.api.arrays",
+    "DensityGrid": "nerg_mi.api.contents",
     "NergError": "nerg_mi.errors",
     "Rays": "nerg_mi.rays.rays",
     "Scene": "nerg_mi.api.scene",
-    "ablate": "nerg_mi.api.workflows",
-    "align": "nerg_mi.api.workflows",
+    "ablate": "nerg_mi.api.evaluation",
+    "align": "nerg_mi.api.recordings",
     "attention": "nerg_mi.api.query",
-    "bake": "nerg_mi.api.workflows",
-    "compile_field": "nerg_mi.api.workflows",
-    "draw": "nerg_mi.workflows.draw",
-    "evaluate_gaze": "nerg_mi.api.workflows",
-    "evaluate_radiance": "nerg_mi.api.workflows",
-    "import_rays": "nerg_mi.api.workflows",
-    "load_field": "nerg_mi.api.scene",
+    "bake": "nerg_mi.api.analysis",
+    "check_rays": "nerg_mi.api.recordings",
+    "compile_field": "nerg_mi.api.training",
+    "draw": "nerg_mi.api.analysis",
+    "evaluate_gaze": "nerg_mi.api.evaluation",
+    "evaluate_radiance": "nerg_mi.api.evaluation",
+    "export": "nerg_mi.api.analysis",
+    "filter_rays": "nerg_mi.api.recordings",
+    "find_poses": "nerg_mi.api.analysis",
+    "folds": "nerg_mi.api.evaluation",
+    "guess": "nerg_mi.api.recordings",
+    "import_checkpoint": "nerg_mi.api.analysis",
+    "import_rays": "nerg_mi.api.recordings",
+    "load_field": "nerg_mi.api.fields",
     "load_gaze": "nerg_mi.api.gaze",
-    "load_rays": "nerg_mi.api.scene",
+    "load_rays": "nerg_mi.api.fields",
     "make_scene": "nerg_mi.api.scene",
-    "next_look": "nerg_mi.api.workflows",
+    "next_look": "nerg_mi.api.evaluation",
     "observe": "nerg_mi.api.query",
+    "plot_rays": "nerg_mi.api.recordings",
     "register_quadrature": "nerg_mi.transport.quadrature",
     "register_reader": "nerg_mi.rays.readers.registry",
     "register_recipe": "nerg_mi.train.gaze_recipes",
     "render": "nerg_mi.api.render",
-    "stats": "nerg_mi.api.workflows",
-    "study": "nerg_mi.api.workflows",
+    "render_film": "nerg_mi.api.analysis",
+    "report": "nerg_mi.api.analysis",
+    "split_rays": "nerg_mi.api.recordings",
+    "statistics": "nerg_mi.api.analysis",
+    "study": "nerg_mi.api.evaluation",
     "trace": "nerg_mi.api.query",
-    "train_gaze": "nerg_mi.api.workflows",
-    "train_prior": "nerg_mi.api.workflows",
-    "train_radiance": "nerg_mi.api.workflows",
+    "train_gaze": "nerg_mi.api.training",
+    "train_prior": "nerg_mi.api.training",
+    "train_radiance": "nerg_mi.api.training",
+    "view": "nerg_mi.viewer.serve",
+    "write_scene": "nerg_mi.api.analysis",
 }
 """The public names, and the module that defines each."""
 
 __all__ = [
     "Camera",
+    "DensityGrid",
     "NergError",
     "Rays",
     "Scene",
@@ -96,10 +112,17 @@ __all__ = [
     "align",
     "attention",
     "bake",
+    "check_rays",
     "compile_field",
     "draw",
     "evaluate_gaze",
     "evaluate_radiance",
+    "export",
+    "filter_rays",
+    "find_poses",
+    "folds",
+    "guess",
+    "import_checkpoint",
     "import_rays",
     "load_field",
     "load_gaze",
@@ -107,16 +130,22 @@ __all__ = [
     "make_scene",
     "next_look",
     "observe",
+    "plot_rays",
     "register_quadrature",
     "register_reader",
     "register_recipe",
     "render",
-    "stats",
+    "render_film",
+    "report",
+    "split_rays",
+    "statistics",
     "study",
     "trace",
     "train_gaze",
     "train_prior",
     "train_radiance",
+    "view",
+    "write_scene",
 ]
 
 

@@ -226,8 +226,8 @@ def test23_what_functions_give_is_listed():
     for function in filter(inspect.isfunction, PUBLIC):
         returned |= set(re.findall(r"\b[A-Z]\w+", str(inspect.signature(function).return_annotation)))
     names = {path.rpartition(".")[2] for path in LISTED}
-    # The networks within a TrainedField, and a figure of matplotlib.
-    assert returned - names <= {"RadianceField", "AnyGazeField", "Figure", "None"}
+    # The networks within a TrainedField, a figure of matplotlib, and a path.
+    assert returned - names <= {"RadianceField", "AnyGazeField", "Figure", "Path", "None"}
 
 
 # ---- Generated parts of pages ----

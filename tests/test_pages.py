@@ -408,7 +408,7 @@ def test18_python(rgb, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     texts, names = [block.text for block in blocks("python", page="python.md")], {}
     assert len([line for line in texts[0].splitlines() if line.strip()]) <= 30
-    for text in texts[:4]:
+    for text in texts[:5]:
         small = text.replace("width=480, height=320", "width=24, height=16").replace("4.6, 10)", "4.6, 8)")
         assert small.count("width=24") == text.count("width=480")
         run(small.replace("spp=4", "spp=1"), "docs/reference/python.md", names)

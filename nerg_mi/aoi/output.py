@@ -13,6 +13,7 @@ import numpy as np
 from nerg_mi.figures.statistics import aois_figure, map_figure, transitions_figure
 from nerg_mi.figures.style import make_provenance, save
 from nerg_mi.files.atomic import replace_atomically, write_text
+from nerg_mi.files.dataframes import ResultTables
 from nerg_mi.files.tables import format_markdown_table, write_csv
 from nerg_mi.measures.tables import MEASURES, MEASURES_BY_NAME, PREDICTED, ParticipantRows, Row, format_measure
 from nerg_mi.measures.visits import VisitSums
@@ -218,8 +219,8 @@ MAX_MATRIX_AREAS = 60  # maximum number of areas in the figure of transitions
 _COLUMNS = {"aois": aoi_columns, "differences": difference_columns, "what_if": what_if_columns}
 
 
-@dataclass(frozen=True, eq=False)
-class StatisticsResult:
+@dataclass(frozen=True, eq=False, repr=False)
+class StatisticsResult(ResultTables):
     """Attention statistics: tables as lists of dicts, and the files that were written.
 
     Parameters
@@ -247,6 +248,8 @@ class StatisticsResult:
     files
         Written files.
     """
+
+    TABLES = (*("aois", "isovists", "differences", "power", "transitions", "durations", "participants", "what_if"),)
 
     aois: list[Row] = field(default_factory=list)
     differences: list[Row] = field(default_factory=list)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -164,6 +164,49 @@ class LabelledArrays:
 
     def __contains__(self, name: object) -> bool:
         return name in self.values
+
+    def to_xarray(self) -> Any:
+        """Return the arrays as an ``xarray.Dataset``.
+
+        Returns
+        -------
+        xarray.Dataset
+            One variable per array, with its unit. The dimensions are ``axes``, and ``channel`` (R, G, B) or ``axis``
+            (x, y, z) for arrays with channels. Coordinates are the indices, and the ``observer_position``
+            (observer, axis).
+
+        Raises
+        ------
+        NergError
+            xarray is not installed.
+        """
+        from nerg_mi.transport.aovs import AOVS
+
+        try:
+            import xarray
+        except ImportError as error:
+            raise NergError(
+                "to_xarray needs xarray, which is not installed; run \"pip install 'nerg-mi[dataframe]'\""
+            ) from error
+        variables, coordinates = {}, {}
+        for name, value in self.values.items():
+            extra, labels = (), None
+            if value.ndim > len(self.axes):
+                channels = "RGB" if name == "color" else AOVS[name].channels if name in AOVS else None
+                labels = [*channels] if channels and len(channels) == value.shape[-1] else None
+                spatial = labels == ["X", "Y", "Z"]
+                extra = ("axis" if spatial else "channel" if name == "color" else f"{name}_channel",)
+                if labels is not None:
+                    coordinates[extra[0]] = [label.lower() for label in labels] if spatial else labels
+            quantity = AOVS.get(name)
+            unit = quantity.unit if quantity is not None else ""
+            title = quantity.heading if quantity is not None else "linear colour"
+            variables[name] = ((*self.axes, *extra), value, {"units": unit or "1", "long_name": title})
+        shape = next(iter(self.values.values())).shape
+        coordinates |= {axis: np.arange(size) for axis, size in zip(self.axes, shape)}
+        if self.observers is not None and "observer" in self.axes:
+            coordinates |= {"axis": ["x", "y", "z"], "observer_position": (("observer", "axis"), self.observers)}
+        return xarray.Dataset(variables, coordinates)
 
     def __repr__(self) -> str:
         first = next(iter(self.values.values()))

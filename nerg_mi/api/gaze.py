@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from nerg_mi.errors import NergError, sanitize, translate_mitsuba_errors
@@ -14,19 +16,23 @@ from nerg_mi.fields.gaze_base import AnyGazeField
 from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.formats.fields import load_gaze as read_gaze
 from nerg_mi.formats.fields import matches_checksum
+from nerg_mi.maths import vmf
 from nerg_mi.maths.geometry import Similarity
-from nerg_mi.ranges import Range, check_number
-from nerg_mi.workflows.base import SILENT, Reporter
+from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.ranges import DIRECTIONS, Range, check_number
+from nerg_mi.rays.rays import Rays, sample_rows
+from nerg_mi.workflows.base import Reporter
+from nerg_mi.workflows.scene_places import PLACES, detect_kind
 
-from .arrays import Floats, as_rays
-from .scene import FilePath, Scene, TrainedField, as_path, get_array_module, resolve_file
+from .arrays import Floats, as_points, as_rays
+from .calls import Progress, report_progress
+from .fields import FilePath, TrainedField, as_path, get_array_module
+from .objects import as_file, copy_from_session
+from .scene import Environment, Scene
 
 if TYPE_CHECKING:
     from nerg_mi.transport.geometry import SceneGeometry
     from nerg_mi.transport.observer import ObserverSettings
-
-Geometry: TypeAlias = "FilePath | Scene | TrainedField[RadianceField]"
-"""What observers see: a file, a scene, or a radiance field in memory."""
 
 
 @dataclass(frozen=True)
@@ -58,9 +64,9 @@ class TrainedGazeField(TrainedField[AnyGazeField]):
         origins: ArrayLike,
         directions: ArrayLike,
         *,
-        geometry: Geometry | None = None,
+        geometry: Environment = None,
         tolerance: float = 0.01,
-        reporter: Reporter = SILENT,
+        progress: Progress = None,
     ) -> Floats:
         """Compute the gaze density of rays for observers at their origins, in all directions.
 
@@ -73,16 +79,17 @@ class TrainedGazeField(TrainedField[AnyGazeField]):
             Positions of the observers, in the frame of the rays of the training: the alignment of the field is applied.
         directions : array_like of shape (N, 3) or (3,)
             Directions of any length except zero, in the same frame.
-        geometry : path, Scene or TrainedField, optional
-            What the observers see, in the frame of the field: a scene, a mesh, a radiance field, Gaussian splats or hit
-            points (.vol) as a file, or a scene or a radiance field in memory. A `Scene` also determines how rays are
+        geometry : Environment, optional
+            What the observers see, in the frame of the field: a scene, a mesh, a radiance field, a grid, Gaussian
+            splats or hit points (.vol), in memory or as a file. A `Scene` also determines how rays are
             traced, and a ``to_world`` of its gaze field is applied. Default: the geometry of the training. A field that
             does not depend on surfaces ignores it.
         tolerance : float
             Relative error up to which a normalised field is integrated over the sphere around each distinct origin
             (0: use the maximum number of directions). The usual error is several times smaller.
-        reporter : Reporter
-            Receives the progress, and a warning if the geometry is not that of the training.
+        progress : bool, Reporter or None
+            None shows a progress bar in notebooks, True shows one anywhere, False none; a `Reporter` receives
+            everything. There is a warning if the geometry is not that of the training.
 
         Returns
         -------
@@ -123,7 +130,7 @@ class TrainedGazeField(TrainedField[AnyGazeField]):
                 f'the gaze field "{self.name}" was created with another Mitsuba variant than the active one; '
                 "load it again, or set that variant"
             )
-        with translate_mitsuba_errors():
+        with report_progress(progress) as reporter, translate_mitsuba_errors():
             space = self._find_space(geometry, reporter)
             # A gaze field maps the frame of the rays by its alignment, and a scene may map that of the field.
             matrix = space.to_world.matrix @ read_training_alignment(dict(self.provenance)).matrix
@@ -139,7 +146,203 @@ class TrainedGazeField(TrainedField[AnyGazeField]):
                 lambda done, count: reporter.progress(done / count, f"observer {done:,} of {count:,}"),
             ).mean(axis=0)
 
-    def _find_space(self, geometry: Geometry | None, reporter: Reporter) -> _ObserverSpace:
+    def score_samples(
+        self, rays: Rays, *, geometry: Environment = None, tolerance: float = 0.01, progress: Progress = None
+    ) -> Floats:
+        """Compute the log density of recorded rays, for observers at their origins.
+
+        Parameters
+        ----------
+        rays : Rays
+            N rays, in the frame of those of the training.
+        geometry, tolerance, progress
+            As for `density`.
+
+        Returns
+        -------
+        ndarray of shape (N,), float32
+            Natural logarithm of the density in 1/sr.
+
+        Raises
+        ------
+        NergError
+            As for `density`.
+        """
+        density = self.density(rays.origin, rays.direction, geometry=geometry, tolerance=tolerance, progress=progress)
+        return np.log(density)
+
+    def score(
+        self,
+        rays: Rays,
+        *,
+        max_rays: int = 1000,
+        seed: int = 0,
+        geometry: Environment = None,
+        progress: Progress = None,
+    ) -> float:
+        """Compute the mean log likelihood of recorded rays, as `GaussianMixture.score` of scikit-learn does.
+
+        Parameters
+        ----------
+        rays : Rays
+            The rays, in the frame of those of the training.
+        max_rays : int
+            Maximum number of rays; of more, a uniform sample is scored, since each position takes some milliseconds.
+        seed : int
+            Seed of the sample.
+        geometry, progress
+            As for `density`.
+
+        Returns
+        -------
+        float
+            Mean natural logarithm of the density in 1/sr. A uniform density has -2.53.
+
+        Raises
+        ------
+        NergError
+            There are no rays, or as for `density`.
+
+        Examples
+        --------
+        >>> import nerg_mi as nerg
+        >>> from importlib.resources import files
+        >>> gaze = nerg.load_gaze(files("nerg_mi.scenes.store") / "shoppers.safetensors")
+        >>> rays = nerg.Rays.from_arrays([[4.4, 2.8, 1.6]] * 2, [[0, 1, 0], [0.2, 1, 0]], times=[0, 1])
+        >>> gaze.score(rays) > -2.53
+        True
+        """
+        if len(rays) == 0:
+            raise NergError("there are no rays to score; relax the selection")
+        chosen = rays[sample_rows(len(rays), max_rays, seed)] if len(rays) > max_rays else rays
+        return float(self.score_samples(chosen, geometry=geometry, progress=progress).mean(dtype=np.float64))
+
+    def sample(
+        self,
+        origin: ArrayLike,
+        n: int,
+        *,
+        seed: int = 0,
+        num_directions: int = 16_384,
+        geometry: Environment = None,
+        progress: Progress = None,
+    ) -> Floats:
+        """Draw gaze directions of an observer.
+
+        Parameters
+        ----------
+        origin : array_like of shape (3,)
+            Position of the observer, in the frame of the rays of the training.
+        n : int
+            Number of directions.
+        seed : int
+            Seed of the random numbers.
+        num_directions : int
+            Number of equal cells of the sphere, within which the density counts as constant; 16,384 cells are 1.6
+            degrees wide.
+        geometry, progress
+            As for `density`.
+
+        Returns
+        -------
+        ndarray of shape (n, 3), float32
+            Unit vectors.
+
+        Raises
+        ------
+        NergError
+            As for `density`.
+
+        Examples
+        --------
+        >>> import nerg_mi as nerg
+        >>> from importlib.resources import files
+        >>> gaze = nerg.load_gaze(files("nerg_mi.scenes.store") / "shoppers.safetensors")
+        >>> gaze.sample((4.4, 2.8, 1.6), 100).shape
+        (100, 3)
+        """
+        check_number(n, Range(1, 10**9), "n", is_integer=True)
+        cells, density = self._density_around(origin, num_directions, geometry, progress)
+        rng = np.random.default_rng(seed)
+        chosen = cells[rng.choice(len(cells), n, p=density / density.sum())]
+        # Uniform in a cap with the area of a cell.
+        local, (across, up) = _sample_cap(n, 4 * np.pi / len(cells), rng), vmf.tangent_frame(chosen)
+        return (local[:, :1] * across + local[:, 1:2] * up + local[:, 2:] * chosen).astype(np.float32)
+
+    def regions(
+        self,
+        origin: ArrayLike,
+        levels: Sequence[float] = (0.5, 0.8),
+        *,
+        num_directions: int = 16_384,
+        geometry: Environment = None,
+        progress: Progress = None,
+    ) -> GazeRegions:
+        """Compute the smallest regions of directions that contain given fractions of an observer's gaze.
+
+        Parameters
+        ----------
+        origin : array_like of shape (3,)
+            Position of the observer, in the frame of the rays of the training.
+        levels : sequence of float
+            Fractions of the gaze, between 0 and 1.
+        num_directions : int
+            Number of equal cells of the sphere.
+        geometry, progress
+            As for `density`.
+
+        Returns
+        -------
+        GazeRegions
+            The regions, as masks of directions.
+
+        Raises
+        ------
+        NergError
+            A level is out of range, or as for `density`.
+
+        Examples
+        --------
+        >>> import nerg_mi as nerg
+        >>> from importlib.resources import files
+        >>> gaze = nerg.load_gaze(files("nerg_mi.scenes.store") / "shoppers.safetensors")
+        >>> regions = gaze.regions((4.4, 2.8, 1.6), levels=(0.5, 0.9))
+        >>> regions.inside.shape, bool(regions.solid_angle[0] < regions.solid_angle[1])
+        ((2, 16384), True)
+        """
+        fractions = np.atleast_1d(np.asarray(levels, float))
+        for level in fractions.tolist():
+            check_number(level, Range(0, 1), "a level of regions")
+        cells, density = self._density_around(origin, num_directions, geometry, progress)
+        order = np.argsort(-density, kind="stable")
+        mass = np.cumsum(density[order], dtype=np.float64)
+        count = np.searchsorted(mass, fractions * mass[-1]) + 1
+        inside = np.zeros((len(fractions), len(cells)), bool)
+        for row, k in zip(inside, count):
+            row[order[:k]] = True
+        threshold = density[order[np.minimum(count, len(cells)) - 1]]
+        return GazeRegions(fractions, threshold, inside.sum(axis=1) * 4 * np.pi / len(cells), cells, density, inside)
+
+    def _density_around(
+        self, origin: ArrayLike, count: int, geometry: Environment, progress: Progress
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return ``count`` directions of equal areas (count, 3) around a position, and their densities (count,)."""
+        position = as_points(origin, "origin")
+        if len(position) != 1:
+            raise NergError(f"origin must be one position x, y, z, got {len(position)}")
+        check_number(count, DIRECTIONS, "num_directions", is_integer=True)
+        directions = fibonacci_directions(count)
+        return directions, self.density(position, directions, geometry=geometry, progress=progress).astype(np.float64)
+
+    def save(self, path: FilePath, half: bool = False) -> Path:
+        """Write a checkpoint (.safetensors) atomically, and next to it the environment of the training if that was in
+        memory. Parameters, returns and errors as for `TrainedField.save`."""
+        path = super().save(path, half)
+        if self.geometry_file is not None:
+            copy_from_session(self.geometry_file, path.parent)
+        return path
+
+    def _find_space(self, geometry: Environment, reporter: Reporter) -> _ObserverSpace:
         """Return what observers see: ``geometry``, or that of the training."""
         from nerg_mi.transport.field_medium import FieldMedium
 
@@ -152,12 +355,7 @@ class TrainedGazeField(TrainedField[AnyGazeField]):
             return _ObserverSpace(geometry.geometry, settings, Similarity() if gaze is None else gaze.to_world)
         if isinstance(geometry, TrainedField) and isinstance(geometry.network, RadianceField):
             return self._make_space(FieldMedium(geometry.network))
-        if not isinstance(geometry, (str, os.PathLike)):
-            raise NergError(
-                "geometry must be a file, a Scene or a radiance field of load_field or train_radiance, "
-                f"got {type(geometry).__name__}"
-            )
-        path = resolve_file(geometry, "geometry")
+        path = as_file(geometry, "geometry")
         self._compare(path, reporter)
         return self._load_space(path)
 
@@ -178,7 +376,6 @@ class TrainedGazeField(TrainedField[AnyGazeField]):
     def _load_space(self, path: Path) -> _ObserverSpace:
         """Return the space of a geometry file; the last one is cached until the file changes."""
         from nerg_mi.train import geometry
-        from nerg_mi.workflows.scene_places import PLACES, detect_kind
 
         status = path.stat()
         key = path.resolve(), status.st_mtime_ns, status.st_size
@@ -226,6 +423,71 @@ class TrainedGazeField(TrainedField[AnyGazeField]):
                 f'"{self.name}" was not trained in "{path}"; its densities are valid only if surfaces and coordinates '
                 "are the same"
             )
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class GazeRegions:
+    """Smallest regions of directions that contain fractions of an observer's gaze.
+
+    Attributes
+    ----------
+    levels : ndarray of shape (L,)
+        Fractions of the gaze.
+    threshold : ndarray of shape (L,)
+        Smallest density in each region, in 1/sr.
+    solid_angle : ndarray of shape (L,)
+        Sizes of the regions in sr.
+    directions : ndarray of shape (K, 3)
+        Unit vectors, which represent equal parts of the sphere.
+    density : ndarray of shape (K,)
+        Their densities in 1/sr.
+    inside : ndarray of shape (L, K), bool
+        Whether each direction is in each region.
+    """
+
+    levels: np.ndarray
+    threshold: np.ndarray
+    solid_angle: np.ndarray
+    directions: np.ndarray
+    density: np.ndarray
+    inside: np.ndarray
+
+    def __repr__(self) -> str:
+        parts = ", ".join(f"{100 * level:g} % in {size:.3g} sr" for level, size in zip(self.levels, self.solid_angle))
+        return f"<GazeRegions: {parts}>"
+
+
+def _sample_cap(n: int, area: float, rng: np.random.Generator) -> np.ndarray:
+    """Return n unit vectors (n, 3) that are uniform in a cap of an ``area`` in sr around z."""
+    z = 1 - rng.random(n) * area / (2 * np.pi)
+    phi, radius = rng.random(n) * 2 * np.pi, np.sqrt(1 - z * z)
+    return np.stack([radius * np.cos(phi), radius * np.sin(phi), z], axis=1)
+
+
+def training_geometry(gaze: object) -> dict[str, Path]:
+    """Return the option that names the environment of the training of a gaze field in memory, if it is known."""
+    from nerg_mi.workflows.geometry import geometry_key
+
+    if not isinstance(gaze, TrainedGazeField) or gaze.geometry_file is None:
+        return {}
+    key = geometry_key(gaze.path or Path(gaze.name), dict(gaze.provenance))
+    return {{"field_file": "field", "scene_file": "scene", "geometry_file": "geometry"}[key]: gaze.geometry_file}
+
+
+def list_inputs(inputs: object) -> list[Any]:
+    """Return one input or several as a list. If there is a gaze field and no environment, that of its training is
+    added, if it is known."""
+    is_one = isinstance(inputs, (str, os.PathLike)) or not isinstance(inputs, (list, tuple))
+    items = [inputs] if is_one else list(inputs)  # pyright: ignore[reportArgumentType] which is a list or a tuple
+    fields = [item for item in items if isinstance(item, TrainedGazeField)]
+    others = [item for item in items if not isinstance(item, (TrainedGazeField, Rays))]
+    has_environment = any(
+        not isinstance(item, (str, os.PathLike)) or (Path(item).exists() and detect_kind(Path(item)) in PLACES)
+        for item in others
+    )
+    if len(fields) == 1 and not has_environment and fields[0].geometry_file is not None:
+        items.append(fields[0].geometry_file)
+    return items
 
 
 def load_gaze(path: FilePath) -> TrainedGazeField:

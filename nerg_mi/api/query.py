@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from nerg_mi.errors import NergError, translate_mitsuba_errors
 from nerg_mi.formats.areas import Region
-from nerg_mi.formats.meshes import READERS
+from nerg_mi.formats.meshes import READERS, MeshFile
 from nerg_mi.maths.arrays import to_vector
 from nerg_mi.maths.types import variant_types
 from nerg_mi.measures.shares import Shares, SummationRule, gaze_shares
@@ -23,7 +23,10 @@ from nerg_mi.workflows.base import SILENT, Reporter
 
 from . import arrays
 from .arrays import Floats, LabelledArrays, broadcast_to_observers
-from .scene import COLOR, FilePath, Scene, activate_mitsuba, load_mesh_child, make_aov_context, resolve_quantities
+from .calls import Progress, report_progress
+from .contents import from_trimesh, is_trimesh, load_mesh, load_mesh_child
+from .fields import FilePath, activate_mitsuba
+from .scene import COLOR, Scene, make_aov_context, resolve_quantities
 
 # ---- One observer of a scene ----
 
@@ -149,7 +152,7 @@ def trace(
     *,
     observers: ArrayLike | None = None,
     seed: int = 0,
-    reporter: Reporter = SILENT,
+    progress: Progress = None,
 ) -> TraceResult:
     """Compute quantities along rays: the surface that they hit, its colour, and its gaze.
 
@@ -168,8 +171,8 @@ def trace(
         origin.
     seed : int
         Seed of random quantities, such as the light on shapes.
-    reporter : Reporter
-        Receives the progress.
+    progress : bool, Reporter or None
+        None shows a progress bar in notebooks, True shows one anywhere, False none; a `Reporter` receives everything.
 
     Returns
     -------
@@ -205,7 +208,7 @@ def trace(
     activate_mitsuba()
     requested = resolve_quantities(scene, quantities)
     o, d = arrays.as_rays(origins, directions)
-    with translate_mitsuba_errors():
+    with report_progress(progress) as reporter, translate_mitsuba_errors():
         tracer = _Tracer(scene, requested, seed, reporter)
         if observers is None:
             return TraceResult(tracer.trace_for_origins(o, d), ("ray",), None)
@@ -474,7 +477,7 @@ def attention(
     tolerance: float = DEFAULT_SUM_RULE.rtol,
     divisions: int | None = None,
     two_sided: bool = False,
-    reporter: Reporter = SILENT,
+    progress: Progress = None,
 ) -> Attention:
     """Compute which fraction of their gaze observers direct at an object.
 
@@ -497,8 +500,8 @@ def attention(
         of the distance to the nearest observer, at most 32 parts; the relative error is then a few thousandths.
     two_sided : bool
         Meshes only: count both sides of an open surface. Otherwise only the side with counterclockwise vertices counts.
-    reporter : Reporter
-        Receives the progress.
+    progress : bool, Reporter or None
+        None shows a progress bar in notebooks, True shows one anywhere, False none; a `Reporter` receives everything.
 
     Returns
     -------
@@ -543,7 +546,8 @@ def attention(
             raise NergError("divisions and two_sided apply to meshes only, but the surface is a box; omit them")
         positions = resolve_observers(scene, observers)
         rule = SummationRule(rtol=float(tolerance))
-        shares = compute_box_shares(scene, [region], positions, margin=float(margin), rule=rule, reporter=reporter)
+        with report_progress(progress) as reporter:
+            shares = compute_box_shares(scene, [region], positions, margin=float(margin), rule=rule, reporter=reporter)
         to_single = lambda v: np.ascontiguousarray(v, np.float32)
         return Attention(
             to_single(shares.share[:, 0]), positions, to_single(shares.error[:, 0]), to_single(shares.escaped)
@@ -553,7 +557,7 @@ def attention(
         raise NergError(f"divisions must be an integer from 1 to 4,096, got {divisions!r}")
     positions = resolve_observers(scene, observers)
     densities = []
-    with translate_mitsuba_errors(), dr.suspend_grad():
+    with report_progress(progress) as reporter, translate_mitsuba_errors(), dr.suspend_grad():
         mesh = _as_mesh(scene, surface)
         pieces = make_patches(mesh, _choose_divisions(mesh, positions) if divisions is None else int(divisions))
         area = np.array(pieces.area, np.float32)
@@ -698,7 +702,7 @@ def _as_box(surface: Any) -> Region | None:
 
     if isinstance(surface, Region):
         return surface
-    if isinstance(surface, (str, os.PathLike, Mapping, mi.Object)):
+    if isinstance(surface, (str, os.PathLike, Mapping, mi.Object)) or is_trimesh(surface):
         return None
     corners = arrays.as_points(surface, "the corners of a box").astype(np.float64)
     if len(corners) != 2 or not np.all(corners[0] < corners[1]):
@@ -718,4 +722,11 @@ def _as_mesh(scene: Scene, surface: Any) -> Any:
         return by_id[surface]
     if isinstance(surface, (str, os.PathLike)):
         surface = load_mesh_child(surface)
+    elif is_trimesh(surface):
+        meshes = from_trimesh(surface, "surface")
+        if len(meshes) > 1:
+            raise NergError(f"the surface is a trimesh.Scene of {len(meshes)} meshes; pass one of them")
+        surface = next(iter(meshes.values()))
+    if isinstance(surface, MeshFile):
+        surface = load_mesh(surface, "surface")
     return mi.load_dict(dict(surface)) if isinstance(surface, Mapping) else surface

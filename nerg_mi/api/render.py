@@ -10,14 +10,19 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nerg_mi.errors import NergError, translate_mitsuba_errors
+from nerg_mi.files.html import image, markup, paragraph
 from nerg_mi.ranges import SEEDS, SPP, Range, check_number
-from nerg_mi.workflows.base import SILENT, Reporter
+from nerg_mi.rendering.bands import SURFACE_OPACITY
+from nerg_mi.workflows.base import Reporter
 
 from .arrays import Camera, Floats, LabelledArrays, as_points, broadcast_to_observers
-from .scene import COLOR, FilePath, Scene, activate_mitsuba, make_aov_context, resolve_quantities
+from .calls import Progress, report_progress
+from .fields import FilePath, activate_mitsuba
+from .scene import COLOR, Scene, make_aov_context, resolve_quantities
 
 if TYPE_CHECKING:
     import mitsuba as mi
+    from matplotlib.figure import Figure
 
 
 AXES = ("observer", "row", "column")
@@ -31,6 +36,58 @@ class Pictures(LabelledArrays):
     and ``result.gaze[0]`` are the gaze of the first observer.
     """
 
+    def plot(self, name: str | None = None, observer: int = 0) -> Figure:
+        """Draw the image as a figure: its colour, with a quantity over it.
+
+        Parameters
+        ----------
+        name : str, optional
+            The quantity. Default: ``gaze`` if there is one, else ``color``.
+        observer : int
+            Index of the observer.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+            The figure.
+
+        Raises
+        ------
+        NergError
+            The result lacks the quantity, or ``opacity``, which tells where there are surfaces.
+
+        Examples
+        --------
+        >>> import nerg_mi as nerg
+        >>> from importlib.resources import files
+        >>> scene = nerg.Scene.load(files("nerg_mi.scenes.store") / "scene.xml", width=48, height=32)
+        >>> len(nerg.render(scene, spp=1).plot("depth").axes)
+        2
+        """
+        from nerg_mi.figures.overlay import OverlayLayers, find_overlay, srgb
+        from nerg_mi.figures.style import Sheet
+
+        name = name or ("gaze" if "gaze" in self else COLOR)
+        needed = {name, COLOR, *([] if name == COLOR else ["opacity"])}
+        if missing := sorted(needed - set(self.names)):
+            raise NergError(f'the result has no "{missing[0]}"; request it with quantities=')
+        color = self[COLOR][observer]
+        color = np.repeat(color, 3, axis=-1) if color.shape[-1] == 1 else color
+        if name == COLOR:
+            return Sheet([srgb(color)], [""]).page
+        overlay = find_overlay(name)
+        layers = OverlayLayers(color, self[name][observer], self["opacity"][observer] >= SURFACE_OPACITY)
+        return overlay.draw(layers, overlay.limits(layers))
+
+    def _repr_html_(self) -> str | None:
+        """The image of the first observer, for notebooks, if it can be drawn."""
+        if COLOR not in self or ("gaze" in self and "opacity" not in self):
+            return None
+        from nerg_mi.figures.style import encode
+
+        note = repr(self).splitlines()[0]
+        return markup([image(encode(self.plot(), ".png", {}), note), paragraph(note)])
+
 
 def render(
     scene: Scene | FilePath,
@@ -40,7 +97,7 @@ def render(
     camera: Camera | int | mi.Sensor | None = None,
     spp: int = 0,
     seed: int = 0,
-    reporter: Reporter = SILENT,
+    progress: Progress = None,
 ) -> Pictures:
     """Render a scene for one or many observers.
 
@@ -64,8 +121,8 @@ def render(
     seed : int
         Equal seeds give equal images. With a box filter, as every `Camera` has, they equal those of ``nerg render`` bit
         by bit.
-    reporter : Reporter
-        Receives the progress.
+    progress : bool, Reporter or None
+        None shows a progress bar in notebooks, True shows one anywhere, False none; a `Reporter` receives everything.
 
     Returns
     -------
@@ -96,7 +153,7 @@ def render(
     requested = resolve_quantities(scene, quantities)
     sensor = scene.resolve_sensor(camera)
     _check_counts(spp, seed)
-    with translate_mitsuba_errors():
+    with report_progress(progress) as reporter, translate_mitsuba_errors():
         context = make_aov_context(scene, requested)
         positions = _resolve_observers(scene, sensor, observers, bool(context.observer_aovs))
         layers = _ObserverLayers(context, sensor, requested, positions)

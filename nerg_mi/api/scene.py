@@ -1,468 +1,41 @@
-"""Scenes and fields: loading and construction, and the conversion of arguments of API functions."""
+"""Scenes: loading, construction without XML, saving, and the quantities and cameras of calls."""
 
 from __future__ import annotations
 
-import difflib
 import os
 import re
 import sys
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from types import ModuleType
-from typing import TYPE_CHECKING, Any, Generic, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from nerg_mi.errors import MissingFile, NergError, translate_mitsuba_errors
+from nerg_mi.errors import NergError, translate_mitsuba_errors
 from nerg_mi.fields.gaze_base import AnyGazeField
 from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.fields.splats import Splats
-from nerg_mi.formats.fields import load_radiance, save_gaze, save_radiance
-from nerg_mi.formats.meshes import read_mesh_file
-from nerg_mi.formats.splats import choose_plugin
-from nerg_mi.rays.rays import Rays
+from nerg_mi.files.atomic import check_writable, write_text
+from nerg_mi.files.html import key_value_table
+from nerg_mi.formats.meshes import READERS as MESHES
+from nerg_mi.formats.splats import is_splat_file
 from nerg_mi.registration import get_plugin_class
 from nerg_mi.rendering.bands import is_nerg
-from nerg_mi.rendering.scene_writer import compute_clip_distances
+from nerg_mi.rendering.nested_scene import make_paths_absolute, read_scene_elements, to_verbatim
+from nerg_mi.rendering.scene_writer import check_attribute, compute_clip_distances, format_document
 from nerg_mi.transport.geometry import check_shape
-from nerg_mi.workflows.old_names import current_keywords
 
+from .arguments import check_names, resolve_file
 from .arrays import Camera, Floats, as_points, join_names
+from .contents import DensityGrid, FieldVolume, GridVolume, load_content, to_scene_children, write_content
+from .fields import FilePath, TrainedField, activate_mitsuba
 
 if TYPE_CHECKING:
     import mitsuba as mi
-    from _typeshed import DataclassInstance
+    from matplotlib.figure import Figure
 
     from nerg_mi.transport.geometry import SceneGeometry
-
-
-# ---- Shapes (files, dicts, scenes, objects) as children of a Mitsuba scene ----
-
-
-def load_mesh_child(path: str | os.PathLike[str]) -> Any:
-    """Load a mesh file as a two-sided child of a Mitsuba scene, with its colours or in grey.
-
-    Unused parts of the file are reported in Mitsuba's log.
-
-    Parameters
-    ----------
-    path : path-like
-        Mesh file.
-
-    Returns
-    -------
-    dict or mi.Mesh
-        A dict for ``mi.load_dict``; a mesh if Mitsuba cannot read the file as it is.
-
-    Raises
-    ------
-    NergError
-        The file does not exist or is damaged.
-    """
-    import mitsuba as mi
-
-    from nerg_mi.surfaces.mesh import mitsuba_mesh
-
-    mesh = read_mesh_file(path)
-    log: Any = mi.Log  # missing in the stubs
-    for note in mesh.notes:
-        log(mi.LogLevel.Warn, f"{path}: {note}")
-    name, colors = ("face_color", mesh.face_colors) if mesh.colors is None else ("vertex_color", mesh.colors)
-    color_texture = {} if colors is None else {"reflectance": {"type": "mesh_attribute", "name": name}}
-    bsdf = {"type": "twosided", "bsdf": {"type": "diffuse", **color_texture}}
-    if mesh.is_readable_by_mitsuba:
-        return {"type": Path(path).suffix.lower()[1:], "filename": str(path), "bsdf": bsdf}
-    shape = mitsuba_mesh(mesh.vertices, mesh.faces, Path(path).stem, bsdf)
-    if colors is not None:
-        shape.add_attribute(name, 3, colors.astype(np.float32).ravel())
-    return shape
-
-
-def to_scene_children(shapes: object, name: str = "shape") -> dict[str, Any]:
-    """Convert shapes to children of a Mitsuba scene dict; the variant must be active.
-
-    Parameters
-    ----------
-    shapes : object
-        A mesh file, a scene file, a dict for ``mi.load_dict``, a Mitsuba shape or scene, or several of these in a list
-        or in a dict by name.
-    name : str
-        Name of shapes that have none.
-
-    Returns
-    -------
-    dict of str to object
-        The children by name.
-
-    Raises
-    ------
-    NergError
-        ``shapes`` is something else.
-    """
-    import mitsuba as mi
-
-    if shapes is None:
-        return {}
-    if isinstance(shapes, (str, os.PathLike)):
-        if Path(shapes).suffix.lower() != ".xml":
-            return {name: load_mesh_child(shapes)}
-        from nerg_mi.rendering.scene import load_scene
-
-        return _list_scene_children(load_scene(Path(shapes)), name)
-    if isinstance(shapes, mi.Scene):
-        return _list_scene_children(shapes, name)
-    if isinstance(shapes, mi.Object):
-        return {name: shapes}
-    if isinstance(shapes, Mapping):
-        if shapes.get("type") == "scene":
-            with translate_mitsuba_errors():
-                return _list_scene_children(mi.load_dict(dict(shapes), optimize=False), name)
-        if "type" in shapes:
-            return {name: dict(shapes)}
-        named = [to_scene_children(child, str(key)) for key, child in shapes.items()]
-    elif isinstance(shapes, (list, tuple)):
-        named = [to_scene_children(child, f"{name}_{i}") for i, child in enumerate(shapes)]
-    else:
-        raise NergError(
-            "shapes must be mesh files, scene files, dicts for mi.load_dict or Mitsuba objects, "
-            f"got {type(shapes).__name__}"
-        )
-    return {key: child for children in named for key, child in children.items()}
-
-
-def _list_scene_children(scene, name: str) -> dict[str, Any]:
-    """Return the shapes of a scene by name, and its emitters that are not shapes."""
-    shapes = list(scene.shapes())
-    named = {shape.id() or f"{name}_{i}": shape for i, shape in enumerate(shapes)}
-    if len(named) < len(shapes):
-        named = {f"{name}_{i}": shape for i, shape in enumerate(shapes)}
-    lights = [light for light in scene.emitters() if not any(s.is_emitter() and s.emitter() is light for s in shapes)]
-    return named | {f"{name}_light_{i}": light for i, light in enumerate(lights)}
-
-
-# ---- The active Mitsuba variant ----
-
-
-def activate_mitsuba() -> ModuleType:
-    """Import Mitsuba with a variant active.
-
-    An active variant is kept. Otherwise ``cuda_ad_rgb`` is activated if it works, and ``llvm_ad_rgb`` if not, as in the
-    command `nerg`.
-
-    Returns
-    -------
-    module
-        ``mitsuba``.
-
-    Raises
-    ------
-    NergError
-        A scalar variant is active.
-    """
-    import mitsuba as mi
-
-    variant = mi.variant()
-    if variant is None:
-        from nerg_mi.rendering.scene import activate_variant
-
-        activate_variant()
-    elif variant.startswith("scalar"):
-        raise NergError(
-            f'fields do not support scalar variants such as "{variant}"; '
-            'call mi.set_variant("llvm_ad_rgb") or mi.set_variant("cuda_ad_rgb") first'
-        )
-    return mi
-
-
-def get_array_module() -> ModuleType:
-    """Return the Dr.Jit array types of the active variant (`nerg_mi.fields.mlp.namespace`)."""
-    from nerg_mi.fields.mlp import namespace
-
-    return namespace(activate_mitsuba().variant())
-
-
-# ---- Fields and gaze samples in memory ----
-
-
-FilePath: TypeAlias = str | Path
-Network = TypeVar("Network", RadianceField, AnyGazeField)
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class TrainedField(Generic[Network]):
-    """A radiance field or a gaze field in memory.
-
-    Attributes
-    ----------
-    network : RadianceField or gaze field
-        The field (`nerg_mi.fields`). Its arrays belong to the variant that was active when it was created.
-    provenance : mapping
-        Training data, options and scores, as stored in the file.
-    name : str
-        Name of the file.
-    path : Path or None
-        The checkpoint; None if the field is not saved.
-    """
-
-    network: Network
-    provenance: Mapping[str, Any] = field(default_factory=dict)
-    name: str = "in memory"
-    path: Path | None = None
-
-    @property
-    def kind(self) -> str:
-        """``radiance`` or ``gaze``."""
-        return "radiance" if isinstance(self.network, RadianceField) else "gaze"
-
-    @property
-    def bounds(self) -> NDArray[np.float64]:
-        """Lower and upper corner (2, 3) of the bounding box of the field, in its own units."""
-        return np.array([self.network.box.lower, self.network.box.upper], np.float64)
-
-    @property
-    def num_weights(self) -> int:
-        """Number of trained weights."""
-        parameters = self.network.parameters()
-        return sum(int(np.prod(value.shape)) for name, value in parameters.items() if not name.startswith("voxels."))
-
-    def save(self, path: FilePath, half: bool = False) -> Path:
-        """Write a checkpoint (.safetensors) atomically.
-
-        Parameters
-        ----------
-        path : path
-            File to write.
-        half : bool
-            Whether to store the weights as fp16 instead of fp32.
-
-        Returns
-        -------
-        Path
-            The file.
-
-        Raises
-        ------
-        NergError
-            The weights are not finite or exceed fp16, or the file cannot be written.
-        """
-        path = Path(path)
-        if path.suffix.lower() != ".safetensors":
-            raise NergError(f'fields are saved as .safetensors; change the file name extension of "{path}"')
-        if isinstance(self.network, RadianceField):
-            save_radiance(self.network, path, dict(self.provenance), half)
-        else:
-            save_gaze(self.network, path, dict(self.provenance), half)
-        return path
-
-    def __repr__(self) -> str:
-        lower, upper = (", ".join(f"{x:.3g}" for x in corner) for corner in self.bounds)
-        members = 1 if isinstance(self.network, RadianceField) else len(self.network.members)
-        what = f"{self.kind} field" if members == 1 else f"ensemble of {members} gaze fields"
-        return f"<{what} {self.name}: {self.num_weights:,} weights, box ({lower}) to ({upper})>"
-
-
-def load_field(path: FilePath) -> TrainedField[RadianceField]:
-    """Load a radiance field: density and colour of an environment.
-
-    Parameters
-    ----------
-    path : path
-        A checkpoint written by ``nerg train radiance``, `train_radiance` or ``nerg import``.
-
-    Returns
-    -------
-    TrainedField
-        The field, for `make_scene`.
-
-    Raises
-    ------
-    NergError
-        The file does not exist, is damaged, or contains something else.
-
-    Examples
-    --------
-    >>> import nerg_mi as nerg
-    >>> from importlib.resources import files
-    >>> store = files("nerg_mi.scenes.store")
-    >>> field = nerg.load_field(store / "store.safetensors")
-    >>> field.bounds.tolist()
-    [[-0.1, -0.1, -0.1], [8.1, 6.1, 3.1]]
-    """
-    network, metadata = load_radiance(as_path(path), get_array_module())
-    return TrainedField(network, metadata.get("provenance", {}), Path(path).name, Path(path))
-
-
-def load_rays(path: FilePath) -> Rays:
-    """Load recorded gaze samples.
-
-    Parameters
-    ----------
-    path : path
-        A file (.npz or .parquet) written by ``nerg rays import``, `import_rays` or `Rays.save`, or a dataset (.rays) of
-        at most 50 million samples.
-
-    Returns
-    -------
-    Rays
-        The samples, right-handed with z up, in metres and seconds.
-
-    Raises
-    ------
-    NergError
-        The file does not exist or is damaged.
-
-    Examples
-    --------
-    >>> import nerg_mi as nerg
-    >>> rays = nerg.Rays(t=[0, 0.1], person=[0, 0], persons=("Ada",), origin=[[1, 1, 1.6]] * 2,
-    ...                  direction=[[1, 0, 0], [0, 1, 0]], confidence=[1, 1])
-    >>> rays.save(folder / "rays.npz")
-    >>> len(nerg.load_rays(folder / "rays.npz"))
-    2
-    """
-    from nerg_mi.rays.dataset import load_rays as load
-
-    return load(as_path(path))
-
-
-def as_path(path: FilePath) -> Path:
-    """Return ``path`` as a `Path`. Raises `NergError` for anything but a string or a path."""
-    try:
-        return Path(path)
-    except TypeError as error:
-        raise NergError(f"a file must be given as a string or a path, got {type(path).__name__}") from error
-
-
-# ---- Checks of options and files, before any computation ----
-
-
-Options = TypeVar("Options", bound="DataclassInstance")
-
-_OUTPUT_OPTIONS = {"pictures", "json_file", "store"}
-"""Options that name a file or folder to write."""
-
-
-def build_options(kind: type[Options], function: str, options: Options | None, overrides: dict[str, Any]) -> Options:
-    """Build the options of a workflow for the active variant.
-
-    Parameters
-    ----------
-    kind : type
-        Dataclass of the options.
-    function : str
-        Name of the API function, for messages.
-    options : dataclass instance or None
-        Base options; None uses the defaults.
-    overrides : dict
-        Values by option name. Files can be given as strings.
-
-    Returns
-    -------
-    dataclass instance
-        The options.
-
-    Raises
-    ------
-    NergError
-        An option or a file does not exist.
-    """
-    types, overrides = {f.name: str(f.type) for f in fields(kind)}, current_keywords(kind, overrides)
-    if "mode" in overrides:
-        raise NergError(f"{function} uses the active variant; call mi.set_variant({overrides['mode']!r}) before it")
-    check_names(function, overrides, [name for name in types if name != "mode"])
-    if "mode" in types:
-        overrides = {**overrides, "mode": activate_mitsuba().variant()}
-    updated = replace(kind() if options is None else options, **overrides)
-    files = {k: getattr(updated, k) for k, type_name in types.items() if "Path" in type_name}
-    return replace(
-        updated,
-        **{k: Path(v) if k in _OUTPUT_OPTIONS else resolve_file(v, k) for k, v in files.items() if v is not None},
-    )
-
-
-def check_names(function: str, names: Iterable[str], allowed: Collection[str], noun: str = "option") -> None:
-    """Check names of options.
-
-    Parameters
-    ----------
-    function : str
-        Name of the API function, for messages.
-    names : iterable of str
-        Names to check.
-    allowed : collection of str
-        Allowed names.
-    noun : str
-        What the names stand for, for messages.
-
-    Raises
-    ------
-    NergError
-        A name is not allowed; the message suggests a similar one.
-    """
-    for name in names:
-        if name not in allowed:
-            near = difflib.get_close_matches(name, allowed, n=1)
-            meant = f'did you mean "{near[0]}"?' if near else f"available: {join_names(list(allowed))}"
-            raise NergError(f'{function} has no {noun} "{name}"; {meant}')
-
-
-def resolve_file(value: object, name: str) -> Path:
-    """Return the file that an argument names.
-
-    Parameters
-    ----------
-    value : object
-        A string, a path, or a field or scene that has a file.
-    name : str
-        Name of the argument, for messages.
-
-    Returns
-    -------
-    Path
-        The existing file.
-
-    Raises
-    ------
-    NergError
-        The file does not exist, or ``value`` is something else.
-    """
-    path = getattr(value, "path", None) or value
-    if not isinstance(path, (str, os.PathLike)):
-        remedy = "; save it and pass the file" if hasattr(value, "save") else ""
-        raise NergError(f'"{name}" must be a file, given as a string or a path, got {type(value).__name__}{remedy}')
-    if not os.path.exists(path):
-        raise MissingFile(f'the file "{os.fspath(path)}" of "{name}" does not exist; correct the path')
-    return Path(path)
-
-
-def resolve_rays(value: object) -> Rays | Path:
-    """Return `Rays` unchanged, or the path of their file. Raises `NergError` for anything else."""
-    if isinstance(value, Rays):
-        return value
-    if not isinstance(value, (str, os.PathLike)):
-        raise NergError(
-            f"rays must be a Rays object or a file of one, got {type(value).__name__}; "
-            "use import_rays to read a table (.csv, .parquet)"
-        )
-    return resolve_file(value, "rays")
-
-
-@contextmanager
-def resolve_checkpoint(value: object, name: str) -> Iterator[Path]:
-    """Yield the checkpoint of a field: its file, or a temporary one for the duration of the block."""
-    if isinstance(value, TrainedField) and value.path is None:
-        with TemporaryDirectory() as folder:
-            yield value.save(Path(folder) / f"{value.kind}.safetensors")
-        return
-    yield resolve_file(value, name)
-
-
-# ---- Scenes ----
-
 
 COLOR = "color"
 """Name of the linear colour, the only quantity that is not an AOV."""
@@ -513,6 +86,8 @@ class Scene:
             check_shape(shape)
         self.mitsuba = mitsuba
         self.path: Path | None = None
+        self._content: dict[str, Any] | None = None
+        self._source: tuple[Path, dict[str, str]] | None = None
 
     @classmethod
     def load(cls, path: FilePath, **values: object) -> Scene:
@@ -538,24 +113,144 @@ class Scene:
         from nerg_mi.rendering.scene import load_scene
 
         activate_mitsuba()
+        texts = {key: str(value) for key, value in values.items()}
         # Merged meshes would lose their names.
-        scene = cls(load_scene(Path(path), {key: str(value) for key, value in values.items()}, merge=False))
+        scene = cls(load_scene(Path(path), texts, merge=False))
         scene.path = None if values else Path(path)
+        scene._source = Path(path), texts
         return scene
 
     @classmethod
-    def coerce(cls, scene: Scene | FilePath | mi.Scene) -> Scene:
-        """Return ``scene`` as a `Scene`; a scene file is loaded, and a Mitsuba scene is wrapped. Raises `NergError`."""
+    def coerce(cls, scene: Scene | FilePath | mi.Scene | Mapping[str, Any]) -> Scene:
+        """Return ``scene`` as a `Scene`: a scene file or a dict is loaded, and a Mitsuba scene is wrapped.
+
+        Raises `NergError`.
+        """
         if isinstance(scene, Scene):
             return scene
         if isinstance(scene, (str, os.PathLike)):
-            return cls.load(scene)
+            return cls.load(Path(scene))
         import mitsuba as mi
 
         activate_mitsuba()
         if isinstance(scene, mi.Scene):
             return cls(scene)
-        raise NergError(f"a scene must be a Scene, a Mitsuba scene or a scene file, got {type(scene).__name__}")
+        if isinstance(scene, Mapping):
+            return cls._from_content(dict(scene))
+        raise NergError(
+            f"a scene must be a Scene, a Mitsuba scene, a dict of one or a scene file, got {type(scene).__name__}; "
+            "make_scene makes a scene of fields and meshes"
+        )
+
+    @classmethod
+    def _from_content(cls, content: dict[str, Any]) -> Scene:
+        """Make a scene of its content (`nerg_mi.api.contents`)."""
+        scene = cls(load_content(content))
+        scene._content = content
+        return scene
+
+    def save(self, path: FilePath) -> Path:
+        """Write a scene file (.xml) atomically.
+
+        Fields, meshes, grids and splats that have no file are written next to it, in files whose names begin with that
+        of the scene. Of a scene that ``Scene(scene)`` wraps, only meshes can be written, in grey; make the scene with
+        `make_scene` to write all of it.
+
+        Parameters
+        ----------
+        path : path
+            File to write.
+
+        Returns
+        -------
+        Path
+            The file.
+
+        Raises
+        ------
+        NergError
+            The scene contains an object of Mitsuba that cannot be written, or a file cannot be written.
+
+        Examples
+        --------
+        >>> import nerg_mi as nerg, trimesh
+        >>> room = trimesh.creation.box((4, 3, 2.5))
+        >>> scene = nerg.make_scene(room, camera=nerg.Camera((0, 0, 0), (1, 0, 0), width=9, height=6))
+        >>> nerg.Scene.load(scene.save(folder / "room.xml"))
+        Scene
+          shapes: 1
+          observer: the camera
+          camera 0: 9 x 6 pixels
+        """
+        path = Path(path)
+        check_writable(path, ".xml")
+        if self._source is not None:
+            source, values = self._source
+            version, children = read_scene_elements(source)
+            for child in children:
+                if child.tag == "default" and (name := child.get("name", "")) in values:
+                    child.set("value", check_attribute(values[name]))
+            elements = [child for child in children if child.tag != "path"]
+            make_paths_absolute(elements, source, children)
+            nodes = [to_verbatim(child) for child in elements]
+            write_text(path, format_document(nodes, f"A copy of {source.name}.", version))
+            return path
+        if self._content is None:
+            aovs = ",".join(self.integrator.aov_names()) and "depth,opacity"
+            if self.integrator.medium is not None or self.integrator.gaze is not None:
+                raise NergError(
+                    "the scene was made by Mitsuba in memory, and its fields cannot be written to a file; make it with "
+                    "make_scene, or load it from a file or a dict"
+                )
+            content = {"type": "scene", "integrator": {"type": "nerg", "aovs": aovs}, **to_scene_children(self.mitsuba)}
+        else:
+            content = self._content
+        write_content(path, content, "A scene made by nerg_mi in Python.")
+        return path
+
+    def show(
+        self, quantity: str | None = None, *, observer: ArrayLike | None = None, spp: int = 16, **settings: Any
+    ) -> Figure:
+        """Render the scene as a figure: its colour, with a quantity over it.
+
+        Parameters
+        ----------
+        quantity : str, optional
+            An AOV such as ``gaze``, ``depth`` or ``visibility``. Default: ``gaze`` if the scene has a gaze field.
+        observer : array_like of shape (3,), optional
+            Position of the observer. Default: as for `render`.
+        spp : int
+            Samples per pixel.
+        **settings
+            Further arguments of `render`: ``camera``, ``seed`` and ``progress``.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+            The figure, which a notebook shows.
+
+        Raises
+        ------
+        NergError
+            As for `render`.
+
+        Examples
+        --------
+        >>> import nerg_mi as nerg
+        >>> from importlib.resources import files
+        >>> scene = nerg.Scene.load(files("nerg_mi.scenes.store") / "scene.xml", width=48, height=32)
+        >>> type(scene.show(spp=1)).__name__
+        'Figure'
+        """
+        import nerg_mi
+
+        name = quantity or ("gaze" if self.has_gaze else COLOR)
+        needed = [COLOR, *([] if name == COLOR else ["opacity", name])]
+        return nerg_mi.render(self, observer, needed, spp=spp, **settings).plot(name)
+
+    def _repr_html_(self) -> str:
+        lines = [line.strip().partition(": ") for line in repr(self).splitlines()[1:]]
+        return key_value_table((name, value) for name, _, value in lines)
 
     @property
     def integrator(self) -> Any:
@@ -663,8 +358,13 @@ class Scene:
         return "\n".join(["Scene", *lines])
 
 
+Environment: TypeAlias = Any
+"""What observers see: a file, a `Scene`, a radiance field, splats, a `DensityGrid`, a mesh or scene of trimesh, a
+Mitsuba scene or shape, or a dict for ``mi.load_dict``."""
+
+
 def make_scene(
-    field: FilePath | TrainedField[RadianceField] | RadianceField | Splats | None = None,
+    environment: Environment = None,
     gaze: FilePath | TrainedField[AnyGazeField] | AnyGazeField | None = None,
     *,
     shapes: object = None,
@@ -673,18 +373,19 @@ def make_scene(
     to_world: ArrayLike | None = None,
     **settings: Any,
 ) -> Scene:
-    """Make a scene from fields, shapes or both, without writing XML.
+    """Make a scene from an environment, a gaze field, or both, without writing XML.
 
     Parameters
     ----------
-    field : TrainedField, RadianceField, Splats or path, optional
-        The environment: a radiance field (`load_field`, `train_radiance`) or Gaussian splats
-        (`nerg_mi.formats.splats.read_splats`), in memory or as a file, or a file of hit points (.vol) as written by
-        `train_gaze` with ``geometry="hits"``. Hit points are grey, shaded by the orientation of their surfaces.
+    environment : Environment, optional
+        What the observers see: a radiance field (`load_field`, `train_radiance`), Gaussian splats
+        (`nerg_mi.fields.splats.Splats`) or a `DensityGrid`, in memory or as a file; a file of hit points (.vol) as
+        written by `train_gaze` with ``geometry="hits"``; or shapes as for ``shapes``. Hit points are grey, shaded by
+        the orientation of their surfaces.
     gaze : TrainedField, gaze field or path, optional
         The gaze field (`load_gaze`, `train_gaze`), in memory or as a file.
     shapes : object, optional
-        Shapes in the environment, or all of it: a mesh file (.ply, .obj, .glb), a scene file, a dict for
+        Further shapes: a mesh or scene of trimesh, a mesh file (.ply, .obj, .glb), a scene file, a dict for
         ``mi.load_dict``, a Mitsuba scene or shape, or several of these in a list or in a dict by name.
     camera : Camera, mapping or mi.Sensor, optional
         The camera.
@@ -704,7 +405,7 @@ def make_scene(
     Raises
     ------
     NergError
-        An argument is invalid, or there is neither a field nor a shape.
+        An argument is invalid, or there is neither an environment nor a shape.
 
     Examples
     --------
@@ -720,8 +421,6 @@ def make_scene(
       observer: the camera
       camera 0: 48 x 32 pixels
     """
-    import mitsuba as mi
-
     activate_mitsuba()
     # Children of the integrator can have any name.
     check_names(
@@ -730,28 +429,36 @@ def make_scene(
         _integrator_parameters(),
         "setting",
     )
+    if isinstance(settings.get("field"), (str, os.PathLike, TrainedField, RadianceField, Splats)):
+        raise NergError('make_scene has no argument "field"; pass the field as the environment')
     integrator: dict[str, Any] = {"type": "nerg", **settings}
     transform = None if to_world is None else _as_transform(to_world)
-    if isinstance(field, (str, os.PathLike)) and Path(field).suffix.lower() == ".vol":
-        integrator = _make_hit_volumes(resolve_file(field, "field"), transform) | integrator
-    elif field is not None:
-        integrator["field"] = _make_volume(field, "field", transform)
+    children: dict[str, Any] = {}
+    if isinstance(environment, (str, os.PathLike)) and Path(environment).suffix.lower() == ".vol":
+        integrator = _make_hit_volumes(resolve_file(environment, "environment"), transform) | integrator
+    elif isinstance(environment, DensityGrid):
+        integrator = dict(environment.volumes(transform)) | integrator
+    elif _is_field(environment):
+        if isinstance(environment, (str, os.PathLike)):
+            environment = resolve_file(environment, "environment")
+        integrator["field"] = FieldVolume(environment, "field", transform)
+    elif environment is not None:
+        children = to_scene_children(environment, "environment")
     if gaze is not None:
-        integrator["gaze"] = _make_volume(gaze, "gaze", transform)
+        gaze = resolve_file(gaze, "gaze") if isinstance(gaze, (str, os.PathLike)) else gaze
+        integrator["gaze"] = FieldVolume(gaze, "gaze", transform)
     if observer is not None:
         position = as_points(observer, "the observer")
         if len(position) != 1:
             raise NergError("a scene has a single observer; pass several observers to render, observe or attention")
         integrator["observer"] = _make_observer_sensor(position[0])
     integrator.setdefault("aovs", ",".join(["depth", "opacity", *(["gaze", "visibility"] if gaze is not None else [])]))
-    children = to_scene_children(shapes)
+    children |= to_scene_children(shapes)
     if not children and integrator.keys().isdisjoint({"field", "density"}):
-        raise NergError("the scene is empty; pass a field or shapes to make_scene")
+        raise NergError("the scene is empty; pass an environment or shapes to make_scene")
     if camera is not None:
         children["camera"] = camera.to_dict() if isinstance(camera, Camera) else camera
-    with translate_mitsuba_errors():
-        # Merged meshes would lose their names.
-        scene = Scene(mi.load_dict({"type": "scene", "integrator": integrator, **children}, optimize=False))
+    scene = Scene._from_content({"type": "scene", "integrator": integrator, **children})
     if isinstance(camera, Camera):
         scene._fit_clip_distances(next(s for s in scene.mitsuba.sensors() if s.id() == "camera"), camera)
     return scene
@@ -818,36 +525,26 @@ def resolve_quantities(scene: Scene, names: object, allowed: tuple[str, ...] | N
     return tuple(dict.fromkeys(requested))
 
 
-def _make_volume(field: object, role: str, to_world: Any) -> Any:
-    """Make the volume of a field, a file or an object, for the integrator's property ``role``."""
-    plugin = {"field": "splats" if isinstance(field, Splats) else "nerf", "gaze": "gazefield"}[role]
-    if isinstance(field, (str, os.PathLike)):
-        field = resolve_file(field, role)
-        plugin = choose_plugin(field) if role == "field" else plugin
-        transform = {} if to_world is None else {"to_world": to_world}
-        return {"type": plugin, "filename": os.path.abspath(field), **transform}
-    volume = get_plugin_class(plugin)
-    if isinstance(field, TrainedField):
-        return volume.from_network(field.network, to_world, field.name)
-    return volume.from_network(field, to_world)
+def _is_field(value: object) -> bool:
+    """Whether ``value`` is a radiance field or splats, in memory or by the suffix of a file."""
+    if isinstance(value, (str, os.PathLike)):
+        path = Path(value)
+        return path.suffix.lower() not in (*MESHES, ".xml") or (path.is_file() and is_splat_file(path))
+    if isinstance(value, TrainedField) and value.kind == "gaze":
+        raise NergError("the environment is a gaze field; pass it with gaze=")
+    return isinstance(value, (TrainedField, RadianceField, Splats))
 
 
 def _make_hit_volumes(path: Path, to_world: Any) -> dict[str, Any]:
     """Make the density and the colour of a volume of hit points, as properties of the integrator."""
-    import mitsuba as mi
-
     from nerg_mi.train.geometry import make_volume_dict
     from nerg_mi.workflows.scene_places import shade_hit_volume
 
     color, lower, upper = shade_hit_volume(path)
-    world: Any = mi.ScalarTransform4d() if to_world is None else to_world
-    in_box = world @ mi.ScalarTransform4d().translate(lower.tolist()).scale((upper - lower).tolist())
-    density = make_volume_dict(os.path.abspath(path))
-    if to_world is not None:
-        density["to_world"] = to_world
+    world = {} if to_world is None else {"to_world": to_world}
     return {
-        "density": density,
-        "color": {"type": "gridvolume", "grid": mi.VolumeGrid(color), "raw": True, "to_world": in_box},
+        "density": make_volume_dict(os.path.abspath(path)) | world,
+        "color": GridVolume(color, lower, upper, to_world),
     }
 
 

@@ -23,9 +23,9 @@ from nerg_mi.ranges import KAPPAS, RANGE
 from nerg_mi.workflows.base import COMMANDS, Command, Parameter
 from nerg_mi.workflows.old_names import find_spelling
 from nerg_mi.workflows.options import GROUPS as GROUPS_OF_OPTIONS
+from nerg_mi.workflows.progress import TerminalReporter
 
 from .ending import shorten_values
-from .progress import TerminalReporter
 
 PACKAGES = ("nerg_mi.workflows", "nerg_mi.viewer", "nerg_mi.cli")
 """Packages whose modules and submodules may declare commands."""

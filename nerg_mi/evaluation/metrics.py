@@ -13,6 +13,7 @@ from nerg_mi.errors import NergError, translate_mitsuba_errors
 from nerg_mi.figures.overlay import srgb, write_png
 from nerg_mi.figures.style import make_provenance
 from nerg_mi.files.atomic import make_folder
+from nerg_mi.files.dataframes import ResultTables
 from nerg_mi.maths.color import color_corrected_psnr, mean_ignoring_nan, psnr
 from nerg_mi.photos.cameras import PosedCamera, make_sensor_dict, pixel_directions
 from nerg_mi.photos.images import PhotoView, apply_lens, make_pinhole_camera
@@ -158,9 +159,11 @@ class FieldRenderer:
         return RenderedView(np.clip(stacked[..., :3], 0, 1), stacked[..., 3], np.clip(stacked[..., 4], 0, 1), mask)
 
 
-@dataclass(frozen=True)
-class ViewScores:
+@dataclass(frozen=True, repr=False)
+class ViewScores(ResultTables):
     """Scores of a field on posed photos."""
+
+    TABLES = ("rows",)
 
     views: list[str]  # Names of the views, in the order of the lists below
     width: int  # Size of the first photo in pixels
@@ -171,6 +174,12 @@ class ViewScores:
     # PSNR of the right half of each view in dB after fitting its colours on the left half; NaN without pixels.
     psnr_fitted: list[float]
     depth: DepthScore | None  # Means over the views with true depth; None if there are none
+
+    @property
+    def rows(self) -> list[dict]:
+        """One row per view."""
+        columns = self.views, self.psnr, self.ssim, self.psnr_fitted
+        return [dict(zip(("view", "psnr", "ssim", "psnr_fitted"), row)) for row in zip(*columns)]
 
     @property
     def psnr_mean(self) -> float:

@@ -8,8 +8,9 @@ import os
 import zipfile
 import zlib
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -363,7 +364,7 @@ _BLOCK = 1 << 18
 FRAME = {"units": "m", "up": "z", "handedness": "right"}
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Rays:
     """N gaze samples as rays, validated on construction.
 
@@ -450,11 +451,211 @@ class Rays:
     def __len__(self) -> int:
         return len(self.t)
 
+    def __getitem__(self, selection: Any) -> Rays:
+        """Select rays by a boolean mask (N,), an array of indices, a slice or one index."""
+        index = selection if isinstance(selection, slice) else np.atleast_1d(np.asarray(selection))
+        if not isinstance(index, slice):
+            if index.dtype.kind not in "biu" and index.size:
+                raise NergError(f"rays are selected by a mask, indices or a slice, got {type(selection).__name__}")
+            if index.dtype.kind == "b" and index.shape != (len(self),):
+                raise NergError(f"the mask has the shape {index.shape}, expected {(len(self),)}: one value per ray")
+            index = index if index.size else index.astype(np.int64)
+        return self.select(index)
+
+    @property
+    def participants(self) -> tuple[str, ...]:
+        """Names of the participants that have rays."""
+        return _used_names(self.person, self.persons)
+
+    def __repr__(self) -> str:
+        return _in_memory().describe_rays(self)
+
+    def _repr_html_(self) -> str | None:
+        """The data-quality report, for notebooks."""
+        return _in_memory().check_rays(self, "rays")._repr_html_() if len(self) else None
+
+    @classmethod
+    def from_arrays(
+        cls,
+        origins: ArrayLike,
+        directions: ArrayLike,
+        *,
+        times: ArrayLike,
+        participants: str | ArrayLike = "participant",
+        hits: ArrayLike | None = None,
+        heads: ArrayLike | None = None,
+        confidence: ArrayLike | None = None,
+        cohorts: str | ArrayLike | None = None,
+        up: str = "z",
+        handedness: str = "right",
+        units: str = "m",
+    ) -> Rays:
+        """Make rays of arrays.
+
+        Rows without a position, a direction, a time or a participant are dropped. The metadata contain their number by
+        reason, which the data-quality report shows (``repr`` of `nerg_mi.check_rays`).
+
+        Parameters
+        ----------
+        origins : array_like of shape (N, 3)
+            Positions of the eye or of the head.
+        directions : array_like of shape (N, 3)
+            Directions of any length except zero.
+        times : array_like of shape (N,)
+            Times in seconds, on any clock.
+        participants : str or array_like of shape (N,)
+            Name of the participant of each ray, or one name for all.
+        hits : array_like of shape (N, 3), optional
+            Points of regard on surfaces, NaN where they are unknown.
+        heads : array_like of shape (N, 3), optional
+            Directions of the head, NaN where they are unknown.
+        confidence : array_like of shape (N,), optional
+            Confidence from 0 to 1. Default: 1.
+        cohorts : str or array_like of shape (N,), optional
+            Name of the group of participants of each ray.
+        up, handedness, units : str
+            Frame of the arrays: the up axis (``x``, ``y``, ``z``, ``-x``, ``-y``, ``-z``), ``right`` or ``left``, and
+            ``m``, ``cm`` or ``mm``. Unity has ``up="y", handedness="left"``.
+
+        Returns
+        -------
+        Rays
+            The rays, right-handed with z up, in metres and seconds.
+
+        Raises
+        ------
+        NergError
+            An array has another shape or contains no numbers, or no row gives a ray.
+
+        Examples
+        --------
+        >>> import nerg_mi as nerg
+        >>> rays = nerg.Rays.from_arrays([[1, 1, 1.6]] * 3, [[2, 0, 0], [0, 1, 0], [float("nan")] * 3], times=[0, 1, 2])
+        >>> rays, rays.metadata["dropped"][0]["reason"]
+        (<Rays: 2 of 1 participant, t 0 to 1 s>, 'direction is missing')
+        """
+        return _in_memory().from_arrays(
+            origins,
+            directions,
+            times=times,
+            participants=participants,
+            hits=hits,
+            heads=heads,
+            confidence=confidence,
+            cohorts=cohorts,
+            frame=(up, handedness, units),
+        )
+
+    @classmethod
+    def from_dataframe(
+        cls,
+        table: Any,
+        columns: Mapping[str, str | Sequence[str]] | None = None,
+        *,
+        up: str = "z",
+        handedness: str = "right",
+        units: str = "m",
+    ) -> Rays:
+        """Make rays of a data frame of pandas, polars, Arrow or another library that narwhals supports.
+
+        Parameters
+        ----------
+        table : data frame
+            One row per sample. Times may be numbers in seconds, dates or durations.
+        columns : mapping, optional
+            Columns by role: ``time``, ``participant``, ``origin``, ``direction``, ``hit``, ``head``, ``confidence`` and
+            ``cohort``; positions and directions have three columns. ``time``, ``origin`` and ``direction`` are
+            required; without ``participant`` all rows are of one. Default: the columns of `to_dataframe`.
+        up, handedness, units : str
+            Frame of the values, as in `from_arrays`.
+
+        Returns
+        -------
+        Rays
+            The rays; rows are dropped as in `from_arrays`, and unused columns are listed in the data-quality report.
+
+        Raises
+        ------
+        NergError
+            A column does not exist or contains other values, or narwhals is not installed.
+
+        Examples
+        --------
+        >>> import nerg_mi as nerg, pandas as pd
+        >>> table = pd.DataFrame({"t": [0, 0.1], "who": "Ada", "x": 1, "y": 2, "z": 1.6, "u": [1, 0], "v": 1, "w": 0})
+        >>> columns = {"time": "t", "participant": "who", "origin": ["x", "y", "z"], "direction": ["u", "v", "w"]}
+        >>> nerg.Rays.from_dataframe(table, columns)
+        <Rays: 2 of 1 participant, t 0 to 0.1 s>
+        """
+        return _in_memory().from_dataframe(table, columns, (up, handedness, units))
+
+    def to_dataframe(self, library: str | None = None) -> Any:
+        """Return a data frame with one row per ray.
+
+        Parameters
+        ----------
+        library : str, optional
+            ``pandas``, ``polars`` or ``pyarrow``. Default: the first of these that is installed.
+
+        Returns
+        -------
+        data frame
+            Columns ``time`` (s), ``participant``, ``origin_x`` to ``origin_z`` (m), ``direction_x`` to ``direction_z``,
+            ``confidence``, and if the rays have them ``hit_x`` to ``hit_z``, ``cohort``, ``head_x`` to ``head_z``.
+
+        Raises
+        ------
+        NergError
+            The library is unknown or not installed.
+
+        Examples
+        --------
+        >>> import nerg_mi as nerg
+        >>> rays = nerg.Rays.from_arrays([[1, 1, 1.6]] * 2, [[1, 0, 0], [0, 1, 0]], times=[0, 1])
+        >>> list(rays.to_dataframe()["direction_y"])
+        [0.0, 1.0]
+        """
+        return _in_memory().to_dataframe(self, library)
+
+    def to_arrow(self) -> Any:
+        """Return a ``pyarrow.Table`` with the columns of `to_dataframe`. Raises `NergError` without pyarrow."""
+        return self.to_dataframe("pyarrow")
+
+    def filter(self, **options: Any) -> Rays:
+        """Select rays by conditions, detect fixations, and thin out stationary periods.
+
+        Parameters
+        ----------
+        **options
+            Options of ``nerg rays filter`` (`nerg_mi.filter_rays`), such as ``persons=["Ada"]``, ``start=10``,
+            ``box=(x0, x1, y0, y1, z0, z1)``, ``fixations="ivt"`` or ``thin=2``.
+
+        Returns
+        -------
+        Rays
+            The selected rays; the steps are recorded in their metadata.
+
+        Raises
+        ------
+        NergError
+            An option is invalid, or no ray is selected.
+
+        Examples
+        --------
+        >>> import nerg_mi as nerg
+        >>> rays = nerg.Rays.from_arrays([[1, 1, 1.6]] * 3, [[1, 0, 0]] * 3, times=[0, 1, 2], participants=list("aab"))
+        >>> rays.filter(start=0.5, persons=["a"])
+        <Rays: 1 of 1 participant, t 1 to 1 s>
+        """
+        import nerg_mi
+
+        return nerg_mi.filter_rays(self, **options)
+
     def columns(self) -> dict[str, np.ndarray]:
         """Arrays with one row per ray, by name, without absent ones."""
         return {name: column for name in COLUMNS if (column := getattr(self, name)) is not None}
 
-    def select(self, selection: np.ndarray) -> Rays:
+    def select(self, selection: np.ndarray | slice) -> Rays:
         """Select rays by a boolean mask (N,) or an index array. Keeps persons and metadata, so that codes and
         provenance remain comparable."""
         return replace(self, **{name: column[selection] for name, column in self.columns().items()})
@@ -493,6 +694,11 @@ class Rays:
             raise NergError(
                 f"\"{path}\" is damaged ({reason}); copy it again, or create it again with 'nerg rays import'"
             ) from error
+
+
+def _in_memory() -> Any:
+    """Return `nerg_mi.rays.in_memory`, which builds on this module and is therefore only imported when it is used."""
+    return import_module("nerg_mi.rays.in_memory")
 
 
 def _to_floats(values: ArrayLike, name: str, dtype: type[np.floating[Any]]) -> np.ndarray:

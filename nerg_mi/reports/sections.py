@@ -14,10 +14,11 @@ from typing import Any
 from nerg_mi import __version__
 from nerg_mi.evaluation.baselines import PRIOR
 from nerg_mi.evaluation.gaze_report import SPLIT_HALF, SPLIT_LABELS, Comparison, GazeResults, Verdict
+from nerg_mi.files.html import Html, element, figure, image, key_value_table, markup, paragraph, table
 from nerg_mi.rays.quality import WARNING_LABEL, make_quality_report
 
+from .charts import Point, interval_chart
 from .data import MeanShare, ObjectAttention, Run
-from .html import Html, Point, element, figure, image, interval_chart, key_value_table, markup, paragraph, table
 
 # ---- Section ----
 

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 import tempfile
 import threading
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+from nerg_mi.api.calls import Progress, report_progress
+from nerg_mi.api.gaze import list_inputs
+from nerg_mi.api.objects import as_file, build_options
+from nerg_mi.files.html import element
 from nerg_mi.workflows.base import SILENT, Reporter
 from nerg_mi.workflows.scene_commands import ViewOptions
 from nerg_mi.workflows.view import make_viewer_scene
@@ -88,6 +94,81 @@ def open_viewer(
             yield RunningViewer(f"http://{host}:{server.get_port()}/{query}", page)
         finally:
             page.close()
+
+
+class Viewer:
+    """A viewer in the background, of `view`: it serves its page until `close`, or the end of the process.
+
+    Attributes
+    ----------
+    address : str
+        URL to open in a browser.
+    """
+
+    def __init__(self, running: AbstractContextManager[RunningViewer]) -> None:
+        self._running = running
+        self.address = running.__enter__().address
+        atexit.register(self.close)
+
+    def close(self) -> None:
+        """Stop serving the page."""
+        atexit.unregister(self.close)
+        running, self._running = self._running, None
+        if running is not None:
+            running.__exit__(None, None, None)
+
+    def __enter__(self) -> Viewer:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        return f"<Viewer: {'closed' if self._running is None else self.address}>"
+
+    def _repr_html_(self) -> str:
+        # Pages of the viewer refuse to be shown within another page.
+        return element("a", f"Viewer at {self.address}", href=self.address, target="_blank", rel="noopener")
+
+
+def view(inputs: object, *, options: ViewOptions | None = None, progress: Progress = None, **overrides: Any) -> Viewer:
+    """Show a scene with its gaze in the browser, with a movable observer.
+
+    The page is served in the background, to this machine only unless ``host`` is set.
+
+    Parameters
+    ----------
+    inputs : object or sequence of these
+        A scene, or an environment, a gaze field and recordings, in memory or as files, in any order.
+    options : ViewOptions, optional
+        Base options (`nerg_mi.workflows.scene_commands.ViewOptions`).
+    progress : bool, Reporter or None
+        None shows a progress bar in notebooks, True shows one anywhere, False none; a `Reporter` receives everything.
+    **overrides
+        Single options on top of ``options``, such as ``port=0`` or ``observer=(4.4, 2.8, 1.6)``.
+
+    Returns
+    -------
+    Viewer
+        The viewer: its ``address``, which a notebook shows as a link, and its method ``close``.
+
+    Raises
+    ------
+    NergError
+        The inputs cannot be shown, the port is in use, or viser is not installed.
+
+    Examples
+    --------
+    >>> import nerg_mi as nerg
+    >>> from importlib.resources import files
+    >>> with nerg.view(files("nerg_mi.scenes.store") / "scene.xml", port=0) as viewer:
+    ...     viewer.address.startswith("http://127.0.0.1:")
+    True
+    """
+    with report_progress(progress, ViewOptions) as reporter:
+        resolved = build_options(ViewOptions, "view", options, overrides)
+        paths = [as_file(item, "inputs") for item in list_inputs(inputs)]
+        return Viewer(open_viewer(paths, resolved, reporter))
 
 
 def view_files(files: Sequence[str | Path], options: ViewOptions | None = None, reporter: Reporter = SILENT) -> None:

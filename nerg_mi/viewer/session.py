@@ -12,8 +12,9 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
+from nerg_mi.api.fields import activate_mitsuba
 from nerg_mi.api.query import compute_box_shares, compute_mesh_shares, trace
-from nerg_mi.api.scene import COLOR, Scene, activate_mitsuba
+from nerg_mi.api.scene import COLOR, Scene
 from nerg_mi.errors import NergError, translate_mitsuba_errors
 from nerg_mi.formats.areas import AreaSet, Region, read_areas
 from nerg_mi.maths.geometry import Similarity

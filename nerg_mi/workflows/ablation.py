@@ -23,6 +23,7 @@ from nerg_mi.evaluation.baselines import Baseline
 from nerg_mi.evaluation.gaze import FieldDensity, GazeTest, select_held_out_rays
 from nerg_mi.figures.style import existing_files, make_provenance
 from nerg_mi.files.atomic import check_folder, replace_atomically
+from nerg_mi.files.dataframes import ResultTables
 from nerg_mi.files.safe_read import read_json
 from nerg_mi.files.tables import write_json
 from nerg_mi.formats.fields import save_gaze
@@ -154,9 +155,11 @@ def load_ground_truth(name: str) -> Baseline:
 _FIELD, _ROW = "gaze.safetensors", "row.json"
 
 
-@dataclass(frozen=True)
-class AblationResult:
+@dataclass(frozen=True, repr=False)
+class AblationResult(ResultTables):
     """Scores of all variants."""
+
+    TABLES = ("rows",)
 
     # One row per variant and seed (`evaluation.ablation.COLUMNS`).
     rows: list[dict]

@@ -33,6 +33,7 @@ from nerg_mi.evaluation.uncertainty import (
 from nerg_mi.fields.gaze_base import AnyGazeField
 from nerg_mi.figures.style import existing_files, make_provenance
 from nerg_mi.files.atomic import check_folder, file_sha256, write_text
+from nerg_mi.files.dataframes import ResultTables
 from nerg_mi.files.safe_read import read_json
 from nerg_mi.files.tables import write_csv, write_json
 from nerg_mi.formats.fields import load_gaze
@@ -66,9 +67,11 @@ _CALIBRATED = (_FIELD, PRIOR_BASELINE, NEAREST_RAYS)
 _PRINTED = tuple(score for score in SCORES if score not in ("SIM", "MAE", "loglik"))
 
 
-@dataclass(frozen=True)
-class GazeEvaluation:
+@dataclass(frozen=True, repr=False)
+class GazeEvaluation(ResultTables):
     """Scores of a gaze field."""
+
+    TABLES = ("rows", "persons", "by_position", "uncertainty", "calibration")
 
     # One row per method, the gaze field first; scores of `gaze.SCORES`, confidence limits with ".low" and ".high".
     rows: list[dict]
@@ -299,8 +302,8 @@ _FOLD_RESAMPLES = 100  # Resamples of the participants of a fold, for the interv
 _LEVELS = tuple(format_level(level) for level in REGION_LEVELS)
 
 
-@dataclass(frozen=True)
-class FoldResult:
+@dataclass(frozen=True, repr=False)
+class FoldResult(ResultTables):
     """Result of a cross-validation.
 
     Attributes
@@ -320,6 +323,8 @@ class FoldResult:
     calibration
         One row per split and method: means over folds.
     """
+
+    TABLES = ("rows", "each", "by_position", "uncertainty", "calibration")
 
     rows: list[dict[str, Any]]
     each: list[dict[str, Any]]

@@ -29,6 +29,7 @@ from nerg_mi.evaluation.next_look import (
     score_next_look,
 )
 from nerg_mi.files.atomic import check_folder, file_sha256, write_text
+from nerg_mi.files.dataframes import ResultTables
 from nerg_mi.files.tables import write_csv, write_json
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.maths.sphere import fibonacci_directions
@@ -51,9 +52,11 @@ _MIN_LOOKS = 16  # per elapsed time
 _COLUMNS = ("elapsed", "method", "looks", "bits", "gap")
 
 
-@dataclass(frozen=True)
-class NextLookEvaluation:
+@dataclass(frozen=True, repr=False)
+class NextLookEvaluation(ResultTables):
     """A fitted model of the next look, and its scores."""
+
+    TABLES = ("rows",)
 
     model: NextLook
     # One row for each elapsed time and method (`evaluation.next_look.score_next_look`).

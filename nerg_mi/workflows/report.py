@@ -20,6 +20,7 @@ from nerg_mi.figures.sphere import sphere_figure
 from nerg_mi.figures.style import Provenance, encode
 from nerg_mi.figures.style import versions as programs
 from nerg_mi.files.atomic import check_writable, file_sha256, write_text
+from nerg_mi.files.html import element
 from nerg_mi.files.images import encode_png
 from nerg_mi.files.safe_read import resolve_path
 from nerg_mi.formats.areas import AreaSet, Region, read_areas
@@ -455,6 +456,10 @@ class ReportResult:
 
     path: Path
     run: Run
+
+    def _repr_html_(self) -> str:
+        """The report in a frame, for notebooks."""
+        return element("iframe", srcdoc=render_page(self.run), width="100%", height=800)
 
 
 def make_report(

@@ -17,6 +17,7 @@ from nerg_mi.evaluation.study import StudyRow, list_rows
 from nerg_mi.evaluation.study_subject import ExactSurfaces, FileSubject, StudySubject, open_subject
 from nerg_mi.figures.style import Provenance, existing_files, make_provenance
 from nerg_mi.files.atomic import check_folder
+from nerg_mi.files.dataframes import ResultTables
 from nerg_mi.files.safe_read import read_json
 from nerg_mi.files.tables import write_json
 from nerg_mi.rendering.scene import activate_variant, list_scene_files
@@ -37,12 +38,19 @@ _TWIN = "twin.xml"
 _PROCESS = uuid.uuid4().hex
 
 
-@dataclass(frozen=True)
-class StudyResult:
+@dataclass(frozen=True, repr=False)
+class StudyResult(ResultTables):
     """Written ``files``; ``report``, the content of study.json, with ``rows`` and ``against_paper``."""
+
+    TABLES = ("rows",)
 
     files: list[Path]
     report: dict
+
+    @property
+    def rows(self) -> list[dict]:
+        """One row per setting: errors and run times."""
+        return self.report["rows"]
 
 
 def run_study(

@@ -166,6 +166,7 @@ def train_gaze(
     output: str | Path | None = None,
     options: GazeOptions | None = None,
     reporter: Reporter = SILENT,
+    volume: Path | None = None,
 ) -> GazeResult:
     """Train a gaze field.
 
@@ -180,6 +181,8 @@ def train_gaze(
         Geometry, recipe and settings.
     reporter
         Receives messages and progress.
+    volume
+        File for a geometry of hit points, if it is not stored next to ``output``.
 
     Raises
     ------
@@ -190,15 +193,17 @@ def train_gaze(
         returned with ``interrupted`` set.
     """
     with reserve_output(output):
-        return _train(rays, None if output is None else Path(output), options or GazeOptions(), reporter)
+        return _train(rays, None if output is None else Path(output), options or GazeOptions(), reporter, volume)
 
 
-def _train(rays: Rays | str | Path | None, output: Path | None, options: GazeOptions, reporter: Reporter) -> GazeResult:
+def _train(
+    rays: Rays | str | Path | None, output: Path | None, options: GazeOptions, reporter: Reporter, volume: Path | None
+) -> GazeResult:
     probes = check_plan(options, views_alone=rays is None)
     state = None if output is None else output.with_suffix(".run")
     if output is not None and state is not None:
         _check_outputs(options, output, state)
-    elif options.resume or options.geometry == "hits":
+    elif options.resume or (options.geometry == "hits" and volume is None):
         raise NergError("--resume and --geometry hits need an output file for the gaze field: give one")
     ns = select_backend(options.mode, options.threads)
     if options.resume and not options.ensemble and (state is None or not state.is_file()):
@@ -207,7 +212,7 @@ def _train(rays: Rays | str | Path | None, output: Path | None, options: GazeOpt
     if not isinstance(rays, Rays):
         reporter.progress(0.0, "reading rays")
     supervision, metadata = _supervision(rays, options, probes, align, reporter)
-    volume = None if output is None else output.with_suffix(".vol")
+    volume = volume or (None if output is None else output.with_suffix(".vol"))
     place = make_geometry(options, supervision.rays, supervision.views, volume, ns, options.voxel_size, reporter)
     place = replace(place, align=align)
     check_geometry(place, supervision.rays, _place_option(options), options.force, reporter)

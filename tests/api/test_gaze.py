@@ -150,8 +150,8 @@ def test07_missing_geometry_is_an_error_that_names_the_option(folder, tmp_path):
 def test08_other_objects_are_no_geometry(folder):
     gaze, (o, d) = nerg.load_gaze(folder / "gaze.safetensors"), some_rays(2)
     for geometry, message in (
-        (3, "must be a file, a Scene or a radiance field .*, got int"),
-        (gaze, "must be a file, a Scene or a radiance field .*, got TrainedGazeField"),
+        (3, "must be an environment in memory or a file, .*, got int"),
+        (gaze, "contains a gaze field; give a scene, a mesh"),
         (folder / "gaze.safetensors", "contains a gaze field; give a scene, a mesh"),
         (folder / "nowhere.ply", '"geometry" does not exist'),
     ):
@@ -181,9 +181,9 @@ def test10_another_geometry_is_reported(folder):
 
     gaze, (o, d) = nerg.load_gaze(folder / "gaze.safetensors"), some_rays(2)
     listener = Listener()
-    gaze.density(o, d, geometry=folder / "room.xml", reporter=listener)
+    gaze.density(o, d, geometry=folder / "room.xml", progress=listener)
     assert not listener.warnings and listener.shares == [(1.0, "observer 2 of 2")]
-    gaze.density(o, d, geometry=folder / "block.ply", reporter=listener)
+    gaze.density(o, d, geometry=folder / "block.ply", progress=listener)
     assert len(listener.warnings) == 1 and "was not trained in" in listener.warnings[0]
 
 

@@ -15,7 +15,7 @@ import pytest
 
 import nerg_mi as nerg
 from nerg_mi.api.arrays import LabelledArrays, as_points, as_unit_vectors, broadcast_to_observers
-from nerg_mi.api.scene import activate_mitsuba, get_array_module
+from nerg_mi.api.fields import activate_mitsuba, get_array_module
 from nerg_mi.errors import NergError
 
 # ---- The names at the top of the package ----
@@ -47,7 +47,7 @@ def test02_importing_loads_nothing_heavy_and_no_module_of_the_api():
 def test03_a_name_loads_its_module_and_not_the_others():
     loaded = run("import nerg_mi as nerg, sys; nerg.Camera; print(*sys.modules)").split()
     assert "nerg_mi.api.arrays" in loaded
-    assert not {"nerg_mi.api.scene", "nerg_mi.api.workflows", "mitsuba", "matplotlib"} & set(loaded)
+    assert not {"nerg_mi.api.scene", "nerg_mi.api.analysis", "mitsuba", "matplotlib"} & set(loaded)
 
 
 def test04_unknown_names_are_attribute_errors():
@@ -127,7 +127,7 @@ def test07_examples_run(name, tmp_path, request):
 
 def test01_default_variant_is_set():
     code = "import nerg_mi as nerg, mitsuba as mi; nerg.Scene; print(mi.variant()); "
-    code += "from nerg_mi.api.scene import activate_mitsuba; print(activate_mitsuba().variant())"
+    code += "from nerg_mi.api.fields import activate_mitsuba; print(activate_mitsuba().variant())"
     before, after = run(code).split()
     assert before == "None" and after in ("cuda_ad_rgb", "llvm_ad_rgb")
 

@@ -124,7 +124,7 @@ def test09_progress_is_reported(scene):
         def progress(self, share, text=""):
             messages.append(share)
 
-    nerg.render(scene, EYES, spp=1, reporter=Reporter())
+    nerg.render(scene, EYES, spp=1, progress=Reporter())
     assert messages == sorted(messages) and messages[-1] == 1
 
 

@@ -163,7 +163,7 @@ def test08_progress_is_reported(empty):
         def progress(self, share, text=""):
             messages.append(share)
 
-    nerg.attention(empty, box_dict(*np.array(BOX)), [(0, 0, 0), (0.1, 0, 0)], reporter=Reporter())
+    nerg.attention(empty, box_dict(*np.array(BOX)), [(0, 0, 0), (0.1, 0, 0)], progress=Reporter())
     assert messages == [0.5, 1.0]
 
 
@@ -445,5 +445,5 @@ def test_progress_is_reported_for_integrals_of_all_origins(tmp_path, rgb, normal
     fields.gaze(tmp_path / "gaze.safetensors", normalized=normalized)
     scene = nerg.make_scene(gaze=tmp_path / "gaze.safetensors", shapes=BALL)
     messages = Recorder()
-    nerg.trace(scene, [(0, -3, 0), (0, 3, 0), (0, -3, 0)], (0, 1, 0), "gaze", reporter=messages)
+    nerg.trace(scene, [(0, -3, 0), (0, 3, 0), (0, -3, 0)], (0, 1, 0), "gaze", progress=messages)
     assert [share for share, _ in messages.steps] == expected

@@ -7,8 +7,11 @@ import numpy as np
 import pytest
 
 import nerg_mi as nerg
-from nerg_mi.api.scene import TrainedField, build_options, load_mesh_child, resolve_quantities, to_scene_children
-from nerg_mi.api.workflows import bake, stats
+from nerg_mi.api.analysis import bake, statistics
+from nerg_mi.api.contents import load_content, load_mesh_child, to_scene_children
+from nerg_mi.api.fields import TrainedField
+from nerg_mi.api.objects import build_options
+from nerg_mi.api.scene import resolve_quantities
 from nerg_mi.errors import NergError
 from nerg_mi.formats.surfaces import write_volume
 from tests.formats.splats.writers import random_splats, write_inria
@@ -99,10 +102,6 @@ def test04_files_may_be_named_by_strings(rgb):
     assert build_options(Options, "job", None, {"store": "to be made"}).store == Path("to be made")
 
 
-def cube():
-    return nerg.make_scene(shapes={"type": "cube"})
-
-
 CALLS = [
     (lambda: nerg.train_gaze("no.npz", scene="no.xml", test_particpants=0.3), 'did you mean "test_participants"'),
     (lambda: nerg.train_gaze("no.npz", scene="no.xml", test_people=0.3), 'file "no.xml" of "scene" does not exist'),
@@ -111,24 +110,24 @@ CALLS = [
         lambda: nerg.train_gaze(np.zeros(3), geometry="none"),
         "rays must be a Rays object .* got ndarray; use import_rays",
     ),
-    (lambda: nerg.train_gaze(None, scene=cube()), '"scene" must be a file, .* got Scene'),
+    (lambda: nerg.train_gaze(None, scene=3), '"scene" must be an environment in memory or a file, .* got int'),
     (lambda: nerg.train_radiance(None), '"photos" must be a file, given as a string or a path, got NoneType'),
     (lambda: nerg.train_radiance("no"), 'file "no" of "photos" does not exist'),
     (lambda: nerg.evaluate_gaze("no.safetensors", "no.npz"), "no.npz"),
-    (lambda: nerg.evaluate_radiance(3, "."), '"field" must be a file, .* got int'),
+    (lambda: nerg.evaluate_radiance(3, "."), '"field" must be .* a file, .* got int'),
     (lambda: nerg.ablate("no.npz", "new", geometry="none"), "no.npz"),
     (lambda: nerg.align("no.npz", scene="no.xml"), "no.xml"),
-    (lambda: nerg.study(cube(), "new"), '"scene" must be a file, .* got Scene'),
-    (lambda: nerg.import_rays(np.zeros(3)), r"reads files, .* got ndarray; write a table to a file \(df.to_csv"),
+    (lambda: nerg.study(3, "new"), '"scene" must be .* a file, .* got int'),
+    (lambda: nerg.import_rays(np.zeros(3)), "reads files, .* got ndarray; use Rays.from_dataframe"),
     (lambda: nerg.import_rays("no.csv", colums="t=t"), 'has no option "colums"; did you mean "columns"'),
     (lambda: nerg.import_rays(["no.csv"], "unity"), 'file "no.csv" of "files" does not exist'),
     (lambda: nerg.make_scene("no.safetensors", falof=0.1), 'no setting "falof"; did you mean "falloff"?'),
-    (lambda: nerg.make_scene("no.safetensors"), '^the file "no.safetensors" of "field" does not exist'),
+    (lambda: nerg.make_scene("no.safetensors"), '^the file "no.safetensors" of "environment" does not exist'),
     (lambda: nerg.render("no.xml"), 'there is no scene file "no.xml"'),
     (lambda: nerg.render(None), "a scene must be a Scene.* got NoneType"),
     (lambda: nerg.trace(3, [0, 0, 0], [1, 0, 0]), "a scene must be a Scene.* got int"),
     (lambda: bake("no.ply", gaze="no.safetensors"), "no.safetensors"),
-    (lambda: stats("no.npz", "no.json"), "no.json"),
+    (lambda: statistics("no.npz", "no.json"), "no.json"),
 ]
 
 
@@ -274,8 +273,9 @@ def test06_a_volume_in_place_of_a_field():
     "arguments, said",
     [
         ({}, "make_scene"),
-        ({"field": "nowhere.safetensors"}, 'file "nowhere.safetensors" of "field" does not exist'),
-        ({"field": 3}, "radiance field in memory"),
+        ({"environment": "nowhere.safetensors"}, 'file "nowhere.safetensors" of "environment" does not exist'),
+        ({"environment": 3}, "got int"),
+        ({"field": "nowhere.safetensors"}, "environment"),
         ({"shapes": "x.stl"}, '"x.stl" is not a supported mesh'),
         ({"shapes": "x.ply"}, 'there is no mesh "x.ply"'),
         ({"shapes": 3}, "shapes must be mesh files"),
@@ -285,7 +285,7 @@ def test06_a_volume_in_place_of_a_field():
         ({"shapes": BALL, "observer": [(0, 0, 1), (0, 0, 2)]}, "a scene has a single observer"),
         ({"shapes": BALL, "gaze": "GAZE", "to_world": np.diag([1, 2, 1, 1])}, '"to_world"'),
         ({"shapes": BALL, "gaze": "GAZE", "to_world": np.eye(3)}, '"to_world".*4.*4'),
-        ({"field": "GAZE"}, "contains a gaze field"),
+        ({"environment": "GAZE"}, "contains a gaze field"),
     ],
 )
 def test07_errors_are_sentences(files, arguments, said):
@@ -300,7 +300,7 @@ def test07_errors_are_sentences(files, arguments, said):
 
 def test08_wrong_kinds_are_refused(files):
     field, gaze = nerg.load_field(files / "field.safetensors"), nerg.load_gaze(files / "gaze.safetensors")
-    with pytest.raises(nerg.NergError, match="radiance field in memory"):
+    with pytest.raises(nerg.NergError, match="pass it with gaze="):
         nerg.make_scene(gaze)
     with pytest.raises(nerg.NergError, match="gaze field in memory"):
         nerg.make_scene(field, field)
@@ -430,7 +430,7 @@ def test04_files_are_checked_first(rgb, tmp_path):
         load_mesh_child(path)
     # Mitsuba does not read quads; mesh arguments support them, with the material of other meshes.
     (tmp_path / "quad.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf -4 -3 -2 -1\n")
-    shape = rgb.load_dict({"type": "scene", **to_scene_children(tmp_path / "quad.obj", "quad")}).shapes()[0]
+    shape = load_content({"type": "scene", **to_scene_children(tmp_path / "quad.obj", "quad")}).shapes()[0]
     assert shape.face_count() == 2 and shape.id() == "quad" and shape.bsdf().class_name() == "TwoSidedBRDF"
     (tmp_path / "empty.obj").write_text("v 0 0 0\n")
     with pytest.raises(NergError, match="empty.obj"):
@@ -450,10 +450,10 @@ def test_colours_of_files_are_used_and_other_content_is_reported(rgb, monkeypatc
     notes = []
     monkeypatch.setattr(rgb, "Log", lambda level, note: notes.append(note))
     child = load_mesh_child(tmp_path / name)
-    shape = child if isinstance(child, rgb.Mesh) else rgb.load_dict(child)
     (note,) = notes
     assert said in note and str(tmp_path / name) in note
-    si = rgb.load_dict({"type": "scene", "a": shape}).ray_intersect(rgb.Ray3f((0.2, 0.2, 1), (0, 0, -1)))
+    scene = load_content({"type": "scene", "a": child})
+    si = scene.ray_intersect(rgb.Ray3f((0.2, 0.2, 1), (0, 0, -1)))
     assert np.allclose(np.ravel(si.bsdf().eval_diffuse_reflectance(si)), (1, 0, 0), atol=1e-4)
 
 
@@ -483,5 +483,5 @@ def test02_other_volumes_are_refused(rgb, tmp_path):
     write_volume(tmp_path / "color.vol", np.zeros((2, 2, 2, 3)), (0, 0, 0), (1, 1, 1))
     with pytest.raises(nerg.NergError, match="not a volume of hit points"):
         nerg.make_scene(tmp_path / "color.vol")
-    with pytest.raises(nerg.NergError, match='file ".*no.vol" of "field" does not exist'):
+    with pytest.raises(nerg.NergError, match='file ".*no.vol" of "environment" does not exist'):
         nerg.make_scene(tmp_path / "no.vol")

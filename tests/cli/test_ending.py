@@ -10,11 +10,12 @@ import time
 
 import pytest
 
-from nerg_mi.cli import main, progress
+from nerg_mi.cli import main
 from nerg_mi.cli.ending import INTERNAL_ERROR, INTERRUPTED, USER_ERROR, CtrlC, exit_code, open_streams, shorten_values
-from nerg_mi.cli.progress import TerminalReporter
 from nerg_mi.errors import NergError
 from nerg_mi.formats.checkpoint import read_checkpoint
+from nerg_mi.workflows import progress
+from nerg_mi.workflows.progress import TerminalReporter
 
 
 def test_user_errors_and_internal_errors_have_exit_codes():

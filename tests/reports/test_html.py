@@ -13,8 +13,8 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from nerg_mi.reports import html
-from nerg_mi.reports.html import Point, interval_chart, nice_ticks
+from nerg_mi.files import html
+from nerg_mi.reports.charts import Point, interval_chart, nice_ticks
 from nerg_mi.reports.sections import SECTIONS, SETTINGS, render_page
 from tests.reports.made import HOSTILE, PNG, full_run, minimal_run, packed_scene
 

@@ -1,11 +1,17 @@
-"""Messages, warnings and progress of a workflow on the terminal, or as lines in a log."""
+"""Messages, warnings and progress of a workflow: on the terminal, as lines in a log, in a notebook, or as warnings."""
 
 from __future__ import annotations
 
 import sys
 import threading
 import time
-from typing import TYPE_CHECKING
+import warnings
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from nerg_mi.files.html import element, markup
+
+from .base import SilentReporter
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -27,7 +33,7 @@ class TerminalReporter:
     """
 
     def __enter__(self) -> TerminalReporter:
-        self._bar: Progress | None = None
+        self._bar: Any = None
         self._lock = threading.Lock()
         self._printed = time.monotonic()
         self._begun: float | None = None
@@ -56,10 +62,14 @@ class TerminalReporter:
             self._counted = time.monotonic()
         self._now = (fraction, text)
         if self._bar is not None:
-            (task,) = self._bar.task_ids
-            self._bar.update(task, completed=fraction, description=self.line())
+            self._show(fraction)
         else:
             self.log_when_due()
+
+    def _show(self, fraction: float) -> None:
+        """Update the progress bar."""
+        (task,) = self._bar.task_ids
+        self._bar.update(task, completed=fraction, description=self.line())
 
     def line(self) -> str:
         """Return the current step with the remaining or elapsed time."""
@@ -118,6 +128,77 @@ class TerminalReporter:
             self._bar.stop()
         if self._pulse is not None:
             self._pulse.join()
+
+
+class NotebookReporter(TerminalReporter):
+    """A `TerminalReporter` that uses one output of the notebook cell: a progress bar, and then the messages, folded.
+
+    A call of less than `SHORTEST` seconds without messages has no output. Warnings go to the standard error.
+    """
+
+    SHORTEST = 0.5
+
+    def __enter__(self) -> NotebookReporter:
+        super().__enter__()
+        self._messages: list[str] = []
+        self._shown = 0.0
+        return self
+
+    def progress(self, fraction: float, text: str = "") -> None:
+        if self._bar is not None or time.monotonic() - self._counted >= self.SHORTEST or self._begun is not None:
+            super().progress(fraction, text)
+
+    def message(self, text: str) -> None:
+        self._messages.append(text)
+
+    def _start(self) -> Any:
+        module: Any = import_module("IPython.display")  # exists where there is a notebook
+        self._make_html = module.HTML
+        return module.display(self._make_html(""), display_id=True)
+
+    def _show(self, fraction: float) -> None:
+        now = time.monotonic()
+        # Every update is a message to the browser.
+        if now - self._shown < 0.2 and fraction < 1:
+            return
+        self._shown = now
+        bar = element("progress", max=1, value=f"{fraction:.4f}")
+        self._bar.update(self._make_html(markup([bar, f" {fraction:.0%} {self.line()}"])))
+
+    def _print(self, text: str, stream) -> None:
+        print(text, file=stream, flush=True)
+
+    def __exit__(self, *error) -> None:
+        self._ended.set()
+        lines = [[text, element("br")] for text in self._messages]
+        content = element("details", element("summary", "Messages"), lines) if lines else ""
+        if self._bar is None and content:
+            self._bar = self._start()
+        if self._bar is not None:
+            self._bar.update(self._make_html(content))
+
+
+class WarningReporter(SilentReporter):
+    """A reporter that is silent except for warnings, which become those of Python (`warnings`)."""
+
+    def __enter__(self) -> WarningReporter:
+        return self
+
+    def __exit__(self, *error) -> None:
+        pass
+
+    def warn(self, text: str) -> None:
+        # Attributed to the code that called the library.
+        level, frame = 1, sys._getframe()
+        while frame.f_back is not None and str(frame.f_globals.get("__name__")).startswith("nerg_mi"):
+            level, frame = level + 1, frame.f_back
+        warnings.warn(text, UserWarning, stacklevel=level)
+
+
+def is_notebook() -> bool:
+    """Return whether the code runs in a notebook, which shows HTML."""
+    shell = sys.modules["IPython"].get_ipython() if "IPython" in sys.modules else None
+    return shell is not None and hasattr(shell, "kernel")
 
 
 def duration(seconds: float) -> str:

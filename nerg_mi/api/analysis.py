@@ -1,0 +1,523 @@
+"""Attention on areas and surfaces, reports, figures, scene files, the viewer, and exports."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from uuid import uuid4
+
+from nerg_mi.aoi.options import StatisticsOptions
+from nerg_mi.errors import NergError
+from nerg_mi.rays.rays import Rays
+from nerg_mi.workflows.radiance_commands import (
+    CheckpointImportOptions,
+    MeshOptions,
+    PointOptions,
+    PoseOptions,
+    SplatOptions,
+    TorchNgpOptions,
+    VolumeOptions,
+)
+from nerg_mi.workflows.scene_commands import BakeOptions, FilmOptions, ReportOptions, SceneOptions
+
+from .arguments import resolve_file
+from .calls import Progress, report_progress
+from .fields import FilePath, TrainedField
+from .gaze import TrainedGazeField, list_inputs
+from .objects import as_file, as_scene_file, build_options, copy_from_session, session_folder
+from .scene import Environment, Scene, make_scene
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from nerg_mi.aoi.output import StatisticsResult
+    from nerg_mi.fields.radiance import RadianceField
+    from nerg_mi.workflows.bake import Bake
+    from nerg_mi.workflows.bake_splats import SplatBake
+    from nerg_mi.workflows.export import Export
+    from nerg_mi.workflows.poses import PosesResult
+    from nerg_mi.workflows.report import ReportResult
+
+
+def statistics(
+    inputs: object, areas: object = None, *, output: FilePath | None = None, progress: Progress = None, **options: Any
+) -> StatisticsResult:
+    """Compute attention statistics of areas of interest, from recordings and as predicted by a gaze field.
+
+    Parameters
+    ----------
+    inputs : object or sequence of these
+        Recordings (`Rays`, a file or a dataset), an environment (`nerg_mi.api.scene.Environment`) and a gaze field, in
+        memory or as files, in any order. A gaze field in memory knows the environment of its training.
+    areas : mapping or path, optional
+        Areas of interest by name: boxes (two corners), meshes of trimesh, or dicts as in a file of areas; or such a
+        JSON file (docs/how-to/statistics.md).
+    output : path, optional
+        Folder for the tables.
+    progress : bool, Reporter or None
+        None shows a progress bar in notebooks, True shows one anywhere, False none; a `Reporter` receives everything.
+    **options
+        Options of `nerg stats` (`nerg_mi.aoi.options.StatisticsOptions`), such as ``resamples=200`` or ``align``.
+
+    Returns
+    -------
+    StatisticsResult
+        Tables as lists of dicts; ``to_dataframe`` returns them as data frames.
+
+    Raises
+    ------
+    NergError
+        An option or a file is invalid.
+
+    Examples
+    --------
+    >>> import nerg_mi as nerg
+    >>> eye, ahead = [[0.0, 0.0, 1.6]] * 3, [[1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
+    >>> rays = nerg.Rays.from_arrays(eye, ahead, times=[0.0, 0.2, 0.4])
+    >>> row = nerg.statistics(rays, {"shelf": [[2, -1, 0], [3, 1, 2]]}).aois[0]
+    >>> row["aoi"], round(row["share"], 3), row["hit_ratio"], row["distance"]
+    ('shelf', 0.667, 1.0, 2.0)
+    """
+    from nerg_mi.workflows.statistics import statistics as compute
+
+    if areas is not None:
+        options["aois"] = areas
+    with report_progress(progress, StatisticsOptions) as reporter:
+        resolved = build_options(StatisticsOptions, "statistics", None, options)
+        files = [item if isinstance(item, Rays) else as_scene_file(item, "inputs") for item in list_inputs(inputs)]
+        return compute(files, None if output is None else Path(output), resolved, reporter)
+
+
+def bake(
+    surface: Environment,
+    outputs: FilePath | Sequence[FilePath] = (),
+    *,
+    rays: Rays | FilePath | None = None,
+    options: BakeOptions | None = None,
+    progress: Progress = None,
+    **overrides: Any,
+) -> Bake | SplatBake:
+    """Compute the attention per area on a surface.
+
+    Parameters
+    ----------
+    surface : Environment
+        A mesh, a scene, a radiance field or Gaussian splats, in memory or as a file.
+    outputs : path or sequence of path
+        Files to write (.ply, .glb, .csv, .json).
+    rays : Rays or path, optional
+        Recordings. With a gaze field they provide the positions of the observers; otherwise they are the gaze to bake.
+    options : BakeOptions, optional
+        Base options (`nerg_mi.workflows.scene_commands.BakeOptions`).
+    progress : bool, Reporter or None
+        None shows a progress bar in notebooks, True shows one anywhere, False none; a `Reporter` receives everything.
+    **overrides
+        Single options on top of ``options``, such as ``gaze`` (a field in memory or a file),
+        ``observer=(4.4, 2.8, 1.6)`` or ``smooth=0.05``.
+
+    Returns
+    -------
+    Bake or SplatBake
+        Attention per square metre and its sums.
+
+    Raises
+    ------
+    NergError
+        An option or a file is invalid.
+
+    Examples
+    --------
+    >>> import nerg_mi as nerg
+    >>> from importlib.resources import files
+    >>> store = files("nerg_mi.scenes.store")
+    >>> gaze = store / "shoppers.safetensors"
+    >>> baked = nerg.bake(store / "twin.ply", gaze=gaze, observer=(4.4, 2.8, 1.6), max_edge=1.0)
+    >>> 0.9 < baked.on_surface < 1, abs(baked.unaccounted) < 0.01
+    (True, True)
+    """
+    from nerg_mi.workflows import bake as baking
+
+    in_memory = rays if isinstance(rays, Rays) else None
+    if rays is not None and in_memory is None:
+        overrides = {**overrides, "rays": rays}
+    files = [outputs] if isinstance(outputs, (str, Path)) or not isinstance(outputs, Sequence) else list(outputs)
+    with report_progress(progress, BakeOptions) as reporter:
+        resolved = build_options(BakeOptions, "bake", options, overrides)
+        surface_file, paths = as_file(surface, "surface"), [Path(str(file)) for file in files]
+        return baking.bake_any(surface_file, paths, resolved, reporter, in_memory)
+
+
+def report(
+    inputs: object,
+    output: FilePath | None = None,
+    *,
+    options: ReportOptions | None = None,
+    progress: Progress = None,
+    **overrides: Any,
+) -> ReportResult:
+    """Write a report on a gaze field: one HTML file with verdict, figures, scores and a 3D view.
+
+    Parameters
+    ----------
+    inputs : object or sequence of these
+        The gaze field and, in any order, recordings, its environment, in memory or as files, and folders of
+        evaluations. A gaze field in memory knows the environment of its training.
+    output : path, optional
+        File to write (.html). Default: a temporary file, which is removed when the process ends.
+    options : ReportOptions, optional
+        Base options (`nerg_mi.workflows.scene_commands.ReportOptions`).
+    progress : bool, Reporter or None
+        None shows a progress bar in notebooks, True shows one anywhere, False none; a `Reporter` receives everything.
+    **overrides
+        Single options on top of ``options``, such as ``evaluate=True``, ``title="Store"`` or ``aois`` (areas as for
+        `statistics`).
+
+    Returns
+    -------
+    ReportResult
+        The ``path`` of the file; a notebook shows the report.
+
+    Raises
+    ------
+    NergError
+        An option or an input is invalid.
+
+    Examples
+    --------
+    >>> import nerg_mi as nerg
+    >>> from importlib.resources import files
+    >>> store = files("nerg_mi.scenes.store")
+    >>> made = nerg.report(store / "shoppers.safetensors", folder / "report.html", width=24, spp=1, viewpoints=1)
+    >>> made.path.name
+    'report.html'
+    """
+    from nerg_mi.workflows.report import make_report
+
+    with report_progress(progress, ReportOptions) as reporter:
+        resolved = build_options(ReportOptions, "report", options, overrides)
+        path = session_folder() / f"report-{uuid4().hex[:12]}.html" if output is None else Path(output)
+        return make_report([as_file(item, "inputs") for item in list_inputs(inputs)], path, resolved, reporter)
+
+
+def draw(
+    kind: str, inputs: object, output: FilePath | None = None, *, progress: Progress = None, **options: Any
+) -> Figure:
+    """Draw a figure.
+
+    Parameters
+    ----------
+    kind : str
+        ``sphere`` or ``triptych`` of a scene, ``floor`` of rays, ``surface`` of a mesh that `bake` has written,
+        ``sheet`` of images, or ``difference`` of two of them.
+    inputs : object or sequence of these
+        The scene, the rays or the files.
+    output : path, optional
+        File to write (.png or .svg).
+    progress : bool, Reporter or None
+        None shows a progress bar in notebooks, True shows one anywhere, False none; a `Reporter` receives everything.
+    **options
+        Options of ``nerg draw KIND``.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        The figure, which a notebook shows.
+
+    Raises
+    ------
+    NergError
+        The kind, an option or an input is invalid.
+
+    Examples
+    --------
+    >>> import nerg_mi as nerg
+    >>> from importlib.resources import files
+    >>> figure = nerg.draw("sphere", files("nerg_mi.scenes.store") / "scene.xml", width=64, spp=1)
+    >>> len(figure.axes) > 0
+    True
+    """
+    from nerg_mi.workflows.draw import draw as draw_figure
+    from nerg_mi.workflows.draw import find_kind
+
+    with report_progress(progress, find_kind(kind).options) as reporter:
+        several = list(inputs) if isinstance(inputs, (list, tuple)) else [inputs]
+        files = [as_file(item, "inputs") for item in several]
+        if (scene := options.get("scene")) is not None:
+            # Figures of a scene need the integrator, which an environment does not have.
+            shown = scene if isinstance(scene, (str, os.PathLike, Scene)) else make_scene(scene)
+            options["scene"] = as_file(shown, "scene")
+        return draw_figure(kind, files, output, reporter, **options)
+
+
+def write_scene(
+    inputs: object,
+    output: FilePath,
+    *,
+    options: SceneOptions | None = None,
+    progress: Progress = None,
+    **overrides: Any,
+) -> Scene:
+    """Write a commented scene file with the best overview as its camera, and an observer.
+
+    `make_scene` makes a scene without a file, and `Scene.save` writes it.
+
+    Parameters
+    ----------
+    inputs : object or sequence of these
+        An environment, a gaze field and recordings, or some of them, in memory or as files, in any order.
+    output : path
+        File to write (.xml).
+    options : SceneOptions, optional
+        Base options (`nerg_mi.workflows.scene_commands.SceneOptions`).
+    progress : bool, Reporter or None
+        None shows a progress bar in notebooks, True shows one anywhere, False none; a `Reporter` receives everything.
+    **overrides
+        Single options on top of ``options``, such as ``observer=(4.4, 2.8, 1.6)`` or ``width=960``.
+
+    Returns
+    -------
+    Scene
+        The scene of the file.
+
+    Raises
+    ------
+    NergError
+        An option or an input is invalid.
+
+    Examples
+    --------
+    >>> import nerg_mi as nerg, trimesh
+    >>> room = trimesh.creation.box((4, 3, 2.5))
+    >>> len(nerg.write_scene(room, folder / "room.xml", observer=(0, 0, 0), width=48).mitsuba.sensors())
+    3
+    """
+    from nerg_mi.workflows.scene import write_scene as write
+
+    output = Path(output)
+    with report_progress(progress, SceneOptions) as reporter:
+        resolved = build_options(SceneOptions, "write_scene", options, overrides)
+        files = [as_file(item, "inputs") for item in list_inputs(inputs)]
+        for file in files:
+            # The scene refers to it by name.
+            copy_from_session(file, output.parent)
+        local = [output.parent / file.name if (output.parent / file.name).exists() else file for file in files]
+        write(local, output, resolved, reporter)
+    return Scene.load(output)
+
+
+def render_film(
+    scene: Scene | FilePath,
+    output: FilePath,
+    *,
+    options: FilmOptions | None = None,
+    progress: Progress = None,
+    **overrides: Any,
+) -> Path:
+    """Render a scene to an image file or a video, as ``nerg render`` does. `render` returns arrays.
+
+    Parameters
+    ----------
+    scene : Scene or path
+        The scene, or its file.
+    output : path
+        Image (.exr with all channels, .png; .svg needs ``overlay``) or video (.mp4, needs ``frames``) to write.
+    options : FilmOptions, optional
+        Base options (`nerg_mi.workflows.scene_commands.FilmOptions`).
+    progress : bool, Reporter or None
+        None shows a progress bar in notebooks, True shows one anywhere, False none; a `Reporter` receives everything.
+    **overrides
+        Single options on top of ``options``, such as ``overlay="gaze"``, ``spp=64`` or ``frames="walk.csv"``.
+
+    Returns
+    -------
+    Path
+        The file, of a sequence the first one.
+
+    Raises
+    ------
+    NergError
+        An option or a file is invalid.
+
+    Examples
+    --------
+    >>> import nerg_mi as nerg
+    >>> from importlib.resources import files
+    >>> scene = nerg.Scene.load(files("nerg_mi.scenes.store") / "scene.xml", width=48, height=32)
+    >>> nerg.render_film(scene, folder / "gaze.png", overlay="gaze", spp=1).name
+    'gaze.png'
+    """
+    from nerg_mi.workflows.render import render_film as render_to_file
+
+    with report_progress(progress, FilmOptions) as reporter:
+        resolved = build_options(FilmOptions, "render_film", options, overrides)
+        return render_to_file(as_file(scene, "scene"), Path(output), resolved, reporter).path
+
+
+# ---- Fields from and to other programs, and poses of photos ----
+
+_EXPORTS = {
+    "mesh": ("export_mesh", MeshOptions),
+    "points": ("export_points", PointOptions),
+    "splats": ("export_splats", SplatOptions),
+    "volume": ("export_volume", VolumeOptions),
+    "torch-ngp": ("export_torch_ngp", TorchNgpOptions),
+}
+_EXPORT_SUFFIXES = {".glb": "mesh", ".vol": "volume", ".pth": "torch-ngp"}
+
+
+def export(
+    field: TrainedField[RadianceField] | FilePath,
+    output: FilePath,
+    kind: str | None = None,
+    *,
+    progress: Progress = None,
+    **options: Any,
+) -> Export:
+    """Write a radiance field in a format of other programs.
+
+    Parameters
+    ----------
+    field : TrainedField or path
+        The radiance field.
+    output : path
+        File to write.
+    kind : str, optional
+        ``mesh`` (.ply, .glb), ``points`` (.ply, .glb), ``splats`` (.ply), ``volume`` (.vol) or ``torch-ngp`` (.pth).
+        Default: by the name of the file; .ply needs a kind.
+    progress : bool, Reporter or None
+        None shows a progress bar in notebooks, True shows one anywhere, False none; a `Reporter` receives everything.
+    **options
+        Options of ``nerg export KIND``, such as ``resolution=128``.
+
+    Returns
+    -------
+    Export
+        The written ``files``, and the ``surface`` of a mesh or points.
+
+    Raises
+    ------
+    NergError
+        The kind, an option or the field is invalid.
+
+    Examples
+    --------
+    >>> import nerg_mi as nerg
+    >>> from importlib.resources import files
+    >>> field = nerg.load_field(files("nerg_mi.scenes.store") / "store.safetensors")
+    >>> nerg.export(field, folder / "store.vol", resolution=16).files[0].name
+    'store.vol'
+    """
+    from nerg_mi.workflows import export as exports
+
+    chosen = kind or _EXPORT_SUFFIXES.get(Path(output).suffix.lower())
+    if chosen not in _EXPORTS:
+        raise NergError(f'kind must be one of {", ".join(_EXPORTS)} for "{output}", got {kind!r}')
+    function, option_type = _EXPORTS[chosen]
+    with report_progress(progress, option_type) as reporter:
+        resolved = build_options(option_type, f"export of {chosen}", None, options)
+        source = field.network if isinstance(field, TrainedField) else resolve_file(field, "field")
+        return getattr(exports, function)(source, Path(output), resolved, reporter)
+
+
+def import_checkpoint(
+    file: FilePath, *, options: CheckpointImportOptions | None = None, progress: Progress = None, **overrides: Any
+) -> tuple[TrainedField[RadianceField] | None, TrainedGazeField | None]:
+    """Read a checkpoint (.pth) of torch-ngp, or of the NeRG paper's authors, without executing code in it.
+
+    Parameters
+    ----------
+    file : path
+        The checkpoint.
+    options : CheckpointImportOptions, optional
+        Base options (`nerg_mi.workflows.radiance_commands.CheckpointImportOptions`).
+    progress : bool, Reporter or None
+        None shows a progress bar in notebooks, True shows one anywhere, False none; a `Reporter` receives everything.
+    **overrides
+        Single options on top of ``options``.
+
+    Returns
+    -------
+    field : TrainedField or None
+        The radiance field, if the checkpoint has one.
+    gaze : TrainedGazeField or None
+        The gaze field, if the checkpoint has one.
+
+    Raises
+    ------
+    NergError
+        The file is not such a checkpoint.
+
+    Examples
+    --------
+    >>> import nerg_mi as nerg
+    >>> from importlib.resources import files
+    >>> field = nerg.load_field(files("nerg_mi.scenes.store") / "store.safetensors")
+    >>> try:
+    ...     nerg.import_checkpoint(folder / "nowhere.pth")
+    ... except nerg.NergError as error:
+    ...     print("nowhere.pth" in str(error))
+    True
+    """
+    from nerg_mi.workflows.export import import_checkpoint as read
+
+    path = resolve_file(file, "file")
+    with report_progress(progress, CheckpointImportOptions) as reporter:
+        resolved = build_options(CheckpointImportOptions, "import_checkpoint", options, overrides)
+        fields = read(path, None, None, resolved, reporter)
+    return (
+        None if fields.field is None else TrainedField(fields.field, fields.origin, path.name),
+        None if fields.gaze is None else TrainedGazeField(fields.gaze, fields.origin, path.name),
+    )
+
+
+def find_poses(
+    pictures: FilePath,
+    output: FilePath,
+    *,
+    options: PoseOptions | None = None,
+    progress: Progress = None,
+    **overrides: Any,
+) -> PosesResult:
+    """Estimate the poses of photos or of a video, for `train_radiance`.
+
+    Parameters
+    ----------
+    pictures : path
+        A folder of photos, or a video.
+    output : path
+        Folder to write, which becomes the ``photos`` of `train_radiance`.
+    options : PoseOptions, optional
+        Base options (`nerg_mi.workflows.radiance_commands.PoseOptions`).
+    progress : bool, Reporter or None
+        None shows a progress bar in notebooks, True shows one anywhere, False none; a `Reporter` receives everything.
+    **overrides
+        Single options on top of ``options``.
+
+    Returns
+    -------
+    PosesResult
+        The written folder (``output``), the photos with and without a pose, and the error in pixels.
+
+    Raises
+    ------
+    NergError
+        The photos do not show one scene, or an option is invalid.
+    ImportError
+        pycolmap, or for a video PyAV, is not installed.
+
+    Examples
+    --------
+    >>> import nerg_mi as nerg
+    >>> try:
+    ...     nerg.find_poses(folder / "nowhere", folder / "posed")
+    ... except nerg.NergError as error:
+    ...     print("nowhere" in str(error))
+    True
+    """
+    from nerg_mi.workflows.poses import find_poses as estimate
+
+    with report_progress(progress, PoseOptions) as reporter:
+        resolved = build_options(PoseOptions, "find_poses", options, overrides)
+        return estimate(resolve_file(pictures, "pictures"), Path(output), resolved, reporter)

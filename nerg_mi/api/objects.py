@@ -1,0 +1,288 @@
+"""Objects in memory where a workflow needs a file: environments, fields, rays, areas and alignments.
+
+Workflows read files, since worker processes and checkpoints refer to them. An object is therefore written to a folder
+of this process, under a name that contains a checksum of its content, and the folder is removed when the process ends.
+"""
+
+from __future__ import annotations
+
+import atexit
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Mapping
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+
+from nerg_mi.errors import NergError
+from nerg_mi.fields.radiance import RadianceField
+from nerg_mi.fields.splats import Splats
+from nerg_mi.files.atomic import file_sha256, replace_atomically, write_text
+from nerg_mi.formats.areas import format_areas
+from nerg_mi.formats.splats import write_ply_splats
+from nerg_mi.rays.rays import Rays
+from nerg_mi.rendering.files import write_mesh
+from nerg_mi.rendering.scene import list_scene_files
+from nerg_mi.workflows.old_names import current_keywords
+from nerg_mi.workflows.scene_places import detect_kind
+
+from .arguments import check_names, resolve_file
+from .contents import DensityGrid, from_trimesh, is_trimesh, to_scene_children, write_content
+from .fields import TrainedField, activate_mitsuba
+from .scene import Scene, make_scene
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+# ---- The folder of this process ----
+
+_folders: list[Path] = []
+
+
+def session_folder() -> Path:
+    """Return the folder for objects of this process; it is removed when the process ends."""
+    if not _folders:
+        _folders.append(Path(tempfile.mkdtemp(prefix="nerg-mi-")))
+        atexit.register(_remove_folder, _folders[0], os.getpid())
+    return _folders[0]
+
+
+def _remove_folder(folder: Path, process: int) -> None:
+    # A forked process inherits the registration, and its parent still needs the folder.
+    if os.getpid() == process:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _store(stem: str, suffix: str, write: Callable[[Path], object]) -> Path:
+    """Write an object with ``write(path)``, which may also write files whose names begin with that of ``path``.
+
+    Returns the path, whose name consists of ``stem``, a checksum of all written files, and ``suffix``.
+    """
+    with tempfile.TemporaryDirectory(dir=session_folder()) as folder:
+        write(Path(folder) / f"{stem}{suffix}")
+        checksums = [file_sha256(file) for file in sorted(Path(folder).iterdir())]
+    path = session_folder() / f"{stem}-{hashlib.sha256(''.join(checksums).encode()).hexdigest()[:12]}{suffix}"
+    if not path.exists():
+        # Scenes refer to their files by name, so they are written again under the final name.
+        write(path)
+    return path
+
+
+def copy_from_session(path: Path, folder: Path) -> None:
+    """Copy ``path`` and the files that it refers to into ``folder``, if they are in the folder of this process."""
+    if not _folders or path.parent != _folders[0]:
+        return
+    for file in list_scene_files(path) if path.suffix == ".xml" else [path]:
+        if file.parent == _folders[0] and folder.absolute() != _folders[0]:
+            with replace_atomically(folder / file.name) as temporary:
+                shutil.copyfile(file, temporary)
+
+
+# ---- Objects as files ----
+
+
+def as_file(value: object, name: str) -> Path:
+    """Return the file of an argument; an object in memory is written to the folder of this process.
+
+    Parameters
+    ----------
+    value : object
+        A path, an environment (`nerg_mi.api.scene.Environment`), a field, `Rays`, areas, changes, or an alignment.
+    name : str
+        Name of the argument, for messages and to tell what a dict or an array contains.
+
+    Returns
+    -------
+    Path
+        The file.
+
+    Raises
+    ------
+    NergError
+        The file does not exist, or ``value`` is something else.
+    """
+    if isinstance(value, (str, os.PathLike)) or getattr(value, "path", None) is not None:
+        return resolve_file(value, name)
+    if isinstance(value, Rays):
+        return _store("rays", ".npz", value.save)
+    if isinstance(value, (TrainedField, RadianceField)):
+        field = value if isinstance(value, TrainedField) else TrainedField(value)
+        return _store("field" if field.kind == "radiance" else "gaze", ".safetensors", field.save)
+    if name in _AREA_NAMES and isinstance(value, Mapping):
+        return _store("areas", ".json", lambda path: _write_areas(path, value))
+    if name in _JSON_NAMES and isinstance(value, Mapping):
+        return _store(name, ".json", lambda path: write_text(path, json.dumps(value, default=_to_json)))
+    matrix: Any = getattr(value, "matrix", value)
+    if name in _ALIGNMENT_NAMES and np.shape(matrix) == (4, 4):
+        return _store("align", ".json", lambda path: write_text(path, json.dumps(np.asarray(matrix, float).tolist())))
+    environment = _write_environment(value)
+    if environment is None:
+        kind = "an environment in memory or a file" if name in _ENVIRONMENT_NAMES else "a file"
+        raise NergError(f'"{name}" must be {kind}, given as a string or a path, got {type(value).__name__}')
+    return environment
+
+
+def as_scene_file(value: object, name: str) -> Path:
+    """Return the file of an argument as `as_file` does, but a scene with the mesh in place of a mesh file."""
+    path = as_file(value, name)
+    if detect_kind(path) != "mesh":
+        return path
+    activate_mitsuba()
+    return _store_shapes(path)
+
+
+_AREA_NAMES, _JSON_NAMES = ("areas", "aois", "zones"), ("what_if",)
+_ALIGNMENT_NAMES = ("align", "align_views", "init")
+_ENVIRONMENT_NAMES = ("environment", "field", "scene", "geometry", "surface")
+
+
+def _write_environment(value: object) -> Path | None:
+    """Write an environment in memory, and return its file; None if ``value`` is something else."""
+    if isinstance(value, Splats):
+        return _store("environment", ".ply", lambda path: write_ply_splats(path, value))
+    if is_trimesh(value):
+        meshes = from_trimesh(value, "environment")  # pyright: ignore[reportArgumentType] which is_trimesh has checked
+        if len(meshes) == 1:
+            (mesh,) = meshes.values()
+            return _store("environment", ".ply", lambda path: write_mesh(path, mesh))
+    elif not isinstance(value, (Scene, DensityGrid, Mapping)) and not _is_mitsuba(value):
+        return None
+    activate_mitsuba()
+    if isinstance(value, Scene):
+        return _store("environment", ".xml", value.save)
+    if isinstance(value, DensityGrid):
+        return _store("environment", ".xml", make_scene(value).save)
+    if isinstance(value, Mapping) and value.get("type") == "scene" and _has_nerg(value):
+        return _store("environment", ".xml", Scene.coerce(value).save)
+    return _store_shapes(value)
+
+
+def _store_shapes(shapes: object) -> Path:
+    """Write shapes as a scene file without an integrator."""
+    content = {"type": "scene", **to_scene_children(shapes, "environment")}
+    return _store("environment", ".xml", lambda path: write_content(path, content, "Shapes of an environment."))
+
+
+def _is_mitsuba(value: object) -> bool:
+    import mitsuba as mi
+
+    return mi.variant() is not None and isinstance(value, mi.Object)
+
+
+def _has_nerg(content: Mapping[str, Any]) -> bool:
+    return any(isinstance(child, Mapping) and child.get("type") == "nerg" for child in content.values())
+
+
+def _to_json(value: Any) -> Any:
+    if isinstance(value, (np.ndarray, np.generic)):
+        return value.tolist()
+    raise NergError(f"a value of {type(value).__name__} cannot be written as JSON; use numbers, texts, lists and dicts")
+
+
+def _write_areas(path: Path, areas: Mapping[str, Any]) -> None:
+    """Write areas by name: boxes (two corners), meshes of trimesh, mesh files, and dicts as in a file of areas."""
+    entries = []
+    for k, (name, area) in enumerate(areas.items()):
+        if is_trimesh(area):
+            meshes = from_trimesh(area, str(name))
+            if len(meshes) > 1:
+                raise NergError(
+                    f'the area "{name}" is a trimesh.Scene of {len(meshes)} meshes; pass one trimesh.Trimesh'
+                )
+            file = path.with_name(f"{path.stem}.{k}.ply")
+            write_mesh(file, next(iter(meshes.values())))
+            entries.append({"name": str(name), "mesh": file.name})
+        elif isinstance(area, Mapping):
+            entries.append({"name": str(name), **area})
+        elif np.shape(area) == (2, 3):
+            lower, upper = np.asarray(area, float).tolist()
+            entries.append({"name": str(name), "min": lower, "max": upper})
+        else:
+            raise NergError(
+                f'the area "{name}" must be a box (two corners of three numbers), a trimesh.Trimesh or a dict as in a '
+                f"file of areas, got {type(area).__name__}"
+            )
+    write_text(path, json.dumps(json.loads(format_areas(())) | {"regions": entries}, default=_to_json))
+
+
+# ---- Options of workflows ----
+
+
+Options = TypeVar("Options", bound="DataclassInstance")
+
+_OUTPUT_OPTIONS = {
+    *("pictures", "json_file", "store", "output", "train_output", "test_output", "align_output", "color")
+}
+"""Options that name a file or folder to write."""
+
+
+def build_options(kind: type[Options], function: str, options: Options | None, overrides: dict[str, Any]) -> Options:
+    """Build the options of a workflow for the active variant.
+
+    Parameters
+    ----------
+    kind : type
+        Dataclass of the options.
+    function : str
+        Name of the API function, for messages.
+    options : dataclass instance or None
+        Base options; None uses the defaults.
+    overrides : dict
+        Values by option name. Where an option names a file, an object in memory can be given (`as_file`). The option
+        ``geometry`` also takes an environment, which becomes the option ``field`` or ``scene``.
+
+    Returns
+    -------
+    dataclass instance
+        The options.
+
+    Raises
+    ------
+    NergError
+        An option or a file does not exist.
+    """
+    types, overrides = {f.name: str(f.type) for f in fields(kind)}, current_keywords(kind, overrides)
+    if "mode" in overrides:
+        raise NergError(f"{function} uses the active variant; call mi.set_variant({overrides['mode']!r}) before it")
+    if "geometry" in overrides and {"field", "scene"} <= types.keys():
+        overrides = _choose_geometry(overrides)
+    check_names(function, overrides, [name for name in types if name != "mode"])
+    if "mode" in types:
+        overrides = {**overrides, "mode": activate_mitsuba().variant()}
+    updated = kind(**overrides) if options is None else replace(options, **overrides)
+    files = {k: getattr(updated, k) for k, type_name in types.items() if "Path" in type_name}
+    return replace(
+        updated, **{k: Path(v) if k in _OUTPUT_OPTIONS else as_file(v, k) for k, v in files.items() if v is not None}
+    )
+
+
+def _choose_geometry(overrides: dict[str, Any]) -> dict[str, Any]:
+    """Replace the option ``geometry`` by ``field`` or ``scene`` if it is an environment."""
+    geometry = overrides["geometry"]
+    if geometry is None or (isinstance(geometry, (str, os.PathLike)) and str(geometry) in ("hits", "none")):
+        return overrides
+    if isinstance(geometry, (str, os.PathLike)) and Path(geometry).suffix.lower() == ".vol":
+        return overrides
+    path = as_file(geometry, "geometry")
+    kind = detect_kind(path)
+    if kind not in ("field", "mesh", "scene"):
+        raise NergError(f'geometry must be an environment, "hits" or "none", but "{path}" contains {kind}')
+    others = {name: value for name, value in overrides.items() if name != "geometry"}
+    return {**others, "field" if kind == "field" else "scene": path}
+
+
+def resolve_rays(value: object) -> Rays | Path:
+    """Return `Rays` unchanged, or the path of their file. Raises `NergError` for anything else."""
+    if isinstance(value, Rays):
+        return value
+    if not isinstance(value, (str, os.PathLike)):
+        raise NergError(
+            f"rays must be a Rays object or a file of one, got {type(value).__name__}; "
+            "use import_rays to read a table (.csv, .parquet)"
+        )
+    return resolve_file(value, "rays")

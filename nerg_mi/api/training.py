@@ -1,0 +1,253 @@
+"""Training of radiance fields and gaze fields."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from uuid import uuid4
+
+from nerg_mi.rays.rays import Rays
+from nerg_mi.workflows.gaze_commands import GazeOptions, PriorOptions
+from nerg_mi.workflows.radiance_commands import CompileOptions, RadianceOptions
+
+from .arguments import resolve_file
+from .calls import Progress, report_progress
+from .fields import FilePath, TrainedField, load_field
+from .gaze import TrainedGazeField
+from .objects import build_options, copy_from_session, resolve_rays, session_folder
+
+if TYPE_CHECKING:
+    from nerg_mi.fields.radiance import RadianceField
+    from nerg_mi.workflows.train_gaze import GazeResult, PriorResult
+
+
+def train_radiance(
+    photos: FilePath,
+    output: FilePath | None = None,
+    *,
+    options: RadianceOptions | None = None,
+    progress: Progress = None,
+    **overrides: Any,
+) -> TrainedField[RadianceField]:
+    """Train a radiance field on posed photos.
+
+    After Ctrl-C, the current state is returned if there is no ``output``.
+
+    Parameters
+    ----------
+    photos : path
+        A folder, its transforms.json, or a COLMAP model.
+    output : path, optional
+        Checkpoint to write (.safetensors), with a preview and, until the training is complete, a state to resume from.
+    options : RadianceOptions, optional
+        Base options (`nerg_mi.workflows.radiance_commands.RadianceOptions`).
+    progress : bool, Reporter or None
+        None shows a progress bar in notebooks, True shows one anywhere, False none; a `Reporter` receives everything.
+    **overrides
+        Single options on top of ``options``, such as ``minutes=5`` or ``size="medium"``.
+
+    Returns
+    -------
+    TrainedField
+        The radiance field. Its ``provenance`` contains the error on held-out photos.
+
+    Raises
+    ------
+    NergError
+        An option or a file is invalid.
+    KeyboardInterrupt
+        Ctrl-C was pressed and there is an ``output``, which has been written.
+
+    Examples
+    --------
+    >>> import nerg_mi as nerg
+    >>> field = nerg.train_radiance(photos, steps=2, holdout=0)  # photos: a folder of posed photos
+    >>> field.kind, field.provenance["steps"]
+    ('radiance', 2)
+    """
+    from nerg_mi.workflows import train_radiance as radiance
+
+    with report_progress(progress, RadianceOptions) as reporter:
+        resolved = build_options(RadianceOptions, "train_radiance", options, overrides)
+        result = radiance.train_radiance(resolve_file(photos, "photos"), output, resolved, reporter)
+    if output is None:
+        return TrainedField(result.field, result.provenance)
+    return TrainedField(result.field, result.provenance, Path(output).name, Path(output))
+
+
+def compile_field(
+    field: TrainedField[RadianceField] | FilePath,
+    output: FilePath | None = None,
+    *,
+    options: CompileOptions | None = None,
+    progress: Progress = None,
+    **overrides: Any,
+) -> TrainedField[RadianceField]:
+    """Evaluate the density of a radiance field on voxels once, so that frames take about half the time.
+
+    Colour still comes from the networks of the field. Gaze fields that were trained in the field accept the result.
+
+    Parameters
+    ----------
+    field : TrainedField or path
+        The field. The object is not changed.
+    output : path, optional
+        Checkpoint to write (.safetensors).
+    options : CompileOptions, optional
+        Base options (`nerg_mi.workflows.radiance_commands.CompileOptions`).
+    progress : bool, Reporter or None
+        None shows a progress bar in notebooks, True shows one anywhere, False none; a `Reporter` receives everything.
+    **overrides
+        Single options on top of ``options``, such as ``resolution=512``, ``min_psnr=35`` or ``memory=100`` (MB).
+
+    Returns
+    -------
+    TrainedField
+        The compiled field. ``provenance["compiled"]`` has its resolution, its size in bytes, its depth errors in scene
+        units, the PSNR of its colour in dB and the speed-up, along random rays.
+
+    Raises
+    ------
+    NergError
+        An option is invalid, the field is compiled already, or the voxels would exceed ``memory``.
+
+    Examples
+    --------
+    >>> import nerg_mi as nerg
+    >>> from importlib.resources import files
+    >>> field = nerg.load_field(files("nerg_mi.scenes.store") / "store.safetensors")
+    >>> small = nerg.compile_field(field, resolution=128)
+    >>> small.provenance["compiled"]["resolution"]
+    128
+    """
+    from nerg_mi.workflows.compile import compile_field as compile_network
+
+    with report_progress(progress, CompileOptions) as reporter:
+        resolved = build_options(CompileOptions, "compile_field", options, overrides)
+        original = load_field(field) if isinstance(field, (str, os.PathLike)) else field
+        result = compile_network(original.network, resolved, reporter)
+    compiled = TrainedField(result.field, {**original.provenance, "compiled": asdict(result.error)})
+    if output is None:
+        return compiled
+    return TrainedField(compiled.network, compiled.provenance, Path(output).name, compiled.save(output))
+
+
+def train_gaze(
+    rays: Rays | FilePath | None,
+    output: FilePath | None = None,
+    *,
+    options: GazeOptions | None = None,
+    progress: Progress = None,
+    **overrides: Any,
+) -> TrainedGazeField:
+    """Train a gaze field on recordings, on salience images of posed photos, or on both.
+
+    Parameters
+    ----------
+    rays : Rays, path or None
+        Recordings. None: salience images alone (options ``views`` and ``salience``).
+    output : path, optional
+        Checkpoint to write (.safetensors), as for `train_radiance`.
+    options : GazeOptions, optional
+        Base options (`nerg_mi.workflows.gaze_commands.GazeOptions`).
+    progress : bool, Reporter or None
+        None shows a progress bar in notebooks, True shows one anywhere, False none; a `Reporter` receives everything.
+    **overrides
+        Single options on top of ``options``, such as ``minutes=5``, ``recipe="small"`` or ``test_zones=3``, and
+        ``geometry``: the environment that the participants saw, in memory or as a file, or ``"hits"`` or ``"none"``.
+        With an ``output``, an environment in memory is written next to it.
+
+    Returns
+    -------
+    TrainedGazeField
+        The gaze field. Its ``provenance`` contains the scores on held-out positions, and its method ``density`` returns
+        densities of rays.
+
+    Raises
+    ------
+    NergError
+        An option or a file is invalid.
+    KeyboardInterrupt
+        Ctrl-C was pressed and there is an ``output``, which has been written.
+
+    Examples
+    --------
+    >>> import nerg_mi as nerg
+    >>> gaze = nerg.train_gaze(rays, geometry="none", steps=2, validation_zones=0, probes=8, directions=64)
+    >>> gaze.kind, gaze.provenance["steps"]
+    ('gaze', 2)
+    """
+    from nerg_mi.workflows import train_gaze as gaze
+
+    with report_progress(progress, GazeOptions) as reporter:
+        resolved = build_options(GazeOptions, "train_gaze", options, overrides)
+        volume = None
+        if output is None and resolved.geometry == "hits":
+            volume = session_folder() / f"hits-{uuid4().hex[:12]}.vol"
+        result = gaze.train_gaze(None if rays is None else resolve_rays(rays), output, resolved, reporter, volume)
+    geometry_file = resolved.field or resolved.scene or volume
+    if output is not None and geometry_file is not None:
+        copy_from_session(geometry_file, Path(output).parent)
+    return _make_gaze_field(result, output, geometry_file)
+
+
+def train_prior(
+    rays: Rays | FilePath | Sequence[Rays | FilePath],
+    output: FilePath | None = None,
+    *,
+    options: PriorOptions | None = None,
+    progress: Progress = None,
+    **overrides: Any,
+) -> TrainedGazeField:
+    """Fit a gaze field for an environment without recordings: the distribution of gaze elevations in other
+    environments.
+
+    Parameters
+    ----------
+    rays : Rays, path, or sequence of these
+        Recordings, one item per environment. Environments have equal weights.
+    output : path, optional
+        Checkpoint to write (.safetensors).
+    options : PriorOptions, optional
+        Base options (`nerg_mi.workflows.gaze_commands.PriorOptions`).
+    progress : bool, Reporter or None
+        None shows a progress bar in notebooks, True shows one anywhere, False none; a `Reporter` receives everything.
+    **overrides
+        Single options on top of ``options``, such as ``seed=1``.
+
+    Returns
+    -------
+    TrainedGazeField
+        The gaze field.
+
+    Raises
+    ------
+    NergError
+        An option or a file is invalid.
+
+    Examples
+    --------
+    >>> import nerg_mi as nerg
+    >>> prior = nerg.train_prior(rays)  # or a list of recordings, one per environment
+    >>> prior.kind, len(prior.provenance["places"])
+    ('gaze', 1)
+    """
+    from nerg_mi.workflows import train_gaze as gaze
+
+    environments = [rays] if isinstance(rays, (str, os.PathLike, Rays)) else rays
+    with report_progress(progress, PriorOptions) as reporter:
+        resolved = build_options(PriorOptions, "train_prior", options, overrides)
+        inputs = [item if isinstance(item, Rays) else resolve_file(item, "rays") for item in environments]
+        result = gaze.learn_prior(inputs, output, resolved, reporter)
+    return _make_gaze_field(result, output, None)
+
+
+def _make_gaze_field(
+    result: GazeResult | PriorResult, output: FilePath | None, geometry_file: Path | None
+) -> TrainedGazeField:
+    path = None if output is None else Path(output)
+    name = "in memory" if path is None else path.name
+    return TrainedGazeField(result.field, result.provenance, name, path, geometry_file)

@@ -1,0 +1,92 @@
+"""HTML of reports and of notebooks: elements and tables.
+
+Text is escaped unless it is an `Html` instance, so that names of files or participants cannot inject markup.
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+from collections.abc import Iterable, Sequence
+
+VOID_ELEMENTS = ("img", "br", "hr", "meta", "input")
+"""Elements without content."""
+
+
+class Html(str):
+    """Markup that is not escaped again."""
+
+
+Content = str | int | float | Html | None | Iterable["Content"]
+"""Content of an element: markup, text, a number, None, or an iterable of these."""
+
+
+def markup(content: Content) -> Html:
+    """Convert ``content`` to markup.
+
+    Text is escaped. Non-printable characters, such as those that change the text direction, become question marks.
+    """
+    if content is None:
+        return Html("")
+    if isinstance(content, Html):
+        return content
+    if isinstance(content, str):
+        return Html(html.escape("".join(c if c.isprintable() else " " if c == "\n" else "?" for c in content)))
+    if isinstance(content, (int, float)):
+        return Html(html.escape(str(content)))
+    return Html("".join(markup(part) for part in content))
+
+
+def element(tag: str, *content: Content, **attributes: str | int | float | bool | None) -> Html:
+    """Return an HTML element.
+
+    Parameters
+    ----------
+    tag
+        Name of the element.
+    content
+        Children of the element.
+    attributes
+        Attributes by name; ``class_`` stands for ``class`` and ``data_x`` for ``data-x``. None and False omit an
+        attribute; True sets it without a value.
+    """
+    attribute_text = ""
+    for name, value in attributes.items():
+        if value is None or value is False:
+            continue
+        name = name.rstrip("_").replace("_", "-")
+        attribute_text += f" {name}" if value is True else f' {name}="{markup(str(value))}"'
+    if tag in VOID_ELEMENTS:
+        return Html(f"<{tag}{attribute_text}>")
+    return Html(f"<{tag}{attribute_text}>{markup(content)}</{tag}>")
+
+
+def paragraph(*content: Content, kind: str | None = None) -> Html:
+    """Return a paragraph of the class ``kind``."""
+    return element("p", *content, class_=kind)
+
+
+def table(header: Sequence[Content], rows: Iterable[Sequence[Content]], numeric_columns: Sequence[int] = ()) -> Html:
+    """Return a table with a header row. The columns with the given indices are right-aligned."""
+    side = lambda column: "number" if column in numeric_columns else None
+    line = lambda tag, cells: element("tr", [element(tag, c, class_=side(i)) for i, c in enumerate(cells)])
+    body = [line("td", row) for row in rows]
+    return element(
+        "div", element("table", element("thead", line("th", header)), element("tbody", body)), class_="scroll"
+    )
+
+
+def key_value_table(rows: Iterable[tuple[Content, Content]]) -> Html:
+    """Return an HTML table with one row per (label, value) pair."""
+    lines = [element("tr", element("th", name, scope="row"), element("td", value)) for name, value in rows]
+    return element("div", element("table", element("tbody", lines), class_="pairs"), class_="scroll")
+
+
+def image(png: bytes, alt: str, kind: str | None = None) -> Html:
+    """Return an HTML image of the CSS class ``kind`` that embeds the file ``png``; ``alt`` is its alternative text."""
+    return element("img", src=f"data:image/png;base64,{base64.b64encode(png).decode()}", alt=alt, class_=kind)
+
+
+def figure(content: Html, caption: Content) -> Html:
+    """Return ``content`` with a caption below it."""
+    return element("figure", content, element("figcaption", caption))

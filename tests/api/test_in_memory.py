@@ -1,0 +1,261 @@
+"""Environments, areas and results in memory: no file of the user is needed, and what is saved is complete."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+import nerg_mi as nerg
+from nerg_mi.api.calls import report_progress
+from nerg_mi.api.objects import as_file, build_options, session_folder
+from nerg_mi.workflows.gaze_commands import FoldOptions, GazeOptions
+
+QUICK = {"recipe": "small", "steps": 2, "probes": 8, "directions": 64, "min_rays": 8, "validation_zones": 0}
+EYE = (2.0, 2.0, 1.6)
+
+
+def make_room():
+    return trimesh.creation.box((6, 4, 3)).apply_translation((3, 2, 1.5))
+
+
+@pytest.fixture(scope="module")
+def room(rgb_module):
+    poster = trimesh.creation.box((0.05, 1.2, 0.8)).apply_translation((5.95, 2, 1.5))
+    poster.visual.vertex_colors = [255, 0, 0, 255]
+    return trimesh.Scene({"room": make_room(), "poster": poster})
+
+
+@pytest.fixture(scope="module")
+def rgb_module():
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_rgb")
+    return mi
+
+
+@pytest.fixture(scope="module")
+def rays():
+    rng = np.random.default_rng(0)
+    eyes = rng.uniform((1, 1, 1.5), (3, 3, 1.7), (600, 3))
+    names = np.array(list("abcd"))[np.arange(600) % 4]
+    seen = rng.uniform((0, 0, 0), (6, 4, 3), (600, 3))
+    return nerg.Rays.from_arrays(eyes, seen - eyes, times=np.arange(600) / 30, participants=names)
+
+
+@pytest.fixture(scope="module")
+def gaze(room, rays):
+    return nerg.train_gaze(rays, geometry=room, **QUICK)
+
+
+# ---- Environments ----
+
+
+def depths(scene):
+    directions = [(1, 0, 0), (0, 1, 0), (0, 0, -1), (1, 0.1, -0.05)]
+    return nerg.trace(scene, EYE, directions, "depth").depth
+
+
+def test_meshes_are_shapes_with_names_and_colours(room):
+    scene = nerg.make_scene(room)
+    assert {shape.id() for shape in scene.mitsuba.shapes()} == {"room", "poster"}
+    np.testing.assert_allclose(depths(scene)[:3], [3.925, 2, 1.6], atol=1e-4)
+    color = nerg.trace(scene, EYE, [(1, 0, 0), (-1, 0, 0)], "color").color
+    assert color[0, 0] > 10 * color[0, 1] + 0.1 and np.isclose(color[1, 0], color[1, 1])
+
+
+@pytest.mark.parametrize("kind", ["mesh", "dict", "scene", "grid", "mitsuba"])
+def test_environments_train_alike_in_memory_and_saved(rgb_module, rays, tmp_path, kind):
+    wall = np.zeros((32, 42, 62), np.float32)
+    wall[[0, -1]] = wall[:, [0, -1]] = wall[:, :, [0, -1]] = 200.0
+    environment = {
+        "mesh": make_room,
+        "dict": lambda: {"type": "scene", "wall": {"type": "sphere", "center": [3, 2, 1.5], "radius": 3.8}},
+        "scene": lambda: nerg.make_scene(make_room()),
+        "grid": lambda: nerg.DensityGrid(wall, (-0.1, -0.1, -0.1), (6.1, 4.1, 3.1)),
+        "mitsuba": lambda: nerg.make_scene(make_room()).mitsuba,
+    }[kind]()
+    gaze = nerg.train_gaze(rays, tmp_path / "gaze.safetensors", geometry=environment, **QUICK)
+    directions = [(1, 0, 0), (0, 1, 0.2)]
+    expected = gaze.density(EYE, directions)
+    if kind == "mesh":
+        # In another process, from what is in the folder.
+        code = f"import nerg_mi as nerg; g = nerg.load_gaze({str(tmp_path / 'gaze.safetensors')!r}); "
+        code += f"print(g.density({EYE}, {directions}).tolist())"
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+        np.testing.assert_allclose(json.loads(done.stdout), expected, rtol=1e-4, err_msg=done.stderr)
+    else:
+        loaded = nerg.load_gaze(tmp_path / "gaze.safetensors")
+        np.testing.assert_allclose(loaded.density(EYE, directions), expected, rtol=1e-4)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # the same environment again has the same checksum
+        np.testing.assert_allclose(gaze.density(EYE, directions, geometry=environment), expected, rtol=1e-4)
+
+
+def test_a_saved_scene_is_the_scene(room, gaze, tmp_path):
+    camera = nerg.Camera((1, 1, 2), (5.9, 2, 1.5), fov=80, width=12, height=8)
+    scene = nerg.make_scene(room, gaze, camera=camera, observer=EYE, falloff=0.3)
+    again = nerg.Scene.load(scene.save(tmp_path / "room.xml"))
+    for name in ("gaze", "depth", "color"):
+        one, other = (nerg.render(s, quantities=name, spp=2)[name] for s in (scene, again))
+        np.testing.assert_array_equal(one, other, err_msg=name)
+    assert repr(again).splitlines()[1:] == repr(scene).replace("in memory", "room.gaze.safetensors").splitlines()[1:]
+    copied = nerg.Scene.load(again.save(tmp_path / "copy.xml"))
+    np.testing.assert_array_equal(depths(copied), depths(scene))
+    with_values = nerg.Scene.load(nerg_store() / "scene.xml", width=24, height=16)
+    width, _ = nerg.Scene.load(with_values.save(tmp_path / "store.xml")).mitsuba.sensors()[0].film().crop_size()
+    assert width == 24
+
+
+def nerg_store():
+    from importlib.resources import files
+
+    return files("nerg_mi.scenes.store")
+
+
+def test_grids_are_refused_if_they_are_wrong():
+    for changes, name in (
+        ({"density": np.ones((2, 2))}, "density"),
+        ({"density": -np.ones((2, 2, 2))}, "density"),
+        ({"lower": (1, 0, 0)}, "lower"),
+        ({"color": np.ones((2, 2, 2))}, "color"),
+        ({"density": np.full((2, 2, 2), np.nan)}, "density"),
+    ):
+        values = {"density": np.ones((2, 2, 2)), "lower": (0, 0, 0), "upper": (1, 1, 1), **changes}
+        with pytest.raises(nerg.NergError, match=name):
+            nerg.DensityGrid(**values)
+
+
+def test_files_of_objects_are_found_again_and_removed(rgb_module):
+    assert as_file(make_room(), "scene") == as_file(make_room(), "scene")
+    with pytest.raises(nerg.NergError, match='"scene".*int'):
+        as_file(3, "scene")
+    code = "import nerg_mi.api.objects as o, trimesh; p = o.as_file(trimesh.creation.box((1, 1, 1)), 'scene'); "
+    done = subprocess.run([sys.executable, "-c", code + "assert p.exists(); print(p)"], capture_output=True, text=True)
+    assert done.stdout.strip().endswith(".ply"), done.stderr
+    assert not Path(done.stdout.strip()).parent.exists()
+
+
+def test_environments_become_options(rgb_module, room):
+    options = build_options(FoldOptions, "folds", None, {"geometry": room})
+    assert options.geometry is None and options.scene is not None and options.scene.parent == session_folder()
+    field = nerg.load_field(nerg_store() / "store.safetensors")
+    assert build_options(GazeOptions, "train_gaze", None, {"geometry": field}).field == field.path
+    assert build_options(GazeOptions, "train_gaze", None, {"geometry": "none"}).geometry == "none"
+    align = build_options(GazeOptions, "train_gaze", None, {"geometry": room, "align": np.eye(4)}).align
+    assert align is not None and json.loads(align.read_text()) == np.eye(4).tolist()
+
+
+# ---- Results ----
+
+
+def test_statistics_of_areas_in_memory(room, rays, gaze):
+    poster = room.geometry["poster"]
+    areas = {"box": [[5.8, 1.4, 1.1], [6.0, 2.6, 1.9]], "mesh": poster, "shape": {"shape": "poster"}}
+    result = nerg.statistics([rays, gaze], areas, resamples=200, viewpoints=4)
+    table = result.to_dataframe("aois")
+    measured = table[table["source"] == "measured"].set_index("aoi")
+    assert len(table) == 6 and (measured["share_low"] <= measured["share"]).all()
+    np.testing.assert_allclose(measured.loc["mesh", "share"], measured.loc["shape", "share"])
+    assert "share_high" in result._repr_html_() and "aois 6" in repr(result)
+    with pytest.raises(nerg.NergError, match='"nothing"'):
+        result.to_dataframe("nothing")
+    with pytest.raises(nerg.NergError, match='"mesh"'):
+        nerg.statistics(rays, {"mesh": room})
+
+
+def test_hit_points_need_no_file(rays):
+    hits = rays.origin + 1.5 * rays.direction
+    with_hits = nerg.Rays.from_arrays(rays.origin, rays.direction, times=rays.t, hits=hits)
+    gaze = nerg.train_gaze(with_hits, geometry="hits", **QUICK)
+    assert gaze.density(EYE, (1, 0, 0)).shape == (1,) and gaze.geometry_file is not None
+
+
+def test_fields_are_densities(gaze, rays):
+    drawn = gaze.sample(EYE, 4000, seed=1)
+    np.testing.assert_allclose(np.linalg.norm(drawn, axis=1), 1, atol=1e-6)
+    regions = gaze.regions(EYE, levels=(0.25, 0.5, 1.0))
+    share = regions.density[regions.inside[1]].sum() / regions.density.sum()
+    assert share == pytest.approx(0.5, abs=1e-3) and regions.solid_angle[2] == pytest.approx(4 * np.pi, rel=1e-3)
+    # The share of samples in a region is that of the gaze.
+    nearest = (drawn @ regions.directions.T.astype(np.float32)).argmax(axis=1)
+    assert regions.inside[1][nearest].mean() == pytest.approx(0.5, abs=0.04)
+    some = rays[:20]
+    density = gaze.density(some.origin, some.direction)
+    assert gaze.score(some) == pytest.approx(np.log(density).mean(), abs=1e-6)
+    np.testing.assert_allclose(gaze.score_samples(some), np.log(density), atol=1e-6)
+    for call in (lambda: gaze.sample([EYE, EYE], 3), lambda: gaze.regions(EYE, [2.0]), lambda: gaze.score(rays[[]])):
+        with pytest.raises(nerg.NergError):
+            call()
+
+
+def test_pictures_are_labelled_arrays_and_figures(room, gaze):
+    xarray = pytest.importorskip("xarray")
+    camera = nerg.Camera((1, 1, 2), (5.9, 2, 1.5), fov=80, width=12, height=8)
+    scene = nerg.make_scene(room, gaze, camera=camera)
+    quantities = ["color", "opacity", "gaze", "position"]
+    pictures = nerg.render(scene, [EYE, (1, 1, 1.6)], quantities, spp=1)
+    data = pictures.to_xarray()
+    assert isinstance(data, xarray.Dataset) and data.gaze.dims == ("observer", "row", "column")
+    assert data.gaze.attrs["units"] == "1/sr" and data.color.sel(channel="R").dims == data.gaze.dims
+    assert data.position.sel(axis="z").shape == (2, 8, 12)
+    np.testing.assert_allclose(data.observer_position.sel(observer=1), (1, 1, 1.6))
+    assert np.array_equal(data.gaze.isel(observer=1), pictures.gaze[1])
+    html = pictures._repr_html_()
+    assert html is not None and "data:image/png" in html
+    assert len(scene.show(spp=1).axes) == 2 and len(pictures.plot("color").axes) >= 1
+    with pytest.raises(nerg.NergError, match='"depth"'):
+        pictures.plot("depth")
+    rays = nerg.trace(scene, EYE, [(1, 0, 0)]).to_xarray()
+    assert rays.depth.dims == ("ray",)
+
+
+# ---- Messages ----
+
+
+class Recorder:
+    def __init__(self):
+        self.lines = []
+
+    def message(self, text):
+        self.lines.append(text)
+
+    def warn(self, text):
+        self.lines.append(text)
+
+    def progress(self, fraction, text=""):
+        pass
+
+
+@pytest.mark.parametrize(
+    "text, expected",
+    [
+        ("add --test-zones 3", "add test_zones=3"),
+        ("one of --field FILE, --geometry hits", 'one of field=FILE, geometry="hits"'),
+        ("leave out --resume to start", "leave out resume=True to start"),
+        ("find it with: nerg align RAYS --field F -o a.json; use it with --align", None),
+        ("the --kappa must lie in 0 .. 3", "the kappa must lie in 0 .. 3"),
+        ("100 --- 3", "100 --- 3"),
+    ],
+)
+def test_messages_name_arguments(text, expected):
+    expected = expected or "find it with: nerg align RAYS --field F -o a.json; use it with align"
+    recorder = Recorder()
+    with pytest.raises(nerg.NergError) as error, report_progress(recorder, GazeOptions) as reporter:
+        reporter.message(text)
+        raise nerg.NergError(text)
+    assert recorder.lines == [expected] and str(error.value) == expected
+
+
+def test_warnings_are_those_of_python_at_the_caller():
+    with pytest.warns(UserWarning, match="test_zones") as caught, report_progress(None) as reporter:
+        reporter.warn("few --test-zones")
+    assert caught[0].filename == __file__
+    with pytest.raises(nerg.NergError, match="progress"), report_progress("yes"):
+        pass
