@@ -29,6 +29,7 @@ from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.files import write_mesh
 from nerg_mi.rendering.scene import list_scene_files
 from nerg_mi.workflows.old_names import current_keywords
+from nerg_mi.workflows.options import GeometryOptions
 from nerg_mi.workflows.scene_places import detect_kind
 
 from .arguments import check_names, resolve_file
@@ -255,6 +256,11 @@ def build_options(kind: type[Options], function: str, options: Options | None, o
     if "mode" in types:
         overrides = {**overrides, "mode": activate_mitsuba().variant()}
     updated = kind(**overrides) if options is None else replace(options, **overrides)
+    if isinstance(updated, GeometryOptions) and (updated.field, updated.scene, updated.geometry) == (None, None, None):
+        raise NergError(
+            f"{function} needs the environment that the participants saw, in memory or as a file, with geometry=; or "
+            'geometry="hits" for that of the hit points, or geometry="none"'
+        )
     files = {k: getattr(updated, k) for k, type_name in types.items() if "Path" in type_name}
     return replace(
         updated, **{k: Path(v) if k in _OUTPUT_OPTIONS else as_file(v, k) for k, v in files.items() if v is not None}

@@ -239,8 +239,8 @@ class Scene:
         >>> import nerg_mi as nerg
         >>> from importlib.resources import files
         >>> scene = nerg.Scene.load(files("nerg_mi.scenes.store") / "scene.xml", width=48, height=32)
-        >>> type(scene.show(spp=1)).__name__
-        'Figure'
+        >>> len(scene.show(spp=1).axes)  # the picture, and the scale of the gaze
+        2
         """
         import nerg_mi
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import doctest
+import importlib
 import inspect
 import pickle
 import subprocess
@@ -120,6 +121,29 @@ def test07_examples_run(name, tmp_path, request):
     said = []
     results = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE).run(test, out=said.append)
     assert results.failed == 0, "".join(said)
+
+
+METHODS = [
+    f"{module}.{kind}.{method}"
+    for module, kind, methods in (
+        ("nerg_mi.rays.rays", "Rays", "from_arrays from_dataframe to_dataframe filter"),
+        ("nerg_mi.api.scene", "Scene", "save show"),
+        ("nerg_mi.api.gaze", "TrainedGazeField", "density score sample regions"),
+        ("nerg_mi.api.render", "Pictures", "plot"),
+    )
+    for method in methods.split()
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", METHODS, ids=lambda name: ".".join(name.split(".")[-2:]))
+def test08_examples_of_methods_run(name, tmp_path):
+    module, kind, method = name.rsplit(".", 2)
+    function = getattr(getattr(importlib.import_module(module), kind), method)
+    (test,) = doctest.DocTestFinder(recurse=False).find(function, name, globs={"folder": tmp_path})
+    said = []
+    results = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE).run(test, out=said.append)
+    assert test.examples and results.failed == 0, "".join(said)
 
 
 # ---- The API uses the active variant, and sets one only if there is none ----

@@ -110,6 +110,7 @@ CALLS = [
         lambda: nerg.train_gaze(np.zeros(3), geometry="none"),
         "rays must be a Rays object .* got ndarray; use import_rays",
     ),
+    (lambda: nerg.train_gaze("no.npz"), "train_gaze needs the environment .* geometry="),
     (lambda: nerg.train_gaze(None, scene=3), '"scene" must be an environment in memory or a file, .* got int'),
     (lambda: nerg.train_radiance(None), '"photos" must be a file, given as a string or a path, got NoneType'),
     (lambda: nerg.train_radiance("no"), 'file "no" of "photos" does not exist'),

@@ -88,8 +88,8 @@ JOBS = {
     ),
     "ablate": (
         ablation,
-        lambda: nerg.ablate("r.npz", "out", options=AblationOptions(seeds=2), recipes="small"),
-        (Path("r.npz"), "out", AblationOptions(seeds=2, recipes="small", **LLVM)),
+        lambda: nerg.ablate("r.npz", "out", options=AblationOptions(seeds=2), recipes="small", geometry="none"),
+        (Path("r.npz"), "out", AblationOptions(seeds=2, recipes="small", geometry="none", **LLVM)),
     ),
     "run_study": (
         study,
