@@ -17,12 +17,12 @@ from nerg_mi.aoi.predicted import load_aoi_scene
 from nerg_mi.errors import NergError
 from nerg_mi.files.atomic import check_new_folder
 from nerg_mi.formats.areas import read_areas
+from nerg_mi.measures.visits import Visits
 from nerg_mi.rays.bids import BidsEvents, write_bids
 from nerg_mi.rays.dataset import load_rays
 from nerg_mi.rays.event_settings import KINDS
 from nerg_mi.rays.events import Events, detect_events
 from nerg_mi.rays.rays import Rays
-from nerg_mi.statistics.visits import Visits
 
 from .base import SILENT, Reporter, select_backend
 from .rays_commands import RaysExportOptions
