@@ -213,7 +213,7 @@ def peers_of(run: Run, compiled: bool) -> dict[str, torch_frames.TorchRenderer]:
     import torch
 
     torch.set_num_threads(run.threads)
-    scene = nerg.Scene.load(find_store_scene())
+    scene = nerg.Scene.load(find_store_scene(), **torch_frames.PEER_SCENE)
     falloff = float(np.ravel(np.array(scene.integrator.falloff))[0])
     made = {
         "PyTorch, eager": {"model": torch_frames.TorchModel},
@@ -259,6 +259,7 @@ def stages(run: Run) -> None:
     works = {name: torch_frames.Ours({**values, **more}, "depth") for name, more in STAGES.items()}
     last = list(works)[-1]
     works["... same observer again"] = torch_frames.Ours({**values, **STAGES[last]}, "map")
+    works["... with re-aimed hits"] = torch_frames.Ours({**values, **STAGES[last], "reaimed_hits": True}, "depth")
     compiled = {**values, "field": str(run.compiled)}
     works |= {
         f"compiled field: {name}": torch_frames.Ours({**compiled, **more}, "depth") for name, more in STAGES.items()
@@ -295,7 +296,7 @@ def peer_stages(run: Run, width: int, height: int) -> dict[str, float]:
     import torch
 
     torch.set_num_threads(run.threads)
-    scene = nerg.Scene.load(find_store_scene())
+    scene = nerg.Scene.load(find_store_scene(), **torch_frames.PEER_SCENE)
     falloff = float(np.ravel(np.array(scene.integrator.falloff))[0])
     peer = torch_frames.TorchRenderer(run.field, run.gaze, falloff, torch_frames.TorchModel)
     o, d = torch_frames.camera_rays(width, height)

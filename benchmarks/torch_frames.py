@@ -80,7 +80,8 @@ class Attention:
         u = torch.minimum((p_o - self.low) * self.scale - 1, self.end).clamp(min=-1)
         waves = [u, (u * (np.pi / 2)).sin(), (u * (np.pi / 2)).cos()]
         capture = self.model._net("capture_net", torch.cat([ones, harmonics(r_o)[:, : self.degree], *waves], 1))
-        return (self.log_prior(r_o) + emit).clamp(max=30).exp() * capture[:, 0].sigmoid()
+        logit = self.log_prior(r_o) + emit if self.config.prior_factor else emit
+        return logit.clamp(max=30).exp() * capture[:, 0].sigmoid()
 
     def gaze(self, p_od, p_o, r_o, integral):
         """Gaze in 1/sr of observers with the given ``integral``."""
@@ -272,6 +273,10 @@ def agreement(scene, peer: TorchRenderer, width: int = 160, height: int = 90) ->
     }
 
 
+PEER_SCENE = {"reaimed_hits": False}
+"""Values of the demo store's scene: the PyTorch renderers have the networks, but not the re-aimed hits."""
+
+
 class Ours:
     """A function that renders frames of the demo store with these ``values`` of its scene; ``constant``: with constant
     weights of its networks; ``moves``: of an observer at another position in each frame. ``first``: seconds of the
@@ -280,7 +285,7 @@ class Ours:
     def __init__(self, values: dict, visibility: str, constant: bool = False, moves: bool = False):
         import mitsuba as mi
 
-        scene = nerg.Scene.load(find_store_scene(), **values, visibility=visibility)
+        scene = nerg.Scene.load(find_store_scene(), **{**PEER_SCENE, **values}, visibility=visibility)
         if constant:
             scene.set_constant_weights()
         self.render = partial(mi.render, scene.mitsuba, sensor=0, spp=1)

@@ -14,7 +14,7 @@ import pytest
 from tests.conftest import ROOT
 
 SCRIPTS = sorted(p for folder in ("benchmarks", "examples", "tools") for p in (ROOT / folder).glob("*.py"))
-EXTRAS = {"torch", "pyarrow", "distributed", "importlinter", "nbformat", "jupyter_client", "nbclient"}
+EXTRAS = {"torch", "pyarrow", "distributed", "importlinter", "nbformat", "jupyter_client", "nbclient", "pymovements"}
 OURS = {"nerg_mi", "tests", "tools", *(p.stem for p in (ROOT / "benchmarks").glob("*.py"))}
 
 
