@@ -126,7 +126,7 @@ def test_numbers_are_refused_outside_their_range(kind):
 
 
 @pytest.mark.parametrize(
-    "kind", [k for k in KINDS if all("help" in f.metadata for f in fields(k))], ids=lambda k: k.__name__
+    "kind", [k for k in KINDS if all("more" in f.metadata for f in fields(k))], ids=lambda k: k.__name__
 )
 def test_command_line_refuses_the_same_values(kind):
     made: list[Any] = []

@@ -14,7 +14,17 @@ import pytest
 from tests.conftest import ROOT
 
 SCRIPTS = sorted(p for folder in ("benchmarks", "examples", "tools") for p in (ROOT / folder).glob("*.py"))
-EXTRAS = {"torch", "pyarrow", "distributed", "importlinter", "nbformat", "jupyter_client", "nbclient", "pymovements"}
+EXTRAS = {
+    "torch",
+    "pyarrow",
+    "distributed",
+    "importlinter",
+    "nbformat",
+    "jupyter_client",
+    "nbclient",
+    "pymovements",
+    "eyedentify3d",
+}
 OURS = {"nerg_mi", "tests", "tools", *(p.stem for p in (ROOT / "benchmarks").glob("*.py"))}
 
 

@@ -240,6 +240,7 @@ INPUTS = {
     "stats": {"aois", "align", "zones", "cohorts", "what_if", "salt"},
     "draw floor": {"scene"},
     "align": {"field", "scene", "surface", "pairs", "tracking_surface", "tracking_cameras", "scene_cameras", "init"},
+    "rays events": {"targets"},
     "rays import": {"salt", "poses", "place"},
     "rays plot": {"test"},
     "train gaze": {"views", "align_views", "field", "scene", "align"},

@@ -115,6 +115,7 @@ class Slanted:
     """Density ``base`` + ``rise`` z, with the colour z, everywhere."""
 
     occupancy = cells = step = hits = None
+    is_density_separate = False
 
     def __init__(self, base, rise=0.0):
         self.base, self.rise = ns.Float(base), rise

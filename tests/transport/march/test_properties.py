@@ -33,6 +33,7 @@ class Along:
     """A medium whose density depends on z in [0, 1] only: ``f(z)``, with white colour."""
 
     occupancy = cells = step = hits = None
+    is_density_separate = False
 
     def __init__(self, mi, f, *parameters):
         self.mi, self.f, self._parameters = mi, f, list(parameters)
