@@ -241,6 +241,7 @@ INPUTS = {
     "draw floor": {"scene"},
     "align": {"field", "scene", "surface", "pairs", "tracking_surface", "tracking_cameras", "scene_cameras", "init"},
     "rays events": {"targets"},
+    "rays export": {"aois", "scene", "align"},
     "rays import": {"salt", "poses", "place"},
     "rays plot": {"test"},
     "train gaze": {"views", "align_views", "field", "scene", "align"},
