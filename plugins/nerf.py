@@ -36,7 +36,7 @@ Radiance field (:monosp:`nerf`)
  * - voxels.log_density
    - |tensor|
    - Log densities of a compiled field (``nerg compile``), which replace the density of its networks. They are discarded
-     when the grid or the density network changes.
+     when the grid or a network changes.
    - |exposed|, |differentiable|
 
 Density and view-dependent colour of a scene: a multiresolution hash grid with two small networks. The colour network is
@@ -121,7 +121,9 @@ class NerfVolume(make_volume_class()):
         return self.max_density
 
     def parameters_changed(self, keys=()):
-        self.field.pack(keys)
+        # Mitsuba passes the last part of each name only, by which the networks cannot be told apart.
+        if set(keys) != {"log_density"}:
+            super().parameters_changed(keys)
 
     def resolution(self):
         cells = int(self.field.config.grid.finest)

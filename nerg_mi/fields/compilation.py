@@ -18,7 +18,7 @@ from .voxels import BLOCK_EDGE, CELLS, VERTICES, VoxelArrays, VoxelGrid
 
 _BATCH = 1 << 12  # Blocks per launch
 _LOG_RANGE = (-20.0, 30.0)  # Range of stored log densities: those of the density net are limited to 30
-BYTES_PER_BLOCK = 2 * VERTICES + CELLS // 8 + 4
+_BYTES_PER_BLOCK = 2 * VERTICES + CELLS // 8 + 4
 
 
 def compile_density(
@@ -42,7 +42,7 @@ def compile_density(
     start : VoxelGrid, optional
         Voxels of the same field with half the resolution: matter is only searched in and next to its cells.
     max_bytes : float
-        Limit of the size of the result, which is estimated before the density is evaluated.
+        Limit of the size of the result. Twice as many candidates are refused before any evaluation.
     on_progress : callable
         Called with the fraction that is done.
 
@@ -55,8 +55,9 @@ def compile_density(
         raise ValueError("the field is compiled already")
     with dr.suspend_grad():
         candidates = _candidate_blocks(field, resolution, start)
-        if BYTES_PER_BLOCK * len(candidates) > 2 * max_bytes:
-            raise NergError(_describe_excess(resolution, BYTES_PER_BLOCK * len(candidates), max_bytes))
+        # About half of the candidates turn out to be empty.
+        if _BYTES_PER_BLOCK * len(candidates) > 2 * max_bytes:
+            raise NergError(_describe_excess(resolution, _BYTES_PER_BLOCK * len(candidates), max_bytes))
         blocks, masks, values = [], [], []
         for first in range(0, len(candidates), _BATCH):
             part = candidates[first : first + _BATCH]
@@ -89,12 +90,10 @@ def occupancy_of_voxels(field: RadianceField, voxels: VoxelGrid) -> CascadeGrid 
     in which the voxels are the occupancy."""
     if field.box.outer_scale is None or field.occupancy is None:
         return None
-    parts, size = voxels.occupied_parts, field.occupancy.resolution
-    factor = len(parts) // size
-    if factor > 1:
-        inner = np.asarray(parts[: size * factor, : size * factor, : size * factor])
-        parts = inner.reshape(size, factor, size, factor, size, factor).max(axis=(1, 3, 5))
-    return cascades_from_contracted(parts, field.box.outer_scale, field.ns, field.occupancy.threshold)
+    grid = field.occupancy
+    return cascades_from_contracted(
+        voxels.occupied_parts, field.box.outer_scale, field.ns, grid.threshold, grid.resolution
+    )
 
 
 def _candidate_blocks(field: RadianceField, resolution: int, start: VoxelGrid | None) -> np.ndarray:

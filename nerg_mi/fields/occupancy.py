@@ -308,14 +308,16 @@ def count_cascade_levels(bound: float) -> int:
     return 1 + int(np.ceil(np.log2(bound)))
 
 
-def cascades_from_contracted(bits: np.ndarray, outer_scale: float, ns: ModuleType, threshold: float) -> CascadeGrid:
+def cascades_from_contracted(
+    bits: np.ndarray, outer_scale: float, ns: ModuleType, threshold: float, resolution: int | None = None
+) -> CascadeGrid:
     """Cascades that cover the occupied cells ``bits`` of a contracted box's unit cube.
 
     ``bits``: bool array (R, R, R), indexed [z, y, x], in the coordinates that `maths.geometry.ContractedBox` encodes, R
-    even; ``outer_scale``: of the box. The cascades have R cells along each edge, so R / 2 cells of the inner cube
-    become R; a cell is occupied if it overlaps one of ``bits``.
+    even; ``outer_scale``: of the box; ``resolution``: cells along each edge of the cascades, even. By default they have
+    R, so that R / 2 cells of the inner cube become R. A cell is occupied if it overlaps one of ``bits``.
     """
-    r, levels = len(bits), count_cascade_levels(outer_scale)
+    r, levels = resolution or len(bits), count_cascade_levels(outer_scale)
     out = np.zeros((levels, r, r, r), bool)
     if bits.any():
         lower, upper = _preimages(bits, outer_scale)

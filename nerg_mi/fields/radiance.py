@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from dataclasses import asdict, dataclass, field
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -351,23 +350,18 @@ class RadianceField:
     def set_parameters(self, values: dict) -> None:
         """Replace arrays by name (any subset of ``parameters()``) and repack the networks."""
         assign_parameters(self, values)
-        self.pack(list(values))
+        if any(not name.startswith("voxels.") for name in values):
+            self.pack()
 
-    def pack(self, names: Collection[str] = ()) -> None:
+    def pack(self) -> None:
         """Update what the kernels read; call it after any change of the weights.
 
-        If the density may have changed, a refined occupancy grid is replaced by the grid that it refines, and voxels
-        are discarded: both are only valid for the weights that they were computed from.
-
-        Parameters
-        ----------
-        names : collection of str
-            Names of the changed parameters. Default: all.
+        A refined occupancy grid is replaced by the grid that it refines, and voxels are discarded: both are only valid
+        for the weights that they were computed from.
         """
-        if not names or any(name.startswith(("grid.", "density_net.")) for name in names):
-            self.voxels = None
-            if self.occupancy is not None:
-                self.occupancy = self.occupancy.coarse
+        self.voxels = None
+        if self.occupancy is not None:
+            self.occupancy = self.occupancy.coarse
         for part in (self.grid, self.density_net, self.color_net):
             part.pack()
         # Depth passes need one output of the last layer, not 1 + geometry of them.

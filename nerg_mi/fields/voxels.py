@@ -76,6 +76,10 @@ class VoxelGrid:
 
     Attributes
     ----------
+    resolution : int
+        Cells along an edge of the unit cube.
+    size : int
+        Bytes of the arrays in a file.
     log_density : Float16
         The log densities of all blocks: a parameter that can carry gradients.
     """
@@ -83,8 +87,9 @@ class VoxelGrid:
     DRJIT_STRUCT: ClassVar[dict[str, Any]] = {"log_density": None, "_masks": None, "_index": None, "_distance": None}
 
     def __init__(self, arrays: VoxelArrays, ns: ModuleType):
-        self.arrays, self._ns, n = arrays, ns, arrays.resolution // BLOCK_EDGE
-        self._blocks_per_edge, self.cells = n, (arrays.resolution,) * 3
+        n = arrays.resolution // BLOCK_EDGE
+        self._ns, self.resolution, self.size, self._blocks_per_edge = ns, arrays.resolution, arrays.size, n
+        self.cells, self._stored_blocks, self._stored_masks = (arrays.resolution,) * 3, arrays.blocks, arrays.masks
         index = np.full(n**3, _EMPTY, np.uint32)
         index[arrays.blocks] = np.arange(len(arrays.blocks), dtype=np.uint32)
         self._index = ns.UInt32(index)
@@ -98,17 +103,17 @@ class VoxelGrid:
         """Whether each part of a block, of 4³ cells, has a cell with matter: bool array, indexed [z, y, x]."""
         n, k = self._blocks_per_edge, BLOCK_EDGE // _PART_EDGE
         # A word has the bits of four rows of a layer, and half of each row belongs to a part.
-        words, half = self.arrays.masks.reshape(-1, k, _PART_EDGE, k), np.uint32(0x0F0F0F0F)
+        words, half = self._stored_masks.reshape(-1, k, _PART_EDGE, k), np.uint32(0x0F0F0F0F)
         parts = np.stack([(words & half) > 0, (words & ~half) > 0], axis=-1).any(axis=2)
         out = np.zeros((n, k, n, k, n, k), bool)
-        z, y, x = np.unravel_index(self.arrays.blocks, (n, n, n))
+        z, y, x = np.unravel_index(self._stored_blocks, (n, n, n))
         out[z, :, y, :, x, :] = parts
         return out.reshape(n * k, n * k, n * k)
 
-    @property
-    def resolution(self) -> int:
-        """Cells along an edge of the unit cube."""
-        return self.arrays.resolution
+    def to_arrays(self) -> VoxelArrays:
+        """What a file stores, with the current log densities."""
+        log_density = self.log_density.numpy().reshape(-1, VERTICES)
+        return VoxelArrays(self.resolution, self._stored_blocks, self._stored_masks, log_density)
 
     @property
     def coarse(self) -> VoxelGrid:
@@ -118,7 +123,7 @@ class VoxelGrid:
     @property
     def occupied_fraction(self) -> float:
         """Fraction of the cells that have matter."""
-        count = sum(int(np.unpackbits(part.view(np.uint8)).sum()) for part in np.array_split(self.arrays.masks, 64))
+        count = sum(int(np.unpackbits(part.view(np.uint8)).sum()) for part in np.array_split(self._stored_masks, 64))
         return count / self.resolution**3
 
     def named(self) -> dict[str, Any]:

@@ -267,10 +267,8 @@ _VOXEL_ARRAYS = ("blocks", "masks", "log_density")
 
 def encode_voxels(voxels: VoxelGrid) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Convert ``voxels`` to arrays of a checkpoint by name, and its metadata."""
-    arrays = {f"voxels.{name}": getattr(voxels.arrays, name) for name in _VOXEL_ARRAYS}
-    # The grid's own densities may have been optimised.
-    arrays["voxels.log_density"] = voxels.log_density.numpy().reshape(voxels.arrays.log_density.shape)
-    return arrays, {"resolution": voxels.resolution}
+    arrays = voxels.to_arrays()
+    return {f"voxels.{name}": getattr(arrays, name) for name in _VOXEL_ARRAYS}, {"resolution": voxels.resolution}
 
 
 def _decode_voxels(arrays: StoredArrays, config: dict) -> VoxelGrid:

@@ -18,7 +18,7 @@ from nerg_mi.maths.types import Bool, Color, Float, Point3f, Ray3f, Vector3f, va
 
 from .depth import DEPTHS, find_surface_depth, penetration_depth
 from .march import march_with_prepass
-from .march_primal import MarchResult, MarchSettings, default_dt_gamma, default_step, default_stop
+from .march_primal import MarchResult, MarchSettings, default_color_cutoff, default_dt_gamma, default_step, default_stop
 from .medium import Medium
 
 if TYPE_CHECKING:
@@ -388,7 +388,12 @@ RAYS_PER_LAUNCH = 1 << 19
 def default_march_settings(subject: Medium | SceneGeometry) -> MarchSettings:
     """The march settings of the integrator ``nerg`` with default parameters."""
     medium = as_scene_geometry(subject).medium
-    return MarchSettings(step=default_step(medium), dt_gamma=default_dt_gamma(medium), stop=default_stop(medium))
+    return MarchSettings(
+        step=default_step(medium),
+        dt_gamma=default_dt_gamma(medium),
+        stop=default_stop(medium),
+        color_cutoff=default_color_cutoff(medium),
+    )
 
 
 def trace_depth(

@@ -116,9 +116,7 @@ def default_stop(medium: Medium | None) -> float:
 
 def default_color_cutoff(medium: Medium | None) -> float:
     """Default of `MarchSettings.color_cutoff`: higher for a medium whose colour takes most of the time."""
-    if medium is None or not medium.is_density_separate:
-        return MarchSettings.color_cutoff
-    return SEPARATE_COLOR_CUTOFF
+    return SEPARATE_COLOR_CUTOFF if medium is not None and medium.is_density_separate else MarchSettings.color_cutoff
 
 
 def kahan_add(total: Float, compensation: Float, term: Float) -> tuple[Float, Float]:
@@ -412,14 +410,24 @@ class _StepState:
     pending: Any
     result: MarchResult
     # Samples to shade behind the march; None if each one is shaded in its step.
-    samples: Any = None
+    deferred: Any
 
 
-_SLOTS = 8  # Samples of a ray that are kept apart; with the default cut-off, 1 of 10,000 rays has more
+_MAX_DEFERRED = 9  # Samples of a ray that can be shaded behind the march
+
+
+def count_deferred(medium: Medium, color_cutoff: float) -> int:
+    """Maximum number of samples of a ray if they are shaded behind the march; 0 if each one is shaded in its step.
+
+    Each sample but the last gathers a weight above ``color_cutoff``, and all weights add up to at most 1.
+    """
+    if not medium.is_density_separate or color_cutoff * (_MAX_DEFERRED + 1) < 1:
+        return 0
+    return math.ceil(1 / color_cutoff) - 1
 
 
 @dataclass
-class _ShadedSamples:
+class _DeferredSamples:
     """Samples of rays whose colour takes much more time than their density.
 
     Neighbouring rays reach their surfaces in different steps. Shaded in its step, a sample takes the time of a packet
@@ -431,19 +439,18 @@ class _ShadedSamples:
     weight: list[Float]
 
     @staticmethod
-    def zero(Float: type) -> _ShadedSamples:
+    def zero(Float: type, size: int) -> _DeferredSamples:
         UInt32: Any = dr.uint32_array_t(Float)
-        return _ShadedSamples(UInt32(0), [Float(0)] * _SLOTS, [Float(0)] * _SLOTS)
+        return _DeferredSamples(UInt32(0), [Float(0)] * size, [Float(0)] * size)
 
-    def add(self, active: Bool, distance: Float, weight: Float) -> _ShadedSamples:
-        """Add a sample; the last slot collects the weights of all further ones."""
-        slot = dr.minimum(self.count, _SLOTS - 1)
-        distances, weights = [], []
-        for k, (d, w) in enumerate(zip(self.distance, self.weight)):
-            here = active & (slot == k)
-            distances.append(dr.select(here & (w == 0), distance, d))
-            weights.append(w + dr.select(here, weight, 0))
-        return _ShadedSamples(dr.select(active, slot + 1, self.count), distances, weights)
+    def add(self, active: Bool, distance: Float, weight: Float) -> _DeferredSamples:
+        """Add a sample to ``active`` rays."""
+        here = [active & (self.count == k) for k in range(len(self.weight))]
+        return _DeferredSamples(
+            self.count + dr.select(active, 1, 0),
+            [dr.select(now, distance, d) for now, d in zip(here, self.distance)],
+            [dr.select(now, weight, w) for now, w in zip(here, self.weight)],
+        )
 
     def shade(self, medium: Medium, ray: LocalRay, shader: SampleShader) -> Color:
         """Weighted sum of the contributions of all samples."""
@@ -468,13 +475,14 @@ def march_primal(ray: LocalRay, t0: Float, t1: Float, request: MarchRequest) -> 
     # which would otherwise carry the weight arrays of a field.
     quadrature = RULES.find(settings.quadrature)
     cells = cells_for_rule(quadrature, medium)
+    num_deferred = 0 if color is None else count_deferred(medium, settings.color_cutoff)
 
     def body(state: _StepState) -> tuple[_StepState]:
         fraction = Float(1) if state.fraction is None else state.fraction
         active, t, delta, t_next = next_step(
             medium, ray, state.t, t1, fraction, settings, state.active, cells, fine_from
         )
-        result, tau, pending, samples = replace(state.result), state.result.tau, state.pending, state.samples
+        result, tau, pending, deferred = replace(state.result), state.result.tau, state.pending, state.deferred
         if occlusion is not None:
             active = result.record_decided(occlusion.is_clear(t, tau), active)
         step = quadrature.step(medium, ray, t, delta, t_next, state.carry, active, color is not None)
@@ -486,13 +494,13 @@ def march_primal(ray: LocalRay, t0: Float, t1: Float, request: MarchRequest) -> 
             shader = color
             pending = pending + weight
             shaded = active & (pending > settings.color_cutoff)
-            if samples is None:
+            if deferred is None:
                 contribution = dr.if_stmt(
                     (shaded,), shaded, lambda lit: step.shade(shader, lit), lambda lit: shader.zero(), label="colour"
                 )
                 result.color = result.color + pending * contribution
             else:
-                samples = samples.add(shaded, step.color_distance, pending)
+                deferred = deferred.add(shaded, step.color_distance, pending)
             pending = dr.select(shaded, 0, pending)
             if result.color_evals is not None:
                 result.color_evals = result.color_evals + dr.select(shaded, 1, 0)
@@ -502,7 +510,7 @@ def march_primal(ray: LocalRay, t0: Float, t1: Float, request: MarchRequest) -> 
             active = result.record_decided(occlusion.is_hidden(t_next, result.tau), active)
         active = active & (t_next < t1) & (result.tau < end)
         fraction = None if state.fraction is None else Float(1)
-        return (_StepState(active, t_next, fraction, step.carry, pending, result, samples),)
+        return (_StepState(active, t_next, fraction, step.carry, pending, result, deferred),)
 
     start = _StepState(
         request.active,
@@ -512,13 +520,13 @@ def march_primal(ray: LocalRay, t0: Float, t1: Float, request: MarchRequest) -> 
         quadrature.init_carry(Float),
         None if color is None else Float(0),
         request.init_result(Float),
-        _ShadedSamples.zero(Float) if color is not None and medium.is_density_separate else None,
+        _DeferredSamples.zero(Float, num_deferred) if num_deferred else None,
     )
     (state,) = dr.while_loop((start,), lambda state: state.active, body, label="march")
     result = state.result
     if color is not None:
-        if state.samples is not None:
-            result.color = state.samples.shade(medium, ray, color)
+        if state.deferred is not None:
+            result.color = state.deferred.shade(medium, ray, color)
         # Samples whose total weight stayed below the cut-off take the mean colour of the others.
         shaded_weight = absorbed_fraction(result.tau) - state.pending
         result.color *= dr.select(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,6 @@ from nerg_mi.maths.arrays import to_vector
 from nerg_mi.maths.types import variant_types
 from nerg_mi.transport.field_medium import FieldMedium, make_color_shader
 from nerg_mi.transport.geometry import SceneGeometry, default_march_settings
-from nerg_mi.transport.march_primal import default_color_cutoff
 
 from .base import SILENT, Reporter, select_backend
 from .radiance_commands import CompileOptions
@@ -85,7 +84,7 @@ def compile_field(
         except NergError as error:
             if result is None:
                 raise
-            reporter.warn(f"{error}; the field is compiled at the resolution {tried[-1].resolution}")
+            reporter.warn(f"{error}; the field is compiled at {tried[-1].resolution}, which does not reach the aims")
             break
         result = _with_voxels(field, voxels)
         compiled, compiled_seconds = _render(result, rays)
@@ -147,7 +146,7 @@ def _render(field: RadianceField, rays: tuple[np.ndarray, np.ndarray]) -> tuple[
     mi: Any = variant_types()
     medium = FieldMedium(field)
     geometry = SceneGeometry(medium)
-    settings = replace(default_march_settings(geometry), color_cutoff=default_color_cutoff(medium))
+    settings = default_march_settings(geometry)
     o, d = (to_vector(mi.Point3f, part) for part in rays)
     shader, fastest = make_color_shader(medium, mi.Color3f), np.inf
     active = dr.full(mi.Bool, True, len(rays[0]))
@@ -172,7 +171,7 @@ def _compare(reference: np.ndarray, compiled: np.ndarray, voxels: VoxelGrid, spe
     difference = np.abs(reference[both, 4] - compiled[both, 4])
     mse = float(np.mean((reference[:, :3] - compiled[:, :3]) ** 2, dtype=np.float64))
     median, high = np.quantile(difference, [0.5, 0.99]).tolist() if both.any() else (0.0, 0.0)
-    return CompiledError(voxels.resolution, voxels.arrays.size, median, high, -10 * np.log10(max(mse, 1e-12)), speedup)
+    return CompiledError(voxels.resolution, voxels.size, median, high, -10 * np.log10(max(mse, 1e-12)), speedup)
 
 
 def _describe(error: CompiledError) -> str:

@@ -20,7 +20,7 @@ from nerg_mi.maths.geometry import Box, ContractedBox
 from nerg_mi.transport.field_medium import FieldMedium, make_color_shader
 from nerg_mi.transport.geometry import trace_depth
 from nerg_mi.transport.march import march
-from nerg_mi.transport.march_primal import MarchSettings
+from nerg_mi.transport.march_primal import MarchSettings, count_deferred
 
 RESOLUTION = 24
 BOX = Box((-1, -2, 0), (3, 2, 4))
@@ -183,8 +183,8 @@ def test_a_finer_search_starts_from_coarse_voxels():
     bits = np.zeros((8, 8, 8), bool)
     bits[2:4, 3:6, 1:3] = True
     field = make_field(occupancy=OccupancyGrid(bits, ns, 0.0))
-    direct = compile_density(field, 64).arrays
-    started = compile_density(field, 64, compile_density(field, 32)).arrays
+    direct = compile_density(field, 64).to_arrays()
+    started = compile_density(field, 64, compile_density(field, 32)).to_arrays()
     for name in ("blocks", "masks", "log_density"):
         assert np.array_equal(getattr(direct, name), getattr(started, name))
     # Cells outside the occupancy of the field have no matter.
@@ -253,7 +253,7 @@ def test_files_and_updates(tmp_path):
     assert np.array_equal(loaded.density(p).numpy(), field.density(p).numpy())
     features = [f.numpy() for f in loaded.density_features(p)[1]]
     assert np.array_equal(features, [f.numpy() for f in field.density_features(p)[1]])
-    loaded.set_parameters({name: v for name, v in loaded.parameters().items() if name.startswith("color_net.")})
+    loaded.set_parameters({"voxels.log_density": loaded.voxels.log_density})
     assert loaded.voxels is not None
     loaded.set_parameters({name: v for name, v in loaded.parameters().items() if name.startswith("density_net.")})
     assert loaded.voxels is None and not any("voxels" in name for name in loaded.parameters())
@@ -299,12 +299,17 @@ def test_a_scene_renders_differentiates_and_updates_compiled_fields(tmp_path):
     params[key] = type(params[key])(np.full(len(params[key]), -20, np.float16))
     params.update()
     assert np.array(mi.render(scene, spp=1))[..., 4].max() < 1e-3
+    # New weights of the density network are used in place of the voxels.
+    weights = next(k for k in params.keys() if k.endswith("density_net.0"))
+    params[weights] = 0.5 * params[weights]
+    params.update()
+    assert scene.integrator().medium.field.voxels is None
 
 
 @pytest.mark.parametrize("rule", ["constant", "linear"])
-@pytest.mark.parametrize("cutoff", [0.3, 1e-3])
+@pytest.mark.parametrize("cutoff", [0.3, 0.1, 1e-3])
 def test_shading_behind_the_march_changes_no_color(rule, cutoff):
-    """Exactly as long as no ray has more samples than are kept apart; closely if some have."""
+    """A cut-off of 1e-3 allows more samples than are deferred, so that they are shaded in their steps."""
     bits = np.zeros((16, 16, 16), bool)
     bits[4:12, 4:12, 4:12] = True
     field = make_field(offset=2.0, occupancy=OccupancyGrid(bits, ns, 0.0))
@@ -323,6 +328,7 @@ def test_shading_behind_the_march_changes_no_color(rule, cutoff):
         result = march(medium, ray, dr.maximum(ray.t_near, 0), ray.t_far, True, settings, color=shader, count=True)
         colors.append(np.array(result.color))
         counts.append(result.color_evals.numpy())
-    assert np.array_equal(*counts) and colors[0].max() > 0.2
-    assert (counts[0].max() > 4) == (cutoff < 0.1)
-    np.testing.assert_allclose(colors[1], colors[0], atol=1e-6 if cutoff > 0.1 else 0.05)
+    assert np.array_equal(*counts) and colors[0].max() > 0.2 and counts[0].max() > 1
+    assert counts[0].max() <= (count_deferred(Separate(field), cutoff) or np.inf)
+    assert [count_deferred(Separate(field), c) for c in (1, 0.3, 0.1, 0.099, 0)] == [0, 3, 9, 0, 0]
+    np.testing.assert_allclose(colors[1], colors[0], atol=1e-6)
