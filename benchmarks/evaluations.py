@@ -1,11 +1,12 @@
 """Density evaluations of a frame, and the time and error of each setting that saves some of them.
 
     python benchmarks/evaluations.py SCENE.xml [-D KEY=VALUE] [--width 640] [--height 360] [--repeats 7]
-    [--out out/benchmarks/evaluations.csv] [--update docs/explanation/error-and-time.md]
+    [--compiled FIELD.safetensors] [--out out/benchmarks/evaluations.csv] [--update docs/explanation/error-and-time.md]
 
 Each row of the table is the scene with some parameters of the integrator. Errors and speed-ups are relative to the
-first row, which marches all occupied cells and each observer ray to its end. Times are CPU times for colour and gaze
-together, medians over rounds in which all rows take turns.
+first row, which marches all occupied cells and each observer ray to its end. With --compiled (repeatable) the rows are
+the scene's field and these compiled copies of it, which the value "field" of the scene file names. Times are CPU times
+for colour and gaze together, medians over rounds in which all rows take turns.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from __future__ import annotations
 import argparse
 import statistics
 import time
+from functools import partial
 from pathlib import Path
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
@@ -44,6 +46,7 @@ HEAD = (
     "depth error, 99.9 % quantile, mm",
     "gaze MAE",
 )
+COMPILED_HEAD = (*HEAD, "depth error, median, mm", "visibility differs by over 0.5, % of pixels")
 
 
 def main(argv=None) -> None:
@@ -80,22 +83,31 @@ def main(argv=None) -> None:
         type=Path,
         help="Page of the manual whose tables below the same headings are replaced. Default: none.",
     )
+    parser.add_argument(
+        "--compiled", type=Path, action="append", default=[], help="Compiled copy of the scene's field. Default: none."
+    )
     args = parser.parse_args(argv)
     defaults = dict(word.split("=", 1) for word in args.define)
-    subject = load_subject(args.scene, args.width, args.height, defaults)
+    load = lambda **values: load_subject(args.scene, args.width, args.height, {**defaults, **values})
+    subject = load()
+    settings = [(subject, *row) for row in ROWS]
+    if args.compiled:
+        fields = {"field": subject, **{path.stem: load(field=str(path.absolute())) for path in args.compiled}}
+        settings = [(of_field, name, AOVS, {}) for name, of_field in fields.items()]
+        settings += [(of_field, f"{name}, map", AOVS, {"visibility": "map"}) for name, of_field in fields.items()]
     pixels = args.width * args.height
 
     def aovs(names: str) -> str:
         return names if subject.has_gaze else names.replace(",gaze", "")
 
     made, rows, first = [], [], None
-    for name, wanted, params in ROWS:
+    for of_field, name, wanted, params in settings:
         counts = f"{aovs(wanted)},density_evals,color_evals"
-        seen = subject.render_channels(subject.make_integrator({**params, "aovs": counts}), 1, 1)
-        integrator = subject.make_integrator({**params, "aovs": aovs(wanted)})
+        seen = of_field.render_channels(of_field.make_integrator({**params, "aovs": counts}), 1, 1)
+        render = partial(of_field.render, of_field.make_integrator({**params, "aovs": aovs(wanted)}), 1, 1)
         for _ in range(2):  # the second frame uses cached data of the observer, with another kernel
-            subject.render(integrator, 1, 1)
-        made.append(integrator)
+            render()
+        made.append(render)
         first = first or seen
         off = np.abs(seen["depth"] - first["depth"])
         square = np.mean((seen["color"] - first["color"]) ** 2)
@@ -108,13 +120,15 @@ def main(argv=None) -> None:
                 "depth_mae": float(off.mean()),
                 "depth_999": float(np.quantile(off, 0.999)),
                 "gaze_mae": float(np.abs(seen["gaze"] - first["gaze"]).mean()) if subject.has_gaze else 0.0,
+                "depth_median": float(np.median(off)),
+                "wrong": float(np.mean(np.abs(seen["visibility"] - first["visibility"]) > 0.5)),
             }
         )
     taken = [[] for _ in made]
     for _ in range(args.repeats):
-        for integrator, times in zip(made, taken):
+        for render, times in zip(made, taken):
             started = time.process_time()
-            subject.render(integrator, 1, 1)
+            render()
             times.append(time.process_time() - started)
     for row, times in zip(rows, taken):
         row["us"] = 1e6 * statistics.median(times) / pixels
@@ -130,10 +144,12 @@ def main(argv=None) -> None:
             f"{1e3 * r['depth_mae']:.4f}",
             f"{1e3 * r['depth_999']:.3f}",
             f"{r['gaze_mae']:.1e}",
+            *([f"{1e3 * r['depth_median']:.2f}", f"{100 * r['wrong']:.2f}"] if args.compiled else ()),
         ]
         for r in rows
     ]
-    print_table(f"Evaluations, {subject.name}", HEAD, shown, args.update)
+    title, head = ("Compiled fields", COMPILED_HEAD) if args.compiled else ("Evaluations", HEAD)
+    print_table(f"{title}, {subject.name}", head, shown, args.update)
 
 
 if __name__ == "__main__":

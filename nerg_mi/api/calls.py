@@ -40,7 +40,7 @@ def report_progress(progress: Progress, options: type | None = None) -> Iterator
             reporter = WarningReporter() if not shows else NotebookReporter() if is_notebook() else TerminalReporter()
             with reporter as opened:
                 yield _ArgumentReporter(opened, names)
-        elif hasattr(progress, "progress"):
+        elif isinstance(progress, Reporter):
             yield _ArgumentReporter(progress, names)
         else:
             raise NergError(f"progress must be True, False or a Reporter, got {type(progress).__name__}")

@@ -17,7 +17,7 @@ from .arguments import resolve_file
 from .calls import Progress, report_progress
 from .fields import FilePath, TrainedField, load_field
 from .gaze import TrainedGazeField
-from .objects import build_options, copy_from_session, resolve_rays, session_folder
+from .objects import as_file, build_options, copy_from_session, resolve_rays, session_folder
 
 if TYPE_CHECKING:
     from nerg_mi.fields.radiance import RadianceField
@@ -123,16 +123,16 @@ def compile_field(
     >>> small.provenance["compiled"]["resolution"]
     128
     """
-    from nerg_mi.workflows.compile import compile_field as compile_network
+    from nerg_mi.workflows import compile as compilation
 
     with report_progress(progress, CompileOptions) as reporter:
         resolved = build_options(CompileOptions, "compile_field", options, overrides)
+        if output is not None:
+            compilation.compile_checkpoint(as_file(field, "field"), output, resolved, reporter)
+            return load_field(output)
         original = load_field(field) if isinstance(field, (str, os.PathLike)) else field
-        result = compile_network(original.network, resolved, reporter)
-    compiled = TrainedField(result.field, {**original.provenance, "compiled": asdict(result.error)})
-    if output is None:
-        return compiled
-    return TrainedField(compiled.network, compiled.provenance, Path(output).name, compiled.save(output))
+        result = compilation.compile_field(original.network, resolved, reporter)
+    return TrainedField(result.field, {**original.provenance, "compiled": asdict(result.error)})
 
 
 def train_gaze(

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 from nerg_mi import __version__, llvm
 from nerg_mi.threads import set_thread_count
@@ -156,6 +156,7 @@ def import_function(function: str) -> Callable[..., Any]:
 # ---- Reporters: a terminal, a notebook, or none ----
 
 
+@runtime_checkable
 class Reporter(Protocol):
     """Receives messages and progress of a workflow.
 

@@ -111,6 +111,8 @@ LONG = {"ablate", "study", "train_radiance"}
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.nightly] * (n in LONG)) for n in nerg.__all__])
 def test07_examples_run(name, tmp_path, request):
+    if name == "view":
+        pytest.importorskip("viser", reason="viser, of the extra viewer, is not installed")
     value = getattr(nerg, name)
     (test,) = doctest.DocTestFinder(recurse=False).find(value, name, globs={"folder": tmp_path})
     assert test.examples, f"the docstring of {name} has no example"
