@@ -23,7 +23,12 @@ Neural radiance and gaze fields (:monosp:`nerg`)
  * - (nested)
    - :paramtype:`integrator`
    - Lights the shapes of the scene; its AOVs follow those of ``nerg``. Without one, ``path`` lights the shapes of a
-     scene with emitters, and the shapes of other scenes show their albedo.
+     scene with emitters, and a headlight those of other scenes.
+
+ * - headlight
+   - |float|
+   - Shading of shapes in a scene without emitters, 0 to 1: the fraction of their brightness that depends on the angle
+     between the normal and the ray. 0 shows the plain albedo. (Default: 0.7)
 
  * - kde
    - :paramtype:`volume`
@@ -231,7 +236,7 @@ from nerg_mi.registration import register
 from nerg_mi.transport import aovs as nerg_aovs
 from nerg_mi.transport import observer
 from nerg_mi.transport.depth import DEPTHS
-from nerg_mi.transport.geometry import Ceiling, Shading
+from nerg_mi.transport.geometry import HEADLIGHT, Ceiling, Shading
 from nerg_mi.transport.jit import gc_paused, is_recording
 from nerg_mi.transport.march_primal import (
     MarchSettings,
@@ -410,6 +415,7 @@ def describe(nerg) -> str:
         "integral_tolerance": observer_settings.integral_tolerance,
         "depth": observer_settings.depth,
         "surface_opacity": observer_settings.surface_opacity,
+        "headlight": nerg.shading.headlight,
         "radiance": nerg.radiance,
         "ceiling": "none" if nerg.ceiling is None else nerg.ceiling,
         "aovs": ",".join(nerg.aovs),
@@ -456,7 +462,8 @@ class NergIntegrator(mi.SamplingIntegrator):
         self._children = read_children(props)
         self.medium, self._frozen_bound = make_medium(self._children)
         self.gaze = make_gaze(self._children, self.medium)
-        self.observer, self.shading = self._children["observer"], Shading(self._children["integrator"])
+        self.observer = self._children["observer"]
+        self.shading = Shading(self._children["integrator"], read_number(props, "headlight", HEADLIGHT, Range(0, 1)))
         check_observer(self.observer)
 
         self.occlusion = read_boolean(props, "occlusion", True)

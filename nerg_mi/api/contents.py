@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from nerg_mi.errors import NergError, translate_mitsuba_errors
 from nerg_mi.fields.splats import Splats
 from nerg_mi.files.atomic import replace_atomically, write_text
-from nerg_mi.formats.meshes import MeshFile, read_mesh_file
+from nerg_mi.formats.meshes import MeshFile, read_mesh_file, with_shading_normals
 from nerg_mi.formats.splats import choose_plugin, write_ply_splats
 from nerg_mi.formats.surfaces import write_volume
 from nerg_mi.maths.color import decode_srgb
@@ -222,7 +222,7 @@ def load_mesh_child(path: str | os.PathLike[str]) -> dict[str, Any] | MeshFile:
     log: Any = mi.Log  # missing in the stubs
     for note in mesh.notes:
         log(mi.LogLevel.Warn, f"{path}: {note}")
-    if mesh.is_readable_by_mitsuba:
+    if mesh.is_readable_by_mitsuba and mesh.normals is not None:
         return {"type": Path(path).suffix.lower()[1:], "filename": str(path), "bsdf": _bsdf(mesh)}
     return mesh
 
@@ -231,7 +231,8 @@ def load_mesh(mesh: MeshFile, name: str) -> Any:
     """Return a mesh in memory as a Mitsuba shape with the id ``name``."""
     from nerg_mi.surfaces.mesh import mitsuba_mesh
 
-    shape = mitsuba_mesh(mesh.vertices, mesh.faces, name, _bsdf(mesh))
+    mesh = with_shading_normals(mesh)
+    shape = mitsuba_mesh(mesh.vertices, mesh.faces, name, _bsdf(mesh), mesh.normals)
     attribute, colors = ("face_color", mesh.face_colors) if mesh.colors is None else ("vertex_color", mesh.colors)
     if colors is not None:
         shape.add_attribute(attribute, 3, colors.astype(np.float32).ravel())
@@ -427,7 +428,7 @@ class _ContentWriter:
     def make_node(self, name: str, value: Any, is_top: bool = False) -> Node:
         if isinstance(value, MeshFile):
             file = self._file(name, ".ply")
-            write_mesh(file, value)
+            write_mesh(file, with_shading_normals(value))
             self.written.append(file)
             return self._make_plugin(name, {"type": "ply", "filename": str(file), "bsdf": _bsdf(value)}, is_top)
         if isinstance(value, (FieldVolume, GridVolume)):

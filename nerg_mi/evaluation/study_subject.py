@@ -55,6 +55,7 @@ def read_parameters(integrator) -> dict:
     return out | {
         "falloff": float(integrator.falloff[0]),
         **{n: getattr(observer, n) for n in observer_names},
+        "headlight": integrator.shading.headlight,
         "background": np.array(integrator.background, float).ravel().tolist(),
     }
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -122,6 +122,51 @@ def read_mesh_file(path: str | os.PathLike, allow_points: bool = False, suffix: 
             raise ValueError(f"it has a face with an index beyond its {len(mesh.vertices):,} vertices")
     check_near_origin(mesh.vertices, f'the mesh "{path}"')
     return mesh
+
+
+# ---- Normals for shading ----
+
+MAX_CREASED_FACES = 500_000  # Faces of a mesh without normals up to which creases are searched
+_CREASE = np.cos(np.radians(40))
+
+
+def with_shading_normals(mesh: MeshFile) -> MeshFile:
+    """Return ``mesh`` with normals that are smooth except across creases, edges whose faces differ by over 40 degrees.
+
+    Vertices at creases are duplicated. A mesh that has normals, or more than `MAX_CREASED_FACES` faces, is returned
+    unchanged: the triangles of such a scan are too small to be distinguished.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    if mesh.normals is not None or not 0 < len(mesh.faces) <= MAX_CREASED_FACES:
+        return mesh
+    # Files duplicate vertices where colours or textures differ, which are not creases.
+    welded = np.unique(mesh.vertices, axis=0, return_inverse=True)[1].reshape(-1)[mesh.faces]
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    area_normals = np.cross(b - a, c - a)
+    unit = area_normals / np.maximum(np.linalg.norm(area_normals, axis=1, keepdims=True), 1e-300)
+    # Half-edges by their corners at the smaller and at the larger vertex; equal ones belong to adjacent faces.
+    corner = np.arange(welded.size).reshape(-1, 3)
+    ends, corners = (np.stack([v, np.roll(v, -1, axis=1)], axis=-1).reshape(-1, 2) for v in (welded, corner))
+    order = np.argsort(ends, axis=1)
+    ends, corners = np.take_along_axis(ends, order, axis=1), np.take_along_axis(corners, order, axis=1)
+    by_edge = np.lexsort(ends.T)
+    ends, corners = ends[by_edge], corners[by_edge]
+    face = corners[:, 0] // 3
+    is_smooth = (ends[1:] == ends[:-1]).all(axis=1) & ((unit[face[1:]] * unit[face[:-1]]).sum(axis=1) > _CREASE)
+    first, second = corners[:-1][is_smooth].ravel(), corners[1:][is_smooth].ravel()
+    links = coo_array((np.ones(len(first), bool), (first, second)), shape=(welded.size, welded.size))
+    count, group = connected_components(links, directed=False)
+    normals = np.stack([np.bincount(group, np.repeat(n, 3), count) for n in area_normals.T], axis=1)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.where(length > 0, normals / np.maximum(length, 1e-300), (0.0, 0.0, 1.0))
+    keys, faces = np.unique(group * len(mesh.vertices) + mesh.faces.ravel(), return_inverse=True)
+    group, vertex = np.divmod(keys, len(mesh.vertices))
+    colors = None if mesh.colors is None else mesh.colors[vertex]
+    return replace(
+        mesh, vertices=mesh.vertices[vertex], faces=faces.reshape(-1, 3), normals=normals[group], colors=colors
+    )
 
 
 class _Triangles(NamedTuple):

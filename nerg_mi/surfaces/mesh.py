@@ -360,18 +360,29 @@ class SurfaceTarget:
         return RayEnds(face, np.where(is_on_surface[:, None], barycentric, 0.0), is_hit & ~is_on_surface)
 
 
-def mitsuba_mesh(vertices: np.ndarray, faces: np.ndarray, name: str, bsdf: Mapping[str, Any] | None = None) -> Any:
-    """Create a Mitsuba mesh in the active variant, with the id ``name`` and a ``bsdf`` given as a dict."""
+def mitsuba_mesh(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    name: str,
+    bsdf: Mapping[str, Any] | None = None,
+    normals: np.ndarray | None = None,
+) -> Any:
+    """Create a Mitsuba mesh in the active variant, with the id ``name`` and a ``bsdf`` given as a dict.
+
+    ``normals`` (V, 3): of the vertices; None: flat faces.
+    """
     import mitsuba as mi
 
     props = mi.Properties()
     props.set_id(name)
     if bsdf is not None:
         props["bsdf"] = mi.load_dict(dict(bsdf))
-    mesh: Any = mi.Mesh(name, len(vertices), len(faces), props=props)
+    mesh: Any = mi.Mesh(name, len(vertices), len(faces), props=props, has_vertex_normals=normals is not None)
     params: Any = mi.traverse(mesh)
     params["vertex_positions"] = np.ravel(vertices).astype(np.float32)
     params["faces"] = np.ravel(faces).astype(np.uint32)
+    if normals is not None:
+        params["vertex_normals"] = np.ravel(normals).astype(np.float32)
     params.update()
     return mesh
 

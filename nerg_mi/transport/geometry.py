@@ -285,18 +285,30 @@ def _cast(scene: Any, ray: Ray3f | SceneRay, active: Bool) -> tuple[Any, Float]:
 
 # ---- Shading ----
 #
-# Radiance behind a medium: shapes lit by a nested integrator or shown by their albedo, or the background.
+# Radiance behind a medium: shapes lit by a nested integrator or, without light, by a headlight, or the background.
+
+HEADLIGHT = 0.7
+"""Default fraction of the brightness of shapes without light that depends on their orientation."""
 
 
 class Shading:
     """Radiance from behind the medium.
 
-    ``nested``: a Mitsuba sampling integrator that lights the shapes. None: ``path`` if the scene has emitters and
-    shapes, otherwise shapes show their albedo. Raises ``NergError`` for integrators that do not compute radiance per
-    ray.
+    Parameters
+    ----------
+    nested : mi.SamplingIntegrator, optional
+        Lights the shapes. None: ``path`` if the scene has emitters and shapes, otherwise a headlight.
+    headlight : float
+        Shapes without light have the radiance albedo * (1 - headlight + headlight * |cos θ|), with the angle θ between
+        the normal and the ray. 0: the albedo.
+
+    Raises
+    ------
+    NergError
+        For integrators that do not compute radiance per ray.
     """
 
-    def __init__(self, nested: mi.SamplingIntegrator | None = None):
+    def __init__(self, nested: mi.SamplingIntegrator | None = None, headlight: float = HEADLIGHT):
         import mitsuba as mi
 
         # By name: each change of the variant creates that class again.
@@ -307,6 +319,7 @@ class Shading:
                 'radiance of single rays; use "path", "direct", "volpath" or another sampling integrator'
             )
         self.nested: mi.SamplingIntegrator | None = nested
+        self.headlight = headlight
         self._path: Any = None
 
     def radiance(
@@ -322,7 +335,7 @@ class Shading:
     ) -> tuple[Color, list[Float], Bool]:
         """``(radiance, AOVs of the nested integrator, shown)`` from behind the medium, or from geometry without one.
 
-        Derivatives are those of the nested integrator or of the albedo; the default ``path`` has none.
+        Derivatives are those of the nested integrator or of the headlight; the default ``path`` has none.
 
         Parameters
         ----------
@@ -362,7 +375,8 @@ class Shading:
                 shape = self._path.sample(scene, sampler, ray, None, hit)[0]
         else:
             si = ray_hit.shape_intersection.compute_surface_interaction(mi.Ray3f(ray), mi.RayFlags.All, hit)
-            shape = si.bsdf().eval_diffuse_reflectance(si, hit)
+            facing = dr.abs(dr.dot(si.sh_frame.n, ray.d))
+            shape = si.bsdf().eval_diffuse_reflectance(si, hit) * dr.fma(self.headlight, facing, 1 - self.headlight)
         return dr.select(hit, shape, behind), [], shown
 
     def aov_names(self) -> list[str]:

@@ -190,7 +190,9 @@ class OpenScene:
         """Render ``sensor`` with the AOV of ``overlay``."""
         options, first = self._options, self._done
         on_strip = lambda part, total: self._tell((first + part / total) / self._parts)
-        layers = render_layers(self.path, self.scene, sensor, overlay, options.spp, options.seed, on_strip)
+        layers = render_layers(
+            self.path, self.scene, sensor, overlay, options.spp, options.seed, on_strip, options.smoothing
+        )
         self._done += 1
         return layers
 

@@ -18,6 +18,7 @@ import numpy as np
 from nerg_mi.errors import NergError, translate_mitsuba_errors
 from nerg_mi.figures import style
 from nerg_mi.figures.overlay import Limits, Overlay, OverlayLayers, Style, find_overlay, shared_limits
+from nerg_mi.figures.shading import draw_outlines, smooth_on_surfaces
 from nerg_mi.figures.style import Provenance, find_colormap, make_provenance, rasterize, save
 from nerg_mi.files.atomic import check_writable, replace_atomically, write_bytes
 from nerg_mi.files.safe_read import read_npy
@@ -31,10 +32,11 @@ from nerg_mi.rendering.scene_writer import project_to_pixel
 from nerg_mi.threads import set_thread_count
 from nerg_mi.transport.aovs import AOVS
 from nerg_mi.transport.observer import sensor_center
+from nerg_mi.transport.volume_medium import VolumeMedium
 
 from .base import SILENT, Reporter
 from .options import to_base
-from .scene_commands import FilmOptions, PictureOptions
+from .scene_commands import SMOOTHING, FilmOptions, PictureOptions
 
 if TYPE_CHECKING:
     from .parts import PartRunner, PlannedScene
@@ -65,7 +67,10 @@ Make = Callable[[Any, Any, OnBand], RenderedPicture]
 """Renders an image from a scene, a sensor, and a function that is called for each strip."""
 
 
-_OVERLAY_DEFAULTS = (("vmax", None), ("cmap", None), ("log_decades", 0.0), ("hatching", True))
+_OVERLAY_DEFAULTS = (("vmax", None), ("cmap", None), ("log_decades", 0.0), ("hatching", True), ("smoothing", SMOOTHING))
+_MIN_VISIBILITY = 1e-3
+"""Visibility from which a density is divided by it."""
+
 
 SUPPORT = 1.0
 """Support in rays below which the gaze of an observer counts as unknown: nothing was recorded within five radii of a
@@ -145,7 +150,9 @@ def render_overlays(
 
         def make(loaded: Any, camera: Any, on_strip: OnBand) -> RenderedPicture:
             check_memory(path, camera, options)
-            layers = render_layers(path, loaded, camera, overlay, options.spp, options.seed, on_strip)
+            layers = render_layers(
+                path, loaded, camera, overlay, options.spp, options.seed, on_strip, options.smoothing
+            )
             limits.append(overlay.limits(layers))
             height, width = layers.mask.shape
             if is_delayed:
@@ -207,11 +214,25 @@ def check_memory(path: Path, camera: Any, options: PictureOptions) -> None:
 
 
 def render_layers(
-    path: Path, loaded: Any, camera: Any, overlay: Overlay, spp: int = 0, seed: int = 0, on_strip: OnBand | None = None
+    path: Path,
+    loaded: Any,
+    camera: Any,
+    overlay: Overlay,
+    spp: int = 0,
+    seed: int = 0,
+    on_strip: OnBand | None = None,
+    smoothing: float = 0.0,
 ) -> OverlayLayers:
-    """Render ``camera`` with the AOV of ``overlay``; also return the observer's pixel and the data behind the AOV."""
+    """Render ``camera`` with the AOV of ``overlay``; also return the observer's pixel and the data behind the AOV.
+
+    Surfaces without light are outlined. ``smoothing``: standard deviation in degrees by which a density seen by a
+    perspective camera is smoothed on surfaces.
+    """
     quantity = overlay.quantity
-    aovs = list(dict.fromkeys([quantity.name, "opacity", "depth"]))
+    has_outlines = shows_unlit_surfaces(loaded)
+    sigma = smoothing * pixels_per_degree(camera) if quantity.display.kind == "heat" else 0.0
+    aovs = [quantity.name, "opacity", "depth", *["position"] * has_outlines, *["visibility"] * (sigma > 0)]
+    aovs = list(dict.fromkeys(aovs))
     with translate_mitsuba_errors():
         channels = render_aovs(path, loaded, camera, aovs, spp, seed, on_strip)
     if overlay.name not in channels.aovs:
@@ -219,7 +240,37 @@ def render_layers(
     marker = observer_pixel(loaded, camera, channels.aovs["depth"])
     supported = not quantity.needs_support or is_supported(loaded, camera)
     basis = describe_basis(loaded, quantity.data_source)
-    return OverlayLayers(channels.color, channels.aovs[overlay.name], channels.mask, marker, supported, basis)
+    color, values = channels.color, channels.aovs[overlay.name]
+    if has_outlines:
+        position = np.stack([channels.aovs[f"position.{axis}"] for axis in "XYZ"], axis=-1)
+        color = draw_outlines(color, position, channels.mask)
+    if sigma > 0:
+        # Smooth the density without the shadows, whose borders stay sharp.
+        visible = channels.aovs["visibility"] if loaded.integrator().occlusion else 1.0
+        weights = np.where(channels.mask, visible, 0.0)
+        unoccluded = np.divide(values, weights, out=np.zeros_like(weights), where=weights > _MIN_VISIBILITY)
+        weights = np.where(weights > _MIN_VISIBILITY, weights, 0.0)
+        values = weights * smooth_on_surfaces(unoccluded, weights, channels.aovs["depth"], sigma)
+        basis = "; ".join(filter(None, [basis, f"smoothed by {smoothing:g}°"]))
+    return OverlayLayers(color, values, channels.mask, marker, supported, basis)
+
+
+def shows_unlit_surfaces(loaded: Any) -> bool:
+    """Return whether the surfaces of a scene have neither light nor colours of photos: shapes without emitters, or hit
+    points."""
+    integrator = loaded.integrator()
+    is_volume = integrator.medium is None or isinstance(integrator.medium, VolumeMedium)
+    return is_volume and integrator.shading.nested is None and not len(loaded.emitters())
+
+
+def pixels_per_degree(camera: Any) -> float:
+    """Return the pixels per degree in the centre of the image of a perspective ``camera``; 0 for other cameras."""
+    import mitsuba as mi
+
+    if camera.class_name() != "PerspectiveCamera":
+        return 0.0
+    half = np.radians(float(np.ravel(np.array(mi.traverse(camera)["x_fov"]))[0])) / 2
+    return float(np.radians(1) * camera.film().size()[0] / 2 / np.tan(half))
 
 
 def describe_basis(loaded: Any, part: str = "gaze") -> str:
@@ -272,7 +323,7 @@ def observer_pixel(loaded: Any, camera: Any, depth: np.ndarray) -> tuple[float, 
 
 VIDEO = ".mp4"
 
-_RECORDED_OPTIONS = ("overlay", "vmax", "cmap", "log_decades", "hatching")
+_RECORDED_OPTIONS = ("overlay", "vmax", "cmap", "log_decades", "hatching", "smoothing")
 
 RESERVE = 150e6
 """Bytes reserved in addition to a band: for its strips and the first kernel compilation."""
@@ -690,7 +741,8 @@ def make_layers(options: PictureOptions, scene: PlannedScene, output: Path) -> d
         loaded = load_scene(path, scene.defaults)
         camera = find_sensor(path, loaded, options.sensor)
         check_memory(path, camera, options)
-        layers = render_layers(path, loaded, camera, overlay, options.spp, options.seed, lambda *_: stop.check())
+        check = lambda *_: stop.check()
+        layers = render_layers(path, loaded, camera, overlay, options.spp, options.seed, check, options.smoothing)
         stop.check()
     with replace_atomically(output) as temporary, temporary.open("wb") as out:
         np.save(out, stack_layers(layers))

@@ -49,7 +49,6 @@ from .scene_cameras import (
 )
 from .scene_commands import SceneOptions
 from .scene_places import (
-    LAMP,
     InputFiles,
     WrittenGeometry,
     colors_path,
@@ -220,7 +219,7 @@ def write_scene(
             probe_file,
             scene.text(probe_file.parent, observer or make_upright(LookAt(np.zeros(3), up), up), Lens(), 96).to_xml(),
         )
-        taken = place.make(probe_file.parent, scene.lamps(1, 1)).reserved_names
+        taken = place.make(probe_file.parent, scene.center).reserved_names
         values = {free_default_name(name, taken): value for name, value in probe_values().items()}
         probe = SceneProbe(load_scene(probe_file, values), scene.attention(probe_file.parent).quantity, up)
         reporter.progress(0.3, "probing the surroundings")
@@ -233,10 +232,8 @@ def write_scene(
         reporter.progress(0.5, "searching for the best camera")
         camera, lens, camera_note = _camera(scene, probe, seen, options, reporter)
         camera = make_upright(camera, up)
-        usual = seen.median_depth if seen is not None and seen.median_depth > 0 else 0.0
-        away = float(np.linalg.norm(camera.target - camera.origin))
-        scene = replace(scene, usual=(max(away, usual), usual), extent=probe.extent(camera, scene.observer))
-        if inputs.kind in ("mesh", "scene") and scene.extent < SMALLEST:
+        scene = replace(scene, extent=probe.extent(camera, scene.observer))
+        if inputs.kind == "scene" and scene.extent < SMALLEST:
             reporter.warn(
                 f"the scene is {scene.extent:.3g} units large, and Mitsuba offsets rays from surfaces by at least "
                 "1e-4 units, so light leaks through walls; scale the scene to metres"
@@ -279,8 +276,6 @@ class _Draft:
     up: np.ndarray
     observer: LookAt | None
     tracked: bool
-    # Typical distances of surfaces from the camera and from the observer, for lamps.
-    usual: tuple[float, float] = (1.0, 1.0)
     extent: float = 10.0
 
     @property
@@ -294,15 +289,14 @@ class _Draft:
         align = None if self.align.is_identity else self.align.matrix
         return GazeFiles(name(self.inputs.gaze), name(self.inputs.rays), align)
 
-    def lamps(self, camera: float, eye: float) -> dict[str, float]:
-        """Return the intensities of lamps by the `<default>` of their position."""
-        if self.observer is None:
-            return {"camera": LAMP * camera**2}
-        return {"eye": LAMP * max(eye, 0.1 * camera) ** 2, "camera": 0.5 * LAMP * camera**2}
+    @property
+    def center(self) -> str:
+        """Name of the `<default>` of the observer's position."""
+        return "camera" if self.observer is None else "eye"
 
     def text(self, folder: Path, camera: LookAt, lens: Lens, width: int) -> SceneText:
         """Return the scene as written to ``folder``."""
-        place = self.place.make(folder, self.lamps(*self.usual))
+        place = self.place.make(folder, self.center)
         return SceneText(
             place, self.attention(folder), camera, self.observer, self.up, lens, width, self.unit, self.extent
         )
@@ -324,6 +318,8 @@ def _check_options(options: SceneOptions) -> None:
         )
     if options.time_range is not None and len(options.time_range) != 2:
         raise NergError(f"--time-range must be two times A,B, got {len(options.time_range)}")
+    for name in ("observer", "camera", "target", "up"):
+        check_point(getattr(options, name), f"--{name}")
 
 
 def _with_hits(

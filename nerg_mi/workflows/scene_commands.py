@@ -81,6 +81,21 @@ def _log_decades(what: str) -> Any:
     return option(0.0, help, within=LOG_DECADES, group=VIEW)
 
 
+SMOOTHING = 1.0
+"""Default smoothing of figures in degrees: about the fovea, and the error of eye trackers."""
+
+
+def _smoothing() -> Any:
+    """Declare the field ``smoothing``."""
+    return option(
+        SMOOTHING,
+        "Standard deviation in degrees by which gaze is smoothed on surfaces before it is drawn; 0: as computed. "
+        "Images of perspective cameras only; .exr files are not smoothed.",
+        within=Range(0, 30),
+        group=VIEW,
+    )
+
+
 # ---- Images of a scene file ----
 
 _MAPS = "inferno, magma, plasma, viridis or cividis"
@@ -120,6 +135,7 @@ class PictureOptions(ValidatedDataclass):
     cmap: str | None = option(None, f"Colour map of the overlay: {_MAPS}.  [default: depends on the AOV]", group=VIEW)
     log_decades: float = _log_decades("the overlay's colour scale")
     hatching: bool = option(True, "Hatch the overlay where its value is unknown.", group=VIEW)
+    smoothing: float = _smoothing()
     frames: Path | None = option(
         None,
         "CSV file of an image sequence: the header names <default>s of the scene, each further line has their values "
@@ -365,6 +381,7 @@ class SceneFigureOptions(ScaleOptions):
     defaults: Mapping[str, str] | None = definitions()
     spp: int = _samples(0)
     seed: int = random_seed("sampling")
+    smoothing: float = _smoothing()
     mode: str | None = best_variant()
 
 

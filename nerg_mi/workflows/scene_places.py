@@ -12,7 +12,7 @@ from nerg_mi.errors import MissingFile, NergError, sanitize
 from nerg_mi.files.safe_read import check_regular_file, resolve_path, translate_read_errors
 from nerg_mi.formats.checkpoint import read_metadata
 from nerg_mi.formats.fields import matches_checksum
-from nerg_mi.formats.meshes import DEFAULT_GREY, READERS, MeshFile, read_mesh_file
+from nerg_mi.formats.meshes import DEFAULT_GREY, READERS, MeshFile, read_mesh_file, with_shading_normals
 from nerg_mi.formats.splats import choose_plugin, is_splat_file, read_splats, refuse_unsupported_splats
 from nerg_mi.formats.surfaces import write_volume
 from nerg_mi.maths.geometry import Similarity
@@ -34,6 +34,7 @@ from nerg_mi.rendering.scene_writer import (
     relative_path,
 )
 from nerg_mi.train.geometry import DEFAULT_DEPTH, shade_hits
+from nerg_mi.transport.geometry import HEADLIGHT
 
 from .base import Reporter
 from .geometry import find_training_file, geometry_key, read_training_alignment
@@ -276,8 +277,8 @@ def _frame(posed: PosedImages, photo: str) -> PosedFrame:
 
 # ---- Scene elements for each kind of geometry ----
 
-LAMP = 2.5
-"""Intensity of a lamp at distance 1 that gives about half of white on a grey surface."""
+NO_DATA_GREY = 0.65
+"""Grey behind hit points, so that their gaps are not mistaken for dark surfaces."""
 
 
 @dataclass(frozen=True)
@@ -287,8 +288,8 @@ class WrittenGeometry:
     Attributes
     ----------
     make
-        ``make(folder, lamps)`` returns its scene elements, with file names relative to that folder. If the geometry has
-        no light, lamps of these intensities are placed at ``$camera`` and ``$eye`` (names of `<default>`s).
+        ``make(folder, center)`` returns its scene elements, with file names relative to that folder; ``center`` names
+        the `<default>` of the observer's position.
     words
         Description for a comment.
     contracted
@@ -299,7 +300,7 @@ class WrittenGeometry:
         Sentences on its file: what is not used, and what was guessed.
     """
 
-    make: Callable[[Path, dict[str, float]], SceneContent]
+    make: Callable[[Path, str], SceneContent]
     words: str
     contracted: bool = False
     files: tuple[Path, ...] = ()
@@ -317,17 +318,17 @@ def write_scene_geometry(inputs: InputFiles, output: Path) -> WrittenGeometry:
         # Unusable files are rejected before a scene refers to them.
         splats = read_splats(_file(inputs)) if inputs.splats else None
         notes = () if splats is None else (*splats.assumptions, *splats.notes)
-        make = lambda folder, lamps: _field(_file(inputs), folder)
+        make = lambda folder, center: _field(_file(inputs), folder)
         return WrittenGeometry(make, _describe_geometry(inputs), contracted, notes=notes)
     if inputs.kind == "mesh":
         return _mesh(_file(inputs), output, _describe_geometry(inputs))
     if inputs.kind == "scene":
         path = _file(inputs)
         nest_scene(path, output.parent)
-        return WrittenGeometry(lambda folder, lamps: nest_scene(path, folder), _describe_geometry(inputs))
+        return WrittenGeometry(lambda folder, center: nest_scene(path, folder), _describe_geometry(inputs))
     if inputs.kind == "hits":
         return _hits(_file(inputs), output, _describe_geometry(inputs))
-    return WrittenGeometry(lambda folder, lamps: _direction_sphere(lamps), _describe_geometry(inputs))
+    return WrittenGeometry(lambda folder, center: _direction_sphere(center), _describe_geometry(inputs))
 
 
 def _describe_geometry(inputs: InputFiles) -> str:
@@ -364,30 +365,24 @@ def mesh_path(output: Path) -> Path:
 
 def _mesh(path: Path, output: Path, words: str) -> WrittenGeometry:
     mesh, shown = read_mesh_file(path), path
-    if not mesh.is_readable_by_mitsuba:
+    shaded = with_shading_normals(mesh)
+    if not mesh.is_readable_by_mitsuba or shaded is not mesh:
         shown = mesh_path(output)
         if resolve_path(shown) == resolve_path(path):
             raise NergError(f'"{path}" would be overwritten by a converted mesh; give the scene another name')
-        write_mesh(shown, mesh)
+        write_mesh(shown, shaded)
     kind = shown.suffix.lower().lstrip(".")
     color = _mesh_color(mesh)
-    light = element("integrator", prop("integer", "max_depth", 5), type="path")
 
-    def make(folder: Path, lamps: dict[str, float]) -> SceneContent:
+    def make(folder: Path, center: str) -> SceneContent:
         bsdf = element("bsdf", element("bsdf", color, type="diffuse"), type="twosided")
         shape = element("shape", prop("string", "filename", "$place"), bsdf, type=kind, id="place")
+        headlight = Comment("Without emitters, a headlight shows the mesh."), prop("float", "headlight", HEADLIGHT)
         return SceneContent(
-            integrator_children=(Comment("Integrator for the light on the mesh."), light),
-            scene_children=(
-                shape,
-                Comment("A mesh has no light: lamps at the camera and the observer."),
-                *_lamps(lamps),
-            ),
-            files={"place": _name(shown, folder)},
-            spp=64,
+            integrator_children=headlight, scene_children=(shape,), files={"place": _name(shown, folder)}
         )
 
-    return WrittenGeometry(make, words, files=() if mesh.is_readable_by_mitsuba else (shown,), notes=mesh.notes)
+    return WrittenGeometry(make, words, files=() if shown is path else (shown,), notes=mesh.notes)
 
 
 def _mesh_color(mesh: MeshFile) -> Node:
@@ -396,18 +391,6 @@ def _mesh_color(mesh: MeshFile) -> Node:
         return prop("rgb", "reflectance", DEFAULT_GREY)
     name = "face_color" if mesh.colors is None else "vertex_color"
     return element("texture", prop("string", "name", name), name="reflectance", type="mesh_attribute")
-
-
-def _lamps(lamps: dict[str, float]) -> list[Node]:
-    return [
-        element(
-            "emitter",
-            element("point", name="position", value=f"${name}"),
-            prop("rgb", "intensity", f"{intensity:.4g}"),
-            type="point",
-        )
-        for name, intensity in lamps.items()
-    ]
 
 
 def colors_path(output: Path) -> Path:
@@ -438,23 +421,23 @@ def _hits(path: Path, output: Path, words: str) -> WrittenGeometry:
     colors = colors_path(output)
     write_volume(colors, color, lower, end)
 
-    def make(folder: Path, lamps: dict[str, float]) -> SceneContent:
-        # As in `train.geometry.volume_dict`: interpolation would move surfaces towards the camera.
-        nearest, box = prop("string", "filter_type", "nearest"), prop("boolean", "use_grid_bbox", "true")
-        density = element(
-            "volume", prop("string", "filename", "$density"), box, nearest, name="density", type="gridvolume"
-        )
+    def make(folder: Path, center: str) -> SceneContent:
+        # Interpolation rounds the edges of voxels; it moves surfaces by less than half a voxel from where a training
+        # looked for them (`train.geometry.make_volume_dict`).
+        box = prop("boolean", "use_grid_bbox", "true")
+        density = element("volume", prop("string", "filename", "$density"), box, name="density", type="gridvolume")
         file = prop("string", "filename", "$color")
         raw = prop("boolean", "raw", "true")
         color = element("volume", file, box, raw, name="color", type="gridvolume")
         return SceneContent(
-            integrator_children=(density, color), files={"density": _name(path, folder), "color": _name(colors, folder)}
+            integrator_children=(density, color, prop("rgb", "background", NO_DATA_GREY)),
+            files={"density": _name(path, folder), "color": _name(colors, folder)},
         )
 
     return WrittenGeometry(make, words, files=(colors,))
 
 
-def _direction_sphere(lamps: dict[str, float]) -> SceneContent:
+def _direction_sphere(center: str) -> SceneContent:
     cells = element(
         "texture",
         prop("rgb", "color0", 0.24),
@@ -465,7 +448,7 @@ def _direction_sphere(lamps: dict[str, float]) -> SceneContent:
     )
     sphere = element(
         "shape",
-        element("point", name="center", value=f"${next(iter(lamps))}"),
+        element("point", name="center", value=f"${center}"),
         prop("float", "radius", f"{DEFAULT_DEPTH:g}"),
         prop("boolean", "flip_normals", "true"),
         element("bsdf", cells, type="diffuse"),

@@ -43,6 +43,7 @@ def test_settings_round_trip(rgb):
         "map_height": 64,
         "directions": 4096,
         "integral_tolerance": 0.125,
+        "headlight": 0.25,
         "background": [0.25, 0.5, 0.75],
     }
     density = {"type": "constvolume", "value": 3.0}

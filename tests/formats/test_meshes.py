@@ -512,3 +512,33 @@ def test_written_glb_follows_specification(image, faces):
     used = {name for m in document["materials"] for name in m.get("extensions", {})}
     assert used == set(document["extensionsUsed"]) and document["asset"]["version"] == "2.0"
     assert all(document["images"][t["source"]]["mimeType"] == "image/png" for t in document.get("textures", []))
+
+
+# ---- Normals for shading ----
+
+
+def test_shading_normals_keep_creases_and_smooth_the_rest(tmp_path):
+    box_mesh = trimesh.creation.box((4, 3, 2.5))
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    vertices = np.concatenate([box_mesh.vertices, ball.vertices + (9, 0, 0)])
+    faces = np.concatenate([box_mesh.faces, ball.faces + len(box_mesh.vertices)])
+    colors = np.random.default_rng(0).random((len(vertices), 3))
+    mesh = meshes.MeshFile(vertices, faces, np.arange(len(faces)), colors=colors)
+    shaded = meshes.with_shading_normals(mesh)
+    # The surface and its colours are unchanged; each face of the box has four vertices of its own.
+    assert np.array_equal(shaded.vertices[shaded.faces], vertices[faces])
+    assert np.array_equal(shaded.colors[shaded.faces], colors[faces])
+    assert len(shaded.vertices) == 24 + len(ball.vertices)
+    normals = shaded.normals[shaded.faces]
+    assert np.allclose(normals[:12], box_mesh.face_normals[:, None], atol=1e-12)
+    assert np.allclose(normals[12:], ball.vertices[ball.faces], atol=0.02)
+    assert meshes.with_shading_normals(shaded) is shaded
+
+
+def test_unwelded_faces_are_smoothed_across_duplicate_vertices():
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    soup = meshes.MeshFile(
+        ball.vertices[ball.faces].reshape(-1, 3), np.arange(ball.faces.size).reshape(-1, 3), np.arange(len(ball.faces))
+    )
+    shaded = meshes.with_shading_normals(soup)
+    assert np.allclose(shaded.normals, shaded.vertices, atol=0.02)

@@ -35,7 +35,7 @@ def closed_form(mi, sigma, eye, depth="expected", light=None):
     It shares no code with `nerg`: rays come from Mitsuba's sensors, distances from its ray casts, light on shapes from
     its integrators. `nerg` should return the same for each ray, for any film, sensor or enclosing integrator. Density
     `sigma` (0: vacuum) and `COLOR` from -1 to 1; visibility by transmittance to the point `eye` (None: everything with
-    a surface is visible). `light`: the integrator that lights shapes; None: they show their albedo.
+    a surface is visible). `light`: the integrator that lights shapes; None: a headlight.
     """
 
     def crossing(o, d, end):
@@ -84,7 +84,8 @@ def closed_form(mi, sigma, eye, depth="expected", light=None):
             if self.light is not None:
                 behind, seen, _ = self.light.sample(scene, sampler, ray, None, active)
             else:
-                behind, seen = dr.select(hit, si.bsdf().eval_diffuse_reflectance(si, hit), 0), hit
+                facing = 0.3 + 0.7 * dr.abs(dr.dot(si.n, ray.d))
+                behind, seen = dr.select(hit, si.bsdf().eval_diffuse_reflectance(si, hit) * facing, 0), hit
             L = T * behind + front * mi.Color3f(COLOR)
             p = dr.select(surface, p, 0)
             return L, seen | (opacity > 0), [z, opacity, p.x, p.y, p.z, dr.select(surface, visible, 0)]
@@ -264,7 +265,7 @@ def test07_textures(rgb):
     shapes = {"board": plugin("rectangle", to_world=turned, bsdf=bsdf)}
     shapes["ball"] = sphere(rgb, 0.7, 0, -0.7, radius=0.4) | {"bsdf": checkers}
     albedo = render(rgb, {"type": "aov", "aovs": "a:albedo"}, **shapes)
-    image = render(rgb, {"type": "nerg", "aovs": ""}, **shapes)
+    image = render(rgb, {"type": "nerg", "aovs": "", "headlight": 0.0}, **shapes)
     assert np.allclose(image[..., :3], albedo[..., -3:], atol=1e-5) and np.ptp(image[..., 0]) > 0.5
 
 

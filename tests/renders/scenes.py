@@ -106,6 +106,7 @@ def both(mi, folder, change=1.0):
         observer=make_observer(mi, -2, 0.8, -2),
         background=0.1,
         color={"type": "constvolume", "value": rgb_of(0.2, 0.4, 0.8)},
+        headlight=0,
     )
     return integrator, things(mi), ("depth.T", "visibility.Y", "B"), camera(mi, (1, 1, -3), size=SIZE)
 

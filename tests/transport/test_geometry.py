@@ -170,7 +170,7 @@ def test_shape_distance_derivative_of_the_shape(rgb):
 
 # ---- Shading ----
 #
-# Radiance from behind a medium: lit shapes, shapes by their albedo, an environment emitter, or the background.
+# Radiance from behind a medium: lit shapes, shapes with a headlight, an environment emitter, or the background.
 
 BACKGROUND = 0.125
 SAMPLES = 1 << 14
@@ -207,10 +207,23 @@ def shade(mi, scene, nested=None, medium=None, hide=False):
 SKY = {"type": "constant", "radiance": 2.0}
 
 
-def test01_shapes_without_light_show_their_albedo(rgb):
+def test01_shapes_without_light_show_their_albedo_where_they_face_the_ray(rgb):
     color, aovs, shown, shading = shade(rgb, scene_of(rgb))
     assert np.allclose(color, [[0.25, 0.5, 0.75], [BACKGROUND] * 3], atol=1e-6)
     assert shown.tolist() == [True, False] and aovs == [] and shading.aov_names() == []
+
+
+@pytest.mark.parametrize("headlight", [0.0, 0.7, 1.0])
+def test_headlight_depends_on_the_angle(rgb, headlight):
+    scene = scene_of(rgb)
+    ray = rgb.RayDifferential3f(rgb.Point3f(1, 0, 0), dr.normalize(rgb.Vector3f(0.5, 0, 2)))
+    view = SceneGeometry(None, scene).trace(ray, rgb.Bool(True), MarchSettings(0.01))
+    sampler = rgb.load_dict({"type": "independent"})
+    color = Shading(headlight=headlight).radiance(
+        scene, sampler, ray, None, view, rgb.Color3f(0), False, rgb.Bool(True)
+    )[0]
+    cosine = 2 / np.hypot(0.5, 2)
+    assert np.allclose(np.ravel(color), np.array([0.25, 0.5, 0.75]) * (1 - headlight + headlight * cosine), atol=1e-6)
 
 
 def test02_shapes_with_emitters_are_lit_by_path(rgb):

@@ -74,7 +74,9 @@ def scene_overlays(tmp_path_factory):
 
 def test_an_overlay_adds_its_quantity_to_the_scene(rgb, scene_overlays, tmp_path):
     recorder = Recorder()
-    made = render_file(scene_overlays, tmp_path / "a.png", PictureOptions(overlay="gaze", mode=MODE), recorder)
+    made = render_file(
+        scene_overlays, tmp_path / "a.png", PictureOptions(overlay="gaze", smoothing=0, mode=MODE), recorder
+    )
     loaded = load_scene(scene_overlays)
     rendered = render_aovs(scene_overlays, loaded, loaded.sensors()[0], ["gaze", "opacity"])
     assert made.vmax == pytest.approx(robust_max(rendered.aovs["gaze"], rendered.mask)) and made.files == (

@@ -348,7 +348,7 @@ def test_all_photo_cameras_are_loaded(photos):
         np.testing.assert_array_equal(camera.eye.origin, load_photo_camera(photos, str(k), {}).eye.origin)
 
 
-# ---- Geometries as parts of a scene: colours of meshes, lamps, and files of other types ----
+# ---- Geometries as parts of a scene: colours of meshes, and files of other types ----
 
 
 PLY = """ply
@@ -372,10 +372,8 @@ def write_input(path, kind):
     return InputFiles(path, kind, None, None, {}, {})
 
 
-def text_of(folder, path, kind, lamps=None):
-    place = write_scene_geometry(write_input(path, kind), folder / "out.xml").make(
-        folder, lamps or {"eye": 3.0, "camera": 1.5}
-    )
+def text_of(folder, path, kind, center="eye"):
+    place = write_scene_geometry(write_input(path, kind), folder / "out.xml").make(folder, center)
     return place, format_document([*place.integrator_children, *place.scene_children], "h")
 
 
@@ -393,8 +391,7 @@ def test_vertex_colours_of_a_mesh_are_used(rgb, tmp_path, names, values, said):
     (tmp_path / "a.ply").write_text(PLY.format(colors=colors, a=values))
     place, text = text_of(tmp_path, tmp_path / "a.ply", "mesh")
     assert said in text
-    assert place.files == {"place": "a.ply"} and text.count('<emitter type="point">') == 2
-    assert 'value="$eye"' in text and 'value="$camera"' in text
+    assert place.files == {"place": "out.mesh.ply"} and 'name="headlight"' in text and "<emitter" not in text
 
 
 @pytest.mark.parametrize(
@@ -463,7 +460,7 @@ def test_coloured_hit_points_are_written_next_to_the_scene(rgb, tmp_path):
     density[2:4] = 100
     write_volume(tmp_path / "a.vol", density, (0, 0, 0), (1, 0.8, 0.6))
     place, text = text_of(tmp_path, tmp_path / "a.vol", "hits")
-    assert place.files == {"density": "a.vol", "color": "out.color.vol"} and '"nearest"' in text
+    assert place.files == {"density": "a.vol", "color": "out.color.vol"} and '"nearest"' not in text
     colors = rgb.load_dict({"type": "gridvolume", "filename": str(colors_path(tmp_path / "out.xml")), "raw": True})
     assert tuple(np.array(rgb.traverse(colors)["data"]).shape) == (3, 4, 5, 3)
     write_volume(tmp_path / "rgb.vol", np.zeros((2, 2, 2, 3)), (0, 0, 0), (1, 1, 1))
