@@ -17,6 +17,7 @@ from .fields import FilePath
 from .objects import build_options, resolve_rays
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from nerg_mi.alignment.check import Alignment
@@ -325,6 +326,7 @@ def plot_rays(
     rays: Rays | FilePath,
     output: FilePath | None = None,
     *,
+    axes: Axes | None = None,
     options: PlotOptions | None = None,
     progress: Progress = None,
     **overrides: Any,
@@ -337,6 +339,8 @@ def plot_rays(
         The rays, or their file.
     output : path, optional
         Image to write (.png or .svg).
+    axes : matplotlib.axes.Axes, optional
+        Axes to draw in. Default: a new figure.
     options : PlotOptions, optional
         Base options (`nerg_mi.workflows.rays_commands.PlotOptions`).
     progress : bool, Reporter or None
@@ -360,9 +364,10 @@ def plot_rays(
     >>> len(nerg.plot_rays(rays).axes) > 0
     True
     """
+    from nerg_mi.figures.style import figure_of
     from nerg_mi.workflows.rays import plot_rays as plot
 
     with report_progress(progress, PlotOptions) as reporter:
         changes = overrides if output is None else {**overrides, "output": output}
         resolved = build_options(PlotOptions, "plot_rays", options, changes)
-        return plot(resolve_rays(rays), resolved, reporter)
+        return figure_of(plot(resolve_rays(rays), resolved, reporter, axes))

@@ -22,6 +22,7 @@ from .scene import COLOR, Scene, make_aov_context, resolve_quantities
 
 if TYPE_CHECKING:
     import mitsuba as mi
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
@@ -36,7 +37,7 @@ class Pictures(LabelledArrays):
     and ``result.gaze[0]`` are the gaze of the first observer.
     """
 
-    def plot(self, name: str | None = None, observer: int = 0) -> Figure:
+    def plot(self, name: str | None = None, observer: int = 0, *, axes: Axes | None = None) -> Figure:
         """Draw the image as a figure: its colour, with a quantity over it.
 
         Parameters
@@ -45,11 +46,13 @@ class Pictures(LabelledArrays):
             The quantity. Default: ``gaze`` if there is one, else ``color``.
         observer : int
             Index of the observer.
+        axes : matplotlib.axes.Axes, optional
+            Axes to draw in. Default: a new figure.
 
         Returns
         -------
         matplotlib.figure.Figure
-            The figure.
+            The figure, which a notebook shows.
 
         Raises
         ------
@@ -65,7 +68,7 @@ class Pictures(LabelledArrays):
         2
         """
         from nerg_mi.figures.overlay import OverlayLayers, find_overlay, srgb
-        from nerg_mi.figures.style import Sheet
+        from nerg_mi.figures.style import Sheet, figure_of
 
         name = name or ("gaze" if "gaze" in self else COLOR)
         needed = {name, COLOR, *([] if name == COLOR else ["opacity"])}
@@ -74,10 +77,10 @@ class Pictures(LabelledArrays):
         color = self[COLOR][observer]
         color = np.repeat(color, 3, axis=-1) if color.shape[-1] == 1 else color
         if name == COLOR:
-            return Sheet([srgb(color)], [""]).page
+            return Sheet([srgb(color)], [""], panels=axes).page
         overlay = find_overlay(name)
         layers = OverlayLayers(color, self[name][observer], self["opacity"][observer] >= SURFACE_OPACITY)
-        return overlay.draw(layers, overlay.limits(layers))
+        return figure_of(overlay.draw(layers, overlay.limits(layers), axes=axes))
 
     def _repr_html_(self) -> str | None:
         """The image of the first observer, for notebooks, if it can be drawn."""

@@ -33,6 +33,7 @@ from .fields import FilePath, TrainedField, activate_mitsuba
 
 if TYPE_CHECKING:
     import mitsuba as mi
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from nerg_mi.transport.geometry import SceneGeometry
@@ -209,7 +210,13 @@ class Scene:
         return path
 
     def show(
-        self, quantity: str | None = None, *, observer: ArrayLike | None = None, spp: int = 16, **settings: Any
+        self,
+        quantity: str | None = None,
+        *,
+        observer: ArrayLike | None = None,
+        axes: Axes | None = None,
+        spp: int = 16,
+        **settings: Any,
     ) -> Figure:
         """Render the scene as a figure: its colour, with a quantity over it.
 
@@ -219,6 +226,8 @@ class Scene:
             An AOV such as ``gaze``, ``depth`` or ``visibility``. Default: ``gaze`` if the scene has a gaze field.
         observer : array_like of shape (3,), optional
             Position of the observer. Default: as for `render`.
+        axes : matplotlib.axes.Axes, optional
+            Axes to draw in. Default: a new figure.
         spp : int
             Samples per pixel.
         **settings
@@ -246,7 +255,7 @@ class Scene:
 
         name = quantity or ("gaze" if self.has_gaze else COLOR)
         needed = [COLOR, *([] if name == COLOR else ["opacity", name])]
-        return nerg_mi.render(self, observer, needed, spp=spp, **settings).plot(name)
+        return nerg_mi.render(self, observer, needed, spp=spp, **settings).plot(name, axes=axes)
 
     def _repr_html_(self) -> str:
         lines = [line.strip().partition(": ") for line in repr(self).splitlines()[1:]]

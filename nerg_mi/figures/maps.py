@@ -10,7 +10,21 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 
-from .style import INK, PAPER, SMALL, TITLE, label_axes, label_bar, new_page, wrap
+from .style import (
+    DPI,
+    INK,
+    PAPER,
+    SMALL,
+    TITLE,
+    as_axes,
+    figure_of,
+    font_size,
+    label_axes,
+    label_bar,
+    new_page,
+    text_scale,
+    wrap,
+)
 
 # ---- Alignment ----
 
@@ -27,8 +41,9 @@ def alignment_figure(
     targets: np.ndarray | None = None,
     title: str = "Alignment",
     cut_height: float | None = None,
-):
-    """Draw the tracking before and after an alignment, from above and from the side; z is up.
+    axes: Any = None,
+) -> np.ndarray:
+    """Draw the tracking before and after an alignment, from above and from the side; z is up. Return the axes (2, 2).
 
     Parameters
     ----------
@@ -44,26 +59,43 @@ def alignment_figure(
         Title of the figure.
     cut_height
         Height above which the scene is omitted in views from above, such as a ceiling.
+    axes
+        Axes (2, 2) to draw in. Default: a new figure with its title.
     """
-    figure = new_page(2 * _ALIGNMENT_SIDE, 2 * _ALIGNMENT_SIDE + 60)
+    grid = _grid_of(axes, (2, 2), 2 * _ALIGNMENT_SIDE, 2 * _ALIGNMENT_SIDE + 60)
     moved = lambda p: p @ matrix[:3, :3].T + matrix[:3, 3]
     rows = ((points, heads, "before"), (moved(points), None if heads is None else moved(heads), "after"))
-    for line, (p, h, when) in zip(figure.subplots(2, 2), rows):
-        for axes, (a, b), view in zip(line, ((0, 1), (0, 2)), ("from above", "from the side")):
+    for line, (p, h, when) in zip(grid, rows):
+        for panel, (a, b), view in zip(line, ((0, 1), (0, 2)), ("from above", "from the side")):
             shown = place
             if shown is not None and cut_height is not None and b == 1:
                 shown = shown[shown[:, 2] < cut_height]
-            _draw_points(axes, shown, (a, b), _PLACE, 1.2, "scene")
-            _draw_points(axes, targets, (a, b), _TARGETS, 30, "targets", "+")
-            _draw_points(axes, p, (a, b), _HITS, 2 if len(p) > 100 else 14, "hit points" if h is not None else "points")
-            _draw_points(axes, h, (a, b), _HEADS, 2, "heads")
-            _set_limits(axes, [v for v in (shown, targets, p, h) if v is not None and len(v)], (a, b))
-            axes.set_title(f"{when}, {view}", fontsize=9, color=INK, loc="left")
-            label_axes(axes, "xyz"[a], "xyz"[b], 7, labelpad=1)
-    figure.axes[0].legend(fontsize=7, frameon=False, markerscale=5, loc="upper right")
-    figure.suptitle(title, fontsize=10, color=INK)
-    figure.tight_layout()
-    return figure
+            name = "hit points" if h is not None else "points"
+            _draw_points(panel, shown, (a, b), _PLACE, 1.2, "scene")
+            _draw_points(panel, targets, (a, b), _TARGETS, 30, "targets", "+")
+            _draw_points(panel, p, (a, b), _HITS, 2 if len(p) > 100 else 14, name)
+            _draw_points(panel, h, (a, b), _HEADS, 2, "heads")
+            _set_limits(panel, [v for v in (shown, targets, p, h) if v is not None and len(v)], (a, b))
+            panel.set_title(f"{when}, {view}", fontsize=font_size(9), color=INK, loc="left")
+            label_axes(panel, "xyz"[a], "xyz"[b], 7, labelpad=1)
+    grid[0, 0].legend(fontsize=font_size(7), frameon=False, markerscale=5, loc="upper right")
+    _finish_grid(grid, title, axes is None)
+    return grid
+
+
+def _grid_of(axes: Any, shape: tuple[int, ...], width: float, height: float) -> np.ndarray:
+    """Return given ``axes`` in this shape, or those of a new figure."""
+    if axes is None:
+        return np.reshape(new_page(width, height).subplots(*shape), shape)
+    return as_axes(axes, int(np.prod(shape))).reshape(shape)
+
+
+def _finish_grid(grid: np.ndarray, title: str, is_new: bool) -> None:
+    """Give a new figure its title and its layout."""
+    if is_new:
+        figure = figure_of(grid)
+        figure.suptitle(title, fontsize=font_size(TITLE), color=INK)
+        figure.tight_layout()
 
 
 def _draw_points(
@@ -94,8 +126,11 @@ _MAX_CAMERA_POINTS = 40_000  # maximum number of drawn points
 _CAMERA_SIDE = 520  # pixels of each of the two plans
 
 
-def camera_figure(to_world: np.ndarray, points: np.ndarray, colors: np.ndarray, title: str):
+def camera_figure(
+    to_world: np.ndarray, points: np.ndarray, colors: np.ndarray, title: str, axes: Any = None
+) -> np.ndarray:
     """Draw cameras and points from above (x, y) and from the side (x, z); z is up, lengths are in units of the poses.
+    Return the axes (2,).
 
     Parameters
     ----------
@@ -105,8 +140,10 @@ def camera_figure(to_world: np.ndarray, points: np.ndarray, colors: np.ndarray, 
         Points (M, 3), without outliers, and their colours (M, 3), uint8.
     title
         Title of the figure.
+    axes
+        Two axes to draw in. Default: a new figure with its title.
     """
-    figure = new_page(2 * _CAMERA_SIDE, _CAMERA_SIDE + 50)
+    panels = _grid_of(axes, (1, 2), 2 * _CAMERA_SIDE, _CAMERA_SIDE + 50)[0]
     centers = to_world[:, :3, 3]
     low, high = _camera_bounds(centers, points)
     size = 0.04 * float(np.max(high - low)) or 1.0
@@ -115,22 +152,21 @@ def camera_figure(to_world: np.ndarray, points: np.ndarray, colors: np.ndarray, 
     if len(points) > _MAX_CAMERA_POINTS:
         subset = np.random.default_rng(0).choice(len(points), _MAX_CAMERA_POINTS, replace=False)
         points, colors = points[subset], colors[subset]
-    for axes, (a, b), name in zip(figure.subplots(1, 2), ((0, 1), (0, 2)), ("from above", "from the side")):
-        axes.scatter(points[:, a], points[:, b], s=1.5, c=colors / 255.0, linewidths=0, rasterized=True)
-        axes.plot(centers[:, a], centers[:, b], color=_PATH, linewidth=0.6)
+    for panel, (a, b), name in zip(panels, ((0, 1), (0, 2)), ("from above", "from the side")):
+        panel.scatter(points[:, a], points[:, b], s=1.5, c=colors / 255.0, linewidths=0, rasterized=True)
+        panel.plot(centers[:, a], centers[:, b], color=_PATH, linewidth=0.6)
         for pose in to_world:
             wedge = (np.array([[0, 0, 0], [-0.6, 0, -1], [0.6, 0, -1], [0, 0, 0]]) * size) @ pose[:3, :3].T + pose[
                 :3, 3
             ]
-            axes.plot(wedge[:, a], wedge[:, b], color=_CAMERA, linewidth=0.8)
-        axes.set_aspect("equal")
-        axes.set_title(name, fontsize=9, color=INK)
-        label_axes(axes, "xyz"[a], "xyz"[b])
-        axes.set_xlim(low[a] - size, high[a] + size)
-        axes.set_ylim(low[b] - size, high[b] + size)
-    figure.suptitle(title, fontsize=10, color=INK)
-    figure.tight_layout()
-    return figure
+            panel.plot(wedge[:, a], wedge[:, b], color=_CAMERA, linewidth=0.8)
+        panel.set_aspect("equal")
+        panel.set_title(name, fontsize=font_size(9), color=INK)
+        label_axes(panel, "xyz"[a], "xyz"[b])
+        panel.set_xlim(low[a] - size, high[a] + size)
+        panel.set_ylim(low[b] - size, high[b] + size)
+    _finish_grid(panels, title, axes is None)
+    return panels
 
 
 def _camera_bounds(centers: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -199,8 +235,9 @@ def floor_figure(
     fields: SightLines | None = None,
     fov: float = 60.0,
     title: str = "Floor plan",
+    axes: Any = None,
 ) -> Any:
-    """Draw a floor plan between the corners ``low`` and ``high`` (2,), in metres.
+    """Draw a floor plan between the corners ``low`` and ``high`` (2,), in metres. Return the axes.
 
     Parameters
     ----------
@@ -218,15 +255,30 @@ def floor_figure(
         Angle of the fields of view in degrees.
     title
         Title of the figure.
+    axes
+        Axes to draw in. Default: a new figure.
     """
     size = np.asarray(high, float) - low
     pixels = np.maximum(size / size.max() * _FLOOR_SIDE, 200)
     names = _legend_entries(walls, paths or [], rays, fields, fov)
-    columns = max(int(pixels[0] // 190), 1)
-    head = 30 + 17 * -(-len(names) // columns)
-    width, height = _LEFT + pixels[0] + _RIGHT, _FOOT + pixels[1] + head
-    page = new_page(width, height)
-    axes = page.add_axes((_LEFT / width, _FOOT / height, pixels[0] / width, pixels[1] / height))
+    scale = text_scale()
+    columns = max(int(pixels[0] // (190 * scale)), 1)
+    head = (30 + 17 * -(-len(names) // columns)) * scale
+    if axes is None:
+        left, foot = _LEFT * scale, _FOOT * scale
+        width, height = left + pixels[0] + _RIGHT, foot + pixels[1] + head
+        page = new_page(width, height)
+        axes = page.add_axes((left / width, foot / height, pixels[0] / width, pixels[1] / height))
+        page.text(
+            left / width,
+            1 - 8 / height,
+            wrap(title, pixels[0], font_size(TITLE)),
+            fontsize=font_size(TITLE),
+            color=INK,
+            va="top",
+        )
+    else:
+        axes.set_title(title, fontsize=font_size(TITLE), color=INK, loc="left", pad=head * 72 / DPI)
     if walls is not None:
         extent = (walls.low[0], walls.high[0], walls.low[1], walls.high[1])
         axes.imshow(_shade_plan(walls), origin="lower", extent=extent, interpolation="nearest", zorder=0)
@@ -252,12 +304,13 @@ def floor_figure(
     label_axes(axes, "x [m]", "y [m]", ticks=SMALL)
     for spine in axes.spines.values():
         spine.set_linewidth(0.5)
-    page.text(_LEFT / width, 1 - 8 / height, wrap(title, pixels[0], TITLE), fontsize=TITLE, color=INK, va="top")
     if names:
         handles = [axes.plot([], [], label=name, **how)[0] for name, how in names]
         where = dict(loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.3, columnspacing=1.4)
-        axes.legend(handles=handles, fontsize=SMALL, frameon=False, ncols=columns, handletextpad=0.5, **where)
-    return page
+        axes.legend(
+            handles=handles, fontsize=font_size(SMALL), frameon=False, ncols=columns, handletextpad=0.5, **where
+        )
+    return axes
 
 
 def participant_color(index: int) -> str:
@@ -329,17 +382,17 @@ def _legend_entries(
 
 # ---- Gaze samples ----
 #
-# Both functions return a matplotlib ``Figure`` with axes in metres; `nerg_mi.figures.style.save` writes it.
+# Both functions draw in matplotlib ``Axes`` in metres and return them.
 
-_POINTS, _SURFACES = "#2b6cb0", "#b9b4aa"
+_POINTS, _HELD_OUT, _SURFACES = "#2b6cb0", "#d9730d", "#b9b4aa"
 _MAX_RAY_POINTS = 60_000  # maximum number of drawn points
 _MAX_CELLS = 4_000_000
 _PLAN_SIDE = 640  # pixels of the plan's longer side
 
 
-def floor_plan(rays, cell: float | None = None, title: str = "Participants' positions"):
+def floor_plan(rays, cell: float | None = None, title: str = "Participants' positions", axes: Any = None) -> Any:
     """Draw the density of the samples' origins on the floor in samples/m², on a logarithmic scale; empty cells are
-    white.
+    white. Return the axes.
 
     Arrows show the mean horizontal gaze direction in coarser cells; longer arrows mean more agreement. Raises
     `NergError` if there are no samples, and for an invalid cell size.
@@ -352,6 +405,8 @@ def floor_plan(rays, cell: float | None = None, title: str = "Participants' posi
         Edge length of a cell in metres. Default: a fiftieth of the shorter side, at least 5 cm.
     title
         Title of the figure.
+    axes
+        Axes to draw in. Default: a new figure.
     """
     from matplotlib.colors import LogNorm
 
@@ -369,19 +424,22 @@ def floor_plan(rays, cell: float | None = None, title: str = "Participants' posi
     edges = [np.arange(a, b + cell, cell) for a, b in zip(low, high)]
     counts, *_ = np.histogram2d(xy[:, 0], xy[:, 1], edges)
     density = np.ma.masked_equal(counts.T / cell**2, 0)
-    figure, axes = _new_plan(low, high, f"{title}: {_describe_rays(rays)}", bar=True)
+    axes, bar_axes = _plan_axes(axes, low, high, f"{title}: {_describe_rays(rays)}", bar=True)
     top = float(density.max())
     bottom = max(float(density.min()), top * 1e-4)
     image = axes.pcolormesh(
         *edges, density, cmap="viridis", norm=LogNorm(bottom, max(top, bottom * 1.01)), rasterized=True
     )
     _draw_arrows(axes, rays, low, high)
-    label_bar(figure.colorbar(image, cax=figure.axes[1]), f"samples/m² in cells of {cell:g} m; white: no sample", 7)
-    return figure
+    bar = axes.figure.colorbar(image, cax=bar_axes, ax=axes)
+    label_bar(bar, f"samples/m² in cells of {cell:g} m; white: no sample", 7)
+    return axes
 
 
-def layout_figure(rays, test=None, centres=None, radius: float | None = None, title: str = "Layout"):
-    """Draw the origin of every sample (blue) in the scene, with its dimensions in metres.
+def layout_figure(
+    rays, test=None, centres=None, radius: float | None = None, title: str = "Layout", axes: Any = None
+) -> Any:
+    """Draw the origin of every sample (blue) in the scene, with its dimensions in metres. Return the axes.
 
     The scene is outlined by the hit points between 0.3 and 2 m above the floor, in grey.
 
@@ -390,39 +448,52 @@ def layout_figure(rays, test=None, centres=None, radius: float | None = None, ti
     rays
         Gaze samples.
     test
-        Held-out samples, in orange.
+        Held-out samples, in orange, on top of the others.
     centres, radius
-        Centres (T, 3) and radius of test positions, drawn as circles.
+        Centres (T, 3) and radius of test positions, drawn as circles on top of all samples.
     title
         Title of the figure.
+    axes
+        Axes to draw in. Default: a new figure.
     """
     points = [rays.origin[:, :2]] + ([] if test is None else [test.origin[:, :2]])
     walls = _hit_outline([rays] if test is None else [rays, test])
     low, high = _bounding_box(np.concatenate([*points, *([] if walls is None else [walls])]))
-    figure, axes = _new_plan(low, high, f"{title}: {_describe_rays(rays, test)}", pad=0.13)
+    axes, _ = _plan_axes(axes, low, high, f"{title}: {_describe_rays(rays, test)}", pad=0.13)
     if walls is not None:
         axes.plot(*_subsample(walls).T, ",", color=_SURFACES, rasterized=True, zorder=1)
-    for xy, color in zip(points, (_POINTS, "#d9730d")):
+    for level, (xy, color) in enumerate(zip(points, (_POINTS, _HELD_OUT))):
         size = 3.5 - 0.5 * np.log10(max(len(xy), 10))  # few points are drawn larger
         axes.plot(
-            *_subsample(xy).T, ".", markersize=max(size, 1.1), markeredgewidth=0, color=color, rasterized=True, zorder=2
+            *_subsample(xy).T,
+            ".",
+            markersize=max(size, 1.1),
+            markeredgewidth=0,
+            color=color,
+            rasterized=True,
+            zorder=2 + level,
         )
     if centres is not None and radius is not None:
         from matplotlib.collections import PatchCollection
         from matplotlib.patches import Circle
 
         circles = [Circle(c, radius) for c in np.asarray(centres)[:, :2]]
-        axes.add_collection(PatchCollection(circles, facecolor="#d9730d", edgecolor="none", alpha=0.02, zorder=1.5))
+        axes.add_collection(PatchCollection(circles, facecolor=_HELD_OUT, edgecolor="none", alpha=0.02, zorder=1.5))
+        edges = PatchCollection(
+            circles, facecolor="none", edgecolor=INK, linewidth=0.6, alpha=_edge_alpha(len(circles))
+        )
+        axes.add_collection(edges)
+        edges.set_zorder(4)
     first, last = _bounding_box(np.concatenate(points), margin=0.0)
     _draw_dimensions(axes, first, last)
     names = [(_POINTS, "samples" if test is None else "training samples")]
-    names += ([] if test is None else [("#d9730d", "test samples")]) + (
+    names += ([] if test is None else [(_HELD_OUT, "test samples")]) + (
         [] if walls is None else [(_SURFACES, "gaze hit points")]
     )
     handles = [axes.plot([], [], "s", markersize=5, color=color, label=name)[0] for color, name in names]
     axes.legend(
         handles=handles,
-        fontsize=7,
+        fontsize=font_size(7),
         frameon=False,
         loc="lower left",
         bbox_to_anchor=(0.0, 1.0),
@@ -430,7 +501,12 @@ def layout_figure(rays, test=None, centres=None, radius: float | None = None, ti
         borderaxespad=0.2,
         handletextpad=0.1,
     )
-    return figure
+    return axes
+
+
+def _edge_alpha(count: int) -> float:
+    """Return the opacity of the outlines of ``count`` circles, which may overlap."""
+    return float(np.clip(8 / max(count, 1), 0.08, 0.9))
 
 
 def _hit_outline(sets) -> np.ndarray | None:
@@ -506,29 +582,32 @@ def _draw_dimensions(axes, low, high) -> None:
     axes.annotate("", (low[0], y), (high[0], y), **line)
     axes.annotate("", (x, low[1]), (x, high[1]), **line)
     label_style = dict(
-        fontsize=7, color=INK, ha="center", va="center", bbox=dict(facecolor=PAPER, edgecolor="none", pad=1)
+        fontsize=font_size(7), color=INK, ha="center", va="center", bbox=dict(facecolor=PAPER, edgecolor="none", pad=1)
     )
     axes.text(0.5 * (low[0] + high[0]), y, f"{high[0] - low[0]:.2f} m", **label_style)
     axes.text(x, 0.5 * (low[1] + high[1]), f"{high[1] - low[1]:.2f} m", rotation=90, **label_style)
 
 
-def _new_plan(low, high, title: str, bar: bool = False, pad: float = 0.0):
-    """Create a figure with axes in metres of equal scale; ``bar`` adds axes for a colour bar."""
+def _plan_axes(axes: Any, low, high, title: str, bar: bool = False, pad: float = 0.0) -> tuple[Any, Any]:
+    """Return ``axes``, or those of a new figure, in metres of equal scale, and axes for a colour ``bar``; None if these
+    are taken from given axes."""
     # Margin for the dimension lines.
     margin = pad * (high - low).max()
     low, high = low - (0, margin), high + (margin, 0)
     size = np.maximum((high - low) / (high - low).max() * _PLAN_SIDE, 160)
-    left, foot, head, right = 48, 40, 46, 96 if bar else 14
-    width, height = left + size[0] + right, foot + size[1] + head
-    figure = new_page(width, height)
-    axes = figure.add_axes((left / width, foot / height, size[0] / width, size[1] / height))
+    bar_axes = None
+    if axes is None:
+        left, foot, head, right = (text_scale() * v for v in (48, 40, 46, 96 if bar else 14))
+        width, height = left + size[0] + right, foot + size[1] + head
+        figure = new_page(width, height)
+        axes = figure.add_axes((left / width, foot / height, size[0] / width, size[1] / height))
+        if bar:
+            bar_axes = figure.add_axes(((left + size[0] + 12) / width, foot / height, 12 / width, size[1] / height))
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
     axes.set_aspect("equal", adjustable="datalim")
     label_axes(axes, "x [m]", "y [m]", 7)
     for spine in axes.spines.values():
         spine.set_linewidth(0.5)
-    axes.set_title(title, fontsize=9, color=INK, loc="left", pad=19 if not bar else 6)
-    if bar:
-        figure.add_axes(((left + size[0] + 12) / width, foot / height, 12 / width, size[1] / height))
-    return figure, axes
+    axes.set_title(title, fontsize=font_size(9), color=INK, loc="left", pad=19 if not bar else 6)
+    return axes, bar_axes

@@ -171,13 +171,15 @@ def color_strip(heat: Heat, steps: int = 256) -> np.ndarray:
 # ---- Figures ----
 #
 # Figures of depth, gaze, visibility and differences, and the occlusion figure of the paper. Functions take images with
-# rows from the top and return a matplotlib ``Figure``; `style.save` writes it.
+# rows from the top, draw in given matplotlib ``Axes`` or in a new figure, and return the axes; `style.save` writes
+# their figure.
 
 HIDDEN_TINT = np.array([0.16, 0.20, 0.42])
 """Tint (display sRGB) of surfaces that are hidden from the observer."""
 
 GAZE_LABEL = AOVS["gaze"].scale_label
 _STEPS = 256
+_OBSERVER_LABEL = "observer"
 
 
 def percentile_limits(values, mask) -> tuple[float, float]:
@@ -201,12 +203,13 @@ def depth_figure(
     unit: str = "m",
     limits: tuple[float, float] | None = None,
     colormap: str = "viridis_r",
-):
-    """Draw ``depth`` (h, w) in scene units with a colour bar; pixels outside ``mask`` are hatched.
+    axes: Any = None,
+) -> Any:
+    """Draw ``depth`` (h, w) in scene units with a colour bar; pixels outside ``mask`` are hatched. Return the axes.
 
-    ``limits``: ends of the scale. Default: `percentile_limits`.
+    ``limits``: ends of the scale. Default: `percentile_limits`. ``axes``: axes to draw in. Default: a new figure.
     """
-    return map_figure(depth, mask, title, f"{AOVS['depth'].label} [{unit}]", limits, colormap)
+    return map_figure(depth, mask, title, f"{AOVS['depth'].label} [{unit}]", limits, colormap, axes=axes)
 
 
 def map_figure(
@@ -218,18 +221,20 @@ def map_figure(
     colormap: str = "viridis",
     colormap_kind: str = "sequential",
     note: str = "",
+    axes: Any = None,
 ) -> Any:
-    """Draw ``values`` (h, w) with a colour map and a colour bar; pixels outside ``mask`` are hatched.
+    """Draw ``values`` (h, w) with a colour map and a colour bar; pixels outside ``mask`` are hatched. Return the axes.
 
-    ``limits``: ends of the scale. Default: `percentile_limits`. ``note``: note below the figure.
+    ``limits``: ends of the scale. Default: `percentile_limits`. ``note``: note below the figure. ``axes``: axes to draw
+    in. Default: a new figure.
     """
     values = np.asarray(values, np.float64)
     is_valid = np.asarray(mask, bool) & np.isfinite(values)
     color_limits = limits or percentile_limits(values, mask)
     shown = map_colors(np.where(is_valid, values, color_limits[0]), color_limits, colormap, colormap_kind)
-    sheet = Sheet([_hatch_grey(shown, ~is_valid)], [title], scale=True, note=note)
+    sheet = Sheet([_hatch_grey(shown, ~is_valid)], [title], scale=True, note=note, panels=axes)
     add_map_scale(sheet, color_limits, colormap, colormap_kind, label, values[is_valid], unknown=not is_valid.all())
-    return sheet.page
+    return sheet.panels[0]
 
 
 def map_colors(values, limits: tuple[float, float], colormap: str, colormap_kind: str) -> np.ndarray:
@@ -272,24 +277,28 @@ def gaze_figure(
     marker=None,
     unknown=None,
     note: str = "",
+    axes: Any = None,
 ) -> Any:
-    """Draw ``gaze`` (h, w) in 1/sr over the linear image ``color`` (h, w, 3), with a labelled scale.
+    """Draw ``gaze`` (h, w) in 1/sr over the linear image ``color`` (h, w, 3), with a labelled scale. Return the axes.
 
     ``marker``: pixel (x, y) of the observer; ``unknown`` (h, w) bool: pixels without data, which are hatched; ``note``:
-    note below the figure.
+    note below the figure; ``axes``: axes to draw in. Default: a new figure.
     """
-    sheet = Sheet([overlay(color, gaze, heat, mask, unknown)], [title], scale=True, note=note)
+    sheet = Sheet([overlay(color, gaze, heat, mask, unknown)], [title], scale=True, note=note, panels=axes)
     if marker is not None:
-        mark_observer(sheet, 0, marker)
+        mark_observer(sheet, 0, marker, heat.alpha(gaze) * np.asarray(mask, bool))
     add_scale(sheet, heat, label, [(gaze, mask)], unknown is not None and bool(np.any(unknown)))
-    return sheet.page
+    return sheet.panels[0]
 
 
-def visibility_figure(color, visibility, mask, title: str = "Visible to the observer"):
+def visibility_figure(color, visibility, mask, title: str = "Visible to the observer", axes: Any = None) -> Any:
     """Draw ``visibility`` (h, w): visible surfaces in colour, hidden ones in dark blue; pixels outside ``mask`` are
-    hatched."""
+    hatched. Return the axes.
+
+    ``axes``: axes to draw in. Default: a new figure.
+    """
     layers = OverlayLayers(np.asarray(color), np.asarray(visibility), np.asarray(mask, bool))
-    return find_overlay("visibility").draw(layers, None, Style(title=title))
+    return find_overlay("visibility").draw(layers, None, Style(title=title), axes)
 
 
 def shade_hidden(color, values) -> np.ndarray:
@@ -310,21 +319,31 @@ def difference_figure(
     limit=None,
     colormap: str = "RdBu_r",
     note: str = "",
-):
+    axes: Any = None,
+) -> Any:
     """Draw ``first`` minus ``second``, (h, w) each, with a diverging colour map; invalid and masked pixels are hatched.
+    Return the axes.
 
-    ``limit``: end of the symmetric scale. Default: `symmetric_limit`. ``note``: note below the figure.
+    ``limit``: end of the symmetric scale. Default: `symmetric_limit`. ``note``: note below the figure. ``axes``: axes
+    to draw in. Default: a new figure.
     """
     difference = np.asarray(first, np.float64) - np.asarray(second, np.float64)
     is_valid = np.isfinite(difference) if mask is None else np.isfinite(difference) & np.asarray(mask, bool)
     limit = float(limit or symmetric_limit(difference[is_valid]))
-    return map_figure(difference, is_valid, title, label, (-limit, limit), colormap, "diverging", note)
+    return map_figure(difference, is_valid, title, label, (-limit, limit), colormap, "diverging", note, axes)
 
 
 def occlusion_figure(
-    observer_view, without_occlusion, with_occlusion, heat: Heat, marker=None, hatch_empty: bool = False, note: str = ""
-):
-    """Draw the occlusion figure of the paper: three images with one scale.
+    observer_view,
+    without_occlusion,
+    with_occlusion,
+    heat: Heat,
+    marker=None,
+    hatch_empty: bool = False,
+    note: str = "",
+    axes: Any = None,
+) -> np.ndarray:
+    """Draw the occlusion figure of the paper: three images with one scale. Return their axes (3,).
 
     Parameters
     ----------
@@ -339,17 +358,20 @@ def occlusion_figure(
         Whether pixels without a surface are hatched.
     note
         Note below the figure.
+    axes
+        Three axes to draw in. Default: a new figure.
     """
     parts = (observer_view, without_occlusion, with_occlusion)
     void = [~np.asarray(m, bool) if hatch_empty else None for _, _, m in parts]
     pictures = [overlay(c, g, heat, m, u) for (c, g, m), u in zip(parts, void)]
     titles = ["Observer's view", "Another camera, without occlusion", "Another camera, with occlusion"]
-    sheet = Sheet(pictures, titles, scale=True, note=note)
+    sheet = Sheet(pictures, titles, scale=True, note=note, panels=axes)
     if marker is not None:
         for panel in (1, 2):
-            mark_observer(sheet, panel, marker)
+            _, gaze, mask = parts[panel]
+            mark_observer(sheet, panel, marker, heat.alpha(gaze) * np.asarray(mask, bool))
     add_scale(sheet, heat, GAZE_LABEL, [(g, m) for _, g, m in parts], any(u is not None and u.any() for u in void))
-    return sheet.page
+    return np.array(sheet.panels)
 
 
 def add_scale(sheet: Sheet, heat: Heat, label: str, values, unknown: bool = False) -> None:
@@ -358,21 +380,36 @@ def add_scale(sheet: Sheet, heat: Heat, label: str, values, unknown: bool = Fals
     sheet.bar(color_strip(heat), heat.vmin, heat.vmax, label, above=above, log=heat.decades > 0, unknown=unknown)
 
 
-def mark_observer(sheet: Sheet, panel: int, at: tuple[float, float]) -> None:
-    """Mark the observer at the pixel ``at`` (x, y) of a panel."""
+def mark_observer(sheet: Sheet, panel: int, at: tuple[float, float], heat: Any = None) -> None:
+    """Mark the observer at the pixel ``at`` (x, y) of a panel.
+
+    The label is placed on the side where it hides least of the ``heat`` (h, w), opacities; default: at the upper right.
+    """
     axes, unit = sheet.panels[panel], sheet.unit
     dot = dict(markerfacecolor="#35c2ff", markeredgecolor="white", markeredgewidth=1.2 * unit)
     axes.plot(*at, marker="o", markersize=6 * unit, **dot)
     height, width = sheet.images[panel].get_array().shape[:2]
-    # Place the label towards the centre, so that it stays inside the image.
-    left, low = at[0] > 0.6 * width, at[1] < 0.15 * height
+    # Extent of the label in pixels of the image.
+    pixels = width / max(axes.bbox.width, 1e-9) * axes.get_figure(root=True).dpi / 72 * SMALL * unit
+    size = np.array([0.7 * len(_OBSERVER_LABEL), 2.0]) * pixels
+    sides = [(right, up) for up in (True, False) for right in (True, False)]
+
+    def cost(side: tuple[bool, bool]) -> float:
+        right, up = side
+        x, y = (at[0] if right else at[0] - size[0]), (at[1] - size[1] if up else at[1])
+        columns, rows = (np.clip([v, v + s], 0, n).astype(int) for v, s, n in zip((x, y), size, (width, height)))
+        outside = 1 - np.ptp(columns) * np.ptp(rows) / max(size.prod(), 1.0)
+        covered = np.zeros(1) if heat is None else np.asarray(heat)[slice(*rows), slice(*columns)]
+        return 2 * max(outside, 0.0) + float(covered.mean() if covered.size else 0.0)
+
+    right, up = min(sides, key=cost)
     axes.annotate(
-        "observer",
+        _OBSERVER_LABEL,
         at,
-        ((-6 if left else 6) * unit, (-6 if low else 5) * unit),
+        ((6 if right else -6) * unit, (5 if up else -6) * unit),
         textcoords="offset points",
-        ha="right" if left else "left",
-        va="top" if low else "bottom",
+        ha="left" if right else "right",
+        va="bottom" if up else "top",
         fontsize=SMALL * unit,
         color="white",
         bbox=dict(boxstyle="round,pad=0.15", facecolor="black", alpha=0.45, linewidth=0),
@@ -501,8 +538,8 @@ class Overlay:
             )
         return shown if unknown is None else _hatch_grey(shown, unknown)
 
-    def draw(self, layers: OverlayLayers, limits: Limits, style: Style = DEFAULT_STYLE) -> Any:
-        """Draw a figure on a scale with the given limits."""
+    def draw(self, layers: OverlayLayers, limits: Limits, style: Style = DEFAULT_STYLE, axes: Any = None) -> Any:
+        """Draw a figure on a scale with the given limits, in ``axes`` or in a new figure. Return the axes."""
         needs_support, label = self.quantity.needs_support, self.quantity.scale_label
         title = style.title or self.quantity.heading
         if self.display.kind == "heat":
@@ -520,11 +557,13 @@ class Overlay:
                 layers.marker,
                 unknown,
                 layers.support_note,
+                axes,
             )
         unknown = ~(np.asarray(layers.mask, bool) & np.isfinite(layers.values))
-        sheet = Sheet([self.paint(layers, limits, style, unknown)], [title], scale=True, note=layers.support_note)
+        picture = self.paint(layers, limits, style, unknown)
+        sheet = Sheet([picture], [title], scale=True, note=layers.support_note, panels=axes)
         self.add_scale(sheet, [layers], limits, style, bool(unknown.any()))
-        return sheet.page
+        return sheet.panels[0]
 
     def add_scale(
         self,

@@ -121,8 +121,9 @@ def sphere_figure(
     unknown=None,
     label: str = GAZE_LABEL,
     note: str = "",
+    axes: Any = None,
 ) -> Any:
-    """Draw images (h, w, ...) of a `panorama` sensor as a map of the observer's sphere.
+    """Draw images (h, w, ...) of a `panorama` sensor as a map of the observer's sphere. Return the axes.
 
     Azimuth 0 is the front of the sensor, positive to the right; elevation 0 is the horizon; both are in degrees.
 
@@ -146,6 +147,8 @@ def sphere_figure(
         Label of the scale.
     note
         Note below the figure.
+    axes
+        Axes to draw in. Default: a new figure.
     """
     map_projection = find_projection(projection)
     width = int(np.shape(gaze)[1]) // 2 * 2
@@ -153,13 +156,13 @@ def sphere_figure(
     has_unknown = unknown is not None and bool(np.any(unknown))
     if has_unknown:
         shown = hatch(shown, resample_panorama(unknown, map_projection, width)[0])
-    sheet = Sheet([np.where(inside[..., None], shown, 1.0)], [title], scale=True, axes=True, note=note)
-    axes = sheet.panels[0]
+    sheet = Sheet([np.where(inside[..., None], shown, 1.0)], [title], scale=True, axes=True, note=note, panels=axes)
+    aspect, axes = "auto" if axes is None else 0.5, sheet.panels[0]
     sheet.images[0].set_extent((-1, 1, -1, 1))
-    axes.set_aspect("auto")
+    axes.set_aspect(aspect)
     _draw_graticule(axes, map_projection, 45 if width >= 360 else 90, sheet.unit)
     add_scale(sheet, heat, label, [(gaze, mask)], has_unknown)
-    return sheet.page
+    return axes
 
 
 def _draw_graticule(axes: Any, projection: Projection, step: int, unit: float) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from nerg_mi.measures.tables import is_underestimate
 
-from .style import INK, label_axes, label_bar, new_page
+from .style import INK, as_axes, font_size, label_axes, label_bar, new_page, text_scale
 
 MAX_BARS = 40
 """Maximum number of areas; those with the largest shares are drawn."""
@@ -19,10 +19,12 @@ _GRID = "#dddddd"
 Row = dict[str, Any]
 
 
-def aois_figure(rows: Sequence[Row], title: str = "Attention on AOIs") -> Any:
-    """Draw the share of time, the hit ratio and the dwell time of each area, from the ``rows`` of one cell.
+def aois_figure(rows: Sequence[Row], title: str = "Attention on AOIs", axes: Any = None) -> np.ndarray:
+    """Draw the share of time, the hit ratio and the dwell time of each area, from the ``rows`` of one cell. Return the
+    axes (3,).
 
     Bars are measured values, points are predictions, both with 95 % confidence intervals. Hollow points are biased low.
+    ``axes``: three axes to draw in. Default: a new figure with its title and legend.
     """
     panels = (
         ("share", "share of time [%]", 100),
@@ -34,9 +36,8 @@ def aois_figure(rows: Sequence[Row], title: str = "Attention on AOIs") -> Any:
         max_share[row["aoi"]] = max(max_share.get(row["aoi"], 0.0), row.get("share") or 0.0)
     names = sorted(max_share, key=lambda n: -max_share[n])[:MAX_BARS][::-1]
     row_of = {name: k for k, name in enumerate(names)}
-    page = new_page(1100, 130 + 24 * max(len(names), 3))
-    height = page.get_figheight() * 100
-    axes = page.subplots(1, len(panels), sharey=True)
+    page = None if axes is not None else new_page(1100, (130 + 24 * max(len(names), 3)) * text_scale())
+    axes = as_axes(axes, len(panels)) if page is None else page.subplots(1, len(panels), sharey=True)
     sources = [s for s in _COLORS if any(row["source"] == s for row in rows)]
     for axis, (key, label, scale) in zip(axes, panels):
         for source in sources:
@@ -63,56 +64,75 @@ def aois_figure(rows: Sequence[Row], title: str = "Attention on AOIs") -> Any:
                 low, high = r.get(f"{key}_low"), r.get(f"{key}_high")
                 if low is not None and high is not None:
                     axis.plot([scale * low, scale * high], [at + shift] * 2, "-", color=color, linewidth=1.1, zorder=3)
-        axis.set_xlabel(label, fontsize=8, color=INK)
-        axis.tick_params(labelsize=7.5, colors=INK, length=2)
+        axis.set_xlabel(label, fontsize=font_size(8), color=INK)
+        axis.tick_params(labelsize=font_size(7.5), colors=INK, length=2)
         axis.grid(axis="x", color=_GRID, linewidth=0.6, zorder=0)
         axis.set_xlim(left=0)
         for side in ("top", "right", "left"):
             axis.spines[side].set_visible(False)
     axes[0].set_yticks(range(len(names)), [n if len(n) <= 34 else n[:33] + "…" for n in names])
     axes[0].set_ylim(-0.7, len(names) - 0.3)
-    page.suptitle(title, fontsize=10, color=INK, x=0.01, ha="left", y=1 - 14 / height)
     labels = {"measured": "measured", "predicted": "predicted by the field"}
     handles = [axes[0].plot([], [], "s", markersize=5, color=_COLORS[s], label=labels[s])[0] for s in sources]
-    page.legend(handles=handles, fontsize=8, frameon=False, loc="upper right", ncols=2)
+    legend = dict(handles=handles, fontsize=font_size(8), frameon=False)
+    if page is None:
+        axes[0].set_title(title, fontsize=font_size(10), color=INK, loc="left")
+        axes[-1].legend(loc="best", **legend)
+        return axes
+    height = page.get_figheight() * 100 / text_scale()
+    page.suptitle(title, fontsize=font_size(10), color=INK, x=0.01, ha="left", y=1 - 14 / height)
+    page.legend(loc="upper right", ncols=2, **legend)
     page.subplots_adjust(left=0.24, right=0.985, wspace=0.08, top=1 - 44 / height, bottom=58 / height)
-    return page
+    return axes
 
 
-def transitions_figure(names: Sequence[str], transitions: np.ndarray, title: str = "Transitions between AOIs") -> Any:
-    """Draw the matrix of transitions (K, K), each row in percent of its sum."""
+def transitions_figure(
+    names: Sequence[str], transitions: np.ndarray, title: str = "Transitions between AOIs", axes: Any = None
+) -> Any:
+    """Draw the matrix of transitions (K, K), each row in percent of its sum. Return the axes.
+
+    ``axes``: axes to draw in. Default: a new figure.
+    """
     total = transitions.sum(axis=1, keepdims=True)
     share = 100 * transitions / np.where(total > 0, total, 1)
-    side = 26 * max(len(names), 4)
     short = [n if len(n) <= 30 else n[:29] + "…" for n in names]
-    label_space = 45 + 5.5 * max(map(len, short), default=0)
-    page = new_page(label_space + side + 120, label_space + side + 50)
-    width, height = (100 * v for v in page.get_size_inches())
-    axis = page.add_axes((label_space / width, label_space / height, side / width, side / height))
+    axis, bar_axes = axes, None
+    if axes is None:
+        side = 26 * max(len(names), 4)
+        label_space = (45 + 5.5 * max(map(len, short), default=0)) * text_scale()
+        page = new_page(label_space + side + 120, label_space + side + 50)
+        width, height = (100 * v for v in page.get_size_inches())
+        axis = page.add_axes((label_space / width, label_space / height, side / width, side / height))
+        beside = ((label_space + side + 10) / width, label_space / height, 12 / width, side / height)
+        bar_axes = page.add_axes(beside)
     image = axis.imshow(np.ma.masked_equal(share, 0), cmap="viridis", vmin=0, vmax=max(float(share.max()), 1.0))
-    axis.set_xticks(range(len(names)), short, rotation=90, fontsize=7, color=INK)
-    axis.set_yticks(range(len(names)), short, fontsize=7, color=INK)
-    axis.set_xlabel("next visit", fontsize=8, color=INK)
-    axis.set_ylabel("visit", fontsize=8, color=INK)
-    axis.set_title(title, fontsize=10, color=INK, loc="left")
-    bar = page.colorbar(
-        image, cax=page.add_axes(((label_space + side + 10) / width, label_space / height, 12 / width, side / height))
-    )
+    axis.set_xticks(range(len(names)), short, rotation=90, fontsize=font_size(7), color=INK)
+    axis.set_yticks(range(len(names)), short, fontsize=font_size(7), color=INK)
+    axis.set_xlabel("next visit", fontsize=font_size(8), color=INK)
+    axis.set_ylabel("visit", fontsize=font_size(8), color=INK)
+    axis.set_title(title, fontsize=font_size(10), color=INK, loc="left")
+    bar = axis.figure.colorbar(image, cax=bar_axes, ax=axis)
     label_bar(bar, "% of the transitions from the area", 7)
-    return page
+    return axis
 
 
-def map_figure(points: np.ndarray, values: np.ndarray, step: float, label: str, title: str) -> Any:
-    """Draw ``values`` (G,) at positions (G, 2 or 3) of a grid with spacing ``step``, seen from above."""
+def map_figure(points: np.ndarray, values: np.ndarray, step: float, label: str, title: str, axes: Any = None) -> Any:
+    """Draw ``values`` (G,) at positions (G, 2 or 3) of a grid with spacing ``step``, seen from above. Return the axes.
+
+    ``axes``: axes to draw in. Default: a new figure.
+    """
     from matplotlib.collections import PatchCollection
     from matplotlib.patches import Rectangle
 
     low, high = points[:, :2].min(axis=0) - step, points[:, :2].max(axis=0) + step
-    scale = 620 / max(high - low)
-    size = (high - low) * scale
-    page = new_page(size[0] + 170, size[1] + 100)
-    width, height = (100 * v for v in page.get_size_inches())
-    axis = page.add_axes((60 / width, 50 / height, size[0] / width, size[1] / height))
+    axis, bar_axes = axes, None
+    if axes is None:
+        scale = 620 / max(high - low)
+        size = (high - low) * scale
+        page = new_page(size[0] + 170, size[1] + 100)
+        width, height = (100 * v for v in page.get_size_inches())
+        axis = page.add_axes((60 / width, 50 / height, size[0] / width, size[1] / height))
+        bar_axes = page.add_axes((1 - 95 / width, 50 / height, 14 / width, size[1] / height))
     squares = [Rectangle((x - step / 2, y - step / 2), step, step) for x, y in points[:, :2]]
     cells = PatchCollection(squares, cmap="viridis", linewidth=0)
     cells.set_array(np.asarray(values, float))
@@ -121,7 +141,6 @@ def map_figure(points: np.ndarray, values: np.ndarray, step: float, label: str, 
     axis.set_ylim(low[1], high[1])
     axis.set_aspect("equal")
     label_axes(axis, "x [m]", "y [m]")
-    axis.set_title(title, fontsize=10, color=INK, loc="left")
-    bar = page.colorbar(cells, cax=page.add_axes((1 - 95 / width, 50 / height, 14 / width, size[1] / height)))
-    label_bar(bar, label)
-    return page
+    axis.set_title(title, fontsize=font_size(10), color=INK, loc="left")
+    label_bar(axis.figure.colorbar(cells, cax=bar_axes, ax=axis), label)
+    return axis

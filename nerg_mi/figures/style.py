@@ -216,22 +216,43 @@ def _to_json(value: Any) -> Any:
 
 # ---- Saving ----
 #
-# PNG and SVG files that are bitwise reproducible, and pixel arrays for videos.
+# PNG, SVG and PDF files that are bitwise reproducible, and pixel arrays for videos. What is drawn is a figure of
+# matplotlib, its axes, or an array of them.
 
-FORMATS = (".png", ".svg")
+FORMATS = (".png", ".svg", ".pdf")
 """Supported file suffixes."""
 
-_SVG_KEYS = {"Software": "Creator", "Comment": "Description", "Title": "Title"}
+_METADATA_KEYS = {
+    ".svg": {"Software": "Creator", "Comment": "Description", "Title": "Title"},
+    ".pdf": {"Software": "Creator", "Comment": "Subject", "Title": "Title"},
+}
+_VECTOR_STYLE: dict[Any, Any] = {"svg.fonttype": "none", "svg.image_inline": True, "pdf.fonttype": 42}
+"""Text stays text in vector files, so that it can be searched and edited."""
+
 _SALT = "nerg_mi"
 
 
-def save(figure: Any, path: str | os.PathLike, metadata: Provenance | Mapping[str, str] | None = None) -> None:
-    """Write a matplotlib figure as .png, or as .svg with embedded images and text as text.
+def as_axes(axes: Any, count: int) -> np.ndarray:
+    """Return one or several axes as an array (``count``,). Raises `NergError` for another number."""
+    several = np.ravel(np.asarray(axes, object))
+    if len(several) != count:
+        raise NergError(f"the figure has {count} panels and needs as many axes, got {len(several)}")
+    return several
+
+
+def figure_of(drawn: Any) -> Any:
+    """Return the matplotlib figure of ``drawn``: a figure, axes, or an array of axes."""
+    first = np.ravel(np.asarray(drawn, object))[0]
+    return first if hasattr(first, "savefig") else first.get_figure(root=True)
+
+
+def save(drawn: Any, path: str | os.PathLike, metadata: Provenance | Mapping[str, str] | None = None) -> None:
+    """Write a matplotlib figure as .png, or as .svg or .pdf with embedded images and text as text.
 
     Parameters
     ----------
-    figure
-        Figure.
+    drawn
+        Figure or axes.
     path
         Output file. Raises `NergError` for other suffixes and for files that cannot be written.
     metadata
@@ -239,20 +260,21 @@ def save(figure: Any, path: str | os.PathLike, metadata: Provenance | Mapping[st
     """
     check_writable(path, *FORMATS)
     text = dict(metadata.text() if isinstance(metadata, Provenance) else metadata or {})
-    write_bytes(path, encode(figure, Path(path).suffix.lower(), text))
+    write_bytes(path, encode(drawn, Path(path).suffix.lower(), text))
 
 
-def encode(figure: Any, suffix: str, text: Mapping[str, str] | None = None) -> bytes:
-    """Encode ``figure`` in one of `FORMATS`, with metadata ``text``."""
+def encode(drawn: Any, suffix: str, text: Mapping[str, str] | None = None) -> bytes:
+    """Encode a figure or axes in one of `FORMATS`, with metadata ``text``."""
     import matplotlib
 
-    out, text = io.BytesIO(), dict(text or {})
-    if suffix == ".svg":
-        svg_metadata = {_SVG_KEYS[k]: v for k, v in text.items() if k in _SVG_KEYS}
-        metadata: dict[str, Any] = {"Date": None, "Creator": None, **svg_metadata}
+    figure, out, text = figure_of(drawn), io.BytesIO(), dict(text or {})
+    if suffix in _METADATA_KEYS:
+        keys = _METADATA_KEYS[suffix]
+        times: dict[str, Any] = {"Date": None} if suffix == ".svg" else {"CreationDate": None}
+        metadata = {**times, "Creator": None, **{keys[k]: v for k, v in text.items() if k in keys}}
         # A fixed salt makes ids deterministic.
-        with matplotlib.rc_context({"svg.hashsalt": _SALT, "svg.fonttype": "none", "svg.image_inline": True}):
-            figure.savefig(out, format="svg", dpi=figure.dpi, metadata=metadata)
+        with matplotlib.rc_context({"svg.hashsalt": _SALT, **_VECTOR_STYLE}):
+            figure.savefig(out, format=suffix[1:], dpi=figure.dpi, metadata=metadata)
         return out.getvalue()
     figure.savefig(
         out, format="png", dpi=figure.dpi, metadata={"Software": None, **text}, pil_kwargs={"optimize": True}
@@ -260,8 +282,9 @@ def encode(figure: Any, suffix: str, text: Mapping[str, str] | None = None) -> b
     return out.getvalue()
 
 
-def rasterize(figure: Any) -> np.ndarray:
-    """Render ``figure`` to display values (h, w, 3), uint8, identical to its PNG."""
+def rasterize(drawn: Any) -> np.ndarray:
+    """Render a figure or axes to display values (h, w, 3), uint8, identical to its PNG."""
+    figure = figure_of(drawn)
     figure.canvas.draw()
     return np.asarray(figure.canvas.buffer_rgba())[..., :3].copy()
 
@@ -318,7 +341,7 @@ def _format_power(p: int) -> str:
 DPI = 100
 INK, PAPER = "#1c1c1c", "#ffffff"
 SMALL, TITLE = 8, 10
-"""Sizes of text, in points, on a page of pictures of `DEFAULT_STYLE` pixels."""
+"""Sizes of text in points, on a page of pictures of `REFERENCE_SIZE` pixels, for `font_size`."""
 
 REFERENCE_SIZE = 700.0
 _MIN_SIZE = 150  # minimum size in pixels of an image with a title and a scale
@@ -336,17 +359,29 @@ def new_page(width: float, height: float) -> Any:
     return _page_type()(figsize=size, dpi=DPI, facecolor=PAPER)
 
 
+def text_scale() -> float:
+    """Return the size of text relative to the default: a tenth of matplotlib's ``rcParams["font.size"]``."""
+    import matplotlib
+
+    return float(matplotlib.rcParams["font.size"]) / 10
+
+
+def font_size(points: float) -> float:
+    """Return a font size that is ``points`` with the default ``rcParams["font.size"]`` of 10 points."""
+    return points * text_scale()
+
+
 def label_axes(axes: Any, x: str, y: str, size: float = SMALL, ticks: float = 7, **how: Any) -> None:
-    """Label ``axes`` with font sizes ``size`` for the labels and ``ticks`` for the ticks."""
-    axes.set_xlabel(x, fontsize=size, color=INK, **how)
-    axes.set_ylabel(y, fontsize=size, color=INK, **how)
-    axes.tick_params(labelsize=ticks, colors=INK, length=2)
+    """Label ``axes`` with sizes ``size`` for the labels and ``ticks`` for the ticks, see `font_size`."""
+    axes.set_xlabel(x, fontsize=font_size(size), color=INK, **how)
+    axes.set_ylabel(y, fontsize=font_size(size), color=INK, **how)
+    axes.tick_params(labelsize=font_size(ticks), colors=INK, length=2)
 
 
 def label_bar(bar: Any, text: str, size: float = SMALL) -> None:
     """Label a colour bar."""
-    bar.set_label(text, fontsize=size, color=INK)
-    bar.ax.tick_params(labelsize=7, colors=INK, length=2)
+    bar.set_label(text, fontsize=font_size(size), color=INK)
+    bar.ax.tick_params(labelsize=font_size(7), colors=INK, length=2)
 
 
 @functools.cache
@@ -367,7 +402,7 @@ def _page_type() -> Any:
 
 
 class Sheet:
-    """Images (h, w, 3) of equal size with titles, arranged in rows.
+    """Images (h, w, 3) of equal size with titles, arranged in rows on a page of their own, or drawn in existing axes.
 
     Attributes: ``page``: figure; ``panels``, ``images``: axes and image of each panel; ``unit``: text size relative to
     the default.
@@ -384,6 +419,8 @@ class Sheet:
         Number of columns. Default: one row.
     note
         Note below the panels.
+    panels
+        Axes to draw in, one for each image. None: a page whose pixels are those of the images.
     """
 
     def __init__(
@@ -394,11 +431,18 @@ class Sheet:
         axes: bool = False,
         columns: int | None = None,
         note: str = "",
+        panels: Any = None,
     ):
+        self.panels: list[Any] = []
+        self.images: list[Any] = []
+        self._has_page = panels is None
+        if panels is not None:
+            self._fill(as_axes(panels, len(pictures)), pictures, titles, axes, note)
+            return
         h, w = pictures[0].shape[:2]
         magnification = max(1, math.ceil(_MIN_SIZE / max(h, w)))
         h, w = h * magnification, w * magnification
-        self.unit = unit = float(np.clip(math.sqrt(h * w) / REFERENCE_SIZE, 1.0, 6.0))
+        self.unit = unit = float(np.clip(math.sqrt(h * w) / REFERENCE_SIZE, 1.0, 6.0)) * text_scale()
         columns = min(columns or len(pictures), len(pictures))
         rows = -(-len(pictures) // columns)
         slot_w, slot_h = max(w, _MIN_SIZE), max(h, _MIN_SIZE if scale and rows == 1 else 1)
@@ -415,23 +459,14 @@ class Sheet:
         foot += SMALL * unit * _PIXELS_PER_POINT * 1.25 * (note.count("\n") + 1) if note else 0.0
         self.height = round_up_to_even(rows * (head + slot_h + below) + foot)
         self.page = new_page(self.width, self.height)
-        self.panels: list[Any] = []
-        self.images: list[Any] = []
         step = slot_w + (left if axes else gap)
         for k, (picture, title) in enumerate(zip(pictures, wrapped)):
             row, column = divmod(k, columns)
             x = round(left + column * step + (slot_w - w) / 2)
             top = round(row * (head + slot_h + below) + head + (slot_h - h) / 2)
             panel = self._add_axes(x, top, w, h)
-            self.images.append(panel.imshow(np.clip(picture, 0, 1), interpolation="nearest"))
             panel.set_anchor("C")
-            for spine in panel.spines.values():
-                spine.set_visible(False)
-            if not axes:
-                panel.set_xticks([])
-                panel.set_yticks([])
-            panel.set_title(title, fontsize=TITLE * unit, color=INK, pad=4 * unit)
-            self.panels.append(panel)
+            self._show(panel, picture, title, axes)
         if note:
             position = left / self.width, 0.6 * _EDGE * unit / self.height
             self.page.text(*position, note, fontsize=SMALL * unit, color=INK, va="bottom")
@@ -442,11 +477,39 @@ class Sheet:
             round(content_height),
         )
 
+    def _show(self, panel: Any, picture: np.ndarray, title: str, axes: bool) -> None:
+        """Draw an image with its title in the axes ``panel``."""
+        self.images.append(panel.imshow(np.clip(picture, 0, 1), interpolation="nearest"))
+        for spine in panel.spines.values():
+            spine.set_visible(False)
+        if not axes:
+            panel.set_xticks([])
+            panel.set_yticks([])
+        panel.set_title(title, fontsize=TITLE * self.unit, color=INK, pad=4 * self.unit)
+        self.panels.append(panel)
+
+    def _fill(
+        self, panels: np.ndarray, pictures: Sequence[np.ndarray], titles: Sequence[str], axes: bool, note: str
+    ) -> None:
+        """Draw the images in existing axes, with the scale to the right of the last one."""
+        self.page, self.unit = figure_of(panels[0]), text_scale()
+        for panel, picture, title in zip(panels, pictures, titles):
+            self._show(panel, picture, title, axes)
+        last = panels[-1]
+        last.apply_aspect()
+        to_layout = DPI / last.get_figure(root=True).dpi
+        self.width, self.height = last.bbox.width * to_layout, last.bbox.height * to_layout
+        self._bar_position = self.width + _GAP * self.unit, 0.0, self.height
+        if note:
+            below = (42 if axes else 4) * self.unit * 72 / DPI
+            text = wrap(note, self.width, SMALL * self.unit)
+            where = dict(xycoords="axes fraction", textcoords="offset points", va="top", annotation_clip=False)
+            panels[0].annotate(text, (0, 0), (0, -below), fontsize=SMALL * self.unit, color=INK, **where)
+
     def _add_axes(self, x: float, top: float, width: float, height: float) -> Any:
-        """Add axes at a position in pixels from the upper left corner of the page."""
-        return self.page.add_axes(
-            (x / self.width, 1 - (top + height) / self.height, width / self.width, height / self.height)
-        )
+        """Add axes at a position in pixels from the upper left corner of the page, or of the last panel."""
+        position = (x / self.width, 1 - (top + height) / self.height, width / self.width, height / self.height)
+        return self.page.add_axes(position) if self._has_page else self.panels[-1].inset_axes(position)
 
     def bar(
         self,
@@ -551,8 +614,9 @@ def contact_sheet(
     columns: int | None = None,
     add_scale: Callable[[Sheet], None] | None = None,
     note: str = "",
-) -> Any:
-    """Arrange images, display values, with titles in a grid; smaller images are centred.
+    axes: Any = None,
+) -> np.ndarray:
+    """Arrange images, display values, with titles in a grid; smaller images are centred. Return the axes (N,).
 
     Parameters
     ----------
@@ -564,6 +628,8 @@ def contact_sheet(
         Draws the common scale.
     note
         Note below the images.
+    axes
+        Axes to draw in, one for each image. None: a new figure.
     """
     if not pictures:
         raise ValueError("a contact sheet needs at least one picture")
@@ -575,10 +641,11 @@ def contact_sheet(
         scale=add_scale is not None,
         columns=columns,
         note=note,
+        panels=axes,
     )
     if add_scale is not None:
         add_scale(sheet)
-    return sheet.page
+    return np.array(sheet.panels)
 
 
 def shrink(picture: Any, width: int) -> np.ndarray:

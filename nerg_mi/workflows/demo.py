@@ -35,7 +35,7 @@ from nerg_mi.transport.observer import sensor_center
 
 from .bake import bake
 from .base import SILENT, Reporter, versions
-from .render import describe_bases, describe_basis
+from .render import describe_bases, describe_basis, describe_smoothing, smooth_gaze
 from .report import RESULTS, make_report
 from .scene_commands import BakeOptions, DemoOptions, ReportOptions
 
@@ -94,7 +94,9 @@ def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Rep
     with Interruption() as stop:
         clock.start("load")
         seen = load_scene(scene, values)
-        unoccluded = load_scene(scene, values | {"occlusion": "false", "radiance": "false", "aovs": "opacity,gaze"})
+        unoccluded = load_scene(
+            scene, values | {"occlusion": "false", "radiance": "false", "aovs": "depth,opacity,gaze"}
+        )
         if len(seen.sensors()) < 3:
             raise NergError(
                 f'"{scene}" has {len(seen.sensors())} sensor(s): it needs a camera, the observer\'s view and a panorama'
@@ -116,14 +118,17 @@ def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Rep
 
     clock.start("pictures")
     record = make_provenance("nerg demo", inputs, seed, {"spp": spp, "mode": mode, **sizes, "defaults": defaults})
+    pictures = {
+        "own": smooth_gaze(own_view, seen, seen.sensors()[FIRST_PERSON]),
+        "without": smooth_gaze(without, unoccluded, unoccluded.sensors()[CAMERA]),
+        "camera": smooth_gaze(camera, seen, seen.sensors()[CAMERA]),
+        "sphere": sphere,
+    }
     # All images of gaze share one colour scale.
-    tops = [
-        robust_max(r.aovs["gaze"], r.mask) for r in (own_view, camera, sphere, without) if np.any(r.aovs["gaze"] > 0)
-    ]
+    tops = [robust_max(r.aovs["gaze"], r.mask) for r in pictures.values() if np.any(r.aovs["gaze"] > 0)]
     if not tops:
         raise NergError(f'the gaze is 0 in all images: move the observer of "{scene}", or train its gaze field longer')
     heat = Heat(max(tops))
-    pictures = {"own": own_view, "without": without, "camera": camera, "sphere": sphere}
     files = _write_pictures(out, pictures, heat, observer_pixel(seen), describe_basis(seen), record)
     for key, value in (record.text() | describe_bases(seen)).items():
         camera.bitmap.metadata()[key] = value
@@ -281,16 +286,17 @@ def _write_pictures(
     note: str,
     record: Provenance,
 ) -> list[Path]:
-    """Write the figures of the images "own", "without" and "camera", and of the "sphere"."""
+    """Write the figures of the images "own", "without" and "camera", whose gaze is smoothed, and of the "sphere"."""
+    smoothed = describe_smoothing(note)
     camera, sphere = pictures["camera"], pictures["sphere"]
     parts = [(seen.color, seen.aovs["gaze"], seen.mask) for seen in pictures.values()]
     total = sphere_integral(sphere)
     drawn = {
         "occlusion": lambda: figures.occlusion_figure(
-            parts[0], (camera.color, *parts[1][1:]), parts[2], heat, marker, True, note
+            parts[0], (camera.color, *parts[1][1:]), parts[2], heat, marker, True, smoothed
         ),
         "gaze": lambda: figures.gaze_figure(
-            *parts[2], heat, "Where the observer looks", marker=marker, unknown=~camera.mask, note=note
+            *parts[2], heat, "Where the observer looks", marker=marker, unknown=~camera.mask, note=smoothed
         ),
         "gaze_sphere": lambda: sphere_figure(
             *parts[3],

@@ -22,7 +22,7 @@ from nerg_mi.figures.overlay import (
     robust_max,
     shared_limits,
 )
-from nerg_mi.figures.style import FORMATS, contact_sheet, find_colormap, make_provenance, save, shrink
+from nerg_mi.figures.style import FORMATS, contact_sheet, figure_of, find_colormap, make_provenance, save, shrink
 from nerg_mi.files.atomic import check_writable
 from nerg_mi.files.images import read_exr, read_exr_attributes
 from nerg_mi.files.safe_read import translate_read_errors
@@ -386,11 +386,12 @@ def draw_kind(
         if not path.exists():
             raise MissingFile(f'there is no file "{path}"')
     drawing = import_function(kind.function)(files, options, reporter)
+    figure = figure_of(drawing.drawn)
     if output is not None:
         record = make_provenance(f"nerg draw {kind.name}", _inputs(drawing.inputs, options), drawing.seed, options)
-        save(drawing.figure, output, record)
-        reporter.message(f"Wrote {output} ({' x '.join(f'{v:.0f}' for v in drawing.figure.bbox.size)}).")
-    return drawing.figure
+        save(figure, output, record)
+        reporter.message(f"Wrote {output} ({' x '.join(f'{v:.0f}' for v in figure.bbox.size)}).")
+    return figure
 
 
 def _inputs(paths: Sequence[Path], options: Any) -> list[Path]:

@@ -16,9 +16,12 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.figures.maps import ParticipantPath, SightLines, Walls, floor_figure
 from nerg_mi.figures.overlay import Overlay, OverlayLayers, find_overlay, occlusion_figure, shared_limits, unknown_mask
+from nerg_mi.figures.scanpath import scanpath_figure
 from nerg_mi.figures.sphere import find_projection, sphere_figure
 from nerg_mi.interruption import Interruption
+from nerg_mi.maths.types import variant_types
 from nerg_mi.rays.dataset import load_rays
+from nerg_mi.rays.events import average_fixations, detect_fixations_idt
 from nerg_mi.rays.filters import find_sessions
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.bands import require_nerg
@@ -28,16 +31,16 @@ from nerg_mi.transport.geometry import SceneGeometry, pixel_solid_angles, trace_
 
 from .base import Reporter
 from .render import render_layers
-from .scene_commands import FloorOptions, SceneFigureOptions, SphereOptions, TriptychOptions
+from .scene_commands import FloorOptions, ScanpathOptions, SceneFigureOptions, SphereOptions, TriptychOptions
 
 # ---- Result of drawing ----
 
 
 @dataclass(frozen=True)
 class Drawing:
-    """A matplotlib ``figure``, its input files, and the ``seed`` of its random numbers, or None."""
+    """The axes or the figure that was ``drawn``, its input files, and the ``seed`` of its random numbers, or None."""
 
-    figure: Any
+    drawn: Any
     inputs: Sequence[Path]
     seed: int | None = None
 
@@ -323,6 +326,65 @@ def triptych(files: Sequence[Path], options: TriptychOptions, reporter: Reporter
     first, second, third = ((view.color, view.values, view.mask) for view in (own_view, without, seen))
     figure = occlusion_figure(first, second, third, heat, marker, style.hatch_unknown, seen.support_note)
     return Drawing(figure, [path], options.seed)
+
+
+# ---- Scanpaths ----
+
+
+def scanpath(files: Sequence[Path], options: ScanpathOptions, reporter: Reporter) -> Drawing:
+    """Draw the fixations of participants of a rays file over a view of ``options.scene``."""
+    from nerg_mi.transport.observer import sensor_center
+
+    (path,) = files
+    if options.scene is None:
+        raise NergError("a scanpath is drawn over a view of a scene; name its file with --scene")
+    rays = load_rays(path)
+    rays = _select_participants(rays, rays.persons[0] if options.participants is None else options.participants)
+    low, high = (-np.inf if options.start is None else options.start), (np.inf if options.end is None else options.end)
+    rays = rays.select((rays.t >= low) & (rays.t <= high))
+    if not len(rays):
+        raise NergError(f'"{path}" has no rays of these participants in this time; change --participants or --start')
+    fixations, durations = average_fixations(
+        rays, detect_fixations_idt(rays, options.dispersion_threshold, options.min_fixation)
+    )
+    order = np.lexsort((fixations.t, fixations.person))
+    rank = np.arange(len(order)) - np.searchsorted(fixations.person[order], fixations.person[order])
+    rows = order[rank < options.max_fixations]
+    view = SceneFigureOptions(
+        defaults=options.defaults, spp=options.spp, seed=options.seed, mode=options.mode, smoothing=0
+    )
+    with open_scene(options.scene, view, reporter) as opened:
+        camera = opened.camera(options.sensor)
+        if camera.class_name() != "PerspectiveCamera":
+            raise NergError(f'sensor {options.sensor} of "{options.scene}" is not a perspective camera; choose another')
+        layers = opened.render(camera, find_overlay("depth"))
+        geometry = SceneGeometry(opened.nerg.medium, opened.scene)
+        origins, directions = fixations.origin[rows], fixations.direction[rows]
+        depth, opacity = trace_depth(geometry, origins, directions, opened.nerg.settings)
+        targets = np.where(opacity[:, None] >= _SURFACE, origins + depth[:, None] * directions, np.nan)
+        pixels = _visible_pixels(camera, targets, layers.values, np.ravel(np.array(sensor_center(camera))))
+    hidden = int(np.isnan(pixels[:, 0]).sum())
+    people, index = np.unique(fixations.person[rows], return_inverse=True)
+    note = f"{len(rows)} fixations (I-DT, {options.dispersion_threshold:g}°, at least {options.min_fixation:g} s)"
+    note += f"; {hidden} outside of the image or hidden" if hidden else ""
+    names = tuple(rays.persons[p] for p in people)
+    axes = scanpath_figure(layers.color, pixels, durations[rows], index, names, "Scanpath", note)
+    return Drawing(axes, [path, options.scene], options.seed)
+
+
+def _visible_pixels(camera: Any, points: np.ndarray, depth: np.ndarray, center: np.ndarray) -> np.ndarray:
+    """Return the pixels (N, 2) of ``points`` (N, 3) in the image of ``camera``; NaN outside of it, or if they are more
+    than 3 % farther than the surface at the pixel."""
+    mi = variant_types()
+    out = np.full((len(points), 2), np.nan)
+    for row, point in enumerate(points):
+        pixel = project_to_pixel(camera, mi.Point3f(*point.tolist())) if np.isfinite(point).all() else None
+        if pixel is None:
+            continue
+        column, line = (int(np.clip(round(v), 0, n - 1)) for v, n in zip(pixel, depth.shape[::-1]))
+        if not 0 < 1.03 * depth[line, column] < np.linalg.norm(point - center):
+            out[row] = pixel
+    return out
 
 
 def _observer_camera(observer: Any, camera: Any) -> Any:

@@ -39,7 +39,7 @@ from .old_names import find_keywords, get_spellings, rename_keywords
 from .rays_commands import DATASET, FilterOptions, PlotOptions, RaysImportOptions, SplitOptions
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from matplotlib.axes import Axes
 
 
 # ---- Steps of a filter: conditions, fixations, thinning, a sample ----
@@ -550,23 +550,25 @@ def split_file(rays: Path, output: Path, options: SplitOptions, reporter: Report
     _report_written(test, reporter)
 
 
-def plot_rays(rays: Rays | FileName, options: PlotOptions | None = None, reporter: Reporter = SILENT) -> Figure:
-    """Return the floor plan of rays, or of their file, as a matplotlib figure."""
+def plot_rays(
+    rays: Rays | FileName, options: PlotOptions | None = None, reporter: Reporter = SILENT, axes: Axes | None = None
+) -> Axes:
+    """Draw the floor plan of rays, or of their file, in ``axes`` or in a new figure, and return its axes."""
     options = options or PlotOptions()
     reporter.progress(0.0, "drawing rays")
     if options.output is not None:
         check_writable(options.output, *style.FORMATS)
     if options.kind == "density":
-        figure = maps.floor_plan(_load(rays), options.cell_size)
+        drawn = maps.floor_plan(_load(rays), options.cell_size, axes=axes)
     else:
         test = None if options.test is None else _load(options.test)
         where = {} if test is None else filters.read_position_split(test)
-        figure = maps.layout_figure(_load(rays), test, where.get("test_centres"), where.get("radius"))
+        drawn = maps.layout_figure(_load(rays), test, where.get("test_centres"), where.get("radius"), axes=axes)
     if options.output is not None:
         record = make_provenance("nerg rays plot", existing_files(rays, options.test), None, options)
-        style.save(figure, options.output, record)
+        style.save(drawn, options.output, record)
         _report_written(options.output, reporter)
-    return figure
+    return drawn
 
 
 def _load(rays: Rays | FileName) -> Rays:

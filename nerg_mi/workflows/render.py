@@ -25,7 +25,7 @@ from nerg_mi.files.safe_read import read_npy
 from nerg_mi.files.video import check_video_output, open_video_writer
 from nerg_mi.interruption import Interruption
 from nerg_mi.rendering import bands
-from nerg_mi.rendering.bands import SamplePace, is_nerg, prepare_long_render, render_aovs
+from nerg_mi.rendering.bands import Channels, SamplePace, is_nerg, prepare_long_render, render_aovs
 from nerg_mi.rendering.files import IMAGE_FORMATS, DisplayRows, frame_path, open_image_rows, read_frames
 from nerg_mi.rendering.scene import activate_variant, list_scene_files, load_scene
 from nerg_mi.rendering.scene_writer import project_to_pixel
@@ -245,14 +245,36 @@ def render_layers(
         position = np.stack([channels.aovs[f"position.{axis}"] for axis in "XYZ"], axis=-1)
         color = draw_outlines(color, position, channels.mask)
     if sigma > 0:
-        # Smooth the density without the shadows, whose borders stay sharp.
-        visible = channels.aovs["visibility"] if loaded.integrator().occlusion else 1.0
-        weights = np.where(channels.mask, visible, 0.0)
-        unoccluded = np.divide(values, weights, out=np.zeros_like(weights), where=weights > _MIN_VISIBILITY)
-        weights = np.where(weights > _MIN_VISIBILITY, weights, 0.0)
-        values = weights * smooth_on_surfaces(unoccluded, weights, channels.aovs["depth"], sigma)
-        basis = "; ".join(filter(None, [basis, f"smoothed by {smoothing:g}°"]))
+        values = _smooth_density(values, channels, loaded, sigma)
+        basis = describe_smoothing(basis, smoothing)
     return OverlayLayers(color, values, channels.mask, marker, supported, basis)
+
+
+def _smooth_density(values: np.ndarray, channels: Channels, loaded: Any, sigma: float) -> np.ndarray:
+    """Smooth a density (h, w) on surfaces, divided by the visibility before, so that shadows keep their border."""
+    visible = channels.aovs["visibility"] if loaded.integrator().occlusion else 1.0
+    weights = np.where(channels.mask, visible, 0.0)
+    weights = np.where(weights > _MIN_VISIBILITY, weights, 0.0)
+    unoccluded = np.divide(values, weights, out=np.zeros_like(weights), where=weights > 0)
+    return weights * smooth_on_surfaces(unoccluded, weights, channels.aovs["depth"], sigma)
+
+
+def smooth_gaze(channels: Channels, loaded: Any, camera: Any, smoothing: float = SMOOTHING) -> Channels:
+    """Return the image of ``camera`` with its AOV ``gaze`` smoothed by ``smoothing`` degrees on surfaces.
+
+    It needs the AOV ``depth``, and ``visibility`` if the scene has occlusion.
+    """
+    width = channels.mask.shape[1] / camera.film().crop_size()[0]
+    sigma = smoothing * pixels_per_degree(camera) * width
+    if not sigma > 0:
+        return channels
+    gaze = _smooth_density(channels.aovs["gaze"], channels, loaded, sigma)
+    return replace(channels, aovs={**channels.aovs, "gaze": gaze})
+
+
+def describe_smoothing(basis: str, smoothing: float = SMOOTHING) -> str:
+    """Return the note ``basis`` on the data with a note on the smoothing."""
+    return "; ".join(filter(None, [basis, f"smoothed by {smoothing:g}°"]))
 
 
 def shows_unlit_surfaces(loaded: Any) -> bool:

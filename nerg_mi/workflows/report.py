@@ -63,7 +63,7 @@ from nerg_mi.transport.observer import sensor_center
 from .base import SILENT, Reporter, SilentReporter, select_backend, versions
 from .evaluate import evaluate_gaze
 from .gaze_commands import GazeEvaluationOptions
-from .render import describe_basis, is_supported
+from .render import describe_basis, describe_smoothing, is_supported, smooth_gaze
 from .scene import SceneResult, write_scene
 from .scene_cameras import support_of_rays, to_scene_frame
 from .scene_commands import ReportOptions, SceneOptions
@@ -182,7 +182,9 @@ class RenderedViews:
     def layers(self, name: str, quantity: str = "gaze") -> OverlayLayers:
         """Return a ``quantity`` over the image ``name``."""
         view, marker = self.images[name], self.marker if name == "camera" else None
-        return OverlayLayers(view.color, view.aovs[quantity], view.mask, marker, self.supported, self.basis)
+        is_smoothed = quantity == "gaze" and name != "sphere"
+        basis = describe_smoothing(self.basis) if is_smoothed else self.basis
+        return OverlayLayers(view.color, view.aovs[quantity], view.mask, marker, self.supported, basis)
 
 
 def gaze_vmax(views: Mapping[str, Channels]) -> float | None:
@@ -631,7 +633,7 @@ class _ReportWork:
         """Render the camera, the observer's view and the sphere."""
         o = self.options
         spread = len(self.field.members) > 1
-        aovs = "depth,opacity,gaze" + (",gaze_std" if spread else "")
+        aovs = "depth,opacity,gaze,visibility" + (",gaze_std" if spread else "")
         loaded = self._load(scene, aovs=aovs, sphere_width=o.width, sphere_height=o.width // 2)
         views = dict(rendered or {})
         for number, name in enumerate(VIEWS):
@@ -642,6 +644,7 @@ class _ReportWork:
                 views[name] = render_channels(
                     loaded, loaded.sensors()[number], o.spp, o.seed, lambda done, total: self.stop.check()
                 )
+        views = {name: smooth_gaze(views[name], loaded, loaded.sensors()[number]) for number, name in enumerate(VIEWS)}
         marker = None
         if scene.observer is not None:
             camera, width = loaded.sensors()[0], views["camera"].mask.shape[1]

@@ -427,6 +427,30 @@ class SphereOptions(SceneFigureOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
+class ScanpathOptions(ValidatedDataclass):
+    """Options of ``nerg draw scanpath``."""
+
+    scene: Path | None = option(None, "Scene file, in the coordinates of the rays; required.", group=INPUT)
+    defaults: Mapping[str, str] | None = definitions()
+    participants: str | None = option(
+        None, "Comma-separated names of the participants to draw.  [default: the first one]", group=INPUT
+    )
+    start: float | None = option(None, "First time in seconds.  [default: the first]", within=TIMES, group=INPUT)
+    end: float | None = option(None, "Last time in seconds.  [default: the last]", within=TIMES, group=INPUT)
+    dispersion_threshold: float = option(
+        1.0, "Dispersion of a fixation in degrees (I-DT).", within=Range(1e-3, 90), group=INPUT
+    )
+    min_fixation: float = option(0.1, "Minimum duration of a fixation in seconds.", within=SECONDS, group=INPUT)
+    max_fixations: int = option(
+        40, "Maximum number of fixations of a participant; the first ones are drawn.", within=Range(1, 1000), group=VIEW
+    )
+    sensor: int = _sensor("Index of the camera, counted from 0.")
+    spp: int = _samples(0)
+    seed: int = random_seed("sampling")
+    mode: str | None = best_variant()
+
+
+@dataclass(frozen=True, kw_only=True)
 class TriptychOptions(SceneFigureOptions):
     """Options of ``nerg draw triptych``."""
 
@@ -500,6 +524,14 @@ _TABLE = (
         1,
         TriptychOptions,
         f"{_SCENE}:triptych",
+    ),
+    FigureKind(
+        "scanpath",
+        "Draw numbered fixations over a view of the scene.",
+        "file of rays (.npz)",
+        1,
+        ScanpathOptions,
+        f"{_SCENE}:scanpath",
     ),
     FigureKind(
         "floor",

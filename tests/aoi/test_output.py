@@ -10,6 +10,7 @@ from nerg_mi.aoi import output
 from nerg_mi.aoi.options import StatisticsOptions
 from nerg_mi.aoi.output import StatisticsResult, write_results
 from nerg_mi.figures.statistics import aois_figure
+from nerg_mi.figures.style import figure_of
 from nerg_mi.measures.tables import MIN_VIEWPOINTS, ParticipantRows
 from nerg_mi.measures.visits import ALL, VisitSums
 from tests.workflows.recorder import Recorder
@@ -116,7 +117,7 @@ def test_hit_ratio_from_few_viewpoints_is_marked():
         texts = output.aoi_columns([one])[1](one)
         said = [text for text in texts if "biased low" in str(text)]
         assert said == ([f"45.0 % (biased low: {places:.1f} viewpoints per participant)"] if low else [])
-        share, extent, dwell = aois_figure([one]).axes
+        share, extent, dwell = figure_of(aois_figure([one])).axes
         assert ("biased low" in extent.get_xlabel()) == low and "low" not in share.get_xlabel() + dwell.get_xlabel()
         assert (extent.lines[0].get_markerfacecolor() == "white") == low
 

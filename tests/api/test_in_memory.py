@@ -8,6 +8,7 @@ import sys
 import warnings
 from pathlib import Path
 
+import matplotlib.figure
 import numpy as np
 import pytest
 import trimesh
@@ -210,6 +211,11 @@ def test_pictures_are_labelled_arrays_and_figures(room, gaze):
     html = pictures._repr_html_()
     assert html is not None and "data:image/png" in html
     assert len(scene.show(spp=1).axes) == 2 and len(pictures.plot("color").axes) >= 1
+    figure = matplotlib.figure.Figure()
+    first, second, third = figure.subplots(1, 3)
+    for name, axes in (("color", first), ("gaze", second)):
+        assert pictures.plot(name, axes=axes) is figure and axes.get_images(), name
+    assert scene.show("depth", axes=third, spp=1) is figure and third.get_images()
     with pytest.raises(nerg.NergError, match='"depth"'):
         pictures.plot("depth")
     rays = nerg.trace(scene, EYE, [(1, 0, 0)]).to_xarray()

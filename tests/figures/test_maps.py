@@ -18,7 +18,7 @@ from nerg_mi.figures.maps import (
     layout_figure,
 )
 from nerg_mi.figures.statistics import aois_figure, map_figure, transitions_figure
-from nerg_mi.figures.style import DPI, encode, rasterize, save
+from nerg_mi.figures.style import DPI, encode, figure_of, rasterize, save
 from nerg_mi.rays.rays import Rays
 
 # ---- Alignment figures ----
@@ -29,7 +29,7 @@ def test_alignment_figure_has_four_plans(place):
     points, heads = np.random.default_rng(1).uniform(0, 2, (2, 300, 3))
     shift = np.eye(4)
     shift[:3, 3] = 1, 2, 0
-    figure = alignment_figure(place, points, heads, shift, cut_height=3.0)
+    figure = figure_of(alignment_figure(place, points, heads, shift, cut_height=3.0))
     assert [a.get_title(loc="left") for a in figure.axes] == [
         f"{when}, {view}" for when in ("before", "after") for view in ("from above", "from the side")
     ]
@@ -43,7 +43,7 @@ def test_alignment_figure_has_four_plans(place):
 
 def test_ceiling_is_cut_in_views_from_above():
     place = np.array([[0.0, 0, 0], [1, 1, 1], [0, 0, 3], [1, 0, 3]])
-    figure = alignment_figure(place, place, None, np.eye(4), cut_height=2.0)
+    figure = figure_of(alignment_figure(place, place, None, np.eye(4), cut_height=2.0))
     assert [len(a.collections[0].get_offsets()) for a in figure.axes] == [2, 4, 2, 4]
 
 
@@ -59,7 +59,7 @@ def poses() -> np.ndarray:
 def test_camera_figure_shows_cameras_and_points(tmp_path):
     points = np.random.default_rng(0).uniform(-1, 6, (500, 3))
     points[0] = 1e6
-    figure = camera_figure(poses(), points, np.full((500, 3), 90, np.uint8), "5 of 6 pictures")
+    figure = figure_of(camera_figure(poses(), points, np.full((500, 3), 90, np.uint8), "5 of 6 pictures"))
     above, side = figure.axes
     assert (above.get_xlabel(), above.get_ylabel(), side.get_ylabel()) == ("x", "y", "z")
     for axes in figure.axes:
@@ -72,7 +72,7 @@ def test_camera_figure_shows_cameras_and_points(tmp_path):
 
 def test_camera_wedges_open_in_viewing_direction():
     """OpenGL cameras look along -z, which is down from the side."""
-    wedge = camera_figure(poses()[:1], np.zeros((0, 3)), np.zeros((0, 3), np.uint8), "").axes[1].lines[1]
+    wedge = figure_of(camera_figure(poses()[:1], np.zeros((0, 3)), np.zeros((0, 3), np.uint8), "")).axes[1].lines[1]
     assert min(wedge.get_ydata()) <= 0 and max(wedge.get_ydata()) == 0
 
 
@@ -91,7 +91,7 @@ def walls():
 
 
 def test_walls_are_drawn_in_place():
-    page = floor_figure(LOW, HIGH, walls())
+    page = figure_of(floor_figure(LOW, HIGH, walls()))
     (image,) = page.axes[0].images
     assert tuple(image.get_extent()) == (0, 4, 0, 3) and image.origin == "lower"
     grey = image.get_array()[..., 0]
@@ -106,7 +106,9 @@ def test_walls_are_drawn_in_place():
 
 def test_paths_have_gaps():
     places = np.array([[0.5, 0.5], [1, 0.5], [3, 2], [3.2, 2.2]])
-    page = floor_figure(LOW, HIGH, paths=[ParticipantPath("Ada", places, np.array([True, False, True, False]))])
+    page = figure_of(
+        floor_figure(LOW, HIGH, paths=[ParticipantPath("Ada", places, np.array([True, False, True, False]))])
+    )
     line = next(l for l in page.axes[0].lines if len(l.get_xdata()) > 2)
     xy = np.stack([line.get_xdata(), line.get_ydata()], axis=1)
     np.testing.assert_array_equal(xy[~np.isnan(xy[:, 0])], places)
@@ -119,7 +121,7 @@ def test_paths_have_gaps():
 def test_lines_of_sight_and_fields_of_view():
     origins, ends = np.array([[1.0, 1], [2, 2]]), np.array([[1.0, 2], [3, 2]])
     sight = SightLines(origins, ends, np.array([0, 1]))
-    page = floor_figure(LOW, HIGH, rays=sight, fields=sight, fov=40)
+    page = figure_of(floor_figure(LOW, HIGH, rays=sight, fields=sight, fov=40))
     (lines,) = [c for c in page.axes[0].collections if isinstance(c, LineCollection)]
     np.testing.assert_array_equal(np.stack(lines.get_segments()), np.stack([origins, ends], axis=1))
     (wedges,) = [c for c in page.axes[0].collections if isinstance(c, PatchCollection)]
@@ -138,7 +140,7 @@ def test_legend_of_many_participants():
     walk = lambda k: ParticipantPath(
         f"somebody with a rather long name {k}", np.array([[0.1 * k, 0.1], [1, 1]]), np.array([True, False])
     )
-    page = floor_figure(LOW, HIGH, walls(), [walk(k) for k in range(20)], title="20 people")
+    page = figure_of(floor_figure(LOW, HIGH, walls(), [walk(k) for k in range(20)], title="20 people"))
     page.canvas.draw()
     texts = page.axes[0].get_legend().get_texts()
     assert len(texts) == 12 and texts[-1].get_text() == "and 12 more participants"
@@ -175,7 +177,7 @@ def rays():
 
 
 def test_density_is_samples_per_square_metre(rays):
-    figure = floor_plan(rays, cell=0.25)
+    figure = figure_of(floor_plan(rays, cell=0.25))
     (mesh,) = [c for c in figure.axes[0].collections if hasattr(c, "_coordinates")]
     density = np.ma.filled(mesh.get_array(), 0.0)
     assert np.isclose(density.sum() * 0.25**2, 1000)
@@ -188,7 +190,11 @@ def test_density_is_samples_per_square_metre(rays):
 
 
 def test_axes_are_metres_of_equal_scale(rays):
-    for figure in (floor_plan(rays), layout_figure(rays), layout_figure(rays, rays, rays.origin[:5], 0.25)):
+    for figure in (
+        figure_of(floor_plan(rays)),
+        figure_of(layout_figure(rays)),
+        figure_of(layout_figure(rays, rays, rays.origin[:5], 0.25)),
+    ):
         axes = figure.axes[0]
         figure.canvas.draw()
         a, b = axes.transData.transform([(0, 0), (1, 1)])
@@ -197,15 +203,15 @@ def test_axes_are_metres_of_equal_scale(rays):
 
 
 def test_layout_shows_dimensions(rays):
-    texts = {t.get_text() for t in layout_figure(rays).axes[0].texts}
+    texts = {t.get_text() for t in figure_of(layout_figure(rays)).axes[0].texts}
     x, y = np.ptp(rays.origin[:, 0]), np.ptp(rays.origin[:, 1])
     assert {f"{x:.2f} m", f"{y:.2f} m"} <= texts
-    legend = [t.get_text() for t in layout_figure(rays, rays).axes[0].get_legend().get_texts()]
+    legend = [t.get_text() for t in figure_of(layout_figure(rays, rays)).axes[0].get_legend().get_texts()]
     assert legend == ["training samples", "test samples", "gaze hit points"]
     bare = Rays(rays.t, rays.person, rays.persons, rays.origin, rays.direction, rays.confidence)
-    assert [t.get_text() for t in layout_figure(bare).axes[0].get_legend().get_texts()] == ["samples"]
+    assert [t.get_text() for t in figure_of(layout_figure(bare)).axes[0].get_legend().get_texts()] == ["samples"]
     one = bare.select([0])
-    floor_plan(one), layout_figure(one)  # a single place has no extent
+    figure_of(floor_plan(one)), figure_of(layout_figure(one))  # a single place has no extent
 
 
 # ---- Figures of statistics ----
@@ -218,7 +224,7 @@ def row(aoi, source, share):
 
 
 def test_bars_show_sorted_shares():
-    page = aois_figure([row("a", "measured", 0.1), row("b", "measured", 0.3), row("a", "predicted", 0.2)])
+    page = figure_of(aois_figure([row("a", "measured", 0.1), row("b", "measured", 0.3), row("a", "predicted", 0.2)]))
     axis = page.axes[0]
     assert [t.get_text() for t in axis.get_yticklabels()] == ["a", "b"]
     assert sorted(p.get_width() for p in axis.patches) == [10.0, 30.0]
@@ -228,13 +234,13 @@ def test_bars_show_sorted_shares():
 
 
 def test_transitions_are_row_percentages():
-    page = transitions_figure(["a", "b"], np.array([[0, 3.0], [0, 0]]))
+    page = figure_of(transitions_figure(["a", "b"], np.array([[0, 3.0], [0, 0]])))
     assert page.axes[0].images[0].get_array().filled(0).tolist() == [[0, 100], [0, 0]]
     assert rasterize(page).std() > 5
 
 
 def test_grid_map():
-    page = map_figure(np.array([[0.0, 0], [1, 0], [1, 1]]), np.array([1.0, 2, 3]), 1.0, "m²", "map")
+    page = figure_of(map_figure(np.array([[0.0, 0], [1, 0], [1, 1]]), np.array([1.0, 2, 3]), 1.0, "m²", "map"))
     assert page.axes[0].collections[0].get_array().tolist() == [1, 2, 3]
     assert rasterize(page).std() > 5
 

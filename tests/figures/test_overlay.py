@@ -21,7 +21,7 @@ from nerg_mi.figures.overlay import (
     to_bytes,
     write_png,
 )
-from nerg_mi.figures.style import save
+from nerg_mi.figures.style import figure_of, save
 from nerg_mi.transport.aovs import AOVS
 
 # ---- Heat over a picture ----
@@ -135,7 +135,7 @@ def test_figures_show_images_pixel_for_pixel(rgb, tmp_path):
     shown = overlay(PLOTS_COLOR, GAZE, HEAT, MASK)
     # The image is so small that a pixel is magnified to 5 x 5.
     shown = np.repeat(np.repeat(shown, 5, axis=0), 5, axis=1)
-    figure = figures.gaze_figure(PLOTS_COLOR, GAZE, MASK, HEAT)
+    figure = figure_of(figures.gaze_figure(PLOTS_COLOR, GAZE, MASK, HEAT))
     box = figure.axes[0].get_window_extent()
     x, y = round(box.x0), round(figure.bbox.height - box.y1)
     assert (round(box.width), round(box.height)) == (180, 120)
@@ -145,10 +145,10 @@ def test_figures_show_images_pixel_for_pixel(rgb, tmp_path):
 @pytest.mark.parametrize("name", ["depth", "gaze", "visibility", "occlusion"])
 def test_figures_are_reproducible(tmp_path, name):
     draw = dict(
-        depth=lambda: figures.depth_figure(3 + GAZE, MASK),
-        gaze=lambda: figures.gaze_figure(PLOTS_COLOR, GAZE, MASK, HEAT),
+        depth=lambda: figure_of(figures.depth_figure(3 + GAZE, MASK)),
+        gaze=lambda: figure_of(figures.gaze_figure(PLOTS_COLOR, GAZE, MASK, HEAT)),
         visibility=lambda: figures.visibility_figure(PLOTS_COLOR, GAZE, MASK),
-        occlusion=lambda: figures.occlusion_figure(*[(PLOTS_COLOR, GAZE, MASK)] * 3, HEAT, (3, 4)),
+        occlusion=lambda: figure_of(figures.occlusion_figure(*[(PLOTS_COLOR, GAZE, MASK)] * 3, HEAT, (3, 4))),
     )[name]
     for k in "ab":
         save(draw(), tmp_path / f"{k}.png", {"Comment": "seed 1"})
@@ -159,7 +159,8 @@ def test_figures_are_reproducible(tmp_path, name):
 def test_note_does_not_move_panels():
     """The note does not move the image or the scale."""
     plain, noted = (
-        figures.gaze_figure(PLOTS_COLOR, GAZE, MASK, HEAT, note=n) for n in ("", "made of 300 rays of 3 participants")
+        figure_of(figures.gaze_figure(PLOTS_COLOR, GAZE, MASK, HEAT, note=n))
+        for n in ("", "made of 300 rays of 3 participants")
     )
     assert noted.bbox.height > plain.bbox.height and noted.bbox.width == plain.bbox.width
     for a, b in zip(plain.axes, noted.axes):
@@ -178,15 +179,17 @@ def test_depth_without_surfaces(tmp_path):
 
 
 def test_occlusion_figure_has_one_scale():
-    figure = figures.occlusion_figure(
-        (PLOTS_COLOR, GAZE, MASK), (PLOTS_COLOR, GAZE, MASK), (PLOTS_COLOR, 0 * GAZE, MASK), HEAT
+    figure = figure_of(
+        figures.occlusion_figure(
+            (PLOTS_COLOR, GAZE, MASK), (PLOTS_COLOR, GAZE, MASK), (PLOTS_COLOR, 0 * GAZE, MASK), HEAT
+        )
     )
     assert len(figure.axes) == 4
     bar = figure.axes[-1]
     # A tip beyond the end of the scale, in the colour of the end.
     assert "1/sr" in bar.get_ylabel().replace("\n", " ") and len(bar.patches) == 1
     assert bar.patches[0].get_xy()[:, 1].max() > 1
-    calm = figures.gaze_figure(PLOTS_COLOR, GAZE, MASK, Heat(vmax=2.0))
+    calm = figure_of(figures.gaze_figure(PLOTS_COLOR, GAZE, MASK, Heat(vmax=2.0)))
     assert not calm.axes[-1].patches
 
 

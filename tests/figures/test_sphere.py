@@ -9,7 +9,7 @@ from scipy.optimize import brentq
 from nerg_mi.errors import NergError
 from nerg_mi.figures.overlay import Heat
 from nerg_mi.figures.sphere import PROJECTIONS, find_projection, resample_panorama, sphere_figure
-from nerg_mi.figures.style import encode
+from nerg_mi.figures.style import encode, figure_of
 from nerg_mi.transport.geometry import pixel_directions
 
 # ---- Projections ----
@@ -93,7 +93,7 @@ def spot(direction, half=0.15):
     ],
 )
 def test_directions_on_the_map(projection, direction, place):
-    figure = sphere_figure(BLACK, spot(direction), ALL, HEAT, projection=projection)
+    figure = figure_of(sphere_figure(BLACK, spot(direction), ALL, HEAT, projection=projection))
     (image,) = figure.axes[0].images
     assert tuple(image.get_extent()) == (-1, 1, -1, 1)
     bright = image.get_array()[..., 0] > 0.5
@@ -108,8 +108,8 @@ def test_directions_on_the_map(projection, direction, place):
 
 def test_unknown_pixels_are_hatched():
     unknown = ALL & (np.arange(HEIGHT)[:, None] < HEIGHT // 2)
-    plain = sphere_figure(BLACK, NO_GAZE, ALL, HEAT, projection="mollweide")
-    hatched = sphere_figure(BLACK, NO_GAZE, ALL, HEAT, projection="mollweide", unknown=unknown)
+    plain = figure_of(sphere_figure(BLACK, NO_GAZE, ALL, HEAT, projection="mollweide"))
+    hatched = figure_of(sphere_figure(BLACK, NO_GAZE, ALL, HEAT, projection="mollweide", unknown=unknown))
     a, b = (f.axes[0].images[0].get_array() for f in (plain, hatched))
     differ = np.any(a != b, axis=-1)
     inside = a.max(axis=-1) < 0.99
@@ -124,4 +124,4 @@ def test_figures_are_reproducible():
 
 def test_figure_with_unknown_projection_is_refused():
     with pytest.raises(NergError, match='"mercator"'):
-        sphere_figure(BLACK, NO_GAZE, ALL, HEAT, projection="mercator")
+        figure_of(sphere_figure(BLACK, NO_GAZE, ALL, HEAT, projection="mercator"))

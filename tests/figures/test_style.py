@@ -28,6 +28,7 @@ from nerg_mi.figures.style import (
     contact_sheet,
     encode,
     existing_files,
+    figure_of,
     find_colormap,
     hatch,
     hatch_lines,
@@ -180,7 +181,7 @@ LINK = "{http://www.w3.org/1999/xlink}href"
 
 
 def figure():
-    return gaze_figure(COLOR, GAZE, MASK, Heat(0.5))
+    return figure_of(gaze_figure(COLOR, GAZE, MASK, Heat(0.5)))
 
 
 def test_png_is_read_by_another_library(tmp_path):
@@ -311,7 +312,7 @@ def overlap(a, b, slack=0.5):
 def test_labels_do_not_overlap_or_leave_the_page(size, label):
     values = np.linspace(0, 2e-5, size[0] * size[1]).reshape(size)
     color, mask = np.zeros((*size, 3)), np.ones(size, bool)
-    page = gaze_figure(color, values, mask, Heat(1.6e-5), "Where people looked", label, None, values < 1e-6)
+    page = figure_of(gaze_figure(color, values, mask, Heat(1.6e-5), "Where people looked", label, None, values < 1e-6))
     texts, axes = boxes(page)
     width, height = page.bbox.size
     for a, b in itertools.combinations(texts, 2):
@@ -344,7 +345,7 @@ def test_sheet_rows_and_columns():
 def test_ticks_match_colours(decades):
     """The position of a tick has the colour of a pixel with its value."""
     heat = Heat(2.0, decades=decades)
-    page = gaze_figure(np.full((200, 200, 3), 0.2), np.zeros((200, 200)), np.ones((200, 200), bool), heat)
+    page = figure_of(gaze_figure(np.full((200, 200, 3), 0.2), np.zeros((200, 200)), np.ones((200, 200), bool), heat))
     bar = page.axes[-1]
     strip = bar.images[0].get_array()[:, 0]
     np.testing.assert_allclose(strip, color_strip(heat))
@@ -370,7 +371,7 @@ RANDOM = np.random.default_rng(0)
 
 def test_contact_sheet_of_different_sizes():
     pictures = [RANDOM.random((90, 160, 3)), RANDOM.random((200, 100, 3)), RANDOM.random((50, 50, 3))]
-    page = contact_sheet(pictures, ["first", "second", "third"])
+    page = figure_of(contact_sheet(pictures, ["first", "second", "third"]))
     assert [a.get_title() for a in page.axes] == ["first", "second", "third"]
     for axes, picture in zip(page.axes, pictures):
         shown = axes.images[0].get_array()
@@ -382,7 +383,7 @@ def test_contact_sheet_of_different_sizes():
 
 def test_contact_sheet_with_one_scale():
     scale = lambda sheet: add_scale(sheet, Heat(2.0), "gaze [1/sr]", [(np.array([3.0]), np.ones(1, bool))])
-    page = contact_sheet([RANDOM.random((90, 160, 3))] * 2, "ab", None, scale)
+    page = figure_of(contact_sheet([RANDOM.random((90, 160, 3))] * 2, "ab", None, scale))
     assert len(page.axes) == 3 and page.axes[-1].get_ylabel() == "gaze [1/sr]" and len(page.axes[-1].patches) == 1
 
 
@@ -397,4 +398,4 @@ def test_shrinking_averages_blocks():
 
 def test_empty_contact_sheet_is_refused():
     with pytest.raises(ValueError, match="at least one picture"):
-        contact_sheet([], [])
+        figure_of(contact_sheet([], []))

@@ -252,10 +252,10 @@ def test05b_empty_scene_is_refused(rgb):
 
 # ---- Defaults in the manual are those of the code ----
 
-NAMES = """occlusion falloff tolerance visibility map_height directions integral_tolerance depth surface_opacity
-radiance background aovs step quadrature coarse dt_gamma stop color_cutoff refined jitter""".split()
+NAMES = """headlight occlusion falloff tolerance visibility map_height directions integral_tolerance depth
+surface_opacity radiance background aovs step quadrature coarse dt_gamma stop color_cutoff refined jitter""".split()
 TEXTS = {"visibility": "map", "depth": "refined", "quadrature": "linear", "aovs": "opacity"}
-SHARES = dict.fromkeys(("surface_opacity", "integral_tolerance", "dt_gamma", "stop", "color_cutoff"), 0.25)
+SHARES = dict.fromkeys(("headlight", "surface_opacity", "integral_tolerance", "dt_gamma", "stop", "color_cutoff"), 0.25)
 OTHER_VALUES, INTEGERS = TEXTS | SHARES, ("map_height", "directions")
 
 

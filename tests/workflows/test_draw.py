@@ -397,6 +397,40 @@ def test_a_scene_whose_camera_is_the_observer_is_refused(rgb, scene_triptych, tm
         draw("triptych", alone, mode=MODE, defaults={})
 
 
+# ---- Scanpaths: fixations at known points of a scene ----
+
+
+def test_fixations_are_numbered_where_they_are(rgb, tmp_path):
+    view = """<sensor type="perspective"><float name="fov" value="60"/>
+        <transform name="to_world"><lookat origin="0, -4, 1" target="0, 0, 1" up="0, 0, 1"/></transform>
+        <film type="hdrfilm"><integer name="width" value="60"/><integer name="height" value="40"/></film></sensor>"""
+    (tmp_path / "scene.xml").write_text(WALLS_SCENE.replace("</scene>", f"{view}</scene>"))
+    # At the front of the tall box, behind it, and at the floor in front of the camera; from another position.
+    eye, targets = np.array([0.5, -2.0, 1.6]), np.array([[1.2, 0.1, 1.0], [1.0, 3.0, 0.0], [-0.8, -1.0, 0.0]])
+    eyes = np.stack([eye, [1.0, 2.0, 1.6], eye])
+    n = 20
+    origin, direction = np.repeat(eyes, n, axis=0), np.repeat(targets - eyes, n, axis=0)
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    t = np.arange(3 * n) / 60 + np.repeat([0, 0.5, 1.0], n)
+    Rays(t, np.zeros(3 * n), ("Ada", "Bob"), origin, direction, np.ones(3 * n)).save(tmp_path / "rays.npz")
+    options = dict(scene=tmp_path / "scene.xml", mode="llvm_ad_rgb", spp=2)
+    axes = draw("scanpath", tmp_path / "rays.npz", **options).axes[0]
+    assert [t.get_text() for t in axes.texts][:2] == ["1", "3"]
+    offset = targets[[0, 2]] - (0, -4, 1)
+    scale = 30 / np.tan(np.radians(30)) / offset[:, 1]
+    expected = np.stack([29.5 + offset[:, 0] * scale, 19.5 - offset[:, 2] * scale], axis=1)
+    magnification = np.ptp(axes.get_xlim()) / 60
+    assert magnification == 1 and np.allclose([t.xy for t in axes.texts[:2]], expected, atol=0.05)
+    assert "1 outside of the image or hidden" in " ".join(axes.figure.texts[0].get_text().split())
+    for refused, said in (
+        (dict(participants="Eve"), "Eve"),
+        (dict(start=9.0), "--start"),
+        (dict(scene=None), "--scene"),
+    ):
+        with pytest.raises(NergError, match=said):
+            draw("scanpath", tmp_path / "rays.npz", **(options | refused))
+
+
 # ---- A scene cut at a height: boxes with known walls and heights ----
 
 
@@ -509,7 +543,7 @@ def test_a_figure_file_records_its_provenance(tmp_path):
 def test_wrong_files_and_options_of_figures_are_refused(tmp_path):
     a = write(tmp_path / "a.exr")
     with pytest.raises(NergError, match="is not supported: choose a file name that ends"):
-        draw("sheet", a, tmp_path / "b.pdf")
+        draw("sheet", a, tmp_path / "b.bmp")
     with pytest.raises(MissingFile, match="gone.exr"):
         draw("sheet", tmp_path / "gone.exr")
     with pytest.raises(NergError, match="1.*400.*0"):
@@ -530,5 +564,5 @@ def test_each_kind_of_figure_has_a_description(name):
 
 
 def test_an_unknown_kind_of_figure_is_refused():
-    with pytest.raises(NergError, match="choose one of sphere, triptych, floor, sheet,"):
+    with pytest.raises(NergError, match="choose one of sphere, triptych, scanpath, floor, sheet,"):
         find_kind("pie")

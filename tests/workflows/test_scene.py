@@ -167,7 +167,7 @@ def test_geometry_of_any_unit_is_visible(rgb, tmp_path, kind, scale):
     # The observer's own view sees all visible surfaces in any unit; gaze fades within the scene.
     assert image.aovs["visibility"][image.mask].min() == 1
     assert 1e-4 * np.linalg.norm(corner) < float(defaults(result.path)["falloff"]) < 0.1 * np.linalg.norm(corner)
-    assert any("light leaks" in line for line in recorder.warnings) == (kind in ("mesh", "scene") and scale < 1)
+    assert any("light leaks" in line for line in recorder.warnings) == (kind == "scene" and scale < 1)
 
 
 def test_an_empty_image_is_refused(rgb, folder, tmp_path):

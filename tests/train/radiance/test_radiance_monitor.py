@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.figures.style import rasterize
+from nerg_mi.figures.style import figure_of, rasterize
 from nerg_mi.figures.training import psnr_figure
 from nerg_mi.photos.cameras import Intrinsics, PosedCamera
 from nerg_mi.photos.images import PhotoView
@@ -187,7 +187,7 @@ def test_unknown_values_are_empty_cells(tmp_path):
 
 
 def test_the_figure_has_both_curves_and_the_written_state():
-    page = psnr_figure(HISTORY, HISTORY[1])
+    page = figure_of(psnr_figure(HISTORY, HISTORY[1]))
     axes, top = page.axes
     lines = {line.get_label(): line for line in axes.lines}
     np.testing.assert_array_equal(lines["held-out views"].get_ydata(), [13, 18, 17])
