@@ -93,7 +93,7 @@ class SplatsVolume(make_volume_class()):
 
     def __init__(self, props, splats=None):
         # ``splats``: Gaussians in memory instead of a file; see ``of``.
-        self._similarity = Similarity(read_transform(props, "to_world"))
+        self.similarity = Similarity(read_transform(props, "to_world"))
         color_space = read_choice(props, "color_space", "file", ("file", "srgb", "linear"))
         extent = read_number(props, "extent", 3, Range(0.1, 10))
         self.filename = "" if splats is not None else resolve_scene_file(read_string(props, "filename"))
@@ -112,7 +112,7 @@ class SplatsVolume(make_volume_class()):
 
     def medium(self) -> SplatMedium:
         """The splats as a medium."""
-        return SplatMedium(self.field, self._similarity, self.color_space)
+        return SplatMedium(self.field, self.similarity, self.color_space)
 
     def eval_1(self, it, active=True):
         raise NergError('"splats" have no density at a point; use them as the "field" of "nerg"')

@@ -25,7 +25,7 @@ from tools import command_pages, generated
 
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 OF_DASK = {"--dashboard-address", "--no-dashboard", "--protocol", "--tls-ca-file", "--tls-cert", "--tls-key"}
-FOREIGN = {"--tcnn", "--ff", "--hook-type"} | OF_DASK  # of torch-ngp, pre-commit and dask
+FOREIGN = {"--tcnn", "--ff", "--hook-type", "--python"} | OF_DASK  # of torch-ngp, pre-commit, Blender and dask
 NUMBERS = "zero one two three four five six seven eight nine ten".split()
 
 

@@ -18,6 +18,7 @@ from nerg_mi.files.atomic import check_writable, replace_atomically
 from nerg_mi.files.images import encode_png, open_exr_writer, split_bitmap_channels
 from nerg_mi.files.safe_read import map_bytes, open_file, read_bytes, translate_read_errors
 from nerg_mi.files.tables import write_csv
+from nerg_mi.formats.camera_path import CameraPath, read_camera_path
 from nerg_mi.formats.meshes import MAX_BYTES, MeshFile, read_mesh_file
 from nerg_mi.formats.ply import PLY_MAGIC, parse_ply, write_columns
 
@@ -36,13 +37,21 @@ _MAX_COLUMNS = 64
 _NAME = re.compile(r"[A-Za-z_]\w*", re.ASCII)
 
 
+def _frames_of_path(path: CameraPath) -> list[dict[str, str]]:
+    text = lambda values: ", ".join(f"{v + 0.0:.9g}" for v in np.atleast_1d(values).tolist())
+    eye, up, back = path.to_world[:, :3, 3], path.to_world[:, :3, 1], path.to_world[:, :3, 2]
+    named = {"camera": eye, "target": eye - back, "up": up, "fov": path.horizontal_fov}
+    return [{name: text(values[k]) for name, values in named.items()} for k in range(len(eye))]
+
+
 def read_frames(path: str | Path) -> list[dict[str, str]]:
     """Read a frames file.
 
     Parameters
     ----------
     path : str or Path
-        CSV file.
+        CSV file, or a camera path of nerfstudio (.json), which sets ``camera``, ``target``, ``up`` and ``fov`` as the
+        scenes of ``nerg scene`` name them.
 
     Returns
     -------
@@ -54,6 +63,8 @@ def read_frames(path: str | Path) -> list[dict[str, str]]:
     NergError
         The file is not a valid frames file; the message names the line.
     """
+    if Path(path).suffix.lower() == ".json":
+        return _frames_of_path(read_camera_path(path))
     raw = read_bytes(path, "frames file", MAX_FRAMES_BYTES)
     with translate_read_errors(path, "frames file", "correct it"):
         text = raw.decode("utf-8-sig")

@@ -17,6 +17,7 @@ from scipy.interpolate import CubicSpline
 from nerg_mi.errors import NergError, format_error, is_user_error
 from nerg_mi.files.atomic import write_text
 from nerg_mi.files.video import check_video_output
+from nerg_mi.formats.camera_path import CameraPath, format_camera_path
 from nerg_mi.rendering.scene_writer import format_numbers
 from nerg_mi.workflows.render import render_file
 from nerg_mi.workflows.scene_commands import PictureOptions
@@ -209,6 +210,16 @@ def format_frames(views: Sequence[PinholeView]) -> str:
     return text.getvalue()
 
 
+def make_camera_path(views: Sequence[PinholeView], width: int, fps: float) -> CameraPath:
+    """Return the views as a camera path of nerfstudio, whose images are ``width`` pixels wide."""
+    poses = np.tile(np.eye(4), (len(views), 1, 1))
+    for pose, view in zip(poses, views):
+        axes = np.cross(view.forward, view.up), view.up, -view.forward
+        pose[:3, :3], pose[:3, 3] = np.stack(axes, axis=1), view.origin
+    height = max(round(width / views[0].aspect), 1)
+    return CameraPath(poses, np.degrees([view.fov for view in views]), width, height, fps)
+
+
 # ---- Panel ----
 
 TITLE = "Flight"
@@ -228,12 +239,14 @@ class FlightPanel:
             self._seconds = gui.add_number("Duration (s)", 6.0, min=0.1, max=3600.0, step=0.5)
             self._fps = gui.add_number("Frames per second", 25.0, min=1.0, max=120.0, step=1.0)
             save_frames = gui.add_button("Save frames (CSV)")
+            save_path = gui.add_button("Save camera path (nerfstudio)")
             self._start_button = gui.add_button("Render video (MP4)")
             self._progress_bar = gui.add_progress_bar(0.0, visible=False)
             self._status = gui.add_markdown("", visible=False)
             self._cancel_button = gui.add_button("Cancel video", visible=False)
         add_view.on_click(self._add_view)
         save_frames.on_click(self._save_frames)
+        save_path.on_click(self._save_path)
         self._start_button.on_click(self._start_video)
         clear_views.on_click(lambda event: self._views.clear())
 
@@ -252,6 +265,15 @@ class FlightPanel:
             text = format_frames(interpolate_views(self._views, self._seconds.value, self._fps.value))
             event.client.send_file_download("view.frames.csv", text.encode(), save_immediately=True)
             notify(event, TITLE, "To render it: nerg render view.xml -o flight.mp4 --frames view.frames.csv")
+
+    def _save_path(self, event: Any) -> None:
+        with notify_errors(event, TITLE):
+            views = interpolate_views(self._views, self._seconds.value, self._fps.value)
+            path = make_camera_path(views, self.session.options.width, self._fps.value)
+            event.client.send_file_download(
+                "camera_path.json", format_camera_path(path).encode(), save_immediately=True
+            )
+            notify(event, TITLE, "To render it: nerg render scene.xml -o flight.mp4 --frames camera_path.json")
 
     def _start_video(self, event: Any) -> None:
         """Render a video and send it to the browser that requested it."""

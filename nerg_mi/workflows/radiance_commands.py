@@ -6,6 +6,7 @@
 ``nerg export points``: Sample surface points with normals and colours (.ply, .glb).
 ``nerg export splats``: Place Gaussian splats on the surface (.ply), for splat viewers and the volume "splats".
 ``nerg export volume``: Sample density and colour on a grid, as Mitsuba grid volumes (.vol).
+``nerg export scene``: Write a scene with its gaze for Rerun (.rrd) or OpenUSD (.usdc, .usda).
 ``nerg export torch-ngp``: Write a torch-ngp checkpoint (.pth), for fields whose grid and networks fit its layout.
 ``nerg refine``: Compute a finer occupancy grid of a radiance field, so that it renders faster.
 ``nerg compile``: Evaluate the density of a radiance field on voxels once, so that it renders faster.
@@ -15,6 +16,7 @@ Options of these commands. The workflows are in `.poses`, `.train_radiance` and 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,6 +34,7 @@ from .options import (
     DerivedOptions,
     coordinates,
     cpu_threads,
+    definitions,
     expose_settings,
     llvm_variant,
     option,
@@ -373,6 +376,54 @@ class TorchNgpOptions(ValidatedDataclass):
 
     mode: str = llvm_variant()
 
+
+@dataclass(frozen=True, kw_only=True)
+class SceneExportOptions(ValidatedDataclass):
+    """Options of ``nerg export scene``."""
+
+    up: str = option("z", "Vertical axis of the scene, z or y.", group=INPUT)
+    meters_per_unit: float = option(1.0, "Length of a unit in metres.", within=LENGTHS, group=INPUT)
+    defaults: Mapping[str, str] | None = definitions()
+    max_rays: int = option(
+        20_000, "Maximum number of rays to write, evenly selected.", within=Range(1, 10**7), group=OUTPUT
+    )
+    dispersion_threshold: float = option(
+        1.0, "Dispersion of a fixation in degrees (I-DT).", within=Range(1e-3, 90), group=INPUT
+    )
+    min_fixation: float = option(0.1, "Minimum duration of a fixation in seconds.", within=SECONDS, group=INPUT)
+    max_points: int = option(
+        100_000, "Maximum number of points of a field or of gaze.", within=Range(1, 10**7), group=OUTPUT
+    )
+    width: int = option(
+        512,
+        "Columns of the panorama in which the gaze of the observer is computed.",
+        within=Range(16, 4096),
+        group=OUTPUT,
+    )
+    vmax: float | None = option(
+        None,
+        "Upper end of the colours of gaze in 1/sr.  [default: the 99.5th percentile]",
+        within=POSITIVE_VALUES,
+        group=OUTPUT,
+    )
+    spp: int = option(4, "Samples per pixel of the panorama.", within=Range(1, 4096), group=PERFORMANCE)
+    seed: int = random_seed("the selection of points")
+    mode: str = llvm_variant()
+
+
+declare(
+    "export scene",
+    "nerg_mi.workflows.export_scene:export_scene",
+    "Write a scene with its gaze for Rerun (.rrd) or OpenUSD (.usdc, .usda).",
+    options=SceneExportOptions,
+    files=argument(
+        "A scene (.xml), meshes (with attention if nerg bake has written them), splats, a radiance field and rays, in "
+        "any order and in the same frame.",
+        list[Path],
+        metavar="FILES",
+    ),
+    output=out("File to write (.rrd, .usdc, .usda or .usd)."),
+)
 
 declare(
     "import",

@@ -139,7 +139,7 @@ class PictureOptions(ValidatedDataclass):
     frames: Path | None = option(
         None,
         "CSV file of an image sequence: the header names <default>s of the scene, each further line has their values "
-        "for one frame.",
+        "for one frame; or a camera path of nerfstudio (.json).",
         group=INPUT,
     )
     fps: float = option(25.0, "Frame rate of an .mp4 video in frames per second.", within=RATES, group=OUTPUT)

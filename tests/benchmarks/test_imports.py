@@ -15,6 +15,7 @@ from tests.conftest import ROOT
 
 SCRIPTS = sorted(p for folder in ("benchmarks", "examples", "tools") for p in (ROOT / folder).glob("*.py"))
 EXTRAS = {
+    "bpy",
     "torch",
     "pyarrow",
     "distributed",

@@ -63,15 +63,15 @@ def test_a_figure_draws_in_given_axes_and_returns_them(name):
     page = Figure(figsize=(8, 5), dpi=60)
     FigureCanvasAgg(page)
     axes = np.ravel(page.subplots(2, 2))
-    given = axes[:count]
+    panels = axes[:count]
     empty = rasterize(page)
-    drawn = draw(axes=given[0] if count == 1 else given)
-    assert list(np.ravel(drawn)) == list(given) and figure_of(drawn) is page
+    drawn = draw(axes=panels[0] if count == 1 else panels)
+    assert list(np.ravel(drawn)) == list(panels) and figure_of(drawn) is page
     assert (rasterize(page) != empty).any()
     # The others are left alone.
     assert all(not a.has_data() and not a.get_title() for a in axes[count:])
-    own = draw()
-    assert figure_of(own) is not page and len(np.ravel(own)) == count
+    fresh = draw()
+    assert figure_of(fresh) is not page and len(np.ravel(fresh)) == count
 
 
 def test_a_wrong_number_of_axes_is_refused():

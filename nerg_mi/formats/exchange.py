@@ -1,0 +1,138 @@
+"""Scenes with gaze for other programs: what is exchanged, and the file formats that it is written in.
+
+To add a format, write a module with a function that writes an `ExchangeScene`, and enter it in `FORMATS`.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+
+from nerg_mi.errors import NergError
+from nerg_mi.fields.splats import Splats
+from nerg_mi.files.atomic import check_writable, replace_atomically
+
+# ---- Contents ----
+#
+# Positions are in the frame and units of the scene. Colours are linear RGB in 0..1.
+
+
+@dataclass(frozen=True, eq=False)
+class ExchangeMesh:
+    """A triangle mesh: ``vertices`` (V, 3), ``faces`` (F, 3), and for its vertices ``colors`` (V, 3) and ``values``
+    (V,), such as attention, or None. ``label`` names the values with their unit."""
+
+    name: str
+    vertices: np.ndarray
+    faces: np.ndarray
+    colors: np.ndarray | None = None
+    values: np.ndarray | None = None
+    label: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class ExchangePoints:
+    """Points of a field: ``positions`` (N, 3), ``colors`` (N, 3), and ``values`` (N,) or None; ``label`` names them."""
+
+    name: str
+    positions: np.ndarray
+    colors: np.ndarray
+    values: np.ndarray | None = None
+    label: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class ExchangeRays:
+    """Gaze of a participant over time: ``times`` (N,) in seconds, ascending, ``origins`` and ``ends`` (N, 3)."""
+
+    participant: str
+    times: np.ndarray
+    origins: np.ndarray
+    ends: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class ExchangeFixations:
+    """Fixations of a participant: start ``times`` and ``durations`` (N,) in seconds, and ``positions`` (N, 3)."""
+
+    participant: str
+    times: np.ndarray
+    durations: np.ndarray
+    positions: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class ExchangeCamera:
+    """A perspective camera: pose ``to_world`` (4, 4) of OpenGL (right, up, backwards), horizontal ``fov`` in degrees,
+    and the size of its image in pixels."""
+
+    name: str
+    to_world: np.ndarray
+    fov: float
+    width: int
+    height: int
+
+
+@dataclass(frozen=True, eq=False)
+class ExchangeScene:
+    """A scene with gaze. ``up``: vertical axis, "y" or "z"; ``meters_per_unit``: length of a unit in metres. The names
+    of participants are unique in ``rays`` and in ``fixations``."""
+
+    meshes: tuple[ExchangeMesh, ...] = ()
+    points: tuple[ExchangePoints, ...] = ()
+    splats: Splats | None = None
+    rays: tuple[ExchangeRays, ...] = ()
+    fixations: tuple[ExchangeFixations, ...] = ()
+    cameras: tuple[ExchangeCamera, ...] = ()
+    up: str = "z"
+    meters_per_unit: float = 1.0
+
+    def name_participants(self, allowed: Callable[[str], str]) -> dict[str, str]:
+        """Return an identifier by ``allowed`` for each participant."""
+        participants = list(dict.fromkeys(g.participant for g in (*self.rays, *self.fixations)))
+        return dict(zip(participants, unique_names(participants, allowed)))
+
+
+# ---- Formats ----
+
+Write = Callable[[ExchangeScene, Path], None]
+"""Writes a scene to an existing file, whose suffix is that of the format."""
+
+_USD = "nerg_mi.formats.exchange_usd:write_usd"
+FORMATS: dict[str, str] = {
+    ".rrd": "nerg_mi.formats.exchange_rerun:write_rerun",
+    ".usdc": _USD,
+    ".usda": _USD,
+    ".usd": _USD,
+}
+"""Function that writes a format, by the suffix of its files."""
+
+
+def write_exchange(scene: ExchangeScene, path: str | os.PathLike) -> None:
+    """Write ``scene`` atomically in the format of the suffix of ``path``.
+
+    Raises `NergError` for another suffix and for an empty scene, and `ImportError` without the format's library.
+    """
+    check_writable(path, *FORMATS)
+    if not (scene.meshes or scene.points or scene.splats or scene.rays or scene.cameras):
+        raise NergError(f'there is nothing to write to "{path}"; name a scene, a mesh, splats or rays')
+    module, _, function = FORMATS[Path(path).suffix.lower()].partition(":")
+    write: Write = getattr(import_module(module), function)
+    with replace_atomically(path) as temporary:
+        write(scene, temporary)
+
+
+def unique_names(names: list[str], allowed: Callable[[str], str]) -> list[str]:
+    """Return ``names`` as identifiers by ``allowed``, with numbers where they would be equal."""
+    out: list[str] = []
+    for name in map(allowed, names):
+        number, unique = 2, name
+        while unique in out:
+            number, unique = number + 1, f"{name}_{number}"
+        out.append(unique)
+    return out

@@ -1,0 +1,61 @@
+"""Camera paths of nerfstudio: written, read, refused, and rendered as frames."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from nerg_mi.errors import NergError
+from nerg_mi.formats.camera_path import CameraPath, read_camera_path, write_camera_path
+from nerg_mi.rendering.files import read_frames
+
+
+def path(count=4):
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, :3] = Rotation.random(count, rng=np.random.default_rng(0)).as_matrix()
+    poses[:, :3, 3] = np.random.default_rng(1).normal(size=(count, 3))
+    return CameraPath(poses, np.linspace(40, 60, count), 96, 64, 24.0)
+
+
+def test_a_path_is_read_as_written(tmp_path):
+    write_camera_path(tmp_path / "camera_path.json", path())
+    again = read_camera_path(tmp_path / "camera_path.json")
+    assert np.array_equal(again.to_world, path().to_world) and np.array_equal(again.fov, path().fov)
+    assert (again.width, again.height, again.fps) == (96, 64, 24.0)
+    data = json.loads((tmp_path / "camera_path.json").read_text())
+    # Names and units of nerfstudio.
+    assert data["camera_path"][1]["aspect"] == 1.5 and len(data["camera_path"][1]["camera_to_world"]) == 16
+    assert data["seconds"] == pytest.approx(4 / 24)
+
+
+def test_frames_are_the_cameras_of_the_path(rgb, tmp_path):
+    write_camera_path(tmp_path / "camera_path.json", path())
+    numbers = lambda text: [float(v) for v in text.split(",")]
+    for frame, pose, fov in zip(read_frames(tmp_path / "camera_path.json"), path().to_world, path().fov):
+        look_at = rgb.ScalarTransform4d().look_at(*(numbers(frame[name]) for name in ("camera", "target", "up")))
+        # Mitsuba's cameras have x to the left and look along +z.
+        assert np.allclose(np.array(look_at.matrix) @ np.diag([-1, 1, -1, 1]), pose, atol=1e-7)
+        across = np.tan(np.radians(float(frame["fov"])) / 2)
+        assert np.isclose(across / np.tan(np.radians(fov) / 2), 1.5)
+
+
+@pytest.mark.parametrize(
+    "change, said",
+    [
+        ({"camera_type": "fisheye"}, "fisheye"),
+        ({"camera_path": []}, "0 frames"),
+        ({"camera_path": [{"camera_to_world": [2.0] * 16, "fov": 50}]}, "rotation"),
+        ({"camera_path": [{"camera_to_world": np.eye(4).ravel().tolist(), "fov": 200}]}, "fov"),
+        ({"camera_path": [{"fov": 50}]}, "camera_to_world"),
+        ({"render_width": 0}, "size"),
+    ],
+)
+def test_other_files_are_refused(tmp_path, change, said):
+    write_camera_path(tmp_path / "a.json", path())
+    data = json.loads((tmp_path / "a.json").read_text())
+    (tmp_path / "a.json").write_text(json.dumps(data | change))
+    with pytest.raises(NergError, match=said):
+        read_camera_path(tmp_path / "a.json")

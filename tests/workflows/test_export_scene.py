@@ -1,0 +1,112 @@
+"""Scenes exported with their gaze: contents of each kind of file."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from nerg_mi.errors import NergError
+from nerg_mi.formats.exchange import ExchangeScene
+from nerg_mi.formats.ply import write_columns
+from nerg_mi.maths.color import decode_srgb
+from nerg_mi.rays.rays import Rays
+from nerg_mi.workflows import export_scene as module
+from nerg_mi.workflows.export_scene import export_scene
+from nerg_mi.workflows.radiance_commands import SceneExportOptions
+from tests.workflows.recorder import Recorder
+
+SENSOR = """<sensor type="perspective" id="view"><float name="fov" value="70"/>
+    <transform name="to_world"><lookat origin="0.5, 0, 0" target="1, 0, 0" up="0, 0, 1"/></transform>
+    <film type="hdrfilm"><integer name="width" value="12"/><integer name="height" value="8"/></film></sensor>"""
+SCENE = f"""<scene version="3.0.0"><integrator type="nerg">
+    <volume type="gazekde" name="kde"><string name="filename" value="rays.npz"/></volume></integrator>
+    {SENSOR}<shape type="ply" id="room"><string name="filename" value="room.ply"/></shape>
+    <shape type="sphere" id="ball"><float name="radius" value="0.1"/></shape></scene>"""
+
+
+def rays():
+    """Ada looks at (2, 0, 0) for a second, then at (0, 2, 0); Bob sees one sample."""
+    n = 60
+    targets = np.repeat([[2.0, 0, 0], [0, 2.0, 0]], n // 2, axis=0)
+    origins = np.tile([0.5, 0.0, 0.0], (n, 1))
+    directions = targets - origins
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    person = np.r_[np.zeros(n, int), 1]
+    t = np.r_[np.arange(n) / 30 + np.repeat([0.0, 0.5], n // 2), 0.0]
+    add = lambda a: np.concatenate([a, a[:1]])
+    return Rays(t, person, ("Ada", "Bob"), add(origins), add(directions), np.ones(n + 1), add(targets))
+
+
+@pytest.fixture
+def folder(tmp_path):
+    rays().save(tmp_path / "rays.npz")
+    room = trimesh.creation.box((4, 4, 4))
+    room.invert()
+    room.export(tmp_path / "room.ply")
+    (tmp_path / "scene.xml").write_text(SCENE)
+    return tmp_path
+
+
+def exported(folder, *names, monkeypatch, **options) -> tuple[ExchangeScene, Recorder]:
+    recorder, written = Recorder(), []
+    monkeypatch.setattr(module, "write_exchange", lambda scene, path: path.write_bytes(b"") or written.append(scene))
+    files = [folder / name for name in names]
+    made = export_scene(files, folder / "out.usdc", SceneExportOptions(**options), recorder)
+    assert written == [made.scene]
+    return made.scene, recorder
+
+
+def test_rays_and_fixations_of_each_participant(rgb, folder, monkeypatch):
+    scene, recorder = exported(folder, "rays.npz", monkeypatch=monkeypatch)
+    assert [r.participant for r in scene.rays] == ["Ada", "Bob"] and len(scene.rays[0].times) == 60
+    (fixations,) = scene.fixations
+    assert np.allclose(fixations.positions, [[2, 0, 0], [0, 2, 0]], atol=1e-6)
+    assert np.allclose(fixations.times, [0, 1.5]) and np.allclose(fixations.durations, 29 / 30)
+    assert any("Bob" in line and "no fixation" in line for line in recorder.messages)
+    fewer, _ = exported(folder, "rays.npz", monkeypatch=monkeypatch, max_rays=7)
+    assert sum(len(r.times) for r in fewer.rays) <= 8 and len(fewer.fixations[0].times) == 2
+
+
+def test_a_scene_has_its_meshes_cameras_and_gaze(rgb, folder, monkeypatch):
+    options = dict(width=64, spp=2, max_points=500)
+    scene, recorder = exported(folder, "scene.xml", monkeypatch=monkeypatch, **options)
+    room, sphere = scene.meshes
+    assert room.name == "room" and np.isclose(np.abs(room.vertices).max(), 2)
+    assert any("not meshes" in line and "ball" in line for line in recorder.messages)
+    (camera,) = scene.cameras
+    assert camera.name == "view" and camera.fov == pytest.approx(70) and (camera.width, camera.height) == (12, 8)
+    # Right, up and backwards.
+    assert np.allclose(camera.to_world[:3], [[0, 0, -1, 0.5], [-1, 0, 0, 0], [0, 1, 0, 0]], atol=1e-6)
+    # Gaze on the walls is largest where the participants looked; so it is on the sphere around the observer.
+    (points,) = scene.points
+    assert len(points.positions) == 500 and points.label.startswith("kde") and points.values.min() >= 0
+    top = points.positions[np.argmax(points.values)]
+    assert min(np.linalg.norm(top - t) for t in ([2, 0, 0], [0, 2, 0])) < 0.5
+    assert np.allclose(np.linalg.norm(sphere.vertices - (0.5, 0, 0), axis=1), 0.15, atol=1e-5)
+    direction = (sphere.vertices[np.argmax(sphere.values)] - (0.5, 0, 0)) / 0.15
+    assert max(direction @ d for d in rays().direction[[0, -2]]) > 0.95
+    # It is not mirrored.
+    at = lambda d: sphere.values[np.argmax((sphere.vertices - (0.5, 0, 0)) @ d)]
+    assert at(rays().direction[-2]) > 5 * at(rays().direction[-2] * (1, -1, 1))
+    assert (decode_srgb(np.ones(3)) >= points.colors).all() and np.ptp(points.colors) > 0.3
+    # The triangles face outwards.
+    a, b, c = (sphere.vertices[sphere.faces[:, k]] for k in range(3))
+    outwards = (np.cross(b - a, c - a) * (a + b + c - 3 * np.array([0.5, 0, 0]))).sum(axis=1)
+    assert (outwards > -1e-9).all()
+
+
+def test_a_baked_mesh_keeps_its_attention(rgb, folder, monkeypatch):
+    columns = dict(zip("xyz", np.eye(3))) | {"value": np.array([0.1, 0.2, 0.3], np.float32)}
+    write_columns(folder / "baked.ply", columns, np.array([[0, 1, 2]]), comments=("value: gaze [1/m²]",))
+    scene, _ = exported(folder, "baked.ply", "room.ply", monkeypatch=monkeypatch)
+    baked, room = scene.meshes
+    assert np.allclose(baked.values, [0.1, 0.2, 0.3]) and baked.label == "gaze [1/m²]" and room.values is None
+
+
+def test_unsuitable_files_and_options_are_refused(rgb, folder):
+    with pytest.raises(NergError, match="--up"):
+        export_scene([folder / "room.ply"], folder / "a.usdc", SceneExportOptions(up="x"))
+    with pytest.raises(NergError, match=r"\.rrd"):
+        export_scene([folder / "room.ply"], folder / "a.fbx")
+    assert not (folder / "a.usdc").exists()
