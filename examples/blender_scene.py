@@ -1,4 +1,4 @@
-"""Open a scene that ``nerg export scene`` has written as USD in Blender, and colour its meshes by attention.
+"""Open a scene that ``nerg export scene`` has written as USD in Blender, and colour its meshes and points by attention.
 
     nerg export scene scene.xml day.npz day.ply -o shop.usdc
     blender --python examples/blender_scene.py -- shop.usdc
@@ -64,7 +64,7 @@ def open_scene(path: Path) -> dict[str, int]:
     grey = grey_material()
     for thing in bpy.data.objects:
         counts[thing.type] = counts.get(thing.type, 0) + 1
-        if thing.type != "MESH":
+        if thing.type not in ("MESH", "POINTCLOUD"):
             continue
         thing.data.materials.clear()
         values = thing.data.attributes.get(ATTENTION)
@@ -95,13 +95,13 @@ def render(path: Path, width: int, height: int) -> None:
 
 def main() -> None:
     """Read the arguments after ``--``, or all of them outside of Blender."""
-    given = sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else sys.argv[1:]
+    words = sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else sys.argv[1:]
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("scene", type=Path, help="USD file of nerg export scene")
     parser.add_argument("--render", type=Path, default=None, help="image to render from the first camera")
     parser.add_argument("--width", type=int, default=720)
     parser.add_argument("--height", type=int, default=480)
-    args = parser.parse_args(given)
+    args = parser.parse_args(words)
     print(open_scene(args.scene))
     if args.render is not None:
         render(args.render, args.width, args.height)

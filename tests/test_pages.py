@@ -44,6 +44,7 @@ SHELL = {
     "make": "its target is looked up in the Makefile",
     "python": "its script and options are looked up by tests/test_docs.py",
     "nerg": "it is parsed, and run where it is quick",
+    "blender": "another program, whose script is in examples/",
     "export": "a setting of the reader's shell",
     "_NERG_COMPLETE=source_bash": "tests/cli/test_main.py asks for it",
     "_NERG_COMPLETE=source_zsh": "tests/cli/test_main.py asks for it",
@@ -90,7 +91,9 @@ def blocks(*languages: str, page: str = "") -> list[Block]:
 def test01_no_block_is_left_out():
     here = {"sh", ("README.md", "python"), ("figures.md", "py"), ("python.md", "py")}
     here |= {(f"{page}.md", "json") for page in ("viewer", "store", "statistics")}
-    here |= {(f"{page}.md", "python") for page in "derivatives exchange python store recordings next-look".split()}
+    here |= {
+        (f"{page}.md", "python") for page in "derivatives evaluation exchange python store recordings next-look".split()
+    }
     here |= {(b.page, b.language) for b in blocks("xml", "python") if b.page in ("plugins.md", *XML_PAGES)}
     for block in blocks():
         key = (block.page, block.language)
@@ -391,8 +394,13 @@ def test16_pictures(tmp_path, rgb, monkeypatch):
             nerg.draw("floor", "rays.npz", "gaze.png")
         smaller = block.text.replace("scenes/store/scene.xml", "scene.xml").replace("width=480", "width=64, spp=1")
         run(smaller, block.page, names)
-    assert {"floor.svg", "gaze.svg"} <= set(os.listdir("."))
-    assert b"my notebook" in Path("gaze.svg").read_bytes()
+    assert {"floor.svg", "gaze.pdf"} <= set(os.listdir("."))
+    assert b"my notebook" in Path("gaze.pdf").read_bytes()
+
+
+def test_saliency_metrics_of_the_evaluation_page():
+    (block,) = blocks("python", page="evaluation.md")
+    assert np.isfinite(list(run(block.text, block.page)["scores"].to_dict().values())).all()
 
 
 def test17_clusters(capsys):

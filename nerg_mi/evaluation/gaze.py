@@ -179,11 +179,12 @@ def format_score_table(rows: list[dict], title: str) -> str:
 SPLITS = ("both", "pos", "people")  # Held-out data: positions and participants, positions only, or participants only
 MAP_SCORES, RAY_SCORES = ("KLD", "CC", "SIM", "MAE"), ("NSS", "AUC", "sAUC", "bits", "loglik")
 OWN_SCORES = ("bits at own origin",)
-SCORES = MAP_SCORES + RAY_SCORES + OWN_SCORES
-"""KLD in nats, CC and SIM of densities normalised over the sphere; MAE in 1/sr of unnormalised densities; NSS;
-AUC-Judd; sAUC against rays of other test positions; information gain over the position-independent prior in bits per
-ray; mean log density (nats of 1/sr); information gain with each density evaluated at the ray's own origin, not at the
-centre of its position.
+HEADLINE = "bits"
+SCORES = (HEADLINE, *MAP_SCORES, *(score for score in RAY_SCORES if score != HEADLINE), *OWN_SCORES)
+"""The headline first: the information gain over the position-independent prior in bits per ray. KLD in nats, CC and SIM
+of densities normalised over the sphere; MAE in 1/sr of unnormalised densities; NSS; AUC-Judd; sAUC against rays of
+other test positions; mean log density (nats of 1/sr); information gain with each density evaluated at the ray's own
+origin, not at the centre of its position.
 """
 # Fraction of the progress for evaluating the methods; the rest is for the bootstrap.
 _EVALUATION_FRACTION = 0.2
@@ -606,7 +607,7 @@ def compute_ray_scores(
     threshold at each value.
     """
     log = _log_density(sample_densities, maps)
-    below = lambda among: np.stack([_fraction_below(a, g) for a, g in zip(among, sample_densities)])
+    below = lambda among: np.stack([metrics.auc(g, a) for a, g in zip(among, sample_densities)])
     return {
         "NSS": metrics.nss(maps, sample_densities),
         "AUC": below(maps),
@@ -621,8 +622,3 @@ def _log_density(sample_densities: np.ndarray, maps: np.ndarray) -> np.ndarray:
     float."""
     sphere = 4 * np.pi * np.maximum(maps, 0).mean(axis=1, keepdims=True)
     return np.log(np.maximum(sample_densities, 0) / np.where(sphere > 0, sphere, 1) + np.finfo(float).eps)
-
-
-def _fraction_below(row: np.ndarray, gaze: np.ndarray) -> np.ndarray:
-    ordered = np.sort(row)
-    return 0.5 * (np.searchsorted(ordered, gaze, "left") + np.searchsorted(ordered, gaze, "right")) / len(row)

@@ -83,7 +83,7 @@ def write_report(
     difference = {k.replace(".less", ""): v for k, v in field_row.items() if ".less" in k}
     differences = [{"method": f"{field_row['method']} less {reference}", **difference}]
     participant_table = format_table(
-        participants, ("method", "person", "rays", "KLD", "CC", "NSS", "AUC", "bits", "loglik")
+        participants, ("method", "person", "rays", "bits", "KLD", "CC", "NSS", "AUC", "loglik")
     )
     text = f"{notes}\n\n{format_table(rows)}\n{format_table(differences)}\n{format_uncertainty(ranks, regions)}"
     write_text(files[0], f"{text}## Per participant\n\n{participant_table}")

@@ -344,6 +344,40 @@ def nss(density: np.ndarray, at_gaze: np.ndarray, weights: np.ndarray | None = N
     return np.where(deviation > 0, (at_gaze - mean) / np.where(deviation > 0, deviation, 1.0), 0.0)
 
 
+def auc(at_gaze: np.ndarray, values: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
+    """Compute the area under the ROC curve of each gaze sample: the fraction of ``values`` below its value.
+
+    Parameters
+    ----------
+    at_gaze : numpy.ndarray
+        Values (K,) of a map at gaze samples.
+    values : numpy.ndarray
+        Values (M,) of the map everywhere (AUC-Judd with a threshold at each value), or at nonfixations (sAUC).
+    weights : numpy.ndarray, optional
+        Solid angles (M,) of the values.
+
+    Returns
+    -------
+    numpy.ndarray
+        Fractions (K,) to be averaged over samples; ties count half.
+    """
+    values = np.asarray(values, np.float64)
+    w = _normalise_weights(values, values, weights)
+    order = np.argsort(values, kind="stable")
+    cumulative = np.r_[0.0, np.cumsum(w[order])]
+    position = lambda side: np.searchsorted(values[order], np.asarray(at_gaze, np.float64), side)
+    return 0.5 * (cumulative[position("left")] + cumulative[position("right")])
+
+
+def information_gain(at_gaze: np.ndarray, prior_at_gaze: np.ndarray) -> np.ndarray:
+    """Compute the information gain of each gaze sample in bits: the log2 of its density over that of the baseline.
+
+    Both densities (...) are normalised; a density of 0 counts as ``EPS``.
+    """
+    gain = np.log2(np.maximum(at_gaze, EPS)) - np.log2(np.maximum(prior_at_gaze, EPS))
+    return np.asarray(gain, np.float64)
+
+
 def _normalise_weights(a: np.ndarray, b: np.ndarray, weights: np.ndarray | None) -> np.ndarray:
     """Return weights that sum to one along the last axis."""
     shape, other = np.shape(a), np.shape(b)
