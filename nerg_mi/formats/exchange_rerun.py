@@ -9,6 +9,7 @@ import numpy as np
 
 from nerg_mi.errors import import_extra
 from nerg_mi.fields.splats import Splats
+from nerg_mi.files.atomic import write_bytes
 from nerg_mi.maths.color import encode_srgb
 
 from .exchange import ExchangeScene, unique_names
@@ -30,7 +31,8 @@ def write_rerun(scene: ExchangeScene, path: Path) -> None:
     # Without it, data that Rerun rejects are left out with a warning.
     rr.set_strict_mode(True)
     recording = rr.RecordingStream("nerg_mi", recording_id="nerg_mi", send_properties=False)
-    recording.save(path)
+    # Errors of Rerun's own file writer are only logged.
+    memory = recording.memory_recording()
     axes = {"z": rr.ViewCoordinates.RIGHT_HAND_Z_UP, "y": rr.ViewCoordinates.RIGHT_HAND_Y_UP}
     recording.log("scene", axes[scene.up], static=True)
     for name, mesh in zip(_entities("mesh", scene.meshes), scene.meshes):
@@ -71,7 +73,7 @@ def write_rerun(scene: ExchangeScene, path: Path) -> None:
         durations = rr.AnyValues.columns(duration=fixations.durations)
         time = [rr.TimeColumn(TIMELINE, duration=fixations.times)]
         recording.send_columns(f"scene/gaze/{name}/fixations", time, [*points, *durations])
-    recording.flush()
+    write_bytes(path, memory.drain_as_bytes())
     recording.disconnect()
 
 

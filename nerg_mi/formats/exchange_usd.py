@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,9 @@ VALUE = "attention"
 
 TIME_CODES_PER_SECOND = 1000.0
 """Resolution of times: a time code is a millisecond."""
+
+_WRITE_ERRORS = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EACCES)
+"""Errors of files that USD reports by their text."""
 
 _APERTURE = 36.0  # horizontal aperture of cameras in tenths of a unit, as of a film of 36 mm
 _WIDTH = 0.01  # width of points in metres
@@ -112,7 +117,11 @@ def write_usd(scene: ExchangeScene, path: Path) -> None:
         prim.CreateExtentAttr(vectors(_extent(fixations.positions)))
         named = {"time": fixations.times, "duration": fixations.durations}
         add_primvars(prim, named, UsdGeom.Tokens.vertex, "seconds")
-    stage.Export(str(path))
+    try:
+        stage.Export(str(path))
+    except Tf.ErrorException as error:
+        code = next((c for c in _WRITE_ERRORS if os.strerror(c) in str(error)), errno.EIO)
+        raise OSError(code, os.strerror(code), str(path)) from error
 
 
 def _import(module: str) -> Any:

@@ -462,7 +462,10 @@ def test_colours_of_files_are_used_and_other_content_is_reported(rgb, monkeypatc
 
 
 def test01_hit_points_are_a_field(rgb, tmp_path):
-    """A floor of two layers and a wall: depths to the faces of their voxels, in the place of the volume."""
+    """A floor of two layers and a wall: depths to the faces of their voxels, in the place of the volume.
+
+    Interpolation moves faces forward by less than half a voxel.
+    """
     density = np.zeros((8, 10, 12), np.float32)
     density[:2] = density[:, :, 10:] = 400.0
     write_volume(tmp_path / "hits.vol", density, (0, 0, 0), (1.2, 1.0, 0.8))
@@ -475,7 +478,8 @@ def test01_hit_points_are_a_field(rgb, tmp_path):
     second = nerg.trace(world, to_world[:3, :3] @ eye + to_world[:3, 3], turned, ["depth", "color", "opacity"])
     for scale, result in ((1, first), (2, second)):
         np.testing.assert_allclose(result.opacity, [1, 1, 0], atol=1e-4)
-        np.testing.assert_allclose(result.depth[:2], [0.3 * scale, 0.5 * scale], atol=0.005 * scale)
+        before_face = np.array([0.3, 0.5]) - result.depth[:2] / scale
+        assert (before_face > -0.005).all() and (before_face < 0.05).all()
         # Grey by orientation: a floor is brighter than a wall.
         assert np.ptp(result.color, axis=1).max() < 1e-4 and result.color[0, 0] > result.color[1, 0] > 0.1
 

@@ -109,6 +109,7 @@ CASES = (
     ),
     Case("draw floor", "{i}/rays.npz -o {o}/a.png", ("a.png",)),
     Case("draw floor", "{i}/rays.npz -o {o}/a.svg --scene {i}/ball.xml -m llvm_ad_rgb", ("a.svg",)),
+    Case("draw scanpath", "{i}/still.npz -o {o}/a.png --scene {i}/ball.xml -m llvm_ad_rgb", ("a.png",)),
     Case("draw sheet", "{i}/a.exr {i}/b.exr -o {o}/a.png --overlay gaze", ("a.png",)),
     Case("draw difference", "{i}/a.exr {i}/b.exr -o {o}/a.svg", ("a.svg",)),
     Case("draw surface", "{i}/baked.ply -o {o}/a.png -m llvm_ad_rgb --width 32 --height 32", ("a.png",)),
@@ -213,6 +214,8 @@ CASES = (
     Case("export points", "{i}/field.safetensors -o {o}/a.ply --resolution 8 --density 3", ("a.ply",)),
     Case("export splats", "{i}/field.safetensors -o {o}/a.ply --resolution 8 --density 3", ("a.ply",)),
     Case("export volume", "{i}/field.safetensors -o {o}/a.vol --color {o}/c.vol --resolution 8", ("a.vol", "c.vol")),
+    Case("export scene", "{i}/room.ply {i}/rays.npz -o {o}/a.usdc", ("a.usdc",)),
+    Case("export scene", "{i}/room.ply {i}/rays.npz -o {o}/a.rrd", ("a.rrd",)),
     Case("export torch-ngp", "{i}/ngp.safetensors -o {o}/a.pth", ("a.pth",)),
     Case(
         "ablate",
@@ -239,6 +242,7 @@ INPUTS = {
     "render": {"frames"},
     "stats": {"aois", "align", "zones", "cohorts", "what_if", "salt"},
     "draw floor": {"scene"},
+    "draw scanpath": {"scene"},
     "align": {"field", "scene", "surface", "pairs", "tracking_surface", "tracking_cameras", "scene_cameras", "init"},
     "rays events": {"targets"},
     "rays export": {"aois", "scene", "align"},
@@ -282,6 +286,8 @@ def make_inputs(folder: Path) -> Path:
         write_exr(folder / f"{name}.exr", {"gaze.Y": np.full((12, 16), 1.0 + k, np.float32)})
     rays: Rays = crowd(3000)
     rays.save(folder / "rays.npz")
+    ahead = np.tile([1.0, 0, 0], (30, 1))
+    Rays(np.arange(30) / 30, np.zeros(30), ("a",), 0 * ahead, ahead, np.ones(30)).save(folder / "still.npz")
     vertices, faces = box((-9, -9, -1), (9, 9, 4))
     write_columns(folder / "room.ply", dict(zip("xyz", vertices.T)), faces)
     columns = dict(zip("xyz", vertices.T)) | {"value": np.arange(len(vertices), dtype=np.float32)}

@@ -97,6 +97,9 @@ def test_an_output_is_written_atomically(case, inputs, tmp_path, capsys, monkeyp
         pytest.importorskip("pyarrow")
     if case.files[0].endswith(".mp4"):
         pytest.importorskip("av")
+    for suffix, module in ((".usdc", "pxr"), (".rrd", "rerun")):
+        if case.files[0].endswith(suffix):
+            pytest.importorskip(module)
 
     for name in case.once:
         remember(monkeypatch, f"nerg_mi.{name}")

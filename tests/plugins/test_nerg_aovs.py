@@ -12,6 +12,7 @@ from nerg_mi.api.scene import Scene
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation.study import count_traced_operations
 from nerg_mi.figures.overlay import find_overlay, to_bytes
+from nerg_mi.figures.style import figure_of
 from nerg_mi.files.images import write_exr
 from nerg_mi.transport import aovs
 from nerg_mi.viewer.layers import choose_range, choose_scale, colorize, format_legend, list_layers
@@ -137,7 +138,7 @@ def test05_new_aov_is_displayed_everywhere(rgb, table, tmp_path, kind):
     if kind == "diverging":
         assert limits[0] == -limits[1]
     assert (limits is None) == (kind == "categorical")
-    said = [axes.get_ylabel().replace("\n", " ") for axes in overlay.draw(layers, limits).axes]
+    said = [axes.get_ylabel().replace("\n", " ") for axes in figure_of(overlay.draw(layers, limits)).axes]
     assert "row of the shelf [rows]" in said
     # The viewer, with the same colours.
     (layer,) = [la for la in list_layers(Scene(scene)) if la.title == "shelf row"]
