@@ -189,14 +189,17 @@ def _make_path_elements(path: Path, children: list[ElementTree.Element], folder:
     return [element("path", value=check_attribute(name)) for name in dict.fromkeys(names) if name != "."]
 
 
-# ---- Replacing the gaze field of a scene file ----
+# ---- Replacing the fields of a scene file ----
 
 GAZE_PROPERTY = "gaze"
 """Name of the gaze field in the integrator."""
 
+FIELD_PROPERTY = "field"
+"""Name of the radiance field in the integrator."""
 
-def find_gaze_file(path: Path) -> Path | None:
-    """Find the file of the gaze field of a scene file; None if it has no gaze field.
+
+def find_field_file(path: Path, name: str = GAZE_PROPERTY) -> Path | None:
+    """Find the file of a field of a scene file, `GAZE_PROPERTY` or `FIELD_PROPERTY`; None if it has no such field.
 
     Raises
     ------
@@ -204,11 +207,23 @@ def find_gaze_file(path: Path) -> Path | None:
         The file does not contain exactly one integrator.
     """
     _, elements = _read_absolute_elements(path)
-    volume = _find_gaze_volume(_find_integrator(path, elements))
-    if volume is None:
-        return None
-    name = next((c.get("value", "") for c in volume if c.get("name") == "filename"), "")
-    return path.parent / substitute_defaults(name, resolve_defaults(elements)) if name else None
+    node = _find_filename(_find_volume(_find_integrator(path, elements), name))
+    value = "" if node is None else node.get("value", "")
+    return path.parent / substitute_defaults(value, resolve_defaults(elements)) if value else None
+
+
+def replace_radiance_field(path: Path, field: Path) -> str:
+    """Return the text of a scene file with another file as its radiance field, in the same place.
+
+    The text contains absolute paths, so that it can be written anywhere. Raises `NergError` if the scene has no
+    radiance field from a file.
+    """
+    version, elements = _read_absolute_elements(path)
+    node = _find_filename(_find_volume(_find_integrator(path, elements), FIELD_PROPERTY))
+    if node is None:
+        raise NergError(f'"{path}" has no radiance field from a file')
+    node.set("value", check_attribute(str(resolve_path(field))))
+    return format_document(list(map(to_verbatim, elements)), f"{path.name} with the field {field.name}.", version)
 
 
 def replace_gaze(path: Path, gaze: Path) -> str:
@@ -233,7 +248,7 @@ def replace_gaze(path: Path, gaze: Path) -> str:
     """
     version, elements = _read_absolute_elements(path)
     integrator = _find_integrator(path, elements)
-    volume = _find_gaze_volume(integrator)
+    volume = _find_volume(integrator, GAZE_PROPERTY)
     if volume is not None:
         integrator.remove(volume)
     volume = SubElement(integrator, "volume", name=GAZE_PROPERTY, type="gazefield")
@@ -256,5 +271,9 @@ def _find_integrator(path: Path, children: list[Element]) -> Element:
     return integrators[0]
 
 
-def _find_gaze_volume(integrator: Element) -> Element | None:
-    return next((child for child in integrator if child.tag == "volume" and child.get("name") == GAZE_PROPERTY), None)
+def _find_volume(integrator: Element, name: str) -> Element | None:
+    return next((child for child in integrator if child.tag == "volume" and child.get("name") == name), None)
+
+
+def _find_filename(volume: Element | None) -> Element | None:
+    return None if volume is None else next((c for c in volume if c.get("name") == "filename"), None)

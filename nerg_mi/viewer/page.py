@@ -55,6 +55,10 @@ class BrowserWindow:
         Counts the changes; a picture of an earlier version is dropped.
     shows_picture : bool
         Whether the browser displays a picture instead of the points.
+    is_frame_pending : bool
+        Whether a frame of a movement is being rendered.
+    frame_version : int
+        The ``version`` of the last frame.
     stale_reason : str
         Why the points are grey; "" if they are up to date.
     message : str
@@ -80,6 +84,8 @@ class BrowserWindow:
     is_handled: bool = False
     version: int = 0
     shows_picture: bool = False
+    is_frame_pending: bool = False
+    frame_version: int = -1
     stale_reason: str = ""
     message: str = ""
     free_position: np.ndarray | None = None
@@ -114,8 +120,9 @@ class BrowserWindow:
 
 # ---- Page ----
 #
-# While a camera moves, its browser draws points. When the camera rests, a rendered picture replaces them, first at low
-# resolution, then at full resolution. No callback waits for rendering: a clock thread starts pending work.
+# While a camera moves, its browser shows frames of low resolution, or draws points where frames take too long. When it
+# rests, a rendered picture replaces them, first at low resolution, then at full resolution. No callback waits for
+# rendering: a clock thread starts pending work.
 
 TICK_SECONDS = 0.04
 """Interval of the clock, in seconds."""
@@ -274,10 +281,13 @@ class Page:
                 self._draw_points(window)
 
     def _hide_picture(self, window: BrowserWindow, change_time: float) -> None:
-        """Replace the picture of ``window`` by the points, since its view or the displayed contents have changed."""
+        """Replace the picture of ``window`` by frames or by the points, since its view or the displayed contents have
+        changed."""
         window.version += 1
         window.change_time, window.is_handled = change_time, False
         self.session.cancel(window.client.client_id)
+        if self._start_frame(window):
+            return
         if window.shows_picture:
             window.shows_picture = False
             with window.client.atomic():
@@ -288,6 +298,42 @@ class Page:
                     # There are no points yet: grey out the old picture.
                     window.client.scene.set_background_image(layers.grey_out(window.last_picture[1]), format="jpeg")
 
+    def _start_frame(self, window: BrowserWindow) -> bool:
+        """Start to render a frame of a moving ``window``; return whether frames are fast enough."""
+        view, version = window.view, window.version
+        width = None if view is None else self.session.choose_frame_width(view)
+        if view is None or width is None:
+            return False
+        if window.is_frame_pending:
+            return True
+
+        def deliver(picture: StagePicture | None, colors: np.ndarray | None) -> None:
+            with self._lock:
+                window.is_frame_pending = False
+                is_open = window.client.client_id in self.windows
+                # The pictures of a view at rest are better than its frame.
+                if picture is None or colors is None or window.is_handled or not is_open:
+                    return
+                window.timings = [f"{width} × {len(colors)}: {picture.seconds:.2f} s a frame"]
+                self._show_picture(window, picture, colors, 80)
+                window.frame_version = version
+                if window.version != version:
+                    self._start_frame(window)
+
+        window.is_frame_pending = True
+        self.session.render_frame(window.client.client_id, view, deliver, width)
+        return True
+
+    def _show_picture(
+        self, window: BrowserWindow, picture: StagePicture, colors: np.ndarray, jpeg_quality: int
+    ) -> None:
+        window.last_picture = picture, colors
+        window.shows_picture = True
+        with window.client.atomic():
+            window.client.scene.set_background_image(colors, format="jpeg", jpeg_quality=jpeg_quality)
+            if window.cloud is not None and window.cloud.visible:
+                window.cloud.visible = False
+
     def _start_refinement(self, window: BrowserWindow) -> None:
         version, start = window.version, time.monotonic()
         window.timings = []
@@ -297,19 +343,17 @@ class Page:
             with self._lock:
                 if window.version != version or client.client_id not in self.windows:
                     return
-                window.last_picture = picture, colors
-                window.shows_picture = True
-                with client.atomic():
-                    client.scene.set_background_image(colors, format="jpeg", jpeg_quality=92)
-                    if window.cloud is not None:
-                        window.cloud.visible = False
+                self._show_picture(window, picture, colors, 92)
                 height, width = colors.shape[:2]
                 seconds = time.monotonic() - start
                 window.timings.append(f"{width} × {height}, {picture.samples} a pixel: {seconds:.2f} s")
 
         assert window.view is not None
         session, origin = self.session, window.view.origin
-        session.refine_picture(client.client_id, window.view, deliver, session.options.width, session.spp)
+        width, min_width = session.options.width, 0
+        if window.frame_version == version and window.last_picture is not None:
+            min_width = window.last_picture[1].shape[1]
+        session.refine_picture(client.client_id, window.view, deliver, width, session.spp, min_width)
         free_position = session.home_view.origin if window.free_position is None else window.free_position
         session.keep_in_free_space(
             client.client_id, origin, free_position, lambda corrected: self._move_camera_out(window, origin, corrected)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
@@ -213,6 +214,77 @@ class BandPace:
             self._index = min(self._index + 1, len(BAND_SIZES) - 1)
 
 
+FRAME_SECONDS = 1 / 15
+"""Target for the time of a frame during a movement, in seconds."""
+
+MAX_FRAME_SECONDS = 0.1
+"""Maximum time of a frame, in seconds; slower movements are shown by points."""
+
+_FRAME_COLOR_CUTOFF = 0.5
+"""`MarchSettings.color_cutoff` of frames of a compiled field: 35 dB in the demo store, in a sixth less time."""
+
+_FRAME_OVERHEAD = 0.02
+"""Time of a frame that does not depend on its size, in seconds: kernels are assembled and started."""
+
+FRAME_WIDTHS = (640, 480, 320, 240)
+"""The possible widths of the frames of a movement, in pixels."""
+
+
+class FramePace:
+    """Chooses the width of the frames of a movement from the time of previous rays."""
+
+    def __init__(self) -> None:
+        self._ray_seconds: deque[float] = deque(maxlen=5)
+
+    def record(self, seconds: float, num_rays: int) -> None:
+        """Record that ``num_rays`` rays took ``seconds``."""
+        self._ray_seconds.append(max(seconds - _FRAME_OVERHEAD, 0.1 * seconds) / num_rays)
+
+    def choose_width(self, view: PinholeView, max_width: int) -> int | None:
+        """Return the width of the next frame of ``view``; None if rays are too slow for frames, or of unknown speed."""
+        if len(self._ray_seconds) < 2:
+            return None
+        # The median: single times contain the compilation of a kernel.
+        ray_seconds = float(np.median(self._ray_seconds))
+        seconds = {
+            w: _FRAME_OVERHEAD + ray_seconds * w * view.picture_height(w) for w in FRAME_WIDTHS if w <= max_width
+        }
+        fast = [w for w in seconds if seconds[w] <= FRAME_SECONDS] or list(seconds)[-1:]
+        return fast[0] if fast and seconds[fast[0]] <= MAX_FRAME_SECONDS else None
+
+
+def render_frame(
+    scene: Scene,
+    view: PinholeView,
+    observer: np.ndarray | None,
+    quantities: Sequence[str],
+    width: int,
+    pace: FramePace,
+    *,
+    ceiling: Ceiling | None = None,
+) -> StagePicture:
+    """Render a picture of ``width`` pixels with one sample per pixel at once. Arguments as for `refine`.
+
+    Of a compiled field the colour is evaluated at one or two positions per ray.
+    """
+    start, integrator = time.perf_counter(), scene.integrator
+    settings = integrator.settings
+    if integrator.medium is not None and integrator.medium.is_density_separate:
+        settings = replace(settings, color_cutoff=max(settings.color_cutoff, _FRAME_COLOR_CUTOFF))
+    shape = view.picture_height(width), width
+    directions = view.ray_directions(width, shape[0], np.full((shape[0] * width, 2), 0.5))
+    with (
+        rough_integrals(scene),
+        override_attribute(scene, "ceiling", ceiling),
+        override_attribute(scene, "settings", settings),
+    ):
+        traced = _trace_from(scene, view.origin, directions, quantities, observer, 0)
+    seconds = time.perf_counter() - start
+    pace.record(seconds, len(directions))
+    values = {name: v.reshape(*shape, *v.shape[1:]) for name, v in traced.items()}
+    return StagePicture(values, 1, seconds, 1, False)
+
+
 def refine(
     scene: Scene,
     view: PinholeView,
@@ -223,6 +295,8 @@ def refine(
     pace: BandPace,
     *,
     ceiling: Ceiling | None = None,
+    frame_pace: FramePace | None = None,
+    min_width: int = 0,
     seed: int = 0,
 ) -> Iterator[StagePicture | None]:
     """Render pictures of increasing quality.
@@ -245,6 +319,10 @@ def refine(
         Chooses the size of the bands.
     ceiling : Ceiling or None
         The part of the scene to hide in views from above; it replaces the ceiling of the scene.
+    frame_pace : FramePace or None
+        Learns from the first pictures how fast frames would be.
+    min_width : int
+        Pictures that are not wider are left out, except the final one.
     seed : int
         Seed of the sample positions.
 
@@ -258,6 +336,8 @@ def refine(
     sums: dict[str, np.ndarray] = {}
     for downsampling in DOWNSAMPLING_STAGES:
         columns = max(width // downsampling, 1)
+        if downsampling > 1 and columns <= min_width:
+            continue
         rows = max(view.picture_height(width) // downsampling, 1)
         samples = spp if downsampling == 1 else 1
         for sample in range(samples):
@@ -275,7 +355,10 @@ def refine(
                         scene, view.origin, pad_directions(part, size), quantities, observer, band_seed
                     )
                 parts.append({name: v[: len(part)] for name, v in traced.items()})
-                pace.record(time.perf_counter() - band_start)
+                seconds = time.perf_counter() - band_start
+                pace.record(seconds)
+                if frame_pace is not None and downsampling > 1:
+                    frame_pace.record(seconds, size)
                 done += len(part)
                 yield None
             values = {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}

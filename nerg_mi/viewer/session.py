@@ -16,12 +16,14 @@ from nerg_mi.api.fields import activate_mitsuba
 from nerg_mi.api.query import compute_box_shares, compute_mesh_shares, trace
 from nerg_mi.api.scene import COLOR, Scene
 from nerg_mi.errors import NergError, translate_mitsuba_errors
+from nerg_mi.files.atomic import write_text
 from nerg_mi.formats.areas import AreaSet, Region, read_areas
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.measures.shares import COARSE
 from nerg_mi.probes.probes import place_probes
 from nerg_mi.ranges import MAX_COORDINATE
 from nerg_mi.rays.rays import Rays
+from nerg_mi.rendering.nested_scene import FIELD_PROPERTY, find_field_file, replace_radiance_field
 from nerg_mi.rendering.scene import load_scene
 from nerg_mi.transport.geometry import Ceiling
 from nerg_mi.workflows.render import describe_basis
@@ -30,10 +32,13 @@ from nerg_mi.workflows.scene_commands import ViewOptions
 from nerg_mi.workflows.view import ViewerScene
 
 from . import layers
+from .compilation import BackgroundCompilation, find_compiled_file, is_compiled, is_current
 from .layers import DisplaySettings, Layer, Scale
 from .points import (
     BAND_SIZES,
+    FRAME_WIDTHS,
     BandPace,
+    FramePace,
     PinholeView,
     PointProxy,
     Points,
@@ -45,6 +50,7 @@ from .points import (
     make_heading,
     pad_directions,
     refine,
+    render_frame,
     rough_integrals,
 )
 
@@ -373,6 +379,9 @@ class Worker:
 # The state that all browsers share: the scene, the observer, the displayed layer, and the tasks that compute them.
 # Mitsuba and Dr.Jit are used only on the thread of the `Worker`, which also calls the `Listener`.
 
+FRAME_PRIORITY = 0
+"""Priority of the frames of a movement."""
+
 NORMAL_PRIORITY = 1
 """Priority of tasks that take turns, such as pictures and attention shares."""
 
@@ -388,6 +397,7 @@ _TASK_NAMES = {
     "people": "recordings",
     "film": "video",
 }
+_COMPILING = "faster pictures"
 """Descriptions of the worker's tasks for the status text."""
 
 _MAX_SPP = 256
@@ -422,7 +432,10 @@ class Session:
         self.ceiling: float | None = None
         self.regions: list[Region] = []
         self.other_areas: list[dict[str, Any]] = []
-        self.band_pace = BandPace()
+        self.band_pace, self.frame_pace = BandPace(), FramePace()
+        # The compiled copy of the radiance field, and the process that makes it.
+        self.compiled: Path | None = None
+        self._compilation: BackgroundCompilation | None = None
         self.checksums: dict[Path, str] = {}
         self._ranges: dict[str, tuple[float, float]] = {}
         self._busy: set[str] = set()
@@ -440,10 +453,40 @@ class Session:
         """
         self.worker.call(self._load).result()
         self.worker.submit("proxy", NORMAL_PRIORITY, self._gather())
+        self._start_compilation()
 
     def stop(self) -> None:
-        """Stop the render thread."""
+        """Stop the render thread and the compilation of the field."""
+        if self._compilation is not None:
+            self._compilation.stop()
         self.worker.stop()
+
+    def _start_compilation(self) -> None:
+        """Use the compiled copy of the radiance field; make it in the background if there is none."""
+        field = find_field_file(self.source.scene, FIELD_PROPERTY) if self.options.compile else None
+        if field is None or field.suffix != ".safetensors" or is_compiled(field):
+            return
+        compiled = find_compiled_file(field, self.source.folder)
+        if is_current(compiled, field):
+            self._use_compiled(compiled)
+        else:
+            self._compilation = BackgroundCompilation(field, compiled, self._use_compiled, self.listener.on_error)
+
+    def _use_compiled(self, compiled: Path) -> None:
+        """Render with the ``compiled`` copy of the radiance field from now on."""
+
+        def steps() -> Iterator[None]:
+            self.compiled = compiled
+            self._load_scene(self.scene_file)
+            self._set_falloff()
+            self.frame_pace = FramePace()
+            yield
+            # Compile the kernels now, and measure the time of rays.
+            for _ in range(3):
+                self._make_frame(self.home_view, FRAME_WIDTHS[-1])
+                yield
+
+        self.worker.submit("compiled", FRAME_PRIORITY, steps())
 
     def _load(self) -> None:
         self.source = self._load_source()
@@ -474,7 +517,11 @@ class Session:
 
     def _load_scene(self, scene_file: Path) -> None:
         """Load a scene file and use it from now on."""
-        self.scene_file, self.scene = scene_file, Scene(load_scene(scene_file))
+        self.scene_file, shown = scene_file, scene_file
+        if self.compiled is not None:
+            shown = self.source.folder / f"{scene_file.stem}.compiled.xml"
+            write_text(shown, replace_radiance_field(scene_file, self.compiled))
+        self.scene = Scene(load_scene(shown))
         self.layers = layers.list_layers(self.scene)
         self.basis = describe_basis(self.scene.mitsuba)
 
@@ -611,7 +658,8 @@ class Session:
         """Descriptions of the running tasks."""
         names = {name[0] if isinstance(name, tuple) else name for name in self.worker.task_names}
         descriptions = _TASK_NAMES | {"gaze": f"{'gaze' if self.scene.has_gaze else 'visibility'} on the points"}
-        return [text for name, text in descriptions.items() if name in names]
+        tasks = [text for name, text in descriptions.items() if name in names]
+        return [*tasks, *([_COMPILING] if self._compilation is not None and self.compiled is None else [])]
 
     def keep_in_free_space(
         self, name: Hashable, position: np.ndarray, free_position: np.ndarray, deliver: Callable[[np.ndarray], None]
@@ -654,6 +702,7 @@ class Session:
         deliver: Callable[[StagePicture, np.ndarray], None],
         width: int,
         spp: int,
+        min_width: int = 0,
     ) -> None:
         """Start to refine a picture.
 
@@ -669,8 +718,49 @@ class Session:
             Width of the final picture in pixels.
         spp : int
             Samples per pixel of the final picture.
+        min_width : int
+            Pictures that are not wider are left out.
         """
-        self.worker.submit(("picture", name), NORMAL_PRIORITY, self._refine(view, deliver, width, spp))
+        self.worker.submit(
+            ("picture", name), NORMAL_PRIORITY, self._refine(view, deliver, width, spp, min_width=min_width)
+        )
+
+    def choose_frame_width(self, view: PinholeView) -> int | None:
+        """Return the width of frames of ``view`` during a movement; None if rendering is too slow for them."""
+        return self.frame_pace.choose_width(view, self.options.width)
+
+    def render_frame(
+        self,
+        name: Hashable,
+        view: PinholeView,
+        deliver: Callable[[StagePicture | None, np.ndarray | None], None],
+        width: int,
+    ) -> None:
+        """Render a frame of a movement before other tasks, and call ``deliver`` with the picture and its colours, or
+        with None if it could not be rendered. Other arguments as for `refine_picture`."""
+
+        def steps() -> Iterator[None]:
+            picture, colors = None, None
+            try:
+                picture, colors = self._make_frame(view, width)
+            finally:
+                deliver(picture, colors)
+            yield
+
+        self.worker.submit(("frame", name), FRAME_PRIORITY, steps())
+
+    def _make_frame(self, view: PinholeView, width: int) -> tuple[StagePicture, np.ndarray]:
+        with self.lock:
+            display, observer, height = self.display, self.observer, self.ceiling
+        ceiling = None if height is None else Ceiling(height, self.ceiling_up)
+        layer = display.layer
+        quantities = layers.required_quantities(layer)
+        picture = render_frame(self.scene, view, observer, quantities, width, self.frame_pace, ceiling=ceiling)
+        return picture, self._colorize(layer, picture)
+
+    def _colorize(self, layer: Layer, picture: StagePicture) -> np.ndarray:
+        values = layer.select_values(picture.values)
+        return layers.colorize(layer, picture.values["color"], values, picture.values["opacity"] > 0.5, self.scale())
 
     def refine_inset(
         self, name: Hashable, view: PinholeView, deliver: Callable[[StagePicture, np.ndarray], None], width: int
@@ -791,20 +881,22 @@ class Session:
         width: int,
         spp: int,
         sets_range: bool = True,
+        min_width: int = 0,
     ) -> Iterator[None]:
         """Refine a picture; ``sets_range``: whether it sets the automatic range."""
         with self.lock:
             display, observer, height = self.display, self.observer, self.ceiling
         ceiling = None if height is None else Ceiling(height, self.ceiling_up)
         layer, quantities = display.layer, layers.required_quantities(display.layer)
-        for picture in refine(self.scene, view, observer, quantities, width, spp, self.band_pace, ceiling=ceiling):
+        settings = {"ceiling": ceiling, "frame_pace": self.frame_pace, "min_width": min_width}
+        for picture in refine(self.scene, view, observer, quantities, width, spp, self.band_pace, **settings):
             if picture is not None:
                 mask = picture.values["opacity"] > 0.5
                 values = layer.select_values(picture.values)
                 if sets_range and values is not None and layer.quantity not in self.point_values:
                     with self.lock:
                         self._update_range(layer.quantity, picture.values, mask)
-                deliver(picture, layers.colorize(layer, picture.values["color"], values, mask, self.scale()))
+                deliver(picture, self._colorize(layer, picture))
             yield None
 
     def _render_panorama(self, deliver: Callable[[np.ndarray], None], width: int) -> Iterator[None]:

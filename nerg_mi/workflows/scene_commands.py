@@ -276,6 +276,12 @@ class ViewOptions(ValidatedDataclass):
         group=INPUT,
     )
     open: bool = option(False, "Open the page in the browser of this machine.", group=OUTPUT)
+    compile: bool = option(
+        True,
+        "Compile the radiance field in the background, for faster pictures, and keep the result next to it as "
+        "NAME.compiled.safetensors for the next time.",
+        group=PERFORMANCE,
+    )
     mode: str | None = best_variant()
 
 

@@ -18,7 +18,7 @@ from nerg_mi.maths.geometry import Similarity
 from nerg_mi.rays.dataset import is_dataset, load_rays
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.bands import is_nerg
-from nerg_mi.rendering.nested_scene import find_gaze_file, replace_gaze
+from nerg_mi.rendering.nested_scene import find_field_file, replace_gaze
 from nerg_mi.rendering.scene import load_scene
 
 from .base import SILENT, Reporter, select_backend
@@ -52,6 +52,8 @@ class ViewerScene:
         Up direction (3,), a unit vector.
     name
         Display name.
+    folder
+        Folder for temporary files.
     variants
         Scene files that differ in their gaze field only, by its name; the first is ``scene``. Empty if there is no
         choice.
@@ -63,6 +65,7 @@ class ViewerScene:
     align: Similarity
     up: np.ndarray
     name: str
+    folder: Path
     variants: dict[str, Path] = field(default_factory=dict)
 
 
@@ -94,12 +97,12 @@ def make_viewer_scene(
     gaze = [path for path, kind in kinds.items() if kind == "gaze"]
     if len(scenes) == 1 and set(kinds.values()) <= {"scene", "rays", "gaze"} and _is_nerg(scenes[0]):
         align = _explicit_align(options, reporter) or Similarity(np.eye(4))
-        own_gaze = find_gaze_file(scenes[0]) if gaze else None
+        own_gaze = find_field_file(scenes[0]) if gaze else None
         variants = (
             write_variants(scenes[0], [*([own_gaze] if own_gaze else []), *gaze], folder, reporter) if gaze else {}
         )
         scene = next(iter(variants.values()), scenes[0])
-        return ViewerScene(scene, bool(gaze), rays, align, _up(options, np.array([0.0, 0, 1])), name, variants)
+        return ViewerScene(scene, bool(gaze), rays, align, _up(options, np.array([0.0, 0, 1])), name, folder, variants)
     inputs = [path for path in paths if not is_dataset(path) and path not in gaze[1:]]
     if rays is not None and rays_files[0] not in inputs:
         copy = folder / "rays.npz"
@@ -114,7 +117,7 @@ def make_viewer_scene(
     if align is None:
         align = read_training_alignment(read_metadata(gaze[0]).get("provenance", {}) if gaze else {})
     variants = write_variants(output, gaze, folder, reporter) if len(gaze) > 1 else {}
-    return ViewerScene(output, True, rays, align, _up(options, _up_of(output)), name, variants)
+    return ViewerScene(output, True, rays, align, _up(options, _up_of(output)), name, folder, variants)
 
 
 def write_variants(scene: Path, gaze: Sequence[Path], folder: Path, reporter: Reporter = SILENT) -> dict[str, Path]:

@@ -8,7 +8,7 @@ import pytest
 import nerg_mi as nerg
 from nerg_mi.errors import NergError
 from nerg_mi.rendering.bands import render_channels
-from nerg_mi.rendering.nested_scene import find_gaze_file, nest_scene, replace_gaze
+from nerg_mi.rendering.nested_scene import find_field_file, nest_scene, replace_gaze
 from nerg_mi.rendering.scene import load_scene
 from nerg_mi.rendering.scene_writer import GazeFiles, LookAt, SceneText
 from nerg_mi.workflows import demo
@@ -98,14 +98,14 @@ NERG = """<integrator type="nerg"><volume name="gaze" type="gazefield"><string n
 </integrator>"""
 
 
-def test01_find_gaze_file(tmp_path):
+def test01_find_field_file(tmp_path):
     path = tmp_path / "a.xml"
     path.write_text(PLAIN.format(NERG))
-    assert find_gaze_file(path) == tmp_path / "a.bin"
+    assert find_field_file(path) == tmp_path / "a.bin"
     path.write_text(PLAIN.format('<integrator type="nerg"/>'))
-    assert find_gaze_file(path) is None
+    assert find_field_file(path) is None
     store = demo.find_store_scene()
-    assert find_gaze_file(store) == store.parent.resolve() / "shoppers.safetensors"
+    assert find_field_file(store) == store.parent.resolve() / "shoppers.safetensors"
 
 
 @pytest.mark.parametrize("count", [0, 2])
@@ -123,7 +123,7 @@ def test03_replaced_gaze_renders_the_same(rgb, tmp_path):
     other = tmp_path / "other.safetensors"
     other.write_bytes((store.parent / "shoppers.safetensors").read_bytes())
     (tmp_path / "copy.xml").write_text(replace_gaze(store, other))
-    assert find_gaze_file(tmp_path / "copy.xml") == other.resolve()
+    assert find_field_file(tmp_path / "copy.xml") == other.resolve()
     at, ahead = [(4.4, 2.8, 1.6)] * 16, np.random.default_rng(1).normal(size=(16, 3))
     ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
     image = [nerg.trace(nerg.Scene.load(path), at, ahead, ["gaze", "depth"]) for path in (store, tmp_path / "copy.xml")]

@@ -169,7 +169,9 @@ def test_command_reports_one_line(tmp_path, name):
     run = [*main, "render", path.name, "-o", "a.exr", "-m", "llvm_ad_rgb"]
     done = subprocess.run(run, cwd=tmp_path, capture_output=True, text=True, timeout=180)
     assert done.returncode == 1, done.stderr[-500:]
-    assert len(done.stderr.strip().splitlines()) == 1 and said in done.stderr
+    # A slow machine also shows the progress.
+    lines = [line for line in done.stderr.strip().splitlines() if not line.lstrip().startswith("0%")]
+    assert len(lines) == 1 and said in lines[0]
     assert not (tmp_path / "a.exr").exists()
 
 

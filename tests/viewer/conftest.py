@@ -13,7 +13,10 @@ from nerg_mi.fields.gaze_log_density import LogGazeConfig, LogGazeField
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.formats.fields import save_gaze
 from nerg_mi.maths.geometry import Box
+from nerg_mi.viewer.session import Session
 from nerg_mi.workflows import demo
+from nerg_mi.workflows.scene_commands import ViewOptions
+from nerg_mi.workflows.view import make_viewer_scene
 
 # ---- A simple room with an analytic solution ----
 
@@ -90,3 +93,42 @@ def store(rgb):
     if not all((path.parent / name).is_file() for name in demo.CHECKPOINTS.values()):
         pytest.skip("the store's fields are not here: python -m nerg_mi.scenes.store.make")
     return path
+
+
+# ---- Sessions ----
+
+
+class CountingListener:
+    """A listener that counts events."""
+
+    def __init__(self):
+        self.proxies = self.baked = self.shares = 0
+        self.errors = []
+        self.on_error, self.on_range = self.errors.append, lambda: None
+
+    def on_proxy(self):
+        self.proxies += 1
+
+    def on_baked(self):
+        self.baked += 1
+
+    def on_shares(self):
+        self.shares += 1
+
+
+@pytest.fixture
+def make_session(tmp_path):
+    made = []
+
+    def make(path, *other_files, **options) -> Session:
+        selected = ViewOptions(**{"compile": False, **options})
+        session = Session(
+            lambda: make_viewer_scene([path, *other_files], tmp_path, selected), selected, CountingListener()
+        )
+        made.append(session)
+        session.start()
+        return session
+
+    yield make
+    for session in made:
+        session.stop()

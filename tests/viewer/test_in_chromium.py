@@ -77,7 +77,7 @@ def running():
     path = demo.find_store_scene()
     if not all((path.parent / name).is_file() for name in demo.CHECKPOINTS.values()):
         pytest.skip("the store's fields are not here: python -m nerg_mi.scenes.store.make")
-    with open_viewer([path], ViewOptions(port=0, width=160, spp=1)) as viewer:
+    with open_viewer([path], ViewOptions(port=0, width=160, spp=1, compile=False)) as viewer:
         yield viewer
 
 

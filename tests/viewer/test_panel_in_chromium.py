@@ -161,7 +161,7 @@ def running(tmp_path_factory):
         pytest.skip("the store's fields are not here: python -m nerg_mi.scenes.store.make")
     rays = tmp_path_factory.mktemp("rays") / "rays.npz"
     make_rays().save(rays)
-    with open_viewer([path, rays], ViewOptions(port=0, width=48, spp=1)) as viewer:
+    with open_viewer([path, rays], ViewOptions(port=0, width=48, spp=1, compile=False)) as viewer:
         yield viewer
 
 
@@ -296,7 +296,7 @@ def test07_gaze_field_can_be_switched(running, tmp_path):
     """One of two gaze fields lacks a factor: the list of layers and the pictures change."""
     (tmp_path / "room.xml").write_text(ROOM)
     with open_viewer(
-        [tmp_path / "room.xml", *write_gaze_fields(tmp_path)], ViewOptions(port=0, width=48, spp=1)
+        [tmp_path / "room.xml", *write_gaze_fields(tmp_path)], ViewOptions(port=0, width=48, spp=1, compile=False)
     ) as viewer:
         session = viewer.page.session
         with chromium(900, 700) as driver:

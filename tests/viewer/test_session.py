@@ -19,8 +19,6 @@ from nerg_mi.viewer import session as module
 from nerg_mi.viewer.layers import get_layer
 from nerg_mi.viewer.page import Page
 from nerg_mi.viewer.session import ALL_PARTICIPANTS, MAX_GAP, Listener, Session, Tracks, Worker
-from nerg_mi.workflows.scene_commands import ViewOptions
-from nerg_mi.workflows.view import make_viewer_scene
 
 # ---- Listener ----
 
@@ -33,42 +31,6 @@ def test_page_implements_listener(name):
 
 
 # ---- Session ----
-
-
-class CountingListener:
-    """A listener that counts events."""
-
-    def __init__(self):
-        self.proxies = self.baked = self.shares = 0
-        self.errors = []
-        self.on_error, self.on_range = self.errors.append, lambda: None
-
-    def on_proxy(self):
-        self.proxies += 1
-
-    def on_baked(self):
-        self.baked += 1
-
-    def on_shares(self):
-        self.shares += 1
-
-
-@pytest.fixture
-def make_session(tmp_path):
-    made = []
-
-    def make(path, *other_files, **options) -> Session:
-        selected = ViewOptions(**options)
-        session = Session(
-            lambda: make_viewer_scene([path, *other_files], tmp_path, selected), selected, CountingListener()
-        )
-        made.append(session)
-        session.start()
-        return session
-
-    yield make
-    for session in made:
-        session.stop()
 
 
 def settle(session):
