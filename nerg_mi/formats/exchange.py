@@ -37,7 +37,8 @@ class ExchangeMesh:
 
 @dataclass(frozen=True, eq=False)
 class ExchangePoints:
-    """Points of a field: ``positions`` (N, 3), ``colors`` (N, 3), and ``values`` (N,) or None; ``label`` names them."""
+    """Points of a field: ``positions`` (N, 3), linear ``colors`` (N, 3), and ``values`` (N,) or None, which ``label``
+    names."""
 
     name: str
     positions: np.ndarray

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError, translate_mitsuba_errors
+from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.figures.overlay import Heat, robust_max
 from nerg_mi.figures.style import apply_colormap
 from nerg_mi.files.atomic import check_writable
@@ -33,6 +34,7 @@ from nerg_mi.rays.events import average_fixations, detect_fixations_idt
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.bands import render_aovs, require_nerg
 from nerg_mi.rendering.scene import activate_variant, load_scene
+from nerg_mi.transport.field_medium import FieldMedium
 from nerg_mi.transport.geometry import pixel_directions
 from nerg_mi.transport.observer import sensor_center
 
@@ -126,16 +128,22 @@ def _add_file(scene: ExchangeScene, path: Path, options: SceneExportOptions, rep
         return replace(scene, splats=read_splats(path))
     if kind == "field":
         field = load_radiance(path, select_backend(options.mode))[0]
-        surface = extract_points(field, count=options.max_points)
-        return replace(scene, points=(*scene.points, ExchangePoints(path.stem, surface.vertices, surface.colors)))
+        return replace(scene, points=(*scene.points, _surface_points(field, path.stem, options)))
     raise NergError(
         f'"{path}" cannot be exported alone; write a scene with "nerg scene {path} -o scene.xml", and export that'
     )
 
 
+def _surface_points(field: RadianceField, name: str, options: SceneExportOptions) -> ExchangePoints:
+    surface = extract_points(field, count=options.max_points)
+    return ExchangePoints(name, surface.vertices, decode_srgb(surface.colors))
+
+
 def _mesh(path: Path) -> ExchangeMesh:
     mesh = read_mesh_file(path)
-    if path.suffix.lower() == ".ply" and b"property float value" in path.open("rb").read(1 << 14):
+    with path.open("rb") as file:
+        head = file.read(1 << 14)
+    if path.suffix.lower() == ".ply" and b"property float value" in head:
         baked = read_baked(path)
         return ExchangeMesh(path.stem, mesh.vertices, mesh.faces, mesh.colors, baked.values, baked.label)
     return ExchangeMesh(path.stem, mesh.vertices, mesh.faces, mesh.colors)
@@ -152,7 +160,7 @@ def _gaze(
     ends = rays.origin + length * rays.direction
     if rays.hit is not None:
         ends = np.where(np.isfinite(rays.hit), rays.hit, ends)
-    out, fixations = [], []
+    out, fixations, without = [], [], []
     step = -(-len(rays) // options.max_rays)
     for person in np.unique(rays.person):
         rows = np.flatnonzero(rays.person == person)
@@ -163,13 +171,17 @@ def _gaze(
         mine = rays.select(rows)
         label = detect_fixations_idt(mine, options.dispersion_threshold, options.min_fixation)
         if not (label >= 0).any():
-            reporter.message(f"{name}: no fixation was detected")
+            without.append(name)
             continue
         mean, durations = average_fixations(mine, label)
         at = mean.origin + length * mean.direction
         if mean.hit is not None:
             at = np.where(np.isfinite(mean.hit), mean.hit, at)
         fixations.append(ExchangeFixations(name, mean.t - durations / 2, durations, at))
+    if without:
+        reporter.message(
+            f"no fixation was detected for {len(without)} of {len(out)} participants, such as {without[0]}"
+        )
     return tuple(out), tuple(fixations)
 
 
@@ -177,7 +189,7 @@ def _gaze(
 
 
 def _add_scene(scene: ExchangeScene, path: Path, options: SceneExportOptions, reporter: Reporter) -> ExchangeScene:
-    """Add the shapes, cameras, splats and gaze of the scene file ``path``."""
+    """Add the shapes, cameras, splats or surface points of the field, and gaze of the scene file ``path``."""
     loaded = load_scene(path, options.defaults)
     nerg = require_nerg(path, loaded)
     skipped = [shape.id() for shape in loaded.shapes() if not shape.is_mesh()]
@@ -192,6 +204,10 @@ def _add_scene(scene: ExchangeScene, path: Path, options: SceneExportOptions, re
     field = nerg.children.get("field")
     if hasattr(field, "splats"):
         scene = replace(scene, splats=field.splats.transform(field.similarity))
+    if isinstance(nerg.medium, FieldMedium) and isinstance(nerg.medium.field, RadianceField):
+        points, matrix = _surface_points(nerg.medium.field, "field", options), nerg.medium.to_world.matrix
+        points = replace(points, positions=points.positions @ matrix[:3, :3].T + matrix[:3, 3])
+        scene = replace(scene, points=(*scene.points, points))
     scene = replace(scene, meshes=scene.meshes + meshes, cameras=scene.cameras + cameras)
     quantity = next((name for name in ("gaze", "kde") if nerg.children.get(name) is not None), None)
     return scene if quantity is None else _add_gaze(scene, path, loaded, quantity, options, reporter)

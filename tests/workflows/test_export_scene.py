@@ -7,10 +7,14 @@ import pytest
 import trimesh
 
 from nerg_mi.errors import NergError
+from nerg_mi.fields.mlp import namespace
 from nerg_mi.formats.exchange import ExchangeScene
+from nerg_mi.formats.fields import load_radiance
 from nerg_mi.formats.ply import write_columns
+from nerg_mi.formats.surfaces import extract_points
 from nerg_mi.maths.color import decode_srgb
 from nerg_mi.rays.rays import Rays
+from nerg_mi.workflows import demo
 from nerg_mi.workflows import export_scene as module
 from nerg_mi.workflows.export_scene import export_scene
 from nerg_mi.workflows.radiance_commands import SceneExportOptions
@@ -36,6 +40,9 @@ def rays():
     t = np.r_[np.arange(n) / 30 + np.repeat([0.0, 0.5], n // 2), 0.0]
     add = lambda a: np.concatenate([a, a[:1]])
     return Rays(t, person, ("Ada", "Bob"), add(origins), add(directions), np.ones(n + 1), add(targets))
+
+
+MOVED = '<transform name="to_world"><translate x="10"/></transform>'
 
 
 @pytest.fixture
@@ -94,6 +101,25 @@ def test_a_scene_has_its_meshes_cameras_and_gaze(rgb, folder, monkeypatch):
     a, b, c = (sphere.vertices[sphere.faces[:, k]] for k in range(3))
     outwards = (np.cross(b - a, c - a) * (a + b + c - 3 * np.array([0.5, 0, 0]))).sum(axis=1)
     assert (outwards > -1e-9).all()
+
+
+@pytest.mark.slow
+def test_a_scene_with_a_radiance_field_has_its_surface_points(rgb, folder, monkeypatch):
+    store = demo.find_store_scene()
+    shown = (folder / store.name, folder / "store.safetensors", folder / "shoppers.safetensors")
+    for path in shown:
+        path.write_bytes((store.parent / path.name).read_bytes())
+    text = store.read_text().replace('name="field" type="nerf">', 'name="field" type="nerf">' + MOVED)
+    (folder / store.name).write_text(text)
+    scene, _ = exported(folder, store.name, monkeypatch=monkeypatch, width=64, spp=1, max_points=2000)
+    field, gaze = scene.points
+    assert (field.name, gaze.name) == ("field", "gaze") and 1000 < len(field.positions) <= 2000
+    # The shop is 8 x 6 x 3 m large.
+    low, high = np.percentile(field.positions - (10, 0, 0), [2, 98], axis=0)
+    assert (low > -0.2).all() and (high < (8.2, 6.2, 3.2)).all() and (high - low > (7, 5, 2)).all()
+    # Colours are linear.
+    surface = extract_points(load_radiance(store.parent / "store.safetensors", namespace("llvm"))[0], count=2000)
+    assert np.allclose(field.colors, decode_srgb(surface.colors)) and np.ptp(field.colors) > 0.3
 
 
 def test_a_baked_mesh_keeps_its_attention(rgb, folder, monkeypatch):
