@@ -16,7 +16,7 @@ from pathlib import Path
 
 import bpy  # pyright: ignore[reportMissingImports]
 
-ATTENTION = "attention"
+ATTENTION, COLOR = "attention", "displayColor"
 # Colours of the map "inferno" at equal steps, linear.
 INFERNO = ((0.0, 0.0, 0.001), (0.093, 0.003, 0.156), (0.496, 0.038, 0.091), (0.946, 0.263, 0.004), (0.972, 1.0, 0.371))
 
@@ -43,11 +43,29 @@ def attention_material(top: float) -> bpy.types.Material:
     return material
 
 
-def grey_material() -> bpy.types.Material:
-    """A diffuse material for meshes without attention."""
+def surface_material(is_colored: bool) -> bpy.types.Material:
+    """A material for what has no attention: its colours or grey, lit by a headlight as in nerg_mi's own pictures."""
     material = bpy.data.materials.new("surface")
     material.use_nodes = True
-    material.node_tree.nodes["Principled BSDF"].inputs["Base Color"].default_value = (0.6, 0.6, 0.6, 1.0)
+    nodes, links = material.node_tree.nodes, material.node_tree.links
+    nodes.clear()
+    geometry, facing = nodes.new("ShaderNodeNewGeometry"), nodes.new("ShaderNodeVectorMath")
+    size, light = nodes.new("ShaderNodeMath"), nodes.new("ShaderNodeMath")
+    facing.operation, size.operation, light.operation = "DOT_PRODUCT", "ABSOLUTE", "MULTIPLY_ADD"
+    light.inputs[1].default_value, light.inputs[2].default_value = 0.7, 0.3
+    shader, output = nodes.new("ShaderNodeEmission"), nodes.new("ShaderNodeOutputMaterial")
+    links.new(geometry.outputs["Normal"], facing.inputs[0])
+    links.new(geometry.outputs["Incoming"], facing.inputs[1])
+    links.new(facing.outputs["Value"], size.inputs[0])
+    links.new(size.outputs["Value"], light.inputs[0])
+    links.new(light.outputs["Value"], shader.inputs["Strength"])
+    links.new(shader.outputs["Emission"], output.inputs["Surface"])
+    if is_colored:
+        color = nodes.new("ShaderNodeAttribute")
+        color.attribute_name = COLOR
+        links.new(color.outputs["Color"], shader.inputs["Color"])
+    else:
+        shader.inputs["Color"].default_value = (0.5, 0.5, 0.5, 1.0)
     return material
 
 
@@ -61,7 +79,6 @@ def open_scene(path: Path) -> dict[str, int]:
     bpy.ops.wm.read_factory_settings(use_empty=True)
     bpy.ops.wm.usd_import(filepath=str(path.resolve()), import_all_materials=True)
     counts: dict[str, int] = {}
-    grey = grey_material()
     for thing in bpy.data.objects:
         counts[thing.type] = counts.get(thing.type, 0) + 1
         if thing.type not in ("MESH", "POINTCLOUD"):
@@ -69,17 +86,12 @@ def open_scene(path: Path) -> dict[str, int]:
         thing.data.materials.clear()
         values = thing.data.attributes.get(ATTENTION)
         if values is None:
-            thing.data.materials.append(grey)
+            thing.data.materials.append(surface_material(COLOR in thing.data.attributes))
         else:
             top = quantile([v.value for v in values.data], 0.995)
             thing.data.materials.append(attention_material(top or 1.0))
     cameras = [thing for thing in bpy.data.objects if thing.type == "CAMERA"]
     bpy.context.scene.camera = cameras[0] if cameras else None
-    for camera in cameras:
-        # A headlight, because exported scenes have no light.
-        lamp = bpy.data.objects.new("headlight", bpy.data.lights.new("headlight", "POINT"))
-        lamp.data.energy, lamp.location = 200.0, camera.matrix_world.translation
-        bpy.context.collection.objects.link(lamp)
     return counts
 
 
