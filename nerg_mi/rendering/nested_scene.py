@@ -198,7 +198,7 @@ FIELD_PROPERTY = "field"
 """Name of the radiance field in the integrator."""
 
 
-def find_field_file(path: Path, name: str = GAZE_PROPERTY) -> Path | None:
+def find_field_file(path: Path, name: str) -> Path | None:
     """Find the file of a field of a scene file, `GAZE_PROPERTY` or `FIELD_PROPERTY`; None if it has no such field.
 
     Raises

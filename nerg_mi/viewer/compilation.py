@@ -23,7 +23,7 @@ def find_compiled_file(field: Path, folder: Path) -> Path:
     It is next to the field, or in ``folder`` if nothing can be written there or another file has its name.
     """
     beside = field.with_name(f"{field.stem}.compiled.safetensors")
-    is_other = beside.exists() and "compiled" not in read_metadata(beside).get("provenance", {})
+    is_other = beside.exists() and _read_origin(beside) is None
     return folder / beside.name if is_other or not os.access(field.parent, os.W_OK) else beside
 
 
@@ -34,10 +34,18 @@ def is_compiled(field: Path) -> bool:
 
 def is_current(compiled: Path, field: Path) -> bool:
     """Whether the file ``compiled`` exists and was compiled from ``field`` as it is now."""
-    if not compiled.exists():
-        return False
-    origin = read_metadata(field).get("refined_from") or file_sha256(field)
-    return is_compiled(compiled) and read_metadata(compiled).get("refined_from") == origin
+    origin = _read_origin(compiled) if compiled.exists() else None
+    return origin is not None and origin == (read_metadata(field).get("refined_from") or file_sha256(field))
+
+
+def _read_origin(path: Path) -> str | None:
+    """Return the checksum of the field from which ``path`` was compiled; None if it is no compiled field."""
+    try:
+        metadata = read_metadata(path)
+    except NergError:
+        # A file of another kind, or a damaged one: it is not used and not replaced.
+        return None
+    return metadata.get("refined_from") if "voxels" in metadata else None
 
 
 class BackgroundCompilation:

@@ -221,7 +221,7 @@ MAX_FRAME_SECONDS = 0.1
 """Maximum time of a frame, in seconds; slower movements are shown by points."""
 
 _FRAME_COLOR_CUTOFF = 0.5
-"""`MarchSettings.color_cutoff` of frames of a compiled field: 35 dB in the demo store, in a sixth less time."""
+"""`MarchSettings.color_cutoff` of frames of a compiled field: colour takes most of their time."""
 
 _FRAME_OVERHEAD = 0.02
 """Time of a frame that does not depend on its size, in seconds: kernels are assembled and started."""

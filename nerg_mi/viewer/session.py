@@ -397,8 +397,9 @@ _TASK_NAMES = {
     "people": "recordings",
     "film": "video",
 }
-_COMPILING = "faster pictures"
 """Descriptions of the worker's tasks for the status text."""
+
+_COMPILING = "faster pictures"
 
 _MAX_SPP = 256
 _MAX_SHAPES = 60

@@ -32,6 +32,7 @@ from nerg_mi.maths.color import decode_srgb
 from nerg_mi.rays.dataset import load_rays
 from nerg_mi.rays.events import average_fixations, detect_fixations_idt
 from nerg_mi.rays.rays import Rays
+from nerg_mi.registration import get_plugin_class
 from nerg_mi.rendering.bands import render_aovs, require_nerg
 from nerg_mi.rendering.scene import activate_variant, load_scene
 from nerg_mi.transport.field_medium import FieldMedium
@@ -202,7 +203,7 @@ def _add_scene(scene: ExchangeScene, path: Path, options: SceneExportOptions, re
         if sensor.class_name() == "PerspectiveCamera"
     )
     field = nerg.children.get("field")
-    if hasattr(field, "splats"):
+    if isinstance(field, get_plugin_class("splats")):
         scene = replace(scene, splats=field.splats.transform(field.similarity))
     if isinstance(nerg.medium, FieldMedium) and isinstance(nerg.medium.field, RadianceField):
         points, matrix = _surface_points(nerg.medium.field, "field", options), nerg.medium.to_world.matrix

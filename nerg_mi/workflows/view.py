@@ -18,7 +18,7 @@ from nerg_mi.maths.geometry import Similarity
 from nerg_mi.rays.dataset import is_dataset, load_rays
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.bands import is_nerg
-from nerg_mi.rendering.nested_scene import find_field_file, replace_gaze
+from nerg_mi.rendering.nested_scene import GAZE_PROPERTY, find_field_file, replace_gaze
 from nerg_mi.rendering.scene import load_scene
 
 from .base import SILENT, Reporter, select_backend
@@ -97,7 +97,7 @@ def make_viewer_scene(
     gaze = [path for path, kind in kinds.items() if kind == "gaze"]
     if len(scenes) == 1 and set(kinds.values()) <= {"scene", "rays", "gaze"} and _is_nerg(scenes[0]):
         align = _explicit_align(options, reporter) or Similarity(np.eye(4))
-        own_gaze = find_field_file(scenes[0]) if gaze else None
+        own_gaze = find_field_file(scenes[0], GAZE_PROPERTY) if gaze else None
         variants = (
             write_variants(scenes[0], [*([own_gaze] if own_gaze else []), *gaze], folder, reporter) if gaze else {}
         )

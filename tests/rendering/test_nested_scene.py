@@ -8,7 +8,7 @@ import pytest
 import nerg_mi as nerg
 from nerg_mi.errors import NergError
 from nerg_mi.rendering.bands import render_channels
-from nerg_mi.rendering.nested_scene import find_field_file, nest_scene, replace_gaze
+from nerg_mi.rendering.nested_scene import GAZE_PROPERTY, find_field_file, nest_scene, replace_gaze
 from nerg_mi.rendering.scene import load_scene
 from nerg_mi.rendering.scene_writer import GazeFiles, LookAt, SceneText
 from nerg_mi.workflows import demo
@@ -101,11 +101,11 @@ NERG = """<integrator type="nerg"><volume name="gaze" type="gazefield"><string n
 def test01_find_field_file(tmp_path):
     path = tmp_path / "a.xml"
     path.write_text(PLAIN.format(NERG))
-    assert find_field_file(path) == tmp_path / "a.bin"
+    assert find_field_file(path, GAZE_PROPERTY) == tmp_path / "a.bin"
     path.write_text(PLAIN.format('<integrator type="nerg"/>'))
-    assert find_field_file(path) is None
+    assert find_field_file(path, GAZE_PROPERTY) is None
     store = demo.find_store_scene()
-    assert find_field_file(store) == store.parent.resolve() / "shoppers.safetensors"
+    assert find_field_file(store, GAZE_PROPERTY) == store.parent.resolve() / "shoppers.safetensors"
 
 
 @pytest.mark.parametrize("count", [0, 2])
@@ -123,7 +123,7 @@ def test03_replaced_gaze_renders_the_same(rgb, tmp_path):
     other = tmp_path / "other.safetensors"
     other.write_bytes((store.parent / "shoppers.safetensors").read_bytes())
     (tmp_path / "copy.xml").write_text(replace_gaze(store, other))
-    assert find_field_file(tmp_path / "copy.xml") == other.resolve()
+    assert find_field_file(tmp_path / "copy.xml", GAZE_PROPERTY) == other.resolve()
     at, ahead = [(4.4, 2.8, 1.6)] * 16, np.random.default_rng(1).normal(size=(16, 3))
     ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
     image = [nerg.trace(nerg.Scene.load(path), at, ahead, ["gaze", "depth"]) for path in (store, tmp_path / "copy.xml")]

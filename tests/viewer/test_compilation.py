@@ -68,6 +68,9 @@ def test_other_files_are_not_replaced(rgb, tmp_path):
     beside.write_bytes(field.read_bytes())
     assert find_compiled_file(field, tmp_path / "temporary") == tmp_path / "temporary" / beside.name
     assert not is_current(beside, field)
+    beside.write_bytes(b"damaged")
+    assert find_compiled_file(field, tmp_path / "temporary") == tmp_path / "temporary" / beside.name
+    assert not is_current(beside, field)
 
 
 def test_a_failure_is_reported_and_a_stop_is_silent(rgb, tmp_path):

@@ -23,7 +23,7 @@ from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.bands import render_channels
 from nerg_mi.rendering.files import read_frames
-from nerg_mi.rendering.nested_scene import find_field_file
+from nerg_mi.rendering.nested_scene import GAZE_PROPERTY, find_field_file
 from nerg_mi.rendering.scene import load_scene
 from nerg_mi.workflows import demo, scene
 from nerg_mi.workflows.geometry import make_geometry
@@ -477,7 +477,7 @@ def test06_several_gaze_fields_are_variants(rgb, tmp_path):
     place = make_viewer_scene([store, run], tmp_path, reporter=recorder)
     assert list(place.variants) == ["shoppers", "a", "b"] and place.scene == place.variants["shoppers"]
     assert (
-        find_field_file(place.variants["b"]) == (run / "b.safetensors").resolve()
+        find_field_file(place.variants["b"], GAZE_PROPERTY) == (run / "b.safetensors").resolve()
         and place.made
         and not recorder.warnings
     )
