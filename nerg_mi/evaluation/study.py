@@ -18,6 +18,7 @@ from nerg_mi.transport import observer
 from nerg_mi.transport.depth import DEPTHS
 from nerg_mi.transport.field_medium import make_color_shader
 from nerg_mi.transport.geometry import SceneGeometry
+from nerg_mi.transport.march_primal import SEPARATE_COLOR_CUTOFF
 from nerg_mi.transport.observer import visibility
 from nerg_mi.transport.quadrature import RULES
 
@@ -233,12 +234,13 @@ class StudyRow:
     params: Mapping = field(default_factory=dict)  # Parameters of the integrator that override the scene's
     spp: int = 1  # Samples per pixel
     resolution: int = 0  # Resolution of the density as a grid; 0: the density of the scene
+    voxels: int = 0  # Resolution of the voxels to which the field is compiled; 0: the field itself
     paper: tuple[int, float] | None = None  # (steps, γ) of the march of the paper; None: the march of this package
     is_first_frame: bool = False  # Whether caches are cleared before each frame
 
     def make_integrator(self, subject, **extra_params):
         """Make the integrator of this row; ``extra_params`` are further parameters, such as AOVs that count."""
-        integrator = subject.make_integrator({**self.params, **extra_params}, self.resolution)
+        integrator = subject.make_integrator({**self.params, **extra_params}, self.resolution, self.voxels)
         return (
             integrator
             if self.paper is None
@@ -284,6 +286,7 @@ def list_rows(subject, quick: bool = False) -> list[StudyRow]:
             rows.append(StudyRow(f"depth {k}, {n} steps", "depth", {"depth": k, **steps(n)}))
     rows.append(StudyRow("unrefined", "refined", {"refined": False}))
     rows.append(StudyRow("jitter", "jitter", {"jitter": True}))
+    rows += _compiled_rows(thin_out(subject.voxel_resolutions))
     rows += _observer_rows(subject, quick) + _reduced_rows(subject) + _sample_rows(quick)
     if subject.can_resample:
         for r in RESOLUTIONS[:1] if quick else RESOLUTIONS:
@@ -309,6 +312,17 @@ def _splat_rows(some) -> list[StudyRow]:
     rows += [StudyRow(f"depth {d.name}", "depth", {"depth": d.name}) for d in DEPTHS if d.surface_kind == d.name]
     loose = [(2.0, 1e-2), (2.5, 1e-2), (2.5, 1e-3)]
     return rows + [StudyRow(f"extent {e:g}, stop {s:g}", "together", {"extent": e, "stop": s}) for e, s in some(loose)]
+
+
+def _compiled_rows(resolutions) -> list[StudyRow]:
+    """List the rows of a compiled field, with its own default of the colour's cutoff and with lower ones."""
+    rows = []
+    for n in resolutions:
+        for name, cutoff in (("", SEPARATE_COLOR_CUTOFF), (", color_cutoff 0.01", 0.01)):
+            rows.append(StudyRow(f"voxels {n}{name}", "compiled", {"color_cutoff": cutoff}, voxels=n))
+        params = {"color_cutoff": SEPARATE_COLOR_CUTOFF, "visibility": "map"}
+        rows.append(StudyRow(f"voxels {n}, visibility map", "compiled", params, voxels=n))
+    return rows
 
 
 def _visibility_rows(quick: bool) -> list[StudyRow]:
@@ -384,7 +398,7 @@ COLUMNS = (
     *ERROR_NAMES,
     *"""
         peak_mb pareto reference quadrature step steps coarse dt_gamma stop extent color_cutoff refined
-        depth visibility map_height integral_tolerance jitter radiance aovs spp resolution precision
+        depth visibility map_height integral_tolerance jitter radiance aovs spp resolution voxels voxels_mb precision
     """.split(),
 )
 MARCH_PARAMETERS = ("quadrature", "step", "coarse", "dt_gamma", "stop", "color_cutoff", "refined", "depth", "jitter")
@@ -414,7 +428,7 @@ def measure_rows(
     for row in rows:
         on_step(row.name)
         integrator = row.make_integrator(subject)
-        values = _collect_parameters(subject, row, subject.make_integrator(row.params, row.resolution))
+        values = _collect_parameters(subject, row, subject.make_integrator(row.params, row.resolution, row.voxels))
         table.append(
             values
             | _measure_quality(subject, row, integrator, values, exact, pixels, pixel_spp)
@@ -448,7 +462,9 @@ def _collect_parameters(subject, row: StudyRow, integrator) -> dict:
         "aovs": ",".join(integrator.aovs),
         "spp": row.spp,
         "resolution": row.resolution or "",
+        "voxels": row.voxels or "",
         "precision": describe_precision(),
+        **({"voxels_mb": subject.compile_field(row.voxels)[1] / 1e6} if row.voxels else {}),
     }
 
 

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError
+from nerg_mi.fields.compilation import attach_voxels, bound_voxel_bytes, compile_density
+from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.files.safe_read import resolve_path
 from nerg_mi.rendering.bands import is_nerg
 from nerg_mi.rendering.scene import load_scene
@@ -76,6 +78,8 @@ def read_splat_extent(integrator) -> float | None:
 KINDS = ("auto", "analytic", "file")
 AOVS = "depth,opacity,visibility,gaze"
 FALLOFF = 0.1
+VOXEL_RESOLUTIONS = (256, 512, 1024)
+_MAX_VOXEL_BYTES = 2 << 30
 REFERENCE_REFINEMENT = 32  # Steps of the reference of a scene file are this many times shorter
 # The reference uses no acceleration or early termination.
 _REFERENCE_PARAMS = {"coarse": 1.0, "dt_gamma": 0.0, "jitter": False, "color_cutoff": 0.0, "stop": 1e-9} | {
@@ -171,6 +175,8 @@ class StudySubject:
     """Whether the medium is Gaussian splats, which are intersected individually."""
     can_resample = False
     """Whether the density is available as a grid of other resolutions."""
+    voxel_resolutions: tuple[int, ...] = ()
+    """Resolutions to which the field can be compiled."""
 
     def _set_up(self, scene, sensor, base: dict) -> None:
         self.scene, self.sensor, self.base_params = scene, sensor, base
@@ -184,15 +190,20 @@ class StudySubject:
             self.tolerance = RELATIVE_TOLERANCE * self.extent
         self.base_params = {**base, "tolerance": self.tolerance}
 
-    def make_integrator(self, params: Mapping = {}, resolution: int = 0):
+    def make_integrator(self, params: Mapping = {}, resolution: int = 0, voxels: int = 0):
         """Make a ``nerg`` integrator with ``params`` overriding the scene's; ``resolution`` selects the density as a
-        grid.
+        grid, ``voxels`` the field compiled to this resolution (one of `voxel_resolutions`).
         """
         import mitsuba as mi
 
         if resolution:
             raise NergError(f'"{self.name}" is not an analytic scene; only these support a grid resolution')
-        return mi.load_dict({"type": "nerg", **apply_splat_extent({**self.base_params, **params})})
+        compiled = {"field": self.compile_field(voxels)[0]} if voxels else {}
+        return mi.load_dict({"type": "nerg", **apply_splat_extent({**self.base_params, **params, **compiled})})
+
+    def compile_field(self, resolution: int) -> tuple[Any, int]:
+        """Return the volume of the field compiled to ``resolution``, and the size of its voxels in bytes."""
+        raise NergError(f'"{self.name}" has no radiance field that can be compiled')
 
     def aov_names(self) -> str:
         return AOVS if self.has_gaze else AOVS.replace(",gaze", "")
@@ -274,9 +285,11 @@ class AnalyticSubject(StudySubject):
         base = {**self._volumes, "observer": observer, "falloff": FALLOFF, "aovs": AOVS}
         self._set_up(mi.load_dict({"type": "scene", "sensor": sensor}), sensor, base)
 
-    def make_integrator(self, params: Mapping = {}, resolution: int = 0):
+    def make_integrator(self, params: Mapping = {}, resolution: int = 0, voxels: int = 0):
         import mitsuba as mi
 
+        if voxels:
+            self.compile_field(voxels)
         grid = {"density": make_volumes(self.analytic, resolution)["density"]} if resolution else {}
         return mi.load_dict({"type": "nerg", **self.base_params, **grid, **params})
 
@@ -324,8 +337,26 @@ class FileSubject(StudySubject):
         self.has_gaze, medium = "gaze" in children, integrator.medium
         self.is_normalized = self.has_gaze and integrator.gaze.field.config.normalized
         self.has_splats = medium is not None and medium.hits is not None
+        self._compiled: dict[int, tuple[Any, int]] = {}
+        self._field: Any = getattr(children.get("field"), "field", None)
+        if isinstance(self._field, RadianceField) and self._field.voxels is None:
+            fits = lambda resolution: bound_voxel_bytes(self._field, resolution) <= _MAX_VOXEL_BYTES
+            self.voxel_resolutions = tuple(filter(fits, VOXEL_RESOLUTIONS))
         self._set_up(scene, sensor, {**children, **read_parameters(integrator), "aovs": self.aov_names()})
         self.resize(width, height)
+
+    def compile_field(self, resolution: int) -> tuple[Any, int]:
+        import mitsuba as mi
+
+        if resolution not in self.voxel_resolutions:
+            return super().compile_field(resolution)
+        if resolution not in self._compiled:
+            voxels = compile_density(self._field, resolution)
+            volume = self.base_params["field"]
+            to_world = mi.ScalarTransform4f(volume.medium().to_world.matrix)
+            compiled = type(volume).from_network(attach_voxels(self._field, voxels), to_world)
+            self._compiled[resolution] = compiled, voxels.size
+        return self._compiled[resolution]
 
     def observer_position(self) -> np.ndarray:
         """Return the position (3,) of the observer."""

@@ -271,7 +271,7 @@ KLD_EPS = 1e-6  # Relative to the mean; bounds the penalty of zero gaze where th
 
 ERROR_NAMES = tuple(
     """
-    color_rmse color_psnr opacity_mae depth_mae depth_p99 visibility_mae visibility_wrong gaze_mae gaze_kld
+    color_rmse color_psnr opacity_mae depth_mae depth_median depth_p99 visibility_mae visibility_wrong gaze_mae gaze_kld
     surface_mae surface_p99
     """.split()
 )
@@ -295,11 +295,11 @@ def compute_errors(
     -------
     dict
         ``color_rmse``: linear radiance, over pixels and channels; ``color_psnr``: -20 log10 of it in dB; ``depth_mae``,
-        ``depth_p99``: mean and 99th percentile of |depth - truth| in scene units, over rays of opacity >=
-        `MIN_DEPTH_OPACITY`, where misses count with depth 0; ``visibility_mae``, ``gaze_mae`` (1/sr): over pixels that
-        truly show a surface; ``gaze_kld``: nats, of both pictures as densities over those pixels. With ``exact``:
-        ``surface_mae``, ``surface_p99``: |depth - exact| over exact hits; ``visibility_wrong``: fraction of these
-        pixels with the wrong binary visibility (threshold 1/2).
+        ``depth_median``, ``depth_p99``: mean, median and 99th percentile of |depth - truth| in scene units, over rays
+        of opacity >= `MIN_DEPTH_OPACITY`, where misses count with depth 0; ``visibility_mae``, ``gaze_mae`` (1/sr):
+        over pixels that truly show a surface; ``gaze_kld``: nats, of both pictures as densities over those pixels.
+        With ``exact``: ``surface_mae``, ``surface_p99``: |depth - exact| over exact hits; ``visibility_wrong``:
+        fraction of these pixels with the wrong binary visibility (threshold 1/2).
     """
     out = {}
     if "color" in channels and np.any(channels["color"]):
@@ -310,7 +310,8 @@ def compute_errors(
     traced = truth.opacity >= MIN_DEPTH_OPACITY
     if "depth" in channels and traced.any():
         off = np.abs(channels["depth"] - truth.depth)[traced]
-        out["depth_mae"], out["depth_p99"] = float(off.mean()), float(np.percentile(off, 99))
+        out["depth_mae"] = float(off.mean())
+        out["depth_median"], out["depth_p99"] = np.percentile(off, [50, 99]).tolist()
     surface = truth.opacity >= MIN_SURFACE_OPACITY
     if "visibility" in channels and surface.any():
         out["visibility_mae"] = float(np.mean(np.abs(channels["visibility"] - truth.visibility)[surface]))

@@ -85,6 +85,30 @@ def _describe_excess(resolution: int, size: float, limit: float) -> str:
     )
 
 
+def bound_voxel_bytes(field: RadianceField, resolution: int) -> int:
+    """Upper bound of the size of `compile_density`'s result in bytes, from the field's occupancy alone."""
+    with dr.suspend_grad():
+        return _BYTES_PER_BLOCK * len(_candidate_blocks(field, resolution, None))
+
+
+def attach_voxels(field: RadianceField, voxels: VoxelGrid) -> RadianceField:
+    """A compiled field with the networks of ``field``, and ``voxels``, which `compile_density` made of it."""
+    compiled = RadianceField(
+        field.config,
+        field.box,
+        field.grid,
+        field.density_net,
+        field.color_net,
+        occupancy_of_voxels(field, voxels) or field.occupancy,
+        field.color_space,
+        field.march_step,
+        field.background,
+        field.march_growth,
+    )
+    compiled.voxels = voxels
+    return compiled
+
+
 def occupancy_of_voxels(field: RadianceField, voxels: VoxelGrid) -> CascadeGrid | None:
     """Occupancy of a contracted ``field`` for its ``voxels``, whose own cells are not equal along rays; None for a box,
     in which the voxels are the occupancy."""

@@ -11,7 +11,7 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.fields.compilation import compile_density, occupancy_of_voxels
+from nerg_mi.fields.compilation import attach_voxels, compile_density
 from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.fields.voxels import BLOCK_EDGE, MAX_RESOLUTION, VoxelGrid
 from nerg_mi.files.atomic import check_writable, file_sha256
@@ -86,7 +86,7 @@ def compile_field(
                 raise
             reporter.warn(f"{error}; the field is compiled at {tried[-1].resolution}, which does not reach the aims")
             break
-        result = _with_voxels(field, voxels)
+        result = attach_voxels(field, voxels)
         compiled, compiled_seconds = _render(result, rays)
         tried.append(_compare(reference, compiled, voxels, seconds / compiled_seconds))
         reporter.message(_describe(tried[-1]))
@@ -107,24 +107,6 @@ def _list_resolutions() -> list[int]:
     while 2 * resolutions[-1] <= MAX_RESOLUTION:
         resolutions.append(2 * resolutions[-1])
     return resolutions
-
-
-def _with_voxels(field: RadianceField, voxels: VoxelGrid) -> RadianceField:
-    """A field with the networks of ``field``, and ``voxels``."""
-    out = RadianceField(
-        field.config,
-        field.box,
-        field.grid,
-        field.density_net,
-        field.color_net,
-        occupancy_of_voxels(field, voxels) or field.occupancy,
-        field.color_space,
-        field.march_step,
-        field.background,
-        field.march_growth,
-    )
-    out.voxels = voxels
-    return out
 
 
 def _make_rays(field: RadianceField) -> tuple[Any, Any]:

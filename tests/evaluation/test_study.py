@@ -187,7 +187,13 @@ def test_the_papers_depth_is_unnormalised_and_at_the_steps_end():
 def rows():
     return list_rows(
         SimpleNamespace(
-            is_marched=True, has_splats=False, extent=2.0, has_gaze=True, is_normalized=True, can_resample=True
+            is_marched=True,
+            has_splats=False,
+            extent=2.0,
+            has_gaze=True,
+            is_normalized=True,
+            can_resample=True,
+            voxel_resolutions=(256, 512),
         )
     )
 

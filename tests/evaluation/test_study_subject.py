@@ -7,15 +7,18 @@ import re
 import numpy as np
 import pytest
 
-from nerg_mi.evaluation import study_scenes
+from nerg_mi.errors import NergError
+from nerg_mi.evaluation import study, study_scenes, study_subject
 from nerg_mi.evaluation import study_truth as study_shapes
 from nerg_mi.evaluation.study_subject import open_subject, read_parameters
+from nerg_mi.fields.compilation import bound_voxel_bytes
 from nerg_mi.maths.geometry import Box
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.train.gaze_data import compute_box_exit
 from nerg_mi.workflows.scene_commands import StudyOptions
 from nerg_mi.workflows.study import find_reference_scene, run_study
 from tests.evaluation.gaze_fields import KINDS, saved
+from tests.plugins import fields
 from tests.reference import march_numpy
 
 # ---- The settings of an integrator as they are read back ----
@@ -139,6 +142,36 @@ def test_a_scene_file_is_compared_with_its_limit(rgb, tmp_path):
     )
     with pytest.raises(ValueError, match='has a "ceiling"'):
         open_subject(str(path), "file", 12, 8)
+
+
+PLACED_FIELD = """<scene version="3.0.0">
+  <integrator type="nerg"><volume name="field" type="nerf"><string name="filename" value="field.safetensors"/>
+    <transform name="to_world"><rotate z="1" angle="30"/><scale value="1.5"/></transform></volume></integrator>
+  <sensor type="perspective"><float name="fov" value="50"/>
+    <transform name="to_world"><lookat origin="1, -5, 2" target="0, 0, 0" up="0, 0, 1"/></transform>
+    <film type="hdrfilm"><rfilter type="box"/><string name="component_format" value="float32"/></film></sensor>
+</scene>"""
+
+
+def test_a_compiled_field_is_a_row_in_the_place_of_its_field(rgb, tmp_path, monkeypatch):
+    monkeypatch.setattr(study_subject, "VOXEL_RESOLUTIONS", (16, 32))
+    fields.radiance(tmp_path / "field.safetensors", density_scale=20.0)
+    (tmp_path / "scene.xml").write_text(PLACED_FIELD)
+    subject = open_subject(str(tmp_path / "scene.xml"), "auto", 24, 16)
+    compiled = [row for row in study.list_rows(subject) if row.voxels]
+    assert {row.voxels for row in compiled} == {16, 32} == set(subject.voxel_resolutions)
+    rows = [study.StudyRow("default", "default"), *(row for row in compiled if "," not in row.name)]
+    default, coarse, fine = study.measure_rows(subject, rows, 1)
+    assert default["depth_mae"] < fine["depth_mae"] < coarse["depth_mae"] < 0.2
+    assert fine["depth_median"] < fine["depth_p99"] and fine["color_rmse"] < 0.05
+    assert 0 < coarse["voxels_mb"] < fine["voxels_mb"] and "voxels_mb" not in default
+    for row in (coarse, fine):
+        assert 1e6 * row["voxels_mb"] <= bound_voxel_bytes(subject.base_params["field"].field, row["voxels"])
+    # Voxels that would not fit into the memory are no rows.
+    monkeypatch.setattr(study_subject, "_MAX_VOXEL_BYTES", 1e6 * coarse["voxels_mb"])
+    assert open_subject(str(tmp_path / "scene.xml"), "auto", 24, 16).voxel_resolutions in ((), (16,))
+    with pytest.raises(NergError, match="can be compiled"):
+        open_subject("sphere", "auto", 12, 8).make_integrator(voxels=16)
 
 
 # ---- Scenes with gaze fields of every kind ----

@@ -22,9 +22,15 @@ def drawn(monkeypatch):
 
 
 def row(group, seconds, error, pareto=""):
-    return {"group": group, "seconds": seconds, "pareto": pareto, "spp": 1, "resolution": "", "visibility": "depth"} | {
-        name: error for name, _ in study_plots.PANELS
-    }
+    return {
+        "group": group,
+        "seconds": seconds,
+        "pareto": pareto,
+        "spp": 1,
+        "resolution": "",
+        "voxels": "",
+        "visibility": "depth",
+    } | {name: error for name, _ in study_plots.PANELS}
 
 
 ALL = "color depth visibility gaze"
@@ -93,7 +99,7 @@ def test_units_of_the_report():
     units = {"seconds": 1e3, "cpu_seconds": 1e3, "visibility_wrong": 100}
     names = [*units, "density_evals", "color_evals", "peak_mb", "color_rmse", "depth_mae", "depth_p99", "surface_mae"]
     names += ["visibility_mae", "gaze_mae", "gaze_kld"]
-    row = {"setting": "a", "group": "leave out", "spp": 1, "resolution": "", "visibility": "depth"}
+    row = {"setting": "a", "group": "leave out", "spp": 1, "resolution": "", "voxels": "", "visibility": "depth"}
     row |= {name: (k + 1) / 128 for k, name in enumerate(names)}
     provenance = {
         "scene": "s",
@@ -119,6 +125,7 @@ def test_comparison_with_the_paper_selects_the_best_rows():
             "density_evals": 1.0,
             "spp": 1,
             "resolution": "",
+            "voxels": "",
             "visibility": "depth",
         }
 
