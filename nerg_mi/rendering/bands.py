@@ -706,24 +706,51 @@ def render_aovs(
 
 # ---- Long renderings ----
 #
-# Kernels with constant network weights are faster but take seconds to compile.
+# Kernels with constant network weights take seconds to compile. Whether they are faster then depends on the processor.
 
 LONG_RENDER_SAMPLES = 1 << 27
-"""Number of samples from which constant weights pay off: 146 images of 1280 x 720."""
+"""Number of samples from which the compilation of constant weights pays off: 146 images of 1280 x 720."""
+
+_TRIAL_IMAGES = 3  # Images of each kind, of which the first one compiles and is not timed
 
 
-def prepare_long_render(samples: int, scene: Any) -> bool:
-    """Prepare ``scene`` for a rendering of ``samples`` samples, which does not change the result.
+class ConstantWeightsTrial:
+    """Decides in a long sequence of images whether constant network weights are faster on this machine.
 
-    Returns whether the rendering is long and the scene has trained fields.
+    The first images are rendered with variable weights, the next ones with constant weights, and all others with what
+    was faster. Images are equal in both cases.
+
+    Parameters
+    ----------
+    images : int
+        Number of images of the sequence. Short sequences have variable weights only.
     """
-    integrator = scene.integrator()
-    if samples < LONG_RENDER_SAMPLES or not is_nerg(integrator):
-        return False
-    trained = get_trained_fields(integrator)
-    for field in trained:
-        set_constant_weights(field)
-    return bool(trained)
+
+    def __init__(self, images: int):
+        self._images = images
+        self._seconds: dict[bool, list[float]] = {False: [], True: []}  # Per sample, of each image
+
+    def prepare(self, samples: int, scene: Any) -> bool:
+        """Set the weights of ``scene`` for the next image, of ``samples`` samples; return whether they are constant."""
+        integrator = scene.integrator()
+        trained = get_trained_fields(integrator) if is_nerg(integrator) else []
+        constant = bool(trained) and self._choose(samples)
+        for field in trained:
+            if constant:
+                set_constant_weights(field)
+        return constant
+
+    def record(self, constant: bool, samples: int, seconds: float) -> None:
+        """Record the time of an image."""
+        self._seconds[constant].append(seconds / samples)
+
+    def _choose(self, samples: int) -> bool:
+        variable, constant = self._seconds[False], self._seconds[True]
+        if self._images < 4 * _TRIAL_IMAGES or self._images * samples < LONG_RENDER_SAMPLES:
+            return False
+        if len(variable) < _TRIAL_IMAGES or len(constant) < _TRIAL_IMAGES:
+            return len(variable) >= _TRIAL_IMAGES
+        return min(constant[1:]) < min(variable[1:])
 
 
 def get_trained_fields(integrator: Any) -> list[RadianceField | AnyGazeField]:

@@ -25,7 +25,7 @@ from nerg_mi.files.safe_read import read_npy
 from nerg_mi.files.video import check_video_output, open_video_writer
 from nerg_mi.interruption import Interruption
 from nerg_mi.rendering import bands
-from nerg_mi.rendering.bands import Channels, SamplePace, is_nerg, prepare_long_render, render_aovs
+from nerg_mi.rendering.bands import Channels, ConstantWeightsTrial, SamplePace, is_nerg, render_aovs
 from nerg_mi.rendering.files import IMAGE_FORMATS, DisplayRows, frame_path, open_image_rows, read_frames
 from nerg_mi.rendering.scene import activate_variant, list_scene_files, load_scene
 from nerg_mi.rendering.scene_writer import project_to_pixel
@@ -457,6 +457,7 @@ def render_file(
         set_thread_count(options.threads)
     start, pace = time.perf_counter(), SamplePace()
     done, top, picture = 0, None, RenderedPicture((0, 0), 0)
+    trial = ConstantWeightsTrial(len(frames))
     with Interruption() as stop:
 
         def on_strip(part: int, total: int) -> None:
@@ -476,8 +477,10 @@ def render_file(
             loaded = load_scene(scene, {**(options.defaults or {}), **frame})
             stop.check()
             camera = find_sensor(scene, loaded, options.sensor)
-            prepare_long_render(len(frames) * sample_count(camera, options.spp), loaded)
+            samples = sample_count(camera, options.spp)
+            constant, begin = trial.prepare(samples, loaded), time.perf_counter()
             made = make(loaded, camera, on_strip)
+            trial.record(constant, samples, time.perf_counter() - begin)
             done += 1
             return made
 

@@ -12,10 +12,10 @@ from nerg_mi.rendering.bands import (
     MIN_STRIP_SAMPLES,
     PACKET_SIZE,
     Channels,
+    ConstantWeightsTrial,
     IntegratorLayer,
     SamplePace,
     get_trained_fields,
-    prepare_long_render,
     render_aovs,
     render_bands,
     render_channels,
@@ -463,17 +463,37 @@ def list_networks(scene):
     return [net for field in get_trained_fields(scene.integrator()) for net in field.mlps]
 
 
+def run_trial(scene, images, samples, seconds):
+    """Return whether the weights of each of ``images`` images were constant, if those with constant weights take
+    ``seconds`` and the others 1 s."""
+    trial, chosen = ConstantWeightsTrial(images), []
+    for _ in range(images):
+        chosen.append(trial.prepare(samples, scene))
+        # The first image of each kind compiles.
+        compiles = chosen.count(chosen[-1]) == 1
+        trial.record(chosen[-1], samples, 100 if compiles else seconds if chosen[-1] else 1.0)
+    return chosen
+
+
 @pytest.mark.nightly
-@pytest.mark.parametrize(("samples", "prepared"), [(LONG_RENDER_SAMPLES - 1, False), (LONG_RENDER_SAMPLES, True)])
-def test07_long_rendering_is_prepared_and_equal(rgb, samples, prepared):
+def test07_constant_weights_are_used_where_they_are_faster_and_equal(rgb):
     plain, scene = load_scene(find_store_scene(), SMALL), load_scene(find_store_scene(), SMALL)
-    assert prepare_long_render(samples, scene) is prepared
-    assert [net.has_constant_weights for net in list_networks(scene)] == [prepared] * 5
+    long = LONG_RENDER_SAMPLES // 20
+    # Short sequences, by their samples and by their images
+    assert not any(run_trial(plain, 20, long - 1, 0.5) + run_trial(plain, 5, 4 * long, 0.5))
+    assert not any(net.has_constant_weights for net in list_networks(plain))
+    slower, faster = (run_trial(load_scene(find_store_scene(), SMALL), 21, long, s) for s in (1.5, 0.5))
+    assert slower == [False] * 3 + [True] * 3 + [False] * 15 and faster == [False] * 3 + [True] * 18
+    trial = ConstantWeightsTrial(21)
+    for _ in range(3):
+        trial.record(trial.prepare(long, plain), long, 1.0)
+    assert trial.prepare(long, scene) and [net.has_constant_weights for net in list_networks(scene)] == [True] * 5
     before, expected = (np.array(rgb.render(s, sensor=0, spp=1)) for s in (scene, plain))
     assert expected[..., :3].max() > 0.1 and np.array_equal(before, expected)
 
 
-def test08_scene_without_fields_is_not_prepared(rgb):
+def test08_scene_without_fields_has_no_trial(rgb):
     shapes = rgb.load_dict({"type": "scene", "integrator": {"type": "nerg"}, "ball": {"type": "sphere"}})
     scenes = rgb.load_dict({"type": "scene", "integrator": {"type": "path"}, "ball": {"type": "sphere"}})
-    assert not prepare_long_render(LONG_RENDER_SAMPLES, shapes) and not prepare_long_render(LONG_RENDER_SAMPLES, scenes)
+    for scene in (shapes, scenes):
+        assert not any(run_trial(scene, 20, LONG_RENDER_SAMPLES, 0.5))

@@ -17,7 +17,7 @@ from nerg_mi.figures.overlay import robust_max
 from nerg_mi.files.atomic import write_bytes
 from nerg_mi.files.images import read_exr_attributes
 from nerg_mi.rendering import bands
-from nerg_mi.rendering.bands import prepare_long_render, render_aovs
+from nerg_mi.rendering.bands import render_aovs
 from nerg_mi.rendering.scene import load_scene
 from nerg_mi.tasks.engines import LocalEngine, ProcessEngine, run_plan
 from nerg_mi.tasks.store import Store
@@ -286,19 +286,18 @@ def test_the_header_records_the_basis_of_the_gaze(tmp_path):
 
 @pytest.mark.nightly
 @pytest.mark.slow
-def test_prepared_renderings_are_byte_identical(tmp_path, monkeypatch):
-    options = PicturesPictureOptions(defaults={"width": "24", "height": "16"}, spp=2, mode="llvm_ad_rgb")
-    render_file(find_store_scene(), tmp_path / "a.png", options)
-    prepared = []
-    monkeypatch.setattr(bands, "LONG_RENDER_SAMPLES", 24 * 16 * 2)
-    monkeypatch.setattr(
-        render,
-        "prepare_long_render",
-        lambda samples, scene: prepared.append(prepare_long_render(samples, scene)) or prepared[-1],
+def test_images_with_constant_weights_are_byte_identical(tmp_path, monkeypatch):
+    (tmp_path / "frames.csv").write_text("width\n" + "24\n" * 13)
+    options = PicturesPictureOptions(
+        frames=tmp_path / "frames.csv", defaults={"height": "16"}, spp=1, mode="llvm_ad_rgb"
     )
-    render_file(find_store_scene(), tmp_path / "b.png", options)
-    assert prepared == [True]
-    assert mitsuba_bitmap(tmp_path / "a.png") == mitsuba_bitmap(tmp_path / "b.png")
+    monkeypatch.setattr(bands, "LONG_RENDER_SAMPLES", 24 * 16)
+    prepared, prepare = [], bands.ConstantWeightsTrial.prepare
+    record = lambda trial, *args: prepared.append(prepare(trial, *args)) or prepared[-1]
+    monkeypatch.setattr(bands.ConstantWeightsTrial, "prepare", record)
+    files = render_file(find_store_scene(), tmp_path / "a.png", options).files
+    assert prepared[:6] == [False] * 3 + [True] * 3 and len(files) == len(prepared) == 13
+    assert len({np.array(mitsuba_bitmap(path)).tobytes() for path in files}) == 1
 
 
 # ---- Films in parts: equal bytes for any worker, without repeated work ----
