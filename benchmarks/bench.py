@@ -7,6 +7,7 @@ The parts are:
 
 - ``frames``: a frame of the demo store, compared with a renderer in PyTorch;
 - ``stages``: the stages of that frame;
+- ``threads``: that frame on 1, 2, 4, ... threads;
 - ``kde``: kernel densities on the sphere, compared with SciPy;
 - ``volume``: the transmittance of a volume, compared with Mitsuba's `volpath`;
 - ``growth``: the growth of each cost with its size;
@@ -288,6 +289,33 @@ def stages(run: Run) -> None:
     run.table("Stages", head, rows, "stages")
 
 
+def threads(run: Run) -> None:
+    """Frames on fewer threads than the others, and the speed-up."""
+    from nerg_mi.threads import set_thread_count
+
+    if run.cuda:
+        print("the number of threads matters on processors only\n")
+        return
+    counts = [n for n in (2**k for k in range(10)) if n < run.threads] + [run.threads]
+    works = {}
+    for size in ((320, 180), (1280, 720)):
+        values = dict(zip(("width", "height"), size)) | {"spp": 1, "aovs": "depth,gaze"}
+        for field, changed in (("field", {}), ("compiled field", {"field": str(run.compiled)})):
+            for name, visibility in (("", "depth"), (", same observer again", "map")):
+                works[f"{size[0]} x {size[1]}", field + name] = torch_frames.Ours({**values, **changed}, visibility)
+    seconds: dict = {}
+    for count in counts:
+        set_thread_count(count)
+        taken = in_turns({str(name): work for name, work in works.items()}, run.runs)
+        seconds[count] = {name: median(wall for wall, _ in taken[str(name)]) for name in works}
+    rows = [
+        [*name, *(f"{seconds[n][name]:.3g}" for n in counts), f"{seconds[1][name] / seconds[counts[-1]][name]:.2f}"]
+        for name in works
+    ]
+    head = {"frame": "image size", "renderer": "renderer"} | {f"s, {n}": f"time, {n} threads, s" for n in counts}
+    run.table("Threads", head | {"speed-up": f"speed-up of {counts[-1]} over 1"}, rows, "threads")
+
+
 def peer_stages(run: Run, width: int, height: int) -> dict[str, float]:
     """Microseconds per pixel of the eager renderer, by the names of `STAGES`: wall-clock, since its threads spin while
     they wait."""
@@ -413,7 +441,7 @@ def start(run: Run) -> None:
     run.table("Start", processes.HEADS["start"], processes.start(run.runs), "start")
 
 
-PARTS = {part.__name__: part for part in (frames, stages, kde, volume, growth, memory, start)}
+PARTS = {part.__name__: part for part in (frames, stages, threads, kde, volume, growth, memory, start)}
 
 
 def main(argv=None) -> None:

@@ -19,6 +19,7 @@ import nerg_mi as nerg
 import nerg_mi.cli
 from nerg_mi.cli.building import find_commands
 from nerg_mi.evaluation import study as study_settings
+from nerg_mi.evaluation.study_subject import VOXEL_RESOLUTIONS
 from nerg_mi.transport.march_primal import MarchSettings
 from tests.conftest import ROOT
 from tools import command_pages, generated
@@ -130,7 +131,13 @@ def test09_files_that_are_named_exist(page):
 
 def test10_settings_of_the_study_are_the_studys():
     subject = SimpleNamespace(
-        is_marched=True, has_splats=False, extent=1.0, has_gaze=True, is_normalized=True, can_resample=True
+        is_marched=True,
+        has_splats=False,
+        extent=1.0,
+        has_gaze=True,
+        is_normalized=True,
+        can_resample=True,
+        voxel_resolutions=VOXEL_RESOLUTIONS,
     )
     names = {setting.name for setting in study_settings.list_rows(subject)}
     listed = set()
