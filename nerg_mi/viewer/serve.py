@@ -46,7 +46,10 @@ class RunningViewer:
 
 @contextmanager
 def open_viewer(
-    files: Sequence[str | Path], options: ViewOptions | None = None, reporter: Reporter = SILENT
+    files: Sequence[str | Path],
+    options: ViewOptions | None = None,
+    reporter: Reporter = SILENT,
+    is_embeddable: bool = False,
 ) -> Iterator[RunningViewer]:
     """Serve ``files`` as a page for the duration of the block.
 
@@ -59,6 +62,8 @@ def open_viewer(
         the address contains a token.
     reporter : Reporter
         Receives progress and messages.
+    is_embeddable : bool
+        Whether pages of this machine, such as a notebook, may contain the page. Only without a token.
 
     Yields
     ------
@@ -73,7 +78,7 @@ def open_viewer(
     options = options or ViewOptions()
     require_viser()
     token = None if is_loopback(options.host) else make_token()
-    guard = RequestGuard(options.host, token, options.hostnames)
+    guard = RequestGuard(options.host, token, options.hostnames, is_embeddable and token is None)
     with tempfile.TemporaryDirectory() as folder:
         server = start_server(guard, options.port, "nerg view")
         page = Page(server)
@@ -105,6 +110,9 @@ class Viewer:
         URL to open in a browser.
     """
 
+    HEIGHT = 600
+    """Height of the viewer in a notebook in CSS pixels."""
+
     def __init__(self, running: AbstractContextManager[RunningViewer]) -> None:
         self._running = running
         self.address = running.__enter__().address
@@ -127,8 +135,12 @@ class Viewer:
         return f"<Viewer: {'closed' if self._running is None else self.address}>"
 
     def _repr_html_(self) -> str:
-        # Pages of the viewer refuse to be shown within another page.
-        return element("a", f"Viewer at {self.address}", href=self.address, target="_blank", rel="noopener")
+        link = element("a", f"Viewer at {self.address}", href=self.address, target="_blank", rel="noopener")
+        # With a token the browser would not send the cookie from within another page.
+        if self._running is None or "?" in self.address:
+            return link
+        style = f"width: 100%; height: {self.HEIGHT}px; border: 0"
+        return element("div", link, element("iframe", src=self.address, style=style))
 
 
 def view(inputs: object, *, options: ViewOptions | None = None, progress: Progress = None, **overrides: Any) -> Viewer:
@@ -150,7 +162,8 @@ def view(inputs: object, *, options: ViewOptions | None = None, progress: Progre
     Returns
     -------
     Viewer
-        The viewer: its ``address``, which a notebook shows as a link, and its method ``close``.
+        The viewer: its ``address`` and its method ``close``. A notebook of this machine contains its page, and other
+        notebooks a link to it.
 
     Raises
     ------
@@ -168,7 +181,7 @@ def view(inputs: object, *, options: ViewOptions | None = None, progress: Progre
     with report_progress(progress, ViewOptions) as reporter:
         resolved = build_options(ViewOptions, "view", options, overrides)
         paths = [as_file(item, "inputs") for item in list_inputs(inputs)]
-        return Viewer(open_viewer(paths, resolved, reporter))
+        return Viewer(open_viewer(paths, resolved, reporter, is_embeddable=True))
 
 
 def view_files(files: Sequence[str | Path], options: ViewOptions | None = None, reporter: Reporter = SILENT) -> None:

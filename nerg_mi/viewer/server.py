@@ -37,8 +37,9 @@ MAX_CLIENTS = 32
 
 _POLICY = (
     "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; connect-src 'self' data: blob: {sockets}; "
-    "object-src 'none'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    "object-src 'none'; base-uri 'none'; form-action 'none'; frame-ancestors {ancestors}"
 )
+_NO_ANCESTORS, _LOCAL_ANCESTORS = "'none'", "http://localhost:* http://127.0.0.1:*"
 
 
 def is_loopback(host: str) -> bool:
@@ -74,11 +75,14 @@ class RequestGuard:
         Token that requests must contain.
     host_names : tuple of str
         Additional names by which the server is addressed.
+    is_embeddable : bool
+        Whether pages of this machine, such as a notebook, may contain the page.
     """
 
     host: str
     token: str | None = field(default=None, repr=False)
     host_names: tuple[str, ...] = ()
+    is_embeddable: bool = False
 
     def check(self, headers: Mapping[str, str], path: str, port: int, num_clients: int = 0) -> Refusal | None:
         """Check a request.
@@ -117,8 +121,11 @@ class RequestGuard:
         They stop the page from contacting other machines and the browser from caching, and set the token as a cookie if
         the query of ``path`` contains it. ``host_header`` is the Host header of the request.
         """
+        ancestors = _LOCAL_ANCESTORS if self.is_embeddable else _NO_ANCESTORS
         headers = {
-            "Content-Security-Policy": _POLICY.format(sockets=f"ws://{host_header} wss://{host_header}"),
+            "Content-Security-Policy": _POLICY.format(
+                sockets=f"ws://{host_header} wss://{host_header}", ancestors=ancestors
+            ),
             "Referrer-Policy": "no-referrer",
             "X-Content-Type-Options": "nosniff",
             "Cross-Origin-Resource-Policy": "same-origin",

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import threading
 import time
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from types import SimpleNamespace
 from urllib.parse import urlsplit
 
@@ -294,3 +296,42 @@ def test08_no_thread_or_port_is_left(rgb, room):
 
     with socket.socket() as probe:
         assert probe.connect_ex(("127.0.0.1", port)) != 0
+
+
+@contextmanager
+def serve_page(text: str):
+    """Serve one page of this machine, as a notebook does, and yield its address."""
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self):
+            self.send_response(200)
+            self.send_header("Content-Type", "text/html")
+            self.end_headers()
+            self.wfile.write(text.encode())
+
+        def log_message(self, *args):
+            pass
+
+    with HTTPServer(("127.0.0.1", 0), Handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://localhost:{server.server_port}/"
+        server.shutdown()
+
+
+def test_a_notebook_contains_the_viewer_of_python(running):
+    import nerg_mi as nerg
+    from nerg_mi.workflows import demo
+
+    has_canvas = lambda browser: browser.execute_script("return document.querySelectorAll('canvas').length") > 0
+    with nerg.view(demo.find_store_scene(), port=0, width=160, compile=False) as viewer, chromium() as browser:
+        with serve_page(viewer._repr_html_()) as address:
+            browser.get(address)
+            browser.switch_to.frame(browser.find_element("tag name", "iframe"))
+            until(lambda: has_canvas(browser))
+        # The page of the command refuses to be shown within another one.
+        with serve_page(f'<iframe src="{running.address}"></iframe>') as address:
+            browser.get(address)
+            browser.switch_to.frame(browser.find_element("tag name", "iframe"))
+            time.sleep(2)
+            assert not has_canvas(browser)
+    assert "iframe" not in viewer._repr_html_()

@@ -111,6 +111,14 @@ def test07_response_sets_cookie_and_policy():
     assert headers["Referrer-Policy"] == "no-referrer"
 
 
+def test_only_pages_of_this_machine_contain_the_page_and_only_on_request():
+    policy = lambda guard: guard.response_headers("/", "127.0.0.1:8080", 8080)["Content-Security-Policy"]
+    assert policy(LOCAL).endswith("frame-ancestors 'none'")
+    assert policy(RequestGuard("127.0.0.1", is_embeddable=True)).endswith(
+        "frame-ancestors http://localhost:* http://127.0.0.1:*"
+    )
+
+
 def test08_number_of_pages_is_limited():
     open_one = dict(Host="localhost:8080", Upgrade="WebSocket")
     assert status(LOCAL, clients=MAX_CLIENTS - 1, **open_one) == 200
