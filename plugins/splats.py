@@ -9,7 +9,8 @@ Gaussian splats (:monosp:`splats`)
  * - filename
    - |string|
    - Gaussian splats as 3DGS ``.ply`` (any order of columns, with or without normals), ``.splat``, ``.spz`` of version 1
-     to 3, or ``.glb`` with KHR_gaussian_splatting. Relative names are resolved in the folder of the scene file.
+     to 3, ``.sog`` of version 2, or ``.glb`` with KHR_gaussian_splatting. Relative names are resolved in the folder of
+     the scene file.
 
  * - to_world
    - |transform|

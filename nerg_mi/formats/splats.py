@@ -1,4 +1,4 @@
-"""Files of Gaussian splats (3DGS PLY, .splat, SPZ and glTF), and splats that are derived from a radiance field."""
+"""Files of Gaussian splats (3DGS PLY, .splat, SPZ, SOG and glTF), and splats that are derived from a radiance field."""
 
 from __future__ import annotations
 
@@ -32,6 +32,7 @@ from nerg_mi.transport.geometry import trace_depth
 
 from .gltf import GLTF_MAGIC, MAX_GLTF_BYTES, iter_instances, read_accessor, read_glb_chunks
 from .ply import PLY_MAGIC, parse_ply, write_columns
+from .sog import read_sog
 from .surfaces import extract_points
 
 # ---- .splat files (antimatter15): 32 bytes per Gaussian, colours independent of the direction ----
@@ -372,11 +373,12 @@ READERS: dict[str, Callable[[str | os.PathLike], Splats]] = {
     ".ply": read_ply_splats,
     ".splat": read_splat,
     ".spz": read_spz,
+    ".sog": read_sog,
     ".glb": read_gltf_splats,
 }
 """Reader by file suffix."""
 
-_UNSUPPORTED_SUFFIXES = (".sog", ".ksplat", ".lcc")
+_UNSUPPORTED_SUFFIXES = (".ksplat", ".lcc")
 _CONVERTIBLE_SUFFIXES = (*_UNSUPPORTED_SUFFIXES, ".gltf", ".json")
 
 

@@ -35,7 +35,14 @@ from nerg_mi.transport.geometry import trace_depth
 from nerg_mi.transport.splat_medium import SplatArrays, SplatMedium
 from nerg_mi.workflows.scene_places import detect_kind
 from tests.conftest import ROOT
-from tests.formats.splats.writers import random_splats, write_antimatter, write_inria, write_khronos, write_spz
+from tests.formats.splats.writers import (
+    random_splats,
+    write_antimatter,
+    write_inria,
+    write_khronos,
+    write_sog,
+    write_spz,
+)
 
 # ---- .splat ----
 
@@ -74,7 +81,7 @@ def test_memory_is_a_small_multiple_of_the_file(tmp_path):
 
 # ---- Files ----
 
-WRITERS = {".ply": write_inria, ".splat": write_antimatter, ".spz": write_spz, ".glb": write_khronos}
+WRITERS = {".ply": write_inria, ".splat": write_antimatter, ".spz": write_spz, ".sog": write_sog, ".glb": write_khronos}
 
 
 def test_suffix_selects_format(tmp_path):
@@ -86,16 +93,16 @@ def test_suffix_selects_format(tmp_path):
 
 def test_unsupported_formats_name_converter(tmp_path):
     with pytest.raises(NergError, match=r"splat-transform.*out\.ply"):
-        read_splats(tmp_path / "a.sog")
+        read_splats(tmp_path / "a.ksplat")
     with pytest.raises(NergError, match=r"supported formats: \.ply"):
         read_splats(tmp_path / "a.txt")
 
 
 def test_unsupported_splats_are_refused_by_all_commands(tmp_path):
-    (tmp_path / "a.sog").write_bytes(b"PK")
+    (tmp_path / "a.ksplat").write_bytes(b"PK")
     for commands in (refuse_unsupported_splats, detect_kind, lambda path: load_field_geometry(path, None)):
-        with pytest.raises(NergError, match=r'splat-transform "a\.sog" out\.ply'):
-            commands(tmp_path / "a.sog")
+        with pytest.raises(NergError, match=r'splat-transform "a\.ksplat" out\.ply'):
+            commands(tmp_path / "a.ksplat")
     refuse_unsupported_splats(tmp_path / "a.obj")
     assert choose_plugin(tmp_path / "a.splat") == "splats" and choose_plugin("a.safetensors") == "nerf"
 
@@ -420,6 +427,48 @@ def test_damaged_spz_is_refused(tmp_path, raw, said):
     with pytest.raises(NergError, match=said) as error:
         read_spz(tmp_path / "a.spz")
     assert "a.spz" in str(error.value)
+
+
+# ---- SOG: images in an archive ----
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_sog_is_decoded_to_its_precision(tmp_path, degree):
+    splats = random_splats(70, degree=degree)  # More than a row of the palette
+    write_sog(tmp_path / "a.sog", splats)
+    read = read_splats(tmp_path / "a.sog")
+    half_step = lambda values: np.ptp(values) / 255 / 2 + 1e-6
+    assert np.abs(read.centers - splats.centers).max() < 2 * np.log(2) / 65535 + 1e-6
+    assert np.abs(np.log(read.scales / splats.scales)).max() <= half_step(np.log(splats.scales)) + 1e-5
+    assert np.abs(read.opacities - splats.opacities).max() <= 0.5 / 255 + 1e-6
+    assert np.abs(read.harmonics[:, 0] - splats.harmonics[:, 0]).max() <= half_step(splats.harmonics[:, 0])
+    if degree:
+        assert np.abs(read.harmonics[:, 1:] - splats.harmonics[:, 1:]).max() <= half_step(splats.harmonics[:, 1:])
+    unit = lambda q: q / np.linalg.norm(q, axis=1, keepdims=True)
+    assert np.abs((unit(read.rotations) * unit(splats.rotations)).sum(axis=1)).min() > 1 - 1e-4
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"version": 3}, "version is 3, not 2"),
+        ({"count": 4_000_000_000}, "4000000000 Gaussians"),
+        ({"count": 41}, "40 pixels for 41 Gaussians"),
+        ({"count": "many"}, "many Gaussians"),
+        ({"scales__codebook": [0.0]}, "codebook"),
+        ({"shN__bands": 4}, "4 bands"),
+        ({"shN__bands": 1}, "image of its palette"),
+        ({"shN__count": 9}, "palette entry 39 of 9"),
+        ({"quats__files": ["sh0.webp"]}, "no largest component"),
+        ({"quats__files": ["other.webp"]}, "other.webp"),
+        ({"quats__files": ["meta.json"]}, "cannot be read"),
+    ],
+)
+def test_damaged_sog_is_refused(tmp_path, changes, said):
+    write_sog(tmp_path / "a.sog", random_splats(), **changes)
+    with pytest.raises(NergError, match=said) as error:
+        read_splats(tmp_path / "a.sog")
+    assert "a.sog" in str(error.value)
 
 
 # ---- Splats of a field show its depth ----

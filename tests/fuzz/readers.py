@@ -300,6 +300,7 @@ def _make_splats(name: str, **how):
             ".ply": writers.write_inria,
             ".splat": writers.write_antimatter,
             ".spz": writers.write_spz,
+            ".sog": writers.write_sog,
             ".glb": writers.write_khronos,
         }[Path(name).suffix]
         write(folder / name, writers.random_splats(12, degree=1), **how)
@@ -324,6 +325,7 @@ SPLATS = [
     ),
     Reader("splats: a.splat", _make_splats("a.splat"), {"a.splat": ()}, _read_splats("a.splat")),
     Reader("splats: a.spz", _make_splats("a.spz"), {"a.spz": ("gzip",)}, _read_splats("a.spz")),
+    Reader("splats: a.sog", _make_splats("a.sog"), {"a.sog": ("zip",)}, _read_splats("a.sog")),
     Reader("splats: a.glb", _make_splats("a.glb"), {"a.glb": ()}, _read_splats("a.glb")),
 ]
 

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import gzip
+import io
+import json
 import struct
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -135,3 +138,67 @@ def write_khronos(path: Path, splats: Splats, node: dict | None = None, shares: 
         "accessors": accessors,
     }
     path.write_bytes(b"".join(pack_glb(document, data)))
+
+
+def write_sog(path: Path, splats: Splats, **changes) -> None:
+    """Write a file of version 2 after the description of PlayCanvas, with codebooks of even steps and a palette entry
+    per Gaussian. ``changes``: replaced values of ``meta.json``.
+    """
+    from PIL import Image
+
+    count, width = len(splats), 8
+    files: dict[str, bytes] = {}
+
+    def add(name: str, pixels: np.ndarray) -> str:
+        """Add an image (height, width, 4), or one of a pixel (N, channels) per Gaussian."""
+        if pixels.ndim == 2:
+            image = np.full((-(-len(pixels) // width) * width, 4), 255, np.uint8)
+            image[: len(pixels), : pixels.shape[1]] = pixels
+            pixels = image.reshape(-1, width, 4)
+        stream = io.BytesIO()
+        Image.fromarray(pixels).save(stream, "WEBP", lossless=True, exact=True)
+        files[f"{name}.webp"] = stream.getvalue()
+        return f"{name}.webp"
+
+    def quantize(values: np.ndarray) -> tuple[list[float], np.ndarray]:
+        codebook = np.linspace(values.min(), values.max(), 256)
+        return codebook.tolist(), np.abs(values[..., None] - codebook).argmin(axis=-1).astype(np.uint8)
+
+    logs = np.sign(splats.centers) * np.log1p(np.abs(splats.centers.astype(np.float64)))
+    low, high = logs.min(axis=0), logs.max(axis=0)
+    bits = np.rint((logs - low) / (high - low) * 65535).astype(int)
+    means = [add("means_l", (bits & 255).astype(np.uint8)), add("means_u", (bits >> 8).astype(np.uint8))]
+    q = splats.rotations / np.linalg.norm(splats.rotations, axis=1, keepdims=True)
+    largest = np.abs(q).argmax(axis=1)
+    q = q * np.sign(q[np.arange(count), largest])[:, None]
+    rest = np.array([np.delete(row, k) for row, k in zip(q, largest)]) * np.sqrt(2)
+    quats = add("quats", np.column_stack([np.rint((rest + 1) * 127.5), 252 + largest]).astype(np.uint8))
+    scale_book, scale_index = quantize(np.log(splats.scales.astype(np.float64)))
+    color_book, color_index = quantize(splats.harmonics[:, 0].astype(np.float64))
+    alpha = np.rint(255 * splats.opacities.astype(np.float64)).astype(np.uint8)
+    meta: dict = {
+        "version": 2,
+        "count": count,
+        "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": means},
+        "quats": {"files": [quats]},
+        "scales": {"codebook": scale_book, "files": [add("scales", scale_index)]},
+        "sh0": {"codebook": color_book, "files": [add("sh0", np.column_stack([color_index, alpha]))]},
+    }
+    num_higher = splats.harmonics.shape[1] - 1
+    if num_higher:
+        book, index = quantize(splats.harmonics[:, 1:].astype(np.float64))
+        palette = np.full((-(-count // 64) * 64, num_higher, 4), 255, np.uint8)
+        palette[:count, :, :3] = index
+        entries = np.arange(count)[::-1]  # The last Gaussian has the first entry
+        palette[:count] = palette[:count][::-1]
+        labels = np.column_stack([entries & 255, entries >> 8]).astype(np.uint8)
+        centroids = add("shN_centroids", palette.reshape(-1, 64 * num_higher, 4))
+        bands = int(np.sqrt(num_higher + 1)) - 1
+        meta["shN"] = {"count": count, "bands": bands, "codebook": book}
+        meta["shN"]["files"] = [centroids, add("shN_labels", labels)]
+    for name, value in changes.items():
+        part, _, key = name.rpartition("__")
+        (meta[part] if part else meta)[key] = value
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, data in {"meta.json": json.dumps(meta).encode(), **files}.items():
+            archive.writestr(name, data)
