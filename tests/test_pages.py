@@ -89,7 +89,7 @@ def blocks(*languages: str, page: str = "") -> list[Block]:
 
 
 def test01_no_block_is_left_out():
-    here = {"sh", ("README.md", "python"), ("figures.md", "py"), ("python.md", "py")}
+    here = {"sh", ("README.md", "python"), ("figures.md", "py"), ("python.md", "py"), ("exchange.md", "py")}
     here |= {(f"{page}.md", "json") for page in ("viewer", "store", "statistics")}
     here |= {
         (f"{page}.md", "python") for page in "derivatives evaluation exchange python store recordings next-look".split()
@@ -187,6 +187,25 @@ def test07_torch(rgb, place):
     (block,) = [block for block in blocks("python", page="exchange.md") if "import torch" in block.text]
     names = run(block.text, block.page)
     assert names["sigma"].shape == (100,) and names["color"].shape == (100, 3)
+
+
+def test_scenes_are_exported(rgb, tmp_path, monkeypatch):
+    """The block of scenes with gaze, in files of both formats."""
+    import trimesh
+
+    import nerg_mi as nerg
+
+    for module in ("rerun", "pxr"):
+        pytest.importorskip(module, reason=f"{module} is not installed")
+    monkeypatch.chdir(tmp_path)
+    room = trimesh.creation.box((8, 6, 3)).apply_translation((4, 3, 1.5))
+    room.export("day.ply")
+    gaze = nerg.load_gaze(demo.find_store_scene().parent / "shoppers.safetensors")
+    names = {"nerg": nerg, "room": room, "gaze": gaze, "camera": nerg.Camera((1, 1, 2), (5, 4, 1), width=12, height=8)}
+    names["rays"] = nerg.Rays.from_arrays([[4, 3, 1.6]] * 9, [[1, 0, 0]] * 9, times=np.arange(9) / 30)
+    (block,) = blocks("py", page="exchange.md")
+    run(block.text, block.page, names)
+    assert all(Path(name).stat().st_size > 1000 for name in ("day.rrd", "day.usdc"))
 
 
 def test08_datasets(tmp_path, monkeypatch):

@@ -16,6 +16,7 @@ from nerg_mi.workflows.radiance_commands import (
     MeshOptions,
     PointOptions,
     PoseOptions,
+    SceneExportOptions,
     SplatOptions,
     TorchNgpOptions,
     VolumeOptions,
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     from nerg_mi.workflows.bake import Bake
     from nerg_mi.workflows.bake_splats import SplatBake
     from nerg_mi.workflows.export import Export
+    from nerg_mi.workflows.export_scene import SceneExport
     from nerg_mi.workflows.poses import PosesResult
     from nerg_mi.workflows.report import ReportResult
 
@@ -419,6 +421,68 @@ def export(
         resolved = build_options(option_type, f"export of {chosen}", None, options)
         source = field.network if isinstance(field, TrainedField) else resolve_file(field, "field")
         return getattr(exports, function)(source, Path(output), resolved, reporter)
+
+
+def export_scene(
+    scene: object,
+    output: FilePath,
+    rays: object = (),
+    *,
+    options: SceneExportOptions | None = None,
+    progress: Progress = None,
+    **overrides: Any,
+) -> SceneExport:
+    """Write a scene with its gaze for Rerun (.rrd) or OpenUSD (.usdc, .usda, .usd).
+
+    Shapes, fields, splats and cameras of the scene are written, and the gaze of its observer as coloured points on
+    surfaces and as a sphere around the observer.
+
+    Parameters
+    ----------
+    scene : object or sequence of these
+        A `Scene` of `make_scene`, an environment without gaze (`nerg_mi.api.scene.Environment`), or a mesh that `bake`
+        has written, in memory or as files, all in the same frame.
+    output : path
+        File to write. ``.rrd`` needs the extra ``rerun``, the others need the extra ``usd``.
+    rays : Rays, path or sequence of these, optional
+        Recordings in the frame of the scene, which are written as eyes, rays and fixations of each participant.
+    options : SceneExportOptions, optional
+        Base options (`nerg_mi.workflows.radiance_commands.SceneExportOptions`).
+    progress : bool, Reporter or None
+        None shows a progress bar in notebooks, True shows one anywhere, False none; a `Reporter` receives everything.
+    **overrides
+        Single options on top of ``options``, such as ``max_rays=5000``, ``spp=16`` or ``up="y"``.
+
+    Returns
+    -------
+    SceneExport
+        The written file (``output``) and its contents (``scene``).
+
+    Raises
+    ------
+    NergError
+        An option or an input is invalid, or the scene contains nothing that can be exported.
+    ImportError
+        The library of the format is not installed.
+
+    Examples
+    --------
+    >>> import nerg_mi as nerg, trimesh
+    >>> room = trimesh.creation.box((4, 3, 2.5))
+    >>> rays = nerg.Rays.from_arrays([[0, 0, 0]] * 3, [[1, 0, 0]] * 3, times=[0.0, 0.1, 0.2])
+    >>> nerg.export_scene(room, folder / "room.usdc", rays)
+    <SceneExport: room.usdc, 1 mesh, 3 rays, 1 fixation>
+    """
+    from nerg_mi.workflows.export_scene import export_scene as write
+
+    with report_progress(progress, SceneExportOptions) as reporter:
+        resolved = build_options(SceneExportOptions, "export_scene", options, overrides)
+        files = [
+            as_file(item, name)
+            for name, items in (("scene", scene), ("rays", rays))
+            for item in (items if isinstance(items, (list, tuple)) else [items])
+        ]
+        return write(files, Path(output), resolved, reporter)
 
 
 def import_checkpoint(

@@ -33,7 +33,7 @@ from nerg_mi.rays.dataset import load_rays
 from nerg_mi.rays.events import average_fixations, detect_fixations_idt
 from nerg_mi.rays.rays import Rays
 from nerg_mi.registration import get_plugin_class
-from nerg_mi.rendering.bands import render_aovs, require_nerg
+from nerg_mi.rendering.bands import is_nerg, render_aovs
 from nerg_mi.rendering.scene import activate_variant, load_scene
 from nerg_mi.transport.field_medium import FieldMedium
 from nerg_mi.transport.geometry import pixel_directions
@@ -53,10 +53,13 @@ _GREY = 0.5
 
 @dataclass(frozen=True)
 class SceneExport:
-    """What was written to ``output``."""
+    """What was written: the file ``output``, and its contents ``scene``."""
 
     output: Path
     scene: ExchangeScene
+
+    def __repr__(self) -> str:
+        return f"<SceneExport: {self.output.name}, {_describe(self.scene)}>"
 
 
 def export_scene(
@@ -101,14 +104,14 @@ def export_scene(
 
 def _describe(scene: ExchangeScene) -> str:
     counts = {
-        "meshes": len(scene.meshes),
-        "point clouds": len(scene.points),
-        "splats": 0 if scene.splats is None else len(scene.splats.centers),
-        "cameras": len(scene.cameras),
-        "rays": sum(len(r.times) for r in scene.rays),
-        "fixations": sum(len(f.times) for f in scene.fixations),
+        ("mesh", "meshes"): len(scene.meshes),
+        ("point cloud", "point clouds"): len(scene.points),
+        ("Gaussian", "Gaussians"): 0 if scene.splats is None else len(scene.splats.centers),
+        ("camera", "cameras"): len(scene.cameras),
+        ("ray", "rays"): sum(len(r.times) for r in scene.rays),
+        ("fixation", "fixations"): sum(len(f.times) for f in scene.fixations),
     }
-    return ", ".join(f"{count:,} {name}" for name, count in counts.items() if count)
+    return ", ".join(f"{count:,} {one if count == 1 else several}" for (one, several), count in counts.items() if count)
 
 
 def _add_file(scene: ExchangeScene, path: Path, options: SceneExportOptions, reporter: Reporter) -> ExchangeScene:
@@ -131,7 +134,8 @@ def _add_file(scene: ExchangeScene, path: Path, options: SceneExportOptions, rep
         field = load_radiance(path, select_backend(options.mode))[0]
         return replace(scene, points=(*scene.points, _surface_points(field, path.stem, options)))
     raise NergError(
-        f'"{path}" cannot be exported alone; write a scene with "nerg scene {path} -o scene.xml", and export that'
+        f'"{path}" is exported as part of a scene, not alone; make one with "nerg scene", or in Python with '
+        "write_scene, and export that"
     )
 
 
@@ -192,16 +196,19 @@ def _gaze(
 def _add_scene(scene: ExchangeScene, path: Path, options: SceneExportOptions, reporter: Reporter) -> ExchangeScene:
     """Add the shapes, cameras, splats or surface points of the field, and gaze of the scene file ``path``."""
     loaded = load_scene(path, options.defaults)
-    nerg = require_nerg(path, loaded)
     skipped = [shape.id() for shape in loaded.shapes() if not shape.is_mesh()]
     if skipped:
-        reporter.message(f"left out {len(skipped)} shapes that are not meshes, such as {skipped[0]}")
+        reporter.warn(f"left out {len(skipped)} shapes that are not meshes, such as {skipped[0]}")
     meshes = tuple(_shape(shape) for shape in loaded.shapes() if shape.is_mesh())
     cameras = tuple(
         _camera(sensor, f"camera_{index}")
         for index, sensor in enumerate(loaded.sensors())
         if sensor.class_name() == "PerspectiveCamera"
     )
+    scene = replace(scene, meshes=scene.meshes + meshes, cameras=scene.cameras + cameras)
+    nerg = loaded.integrator()
+    if not is_nerg(nerg):
+        return scene
     field = nerg.children.get("field")
     if isinstance(field, get_plugin_class("splats")):
         scene = replace(scene, splats=field.splats.transform(field.similarity))
@@ -209,7 +216,10 @@ def _add_scene(scene: ExchangeScene, path: Path, options: SceneExportOptions, re
         points, matrix = _surface_points(nerg.medium.field, "field", options), nerg.medium.to_world.matrix
         points = replace(points, positions=points.positions @ matrix[:3, :3].T + matrix[:3, 3])
         scene = replace(scene, points=(*scene.points, points))
-    scene = replace(scene, meshes=scene.meshes + meshes, cameras=scene.cameras + cameras)
+    if nerg.children.get("density") is not None:
+        reporter.warn(
+            f'the volume "density" of "{path}" is left out, since only radiance fields, splats and meshes are exported'
+        )
     quantity = next((name for name in ("gaze", "kde") if nerg.children.get(name) is not None), None)
     return scene if quantity is None else _add_gaze(scene, path, loaded, quantity, options, reporter)
 
@@ -239,15 +249,18 @@ def _add_gaze(
     """Add the gaze of the scene's observer: as coloured points on surfaces, and as a sphere around the observer."""
     import mitsuba as mi
 
-    nerg = loaded.integrator()
-    camera = loaded.sensors()[0]
-    observer = nerg.observer or camera
+    sensors = loaded.sensors()
+    observer = loaded.integrator().observer or (sensors[0] if sensors else None)
+    if observer is None:
+        raise NergError(
+            f'the gaze of "{path}" needs an observer, and the scene has neither an observer nor a camera; add one'
+        )
     pose = upright_pose(observer)
     panorama = {
         "type": "panorama",
         "to_world": pose,
         "film": make_film(options.width, options.width // 2),
-        "sampler": copy_sampler(camera),
+        "sampler": copy_sampler(observer),
     }
     reporter.progress(0.5, "rendering the gaze of the observer")
     with translate_mitsuba_errors():

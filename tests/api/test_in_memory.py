@@ -16,6 +16,7 @@ import trimesh
 import nerg_mi as nerg
 from nerg_mi.api.calls import report_progress
 from nerg_mi.api.objects import as_file, build_options, session_folder
+from nerg_mi.fields.splats import Splats
 from nerg_mi.workflows.gaze_commands import FoldOptions, GazeOptions
 
 QUICK = {"recipe": "small", "steps": 2, "probes": 8, "directions": 64, "min_rays": 8, "validation_zones": 0}
@@ -112,6 +113,89 @@ def test_a_saved_scene_is_the_scene(room, gaze, tmp_path):
     with_values = nerg.Scene.load(nerg_store() / "scene.xml", width=24, height=16)
     width, _ = nerg.Scene.load(with_values.save(tmp_path / "store.xml")).mitsuba.sensors()[0].film().crop_size()
     assert width == 24
+
+
+# ---- Exports to other programs ----
+
+
+@pytest.fixture
+def written(monkeypatch):
+    """Contents of exported scenes, which are not written, since that needs optional libraries."""
+    contents = []
+    write = lambda scene, path: path.write_bytes(b"") or contents.append(scene)
+    monkeypatch.setattr("nerg_mi.workflows.export_scene.write_exchange", write)
+    return contents
+
+
+def test_scenes_with_gaze_are_exported(room, gaze, rays, tmp_path, written):
+    camera = nerg.Camera((1, 1, 2), (5.9, 2, 1.5), fov=80, width=12, height=8)
+    scene = nerg.make_scene(room, gaze, camera=camera, observer=EYE)
+    made = nerg.export_scene(scene, tmp_path / "a.rrd", rays, width=64, spp=16, max_points=500)
+    (content,) = written
+    assert made.scene is content and made.output == tmp_path / "a.rrd"
+    meshes = {mesh.name: mesh for mesh in content.meshes}
+    assert meshes.keys() == {"room", "poster", "observer"}
+    np.testing.assert_allclose(np.ptp(meshes["room"].vertices, axis=0), (6, 4, 3), atol=1e-5)
+    directions = (meshes["observer"].vertices - EYE) / 0.15
+    density = gaze.density(EYE, directions)
+    assert np.corrcoef(meshes["observer"].values, density)[0, 1] > 0.99
+    np.testing.assert_allclose(meshes["observer"].values.mean(), density.mean(), rtol=0.02)
+    (points,) = content.points
+    assert len(points.positions) == 500 and points.label.startswith("gaze")
+    (shown,) = content.cameras
+    assert shown.fov == pytest.approx(80) and np.allclose(shown.to_world[:3, 3], (1, 1, 2), atol=1e-6)
+    assert [r.participant for r in content.rays] == list("abcd") and sum(len(r.times) for r in content.rays) == 600
+    # The observer is the camera if there is no other, and one of them is needed.
+    seen_by_camera = nerg.make_scene(room, gaze, camera=camera)
+    content = nerg.export_scene(seen_by_camera, tmp_path / "a.rrd", width=64, spp=1).scene
+    sphere = next(mesh for mesh in content.meshes if mesh.name == "observer")
+    np.testing.assert_allclose(sphere.vertices.min(axis=0)[2], 2 - 0.15, atol=2e-3)
+    with pytest.raises(nerg.NergError, match="observer"):
+        nerg.export_scene(nerg.make_scene(room, gaze), tmp_path / "a.rrd")
+
+
+@pytest.mark.parametrize("kind", ["mesh", "meshes", "mitsuba", "dict", "splats", "field", "file"])
+def test_environments_are_exported(room, tmp_path, written, kind):
+    splats = Splats(*(np.ones((3, n)) for n in (3, 3, 4)), np.ones(3), np.zeros((3, 1, 3)))
+    environment = {
+        "mesh": make_room,
+        "meshes": lambda: room,
+        "mitsuba": lambda: nerg.make_scene(room).mitsuba,
+        "dict": lambda: {"type": "scene", "integrator": {"type": "path"}, "wall": {"type": "cube"}},
+        "splats": lambda: splats,
+        "field": lambda: nerg.load_field(nerg_store() / "store.safetensors").network,
+        "file": lambda: Path(make_room().export(tmp_path / "room.ply") and tmp_path / "room.ply"),
+    }[kind]()
+    nerg.export_scene([environment], tmp_path / "a.usdc", max_points=100)
+    (content,) = written
+    if kind == "splats":
+        np.testing.assert_array_equal(content.splats.centers, splats.centers)
+    elif kind == "field":
+        (points,) = content.points
+        assert 0 < len(points.positions) <= 100
+    else:
+        assert len(content.meshes) == (2 if kind in ("meshes", "mitsuba") else 1)
+        extents = np.array([np.ptp(mesh.vertices, axis=0) for mesh in content.meshes])
+        np.testing.assert_allclose(extents.max(axis=0), (2, 2, 2) if kind == "dict" else (6, 4, 3), atol=1e-5)
+
+
+def test_what_cannot_be_exported_is_reported(rgb_module, gaze, tmp_path, monkeypatch):
+    grid = nerg.DensityGrid(np.ones((2, 2, 2)), (0, 0, 0), (1, 1, 1))
+    with pytest.raises(nerg.NergError, match="nothing"), pytest.warns(UserWarning, match='"density"'):
+        nerg.export_scene(grid, tmp_path / "a.usdc")
+    with pytest.raises(nerg.NergError, match="write_scene"):
+        nerg.export_scene(gaze, tmp_path / "a.usdc")
+    with pytest.raises(nerg.NergError, match='"max_ray".*"max_rays"'):
+        nerg.export_scene(make_room(), tmp_path / "a.usdc", max_ray=3)
+    with pytest.raises(nerg.NergError, match=r"\.rrd"):
+        nerg.export_scene(make_room(), tmp_path / "a.fbx")
+    with pytest.raises(nerg.NergError, match='"rays".*int'):
+        nerg.export_scene(make_room(), tmp_path / "a.usdc", 3)
+    for suffix, module in ((".usda", "pxr.Gf"), (".rrd", "rerun")):
+        monkeypatch.setitem(sys.modules, module, None)
+        with pytest.raises(ImportError, match="nerg-mi"):
+            nerg.export_scene(make_room(), tmp_path / f"a{suffix}")
+    assert not [file for file in tmp_path.iterdir() if file.name.startswith("a.")]
 
 
 def nerg_store():

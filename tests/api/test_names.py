@@ -108,11 +108,15 @@ def rays():
 # These examples train or measure for seconds; faster tests of the same workflows exist.
 LONG = {"ablate", "study", "train_radiance"}
 
+# Modules that an example needs, and the extras that install them.
+EXTRAS = {"view": ("viser", "viewer"), "export_scene": ("pxr", "usd")}
+
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.nightly] * (n in LONG)) for n in nerg.__all__])
 def test07_examples_run(name, tmp_path, request):
-    if name == "view":
-        pytest.importorskip("viser", reason="viser, of the extra viewer, is not installed")
+    if name in EXTRAS:
+        module, extra = EXTRAS[name]
+        pytest.importorskip(module, reason=f"{module}, of the extra {extra}, is not installed")
     value = getattr(nerg, name)
     (test,) = doctest.DocTestFinder(recurse=False).find(value, name, globs={"folder": tmp_path})
     assert test.examples, f"the docstring of {name} has no example"

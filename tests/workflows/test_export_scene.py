@@ -80,7 +80,7 @@ def test_a_scene_has_its_meshes_cameras_and_gaze(rgb, folder, monkeypatch):
     scene, recorder = exported(folder, "scene.xml", monkeypatch=monkeypatch, **options)
     room, sphere = scene.meshes
     assert room.name == "room" and np.isclose(np.abs(room.vertices).max(), 2)
-    assert any("not meshes" in line and "ball" in line for line in recorder.messages)
+    assert any("not meshes" in line and "ball" in line for line in recorder.warnings)
     (camera,) = scene.cameras
     assert camera.name == "view" and camera.fov == pytest.approx(70) and (camera.width, camera.height) == (12, 8)
     # Right, up and backwards.
@@ -128,6 +128,14 @@ def test_a_baked_mesh_keeps_its_attention(rgb, folder, monkeypatch):
     scene, _ = exported(folder, "baked.ply", "room.ply", monkeypatch=monkeypatch)
     baked, room = scene.meshes
     assert np.allclose(baked.values, [0.1, 0.2, 0.3]) and baked.label == "gaze [1/m²]" and room.values is None
+
+
+def test_a_scene_without_nerg_has_its_meshes_and_cameras(rgb, folder, monkeypatch):
+    start, end = SCENE.index("<integrator"), SCENE.index("</integrator>")
+    (folder / "plain.xml").write_text(SCENE[:start] + '<integrator type="path">' + SCENE[end:])
+    scene, _ = exported(folder, "plain.xml", monkeypatch=monkeypatch)
+    assert [mesh.name for mesh in scene.meshes] == ["room"] and [c.name for c in scene.cameras] == ["view"]
+    assert not scene.points
 
 
 def test_unsuitable_files_and_options_are_refused(rgb, folder):
