@@ -30,6 +30,7 @@ from nerg_mi.rendering.files import write_mesh
 from nerg_mi.rendering.scene import list_scene_files
 from nerg_mi.workflows.old_names import current_keywords
 from nerg_mi.workflows.options import GeometryOptions
+from nerg_mi.workflows.progress import WarningReporter
 from nerg_mi.workflows.scene_places import detect_kind
 
 from .arguments import check_names, resolve_file
@@ -165,7 +166,16 @@ def _write_environment(value: object) -> Path | None:
 
 def _store_shapes(shapes: object) -> Path:
     """Write shapes as a scene file without an integrator."""
-    content = {"type": "scene", **to_scene_children(shapes, "environment")}
+    import mitsuba as mi
+
+    children = to_scene_children(shapes, "environment")
+    lights = [name for name, child in children.items() if isinstance(child, mi.Emitter)]
+    if lights:
+        WarningReporter().warn(
+            f"{len(lights)} lights of a Mitsuba scene are left out, since objects of Mitsuba cannot be written to a "
+            "file; pass the dict or the file of the scene to keep them"
+        )
+    content = {"type": "scene", **{name: child for name, child in children.items() if name not in lights}}
     return _store("environment", ".xml", lambda path: write_content(path, content, "Shapes of an environment."))
 
 

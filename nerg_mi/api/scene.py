@@ -440,6 +440,11 @@ def make_scene(
     )
     if isinstance(settings.get("field"), (str, os.PathLike, TrainedField, RadianceField, Splats)):
         raise NergError('make_scene has no argument "field"; pass the field as the environment')
+    if isinstance(environment, Scene):
+        raise NergError(
+            "the environment is a Scene already; pass the field, the grid or the shapes that it is made of, or show "
+            "another gaze field in it with write_scene"
+        )
     integrator: dict[str, Any] = {"type": "nerg", **settings}
     transform = None if to_world is None else _as_transform(to_world)
     children: dict[str, Any] = {}

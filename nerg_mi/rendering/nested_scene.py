@@ -13,6 +13,7 @@ from nerg_mi.files.safe_read import check_regular_file, resolve_path, translate_
 
 from .scene import check_scene_file
 from .scene_writer import (
+    INTEGRATOR_SETTINGS,
     BlankLine,
     Comment,
     Node,
@@ -27,14 +28,21 @@ from .scene_writer import (
 # ---- A scene file nested in a scene with gaze ----
 #
 # A Mitsuba scene has one integrator, which must be `nerg`; the integrator of the nested file becomes its child and
-# computes the light on the shapes (docs/how-to/environments.md). An `<include>` cannot do this, so the elements of the
-# file are copied, included files are expanded, and a `<path>` makes its relative file names valid.
+# computes the light on the shapes (docs/how-to/environments.md). If it is `nerg` itself, its field or volumes are
+# copied in its place. An `<include>` cannot do this, so the elements of the file are copied, included files are
+# expanded, and a `<path>` makes its relative file names valid.
 
 MAX_BYTES = 16 << 20
 """Maximum size of a scene file to copy, and of each file that it includes."""
 
 DEFAULT_SPP = 64
 """Samples per pixel: path tracing is noisier than fields."""
+
+GAZE_PROPERTIES = ("gaze", "kde")
+"""Names of the gaze in the integrator `nerg`."""
+
+# Properties of `nerg` that belong to a view of an environment; a written scene has its own.
+_VIEW_PROPERTIES = (*GAZE_PROPERTIES, "observer", *INTEGRATOR_SETTINGS)
 
 
 def nest_scene(path: Path, folder: Path) -> SceneContent:
@@ -55,31 +63,34 @@ def nest_scene(path: Path, folder: Path) -> SceneContent:
     Raises
     ------
     NergError
-        The file is not a scene file, has several integrators, or its integrator is already `nerg`.
+        The file is not a scene file, has several integrators, or its integrator `nerg` is within another one.
     """
     version, children = read_scene_elements(path)
     defaults = [child for child in children if child.tag == "default"]
     values = resolve_defaults(children)
-    integrators = [child for child in children if child.tag == "integrator"]
-    _check_integrators(path, integrators, values)
-    ids = {node.get("id", "") for child in children for node in child.iter()}
-    other_elements = [child for child in children if child.tag not in ("default", "integrator", "path")]
-    light_nodes: tuple[Node, ...] = ()
-    if integrators:
-        light_nodes = (
-            Comment(f"The integrator of {path.name} computes the light on the shapes."),
-            *map(to_verbatim, integrators),
-        )
+    others = [child for child in children if child.tag not in ("default", "integrator", "path")]
+    integrator = _read_integrator(path, children, values)
+    is_nerg = integrator is not None and _is_nerg(integrator, values)
+    comment, copied, left_out = f"The integrator of {path.name} computes the light on the shapes.", [], ()
+    if integrator is not None and is_nerg:
+        comment = f"Copied from the integrator of {path.name}."
+        copied = [node for node in integrator if node.get("name") not in _VIEW_PROPERTIES]
+        left_out = tuple(name for node in integrator if (name := node.get("name", "")) in _VIEW_PROPERTIES)
+    elif integrator is not None:
+        copied = [integrator]
+    nodes = [node for child in (*copied, *others) for node in child.iter()]
+    is_lit = not is_nerg or any(node.tag in ("integrator", "emitter") for node in nodes)
     return SceneContent(
-        integrator_children=light_nodes,
+        integrator_children=(Comment(comment), *map(to_verbatim, copied)) if copied else (),
         scene_children=(
             Comment(f"The rest is copied from {path.name}. Its sensors come after the sensors above."),
-            *map(to_verbatim, other_elements),
+            *map(to_verbatim, others),
         ),
         preamble=(*_make_path_elements(path, children, folder), *map(to_verbatim, defaults), BlankLine()),
-        spp=DEFAULT_SPP,
+        spp=DEFAULT_SPP if is_lit else SceneContent.spp,
         version=version,
-        reserved_names=frozenset(values) | frozenset(ids),
+        reserved_names=frozenset(values) | {node.get("id", "") for node in nodes},
+        left_out=left_out,
     )
 
 
@@ -163,15 +174,19 @@ def _expand_includes(root: ElementTree.Element, path: Path, folders: list[Path])
         yield from _expand_includes(_parse_root(included), included, folders)
 
 
-def _check_integrators(path: Path, integrators: list[ElementTree.Element], values: dict[str, str]) -> None:
+def _read_integrator(path: Path, children: list[ElementTree.Element], values: dict[str, str]) -> Element | None:
+    """Return the integrator among the elements of a scene file, or None."""
+    integrators = [child for child in children if child.tag == "integrator"]
     if len(integrators) > 1:
         raise NergError(f'the scene file "{path}" has {len(integrators)} integrators; keep one of them')
-    kinds = {substitute_defaults(node.get("type", ""), values) for i in integrators for node in i.iter("integrator")}
-    if "nerg" in kinds:
-        raise NergError(
-            f'the integrator of "{path}" is already "nerg"; add the gaze field to it as <volume name="gaze" '
-            'type="gazefield"> (docs/reference/plugins.md) and use "nerg render"'
-        )
+    integrator = next(iter(integrators), None)
+    if integrator is not None and any(_is_nerg(node, values) for node in integrator.findall(".//integrator")):
+        raise NergError(f'the integrator "nerg" of "{path}" is within another integrator; take it out of that')
+    return integrator
+
+
+def _is_nerg(integrator: Element, values: dict[str, str]) -> bool:
+    return substitute_defaults(integrator.get("type", ""), values) == "nerg"
 
 
 def substitute_defaults(text: str, values: dict[str, str]) -> str:

@@ -287,6 +287,8 @@ class SceneContent:
         Version of the scene format.
     reserved_names : frozenset of str
         Names of `<default>`s and ids that another file uses.
+    left_out : tuple of str
+        Names of properties of another file's integrator `nerg` that are not used.
     """
 
     integrator_children: tuple[Node, ...] = ()
@@ -296,6 +298,7 @@ class SceneContent:
     spp: int = 16
     version: str = "3.0.0"
     reserved_names: frozenset[str] = frozenset()
+    left_out: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -372,6 +375,10 @@ class SceneText:
     def to_xml(self) -> str:
         """Return the text of the file."""
         return format_document(_make_nodes(self), self.comment, self.content.version)
+
+
+INTEGRATOR_SETTINGS = ("occlusion", "radiance", "visibility", "falloff", "tolerance", "depth", "aovs")
+"""Parameters of the integrator that are `<default>`s of a written scene."""
 
 
 class _SceneNames:
@@ -461,7 +468,7 @@ def _make_integrator(scene: SceneText, names: _SceneNames) -> Element:
         pose = _make_look_at(names.use("eye"), names.use("ahead"), _format_up(scene.observer, names))
         children.append(element("sensor", pose, name="observer", type="perspective"))
     kinds = {"occlusion": "boolean", "radiance": "boolean", "falloff": "float", "tolerance": "float"}
-    for name in ("occlusion", "radiance", "visibility", "falloff", "tolerance", "depth", "aovs"):
+    for name in INTEGRATOR_SETTINGS:
         children.append(prop(kinds.get(name, "string"), name, names.use(name)))
     return element("integrator", *children, type="nerg", id=names("integrator"))
 

@@ -497,7 +497,10 @@ class Session:
         self.display = DisplaySettings(self._default_layer())
         sensors = self.scene.mitsuba.sensors()
         if not sensors:
-            raise NergError(f'"{self.source.scene}" has no sensor for the initial view; add a <sensor> to the scene')
+            raise NergError(
+                f'"{self.source.scene}" has gaze, but no sensor for the initial view; add a <sensor> to the scene, or '
+                "in Python a camera by make_scene"
+            )
         self.home_view = PinholeView.from_sensor(sensors[0])
         self.spp = min(self.options.spp or int(sensors[0].sampler().sample_count()), _MAX_SPP)
         observer = check_point(self.options.observer, "--observer")

@@ -386,7 +386,7 @@ def _read_scene_target(path: Path, shapes: tuple[str, ...]) -> tuple[dict[str, T
         remedy = f"it has {', '.join(every)}" if every else "it has no shapes"
         raise NergError(f'the scene "{path}" has no shape "{missing[0]}"; {remedy}')
     if not every:
-        raise NergError(f'the scene "{path}" has no shapes; give its radiance field or splats as the target instead')
+        raise NergError(f'the scene "{path}" has no shapes; give a mesh, a radiance field or splats as the target')
     targets, occluders = {}, []
     for name, shape in every.items():
         triangles = shape_triangles(shape)

@@ -179,7 +179,7 @@ class OpenScene:
         self.path, self.scene, self._options = path, scene, options
         self.nerg = require_nerg(path, scene)
         if not scene.sensors():
-            raise NergError(f'"{path}" has no sensor; add one')
+            raise NergError(f'"{path}" has no sensor; add a <sensor>, or in Python a camera by make_scene')
         self._tell, self._parts, self._done = tell, parts, 0
 
     def camera(self, index: int) -> Any:

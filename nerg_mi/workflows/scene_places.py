@@ -21,7 +21,7 @@ from nerg_mi.photos.images import read_photo, read_posed_images
 from nerg_mi.photos.posed import PosedFrame, PosedImages
 from nerg_mi.rays.dataset import is_dataset, load_rays
 from nerg_mi.rendering.files import check_vol, write_mesh
-from nerg_mi.rendering.nested_scene import nest_scene
+from nerg_mi.rendering.nested_scene import GAZE_PROPERTIES, nest_scene
 from nerg_mi.rendering.scene_writer import (
     Comment,
     Lens,
@@ -324,8 +324,18 @@ def write_scene_geometry(inputs: InputFiles, output: Path) -> WrittenGeometry:
         return _mesh(_file(inputs), output, _describe_geometry(inputs))
     if inputs.kind == "scene":
         path = _file(inputs)
-        nest_scene(path, output.parent)
-        return WrittenGeometry(lambda folder, center: nest_scene(path, folder), _describe_geometry(inputs))
+        left_out = [name for name in nest_scene(path, output.parent).left_out if name != "aovs"]
+        # Gaze is replaced, and never only lost.
+        replaced_by = dict(zip(GAZE_PROPERTIES, (inputs.gaze, inputs.gaze or inputs.rays)))
+        lost = next((name for name in left_out if name in replaced_by and replaced_by[name] is None), None)
+        if lost is not None:
+            raise NergError(
+                f'"{path}" already has the "{lost}" of an observer; use it as it is, or also name the gaze field to '
+                "show in its place"
+            )
+        notes = (f"not used of its integrator: {', '.join(left_out)}",) if left_out else ()
+        make = lambda folder, center: nest_scene(path, folder)
+        return WrittenGeometry(make, _describe_geometry(inputs), notes=notes)
     if inputs.kind == "hits":
         return _hits(_file(inputs), output, _describe_geometry(inputs))
     return WrittenGeometry(lambda folder, center: _direction_sphere(center), _describe_geometry(inputs))

@@ -18,7 +18,7 @@ from nerg_mi.maths.geometry import Similarity
 from nerg_mi.rays.dataset import is_dataset, load_rays
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.bands import is_nerg
-from nerg_mi.rendering.nested_scene import GAZE_PROPERTY, find_field_file, replace_gaze
+from nerg_mi.rendering.nested_scene import GAZE_PROPERTIES, GAZE_PROPERTY, find_field_file, replace_gaze
 from nerg_mi.rendering.scene import load_scene
 
 from .base import SILENT, Reporter, select_backend
@@ -72,11 +72,11 @@ class ViewerScene:
 def make_viewer_scene(
     files: Sequence[str | Path], folder: Path, options: ViewOptions | None = None, reporter: Reporter = SILENT
 ) -> ViewerScene:
-    """Return the scene of ``files``: a scene file with `nerg`, or one that `write_scene` writes to ``folder``.
+    """Return the scene of ``files``: a scene file with `nerg` and a camera, or one that `write_scene` writes.
 
-    A folder is replaced by the files in it, at most one of a kind, or is a dataset of rays (.rays). Rays are shown in
-    the scene. Several gaze fields, such as those of `nerg ablate`, are variants to choose from; the gaze field of a
-    scene is the first of them. Raises `NergError` for errors that the user can correct.
+    It is written to ``folder``. A folder is replaced by the files in it, at most one of a kind, or is a dataset of rays
+    (.rays). Rays are shown in the scene. Several gaze fields, such as those of `nerg ablate`, are variants to choose
+    from; the gaze field of a scene is the first of them. Raises `NergError` for errors that the user can correct.
     """
     options = options or ViewOptions()
     select_backend(options.mode)
@@ -95,7 +95,7 @@ def make_viewer_scene(
     name = " + ".join(path.name for path in paths)
     scenes = [path for path, kind in kinds.items() if kind == "scene"]
     gaze = [path for path, kind in kinds.items() if kind == "gaze"]
-    if len(scenes) == 1 and set(kinds.values()) <= {"scene", "rays", "gaze"} and _is_nerg(scenes[0]):
+    if len(scenes) == 1 and set(kinds.values()) <= {"scene", "rays", "gaze"} and _is_complete(scenes[0]):
         align = _explicit_align(options, reporter) or Similarity(np.eye(4))
         own_gaze = find_field_file(scenes[0], GAZE_PROPERTY) if gaze else None
         variants = (
@@ -169,8 +169,11 @@ def _expanded(path: Path) -> list[Path]:
     return ready or inside
 
 
-def _is_nerg(path: Path) -> bool:
-    return is_nerg(load_scene(path).integrator())
+def _is_complete(path: Path) -> bool:
+    """Return whether a scene file has the integrator `nerg`, and a camera or gaze: others are environments."""
+    scene = load_scene(path)
+    nerg = scene.integrator()
+    return is_nerg(nerg) and (len(scene.sensors()) > 0 or not nerg.children.keys().isdisjoint(GAZE_PROPERTIES))
 
 
 def _explicit_align(options: ViewOptions, reporter: Reporter) -> Similarity | None:

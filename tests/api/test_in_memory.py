@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 import warnings
@@ -17,7 +18,9 @@ import nerg_mi as nerg
 from nerg_mi.api.calls import report_progress
 from nerg_mi.api.objects import as_file, build_options, session_folder
 from nerg_mi.fields.splats import Splats
+from nerg_mi.rendering.scene import list_scene_files
 from nerg_mi.workflows.gaze_commands import FoldOptions, GazeOptions
+from nerg_mi.workflows.view import make_viewer_scene
 
 QUICK = {"recipe": "small", "steps": 2, "probes": 8, "directions": 64, "min_rays": 8, "validation_zones": 0}
 EYE = (2.0, 2.0, 1.6)
@@ -25,6 +28,21 @@ EYE = (2.0, 2.0, 1.6)
 
 def make_room():
     return trimesh.creation.box((6, 4, 3)).apply_translation((3, 2, 1.5))
+
+
+def make_grid():
+    """The room as a density grid, whose cells are 0.1 m large."""
+    wall = np.zeros((32, 42, 62), np.float32)
+    wall[[0, -1]] = wall[:, [0, -1]] = wall[:, :, [0, -1]] = 200.0
+    return nerg.DensityGrid(wall, (-0.1, -0.1, -0.1), (6.1, 4.1, 3.1))
+
+
+def make_splats():
+    """The room as Gaussians on a lattice of its surface."""
+    points, _ = trimesh.sample.sample_surface_even(make_room(), 6000, seed=0)
+    n = len(points)
+    rotations = np.tile([1.0, 0, 0, 0], (n, 1))
+    return Splats(points, np.full((n, 3), 0.08), rotations, np.full(n, 0.99), np.zeros((n, 1, 3)))
 
 
 @pytest.fixture(scope="module")
@@ -74,13 +92,11 @@ def test_meshes_are_shapes_with_names_and_colours(room):
 
 @pytest.mark.parametrize("kind", ["mesh", "dict", "scene", "grid", "mitsuba"])
 def test_environments_train_alike_in_memory_and_saved(rgb_module, rays, tmp_path, kind):
-    wall = np.zeros((32, 42, 62), np.float32)
-    wall[[0, -1]] = wall[:, [0, -1]] = wall[:, :, [0, -1]] = 200.0
     environment = {
         "mesh": make_room,
         "dict": lambda: {"type": "scene", "wall": {"type": "sphere", "center": [3, 2, 1.5], "radius": 3.8}},
         "scene": lambda: nerg.make_scene(make_room()),
-        "grid": lambda: nerg.DensityGrid(wall, (-0.1, -0.1, -0.1), (6.1, 4.1, 3.1)),
+        "grid": make_grid,
         "mitsuba": lambda: nerg.make_scene(make_room()).mitsuba,
     }[kind]()
     gaze = nerg.train_gaze(rays, tmp_path / "gaze.safetensors", geometry=environment, **QUICK)
@@ -202,6 +218,79 @@ def nerg_store():
     from importlib.resources import files
 
     return files("nerg_mi.scenes.store")
+
+
+ENVIRONMENTS = {
+    "grid": make_grid,
+    "mesh": make_room,
+    "splats": make_splats,
+    "mitsuba": lambda: nerg.make_scene(make_room()).mitsuba,
+    "scene": lambda: nerg.make_scene(make_grid()),
+}
+
+
+@pytest.mark.parametrize("kind", ENVIRONMENTS)
+def test_environments_are_shown(rgb_module, rays, tmp_path, kind):
+    """Scene files, reports and the viewer of each kind of environment, with and without gaze."""
+    environment = ENVIRONMENTS[kind]()
+    gaze = nerg.train_gaze(rays, tmp_path / "gaze.safetensors", geometry=environment, **QUICK)
+    path = tmp_path / "out" / "room.xml"
+    path.parent.mkdir()
+    written = nerg.write_scene([environment, gaze, rays], path, width=24)
+    np.testing.assert_allclose(depths(written)[:3], [4, 2, 1.6], atol=0.15)
+    assert written.has_gaze and len(written.mitsuba.sensors()) == 3
+    # The scene is complete in its folder.
+    assert not [file for file in list_scene_files(path) if session_folder() in file.parents]
+    plain = nerg.write_scene(environment, tmp_path / "plain.xml", observer=EYE, width=24)
+    np.testing.assert_allclose(depths(plain), depths(written), atol=1e-4)
+    if kind in ("grid", "scene"):
+        # Without the objects, from the files of the training.
+        report = nerg.report(tmp_path / "gaze.safetensors", tmp_path / "a.html", width=24, spp=1, viewpoints=1)
+        assert "density" in written.integrator.children and report.path.stat().st_size > 10_000
+    shown = make_viewer_scene([as_file(environment, "inputs"), as_file(gaze, "inputs")], tmp_path)
+    np.testing.assert_allclose(depths(nerg.Scene.load(shown.scene)), depths(written), atol=1e-4)
+
+
+@pytest.mark.parametrize("inputs", ["environment", "gaze", "both"])
+def test_grids_are_viewed(rgb_module, rays, inputs):
+    pytest.importorskip("viser", reason="viser, of the extra viewer, is not installed")
+    grid = make_grid()
+    gaze = None if inputs == "environment" else nerg.train_gaze(rays, geometry=grid, **QUICK)
+    with nerg.view({"environment": grid, "gaze": gaze, "both": [grid, gaze, rays]}[inputs], port=0) as viewer:
+        assert viewer.address.startswith("http://127.0.0.1")
+
+
+def test_scenes_with_gaze_are_viewed_from_their_camera(gaze, room):
+    pytest.importorskip("viser", reason="viser, of the extra viewer, is not installed")
+    with pytest.raises(nerg.NergError, match="camera"):
+        nerg.view(nerg.make_scene(room, gaze), port=0)
+
+
+def test_scenes_that_show_gaze_are_not_environments_alone(gaze, room, rays, tmp_path):
+    camera = nerg.Camera((1, 1, 2), (5.9, 2, 1.5), width=12, height=8)
+    scene = nerg.make_scene(room, gaze, camera=camera, observer=EYE, falloff=0.3)
+    for inputs in (scene, [scene, rays]):
+        with pytest.raises(nerg.NergError, match='"gaze"'):
+            nerg.write_scene(inputs, tmp_path / "a.xml")
+    other, recorder = nerg.train_gaze(rays, geometry=room, **{**QUICK, "steps": 3}), Recorder()
+    again = nerg.write_scene([scene, other], tmp_path / "a.xml", observer=EYE, width=24, progress=recorder)
+    assert any({"gaze", "observer", "falloff"} <= set(re.findall(r"\w+", line)) for line in recorder.lines)
+    ahead = [(1, 0, 0), (0, 1, 0)]
+    shown = nerg.trace(again, EYE, ahead, "gaze").gaze
+    np.testing.assert_allclose(shown, other.density(EYE, ahead), rtol=0.01)
+    assert not np.allclose(shown, gaze.density(EYE, ahead), rtol=0.01)
+    with pytest.raises(nerg.NergError, match="write_scene"):
+        nerg.make_scene(scene, gaze)
+
+
+def test_lights_of_mitsuba_scenes_are_left_out_with_a_warning(rgb_module, tmp_path):
+    light = {"type": "point", "position": [3, 2, 2], "intensity": 5.0}
+    content = {"type": "scene", "light": light, "box": {"type": "cube"}}
+    with pytest.warns(UserWarning, match="lights"):
+        scene = nerg.write_scene(rgb_module.load_dict(content), tmp_path / "a.xml", observer=(0, 0, 0), width=24)
+    assert len(scene.mitsuba.shapes()) == 1 and not scene.mitsuba.emitters()
+    from_dict = nerg.write_scene(content, tmp_path / "b.xml", observer=(0, 0, 0), width=24)
+    assert len(from_dict.mitsuba.emitters()) == 1
 
 
 def test_grids_are_refused_if_they_are_wrong():

@@ -7,6 +7,7 @@ import pytest
 
 import nerg_mi as nerg
 from nerg_mi.errors import NergError
+from nerg_mi.formats.surfaces import write_volume
 from nerg_mi.rendering.bands import render_channels
 from nerg_mi.rendering.nested_scene import GAZE_PROPERTY, find_field_file, nest_scene, replace_gaze
 from nerg_mi.rendering.scene import load_scene
@@ -75,10 +76,42 @@ def test_nested_integrator_is_kept(rgb, theirs, tmp_path):
     assert scene.integrator().shading.nested.class_name() == "DirectIntegrator"
 
 
+NERG_THEIRS = """<scene version="3.0.0"><default name="kind" value="nerg"/>
+    <integrator type="$kind" id="integrator"><string name="aovs" value="depth"/><float name="falloff" value="0.3"/>
+        <volume name="density" type="gridvolume"><string name="filename" value="d.vol"/>
+            <boolean name="use_grid_bbox" value="true"/></volume>
+        <volume name="gaze" type="gazefield"><string name="filename" value="nowhere.safetensors"/></volume>
+        <sensor name="observer" type="perspective"/>{light}
+        <rgb name="background" value="0.25"/></integrator>
+    <shape type="obj"><string name="filename" value="tri.obj"/></shape></scene>"""
+
+
+@pytest.mark.parametrize("where", ["theirs/ours.xml", "elsewhere/ours.xml"])
+def test_volumes_of_nerg_are_copied(rgb, theirs, tmp_path, where):
+    path, out = theirs(text=NERG_THEIRS.replace("{light}", "")), tmp_path / where
+    out.parent.mkdir(exist_ok=True)
+    # Solid from x = 1 to 3; the camera is at x = 0.3.
+    write_volume(path.parent / "d.vol", np.full((4, 4, 4), 1e3), (1, -2, 2), (3, 2, 6))
+    scene = shown(path, out)
+    assert nest_scene(path, out.parent).left_out == ("aovs", "falloff", "gaze", "observer")
+    assert scene.integrator().id() == "integrator" and scene.integrator().gaze is None
+    views = nerg.Scene(scene)
+    rays = nerg.trace(views, [(0.3, 0, 4)] * 3, [(1, 0, 0), (0, 0, -1), (0, 0, 1)], ["depth", "color"])
+    np.testing.assert_allclose(rays.depth[:2], [0.7, 4], atol=0.01)
+    np.testing.assert_allclose(rays.color[2], 0.25, atol=1e-6)
+
+
+def test_light_in_nerg_takes_more_samples(theirs, tmp_path):
+    count = {}
+    for light in ("", '<integrator type="path"/>'):
+        count[light] = nest_scene(theirs(text=NERG_THEIRS.replace("{light}", light)), tmp_path).spp
+    assert count[""] < count['<integrator type="path"/>'] == nest_scene(theirs(), tmp_path).spp
+
+
 @pytest.mark.parametrize(
     "text, said",
     [
-        (THEIRS.replace("{kind}", "nerg").replace('<integer name="max_depth" value="2"/>', ""), 'already "nerg"'),
+        ('<scene version="3.0.0"><integrator type="moment"><integrator type="nerg"/></integrator></scene>', "within"),
         ('<scene version="3.0.0"><integrator type="path"/><integrator type="path"/></scene>', "has 2 integrators"),
         ('<scene version="3.0.0"><include filename="nowhere.xml"/></scene>', 'includes "nowhere.xml"'),
         ("<bsdf/>", "root element is <bsdf>"),
