@@ -26,6 +26,7 @@ from nerg_mi.fields.mlp import namespace
 from nerg_mi.fields.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import save_gaze, save_radiance
 from nerg_mi.maths.geometry import Box
+from nerg_mi.transport.mitsuba_mesh import pack_positions, positions_key, unpack_positions
 from timing import print_table
 
 import drjit as dr
@@ -237,8 +238,8 @@ def turn(mi, key, base, x):
 
 
 def vertices(mi, key, base, x):
-    p = dr.unravel(mi.Point3f, mi.Float(base))
-    return dr.ravel(p + mi.Vector3f(0.3 * x, -0.2 * x, x) * (1 + 0.2 * p.x))
+    p = unpack_positions(base)
+    return pack_positions(p + mi.Vector3f(0.3 * x, -0.2 * x, x) * (1 + 0.2 * p.x))
 
 
 def nets(prefix, *names):
@@ -272,9 +273,9 @@ def cases() -> list[Case]:
         Case("camera: turned", "field", ["sensor.to_world"], turn, 4e-3),
         Case("camera that is the observer", "field, own camera", ["sensor.to_world"], walk, 4e-3),
         Case("camera before shapes", "shapes", ["sensor.to_world"], walk, 4e-3),
-        Case("mesh: vertices", "shapes", ["slab.vertex_positions"], vertices, 4e-3),
-        Case("mesh: vertices of what hides it", "shapes", ["lid.vertex_positions"], vertices, 4e-3),
-        Case("mesh in a haze: vertices", "both", ["slab.vertex_positions"], vertices, 4e-3),
+        Case("mesh: vertices", "shapes", [f"slab.{positions_key()}"], vertices, 4e-3),
+        Case("mesh: vertices of what hides it", "shapes", [f"lid.{positions_key()}"], vertices, 4e-3),
+        Case("mesh in a haze: vertices", "both", [f"slab.{positions_key()}"], vertices, 4e-3),
         Case("sphere: to_world", "ball", ["ball.to_world"], walk, 4e-3),
         Case("shape: colour", "shapes", ["slab.bsdf.reflectance.value"], color, 2e-2),
     ]

@@ -37,11 +37,11 @@ from nerg_mi.ranges import COORDINATES
 from nerg_mi.rays.readers.tables import iterate_table
 from nerg_mi.rendering.bands import is_nerg
 from nerg_mi.rendering.scene import load_scene
-from nerg_mi.surfaces.mesh import mitsuba_mesh
 from nerg_mi.train import geometry
 from nerg_mi.train.gaze_data import SURFACE_OPACITY
 from nerg_mi.train.geometry import TrainingGeometry
 from nerg_mi.transport.geometry import SceneGeometry, default_march_settings, shape_corners, trace_depth
+from nerg_mi.transport.mitsuba_mesh import make_mesh, read_triangles
 from nerg_mi.transport.observer import ObserverSettings
 from nerg_mi.transport.observer_gaze import GazeFieldInstance, make_gaze_evaluator
 from nerg_mi.workflows.gaze_commands import GazeEvaluationOptions
@@ -331,7 +331,7 @@ def _make_part_mesh(part: MeshPart, mesh: MeshFile) -> Any:
     """Create a mesh of the faces of ``part``, whose numbers refer to the file of the mesh."""
     faces = mesh.faces[part.select_faces(int(mesh.polygons.max()) + 1)[mesh.polygons]]
     used, index = np.unique(faces, return_inverse=True)
-    return mitsuba_mesh(mesh.vertices[used], index.reshape(-1, 3), part.name)
+    return make_mesh(mesh.vertices[used], index.reshape(-1, 3), part.name)
 
 
 # ---- What-if changes ----
@@ -540,24 +540,21 @@ def apply_to_scene(
 
 
 def _move_shape(shape: Any, move: Move) -> Any:
-    import mitsuba as mi
-
     if not shape.is_mesh():
         raise NergError(
             f'the shape "{sanitize(move.name, 40)}" is not a mesh and cannot be moved; "swap" it for a mesh'
         )
-    params: Any = mi.traverse(shape)
-    vertices = np.array(params["vertex_positions"], np.float64).reshape(-1, 3)
+    vertices, faces = read_triangles(shape)
     center = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
     c, s = np.cos(np.radians(move.rotation_degrees)), np.sin(np.radians(move.rotation_degrees))
     moved = (vertices - center) @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T + center + move.offset
-    return mitsuba_mesh(moved, np.array(params["faces"]).reshape(-1, 3), move.name)
+    return make_mesh(moved, faces, move.name)
 
 
 def _make_shape(new_shape: NewShape, meshes: Mapping[Path, MeshFile]) -> Any:
     if isinstance(new_shape.geometry, Path):
         mesh = meshes[new_shape.geometry]
-        return mitsuba_mesh(mesh.vertices, mesh.faces, new_shape.name)
+        return make_mesh(mesh.vertices, mesh.faces, new_shape.name)
     corner = lambda *bits: sum(b << k for k, b in enumerate(bits))
     faces = []
     for axis in range(3):
@@ -568,4 +565,4 @@ def _make_shape(new_shape: NewShape, meshes: Mapping[Path, MeshFile]) -> Any:
                 at[n][axis], at[n][u], at[n][v] = side, a, b
             q = [corner(*bits) for bits in at]
             faces += [[q[0], q[1], q[2]], [q[0], q[2], q[3]]]
-    return mitsuba_mesh(new_shape.geometry.vertices, np.array(faces), new_shape.name)
+    return make_mesh(new_shape.geometry.vertices, np.array(faces), new_shape.name)

@@ -229,13 +229,13 @@ def load_mesh_child(path: str | os.PathLike[str]) -> dict[str, Any] | MeshFile:
 
 def load_mesh(mesh: MeshFile, name: str) -> Any:
     """Return a mesh in memory as a Mitsuba shape with the id ``name``."""
-    from nerg_mi.surfaces.mesh import mitsuba_mesh
+    from nerg_mi.transport.mitsuba_mesh import add_attribute, make_mesh
 
     mesh = with_shading_normals(mesh)
-    shape = mitsuba_mesh(mesh.vertices, mesh.faces, name, _bsdf(mesh), mesh.normals)
+    shape = make_mesh(mesh.vertices, mesh.faces, name, mesh.normals, bsdf=_bsdf(mesh))
     attribute, colors = ("face_color", mesh.face_colors) if mesh.colors is None else ("vertex_color", mesh.colors)
     if colors is not None:
-        shape.add_attribute(attribute, 3, colors.astype(np.float32).ravel())
+        add_attribute(shape, attribute, colors)
     return shape
 
 
@@ -426,6 +426,8 @@ class _ContentWriter:
         self.path, self.written = path, []
 
     def make_node(self, name: str, value: Any, is_top: bool = False) -> Node:
+        from nerg_mi.transport.mitsuba_mesh import is_mesh, write_ply
+
         if isinstance(value, MeshFile):
             file = self._file(name, ".ply")
             write_mesh(file, with_shading_normals(value))
@@ -440,11 +442,11 @@ class _ContentWriter:
             return self._make_plugin(name, description, is_top)
         if isinstance(value, Mapping):
             return self._make_plugin(name, value, is_top)
-        if hasattr(value, "write_ply"):
+        if is_mesh(value):
             # A mesh of Mitsuba does not tell the parameters of its material.
             file = self._file(name, ".ply")
             with replace_atomically(file) as temporary:
-                value.write_ply(str(temporary))
+                write_ply(value, temporary)
             self.written.append(file)
             grey = {"type": "twosided", "bsdf": {"type": "diffuse"}}
             return self._make_plugin(name, {"type": "ply", "filename": str(file), "bsdf": grey}, is_top)

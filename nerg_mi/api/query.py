@@ -683,11 +683,11 @@ def _compute_density(scene: Scene, position: Floats, pieces: Any, two_sided: boo
 
 def _choose_divisions(mesh: Any, positions: Floats) -> int:
     """Choose a power of two, so that meshes of different sizes share kernels."""
-    import mitsuba as mi
+    from nerg_mi.transport.mitsuba_mesh import is_mesh, read_triangles
 
-    if not isinstance(mesh, mi.Mesh):
+    if not is_mesh(mesh):
         return 1  # an error is raised later
-    vertices, faces = (np.reshape(np.array(v), (-1, 3)) for v in (mesh.vertex_positions_buffer(), mesh.faces_buffer()))
+    vertices, faces = read_triangles(mesh)
     corners = vertices[faces]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max()
     distances = np.maximum(np.maximum(corners.min((0, 1)) - positions, positions - corners.max((0, 1))), 0)

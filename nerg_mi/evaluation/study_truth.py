@@ -14,6 +14,7 @@ from nerg_mi.maths.geometry import intersect_box_numpy
 from nerg_mi.maths.types import variant_types
 from nerg_mi.transport.depth import DEPTHS
 from nerg_mi.transport.geometry import SceneGeometry
+from nerg_mi.transport.mitsuba_mesh import read_triangles
 from nerg_mi.transport.observer_gaze import ObservedGaze
 
 from . import metrics
@@ -339,8 +340,6 @@ def extract_triangles(scene) -> np.ndarray:
     """Extract the corners (N, 3, 3), float64, of all shapes of a Mitsuba scene. Raises `NergError` for a shape that is
     not a mesh.
     """
-    import mitsuba as mi
-
     parts = []
     for shape in scene.shapes():
         if not shape.is_mesh():
@@ -348,9 +347,8 @@ def extract_triangles(scene) -> np.ndarray:
                 f"a study of shapes supports only meshes, and this scene has a {shape.class_name()}; convert it to "
                 "triangles"
             )
-        params = mi.traverse(shape)
-        corners = np.array(params["vertex_positions"], float).reshape(-1, 3)
-        parts.append(corners[np.array(params["faces"], int).reshape(-1, 3)])
+        vertices, faces = read_triangles(shape)
+        parts.append(vertices[faces])
     return np.concatenate(parts)
 
 

@@ -23,6 +23,7 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.maths.types import Bool, Float, Point3f, Vector3f, variant_types
 from nerg_mi.transport.geometry import SceneGeometry, default_march_settings
+from nerg_mi.transport.mitsuba_mesh import count_faces, gather_corners, is_mesh
 from nerg_mi.transport.observer import ObserverSettings, distance_and_direction
 from nerg_mi.transport.occlusion import trace_from_observer
 
@@ -49,26 +50,22 @@ class Patches:
         return Patches(self.p + offset, self.n, self.area)
 
 
-def make_patches(mesh: mi.Mesh, divisions: int = 4) -> Patches:
+def make_patches(mesh: mi.Shape, divisions: int = 4) -> Patches:
     """Divide each triangle of a Mitsuba mesh into ``divisions``² congruent patches: the centroid rule, of second order.
 
     The normals are the face normals, on the side that sees the vertices counter-clockwise. The patches are
-    differentiable with respect to ``vertex_positions`` of the mesh, or ``to_world`` of a rectangle. Raises `NergError`
+    differentiable with respect to the vertices of the mesh, or ``to_world`` of a rectangle. Raises `NergError`
     if the shape is not a mesh, ``ValueError`` if ``divisions`` is below 1.
     """
     mi = variant_types()
-    if not isinstance(mesh, mi.Mesh):
+    if not is_mesh(mesh):
         raise NergError(f'"{mesh.id()}" is not a mesh; use a mesh shape (cube, rectangle, ply, obj)')
     if divisions < 1:
         raise ValueError(f"divisions must be at least 1, got {divisions}")
-    # Not read from its parameters, because a rectangle only exposes its transform.
-    positions, faces = mesh.vertex_positions_buffer(), mi.UInt32(mesh.faces_buffer())
     centre = _centroids(divisions)
-    count = len(faces) // 3
-    index = dr.arange(mi.UInt32, count * len(centre))
+    index = dr.arange(mi.UInt32, count_faces(mesh) * len(centre))
     face, piece = index // len(centre), index % len(centre)
-    corners = [dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, faces, 3 * face + k)) for k in range(3)]
-    a, b, c = corners
+    a, b, c = gather_corners(mesh, face)
     u, v = (dr.gather(mi.Float, mi.Float(np.ascontiguousarray(centre[:, k])), piece) for k in range(2))
     across = dr.cross(b - a, c - a)
     double_area = dr.norm(across)

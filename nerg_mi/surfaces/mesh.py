@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -16,6 +16,7 @@ from nerg_mi.maths.coordinates import check_coordinates
 from nerg_mi.maths.types import variant_types
 from nerg_mi.transport.geometry import SceneGeometry, default_march_settings
 from nerg_mi.transport.medium import Medium
+from nerg_mi.transport.mitsuba_mesh import make_mesh
 from nerg_mi.transport.observer import ObserverSettings
 
 # ---- Mesh ----
@@ -146,19 +147,6 @@ def _unique_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     number = np.empty(len(rows), np.int64)
     number[order] = np.cumsum(new) - 1
     return order[new], number
-
-
-# ---- Shapes of Mitsuba scenes ----
-
-Triangles = tuple[np.ndarray, np.ndarray]  # vertices (V, 3) float64 and faces (F, 3) int64
-
-
-def shape_triangles(shape: Any) -> Triangles | None:
-    """Return the triangles of a shape in scene coordinates; None if it is not a mesh."""
-    if not shape.is_mesh():
-        return None
-    vertices = np.array(shape.vertex_positions_buffer(), np.float64).reshape(-1, 3)
-    return vertices, np.array(shape.faces_buffer(), np.int64).reshape(-1, 3)
 
 
 # ---- Refinement ----
@@ -298,8 +286,8 @@ class SurfaceTarget:
         import mitsuba as mi
 
         self.mesh, self.falloff = mesh, falloff
-        self._shape = mitsuba_mesh(mesh.vertices, mesh.faces, "surface")
-        occluder_shapes = {f"other_{k}": mitsuba_mesh(v, f, f"other_{k}") for k, (v, f) in enumerate(occluders or ())}
+        self._shape = make_mesh(mesh.vertices, mesh.faces, "surface")
+        occluder_shapes = {f"other_{k}": make_mesh(v, f, f"other_{k}") for k, (v, f) in enumerate(occluders or ())}
         scene: Any = mi.load_dict({"type": "scene", "surface": self._shape, **occluder_shapes}, optimize=False)
         # The scene may wrap the shape in another object.
         self._shape = next(shape for shape in scene.shapes() if shape.id() == "surface")
@@ -358,33 +346,6 @@ class SurfaceTarget:
         barycentric = np.stack([1 - u - v, u, v], axis=1)
         face = np.where(is_on_surface, np.array(prim).astype(np.int64), -1)
         return RayEnds(face, np.where(is_on_surface[:, None], barycentric, 0.0), is_hit & ~is_on_surface)
-
-
-def mitsuba_mesh(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    name: str,
-    bsdf: Mapping[str, Any] | None = None,
-    normals: np.ndarray | None = None,
-) -> Any:
-    """Create a Mitsuba mesh in the active variant, with the id ``name`` and a ``bsdf`` given as a dict.
-
-    ``normals`` (V, 3): of the vertices; None: flat faces.
-    """
-    import mitsuba as mi
-
-    props = mi.Properties()
-    props.set_id(name)
-    if bsdf is not None:
-        props["bsdf"] = mi.load_dict(dict(bsdf))
-    mesh: Any = mi.Mesh(name, len(vertices), len(faces), props=props, has_vertex_normals=normals is not None)
-    params: Any = mi.traverse(mesh)
-    params["vertex_positions"] = np.ravel(vertices).astype(np.float32)
-    params["faces"] = np.ravel(faces).astype(np.uint32)
-    if normals is not None:
-        params["vertex_normals"] = np.ravel(normals).astype(np.float32)
-    params.update()
-    return mesh
 
 
 # ---- Textures ----
@@ -458,7 +419,7 @@ def iter_texture_rows(
     corners = np.einsum("fij,fjk->fik", refined.barycentric, charts.uv[charts.faces[refined.parent]])
     flat = np.concatenate([corners, np.zeros((*corners.shape[:2], 1))], axis=2).reshape(-1, 3)
     # Find the triangle under the centre of each texel by a ray cast.
-    sheet = mitsuba_mesh(flat, np.arange(len(flat)).reshape(-1, 3), "charts")
+    sheet = make_mesh(flat, np.arange(len(flat)).reshape(-1, 3), "charts")
     scene: Any = mi.load_dict({"type": "scene", "charts": sheet})
     center = (np.arange(pixels) + 0.5) / pixels
     is_empty = True

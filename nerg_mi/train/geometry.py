@@ -22,9 +22,9 @@ from nerg_mi.ranges import LENGTHS, check_number
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.files import check_vol
 from nerg_mi.rendering.scene import load_scene
-from nerg_mi.surfaces.mesh import mitsuba_mesh
 from nerg_mi.transport.field_medium import FieldMedium
 from nerg_mi.transport.geometry import SceneGeometry
+from nerg_mi.transport.mitsuba_mesh import make_mesh
 from nerg_mi.transport.splat_medium import SplatArrays, SplatMedium
 from nerg_mi.transport.volume_medium import VolumeMedium
 
@@ -421,7 +421,7 @@ def _load_mesh_scene(path: Path) -> tuple[Any, tuple[str, ...]]:
         raise NergError(f'"{path}" contains Gaussian splats, not a mesh; pass it with --field')
     mesh = read_mesh_file(path)
     with translate_mitsuba_errors(path):
-        return mi.load_dict({"type": "scene", "mesh": mitsuba_mesh(mesh.vertices, mesh.faces, "mesh")}), mesh.notes
+        return mi.load_dict({"type": "scene", "mesh": make_mesh(mesh.vertices, mesh.faces, "mesh")}), mesh.notes
 
 
 def make_hit_geometry(rays: Rays, path: Path, voxel: float | None = None) -> TrainingGeometry:

@@ -20,6 +20,7 @@ from .depth import DEPTHS, find_surface_depth, penetration_depth
 from .march import march_with_prepass
 from .march_primal import MarchResult, MarchSettings, default_color_cutoff, default_dt_gamma, default_step, default_stop
 from .medium import Medium
+from .mitsuba_mesh import count_faces, read_vertices
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -250,7 +251,7 @@ def check_shape(shape: Any, context: str = "", check_merged: bool = False) -> No
     ``context``: suffix of the message that names the scene. ``check_merged``: whether meshes that Mitsuba has merged,
     which have no bounding box, are checked by their vertices, which are computed for this purpose.
     """
-    if shape.is_mesh() and shape.face_count() == 0:
+    if shape.is_mesh() and count_faces(shape) == 0:
         # Mitsuba 3.9.1 builds a scene with such a mesh but cannot shade it.
         raise NergError(f'the mesh "{shape.id()}"{context} has no faces; remove it from the scene')
     if check_merged or shape.bbox().valid() or not shape.is_mesh():
@@ -265,9 +266,7 @@ def shape_corners(shape: mi.Shape) -> tuple[np.ndarray, np.ndarray]:
     if box.valid() or not shape.is_mesh():
         return np.array(box.min), np.array(box.max)
     # Mitsuba 3.9.1 does not set the bounding boxes of meshes that it has merged.
-    import mitsuba as mi
-
-    vertices = np.asarray(mi.traverse(shape)["vertex_positions"]).reshape(-1, 3)
+    vertices = read_vertices(shape)
     return vertices.min(0), vertices.max(0)
 
 

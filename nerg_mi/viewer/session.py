@@ -26,6 +26,7 @@ from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.nested_scene import FIELD_PROPERTY, find_field_file, replace_radiance_field
 from nerg_mi.rendering.scene import load_scene
 from nerg_mi.transport.geometry import Ceiling
+from nerg_mi.transport.mitsuba_mesh import count_faces
 from nerg_mi.workflows.render import describe_basis
 from nerg_mi.workflows.scene_cameras import check_point
 from nerg_mi.workflows.scene_commands import ViewOptions
@@ -119,7 +120,7 @@ def iter_attention_shares(
 
 def group_shapes(scene: Scene, shapes: Sequence[str]) -> Iterator[list[str]]:
     """Group the mesh ids ``shapes`` so that each group has at most `MAX_FACES_PER_STEP` faces or is a single mesh."""
-    faces = {shape.id(): shape.face_count() for shape in scene.mitsuba.shapes() if shape.is_mesh()}
+    faces = {shape.id(): count_faces(shape) for shape in scene.mitsuba.shapes() if shape.is_mesh()}
     group: list[str] = []
     for name in shapes:
         if group and sum(faces[n] for n in [*group, name]) > MAX_FACES_PER_STEP:

@@ -32,16 +32,7 @@ from nerg_mi.rays.readers.tables import iterate_table, read_table_columns
 from nerg_mi.rendering.bands import is_nerg
 from nerg_mi.rendering.scene import load_scene
 from nerg_mi.surfaces.laplacian import SurfaceSums
-from nerg_mi.surfaces.mesh import (
-    SURFACE_OPACITY,
-    Mesh,
-    RefinedMesh,
-    SurfaceTarget,
-    Triangles,
-    refine,
-    shape_triangles,
-    weld_mesh,
-)
+from nerg_mi.surfaces.mesh import SURFACE_OPACITY, Mesh, RefinedMesh, SurfaceTarget, refine, weld_mesh
 from nerg_mi.surfaces.sources import (
     WEIGHTINGS,
     GazeSumSettings,
@@ -60,6 +51,7 @@ from nerg_mi.surfaces.splats import integrate_gaze, shortest_axes, splat_densiti
 from nerg_mi.tasks.engines import TaskOutput, prepare_once
 from nerg_mi.tasks.task import RENDER_LIBRARIES, Part, Plan
 from nerg_mi.transport.geometry import SceneGeometry, default_march_settings
+from nerg_mi.transport.mitsuba_mesh import Triangles, read_triangles
 from nerg_mi.transport.observer import ObserverSettings
 from nerg_mi.transport.observer_gaze import GazeFieldInstance
 from nerg_mi.transport.splat_medium import SplatArrays, SplatMedium
@@ -389,12 +381,12 @@ def _read_scene_target(path: Path, shapes: tuple[str, ...]) -> tuple[dict[str, T
         raise NergError(f'the scene "{path}" has no shapes; give a mesh, a radiance field or splats as the target')
     targets, occluders = {}, []
     for name, shape in every.items():
-        triangles = shape_triangles(shape)
-        if triangles is None:
+        if not shape.is_mesh():
             raise NergError(
                 f'the shape "{name}" of "{path}" is a {shape.class_name()}, which has no triangles; replace it by '
                 "a mesh"
             )
+        triangles = read_triangles(shape)
         if shapes and name not in shapes:
             occluders.append(triangles)
         else:

@@ -32,7 +32,8 @@ from nerg_mi.formats.splats import is_splat_file
 from nerg_mi.maths.arrays import to_vector
 from nerg_mi.rendering.bands import SURFACE_OPACITY
 from nerg_mi.rendering.scene import activate_variant
-from nerg_mi.surfaces.mesh import Mesh, mitsuba_mesh
+from nerg_mi.surfaces.mesh import Mesh
+from nerg_mi.transport.mitsuba_mesh import make_mesh
 
 from .base import SILENT, Reporter, import_function
 from .draw_scenes import Drawing
@@ -247,7 +248,7 @@ def _trace_mesh(mesh: Mesh, values: np.ndarray, up: np.ndarray, options: BakedFi
     x, y = np.meshgrid((np.arange(w) + 0.5) / w * 2 - 1, (1 - (np.arange(h) + 0.5) / h * 2) * h / w)
     d = (ahead + half * (x[..., None] * across + y[..., None] * rise)).reshape(-1, 3)
     d /= np.linalg.norm(d, axis=1, keepdims=True)
-    mesh_shape = mitsuba_mesh(mesh.vertices, mesh.faces, "surface")
+    mesh_shape = make_mesh(mesh.vertices, mesh.faces, "surface")
     scene: mi.Scene = mi.load_dict({"type": "scene", "surface": mesh_shape})
     ray = mi.Ray3f(mi.Point3f(*eye.tolist()), to_vector(mi.Vector3f, d))
     intersection = scene.ray_intersect_preliminary(ray)

@@ -37,6 +37,7 @@ from nerg_mi.rendering.bands import is_nerg, render_aovs
 from nerg_mi.rendering.scene import activate_variant, load_scene
 from nerg_mi.transport.field_medium import FieldMedium
 from nerg_mi.transport.geometry import pixel_directions
+from nerg_mi.transport.mitsuba_mesh import read_attribute, read_triangles
 from nerg_mi.transport.observer import sensor_center
 
 from .base import SILENT, Reporter, select_backend
@@ -225,12 +226,7 @@ def _add_scene(scene: ExchangeScene, path: Path, options: SceneExportOptions, re
 
 
 def _shape(shape: Any) -> ExchangeMesh:
-    import mitsuba as mi
-
-    params: Any = mi.traverse(shape)
-    vertices = np.array(params["vertex_positions"], np.float64).reshape(-1, 3)
-    colors = np.array(params["vertex_color"]).reshape(-1, 3) if "vertex_color" in params else None
-    return ExchangeMesh(shape.id() or "mesh", vertices, np.array(params["faces"], np.int64).reshape(-1, 3), colors)
+    return ExchangeMesh(shape.id() or "mesh", *read_triangles(shape), read_attribute(shape, "vertex_color"))
 
 
 def _camera(sensor: Any, name: str) -> ExchangeCamera:

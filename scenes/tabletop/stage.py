@@ -8,6 +8,7 @@ from nerg_mi.scenes.tabletop.layout import MATERIALS, Material, TabletopLayout, 
 from nerg_mi.scenes.tabletop.mesh import Mesh
 
 from nerg_mi.maths.color import decode_srgb
+from nerg_mi.transport.mitsuba_mesh import make_mesh
 
 # Reflectances exclude black and white: light stays soft, and every texel has a gradient.
 _ALBEDO = (0.02, 0.8)
@@ -58,26 +59,11 @@ def _make_shape(name: str, mesh: Mesh, material: Material, seed: int):
     bsdf = {"type": "diffuse", "reflectance": texture}
     if material.gloss:
         bsdf = {"type": "roughplastic", "diffuse_reflectance": texture, "alpha": 0.15, "nonlinear": False}
-    props = mi.Properties()
-    props["bsdf"] = mi.load_dict({"type": "twosided", "bsdf": bsdf})
+    children: dict[str, dict] = {"bsdf": {"type": "twosided", "bsdf": bsdf}}
     if material.radiance is not None:
-        props["emitter"] = mi.load_dict(
-            {
-                "type": "area",
-                "radiance": {"type": "rgb", "value": list(material.radiance)},
-                "sampling_weight": material.sampling_weight,
-            }
-        )
-    shape = mi.Mesh(
-        name, len(mesh.points), len(mesh.faces), props=props, has_vertex_normals=True, has_vertex_texcoords=True
-    )
-    params = mi.traverse(shape)
-    for key, values in (
-        ("vertex_positions", mesh.points),
-        ("vertex_normals", mesh.normals),
-        ("vertex_texcoords", mesh.uv),
-    ):
-        params[key] = np.ascontiguousarray(values, np.float32).ravel()
-    params["faces"] = np.ascontiguousarray(mesh.faces, np.uint32).ravel()
-    params.update()
-    return shape
+        children["emitter"] = {
+            "type": "area",
+            "radiance": {"type": "rgb", "value": list(material.radiance)},
+            "sampling_weight": material.sampling_weight,
+        }
+    return make_mesh(mesh.points, mesh.faces, name, mesh.normals, mesh.uv, **children)

@@ -26,7 +26,7 @@ from nerg_mi.files.tables import write_csv
 from nerg_mi.formats.areas import AreaGroup, AreaSet, MeshPart, Region, SceneShape
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.rendering.scene import load_scene
-from nerg_mi.surfaces.mesh import mitsuba_mesh
+from nerg_mi.transport.mitsuba_mesh import make_mesh
 
 from .place import SIGN, STAND, first_box, people, write_place
 
@@ -318,6 +318,6 @@ def test_meshes_keep_their_names_in_a_scene():
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
-    mesh = mitsuba_mesh(np.eye(3), np.array([[0, 1, 2]]), "tri")
+    mesh = make_mesh(np.eye(3), np.array([[0, 1, 2]]), "tri")
     before = mesh.id()
     assert len(scene_from_shapes({"tri": mesh}).shapes()) == 1 and mesh.id() == before

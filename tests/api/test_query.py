@@ -12,6 +12,7 @@ from nerg_mi.measures.shares import COARSE, gaze_shares
 from nerg_mi.measures.visits import MARGIN, BoxAoi
 from nerg_mi.reports.data import GazeSampler
 from nerg_mi.train.geometry import TrainingGeometry
+from nerg_mi.transport.mitsuba_mesh import make_mesh
 from nerg_mi.workflows.statistics import statistics
 from tests.aoi.place import SIGN, STAND, write_place
 from tests.pictures import box_dict
@@ -104,11 +105,7 @@ def test04_a_shape_of_the_scene_by_its_id(files, rgb, tmp_path):
 
 
 def test05_both_sides_of_an_open_surface(empty, rgb):
-    mesh = rgb.Mesh("sheet", 3, 1)
-    params = rgb.traverse(mesh)
-    params["vertex_positions"] = np.float32([0, 2, 0, 0.3, 2, 0, 0, 2, 0.3])
-    params["faces"] = np.uint32([0, 1, 2])
-    params.update()
+    mesh = make_mesh(np.array([(0, 2, 0), (0.3, 2, 0), (0, 2, 0.3)]), np.array([(0, 1, 2)]), "sheet")
     observers = [(0, 0, 0), (0, 4, 0)]
     one, both = (nerg.attention(empty, mesh, observers, two_sided=t).share for t in (False, True))
     assert (one > 0).sum() == 1 and (both > 0).all() and np.allclose(one[one > 0], both[one > 0])

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.evaluation.study import count_traced_operations
+from nerg_mi.transport.mitsuba_mesh import pack_positions, positions_key, unpack_positions
 
 from .scenes import (
     GAZE,
@@ -246,11 +247,11 @@ def test12_depth_follows_a_moving_shape(rgb, depth, veiled):
     how = {"aovs": "depth", "depth": depth}
     integrator = constant(0.2, **how) if veiled else plugin("nerg", **how)
     scene = scene_with(rgb, integrator, still(camera(rgb, size=6, fov=8)), cube=mesh)
-    params, key = rgb.traverse(scene), "cube.vertex_positions"
-    start = rgb.Point3f(dr.unravel(rgb.Point3f, rgb.Float(params[key])))
+    params, key = rgb.traverse(scene), f"cube.{positions_key()}"
+    start = rgb.Point3f(unpack_positions(params[key]))
 
     def image(z):
-        put(params, key, dr.ravel(start + rgb.Vector3f(0, 0, z)))
+        put(params, key, pack_positions(start + rgb.Vector3f(0, 0, z)))
         return rgb.render(scene, params, spp=1)[..., 3]
 
     z, h = rgb.Float(0), 1e-2

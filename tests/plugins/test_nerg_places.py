@@ -5,6 +5,8 @@ import drjit as dr
 import numpy as np
 import pytest
 
+from nerg_mi.transport.mitsuba_mesh import positions_key
+
 from .scenes import (
     camera,
     channels,
@@ -229,9 +231,9 @@ def mover(mi, name):
         return {"group": group, "it": instance}, "it.to_world", {"group": group, "it": {**instance, "to_world": t}}
     if name == "group":
         after = {**group, "cube": {"type": "cube", "to_world": t}}
-        return {"group": group, "it": instance}, "group.cube.vertex_positions", {"group": after, "it": instance}
+        return {"group": group, "it": instance}, f"group.cube.{positions_key()}", {"group": after, "it": instance}
     if name == "mesh":
-        return {"it": {"type": "cube"}}, "it.vertex_positions", {"it": {"type": "cube", "to_world": t}}
+        return {"it": {"type": "cube"}}, f"it.{positions_key()}", {"it": {"type": "cube", "to_world": t}}
     return {"it": {"type": name}}, "it.to_world", {"it": {"type": name, "to_world": t}}
 
 

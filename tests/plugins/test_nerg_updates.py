@@ -9,6 +9,7 @@ from nerg_mi.formats.fields import save_gaze
 from nerg_mi.rays.rays import Rays
 from nerg_mi.registration import get_plugin_class
 from nerg_mi.transport import observer, volume_medium
+from nerg_mi.transport.mitsuba_mesh import positions_key
 from tests.formats.splats.writers import random_splats
 
 from . import fields
@@ -250,7 +251,7 @@ FROZEN = {
     "transmittance": (lambda mi, files: scene_of(mi, files, visibility="transmittance"), OBSERVER, moved),
     "normalized": (normalized_scene, OBSERVER, moved),
     "grid": (lambda mi, files: grid_scene(mi), "integrator.density.data", sheet),
-    "mesh": (cube_scene, "cube.vertex_positions", shifted),
+    "mesh": (cube_scene, "cube.{positions}", shifted),
     "splats": (lambda mi, files: splat_scene(mi), "integrator.field.centers", shifted),
 }
 
@@ -258,6 +259,7 @@ FROZEN = {
 @pytest.mark.parametrize("what", list(FROZEN))
 def test10_replays_match_traced_calls(rgb, files, what):
     make, key, change = FROZEN[what]
+    key = key.format(positions=positions_key())
     scene = make(rgb, files)
     params = rgb.traverse(scene)
     start = type(params[key])(params[key])

@@ -6,6 +6,7 @@ import pytest
 
 from nerg_mi.probes.surface_attention import Patches, attention_on, attention_per_patch, make_patches
 from nerg_mi.transport.geometry import SceneGeometry, pixel_solid_angles
+from nerg_mi.transport.mitsuba_mesh import make_mesh, pack_positions, positions_key, unpack_positions
 from tests.plugins import fields
 from tests.plugins.scenes import camera
 
@@ -14,17 +15,9 @@ def uniform(p_od, p_o, r_o, active):
     return type(p_o.x)(1 / (4 * np.pi))
 
 
-def mesh(mi, corners, faces):
-    out = mi.Mesh("sheet", len(corners), len(faces))
-    params = mi.traverse(out)
-    params["vertex_positions"] = np.ravel(corners).astype(np.float32)
-    params["faces"] = np.ravel(faces).astype(np.uint32)
-    params.update()
-    return out
-
-
 def sheet(mi, a=0.6, b=0.4, z=0.0):
-    return mesh(mi, [(-a, -b, z), (a, -b, z), (a, b, z), (-a, b, z)], [(0, 1, 2), (0, 2, 3)])
+    corners = [(-a, -b, z), (a, -b, z), (a, b, z), (-a, b, z)]
+    return make_mesh(np.array(corners), np.array([(0, 1, 2), (0, 2, 3)]), "sheet")
 
 
 def solid_angle(a, b, p):
@@ -90,11 +83,11 @@ def test05_inside_a_box_attention_sums_to_one(rgb):
 def test06_occluders_hide_surfaces(rgb):
     # A plate over x < 0 halfway to the observer hides the part of z = 0 below it.
     plate = sheet(rgb, 10, 10, 0.5)
-    vertices = rgb.traverse(plate)
-    vertices["vertex_positions"] = np.ravel([(-10, -10, 0.5), (0, -10, 0.5), (0, 10, 0.5), (-10, 10, 0.5)]).astype(
-        np.float32
-    )
-    vertices.update()
+    params, key = rgb.traverse(plate), positions_key()
+    points = unpack_positions(params[key])
+    points.x = dr.minimum(points.x, 0)
+    params[key] = pack_positions(points)
+    params.update()
     place = SceneGeometry(None, rgb.load_dict({"type": "scene", "plate": plate}))
     eye, surface = rgb.Point3f(0, 0, 1), make_patches(sheet(rgb), 8)
     each = attention_per_patch(place, uniform, eye, surface).numpy()
@@ -160,7 +153,7 @@ def test10_derivatives_of_vertices_and_of_the_fall_off(rgb):
     params = rgb.traverse(plate)
     scale, falloff = rgb.Float(1), rgb.Float(0.5)
     dr.enable_grad(scale, falloff)
-    params["vertex_positions"] = scale * rgb.Float(params["vertex_positions"])
+    params[positions_key()] = pack_positions(scale * unpack_positions(params[positions_key()]))
     params.update()
     dr.backward(attention_on(None, uniform, rgb.Point3f(0, 0, 1), make_patches(plate, 24)))
     ends = [solid_angle(0.6 * s, 0.4 * s, (0, 0, 1)) / (4 * np.pi) for s in (1.0001, 0.9999)]

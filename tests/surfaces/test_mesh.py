@@ -8,7 +8,7 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.surfaces import mesh
-from nerg_mi.surfaces.mesh import SurfaceTarget, iter_texture_rows, refine, shape_triangles, unwrap_uv, weld_mesh
+from nerg_mi.surfaces.mesh import SurfaceTarget, iter_texture_rows, refine, unwrap_uv, weld_mesh
 from nerg_mi.transport.volume_medium import VolumeMedium
 from tests.surfaces.meshes import box, joined, longest_edge, plate
 
@@ -48,21 +48,6 @@ def test_meshes_without_area_are_refused():
         weld_mesh([(0, 0, 0), (0, 0, 1.1e7), (1, 0, 0)], [(0, 1, 2)])
     with pytest.raises(NergError, match="no face with an area"):
         weld_mesh([(0, 0, 0), (1, 0, 0), (2, 0, 0)], [(0, 1, 2)])
-
-
-# ---- Shapes of scenes as triangles ----
-
-
-def test_triangles_of_scene_shapes(rgb):
-    flat = rgb.load_dict(
-        {"type": "rectangle", "to_world": rgb.ScalarTransform4f().translate([1, 2, 3]).scale([2, 1, 1])}
-    )
-    vertices, faces = shape_triangles(flat)
-    assert np.allclose(sorted(map(tuple, vertices)), [(-1, 1, 3), (-1, 3, 3), (3, 1, 3), (3, 3, 3)])
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    assert np.allclose(np.cross(b - a, c - a).sum(axis=0), [0, 0, 16])
-    assert len(shape_triangles(rgb.load_dict({"type": "cube"}))[1]) == 12
-    assert shape_triangles(rgb.load_dict({"type": "sphere"})) is None
 
 
 # ---- Refinement ----
