@@ -161,6 +161,64 @@ def test08_entry_points():
         importlib.reload(module)  # what Mitsuba after 3.9 does when the variant changes
 
 
+AUTOLOAD = """
+    import importlib, importlib.metadata, sys, warnings
+    import mitsuba as mi
+
+    warnings.simplefilter("error")
+    modules = []
+
+    def load_plugins():
+        '''Double of Mitsuba after 3.9: import at the first variant, reload at later ones. Errors end the test.'''
+        for module in modules:
+            importlib.reload(module)
+        if not modules:
+            entries = importlib.metadata.entry_points(group="mitsuba")
+            entries = sorted((e for e in entries if e.name.startswith("nerg_")), key=lambda e: e.name)
+            modules.extend(importlib.import_module(e.value) for e in entries)
+
+    def activate(variant):
+        if order == "callbacks first" or "nerg_mi" not in sys.modules:
+            mi.set_variant(variant)
+            load_plugins()
+        else:
+            from nerg_mi import registration
+            mi.detail.remove_variant_callback(registration._on_variant)
+            old = mi.variant()
+            mi.set_variant(variant)
+            load_plugins()
+            registration._on_variant(old, variant)
+
+    def load(kind):
+        try:
+            return mi.load_dict(kind)
+        except RuntimeError as error:
+            return str(error)
+
+    for variant in variants:
+        activate(variant)
+        from nerg_mi.registration import get_plugin_class
+        nerg = load({"type": "nerg", "density": {"type": "constvolume"}})
+        field = load({"type": "nerg", "field": {"type": "nerf", "filename": "nowhere"}})
+        sensor = load({"type": "panorama"})
+        if variant.startswith("scalar"):
+            assert "needs a variant with compiled kernels" in nerg and "needs a variant" in sensor, (nerg, sensor)
+        else:
+            assert type(nerg) is get_plugin_class("nerg") and nerg.variant_name() == variant, nerg
+            assert type(sensor) is get_plugin_class("panorama") and "does not exist" in field, (sensor, field)
+    print("done")
+"""
+
+
+@pytest.mark.parametrize("order", ["callbacks first", "plugins first"])
+@pytest.mark.parametrize(
+    "variants", [("llvm_ad_rgb", "scalar_rgb", "llvm_ad_mono", "llvm_ad_rgb"), ("scalar_spectral", "llvm_ad_rgb")]
+)
+def test27_autoloaded_plugins_are_registered_twice_without_harm(order, variants):
+    """The caller does not import nerg_mi. Mitsuba reloads the modules, and so does the callback of nerg_mi."""
+    assert "done" in run(f"order, variants = {order!r}, {variants!r}\n" + textwrap.dedent(AUTOLOAD))
+
+
 def test09_broken_plugin_is_reported():
     done = subprocess.run(
         [
@@ -364,6 +422,14 @@ def test25_verdict(monkeypatch, backend_state, verdict):
     result = diagnosis.run_diagnosis()
     assert result.is_usable is (backend_state is WORKS) and verdict in str(result)
     assert ("it died" in str(result)) is (backend_state is NO_FINDINGS)
+
+
+@pytest.mark.parametrize("version, is_tested", [("3.9.1", True), ("3.10.0", False), (None, True)])
+def test28_untested_mitsuba_is_reported(monkeypatch, version, is_tested):
+    monkeypatch.setattr(diagnosis, "try_backend", lambda backend: WORKS)
+    monkeypatch.setattr(llvm, "has_cuda", lambda: False)
+    monkeypatch.setattr(diagnosis, "_version", lambda name: version)
+    assert (diagnosis.run_diagnosis().findings[0].problem == "") is is_tested
 
 
 @pytest.mark.parametrize("version, old", [([12, 4], True), ([12, 8], False), ([13, 0], False)])

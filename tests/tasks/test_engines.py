@@ -217,8 +217,10 @@ def test_two_processes_work_at_once_with_their_threads(store, tmp_path, runs):
     plan = works.make_plan(4, (tmp_path / "a",), seconds=0.5, runs=runs)
     assert read_outputs(plan, store, ProcessEngine(2)) == [works.expected(k, (tmp_path / "a",)) for k in range(4)]
     assert len({path.name.split("-")[1] for path in runs.iterdir()}) == 2
-    (made,) = run_plan(works.make_small_plan("threads"), store, ProcessEngine(1, threads=1))
+    made, scene = run_plan(works.make_small_plan("threads", "plugin"), store, ProcessEngine(1, threads=1))
     assert made.notes == {"threads": 1} and dr.thread_count() >= 1
+    # The part imports Mitsuba only.
+    assert scene.notes == {"plugin": "NergIntegrator"}
 
 
 def test_dead_process_is_replaced(store, tmp_path, runs):
@@ -319,8 +321,8 @@ def test_cluster_reports_errors_and_limits_threads(cluster, tmp_path, monkeypatc
         read_outputs(works.make_small_plan("fault"), store, engine)
     with pytest.raises(NergError, match="the part deadly was started by several workers"):
         read_outputs(works.make_small_plan("deadly"), store, engine)
-    (made,) = run_plan(works.make_small_plan("threads"), store, engine)
-    assert made.notes == {"threads": 1}
+    made, scene = run_plan(works.make_small_plan("threads", "plugin"), store, engine)
+    assert made.notes == {"threads": 1} and scene.notes == {"plugin": "NergIntegrator"}
     folders = list(run_plan(works.folders(5), store, engine))
     assert (folders[0].path / "below" / "b.txt").is_file() and folders[0].notes == {}
     plan = works.make_small_plan("b")

@@ -68,6 +68,13 @@ def write_mixture(common: Any, value: str, output: Path) -> dict[str, Any] | Non
 
         write_text(output, "")
         return {"threads": dr.thread_count()}
+    if value == "plugin":
+        import mitsuba as mi
+
+        mi.set_variant("llvm_ad_rgb")
+        nerg = mi.load_dict({"type": "scene", "i": {"type": "nerg", "density": {"type": "constvolume"}}}).integrator()
+        write_text(output, "")
+        return {"plugin": type(nerg).__name__}
     if value.startswith("term "):
         # The sum of the terms depends on their order.
         number = int(value.removeprefix("term "))
