@@ -26,6 +26,9 @@ EXTRAS = {
 }
 """Optional distributions, each with its purpose and the command that installs it."""
 
+TESTED_MITSUBA = "3.9."
+"""How the versions of Mitsuba begin with which the tests were run."""
+
 MIN_CUDA_VERSION = (12, 8)
 """CUDA version of the oldest NVIDIA driver (R570) on which drjit.nn works."""
 
@@ -112,7 +115,10 @@ def run_diagnosis() -> Diagnosis:
     diagnosis = Diagnosis()
     add = diagnosis.findings.append
     core = (f"{name} {_version(name) or 'not installed'}" for name in ("mitsuba", "drjit"))
-    add(Finding("versions", ", ".join((f"nerg {__version__}", f"Python {platform.python_version()}", *core))))
+    versions, problem = ", ".join((f"nerg {__version__}", f"Python {platform.python_version()}", *core)), ""
+    if not (_version("mitsuba") or TESTED_MITSUBA).startswith(TESTED_MITSUBA):
+        problem = f'tested with mitsuba {TESTED_MITSUBA}* only; if it fails: pip install "mitsuba=={TESTED_MITSUBA}*"'
+    add(Finding("versions", versions, problem))
 
     library, llvm_problem = llvm.find_current(), llvm.find_problem()
     add(Finding("libLLVM", str(library) if library else "none", llvm_problem or ""))
