@@ -519,11 +519,16 @@ def _append_evaluation(
 
 
 def _evaluate(trainer: RadianceTrainer, watched: WatchedViews, field: RadianceField | None) -> dict:
-    """Return the PSNR of held-out and training views, on a subset of the pixels that takes little time."""
+    """Return the PSNR of held-out and training views, on a subset of the pixels that takes little time.
+
+    If photos have colour changes of their own, which cannot be known of held-out photos, colours are fitted first:
+    otherwise the PSNR would follow exposures, and choose an early state of a field that still improves.
+    """
     if not watched.held_out:
         return {"psnr": None}
     every = trainer.choose_pixel_stride(watched.held_out, _EVALUATION_SAMPLES)
     shown = field or trainer.make_field(with_occupancy=False)
-    held_out, training = (evaluate_views(trainer, v, every, shown).mean for v in (watched.held_out, watched.training))
+    errors = [evaluate_views(trainer, views, every, shown) for views in (watched.held_out, watched.training)]
+    held_out, training = ((e.mean if trainer.photos is None else e.mean_fitted) for e in errors)
     as_number = lambda x: None if math.isnan(x) else round(x, 2)
     return {"psnr": as_number(held_out), "psnr_train": as_number(training), "every_pixel": every}

@@ -195,7 +195,8 @@ def test_the_best_state_is_the_result(dataset, tmp_path, monkeypatch, falls):
         # Grey noise: the untrained field, which is fog, is nearer to it than a ball.
         grey = 0.3 + 0.1 * rng.random((24, 24, 3)).astype(np.float32)
         held_out = [replace(v, pixels=grey, depth=None) for v in held_out]
-    field, provenance = train_field(replace(dataset, held_out=held_out), TINY, settings(steps=60), ns)
+    plan = settings(steps=60, photo_colors=False)  # Fitted colours would turn a ball into grey
+    field, provenance = train_field(replace(dataset, held_out=held_out), TINY, plan, ns)
     history, result = provenance["psnr_watched"]["history"], provenance["psnr_watched"]["result"]
     best = max(row["psnr"] for row in history)
     assert result["psnr"] > best - 0.3
@@ -207,6 +208,20 @@ def test_the_best_state_is_the_result(dataset, tmp_path, monkeypatch, falls):
     stated = provenance["psnr_held_out"]["mean"]
     again = evaluate_views(RadianceTrainer(dataset.train, BOX, TINY, settings(), ns), held_out, 1, loaded)
     assert again.mean == pytest.approx(stated, abs=0.01)
+
+
+def test_the_exposure_of_held_out_photos_does_not_choose_the_state(dataset, monkeypatch):
+    monkeypatch.setattr(radiance_run, "MIN_EVALUATION_INTERVAL", 1)
+    dark = [replace(v, pixels=0.4 * v.color, depth=None) for v in dataset.held_out]
+    watched = {}
+    for photo_colors in (True, False):
+        for name, views in (("photos", dataset.held_out), ("dark", dark)):
+            plan = settings(steps=60, photo_colors=photo_colors)
+            _, provenance = train_field(replace(dataset, held_out=views), TINY, plan, ns)
+            watched[photo_colors, name] = provenance["psnr_watched"]["result"]["psnr"]
+    # Fitted colours of darker photos have an error that is smaller in proportion.
+    assert watched[True, "dark"] > watched[True, "photos"] + 3
+    assert watched[False, "dark"] < watched[False, "photos"]
 
 
 # ---- Compiling before a run's clock starts changes nothing of the run, and leaves nothing to be compiled in it ----
