@@ -10,7 +10,6 @@ import subprocess
 import sys
 from dataclasses import fields
 from importlib import import_module
-from types import SimpleNamespace
 
 import pytest
 import typer
@@ -22,6 +21,7 @@ from nerg_mi.evaluation import study as study_settings
 from nerg_mi.evaluation.study_subject import VOXEL_RESOLUTIONS
 from nerg_mi.transport.march_primal import MarchSettings
 from tests.conftest import ROOT
+from tests.evaluation.subjects import make_subject
 from tools import command_pages, generated
 
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -130,15 +130,7 @@ def test09_files_that_are_named_exist(page):
 
 
 def test10_settings_of_the_study_are_the_studys():
-    subject = SimpleNamespace(
-        is_marched=True,
-        has_splats=False,
-        extent=1.0,
-        has_gaze=True,
-        is_normalized=True,
-        can_resample=True,
-        voxel_resolutions=VOXEL_RESOLUTIONS,
-    )
+    subject = make_subject(1.0, is_normalized=True, voxel_resolutions=VOXEL_RESOLUTIONS)
     names = {setting.name for setting in study_settings.list_rows(subject)}
     listed = set()
     for table in re.findall(

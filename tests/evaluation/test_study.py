@@ -17,6 +17,7 @@ from nerg_mi.evaluation.study import RESOLUTIONS, STEP_COUNTS, count_traced_oper
 from nerg_mi.evaluation.study_subject import open_subject
 from nerg_mi.fields.occupancy import OccupancyGrid
 from nerg_mi.transport.medium import LocalRay
+from tests.evaluation.subjects import make_subject
 from tests.plugins import fields
 from tests.plugins.scenes import camera
 from tests.reference import march_numpy
@@ -185,17 +186,7 @@ def test_the_papers_depth_is_unnormalised_and_at_the_steps_end():
 
 @pytest.fixture(scope="module")
 def rows():
-    return list_rows(
-        SimpleNamespace(
-            is_marched=True,
-            has_splats=False,
-            extent=2.0,
-            has_gaze=True,
-            is_normalized=True,
-            can_resample=True,
-            voxel_resolutions=(256, 512),
-        )
-    )
+    return list_rows(make_subject(2.0, is_normalized=True, voxel_resolutions=(256, 512)))
 
 
 def test_sweeps_are_even_on_a_log_axis(rows):

@@ -5,7 +5,6 @@ import subprocess
 import sys
 from dataclasses import dataclass
 from fractions import Fraction
-from types import SimpleNamespace
 
 import drjit as dr
 import drjit.llvm.ad as ns
@@ -32,6 +31,7 @@ from nerg_mi.transport.quadrature import (
     register_quadrature,
 )
 from nerg_mi.transport.volume_medium import VolumeMedium
+from tests.evaluation.subjects import make_subject
 from tests.plugins.scenes import camera, channels, constant, named, render
 from tests.reference import march_numpy as reference
 
@@ -610,8 +610,6 @@ def test04_registered_rule_with_shapes_and_all_depths(rgb, simpson):
 
 
 def test05_registered_rule_is_listed(rgb, simpson):
-    subject = SimpleNamespace(
-        is_marched=True, has_splats=False, extent=1.0, has_gaze=True, is_normalized=False, can_resample=True
-    )
+    subject = make_subject(1.0)
     assert {s.params.get("quadrature") for s in study.list_rows(subject)} >= {"constant", "linear", "simpson"}
     assert RULES.format_manual().endswith("``simpson``: three samples a step.")

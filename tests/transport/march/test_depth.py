@@ -1,7 +1,6 @@
 """Depths against closed forms, for opaque and semi-transparent matter, and a user-defined kind of depth."""
 
 import math
-from types import SimpleNamespace
 
 import drjit as dr
 import numpy as np
@@ -14,6 +13,7 @@ from nerg_mi.transport.geometry import trace_depth
 from nerg_mi.transport.march import march
 from nerg_mi.transport.march_primal import MarchSettings
 from nerg_mi.transport.volume_medium import VolumeMedium
+from tests.evaluation.subjects import make_subject
 from tests.plugins.scenes import channels, constant, straight
 from tests.reference import march_numpy as reference
 
@@ -230,9 +230,7 @@ def test04_penetration_depth_matches_mean_free_paths(rgb):
 @pytest.mark.parametrize("hits", [False, True], ids=["marched", "splats"])
 def test05_study_includes_registered_depth(entered, hits):
     """Each kind is among the study's settings, for splats only kinds with a surface of their own."""
-    subject = SimpleNamespace(
-        is_marched=True, has_splats=hits, extent=1.0, has_gaze=True, is_normalized=False, can_resample=True
-    )
+    subject = make_subject(1.0, has_splats=hits)
     kinds = {s.params["depth"] for s in study.list_rows(subject) if s.group == "depth"}
     assert kinds >= {"expected", "median", "entered"} and ("refined" in kinds) is not hits
 
