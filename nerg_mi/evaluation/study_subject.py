@@ -11,11 +11,11 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.fields.compilation import attach_voxels, bound_voxel_bytes, compile_density
-from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.files.safe_read import resolve_path
 from nerg_mi.rendering.bands import is_nerg
 from nerg_mi.rendering.scene import load_scene
 from nerg_mi.transport.depth import DEPTHS
+from nerg_mi.transport.field_medium import FieldMedium
 from nerg_mi.transport.geometry import SceneGeometry
 from nerg_mi.transport.observer import sensor_center
 from nerg_mi.transport.occlusion import RELATIVE_TOLERANCE
@@ -338,9 +338,8 @@ class FileSubject(StudySubject):
         self.is_normalized = self.has_gaze and integrator.gaze.field.config.normalized
         self.has_splats = medium is not None and medium.hits is not None
         self._compiled: dict[int, tuple[Any, int]] = {}
-        self._field: Any = getattr(children.get("field"), "field", None)
-        if isinstance(self._field, RadianceField) and self._field.voxels is None:
-            fits = lambda resolution: bound_voxel_bytes(self._field, resolution) <= _MAX_VOXEL_BYTES
+        if isinstance(medium, FieldMedium) and medium.field.voxels is None:
+            fits = lambda resolution: bound_voxel_bytes(medium.field, resolution) <= _MAX_VOXEL_BYTES
             self.voxel_resolutions = tuple(filter(fits, VOXEL_RESOLUTIONS))
         self._set_up(scene, sensor, {**children, **read_parameters(integrator), "aovs": self.aov_names()})
         self.resize(width, height)
@@ -351,10 +350,10 @@ class FileSubject(StudySubject):
         if resolution not in self.voxel_resolutions:
             return super().compile_field(resolution)
         if resolution not in self._compiled:
-            voxels = compile_density(self._field, resolution)
             volume = self.base_params["field"]
+            voxels = compile_density(volume.field, resolution)
             to_world = mi.ScalarTransform4f(volume.medium().to_world.matrix)
-            compiled = type(volume).from_network(attach_voxels(self._field, voxels), to_world)
+            compiled = type(volume).from_network(attach_voxels(volume.field, voxels), to_world)
             self._compiled[resolution] = compiled, voxels.size
         return self._compiled[resolution]
 

@@ -735,9 +735,8 @@ class ConstantWeightsTrial:
         integrator = scene.integrator()
         trained = get_trained_fields(integrator) if is_nerg(integrator) else []
         constant = bool(trained) and self._choose(samples)
-        for field in trained:
-            if constant:
-                set_constant_weights(field)
+        for field in trained if constant else ():
+            set_constant_weights(field)
         return constant
 
     def record(self, constant: bool, samples: int, seconds: float) -> None:

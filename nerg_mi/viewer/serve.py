@@ -38,10 +38,13 @@ class RunningViewer:
         URL to open in a browser.
     page : Page
         Its page.
+    is_embeddable : bool
+        Whether pages of this machine, such as a notebook, may contain the page.
     """
 
     address: str
     page: Page
+    is_embeddable: bool
 
 
 @contextmanager
@@ -63,7 +66,8 @@ def open_viewer(
     reporter : Reporter
         Receives progress and messages.
     is_embeddable : bool
-        Whether pages of this machine, such as a notebook, may contain the page. Only without a token.
+        Whether pages of this machine, such as a notebook, may contain the page. Only without a token, whose cookie a
+        browser would not send from within another page.
 
     Yields
     ------
@@ -96,7 +100,7 @@ def open_viewer(
             host = "localhost" if options.host in ("0.0.0.0", "::") else options.host
             host = f"[{host}]" if ":" in host else host
             query = "" if token is None else f"?token={token}"
-            yield RunningViewer(f"http://{host}:{server.get_port()}/{query}", page)
+            yield RunningViewer(f"http://{host}:{server.get_port()}/{query}", page, guard.is_embeddable)
         finally:
             page.close()
 
@@ -115,7 +119,8 @@ class Viewer:
 
     def __init__(self, running: AbstractContextManager[RunningViewer]) -> None:
         self._running = running
-        self.address = running.__enter__().address
+        opened = running.__enter__()
+        self.address, self._is_embeddable = opened.address, opened.is_embeddable
         atexit.register(self.close)
 
     def close(self) -> None:
@@ -136,8 +141,7 @@ class Viewer:
 
     def _repr_html_(self) -> str:
         link = element("a", f"Viewer at {self.address}", href=self.address, target="_blank", rel="noopener")
-        # With a token the browser would not send the cookie from within another page.
-        if self._running is None or "?" in self.address:
+        if self._running is None or not self._is_embeddable:
             return link
         style = f"width: 100%; height: {self.HEIGHT}px; border: 0"
         return element("div", link, element("iframe", src=self.address, style=style))
