@@ -182,9 +182,9 @@ OWN_SCORES = ("bits at own origin",)
 HEADLINE = "bits"
 SCORES = (HEADLINE, *MAP_SCORES, *(score for score in RAY_SCORES if score != HEADLINE), *OWN_SCORES)
 """The headline first: the information gain over the position-independent prior in bits per ray. KLD in nats, CC and SIM
-of densities normalised over the sphere; MAE in 1/sr of unnormalised densities; NSS; AUC-Judd; sAUC against rays of
-other test positions; mean log density (nats of 1/sr); information gain with each density evaluated at the ray's own
-origin, not at the centre of its position.
+of densities normalised over the sphere; MAE in 1/sr of unnormalised densities; NSS; AUC-Judd; sAUC of the ratio to the
+prior, against rays of other test positions; mean log density (nats of 1/sr); information gain with each density
+evaluated at the ray's own origin, not at the centre of its position.
 """
 # Fraction of the progress for evaluating the methods; the rest is for the bootstrap.
 _EVALUATION_FRACTION = 0.2
@@ -509,11 +509,11 @@ def _evaluate_methods(
             at_own = np.asarray(method(test.own_origins, test.own_directions), np.float64)[:, 0]
         return maps, at, np.log(np.maximum(at_own, 0) + np.finfo(float).eps)
 
-    maps, at, log_own_prior = evaluate(prior)
-    log_prior, out = _log_density(at[:, :K], maps), []
+    maps, at_prior, log_own_prior = evaluate(prior)
+    log_prior, out = _log_density(at_prior[:, :K], maps), []
     for name, method in methods.items():
         maps, at, log_own = evaluate(method)
-        values = compute_ray_scores(maps, at[:, :K], at[:, K:], log_prior)
+        values = compute_ray_scores(maps, at, at_prior, log_prior)
         out.append(
             _EvaluatedMethod(name, test.smooth(maps), values, {OWN_SCORES[0]: (log_own - log_own_prior) / np.log(2)})
         )
@@ -586,7 +586,7 @@ def compute_map_scores(truth: np.ndarray, maps: np.ndarray) -> dict[str, float]:
 
 
 def compute_ray_scores(
-    maps: np.ndarray, sample_densities: np.ndarray, other_densities: np.ndarray, log_prior: np.ndarray
+    maps: np.ndarray, densities: np.ndarray, prior_densities: np.ndarray, log_prior: np.ndarray
 ) -> dict[str, np.ndarray]:
     """Compute ``RAY_SCORES`` of each ray (P, K).
 
@@ -594,24 +594,27 @@ def compute_ray_scores(
     ----------
     maps : numpy.ndarray
         Densities (P, D) over the sphere.
-    sample_densities : numpy.ndarray
-        Densities (P, K) at the rays.
-    other_densities : numpy.ndarray
-        Densities (P, M) at rays of other positions.
+    densities : numpy.ndarray
+        Densities (P, K + M) at the rays and at M rays of other positions.
+    prior_densities : numpy.ndarray
+        Densities (P, K + M) of the position-independent prior at the same rays.
     log_prior : numpy.ndarray
         Log of the reference density (P, K) at the rays.
 
     Notes
     -----
     The AUC of a ray is the fraction of the sphere with a lower density, counting ties half. Its mean is AUC-Judd with a
-    threshold at each value.
+    threshold at each value. sAUC compares the ratio of the density to the prior, which is the map with the largest
+    expected sAUC (`nerg_mi.evaluation.saliency`).
     """
-    log = _log_density(sample_densities, maps)
-    below = lambda among: np.stack([metrics.auc(g, a) for a, g in zip(among, sample_densities)])
+    K = log_prior.shape[1]
+    at_rays, log = densities[:, :K], _log_density(densities[:, :K], maps)
+    ratio = densities / np.maximum(prior_densities, metrics.EPS)
+    below = lambda values, among: np.stack([metrics.auc(v, a) for v, a in zip(values, among)])
     return {
-        "NSS": metrics.nss(maps, sample_densities),
-        "AUC": below(maps),
-        "sAUC": below(other_densities),
+        "NSS": metrics.nss(maps, at_rays),
+        "AUC": below(at_rays, maps),
+        "sAUC": below(ratio[:, :K], ratio[:, K:]),
         "bits": (log - log_prior) / np.log(2),
         "loglik": log,
     }

@@ -285,10 +285,11 @@ def _notes(
         f"{total:,} rays used for training. Reference: rays within {radius:g} m, kappa {options.kappa:g}, "
         f"{options.directions} directions of equal area; KLD in nats with {EPS:g} of the uniform density added; "
         "MAE in 1/sr; densities are smoothed with the kernel of the reference before these; AUC against all "
-        "directions, sAUC against rays of other positions; bits per ray above the position-independent prior, at the "
-        "centres of the positions and at the origin of each ray; loglik in nats of 1/sr. Brackets: ± 1.96 "
-        f"standard errors from {options.resamples} resamples of the participants. Split half: one half of the "
-        "participants predicts the other, where both have enough rays; a reference, not a bound."
+        "directions, sAUC of the ratio to the position-independent prior, against rays of other positions; bits per "
+        "ray above the position-independent prior, at the centres of the positions and at the origin of each ray; "
+        f"loglik in nats of 1/sr. Brackets: ± 1.96 standard errors from {options.resamples} resamples of the "
+        "participants. Split half: one half of the participants "
+        "predicts the other, where both have enough rays; a reference, not a bound."
     )
 
 

@@ -212,9 +212,11 @@ def test_rays_are_also_scored_at_their_own_origins(test_set, rays_evaluation):
 def test_ray_scores_by_hand():
     maps = np.array([[0.0, 1.0, 2.0, 5.0]]) / (4 * np.pi * 2)
     at, other_values = maps[:, [3, 1]], maps[:, [0, 0, 1, 3]]
-    scores = gaze.compute_ray_scores(maps, at, other_values, np.zeros((1, 2)))
+    prior_values = np.array([[1, 2, 1, 1, 1, 20.0]])
+    scores = gaze.compute_ray_scores(maps, np.hstack([at, other_values]), prior_values, np.zeros((1, 2)))
     np.testing.assert_allclose(scores["AUC"], [[3.5 / 4, 1.5 / 4]])
-    np.testing.assert_allclose(scores["sAUC"], [[3.5 / 4, 2.5 / 4]])
+    # Ratios to the prior: 5 and 0.5 at the rays, and 0, 0, 1, 0.25 at those of other positions.
+    np.testing.assert_allclose(scores["sAUC"], [[1, 3 / 4]])
     np.testing.assert_allclose(scores["loglik"], np.log(at), rtol=1e-6)
     np.testing.assert_allclose(scores["bits"], np.log2(at), rtol=1e-6)
     values = np.array([0, 1, 2, 5.0])
