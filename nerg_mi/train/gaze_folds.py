@@ -283,7 +283,7 @@ def evaluate_folds(
         rays = replace(rays, hit=find_hit_points(rays, geometry, probes.depth))
     for k, (train, held_out) in enumerate(iter_folds(rays, probes.radius, settings.mix_folds, settings.seed)):
         try:
-            targets = make_targets_from_rays(train, geometry, probes, needs, seed=settings.seed)
+            targets = make_targets_from_rays(train, geometry, plan.probes, needs, seed=settings.seed)
         except NergError:
             # The remaining participants make no probe: skip this fold.
             continue
@@ -295,7 +295,8 @@ def evaluate_folds(
                 on_progress(GazeProgress(f"fold {k + 1}", fraction, trainer.steps, trainer.seconds, None))
                 stop.check()
         test = sample_participants_equally(held_out, _MAX_RAYS, settings.seed + 3)
-        folds.append(_evaluate_fold(trainer, train, test, geometry, plan, needs))
+        assert targets.prior_table is not None  # The field has a prior
+        folds.append(_evaluate_fold(trainer, targets.prior_table, train, test, geometry, plan, needs))
         if len(folds) == _MIN_FOLDS and _has_enough_participants(folds, settings) and all(map(_needs_no_prior, folds)):
             break
     on_progress(GazeProgress("folds", 1.0, settings.steps or 0, 0.0, None))
@@ -304,9 +305,16 @@ def evaluate_folds(
 
 
 def _evaluate_fold(
-    trainer: GazeTrainer, train: Rays, test: Rays, geometry: TrainingGeometry, plan: GazePlan, needs: TargetRequirements
+    trainer: GazeTrainer,
+    prior_table: np.ndarray,
+    train: Rays,
+    test: Rays,
+    geometry: TrainingGeometry,
+    plan: GazePlan,
+    needs: TargetRequirements,
 ) -> FoldDensities:
-    """Evaluate the field of ``trainer``, and the prior and the hits of the rays ``train``, at the rays ``test``."""
+    """Evaluate the field of ``trainer``, the prior in ``prior_table`` and the hits of the rays ``train`` at the rays
+    ``test``."""
     seed, rows, ns = plan.settings.seed, plan.config.prior, trainer.ns
     maps = make_rotated_directions(_NUM_DIRECTIONS, len(test), np.random.default_rng(seed + 3))
     directions = geometry.directions_to_field(np.concatenate([maps, test.direction[:, None]], axis=1))
@@ -317,8 +325,7 @@ def _evaluate_fold(
     field = trainer.evaluate_densities(targets).astype(np.float64)
     # The trainer normalises over all directions, among which that of the ray is one too many.
     field /= 4 * np.pi * field[:, :-1].mean(axis=1, keepdims=True)
-    table = make_prior_from_rays(train, rows, geometry, seed, plan.probes.weights, plan.probes.mix_kappa)
-    log = interpolate_table(ns.Float(table.ravel()), rows, to_vector(ns.Array3f, directions.reshape(-1, 3)))
+    log = interpolate_table(ns.Float(prior_table.ravel()), rows, to_vector(ns.Array3f, directions.reshape(-1, 3)))
     prior = np.exp(np.asarray(log, np.float64)).reshape(field.shape)
     hits = np.empty((len(test), 0))
     if plan.settings.reaimed_hits:
