@@ -36,6 +36,13 @@ _TABLE_SPACING = 0.2  # Texels of a table in units of 1/sqrt(κ): errors below 3
 _MIN_TABLE_LANES = 8192  # Number of directions below which a table is not considered
 
 
+class NearestOrigins(NamedTuple):
+    """The k samples with the origins nearest to each of P positions, nearest first."""
+
+    distance: np.ndarray  # Distance of the origin (P, k)
+    index: np.ndarray  # Index of the sample (P, k)
+
+
 class HitNeighbours(NamedTuple):
     """The k samples nearest to each of P positions."""
 
@@ -89,16 +96,29 @@ class ReaimedHits:
 
         return KDTree(self.origins.astype(np.float64))
 
-    def find(self, positions: np.ndarray) -> HitNeighbours:
+    @cached_property
+    def _recorded_directions(self) -> np.ndarray:
+        # A point at the observer who looked at it has no direction.
+        return aim(self.points.astype(np.float64), np.zeros(3), self.origins.astype(np.float64), 0.0)
+
+    def find_nearest(self, positions: np.ndarray) -> NearestOrigins:
         """Find the samples nearest to each of ``positions`` (P, 3), in the field's frame."""
         positions = np.atleast_2d(np.asarray(positions, np.float64))
         k = min(MAX_NEIGHBOURS, len(self.origins))
-        distance, index = self._tree.query(positions, k=np.arange(1, k + 1))
+        return NearestOrigins(*self._tree.query(positions, k=np.arange(1, k + 1)))
+
+    def find(self, positions: np.ndarray, nearest: NearestOrigins | None = None) -> HitNeighbours:
+        """Find the samples nearest to each of ``positions`` (P, 3), in the field's frame, with their weights and
+        directions.
+
+        ``nearest``: what `find_nearest` returns for these positions, of any hits with these origins.
+        """
+        positions = np.atleast_2d(np.asarray(positions, np.float64))
+        distance, index = nearest or self.find_nearest(positions)
         # Relative to the nearest sample, so that the weights do not vanish far from all samples.
         weights = np.exp(0.5 * (distance[:, :1] ** 2 - distance**2) / self.bandwidth**2)
         origins, points = self.origins[index].astype(np.float64), self.points[index].astype(np.float64)
-        # A point at the observer who looked at it has no direction.
-        recorded = aim(points, np.zeros(3), origins, 0.0)
+        recorded = self._recorded_directions[index]
         min_distance = _MIN_DISTANCE * self.bandwidth
         directions = aim(points, recorded, positions[:, None], min_distance)
         weights = np.where(directions.any(axis=-1), weights, 0)

@@ -13,7 +13,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.fields.gaze_base import GazeHead, GazeHeadConfig, interpolate_table
-from nerg_mi.fields.gaze_hits import MAX_HITS, ReaimedHits, place_missing_points
+from nerg_mi.fields.gaze_hits import MAX_HITS, NearestOrigins, ReaimedHits, place_missing_points
 from nerg_mi.interruption import Interruption
 from nerg_mi.maths.arrays import to_vector
 from nerg_mi.probes.probes import calibrate_levels, compute_region_levels
@@ -327,15 +327,15 @@ def _evaluate_fold(
     field /= 4 * np.pi * field[:, :-1].mean(axis=1, keepdims=True)
     log = interpolate_table(ns.Float(prior_table.ravel()), rows, to_vector(ns.Array3f, directions.reshape(-1, 3)))
     prior = np.exp(np.asarray(log, np.float64)).reshape(field.shape)
-    hits = np.empty((len(test), 0))
+    hits, nearest = np.empty((len(test), 0)), None
     if plan.settings.reaimed_hits:
         train = sample_participants_equally(train, MAX_HITS, seed + 5)
-        hits = _evaluate_hit_kernels(train, geometry, positions, directions[:, -1], ns)
+        hits, nearest = _evaluate_hit_kernels(train, geometry, positions, directions[:, -1], ns)
 
     def make_hit_maps(kernel: int) -> np.ndarray:
         bandwidth, kappa = HIT_KERNELS[kernel]
         kernels = _make_hits(train, geometry, bandwidth, kappa)
-        return kernels.make_kde(kernels.find(positions), ns).evaluate(directions[:, :-1])
+        return kernels.make_kde(kernels.find(positions, nearest), ns).evaluate(directions[:, :-1])
 
     return FoldDensities(test.person, field[:, -1], prior[:, -1], field[:, :-1], prior[:, :-1], hits, make_hit_maps)
 
@@ -353,17 +353,18 @@ def _make_hits(
 
 def _evaluate_hit_kernels(
     rays: Rays, geometry: TrainingGeometry, positions: np.ndarray, directions: np.ndarray, ns: ModuleType
-) -> np.ndarray:
+) -> tuple[np.ndarray, NearestOrigins]:
     """Evaluate the re-aimed hits of ``rays`` with each of `HIT_KERNELS` (n, C) in ``directions`` from ``positions``
-    (n, 3)."""
+    (n, 3). Also returns the samples nearest to the positions, which are the same for all kernels."""
+    nearest = _make_hits(rays, geometry, *HIT_KERNELS[0]).find_nearest(positions)
     columns, neighbours = [], {}
     probe, d = dr.arange(ns.UInt32, len(positions)), to_vector(ns.Array3f, directions)
     for bandwidth, kappa in HIT_KERNELS:
         hits = _make_hits(rays, geometry, bandwidth, kappa)
         if bandwidth not in neighbours:
-            neighbours[bandwidth] = hits.find(positions)
+            neighbours[bandwidth] = hits.find(positions, nearest)
         columns.append(np.array(hits.make_kde(neighbours[bandwidth], ns).density(probe, d), np.float64))
-    return np.stack(columns, axis=1)
+    return np.stack(columns, axis=1), nearest
 
 
 def _has_enough_participants(folds: Sequence[FoldDensities], settings: GazeSettings) -> bool:

@@ -67,6 +67,16 @@ def test_samples_without_a_hit_keep_their_direction():
     assert ReaimedHits(1e3 * origins, far, 0.5, 5e3, 50.0).find(origins).directions.shape == (5, 5, 3)
 
 
+def test_nearest_samples_are_shared_by_bandwidths():
+    origins, points = sample()
+    positions = np.array([(0.2, 0.1, 0.0), (-0.7, 0.3, 0.5)])
+    nearest = ReaimedHits(origins, points, 0.5, 0.4, 60.0).find_nearest(positions)
+    assert (np.diff(nearest.distance, axis=1) >= 0).all()
+    other = ReaimedHits(origins, points + 1, 0.5, 2.0, 60.0)
+    for shared, separate in zip(other.find(positions, nearest), other.find(positions)):
+        np.testing.assert_array_equal(shared, separate)
+
+
 def test_extreme_positions_are_finite():
     origins, points = sample(3)
     points[0] = origins[0]  # A hit at the eye has no direction

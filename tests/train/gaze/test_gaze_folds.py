@@ -133,7 +133,7 @@ def test03c_hits_are_seen_from_the_observer():
     positions, directions = rng.uniform(0, 2, (7, 3)), fibonacci_directions(7)
     for hit in (None, rays.origin + 3 * rays.direction):
         rays = replace(rays, hit=hit)
-        columns = _evaluate_hit_kernels(rays, NOWHERE, positions, directions, ns)
+        columns, _ = _evaluate_hit_kernels(rays, NOWHERE, positions, directions, ns)
         for column, (bandwidth, kappa) in zip(columns.T, HIT_KERNELS):
             far = rays.origin + FAR * bandwidth * rays.direction
             points = far if hit is None else hit
