@@ -70,9 +70,14 @@ def morton_order(count: int) -> np.ndarray:
 
     Rays that are traced together then traverse similar parts of the scene; in spiral order they do not.
     """
-    order = np.argsort(_morton(fibonacci_directions(count)), kind="stable").astype(np.uint32)
+    order = sort_directions(fibonacci_directions(count))
     order.flags.writeable = False
     return order
+
+
+def sort_directions(directions: np.ndarray) -> np.ndarray:
+    """The indices (N,) uint32 of unit ``directions`` (N, 3) in Morton order, so that neighbours follow each other."""
+    return np.argsort(_morton(directions), kind="stable").astype(np.uint32)
 
 
 def _morton(d: np.ndarray) -> np.ndarray:

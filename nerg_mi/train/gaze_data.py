@@ -17,7 +17,7 @@ from nerg_mi.fields.gaze_base import GazeHeadConfig, RaySupport, add_prior_floor
 from nerg_mi.fields.kde import SphericalKde
 from nerg_mi.maths.arrays import to_vector
 from nerg_mi.maths.geometry import AnyBox, intersect_box_numpy
-from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.maths.sphere import fibonacci_directions, sort_directions
 from nerg_mi.maths.types import variant_types
 from nerg_mi.photos.salience import SalienceView
 from nerg_mi.probes.probes import Probes, compute_participant_weights, place_probes
@@ -472,14 +472,22 @@ def compute_surface_distances(
         Mask (P, D) of the rays that hit no surface.
     """
     P, D = directions.shape[:2]
-    if geometry.medium is None:
+    if geometry.medium is None or not P:
         return np.full((P, D), DEFAULT_DEPTH, np.float32), np.zeros((P, D), bool)
-    origins = np.repeat(np.asarray(positions, np.float64), D, axis=0)
-    flat = np.asarray(directions, np.float64).reshape(-1, 3)
-    distance, opacity = trace_depth(geometry.medium, origins, flat, kind=depth)
+    # Rays that are traced together should traverse similar parts of the scene. The directions of the observers are
+    # mostly rotated copies of one set, which have one order.
+    order = sort_directions(directions[0])
+    traced = trace_depth(
+        geometry.medium,
+        np.repeat(np.asarray(positions, np.float32), D, axis=0),
+        np.asarray(directions, np.float32)[:, order].reshape(-1, 3),
+        kind=depth,
+    )
+    distance, opacity = np.empty((2, P, D), np.float32)
+    distance[:, order], opacity[:, order] = (values.reshape(P, D) for values in traced)
     misses = opacity < SURFACE_OPACITY
-    distance[misses] = compute_box_exit(geometry.box, origins[misses], flat[misses])
-    distance, misses = distance.reshape(P, D), misses.reshape(P, D)
+    origins = np.asarray(positions, np.float64)[np.nonzero(misses)[0]]
+    distance[misses] = compute_box_exit(geometry.box, origins, np.asarray(directions, np.float64)[misses])
     if fill_misses:
         for p in np.flatnonzero(misses.any(axis=1) & ~misses.all(axis=1)):
             is_hit = ~misses[p]

@@ -620,6 +620,16 @@ def test_misses_end_at_the_box(wall):
     assert on_box[escaped].max() < 1e-5 and 0.5 < escaped.mean() < 0.95
 
 
+def test_observers_have_their_own_directions(wall):
+    positions = np.array([[-0.5, 0, 1.6], [0.2, -0.4, 1.5]])
+    directions = np.stack([fibonacci_directions(256), fibonacci_directions(256)[::-1, [1, 2, 0]]])
+    together = compute_surface_distances(wall, positions, directions)
+    for k in range(2):
+        alone = compute_surface_distances(wall, positions[[k]], directions[[k]])
+        for one, both in zip(alone, together):
+            np.testing.assert_array_equal(one[0], both[k])
+
+
 def test_holes_are_filled_with_the_depth_around_them(wall):
     """Directions that pass the wall take the depth of the neighbouring ones."""
     positions, directions = np.array([[-0.5, 0, 1.6]]), fibonacci_directions(1024)[None]
