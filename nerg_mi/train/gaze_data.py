@@ -829,7 +829,7 @@ def make_rotated_directions(count: int, sets: int, rng: np.random.Generator) -> 
     """
     # Normalised Gaussian quaternions are uniform rotations (Shoemake 1992). The first number is the real part.
     rotation = Rotation.from_quat(np.roll(rng.normal(size=(sets, 4)), -1, axis=1)).as_matrix()
-    return np.einsum("dj,pij->pdi", fibonacci_directions(count), rotation)
+    return fibonacci_directions(count) @ rotation.transpose(0, 2, 1)
 
 
 # ---- Targets from salience views ----
