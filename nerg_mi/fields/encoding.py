@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from types import ModuleType
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, cast
 
 import drjit as dr
 import numpy as np
@@ -107,6 +107,14 @@ class Encoding(Protocol):
         out = self(p, active)
         dr.eval(out)
         return out
+
+    def attach(self, features: list[Float], p: Array3f) -> list[Float]:
+        """``features``, evaluated earlier at ``p``, with the derivatives by the parameters alone.
+
+        An encoding can have a faster implementation.
+        """
+        rows = self(dr.detach(p))
+        return [cast("Float", dr.replace_grad(value, row)) for value, row in zip(features, rows)]
 
     def named(self) -> dict[str, Any]:
         """The parameters by name."""
@@ -312,6 +320,31 @@ class HashGrid(Encoding):
             dr.eval(out)
         return out
 
+    def attach(self, features: list[Float], p: Array3f) -> list[Float]:
+        # Not the grid itself, which Dr.Jit would copy by its constructor.
+        with_table = lambda table: HashGrid(self.config, table, self.mode)
+        return dr.custom(_TableDerivatives, self.table, features, p, with_table)
+
+    def scatter(self, p: Array3f, features: list[Float]) -> None:
+        """Add ``features`` at ``p`` to the vertices around, times the weights of the interpolation.
+
+        This is the transpose of the evaluation, level by level as in `evaluate_eagerly`.
+        """
+        p, inside = self._clamped(p, True)
+        packet = self._packet(p)
+        for level in range(self.config.levels):
+            parts = features[level * self.config.features : (level + 1) * self.config.features]
+            cell, w = self._locate(level, p)
+            lo, hi = self._corner_indices(level, cell)
+            for corner in np.ndindex(*(2,) * self.config.dimensions):
+                index = self._combine(level, tuple((hi if c else lo)[k] for k, c in enumerate(corner)))
+                weight = 1.0
+                for c, x in zip(corner, w):
+                    weight *= x if c else 1 - x
+                values = packet(*[weight * x for x in parts])
+                dr.scatter_add(self.table, values, index + self._offsets[level], inside, self.mode)
+            dr.eval(self.table)
+
     @staticmethod
     def _clamped(p, active):
         """``p`` with 0 for points outside the cube, and the mask of the points inside."""
@@ -320,17 +353,25 @@ class HashGrid(Encoding):
         return dr.select(inside, p, 0), inside
 
     def _level(self, level: int, p, active) -> list:
-        ns = namespace(p)
-        packet = {2: ns.Array2f, 4: ns.Array4f}[self.config.features]
-        scale = float(self._scales[level])
-        pos = [dr.fma(c, scale, 0.5) for c in p]
-        cell = [ns.UInt32(c) for c in pos]
-        w = [c - ns.Float(i) for c, i in zip(pos, cell)]
+        cell, w = self._locate(level, p)
         lo, hi = self._corner_indices(level, cell)
+        packet = self._packet(p)
         read = lambda index: dr.gather(
             packet, self.table, self._combine(level, index) + self._offsets[level], active, mode=self.mode
         )
         return list(dr.select(active, _blend(read, lo, hi, w, self.config.dimensions - 1, ()), 0))
+
+    def _packet(self, p) -> type:
+        """Array type of the features of a vertex."""
+        ns = namespace(p)
+        return {2: ns.Array2f, 4: ns.Array4f}[self.config.features]
+
+    def _locate(self, level: int, p) -> tuple[list, list]:
+        """Cell of ``level`` that holds ``p``, and the position in it, per axis."""
+        ns, scale = namespace(p), float(self._scales[level])
+        pos = [dr.fma(c, scale, 0.5) for c in p]
+        cell = [ns.UInt32(c) for c in pos]
+        return cell, [c - ns.Float(i) for c, i in zip(pos, cell)]
 
     def _corner_indices(self, level: int, cell):
         """Per-axis parts of the vertex index, for the lower and the upper corner."""
@@ -361,6 +402,26 @@ def _blend(read, lo: list, hi: list, w: list, axis: int, index: tuple):
         return read(index)
     low, high = (_blend(read, lo, hi, w, axis - 1, (i[axis], *index)) for i in (lo, hi))
     return dr.lerp(low, high, w[axis])
+
+
+class _TableDerivatives(dr.CustomOp):
+    """Features of a hash grid that were evaluated earlier, with their derivatives by the table."""
+
+    def eval(self, table, features, p, with_table):
+        self.p, self.with_table = p, with_table
+        self.table_type, self.table_size = type(table), len(table)
+        return list(features)
+
+    def forward(self):
+        self.set_grad_out(self.with_table(self.grad_in("table"))(self.p))
+
+    def backward(self):
+        grid = self.with_table(dr.zeros(self.table_type, self.table_size))
+        grid.scatter(self.p, self.grad_out())
+        self.set_grad_in("table", grid.table)
+
+    def name(self):
+        return "hash grid"
 
 
 register(HashGridConfig, HashGrid)

@@ -240,12 +240,14 @@ class MLP:
     def tensor(self, x: Any) -> Any:
         """Outputs (N, outputs) at inputs ``x`` (N, inputs), both TensorXf, as matrix products.
 
+        Without layer normalisation ``x`` may have further columns, which are ignored.
+
         One point per row: Dr.Jit's matrix products are fastest with the inputs of a point adjacent in memory, by up to
         a factor of two in the derivatives.
         """
         for i, w in enumerate(self.weights):
             if self.norms is None:
-                x = _products(x, w)
+                x = _products(x, _append_zeros(w, x.shape[1]))
             else:
                 x = x - dr.reshape(type(x), dr.mean(x, axis=1), (-1, 1))
                 x = x * dr.reshape(type(x), dr.rsqrt(dr.mean(x * x, axis=1) + _NORM_EPSILON), (-1, 1))
@@ -258,6 +260,19 @@ class MLP:
 
 def _products(x: Any, w: Any) -> Any:
     return dr.matmul(x, w, Bt=True)
+
+
+def _append_zeros(w: Any, inputs: int) -> Any:
+    """Weights ``w`` of a layer with zeros for further ``inputs``."""
+    rows, columns = w.shape
+    if inputs == columns:
+        return w
+    UInt32 = dr.uint32_array_t(w.array)
+    index = dr.arange(UInt32, rows * inputs)
+    column = index % inputs
+    source = index // inputs * columns + column
+    padded = dr.gather(type(w.array), w.array, source, column < columns, mode=dr.ReduceMode.Permute)
+    return type(w)(padded, (rows, inputs))
 
 
 def _fold_norm(w, norm: dict[str, Any]) -> tuple:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import ModuleType
 from typing import Any, cast
 
 import drjit as dr
@@ -18,11 +21,13 @@ from nerg_mi.fields.radiance import (
     point_features,
 )
 from nerg_mi.maths.geometry import AnyBox
-from nerg_mi.maths.types import Float, UInt32
+from nerg_mi.maths.types import Array3f, Float, UInt32
+from nerg_mi.transport.jit import gc_paused
 from nerg_mi.transport.quadrature import mean_depth_fraction
 
 from .radiance_data import PixelBatch
-from .radiance_sampling import RaySamples, compute_weights, sum_along_rays
+from .radiance_sampling import RaySamples, compute_weights, damp_near, sum_along_rays
+from .radiance_settings import RadianceSettings
 
 # ---- Losses of ray colours and depths ----
 
@@ -101,13 +106,13 @@ def _find_near_samples(samples: RaySamples, depth: Float, margin: float | Float)
     return truth, (samples.t < truth + margin) & (samples.t + samples.length > truth - margin)
 
 
-def feature_decay_loss(features):
-    """Mean square (Float) of the ``features`` of a grid.
+def feature_decay_gradient(features, weight: float):
+    """Gradient of ``weight`` times the mean square of the ``features`` of a grid.
 
     Features seen by many rays hardly change, because each has a share of one in millions. Features shaped by few rays
     or by chance decay to 0; Adam would otherwise move them as much as all others.
     """
-    return dr.mean(dr.square(features))
+    return features * (2 * weight / int(np.prod(features.shape)))
 
 
 def distortion_loss(weight, samples: RaySamples, scale: float):
@@ -179,23 +184,63 @@ def composite(sigma: Float, parts: list, samples: RaySamples) -> tuple[Float, Fl
 
 
 def stack(rows: list, ns):
-    """Stack rows (Floats of one length, or constants) to a TensorXf (N, rows)."""
-    flat = dr.ravel(ns.ArrayXf(rows), order="F")
-    return ns.TensorXf(flat, (dr.width(flat) // len(rows), len(rows)))
+    """Stack rows (Floats of one length, or constants) to a TensorXf (N, columns).
+
+    Columns of zeros follow up to a multiple of eight, which Dr.Jit stores at once.
+    """
+    return dr.custom(_Stack, [*rows, *[ns.Float(0)] * (-len(rows) % 8)], ns)
 
 
 def unstack(x, ns) -> list:
-    """Split a TensorXf (N, rows) into its columns as Floats.
+    """Split a TensorXf (N, columns) into its columns as Floats."""
+    return dr.custom(_Unstack, x, ns)
 
-    A plain slice would propagate its gradient through atomic additions. No two columns share an entry, so ``Permute``
-    (plain stores) is correct.
-    """
+
+class _Stack(dr.CustomOp):
+    """Dr.Jit's own derivative would load one number at a time, and that of `_Unstack` add one atomically."""
+
+    def eval(self, rows, ns):
+        self.ns = ns
+        return _join(rows, ns)
+
+    def forward(self):
+        self.set_grad_out(_join(self.grad_in("rows"), self.ns))
+
+    def backward(self):
+        self.set_grad_in("rows", _split(self.grad_out(), self.ns))
+
+    def name(self):
+        return "stack of rows"
+
+
+class _Unstack(dr.CustomOp):
+    """Inverse of `_Stack`."""
+
+    def eval(self, x, ns):
+        self.ns = ns
+        return _split(x, ns)
+
+    def forward(self):
+        self.set_grad_out(_split(self.grad_in("x"), self.ns))
+
+    def backward(self):
+        self.set_grad_in("x", _join(self.grad_out(), self.ns))
+
+    def name(self):
+        return "columns of a matrix"
+
+
+def _join(rows: Any, ns):
+    columns = ns.ArrayXf(rows)
+    # Dr.Jit aborts if it stores several numbers at once of which one awaits additions.
+    dr.eval([x for x in columns if x.state == dr.VarState.Dirty])
+    flat = dr.ravel(columns, order="F")
+    return ns.TensorXf(flat, (dr.width(flat) // len(rows), len(rows)))
+
+
+def _split(x, ns) -> list:
     width, rows = x.shape
-    index = dr.arange(ns.UInt32, width)
-    return [
-        dr.gather(ns.Float, x.array, index * rows + dr.opaque(ns.UInt32, k), mode=dr.ReduceMode.Permute)
-        for k in range(rows)
-    ]
+    return list(dr.gather(ns.ArrayXf, x.array, dr.arange(ns.UInt32, width), shape=(rows, width)))
 
 
 def evaluate_samples(config: RadianceConfig, box: AnyBox, parameters: dict, p, d, ns, features: list | None = None):
@@ -255,13 +300,25 @@ def evaluate_density(config: RadianceConfig, box: AnyBox, parameters: dict, p, n
     return box.density_from_encoded(density_from_log(log_density, config.density_scale), p)
 
 
-def evaluate_density_from_features(config: RadianceConfig, box: AnyBox, parameters: dict, p, features: list):
-    """Evaluate the density (1/unit) at ``p`` from grid ``features`` (list of Floats), in one kernel without weight
-    gradients.
+def make_density_prepass(config: RadianceConfig, box: AnyBox) -> Callable[..., tuple[Float, list[Float]]]:
+    """Return a function of detached parameters, world points and a mask, which evaluates the density (1/unit) and the
+    grid features, for `evaluate_samples`.
+
+    Dr.Jit records its kernels once; to trace them for each batch takes as long as the networks.
     """
-    return box.density_from_encoded(
-        density_from_log(_make_density_head(parameters)(features)[0], config.density_scale), p
-    )
+
+    @dr.freeze
+    def evaluate(parameters: dict, head: MLP, p: Array3f, active) -> tuple[Float, list[Float]]:
+        with gc_paused():
+            features = encoding_from_parameters(config.grid, parameters).evaluate_eagerly(box.to_unit(p), active)
+            return box.density_from_encoded(density_from_log(head(features)[0], config.density_scale), p), features
+
+    def prepass(parameters: dict, p: Array3f, active) -> tuple[Float, list[Float]]:
+        head = _make_density_head(parameters)
+        head.pack()  # Dr.Jit cannot record this
+        return evaluate({k: v for k, v in parameters.items() if k.startswith("grid.")}, head, p, active)
+
+    return prepass
 
 
 def _make_density_head(parameters: dict) -> MLP:
@@ -270,8 +327,11 @@ def _make_density_head(parameters: dict) -> MLP:
 
 
 def _evaluate_features(config: RadianceConfig, box: AnyBox, parameters: dict, p, ns, features: list | None = None):
-    rows = encoding_from_parameters(config.grid, parameters, mode=dr.ReduceMode.Expand)(box.to_unit(p))
-    return stack(rows if features is None else [dr.replace_grad(a, b) for a, b in zip(features, rows)], ns)
+    grid, p = encoding_from_parameters(config.grid, parameters, mode=dr.ReduceMode.Expand), box.to_unit(p)
+    if features is None:
+        with dr.suspend_grad():
+            features = grid.evaluate_eagerly(p)
+    return stack(grid.attach(features, p), ns)
 
 
 def _make_network(parameters: dict, name: str) -> MLP:
@@ -331,3 +391,136 @@ class PhotoColors:
     def compute_matrices(self, parameter: Float) -> np.ndarray:
         """Return [A | b] of each photo, (frames, 3, 4)."""
         return np.eye(3, 4) + self.compute_changes(parameter).numpy().reshape(-1, 3, 4)
+
+
+# ---- Loss of a step, and its gradients ----
+
+
+@dataclass
+class LossInputs:
+    """Inputs of the loss that change from step to step. Numbers are arrays of one entry, because `TrainingLoss` is
+    recorded.
+
+    Attributes
+    ----------
+    samples : RaySamples
+        Samples of the rays.
+    pixels : PixelBatch
+        Pixels of the rays.
+    background : Array3f
+        Random background per ray.
+    covered : UInt32
+        Number of leading rays that are covered completely.
+    stride : Float
+        March stride.
+    damping_distance : Float
+        Distance of `damp_near` in scene units.
+    depth_weight, point_weight : Float
+        Weights of the losses of depth and of points.
+    point_depth : tuple of Float, optional
+        Distance of each ray's point, 0 for other rays, and its standard error.
+    empty_points : Array3f, optional
+        World points in cells that are not sampled.
+    """
+
+    samples: RaySamples
+    pixels: PixelBatch
+    background: Array3f
+    covered: UInt32
+    stride: Float
+    damping_distance: Float
+    depth_weight: Float
+    point_weight: Float
+    point_depth: tuple[Float, Float] | None
+    empty_points: Array3f | None
+
+
+@dataclass(frozen=True)
+class TrainingLoss:
+    """Loss of a step, whose constants are those of a run.
+
+    Parameters
+    ----------
+    config : RadianceConfig
+        Configuration of the field.
+    box : AnyBox
+        Bounds of the field.
+    settings : RadianceSettings
+        Training settings.
+    ns : module
+        Dr.Jit backend.
+    photos : PhotoColors, optional
+        Colour corrections of the photos.
+    use_depth : bool
+        Whether the depth of pixels is supervised.
+    cell_size_at : callable
+        Maps world points to the edge of their cell of the density grid.
+    """
+
+    config: RadianceConfig
+    box: AnyBox
+    settings: RadianceSettings
+    ns: ModuleType
+    photos: PhotoColors | None
+    use_depth: bool
+    cell_size_at: Callable[[Array3f], Float | float]
+
+    def compute_gradients(self, weights: dict[str, Any], inputs: LossInputs) -> tuple[Float, Float | None, dict]:
+        """Return the loss of the rays, the depth loss of each ray or None, and the gradients of all ``weights``.
+
+        Only arrays change between two calls, so that Dr.Jit can record the kernels (`dr.freeze`): to trace them takes
+        as long as a quarter of their execution.
+        """
+        with gc_paused():
+            parameters = {name: type(value)(value) for name, value in weights.items()}
+            dr.enable_grad(parameters)
+            loss, depth_errors, penalty = self._compute_losses(parameters, inputs)
+            dr.backward(loss + penalty)
+        return dr.detach(loss), depth_errors, {name: dr.grad(value) for name, value in parameters.items()}
+
+    def _compute_losses(self, parameters: dict, inputs: LossInputs) -> tuple[Float, Float | None, Any]:
+        """Return the loss of the rays, the depth loss of each ray, and the penalties without rays."""
+        s, ns, depth_errors = self.settings, self.ns, None
+        samples, pixels, march_step = inputs.samples, inputs.pixels, s.march_step * self.box.side
+        d = dr.gather(ns.Array3f, pixels.d, samples.ray)
+        sigma, parts = evaluate_samples(self.config, self.box, parameters, samples.p, d, ns, samples.features)
+        if s.damping_distance > 0:
+            sigma, *parts = damp_near([sigma, *parts], samples.t, inputs.damping_distance)
+        # Evaluate now; otherwise each sum along the rays would evaluate the networks again.
+        dr.eval(sigma, parts)
+        weight, tau, sums, opacity = composite(sigma, parts, samples)
+        color = evaluate_ray_color(self.config, parameters, sums, opacity, pixels.d, ns)
+        penalty = self._compute_empty_penalty(parameters, inputs.empty_points)
+        if self.photos is not None:
+            changes = self.photos.compute_changes(parameters[PHOTO_PARAMETER])
+            color = self.photos.apply(changes, color, opacity, pixels.frame)
+            penalty += s.photo_decay * self.photos.decay_loss(changes)
+        loss = color_loss(color, opacity, pixels, inputs.background, s.huber_delta)
+        if self.use_depth and pixels.depth is not None:
+            # In units of the current step: a coarse march cannot place surfaces more precisely.
+            step = march_step
+            if self.box.is_contracted:
+                step = dr.maximum(s.step_growth * pixels.depth, march_step)
+            depth_term = depth_loss(weight, tau, samples, pixels.depth, step * s.depth_margin, step * inputs.stride)
+            loss += inputs.depth_weight * depth_term
+            depth_errors = dr.detach(depth_term)
+        if inputs.point_depth is not None:
+            distance, error = inputs.point_depth
+            step = dr.maximum(s.step_growth * distance, march_step) * inputs.stride
+            margin = dr.maximum(s.point_margin * error, s.depth_margin * step)
+            loss += inputs.point_weight / s.point_fraction * surface_loss(weight, samples, distance, margin)
+        if s.distortion_weight > 0:
+            loss += s.distortion_weight * distortion_loss(weight, samples, self.box.side)
+        complete = dr.arange(ns.UInt32, dr.width(pixels.d)) < inputs.covered
+        return dr.sum(dr.select(complete, loss, 0)) / ns.Float(inputs.covered), depth_errors, penalty
+
+    def _compute_empty_penalty(self, parameters: dict, p: Array3f | None):
+        """Return the penalty on density at points ``p`` in cells that are not sampled.
+
+        Without it nothing would keep these cells empty, and hash collisions fill them with artefacts of surfaces
+        elsewhere. The logarithm acts on fog and artefacts alike.
+        """
+        if p is None:
+            return 0
+        sigma = evaluate_density(self.config, self.box, parameters, p, self.ns)
+        return self.settings.empty_weight * dr.mean(dr.log(1 + sigma * self.cell_size_at(p)))

@@ -12,7 +12,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.maths.arrays import copy_aligned
 from nerg_mi.maths.geometry import AnyBox
-from nerg_mi.maths.types import Array3f, Float, UInt32
+from nerg_mi.maths.types import Array3f, Bool, Float, UInt32
 from nerg_mi.transport.quadrature import absorbed_fraction
 
 # ---- Differentiable volume rendering of samples packed ray after ray in flat arrays ----
@@ -29,16 +29,23 @@ from nerg_mi.transport.quadrature import absorbed_fraction
 _MAX_TAU = 60.0
 
 
+@dataclass
 class Segments:
     """Assignment of packed samples to rays.
 
-    ``ray`` (UInt32, ascending) is the ray index of each sample, ``active`` is False for padding at the end, ``rays`` is
-    the number of rays. ``start`` and ``stop`` (one entry per ray) bound its samples; both are 0 for rays without any.
+    ``ray`` (UInt32, ascending) is the ray index of each sample, ``active`` is False for padding at the end. ``start``
+    and ``stop`` (one entry per ray) bound its samples; both are 0 for rays without any.
     """
 
-    def __init__(self, ray, active, rays: int):
+    ray: UInt32
+    active: Bool
+    start: UInt32
+    stop: UInt32
+
+    @staticmethod
+    def find(ray, active, rays: int) -> Segments:
+        """Find the samples of each of ``rays`` rays."""
         UInt32 = type(ray)
-        self.ray, self.active, self.rays = ray, active, rays
         count = dr.width(ray)
         j = dr.arange(UInt32, count)
         # Neighbours beyond the ends count as other rays, and so does padding.
@@ -48,10 +55,11 @@ class Segments:
         after_active = dr.gather(type(active), active, dr.minimum(j + 1, last))
         first = active & ((j == 0) | (before != ray))
         final = active & ((j == last) | (after != ray) | ~after_active)
-        self.start, self.stop = dr.zeros(UInt32, rays), dr.zeros(UInt32, rays)
-        dr.scatter(self.start, j, ray, first)
-        dr.scatter(self.stop, j + 1, ray, final)
-        dr.eval(self.start, self.stop)
+        start, stop = dr.zeros(UInt32, rays), dr.zeros(UInt32, rays)
+        dr.scatter(start, j, ray, first)
+        dr.scatter(stop, j + 1, ray, final)
+        dr.eval(start, stop)
+        return Segments(ray, active, start, stop)
 
     def before(self, x):
         """Sum of ``x`` over the earlier samples of the same ray, one float64 per sample."""
@@ -389,9 +397,8 @@ def select_visible_samples(
         return None, rays.count
     ray, t, length, p, covered = steps
     Bool, Float, UInt32 = dr.mask_t(t), type(t), type(ray)
-    everywhere = dr.full(Bool, True, dr.width(t))
-    segments = Segments(ray, everywhere, rays.count)
-    sigma, features = density(p, everywhere) if with_features else (density(p, everywhere), None)
+    segments = Segments.find(ray, dr.full(Bool, True, dr.width(t)), rays.count)
+    sigma, features = density(p, True) if with_features else (density(p, True), None)
     tau = dr.minimum(sigma * length, 60.0)
     # Evaluate both in one kernel; separate evaluations would evaluate the field twice.
     dr.eval(tau, features)
@@ -429,7 +436,7 @@ def select_visible_samples(
         )
         dr.eval(thinned.multiplicity, thinned.before)
     dr.eval(ray, active, t, length, p, features)
-    segments = Segments(ray, active, rays.count)
+    segments = Segments.find(ray, active, rays.count)
     return RaySamples(
         ray, t, length, p, segments, min(count, pad or count), features, thinned, prepass_samples_per_ray
     ), covered

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, cast
+from dataclasses import dataclass, replace
+from typing import Any
 
 import drjit as dr
 import numpy as np
 from drjit.opt import Adam
 
 from nerg_mi.errors import NergError
-from nerg_mi.fields.encoding import encoding_from_parameters
 from nerg_mi.fields.occupancy import refine_occupancy
 from nerg_mi.fields.radiance import RadianceConfig, RadianceField, mean_features
 from nerg_mi.formats.fields import read_number
@@ -21,28 +20,23 @@ from nerg_mi.photos.cameras import pixel_directions
 from nerg_mi.photos.images import PhotoView
 from nerg_mi.transport.quadrature import mean_depth_fraction
 
-from .radiance_data import FreeSpace, PixelBank
+from .radiance_data import FreeSpace, PixelBank, PixelBatch
 from .radiance_grid import GRID_STATE, DensityGrid, OccupancyExtraction
 from .radiance_losses import (
     PHOTO_PARAMETER,
+    LossInputs,
     PhotoColors,
-    color_loss,
+    TrainingLoss,
     composite,
-    depth_loss,
-    distortion_loss,
-    evaluate_density,
-    evaluate_density_from_features,
-    evaluate_ray_color,
-    evaluate_samples,
-    feature_decay_loss,
-    surface_loss,
+    feature_decay_gradient,
+    make_density_prepass,
 )
 from .radiance_sampling import (
+    RaySamples,
     RussianRoulette,
     StepTable,
     clip_rays,
     compute_weights,
-    damp_near,
     select_visible_samples,
     sum_along_rays,
 )
@@ -216,6 +210,7 @@ class RadianceTrainer(Trainer):
             {} if self.photos is None else {PHOTO_PARAMETER: self.photos.init_parameter()}
         )
         self.start(Adam(settings.learning_rate, start, beta_2=0.99, epsilon=1e-15))
+        self._evaluate_prepass = make_density_prepass(config, box)
         self.march_step = settings.march_step * box.side
         free_space = FreeSpace.find(
             views, settings.near * box.side, settings.clear_fraction, settings.surrounding_fraction
@@ -231,6 +226,9 @@ class RadianceTrainer(Trainer):
             free_space=free_space,
             growth=settings.step_growth,
         )
+        loss = TrainingLoss(config, box, settings, ns, self.photos, self.use_depth, self.grid.cell_size_at)
+        # The networks of a deferred field are evaluated at rays, whose number would be recorded.
+        self._compute_gradients = dr.freeze(loss.compute_gradients, enabled=not config.deferred)
         # With exact depth everywhere the free space is known from the start, and there is no fog to clear.
         self.is_carved = self.use_depth and self.pixels.has_full_depth
         if self.is_carved:
@@ -309,15 +307,12 @@ class RadianceTrainer(Trainer):
     def evaluate_density(self, p, active):
         """Evaluate the current density at world points without gradient."""
         self.clock.add_evaluations(dr.width(p))
-        with dr.suspend_grad():
-            return self.current_field.density(p, active)
+        return self._evaluate_prepass(self.current_field.parameters(), p, active)[0]
 
     def _density_prepass(self, p, active):
         """Evaluate the density at ``p`` to select samples, and the grid features, which are reused."""
         self.clock.add_evaluations(dr.width(p))
-        weights_now = {k: dr.detach(v) for k, v in self._get_parameters().items()}
-        features = encoding_from_parameters(self.config.grid, weights_now).evaluate_eagerly(self.box.to_unit(p), active)
-        return evaluate_density_from_features(self.config, self.box, weights_now, p, features), features
+        return self._evaluate_prepass({k: dr.detach(v) for k, v in self._get_parameters().items()}, p, active)
 
     def _get_parameters(self) -> dict:
         """Return the weights of the field with gradients enabled."""
@@ -333,9 +328,12 @@ class RadianceTrainer(Trainer):
         self._update_density_grid()
         self._refine_stride()
         table = self.get_step_table(self.stride)
-        self.rays = limit_ray_count(
+        limit = limit_ray_count(
             self.rays, self.prepass_samples_per_ray, table.steps, max_prepass_samples, _MAX_CANDIDATES * s.batch
         )
+        # Odd, unlike the lengths of other arrays of a step: Dr.Jit evaluates arrays of equal length together, so that
+        # each coincidence would record other kernels.
+        self.rays = (limit - 1) | 1
         index = self._draw_pixels()
         point_depth = self._draw_points(index) if self.use_points else None
         pixels = self.pixels.gather_batch(ns.UInt32(copy_aligned(index, np.uint32)))
@@ -362,8 +360,7 @@ class RadianceTrainer(Trainer):
         if samples is None:
             self.rays = adapt_ray_count(self.rays, 0, 0, s.batch, max_prepass_samples)
             return
-        background = ns.Array3f(*[ns.Float(copy_aligned(self.rng.random(self.rays, np.float32))) for _ in range(3)])
-        depth_errors = self._optimize_step(samples, pixels, background, covered, self.stride, point_depth)
+        depth_errors = self._optimize_step(samples, pixels, covered, point_depth)
         if depth_errors is not None:
             self._update_hard_pixels(index[:covered], depth_errors)
         self.prepass_samples_per_ray = samples.prepass_samples_per_ray
@@ -437,75 +434,42 @@ class RadianceTrainer(Trainer):
         self.hard_pixels = np.concatenate([self.hard_pixels, index[is_hard]])[-_MAX_HARD_PIXELS:]
 
     def _optimize_step(
-        self, samples, pixels, background, covered: int, stride: int, point_depth: tuple[Float, Float] | None
+        self, samples: RaySamples, pixels: PixelBatch, covered: int, point_depth: tuple[Float, Float] | None
     ) -> Float | None:
         """Update the weights once; returns the depth loss of each ray, or None without depth supervision.
 
         ``point_depth`` has the distance of each ray's point, and its error, as `_draw_points` returns them.
         """
-        s, ns, depth_errors = self.settings, self.ns, None
-        d = dr.gather(ns.Array3f, pixels.d, samples.ray)
-        parameters = self._get_parameters()
-        sigma, parts = evaluate_samples(self.config, self.box, parameters, samples.p, d, ns, samples.features)
-        if s.damping_distance > 0:
-            # Never 0 and never skipped, which would compile other kernels during the run.
-            damping_distance = max(s.damping_distance_at(self.progress), 1e-6) * self.box.side
-            sigma, *parts = damp_near([sigma, *parts], samples.t, dr.opaque(ns.Float, damping_distance))
-        # Evaluate now; otherwise each sum along the rays would evaluate the networks again.
-        dr.eval(sigma, parts)
-        self.clock.add_evaluations(s.batch)
-        weight, tau, sums, opacity = composite(sigma, parts, samples)
-        color = evaluate_ray_color(self.config, parameters, sums, opacity, pixels.d, ns)
-        total = 0
-        if self.photos is not None:
-            changes = self.photos.compute_changes(cast("Float", self.optimiser[PHOTO_PARAMETER]))
-            color = self.photos.apply(changes, color, opacity, pixels.frame)
-            total = s.photo_decay * self.photos.decay_loss(changes)
-        loss = color_loss(color, opacity, pixels, background, s.huber_delta)
-        if self.use_depth:
-            # In units of the current step: a coarse march cannot place surfaces more precisely.
-            unit, margin = dr.opaque(ns.Float, stride * self.march_step), s.depth_margin * self.march_step
-            if self.box.is_contracted:
-                step = dr.maximum(s.step_growth * pixels.depth, self.march_step)
-                unit, margin = step * stride, step * s.depth_margin
-            depth_term = depth_loss(weight, tau, samples, pixels.depth, margin, unit)
+        s, ns, opaque = self.settings, self.ns, lambda value: dr.opaque(self.ns.Float, value)
+        background = ns.Array3f(*[ns.Float(copy_aligned(self.rng.random(self.rays, np.float32))) for _ in range(3)])
+        empty_points = self.grid.empty_points(max(2, s.batch // 32 * 2), self.rng) if s.empty_weight > 0 else None
+        inputs = LossInputs(
+            # Numbers would be recorded, and nothing depends on these.
+            replace(samples, count=0, prepass_samples_per_ray=0.0),
+            pixels,
+            background,
+            dr.opaque(ns.UInt32, covered),
+            opaque(self.stride),
+            # Never 0, because distances are divided by it.
+            opaque(max(s.damping_distance_at(self.progress), 1e-6) * self.box.side),
             # Depth matters most at first; later colour provides more information.
-            loss += dr.opaque(ns.Float, s.depth_weight * s.depth_weight_final_ratio**self.progress) * depth_term
-            depth_errors = dr.detach(depth_term)
-        if point_depth is not None:
-            distance, error = point_depth
-            step = dr.maximum(s.step_growth * distance, self.march_step) * dr.opaque(ns.Float, stride)
-            margin = dr.maximum(s.point_margin * error, s.depth_margin * step)
-            scale = s.point_weight * s.point_weight_final_ratio**self.progress / s.point_fraction
-            loss += dr.opaque(ns.Float, scale) * surface_loss(weight, samples, distance, margin)
-        if s.distortion_weight > 0:
-            loss += s.distortion_weight * distortion_loss(weight, samples, self.box.side)
-        complete = dr.arange(ns.UInt32, self.rays) < dr.opaque(ns.UInt32, covered)
-        loss = dr.sum(dr.select(complete, loss, 0)) / dr.opaque(ns.Float, covered)
-        total += loss + self._compute_empty_penalty(parameters)
-        for name, value in parameters.items():
+            opaque(s.depth_weight * s.depth_weight_final_ratio**self.progress),
+            opaque(s.point_weight * s.point_weight_final_ratio**self.progress),
+            point_depth,
+            empty_points,
+        )
+        self.clock.add_evaluations(s.batch + (0 if empty_points is None else dr.width(empty_points)))
+        weights = {k: dr.detach(v) for k, v in self.optimiser.items()}
+        loss, depth_errors, gradients = self._compute_gradients(weights, inputs)
+        for name, gradient in gradients.items():
             if name.startswith("grid."):
-                total = total + s.grid_decay * feature_decay_loss(value.array if dr.is_tensor_v(value) else value)
-        dr.backward(total)
+                gradient = gradient + feature_decay_gradient(weights[name], s.grid_decay)
+            dr.set_grad(self.optimiser[name], gradient)
         self.move_weights()
         self.loss, self.samples = loss, samples.count
         if self.steps % self.AVERAGE_INTERVAL == 0:
             self.average_weights()
         return depth_errors
-
-    def _compute_empty_penalty(self, parameters: dict):
-        """Return the penalty on density in cells that are not sampled.
-
-        Without it nothing would keep these cells empty, and hash collisions fill them with artefacts of surfaces
-        elsewhere. The logarithm acts on fog and artefacts alike.
-        """
-        s = self.settings
-        p = self.grid.empty_points(s.batch // 16, self.rng)
-        if p is None or s.empty_weight == 0:
-            return 0
-        self.clock.add_evaluations(dr.width(p))
-        sigma, cell = evaluate_density(self.config, self.box, parameters, p, self.ns), self.grid.cell_size_at(p)
-        return s.empty_weight * dr.mean(dr.log(1 + sigma * cell))
 
     def _contributing_samples(self, density, occupied):
         """Yield the points (Array3f) of samples with more than a thousandth of the light of a training ray."""

@@ -219,6 +219,35 @@ def test12_table_of_wrong_length_is_refused():
         HashGrid(SMALL, dr.zeros(ns.Float, 10))
 
 
+@pytest.mark.parametrize("dimensions, features", [(3, 2), (3, 4), (2, 2)])
+def test_attached_features_have_the_derivatives_of_the_evaluation(dimensions, features):
+    rng = np.random.default_rng(3)
+    config = HashGridConfig(levels=4, features=features, log2_rows=8, base=4, finest=32, dimensions=dimensions)
+    grid = HashGrid.random(config, ns, rng)
+    start = grid.table
+    direction = ns.Float(rng.normal(size=len(start)).astype(np.float32))
+    # The last point is outside.
+    points = np.append(rng.random((dimensions, 99)), np.full((dimensions, 1), 2.0), axis=1)
+    p = ns.Array3f(points) if dimensions == 3 else ns.Array2f(points)
+    weights = [ns.Float(rng.normal(size=100).astype(np.float32)) for _ in range(config.size)]
+    values = grid.evaluate_eagerly(p)
+    backward, forward = [], []
+    for rows in (lambda: grid(p), lambda: grid.attach(values, p)):
+        grid.table = ns.Float(start)
+        dr.enable_grad(grid.table)
+        dr.backward(dr.sum(sum(w * row for w, row in zip(weights, rows()))))
+        backward.append(dr.grad(grid.table).numpy())
+        grid.table = ns.Float(start)
+        dr.enable_grad(grid.table)
+        result = rows()
+        dr.set_grad(grid.table, direction)
+        dr.enqueue(dr.ADMode.Forward, grid.table)
+        dr.traverse(dr.ADMode.Forward)
+        forward.append([np.array(dr.grad(row)) for row in result])
+    assert np.abs(backward[0]).max() > 0 and np.allclose(*backward, rtol=1e-4, atol=1e-5)
+    assert np.abs(forward[0]).max() > 0 and np.allclose(*forward, rtol=1e-4, atol=1e-5)
+
+
 def test13_evaluation_leaves_no_reference_cycles():
     """Arrays in a reference cycle stay until garbage collection, which is rare for so few objects."""
     _, grid = random_grid(SMALL)

@@ -53,7 +53,7 @@ def packed():
     active = np.r_[np.ones(len(ray), bool), np.zeros(padding, bool)]
     padded_ray = np.r_[ray, np.full(padding, ray[-1])]
     padded_tau = np.r_[tau, rng.exponential(1, padding)]
-    segments = Segments(ns.UInt32(padded_ray), ns.Bool(active), RAYS)
+    segments = Segments.find(ns.UInt32(padded_ray), ns.Bool(active), RAYS)
     return ray, tau, padded_tau, segments
 
 
@@ -72,14 +72,14 @@ def test_the_ends_of_a_ray_are_written_once(packed, monkeypatch):
     written, scatter = [], dr.scatter
     monkeypatch.setattr(dr, "scatter", lambda *a: (written.append(np.array(a[2])[np.array(a[3])]), scatter(*a)))
     ray, _, _, segments = packed
-    Segments(segments.ray, segments.active, RAYS)
+    Segments.find(segments.ray, segments.active, RAYS)
     assert [w.tolist() for w in written] == [np.unique(ray).tolist()] * 2
 
 
 def test_opaque_samples_do_not_affect_other_rays():
     """An extremely dense sample must not reduce the precision of later rays."""
     tau = np.array([1e12, 1e12, 0.1, 0.2])
-    segments = Segments(ns.UInt32([0, 0, 1, 1]), ns.Bool([True] * 4), 2)
+    segments = Segments.find(ns.UInt32([0, 0, 1, 1]), ns.Bool([True] * 4), 2)
     w = compute_weights(ns.Float(tau), segments).numpy()
     assert np.allclose(w, [1, 0, -np.expm1(-0.1), np.exp(-0.1) * -np.expm1(-0.2)], atol=1e-7)
 
@@ -155,7 +155,7 @@ def test_distortion_equals_its_double_sum_and_its_derivative_finite_differences(
     length = rng.uniform(0.02, 0.1, 25).astype(np.float32)
     t = np.concatenate([np.cumsum(length[ray == r]) for r in range(4)]).astype(np.float32)
     w = (rng.random(25) * active).astype(np.float32)
-    segments = Segments(ns.UInt32(ray), ns.Bool(active), 4)
+    segments = Segments.find(ns.UInt32(ray), ns.Bool(active), 4)
     samples = RaySamples(ns.UInt32(ray), ns.Float(t), ns.Float(length), None, segments, 23)
 
     def reference(w):

@@ -119,7 +119,15 @@ def test_protocol_default_methods():
     assert grid.kernel_parameters()[0].index == values.array.index
     grid.replace("values", values * 2)
     p = ns.Array3f(0.5 + 0.5 * POINTS)
-    assert np.allclose(np.array(grid.evaluate_eagerly(p)), np.array(grid(p)))
+    features = grid.evaluate_eagerly(p)
+    assert np.allclose(np.array(features), np.array(grid(p)))
+    slopes = []
+    for rows in (lambda: grid(p), lambda: grid.attach(features, p)):
+        dr.enable_grad(grid.values)
+        dr.backward(dr.sum(sum(rows())))
+        slopes.append(dr.grad(grid.values).numpy())
+        dr.disable_grad(grid.values)
+    assert np.abs(slopes[0]).max() > 0 and np.allclose(*slopes, rtol=1e-5)
     grid.check_config(DenseConfig())
     with pytest.raises(ValueError, match="but its field needs"):
         grid.check_config(DenseConfig(size=5))

@@ -15,10 +15,10 @@ from nerg_mi.train.radiance_losses import (
     color_loss,
     depth_loss,
     evaluate_density,
-    evaluate_density_from_features,
     evaluate_ray_color,
     evaluate_samples,
     huber_loss,
+    make_density_prepass,
     stack,
     surface_loss,
     unstack,
@@ -38,7 +38,7 @@ TAU = np.array([0.1, 0.7, 2.0, 3.0, 0.2, 40.0, 0.5, 0.3, 1.0])
 
 
 def samples():
-    segments = Segments(ns.UInt32(RAY), dr.full(ns.Bool, True, len(RAY)), 3)
+    segments = Segments.find(ns.UInt32(RAY), dr.full(ns.Bool, True, len(RAY)), 3)
     return RaySamples(ns.UInt32(RAY), ns.Float(T), ns.Float(LENGTH), None, segments, len(RAY))
 
 
@@ -133,19 +133,28 @@ def test_density_alone_is_that_of_the_field():
     f, (p, _) = field(), points()
     want = f.density(p).numpy()
     assert np.allclose(evaluate_density(TINY, BOX, f.parameters(), p, ns).numpy(), want, rtol=1e-4)
-    features = [ns.Float(x) for x in f.grid(BOX.to_unit(p))]
-    assert np.allclose(evaluate_density_from_features(TINY, BOX, f.parameters(), p, features).numpy(), want, rtol=1e-4)
+    prepass = make_density_prepass(TINY, BOX)
+    for part in (slice(None), slice(150)):  # Recorded, and repeated for fewer points
+        q = ns.Array3f(p.numpy()[:, part])
+        sigma, features = prepass(f.parameters(), q, True)
+        assert np.allclose(sigma.numpy(), want[part], rtol=1e-4)
+        assert np.allclose(np.array(features), np.array(f.grid(BOX.to_unit(q))), rtol=1e-5)
 
 
 def test_rows_are_stacked_and_taken_apart():
     rows = [ns.Float([1, 2, 3]), ns.Float([4, 5, 6])]
     x = stack(rows, ns)
-    assert x.shape == (3, 2) and np.array_equal(x.numpy(), [[1, 4], [2, 5], [3, 6]])
-    assert np.array_equal([r.numpy() for r in unstack(x, ns)], [[1, 2, 3], [4, 5, 6]])
+    assert x.shape == (3, 8) and np.array_equal(x.numpy()[:, :2], [[1, 4], [2, 5], [3, 6]])
+    assert not x.numpy()[:, 2:].any()
+    assert np.array_equal([r.numpy() for r in unstack(x, ns)][:2], [[1, 2, 3], [4, 5, 6]])
+    x = ns.TensorXf(ns.Float([1, 4, 2, 5, 3, 6]), (3, 2))
     dr.enable_grad(x)
     a, b = unstack(x, ns)
     dr.backward(dr.sum(a * ns.Float([1, 10, 100]) + 2 * b))
     assert np.array_equal(dr.grad(x).numpy(), [[1, 2], [10, 2], [100, 2]])
+    dr.enable_grad(rows)
+    dr.backward(dr.sum(stack(rows, ns).array * ns.Float(np.arange(24))))
+    assert np.array_equal([dr.grad(r).numpy() for r in rows], [[0, 8, 16], [1, 9, 17]])
 
 
 def test_tensor_products_equal_the_fields_own_evaluation():
