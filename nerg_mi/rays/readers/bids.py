@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from nerg_mi.ranges import TIME_UNITS, ValidatedDataclass
 
 from . import poses
 from .base import GENERATED_FILES, RaysBuilder, Signature, TrackingFrame, option
-from .poses import PoseTrack
+from .poses import PoseTrack, find_fill_values
 from .tables import iterate_table, parse_clock_seconds, read_table_columns
 
 # ---- Names in the files ----
@@ -42,7 +42,9 @@ _TICKS |= {"us": 1e-6, "\N{MICRO SIGN}s": 1e-6, "\N{GREEK SMALL LETTER MU}s": 1e
 _TICKS |= {"ns": 1e-9, "nanosecond": 1e-9, "nanoseconds": 1e-9}
 _LENGTHS = {"m": "m", "meter": "m", "meters": "m", "metre": "m", "metres": "m", "cm": "cm", "mm": "mm"}
 _HEAD_NAMES = re.compile(r"head|hmd|helmet|glasses|\bcap\b|cent(er|re)_?eye", re.IGNORECASE)
-_EYES = ("cyclopean", "left", "right")
+_BOTH = "both"  # the mean of the left and the right eye
+_EYES = ("cyclopean", _BOTH, "left", "right")
+_MAX_DEPTH_DIFFERENCE = 0.1  # of the points of both eyes, as a fraction of their distance; beyond it they are unknown
 _MAX_POSE_GAP = 0.1  # seconds; gaze farther from a pose is dropped
 
 
@@ -52,7 +54,9 @@ class BidsOptions(ValidatedDataclass):
 
     task: str | None = option(None, "Label of the task whose recordings are imported.", default_text="all")
     eye: str | None = option(
-        None, "Eye whose gaze is imported: cyclopean, left or right.", default_text="cyclopean, or the only one"
+        None,
+        "Eye whose gaze is imported: cyclopean, both (their mean), left or right.",
+        default_text="cyclopean, otherwise both or the only one",
     )
     rigid_body: str | None = option(
         None,
@@ -75,7 +79,7 @@ class BidsOptions(ValidatedDataclass):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.eye not in (None, *_EYES):
-            raise NergError(f'--eye is "{sanitize(str(self.eye), 40)}"; it must be cyclopean, left or right')
+            raise NergError(f'--eye is "{sanitize(str(self.eye), 40)}"; it must be cyclopean, both, left or right')
         if self.forward is not None:
             poses.parse_axis(self.forward, "forward")
 
@@ -225,6 +229,10 @@ class _Gaze:
     metadata: dict[str, Any]
 
     @property
+    def eye(self) -> str:
+        return str(self.metadata.get("RecordedEye"))
+
+    @property
     def system(self) -> str:
         return str(self.metadata.get("SampleCoordinateSystem"))
 
@@ -268,18 +276,24 @@ class _Gaze:
         return _TICKS[units.lower()] if options.tick is None else options.tick
 
 
-def _list_gaze(dataset: _Dataset, options: BidsOptions) -> list[_Gaze]:
-    """The recordings of gaze of one eye, of the requested task."""
+def _list_gaze(dataset: _Dataset, options: BidsOptions) -> list[tuple[_Gaze, ...]]:
+    """The recordings of gaze of the requested task: of each, the file of one eye, or those of both."""
     recordings: dict[frozenset[str], list[_Gaze]] = {}
     for path in dataset.list_files("physio", ".tsv.gz"):
         gaze = _Gaze(path, BidsName.parse(path.name), dataset.read_sidecar(path))
         is_requested = options.task is None or gaze.name.get("task") == options.task
         if is_requested and gaze.metadata.get("PhysioType") == "eyetrack":
             recordings.setdefault(gaze.name.without("recording"), []).append(gaze)
-    return [_choose_eye(eyes, options.eye) for eyes in recordings.values()]
+    return [_choose_eyes(eyes, options.eye) for eyes in recordings.values()]
 
 
-def _choose_eye(eyes: Sequence[_Gaze], requested: str | None) -> _Gaze:
+def _describe_eyes(recordings: Iterable[Sequence[_Gaze]]) -> dict[str, str]:
+    """Metadata of rays: the eye that was imported, if it is that of all recordings."""
+    chosen = {_BOTH if len(eyes) > 1 else eyes[0].eye for eyes in recordings}
+    return {"eye": chosen.pop()} if len(chosen) == 1 and chosen <= set(_EYES) else {}
+
+
+def _choose_eyes(eyes: Sequence[_Gaze], requested: str | None) -> tuple[_Gaze, ...]:
     for gaze in eyes:
         if gaze.system not in (GAZE_IN_WORLD, "eye-in-head"):
             raise NergError(
@@ -287,12 +301,20 @@ def _choose_eye(eyes: Sequence[_Gaze], requested: str | None) -> _Gaze:
                 "the positions of the eyes and of the screen in the world; rays need gaze-in-world, or eye-in-head "
                 "with head poses of Motion-BIDS"
             )
-    by_eye = {str(gaze.metadata.get("RecordedEye")): gaze for gaze in eyes}
-    gaze = by_eye.get(requested or "cyclopean") or (eyes[0] if requested is None and len(eyes) == 1 else None)
-    if gaze is None:
-        recorded = ", ".join(sanitize(eye, 20) for eye in by_eye)
-        raise NergError(f'"{eyes[0].path}" and the files next to it record the eyes {recorded}; choose one (--eye)')
-    return gaze
+    by_eye = {gaze.eye: gaze for gaze in eyes}
+    if len(by_eye) < len(eyes):
+        raise NergError(
+            f'"{eyes[0].path}" and a file next to it record the same eye ("RecordedEye"); correct their JSON files, or '
+            "specify one of the files"
+        )
+    choices = {"cyclopean": ("cyclopean",), _BOTH: ("left", "right"), "left": ("left",), "right": ("right",)}
+    for choice in ["cyclopean", _BOTH] if requested is None else [requested]:
+        if all(eye in by_eye for eye in choices[choice]):
+            return tuple(by_eye[eye] for eye in choices[choice])
+    if requested is None and len(eyes) == 1:
+        return tuple(eyes)
+    recorded = ", ".join(sanitize(eye, 20) for eye in by_eye)
+    raise NergError(f'"{eyes[0].path}" and the files next to it record the eyes {recorded}; choose one (--eye)')
 
 
 # ---- Heads of Motion-BIDS ----
@@ -497,6 +519,10 @@ class Bids:
       z_coordinate a direction in its frame; the head's pose is that of Motion-BIDS, at most 0.1 s from the sample.
     - gaze-on-screen and custom are refused, since the poses of screen and eyes in the world are not in the dataset.
 
+    A recording with a file of the left and one of the right eye gives the mean of both eyes, and the gaze of one eye
+    where the other was not seen (n/a, or confidence 0); a file of the cyclopean eye is preferred. Rows of both eyes
+    belong together if their times differ by at most half a sampling interval.
+
     Gaze and motion are aligned by ``acq_time`` in scans.tsv, otherwise by ``StartTime``. A dataset without eye tracking
     gives the heads of Motion-BIDS as rays. The participant is that of the folder, or its ``source_name`` in
     participants.tsv, and the cohort its ``group``. Events are not read.
@@ -522,7 +548,7 @@ class Bids:
     def _find_frame(self, dataset: _Dataset, options: BidsOptions) -> TrackingFrame:
         gaze = _list_gaze(dataset, options)
         heads = [] if gaze else _find_motions(dataset, options)
-        frames = {_frame_of_gaze(dataset, one, options) for one in gaze}
+        frames = {_frame_of_gaze(dataset, eye, options) for eyes in gaze for eye in eyes}
         frames |= {head.get_axes(options)[0] for head in heads}
         if not frames:
             raise NergError(
@@ -542,8 +568,9 @@ class Bids:
         for path in files:
             dataset = _Dataset(path, builder)
             recordings = _list_gaze(dataset, options)
-            for gaze in recordings:
-                _add_gaze(dataset, gaze, frame, options, builder)
+            builder.add_metadata(**_describe_eyes(recordings))
+            for eyes in recordings:
+                _add_gaze(dataset, eyes, frame, options, builder)
             if not recordings:
                 builder.add_metadata(floor="unknown")
                 for motion in _find_motions(dataset, options):
@@ -574,21 +601,173 @@ def _frame_of_gaze(dataset: _Dataset, gaze: _Gaze, options: BidsOptions) -> Trac
     return TrackingFrame(str(up), str(handedness), gaze.get_length_unit(ORIGIN[0]))
 
 
-def _add_gaze(dataset: _Dataset, gaze: _Gaze, frame: TrackingFrame, options: BidsOptions, builder: RaysBuilder) -> None:
-    """Add the rays of a recording of gaze."""
-    person, cohort = _find_person(dataset, gaze.name, gaze.metadata)
-    world = gaze.metadata.get(WORLD)
+@dataclass(frozen=True, eq=False)
+class _Samples:
+    """n samples of an eye, or of both, in the world of the dataset."""
+
+    times: np.ndarray  # (n,) seconds
+    origin: np.ndarray  # (n, 3)
+    direction: np.ndarray  # (n, 3), of any length
+    lines: np.ndarray  # (n,)
+    confidence: np.ndarray | None = None  # (n,)
+    hit: np.ndarray | None = None  # (n, 3)
+    head: np.ndarray | None = None  # (n, 3)
+    drop: dict[str, np.ndarray] = field(default_factory=dict)  # reasons and masks (n,)
+
+    def select(self, rows: np.ndarray) -> _Samples:
+        """The samples of a mask or of indices."""
+        return self._from_columns({name: v[rows] for name, v in self._to_columns().items()})
+
+    @classmethod
+    def join(cls, parts: Sequence[_Samples]) -> _Samples:
+        """Join the parts of a file, of which there is at least one."""
+        columns = [part._to_columns() for part in parts]
+        return cls._from_columns({name: np.concatenate([c[name] for c in columns]) for name in columns[0]})
+
+    def _to_columns(self) -> dict[str, np.ndarray]:
+        """The columns that exist, by name, and the masks, by reason."""
+        columns = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "drop"}
+        return {name: values for name, values in columns.items() if values is not None} | self.drop
+
+    @classmethod
+    def _from_columns(cls, columns: dict[str, np.ndarray]) -> _Samples:
+        arguments = {f.name: columns[f.name] for f in fields(cls) if f.name in columns}
+        return cls(**arguments, drop={reason: mask for reason, mask in columns.items() if reason not in arguments})
+
+    @property
+    def is_seen(self) -> np.ndarray:
+        """Whether the eye has a direction with a confidence above 0, (n,) bool."""
+        values = np.c_[self.origin, self.direction]
+        is_seen = np.isfinite(values).all(axis=1) & (self.direction != 0).any(axis=1)
+        is_seen &= np.isnan(find_fill_values(self.direction))
+        return is_seen if self.confidence is None else is_seen & (self.confidence > 0)
+
+
+def _add_gaze(
+    dataset: _Dataset, eyes: Sequence[_Gaze], frame: TrackingFrame, options: BidsOptions, builder: RaysBuilder
+) -> None:
+    """Add the rays of a recording, of one eye or of both."""
+    first = eyes[0]
+    person, cohort = _find_person(dataset, first.name, first.metadata)
+    world = first.metadata.get(WORLD)
     world = world if isinstance(world, dict) else {}
     if world.get("FloorHeight") != 0:
         builder.add_metadata(floor="unknown")
     if _is_matrix(world.get("EnvironmentFromWorld")):
         builder.add_metadata(place_from_rays=world["EnvironmentFromWorld"])
+
+    def add(samples: _Samples, eye_distance: np.ndarray | None = None) -> None:
+        builder.add(
+            samples.times,
+            person,
+            samples.origin,
+            samples.direction,
+            rows=samples.lines,
+            confidence=samples.confidence,
+            hit=samples.hit,
+            cohort=None if cohort is None else np.full(len(samples.times), cohort),
+            head=samples.head,
+            eye_distance=eye_distance,
+            drop=samples.drop,
+        )
+
+    tracks: dict[Path, PoseTrack] = {}
+    iterate = lambda gaze: _iterate_samples(dataset, gaze, frame, options, builder, tracks)
+    if len(eyes) == 1:
+        for samples in iterate(first):
+            add(samples)
+        return
+    parts = list(iterate(eyes[1]))
+    if not parts:
+        raise NergError(f'"{eyes[1].path}" has no samples; copy it again, or import the other eye alone (--eye)')
+    second = _Samples.join(parts)
+    tolerance = _find_interval(second.times) / 2
+    # Rows of the second eye become rays of their own only at times without a row of the first eye.
+    is_alone = ~_find_nearest(_read_times(first, options, builder), second.times, tolerance)[1]
+    builder.count_lines(int((~is_alone).sum()))
+    add(second.select(is_alone))
+    for samples in iterate(first):
+        nearest, is_paired = _find_nearest(second.times, samples.times, tolerance)
+        add(*_average_eyes(samples, second.select(nearest), is_paired))
+
+
+def _read_times(gaze: _Gaze, options: BidsOptions, builder: RaysBuilder) -> np.ndarray:
+    """Read the times of a file in seconds, (n,), without its other columns."""
+    skip = None if builder.on_bad_line is None else lambda line, reason: None  # recorded when its samples are read
+    blocks = iterate_table(gaze.path, [TIME], (), gaze.columns, skip, separator="\t")
+    return gaze.get_tick(options) * np.concatenate([np.zeros(0), *(block.numbers[:, 0] for block in blocks)])
+
+
+def _find_interval(times: np.ndarray) -> float:
+    """The median interval of times (n,) that increase; 0 if none does."""
+    steps = np.diff(times)
+    steps = steps[steps > 0]
+    return float(np.median(steps)) if len(steps) else 0.0
+
+
+def _find_nearest(times: np.ndarray, wanted: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+    """Indices (n,) of the nearest of ``times`` (m,) for each of the times ``wanted`` (n,), and whether it is within the
+    ``tolerance``, (n,) bool."""
+    rows = np.flatnonzero(np.isfinite(times))
+    if not len(rows):
+        return np.zeros(len(wanted), np.int64), np.zeros(len(wanted), bool)
+    rows = rows[np.argsort(times[rows], kind="stable")]
+    after = np.clip(np.searchsorted(times[rows], wanted), 1, max(len(rows) - 1, 1))
+    candidates = rows[np.minimum(np.stack([after - 1, after]), len(rows) - 1)]
+    distances = np.abs(times[candidates] - wanted)
+    is_after = distances[1] < distances[0]
+    return np.where(is_after, candidates[1], candidates[0]), distances.min(axis=0) <= tolerance
+
+
+def _average_eyes(first: _Samples, second: _Samples, is_paired: np.ndarray) -> tuple[_Samples, np.ndarray]:
+    """One sample for each of both eyes (n): from midway between these along the mean of their directions, or of the eye
+    that was seen, if the other was not or is not paired; and the distance between the eyes, (n,), NaN if unknown."""
+    is_seen = np.stack([first.is_seen, second.is_seen & is_paired], axis=1)
+    is_both = is_seen.all(axis=1)
+
+    def average(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return poses.average_eyes(np.where(is_seen[..., None], np.stack([a, b], axis=1), np.nan))
+
+    normalize = lambda v: v / np.linalg.norm(v, axis=1, keepdims=True)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        direction = average(normalize(first.direction), normalize(second.direction))
+    origin = average(first.origin, second.origin)
+    hit, head = first.hit, first.head
+    if first.hit is not None and second.hit is not None:
+        hit = average(first.hit, second.hit)
+        # Between points on two surfaces there is no surface.
+        depths = [np.linalg.norm(point - origin, axis=1) for point in (first.hit, second.hit)]
+        hit[is_both & (np.abs(depths[0] - depths[1]) > _MAX_DEPTH_DIFFERENCE * np.minimum(*depths))] = np.nan
+    if first.head is not None and second.head is not None:
+        head = average(first.head, second.head)
+    confidence = first.confidence
+    if first.confidence is not None and second.confidence is not None:
+        values = np.stack([first.confidence, second.confidence], axis=1)
+        confidence = np.where(is_seen, values, 1.0).min(axis=1)
+    distance = np.linalg.norm(second.origin - first.origin, axis=1)
+    distance[~is_both | (distance == 0)] = np.nan  # 0: both are the position of the head
+    drop = {**first.drop, "no eye was seen": ~is_seen.any(axis=1)}
+    samples = _Samples(first.times, origin, direction, first.lines, confidence, hit, head, drop)
+    return samples, distance
+
+
+def _iterate_samples(
+    dataset: _Dataset,
+    gaze: _Gaze,
+    frame: TrackingFrame,
+    options: BidsOptions,
+    builder: RaysBuilder,
+    tracks: dict[Path, PoseTrack],
+) -> Iterator[_Samples]:
+    """Iterate over the samples of a file of gaze block by block; ``tracks`` caches the poses of the head."""
     has_rays = gaze.system == GAZE_IN_WORLD and gaze.has(*ORIGIN, *DIRECTION)
     track, start, forward = None, 0.0, np.zeros(3)
     if not has_rays:
         motion = _find_motion(dataset, gaze, options)
         forward = motion.get_axes(options)[1]
-        track = _read_track(dataset, motion, frame.handedness, builder)
+        if motion.path not in tracks:
+            tracks[motion.path] = _read_track(dataset, motion, frame.handedness, builder)
+        track = tracks[motion.path]
         start = _find_start(dataset, gaze, motion)
     has_point = gaze.has(*POINT)
     angles = gaze.system == "eye-in-head" and not has_point
@@ -621,18 +800,8 @@ def _add_gaze(dataset: _Dataset, gaze: _Gaze, frame: TrackingFrame, options: Bid
                 local = _directions_in_head(gaze, take(v, POINT[:2]), frame, forward) if angles else point
                 assert local is not None
                 direction, point = poses.rotate(rotation, local), None
-        builder.add(
-            t,
-            person,
-            origin,
-            direction,
-            rows=lines,
-            confidence=v[:, -1] if gaze.has(CONFIDENCE) else None,
-            hit=point,
-            cohort=None if cohort is None else np.full(len(t), cohort),
-            head=head,
-            drop=drop,
-        )
+        confidence = v[:, -1] if gaze.has(CONFIDENCE) else None
+        yield _Samples(t, origin, direction, lines, confidence, point, head, drop)
 
 
 def _directions_in_head(gaze: _Gaze, angles: np.ndarray, frame: TrackingFrame, forward: np.ndarray) -> np.ndarray:

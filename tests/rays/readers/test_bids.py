@@ -117,7 +117,7 @@ def test_eye_in_head(dataset, axes, euler):
     dataset.motion(axes, euler=euler)
     dataset.gaze(ANGLES)
     rays = read("bids", dataset.folder)
-    assert len(rays) == N and rays.persons == ("sub-01",)
+    assert len(rays) == N and rays.persons == ("sub-01",) and rays.metadata["eye"] == "left"
     np.testing.assert_allclose(rays.t, 5 + T)
     np.testing.assert_allclose(rays.origin, in_rays_frame(axes, HEAD), atol=1e-9)
     np.testing.assert_allclose(rays.direction, in_rays_frame(axes, world_gaze()), atol=1e-9)
@@ -246,17 +246,93 @@ def test_participants(dataset):
     assert len(read("bids", dataset.folder / "sub-b")) == N
 
 
-def test_eyes(dataset):
-    for k, eye in enumerate(("left", "right"), 1):
-        columns = {**IN_WORLD, "origin_x": np.full(N, float(k))}
+def of_eye(eye: str, origin, direction, **changes) -> dict[str, np.ndarray]:
+    """Columns of an eye at rest, with a hit point two metres ahead."""
+    groups = {"": np.add(origin, 2.0 * np.array(direction)), "origin": origin, "direction": direction}
+    names = {"": "{}_coordinate", "origin": "origin_{}", "direction": "direction_{}"}
+    columns = {names[g].format(a): np.full(N, v[k]) for g, v in groups.items() for k, a in enumerate("xyz")}
+    return {"timestamp": 1000 * T, **columns, "confidence": np.full(N, 0.8 if eye == "left" else 0.6)} | changes
+
+
+def write_eyes(dataset, left: dict, right: dict) -> None:
+    for k, (eye, columns) in enumerate((("left", left), ("right", right)), 1):
         dataset.gaze(columns, f"sub-a/beh/sub-a_task-look_recording-eye{k}", **{**SYSTEM, "RecordedEye": eye})
-    with pytest.raises(NergError, match="--eye"):
-        read("bids", dataset.folder)
-    assert (read("bids", dataset.folder, eye="right").origin[:, 0] == 2).all()
+
+
+LEFT, RIGHT = ((-0.03, 2, 1.6), (0.6, 0.8, 0)), ((0.03, 2, 1.6), (-0.6, 0.8, 0))
+
+
+def test_eyes(dataset):
+    write_eyes(dataset, of_eye("left", *LEFT), of_eye("right", *RIGHT))
+    assert (read("bids", dataset.folder, eye="right").origin == RIGHT[0]).all()
+    both = read("bids", dataset.folder)
+    assert len(both) == N and both.metadata["eye"] == read("bids", dataset.folder, eye="both").metadata["eye"] == "both"
+    np.testing.assert_allclose(both.origin, np.tile([0, 2, 1.6], (N, 1)), atol=1e-12)
+    np.testing.assert_allclose(both.direction, np.tile([0, 1, 0], (N, 1)), atol=1e-12)
+    np.testing.assert_allclose(both.hit, np.tile([0, 3.6, 1.6], (N, 1)), atol=1e-12)
+    np.testing.assert_allclose(both.metadata["eye_distance"]["sub-a"], 0.06, rtol=1e-6)
+    assert (both.confidence == 0.6).all()
     dataset.gaze(IN_WORLD, "sub-a/beh/sub-a_task-look_recording-eye3", **{**SYSTEM, "RecordedEye": "cyclopean"})
-    assert len(read("bids", dataset.folder)) == N
+    assert (read("bids", dataset.folder).origin[:, 0] == 1).all()
+    assert len(read("bids", dataset.folder, eye="both")) == N
     with pytest.raises(NergError, match="--eye"):
         read("bids", dataset.folder, eye="third")
+
+
+def test_an_eye_that_was_not_seen(dataset):
+    """Lost samples of an eye are n/a or have no confidence; then the other one is used alone."""
+    left, right = of_eye("left", *LEFT), of_eye("right", *RIGHT)
+    left["direction_x"][:10] = np.nan
+    right["confidence"][20:30] = 0
+    left["direction_y"][40:45] = right["direction_y"][40:45] = np.nan
+    # A point of the right eye on a farther surface: the mean of both is on none.
+    for k, axis in enumerate("xyz"):
+        right[f"{axis}_coordinate"][50:] = RIGHT[0][k] + 3 * RIGHT[1][k]
+    write_eyes(dataset, left, right)
+    rays = read("bids", dataset.folder)
+    expected = np.tile([0.0, 1, 0], (N, 1))
+    expected[:10], expected[20:30] = RIGHT[1], LEFT[1]
+    np.testing.assert_allclose(rays.direction, np.delete(expected, np.s_[40:45], axis=0), atol=1e-12)
+    assert [RIGHT[0], LEFT[0]] == [tuple(rays.origin[k]) for k in (0, 20)]
+    assert rays.confidence[0] == 0.6 and rays.confidence[20] == 0.8
+    assert dropped(rays) == {"no eye was seen": [[41, 45]]}
+    assert rays.hit is not None
+    assert np.isnan(rays.hit).any(axis=1).tolist() == [False] * 45 + [True] * 10
+
+
+def test_rows_of_both_eyes_are_paired_by_time(dataset):
+    """The right eye is sampled a little later; each eye lacks rows, so that the files have different lengths."""
+    keep = lambda columns, rows: {name: values[rows] for name, values in columns.items()}
+    left = keep(of_eye("left", *LEFT), np.r_[5:N])
+    right = keep(of_eye("right", *RIGHT, timestamp=1000 * T + 5), np.r_[0:20, 30:N])
+    write_eyes(dataset, left, right)
+    rays = read("bids", dataset.folder)
+    order = np.argsort(rays.t)
+    np.testing.assert_allclose(rays.t[order], np.r_[T[:5] + 0.005, T[5:]])
+    expected = np.tile([0.0, 1, 0], (N, 1))
+    expected[:5], expected[20:30] = RIGHT[1], LEFT[1]
+    np.testing.assert_allclose(rays.direction[order], expected, atol=1e-12)
+    assert rays.metadata["rows_read"] == len(left["timestamp"]) + len(right["timestamp"]) - (N - 15)
+
+
+def test_both_eyes_in_the_head(dataset):
+    dataset.motion("ALS")
+    for k, (eye, angle) in enumerate((("left", 3.0), ("right", -3.0)), 1):
+        columns = {**ANGLES, "x_coordinate": GAZE[:, 0] + angle}
+        dataset.gaze(columns, f"sub-01/beh/sub-01_task-walk_recording-eye{k}", RecordedEye=eye)
+    rays = read("bids", dataset.folder)
+    # The mean of two directions of one elevation is a little higher than these.
+    np.testing.assert_allclose(rays.direction, world_gaze(), atol=2e-3)
+    np.testing.assert_allclose(rays.origin, HEAD, atol=1e-9)
+    assert sum("motion.tsv" in source["file"] for source in rays.metadata["sources"]) == 1
+
+
+def test_two_files_of_one_eye_are_refused(dataset):
+    write_eyes(dataset, of_eye("left", *LEFT), of_eye("right", *RIGHT))
+    dataset.gaze(IN_WORLD, "sub-a/beh/sub-a_task-look_recording-eye3", **{**SYSTEM, "RecordedEye": "left"})
+    with pytest.raises(NergError, match="RecordedEye"):
+        read("bids", dataset.folder)
+    assert len(read("bids", dataset.folder / "sub-a/beh/sub-a_task-look_recording-eye3_physio.tsv.gz")) == N
 
 
 # ---- Refusals ----
