@@ -244,8 +244,9 @@ def build_options(kind: type[Options], function: str, options: Options | None, o
     options : dataclass instance or None
         Base options; None uses the defaults.
     overrides : dict
-        Values by option name. Where an option names a file, an object in memory can be given (`as_file`). The option
-        ``geometry`` also takes an environment, which becomes the option ``field`` or ``scene``.
+        Values by option name. Where an option names a file, an object in memory can be given (`as_file`). An
+        environment in memory, as ``geometry``, ``field`` or ``scene``, becomes that of ``field`` and ``scene`` which
+        fits its content.
 
     Returns
     -------
@@ -260,8 +261,9 @@ def build_options(kind: type[Options], function: str, options: Options | None, o
     types, overrides = {f.name: str(f.type) for f in fields(kind)}, current_keywords(kind, overrides)
     if "mode" in overrides:
         raise NergError(f"{function} uses the active variant; call mi.set_variant({overrides['mode']!r}) before it")
-    if "geometry" in overrides and {"field", "scene"} <= types.keys():
-        overrides = _choose_geometry(overrides)
+    if {"field", "scene"} <= types.keys():
+        for name in ("geometry", "field", "scene"):
+            overrides = _choose_geometry(overrides, name)
     check_names(function, overrides, [name for name in types if name != "mode"])
     if "mode" in types:
         overrides = {**overrides, "mode": activate_mitsuba().variant()}
@@ -277,19 +279,29 @@ def build_options(kind: type[Options], function: str, options: Options | None, o
     )
 
 
-def _choose_geometry(overrides: dict[str, Any]) -> dict[str, Any]:
-    """Replace the option ``geometry`` by ``field`` or ``scene`` if it is an environment."""
-    geometry = overrides["geometry"]
-    if geometry is None or (isinstance(geometry, (str, os.PathLike)) and str(geometry) in ("hits", "none")):
+def _choose_geometry(overrides: dict[str, Any], name: str) -> dict[str, Any]:
+    """Replace the option ``name`` by ``field`` or ``scene``, by its content, if it is an environment.
+
+    Files are replaced as ``geometry`` only, since a workflow checks those of ``field`` and ``scene``.
+    """
+    value = overrides.get(name)
+    if isinstance(value, (str, os.PathLike)):
+        is_environment = name == "geometry" and str(value) not in ("hits", "none")
+        if not is_environment or Path(value).suffix.lower() == ".vol":
+            return overrides
+    elif value is None:
         return overrides
-    if isinstance(geometry, (str, os.PathLike)) and Path(geometry).suffix.lower() == ".vol":
-        return overrides
-    path = as_file(geometry, "geometry")
+    path = as_file(value, name)
     kind = detect_kind(path)
     if kind not in ("field", "mesh", "scene"):
-        raise NergError(f'geometry must be an environment, "hits" or "none", but "{path}" contains {kind}')
-    others = {name: value for name, value in overrides.items() if name != "geometry"}
-    return {**others, "field" if kind == "field" else "scene": path}
+        choices = 'an environment, "hits" or "none"' if name == "geometry" else "an environment"
+        content = f'"{value}", which contains {kind}' if isinstance(value, (str, os.PathLike)) else type(value).__name__
+        raise NergError(f"{name} must be {choices}, got {content}")
+    others = {key: option for key, option in overrides.items() if key != name}
+    target = "field" if kind == "field" else "scene"
+    if others.get(target) is not None:
+        raise NergError(f"only one environment can be given, not both {name} and {target}; leave one of them out")
+    return {**others, target: path}
 
 
 def resolve_rays(value: object) -> Rays | Path:

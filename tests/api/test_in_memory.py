@@ -20,6 +20,7 @@ from nerg_mi.api.objects import as_file, build_options, session_folder
 from nerg_mi.fields.splats import Splats
 from nerg_mi.rendering.scene import list_scene_files
 from nerg_mi.workflows.gaze_commands import FoldOptions, GazeOptions
+from nerg_mi.workflows.rays_commands import AlignOptions
 from nerg_mi.workflows.view import make_viewer_scene
 
 QUICK = {"recipe": "small", "steps": 2, "probes": 8, "directions": 64, "min_rays": 8, "validation_zones": 0}
@@ -249,6 +250,33 @@ def test_environments_are_shown(rgb_module, rays, tmp_path, kind):
         assert "density" in written.integrator.children and report.path.stat().st_size > 10_000
     shown = make_viewer_scene([as_file(environment, "inputs"), as_file(gaze, "inputs")], tmp_path)
     np.testing.assert_allclose(depths(nerg.Scene.load(shown.scene)), depths(written), atol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["geometry", "field", "scene"])
+def test_environments_have_one_argument_each(rgb_module, rays, name):
+    """A grid is written as a scene file, and splats as a field, whatever the argument is called."""
+    for environment, option in ((make_grid(), "scene"), (make_splats(), "field"), (make_room(), "scene")):
+        resolved = build_options(AlignOptions, "align", None, {name: environment})
+        assert [n for n in ("field", "scene") if getattr(resolved, n) is not None] == [option]
+    with pytest.raises(nerg.NergError, match=f"{name} must be .* Rays"):
+        nerg.align(rays, **{name: rays})
+    other = "field" if name == "scene" else "scene"
+    with pytest.raises(nerg.NergError, match="both"):
+        nerg.align(rays, **{name: make_room(), other: make_grid()})
+
+
+def test_recordings_are_aligned_with_a_grid(rgb_module):
+    rng = np.random.default_rng(0)
+    eyes, seen = rng.uniform((1, 1, 1.5), (5, 3, 1.7), (1500, 3)), rng.uniform((0, 0, 0), (6, 4, 3), (1500, 3))
+    axis = rng.integers(0, 3, 1500)
+    seen[np.arange(1500), axis] = np.array([6, 4, 3])[axis] * rng.integers(0, 2, 1500)
+    names = np.array(list("abcd"))[np.arange(1500) % 4]
+    shift = np.array([0.3, -0.2, 0])
+    moved = nerg.Rays.from_arrays(
+        eyes + shift, seen - eyes, times=np.arange(1500) / 30, participants=names, hits=seen + shift
+    )
+    alignment = nerg.align(moved, field=make_grid(), turn=0, scale=1)
+    np.testing.assert_allclose(alignment.matrix[:3, 3], -shift, atol=0.06)
 
 
 @pytest.mark.parametrize("inputs", ["environment", "gaze", "both"])
