@@ -10,10 +10,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, import_extra
 from nerg_mi.fields.splats import Splats
 from nerg_mi.files.atomic import check_writable, replace_atomically
 
@@ -104,14 +105,32 @@ class ExchangeScene:
 Write = Callable[[ExchangeScene, Path], None]
 """Writes a scene to an existing file, whose suffix is that of the format."""
 
-_USD = "nerg_mi.formats.exchange_usd:write_usd"
-FORMATS: dict[str, str] = {
-    ".rrd": "nerg_mi.formats.exchange_rerun:write_rerun",
-    ".usdc": _USD,
-    ".usda": _USD,
-    ".usd": _USD,
-}
-"""Function that writes a format, by the suffix of its files."""
+
+class Format(NamedTuple):
+    """The function that writes a format, and the library that it needs."""
+
+    write: str  # module:function
+    library: str
+    reason: str  # as of `nerg_mi.errors.import_extra`
+    extra: str
+
+
+_RERUN = Format("nerg_mi.formats.exchange_rerun:write_rerun", "rerun", "a Rerun recording needs rerun-sdk", "rerun")
+_USD = Format("nerg_mi.formats.exchange_usd:write_usd", "pxr.Usd", "a USD scene needs usd-core", "usd")
+FORMATS: dict[str, Format] = {".rrd": _RERUN, ".usdc": _USD, ".usda": _USD, ".usd": _USD}
+"""Formats by the suffix of their files."""
+
+
+def check_exchange(path: str | os.PathLike) -> Format:
+    """Return the format of the file ``path``, before the work on its content.
+
+    Raises `NergError` for another suffix and for a file that cannot be written, and `ImportError` without the format's
+    library.
+    """
+    check_writable(path, *FORMATS)
+    chosen = FORMATS[Path(path).suffix.lower()]
+    import_extra(chosen.library, chosen.reason, chosen.extra)
+    return chosen
 
 
 def write_exchange(scene: ExchangeScene, path: str | os.PathLike) -> None:
@@ -119,10 +138,10 @@ def write_exchange(scene: ExchangeScene, path: str | os.PathLike) -> None:
 
     Raises `NergError` for another suffix and for an empty scene, and `ImportError` without the format's library.
     """
-    check_writable(path, *FORMATS)
+    chosen = check_exchange(path)
     if not (scene.meshes or scene.points or scene.splats or scene.rays or scene.cameras):
         raise NergError(f'there is nothing to write to "{path}"; name a scene, a mesh, splats or rays')
-    module, _, function = FORMATS[Path(path).suffix.lower()].partition(":")
+    module, _, function = chosen.write.partition(":")
     write: Write = getattr(import_module(module), function)
     with replace_atomically(path) as temporary:
         write(scene, temporary)

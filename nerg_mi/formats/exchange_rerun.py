@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import import_extra
 from nerg_mi.fields.splats import Splats
 from nerg_mi.files.atomic import write_bytes
 from nerg_mi.maths.color import encode_srgb
@@ -27,7 +27,7 @@ def write_rerun(scene: ExchangeScene, path: Path) -> None:
     Values of meshes and points are stored as component ``value`` of their entities, which no view displays, and are
     named by the component ``label``.
     """
-    rr = import_extra("rerun", "a Rerun recording needs rerun-sdk", "rerun")
+    rr: Any = import_module("rerun")
     # Without it, data that Rerun rejects are left out with a warning.
     rr.set_strict_mode(True)
     recording = rr.RecordingStream("nerg_mi", recording_id="nerg_mi", send_properties=False)

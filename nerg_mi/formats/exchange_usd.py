@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import errno
 import os
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import import_extra
 from nerg_mi.fields.splats import Splats
 
 from .exchange import ExchangeScene, unique_names
@@ -125,7 +125,7 @@ def write_usd(scene: ExchangeScene, path: Path) -> None:
 
 
 def _import(module: str) -> Any:
-    return import_extra(f"pxr.{module}", "a USD scene needs usd-core", "usd")
+    return import_module(f"pxr.{module}")
 
 
 def _add_splats(stage: Any, path: str, splats: Splats) -> None:

@@ -13,15 +13,14 @@ from nerg_mi.errors import NergError, translate_mitsuba_errors
 from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.figures.overlay import Heat, robust_max
 from nerg_mi.figures.style import apply_colormap
-from nerg_mi.files.atomic import check_writable
 from nerg_mi.formats.exchange import (
-    FORMATS,
     ExchangeCamera,
     ExchangeFixations,
     ExchangeMesh,
     ExchangePoints,
     ExchangeRays,
     ExchangeScene,
+    check_exchange,
     write_exchange,
 )
 from nerg_mi.formats.fields import load_radiance
@@ -89,7 +88,7 @@ def export_scene(
         For unusable files; `ImportError` if the library of the format is not installed.
     """
     options, output = options or SceneExportOptions(), Path(output)
-    check_writable(output, *FORMATS)
+    check_exchange(output)
     if options.up not in ("y", "z"):
         raise NergError(f'--up must be z or y, got "{options.up}"')
     activate_variant(options.mode)

@@ -208,7 +208,7 @@ def test_what_cannot_be_exported_is_reported(rgb_module, gaze, tmp_path, monkeyp
         nerg.export_scene(make_room(), tmp_path / "a.fbx")
     with pytest.raises(nerg.NergError, match='"rays".*int'):
         nerg.export_scene(make_room(), tmp_path / "a.usdc", 3)
-    for suffix, module in ((".usda", "pxr.Gf"), (".rrd", "rerun")):
+    for suffix, module in ((".usda", "pxr.Usd"), (".rrd", "rerun")):
         monkeypatch.setitem(sys.modules, module, None)
         with pytest.raises(ImportError, match="nerg-mi"):
             nerg.export_scene(make_room(), tmp_path / f"a{suffix}")

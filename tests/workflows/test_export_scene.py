@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 import pytest
 import trimesh
@@ -58,6 +60,7 @@ def folder(tmp_path):
 def exported(folder, *names, monkeypatch, **options) -> tuple[ExchangeScene, Recorder]:
     recorder, written = Recorder(), []
     monkeypatch.setattr(module, "write_exchange", lambda scene, path: path.write_bytes(b"") or written.append(scene))
+    monkeypatch.setattr(module, "check_exchange", lambda path: None)  # libraries may be missing
     files = [folder / name for name in names]
     made = export_scene(files, folder / "out.usdc", SceneExportOptions(**options), recorder)
     assert written == [made.scene]
@@ -144,3 +147,10 @@ def test_unsuitable_files_and_options_are_refused(rgb, folder):
     with pytest.raises(NergError, match=r"\.rrd"):
         export_scene([folder / "room.ply"], folder / "a.fbx")
     assert not (folder / "a.usdc").exists()
+
+
+@pytest.mark.parametrize("suffix, library", [(".rrd", "rerun"), (".usdc", "pxr.Usd")])
+def test_missing_libraries_are_named_before_files_are_read(rgb, folder, monkeypatch, suffix, library):
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(ImportError, match=f"nerg-mi.{'usd' if suffix == '.usdc' else 'rerun'}"):
+        export_scene([folder / "no such file.ply"], folder / f"a{suffix}")
