@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from uuid import uuid4
@@ -27,7 +28,7 @@ from .arguments import resolve_file
 from .calls import Progress, report_progress
 from .fields import FilePath, TrainedField
 from .gaze import TrainedGazeField, list_inputs
-from .objects import as_file, as_scene_file, build_options, copy_from_session, session_folder
+from .objects import as_file, as_scene_file, build_options, copy_from_session, display_name, is_object, session_folder
 from .scene import Environment, Scene, make_scene
 
 if TYPE_CHECKING:
@@ -200,7 +201,10 @@ def report(
     with report_progress(progress, ReportOptions) as reporter:
         resolved = build_options(ReportOptions, "report", options, overrides)
         path = session_folder() / f"report-{uuid4().hex[:12]}.html" if output is None else Path(output)
-        return make_report([as_file(item, "inputs") for item in list_inputs(inputs)], path, resolved, reporter)
+        files = [as_file(item, "inputs") for item in list_inputs(inputs)]
+        if resolved.title is None and any(file.suffix == ".safetensors" and is_object(file) for file in files):
+            resolved = replace(resolved, title="Gaze field")  # an object has no name
+        return make_report(files, path, resolved, reporter)
 
 
 def draw(
@@ -482,7 +486,7 @@ def export_scene(
             for name, items in (("scene", scene), ("rays", rays))
             for item in (items if isinstance(items, (list, tuple)) else [items])
         ]
-        return write(files, Path(output), resolved, reporter)
+        return write(files, Path(output), resolved, reporter, names=[display_name(file) for file in files])
 
 
 def import_checkpoint(

@@ -44,6 +44,7 @@ if TYPE_CHECKING:
 # ---- The folder of this process ----
 
 _folders: list[Path] = []
+_CHECKSUM_DIGITS = 12
 
 
 def session_folder() -> Path:
@@ -68,16 +69,27 @@ def _store(stem: str, suffix: str, write: Callable[[Path], object]) -> Path:
     with tempfile.TemporaryDirectory(dir=session_folder()) as folder:
         write(Path(folder) / f"{stem}{suffix}")
         checksums = [file_sha256(file) for file in sorted(Path(folder).iterdir())]
-    path = session_folder() / f"{stem}-{hashlib.sha256(''.join(checksums).encode()).hexdigest()[:12]}{suffix}"
+    checksum = hashlib.sha256("".join(checksums).encode()).hexdigest()[:_CHECKSUM_DIGITS]
+    path = session_folder() / f"{stem}-{checksum}{suffix}"
     if not path.exists():
         # Scenes refer to their files by name, so they are written again under the final name.
         write(path)
     return path
 
 
+def is_object(path: Path) -> bool:
+    """Whether a file is that of an object in memory."""
+    return bool(_folders) and path.parent == _folders[0]
+
+
+def display_name(path: Path) -> str:
+    """Return the name of a file for people: without its suffix and, of an object in memory, without its checksum."""
+    return path.stem[: -_CHECKSUM_DIGITS - 1] if is_object(path) else path.stem
+
+
 def copy_from_session(path: Path, folder: Path) -> None:
     """Copy ``path`` and the files that it refers to into ``folder``, if they are in the folder of this process."""
-    if not _folders or path.parent != _folders[0]:
+    if not is_object(path):
         return
     for file in list_scene_files(path) if path.suffix == ".xml" else [path]:
         if file.parent == _folders[0] and folder.absolute() != _folders[0]:

@@ -21,6 +21,7 @@ from nerg_mi.formats.exchange import (
     ExchangeRays,
     ExchangeScene,
     check_exchange,
+    unique_names,
     write_exchange,
 )
 from nerg_mi.formats.fields import load_radiance
@@ -67,6 +68,8 @@ def export_scene(
     output: str | Path,
     options: SceneExportOptions | None = None,
     reporter: Reporter = SILENT,
+    *,
+    names: Sequence[str] | None = None,
 ) -> SceneExport:
     """Write a scene and its gaze for Rerun (.rrd) or OpenUSD (.usdc, .usda, .usd).
 
@@ -81,6 +84,8 @@ def export_scene(
         Options. Default: all defaults.
     reporter
         Receives messages and progress.
+    names
+        Names of the files in the scene. Default: those of the files, without suffixes.
 
     Raises
     ------
@@ -93,9 +98,11 @@ def export_scene(
         raise NergError(f'--up must be z or y, got "{options.up}"')
     activate_variant(options.mode)
     scene = ExchangeScene(up=options.up, meters_per_unit=options.meters_per_unit)
-    for number, path in enumerate(map(Path, files)):
-        reporter.progress(number / len(files), f"reading {path.name}")
-        scene = _add_file(scene, path, options, reporter)
+    paths = [Path(file) for file in files]
+    names = unique_names([path.stem for path in paths] if names is None else list(names), str)
+    for number, (path, name) in enumerate(zip(paths, names)):
+        reporter.progress(number / len(files), f"reading {name}")
+        scene = _add_file(scene, path, name, options, reporter)
     write_exchange(scene, output)
     reporter.message(_describe(scene))
     reporter.message(f"wrote {output} ({output.stat().st_size / 1e6:.1f} MB)")
@@ -114,16 +121,18 @@ def _describe(scene: ExchangeScene) -> str:
     return ", ".join(f"{count:,} {one if count == 1 else several}" for (one, several), count in counts.items() if count)
 
 
-def _add_file(scene: ExchangeScene, path: Path, options: SceneExportOptions, reporter: Reporter) -> ExchangeScene:
+def _add_file(
+    scene: ExchangeScene, path: Path, name: str, options: SceneExportOptions, reporter: Reporter
+) -> ExchangeScene:
     kind = detect_kind(path)
     if kind == "rays":
         rays = load_rays(path)
         taken = {r.participant for r in scene.rays}
-        names = tuple(f"{name} ({path.stem})" if name in taken else name for name in rays.persons)
+        names = tuple(f"{person} ({name})" if person in taken else person for person in rays.persons)
         rays, fixations = _gaze(replace(rays, persons=names), options, reporter)
         return replace(scene, rays=scene.rays + rays, fixations=scene.fixations + fixations)
     if kind == "mesh":
-        return replace(scene, meshes=(*scene.meshes, _mesh(path)))
+        return replace(scene, meshes=(*scene.meshes, _mesh(path, name)))
     if kind == "scene":
         return _add_scene(scene, path, options, reporter)
     if kind == "field" and is_splat_file(path):
@@ -132,7 +141,7 @@ def _add_file(scene: ExchangeScene, path: Path, options: SceneExportOptions, rep
         return replace(scene, splats=read_splats(path))
     if kind == "field":
         field = load_radiance(path, select_backend(options.mode))[0]
-        return replace(scene, points=(*scene.points, _surface_points(field, path.stem, options)))
+        return replace(scene, points=(*scene.points, _surface_points(field, name, options)))
     raise NergError(
         f'"{path}" is exported as part of a scene, not alone; make one with "nerg scene", or in Python with '
         "write_scene, and export that"
@@ -144,14 +153,14 @@ def _surface_points(field: RadianceField, name: str, options: SceneExportOptions
     return ExchangePoints(name, surface.vertices, decode_srgb(surface.colors))
 
 
-def _mesh(path: Path) -> ExchangeMesh:
+def _mesh(path: Path, name: str) -> ExchangeMesh:
     mesh = read_mesh_file(path)
     with path.open("rb") as file:
         head = file.read(1 << 14)
     if path.suffix.lower() == ".ply" and b"property float value" in head:
         baked = read_baked(path)
-        return ExchangeMesh(path.stem, mesh.vertices, mesh.faces, mesh.colors, baked.values, baked.label)
-    return ExchangeMesh(path.stem, mesh.vertices, mesh.faces, mesh.colors)
+        return ExchangeMesh(name, mesh.vertices, mesh.faces, mesh.colors, baked.values, baked.label)
+    return ExchangeMesh(name, mesh.vertices, mesh.faces, mesh.colors)
 
 
 # ---- Gaze recordings ----

@@ -279,6 +279,21 @@ def test_recordings_are_aligned_with_a_grid(rgb_module):
     np.testing.assert_allclose(alignment.matrix[:3, 3], -shift, atol=0.06)
 
 
+def test_objects_are_exported_under_readable_names(rgb_module, room, rays, gaze, tmp_path, monkeypatch):
+    monkeypatch.setattr("nerg_mi.workflows.export_scene.check_exchange", lambda path: None)
+    monkeypatch.setattr("nerg_mi.workflows.export_scene.write_exchange", lambda scene, path: path.write_bytes(b""))
+    make_room().export(tmp_path / "kitchen.ply")
+    both = [make_room(), trimesh.creation.box((1, 2, 3)), tmp_path / "kitchen.ply"]
+    made = nerg.export_scene(both, tmp_path / "a.usdc", [rays, rays[:300], rays[300:]]).scene
+    assert [mesh.name for mesh in made.meshes] == ["environment", "environment_2", "kitchen"]
+    names = [r.participant for r in made.rays]
+    assert len(set(names)) == len(names) == 12 and not re.search("[0-9a-f]{12}", " ".join(names))
+    report = nerg.report(gaze, tmp_path / "a.html", width=24, spp=1, viewpoints=1).path.read_text(encoding="utf-8")
+    assert "<title>Gaze field</title>" in report
+    titled = nerg.report(gaze, tmp_path / "b.html", title="Ours", width=24, spp=1, viewpoints=1)
+    assert "<title>Ours</title>" in titled.path.read_text(encoding="utf-8")
+
+
 @pytest.mark.parametrize("inputs", ["environment", "gaze", "both"])
 def test_grids_are_viewed(rgb_module, rays, inputs):
     pytest.importorskip("viser", reason="viser, of the extra viewer, is not installed")
