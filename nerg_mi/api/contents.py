@@ -373,6 +373,11 @@ def _load_values(content: Mapping[str, Any]) -> dict[str, Any]:
     return {name: load(name, value) for name, value in content.items()}
 
 
+def has_nerg(content: Mapping[str, Any]) -> bool:
+    """Whether the content of a scene has the integrator ``nerg``."""
+    return any(isinstance(child, Mapping) and child.get("type") == "nerg" for child in content.values())
+
+
 # ---- The content of a scene as files ----
 
 _TAGS = dict(PLUGINS)

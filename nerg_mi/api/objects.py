@@ -34,7 +34,7 @@ from nerg_mi.workflows.progress import WarningReporter
 from nerg_mi.workflows.scene_places import detect_kind
 
 from .arguments import check_names, resolve_file
-from .contents import DensityGrid, from_trimesh, is_trimesh, to_scene_children, write_content
+from .contents import DensityGrid, from_trimesh, has_nerg, is_trimesh, to_scene_children, write_content
 from .fields import TrainedField, activate_mitsuba
 from .scene import Scene, make_scene
 
@@ -171,7 +171,7 @@ def _write_environment(value: object) -> Path | None:
         return _store("environment", ".xml", value.save)
     if isinstance(value, DensityGrid):
         return _store("environment", ".xml", make_scene(value).save)
-    if isinstance(value, Mapping) and value.get("type") == "scene" and _has_nerg(value):
+    if isinstance(value, Mapping) and value.get("type") == "scene" and has_nerg(value):
         return _store("environment", ".xml", Scene.coerce(value).save)
     return _store_shapes(value)
 
@@ -195,10 +195,6 @@ def _is_mitsuba(value: object) -> bool:
     import mitsuba as mi
 
     return mi.variant() is not None and isinstance(value, mi.Object)
-
-
-def _has_nerg(content: Mapping[str, Any]) -> bool:
-    return any(isinstance(child, Mapping) and child.get("type") == "nerg" for child in content.values())
 
 
 def _to_json(value: Any) -> Any:

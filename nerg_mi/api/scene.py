@@ -28,7 +28,16 @@ from nerg_mi.transport.geometry import check_shape
 
 from .arguments import check_names, resolve_file
 from .arrays import Camera, Floats, as_points, join_names
-from .contents import DensityGrid, FieldVolume, GridVolume, load_content, to_scene_children, write_content
+from .contents import (
+    DensityGrid,
+    FieldVolume,
+    GridVolume,
+    find_tag,
+    has_nerg,
+    load_content,
+    to_scene_children,
+    write_content,
+)
 from .fields import FilePath, TrainedField, activate_mitsuba
 
 if TYPE_CHECKING:
@@ -390,7 +399,8 @@ def make_scene(
         What the observers see: a radiance field (`load_field`, `train_radiance`), Gaussian splats
         (`nerg_mi.fields.splats.Splats`) or a `DensityGrid`, in memory or as a file; a file of hit points (.vol) as
         written by `train_gaze` with ``geometry="hits"``; or shapes as for ``shapes``. Hit points are grey, shaded by
-        the orientation of their surfaces.
+        the orientation of their surfaces. Of a `Scene` of `make_scene`, or a dict of one, all is kept that no argument
+        replaces: its gaze field, observer and cameras too. Of other scenes only shapes and lights are used.
     gaze : TrainedField, gaze field or path, optional
         The gaze field (`load_gaze`, `train_gaze`), in memory or as a file.
     shapes : object, optional
@@ -440,15 +450,17 @@ def make_scene(
     )
     if isinstance(settings.get("field"), (str, os.PathLike, TrainedField, RadianceField, Splats)):
         raise NergError('make_scene has no argument "field"; pass the field as the environment')
-    if isinstance(environment, Scene):
-        raise NergError(
-            "the environment is a Scene already; pass the field, the grid or the shapes that it is made of, or show "
-            "another gaze field in it with write_scene"
-        )
     integrator: dict[str, Any] = {"type": "nerg", **settings}
     transform = None if to_world is None else _as_transform(to_world)
     children: dict[str, Any] = {}
-    if isinstance(environment, (str, os.PathLike)) and Path(environment).suffix.lower() == ".vol":
+    content = _find_content(environment)
+    if content is not None:
+        children = {k: v for k, v in content.items() if k != "type" and (camera is None or find_tag(v) != "sensor")}
+        name = next(name for name, child in children.items() if find_tag(child) == "integrator")
+        # The quantities of a scene without gaze are not those of one with gaze.
+        left_out = ("type", "aovs") if gaze is not None else ("type",)
+        integrator |= {k: v for k, v in children.pop(name).items() if k not in left_out} | settings
+    elif isinstance(environment, (str, os.PathLike)) and Path(environment).suffix.lower() == ".vol":
         integrator = _make_hit_volumes(resolve_file(environment, "environment"), transform) | integrator
     elif isinstance(environment, DensityGrid):
         integrator = dict(environment.volumes(transform)) | integrator
@@ -457,7 +469,7 @@ def make_scene(
             environment = resolve_file(environment, "environment")
         integrator["field"] = FieldVolume(environment, "field", transform)
     elif environment is not None:
-        children = to_scene_children(environment, "environment")
+        children = _take_shapes(environment)
     if gaze is not None:
         gaze = resolve_file(gaze, "gaze") if isinstance(gaze, (str, os.PathLike)) else gaze
         integrator["gaze"] = FieldVolume(gaze, "gaze", transform)
@@ -467,7 +479,10 @@ def make_scene(
             raise NergError("a scene has a single observer; pass several observers to render, observe or attention")
         integrator["observer"] = _make_observer_sensor(position[0])
     integrator.setdefault("aovs", ",".join(["depth", "opacity", *(["gaze", "visibility"] if gaze is not None else [])]))
-    children |= to_scene_children(shapes)
+    added = to_scene_children(shapes)
+    if taken := added.keys() & children.keys():
+        raise NergError(f'the scene has "{min(taken)}" already; pass the shapes in a dict with other names')
+    children |= added
     if not children and integrator.keys().isdisjoint({"field", "density"}):
         raise NergError("the scene is empty; pass an environment or shapes to make_scene")
     if camera is not None:
@@ -537,6 +552,33 @@ def resolve_quantities(scene: Scene, names: object, allowed: tuple[str, ...] | N
         if allowed is not None and name not in allowed:
             raise NergError(f'the quantity "{name}" is not available here; available: {join_names(allowed)}')
     return tuple(dict.fromkeys(requested))
+
+
+def _find_content(environment: Environment) -> dict[str, Any] | None:
+    """The content of a scene with the integrator ``nerg`` that was made in Python; None for other environments."""
+    if isinstance(environment, Scene):
+        return environment._content
+    is_scene = isinstance(environment, Mapping) and environment.get("type") == "scene"
+    return dict(environment) if is_scene and has_nerg(environment) else None
+
+
+def _take_shapes(environment: Environment) -> dict[str, Any]:
+    """The shapes and lights of an environment by name. Raises `NergError` for a loaded scene with a field."""
+    import mitsuba as mi
+
+    if isinstance(environment, (str, os.PathLike)) and Path(environment).suffix.lower() == ".xml":
+        from nerg_mi.rendering.scene import load_scene
+
+        environment = load_scene(Path(environment))
+    elif isinstance(environment, Scene):
+        environment = environment.mitsuba
+    integrator: Any = environment.integrator() if isinstance(environment, mi.Scene) else None
+    if is_nerg(integrator) and integrator.medium is not None:
+        raise NergError(
+            "the environment is a loaded scene, whose field cannot be shown in another scene; pass the file of the "
+            "field, or show another gaze field in the scene with write_scene"
+        )
+    return to_scene_children(environment, "environment")
 
 
 def _is_field(value: object) -> bool:

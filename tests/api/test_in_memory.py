@@ -322,8 +322,41 @@ def test_scenes_that_show_gaze_are_not_environments_alone(gaze, room, rays, tmp_
     shown = nerg.trace(again, EYE, ahead, "gaze").gaze
     np.testing.assert_allclose(shown, other.density(EYE, ahead), rtol=0.01)
     assert not np.allclose(shown, gaze.density(EYE, ahead), rtol=0.01)
-    with pytest.raises(nerg.NergError, match="write_scene"):
-        nerg.make_scene(scene, gaze)
+
+
+@pytest.mark.parametrize("kind", ["meshes", "grid"])
+def test_gaze_is_shown_in_a_scene(gaze, rays, room, tmp_path, kind):
+    """What is not replaced is kept, and the result can be saved like any scene."""
+    camera = nerg.Camera((1, 1, 2), (5.9, 2, 1.5), width=12, height=8)
+    plain = nerg.make_scene(room if kind == "meshes" else make_grid(), camera=camera, falloff=0.3)
+    directly = nerg.make_scene(room if kind == "meshes" else make_grid(), gaze, camera=camera, falloff=0.3)
+    shown = nerg.make_scene(plain, gaze)
+    assert not plain.has_gaze and shown.default_quantities == directly.default_quantities
+    for name in ("color", "gaze"):
+        expected = nerg.render(directly, quantities=name, spp=2)[name]
+        for scene in (shown, nerg.Scene.load(shown.save(tmp_path / "a.xml"))):
+            np.testing.assert_array_equal(nerg.render(scene, quantities=name, spp=2)[name], expected)
+    other = nerg.train_gaze(rays, geometry=room, **{**QUICK, "steps": 3})
+    again = nerg.make_scene(shown, other, observer=EYE, camera=nerg.Camera((2, 2, 2), (5, 2, 1), width=6, height=4))
+    np.testing.assert_allclose(nerg.trace(again, EYE, [(1, 0, 0)], "gaze").gaze, other.density(EYE, [(1, 0, 0)]), 0.01)
+    assert len(again.mitsuba.sensors()) == 1 and nerg.render(again, spp=1).color.shape[-3:-1] == (4, 6)
+    np.testing.assert_allclose(again.observer, EYE)
+    box = {"type": "cube"}
+    with_box = nerg.make_scene(shown, shapes=box)
+    assert len(with_box.mitsuba.shapes()) == len(shown.mitsuba.shapes()) + 1 and with_box.has_gaze
+    with pytest.raises(nerg.NergError, match='"shape"'):
+        nerg.make_scene(with_box, shapes=box)
+
+
+def test_scenes_that_were_loaded_give_their_shapes(gaze, room, tmp_path):
+    path = nerg.make_scene(room, gaze, observer=EYE).save(tmp_path / "a.xml")
+    for environment in (path, nerg.Scene.load(path), nerg.Scene.load(path).mitsuba):
+        scene = nerg.make_scene(environment, gaze)
+        np.testing.assert_allclose(depths(scene)[:3], [3.925, 2, 1.6], atol=1e-4)
+    store = nerg_store() / "scene.xml"
+    for environment in (store, nerg.Scene.load(store), nerg.Scene.load(store).mitsuba):
+        with pytest.raises(nerg.NergError, match="write_scene"):
+            nerg.make_scene(environment, gaze)
 
 
 def test_lights_of_mitsuba_scenes_are_left_out_with_a_warning(rgb_module, tmp_path):
