@@ -27,7 +27,7 @@ from nerg_mi.workflows.scene_places import PLACES, detect_kind
 from .arrays import Floats, as_points, as_rays
 from .calls import Progress, report_progress
 from .fields import FilePath, TrainedField, as_path, get_array_module
-from .objects import as_file, copy_from_session
+from .objects import as_file, copy_from_session, resolve_rays
 from .scene import Environment, Scene
 
 if TYPE_CHECKING:
@@ -147,13 +147,13 @@ class TrainedGazeField(TrainedField[AnyGazeField]):
             ).mean(axis=0)
 
     def score_samples(
-        self, rays: Rays, *, geometry: Environment = None, tolerance: float = 0.01, progress: Progress = None
+        self, rays: Rays | FilePath, *, geometry: Environment = None, tolerance: float = 0.01, progress: Progress = None
     ) -> Floats:
         """Compute the log density of recorded rays, for observers at their origins.
 
         Parameters
         ----------
-        rays : Rays
+        rays : Rays or path
             N rays, in the frame of those of the training.
         geometry, tolerance, progress
             As for `density`.
@@ -168,12 +168,13 @@ class TrainedGazeField(TrainedField[AnyGazeField]):
         NergError
             As for `density`.
         """
+        rays = _load_rays(rays)
         density = self.density(rays.origin, rays.direction, geometry=geometry, tolerance=tolerance, progress=progress)
         return np.log(density)
 
     def score(
         self,
-        rays: Rays,
+        rays: Rays | FilePath,
         *,
         max_rays: int = 1000,
         seed: int = 0,
@@ -184,7 +185,7 @@ class TrainedGazeField(TrainedField[AnyGazeField]):
 
         Parameters
         ----------
-        rays : Rays
+        rays : Rays or path
             The rays, in the frame of those of the training.
         max_rays : int
             Maximum number of rays; of more, a uniform sample is scored, since each position takes some milliseconds.
@@ -212,6 +213,7 @@ class TrainedGazeField(TrainedField[AnyGazeField]):
         >>> gaze.score(rays) > -2.53
         True
         """
+        rays = _load_rays(rays)
         if len(rays) == 0:
             raise NergError("there are no rays to score; relax the selection")
         chosen = rays[sample_rows(len(rays), max_rays, seed)] if len(rays) > max_rays else rays
@@ -472,6 +474,13 @@ def training_geometry(gaze: object) -> dict[str, Path]:
         return {}
     key = geometry_key(gaze.path or Path(gaze.name), dict(gaze.provenance))
     return {{"field_file": "field", "scene_file": "scene", "geometry_file": "geometry"}[key]: gaze.geometry_file}
+
+
+def _load_rays(rays: object) -> Rays:
+    from nerg_mi.rays.dataset import load_rays
+
+    data = resolve_rays(rays)
+    return data if isinstance(data, Rays) else load_rays(data)
 
 
 def list_inputs(inputs: object) -> list[Any]:

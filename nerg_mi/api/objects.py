@@ -136,8 +136,9 @@ def as_file(value: object, name: str) -> Path:
         return _store("align", ".json", lambda path: write_text(path, json.dumps(np.asarray(matrix, float).tolist())))
     environment = _write_environment(value)
     if environment is None:
-        kind = "an environment in memory or a file" if name in _ENVIRONMENT_NAMES else "a file"
-        raise NergError(f'"{name}" must be {kind}, given as a string or a path, got {type(value).__name__}')
+        kind = _KINDS.get(name, "a file")
+        remedy = "; make Rays of a table with Rays.from_dataframe" if hasattr(value, "columns") else ""
+        raise NergError(f'"{name}" must be {kind}, given as a string or a path, got {type(value).__name__}{remedy}')
     return environment
 
 
@@ -152,7 +153,11 @@ def as_scene_file(value: object, name: str) -> Path:
 
 _AREA_NAMES, _JSON_NAMES = ("areas", "aois", "zones"), ("what_if",)
 _ALIGNMENT_NAMES = ("align", "align_views", "init")
-_ENVIRONMENT_NAMES = ("environment", "field", "scene", "geometry", "surface")
+_KINDS: dict[str, str] = {
+    **dict.fromkeys(("environment", "field", "scene", "geometry", "surface"), "an environment in memory or a file"),
+    **dict.fromkeys(_AREA_NAMES, "a dict of areas by name or a file"),
+    "inputs": "environments, gaze fields and rays, in memory or as files",
+}
 
 
 def _write_environment(value: object) -> Path | None:
@@ -219,7 +224,7 @@ def _write_areas(path: Path, areas: Mapping[str, Any]) -> None:
         elif isinstance(area, Mapping):
             entries.append({"name": str(name), **area})
         elif np.shape(area) == (2, 3):
-            lower, upper = np.asarray(area, float).tolist()
+            lower, upper = np.sort(np.asarray(area, float), axis=0).tolist()  # opposite corners in any order
             entries.append({"name": str(name), "min": lower, "max": upper})
         else:
             raise NergError(
@@ -318,7 +323,7 @@ def resolve_rays(value: object) -> Rays | Path:
         return value
     if not isinstance(value, (str, os.PathLike)):
         raise NergError(
-            f"rays must be a Rays object or a file of one, got {type(value).__name__}; "
-            "use import_rays to read a table (.csv, .parquet)"
+            f"rays must be a Rays object or a file of one, got {type(value).__name__}; make one of a table in memory "
+            "with Rays.from_dataframe or Rays.from_arrays, and of other files with import_rays"
         )
     return resolve_file(value, "rays")

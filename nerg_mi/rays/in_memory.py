@@ -104,8 +104,15 @@ def from_dataframe(table: Any, columns: Mapping[str, Any] | None, frame: tuple[s
     """Make rays of a data frame, see `Rays.from_dataframe`."""
     reader = DataFrameReader(table)
     as_list = lambda names: [names] if isinstance(names, str) else list(names)
+    example = '{"origin": ["x", "y", "z"], "direction": ["dx", "dy", "dz"], "time": "t"}'
     if columns is None:
         choices = {role: _default_columns(role) for role in ROLES}
+        defaults = [name for role in _REQUIRED for name in as_list(choices[role])]
+        if missing := [name for name in defaults if name not in reader.names]:
+            raise NergError(
+                f'the data frame has no column "{missing[0]}"; name those that it has '
+                f"({', '.join(map(str, reader.names))}), as in columns={example}"
+            )
         columns = {
             role: names
             for role, names in choices.items()
@@ -114,7 +121,6 @@ def from_dataframe(table: Any, columns: Mapping[str, Any] | None, frame: tuple[s
     if unknown := [role for role in columns if role not in ROLES]:
         raise NergError(f'columns has no role "{unknown[0]}"; the roles are {", ".join(ROLES)}')
     if missing := [role for role in _REQUIRED if role not in columns]:
-        example = '{"origin": ["x", "y", "z"], "direction": ["dx", "dy", "dz"], "time": "t"}'
         raise NergError(f'columns lacks "{missing[0]}"; name its columns, as in columns={example}')
     used = [name for names in columns.values() for name in as_list(names)]
     if repeated := next((name for name in used if used.count(name) > 1), None):

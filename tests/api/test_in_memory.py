@@ -474,6 +474,35 @@ def test_pictures_are_labelled_arrays_and_figures(room, gaze):
 # ---- Messages ----
 
 
+def test_tables_in_place_of_rays_are_refused_with_the_way_to_rays(gaze, room):
+    table = pytest.importorskip("pandas").DataFrame({"x": [0.0], "y": [0.0]})
+    calls = [
+        lambda: nerg.train_gaze(table, geometry=room),
+        lambda: nerg.statistics([table, gaze], {"a": [[0, 0, 0], [1, 1, 1]]}),
+        lambda: nerg.check_rays(table),
+        lambda: gaze.score(table),
+        lambda: gaze.score_samples(table),
+    ]
+    for call in calls:
+        with pytest.raises(nerg.NergError, match=r"Rays\.from_dataframe"):
+            call()
+    with pytest.raises(nerg.NergError, match="columns="):
+        nerg.Rays.from_dataframe(table)
+
+
+def test_rays_of_a_file_are_scored(gaze, rays, tmp_path):
+    rays.save(tmp_path / "a.npz")
+    assert gaze.score(tmp_path / "a.npz", max_rays=20) == gaze.score(rays, max_rays=20)
+
+
+def test_corners_of_boxes_have_any_order(rays):
+    boxes = {"a": [[5, 1, 1], [7, 3, 2]], "b": [[7, 1, 2], [5, 3, 1]]}
+    first, second = nerg.statistics(rays, boxes).aois
+    assert first["share"] == second["share"] > 0
+    with pytest.raises(nerg.NergError, match="by name"):
+        nerg.statistics(rays, list(boxes.values()))
+
+
 class Recorder:
     def __init__(self):
         self.lines = []

@@ -108,7 +108,7 @@ CALLS = [
     (lambda: nerg.train_gaze("no.npz", geometry="none"), 'file "no.npz" of "rays" does not exist'),
     (
         lambda: nerg.train_gaze(np.zeros(3), geometry="none"),
-        "rays must be a Rays object .* got ndarray; use import_rays",
+        "rays must be a Rays object .* got ndarray; .* import_rays",
     ),
     (lambda: nerg.train_gaze("no.npz"), "train_gaze needs the environment .* geometry="),
     (lambda: nerg.train_gaze(None, scene=3), '"scene" must be an environment in memory or a file, .* got int'),
