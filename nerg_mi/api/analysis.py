@@ -24,7 +24,7 @@ from nerg_mi.workflows.radiance_commands import (
 )
 from nerg_mi.workflows.scene_commands import BakeOptions, FilmOptions, ReportOptions, SceneOptions
 
-from .arguments import resolve_file
+from .arguments import check_output, resolve_file
 from .calls import Progress, report_progress
 from .fields import FilePath, TrainedField
 from .gaze import TrainedGazeField, list_inputs
@@ -146,6 +146,8 @@ def bake(
     if rays is not None and in_memory is None:
         overrides = {**overrides, "rays": rays}
     files = [outputs] if isinstance(outputs, (str, Path)) or not isinstance(outputs, Sequence) else list(outputs)
+    for file in files:
+        check_output(file, "outputs")
     with report_progress(progress, BakeOptions) as reporter:
         resolved = build_options(BakeOptions, "bake", options, overrides)
         surface_file, paths = as_file(surface, "surface"), [Path(str(file)) for file in files]
@@ -198,6 +200,7 @@ def report(
     """
     from nerg_mi.workflows.report import make_report
 
+    check_output(output)
     with report_progress(progress, ReportOptions) as reporter:
         resolved = build_options(ReportOptions, "report", options, overrides)
         path = session_folder() / f"report-{uuid4().hex[:12]}.html" if output is None else Path(output)
@@ -247,6 +250,7 @@ def draw(
     from nerg_mi.workflows.draw import draw as draw_figure
     from nerg_mi.workflows.draw import find_kind
 
+    check_output(output)
     with report_progress(progress, find_kind(kind).options) as reporter:
         several = list(inputs) if isinstance(inputs, (list, tuple)) else [inputs]
         files = [as_file(item, "inputs") for item in several]
@@ -301,6 +305,7 @@ def write_scene(
     """
     from nerg_mi.workflows.scene import write_scene as write
 
+    check_output(output)
     output = Path(output)
     with report_progress(progress, SceneOptions) as reporter:
         resolved = build_options(SceneOptions, "write_scene", options, overrides)
@@ -356,6 +361,7 @@ def render_film(
     """
     from nerg_mi.workflows.render import render_film as render_to_file
 
+    check_output(output)
     with report_progress(progress, FilmOptions) as reporter:
         resolved = build_options(FilmOptions, "render_film", options, overrides)
         return render_to_file(as_file(scene, "scene"), Path(output), resolved, reporter).path
@@ -417,12 +423,19 @@ def export(
     """
     from nerg_mi.workflows import export as exports
 
+    check_output(output)
     chosen = kind or _EXPORT_SUFFIXES.get(Path(output).suffix.lower())
     if chosen not in _EXPORTS:
-        raise NergError(f'kind must be one of {", ".join(_EXPORTS)} for "{output}", got {kind!r}')
+        reason = "since its name does not tell it" if kind is None else f'got "{kind}"'
+        raise NergError(f'kind must be one of {", ".join(_EXPORTS)} for "{output}", {reason}')
     function, option_type = _EXPORTS[chosen]
     with report_progress(progress, option_type) as reporter:
         resolved = build_options(option_type, f"export of {chosen}", None, options)
+        if isinstance(field, TrainedField) and field.kind != "radiance":
+            raise NergError(
+                "export writes radiance fields, not gaze fields; write gaze with its method save, on a surface with "
+                "bake, or in a scene with export_scene"
+            )
         source = field.network if isinstance(field, TrainedField) else resolve_file(field, "field")
         return getattr(exports, function)(source, Path(output), resolved, reporter)
 
@@ -479,6 +492,7 @@ def export_scene(
     """
     from nerg_mi.workflows.export_scene import export_scene as write
 
+    check_output(output)
     with report_progress(progress, SceneExportOptions) as reporter:
         resolved = build_options(SceneExportOptions, "export_scene", options, overrides)
         files = [
@@ -586,6 +600,7 @@ def find_poses(
     """
     from nerg_mi.workflows.poses import find_poses as estimate
 
+    check_output(output)
     with report_progress(progress, PoseOptions) as reporter:
         resolved = build_options(PoseOptions, "find_poses", options, overrides)
         return estimate(resolve_file(pictures, "pictures"), Path(output), resolved, reporter)

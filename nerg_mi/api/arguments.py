@@ -38,6 +38,18 @@ def check_names(function: str, names: Iterable[str], allowed: Collection[str], n
             raise NergError(f'{function} has no {noun} "{name}"; {meant}')
 
 
+def check_output(value: object, name: str = "output") -> None:
+    """Check the name of a file or folder to write, if there is one. Raises `NergError` for anything else.
+
+    Outputs follow the first argument, so that a second object in memory is taken for one.
+    """
+    if value is not None and not isinstance(value, (str, os.PathLike)):
+        raise NergError(
+            f'"{name}" must be a file or folder to write, given as a string or a path, got {type(value).__name__}; '
+            "pass an object by the name of its argument (geometry=, gaze=), or in a list with the first input"
+        )
+
+
 def resolve_file(value: object, name: str) -> Path:
     """Return the file that an argument names.
 

@@ -10,7 +10,7 @@ from nerg_mi.workflows.gaze_commands import AblationOptions, FoldOptions, GazeEv
 from nerg_mi.workflows.radiance_commands import RadianceScoreOptions
 from nerg_mi.workflows.scene_commands import StudyOptions
 
-from .arguments import resolve_file
+from .arguments import check_output, resolve_file
 from .calls import Progress, report_progress
 from .fields import FilePath, TrainedField
 from .gaze import TrainedGazeField, training_geometry
@@ -125,6 +125,7 @@ def evaluate_gaze(
     """
     from nerg_mi.workflows import evaluate
 
+    check_output(output)
     with report_progress(progress, GazeEvaluationOptions) as reporter:
         if options is None:
             overrides = training_geometry(gaze) | overrides
@@ -188,6 +189,7 @@ def next_look(
     """
     from nerg_mi.workflows import next_look
 
+    check_output(output)
     with report_progress(progress, NextLookOptions) as reporter:
         if options is None:
             overrides = training_geometry(gaze) | overrides
@@ -243,6 +245,7 @@ def ablate(
     """
     from nerg_mi.workflows import ablation
 
+    check_output(output)
     with report_progress(progress, AblationOptions) as reporter:
         resolved = build_options(AblationOptions, "ablate", options, overrides)
         folder = session_folder() / f"ablation-{uuid4().hex[:12]}" if output is None else output
@@ -294,6 +297,7 @@ def study(
     """
     from nerg_mi.workflows import study as studies
 
+    check_output(output)
     with report_progress(progress, StudyOptions) as reporter:
         resolved = build_options(StudyOptions, "study", options, overrides)
         file = scene if isinstance(scene, str) else str(as_file(scene, "scene"))
@@ -346,6 +350,7 @@ def folds(
     """
     from nerg_mi.workflows import evaluate
 
+    check_output(output)
     with report_progress(progress, FoldOptions) as reporter:
         resolved = build_options(FoldOptions, "folds", options, overrides)
         folder = session_folder() / f"folds-{uuid4().hex[:12]}" if output is None else output

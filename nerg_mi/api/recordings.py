@@ -11,7 +11,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.rays.rays import Rays
 from nerg_mi.workflows.rays_commands import AlignOptions, FilterOptions, PlotOptions, RaysImportOptions, SplitOptions
 
-from .arguments import check_names, resolve_file
+from .arguments import check_names, check_output, resolve_file
 from .calls import Progress, report_progress
 from .fields import FilePath
 from .objects import build_options, resolve_rays
@@ -150,6 +150,7 @@ def align(
     """
     from nerg_mi.workflows import align as alignment
 
+    check_output(output)
     with report_progress(progress, AlignOptions) as reporter:
         resolved = build_options(AlignOptions, "align", options, overrides)
         return alignment.align(None if rays is None else resolve_rays(rays), output, resolved, reporter).alignment
@@ -367,6 +368,7 @@ def plot_rays(
     from nerg_mi.figures.style import figure_of
     from nerg_mi.workflows.rays import plot_rays as plot
 
+    check_output(output)
     with report_progress(progress, PlotOptions) as reporter:
         changes = overrides if output is None else {**overrides, "output": output}
         resolved = build_options(PlotOptions, "plot_rays", options, changes)

@@ -13,7 +13,7 @@ from nerg_mi.rays.rays import Rays
 from nerg_mi.workflows.gaze_commands import GazeOptions, PriorOptions
 from nerg_mi.workflows.radiance_commands import CompileOptions, RadianceOptions
 
-from .arguments import resolve_file
+from .arguments import check_output, resolve_file
 from .calls import Progress, report_progress
 from .fields import FilePath, TrainedField, load_field
 from .gaze import TrainedGazeField
@@ -70,6 +70,7 @@ def train_radiance(
     """
     from nerg_mi.workflows import train_radiance as radiance
 
+    check_output(output)
     with report_progress(progress, RadianceOptions) as reporter:
         resolved = build_options(RadianceOptions, "train_radiance", options, overrides)
         result = radiance.train_radiance(resolve_file(photos, "photos"), output, resolved, reporter)
@@ -125,6 +126,7 @@ def compile_field(
     """
     from nerg_mi.workflows import compile as compilation
 
+    check_output(output)
     with report_progress(progress, CompileOptions) as reporter:
         resolved = build_options(CompileOptions, "compile_field", options, overrides)
         if output is not None:
@@ -182,6 +184,7 @@ def train_gaze(
     """
     from nerg_mi.workflows import train_gaze as gaze
 
+    check_output(output)
     with report_progress(progress, GazeOptions) as reporter:
         resolved = build_options(GazeOptions, "train_gaze", options, overrides)
         volume = None
@@ -237,6 +240,7 @@ def train_prior(
     """
     from nerg_mi.workflows import train_gaze as gaze
 
+    check_output(output)
     environments = [rays] if isinstance(rays, (str, os.PathLike, Rays)) else rays
     with report_progress(progress, PriorOptions) as reporter:
         resolved = build_options(PriorOptions, "train_prior", options, overrides)

@@ -490,6 +490,25 @@ def test_tables_in_place_of_rays_are_refused_with_the_way_to_rays(gaze, room):
         nerg.Rays.from_dataframe(table)
 
 
+def test_objects_in_place_of_outputs_are_refused(gaze, rays, room):
+    for call in (
+        lambda: nerg.train_gaze(rays, room),
+        lambda: nerg.align(rays, room),
+        lambda: nerg.bake(room, gaze),
+        lambda: nerg.bake(room, [gaze]),
+        lambda: nerg.report(gaze, rays),
+        lambda: nerg.write_scene(room, gaze),
+        lambda: nerg.export_scene(room, gaze),
+    ):
+        with pytest.raises(nerg.NergError, match="outputs?. must be .* got (TrainedGazeField|Rays|Scene)"):
+            call()
+
+
+def test_gaze_fields_are_not_exported_as_radiance_fields(gaze, tmp_path):
+    with pytest.raises(nerg.NergError, match="export_scene"):
+        nerg.export(gaze, tmp_path / "a.glb")
+
+
 def test_rays_of_a_file_are_scored(gaze, rays, tmp_path):
     rays.save(tmp_path / "a.npz")
     assert gaze.score(tmp_path / "a.npz", max_rays=20) == gaze.score(rays, max_rays=20)
