@@ -28,8 +28,9 @@ from .arguments import check_output, resolve_file
 from .calls import Progress, report_progress
 from .fields import FilePath, TrainedField
 from .gaze import TrainedGazeField, list_inputs
-from .objects import as_file, as_scene_file, build_options, copy_from_session, display_name, is_object, session_folder
+from .objects import as_file, as_scene_file, build_options, copy_from_session
 from .scene import Environment, Scene, make_scene
+from .session import display_name, is_object, session_folder
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

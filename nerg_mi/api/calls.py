@@ -1,4 +1,4 @@
-"""Calls of workflows by functions of the API: progress, and messages that name arguments in place of options."""
+"""Calls of workflows by functions of the API: progress, and messages that name arguments and objects in memory."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from nerg_mi.errors import NergError
 from nerg_mi.ranges import FLAG
 from nerg_mi.workflows.base import Reporter
 from nerg_mi.workflows.progress import NotebookReporter, TerminalReporter, WarningReporter, is_notebook
+
+from .session import name_objects
 
 Progress: TypeAlias = "bool | Reporter | None"
 """Progress of a call: None shows a bar in notebooks, True shows one anywhere, False shows none. Warnings about the
@@ -73,7 +75,7 @@ _OPTION = re.compile(
 
 
 def _name_arguments(text: str, names: dict[str, Field[Any]]) -> str:
-    """Replace options in ``text``, as ``--test-zones 3``, by arguments, as ``test_zones=3``."""
+    """Replace options in ``text``, as ``--test-zones 3``, by arguments, as ``test_zones=3``, and files of objects."""
 
     def replace(match: re.Match[str]) -> str:
         if match["command"]:
@@ -87,4 +89,4 @@ def _name_arguments(text: str, names: dict[str, Field[Any]]) -> str:
         value = match["place"] or match["number"]
         return name if value is None else f"{name}={value}"
 
-    return _OPTION.sub(replace, text)
+    return name_objects(_OPTION.sub(replace, text))

@@ -14,8 +14,9 @@ from .arguments import check_output, resolve_file
 from .calls import Progress, report_progress
 from .fields import FilePath, TrainedField
 from .gaze import TrainedGazeField, training_geometry
-from .objects import as_file, build_options, resolve_rays, session_folder
+from .objects import as_file, build_options, resolve_rays
 from .scene import Scene
+from .session import session_folder
 
 if TYPE_CHECKING:
     from nerg_mi.evaluation.metrics import ViewScores

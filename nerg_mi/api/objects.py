@@ -6,7 +6,6 @@ of this process, under a name that contains a checksum of its content, and the f
 
 from __future__ import annotations
 
-import atexit
 import hashlib
 import json
 import os
@@ -37,28 +36,10 @@ from .arguments import check_names, resolve_file
 from .contents import DensityGrid, from_trimesh, has_nerg, is_trimesh, to_scene_children, write_content
 from .fields import TrainedField, activate_mitsuba
 from .scene import Scene, make_scene
+from .session import CHECKSUM_DIGITS, is_object, session_folder
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
-
-# ---- The folder of this process ----
-
-_folders: list[Path] = []
-_CHECKSUM_DIGITS = 12
-
-
-def session_folder() -> Path:
-    """Return the folder for objects of this process; it is removed when the process ends."""
-    if not _folders:
-        _folders.append(Path(tempfile.mkdtemp(prefix="nerg-mi-")))
-        atexit.register(_remove_folder, _folders[0], os.getpid())
-    return _folders[0]
-
-
-def _remove_folder(folder: Path, process: int) -> None:
-    # A forked process inherits the registration, and its parent still needs the folder.
-    if os.getpid() == process:
-        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _store(stem: str, suffix: str, write: Callable[[Path], object]) -> Path:
@@ -69,7 +50,7 @@ def _store(stem: str, suffix: str, write: Callable[[Path], object]) -> Path:
     with tempfile.TemporaryDirectory(dir=session_folder()) as folder:
         write(Path(folder) / f"{stem}{suffix}")
         checksums = [file_sha256(file) for file in sorted(Path(folder).iterdir())]
-    checksum = hashlib.sha256("".join(checksums).encode()).hexdigest()[:_CHECKSUM_DIGITS]
+    checksum = hashlib.sha256("".join(checksums).encode()).hexdigest()[:CHECKSUM_DIGITS]
     path = session_folder() / f"{stem}-{checksum}{suffix}"
     if not path.exists():
         # Scenes refer to their files by name, so they are written again under the final name.
@@ -77,22 +58,12 @@ def _store(stem: str, suffix: str, write: Callable[[Path], object]) -> Path:
     return path
 
 
-def is_object(path: Path) -> bool:
-    """Whether a file is that of an object in memory."""
-    return bool(_folders) and path.parent == _folders[0]
-
-
-def display_name(path: Path) -> str:
-    """Return the name of a file for people: without its suffix and, of an object in memory, without its checksum."""
-    return path.stem[: -_CHECKSUM_DIGITS - 1] if is_object(path) else path.stem
-
-
 def copy_from_session(path: Path, folder: Path) -> None:
     """Copy ``path`` and the files that it refers to into ``folder``, if they are in the folder of this process."""
     if not is_object(path):
         return
     for file in list_scene_files(path) if path.suffix == ".xml" else [path]:
-        if file.parent == _folders[0] and folder.absolute() != _folders[0]:
+        if is_object(file) and folder.absolute() != session_folder():
             with replace_atomically(folder / file.name) as temporary:
                 shutil.copyfile(file, temporary)
 

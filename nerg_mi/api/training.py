@@ -17,7 +17,8 @@ from .arguments import check_output, resolve_file
 from .calls import Progress, report_progress
 from .fields import FilePath, TrainedField, load_field
 from .gaze import TrainedGazeField
-from .objects import as_file, build_options, copy_from_session, resolve_rays, session_folder
+from .objects import as_file, build_options, copy_from_session, resolve_rays
+from .session import session_folder
 
 if TYPE_CHECKING:
     from nerg_mi.fields.radiance import RadianceField

@@ -16,7 +16,8 @@ import trimesh
 
 import nerg_mi as nerg
 from nerg_mi.api.calls import report_progress
-from nerg_mi.api.objects import as_file, build_options, session_folder
+from nerg_mi.api.objects import as_file, build_options
+from nerg_mi.api.session import session_folder
 from nerg_mi.fields.splats import Splats
 from nerg_mi.rendering.scene import list_scene_files
 from nerg_mi.workflows.gaze_commands import FoldOptions, GazeOptions
@@ -507,6 +508,27 @@ def test_objects_in_place_of_outputs_are_refused(gaze, rays, room):
 def test_gaze_fields_are_not_exported_as_radiance_fields(gaze, tmp_path):
     with pytest.raises(nerg.NergError, match="export_scene"):
         nerg.export(gaze, tmp_path / "a.glb")
+
+
+def test_messages_name_objects_in_place_of_their_files(gaze, rays, room, tmp_path):
+    for call, name in (
+        (lambda: nerg.next_look(gaze, rays), "gaze field"),
+        (lambda: nerg.evaluate_gaze(gaze, rays), "gaze field"),
+        (lambda: nerg.export_scene([room, gaze], tmp_path / "a.usdc", rays), "gaze field"),
+        (lambda: nerg.export_scene(nerg.make_scene(room, gaze), tmp_path / "a.usdc"), "environment"),
+    ):
+        with pytest.raises(nerg.NergError, match=f"the {name} in memory") as error:
+            call()
+        assert str(session_folder()) not in str(error.value)
+    # Copies of the user are files.
+    saved = nerg.train_gaze(rays, tmp_path / "own.safetensors", geometry=room, **QUICK)
+    with pytest.raises(nerg.NergError, match="own.safetensors"):
+        nerg.evaluate_gaze(saved, rays)
+    path = tmp_path / saved.geometry_file.name
+    recorder = Recorder()
+    with report_progress(recorder, GazeOptions) as reporter:
+        reporter.message(f'reading "{path}"')
+    assert recorder.lines == [f'reading "{path}"']
 
 
 def test_rays_of_a_file_are_scored(gaze, rays, tmp_path):
