@@ -11,6 +11,14 @@ from nerg_mi.errors import MissingFile, NergError
 
 from .arrays import join_names
 
+_SYNONYMS = {
+    "environment": "geometry",
+    "areas": "aois",
+    "participants": "persons",
+    "without_participants": "without_persons",
+}
+"""Names of options that are those of other arguments, and the options."""
+
 
 def check_names(function: str, names: Iterable[str], allowed: Collection[str], noun: str = "option") -> None:
     """Check names of options.
@@ -33,7 +41,7 @@ def check_names(function: str, names: Iterable[str], allowed: Collection[str], n
     """
     for name in names:
         if name not in allowed:
-            near = difflib.get_close_matches(name, allowed, n=1)
+            near = [n for n in (_SYNONYMS.get(name),) if n in allowed] or difflib.get_close_matches(name, allowed, n=1)
             meant = f'did you mean "{near[0]}"?' if near else f"available: {join_names(list(allowed))}"
             raise NergError(f'{function} has no {noun} "{name}"; {meant}')
 

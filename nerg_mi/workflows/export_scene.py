@@ -257,7 +257,8 @@ def _add_gaze(
     observer = loaded.integrator().observer or (sensors[0] if sensors else None)
     if observer is None:
         raise NergError(
-            f'the gaze of "{path}" needs an observer, and the scene has neither an observer nor a camera; add one'
+            f'the gaze of "{path}" needs an observer, and the scene has neither an observer nor a camera; add one, '
+            "in Python with observer= of make_scene"
         )
     pose = upright_pose(observer)
     panorama = {

@@ -531,6 +531,18 @@ def test_messages_name_objects_in_place_of_their_files(gaze, rays, room, tmp_pat
     assert recorder.lines == [f'reading "{path}"']
 
 
+@pytest.mark.parametrize(
+    "call, name",
+    [
+        (lambda rays: nerg.train_gaze(rays, environment=make_room()), "geometry"),
+        (lambda rays: rays.filter(participants=["a"]), "persons"),
+    ],
+)
+def test_names_of_other_functions_suggest_the_option(rays, call, name):
+    with pytest.raises(nerg.NergError, match=f'did you mean "{name}"'):
+        call(rays)
+
+
 def test_rays_of_a_file_are_scored(gaze, rays, tmp_path):
     rays.save(tmp_path / "a.npz")
     assert gaze.score(tmp_path / "a.npz", max_rays=20) == gaze.score(rays, max_rays=20)
