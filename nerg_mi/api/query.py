@@ -565,6 +565,11 @@ def attention(
             densities.append(_compute_density(scene, position, pieces, two_sided))
             reporter.progress((number + 1) / len(positions), f"observer {number + 1} of {len(positions)}")
         centers, normals = (np.ascontiguousarray(np.array(v, np.float32).T) for v in (pieces.p, pieces.n))
+        if not two_sided and all((((eye - centers) * normals).sum(axis=1) <= 0).all() for eye in positions):
+            reporter.warn(
+                "the attention is 0, since the observers are behind all faces of the mesh (in front, vertices are "
+                "counterclockwise); add two_sided=True to count both sides, as of a room seen from inside"
+            )
     density = np.stack(densities)
     share = (density.astype(np.float64) @ area.astype(np.float64)).astype(np.float32)
     if not np.isfinite(share).all():

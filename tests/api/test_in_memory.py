@@ -543,6 +543,15 @@ def test_names_of_other_functions_suggest_the_option(rays, call, name):
         call(rays)
 
 
+def test_observers_behind_all_faces_are_reported(gaze):
+    scene = nerg.make_scene(make_room(), gaze, observer=EYE)
+    with pytest.warns(UserWarning, match="two_sided"):
+        assert nerg.attention(scene, "environment").share == 0
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        np.testing.assert_allclose(nerg.attention(scene, "environment", two_sided=True).share, 1, atol=0.01)
+
+
 def test_rays_of_a_file_are_scored(gaze, rays, tmp_path):
     rays.save(tmp_path / "a.npz")
     assert gaze.score(tmp_path / "a.npz", max_rays=20) == gaze.score(rays, max_rays=20)
