@@ -135,6 +135,11 @@ class Alignment:
     files: dict[str, Any] = field(default_factory=dict)
     forced: bool = False
 
+    def __repr__(self) -> str:
+        residual = self.residuals.get("median_cm")
+        fit = "" if residual is None else f", median residual {residual:.3g} cm"
+        return f"<Alignment: {self.evidence.get('kind', 'matrix')}, scale {similarity_scale(self.matrix):.4g}{fit}>"
+
     @classmethod
     def from_fit(cls, kind: str, fit: AlignmentFit, files: Mapping[str, Any], forced: bool) -> Alignment:
         """Create the record of a fit."""

@@ -459,6 +459,9 @@ class ReportResult:
     path: Path
     run: Run
 
+    def __repr__(self) -> str:
+        return f'<ReportResult: "{self.run.title}", {self.path}>'
+
     def _repr_html_(self) -> str:
         """The report in a frame, for notebooks."""
         return element("iframe", srcdoc=render_page(self.run), width="100%", height=800)

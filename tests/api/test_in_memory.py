@@ -552,6 +552,15 @@ def test_observers_behind_all_faces_are_reported(gaze):
         np.testing.assert_allclose(nerg.attention(scene, "environment", two_sided=True).share, 1, atol=0.01)
 
 
+def test_results_have_a_short_representation(gaze, rays, tmp_path):
+    report = nerg.report(gaze, tmp_path / "a.html", width=24, spp=1, viewpoints=1)
+    (tmp_path / "pairs.csv").write_text(
+        "x,y,z,place_x,place_y,place_z\n0,0,0,1,0,0\n2,0,0,5,0,0\n0,1,0,1,2,0\n0,0,1,1,0,2\n"
+    )
+    for result in (report, nerg.align(pairs=tmp_path / "pairs.csv")):
+        assert type(result).__name__ in repr(result) and len(repr(result)) < 200 and "\n" not in repr(result)
+
+
 def test_rays_of_a_file_are_scored(gaze, rays, tmp_path):
     rays.save(tmp_path / "a.npz")
     assert gaze.score(tmp_path / "a.npz", max_rays=20) == gaze.score(rays, max_rays=20)
