@@ -124,7 +124,7 @@ def bake(
     Returns
     -------
     Bake or SplatBake
-        Attention per square metre and its sums.
+        Attention per square metre and its sums, for `export_scene` and ``draw("surface", ...)``.
 
     Raises
     ------

@@ -77,7 +77,8 @@ def as_file(value: object, name: str) -> Path:
     Parameters
     ----------
     value : object
-        A path, an environment (`nerg_mi.api.scene.Environment`), a field, `Rays`, areas, changes, or an alignment.
+        A path, an environment (`nerg_mi.api.scene.Environment`), a field, `Rays`, areas, changes, an alignment, or what
+        `bake` has returned.
     name : str
         Name of the argument, for messages and to tell what a dict or an array contains.
 
@@ -105,7 +106,7 @@ def as_file(value: object, name: str) -> Path:
     matrix: Any = getattr(value, "matrix", value)
     if name in _ALIGNMENT_NAMES and np.shape(matrix) == (4, 4):
         return _store("align", ".json", lambda path: write_text(path, json.dumps(np.asarray(matrix, float).tolist())))
-    environment = _write_environment(value)
+    environment = _write_environment(value) or _write_baked(value)
     if environment is None:
         kind = _KINDS.get(name, "a file")
         remedy = "; make Rays of a table with Rays.from_dataframe" if hasattr(value, "columns") else ""
@@ -150,6 +151,16 @@ def _write_environment(value: object) -> Path | None:
     if isinstance(value, Mapping) and value.get("type") == "scene" and has_nerg(value):
         return _store("environment", ".xml", Scene.coerce(value).save)
     return _store_shapes(value)
+
+
+def _write_baked(value: object) -> Path | None:
+    """Write a surface with attention that `bake` has returned; None if ``value`` is something else."""
+    from nerg_mi.workflows.bake import Bake
+    from nerg_mi.workflows.bake_splats import SplatBake
+
+    if isinstance(value, SplatBake):
+        return _write_environment(value.splats)
+    return _store("surface", ".ply", value.save) if isinstance(value, Bake) else None
 
 
 def _store_shapes(shapes: object) -> Path:

@@ -13,7 +13,7 @@ CHECKSUM_DIGITS = 12
 """Digits of the checksum in the name of an object's file, as in ``environment-0123456789ab.ply``."""
 
 _NAMES = {name: name for name in ("environment", "field", "rays", "areas")}
-_NAMES |= {"gaze": "gaze field", "align": "alignment", "what_if": "changes"}
+_NAMES |= {"gaze": "gaze field", "align": "alignment", "what_if": "changes", "surface": "baked surface"}
 _folders: list[Path] = []
 
 

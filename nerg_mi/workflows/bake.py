@@ -220,6 +220,8 @@ class Bake:
         Integral of the gaze.
     summary
         Content of the JSON file.
+    content
+        Content of output files.
     files
         Written files.
     """
@@ -232,7 +234,18 @@ class Bake:
     escaped: float
     total: float
     summary: dict[str, Any]
+    content: BakeOutput
     files: tuple[Path, ...] = ()
+
+    def __repr__(self) -> str:
+        return f"<Bake: {len(self.mesh.faces):,} triangles, {self.on_surface:.3g} of the gaze on the surface>"
+
+    def save(self, path: str | Path) -> Path:
+        """Write a file in the format of its suffix (.ply, .glb, .csv, .json). Raises `NergError` for another one."""
+        path = Path(path)
+        check_writable(path, *SUFFIXES)
+        write_output(self.content, path, None)
+        return path
 
     @property
     def unaccounted(self) -> float:
@@ -316,7 +329,7 @@ def bake(
         write_output(baked, path, options.texture_size)
         reporter.message(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB, {time.perf_counter() - start:.1f} s)")
     on, elsewhere, escaped, total = (summary[k] for k in ("on_surface", "elsewhere", "escaped", "total"))
-    return Bake(mesh, density, share, on, elsewhere, escaped, total, summary, tuple(paths))
+    return Bake(mesh, density, share, on, elsewhere, escaped, total, summary, baked, tuple(paths))
 
 
 def bake_any(

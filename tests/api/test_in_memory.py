@@ -561,6 +561,18 @@ def test_results_have_a_short_representation(gaze, rays, tmp_path):
         assert type(result).__name__ in repr(result) and len(repr(result)) < 200 and "\n" not in repr(result)
 
 
+def test_baked_surfaces_are_exported_and_drawn(gaze, tmp_path, monkeypatch):
+    monkeypatch.setattr("nerg_mi.workflows.export_scene.check_exchange", lambda path: None)
+    monkeypatch.setattr("nerg_mi.workflows.export_scene.write_exchange", lambda scene, path: path.write_bytes(b""))
+    baked = nerg.bake(make_room(), tmp_path / "a.ply", gaze=gaze, observer=EYE, max_edge=1.0)
+    (mesh,) = nerg.export_scene(baked, tmp_path / "a.usdc").scene.meshes
+    assert mesh.name == "surface" and np.allclose(mesh.values, baked.density, rtol=1e-5)
+    assert (tmp_path / "a.ply").read_bytes() == baked.save(tmp_path / "b.ply").read_bytes()
+    assert len(nerg.draw("surface", baked, width=48).axes) > 0 and len(repr(baked)) < 200
+    with pytest.raises(nerg.NergError, match=r"\.glb"):
+        baked.save(tmp_path / "b.obj")
+
+
 def test_rays_of_a_file_are_scored(gaze, rays, tmp_path):
     rays.save(tmp_path / "a.npz")
     assert gaze.score(tmp_path / "a.npz", max_rays=20) == gaze.score(rays, max_rays=20)
