@@ -29,7 +29,6 @@ import time
 from pathlib import Path
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
-from nerg_mi.workflows.demo import find_store_scene
 from timing import median, print_table, spread
 
 SIZES = ((320, 180), (1280, 720), (1920, 1080))
@@ -62,6 +61,7 @@ def peak(direction: str, width: int, height: int) -> dict[str, float]:
 
     mi.set_variant("llvm_ad_rgb")
     from nerg_mi.rendering.scene import load_scene
+    from nerg_mi.workflows.demo import find_store_scene
     from nerg_mi.workflows.render import render_file
     from nerg_mi.workflows.scene_commands import PictureOptions
 
@@ -97,6 +97,9 @@ def memory(sizes=SIZES) -> list[list[str]]:
 
 def works(folder: Path) -> dict[str, tuple[list[str], bool]]:
     """Commands by name, and whether they start without compiled kernels; files are written into ``folder``."""
+    # Loads Dr.Jit, whose cache of kernels `torch_frames` must choose before.
+    from nerg_mi.workflows.demo import find_store_scene
+
     picture = [*COMMAND, "render", str(find_store_scene()), "-o", str(folder / "a.png"), "-m", "llvm_ad_rgb"]
     demo = [*COMMAND, "demo", "-o", str(folder / "demo"), "-m", "llvm_ad_rgb"]
     return {
