@@ -36,8 +36,9 @@ def resident() -> float:
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1024
 
 
-def slope(unit: Callable[[int], object], count: int) -> float:
-    """Return the growth of the memory in KiB per unit of work ``unit(k)``, for k from 0 to ``count``."""
+def record_memory(unit: Callable[[int], object], count: int) -> tuple[list[int], list[float]]:
+    """Return numbers of units of work ``unit(k)``, for k from 0 to ``count``, and the memory in KiB after each, without
+    a first third that warms up."""
     every = max(1, count // 120)
     at, memory = [], []
     for k in range(count):
@@ -47,7 +48,18 @@ def slope(unit: Callable[[int], object], count: int) -> float:
             # A finishing thread can still hold memory.
             memory.append(min(resident() for _ in range(3)))
     warm = len(at) // 3
-    return float(np.polyfit(at[warm:], memory[warm:], 1)[0])
+    return at[warm:], memory[warm:]
+
+
+def slope(unit: Callable[[int], object], count: int) -> float:
+    """Return the growth of the memory in KiB per unit of work."""
+    return float(np.polyfit(*record_memory(unit, count), 1)[0])
+
+
+def usual_growth(unit: Callable[[int], object], count: int) -> float:
+    """Return the median growth of the memory in KiB per unit of work, without single larger allocations."""
+    at, memory = record_memory(unit, count)
+    return float(np.median(np.diff(memory) / np.diff(at)))
 
 
 def store(**values: str):
@@ -157,7 +169,7 @@ count, bound = int(sys.argv[2]), float(sys.argv[3])
 def leaking(k):
     unit(k)
     hoard.append(b"x" * round(4 * 1024 * bound))
-print("\\n" + json.dumps([test_soak.slope(unit, count), test_soak.slope(leaking, 12)]))
+print("\\n" + json.dumps([test_soak.slope(unit, count), test_soak.usual_growth(leaking, 12)]))
 """
 
 
