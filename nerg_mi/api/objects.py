@@ -109,8 +109,7 @@ def as_file(value: object, name: str) -> Path:
     environment = _write_environment(value) or _write_baked(value)
     if environment is None:
         kind = _KINDS.get(name, "a file")
-        remedy = "; make Rays of a table with Rays.from_dataframe" if hasattr(value, "columns") else ""
-        raise NergError(f'"{name}" must be {kind}, given as a string or a path, got {type(value).__name__}{remedy}')
+        raise NergError(f'"{name}" must be {kind}, given as a string or a path, got {type(value).__name__}')
     return environment
 
 
@@ -128,7 +127,8 @@ _ALIGNMENT_NAMES = ("align", "align_views", "init")
 _KINDS: dict[str, str] = {
     **dict.fromkeys(("environment", "field", "scene", "geometry", "surface"), "an environment in memory or a file"),
     **dict.fromkeys(_AREA_NAMES, "a dict of areas by name or a file"),
-    "inputs": "environments, gaze fields and rays, in memory or as files",
+    "inputs": "environments, gaze fields and rays (of a data frame by Rays.from_dataframe), in memory or as files",
+    "rays": "Rays (of a data frame by Rays.from_dataframe) or a file",
 }
 
 
