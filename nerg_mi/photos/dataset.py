@@ -39,6 +39,8 @@ _MAX_STRAY_FRACTION = 0.02
 # Fraction of the points in the core of an unbounded scene, the maximum size of the core relative to the box of the
 # cameras, and the minimum size of the box of all points relative to the core.
 _CORE_FRACTION, _MAX_CORE_GROWTH, _MIN_CORE_SHRINKAGE = 0.9, 4.0, 2.5
+# Minimum median distance of cameras that are placed around a point from their mean, relative to that from the point.
+_MIN_CAMERA_SPREAD = 0.25
 # Maximum growth of the box of the points when the cameras are included.
 _MAX_CAMERA_GROWTH = 2.0
 # Maximum median depth relative to the extent of the cameras.
@@ -81,11 +83,15 @@ def estimate_extent(
 ) -> SceneExtent:
     """Estimate the box of the scene with `estimate_box`, and whether the scene ends there.
 
-    The scene ends at its box if it is an object (``object_only``), if there are no ``points``, or if all points except
-    a few strays are in the box. Otherwise it is unbounded, and its box is the core of a contracted one. A scene is also
-    unbounded if its box is over 2.5 times as large as the box of nine tenths of the points, which means that some
-    points are far away. The core contains nine tenths of the points, but is at most four times as large as the box from
-    the cameras.
+    The scene ends at its box if it is an object (``object_only``), or if all points except a few strays are in the box.
+    Otherwise it is unbounded, and its box is the core of a contracted one. A scene is also unbounded if its box is over
+    2.5 times as large as the box of nine tenths of the points, which means that some points are far away. The core
+    contains nine tenths of the points, but is at most four times as large as the box from the cameras. If the cameras
+    are placed around a common point that they look at, the core also contains their box, because they would see a
+    smaller core through space of low resolution.
+
+    Without ``points``, the scene is unbounded if the cameras are placed around a common point, since their photos show
+    what is behind it. Otherwise it ends at its box.
 
     A bounded box also contains the cameras, or is contracted around the points if that would more than double its size.
     This does not apply if ``are_points_complete``, because then nothing is between the cameras and the points.
@@ -105,6 +111,9 @@ def estimate_extent(
     if object_only:
         return SceneExtent(box, source, "object", "the photos show no background")
     if points is None or len(points) < _MIN_POINTS:
+        if _surround_a_point(cameras):
+            reason = "the photos were taken around a common point, and no surface points show where the scene ends"
+            return SceneExtent(ContractedBox(box), source, "unbounded", reason)
         return SceneExtent(
             box, source, "room", "there are no surface points to show whether the scene extends beyond its box"
         )
@@ -115,15 +124,13 @@ def estimate_extent(
         core_distance = float(np.quantile(np.abs(points - box.center).max(axis=1), _CORE_FRACTION))
         half_side = float(np.clip(core_distance, 0.5 * box.side, 0.5 * _MAX_CORE_GROWTH * box.side))
         core = Box(tuple(np.subtract(box.center, half_side)), tuple(np.add(box.center, half_side)))
-        return SceneExtent(ContractedBox(core), f"{source}, nine tenths of the points", "unbounded", reason)
+        return _contract_around(core, cameras, f"{source}, nine tenths of the points", reason)
     lower, upper = np.quantile(points, [0.5 - 0.5 * _CORE_FRACTION, 0.5 + 0.5 * _CORE_FRACTION], axis=0)
     if box.side > _MIN_CORE_SHRINKAGE * float(np.max(upper - lower)):
         margin = _MARGIN * float(np.max(upper - lower))
         reason = f"a box of two fifths of the size of the box of all {len(points)} points contains nine tenths of them"
         core = Box(tuple(lower - margin), tuple(upper + margin))
-        return SceneExtent(
-            ContractedBox(core), f"around nine tenths of {len(points)} surface points", "unbounded", reason
-        )
+        return _contract_around(core, cameras, f"around nine tenths of {len(points)} surface points", reason)
     return (
         SceneExtent(box, source, "room", reason)
         if are_points_complete
@@ -131,16 +138,37 @@ def estimate_extent(
     )
 
 
+def _surround_a_point(cameras: list[PosedCamera]) -> bool:
+    """Return whether the cameras are placed around a common point that they look at, and not only in front of it."""
+    focus, angles = find_focus(cameras)
+    centers = np.array([c.center for c in cameras])
+    distance, spread = (np.median(np.linalg.norm(centers - p, axis=1)) for p in (focus, centers.mean(axis=0)))
+    return bool(np.median(angles) < MAX_CONVERGENCE_ANGLE and spread > _MIN_CAMERA_SPREAD * distance)
+
+
+def _contract_around(core: Box, cameras: list[PosedCamera], source: str, reason: str) -> SceneExtent:
+    """Return an unbounded scene with the ``core``, extended to the box of cameras that are placed around a point."""
+    extended = core
+    if _surround_a_point(cameras):
+        box = estimate_box(cameras)[0]
+        extended = _unite(core, box.lower, box.upper)
+    return SceneExtent(
+        ContractedBox(extended), f"{source} and the cameras" if extended != core else source, "unbounded", reason
+    )
+
+
 def _include_cameras(box: Box, cameras: list[PosedCamera], source: str, reason: str) -> SceneExtent:
     """Extend ``box``, which contains the points, to the cameras. Visible matter between them may have no points."""
     centers = np.array([c.center for c in cameras])
-    lower, upper = np.minimum(box.lower, centers.min(axis=0)), np.maximum(box.upper, centers.max(axis=0))
-    union = Box(tuple(lower), tuple(upper))
+    union = _unite(box, centers.min(axis=0), centers.max(axis=0))
     if union.side > _MAX_CAMERA_GROWTH * box.side:
-        reason = f"{reason}, but the cameras are far outside of it"
-        return SceneExtent(ContractedBox(box), source, "unbounded", reason)
-    is_grown = np.any(lower < box.lower) or np.any(upper > box.upper)
-    return SceneExtent(union, f"{source} and the cameras" if is_grown else source, "room", reason)
+        return _contract_around(box, cameras, source, f"{reason}, but the cameras are far outside of it")
+    return SceneExtent(union, f"{source} and the cameras" if union != box else source, "room", reason)
+
+
+def _unite(box: Box, lower, upper) -> Box:
+    """Return the smallest box that contains ``box`` and the corners ``lower`` and ``upper``."""
+    return Box(tuple(np.minimum(box.lower, lower)), tuple(np.maximum(box.upper, upper)))
 
 
 def estimate_box(

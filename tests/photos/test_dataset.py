@@ -152,9 +152,25 @@ def test_distant_points_make_scene_unbounded():
 
 
 def test_scene_without_points_ends_at_box():
-    for cameras in (AROUND, INSIDE):
+    for cameras in (INSIDE, facing(30)[0]):
         extent = estimate_extent(cameras)
         assert extent.kind == "room" and extent.box == estimate_box(cameras)[0] and "no surface points" in extent.reason
+
+
+def test_scene_around_a_common_point_is_unbounded_without_points():
+    extent = estimate_extent(AROUND)
+    assert extent.kind == "unbounded" and extent.box.is_contracted and "no surface points" in extent.reason
+    assert extent.box.core == estimate_box(AROUND)[0]
+
+
+def test_core_contains_cameras_around_it():
+    """Otherwise cameras see a small object through contracted space."""
+    near = [1, 2, 3] + 0.3 * directions(900, 9)
+    scattered = [1, 2, 3] + np.random.default_rng(9).uniform(-3, 3, (60, 3))
+    for points in (near, np.concatenate([near, scattered])):
+        extent = estimate_extent(AROUND, points=points)
+        assert extent.box.is_contracted and extent.source.endswith("and the cameras")
+        assert extent.box.core == estimate_box(AROUND)[0]
 
 
 def facing(distance):
