@@ -83,15 +83,12 @@ def estimate_extent(
 ) -> SceneExtent:
     """Estimate the box of the scene with `estimate_box`, and whether the scene ends there.
 
-    The scene ends at its box if it is an object (``object_only``), or if all points except a few strays are in the box.
-    Otherwise it is unbounded, and its box is the core of a contracted one. A scene is also unbounded if its box is over
-    2.5 times as large as the box of nine tenths of the points, which means that some points are far away. The core
-    contains nine tenths of the points, but is at most four times as large as the box from the cameras. If the cameras
-    are placed around a common point that they look at, the core also contains their box, because they would see a
-    smaller core through space of low resolution.
-
-    Without ``points``, the scene is unbounded if the cameras are placed around a common point, since their photos show
-    what is behind it. Otherwise it ends at its box.
+    The scene ends at its box if it is an object (``object_only``), if there are no ``points``, or if all points except
+    a few strays are in the box. Otherwise it is unbounded, and its box is the core of a contracted one. A scene is also
+    unbounded if its box is over 2.5 times as large as the box of nine tenths of the points, which means that some
+    points are far away. The core contains nine tenths of the points, but is at most four times as large as the box from
+    the cameras. If the cameras are placed around a common point that they look at, the core also contains their box,
+    because they would see a smaller core through space of low resolution.
 
     A bounded box also contains the cameras, or is contracted around the points if that would more than double its size.
     This does not apply if ``are_points_complete``, because then nothing is between the cameras and the points.
@@ -111,9 +108,6 @@ def estimate_extent(
     if object_only:
         return SceneExtent(box, source, "object", "the photos show no background")
     if points is None or len(points) < _MIN_POINTS:
-        if _surround_a_point(cameras):
-            reason = "the photos were taken around a common point, and no surface points show where the scene ends"
-            return SceneExtent(ContractedBox(box), source, "unbounded", reason)
         return SceneExtent(
             box, source, "room", "there are no surface points to show whether the scene extends beyond its box"
         )

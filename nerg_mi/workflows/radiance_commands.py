@@ -153,8 +153,8 @@ class RadianceOptions(DerivedOptions, PhotoOptions):
     )
     unbounded: bool | None = option(
         None,
-        "Whether there is anything to see beyond the bounding box.  [default: derived from the points; without any, "
-        "from whether the photos were taken around a common point]",
+        "Whether there is anything to see beyond the bounding box.  [default: derived from the points; bounded without "
+        "any]",
         "--unbounded/--bounded",
         group=MODEL,
     )
