@@ -91,7 +91,7 @@ def estimate_extent(
     because they would see a smaller core through space of low resolution.
 
     A bounded box also contains the cameras, or is contracted around the points if that would more than double its size.
-    This does not apply if ``are_points_complete``, because then nothing is between the cameras and the points.
+    Cameras extend neither box nor core if ``are_points_complete``, because then nothing is between them and the points.
 
     Parameters
     ----------
@@ -111,6 +111,8 @@ def estimate_extent(
         return SceneExtent(
             box, source, "room", "there are no surface points to show whether the scene extends beyond its box"
         )
+    # Nothing is between the cameras and complete points.
+    surrounding = [] if are_points_complete else cameras
     outside_fraction = float(np.mean(np.any((points < box.lower) | (points > box.upper), axis=1)))
     reason = f"{100 * outside_fraction:.1f} % of the surface points are outside of its box"
     if outside_fraction > _MAX_STRAY_FRACTION:
@@ -118,13 +120,13 @@ def estimate_extent(
         core_distance = float(np.quantile(np.abs(points - box.center).max(axis=1), _CORE_FRACTION))
         half_side = float(np.clip(core_distance, 0.5 * box.side, 0.5 * _MAX_CORE_GROWTH * box.side))
         core = Box(tuple(np.subtract(box.center, half_side)), tuple(np.add(box.center, half_side)))
-        return _contract_around(core, cameras, f"{source}, nine tenths of the points", reason)
+        return _contract_around(core, surrounding, f"{source}, nine tenths of the points", reason)
     lower, upper = np.quantile(points, [0.5 - 0.5 * _CORE_FRACTION, 0.5 + 0.5 * _CORE_FRACTION], axis=0)
     if box.side > _MIN_CORE_SHRINKAGE * float(np.max(upper - lower)):
         margin = _MARGIN * float(np.max(upper - lower))
         reason = f"a box of two fifths of the size of the box of all {len(points)} points contains nine tenths of them"
         core = Box(tuple(lower - margin), tuple(upper + margin))
-        return _contract_around(core, cameras, f"around nine tenths of {len(points)} surface points", reason)
+        return _contract_around(core, surrounding, f"around nine tenths of {len(points)} surface points", reason)
     return (
         SceneExtent(box, source, "room", reason)
         if are_points_complete
@@ -143,7 +145,7 @@ def _surround_a_point(cameras: list[PosedCamera]) -> bool:
 def _contract_around(core: Box, cameras: list[PosedCamera], source: str, reason: str) -> SceneExtent:
     """Return an unbounded scene with the ``core``, extended to the box of cameras that are placed around a point."""
     extended = core
-    if _surround_a_point(cameras):
+    if cameras and _surround_a_point(cameras):
         box = estimate_box(cameras)[0]
         extended = _unite(core, box.lower, box.upper)
     return SceneExtent(

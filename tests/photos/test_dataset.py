@@ -165,6 +165,8 @@ def test_core_contains_cameras_around_it():
         extent = estimate_extent(AROUND, points=points)
         assert extent.box.is_contracted and extent.source.endswith("and the cameras")
         assert extent.box.core == estimate_box(AROUND)[0]
+    extent = estimate_extent(AROUND, points=points, are_points_complete=True)
+    assert extent.box.is_contracted and extent.box.side < 2 and "cameras" not in extent.source
 
 
 def facing(distance):
