@@ -341,7 +341,7 @@ class FreeSpace:
         """
         points = [view.points.positions for view in views if view.points is not None]
         distinct = np.unique(np.concatenate([np.zeros((0, 3)), *points]), axis=0)
-        radius = np.maximum(near, around * _find_focus_distances(views)).astype(np.float32)
+        radius = np.maximum(near, around * find_focus_distances(views)).astype(np.float32)
         clear = np.zeros_like(radius)
         for k, view in enumerate(views):
             distances = np.linalg.norm(distinct - view.camera.center, axis=1)
@@ -364,7 +364,7 @@ def _find_clear_distance(view: PhotoView, points: np.ndarray, distances: np.ndar
     return min(distance, _CLEAR_MARGIN * float(np.min(distances[near][is_visible], initial=np.inf)))
 
 
-def _find_focus_distances(views: list[PhotoView]) -> np.ndarray:
+def find_focus_distances(views: list[PhotoView]) -> np.ndarray:
     """Return the distance (V,) of cameras that look at a common point from it; 0 for others, and with depth."""
     if len(views) < 2 or any(view.depth is not None for view in views):
         return np.zeros(len(views))

@@ -462,7 +462,8 @@ def _choose_state(
 ) -> tuple[RadianceField, dict | None]:
     """Return the field of the last state, or of the best one if that is better as a result, and its evaluation.
 
-    The last state is appended to ``history``; ``seconds`` is the time of its training.
+    The last state is appended to ``history``, and the evaluation of the best one replaced if it was repeated;
+    ``seconds`` is the time of the training of the last state.
     """
     field = trainer.make_field()
     last = _append_evaluation(trainer, watched, history, field, seconds)
@@ -471,6 +472,8 @@ def _choose_state(
         return field, last
     earlier = trainer.make_field(snapshot=best)
     row = {**best.row, **_evaluate(trainer, watched, earlier)}
+    # The evaluation during the training may have covered other pixels and cells, and cannot be compared with the last.
+    history[:] = [row if r["steps"] == row["steps"] else r for r in history]
     if row["psnr"] <= last["psnr"] + _MIN_IMPROVEMENT:
         return field, last
     return earlier, row

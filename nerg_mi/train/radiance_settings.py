@@ -200,6 +200,9 @@ class RadianceSettings(RunSettings):
     # Distance within which derivatives of samples are scaled by the square of their relative distance (Philip and
     # Deschaintre 2023, "Floaters No More"); 0 disables the scaling.
     damping_distance: float = range_field(0.4, Range(0, 1000))
+    # Maximum of this distance as a fraction of the distance of cameras that look at a common point from it. The box of
+    # such photos can be much larger, and what they show must not be scaled.
+    max_focus_damping: float = range_field(1.25, Range(1e-6, 1e6))
     # Fraction of the run over which ``damping_distance`` falls to 0, when surfaces have replaced fog.
     damping_fraction: float = range_field(0.5, Range(1e-6, 1e6))
     min_transmittance: float = range_field(2e-3, Range(0, 1))  # Samples reached by less light are dropped
@@ -278,9 +281,9 @@ class RadianceSettings(RunSettings):
         """Maximum number of samples of the density pass of a step."""
         return int(self.max_prepass_batches * self.batch)
 
-    def damping_distance_at(self, progress: float) -> float:
-        """Damping distance at ``progress`` in 0..1 of the run, as a fraction of the side."""
-        return self.damping_distance * max(0.0, 1 - progress / self.damping_fraction)
+    def damping_factor_at(self, progress: float) -> float:
+        """Damping distance at ``progress`` in 0..1 of the run, as a fraction of that at the start."""
+        return max(0.0, 1 - progress / self.damping_fraction)
 
     def stride_at(self, progress: float) -> int:
         """March stride in units of ``march_step`` at ``progress`` in 0..1 of the run."""

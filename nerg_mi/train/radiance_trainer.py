@@ -20,7 +20,7 @@ from nerg_mi.photos.cameras import pixel_directions
 from nerg_mi.photos.images import PhotoView
 from nerg_mi.transport.quadrature import mean_depth_fraction
 
-from .radiance_data import FreeSpace, PixelBank, PixelBatch
+from .radiance_data import FreeSpace, PixelBank, PixelBatch, find_focus_distances
 from .radiance_grid import GRID_STATE, DensityGrid, OccupancyExtraction
 from .radiance_losses import (
     PHOTO_PARAMETER,
@@ -212,6 +212,9 @@ class RadianceTrainer(Trainer):
         self.start(Adam(settings.learning_rate, start, beta_2=0.99, epsilon=1e-15))
         self._evaluate_prepass = make_density_prepass(config, box)
         self.march_step = settings.march_step * box.side
+        self._damping_distance = settings.damping_distance * box.side
+        if (focus_distance := float(np.median(find_focus_distances(views)))) > 0:
+            self._damping_distance = min(self._damping_distance, settings.max_focus_damping * focus_distance)
         free_space = FreeSpace.find(
             views, settings.near * box.side, settings.clear_fraction, settings.surrounding_fraction
         )
@@ -451,7 +454,7 @@ class RadianceTrainer(Trainer):
             dr.opaque(ns.UInt32, covered),
             opaque(self.stride),
             # Never 0, because distances are divided by it.
-            opaque(max(s.damping_distance_at(self.progress), 1e-6) * self.box.side),
+            opaque(max(self._damping_distance * s.damping_factor_at(self.progress), 1e-6 * self.box.side)),
             # Depth matters most at first; later colour provides more information.
             opaque(s.depth_weight * s.depth_weight_final_ratio**self.progress),
             opaque(s.point_weight * s.point_weight_final_ratio**self.progress),

@@ -46,7 +46,8 @@ def test_too_few_steps_are_reported_with_the_rate():
 
 
 @pytest.mark.parametrize(
-    "psnr, training, is_poor", [(19.0, 21.0, True), (23.0, 28.5, True), (23.0, 26.0, False), (23.0, None, False)]
+    "psnr, training, is_poor",
+    [(19.0, 21.0, True), (23.0, 28.5, True), (23.0, 26.0, False), (23.0, None, False), (29.0, 35.0, False)],
 )
 def test_poor_fields_are_named_with_their_causes(psnr, training, is_poor):
     outcome = make_outcome(psnr, training=training)

@@ -269,20 +269,20 @@ def test_damping_near_cameras(dataset):
     dr.backward(dr.sum(2 * y))
     assert np.array_equal(y.numpy(), x.numpy()) and np.allclose(dr.grad(x).numpy(), [2 / 16, 2 / 4, 2, 2])
 
-    def first_step(half_width):
+    def first_step(views, **changes):
         # All samples are within a distance of a thousand sides: no gradient of the pictures reaches the weights.
         trainer = RadianceTrainer(
-            dataset.train,
-            BOX,
-            TINY,
-            settings(damping_distance=half_width, empty_weight=0.0, photo_colors=False),
-            ns,
-            False,
+            views, BOX, TINY, settings(empty_weight=0.0, photo_colors=False, **changes), ns, False
         )
         trainer.step()
         return max(np.abs(state[3][1].numpy()).max() for state in trainer.optimiser.state.values())
 
-    assert first_step(1000.0) < 1e-4 * first_step(0.0)
+    assert first_step(dataset.train, damping_distance=1000.0) < 1e-4 * first_step(dataset.train, damping_distance=0.0)
+    # Cameras without depth that look at a common point limit the distance by theirs to that point.
+    views = [replace(view, depth=None) for view in dataset.train]
+    limited = first_step(views, damping_distance=1000.0)
+    assert limited > 0.1 * first_step(views, damping_distance=0.0)
+    assert first_step(views, damping_distance=1000.0, max_focus_damping=1e5) < 1e-4 * limited
 
 
 def test_a_box_outside_all_views_is_refused(dataset):
@@ -489,8 +489,8 @@ def test_settings_and_sizes_are_checked():
 
 
 def test_damping_near_cameras_ends():
-    s = RadianceSettings(steps=5, damping_distance=0.4, damping_fraction=0.5)
-    assert [s.damping_distance_at(p) for p in (0, 0.25, 0.5, 1)] == pytest.approx([0.4, 0.2, 0, 0])
+    s = RadianceSettings(steps=5, damping_fraction=0.5)
+    assert [s.damping_factor_at(p) for p in (0, 0.25, 0.5, 1)] == pytest.approx([1, 0.5, 0, 0])
 
 
 def test_a_size_is_a_grid_and_a_contracted_box_has_one_twice_as_fine():
