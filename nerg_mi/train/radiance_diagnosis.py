@@ -144,6 +144,11 @@ def find_causes(views: list[PhotoView], exposure_stops: float = 0.0, outside_fra
         )
     if len(views) < _FEW_VIEWS:
         out.append(f"only {len(views)} training photos: take more, from more directions")
+    if all(view.points is None and view.depth is None for view in views):
+        out.append(
+            "the photos have neither depth nor points of a reconstruction, which prevent fog: estimate their poses and "
+            "points with `nerg poses`"
+        )
     focal = [v.camera.intrinsics.fx / max(v.shape) for v in views]
     if max(focal) > _MAX_FOCAL_RATIO * min(focal):
         out.append(

@@ -202,7 +202,7 @@ class RadianceSettings(RunSettings):
     damping_distance: float = range_field(0.4, Range(0, 1000))
     # Maximum of this distance as a fraction of the distance of cameras that look at a common point from it. The box of
     # such photos can be much larger, and what they show must not be scaled.
-    max_focus_damping: float = range_field(1.25, Range(1e-6, 1e6))
+    max_focus_damping: float = range_field(1.75, Range(1e-6, 1e6))
     # Fraction of the run over which ``damping_distance`` falls to 0, when surfaces have replaced fog.
     damping_fraction: float = range_field(0.5, Range(1e-6, 1e6))
     min_transmittance: float = range_field(2e-3, Range(0, 1))  # Samples reached by less light are dropped

@@ -10,6 +10,7 @@ from scipy.ndimage import gaussian_filter
 
 from nerg_mi.photos.cameras import Intrinsics, PosedCamera
 from nerg_mi.photos.images import PhotoView
+from nerg_mi.photos.observed import ObservedPoints
 from nerg_mi.train.radiance_diagnosis import Outcome, find_causes, find_problems
 
 
@@ -58,13 +59,16 @@ def test_poor_fields_are_named_with_their_causes(psnr, training, is_poor):
 # ---- Causes ----
 
 
-def make_views(count=60, focal=lambda k: 50.0, picture=None):
+POINTS = ObservedPoints(np.zeros((1, 3)), np.zeros(1))
+
+
+def make_views(count=60, focal=lambda k: 50.0, picture=None, points=POINTS):
     rng = np.random.default_rng(0)
     views = []
     for k in range(count):
         color = rng.random((48, 64, 3)).astype(np.float32) if picture is None else picture(k, rng).astype(np.float32)
         lens = Intrinsics(64, 48, focal(k), focal(k), 32.0, 24.0)
-        views.append(PhotoView(f"photo {k}", PosedCamera(lens, np.eye(4)), color))
+        views.append(PhotoView(f"photo {k}", PosedCamera(lens, np.eye(4)), color, points=points))
     return views
 
 
@@ -79,6 +83,7 @@ def test_causes_are_found():
         "factor of 2.00": find_causes(make_views(focal=lambda k: 50.0 if k % 2 else 100.0)),
         "0.5 stops": find_causes(make_views(), exposure_stops=0.5),
         "80%": find_causes(make_views(), outside_fraction=0.8),
+        "nerg poses": find_causes(make_views(points=None)),
     }
 
     def object_on_white(k, rng):
