@@ -353,6 +353,8 @@ def main(argv=None) -> None:
         help="Folder for the results. Default: %(default)s.",
     )
     args = parser.parse_args(argv)
+    if args.steps is not None and args.what != "captures":
+        parser.error("--steps is for captures; give --minutes")
     work, folder, minutes = SETS[args.what]
     args.data, args.minutes = args.data or folder, args.minutes or minutes
     args.out.mkdir(parents=True, exist_ok=True)
