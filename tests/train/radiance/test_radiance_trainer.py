@@ -278,7 +278,7 @@ def test_damping_near_cameras(dataset):
         return max(np.abs(state[3][1].numpy()).max() for state in trainer.optimiser.state.values())
 
     assert first_step(dataset.train, damping_distance=1000.0) < 1e-4 * first_step(dataset.train, damping_distance=0.0)
-    # Cameras without depth that look at a common point limit the distance by theirs to that point.
+    # For cameras without depth that look at a common point, their distance from it limits that of the scaling.
     views = [replace(view, depth=None) for view in dataset.train]
     limited = first_step(views, damping_distance=1000.0)
     assert limited > 0.1 * first_step(views, damping_distance=0.0)
