@@ -1,19 +1,19 @@
 """Radiance fields trained on photos: PSNR, SSIM and depth of held-out views, rendered by the integrator.
 
-    python benchmarks/radiance.py fox [--minutes 1,2,4,7,10] [--width 135] [--deferred] [--validate]
+    python benchmarks/radiance.py fox [--minutes 1,2,4,7,10 | --steps 9000] [--width 135] [--deferred] [--validate]
         [--set lr_hold_fraction=0.5]
     python -m nerg_mi.scenes.store.make --stage views          # once: images of the store, rendered from the twin
-    python benchmarks/radiance.py store [--minutes 10] [--size medium] [--only images|depth]
+    python benchmarks/radiance.py store [--minutes 10 | --steps 15000] [--size medium] [--only images|depth]
     python -m nerg_mi.scenes.tabletop.make                     # once: photos, rendered from a generated scene
-    python benchmarks/radiance.py tabletop [--minutes 4] [--bounded]
+    python benchmarks/radiance.py tabletop [--minutes 4 | --steps 6000] [--bounded]
     python benchmarks/radiance.py captures --data FOLDER [--minutes 2,10 | --steps 1000] [--width 240]
 
-``fox``: real photos, of which every 8th is held out. There is one training, for the last of the ``--minutes``, whose
-learning-rate schedule covers the whole time. After each of the ``--minutes``, the clock stops and the current weights
-are written. They are scored after the training, like by `nerg eval radiance`. A row for a shorter time is therefore an
-intermediate state of a longer training, not the result of a training of that length. "PSNR, colours fitted" is the PSNR
-of the right halves of the images after a colour correction that is fitted to the left halves, because the exposure of
-the held-out photos is unknown.
+``fox``: real photos, of which every 8th is held out. There is one training, for the last of the ``--minutes`` or for
+``--steps``, whose learning-rate schedule covers the whole time. After each of the ``--minutes``, the clock stops and
+the current weights are written. They are scored after the training, like by `nerg eval radiance`. A row for a shorter
+time is therefore an intermediate state of a longer training, not the result of a training of that length. "PSNR,
+colours fitted" is the PSNR of the right halves of the images after a colour correction that is fitted to the left
+halves, because the exposure of the held-out photos is unknown.
 
 ``store``: a room seen from inside, trained from its images alone and from images with depth. Depth and the opacity of
 the walls are compared with exact ray casts at the store's mesh.
@@ -77,9 +77,21 @@ def open_views(folder: Path, args: argparse.Namespace, width: int | None = None)
     return data
 
 
-def fields(data, stops: list[float], args: argparse.Namespace, name: str, depth: bool, deferred=False) -> Iterator:
-    """Train once; yields ``(trainer, path, row)`` after each of the minutes ``stops``, with the current field in a file
-    whose name starts with ``name``."""
+def make_lengths(args: argparse.Namespace) -> list[dict[str, float]]:
+    """The length of each training as a keyword argument, in ascending order."""
+    if args.steps is not None:
+        return [{"steps": args.steps}]
+    return [{"minutes": minutes} for minutes in sorted(float(m) for m in args.minutes.split(","))]
+
+
+def make_settings(args: argparse.Namespace) -> dict:
+    """The keyword arguments of ``--set``."""
+    return {key: ast.literal_eval(value) for key, value in (pair.split("=", 1) for pair in args.set)}
+
+
+def fields(data, args: argparse.Namespace, name: str, depth: bool, deferred=False) -> Iterator:
+    """Train once; yields ``(trainer, path, row)`` after each of `make_lengths`, with the current field in a file whose
+    name starts with ``name``."""
     from nerg_mi.formats.fields import save_radiance
     from nerg_mi.train.radiance_run import warm_up
     from nerg_mi.train.radiance_settings import RadianceSettings, make_radiance_config
@@ -87,20 +99,17 @@ def fields(data, stops: list[float], args: argparse.Namespace, name: str, depth:
     from nerg_mi.workflows.base import select_backend
 
     ns = select_backend("llvm_ad_rgb", args.threads)
-    pairs = (pair.split("=", 1) for pair in args.set)
-    settings = RadianceSettings(
-        minutes=stops[-1], seed=args.seed, **{key: ast.literal_eval(value) for key, value in pairs}
-    )
+    settings = RadianceSettings(seed=args.seed, **make_lengths(args)[-1], **make_settings(args))
     config = replace(make_radiance_config(args.size, data.box), deferred=deferred)
     trainer = RadianceTrainer(data.train, data.box, config, settings, ns, depth=depth)
     warm_up(trainer)
-    for stop in stops:
-        while trainer.seconds < 60 * stop and trainer.progress < 1:
+    for length in make_lengths(args):
+        while trainer.progress < 1 and trainer.seconds < 60 * length.get("minutes", np.inf):
             trainer.step()
         seconds = trainer.seconds
-        path = args.out / f"{name}_{stop:g}.safetensors"
-        save_radiance(trainer.make_field(), path, {"minutes": stop, "settings": settings.to_dict()})
-        row = {"minutes": stop, "steps": trainer.steps, "ms a step": 1e3 * seconds / trainer.steps}
+        path = args.out / f"{name}_{next(iter(length.values())):g}.safetensors"
+        save_radiance(trainer.make_field(), path, {"minutes": seconds / 60, "settings": settings.to_dict()})
+        row = {"minutes": seconds / 60, "steps": trainer.steps, "ms a step": 1e3 * seconds / trainer.steps}
         yield trainer, path, row | {"load": os.getloadavg()[0]}
         # Evaluation does not count as training time.
         trainer.set_seconds(seconds)
@@ -119,7 +128,7 @@ def scored(path: Path, held_out: list, spp: int):
 
 def cells(row: dict) -> list[str]:
     """The columns of `SCORES`."""
-    formats = ("g", ",", ".1f", ".2f", ".2f", ".3f")
+    formats = (".3g", ",", ".1f", ".2f", ".2f", ".3f")
     return [f"{row[key]:{format_}}" for key, format_ in zip(SCORES, formats)]
 
 
@@ -128,9 +137,8 @@ def fox(args: argparse.Namespace) -> tuple[str, list[str], list[list[str]], list
     from nerg_mi.train.radiance_run import evaluate_views
 
     data = open_views(args.data, args, args.width)
-    stops = sorted(float(m) for m in args.minutes.split(","))
     rows = []
-    for trainer, path, row in fields(data, stops, args, f"fox_{args.width}", False, args.deferred):
+    for trainer, path, row in fields(data, args, f"fox_{args.width}", False, args.deferred):
         rows.append(row | {"training views, dB": evaluate_views(trainer, data.train[::8], 2).mean, "file": path})
     for row in rows:
         row |= scored(row["file"], data.held_out, args.spp)[1]
@@ -141,7 +149,7 @@ def fox(args: argparse.Namespace) -> tuple[str, list[str], list[list[str]], list
 def store(args: argparse.Namespace) -> tuple[str, list[str], list[list[str]], list[dict]]:
     data, table, rows = open_views(args.data, args), [], []
     for source in ("images", "depth") if args.only is None else (args.only,):
-        for _, path, row in fields(data, [float(args.minutes)], args, source, source == "depth"):
+        for _, path, row in fields(data, args, source, source == "depth"):
             scores, columns = scored(path, data.held_out, args.spp)
             depth = scores.depth
             row |= {"from": source, **columns, "depth_median": depth.median, "depth_mean": depth.mean}
@@ -167,9 +175,10 @@ def tabletop(args: argparse.Namespace) -> tuple[str, list[str], list[list[str]],
 
     if not (args.data / DEPTH_FILE).is_file():
         raise SystemExit(f"{args.data} holds no photos; make them with: python -m nerg_mi.scenes.tabletop.make")
-    path, minutes = args.out / "tabletop.safetensors", float(args.minutes)
-    unbounded = False if args.bounded else None
-    options = RadianceOptions(minutes=minutes, unbounded=unbounded, threads=args.threads, seed=args.seed)
+    path, unbounded = args.out / "tabletop.safetensors", False if args.bounded else None
+    options = RadianceOptions(
+        unbounded=unbounded, threads=args.threads, seed=args.seed, **make_lengths(args)[-1], **make_settings(args)
+    )
     result = train_radiance(args.data, path, options)
     metadata, box = result.provenance, result.field.box.core
     held_out = open_dataset(args.data / DEPTH_FILE).held_out
@@ -180,18 +189,12 @@ def tabletop(args: argparse.Namespace) -> tuple[str, list[str], list[list[str]],
     s = score_depths(path, held_out, box, OBJECT_CENTER, args.spp, args.out / "pictures")
     size = " x ".join(f"{u - l:.1f}" for l, u in zip(box.lower, box.upper)) + " m"
     size += ", contracted" if result.field.box.is_contracted else ""
-    table = [
-        f"{minutes:g}",
-        f"{metadata['seconds']:.0f}",
-        f"{metadata['steps']:,}",
-        f"{s['psnr']:.2f}",
-        f"{s['ssim']:.3f}",
-    ]
+    table = [f"{metadata['seconds'] / 60:.1f}", f"{metadata['steps']:,}", f"{s['psnr']:.2f}", f"{s['ssim']:.3f}"]
     table += [f"{s['psnr_within']:.2f}, {s['psnr_beyond']:.2f}", f"{s['beyond']:.1%}"]
     table += [f"{100 * s['near_median']:.2f} cm, {s['near_off']:.1%}", f"{s['far_median']:.1%}, {s['far_off']:.1%}"]
-    head = ["training time, min", "elapsed time, s", "steps", "PSNR, dB", "SSIM", "PSNR within, beyond, dB"]
+    head = ["training time, min", "steps", "PSNR, dB", "SSIM", "PSNR within, beyond, dB"]
     head += ["pixels beyond", *(f"{name}: median depth error, outliers" for name in ("near", "far")), "box"]
-    row = {"minutes": minutes, "seconds": metadata["seconds"], "steps": metadata["steps"], **s, "box": size}
+    row = {"minutes": metadata["seconds"] / 60, "steps": metadata["steps"], **s, "box": size}
     return "An unbounded capture", head, [[*table, size]], [row]
 
 
@@ -201,17 +204,13 @@ def captures(args: argparse.Namespace) -> tuple[str, list[str], list[list[str]],
     from nerg_mi.workflows.radiance_commands import RadianceOptions
     from nerg_mi.workflows.train_radiance import train_radiance
 
-    lengths = [{"minutes": float(minutes)} for minutes in args.minutes.split(",")]
-    if args.steps is not None:
-        lengths = [{"steps": args.steps}]
-    settings = {key: ast.literal_eval(value) for key, value in (pair.split("=", 1) for pair in args.set)}
     rows = []
     for folder in sorted(p for p in args.data.iterdir() if p.is_dir()):
         width = min(args.width, *(view.shape[1] for view in open_dataset(folder).train))
-        for length in lengths:
+        for length in make_lengths(args):
             path = args.out / f"{folder.name}_{next(iter(length.values())):g}.safetensors"
             options = RadianceOptions(
-                width=width, size=args.size, threads=args.threads, seed=args.seed, **length, **settings
+                width=width, size=args.size, threads=args.threads, seed=args.seed, **length, **make_settings(args)
             )
             made = train_radiance(folder, path, options).provenance
             held_out = pick_evenly(open_dataset(folder, width=width).held_out, 8)
@@ -302,7 +301,7 @@ def main(argv=None) -> None:
         "captures the lengths of several trainings. Default: 1,2,4,7,10 (fox), 10 (store), 4 (tabletop), 2,10 "
         "(captures).",
     )
-    parser.add_argument("--steps", type=int, help="Training steps in place of minutes (captures). Default: by minutes.")
+    parser.add_argument("--steps", type=int, help="Number of training steps in place of --minutes.")
     parser.add_argument(
         "--width", type=int, default=135, help="Width of the photos in pixels (fox, captures). Default: %(default)s."
     )
@@ -335,8 +334,8 @@ def main(argv=None) -> None:
         action="append",
         default=[],
         metavar="KEY=VALUE",
-        help="Value of a field of RadianceSettings (fox, store), or of an option (captures); can be repeated. "
-        "Default: none.",
+        help="Value of a field of RadianceSettings (fox, store), or of an option (tabletop, captures); can be "
+        "repeated. Default: none.",
     )
     parser.add_argument(
         "--spp",
@@ -353,8 +352,6 @@ def main(argv=None) -> None:
         help="Folder for the results. Default: %(default)s.",
     )
     args = parser.parse_args(argv)
-    if args.steps is not None and args.what != "captures":
-        parser.error("--steps is for captures; give --minutes")
     work, folder, minutes = SETS[args.what]
     args.data, args.minutes = args.data or folder, args.minutes or minutes
     args.out.mkdir(parents=True, exist_ok=True)
