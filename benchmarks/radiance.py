@@ -175,27 +175,31 @@ def tabletop(args: argparse.Namespace) -> tuple[str, list[str], list[list[str]],
 
     if not (args.data / DEPTH_FILE).is_file():
         raise SystemExit(f"{args.data} holds no photos; make them with: python -m nerg_mi.scenes.tabletop.make")
-    path, unbounded = args.out / "tabletop.safetensors", False if args.bounded else None
-    options = RadianceOptions(
-        unbounded=unbounded, threads=args.threads, seed=args.seed, **make_lengths(args)[-1], **make_settings(args)
-    )
-    result = train_radiance(args.data, path, options)
-    metadata, box = result.provenance, result.field.box.core
     held_out = open_dataset(args.data / DEPTH_FILE).held_out
-    if [v.name.rpartition("/")[2] for v in held_out] != metadata["held_out"]["frames"]:
-        raise SystemExit(f"{args.data / DEPTH_FILE} holds out other photos than the capture next to it")
-    for line in metadata["complaints"]:
-        print(line)
-    s = score_depths(path, held_out, box, OBJECT_CENTER, args.spp, args.out / "pictures")
-    size = " x ".join(f"{u - l:.1f}" for l, u in zip(box.lower, box.upper)) + " m"
-    size += ", contracted" if result.field.box.is_contracted else ""
-    table = [f"{metadata['seconds'] / 60:.1f}", f"{metadata['steps']:,}", f"{s['psnr']:.2f}", f"{s['ssim']:.3f}"]
-    table += [f"{s['psnr_within']:.2f}, {s['psnr_beyond']:.2f}", f"{s['beyond']:.1%}"]
-    table += [f"{100 * s['near_median']:.2f} cm, {s['near_off']:.1%}", f"{s['far_median']:.1%}, {s['far_off']:.1%}"]
+    table, rows = [], []
+    for length in make_lengths(args):
+        path = args.out / f"tabletop_{next(iter(length.values())):g}.safetensors"
+        unbounded = False if args.bounded else None
+        options = RadianceOptions(
+            unbounded=unbounded, threads=args.threads, seed=args.seed, **length, **make_settings(args)
+        )
+        result = train_radiance(args.data, path, options)
+        metadata, box = result.provenance, result.field.box.core
+        if [v.name.rpartition("/")[2] for v in held_out] != metadata["held_out"]["frames"]:
+            raise SystemExit(f"{args.data / DEPTH_FILE} holds out other photos than the capture next to it")
+        for line in metadata["complaints"]:
+            print(line)
+        s = score_depths(path, held_out, box, OBJECT_CENTER, args.spp, path.with_suffix(""))
+        size = " x ".join(f"{u - l:.1f}" for l, u in zip(box.lower, box.upper)) + " m"
+        size += ", contracted" if result.field.box.is_contracted else ""
+        columns = [f"{metadata['seconds'] / 60:.1f}", f"{metadata['steps']:,}", f"{s['psnr']:.2f}", f"{s['ssim']:.3f}"]
+        columns += [f"{s['psnr_within']:.2f}, {s['psnr_beyond']:.2f}", f"{s['beyond']:.1%}"]
+        columns += [f"{100 * s['near_median']:.2f} cm, {s['near_off']:.1%}"]
+        table.append([*columns, f"{s['far_median']:.1%}, {s['far_off']:.1%}", size])
+        rows.append({"minutes": metadata["seconds"] / 60, "steps": metadata["steps"], **s, "box": size})
     head = ["training time, min", "steps", "PSNR, dB", "SSIM", "PSNR within, beyond, dB"]
     head += ["pixels beyond", *(f"{name}: median depth error, outliers" for name in ("near", "far")), "box"]
-    row = {"minutes": metadata["seconds"] / 60, "steps": metadata["steps"], **s, "box": size}
-    return "An unbounded capture", head, [[*table, size]], [row]
+    return "An unbounded capture", head, table, rows
 
 
 def captures(args: argparse.Namespace) -> tuple[str, list[str], list[list[str]], list[dict]]:
@@ -297,9 +301,9 @@ def main(argv=None) -> None:
     )
     parser.add_argument(
         "--minutes",
-        help="Training time in minutes; for the fox several, separated by commas, after which the field is scored; for "
-        "captures the lengths of several trainings. Default: 1,2,4,7,10 (fox), 10 (store), 4 (tabletop), 2,10 "
-        "(captures).",
+        help="Training time in minutes, or several, separated by commas: times in one training at which the field is "
+        "scored (fox, store), or lengths of several trainings (tabletop, captures). Default: 1,2,4,7,10 (fox), 10 "
+        "(store), 4 (tabletop), 2,10 (captures).",
     )
     parser.add_argument("--steps", type=int, help="Number of training steps in place of --minutes.")
     parser.add_argument(
