@@ -471,8 +471,8 @@ def _choose_state(
     if last is None or best is None or best.row["psnr"] <= last["psnr"] + _MIN_IMPROVEMENT:
         return field, last
     earlier = trainer.make_field(snapshot=best)
-    row = {**best.row, **_evaluate(trainer, watched, earlier)}
-    # The evaluation during the training may have covered other pixels and cells, and cannot be compared with the last.
+    row = {**best.row, **_evaluate(trainer, watched, history, earlier)}
+    # The evaluation during the training may have covered other cells, and cannot be compared with the last.
     history[:] = [row if r["steps"] == row["steps"] else r for r in history]
     if row["psnr"] <= last["psnr"] + _MIN_IMPROVEMENT:
         return field, last
@@ -512,7 +512,7 @@ def _append_evaluation(
     views, or if all of their pixels are masked.
     """
     seconds = trainer.seconds if seconds is None else seconds
-    row = {"steps": trainer.steps, "seconds": round(seconds, 1), **_evaluate(trainer, watched, field)}
+    row = {"steps": trainer.steps, "seconds": round(seconds, 1), **_evaluate(trainer, watched, history, field)}
     if row["psnr"] is None:
         return None
     history.append(row)
@@ -521,15 +521,19 @@ def _append_evaluation(
     return row
 
 
-def _evaluate(trainer: RadianceTrainer, watched: WatchedViews, field: RadianceField | None) -> dict:
+def _evaluate(trainer: RadianceTrainer, watched: WatchedViews, history: list, field: RadianceField | None) -> dict:
     """Return the PSNR of held-out and training views, on a subset of the pixels that takes little time.
 
+    All evaluations of a run (``history``) cover the same pixels, because results on others differ by tenths of a dB.
     If photos have colour changes of their own, which cannot be known of held-out photos, colours are fitted first:
     otherwise the PSNR would follow exposures, and choose an early state of a field that still improves.
     """
     if not watched.held_out:
         return {"psnr": None}
-    every = trainer.choose_pixel_stride(watched.held_out, _EVALUATION_SAMPLES)
+    if history:
+        every = history[0]["every_pixel"]
+    else:
+        every = trainer.choose_pixel_stride(watched.held_out, _EVALUATION_SAMPLES)
     shown = field or trainer.make_field(with_occupancy=False)
     errors = [evaluate_views(trainer, views, every, shown) for views in (watched.held_out, watched.training)]
     held_out, training = ((e.mean if trainer.photos is None else e.mean_fitted) for e in errors)

@@ -206,6 +206,7 @@ def test_the_best_state_is_the_result(dataset, tmp_path, monkeypatch, falls):
     assert result in history  # The repeated evaluation of the best state replaces that during the training.
     assert (result["steps"] < 60) == falls and history[-1]["steps"] == 60
     assert history[-1]["psnr_train"] > history[0]["psnr_train"]
+    assert len({row["every_pixel"] for row in history}) == 1
     # The written field is the one that was evaluated.
     save_radiance(field, tmp_path / "a.safetensors", provenance)
     loaded, _ = load_radiance(tmp_path / "a.safetensors", ns)
