@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -316,11 +316,20 @@ class FreeSpace:
     near
         (V,) float32 distance from each camera within which all space is empty, in scene units.
     clear
-        (V,) float32 distance from each camera within which the space that it sees is empty; at least ``near``.
+        (V,) float32 distance from each camera within which the space that it sees is empty.
     """
 
     near: np.ndarray
     clear: np.ndarray
+
+    @property
+    def ray_starts(self) -> np.ndarray:
+        """(V,) float32 distance from each camera at which its rays start."""
+        return np.maximum(self.near, self.clear)
+
+    def restrict_to_views(self, near: float) -> FreeSpace:
+        """Return the space that is empty in view of the cameras, and within ``near`` of them."""
+        return replace(self, near=np.full_like(self.near, near))
 
     @staticmethod
     def find(views: list[PhotoView], near: float, in_view: float, around: float) -> FreeSpace:
@@ -346,7 +355,7 @@ class FreeSpace:
         for k, view in enumerate(views):
             distances = np.linalg.norm(distinct - view.camera.center, axis=1)
             radius[k] = max(near, min(radius[k], _CLEAR_MARGIN * np.min(distances, initial=np.inf)))
-            clear[k] = max(radius[k], _find_clear_distance(view, distinct, distances, in_view))
+            clear[k] = _find_clear_distance(view, distinct, distances, in_view)
         return FreeSpace(radius, clear)
 
 

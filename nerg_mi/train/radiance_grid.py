@@ -68,11 +68,12 @@ class DensityGrid:
     ):
         self.ns, self.box, self.resolution, self.step, self.threshold = ns, box, resolution, step, threshold
         self.growth = growth if box.is_contracted else 0.0
+        self.cameras, self.min_views = cameras, min_views
         cells = resolution**3
         self.index = dr.arange(ns.UInt32, cells)
         if free_space is None:
             free_space = FreeSpace(np.zeros(len(cameras), np.float32), np.zeros(len(cameras), np.float32))
-        self._restrict_to(self._find_seen_cells(cameras, min_views, free_space))
+        self._restrict_to(self._find_seen_cells(free_space))
         if self.seen_count == 0:
             raise NergError(
                 f"no cell of the scene box {box.lower} to {box.upper} is seen by {min_views} cameras; "
@@ -109,8 +110,8 @@ class DensityGrid:
         inner = 2 if self.box.is_contracted else 1
         return self.box.distance_scale(p) * (inner * self.box.side / self.resolution)
 
-    def _find_seen_cells(self, cameras: list[PosedCamera], min_views: int, free_space: FreeSpace):
-        """Return the cells whose centre is in the box and in at least ``min_views`` pictures, and not in free space.
+    def _find_seen_cells(self, free_space: FreeSpace):
+        """Return the cells whose centre is in the box and in at least `min_views` pictures, and not in free space.
 
         Occlusion is ignored, and the frusta are widened by 10 %, or narrowed by 5 % for free space.
         """
@@ -121,7 +122,7 @@ class DensityGrid:
         inside = dr.all(dr.abs(p - self.ns.Array3f(*self.box.center)) < self.ns.Array3f(*half))
         count = dr.zeros(UInt32, self.resolution**3)
         dr.eval(p, inside)
-        for camera, near, clear in zip(cameras, free_space.near.tolist(), free_space.clear.tolist()):
+        for camera, near, clear in zip(self.cameras, free_space.near.tolist(), free_space.clear.tolist()):
             rows = [Float(v) for v in camera.to_world[:3, :3].T.ravel()]
             origin = [Float(v) for v in camera.center]
             edge = [Float(v) for v in find_view_tangents(camera.intrinsics)]
@@ -140,7 +141,15 @@ class DensityGrid:
             if clear > near:
                 inside &= ~is_in_view(0.95) | (squared_distance > dr.opaque(Float, clear * clear))
             dr.eval(count, inside)
-        return inside & (count >= min(min_views, len(cameras)))
+        return inside & (count >= min(self.min_views, len(self.cameras)))
+
+    def set_free_space(self, free_space: FreeSpace) -> None:
+        """Replace the empty space near the cameras.
+
+        Samples are taken in cells that were empty before once an update finds density there.
+        """
+        self.seen = self._find_seen_cells(free_space)
+        self._count_seen()
 
     def carve(self, points) -> None:
         """Restrict samples to the cells that hold or touch a surface point; ``points`` yields Array3f (world).
@@ -169,11 +178,15 @@ class DensityGrid:
     def _restrict_to(self, cells) -> None:
         """Restrict samples to the mask ``cells``. All of them count as occupied until they are evaluated."""
         self.seen = cells
-        count: Any = dr.count(cells)
-        self.seen_count = int(count[0])
+        self._count_seen()
         self.value = dr.zeros(self.ns.Float, self.resolution**3)
         self.bits = dr.select(cells, self.ns.UInt8(1), 0)
-        dr.eval(self.seen, self.value, self.bits)
+        dr.eval(self.value, self.bits)
+
+    def _count_seen(self) -> None:
+        dr.eval(self.seen)
+        count: Any = dr.count(self.seen)
+        self.seen_count = int(count[0])
 
     def is_occupied(self, p, active):
         """Return the mask of points ``p`` (Array3f, world) in occupied cells."""

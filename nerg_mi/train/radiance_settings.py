@@ -259,10 +259,12 @@ class RadianceSettings(RunSettings):
     )
     surrounding_fraction: float = setting(
         0.35,
-        "Fraction of the distance to a common point of all views up to which the space around a camera is empty; 0 "
-        "disables it.",
+        "Fraction of the distance to a common point of all views up to which the space around a camera is empty in "
+        "the first half of the training; 0 disables it.",
         allowed=Range(0, 1),
     )
+    # Fraction of the run after which the space around cameras may have density, because walls may be near a camera
+    surrounding_end: float = range_field(0.5, Range(0, 1))
     # Fraction of the rays drawn from pixels with a large depth error
     hard_pixel_fraction: float = range_field(0.25, Range(0, 1))
     distortion_weight: float = setting(

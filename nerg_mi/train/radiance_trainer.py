@@ -215,10 +215,12 @@ class RadianceTrainer(Trainer):
         self._damping_distance = settings.damping_distance * box.side
         if (focus_distance := float(np.median(find_focus_distances(views)))) > 0:
             self._damping_distance = min(self._damping_distance, settings.max_focus_damping * focus_distance)
-        free_space = FreeSpace.find(
-            views, settings.near * box.side, settings.clear_fraction, settings.surrounding_fraction
-        )
-        self._ray_starts = ns.Float(free_space.clear)
+        near = settings.near * box.side
+        free_space = FreeSpace.find(views, near, settings.clear_fraction, settings.surrounding_fraction)
+        self._ray_starts = ns.Float(free_space.ray_starts)
+        # Empty space of the last part of the run, if it differs
+        late = free_space.restrict_to_views(near)
+        self._late_free_space = None if np.array_equal(late.near, free_space.near) else late
         self.grid = DensityGrid(
             ns,
             box,
@@ -328,6 +330,9 @@ class RadianceTrainer(Trainer):
 
     def _step(self) -> None:
         s, ns, max_prepass_samples = self.settings, self.ns, self.settings.max_prepass_samples
+        if self._late_free_space is not None and self.progress >= s.surrounding_end:
+            self.grid.set_free_space(self._late_free_space)
+            self._ray_starts, self._late_free_space = ns.Float(self._late_free_space.ray_starts), None
         self._update_density_grid()
         self._refine_stride()
         table = self.get_step_table(self.stride)

@@ -49,17 +49,21 @@ def test_cameras_see_through_free_space_in_front_of_points():
     views = [view([0, 0.1, 3], points), view([4, 0, 0], points), view([0, 2, 1], points[:20])]
     space = FreeSpace.find(views, 0.1, 0.6, 0.35)
     assert space.near == pytest.approx([0.35 * 3, 0.35 * 4, 0.35 * 5**0.5], abs=0.02)
-    assert space.clear == pytest.approx([0.6 * 2.9, 0.6 * 3.9, 0.35 * 5**0.5], abs=0.05)
+    assert space.clear == pytest.approx([0.6 * 2.9, 0.6 * 3.9, 0], abs=0.05)
+    assert space.ray_starts == pytest.approx([0.6 * 2.9, 0.6 * 3.9, 0.35 * 5**0.5], abs=0.05)
+    late = space.restrict_to_views(0.1)
+    assert np.array_equal(late.clear, space.clear) and np.allclose(late.near, 0.1)
+    assert late.ray_starts == pytest.approx([0.6 * 2.9, 0.6 * 3.9, 0.1], abs=0.05)
     # A point near the second camera, that only the first photo shows.
     views[0] = view([0, 0.1, 3], np.concatenate([points, [[3.5, 0, 0]]]))
     space = FreeSpace.find(views, 0.1, 0.6, 0.35)
-    assert space.near[1] == pytest.approx(0.8 * 0.5, abs=1e-3) == space.clear[1]
+    assert space.near[1] == pytest.approx(0.8 * 0.5, abs=1e-3) == space.ray_starts[1]
 
 
 def test_cameras_around_a_common_point_are_in_free_space():
     views = [view(c) for c in ([0, 0.1, 3], [4, 0, 0], [0, -2, 0.1])]
     space = FreeSpace.find(views, 0.1, 0.25, 0.35)
-    assert space.near == pytest.approx([1.05, 1.4, 0.7], abs=0.02) and np.array_equal(space.near, space.clear)
+    assert space.near == pytest.approx([1.05, 1.4, 0.7], abs=0.02) and not space.clear.any()
     # Not with depth, and not in a room whose cameras look outwards.
     with_depth = [replace(v, depth=np.ones((30, 40), np.float32)) for v in views]
     outwards = [replace(v, camera=PosedCamera(LENS, v.camera.to_world @ np.diag([-1.0, 1, -1, 1]))) for v in views]

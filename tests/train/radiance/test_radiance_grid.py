@@ -94,6 +94,26 @@ def test_free_space_in_view_of_a_camera_is_not_sampled():
     assert np.array_equal(seen[~(is_in_view & near)], everything[~(is_in_view & near)])
 
 
+def test_space_that_is_no_longer_empty_is_sampled_where_density_is():
+    camera, nothing = camera_at(0, 0, 1.5), FreeSpace(*np.zeros((2, 1), np.float32))
+    grid = DensityGrid(ns, BOX, R, 0.1, [camera], 1, free_space=FreeSpace(*np.full((2, 1), 0.9, np.float32)))
+
+    def left_half(p, active):
+        return dr.select(p.x < 0, ns.Float(1e3), 0)
+
+    grid.update(left_half, rng(), everywhere=True)
+    before, bits = cube(grid.seen), cube(grid.bits)
+    grid.set_free_space(nothing)
+    reference = DensityGrid(ns, BOX, R, 0.1, [camera], 1)
+    assert np.array_equal(cube(grid.seen), cube(reference.seen)) and grid.seen_count == reference.seen_count
+    assert np.array_equal(cube(grid.bits), bits)
+    for _ in range(8):
+        grid.update(left_half, rng())
+    is_left = centres()[..., 0] < 0
+    assert np.array_equal(cube(grid.bits) > 0, cube(reference.seen) & is_left)
+    assert (cube(grid.seen) & ~before & is_left).any()
+
+
 def test_cells_outside_a_non_cubic_box_are_empty():
     """The grid spans a cube; cells with centres more than half a cell outside the box are empty."""
     for z, rows in ((0.3, [2, 3, 4, 5]), (0.2, [3, 4])):

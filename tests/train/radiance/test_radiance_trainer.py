@@ -327,6 +327,24 @@ def test_free_space_is_carved_with_full_depth(dataset, depth):
     assert (seen.mean() < 0.2) == depth
 
 
+def test_space_around_cameras_is_empty_at_first(dataset):
+    """In the last part of a run, also of a resumed one, density is allowed there, and rays start near the camera."""
+    views = [replace(v, depth=None) for v in dataset.train]
+    options = settings(steps=100, surrounding_end=0.3)
+    reference = RadianceTrainer(views, BOX, TINY, replace(options, surrounding_fraction=0.0), ns)
+    trainer, resumed = (RadianceTrainer(views, BOX, TINY, options, ns) for _ in range(2))
+    starts = dr.min(trainer._ray_starts)[0]
+    assert starts > 2 * dr.max(reference._ray_starts)[0] and trainer.grid.seen_count < reference.grid.seen_count
+    trainer.steps = 29
+    trainer.step()
+    assert dr.min(trainer._ray_starts)[0] == starts and trainer.grid.seen_count < reference.grid.seen_count
+    trainer.step()
+    resumed.restore(*trainer.get_state())
+    resumed.step()
+    for other in (trainer, resumed):
+        assert dr.all(other._ray_starts == reference._ray_starts) and dr.all(other.grid.seen == reference.grid.seen)
+
+
 def test_depth_weight_decays(dataset, monkeypatch):
     """The loss of depth alone, one per ray: its weight, which decreases over the run."""
     monkeypatch.setattr(radiance_losses, "color_loss", lambda *options: 0 * color_loss(*options))
