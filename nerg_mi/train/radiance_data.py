@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -327,9 +327,10 @@ class FreeSpace:
         """(V,) float32 distance from each camera at which its rays start."""
         return np.maximum(self.near, self.clear)
 
-    def restrict_to_views(self, near: float) -> FreeSpace:
-        """Return the space that is empty in view of the cameras, and within ``near`` of them."""
-        return replace(self, near=np.full_like(self.near, near))
+    @staticmethod
+    def around(num_cameras: int, near: float) -> FreeSpace:
+        """Return the space within ``near`` of each camera."""
+        return FreeSpace(np.full(num_cameras, near, np.float32), np.zeros(num_cameras, np.float32))
 
     @staticmethod
     def find(views: list[PhotoView], near: float, in_view: float, around: float) -> FreeSpace:

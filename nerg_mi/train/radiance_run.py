@@ -136,6 +136,7 @@ def warm_up(trainer) -> None:
             settling.pieces_done = at
             trainer.update_current_field()
             trainer.extract_occupancy_piece()
+        trainer.end_free_space()
         dr.sync_thread()
     trainer.start()
 

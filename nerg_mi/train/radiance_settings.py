@@ -254,7 +254,7 @@ class RadianceSettings(RunSettings):
     clear_fraction: float = setting(
         0.25,
         "Fraction of the distance to the nearest points of the COLMAP model in a photo up to which the view of its "
-        "camera is empty; 0 disables it.",
+        "camera is empty in the first half of the training; 0 disables it.",
         allowed=Range(0, 1),
     )
     surrounding_fraction: float = setting(
@@ -263,8 +263,9 @@ class RadianceSettings(RunSettings):
         "the first half of the training; 0 disables it.",
         allowed=Range(0, 1),
     )
-    # Fraction of the run after which the space around cameras may have density, because walls may be near a camera
-    surrounding_end: float = range_field(0.5, Range(0, 1))
+    # Fraction of the run after which this space may have density, because surfaces without texture, of which there are
+    # no points, may be near a camera. Until then it prevents fog.
+    free_space_end: float = range_field(0.5, Range(0, 1))
     # Fraction of the rays drawn from pixels with a large depth error
     hard_pixel_fraction: float = range_field(0.25, Range(0, 1))
     distortion_weight: float = setting(

@@ -218,9 +218,6 @@ class RadianceTrainer(Trainer):
         near = settings.near * box.side
         free_space = FreeSpace.find(views, near, settings.clear_fraction, settings.surrounding_fraction)
         self._ray_starts = ns.Float(free_space.ray_starts)
-        # Empty space of the last part of the run, if it differs
-        late = free_space.restrict_to_views(near)
-        self._late_free_space = None if np.array_equal(late.near, free_space.near) else late
         self.grid = DensityGrid(
             ns,
             box,
@@ -238,6 +235,9 @@ class RadianceTrainer(Trainer):
         self.is_carved = self.use_depth and self.pixels.has_full_depth
         if self.is_carved:
             self.grid.carve(self.pixels.iter_surface_points())
+        # Empty space of the last part of the run, if it differs
+        late = FreeSpace.around(len(views), near)
+        self._late_free_space = None if self.is_carved or (free_space.ray_starts <= late.near).all() else late
         self.grid.update(self.evaluate_density, self.rng, everywhere=True)
         self._tables: dict[int, StepTable] = {}
         self.extraction = OccupancyExtraction(self.grid)
@@ -330,9 +330,8 @@ class RadianceTrainer(Trainer):
 
     def _step(self) -> None:
         s, ns, max_prepass_samples = self.settings, self.ns, self.settings.max_prepass_samples
-        if self._late_free_space is not None and self.progress >= s.surrounding_end:
-            self.grid.set_free_space(self._late_free_space)
-            self._ray_starts, self._late_free_space = ns.Float(self._late_free_space.ray_starts), None
+        if self.progress >= s.free_space_end:
+            self.end_free_space()
         self._update_density_grid()
         self._refine_stride()
         table = self.get_step_table(self.stride)
@@ -375,6 +374,12 @@ class RadianceTrainer(Trainer):
         self.rays = adapt_ray_count(
             self.rays, samples.count / covered, self.prepass_samples_per_ray, s.batch, max_prepass_samples
         )
+
+    def end_free_space(self) -> None:
+        """Allow density in the empty space near the cameras from now on."""
+        if (late := self._late_free_space) is not None:
+            self.grid.set_free_space(late)
+            self._ray_starts, self._late_free_space = self.ns.Float(late.ray_starts), None
 
     def _update_density_grid(self) -> None:
         """Update a part of the density grid if due, and extract a piece of the occupancy."""

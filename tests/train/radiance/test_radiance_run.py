@@ -270,13 +270,18 @@ def test_a_run_is_the_same_bit_for_bit(dataset, one_thread, depth):
 
 @pytest.mark.parametrize("depth", [True, False])
 def test_nothing_is_compiled_in_a_run(dataset, depth):
-    """Through all strides, grid updates, hard pixels, the end of damping near cameras, and occupancy extraction."""
-    t = trainer(dataset, steps=120, depth=depth, extraction_start=0.4)
+    """Through all strides, grid updates, hard pixels, the end of damping and of empty space near cameras, and
+    occupancy extraction.
+    """
+    data = dataset if depth else replace(dataset, train=[replace(v, depth=None) for v in dataset.train])
+    t = trainer(data, steps=120, depth=depth, extraction_start=0.4)
+    space_ends = t._late_free_space is not None
     # Other trainings in this process have compiled most kernels.
     dr.flush_kernel_cache()
     warm_up(t)
     assert not kernels_of_a_run(t)
     assert t.stride == 1 and t.extraction.is_done
+    assert space_ends != depth and t._late_free_space is None
 
 
 def test_nothing_is_compiled_once_fog_has_cleared(dataset):

@@ -325,16 +325,23 @@ def test_free_space_is_carved_with_full_depth(dataset, depth):
     p = dr.normalize(ns.Array3f(*np.random.default_rng(0).normal(size=(3, 500)).astype(np.float32))) * 0.9
     seen = trainer.grid.is_occupied(p, dr.full(ns.Bool, True, 500)).numpy()
     assert (seen.mean() < 0.2) == depth
+    if depth:
+        num_cells, trainer.steps = trainer.grid.seen_count, int(0.9 * trainer.settings.steps)
+        trainer.step()
+        assert trainer.grid.seen_count == num_cells
 
 
-def test_space_around_cameras_is_empty_at_first(dataset):
+@pytest.mark.parametrize("use_points", [True, False])
+def test_space_near_cameras_is_empty_at_first(dataset, use_points):
     """In the last part of a run, also of a resumed one, density is allowed there, and rays start near the camera."""
-    views = [replace(v, depth=None) for v in dataset.train]
-    options = settings(steps=100, surrounding_end=0.3)
-    reference = RadianceTrainer(views, BOX, TINY, replace(options, surrounding_fraction=0.0), ns)
+    views = [with_points(v) if use_points else replace(v, depth=None) for v in dataset.train]
+    options = settings(
+        steps=100, free_space_end=0.3, clear_fraction=0.9, surrounding_fraction=0.0 if use_points else 0.35
+    )
+    reference = RadianceTrainer(views, BOX, TINY, replace(options, clear_fraction=0.0, surrounding_fraction=0.0), ns)
     trainer, resumed = (RadianceTrainer(views, BOX, TINY, options, ns) for _ in range(2))
     starts = dr.min(trainer._ray_starts)[0]
-    assert starts > 2 * dr.max(reference._ray_starts)[0] and trainer.grid.seen_count < reference.grid.seen_count
+    assert starts > 1.5 * dr.max(reference._ray_starts)[0] and trainer.grid.seen_count < reference.grid.seen_count
     trainer.steps = 29
     trainer.step()
     assert dr.min(trainer._ray_starts)[0] == starts and trainer.grid.seen_count < reference.grid.seen_count
