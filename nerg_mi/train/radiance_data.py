@@ -328,7 +328,7 @@ class FreeSpace:
         return np.maximum(self.near, self.clear)
 
     @staticmethod
-    def around(num_cameras: int, near: float) -> FreeSpace:
+    def within(num_cameras: int, near: float) -> FreeSpace:
         """Return the space within ``near`` of each camera."""
         return FreeSpace(np.full(num_cameras, near, np.float32), np.zeros(num_cameras, np.float32))
 

@@ -72,7 +72,7 @@ class DensityGrid:
         cells = resolution**3
         self.index = dr.arange(ns.UInt32, cells)
         if free_space is None:
-            free_space = FreeSpace.around(len(cameras), 0)
+            free_space = FreeSpace.within(len(cameras), 0)
         self._restrict_to(self._find_seen_cells(free_space))
         if self.seen_count == 0:
             raise NergError(

@@ -236,7 +236,7 @@ class RadianceTrainer(Trainer):
         if self.is_carved:
             self.grid.carve(self.pixels.iter_surface_points())
         # Empty space of the last part of the run, if it differs
-        late = FreeSpace.around(len(views), near)
+        late = FreeSpace.within(len(views), near)
         self._late_free_space = None if self.is_carved or (free_space.ray_starts <= late.near).all() else late
         self.grid.update(self.evaluate_density, self.rng, everywhere=True)
         self._tables: dict[int, StepTable] = {}

@@ -96,14 +96,14 @@ def test_free_space_in_view_of_a_camera_is_not_sampled():
 
 def test_space_that_is_no_longer_empty_is_sampled_where_density_is():
     camera = camera_at(0, 0, 1.5)
-    grid = DensityGrid(ns, BOX, R, 0.1, [camera], 1, free_space=FreeSpace.around(1, 0.9))
+    grid = DensityGrid(ns, BOX, R, 0.1, [camera], 1, free_space=FreeSpace.within(1, 0.9))
 
     def left_half(p, active):
         return dr.select(p.x < 0, ns.Float(1e3), 0)
 
     grid.update(left_half, rng(), everywhere=True)
     before, bits = cube(grid.seen), cube(grid.bits)
-    grid.set_free_space(FreeSpace.around(1, 0))
+    grid.set_free_space(FreeSpace.within(1, 0))
     reference = DensityGrid(ns, BOX, R, 0.1, [camera], 1)
     assert np.array_equal(cube(grid.seen), cube(reference.seen)) and grid.seen_count == reference.seen_count
     assert np.array_equal(cube(grid.bits), bits)
