@@ -325,25 +325,29 @@ class HashGrid(Encoding):
         with_table = lambda table: HashGrid(self.config, table, self.mode)
         return dr.custom(_TableDerivatives, self.table, features, p, with_table)
 
-    def scatter(self, p: Array3f, features: list[Float]) -> None:
-        """Add ``features`` at ``p`` to the vertices around, times the weights of the interpolation.
+    def scatter(self, p: Array3f, features: list[Float]) -> Float:
+        """Sum ``features`` at ``p`` over the vertices around, times the weights of the interpolation, in a new table.
 
-        This is the transpose of the evaluation, level by level as in `evaluate_eagerly`.
+        This is the transpose of the evaluation, level by level as in `evaluate_eagerly`. Each level has its own array,
+        because with `dr.ReduceMode.Expand` each evaluation copies a whole array for every thread and adds the copies.
         """
         p, inside = self._clamped(p, True)
         packet = self._packet(p)
-        for level in range(self.config.levels):
+        tables = []
+        for level, rows in enumerate(self._rows):
             parts = features[level * self.config.features : (level + 1) * self.config.features]
             cell, w = self._locate(level, p)
             lo, hi = self._corner_indices(level, cell)
+            table = dr.zeros(type(self.table), rows * self.config.features)
             for corner in np.ndindex(*(2,) * self.config.dimensions):
                 index = self._combine(level, tuple((hi if c else lo)[k] for k, c in enumerate(corner)))
                 weight = 1.0
                 for c, x in zip(corner, w):
                     weight *= x if c else 1 - x
-                values = packet(*[weight * x for x in parts])
-                dr.scatter_add(self.table, values, index + self._offsets[level], inside, self.mode)
-            dr.eval(self.table)
+                dr.scatter_add(table, packet(*[weight * x for x in parts]), index, inside, self.mode)
+            dr.eval(table)
+            tables.append(table)
+        return dr.concat(tables)
 
     @staticmethod
     def _clamped(p, active):
@@ -408,17 +412,14 @@ class _TableDerivatives(dr.CustomOp):
     """Features of a hash grid that were evaluated earlier, with their derivatives by the table."""
 
     def eval(self, table, features, p, with_table):
-        self.p, self.with_table = p, with_table
-        self.table_type, self.table_size = type(table), len(table)
+        self.p, self.table, self.with_table = p, table, with_table
         return list(features)
 
     def forward(self):
         self.set_grad_out(self.with_table(self.grad_in("table"))(self.p))
 
     def backward(self):
-        grid = self.with_table(dr.zeros(self.table_type, self.table_size))
-        grid.scatter(self.p, self.grad_out())
-        self.set_grad_in("table", grid.table)
+        self.set_grad_in("table", self.with_table(self.table).scatter(self.p, self.grad_out()))
 
     def name(self):
         return "hash grid"
