@@ -18,6 +18,7 @@ from nerg_mi.fields.encoding import (
     init_encoding,
     register,
 )
+from nerg_mi.threads import set_thread_count
 from tests.reference import fields_numpy as reference
 from tests.reference import hashgrid_numpy as reference_hashgrid
 
@@ -246,6 +247,26 @@ def test_attached_features_have_the_derivatives_of_the_evaluation(dimensions, fe
         forward.append([np.array(dr.grad(row)) for row in result])
     assert np.abs(backward[0]).max() > 0 and np.allclose(*backward, rtol=1e-4, atol=1e-5)
     assert np.abs(forward[0]).max() > 0 and np.allclose(*forward, rtol=1e-4, atol=1e-5)
+
+
+def test_derivatives_of_several_threads_are_added_once():
+    """Dr.Jit keeps a copy of a sum for each thread; to add the copies of all levels after each level took longer than
+    the rest of a training step."""
+    rng, threads = np.random.default_rng(3), dr.thread_count()
+    config = HashGridConfig(levels=4, features=2, log2_rows=8, base=4, finest=32)
+    grid = HashGrid(config, HashGrid.random(config, ns, rng).table, dr.ReduceMode.Expand)
+    p = ns.Array3f(rng.random((3, 100)))
+    gradients = [ns.Float(rng.normal(size=100).astype(np.float32)) for _ in range(config.size)]
+    dr.eval(p, gradients)
+    try:
+        set_thread_count(2)
+        dr.kernel_history_clear()
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.eval(grid.scatter(p, gradients))
+            additions = [k["size"] for k in dr.kernel_history() if k["type"] == dr.KernelType.BlockReduce]
+    finally:
+        set_thread_count(threads)
+    assert 0 < sum(additions) <= len(grid.table)
 
 
 def test13_evaluation_leaves_no_reference_cycles():
