@@ -78,7 +78,7 @@ class OpenXr(FixedFrameReader):
             for v, words, lines in builder.read_table(path, numbers, texts, clocks={time: options.tick}):
                 word = dict(zip(texts, words.T))
                 first = v[0, 0] if first is None else first
-                drop = {}
+                drop = poses.find_unusable_quaternions(v[:, 4:8])
                 if flags:
                     flag_bits = np.nan_to_num(v[:, 8]).clip(0, 1 << 30).astype(np.int64) & _VALID_POSE
                     drop["the pose is not valid"] = flag_bits != _VALID_POSE

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nerg_mi.errors import NergError
+from nerg_mi.maths.transforms import ROTATION_TOLERANCE, check_rigid_transforms, rotation_errors
 from nerg_mi.ranges import MAX_COORDINATE, TIMES
 
 # ---- Pose tracks ----
@@ -56,7 +57,10 @@ class PoseTrack:
 AXES = {f"{sign}{axis}": s * np.eye(3)[i] for i, axis in enumerate("xyz") for sign, s in (("", 1.0), ("-", -1.0))}
 """Unit vectors by name: x, -x, y, -y, z, -z."""
 
-MIRRORED_MATRIX = "the head's matrix is mirrored (its determinant is negative)"  # Reason for dropping a row
+# Reasons for dropping a row.
+MIRRORED_MATRIX = "the head's matrix is mirrored (its determinant is negative)"
+_NO_ROTATION = f"the head's matrix is not a scaled rotation (R Rᵀ is not the identity within {ROTATION_TOLERANCE:g})"
+_NO_UNIT_QUATERNION = f"the length of a quaternion is not 1 within {ROTATION_TOLERANCE:g} (are its columns right?)"
 
 
 def parse_axis(name: str, what: str) -> np.ndarray:
@@ -74,17 +78,28 @@ def default_forward(up: str, handedness: str) -> str:
 
 
 def rotations_from_quaternions(q: np.ndarray, order: str = "xyzw") -> np.ndarray:
-    """Rotation matrices (N, 3, 3) of quaternions (N, 4) of any length, in ``order`` xyzw or wxyz. NaN for quaternions
-    that are not finite, zero or a fill value."""
+    """Rotation matrices (N, 3, 3) of quaternions (N, 4) in ``order`` xyzw or wxyz. NaN for quaternions that are not
+    finite, zero or a fill value, or whose length is not 1 (`find_unusable_quaternions`)."""
     q = np.asarray(q, dtype=np.float64)
     if order not in ("xyzw", "wxyz") or q.ndim != 2 or q.shape[1] != 4:
         raise ValueError(f'quaternions {q.shape} in order "{order}": expected (N, 4), xyzw or wxyz')
-    with np.errstate(over="ignore"):
-        length = np.linalg.norm(q, axis=1)
-    is_valid = np.isfinite(length) & (length > 1e-12) & np.isnan(find_fill_values(q))
+    is_valid = ~_is_missing(q) & ~next(iter(find_unusable_quaternions(q).values()))
     if order == "wxyz":
         q = np.roll(q, -1, axis=1)
     return _make_rotations(is_valid, q, lambda rotation, q: rotation.from_quat(q))
+
+
+def find_unusable_quaternions(q: np.ndarray) -> dict[str, np.ndarray]:
+    """The reason to drop rows, with the mask (N,) bool of quaternions (N, 4) that are not missing, but whose length is
+    not 1: other columns, or an average of different rotations."""
+    with np.errstate(over="ignore"):
+        is_unit = np.abs(np.linalg.norm(q, axis=1) - 1) <= ROTATION_TOLERANCE
+    return {_NO_UNIT_QUATERNION: ~is_unit & ~_is_missing(q)}
+
+
+def _is_missing(v: np.ndarray) -> np.ndarray:
+    """Whether vectors (N, C) are not finite, zero or a fill value, (N,) bool."""
+    return ~np.isfinite(v).all(axis=1) | np.isfinite(find_fill_values(v))
 
 
 def rotations_from_angles(angles: np.ndarray, up: str, forward: str, degrees: bool = True) -> np.ndarray:
@@ -129,27 +144,38 @@ def directions_from_azimuths(
 def rotations_from_matrices(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rotation matrices (N, 3, 3) and origins (N, 3) of head-to-world matrices, row by row as (N, 12) or (N, 16).
 
-    Removes a uniform scale. NaN if the upper left part is not a scaled rotation, to 1 %, or is mirrored.
+    Removes a uniform scale. NaN for rows with missing values, and for those of `find_unusable_matrices`.
     """
-    values = np.asarray(values, dtype=np.float64)
-    m = values[:, :12].reshape(-1, 3, 4)
+    m = np.asarray(values, dtype=np.float64)[:, :12].reshape(-1, 3, 4)
     R, origin = m[:, :, :3].copy(), m[:, :, 3]
+    R[_is_missing(values) | np.logical_or.reduce([*find_unusable_matrices(values).values()])] = np.nan
     with np.errstate(divide="ignore", invalid="ignore"):
-        # The cube root keeps the sign: a mirrored matrix becomes a rotation times -1, and is excluded below.
-        R /= np.cbrt(_determinants(values))[:, None, None]
-        errors = np.abs(np.einsum("nij,nik->njk", R, R) - np.eye(3)).max(axis=(1, 2))
-    R[~(errors < 0.01) | is_mirrored(values)] = np.nan
+        R /= np.cbrt(np.linalg.det(R))[:, None, None]
     return R, origin
+
+
+def find_unusable_matrices(values: np.ndarray) -> dict[str, np.ndarray]:
+    """Reasons to drop rows, with masks (N,) bool of matrices (N, 12) or (N, 16) that are not missing, but mirrored, or
+    whose upper left part is not a scaled rotation."""
+    R = values[:, :12].reshape(-1, 3, 4)[:, :, :3]
+    is_present, mirrored = ~_is_missing(values), is_mirrored(values)
+    is_rotation = rotation_errors(R, may_scale=True) <= ROTATION_TOLERANCE
+    return {MIRRORED_MATRIX: mirrored, _NO_ROTATION: is_present & ~mirrored & ~is_rotation}
+
+
+def check_last_rows(values: np.ndarray, name: str, lines: np.ndarray) -> None:
+    """Raise `NergError` with ``name`` and the line for a matrix (N, 16) that is not missing, and whose last row is not
+    0, 0, 0, 1; ``lines`` (N,) are line numbers."""
+    rows = np.flatnonzero(~_is_missing(values))
+    if values.shape[1] == 16:
+        matrices = values[rows].reshape(-1, 4, 4)
+        check_rigid_transforms(matrices, name, lambda row: f"line {lines[rows[row]]}", tolerance=np.inf)
 
 
 def is_mirrored(values: np.ndarray) -> np.ndarray:
     """Whether head-to-world matrices (N, 12) or (N, 16) have a negative determinant, (N,) bool."""
-    return _determinants(values) < 0
-
-
-def _determinants(values: np.ndarray) -> np.ndarray:
     R = np.asarray(values, dtype=np.float64)[:, :12].reshape(-1, 3, 4)[:, :, :3]
-    return np.linalg.det(np.where(np.isfinite(R), R, 0.0))
+    return np.linalg.det(np.where(np.isfinite(R), R, 0.0)) < 0
 
 
 def rotate(rotations: np.ndarray, vectors: np.ndarray) -> np.ndarray:

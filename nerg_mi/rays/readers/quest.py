@@ -94,7 +94,8 @@ class Quest(FixedFrameReader):
                     recorded_origin=poses_read[:, : len(eye_columns), :3].mean(axis=1),
                     drop={
                         f"confidence below {options.min_confidence:g} (option --min-confidence)": confidence
-                        < options.min_confidence
+                        < options.min_confidence,
+                        **_find_unusable(poses_read),
                     },
                 )
 
@@ -116,6 +117,12 @@ def _compute_rays(values: np.ndarray, num_eyes: int) -> tuple[np.ndarray, np.nda
         origin = values[:, -1, :3] + poses.rotate(rotations[-1], origin)
         direction = poses.rotate(rotations[-1], direction)
     return origin, direction
+
+
+def _find_unusable(values: np.ndarray) -> dict[str, np.ndarray]:
+    """`poses.find_unusable_quaternions` of any of the poses (n, P, 7)."""
+    reasons = poses.find_unusable_quaternions(values[:, :, 3:].reshape(-1, 4))
+    return {reason: mask.reshape(values.shape[:2]).any(axis=1) for reason, mask in reasons.items()}
 
 
 def _make_prefixes(side: str) -> tuple[str, ...]:

@@ -188,8 +188,7 @@ class MappedRows:
         t = value[columns.t] if columns.t else np.arange(first_row, first_row + n, dtype=np.float64)
         confidence = value[columns.confidence] if columns.confidence else np.ones(n)
         origin, direction, head = self._compute_geometry(vector)
-        pose = vector(self.pose_columns) if columns.pose == "matrix" else None
-        drop = {} if pose is None else {poses.MIRRORED_MATRIX: poses.is_mirrored(pose)}
+        drop = self._find_unusable_poses(path, block, vector)
         is_uncertain = confidence < options.min_confidence
         drop |= {f"confidence below {options.min_confidence:g} (option --min-confidence)": is_uncertain}
         for name, words in self.valid.items():
@@ -212,6 +211,20 @@ class MappedRows:
             recorded_origin=vector(columns.origin) if columns.origin else None,
             recorded_direction=vector(columns.direction) if columns.direction else None,
         )
+
+    def _find_unusable_poses(
+        self, path: Path, block: TableBlock, vector: Callable[[Sequence[str]], np.ndarray]
+    ) -> dict[str, np.ndarray]:
+        """Reasons to drop rows for their pose, with masks (n,). Raises `NergError` for a last row of a matrix that is
+        not 0, 0, 0, 1."""
+        columns = self.columns
+        if columns.pose in ("xyzw", "wxyz"):
+            return poses.find_unusable_quaternions(vector(self.pose_columns))
+        if columns.matrix is None:
+            return {}
+        values = vector(self.pose_columns)
+        poses.check_last_rows(values, f"{path}, the matrix {columns.matrix[0]!r}, ...", block.lines)
+        return poses.find_unusable_matrices(values)
 
     def _compute_geometry(
         self, vector: Callable[[Sequence[str]], np.ndarray]

@@ -60,7 +60,10 @@ class Varjo(FixedFrameReader):
                     poses.rotate(matrices, forward),
                     rows=lines[~is_bad],
                     head=matrices[:, :, 2],
-                    drop={"GazeStatus is not VALID": ~_is_valid(path, texts[~is_bad, 4])},
+                    drop={
+                        "GazeStatus is not VALID": ~_is_valid(path, texts[~is_bad, 4]),
+                        **poses.find_unusable_quaternions(rotation),
+                    },
                     recorded_origin=position,
                     recorded_direction=forward,
                 )

@@ -88,10 +88,10 @@ def test_openxr_forward_is_minus_z(tmp_path):
 
 def test_openxr_bare_names(tmp_path):
     path = tmp_path / "ann.csv"
-    path.write_text("time,x,y,z,qx,qy,qz,qw\n5000000000,1,1.6,-2,0,0,0,2\n")
+    path.write_text("time,x,y,z,qx,qy,qz,qw\n5000000000,1,1.6,-2,0,0,0,1\n")
     rays = read("openxr", path)
     assert np.allclose(rays.origin, [[1, 2, 1.6]]) and np.allclose(rays.direction, [[0, 1, 0]]) and rays.t[0] == 0
-    path.write_text("x,y,z,qx,qy,qz,qw\n1,1.6,-2,0,0,0,2\n")
+    path.write_text("x,y,z,qx,qy,qz,qw\n1,1.6,-2,0,0,0,1\n")
     with pytest.raises(NergError, match="has no column of time"):
         read("openxr", path)
 

@@ -101,13 +101,16 @@ def test_samples_in_any_order_with_missing_values():
 # ---- Head poses as rotations; see test_table.py for the meaning of angles ----
 
 
-def test_quaternions_need_not_be_unit():
+def test_quaternions_of_another_length_are_unusable():
     turn = Rotation.from_quat(np.random.default_rng(0).normal(size=(20, 4)))
-    q = turn.as_quat() * 3
-    assert np.allclose(poses.rotations_from_quaternions(q), turn.as_matrix())
-    assert np.allclose(poses.rotations_from_quaternions(np.roll(q, 1, axis=1), "wxyz"), turn.as_matrix())
-    q[3], q[4, 1] = 0, np.nan
-    assert np.isnan(poses.rotations_from_quaternions(q)[3:5]).all()
+    q = turn.as_quat() * 1.004  # as from averages or rounded values
+    np.testing.assert_allclose(poses.rotations_from_quaternions(q), turn.as_matrix(), atol=1e-12)
+    wxyz = np.roll(q, 1, axis=1)
+    np.testing.assert_allclose(poses.rotations_from_quaternions(wxyz, "wxyz"), turn.as_matrix(), atol=1e-12)
+    q[3], q[4, 1], q[5], q[6, 2] = 0, np.nan, 1.1 * q[5], q[6, 2] + 0.3
+    assert np.isnan(poses.rotations_from_quaternions(q)[3:7]).all()
+    (mask,) = poses.find_unusable_quaternions(q).values()
+    assert np.flatnonzero(mask).tolist() == [5, 6]
     for bad, order in ((q[:, :3], "xyzw"), (q, "zyxw")):
         with pytest.raises(ValueError, match="expected"):
             poses.rotations_from_quaternions(bad, order)

@@ -61,7 +61,7 @@ def test_poses_of_any_kind_give_the_same_rays(tmp_path, heads, kind, forward):
         path = write(tmp_path / "t.csv", names, m.reshape(20, 16))
         mapping = f"matrix={names}"
     else:
-        q = np.roll(turn.as_quat(), 1 if kind == "wxyz" else 0, axis=1) * 1.7  # need not be unit
+        q = np.roll(turn.as_quat(), 1 if kind == "wxyz" else 0, axis=1)
         path = write(tmp_path / "t.csv", "x,y,z," + names, np.hstack([origin, q]))
         mapping = f"origin=x,y,z {kind}={names}"
     rays = read_table(path, mapping, up="y", handedness="left", forward=forward)
@@ -106,7 +106,7 @@ def test_rows_with_invalid_poses_are_dropped(tmp_path):
     path.write_text("x,y,z,a,b,c,d\n0,0,0,0,0,0,1\n0,0,0,0,0,0,0\n0,0,0,nan,0,0,1\n")
     assert dropped(read_table(path, "origin=x,y,z xyzw=a,b,c,d")) == {"direction is missing": [[3, 4]]}
     path = write(tmp_path / "m.csv", ",".join("abcdefghijkl"), [np.eye(4)[:3].ravel(), np.ones(12)])
-    assert dropped(read_table(path, MATRIX)) == {"direction is missing": [[3, 3]]}
+    assert list(dropped(read_table(path, MATRIX)).values()) == [[[3, 3]]]
 
 
 def test_cohorts_persons_and_validity(tmp_path):
@@ -232,6 +232,42 @@ def test_mirrored_matrices_are_dropped(tmp_path, heads):
     assert len(rays) == 19 and dropped(rays) == {mirrored: [[6, 6]]}
 
 
+FULL_MATRIX = ",".join(f"m{k}" for k in range(16))
+
+
+def write_matrices(path, heads):
+    origin, turn = heads
+    m = np.tile(np.eye(4), (20, 1, 1))
+    m[:, :3, :3], m[:, :3, 3] = turn.as_matrix(), origin + 1
+    return m, lambda m: write(path, FULL_MATRIX, m.reshape(-1, 16))
+
+
+def test_matrices_with_another_last_row_are_refused(tmp_path, heads):
+    m, save = write_matrices(tmp_path / "m.csv", heads)
+    with pytest.raises(NergError, match=r"m\.csv.*line 2: it is transposed"):
+        read_table(save(np.swapaxes(m, 1, 2)), f"matrix={FULL_MATRIX}")
+    m[5, 3] = 0.3, 0.2, 0.1, 0.7
+    with pytest.raises(NergError, match=r"m\.csv.*'m0'.*line 7.*0\.3, 0\.2, 0\.1, 0\.7"):
+        read_table(save(m), f"matrix={FULL_MATRIX}")
+    with pytest.raises(NergError, match="line 7"):
+        read_table(save(m), f"matrix={FULL_MATRIX}", skip_bad_lines=True)
+    m[5] = 0  # nothing was tracked
+    rays = read_table(save(m), f"matrix={FULL_MATRIX}")
+    assert len(rays) == 19 and list(dropped(rays).values()) == [[[7, 7]]]
+
+
+def test_matrices_and_quaternions_that_are_no_rotations_are_dropped_by_name(tmp_path, heads):
+    m, save = write_matrices(tmp_path / "m.csv", heads)
+    m[3, :3, 1] *= 1.3
+    rays = read_table(save(m), f"matrix={FULL_MATRIX}")
+    assert [(rows, "not a scaled rotation" in reason) for reason, rows in dropped(rays).items()] == [([[5, 5]], True)]
+    q = heads[1].as_quat()
+    q[3, 3] += 0.5
+    path = write(tmp_path / "q.csv", "x,y,z,a,b,c,d", np.hstack([heads[0] + 1, q]))
+    rays = read_table(path, "origin=x,y,z xyzw=a,b,c,d")
+    assert [(rows, "quaternion" in reason) for reason, rows in dropped(rays).items()] == [([[5, 5]], True)]
+
+
 def test_fill_values_in_the_heads_frame(tmp_path, heads):
     """Fill values are detected before the rotation of the head."""
     origin, turn = heads
@@ -245,7 +281,7 @@ def test_fill_values_in_the_heads_frame(tmp_path, heads):
 @pytest.mark.parametrize(
     "columns, rows, num_valid",
     [
-        ("xyzw=a,b,c,d", [(0, 0, 0, 1), (-1, -1, -1, -1), (0, 0, 0, 0), (-9999,) * 4, (1, 1, 1, 1)], 2),
+        ("xyzw=a,b,c,d", [(0, 0, 0, 1), (-1, -1, -1, -1), (0, 0, 0, 0), (-9999,) * 4, (0.5, 0.5, 0.5, 0.5)], 2),
         ("ypr=a,b,c", [(0, 0, 0), (-9999,) * 3, (-1, -1, -1), (999, 999, 999), (-32768,) * 3], 2),
         ("azel=a,b", [(0, 0), (-1, -1), (-9999, -9999), (999, 999), (3.402823e38,) * 2], 2),
         ("yawpitch=a,b", [(0, 0), (-9999, -9999), (-999, -999), (99999, 99999), (20, 20)], 2),

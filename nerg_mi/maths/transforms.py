@@ -1,0 +1,90 @@
+"""Checks of rigid and similarity transforms given as matrices."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from nerg_mi.errors import NergError
+
+ROTATION_TOLERANCE = 0.01
+"""Maximum deviation of an element of R Rᵀ from the identity for a rotation R, and of a unit quaternion's length from
+1: matrices and quaternions that were written with two decimals pass."""
+
+_LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
+_LAST_ROW_TOLERANCE = 1e-5  # of single precision
+
+
+def check_rigid_transforms(
+    matrices: ArrayLike,
+    name: str,
+    label: Callable[[int], str] = "matrix {}".format,
+    *,
+    may_scale: bool = False,
+    tolerance: float = ROTATION_TOLERANCE,
+) -> None:
+    """Raise `NergError` for a matrix that is not a rotation and a translation with the last row 0, 0, 0, 1.
+
+    Parameters
+    ----------
+    matrices
+        (4, 4), (3, 4) without the last row, or N of them (N, 4, 4) or (N, 3, 4).
+    name
+        For the message: "the matrix of the head", "to_world".
+    label
+        Returns the name of each of N matrices for the message, such as "line 7", from its index.
+    may_scale
+        Whether the rotation may be multiplied by a uniform scale, as in an alignment.
+    tolerance
+        Maximum deviation of an element of R Rᵀ from the identity; infinite: any 3 x 3 part is accepted.
+    """
+    m = np.asarray(matrices, np.float64)
+    if m.ndim not in (2, 3) or m.shape[-2:] not in ((4, 4), (3, 4)):
+        raise NergError(f"{name} has the shape {m.shape}; it must be (4, 4) or (3, 4)")
+    is_single = m.ndim == 2
+    m = m.reshape(-1, *m.shape[-2:])
+    errors = rotation_errors(m[:, :3, :3], may_scale=may_scale)
+    is_bad = ~np.isfinite(m).all(axis=(1, 2)) | ~(errors <= tolerance) | ~has_last_row(m)
+    if not is_bad.any():
+        return
+    row = int(np.argmax(is_bad))
+    where = name if is_single else f"{name}, {label(row)}"
+    raise NergError(f"{where}: {_explain(m[row], errors[row], tolerance)}")
+
+
+def has_last_row(matrices: np.ndarray) -> np.ndarray:
+    """Whether the last row of each matrix (N, 4, 4) is 0, 0, 0, 1, (N,) bool; True for (N, 3, 4)."""
+    return np.asarray(np.abs(matrices[:, 3:] - _LAST_ROW) <= _LAST_ROW_TOLERANCE).all(axis=(1, 2))
+
+
+def rotation_errors(linear: np.ndarray, *, may_scale: bool = False) -> np.ndarray:
+    """Maximum deviation of R Rᵀ from the identity for each of the matrices (N, 3, 3), (N,); infinite for mirrored
+    matrices and values that are not finite. ``may_scale``: a uniform scale is removed before."""
+    is_finite = np.isfinite(linear).all(axis=(1, 2))
+    R = np.where(is_finite[:, None, None], linear, 0.0)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        determinant = np.linalg.det(R)
+        if may_scale:
+            R = R / np.cbrt(determinant)[:, None, None]
+        errors = np.abs(np.einsum("nij,nkj->nik", R, R) - np.eye(3)).max(axis=(1, 2))
+    return np.where(determinant > 0, errors, np.inf)
+
+
+def _explain(m: np.ndarray, error: float, tolerance: float) -> str:
+    """Why a matrix (4, 4) or (3, 4) is refused, and the remedy."""
+    if not np.isfinite(m).all():
+        return "it has values that are not finite; correct or remove it"
+    if len(m) == 4 and not has_last_row(m[None])[0]:
+        if has_last_row(m.T[None])[0]:
+            return "it is transposed: its last column is 0, 0, 0, 1 instead of its last row; transpose it"
+        values = ", ".join(f"{v:g}" for v in m[3])
+        return f"its last row is {values} instead of 0, 0, 0, 1; check the order of its values"
+    scale = float(np.cbrt(np.linalg.det(m[:3, :3])))
+    if scale < 0:
+        return "it is mirrored (its determinant is negative); exchange two axes or negate one in the file's frame"
+    if scale > 0 and rotation_errors(m[None, :3, :3], may_scale=True)[0] <= tolerance:
+        return f"it contains a scale of {scale:.6g}; only a rotation and a translation are possible, so divide by it"
+    deviation = f"R Rᵀ differs from the identity by {error:.3g}" if np.isfinite(error) else "its determinant is 0"
+    return f"its upper left 3 x 3 part is not a rotation ({deviation}; at most {tolerance:g}); correct it"
