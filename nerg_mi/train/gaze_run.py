@@ -169,7 +169,9 @@ def train_gaze(
         }
     if write is not None:
         stage, weights = ("refit", {}) if is_refit else ("fit", last.weights)
-        save = lambda: file.save(stage, trainer, first.to_dict(), weights, force=True)
+        # The state of an interrupted fit is saved, without this result: a resumed fit continues as if it had none.
+        is_saved = first.interrupted or last.interrupted
+        save = lambda: None if is_saved else file.save(stage, trainer, first.to_dict(), weights, force=True)
         with saving_on_failure(state.path, save, is_done=not provenance["interrupted"]):
             write(field, provenance)
     return TrainedGaze(field, provenance)

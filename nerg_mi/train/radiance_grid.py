@@ -224,12 +224,16 @@ class DensityGrid:
         dr.eval(self.bits)
         self.unsampled = dr.compress(self.seen & (self.bits == 0))
 
-    def restore(self, value, bits, seen, always, turn: int) -> None:
-        """Restore a stored state (arrays of the attributes of these names)."""
+    def restore(self, value, bits, seen, always, turn: int, unsampled=None) -> None:
+        """Restore a stored state (arrays of the attributes of these names).
+
+        States of earlier versions have no ``unsampled``, which differs between a change of free space and the next
+        update.
+        """
         ns = self.ns
         self.value, self.bits, self.seen, self.always = ns.Float(value), ns.UInt8(bits), ns.Bool(seen), ns.Bool(always)
         self.seen_count, self.turn = int(seen.sum()), turn
-        self.unsampled = dr.compress(self.seen & (self.bits == 0))
+        self.unsampled = dr.compress(self.seen & (self.bits == 0)) if unsampled is None else ns.UInt32(unsampled)
 
     def empty_points(self, count: int, rng: np.random.Generator):
         """Return random points (Array3f, world) in visible cells that are not sampled; None if there are none."""
@@ -366,14 +370,20 @@ class OccupancyExtraction:
     def is_done(self) -> bool:
         return self.pieces_done >= self.NUM_PIECES
 
-    def restore(self, pieces_done: int, dense_cells: np.ndarray, contributing_cells: np.ndarray) -> None:
+    def restore(
+        self,
+        pieces_done: int,
+        dense_cells: np.ndarray,
+        contributing_cells: np.ndarray,
+        dilated_dense: np.ndarray | None = None,
+    ) -> None:
         """Restore a stored state."""
         UInt8 = self.grid.ns.UInt8
         self.pieces_done, self.dense_cells, self.contributing_cells, self.dilated_dense = (
             pieces_done,
             UInt8(dense_cells),
             UInt8(contributing_cells),
-            None,
+            None if dilated_dense is None else UInt8(dilated_dense),
         )
 
     def advance(self, density, contributing_points, seed: int) -> None:

@@ -275,7 +275,9 @@ def train_field(
     }
     history = load_run(trainer, state, identity) if resume else []
     last_psnr = history[-1]["psnr"] if history else None
-    evaluation_times = [x for x in _EVALUATION_TIMES if x > trainer.progress] if watched.held_out else []
+    # Not from the present progress: an evaluation that has come due may be postponed (`MIN_EVALUATION_INTERVAL`).
+    evaluated = trainer.progress_at(history[-1]["steps"], history[-1]["seconds"]) if history else 0.0
+    evaluation_times = [x for x in _EVALUATION_TIMES if x > evaluated] if watched.held_out else []
     last_evaluation, saved, interrupted = history[-1]["steps"] if history else 0, trainer.seconds, False
     previews = PreviewWriter(preview, watched.held_out[0]) if preview is not None and watched.held_out else None
 
@@ -324,15 +326,22 @@ def train_field(
     seconds = trainer.seconds
     if interrupted:
         save()
-    with saving_on_failure(state, save, is_done=write is not None and not interrupted):
+
+    def save_end() -> None:
+        trainer.set_seconds(seconds)
+        save()
+
+    with saving_on_failure(state, save_end, is_done=write is not None and not interrupted):
         score = lambda fraction: report(fraction, "scoring")
         duration = seconds, pace.waiting_fraction
-        field, provenance = _make_result(trainer, dataset, watched, history, duration, interrupted, score)
+        # A copy, because the evaluation of the result is not part of the run: a resumed run would not repeat it.
+        field, provenance = _make_result(trainer, dataset, watched, list(history), duration, interrupted, score)
+        evaluations, result = provenance["psnr_watched"]["history"], provenance["psnr_watched"]["result"]
         if previews is not None:
             previews.write_result(trainer, field)
-        if curves is not None and history:
-            write_curves_table(curves, history)
-            write_curves_figure(get_curves_figure(curves), history, provenance["psnr_watched"]["result"])
+        if curves is not None and evaluations:
+            write_curves_table(curves, evaluations)
+            write_curves_figure(get_curves_figure(curves), evaluations, result)
         if write is not None:
             report(0.0, "writing")
             write(field, provenance)

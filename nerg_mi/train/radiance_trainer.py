@@ -256,7 +256,10 @@ class RadianceTrainer(Trainer):
         tensors |= {
             "settling.found": settling.dense_cells.numpy(),
             "settling.shown": settling.contributing_cells.numpy(),
+            "grid.unsampled": self.grid.unsampled.numpy(),
         }
+        if settling.dilated_dense is not None:
+            tensors["settling.dilated"] = settling.dilated_dense.numpy()
         meta |= {key: getattr(self, name) for key, name in _NUMBERS.items()}
         meta |= {"settling": settling.pieces_done, "turn": self.grid.turn, "clock": self.clock.to_dict()}
         if self.best is not None:
@@ -278,9 +281,15 @@ class RadianceTrainer(Trainer):
         dense, contributing = (tensors[f"settling.{name}"] for name in ("found", "shown"))
         for name, cells in (("found", self.extraction.dense_cells), ("shown", self.extraction.contributing_cells)):
             check_shape(tensors, f"settling.{name}", cells)
+        dilated, unsampled = tensors.get("settling.dilated"), tensors.get("grid.unsampled")
+        if dilated is not None:
+            check_shape(tensors, "settling.dilated", self.extraction.dense_cells)
+        if unsampled is not None and (unsampled.ndim != 1 or np.any(unsampled >= self.grid.resolution**3)):
+            raise ValueError('its array "grid.unsampled" has cells outside the grid')
         super().restore(tensors, meta)
-        self.grid.restore(**{name: tensors[f"grid.{name}"] for name in GRID_STATE}, turn=int(read_count(meta, "turn")))
-        self.extraction.restore(int(read_number(meta, "settling", "state")), dense, contributing)
+        turn = int(read_count(meta, "turn"))
+        self.grid.restore(**{name: tensors[f"grid.{name}"] for name in GRID_STATE}, turn=turn, unsampled=unsampled)
+        self.extraction.restore(int(read_number(meta, "settling", "state")), dense, contributing, dilated)
         self.clock.restore(meta["clock"])
         if "best" in meta:
             best = {}

@@ -54,8 +54,12 @@ class Trainer:
     @property
     def progress(self) -> float:
         """Completed fraction of the schedule, 0..1."""
-        steps, minutes = self._schedule or self.settings.steps, self.settings.minutes
-        return min(1.0, self.steps / steps if steps else self.seconds / (60 * minutes))
+        return self.progress_at(self.steps, self.seconds)
+
+    def progress_at(self, steps: int, seconds: float) -> float:
+        """Completed fraction of the schedule after so many ``steps`` and ``seconds``."""
+        schedule, minutes = self._schedule or self.settings.steps, self.settings.minutes
+        return min(1.0, steps / schedule if schedule else seconds / (60 * minutes))
 
     def move_weights(self) -> None:
         """Update the weights with the current gradients and learning rate."""

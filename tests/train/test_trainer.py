@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 
 import drjit as dr
 import drjit.llvm.ad as ns
@@ -19,6 +20,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.formats.checkpoint import read_checkpoint
 from nerg_mi.formats.fields import save_radiance
 from nerg_mi.threads import set_thread_count
+from nerg_mi.train import radiance_run
 from nerg_mi.train import trainer as shared
 from nerg_mi.train.radiance_run import load_run, save_run, train_field
 from nerg_mi.train.radiance_trainer import RadianceTrainer
@@ -44,6 +46,76 @@ def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(dataset, one_thre
     for name, value in expected.items():
         assert np.array_equal(value, got[name]), name
     assert full.extraction.pieces_done == second.extraction.pieces_done > 0
+
+
+class Killed(BaseException):
+    """End of the process, of which the run knows nothing."""
+
+
+@pytest.mark.parametrize(
+    "held_out, depth, kills", [(True, False, (1, 16, 33)), (True, True, (9, 47)), (False, False, (20, 41, 44))]
+)
+def test_killed_runs_have_the_result_of_an_uninterrupted_one(
+    dataset, one_thread, tmp_path, monkeypatch, held_out, depth, kills
+):
+    """Weights, occupancy, curves and the chosen state, with evaluations that have come due but are postponed, and
+    between the end of free space (step 39) and the next update of the grid (42), during the extraction of occupancy.
+    """
+    monkeypatch.setattr(radiance_run, "MIN_EVALUATION_INTERVAL", 10)
+    # The best state is an early one: grey noise is nearer to fog than to a ball.
+    grey = 0.3 + 0.1 * np.random.default_rng(0).random((24, 24, 3)).astype(np.float32)
+    views = [replace(v, pixels=grey, depth=None) for v in dataset.held_out] if held_out else []
+    data = replace(dataset, held_out=views)
+    if not depth:
+        data = replace(data, train=[replace(v, depth=None) for v in data.train])
+    plan = settings(steps=48, photo_colors=False, grid_interval=7, extraction_start=0.0, free_space_end=0.8)
+
+    def kill(progress):
+        if progress.phase == "training" and progress.steps in remaining:
+            remaining.remove(progress.steps)
+            raise Killed
+
+    remaining = list(kills)
+    expected, provenance = train_field(data, TINY, plan, ns, depth)
+    options = {"state": tmp_path / "a.run", "save_every": 0.0, "on_progress": kill}
+    for number in range(len(kills)):
+        with pytest.raises(Killed):
+            train_field(data, TINY, plan, ns, depth, resume=number > 0, **options)
+    field, again = train_field(data, TINY, plan, ns, depth, resume=True, **options)
+    without_time = lambda rows: [{k: v for k, v in row.items() if k != "seconds"} for row in rows]
+    watched, watched_again = provenance["psnr_watched"], again["psnr_watched"]
+    assert without_time(watched["history"]) == without_time(watched_again["history"])
+    if held_out:
+        assert len(watched["history"]) >= 3
+        assert without_time([watched["result"]]) == without_time([watched_again["result"]])
+        assert watched["result"]["steps"] < 48
+        assert provenance["psnr_held_out"] == again["psnr_held_out"]
+    for name, value in expected.parameters().items():
+        assert np.array_equal(value.numpy(), field.parameters()[name].numpy()), name
+    cells = "masks" if hasattr(expected.occupancy, "masks") else "bits"  # An early state has no finer occupancy
+    assert np.array_equal(getattr(expected.occupancy, cells), getattr(field.occupancy, cells))
+
+
+def test_an_interruption_and_a_failed_write_change_nothing(dataset, one_thread, tmp_path, monkeypatch):
+    """The result of an interrupted run is evaluated, but the resumed run evaluates as if it had not been."""
+    monkeypatch.setattr(radiance_run, "MIN_EVALUATION_INTERVAL", 4)
+
+    def stop(progress):
+        if progress.steps == 5:
+            raise KeyboardInterrupt
+
+    def refuse(field, provenance):
+        raise NergError("the disk is full")
+
+    options = {"state": tmp_path / "a.run", "on_progress": stop}
+    steps = lambda provenance: [row["steps"] for row in provenance["psnr_watched"]["history"]]
+    expected = steps(train_field(dataset, TINY, settings(steps=12), ns)[1])
+    with pytest.raises(NergError, match="--resume"):
+        train_field(dataset, TINY, settings(steps=12), ns, write=refuse, **options)
+    for row in read_checkpoint(tmp_path / "a.run", "radiance run")[1]["history"]:
+        assert row["steps"] < 5
+    _, provenance = train_field(dataset, TINY, settings(steps=12), ns, resume=True, **options)
+    assert steps(provenance) == expected
 
 
 def test_ctrl_c_saves_the_state_and_writing_removes_it(dataset, tmp_path):

@@ -261,6 +261,25 @@ def test_a_result_that_cannot_be_written_is_saved(wall, refit, threads, tmp_path
         np.testing.assert_array_equal(np.array(value), np.array(expected[name]), err_msg=name)
 
 
+@pytest.mark.parametrize("zones", [0, 2])
+def test_a_failed_write_of_an_interrupted_run_changes_nothing(wall, zones, threads, tmp_path):
+    """The state is that of the step, and not the result, whose weights would otherwise count as the best ones."""
+    threads(1)
+    settings = replace(PRODUCT, zones=zones, num_validations=2)
+
+    def refuse(field, provenance):
+        raise NergError("the disk is full.")
+
+    path = tmp_path / "a.run"
+    with pytest.raises(NergError, match="--resume"):
+        train(wall, settings, SMALL, path=path, interval=1e9, on_progress=stopping("fit", 5), write=refuse)
+    field, provenance = train(wall, settings, SMALL, path=path, resume=True)
+    expected, full = train(wall, settings, SMALL)
+    assert provenance.get("validation") == full.get("validation") and provenance["steps"] == full["steps"]
+    for name, value in field.parameters().items():
+        np.testing.assert_array_equal(np.array(value), np.array(expected.parameters()[name]), err_msg=name)
+
+
 # ---- Averaged weights ----
 
 
