@@ -217,8 +217,9 @@ def parse_json(
 ) -> object:
     """Parse the JSON text ``raw`` of the file ``path``.
 
-    Raises `NergError` for invalid JSON, for text of more than ``max_bytes``, nested deeper than `MAX_JSON_DEPTH`, or
-    with more than `MAX_JSON_VALUES` values. Integers of more than 300 digits become floats.
+    Raises `NergError` for invalid JSON, for an object with a key twice, for text of more than ``max_bytes``, nested
+    deeper than `MAX_JSON_DEPTH`, or with more than `MAX_JSON_VALUES` values. Integers of more than 300 digits
+    become floats.
     """
     if len(raw) > max_bytes:
         raise NergError(
@@ -231,11 +232,21 @@ def parse_json(
             raw = raw.decode(json.detect_encoding(raw))
         _check_json(raw, path, file_kind)
         try:
-            return json.loads(raw, parse_int=_parse_integer)
+            return json.loads(raw, parse_int=_parse_integer, object_pairs_hook=_make_object)
         except json.JSONDecodeError as error:
             raise NergError(
                 f'the {file_kind} "{path}" is not valid JSON: {sanitize(error)}; correct it, or create it again'
             ) from error
+
+
+def _make_object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Make an object. Of a key that occurs twice, Python would silently use the last value."""
+    values = dict(pairs)
+    if len(values) < len(pairs):
+        names = [name for name, _ in pairs]
+        repeated = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f'it has the key "{sanitize(repeated, 40)}" twice in one object')
+    return values
 
 
 def _parse_integer(digits: str) -> int | float:

@@ -9,6 +9,7 @@ import io
 import json
 import math
 import os
+import re
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,6 +33,8 @@ Quaternion = tuple[float, float, float, float]  # x, y, z, w
 NON_BOX_KEYS = ("mesh", "shape", "parts", "adt")  # an area with one of these keys is not a box
 _MAX_NAME_LENGTH = 80
 _EXAMPLE = '{"shelf": [[0, 0, 0], [1, 2, 3]]}'
+_GEOMETRY_KEY = re.compile("rot(ation|ate)?|orientation|quat(ernion)?|angle|yaw|heading|transform|matrix|scale", re.I)
+"""Keys of other programs for what ``turn``, ``min`` and ``max`` state; further keys of any other name are allowed."""
 
 
 @dataclass(frozen=True)
@@ -214,6 +217,13 @@ def parse_box(entry: AreaEntry) -> Region:
     name, definition, location = entry.name, entry.definition, entry.location
     corners: Any = (definition.get("min"), definition.get("max")) if isinstance(definition, dict) else definition
     rotation: Any = definition.get("turn") if isinstance(definition, dict) else None
+    keys = definition if isinstance(definition, dict) else ()
+    unread = next((key for key in keys if _GEOMETRY_KEY.fullmatch(key)), None)
+    if unread is not None:
+        raise NergError(
+            f'{location} has the key "{unread}", which is not read; a box has "min", "max" and "turn" (degrees about '
+            "z, or a quaternion x, y, z, w)"
+        )
     try:
         lower, upper = (list(corner) for corner in corners)
         numbers = [

@@ -378,6 +378,15 @@ def _check_count(path: Path, count: int, limit: int, records: str) -> None:
         raise NergError(f'"{path}" has {count:,} {records}, the limit is {limit:,}; use a smaller model')
 
 
+def _add_camera(cameras: dict[int, _Camera], number: int, camera: _Camera, path: Path) -> None:
+    """Add a camera. Raises `NergError` if there is another one with its number, as in two models that were joined."""
+    if cameras.setdefault(number, camera) != camera:
+        raise NergError(
+            f'"{path}" has two cameras with the number {number} and different lenses; join models with '
+            '"colmap model_merger", which renumbers them'
+        )
+
+
 def _read_cameras_bin(path: Path) -> dict[int, _Camera]:
     out = {}
     with _open_model_file(path) as file:
@@ -391,7 +400,8 @@ def _read_cameras_bin(path: Path) -> dict[int, _Camera]:
                     'read; convert it with "colmap model_converter --output_type TXT"'
                 )
             name, count = _MODELS[model]
-            out[number] = _Camera(name, width, height, r.read_values(f"{count}d", f"camera record {k + 1}"))
+            parameters = r.read_values(f"{count}d", f"camera record {k + 1}")
+            _add_camera(out, number, _Camera(name, width, height, parameters), path)
         r.check_end(len(out))
     return out
 
@@ -477,9 +487,11 @@ def _read_cameras_txt(path: Path) -> dict[int, _Camera]:
     out = {}
     for number, words in _iter_rows(path, MAX_IMAGES, "cameras"):
         try:
-            out[int(words[0])] = _Camera(words[1], int(words[2]), int(words[3]), tuple(map(float, words[4:])))
+            index = int(words[0])
+            camera = _Camera(words[1], int(words[2]), int(words[3]), tuple(map(float, words[4:])))
         except (ValueError, IndexError) as e:
             raise NergError(f'line {number} of "{path}" is not "CAMERA_ID MODEL WIDTH HEIGHT PARAMETERS"') from e
+        _add_camera(out, index, camera, path)
     return out
 
 

@@ -114,8 +114,8 @@ def test_mapped_files_need_magic(tmp_path):
 
 def test_json_equals_json_module(tmp_path):
     path = tmp_path / "a.json"
-    path.write_bytes('{"a": [1, 2.5, "é"], "a": 3}'.encode("utf-16"))
-    assert read_json(path) == {"a": 3}
+    path.write_bytes('{"a": [1, 2.5, "é"], "b": 3}'.encode("utf-16"))
+    assert read_json(path) == {"a": [1, 2.5, "é"], "b": 3}
     deep = "[" * 60 + "]" * 60
     assert parse_json(
         '{"brackets": "' + "[" * 500 + '", "escaped": "\\"' + "{" * 500 + '", "deep": ' + deep + "}", path
@@ -146,6 +146,12 @@ def test_invalid_json_error_names_file(tmp_path, raw):
 
 def test_text_of_files_is_sanitized():
     assert sanitize("a\x1b[2J\nb") == "a?[2J?b" and sanitize("x" * 400) == "x" * 300 + "..."
+
+
+def test_json_with_a_repeated_key_is_refused():
+    with pytest.raises(NergError, match='"shelf"'):
+        parse_json('{"regions": {"shelf": 1, "wall": 2, "shelf": 3}}', "a.json")
+    assert parse_json('[{"a": 1}, {"a": {"a": 2}}]', "a.json") == [{"a": 1}, {"a": {"a": 2}}]
 
 
 def test_json_limits_are_inclusive(tmp_path, monkeypatch):

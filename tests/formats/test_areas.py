@@ -52,6 +52,13 @@ def test03_nested_groups_are_resolved_once():
 BOX = {"name": "shelf", "min": [0, 0, 0], "max": [1, 2, 3]}
 
 
+@pytest.mark.parametrize("key", ["rotation", "Orientation", "yaw", "quat"])
+def test_a_rotation_under_another_name_is_refused(tmp_path, key):
+    with pytest.raises(NergError, match=f'"{key}".*"turn"'):
+        read_areas(write_areas(tmp_path, {**BOX, key: 30}))
+    assert read_areas(write_areas(tmp_path, {**BOX, "category": "sweets"})).names == ("shelf",)
+
+
 def write_areas(tmp_path, *entries, name="a.json"):
     path = tmp_path / name
     path.write_text(json.dumps({"regions": entries}))

@@ -171,6 +171,23 @@ def test_unsupported_camera_model_excludes_its_images(model):
     assert "image_undistorter" in posed.unused[0].reason
 
 
+@pytest.mark.parametrize("focal", [50.0, 90.0])
+def test_two_cameras_with_one_number_are_refused_unless_equal(model, focal):
+    if (model / "cameras.txt").exists():
+        with open(model / "cameras.txt", "a") as file:
+            file.write(f"1 SIMPLE_PINHOLE 40 30 {focal} 20.5 14.5\n")
+    else:
+        raw = (model / "cameras.bin").read_bytes()
+        record = struct.pack("<iiQQ3d", 1, 0, 40, 30, focal, 20.5, 14.5)
+        (model / "cameras.bin").write_bytes(struct.pack("<Q", len(CAMERAS) + 1) + raw[8:] + record)
+    read = lambda: read_colmap(model, model.parents[1] / "images")
+    if focal == 50:
+        assert len(read().frames) == 9
+    else:
+        with pytest.raises(NergError, match="number 1 .*model_merger"):
+            read()
+
+
 def test_missing_images_and_masks_are_listed(model):
     images, masks = model.parents[1] / "images", model.parents[1] / "masks"
     (images / NAMES[0]).unlink()
