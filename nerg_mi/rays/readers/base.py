@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 import types
 import typing
 from collections import Counter
@@ -14,14 +15,14 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, sanitize
 from nerg_mi.files.atomic import file_sha256
 from nerg_mi.files.safe_read import BadLineCallback, check_regular_file
 from nerg_mi.maths.coordinates import check_near_origin
 from nerg_mi.ranges import FLAG, MAX_COORDINATE, RANGE, TIME_UNITS, Range, ValidatedDataclass
 from nerg_mi.rays.rays import COLUMNS, FRAME, Rays
 
-from .columns import ColumnFinder, may_be_validity_column
+from .columns import ColumnFinder, may_be_validity_column, parse_time_unit
 from .poses import FilledOriginFinder, find_fill_values, is_aimed
 from .tables import TableBlock, iterate_table, read_table_columns
 
@@ -185,6 +186,13 @@ class RaysBuilder:
         used = {*numbers, *texts, *also_used}
         available = read_table_columns(path) if header is None else header
         self.add_unused_columns(name for name in available if name and name not in used)
+        for name, tick in (clocks or {}).items():
+            unit = parse_time_unit(name)
+            if unit is not None and not math.isclose(unit, tick):
+                self.add_warning(
+                    f"{sanitize(name, 40)!r} is in units of {unit:g} s by its name, but was read in units of {tick:g} "
+                    f"s: set --tick {unit:g}, unless the name is wrong"
+                )
         settings = {"first_line": first_line, "separator": separator, "clocks": clocks, "on_note": self.add_metadata}
         return iterate_table(path, numbers, texts, header, self.on_bad_line, **settings)
 

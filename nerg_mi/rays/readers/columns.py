@@ -63,9 +63,18 @@ class ColumnFinder:
         )
         return next((column_by_name[n] for n in names if n in column_by_name), None)
 
+    def find_time(self, *names: str) -> str | None:
+        """As `find`, also with a unit at the end of the name: ``timestamp_ms``, ``timeNs``."""
+        by_stem = {
+            words.rpartition("_")[0]: column
+            for words, column in self._by_words.items()
+            if words.rpartition("_")[2] in _TIME_UNITS
+        }
+        return self.find(*names) or next((by_stem[name] for name in names if name in by_stem), None)
+
     def require_time(self, *names: str) -> str:
-        """As `find`, but raises `NergError` instead of returning None."""
-        column = self.find(*names)
+        """As `find_time`, but raises `NergError` instead of returning None."""
+        column = self.find_time(*names)
         if column is None:
             raise NergError(f"{self.path} has no column of time; name its columns with --map")
         return column
@@ -459,6 +468,16 @@ def parse_time_unit(column: str) -> float | None:
     bracket = re.search(r"[(\[]([^)\]]{1,12})[)\]]", column)
     last = split_column_name(column).split("_")[-1]
     return _TIME_UNITS.get(bracket[1].strip().lower() if bracket else last)
+
+
+_LENGTH_UNITS = {"mm": "mm", "millimeters": "mm", "millimetres": "mm", "cm": "cm", "centimeters": "cm"}
+_LENGTH_UNITS |= {"centimetres": "cm", "m": "m", "meters": "m", "metres": "m"}
+
+
+def parse_length_unit(column: str) -> str | None:
+    """The unit of length in the name of a column: m, cm or mm; None if there is none."""
+    bracket = re.search(r"[(\[]([^)\]]{1,12})[)\]]", column)
+    return _LENGTH_UNITS.get(bracket[1].strip().lower() if bracket else split_column_name(column).split("_")[-1])
 
 
 def are_degrees(columns: Sequence[str]) -> bool | None:

@@ -9,12 +9,21 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, sanitize
 from nerg_mi.ranges import Range, ValidatedDataclass
 
 from . import poses
 from .base import RECORDINGS, RaysBuilder, Signature, TrackingFrame, option, tick_option, valid_option
-from .columns import PERSON_NAMES, ColumnFinder, ColumnMap, is_counter, mark_valid, parse_valid, require_valid_values
+from .columns import (
+    PERSON_NAMES,
+    ColumnFinder,
+    ColumnMap,
+    is_counter,
+    mark_valid,
+    parse_length_unit,
+    parse_valid,
+    require_valid_values,
+)
 from .tables import TableBlock, iterate_table
 
 
@@ -96,6 +105,7 @@ class Table:
         add_tables(files, options, builder)
 
 
+_MIN_ANGLES = 20  # rows needed to judge the unit of angles
 _MAX_VALUES = 1000  # maximum number of different values of a column of validity
 
 TABLE = Table()
@@ -121,8 +131,26 @@ def add_tables(
         builder.add_metadata(forward=options.forward_axis)
     if rows.columns.ypr or rows.columns.angles:
         builder.add_metadata(degrees=not options.radians)
+    if rows.columns.t is None and options.tick == 1.0:
+        builder.add_warning(
+            "no column is the time, so rows are one second apart: name it (--map t=), or set the sampling interval "
+            "(--tick)"
+        )
+    _check_units(rows.columns, options, builder)
     for path in files:
         rows.add(path, builder)
+    rows.check_angles(builder)
+
+
+def _check_units(columns: ColumnMap, options: TableOptions, builder: RaysBuilder) -> None:
+    """Warn about columns whose names state another unit than that in which they are read."""
+    lengths = [name for role in ("origin", "hit", "eye", "eyes") for name in getattr(columns, role) or ()]
+    named = next((name for name in lengths if parse_length_unit(name) not in (None, options.units)), None)
+    if named is not None:
+        builder.add_warning(
+            f"{sanitize(named, 40)!r} is in {parse_length_unit(named)} by its name, but was read in {options.units}: "
+            f"set --units {parse_length_unit(named)} (with --map), unless the name is wrong"
+        )
 
 
 def _count_values(files: Sequence[Path], column: str) -> Counter[str]:
@@ -168,6 +196,7 @@ class MappedRows:
         self.numbers = [name for v in vectors for name in v]
         self.numbers += [*self.pose_columns, *self.angle_columns, *(c for c in (columns.t, columns.confidence) if c)]
         self.texts = [c for c in (self.person, columns.cohort, *valid) if c]
+        self._num_angles, self._max_angle = 0, 0.0
 
     def add(self, path: Path, builder: RaysBuilder) -> None:
         """Add the rows of ``path``."""
@@ -177,6 +206,18 @@ class MappedRows:
         for block in builder.read_table(path, self.numbers, self.texts, clocks=clocks):
             self._add_block(path, block, first_row, builder)
             first_row += len(block.lines)
+
+    def check_angles(self, builder: RaysBuilder) -> None:
+        """Warn if all angles that were read as degrees are so small that they are probably radians."""
+        # Heads turn around; gaze in the head's frame exceeds two degrees.
+        limit = 2 * np.pi if self.columns.pose == "ypr" else np.pi / 2
+        if self.options.radians or self._num_angles < _MIN_ANGLES or not 0 < self._max_angle <= limit:
+            return
+        names = ", ".join(sanitize(name, 40) for name in (*self.pose_columns, *self.angle_columns))
+        builder.add_warning(
+            f"{names} were read as degrees, but none exceeds {self._max_angle:.3g}: are they radians (--map with "
+            "--radians), or a quaternion without its w?"
+        )
 
     def _add_block(self, path: Path, block: TableBlock, first_row: int, builder: RaysBuilder) -> None:
         """Add the rows of ``block``, the first of which is row ``first_row`` of the file."""
@@ -188,6 +229,9 @@ class MappedRows:
         t = value[columns.t] if columns.t else np.arange(first_row, first_row + n, dtype=np.float64)
         confidence = value[columns.confidence] if columns.confidence else np.ones(n)
         origin, direction, head = self._compute_geometry(vector)
+        if angles := self.angle_columns or self.pose_columns * (columns.pose == "ypr"):
+            self._num_angles += n
+            self._max_angle = max(self._max_angle, float(np.nanmax(np.abs(vector(angles)), initial=0.0)))
         drop = self._find_unusable_poses(path, block, vector)
         is_uncertain = confidence < options.min_confidence
         drop |= {f"confidence below {options.min_confidence:g} (option --min-confidence)": is_uncertain}

@@ -69,7 +69,7 @@ class UnityReader(FixedFrameReader):
         return ColumnMap(
             **self._find_columns(table),
             hit=table.find_vector(*names.HIT_NAMES),
-            t=table.find(*names.TIME_NAMES),
+            t=table.find_time(*names.TIME_NAMES),
             person=person,
             confidence=table.find("confidence"),
         )

@@ -235,6 +235,19 @@ def test_unity(tmp_path, stem):
     assert list(dropped(rays).values()) == [[[3, 3]]] and rays.metadata["preset"] == "unity"
 
 
+@pytest.mark.parametrize(
+    ("name", "tick"), [("timestamp_ms", 1e-3), ("timeNs", 1e-9), ("Time (s)", 1.0), ("frame", 1.0)]
+)
+def test_times_with_a_unit_in_their_name_are_found(tmp_path, name, tick):
+    head = [name, *xyz("gaze_origin_"), *xyz("gaze_dir_")]
+    (tmp_path / "p.csv").write_text(csv(head, [[5 + 20 * k, 1, 1.6, 3, 0, 0, 1] for k in range(3)]))
+    rays = read("unity", tmp_path / "p.csv", tick=tick)
+    assert np.allclose(rays.t, np.arange(3) if name == "frame" else tick * np.array([5, 25, 45]))
+    assert ["no column is the time" in text for text in rays.metadata.get("complaints", [])] == [True] * (
+        name == "frame"
+    )
+
+
 def test_unity_local_and_head(tmp_path):
     path, q = tmp_path / "log.csv", RIGHT_DOWN.as_quat()
     head = ["time", "user_id", *xyz("head_pos_"), *xyz("head_rot_", "xyzw"), *xyz("gaze_origin_"), *xyz("gaze_dir_")]

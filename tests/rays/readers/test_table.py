@@ -299,12 +299,46 @@ def test_columns_of_validity_of_a_map(tmp_path):
     path = tmp_path / "t.csv"
     path.write_text("x,y,z,a,b,c,isValid\n" + "".join(f"{k},0,1.6,1,0,0,{k % 2}\n" for k in range(10)))
     columns = "origin=x,y,z direction=a,b,c"
-    rays = read_table(path, columns)
+    rays = read_table(path, columns, tick=0.1)
     assert len(rays) == 10 and "'isValid' may mark valid rows by their names" in rays.metadata["complaints"][0]
-    rays = read_table(path, columns, valid="isValid=1")
+    rays = read_table(path, columns, tick=0.1, valid="isValid=1")
     assert len(rays) == 5 and "complaints" not in rays.metadata and "unused_columns" not in rays.metadata
     with pytest.raises(NergError, match="has no column other"):
         read_table(path, columns, valid="other=1")
+
+
+@pytest.mark.parametrize("time", ["time [ms]", "stamp_ms", "tNs", "seconds", None])
+def test_times_that_the_names_contradict_are_reported(tmp_path, time):
+    path, unit = (
+        tmp_path / "t.csv",
+        {"time [ms]": 1e-3, "stamp_ms": 1e-3, "tNs": 1e-9, "seconds": 1.0, None: None}[time],
+    )
+    path.write_text(f"x,y,z,a,b,c,{time}\n0,0,0,1,0,0,0\n0,0,0,1,0,0,20\n")
+    columns = "origin=x,y,z direction=a,b,c" + (f' "t={time}"' if time else "")
+    said = read_table(path, columns).metadata.get("complaints", [])
+    assert len(said) == (unit != 1.0) and all("--tick" in text for text in said)
+    assert "complaints" not in read_table(path, columns, tick=unit or 0.02).metadata
+
+
+@pytest.mark.parametrize(("suffix", "units"), [(" [mm]", "mm"), ("_cm", "cm"), ("(m)", "m"), ("", "m")])
+def test_lengths_that_the_names_contradict_are_reported(tmp_path, suffix, units):
+    path = tmp_path / "t.csv"
+    path.write_text(",".join([*(f"p{a}{suffix}" for a in "xyz"), "a,b,c,t\n0,0,0,1,0,0,0\n"]))
+    columns = " ".join([f'"origin={",".join(f"p{a}{suffix}" for a in "xyz")}"', "direction=a,b,c t=t"])
+    said = read_table(path, columns).metadata.get("complaints", [])
+    assert len(said) == (units != "m") and all(f"--units {units}" in text for text in said)
+    assert "complaints" not in read_table(path, columns, units=units).metadata
+
+
+@pytest.mark.parametrize("role", ["ypr=a,b,c", "azel=a,b", "yawpitch=a,b"])
+def test_radians_that_are_read_as_degrees_are_reported(tmp_path, role):
+    def said(scale, **options):
+        rows = "".join(f"0,0,1.6,{scale * k / 24},{-scale * k / 48},0,{k}\n" for k in range(24))
+        (tmp_path / "t.csv").write_text("x,y,z,a,b,c,t\n" + rows)
+        return read_table(tmp_path / "t.csv", f"origin=x,y,z {role} t=t", **options).metadata.get("complaints", [])
+
+    assert ["--radians" in text for text in said(1.5)] == [True]
+    assert not said(1.5, radians=True) and not said(85.0) and not said(0.0)
 
 
 @pytest.mark.parametrize("tick", [1.0, 1e-3])
