@@ -12,6 +12,7 @@ from nerg_mi.files.safe_read import resolve_path
 from nerg_mi.maths.geometry import AnyBox, Box, ContractedBox, intersect_box_numpy
 
 from . import cameras
+from .background import remove_background
 from .cameras import PosedCamera, pixel_directions, project
 from .colmap import UpEstimate
 from .images import PhotoView, estimate_photo_up, load_usable_views, read_split
@@ -424,8 +425,10 @@ def open_dataset(
             f'none of the {len(unusable)} training frames of "{split.posed.path}" can be used; the first, '
             f'"{unusable[0].name}": {unusable[0].reason}'
         )
-    _check_depth(split.posed, train)
     held_out, unusable_held_out = load_usable_views(split.held_out, width, downscale, depth)
+    views, background = remove_background([*train, *held_out])
+    train, held_out = views[: len(train)], views[len(train) :]
+    _check_depth(split.posed, train)
     masks = _describe_masks([*train, *held_out])
     extent = _choose_extent(split.posed, train, aabb, unbounded)
     unmatched = find_unmatched([v.camera for v in train], extent.box) if len(train) > 1 else []
@@ -463,7 +466,7 @@ def open_dataset(
         extent.source,
         unused,
         source,
-        [*split.posed.notes, *masks],
+        [*split.posed.notes, *masks, *([] if background is None else [str(background)])],
         unit,
         kind,
         _describe_up(up),

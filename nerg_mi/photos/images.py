@@ -178,8 +178,14 @@ def _select_color_layer(bitmap, path):
     )
 
 
+_MAX_HALF = float(np.finfo(np.float16).max)
+
+
 def read_depth(source: DepthFile) -> np.ndarray:
-    """Read depth (h, w) from ``.npy``, ``.exr`` or 16-bit ``.png`` in scene units, float32; 0 is unknown."""
+    """Read depth (h, w) from ``.npy``, ``.exr`` or 16-bit ``.png`` in scene units, float32; 0 is unknown.
+
+    The largest number of an integer type, and of half precision, is no depth: programs write it for the background.
+    """
     path, suffix = source.path, source.path.suffix.lower()
     if suffix == ".npy":
         out = read_npy(path, "depth file")
@@ -197,9 +203,10 @@ def read_depth(source: DepthFile) -> np.ndarray:
         raise NergError(f'the depth file "{path}" must contain one number per pixel, got shape {out.shape}')
     if np.iscomplexobj(out):
         raise NergError(f'the depth file "{path}" contains complex numbers; save it as float32')
+    largest = np.iinfo(out.dtype).max if np.issubdtype(out.dtype, np.integer) else _MAX_HALF
     with np.errstate(over="ignore", invalid="ignore"):  # values beyond float32 are unknown depth
-        out = out.astype(np.float32)
-    return np.where(np.isfinite(out) & (out > 0), out * np.float32(source.unit), 0).astype(np.float32)
+        scaled = out.astype(np.float32) * np.float32(source.unit)
+        return np.where(np.isfinite(scaled) & (out > 0) & (out != largest), scaled, 0).astype(np.float32)
 
 
 def read_mask(source: MaskFile, shape: tuple[int, int]) -> np.ndarray:
@@ -400,7 +407,9 @@ def _load_distances(file: DepthFile, shape: tuple[int, int], intrinsics) -> np.n
     out = resize_nearest(out, intrinsics.width, intrinsics.height)
     if file.along_axis:
         ahead = -pixel_directions(intrinsics)[..., 2]
-        out = np.where(ahead > 1e-3, out / np.maximum(ahead, 1e-3), 0).astype(np.float32)
+        with np.errstate(over="ignore"):
+            out = np.where(ahead > 1e-3, out / np.maximum(ahead, 1e-3), 0).astype(np.float32)
+        out[~np.isfinite(out)] = 0
     return np.ascontiguousarray(out)
 
 
