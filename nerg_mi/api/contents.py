@@ -22,8 +22,9 @@ from nerg_mi.formats.meshes import MeshFile, read_mesh_file, with_shading_normal
 from nerg_mi.formats.splats import choose_plugin, write_ply_splats
 from nerg_mi.formats.surfaces import write_volume
 from nerg_mi.maths.color import decode_srgb
+from nerg_mi.properties import resolve_scene_file
 from nerg_mi.registration import PLUGINS, get_plugin_class
-from nerg_mi.rendering.files import write_mesh
+from nerg_mi.rendering.files import check_mesh, write_mesh
 from nerg_mi.rendering.scene_writer import (
     Element,
     Node,
@@ -363,6 +364,13 @@ def load_content(content: Mapping[str, Any]) -> Any:
 
 
 def _load_values(content: Mapping[str, Any]) -> dict[str, Any]:
+    kind, name = content.get("type"), content.get("filename")
+    if kind in ("obj", "ply") and isinstance(name, (str, os.PathLike)):
+        file = resolve_scene_file(str(name))
+        # Mitsuba reports missing files.
+        if os.path.exists(file):
+            check_mesh(file, kind)
+
     def load(name: str, value: Any) -> Any:
         if isinstance(value, MeshFile):
             return load_mesh(value, name)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import codecs
+import dis
 import gzip
 import io
 import json
@@ -91,27 +92,60 @@ def translate_read_errors(
         raise MissingFile(f'there is no {file_kind} "{path}"; correct its name') from error
     except (*_DAMAGE_ERRORS, *extra_errors) as error:
         raise NergError(
-            f'the {file_kind} "{path}" cannot be read: {_describe_error(error)}; {_choose_remedy(error, remedy)}'
+            f'the {file_kind} "{path}" cannot be read: {describe_error(error)}; {_choose_remedy(error, remedy)}'
         ) from error
     except Exception as error:
         # Compared by name, so that safetensors is not imported here.
         if type(error).__name__ != "SafetensorError":
             raise
-        raise NergError(f'the {file_kind} "{path}" cannot be read: {_describe_error(error)}; {remedy}') from error
+        raise NergError(f'the {file_kind} "{path}" cannot be read: {describe_error(error)}; {remedy}') from error
 
 
-def _describe_error(error: BaseException) -> str:
+_NOT_A_NUMBER = re.compile(
+    r"could not convert string to float: (.*)|invalid literal for int\(\) with base \d+: (.*)", re.S
+)
+
+
+def describe_error(error: BaseException) -> str:
+    """Return what is wrong with a file whose reading raised ``error``; no message of Python itself, such as "list index
+    out of range", which does not name a cause.
+    """
     if isinstance(error, MemoryError):
         return "it needs more memory than is available"
     if isinstance(error, RecursionError):
         return "it is nested too deeply"
-    if isinstance(error, EOFError):
+    if isinstance(error, (EOFError, struct.error)):
         return "it is truncated"
-    if isinstance(error, KeyError):
-        return f"it lacks {sanitize(error)}"
+    if isinstance(error, zlib.error):
+        return "its compressed data are damaged"
+    if isinstance(error, UnicodeDecodeError):
+        return "it is not UTF-8 text"
     if isinstance(error, OSError) and error.strerror:
         return error.strerror[:1].lower() + error.strerror[1:]
+    if type(error) in (KeyError, IndexError, TypeError, AttributeError, OverflowError, ValueError):
+        if not _has_raise_statement(error):
+            match = _NOT_A_NUMBER.match(str(error))
+            if match:
+                return f"it has {sanitize(match[1] or match[2], 60)} in place of a number"
+            if isinstance(error, KeyError):
+                return f'it lacks "{sanitize(error.args[0], 60)}"'
+            if isinstance(error, OverflowError):
+                return "a number is too large"
+            return "a value is missing, or has another type or size than its format requires"
+        if isinstance(error, KeyError):
+            return sanitize(error.args[0]).rstrip(".")
     return sanitize(format_error(error)).rstrip(".")
+
+
+def _has_raise_statement(error: BaseException) -> bool:
+    """Return whether a statement ``raise`` of Python code, and not compiled code, raised ``error``."""
+    trace = error.__traceback__
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    if trace is None:
+        return True
+    code = trace.tb_frame.f_code.co_code
+    return trace.tb_lasti < len(code) and code[trace.tb_lasti] == dis.opmap["RAISE_VARARGS"]
 
 
 def _choose_remedy(error: BaseException, remedy: str) -> str:
@@ -194,14 +228,43 @@ def read_bytes(path: str | os.PathLike, file_kind: str, max_bytes: int) -> bytes
         return file.read()
 
 
+def read_text(path: str | os.PathLike, file_kind: str, max_bytes: int) -> str:
+    """Read the UTF-8 file ``path`` without its byte order mark, if it has one; see `read_bytes`."""
+    raw = read_bytes(path, file_kind, max_bytes)
+    with translate_read_errors(path, file_kind, "save it as UTF-8"):
+        return raw[measure_byte_order_mark(raw[:4], path, file_kind) :].decode()
+
+
+# The four bytes of UTF-32 begin like UTF-16.
+_OTHER_MARKS = {
+    codecs.BOM_UTF32_LE: "UTF-32",
+    codecs.BOM_UTF32_BE: "UTF-32",
+    codecs.BOM_UTF16_LE: "UTF-16",
+    codecs.BOM_UTF16_BE: "UTF-16",
+}
+
+
+def measure_byte_order_mark(head: bytes, path: str | os.PathLike, file_kind: str) -> int:
+    """Return the number of bytes to skip at the ``head`` of a text file: 3 for the byte order mark of UTF-8, else 0.
+
+    Raises `NergError` for the marks of UTF-16 and UTF-32.
+    """
+    encoding = next((name for mark, name in _OTHER_MARKS.items() if head.startswith(mark)), None)
+    if encoding:
+        raise NergError(f'the {file_kind} "{path}" is {encoding} text; save it as UTF-8')
+    return len(codecs.BOM_UTF8) if head.startswith(codecs.BOM_UTF8) else 0
+
+
 def map_bytes(
     path: str | os.PathLike, file_kind: str, max_bytes: int, magic: bytes, remedy: str = _REMEDY
 ) -> memoryview:
     """Map the regular file ``path``, of at most ``max_bytes``, into memory, so that only accessed parts are read.
 
-    Raises `NergError` for a file that does not begin with ``magic``; see `open_file`.
+    Raises `NergError` for a file that does not begin with ``magic``, after a byte order mark of UTF-8 that some editors
+    insert; see `open_file`.
     """
     with open_file(path, file_kind, remedy, max_bytes) as file:
+        file.seek(measure_byte_order_mark(file.read(4), path, file_kind))
         if file.read(len(magic)) != magic:
             raise ValueError(f'it does not begin with "{sanitize(magic.decode("latin-1"))}"')
         return memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
@@ -504,8 +567,8 @@ BadLineCallback = Callable[[int, str], None]
 
 
 def read_line_blocks(path: str | os.PathLike, file_kind: str, max_lines: int) -> Generator[list[str], None, None]:
-    """Read the lines of a UTF-8 file, with their line ends, in blocks. A file whose name ends in ``.gz`` is
-    decompressed.
+    """Read the lines of a UTF-8 file, with their line ends and without a byte order mark, in blocks. A file whose name
+    ends in ``.gz`` is decompressed.
 
     Parameters
     ----------
@@ -523,10 +586,12 @@ def read_line_blocks(path: str | os.PathLike, file_kind: str, max_lines: int) ->
     """
     decoder, remainder, pending, count, characters = codecs.getincrementaldecoder("utf-8")(), "", [], 0, 0
     with _open_plain_or_gzip(path, file_kind) as source:
-        is_at_end = False
+        is_at_start, is_at_end = True, False
         while not is_at_end:
             with translate_read_errors(path, file_kind):
                 data = source.read(_LINE_BLOCKS_CHUNK)
+            if is_at_start:
+                data, is_at_start = data[measure_byte_order_mark(data[:4], path, file_kind) :], False
             is_at_end = not data
             try:
                 text = remainder + decoder.decode(data, final=is_at_end)

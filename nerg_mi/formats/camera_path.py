@@ -6,15 +6,25 @@ import json
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, sanitize
 from nerg_mi.files.atomic import write_text
-from nerg_mi.files.safe_read import MAX_JSON_BYTES, read_bytes, translate_read_errors
+from nerg_mi.files.safe_read import read_json, translate_read_errors
+from nerg_mi.files.schema import NUMBER, Items, Number, check_json
 
 MAX_FRAMES = 100_000
 """Maximum number of frames of a path."""
+
+_POSITIVE, _PIXELS = Number(1e-6, 1e6), Number(1, 1 << 20)
+_PATH = {
+    "camera_path": Items({"camera_to_world": Items(NUMBER, 16, 16), "fov": Number(1e-6, 179.999)}, 1, MAX_FRAMES),
+    "render_width": _PIXELS,
+    "render_height": _PIXELS,
+    "fps?": _POSITIVE,
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,30 +61,22 @@ def read_camera_path(path: str | os.PathLike) -> CameraPath:
 
     Raises `NergError` for another file, for cameras that are not perspective, and for poses that are not rotations.
     """
-    raw = read_bytes(path, "camera path", MAX_JSON_BYTES)
-    with translate_read_errors(
-        path, "camera path", "save it again", extra_errors=(KeyError, TypeError, AttributeError)
-    ):
-        data = json.loads(raw)
-        kind = data.get("camera_type", "perspective")
+    data: Any = read_json(path, "camera path")
+    with translate_read_errors(path, "camera path", "save it again"):
+        kind = check_json(data, {}).get("camera_type", "perspective")
         if kind != "perspective":
-            raise NergError(f'the cameras of "{path}" are of type "{kind}"; save a path of perspective cameras')
-        frames = data["camera_path"]
-        if not 0 < len(frames) <= MAX_FRAMES:
-            raise ValueError(f"it has {len(frames)} frames; a path has 1 to {MAX_FRAMES:,}")
+            raise NergError(
+                f'the cameras of "{path}" are of type "{sanitize(kind, 40)}"; save a path of perspective cameras'
+            )
+        frames = check_json(data, _PATH)["camera_path"]
         to_world = np.array([frame["camera_to_world"] for frame in frames], np.float64).reshape(-1, 4, 4)
         fov = np.array([frame["fov"] for frame in frames], np.float64)
         rotation = to_world[:, :3, :3]
-        if not (
-            np.isfinite(to_world).all() and np.allclose(rotation @ rotation.transpose(0, 2, 1), np.eye(3), atol=1e-3)
-        ):
+        is_rotation = np.allclose(rotation @ rotation.transpose(0, 2, 1), np.eye(3), atol=1e-3)
+        if not (is_rotation and np.linalg.det(rotation).min() > 0 and np.allclose(to_world[:, 3], (0, 0, 0, 1))):
             raise ValueError("a camera_to_world is not a rotation and a translation")
-        if not ((fov > 0) & (fov < 180)).all():
-            raise ValueError("a fov is not between 0 and 180 degrees")
         width, height = int(data["render_width"]), int(data["render_height"])
         fps = float(data.get("fps", 24))
-        if min(width, height) < 1 or not 0 < fps < np.inf:
-            raise ValueError("its size or its number of frames per second is not positive")
     return CameraPath(to_world, fov, width, height, fps)
 
 

@@ -18,7 +18,8 @@ import numpy as np
 
 from nerg_mi.errors import sanitize
 from nerg_mi.fields.splats import quaternions_to_matrices
-from nerg_mi.files.safe_read import is_count, parse_json, translate_read_errors
+from nerg_mi.files.safe_read import parse_json, translate_read_errors
+from nerg_mi.files.schema import INDEX, NUMBER, Items, Names, check_json
 
 GLTF_MAGIC = b"glTF"  # first bytes of a file
 MAX_GLTF_BYTES = 1 << 30  # maximum size of a file in bytes
@@ -34,6 +35,39 @@ _QUANTIZATION, _INSTANCING = "KHR_mesh_quantization", "EXT_mesh_gpu_instancing"
 # Prefixes of extensions that change the appearance of triangles, but not their positions.
 _APPEARANCE_PREFIXES = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_", "EXT_lights_", "KHR_xmp")
 _TRIANGLES = 4
+_INDICES_LIST = Items(INDEX)
+_DOCUMENT = {
+    "scene?": INDEX,
+    "scenes?": Items({"nodes?": _INDICES_LIST}),
+    "nodes?": Items(
+        {
+            "children?": _INDICES_LIST,
+            "mesh?": INDEX,
+            "matrix?": Items(NUMBER, 16, 16),
+            "rotation?": Items(NUMBER, 4, 4),
+            "scale?": Items(NUMBER, 3, 3),
+            "translation?": Items(NUMBER, 3, 3),
+            "extensions?": dict,
+        }
+    ),
+    "meshes?": Items(
+        {"primitives": Items({"attributes": Names(INDEX), "indices?": INDEX, "mode?": INDEX, "extensions?": dict})}
+    ),
+    "accessors?": Items(
+        {
+            "bufferView?": INDEX,
+            "byteOffset?": INDEX,
+            "componentType": INDEX,
+            "normalized?": bool,
+            "count": INDEX,
+            "type": str,
+        }
+    ),
+    "bufferViews?": Items({"buffer?": INDEX, "byteOffset?": INDEX, "byteStride?": INDEX}),
+    "buffers?": Items(dict),
+    "extensionsUsed?": Items(str),
+    "extensionsRequired?": Items(str),
+}
 
 Attribute = tuple[str, np.ndarray, bool]
 """Name of a vertex attribute, its values (V,) or (V, components), and whether integers are normalised to 0..1."""
@@ -150,8 +184,7 @@ def parse_glb(raw: bytes | memoryview, path: str | os.PathLike) -> GltfTriangles
     Raises `NergError` for a file that is damaged, compressed, quantised without declaring it, or beyond the limits of
     this module, for required extensions that are not supported, and for a file without triangles.
     """
-    # A value of a wrong JSON type is an error of the file.
-    with translate_read_errors(path, "mesh", "export it again", extra_errors=(TypeError, AttributeError)):
+    with translate_read_errors(path, "mesh", "export it again"):
         document, data = read_glb_chunks(raw, path)
         _check_extensions(document)
         quantized = _QUANTIZATION in document.get("extensionsUsed", [])
@@ -213,7 +246,7 @@ def _read_vertex_colors(
 ) -> np.ndarray | None:
     if "COLOR_0" not in attributes:
         return None
-    shape = document["accessors"][_check_index(attributes["COLOR_0"])]["type"]
+    shape = _get(document, "accessors", attributes["COLOR_0"])["type"]
     if shape not in ("VEC3", "VEC4"):
         raise ValueError(f'its colours have the type "{sanitize(shape, 40)}"')
     colors = read_accessor(document, data, attributes["COLOR_0"], shape)[:, :3].astype(np.float64)
@@ -240,28 +273,36 @@ def read_glb_chunks(
         elif kind == _BINARY and not data:
             data = part
         offset += 8 + length
-    if not isinstance(document, dict):
+    if document is None:
         raise ValueError("it has no JSON document")
-    return document, data
+    return check_json(document, _DOCUMENT), data
+
+
+def _get(document: dict[str, Any], kind: str, index: int) -> dict[str, Any]:
+    """Return the entry that the document calls by its ``index``, such as an accessor."""
+    entries = document.get(kind, [])
+    if index >= len(entries):
+        raise ValueError(f"it refers to number {index:,} of {len(entries):,} {kind}, counted from 0")
+    return entries[index]
 
 
 def iter_instances(document: dict[str, Any], *modes: int) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
     """Iterate over the primitives of the scene with one of these ``modes``, each with the matrix (4, 4) of its node."""
-    nodes = document.get("nodes", [])
-    scenes = document.get("scenes")
-    roots = scenes[_check_index(document.get("scene", 0))]["nodes"] if scenes else range(len(nodes))
-    pending = [(_check_index(k), np.eye(4), 0) for k in roots]
+    roots = range(len(document.get("nodes", [])))
+    if document.get("scenes"):
+        roots = _get(document, "scenes", document.get("scene", 0)).get("nodes", [])
+    pending = [(k, np.eye(4), 0) for k in roots]
     visited = 0
     while pending:
         number, parent, depth = pending.pop()
         visited += 1
         if depth > MAX_NODE_DEPTH or visited > MAX_INSTANCES:
             raise ValueError("its nodes are nested too deeply, or form a cycle")
-        node = nodes[number]
+        node = _get(document, "nodes", number)
         to_scene = parent @ _read_node_matrix(node)
-        pending += [(_check_index(k), to_scene, depth + 1) for k in reversed(node.get("children", []))]
+        pending += [(k, to_scene, depth + 1) for k in reversed(node.get("children", []))]
         if "mesh" in node:
-            for primitive in document["meshes"][_check_index(node["mesh"])]["primitives"]:
+            for primitive in _get(document, "meshes", node["mesh"])["primitives"]:
                 if primitive.get("mode", _TRIANGLES) in modes:
                     yield primitive, to_scene
 
@@ -283,8 +324,8 @@ def _read_node_matrix(node: dict[str, Any]) -> np.ndarray:
 def _read_triangles(
     document: dict[str, Any],
     data: bytes | memoryview,
-    position: object,
-    indices: object,
+    position: int,
+    indices: int | None,
     mode: int,
     kinds: Mapping[int, str],
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -320,7 +361,7 @@ _TRIANGLE_INDEXERS = {_TRIANGLES: _index_triangles, 5: _index_strip, 6: _index_f
 
 
 def read_accessor(
-    document: dict[str, Any], data: bytes | memoryview, number: object, shape: str, kinds: Mapping[int, str] = _FLOATS
+    document: dict[str, Any], data: bytes | memoryview, number: int, shape: str, kinds: Mapping[int, str] = _FLOATS
 ) -> np.ndarray:
     """Read the values (N, components) of an accessor.
 
@@ -340,26 +381,20 @@ def read_accessor(
     ValueError
         For another type, and if the buffer is too short.
     """
-    accessor = document["accessors"][_check_index(number)]
+    accessor = _get(document, "accessors", number)
     is_normalized = bool(accessor.get("normalized")) and kinds is not _INDICES
     component_types = _NORMALIZED if is_normalized else kinds
     if accessor["type"] != shape or accessor["componentType"] not in component_types or "sparse" in accessor:
         raise ValueError("its positions or indices have an unsupported type; export it again without compression")
-    view = document["bufferViews"][_check_index(accessor["bufferView"])]
-    if _check_index(view.get("buffer", 0)) != 0 or "uri" in document["buffers"][0]:
+    view = _get(document, "bufferViews", accessor["bufferView"])
+    if view.get("buffer", 0) != 0 or "uri" in _get(document, "buffers", 0):
         raise ValueError("its triangles are in another file; export it as one .glb")
     dtype, width = np.dtype(component_types[accessor["componentType"]]), _WIDTHS[shape]
-    count, step = _check_index(accessor["count"]), _check_index(view.get("byteStride", 0)) or dtype.itemsize * width
-    start = _check_index(view.get("byteOffset", 0)) + _check_index(accessor.get("byteOffset", 0))
+    count, step = accessor["count"], view.get("byteStride", 0) or dtype.itemsize * width
+    start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
     if step < dtype.itemsize * width or (count and start + (count - 1) * step + dtype.itemsize * width > len(data)):
         raise ValueError("it is truncated: it has fewer values than it claims")
     if not count:
         return np.zeros((0, width), dtype)
     values = np.ndarray((count, width), dtype, data, start, (step, dtype.itemsize)).copy()
     return np.maximum(values / np.float32(np.iinfo(dtype).max), -1) if is_normalized else values
-
-
-def _check_index(value: object) -> int:
-    if not is_count(value):
-        raise ValueError("an index is not a whole number")
-    return int(value)  # pyright: ignore[reportArgumentType] is_count has looked

@@ -7,6 +7,7 @@ Mitsuba's readers support only triangles in PLY, and neither negative indices no
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,12 +16,12 @@ from typing import NamedTuple
 import numpy as np
 
 from nerg_mi.errors import NergError, sanitize
-from nerg_mi.files.safe_read import check_regular_file, map_bytes, translate_read_errors
+from nerg_mi.files.safe_read import check_regular_file, map_bytes, measure_byte_order_mark, translate_read_errors
 from nerg_mi.maths.color import decode_srgb
 from nerg_mi.maths.coordinates import check_near_origin
 
 from .gltf import GLTF_MAGIC, MAX_GLTF_BYTES, parse_glb
-from .ply import PLY_MAGIC, PlyTable, parse_numbers, parse_ply
+from .ply import BYTE_ORDER_MARK, MAC_LINE_ENDS, PLY_MAGIC, PlyTable, describe_cell, find_cell, parse_numbers, parse_ply
 
 MAX_BYTES = 64 << 30  # maximum size of a file in bytes
 MAX_TEXT_BYTES = 1 << 30  # maximum size of a text file in bytes
@@ -32,6 +33,11 @@ _CENTER, _NORMAL = ("x", "y", "z"), ("nx", "ny", "nz")
 _COLORS = (("red", "green", "blue", "alpha"), ("r", "g", "b", "a"), ("color_0", "color_1", "color_2", "color_3"))
 _FACE_INDEX_NAMES = ("vertex_index", "vertex_indices")
 _OBJ_STATEMENTS = {b"v", b"vn", b"f", b"g", b"o", b"s"}
+# The other statements of the format (Wavefront, appendix B1 of the Advanced Visualizer, and its older versions).
+_UNUSED_OBJ_STATEMENTS = set(
+    b"vt vp cstype deg bmat step p l curv curv2 surf parm trim hole scrv sp end con mg bevel c_interp d_interp lod "
+    b"usemtl mtllib shadow_obj trace_obj ctech stech usemap maplib call csh bsp bzp cdc cdp res".split()
+)
 _MAX_OBJ_LINE = 1000
 _CONCAVE_NOTE = (
     "{:,} of its faces are concave and were triangulated incorrectly: triangulate it in the program that made it"
@@ -307,6 +313,8 @@ def _read_ply(path: str | os.PathLike) -> MeshFile:
     unreadable = ""
     if num_polygons:
         unreadable = "it has faces with more than three corners"
+    elif ply.unusual_text:
+        unreadable = ply.unusual_text
     elif ply.has_trailing_data:
         unreadable = "it has data after its rows"
     elif "nx" in vertex.columns and normals is None:
@@ -343,14 +351,16 @@ class _ObjStatements:
         self.unused_statements: dict[bytes, None] = {}
         self.unreadable_reason = ""
 
-    def read(self, lines: list[bytes]) -> None:
-        """Parse complete lines without their line ends."""
+    def read(self, lines: list[bytes], numbers: Sequence[int]) -> None:
+        """Parse complete lines, whose line numbers are ``numbers``, without their line ends."""
         vertices: list[bytes] = []
+        # Cells that need to be numbers, but whose values are not used here.
+        other_cells: list[bytes] = []
         normals: list[bytes] = []
         tokens: list[bytes] = []
         counts: list[int] = []
         before: list[int] = []
-        for line in lines:
+        for number, line in zip(numbers, lines):
             words = line.split()
             if b"#" in line:
                 words = line.partition(b"#")[0].split()
@@ -361,38 +371,50 @@ class _ObjStatements:
                 vertices += words[1:4]
                 if len(words) != 4:
                     if len(words) < 4:
-                        raise ValueError(f"vertex {self.count + 1:,} has fewer than three coordinates")
+                        raise ValueError(f"line {number:,}: vertex {self.count + 1:,} has fewer than three coordinates")
                     self.vertex_extras[self.count] = words[4:]
+                    other_cells += words[4:]
                 self.count += 1
             elif kind == b"f":
                 tokens += words[1:]
                 counts.append(len(words) - 1)
                 before.append(self.count)
             elif kind == b"vn":
+                if len(words) < 4:
+                    raise ValueError(f"line {number:,}: a normal has fewer than three components")
                 normals += words[1:4]
                 self.normals += 1
             elif kind == b"vt":
                 self.textures += 1
+                other_cells += words[1:]
                 if len(words) < 3:
                     self.unreadable_reason = "it has texture coordinates with one number"
             if kind not in _OBJ_STATEMENTS:
+                if kind not in _UNUSED_OBJ_STATEMENTS:
+                    name = sanitize(kind.decode("latin-1"), 40)
+                    raise ValueError(f'line {number:,} begins with "{name}", which is no statement of an OBJ file')
                 self.unused_statements[kind] = None
             if len(line) > _MAX_OBJ_LINE:
                 self.unreadable_reason = f"it has lines with more than {_MAX_OBJ_LINE:,} characters"
-        self.vertices.append(parse_numbers(b" ".join(vertices)).reshape(-1, 3))
-        directions = np.linalg.norm(parse_numbers(b" ".join(normals)).reshape(-1, 3), axis=1)
-        if not (np.isfinite(directions).all() and (directions > 0).all()):
+        try:
+            corners = _split_corners(tokens)
+            positions, directions, _ = (parse_numbers(b" ".join(cells)) for cells in (vertices, normals, other_cells))
+        except ValueError as error:
+            raise ValueError(_describe_bad_line(lines, numbers) or str(error)) from error
+        self.vertices.append(positions.reshape(-1, 3))
+        lengths = np.linalg.norm(directions.reshape(-1, 3), axis=1)
+        if not (np.isfinite(lengths).all() and (lengths > 0).all()):
             self.unreadable_reason = _BAD_NORMALS
         if tokens:
-            self.corners.append(self._parse_corners(tokens, np.repeat(before, counts)))
+            self.corners.append(self._parse_corners(corners, np.repeat(before, counts)))
             self.counts += counts
 
-    def _parse_corners(self, tokens: list[bytes], before: np.ndarray) -> np.ndarray:
-        """Return the vertex indices (N,), from 0, of the face corners ``tokens`` (N,); -1 for an invalid index.
+    def _parse_corners(self, corners: list[np.ndarray], before: np.ndarray) -> np.ndarray:
+        """Return the vertex indices (N,), from 0, of face ``corners`` of `_split_corners`; -1 for an invalid index.
 
         ``before`` (N,) is the number of vertices that precede the face.
         """
-        index, *other_indices = _split_corners(tokens)
+        index, *other_indices = corners
         if (index == 0).any():
             raise ValueError("a face refers to vertex 0, but indices start at 1")
         for indices, count, what in zip(other_indices, (self.textures, self.normals), ("texture coordinate", "normal")):
@@ -405,6 +427,18 @@ class _ObjStatements:
             self.unreadable_reason = "its faces refer to later vertices"
         # Negative indices count back from the last vertex before the face.
         return np.where(index > 0, index - 1, np.where(-index <= before, before + index, -1))
+
+
+def _describe_bad_line(lines: list[bytes], numbers: Sequence[int]) -> str | None:
+    """Return the number and the cell of the first of ``lines`` with text in place of a number."""
+    for number, line in zip(numbers, lines):
+        kind, *words = line.partition(b"#")[0].split() or [b""]
+        text, dtype = (b" ".join(words), np.float64) if kind in (b"v", b"vn", b"vt") else (b"", np.float64)
+        if kind == b"f":
+            text, dtype = b" ".join(words).replace(b"/", b" "), np.int64
+        if find_cell(text, dtype) >= 0:
+            return f"line {number:,} has {describe_cell(text, dtype)}"
+    return None
 
 
 def _split_corners(tokens: list[bytes]) -> list[np.ndarray]:
@@ -431,28 +465,37 @@ def _split_corners(tokens: list[bytes]) -> list[np.ndarray]:
 
 def _read_obj(path: str | os.PathLike) -> MeshFile:
     check_regular_file(path, "mesh", MAX_TEXT_BYTES)
-    obj, continued, end, is_at_end = _ObjStatements(), bytearray(), b"", False
+    obj, continued, end, is_at_end, num_lines = _ObjStatements(), bytearray(), b"", False, 0
     with open(path, "rb") as file:
+        if file.seek(measure_byte_order_mark(file.read(4), path, "mesh")):
+            obj.unreadable_reason = BYTE_ORDER_MARK
         while not is_at_end:
             block = file.read(_BLOCK)
+            if block.endswith(b"\r"):
+                block += file.read(1)  # the second half of \r\n
+            if re.search(rb"\r[^\r\n]", block):
+                obj.unreadable_reason = MAC_LINE_ENDS
             is_at_end = not block
+            block = block.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
             *lines, end = (end + (block or b"\n")).split(b"\n")
             lines = [line.rstrip() for line in lines]
+            numbers: Sequence[int] = range(num_lines + 1, num_lines + 1 + len(lines))
+            num_lines += len(lines)
             if continued or any(line.endswith(b"\\") for line in lines):
-                obj.unreadable_reason = "it has lines that are continued after a \\"
-                joined: list[bytes] = []
-                for line in lines:
+                joined: list[tuple[int, bytes]] = []
+                for number, line in zip(numbers, lines):
                     continued += line
-                    if continued.endswith(b"\\"):
+                    if continued.endswith(b"\\") and not line.lstrip().startswith(b"#"):
                         continued[-1:] = b" "
+                        obj.unreadable_reason = "it has lines that are continued after a \\"
                     else:
-                        joined.append(bytes(continued))
+                        joined.append((number, bytes(continued)))
                         continued.clear()
-                lines = joined
+                numbers, lines = [number for number, _ in joined], [line for _, line in joined]
             if max(len(end), len(continued)) > _BLOCK:
                 raise ValueError(f"it has a line of more than {_BLOCK:,} bytes, the limit")
-            obj.read(lines)
-    obj.read([bytes(continued)])
+            obj.read(lines, numbers)
+    obj.read([bytes(continued)], [num_lines])
     vertices, corners = np.concatenate(obj.vertices), np.concatenate([*obj.corners, np.zeros(0, np.int64)])
     faces, polygons, concave, beyond = _triangulate(np.array(obj.counts, np.int64), corners, vertices)
     if concave:

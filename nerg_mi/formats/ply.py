@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 import re
 import warnings
+from codecs import BOM_UTF8
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -18,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from nerg_mi.errors import sanitize
 from nerg_mi.files.atomic import write_bytes
 
 PLY_MAGIC = b"ply"  # first bytes of a file
@@ -60,45 +62,99 @@ class PlyTable:
 
 @dataclass(frozen=True, eq=False)
 class Ply:
-    """Parsed file: ``tables`` by element name in file order, ``comments``, and whether data follows the last row."""
+    """Parsed file: ``tables`` by element name in file order, ``comments``, whether data follows the last row, and why
+    stricter readers reject its text, or "".
+    """
 
     tables: dict[str, PlyTable]
     comments: tuple[str, ...]
     has_trailing_data: bool
+    unusual_text: str = ""
+
+
+BYTE_ORDER_MARK, MAC_LINE_ENDS = "it begins with a byte order mark", "its lines end as on an old Mac (CR)"
 
 
 def parse_ply(raw: np.ndarray) -> Ply:
-    """Parse the bytes ``raw`` (uint8) of a file, read or memory-mapped.
+    """Parse the bytes ``raw`` (uint8) of a file, read or memory-mapped. A byte order mark is skipped.
 
     Raises `ValueError` for another kind of file, and for a file that ends before its rows. No memory is allocated for
     counts that exceed the file. Values of text files are float64.
     """
-    head = bytes(raw[:MAX_HEADER_BYTES])
-    end = re.search(rb"(?:^|\n)end_header[ \t]*\r?\n", head)
-    if not head.startswith(PLY_MAGIC) or end is None:
+    start = len(BOM_UTF8) if raw[: len(BOM_UTF8)].tobytes() == BOM_UTF8 else 0
+    head = bytes(raw[start : start + MAX_HEADER_BYTES])
+    # The first line tells the line ends of the header: a byte of binary rows may look like the second half of \r\n.
+    line_end = re.match(rb"ply[ \t]*(\r\n|\r|\n)", head)
+    end = re.search(rb"[\r\n]end_header[ \t]*" + (b"\r" if line_end and line_end[1] == b"\r" else b"\r?\n"), head)
+    if line_end is None or end is None:
         raise ValueError("it has no PLY header")
     order, elements, comments = _parse_header(head[: end.start()].decode("latin-1"))
-    source: _BinaryRows | _TextRows = _BinaryRows(raw[end.end() :], order) if order else _TextRows(raw[end.end() :])
+    body = raw[start + end.end() :]
+    num_lines = len(re.findall(rb"\r\n|\r|\n", head[: end.end()]))
+    source: _BinaryRows | _TextRows = _BinaryRows(body, order) if order else _TextRows(body, num_lines + 1)
     tables, at = {}, 0
     for name, count, properties in elements:
         if name in tables:
             raise ValueError(f'it has two elements named "{name}"')
         tables[name], at = source.read_table(at, name, count, properties)
-    return Ply(tables, comments, at < source.length)
+    if at < source.length and not order:
+        raise ValueError(f"its header describes {at:,} numbers, but {source.length:,} follow")
+    return Ply(
+        tables,
+        comments,
+        at < source.length,
+        BYTE_ORDER_MARK if start else MAC_LINE_ENDS if line_end[1] == b"\r" else "",
+    )
+
+
+_REAL = rb"[-+]?(?:(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|[iI][nN][fF](?:[iI][nN][iI][tT][yY])?|[nN][aA][nN])"
+_CELLS = {
+    kind: re.compile(rb"(?<!\S)(?!" + pattern + rb"(?!\S))\S+")
+    for kind, pattern in ((np.float64, _REAL), (np.int64, rb"[-+]?\d+"))
+}
 
 
 def parse_numbers(text: bytes, dtype: type = np.float64) -> np.ndarray:
-    """Parse the numbers in ``text``, separated by white space. Raises `ValueError` for anything else."""
+    """Parse the numbers in ``text``, separated by white space. Raises `ValueError`, which quotes the cell, for anything
+    else; see `find_cell`.
+    """
     with warnings.catch_warnings():
         warnings.simplefilter("error", DeprecationWarning)
         try:
-            return np.fromstring(text, dtype, sep=" ") if text.strip() else np.zeros(0, dtype)
-        except (DeprecationWarning, ValueError) as error:
-            raise ValueError("it has text in place of numbers") from error
+            values = np.fromstring(text, dtype, sep=" ") if text.strip() else np.zeros(0, dtype)
+        except (DeprecationWarning, ValueError):
+            values = None
+    # "1.5.2" is parsed as two numbers.
+    if values is None or len(values) != _count_cells(text):
+        raise ValueError(f"it has {describe_cell(text, dtype)}")
+    return values
+
+
+def _count_cells(text: bytes) -> int:
+    is_in_cell = np.frombuffer(text, np.uint8) > 32
+    return int(np.count_nonzero(is_in_cell[1:] & ~is_in_cell[:-1])) + int(is_in_cell[:1].sum())
+
+
+def find_cell(text: bytes, dtype: type = np.float64) -> int:
+    """Return the position of the first cell of ``text`` that is not a number; -1 if there is none."""
+    match = _CELLS[dtype].search(text)
+    return match.start() if match else -1
+
+
+def describe_cell(text: bytes, dtype: type = np.float64) -> str:
+    """Return what the first cell of ``text`` is that is not a number, with the likely cause."""
+    match = _CELLS[dtype].search(text)
+    if match is None:
+        return "text in place of numbers"
+    cause = "; decimals need a point, not a comma" if b"," in match[0] else ""
+    return f'"{sanitize(match[0].decode("latin-1"), 40)}" in place of a number{cause}'
 
 
 # Name, NumPy type of the values, and NumPy type of the length of a list.
 _Property = tuple[str, str, str | None]
+
+
+_HEADER_LINE = re.compile(r"(format \S+( \S+)?|element \S+ -?\d{1,40}|property list \S+ \S+ \S+|property \S+ \S+)")
 
 
 def _parse_header(head: str) -> tuple[str, list[tuple[str, int, list[_Property]]], tuple[str, ...]]:
@@ -108,6 +164,8 @@ def _parse_header(head: str) -> tuple[str, list[tuple[str, int, list[_Property]]
         words = line.split()
         if not words or words[0] in ("comment", "obj_info"):
             comments.append(line.partition(" ")[2].strip())
+        elif not _HEADER_LINE.fullmatch(" ".join(words)) or (words[0] == "property" and not elements):
+            raise ValueError(f'its header has the line "{sanitize(line.strip(), 60)}"')
         elif words[0] == "format":
             if words[1] not in (orders := {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}):
                 raise ValueError(f'its format is "{words[1][:40]}"')
@@ -116,7 +174,7 @@ def _parse_header(head: str) -> tuple[str, list[tuple[str, int, list[_Property]]
             elements.append((words[1], int(words[2]), []))
             if elements[-1][1] < 0:
                 raise ValueError(f'its element "{words[1][:40]}" has {elements[-1][1]} rows')
-        elif words[0] == "property":
+        else:
             listed = words[1] == "list"
             name, kind, count = (words[4], words[3], words[2]) if listed else (words[2], words[1], None)
             for used in (kind, *([count] if count else [])):
@@ -125,8 +183,6 @@ def _parse_header(head: str) -> tuple[str, list[tuple[str, int, list[_Property]]
             if any(name == other for other, *_ in elements[-1][2]):
                 raise ValueError(f'it has two properties named "{name[:40]}"')
             elements[-1][2].append((name, _DTYPES[kind], _DTYPES[count] if count else None))
-        else:
-            raise ValueError(f'its header has a line that begins with "{words[0][:40]}"')
     if order is None:
         raise ValueError("its header has no format")
     return order, elements, tuple(c for c in comments if c)
@@ -248,10 +304,15 @@ class _BinaryRows(_RowSource):
 
 
 class _TextRows(_RowSource):
-    def __init__(self, raw: np.ndarray):
+    def __init__(self, raw: np.ndarray, first_line: int):
         if len(raw) > MAX_TEXT_BYTES:
             raise ValueError(f"it is a text file of more than {MAX_TEXT_BYTES:,} bytes, the limit; save it as binary")
-        self._words = parse_numbers(raw.tobytes())
+        text = raw.tobytes()
+        try:
+            self._words = parse_numbers(text)
+        except ValueError as error:
+            lines_before = re.findall(rb"\r\n|\r|\n", text[: max(find_cell(text), 0)])
+            raise ValueError(f"line {first_line + len(lines_before):,}: {error}") from error
         self.length = len(self._words)
 
     def size(self, kind: str) -> int:

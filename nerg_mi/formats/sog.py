@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import warnings
 from pathlib import Path
 from typing import Any
 from zipfile import ZipFile
@@ -12,7 +13,8 @@ import numpy as np
 
 from nerg_mi.errors import sanitize
 from nerg_mi.fields.splats import Splats, scales_from_logs
-from nerg_mi.files.safe_read import is_count, open_zip, parse_json, read_member, translate_read_errors
+from nerg_mi.files.safe_read import open_zip, parse_json, read_member, translate_read_errors
+from nerg_mi.files.schema import NUMBER, Items, Number, check_json
 
 # Each pixel of an image belongs to one Gaussian, in rows from the top. Positions have 16 bits per axis in two images,
 # scales and colours are indices into codebooks, and higher harmonics are indices into a palette, whose image has 64
@@ -24,6 +26,20 @@ _CODEBOOK = 256  # Entries of a codebook
 _PALETTE_COLUMNS, _MAX_PALETTE = 64, 1 << 16
 _LARGEST_IS_FIRST = 252  # Alpha of a quaternion whose largest component is w; 253 to 255: x, y, z
 _KIND = "splat file"
+_FILES, _ENDS, _VALUES = Items(str, 1), Items(NUMBER, 3, 3), Items(NUMBER, _CODEBOOK, _CODEBOOK)
+_META = {
+    "count": Number(1, MAX_SOG_GAUSSIANS, is_integer=True),
+    "means": {"mins": _ENDS, "maxs": _ENDS, "files": Items(str, 2)},
+    "scales": {"codebook": _VALUES, "files": _FILES},
+    "quats": {"files": _FILES},
+    "sh0": {"codebook": _VALUES, "files": _FILES},
+    "shN?": {
+        "count": Number(1, _MAX_PALETTE, is_integer=True),
+        "bands": Number(1, 3, is_integer=True),
+        "codebook": _VALUES,
+        "files": Items(str, 2),
+    },
+}
 
 
 def read_sog(path: str | os.PathLike) -> Splats:
@@ -31,11 +47,10 @@ def read_sog(path: str | os.PathLike) -> Splats:
     convert = f'convert it by: npx @playcanvas/splat-transform "{Path(path).name}" out.ply'
     with open_zip(path, _KIND) as archive, translate_read_errors(path, _KIND, convert):
         meta: Any = parse_json(bytes(read_member(archive, "meta.json", path, _KIND)), path, _KIND)
-        version, count = meta.get("version"), meta.get("count")
+        version = check_json(meta, {}).get("version")
         if version != 2:
-            raise ValueError(f"its version is {sanitize(version)}, not 2")
-        if not is_count(count) or not 0 < count <= MAX_SOG_GAUSSIANS:
-            raise ValueError(f"it claims {sanitize(count)} Gaussians; the limit is {MAX_SOG_GAUSSIANS:,}")
+            raise ValueError(f"its version is {sanitize(version, 40)}, not 2")
+        count = check_json(meta, _META)["count"]
         read = lambda part, index=0: _read_image(archive, path, meta[part]["files"][index])
         pixels = lambda part, index=0: _take_gaussians(read(part, index), count, part)
         low, high = pixels("means", 0)[:, :3], pixels("means", 1)[:, :3]
@@ -59,10 +74,16 @@ def _read_image(archive: ZipFile, path: str | os.PathLike, name: str) -> np.ndar
     """Read an image of the archive: (height, width, 4), bytes."""
     from PIL import Image
 
-    with Image.open(io.BytesIO(read_member(archive, name, path, _KIND))) as image:
-        if image.width * image.height > _MAX_PIXELS:
-            raise ValueError(f'its image "{sanitize(name)}" has {image.width} x {image.height} pixels')
-        return np.asarray(image.convert("RGBA"))
+    with warnings.catch_warnings():
+        # Pillow's own limit is a warning and then an error that is no `ValueError`; ours is lower.
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        try:
+            with Image.open(io.BytesIO(read_member(archive, name, path, _KIND))) as image:
+                if image.width * image.height <= _MAX_PIXELS:
+                    return np.asarray(image.convert("RGBA"))
+        except Image.DecompressionBombError:
+            pass
+    raise ValueError(f'its image "{sanitize(name)}" has more than {_MAX_PIXELS:,} pixels, the limit')
 
 
 def _take_gaussians(image: np.ndarray, count: int, part: str) -> np.ndarray:
@@ -74,17 +95,12 @@ def _take_gaussians(image: np.ndarray, count: int, part: str) -> np.ndarray:
 
 
 def _read_codebook(part: dict) -> np.ndarray:
-    values = np.array(part["codebook"], np.float64)
-    if values.shape != (_CODEBOOK,):
-        raise ValueError(f"a codebook has the shape {values.shape}, not {_CODEBOOK} values")
-    return values
+    return np.array(part["codebook"], np.float64)
 
 
 def _read_palette(image: np.ndarray, part: dict) -> np.ndarray:
     """Return the palette (P, K, 3) of the K harmonics above degree 0."""
     size, bands = part["count"], part["bands"]
-    if not (is_count(size) and 0 < size <= _MAX_PALETTE and bands in (1, 2, 3)):
-        raise ValueError(f"it has a palette of {sanitize(size)} entries and {sanitize(bands)} bands")
     num_harmonics = (bands + 1) ** 2 - 1
     rows = -(-size // _PALETTE_COLUMNS)
     if image.shape[0] < rows or image.shape[1] != _PALETTE_COLUMNS * num_harmonics:

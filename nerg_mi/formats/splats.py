@@ -24,6 +24,7 @@ from nerg_mi.fields.splats import (
     splats_from_raw_parameters,
 )
 from nerg_mi.files.safe_read import MAX_JSON_BYTES, map_bytes, open_file, open_gzip, translate_read_errors
+from nerg_mi.files.schema import check_json
 from nerg_mi.maths.coordinates import check_near_origin
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.sphere import HARMONIC_DEGREES
@@ -69,6 +70,7 @@ EXTENSION = "KHR_gaussian_splatting"
 _POINTS = 0
 _COLOR_SPACES = {"srgb_rec709_display": "srgb", "lin_rec709_display": "linear"}
 _TOLERANCE = 1e-4
+_EXTENSION = {"extensions?": dict, "kernel?": str, "colorSpace?": str}
 
 
 def has_gltf_splats(path: str | os.PathLike) -> bool:
@@ -86,13 +88,14 @@ def read_gltf_splats(path: str | os.PathLike) -> Splats:
     splats with different degrees of spherical harmonics, and values outside of the ranges of the extension.
     """
     raw = map_bytes(path, "splat file", MAX_GLTF_BYTES, GLTF_MAGIC, "export it again")
-    with translate_read_errors(path, "splat file", "export it again", extra_errors=(TypeError, AttributeError)):
+    with translate_read_errors(path, "splat file", "export it again"):
         document, data = read_glb_chunks(raw, path, "splat file")
         parts = []
         for primitive, matrix in iter_instances(document, _POINTS):
             extension = primitive.get("extensions", {}).get(EXTENSION)
             if extension is None:
                 continue
+            check_json(extension, _EXTENSION, EXTENSION)
             if any("compression" in name for name in extension.get("extensions", {})):
                 raise ValueError("its splats are compressed; export it without compression")
             try:
@@ -171,7 +174,8 @@ _MAX_LOGIT = 32
 def has_ply_splats(path: str | os.PathLike) -> bool:
     """Return whether the header of the PLY file ``path`` contains colours or shapes of Gaussian splats."""
     with open_file(path, "PLY file") as file:
-        names = re.findall(rb"^property [a-z0-9]+ (\w+)\s*$", file.read(DETECTION_BYTES), re.MULTILINE)
+        head = file.read(DETECTION_BYTES).replace(b"\r", b"\n")
+        names = re.findall(rb"^property [a-z0-9]+ (\w+)\s*$", head, re.MULTILINE)
         return b"f_dc_0" in names or {b"opacity", b"scale_0", b"rot_0"} <= set(names)
 
 

@@ -17,7 +17,13 @@ import numpy as np
 
 from nerg_mi.errors import MissingFile, NergError, format_error, sanitize
 from nerg_mi.files.atomic import file_sha256
-from nerg_mi.files.safe_read import check_regular_file, is_regular_file, open_file, resolve_path
+from nerg_mi.files.safe_read import (
+    check_regular_file,
+    is_regular_file,
+    measure_byte_order_mark,
+    open_file,
+    resolve_path,
+)
 
 from .observed import MatchedImage, PointTable
 from .posed import MAX_POSITION, FileFinder, MaskFile, PosedFrame, PosedImages, UnusedFrame, format_names, sort_frames
@@ -449,6 +455,7 @@ def _read_points_bin(path: Path) -> Iterator[_Point]:
 def _iter_lines(path: Path) -> Iterator[tuple[int, str]]:
     """Iterate over line numbers and lines, without comments."""
     with _open_model_file(path) as file:
+        file.seek(measure_byte_order_mark(file.read(4), path, "COLMAP file"))
         # Image names may have any encoding.
         text = io.TextIOWrapper(file, encoding="utf-8", errors="surrogateescape")
         # A file without line ends must not be read as one line of gigabytes.

@@ -16,7 +16,7 @@ import numpy as np
 from nerg_mi.errors import NergError, sanitize
 from nerg_mi.files.atomic import check_writable, replace_atomically
 from nerg_mi.files.images import encode_png, open_exr_writer, split_bitmap_channels
-from nerg_mi.files.safe_read import map_bytes, open_file, read_bytes, translate_read_errors
+from nerg_mi.files.safe_read import map_bytes, open_file, read_text, translate_read_errors
 from nerg_mi.files.tables import write_csv
 from nerg_mi.formats.camera_path import CameraPath, read_camera_path
 from nerg_mi.formats.meshes import MAX_BYTES, MeshFile, read_mesh_file
@@ -65,9 +65,7 @@ def read_frames(path: str | Path) -> list[dict[str, str]]:
     """
     if Path(path).suffix.lower() == ".json":
         return _frames_of_path(read_camera_path(path))
-    raw = read_bytes(path, "frames file", MAX_FRAMES_BYTES)
-    with translate_read_errors(path, "frames file", "correct it"):
-        text = raw.decode("utf-8-sig")
+    text = read_text(path, "frames file", MAX_FRAMES_BYTES)
     names: list[str] | None = None
     frames: list[dict[str, str]] = []
     lines = csv.reader(io.StringIO(text, newline=""), strict=True)
@@ -160,9 +158,11 @@ def check_ply_points(path: str | os.PathLike) -> None:
     """Check that a PLY file has vertices and is complete. Raises `NergError` otherwise."""
     raw = map_bytes(path, "PLY file", MAX_BYTES, PLY_MAGIC, "export it again")
     with translate_read_errors(path, "PLY file", "export it again"):
-        tables = parse_ply(np.frombuffer(raw, np.uint8)).tables
-        if "vertex" not in tables or not tables["vertex"].count:
+        ply = parse_ply(np.frombuffer(raw, np.uint8))
+        if "vertex" not in ply.tables or not ply.tables["vertex"].count:
             raise ValueError("it has no vertices")
+        if ply.unusual_text:
+            raise ValueError(f"{ply.unusual_text}, which Mitsuba does not read")
 
 
 def write_mesh(path: str | os.PathLike, mesh: MeshFile) -> None:

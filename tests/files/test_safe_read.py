@@ -30,6 +30,7 @@ from nerg_mi.files.safe_read import (
     read_member,
     read_npy,
     read_npz,
+    read_text,
     sanitize,
     translate_read_errors,
 )
@@ -383,7 +384,7 @@ def test_blocks_are_bounded_by_lines_and_characters(tmp_path, monkeypatch):
 def test_binary_file_is_refused(tmp_path, monkeypatch):
     path = tmp_path / "t.csv"
     path.write_bytes("name\n".encode("utf-16"))
-    with pytest.raises(NergError, match='"[^"]*t.csv" is not UTF-8 text'):
+    with pytest.raises(NergError, match='t.csv" is UTF-16 text'):
         read_lines(path)
     path.write_bytes(b"a\xe2\x82")
     with pytest.raises(NergError, match="UTF-8"):
@@ -528,3 +529,59 @@ def test_number_of_axes_is_limited(tmp_path, axes, good):
     else:
         with pytest.raises(NergError, match="claims the shape"):
             read_npy(tmp_path / "a.npy")
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])
+def test_byte_order_mark_is_no_content(tmp_path, encoding):
+    path = tmp_path / "a.txt"
+    path.write_text("x,y\n1,2\n", encoding=encoding)
+    assert [line for block in read_line_blocks(path, "table", 9) for line in block] == ["x,y\n", "1,2\n"]
+    assert read_text(path, "table", 99) == "x,y\n1,2\n"
+    (tmp_path / "a.txt.gz").write_bytes(gzip.compress(path.read_bytes()))
+    assert next(iter(read_line_blocks(tmp_path / "a.txt.gz", "table", 1))) == ["x,y\n"]
+    path.write_text('{"a": 1}', encoding=encoding)
+    assert read_json(path) == {"a": 1}
+
+
+@pytest.mark.parametrize("encoding", ["utf-16-le", "utf-16-be", "utf-32-le", "utf-32-be"])
+def test_text_in_other_encodings_is_named(tmp_path, encoding):
+    path = tmp_path / "a.txt"
+    path.write_text("\ufeffx,y\n1,2\n", encoding=encoding)
+    for read in (lambda: next(iter(read_line_blocks(path, "table", 9))), lambda: read_text(path, "table", 99)):
+        with pytest.raises(NergError, match=f"a.txt.*{encoding[:6].upper()}"):
+            read()
+
+
+@pytest.mark.parametrize(
+    "act, word",
+    [
+        ([].pop, "missing"),
+        (lambda: {}["speed"], 'lacks "speed"'),
+        (lambda: float("fast"), "fast"),
+        (lambda: int("1,5"), "1,5"),
+        (lambda: None["x"], "missing"),
+        (lambda: (1).x, "missing"),
+        (lambda: float(10**400), "too large"),
+        (lambda: np.zeros(3).reshape(2, 2), "size"),
+        (lambda: np.array([[1], [1, 2]], float), "size"),
+        (lambda: struct.unpack("<I", b"a"), "truncated"),
+        (b"\xff".decode, "UTF-8"),
+        (lambda: zlib.decompress(b"a"), "compressed"),
+    ],
+)
+def test_message_of_python_is_no_message_of_a_file(act, word):
+    with (
+        pytest.raises(NergError, match=word) as error,
+        translate_read_errors("a", extra_errors=(TypeError, AttributeError)),
+    ):
+        act()
+    cause = error.value.__cause__
+    assert isinstance(cause, KeyError) or str(cause) not in str(error.value)
+
+
+def test_message_of_a_reader_is_kept():
+    def read():
+        raise ValueError("it has 3 wheels")
+
+    with pytest.raises(NergError, match="it has 3 wheels"), translate_read_errors("a"):
+        read()

@@ -1,8 +1,12 @@
 """Tests of `nerg_mi.formats.splats`."""
 
+import functools
 import gzip
+import json
+import re
 import struct
 import tracemalloc
+import zipfile
 from dataclasses import replace
 
 import drjit.llvm.ad as ns
@@ -327,7 +331,7 @@ def test_nodes_are_applied_and_integers_normalised(tmp_path):
         (b'"kernel": "ellipse"', b'"extensions": {"compression": 1}', "compressed"),
         (b'"kernel": "ellipse"', b'"kernel": "triangle"', 'kernel is "triangle"'),
         (b"srgb_rec709", b"rgbb_rec2020", "colour space"),
-        (b'"buffer": 0,', b'"buffer": -1,', "not a whole number"),
+        (b'"buffer": 0,', b'"buffer": -1,', "whole number"),
         (b'"nodes": [{"mesh": 0', b'"nodes": [{"scale": [1, 2, 1], "mesh": 0', "uniform scale"),
     ],
 )
@@ -452,11 +456,11 @@ def test_sog_is_decoded_to_its_precision(tmp_path, degree):
     ("changes", "said"),
     [
         ({"version": 3}, "version is 3, not 2"),
-        ({"count": 4_000_000_000}, "4000000000 Gaussians"),
+        ({"count": 4_000_000_000}, "50,000,000, got 4000000000"),
         ({"count": 41}, "40 pixels for 41 Gaussians"),
-        ({"count": "many"}, "many Gaussians"),
+        ({"count": "many"}, "count.* got .many"),
         ({"scales__codebook": [0.0]}, "codebook"),
-        ({"shN__bands": 4}, "4 bands"),
+        ({"shN__bands": 4}, "bands.* got 4"),
         ({"shN__bands": 1}, "image of its palette"),
         ({"shN__count": 9}, "palette entry 39 of 9"),
         ({"quats__files": ["sh0.webp"]}, "no largest component"),
@@ -469,6 +473,80 @@ def test_damaged_sog_is_refused(tmp_path, changes, said):
     with pytest.raises(NergError, match=said) as error:
         read_splats(tmp_path / "a.sog")
     assert "a.sog" in str(error.value)
+
+
+def _damaged_values(meta: dict) -> list[tuple[dict, str]]:
+    """Copies of ``meta`` in which each key, and the first item of each list, is missing or has another type or size."""
+    others = [None, {}, [], "x", -1, 1e300, float("nan"), float("inf"), True, [[0.0]], 1 << 70]
+    out = []
+
+    def visit(path: tuple) -> None:
+        value = functools.reduce(lambda at, key: at[key], path, meta)
+        for other in [*others, KeyError] if path else others:
+            copy = json.loads(json.dumps(meta))
+            parent = functools.reduce(lambda at, key: at[key], path[:-1], copy)
+            if not path:
+                copy = other
+            elif other is KeyError:
+                del parent[path[-1]]
+            else:
+                parent[path[-1]] = other
+            out.append((copy, f"{path} {other}"))
+        keys = list(value) if isinstance(value, dict) else [0] if isinstance(value, list) else []
+        for key in keys:
+            visit((*path, key))
+
+    visit(())
+    return out
+
+
+def test_sog_with_any_damaged_value_is_read_or_refused_in_a_sentence(tmp_path):
+    write_sog(tmp_path / "a.sog", random_splats())
+    with zipfile.ZipFile(tmp_path / "a.sog") as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    num_refused = 0
+    for meta, what in _damaged_values(json.loads(files["meta.json"])):
+        with zipfile.ZipFile(tmp_path / "b.sog", "w") as archive:
+            for name, data in (files | {"meta.json": json.dumps(meta).encode()}).items():
+                archive.writestr(name, data)
+        try:
+            read_splats(tmp_path / "b.sog")
+        except NergError as error:
+            num_refused += 1
+            said = str(error)
+            assert "b.sog" in said and not re.search(
+                "index out of|object has no|Error|subscript|iter|convert s", said
+            ), what
+    assert num_refused > 200
+
+
+@pytest.mark.parametrize("size", [(16383, 16383), (9000, 9000), (16383, 5000)])
+def test_too_large_images_of_a_sog_are_refused(tmp_path, size):
+    write_sog(tmp_path / "a.sog", random_splats())
+    with zipfile.ZipFile(tmp_path / "a.sog") as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    # A WebP header that claims the size: width - 1 and height - 1 in 14 bits each.
+    bits = (size[0] - 1) | (size[1] - 1) << 14
+    data = b"\x2f" + bits.to_bytes(4, "little") + bytes(64)
+    chunk = b"VP8L" + len(data).to_bytes(4, "little") + data + b"\0"
+    files["quats.webp"] = b"RIFF" + (len(chunk) + 4).to_bytes(4, "little") + b"WEBP" + chunk
+    with zipfile.ZipFile(tmp_path / "a.sog", "w") as archive:
+        for name, data in files.items():
+            archive.writestr(name, data)
+    with pytest.raises(NergError, match="quats.webp.*pixels"):
+        read_splats(tmp_path / "a.sog")
+
+
+@pytest.mark.parametrize("mark", [b"", b"\xef\xbb\xbf"], ids=["plain", "mark"])
+@pytest.mark.parametrize("end", [b"\n", b"\r\n", b"\r"])
+def test_marks_and_line_ends_of_splats_in_text_change_no_value(tmp_path, mark, end):
+    write_inria(tmp_path / "a.ply", random_splats(), style="ascii")
+    raw = (tmp_path / "a.ply").read_bytes()
+    (tmp_path / "b.ply").write_bytes(mark + raw.replace(b"\n", end))
+    assert is_splat_file(tmp_path / "b.ply")
+    first, second = read_splats(tmp_path / "a.ply"), read_splats(tmp_path / "b.ply")
+    np.testing.assert_array_equal(first.centers, second.centers)
+    np.testing.assert_array_equal(first.opacities, second.opacities)
 
 
 # ---- Splats of a field show its depth ----

@@ -120,6 +120,23 @@ def write_txt(folder, names, cameras=CAMERAS):
 NAMES = [f"room {k}/photo {k}.png" for k in range(1, 11)]
 
 
+@pytest.mark.parametrize("comments", [True, False])
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+def test_byte_order_mark_of_a_text_model_is_no_content(tmp_path, comments, end):
+    for folder, mark in (("plain", ""), ("marked", "\ufeff")):
+        (tmp_path / folder).mkdir()
+        write_txt(tmp_path / folder, NAMES)
+        for file in (tmp_path / folder).iterdir():
+            lines = file.read_text().splitlines()[0 if comments else 1 :]
+            file.write_bytes((mark + end.join(lines) + end).encode())
+    plain, marked = (read_named_poses(tmp_path / folder) for folder in ("plain", "marked"))
+    assert marked.names == plain.names and len(marked.names) == len(NAMES)
+    np.testing.assert_array_equal(marked.to_world, plain.to_world)
+    (tmp_path / "marked" / "images.txt").write_text("1 2 3", encoding="utf-16")
+    with pytest.raises(NergError, match="images.txt.*UTF-16"):
+        read_named_poses(tmp_path / "marked")
+
+
 @pytest.fixture(params=["bin", "txt"])
 def model(request, tmp_path):
     """A model of ten images, each with its own camera, next to empty image files."""

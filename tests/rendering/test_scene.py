@@ -57,6 +57,38 @@ def test_values_for_defaults(rgb, tmp_path):
         load_scene(tmp_path / "s.xml", {"tall": "2"})
 
 
+_OBJ = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 9 9 9\nf 1 2 3\nf 1 3 4\n"
+_DAMAGED_OBJ = {
+    "mark": (b"\xef\xbb\xbf" + _OBJ.encode(), "byte order mark"),
+    "mac": (_OBJ.replace("\n", "\r").encode(), "CR"),
+    "comma": (_OBJ.replace("v 1 1 0", "v 1,0 1,0 0,0").encode(), "line 3"),
+    "statement": (_OBJ.replace("v 1 1", "vv 1 1").encode(), "vv"),
+    "utf-16": (_OBJ.encode("utf-16"), "UTF-16"),
+}
+
+
+@pytest.mark.parametrize("kind", _DAMAGED_OBJ)
+@pytest.mark.parametrize("form", ["file", "include", "default", "dict", "nested dict"])
+def test_mitsuba_does_not_open_an_obj_that_it_would_misread(rgb, tmp_path, kind, form):
+    content, said = _DAMAGED_OBJ[kind]
+    (tmp_path / "a.obj").write_bytes(content)
+    shape = '<shape type="obj"><string name="filename" value="a.obj"/></shape>'
+    if form == "include":
+        (tmp_path / "part.xml").write_text(f'<scene version="3.0.0">{shape}</scene>')
+        shape = '<include filename="part.xml"/>'
+    if form == "default":
+        shape = '<default name="kind" value="obj"/>' + shape.replace('"obj"', '"$kind"')
+    (tmp_path / "s.xml").write_bytes(f'\ufeff<scene version="3.0.0">{shape}</scene>'.encode())
+    with pytest.raises(NergError, match=rf"a\.obj.*{said}"):
+        if "dict" in form:
+            from nerg_mi.api.contents import load_content
+
+            child = {"type": "obj", "filename": str(tmp_path / "a.obj")}
+            load_content({"type": "scene", "a": child} if form == "dict" else {"type": "scene", "b": {"a": child}})
+        else:
+            load_scene(tmp_path / "s.xml")
+
+
 @pytest.mark.parametrize("name", ["path", "parallel", "optimize"])
 def test_reserved_names_are_refused(rgb, tmp_path, name):
     file = tmp_path / "scene.xml"

@@ -68,9 +68,7 @@ class Motive:
     frame_description = "right-handed, `--up` (y in Motive), unit of the file"
     validated_on = GENERATED_FILES
     signature = Signature(
-        line=lambda line: (
-            "its first line is that of Motive's export" if line.lstrip("\ufeff").startswith("Format Version,") else None
-        ),
+        line=lambda line: "its first line is that of Motive's export" if line.startswith("Format Version,") else None,
         question="the forward axis of the head's rigid body (--forward; default -z)",
     )
     Options = MotiveOptions
@@ -130,7 +128,7 @@ def _choose_body(path: Path, layout: MotiveLayout, requested: str | None) -> str
 def _read_layout(path: Path) -> MotiveLayout:
     """Read the header lines. Raises `NergError` for another file or kind of export."""
     with closing(read_line_blocks(path, "table", _HEADER_LINES)) as blocks:
-        rows = list(csv.reader(line.lstrip("\ufeff") for line in next(blocks, [])))
+        rows = list(csv.reader(next(blocks, [])))
     rows = [[cell.strip() for cell in row] for row in rows]
     header_row = next((k for k, row in enumerate(rows) if row[:1] == ["Frame"]), None)
     if header_row is None or len(rows[header_row]) < 2 or rows[0][:1] != ["Format Version"]:

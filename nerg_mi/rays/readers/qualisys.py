@@ -136,7 +136,7 @@ def _make_layout(
 
 
 def _split_cells(line: str) -> list[str]:
-    return [cell.strip().strip('"') for cell in line.lstrip("\ufeff").rstrip("\r\n").split("\t")]
+    return [cell.strip().strip('"') for cell in line.rstrip("\r\n").split("\t")]
 
 
 def _parse_number(cell: str) -> float:

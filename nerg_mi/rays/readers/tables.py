@@ -185,7 +185,7 @@ def _split_cells(row: str, separator: str) -> list[str] | None:
 
 def _parse_header(path: str | os.PathLike, line: str) -> tuple[list[str], str]:
     """Parse the header: column names, and the separator."""
-    line = line.rstrip("\r\n").lstrip("\ufeff")
+    line = line.rstrip("\r\n")
     if line.startswith("Format Version,"):
         raise NergError(f'"{path}" is an export of OptiTrack\'s Motive; import it with --preset motive')
     separator = max(",;\t", key=line.count)
