@@ -567,8 +567,8 @@ BadLineCallback = Callable[[int, str], None]
 
 
 def read_line_blocks(path: str | os.PathLike, file_kind: str, max_lines: int) -> Generator[list[str], None, None]:
-    """Read the lines of a UTF-8 file, with their line ends and without a byte order mark, in blocks. A file whose name
-    ends in ``.gz`` is decompressed.
+    """Read the lines of a UTF-8 file, or of one whose byte order mark states another encoding (as Excel's Unicode
+    text), with their line ends, in blocks. The mark is skipped. A file whose name ends in ``.gz`` is decompressed.
 
     Parameters
     ----------
@@ -584,20 +584,21 @@ def read_line_blocks(path: str | os.PathLike, file_kind: str, max_lines: int) ->
     NergError
         For a file that is damaged or not UTF-8, and for a line of more than `MAX_LINE_LENGTH` characters.
     """
-    decoder, remainder, pending, count, characters = codecs.getincrementaldecoder("utf-8")(), "", [], 0, 0
+    decoder, remainder, pending, count, characters = None, "", [], 0, 0
     with _open_plain_or_gzip(path, file_kind) as source:
-        is_at_start, is_at_end = True, False
+        is_at_end = False
         while not is_at_end:
             with translate_read_errors(path, file_kind):
                 data = source.read(_LINE_BLOCKS_CHUNK)
-            if is_at_start:
-                data, is_at_start = data[measure_byte_order_mark(data[:4], path, file_kind) :], False
             is_at_end = not data
+            if decoder is None:
+                encoding = next((name for mark, name in _OTHER_MARKS.items() if data.startswith(mark)), "utf-8-sig")
+                decoder = codecs.getincrementaldecoder(encoding)()
             try:
                 text = remainder + decoder.decode(data, final=is_at_end)
             except UnicodeDecodeError as error:
                 raise NergError(
-                    f'the {file_kind} "{path}" is not UTF-8 text ({error.reason}); save it as UTF-8'
+                    f'the {file_kind} "{path}" is not {error.encoding.upper()} text ({error.reason}); save it as UTF-8'
                 ) from error
             # Split at \n, \r or \r\n, but not at the other characters at which str.splitlines splits.
             lines = io.StringIO(text, newline="").readlines()

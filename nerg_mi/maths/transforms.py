@@ -56,13 +56,14 @@ def check_rigid_transforms(
 
 def has_last_row(matrices: np.ndarray) -> np.ndarray:
     """Whether the last row of each matrix (N, 4, 4) is 0, 0, 0, 1, (N,) bool; True for (N, 3, 4)."""
-    return np.asarray(np.abs(matrices[:, 3:] - _LAST_ROW) <= _LAST_ROW_TOLERANCE).all(axis=(1, 2))
+    rows = np.abs(matrices[:, 3:] - _LAST_ROW)
+    return np.asarray((rows <= _LAST_ROW_TOLERANCE).all(axis=(1, 2)))
 
 
 def rotation_errors(linear: np.ndarray, *, may_scale: bool = False) -> np.ndarray:
     """Maximum deviation of R Rᵀ from the identity for each of the matrices (N, 3, 3), (N,); infinite for mirrored
     matrices and values that are not finite. ``may_scale``: a uniform scale is removed before."""
-    is_finite = np.isfinite(linear).all(axis=(1, 2))
+    is_finite = np.asarray(np.isfinite(linear).all(axis=(1, 2)))
     R = np.where(is_finite[:, None, None], linear, 0.0)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         determinant = np.linalg.det(R)

@@ -472,7 +472,7 @@ def read_semidense(
 
 def _find_columns(path: str | os.PathLike, header: str) -> tuple[int, ...]:
     """Return the number of cells of a line, and the positions of the world and of the numbers."""
-    names = [name.strip() for name in header.lstrip("\ufeff").split(",")]
+    names = [name.strip() for name in header.split(",")]
     missing = [name for name in (_WORLD_COLUMN, *_NUMBER_COLUMNS) if name not in names]
     if missing:
         existing = ", ".join(sanitize(name, 40) for name in names[:8])

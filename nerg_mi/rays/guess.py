@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import csv
+import itertools
 import shlex
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,6 +17,7 @@ from nerg_mi.files.safe_read import read_line_blocks, resolve_path
 
 from .readers import poses
 from .readers.base import MAX_BAD_LINE_FRACTION, UNITS, Reader
+from .readers.cells import is_missing
 from .readers.columns import (
     ColumnFinder,
     ColumnMap,
@@ -28,7 +30,7 @@ from .readers.columns import (
     parse_time_unit,
 )
 from .readers.registry import iterate_readers
-from .readers.tables import iterate_table, parse_clock_seconds
+from .readers.tables import iterate_samples, iterate_table, parse_clock_seconds, read_table_columns, split_component
 
 # ---- Evidence from rows ----
 #
@@ -249,16 +251,17 @@ def find_preset_by_columns(table: ColumnFinder) -> tuple[Reader[Any], str] | Non
 # ---- First rows of a table, and which columns contain numbers or times ----
 
 
-_SNIFFED_LINES = 40  # lines used to find the columns with numbers
-_MISSING_WORDS = {"", "nan", "na", "n/a", "null", "none", "-"}
+_MIN_NUMBERS = 0.95  # fraction of the cells of a column that are numbers; the import reports the others
+_MAX_BLOCKS = 16  # blocks of 65,536 rows that are searched if columns are empty in those before
 _MAX_COLUMNS = 400  # columns of numbers that are read
 
 
 class TableSample:
     """At most 65,536 rows of the ``columns`` of a table that contain numbers; ``numbers[name]`` is (n,) float64.
 
-    Times in text form are converted to seconds, and their columns are in ``clocks``. Columns with a repeated name are
-    excluded. Raises `NergError` if more than 1 % of the rows have more or fewer cells than the header.
+    They are the first rows, or later ones if columns are empty in the first. Times in text form are converted to
+    seconds, and their columns are in ``clocks``. Columns with a repeated name are excluded. Raises `NergError` if more
+    than 1 % of the rows have more or fewer cells than the header.
     """
 
     def __init__(self, path: Path, columns: Sequence[str]) -> None:
@@ -267,15 +270,21 @@ class TableSample:
         self.repeated = sorted(set(columns) - set(self.columns))
         kinds = _find_numeric_columns(path, list(columns))
         wanted = [name for name in self.columns if name in kinds][:_MAX_COLUMNS]
+        self._block = 0
         for name in (wanted or self.columns)[:1]:
-            self.read_texts(name)
+            self.read_texts(split_component(name, read_table_columns(path)) or name)
         self.clocks = {name for name in wanted if kinds[name]}
         self.numbers: dict[str, np.ndarray] = {}
         # The import reports cells that are not numbers.
         clocks = dict.fromkeys(self.clocks, 1.0)
-        for block in iterate_table(path, wanted, on_bad_line=lambda line, why: None, clocks=clocks):
-            self.numbers = dict(zip(wanted, block.numbers.T))
-            break
+        max_cells = -1
+        blocks = iterate_table(path, wanted, on_bad_line=lambda line, why: None, clocks=clocks)
+        for k, block in enumerate(itertools.islice(blocks, _MAX_BLOCKS)):
+            num_cells = np.isfinite(block.numbers).any(axis=0).sum()
+            if num_cells > max_cells:
+                self.numbers, self._block, max_cells = dict(zip(wanted, block.numbers.T)), k, num_cells
+            if max_cells == len(wanted):
+                break
         self.rows = len(next(iter(self.numbers.values()), ()))
 
     def stack_columns(self, names: Sequence[str]) -> np.ndarray:
@@ -286,7 +295,8 @@ class TableSample:
     def read_texts(self, name: str) -> np.ndarray:
         """Cells (n,) of a column as text."""
         bad: list[tuple[int, str]] = []
-        for block in iterate_table(self.path, (), [name], on_bad_line=lambda line, why: bad.append((line, why))):
+        blocks = iterate_table(self.path, (), [name], on_bad_line=lambda line, why: bad.append((line, why)))
+        for block in itertools.islice(blocks, self._block, None):
             if len(bad) > max(1, MAX_BAD_LINE_FRACTION * len(block.lines)):
                 break
             return block.texts[:, 0]
@@ -296,22 +306,25 @@ class TableSample:
 
 
 def _find_numeric_columns(path: Path, columns: list[str]) -> dict[str, bool]:
-    """Columns that contain only numbers, or only times, or empty cells; the value is whether they are times in text
-    form."""
+    """Columns that contain only numbers, or only times, or empty cells, apart from a few cells; the value is whether
+    they are times in text form."""
     if path.suffix.lower() == ".parquet":
         return {name: kind for name in dict.fromkeys(columns) if (kind := _is_parquet_clock(path, name)) is not None}
-    head, *rows = next(iter(read_line_blocks(path, "table", _SNIFFED_LINES + 1)), [""])
-    separator = max(",;\t", key=head.count)
-    kinds: list[set[bool | None]] = [set() for _ in columns]
-    for line in rows:
-        try:
-            cells = next(csv.reader([line], delimiter=separator), [])
-        except csv.Error:
-            continue
-        for k, cell in enumerate(cells[: len(columns)]):
-            if cell.strip().lower() not in _MISSING_WORDS:
-                kinds[k].add(_is_clock_time(cell))
-    return {name: True in kind for name, kind in zip(columns, kinds) if kind in ({True}, {False})}
+    kinds: dict[str, Counter[bool | None]] = {name: Counter() for name in columns}
+    header = read_table_columns(path)
+    for name in columns:
+        if (base := split_component(name, header)) is not None:
+            kinds[name][False], kinds[base][None] = 1, 1
+    open_columns = {k for k, name in enumerate(columns) if columns.count(name) == 1 and not kinds[name]}
+    for rows in itertools.islice(iterate_samples(path), _MAX_BLOCKS):
+        for cells in rows:
+            for k in open_columns:
+                if k < len(cells) and not is_missing(cells[k]):
+                    kinds[columns[k]][_is_clock_time(cells[k])] += 1
+        if all(kinds[columns[k]] for k in open_columns):
+            break
+    shares = {(name, k): n / counts.total() for name, counts in kinds.items() for k, n in counts.items()}
+    return {name: kind for (name, kind), share in shares.items() if kind is not None and share >= _MIN_NUMBERS}
 
 
 def _is_clock_time(cell: str) -> bool | None:

@@ -21,6 +21,7 @@ from nerg_mi.rays.guess import (
     propose_imports,
 )
 from nerg_mi.rays.rays import Rays
+from nerg_mi.rays.readers import tables
 from nerg_mi.rays.readers.columns import ColumnFinder, are_degrees, find_roles, parse_time_unit
 from tests.cli.rays.running import run
 from tests.rays.readers.examples import EXAMPLES
@@ -602,3 +603,31 @@ def test_the_command_is_printed_and_nothing_is_written(tmp_path):
     assert any(line.startswith("guess  y is up and the unit m") for line in lines)
     path.write_text("a,b\n1,2\n")
     assert run("guess", path).output.splitlines()[-1] == "no command can be proposed"
+
+
+def test_rows_without_gaze_at_the_beginning(tmp_path, monkeypatch):
+    """The proposal is that of the rows with gaze, even in a later block."""
+    rng = np.random.default_rng(4)
+    values = np.hstack([rng.normal([5, 1.6, 9], [2, 0.03, 2], (400, 3)), rng.normal([0, 0, 1], 0.1, (400, 3))])
+    values[:, 3:] /= np.linalg.norm(values[:, 3:], axis=1, keepdims=True)
+    header = "timestamp_ms,eye_x,eye_y,eye_z,look_x,look_y,look_z\n"
+    write = lambda rows: (tmp_path / "t.csv").write_text(header + "".join(rows))
+    rows = [f"{10 * k}," + ",".join(f"{v:.6f}" for v in row) + "\n" for k, row in enumerate(values)]
+    write(rows)
+    expected = propose_import(tmp_path / "t.csv")
+    empty = [f"{10 * (k - 350)},,,,,,\n" for k in range(350)]
+    for block_rows in (1 << 16, 100):
+        monkeypatch.setattr(tables, "BLOCK_ROWS", block_rows)
+        write([*empty, *rows])
+        proposal = propose_import(tmp_path / "t.csv")
+        assert proposal.command == expected.command and "--up y" in proposal.command
+
+
+def test_tables_for_excel_and_vectors_in_cells(tmp_path):
+    rows = [f'{k / 50:.2f};"(1.0{k % 10}, 1.6, 2.0)";"(0.6, 0.0, 0.8)"' for k in range(60)]
+    text = "\n".join(["sep=;", "time;GazeOrigin;GazeDirection", *rows])
+    (tmp_path / "t.csv").write_bytes(text.encode("utf-16"))
+    proposal = propose_import(tmp_path / "t.csv")
+    assert proposal.columns.origin == ("GazeOrigin.x", "GazeOrigin.y", "GazeOrigin.z")
+    assert proposal.columns.direction == ("GazeDirection.x", "GazeDirection.y", "GazeDirection.z")
+    assert proposal.columns.t == "time" and proposal.options["--up"] == "y"

@@ -22,9 +22,10 @@ from nerg_mi.maths.coordinates import check_near_origin
 from nerg_mi.ranges import FLAG, MAX_COORDINATE, RANGE, TIME_UNITS, Range, ValidatedDataclass
 from nerg_mi.rays.rays import COLUMNS, FRAME, Rays
 
+from .cells import MISSING_WORDS
 from .columns import ColumnFinder, may_be_validity_column, parse_time_unit
 from .poses import FilledOriginFinder, find_fill_values, is_aimed
-from .tables import TableBlock, iterate_table, read_table_columns
+from .tables import TableBlock, iterate_table, read_table_columns, split_component
 
 # ---- Frames ----
 #
@@ -91,7 +92,7 @@ MAX_LISTED_RUNS = 500_000
 
 _MAX_UNUSED_NAMES = 256  # names of unused columns in the metadata
 
-_MISSING_NAMES = {"nan", "none", "null", "n/a", "<na>"}  # written by programs for a missing name
+_MISSING_NAMES = MISSING_WORDS - {"na"}  # written by programs for a missing name; NA may be initials
 
 _EYE_DISTANCE = "eye_distance"  # a column while reading; then the median per participant in the metadata
 
@@ -183,8 +184,8 @@ class RaysBuilder:
 
         ``also_used`` are columns that are read separately.
         """
-        used = {*numbers, *texts, *also_used}
         available = read_table_columns(path) if header is None else header
+        used = {split_component(name, available) or name for name in (*numbers, *texts, *also_used)}
         self.add_unused_columns(name for name in available if name and name not in used)
         for name, tick in (clocks or {}).items():
             unit = parse_time_unit(name)

@@ -12,7 +12,8 @@ import numpy as np
 
 from nerg_mi.errors import NergError, sanitize
 
-from .tables import read_table_columns
+from .cells import AXES, is_missing
+from .tables import find_vector_columns, read_table_columns
 
 # ---- Columns of a table by their usual names ----
 
@@ -24,10 +25,11 @@ class ColumnFinder:
 
     Spaces and dots count as underscores, and case is ignored. If no column matches, names are split into words:
     ``gazeOrigin_x``, ``GazeOriginX`` and ``gaze origin [x]`` are ``gaze_origin_x``. Units in brackets are ignored.
+    Columns of vectors, ``GazeOrigin`` with cells (1, 2, 3), have the columns ``GazeOrigin.x``, ``GazeOrigin.y``, ...
     """
 
     def __init__(self, path: Path) -> None:
-        self.path, self.columns = path, read_table_columns(path)
+        self.path, self.columns = path, [*read_table_columns(path), *find_vector_columns(path)]
         self._by_name = {re.sub(r"[ .]", "_", c).lower(): c for c in reversed(self.columns)}
         self._by_words = {split_column_name(c): c for c in reversed(self.columns)}
 
@@ -104,7 +106,8 @@ def split_column_name(column: str) -> str:
 # of the eye in the head's frame. A direction may also be two angles: ``azel=azimuth,elevation`` (right and up) or
 # ``yawpitch=yaw,pitch`` (turning as those of ``ypr``); ``-`` before a column name negates it. For the checks:
 # ``head=fx,fy,fz`` or ``head=qx,qy,qz,qw``, the direction or rotation of the head if ``direction`` is in the table's
-# frame, and ``eyes=lx,ly,lz,rx,ry,rz``, the positions of both eyes.
+# frame, and ``eyes=lx,ly,lz,rx,ry,rz``, the positions of both eyes. A column ``c`` with vectors such as (1, 2, 3) in
+# its cells is ``c.x,c.y,c.z``, or ``c`` alone for origin, direction, eye, hit and xyzw.
 
 _COLUMN_COUNTS = {
     **dict.fromkeys(("origin", "direction", "eye", "hit"), (3,)),
@@ -118,6 +121,8 @@ _COLUMN_COUNTS = {
     "head": (3, 4),
     "eyes": (6,),
 }
+# Fields that may name one column, whose cells contain vectors.
+_VECTOR_FIELDS = ("origin", "direction", "eye", "hit", "xyzw")
 POSE_FIELDS = ("xyzw", "wxyz", "ypr", "matrix")
 ANGLE_FIELDS = ("azel", "yawpitch")
 
@@ -218,9 +223,14 @@ class ColumnMap:
                 raise NergError(
                     f"column map: {key!r} is unknown or given twice; use {', '.join(_COLUMN_COUNTS)}, each once"
                 )
+            if len(columns) == 1 and key in _VECTOR_FIELDS:
+                columns = tuple(f"{columns[0]}.{axis}" for axis in AXES[: _COLUMN_COUNTS[key][0]])
             if len(columns) not in _COLUMN_COUNTS[key]:
                 needed = " or ".join(map(str, _COLUMN_COUNTS[key]))
-                raise NergError(f"column map: {key} needs {needed} column name(s), got {len(columns)} in {word!r}")
+                raise NergError(
+                    f"column map: {key} needs {needed} column name(s), got {len(columns)} in {word!r}; the parts of "
+                    "vectors in the cells of a column c are c.x, c.y, c.z and c.w"
+                )
             fields_by_name[key] = columns[0] if _COLUMN_COUNTS[key] == (1,) else columns
         return cls(**fields_by_name)
 
@@ -285,7 +295,7 @@ _VALIDITY_WORDS = {
 _VALID = ("valid", "true", "tracked", "tracking", "ok", "yes")
 _INVALID = (
     *("invalid", "false", "lost", "untracked", "nottracked", "nottracking", "notvalid", "no", "none", "limited"),
-    *("adjust", "calibrating", "unavailable", "missing", "error", "nan", "null", "na", ""),
+    *("adjust", "calibrating", "unavailable", "error", ""),
 )
 _VARJO_CODES = {0, 1, 2}  # invalid, being calibrated, valid
 _MAX_VALUES = 6
@@ -312,6 +322,7 @@ def find_valid_values(column: str, values: Iterable[str]) -> list[str] | None:
     on the device. A gaze status with codes up to 2 is that of Varjo: 0 invalid, 1 calibrating, 2 valid.
     """
     words = {value: re.sub(r"[^a-z0-9.]", "", value.lower()) for value in values}
+    words |= {value: "" for value in words if is_missing(value)}
     codes = {value: float(value) for value in words if re.fullmatch(r"\s*[+-]?\d{1,9}(\.0*)?\s*", value)}
     name = split_column_name(column).replace("_", "")
     is_status = name.endswith(("status", "state", "code"))

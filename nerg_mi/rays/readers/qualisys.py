@@ -15,6 +15,7 @@ from nerg_mi.errors import NergError, sanitize
 from nerg_mi.files.safe_read import BadLineCallback, read_line_blocks, resolve_path
 
 from .base import GENERATED_FILES, RaysBuilder, Signature, TrackingFrame, option
+from .cells import is_missing
 from .columns import ColumnFinder
 from .table import person_from_filename
 
@@ -28,7 +29,6 @@ from .table import person_from_filename
 _COLUMN_NAMES = ("x pos", "y pos", "z pos", "x vec", "y vec", "z vec")
 _BLOCK = 1 << 16  # lines converted at a time
 _HEADER_LINES = 200
-_MISSING_WORDS = {"", "nan", "null", "-"}
 _FILE_KIND = "file of gaze vectors"
 
 
@@ -104,7 +104,7 @@ def _read_layout(path: Path) -> GazeVectorLayout:
             return _make_layout(
                 path, number + 1, tuple(i for i in indices if i is not None), time, header, len(cells) - (not cells[-1])
             )
-        if re.match(r"[A-Za-z_]", cells[0]) and cells[0].lower() not in _MISSING_WORDS:
+        if re.match(r"[A-Za-z_]", cells[0]) and not is_missing(cells[0]):
             header[cells[0].upper()] = cells[1] if len(cells) > 1 else ""
         elif len(cells) in (6, 8):
             # Without column names: six numbers, possibly after the number and the time of the sample.
@@ -140,7 +140,7 @@ def _split_cells(line: str) -> list[str]:
 
 
 def _parse_number(cell: str) -> float:
-    return np.nan if cell.lower() in _MISSING_WORDS else float(cell)
+    return np.nan if is_missing(cell) else float(cell)
 
 
 # ---- Readers ----

@@ -122,7 +122,7 @@ def _compute_rays(values: np.ndarray, num_eyes: int) -> tuple[np.ndarray, np.nda
 def _find_unusable(values: np.ndarray) -> dict[str, np.ndarray]:
     """`poses.find_unusable_quaternions` of any of the poses (n, P, 7)."""
     reasons = poses.find_unusable_quaternions(values[:, :, 3:].reshape(-1, 4))
-    return {reason: mask.reshape(values.shape[:2]).any(axis=1) for reason, mask in reasons.items()}
+    return {reason: np.asarray(mask.reshape(values.shape[:2]).any(axis=1)) for reason, mask in reasons.items()}
 
 
 def _make_prefixes(side: str) -> tuple[str, ...]:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import csv
 import datetime
+import itertools
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from typing import Any, NamedTuple
 
@@ -15,6 +16,8 @@ import numpy as np
 from nerg_mi.errors import NergError, sanitize
 from nerg_mi.files.safe_read import BadLineCallback, read_line_blocks, translate_read_errors
 from nerg_mi.rays.rays import open_parquet
+
+from .cells import AXES, MISSING_WORDS, count_components, is_missing, parse_vectors, quote_vectors
 
 BLOCK_ROWS = 1 << 16  # rows converted at a time, to bound memory
 MAX_COLUMNS = 1 << 14  # maximum number of columns of a table
@@ -25,8 +28,6 @@ _MAX_TEXT_BLOCK = 1 << 26
 
 # Minimum memory of a row, in bytes.
 _ROW_BYTES = 32
-
-_MISSING_WORDS = {"", "nan", "na", "n/a", "null", "none", "-"}
 
 _DECIMAL = re.compile(r"\s*[+-]?\d*([.,])\d*([eE][+-]?\d+)?\s*")
 
@@ -47,11 +48,91 @@ def read_table_columns(path: str | os.PathLike) -> list[str]:
     if str(path).lower().endswith(".parquet"):
         with open_parquet(path, "table", _ROW_BYTES) as table:
             return list(table.schema_arrow.names)
-    with closing(read_line_blocks(path, "table", 1)) as blocks:
-        return _parse_header(path, next(blocks, [""])[0])[0]
+    with closing(read_line_blocks(path, "table", _HEADER_LINES)) as blocks:
+        return _parse_header(path, next(blocks, [])).columns
+
+
+def find_vector_columns(path: str | os.PathLike) -> list[str]:
+    """Names of the components of columns whose cells contain vectors: ``Gaze.x``, ``Gaze.y``, ``Gaze.z`` for cells such
+    as (1, 2, 3) in a column ``Gaze``. `iterate_table` reads them as numbers."""
+    columns, cells = read_table_columns(path), dict[int, list[str]]()
+    if str(path).lower().endswith(".parquet"):
+        for name, values in _read_parquet_texts(path).items():
+            cells[columns.index(name)] = [text for v in values if not is_missing(text := "" if v is None else str(v))]
+    else:
+        for row in next(iterate_samples(path), []):
+            for k, cell in enumerate(row[: len(columns)]):
+                if not is_missing(cell):
+                    cells.setdefault(k, []).append(cell)
+    names = ((columns[k], AXES[: count_components(column[:_VECTOR_ROWS])]) for k, column in sorted(cells.items()))
+    return [f"{name}.{axis}" for name, axes in names if name and columns.count(name) == 1 for axis in axes]
+
+
+def _read_parquet_texts(path: str | os.PathLike) -> dict[str, list[Any]]:
+    """First cells of the columns of a Parquet table that are neither numbers nor times."""
+    import pyarrow as pa
+
+    is_number = lambda kind: pa.types.is_primitive(kind) or pa.types.is_decimal(kind)
+    with open_parquet(path, "table", _ROW_BYTES) as table:
+        schema = table.schema_arrow
+        fields = (schema.field(k) for k in range(len(schema.names)))
+        names = [field.name for field in fields if not is_number(field.type) and schema.names.count(field.name) == 1]
+        with translate_read_errors(path, "table", extra_errors=(pa.ArrowException,)):
+            batch = next(table.iter_batches(batch_size=_SAMPLED_ROWS, columns=names), None) if names else None
+            return batch.to_pydict() if batch is not None else {}
+
+
+def split_component(name: str, columns: Sequence[str]) -> str | None:
+    """The column of the cells with vectors of which ``name`` is a component, such as ``Gaze`` for ``Gaze.x``; None for
+    a name in ``columns``, and any other name."""
+    base, _, axis = name.rpartition(".")
+    return base if name not in columns and base in columns and axis and axis in AXES else None
 
 
 def iterate_table(
+    path: str | os.PathLike,
+    numbers: Sequence[str],
+    texts: Sequence[str] = (),
+    header: Sequence[str] | None = None,
+    on_bad_line: BadLineCallback | None = None,
+    **options: Any,
+) -> Iterator[TableBlock]:
+    """Iterate over columns of a table in blocks, as `_iterate_cells` with its ``options``.
+
+    A number ``Gaze.x`` is the first component of the vectors in the cells of a column ``Gaze``, if no column has its
+    name; all components of a vector must be requested.
+    """
+    available = (header or read_table_columns(path)) if any(name[-2:-1] == "." for name in numbers) else ()
+    bases = {name: base for name in numbers if (base := split_component(name, available))}
+    if not bases:
+        yield from _iterate_cells(path, numbers, texts, header, on_bad_line, **options)
+        return
+    plain = [name for name in numbers if name not in bases]
+    words = list(dict.fromkeys((*texts, *bases.values())))
+    for block in _iterate_cells(path, plain, words, header, on_bad_line, **options):
+        value, is_bad = dict(zip(plain, block.numbers.T)), np.zeros(len(block.lines), bool)
+        for base in dict.fromkeys(bases.values()):
+            names = [f"{base}.{axis}" for axis in AXES if bases.get(f"{base}.{axis}") == base]
+            cells = block.texts[:, words.index(base)]
+            vectors, is_other = parse_vectors(cells.tolist(), len(names))
+            for row in np.flatnonzero(is_other & ~is_bad):
+                cell = sanitize(str(cells[row]), 60)
+                reason = f", column {sanitize(base, 40)!r}: {cell!r} is not {len(names)} numbers; correct the cell"
+                _report_bad_line(path, int(block.lines[row]), f"{reason} or the columns", on_bad_line)
+            value |= zip(names, vectors.T)
+            is_bad |= is_other
+        stacked = np.stack([value[name] for name in numbers], axis=1)
+        if not is_bad.all():
+            yield TableBlock(stacked[~is_bad], block.texts[~is_bad, : len(texts)], block.lines[~is_bad])
+
+
+def _report_bad_line(path: str | os.PathLike, line: int, reason: str, on_bad_line: BadLineCallback | None) -> None:
+    if on_bad_line is None:
+        raise NergError(f"{path}, line {line}{reason}, or skip such lines with --skip-bad-lines")
+    on_bad_line(line, reason)
+
+
+def _iterate_cells(
     path: str | os.PathLike,
     numbers: Sequence[str],
     texts: Sequence[str] = (),
@@ -63,11 +144,11 @@ def iterate_table(
     clocks: Mapping[str, float] | None = None,
     on_note: Callable[..., None] | None = None,
 ) -> Iterator[TableBlock]:
-    """Iterate over columns of a table in blocks of at most `BLOCK_ROWS` rows.
+    """Iterate over columns of a table in blocks of about `BLOCK_ROWS` rows.
 
-    The separator (comma, semicolon or tab) is detected in the header, and the decimal sign (point or comma) in the
-    first number that has one. Empty cells and nan, na, null or none are NaN. Cells are converted with pyarrow if it is
-    installed, with the same results.
+    The separator (comma, semicolon or tab) is read from a first line such as ``sep=;``, or detected in the header, and
+    the decimal sign (point or comma) in the first number that has one. Missing values are NaN (`is_missing`). Cells are
+    converted with pyarrow if it is installed, with the same results.
 
     Parameters
     ----------
@@ -97,24 +178,21 @@ def iterate_table(
     if str(path).lower().endswith(".parquet"):
         yield from _iterate_parquet(path, numbers, texts, clocks or {}, on_note)
         return
-    count, layout, convert = 0, None, None
+    blocks = read_line_blocks(path, "table", BLOCK_ROWS)
+    first = next(blocks, [])
+    if header is None:
+        top = _parse_header(path, first)
+    else:
+        top = _Header(list(header), separator, first_line - 1, False)
+    check_columns(path, [*numbers, *texts], top.columns)
+    number_at, text_at = ([top.columns.index(name) for name in names] for names in (numbers, texts))
+    layout, convert = _Layout(top.separator, top.columns, number_at, text_at, ".", {}, len(top.columns)), None
     days: dict[int, DayCounter] = {}
-    for raw in read_line_blocks(path, "table", BLOCK_ROWS):
-        skip = max(0, first_line - 1 - count)
-        raw, count = raw[skip:], count + min(skip, len(raw))
-        if layout is None and raw:
-            columns = list(header or ())
-            if header is None:
-                columns, separator = _parse_header(path, raw[0])
-                raw, count = raw[1:], count + 1
-            check_columns(path, [*numbers, *texts], columns)
-            number_at, text_at = ([columns.index(name) for name in names] for names in (numbers, texts))
-            layout = _Layout(separator, columns, number_at, text_at, ".", {}, len(columns))
-        blank = [line.isspace() for line in raw]
-        lines = count + 1 + np.flatnonzero(~np.array(blank, dtype=bool))
-        rows = raw if len(lines) == len(raw) else [line for line, is_blank in zip(raw, blank) if not is_blank]
-        count += len(raw)
-        if rows and layout is not None:
+    for raw, starts in _iterate_rows(itertools.chain([first[top.size :]], blocks), layout, top):
+        blank = np.array([line.isspace() for line in raw], dtype=bool)
+        lines = starts[~blank]
+        rows = list(itertools.compress(raw, ~blank)) if blank.any() else raw
+        if rows:
             if convert is None:
                 layout = _detect_spelling(layout, rows, clocks or {})
                 convert = _make_arrow_converter(layout) or (lambda rows: None)
@@ -128,8 +206,6 @@ def iterate_table(
                 column[:] = counter.unwrap(column)
             if len(block.lines):
                 yield block
-    if layout is None and header is None:
-        check_columns(path, [*numbers, *texts], [])
 
 
 class _Layout(NamedTuple):
@@ -163,12 +239,13 @@ def _detect_spelling(layout: _Layout, rows: list[str], clocks: Mapping[str, floa
         if not layout.accepts(len(cells), cells[-1] if cells else ""):
             continue
         row_cells = row_cells or len(cells)
-        for k in [k for k in pending if cells[k].strip().lower() not in _MISSING_WORDS]:
+        for k in [k for k in pending if not is_missing(cells[k])]:
             pending.remove(k)
             time = parse_clock_seconds(cells[k])
             if time is not None:
                 times[k] = ticks[k], time[1]
-        signs = (match[1] for k in layout.number_at if k not in times and (match := _DECIMAL.fullmatch(cells[k])))
+        values = (cells[k] for k in layout.number_at if k not in times and not is_missing(cells[k]))
+        signs = (match[1] for cell in values if (match := _DECIMAL.fullmatch(cell)))
         decimal = decimal or next(signs, "")
         if decimal and not pending:
             break
@@ -183,18 +260,121 @@ def _split_cells(row: str, separator: str) -> list[str] | None:
         return None
 
 
-def _parse_header(path: str | os.PathLike, line: str) -> tuple[list[str], str]:
-    """Parse the header: column names, and the separator."""
-    line = line.rstrip("\r\n")
+# The first line of tables for Excel that names the separator; saved by another program, it has empty cells.
+_SEPARATOR_LINE = re.compile(r'"?sep=(\\t|[^"])"?(?:[,;\t ]|\1)*', re.IGNORECASE)
+
+_HEADER_LINES = 16  # lines in which the header ends
+_SAMPLED_ROWS = 400  # rows of a block that are searched for vectors
+_VECTOR_ROWS = 100  # cells of a column that must be vectors
+_MAX_RECORD_LINES = 100  # lines of one row whose cells contain line breaks in quotes
+
+
+class _Header(NamedTuple):
+    """The first lines of a CSV."""
+
+    columns: list[str]
+    separator: str
+    size: int  # lines before the first row
+    quotes_vectors: bool  # whether the rows have vectors in brackets whose separators would split them
+
+
+def _parse_header(path: str | os.PathLike, lines: Sequence[str]) -> _Header:
+    """Parse the header in the first ``lines`` of a CSV."""
+    match = _SEPARATOR_LINE.fullmatch(lines[0].rstrip("\r\n")) if lines else None
+    size = 1 if match else 0
+    line = lines[size] if size < len(lines) else ""
+    separator = match[1].replace("\\t", "\t") if match else _find_separator(line)
+    while _is_open(line, separator) and size < min(len(lines) - 1, _HEADER_LINES):
+        size += 1
+        line = f"{line.rstrip()} {lines[size]}"
+    columns = _split_header(path, line.rstrip("\r\n"), separator)
+    header = _Header(columns, separator, size + 1, False)
+    width = _Layout(separator, columns, [], [], ".", {}, len(columns))
+    num_rows = [0, 0]
+    for row in _sample_rows(lines[size + 1 :]):
+        if "(" in row or "[" in row or "{" in row:
+            for k, text in enumerate((row, quote_vectors(row, separator))):
+                cells = _split_cells(text, separator) or [""]
+                num_rows[k] += width.accepts(len(cells), cells[-1])
+    return header._replace(quotes_vectors=num_rows[1] > num_rows[0])
+
+
+def _find_separator(line: str) -> str:
+    """The most frequent separator of a header, outside of quotes and brackets if there is one."""
+    outside = re.sub(r'"[^"]*"|\([^)]*\)|\[[^\]]*\]', "", line)
+    return max(",;\t", key=lambda sign: (outside.count(sign), line.count(sign)))
+
+
+def iterate_samples(path: str | os.PathLike) -> Iterator[list[list[str]]]:
+    """Cells of about `_SAMPLED_ROWS` rows of each block of a CSV, the first ones and some of the others."""
+    with closing(read_line_blocks(path, "table", BLOCK_ROWS)) as blocks:
+        first = next(blocks, [])
+        header = _parse_header(path, first)
+        layout = _Layout(header.separator, header.columns, [], [], ".", {}, len(header.columns))
+        for rows, _ in _iterate_rows(itertools.chain([first[header.size :]], blocks), layout, header):
+            yield [_split_cells(row, header.separator) or [] for row in _sample_rows(rows)]
+
+
+def _sample_rows(rows: Sequence[str]) -> list[str]:
+    half = _SAMPLED_ROWS // 2
+    return [row for row in (*rows[:half], *rows[half :: len(rows) // half + 1]) if not row.isspace()]
+
+
+def _is_open(text: str, separator: str) -> bool:
+    """Whether a quoted cell of a row begins in ``text``, but does not end."""
+    if '"' not in text:
+        return False
+    cells = re.finditer(rf'(?:^|{re.escape(separator)})"(?:[^"]|"")*("?)', text)
+    return any(not match[1] for match in cells)
+
+
+def _iterate_rows(
+    blocks: Iterable[list[str]], layout: _Layout, header: _Header
+) -> Iterator[tuple[list[str], np.ndarray]]:
+    """Join lines to rows with line breaks in quoted cells, in which spaces replace them; returns blocks of rows and
+    their first lines (n,)."""
+    rest, line = list[str](), header.size + 1
+    for block in blocks:
+        block = rest + block
+        rows, starts, rest = _join_lines(block, layout) if any(r.count('"') % 2 for r in block) else (block, None, [])
+        starts = np.arange(len(rows)) if starts is None else np.array(starts, np.int64)
+        if header.quotes_vectors:
+            rows = [quote_vectors(row, layout.separator) for row in rows]
+        yield rows, line + starts
+        line += len(block) - len(rest)
+    if rest:
+        yield rest, line + np.arange(len(rest))
+
+
+def _join_lines(lines: list[str], layout: _Layout) -> tuple[list[str], list[int], list[str]]:
+    """Rows, the indices of their first lines, and the lines of a row that continues after ``lines``. Lines are joined
+    if this gives a row with the cells of the header: a stray quotation mark must not join others."""
+    rows, starts, k = [], [], 0
+    while k < len(lines):
+        row, end = lines[k], k + 1
+        if row.count('"') % 2 and _is_open(row, layout.separator):
+            while _is_open(row, layout.separator) and end < len(lines) and end - k < _MAX_RECORD_LINES:
+                row, end = f"{row.rstrip()} {lines[end]}", end + 1
+            if _is_open(row, layout.separator) and end == len(lines) and end - k < _MAX_RECORD_LINES:
+                return rows, starts, lines[k:]
+            cells = _split_cells(row, layout.separator) or [""]
+            if _is_open(row, layout.separator) or not layout.accepts(len(cells), cells[-1]):
+                row, end = lines[k], k + 1
+        rows.append(row)
+        starts.append(k)
+        k = end
+    return rows, starts, []
+
+
+def _split_header(path: str | os.PathLike, line: str, separator: str) -> list[str]:
     if line.startswith("Format Version,"):
         raise NergError(f'"{path}" is an export of OptiTrack\'s Motive; import it with --preset motive')
-    separator = max(",;\t", key=line.count)
     if line.count(separator) >= MAX_COLUMNS:
         raise NergError(
             f'the table "{path}" has more columns than the maximum of {MAX_COLUMNS:,}; provide one with fewer'
         )
     try:
-        return [c.strip() for c in next(csv.reader([line], delimiter=separator))] if line else [], separator
+        return [c.strip() for c in next(csv.reader([line], delimiter=separator))] if line else []
     except csv.Error as error:
         raise NergError(f'the first line of the table "{path}" is not a header ({error}); is it a table?') from error
 
@@ -229,7 +409,7 @@ def _make_arrow_converter(layout: _Layout) -> Callable[[list[str]], tuple[np.nda
             },
             null_values=[
                 "",
-                *(spelt for word in _MISSING_WORDS if word for spelt in (word, word.upper(), word.title())),
+                *(spelt for word in MISSING_WORDS if word for spelt in (word, word.upper(), word.title())),
             ],
             strings_can_be_null=False,
             decimal_point=layout.decimal,
@@ -267,7 +447,7 @@ def _make_arrow_converter(layout: _Layout) -> Callable[[list[str]], tuple[np.nda
 
 def _parse_clock_column(cells: Sequence[str], tick: float, dated: bool) -> np.ndarray | None:
     """Times (n,) in units of ``tick`` seconds; None if a cell is not a time, or differs in whether it has a date."""
-    times = [np.nan if cell.strip().lower() in _MISSING_WORDS else _parse_clock(cell, tick, dated) for cell in cells]
+    times = [np.nan if is_missing(cell) else _parse_clock(cell, tick, dated) for cell in cells]
     return None if None in times else np.array(times, np.float64)
 
 
@@ -318,9 +498,7 @@ def _convert_slowly(
     for row, line in zip(rows, lines.tolist()):
         parsed = _parse_cells(row, layout)
         if isinstance(parsed, str):
-            if on_bad_line is None:
-                raise NergError(f"{path}, line {line}{parsed}, or skip such lines with --skip-bad-lines")
-            on_bad_line(line, parsed)
+            _report_bad_line(path, line, parsed, on_bad_line)
             continue
         cells, numbers = parsed
         values.append(numbers)
@@ -349,7 +527,7 @@ def _parse_cells(row: str, layout: _Layout) -> tuple[list[str], list[float]] | s
     numbers = []
     for k in layout.number_at:
         word = cells[k].strip()
-        number = np.nan if word.lower() in _MISSING_WORDS else _parse_number(word, k, layout)
+        number = np.nan if is_missing(word) else _parse_number(word, k, layout)
         if number is None:
             cell = f"column {sanitize(layout.columns[k], 40)!r}: {sanitize(word, 60)!r}"
             return f", {cell} {_explain_bad_number(word, k, layout)}"

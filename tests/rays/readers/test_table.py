@@ -268,6 +268,26 @@ def test_matrices_and_quaternions_that_are_no_rotations_are_dropped_by_name(tmp_
     assert [(rows, "quaternion" in reason) for reason, rows in dropped(rays).items()] == [([[5, 5]], True)]
 
 
+def test_vectors_in_one_cell(tmp_path, heads):
+    origin, turn = heads
+    vector = lambda v: '"(' + ", ".join(map(repr, map(float, v))) + ')"'
+    rows = [f"{vector(o + 1)},{vector(q)},{k}" for k, (o, q) in enumerate(zip(origin, turn.as_quat()))]
+    for name, text in (("quoted", "\n".join(rows)), ("bare", "\n".join(rows).replace('"', ""))):
+        path = tmp_path / f"{name}.csv"
+        path.write_text("Position,Rotation,t\n" + text)
+        rays = read_table(path, "origin=Position xyzw=Rotation t=t")
+        np.testing.assert_allclose(rays.origin, origin + 1)
+        np.testing.assert_allclose(rays.direction, turn.apply([1, 0, 0]), atol=1e-12)
+        assert "unused_columns" not in rays.metadata
+        names = "Rotation.w,Rotation.x,Rotation.y,Rotation.z"
+        same = read_table(path, f"origin=Position.x,Position.y,Position.z wxyz={names} t=t")
+        np.testing.assert_allclose(same.direction, rays.direction)
+        with pytest.raises(NergError, match="'Rotation'.*is not 3 numbers"):
+            read_table(path, "origin=Position direction=Rotation t=t")
+    with pytest.raises(NergError, match="wxyz needs 4 .*c.x"):
+        read_table(path, "origin=Position wxyz=Rotation")
+
+
 def test_fill_values_in_the_heads_frame(tmp_path, heads):
     """Fill values are detected before the rotation of the head."""
     origin, turn = heads

@@ -1,11 +1,14 @@
 """Tests of `nerg_mi.rays.readers.tables`."""
 
+import csv
+
 import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.rays.readers import tables as ray_tables
-from nerg_mi.rays.readers.tables import iterate_table, read_table_columns
+from nerg_mi.rays.readers.cells import parse_vector
+from nerg_mi.rays.readers.tables import find_vector_columns, iterate_table, read_table_columns
 
 
 def read(path, numbers, texts=()):
@@ -92,8 +95,9 @@ def test_bad_lines_are_reported_and_skipped(tmp_path, monkeypatch, bad, fast):
     choose_reader(monkeypatch, fast)
     path, bad_lines = tmp_path / "t.csv", []
     path.write_text("a,b\n" + "".join(f"{i},{i}\n" for i in range(5)) + bad + "7,7\n")
-    (block,) = iterate_table(path, ["a", "b"], on_bad_line=lambda line, why: bad_lines.append((line, why)))
-    assert block.numbers[:, 0].tolist() == [0, 1, 2, 3, 4, 7] and block.lines.tolist() == [2, 3, 4, 5, 6, 8]
+    blocks = list(iterate_table(path, ["a", "b"], on_bad_line=lambda line, why: bad_lines.append((line, why))))
+    assert np.concatenate([block.numbers for block in blocks])[:, 0].tolist() == [0, 1, 2, 3, 4, 7]
+    assert np.concatenate([block.lines for block in blocks]).tolist() == [2, 3, 4, 5, 6, 8]
     assert [line for line, _ in bad_lines] == [7]
     with pytest.raises(NergError, match="t.csv, line 7[:,].*--skip-bad-lines"):
         read(path, ["a", "b"])
@@ -323,3 +327,143 @@ def test_times_of_parquet(tmp_path):
     pq.write_table(pa.table({"t": ["23:59:59", None, "00:00:01"]}), tmp_path / "t.parquet")
     (block,) = iterate_table(tmp_path / "t.parquet", ["t"], clocks={"t": 0.5})
     assert np.allclose(block.numbers[:, 0], [2 * 86399, np.nan, 2 * 86401], equal_nan=True)
+
+
+# ---- Tables for Excel, other encodings, and cells with line breaks or vectors ----
+
+
+def read_all(path, numbers, texts=(), **options):
+    blocks = list(iterate_table(path, numbers, texts, **options))
+    return tuple(np.concatenate([block[k] for block in blocks]) for k in range(3))
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-32"])
+@pytest.mark.parametrize("separator", [";", ",", "\t", "|"])
+@pytest.mark.parametrize("first", ["sep={}", "SEP={}", '"sep={}"', "sep={0}{0}{0}"])
+def test_line_that_names_the_separator(tmp_path, encoding, separator, first):
+    text = f"{first.format(separator)}\nwho;a;b\nann;1;2\nbo;3;4\n".replace(";", separator)
+    (tmp_path / "t.csv").write_bytes(text.replace("\n", "\r\n").encode(encoding))
+    assert read_table_columns(tmp_path / "t.csv") == ["who", "a", "b"]
+    numbers, texts, lines = read_all(tmp_path / "t.csv", ["b", "a"], ["who"])
+    assert numbers.tolist() == [[2, 1], [4, 3]] and texts.tolist() == [["ann"], ["bo"]] and lines.tolist() == [3, 4]
+
+
+def test_bytes_of_another_encoding_are_named(tmp_path):
+    (tmp_path / "t.csv").write_bytes("a,b\n1,2\n".encode("utf-16")[:-1])
+    with pytest.raises(NergError, match="UTF-16"):
+        read(tmp_path / "t.csv", ["a"])
+
+
+MISSING = ["1.#QNAN", "-1.#IND00", "1.#INF", "#N/A", "#NUM!", "#VALUE!", ".", "--", "-", "NULL", "None", "n/a", "NaN"]
+MISSING += ["", "#DIV/0!", "<NA>", "nan(ind)", "-nan(ind)", "N/A", "NaT", "1,#QNAN", " - "]
+
+
+@pytest.mark.parametrize("fast", [True, False])
+@pytest.mark.parametrize("word", MISSING)
+def test_words_for_missing_values(tmp_path, monkeypatch, fast, word):
+    choose_reader(monkeypatch, fast)
+    (tmp_path / "t.csv").write_text(f"a;b;t\n{word};0,5;12:00:00\n1,5;{word};{word}\n")
+    numbers, _, _ = read_all(tmp_path / "t.csv", ["a", "b", "t"], clocks={"t": 1.0})
+    np.testing.assert_array_equal(numbers, [[np.nan, 0.5, 43200], [1.5, np.nan, np.nan]])
+
+
+@pytest.mark.parametrize("fast", [True, False])
+def test_line_breaks_in_quoted_cells(tmp_path, monkeypatch, fast):
+    choose_reader(monkeypatch, fast)
+    monkeypatch.setattr(ray_tables, "BLOCK_ROWS", 3)
+    rows = ['1,"a\nb",2', '3,"c",4', '5,"d\n\n""e"",\nf",6', "7,g,8", '9,"h\r\ni",10', '11,5" h,12']
+    (tmp_path / "t.csv").write_text("\n".join(['x,"te\nxt",y', *rows, ""]), newline="")
+    assert read_table_columns(tmp_path / "t.csv") == ["x", "te xt", "y"]
+    numbers, texts, lines = read_all(tmp_path / "t.csv", ["x", "y"], ["te xt"])
+    np.testing.assert_array_equal(numbers, np.arange(1.0, 13).reshape(6, 2))
+    assert [text.split() for text in texts[:, 0].tolist()] == [
+        *(["a", "b"], ["c"], ["d", '"e",', "f"], ["g"], ["h", "i"], ['5"', "h"])
+    ]
+    assert lines.tolist() == [3, 5, 6, 10, 11, 13]
+
+
+def test_a_stray_quotation_mark_joins_no_lines(tmp_path):
+    rows = [f"{k},{k}\n" for k in range(300)]
+    rows[7], rows[150] = '"7,7\n', '"150,150\n'
+    (tmp_path / "t.csv").write_text("a,b\n" + "".join(rows))
+    bad_lines = []
+    numbers, _, _ = read_all(tmp_path / "t.csv", ["a"], on_bad_line=lambda line, why: bad_lines.append(line))
+    assert bad_lines == [9, 152] and len(numbers) == 298
+
+
+VECTORS = [
+    ("({}, {}, {})", ","),
+    ("({}, {}, {})", ";"),
+    ("[{} {} {}]", ","),
+    ("[{}, {}, {}]", "\t"),
+    ("{};{};{}", ","),
+    ("{} {} {}", ";"),
+    ("X={} Y={} Z={}", ","),
+    ("Vector3({},{},{})", ","),
+    ('{{"x": {}, "y": {}, "z": {}}}', ","),
+    ("<{}|{}|{}>", ","),
+]
+
+
+@pytest.mark.parametrize("is_quoted", [True, False])
+@pytest.mark.parametrize(("form", "separator"), VECTORS)
+def test_vectors_in_cells(tmp_path, form, separator, is_quoted):
+    values = np.random.default_rng(0).normal(size=(30, 2, 3)).round(4)
+    spell = lambda v: form.format(*(repr(float(x)) for x in v))
+    rows = [[str(k), spell(a), spell(b), "x"] for k, (a, b) in enumerate(values)]
+    rows[4][1], rows[5][2] = "", "NaN"
+    values[4, 0] = values[5, 1] = np.nan
+    with open(tmp_path / "t.csv", "w", newline="") as file:
+        if is_quoted:
+            csv.writer(file, delimiter=separator).writerows([["t", "Gaze Origin", "dir", "s"], *rows])
+        else:
+            file.write("\n".join(separator.join(row) for row in [["t", "Gaze Origin", "dir", "s"], *rows]) + "\n")
+    names = ["Gaze Origin.x", "Gaze Origin.y", "Gaze Origin.z", "dir.x", "dir.y", "dir.z"]
+    assert find_vector_columns(tmp_path / "t.csv") == names
+    numbers, texts, _ = read_all(tmp_path / "t.csv", ["t", *names[::-1]], ["s"])
+    np.testing.assert_array_equal(numbers[:, 0], np.arange(30))
+    np.testing.assert_allclose(numbers[:, :0:-1], values.reshape(30, 6))
+    assert set(texts[:, 0].tolist()) == {"x"}
+
+
+@pytest.mark.parametrize("cells", ["(0,100, 0,200, -0,300)", "0,1;0,2;-0,3", "(0,1; 0,2; -0,3)", "0,1 0,2 -0,3"])
+def test_vectors_with_decimal_commas(cells):
+    np.testing.assert_allclose(parse_vector(cells), [0.1, 0.2, -0.3])
+
+
+@pytest.mark.parametrize("cell", ["1,5", "0.5", "12:00:00", "Shelf (1)", "(1)", "a b c", "(1, 2, 3, 4, 5)", "", "x"])
+def test_other_cells_are_no_vectors(cell):
+    assert parse_vector(cell) is None
+
+
+def test_cells_with_other_vectors_are_refused_by_line(tmp_path):
+    rows = ['"(1, 2, 3)"', '"(1, 2, 3, 4)"', "7", '"(5, 6, 7)"']
+    (tmp_path / "t.csv").write_text("p,s\n" + "".join(f"{row},x\n" for row in rows))
+    names = ["p.x", "p.y", "p.z"]
+    with pytest.raises(NergError, match=r"t\.csv, line 3, column 'p'.*\(1, 2, 3, 4\).*3 numbers"):
+        read(tmp_path / "t.csv", names)
+    bad_lines = []
+    numbers, texts, lines = read_all(
+        tmp_path / "t.csv", names, ["s"], on_bad_line=lambda line, why: bad_lines.append(line)
+    )
+    assert numbers.tolist() == [[1, 2, 3], [5, 6, 7]] and lines.tolist() == [2, 5] and bad_lines == [3, 4]
+    assert texts.tolist() == [["x"], ["x"]]
+    with pytest.raises(NergError, match=r"q\.x"):
+        read(tmp_path / "t.csv", ["q.x"])
+
+
+def test_vectors_in_cells_of_parquet(tmp_path):
+    pa = pytest.importorskip("pyarrow")
+    from pyarrow import parquet
+
+    lists = [[1.0, 2.0, 3.0], None, [4.0, 5.0, 6.0]]
+    columns = {"p": lists, "d": ["(1, 2, 3)", "(4, 5, 6)", ""], "who": ["a", "b", "c"], "n": [1, 2, 3]}
+    parquet.write_table(pa.table(columns), tmp_path / "t.parquet")
+    names = find_vector_columns(tmp_path / "t.parquet")
+    assert names == ["p.x", "p.y", "p.z", "d.x", "d.y", "d.z"]
+    numbers, texts, _ = read_all(tmp_path / "t.parquet", [*names, "n"], ["who"])
+    nan = np.nan
+    np.testing.assert_array_equal(
+        numbers, [[1, 2, 3, 1, 2, 3, 1], [nan, nan, nan, 4, 5, 6, 2], [4, 5, 6, nan, nan, nan, 3]]
+    )
+    assert texts[:, 0].tolist() == ["a", "b", "c"]
