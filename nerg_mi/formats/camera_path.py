@@ -14,6 +14,7 @@ from nerg_mi.errors import NergError, sanitize
 from nerg_mi.files.atomic import write_text
 from nerg_mi.files.safe_read import read_json, translate_read_errors
 from nerg_mi.files.schema import NUMBER, Items, Number, check_json
+from nerg_mi.maths.transforms import check_rigid_transforms
 
 MAX_FRAMES = 100_000
 """Maximum number of frames of a path."""
@@ -71,10 +72,7 @@ def read_camera_path(path: str | os.PathLike) -> CameraPath:
         frames = check_json(data, _PATH)["camera_path"]
         to_world = np.array([frame["camera_to_world"] for frame in frames], np.float64).reshape(-1, 4, 4)
         fov = np.array([frame["fov"] for frame in frames], np.float64)
-        rotation = to_world[:, :3, :3]
-        is_rotation = np.allclose(rotation @ rotation.transpose(0, 2, 1), np.eye(3), atol=1e-3)
-        if not (is_rotation and np.linalg.det(rotation).min() > 0 and np.allclose(to_world[:, 3], (0, 0, 0, 1))):
-            raise ValueError("a camera_to_world is not a rotation and a translation")
+        check_rigid_transforms(to_world, f'the camera_to_world of "{path}"', lambda k: f"frame {k + 1}")
         width, height = int(data["render_width"]), int(data["render_height"])
         fps = float(data.get("fps", 24))
     return CameraPath(to_world, fov, width, height, fps)

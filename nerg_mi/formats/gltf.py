@@ -8,6 +8,7 @@ integers, omits triangle fans and the instances of EXT_mesh_gpu_instancing, and 
 from __future__ import annotations
 
 import json
+import math
 import os
 import struct
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,6 +21,7 @@ from nerg_mi.errors import sanitize
 from nerg_mi.fields.splats import quaternions_to_matrices
 from nerg_mi.files.safe_read import parse_json, translate_read_errors
 from nerg_mi.files.schema import INDEX, NUMBER, Items, Names, check_json
+from nerg_mi.maths.transforms import ROTATION_TOLERANCE, has_last_row
 
 GLTF_MAGIC = b"glTF"  # first bytes of a file
 MAX_GLTF_BYTES = 1 << 30  # maximum size of a file in bytes
@@ -310,8 +312,12 @@ def iter_instances(document: dict[str, Any], *modes: int) -> Iterator[tuple[dict
 def _read_node_matrix(node: dict[str, Any]) -> np.ndarray:
     if "matrix" in node:
         out = np.array(node["matrix"], np.float64).reshape(4, 4).T
+        if not has_last_row(out[None])[0]:
+            raise ValueError("the matrix of a node has another last row than 0, 0, 0, 1; glTF stores its columns")
     else:
         x, y, z, w = (float(v) for v in node.get("rotation", (0, 0, 0, 1)))
+        if not abs(math.hypot(x, y, z, w) - 1) <= ROTATION_TOLERANCE:
+            raise ValueError("the rotation of a node is not a quaternion of length 1")
         out = np.eye(4)
         rotation = quaternions_to_matrices(np.array([[w, x, y, z]]))[0]
         out[:3, :3] = rotation * np.array(node.get("scale", (1, 1, 1)), np.float64).reshape(3)

@@ -23,6 +23,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError, format_error, sanitize
 from nerg_mi.files.safe_read import MAX_JSON_BYTES, is_regular_file, parse_json, read_bytes
+from nerg_mi.maths.transforms import has_last_row, rotation_errors
 
 from .cameras import OPENGL_FROM_MITSUBA
 from .posed import (
@@ -380,7 +381,7 @@ def _is_rigid(m: np.ndarray) -> bool:
     """Return whether ``m``, 3 x 4 or 4 x 4, is a rotation and a translation."""
     if m.shape not in ((3, 4), (4, 4)) or not np.abs(m).max() <= MAX_POSITION:
         return False
-    return bool(np.abs(m[:3, :3] @ m[:3, :3].T - np.eye(3)).max() < 1e-3 and np.linalg.det(m[:3, :3]) > 0)
+    return bool(has_last_row(m[None])[0] and rotation_errors(m[None, :3, :3])[0] < 1e-3)
 
 
 def _read_splits(data: dict, frames: list[PosedFrame]) -> tuple[list[str] | None, list[str]]:

@@ -47,7 +47,9 @@ def test_frames_are_the_cameras_of_the_path(rgb, tmp_path):
     [
         ({"camera_type": "fisheye"}, "fisheye"),
         ({"camera_path": []}, "1 to 100,000"),
-        ({"camera_path": [{"camera_to_world": [2.0] * 16, "fov": 50}]}, "rotation"),
+        ({"camera_path": [{"camera_to_world": np.diag([1.0, 2, 1, 1]).ravel().tolist(), "fov": 50}]}, "rotation"),
+        ({"camera_path": [{"camera_to_world": np.diag([-1.0, 1, 1, 1]).ravel().tolist(), "fov": 50}]}, "mirrored"),
+        ({"camera_path": [{"camera_to_world": (np.eye(4) + np.eye(4, k=-1)).ravel().tolist(), "fov": 50}]}, "last row"),
         ({"camera_path": [{"camera_to_world": np.eye(4).ravel().tolist(), "fov": 200}]}, "fov"),
         ({"camera_path": [{"fov": 50}]}, "camera_to_world"),
         ({"render_width": 0}, "render_width"),

@@ -553,6 +553,8 @@ def test_glb_of_trimesh_is_read_with_nodes(tmp_path):
         ),
         ({"bufferViews": []}, "refers to number 0 of 0 bufferViews"),
         ({"nodes": [{"mesh": 0, "scale": [1, 1, "nan"]}]}, r"nodes\[0\].scale\[2\]"),
+        ({"nodes": [{"mesh": 0, "matrix": [1, 0, 0, 5, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}]}, "last row"),
+        ({"nodes": [{"mesh": 0, "rotation": [0, 0, 0, 0]}]}, "length 1"),
         ({"buffers": [{"uri": "b.bin"}]}, "in another file"),
         (
             {

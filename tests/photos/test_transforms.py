@@ -160,6 +160,10 @@ def test_pipe_is_refused(write, name):
         ({"fl_x": 1.0, "aabb": [[0, 0, 0], [1, 0, 1]], "frames": [frame("a.png")]}, "aabb"),
         ({"fl_x": 1.0, "aabb": "wide", "frames": [frame("a.png")]}, "aabb"),
         ({"fl_x": 1.0, "applied_transform": [[1, 0], [2]], "frames": [frame("a.png")]}, "applied_transform"),
+        (
+            {"fl_x": 1.0, "applied_transform": np.diag([1, 1, 1, 2]).tolist(), "frames": [frame("a.png")]},
+            "applied_transform",
+        ),
         ({"fl_x": 1.0, "applied_scale": 0, "frames": [frame("a.png")]}, "applied_scale"),
         *(
             ({"fl_x": 30.0, **keys, "frames": [frame("a.png")]}, "transforms.json")
