@@ -78,6 +78,7 @@ import mitsuba as mi
 import numpy as np
 
 from nerg_mi.errors import NergError
+from nerg_mi.maths.transforms import has_last_row
 from nerg_mi.registration import register
 from nerg_mi.transport.geometry import pixel_solid_angles
 
@@ -173,7 +174,7 @@ class Panorama(mi.Sensor):
     def _check_to_world(self):
         matrix = np.array(self.world_transform().matrix, dtype=np.float64).reshape(4, 4)
         turn = matrix[:3, :3]
-        if not np.allclose(turn.T @ turn, np.eye(3), atol=1e-3):
+        if not has_last_row(matrix[None])[0] or not np.allclose(turn.T @ turn, np.eye(3), atol=1e-3):
             # mi.Transform4f.rotate does not normalise its axis and gives a shear for an axis that is not a unit vector.
             raise NergError(
                 '"to_world" of a panorama must be a rotation and a translation: remove its scale or shear, '

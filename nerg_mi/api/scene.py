@@ -609,10 +609,7 @@ def _as_transform(matrix: ArrayLike) -> Any:
 
     from nerg_mi.maths.geometry import Similarity
 
-    matrix = np.array(getattr(matrix, "matrix", matrix), np.float64)
-    if matrix.shape != (4, 4):
-        raise NergError(f'"to_world" must have the shape (4, 4), got {matrix.shape}')
-    return mi.ScalarTransform4d(Similarity(matrix).matrix)
+    return mi.ScalarTransform4d(Similarity(np.array(getattr(matrix, "matrix", matrix), np.float64)).matrix)
 
 
 def _format_position(position: Floats) -> str:

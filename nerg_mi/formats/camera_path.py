@@ -14,7 +14,7 @@ from nerg_mi.errors import NergError, sanitize
 from nerg_mi.files.atomic import write_text
 from nerg_mi.files.safe_read import read_json, translate_read_errors
 from nerg_mi.files.schema import NUMBER, Items, Number, check_json
-from nerg_mi.maths.transforms import check_rigid_transforms
+from nerg_mi.maths.transforms import check_rigid_transforms, correct_rotation
 
 MAX_FRAMES = 100_000
 """Maximum number of frames of a path."""
@@ -73,6 +73,7 @@ def read_camera_path(path: str | os.PathLike) -> CameraPath:
         to_world = np.array([frame["camera_to_world"] for frame in frames], np.float64).reshape(-1, 4, 4)
         fov = np.array([frame["fov"] for frame in frames], np.float64)
         check_rigid_transforms(to_world, f'the camera_to_world of "{path}"', lambda k: f"frame {k + 1}")
+        to_world[:, :3, :3] = [correct_rotation(linear) for linear in to_world[:, :3, :3]]
         width, height = int(data["render_width"]), int(data["render_height"])
         fps = float(data.get("fps", 24))
     return CameraPath(to_world, fov, width, height, fps)

@@ -14,6 +14,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.ranges import MAX_COORDINATE
 
 from .coordinates import check_coordinates
+from .transforms import check_rigid_transforms, correct_rotation
 from .types import Array3f, Bool, Float, Point3f, Vector3f
 
 # ---- The axis-aligned box of a field, and its map to the unit cube ----
@@ -294,25 +295,18 @@ class Similarity:
 
     ``matrix``: (4, 4), local (field) to world (scene); default: the identity. ``scale``: length in the scene of one
     unit of the field. Raises ``NergError`` for a shear, a reflection or a non-uniform scale, for which densities and
-    directions have no single scale, and for a translation beyond `MAX_COORDINATE`.
+    directions have no single scale, and for a translation beyond `MAX_COORDINATE`. Rounding errors of the rotation up
+    to `ROTATION_TOLERANCE` are removed.
     """
 
     def __init__(self, matrix: np.ndarray | None = None):
-        m = np.eye(4) if matrix is None else np.asarray(matrix, float)
-        linear = m[:3, :3]
-        determinant = np.linalg.det(linear) if np.all(np.isfinite(m)) else np.nan
-        scale = abs(determinant) ** (1 / 3)
-        if not (
-            determinant > 0
-            and np.array_equal(m[3], [0, 0, 0, 1])
-            and np.allclose(linear @ linear.T, scale**2 * np.eye(3), atol=1e-4 * scale**2)
-        ):
-            raise NergError(
-                '"to_world" of a field must be a rotation, a uniform scale and a translation; bake any other '
-                "transform into the field's training data"
-            )
+        m = np.eye(4) if matrix is None else np.array(matrix, float)
+        if m.shape != (4, 4):
+            raise NergError(f'"to_world" must have the shape (4, 4), got {m.shape}')
+        check_rigid_transforms(m, '"to_world" of a field or an alignment', may_scale=True)
         check_coordinates(m[None, :3, 3], 'the translation of "to_world"')
-        self.matrix, self.scale = m, float(scale)
+        m[:3, :3], m[3] = correct_rotation(m[:3, :3]), (0, 0, 0, 1)
+        self.matrix, self.scale = m, float(np.linalg.det(m[:3, :3]) ** (1 / 3))
         self.inverse = np.linalg.inv(m)
         self.is_identity = bool(np.array_equal(m, np.eye(4)))
 

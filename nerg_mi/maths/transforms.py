@@ -13,6 +13,8 @@ ROTATION_TOLERANCE = 0.01
 """Maximum deviation of an element of R Rᵀ from the identity for a rotation R, and of a unit quaternion's length from
 1: matrices and quaternions that were written with two decimals pass."""
 
+# Deviation of a rotation from orthonormality that is not corrected.
+_ROUNDING = 1e-4
 _LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
 _LAST_ROW_TOLERANCE = 1e-5  # of single precision
 
@@ -51,7 +53,7 @@ def check_rigid_transforms(
         return
     row = int(np.argmax(is_bad))
     where = name if is_single else f"{name}, {label(row)}"
-    raise NergError(f"{where}: {_explain(m[row], errors[row], tolerance)}")
+    raise NergError(f"{where}: {_explain(m[row], errors[row], tolerance, may_scale)}")
 
 
 def has_last_row(matrices: np.ndarray) -> np.ndarray:
@@ -73,7 +75,20 @@ def rotation_errors(linear: np.ndarray, *, may_scale: bool = False) -> np.ndarra
     return np.where(determinant > 0, errors, np.inf)
 
 
-def _explain(m: np.ndarray, error: float, tolerance: float) -> str:
+def nearest_rotation(linear: np.ndarray) -> np.ndarray:
+    """The rotation (3, 3) nearest to a matrix with a positive determinant, which removes scale and rounding errors."""
+    u, _, vt = np.linalg.svd(linear)
+    return u @ vt
+
+
+def correct_rotation(linear: np.ndarray) -> np.ndarray:
+    """``linear`` (3, 3), a rotation times a uniform scale, with its rounding errors removed if they matter."""
+    if rotation_errors(linear[None], may_scale=True)[0] <= _ROUNDING:
+        return linear
+    return np.cbrt(np.linalg.det(linear)) * nearest_rotation(linear)
+
+
+def _explain(m: np.ndarray, error: float, tolerance: float, may_scale: bool) -> str:
     """Why a matrix (4, 4) or (3, 4) is refused, and the remedy."""
     if not np.isfinite(m).all():
         return "it has values that are not finite; correct or remove it"
@@ -87,5 +102,7 @@ def _explain(m: np.ndarray, error: float, tolerance: float) -> str:
         return "it is mirrored (its determinant is negative); exchange two axes or negate one in the file's frame"
     if scale > 0 and rotation_errors(m[None, :3, :3], may_scale=True)[0] <= tolerance:
         return f"it contains a scale of {scale:.6g}; only a rotation and a translation are possible, so divide by it"
-    deviation = f"R Rᵀ differs from the identity by {error:.3g}" if np.isfinite(error) else "its determinant is 0"
-    return f"its upper left 3 x 3 part is not a rotation ({deviation}; at most {tolerance:g}); correct it"
+    deviation = f"R Rᵀ differs from the identity by {error:.3g}; at most {tolerance:g}"
+    deviation = deviation if np.isfinite(error) else "its determinant is 0"
+    kind = "a rotation times a uniform scale" if may_scale else "a rotation"
+    return f"its upper left 3 x 3 part is not {kind} ({deviation}); correct it"

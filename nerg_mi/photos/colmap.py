@@ -24,6 +24,7 @@ from nerg_mi.files.safe_read import (
     open_file,
     resolve_path,
 )
+from nerg_mi.maths.transforms import ROTATION_TOLERANCE
 
 from .observed import MatchedImage, PointTable
 from .posed import MAX_POSITION, FileFinder, MaskFile, PosedFrame, PosedImages, UnusedFrame, format_names, sort_frames
@@ -312,9 +313,11 @@ def _make_pose(record: _ImageRecord) -> np.ndarray:
     from scipy.spatial.transform import Rotation
 
     q, t = record.quaternion, record.translation
-    norm = float(np.linalg.norm(q))
-    if not (1e-6 < norm <= MAX_POSITION and np.abs(t).max() <= MAX_POSITION):
-        raise NergError("not finite, or its quaternion is zero")
+    length = float(np.linalg.norm(q))
+    if not (np.isfinite(length) and np.abs(t).max() <= MAX_POSITION):
+        raise NergError("not finite")
+    if not abs(length - 1) <= ROTATION_TOLERANCE:
+        raise NergError(f"no rotation: the length of its quaternion is {length:.4g} instead of 1")
     back = Rotation.from_quat(np.roll(np.asarray(q, np.float64), -1)).as_matrix().T
     out = np.eye(4)
     out[:3, :3], out[:3, 3] = back, -back @ np.asarray(t, np.float64)

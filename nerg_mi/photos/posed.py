@@ -16,6 +16,7 @@ import numpy as np
 from nerg_mi.errors import NergError, sanitize
 from nerg_mi.files.safe_read import is_regular_file, read_line_blocks, resolve_path
 from nerg_mi.maths.coordinates import check_near_origin
+from nerg_mi.maths.transforms import check_rigid_transforms, nearest_rotation
 
 from .cameras import Intrinsics
 from .observed import ObservedPoints
@@ -338,23 +339,13 @@ def rigid_pose(matrix: object) -> np.ndarray:
         pose = np.asarray(matrix, np.float64)
     except (TypeError, ValueError, OverflowError) as e:
         raise NergError("its pose must be a matrix of 4 x 4 numbers") from e
-    if pose.shape == (3, 4):
-        pose = np.vstack([pose, [0, 0, 0, 1]])
-    if pose.shape != (4, 4) or not np.all(np.isfinite(pose)):
-        raise NergError("its pose must be a matrix of 4 x 4 finite numbers")
-    if np.abs(pose[3] - [0, 0, 0, 1]).max() > 1e-6:
-        raise NergError("the last row of its pose is not 0, 0, 0, 1 (is the matrix transposed?)")
-    rotation = pose[:3, :3]
-    if not np.abs(pose).max() <= MAX_POSITION:
+    if np.isfinite(pose).all() and np.abs(pose).max(initial=0) > MAX_POSITION:
         raise NergError(f"its pose has numbers beyond {MAX_POSITION:g}")
-    scale = np.cbrt(np.linalg.det(rotation))
-    if not scale > 0 or not np.abs(rotation @ rotation.T / scale**2 - np.eye(3)).max() <= 1e-2:
-        raise NergError("its pose is not a rotation and a translation (mirrored, sheared or singular)")
     # Some writers leave a scale in the rotation, or round it; use the nearest rotation.
-    u, _, vt = np.linalg.svd(rotation)
-    pose = pose.copy()
-    pose[:3, :3] = u @ vt
-    return pose
+    check_rigid_transforms(pose, "its pose", may_scale=True)
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = nearest_rotation(pose[:3, :3]), pose[:3, 3]
+    return out
 
 
 def sort_frames(

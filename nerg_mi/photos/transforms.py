@@ -23,7 +23,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError, format_error, sanitize
 from nerg_mi.files.safe_read import MAX_JSON_BYTES, is_regular_file, parse_json, read_bytes
-from nerg_mi.maths.transforms import has_last_row, rotation_errors
+from nerg_mi.maths.transforms import check_rigid_transforms, nearest_rotation
 
 from .cameras import OPENGL_FROM_MITSUBA
 from .posed import (
@@ -178,11 +178,7 @@ def read_dataparser(path: str | Path) -> np.ndarray:
         m, scale = np.asarray(data["transform"], np.float64), float(data["scale"])
     except (KeyError, TypeError, ValueError, OverflowError) as e:
         raise NergError(f'"{path}" needs "transform", 3 x 4 numbers, and "scale"') from e
-    if not _is_rigid(m) or not _SCALE_RANGE[0] <= scale <= _SCALE_RANGE[1]:
-        raise NergError(
-            f'"{path}" needs "transform", a rotation and a translation of 3 x 4 numbers, and a positive "scale"'
-        )
-    return np.vstack([scale * m[:3], [0, 0, 0, 1]])
+    return _make_similarity(m, scale, f'"transform" of "{path}"', f'"scale" of "{path}"')
 
 
 def _parse_json_object(path: Path, raw: bytes) -> dict:
@@ -367,21 +363,24 @@ def _read_original(data: dict, path: Path) -> np.ndarray | None:
     try:
         m = np.eye(4) if matrix is None else np.asarray(matrix, np.float64)
         scale = 1.0 if scale is None else float(scale)
-    except (TypeError, ValueError, OverflowError):
-        m, scale = np.zeros(0), 0.0
-    if not _is_rigid(m) or not _SCALE_RANGE[0] <= scale <= _SCALE_RANGE[1]:
+    except (TypeError, ValueError, OverflowError) as e:
         raise NergError(
             f'"applied_transform" of "{path}" must be a rotation and a translation, 3 x 4 numbers, and '
-            '"applied_scale" positive'
-        )
-    return np.linalg.inv(np.vstack([scale * m[:3], [0, 0, 0, 1]]))
+            '"applied_scale" a positive number'
+        ) from e
+    return np.linalg.inv(_make_similarity(m, scale, f'"applied_transform" of "{path}"', f'"applied_scale" of "{path}"'))
 
 
-def _is_rigid(m: np.ndarray) -> bool:
-    """Return whether ``m``, 3 x 4 or 4 x 4, is a rotation and a translation."""
-    if m.shape not in ((3, 4), (4, 4)) or not np.abs(m).max() <= MAX_POSITION:
-        return False
-    return bool(has_last_row(m[None])[0] and rotation_errors(m[None, :3, :3])[0] < 1e-3)
+def _make_similarity(m: np.ndarray, scale: float, matrix_name: str, scale_name: str) -> np.ndarray:
+    """Return the similarity (4, 4) of a rigid transform ``m`` (3 or 4, 4) that is then scaled."""
+    check_rigid_transforms(m, matrix_name)
+    if not np.abs(m).max() <= MAX_POSITION:
+        raise NergError(f"{matrix_name} has numbers beyond {MAX_POSITION:g}; correct it")
+    if not _SCALE_RANGE[0] <= scale <= _SCALE_RANGE[1]:
+        raise NergError(f"{scale_name} is {scale:g}; it must be {_SCALE_RANGE[0]:g} to {_SCALE_RANGE[1]:g}")
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = scale * nearest_rotation(m[:3, :3]), scale * m[:3, 3]
+    return out
 
 
 def _read_splits(data: dict, frames: list[PosedFrame]) -> tuple[list[str] | None, list[str]]:

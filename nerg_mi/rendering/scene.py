@@ -17,6 +17,7 @@ from nerg_mi.files.images import check_image, ensure_two_threads
 from nerg_mi.files.safe_read import check_regular_file, open_file, resolve_path
 from nerg_mi.formats.meshes import READERS as MESHES
 from nerg_mi.maths.coordinates import check_coordinates
+from nerg_mi.maths.transforms import check_rigid_transforms
 from nerg_mi.properties import resolve_scene_file
 from nerg_mi.ranges import SPP, check_number
 from nerg_mi.transport.geometry import check_shape
@@ -92,10 +93,9 @@ def check_scene(path: str | Path, scene) -> None:
     for shape in scene.shapes():
         check_shape(shape, f' of "{path}"', check_merged=True)
     for index, sensor in enumerate(scene.sensors()):
-        check_coordinates(
-            np.array(sensor.world_transform().matrix, float).reshape(4, 4)[:3, 3:].T,
-            f'the to_world of sensor {index} of "{path}"',
-        )
+        pose, name = np.array(sensor.world_transform().matrix, float).reshape(4, 4), f"the to_world of sensor {index}"
+        check_rigid_transforms(pose, f'{name} of "{path}"', tolerance=np.inf)
+        check_coordinates(pose[:3, 3:].T, f'{name} of "{path}"')
         film, count = sensor.film(), sensor.sampler().sample_count()
         width, height = map(int, film.crop_size())
         if not 0 < width * height <= MAX_PIXELS:
@@ -192,6 +192,15 @@ class _SceneFileChecker:
             if file is not None:
                 self.files.append(file)
                 self._read(file, depth, parents)
+        elif tag == "matrix":
+            # Mitsuba applies transposed matrices as they are.
+            try:
+                numbers = [float(x) for x in value.replace(",", " ").split()]
+            except ValueError:
+                return  # Mitsuba reports the line
+            if len(numbers) == 16:
+                name = f'the matrix in "{path}" (line {parser.CurrentLineNumber})'
+                check_rigid_transforms(np.reshape(numbers, (4, 4)), name, tolerance=np.inf)
         elif tag == "spectrum" and "filename" in values:
             file = self._find(values["filename"], "spectrum")
             if file is not None:

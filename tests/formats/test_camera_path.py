@@ -42,6 +42,9 @@ def test_frames_are_the_cameras_of_the_path(rgb, tmp_path):
         assert np.isclose(across / np.tan(np.radians(fov) / 2), 1.5)
 
 
+TRANSPOSED = np.eye(4) + np.eye(4, k=-3)
+
+
 @pytest.mark.parametrize(
     "change, said",
     [
@@ -50,6 +53,10 @@ def test_frames_are_the_cameras_of_the_path(rgb, tmp_path):
         ({"camera_path": [{"camera_to_world": np.diag([1.0, 2, 1, 1]).ravel().tolist(), "fov": 50}]}, "rotation"),
         ({"camera_path": [{"camera_to_world": np.diag([-1.0, 1, 1, 1]).ravel().tolist(), "fov": 50}]}, "mirrored"),
         ({"camera_path": [{"camera_to_world": (np.eye(4) + np.eye(4, k=-1)).ravel().tolist(), "fov": 50}]}, "last row"),
+        (
+            {"camera_path": [{"camera_to_world": m.ravel().tolist(), "fov": 50} for m in (np.eye(4), TRANSPOSED)]},
+            "frame 2: it is transposed",
+        ),
         ({"camera_path": [{"camera_to_world": np.eye(4).ravel().tolist(), "fov": 200}]}, "fov"),
         ({"camera_path": [{"fov": 50}]}, "camera_to_world"),
         ({"render_width": 0}, "render_width"),

@@ -333,6 +333,11 @@ def test_nodes_are_applied_and_integers_normalised(tmp_path):
         (b"srgb_rec709", b"rgbb_rec2020", "colour space"),
         (b'"buffer": 0,', b'"buffer": -1,', "whole number"),
         (b'"nodes": [{"mesh": 0', b'"nodes": [{"scale": [1, 2, 1], "mesh": 0', "uniform scale"),
+        (
+            b'"nodes": [{"mesh": 0',
+            b'"nodes": [{"matrix": [1, 0, 0, 5, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1], "mesh": 0',
+            "last row",
+        ),
     ],
 )
 def test_unsupported_glb_splats_are_refused(tmp_path, old, new, said):

@@ -266,6 +266,20 @@ def test03_non_similarities_are_refused(row, column, value):
         Similarity(matrix)
 
 
+def test03_rounding_errors_are_removed():
+    """Files have matrices with few decimals; those of double precision are not changed."""
+    exact = turn(2.0)
+    assert np.array_equal(Similarity(exact).matrix, exact)
+    rounded = Similarity(np.round(exact, 2))
+    np.testing.assert_allclose(rounded.matrix, exact, atol=0.01)
+    linear = rounded.matrix[:3, :3] / rounded.scale
+    np.testing.assert_allclose(linear @ linear.T, np.eye(3), atol=1e-9)
+    with pytest.raises(ValueError, match="transposed"):
+        Similarity(np.eye(4) + np.eye(4, k=-3))
+    with pytest.raises(ValueError, match="shape"):
+        Similarity(np.eye(3))
+
+
 def test04_identity_returns_its_argument(rgb):
     p = rgb.Point3f(1, 2, 3)
     s = Similarity()

@@ -251,7 +251,7 @@ def test_unusable_frames_are_listed(ring, rgb):
     reasons = {u.name: u.reason for u in data.unused}
     for k, part in {
         0: "does not exist",
-        1: "singular",
+        1: "determinant is 0",
         2: "14 x 10",
         3: "3.png",
         4: "inverted",

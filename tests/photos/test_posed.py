@@ -63,6 +63,7 @@ def test_rounded_pose_becomes_nearest_rotation():
     pose = rigid_pose(turned.tolist())
     assert np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12) and np.allclose(pose[:3, 3], [1, 2, 3])
     assert np.abs(pose[:3] - turned).max() < 2e-3
+    np.testing.assert_allclose(rigid_pose(np.diag([2.0, 2, 2, 1])), np.eye(4), atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -70,8 +71,12 @@ def test_rounded_pose_becomes_nearest_rotation():
     [
         ("x", "4 x 4 numbers"),
         (np.diag([1.0, 1, -1, 1]), "mirrored"),
-        (np.diag([1.0, 1, 2, 1]), "sheared"),
-        (np.eye(4).T + np.eye(4, k=-3), "transposed"),
+        (np.diag([1.0, 1, 2, 1]), "not a rotation"),
+        (np.eye(4) + np.eye(4, k=-3), "transposed"),
+        (np.eye(4) + 0.1 * np.eye(4)[[3, 2, 1, 0]], "last row is 0.1, 0, 0, 1"),
+        (np.diag([1.0, 1, 1, 2]), "last row is 0, 0, 0, 2"),
+        (np.zeros((3, 3)), "shape"),
+        (np.diag([1e13, 1e13, 1e13, 1]), "beyond"),
         (np.full((4, 4), np.nan), "finite"),
     ],
 )

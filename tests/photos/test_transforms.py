@@ -84,7 +84,9 @@ def test_units_and_kinds_of_depth(write):
     assert depth("d.npy", depth_unit_scale_factor=1.0) == DepthFile(folder / "d.npy", 1.0, True)
     assert depth("d.npy", depth_unit_scale_factor=0.5, applied_scale=2.0).unit == pytest.approx(1.0)
     assert depth("d.exr") == DepthFile(folder / "d.exr", 1.0, True)
-    assert depth("d.exr", applied_scale=2.0, is_euclidean_depth=True) == DepthFile(folder / "d.exr", 2.0, False)
+    assert depth("d.exr", applied_scale=2.0, is_euclidean_depth=True) == DepthFile(
+        folder / "d.exr", pytest.approx(2.0), False
+    )
     assert depth("d.exr", depth_unit_scale_factor=1e-3).unit == 1e-3
     assert depth("d.png", enable_depth_loading=False) is None
 
@@ -212,9 +214,11 @@ def test_dataparser_transforms(tmp_path):
     path = tmp_path / "dataparser_transforms.json"
     path.write_text(json.dumps({"transform": [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3]], "scale": 0.5}))
     assert np.allclose(read_dataparser(path) @ [1, 1, 1, 1], [0, 1.5, 2, 1])
-    path.write_text(json.dumps({"transform": [[0, -1, 0, 1]], "scale": 0.5}))
-    with pytest.raises(ValueError, match="dataparser_transforms.json"):
-        read_dataparser(path)
+    rows, scaled = [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3]], np.diag([2, 2, 2, 1]).tolist()
+    for transform, scale in ((rows[:1], 0.5), ([*rows, [0, 0, 1, 1]], 0.5), (scaled, 1), (rows, 0)):
+        path.write_text(json.dumps({"transform": transform, "scale": scale}))
+        with pytest.raises(ValueError, match="dataparser_transforms.json"):
+            read_dataparser(path)
 
 
 def test_nerfstudio_file_lists_define_split(write):

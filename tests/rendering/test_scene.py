@@ -267,6 +267,17 @@ def test_invalid_xml_is_refused(tmp_path, text, said):
     refused(tmp_path, text, said)
 
 
+@pytest.mark.parametrize(
+    "numbers, said",
+    [("1 0 0 0 0 1 0 0 0 0 1 0 3 1 2 1", "transposed"), ("1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,2", "last row")],
+)
+def test_a_matrix_has_the_last_row_of_a_transform(tmp_path, numbers, said):
+    matrix = '<shape type="cube"><transform name="to_world"><matrix value="{}"/></transform></shape>'
+    refused(tmp_path, scene(matrix.format(numbers)), said)
+    (tmp_path / "a.xml").write_text(scene(matrix.format("2 1 0 5 0 3 0 6 0 0 -1 7 0 0 0 1")))
+    check_scene_file(tmp_path / "a.xml")
+
+
 def test_too_many_elements(tmp_path, monkeypatch):
     monkeypatch.setattr("nerg_mi.rendering.scene.MAX_ELEMENTS", 100)
     refused(tmp_path, scene('<shape type="cube"/>' * 101), "more than 100 elements")
