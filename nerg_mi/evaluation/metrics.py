@@ -14,6 +14,7 @@ from nerg_mi.figures.overlay import srgb, write_png
 from nerg_mi.figures.style import make_provenance
 from nerg_mi.files.atomic import make_folder
 from nerg_mi.files.dataframes import ResultTables
+from nerg_mi.maths.arrays import check_weights
 from nerg_mi.maths.color import color_corrected_psnr, mean_ignoring_nan, psnr
 from nerg_mi.photos.cameras import PosedCamera, make_sensor_dict, pixel_directions
 from nerg_mi.photos.images import PhotoView, apply_lens, make_pinhole_camera
@@ -385,17 +386,15 @@ def _normalise_weights(a: np.ndarray, b: np.ndarray, weights: np.ndarray | None)
         raise ValueError(f"maps of shape {shape} and {other} must have the same directions along the last axis")
     if weights is None:
         return np.full(shape[-1], 1.0 / shape[-1])
-    w = np.asarray(weights, dtype=np.float64)
-    if w.shape[-1:] != shape[-1:] or not (w >= 0).all() or not (w.sum(axis=-1) > 0).all():
-        raise ValueError(
-            f"weights of shape {w.shape} must be non-negative solid angles of the {shape[-1]} directions, not all zero"
-        )
+    w = check_weights(weights, shape[-1])
     return w / w.sum(axis=-1, keepdims=True)
 
 
 def _normalise_density(density: np.ndarray, w: np.ndarray) -> np.ndarray:
     """Return the density relative to the uniform density of the same integral; a map of zeros is uniform."""
     density = np.asarray(density, dtype=np.float64)
+    if np.isinf(density).any():
+        raise NergError("a map of a score has an infinite value; it must be finite")
     density = density - np.minimum(density.min(axis=-1, keepdims=True), 0.0)
     # Scale by the maximum first, because the mean of tiny values may underflow.
     top = density.max(axis=-1, keepdims=True)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nerg_mi.errors import NergError
+from nerg_mi.maths.arrays import check_weights
 
 from . import metrics
 
@@ -83,21 +84,26 @@ def make_metric_maps(
     >>> maps.ratio.argmax()  # of direction 2, where the density exceeds the prior most
     np.int64(2)
     """
-    p, reference = (np.asarray(v, np.float64) for v in (density, prior))
-    w = _weights(p, weights)
-    p, reference = p / (w @ p), reference / (w @ reference)
+    w = _normalise_weights(np.shape(density)[-1], weights)
+    p, reference = _normalise(density, w, "density"), _normalise(prior, w, "prior")
     ratio = p / np.maximum(reference, metrics.EPS)
     drawn = np.random.default_rng(seed).multinomial(count, w * p / (w * p).sum(), samples)
     empirical = smooth(drawn / np.where(w > 0, w * count, 1.0))
     return MetricMaps(p, ratio, smooth(p), _maximise_expected_sim(empirical, w))
 
 
-def _weights(density: np.ndarray, weights: ArrayLike | None) -> np.ndarray:
-    """Return weights (D,) that sum to 1. Raises `NergError` for densities without mass."""
-    w = np.full(density.shape[-1], 1.0) if weights is None else np.asarray(weights, np.float64)
-    if not (np.isfinite(density).all() and (density >= 0).all() and w @ density > 0):
-        raise NergError("a density must be finite, not negative and not 0 everywhere")
+def _normalise_weights(count: int, weights: ArrayLike | None) -> np.ndarray:
+    """Return weights (count,) that sum to 1; None: equal."""
+    w = np.full(count, 1.0) if weights is None else check_weights(weights, count)
     return w / w.sum()
+
+
+def _normalise(density: ArrayLike, w: np.ndarray, name: str) -> np.ndarray:
+    """Return ``density`` (D,) with the weighted mean 1. Raises `NergError` for values without mass."""
+    density = np.asarray(density, np.float64)
+    if not (np.isfinite(density).all() and (density >= 0).all() and w @ density > 0):
+        raise NergError(f"the {name} must be finite, not negative and not 0 everywhere")
+    return density / (w @ density)
 
 
 def _maximise_expected_sim(samples: np.ndarray, w: np.ndarray) -> np.ndarray:
@@ -182,8 +188,8 @@ def score_saliency(
     at, other = np.asarray(fixations, np.int64), np.asarray(nonfixations, np.int64)
     if not len(at) or not len(other):
         raise NergError(f"a score needs fixations and nonfixations, got {len(at)} and {len(other)}")
-    w = _weights(maps.density, weights)
-    reference = np.asarray(prior, np.float64) / (w @ np.asarray(prior, np.float64))
+    w = _normalise_weights(len(maps.density), weights)
+    reference = _normalise(prior, w, "prior")
     counts = np.bincount(at, minlength=len(w))
     empirical = smooth(counts / np.where(w > 0, w * len(at), 1.0))
     return SaliencyScores(

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
@@ -13,7 +14,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.maths import vmf
-from nerg_mi.maths.arrays import to_vector
+from nerg_mi.maths.arrays import check_weights, kahan_add, to_vector
 from nerg_mi.maths.types import Array3f, Float, UInt32
 from nerg_mi.maths.vmf import log_normaliser
 
@@ -155,6 +156,7 @@ Dr.Jit array of that backend, or None for the backend of Mitsuba's variant (:fun
 """
 
 DIRECTIONS_PER_LANE = 16  # Directions evaluated by one lane of `SphericalKde.evaluate`
+RAYS_PER_BLOCK = 256  # Rays whose terms are added without compensation: a relative error of up to 4e-6
 
 
 def get_default_backend() -> str:
@@ -185,7 +187,7 @@ class SphericalKde:
     ValueError
         If the shapes do not match.
     NergError
-        If a probe has no rays, or only rays with weight zero.
+        If a probe has no rays, or only rays with weight zero, and for values that are not finite or negative.
     """
 
     def __init__(
@@ -213,12 +215,14 @@ class SphericalKde:
         if counts.min() < 1:
             raise NergError(f"probe {int(np.argmin(counts))} has no rays; increase min_rays")
         kappa = np.broadcast_to(np.asarray(kappa, dtype=np.float64), counts.shape)
+        if not np.isfinite(rays).all() or not (np.isfinite(kappa) & (kappa >= 0)).all():
+            raise NergError(
+                "the directions and concentrations of kernels must be finite, and concentrations not negative"
+            )
         if weights is None:
             ray_weights = np.repeat(1.0 / counts, counts)
         else:
-            weights = np.asarray(weights, dtype=np.float64)
-            if weights.shape != (len(rays),) or not (weights >= 0).all():
-                raise ValueError(f"weights {weights.shape} must be {len(rays)} non-negative numbers, one per ray")
+            weights = check_weights(weights, len(rays))
             total = np.add.reduceat(weights, offsets[:-1])
             if not (total > 0).all():
                 raise NergError(f"all weights of probe {int(np.argmin(total))} are zero; remove the probe")
@@ -274,19 +278,33 @@ class SphericalKde:
         kappa = dr.gather(ns.Float, self._kappa, probe)
         log_c = dr.gather(ns.Float, self._log_c, probe)
 
-        def body(i, total, direction, kappa, last):
-            ray = dr.gather(ns.Array4f, self._rays, i)
+        def add(ray, total, direction, kappa):
             offset = direction - ns.Array3f(ray.x, ray.y, ray.z)
-            return i + 1, dr.fma(ray.w, dr.exp(-0.5 * kappa * dr.squared_norm(offset)), total), direction, kappa, last
+            return [dr.fma(ray.w, dr.exp(-0.5 * kappa * dr.squared_norm(offset)), total[0])]
 
-        _, total, *_ = dr.while_loop(
-            state=(first, dr.zeros(ns.Float, dr.width(direction)), ns.Array3f(direction), kappa, last),
-            cond=lambda i, total, direction, kappa, last: i < last,
-            body=body,
-            labels=("i", "total", "direction", "kappa", "last"),
-            label="spherical KDE",
-        )
+        zero = dr.zeros(ns.Float, dr.width(direction))
+        (total,) = self._sum_rays(first, last, [zero], add, ns.Array3f(direction), kappa)
         return total * dr.exp(log_c)
+
+    def _sum_rays(self, first: UInt32, last: UInt32, zeros: list[Float], add: Callable[..., list[Float]], *values: Any):
+        """Sum over the rays ``first`` to ``last`` - 1: ``add(ray, sums, *values)`` returns ``sums`` with one more ray.
+
+        Blocks of rays are summed, and then their sums with compensation. A million plain additions in single precision
+        would have a relative error of 1 %.
+        """
+        ns = self.ns
+
+        def add_ray(i, end, sums, values):
+            return i + 1, end, add(dr.gather(ns.Array4f, self._rays, i), sums, *values), values
+
+        def add_block(i, last, totals, compensations, values):
+            state = i, dr.minimum(i + RAYS_PER_BLOCK, last), [dr.zeros(ns.Float, dr.width(z)) for z in zeros], values
+            i, _, sums, values = dr.while_loop(state, lambda i, end, *_: i < end, add_ray, label="block of rays")
+            pairs = [kahan_add(*terms) for terms in zip(totals, compensations, sums)]
+            return i, last, [total for total, _ in pairs], [compensation for _, compensation in pairs], values
+
+        state = first, last, zeros, [ns.Float(zero) for zero in zeros], list(values)
+        return dr.while_loop(state, lambda i, last, *_: i < last, add_block, label="spherical KDE")[2]
 
     def evaluate(self, directions: np.ndarray) -> np.ndarray:
         """Evaluate the densities of all probes in many directions in one kernel.
@@ -321,19 +339,13 @@ class SphericalKde:
         flat = ns.Float(np.ascontiguousarray(directions).ravel())
         x = [dr.gather(ns.Array3f, flat, base + dr.minimum(first + j, D - 1)) for j in range(G)]
         scale = dr.gather(ns.Float, self._kappa, probe) * (-0.5 / math.log(2.0))
-        last = dr.gather(ns.UInt32, self._offsets, probe + 1)
+        start, end = (dr.gather(ns.UInt32, self._offsets, probe + k) for k in range(2))
 
-        def body(i, total):
-            ray = dr.gather(ns.Array4f, self._rays, i)
+        def add(ray, total):
             mu = ns.Array3f(ray.x, ray.y, ray.z)
-            return i + 1, [dr.fma(ray.w, dr.exp2(scale * dr.squared_norm(a - mu)), t) for a, t in zip(x, total)]
+            return [dr.fma(ray.w, dr.exp2(scale * dr.squared_norm(a - mu)), t) for a, t in zip(x, total)]
 
-        _, total = dr.while_loop(
-            state=(dr.gather(ns.UInt32, self._offsets, probe), [dr.zeros(ns.Float, dr.width(lane)) for _ in x]),
-            cond=lambda i, total: i < last,
-            body=body,
-            label="spherical KDE of many directions",
-        )
+        total = self._sum_rays(start, end, [dr.zeros(ns.Float, dr.width(lane)) for _ in x], add)
         c = dr.exp(dr.gather(ns.Float, self._log_c, probe))
         total = [t * c for t in total]
         dr.eval(total)

@@ -9,7 +9,34 @@ import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
 
+from nerg_mi.errors import NergError
+from nerg_mi.ranges import POSITIVE_VALUES
+
 from .types import Float
+
+# ---- Weights ----
+
+
+def check_weights(weights: ArrayLike, count: int, name: str = "weights") -> np.ndarray:
+    """Return ``weights`` (..., count) as float64.
+
+    Raises `NergError`, which calls them ``name``, for another number of weights, for one that is not finite, negative
+    or above `POSITIVE_VALUES`, and if all are zero: a density with such weights would be NaN.
+    """
+    out = np.asarray(weights, np.float64)
+    if out.shape[-1:] != (count,):
+        raise NergError(f"{name} of shape {out.shape} must be {count:,} numbers that are not negative")
+    bad = np.argwhere(~((out >= 0) & (out <= POSITIVE_VALUES.high)))
+    if len(bad):
+        place = ", ".join(map(str, bad[0]))
+        raise NergError(
+            f"{name}[{place}] is {out[tuple(bad[0])]:g}, but a weight must be 0 to {POSITIVE_VALUES.high:g}; "
+            "correct it, or leave out what it weights"
+        )
+    if not (out.sum(axis=-1) > 0).all():
+        raise NergError(f"all {name} are zero; at least one must be positive")
+    return out
+
 
 # ---- NumPy arrays to Dr.Jit, with kernels that do not depend on their length ----
 #
@@ -72,3 +99,13 @@ def quotient(a: Float, b: Float) -> Float:
 def sigmoid(x: Float) -> Float:
     """1 / (1 + exp(-x)), finite with a finite gradient for every finite x."""
     return dr.fma(0.5, dr.tanh(0.5 * x), 0.5)
+
+
+def kahan_add(total: Float, compensation: Float, term: Float) -> tuple[Float, Float]:
+    """``(total + term, compensation)``: compensated summation (Kahan 1965).
+
+    A thousand plain additions lose two digits, and the derivative of a depth divides that error by the opacity.
+    """
+    term = term - compensation
+    after = total + term
+    return after, (after - total) - term

@@ -10,6 +10,7 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.fields.kde import Backend, SphericalKde, compute_silverman_kappas, select_loo_kappas
 from nerg_mi.maths import vmf
+from nerg_mi.maths.arrays import check_weights
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.rays.rays import Neighbours, RayIndex, Rays
 
@@ -232,7 +233,7 @@ def place_probes(
     rng = np.random.default_rng(seed)
     nonzero = None
     if ray_weights is not None:
-        ray_weights = _check_ray_weights(ray_weights, len(rays))
+        ray_weights = check_weights(ray_weights, len(rays), "ray_weights")
         if not ray_weights.all():
             # Rays of weight zero are removed.
             nonzero = np.flatnonzero(ray_weights)
@@ -274,13 +275,6 @@ def compute_participant_weights(rays: Rays) -> np.ndarray:
 def _check_one_of(name: str, value: str, choices: Iterable[str]) -> None:
     if value not in choices:
         raise NergError(f'{name} must be one of {", ".join(choices)}, got "{value}"')
-
-
-def _check_ray_weights(weights: np.ndarray, count: int) -> np.ndarray:
-    weights = np.asarray(weights, dtype=np.float64)
-    if weights.shape != (count,) or not (weights >= 0).all():
-        raise ValueError(f"ray_weights {weights.shape} must be {count} non-negative numbers, one per ray")
-    return weights
 
 
 def _select_queries(neighbours: Neighbours, mask: np.ndarray) -> Neighbours:

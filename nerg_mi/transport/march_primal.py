@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 
-from nerg_mi.maths.arrays import log1p, quotient
+from nerg_mi.maths.arrays import kahan_add, log1p, quotient
 from nerg_mi.maths.types import Bool, Color, Float, UInt32
 
 from .medium import Hits, LastHit, LocalRay, Medium, Occupancy, SampleShader, VoxelCells
@@ -117,16 +117,6 @@ def default_stop(medium: Medium | None) -> float:
 def default_color_cutoff(medium: Medium | None) -> float:
     """Default of `MarchSettings.color_cutoff`: higher for a medium whose colour takes most of the time."""
     return SEPARATE_COLOR_CUTOFF if medium is not None and medium.is_density_separate else MarchSettings.color_cutoff
-
-
-def kahan_add(total: Float, compensation: Float, term: Float) -> tuple[Float, Float]:
-    """``(total + term, compensation)``: compensated summation (Kahan 1965).
-
-    A thousand plain additions lose two digits, and the derivative of a depth divides that error by the opacity.
-    """
-    term = term - compensation
-    after = total + term
-    return after, (after - total) - term
 
 
 @dataclass(kw_only=True)

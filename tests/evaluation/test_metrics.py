@@ -6,6 +6,7 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
+from nerg_mi.errors import NergError
 from nerg_mi.evaluation import metrics
 from nerg_mi.evaluation.metrics import FieldRenderer, compute_depth_score, score_views, ssim
 from nerg_mi.fields.encoding import HashGridConfig
@@ -261,5 +262,17 @@ def test_correlation_of_maps_of_any_scale(scale):
 def test_refusals():
     with pytest.raises(ValueError, match="same directions"):
         metrics.cc(np.zeros(4), np.zeros(5))
-    with pytest.raises(ValueError, match="solid angles"):
-        metrics.cc(np.zeros(4), np.zeros(4), -np.ones(4))
+
+
+@pytest.mark.parametrize("bad", [np.inf, np.nan, -1.0])
+def test_invalid_weights_and_maps_are_named(bad):
+    weights, values = np.array([1, 2, bad, 1.0]), np.arange(4.0)
+    for score in (metrics.kld, metrics.cc, metrics.sim, metrics.mae, metrics.nss, metrics.auc):
+        with pytest.raises(NergError, match=r"weights\[2\]"):
+            score(values, values, weights)
+    for weights in (np.zeros(4), np.ones(3)):
+        with pytest.raises(NergError, match="weights"):
+            metrics.cc(values, values, weights)
+    for score in (metrics.kld, metrics.sim):
+        with pytest.raises(NergError, match="infinite"):
+            score(values, np.array([1, 2, np.inf, 1]))

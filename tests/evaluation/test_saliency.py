@@ -127,3 +127,11 @@ def test_unusable_densities_and_fixations_are_refused():
             maps(density)
     with pytest.raises(NergError, match="0 and 1000"):
         score_saliency(maps(), PRIOR.ravel(), [], OTHERS, smooth)
+
+
+@pytest.mark.parametrize("bad", [np.inf, np.nan, -1.0])
+@pytest.mark.parametrize("name", ["density", "prior", "weights"])
+def test_invalid_densities_and_weights_are_named(bad, name):
+    arguments = {"density": [1, 2, 3], "prior": [1, 1, 1], "weights": [1, 1, 2]} | {name: [1, bad, 1]}
+    with pytest.raises(NergError, match=name):
+        make_metric_maps(**arguments, smooth=lambda density: density)

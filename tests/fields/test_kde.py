@@ -4,6 +4,7 @@ import drjit as dr
 import numpy as np
 import pytest
 
+from nerg_mi.errors import NergError
 from nerg_mi.fields.kde import (
     SphericalKde,
     SphericalKdeTable,
@@ -72,6 +73,42 @@ def test_refusals():
         SphericalKde(rays, [0, len(rays)], 1.0, np.zeros(len(rays)), "llvm")
     with pytest.raises(ValueError, match="expected"):
         SphericalKde(rays, offsets, kappa, backend="llvm").evaluate(np.zeros((2, 5, 3)))
+
+
+@pytest.mark.parametrize("bad", [np.inf, -np.inf, np.nan, -1.0, 1e300])
+def test_invalid_weights_are_named(bad):
+    rays, offsets, kappa, _ = ragged()
+    weights = np.ones(len(rays))
+    weights[7] = bad
+    with pytest.raises(NergError, match=r"weights\[7\]"):
+        SphericalKde(rays, offsets, kappa, weights, "llvm")
+    with pytest.raises(NergError, match="372"):
+        SphericalKde(rays, offsets, kappa, weights[1:], "llvm")
+    for change in ({"kappa": bad}, {"rays": np.where(np.arange(len(rays))[:, None] == 3, bad, rays)}):
+        if abs(bad) == np.inf or np.isnan(bad) or (bad < 0 and "kappa" in change):
+            with pytest.raises(NergError, match="finite"):
+                SphericalKde(**{"rays": rays, "offsets": offsets, "kappa": kappa, "backend": "llvm"} | change)
+
+
+@pytest.mark.parametrize("count", [10**5, 10**6])
+def test_many_equal_rays_have_the_density_of_one(count):
+    """Added one by one in single precision, a million equal terms are wrong by 1 %."""
+    import drjit.llvm.ad as ns
+
+    axis, x = np.array([[0.0, 0.6, 0.8]]), fibonacci_directions(32)
+    expected = reference(x, axis, [0, 1], [20.0])[0]
+    many = SphericalKde(np.repeat(axis, count, axis=0), [0, count], 20.0, backend=ns)
+    np.testing.assert_allclose(many.evaluate(x)[0], expected, rtol=2e-5, atol=0)
+    single = many.density(ns.UInt32(np.zeros(len(x), np.uint32)), ns.Array3f(*x.T.astype(np.float32).copy()))
+    np.testing.assert_allclose(np.array(single), expected, rtol=2e-5, atol=0)
+
+
+def test_unequal_weights_of_many_rays():
+    count = 300_000
+    rng = np.random.default_rng(5)
+    rays, weights, x = sample_uniform_directions(count, rng), rng.random(count) ** 4, fibonacci_directions(8)
+    got = SphericalKde(rays, [0, count], 20.0, weights, "llvm").evaluate(x)
+    np.testing.assert_allclose(got, reference(x, rays, [0, count], [20.0], weights), rtol=5e-6)
 
 
 @pytest.mark.parametrize("weighted", [False, True])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from nerg_mi.errors import NergError
 from nerg_mi.fields.kde import select_loo_kappa
 from nerg_mi.maths import vmf
 from nerg_mi.maths.sphere import fibonacci_directions
@@ -243,3 +244,11 @@ def test_calibrated_levels_are_weighted_quantiles():
     times = rng.integers(0, 4, len(some))
     assert calibrate_levels(some, times.astype(float)) == calibrate_levels(np.repeat(some, times), np.ones(times.sum()))
     assert calibrate_levels(np.array([0.3]), np.ones(1)) == {"50%": 0.3, "80%": 0.3, "95%": 0.3}
+
+
+@pytest.mark.parametrize("bad", [np.inf, np.nan, -1.0])
+def test_invalid_ray_weights_are_named(rays_measures, bad):
+    weights = np.ones(len(rays_measures))
+    weights[2] = bad
+    with pytest.raises(NergError, match=r"ray_weights\[2\]"):
+        place_probes(rays_measures, 0.3, ray_weights=weights)

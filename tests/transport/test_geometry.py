@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import drjit as dr
 import numpy as np
 import pytest
@@ -320,6 +322,33 @@ def test_wall_depth(wall):
     assert hit.sum() > 50
     np.testing.assert_allclose(depth[hit], 0.4 / d[hit, 0], atol=default_march_settings(wall).step)
     assert (opacity[hit] > 0.999).all()
+
+
+def _shares_in_front(rgb, opacity, rule, kind, width=2, count=300):
+    """Fraction of rays whose depth is on the first of two slabs, which has this ``opacity``; the second is opaque."""
+    data = np.zeros((2, 2, 32, 1), np.float32)
+    data[:, :, 8 : 8 + width] = -np.log1p(-opacity) / (width / 32)
+    data[:, :, 24:28] = 1e5
+    medium = VolumeMedium(rgb.load_dict({"type": "gridvolume", "data": rgb.TensorXf(data), "filter_type": "nearest"}))
+    # Rays from inside the box, whose steps begin anywhere relative to the slabs.
+    o = np.stack([np.linspace(0.1, 0.2, count), *np.full((2, count), 0.4)], axis=1)
+    settings = replace(default_march_settings(medium), quadrature=rule)
+    depth, _ = trace_depth(medium, o, np.tile([1.0, 0, 0], (count, 1)), settings, kind)
+    return float(np.mean(o[:, 0] + depth < 0.7)), 0.5 * np.log(2) / (width / 32) * settings.step
+
+
+@pytest.mark.parametrize("kind", ["median", "refined"])
+@pytest.mark.parametrize("rule", ["constant", "linear", "cells"])
+def test_median_is_on_the_right_slab_beyond_a_bound_from_one_half(rgb, rule, kind):
+    """docs/explanation/numerics.md states the bound: half the optical depth of a step in the first slab."""
+    _, bound = _shares_in_front(rgb, 0.5, rule, kind)
+    bound = 1e-5 if rule == "cells" else 1.02 * bound
+    assert _shares_in_front(rgb, 0.5 - bound, rule, kind)[0] == 0
+    assert _shares_in_front(rgb, 0.5 + bound, rule, kind)[0] == 1
+    if rule != "cells":
+        # Within the bound, the slab depends on where steps begin: the bound is not too wide by more than a factor of 2.
+        shares = [_shares_in_front(rgb, 0.5 + sign * 0.5 * bound, rule, kind)[0] for sign in (-1, 1)]
+        assert shares[0] > 0 or shares[1] < 1
 
 
 @pytest.mark.parametrize("batch", [1, 2, 100])
