@@ -336,7 +336,7 @@ class AoiScene:
         if changes.changes_shapes:
             scene, shapes = apply_to_scene(gaze_scene.scene, changes, meshes)
             gaze_scene = gaze_scene.with_scene(scene)
-        aois = make_aois(areas.elements, shapes, meshes)
+        aois = make_aois(areas.elements, shapes, meshes, gaze_scene.scene)
         return replace(self, gaze_scene=gaze_scene, areas=areas, aois=aois, meshes=meshes)
 
     def predict(self, viewpoints: Viewpoints, fov: float, reporter: Reporter = SILENT) -> PredictedAttention:
@@ -380,7 +380,7 @@ def load_aoi_scene(
         align = read_similarity(options.align, "--align", "rays to scene", doubts.append)
     gaze_scene = load_gaze_scene(scene, field, gaze, align, ns)
     meshes = read_meshes(areas.meshes)
-    aois = make_aois(areas.elements, shapes_by_id(gaze_scene.scene), meshes)
+    aois = make_aois(areas.elements, shapes_by_id(gaze_scene.scene), meshes, gaze_scene.scene)
     return AoiScene(gaze_scene, areas, aois, options, meshes, tuple(doubts))
 
 

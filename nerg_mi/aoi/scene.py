@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -41,7 +41,7 @@ from nerg_mi.train import geometry
 from nerg_mi.train.gaze_data import SURFACE_OPACITY
 from nerg_mi.train.geometry import TrainingGeometry
 from nerg_mi.transport.geometry import SceneGeometry, default_march_settings, shape_corners, trace_depth
-from nerg_mi.transport.mitsuba_mesh import make_mesh, read_triangles
+from nerg_mi.transport.mitsuba_mesh import gather_corners, make_mesh, read_triangles
 from nerg_mi.transport.observer import ObserverSettings
 from nerg_mi.transport.observer_gaze import GazeFieldInstance, make_gaze_evaluator
 from nerg_mi.workflows.gaze_commands import GazeEvaluationOptions
@@ -223,27 +223,61 @@ def _gaze_scene_from_training(
 # Boxes are intersected in closed form, meshes and shapes by ray casts in Mitsuba.
 
 _RAY_BATCH = 1 << 20
+_MIN_COSINE = 0.05  # limits the distance along a grazing ray that corresponds to the tolerance
 
 
 @dataclass(frozen=True, eq=False)
 class ShapeAoi:
-    """A Mitsuba shape as an AOI; ``isolated`` is a scene that contains only this shape."""
+    """A Mitsuba shape as an AOI.
+
+    Parameters
+    ----------
+    name
+        Name of the area.
+    shape
+        The shape.
+    isolated
+        Scene that contains only this shape.
+    scene
+        Scene that contains the shape, whose other shapes occlude it: each ray hits one shape at most, also where shapes
+        touch or coincide. None for a shape that is not part of the scene.
+    two_sided
+        Whether rays hit faces from behind. False requires a mesh; in front, vertices are counterclockwise.
+    tolerance
+        Distance in scene units above the faces at which rays hit them.
+    """
 
     name: str
     shape: Any
     isolated: Any
+    scene: Any = None
+    two_sided: bool = True
+    tolerance: float = 0.0
     is_surface = True
 
     def intersect(self, o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        out = np.concatenate(
+            [np.zeros(0), *(self._cast(*rays, self.scene or self.isolated) for rays in _batches(o, d))]
+        )
+        return out, out
+
+    def _cast(self, o: np.ndarray, d: np.ndarray, scene: Any) -> np.ndarray:
+        """Return the distances (N,) at which rays hit the shape first in ``scene``."""
+        import drjit as dr
         import mitsuba as mi
 
-        out = np.full(len(o), np.inf)
-        for a in range(0, len(o), _RAY_BATCH):
-            origin, direction = (np.ascontiguousarray(v[a : a + _RAY_BATCH].T, np.float32) for v in (o, d))
-            ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(direction))
-            t = np.array(self.isolated.ray_intersect_preliminary(ray, coherent=False).t, np.float64)
-            out[a : a + _RAY_BATCH] = t
-        return out, out
+        origin, direction = (np.ascontiguousarray(v.T, np.float32) for v in (o, d))
+        ray: Any = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(direction))
+        hit = scene.ray_intersect_preliminary(ray, coherent=False)
+        shape = mi.ShapePtr(self.shape)
+        is_hit, t = hit.is_valid() & ((hit.shape == shape) | (hit.instance == shape)), hit.t
+        if self.tolerance > 0 or not self.two_sided:
+            a, b, c = gather_corners(self.shape, dr.select(is_hit, hit.prim_index, 0))
+            cosine = -dr.dot(dr.normalize(dr.cross(b - a, c - a)), ray.d)
+            if not self.two_sided:
+                is_hit &= cosine > 0
+            t = dr.maximum(t - self.tolerance / dr.maximum(dr.abs(cosine), _MIN_COSINE), 0)
+        return np.array(dr.select(is_hit, t, dr.inf), np.float64)
 
     @cached_property
     def _bounds(self) -> np.ndarray:
@@ -259,7 +293,13 @@ class ShapeAoi:
 
     def hits_bounds(self, o: np.ndarray, d: np.ndarray) -> np.ndarray:
         near, far = intersect_box_numpy(o, d, *self._bounds)
-        return (near < far) & (far > 0)
+        is_hit = (near < far) & (far > 0)
+        # The shape itself: of a thin shape, few of these directions hit more than the box.
+        rays = np.flatnonzero(is_hit)
+        is_hit[rays] = np.concatenate(
+            [np.zeros(0, bool), *(np.isfinite(self._cast(*part, self.isolated)) for part in _batches(o[rays], d[rays]))]
+        )
+        return is_hit
 
     def sample_points(self, count: int) -> tuple[np.ndarray, np.ndarray]:
         import mitsuba as mi
@@ -272,18 +312,25 @@ class ShapeAoi:
         return points, np.zeros_like(points)
 
 
+def _batches(o: np.ndarray, d: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    return ((o[a : a + _RAY_BATCH], d[a : a + _RAY_BATCH]) for a in range(0, len(o), _RAY_BATCH))
+
+
 def read_meshes(files: Iterable[Path]) -> dict[Path, MeshFile]:
     """Read the mesh of each file once. Raises `NergError` for missing and damaged files."""
     return {file: read_mesh_file(file) for file in dict.fromkeys(files)}
 
 
 def make_aois(
-    areas: Sequence[Region | MeshPart | SceneShape], shapes: Mapping[str, Any], meshes: Mapping[Path, MeshFile]
+    areas: Sequence[Region | MeshPart | SceneShape],
+    shapes: Mapping[str, Any],
+    meshes: Mapping[Path, MeshFile],
+    scene: mi.Scene | None = None,
 ) -> list[Aoi]:
     """Create the elementary AOIs of ``areas``, in the same order.
 
-    ``shapes`` are those of the scene by name, ``meshes`` those of mesh parts by file. A Mitsuba variant must be active.
-    Raises `NergError` for unknown shapes and faces.
+    ``shapes`` are those of ``scene`` by name (see `ShapeAoi`), ``meshes`` those of mesh parts by file. A Mitsuba
+    variant must be active. Raises `NergError` for unknown shapes and faces.
     """
     aois: list[Aoi] = []
     for area in areas:
@@ -292,13 +339,13 @@ def make_aois(
         elif isinstance(area, MeshPart):
             aois.append(aoi_from_shape(area.name, _make_part_mesh(area, meshes[area.file])))
         else:
-            aois.append(aoi_from_shape(area.name, find_shape(shapes, area.shape)))
+            aois.append(aoi_from_shape(area.name, find_shape(shapes, area.shape), scene))
     return aois
 
 
-def aoi_from_shape(name: str, shape: Any) -> ShapeAoi:
-    """Create an AOI from a Mitsuba shape."""
-    return ShapeAoi(name, shape, scene_from_shapes({name: shape}))
+def aoi_from_shape(name: str, shape: Any, scene: Any = None, **options: Any) -> ShapeAoi:
+    """Create an AOI from a Mitsuba shape; ``scene`` and ``options`` are those of `ShapeAoi`."""
+    return ShapeAoi(name, shape, scene_from_shapes({name: shape}), scene, **options)
 
 
 def scene_from_shapes(shapes: Mapping[str, Any]) -> mi.Scene:

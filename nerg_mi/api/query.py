@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,7 +17,7 @@ from nerg_mi.formats.meshes import READERS, MeshFile
 from nerg_mi.maths.arrays import to_vector
 from nerg_mi.maths.types import variant_types
 from nerg_mi.measures.shares import Shares, SummationRule, gaze_shares
-from nerg_mi.measures.visits import MARGIN, BoxAoi
+from nerg_mi.measures.visits import MARGIN, Aoi, BoxAoi
 from nerg_mi.ranges import MAX_COORDINATE, Range, check_number
 from nerg_mi.workflows.base import SILENT, Reporter
 
@@ -27,6 +27,10 @@ from .calls import Progress, report_progress
 from .contents import from_trimesh, is_trimesh, load_mesh, load_mesh_child
 from .fields import FilePath, activate_mitsuba
 from .scene import COLOR, Scene, make_aov_context, resolve_quantities
+
+if TYPE_CHECKING:
+    from nerg_mi.aoi.scene import ShapeAoi
+    from nerg_mi.transport.geometry import SceneGeometry
 
 # ---- One observer of a scene ----
 
@@ -43,13 +47,15 @@ class SceneObserver:
         The scene.
     position : ndarray of shape (3,)
         Position of the observer in scene units.
+    geometry : SceneGeometry, optional
+        What rays hit. Default: that of the scene.
     """
 
-    def __init__(self, scene: Scene, position: Floats):
+    def __init__(self, scene: Scene, position: Floats, geometry: SceneGeometry | None = None):
         import drjit as dr
         import mitsuba as mi
 
-        self.scene, self.geometry, self.integrator = scene, scene.geometry, scene.integrator
+        self.scene, self.geometry, self.integrator = scene, geometry or scene.geometry, scene.integrator
         self.center: Any = mi.Point3f(position.tolist())
         # A literal position would be compiled into the kernel, which would be recompiled for each observer.
         dr.make_opaque(self.center)
@@ -395,14 +401,14 @@ def _to_array(value: Any, count: int) -> Floats:
 
 # ---- Attention ----
 #
-# The attention share of a box is the fraction of the gaze whose first surface is in the box, summed over directions
-# (`nerg_mi.measures.shares`). Statistics, reports and the viewer use this definition. The attention share of a mesh
-# or shape is the integral over its own surface (`nerg_mi.probes.surface_attention`), which also yields its distribution
-# on the surface.
+# An attention share is the fraction of the gaze whose first surface is in a box, or is a mesh or shape, summed over
+# directions (`nerg_mi.measures.shares`): the size of triangles does not matter, and each direction meets one surface.
+# Statistics, reports and the viewer use this definition. The distribution on a mesh is the integral over its patches
+# (`nerg_mi.probes.surface_attention`), scaled to the share.
 
 
 DEFAULT_SUM_RULE = SummationRule()
-"""Default accuracy of the attention share of a box."""
+"""Default accuracy of attention shares."""
 
 PATCH_SIZE_RATIO = 4
 """Ratio of an observer's distance from a surface and the size of the patches into which it is divided."""
@@ -422,16 +428,16 @@ class Attention:
         The denominator includes gaze that hits no surface.
     observers : ndarray of shape (M, 3)
         Positions of the observers in scene units.
-    error : ndarray of shape (M,) or None
-        Estimate of the maximum error of the share of a box; None for meshes.
-    escaped : ndarray of shape (M,) or None
-        Fraction of the gaze that hits no surface; None for meshes.
+    error : ndarray of shape (M,)
+        Estimate of the maximum error of the share.
+    escaped : ndarray of shape (M,)
+        Fraction of the gaze that hits no surface.
     """
 
     share: Floats
     observers: Floats
-    error: Floats | None = None
-    escaped: Floats | None = None
+    error: Floats
+    escaped: Floats
 
     @property
     def mean(self) -> float:
@@ -449,7 +455,8 @@ class SurfaceAttention(Attention):
     Attributes
     ----------
     density : ndarray of shape (M, K)
-        Attention share per area, in 1 / (scene unit)²; ``density @ area`` equals ``share``.
+        Attention share per area, in 1 / (scene unit)²; ``density @ area`` equals ``share``, except where no centre of a
+        patch is visible.
     points, normals : ndarray of shape (K, 3)
         Centres of the patches in scene units, and their outward unit normals.
     area : ndarray of shape (K,)
@@ -493,11 +500,12 @@ def attention(
     margin : float
         Boxes only: a surface counts if it is at most this far outside the box along the ray, in scene units.
     tolerance : float
-        Boxes only: directions are added until the error of the share is below this fraction of it, or below 1e-5, or
-        until a million directions are used.
+        Directions are added until the error of the share is below this fraction of it, or below 1e-5, or until 16
+        million directions are used (a million for areas all around the observer).
     divisions : int, optional
-        Meshes only: number of parts per side into which each triangle is divided. Default: patches of at most a quarter
-        of the distance to the nearest observer, at most 32 parts; the relative error is then a few thousandths.
+        Meshes only: number of parts per side into which each triangle is divided for the distribution on the surface.
+        The share does not depend on it. Default: patches of at most a quarter of the distance to the nearest observer,
+        at most 32 parts.
     two_sided : bool
         Meshes only: count both sides of an open surface. Otherwise only the side with counterclockwise vertices counts.
     progress : bool, Reporter or None
@@ -519,8 +527,10 @@ def attention(
     empty space has none. With ``margin=0``, the shares of boxes that fill space without overlap, and whose faces do not
     coincide with surfaces, sum to 1 together with ``escaped``.
 
-    A mesh that is not part of the scene is treated as if it were there: the scene occludes it, and it occludes only its
-    own back side. The fall-off of the scene is ignored: an occluded point receives no attention.
+    The shares of all meshes of a closed room sum to 1 (with ``two_sided=True`` if faces are seen from behind).
+
+    A mesh that is not part of the scene is treated as if it were there: the scene occludes it, and it occludes only
+    itself. The fall-off of the scene is ignored: an occluded point receives no attention.
 
     Examples
     --------
@@ -541,17 +551,14 @@ def attention(
     _check_has_gaze(scene)
     check_number(margin, Range(0, MAX_COORDINATE), "margin")
     check_number(tolerance, Range(1e-9, 1), "tolerance")
+    rule = SummationRule(rtol=float(tolerance))
     if (region := _as_box(surface)) is not None:
         if divisions is not None or two_sided:
             raise NergError("divisions and two_sided apply to meshes only, but the surface is a box; omit them")
         positions = resolve_observers(scene, observers)
-        rule = SummationRule(rtol=float(tolerance))
         with report_progress(progress) as reporter:
             shares = compute_box_shares(scene, [region], positions, margin=float(margin), rule=rule, reporter=reporter)
-        to_single = lambda v: np.ascontiguousarray(v, np.float32)
-        return Attention(
-            to_single(shares.share[:, 0]), positions, to_single(shares.error[:, 0]), to_single(shares.escaped)
-        )
+        return Attention(**_first_shares(shares), observers=positions)
     is_integer = isinstance(divisions, (int, np.integer)) and not isinstance(divisions, bool)
     if not (divisions is None or (is_integer and 1 <= divisions <= 4096)):
         raise NergError(f"divisions must be an integer from 1 to 4,096, got {divisions!r}")
@@ -560,46 +567,59 @@ def attention(
     with report_progress(progress) as reporter, translate_mitsuba_errors(), dr.suspend_grad():
         mesh = _as_mesh(scene, surface)
         pieces = make_patches(mesh, _choose_divisions(mesh, positions) if divisions is None else int(divisions))
-        area = np.array(pieces.area, np.float32)
+        arrays_of_patches = pieces.area, pieces.p, pieces.n
+        area, centers, normals = (np.ascontiguousarray(np.array(v, np.float32).T) for v in arrays_of_patches)
+        geometry = scene.geometry if _is_part(scene, mesh) else _add_mesh(scene, mesh)
         for number, position in enumerate(positions):
-            densities.append(_compute_density(scene, position, pieces, two_sided))
+            densities.append(_compute_density(scene, geometry, position, pieces, two_sided))
             reporter.progress((number + 1) / len(positions), f"observer {number + 1} of {len(positions)}")
-        centers, normals = (np.ascontiguousarray(np.array(v, np.float32).T) for v in (pieces.p, pieces.n))
+        density = np.stack(densities)
+        sums = density.astype(np.float64) @ area.astype(np.float64)
+        if not np.isfinite(sums).all():
+            raise NergError("the attention on this mesh is not finite; check the scale of mesh and observers")
+        aoi = _make_mesh_aoi(scene, mesh, two_sided)
+        shares = _first_shares(compute_shares(scene, [aoi], positions, margin=0.0, rule=rule, geometry=geometry))
         if not two_sided and all((((eye - centers) * normals).sum(axis=1) <= 0).all() for eye in positions):
             reporter.warn(
                 "the attention is 0, since the observers are behind all faces of the mesh (in front, vertices are "
                 "counterclockwise); add two_sided=True to count both sides, as of a room seen from inside"
             )
-    density = np.stack(densities)
-    share = (density.astype(np.float64) @ area.astype(np.float64)).astype(np.float32)
-    if not np.isfinite(share).all():
-        raise NergError("the attention on this mesh is not finite; check the scale of the mesh and of the observers")
-    return SurfaceAttention(share, positions, density=density, points=centers, normals=normals, area=area)
+    density *= np.divide(shares["share"], sums, out=np.zeros(len(sums)), where=sums > 0)[:, None].astype(np.float32)
+    return SurfaceAttention(**shares, observers=positions, density=density, points=centers, normals=normals, area=area)
 
 
-def compute_box_shares(
+def _first_shares(shares: Shares) -> dict[str, Floats]:
+    """Return share, error and escaped gaze (M,) of the first area."""
+    columns = {"share": shares.share[:, 0], "error": shares.error[:, 0], "escaped": shares.escaped}
+    return {name: np.ascontiguousarray(values, np.float32) for name, values in columns.items()}
+
+
+def compute_shares(
     scene: Scene,
-    regions: Sequence[Region],
+    aois: Sequence[Aoi],
     observers: Floats,
     *,
     margin: float = MARGIN,
     rule: SummationRule = DEFAULT_SUM_RULE,
     reporter: Reporter = SILENT,
+    geometry: SceneGeometry | None = None,
 ) -> Shares:
-    """Compute the attention shares of N boxes, which may be rotated, for M observers.
+    """Compute the attention shares of N areas for M observers: the function behind `attention` and the viewer.
 
     Parameters
     ----------
     scene : Scene
         The scene, with a gaze field.
-    regions : sequence of Region
-        The boxes.
+    aois : sequence of Aoi
+        The areas.
     observers : ndarray of shape (M, 3)
         Positions in scene units.
     margin, reporter
         As for `attention`.
-    rule : SumRule
+    rule : SummationRule
         Accuracy of the sum over directions.
+    geometry : SceneGeometry, optional
+        What rays hit. Default: that of the scene.
 
     Returns
     -------
@@ -609,60 +629,53 @@ def compute_box_shares(
     from nerg_mi.transport.observer_gaze import make_gaze_evaluator
 
     _check_has_gaze(scene)
-    i, place, count = scene.integrator, scene.geometry, len(observers)
+    i, place, count = scene.integrator, geometry or scene.geometry, len(observers)
     on_progress = lambda done: reporter.progress(done / count, f"observer {done} of {count}")
     with translate_mitsuba_errors():
         return gaze_shares(
             lambda eye: make_gaze_evaluator(i.gaze, place, i.observer_settings, eye),
             observers,
-            [BoxAoi(region) for region in regions],
-            [(k,) for k in range(len(regions))],
+            aois,
+            [(k,) for k in range(len(aois))],
             margin,
             rule,
             on_progress,
         )
 
 
-def compute_mesh_shares(
-    scene: Scene, surfaces: Sequence[Any], observer: ArrayLike, *, divisions: int, two_sided: bool = False
-) -> Floats:
-    """Compute the attention share (N,) of each of N meshes for one observer.
+def compute_box_shares(scene: Scene, regions: Sequence[Region], observers: Floats, **options: Any) -> Shares:
+    """Compute the attention shares of N boxes, which may be rotated; ``options`` are those of `compute_shares`."""
+    return compute_shares(scene, [BoxAoi(region) for region in regions], observers, **options)
 
-    Parameters
-    ----------
-    scene : Scene
-        The scene, with a gaze field.
-    surfaces : sequence
-        Meshes, as for `attention`.
-    observer : array_like of shape (3,)
-        Position in scene units.
-    divisions, two_sided
-        As for `attention`.
 
-    Returns
-    -------
-    ndarray of shape (N,), float32
-        Attention shares.
-    """
-    import drjit as dr
-
-    mi = variant_types()
-    from nerg_mi.probes.surface_attention import Patches, make_patches
-
+def make_shape_aois(scene: Scene, names: Sequence[str]) -> list[Aoi]:
+    """Return the meshes of the scene with these ids as areas, which are hit from both sides."""
     _check_has_gaze(scene)
-    if not len(surfaces):
-        return np.zeros(0, np.float32)
-    position = resolve_observers(scene, observer)[0]
-    with translate_mitsuba_errors(), dr.suspend_grad():
-        patches_by_mesh = [make_patches(_as_mesh(scene, surface), divisions) for surface in surfaces]
-        area = [np.array(pieces.area, np.float64) for pieces in patches_by_mesh]
-        concatenate = lambda name: np.concatenate(
-            [np.array(getattr(pieces, name), np.float32) for pieces in patches_by_mesh], axis=1
-        )
-        pieces = Patches(mi.Point3f(concatenate("p")), mi.Vector3f(concatenate("n")), mi.Float(np.concatenate(area)))
-        density = _compute_density(scene, position, pieces, two_sided)
-    starts = np.cumsum([0, *(len(a) for a in area[:-1])])
-    return np.add.reduceat(density * np.concatenate(area), starts).astype(np.float32)
+    with translate_mitsuba_errors():
+        return [_make_mesh_aoi(scene, _as_mesh(scene, name), two_sided=True) for name in names]
+
+
+def _make_mesh_aoi(scene: Scene, mesh: Any, two_sided: bool) -> ShapeAoi:
+    """Return ``mesh`` as an area, with the tolerance of `transport.occlusion`."""
+    from nerg_mi.aoi.scene import aoi_from_shape
+    from nerg_mi.transport.occlusion import shape_tolerance
+
+    part_of = scene.mitsuba if _is_part(scene, mesh) else None
+    tolerance = shape_tolerance(scene.geometry, scene.integrator.observer_settings, mesh)
+    return aoi_from_shape(mesh.id(), mesh, part_of, two_sided=two_sided, tolerance=tolerance)
+
+
+def _is_part(scene: Scene, mesh: Any) -> bool:
+    return any(shape is mesh for shape in scene.mitsuba.shapes())
+
+
+def _add_mesh(scene: Scene, mesh: Any) -> SceneGeometry:
+    """Return the geometry of the scene with ``mesh``."""
+    from nerg_mi.aoi.scene import scene_from_shapes
+    from nerg_mi.transport.geometry import SceneGeometry
+
+    shapes = {str(k): shape for k, shape in enumerate([*scene.mitsuba.shapes(), mesh])}
+    return SceneGeometry(scene.geometry.medium, scene_from_shapes(shapes))
 
 
 def _check_has_gaze(scene: Scene) -> None:
@@ -671,18 +684,15 @@ def _check_has_gaze(scene: Scene) -> None:
         raise NergError("attention needs a scene with a gaze field; pass gaze= to make_scene")
 
 
-def _compute_density(scene: Scene, position: Floats, pieces: Any, two_sided: bool) -> Floats:
-    """Compute the attention share per area (K,) of ``pieces`` for the observer at ``position`` (3,)."""
+def _compute_density(scene: Scene, geometry: SceneGeometry, position: Floats, pieces: Any, two_sided: bool) -> Floats:
+    """Compute the attention per area (K,) of ``pieces`` for the observer at ``position`` (3,), up to a factor."""
     from nerg_mi.probes.surface_attention import attention_per_area
 
-    observer = SceneObserver(scene, position)
+    observer = SceneObserver(scene, position, geometry)
     settings = observer.integrator.observer_settings
     density = attention_per_area(
-        observer.geometry, observer.eval_gaze, observer.center, pieces.p, pieces.n, 0.0, settings, two_sided
+        geometry, observer.eval_gaze, observer.center, pieces.p, pieces.n, 0.0, settings, two_sided
     )
-    if not observer.integrator.gaze.field.config.normalized:
-        total = compute_box_shares(scene, [], position[None]).integral[0]
-        density /= total if total > 0 else 1
     return np.array(density, np.float32)
 
 

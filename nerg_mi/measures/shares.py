@@ -9,7 +9,10 @@ evaluated, so that small areas cost no more than large ones, and areas that need
 The normalising integral over the whole sphere, including directions that meet no surface, is computed in the same way.
 
 The error is estimated from the scatter of the sums over every eighth direction, as for the integral over an observer's
-sphere (`nerg_mi.transport.observer_gaze`).
+sphere (`nerg_mi.transport.observer_gaze`). That estimate holds for areas that contain many directions. Directions meet
+an area that is thinner than their spacing at random, or not at all. The error of an area therefore also contains
+`_RANDOM_ERRORS` standard errors of random directions, times the ratio (at most 1) of the variance between the partial
+sums and that of random directions, and at least the gaze of `_RANDOM_ERRORS` directions.
 """
 
 from __future__ import annotations
@@ -28,10 +31,12 @@ from nerg_mi.transport.observer_gaze import ERROR_EXPONENT, ERROR_PARTS
 from .visits import Aoi, assign_hits, merge_members
 
 INITIAL_DIRECTIONS = 1 << 13  # initial number of directions over the sphere
-MAX_DIRECTIONS = 1 << 20  # maximum number of directions of a spiral, a fifth of a degree apart
+MAX_DIRECTIONS = 1 << 24  # maximum number of directions of a spiral, a twentieth of a degree apart
+MAX_BAND_DIRECTIONS = 1 << 20  # maximum number of directions among which those that may hit an area are searched
 MAX_SPHERE_DIRECTIONS = 1 << 17  # maximum number of directions for the integral over the whole sphere
 MIN_AOI_DIRECTIONS = 64  # minimum number of directions that may hit an area, if the spiral has as many
 MAX_AOI_DIRECTIONS = 1 << 14  # number of directions that may hit an area beyond which it is not refined
+_RANDOM_ERRORS = 3.0
 _RAY_BATCH = 1 << 17
 _SPHERE_AREA = 4 * math.pi
 
@@ -50,7 +55,7 @@ class Shares:
     share
         Attention share, (E, A).
     error
-        Estimated error of the share, (E, A).
+        Estimated maximum error of the share, (E, A).
     is_hit
         Whether any direction hits the area, (E, A).
     distance
@@ -74,15 +79,17 @@ class Shares:
 
 @dataclass(frozen=True, kw_only=True)
 class SummationRule:
-    """Accuracy of the integrals: relative tolerance, absolute tolerance as a share of the gaze, and initial number
-    of directions."""
+    """Accuracy of the integrals: relative tolerance, absolute tolerance as a share of the gaze, the same for areas that
+    no direction hits, and initial number of directions."""
 
     rtol: float = 1e-2
     atol: float = 1e-5
+    unseen_atol: float = 1e-5
     initial_directions: int = INITIAL_DIRECTIONS
 
 
-COARSE = SummationRule(rtol=0.02, atol=5e-5)  # for many areas, or for averages over many observers
+# For many areas, or for averages over many observers.
+COARSE = SummationRule(rtol=0.02, atol=5e-5, unseen_atol=1e-3)
 
 
 def gaze_shares(
@@ -153,13 +160,17 @@ class _AdaptiveSums:
         E, A = len(observers), len(members)
         # Integrals over the parts of the spiral: of the mean density, then of each ensemble member.
         self.parts: np.ndarray = np.zeros((1, E, A + 1, ERROR_PARTS))
+        # Sums of the squared gaze of directions that hit an area, and the maximum of those that may hit it.
+        self.square, self.peak = np.zeros((E, A)), np.zeros((E, A))
         self.distance, self.escaped = np.zeros((E, A)), np.zeros(E)
         self.seen = np.zeros((E, A), bool)
         self.count = np.full((E, A + 1), rule.initial_directions)
+        self.max_count = np.full((E, A + 1), MAX_SPHERE_DIRECTIONS)
         # Candidate directions of each area on its current spiral.
         self._crossing: dict[tuple[int, int], tuple[int, np.ndarray]] = {}
         for e in range(E):
             for a in range(A):
+                self.max_count[e, a] = self._find_max_count(e, a)
                 self.count[e, a] = self._initial_count(e, a)
         is_open = np.ones((E, A + 1), bool)
         while is_open.any():
@@ -186,23 +197,28 @@ class _AdaptiveSums:
     def _integrals(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the integrals (M, E, A + 1) and the error of the mean density's integral (E, A + 1)."""
         scatter = self.parts[0].std(axis=-1, ddof=1)
-        return self.parts.mean(axis=-1), scatter * ERROR_PARTS**-ERROR_EXPONENT
+        error = scatter * ERROR_PARTS**-ERROR_EXPONENT
+        # The variance of a partial sum of random directions.
+        random_variance = np.maximum(ERROR_PARTS * self.square, np.finfo(float).tiny)
+        variance_ratio = np.minimum(scatter[:, :-1] ** 2 / random_variance, 1)
+        error[:, :-1] += _RANDOM_ERRORS * np.maximum(variance_ratio * np.sqrt(self.square), self.peak)
+        return self.parts.mean(axis=-1), error
 
     def _refine(self, is_open: np.ndarray) -> np.ndarray:
         """Increase the number of directions of the integrals whose error exceeds the tolerance, and return their
         mask (E, A + 1)."""
         value, error = self._integrals()
-        tolerance = self.rule.rtol * np.abs(value[0]) + self.rule.atol * value[0, :, -1:]
-        max_count = np.full(self.count.shape, MAX_DIRECTIONS)
-        max_count[:, -1] = MAX_SPHERE_DIRECTIONS
-        needs_more = is_open & (error > tolerance) & (self.count < max_count)
+        atol = np.full(self.count.shape, self.rule.atol)
+        atol[:, :-1][~self.seen] = self.rule.unseen_atol
+        tolerance = self.rule.rtol * np.abs(value[0]) + atol * value[0, :, -1:]
+        needs_more = is_open & (error > tolerance) & (self.count < self.max_count)
         for e, a in np.argwhere(needs_more).tolist():
             # The error is roughly inversely proportional to the number of directions.
             factor = 1 << max(1, math.ceil(math.log2(error[e, a] / tolerance[e, a])))
             if a < len(self.members):
                 crossing = max(1, len(self._candidate_directions(int(self.count[e, a]), e, a)))
                 factor = min(factor, MAX_AOI_DIRECTIONS // crossing)
-            count = min(int(self.count[e, a]) * factor, int(max_count[e, a]))
+            count = min(int(self.count[e, a]) * factor, int(self.max_count[e, a]))
             needs_more[e, a] = count > self.count[e, a]
             self.count[e, a] = count
         return needs_more
@@ -210,11 +226,18 @@ class _AdaptiveSums:
     def _initial_count(self, e: int, a: int) -> int:
         """Return a number of directions of which at least `MIN_AOI_DIRECTIONS` may hit the area, or the maximum."""
         count = self.rule.initial_directions
-        while (
-            count < MAX_DIRECTIONS and (crossing := len(self._candidate_directions(count, e, a))) < MIN_AOI_DIRECTIONS
-        ):
-            count = min(MAX_DIRECTIONS, count << max(1, math.ceil(math.log2(MIN_AOI_DIRECTIONS / max(crossing, 0.5)))))
+        max_count = int(self.max_count[e, a])
+        while count < max_count and (crossing := len(self._candidate_directions(count, e, a))) < MIN_AOI_DIRECTIONS:
+            count = min(max_count, count << max(1, math.ceil(math.log2(MIN_AOI_DIRECTIONS / max(crossing, 0.5)))))
         return count
+
+    def _find_max_count(self, e: int, a: int) -> int:
+        """Return the maximum number of directions for an area: more for one of a smaller bounding cone."""
+        sines = [
+            min(radius / max(float(np.linalg.norm(center - self.observers[e])), radius, 1e-30), 1.0)
+            for center, radius in (self.aois[k].bounding_sphere for k in self.members[a])
+        ]
+        return int(np.clip(MAX_BAND_DIRECTIONS / max(sum(sines), 1e-9), MAX_BAND_DIRECTIONS, MAX_DIRECTIONS))
 
     def _candidate_directions(self, count: int, e: int, a: int) -> np.ndarray:
         """Return the indices of the directions, out of ``count``, that may hit the area."""
@@ -292,6 +315,11 @@ class _AdaptiveSums:
             mask, rows = requested[:, a], hits.rows[a]
             for m, g in enumerate(gaze):
                 self.parts[m, mask, a] = sum_bins(rows, g[rows])[mask]
+            direction_area = _SPHERE_AREA / count
+            self.square[mask, a] = np.bincount(observer[rows], gaze[0, rows] ** 2, E)[mask] * direction_area**2
+            for b in batch:
+                if mask[b.observer]:
+                    self.peak[b.observer, a] = b.gaze[0, b.rows[a]].max(initial=0) * direction_area
             self.seen[observer[rows], a] = True
             self.distance[mask, a] = sum_bins(rows, gaze[0, rows] * hits.distance[a]).mean(axis=1)[mask]
         mask = requested[:, A]

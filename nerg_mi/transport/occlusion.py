@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
+import numpy as np
 
 from nerg_mi.maths.types import Bool, Float, Point3f, Ray3f, Vector3f, variant_types
 
 from .depth import DEPTHS
-from .geometry import RayHit, SceneGeometry
+from .geometry import RayHit, SceneGeometry, shape_corners
 from .march_primal import OcclusionQuery
 from .observer import ObserverCache, ObserverSettings, distance_and_direction, fingerprint_geometry, visibility
 from .observer_gaze import ObservedGaze
@@ -241,6 +243,18 @@ def _tolerance(
         return RELATIVE_TOLERANCE * dr.minimum(geometry.shape_diagonal, near) + _FAR * geometry.shape_diagonal
     march = settings.march
     return dr.minimum(2 * dr.maximum(march.step, march.dt_gamma * dr.norm(p_d - ray.o)), MAX_TOLERANCE)
+
+
+def shape_tolerance(geometry: SceneGeometry, settings: ObserverSettings, shape: Any) -> float:
+    """Return the distance in scene units by which a surface may lie in front of a point of ``shape`` that it does not
+    occlude."""
+    if settings.tolerance:
+        return min(settings.tolerance, MAX_TOLERANCE)
+    if geometry.medium is not None:
+        march = settings.march
+        return min(2 * max(march.step, march.dt_gamma), MAX_TOLERANCE)
+    diagonal, near = geometry.shape_diagonal, 2 * float(np.abs(shape_corners(shape)).max())
+    return RELATIVE_TOLERANCE * min(diagonal, near) + _FAR * diagonal
 
 
 def _depth_map_for(

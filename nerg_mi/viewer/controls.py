@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from html import escape
 from typing import Any
@@ -23,6 +23,7 @@ from .layers import Scale
 from .page import BrowserWindow, Page
 from .points import PinholeView, make_heading
 from .scene import copy_view
+from .session import AttentionShare
 
 # ---- Panel ----
 
@@ -359,20 +360,30 @@ def set_camera(client: Any, origin: np.ndarray, target: np.ndarray, up: np.ndarr
         client.camera.look_at = tuple(target)
 
 
-def format_shares(shares: dict[str, float], stale: bool = False) -> str:
-    """Format attention shares as an HTML table, largest first; ``stale``: whether they are outdated."""
+def format_shares(shares: Mapping[str, AttentionShare], stale: bool = False) -> str:
+    """Format attention shares and their errors as an HTML table, largest first.
+
+    Shares whose error exceeds the accuracy of the viewer are pale and marked; ``stale``: whether all are outdated.
+    """
     if not shares:
         return layers.format_note("Computing." if stale else "Add areas of interest to see their attention shares.")
-    rows = sorted(shares.items(), key=lambda item: -item[1])
-    remainder = sum(share for _, share in rows[_MAX_ROWS:])
-    entries = [*rows[:_MAX_ROWS], *([(f"{len(rows) - _MAX_ROWS} more", remainder)] if len(rows) > _MAX_ROWS else [])]
+    rows = sorted(shares.items(), key=lambda item: -item[1].share)
+    entries, remainder = rows[:_MAX_ROWS], [value for _, value in rows[_MAX_ROWS:]]
+    if remainder:
+        total = AttentionShare(sum(v.share for v in remainder), sum(v.error for v in remainder))
+        entries.append((f"{len(remainder)} more", total))
+    are_final = [*(value.is_final for _, value in rows[:_MAX_ROWS]), all(v.is_final for v in remainder)]
+    preliminary = f" style='{layers.STALE_STYLE}'"
     cells = "".join(
-        f"<tr><td>{escape(name)}</td><td style='text-align:right'>{100 * share:.1f} %</td></tr>"
-        for name, share in entries
+        f"<tr{'' if is_final else preliminary}><td>{escape(name)}</td>"
+        f"<td style='text-align:right'>{100 * value.share:.1f} % ± {100 * value.error:.1f}</td></tr>"
+        for (name, value), is_final in zip(entries, are_final)
     )
     style = f"font-size:0.85em;margin:0 1em;{layers.STALE_STYLE if stale else ''}"
     text = f"<table style='{style}'><tr><th>area of interest</th><th>attention share</th></tr>{cells}</table>"
-    return text + (layers.format_note("Outdated: computing.") if stale else "")
+    if stale:
+        return text + layers.format_note("Outdated: computing.")
+    return text if all(are_final) else text + layers.format_note("Preliminary where pale.")
 
 
 def round_position(position: np.ndarray) -> tuple[float, float, float]:

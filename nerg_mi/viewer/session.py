@@ -13,20 +13,20 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 
 from nerg_mi.api.fields import activate_mitsuba
-from nerg_mi.api.query import compute_box_shares, compute_mesh_shares, trace
+from nerg_mi.api.query import compute_shares, make_shape_aois, trace
 from nerg_mi.api.scene import COLOR, Scene
 from nerg_mi.errors import NergError, translate_mitsuba_errors
 from nerg_mi.files.atomic import write_text
 from nerg_mi.formats.areas import AreaSet, Region, read_areas
 from nerg_mi.maths.geometry import Similarity
-from nerg_mi.measures.shares import COARSE
+from nerg_mi.measures.shares import SummationRule
+from nerg_mi.measures.visits import MARGIN, Aoi, BoxAoi
 from nerg_mi.probes.probes import place_probes
 from nerg_mi.ranges import MAX_COORDINATE
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.nested_scene import FIELD_PROPERTY, find_field_file, replace_radiance_field
 from nerg_mi.rendering.scene import load_scene
 from nerg_mi.transport.geometry import Ceiling
-from nerg_mi.transport.mitsuba_mesh import count_faces
 from nerg_mi.workflows.render import describe_basis
 from nerg_mi.workflows.scene_cameras import check_point
 from nerg_mi.workflows.scene_commands import ViewOptions
@@ -52,7 +52,6 @@ from .points import (
     pad_directions,
     refine,
     render_frame,
-    rough_integrals,
 )
 
 # ---- Listener ----
@@ -84,14 +83,37 @@ class Listener(Protocol):
 
 # ---- Attention shares ----
 
-MAX_FACES_PER_STEP = 1 << 17
-"""Maximum number of faces whose attention share is computed in one step; a single shape can have more."""
+SHAPES_PER_STEP = 16
+"""Maximum number of shapes whose attention shares are computed in one step."""
+
+SHARE_RULE = SummationRule(rtol=0.02, atol=5e-4, unseen_atol=5e-4)
+"""Accuracy of the attention shares: errors that are hardly visible with one decimal of a per cent."""
+
+PRELIMINARY_SHARE_RULE = SummationRule(rtol=1, atol=1, unseen_atol=1)
+"""Accuracy of the first attention shares."""
+
+
+@dataclass(frozen=True)
+class AttentionShare:
+    """An attention ``share``, from 0 to 1, and the estimate of its maximum ``error``."""
+
+    share: float
+    error: float
+
+    @property
+    def is_final(self) -> bool:
+        """Whether the error is within `SHARE_RULE`."""
+        return self.error <= SHARE_RULE.rtol * self.share + SHARE_RULE.atol
 
 
 def iter_attention_shares(
-    scene: Scene, observer: np.ndarray, regions: Sequence[Region], shapes: Sequence[str]
-) -> Iterator[dict[str, float]]:
-    """Compute the attention shares of areas and shapes in steps.
+    scene: Scene,
+    observer: np.ndarray,
+    regions: Sequence[Region],
+    shapes: Sequence[str],
+    shape_aois: Sequence[Aoi] | None = None,
+) -> Iterator[dict[str, AttentionShare]]:
+    """Compute the attention shares of areas and shapes in steps: first preliminary ones, then within `SHARE_RULE`.
 
     Parameters
     ----------
@@ -100,35 +122,32 @@ def iter_attention_shares(
     observer : ndarray of shape (3,)
         Position of the observer in scene units.
     regions : sequence of Region
-        Areas of interest, computed in the first step.
+        Areas of interest.
     shapes : sequence of str
-        Ids of meshes, computed in groups (`group_shapes`).
+        Ids of meshes, which are seen from both sides.
+    shape_aois : sequence of Aoi, optional
+        The result of `make_shape_aois` for ``shapes``.
 
     Yields
     ------
-    dict of str to float
-        Shares of the observer's gaze, from 0 to 1, by name.
+    dict of str to AttentionShare
+        Shares of the observer's gaze by name.
     """
-    if regions:
-        boxes = compute_box_shares(scene, regions, np.asarray(observer, np.float32)[None], rule=COARSE).share[0]
-        yield dict(zip([region.name for region in regions], boxes.tolist()))
-    for names in group_shapes(scene, shapes):
-        with rough_integrals(scene):
-            meshes = compute_mesh_shares(scene, names, observer, divisions=1, two_sided=True)
-        yield dict(zip(names, meshes.tolist()))
-
-
-def group_shapes(scene: Scene, shapes: Sequence[str]) -> Iterator[list[str]]:
-    """Group the mesh ids ``shapes`` so that each group has at most `MAX_FACES_PER_STEP` faces or is a single mesh."""
-    faces = {shape.id(): count_faces(shape) for shape in scene.mitsuba.shapes() if shape.is_mesh()}
-    group: list[str] = []
-    for name in shapes:
-        if group and sum(faces[n] for n in [*group, name]) > MAX_FACES_PER_STEP:
-            yield group
-            group = []
-        group.append(name)
-    if group:
-        yield group
+    areas = [(region.name, BoxAoi(region), MARGIN) for region in regions]
+    meshes = make_shape_aois(scene, shapes) if shape_aois is None else shape_aois
+    groups = [areas] if areas else []
+    groups += [
+        [(name, aoi, 0.0) for name, aoi in zip(shapes[a : a + SHAPES_PER_STEP], meshes[a : a + SHAPES_PER_STEP])]
+        for a in range(0, len(shapes), SHAPES_PER_STEP)
+    ]
+    position = np.asarray(observer, np.float32)[None]
+    for rule in (PRELIMINARY_SHARE_RULE, SHARE_RULE):
+        for group in groups:
+            shares = compute_shares(scene, [aoi for _, aoi, _ in group], position, margin=group[0][2], rule=rule)
+            yield {
+                name: AttentionShare(share, error)
+                for (name, *_), share, error in zip(group, shares.share[0].tolist(), shares.error[0].tolist())
+            }
 
 
 # ---- Recordings: paths and poses of participants ----
@@ -430,7 +449,7 @@ class Session:
         # The inputs of `point_values` and `shares`: observer, areas and `settings_version`.
         self._point_inputs: tuple[np.ndarray, int] | None = None
         self._share_inputs: tuple[np.ndarray, tuple[Region, ...], int] | None = None
-        self.shares: dict[str, float] = {}
+        self.shares: dict[str, AttentionShare] = {}
         self.ceiling: float | None = None
         self.regions: list[Region] = []
         self.other_areas: list[dict[str, Any]] = []
@@ -527,6 +546,7 @@ class Session:
             shown = self.source.folder / f"{scene_file.stem}.compiled.xml"
             write_text(shown, replace_radiance_field(scene_file, self.compiled))
         self.scene = Scene(load_scene(shown))
+        self._shape_aois: list[Aoi] | None = None
         self.layers = layers.list_layers(self.scene)
         self.basis = describe_basis(self.scene.mitsuba)
 
@@ -852,12 +872,22 @@ class Session:
     def _compute_shares(self, inputs: tuple[np.ndarray, tuple[Region, ...], int]) -> Iterator[None]:
         try:
             observer, regions, version = inputs
-            shares: dict[str, float] = {}
-            for part in iter_attention_shares(self.scene, observer, regions, self.shapes):
+            if self._shape_aois is None:
+                self._shape_aois = make_shape_aois(self.scene, self.shapes)
+            names = {*(region.name for region in regions), *self.shapes}
+            shares: dict[str, AttentionShare] = {}
+            for part in iter_attention_shares(self.scene, observer, regions, self.shapes, self._shape_aois):
                 shares |= part
                 yield None
                 if version != self.settings_version:
                     return
+                if shares.keys() == names:
+                    # Preliminary shares of all are replaced by better ones, unless the observer has moved on.
+                    with self.lock:
+                        self.shares, self._share_inputs = dict(shares), inputs
+                    self.listener.on_shares()
+                    if not _same_inputs(inputs, self._current_share_inputs()):
+                        return
             with self.lock:
                 self.shares, self._finished_share_inputs, self._share_inputs = shares, inputs, inputs
             self.listener.on_shares()

@@ -19,7 +19,7 @@ from nerg_mi.viewer.controls import Inset, box_edges, encode_picture, fit_box, f
 from nerg_mi.viewer.layers import STALE_STYLE, DisplaySettings, Scale, get_layer
 from nerg_mi.viewer.points import PinholeView
 from nerg_mi.viewer.scene import copy_view
-from nerg_mi.viewer.session import Worker
+from nerg_mi.viewer.session import AttentionShare, Worker
 
 # ---- Boxes fitted to a rectangle ----
 
@@ -57,14 +57,19 @@ def test03_box_has_twelve_edges():
 
 def test04_shares_are_sorted():
     cells = lambda text: re.findall(r"<td[^>]*>(.*?)</td>", text)
-    text = format_shares({"a": 0.1, "b|<b>": 0.25, "c": 0.0})
-    assert cells(text) == ["b|&lt;b&gt;", "25.0 %", "a", "10.0 %", "c", "0.0 %"]
-    many = cells(format_shares({f"n{k}": 0.01 for k in range(20)}))
-    assert len(many) == 26 and many[-2:] == ["8 more", "8.0 %"]
+    text = format_shares({n: AttentionShare(s, 1e-3) for n, s in {"a": 0.1, "b|<b>": 0.25, "c": 0.0}.items()})
+    assert cells(text) == ["b|&lt;b&gt;", "25.0 % ± 0.1", "a", "10.0 % ± 0.1", "c", "0.0 % ± 0.1"]
+    many = cells(format_shares({f"n{k}": AttentionShare(0.01, 1e-4) for k in range(20)}))
+    assert len(many) == 26 and many[-2:] == ["8 more", "8.0 % ± 0.1"]
     assert "Add areas" in format_shares({}) and "Computing" in format_shares({}, True)
-    # Outdated shares are pale and marked.
-    assert "Outdated" not in text and STALE_STYLE not in text
-    assert "Outdated" in (old := format_shares({"a": 0.1}, True)) and STALE_STYLE in old
+    # Outdated shares are pale and marked, and so are preliminary ones.
+    final = format_shares({"a": AttentionShare(0.1, 1e-3)})
+    assert "Outdated" not in final and STALE_STYLE not in final and "Preliminary" not in final
+    assert "Outdated" in (old := format_shares({"a": AttentionShare(0.1, 1e-3)}, True)) and STALE_STYLE in old
+    mixed = format_shares({"a": AttentionShare(0.1, 0.05), "b": AttentionShare(0.3, 1e-3)})
+    assert "Preliminary" in mixed and mixed.count(STALE_STYLE) == 1
+    many = {f"n{k}": AttentionShare(0.5, 1e-3) for k in range(12)} | {"last": AttentionShare(0.1, 0.09)}
+    assert "Preliminary" in format_shares(many)
 
 
 def test05_stale_inset_is_grey():

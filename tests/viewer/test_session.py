@@ -15,6 +15,7 @@ from nerg_mi.formats.areas import Region
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.nested_scene import replace_gaze
+from nerg_mi.transport.mitsuba_mesh import make_mesh, read_triangles
 from nerg_mi.viewer import session as module
 from nerg_mi.viewer.layers import get_layer
 from nerg_mi.viewer.page import Page
@@ -172,7 +173,8 @@ def test07_shares_equal_api(make_session, store):
     for region in session.regions:
         true = nerg.attention(scene, region.corners, observers=[(4.6, 3.0, 1.6)]).share[0]
         # Hardly any gaze falls on the floor.
-        assert session.shares[region.name] == pytest.approx(float(true), rel=0.03, abs=1e-4)
+        share = session.shares[region.name]
+        assert share.is_final and share.share == pytest.approx(float(true), rel=0.01, abs=share.error)
     assert "rays of" in session.basis and "participants" in session.basis
     shown = session.points()
     assert shown.colors.shape == shown.points.shape == session.proxy.points.shape
@@ -270,19 +272,34 @@ def scene(room, gaze_fields, tmp_path):
     return nerg.Scene.load(path)
 
 
-def test12_areas_in_one_step_and_meshes_in_groups(scene, monkeypatch):
-    faces = {"floor": 2, "box": 12}
+def test12_areas_and_meshes_in_steps(scene, monkeypatch):
     regions = [
         Region.create("left", (0, 0.5, -0.1), (2, 2, 0.4)),
         Region.create("right", (0, -2, -0.1), (2, -0.5, 0.4)),
     ]
-    shapes = [name for name in faces if name in {s.id() for s in scene.mitsuba.shapes() if s.is_mesh()}]
-    steps = list(module.iter_attention_shares(scene, AT, regions, shapes))
-    assert [sorted(step) for step in steps] == [["left", "right"], sorted(shapes)]
-    one = nerg.attention(scene, regions[0].corners, observers=AT[None]).share[0]
-    assert steps[0]["left"] == pytest.approx(float(one), rel=0.03) and steps[0]["left"] > 0
-    monkeypatch.setattr(module, "MAX_FACES_PER_STEP", 1)
-    assert list(module.group_shapes(scene, shapes)) == [[name] for name in shapes]
+    monkeypatch.setattr(module, "SHAPES_PER_STEP", 1)
+    steps = list(module.iter_attention_shares(scene, AT, regions, ["floor", "box"]))
+    assert [sorted(step) for step in steps] == 2 * [["left", "right"], ["floor"], ["box"]]
+    one = nerg.attention(scene, regions[0].corners, observers=AT[None])
+    left, preliminary = steps[3]["left"], steps[0]["left"]
+    assert left.share == pytest.approx(float(one.share[0]), abs=left.error) and left.share > 0
+    assert left.is_final and left.error <= preliminary.error
+
+
+def test21_meshes_are_seen_from_both_sides(scene):
+    """Faces in either order, from outside and from inside."""
+    vertices, faces = read_triangles(next(s for s in scene.mitsuba.shapes() if s.id() == "box"))
+    lower, upper = vertices.min(0), vertices.max(0)
+    shares = []
+    for eye in (AT, (lower + upper) / 2):
+        for f in (faces, faces[:, ::-1]):
+            other = nerg.make_scene(
+                gaze=scene.integrator.children["gaze"].filename, shapes={"box": make_mesh(vertices, f, "box")}
+            )
+            *_, step = module.iter_attention_shares(other, np.asarray(eye), [], ["box"])
+            shares.append(step["box"].share)
+    assert shares[0] == pytest.approx(shares[1]) and shares[0] > 0
+    assert shares[2:] == pytest.approx([1, 1], abs=1e-3)
 
 
 def test13_no_areas_and_no_shapes(scene):
