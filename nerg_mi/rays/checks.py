@@ -389,12 +389,20 @@ _HEAD_HEIGHTS = 0.4, 2.3  # metres above the floor; range of the median height o
 
 
 @check(
-    "implausible heights and extents of head positions, and the axis of the file with plausible heights (`--units`, "
-    "`--up`)"
+    "implausible heights and extents of head positions, origins that never move, and the axis of the file with "
+    "plausible heights (`--units`, `--up`)"
 )
 def check_lengths(stats: RayStatistics) -> list[str]:
     """Check the unit of length and the up axis by the heights and the extent of the origins."""
     extent, median, out = stats.extent, stats.height_percentiles[1], []
+    if stats.rays.metadata.get("has_fixed_origins"):
+        return []  # check_files reports these
+    if not extent.any() and len(stats.rays) > 1:
+        position = ", ".join(f"{v:.3g}" for v in stats.rays.origin[0] + 0.0)
+        return [
+            f"all origins are {position} m: the head's position was not recorded, or the gaze is in the head's frame; "
+            "map the position (origin) and the rotation of the head (--map), if the files contain them"
+        ]
     if 100 <= median <= 230:
         out.append(f"the median height is {median:.0f} m: is the unit centimetres? (--units cm)")
     elif extent.max() > 1000 or 1000 <= median <= 2300:

@@ -19,15 +19,23 @@ from .readers import poses
 from .readers.base import MAX_BAD_LINE_FRACTION, UNITS, Reader
 from .readers.cells import is_missing
 from .readers.columns import (
+    DIRECTION_WORDS,
+    GAZE_WORDS,
+    HEAD_WORDS,
+    HIT_WORDS,
+    ROTATION_WORDS,
+    SIDE_WORDS,
     ColumnFinder,
     ColumnMap,
     Roles,
     are_degrees,
+    find_head_positions,
     find_roles,
     find_valid_values,
     is_counter,
     is_validity_column,
     parse_time_unit,
+    split_stem,
 )
 from .readers.registry import iterate_readers
 from .readers.tables import iterate_samples, iterate_table, parse_clock_seconds, read_table_columns, split_component
@@ -351,12 +359,6 @@ def _is_parquet_clock(path: Path, name: str) -> bool | None:
 #
 # Nothing is imported: a proposal lists what is certain, what is a guess and what only the user knows, and the command.
 
-_DIRECTION_WORDS = {"dir", "direct", "direction", "forward", "vec", "vector", "ray", "normal", "look", "gazedir"}
-_HIT_WORDS = {"hit", "point", "intersection", "target", "fixation", "poi", "collision"}
-_HEAD_WORDS = {"head", "hmd", "camera", "cam", "device", "body", "headset"}
-_GAZE_WORDS = {"gaze", "eye", "eyes"}
-_SIDE_WORDS = {"left", "right", "l", "r", "0", "1"}
-
 
 @dataclass
 class Proposal:
@@ -520,40 +522,48 @@ def _propose_columns(out: Proposal, sample: TableSample, roles: Roles) -> None:
     }
     # A position named like a quaternion (x, y, z and w) is not one.
     vectors |= {s: q[:3] for s, q in roles.quaternions.items() if s not in quaternions and all(c in numbers for c in q)}
-    parts = {stem: set(stem.replace("*", "").split("_")) for stem in (*vectors, *quaternions)}
+    parts = {stem: split_stem(stem) for stem in (*vectors, *quaternions)}
+    eulers = {stem: vectors.pop(stem) for stem in list(vectors) if parts[stem] & ROTATION_WORDS}
     direction = _find_best(
         vectors,
         lambda s: (
-            4 * bool(parts[s] & _DIRECTION_WORDS)
+            4 * bool(parts[s] & DIRECTION_WORDS)
             + 2 * is_unit(sample.stack_columns(vectors[s]))
             - _side_penalty(parts[s])
         ),
         min_score=2,
-        tie_break=lambda s: bool(parts[s] & _GAZE_WORDS) - 2 * bool(parts[s] & _HEAD_WORDS),
+        tie_break=lambda s: bool(parts[s] & GAZE_WORDS) - 2 * bool(parts[s] & HEAD_WORDS),
     )
     hit = _find_best(
-        vectors, lambda s: 3 * bool(parts[s] & _HIT_WORDS) - _side_penalty(parts[s]), min_score=3, excluded=(direction,)
+        vectors, lambda s: 3 * bool(parts[s] & HIT_WORDS) - _side_penalty(parts[s]), min_score=3, excluded=(direction,)
     )
     find_position = lambda prefer, but: _find_best(
         vectors,
         lambda s: (
             2
             + 3 * bool(parts[s] & prefer)
-            - 3 * bool(parts[s] & (_HIT_WORDS | _DIRECTION_WORDS))
+            - 3 * bool(parts[s] & (HIT_WORDS | DIRECTION_WORDS))
             - _side_penalty(parts[s])
         ),
         min_score=1,
         excluded=but,
     )
     quaternion = _find_best(
-        quaternions, lambda s: 2 + 2 * bool(parts[s] & _HEAD_WORDS) - _side_penalty(parts[s]), min_score=1
+        quaternions, lambda s: 2 + 2 * bool(parts[s] & HEAD_WORDS) - _side_penalty(parts[s]), min_score=1
     )
     matrix = next((m for m in roles.matrices.values() if all(c in numbers for c in m)), None)
-    head = find_position(_HEAD_WORDS, (direction, hit))
-    eye = find_position(_GAZE_WORDS, (direction, hit, head)) if head is not None and parts[head] & _HEAD_WORDS else None
+    head = find_position(HEAD_WORDS, (direction, hit))
+    eye = find_position(GAZE_WORDS, (direction, hit, head)) if head is not None and parts[head] & HEAD_WORDS else None
     has_pose = quaternion is not None or matrix is not None
+    moving_head = _find_moving_head(sample, vectors, eye or head)
+    if moving_head is not None and matrix is None:
+        head, eye = moving_head, eye or head
+        names = ", ".join(vectors[head])
+        out.assumptions.append(
+            f"the gaze is in the head's frame: {', '.join(vectors[eye])} do not move, but {names} do"
+        )
 
-    origin = head if has_pose or eye is None else eye
+    origin = head if has_pose or eye is None or moving_head is not None else eye
     upright = None
     head_positions = (
         sample.stack_columns(matrix)[:, 3:12:4] if matrix else sample.stack_columns(vectors[origin]) if origin else None
@@ -565,6 +575,10 @@ def _propose_columns(out: Proposal, sample: TableSample, roles: Roles) -> None:
     rotations = None
     if matrix is not None:
         rotations, _ = poses.rotations_from_matrices(sample.stack_columns(matrix))
+        try:
+            poses.check_last_rows(sample.stack_columns(matrix), "the matrix", np.arange(2, sample.rows + 2))
+        except NergError as error:
+            out.questions.append(f"{error}; the import refuses it")
         is_mirrored = poses.is_mirrored(sample.stack_columns(matrix))
         if is_mirrored.any():
             out.questions.append(
@@ -573,12 +587,25 @@ def _propose_columns(out: Proposal, sample: TableSample, roles: Roles) -> None:
     elif quaternion is not None:
         rotations = poses.rotations_from_quaternions(sample.stack_columns(quaternions[quaternion]))
     gaze = sample.stack_columns(vectors[direction]) if direction else None
+    angles = None
+    euler = _find_best(eulers, lambda s: 2 * bool(parts[s] & HEAD_WORDS) - _side_penalty(parts[s]), min_score=2)
+    if rotations is None and euler is not None and "up" in settings:
+        angles, degrees, rotations = _read_euler_angles(sample, eulers[euler], settings["up"])
+        # Directions in the world need no rotation of the head.
+        forward = poses.default_forward(settings["up"], "left")
+        if moving_head is None and gaze is not None and not is_gaze_in_head_frame(gaze, rotations, forward):
+            angles = rotations = None
     if direction and gaze is not None and not is_unit(gaze):
         _question_lengths(out, vectors[direction], gaze)
-    is_local = _propose_pose(out, settings, rotations, gaze, head_positions, time[1])
+    is_local = _propose_pose(out, settings, rotations, gaze, head_positions, time[1], moving_head is not None)
+    if moving_head is not None and rotations is None and direction is not None:
+        out.questions.append(
+            "the head's rotation, without which gaze in the head's frame cannot be placed in the world"
+        )
+        direction = None
     if rotations is not None and gaze is not None and is_local is False:
-        quaternion = matrix = rotations = None
-        if origin is None or (eye is not None and parts[eye] & _GAZE_WORDS):
+        quaternion = matrix = rotations = angles = None
+        if origin is None or (eye is not None and parts[eye] & GAZE_WORDS):
             origin = eye or origin
     mapping: dict = {
         "t": time[0],
@@ -588,12 +615,43 @@ def _propose_columns(out: Proposal, sample: TableSample, roles: Roles) -> None:
         "direction": vectors[direction] if direction else None,
         "xyzw": quaternions[quaternion] if quaternion else None,
         "matrix": matrix,
+        "ypr": angles,
         "origin": vectors[origin] if origin and matrix is None else None,
         "eye": vectors[eye] if rotations is not None and is_local and eye and eye != origin else None,
     }
+    if mapping["eye"] and not np.nan_to_num(sample.stack_columns(mapping["eye"])).any():
+        mapping["eye"] = None
+    if angles is not None:
+        out.assumptions.append(f"the head turns by {', '.join(angles)} (yaw, pitch, roll)")
+        if not degrees:
+            out.options["--radians"] = ""
+            out.assumptions.append("these angles are radians: they stay within 2 pi")
     _propose_angles(out, sample, roles, mapping)
     _propose_validity(out, sample)
     _finish_proposal(out, sample, roles, mapping)
+
+
+def _find_moving_head(sample: TableSample, vectors: dict[str, tuple[str, ...]], eye: str | None) -> str | None:
+    """The stem of positions that move while those of ``eye`` do not, as in the head's frame; None without these."""
+    if eye is None:
+        return None
+    others = (stem for stem in find_head_positions(vectors) if stem != eye)
+    positions = lambda stem: sample.stack_columns(vectors[stem])
+    return next((stem for stem in others if poses.is_fixed(positions(eye), positions(stem))), None)
+
+
+def _read_euler_angles(
+    sample: TableSample, columns: tuple[str, ...], up: str
+) -> tuple[tuple[str, ...], bool, np.ndarray]:
+    """Yaw, pitch and roll among the columns of rotations about x, y and z, whether they are degrees, and rotations
+    (n, 3, 3)."""
+    forward = poses.default_forward(up, "left")
+    (side,) = set("xyz") - {up[-1], forward[-1]}
+    names = tuple(columns["xyz".index(axis)] for axis in (up[-1], side, forward[-1]))
+    angles = sample.stack_columns(names)
+    degrees = are_degrees(names)
+    degrees = bool(np.nanmax(np.abs(angles), initial=0.0) > 2 * np.pi) if degrees is None else degrees
+    return names, degrees, poses.rotations_from_angles(angles, up, forward, degrees)
 
 
 def _question_lengths(out: Proposal, names: Sequence[str], vectors: np.ndarray) -> None:
@@ -610,7 +668,7 @@ def _question_lengths(out: Proposal, names: Sequence[str], vectors: np.ndarray) 
 
 def _side_penalty(parts: set[str]) -> int:
     """Penalty of vectors of a single eye in the choice of columns."""
-    return 2 * bool(parts & _SIDE_WORDS)
+    return 2 * bool(parts & SIDE_WORDS)
 
 
 def _find_best(stems, score, min_score: int, excluded: tuple = (), tie_break=lambda stem: 0) -> str | None:
@@ -714,6 +772,7 @@ def _propose_pose(
     gaze: np.ndarray | None,
     positions: np.ndarray | None,
     seconds: np.ndarray | None,
+    is_known_local: bool,
 ) -> bool | None:
     """Propose the handedness and the forward axis in ``out``; returns whether gaze is in the head's frame."""
     up = settings.get("up")
@@ -743,8 +802,8 @@ def _propose_pose(
         out.questions.append(
             f"the forward axis of heads (--forward): {usual_one}, and there is no walking to confirm it"
         )
-    if gaze is None:
-        return None
+    if gaze is None or is_known_local:
+        return is_known_local or None
     is_local = is_gaze_in_head_frame(gaze, rotations, forward or default or "z")
     if is_local is None:
         out.questions.append(
@@ -803,7 +862,7 @@ def _propose_angles(out: Proposal, sample: TableSample, roles: Roles, mapping: d
     elif mapping["direction"] is None and roles.yaw_pitch_roll:
         if all(c in sample.numbers for c in roles.yaw_pitch_roll):
             names = roles.yaw_pitch_roll
-            gaze = any(set(n.lower().replace("_", " ").split()) & _GAZE_WORDS for n in names)
+            gaze = any(set(n.lower().replace("_", " ").split()) & GAZE_WORDS for n in names)
             mapping["yawpitch" if has_pose or (gaze and len(names) == 2) else "ypr"] = names[: 2 if has_pose else 3]
             out.assumptions.append(
                 "yaw and pitch turn as described in docs/reference/formats.md for this frame; put - before a name of "
@@ -832,7 +891,7 @@ def _finish_proposal(out: Proposal, sample: TableSample, roles: Roles, mapping: 
             f"{', '.join(list(sample.numbers)[:24]) or 'none'}"
         )
         return
-    for key in ("origin", "direction", "hit", "eye", "xyzw", "matrix"):
+    for key in ("origin", "direction", "hit", "eye", "xyzw", "matrix", "ypr"):
         if key in named:
             out.assumptions.append(
                 f"{key}: {', '.join(named[key][:4])}{', ...' if len(named[key]) > 4 else ''} by its names"

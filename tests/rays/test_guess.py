@@ -631,3 +631,11 @@ def test_tables_for_excel_and_vectors_in_cells(tmp_path):
     assert proposal.columns.origin == ("GazeOrigin.x", "GazeOrigin.y", "GazeOrigin.z")
     assert proposal.columns.direction == ("GazeDirection.x", "GazeDirection.y", "GazeDirection.z")
     assert proposal.columns.t == "time" and proposal.options["--up"] == "y"
+
+
+def test_matrix_with_another_last_row(tmp_path):
+    matrices = np.tile(np.eye(4), (60, 1, 1))
+    matrices[:, 3, :3] = np.linspace([0, 1.5, 0], [3, 1.6, 2], 60)  # transposed
+    names = ",".join(f"m{r}{c}" for r in range(4) for c in range(4))
+    np.savetxt(tmp_path / "t.csv", matrices.reshape(60, 16), delimiter=",", header=names, comments="")
+    assert any("transposed" in question for question in propose_import(tmp_path / "t.csv").questions)

@@ -24,6 +24,7 @@ from nerg_mi.rays.rays import COLUMNS, FRAME, Rays
 
 from .cells import MISSING_WORDS
 from .columns import ColumnFinder, may_be_validity_column, parse_time_unit
+from .head_frame import HeadFrameFinder
 from .poses import FilledOriginFinder, find_fill_values, is_aimed
 from .tables import TableBlock, iterate_table, read_table_columns, split_component
 
@@ -155,7 +156,9 @@ class RaysBuilder:
         self._rows_read = self._num_runs = 0
         self._unused_columns: dict[str, None] = {}
         self._missing = Counter[str]()
-        self._filled_origins = FilledOriginFinder(1.0)
+        metre = float(np.cbrt(abs(np.linalg.det(self._transform[:3, :3]))))
+        self._make_origin_finder = lambda: FilledOriginFinder(metre)
+        self._filled_origins, self._head_frames = self._make_origin_finder(), HeadFrameFinder(metre)
         self._skips_bad_lines, self._num_lines, self._bad_lines, self._first_bad_line = skip_bad_lines, 0, [], ""
 
     def add_metadata(self, **entries: Any) -> None:
@@ -186,7 +189,10 @@ class RaysBuilder:
         """
         available = read_table_columns(path) if header is None else header
         used = {split_component(name, available) or name for name in (*numbers, *texts, *also_used)}
-        self.add_unused_columns(name for name in available if name and name not in used)
+        unused = [name for name in available if name and name not in used]
+        self.add_unused_columns(unused)
+        if header is None:
+            self._head_frames.add_table(path, unused)
         for name, tick in (clocks or {}).items():
             unit = parse_time_unit(name)
             if unit is not None and not math.isclose(unit, tick):
@@ -246,7 +252,9 @@ class RaysBuilder:
                 f"the first {count:,} rows of {self._persons.get_name(code)} in {self._sources[-1]['file']} have one "
                 "fill value as their origin, and were kept; exclude them (nerg rays filter --start)"
             )
-        self._filled_origins = FilledOriginFinder(float(np.cbrt(abs(np.linalg.det(self._transform[:3, :3])))))
+        self._filled_origins = self._make_origin_finder()
+        if self._sources:
+            self._head_frames.end_source(self._sources[-1]["file"])
 
     def begin_source(self, path: Path, name: str | None = None) -> None:
         """Begin a source. Only its file name (or ``name``, if files have the same name) and its checksum are recorded.
@@ -348,6 +356,8 @@ class RaysBuilder:
             "direction": (direction[is_kept] / length[is_kept, None]) @ (R / scale).T,
             "confidence": confidence[is_kept],
         }
+        recorded = origin if recorded_origin is None else recorded_origin
+        self._head_frames.add_rays(recorded[is_kept], part["direction"] if head is None else None)
         if hit is not None:
             hit = self._mask_filled_hits(hit, origin, direction, is_kept)
             part["hit"] = self._to_rays_frame(hit[is_kept])
@@ -422,6 +432,8 @@ class RaysBuilder:
                 f"{', '.join(map(repr, unused_validity[:3]))}{suffix} may mark valid rows by their names, but are not "
                 "used; use it with --map and --valid"
             )
+        for sentence in self._head_frames.describe():
+            self.add_warning(sentence)
         metadata = {
             "frame": dict(FRAME),
             "transform": self._transform.tolist(),
@@ -431,6 +443,7 @@ class RaysBuilder:
             "dropped": self._dropped,
             **({"missing": dict(self._missing)} if self._missing else {}),
             **({"unused_columns": list(self._unused_columns)[:_MAX_UNUSED_NAMES]} if self._unused_columns else {}),
+            **({"has_fixed_origins": True} if self._head_frames.has_fixed_origins else {}),
             **self._metadata,
         }
         return self._take_rays(metadata)

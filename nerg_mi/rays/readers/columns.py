@@ -417,6 +417,29 @@ _PERSON_NAMES = (*PERSON_NAMES, "pid", "participant_name", "subject_name", "user
 _CONFIDENCE_NAMES = ("confidence", "gaze_confidence", "conf", "quality")
 
 
+# Words in the names of vectors.
+DIRECTION_WORDS = {"dir", "direct", "direction", "forward", "vec", "vector", "ray", "normal", "look", "gazedir"}
+HIT_WORDS = {"hit", "point", "intersection", "target", "fixation", "poi", "collision"}
+HEAD_WORDS = {"head", "hmd", "camera", "cam", "device", "body", "headset"}
+GAZE_WORDS = {"gaze", "eye", "eyes"}
+SIDE_WORDS = {"left", "right", "l", "r", "0", "1"}
+ROTATION_WORDS = {"rotation", "rot", "euler", "angle", "angles", "orientation", "orient"}
+_POSITION_WORDS = {"position", "pos", "origin", "location", "translation"}
+
+
+def split_stem(stem: str) -> set[str]:
+    """The words of the stem of a vector in `Roles`."""
+    return set(stem.replace("*", "").split("_"))
+
+
+def find_head_positions(vectors: Mapping[str, tuple[str, ...]]) -> list[str]:
+    """The stems of vectors that may be positions of a head by their names, those named like a head first."""
+    others = DIRECTION_WORDS | HIT_WORDS | ROTATION_WORDS | SIDE_WORDS
+    words = {stem: split_stem(stem) for stem in vectors}
+    positions = (s for s, w in words.items() if w & (HEAD_WORDS | _POSITION_WORDS) and not w & others)
+    return sorted(positions, key=lambda stem: not words[stem] & HEAD_WORDS)
+
+
 @dataclass
 class Roles:
     """Possible roles of the columns of a table. Vectors and the like are by stem: the name without the axis."""

@@ -239,6 +239,18 @@ def is_aimed(origin: np.ndarray, direction: np.ndarray, hit: np.ndarray) -> np.n
     return cosine > _MIN_AIM_COSINE
 
 
+_MAX_FIXED_RATIO = 0.1  # of the movement of eyes in the head's frame to that of the head
+
+
+def is_fixed(positions: np.ndarray, heads: np.ndarray) -> bool:
+    """Whether ``positions`` (n, 3) stay in one place, like eyes in the head's frame, while ``heads`` (m, 3) move."""
+    extent, movement = (
+        float(np.ptp(v[np.isfinite(v).all(axis=1)], axis=0).max(initial=0)) if len(v) else 0.0
+        for v in (positions, heads)
+    )
+    return movement > 0 and extent <= _MAX_FIXED_RATIO * movement
+
+
 class FilledOriginFinder:
     """Finds origins of one source that are fill values, block by block.
 

@@ -79,7 +79,7 @@ def _find_gaze_in_world(table: ColumnFinder) -> dict:
     return {
         "direction": table.require_vector(*names.DIRECTION_NAMES, *names.BARE_DIRECTION_NAMES),
         "origin": table.require_vector(*names.EYE_NAMES, *names.BARE_POSITION_NAMES),
-        "head": table.find_vector(*names.ROTATION_NAMES, axes="xyzw"),  # for the checks
+        "head": table.find_vector(*names.HEADSET_ROTATION_NAMES, axes="xyzw"),  # for the checks
     }
 
 
@@ -87,18 +87,21 @@ def _find_gaze_in_head(table: ColumnFinder) -> dict:
     return {
         "direction": table.require_vector(*names.DIRECTION_NAMES, *names.BARE_DIRECTION_NAMES),
         "eye": table.find_vector(*names.EYE_NAMES),
-        "origin": table.require_vector(*names.HEAD_NAMES, *names.BARE_POSITION_NAMES),
-        "xyzw": table.require_vector(*names.ROTATION_NAMES, *names.BARE_ROTATION_NAMES, axes="xyzw"),
+        "origin": table.require_vector(*names.HEADSET_POSITION_NAMES, *names.BARE_POSITION_NAMES),
+        "xyzw": table.require_vector(*names.HEADSET_ROTATION_NAMES, *names.BARE_ROTATION_NAMES, axes="xyzw"),
     }
 
 
 def _find_heads(table: ColumnFinder) -> dict:
-    rotation = table.find_vector(*names.ROTATION_NAMES, *names.BARE_ROTATION_NAMES, axes="xyzw")
+    rotation = table.find_vector(*names.HEADSET_ROTATION_NAMES, *names.BARE_ROTATION_NAMES, axes="xyzw")
     if rotation is not None:
-        return {"origin": table.require_vector(*names.HEAD_NAMES, *names.BARE_POSITION_NAMES), "xyzw": rotation}
+        return {
+            "origin": table.require_vector(*names.HEADSET_POSITION_NAMES, *names.BARE_POSITION_NAMES),
+            "xyzw": rotation,
+        }
     # Unity's Euler angles in degrees are pitch, yaw and roll.
-    x, y, z = table.require_vector(*names.ROTATION_NAMES, "rot", "rotation")
-    return {"origin": table.require_vector(*names.HEAD_NAMES, *names.BARE_POSITION_NAMES), "ypr": (y, x, z)}
+    x, y, z = table.require_vector(*names.HEADSET_ROTATION_NAMES, "rot", "rotation")
+    return {"origin": table.require_vector(*names.HEADSET_POSITION_NAMES, *names.BARE_POSITION_NAMES), "ypr": (y, x, z)}
 
 
 READERS = (
