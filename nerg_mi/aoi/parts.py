@@ -26,7 +26,7 @@ from nerg_mi.rays.dataset import (
 )
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.scene import list_scene_files
-from nerg_mi.tasks.engines import prepare_once
+from nerg_mi.tasks.execution import prepare_once
 from nerg_mi.tasks.task import RENDER_LIBRARIES, FileGroup, Part, Plan
 from nerg_mi.workflows.base import select_backend
 from nerg_mi.workflows.geometry import find_training_file, geometry_key

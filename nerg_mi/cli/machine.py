@@ -51,7 +51,7 @@ class WorkerOptions(ValidatedDataclass):
 )
 def work(address: str, options: WorkerOptions, reporter: Reporter) -> None:
     """Connect to a dask scheduler and run the parts that it sends."""
-    from nerg_mi.tasks.engines import describe_exposure, run_dask_worker
+    from nerg_mi.tasks.cluster import describe_exposure, run_dask_worker
     from nerg_mi.threads import THREADS_VARIABLE
 
     if options.threads:

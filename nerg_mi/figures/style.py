@@ -102,7 +102,7 @@ def hatch_swatch(height: int, width: int, unit: int = 1) -> np.ndarray:
 # Files are identified by name and SHA-256; paths, users and times are excluded, so that equal inputs give equal files.
 
 _PACKAGES = ("mitsuba", "drjit")
-_EXCLUDED_OPTIONS = ("seed", "store", "scheduler")
+_EXCLUDED_OPTIONS = ("seed", "store", "scheduler", "worker_wait")
 """Options that are recorded elsewhere, or do not change results."""
 
 

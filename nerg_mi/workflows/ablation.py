@@ -30,7 +30,7 @@ from nerg_mi.formats.fields import save_gaze
 from nerg_mi.formats.splats import is_splat_file
 from nerg_mi.rays.dataset import load_rays
 from nerg_mi.rays.rays import Rays
-from nerg_mi.tasks.engines import prepare_once
+from nerg_mi.tasks.execution import prepare_once
 from nerg_mi.tasks.task import FOLDER_SUFFIX, RENDER_LIBRARIES, Part, Plan
 from nerg_mi.train.gaze_data import Supervision, digest_rays, hold_out
 from nerg_mi.train.gaze_recipes import get_recipe

@@ -48,7 +48,8 @@ from nerg_mi.surfaces.sources import (
     sum_rays,
 )
 from nerg_mi.surfaces.splats import integrate_gaze, shortest_axes, splat_densities, sum_rays_on_splats
-from nerg_mi.tasks.engines import TaskOutput, prepare_once
+from nerg_mi.tasks.engines import TaskOutput
+from nerg_mi.tasks.execution import prepare_once
 from nerg_mi.tasks.task import RENDER_LIBRARIES, Part, Plan
 from nerg_mi.transport.geometry import SceneGeometry, default_march_settings
 from nerg_mi.transport.mitsuba_mesh import Triangles, read_triangles

@@ -17,6 +17,7 @@ from nerg_mi.ranges import (
     COORDINATES,
     FLAG,
     RANGE,
+    SECONDS,
     SEEDS,
     THREADS,
     Range,
@@ -269,6 +270,13 @@ class PartOptions(ValidatedDataclass):
         None,
         "What computes the parts: local, local:N for N processes, or a dask cluster at tcp://HOST:PORT or "
         "tls://HOST:PORT.  [default: local if --store is given]",
+        changes_result=False,
+        group=PERFORMANCE,
+    )
+    worker_wait: float = option(
+        600.0,
+        "Time in seconds to wait for workers of a dask cluster while none can run the parts.",
+        within=SECONDS,
         changes_result=False,
         group=PERFORMANCE,
     )

@@ -32,7 +32,7 @@ class PartRunner:
 
     def __init__(self, options: PartOptions, output: Path, reporter: Reporter, threads: int | None = None):
         self.store = Store(output.with_suffix(SUFFIX) if options.store is None else options.store)
-        self.engine = open_engine(options.scheduler, threads or 0)
+        self.engine = open_engine(options.scheduler, threads or 0, options.worker_wait)
         self._reporter = reporter
 
     def run(self, plan: Plan, since: float = 0.0, until: float = 1.0) -> Iterator[TaskOutput]:

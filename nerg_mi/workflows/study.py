@@ -21,7 +21,7 @@ from nerg_mi.files.dataframes import ResultTables
 from nerg_mi.files.safe_read import read_json
 from nerg_mi.files.tables import write_json
 from nerg_mi.rendering.scene import activate_variant, list_scene_files
-from nerg_mi.tasks.engines import prepare_once
+from nerg_mi.tasks.execution import prepare_once
 from nerg_mi.tasks.task import Part, Plan, read_processor_name
 
 from .base import SILENT, Reporter, select_backend, versions

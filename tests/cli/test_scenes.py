@@ -23,7 +23,7 @@ from nerg_mi.files.images import write_exr
 from nerg_mi.formats.ply import write_columns
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.bands import render_channels
-from nerg_mi.tasks import engines
+from nerg_mi.tasks import cluster
 from nerg_mi.tasks.engines import LocalEngine, run_plan
 from nerg_mi.tasks.store import Store
 from nerg_mi.threads import THREADS_VARIABLE
@@ -409,7 +409,7 @@ def test_a_store_is_summarised_and_cleaned(tmp_path, nerg):
 def test_a_worker_serves_an_address_and_warns_of_an_open_one(monkeypatch, nerg):
     served = []
     monkeypatch.setattr(
-        engines, "run_dask_worker", lambda *a: served.append((*a[:2], a[3], os.environ.get(THREADS_VARIABLE)))
+        cluster, "run_dask_worker", lambda *a: served.append((*a[:2], a[3], os.environ.get(THREADS_VARIABLE)))
     )
     # Settings of the command are restored after the test.
     monkeypatch.setenv(THREADS_VARIABLE, "")

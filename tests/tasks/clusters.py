@@ -58,6 +58,13 @@ class ClusterOfProcesses:
         self.workers.append(self._start(f"worker{number}", *line))
         return self.workers[-1]
 
+    def start_plain_worker(self, prelude: str) -> subprocess.Popen:
+        """Start a worker with `dask worker` in a process that first runs the code ``prelude``."""
+        code = f"{prelude}\nfrom distributed.cli.dask_worker import main; main()"
+        line = ("-c", code, self.address, "--host", "127.0.0.1", "--nthreads", "1", "--no-nanny", "--no-dashboard")
+        self.workers.append(self._start(f"worker{len(self.workers)}", *line))
+        return self.workers[-1]
+
     def kill_scheduler(self) -> None:
         assert self.scheduler is not None
         self.scheduler.kill()

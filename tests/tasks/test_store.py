@@ -54,17 +54,26 @@ def key(value=1, common=None, work=works.write_mixture, suffix=".txt", label="",
 
 
 def test_key_depends_on_results_only(monkeypatch):
-    assert key() == key(label="called otherwise") == key(1)
-    other_keys = [
+    reference = key()
+    assert reference == key(label="called otherwise") == key(1)
+    others = [
         key(2),
+        key("1"),
         key(common=1),
         key(work=works.write_folder),
         key(suffix=".csv"),
         key(libraries=("numpy",)),
-        key("1"),
     ]
-    monkeypatch.setattr(module, "compute_code_digest", lambda: "other")
-    assert len({key(), *other_keys}) == 7
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "compute_code_digest", lambda: "other")
+        others.append(key())
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "version", lambda name: "other")
+        others.append(key())
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "FORMAT", module.FORMAT + 1)
+        others.append(key())
+    assert len({reference, *others}) == 10 and key() == reference
 
 
 @pytest.mark.parametrize(

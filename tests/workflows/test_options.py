@@ -212,7 +212,7 @@ def test_conditions_list_the_selected_options():
 # ---- Keys of stored parts ----
 
 
-STORE = {"store", "scheduler", "threads"}
+STORE = {"store", "scheduler", "worker_wait", "threads"}
 
 # For each command: its options, the function that returns the options of its parts, and the options that the parts do
 # not receive. These concern the schedule, the selection of parts, or the processing of their outputs.
