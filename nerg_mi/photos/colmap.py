@@ -55,6 +55,12 @@ _MODELS = {
     9: ("RADIAL_FISHEYE", 5),
     10: ("THIN_PRISM_FISHEYE", 12),
     11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+    12: ("SIMPLE_DIVISION", 4),
+    13: ("DIVISION", 5),
+    14: ("SIMPLE_FISHEYE", 3),
+    15: ("FISHEYE", 4),
+    16: ("EUCM", 6),
+    17: ("EQUIRECTANGULAR", 2),
 }
 # Parameters of the supported models in COLMAP's order; "f" sets both focal lengths.
 _PARAMETERS = {
@@ -67,7 +73,11 @@ _PARAMETERS = {
     "OPENCV_FISHEYE": "fl_x fl_y cx cy k1 k2 k3 k4",
     "SIMPLE_RADIAL_FISHEYE": "f cx cy k1",
     "RADIAL_FISHEYE": "f cx cy k1 k2",
+    # Equidistant: OPENCV_FISHEYE with coefficients of zero.
+    "SIMPLE_FISHEYE": "f cx cy",
+    "FISHEYE": "fl_x fl_y cx cy",
 }
+_UNDISTORT = 'run "colmap image_undistorter" and train on its result'
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 # Points with fewer observations, or with a larger reprojection error in pixels, are not used as surface points.
 _MIN_TRACK, _MAX_ERROR = 3, 4.0
@@ -109,9 +119,11 @@ class _Camera:
         """Convert to the keys of `posed.LENS_KEYS`. Raises `NergError` for an unsupported model."""
         names = _PARAMETERS.get(self.model)
         if names is None:
+            # COLMAP leaves panoramas as they are.
+            remedy = "project the panoramas to perspective photos" if self.model == "EQUIRECTANGULAR" else _UNDISTORT
             raise NergError(
-                f'its camera model "{self.model}" is not supported; run "colmap image_undistorter" and train on '
-                f"its result, or use one of {', '.join(_PARAMETERS)}"
+                f'its camera model "{sanitize(self.model, 40)}" is not supported; {remedy}, or use one of '
+                f"{', '.join(_PARAMETERS)}"
             )
         names = names.split()
         if len(names) != len(self.parameters) or not np.all(np.isfinite(self.parameters)):
@@ -135,6 +147,8 @@ class _ImageRecord:
     quaternion: tuple
     translation: tuple
     points: np.ndarray = field(default_factory=lambda: _NO_POINTS)
+    # Name with spaces at its ends, which separate or align columns unless a file has this name.
+    padded_name: str = ""
 
 
 def find_model_files(folder: str | Path) -> dict[str, Path] | None:
@@ -151,7 +165,11 @@ def find_model_files(folder: str | Path) -> dict[str, Path] | None:
 
 
 def read_colmap(
-    folder: str | Path, images: str | Path, masks: str | Path | None = None, allow_outside: bool = False
+    folder: str | Path,
+    images: str | Path,
+    masks: str | Path | None = None,
+    allow_outside: bool = False,
+    root: Path | None = None,
 ) -> PosedImages:
     """Read the COLMAP model in ``folder``, in its own world coordinates.
 
@@ -164,8 +182,9 @@ def read_colmap(
     masks
         Folder of the masks (``NAME.png``).
     allow_outside
-        Whether images and masks outside of the data set may be used. The data set is the parent folder of ``images``;
-        links are resolved.
+        Whether images and masks outside of the data set may be used; links are resolved.
+    root
+        Folder of the data set. Default: the parent folder of ``images``.
 
     Returns
     -------
@@ -190,12 +209,14 @@ def read_colmap(
         )
         table = PointTable(numbers, points, _iter_matches(records, cameras))
     frames, unused = [], []
-    limit = None if allow_outside else images.parent
+    root = root or images.parent
+    limit = None if allow_outside else root
     finder, mask_finder = FileFinder(images, limit), None if masks is None else FileFinder(Path(masks), limit)
     listed_images = set()
     for record in records:
         try:
-            image = finder.find(record.name, "image")
+            image = finder.find(record.padded_name or record.name, "image")
+            image = image if image.is_file() else finder.find(record.name, "image")
             listed_images.add(image)
             frames.append(_make_frame(record, cameras.get(record.camera), image, mask_finder, table))
         except (ValueError, OverflowError, OSError) as e:
@@ -206,7 +227,7 @@ def read_colmap(
     digest = _compute_digest(files)
     folders = frozenset([images, *(p for p in images.rglob("*") if p.is_dir())])
     return PosedImages(
-        files["images"], frames, unused, None, digest, notes, points, images.parent, folders, frozenset(listed_images)
+        files["images"], frames, unused, None, digest, notes, points, root, folders, frozenset(listed_images)
     )
 
 
@@ -217,6 +238,12 @@ def count_images(folder: Path) -> int:
         return len(_read_images_txt(path))
     with _open_model_file(path) as file:
         return int.from_bytes(file.read(8), "little")
+
+
+def read_image_names(folder: Path) -> list[str]:
+    """Return the names of the images of the model in ``folder``."""
+    path = _require_model(folder)["images"]
+    return [record.name for record in (_read_images_bin if path.suffix == ".bin" else _read_images_txt)(path)]
 
 
 def read_image_poses(folder: str | Path) -> tuple[Path, str, list[tuple[str, np.ndarray]], list[str]]:
@@ -405,8 +432,7 @@ def _read_cameras_bin(path: Path) -> dict[int, _Camera]:
             if model not in _MODELS:
                 raise NergError(
                     f'camera {number} of "{path}" has the unknown model number {model}, so the rest of the file '
-                    "cannot be "
-                    'read; convert it with "colmap model_converter --output_type TXT"'
+                    f"cannot be read; {_UNDISTORT}"
                 )
             name, count = _MODELS[model]
             parameters = r.read_values(f"{count}d", f"camera record {k + 1}")
@@ -517,9 +543,11 @@ def _read_images_txt(path: Path, with_points: bool = False) -> list[_ImageRecord
             continue
         try:
             q, t = tuple(map(float, words[1:5])), tuple(map(float, words[5:8]))
-            out.append(_ImageRecord(" ".join(words[9:]), int(words[8]), q, t))
             if len(q) != 4 or len(t) != 3 or not words[9:]:
                 raise ValueError
+            # Names may contain several spaces, and tabs.
+            padded_name = re.split(r"\s+", line.lstrip(), maxsplit=8)[8][len(words[8]) + 1 :]
+            out.append(_ImageRecord(padded_name.strip(), int(words[8]), q, t, padded_name=padded_name))
         except (ValueError, IndexError) as e:
             raise NergError(f'line {number} of "{path}" is not "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"') from e
         _check_count(path, len(out), MAX_IMAGES, "images")

@@ -30,7 +30,15 @@ from .cameras import (
     resize_mask,
     resize_nearest,
 )
-from .colmap import UpEstimate, describe_other_models, estimate_up, find_pose_source, read_colmap, rotation_to_z
+from .colmap import (
+    UpEstimate,
+    describe_other_models,
+    estimate_up,
+    find_pose_source,
+    read_colmap,
+    read_image_names,
+    rotation_to_z,
+)
 from .observed import ObservedPoints
 from .posed import DepthFile, MaskFile, PosedFrame, PosedImages, UnusedFrame, format_names
 from .transforms import read_dataparser, read_transforms
@@ -451,13 +459,19 @@ def read_posed_images(source: Path, allow_outside: bool = False) -> PosedImages:
         return read_transforms(source, allow_outside)
     folders = [source, *list(resolve_path(source).parents)[:3]]
     images = next((f / "images" for f in folders if (f / "images").is_dir()), None)
+    root, notes = None, describe_other_models(source)
+    if images is None or not any(p.suffix.lower() in _PHOTO_SUFFIXES for p in images.rglob("*")):
+        names = read_image_names(source)
+        root = next((f for f in folders if any(is_regular_file(f / name, "image") for name in names)), None)
+        if root is not None:
+            images, notes = root, [*notes, f'the photos are in "{sanitize(root)}", and not in a folder "images"']
     if images is None:
         raise MissingFile(
             f'there is no folder "images" next to or above the COLMAP model "{source}"; put the photos there'
         )
-    masks = images.with_name("masks")
-    posed = read_colmap(source, images, masks if masks.is_dir() else None, allow_outside)
-    return replace(posed, notes=[*posed.notes, *describe_other_models(source)])
+    masks = (root or images.parent) / "masks"
+    posed = read_colmap(source, images, masks if masks.is_dir() else None, allow_outside, root)
+    return replace(posed, notes=[*posed.notes, *notes])
 
 
 def read_split(

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -44,7 +45,7 @@ from .posed import (
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".exr")
 _PINHOLE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE", "FULL_OPENCV")
-_FISHEYE = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+_FISHEYE = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 _MILLIMETRE = 1e-3
 _SCALE_RANGE = 1e-9, 1e9
 # Order of nerfstudio's distortion_params.
@@ -105,7 +106,9 @@ def read_transforms(path: str | Path, allow_outside: bool = False) -> PosedImage
     original = _read_original(data, path)
     # Millimetres refer to the original coordinates.
     units_per_metre = 1.0 if original is None else 1 / float(np.cbrt(np.linalg.det(original[:3, :3])))
-    frames, unused, notes, listed_images = [], [], [], set()
+    frames, unused, notes, listed_images, moved = [], [], [], set(), []
+    # Frames with equal base names in different folders must not get the same photo.
+    counts = Counter(_get_base_name(f["file_path"]) for f in entries if isinstance(f, dict) and "file_path" in f)
     with_depth = any(isinstance(f, dict) and (f.get("depth_file_path") or f.get("depth_path")) for f in entries)
     unused_keys = _find_unused_file_keys(data, path, with_depth)
     shared = {k: v for k, v in data.items() if k in _SHARED_KEYS or k.startswith("ftheta")}
@@ -116,8 +119,9 @@ def read_transforms(path: str | Path, allow_outside: bool = False) -> PosedImage
             unused.append(UnusedFrame(f"frame {index}", 'it has no "file_path"'))
             continue
         try:
-            image = _find_image(finder, name)
+            image, is_moved = _find_image(finder, name, counts[_get_base_name(name)] == 1)
             listed_images.add(image)
+            moved += [image] if is_moved else []
             unused_keys |= _find_unused_keys(entry, with_depth)
             frames.append(_read_frame({**shared, **entry}, entry, finder, name, image, units_per_metre, notes))
         except (ValueError, OverflowError, OSError) as e:
@@ -125,6 +129,9 @@ def read_transforms(path: str | Path, allow_outside: bool = False) -> PosedImage
             unused.append(UnusedFrame(name, format_error(e)))
     frames, unused = sort_frames(path, frames, unused)
     held_out, unassigned = _read_splits(data, frames)
+    if moved:
+        folder = sanitize(moved[0].parent)
+        notes.append(f'{len(moved)} photos are not where {path.name} states, but in "{folder}", and used from there')
     if unused_keys:
         notes.append(f"unused keys of {path.name}: {format_names(sorted(unused_keys), 12)}")
     return PosedImages(
@@ -250,10 +257,32 @@ def _read_frame(
     return PosedFrame(name, image, pose, lens, depth, mask)
 
 
-def _find_image(finder: FileFinder, name: str) -> Path:
-    """Return the image ``name``. Blender files omit the suffix. If no file exists, returns the path as spelled."""
-    paths = (finder.find(name + suffix, "image") for suffix in ("", *_SUFFIXES))
-    return next((p for p in paths if p.is_file()), finder.folder / name)
+def _get_base_name(name: object) -> str:
+    """Return the normalised last part of the path of an image."""
+    return normalize_name(str(name)).rpartition("/")[2]
+
+
+def _find_image(finder: FileFinder, name: str, may_move: bool) -> tuple[Path, bool]:
+    """Return the image ``name``, and whether it is in another folder.
+
+    Blender files omit the suffix. With ``may_move`` an image that does not exist may also be next to the file or in its
+    folder ``images``. If no file exists, returns the path as spelled.
+    """
+    outside = None
+    for folder in (None, "", "images/") if may_move else (None,):
+        spelled = name if folder is None else folder + name.replace("\\", "/").rpartition("/")[2]
+        for suffix in ("", *_SUFFIXES):
+            try:
+                path = finder.find(spelled + suffix, "image")
+            except NergError as error:
+                # Possibly the folder of another machine, which is not accessed.
+                outside = outside or error
+                continue
+            if path.is_file():
+                return path, folder is not None
+    if outside is not None:
+        raise outside
+    return finder.folder / name, False
 
 
 def _read_mask(entry: dict, finder: FileFinder, image: Path) -> MaskFile | None:

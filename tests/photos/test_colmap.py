@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from nerg_mi.errors import NergError
 from nerg_mi.photos import colmap
+from nerg_mi.photos.cameras import PosedCamera, project
 from nerg_mi.photos.colmap import (
     describe_other_models,
     estimate_up,
@@ -24,6 +25,7 @@ from nerg_mi.photos.colmap import (
     read_named_poses,
     rotation_to_z,
 )
+from nerg_mi.photos.images import read_posed_images
 from nerg_mi.photos.transforms import read_transforms
 
 # ---- COLMAP models, written byte by byte and line by line: cameras, poses, points, and invalid files ----
@@ -188,6 +190,81 @@ def test_unsupported_camera_model_excludes_its_images(model):
     assert "image_undistorter" in posed.unused[0].reason
 
 
+@pytest.mark.parametrize("write", [write_bin, write_txt])
+@pytest.mark.parametrize(
+    "model", [(14, "SIMPLE_FISHEYE", (50.0, 20.5, 14.5)), (15, "FISHEYE", (50.0, 51.0, 20.5, 14.5))]
+)
+def test_equidistant_fisheye(tmp_path, write, model):
+    """Compared with the definition of COLMAP, and with its own projection where it is installed."""
+    (tmp_path / "a.png").touch()
+    number, name, parameters = model
+    write(tmp_path, ["a.png"], {1: (number, name, 40, 30, parameters)})
+    camera = PosedCamera(read_colmap(tmp_path, tmp_path).frames[0].intrinsics(40, 30), np.eye(4))
+    points = np.array([[0.3, -0.2, 1.0], [2.0, 1.0, 0.5], [-0.1, 0.4, 3.0]])
+    pixels, is_visible = project(points * [1, -1, -1], camera)
+    radius = np.linalg.norm(points[:, :2], axis=1)
+    expected = points[:, :2] * (np.arctan2(radius, points[:, 2]) / radius)[:, None]
+    np.testing.assert_allclose(pixels, expected * [50, parameters[-3]] + [20.5, 14.5], rtol=1e-12)
+    assert is_visible.all()
+    try:
+        import pycolmap
+    except ImportError:
+        return
+    theirs = pycolmap.Camera(model=name, width=40, height=30, params=parameters).img_from_cam(points)
+    np.testing.assert_allclose(pixels, theirs, rtol=1e-10)
+
+
+@pytest.mark.parametrize("write", [write_bin, write_txt])
+@pytest.mark.parametrize(
+    "number, name, parameters",
+    [(12, "SIMPLE_DIVISION", 4), (13, "DIVISION", 5), (16, "EUCM", 6), (17, "EQUIRECTANGULAR", 2)],
+)
+def test_other_models_exclude_their_images_alone(tmp_path, write, number, name, parameters):
+    """COLMAP undistorts all but panoramas, which it leaves as they are."""
+    for photo in ("a.png", "b.png"):
+        (tmp_path / photo).touch()
+    write(tmp_path, ["a.png", "b.png"], {1: (number, name, 40, 30, (50.0,) * parameters), 2: CAMERAS[2]})
+    posed = read_colmap(tmp_path, tmp_path)
+    assert [f.name for f in posed.frames] == ["b.png"] and f'"{name}"' in posed.unused[0].reason
+    assert ("image_undistorter" in posed.unused[0].reason) == (name != "EQUIRECTANGULAR")
+
+
+@pytest.mark.parametrize(
+    "name, written",
+    [
+        ("IMG  0011  (copy).jpg", "IMG  0011  (copy).jpg"),
+        ("4 5 7.jpg", "4 5 7.jpg"),
+        ("a\tb.jpg", "a\tb.jpg"),
+        (" a.jpg", " a.jpg"),
+        ("a.jpg ", "a.jpg "),
+        ("a b.jpg", "   a b.jpg  "),
+        ("a.jpg", "\ta.jpg"),
+        ("x 1/y  2.jpg", "x 1\\y  2.jpg"),
+    ],
+)
+def test_spaces_in_names_of_text_models(tmp_path, name, written):
+    """Spaces at the ends belong to the name if there is such a file."""
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).touch()
+    write_txt(tmp_path, [written], {1: CAMERAS[1]})
+    posed = read_colmap(tmp_path, tmp_path)
+    assert [f.image for f in posed.frames] == [tmp_path / name] and not posed.unused
+    assert read_named_poses(tmp_path).names == [written.strip()]
+
+
+@pytest.mark.parametrize("folder", [".", "sparse", "sparse/0"])
+@pytest.mark.parametrize("has_images", [True, False])
+def test_photos_next_to_a_model_are_used_and_reported(model, folder, has_images):
+    root, images = model.parents[1], model.parents[1] / "images"
+    for child in list(images.iterdir()):
+        child.rename(root / folder / child.name)
+    if not has_images:
+        images.rmdir()
+    posed = read_posed_images(model)
+    assert len(posed.frames) == 9 and posed.frames[0].image.is_relative_to(root / folder)
+    assert posed.root == root / folder and any("photos are in" in note for note in posed.notes)
+
+
 @pytest.mark.parametrize("focal", [50.0, 90.0])
 def test_two_cameras_with_one_number_are_refused_unless_equal(model, focal):
     if (model / "cameras.txt").exists():
@@ -254,7 +331,7 @@ def test_invalid_quaternion_is_listed(tmp_path, numbers):
 
 def test_unknown_model_number_is_refused(tmp_path):
     write_bin(tmp_path, ["a.png"], {1: (99, "NEW", 40, 30, (1.0,))})
-    with pytest.raises(ValueError, match="99.*model_converter"):
+    with pytest.raises(ValueError, match="number 99.*image_undistorter"):
         read_colmap(tmp_path, tmp_path)
 
 

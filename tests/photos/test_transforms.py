@@ -237,6 +237,30 @@ def test_nerfstudio_file_lists_define_split(write):
     assert (t.held_out, t.unassigned) == (["d.png"], ["c.png"])
 
 
+@pytest.mark.parametrize(
+    "stated, stored",
+    [
+        ("images/{}.png", "{}.png"),
+        ("{}.png", "images/{}.png"),
+        ("./train/{}", "{}.png"),
+        ("/home/somebody/photos/{}.png", "images/{}.png"),
+        ("C:\\photos\\{}.png", "{}.png"),
+    ],
+)
+def test_photos_in_another_folder_are_used_and_reported(write, stated, stored):
+    names = [stored.format(k) for k in "ab"]
+    t = read_transforms(write({"fl_x": 1.0, "frames": [frame(stated.format(k)) for k in "ab"]}, names))
+    assert [f.image for f in t.frames] == [t.root / name for name in names] and not t.unused
+    assert any("2 photos" in note for note in t.notes)
+
+
+def test_photos_of_equal_names_in_other_folders_are_missing(write):
+    """Otherwise two poses would show the same photo."""
+    frames = [frame("left/a.png"), frame("right/a.png"), frame("left/b.png")]
+    t = read_transforms(write({"fl_x": 1.0, "frames": frames}, ["a.png", "b.png"]))
+    assert [f.name for f in t.frames] == ["left/b.png"] and len(t.unused) == 2
+
+
 def test_the_fox(recorded):
     """Real photos: 17 of the 67 listed images do not exist."""
     t = read_transforms(recorded("fox") / "transforms.json")
@@ -285,7 +309,7 @@ def test_links_within_the_folder_are_followed(tmp_path, write):
 def test_absolute_path_outside_is_not_accessed(tmp_path, write, monkeypatch):
     path = write({"fl_x": 30.0, "frames": [frame("a.png"), frame("/etc/passwd"), frame("../../etc/hostname")]})
     accessed = []
-    monkeypatch.setattr("pathlib.Path.is_file", lambda self: accessed.append(self) or True)
+    monkeypatch.setattr("pathlib.Path.is_file", lambda self: accessed.append(self) or self.name == "a.png")
     t = read_transforms(path)
     assert len(t.unused) == 2 and not [p for p in accessed if "etc" in str(p)]
 
