@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from nerg_mi.errors import NergError, sanitize
 from nerg_mi.ranges import COORDINATES, SECONDS, TIMES, Range, ValidatedDataclass
+from nerg_mi.workflows.old_names import accept_old_keywords
 from nerg_mi.workflows.options import (
     ALIGN_HELP,
     ANALYSIS,
@@ -214,6 +215,10 @@ class StatisticsOptions(CountOptions, PredictionOptions, PartOptions):
         super().__post_init__()
         for text in self.observers:
             parse_point(text, "--observer")
+
+
+# The command is declared in nerg_mi.workflows.scene_commands.
+accept_old_keywords(StatisticsOptions, "stats")
 
 
 def parse_window(text: str) -> tuple[str, float, float]:

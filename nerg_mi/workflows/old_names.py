@@ -195,7 +195,11 @@ def find_keywords(command: str, spellings: Mapping[str, str]) -> dict[str, str]:
 
 
 def accept_old_keywords(kind: type, command: str) -> None:
-    """Let the dataclass of options ``kind`` and its bases take the old keywords of ``command``, too."""
+    """Let the dataclass of options ``kind`` and its bases take the old keywords of ``command``, too.
+
+    `nerg_mi.workflows.base.command` calls this. Where the command is declared in another module than its options, the
+    options' module calls it as well, so that the old keywords do not depend on what else is imported.
+    """
     for base in kind.__mro__:
         if not is_dataclass(base) or "__init__" not in vars(base):
             continue

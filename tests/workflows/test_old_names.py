@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import ast
+import json
 import re
+import subprocess
+import sys
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -14,7 +17,7 @@ from nerg_mi.cli.building import DEBUG, build_command
 from nerg_mi.errors import NergError
 from nerg_mi.workflows.base import COMMANDS, Command
 from nerg_mi.workflows.gaze_commands import AblationOptions, FoldOptions, GazeOptions
-from nerg_mi.workflows.old_names import ALL, OLD_NAMES, renamed_options
+from nerg_mi.workflows.old_names import _KEYWORDS, ALL, OLD_NAMES, renamed_options
 from tools.command_pages import iter_commands
 
 # Options of colmap, pip, Python's server and torch-ngp, and the prefix of negated flags.
@@ -90,3 +93,23 @@ def test_functions_of_the_library_accept_old_keywords(rgb, tmp_path):
         nerg.train_gaze(tmp_path / "none.npz", caps=1)
     with pytest.raises(NergError, match="none.npz"):
         nerg.train_gaze(tmp_path / "none.npz", cap=1, weights="person", geometry="none")
+
+
+ALONE = """
+import importlib, json, sys
+module = importlib.import_module(sys.argv[1])
+print(json.dumps({name: getattr(getattr(module, name), "%s", {}) for name in sys.argv[2:]}))
+"""
+
+
+def test_old_keywords_do_not_depend_on_other_imports():
+    expected: dict[str, dict[str, dict[str, str]]] = {}
+    for command in COMMANDS.values():
+        for kind in command.options.__mro__ if command.options else ():
+            if _KEYWORDS in vars(kind):
+                expected.setdefault(kind.__module__, {})[kind.__name__] = vars(kind)[_KEYWORDS]
+    assert "StatisticsOptions" in expected["nerg_mi.aoi.options"]
+    for module, keywords in expected.items():
+        line = [sys.executable, "-c", ALONE % _KEYWORDS, module, *keywords]
+        done = subprocess.run(line, capture_output=True, text=True, check=True)
+        assert json.loads(done.stdout) == keywords, module
