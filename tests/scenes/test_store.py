@@ -1,13 +1,16 @@
 """The demo store: layout, twin, pictures, attention law and shoppers."""
 
 import json
+import zipfile
 
 import numpy as np
 import pytest
 
 mi = pytest.importorskip("mitsuba")
 
-from nerg_mi.scenes.store import attention_law, cameras, layout, shoppers, twin, views  # noqa: E402
+from nerg_mi.scenes.store import attention_law, cameras, layout, make, shoppers, twin, views  # noqa: E402
+
+from nerg_mi.rays.rays import Rays  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -223,3 +226,24 @@ def test_shoppers_keep_clear_of_furniture_and_return_to_the_skeleton_file(store,
     o, d = head_poses(*(rows.keypoints[:, k] for k in (LEFT_EAR, RIGHT_EAR, NOSE)))
     assert np.array_equal(rows.ids, ids) and np.array_equal(rows.times, times)
     assert np.allclose(o, origins, atol=1e-4) and np.allclose(d, directions, atol=2e-3)
+
+
+def read_members(path):
+    """Uncompressed bytes of the files of an archive: the compressed ones differ between versions of zlib."""
+    with zipfile.ZipFile(path) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+def test_committed_sample_is_written_as_today(tmp_path):
+    Rays.load(make.FOLDER / "shoppers.npz").save(tmp_path / "again.npz")
+    assert read_members(tmp_path / "again.npz") == read_members(make.FOLDER / "shoppers.npz"), "run make --stage rays"
+
+
+@pytest.mark.nightly
+def test_committed_sample_is_that_of_seed_zero(tmp_path):
+    job = make.Job(0, tmp_path, tmp_path / "build")
+    job.build.mkdir()
+    make.make_twin(job)
+    make.make_shoppers(job)
+    _, sample = make.make_rays(job)
+    assert read_members(sample) == read_members(make.FOLDER / "shoppers.npz"), "run make --stage rays"
