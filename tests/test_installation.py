@@ -70,6 +70,28 @@ def test01_checkout_works_without_installation(clone, elsewhere):
     assert files.split() == [str(clone / "plugins" / "nerg.py"), str(clone / "scenes" / "store" / "layout.py")]
 
 
+def test01_an_editable_installation_is_found_next_to_a_clone_of_that_name(tmp_path):
+    """From the folder above a clone, ``nerg_mi`` is that folder, unless a package of this name is on the path."""
+    pytest.importorskip("setuptools", minversion="77")
+    clone, site = tmp_path / "above" / "nerg_mi", tmp_path / "site"
+    for name in ("nerg_mi", "plugins", "scenes"):
+        shutil.copytree(ROOT / name, clone / name, ignore=shutil.ignore_patterns("__pycache__", "build"))
+    for name in ("pyproject.toml", "README.md", "LICENSE", "MANIFEST.in"):
+        shutil.copy(ROOT / name, clone / name)
+    # What pip does for `pip install -e`, without its downloads.
+    build = f"from setuptools import build_meta; build_meta.build_editable({str(tmp_path)!r})"
+    done = subprocess.run([sys.executable, "-c", build], cwd=clone, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    shutil.unpack_archive(next(tmp_path.glob("*.whl")), site, "zip")
+    begin = f"import site; site.addsitedir({str(site)!r})\n"
+    done = run_uninstalled(
+        begin + "import nerg_mi; print(nerg_mi.render.__module__)" + textwrap.dedent(USE), clone.parent
+    )
+    assert done.returncode == 0, done.stderr
+    assert "nerg_mi.api.render" in done.stdout
+    assert done.stdout.split()[-2:] == [str(clone / "plugins/nerg.py"), str(clone / "scenes/store/layout.py")]
+
+
 # ---- Plugins are registered after any order of imports and variant changes; each order needs a process ----
 
 

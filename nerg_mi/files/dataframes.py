@@ -142,17 +142,12 @@ class DataFrameReader:
     Raises
     ------
     NergError
-        narwhals is not installed, or does not support ``frame``.
+        narwhals does not support ``frame``.
     """
 
     def __init__(self, frame: Any) -> None:
-        try:
-            import narwhals
-        except ImportError as error:
-            raise NergError(
-                "a data frame is read by narwhals, which is not installed; run \"pip install 'nerg-mi[dataframe]'\", "
-                "or pass the columns as arrays to Rays.from_arrays"
-            ) from error
+        import narwhals  # it takes a tenth of a second
+
         try:
             table: Any = narwhals.from_native(frame)
         except TypeError as error:

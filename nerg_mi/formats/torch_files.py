@@ -84,10 +84,11 @@ _STAND_INS = [
 
 def _import_torch() -> Any:
     torch = import_extra("torch", "checkpoints of torch need torch", "torch")
-    # In earlier versions, weights_only could be bypassed to run code (CVE-2025-32434).
-    if tuple(int(n) for n in re.findall(r"\d+", torch.__version__)[:2]) < (2, 6):
+    # In earlier versions, files can make torch run code in spite of weights_only (CVE-2025-32434, CVE-2026-24747) and
+    # damage memory (CVE-2026-4538).
+    if tuple(int(n) for n in re.findall(r"\d+", torch.__version__)[:2]) < (2, 11):
         raise ImportError(
-            f"checkpoints need torch 2.6 or newer, but {torch.__version__} is installed: pip install -U "
+            f"checkpoints need torch 2.11 or newer, but {torch.__version__} is installed: pip install -U "
             '"nerg-mi[torch]"'
         )
     return torch

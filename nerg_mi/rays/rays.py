@@ -577,7 +577,7 @@ class Rays:
         Raises
         ------
         NergError
-            A column does not exist or contains other values, or narwhals is not installed.
+            A column does not exist or contains other values.
 
         Examples
         --------
