@@ -14,7 +14,6 @@ import time
 from functools import partial
 from pathlib import Path
 
-import nerg_mi
 import nerg_mi.scenes.store
 from nerg_mi.evaluation.study import count_traced_operations
 from nerg_mi.files.tables import format_markdown_table

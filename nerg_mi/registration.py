@@ -9,7 +9,6 @@ is checked when Dr.Jit is imported, because an unusable library has no effect be
 from __future__ import annotations
 
 import importlib
-import importlib.machinery
 import importlib.util
 import sys
 from typing import Any

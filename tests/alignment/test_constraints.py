@@ -96,7 +96,7 @@ def test_interpolation_is_trilinear():
     value, slope = DistanceGrid(np.arange(4.0).reshape(4, 1, 1), np.zeros(3), 1.0).interpolate_with_gradient(
         np.array([[1.5, 0, 0]])
     )
-    assert value[0] == 1.5 and slope[0].tolist() == [1, 0, 0]
+    assert value[0] == pytest.approx(1.5) and slope[0].tolist() == [1, 0, 0]
 
 
 def test_gradients_match_central_differences():

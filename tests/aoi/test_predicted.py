@@ -177,7 +177,7 @@ def test_cohorts_come_from_the_table_or_the_samples(tmp_path, rgb):
     write_place(tmp_path)
     (tmp_path / "who.csv").write_text("person,cohort\na,old\nb,new\n")
     result = setting(tmp_path)
-    assert result.members == [(0,), (1,), (0, 1)] and result.margin == 0.03
+    assert result.members == [(0,), (1,), (0, 1)] and result.margin == 0.03  # noqa: RUF069 (stored)
     assert result.make_context(False, ("x",)).cohort_names == ("x",) and result.make_context(True, ()).use_hit_points
     table = setting(tmp_path, cohorts=tmp_path / "who.csv").make_context(False, ("x",))
     assert table.cohort_names == ("new", "old") and list(table.transition_areas) == [0, 1]
@@ -320,7 +320,7 @@ def test_what_if_with_other_observers(tmp_path):
     after = texts([[0.5, 0.5]] * 2)
     result, (observers, *_) = rows_what_if(tmp_path, {"observers": [[9, 9, 9], [8, 8, 8]], "shift": [0, 0, 1]}, after)
     assert observers.positions.tolist() == [[9, 9, 10], [8, 8, 9]]
-    assert result["a", "share"]["after"] == 0.5 and result["a", "share"]["before"] == pytest.approx(0.15)
+    assert result["a", "share"]["after"] == pytest.approx(0.5) and result["a", "share"]["before"] == pytest.approx(0.15)
 
 
 def test_what_if_suppresses_few_participants(tmp_path):

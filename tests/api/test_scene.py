@@ -259,7 +259,7 @@ def test04_shapes_of_every_kind(files, rgb, tmp_path):
 def test05_settings_are_the_integrators(files):
     scene = nerg.make_scene(files / "field.safetensors", falloff=0.7, visibility="map", depth="expected", step=0.05)
     i = scene.integrator
-    assert np.isclose(i.falloff[0], 0.7) and i.settings.step == 0.05
+    assert np.isclose(i.falloff[0], 0.7) and i.settings.step == 0.05  # noqa: RUF069 (stored)
     assert i.observer_settings.visibility == "map" and i.observer_settings.depth == "expected"
 
 

@@ -73,12 +73,12 @@ def test_files(tmp_path):
     assert "| field | ann | 3 | 0.500 |  |" in page
     with open(files[1], newline="") as f:
         rows = list(csv.DictReader(f))
-    assert [r["method"] for r in rows] == ["field", "uniform", "split half"] and float(rows[0]["MAE"]) == 0.012345
+    assert [r["method"] for r in rows] == ["field", "uniform", "split half"] and float(rows[0]["MAE"]) == 0.012345  # noqa: RUF069 (stored)
     provenance = json.loads(files[3].read_text(), parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
     assert (
         provenance["seed"] == 4 and provenance["methods"][0]["NSS"] is None and provenance["persons"][0]["NSS"] is None
     )
-    assert provenance["methods"][0]["KLD"] == 0.51234 and provenance["persons"][0]["rays"] == 3
+    assert provenance["methods"][0]["KLD"] == 0.51234 and provenance["persons"][0]["rays"] == 3  # noqa: RUF069 (stored)
 
 
 def test_pictures_are_on_the_scale_of_the_reference(tmp_path, monkeypatch):
@@ -146,7 +146,9 @@ def test_results_are_read_back(tmp_path):
         "ab",
     )
     assert (
-        result.rows[0]["KLD"] is None and result.rows[1]["KLD"] == 1.0 and result.participant_rows[0]["person"] == "Ada"
+        result.rows[0]["KLD"] is None
+        and result.rows[1]["KLD"] == pytest.approx(1.0)
+        and result.participant_rows[0]["person"] == "Ada"
     )
 
 
@@ -379,7 +381,7 @@ def test_means_intervals_and_differences_of_pairs():
     low, high = stats.ttest_1samp(ours, 0).confidence_interval(0.95)
     field = rows["gaze field"]
     assert (field["KLD"], field["KLD.low"], field["KLD.high"]) == pytest.approx((0.5, low, high))
-    assert field["folds"] == 3 and field["integral.low"] == field["integral.high"] == 1.0
+    assert field["folds"] == 3 and field["integral.low"] == field["integral.high"] == pytest.approx(1.0)
     low, high = stats.ttest_rel(ours, bars).confidence_interval(0.95)
     less = rows["gaze field less nearest"]
     assert (less["KLD"], less["KLD.low"], less["KLD.high"]) == pytest.approx((-0.25, low, high))
@@ -388,7 +390,7 @@ def test_means_intervals_and_differences_of_pairs():
 def test_missing_scores_of_folds_are_skipped():
     rows = {row["method"]: row for row in summarise_folds([fold(0.4, 0.7, 0.2), fold(0.6, math.nan)])}
     assert rows["split half"] == {"method": "split half", "folds": 1, "KLD": 0.2}
-    assert rows["nearest"]["KLD"] == 0.7 and "KLD.low" not in rows["nearest"]
+    assert rows["nearest"]["KLD"] == pytest.approx(0.7) and "KLD.low" not in rows["nearest"]
     # The comparison is with the last method, not with the split half.
     assert "gaze field less nearest" in rows and summarise_folds([fold(1, 2)[:1]])[0]["KLD"] == 1
 
@@ -427,7 +429,7 @@ def test_spread_correlates_with_errors_and_few_groups_have_no_interval():
     assert result["spread", "KLD"]["25%"] == 1 and "rho.low" not in result["spread", "KLD"]
     # A constant signal has no rank, and all positions count.
     same = result["support", "KLD"]
-    assert math.isnan(same["rho"]) and same["25%"] == same["100%"] == 5.5
+    assert math.isnan(same["rho"]) and same["25%"] == same["100%"] == pytest.approx(5.5)
 
 
 def test_position_rows_have_their_errors(evaluation):

@@ -32,13 +32,13 @@ def test_errors_of_synthetic_pictures():
     }
     off = compute_errors(seen, truth, (2 * one, np.arange(n) >= 250))
     assert math.isclose(off["color_rmse"], 0.1, rel_tol=1e-9) and math.isclose(off["color_psnr"], 20, rel_tol=1e-9)
-    assert math.isclose(off["depth_mae"], 0.05) and off["depth_p99"] == 0.5
-    assert off["visibility_mae"] == 0 and off["visibility_wrong"] == 0.25
+    assert math.isclose(off["depth_mae"], 0.05) and off["depth_p99"] == pytest.approx(0.5)
+    assert off["visibility_mae"] == 0 and off["visibility_wrong"] == pytest.approx(0.25)
     assert off["gaze_mae"] == 0 and abs(off["gaze_kld"]) < 1e-12
     # Errors of both signs; half visible counts as visible.
     half = np.where(np.arange(n) % 2, 0.4, 0.6)
     off = compute_errors({"opacity": 0.5 + half, "visibility": half}, truth, (2 * one, one > 0))
-    assert math.isclose(off["opacity_mae"], 0.1) and off["visibility_wrong"] == 0.5
+    assert math.isclose(off["opacity_mae"], 0.1) and off["visibility_wrong"] == pytest.approx(0.5)
     # A miss counts with its full depth; channels that are not rendered have no error.
     off = compute_errors({"depth": none, "color": none[:, None]}, truth)
     assert off["depth_mae"] == 2 and "color_rmse" not in off and "gaze_mae" not in off

@@ -89,7 +89,7 @@ def test_points_outside_are_clamped():
 def test_packed_bits_round_trip(bound):
     grid, bits = made(bound, 0.3)
     again = CascadeGrid.from_packed(grid.pack_bits(), R, bound, ns, 0.25)
-    assert np.array_equal(again.bits, bits) and again.threshold == 0.25 and again.resolution == R
+    assert np.array_equal(again.bits, bits) and again.threshold == 0.25 and again.resolution == R  # noqa: RUF069 (stored)
     with pytest.raises(ValueError, match="bytes"):
         CascadeGrid.from_packed(grid.pack_bits()[:-1], R, bound, ns, 0.25)
 
@@ -156,7 +156,7 @@ def test05_packed_round_trip(resolution):
     packed = OccupancyGrid(bits, ns, 0.5).pack_bits()
     assert packed.dtype == np.uint8 and packed.size == -(-(resolution**3) // 8)
     again = OccupancyGrid.from_packed(packed, resolution, ns, 0.5)
-    assert np.array_equal(again.bits, bits) and again.threshold == 0.5
+    assert np.array_equal(again.bits, bits) and again.threshold == 0.5  # noqa: RUF069 (stored)
     # Lowest bit first, x fastest
     i = int(np.flatnonzero(bits.ravel())[-1]) if bits.any() else 0
     assert bool(packed[i // 8] >> (i % 8) & 1) == bool(bits.ravel()[i])
@@ -210,10 +210,10 @@ def test_parts_belong_to_their_cells():
     # The part with the upper x, the lower y and the upper z.
     grid = RefinedGrid(bits, np.array([1 << 0b101]), ns, 0.1, 0.5, 0)
     assert np.argwhere(grid.bits).tolist() == [[5, 0, 3]]
-    assert grid.cells == (6, 6, 6) and grid.occupied_fraction == 1 / 216
+    assert grid.cells == (6, 6, 6) and grid.occupied_fraction == pytest.approx(1 / 216)
     points = ns.Array3f([3.5 / 6, 2.5 / 6, 3.5 / 6], [0.1 / 6, 0.1 / 6, -4], [5.5 / 6, 5.5 / 6, 9])
     assert grid.distance_to_occupied(points).numpy().tolist() == [0, 1, 0]
-    assert np.array_equal(grid.coarse.bits, bits) and grid.coarse.threshold == 0.5
+    assert np.array_equal(grid.coarse.bits, bits) and grid.coarse.threshold == 0.5  # noqa: RUF069 (stored)
 
 
 def test_cells_without_parts_are_empty():
@@ -295,8 +295,9 @@ def test_empty_cells_stay_empty_and_refinement_is_deterministic():
     assert np.array_equal(one.coarse_bits, bits) and np.array_equal(one.masks, other.masks)
     # Again, from the refined grid: the same.
     again = refine_occupancy(field(smooth, occupancy=one))
-    assert np.array_equal(again.masks, one.masks) and again.threshold == one.threshold == MIN_STEP_OPTICAL_DEPTH / 0.01
-    assert again.coarse_threshold == 1.0
+    assert np.array_equal(again.masks, one.masks) and again.threshold == one.threshold
+    assert one.threshold == pytest.approx(MIN_STEP_OPTICAL_DEPTH / 0.01)
+    assert again.coarse_threshold == 1.0  # noqa: RUF069 (stored)
 
 
 def test_cascades_and_missing_grids_are_not_refined():

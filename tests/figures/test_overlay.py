@@ -63,10 +63,10 @@ def test_robust_maximum_is_a_percentile():
     values = np.arange(100.0).reshape(10, 10)
     mask = values < 50
     assert robust_max(values, mask, 100) == 49
-    assert robust_max(values, mask, 50) == 24.5
+    assert robust_max(values, mask, 50) == pytest.approx(24.5)
     spot = np.zeros((50, 50))
     spot[3, 3] = 2.5
-    assert robust_max(spot, np.ones_like(spot, bool)) == 2.5
+    assert robust_max(spot, np.ones_like(spot, bool)) == pytest.approx(2.5)
 
 
 def test_invalid_scales_are_refused():

@@ -92,8 +92,8 @@ def test_only_unknown_pixels_are_hatched():
 
 def test_hatch_lines_are_diagonal():
     on = hatch_lines(64, 64)
-    assert on.mean() == 0.25 and np.array_equal(on[1:, :-1], on[:-1, 1:])
-    assert hatch_lines(64, 64, 2)[::2, ::2].mean() == 0.25
+    assert on.mean() == pytest.approx(0.25) and np.array_equal(on[1:, :-1], on[:-1, 1:])
+    assert hatch_lines(64, 64, 2)[::2, ::2].mean() == pytest.approx(0.25)
 
 
 def test_hatching_differs_from_all_colours():
@@ -266,7 +266,7 @@ def test_ticks_around_zero():
         places, names, factor = scale_ticks(low, high, 6)
         for place, name in zip(places, names):
             assert value(name, factor) == pytest.approx(low + place * (high - low), abs=1e-6 * max(abs(low), high))
-    assert "0.0" in scale_ticks(-0.5, 0.5, 6)[1] and not any(n.startswith("−0.0") and float(n[1:]) == 0 for n in names)
+    assert "0.0" in scale_ticks(-0.5, 0.5, 6)[1] and not any(n.startswith("−0.0") and float(n[1:]) == 0 for n in names)  # noqa: RUF069 (text)
 
 
 @pytest.mark.parametrize("low, high", [(1e-4, 1.0), (3e-12, 0.3), (1e-20, 1e10), (0.05, 700.0)])

@@ -27,7 +27,8 @@ def test_a_path_is_read_as_written(tmp_path):
     assert (again.width, again.height, again.fps) == (96, 64, 24.0)
     data = json.loads((tmp_path / "camera_path.json").read_text())
     # Names and units of nerfstudio.
-    assert data["camera_path"][1]["aspect"] == 1.5 and len(data["camera_path"][1]["camera_to_world"]) == 16
+    assert data["camera_path"][1]["aspect"] == pytest.approx(1.5)
+    assert len(data["camera_path"][1]["camera_to_world"]) == 16
     assert data["seconds"] == pytest.approx(4 / 24)
 
 

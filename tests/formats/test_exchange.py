@@ -92,7 +92,7 @@ def test_usd_reads_what_was_written(tmp_path, suffix):
 
     write_exchange(SCENE, tmp_path / f"a{suffix}")
     stage = Usd.Stage.Open(str(tmp_path / f"a{suffix}"))
-    assert UsdGeom.GetStageUpAxis(stage) == "Z" and UsdGeom.GetStageMetersPerUnit(stage) == 0.5
+    assert UsdGeom.GetStageUpAxis(stage) == "Z" and UsdGeom.GetStageMetersPerUnit(stage) == 0.5  # noqa: RUF069 (stored)
     assert stage.GetDefaultPrim().GetPath() == "/scene"
     get = lambda path, name, *time: stage.GetPrimAtPath(f"/scene/{path}").GetAttribute(name).Get(*time)
     mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/scene/meshes/a_room"))

@@ -233,7 +233,7 @@ def test02_optional_parts_of_radiance_fields(tmp_path):
     save_radiance(field, tmp_path / "f", {})
     again, meta = load_radiance(tmp_path / "f", ns)
     assert (again.color_space, again.march_step) == ("linear", 0.01) and "deferred" not in meta["architecture"]
-    assert np.array_equal(again.occupancy.bits, field.occupancy.bits) and again.occupancy.threshold == 0.25
+    assert np.array_equal(again.occupancy.bits, field.occupancy.bits) and again.occupancy.threshold == 0.25  # noqa: RUF069 (stored)
     p = ns.Array3f(1, 1, 3)
     assert field.density(p).numpy()[0] == again.density(p).numpy()[0] > 0
     save_radiance(
@@ -393,7 +393,7 @@ def test_contracted_box_round_trips(tmp_path):
     path = tmp_path / "f.safetensors"
     save_radiance(field, path, {})
     again, meta = load_radiance(path, ns)
-    assert again.box == box and again.march_growth == 1 / 128 and meta["box"]["reach"] == 8
+    assert again.box == box and again.march_growth == 1 / 128 and meta["box"]["reach"] == 8  # noqa: RUF069 (stored)
     assert np.array_equal(again.occupancy.bits, field.occupancy.bits) and again.occupancy.bound == 8
     p = ns.Array3f(np.random.default_rng(1).uniform(-14, 14, (3, 100)).astype(np.float32))
     assert np.array_equal(again.density(p).numpy(), field.density(p).numpy())

@@ -114,7 +114,7 @@ def test_participant_rows_are_sorted_by_name():
         "time_to_first_visit": 3.0,
     }
     assert rows[1] == bo | {"visible": 5.0} and tuple(rows[1]) == rows.columns
-    assert rows[3]["time_to_first_visit"] is None and rows[2]["time_to_first_visit"] == 1.0
+    assert rows[3]["time_to_first_visit"] is None and rows[2]["time_to_first_visit"] == pytest.approx(1.0)
     with pytest.raises(IndexError):
         rows[4]
 

@@ -426,10 +426,12 @@ def test_last_visit_ends_with_its_last_sample():
     on = np.array([1, 2, 5, 6])
     landed = HitAssignment(8, (on,), (np.ones(4),))
     early = sum_visits(rays, landed, ("a",), [(ALL, None)], VisitRules())
-    assert early.visits[0, 0] == 2 and early.first_start[0, 0] == 0.25 and early.last_end[0, 0] == 1.75
+    assert early.visits[0, 0] == 2
+    assert (early.first_start[0, 0], early.last_end[0, 0]) == pytest.approx((0.25, 1.75))
     late = sum_visits(replace(rays, t=t + 100), landed, ("a",), [(ALL, None)], VisitRules())
     for parts in ([early, late], [late, early]):
-        assert merge_sums(parts).first_start[0, 0] == 0.25 and merge_sums(parts).last_end[0, 0] == 101.75
+        assert merge_sums(parts).first_start[0, 0] == pytest.approx(0.25)
+        assert merge_sums(parts).last_end[0, 0] == pytest.approx(101.75)
 
 
 def test_sums_without_samples():

@@ -141,7 +141,7 @@ def test_exif_has_focal_length_and_camera(folder, folders):
     (picture,), _ = copy_all(folder, folders)
     # An image with the aspect ratio of film, on which 36 mm are 360 pixels.
     assert picture.focal == pytest.approx(260, rel=1e-4) and picture.camera_key[:2] == ("Maker", "Model")
-    assert float(picture.camera_key[2]) == 4.25
+    assert float(picture.camera_key[2]) == 4.25  # noqa: RUF069 (text)
 
 
 def test_unusable_photos_are_listed(folder, folders):

@@ -87,7 +87,7 @@ def test_units_and_kinds_of_depth(write):
     assert depth("d.exr", applied_scale=2.0, is_euclidean_depth=True) == DepthFile(
         folder / "d.exr", pytest.approx(2.0), False
     )
-    assert depth("d.exr", depth_unit_scale_factor=1e-3).unit == 1e-3
+    assert depth("d.exr", depth_unit_scale_factor=1e-3).unit == pytest.approx(1e-3)
     assert depth("d.png", enable_depth_loading=False) is None
 
 

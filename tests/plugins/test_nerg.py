@@ -294,7 +294,7 @@ def test03_default_step_is_a_fraction_of_the_diagonal(rgb):
     settings = rgb.load_dict(constant()).settings
     assert settings.step == pytest.approx(3**0.5 / 1024, rel=1e-5) and settings.cell_step == float("inf")
     arguments = rgb.load_dict(constant(step=0.25)).settings
-    assert arguments.step == arguments.cell_step == 0.25
+    assert arguments.step == arguments.cell_step == 0.25  # noqa: RUF069 (stored)
 
 
 def test_manual_texts_are_used_once(rgb):

@@ -93,7 +93,7 @@ def test06_occluders_hide_surfaces(rgb):
     each = attention_per_patch(place, uniform, eye, surface).numpy()
     free = attention_per_patch(None, uniform, eye, surface).numpy()
     right = surface.p.numpy()[0] > 0
-    assert np.array_equal(each[right], free[right]) and not each[~right].any() and right.mean() == 0.5
+    assert np.array_equal(each[right], free[right]) and not each[~right].any() and right.mean() == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize("falloff, share", [(0.0, 0.0), (0.5, 0.6), (4.0, 0.95)])

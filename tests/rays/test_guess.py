@@ -236,7 +236,7 @@ def test_participants_confidence_and_hits(tmp_path, monkeypatch):
     path = tmp_path / "log.tsv"
     path.write_text(csv(**table).replace(",", "\t"))
     rays = imported(path, monkeypatch)
-    assert rays.persons == ("ann", "bo") and np.all(rays.confidence == 0.5)
+    assert rays.persons == ("ann", "bo") and np.all(rays.confidence == 0.5)  # noqa: RUF069 (stored)
     assert rays.hit is not None and np.allclose(rays.hit, rays.origin + 2 * rays.direction, atol=1e-5)
 
 
@@ -474,9 +474,9 @@ def test_unit_of_time(rate, tick):
 
 @pytest.mark.parametrize("rate", [50.0, 72.0, 90.0, 120.0, 200.0])
 def test_ticks_of_100_ns_are_not_microseconds(rate):
-    assert rows.find_time_unit(np.arange(100) / rate / 1e-7) == 1e-7
+    assert rows.find_time_unit(np.arange(100) / rate / 1e-7) == 1e-7  # noqa: RUF069 (one of a table)
     # At 11 Hz in milliseconds there is no other unit.
-    assert rows.find_time_unit(np.arange(100) / 11 / 1e-3) == 1e-3
+    assert rows.find_time_unit(np.arange(100) / 11 / 1e-3) == 1e-3  # noqa: RUF069 (one of a table)
 
 
 @pytest.mark.parametrize(

@@ -275,8 +275,8 @@ def test_interval_matches_the_bootstrap():
 
 
 def test_intervals_stay_within_0_and_1():
-    assert mean_over_participants(np.array([0.0, 0.0, 0.0, 0.9])).low == 0.0
-    assert mean_over_participants(np.array([1.0, 1.0, 1.0, 0.1])).high == 1.0
+    assert mean_over_participants(np.array([0.0, 0.0, 0.0, 0.9])).low == 0.0  # noqa: RUF069 (a bound)
+    assert mean_over_participants(np.array([1.0, 1.0, 1.0, 0.1])).high == 1.0  # noqa: RUF069 (a bound)
     assert math.isnan(mean_over_participants(np.array([0.2, 0.3])).low)
 
 

@@ -145,14 +145,16 @@ def test_parts_of_another_version_are_refused(store, monkeypatch):
 
 def test_progress_has_rate_and_time_left():
     progress = PlanProgress(10, reused=2, done=2)
-    assert progress.format_line() == "2 of 10 parts" and progress.remaining_seconds is None and progress.fraction == 0.2
+    assert progress.format_line() == "2 of 10 parts" and progress.remaining_seconds is None
+    assert progress.fraction == pytest.approx(0.2)
     progress.done, progress.seconds = 6, 8.0
     assert (
         progress.remaining_seconds == pytest.approx(8.0)
         and progress.format_line() == "6 of 10 parts, 30 per minute, 8 s left"
     )
     progress.seconds = 2.0
-    assert progress.format_line(False) == "6 of 10 parts, 2 per second" and PlanProgress(0).fraction == 1.0
+    assert progress.format_line(False) == "6 of 10 parts, 2 per second"
+    assert PlanProgress(0).fraction == pytest.approx(1)
 
 
 def test_other_processors_cause_one_warning(store):

@@ -153,9 +153,9 @@ def test_tracking_outliers_do_not_enlarge_the_box(rays_hit_extent):
 
 
 def test_a_given_voxel_size_is_used(rays_hit_extent):
-    assert compute_hit_extent(rays_hit_extent, 0.2, MAX_CELLS).voxel == 0.2
+    assert compute_hit_extent(rays_hit_extent, 0.2, MAX_CELLS).voxel == 0.2  # noqa: RUF069 (stored)
     fine = compute_hit_extent(rays_hit_extent, 0.05, 1 << 21)
-    assert fine.voxel == 0.05 and fine.is_cut
+    assert fine.voxel == 0.05 and fine.is_cut  # noqa: RUF069 (stored)
     with pytest.raises(NergError, match="--voxel-size"):
         compute_hit_extent(rays_hit_extent, 0.005, MAX_CELLS)
     for bad in (0.0, -1.0, np.nan, np.inf):

@@ -75,7 +75,7 @@ def test02_mean_depth_share():
 
 def test03_mean_depth_fraction_limits():
     got = mean_depth_fraction(ns.Float([0, 1e-38, 3e38, np.inf])).numpy()
-    assert got[0] == 0.5 and got[1] == 0.5 and abs(got[2]) < 1e-34 and abs(got[3]) < 1e-34
+    assert got[0] == pytest.approx(0.5) and got[1] == pytest.approx(0.5) and abs(got[2]) < 1e-34 and abs(got[3]) < 1e-34
 
 
 def slope_of(function, x, mode):

@@ -242,7 +242,7 @@ def test14_view_from_page():
     )
     view = PinholeView.from_page(camera)
     assert np.allclose(view.forward, [0, 1, 0]) and np.allclose(view.up, [0, 0, 1])
-    assert view.aspect == 1.5 and view.fov == 0.8 and np.allclose(view.origin, [1, 2, 3])
+    assert view.aspect == 1.5 and view.fov == 0.8 and np.allclose(view.origin, [1, 2, 3])  # noqa: RUF069 (stored)
 
 
 def test15_rays_equal_mitsuba_sensor(rgb):

@@ -245,7 +245,7 @@ def test02_the_table_adds_up_and_the_summary_records_the_options(baked):
         and 0.3 < summary["halves_cc"] <= 1
         and summary["shapes"] == {"room": pytest.approx(1)}
     )
-    assert list(summary["provenance"]["inputs"]) == ["room.ply"] and summary["provenance"]["settings"]["smooth"] == 0.1
+    assert list(summary["provenance"]["inputs"]) == ["room.ply"] and summary["provenance"]["settings"]["smooth"] == 0.1  # noqa: RUF069 (stored)
     raw = (folder / "a.glb").read_bytes()
     document = json.loads(raw[20 : 20 + struct.unpack_from("<I", raw, 12)[0]])
     assert document["asset"]["extras"]["provenance"]["what"] == "nerg bake"

@@ -449,7 +449,7 @@ def test_boxes_are_cut_at_a_height(rgb, tmp_path):
     plan = cut_scene(scene.integrator(), scene, LOW, HIGH, 1.2, 0.0)
     ny, nx = plan.height.shape
     side = (plan.high - plan.low) / (nx, ny)
-    assert plan.cut_height == 1.2 and np.allclose(side, side[0])
+    assert plan.cut_height == 1.2 and np.allclose(side, side[0])  # noqa: RUF069 (stored)
     x, y = plan.low[0] + (np.arange(nx) + 0.5) * side[0], plan.low[1] + (np.arange(ny) + 0.5) * side[0]
     x, y = np.meshgrid(x, y)
     low_box = (np.abs(x + 1) < 0.3) & (np.abs(y) < 0.4)
@@ -494,7 +494,7 @@ def test_paths_break_at_recording_gaps(rays):
     gaps = np.flatnonzero(np.isnan(xy[:, 0]))
     assert len(gaps) == 2 and gaps[0] == 0
     first, second = xy[1 : gaps[1]], xy[gaps[1] + 1 :]
-    assert np.all(first[:, 1] == 0) and np.all(second[:, 1] == 0.4) and len(first) == len(second) == 20
+    assert np.all(first[:, 1] == 0) and np.allclose(second[:, 1], 0.4) and len(first) == len(second) == 20
 
 
 def test_one_participant_and_their_hit_points_are_drawn(rays):

@@ -169,7 +169,7 @@ def test_filter_selects_one_ray_per_fixation(walk):
     )
     (step,) = result.rays.metadata["steps"]
     assert len(result.rays) == result.fixations == step["kept"] and step["one_ray"] and step["velocity"] == 300
-    assert step["least"] == 0.1 and step["of"] == 12_000
+    assert step["least"] == 0.1 and step["of"] == 12_000  # noqa: RUF069 (stored)
 
 
 def test_split_separates_training_and_test_rays(walk, tmp_path):

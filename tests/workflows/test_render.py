@@ -86,7 +86,7 @@ def test_an_overlay_adds_its_quantity_to_the_scene(rgb, scene_overlays, tmp_path
     width, height = mitsuba_bitmap(made.path).size()
     assert width > 18 + 60 and height > 12 and f"scale up to {made.vmax:.4g}" in recorder.messages[0]
     fixed = render_file(scene_overlays, tmp_path / "b.png", PictureOptions(overlay="gaze", vmax=9.0, mode=MODE))
-    assert fixed.vmax == 9.0 and (tmp_path / "b.png").read_bytes() != (tmp_path / "a.png").read_bytes()
+    assert fixed.vmax == 9.0 and (tmp_path / "b.png").read_bytes() != (tmp_path / "a.png").read_bytes()  # noqa: RUF069 (stored)
 
 
 @pytest.mark.parametrize("name", ["visibility", "depth", "emit"])
@@ -142,7 +142,7 @@ def test_a_video_contains_the_images_of_the_sequence(rgb, scene_overlays, tmp_pa
         picture = np.array(mitsuba_bitmap(tmp_path / f"walk_000{k + 1}.png").convert(rgb.Bitmap.PixelFormat.RGB))
         assert frame.shape == picture.shape and np.abs(frame.astype(int) - picture).mean() < 3
     comment = json.loads(metadata["comment"])
-    assert comment["settings"]["fps"] == 5.0 and set(comment["inputs"]) == {
+    assert comment["settings"]["fps"] == 5.0 and set(comment["inputs"]) == {  # noqa: RUF069 (stored)
         "scene.xml",
         "walk.csv",
         "field.safetensors",

@@ -319,7 +319,8 @@ def test_pose_and_lens_of_a_photo_are_read(photos, photo):
     np.testing.assert_allclose(camera.eye.origin, [1.5, -3, 1.2])
     np.testing.assert_allclose(camera.eye.target - camera.eye.origin, [0, 1, 0], atol=1e-12)
     np.testing.assert_allclose(camera.eye.up, [0, 0, 1], atol=1e-12)
-    assert camera.lens.fov == pytest.approx(np.degrees(2 * np.arctan(15 / 25))) and camera.lens.aspect == 1.5
+    assert camera.lens.fov == pytest.approx(np.degrees(2 * np.arctan(15 / 25)))
+    assert camera.lens.aspect == pytest.approx(1.5)
     assert camera.lens.offset == pytest.approx((0.1, 0))
 
 

@@ -155,7 +155,7 @@ def test04_predicted_and_recorded_statistics_and_what_if(folder, tmp_path):
     assert all(p.is_file() for p in result.files)
     with (tmp_path / "out" / "aois.csv").open() as file:
         first = next(csv.DictReader(file))
-    assert float(first["share"]) == result.aois[0]["share"] and first["aoi"] == "the sign"
+    assert float(first["share"]) == result.aois[0]["share"] and first["aoi"] == "the sign"  # noqa: RUF069 (stored)
     text = "".join(p.read_text() for p in result.files if p.suffix in (".csv", ".md", ".json"))
     assert "name 0" not in text
 

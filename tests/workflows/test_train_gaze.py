@@ -329,7 +329,7 @@ def test_contradictory_options_are_refused(options, alone, said):
 
 @pytest.mark.parametrize("options, alone", [(HITS, False), (FIELD, False), (VIEWS, True), (VIEWS, False)])
 def test_compatible_options_are_accepted(options, alone):
-    assert check_plan(options, alone).radius == 0.25
+    assert check_plan(options, alone).radius == 0.25  # noqa: RUF069 (stored)
 
 
 def test_every_option_reaches_the_plan():

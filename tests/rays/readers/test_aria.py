@@ -338,7 +338,7 @@ def test_directions_of_tangents():
     assert distance[0] == 3 and np.isnan(distance[1]) and not eye.any()
     # To the left of the left eye, at 45 degrees: the mean of the tangents.
     _, direction, distance = compute_gaze_in_cpf(VERGENCE, np.array([[0, np.arctan(0.9), np.arctan(1.1), 0, 0.5]]))
-    assert np.allclose(direction, [[np.sqrt(0.5), 0, np.sqrt(0.5)]]) and distance[0] == 0.5
+    assert np.allclose(direction, [[np.sqrt(0.5), 0, np.sqrt(0.5)]]) and distance[0] == pytest.approx(0.5)
 
 
 def test_polar_directions_and_eyes():

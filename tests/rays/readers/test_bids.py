@@ -271,7 +271,7 @@ def test_eyes(dataset):
     np.testing.assert_allclose(both.direction, np.tile([0, 1, 0], (N, 1)), atol=1e-12)
     np.testing.assert_allclose(both.hit, np.tile([0, 3.6, 1.6], (N, 1)), atol=1e-12)
     np.testing.assert_allclose(both.metadata["eye_distance"]["sub-a"], 0.06, rtol=1e-6)
-    assert (both.confidence == 0.6).all()
+    assert np.allclose(both.confidence, 0.6)
     dataset.gaze(IN_WORLD, "sub-a/beh/sub-a_task-look_recording-eye3", **{**SYSTEM, "RecordedEye": "cyclopean"})
     assert (read("bids", dataset.folder).origin[:, 0] == 1).all()
     assert len(read("bids", dataset.folder, eye="both")) == N
@@ -294,7 +294,7 @@ def test_an_eye_that_was_not_seen(dataset):
     expected[:10], expected[20:30] = RIGHT[1], LEFT[1]
     np.testing.assert_allclose(rays.direction, np.delete(expected, np.s_[40:45], axis=0), atol=1e-12)
     assert [RIGHT[0], LEFT[0]] == [tuple(rays.origin[k]) for k in (0, 20)]
-    assert rays.confidence[0] == 0.6 and rays.confidence[20] == 0.8
+    assert np.allclose(rays.confidence[[0, 20]], [0.6, 0.8])
     assert dropped(rays) == {"no eye was seen": [[41, 45]]}
     assert rays.hit is not None
     assert np.isnan(rays.hit).any(axis=1).tolist() == [False] * 45 + [True] * 10

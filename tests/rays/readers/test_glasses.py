@@ -425,7 +425,7 @@ def test_pupil(tmp_path):
         f"10.51,0,0.9,{both}\n10.52,0,0.3,{both}\n10.53,0,0.9,{one}\n11.5,0,0.9,{both}\n"
     )
     rays = read("pupil", folder, marker=0.05, up="z")
-    assert rays.persons == ("anna",) and np.allclose(rays.t, [10.51, 10.53]) and rays.metadata["marker"] == 0.05
+    assert rays.persons == ("anna",) and np.allclose(rays.t, [10.51, 10.53]) and rays.metadata["marker"] == 0.05  # noqa: RUF069 (stored)
     turn = Rotation.from_rotvec([[0, 0, 0.51 * np.pi / 2], [0, 0, 0.53 * np.pi / 2]])
     assert np.allclose(rays.direction, [0, 0, 1]) and np.allclose(rays.head, [0, 0, 1])
     assert rays.metadata["floor"] == "unknown"

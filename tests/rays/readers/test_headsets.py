@@ -177,7 +177,7 @@ def test_sranipal_x_is_negated(tmp_path, style):
     rays = read("sranipal", path)
     origin, direction = (np.delete(v, [4, 9], axis=0) for v in sranipal_world(ORIGIN, LOOK))
     assert np.allclose(rays.origin, origin) and np.allclose(rays.direction, direction)
-    assert np.allclose(rays.t, np.delete(0.02 * np.arange(N), [4, 9])) and rays.metadata["tick"] == 1e-3
+    assert np.allclose(rays.t, np.delete(0.02 * np.arange(N), [4, 9])) and rays.metadata["tick"] == 1e-3  # noqa: RUF069 (stored)
     assert dropped(rays) == {"no eye is valid": [[6, 6], [11, 11]]}
 
 
@@ -290,7 +290,7 @@ def test_other_usual_names(tmp_path, head):
     path = tmp_path / "ann.csv"
     path.write_text(head + "\n0.5,1,1.6,3,0,0,2\n")
     rays = read("unity", path)
-    assert np.allclose(rays.origin, [[1, 3, 1.6]]) and np.allclose(rays.direction, [[0, 1, 0]]) and rays.t[0] == 0.5
+    assert np.allclose(rays.origin, [[1, 3, 1.6]]) and np.allclose(rays.direction, [[0, 1, 0]]) and rays.t[0] == 0.5  # noqa: RUF069 (stored)
 
 
 @pytest.mark.parametrize(

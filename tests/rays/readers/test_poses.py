@@ -166,7 +166,7 @@ def test_fill_values(fill):
     v = np.array([[fill] * 3, [fill, fill, 0.5], [0.5] * 3, [np.inf] * 3, [fill, fill, fill + 1e-9]], float)
     nan = np.nan
     assert np.array_equal(find_fill_values(v)[:4], [fill, nan, nan, nan], equal_nan=True)
-    assert np.isnan(find_fill_values(v)[4]) == (fill + 1e-9 != fill)
+    assert np.isnan(find_fill_values(v)[4]) == (fill + 1e-9 != fill)  # noqa: RUF069 (that they differ)
     assert np.array_equal(find_fill_values(v[:3, :2]), [fill, fill, nan], equal_nan=True)
 
 

@@ -88,7 +88,7 @@ def test_format_is_added_by_one_object(tmp_path, made_up):
     rays = result.rays
     assert np.allclose(rays.origin, [[1, 3, 1.6]]) and np.allclose(rays.direction, [[0, 1, 0]])
     assert rays.persons == ("ann",) and result.summary.dropped == {"a blink": 1}
-    assert rays.metadata["preset"] == "made_up" and rays.metadata["scale"] == 0.01 and rays.metadata["tick"] == 1e-3
+    assert rays.metadata["preset"] == "made_up" and rays.metadata["scale"] == 0.01 and rays.metadata["tick"] == 1e-3  # noqa: RUF069 (stored)
     assert "heads" not in rays.metadata and [s["file"] for s in rays.metadata["sources"]] == ["heads.csv", "ann.csv"]
 
     run = lambda *arguments: CliRunner().invoke(build_app(), ["rays", *(str(a) for a in arguments)])

@@ -278,7 +278,7 @@ class Centre(SceneReader[Recording]):
         t = np.loadtxt(gaze, ndmin=1)
         builder.count_lines(len(t))
         ahead = np.tile([0.0, 0.0, 1.0], (len(t), 1))
-        yield GazeBlock(t, ahead, np.arange(len(t)) + 1, {"nobody wore them": t == 0.3})
+        yield GazeBlock(t, ahead, np.arange(len(t)) + 1, {"nobody wore them": t == 0.3})  # noqa: RUF069 (stored)
 
 
 @pytest.fixture

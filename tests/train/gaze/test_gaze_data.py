@@ -462,7 +462,7 @@ def test_the_support_is_of_all_rays_in_the_frame_of_the_place():
         None, BOX, "none", align=Similarity([[2, 0, 0, 1], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]])
     )
     plain, moved = (Supervision(rays).make_support(0.5, place) for place in (NOWHERE, double))
-    assert plain.radius == 0.5 and moved.radius == pytest.approx(1.0)
+    assert plain.radius == 0.5 and moved.radius == pytest.approx(1.0)  # noqa: RUF069 (stored)
     assert plain.cells[:, 3].sum() == moved.cells[:, 3].sum() == 400
     np.testing.assert_allclose(moved.cells[:, :3], plain.cells[:, :3] * 2 + [1, 0, 0], atol=1e-5)
     assert Supervision(None, around(1)).make_support(0.5, NOWHERE) is None

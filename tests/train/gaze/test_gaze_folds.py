@@ -97,7 +97,7 @@ def test03_the_weight_maximises_the_held_out_likelihood():
     result = FoldResults(0.1, 20.0, [fold, fold]).select()
     expected = max(PRIOR_WEIGHTS, key=lambda m: np.log((1 - m) * field + m * prior).mean())
     assert result.prior_weight == expected and result.bits > max(0, result.bits_field)
-    assert result.folds == 2 and result.prior_kappa == 20.0
+    assert result.folds == 2 and result.prior_kappa == 20.0  # noqa: RUF069 (stored)
 
 
 def test03b_hits_have_weight_only_if_they_improve_the_mixture():

@@ -121,7 +121,7 @@ def test_refusals():
 
 def test_the_learning_rate_is_held_and_then_falls_to_its_last():
     s = GazeSettings(steps=10, learning_rate=0.02, lr_final_ratio=0.04, lr_hold_fraction=0.25)
-    assert s.learning_rate_at(0) == s.learning_rate_at(0.25) == 0.02
+    assert s.learning_rate_at(0) == s.learning_rate_at(0.25) == pytest.approx(0.02)
     assert s.learning_rate_at(0.625) == pytest.approx(0.02 * 0.2) and s.learning_rate_at(1) == s.learning_rate_at(
         1.5
     ) == pytest.approx(0.02 * 0.04)
@@ -248,7 +248,7 @@ def test_the_papers_recipe_is_fifty_epochs_at_a_rate_that_falls_from_the_start()
     recipe = get_recipe("paper")
     assert recipe.settings["steps"] * recipe.settings["probes"] == 50 * recipe.probes["count"]
     settings = GazeSettings(**recipe.settings)
-    assert settings.learning_rate_at(0) == 1e-3 and settings.learning_rate_at(0.01) < 1e-3
+    assert settings.learning_rate_at(0) == pytest.approx(1e-3) and settings.learning_rate_at(0.01) < 1e-3
     assert settings.learning_rate_at(0.5) == pytest.approx(1e-3 * 0.1**0.5) and settings.learning_rate_at(
         1
     ) == pytest.approx(1e-4)

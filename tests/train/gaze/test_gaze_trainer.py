@@ -209,7 +209,7 @@ def test_the_state_is_saved_at_intervals_and_on_request(monkeypatch, tmp_path):
     )
     file = gaze_state.GazeRunFile(tmp_path / "a.run", {}, 10.0, False)
     for clock[0] in (105.0, 109.0, 111.0, 112.0, 120.0, 122.5):
-        file.save("fit", None, {}, {}, force=clock[0] == 112.0)
+        file.save("fit", None, {}, {}, force=clock[0] == 112.0)  # noqa: RUF069 (stored)
     assert selected == [(111.0, 11.0), (112.0, 12.0), (122.5, 22.5)]
     gaze_state.GazeRunFile(None, {}, 10.0, False).save("fit", None, {}, {}, force=True)
 

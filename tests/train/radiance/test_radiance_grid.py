@@ -260,7 +260,7 @@ def test_cells_and_steps_of_a_contracted_box_grow_outwards():
     assert np.allclose(grid.cell_size_at(p).numpy(), np.array([1, 1, 4]) * 2 / (R / 2))
     assert np.allclose(grid.step_length_at(p).numpy(), [0.01, 0.01, 5 / 128])
     plain = DensityGrid(ns, BOX, R, 0.01, above(), 1, growth=1 / 128)
-    assert plain.cell_size_at(p) == 2 / R and plain.step_length_at(p) == 0.01
+    assert plain.cell_size_at(p) == 2 / R and plain.step_length_at(p) == pytest.approx(0.01)
 
 
 # ---- Settling ----

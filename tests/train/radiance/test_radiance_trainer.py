@@ -521,7 +521,7 @@ def test_damping_near_cameras_ends():
 def test_a_size_is_a_grid_and_a_contracted_box_has_one_twice_as_fine():
     """The inner cube takes half of each edge."""
     small = make_radiance_config("small", BOX)
-    assert small.grid == HashGridConfig(levels=8, log2_rows=16, base=32, finest=512) and small.density_scale == 0.5
+    assert small.grid == HashGridConfig(levels=8, log2_rows=16, base=32, finest=512) and small.density_scale == 0.5  # noqa: RUF069 (stored)
     around = make_radiance_config("small", ContractedBox(BOX))
     assert around.grid == HashGridConfig(levels=8, log2_rows=16, base=64, finest=1024)
     assert around.density_scale == small.density_scale
