@@ -419,9 +419,10 @@ class RaysBuilder:
         `on_rays`, the last rays may be none."""
         self._end_source()
         if not sum(self._part_sizes) and self._on_rays is None:
-            reasons = (
-                "; ".join(f"{d['count']} rows: {d['reason']}" for d in self._dropped[:4]) or "the files have no rows"
-            )
+            if not self._rows_read:
+                names = ", ".join(source["file"] for source in self._sources[:4])
+                raise NergError(f"there are no samples in {sanitize(names)}; record or export them again")
+            reasons = "; ".join(f"{d['count']} rows: {d['reason']}" for d in self._dropped[:4])
             raise NergError(
                 f"none of {self._rows_read} rows gives a ray ({reasons}); check the column map and the preset"
             )

@@ -13,7 +13,7 @@ import numpy as np
 from nerg_mi.errors import NergError, sanitize
 
 from .cells import AXES, is_missing
-from .tables import find_vector_columns, read_table_columns
+from .tables import explain_columns, find_vector_columns, read_table_columns
 
 # ---- Columns of a table by their usual names ----
 
@@ -49,8 +49,7 @@ class ColumnFinder:
         vector_columns = self.find_vector(*stems, axes=axes)
         if vector_columns is None:
             wanted = " or ".join(f"{s}{'_' if s else ''}{{{','.join(axes)}}}" for s in stems)
-            available = ", ".join(sanitize(c, 40) for c in self.columns[:16])
-            raise NergError(f"{self.path} has no columns {wanted}; its columns are {available}; name them with --map")
+            raise NergError(f"{self.path} has no columns {wanted}; {explain_columns(self.columns)}")
         return vector_columns
 
     def find(self, *names: str) -> str | None:
@@ -78,7 +77,7 @@ class ColumnFinder:
         """As `find_time`, but raises `NergError` instead of returning None."""
         column = self.find_time(*names)
         if column is None:
-            raise NergError(f"{self.path} has no column of time; name its columns with --map")
+            raise NergError(f"{self.path} has no column of time; {explain_columns(self.columns)}")
         return column
 
 

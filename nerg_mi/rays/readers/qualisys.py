@@ -18,6 +18,7 @@ from .base import GENERATED_FILES, RaysBuilder, Signature, TrackingFrame, option
 from .cells import is_missing
 from .columns import ColumnFinder
 from .table import person_from_filename
+from .tables import explain_columns
 
 # ---- Gaze vectors ----
 #
@@ -272,8 +273,7 @@ class NeonMocap:
             columns = ColumnFinder(path)
             time = columns.find("timestamp_[ns]")
             if time is None:
-                available = ", ".join(sanitize(c, 40) for c in columns.columns[:8])
-                raise NergError(f'{path} has no column "timestamp [ns]"; its columns are {available}')
+                raise NergError(f'{path} has no column "timestamp [ns]"; {explain_columns(columns.columns)}')
             names = [time, *columns.require_vector("gaze_origin"), *columns.require_vector("gaze_dir")]
             builder.begin_source(path)
             has_usual_name = path.name.startswith("gaze_in_mocap_space")

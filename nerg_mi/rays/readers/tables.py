@@ -280,8 +280,9 @@ class _Header(NamedTuple):
 
 def _parse_header(path: str | os.PathLike, lines: Sequence[str]) -> _Header:
     """Parse the header in the first ``lines`` of a CSV."""
-    match = _SEPARATOR_LINE.fullmatch(lines[0].rstrip("\r\n")) if lines else None
-    size = 1 if match else 0
+    size = next((k for k, line in enumerate(lines) if not line.isspace()), 0)
+    match = _SEPARATOR_LINE.fullmatch(lines[size].rstrip("\r\n")) if lines else None
+    size += 1 if match else 0
     line = lines[size] if size < len(lines) else ""
     separator = match[1].replace("\\t", "\t") if match else _find_separator(line)
     while _is_open(line, separator) and size < min(len(lines) - 1, _HEADER_LINES):
@@ -634,15 +635,43 @@ def _to_numbers(path: str | os.PathLike, name: str, column: Any, days: DayCounte
         ) from None
 
 
+def _list_names(names: Sequence[str]) -> str:
+    return ", ".join(sanitize(c, 40) for c in names[:12]) + (", ..." if len(names) > 12 else "")
+
+
+# Beginnings of files that are no tables, and their remedies.
+_OTHER_FILES = {
+    "<": "it is HTML or XML instead of a table; download or export it again",
+    "version https://git-lfs": 'it is a pointer of Git LFS; get the file (run "git lfs pull")',
+    "{": "it is JSON; convert it to CSV",
+    "[": "it is JSON; convert it to CSV",
+    "PK\x03\x04": "it is a workbook or an archive; export it as CSV",
+}
+
+
+def explain_columns(columns: Sequence[str]) -> str:
+    """The end of a sentence about missing columns: which ``columns`` there are, or why there is no header, and the
+    remedy."""
+    if not any(columns):
+        return "it is empty; export it again"
+    remedy = next((remedy for start, remedy in _OTHER_FILES.items() if columns[0].startswith(start)), None)
+    if remedy is not None:
+        return remedy
+    if len(columns) == 1 and columns[0].startswith(("#", "%", "//")):
+        return "its first line is a comment; remove the lines above the header"
+    if len(columns) == 1 and ("|" in columns[0] or len(columns[0].split()) > 2):
+        return (
+            f'its first line, "{sanitize(columns[0], 40)}", has neither commas, semicolons nor tabs; export it with '
+            "one of these between its columns"
+        )
+    return f"its columns are {_list_names(columns)}; name columns with --map"
+
+
 def check_columns(path: str | os.PathLike, requested: Sequence[str], available: Sequence[str]) -> None:
     """Raise `NergError` for a requested column that is missing, exists several times, or is requested twice."""
     missing = [c for c in requested if c not in available]
     if missing:
-        list_names = lambda names: ", ".join(sanitize(c, 40) for c in names[:12]) + (", ..." if len(names) > 12 else "")
-        raise NergError(
-            f"{path} has no column {list_names(missing)}; its columns are {list_names(available) or 'none'}; name "
-            "columns with --map"
-        )
+        raise NergError(f"{path} has no column {_list_names(missing)}; {explain_columns(available)}")
     repeated = next((c for c in requested if available.count(c) > 1), None)
     if repeated is not None:
         raise NergError(f'the table "{path}" has several columns called {sanitize(repeated, 40)!r}; rename all but one')

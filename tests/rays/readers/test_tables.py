@@ -1,6 +1,7 @@
 """Tests of `nerg_mi.rays.readers.tables`."""
 
 import csv
+import re
 
 import numpy as np
 import pytest
@@ -467,3 +468,33 @@ def test_vectors_in_cells_of_parquet(tmp_path):
         numbers, [[1, 2, 3, 1, 2, 3, 1], [nan, nan, nan, 4, 5, 6, 2], [4, 5, 6, nan, nan, nan, 3]]
     )
     assert texts[:, 0].tolist() == ["a", "b", "c"]
+
+
+@pytest.mark.parametrize(
+    "text, remedy",
+    [
+        ("", "it is empty; export"),
+        ("\n\n", "it is empty; export"),
+        ("<!DOCTYPE html>\n<title>404, not found</title>\n", "HTML"),
+        ("version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "git lfs pull"),
+        ('[{"x": 1, "y": 2}]\n', "JSON; convert"),
+        ("PK\x03\x04\x14\x00", "export it as CSV"),
+        ("# recorded by a program\nx,y\n1,2\n", "remove the lines above"),
+        ("t x y z\n0 1 2 3\n", '"t x y z", has neither commas'),
+        ("t|x|y|z\n0|1|2|3\n", "between its columns"),
+        ("t,x\n0,1\n", "columns are t, x; name columns with --map"),
+    ],
+)
+def test_files_without_a_header_are_named_with_a_remedy(tmp_path, text, remedy):
+    (tmp_path / "t.csv").write_bytes(text.encode())
+    with pytest.raises(NergError, match=re.escape(remedy)):
+        list(iterate_table(tmp_path / "t.csv", ["speed"]))
+
+
+@pytest.mark.parametrize("top", ["\n", "\r\n \r\n", "\nsep=;\n"])
+def test_empty_lines_may_precede_the_header(tmp_path, top):
+    (tmp_path / "t.csv").write_bytes(f"{top}x;y\n1;2\n3;4\n".encode())
+    (block,) = iterate_table(tmp_path / "t.csv", ["y"])
+    assert block.numbers[:, 0].tolist() == [2, 4] and block.lines.tolist() == [
+        len(top.splitlines()) + k for k in (2, 3)
+    ]
