@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from nerg_mi.errors import NergError, translate_mitsuba_errors
 from nerg_mi.fields.splats import Splats
-from nerg_mi.files.atomic import replace_atomically, write_text
+from nerg_mi.files.atomic import make_folder, replace_atomically, write_text
 from nerg_mi.formats.meshes import MeshFile, read_mesh_file, with_shading_normals
 from nerg_mi.formats.splats import choose_plugin, write_ply_splats
 from nerg_mi.formats.surfaces import write_volume
@@ -412,9 +412,9 @@ def find_tag(child: object) -> str:
 def write_content(path: Path, content: Mapping[str, Any], comment: str) -> list[Path]:
     """Write the content of a scene as the scene file ``path``.
 
-    Meshes, volumes and fields in memory become files next to it, whose names begin with that of the scene. Names of
-    files are relative to its folder where possible. Meshes that are objects of Mitsuba are written in grey, since their
-    material cannot be read.
+    Volumes and fields in memory become files next to it, whose names begin with that of the scene, and meshes become
+    files of the folder ``NAME.meshes``. Names of files are relative to its folder where possible. Meshes that are
+    objects of Mitsuba are written in grey, since their material cannot be read.
 
     Returns
     -------
@@ -442,7 +442,7 @@ class _ContentWriter:
         from nerg_mi.transport.mitsuba_mesh import is_mesh, write_ply
 
         if isinstance(value, MeshFile):
-            file = self._file(name, ".ply")
+            file = self._file(name, ".ply", is_mesh=True)
             write_mesh(file, with_shading_normals(value))
             self.written.append(file)
             return self._make_plugin(name, {"type": "ply", "filename": str(file), "bsdf": _bsdf(value)}, is_top)
@@ -457,7 +457,7 @@ class _ContentWriter:
             return self._make_plugin(name, value, is_top)
         if is_mesh(value):
             # A mesh of Mitsuba does not tell the parameters of its material.
-            file = self._file(name, ".ply")
+            file = self._file(name, ".ply", is_mesh=True)
             with replace_atomically(file) as temporary:
                 write_ply(value, temporary)
             self.written.append(file)
@@ -465,11 +465,14 @@ class _ContentWriter:
             return self._make_plugin(name, {"type": "ply", "filename": str(file), "bsdf": grey}, is_top)
         return self._make_property(name, value)
 
-    def _file(self, name: str, suffix: str) -> Path:
+    def _file(self, name: str, suffix: str, is_mesh: bool = False) -> Path:
         safe = "".join(c if c.isalnum() or c in "-_" else "_" for c in name)
-        path = self.path.absolute().with_name(f"{self.path.stem}.{safe}{suffix}")
-        count = sum(written.name.startswith(f"{self.path.stem}.{safe}") for written in self.written)
-        return path.with_name(f"{self.path.stem}.{safe}_{count}{suffix}") if path in self.written else path
+        stem = self.path.absolute().with_suffix("")
+        # A scene may have hundreds of meshes.
+        prefix = make_folder(f"{stem}.meshes") / safe if is_mesh else Path(f"{stem}.{safe}")
+        path = Path(f"{prefix}{suffix}")
+        count = sum(str(written).startswith(str(prefix)) for written in self.written)
+        return Path(f"{prefix}_{count}{suffix}") if path in self.written else path
 
     def _make_plugin(self, name: str, value: Mapping[str, Any], is_top: bool) -> Element:
         kind = str(value.get("type", ""))

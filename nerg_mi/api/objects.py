@@ -21,7 +21,7 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.fields.splats import Splats
-from nerg_mi.files.atomic import file_sha256, replace_atomically, write_text
+from nerg_mi.files.atomic import file_sha256, make_folder, replace_atomically, write_text
 from nerg_mi.formats.areas import format_areas
 from nerg_mi.formats.splats import write_ply_splats
 from nerg_mi.rays.rays import Rays
@@ -43,13 +43,14 @@ if TYPE_CHECKING:
 
 
 def _store(stem: str, suffix: str, write: Callable[[Path], object]) -> Path:
-    """Write an object with ``write(path)``, which may also write files whose names begin with that of ``path``.
+    """Write an object with ``write(path)``, which may also write files and a folder whose names begin with that of
+    ``path``.
 
     Returns the path, whose name consists of ``stem``, a checksum of all written files, and ``suffix``.
     """
     with tempfile.TemporaryDirectory(dir=session_folder()) as folder:
         write(Path(folder) / f"{stem}{suffix}")
-        checksums = [file_sha256(file) for file in sorted(Path(folder).iterdir())]
+        checksums = [file_sha256(file) for file in sorted(Path(folder).rglob("*")) if file.is_file()]
     checksum = hashlib.sha256("".join(checksums).encode()).hexdigest()[:CHECKSUM_DIGITS]
     path = session_folder() / f"{stem}-{checksum}{suffix}"
     if not path.exists():
@@ -64,7 +65,9 @@ def copy_from_session(path: Path, folder: Path) -> None:
         return
     for file in list_scene_files(path) if path.suffix == ".xml" else [path]:
         if is_object(file) and folder.absolute() != session_folder():
-            with replace_atomically(folder / file.name) as temporary:
+            target = folder / file.relative_to(session_folder())
+            make_folder(target.parent)
+            with replace_atomically(target) as temporary:
                 shutil.copyfile(file, temporary)
 
 

@@ -162,9 +162,9 @@ class Scene:
     def save(self, path: FilePath) -> Path:
         """Write a scene file (.xml) atomically.
 
-        Fields, meshes, grids and splats that have no file are written next to it, in files whose names begin with that
-        of the scene. Of a scene that ``Scene(scene)`` wraps, only meshes can be written, in grey; make the scene with
-        `make_scene` to write all of it.
+        Fields, grids and splats that have no file are written next to it, in files whose names begin with that of the
+        scene, and meshes in the folder ``NAME.meshes``. Of a scene that ``Scene(scene)`` wraps, only meshes can be
+        written, in grey; make the scene with `make_scene` to write all of it.
 
         Parameters
         ----------

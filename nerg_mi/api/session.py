@@ -33,7 +33,7 @@ def _remove_folder(folder: Path, process: int) -> None:
 
 def is_object(path: Path) -> bool:
     """Whether a file is that of an object in memory."""
-    return bool(_folders) and path.parent == _folders[0]
+    return bool(_folders) and _folders[0] in path.parents
 
 
 def display_name(path: Path) -> str:
@@ -47,5 +47,5 @@ def name_objects(text: str) -> str:
         return text
     # Copies in other folders are files of the user.
     folder = rf"(?<![\w/\\.-])\"?(?:{re.escape(f'{_folders[0]}{os.sep}')})?"
-    pattern = rf"{folder}({'|'.join(_NAMES)})-[0-9a-f]{{{CHECKSUM_DIGITS}}}(?:\.\w+)+\"?"
+    pattern = rf"{folder}({'|'.join(_NAMES)})-[0-9a-f]{{{CHECKSUM_DIGITS}}}(?:\.\w+)+(?:/[\w.-]+)?\"?"
     return re.sub(pattern, lambda match: f"the {_NAMES[match[1]]} in memory", text)

@@ -19,7 +19,7 @@ from nerg_mi.api.calls import report_progress
 from nerg_mi.api.objects import as_file, build_options
 from nerg_mi.api.session import session_folder
 from nerg_mi.fields.splats import Splats
-from nerg_mi.rendering.scene import list_scene_files
+from nerg_mi.rendering.scene import list_scene_files, load_scene
 from nerg_mi.workflows.gaze_commands import FoldOptions, GazeOptions
 from nerg_mi.workflows.rays_commands import AlignOptions
 from nerg_mi.workflows.view import make_viewer_scene
@@ -82,6 +82,38 @@ def gaze(room, rays):
 def depths(scene):
     directions = [(1, 0, 0), (0, 1, 0), (0, 0, -1), (1, 0.1, -0.05)]
     return nerg.trace(scene, EYE, directions, "depth").depth
+
+
+@pytest.mark.parametrize("in_memory", ["trimesh", "mitsuba"])
+def test_meshes_of_a_saved_scene_are_in_one_folder(rgb, tmp_path, in_memory):
+    nodes = {f"wall {k}/{k % 2}": trimesh.creation.box((1, 1, 1)).apply_translation((2 * k, 0, 0)) for k in range(12)}
+    room = trimesh.Scene(nodes)
+    shapes = room if in_memory == "trimesh" else nerg.make_scene(shapes=room).mitsuba
+    saved = nerg.make_scene(shapes=shapes).save(tmp_path / "room.v2.xml")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["room.v2.meshes", "room.v2.xml"]
+    assert len(list((tmp_path / "room.v2.meshes").iterdir())) == len(nodes)
+    # Both together can be moved.
+    moved = tmp_path / "elsewhere"
+    moved.mkdir()
+    for name in ("room.v2.xml", "room.v2.meshes"):
+        (tmp_path / name).rename(moved / name)
+    again = {shape.id(): shape.bbox() for shape in nerg.Scene.load(moved / saved.name).mitsuba.shapes()}
+    assert set(again) == set(nodes)
+    for name, mesh in nodes.items():
+        np.testing.assert_allclose(np.array(again[name].min), mesh.bounds[0], atol=1e-6)
+
+
+def test_geometry_of_a_training_is_one_file_and_one_folder(rgb, tmp_path):
+    nodes = {f"wall {k}": trimesh.creation.box((4, 1, 4)).apply_translation((0, 3 + k, 0)) for k in range(7)}
+    rng = np.random.default_rng(0)
+    directions = rng.normal(size=(300, 3)) + (0, 3, 0)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    rays = nerg.Rays.from_arrays(origins=rng.normal(size=(300, 3)) * 0.1, directions=directions, times=np.arange(300.0))
+    nerg.train_gaze(rays, geometry=trimesh.Scene(nodes), output=tmp_path / "gaze.safetensors", **QUICK)
+    made = [p for p in tmp_path.iterdir() if p.name.startswith("environment")]
+    assert sorted(p.suffix for p in made) == [".meshes", ".xml"]
+    assert len(list(next(p for p in made if p.suffix == ".meshes").iterdir())) == len(nodes)
+    assert len(load_scene(next(p for p in made if p.suffix == ".xml"), merge=False).shapes()) == len(nodes)
 
 
 def test_meshes_are_shapes_with_names_and_colours(room):
