@@ -118,7 +118,7 @@ def test_bad_line_in_text_columns(tmp_path):
 @pytest.mark.parametrize(
     "text, message",
     [
-        ("", "column b; its columns"),
+        ("", "column b; it is empty"),
         ("," * (ray_tables.MAX_COLUMNS + 1) + "\n", "more columns than"),
         ("a" * 200_000 + ",b\n1,2\n", "not a header"),
         ("a,b\n1,2\n3,four\n", "3.*'b'.*'four'"),
