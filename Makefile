@@ -13,6 +13,8 @@
 #   make docs      regenerate the parts of the manual that are derived from the code
 #   make manual    build the manual into out/manual/html (Python 3.11 or newer); any warning is an error
 #   make onecore   run the tests that render, write images and train on one core, where Dr.Jit has one thread
+#   make portable  run the tests in random order, as a processor with narrower vectors computes; ARGS=--randomly-seed=N
+#                  repeats an order
 #   make coverage  measure line and branch coverage of all tests (also as out/coverage/index.html)
 #   make fuzz      pass 20,000 damaged files to the readers and count the outcomes (about ten minutes)
 #   make faults    kill commands at moments spread over their run and check that nothing is lost
@@ -38,12 +40,12 @@ PYTEST = $(RUN) -m pytest -n $(JOBS) --maxprocesses 4 --max-worker-restart 0 --d
 ONE_CORE = tests/cli/test_scenes.py tests/cli/test_ending.py tests/files/test_images.py \
 	tests/test_runtime.py tests/renders
 
-.PHONY: demo test test-all check lint types format docs manual onecore coverage fuzz faults soak packages bench bench-gpu setup
+.PHONY: demo test test-all portable check lint types format docs manual onecore coverage fuzz faults soak packages bench bench-gpu setup
 
 demo: setup
 	.venv/bin/nerg demo --output out/demo
 
-test test-all check onecore coverage fuzz faults soak: EXTRAS = test
+test test-all portable check onecore coverage fuzz faults soak: EXTRAS = test
 
 packages: EXTRAS = dev
 
@@ -54,6 +56,9 @@ test-all: setup
 	$(PYTEST) $(ARGS)
 
 bench bench-gpu: EXTRAS = torch
+
+portable: setup
+	$(RUN) -m tools.other_processor $(PYTEST) -p randomly -m "not nightly" $(ARGS)
 
 lint types format docs: EXTRAS = lint
 

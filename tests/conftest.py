@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.threads import set_thread_count
+from tools import other_processor
 
 ROOT = Path(__file__).resolve().parents[1]
 TORCH_REQUIRED = os.environ.get("NERG_REQUIRE_TORCH", "0") not in ("", "0")
@@ -150,6 +151,11 @@ def pytest_configure(config):
         pytest.exit(
             "NERG_REQUIRE_TORCH is set and torch is not installed: pip install torch, or unset it.", returncode=1
         )
+
+
+def pytest_sessionstart():
+    if width := os.environ.get(other_processor.VARIABLE):
+        other_processor.limit_drjit(int(width))
 
 
 def _fail_if_skipped_for_torch(report):

@@ -336,7 +336,7 @@ def test_times_that_the_names_contradict_are_reported(tmp_path, time):
     path.write_text(f"x,y,z,a,b,c,{time}\n0,0,0,1,0,0,0\n0,0,0,1,0,0,20\n")
     columns = "origin=x,y,z direction=a,b,c" + (f' "t={time}"' if time else "")
     said = read_table(path, columns).metadata.get("complaints", [])
-    assert len(said) == (unit != 1.0) and all("--tick" in text for text in said)
+    assert len(said) == (unit != 1.0) and all("--tick" in text for text in said)  # noqa: RUF069 (stored)
     assert "complaints" not in read_table(path, columns, tick=unit or 0.02).metadata
 
 
