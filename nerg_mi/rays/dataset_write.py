@@ -373,7 +373,10 @@ def import_source(task: ImportTask) -> ImportOutcome:
             write_source_manifest(task.folder, entry)
         return ImportOutcome(task.path, source.id, source.rays, is_unchanged=True)
     except NergError as error:
-        return ImportOutcome(task.path, "", 0, error=str(error))
+        message = str(error)
+        return ImportOutcome(
+            task.path, "", 0, error=message if task.path.name in message else f"{task.path}: {message}"
+        )
     return ImportOutcome(task.path, source.id, source.rays)
 
 
@@ -434,13 +437,12 @@ def _pseudonymise_metadata(
     empty = replace(
         last_rays.select(last_rays.t < last_rays.t), persons=names, metadata={**last_rays.metadata, "sources": sources}
     )
-    hidden = pseudonymise(empty, recipe.key).metadata
+    hidden = pseudonymise(empty, recipe.key, is_salt_stored=recipe.is_salt_stored).metadata
     alias = pseudonymise(
         replace(empty, metadata={"frame": last_rays.metadata["frame"], "sources": sources[-1:]}), recipe.key
     )
     files = [entry for entry in hidden["sources"] if "hmac_sha256" in entry]
-    salt_origin = "salt of a file" if recipe.is_salt_stored else "random salt, not kept"
-    metadata = {**hidden, "sources": files, "pseudonyms": f"HMAC-SHA256, {salt_origin}"}
+    metadata = {**hidden, "sources": files}
     return metadata, alias.metadata["sources"][0]["file"]
 
 

@@ -555,13 +555,12 @@ def _propose_columns(out: Proposal, sample: TableSample, roles: Roles) -> None:
     head = find_position(HEAD_WORDS, (direction, hit))
     eye = find_position(GAZE_WORDS, (direction, hit, head)) if head is not None and parts[head] & HEAD_WORDS else None
     has_pose = quaternion is not None or matrix is not None
-    moving_head = _find_moving_head(sample, vectors, eye or head)
-    if moving_head is not None and matrix is None:
-        head, eye = moving_head, eye or head
-        names = ", ".join(vectors[head])
-        out.assumptions.append(
-            f"the gaze is in the head's frame: {', '.join(vectors[eye])} do not move, but {names} do"
-        )
+    still = eye or head
+    moving_head = _find_moving_head(sample, vectors, still) if matrix is None else None
+    if moving_head is not None and still is not None:
+        head, eye = moving_head, still
+        names, moving_names = ", ".join(vectors[still]), ", ".join(vectors[moving_head])
+        out.assumptions.append(f"the gaze is in the head's frame: {names} do not move, but {moving_names} do")
 
     origin = head if has_pose or eye is None or moving_head is not None else eye
     upright = None
@@ -587,7 +586,7 @@ def _propose_columns(out: Proposal, sample: TableSample, roles: Roles) -> None:
     elif quaternion is not None:
         rotations = poses.rotations_from_quaternions(sample.stack_columns(quaternions[quaternion]))
     gaze = sample.stack_columns(vectors[direction]) if direction else None
-    angles = None
+    angles, degrees = None, True
     euler = _find_best(eulers, lambda s: 2 * bool(parts[s] & HEAD_WORDS) - _side_penalty(parts[s]), min_score=2)
     if rotations is None and euler is not None and "up" in settings:
         angles, degrees, rotations = _read_euler_angles(sample, eulers[euler], settings["up"])

@@ -47,6 +47,11 @@ def make_pseudonyms(names: Iterable[str], salt: bytes | None = None) -> dict[str
     return {name: "p" + _compute_digest(key, "person", name)[:_DIGITS] for name in names}
 
 
+def make_file_aliases(files: Iterable[str], salt: bytes) -> dict[str, str]:
+    """Names of files by the aliases that `pseudonymise` gives them with this ``salt``."""
+    return {_make_alias(file, lambda kind, text: _compute_digest(salt, kind, text)): file for file in files}
+
+
 def _make_key(salt: bytes | None) -> bytes:
     if salt is not None and len(salt) < MIN_SALT_BYTES:
         raise NergError(f"the salt has {len(salt)} bytes and can be guessed; use at least {MIN_SALT_BYTES}")
@@ -57,7 +62,7 @@ def _compute_digest(key: bytes, kind: str, text: str) -> str:
     return hmac.new(key, f"{kind}:{text}".encode("utf-8", "surrogatepass"), hashlib.sha256).hexdigest()
 
 
-def pseudonymise(rays: Rays, salt: bytes | None = None) -> Rays:
+def pseudonymise(rays: Rays, salt: bytes | None = None, *, is_salt_stored: bool = True) -> Rays:
     """Replace the name of each participant by a pseudonym (``p`` and 16 hexadecimal digits).
 
     Rays are sorted by pseudonym, since their former order would reveal that of the names. In the metadata, files get
@@ -68,6 +73,8 @@ def pseudonymise(rays: Rays, salt: bytes | None = None) -> Rays:
     ----------
     salt
         At least `MIN_SALT_BYTES` bytes; equal salts give equal pseudonyms. Default: a random salt, which is discarded.
+    is_salt_stored
+        False for a random ``salt`` that the caller discards.
     """
     key = _make_key(salt)
     digest = lambda kind, text: _compute_digest(key, kind, text)
@@ -78,7 +85,9 @@ def pseudonymise(rays: Rays, salt: bytes | None = None) -> Rays:
     rank[order] = np.arange(len(names))
     code = rank[rays.person]
     metadata = _replace_names(rays.metadata, rays.persons, person, digest)
-    metadata["pseudonyms"] = "HMAC-SHA256, " + ("random salt, not kept" if salt is None else "salt of a file")
+    metadata["pseudonyms"] = "HMAC-SHA256, " + (
+        "salt of a file" if salt is not None and is_salt_stored else "random salt, not kept"
+    )
     rows = np.argsort(code, kind="stable")
     return replace(rays, person=code, persons=tuple(names[i] for i in order), metadata=metadata).select(rows)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import secrets
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,7 +29,7 @@ from nerg_mi.rays.dataset import (
 )
 from nerg_mi.rays.dataset_write import DatasetUpdate, ImportRecipe, SourceWriter, update_dataset
 from nerg_mi.rays.guess import Proposal, propose_imports
-from nerg_mi.rays.pseudonyms import pseudonymise, read_salt
+from nerg_mi.rays.pseudonyms import make_file_aliases, pseudonymise, read_salt
 from nerg_mi.rays.quality import RaysSummary, format_quality_report, summarise, summarise_dataset
 from nerg_mi.rays.rays import SUFFIXES, Rays, merge_rays
 from nerg_mi.rays.readers.registry import TABLE, collect_shared_options, get_reader, parse_options, read_rays
@@ -144,9 +144,10 @@ def smallest_mask(numbers: np.ndarray, n: int) -> np.ndarray:
 
 FileName = str | os.PathLike
 Card = tuple[Rays, RaysSummary, tuple[tuple[str, str], ...]]
+_MAX_ERRORS = 20  # files that could not be imported and are listed
 
 
-def import_dataset(files: Sequence[FileName], options: RaysImportOptions, reporter: Reporter) -> Card:
+def import_dataset(files: Sequence[FileName], options: RaysImportOptions, reporter: Reporter) -> ImportResult:
     """Import ``files`` into the dataset ``options.output``, except those that are there unchanged.
 
     Returns the data-quality report of their environment. Raises `NergError` if some files could not be imported, after
@@ -179,8 +180,11 @@ def import_dataset(files: Sequence[FileName], options: RaysImportOptions, report
             if len(files) > 1
             else ""
         )
+        for error in update.errors[1:_MAX_ERRORS]:
+            reporter.message(sanitize(error, 2000))
         raise NergError(update.errors[0] + count_note)
-    return summarise_dataset(RayDataset.open(folder).select_place(place))
+    aliases = {} if key is None else make_file_aliases([Path(file).name for file in files], key)
+    return ImportResult(*summarise_dataset(RayDataset.open(folder).select_place(place)), aliases)
 
 
 def _report_update(update: DatasetUpdate, reporter: Reporter) -> None:
@@ -355,6 +359,8 @@ class ImportResult:
     summary: RaysSummary
     # Further lines of the report of a dataset: names and texts.
     lines: tuple[tuple[str, str], ...] = ()
+    # Names of files by their aliases, with pseudonyms; they are not written to any file.
+    aliases: dict[str, str] = field(default_factory=dict)
 
 
 def import_rays(
@@ -368,7 +374,7 @@ def import_rays(
     options = options or RaysImportOptions()
     files = [files] if isinstance(files, (str, os.PathLike)) else list(files)
     if options.into_dataset:
-        return ImportResult(*import_dataset(files, options, reporter))
+        return import_dataset(files, options, reporter)
     _check_outputs(options.output)
     if options.align_output is not None:
         check_writable(options.align_output, ".json")
@@ -380,13 +386,16 @@ def import_rays(
         begun.append(name)
 
     rays = read_rays(options.reader, files, options.settings, skip_bad_lines=options.skip_bad_lines, on_source=progress)
+    aliases: dict[str, str] = {}
     if options.pseudonyms:
-        rays = pseudonymise(rays, salt)
+        key = secrets.token_bytes(32) if salt is None else salt
+        aliases = make_file_aliases([source["file"] for source in rays.metadata["sources"]], key)
+        rays = pseudonymise(rays, key, is_salt_stored=salt is not None)
     align = None if options.align_output is None else _transform_to_files(rays)
     _save(rays, options.output)
     if options.align_output is not None:
         write_json(options.align_output, align)
-    return ImportResult(rays, summarise(rays))
+    return ImportResult(rays, summarise(rays), aliases=aliases)
 
 
 def _transform_to_files(rays: Rays) -> list[list[float]]:
@@ -412,7 +421,12 @@ def import_files(
     reader = preset or TABLE
     options = replace(options, reader=reader, settings=parse_options(reader, settings))
     result = import_rays(files, options, reporter)
-    reporter.message(format_quality_report(result.rays, result.summary, str(options.output), result.lines))
+    report = format_quality_report(result.rays, result.summary, str(options.output), result.lines)
+    reporter.message(report)
+    unwrapped = "".join(report.split())
+    for alias, file in result.aliases.items():
+        if alias in unwrapped:
+            reporter.message(f"{alias} is {sanitize(file, 200)} (only shown here)")
     for path in (options.output, options.align_output):
         _report_written(path, reporter)
 

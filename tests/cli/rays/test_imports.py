@@ -118,3 +118,31 @@ def test_names_are_not_interpreted_as_markup(tmp_path):
     (tmp_path / "m.csv").write_text("t,x,y,z,a,b,c,who\n0,0,0,1.6,1,0,0,[/bold]\n1,0,0,1.6,1,0,0,x\x1b[31m\n")
     done = run("import", tmp_path / "m.csv", "-o", tmp_path / "r.npz", "--map", f"{MAP[1]} person=who")
     assert done.exit_code == 0 and "[/bold]" in done.output and "\x1b[31m" not in done.output, done.output
+
+
+@pytest.mark.parametrize("output", ["r.npz", "r.rays"])
+def test_files_with_faults_can_be_found_despite_pseudonyms(tmp_path, output):
+    (tmp_path / "ann.csv").write_text(ROWS)
+    (tmp_path / "berta.csv").write_text(ROWS + "2,1,1.6,2,0,0,0\n")
+    salt = [] if output == "r.npz" else ["--salt", tmp_path / "salt"]
+    (tmp_path / "salt").write_bytes(b"s" * 32)
+    command = [*MAP, *UNITY, "--person-from", "filename", "--pseudonyms", *salt]
+    done = run("import", tmp_path / "ann.csv", tmp_path / "berta.csv", "-o", tmp_path / output, *command)
+    assert done.exit_code == 0, done.output
+    (line,) = [line for line in done.output.splitlines() if "berta.csv" in line]
+    alias = line.split()[0]
+    assert alias.endswith(".csv") and f"of {alias}" in " ".join(done.output.split()) and "ann.csv is" not in done.output
+    written = [tmp_path / output] if output == "r.npz" else (tmp_path / output).rglob("*")
+    assert not any(b"berta" in path.read_bytes() for path in written if path.is_file())
+    assert "berta" not in str(run("show", tmp_path / output).output)
+
+
+def test_all_refused_files_of_a_dataset_are_named(tmp_path):
+    for name in ("ann", "bo", "cy"):
+        (tmp_path / f"{name}.csv").write_text(
+            ROWS.replace("1.6", "1.6" if name == "ann" else "x" if name == "bo" else "1e5")
+        )
+    files = [tmp_path / f"{name}.csv" for name in ("ann", "bo", "cy")]
+    done = run("import", *files, "-o", tmp_path / "r.rays", *MAP, *UNITY, "--pseudonyms")
+    text = done.output + str(done.exception)
+    assert done.exit_code != 0 and "bo.csv" in text and "cy.csv" in text and "2 of 3 files" in text
