@@ -4,6 +4,33 @@ from __future__ import annotations
 
 import signal
 import threading
+from pathlib import Path
+from typing import Any
+
+
+class TrainingInterrupted(KeyboardInterrupt):
+    """Ctrl-C ended a training before its last step.
+
+    Attributes
+    ----------
+    field
+        Field of the state so far.
+    provenance : dict
+        Its provenance.
+
+    Parameters
+    ----------
+    state : Path, optional
+        File from which the training can be resumed.
+    """
+
+    def __init__(self, field: Any, provenance: dict[str, Any], state: Path | None = None):
+        message = f"interrupted; continue with --resume (state in {state})"
+        if state is None:
+            steps = provenance["steps"]
+            message = f'interrupted after {steps} steps; the attribute "field" of this exception has the result so far'
+        super().__init__(message)
+        self.field, self.provenance = field, provenance
 
 
 class Interruption:

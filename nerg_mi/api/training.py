@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
+from nerg_mi.interruption import TrainingInterrupted
 from nerg_mi.rays.rays import Rays
 from nerg_mi.workflows.gaze_commands import GazeOptions, PriorOptions
 from nerg_mi.workflows.radiance_commands import CompileOptions, RadianceOptions
@@ -35,8 +37,6 @@ def train_radiance(
 ) -> TrainedField[RadianceField]:
     """Train a radiance field on posed photos.
 
-    After Ctrl-C, the current state is returned if there is no ``output``.
-
     Parameters
     ----------
     photos : path
@@ -60,7 +60,8 @@ def train_radiance(
     NergError
         An option or a file is invalid.
     KeyboardInterrupt
-        Ctrl-C was pressed and there is an ``output``, which has been written.
+        Ctrl-C was pressed. An ``output`` has been written. The attribute ``field`` of the exception is the field of the
+        state so far.
 
     Examples
     --------
@@ -74,10 +75,9 @@ def train_radiance(
     check_output(output)
     with report_progress(progress, RadianceOptions) as reporter:
         resolved = build_options(RadianceOptions, "train_radiance", options, overrides)
-        result = radiance.train_radiance(resolve_file(photos, "photos"), output, resolved, reporter)
-    if output is None:
-        return TrainedField(result.field, result.provenance)
-    return TrainedField(result.field, result.provenance, Path(output).name, Path(output))
+        make = lambda result: TrainedField(result.field, result.provenance, *_locate(output))
+        with _converting_interrupts(make):
+            return make(radiance.train_radiance(resolve_file(photos, "photos"), output, resolved, reporter))
 
 
 def compile_field(
@@ -174,7 +174,7 @@ def train_gaze(
     NergError
         An option or a file is invalid.
     KeyboardInterrupt
-        Ctrl-C was pressed and there is an ``output``, which has been written.
+        Ctrl-C was pressed, as for `train_radiance`.
 
     Examples
     --------
@@ -191,11 +191,17 @@ def train_gaze(
         volume = None
         if output is None and resolved.geometry == "hits":
             volume = session_folder() / f"hits-{uuid4().hex[:12]}.vol"
-        result = gaze.train_gaze(None if rays is None else resolve_rays(rays), output, resolved, reporter, volume)
-    geometry_file = resolved.field or resolved.scene or volume
-    if output is not None and geometry_file is not None:
-        copy_from_session(geometry_file, Path(output).parent)
-    return _make_gaze_field(result, output, geometry_file)
+        geometry_file = resolved.field or resolved.scene or volume
+
+        def make(result: GazeResult | TrainingInterrupted) -> TrainedGazeField:
+            if output is not None and geometry_file is not None:
+                copy_from_session(geometry_file, Path(output).parent)
+            return _make_gaze_field(result, output, geometry_file)
+
+        with _converting_interrupts(make):
+            return make(
+                gaze.train_gaze(None if rays is None else resolve_rays(rays), output, resolved, reporter, volume)
+            )
 
 
 def train_prior(
@@ -250,9 +256,22 @@ def train_prior(
     return _make_gaze_field(result, output, None)
 
 
+@contextmanager
+def _converting_interrupts(make: Callable[[TrainingInterrupted], object]) -> Iterator[None]:
+    """Replace the field of an interrupted training by the object that ``make`` returns."""
+    try:
+        yield
+    except TrainingInterrupted as error:
+        error.field = make(error)
+        raise
+
+
 def _make_gaze_field(
-    result: GazeResult | PriorResult, output: FilePath | None, geometry_file: Path | None
+    result: GazeResult | PriorResult | TrainingInterrupted, output: FilePath | None, geometry_file: Path | None
 ) -> TrainedGazeField:
-    path = None if output is None else Path(output)
-    name = "in memory" if path is None else path.name
-    return TrainedGazeField(result.field, result.provenance, name, path, geometry_file)
+    return TrainedGazeField(result.field, result.provenance, *_locate(output), geometry_file)
+
+
+def _locate(output: FilePath | None) -> tuple[str, Path | None]:
+    """Return the name of a trained field, and its path, if it was written."""
+    return ("in memory", None) if output is None else (Path(output).name, Path(output))

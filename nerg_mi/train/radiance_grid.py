@@ -362,8 +362,8 @@ class OccupancyExtraction:
 
     def __init__(self, grid: DensityGrid):
         self.grid, self.pieces_done = grid, 0
+        self.dilated_dense: Any = None
         self.dense_cells, self.contributing_cells = (dr.zeros(grid.ns.UInt8, grid.resolution**3) for _ in range(2))
-        self.dilated_dense = None
         dr.eval(self.dense_cells, self.contributing_cells)
 
     @property

@@ -17,6 +17,7 @@ from nerg_mi.fields.gaze_base import AnyGazeField
 from nerg_mi.files.atomic import check_writable, reserve_output
 from nerg_mi.formats.checkpoint import read_checkpoint
 from nerg_mi.formats.fields import save_gaze
+from nerg_mi.interruption import TrainingInterrupted
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.photos.salience import SalienceSet, open_salience
 from nerg_mi.rays.dataset import hash_rays, is_dataset, load_rays
@@ -188,9 +189,8 @@ def train_gaze(
     ------
     NergError
         For errors that the user can correct, before any time is spent.
-    KeyboardInterrupt
-        After Ctrl-C, when the result so far and the state have been written. Without ``output`` the result so far is
-        returned with ``interrupted`` set.
+    TrainingInterrupted
+        After Ctrl-C, when the result so far and the state have been written. The exception has the result so far.
     """
     with reserve_output(output):
         return _train(rays, None if output is None else Path(output), options or GazeOptions(), reporter, volume)
@@ -243,8 +243,8 @@ def _train(
         reporter=reporter,
     )
     _report_result(result, reporter)
-    if result.interrupted and output is not None:
-        raise KeyboardInterrupt(f"interrupted; continue with --resume (state in {state})")
+    if result.interrupted:
+        raise TrainingInterrupted(result.field, result.provenance, state)
     return result
 
 

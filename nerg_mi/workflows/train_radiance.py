@@ -16,6 +16,7 @@ from nerg_mi.files.atomic import check_folder, check_writable, reserve_output
 from nerg_mi.files.tables import write_json
 from nerg_mi.formats.checkpoint import read_checkpoint
 from nerg_mi.formats.fields import save_radiance
+from nerg_mi.interruption import TrainingInterrupted
 from nerg_mi.photos.dataset import Dataset, open_dataset
 from nerg_mi.photos.images import pick_evenly
 from nerg_mi.photos.posed import describe_unused
@@ -89,9 +90,8 @@ def train_radiance(
     ------
     NergError
         For errors that the user can correct, before any time is spent.
-    KeyboardInterrupt
-        After Ctrl-C, when the result so far and the state have been written. Without ``output`` the result so far is
-        returned with ``interrupted`` set.
+    TrainingInterrupted
+        After Ctrl-C, when the result so far and the state have been written. The exception has the result so far.
     """
     options = options or RadianceOptions()
     with reserve_output(output), _open_page(options, reporter) as observer:
@@ -137,8 +137,8 @@ def _train(
     )
     result = RadianceResult(field, provenance, output, provenance["interrupted"])
     _report_result(result, reporter)
-    if result.interrupted and output is not None:
-        raise KeyboardInterrupt(f"interrupted; continue with --resume (state in {state})")
+    if result.interrupted:
+        raise TrainingInterrupted(field, provenance, state)
     return result
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import signal
 import subprocess
 import sys
 import warnings
@@ -20,6 +21,7 @@ from nerg_mi.api.objects import as_file, build_options
 from nerg_mi.api.session import session_folder
 from nerg_mi.fields.splats import Splats
 from nerg_mi.rendering.scene import list_scene_files, load_scene
+from nerg_mi.workflows.base import SilentReporter
 from nerg_mi.workflows.gaze_commands import FoldOptions, GazeOptions
 from nerg_mi.workflows.rays_commands import AlignOptions
 from nerg_mi.workflows.view import make_viewer_scene
@@ -122,6 +124,31 @@ def test_meshes_are_shapes_with_names_and_colours(room):
     np.testing.assert_allclose(depths(scene)[:3], [3.925, 2, 1.6], atol=1e-4)
     color = nerg.trace(scene, EYE, [(1, 0, 0), (-1, 0, 0)], "color").color
     assert color[0, 0] > 10 * color[0, 1] + 0.1 and np.isclose(color[1, 0], color[1, 1])
+
+
+class Impatient(SilentReporter):
+    """A reporter that presses Ctrl-C at the first step of a fit."""
+
+    def progress(self, fraction, text=""):
+        if "step" in text:
+            signal.raise_signal(signal.SIGINT)
+
+
+@pytest.mark.parametrize("has_output", [False, True])
+def test_ctrl_c_ends_a_loop_over_trainings(rays, tmp_path, has_output):
+    """The first training raises, also without an output; the exception has the field so far."""
+    fields, output = [], tmp_path / "gaze.safetensors" if has_output else None
+    options = {**QUICK, "steps": 50, "geometry": make_room(), "progress": Impatient()}
+    with pytest.raises(KeyboardInterrupt) as end:
+        for seed in range(3):
+            fields.append(nerg.train_gaze(rays, output, seed=seed, **options))
+    assert not fields
+    field = end.value.field
+    assert 0 < field.provenance["steps"] < 50 and field.provenance["interrupted"]
+    assert np.isfinite(field.density(EYE, [(1, 0, 0)])).all()
+    if has_output:
+        assert nerg.load_gaze(output).provenance["steps"] == field.provenance["steps"]
+        assert field.path == output and len(list(tmp_path.iterdir())) > 2  # The environment, too
 
 
 @pytest.mark.parametrize("kind", ["mesh", "dict", "scene", "grid", "mitsuba"])

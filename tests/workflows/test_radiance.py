@@ -19,6 +19,7 @@ from nerg_mi.files.atomic import file_sha256
 from nerg_mi.formats.checkpoint import read_checkpoint
 from nerg_mi.formats.fields import load_radiance, matches_checksum
 from nerg_mi.formats.splats import read_splats
+from nerg_mi.interruption import TrainingInterrupted
 from nerg_mi.photos.colmap import UpEstimate
 from nerg_mi.photos.dataset import open_dataset
 from nerg_mi.photos.structure import Reconstruction
@@ -95,9 +96,10 @@ def test_a_deferred_field_is_trained_and_evaluated(cube, tmp_path):
     assert np.isfinite(scores.psnr_mean)
 
 
-def test_an_interrupted_training_without_an_output_returns_a_result(cube):
-    result = train_radiance(cube, options=RadianceOptions(steps=10**6, holdout=0), reporter=Impatient())
-    assert result.interrupted and result.provenance["steps"] == 1 and result.psnr is None
+def test_an_interrupted_training_without_an_output_has_a_result(cube):
+    with pytest.raises(TrainingInterrupted, match="1 steps") as end:
+        train_radiance(cube, options=RadianceOptions(steps=10**6, holdout=0), reporter=Impatient())
+    assert end.value.provenance["steps"] == 1 and end.value.field.occupancy is not None
 
 
 def test_an_interrupted_training_with_an_output_can_be_resumed(cube):

@@ -15,6 +15,7 @@ from nerg_mi.fields.encoding import HashGridConfig
 from nerg_mi.fields.gaze_log_density import LogGazeConfig
 from nerg_mi.files.atomic import reserve_output
 from nerg_mi.formats.fields import load_gaze
+from nerg_mi.interruption import TrainingInterrupted
 from nerg_mi.train import gaze_recipes
 from nerg_mi.train.gaze_data import compute_surface_distances
 from nerg_mi.train.gaze_log_density import LikelihoodTrainer, get_geometry_options
@@ -201,16 +202,21 @@ def test_held_out_positions_and_participants_are_reported(tmp_path):
     )
 
 
-def test_an_interrupted_training_returns_a_result_or_reports_how_to_resume(rays, tmp_path):
-    """Without an output file an interrupted field is returned; with one, the interrupt stops the script."""
+def test_an_interrupted_training_stops_the_script_and_reports_how_to_resume(rays, tmp_path):
+    """The exception has the field so far."""
     options = replace(QUICK, steps=8, fresh=True, threads=1, variant="capture")
-    result = train_gaze(rays, options=options, reporter=Listener(0.5))
-    assert result.interrupted and result.provenance["steps"] == 4
+    with pytest.raises(TrainingInterrupted, match="4 steps") as end:
+        train_gaze(rays, options=options, reporter=Listener(0.5))
+    assert end.value.provenance["steps"] == 4 and end.value.provenance["interrupted"]
+    assert arrays(end.value.field)
     out = tmp_path / "gaze.safetensors"
     with pytest.raises(KeyboardInterrupt, match="interrupted; continue with --resume"):
         train_gaze(rays, out, options, Listener(0.5))
     assert {p.name for p in tmp_path.iterdir()} == {"gaze.safetensors", "gaze.run"}
-    assert load_gaze(out, ns)[1]["provenance"]["interrupted"]
+    field, meta = load_gaze(out, ns)
+    assert meta["provenance"]["interrupted"]
+    for name, value in arrays(field).items():
+        np.testing.assert_array_equal(value, arrays(end.value.field)[name], err_msg=name)
     complete = train_gaze(rays, options=options)
     resumed = train_gaze(rays, out, replace(options, resume=True))
     assert not out.with_suffix(".run").exists() and not resumed.interrupted and resumed.provenance["steps"] == 8
