@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -541,6 +542,13 @@ def score_participants(test: GazeTest, methods: dict[str, Baseline], prior: Base
     return rows
 
 
+SPLIT_HALF = "split half"
+"""Method of the row of `score_split_half`, a reference and no baseline."""
+
+MIN_HALF_PARTICIPANTS = 5
+"""Minimum number of participants of each half."""
+
+
 def score_split_half(
     test_rays: Rays,
     centres: np.ndarray,
@@ -549,18 +557,26 @@ def score_split_half(
     prior: Baseline,
     min_rays: int = 64,
     seed: int = 0,
-) -> dict | None:
+    resamples: int = 200,
+) -> tuple[dict | None, str]:
     """Score one half of the participants as predicted by the other half, at positions where both have ``min_rays``
     rays.
 
-    This is a reference, not an upper bound. Returns None if there is no such position, or only one participant.
+    This is a reference, not an upper bound.
+
+    Returns
+    -------
+    row : dict or None
+        The scores; None if they are noise.
+    note : str
+        Why they are, see `find_split_half_fault`; "" with a row.
     """
     if len(np.unique(test_rays.person)) < 2:
-        return None
+        return None, "there is only one participant"
     halves = [test_rays.select(mask) for mask in split_by_person(test_rays, seed=seed)]
     has_both = np.logical_and(*(_has_enough_rays(half, centres, radius, min_rays) for half in halves))
     if not has_both.any():
-        return None
+        return None, f"at no position do both halves have {min_rays} rays"
     # The prediction is a kernel density of the same concentration, so it is as smooth as the truth.
     first = replace(make_test(halves[0], centres[has_both], radius, kappa, min_rays=min_rays), kappa=None)
     probes = place_probes(
@@ -570,9 +586,30 @@ def score_split_half(
     first = replace(
         first, own_origins=np.empty((0, 3)), own_directions=np.empty((0, 1, 3)), own_participants=np.empty(0, int)
     )
+    participants = min(len(first.participants), len(np.unique(halves[1].person[probes.indices])))
     predicted = lambda positions, directions: probes.density(directions)
-    row = evaluate_gaze(first, {"split half": predicted}, prior, resamples=0)[0]
-    return {k: v for k, v in row.items() if "." not in k}
+    row = evaluate_gaze(first, {SPLIT_HALF: predicted}, prior, resamples, seed)[0]
+    note = find_split_half_fault(participants, row[HEADLINE], row.get(f"{HEADLINE}.low", math.nan))
+    return (None if note else {k: v for k, v in row.items() if "." not in k}), note
+
+
+def find_split_half_fault(participants: int, bits: float, low: float = math.nan) -> str:
+    """Return why the scores of a split half are noise; "" if they are a reference.
+
+    Parameters
+    ----------
+    participants : int
+        Number of participants of the smaller half.
+    bits : float
+        Information gain over the position-independent prior.
+    low : float
+        Lower end of its confidence interval over participants; NaN if unknown.
+    """
+    if participants < MIN_HALF_PARTICIPANTS:
+        return f"a half has {participants} participants, fewer than {MIN_HALF_PARTICIPANTS}"
+    if not (bits if math.isnan(low) else low) > 0:
+        return f"its information gain over the prior, {bits:.2f} bits, does not exceed 0 with 95 % confidence"
+    return ""
 
 
 def compute_map_scores(truth: np.ndarray, maps: np.ndarray) -> dict[str, float]:

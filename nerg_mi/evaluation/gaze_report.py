@@ -19,7 +19,7 @@ from nerg_mi.maths.sphere import Z_UP, latlong_grid
 from nerg_mi.probes.probes import REGION_LEVELS, format_level
 
 from .baselines import CONDITIONAL_KDE, NEAREST_RAYS, PRIOR, REAIMED_HITS, UNIFORM, Baseline
-from .gaze import SCORES, GazeTest
+from .gaze import SCORES, SPLIT_HALF, GazeTest, find_split_half_fault
 from .uncertainty import RETAINED_FRACTIONS
 
 # ---- Reports of an evaluation: tables as Markdown, CSV and JSON, and pictures of reference and prediction ----
@@ -79,7 +79,7 @@ def write_report(
     """
     positions, ranks, regions = positions or [], ranks or [], regions or []
     files = [folder / name for name in ("gaze.md", "gaze.csv", "persons.csv", "gaze.json", "positions.csv")]
-    field_row, reference = rows[0], next(r["method"] for r in reversed(rows) if r["method"] != "split half")
+    field_row, reference = rows[0], next(r["method"] for r in reversed(rows) if r["method"] != SPLIT_HALF)
     difference = {k.replace(".less", ""): v for k, v in field_row.items() if ".less" in k}
     differences = [{"method": f"{field_row['method']} less {reference}", **difference}]
     participant_table = format_table(
@@ -184,6 +184,8 @@ class GazeResults:
         Concentration of the kernels of the truth.
     rows, participant_rows : tuple of dict
         Scores per method, the field's first, and per method and participant.
+    split_half_note : str
+        Why there is no split half; "" if there is one or the reason is unknown.
     """
 
     gaze: str
@@ -194,6 +196,7 @@ class GazeResults:
     kappa: float
     rows: tuple[dict[str, Any], ...]
     participant_rows: tuple[dict[str, Any], ...]
+    split_half_note: str = ""
 
 
 def read_results(path: str | Path) -> GazeResults:
@@ -209,14 +212,19 @@ def read_results(path: str | Path) -> GazeResults:
         raise _make_error(path, 'its "methods" or "positions" are invalid')
     people = data.get("people", len({r.get("person") for r in persons}))
     kappa = data.get("kappa", math.nan)
-    names = [data["gaze"], data["split"], data.get("gaze_sha256", "")]
+    names = [data["gaze"], data["split"], data.get("gaze_sha256", ""), data.get("split_half_note", "")]
     if (
         not is_count(people)
         or not _is_number(kappa)
         or not all(isinstance(w, str) and len(w) <= _MAX_NAME_LENGTH for w in names)
     ):
         raise _make_error(path, "one of its values is not a valid number or name")
-    return GazeResults(names[0], names[2], names[1], data["positions"], people, float(kappa), rows, persons)
+    half = _find_row(rows, SPLIT_HALF)
+    if half is not None:
+        # Files of earlier versions have scores that are noise.
+        names[3] = find_split_half_fault(people // 2, _read_number(half, "bits"))
+        rows = tuple(row for row in rows if row is not half or not names[3])
+    return GazeResults(names[0], names[2], names[1], data["positions"], people, float(kappa), rows, persons, names[3])
 
 
 def _check_rows(rows: object, path: str | Path, name: str) -> tuple[dict[str, Any], ...]:
@@ -280,8 +288,6 @@ def _make_error(path: str | Path, why: str) -> NergError:
 MIN_PARTICIPANTS, MIN_POSITIONS = 5, 10  # Minimum sizes for a verdict
 
 VERDICT_SCORES = {"bits": 1, "CC": 1, "KLD": -1}  # Scores of the verdict; 1: higher is better, -1: lower is better
-
-SPLIT_HALF = "split half"  # The other half of the participants, a reference and no baseline
 
 _BASELINE_NAMES = {
     UNIFORM: "the uniform density",

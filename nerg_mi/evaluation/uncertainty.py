@@ -11,7 +11,7 @@ import numpy as np
 from nerg_mi.probes.probes import REGION_LEVELS, compute_region_levels, format_level, get_calibrated_level
 
 from . import metrics
-from .gaze import EPS, SCORES, GazeTest
+from .gaze import EPS, SCORES, SPLIT_HALF, GazeTest
 
 SIGNALS = {"support": True, "spread": False}
 """Signals of certainty by their name in a row of `score_positions`, and whether higher values are more certain."""
@@ -216,7 +216,6 @@ def _mean_certain_error(uncertainty: np.ndarray, error: np.ndarray, fraction: fl
 # and Grandvalet 2004): the interval measures the variation over held-out participants and zones, not that of a new
 # environment. Differences are taken fold by fold, where most of the variation is common to both methods.
 
-SPLIT_HALF = "split half"  # A reference, not a method: prediction of one half of the participants from the other
 _SCORES = (*SCORES, "integral")
 
 

@@ -13,7 +13,8 @@ from typing import Any
 
 from nerg_mi import __version__
 from nerg_mi.evaluation.baselines import PRIOR
-from nerg_mi.evaluation.gaze_report import SPLIT_HALF, SPLIT_LABELS, Comparison, GazeResults, Verdict
+from nerg_mi.evaluation.gaze import SPLIT_HALF
+from nerg_mi.evaluation.gaze_report import SPLIT_LABELS, Comparison, GazeResults, Verdict
 from nerg_mi.files.html import Html, element, figure, image, key_value_table, markup, paragraph, table
 from nerg_mi.rays.quality import WARNING_LABEL, make_quality_report
 
@@ -316,8 +317,7 @@ def _show_scores(run: Run) -> Html:
             "The ground truth at a position is the density of the gaze samples recorded there. The log score is the "
             "gain in bits per sample over the position-independent baseline. Higher values of the log score, CC, NSS "
             "and AUC are better; lower values of KLD are better. Intervals are 95 % confidence intervals over "
-            "participants. The split-half score predicts one half of the participants from the other half; it is a "
-            "reference, not an upper bound.",
+            "participants.",
             kind="note",
         )
     ]
@@ -345,6 +345,14 @@ def _render_split(results: GazeResults, verdict: Verdict) -> list[Html]:
     columns = [c for c in COLUMNS if any(_is_finite(r.get(c)) for r in results.rows)]
     rows = [[str(r["method"]), *(_format_score(r, c) for c in columns)] for r in results.rows]
     parts.append(table(["", *(COLUMNS[c] for c in columns)], rows, range(1, 1 + len(columns))))
+    if any(r["method"] == SPLIT_HALF for r in results.rows):
+        half = (
+            "The split half predicts one half of the participants from the other half; it is a reference, not an upper "
+            "bound."
+        )
+        parts.append(paragraph(half, kind="note"))
+    elif results.split_half_note:
+        parts.append(paragraph(f"The split half is not shown: {results.split_half_note}.", kind="note"))
     if verdict.comparisons:
         comparison_table = table(
             ["baseline", *(f"gain in {COLUMNS[s]}" for s in _PANELS), "outcome"],

@@ -90,6 +90,7 @@ class GazeEvaluation(ResultTables):
     uncertainty: list[dict[str, Any]] = field(default_factory=list)
     # One row per method: coverage of its highest-density regions (`uncertainty.calibration_rows`).
     calibration: list[dict[str, Any]] = field(default_factory=list)
+    split_half_note: str = ""  # Why there is no row of the split half
 
 
 def evaluate_gaze(
@@ -164,10 +165,12 @@ def evaluate_gaze(
     reporter.progress(0.05, "scores")
     report_share = lambda share: reporter.progress(0.65 + 0.2 * share, "scores") if share > 0 else None
     rows = evaluation.evaluate_gaze(test, methods, prior, options.resamples, seed, report_share)
-    half = evaluation.score_split_half(
-        scored, test.centres, account["radius"], options.kappa, prior, options.min_rays, seed
+    half, half_note = evaluation.score_split_half(
+        scored, test.centres, account["radius"], options.kappa, prior, options.min_rays, seed, options.resamples
     )
     rows += [half] if half else []
+    if half_note:
+        reporter.message(f"the split half is not shown: {half_note}")
     reporter.progress(0.86, "participants")
     select = lambda names: {name: methods[name] for name in names if name in methods}
     persons = evaluation.score_participants(test, select(_BY_PERSON), prior, options.min_rays)
@@ -190,8 +193,10 @@ def evaluate_gaze(
             "positions": len(test.centres),
             "people": len(test.participants),
             "resamples": options.resamples,
+            "split_half": half,
+            "split_half_note": half_note,
         }
-        notes = _notes(gaze.name, split, test, (len(train), len(data)), account["radius"], options)
+        notes = _notes(gaze.name, split, test, (len(train), len(data)), account["radius"], options, half_note)
         notes += f" {format_settings(baselines)}"
         files = write_report(output, rows, persons, summary, notes, places, ranks, regions)
         if options.pictures:
@@ -201,15 +206,20 @@ def evaluate_gaze(
             record = make_provenance("nerg eval gaze", sources, seed, options)
             draw_comparison(test, select(_DRAWN), files[-1], options.pictures, provenance=record)
     return GazeEvaluation(
-        rows, persons, split, len(test.centres), len(test.participants), files, places, ranks, regions
+        rows, persons, split, len(test.centres), len(test.participants), files, places, ranks, regions, half_note
     )
+
+
+def default_output(gaze: Path) -> Path:
+    """Return the folder in which the command writes the evaluation of ``gaze``, and a report looks for it."""
+    return gaze.with_suffix(".eval")
 
 
 def print_evaluation(
     gaze: Path, rays: Path, output: Path | None, options: GazeEvaluationOptions, reporter: Reporter
 ) -> None:
     """Call `evaluate_gaze`, and print the scores as a table."""
-    result = evaluate_gaze(gaze, rays, output or gaze.with_suffix(".eval"), options, reporter)
+    result = evaluate_gaze(gaze, rays, output or default_output(gaze), options, reporter)
     rows = [{k: row[k] for k in ("method", *_PRINTED, "integral")} for row in result.rows]
     title = f"{gaze.name}, {result.split}: {result.positions} positions, {result.people} participants"
     reporter.message(evaluation.format_score_table(rows, title))
@@ -277,9 +287,15 @@ def _notes(
     count: tuple[int, int],
     radius: float,
     options: GazeEvaluationOptions,
+    half_note: str,
 ) -> str:
     """Return the text above the tables; ``count`` holds the number of training rays and of all rays."""
     trained, total = count
+    half = (
+        f"not shown: {half_note}"
+        if half_note
+        else ("one half of the participants predicts the other, where both have enough rays; a reference, not a bound")
+    )
     return (
         f"# {name}: {split}\n\n{len(test.centres)} positions, {len(test.participants)} participants; {trained:,} of "
         f"{total:,} rays used for training. Reference: rays within {radius:g} m, kappa {options.kappa:g}, "
@@ -288,8 +304,7 @@ def _notes(
         "directions, sAUC of the ratio to the position-independent prior, against rays of other positions; bits per "
         "ray above the position-independent prior, at the centres of the positions and at the origin of each ray; "
         f"loglik in nats of 1/sr. Brackets: ± 1.96 standard errors from {options.resamples} resamples of the "
-        "participants. Split half: one half of the participants "
-        "predicts the other, where both have enough rays; a reference, not a bound."
+        f"participants. Split half: {half}."
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -61,7 +61,7 @@ from nerg_mi.transport.geometry import SceneGeometry
 from nerg_mi.transport.observer import sensor_center
 
 from .base import SILENT, Reporter, SilentReporter, select_backend, versions
-from .evaluate import evaluate_gaze
+from .evaluate import default_output, evaluate_gaze
 from .gaze_commands import GazeEvaluationOptions
 from .render import describe_basis, describe_smoothing, is_supported, smooth_gaze
 from .scene import SceneResult, write_scene
@@ -293,6 +293,18 @@ def read_matching_results(files: ReportFiles) -> tuple[list[GazeResults], list[s
     return evaluations, doubts
 
 
+def _find_results(gaze: Path, reporter: Reporter) -> tuple[Path, ...]:
+    """Return the evaluation that `nerg eval gaze` has written next to the checkpoint ``gaze``, if it is of this one."""
+    path = default_output(gaze) / RESULTS
+    if not path.is_file():
+        return ()
+    if read_results(path).sha256 not in ("", file_sha256(gaze)):
+        reporter.warn(f'"{path}" is not used: "{gaze.name}" was trained again since; run nerg eval gaze')
+        return ()
+    reporter.message(f"the evaluation is {path}")
+    return (path,)
+
+
 def compute_results(
     files: ReportFiles, options: ReportOptions, have: Sequence[GazeResults], reporter: Reporter
 ) -> list[GazeResults]:
@@ -312,7 +324,7 @@ def compute_results(
         reporter.message(f"scoring the split {split}")
         scored = evaluate_gaze(files.gaze, files.rays, None, job, reporter)
         identity = files.gaze.name, file_sha256(files.gaze), split, scored.positions, scored.people, job.kappa
-        evaluations.append(GazeResults(*identity, tuple(scored.rows), tuple(scored.persons)))
+        evaluations.append(GazeResults(*identity, tuple(scored.rows), tuple(scored.persons), scored.split_half_note))
     return evaluations
 
 
@@ -479,8 +491,8 @@ def make_report(
     Parameters
     ----------
     files
-        The gaze field and, in any order, its scene, rays and evaluations, or folders of these. The scene is looked up
-        next to the gaze field if it is not given.
+        The gaze field and, in any order, its scene, rays and evaluations, or folders of these. The scene and the
+        evaluation are looked up next to the gaze field if they are not given.
     output
         HTML file.
     options
@@ -499,6 +511,8 @@ def make_report(
     options, output = options or ReportOptions(), Path(output)
     check_writable(output, ".html", ".htm")
     report_files = sort_files([Path(file) for file in files])
+    if not report_files.results:
+        report_files = replace(report_files, results=_find_results(report_files.gaze, reporter))
     areas = AreaSet(()) if options.aois is None else _load_aois(options.aois, reporter)
     results, doubts = read_matching_results(report_files)
     ns = select_backend(options.mode, options.threads)

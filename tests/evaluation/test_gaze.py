@@ -53,7 +53,7 @@ def crowd(n=3000, people=4, seed=0):
     return Rays(
         np.arange(n),
         person,
-        tuple("abcdefgh"[:people]),
+        tuple("abcdefghijkl"[:people]),
         origin,
         direction / np.linalg.norm(direction, axis=1, keepdims=True),
         np.ones(n),
@@ -259,32 +259,61 @@ def test_maps_that_exceed_memory_are_refused(rays_evaluation, monkeypatch):
         gaze.make_test(rays_evaluation, np.array([[-0.5, 0, 1.6], [-0.5, 3, 1.6]]), 0.6, 20.0, 512, min_rays=20)
 
 
-def test_split_half_uses_positions_of_both_halves(rays_evaluation, test_set):
-    row = gaze.score_split_half(
-        rays_evaluation,
-        np.array([[-0.5, 0, 1.6], [-0.5, 3, 1.6], [40, 0, 0]]),
-        0.6,
-        20.0,
-        make_uniform_baseline(),
-        min_rays=20,
-    )
-    assert row["method"] == "split half" and 0 < row["CC"] < 1 and row["KLD"] > 0
-    nowhere = np.array([[40.0, 0, 0]])
-    assert gaze.score_split_half(rays_evaluation, nowhere, 0.6, 20.0, make_uniform_baseline(), min_rays=20) is None
-    two = gaze.score_split_half(
-        rays_evaluation.select(rays_evaluation.person < 2),
-        test_set.centres,
-        0.6,
-        20.0,
-        make_uniform_baseline(),
-        min_rays=20,
-    )
-    assert two is not None and two["KLD"] > 0
-    alone = rays_evaluation.select(rays_evaluation.person == 0)
-    assert gaze.score_split_half(alone, test_set.centres, 0.6, 20.0, make_uniform_baseline(), min_rays=20) is None
-    with pytest.raises(ValueError, match="kappa is negative"):
+def score_half(rays, centres=((-0.5, 0, 1.6), (-0.5, 3, 1.6)), **options):
+    prior = make_uniform_baseline()
+    return gaze.score_split_half(rays, np.array(centres, float), 0.6, options.pop("kappa", 20.0), prior, 20, **options)
+
+
+def test_split_half_uses_positions_of_both_halves():
+    rays = crowd(people=12)
+    row, note = score_half(rays, ((-0.5, 0, 1.6), (-0.5, 3, 1.6), (40, 0, 0)), resamples=20)
+    assert row["method"] == "split half" and 0 < row["CC"] < 1 and row["KLD"] > 0 and not note
+    row, note = score_half(rays, ((40, 0, 0),))
+    assert row is None and "no position" in note
+    row, note = score_half(rays.select(rays.person == 0))
+    assert row is None and "one participant" in note
+    with pytest.raises(ValueError, match="not negative|kappa is negative"):
         # Errors are raised and not mistaken for missing rays.
-        gaze.score_split_half(rays_evaluation, test_set.centres, 0.6, -1.0, make_uniform_baseline(), min_rays=20)
+        score_half(rays, kappa=-1.0)
+
+
+def test_split_half_that_is_noise_is_left_out():
+    """Few participants, and participants who look in different directions."""
+    row, note = score_half(crowd(people=9), resamples=5)
+    assert row is None and "4 participants" in note
+    rng = np.random.default_rng(1)
+    directions = rng.normal(size=(12, 3))
+    rays = crowd(people=12)
+    scattered = replace(rays, direction=(directions / np.linalg.norm(directions, axis=1, keepdims=True))[rays.person])
+    row, note = score_half(scattered, kappa=200.0, resamples=20)
+    assert row is None and "does not exceed 0" in note
+    assert not gaze.find_split_half_fault(5, 0.1) and gaze.find_split_half_fault(5, 0.1, -0.01)
+    assert gaze.find_split_half_fault(4, 0.1) and gaze.find_split_half_fault(5, float("nan"))
+
+
+def test_intervals_of_ray_scores_resample_participants(test_set):
+    """The interval of each score of rays equals that of draws of whole participants with the same seed."""
+    # A field that suits some participants only, so that scores depend on the participant.
+    peak = test_set.sample_directions[test_set.sample_participants == 0].mean(axis=0)
+    peaked = lambda positions, directions: np.exp(
+        3 * np.broadcast_to(directions @ peak, (len(positions), directions.shape[-2]))
+    )
+    prior, count, seed = make_uniform_baseline(), 40, 3
+    (row,) = gaze.evaluate_gaze(test_set, {"peaked": peaked}, prior, count, seed)
+    (evaluated,) = gaze._evaluate_methods(test_set, {"peaked": peaked}, prior)
+    rng, num = np.random.default_rng(seed), len(test_set.participants)
+    draws = [rng.multinomial(num, np.full(num, 1 / num)) for _ in range(count)]
+    for name, values, who in [
+        *((k, evaluated.rays[k], test_set.sample_participants) for k in gaze.RAY_SCORES),
+        *((k, evaluated.own_rays[k], test_set.own_participants) for k in gaze.OWN_SCORES),
+    ]:
+        sums = np.array([[values[who == p].sum(), (who == p).sum()] for p in range(num)])
+        resampled = [float(times @ sums[:, 0] / (times @ sums[:, 1])) for times in draws]
+        half_width = 1.96 * np.std(resampled)
+        assert row[f"{name}.high"] - row[name] == pytest.approx(half_width, rel=1e-6), name
+        assert row[name] - row[f"{name}.low"] == pytest.approx(half_width, rel=1e-6), name
+    other_seed = gaze.evaluate_gaze(test_set, {"peaked": peaked}, prior, count, seed + 1)[0]
+    assert other_seed["bits.low"] != row["bits.low"] and other_seed["KLD.low"] != row["KLD.low"]
 
 
 # ---- Scores ----

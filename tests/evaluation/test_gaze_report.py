@@ -359,6 +359,16 @@ def test_small_sample_intervals_have_nominal_coverage():
     assert small_sample_factor(10**6) == pytest.approx(1, abs=1e-3)
 
 
+def test_noisy_split_half_of_old_files_is_left_out(tmp_path):
+    rows = [{"method": "gaze field", "bits": 0.5}, {"method": "split half", "bits": -11.0}]
+    data = {"gaze": "g", "split": "both", "positions": 20, "people": 30, "methods": rows}
+    for people, bits, is_kept in ((30, -11.0, False), (9, 0.3, False), (10, 0.3, True)):
+        rows[1]["bits"], data["people"] = bits, people
+        (tmp_path / "gaze.json").write_text(json.dumps(data))
+        results = read_results(tmp_path / "gaze.json")
+        assert (len(results.rows) == 2) == is_kept == (not results.split_half_note)
+
+
 def test_split_half_fraction():
     verdict = compute_verdict(scored((0.3, 0.55, 0.6)), "both", 30, 60)
     assert verdict.split_half_fraction == pytest.approx((0.55 - 0.4) / (0.7 - 0.4))

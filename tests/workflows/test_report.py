@@ -120,9 +120,30 @@ def test_names_are_shown_only_on_request(run, tmp_path):
     assert "Ada" in text and packed_scene(text)["paths"] == []
 
 
-def test_a_report_of_a_gaze_field_alone(run, tmp_path):
+@pytest.fixture
+def not_evaluated(run, tmp_path):
+    """The folder ``run`` without its evaluation."""
+    return shutil.copytree(run, tmp_path / "not evaluated", ignore=shutil.ignore_patterns("gaze.eval"))
+
+
+def test_evaluation_next_to_the_gaze_field_is_used(without_3d, run, tmp_path):
+    recorder, gaze = Recorder(), run / "gaze.safetensors"
+    contents = make_report([gaze], tmp_path / "a.html", SMALL, recorder).run
+    assert len(contents.results) == 1 and contents.results[0].num_positions == 60
+    assert any(str(run / "gaze.eval" / "gaze.json") in text for text in recorder.messages)
+    # An evaluation of an earlier checkpoint of that name.
+    copy = shutil.copytree(run, tmp_path / "copy")
+    data = json.loads((copy / "gaze.eval" / "gaze.json").read_text())
+    for sha256, count in ((file_sha256(gaze), 1), ("0" * 64, 0)):
+        (copy / "gaze.eval" / "gaze.json").write_text(json.dumps({**data, "gaze_sha256": sha256}))
+        contents = make_report([copy / "gaze.safetensors"], tmp_path / "b.html", SMALL, recorder).run
+        assert len(contents.results) == count
+    assert any("trained again" in text for text in recorder.warnings)
+
+
+def test_a_report_of_a_gaze_field_alone(not_evaluated, tmp_path):
     recorder = Recorder()
-    result = make_report([run / "gaze.safetensors"], tmp_path / "a.html", SMALL, recorder)
+    result = make_report([not_evaluated / "gaze.safetensors"], tmp_path / "a.html", SMALL, recorder)
     text = result.path.read_text(encoding="utf-8")
     for sentence in (
         "No evaluation was given",
@@ -142,7 +163,7 @@ def test_a_report_of_objects_without_rays(without_3d, run, tmp_path):
     assert "at the given position, (-0.50, 0.00, 1.60)" in contents.observer
 
 
-def test_missing_evaluations_are_computed(without_3d, run, tmp_path, monkeypatch):
+def test_missing_evaluations_are_computed(without_3d, not_evaluated, tmp_path, monkeypatch):
     from nerg_mi.workflows import report
 
     splits = []
@@ -153,7 +174,7 @@ def test_missing_evaluations_are_computed(without_3d, run, tmp_path, monkeypatch
         return evaluate(gaze, rays, output, replace(job, directions=64, resamples=2, min_rays=8), reporter)
 
     monkeypatch.setattr(report, "evaluate_gaze", quick)
-    files = [run / "gaze.safetensors", run / "rays.npz"]
+    files = [not_evaluated / "gaze.safetensors", not_evaluated / "rays.npz"]
     contents = make_report(files, tmp_path / "a.html", replace(SMALL, evaluate=True)).run
     assert splits == ["pos"] and contents.results[0].rows[0]["method"] == "gaze field"
     assert contents.verdicts[0][1].grade == "none"  # of three positions
