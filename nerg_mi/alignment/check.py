@@ -11,6 +11,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError, sanitize
 from nerg_mi.files.safe_read import read_json
+from nerg_mi.files.schema import NUMBER, Items, check_json
 from nerg_mi.files.tables import write_json
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
@@ -105,6 +106,8 @@ def check_alignment(geometry: Medium | SceneGeometry, rays: Rays, align: Similar
 KIND, VERSION = "alignment", 1
 
 _MAX_BYTES = 4 << 20
+_ROWS, _ENDS = Items(Items(NUMBER, 4, 4), 4, 4), Items(NUMBER, 2, 2)
+_UNCERTAINTY = {"turn_degrees": _ENDS, "scale": _ENDS, "shift_cm": NUMBER}
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,8 +208,8 @@ def read_similarity(
         _report_doubt(data.get("uncertainty"), path, on_doubt)
         data = data["matrix"]
     try:
-        return Similarity(np.array([[float(x) for x in row] for row in data]))
-    except (TypeError, ValueError, IndexError, OverflowError) as error:
+        return Similarity(np.array(check_json(data, _ROWS, "matrix"), np.float64))
+    except ValueError as error:
         raise NergError(
             f'{option} needs a JSON file with the 4 rows of a similarity from {frames}; "{path}": {sanitize(error)}'
         ) from error
@@ -216,9 +219,10 @@ def _report_doubt(uncertainty: Any, path: Path, on_doubt: Callable[[str], None])
     if not isinstance(uncertainty, dict) or "turn_degrees" not in uncertainty:
         return
     try:
-        turn, scale = ((float(low), float(high)) for low, high in (uncertainty[k] for k in ("turn_degrees", "scale")))
-        reason = Interval(turn, scale, float(uncertainty["shift_cm"]) / 100).rejection_reason()
-    except (TypeError, ValueError, KeyError, OverflowError) as error:
+        check_json(uncertainty, _UNCERTAINTY, "uncertainty")
+        turn, scale = (tuple(uncertainty[k]) for k in ("turn_degrees", "scale"))
+        reason = Interval(turn, scale, uncertainty["shift_cm"] / 100).rejection_reason()
+    except ValueError as error:
         raise NergError(
             f'the uncertainty in "{path}" is not an interval of "nerg align" ({sanitize(error)}); run it again'
         ) from error

@@ -10,7 +10,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from nerg_mi.errors import NergError, sanitize
-from nerg_mi.files.safe_read import check_regular_file, read_json
+from nerg_mi.files.safe_read import check_regular_file, read_json, translate_read_errors
+from nerg_mi.files.schema import NUMBER, Items, check_json
 from nerg_mi.photos.colmap import find_pose_source
 from nerg_mi.photos.images import read_posed_images
 from nerg_mi.photos.posed import PosedImages, describe_unused
@@ -190,6 +191,7 @@ def _name_key(name: str) -> str:
 # ---- Picked points ----
 
 MAX_PAIRS_BYTES = 4 << 20  # maximum size of a file of pairs
+_POINT = Items(NUMBER, 3, 3)
 _COLUMNS = ("x", "y", "z", "place_x", "place_y", "place_z")
 _FORMAT = (
     'CSV with the columns x,y,z (tracking, metres) and place_x,place_y,place_z, or JSON [{"tracking": [x, y, z], '
@@ -304,17 +306,12 @@ def _read_csv(path: Path) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
 
 def _read_json(path: Path) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
     rows: Any = read_json(path, "file of pairs", MAX_PAIRS_BYTES)
-    rows = rows.get("pairs") if isinstance(rows, dict) else rows
-    try:
-        points = [np.array([[float(v) for v in row[k]] for row in rows]) for k in ("tracking", "place")]
-        if rows and any(p.shape != (len(rows), 3) for p in points):
-            raise ValueError("a point has three coordinates")
-        names = tuple(str(row.get("name", "")) for row in rows)
-    except (TypeError, ValueError, KeyError, IndexError, AttributeError, OverflowError) as error:
-        raise NergError(
-            f'the file of pairs "{path}" cannot be read ({sanitize(error)}); the format is {_FORMAT}'
-        ) from error
-    return points[0].reshape(-1, 3), points[1].reshape(-1, 3), names if any(names) else ()
+    with translate_read_errors(path, "file of pairs", f"the format is {_FORMAT}"):
+        rows = check_json(rows, {"pairs": list})["pairs"] if isinstance(rows, dict) else rows
+        check_json(rows, Items({"tracking": _POINT, "place": _POINT}), "pairs")
+    points = [np.array([row[k] for row in rows], np.float64).reshape(-1, 3) for k in ("tracking", "place")]
+    names = tuple(str(row.get("name", "")) for row in rows)
+    return points[0], points[1], names if any(names) else ()
 
 
 def _rms(distance: np.ndarray) -> float:

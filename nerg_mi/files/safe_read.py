@@ -101,8 +101,12 @@ def translate_read_errors(
         raise NergError(f'the {file_kind} "{path}" cannot be read: {describe_error(error)}; {remedy}') from error
 
 
-_NOT_A_NUMBER = re.compile(
-    r"could not convert string to float: (.*)|invalid literal for int\(\) with base \d+: (.*)", re.S
+# Messages of Python that name a value or a key, and what is said instead.
+_VALUE_MESSAGES = (
+    (r"could not convert string to float: (.*)", "it has {} in place of a number"),
+    (r"invalid literal for int\(\) with base \d+: (.*)", "it has {} in place of a number"),
+    (r".*got an unexpected keyword argument '(.*)'", 'it has an unknown entry "{}"'),
+    (r".*missing \d+ required (?:positional|keyword-only) arguments?: '(\w+)'.*", 'it lacks "{}"'),
 )
 
 
@@ -122,18 +126,18 @@ def describe_error(error: BaseException) -> str:
         return "it is not UTF-8 text"
     if isinstance(error, OSError) and error.strerror:
         return error.strerror[:1].lower() + error.strerror[1:]
-    if type(error) in (KeyError, IndexError, TypeError, AttributeError, OverflowError, ValueError):
-        if not _has_raise_statement(error):
-            match = _NOT_A_NUMBER.match(str(error))
-            if match:
-                return f"it has {sanitize(match[1] or match[2], 60)} in place of a number"
-            if isinstance(error, KeyError):
-                return f'it lacks "{sanitize(error.args[0], 60)}"'
-            if isinstance(error, OverflowError):
-                return "a number is too large"
-            return "a value is missing, or has another type or size than its format requires"
-        if isinstance(error, KeyError):
-            return sanitize(error.args[0]).rstrip(".")
+    if isinstance(error, KeyError):
+        key = sanitize("".join(map(str, error.args)), 100).rstrip(".")
+        # Libraries raise it with a sentence.
+        return key if " " in key else f'it lacks "{key}"'
+    is_built_in = type(error) in (IndexError, TypeError, AttributeError, OverflowError, ValueError)
+    if is_built_in and not _has_raise_statement(error):
+        for pattern, sentence in _VALUE_MESSAGES:
+            if match := re.fullmatch(pattern, str(error), re.DOTALL):
+                return sentence.format(sanitize(match[1], 60))
+        if isinstance(error, OverflowError):
+            return "a number is too large"
+        return "a value is missing, or has another type or size than its format requires"
     return sanitize(format_error(error)).rstrip(".")
 
 

@@ -29,6 +29,7 @@ from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid, RefinedGrid, un
 from nerg_mi.fields.radiance import Background, BackgroundConfig, RadianceConfig, RadianceField
 from nerg_mi.fields.voxels import VoxelArrays, VoxelGrid
 from nerg_mi.files.atomic import file_sha256
+from nerg_mi.files.safe_read import describe_error
 from nerg_mi.maths.arrays import copy_aligned
 from nerg_mi.maths.geometry import box_from_dict
 from nerg_mi.ranges import MAX_COORDINATE, POSITIVE_VALUES
@@ -64,10 +65,8 @@ def translate_build_errors(path: str | os.PathLike) -> Iterator[None]:
         yield
     except NergError:
         raise
-    except KeyError as e:
-        raise NergError(f'the checkpoint "{path}" lacks {sanitize(e)}, which its kind of field needs; {remedy}') from e
-    except (TypeError, ValueError, AttributeError, IndexError, OverflowError, MemoryError) as e:
-        raise NergError(f'the checkpoint "{path}" contains no usable field: {sanitize(e)}; {remedy}') from e
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError, MemoryError) as e:
+        raise NergError(f'the checkpoint "{path}" contains no usable field: {describe_error(e)}; {remedy}') from e
 
 
 def check_sizes(config: object, section: str = "architecture", limits: Mapping[str, int] = _SIZE_LIMITS) -> dict:

@@ -167,7 +167,7 @@ def test_pair_files_are_read(tmp_path):
         ("a.csv", HEAD, "no pairs"),
         ("a.json", "[]", "no pairs"),
         ("a.json", '{"a": 1}', "cannot be read"),
-        ("a.json", '[{"tracking": [1, 2], "place": [1, 2]}]', "three coordinates"),
+        ("a.json", '[{"tracking": [1, 2], "place": [1, 2]}]', "3 numbers"),
         ("a.json", "[1, 2]", "cannot be read"),
         ("a.csv", "x,y,z,place_x,place_y,place_z\n0,5,1,5,0,1,1,2,3\n", "line 2: 9 cells, the header has 6; are these"),
     ],

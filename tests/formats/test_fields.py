@@ -102,7 +102,7 @@ def test_occupancy_size_is_limited():
 @pytest.mark.parametrize("error", [KeyError("box"), ValueError("x"), TypeError("x"), OverflowError("x")])
 def test_build_errors_name_file(error):
     with pytest.raises(
-        NergError, match='the checkpoint "a.safetensors" (lacks .box.|contains no usable field: x)'
+        NergError, match='the checkpoint "a.safetensors" (contains no usable field: (it lacks .box.|x))'
     ) as e:
         with translate_build_errors("a.safetensors"):
             raise error

@@ -1,9 +1,7 @@
 """Tests of `nerg_mi.formats.splats`."""
 
-import functools
 import gzip
 import json
-import re
 import struct
 import tracemalloc
 import zipfile
@@ -47,6 +45,8 @@ from tests.formats.splats.writers import (
     write_sog,
     write_spz,
 )
+from tests.fuzz.mutations import iter_damaged_documents
+from tests.fuzz.watch import PYTHON_WORDS
 
 # ---- .splat ----
 
@@ -480,37 +480,12 @@ def test_damaged_sog_is_refused(tmp_path, changes, said):
     assert "a.sog" in str(error.value)
 
 
-def _damaged_values(meta: dict) -> list[tuple[dict, str]]:
-    """Copies of ``meta`` in which each key, and the first item of each list, is missing or has another type or size."""
-    others = [None, {}, [], "x", -1, 1e300, float("nan"), float("inf"), True, [[0.0]], 1 << 70]
-    out = []
-
-    def visit(path: tuple) -> None:
-        value = functools.reduce(lambda at, key: at[key], path, meta)
-        for other in [*others, KeyError] if path else others:
-            copy = json.loads(json.dumps(meta))
-            parent = functools.reduce(lambda at, key: at[key], path[:-1], copy)
-            if not path:
-                copy = other
-            elif other is KeyError:
-                del parent[path[-1]]
-            else:
-                parent[path[-1]] = other
-            out.append((copy, f"{path} {other}"))
-        keys = list(value) if isinstance(value, dict) else [0] if isinstance(value, list) else []
-        for key in keys:
-            visit((*path, key))
-
-    visit(())
-    return out
-
-
 def test_sog_with_any_damaged_value_is_read_or_refused_in_a_sentence(tmp_path):
     write_sog(tmp_path / "a.sog", random_splats())
     with zipfile.ZipFile(tmp_path / "a.sog") as archive:
         files = {name: archive.read(name) for name in archive.namelist()}
     num_refused = 0
-    for meta, what in _damaged_values(json.loads(files["meta.json"])):
+    for meta in iter_damaged_documents(json.loads(files["meta.json"])):
         with zipfile.ZipFile(tmp_path / "b.sog", "w") as archive:
             for name, data in (files | {"meta.json": json.dumps(meta).encode()}).items():
                 archive.writestr(name, data)
@@ -518,10 +493,7 @@ def test_sog_with_any_damaged_value_is_read_or_refused_in_a_sentence(tmp_path):
             read_splats(tmp_path / "b.sog")
         except NergError as error:
             num_refused += 1
-            said = str(error)
-            assert "b.sog" in said and not re.search(
-                "index out of|object has no|Error|subscript|iter|convert s", said
-            ), what
+            assert "b.sog" in str(error) and not PYTHON_WORDS.search(str(error))
     assert num_refused > 200
 
 

@@ -9,6 +9,7 @@ import re
 import struct
 import zipfile
 import zlib
+from collections.abc import Iterator
 
 from hypothesis import strategies as st
 
@@ -343,3 +344,26 @@ _STRUCTURES = {"json": _json, "text": _text, "npy": _npy, "gzip": _gzip, "zip": 
     "png": _png,
     "boxes": _boxes,
 }
+
+
+# ---- Every value of a JSON document, one after another ----
+
+_OTHER_VALUES = (None, {}, [], "x", -1, 1e300, float("nan"), float("inf"), True, [[0.0]], 1 << 70)
+
+
+def iter_damaged_documents(document: object) -> Iterator[object]:
+    """Iterate over copies of a JSON ``document`` in which one value is missing or replaced by each of `_OTHER_VALUES`.
+
+    Of lists, only the first item is damaged.
+    """
+    yield from _OTHER_VALUES
+    if isinstance(document, (dict, list)) and document:
+        items = list(document.items()) if isinstance(document, dict) else [(0, document[0])]
+        for key, value in items:
+            copy = dict(document) if isinstance(document, dict) else list(document)
+            del copy[key]
+            yield copy
+            for other in iter_damaged_documents(value):
+                copy = dict(document) if isinstance(document, dict) else list(document)
+                copy[key] = other
+                yield copy

@@ -5,15 +5,18 @@ The cases are identical in each run; ``make fuzz`` tries twenty times as many.
 
 from __future__ import annotations
 
+import json
 import re
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from tests.fuzz import commands, semantic
 from tests.fuzz.cases import draw_cases, make_inputs
+from tests.fuzz.mutations import iter_damaged_documents
 from tests.fuzz.readers import ALL, READERS
-from tests.fuzz.watch import BREACHES, Case, corpus, corpus_name, run_cases
+from tests.fuzz.watch import BREACHES, PYTHON_WORDS, Case, corpus, corpus_name, run_cases
 
 CASES = 750
 
@@ -39,6 +42,39 @@ def test_damaged_files_give_a_result_or_one_sentence(inputs):
     cases = list(draw_cases(READERS, inputs, CASES))
     assert len(cases) > 0.95 * CASES and {c.reader for c in cases} == {r.name for r in READERS}
     assert breaches(cases, inputs) == []
+
+
+@pytest.mark.nightly
+@pytest.mark.slow
+def test_each_value_of_a_json_document_may_be_damaged(inputs):
+    """Also those of the metadata in checkpoints."""
+    cases = []
+    for reader in READERS:
+        for target, kinds in reader.targets.items():
+            raw = (inputs / reader.name / target).read_bytes()
+            if "json" in kinds:
+                damaged = (json.dumps(d).encode() for d in iter_damaged_documents(json.loads(raw)))
+            elif "safetensors" in kinds:
+                size = int.from_bytes(raw[:8], "little")
+                header = json.loads(raw[8 : 8 + size])
+                damaged = map(
+                    partial(_with_metadata, header, raw[8 + size :]),
+                    iter_damaged_documents(json.loads(header["__metadata__"]["nerg"])),
+                )
+            else:
+                continue
+            cases += [Case(reader.name, target, data) for data in damaged]
+    assert len(cases) > 3000
+    names, wrong = [r.name for r in READERS], []
+    for case, report in run_cases(cases, inputs, names):
+        if report.outcome in BREACHES or PYTHON_WORDS.search(report.said):
+            wrong.append((case.reader, case.data[-300:], report.outcome, report.said))
+    assert wrong == []
+
+
+def _with_metadata(header: dict, tensors: bytes, metadata: object) -> bytes:
+    raw = json.dumps({**header, "__metadata__": {**header["__metadata__"], "nerg": json.dumps(metadata)}}).encode()
+    return len(raw).to_bytes(8, "little") + raw + tensors
 
 
 def test_cases_that_once_failed(inputs):

@@ -7,6 +7,7 @@ import hashlib
 import importlib.util
 import json
 import os
+import re
 import select
 import subprocess
 import sys
@@ -48,6 +49,12 @@ ROOT = Path(__file__).resolve().parents[2]
 BREACHES = ("other exception", "crash", "hang", "executed", "left a file", "memory", "slow", "no sentence")
 # A case has 5 s of processor time. The wall-clock limit is longer, because the machine may be busy.
 _PATIENCE = 60.0
+PYTHON_WORDS = re.compile(
+    r"index out of|object has no|not subscriptable|not iterable|not callable|NoneType|Error\b|could not convert s|"
+    r"invalid literal|unpack|inhomogeneous|unhashable|must be real number|unsupported operand|not supported between"
+)
+"""What Python, and no sentence for a user, says about a value of another type or size."""
+
 SPECIAL = ("fifo", "/dev/zero", "/dev/null", "folder", "missing", "loop", "sparse")
 """What may stand at a path in place of a regular file: itself, or a link to it."""
 
