@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import NergError
+from nerg_mi.files.values import to_name
 from nerg_mi.formats.areas import Region
 from nerg_mi.measures.shares import VisibilityCache
 from nerg_mi.measures.visits import (
@@ -115,7 +116,7 @@ class AoiContext:
 
     def _cohort_mask(self, rays: Rays, name: str) -> np.ndarray:
         if self.cohorts:
-            is_member = np.array([self.cohorts.get(person) == name for person in rays.persons], bool)
+            is_member = np.array([self.cohorts.get(to_name(person)) == name for person in rays.persons], bool)
             return is_member[rays.person]
         if rays.cohort is None or name not in rays.cohorts:
             return np.zeros(len(rays), bool)

@@ -14,6 +14,7 @@ import numpy as np
 from nerg_mi.errors import NergError, sanitize, translate_mitsuba_errors
 from nerg_mi.files.safe_read import read_json
 from nerg_mi.files.tables import unescape_formula
+from nerg_mi.files.values import normalize_name, to_name
 from nerg_mi.formats.areas import (
     Area,
     AreaEntry,
@@ -63,7 +64,7 @@ def read_cohorts(path: Path) -> dict[str, str]:
     """
     cohorts: dict[str, str] = {}
     for block in iterate_table(path, (), ("person", "cohort")):
-        for participant, cohort in (map(unescape_formula, row) for row in block.texts.tolist()):
+        for participant, cohort in (map(to_name, map(unescape_formula, row)) for row in block.texts.tolist()):
             if cohorts.setdefault(participant, cohort) != cohort:
                 raise NergError(f'"{path}" has "{sanitize(participant, 40)}" in two cohorts; remove one of them')
         if len(cohorts) > MAX_PARTICIPANTS:
@@ -363,7 +364,7 @@ def scene_from_shapes(shapes: Mapping[str, Any]) -> mi.Scene:
 
 def shapes_by_id(scene: mi.Scene | None) -> dict[str, Any]:
     """Return the shapes of a scene by id."""
-    return {} if scene is None else {shape.id(): shape for shape in scene.shapes()}
+    return {} if scene is None else {normalize_name(shape.id()): shape for shape in scene.shapes()}
 
 
 def find_shape(shapes: Mapping[str, Any], name: str) -> Any:
@@ -501,7 +502,7 @@ def _parse_new_shape(entry: Any, key: str, path: Path) -> NewShape:
 def _parse_name(value: Any, key: str) -> str:
     if not isinstance(value, str) or not 0 < len(value) <= 1000 or "\0" in value:
         raise NergError(f'"{key}" must be a name, as in {_EXAMPLE}')
-    return value
+    return normalize_name(value)
 
 
 def _parse_vector(value: Any, key: str) -> tuple[float, float, float]:

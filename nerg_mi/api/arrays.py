@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nerg_mi.errors import NergError, sanitize
+from nerg_mi.files.values import to_numbers
 from nerg_mi.maths.coordinates import check_coordinates
-from nerg_mi.ranges import FIELDS_OF_VIEW, MAX_COORDINATE, Range, check_number
+from nerg_mi.ranges import FIELDS_OF_VIEW, Range, check_number
 
 # ---- Input arrays and labelled results ----
 
@@ -39,13 +40,10 @@ def as_points(values: ArrayLike, name: str) -> Floats:
         The values are not numbers, are not finite, are too large, or have another shape.
     """
     try:
-        array = np.asarray(values, np.float64)
-    except OverflowError as error:
-        raise NergError(
-            f"{name} must have coordinates from {-MAX_COORDINATE:g} to {MAX_COORDINATE:g}, but one is out of range"
-        ) from error
-    except (TypeError, ValueError) as error:
-        raise NergError(f"{name} must be x, y, z or rows of these, got {sanitize(repr(values), 60)}") from error
+        array = to_numbers(values, name)
+    except NergError as error:
+        shown = sanitize(repr(values), 60)
+        raise NergError(f"{name} must be x, y, z or rows of these, got {shown} ({error})") from error
     array = array[None] if array.shape == (3,) else array
     if array.ndim != 2 or array.shape[1] != 3 or len(array) == 0:
         raise NergError(f"{name} must have the shape (3,) or (N, 3), got {array.shape}")

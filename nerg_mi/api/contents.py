@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from nerg_mi.errors import NergError, translate_mitsuba_errors
 from nerg_mi.fields.splats import Splats
 from nerg_mi.files.atomic import make_folder, replace_atomically, write_text
+from nerg_mi.files.values import to_numbers
 from nerg_mi.formats.meshes import MeshFile, read_mesh_file, with_shading_normals
 from nerg_mi.formats.splats import choose_plugin, write_ply_splats
 from nerg_mi.formats.surfaces import write_volume
@@ -81,7 +82,7 @@ class DensityGrid:
     def __post_init__(self) -> None:
         for name in ("density", "lower", "upper", "color"):
             if (value := getattr(self, name)) is not None:
-                object.__setattr__(self, name, np.asarray(value, np.float32))
+                object.__setattr__(self, name, to_numbers(value, f"{name} of a DensityGrid", np.float32))
         shapes = {"density": 3, "lower": 1, "upper": 1} | ({} if self.color is None else {"color": 4})
         for name, dimensions in shapes.items():
             array = np.asarray(getattr(self, name))
@@ -504,7 +505,7 @@ class _ContentWriter:
         if hasattr(value, "matrix"):
             return transform(matrix(np.array(value.matrix, float).reshape(4, 4)), name=name)
         if isinstance(value, (Sequence, np.ndarray)) or hasattr(value, "__len__"):
-            numbers = np.ravel(np.array(value, float))
+            numbers = np.ravel(to_numbers(value, f'"{name}" of the scene'))
             if len(numbers) == 3:
                 return prop("vector", name, format_numbers(numbers))
         raise NergError(

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from nerg_mi.errors import NergError, sanitize, translate_mitsuba_errors
 from nerg_mi.fields.gaze_base import AnyGazeField
 from nerg_mi.fields.radiance import RadianceField
+from nerg_mi.files.values import to_numbers
 from nerg_mi.formats.fields import load_gaze as read_gaze
 from nerg_mi.formats.fields import matches_checksum
 from nerg_mi.maths import vmf
@@ -312,7 +313,7 @@ class TrainedGazeField(TrainedField[AnyGazeField]):
         >>> regions.inside.shape, bool(regions.solid_angle[0] < regions.solid_angle[1])
         ((2, 16384), True)
         """
-        fractions = np.atleast_1d(np.asarray(levels, float))
+        fractions = np.atleast_1d(to_numbers(levels, "levels"))
         for level in fractions.tolist():
             check_number(level, Range(0, 1), "a level of regions")
         cells, density = self._density_around(origin, num_directions, geometry, progress)

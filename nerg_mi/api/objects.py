@@ -22,6 +22,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.fields.splats import Splats
 from nerg_mi.files.atomic import file_sha256, make_folder, replace_atomically, write_text
+from nerg_mi.files.values import to_numbers
 from nerg_mi.formats.areas import format_areas
 from nerg_mi.formats.splats import write_ply_splats
 from nerg_mi.rays.rays import Rays
@@ -108,7 +109,7 @@ def as_file(value: object, name: str) -> Path:
         return _store(name, ".json", lambda path: write_text(path, json.dumps(value, default=_to_json)))
     matrix: Any = getattr(value, "matrix", value)
     if name in _ALIGNMENT_NAMES and np.shape(matrix) == (4, 4):
-        return _store("align", ".json", lambda path: write_text(path, json.dumps(np.asarray(matrix, float).tolist())))
+        return _store("align", ".json", lambda path: write_text(path, json.dumps(to_numbers(matrix, name).tolist())))
     environment = _write_environment(value) or _write_baked(value)
     if environment is None:
         kind = _KINDS.get(name, "a file")
@@ -209,7 +210,9 @@ def _write_areas(path: Path, areas: Mapping[str, Any]) -> None:
         elif isinstance(area, Mapping):
             entries.append({"name": str(name), **area})
         elif np.shape(area) == (2, 3):
-            lower, upper = np.sort(np.asarray(area, float), axis=0).tolist()  # opposite corners in any order
+            lower, upper = np.sort(
+                to_numbers(area, f'the area "{name}"'), axis=0
+            ).tolist()  # opposite corners in any order
             entries.append({"name": str(name), "min": lower, "max": upper})
         else:
             raise NergError(

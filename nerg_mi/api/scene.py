@@ -18,6 +18,7 @@ from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.fields.splats import Splats
 from nerg_mi.files.atomic import check_writable, write_text
 from nerg_mi.files.html import key_value_table
+from nerg_mi.files.values import to_numbers
 from nerg_mi.formats.meshes import READERS as MESHES
 from nerg_mi.formats.splats import is_splat_file
 from nerg_mi.registration import get_plugin_class
@@ -609,7 +610,7 @@ def _as_transform(matrix: ArrayLike) -> Any:
 
     from nerg_mi.maths.geometry import Similarity
 
-    return mi.ScalarTransform4d(Similarity(np.array(getattr(matrix, "matrix", matrix), np.float64)).matrix)
+    return mi.ScalarTransform4d(Similarity(to_numbers(getattr(matrix, "matrix", matrix), '"to_world"')).matrix)
 
 
 def _format_position(position: Floats) -> str:

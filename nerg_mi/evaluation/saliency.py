@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nerg_mi.errors import NergError
+from nerg_mi.files.values import to_numbers
 from nerg_mi.maths.arrays import check_weights
 
 from . import metrics
@@ -92,6 +93,13 @@ def make_metric_maps(
     return MetricMaps(p, ratio, smooth(p), _maximise_expected_sim(empirical, w))
 
 
+def _to_indices(values: ArrayLike, name: str) -> np.ndarray:
+    numbers = to_numbers(values, name)
+    if not (numbers == np.floor(numbers)).all():
+        raise NergError(f"{name} must be indices of directions or pixels, which are whole numbers")
+    return numbers.astype(np.int64)
+
+
 def _normalise_weights(count: int, weights: ArrayLike | None) -> np.ndarray:
     """Return weights (count,) that sum to 1; None: equal."""
     w = np.full(count, 1.0) if weights is None else check_weights(weights, count)
@@ -100,7 +108,7 @@ def _normalise_weights(count: int, weights: ArrayLike | None) -> np.ndarray:
 
 def _normalise(density: ArrayLike, w: np.ndarray, name: str) -> np.ndarray:
     """Return ``density`` (D,) with the weighted mean 1. Raises `NergError` for values without mass."""
-    density = np.asarray(density, np.float64)
+    density = to_numbers(density, name)
     if not (np.isfinite(density).all() and (density >= 0).all() and w @ density > 0):
         raise NergError(f"the {name} must be finite, not negative and not 0 everywhere")
     return density / (w @ density)
@@ -185,7 +193,7 @@ def score_saliency(
     weights
         Solid angles (D,).
     """
-    at, other = np.asarray(fixations, np.int64), np.asarray(nonfixations, np.int64)
+    at, other = _to_indices(fixations, "fixations"), _to_indices(nonfixations, "nonfixations")
     if not len(at) or not len(other):
         raise NergError(f"a score needs fixations and nonfixations, got {len(at)} and {len(other)}")
     w = _normalise_weights(len(maps.density), weights)

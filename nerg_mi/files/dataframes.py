@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any, ClassVar
@@ -12,6 +12,7 @@ import numpy as np
 from nerg_mi.errors import NergError
 
 from . import html
+from .values import fold_name, to_names, to_numbers, to_seconds
 
 LIBRARIES = ("pandas", "polars", "pyarrow")
 """Libraries of data frames, in the order of preference."""
@@ -134,6 +135,9 @@ def _format_cell(value: Any) -> Any:
 class DataFrameReader:
     """The columns of a data frame of pandas, polars, Arrow or another library that narwhals supports, as arrays.
 
+    A column is named by its name or, if the names have several levels, by a tuple or by its parts joined by "_". Names
+    are compared by their folded form (`nerg_mi.files.values.fold_name`).
+
     Parameters
     ----------
     frame : data frame
@@ -146,6 +150,20 @@ class DataFrameReader:
     """
 
     def __init__(self, frame: Any) -> None:
+        labels = getattr(frame, "columns", None)
+        if hasattr(frame, "iloc") and labels is not None:
+            # pandas allows repeated names and tuples, which narwhals refuses even in unused columns.
+            self._labels, self._get = list(labels), lambda k: frame.iloc[:, k]
+        elif hasattr(frame, "column_names") and hasattr(frame, "combine_chunks"):
+            # So does Arrow.
+            self._labels, self._get = list(frame.column_names), frame.column
+        else:
+            table = self._open(frame)
+            self._labels, self._get = list(table.columns), lambda k: table[table.columns[k]].to_native()
+        self.names: list[str] = [_format_label(label) for label in self._labels]
+
+    @staticmethod
+    def _open(frame: Any) -> Any:
         import narwhals  # it takes a tenth of a second
 
         try:
@@ -156,43 +174,58 @@ class DataFrameReader:
                 "Rays.from_arrays, and files by import_rays"
             ) from error
         # A lazy frame has no values yet.
-        self._table: Any = table.collect() if hasattr(table, "collect") else table
-        self.names: list[str] = list(self._table.columns)
+        return table.collect() if hasattr(table, "collect") else table
 
-    def __len__(self) -> int:
-        return len(self._table)
+    def find(self, name: Any) -> int:
+        """Return the index of a column. Raises `NergError` if there is none, or more than one."""
+        matches = [k for k, label in enumerate(self._labels) if _is_same(label, name)]
+        if not matches:
+            text = fold_name(_format_label(name))
+            matches = [k for k, label in enumerate(self.names) if fold_name(label) == text]
+        if not matches:
+            raise NergError(
+                f'the data frame has no column "{_format_label(name)}"; it has {", ".join(self.names) or "none"}'
+            )
+        if len(matches) > 1:
+            raise NergError(
+                f'the data frame has {len(matches)} columns called "{_format_label(name)}"; rename all but one'
+            )
+        return matches[0]
 
-    def _column(self, name: str) -> Any:
-        if name not in self.names:
-            raise NergError(f'the data frame has no column "{name}"; it has {", ".join(map(str, self.names))}')
-        return self._table[name]
+    def _column(self, name: Any) -> tuple[Any, str]:
+        """Return a column, and how messages name it."""
+        k = self.find(name)
+        return self._get(k), f'the column "{self.names[k]}"'
 
-    def read_numbers(self, name: str) -> np.ndarray:
-        """Return the numbers (N,) of a column as float64, NaN where they are missing; dates and durations in seconds.
+    def read_numbers(self, name: Any) -> np.ndarray:
+        """Return the numbers (N,) of a column as float64, NaN where they are missing; truth values are 0 and 1.
 
         Raises `NergError` if there is no such column, and for values that are not numbers.
         """
-        column = self._column(name)
-        values = np.asarray(column.to_numpy())
-        if values.dtype.kind in "mM":
-            unit = "datetime64[ns]" if values.dtype.kind == "M" else "timedelta64[ns]"
-            values = values.astype(unit)
-            return np.where(np.isnat(values), np.nan, values.astype(np.int64) / 1e9)
-        try:
-            return values.astype(np.float64)
-        except (TypeError, ValueError) as error:
-            raise NergError(f'the column "{name}" contains values that are not numbers ({error})') from error
+        return to_numbers(*self._column(name), flags=True)
 
-    def read_vectors(self, names: Iterable[str]) -> np.ndarray:
-        """Return three columns as an array (N, 3). Raises `NergError` as `read_numbers`, and for another number."""
+    def read_seconds(self, name: Any) -> np.ndarray:
+        """Return the times (N,) of a column in seconds, see `nerg_mi.files.values.to_seconds`."""
+        return to_seconds(*self._column(name))
+
+    def read_vectors(self, names: Any) -> np.ndarray:
+        """Return three columns as an array (N, 3). Raises `NergError` as `read_numbers`, for truth values, and for
+        another number of columns."""
         names = [names] if isinstance(names, str) else list(names)
         if len(names) != 3:
             raise NergError(f"a vector needs three columns, got {', '.join(map(repr, names))}")
-        return np.stack([self.read_numbers(name) for name in names], axis=1)
+        return np.stack([to_numbers(*self._column(name)) for name in names], axis=1)
 
-    def read_names(self, name: str) -> np.ndarray:
-        """Return the texts (N,) of a column, "" where they are missing; other values are written as text."""
-        column = self._column(name)
-        texts = [str(value) for value in column.to_list()]
-        missing = column.is_null().to_numpy()
-        return np.where(missing, "", np.array(texts, dtype=np.str_))
+    def read_names(self, name: Any) -> np.ndarray:
+        """Return the names (N,) of a column, "" where they are missing, see `nerg_mi.files.values.to_names`."""
+        return to_names(*self._column(name))
+
+
+def _format_label(label: Any) -> str:
+    """Return the name of a column as text; levels are joined by "_"."""
+    return "_".join(str(part) for part in label if str(part)) if isinstance(label, tuple) else str(label)
+
+
+def _is_same(label: Any, name: Any) -> bool:
+    """Whether two names of columns are equal; 1 and True are not."""
+    return type(label) is type(name) and bool(label == name)

@@ -20,6 +20,7 @@ import numpy as np
 from nerg_mi.errors import NergError, sanitize
 from nerg_mi.fields.splats import quaternions_to_matrices
 from nerg_mi.files.safe_read import is_count, is_regular_file, read_json, read_text, translate_read_errors
+from nerg_mi.files.values import normalize_name
 from nerg_mi.ranges import MAX_COORDINATE
 
 # ---- Boxes ----
@@ -61,6 +62,7 @@ class Region:
                 f'the area "{sanitize(self.name, 40)}" needs a lower and an upper corner of three numbers; each '
                 "number of the lower corner must be the smaller one"
             )
+        object.__setattr__(self, "name", normalize_name(self.name))
         check_area_name(self.name)
         if self.rotation is not None:
             norm = math.hypot(*self.rotation) if len(self.rotation) == 4 else math.nan
@@ -206,6 +208,7 @@ def read_area_entries(path: str | Path) -> list[AreaEntry]:
         raise NergError(f'"{path}" contains no areas; write {_EXAMPLE} in the coordinates of the scene')
     if not 0 < len(pairs) <= MAX_AREAS:
         raise NergError(f'"{path}" has {len(pairs)} areas; 1 to {MAX_AREAS} are supported; write {_EXAMPLE}')
+    pairs = [(normalize_name(name) if isinstance(name, str) else name, item) for name, item in pairs]
     names = [name for name, _ in pairs if isinstance(name, str)]
     if len(set(names)) < len(names):
         raise NergError(f'"{path}" has two areas with the same name; rename one of them')
@@ -600,7 +603,7 @@ def _parse_non_box(entry: AreaEntry, path: Path) -> list[Area]:
     if "shape" in definition:
         if not isinstance(definition["shape"], str) or not definition["shape"]:
             raise NergError('"shape" must be the id of a shape of the scene')
-        return [SceneShape(name, definition["shape"])]
+        return [SceneShape(name, normalize_name(definition["shape"]))]
     return [AreaGroup(name, _parse_names(definition["parts"], "parts"))]
 
 
@@ -657,4 +660,4 @@ def _parse_ranges(value: object) -> tuple[tuple[int, int], ...]:
 def _parse_names(value: object, key: str) -> tuple[str, ...]:
     if not isinstance(value, list) or not 0 < len(value) <= MAX_PARTS or not all(isinstance(w, str) for w in value):
         raise NergError(f'"{key}" must be 1 to {MAX_PARTS} names')
-    return tuple(dict.fromkeys(value))
+    return tuple(dict.fromkeys(map(normalize_name, value)))

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
 
 from nerg_mi.errors import NergError
+from nerg_mi.files.values import to_numbers
 from nerg_mi.ranges import POSITIVE_VALUES
 
 from .types import Float
@@ -23,7 +24,7 @@ def check_weights(weights: ArrayLike, count: int, name: str = "weights") -> np.n
     Raises `NergError`, which calls them ``name``, for another number of weights, for one that is not finite, negative
     or above `POSITIVE_VALUES`, and if all are zero: a density with such weights would be NaN.
     """
-    out = np.asarray(weights, np.float64)
+    out = to_numbers(weights, name)
     if out.shape[-1:] != (count,):
         raise NergError(f"{name} of shape {out.shape} must be {count:,} numbers that are not negative")
     bad = np.argwhere(~((out >= 0) & (out <= POSITIVE_VALUES.high)))

@@ -25,6 +25,7 @@ from nerg_mi.files.safe_read import (
     read_json,
     translate_read_errors,
 )
+from nerg_mi.files.values import find_names, to_name
 
 from .filters import select_mask
 from .rays import VERSION as RAYS_VERSION
@@ -366,7 +367,9 @@ class Conditions:
         """The rays that match. Names that do not occur in ``rays`` are not an error here."""
         if not self.has_any:
             return rays
-        keep_present = lambda names, available: None if names is None else [name for name in names if name in available]
+        keep_present = lambda names, available: (
+            None if names is None else [name for name in map(to_name, names) if name in available]
+        )
         applicable = replace(
             self,
             persons=keep_present(self.persons, rays.persons),
@@ -643,7 +646,7 @@ class RayDataset:
         NergError
             For unknown participants and cohorts, and for damaged files.
         """
-        self._check_conditions(conditions)
+        conditions = self._resolve_conditions(conditions)
         for source, part in self.parts:
             if not conditions.may_match_part(part, self.manifest.buckets):
                 continue
@@ -658,18 +661,19 @@ class RayDataset:
                 blocks = [merge_rays(part_blocks)] if part_blocks else []
             yield from blocks
 
-    def _check_conditions(self, conditions: Conditions) -> None:
-        """Raise `NergError` for unknown names and an invalid box."""
+    def _resolve_conditions(self, conditions: Conditions) -> Conditions:
+        """Return ``conditions`` with names as they are stored. Raises `NergError` for unknown names and an invalid
+        box."""
         conditions.validate()
-        for what, available, names in (
-            ("person", self.persons, conditions.persons),
-            ("person", self.persons, conditions.without_persons),
-            ("cohort", sorted({*self.cohorts, "unknown"}), conditions.cohorts),
-        ):
-            unknown = [name for name in names or () if name not in available]
-            if unknown:
-                listed = ", ".join(available[:20]) + (", ..." if len(available) > 20 else "")
-                raise NergError(f"no {what} is called {', '.join(map(repr, unknown))}; there are {listed}")
+        persons, cohorts = self.persons, tuple(sorted({*self.cohorts, "unknown"}))
+        stored = {}
+        for key, available in {"persons": persons, "without_persons": persons, "cohorts": cohorts}.items():
+            if (names := getattr(conditions, key)) is not None:
+                what = "cohort" if key == "cohorts" else "person"
+                wanted = {to_name(available[k]) for k in find_names(names, available, what)}
+                # A dataset of an earlier version may store a name in two forms.
+                stored[key] = [name for name in available if to_name(name) in wanted]
+        return replace(conditions, **stored)
 
     def load(
         self, conditions: Conditions = NO_CONDITIONS, *, max_rays: int = MAX_LOADED_RAYS, read_hits: bool = True

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError
+from nerg_mi.files.values import find_names, to_numbers
 
 from .rays import RayIndex, Rays
 
@@ -52,15 +53,15 @@ def select_mask(
         start, end = time
         keep &= (rays.t >= (-np.inf if start is None else start)) & (rays.t < (np.inf if end is None else end))
     if persons is not None:
-        keep &= np.isin(rays.person, _find_codes(persons, rays.persons, "person"))
+        keep &= np.isin(rays.person, find_names(persons, rays.persons, "person"))
     if without_persons is not None:
-        keep &= ~np.isin(rays.person, _find_codes(without_persons, rays.persons, "person"))
+        keep &= ~np.isin(rays.person, find_names(without_persons, rays.persons, "person"))
     if cohorts is not None:
         if rays.cohort is None:
             raise NergError("these rays have no cohorts; import them with a cohort column (--map cohort=...)")
-        keep &= np.isin(rays.cohort, _find_codes(cohorts, rays.cohorts, "cohort"))
+        keep &= np.isin(rays.cohort, find_names(cohorts, rays.cohorts, "cohort"))
     if box is not None:
-        sides = np.asarray(box, dtype=np.float64)
+        sides = to_numbers(box, "a box")
         if sides.shape != (6,) or not (sides[0::2] < sides[1::2]).all():
             raise NergError(
                 f"a box needs x0, x1, y0, y1, z0, z1 in metres with x0 < x1, y0 < y1, z0 < z1, got {sides.tolist()}"
@@ -71,13 +72,6 @@ def select_mask(
     if with_hit:
         keep &= False if rays.hit is None else np.isfinite(rays.hit).all(axis=1)
     return keep
-
-
-def _find_codes(names: Sequence[str], available: tuple[str, ...], what: str) -> list[int]:
-    unknown = [n for n in names if n not in available]
-    if unknown:
-        raise NergError(f"no {what} is called {', '.join(map(repr, unknown))}; there are {', '.join(available)}")
-    return [available.index(n) for n in names]
 
 
 def argsort_by_person_time(rays: Rays) -> np.ndarray | None:
@@ -363,12 +357,7 @@ def split_by_person(
     """
     present = np.unique(rays.person)
     if test_persons is not None:
-        unknown = [p for p in test_persons if p not in rays.persons]
-        if unknown:
-            raise NergError(
-                f"no person is called {', '.join(map(repr, unknown))}; the persons are {', '.join(rays.persons)}"
-            )
-        test_codes = np.array([rays.persons.index(p) for p in test_persons])
+        test_codes = np.array(find_names(test_persons, rays.persons, "person"))
     else:
         count = int(np.clip(round(test_fraction * len(present)), 1, max(1, len(present) - 1)))
         test_codes = np.random.default_rng(seed).permutation(present)[:count]

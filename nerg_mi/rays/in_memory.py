@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from nerg_mi.errors import NergError
 from nerg_mi.files.dataframes import DataFrameReader, make_dataframe
 from nerg_mi.files.html import key_value_table
+from nerg_mi.files.values import to_names, to_numbers, to_seconds
 
 from .quality import RaysSummary, format_quality_report, make_quality_report, summarise
 from .rays import Rays
@@ -41,16 +42,16 @@ def from_arrays(
 
     ``frame`` are up axis, handedness and unit; ``unused`` are names of columns to report as unused.
     """
-    t = _as_numbers(times, "times")
+    t = to_seconds(times, "times")
     if t.ndim != 1 or not len(t):
         raise NergError(f"times must have the shape (N,) with at least one sample, got {t.shape}")
     count = len(t)
     vectors = {"origins": origins, "directions": directions, "hits": hits, "heads": heads}
-    arrays = {name: _as_numbers(value, name) for name, value in vectors.items() if value is not None}
+    arrays = {name: to_numbers(value, name) for name, value in vectors.items() if value is not None}
     names = {"participants": participants} if cohorts is None else {"participants": participants, "cohorts": cohorts}
-    texts = {name: value if isinstance(value, str) else _as_names(value) for name, value in names.items()}
+    texts = {name: value if isinstance(value, str) else to_names(value, name) for name, value in names.items()}
     if confidence is not None:
-        arrays["confidence"] = _as_numbers(confidence, "confidence")
+        arrays["confidence"] = to_numbers(confidence, "confidence", flags=True)
     for name, array in {**arrays, **texts}.items():
         expected = (count, 3) if name in vectors else (count,)
         if not isinstance(array, str) and array.shape != expected:
@@ -72,63 +73,52 @@ def from_arrays(
     return builder.build()
 
 
-def _as_numbers(values: ArrayLike, name: str) -> np.ndarray:
-    try:
-        return np.ascontiguousarray(values, np.float64)
-    except (TypeError, ValueError) as error:
-        raise NergError(f"{name} must be numbers, got {type(values).__name__} ({error})") from error
-
-
-def _as_names(values: ArrayLike) -> np.ndarray:
-    """Return names (N,) as text; None and NaN become ""."""
-    array = np.asarray(values)
-    if array.dtype.kind == "O":
-        array = np.array(["" if v is None or v != v else str(v) for v in array.ravel()], np.str_).reshape(array.shape)
-    return array.astype(np.str_)
-
-
 # ---- Data frames ----
 
-_NUMBERS, _NAMES, _VECTORS = ("time", "confidence"), ("participant", "cohort"), ("origin", "direction", "hit", "head")
+_NAMES, _VECTORS = ("participant", "cohort"), ("origin", "direction", "hit", "head")
 ROLES = ("time", "participant", "origin", "direction", "hit", "head", "confidence", "cohort")
 """What columns of a data frame can contain."""
 
 _REQUIRED = ("time", "origin", "direction")
 
 
-def _default_columns(role: str) -> str | list[str]:
-    return [f"{role}_{axis}" for axis in "xyz"] if role in _VECTORS else role
+def _default_columns(role: str) -> list[str]:
+    return [f"{role}_{axis}" for axis in "xyz"] if role in _VECTORS else [role]
 
 
 def from_dataframe(table: Any, columns: Mapping[str, Any] | None, frame: tuple[str, str, str]) -> Rays:
     """Make rays of a data frame, see `Rays.from_dataframe`."""
     reader = DataFrameReader(table)
-    as_list = lambda names: [names] if isinstance(names, str) else list(names)
+    # A tuple is the name of one column with several levels, unless it is a vector.
+    is_one = lambda role, names: not isinstance(names, list) and not (role in _VECTORS and not isinstance(names, str))
+    as_list = lambda role, names: [names] if is_one(role, names) else list(names)
     example = '{"origin": ["x", "y", "z"], "direction": ["dx", "dy", "dz"], "time": "t"}'
     if columns is None:
-        choices = {role: _default_columns(role) for role in ROLES}
-        defaults = [name for role in _REQUIRED for name in as_list(choices[role])]
-        if missing := [name for name in defaults if name not in reader.names]:
+        defaults = {role: _default_columns(role) for role in ROLES}
+        if missing := [name for role in _REQUIRED for name in defaults[role] if name not in reader.names]:
             raise NergError(
                 f'the data frame has no column "{missing[0]}"; name those that it has '
-                f"({', '.join(map(str, reader.names))}), as in columns={example}"
+                f"({', '.join(reader.names)}), as in columns={example}"
             )
-        columns = {
-            role: names
-            for role, names in choices.items()
-            if role in _REQUIRED or set(as_list(names)) <= set(reader.names)
-        }
-    if unknown := [role for role in columns if role not in ROLES]:
-        raise NergError(f'columns has no role "{unknown[0]}"; the roles are {", ".join(ROLES)}')
-    if missing := [role for role in _REQUIRED if role not in columns]:
+        choices = {role: names for role, names in defaults.items() if set(names) <= set(reader.names)}
+    else:
+        if unknown := [role for role in columns if role not in ROLES]:
+            raise NergError(f'columns has no role "{unknown[0]}"; the roles are {", ".join(ROLES)}')
+        choices = {role: as_list(role, names) for role, names in columns.items()}
+    if missing := [role for role in _REQUIRED if role not in choices]:
         raise NergError(f'columns lacks "{missing[0]}"; name its columns, as in columns={example}')
-    used = [name for names in columns.values() for name in as_list(names)]
-    if repeated := next((name for name in used if used.count(name) > 1), None):
-        raise NergError(f'the column "{repeated}" has two roles in columns; a column has one role')
-    values = {}
-    for role, names in columns.items():
-        read = reader.read_vectors if role in _VECTORS else reader.read_names if role in _NAMES else reader.read_numbers
-        values[role] = read(names)
+    for role, names in choices.items():
+        if role not in _VECTORS and len(names) != 1:
+            raise NergError(f"{role} needs one column, got {', '.join(map(repr, names))}")
+    used = [reader.find(name) for names in choices.values() for name in names]
+    repeated = next((k for k in used if used.count(k) > 1), None)
+    if repeated is not None:
+        raise NergError(f'the column "{reader.names[repeated]}" has two roles in columns; a column has one role')
+    read = {"time": reader.read_seconds, "confidence": reader.read_numbers} | dict.fromkeys(_NAMES, reader.read_names)
+    values = {
+        role: reader.read_vectors(names) if role in _VECTORS else read[role](names[0])
+        for role, names in choices.items()
+    }
     return from_arrays(
         values["origin"],
         values["direction"],
@@ -139,7 +129,7 @@ def from_dataframe(table: Any, columns: Mapping[str, Any] | None, frame: tuple[s
         confidence=values.get("confidence"),
         cohorts=values.get("cohort"),
         frame=frame,
-        unused=[str(name) for name in reader.names if name not in used],
+        unused=[name for k, name in enumerate(reader.names) if k not in used],
     )
 
 

@@ -28,6 +28,7 @@ from nerg_mi.files.safe_read import (
     parse_json,
     translate_read_errors,
 )
+from nerg_mi.files.values import to_names, to_numbers, to_seconds, unify_names
 from nerg_mi.ranges import MAX_COORDINATE
 
 # ---- JSON metadata of a rays file: the values that this package uses are validated here ----
@@ -400,13 +401,19 @@ class Rays:
             names = getattr(self, name)
             if isinstance(names, str):
                 raise NergError(f'{name} needs a sequence of names, as in {name}=("Ada", "Bob"), got {names!r}')
-            set_field(name, tuple(str(one) for one in names))
-        for name in ("person", "cohort"):
-            if getattr(self, name) is not None:
-                set_field(name, _to_codes(getattr(self, name), getattr(self, name + "s"), name))
+            texts, index = unify_names(names)
+            set_field(name, texts)
+            column = name.removesuffix("s")
+            if getattr(self, column) is not None:
+                set_field(column, _to_codes(getattr(self, column), texts, index, column))
         for name in ("t", "origin", "direction", "confidence", "hit", "head"):
             if (value := getattr(self, name)) is not None:
-                set_field(name, _to_floats(value, name, np.float32 if name == "head" else np.float64))
+                what = f'"{name}" of rays'
+                if name == "t":
+                    set_field(name, to_seconds(value, what))
+                else:
+                    dtype = np.float32 if name == "head" else np.float64
+                    set_field(name, to_numbers(value, what, dtype, flags=name == "confidence"))
 
         n = len(self.t)
         for name, value in self.columns().items():
@@ -502,9 +509,9 @@ class Rays:
         directions : array_like of shape (N, 3)
             Directions of any length except zero.
         times : array_like of shape (N,)
-            Times in seconds, on any clock.
+            Times on any clock: numbers in seconds, durations, or dates, which become seconds since 1970 in UTC.
         participants : str or array_like of shape (N,)
-            Name of the participant of each ray, or one name for all.
+            Name or number of the participant of each ray, or one name for all.
         hits : array_like of shape (N, 3), optional
             Points of regard on surfaces, NaN where they are unknown.
         heads : array_like of shape (N, 3), optional
@@ -525,7 +532,8 @@ class Rays:
         Raises
         ------
         NergError
-            An array has another shape or contains no numbers, or no row gives a ray.
+            An array has another shape or contains no numbers (text, truth values, complex numbers), or no row gives a
+            ray.
 
         Examples
         --------
@@ -565,7 +573,8 @@ class Rays:
         columns : mapping, optional
             Columns by role: ``time``, ``participant``, ``origin``, ``direction``, ``hit``, ``head``, ``confidence`` and
             ``cohort``; positions and directions have three columns. ``time``, ``origin`` and ``direction`` are
-            required; without ``participant`` all rows are of one. Default: the columns of `to_dataframe`.
+            required; without ``participant`` all rows are of one. A column with several levels is named by a tuple.
+            Default: the columns of `to_dataframe`.
         up, handedness, units : str
             Frame of the values, as in `from_arrays`.
 
@@ -701,23 +710,25 @@ def _in_memory() -> Any:
     return import_module("nerg_mi.rays.in_memory")
 
 
-def _to_floats(values: ArrayLike, name: str, dtype: type[np.floating[Any]]) -> np.ndarray:
-    try:
-        return np.ascontiguousarray(values, dtype=dtype)
-    except (TypeError, ValueError) as error:
-        raise NergError(f'"{name}" of rays contains values that are not numbers ({error})') from error
-
-
-def _to_codes(values: ArrayLike, names: tuple[str, ...], what: str) -> np.ndarray:
-    """Convert ``values`` (N,), which are codes or names among ``names``, to codes."""
-    values = np.asarray(values)
-    if not any(isinstance(value, str) for value in values.ravel()[:1].tolist()):
-        return values
-    numbers = {name: number for number, name in enumerate(names)}
-    unknown = next((value for value in values.ravel().tolist() if value not in numbers), None)
-    if unknown is not None:
-        raise NergError(f"{unknown!r} is a {what} of the rays but not in {what}s; list all names in {what}s=(...)")
-    return np.array([numbers[value] for value in values.ravel().tolist()], np.int32).reshape(values.shape)
+def _to_codes(values: ArrayLike, names: tuple[str, ...], index: np.ndarray | None, what: str) -> np.ndarray:
+    """Convert ``values`` (N,), which are codes or names among ``names``, to codes; ``index`` are the new codes, if some
+    names were unified."""
+    array = np.asarray(values)
+    if any(isinstance(value, str) for value in array.ravel()[:1].tolist()):
+        numbers = {name: number for number, name in enumerate(names)}
+        texts = to_names(array, what).ravel().tolist()
+        unknown = next((text for text in texts if text not in numbers), None)
+        if unknown is not None:
+            raise NergError(f"{unknown!r} is a {what} of the rays but not in {what}s; list all names in {what}s=(...)")
+        return np.array([numbers[text] for text in texts], np.int32).reshape(array.shape)
+    if array.dtype.kind not in "iu":
+        codes = to_numbers(values, f'"{what}" of rays')
+        _refuse_rows(codes != np.floor(codes), f"a {what} that is no index into {what}s", "use whole numbers, or names")
+        array = codes
+    if index is None:
+        return array
+    _refuse_rows(~((array >= 0) & (array < len(index))), f"an unknown {what}", f"extend {what}s")
+    return index[array.astype(np.int64)]
 
 
 def _refuse_rows(bad: np.ndarray | np.bool_, what: str, remedy: str) -> None:

@@ -18,6 +18,7 @@ from nerg_mi.figures.maps import ParticipantPath, SightLines, Walls, floor_figur
 from nerg_mi.figures.overlay import Overlay, OverlayLayers, find_overlay, occlusion_figure, shared_limits, unknown_mask
 from nerg_mi.figures.scanpath import scanpath_figure
 from nerg_mi.figures.sphere import find_projection, sphere_figure
+from nerg_mi.files.values import find_names
 from nerg_mi.interruption import Interruption
 from nerg_mi.maths.types import variant_types
 from nerg_mi.rays.dataset import load_rays
@@ -95,14 +96,7 @@ def _select_participants(rays: Rays, names: str | None) -> Rays:
     """Select the rays of the participants ``names``."""
     if names is None:
         return rays
-    selected = [name.strip() for name in names.split(",")]
-    missing = [name for name in selected if name not in rays.persons]
-    if missing:
-        some = ", ".join(rays.persons[:8])
-        raise NergError(
-            f'the rays have no person "{missing[0]}"; persons are {some}{", ..." * (len(rays.persons) > 8)}'
-        )
-    return rays.select(np.isin(rays.person, [rays.persons.index(name) for name in selected]))
+    return rays.select(np.isin(rays.person, find_names(names.split(","), rays.persons, "person")))
 
 
 def _corners(rays: Rays) -> tuple[np.ndarray, np.ndarray]:

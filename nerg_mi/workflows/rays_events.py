@@ -13,6 +13,7 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.files.atomic import check_writable
 from nerg_mi.files.tables import unescape_formula, write_csv
+from nerg_mi.files.values import find_names
 from nerg_mi.rays.dataset import load_rays
 from nerg_mi.rays.events import Events, detect_events
 from nerg_mi.rays.quality import GazeTarget, RecordingQuality, measure_recordings
@@ -93,9 +94,8 @@ def read_targets(path: Path, participants: Sequence[str]) -> list[GazeTarget]:
             name = unescape_formula(words[0]) if words and words[0] else None
             if not np.isfinite(row).all():
                 raise NergError(f"{path}, line {line}: a target needs start, end, x, y and z; complete or remove it")
-            if name is not None and name not in participants:
-                raise NergError(f"{path}, line {line}: no person of the rays is called {name!r}; correct the name")
             try:
+                name = None if name is None else participants[find_names([name], participants, "person")[0]]
                 targets.append(GazeTarget(row[0], row[1], (row[2], row[3], row[4]), name))
             except NergError as error:
                 raise NergError(f"{path}, line {line}: {error}; correct it") from error

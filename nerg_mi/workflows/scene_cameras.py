@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError, sanitize, translate_mitsuba_errors
+from nerg_mi.errors import NergError, translate_mitsuba_errors
 from nerg_mi.fields.gaze_base import RaySupport
 from nerg_mi.figures.overview import PinholeFrame, ScoredView, SeenSurfaces, ViewScorer, view_of_observer, view_of_scene
+from nerg_mi.files.values import find_names
 from nerg_mi.maths.geometry import Similarity, box_from_dict
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.rays.rays import Rays
@@ -199,8 +200,6 @@ RADIUS = 0.5
 MAX_FRAMES = 100_000
 """Maximum number of frames of a walk."""
 
-_NAMED = 8
-
 
 @dataclass(frozen=True)
 class ObserverPath:
@@ -278,11 +277,7 @@ def to_scene_frame(points: np.ndarray, align: Similarity) -> np.ndarray:
 
 def _find_person_rows(rays: Rays, person: str) -> np.ndarray:
     """Return the indices of the rays of ``person``."""
-    if person not in rays.persons:
-        some = ", ".join(sanitize(name, 40) for name in rays.persons[:_NAMED])
-        suffix = "" if len(rays.persons) <= _NAMED else f" and {len(rays.persons) - _NAMED} more"
-        raise NergError(f'the rays have no person "{person}"; persons are {some}{suffix}')
-    rows = np.flatnonzero(rays.person == rays.persons.index(person))
+    rows = np.flatnonzero(rays.person == find_names([person], rays.persons, "person")[0])
     if not len(rows):
         raise NergError(f'"{person}" has no rays; choose another person')
     return rows

@@ -181,6 +181,11 @@ def test_cohort_names_survive_a_round_trip(tmp_path):
     assert read_cohorts(tmp_path / "c.csv") == cohorts
 
 
+def test_cohorts_of_ids_and_names_in_another_form(tmp_path):
+    (tmp_path / "c.csv").write_text("person,cohort\n1.0,o\u0308ld\nJo\u0308rg,young\n", "utf-8")
+    assert read_cohorts(tmp_path / "c.csv") == {"1": "\u00f6ld", "J\u00f6rg": "young"}
+
+
 @pytest.mark.parametrize(
     "text", ["person,cohort\n", "person,group\nAda,old\n", "person,cohort\nAda,old\nAda,young\n", ""]
 )

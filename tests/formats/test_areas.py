@@ -93,6 +93,14 @@ def test01_one_area_of_each_kind(tmp_path):
     assert read_areas(tmp_path / "b.json") == areas
 
 
+def test_names_are_composed(tmp_path):
+    composed, decomposed = "K\u00fche", "Ku\u0308he"
+    path = write_areas(tmp_path, {**BOX, "name": decomposed}, {"name": "all", "parts": [composed]})
+    assert read_areas(path).names == (composed, "all")
+    with pytest.raises(NergError, match="same name"):
+        read_areas(write_areas(tmp_path, {**BOX, "name": decomposed}, {**BOX, "name": composed}))
+
+
 @pytest.mark.parametrize("value", [[[0, 0, 0], [1, 2, 3]], {"min": [0, 0, 0], "max": [1, 2, 3]}])
 @pytest.mark.parametrize("name", ["Käse & Co", "mesh"])
 def test02_older_files_are_read(tmp_path, name, value):

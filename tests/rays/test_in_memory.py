@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.rays.rays import Rays
+from nerg_mi.files.dataframes import make_dataframe
+from nerg_mi.rays.filters import split_by_person
+from nerg_mi.rays.rays import Rays, write_rays_file
 
 
 def arrays(n=50):
@@ -139,3 +141,101 @@ def test_columns_have_roles_and_others_are_reported():
 def test_unknown_libraries_are_named():
     with pytest.raises(NergError, match='"numpy"'):
         make_rays().to_dataframe("numpy")
+
+
+# ---- Times, names and columns of several libraries ----
+
+POSES = ([[1.0, 1.0, 1.6]] * 3, [[1.0, 0.0, 0.0]] * 3)
+
+
+@pytest.mark.parametrize("library", ["pandas", "polars", "pyarrow"])
+def test_times_of_arrays_and_data_frames_are_equal(library):
+    pytest.importorskip(library)
+    times = np.array(["2026-01-01T00:00:00", "2026-01-01T00:00:00.016", "2026-01-01T00:00:00.033"], "datetime64[ms]")
+    expected = [1767225600, 1767225600.016, 1767225600.033]
+    table = make_dataframe({"time": times, **vectors()}, library)
+    column = table["time"]
+    for rays in (
+        Rays.from_arrays(*POSES, times=times),
+        Rays.from_arrays(*POSES, times=column),
+        Rays(times, [0] * 3, ("Ada",), *POSES, [1.0] * 3),
+        Rays.from_dataframe(table),
+    ):
+        np.testing.assert_allclose(rays.t, expected, rtol=0, atol=1e-6)
+    durations = times - times[0]
+    np.testing.assert_allclose(Rays.from_arrays(*POSES, times=durations).t, [0, 0.016, 0.033], atol=1e-9)
+
+
+def vectors(n=3):
+    columns = {f"origin_{a}": np.ones(n) for a in "xyz"}
+    return columns | {f"direction_{a}": np.full(n, float(a == "x")) for a in "xyz"}
+
+
+def test_values_that_are_no_numbers_name_the_argument():
+    for name, value in {"times": ["a", "b", "c"], "confidence": [1j] * 3, "origins": [["1", "2", "3"]] * 3}.items():
+        values = {"origins": POSES[0], "directions": POSES[1], "times": [0, 1, 2], name: value}
+        with pytest.raises(NergError, match=name):
+            Rays.from_arrays(**values)
+    with pytest.raises(NergError, match='"origin" of rays'):
+        Rays([0], [0], ("Ada",), np.array([["2026-01-01"] * 3], "datetime64[D]"), [[1, 0, 0]], [1])
+    with pytest.raises(NergError, match="no index into persons"):
+        Rays([0], [0.5], ("Ada", "Bob"), [[0, 0, 0]], [[1, 0, 0]], [1])
+    assert Rays.from_arrays(*POSES, times=[0, 1, 2], confidence=[True, False, True]).confidence.tolist() == [1, 0, 1]
+
+
+@pytest.mark.parametrize("library", ["pandas", "polars", "pyarrow"])
+def test_ids_with_a_gap(library):
+    pytest.importorskip(library)
+    for ids in ([1, None, 2], [1.0, None, 2.0], ["1", None, "2"]):
+        table = make_dataframe({"time": [0.0, 1.0, 2.0], "participant": ids, **vectors()}, library)
+        rays = Rays.from_dataframe(table)
+        assert rays.persons == ("1", "2") and rays.t.tolist() == [0, 2]
+        assert Rays.from_arrays(*POSES, times=[0, 1, 2], participants=table["participant"]).persons == ("1", "2")
+        assert len(rays.filter(persons=[1])) == len(rays.filter(persons=["1.0"])) == 1
+
+
+COMPOSED, DECOMPOSED = "J\u00f6rg", "Jo\u0308rg"
+
+
+def test_two_forms_of_a_name_are_one_participant(tmp_path):
+    rays = Rays.from_arrays(*POSES, times=[0, 1, 2], participants=[COMPOSED, DECOMPOSED, "Ada"])
+    assert rays.persons == ("Ada", COMPOSED)
+    built = Rays([0, 1, 2], [2, 0, 1], (COMPOSED, "Ada", DECOMPOSED), *POSES, [1] * 3)
+    assert built.persons == (COMPOSED, "Ada") and built.person.tolist() == [0, 0, 1]
+    assert len(rays.filter(persons=[DECOMPOSED])) == 2
+    train, test = split_by_person(rays, test_persons=[DECOMPOSED])
+    assert test.tolist() == [True, True, False] and train.sum() == 1
+    path = tmp_path / "rays.npz"
+    write_rays_file(path, rays.columns(), {**rays.metadata, "persons": ["Ada", DECOMPOSED]})
+    assert Rays.load(path).persons == ("Ada", COMPOSED)
+
+
+def test_repeated_columns_of_data_frames():
+    pandas, pyarrow = pytest.importorskip("pandas"), pytest.importorskip("pyarrow")
+    names = ["time", "note", *vectors(), "note"]
+    values = [[0.0, 1.0, 2.0], list("abc"), *vectors().values(), list("abc")]
+    frame = pandas.concat([pandas.Series(v) for v in values], axis=1, keys=names)
+    for table in (frame, pyarrow.Table.from_arrays([pyarrow.array(v) for v in values], names=names)):
+        assert Rays.from_dataframe(table).metadata["unused_columns"] == ["note"]
+        with pytest.raises(NergError, match='2 columns called "note"'):
+            Rays.from_dataframe(table, {"time": "note", "origin": names[2:5], "direction": names[5:8]})
+
+
+def test_names_of_columns_with_levels_and_numbers():
+    pandas = pytest.importorskip("pandas")
+    frame = pandas.DataFrame({"time": [0.0, 1.0, 2.0], **vectors()})
+    names = [("clock", "t"), *(("eye", a) for a in "xyz"), *(("gaze", a) for a in "xyz")]
+    levels = frame.set_axis(pandas.MultiIndex.from_tuples(names), axis=1)
+    by_tuples = {"time": ("clock", "t"), "origin": names[1:4], "direction": names[4:]}
+    by_text = {"time": "clock_t", "origin": ["eye_x", "eye_y", "eye_z"], "direction": ["gaze_x", "gaze_y", "gaze_z"]}
+    for columns in (by_tuples, by_text):
+        assert Rays.from_dataframe(levels, columns).t.tolist() == [0, 1, 2]
+    numbers = frame.set_axis(range(7), axis=1)
+    assert Rays.from_dataframe(numbers, {"time": 0, "origin": [1, 2, 3], "direction": [4, 5, 6]}).t.tolist() == [
+        0,
+        1,
+        2,
+    ]
+    greek = frame.rename(columns={"time": "t [\u03bcs]"})
+    micro = {"time": "t [\u00b5s]", "origin": list(vectors())[:3], "direction": list(vectors())[3:]}
+    assert Rays.from_dataframe(greek, micro).t.tolist() == [0, 1, 2]

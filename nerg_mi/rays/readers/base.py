@@ -18,6 +18,7 @@ import numpy as np
 from nerg_mi.errors import NergError, sanitize
 from nerg_mi.files.atomic import file_sha256
 from nerg_mi.files.safe_read import BadLineCallback, check_regular_file
+from nerg_mi.files.values import normalize_name, to_name
 from nerg_mi.maths.coordinates import check_near_origin
 from nerg_mi.ranges import FLAG, MAX_COORDINATE, RANGE, TIME_UNITS, Range, ValidatedDataclass
 from nerg_mi.rays.rays import COLUMNS, FRAME, Rays
@@ -26,7 +27,7 @@ from .cells import MISSING_WORDS
 from .columns import ColumnFinder, may_be_validity_column, parse_time_unit
 from .head_frame import HeadFrameFinder
 from .poses import FilledOriginFinder, find_fill_values, is_aimed
-from .tables import TableBlock, iterate_table, read_table_columns, split_component
+from .tables import TableBlock, find_column, iterate_table, read_table_columns, split_component
 
 # ---- Frames ----
 #
@@ -188,7 +189,8 @@ class RaysBuilder:
         ``also_used`` are columns that are read separately.
         """
         available = read_table_columns(path) if header is None else header
-        used = {split_component(name, available) or name for name in (*numbers, *texts, *also_used)}
+        columns = [find_column(name, available) for name in (*numbers, *texts, *also_used)]
+        used = {split_component(name, available) or name for name in columns}
         unused = [name for name in available if name and name not in used]
         self.add_unused_columns(unused)
         if header is None:
@@ -266,7 +268,7 @@ class RaysBuilder:
         if self._on_source is not None:
             self._on_source(name or path.name)
         self._path = path
-        self._sources.append({"file": name or path.name})
+        self._sources.append({"file": normalize_name(name or path.name)})
 
     def add(
         self,
@@ -498,12 +500,12 @@ class NameCodes:
     def encode(self, names: Sequence[str] | np.ndarray | str, n: int) -> np.ndarray:
         """Codes (n,) int32 of one name for all rows, or of n names."""
         if isinstance(names, str):
-            return np.full(n, self.get_code(names.strip()), dtype=np.int32)
+            return np.full(n, self.get_code(to_name(names)), dtype=np.int32)
         names = np.asarray(names, dtype=str)
         # Rows of one participant are mostly contiguous: look up names only where they change.
         starts = np.flatnonzero(np.r_[True, names[1:] != names[:-1]][:n])
-        stripped = (name.strip() for name in names[starts].tolist())
-        codes = np.array([self.get_code("" if s.lower() in _MISSING_NAMES else s) for s in stripped], dtype=np.int32)
+        texts = map(to_name, names[starts].tolist())
+        codes = np.array([self.get_code("" if s.lower() in _MISSING_NAMES else s) for s in texts], dtype=np.int32)
         return np.repeat(codes, np.diff(np.r_[starts, n]))
 
     def sort_codes(self, codes: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:

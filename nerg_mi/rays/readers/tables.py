@@ -15,6 +15,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError, sanitize
 from nerg_mi.files.safe_read import BadLineCallback, read_line_blocks, translate_read_errors
+from nerg_mi.files.values import find_name, to_name, to_numbers, to_seconds
 from nerg_mi.rays.rays import open_parquet
 
 from .cells import AXES, MISSING_WORDS, count_components, is_missing, parse_vectors, quote_vectors
@@ -82,6 +83,17 @@ def _read_parquet_texts(path: str | os.PathLike) -> dict[str, list[Any]]:
             return batch.to_pydict() if batch is not None else {}
 
 
+def find_column(name: str, columns: Sequence[str]) -> str:
+    """Return the name among ``columns`` that is equal to ``name`` in its folded form, or of whose vectors it is a
+    component; ``name`` itself if there is none."""
+    k = find_name(name, columns)
+    if k is not None:
+        return columns[k]
+    base, dot, axis = name.rpartition(".")
+    k = find_name(base, columns) if dot and axis in AXES else None
+    return name if k is None else f"{columns[k]}.{axis}"
+
+
 def split_component(name: str, columns: Sequence[str]) -> str | None:
     """The column of the cells with vectors of which ``name`` is a component, such as ``Gaze`` for ``Gaze.x``; None for
     a name in ``columns``, and any other name."""
@@ -102,7 +114,11 @@ def iterate_table(
     A number ``Gaze.x`` is the first component of the vectors in the cells of a column ``Gaze``, if no column has its
     name; all components of a vector must be requested.
     """
-    available = (header or read_table_columns(path)) if any(name[-2:-1] == "." for name in numbers) else ()
+    available = list(header or read_table_columns(path))
+    columns = {name: find_column(name, available) for name in (*numbers, *texts)}
+    numbers, texts = ([columns[name] for name in names] for names in (numbers, texts))
+    if clocks := options.get("clocks"):
+        options["clocks"] = {columns.get(name, name): tick for name, tick in clocks.items()}
     bases = {name: base for name in numbers if (base := split_component(name, available))}
     if not bases:
         yield from _iterate_cells(path, numbers, texts, header, on_bad_line, **options)
@@ -605,7 +621,7 @@ def _iterate_parquet(
 
 
 def _to_texts(path: str | os.PathLike, name: str, column: Any) -> np.ndarray:
-    words = ["" if v is None else str(v) for v in column.to_pylist()]
+    words = [to_name(value) for value in column.to_pylist()]
     if max(map(len, words), default=0) > MAX_TEXT_CHARACTERS:
         raise NergError(
             f'the column {sanitize(name, 40)!r} of the table "{path}" has cells with more characters than the maximum '
@@ -623,12 +639,11 @@ def _to_numbers(path: str | os.PathLike, name: str, column: Any, days: DayCounte
             dated = next((time[1] for cell in cells if (time := parse_clock_seconds(cell))), False)
             values = _parse_clock_column(cells, days.tick, dated)
             values = values if dated or values is None else days.unwrap(values)
-        elif days is not None and values.dtype.kind == "M":
-            since = values.astype("datetime64[ns]").astype(np.int64) * (1e-9 / days.tick)
-            values = np.where(np.isnat(values), np.nan, since)
-        if values is None or values.dtype.kind == "M":
+        elif days is not None and values.dtype.kind in "mM":
+            values = to_seconds(values, name) / days.tick
+        if values is None:
             raise TypeError("no numbers")
-        return values.astype(np.float64)
+        return to_numbers(values, name, flags=True)
     except (TypeError, ValueError):
         raise NergError(
             f'the column {sanitize(name, 40)!r} of the table "{path}" does not contain numbers; use another column'

@@ -101,6 +101,19 @@ def test_unknown_names_are_refused(made):
             list(made[0].scan(Conditions(**cases)))
 
 
+def test_participants_are_found_by_another_form_of_their_name(tmp_path):
+    composed, decomposed = "J\u00f6rg", "Jo\u0308rg"
+    paths = [write_source(tmp_path / f"{k}.csv", k, people=2) for k in range(2)]
+    for path, name in zip(paths, (composed, decomposed)):
+        path.write_text(path.read_text().replace(f"p{path.stem}_0", name))
+    update_dataset(tmp_path / "a.rays", paths, recipe())
+    dataset = RayDataset.open(tmp_path / "a.rays")
+    assert set(dataset.persons) == {composed, "p0_1", "p1_1"}
+    for name in (composed, decomposed):
+        assert len(dataset.load(Conditions(persons=[name]))) == 398  # the third row of each file has no confidence
+        assert len(dataset.load(Conditions(without_persons=[name]))) == 400
+
+
 def test_too_many_rays_are_refused(made):
     dataset, rays = made
     with pytest.raises(NergError, match="1,197.*1,000.*--sample"):

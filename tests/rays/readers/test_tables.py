@@ -498,3 +498,27 @@ def test_empty_lines_may_precede_the_header(tmp_path, top):
     assert block.numbers[:, 0].tolist() == [2, 4] and block.lines.tolist() == [
         len(top.splitlines()) + k for k in (2, 3)
     ]
+
+
+def test_columns_are_compared_in_the_compatible_form(tmp_path):
+    pa, pq = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    text, table = tmp_path / "a.csv", tmp_path / "a.parquet"
+    text.write_text("t [\u03bcs],name,Gaze \uff11\n5,Ada,2\n")
+    pq.write_table(pa.table({"t [\u03bcs]": [5], "name": ["Ada"], "Gaze \uff11": [2]}), table)
+    for path in (text, table):
+        (block,) = iterate_table(path, ["Gaze 1", "t [\u00b5s]"], ["name"], clocks={"t [\u00b5s]": 1e-6})
+        assert block.numbers.tolist() == [[2, 5]] and block.texts.tolist() == [["Ada"]]
+        with pytest.raises(NergError, match="no column"):
+            next(iterate_table(path, ["t [ms]"]))
+
+
+def test_durations_and_ids_of_parquet(tmp_path):
+    pa, pq = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    path = tmp_path / "a.parquet"
+    durations = pa.array(np.array([0, 16_000], "timedelta64[us]"))
+    pq.write_table(pa.table({"t": durations, "x": [1.0, 2.0], "id": pa.array([1.0, None]), "d": durations}), path)
+    (block,) = iterate_table(path, ["t", "x"], ["id"], clocks={"t": 1e-3})
+    np.testing.assert_allclose(block.numbers, [[0, 1], [16, 2]])
+    assert block.texts.tolist() == [["1"], [""]]
+    with pytest.raises(NergError, match="'d'"):
+        next(iterate_table(path, ["d"]))
