@@ -20,7 +20,7 @@ import typer.core
 
 from nerg_mi import __version__
 from nerg_mi.ranges import KAPPAS, RANGE
-from nerg_mi.workflows.base import COMMANDS, Command, Parameter
+from nerg_mi.workflows.base import COMMANDS, Command, HelpView, Parameter
 from nerg_mi.workflows.old_names import find_spelling
 from nerg_mi.workflows.options import GROUPS as GROUPS_OF_OPTIONS
 from nerg_mi.workflows.progress import TerminalReporter
@@ -110,7 +110,17 @@ def _group(
 ) -> typer.Typer:
     """Return the parser of ``entries``, whose names start with ``prefix``; a command is built when it is called."""
 
+    lines: dict[str, str] = {}
+    for name, entry in entries.items():
+        first, below, _ = name.removeprefix(prefix).partition(" ")
+        lines[first] = _about_group(prefix + first, entries) if below else entry.line
+
     class Commands(typer.core.TyperGroup):
+        def format_commands(self, ctx: Any, formatter: Any) -> None:
+            # The parent class cuts descriptions to one line.
+            with formatter.section("Commands"):
+                formatter.write_dl([(name, lines[name]) for name in self.list_commands(ctx)])
+
         def resolve_command(self, ctx: Any, args: list[str]) -> Any:
             name, listed, rest = super().resolve_command(ctx, args)
             return name, None if listed is None else _build(f"{prefix}{name}", entries), rest
@@ -125,10 +135,6 @@ def _group(
 
     app = typer.Typer(cls=Commands, no_args_is_help=True, rich_markup_mode=None, **settings)
     app.callback()(callback)
-    lines: dict[str, str] = {}
-    for name, entry in entries.items():
-        first, below, _ = name.removeprefix(prefix).partition(" ")
-        lines[first] = _about_group(prefix + first, entries) if below else entry.line
     for word, line in lines.items():
         app.command(word, help=line)(_listed)
     return app
@@ -174,17 +180,38 @@ def _shortened(arguments: Sequence[str]) -> Iterator[None]:
 
 
 class _GroupedCommand(typer.core.TyperCommand):
-    """A command whose help lists its options in groups with headings."""
+    """A command whose help lists its options in groups with headings, those of its ``view``."""
+
+    view: Callable[[Sequence[str]], HelpView] | None = None
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        ctx.meta[_ARGUMENTS] = list(args)
+        return super().parse_args(ctx, args)
+
+    def _choose_view(self, ctx: Any) -> HelpView:
+        return self.view(ctx.meta.get(_ARGUMENTS, ())) if self.view is not None else HelpView()
+
+    def format_help_text(self, ctx: Any, formatter: Any) -> None:
+        super().format_help_text(ctx, formatter)
+        if text := self._choose_view(ctx).text:
+            formatter.write_paragraph()
+            with formatter.indentation():
+                formatter.write_text(text)
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
-        sections: dict[str, list[tuple[str, str]]] = {}
+        view, sections = self._choose_view(ctx), dict[str, list[tuple[str, str]]]()
         for parameter in self.get_params(ctx):
             record = parameter.get_help_record(ctx)
-            if record is not None:
+            if record is not None and parameter.name not in view.hidden:
+                record = record[0], view.helps.get(parameter.name or "", record[1])
                 sections.setdefault(_heading(parameter), []).append(record)
+        sections |= {heading: list(records) for heading, records in view.lists.items()}
         for heading, records in sections.items():
             with formatter.section(heading):
                 formatter.write_dl(records)
+
+
+_ARGUMENTS = "nerg_mi.arguments"  # of the command, in click's context
 
 
 def _heading(parameter: Any) -> str:
@@ -205,7 +232,8 @@ def build_command(command: Command, line: str = "") -> Any:
     app = typer.Typer(add_completion=False, rich_markup_mode=None)
     help = "\n\n".join(text for text in (command.help or line, command.more) if text)
     app.command(command.name.split()[-1], help=help, cls=_GroupedCommand)(make_callback(command))
-    parser = typer.main.get_command(app)
+    parser: Any = typer.main.get_command(app)
+    parser.view = command.view
     spellings = {spelling for p in parser.params for spelling in (*p.opts, *p.secondary_opts)}
     # In the order of the help, also for the reference in the manual.
     parser.params.sort(key=_group_position)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import platform
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
@@ -75,6 +75,20 @@ def extra(default: Any, help: str, kind: Any, *names: str, group: str = "", **mo
 
 
 @dataclass(frozen=True)
+class HelpView:
+    """What ``--help`` shows of a command with many options, depending on its other arguments."""
+
+    # Paragraph after the help of the command.
+    text: str = ""
+    # Names of parameters that are not listed.
+    hidden: frozenset[str] = frozenset()
+    # Help texts in place of those of the parameters, by name.
+    helps: Mapping[str, str] = field(default_factory=dict)
+    # Further lists of terms and descriptions, by heading.
+    lists: Mapping[str, Sequence[tuple[str, str]]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class Command:
     """A command as declared by `command`."""
 
@@ -86,6 +100,7 @@ class Command:
     without: tuple[str, ...]
     further: Callable[[], Mapping[str, Parameter]] | None
     parameters: Mapping[str, Parameter]
+    view: Callable[[Sequence[str]], HelpView] | None = None
 
 
 COMMANDS: dict[str, Command] = {}
@@ -103,6 +118,7 @@ def command(
     options: type | None = None,
     without: tuple[str, ...] = (),
     further: Callable[[], Mapping[str, Parameter]] | None = None,
+    view: Callable[[Sequence[str]], HelpView] | None = None,
     **parameters: Parameter,
 ) -> Callable[[Run], Run]:
     """Declare the decorated function as what ``nerg NAME`` runs. The function is not changed.
@@ -124,6 +140,8 @@ def command(
         Fields that are not exposed on the command line.
     further
         Returns additional parameters when the command is called, for options that plugins register.
+    view
+        Returns what ``--help`` shows with the arguments of the command line. Default: everything.
     parameters
         Arguments and options. The names are those of fields of ``options`` or of parameters of the function.
     """
@@ -132,7 +150,7 @@ def command(
         accept_old_keywords(options, name)
 
     def decorate(run: Run) -> Run:
-        COMMANDS[name] = Command(name, run, help, more, options, without, further, parameters)
+        COMMANDS[name] = Command(name, run, help, more, options, without, further, parameters, view)
         return run
 
     return decorate

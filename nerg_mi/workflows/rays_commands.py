@@ -13,7 +13,7 @@ Options of these commands. The workflows are in `.rays`, `.rays_events`, `.rays_
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.ranges import COORDINATES, LENGTHS, RAYS, SECONDS, SEEDS, THREADS, TIMES, Range, ValidatedDataclass
 from nerg_mi.rays.event_settings import EventRules
 
-from .base import Parameter, argument, declare, extra, out
+from .base import HelpView, Parameter, argument, declare, extra, out
 from .options import (
     ALIGN_HELP,
     ANALYSIS,
@@ -387,6 +387,37 @@ def _reader_parameters() -> Mapping[str, Parameter]:
     return parameters
 
 
+def _view_import(arguments: Sequence[str]) -> HelpView:
+    """Show the options of the preset among the ``arguments``, or those of all formats and the presets."""
+    from nerg_mi.rays.readers.base import list_options
+    from nerg_mi.rays.readers.registry import (
+        TABLE,
+        collect_shared_options,
+        get_reader,
+        list_preset_names,
+        summarise_files,
+    )
+
+    values = [f"{a}={b}" if a == "--preset" else a for a, b in zip(arguments, [*arguments[1:], ""])]
+    preset = next((value.partition("=")[2] for value in values if value.startswith("--preset=")), None)
+    if preset is None and any(value.partition("=")[0] == "--map" for value in values):
+        preset = TABLE
+    names = {o.name for o in collect_shared_options()}
+    if preset is None:
+        return HelpView(
+            "Options of a format: nerg rays import --preset NAME --help; of tables: nerg rays import --map COLUMNS "
+            "--help.",
+            frozenset(names - {"columns"}),
+            {"preset": "Format of the files, see below.  [default: a table, see --map]"},
+            {"Presets": [(name, summarise_files(get_reader(name))) for name in list_preset_names()]},
+        )
+    reader = get_reader(preset)
+    options = {o.name: o for o in list_options(reader.Options)}
+    text = f"The preset {reader.name} reads {reader.files}. Frame: {reader.frame_description}."
+    helps = {o.name: o.help + (f"  [default: {o.default_text}]" if o.default_text else "") for o in options.values()}
+    return HelpView(text.replace("`", ""), frozenset(names - set(options)), {"preset": "Format of the files.", **helps})
+
+
 _RAYS_FILE = argument("Rays file (.npz or .parquet) or dataset (.rays).")
 _OUTPUT = out("Rays file (.npz or .parquet) or dataset (.rays) to write.")
 
@@ -396,6 +427,7 @@ declare(
     options=RaysImportOptions,
     without=("reader", "settings"),
     further=_reader_parameters,
+    view=_view_import,
     files=argument("Tracking files (CSV, CSV.gz, Parquet, skeleton files); for pupil, folders.", list[Path]),
     output=_OUTPUT,
 )

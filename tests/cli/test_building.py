@@ -12,7 +12,9 @@ from typer.testing import CliRunner
 
 import nerg_mi.cli
 import nerg_mi.workflows
-from nerg_mi.cli.building import make_callback
+from nerg_mi.cli.building import GROUPS, find_commands, make_callback
+from nerg_mi.rays.readers.base import list_options
+from nerg_mi.rays.readers.registry import collect_shared_options, get_reader, list_preset_names
 from nerg_mi.workflows.base import COMMANDS, Command, argument, extra
 from nerg_mi.workflows.options import option, parse_numbers
 
@@ -141,3 +143,45 @@ def test_a_command_line_without_a_command_is_refused(monkeypatch, tmp_path, caps
         nerg_mi.cli.main(["nothing"])
     sys.modules.pop("nerg_mi.workflows.nothing")
     assert end.value.code == 70 and "nerg_mi.workflows.nothing lists the command" in capsys.readouterr().err
+
+
+def show_help(*line):
+    done = CliRunner().invoke(nerg_mi.cli.build_app(), [*line, "--help"])
+    assert done.exit_code == 0, done.output
+    return done.output
+
+
+@pytest.mark.parametrize("group", [(), ("rays",), ("train",)])
+def test_descriptions_of_commands_are_complete(group):
+    """No description ends in dots, at the width of 80 characters."""
+    text = show_help(*group)
+    assert "..." not in text.partition("Commands:")[2] and max(map(len, text.splitlines())) <= 80
+    prefix = "".join(f"{word} " for word in group)
+    listed = {name: entry.line for name, entry in find_commands().items() if name.startswith(prefix)}
+    lines = [GROUPS.get(prefix + name.removeprefix(prefix).split()[0], line) for name, line in listed.items()]
+    shown = "".join(text.split())
+    assert lines and all("".join(line.split()) in shown for line in lines)
+
+
+def test_help_of_an_import_shows_the_options_of_its_preset():
+    shared = {o.flag: o for o in collect_shared_options()}
+    shows = lambda text, flag: f"\n  {flag} " in text or f"\n  {flag}\n" in text
+    plain = show_help("rays", "import")
+    assert all(f"\n  {name} " in plain for name in list_preset_names())
+    assert [flag for flag in shared if shows(plain, flag)] == ["--map"] and shows(plain, "--pseudonyms")
+    for name in list_preset_names():
+        text = show_help("rays", "import", f"--preset={name}")
+        options = {o.flag for o in list_options(get_reader(name).Options)}
+        assert {flag for flag in shared if shows(text, flag)} == options
+        assert "".join(get_reader(name).files.replace("`", "").split()) in "".join(text.split())
+        assert shows(text, "--skip-bad-lines")
+        assert "".join(text.split()) == "".join(show_help("rays", "import", "--preset", name).split())
+    table = show_help("rays", "import", "--map", "origin=x,y,z")
+    assert {flag for flag in shared if shows(table, flag)} == {
+        o.flag for o in list_options(get_reader("table").Options)
+    }
+
+
+def test_help_of_an_unknown_preset_names_the_presets():
+    done = CliRunner().invoke(nerg_mi.cli.build_app(), ["rays", "import", "--preset", "nothing", "--help"])
+    assert "varjo" in str(done.exception)

@@ -197,6 +197,11 @@ def _merge_options(options_by_reader: dict[str, Option]) -> tuple[str, type, str
     )
 
 
+def summarise_files(reader: Reader[Any]) -> str:
+    """The files of a reader in a few words: the beginning of its phrase."""
+    return re.split(r"[:;(]|, (?!and)", reader.files.replace("`", ""))[0].strip()
+
+
 def format_preset_table() -> str:
     """Format the presets as a table in Markdown, for the manual."""
     rows = ["| preset | files | frame | validated on |", "|---|---|---|---|"]

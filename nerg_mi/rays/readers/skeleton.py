@@ -541,9 +541,9 @@ class SkeletonFile:
 
     name = "skeleton"
     files = (
-        "`id|time|[numbers]`, one pose per line, x, y, z (or x, y, z, confidence) of each keypoint: the 22 of the NeRG "
-        "paper's tracking, COCO-17, BODY_25 of OpenPose, MediaPipe's 33, Azure Kinect's 32 or Kinect v2's 25; rays go "
-        "from the midpoint of the ears through the nose"
+        "keypoints of persons: lines `id|time|[numbers]`, one pose each, x, y, z (or x, y, z, confidence): the 22 of "
+        "the NeRG paper's tracking, COCO-17, BODY_25 of OpenPose, MediaPipe's 33, Azure Kinect's 32 or Kinect v2's 25; "
+        "rays go from the midpoint of the ears through the nose"
     )
     frame_description = "declared: `--up`, `--hand`, `--units`"
     validated_on = GENERATED_FILES

@@ -107,17 +107,19 @@ def _find_heads(table: ColumnFinder) -> dict:
 READERS = (
     UnityReader(
         "unity",
-        "logs of gaze in the world: `gaze_origin_*`, `gaze_dir_*` (or `gaze_direction_*`, `gaze_forward_*`), "
-        "optionally `hit_*`, a time, a person, a validity (`status`, `isValid`)",
+        "logs of Unity with gaze in the world: `gaze_origin_*`, `gaze_dir_*` (or `gaze_direction_*`, "
+        "`gaze_forward_*`), optionally `hit_*`, a time, a person, a validity (`status`, `isValid`)",
         _find_gaze_in_world,
     ),
     UnityReader(
         "unity_local",
-        "the same in the head's frame (z forward), with `head_pos_*` and `head_rot_*` (x, y, z, w); without "
-        "`gaze_origin_*` the eye is at the head",
+        "logs of Unity with gaze in the head's frame (z forward): as for `unity`, with `head_pos_*` and `head_rot_*` "
+        "(x, y, z, w); without `gaze_origin_*` the eye is at the head",
         _find_gaze_in_head,
     ),
     UnityReader(
-        "unity_head", "heads only: `head_pos_*`, `head_rot_*` (a quaternion, or Unity's Euler angles)", _find_heads
+        "unity_head",
+        "logs of Unity with heads only: `head_pos_*`, `head_rot_*` (a quaternion, or Unity's Euler angles)",
+        _find_heads,
     ),
 )

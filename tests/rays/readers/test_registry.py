@@ -101,8 +101,9 @@ def test_format_is_added_by_one_object(tmp_path, made_up):
     assert done.exit_code == 0 and len(Rays.load(tmp_path / "r.npz")) == 2
     assert "name the file of the heads (--heads)" in str(run(*command[:6]).exception)
     assert "leave out --up" in str(run(*command, "--up", "y").exception)
-    shown = " ".join(run("import", "--help").output.replace("│", " ").split())
-    assert "made_up: What a unit of the heads' places is, in metres." in shown and "made_up" in shown
+    assert "made_up" in run("import", "--help").output
+    shown = " ".join(run("import", "--preset", "made_up", "--help").output.split())
+    assert "What a unit of the heads' places is, in metres." in shown
     assert run("guess", both_eyes).output.rstrip().endswith("--preset made_up --heads HEADS")
     assert "| `made_up` | directions, with the file of the heads in `--heads`" in registry.format_preset_table()
 
