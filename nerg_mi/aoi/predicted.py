@@ -34,6 +34,7 @@ from nerg_mi.measures.tables import (
     MinParticipantsFilter,
     Participants,
     Row,
+    explain_difference,
 )
 from nerg_mi.measures.visits import ALL, Aoi, Cell
 from nerg_mi.workflows.base import SILENT, Reporter
@@ -78,6 +79,8 @@ class PredictedAttention:
         Number of training samples around the viewpoint, (E,); NaN if the checkpoint does not contain it.
     members
         Attention share by each ensemble member, (M, E, A); for a single field the share again.
+    note
+        Which viewpoints are extrapolated, and why; "" if none is.
     """
 
     share: np.ndarray
@@ -85,6 +88,7 @@ class PredictedAttention:
     visible: np.ndarray
     support: np.ndarray
     members: np.ndarray
+    note: str = ""
 
 
 def subsample_participants(viewpoints: Viewpoints, max_participants: int, reporter: Reporter) -> Viewpoints:
@@ -422,6 +426,8 @@ def add_uncertainty(
             row[f"{name}_spread"] = float(spreads[name][index]) if has_spread else None
         row["support"] = support if is_predicted and row["participants"] is not None else None
         row["viewpoints"] = viewpoints_per_participant if is_predicted and row["participants"] is not None else None
+        if is_predicted:
+            row["note"] = "; ".join(filter(None, (predicted.note, row.get("note"))))
 
 
 def median_support(predicted: PredictedAttention, mask: np.ndarray | None = None) -> float | None:
@@ -524,6 +530,7 @@ def what_if_rows(
     if changes.shift is not None:
         changed_viewpoints = replace(changed_viewpoints, positions=changed_viewpoints.positions + changes.shift)
     after = predict(changed_scene, changed_viewpoints)
+    after = replace(after, note=changed_scene.gaze_scene.describe_extrapolation(changed_viewpoints.positions))
     # Participants with viewpoints before and after the changes are paired.
     names = sorted({*viewpoints.participants, *changed_viewpoints.participants})
     support = median_support(after)
@@ -541,6 +548,7 @@ def what_if_rows(
                     for old_share, new_share in zip(before.members, after.members)
                 ]
                 row["difference_spread"] = float(np.std(differences, ddof=1))
+            row["note"] = "; ".join(filter(None, (after.note, row["note"])))
             rows.append(row | {"support": support, "source": PREDICTED})
     adjusted_p = adjust_p_values(np.array([np.nan if row["p"] is None else row["p"] for row in rows], float))
     for row, p in zip(rows, adjusted_p):
@@ -580,4 +588,5 @@ def _what_if_row(
     )
     number = lambda v: float(v[0]) if np.isfinite(v[0]) else None
     keys = {"difference": "value", "low": "low", "high": "high", "p": "p"}
-    return row | {k: None if differences is None else number(getattr(differences, v)) for k, v in keys.items()}
+    row |= {k: None if differences is None else number(getattr(differences, v)) for k, v in keys.items()}
+    return row | {"note": explain_difference(row, has_both, min_participants, is_allowed)}

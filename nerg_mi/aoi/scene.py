@@ -41,6 +41,7 @@ from nerg_mi.rendering.scene import load_scene
 from nerg_mi.train import geometry
 from nerg_mi.train.gaze_data import SURFACE_OPACITY
 from nerg_mi.train.geometry import TrainingGeometry
+from nerg_mi.transport.extrapolation import describe_extrapolation
 from nerg_mi.transport.geometry import SceneGeometry, default_march_settings, shape_corners, trace_depth
 from nerg_mi.transport.mitsuba_mesh import gather_corners, make_mesh, read_triangles
 from nerg_mi.transport.observer import ObserverSettings
@@ -148,6 +149,10 @@ class GazeScene:
             return float("nan")
         p = self.gaze.to_world.point_to_local(mi.Point3f(*np.asarray(observer, float).tolist()))
         return float(np.array(self.gaze.field.support.evaluate(p)).ravel()[0])
+
+    def describe_extrapolation(self, observers: np.ndarray) -> str:
+        """Return a sentence on the ``observers`` (M, 3) whose values are extrapolated; "" if there are none."""
+        return describe_extrapolation(self.geometry, self.gaze, observers)
 
     def bounds(self) -> np.ndarray:
         """Return the corners (2, 3) of the bounding box. Raises `NergError` if it is unknown."""

@@ -120,6 +120,7 @@ class TrainedGazeField(TrainedField[AnyGazeField]):
         >>> density.shape, bool(density[0] > density[1] > 0)
         ((2,), True)
         """
+        from nerg_mi.transport.extrapolation import warn_extrapolation
         from nerg_mi.transport.observer_batch import evaluate_densities
         from nerg_mi.transport.observer_gaze import GazeFieldInstance
         from nerg_mi.workflows.geometry import read_training_alignment
@@ -138,8 +139,10 @@ class TrainedGazeField(TrainedField[AnyGazeField]):
             to_scene = Similarity(matrix)
             positions = o.astype(float) @ matrix[:3, :3].T + matrix[:3, 3]
             vectors = d.astype(float) @ (matrix[:3, :3] / to_scene.scale).T
+            instance = GazeFieldInstance(self.network, space.to_world)
+            warn_extrapolation(reporter.warn, space.geometry, instance, np.unique(positions, axis=0))
             return evaluate_densities(
-                GazeFieldInstance(self.network, space.to_world),
+                instance,
                 space.geometry,
                 replace(space.settings, integral_tolerance=float(tolerance)),
                 positions,

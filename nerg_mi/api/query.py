@@ -217,8 +217,10 @@ def trace(
     with report_progress(progress) as reporter, translate_mitsuba_errors():
         tracer = _Tracer(scene, requested, seed, reporter)
         if observers is None:
+            if tracer.per_observer:
+                warn_extrapolation(reporter.warn, scene, np.unique(o, axis=0))
             return TraceResult(tracer.trace_for_origins(o, d), ("ray",), None)
-        positions = arrays.as_points(observers, "observers")
+        positions = resolve_observers(scene, observers, reporter)
         return TraceResult(tracer.trace_for_observers(o, d, positions), ("observer", "ray"), positions)
 
 
@@ -356,27 +358,34 @@ def observe(
     allowed = POINT_QUANTITIES if scene.has_gaze else POINT_QUANTITIES[1:]
     requested = allowed if quantities is None else resolve_quantities(scene, quantities, allowed)
     p = arrays.as_points(points, "points")
-    positions = resolve_observers(scene, observers)
-    with translate_mitsuba_errors():
+    with report_progress(None) as reporter, translate_mitsuba_errors():
+        positions = resolve_observers(scene, observers, reporter)
         each = [_observe_points(SceneObserver(scene, eye), p, "gaze" in requested) for eye in positions]
     return ObserveResult(
         {name: np.stack([one[name] for one in each]) for name in requested}, ("observer", "point"), positions
     )
 
 
-def resolve_observers(scene: Scene, observers: ArrayLike | None) -> Floats:
-    """Return the positions (M, 3) of ``observers``, or of the scene's observer for None.
+def resolve_observers(scene: Scene, observers: ArrayLike | None, reporter: Reporter) -> Floats:
+    """Return the positions (M, 3) of ``observers``, or of the scene's observer for None. Warn of extrapolated ones.
 
     Raises
     ------
     NergError
         The scene has no observer.
     """
-    if observers is not None:
-        return arrays.as_points(observers, "observers")
-    if scene.observer is None:
+    if observers is None and scene.observer is None:
         raise NergError("the scene has no observer; pass positions with observers=[(x, y, z), ...]")
-    return scene.observer[None]
+    positions = scene.observer[None] if observers is None else arrays.as_points(observers, "observers")
+    warn_extrapolation(reporter.warn, scene, positions)
+    return positions
+
+
+def warn_extrapolation(warn: Callable[[str], None], scene: Scene, positions: Floats) -> None:
+    """Warn if values at ``positions`` (M, 3) are extrapolated."""
+    from nerg_mi.transport import extrapolation
+
+    extrapolation.warn_extrapolation(warn, scene.geometry, scene.integrator.gaze, positions)
 
 
 def _observe_points(observer: SceneObserver, p: Floats, with_gaze: bool) -> dict[str, Floats]:
@@ -555,16 +564,16 @@ def attention(
     if (region := _as_box(surface)) is not None:
         if divisions is not None or two_sided:
             raise NergError("divisions and two_sided apply to meshes only, but the surface is a box; omit them")
-        positions = resolve_observers(scene, observers)
         with report_progress(progress) as reporter:
+            positions = resolve_observers(scene, observers, reporter)
             shares = compute_box_shares(scene, [region], positions, margin=float(margin), rule=rule, reporter=reporter)
         return Attention(**_first_shares(shares), observers=positions)
     is_integer = isinstance(divisions, (int, np.integer)) and not isinstance(divisions, bool)
     if not (divisions is None or (is_integer and 1 <= divisions <= 4096)):
         raise NergError(f"divisions must be an integer from 1 to 4,096, got {divisions!r}")
-    positions = resolve_observers(scene, observers)
     densities = []
     with report_progress(progress) as reporter, translate_mitsuba_errors(), dr.suspend_grad():
+        positions = resolve_observers(scene, observers, reporter)
         mesh = _as_mesh(scene, surface)
         pieces = make_patches(mesh, _choose_divisions(mesh, positions) if divisions is None else int(divisions))
         arrays_of_patches = pieces.area, pieces.p, pieces.n

@@ -18,6 +18,7 @@ from nerg_mi.workflows.base import Reporter
 from .arrays import Camera, Floats, LabelledArrays, as_points, broadcast_to_observers
 from .calls import Progress, report_progress
 from .fields import FilePath, activate_mitsuba
+from .query import warn_extrapolation
 from .scene import COLOR, Scene, make_aov_context, resolve_quantities
 
 if TYPE_CHECKING:
@@ -159,6 +160,8 @@ def render(
     with report_progress(progress) as reporter, translate_mitsuba_errors():
         context = make_aov_context(scene, requested)
         positions = _resolve_observers(scene, sensor, observers, bool(context.observer_aovs))
+        if context.observer_aovs and (observers is not None or scene.observer is not None):
+            warn_extrapolation(reporter.warn, scene, positions)
         layers = _ObserverLayers(context, sensor, requested, positions)
         values = _render_layers(scene, sensor, layers, int(spp), int(seed), reporter)
     return Pictures({name: values[name] for name in requested}, AXES, positions)

@@ -10,6 +10,7 @@ from typing import Any, overload
 import numpy as np
 
 from .estimates import (
+    MIN_PARTICIPANTS,
     Estimates,
     adjust_p_values,
     estimate_proportion_differences,
@@ -313,7 +314,8 @@ def aoi_rows(
     """Return a row for each cell, area and source.
 
     A row has the number of ``participants`` in the cell, and for each measure the value and the keys ``_low``,
-    ``_high`` and ``_participants`` with the measure's name before them; unknown and suppressed values are None.
+    ``_high`` and ``_participants`` with the measure's name before them; unknown and suppressed values are None, and the
+    ``note`` says why.
     """
     rows: list[Row] = []
     for cell, sources in cells.items():
@@ -325,6 +327,7 @@ def aoi_rows(
             for a, area in enumerate(areas):
                 row: Row = {"cell": cell.dimension, "value": cell.value, "aoi": area, "source": source}
                 row["participants"] = count if min_participants.allows(count) else None
+                reasons: dict[str, list[str]] = {}
                 for name, estimate in estimates.items():
                     is_allowed = estimate is not None and min_participants.allows(int(estimate.participants[a]))
                     for key in ("", "_low", "_high"):
@@ -334,9 +337,44 @@ def aoi_rows(
                     row[name + "_participants"] = (
                         int(estimate.participants[a]) if estimate is not None and is_allowed else None
                     )
+                    if estimate is None:
+                        reason = _NOT_COMPUTED if name in _VISIBILITY_MEASURES else _NOT_PREDICTED
+                    elif not is_allowed:
+                        reason = _SUPPRESSED.format(min_participants.minimum)
+                    elif row[name] is None:
+                        reason = f"no {MEASURES_BY_NAME[name].population}"
+                    else:
+                        reason = _NO_INTERVAL if row[name + "_low"] is None or row[name + "_high"] is None else ""
+                    reasons.setdefault(reason, []).append(name)
+                row["note"] = _join_reasons(reasons)
                 rows_of_source[source].append(row)
         rows += [rows_of_source[source][a] for a in range(len(areas)) for source in sources]
     return rows
+
+
+_NOT_COMPUTED, _NOT_PREDICTED = "visibility is not computed", "a gaze field has no time course"
+_VISIBILITY_MEASURES = ("visible", "share_when_visible", "unseen")
+_SUPPRESSED = "suppressed, fewer than {} participants"
+_NO_INTERVAL = f"no interval, fewer than {MIN_PARTICIPANTS} participants with values other than 0, or equal values"
+
+
+def _join_reasons(reasons: Mapping[str, Sequence[str]]) -> str:
+    """Join the reasons of missing values, with the names of the values; "" is no reason."""
+    return "; ".join(f"{', '.join(names)}: {reason}" for reason, names in reasons.items() if reason)
+
+
+def explain_difference(row: Row, has_both: bool, min_participants: MinParticipantsFilter, is_allowed: bool) -> str:
+    """Return why a ``row`` has no difference, no interval or no p-value; "" if it has all."""
+    if not is_allowed:
+        return _SUPPRESSED.format(min_participants.minimum)
+    if row["difference"] is None:
+        return "undefined, equal values" if has_both else "no participants on one side"
+    reasons: dict[str, list[str]] = {"": []}
+    if row["low"] is None:
+        reasons[_NO_INTERVAL] = ["low, high"]
+    elif row["p"] is None:
+        reasons["undefined, since no participant differs from the others"] = ["p"]
+    return _join_reasons(reasons)
 
 
 def _finite_or_none(value: float) -> float | None:
@@ -404,6 +442,7 @@ def _measure_differences(
             row["difference" if key == "value" else key] = (
                 _finite_or_none(getattr(differences, key)[a]) if is_allowed else None
             )
+        row["note"] = explain_difference(row, num_participants[a] > 0, min_participants, is_allowed)
         rows.append(row)
     return rows
 
@@ -482,7 +521,8 @@ class ParticipantRows(Sequence[Row]):
 
     Rows are created on access, so that the table of many participants needs no memory in addition to ``sums``. A row
     has the keys ``participant``, ``aoi``, ``time`` in seconds, ``samples``, and for the area ``dwell`` in seconds,
-    ``visits``, ``time_to_first_visit`` and ``visible`` in seconds; values that are undefined or unknown are None.
+    ``visits``, ``time_to_first_visit`` and ``visible`` in seconds; values that are undefined or unknown are None, and
+    the ``note`` says why.
 
     Parameters
     ----------
@@ -494,7 +534,7 @@ class ParticipantRows(Sequence[Row]):
         Whether visibility was computed.
     """
 
-    columns = ("participant", "aoi", "time", "samples", "dwell", "visits", "time_to_first_visit", "visible")
+    columns = ("participant", "aoi", "time", "samples", "dwell", "visits", "time_to_first_visit", "visible", "note")
 
     def __init__(self, sums: VisitSums, names: Mapping[str, str], has_visibility: bool):
         rows, persons = sums.find_participants(ALL)
@@ -522,6 +562,8 @@ class ParticipantRows(Sequence[Row]):
         s = self._sums
         (name, r), a = self._sorted_rows[k // len(s.areas)], k % len(s.areas)
         first_visit: Any = None
+        reasons = {"" if s.visits[r, a] > 0 else "no visit": ["time_to_first_visit"]}
+        reasons.setdefault("" if self._has_visibility else _NOT_COMPUTED, []).append("visible")
         if s.visits[r, a] > 0:
             first_visit = float(s.first_visit_sum[r, a] / s.first_visit_count[r, a])
         return {
@@ -533,4 +575,5 @@ class ParticipantRows(Sequence[Row]):
             "visits": int(s.visits[r, a]),
             "time_to_first_visit": first_visit,
             "visible": float(s.visible_time[r, a]) if self._has_visibility else None,
+            "note": _join_reasons(reasons),
         }

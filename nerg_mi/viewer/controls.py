@@ -244,7 +244,10 @@ class Controls:
                 session.display.layer, session.scale(), self.page.stale_scale_reason
             )
             if session.scene.has_gaze:
-                self._table.content = format_shares(session.shares, session.are_shares_stale)
+                table = format_shares(session.shares, session.are_shares_stale)
+                self._table.content = table + (
+                    layers.format_note(session.observer_note) if session.observer_note else ""
+                )
 
     def _get_inset_inputs(self) -> tuple[Any, ...]:
         """Return everything the insets depend on."""

@@ -26,6 +26,7 @@ from nerg_mi.ranges import MAX_COORDINATE
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.nested_scene import FIELD_PROPERTY, find_field_file, replace_radiance_field
 from nerg_mi.rendering.scene import load_scene
+from nerg_mi.transport.extrapolation import describe_extrapolation
 from nerg_mi.transport.geometry import Ceiling
 from nerg_mi.workflows.render import describe_basis
 from nerg_mi.workflows.scene_cameras import check_point
@@ -450,6 +451,8 @@ class Session:
         self._point_inputs: tuple[np.ndarray, int] | None = None
         self._share_inputs: tuple[np.ndarray, tuple[Region, ...], int] | None = None
         self.shares: dict[str, AttentionShare] = {}
+        # Why the gaze of the observer is extrapolated; "" if it is not.
+        self.observer_note = ""
         self.ceiling: float | None = None
         self.regions: list[Region] = []
         self.other_areas: list[dict[str, Any]] = []
@@ -872,6 +875,8 @@ class Session:
     def _compute_shares(self, inputs: tuple[np.ndarray, tuple[Region, ...], int]) -> Iterator[None]:
         try:
             observer, regions, version = inputs
+            gaze = self.scene.integrator.gaze
+            self.observer_note = describe_extrapolation(self.scene.geometry, gaze, observer)
             if self._shape_aois is None:
                 self._shape_aois = make_shape_aois(self.scene, self.shapes)
             names = {*(region.name for region in regions), *self.shapes}

@@ -51,6 +51,7 @@ from nerg_mi.surfaces.splats import integrate_gaze, shortest_axes, splat_densiti
 from nerg_mi.tasks.engines import TaskOutput
 from nerg_mi.tasks.execution import prepare_once
 from nerg_mi.tasks.task import RENDER_LIBRARIES, Part, Plan
+from nerg_mi.transport.extrapolation import warn_extrapolation
 from nerg_mi.transport.geometry import SceneGeometry, default_march_settings
 from nerg_mi.transport.mitsuba_mesh import Triangles, read_triangles
 from nerg_mi.transport.observer import ObserverSettings
@@ -110,6 +111,8 @@ OBSERVERS = 4
 RAYS = 1 << 16
 """Number of rays in a part."""
 
+Environment = tuple[SceneGeometry, GazeFieldInstance | None]
+
 
 @dataclass(frozen=True, eq=False)
 class BakeScene:
@@ -144,14 +147,19 @@ class BakeScene:
 
         A Mitsuba variant must be active. Loaded files are cached for the next part. Raises `NergError`.
         """
-        target, make = prepare_once(self, self._load)
+        target, make, _ = prepare_once(self, self._load)
         if isinstance(part, TrackedRays):
             return sum_rays(target, part, self.ray_settings)
         if make is None:
             raise NergError("there is no gaze field: name one by --gaze, or take the gaze of the rays, --source rays")
         return sum_gaze(target, make, part.positions, part.weights, self.gaze_settings)
 
-    def _load(self) -> tuple[SurfaceTarget, MakeObserver | None]:
+    @property
+    def environment(self) -> Environment:
+        """What the observers see, and the gaze field."""
+        return prepare_once(self, self._load)[2]
+
+    def _load(self) -> tuple[SurfaceTarget, MakeObserver | None, Environment]:
         import mitsuba as mi
 
         medium, settings, falloff, gaze = None, None, 0.0, None
@@ -165,7 +173,8 @@ class BakeScene:
         )
         if self.gaze is not None:
             gaze = GazeFieldInstance(load_gaze(self.gaze, namespace(mi.Float))[0])
-        return target, None if gaze is None else observers_from_field(gaze, target.geometry, target.settings)
+        make = None if gaze is None else observers_from_field(gaze, target.geometry, target.settings)
+        return target, make, (target.geometry, gaze)
 
 
 def split_into_parts(who: WeightedObservers | TrackedRays) -> Iterator[WeightedObservers | TrackedRays]:
@@ -448,7 +457,7 @@ class SplatScene:
         which are not part of ``total``. A Mitsuba variant must be active. Loaded files are cached for the next part.
         Raises `NergError`.
         """
-        geometry, make = prepare_once(self, self._load)
+        geometry, make, _ = prepare_once(self, self._load)
         if isinstance(part, TrackedRays):
             return sum_rays_on_splats(geometry.arrays, geometry.axes, part, self.ray_settings)
         if make is None:
@@ -473,14 +482,19 @@ class SplatScene:
             )
         return sums
 
-    def _load(self) -> tuple[SplatGeometry, MakeObserver | None]:
+    @property
+    def environment(self) -> Environment:
+        """What the observers see, and the gaze field."""
+        return prepare_once(self, self._load)[2]
+
+    def _load(self) -> tuple[SplatGeometry, MakeObserver | None, Environment]:
         import mitsuba as mi
 
         geometry = make_splat_geometry(read_splats(self.splats))
         if self.gaze is None:
-            return geometry, None
+            return geometry, None, (geometry.place, None)
         gaze = GazeFieldInstance(load_gaze(self.gaze, namespace(mi.Float))[0])
-        return geometry, observers_from_field(gaze, geometry.place, geometry.settings)
+        return geometry, observers_from_field(gaze, geometry.place, geometry.settings), (geometry.place, gaze)
 
 
 @dataclass(frozen=True, eq=False)
@@ -613,6 +627,9 @@ def compute_sums(
     reporter: Reporter,
 ) -> list[SurfaceSums]:
     """Return the sums of each of ``groups``, directly or in parts; ``name`` is a file of the bake."""
+    if options.observer is not None or options.observer_file is not None:
+        positions = [group.positions for group in groups if isinstance(group, WeightedObservers)]
+        warn_extrapolation(reporter.warn, *scene.environment, np.concatenate(positions))
     if not options.in_parts:
         return sum_directly(scene, groups, reporter)
     parts = PartRunner(options, name, reporter, options.threads)

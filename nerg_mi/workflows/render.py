@@ -31,6 +31,8 @@ from nerg_mi.rendering.scene import activate_variant, list_scene_files, load_sce
 from nerg_mi.rendering.scene_writer import project_to_pixel
 from nerg_mi.threads import set_thread_count
 from nerg_mi.transport.aovs import AOVS
+from nerg_mi.transport.extrapolation import warn_extrapolation
+from nerg_mi.transport.geometry import SceneGeometry
 from nerg_mi.transport.observer import sensor_center
 from nerg_mi.transport.volume_medium import VolumeMedium
 
@@ -326,6 +328,14 @@ def is_supported(loaded: Any, camera: Any) -> bool:
     return float(np.ravel(np.array(gaze.field.support.evaluate(gaze.to_world.point_to_local(eye))))[0]) >= SUPPORT
 
 
+def warn_observer(loaded: Any, reporter: Reporter) -> None:
+    """Warn if the observer of a ``loaded`` scene is at a position where gaze and visibility are extrapolated."""
+    integrator = loaded.integrator()
+    if is_nerg(integrator) and integrator.observer is not None:
+        position = np.ravel(np.array(sensor_center(integrator.observer), np.float64))
+        warn_extrapolation(reporter.warn, SceneGeometry(integrator.medium, loaded), integrator.gaze, position)
+
+
 def observer_pixel(loaded: Any, camera: Any, depth: np.ndarray) -> tuple[float, float] | None:
     """Return the pixel of the scene's observer if it is visible from ``camera``, else None."""
     observer = loaded.integrator().observer
@@ -476,6 +486,8 @@ def render_file(
             nonlocal done
             loaded = load_scene(scene, {**(options.defaults or {}), **frame})
             stop.check()
+            if done == 0:
+                warn_observer(loaded, reporter)
             camera = find_sensor(scene, loaded, options.sensor)
             samples = sample_count(camera, options.spp)
             constant, begin = trial.prepare(samples, loaded), time.perf_counter()

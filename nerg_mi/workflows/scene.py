@@ -32,6 +32,7 @@ from nerg_mi.rendering.scene_writer import (
 from nerg_mi.train.geometry import make_hit_geometry
 
 from .base import SILENT, Reporter, select_backend
+from .render import warn_observer
 from .scene_cameras import (
     ObserverPath,
     SceneProbe,
@@ -240,7 +241,9 @@ def write_scene(
             )
         reporter.progress(0.8, "checking the image")
         write_text(probe_file, scene.text(probe_file.parent, camera, lens, 96).to_xml())
-        if not sees_anything(load_scene(probe_file, values)):
+        probed = load_scene(probe_file, values)
+        warn_observer(probed, reporter)
+        if not sees_anything(probed):
             raise NergError("the image of the camera would be empty; choose another one with --camera and --target")
     text = scene.text(output.parent, camera, lens, options.width)
     text = replace(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
 
@@ -292,9 +292,14 @@ class _StatisticsWork:
 
     def _predict(self, viewpoints: Viewpoints) -> PredictedAttention:
         """Return the attention that the field predicts at these viewpoints."""
+        note = self.around.describe_extrapolation(viewpoints.positions)
+        if note:
+            self.reporter.warn(note)
         if self.parts is None:
-            return self.setting.predict(viewpoints, self._view, self.reporter)
-        return self.parts.predict(viewpoints, self._view)
+            predicted = self.setting.predict(viewpoints, self._view, self.reporter)
+        else:
+            predicted = self.parts.predict(viewpoints, self._view)
+        return replace(predicted, note=note)
 
     def _isovists(self) -> Isovists:
         from nerg_mi.measures.shares import compute_isovists

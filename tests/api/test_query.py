@@ -1,5 +1,7 @@
 """Tests of `nerg_mi.api.query`."""
 
+import warnings
+
 import drjit as dr
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from nerg_mi.measures.visits import MARGIN, BoxAoi
 from nerg_mi.reports.data import GazeSampler
 from nerg_mi.train.geometry import TrainingGeometry
 from nerg_mi.transport.mitsuba_mesh import make_mesh
+from nerg_mi.workflows.progress import WarningReporter
 from nerg_mi.workflows.statistics import statistics
 from tests.aoi.place import SIGN, STAND, write_place
 from tests.pictures import box_dict
@@ -461,3 +464,40 @@ def test_progress_is_reported_for_integrals_of_all_origins(tmp_path, rgb, normal
     messages = Recorder()
     nerg.trace(scene, [(0, -3, 0), (0, 3, 0), (0, -3, 0)], (0, 1, 0), "gaze", progress=messages)
     assert [share for share, _ in messages.steps] == expected
+
+
+# ---- Observers whose values are extrapolated ----
+
+
+CALLS = {
+    "observe": lambda scene, eye, **k: nerg.observe(scene, (2, 2, 1), eye),
+    "attention on a box": lambda scene, eye, **k: nerg.attention(scene, SIGN, eye),
+    "attention on a mesh": lambda scene, eye, **k: nerg.attention(scene, "sign", eye),
+    "trace": lambda scene, eye, **k: nerg.trace(scene, EYE, (1, 0, 0), "gaze", observers=eye),
+    "trace from origins": lambda scene, eye, **k: nerg.trace(scene, eye, (1, 0, 0), "gaze"),
+    "render": lambda scene, eye, **k: nerg.render(
+        scene, eye, "gaze", camera=nerg.Camera((1, 1, 1), (3, 2, 1), width=4, height=3), spp=1
+    ),
+    "statistics": lambda scene, eye, path: statistics(
+        [path],
+        options=StatisticsOptions(
+            aois=path.parent / "areas.json", observers=(",".join(map(str, eye)),), resamples=199, mode="llvm_ad_rgb"
+        ),
+        reporter=WarningReporter(),
+    ),
+}
+
+
+@pytest.mark.parametrize("call", list(CALLS))
+def test16_extrapolated_observers_are_reported(room, call):
+    path, scene = room
+    for eye, reason in (((99, 99, 1.6), "outside"), ((2.7, 1.5, 1.0), "solid")):
+        with pytest.warns(UserWarning, match=f"{eye[0]:g}, {eye[1]:g}.*{reason}.*extrapolated"):
+            result = CALLS[call](scene, eye, path=path)
+        if call == "statistics":
+            assert all(reason in row["note"] for row in result.aois)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        result = CALLS[call](scene, EYE, path=path)
+    if call == "statistics":
+        assert not any("extrapolated" in row["note"] for row in result.aois)

@@ -9,6 +9,7 @@ from nerg_mi.measures.tables import (
     MEASURED,
     MEASURES,
     MEASURES_BY_NAME,
+    PREDICTED,
     MinParticipantsFilter,
     ParticipantRows,
     Participants,
@@ -113,7 +114,7 @@ def test_participant_rows_are_sorted_by_name():
         "visits": 1,
         "time_to_first_visit": 3.0,
     }
-    assert rows[1] == bo | {"visible": 5.0} and tuple(rows[1]) == rows.columns
+    assert rows[1] == bo | {"visible": 5.0, "note": ""} and tuple(rows[1]) == rows.columns
     assert rows[3]["time_to_first_visit"] is None and rows[2]["time_to_first_visit"] == pytest.approx(1.0)
     with pytest.raises(IndexError):
         rows[4]
@@ -160,7 +161,7 @@ def test_few_participants_are_suppressed():
     rows = aoi_rows(("x", "y"), cells, floor, **HOW)
     assert rows[0]["share"] is not None
     blank = [k for k, v in rows[2].items() if v is not None]
-    assert blank == ["cell", "value", "aoi", "source"]
+    assert blank == ["cell", "value", "aoi", "source", "note"]
     # Both AOIs have the number of participants and the measures of samples.
     texts = sum(measure.numerator_denominator(cells[A][MEASURED]) is not None for measure in MEASURES)
     assert floor.num_suppressed == 2 * (1 + texts) and texts >= 7
@@ -171,6 +172,30 @@ def test_few_participants_are_suppressed():
         and not suppressing.allows(4)
         and suppressing.num_suppressed == 1
     )
+
+
+def test_missing_values_have_a_reason():
+    """Of one participant, of predictions, of participants without a visit, and of suppressed values."""
+    lone = Participants.from_sums(sums(), ALL, False)
+    cells = {
+        ALL: {MEASURED: people(12, 0.2, 0), PREDICTED: lone},
+        A: {MEASURED: people(4, 0.2, 1)},
+        B: {MEASURED: lone},
+    }
+    rows = aoi_rows(("x", "y"), cells, MinParticipantsFilter(4), **HOW)
+    for row in rows:
+        reasons = {n: why for part in row["note"].split("; ") for n in part.split(":")[0].split(", ") for why in [part]}
+        for measure in MEASURES:
+            missing = [row[measure.name + key] is None for key in ("", "_low", "_high")]
+            assert any(missing) == (measure.name in reasons), (row, measure.name)
+    assert any("suppressed" in row["note"] for row in rows) and any("interval" in row["note"] for row in rows)
+    differences = difference_rows(("x", "y"), cells, MinParticipantsFilter(), measures=("share", "hit_ratio"), **HOW)
+    assert differences and all(bool(r["note"]) == (None in (r["difference"], r["low"], r["p"])) for r in differences)
+    (one, other) = (
+        next(r for r in ParticipantRows(sums(), {"Ada": "a", "Bo": "b"}, seen) if r["visits"] == 0)
+        for seen in (True, False)
+    )
+    assert "time_to_first_visit" in one["note"] and "visible" not in one["note"] and "visible" in other["note"]
 
 
 def test_differences_are_detected():
