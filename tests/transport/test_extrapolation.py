@@ -44,8 +44,8 @@ def gaze(origins, scale=1.0):
 )
 @pytest.mark.parametrize("field", [None, gaze(None)], ids=["no gaze", "gaze"])
 def test_a_room(room, at, reason, field):
-    (found,) = find_extrapolation(room, field, at)
-    assert reason in found and bool(found) == bool(reason)
+    (match,) = find_extrapolation(room, field, at)
+    assert reason in match and bool(match) == bool(reason)
 
 
 def test_a_merged_mesh_has_solid_parts(room, rgb):
@@ -60,8 +60,8 @@ def test_a_merged_mesh_has_solid_parts(room, rgb):
 
 def test_recorded_positions_decide_if_they_are_known(room):
     """An observer near recorded positions may be outside of the environment, as around an object."""
-    known = gaze([(7.0, 2, 1.6), (1, 1, 1.6)])
-    outside, inside, far = find_extrapolation(room, known, [(7.2, 2, 1.6), (1.1, 1, 1.6), (4, 2, 1.6)])
+    field = gaze([(7.0, 2, 1.6), (1, 1, 1.6)])
+    outside, inside, far = find_extrapolation(room, field, [(7.2, 2, 1.6), (1.1, 1, 1.6), (4, 2, 1.6)])
     assert outside == inside == "" and "recorded position" in far
     assert "3" in far.split()
     # In scene units, of a field with other units.
