@@ -15,7 +15,7 @@ from nerg_mi.files.schema import NUMBER, Items, check_json
 from nerg_mi.photos.colmap import find_pose_source
 from nerg_mi.photos.images import read_posed_images
 from nerg_mi.photos.posed import PosedImages, describe_unused
-from nerg_mi.rays.readers.tables import iterate_table, read_table_columns
+from nerg_mi.rays.readers.columns import open_named_table
 
 from .constraints import (
     AlignmentFit,
@@ -291,16 +291,12 @@ def read_pairs(path: Path) -> Pairs:
 
 
 def _read_csv(path: Path) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
-    columns = read_table_columns(path)
-    missing = [name for name in _COLUMNS if name not in columns]
-    if missing:
-        raise NergError(f'the file of pairs "{path}" has no column {", ".join(missing)}; the format is {_FORMAT}')
-    texts = ["name"] if "name" in columns else []
-    blocks = list(iterate_table(path, _COLUMNS, texts))
+    columns, table = open_named_table(path, _COLUMNS, ["name"], optional=["name"])
+    blocks = list(table)
     if not blocks:
         return np.zeros((0, 3)), np.zeros((0, 3)), ()
     numbers = np.concatenate([b.numbers for b in blocks])
-    names = tuple(str(t[0]) for b in blocks for t in b.texts) if texts else ()
+    names = tuple(str(t[0]) for b in blocks for t in b.texts) if "name" in columns else ()
     return numbers[:, :3], numbers[:, 3:], names
 
 

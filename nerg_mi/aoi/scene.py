@@ -35,7 +35,7 @@ from nerg_mi.maths.types import variant_types
 from nerg_mi.measures.shares import DirectionQuery
 from nerg_mi.measures.visits import Aoi, BoxAoi
 from nerg_mi.ranges import COORDINATES
-from nerg_mi.rays.readers.tables import iterate_table
+from nerg_mi.rays.readers.columns import open_named_table
 from nerg_mi.rendering.bands import is_nerg
 from nerg_mi.rendering.scene import load_scene
 from nerg_mi.train import geometry
@@ -59,12 +59,12 @@ MAX_PARTICIPANTS = 10_000_000  # maximum number of participants in a table of co
 
 
 def read_cohorts(path: Path) -> dict[str, str]:
-    """Read the cohort of each participant from the columns ``person`` and ``cohort`` of a CSV file.
+    """Read the cohort of each participant from a CSV file with columns ``person`` (or ``participant``) and ``cohort``.
 
     Raises `NergError` for missing columns, and for a participant in two cohorts.
     """
     cohorts: dict[str, str] = {}
-    for block in iterate_table(path, (), ("person", "cohort")):
+    for block in open_named_table(path, (), ("person", "cohort"))[1]:
         for participant, cohort in (map(to_name, map(unescape_formula, row)) for row in block.texts.tolist()):
             if cohorts.setdefault(participant, cohort) != cohort:
                 raise NergError(f'"{path}" has "{sanitize(participant, 40)}" in two cohorts; remove one of them')

@@ -28,7 +28,7 @@ from nerg_mi.maths.geometry import Similarity
 from nerg_mi.ranges import POSITIVE_VALUES
 from nerg_mi.rays.dataset import load_rays
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rays.readers.tables import iterate_table, read_table_columns
+from nerg_mi.rays.readers.columns import open_named_table
 from nerg_mi.rendering.bands import is_nerg
 from nerg_mi.rendering.scene import load_scene
 from nerg_mi.surfaces.laplacian import SurfaceSums
@@ -196,15 +196,8 @@ POSITIONS = 1_000_000
 
 def read_observer_file(path: Path) -> WeightedObservers:
     """Read observers from a CSV file with columns x, y, z and, optionally, weight. Raises `NergError`."""
-    names = ("x", "y", "z")
-    columns = read_table_columns(path)
-    missing = [name for name in names if name not in columns]
-    if missing:
-        raise NergError(
-            f'the observer file "{path}" has no column "{missing[0]}"; it needs x, y, z and may have weight'
-        )
-    weighted = "weight" in columns
-    blocks = [b.numbers for b in iterate_table(path, (*names, "weight") if weighted else names)]
+    names, table = open_named_table(path, ("x", "y", "z", "weight"), optional=["weight"])
+    weighted, blocks = "weight" in names, [b.numbers for b in table]
     rows = np.concatenate(blocks) if blocks else np.zeros((0, 3 + weighted))
     if not 0 < len(rows) <= POSITIONS:
         raise NergError(f'the observer file "{path}" has {len(rows):,} positions; it must have 1 to {POSITIONS:,}')

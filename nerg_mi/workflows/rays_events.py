@@ -18,7 +18,7 @@ from nerg_mi.rays.dataset import load_rays
 from nerg_mi.rays.events import Events, detect_events
 from nerg_mi.rays.quality import GazeTarget, RecordingQuality, measure_recordings
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rays.readers.tables import iterate_table, read_table_columns
+from nerg_mi.rays.readers.columns import open_named_table
 
 from .base import SILENT, Reporter
 from .rays_commands import EventOptions, RaysEventsOptions
@@ -85,11 +85,12 @@ def _iterate_rows(rays: Rays, events: Events) -> Iterator[dict[str, Any]]:
 
 
 def read_targets(path: Path, participants: Sequence[str]) -> list[GazeTarget]:
-    """Read targets from the columns start, end, x, y, z and optionally person of a CSV file. Raises `NergError` for a
-    table without these columns, for missing numbers, and for an unknown participant."""
-    texts = [name for name in ("person",) if name in read_table_columns(path)]
+    """Read targets from the columns start, end, x, y, z and optionally person (or participant) of a CSV file.
+
+    Raises `NergError` for a table without these columns, for missing numbers, and for an unknown participant.
+    """
     targets = []
-    for block in iterate_table(path, ("start", "end", "x", "y", "z"), texts):
+    for block in open_named_table(path, ("start", "end", "x", "y", "z"), ["person"], optional=["person"])[1]:
         for row, words, line in zip(block.numbers.tolist(), block.texts.tolist(), block.lines.tolist()):
             name = unescape_formula(words[0]) if words and words[0] else None
             if not np.isfinite(row).all():

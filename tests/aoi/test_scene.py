@@ -175,6 +175,19 @@ def test_cohorts_are_read(tmp_path):
     assert read_cohorts(tmp_path / "c.csv") == {"Ada": "old", "Bo": "young"}
 
 
+def test_cohorts_of_participants_and_remedies_of_their_table(tmp_path):
+    (tmp_path / "c.csv").write_text("Participant,Cohort\nAda,old\n")
+    assert read_cohorts(tmp_path / "c.csv") == {"Ada": "old"}
+    (tmp_path / "c.csv").write_text("person,kind\nAda,old\n")
+    with pytest.raises(NergError, match="no column cohort; .*person, kind") as error:
+        read_cohorts(tmp_path / "c.csv")
+    assert "--map" not in str(error.value)
+    (tmp_path / "c.csv").write_text("person,cohort\nAda,old,x\n")
+    with pytest.raises(NergError, match="line 2: 3 cells") as error:
+        read_cohorts(tmp_path / "c.csv")
+    assert "--skip-bad-lines" not in str(error.value)
+
+
 def test_cohort_names_survive_a_round_trip(tmp_path):
     cohorts = {"=Ada": "-old", "@Bo": "+young", "'Cy": "old", "'=Di": "-1"}
     write_csv(tmp_path / "c.csv", [{"person": k, "cohort": v} for k, v in cohorts.items()])

@@ -28,9 +28,10 @@ def looks() -> Rays:
     return some_rays(2 * n, t=np.r_[t, t], person=person, direction=np.r_[d, d], hit=np.r_[point, point])
 
 
-def test_tables(looks, tmp_path):
+@pytest.mark.parametrize("person", ["person", "participant", "Participant ID"])
+def test_tables(looks, tmp_path, person):
     looks.save(tmp_path / "rays.npz")
-    (tmp_path / "targets.csv").write_text("start,end,x,y,z,person\n0,0.4,2,0,0,ann\n0.6,1,0,1,1,\n")
+    (tmp_path / "targets.csv").write_text(f"start,end,x,y,z,{person}\n0,0.4,2,0,0,ann\n0.6,1,0,1,1,\n")
     options = RaysEventsOptions(targets=tmp_path / "targets.csv", quality=tmp_path / "quality.csv")
     reporter = Recorder()
     write_events(tmp_path / "rays.npz", tmp_path / "events.csv", options, reporter)

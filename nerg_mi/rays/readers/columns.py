@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ import numpy as np
 from nerg_mi.errors import NergError, sanitize
 
 from .cells import AXES, is_missing
-from .tables import explain_columns, find_vector_columns, read_table_columns
+from .tables import TableBlock, explain_columns, find_vector_columns, iterate_table, read_table_columns
 
 # ---- Columns of a table by their usual names ----
 
@@ -79,6 +79,30 @@ class ColumnFinder:
         if column is None:
             raise NergError(f"{self.path} has no column of time; {explain_columns(self.columns)}")
         return column
+
+
+def open_named_table(
+    path: Path, numbers: Sequence[str], texts: Sequence[str] = (), *, optional: Sequence[str] = ()
+) -> tuple[list[str], Iterator[TableBlock]]:
+    """Open a table that is no recording, such as one of cohorts: its columns are found by name as in `ColumnFinder`,
+    that of ``person`` by any of `PERSON_NAMES`.
+
+    Returns the names of those ``numbers`` and ``texts`` that the table has, and its blocks, whose columns these are.
+    Raises `NergError` for a missing column that is not ``optional``, and, as the iterator does, for an unreadable line.
+    """
+    table = ColumnFinder(path)
+    columns = {name: table.find(*(PERSON_NAMES if name == "person" else (name,))) for name in (*numbers, *texts)}
+    missing = [name for name, column in columns.items() if column is None and name not in optional]
+    if missing:
+        remedy = explain_columns(table.columns, "rename columns in its header")
+        raise NergError(f'"{path}" has no column {", ".join(missing)}; {remedy}')
+
+    def refuse(line: int, reason: str) -> None:
+        raise NergError(f"{path}, line {line}{reason}")
+
+    select = lambda names: [columns[name] for name in names if columns[name] is not None]
+    blocks = iterate_table(path, select(numbers), select(texts), on_bad_line=refuse)
+    return [name for name, column in columns.items() if column is not None], blocks
 
 
 def is_counter(values: Sequence[str] | np.ndarray) -> bool:

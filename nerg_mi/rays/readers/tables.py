@@ -570,7 +570,7 @@ def _explain_bad_number(word: str, k: int, layout: _Layout) -> str:
     if any(sign in word for sign in ".," if sign != layout.decimal):
         sign = {".": "points", ",": "commas"}[layout.decimal]
         return f"is not a number with the decimal {sign} of the table; use one notation for all numbers"
-    return "is not a number; correct the cell or the column map"
+    return "is not a number; correct the cell, or use another column"
 
 
 def _explain_cell_count(cells: list[str], layout: _Layout) -> str:
@@ -664,14 +664,14 @@ _OTHER_FILES = {
 }
 
 
-def explain_columns(columns: Sequence[str]) -> str:
-    """The end of a sentence about missing columns: which ``columns`` there are, or why there is no header, and the
-    remedy."""
+def explain_columns(columns: Sequence[str], remedy: str = "name columns with --map") -> str:
+    """The end of a sentence about missing columns: which ``columns`` there are, and the ``remedy``; or why there is no
+    header."""
     if not any(columns):
         return "it is empty; export it again"
-    remedy = next((remedy for start, remedy in _OTHER_FILES.items() if columns[0].startswith(start)), None)
-    if remedy is not None:
-        return remedy
+    other = next((reason for start, reason in _OTHER_FILES.items() if columns[0].startswith(start)), None)
+    if other is not None:
+        return other
     if len(columns) == 1 and columns[0].startswith(("#", "%", "//")):
         return "its first line is a comment; remove the lines above the header"
     if len(columns) == 1 and ("|" in columns[0] or len(columns[0].split()) > 2):
@@ -679,7 +679,7 @@ def explain_columns(columns: Sequence[str]) -> str:
             f'its first line, "{sanitize(columns[0], 40)}", has neither commas, semicolons nor tabs; export it with '
             "one of these between its columns"
         )
-    return f"its columns are {_list_names(columns)}; name columns with --map"
+    return f"its columns are {_list_names(columns)}; {remedy}"
 
 
 def check_columns(path: str | os.PathLike, requested: Sequence[str], available: Sequence[str]) -> None:
