@@ -160,12 +160,14 @@ CASES = (
         "{i}/rays.npz -o {o}/a.safetensors --geometry hits " + GAZE,
         ("a.safetensors", "a.vol"),
         ("a.safetensors", "a.vol", "a.run"),
+        ("train.gaze_folds.evaluate_folds",),
     ),
     Case(
         "train gaze",
         "{i}/rays.npz -o {o}/a.safetensors --geometry none --ensemble 2 " + GAZE,
         ("a.safetensors",),
         ("a.safetensors", "a.run"),
+        ("train.gaze_folds.evaluate_folds",),
     ),
     Case("train prior", "{i}/rays.npz {i}/rays.npz -o {o}/a.safetensors", ("a.safetensors",)),
     Case(
