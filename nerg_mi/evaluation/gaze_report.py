@@ -397,6 +397,33 @@ def compute_verdict(
     return Verdict(grade, sentence, comparisons, split_half_fraction)
 
 
+_PLAIN_SPLITS = {
+    "both": "other people at other positions than in its training",
+    "pos": "the people of its training at other positions",
+    "people": "other people at the positions of its training",
+}
+_PLAIN_PRIOR = f"one average for all positions ({PRIOR})"
+_PLAIN_RAYS = f"copying the gaze recorded closest by ({NEAREST_RAYS})"
+
+
+def explain_verdict(verdict: Verdict, split: str) -> str:
+    """Return the verdict for readers who do not know the terms, which follow in parentheses."""
+    outcome = {c.reference: c.outcome for c in verdict.comparisons}
+    where = f'tested on {_PLAIN_SPLITS.get(split, split)} (split "{split}")'
+    if verdict.grade == "none":
+        return f"Verdict: there is too little test data to judge the prediction, {where}."
+    if verdict.grade == "reject":
+        return f"Verdict: do not use the prediction of where people look; {where}, it is worse than simple guesses."
+    if verdict.grade == "unclear":
+        return f"Verdict: {where}, the prediction of where people look is not shown to be better than {_PLAIN_PRIOR}."
+    better = f"Verdict: {where}, the prediction of where people look is better than {_PLAIN_PRIOR}"
+    if verdict.grade == "use":
+        return f"{better}, than {_PLAIN_RAYS}, and than the best of all simple methods (baselines)."
+    if outcome.get(NEAREST_RAYS) == BETTER:
+        return f"{better} and than {_PLAIN_RAYS}, but not shown to be better than every simple method (baseline)."
+    return f"{better}, but not shown to be better than {_PLAIN_RAYS}."
+
+
 def compare_scores(
     field: Mapping[str, Any], other: Mapping[str, Any], score: str, num_participants: int
 ) -> ScoreDifference:

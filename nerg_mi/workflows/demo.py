@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError, translate_mitsuba_errors
-from nerg_mi.evaluation.gaze_report import read_results
+from nerg_mi.evaluation.gaze_report import explain_verdict, read_results
 from nerg_mi.figures import overlay as figures
 from nerg_mi.figures.overlay import Heat, robust_max, srgb, write_png
 from nerg_mi.figures.sphere import sphere_figure
@@ -34,7 +34,7 @@ from nerg_mi.transport.geometry import pixel_solid_angles
 from nerg_mi.transport.observer import sensor_center
 
 from .bake import bake
-from .base import SILENT, Reporter, versions
+from .base import SILENT, Reporter, SilentReporter, versions
 from .render import describe_bases, describe_basis, describe_smoothing, smooth_gaze
 from .report import RESULTS, make_report
 from .scene_commands import BakeOptions, DemoOptions, ReportOptions
@@ -53,10 +53,18 @@ TRACKED = "shoppers.npz"
 REPORT_VIEWPOINTS = 24
 """Number of viewpoints of the report; small, to keep the demo short."""
 
-STAGES = (
-    *("load", "camera", "own view", "gaze sphere", "without occlusion", "pictures", "surfaces", "tracked gaze"),
-    "report",
-)
+STAGES = {
+    "load": ("loading the store", 1),
+    "camera": ("rendering the store from a camera", 8),
+    "own view": ("rendering what the shopper sees", 11),
+    "gaze sphere": ("rendering all directions around the shopper", 9),
+    "without occlusion": ("rendering gaze that passes through shelves, for comparison", 10),
+    "pictures": ("drawing figures", 9),
+    "surfaces": ("computing gaze on the surfaces of the store", 4),
+    "tracked gaze": ("copying recorded gaze", 1),
+    "report": ("writing the report", 40),
+}
+"""What each stage does, and about how long it takes, relative to the others."""
 OBJECTS, TWIN = "regions.json", "twin.ply"
 """Files with the AOIs and the mesh of the scene, next to the scene file."""
 
@@ -102,9 +110,13 @@ def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Rep
                 f'"{scene}" has {len(seen.sensors())} sensor(s): it needs a camera, the observer\'s view and a panorama'
             )
 
+        def report_strip(done: int, total: int) -> None:
+            stop.check()
+            clock.progress(done / total)
+
         def render(loaded: Any, index: int) -> Channels:
             with translate_mitsuba_errors():
-                return render_channels(loaded, loaded.sensors()[index], spp, seed, lambda done, total: stop.check())
+                return render_channels(loaded, loaded.sensors()[index], spp, seed, report_strip)
 
         clock.start("camera")
         camera = render(seen, CAMERA)
@@ -159,7 +171,8 @@ def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Rep
     )
     rendered = {"camera": camera, "own": own_view, "sphere": sphere}
     evaluation = find_evaluation(scene, inputs[2])
-    made = make_report([*inputs[1:], *tracked, *evaluation], out / "report.html", shown, rendered=rendered)
+    files_shown = [*inputs[1:], *tracked, *evaluation]
+    made = make_report(files_shown, out / "report.html", shown, _StageReporter(clock), rendered)
     files.append(made.path)
     if made.run.observed_objects:
         rows = [{"object": o.name, "observer_share": round(o.predicted.mean, 6)} for o in made.run.observed_objects]
@@ -185,25 +198,29 @@ def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Rep
     files.append(out / "run.json")
     for path in files:
         reporter.message(f"wrote {path}")
-    for _, verdict in made.run.verdicts:
-        reporter.message(verdict.sentence)
+    for results, verdict in made.run.verdicts:
+        reporter.message(explain_verdict(verdict, results.split))
     return DemoResult(files, clock.seconds, report)
 
 
 def make_demo_to_look_at(out: Path, options: DemoOptions, reporter: Reporter) -> None:
-    """Call `make_demo`, and report how to view the images."""
+    """Call `make_demo`, and report what it does and which files to open."""
+    reporter.message(
+        f"The demo renders a small store and where a simulated shopper looks: {len(STAGES)} steps, half a minute on "
+        "eight cores and a few minutes on two."
+    )
     make_demo(out, options, reporter)
-    reporter.message(f"View the images with: {_viewer(out)}")
+    reporter.message(f"Report: {out / 'report.html'}. Pictures: {out / 'occlusion.png'}, {out / 'gaze.png'}.")
+    reporter.message(f"Open it with: {_viewer(out / 'report.html')}")
 
 
-def _viewer(out: Path) -> str:
-    """Return the command that shows the images in ``out`` on this machine."""
-    first = out / "occlusion.png"
+def _viewer(page: Path) -> str:
+    """Return the command that shows ``page`` on this machine."""
     opener = "open" if sys.platform == "darwin" else "xdg-open"
     if shutil.which(opener):
-        return f"{opener} {first}"
+        return f"{opener} {page}"
     # Without a desktop: any browser with network access to this machine.
-    return f"python3 -m http.server --bind 127.0.0.1 --directory {out} 8000, then http://127.0.0.1:8000/{first.name}"
+    return f"python3 -m http.server --bind 127.0.0.1 --directory {page.parent} 8000, then http://127.0.0.1:8000/{page.name}"
 
 
 def find_store_scene() -> Path:
@@ -327,9 +344,26 @@ class _Clock:
     def start(self, name: str) -> None:
         self.stop()
         self._name, self._since = name, time.perf_counter()
-        self._reporter.progress(STAGES.index(name) / len(STAGES), name)
+        self._reporter.message(f"{list(STAGES).index(name) + 1} of {len(STAGES)}: {STAGES[name][0]}")
+        self.progress(0.0)
+
+    def progress(self, fraction: float) -> None:
+        """Report the completed ``fraction`` of the present stage."""
+        before = sum(weight for _, weight in list(STAGES.values())[: list(STAGES).index(self._name)])
+        total = sum(weight for _, weight in STAGES.values())
+        self._reporter.progress((before + fraction * STAGES[self._name][1]) / total, self._name)
 
     def stop(self) -> None:
         if self._name:
             self.seconds[self._name] = time.perf_counter() - self._since
             self._name = ""
+
+
+class _StageReporter(SilentReporter):
+    """Passes on the progress of a workflow as that of the present stage."""
+
+    def __init__(self, clock: _Clock):
+        self._clock = clock
+
+    def progress(self, fraction: float, text: str = "") -> None:
+        self._clock.progress(fraction)

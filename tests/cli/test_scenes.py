@@ -189,7 +189,7 @@ def test_the_demo_writes_and_names_everything(rgb, standins, tmp_path, nerg):
     out = tmp_path / "new" / "demo"
     ended = nerg("demo", "--out", out, *TINY, *defines(standins))
     assert ended.code == 0 and {p.name for p in out.iterdir()} == NAMES
-    assert all(str(out / n) in ended.out for n in NAMES) and "View the images with: " in ended.out
+    assert all(str(out / n) in ended.out for n in NAMES) and "Open it with: " in ended.out
 
     bitmap = mitsuba_bitmap(out / "scene.exr")
     fields = [f.name for f in bitmap.struct_()]

@@ -14,16 +14,18 @@ from scipy.stats import spearmanr
 
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation import gaze, gaze_report, metrics, uncertainty
-from nerg_mi.evaluation.baselines import CONDITIONAL_KDE, PRIOR, UNIFORM
+from nerg_mi.evaluation.baselines import CONDITIONAL_KDE, NEAREST_RAYS, PRIOR, UNIFORM
 from nerg_mi.evaluation.gaze_report import (
     BETTER,
     UNDECIDED,
     WORSE,
     Comparison,
     ScoreDifference,
+    Verdict,
     compare_scores,
     compute_verdict,
     draw_comparison,
+    explain_verdict,
     format_table,
     read_results,
     small_sample_factor,
@@ -357,6 +359,20 @@ def test_small_sample_intervals_have_nominal_coverage():
     assert np.mean(mean <= half_width * small_sample_factor(n)) == pytest.approx(0.95, abs=0.012)
     assert np.mean(mean <= half_width) < 0.88
     assert small_sample_factor(10**6) == pytest.approx(1, abs=1e-3)
+
+
+def test_verdicts_are_explained_with_their_terms():
+    """The grades of `compute_verdict`, and the terms in parentheses."""
+    texts = {}
+    for grade in ("use", "limited", "unclear", "reject", "none"):
+        for outcome in (1.0, 0.0):
+            difference = ScoreDifference("bits", outcome, outcome - 0.5, outcome + 0.5)
+            verdict = Verdict(grade, "", (Comparison(NEAREST_RAYS, (difference, difference)),))
+            texts[grade, outcome] = explain_verdict(verdict, "pos")
+            assert '(split "pos")' in texts[grade, outcome]
+    assert texts["use", 1.0] != texts["limited", 1.0] != texts["limited", 0.0]
+    assert len(set(texts.values())) == 6
+    assert all(f"({PRIOR})" in texts[grade, 1.0] for grade in ("use", "limited", "unclear"))
 
 
 def test_noisy_split_half_of_old_files_is_left_out(tmp_path):

@@ -112,10 +112,24 @@ def test_the_demo_reports_each_stage_and_writes_each_file(tmp_path):
     recorder = Recorder()
     options = DemoOptions(defaults=write_standins(tmp_path), width=24, spp=1, mode="llvm_ad_rgb")
     result = make_demo(tmp_path / "demo", options, recorder)
-    assert [text for _, text in recorder.steps] == list(STAGES) == list(result.seconds)
-    assert [share for share, _ in recorder.steps] == [k / len(STAGES) for k in range(len(STAGES))]
+    steps = [text for _, text in recorder.steps]
+    assert list(dict.fromkeys(steps)) == list(STAGES) == list(result.seconds)
+    fractions = [share for share, _ in recorder.steps]
+    assert fractions == sorted(fractions) and fractions[0] == 0 and fractions[-1] <= 1
     assert set(result.files) == set((tmp_path / "demo").iterdir()) and result.report["variant"] == "llvm_ad_rgb"
-    assert recorder.messages == [f"wrote {path}" for path in result.files]
+    assert recorder.messages[-len(result.files) :] == [f"wrote {path}" for path in result.files]
+    assert len(recorder.messages) == len(STAGES) + len(result.files)
+
+
+def test_demo_ends_with_the_files_to_open(tmp_path, monkeypatch):
+    """Without the images, which take long."""
+    recorder = Recorder()
+    monkeypatch.setattr(demo, "make_demo", lambda *_: recorder.message("made"))
+    demo.make_demo_to_look_at(tmp_path, DemoOptions(), recorder)
+    first, made, files, command = recorder.messages
+    assert str(len(STAGES)) in first and made == "made"
+    assert all(str(tmp_path / name) in files for name in ("report.html", "occlusion.png"))
+    assert "report.html" in command
 
 
 @pytest.mark.nightly
