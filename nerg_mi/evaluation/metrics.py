@@ -14,6 +14,7 @@ from nerg_mi.figures.overlay import srgb, write_png
 from nerg_mi.figures.style import make_provenance
 from nerg_mi.files.atomic import make_folder
 from nerg_mi.files.dataframes import ResultTables
+from nerg_mi.files.names import make_portable_names
 from nerg_mi.maths.arrays import check_weights
 from nerg_mi.maths.color import color_corrected_psnr, mean_ignoring_nan, psnr
 from nerg_mi.photos.cameras import PosedCamera, make_sensor_dict, pixel_directions
@@ -241,6 +242,7 @@ def score_views(
     if picture_folder is not None:
         make_folder(picture_folder)
         text = make_provenance("nerg eval radiance", [field], None, {"spp": spp}).text()
+    names = make_portable_names(Path(view.name).stem for view in views)
     for k, view in enumerate(views):
         rendered, truth = render(view.camera, k), view.composite_over(0)
         mask = rendered.mask if view.mask is None else rendered.mask & view.mask
@@ -251,7 +253,7 @@ def score_views(
             depths.append(compute_depth_score(rendered.depth, rendered.opacity, np.where(mask, view.depth, 0)))
         if picture_folder is not None:
             both = np.concatenate([rendered.color, truth], axis=1)
-            write_png(picture_folder / f"{Path(view.name).stem}.png", both, text)
+            write_png(picture_folder / f"{names[k]}.png", both, text)
         on_view(view.name, *rows[-1][:2])
     depth_scores = [d for d in depths if d is not None]
     return ViewScores(
