@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 
 from . import __version__, llvm
 from .errors import format_error
+from .memory import MITSUBA_MEGABYTES, NUMPY_MEGABYTES, find_free_address_space
 
 EXTRAS = {
     "torch": 'for torch-ngp checkpoints and fields as torch modules: pip install "nerg-mi[torch]"',
@@ -150,14 +151,25 @@ def run_diagnosis() -> Diagnosis:
             problem = f"{name} failed ({_one_line(message)}); reinstall with: pip install --force-reinstall mitsuba"
         add(Finding(f"{backend} variants", text, problem))
 
+    free = find_free_address_space()
+    needed = NUMPY_MEGABYTES + MITSUBA_MEGABYTES
+    has_memory = free is None or free >= needed
+    if free is not None:
+        problem = "" if has_memory else f'rendering needs about {needed} MB: raise the limit with "ulimit -v".'
+        add(Finding("memory limit", f"{free} MB", problem))
+
     threads = results["llvm"].get("threads")
     if threads:
         add(Finding("threads", str(threads)))
     for name, purpose in EXTRAS.items():
         add(Finding(name, _version(name) or f"not installed ({purpose})"))
 
-    diagnosis.is_usable = any(not v.startswith("scalar") for result in results.values() for v in result["variants"])
-    if not diagnosis.is_usable:
+    diagnosis.is_usable = has_memory and any(
+        not v.startswith("scalar") for result in results.values() for v in result["variants"]
+    )
+    if not has_memory:
+        add(Finding("verdict", "cannot render: the memory limit of this process is too low", "raise it."))
+    elif not diagnosis.is_usable:
         problem = "fix libLLVM or CUDA as described above."
         add(Finding("verdict", "cannot render: no llvm or cuda variant works", problem))
     else:

@@ -67,8 +67,24 @@ def import_extra(module: str, reason: str, extra: str) -> Any:
     """
     try:
         return importlib.import_module(module)
-    except ImportError:
+    except ImportError as error:
+        if is_lack_of_memory(error):
+            raise
         raise ImportError(f'{reason}, which is not installed: pip install "nerg-mi[{extra}]"') from None
+
+
+# What the dynamic loader, the operating system and C++ say if memory cannot be allocated.
+_LACK_OF_MEMORY = re.compile(
+    r"failed to map segment|cannot allocate memory|cannot create shared object descriptor|bad_alloc|"
+    r"can't start new thread|unable to allocate|out of memory",
+    re.IGNORECASE,
+)
+
+
+def is_lack_of_memory(error: BaseException) -> bool:
+    """Return whether ``error`` means that memory cannot be allocated, for data or for a library."""
+    is_system_error = isinstance(error, (ImportError, OSError, RuntimeError)) and not isinstance(error, NergError)
+    return isinstance(error, MemoryError) or (is_system_error and bool(_LACK_OF_MEMORY.search(str(error))))
 
 
 def is_user_error(error: BaseException) -> bool:
@@ -78,12 +94,14 @@ def is_user_error(error: BaseException) -> bool:
     or device, and a lack of memory. Everything else is a bug. This includes `ValueError`, which means that one internal
     function called another one with invalid values.
     """
+    if is_lack_of_memory(error):
+        return True
     if isinstance(error, ImportError):
         # The modules of this package are always installed.
         return not (error.name or "").startswith("nerg_mi")
     if isinstance(error, OSError):
         return error.errno is not None or error.filename is not None or isinstance(error, NergError)
-    return isinstance(error, (NergError, MemoryError))
+    return isinstance(error, NergError)
 
 
 _TRACEBACK = "Traceback (most recent call last):"
@@ -140,7 +158,9 @@ def format_error(error: BaseException) -> str:
     location in the scene (the text before the traceback) and the message of the exception (its last line).
     """
     text = str(error).strip()
-    if isinstance(error, MemoryError):
+    if is_lack_of_memory(error):
+        # The loader and the operating system name a library or a function, which is not the cause.
+        text = text if isinstance(error, MemoryError) else ""
         text = f"not enough memory{': ' + text if text else ''}; reduce the size of the job, or close other programs"
     elif isinstance(error, OSError) and error.strerror:
         message = f"{error.strerror[:1].lower()}{error.strerror[1:]}"

@@ -15,6 +15,7 @@ from typing import Any
 
 from . import llvm
 from .errors import NergError
+from .memory import MITSUBA_MEGABYTES, require_address_space
 
 PLUGINS = (
     ("panorama", "sensor"),
@@ -130,6 +131,7 @@ class _ImportHook:
 
         def exec_module(module):
             if fullname == "drjit":
+                require_address_space(MITSUBA_MEGABYTES, "Mitsuba")
                 llvm.require_usable()
                 original_exec(module)
                 return

@@ -12,6 +12,8 @@ import traceback
 from .ending import INTERRUPTED, CtrlC, exit_code, open_streams, quiet_ctrl_c, shorten_values
 
 with quiet_ctrl_c():
+    from nerg_mi.memory import NUMPY_MEGABYTES, require_address_space
+
     from .building import DEBUG, build_app
 
 
@@ -32,6 +34,7 @@ def main(arguments: list[str] | None = None) -> None:
     with CtrlC() as ctrl_c:
         try:
             try:
+                require_address_space(NUMPY_MEGABYTES, "this command")
                 build_app(arguments)(arguments, prog_name="nerg")
             finally:
                 sys.stdout.flush()
