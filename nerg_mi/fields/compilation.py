@@ -49,7 +49,7 @@ def compile_density(
     Raises
     ------
     NergError
-        If the result would exceed ``max_bytes``.
+        If the result would exceed ``max_bytes``, or if nothing has matter.
     """
     if field.voxels is not None:
         raise ValueError("the field is compiled already")
@@ -67,6 +67,11 @@ def compile_density(
             masks.append(mask[some])
             values.append(log_density[some])
             on_progress(min(1.0, (first + _BATCH) / len(candidates)))
+    if not any(map(len, blocks)):
+        raise NergError(
+            f"the radiance field has no matter at the resolution {resolution}: nowhere in its occupied cells it "
+            f"absorbs more than {MIN_STEP_OPTICAL_DEPTH:g} over a march step; train it longer"
+        )
     arrays = VoxelArrays(
         resolution,
         np.concatenate([np.zeros(0, np.uint32), *blocks]),

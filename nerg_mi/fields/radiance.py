@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import drjit as dr
 import numpy as np
 
+from nerg_mi.errors import NergError
 from nerg_mi.maths.arrays import sigmoid
 from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.maths.types import Bool, Float
@@ -21,6 +22,12 @@ from .voxels import VoxelGrid
 
 if TYPE_CHECKING:
     from typing_extensions import Self
+
+EMPTY = (
+    "is empty: no cell of its occupancy has density, because its training was too short or did not converge; train it "
+    "longer with --steps or --minutes"
+)
+"""What an empty radiance field is, as the end of a sentence."""
 
 # ---- Background ----
 #
@@ -377,6 +384,16 @@ class RadianceField:
         """The arrays that evaluations read: the encoding's and the packed networks, attached to ``parameters()``."""
         networks = [*self.grid.kernel_parameters(), self.density_net.buffer, self.color_net.buffer, self._head.buffer]
         return networks if self.voxels is None else [*networks, *self.voxels.kernel_parameters()]
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether no cell of its occupancy has density, as after a few steps of training."""
+        return self.occupancy is not None and self.occupancy.occupied_fraction == 0
+
+    def require_density(self, name: str) -> None:
+        """Raise `NergError` for an empty field; ``name`` is its name in the message."""
+        if self.is_empty:
+            raise NergError(f"{name} {EMPTY}")
 
     def density(self, p, active: Bool | bool = True):
         """Density in 1/unit at ``p`` (Array3f, the field's units); 0 outside the box."""

@@ -26,7 +26,7 @@ from nerg_mi.fields.gaze_base import (
 from nerg_mi.fields.gaze_hits import ReaimedHits
 from nerg_mi.fields.mlp import MLP
 from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid, RefinedGrid, unpack_bits
-from nerg_mi.fields.radiance import Background, BackgroundConfig, RadianceConfig, RadianceField
+from nerg_mi.fields.radiance import EMPTY, Background, BackgroundConfig, RadianceConfig, RadianceField
 from nerg_mi.fields.voxels import VoxelArrays, VoxelGrid
 from nerg_mi.files.atomic import file_sha256
 from nerg_mi.files.safe_read import describe_error
@@ -311,7 +311,10 @@ def load_radiance(path: str | Path, ns: ModuleType) -> tuple[RadianceField, dict
     """
     tensors, meta = read_checkpoint(path, "radiance")
     if meta.get("provenance", {}).get("quality") == "poor":
-        _warn_of_poor_field(str(path))
+        _warn_once(
+            f'the radiance field "{path}" predicts photos badly that it was not trained on (quality "poor" in its '
+            "provenance): its surfaces may be wrong; see the warnings of its training"
+        )
     with translate_build_errors(path):
         arrays, config = StoredArrays(tensors, ns), RadianceConfig.from_dict(check_sizes(meta["architecture"]))
         step = meta["march_step"]
@@ -342,20 +345,18 @@ def load_radiance(path: str | Path, ns: ModuleType) -> tuple[RadianceField, dict
         )
         if "voxels" in meta:
             field.voxels = _decode_voxels(arrays, meta["voxels"])
+    if field.is_empty:
+        _warn_once(f'the radiance field "{path}" {EMPTY}')
     return field, meta
 
 
 @cache
-def _warn_of_poor_field(path: str) -> None:
-    """Warn of a field that its training found to be of poor quality, once per process."""
+def _warn_once(text: str) -> None:
+    """Log a warning once per process."""
     import mitsuba as mi
 
     log: Any = mi.Log  # missing in the stubs
-    log(
-        mi.LogLevel.Warn,
-        f'the radiance field "{path}" predicts photos badly that it was not trained on (quality "poor" in its '
-        "provenance): its surfaces may be wrong; see the warnings of its training",
-    )
+    log(mi.LogLevel.Warn, text)
 
 
 def matches_checksum(path: str | Path, sha256: object) -> bool:

@@ -381,6 +381,7 @@ def load_field_geometry(path: Path, ns: ModuleType) -> TrainingGeometry:
         return _load_splat_geometry(path, ns)
     refuse_unsupported_splats(path)
     radiance, _ = load_radiance(path, ns)
+    radiance.require_density(f'"{path}"')
     metadata = {"field_file": identify_file(path)}
     return TrainingGeometry(FieldMedium(radiance), radiance.box, "field", metadata, radiance=radiance)
 

@@ -15,7 +15,7 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.fields.radiance import RadianceConfig, RadianceField
+from nerg_mi.fields.radiance import EMPTY, RadianceConfig, RadianceField
 from nerg_mi.formats.checkpoint import read_checkpoint, write_checkpoint
 from nerg_mi.interruption import Interruption
 from nerg_mi.maths.color import color_corrected_psnr, mean_ignoring_nan, psnr
@@ -463,7 +463,7 @@ def _make_result(
     causes = []
     if outcome.is_poor:
         causes = find_causes(dataset.train, provenance.get("photo_stops", 0.0), provenance.get("beyond_box", 0.0))
-    provenance["complaints"] = find_problems(outcome, causes)
+    provenance["complaints"] = [*([f"the field {EMPTY}"] if field.is_empty else []), *find_problems(outcome, causes)]
     return field, provenance
 
 

@@ -348,7 +348,9 @@ def read_target(path: Path, shapes: tuple[str, ...], resolution: int, ns: Module
                 f'"{path}" is not a radiance field; give the target surface first, and the gaze field with --gaze'
             )
         reporter.progress(0.02, "extracting the surface of the field")
-        body = mesh_of_field(load_radiance(path, ns)[0], resolution)
+        field = load_radiance(path, ns)[0]
+        field.require_density(f'"{path}"')
+        body = mesh_of_field(field, resolution)
         assert body.faces is not None, "a mesh has faces"
         meshes = {path.stem: (body.vertices, body.faces)}
     else:

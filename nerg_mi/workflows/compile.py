@@ -63,13 +63,14 @@ def compile_field(
 
     Without a ``resolution``, it is doubled until the depth and the colour are accurate enough, or until the voxels
     would exceed ``memory``. Raises `NergError` if the first resolution does so, for a resolution that is not a multiple
-    of 8, and for a field that is compiled.
+    of 8, and for a field that is compiled or has no matter.
     """
     options = options or CompileOptions()
     if options.resolution % BLOCK_EDGE:
         raise NergError(f"the resolution must be a multiple of {BLOCK_EDGE}, got {options.resolution}")
     if field.voxels is not None:
         raise NergError("this field is compiled already; compile the field that it was made from")
+    field.require_density("the radiance field")
     max_depth_error = options.max_depth_error or 0.1 * (field.march_step or field.box.diagonal / 1024)
     resolutions = [options.resolution] if options.resolution else _list_resolutions()
     rays = _make_rays(field)

@@ -267,6 +267,7 @@ def _load(field: str | Path | RadianceField, mode: str, reporter: Reporter) -> R
     reporter.progress(0.0, "reading the field")
     ns = select_backend(mode)
     loaded = field if isinstance(field, RadianceField) else load_radiance(field, ns)[0]
+    loaded.require_density("the radiance field" if isinstance(field, RadianceField) else f'"{field}"')
     reporter.progress(0.01, "sampling the field")
     if loaded.box.is_contracted:
         reporter.message("the scene is unbounded: only the box that the field resolves best is exported")

@@ -141,6 +141,7 @@ def _add_file(
         return replace(scene, splats=read_splats(path))
     if kind == "field":
         field = load_radiance(path, select_backend(options.mode))[0]
+        field.require_density(f'"{path}"')
         return replace(scene, points=(*scene.points, _surface_points(field, name, options)))
     raise NergError(
         f'"{path}" is exported as part of a scene, not alone; make one with "nerg scene", or in Python with '

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import drjit.llvm.ad as ns
@@ -15,21 +15,26 @@ from scipy.spatial.transform import Rotation
 
 from nerg_mi.errors import NergError
 from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid
+from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.files.atomic import file_sha256
 from nerg_mi.formats.checkpoint import read_checkpoint
-from nerg_mi.formats.fields import load_radiance, matches_checksum
+from nerg_mi.formats.fields import load_radiance, matches_checksum, save_radiance
 from nerg_mi.formats.splats import read_splats
 from nerg_mi.interruption import TrainingInterrupted
 from nerg_mi.photos.colmap import UpEstimate
 from nerg_mi.photos.dataset import open_dataset
 from nerg_mi.photos.structure import Reconstruction
+from nerg_mi.train.geometry import load_field_geometry
+from nerg_mi.train.radiance_run import train_field
 from nerg_mi.train.radiance_settings import RadianceSettings
 from nerg_mi.workflows import poses as job
 from nerg_mi.workflows import train_radiance as training
+from nerg_mi.workflows.compile import compile_checkpoint, compile_field
 from nerg_mi.workflows.export import (
     PointOptions,
     SplatOptions,
     VolumeOptions,
+    export_mesh,
     export_points,
     export_splats,
     export_volume,
@@ -39,6 +44,7 @@ from nerg_mi.workflows.export import (
 from nerg_mi.workflows.poses import STAGES, find_poses
 from nerg_mi.workflows.radiance_commands import (
     CheckpointImportOptions,
+    CompileOptions,
     PoseOptions,
     RadianceOptions,
     RadianceScoreOptions,
@@ -49,6 +55,7 @@ from tests.formats.test_torch_ngp import small_gaze, small_state
 from tests.photos import rendered
 from tests.plugins import fields
 from tests.plugins.fields import radiance
+from tests.train.radiance.ball import BOX, TINY, ball_dataset, settings
 from tests.workflows.recorder import Recorder
 
 # ---- Radiance fields by jobs: results and messages ----
@@ -449,3 +456,42 @@ def test_frames_of_a_video_are_extracted(finds, tmp_path):
     seconds = list(result.report["seconds"].values())
     assert result.registered == [f"frame_{round(10 * s) + 1:06d}.jpg" for s in seconds]
     assert len(seconds) == 4 and seconds == sorted(seconds) and seconds[-1] >= 0.8
+
+
+# ---- Fields that are hardly trained ----
+
+
+@pytest.fixture
+def empty_field(tmp_path, rgb):
+    """A field without an occupied cell, as a training of a few steps leaves it, and its file."""
+    field = RadianceField.random(TINY, BOX, ns, 0, march_step=1 / 64)
+    field.occupancy = OccupancyGrid(np.zeros((8, 8, 8), bool), ns, 0.1)
+    save_radiance(field, tmp_path / "empty.safetensors", {})
+    return field, tmp_path / "empty.safetensors"
+
+
+def test_an_empty_field_is_refused_by_name(empty_field, tmp_path):
+    field, path = empty_field
+    for use in (
+        lambda: compile_field(field),
+        lambda: compile_checkpoint(path, tmp_path / "a.safetensors"),
+        lambda: export_mesh(path, tmp_path / "a.ply"),
+        lambda: export_splats(field, tmp_path / "a.ply"),
+        lambda: load_field_geometry(path, ns),
+    ):
+        with pytest.raises(NergError, match="empty.*train it longer"):
+            use()
+
+
+def test_a_field_without_matter_is_not_compiled(rgb):
+    """Its density is too small in all cells of its occupancy."""
+    field = RadianceField.random(replace(TINY, density_scale=1e-6), BOX, ns, 0, march_step=1 / 64)
+    field.occupancy = OccupancyGrid(np.ones((8, 8, 8), bool), ns, 0.1)
+    with pytest.raises(NergError, match="no matter"):
+        compile_field(field, CompileOptions(resolution=64))
+
+
+def test_a_training_reports_that_its_field_is_empty():
+    thin = replace(TINY, density_scale=1e-9)
+    _, provenance = train_field(ball_dataset(), thin, settings(steps=2), ns)
+    assert any("is empty" in line for line in provenance["complaints"])
