@@ -135,6 +135,12 @@ def translate_mitsuba_errors(file: str | PathLike[str] | None = None) -> Iterato
     try:
         yield
     except RuntimeError as error:
+        # `mi.render` wraps what an integrator raises in an error that says nothing.
+        cause = error.__cause__
+        while isinstance(cause, RuntimeError):
+            cause = cause.__cause__
+        if isinstance(cause, NergError):
+            raise cause from error
         _, marker, trace = str(error).partition(_TRACEBACK)
         error_type = _read_last_exception(trace).partition(":")[0].strip().rpartition(".")[2] if marker else None
         if error_type is not None and error_type not in USER_ERRORS:

@@ -479,6 +479,7 @@ class NergIntegrator(mi.SamplingIntegrator):
         self.required_data = nerg_aovs.collect_required_data(self.aovs)
         self.views = nerg_aovs.collect_observer_views(self.aovs, self)
         self.cache = ObserverCache()
+        self.variant = mi.variant()
         self._sensors = None  # sensor of the current rendering; None if another integrator calls this one
 
     def aov_names(self):
@@ -487,6 +488,8 @@ class NergIntegrator(mi.SamplingIntegrator):
     def render(self, scene, sensor=0, seed: Any = 0, spp=0, develop=True, evaluate=True):
         if isinstance(sensor, int):
             sensor = scene.sensors()[sensor]
+        if self.observer is None and self.context().observer_aovs:
+            observer.check_centers(sensor)
         restore_interrupt_handler()
         with self.rendering_from(sensor, scene), gc_paused():
             image = super().render(scene, sensor, seed, spp, develop, evaluate)

@@ -176,7 +176,7 @@ def _resolve_observers(scene: Scene, sensor: Any, positions: ArrayLike | None, i
     if scene.observer is not None:
         return scene.observer[None]
     if is_needed:
-        observer.check_center(sensor, "the camera")
+        observer.check_centers(sensor)
     return np.array(observer.sensor_center(sensor), np.float32).reshape(1, 3)
 
 

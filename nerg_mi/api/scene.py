@@ -93,9 +93,10 @@ class Scene:
                 f'a scene needs the integrator "nerg", but this one has {have}; '
                 "use make_scene(shapes=scene) to make a scene with its shapes"
             )
+        self.mitsuba, self.variant = mitsuba, integrator.variant
+        self.check_variant()
         for shape in mitsuba.shapes():
             check_shape(shape)
-        self.mitsuba = mitsuba
         self.path: Path | None = None
         self._content: dict[str, Any] | None = None
         self._source: tuple[Path, dict[str, str]] | None = None
@@ -131,6 +132,17 @@ class Scene:
         scene._source = Path(path), texts
         return scene
 
+    def check_variant(self) -> None:
+        """Raise `NergError` if another Mitsuba variant than that of the scene is active."""
+        import mitsuba as mi
+
+        activate_mitsuba()
+        if mi.variant() != self.variant:
+            raise NergError(
+                f'the scene belongs to the Mitsuba variant "{self.variant}", but "{mi.variant()}" is active; call '
+                f'mi.set_variant("{self.variant}"), or load the scene again'
+            )
+
     @classmethod
     def coerce(cls, scene: Scene | FilePath | mi.Scene | Mapping[str, Any]) -> Scene:
         """Return ``scene`` as a `Scene`: a scene file or a dict is loaded, and a Mitsuba scene is wrapped.
@@ -138,13 +150,14 @@ class Scene:
         Raises `NergError`.
         """
         if isinstance(scene, Scene):
+            scene.check_variant()
             return scene
         if isinstance(scene, (str, os.PathLike)):
             return cls.load(Path(scene))
-        import mitsuba as mi
 
         activate_mitsuba()
-        if isinstance(scene, mi.Scene):
+        # Each variant has a class of this name.
+        if type(scene).__name__ == "Scene" and type(scene).__module__.partition(".")[0] == "mitsuba":
             return cls(scene)
         if isinstance(scene, Mapping):
             return cls._from_content(dict(scene))

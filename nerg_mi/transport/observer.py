@@ -222,9 +222,15 @@ def check_center(sensor: mi.Sensor, role: str) -> None:
     """Raise ``NergError`` if ``sensor`` (called ``role`` in the message) has no single centre."""
     if _kind(sensor) not in _CENTERED:
         raise NergError(
-            f"{role} is a {_kind(sensor)}, which has no centre; "
+            f"{role} is of the type {_kind(sensor)}, which has no centre from which somebody could look; "
             'give the integrator an explicit "observer" such as a perspective sensor'
         )
+
+
+def check_centers(sensor: mi.Sensor) -> None:
+    """Raise ``NergError`` if ``sensor``, or a member of a batch, has no single centre."""
+    for member in _members(sensor):
+        check_center(member, "the rendering sensor")
 
 
 def have_same_center(sensors: Sequence[mi.Sensor], p_o: Point3f) -> bool:
@@ -251,8 +257,8 @@ def center_of_ray(sensors: Sequence[mi.Sensor], ray: Ray3f) -> Point3f:
     This distinguishes the members of a batch.
     """
     members = [m for s in sensors for m in _members(s)]
-    for member in members:
-        check_center(member, "the rendering sensor")
+    for sensor in sensors:
+        check_centers(sensor)
     if not members:
         raise NergError('no sensor defines the position of the observer; give the integrator an "observer"')
     best = sensor_center(members[0])
