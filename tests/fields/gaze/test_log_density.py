@@ -182,6 +182,20 @@ def test_invalid_settings_are_refused(wrong):
         replace(SMALL, **wrong)
 
 
+def test_observers_outside_of_the_box_of_heads_are_as_at_its_nearest_point():
+    """In each axis alone; the box is not a cube, whose longest edge is two units of the network's coordinates."""
+    low, high = np.array([-1, -1, 1.4]), np.array([1, 0.5, 1.8])
+    field = made(replace(SMALL, heads=(tuple(low), tuple(high))))
+    points = np.array([[-3, 0, 1.5], [3, 0, 1.5], [0, -9, 1.5], [0, 2, 1.5], [0, 0, 0], [0, 0, 2.5], [99, 99, 99]])
+    outside, inside = (
+        np.array([np.array(v) for v in field.capture_position(jit(p))]) for p in (points, np.clip(points, low, high))
+    )
+    np.testing.assert_allclose(outside, inside, atol=1e-6)
+    np.testing.assert_allclose(
+        inside[:3, :4].T, [[-1, 0, -0.9], [1, 0, -0.9], [0, -1, -0.9], [0, 0.5, -0.9]], atol=1e-6
+    )
+
+
 def test_capture_coordinates_do_not_depend_on_the_box_size():
     result = []
     for size in (1.0, 1e-5):

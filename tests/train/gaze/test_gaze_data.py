@@ -157,6 +157,17 @@ def test_kernels_of_the_prior_are_those_that_predict_other_participants():
     assert select_prior_kappa(make(common, 1), "person") == pytest.approx(np.sqrt(100 * 30))
 
 
+@pytest.mark.parametrize("weights, best", [("equal", 2), ("person", 100)])
+def test_participants_count_equally_for_the_kernels_of_the_prior(weights, best):
+    """One with 2,000 rays to all sides, and five with four rays each, around one direction with a concentration of 100:
+    as rays, those are too few to predict each other."""
+    around = vmf.sample(np.tile([0.0, 1.0, 0.0], (20, 1)), 100.0, np.random.default_rng(0))
+    person = np.concatenate([np.zeros(2000, int), 1 + np.arange(20) % 5])
+    direction = np.concatenate([fibonacci_directions(2000), around])
+    rays = Rays(np.arange(2020.0), person, tuple("abcdef"), np.zeros((2020, 3)), direction, np.ones(2020))
+    assert select_prior_kappa(rays, weights) == pytest.approx(np.sqrt(best * 30))
+
+
 def test_prior_is_in_the_frame_of_the_geometry():
     """All look along x, which is y in a geometry rotated by a quarter turn."""
     direction = np.tile([1.0, 0, 0], (10, 1))

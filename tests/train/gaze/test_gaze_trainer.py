@@ -20,7 +20,7 @@ from nerg_mi.train.gaze_log_density import compute_elevation_density, make_eleva
 from nerg_mi.train.gaze_product import ProductTrainer
 from nerg_mi.train.gaze_run import make_targets
 from nerg_mi.train.gaze_settings import GazeSettings
-from nerg_mi.train.gaze_trainer import GazeRunFile, GazeTrainer, StateSettings, fit_with_validation, refit
+from nerg_mi.train.gaze_trainer import GazeRunFile, GazeTrainer, Scores, StateSettings, fit_with_validation, refit
 
 from .looks import (
     BOX,
@@ -66,6 +66,26 @@ def test_early_stopping(wall, patience, looks):
     v = provenance["validation"]
     assert [h["steps"] for h in v["history"]] == [2 * k for k in range(1, looks + 1)]
     assert v["best_step"] == 2 and provenance["steps"] == 2 * looks
+
+
+@pytest.mark.parametrize("settings, config", [(PRODUCT, SMALL), (LIKELIHOOD, LOG)], ids=["product", "likelihood"])
+@pytest.mark.parametrize("losses", [(3, 1, 2, 1.5), (1, 2, 3, 4), (4, 3, 2, 1), (2, np.nan, 1, 3), (np.nan, 5, 4, 6)])
+def test_the_state_of_the_smallest_loss_is_the_result(targets_fit, monkeypatch, settings, config, losses):
+    """Not the last one; its weights, step and scores."""
+    plan, states = planned(config, replace(settings, num_validations=4)), []
+
+    def evaluate(trainer, targets, weights=None):
+        states.append((trainer.steps, {k: np.array(v) for k, v in trainer.averaged.items()}))
+        return Scores(losses[len(states) - 1], *range(4))
+
+    monkeypatch.setattr(plan.trainer, "evaluate", evaluate)
+    fit = fit_with_validation(targets_fit, targets_fit, BOX, plan, ns, 1.0, NO_FILE, lambda progress: None)
+    best = int(np.nanargmin(losses))
+    assert [row["steps"] for row in fit.history] == [4, 8, 12, 16] and fit.best_step == states[best][0]
+    assert fit.scores is not None and fit.scores.loss == losses[best]
+    for name, value in fit.weights.items():
+        np.testing.assert_array_equal(value.numpy(), states[best][1][name], err_msg=name)
+    assert any(np.any(states[0][1][name] != states[3][1][name]) for name in fit.weights)
 
 
 def test_a_fit_without_validation_ends_with_its_schedule(targets_fit):
