@@ -304,7 +304,10 @@ class SphericalKde:
             return i, last, [total for total, _ in pairs], [compensation for _, compensation in pairs], values
 
         state = first, last, zeros, [ns.Float(zero) for zero in zeros], list(values)
-        return dr.while_loop(state, lambda i, last, *_: i < last, add_block, label="spherical KDE")[2]
+        # An enclosing derivative, of which this sum may be no part, evaluates loops: each ray would be a kernel.
+        is_symbolic = dr.flag(dr.JitFlag.SymbolicLoops) or not dr.grad_enabled(values)
+        with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, is_symbolic):
+            return dr.while_loop(state, lambda i, last, *_: i < last, add_block, label="spherical KDE")[2]
 
     def evaluate(self, directions: np.ndarray) -> np.ndarray:
         """Evaluate the densities of all probes in many directions in one kernel.

@@ -373,7 +373,9 @@ def march(
     if needs_gradients(medium, ray, t0, t1):
         result = march_differentiably(MarchOp if medium.hits is None else HitMarchOp, ray, t0, t1, request)
     else:
-        result = (march_primal if medium.hits is None else march_hits)(ray, t0, t1, request)
+        # An enclosing derivative, such as that of the albedo of a shape, evaluates loops: each step would be a kernel.
+        with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, True):
+            result = (march_primal if medium.hits is None else march_hits)(ray, t0, t1, request)
     result.start_distance = t0
     if until is not None and dr.grad_enabled(until):
         crossed = dr.isfinite(result.median_depth)

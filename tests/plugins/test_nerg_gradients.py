@@ -15,6 +15,7 @@ from .scenes import (
     plugin,
     put,
     scene_with,
+    sphere,
     still,
     stored,
     with_gaze,
@@ -329,3 +330,52 @@ def test04_ray_batch_matches_its_pixels(rgb, files):
     assert np.allclose(np.array(colors)[0], expected[:, :3])
     span = np.ptp(expected, axis=0)
     assert np.all(span[:6] > 1e-4) and np.all(np.abs(got - expected) <= 0.1 * span)
+
+
+# ---- The derivative of something that the march does not depend on ----
+
+
+@pytest.mark.parametrize("kind", ["grid", "field", "gaze", "refined"])
+def test_march_beside_a_differentiated_albedo_stays_one_kernel(rgb, learnt, kind):
+    """Mitsuba evaluates the loops of a derivative: each step would be a kernel, and take seconds per image."""
+
+    def make(step):
+        path = {"inner": {"type": "path", "max_depth": 2}}
+        if kind == "grid":
+            data = rgb.TensorXf(np.full((4, 4, 4, 1), 1.5, np.float32))
+            integrator = plugin(
+                "nerg", step=step, quadrature="constant", density=plugin("gridvolume", data=data), **path
+            )
+        elif kind == "refined":
+            integrator = plugin("nerg", step=step, density=plugin("constvolume", value=1.0), depth="refined", **path)
+        else:
+            observer = {"observer": make_observer(rgb, -2, 0.3, -2)} if kind == "gaze" else {}
+            integrator = plugin(
+                "nerg", step=step, field=stored("nerf", learnt / "field.safetensors"), **observer, **path
+            )
+            if kind == "gaze":
+                integrator |= {
+                    "gaze": stored("gazefield", learnt / "gaze.safetensors"),
+                    "aovs": "depth,gaze,visibility",
+                }
+        ball, light = sphere(rgb, 0, 0, 3, radius=1.5), {"type": "constant"}
+        return scene_with(rgb, integrator, small_camera(rgb), ball=ball, light=light)
+
+    counts = []
+    for step in (0.2, 0.02):
+        scene = make(step)
+        params = rgb.traverse(scene)
+        key = next(k for k in params.keys() if k.endswith("reflectance.value"))
+        attach(params, key)
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            dr.backward(dr.mean(rgb.render(scene, params, spp=64)[..., :3]))
+            slope = np.array(dr.grad(params[key])).ravel().sum()
+            counts.append(len(dr.kernel_history([dr.KernelType.JIT])))
+    assert counts[0] == counts[1] < 100
+    with dr.suspend_grad():
+        means = []
+        for value in (0.4, 0.6):
+            put(params, key, rgb.Color3f(value))
+            means.append(np.mean(np.array(rgb.render(scene, spp=64))[..., :3]))
+    assert slope == pytest.approx((means[1] - means[0]) / 0.2, rel=0.05)
