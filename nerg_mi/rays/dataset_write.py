@@ -517,6 +517,7 @@ class DatasetUpdate:
     num_unchanged: int = 0
     num_duplicates: int = 0  # with the name and content of another source: stored once
     errors: list[str] = field(default_factory=list)  # messages of sources that could not be imported
+    empty: list[Path] = field(default_factory=list)  # imported sources of which all rows were dropped
 
 
 def update_dataset(
@@ -609,6 +610,7 @@ def _count_outcome(update: DatasetUpdate, outcome: ImportOutcome, imported_ids: 
     else:
         update.num_imported += 1
         update.num_rays += outcome.rays
+        update.empty += [] if outcome.rays else [outcome.path]
     imported_ids.add(outcome.source)
 
 

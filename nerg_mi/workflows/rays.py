@@ -201,6 +201,8 @@ def _report_update(update: DatasetUpdate, reporter: Reporter) -> None:
     ]
     parts += [f"{update.num_replaced:,} replaced"] if update.num_replaced else []
     reporter.message("; ".join(parts))
+    for path in update.empty[:_MAX_ERRORS]:
+        reporter.message(sanitize(f"{path}: none of its rows gives a ray; the report lists why", 2000))
 
 
 def make_dataset_reports(path: FileName) -> Iterator[tuple[str, Card]]:

@@ -146,3 +146,12 @@ def test_all_refused_files_of_a_dataset_are_named(tmp_path):
     done = run("import", *files, "-o", tmp_path / "r.rays", *MAP, *UNITY, "--pseudonyms")
     text = done.output + str(done.exception)
     assert done.exit_code != 0 and "bo.csv" in text and "cy.csv" in text and "2 of 3 files" in text
+
+
+def test_files_without_rays_are_named(tmp_path):
+    (tmp_path / "ann.csv").write_text(ROWS)
+    (tmp_path / "bo.csv").write_text("t,x,y,z,a,b,c\n0,1,1.6,2,0,0,0\n")
+    done = run("import", tmp_path / "ann.csv", tmp_path / "bo.csv", "-o", tmp_path / "r.rays", *MAP, *UNITY)
+    assert done.exit_code == 0, done.output
+    (line,) = [line for line in done.output.splitlines() if "gives a ray" in line]
+    assert "bo.csv" in line and "ann" not in line
