@@ -19,6 +19,7 @@ import typer
 import typer.core
 
 from nerg_mi import __version__
+from nerg_mi.errors import sanitize
 from nerg_mi.ranges import KAPPAS, RANGE
 from nerg_mi.workflows.base import COMMANDS, Command, HelpView, Parameter
 from nerg_mi.workflows.old_names import find_spelling
@@ -171,10 +172,15 @@ def _build(name: str, entries: Mapping[str, ListedCommand]) -> Any:
 
 @contextmanager
 def _shortened(arguments: Sequence[str]) -> Iterator[None]:
-    """Within this block, errors about the command line shorten long ``arguments``."""
+    """Within this block, errors about the command line name their value, and shorten long ``arguments``."""
     try:
         yield
     except _UsageError as error:
+        flags = getattr(getattr(error, "param", None), "opts", ())
+        values = [value for flag, value in zip(arguments, arguments[1:]) if flag in flags]
+        values += [value for flag, _, value in (a.partition("=") for a in arguments) if flag in flags and value]
+        if len(values) == 1 and values[0] not in error.message:
+            error.message = f'{error.message}, got "{sanitize(values[0])}"'
         error.message = shorten_values(error.message, arguments)
         raise
 

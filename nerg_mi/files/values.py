@@ -90,6 +90,9 @@ def _to_array(values: Any, name: str) -> tuple[np.ndarray, np.ndarray | None]:
     if hasattr(getattr(values, "type", None), "index_type") and hasattr(values, "cast"):
         # Arrow's chunked dictionaries lose missing values on the way to NumPy.
         values = values.cast(values.type.value_type)
+    if hasattr(values, "detach") and hasattr(values, "cpu"):
+        # Tensors of PyTorch that have derivatives, or are on another device.
+        values = values.detach().cpu()
     try:
         return np.asarray(values), None
     except (TypeError, ValueError, OverflowError) as error:

@@ -104,7 +104,7 @@ def from_dataframe(table: Any, columns: Mapping[str, Any] | None, frame: tuple[s
     else:
         if unknown := [role for role in columns if role not in ROLES]:
             raise NergError(f'columns has no role "{unknown[0]}"; the roles are {", ".join(ROLES)}')
-        choices = {role: as_list(role, names) for role, names in columns.items()}
+        choices = {role: as_list(role, names) for role, names in columns.items() if names is not None}
     if missing := [role for role in _REQUIRED if role not in choices]:
         raise NergError(f'columns lacks "{missing[0]}"; name its columns, as in columns={example}')
     for role, names in choices.items():

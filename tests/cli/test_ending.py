@@ -102,6 +102,13 @@ import nerg_mi.cli
     assert (done.returncode, done.stderr) == (INTERRUPTED, "Interrupted.\n")
 
 
+@pytest.mark.parametrize("spelt", [["--cell-size", "1,5"], ["--cell-size=1,5"]])
+def test_invalid_values_are_named(capsys, spelt):
+    with pytest.raises(SystemExit):
+        main(["rays", "plot", "a.npz", "-o", "b.png", *spelt])
+    assert "--cell-size" in (said := capsys.readouterr().err) and 'got "1,5"' in said
+
+
 @pytest.mark.parametrize("long", ["x" * 1500, "1 " * 750, "a" * 700 + "=" + "b" * 800, "it's " * 300, "z,9" * 500])
 def test_messages_abbreviate_long_values(capsys, long):
     with pytest.raises(SystemExit):

@@ -128,6 +128,12 @@ def test_flags_are_numbers_where_they_are_allowed():
     )
 
 
+def test_tensors_with_derivatives_are_numbers():
+    torch = pytest.importorskip("torch")
+    tensor = torch.tensor([[1.0, 2.0]], requires_grad=True)
+    np.testing.assert_allclose(to_numbers(tensor, "origins"), [[1, 2]])
+
+
 def test_numbers_keep_their_shape_and_type():
     array = np.arange(6.0).reshape(2, 3)
     assert to_numbers(array, "x") is array

@@ -121,7 +121,7 @@ def test_columns_have_roles_and_others_are_reported():
     table["when"] = pandas.to_datetime("2026-01-01") + pandas.to_timedelta(times, "s")
     table.loc[1, "who"] = None
     columns = {"time": "when", "participant": "who", "origin": ["x", "y", "z"], "direction": ["u", "v", "w"]}
-    rays = Rays.from_dataframe(table, {**columns, "confidence": "c"})
+    rays = Rays.from_dataframe(table, {**columns, "confidence": "c", "hit": None})
     assert len(rays) == 3 and rays.metadata["unused_columns"] == ["note"] and (rays.confidence == 0.5).all()  # noqa: RUF069 (stored)
     np.testing.assert_allclose(rays.t - rays.t[0], times[[0, 2, 3]], atol=1e-6)
     for wrong, said in (
