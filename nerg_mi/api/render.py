@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 
 AXES = ("observer", "row", "column")
 
+_NO_COLOR = 0.2
+"""Linear grey below a quantity if the colour was not rendered."""
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Pictures(LabelledArrays):
@@ -44,7 +47,8 @@ class Pictures(LabelledArrays):
         Parameters
         ----------
         name : str, optional
-            The quantity. Default: ``gaze`` if there is one, else ``color``.
+            The quantity. Default: ``gaze`` if there is one, else ``color``, else the first one. It is drawn over the
+            colour, or over grey without it; pixels without a surface are hatched if there is ``opacity``.
         observer : int
             Index of the observer.
         axes : matplotlib.axes.Axes, optional
@@ -53,12 +57,12 @@ class Pictures(LabelledArrays):
         Returns
         -------
         matplotlib.figure.Figure
-            The figure, which a notebook shows.
+            The figure, which a notebook shows and its method ``savefig`` writes. It does not belong to pyplot.
 
         Raises
         ------
         NergError
-            The result lacks the quantity, or ``opacity``, which tells where there are surfaces.
+            The result lacks the quantity or the observer; nothing is drawn then.
 
         Examples
         --------
@@ -71,21 +75,29 @@ class Pictures(LabelledArrays):
         from nerg_mi.figures.overlay import OverlayLayers, find_overlay, srgb
         from nerg_mi.figures.style import Sheet, figure_of
 
-        name = name or ("gaze" if "gaze" in self else COLOR)
-        needed = {name, COLOR, *([] if name == COLOR else ["opacity"])}
-        if missing := sorted(needed - set(self.names)):
-            raise NergError(f'the result has no "{missing[0]}"; request it with quantities=')
-        color = self[COLOR][observer]
+        drawable = [n for n in ("gaze", COLOR, *self.names) if n in self and (n == COLOR or self[n].ndim == 3)]
+        if name is None and drawable:
+            name = drawable[0]
+        if name is None:
+            raise NergError(
+                f"{', '.join(self.names)} cannot be drawn as one image; plot one of their channels yourself"
+            )
+        if name not in self:
+            raise NergError(f'the result has no "{name}", only {", ".join(self.names)}; request it with quantities=')
+        count, *shape = self[name].shape[:3]
+        check_number(observer, Range(-count, count - 1), "observer", is_integer=True)
+        color = self[COLOR][observer] if COLOR in self else np.full((*shape, 3), _NO_COLOR, np.float32)
         color = np.repeat(color, 3, axis=-1) if color.shape[-1] == 1 else color
         if name == COLOR:
             return Sheet([srgb(color)], [""], panels=axes).page
         overlay = find_overlay(name)
-        layers = OverlayLayers(color, self[name][observer], self["opacity"][observer] >= SURFACE_OPACITY)
+        mask = self["opacity"][observer] >= SURFACE_OPACITY if "opacity" in self else np.ones(shape, bool)
+        layers = OverlayLayers(color, self[name][observer], mask)
         return figure_of(overlay.draw(layers, overlay.limits(layers), axes=axes))
 
     def _repr_html_(self) -> str | None:
         """The image of the first observer, for notebooks, if it can be drawn."""
-        if COLOR not in self or ("gaze" in self and "opacity" not in self):
+        if COLOR not in self and "gaze" not in self:
             return None
         from nerg_mi.figures.style import encode
 

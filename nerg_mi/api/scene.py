@@ -275,9 +275,12 @@ class Scene:
         2
         """
         import nerg_mi
+        from nerg_mi.figures.overlay import find_overlay
 
         name = quantity or ("gaze" if self.has_gaze else COLOR)
         needed = [COLOR, *([] if name == COLOR else ["opacity", name])]
+        if name != COLOR:
+            find_overlay(name)  # refuse what cannot be drawn before it is rendered
         return nerg_mi.render(self, observer, needed, spp=spp, **settings).plot(name, axes=axes)
 
     def _repr_html_(self) -> str:

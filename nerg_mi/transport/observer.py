@@ -222,7 +222,7 @@ def check_center(sensor: mi.Sensor, role: str) -> None:
     """Raise ``NergError`` if ``sensor`` (called ``role`` in the message) has no single centre."""
     if _kind(sensor) not in _CENTERED:
         raise NergError(
-            f"{role} is of the type {_kind(sensor)}, which has no centre from which somebody could look; "
+            f"{role} is of the type {_kind(sensor)}, which has no centre; "
             'give the integrator an explicit "observer" such as a perspective sensor'
         )
 

@@ -527,6 +527,15 @@ def test_pictures_are_labelled_arrays_and_figures(room, gaze):
     assert scene.show("depth", axes=third, spp=1) is figure and third.get_images()
     with pytest.raises(nerg.NergError, match='"depth"'):
         pictures.plot("depth")
+    empty = figure.add_subplot()
+    for name, observer in (("depth", 0), ("gaze", 2), ("position", 0)):
+        with pytest.raises(nerg.NergError):
+            pictures.plot(name, observer, axes=empty)
+    assert not empty.get_images(), "nothing is drawn before a request is refused"
+    # Every result can be drawn, also without colour or opacity.
+    for quantities in ("gaze", "color", "depth", ["position", "depth"], ["visibility", "opacity"]):
+        drawn = nerg.render(scene, EYE, quantities, spp=1).plot()
+        assert any(axes.get_images() for axes in drawn.axes), quantities
     rays = nerg.trace(scene, EYE, [(1, 0, 0)]).to_xarray()
     assert rays.depth.dims == ("ray",)
 
