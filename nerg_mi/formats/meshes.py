@@ -142,7 +142,7 @@ def with_shading_normals(mesh: MeshFile) -> MeshFile:
     Vertices at creases are duplicated. A mesh that has normals, or more than `MAX_CREASED_FACES` faces, is returned
     unchanged: the triangles of such a scan are too small to be distinguished.
     """
-    from scipy.sparse import coo_array
+    from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
     if mesh.normals is not None or not 0 < len(mesh.faces) <= MAX_CREASED_FACES:
@@ -162,7 +162,8 @@ def with_shading_normals(mesh: MeshFile) -> MeshFile:
     face = corners[:, 0] // 3
     is_smooth = (ends[1:] == ends[:-1]).all(axis=1) & ((unit[face[1:]] * unit[face[:-1]]).sum(axis=1) > _CREASE)
     first, second = corners[:-1][is_smooth].ravel(), corners[1:][is_smooth].ravel()
-    links = coo_array((np.ones(len(first), bool), (first, second)), shape=(welded.size, welded.size))
+    # coo_array keeps 64-bit indices, with which SciPy 1.11 returns nonsense without an exception.
+    links = coo_matrix((np.ones(len(first), bool), (first, second)), shape=(welded.size, welded.size))
     count, group = connected_components(links, directed=False)
     normals = np.stack([np.bincount(group, np.repeat(n, 3), count) for n in area_normals.T], axis=1)
     length = np.linalg.norm(normals, axis=1, keepdims=True)

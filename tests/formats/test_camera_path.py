@@ -15,7 +15,7 @@ from nerg_mi.rendering.files import read_frames
 
 def path(count=4):
     poses = np.tile(np.eye(4), (count, 1, 1))
-    poses[:, :3, :3] = Rotation.random(count, rng=np.random.default_rng(0)).as_matrix()
+    poses[:, :3, :3] = Rotation.from_quat(np.random.default_rng(0).normal(size=(count, 4))).as_matrix()
     poses[:, :3, 3] = np.random.default_rng(1).normal(size=(count, 3))
     return CameraPath(poses, np.linspace(40, 60, count), 96, 64, 24.0)
 
