@@ -175,7 +175,7 @@ def test_help_of_an_import_shows_the_options_of_its_preset():
         assert {flag for flag in shared if shows(text, flag)} == options
         assert "".join(get_reader(name).files.replace("`", "").split()) in "".join(text.split())
         assert shows(text, "--skip-bad-lines")
-        assert "".join(text.split()) == "".join(show_help("rays", "import", "--preset", name).split())
+    assert show_help("rays", "import", "--preset", name) == text
     table = show_help("rays", "import", "--map", "origin=x,y,z")
     assert {flag for flag in shared if shows(table, flag)} == {
         o.flag for o in list_options(get_reader("table").Options)

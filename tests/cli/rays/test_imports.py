@@ -10,6 +10,7 @@ from tests.cli.rays.running import run
 
 MAP = ["--map", "origin=x,y,z direction=a,b,c t=t"]
 UNITY = ["--up", "y", "--hand", "left"]
+ALONE = ["--workers", 1]
 ROWS = "t,x,y,z,a,b,c\n0,1,1.6,2,0,0,1\n1,1,1.6,2,0,0,1\n"
 
 
@@ -124,7 +125,7 @@ def test_names_are_not_interpreted_as_markup(tmp_path):
 def test_files_with_faults_can_be_found_despite_pseudonyms(tmp_path, output):
     (tmp_path / "ann.csv").write_text(ROWS)
     (tmp_path / "berta.csv").write_text(ROWS + "2,1,1.6,2,0,0,0\n")
-    salt = [] if output == "r.npz" else ["--salt", tmp_path / "salt"]
+    salt = [] if output == "r.npz" else ["--salt", tmp_path / "salt", *ALONE]
     (tmp_path / "salt").write_bytes(b"s" * 32)
     command = [*MAP, *UNITY, "--person-from", "filename", "--pseudonyms", *salt]
     done = run("import", tmp_path / "ann.csv", tmp_path / "berta.csv", "-o", tmp_path / output, *command)
@@ -143,7 +144,7 @@ def test_all_refused_files_of_a_dataset_are_named(tmp_path):
             ROWS.replace("1.6", "1.6" if name == "ann" else "x" if name == "bo" else "1e5")
         )
     files = [tmp_path / f"{name}.csv" for name in ("ann", "bo", "cy")]
-    done = run("import", *files, "-o", tmp_path / "r.rays", *MAP, *UNITY, "--pseudonyms")
+    done = run("import", *files, "-o", tmp_path / "r.rays", *MAP, *UNITY, *ALONE, "--pseudonyms")
     text = done.output + str(done.exception)
     assert done.exit_code != 0 and "bo.csv" in text and "cy.csv" in text and "2 of 3 files" in text
 
@@ -151,7 +152,7 @@ def test_all_refused_files_of_a_dataset_are_named(tmp_path):
 def test_files_without_rays_are_named(tmp_path):
     (tmp_path / "ann.csv").write_text(ROWS)
     (tmp_path / "bo.csv").write_text("t,x,y,z,a,b,c\n0,1,1.6,2,0,0,0\n")
-    done = run("import", tmp_path / "ann.csv", tmp_path / "bo.csv", "-o", tmp_path / "r.rays", *MAP, *UNITY)
+    done = run("import", tmp_path / "ann.csv", tmp_path / "bo.csv", "-o", tmp_path / "r.rays", *MAP, *UNITY, *ALONE)
     assert done.exit_code == 0, done.output
     (line,) = [line for line in done.output.splitlines() if "gives a ray" in line]
     assert "bo.csv" in line and "ann" not in line
