@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -466,6 +467,9 @@ def test_position_rows_have_their_errors(evaluation):
     assert [r["KLD"] for r in rows] == pytest.approx(expected.tolist()) and "spread" not in rows[0]
     # The four participants look at different heights, so one half predicts the other worse than itself.
     assert all(0 < r["half"] < r["prior"] and r["excess"] == r["KLD"] - r["half"] for r in rows)
+    halves = [[r["half"] for r in uncertainty.score_positions(test, maps, uniform, seed=seed)] for seed in (1, 2)]
+    assert halves[0] != halves[1]
+    np.testing.assert_allclose(halves[1], uncertainty.compute_split_half_errors(test, test.smooth(uniform), 2))
     alone = gaze.make_test(crowd(people=1), test.centres, 0.6, 20.0, 256, min_rays=20)
     assert "half" not in uncertainty.score_positions(alone, maps, uniform)[0]
 
@@ -478,6 +482,62 @@ def test_equal_halves_agree():
         -np.log(1), abs=1e-6
     )
     assert distances[0] > 0.05
+
+
+def test_split_half_error_of_two_participants():
+    """Each half is one participant, so all random halves have the same error, in both directions."""
+    rng, num = np.random.default_rng(0), 64
+    test = gaze.make_test(crowd(people=2), np.array([[-0.5, 0, 1.6]]), 0.6, 20.0, num, min_rays=20)
+    a, b, prior = rng.uniform(0.1, 2, (3, num))
+    test = replace(test, participant_densities=np.stack([a, b])[None], counts=np.full((1, 2), 50.0))
+    normalise = lambda v: v / v.mean()
+    divergence = lambda p, q: np.mean(normalise(p) * np.log(normalise(p) / normalise(q)))
+    expected = (divergence(a, 0.8 * b + 0.2 * prior) + divergence(b, 0.8 * a + 0.2 * prior)) / 2
+    np.testing.assert_allclose(uncertainty.compute_split_half_errors(test, prior[None]), expected, rtol=1e-4)
+
+
+def test_interval_of_correlations_draws_groups():
+    """Quantiles of Spearman's correlation over draws of whole groups, each of positions that agree."""
+    rng, groups, size, count = np.random.default_rng(2), 6, 5, 400
+    group = np.repeat(np.arange(groups), size)
+    support, kld = rng.normal(size=(2, groups))[:, group] + 1e-3 * rng.normal(size=(2, groups * size))
+    rows = [{"support": s, "KLD": e, "group": str(g)} for s, e, g in zip(support, kld, group)]
+    (row,) = uncertainty.correlate_uncertainty(rows, count, seed=7)
+    assert row["rho"] == pytest.approx(spearmanr(-support, kld).statistic)
+    draws = np.random.default_rng(7)
+    values = []
+    for _ in range(count):
+        taken = np.concatenate([np.flatnonzero(group == g) for g in draws.integers(0, groups, groups)])
+        values.append(spearmanr(-support[taken], kld[taken]).statistic)
+    np.testing.assert_allclose([row["rho.low"], row["rho.high"]], np.quantile(values, [0.025, 0.975]), atol=1e-6)
+
+
+def test_interval_of_coverage_draws_participants(evaluation):
+    """1.96 standard deviations of the coverage over draws of whole participants."""
+    test, maps, _ = evaluation
+    at = np.random.default_rng(3).uniform(0, maps.max(), test.sample_participants.shape)
+    # The rays of the first participant are at the lowest densities.
+    at[test.sample_participants == 0] = 0
+    (row,) = uncertainty.measure_calibration(test, {"field": (maps, at)}, 50, seed=5)
+    num = len(test.participants)
+    draws = np.random.default_rng(5).multinomial(num, np.full(num, 1 / num), 50)
+    is_inside = compute_region_levels(maps, at) <= 0.8
+    inside, total = (
+        np.array([np.sum(w[test.sample_participants == p]) for p in range(num)])
+        for w in (is_inside, np.ones_like(is_inside, float))
+    )
+    half_width = 1.96 * np.std(draws @ inside / (draws @ total))
+    assert row["80%"] == pytest.approx(is_inside.mean()) and half_width > 0.01
+    assert row["80%.high"] - row["80%"] == pytest.approx(half_width) == pytest.approx(row["80%"] - row["80%.low"])
+
+
+def test_interval_of_folds_is_that_of_students_t():
+    folds = [[{"method": "field", "bits": v}, {"method": "other", "bits": w}] for v, w in ((1, 0.5), (2, 1), (4, 3.5))]
+    field, _, difference = summarise_folds(folds)
+    for row, values in ((field, [1, 2, 4]), (difference, [0.5, 1, 0.5])):
+        interval = stats.t.interval(0.95, 2, np.mean(values), stats.sem(values))
+        assert row["bits"] == pytest.approx(np.mean(values))
+        np.testing.assert_allclose((row["bits.low"], row["bits.high"]), interval)
 
 
 def test_calibrated_regions_have_nominal_coverage(evaluation):

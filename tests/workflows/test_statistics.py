@@ -111,6 +111,18 @@ def test03_windows_zones_and_cohorts_are_read_from_a_file(folder, tmp_path):
     assert {r["cell"] for r in result.differences} == {"window", "cohort"}
 
 
+def test_the_seed_sets_all_intervals(folder, tmp_path):
+    """Equal seeds give equal intervals, in all tables; other seeds give other ones."""
+    scene = folder / "bare" / "scene.xml"
+    run = lambda seed: statistics(
+        [scene, people()], options=StatisticsOptions(aois=folder / "areas.json", seed=seed, **FAST)
+    )
+    one, again, other = run(1), run(1), run(2)
+    for name, columns in (("aois", "share_low"), ("differences", "low")):
+        values = [[row[columns] for row in getattr(result, name)] for result in (one, again, other)]
+        assert values[0] == values[1] != values[2], name
+
+
 def test_power_is_a_table_of_the_output(folder, tmp_path):
     options = StatisticsOptions(aois=folder / "areas.json", power=0.5, **FAST)
     scene = folder / "bare" / "scene.xml"
