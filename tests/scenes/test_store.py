@@ -2,7 +2,9 @@
 
 import json
 import zipfile
+from pathlib import Path
 
+import drjit as dr
 import numpy as np
 import pytest
 
@@ -11,6 +13,9 @@ mi = pytest.importorskip("mitsuba")
 from nerg_mi.scenes.store import attention_law, cameras, layout, make, shoppers, twin, views  # noqa: E402
 
 from nerg_mi.rays.rays import Rays  # noqa: E402
+from tests.plugins import scenes  # noqa: E402
+from tests.plugins.scenes import still  # noqa: E402
+from tests.plugins.test_nerg_gradients import COLOR, DEPTH, LAST, check  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -247,3 +252,66 @@ def test_committed_sample_is_that_of_seed_zero(tmp_path):
     make.make_shoppers(job)
     _, sample = make.make_rays(job)
     assert read_members(sample) == read_members(make.FOLDER / "shoppers.npz"), "run make --stage rays"
+
+
+# ------------------------------------------------------------------- derivatives of images of the trained store
+
+
+@pytest.fixture(scope="module")
+def aisle():
+    """A picture of 10 x 10 pixels along an aisle, with the gaze of a shopper, and continuous except at edges."""
+    mi.set_variant("llvm_ad_rgb")
+    sensor = still(scenes.camera(mi, size=10, fov=40))
+    sensor["to_world"] = scenes.look_at(mi, (4.4, 2.8, 1.6), (6.5, 3.4, 1.2), (0, 0, 1))
+    folder = Path(make.__file__).parent
+    integrator = scenes.plugin("nerg", depth="expected", stop=1e-12, color_cutoff=0.0, aovs="depth,opacity,gaze")
+    integrator |= {
+        "field": scenes.stored("nerf", folder / "store.safetensors"),
+        "gaze": scenes.stored("gazefield", folder / "shoppers.safetensors"),
+        "observer": scenes.make_observer(mi, 4.4, 2.8, 1.6),
+    }
+    return scenes.scene_with(mi, integrator, sensor)
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize(
+    "name, channels",
+    [
+        ("field.color_net.0", COLOR),
+        ("field.color_net.1", COLOR),
+        ("gaze.emit_net.0", LAST),
+        ("gaze.capture_net.1", LAST),
+        ("gaze.grid.table", LAST),
+    ],
+)
+def test_derivatives_of_weights_equal_differences(aisle, name, channels):
+    check(mi, aisle, f"integrator.{name}", channels, 1e-2)
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0), (0, 0, 1)])
+def test_derivatives_of_the_camera_equal_differences_away_from_edges(aisle, axis):
+    params = mi.traverse(aisle)
+    base = mi.Transform4f(params["sensor.to_world"])
+
+    def image(x):
+        scenes.put(params, "sensor.to_world", mi.Transform4f().translate(x * mi.Vector3f(*axis)) @ base)
+        return mi.render(aisle, params=params, spp=1, seed=0)
+
+    x = mi.Float(0)
+    dr.enable_grad(x)
+    shown = image(x)
+    dr.forward(x)
+    slope = dr.grad(shown).numpy()
+    differences = [
+        (np.array(image(mi.Float(h))) - np.array(image(mi.Float(-h)))).astype(float) / (2 * h) for h in (2e-3, 1e-3)
+    ]
+    scenes.put(params, "sensor.to_world", base)
+    for channels in (COLOR, DEPTH, LAST):
+        got, wide, narrow = (v[..., channels] for v in (slope, *differences))
+        scale = np.maximum(np.abs(narrow), np.median(np.abs(narrow)))
+        # Differences over two distances agree where neither crosses an edge.
+        is_smooth = np.abs(wide - narrow) < 0.05 * scale
+        assert np.isfinite(got).all() and is_smooth.mean() > 0.2
+        error = np.abs(got - narrow)[is_smooth] / scale[is_smooth]
+        assert np.median(error) < 0.04
