@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -16,6 +17,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.formats.checkpoint import read_checkpoint
 from nerg_mi.workflows import progress
 from nerg_mi.workflows.progress import TerminalReporter
+from tools.faults import is_partial, read_whole
 
 
 def test_user_errors_and_internal_errors_have_exit_codes():
@@ -268,7 +270,7 @@ def interrupted(*args, **kwargs):
     global left
     left -= 1
     if left == 0:
-        os.kill(os.getpid(), signal.SIGINT)
+        os.kill(os.getpid(), getattr(signal, os.environ.get("SENT_SIGNAL", "SIGINT")))
     return original(*args, **kwargs)
 
 setattr(owner, function, interrupted)
@@ -276,11 +278,15 @@ nerg_mi.cli.main(arguments)
 """
 
 
-def interrupted(name: str, calls: int, *arguments) -> subprocess.CompletedProcess:
-    """`nerg` in a process that gets SIGINT at a given call of a function."""
+def interrupted(name: str, calls: int, *arguments, sent: str = "SIGINT") -> subprocess.CompletedProcess:
+    """`nerg` in a process that gets a signal at a given call of a function."""
     command = [sys.executable, "-c", _CHILD, f"nerg_mi.{name}", str(calls), *map(str, arguments)]
     return subprocess.run(
-        command, capture_output=True, text=True, timeout=300, env={**os.environ, "PYTHONPATH": os.getcwd()}
+        command,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        env={**os.environ, "PYTHONPATH": os.getcwd(), "SENT_SIGNAL": sent},
     )
 
 
@@ -365,3 +371,38 @@ def test_an_interrupted_command_exits_immediately(name, inputs, tmp_path):
     assert done.returncode == 130 and "Interrupted." in done.stderr and "Traceback" not in done.stderr, done.stderr
     written_files = sorted(p.name for p in tmp_path.rglob("*") if p.is_file())
     assert written_files == (["0.png"] if name == "eval" else [])
+
+
+KILLED = {
+    "bake": "bake {i}/room.ply --rays {i}/rays.npz --detail 2 -m llvm_ad_rgb -o {o}/a.ply -o {o}/a.csv -o {o}/a.json",
+    "report": "report {i}/gaze.safetensors {i}/rays.npz -o {o}/a.html --width 24 --spp 1 --points 200 -m llvm_ad_rgb",
+}
+"""Command lines. Each output is synchronised by `os.fsync`, and then moved to its place by `os.replace`."""
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("function", ["files.atomic.os.fsync", "files.atomic.os.replace"])
+@pytest.mark.parametrize("name, call", [("bake", 1), ("bake", 2), ("bake", 3), ("report", 1)])
+def test_a_killed_command_leaves_outputs_complete_or_as_they_were(name, call, function, inputs, tmp_path):
+    line = KILLED[name].format(i=inputs, o=tmp_path)
+    outputs = [Path(word) for word in line.split() if word.startswith(str(tmp_path))]
+    for path in outputs:
+        path.write_text("earlier")
+    done = interrupted(function, call, *shlex.split(line), sent="SIGKILL")
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    changed = [path for path in outputs if path.read_bytes() != b"earlier"]
+    assert len(changed) < len(outputs)
+    for path in changed:
+        read_whole(path)
+    others = set(tmp_path.iterdir()) - set(outputs)
+    assert all(is_partial(path) or path.suffix == ".lock" for path in others), others
+    # The next start is not disturbed by what is left.
+    done = subprocess.run(
+        [sys.executable, "-c", "from nerg_mi.cli import main; main()", *shlex.split(line)],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    for path in outputs:
+        assert path.read_bytes() != b"earlier"
+        read_whole(path)
