@@ -147,3 +147,13 @@ def test_the_scores_of_the_folds_are_those_of_the_densities():
 def test_uniform_baseline():
     assert np.allclose(make_uniform_baseline()(AT, X), 1 / (4 * np.pi))
     assert make_uniform_baseline()(AT, np.stack([X, X])).shape == (2, 1024)
+
+
+def test_settings_are_scored_with_equal_weight_of_participants():
+    rng = np.random.default_rng(0)
+    person = np.array([0, 0, 0, 0, 2, 2, 1])
+    directions = np.tile([1.0, 0, 0], (7, 1))
+    rays = Rays(np.arange(7.0), person, ("a", "b", "c"), np.zeros((7, 3)), directions, np.ones(7))
+    log_density = rng.normal(size=(3, 7))
+    expected = [[row[:4].mean(), row[6], row[4:6].mean()] for row in log_density]
+    np.testing.assert_allclose(baselines._average_participants(log_density, rays), expected)

@@ -233,6 +233,17 @@ def test_participants_are_scored_on_their_own_rays(rays_evaluation, test_set):
     assert np.ptp([r["KLD"] for r in rows]) > 0.01
 
 
+def test_maps_of_participants_need_enough_rays(test_set):
+    """Map scores are means over the positions at which a participant has enough rays."""
+    uniform = make_uniform_baseline()
+    counts = test_set.counts[:, 0]
+    for min_rays in (counts.min(), counts.min() + 1, counts.max() + 1):
+        row = gaze.score_participants(test_set, {"uniform": uniform}, uniform, int(min_rays))[0]
+        truth = test_set.participant_densities[counts >= min_rays, 0]
+        expected = metrics.kld(truth, np.ones_like(truth), eps=1e-6).mean() if len(truth) else np.nan
+        np.testing.assert_allclose(row["KLD"], expected, rtol=1e-6)
+
+
 def test_training_and_test_rays_are_disjoint(rays_evaluation):
     _, account = hold_out(rays_evaluation, 0.3, zones=2, positions=8, min_rays=8, participant_fraction=0.5)
     for split in gaze.SPLITS:

@@ -14,6 +14,7 @@ from nerg_mi.measures.shares import (
     SamplePoints,
     SummationRule,
     VisibilityCache,
+    _AdaptiveSums,
     compute_isovists,
     compute_visibility,
     find_standing_positions,
@@ -241,3 +242,14 @@ def test_standing_positions():
     assert len(find_standing_positions(*ROOM, 0.5, 1.6, room_depth, -1.0)) == 0
     with pytest.raises(NergError, match="--grid-step"):
         find_standing_positions(*ROOM, 1e-4, 1.6, room_depth, 0.0)
+
+
+def test_errors_of_shares_contain_that_of_the_whole_integral(monkeypatch):
+    """A share is a / b, so its error is that of a over b, and the share times that of b over b, in quadrature."""
+    sums = object.__new__(_AdaptiveSums)
+    sums.observers, sums.seen = np.zeros((1, 3)), np.ones((1, 1), bool)
+    sums.distance, sums.escaped = np.zeros((1, 1)), np.zeros(1)
+    monkeypatch.setattr(sums, "_integrals", lambda: (np.array([[[0.5, 2.0]]]), np.array([[0.01, 0.3]])))
+    shares = sums.shares()
+    assert shares.share[0, 0] == pytest.approx(0.25)
+    assert shares.error[0, 0] == pytest.approx(np.hypot(0.01 / 2, 0.25 * 0.3 / 2))

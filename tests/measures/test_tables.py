@@ -174,6 +174,15 @@ def test_few_participants_are_suppressed():
     )
 
 
+def test_differences_to_few_participants_are_suppressed():
+    """The smaller of the two groups decides, in either order."""
+    for counts in ((12, 4), (4, 12)):
+        cells = {cell: {MEASURED: people(n, 0.2, n, str(n))} for cell, n in zip((A, B), counts)}
+        for minimum, is_shown in ((5, False), (4, True)):
+            rows = difference_rows(("x", "y"), cells, MinParticipantsFilter(minimum), measures=("share",), **HOW)
+            assert rows and all((row["difference"] is not None) == is_shown for row in rows)
+
+
 def test_missing_values_have_a_reason():
     """Of one participant, of predictions, of participants without a visit, and of suppressed values."""
     lone = Participants.from_sums(sums(), ALL, False)
