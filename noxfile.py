@@ -13,7 +13,10 @@ import nox
 nox.options.error_on_missing_interpreters = False
 EXTRAS = ("test", "parquet", "mesh")
 TESTS = (
+    "alignment",
+    "aoi",
     "api",
+    "evaluation",
     "fields",
     "files",
     "formats",
@@ -21,7 +24,9 @@ TESTS = (
     "measures",
     "photos",
     "plugins/test_nerg.py",
+    "probes",
     "rays",
+    "surfaces",
     "transport",
     "workflows/test_statistics.py",
 )

@@ -162,7 +162,7 @@ def with_shading_normals(mesh: MeshFile) -> MeshFile:
     face = corners[:, 0] // 3
     is_smooth = (ends[1:] == ends[:-1]).all(axis=1) & ((unit[face[1:]] * unit[face[:-1]]).sum(axis=1) > _CREASE)
     first, second = corners[:-1][is_smooth].ravel(), corners[1:][is_smooth].ravel()
-    # coo_array keeps 64-bit indices, with which SciPy 1.11 returns nonsense without an exception.
+    # coo_array keeps 64-bit indices, with which older versions of SciPy return nonsense without an exception.
     links = coo_matrix((np.ones(len(first), bool), (first, second)), shape=(welded.size, welded.size))
     count, group = connected_components(links, directed=False)
     normals = np.stack([np.bincount(group, np.repeat(n, 3), count) for n in area_normals.T], axis=1)
