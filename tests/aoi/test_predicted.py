@@ -79,6 +79,11 @@ def test_shares_are_integrals():
     mean = (r2**-1.5 * np.sqrt(r2)).sum() / (r2**-1.5).sum()
     assert result.distance[0, 0] / result.share[0, 0] == pytest.approx(mean, rel=2e-3)
     assert result.visible.tolist() == [[True, False, True]] * 3 and result.support.tolist() == [7, 7, 7]
+    # Distances are in metres, of which a scene of twice the size has half as many.
+    doubled = Law(None, None, Similarity(np.diag([2.0, 2, 2, 1])))
+    in_metres = predict_attention(doubled, OBSERVERS, aois, [(0,), (1,), (0, 1)], 0.0, 120.0, 24, 1 << 15, SILENT)
+    np.testing.assert_allclose(in_metres.distance, result.distance / 2)
+    np.testing.assert_allclose(in_metres.share, result.share)
 
 
 def test_prediction_is_aggregated_by_participant():

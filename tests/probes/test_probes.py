@@ -192,6 +192,19 @@ def test_participants_can_have_equal_weight():
     assert stays == pytest.approx(passes, rel=1e-5)
 
 
+def test_participants_have_equal_weight_in_each_probe():
+    """Two probes in which the same participants have different numbers of rays."""
+    x, person = np.array([0.0] * 9 + [5.0] * 6), np.array([0] * 8 + [1] + [0] * 2 + [1] * 4)
+    origin = x[:, None] * [1.0, 0, 0]
+    rays = Rays(np.arange(15.0), person, ("a", "b"), origin, np.tile([0, 1.0, 0], (15, 1)), np.ones(15))
+    queries = np.array([[0.0, 0, 0], [5.0, 0, 0]])
+    probes = place_probes(rays, 0.2, weights="person", queries=queries, min_rays=1, kappa_rule="fixed", kappa=9.0)
+    assert probes.weights is not None
+    for start, end in zip(probes.offsets[:-1], probes.offsets[1:]):
+        totals = np.bincount(person[probes.indices[start:end]], probes.weights[start:end])
+        assert totals[0] == pytest.approx(totals[1])
+
+
 def test_distance_and_ray_weights_multiply():
     """Rays at 0, R/2 and exactly at the rim; the last has a tiny weight, so that a probe with only rim rays is
     valid."""
