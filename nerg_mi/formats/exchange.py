@@ -6,11 +6,11 @@ To add a format, write a module with a function that writes an `ExchangeScene`, 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -50,22 +50,34 @@ class ExchangePoints:
 
 @dataclass(frozen=True, eq=False)
 class ExchangeRays:
-    """Gaze of a participant over time: ``times`` (N,) in seconds, ascending, ``origins`` and ``ends`` (N, 3)."""
+    """Gaze of a participant over time: ``times`` (N,) in seconds, ascending, ``origins`` and ``ends`` (N, 3).
+
+    ``tracking`` tells what the directions are, as `nerg_mi.rays.rays.TRACKING`.
+    """
 
     participant: str
     times: np.ndarray
     origins: np.ndarray
     ends: np.ndarray
+    tracking: str = "unknown"
+
+    @property
+    def origin_name(self) -> str:
+        """Name of the object at the origins: ``heads`` for directions of heads, otherwise ``eyes``."""
+        return "heads" if self.tracking == "head" else "eyes"
 
 
 @dataclass(frozen=True, eq=False)
 class ExchangeFixations:
-    """Fixations of a participant: start ``times`` and ``durations`` (N,) in seconds, and ``positions`` (N, 3)."""
+    """Fixations of a participant: start ``times`` and ``durations`` (N,) in seconds, ``positions`` (N, 3), ``kinds``
+    (N,), and their ``definition`` with its parameters."""
 
     participant: str
     times: np.ndarray
     durations: np.ndarray
     positions: np.ndarray
+    kinds: np.ndarray
+    definition: Mapping[str, Any]
 
 
 @dataclass(frozen=True, eq=False)

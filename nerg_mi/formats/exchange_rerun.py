@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -65,14 +66,17 @@ def write_rerun(scene: ExchangeScene, path: Path) -> None:
         lines = np.stack([rays.origins, rays.ends], axis=1).astype(np.float32)
         recording.send_columns(f"scene/gaze/{name}/rays", time, rr.LineStrips3D.columns(strips=list(lines)))
         heads = rr.Points3D.columns(positions=rays.origins.astype(np.float32))
-        recording.send_columns(f"scene/gaze/{name}/eyes", time, heads)
+        recording.send_columns(f"scene/gaze/{name}/{rays.origin_name}", time, heads)
+        recording.log(f"scene/gaze/{name}", rr.AnyValues(tracking=rays.tracking), static=True)
     for fixations in scene.fixations:
         name = names[fixations.participant]
         radii = _FIXATION_RADIUS / scene.meters_per_unit * np.sqrt(fixations.durations)
         points = rr.Points3D.columns(positions=fixations.positions.astype(np.float32), radii=radii.astype(np.float32))
-        durations = rr.AnyValues.columns(duration=fixations.durations)
+        durations = rr.AnyValues.columns(duration=fixations.durations, kind=fixations.kinds.tolist())
         time = [rr.TimeColumn(TIMELINE, duration=fixations.times)]
         recording.send_columns(f"scene/gaze/{name}/fixations", time, [*points, *durations])
+        definition = rr.AnyValues(definition=json.dumps(dict(fixations.definition)))
+        recording.log(f"scene/gaze/{name}/fixations", definition, static=True)
     write_bytes(path, memory.drain_as_bytes())
     recording.disconnect()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 from importlib import import_module
 from pathlib import Path
@@ -96,8 +97,10 @@ def write_usd(scene: ExchangeScene, path: Path) -> None:
     names = scene.name_participants(Tf.MakeValidIdentifier)
     for rays in scene.rays:
         target = f"/scene/gaze/{names[rays.participant]}"
-        UsdGeom.Xform.Define(stage, target).GetPrim().SetDisplayName(rays.participant)
-        operation = UsdGeom.Xform.Define(stage, f"{target}/eyes").AddTranslateOp()
+        participant = UsdGeom.Xform.Define(stage, target).GetPrim()
+        participant.SetDisplayName(rays.participant)
+        participant.SetCustomDataByKey("tracking", rays.tracking)
+        operation = UsdGeom.Xform.Define(stage, f"{target}/{rays.origin_name}").AddTranslateOp()
         for time, origin in zip(rays.times, rays.origins):
             operation.Set(Gf.Vec3d(*map(float, origin)), float(time * TIME_CODES_PER_SECOND))
         lines = np.stack([rays.origins, rays.ends], axis=1).reshape(-1, 3)
@@ -117,6 +120,8 @@ def write_usd(scene: ExchangeScene, path: Path) -> None:
         prim.CreateExtentAttr(vectors(_extent(fixations.positions)))
         named = {"time": fixations.times, "duration": fixations.durations}
         add_primvars(prim, named, UsdGeom.Tokens.vertex, "seconds")
+        prim.GetPrim().SetCustomDataByKey("definition", json.dumps(dict(fixations.definition)))
+        prim.GetPrim().SetCustomDataByKey("kinds", " ".join(fixations.kinds.tolist()))
     try:
         stage.Export(str(path))
     except Tf.ErrorException as error:

@@ -21,8 +21,8 @@ from nerg_mi.errors import NergError, sanitize
 from nerg_mi.files.atomic import create_folder_atomically, write_bytes, write_text
 from nerg_mi.files.tables import write_json
 
-from .filters import find_sessions
-from .rays import Rays
+from .filters import estimate_interval, find_sessions
+from .rays import TRACKING, Rays
 from .readers.bids import (
     CONFIDENCE,
     DESCRIPTION,
@@ -34,6 +34,7 @@ from .readers.bids import (
     POINT,
     SOURCE_NAME,
     TIME,
+    TRACKING_KEY,
     WORLD,
 )
 
@@ -63,6 +64,7 @@ def write_bids(
     name: str = "Gaze in the world",
     events: BidsEvents | None = None,
     event_columns: Mapping[str, Mapping[str, Any]] | None = None,
+    event_rules: Mapping[str, Any] | None = None,
     provenance: Mapping[str, Any] | None = None,
 ) -> list[Path]:
     """Write ``rays`` as the BIDS dataset ``folder``, which must not exist or be empty; returns the files of gaze.
@@ -78,6 +80,8 @@ def write_bids(
         Events, written next to the gaze (``*_physioevents.tsv.gz``).
     event_columns
         Descriptions of the events' kinds (``trial_type``) and further columns, as BIDS objects.
+    event_rules
+        How the events were detected, with all parameters.
     provenance
         Entry of ``GeneratedBy``.
 
@@ -85,10 +89,15 @@ def write_bids(
     ------
     NergError
         For a label with other characters than letters and digits, for rays without two times of a participant, and for
-        a folder that is not empty.
+        a folder that is not empty, and for directions of heads.
     """
     if not re.fullmatch("[0-9a-zA-Z]+", task):
         raise NergError(f'the label of a task is made of letters and digits, not "{sanitize(task, 40)}"; change --task')
+    if rays.tracking in ("head", "mixed"):
+        raise NergError(
+            f"BIDS describes eye tracking, but these rays are {TRACKING[rays.tracking]}; export those of eyes; "
+            "heads are written as .parquet (Rays.save) or as a data frame (to_dataframe)"
+        )
     events = events if events is not None and len(events.row) else None  # BIDS has no metadata of missing files
     runs = _split_runs(rays)
     rate = _find_rate(rays, [rows for rows, *_ in runs])
@@ -101,7 +110,10 @@ def write_bids(
         _write_participants(root, rays, labels)
         write_json(root / f"task-{task}_physio.json", _describe_gaze(rays, task, columns))
         if events is not None:
-            write_json(root / f"task-{task}_physioevents.json", _describe_events(events, event_columns or {}, task))
+            write_json(
+                root / f"task-{task}_physioevents.json",
+                _describe_events(events, event_columns or {}, event_rules, task),
+            )
         run_of_row = np.empty(len(rays), np.int64)
         for k, (rows, *_) in enumerate(runs):
             run_of_row[rows] = k
@@ -142,10 +154,9 @@ def _split_runs(rays: Rays) -> list[tuple[np.ndarray, int, int]]:
 
 
 def _measure_rate(t: np.ndarray) -> float | None:
-    """Samples per second, from the median interval; None if no time increases."""
-    steps = np.diff(t)
-    steps = steps[steps > 0]
-    return float(f"{1 / np.median(steps):.6g}") if len(steps) else None
+    """Samples per second; None if no time increases."""
+    interval = estimate_interval(np.diff(t))
+    return float(f"{1 / interval:.6g}") if interval > 0 else None
 
 
 def _find_rate(rays: Rays, runs: Sequence[np.ndarray]) -> float:
@@ -280,6 +291,7 @@ def _describe_gaze(rays: Rays, task: str, columns: Iterable[str]) -> dict[str, A
         "TaskName": task,
         "PhysioType": "eyetrack",
         "RecordedEye": _EYES.get(str(rays.metadata.get("eye")), "cyclopean"),
+        TRACKING_KEY: rays.tracking,
         "SampleCoordinateSystem": GAZE_IN_WORLD,
         WORLD: world,
         "Columns": list(columns),
@@ -287,11 +299,14 @@ def _describe_gaze(rays: Rays, task: str, columns: Iterable[str]) -> dict[str, A
     }
 
 
-def _describe_events(events: BidsEvents, descriptions: Mapping[str, Mapping[str, Any]], task: str) -> dict[str, Any]:
+def _describe_events(
+    events: BidsEvents, descriptions: Mapping[str, Mapping[str, Any]], rules: Mapping[str, Any] | None, task: str
+) -> dict[str, Any]:
     names = ["onset", "duration", "trial_type", *events.columns]
     return {
         "TaskName": task,
         "Description": "Events detected in the gaze samples.",
+        **({} if rules is None else {"Detection": dict(rules)}),
         "OnsetSource": TIME,
         "Columns": names,
         "onset": {"Description": "Time of the first sample of the event.", "Units": "s"},

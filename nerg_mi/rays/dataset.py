@@ -28,8 +28,8 @@ from nerg_mi.files.safe_read import (
 from nerg_mi.files.values import find_names, to_name
 
 from .filters import select_mask
-from .rays import VERSION as RAYS_VERSION
 from .rays import (
+    FRAME,
     Rays,
     import_pyarrow,
     merge_counts,
@@ -39,6 +39,7 @@ from .rays import (
     read_metadata,
     sample_rows,
 )
+from .rays import VERSION as RAYS_VERSION
 
 # ---- Layout of a dataset ----
 #
@@ -504,6 +505,7 @@ def _make_rays(pa: Any, table: Any, path: Path, source: SourceManifest) -> Rays:
             head=vector("head") if "head_x" in names else None,
             cohort=cohort,
             cohorts=cohorts,
+            metadata={"frame": dict(FRAME), "tracking": source.metadata.get("tracking", "unknown")},
         )
     except NergError as error:
         raise _mismatched_part(path, str(error).split(";")[0]) from error

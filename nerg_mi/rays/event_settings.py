@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 from nerg_mi.ranges import SECONDS, Range, ValidatedDataclass, setting
 
@@ -16,6 +17,9 @@ KINDS = {
     "loss": "longer pause between samples",
 }
 """Kinds of events, and what they are."""
+
+FIXATIONS = ("fixation", "vor_fixation")
+"""The kinds of events that are fixations, in all exports, figures and reports."""
 
 MAX_STEP = 0.1
 """Longest interval in seconds between consecutive samples."""
@@ -58,3 +62,15 @@ class EventRules(ValidatedDataclass):
         MAX_STEP, "Longest interval between consecutive samples in seconds; a longer one is a pause.", allowed=SECONDS
     )
     max_blink: float = setting(0.5, "Longest pause in seconds that is a blink.", allowed=SECONDS)
+
+    def describe(self, dispersion: float | None = None) -> dict[str, Any]:
+        """Return the definition of a fixation and its parameters, as exports record them; ``dispersion`` as for
+        `nerg_mi.rays.events.label_fixations`."""
+        if dispersion is not None:
+            return {
+                "algorithm": "I-DT",
+                "dispersion": dispersion,
+                "min_fixation": self.min_fixation,
+                "max_step": self.max_step,
+            }
+        return {"algorithm": "velocities of gaze and head (I-VT), kinds " + " and ".join(FIXATIONS), **asdict(self)}

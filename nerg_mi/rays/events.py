@@ -9,9 +9,9 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.maths import vmf
 
-from .event_settings import KINDS, MAX_STEP, EventRules
+from .event_settings import FIXATIONS, KINDS, MAX_STEP, EventRules
 from .filters import MAX_PAUSE, group_by_person
-from .rays import Rays
+from .rays import TRACKING, Rays
 
 # ---- Fixations ----
 #
@@ -21,8 +21,11 @@ from .rays import Rays
 # return the number of the fixation of each ray, or -1; numbers increase by participant and time.
 
 
+MIN_FIXATION_IVT, MIN_FIXATION_IDT = 0.06, 0.1  # default minimum durations in seconds
+
+
 def detect_fixations_ivt(
-    rays: Rays, velocity: float = 100.0, min_duration: float = 0.06, gap: float = MAX_STEP
+    rays: Rays, velocity: float = 100.0, min_duration: float = MIN_FIXATION_IVT, gap: float = MAX_STEP
 ) -> np.ndarray:
     """Detect fixations by velocity (I-VT): runs of rays that turn at most by ``velocity`` degrees per second and last
     at least ``min_duration`` seconds.
@@ -31,6 +34,7 @@ def detect_fixations_ivt(
     default of 100 degrees per second suits gaze in the world frame of people who walk and turn; 30 is common for a
     stationary head. Returns (N,) int64.
     """
+    require_gaze(rays)
     _require_positive(velocity=velocity, min_duration=min_duration, gap=gap)
     order, step, gaze = _measure_steps(rays)
     with np.errstate(invalid="ignore"):
@@ -42,7 +46,7 @@ def detect_fixations_ivt(
 
 
 def detect_fixations_idt(
-    rays: Rays, dispersion: float = 3.0, min_duration: float = 0.1, gap: float = MAX_STEP
+    rays: Rays, dispersion: float = 3.0, min_duration: float = MIN_FIXATION_IDT, gap: float = MAX_STEP
 ) -> np.ndarray:
     """Detect fixations by dispersion (I-DT): a window of ``min_duration`` seconds with a dispersion of at most
     ``dispersion`` degrees grows as long as this holds; otherwise the window starts one ray later.
@@ -51,6 +55,7 @@ def detect_fixations_idt(
     sphere at the window's first direction (azimuthal equidistant projection, horizontal and vertical axes). Returns
     (N,) int64.
     """
+    require_gaze(rays)
     _require_positive(dispersion=dispersion, min_duration=min_duration, gap=gap)
     order, starts = group_by_person(rays)
     t, d = rays.t[order], rays.direction[order]
@@ -71,6 +76,45 @@ def detect_fixations_idt(
     out = np.empty_like(label)
     out[order] = label
     return out
+
+
+def require_gaze(rays: Rays) -> None:
+    """Raise `NergError` for directions of heads, whose fixations and saccades are no eye movements."""
+    if rays.tracking in ("head", "mixed"):
+        raise NergError(
+            f"eye movements are detected in gaze, but these rays are {TRACKING[rays.tracking]}; use rays of an eye "
+            "tracker, or leave out their fixations and events"
+        )
+
+
+def label_fixations(
+    rays: Rays, rules: EventRules | None = None, dispersion: float | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Label the fixations of rays, by the one definition of all exports, figures and reports.
+
+    Fixations are the events of `detect_events` whose kind is one of `FIXATIONS`; with a ``dispersion`` in degrees those
+    of `detect_fixations_idt`. `EventRules.describe` returns the definition and its parameters.
+
+    Returns
+    -------
+    label : ndarray of shape (N,), int64
+        Number of the fixation of each ray, by participant and time; -1: none.
+    kinds : ndarray of shape (F,)
+        Kinds of the fixations, of `FIXATIONS`.
+    """
+    rules = rules or EventRules()
+    if dispersion is not None:
+        label = detect_fixations_idt(rays, dispersion, rules.min_fixation, rules.max_step)
+        return label, np.full(label.max(initial=-1) + 1, FIXATIONS[0])
+    events = detect_events(rays, rules)
+    mask = np.isin(events.kind, FIXATIONS)
+    order, _ = group_by_person(rays)
+    position = np.empty(len(rays), np.int64)
+    position[order] = np.arange(len(rays))
+    run, sample = expand_runs(np.stack([position[events.first[mask]], position[events.last[mask]]], axis=1), 1)
+    label = np.full(len(rays), -1, np.int64)
+    label[order[sample]] = run
+    return label, events.kind[mask]
 
 
 def average_fixations(rays: Rays, label: np.ndarray) -> tuple[Rays, np.ndarray]:
@@ -279,6 +323,7 @@ def detect_events(rays: Rays, rules: EventRules | None = None) -> Events:
     away both from its mean direction and, where hit points are known, from their mean, which is fixed also for somebody
     who walks past. Shorter slow runs are no event. A pause longer than a minute separates recordings.
     """
+    require_gaze(rays)
     rules = rules or EventRules()
     v = measure_velocities(rays)
     with np.errstate(invalid="ignore"):

@@ -192,6 +192,22 @@ def find_sessions(rays: Rays) -> Sessions:
     return Sessions(order, starts, sorted_(person)[starts[:-1]], np.r_[False, back[new - 1]])
 
 
+_MAX_JITTER = 1.5  # intervals longer than this multiple of their median are gaps
+
+
+def estimate_interval(steps: np.ndarray) -> float:
+    """Estimate the sampling interval from the intervals (N,) between successive samples; NaN without positive ones.
+
+    The mean of the positive intervals without gaps: their median is biased by the resolution of the clock, as 17 ms at
+    60 Hz in whole milliseconds.
+    """
+    steps = steps[steps > 0]
+    if not steps.size:
+        return float("nan")
+    median = np.partition(steps, len(steps) // 2)[len(steps) // 2]
+    return float(steps[steps <= _MAX_JITTER * median * (1 + 1e-6)].mean())
+
+
 # ---- Frozen gaze: gaze that does not move while the head does, as trackers write when they lose the eyes ----
 
 _MAX_STILL_STEP = 2e-4  # radians between successive rays; tracked eyes have more noise

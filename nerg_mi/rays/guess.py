@@ -15,6 +15,7 @@ import numpy as np
 from nerg_mi.errors import NergError, sanitize
 from nerg_mi.files.safe_read import read_line_blocks, resolve_path
 
+from .filters import estimate_interval
 from .readers import poses
 from .readers.base import MAX_BAD_LINE_FRACTION, UNITS, Reader
 from .readers.cells import is_missing
@@ -135,9 +136,9 @@ def _is_plausible_rate(rate: float) -> bool:
 
 
 def _find_rate(times: np.ndarray) -> float:
-    """Samples per unit of ``times`` (n,), from the median step; NaN without steps."""
+    """Samples per unit of ``times`` (n,); NaN without steps."""
     step = np.diff(times[np.isfinite(times)])
-    return 1 / float(np.median(step[step > 0])) if (step > 0).any() else np.nan
+    return 1 / estimate_interval(step)
 
 
 def is_unit(vectors: np.ndarray, tolerance: float = 0.02) -> bool:

@@ -5,7 +5,8 @@ Implements the methods of `nerg_mi.rays.rays.Rays` that need the modules above i
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -13,13 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, sanitize
 from nerg_mi.files.dataframes import DataFrameReader, make_dataframe
 from nerg_mi.files.html import key_value_table
 from nerg_mi.files.values import to_names, to_numbers, to_seconds
 
 from .quality import RaysSummary, format_quality_report, make_quality_report, summarise
-from .rays import Rays
+from .rays import TRACKING, Rays, check_tracking, merge_metadata, merge_rays, merge_tracking
 from .readers.base import RaysBuilder, TrackingFrame
 
 # ---- Rays from arrays ----
@@ -35,6 +36,7 @@ def from_arrays(
     heads: ArrayLike | None = None,
     confidence: ArrayLike | None = None,
     cohorts: str | ArrayLike | None = None,
+    tracking: str | None = None,
     frame: tuple[str, str, str] = ("z", "right", "m"),
     unused: Sequence[str] = (),
 ) -> Rays:
@@ -42,6 +44,8 @@ def from_arrays(
 
     ``frame`` are up axis, handedness and unit; ``unused`` are names of columns to report as unused.
     """
+    if tracking is not None:
+        check_tracking(tracking)
     t = to_seconds(times, "times")
     if t.ndim != 1 or not len(t):
         raise NergError(f"times must have the shape (N,) with at least one sample, got {t.shape}")
@@ -65,6 +69,7 @@ def from_arrays(
         arrays["origins"],
         arrays["directions"],
         rows=np.arange(1, count + 1),
+        tracking=tracking or ("unknown" if heads is None else "eye"),
         confidence=arrays.get("confidence"),
         hit=arrays.get("hits"),
         head=arrays.get("heads"),
@@ -73,10 +78,45 @@ def from_arrays(
     return builder.build()
 
 
+# ---- Concatenation ----
+
+
+def concatenate(rays: Iterable[Rays]) -> Rays:
+    """Concatenate rays, see `Rays.concatenate`."""
+    parts = [rays] if isinstance(rays, Rays) else list(rays)
+    if not parts:
+        raise NergError("there are no rays to concatenate; pass one set or more")
+    for k, part in enumerate(parts):
+        if not isinstance(part, Rays):
+            raise NergError(
+                f"element {k} must be Rays, got {type(part).__name__}; files are read by load_rays, arrays by "
+                "Rays.from_arrays"
+            )
+    # The frame of rays, and the transform from it to that of an environment.
+    for key, what in {"frame": "frame", "place_from_rays": "alignment to the environment (place_from_rays)"}.items():
+        values = [part.metadata.get(key) for part in parts]
+        if other := next((k for k, value in enumerate(values) if value != values[0]), None):
+            raise NergError(
+                f"element {other} has another {what} than element 0 ({values[other]} and {values[0]}); transform one "
+                "of them first"
+            )
+    names = [name for part in parts for name in part.participants]
+    if repeated := sorted({name for name in names if names.count(name) > 1}):
+        shown = ", ".join(sanitize(name, 40) for name in repeated[:5]) + (", ..." if len(repeated) > 5 else "")
+        warnings.warn(
+            f"{shown} {'is a participant' if len(repeated) == 1 else 'are participants'} of several sets, and counted "
+            "as one: rename them before if they are different people",
+            stacklevel=3,
+        )
+    metadata = merge_metadata([part.metadata for part in parts])
+    steps = [step for part in parts for step in part.metadata.get("steps", [])]
+    return merge_rays(parts, {**metadata, **({"steps": steps} if steps else {})})
+
+
 # ---- Data frames ----
 
-_NAMES, _VECTORS = ("participant", "cohort"), ("origin", "direction", "hit", "head")
-ROLES = ("time", "participant", "origin", "direction", "hit", "head", "confidence", "cohort")
+_NAMES, _VECTORS = ("participant", "cohort", "tracking"), ("origin", "direction", "hit", "head")
+ROLES = ("time", "participant", "origin", "direction", "hit", "head", "confidence", "cohort", "tracking")
 """What columns of a data frame can contain."""
 
 _REQUIRED = ("time", "origin", "direction")
@@ -86,7 +126,9 @@ def _default_columns(role: str) -> list[str]:
     return [f"{role}_{axis}" for axis in "xyz"] if role in _VECTORS else [role]
 
 
-def from_dataframe(table: Any, columns: Mapping[str, Any] | None, frame: tuple[str, str, str]) -> Rays:
+def from_dataframe(
+    table: Any, columns: Mapping[str, Any] | None, tracking: str | None, frame: tuple[str, str, str]
+) -> Rays:
     """Make rays of a data frame, see `Rays.from_dataframe`."""
     reader = DataFrameReader(table)
     # A tuple is the name of one column with several levels, unless it is a vector.
@@ -119,6 +161,15 @@ def from_dataframe(table: Any, columns: Mapping[str, Any] | None, frame: tuple[s
         role: reader.read_vectors(names) if role in _VECTORS else read[role](names[0])
         for role, names in choices.items()
     }
+    if tracking is None and "tracking" in values:
+        kinds = np.unique(values["tracking"]).tolist()
+        if unknown := [kind for kind in kinds if kind not in TRACKING]:
+            column = choices["tracking"][0]
+            raise NergError(
+                f'the column "{column}" contains {sanitize(unknown[0], 40)!r}, but what was tracked is one of '
+                f"{', '.join(TRACKING)}; correct it, or pass tracking="
+            )
+        tracking = merge_tracking(kinds)
     return from_arrays(
         values["origin"],
         values["direction"],
@@ -128,6 +179,7 @@ def from_dataframe(table: Any, columns: Mapping[str, Any] | None, frame: tuple[s
         heads=values.get("head"),
         confidence=values.get("confidence"),
         cohorts=values.get("cohort"),
+        tracking=tracking,
         frame=frame,
         unused=[name for k, name in enumerate(reader.names) if k not in used],
     )
@@ -145,6 +197,8 @@ def to_dataframe(rays: Rays, library: str | None) -> Any:
             columns[names[name]] = np.array(texts, dtype=object)[values]
         else:
             columns[names.get(name, name)] = values
+    if rays.tracking != "unknown":
+        columns["tracking"] = np.full(len(rays), rays.tracking, object)
     return make_dataframe(columns, library)
 
 
@@ -200,4 +254,5 @@ def describe_rays(rays: Rays) -> str:
     people = f"{present} participant{'' if present == 1 else 's'}"
     span = f"t {rays.t.min():.4g} to {rays.t.max():.4g} s" if len(rays) else "no times"
     extra = [f"{name}s" for name in ("hit", "head", "cohort") if getattr(rays, name) is not None]
-    return f"<Rays: {len(rays):,} of {people}, {span}{', with ' + ', '.join(extra) if extra else ''}>"
+    heads = {"head": "directions of heads, ", "mixed": "some directions of heads, "}.get(rays.tracking, "")
+    return f"<Rays: {len(rays):,} of {people}, {heads}{span}{', with ' + ', '.join(extra) if extra else ''}>"

@@ -132,7 +132,7 @@ def _replace_names(metadata: dict, persons: tuple[str, ...], person: Callable, d
 
 
 # Keys whose values this package writes; they may contain a participant's name by chance.
-_PLAIN_KEYS = ("frame", "source_frame", "transform", "rows_read", "preset", "tick", "degrees", "forward")
+_PLAIN_KEYS = ("frame", "tracking", "source_frame", "transform", "rows_read", "preset", "tick", "degrees", "forward")
 
 
 def _make_alias(file: str, digest: Callable) -> str:

@@ -14,9 +14,10 @@ from nerg_mi.files.safe_read import sanitize
 from .checks import RECORDING_CHECKS, RayStatistics
 from .dataset import RayDataset
 from .direction_checks import DIRECTION_CHECKS
+from .event_settings import FIXATIONS
 from .events import Events, angles_about, detect_events, expand_runs
-from .filters import argsort_by_person_time, find_sessions
-from .rays import Rays
+from .filters import argsort_by_person_time, estimate_interval, find_sessions
+from .rays import TRACKING, Rays
 
 # ---- The list of checks, and the warnings of all of them ----
 
@@ -47,7 +48,7 @@ class RaysSummary:
     rays: int
     persons: int
     duration: float  # recorded seconds of all participants, without gaps longer than `MAX_GAP`
-    sampling_rate: float  # Hz, from the median interval; NaN if no participant has two times
+    sampling_rate: float  # Hz, within recordings without gaps; NaN if no participant has two times
     box_low: np.ndarray  # (3,) bounding box of the origins, metres
     box_high: np.ndarray
     eye_height: np.ndarray  # (3,) 5th, 50th and 95th percentile of the origins' heights, metres
@@ -77,7 +78,7 @@ def summarise(rays: Rays) -> RaysSummary:
     speed /= step
     speed_p95 = float(np.percentile(speed, 95, overwrite_input=True)) if speed.size else float("nan")
     del speed
-    rate = 1.0 / (float(np.median(step)) if step.size else median_step)
+    rate = 1.0 / (estimate_interval(step) if step.size else median_step)
 
     num_hits, distance = _measure_hits(rays)
     height = np.percentile(rays.origin[:, 2], [5, 50, 95])
@@ -153,6 +154,7 @@ def make_quality_report(rays: Rays, summary: RaysSummary) -> list[tuple[str, str
     present = [rays.persons[p] for p in np.flatnonzero(np.bincount(rays.person))]
     lines = [
         ("samples", f"{s.rays:,} of {s.rows_read:,} rows"),
+        ("tracking", TRACKING[rays.tracking]),
         (
             "participants",
             f"{s.persons}: {', '.join(present[:_MAX_NAMES])}{', ...' if len(present) > _MAX_NAMES else ''}",
@@ -338,14 +340,14 @@ def measure_recordings(
     session_of = np.empty(len(rays), np.int64)
     for k, rows in enumerate(rows_of):
         session_of[rows] = k
-    is_fixation = np.isin(events.kind, ("fixation", "vor_fixation"))
+    is_fixation = np.isin(events.kind, FIXATIONS)
     precision = _measure_precision(rays, events, is_fixation)
     fixation_session = session_of[events.first[is_fixation]]
     out = []
     for k, (rows, person) in enumerate(zip(rows_of, sessions.person.tolist())):
         name = rays.persons[person]
         t = np.sort(rays.t[rows])
-        interval = float(np.median(np.diff(t))) if len(t) > 1 else float("nan")
+        interval = estimate_interval(np.diff(t))
         duration = float(t[-1] - t[0] + interval) if interval > 0 else float("nan")
         of_fixations = precision[fixation_session == k]
         medians = np.median(of_fixations, axis=0) if len(of_fixations) else np.full(2, np.nan)

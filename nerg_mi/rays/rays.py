@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, sanitize
 from nerg_mi.files.atomic import replace_atomically
 from nerg_mi.files.safe_read import (
     MAX_JSON_BYTES,
@@ -157,6 +157,7 @@ _METADATA_CHECKS = {
         "a mapping of persons to distances in metres",
     ),
     "floor": (_is_text, "text"),
+    "tracking": (lambda v: isinstance(v, str) and v in TRACKING, "eye, head, mixed or unknown"),
     "tick": (lambda v: _is_number(v) and v > 0, "a time in seconds"),
 }
 
@@ -364,6 +365,27 @@ _BLOCK = 1 << 18
 
 FRAME = {"units": "m", "up": "z", "handedness": "right"}
 
+TRACKING = {
+    "eye": "gaze (eye tracking)",
+    "head": "directions of heads (head tracking), not gaze",
+    "mixed": "gaze of some samples, and directions of heads of others",
+    "unknown": "not stated: gaze, or directions of heads",
+}
+"""What directions are; unknown in files of earlier versions. Those of heads have no fixations and saccades."""
+
+
+def check_tracking(tracking: str) -> str:
+    """Return ``tracking``. Raises `NergError` unless it is one of `TRACKING`."""
+    if not isinstance(tracking, str) or tracking not in TRACKING:
+        raise NergError(f"tracking must be one of {', '.join(TRACKING)}, got {sanitize(repr(tracking), 40)}")
+    return tracking
+
+
+def merge_tracking(kinds: Iterable[str]) -> str:
+    """Return what directions of several kinds are together: "mixed" if some, but not all, are of heads."""
+    kinds = set(kinds) or {"unknown"}
+    return kinds.pop() if len(kinds) == 1 else "mixed" if kinds & {"head", "mixed"} else "unknown"
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Rays:
@@ -387,9 +409,9 @@ class Rays:
     direction: np.ndarray  # (N, 3) unit
     confidence: np.ndarray  # (N,) in [0, 1]
     hit: np.ndarray | None = None  # (N, 3) metres: point of regard on a surface, NaN if unknown
-    # frame (units, up, handedness) and, after an import: source_frame, sources (file name and sha256), transform
-    # (4x4 from the source's frame), rows_read, dropped (reason, count and rows of each source), missing (counts of
-    # hit points that were fill values), unused_columns (names), steps (processing since the import).
+    # frame (units, up, handedness), tracking (of `TRACKING`) and, after an import: source_frame, sources (file name and
+    # sha256), transform (4x4 from the source's frame), rows_read, dropped (reason, count and rows of each source),
+    # missing (counts of hit points that were fill values), unused_columns (names), steps (processing since the import).
     metadata: dict[str, Any] = field(default_factory=lambda: {"frame": dict(FRAME)})
     cohort: np.ndarray | None = None  # (N,) int32 index into cohorts
     cohorts: tuple[str, ...] = ()  # names of groups of participants
@@ -470,6 +492,11 @@ class Rays:
         return self.select(index)
 
     @property
+    def tracking(self) -> str:
+        """What the directions are: ``eye`` (gaze), ``head``, ``mixed`` (some of both) or ``unknown``."""
+        return self.metadata.get("tracking", "unknown")
+
+    @property
     def participants(self) -> tuple[str, ...]:
         """Names of the participants that have rays."""
         return _used_names(self.person, self.persons)
@@ -493,6 +520,7 @@ class Rays:
         heads: ArrayLike | None = None,
         confidence: ArrayLike | None = None,
         cohorts: str | ArrayLike | None = None,
+        tracking: str | None = None,
         up: str = "z",
         handedness: str = "right",
         units: str = "m",
@@ -520,6 +548,9 @@ class Rays:
             Confidence from 0 to 1. Default: 1.
         cohorts : str or array_like of shape (N,), optional
             Name of the group of participants of each ray.
+        tracking : str, optional
+            What the directions are: ``eye`` (gaze) or ``head``, which has no fixations and is not exported as eye
+            tracking. Default: ``eye`` with ``heads``, otherwise ``unknown``.
         up, handedness, units : str
             Frame of the arrays: the up axis (``x``, ``y``, ``z``, ``-x``, ``-y``, ``-z``), ``right`` or ``left``, and
             ``m``, ``cm`` or ``mm``. Unity has ``up="y", handedness="left"``.
@@ -551,6 +582,7 @@ class Rays:
             heads=heads,
             confidence=confidence,
             cohorts=cohorts,
+            tracking=tracking,
             frame=(up, handedness, units),
         )
 
@@ -560,6 +592,7 @@ class Rays:
         table: Any,
         columns: Mapping[str, str | Sequence[str]] | None = None,
         *,
+        tracking: str | None = None,
         up: str = "z",
         handedness: str = "right",
         units: str = "m",
@@ -571,12 +604,12 @@ class Rays:
         table : data frame
             One row per sample. Times may be numbers in seconds, dates or durations.
         columns : mapping, optional
-            Columns by role: ``time``, ``participant``, ``origin``, ``direction``, ``hit``, ``head``, ``confidence`` and
-            ``cohort``; positions and directions have three columns. ``time``, ``origin`` and ``direction`` are
-            required; without ``participant`` all rows are of one. A column with several levels is named by a tuple.
-            Default: the columns of `to_dataframe`.
-        up, handedness, units : str
-            Frame of the values, as in `from_arrays`.
+            Columns by role: ``time``, ``participant``, ``origin``, ``direction``, ``hit``, ``head``, ``confidence``,
+            ``cohort`` and ``tracking``; positions and directions have three columns. ``time``, ``origin`` and
+            ``direction`` are required; without ``participant`` all rows are of one. A column with several levels is
+            named by a tuple. Default: the columns of `to_dataframe`.
+        tracking, up, handedness, units : str
+            What the directions are, and their frame, as in `from_arrays`.
 
         Returns
         -------
@@ -596,7 +629,39 @@ class Rays:
         >>> nerg.Rays.from_dataframe(table, columns)
         <Rays: 2 of 1 participant, t 0 to 0.1 s>
         """
-        return _in_memory().from_dataframe(table, columns, (up, handedness, units))
+        return _in_memory().from_dataframe(table, columns, tracking, (up, handedness, units))
+
+    @classmethod
+    def concatenate(cls, rays: Iterable[Rays]) -> Rays:
+        """Concatenate several sets of rays in this order.
+
+        The metadata are merged: sources, dropped rows and counts are those of all, and other values are kept where they
+        are equal. Rays without hit points or heads get NaN, and those without cohorts the cohort "unknown", if others
+        have some. A participant who is in several sets is one participant, which a warning names.
+
+        Parameters
+        ----------
+        rays : iterable of Rays
+            The sets, in one frame.
+
+        Returns
+        -------
+        Rays
+            All rays.
+
+        Raises
+        ------
+        NergError
+            There are none, one is not `Rays`, or their frames or alignments to an environment differ.
+
+        Examples
+        --------
+        >>> import nerg_mi as nerg
+        >>> make = lambda name: nerg.Rays.from_arrays([[1, 1, 1.6]], [[1, 0, 0]], times=[0], participants=name)
+        >>> nerg.Rays.concatenate([make("Ada"), make("Bob")])
+        <Rays: 2 of 2 participants, t 0 to 0 s>
+        """
+        return _in_memory().concatenate(rays)
 
     def to_dataframe(self, library: str | None = None) -> Any:
         """Return a data frame with one row per ray.
@@ -610,7 +675,8 @@ class Rays:
         -------
         data frame
             Columns ``time`` (s), ``participant``, ``origin_x`` to ``origin_z`` (m), ``direction_x`` to ``direction_z``,
-            ``confidence``, and if the rays have them ``hit_x`` to ``hit_z``, ``cohort``, ``head_x`` to ``head_z``.
+            ``confidence``, and if the rays have them ``hit_x`` to ``hit_z``, ``cohort``, ``head_x`` to ``head_z``, and
+            ``tracking``.
 
         Raises
         ------
@@ -685,6 +751,17 @@ class Rays:
     def with_step(self, **entry: Any) -> Rays:
         """Add an entry to ``steps`` of the metadata, the processing since the import; returns a new object."""
         return replace(self, metadata={**self.metadata, "steps": [*self.metadata.get("steps", []), entry]})
+
+    def with_tracking(self, tracking: str) -> Rays:
+        """Return the same rays, whose directions are gaze (``eye``) or directions of heads (``head``): for files of
+        earlier versions. Raises `NergError` for another value.
+
+        >>> import nerg_mi as nerg
+        >>> rays = nerg.Rays.from_arrays([[1, 1, 1.6]], [[1, 0, 0]], times=[0])
+        >>> rays.tracking, rays.with_tracking("head").tracking
+        ('unknown', 'head')
+        """
+        return replace(self, metadata={**self.metadata, "tracking": check_tracking(tracking)})
 
     def save(self, path: str | os.PathLike) -> None:
         """Write ``.npz`` or ``.parquet``; see :mod:`nerg_mi.rays.rays`."""
@@ -796,8 +873,14 @@ def merge_rays(blocks: Iterable[Rays], metadata: dict[str, Any] | None = None) -
 
     Blocks without hit points or heads get NaN, and blocks without cohorts the cohort "unknown", if others have some.
     """
-    parts = [(block.columns(), block.persons, block.cohorts, len(block)) for block in map(_compact, blocks)]
+    compacted = list(map(_compact, blocks))
+    parts = [(block.columns(), block.persons, block.cohorts, len(block)) for block in compacted]
     metadata = {"frame": dict(FRAME)} if metadata is None else metadata
+    if any(map(len, compacted)):
+        # More precise than that of all sources, of which some may not be selected.
+        tracking = merge_tracking(block.tracking for block in compacted if len(block))
+        metadata = metadata if tracking == "unknown" else {**metadata, "tracking": tracking}
+    del compacted  # so that a column is freed once it is joined
     if not parts:
         no_values = _EMPTY[:, 0]
         return Rays(no_values, np.zeros(0, np.int32), (), _EMPTY, _EMPTY, no_values, metadata=metadata)
@@ -823,7 +906,16 @@ def merge_rays(blocks: Iterable[Rays], metadata: dict[str, Any] | None = None) -
     return Rays(**joined, persons=persons, cohorts=cohorts, metadata=metadata)
 
 
-_MERGED_KEYS = ("sources", "dropped", "rows_read", "complaints", "eye_distance", "missing", "unused_columns")
+_MERGED_KEYS = (
+    "tracking",
+    "sources",
+    "dropped",
+    "rows_read",
+    "complaints",
+    "eye_distance",
+    "missing",
+    "unused_columns",
+)
 
 
 def merge_metadata(documents: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -841,6 +933,7 @@ def merge_metadata(documents: Sequence[dict[str, Any]]) -> dict[str, Any]:
         **same,
         **{key: value for key, value in combined.items() if value},
         "frame": first["frame"],
+        "tracking": merge_tracking(other.get("tracking", "unknown") for other in documents),
         "sources": join_lists("sources"),
         "rows_read": sum(other.get("rows_read", 0) for other in documents),
         "dropped": join_lists("dropped"),

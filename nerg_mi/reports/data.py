@@ -175,7 +175,7 @@ def assign_ray_hits(
 
 
 # Metadata keys that cannot contain a name.
-_SAFE_METADATA = ("frame", "source_frame", "transform", "rows_read", "preset")
+_SAFE_METADATA = ("frame", "tracking", "source_frame", "transform", "rows_read", "preset")
 # Shorter names are only replaced as whole words, since they occur within many other words.
 _MIN_SUBSTRING = 3
 

@@ -22,7 +22,7 @@ from nerg_mi.files.values import find_names
 from nerg_mi.interruption import Interruption
 from nerg_mi.maths.types import variant_types
 from nerg_mi.rays.dataset import load_rays
-from nerg_mi.rays.events import average_fixations, detect_fixations_idt
+from nerg_mi.rays.events import average_fixations, label_fixations
 from nerg_mi.rays.filters import find_sessions
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.bands import require_nerg
@@ -31,6 +31,7 @@ from nerg_mi.rendering.scene_writer import project_to_pixel
 from nerg_mi.transport.geometry import SceneGeometry, pixel_solid_angles, trace_depth
 
 from .base import Reporter
+from .rays_events import warn_slow_sampling
 from .render import render_layers
 from .scene_commands import FloorOptions, ScanpathOptions, SceneFigureOptions, SphereOptions, TriptychOptions
 
@@ -338,9 +339,9 @@ def scanpath(files: Sequence[Path], options: ScanpathOptions, reporter: Reporter
     rays = rays.select((rays.t >= low) & (rays.t <= high))
     if not len(rays):
         raise NergError(f'"{path}" has no rays of these participants in this time; change --participants or --start')
-    fixations, durations = average_fixations(
-        rays, detect_fixations_idt(rays, options.dispersion_threshold, options.min_fixation)
-    )
+    warn_slow_sampling(rays, options, reporter)
+    rules, dispersion = options.event_rules(), options.dispersion_threshold
+    fixations, durations = average_fixations(rays, label_fixations(rays, rules, dispersion)[0])
     order = np.lexsort((fixations.t, fixations.person))
     rank = np.arange(len(order)) - np.searchsorted(fixations.person[order], fixations.person[order])
     rows = order[rank < options.max_fixations]
@@ -359,7 +360,8 @@ def scanpath(files: Sequence[Path], options: ScanpathOptions, reporter: Reporter
         pixels = _visible_pixels(camera, targets, layers.values, np.ravel(np.array(sensor_center(camera))))
     hidden = int(np.isnan(pixels[:, 0]).sum())
     people, index = np.unique(fixations.person[rows], return_inverse=True)
-    note = f"{len(rows)} fixations (I-DT, {options.dispersion_threshold:g}°, at least {options.min_fixation:g} s)"
+    threshold = f"I-VT, {rules.velocity:g}°/s" if dispersion is None else f"I-DT, {dispersion:g}°"
+    note = f"{len(rows)} fixations ({threshold}, at least {rules.min_fixation:g} s)"
     note += f"; {hidden} outside of the image or hidden" if hidden else ""
     names = tuple(rays.persons[p] for p in people)
     axes = scanpath_figure(layers.color, pixels, durations[rows], index, names, "Scanpath", note)

@@ -30,8 +30,8 @@ from nerg_mi.formats.splats import is_splat_file, read_splats
 from nerg_mi.formats.surfaces import extract_points
 from nerg_mi.maths.color import decode_srgb
 from nerg_mi.rays.dataset import load_rays
-from nerg_mi.rays.events import average_fixations, detect_fixations_idt
-from nerg_mi.rays.rays import Rays
+from nerg_mi.rays.events import average_fixations, label_fixations
+from nerg_mi.rays.rays import TRACKING, Rays
 from nerg_mi.registration import get_plugin_class
 from nerg_mi.rendering.bands import is_nerg, render_aovs
 from nerg_mi.rendering.scene import activate_variant, load_scene
@@ -44,6 +44,7 @@ from .base import SILENT, Reporter, select_backend
 from .draw import read_baked
 from .draw_scenes import copy_sampler, make_film, upright_pose
 from .radiance_commands import SceneExportOptions
+from .rays_events import warn_slow_sampling
 from .scene_places import detect_kind
 
 _SPHERE_RADIUS = 0.15  # metres
@@ -175,6 +176,13 @@ def _gaze(
     ends = rays.origin + length * rays.direction
     if rays.hit is not None:
         ends = np.where(np.isfinite(rays.hit), rays.hit, ends)
+    label, kinds = np.full(len(rays), -1), np.zeros(0, str)
+    if rays.tracking in ("head", "mixed"):
+        reporter.message(f"no fixations are written, since the rays are {TRACKING[rays.tracking]}")
+    else:
+        warn_slow_sampling(rays, options, reporter)
+        label, kinds = label_fixations(rays, options.event_rules(), options.dispersion_threshold)
+    definition = options.event_rules().describe(options.dispersion_threshold)
     out, fixations, without = [], [], []
     step = -(-len(rays) // options.max_rays)
     for person in np.unique(rays.person):
@@ -182,18 +190,19 @@ def _gaze(
         rows = rows[np.argsort(rays.t[rows], kind="stable")]
         name = rays.persons[person]
         shown = rows[::step]
-        out.append(ExchangeRays(name, rays.t[shown], rays.origin[shown].astype(float), ends[shown]))
-        mine = rays.select(rows)
-        label = detect_fixations_idt(mine, options.dispersion_threshold, options.min_fixation)
-        if not (label >= 0).any():
+        origins = rays.origin[shown].astype(float)
+        out.append(ExchangeRays(name, rays.t[shown], origins, ends[shown], rays.tracking))
+        rows = rows[label[rows] >= 0]
+        if not len(rows):
             without.append(name)
             continue
-        mean, durations = average_fixations(mine, label)
+        mean, durations = average_fixations(rays.select(rows), label[rows])
         at = mean.origin + length * mean.direction
         if mean.hit is not None:
             at = np.where(np.isfinite(mean.hit), mean.hit, at)
-        fixations.append(ExchangeFixations(name, mean.t - durations / 2, durations, at))
-    if without:
+        kinds_of_person = kinds[np.unique(label[rows])]
+        fixations.append(ExchangeFixations(name, mean.t - durations / 2, durations, at, kinds_of_person, definition))
+    if without and rays.tracking not in ("head", "mixed"):
         reporter.message(
             f"no fixation was detected for {len(without)} of {len(out)} participants, such as {without[0]}"
         )

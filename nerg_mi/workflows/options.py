@@ -24,6 +24,7 @@ from nerg_mi.ranges import (
     ValidatedDataclass,
     check_number,
 )
+from nerg_mi.rays.event_settings import EventRules
 
 # Key in the metadata of a field that `expose_settings` made.
 _EXPOSED = "nerg_mi.exposed"
@@ -308,3 +309,13 @@ class GeometryOptions(ValidatedDataclass):
         "geometry.",
         group=INPUT,
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+@expose_settings(EventRules, group=ANALYSIS)
+class EventOptions(DerivedOptions):
+    """How events are told apart (`nerg_mi.rays.event_settings.EventRules`)."""
+
+    def event_rules(self) -> EventRules:
+        """Return the limits between the kinds of events. Raises `NergError` for values out of range."""
+        return EventRules(**explicit_settings(self, EventRules))

@@ -32,6 +32,7 @@ from .options import (
     TEST,
     TRAINING,
     DerivedOptions,
+    EventOptions,
     coordinates,
     cpu_threads,
     definitions,
@@ -378,7 +379,7 @@ class TorchNgpOptions(ValidatedDataclass):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SceneExportOptions(ValidatedDataclass):
+class SceneExportOptions(EventOptions):
     """Options of ``nerg export scene``."""
 
     up: str = option("z", "Vertical axis of the scene, z or y.", group=INPUT)
@@ -387,10 +388,12 @@ class SceneExportOptions(ValidatedDataclass):
     max_rays: int = option(
         20_000, "Maximum number of rays to write, evenly selected.", within=Range(1, 10**7), group=OUTPUT
     )
-    dispersion_threshold: float = option(
-        1.0, "Dispersion of a fixation in degrees (I-DT).", within=Range(1e-3, 90), group=INPUT
+    dispersion_threshold: float | None = option(
+        None,
+        "Dispersion in degrees, to detect fixations by it (I-DT).  [default: fixations as in nerg rays events]",
+        within=Range(1e-3, 90),
+        group=INPUT,
     )
-    min_fixation: float = option(0.1, "Minimum duration of a fixation in seconds.", within=SECONDS, group=INPUT)
     max_points: int = option(
         100_000, "Maximum number of points of a field or of gaze.", within=Range(1, 10**7), group=OUTPUT
     )

@@ -94,15 +94,16 @@ class FilterSteps:
         threshold = {"velocity": options.velocity_threshold}
         if not by_velocity:
             threshold = {"dispersion": options.dispersion_threshold}
-        duration = {} if options.min_fixation is None else {"min_duration": options.min_fixation}
+        min_duration = options.min_fixation
+        if min_duration is None:
+            min_duration = events.MIN_FIXATION_IVT if by_velocity else events.MIN_FIXATION_IDT
         label = np.zeros(0, np.int64)
         if len(self.rays):
-            label = detect(self.rays, **threshold, **duration)
+            label = detect(self.rays, **threshold, min_duration=min_duration)
         count = len(np.unique(label[label >= 0]))
         self._reporter.message(f"{count:,} fixations ({options.fixations})")
-        settings = {"by": options.fixations, **threshold}
-        # The key of the metadata.
-        settings |= {} if options.min_fixation is None else {"least": options.min_fixation}
+        # The keys of the metadata.
+        settings = {"by": options.fixations, **threshold, "least": min_duration}
         if options.merge_fixations:
             self._replace(label, {**settings, "one_ray": True})
         else:

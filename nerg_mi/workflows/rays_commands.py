@@ -20,7 +20,6 @@ from typing import Any
 
 from nerg_mi.errors import NergError
 from nerg_mi.ranges import COORDINATES, LENGTHS, RAYS, SECONDS, SEEDS, THREADS, TIMES, Range, ValidatedDataclass
-from nerg_mi.rays.event_settings import EventRules
 
 from .base import HelpView, Parameter, argument, declare, extra, out
 from .options import (
@@ -30,12 +29,10 @@ from .options import (
     OUTPUT,
     PERFORMANCE,
     TEST,
-    DerivedOptions,
+    EventOptions,
     best_variant,
     coordinates,
     cpu_threads,
-    explicit_settings,
-    expose_settings,
     llvm_variant,
     option,
     random_seed,
@@ -314,16 +311,6 @@ class PlotOptions(ValidatedDataclass):
             raise NergError(f'--kind must be density or layout, got "{self.kind}"')
         if self.kind == "density" and self.test is not None:
             raise NergError("--test applies to layouts only; add --kind layout")
-
-
-@dataclass(frozen=True, kw_only=True)
-@expose_settings(EventRules, group=ANALYSIS)
-class EventOptions(DerivedOptions):
-    """How events are told apart (`nerg_mi.rays.event_settings.EventRules`)."""
-
-    def event_rules(self) -> EventRules:
-        """Return the limits between the kinds of events. Raises `NergError` for values out of range."""
-        return EventRules(**explicit_settings(self, EventRules))
 
 
 @dataclass(frozen=True, kw_only=True)

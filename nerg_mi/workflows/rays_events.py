@@ -16,12 +16,14 @@ from nerg_mi.files.tables import unescape_formula, write_csv
 from nerg_mi.files.values import find_names
 from nerg_mi.rays.dataset import load_rays
 from nerg_mi.rays.events import Events, detect_events
+from nerg_mi.rays.filters import estimate_interval
 from nerg_mi.rays.quality import GazeTarget, RecordingQuality, measure_recordings
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rays.readers.columns import open_named_table
 
 from .base import SILENT, Reporter
-from .rays_commands import EventOptions, RaysEventsOptions
+from .options import EventOptions
+from .rays_commands import RaysEventsOptions
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,11 +110,11 @@ def read_targets(path: Path, participants: Sequence[str]) -> list[GazeTarget]:
 def warn_slow_sampling(rays: Rays, options: EventOptions, reporter: Reporter) -> None:
     """Warn of rays whose intervals are mostly pauses by the options."""
     steps = np.diff(rays.t)[np.diff(rays.person) == 0]
-    interval = float(np.median(steps[steps > 0])) if (steps > 0).any() else float("nan")
+    interval = estimate_interval(steps)
     longest = options.event_rules().max_step
     if interval > longest * (1 - 1e-6):
         reporter.warn(
-            f"samples are {interval:.3g} s apart in the median, and intervals above {longest:g} s are pauses: raise "
+            f"samples are {interval:.3g} s apart, and intervals above {longest:g} s are pauses: raise "
             "--max-step; saccades, which last 0.02 to 0.1 s, are not resolved"
         )
 

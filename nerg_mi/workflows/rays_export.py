@@ -51,6 +51,11 @@ def export_rays(
     check_new_folder(output)
     reporter.progress(0.0, "reading rays")
     data = rays if isinstance(rays, Rays) else load_rays(rays)
+    if data.tracking == "unknown":
+        reporter.warn(
+            "the rays do not state whether they are gaze or directions of heads, and are exported as gaze: import them "
+            'again, or state it in Python (rays.with_tracking("eye"))'
+        )
     parts = [_find_events(data, options, reporter)] if options.events else []
     if options.aois is not None:
         reporter.progress(0.2, "finding visits")
@@ -65,6 +70,7 @@ def export_rays(
         name=options.title,
         events=events,
         event_columns=_describe(events),
+        event_rules=options.event_rules().describe() if options.events else None,
         provenance=provenance,
     )
     kinds, counts = ((), ()) if events is None else np.unique(events.kind, return_counts=True)

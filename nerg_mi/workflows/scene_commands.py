@@ -44,6 +44,7 @@ from .options import (
     OUTPUT,
     PERFORMANCE,
     VIEW,
+    EventOptions,
     PartOptions,
     best_variant,
     coordinates,
@@ -433,7 +434,7 @@ class SphereOptions(SceneFigureOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ScanpathOptions(ValidatedDataclass):
+class ScanpathOptions(EventOptions):
     """Options of ``nerg draw scanpath``."""
 
     scene: Path | None = option(None, "Scene file, in the coordinates of the rays; required.", group=INPUT)
@@ -443,10 +444,12 @@ class ScanpathOptions(ValidatedDataclass):
     )
     start: float | None = option(None, "First time in seconds.  [default: the first]", within=TIMES, group=INPUT)
     end: float | None = option(None, "Last time in seconds.  [default: the last]", within=TIMES, group=INPUT)
-    dispersion_threshold: float = option(
-        1.0, "Dispersion of a fixation in degrees (I-DT).", within=Range(1e-3, 90), group=INPUT
+    dispersion_threshold: float | None = option(
+        None,
+        "Dispersion in degrees, to detect fixations by it (I-DT).  [default: fixations as in nerg rays events]",
+        within=Range(1e-3, 90),
+        group=INPUT,
     )
-    min_fixation: float = option(0.1, "Minimum duration of a fixation in seconds.", within=SECONDS, group=INPUT)
     max_fixations: int = option(
         40, "Maximum number of fixations of a participant; the first ones are drawn.", within=Range(1, 1000), group=VIEW
     )

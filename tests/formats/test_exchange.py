@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
@@ -31,8 +33,9 @@ SPLATS = Splats(
     RNG.random(4),
     0.2 * RNG.normal(size=(4, 4, 3)),
 )
-RAYS = ExchangeRays("1 Ada", np.array([0.5, 0.51, 2.0]), RNG.random((3, 3)), 3 + RNG.random((3, 3)))
-FIXATIONS = ExchangeFixations("1 Ada", np.array([0.5, 2.0]), np.array([0.25, 1.0]), RNG.random((2, 3)))
+RAYS = ExchangeRays("1 Ada", np.array([0.5, 0.51, 2.0]), RNG.random((3, 3)), 3 + RNG.random((3, 3)), "eye")
+KINDS, RULES = np.array(["fixation", "vor_fixation"]), {"velocity": 100.0}
+FIXATIONS = ExchangeFixations("1 Ada", np.array([0.5, 2.0]), np.array([0.25, 1.0]), RNG.random((2, 3)), KINDS, RULES)
 POSE = np.array([[0, 0, 1, 4.0], [1, 0, 0, 5], [0, 1, 0, 6], [0, 0, 0, 1]])
 CAMERA = ExchangeCamera("camera", POSE, 80.0, 60, 40)
 SCENE = ExchangeScene((MESH,), (POINTS,), SPLATS, (RAYS,), (FIXATIONS,), (CAMERA,), meters_per_unit=0.5)
@@ -77,6 +80,9 @@ def test_rerun_reads_what_was_written(tmp_path):
     assert close(strips[:, 0], RAYS.origins) and close(strips[:, 1], RAYS.ends)
     assert close(np.reshape(get("gaze/1_Ada/fixations", "Points3D:positions"), (2, 3)), FIXATIONS.positions)
     assert close(np.ravel(get("gaze/1_Ada/fixations", "duration")), FIXATIONS.durations)
+    assert np.ravel(get("gaze/1_Ada/fixations", "kind")).tolist() == KINDS.tolist()
+    assert json.loads(np.ravel(get("gaze/1_Ada/fixations", "definition"))[0]) == RULES
+    assert np.ravel(get("gaze/1_Ada", "tracking")).tolist() == ["eye"]
     assert close(np.ravel(get("cameras/camera", "Transform3D:translation")), [4, 5, 6])
     matrix = np.reshape(get("cameras/camera", "Transform3D:mat3x3"), (3, 3)).T
     # The camera looks along +z: the opposite of the backward axis.
@@ -125,6 +131,10 @@ def test_usd_reads_what_was_written(tmp_path, suffix):
     assert close([stage.GetStartTimeCode(), stage.GetEndTimeCode()], [500, 2000])
     assert close(get(f"{name}/fixations", "points"), FIXATIONS.positions)
     assert close(get(f"{name}/fixations", "primvars:duration"), FIXATIONS.durations)
+    assert person.GetCustomDataByKey("tracking") == "eye"
+    fixations = stage.GetPrimAtPath(f"/scene/{name}/fixations")
+    assert json.loads(fixations.GetCustomDataByKey("definition")) == RULES
+    assert fixations.GetCustomDataByKey("kinds").split() == KINDS.tolist()
 
 
 def test_an_empty_scene_and_other_formats_are_refused(tmp_path):

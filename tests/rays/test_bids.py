@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ from nerg_mi.rays.rays import FRAME, Rays
 from nerg_mi.workflows.rays_commands import RaysExportOptions
 from nerg_mi.workflows.rays_export import export_rays
 from tests.rays.readers.examples import read
+from tests.workflows.recorder import Recorder
 
 FULL = ("t", "origin", "direction", "confidence", "hit", "head")
 
@@ -50,6 +52,34 @@ def crowd(n: int = 400, seed: int = 0) -> Rays:
         cohorts=("before", "after the change"),
         metadata={"frame": dict(FRAME), "floor": "unknown", "place_from_rays": np.diag([2.0, 2, 2, 1]).tolist()},
     )
+
+
+@pytest.mark.parametrize("kind", ["head", "mixed"])
+def test_heads_are_not_exported_as_eyes(tmp_path, kind):
+    with pytest.raises(NergError, match="heads"):
+        export_rays(crowd().with_tracking(kind), tmp_path / "bids", RaysExportOptions(events=False))
+    assert not (tmp_path / "bids").exists()
+
+
+def test_exports_name_what_was_tracked_and_how_events_were_detected(tmp_path):
+    for kind in ("unknown", "eye"):
+        recorder = Recorder()
+        export_rays(crowd().with_tracking(kind), tmp_path / kind, RaysExportOptions(min_fixation=0.02), recorder)
+        assert json.loads((tmp_path / kind / "task-gaze_physio.json").read_text())["Tracking"] == kind
+        assert any("heads" in text for text in recorder.warnings) == (kind == "unknown")
+        assert read("bids", tmp_path / kind).tracking == kind
+    detection = json.loads((tmp_path / "eye" / "task-gaze_physioevents.json").read_text())["Detection"]
+    assert detection["min_fixation"] == pytest.approx(0.02) and detection["velocity"] == pytest.approx(100)
+
+
+def test_the_rate_of_times_in_milliseconds(tmp_path):
+    rays = crowd()
+    t = np.floor(np.arange(300) / 60 * 1000) / 1000
+    t[150:] += 0.5  # a gap, which is no interval between samples
+    one = replace(rays.select(slice(300)), t=t, person=np.zeros(300, int), cohort=None, cohorts=())
+    export_rays(one, tmp_path / "bids")
+    (path,) = (tmp_path / "bids").rglob("sub-*_physio.json")
+    assert json.loads(path.read_text())["SamplingFrequency"] == pytest.approx(60, rel=1e-3)
 
 
 def assert_equal(rays: Rays, again: Rays, atol: float = 1e-6) -> None:

@@ -10,13 +10,14 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from nerg_mi.errors import NergError
-from nerg_mi.rays.event_settings import KINDS, EventRules
+from nerg_mi.rays.event_settings import FIXATIONS, KINDS, EventRules
 from nerg_mi.rays.events import (
     angles_about,
     average_fixations,
     detect_events,
     detect_fixations_idt,
     detect_fixations_ivt,
+    label_fixations,
     measure_velocities,
 )
 from nerg_mi.rays.rays import Rays
@@ -299,3 +300,33 @@ def test_angles_about(azimuth, elevation, a, e):
 def test_rules_are_validated():
     with pytest.raises(NergError, match="max_blink"):
         EventRules(max_blink=-1.0)
+
+
+# ---- Directions of heads have no eye movements, and all exports have the same fixations ----
+
+
+@pytest.mark.parametrize("kind", ["head", "mixed"])
+def test_directions_of_heads_have_no_fixations(kind):
+    heads = gaze(SEQUENCE).with_tracking(kind)
+    for detect in (detect_fixations_ivt, detect_fixations_idt, detect_events, label_fixations):
+        with pytest.raises(NergError, match="heads"):
+            detect(heads)
+    assert len(detect_events(heads.with_tracking("eye"))) == len(detect_events(gaze(SEQUENCE)))
+
+
+def test_labels_are_those_of_the_events():
+    n = 12
+    head = np.tile([1.0, 0, 0], (2 * n, 1))
+    rays = gaze([*np.zeros(n), *np.full(n, 20.0)], head=head)
+    mixed = rays.select(np.random.default_rng(0).permutation(len(rays)))  # in any order
+    label, kinds = label_fixations(mixed)
+    events = detect_events(mixed)
+    count = events.count()
+    assert label.max() + 1 == len(kinds) == sum(count.get(kind, 0) for kind in FIXATIONS) == 2
+    mean, duration = average_fixations(mixed, label)
+    order = np.argsort(mean.t)
+    np.testing.assert_allclose(np.degrees(np.arctan2(mean.direction[order, 1], mean.direction[order, 0])), [0, 20])
+    np.testing.assert_allclose(duration, np.sort(events.duration[np.isin(events.kind, FIXATIONS)]))
+    by_dispersion, kinds = label_fixations(rays, EventRules(min_fixation=0.1), dispersion=1.0)
+    assert np.array_equal(by_dispersion, detect_fixations_idt(rays, 1.0, 0.1)) and len(kinds) == 2
+    assert EventRules().describe()["velocity"] == pytest.approx(100) and EventRules().describe(2.0)["dispersion"] == 2

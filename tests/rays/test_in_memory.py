@@ -8,6 +8,7 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.files.dataframes import make_dataframe
 from nerg_mi.rays.filters import split_by_person
+from nerg_mi.rays.in_memory import check_rays
 from nerg_mi.rays.rays import Rays, write_rays_file
 
 
@@ -192,6 +193,24 @@ def test_ids_with_a_gap(library):
         assert rays.persons == ("1", "2") and rays.t.tolist() == [0, 2]
         assert Rays.from_arrays(*POSES, times=[0, 1, 2], participants=table["participant"]).persons == ("1", "2")
         assert len(rays.filter(persons=[1])) == len(rays.filter(persons=["1.0"])) == 1
+
+
+@pytest.mark.parametrize("library", ["pandas", "polars", "pyarrow"])
+def test_tracking_of_arrays_and_data_frames(library):
+    pytest.importorskip(library)
+    heads = make_rays(tracking="head")
+    assert heads.tracking == "head" and "head" in repr(heads)
+    assert make_rays().tracking == "unknown" and make_rays(heads=arrays()[1]).tracking == "eye"
+    assert "heads" in dict(check_rays(heads, "").lines)["tracking"]
+    assert Rays.from_dataframe(heads.to_dataframe(library)).tracking == "head"
+    assert "tracking" not in make_rays().to_dataframe("pandas")
+    table = make_dataframe({"time": [0.0, 1.0, 2.0], "tracking": ["eye", "head", "eye"], **vectors()}, library)
+    assert Rays.from_dataframe(table).tracking == "mixed"
+    assert Rays.from_dataframe(table, tracking="eye").tracking == "eye"
+    with pytest.raises(NergError, match="'gaze'"):
+        make_rays(tracking="gaze")
+    with pytest.raises(NergError, match="tracking.*'gaze'"):
+        Rays.from_dataframe(make_dataframe({"time": [0.0] * 3, "tracking": ["gaze"] * 3, **vectors()}, library))
 
 
 COMPOSED, DECOMPOSED = "J\u00f6rg", "Jo\u0308rg"

@@ -432,6 +432,46 @@ def test_merge_keeps_occurring_persons_and_fills_missing_columns():
     assert without.hit is None and without.cohort is None and without.cohorts == ()
 
 
+def test_tracking_survives_selection_merging_and_files(tmp_path):
+    eyes, heads, old = (ray(k, name).with_tracking(kind) for k, (name, kind) in enumerate(KINDS_OF_RAYS))
+    assert ray(0, "a").tracking == old.tracking == "unknown"
+    for kinds, expected in (([eyes], "eye"), ([eyes, heads], "mixed"), ([heads, old], "mixed")):
+        for merged in (merge_rays(kinds), Rays.concatenate(kinds)):
+            assert merged.tracking == merged.select(slice(1)).tracking == expected
+            for suffix in (".npz", ".parquet") if importlib.util.find_spec("pyarrow") else (".npz",):
+                merged.save(tmp_path / f"rays{suffix}")
+                assert Rays.load(tmp_path / f"rays{suffix}").tracking == expected
+    assert merge_rays([eyes, old]).tracking == "unknown"
+    assert merge_rays([heads.select(slice(0)), eyes]).tracking == "eye"
+    with pytest.raises(NergError, match="'ear'"):
+        eyes.with_tracking("ear")
+    with pytest.raises(NergError, match="tracking"):
+        write_rays_file(tmp_path / "bad.npz", eyes.columns(), {**eyes.metadata, "persons": ["a"], "tracking": ["eye"]})
+
+
+KINDS_OF_RAYS = (("a", "eye"), ("b", "head"), ("c", "unknown"))
+
+
+def test_concatenation():
+    first = ray(0, "a", metadata={"frame": FRAME, "rows_read": 3, "sources": [{"file": "a"}], "preset": "table"})
+    second = ray(1, "b", metadata={"frame": FRAME, "rows_read": 4, "sources": [{"file": "b"}], "preset": "unity"})
+    both = Rays.concatenate(rays for rays in (first, second))
+    assert both.persons == ("a", "b") and both.t.tolist() == [0, 1]
+    assert both.metadata["rows_read"] == 7 and len(both.metadata["sources"]) == 2 and "preset" not in both.metadata
+    with pytest.warns(UserWarning, match="a is a participant of several sets"):
+        assert len(Rays.concatenate([first, second, first])) == 3
+    aligned = ray(2, "c", metadata={"frame": FRAME, "place_from_rays": np.eye(4).tolist()})
+    inches = ray(2, "c", metadata={"frame": {**FRAME, "units": "in"}})
+    for bad, reason in (
+        ([], "no rays"),
+        ([first, "rays.npz"], "element 1 must be Rays"),
+        ([first, aligned], "alignment"),
+        ([first, inches], "another frame"),
+    ):
+        with pytest.raises(NergError, match=reason):
+            Rays.concatenate(bad)
+
+
 def test_merge_metadata_keeps_common_values():
     metadata = {"frame": dict(FRAME), "preset": "table", "tick": 1.0, "rows_read": 4, "sources": [{"file": "a"}]}
     metadata["dropped"] = [{"reason": "blink", "file": "a", "count": 1, "rows": [[1, 1]]}]

@@ -15,11 +15,13 @@ from nerg_mi.formats.fields import load_radiance
 from nerg_mi.formats.ply import write_columns
 from nerg_mi.formats.surfaces import extract_points
 from nerg_mi.maths.color import decode_srgb
+from nerg_mi.rays.event_settings import FIXATIONS, EventRules
 from nerg_mi.rays.rays import Rays
 from nerg_mi.workflows import demo
 from nerg_mi.workflows import export_scene as module
 from nerg_mi.workflows.export_scene import export_scene
 from nerg_mi.workflows.radiance_commands import SceneExportOptions
+from nerg_mi.workflows.rays_export import export_rays
 from tests.workflows.recorder import Recorder
 
 SENSOR = """<sensor type="perspective" id="view"><float name="fov" value="70"/>
@@ -76,6 +78,23 @@ def test_rays_and_fixations_of_each_participant(rgb, folder, monkeypatch):
     assert any("Bob" in line and "no fixation" in line for line in recorder.messages)
     fewer, _ = exported(folder, "rays.npz", monkeypatch=monkeypatch, max_rays=7)
     assert sum(len(r.times) for r in fewer.rays) <= 8 and len(fewer.fixations[0].times) == 2
+
+
+def test_fixations_are_those_of_other_exports(rgb, folder, monkeypatch):
+    scene, _ = exported(folder, "rays.npz", monkeypatch=monkeypatch)
+    counts = export_rays(rays(), folder / "bids").events
+    (fixations,) = scene.fixations
+    assert len(fixations.times) == sum(counts.get(kind, 0) for kind in FIXATIONS) == len(fixations.kinds)
+    assert fixations.definition == EventRules().describe()
+    by_dispersion, _ = exported(folder, "rays.npz", monkeypatch=monkeypatch, dispersion_threshold=1.0)
+    assert by_dispersion.fixations[0].definition["algorithm"] == "I-DT"
+
+
+def test_heads_have_no_fixations_and_are_named(rgb, folder, monkeypatch):
+    rays().with_tracking("head").save(folder / "rays.npz")
+    scene, recorder = exported(folder, "rays.npz", monkeypatch=monkeypatch)
+    assert scene.fixations == () and {r.tracking for r in scene.rays} == {"head"}
+    assert scene.rays[0].origin_name == "heads" and any("heads" in line for line in recorder.messages)
 
 
 def test_a_scene_has_its_meshes_cameras_and_gaze(rgb, folder, monkeypatch):

@@ -416,6 +416,7 @@ def _add_gaze(recording: _Recording, world: str, builder: RaysBuilder) -> None:
             origin,
             direction,
             rows=lines,
+            tracking="eye",
             head=rotation @ R[:, 2],
             hit=origin + distance[:, None] * direction,
             drop={

@@ -21,7 +21,7 @@ from nerg_mi.files.safe_read import BadLineCallback, check_regular_file
 from nerg_mi.files.values import normalize_name, to_name
 from nerg_mi.maths.coordinates import check_near_origin
 from nerg_mi.ranges import FLAG, MAX_COORDINATE, RANGE, TIME_UNITS, Range, ValidatedDataclass
-from nerg_mi.rays.rays import COLUMNS, FRAME, Rays
+from nerg_mi.rays.rays import COLUMNS, FRAME, Rays, merge_tracking
 
 from .cells import MISSING_WORDS
 from .columns import ColumnFinder, may_be_validity_column, parse_time_unit
@@ -157,6 +157,7 @@ class RaysBuilder:
         self._rows_read = self._num_runs = 0
         self._unused_columns: dict[str, None] = {}
         self._missing = Counter[str]()
+        self._tracking = set[str]()
         metre = float(np.cbrt(abs(np.linalg.det(self._transform[:3, :3]))))
         self._make_origin_finder = lambda: FilledOriginFinder(metre)
         self._filled_origins, self._head_frames = self._make_origin_finder(), HeadFrameFinder(metre)
@@ -278,6 +279,7 @@ class RaysBuilder:
         direction: np.ndarray,
         *,
         rows: np.ndarray,
+        tracking: str = "unknown",
         confidence: np.ndarray | None = None,
         hit: np.ndarray | None = None,
         cohort: Sequence[str] | np.ndarray | None = None,
@@ -304,6 +306,8 @@ class RaysBuilder:
             (n, 3) in that frame, of any length.
         rows
             (n,) row numbers in the source, from 1.
+        tracking
+            What was tracked, of `nerg_mi.rays.rays.TRACKING`: "eye", or "head" if ``direction`` is that of the head.
         confidence
             (n,) in [0, 1]. Default: 1.
         cohort
@@ -377,6 +381,8 @@ class RaysBuilder:
             part["cohort"] = self._cohorts.encode(cohort, n)[is_kept]
         self._parts.append(part)
         self._part_sizes.append(int(is_kept.sum()))
+        if is_kept.any():
+            self._tracking.add(tracking)
         if self._on_rays is not None and sum(self._part_sizes) >= STREAM_RAYS:
             self._on_rays(self._take_rays({"frame": dict(FRAME)}))
 
@@ -439,6 +445,7 @@ class RaysBuilder:
             self.add_warning(sentence)
         metadata = {
             "frame": dict(FRAME),
+            "tracking": merge_tracking(self._tracking),
             "transform": self._transform.tolist(),
             "source_frame": self._frame.to_dict(),
             "sources": self._sources,
@@ -729,7 +736,8 @@ class Reader(Protocol[O]):
 
         Call ``builder.begin_source(path)`` for each file, and ``builder.add`` for each block of its rows: times in
         seconds, origins and hit points in the frame and units of `frame`, directions of any length, confidences in
-        [0, 1], NaN for missing values, row numbers from 1, and the format's own reasons to ``drop`` rows. Pass
+        [0, 1], NaN for missing values, row numbers from 1, whether eyes or heads were tracked (``tracking``), and the
+        format's own reasons to ``drop`` rows. Pass
         ``head`` and ``eye_distance`` if the file has them, for the checks of the quality report. If height 0 of the
         files is not the floor, call ``builder.add_metadata(floor="unknown")``. If origins or directions are computed,
         pass those of the file as ``recorded_origin`` and ``recorded_direction``, to detect fill values.

@@ -29,6 +29,7 @@ from .tables import iterate_table, parse_clock_seconds, read_table_columns
 DESCRIPTION = "dataset_description.json"
 GAZE_IN_WORLD = "gaze-in-world"
 WORLD = "WorldCoordinateSystem"  # key of the proposal: axes of the world, of `GazeColumns`
+TRACKING_KEY = "Tracking"  # key of the proposal: what directions are, of `nerg_mi.rays.rays.TRACKING`
 TIME = "timestamp"
 POINT = ("x_coordinate", "y_coordinate", "z_coordinate")
 ORIGIN, DIRECTION, HEAD = (tuple(f"{name}_{a}" for a in "xyz") for name in ("origin", "direction", "head"))
@@ -663,6 +664,7 @@ def _add_gaze(
             samples.origin,
             samples.direction,
             rows=samples.lines,
+            tracking="unknown" if eyes[0].metadata.get(TRACKING_KEY) == "unknown" else "eye",
             confidence=samples.confidence,
             hit=samples.hit,
             cohort=None if cohort is None else np.full(len(samples.times), cohort),
@@ -829,6 +831,7 @@ def _add_heads(
             block.positions,
             block.rotations @ forward,
             rows=block.rows,
+            tracking="head",
             cohort=None if cohort is None else np.full(len(block.times), cohort),
         )
 

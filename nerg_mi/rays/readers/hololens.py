@@ -56,6 +56,7 @@ class HoloLens(FixedFrameReader):
                     origin,
                     direction,
                     rows=lines,
+                    tracking="eye",
                     hit=np.where(distance > 0, origin + distance * unit, np.nan),
                     head=-v[:, 11:],
                     drop={"the eyes were not seen": v[:, 1] != 1},
@@ -96,6 +97,7 @@ class Arett(FixedFrameReader):
                     v[:, 1:4],
                     v[:, 4:7],
                     rows=block.lines,
+                    tracking="eye",
                     hit=np.where(has_hit[:, None], v[:, 7:10], np.nan),
                     drop={"gazeHasValue is not true": ~has_gaze, "isCalibrationValid is not true": ~is_calibrated},
                 )

@@ -201,6 +201,7 @@ class C3d:
                         origin,
                         direction,
                         rows=frames + 1,
+                        tracking="head",
                         drop={MISSING_KEYPOINT: missing},
                     )
             if not count:

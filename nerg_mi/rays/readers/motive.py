@@ -102,6 +102,7 @@ class Motive:
                     v[:, 5:8],
                     poses.rotations_from_quaternions(v[:, 1:5]) @ forward,
                     rows=lines,
+                    tracking="head",
                     drop={
                         "the rigid body was not tracked": np.asarray(np.isnan(v[:, 1:]).any(axis=1)),
                         **poses.find_unusable_quaternions(v[:, 1:5]),

@@ -92,6 +92,7 @@ class OpenXr(FixedFrameReader):
                     v[:, 1:4],
                     poses.rotations_from_quaternions(v[:, 4:8]) @ poses.parse_axis("-z", "forward"),
                     rows=lines,
+                    tracking="eye",
                     drop=drop,
                 )
 

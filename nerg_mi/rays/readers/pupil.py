@@ -77,6 +77,7 @@ class Pupil:
                     options.marker * position + poses.rotate(rotation, 1e-3 * eye),
                     poses.rotate(rotation, direction),
                     rows=lines,
+                    tracking="eye",
                     confidence=v[:, 1],
                     head=rotation[:, :, 2],
                     drop={

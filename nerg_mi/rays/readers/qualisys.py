@@ -228,6 +228,7 @@ def _add_eye(path: Path, other: np.ndarray | None, builder: RaysBuilder) -> None
             (weight[:, :, None] * values[:, :, :3]).sum(axis=1),
             (weight[:, :, None] * direction).sum(axis=1),
             rows=block.lines,
+            tracking="eye",
             drop={"no eye was seen": ~is_seen.any(axis=1)},
         )
 
@@ -286,6 +287,7 @@ class NeonMocap:
                     v[:, 1:4],
                     v[:, 4:7],
                     rows=lines,
+                    tracking="eye",
                     drop={"the glasses' markers were not seen": is_missing},
                 )
 

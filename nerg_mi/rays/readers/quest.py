@@ -90,6 +90,7 @@ class Quest(FixedFrameReader):
                     origin,
                     direction,
                     rows=lines,
+                    tracking="eye",
                     confidence=confidence,
                     recorded_origin=poses_read[:, : len(eye_columns), :3].mean(axis=1),
                     drop={

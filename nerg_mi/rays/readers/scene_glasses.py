@@ -469,7 +469,8 @@ class SceneGaze:
             self._angles.append(angles[np.isfinite(angles) & ~np.any(list(drop.values()), axis=0)])
         drop["no frame of the scene camera near that time has a pose (option --max-gap)"] = has_no_pose
         ray = poses.rotate(rotation, direction)
-        self._builder.add(block.t, self._person, position, ray, rows=block.rows, head=rotation[:, :, 2], drop=drop)
+        head = rotation[:, :, 2]
+        self._builder.add(block.t, self._person, position, ray, rows=block.rows, tracking="eye", head=head, drop=drop)
 
     def finish(self, compared: str) -> None:
         """Add to the metadata the number of frames with a pose, and the difference between the two representations of

@@ -604,6 +604,7 @@ class SkeletonFile:
                     origin,
                     direction,
                     rows=rows.lines,
+                    tracking="head",
                     confidence=scaled_confidence,
                     drop={MISSING_KEYPOINT: missing},
                 )

@@ -104,6 +104,7 @@ class Sranipal(FixedFrameReader):
                     vector(columns.head) + poses.rotate(rotation, _MILLIMETRE * _TO_UNITY * origin),
                     poses.rotate(rotation, _TO_UNITY * direction),
                     rows=lines,
+                    tracking="eye",
                     drop={"no eye is valid": ~is_valid, **poses.find_unusable_quaternions(vector(columns.rotation))},
                     recorded_origin=vector(columns.head),
                 )

@@ -23,6 +23,7 @@ from .columns import (
     parse_length_unit,
     parse_valid,
     require_valid_values,
+    split_column_name,
 )
 from .tables import TableBlock, iterate_table
 
@@ -58,6 +59,13 @@ class TableOptions(ValidatedDataclass):
     person_from: str = option(
         "column", "Source of the participants' names in a table read with --map: column or filename.", is_recorded=False
     )
+    tracking: str | None = option(
+        None,
+        "What the directions of a table read with --map are: eye (gaze) or head.",
+        default_text="head for a head pose without a direction, and for directions with head, hmd or camera in their "
+        "names; otherwise eye",
+        is_recorded=False,
+    )
     min_confidence: float = option(0.0, "Drop rows below this confidence.", within=Range(0, 1))
     valid: str | None = valid_option()
     tick: float = tick_option()
@@ -66,6 +74,8 @@ class TableOptions(ValidatedDataclass):
         super().__post_init__()
         parse_valid(self.valid)
         poses.parse_axis(self.forward_axis, "forward")
+        if self.tracking not in (None, "eye", "head"):
+            raise NergError(f'--tracking must be eye or head, got "{sanitize(self.tracking, 40)}"')
         if self.person_from not in ("column", "filename"):
             raise NergError(f'persons are named by "column" or "filename" (--person-from), not by "{self.person_from}"')
 
@@ -182,6 +192,20 @@ def person_from_filename(path: Path) -> str:
     return path.name.split(".")[0]
 
 
+_HEAD_WORDS, _GAZE_WORDS = {"head", "headset", "hmd", "camera"}, {"gaze", "eye", "eyes"}
+
+
+def find_tracking(columns: ColumnMap) -> str:
+    """Whether the directions of ``columns`` are gaze ("eye") or those of heads ("head"), by their roles and names."""
+    names = columns.direction or (getattr(columns, columns.angles) if columns.angles else ())
+    if not names:
+        return "head"
+    words = {word for name in names for word in split_column_name(name).split("_")}
+    # Directions next to those of heads, or in their frame, are gaze.
+    is_head = words & _HEAD_WORDS and not words & _GAZE_WORDS and not columns.head and not columns.pose
+    return "head" if is_head else "eye"
+
+
 class MappedRows:
     """Converts rows of tables with equal columns to rays."""
 
@@ -195,6 +219,7 @@ class MappedRows:
         vectors = [getattr(columns, name) or () for name in ("origin", "direction", "eye", "hit", "head", "eyes")]
         self.numbers = [name for v in vectors for name in v]
         self.numbers += [*self.pose_columns, *self.angle_columns, *(c for c in (columns.t, columns.confidence) if c)]
+        self.tracking = options.tracking or find_tracking(columns)
         self.texts = [c for c in (self.person, columns.cohort, *valid) if c]
         self._num_angles, self._max_angle = 0, 0.0
 
@@ -244,6 +269,7 @@ class MappedRows:
             origin,
             direction,
             rows=block.lines,
+            tracking=self.tracking,
             confidence=confidence,
             hit=vector(columns.hit) if columns.hit else None,
             cohort=word[columns.cohort] if columns.cohort else None,

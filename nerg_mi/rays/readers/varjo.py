@@ -51,6 +51,7 @@ class Varjo(FixedFrameReader):
                     position + poses.rotate(matrices, eye),
                     poses.rotate(matrices, forward),
                     rows=lines,
+                    tracking="eye",
                     head=matrices[:, :, 2],
                     drop={
                         "GazeStatus is not VALID": ~_is_valid(path, texts[:, 0]),

@@ -72,6 +72,7 @@ class VrSupermarket(FixedFrameReader):
                     position + poses.rotate(rotation, v[:, 15:18] * _FLIP),
                     poses.rotate(rotation, v[:, 12:15] * _FLIP),
                     rows=lines,
+                    tracking="eye",
                     confidence=np.clip(openness, 0.0, 1.0),
                     hit=v[:, 18:21],
                     head=-rotation[:, :, 2],

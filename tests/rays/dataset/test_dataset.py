@@ -19,7 +19,9 @@ from nerg_mi.rays.dataset_write import update_dataset
 from nerg_mi.rays.filters import select_mask
 from nerg_mi.rays.quality import summarise, summarise_dataset
 from nerg_mi.rays.rays import Rays
-from tests.rays.dataset.making import DAY, assert_same, recipe, write_dataset, write_source
+from nerg_mi.rays.readers.columns import ColumnMap
+from nerg_mi.rays.readers.registry import make_options
+from tests.rays.dataset.making import DAY, MAP, assert_same, recipe, write_dataset, write_source
 
 pytest.importorskip("pyarrow")
 
@@ -99,6 +101,17 @@ def test_unknown_names_are_refused(made):
     ):
         with pytest.raises(NergError, match=why):
             list(made[0].scan(Conditions(**cases)))
+
+
+def test_tracking_is_that_of_the_selected_sources(tmp_path):
+    eyes, heads = (write_source(tmp_path / f"{k}.csv", k) for k in range(2))
+    update_dataset(tmp_path / "a.rays", [eyes], recipe())
+    options = make_options("table", {"columns": ColumnMap.parse(MAP), "tracking": "head"})
+    update_dataset(tmp_path / "b.rays", [heads], recipe(settings=options, key=bytes(32)))
+    assert RayDataset.open(tmp_path / "a.rays").load().tracking == "eye"
+    dataset = RayDataset.open(tmp_path / "b.rays")
+    assert dataset.load().tracking == dataset.sample(10).tracking == load_rays(tmp_path / "b.rays").tracking == "head"
+    assert all(block.tracking == "head" for block in dataset.scan())
 
 
 def test_participants_are_found_by_another_form_of_their_name(tmp_path):

@@ -407,6 +407,8 @@ def test_all_readers_give_valid_rays(tmp_path, name):
     rays = registry.read_rays(name, cases, options, on_source=begun_files.append)
     content = rays.metadata
     assert len(rays) > 0 and content["preset"] == name
+    heads = ("c3d", "motive", "skeleton", "unity_head")
+    assert rays.tracking == ("head" if name in heads else "eye")
     assert content["rows_read"] == len(rays) + sum(d["count"] for d in content["dropped"])
     assert content["source_frame"] == reader.frame([cases], options).to_dict()
     assert np.allclose(content["transform"], reader.frame([cases], options).to_rays())
