@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import importlib
 import re
+import unicodedata
 from collections.abc import Iterator
 from contextlib import contextmanager
 from os import PathLike
@@ -24,6 +25,9 @@ class NergError(ValueError):
     ...     print(error)
     the checkpoint "nowhere.safetensors" does not exist: correct its name, or make one with "nerg train"
     """
+
+    def __str__(self) -> str:
+        return clean_text(super().__str__())
 
 
 class MissingFile(NergError, FileNotFoundError):
@@ -191,6 +195,21 @@ def sanitize(text: object, max_length: int = 300) -> str:
     """
     text_out = "".join(c if c.isprintable() else "?" for c in str(text)[: max_length + 1])
     return text_out if len(text_out) <= max_length else text_out[:max_length] + "..."
+
+
+_INVISIBLE = ("Cc", "Cf", "Cs")  # control characters, format characters such as reversed order, and surrogates
+_KEPT = "\n\t\u200c\u200d"  # line breaks, tabs, and the joiners of Persian, Indic scripts and emoji
+
+
+def clean_text(text: str) -> str:
+    """Return ``text`` without characters that control a terminal or reorder what it shows; "?" replaces them.
+
+    Every message, warning, line of progress and figure passes through this function, since names of participants, files
+    and areas may contain anything.
+    """
+    if text.isascii() and text.isprintable():
+        return text
+    return "".join("?" if unicodedata.category(c) in _INVISIBLE and c not in _KEPT else c for c in text)
 
 
 def _read_last_exception(trace: str) -> str:

@@ -276,6 +276,30 @@ PARAMETER_TEXTS = {
 }
 
 
+SUMMARY = """Integrator for radiance fields, shapes, and the gaze of an observer.
+
+The parameters that matter most, with their defaults:
+
+    field      Radiance field or Gaussian splats, a volume (none: shapes only).
+    gaze       Gaze field, a volume of the type "gazefield" (none: no gaze).
+    observer   Sensor at the observer's position (the rendering camera).
+    (nested)   Integrator that lights the shapes ("path" with emitters, else a headlight).
+    aovs       Images besides colour, separated by commas ("depth,opacity").
+    depth      Kind of depth of a field's surface ("median").
+    falloff    Distance behind an occluder over which gaze fades (0.1 scene units).
+    occlusion  Whether to hide gaze on surfaces that the observer does not see (true).
+    step       Step length of the march in scene units (that of the field).
+    ceiling    Height above which views from above are clipped (none).
+
+Example, a dictionary for mi.load_dict:
+
+    {"type": "nerg", "field": {"type": "nerf", "filename": "store.safetensors"},
+     "gaze": {"type": "gazefield", "filename": "shoppers.safetensors"}, "aovs": "depth,gaze"}
+
+All parameters, and the AOVs, as in the manual:
+"""
+
+
 def fill_manual(manual: str) -> str:
     """``manual`` with all registered kinds of depth and quadrature, and the texts above."""
     texts = {"quadratures": RULES.format_manual(), "depths": DEPTHS.format_manual(), **PARAMETER_TEXTS}
@@ -450,7 +474,7 @@ __doc__ = fill_manual(__doc__ or "").replace("{aovs}", nerg_aovs.format_manual()
 
 
 class NergIntegrator(mi.SamplingIntegrator):
-    __doc__ = __doc__
+    __doc__ = SUMMARY + __doc__
 
     def __init__(self, props):
         super().__init__(props)

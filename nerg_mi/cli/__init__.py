@@ -12,6 +12,7 @@ import traceback
 from .ending import INTERRUPTED, CtrlC, exit_code, open_streams, quiet_ctrl_c, shorten_values
 
 with quiet_ctrl_c():
+    from nerg_mi.errors import clean_text
     from nerg_mi.memory import NUMPY_MEGABYTES, require_address_space
 
     from .building import DEBUG, build_app
@@ -41,12 +42,12 @@ def main(arguments: list[str] | None = None) -> None:
         except BaseException as error:
             interrupt = ctrl_c.find_interrupt(error)
             if interrupt is not None:
-                print(str(interrupt) or "Interrupted.", file=sys.stderr)
+                print(clean_text(str(interrupt)) or "Interrupted.", file=sys.stderr)
                 sys.exit(INTERRUPTED)
             if not isinstance(error, Exception):  # normal end of a command
                 raise
             if debug:
                 traceback.print_exception(error)
             code, text = exit_code(error)
-            print(f"nerg: {shorten_values(text, arguments)}", file=sys.stderr)
+            print(f"nerg: {clean_text(shorten_values(text, arguments))}", file=sys.stderr)
             sys.exit(code)

@@ -162,7 +162,7 @@ def format_score_table(rows: list[dict], title: str) -> str:
     for row in rows:
         out.add_row(*(v if isinstance(v, str) else "" if np.isnan(v) else f"{v:.3f}" for v in row.values()))
     # Fixed width, so that a table in a file or pipe is not folded.
-    console = Console(width=120)
+    console = Console(width=120, color_system=None)
     with console.capture() as text:
         console.print(out)
     return text.get().removesuffix("\n")

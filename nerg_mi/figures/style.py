@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi import __version__
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, clean_text
 from nerg_mi.files.atomic import check_writable, file_sha256, write_bytes
 
 # ---- Colour maps ----
@@ -267,7 +267,7 @@ def encode(drawn: Any, suffix: str, text: Mapping[str, str] | None = None) -> by
     """Encode a figure or axes in one of `FORMATS`, with metadata ``text``."""
     import matplotlib
 
-    figure, out, text = figure_of(drawn), io.BytesIO(), dict(text or {})
+    figure, out, text = _clean_texts(figure_of(drawn)), io.BytesIO(), dict(text or {})
     if suffix in _METADATA_KEYS:
         keys = _METADATA_KEYS[suffix]
         times: dict[str, Any] = {"Date": None} if suffix == ".svg" else {"CreationDate": None}
@@ -282,9 +282,20 @@ def encode(drawn: Any, suffix: str, text: Mapping[str, str] | None = None) -> by
     return out.getvalue()
 
 
+def _clean_texts(figure: Any) -> Any:
+    """Remove characters that no font shows and that SVG does not allow from all texts of ``figure``; return it."""
+    from matplotlib.text import Text
+
+    for artist in figure.findobj(Text):
+        content = artist.get_text()
+        if (cleaned := clean_text(content)) != content:
+            artist.set_text(cleaned)
+    return figure
+
+
 def rasterize(drawn: Any) -> np.ndarray:
     """Render a figure or axes to display values (h, w, 3), uint8, identical to its PNG."""
-    figure = figure_of(drawn)
+    figure = _clean_texts(figure_of(drawn))
     figure.canvas.draw()
     return np.asarray(figure.canvas.buffer_rgba())[..., :3].copy()
 

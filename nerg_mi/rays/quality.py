@@ -210,7 +210,8 @@ def format_quality_report(rays: Rays, summary: RaysSummary, title: str, lines: S
     table = Table(show_header=False, box=None, title=safe(title), title_justify="left")
     for name, text in sorted([*make_quality_report(rays, summary), *lines], key=lambda line: line[0] == WARNING_LABEL):
         table.add_row(f"[bold]{name}[/bold]" if name == WARNING_LABEL else name, safe(text))
-    console = Console()
+    # Without styles, which are control characters: messages contain none.
+    console = Console(color_system=None)
     with console.capture() as capture:
         console.print(table)
     return capture.get().removesuffix("\n")

@@ -9,6 +9,7 @@ import warnings
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from nerg_mi.errors import clean_text
 from nerg_mi.files.html import element, markup
 
 from .base import SilentReporter
@@ -73,7 +74,7 @@ class TerminalReporter:
 
     def line(self) -> str:
         """Return the current step with the remaining or elapsed time."""
-        share, text = self._now
+        share, text = self._now[0], clean_text(self._now[1])
         elapsed = 0.0 if self._begun is None else time.monotonic() - self._begun
         if text.endswith(" left") or " left, " in text:
             return text
@@ -116,6 +117,7 @@ class TerminalReporter:
         return bar
 
     def _print(self, text: str, stream) -> None:
+        text = clean_text(text)
         if self._bar is not None and stream.isatty():
             # Above the bar, on the same terminal.
             self._bar.console.print(text, markup=False, highlight=False, soft_wrap=True)
@@ -166,7 +168,7 @@ class NotebookReporter(TerminalReporter):
         self._bar.update(self._make_html(markup([bar, f" {fraction:.0%} {self.line()}"])))
 
     def _print(self, text: str, stream) -> None:
-        print(text, file=stream, flush=True)
+        print(clean_text(text), file=stream, flush=True)
 
     def __exit__(self, *error) -> None:
         self._ended.set()
@@ -192,7 +194,7 @@ class WarningReporter(SilentReporter):
         level, frame = 1, sys._getframe()
         while frame.f_back is not None and str(frame.f_globals.get("__name__")).startswith("nerg_mi"):
             level, frame = level + 1, frame.f_back
-        warnings.warn(text, UserWarning, stacklevel=level)
+        warnings.warn(clean_text(text), UserWarning, stacklevel=level)
 
 
 def is_notebook() -> bool:

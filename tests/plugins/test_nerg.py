@@ -273,6 +273,17 @@ def test01_manual_states_all_defaults(rgb):
     assert list(manual(rgb)) == NAMES
 
 
+def test04_help_begins_with_a_summary(rgb):
+    """Ten parameters of the manual, with its defaults, before the manual itself."""
+    text = type(rgb.load_dict({"type": "nerg"})).__doc__
+    summary, _, rest = text.partition(".. _integrator-nerg:")
+    rows = dict(re.findall(r"^    (\(?[a-z]+\)?) {2,}(.*)$", summary, re.MULTILINE))
+    defaults = manual(rgb)
+    assert len(rows) == 10 and all(f"* - {name}" in rest for name in rows)
+    stated = {name: default for name, default in defaults.items() if name in rows}
+    assert all(default in rows[name] for name, default in stated.items() if name != "step") and len(stated) >= 4
+
+
 def settings_of(mi, **overrides):
     integrator = mi.load_dict(constant(1.0, depth="median") | overrides)
     overrides = {"text": str(integrator), "background": np.array(integrator.background).tolist()}
