@@ -198,7 +198,7 @@ def sanitize(text: object, max_length: int = 300) -> str:
 
 
 _INVISIBLE = ("Cc", "Cf", "Cs")  # control characters, format characters such as reversed order, and surrogates
-_KEPT = "\n\t\u200c\u200d"  # line breaks, tabs, and the joiners of Persian, Indic scripts and emoji
+_ALLOWED = "\n\t\u200c\u200d"  # line breaks, tabs, and the joiners of Persian, Indic scripts and emoji
 
 
 def clean_text(text: str) -> str:
@@ -209,7 +209,7 @@ def clean_text(text: str) -> str:
     """
     if text.isascii() and text.isprintable():
         return text
-    return "".join("?" if unicodedata.category(c) in _INVISIBLE and c not in _KEPT else c for c in text)
+    return "".join("?" if unicodedata.category(c) in _INVISIBLE and c not in _ALLOWED else c for c in text)
 
 
 def _read_last_exception(trace: str) -> str:

@@ -474,7 +474,7 @@ __doc__ = fill_manual(__doc__ or "").replace("{aovs}", nerg_aovs.format_manual()
 
 
 class NergIntegrator(mi.SamplingIntegrator):
-    __doc__ = SUMMARY + __doc__
+    __doc__ = SUMMARY + (__doc__ or "")
 
     def __init__(self, props):
         super().__init__(props)

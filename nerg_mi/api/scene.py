@@ -158,7 +158,7 @@ class Scene:
         activate_mitsuba()
         # Each variant has a class of this name.
         if type(scene).__name__ == "Scene" and type(scene).__module__.partition(".")[0] == "mitsuba":
-            return cls(scene)
+            return cls(cast("mi.Scene", scene))
         if isinstance(scene, Mapping):
             return cls._from_content(dict(scene))
         raise NergError(
