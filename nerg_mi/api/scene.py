@@ -7,7 +7,7 @@ import re
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -86,7 +86,7 @@ class Scene:
     """
 
     def __init__(self, mitsuba: mi.Scene):
-        integrator = mitsuba.integrator()
+        integrator: Any = mitsuba.integrator()
         if not is_nerg(integrator):
             have = "none" if integrator is None else f'"{integrator.class_name()}"'
             raise NergError(
