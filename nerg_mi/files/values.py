@@ -220,6 +220,10 @@ def find_name(name: str, names: Sequence[str]) -> int | None:
 _WHOLE = re.compile(r"(-?(?:0|[1-9]\d*))\.0+")
 
 
+# Spaces at the ends of a name, also those without width, which copies from pages contain.
+_ENDS = re.compile(r"^[\s\u200b\u2060\ufeff]+|[\s\u200b\u2060\ufeff]+$")
+
+
 def to_name(value: Any) -> str:
     """Return the name, or the number of a participant, as text; "" if it is missing.
 
@@ -227,7 +231,7 @@ def to_name(value: Any) -> str:
     stored as floating-point numbers by many programs.
     """
     if isinstance(value, str):
-        text = normalize_name(value.strip())
+        text = normalize_name(_ENDS.sub("", value))
         return match[1] if (match := _WHOLE.fullmatch(text)) else text
     if is_missing(value):
         return ""

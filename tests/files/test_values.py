@@ -128,6 +128,12 @@ def test_flags_are_numbers_where_they_are_allowed():
     )
 
 
+@pytest.mark.parametrize("name", ["Ann\u200b", "\ufeff Ann", "Ann\u2060\n", "\u00a0Ann "])
+def test_spaces_of_any_kind_around_names_do_not_count(name):
+    assert to_name(name) == "Ann" and to_names(["Ann", name], "participants").tolist() == ["Ann", "Ann"]
+    assert to_name("A\u200bnn") == "A\u200bnn"
+
+
 def test_tensors_with_derivatives_are_numbers():
     torch = pytest.importorskip("torch")
     tensor = torch.tensor([[1.0, 2.0]], requires_grad=True)

@@ -100,7 +100,7 @@ def open_named_table(
     def refuse(line: int, reason: str) -> None:
         raise NergError(f"{path}, line {line}{reason}")
 
-    select = lambda names: [columns[name] for name in names if columns[name] is not None]
+    select = lambda names: [column for name in names if (column := columns[name]) is not None]
     blocks = iterate_table(path, select(numbers), select(texts), on_bad_line=refuse)
     return [name for name, column in columns.items() if column is not None], blocks
 
