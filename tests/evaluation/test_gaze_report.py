@@ -531,6 +531,15 @@ def test_interval_of_coverage_draws_participants(evaluation):
     assert row["80%.high"] - row["80%"] == pytest.approx(half_width) == pytest.approx(row["80%"] - row["80%.low"])
 
 
+def test_intervals_of_differences_are_widened_for_few_participants():
+    """The bootstrap's interval, in the units of Student's t with n - 1 degrees of freedom and of n / (n - 1)."""
+    field, other = {"bits": 1.0}, {"bits": 0.4, "bits.gap.low": 0.5, "bits.gap.high": 0.7}
+    for count in (3, 5, 50):
+        difference = compare_scores(field, other, "bits", count)
+        half_width = 0.1 / 1.96 * stats.t.ppf(0.975, count - 1) * math.sqrt(count / (count - 1))
+        np.testing.assert_allclose((difference.low, difference.high), (0.6 - half_width, 0.6 + half_width))
+
+
 def test_interval_of_folds_is_that_of_students_t():
     folds = [[{"method": "field", "bits": v}, {"method": "other", "bits": w}] for v, w in ((1, 0.5), (2, 1), (4, 3.5))]
     field, _, difference = summarise_folds(folds)
