@@ -88,10 +88,11 @@ class _Grid:
             ns.Bool([True] * 8),
             ns.Bool([False] * 8),
         )
-        self.turn = 3
+        self.turn, self.resolution, self.unsampled = 3, 2, ns.UInt32([1, 6])
 
-    def restore(self, value, bits, seen, always, turn: int) -> None:
+    def restore(self, value, bits, seen, always, turn: int, unsampled=None) -> None:
         assert len(value) == len(bits) == len(seen) == len(always) == 8 and isinstance(turn, int)
+        assert unsampled is None or unsampled.ndim == 1
 
 
 def _trainer(kind):
@@ -123,6 +124,7 @@ def _trainer(kind):
             pieces_done=0,
             dense_cells=ns.UInt8([0] * 8),
             contributing_cells=ns.UInt8([0] * 8),
+            dilated_dense=None,
             restore=lambda *state: None,
         ),
         clock=StepClock(),
