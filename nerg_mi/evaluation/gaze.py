@@ -431,7 +431,8 @@ def evaluate_gaze(
     Notes
     -----
     An interval is ± 1.96 standard errors of the bootstrap. Quantiles are not used, because the truth of a resample has
-    fewer participants and narrower peaks, which lowers every score. All methods share the same resamples.
+    fewer participants and narrower peaks, which lowers every score. All methods share the same resamples. A resample in
+    which no ray is scored does not count.
     """
     rng, N = np.random.default_rng(seed), len(test.participants)
     report = on_progress or (lambda share: None)
@@ -450,7 +451,7 @@ def evaluate_gaze(
             resampled.append({**compute_map_scores(truth, m.maps[has_rays]), **m.average_rays(*weights)})
     for row, resampled, m in zip(rows, bootstrap, evaluated):
         for k in SCORES if resampled else ():
-            half_width = 1.96 * np.std([b[k] for b in resampled])
+            half_width = 1.96 * np.nanstd([b[k] for b in resampled])
             row[f"{k}.low"], row[f"{k}.high"] = float(row[k] - half_width), float(row[k] + half_width)
         row["integral"] = float(4 * np.pi * m.maps.mean())
     for other, resampled in zip(rows[1:], bootstrap[1:]):
@@ -468,7 +469,7 @@ def _make_difference(name: str, value: float, resampled: list[float]) -> dict[st
     """Return ``value`` under ``name`` and, if ``resampled``, the ends of its 95 % confidence interval."""
     if not resampled:
         return {name: value}
-    half_width = 1.96 * np.std(resampled)
+    half_width = 1.96 * np.nanstd(resampled)
     return {name: value, f"{name}.low": float(value - half_width), f"{name}.high": float(value + half_width)}
 
 
@@ -485,14 +486,14 @@ class _EvaluatedMethod(NamedTuple):
     ) -> dict[str, float]:
         """Return the mean of each score of rays, with ``weights`` (P, K) and ``own_weights`` (n,)."""
         return {
-            **{k: float(np.average(v, weights=weights)) for k, v in self.rays.items()},
+            **{k: _average(v, weights) for k, v in self.rays.items()},
             **{k: _average(v, own_weights) for k, v in self.own_rays.items()},
         }
 
 
 def _average(values: np.ndarray, weights: np.ndarray | None) -> float:
-    """Return the weighted mean of ``values`` (n,); not a number if nothing has weight."""
-    if not len(values) or (weights is not None and not weights.any()):
+    """Return the weighted mean of ``values``; not a number if nothing has weight."""
+    if not values.size or (weights is not None and not weights.any()):
         return float("nan")
     return float(np.average(values, weights=weights))
 

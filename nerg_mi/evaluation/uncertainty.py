@@ -167,6 +167,7 @@ def measure_calibration(
                 row[key] = float(is_inside.mean())
                 if len(draws):
                     weights = [times[test.sample_participants] for times in draws]
+                    weights = [w for w in weights if w.any()]
                     half_width = 1.96 * np.std([(is_inside * w).sum() / w.sum() for w in weights])
                     row[f"{key}.low"], row[f"{key}.high"] = row[key] - half_width, row[key] + half_width
             out.append(row)

@@ -13,6 +13,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.evaluation import gaze, metrics
 from nerg_mi.evaluation.baselines import make_prior_baseline, make_uniform_baseline
 from nerg_mi.evaluation.gaze import FieldDensity, compute_map_scores
+from nerg_mi.evaluation.uncertainty import measure_calibration
 from nerg_mi.fields.kde import SphericalKde
 from nerg_mi.maths.geometry import Box, Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
@@ -300,6 +301,23 @@ def test_split_half_that_is_noise_is_left_out():
     assert row is None and "does not exceed 0" in note
     assert not gaze.find_split_half_fault(5, 0.1) and gaze.find_split_half_fault(5, 0.1, -0.01)
     assert gaze.find_split_half_fault(4, 0.1) and gaze.find_split_half_fault(5, float("nan"))
+
+
+def test_resamples_without_a_scored_ray_do_not_count(test_set):
+    """All scored rays are of one participant, whom some resamples lack."""
+    who, origins = np.zeros_like(test_set.sample_participants), np.zeros_like(test_set.own_participants)
+    test = replace(test_set, sample_participants=who, own_participants=origins)
+    peaked = lambda positions, directions: np.exp(
+        3 * np.broadcast_to(directions[..., 0], (len(positions), directions.shape[-2]))
+    )
+    (row,) = gaze.evaluate_gaze(test, {"peaked": peaked}, make_uniform_baseline(), 40)
+    # Every resample with this participant has the same mean.
+    for score in (*gaze.RAY_SCORES, *gaze.OWN_SCORES):
+        assert row[f"{score}.low"] == pytest.approx(row[score]) == pytest.approx(row[f"{score}.high"])
+    assert row["KLD.low"] < row["KLD"]
+    at = np.ones(who.shape)
+    (row,) = measure_calibration(test, {"peaked": (test.truth, at)}, 40)
+    assert row["80%.low"] == pytest.approx(row["80%"]) == pytest.approx(row["80%.high"])
 
 
 def test_intervals_of_ray_scores_resample_participants(test_set):
