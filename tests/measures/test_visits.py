@@ -328,7 +328,19 @@ def slow_sums(rays, on, far, visible, cells):
 
 
 def cells_of(rays):
-    return [(ALL, None), (Cell("window", "early"), rays.t < 4), (Cell("zone", "none"), np.zeros(len(rays), bool))]
+    # The last ones begin within sessions, and have no samples.
+    late, none = (Cell("window", "late"), rays.t >= 1.5), (Cell("zone", "none"), np.zeros(len(rays), bool))
+    return [(ALL, None), (Cell("window", "early"), rays.t < 4), late, none]
+
+
+def test_the_first_visit_in_a_cell_counts_from_its_first_sample():
+    """Ten samples of a session, of which the cell has those from 0.4 s on; the area is hit from 0.7 s on."""
+    t = 0.1 * np.arange(10)
+    rays = Rays(t, np.zeros(10), ("Ada",), np.zeros((10, 3)), np.tile([1.0, 0, 0], (10, 1)), np.ones(10))
+    hits = HitAssignment(10, (np.arange(7, 10),), (np.ones(3),))
+    cells = [(ALL, None), (Cell("window", "late"), t > 0.35)]
+    sums = sum_visits(rays, hits, ("a",), cells, RULES)
+    assert sums.first_visit_sum[:, 0] == pytest.approx([0.7, 0.3]) and sums.first_visit_count[:, 0].tolist() == [1, 1]
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -358,7 +370,7 @@ def test_sums_match_loops(seed):
             [slow["lasted", cell, a, b] for b in range(len(BINS) - 1)] for a in range(3)
         ]
         assert sums.transitions[c].tolist() == [[slow["moves", cell, a, b] for b in range(3)] for a in range(3)]
-    assert {cell for cell, _ in sums.rows} == {ALL, Cell("window", "early")} and sums.transitions[0].sum() > 3
+    assert {cell for cell, _ in sums.rows} == {cell for cell, _ in cells[:-1]} and sums.transitions[0].sum() > 3
     # Area c has no visit.
     assert (
         sums.dwell_time[:, 2].sum() == 0
