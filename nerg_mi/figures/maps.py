@@ -542,7 +542,8 @@ def _describe_rays(rays, test=None) -> str:
         np.concatenate([np.asarray(rays.persons)[np.unique(r.person)] for r in (rays, test) if r is not None])
     ).size
     count = f"{len(rays):,} samples" if test is None else f"{len(rays):,} + {len(test):,} samples"
-    return f"{count} of {num_participants} {'participant' if num_participants == 1 else 'participants'}"
+    what = {"head": ", directions of heads", "mixed": ", partly directions of heads"}.get(rays.tracking, "")
+    return f"{count} of {num_participants} {'participant' if num_participants == 1 else 'participants'}{what}"
 
 
 def _draw_arrows(axes, rays, low, high) -> None:

@@ -150,10 +150,9 @@ class DataFrameReader:
     """
 
     def __init__(self, frame: Any) -> None:
-        labels = getattr(frame, "columns", None)
-        if hasattr(frame, "iloc") and labels is not None:
+        if hasattr(frame, "iloc") and hasattr(frame, "columns"):
             # pandas allows repeated names and tuples, which narwhals refuses even in unused columns.
-            self._labels, self._get = list(labels), lambda k: frame.iloc[:, k]
+            self._labels, self._get = list(frame.columns), lambda k: frame.iloc[:, k]
         elif hasattr(frame, "column_names") and hasattr(frame, "combine_chunks"):
             # So does Arrow.
             self._labels, self._get = list(frame.column_names), frame.column

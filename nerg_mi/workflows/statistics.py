@@ -57,7 +57,7 @@ from nerg_mi.measures.tables import (
 )
 from nerg_mi.measures.visits import ALL, Cell, Total, VisitSums
 from nerg_mi.rays.pseudonyms import make_pseudonyms, read_salt
-from nerg_mi.rays.rays import Rays
+from nerg_mi.rays.rays import TRACKING, Rays
 
 from .base import SILENT, Reporter, select_backend
 from .options import parse_point
@@ -211,6 +211,8 @@ class _StatisticsWork:
     def _counting(self, rays: Path | Rays) -> AoiContext:
         first = next(iter_blocks(rays, self.options.visit_rules()))
         hits = self.around.geometry is None and first.hit is not None and bool(np.isfinite(first.hit).any())
+        if first.tracking in ("head", "mixed"):
+            self.reporter.message(f"the rays are {TRACKING[first.tracking]}: numbers are those of heads, not of eyes")
         if self.around.geometry is None:
             self.reporter.message(
                 "no scene is given: rays end at their hit points"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pytest
 
@@ -258,3 +260,11 @@ def test_names_of_columns_with_levels_and_numbers():
     greek = frame.rename(columns={"time": "t [\u03bcs]"})
     micro = {"time": "t [\u00b5s]", "origin": list(vectors())[:3], "direction": list(vectors())[3:]}
     assert Rays.from_dataframe(greek, micro).t.tolist() == [0, 1, 2]
+
+
+def test_lazy_frames_are_collected():
+    polars = pytest.importorskip("polars")
+    table = polars.DataFrame({"time": [0.0, 1.0, 2.0], **vectors()}).lazy()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert len(Rays.from_dataframe(table)) == 3

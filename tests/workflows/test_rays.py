@@ -192,6 +192,7 @@ def test_plots_are_written(walk, tmp_path):
     figure = plot_rays(split.train, PlotOptions(kind="layout", test=split.test, output=tmp_path / "p.png"))
     assert figure.axes and (tmp_path / "p.png").read_bytes().startswith(b"\x89PNG")
     assert plot_rays(walk).axes
+    assert "directions of heads" in plot_rays(Rays.load(walk).with_tracking("head")).get_title(loc="left")
 
 
 @pytest.mark.parametrize(

@@ -279,3 +279,13 @@ def test11_impossible_requests_are_refused(folder, names, options, said):
         made["what_if"] = folder / "areas.json"
     with pytest.raises(NergError, match=said):
         statistics([folder / name for name in names], options=StatisticsOptions(**made))
+
+
+def test_directions_of_heads_are_named(folder):
+    recorder = Recorder()
+    statistics(
+        [folder / "bare" / "scene.xml", people().with_tracking("head")],
+        options=StatisticsOptions(aois=folder / "areas.json", **FAST),
+        reporter=recorder,
+    )
+    assert any("heads" in text for text in recorder.messages)
