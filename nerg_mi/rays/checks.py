@@ -7,6 +7,7 @@ To add a check, write ``@check("what it detects") def check_NAME(stats)`` here o
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -461,6 +462,7 @@ def check_participants(stats: RayStatistics) -> list[str]:
 # ---- Unit and column of time ----
 
 _DEVICE_RATES = 5.0, 2100.0  # sampling rates of existing devices, Hz
+_COMMON_RATE = 60.0
 
 
 @check("speeds above walking pace, implausible sampling rates, constant times (`--tick`, `--map t=`)")
@@ -479,12 +481,13 @@ def check_times(stats: RayStatistics) -> list[str]:
     # With most intervals above one second, hardly any time counts as recorded.
     if not 1e-4 <= step <= 1.0:
         tick = stats.rays.metadata.get("tick", 1.0)
-        factors = [
-            f for f in (1e-3, 1e-6, 1e-7, 1e-9, 1e3, 60.0) if _DEVICE_RATES[0] <= 1 / (step * f) <= _DEVICE_RATES[1]
-        ]
+        rates = {1 / (step * f): f for f in (1e-3, 1e-6, 1e-7, 1e-9, 1e3, 60.0)}
+        factors = {rate: f for rate, f in rates.items() if _DEVICE_RATES[0] <= rate <= _DEVICE_RATES[1]}
         remedy = "check the unit of time (--tick)"
         if factors:
-            unit, rate = tick * factors[0], 1 / (step * factors[0])
+            # Microseconds of 60 Hz are also 600 Hz in the ticks of .NET, and these are also 6 Hz in microseconds.
+            rate = min(factors, key=lambda rate: abs(math.log(rate / _COMMON_RATE)))
+            unit = tick * factors[rate]
             remedy = f"with a unit of time of {unit:g} s the sampling rate would be {rate:.3g} Hz (--tick {unit:g})"
         out.append(f"the median sampling interval is {step:.3g} s; {remedy}")
     return out

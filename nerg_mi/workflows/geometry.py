@@ -35,7 +35,10 @@ def geometry_kind(options: GeometryOptions) -> str:
             "--geometry none"
         )
     if options.geometry not in (None, "hits", "none"):
-        raise NergError(f'--geometry must be "hits" or "none", got "{options.geometry}"')
+        raise NergError(
+            f'--geometry must be "hits" or "none", got "{options.geometry}"; the file of a mesh or scene is given with '
+            "--scene, that of a radiance field with --field"
+        )
     return options.geometry or ("field" if options.field is not None else "scene")
 
 

@@ -199,6 +199,9 @@ def test_one_participant_per_row(get_or_compute_each, is_counter):
 def test_times_and_steep_gaze():
     rays = walk(hit=False)
     assert "the median sampling interval is 20 s" in warnings_of(replace(rays, t=rays.t * 1000))
+    # 50 Hz in microseconds, and in the ticks of .NET.
+    for tick in (1e-6, 1e-7):
+        assert f"--tick {tick:g})" in warnings_of(replace(rays, t=rays.t / tick))
     down = np.tile([0.1, 0.1, -1.0], (len(rays), 1)) / np.linalg.norm([0.1, 0.1, -1.0])
     assert "degrees down" in warnings_of(replace(rays, direction=down))
 

@@ -73,7 +73,8 @@ class VrSupermarket(FixedFrameReader):
                     poses.rotate(rotation, v[:, 12:15] * _FLIP),
                     rows=lines,
                     tracking="eye",
-                    confidence=np.clip(openness, 0.0, 1.0),
+                    # Slightly above 1 is open; percent are no confidences.
+                    confidence=np.where(openness < 2, np.minimum(openness, 1.0), openness),
                     hit=v[:, 18:21],
                     head=-rotation[:, :, 2],
                     recorded_direction=v[:, 12:15],

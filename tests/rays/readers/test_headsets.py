@@ -439,6 +439,9 @@ def test_supermarket_frame_eyes_and_openness(tmp_path):
         "confidence is missing or outside [0, 1]": [[5, 5]],
     }
     assert len(read("vr_supermarket", path, min_openness=0.4)) == 3
+    percent = [[*row[:21], 90, 80, row[23]] if k == 1 else row for k, row in enumerate(rows)]
+    path.write_text(csv(SUPERMARKET, percent))
+    assert [2 + 1, 2 + 1] in dropped(read("vr_supermarket", path))["confidence is missing or outside [0, 1]"]
 
 
 def test_supermarket_mirrored_rows_and_fill_values(tmp_path):
