@@ -10,7 +10,7 @@ from typing import Any, TypeAlias
 
 from nerg_mi.errors import NergError
 from nerg_mi.ranges import FLAG
-from nerg_mi.workflows.base import Reporter
+from nerg_mi.workflows.base import SILENT, Reporter
 from nerg_mi.workflows.progress import NotebookReporter, TerminalReporter, WarningReporter, is_notebook
 
 from .session import name_objects
@@ -56,6 +56,7 @@ class _ArgumentReporter:
 
     def __init__(self, reporter: Reporter, names: dict[str, Field[Any]]) -> None:
         self._reporter, self._names = reporter, names
+        self.is_silent = reporter is SILENT
         self.progress = reporter.progress
 
     def message(self, text: str) -> None:

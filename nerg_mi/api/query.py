@@ -216,11 +216,11 @@ def trace(
     o, d = arrays.as_rays(origins, directions)
     with report_progress(progress) as reporter, translate_mitsuba_errors():
         tracer = _Tracer(scene, requested, seed, reporter)
+        positions = np.unique(o, axis=0) if observers is None else arrays.as_points(observers, "observers")
+        if tracer.per_observer:
+            warn_extrapolation(reporter, scene, positions)
         if observers is None:
-            if tracer.per_observer:
-                warn_extrapolation(reporter.warn, scene, np.unique(o, axis=0))
             return TraceResult(tracer.trace_for_origins(o, d), ("ray",), None)
-        positions = resolve_observers(scene, observers, reporter)
         return TraceResult(tracer.trace_for_observers(o, d, positions), ("observer", "ray"), positions)
 
 
@@ -316,6 +316,8 @@ def observe(
     points: ArrayLike,
     observers: ArrayLike | None = None,
     quantities: str | Sequence[str] | None = None,
+    *,
+    progress: Progress = None,
 ) -> ObserveResult:
     """Compute what observers see of points: visibility and gaze.
 
@@ -332,6 +334,8 @@ def observe(
         Any of ``gaze`` (1/sr, after occlusion), ``visibility`` (1 visible to 0 occluded), ``distance`` from the
         observer to the point, and ``depth`` of the first surface in that direction, or the distance if there is none
         (both in scene units). Default: all.
+    progress : bool, Reporter or None
+        A `Reporter` receives warnings, which are Python warnings otherwise.
 
     Returns
     -------
@@ -358,7 +362,7 @@ def observe(
     allowed = POINT_QUANTITIES if scene.has_gaze else POINT_QUANTITIES[1:]
     requested = allowed if quantities is None else resolve_quantities(scene, quantities, allowed)
     p = arrays.as_points(points, "points")
-    with report_progress(None) as reporter, translate_mitsuba_errors():
+    with report_progress(progress) as reporter, translate_mitsuba_errors():
         positions = resolve_observers(scene, observers, reporter)
         each = [_observe_points(SceneObserver(scene, eye), p, "gaze" in requested) for eye in positions]
     return ObserveResult(
@@ -377,15 +381,16 @@ def resolve_observers(scene: Scene, observers: ArrayLike | None, reporter: Repor
     if observers is None and scene.observer is None:
         raise NergError("the scene has no observer; pass positions with observers=[(x, y, z), ...]")
     positions = scene.observer[None] if observers is None else arrays.as_points(observers, "observers")
-    warn_extrapolation(reporter.warn, scene, positions)
+    warn_extrapolation(reporter, scene, positions)
     return positions
 
 
-def warn_extrapolation(warn: Callable[[str], None], scene: Scene, positions: Floats) -> None:
-    """Warn if values at ``positions`` (M, 3) are extrapolated."""
+def warn_extrapolation(reporter: Reporter, scene: Scene, positions: Floats) -> None:
+    """Warn if values at ``positions`` (M, 3) are extrapolated; a silent reporter takes no time."""
     from nerg_mi.transport import extrapolation
 
-    extrapolation.warn_extrapolation(warn, scene.geometry, scene.integrator.gaze, positions)
+    if not getattr(reporter, "is_silent", False):
+        extrapolation.warn_extrapolation(reporter.warn, scene.geometry, scene.integrator.gaze, positions)
 
 
 def _observe_points(observer: SceneObserver, p: Floats, with_gaze: bool) -> dict[str, Floats]:

@@ -173,7 +173,7 @@ def render(
         context = make_aov_context(scene, requested)
         positions = _resolve_observers(scene, sensor, observers, bool(context.observer_aovs))
         if context.observer_aovs and (observers is not None or scene.observer is not None):
-            warn_extrapolation(reporter.warn, scene, positions)
+            warn_extrapolation(reporter, scene, positions)
         layers = _ObserverLayers(context, sensor, requested, positions)
         values = _render_layers(scene, sensor, layers, int(spp), int(seed), reporter)
     return Pictures({name: values[name] for name in requested}, AXES, positions)

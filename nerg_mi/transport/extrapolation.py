@@ -20,7 +20,7 @@ _MIN_RELATIVE_EXTENT = 0.5
 """Minimum extent of the environment's box along an axis, relative to its largest one: an observer may stand above a
 floor with furniture, whose box is flat."""
 
-_MAX_SOLID_FACES = 500_000  # larger meshes are not searched for solids
+_MAX_SOLID_FACES = 100_000  # larger meshes are not searched for solids
 _SOLID_DIRECTIONS = 64
 _SOLID_DEPTH = 0.01  # depth in all directions within matter, relative to the environment's diagonal
 

@@ -17,6 +17,7 @@ from nerg_mi.api.query import observe, trace
 from nerg_mi.api.scene import Scene
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.transport.geometry import Ceiling
+from nerg_mi.workflows.base import SILENT
 
 # ---- Views ----
 
@@ -406,7 +407,8 @@ def _trace_from(
 ) -> dict[str, np.ndarray]:
     """Compute quantities (N,) or (N, channels) of rays from ``origin`` (3,) in ``directions`` (N, 3)."""
     observer_position = origin if observer is None else observer
-    traced = trace(scene, origin[None], directions, list(quantities), observers=observer_position[None], seed=seed)
+    options = {"observers": observer_position[None], "seed": seed, "progress": SILENT}
+    traced = trace(scene, origin[None], directions, list(quantities), **options)
     return {name: np.asarray(traced[name][0]) for name in quantities}
 
 
@@ -660,7 +662,9 @@ def compute_point_gaze(scene: Scene, proxy: PointProxy, observer: np.ndarray) ->
         part = points[a : a + BATCH_SIZE]
         with rough_integrals(scene):
             # Kernels depend on the number of points.
-            observed = observe(scene, pad_directions(part, BATCH_SIZE), observers=observer[None], quantities=names)
+            observed = observe(
+                scene, pad_directions(part, BATCH_SIZE), observers=observer[None], quantities=names, progress=SILENT
+            )
         for name in names:
             values = np.asarray(observed[name][0, : len(part)])
             if a == 0:

@@ -28,6 +28,7 @@ from nerg_mi.rendering.nested_scene import FIELD_PROPERTY, find_field_file, repl
 from nerg_mi.rendering.scene import load_scene
 from nerg_mi.transport.extrapolation import describe_extrapolation
 from nerg_mi.transport.geometry import Ceiling
+from nerg_mi.workflows.base import SILENT
 from nerg_mi.workflows.render import describe_basis
 from nerg_mi.workflows.scene_cameras import check_point
 from nerg_mi.workflows.scene_commands import ViewOptions
@@ -957,6 +958,7 @@ class Session:
             pad_directions(directions, self.band_pace.num_rays),
             quantities,
             observers=observer[None],
+            progress=SILENT,
         )
         count = len(directions)
         values = {k: np.asarray(traced[k][0])[:count].reshape(height, width, *traced[k].shape[2:]) for k in quantities}

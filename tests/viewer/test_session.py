@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import threading
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -258,6 +259,18 @@ def test11_failed_shares_are_reported_once(make_session, room, gaze_fields, monk
     assert [str(e) for e in session.listener.errors] == ["no"]
     session.place_observer(np.array([0.0, 1, 1]))
     assert not session.update_shares()
+
+
+def test22_observer_outside_is_noted(make_session, room, gaze_fields):
+    session = make_session(room, gaze_fields[0])
+    settle(session)
+    assert session.observer_note == "" and all(share.is_final for share in session.shares.values())
+    session.place_observer(np.array([99.0, 99, 1.6]))
+    with warnings.catch_warnings():
+        # The note is enough: pictures and points follow each step of the observer.
+        warnings.simplefilter("error")
+        settle(session)
+    assert "99, 99, 1.6" in session.observer_note and "extrapolated" in session.observer_note
 
 
 # ---- Attention shares ----
