@@ -378,9 +378,12 @@ def resolve_observers(scene: Scene, observers: ArrayLike | None, reporter: Repor
     NergError
         The scene has no observer.
     """
-    if observers is None and scene.observer is None:
+    if observers is not None:
+        positions = arrays.as_points(observers, "observers")
+    elif scene.observer is not None:
+        positions = scene.observer[None]
+    else:
         raise NergError("the scene has no observer; pass positions with observers=[(x, y, z), ...]")
-    positions = scene.observer[None] if observers is None else arrays.as_points(observers, "observers")
     warn_extrapolation(reporter, scene, positions)
     return positions
 
