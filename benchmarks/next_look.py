@@ -157,7 +157,7 @@ def run_heads(args) -> None:
         rays, heads = Rays.load(path), folder / "heads.npz"
         if rays.head is None:
             raise SystemExit(f'"{name}" has no directions of heads; leave it out')
-        replace(rays, direction=rays.head, hit=None).save(heads)
+        replace(rays, direction=rays.head, hit=None).with_tracking("head").save(heads)
         for seed in range(args.seed, args.seed + args.folds):
             # The last field has no surfaces, as that of heads.
             for surfaces in dict.fromkeys([where["geometry"], "none"]):

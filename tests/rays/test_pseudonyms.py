@@ -12,6 +12,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.rays.pseudonyms import pseudonymise, read_salt
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rays.readers.columns import ColumnMap
+from tests.rays.people import some_rays
 from tests.rays.readers.examples import read
 
 SALT = bytes(range(16))
@@ -104,3 +105,9 @@ def test_salts(tmp_path):
         read_salt(tmp_path / "absent")
     with pytest.raises(NergError, match="at least 16"):
         pseudonymise(one_ray("a", ""), b"x")
+
+
+def test_participants_called_as_what_was_tracked():
+    rays = some_rays(4, person=[0, 1, 0, 1], persons=("eye", "head")).with_tracking("head")
+    hidden = pseudonymise(rays, bytes(range(32)))
+    assert hidden.tracking == "head" and not {"eye", "head"} & set(hidden.persons)

@@ -127,6 +127,22 @@ def test_participants_are_found_by_another_form_of_their_name(tmp_path):
         assert len(dataset.load(Conditions(without_persons=[name]))) == 400
 
 
+def test_datasets_of_earlier_versions_have_two_forms_of_a_name(tmp_path, monkeypatch):
+    composed, decomposed = "J\u00f6rg", "Jo\u0308rg"
+    paths = [write_source(tmp_path / f"{k}.csv", k, people=1) for k in range(2)]
+    for path, name in zip(paths, (composed, decomposed)):
+        path.write_text(path.read_text().replace(f"p{path.stem}_0", name))
+    with monkeypatch.context() as change:
+        change.setattr("nerg_mi.files.values.unicodedata.normalize", lambda form, text: text)
+        update_dataset(tmp_path / "a.rays", paths, recipe())
+    dataset = RayDataset.open(tmp_path / "a.rays")
+    assert set(dataset.persons) == {composed, decomposed}
+    for name in (composed, decomposed):
+        rays = dataset.load(Conditions(persons=[name]))
+        assert len(rays) == 798 and rays.persons == (composed,)
+        assert not len(dataset.load(Conditions(without_persons=[name])))
+
+
 def test_too_many_rays_are_refused(made):
     dataset, rays = made
     with pytest.raises(NergError, match="1,197.*1,000.*--sample"):

@@ -18,6 +18,7 @@ from nerg_mi.rays.readers import registry
 from nerg_mi.rays.readers.base import (
     UNITY,
     UP_AXES,
+    NameCodes,
     NoOptions,
     RaysBuilder,
     TickOption,
@@ -447,3 +448,10 @@ def test_all_readers_refuse_circular_links(name, tmp_path):
             registry.read_rays(name, cases, options)
         (tmp_path / file).unlink()
         (tmp_path / file).write_bytes(content)
+
+
+def test_codes_of_names_do_not_depend_on_their_form():
+    codes = NameCodes()
+    assert codes.encode(["J\u00f6rg", "Jo\u0308rg", "1.0", " 1", "nan"], 5).tolist() == [0, 0, 1, 1, 2]
+    assert codes.encode("Jo\u0308rg ", 2).tolist() == [0, 0]
+    assert codes.sort_codes(np.array([0, 1]))[1] == ("1", "J\u00f6rg")

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from nerg_mi.errors import NergError
 from nerg_mi.rays.readers.base import RaysBuilder
 from nerg_mi.rays.readers.columns import ColumnMap
-from nerg_mi.rays.readers.table import TableOptions, add_tables
+from nerg_mi.rays.readers.table import TableOptions, add_tables, find_tracking
 from tests.rays.readers.examples import dropped, read
 
 
@@ -367,3 +367,28 @@ def test_clock_times_need_no_tick(tmp_path, tick):
     assert np.allclose(
         read_table(tmp_path / "t.csv", "origin=x,y,z direction=a,b,c t=t", tick=tick).t, [43200.5, 43201]
     )
+
+
+@pytest.mark.parametrize(
+    "columns, tracking",
+    [
+        ("origin=x,y,z direction=a,b,c", "eye"),
+        ("origin=x,y,z xyzw=q,r,s,t", "head"),
+        ("origin=x,y,z xyzw=q,r,s,t direction=a,b,c", "eye"),
+        ("origin=x,y,z direction=HeadForward.x,HeadForward.y,HeadForward.z", "head"),
+        ("origin=x,y,z direction=hmd_dir_x,hmd_dir_y,hmd_dir_z", "head"),
+        ("origin=x,y,z direction=head_gaze_x,head_gaze_y,head_gaze_z", "eye"),
+        ("origin=x,y,z direction=camera_x,camera_y,camera_z head=a,b,c", "eye"),
+        ("origin=x,y,z azel=a,b", "eye"),
+    ],
+)
+def test_maps_tell_heads_from_eyes(columns, tracking):
+    assert find_tracking(ColumnMap.parse(columns)) == tracking
+
+
+def test_what_was_tracked_can_be_stated(tmp_path):
+    (tmp_path / "a.csv").write_text("t,x,y,z,a,b,c\n0,1,2,3,1,0,0\n")
+    columns = "origin=x,y,z direction=a,b,c t=t"
+    assert read_table(tmp_path / "a.csv", columns, tracking="head").tracking == "head"
+    with pytest.raises(NergError, match="--tracking must be eye or head"):
+        TableOptions(tracking="ear")
