@@ -13,7 +13,7 @@
 #   make docs      regenerate the parts of the manual that are derived from the code
 #   make manual    build the manual into out/manual/html (Python 3.11 or newer); any warning is an error
 #   make onecore   run the tests that render, write images and train on one core, where Dr.Jit has one thread
-#   make portable  run the tests in random order, as a processor with narrower vectors computes; ARGS=--randomly-seed=N
+#   make portable  run all tests in random order, as a processor with narrower vectors computes; ARGS=--randomly-seed=N
 #                  repeats an order
 #   make coverage  measure line and branch coverage of all tests (also as out/coverage/index.html)
 #   make fuzz      pass 20,000 damaged files to the readers and count the outcomes (about ten minutes)
@@ -58,7 +58,7 @@ test-all: setup
 bench bench-gpu: EXTRAS = torch
 
 portable: setup
-	$(RUN) -m tools.other_processor $(PYTEST) -p randomly -m "not nightly" $(ARGS)
+	$(RUN) -m tools.other_processor $(PYTEST) -p randomly $(ARGS)
 
 lint types format docs: EXTRAS = lint
 
