@@ -10,6 +10,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.files.safe_read import sanitize
+from nerg_mi.files.values import to_name
 
 from .checks import RECORDING_CHECKS, RayStatistics
 from .dataset import RayDataset
@@ -307,6 +308,8 @@ class GazeTarget:
     def __post_init__(self) -> None:
         if not self.end > self.start:
             raise NergError(f"a target must end after it starts, got {self.start:g} to {self.end:g} s")
+        if self.participant is not None:
+            object.__setattr__(self, "participant", to_name(self.participant))
 
 
 @dataclass(frozen=True)

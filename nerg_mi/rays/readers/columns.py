@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError, sanitize
+from nerg_mi.files.values import fold_name
 
 from .cells import AXES, is_missing
 from .tables import TableBlock, explain_columns, find_vector_columns, iterate_table, read_table_columns
@@ -385,7 +386,7 @@ def mark_valid(cells: np.ndarray, values: Iterable[str]) -> np.ndarray:
 
 
 def _normalise_cell(text: str) -> str:
-    text = text.strip().lower()
+    text = fold_name(text).strip().lower()
     return text.partition(".")[0] if re.fullmatch(r"\d+\.0*", text) else text
 
 
@@ -435,7 +436,8 @@ _EXCLUDED_WORDS = (
     *("ecef", "scale", "size", "color", "uv", "std", "var", "screen", "webcam", "px", "pixel", "norm2d", "pupil"),
     *("target", "aoi", "hand", "controller", "screenpoint", "velo"),
 )
-_TIME_UNITS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0, "sec": 1.0, "seconds": 1.0, "µs": 1e-6, "100ns": 1e-7}
+_TIME_UNITS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0, "sec": 1.0, "seconds": 1.0, "100ns": 1e-7}
+_TIME_UNITS |= {fold_name("\u00b5s"): 1e-6}
 _PERSON_NAMES = (*PERSON_NAMES, "pid", "participant_name", "subject_name", "user_name", "person_id", "player")
 _CONFIDENCE_NAMES = ("confidence", "gaze_confidence", "conf", "quality")
 
@@ -524,7 +526,7 @@ def parse_time_unit(column: str) -> float | None:
     """The unit of time in the name of a column, in seconds; None if there is none."""
     bracket = re.search(r"[(\[]([^)\]]{1,12})[)\]]", column)
     last = split_column_name(column).split("_")[-1]
-    return _TIME_UNITS.get(bracket[1].strip().lower() if bracket else last)
+    return _TIME_UNITS.get(fold_name(bracket[1].strip()).lower() if bracket else last)
 
 
 _LENGTH_UNITS = {"mm": "mm", "millimeters": "mm", "millimetres": "mm", "cm": "cm", "centimeters": "cm"}

@@ -11,6 +11,7 @@ from nerg_mi.rays.readers.columns import (
     is_validity_column,
     mark_valid,
     may_be_validity_column,
+    parse_time_unit,
     parse_valid,
     require_valid_values,
     split_column_name,
@@ -178,3 +179,8 @@ def test_values_given_by_the_user():
         with pytest.raises(NergError, match="--valid is"):
             parse_valid(text)
     assert mark_valid(np.array(["2", "2.0", "True", "3"]), ["2", "true"]).tolist() == [True, True, True, False]
+
+
+def test_units_and_values_are_compared_in_the_compatible_form():
+    assert parse_time_unit("t [\u00b5s]") == parse_time_unit("t [\u03bcs]") == pytest.approx(1e-6)
+    assert mark_valid(np.array(["gu\u0308ltig", "nein"]), ["g\u00fcltig"]).tolist() == [True, False]
