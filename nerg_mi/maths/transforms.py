@@ -53,7 +53,8 @@ def check_rigid_transforms(
         return
     row = int(np.argmax(is_bad))
     where = name if is_single else f"{name}, {label(row)}"
-    raise NergError(f"{where}: {_explain(m[row], errors[row], tolerance, may_scale)}")
+    with np.errstate(all="ignore"):
+        raise NergError(f"{where}: {_explain(m[row], errors[row], tolerance, may_scale)}")
 
 
 def has_last_row(matrices: np.ndarray) -> np.ndarray:

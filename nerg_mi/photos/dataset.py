@@ -10,6 +10,7 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.files.safe_read import resolve_path
 from nerg_mi.maths.geometry import AnyBox, Box, ContractedBox, intersect_box_numpy
+from nerg_mi.ranges import MAX_COORDINATE
 
 from . import cameras
 from .background import remove_background
@@ -522,8 +523,11 @@ def _find_extent(posed: PosedImages, views: list[PhotoView], aabb) -> SceneExten
         return estimate_extent(
             [v.camera for v in views], is_object_only, points, are_points_complete=depth_points_all is not None
         )
-    box_unpadded = Box(tuple(corners[0]), tuple(corners[1]))
-    pad = _RELATIVE_PADDING * box_unpadded.side
+    pad = _RELATIVE_PADDING * float(np.max(corners[1] - corners[0]))
+    if not np.abs(corners).max() + pad <= MAX_COORDINATE:
+        raise NergError(f"the box {source} has corners beyond {MAX_COORDINATE:g} units; correct it")
+    if not np.all(corners[1] > corners[0]):
+        raise NergError(f"the box {source} needs its lower corner first: {corners[0]} is not below {corners[1]}")
     box, how = Box(tuple(corners[0] - pad), tuple(corners[1] + pad)), f"{source}, padded by {pad:.3g} on each side"
     return SceneExtent(box, how, "room", "it ends at its box")
 

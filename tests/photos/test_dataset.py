@@ -319,7 +319,14 @@ def test_box_unit_and_scale(ring):
     assert np.allclose([v.camera.center for v in open_dataset(ring, holdout=0, scale=0.5).train], centers / 2)
     corners = open_dataset(ring, aabb=(0, 0, 0, 1, 1, 1))
     assert np.allclose(corners.box.side, 1.025)
-    for wrong in ({"aabb": (0, 0, 0)}, {"scale": 0.0}, {"coordinates": "elsewhere"}, {"coordinates": "original"}):
+    for wrong in (
+        {"aabb": (0, 0, 0)},
+        {"aabb": (0, 0, 1, 1, 1, 0.999)},
+        {"aabb": (0, 0, 0, 1, 1, 1e9)},
+        {"scale": 0.0},
+        {"coordinates": "elsewhere"},
+        {"coordinates": "original"},
+    ):
         with pytest.raises(ValueError):
             open_dataset(ring, **wrong)
 

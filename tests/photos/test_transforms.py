@@ -1,7 +1,10 @@
 """Transforms files: accepted, listed and refused content."""
 
+import copy
+import functools
 import json
 import os
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -235,6 +238,74 @@ def test_nerfstudio_file_lists_define_split(write):
         )
     )
     assert (t.held_out, t.unassigned) == (["d.png"], ["c.png"])
+
+
+# A value of each key and of each part of a value is dropped, or replaced by these.
+_WRONG = [
+    None,
+    True,
+    0,
+    -1,
+    1e308,
+    1e-308,
+    10**400,
+    np.nan,
+    "",
+    "x",
+    "1e9",
+    "\ud800",
+    "../..",
+    [],
+    {},
+    [[1]],
+    [None] * 4,
+]
+_WRONG += [[["x"] * 4] * 4, np.ones((4, 4)).tolist(), [1, [2, 3]], [[[1]] * 3] * 3]
+
+
+def _list_paths(value, path=()):
+    """Paths of keys and indices to all parts of a JSON value, of lists to the first two."""
+    keys = value if isinstance(value, dict) else range(min(len(value), 2)) if isinstance(value, list) else ()
+    return [p for key in keys for p in ((*path, key), *_list_paths(value[key], (*path, key)))]
+
+
+@pytest.mark.filterwarnings("error")
+def test_mutated_files_are_read_or_refused(write):
+    """A sample of all combinations; what is read is finite."""
+    first = {
+        "file_path": "a.png",
+        "transform_matrix": np.eye(4).tolist(),
+        "depth_file_path": "d.npy",
+        "mask_path": "m.png",
+    }
+    numbers = dict.fromkeys(
+        "fl_x fl_y cx cy k1 k2 p1 p2 k3 k4 camera_angle_x x_fov depth_unit_scale_factor".split(), 1.0
+    )
+    flags = dict.fromkeys("is_fisheye from_mitsuba is_euclidean_depth enable_depth_loading".split(), False)
+    content = {**numbers, **flags, "w": 8, "h": 8, "camera_model": "OPENCV", "distortion_params": [0] * 6}
+    content |= {"applied_transform": np.eye(4)[:3].tolist(), "applied_scale": 1.0, "aabb": [[0, 0, 0], [1, 1, 1]]}
+    content |= {"train_filenames": ["a.png"], "test_filenames": ["b.png"], "frames": [first, frame("b.png")]}
+    path = write(content, ["a.png", "b.png", "d.npy", "m.png"])
+    cases = [(p, k) for p in _list_paths(content) for k in range(len(_WRONG) + 1)]
+    outcomes = Counter()
+    for number in np.random.default_rng(0).permutation(len(cases))[:600]:
+        keys, k = cases[number]
+        changed = copy.deepcopy(content)
+        parent = functools.reduce(lambda value, key: value[key], keys[:-1], changed)
+        if k < len(_WRONG):
+            parent[keys[-1]] = _WRONG[k]
+        else:
+            del parent[keys[-1]]
+        path.write_text(json.dumps(changed))
+        try:
+            posed = read_transforms(path)
+        except NergError as error:
+            outcomes["refused"] += 1
+            assert "\n" not in str(error)
+        else:
+            outcomes["read"] += 1
+            assert all(np.isfinite(f.to_world).all() and np.isfinite(list(f.lens.values())).all() for f in posed.frames)
+    assert min(outcomes.values()) > 50
 
 
 @pytest.mark.parametrize(
