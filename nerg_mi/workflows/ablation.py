@@ -28,7 +28,6 @@ from nerg_mi.files.safe_read import read_json
 from nerg_mi.files.tables import write_json
 from nerg_mi.formats.fields import save_gaze
 from nerg_mi.formats.splats import is_splat_file
-from nerg_mi.interruption import TrainingInterrupted
 from nerg_mi.rays.dataset import load_rays
 from nerg_mi.rays.rays import Rays
 from nerg_mi.tasks.execution import prepare_once
@@ -124,11 +123,11 @@ def make_plan(variant: Variant, seed: int, bench: AblationBenchmark) -> GazePlan
 
 
 def _train(made: dict, plan: GazePlan, path: Path, bench: AblationBenchmark) -> dict:
-    """Train, write the checkpoint with the metadata ``made``, and score; raise `TrainingInterrupted` after Ctrl-C."""
+    """Train, write the checkpoint with the metadata ``made``, and score. Raises ``KeyboardInterrupt`` after Ctrl-C."""
     started = time.perf_counter()
     result = train_planned(Supervision(bench.train), bench.place, plan, bench.ns)
     if result.interrupted:
-        raise TrainingInterrupted(result.field, result.provenance)
+        raise KeyboardInterrupt
     seconds = time.perf_counter() - started
     save_gaze(result.field, path, {**bench.place.metadata, **result.provenance, **made})
     density = FieldDensity(result.field, bench.place.medium, bench.place.align, plan.probes.depth)

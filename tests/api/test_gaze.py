@@ -182,9 +182,10 @@ def test10_another_geometry_is_reported(folder):
     gaze, (o, d) = nerg.load_gaze(folder / "gaze.safetensors"), some_rays(2)
     listener = Listener()
     gaze.density(o, d, geometry=folder / "room.xml", progress=listener)
-    assert not listener.warnings and listener.shares == [(1.0, "observer 2 of 2")]
+    assert not any("was not trained in" in text for text in listener.warnings)
+    assert listener.shares == [(1.0, "observer 2 of 2")]
     gaze.density(o, d, geometry=folder / "block.ply", progress=listener)
-    assert len(listener.warnings) == 1 and "was not trained in" in listener.warnings[0]
+    assert sum("was not trained in" in text for text in listener.warnings) == 1
 
 
 def test11_a_changed_file_is_read_again(folder, tmp_path):

@@ -309,7 +309,7 @@ def test_a_walk_writes_frames(rgb, folder, tmp_path):
         (["mesh.ply"], {"geometry": "hits"}, "--geometry"),
         (["mesh.ply"], {"person": "Ada"}, "--person needs one of --time and --time-range,"),
         (["mesh.ply"], {"person": "Ada", "time": 1.0}, "--person"),
-        (["rays.npz"], {"person": "Eve", "time": 1.0}, "the rays have no person"),
+        (["rays.npz"], {"person": "Eve", "time": 1.0}, "Eve"),
         (["mesh.ply"], {"camera_to": (0, 0, 1)}, "the camera is set by --camera and --target, by"),
         (["mesh.ply"], {"photo": "1"}, "--photo needs the photos of the training; add"),
         (["mesh.ply"], {"observer": (1, 2)}, "--observer must be three numbers x,y,z, got"),

@@ -151,7 +151,7 @@ def test_the_nearest_ray_of_a_person(rays):
 @pytest.mark.parametrize(
     "person, time, said",
     [
-        ("Eve", 0, '"Eve"'),
+        ("Eve", 0, "Eve"),
         ("Cy", 0, "has no rays; choose another person"),
         ("Ada", 5.0, "s; increase --max-gap to bridge longer pauses"),
     ],
