@@ -23,7 +23,7 @@ from .radiance_data import FreeSpace
 
 _DECAY = 0.6
 # One part of the cells is updated at a time; strides cycle through all parts.
-_NUM_PARTS = 8
+NUM_PARTS = 8
 GRID_STATE = ("value", "bits", "seen", "always")  # Arrays of the grid in the run state
 
 
@@ -208,7 +208,7 @@ class DensityGrid:
 
         ``density`` maps world points (Array3f, mask) to σ without gradient.
         """
-        index = self.select_cells(self.turn, 1 if everywhere else _NUM_PARTS)
+        index = self.select_cells(self.turn, 1 if everywhere else NUM_PARTS)
         self.turn += not everywhere
         if dr.width(index) > 0:
             # Clamp the optical depth: larger values carry no information and would dominate the mean.
@@ -323,7 +323,7 @@ class DensityGrid:
         self.always = self.always | self.ns.Bool(cells.ravel())
         dr.eval(self.always)
 
-    def select_cells(self, turn: int, parts: int = _NUM_PARTS):
+    def select_cells(self, turn: int, parts: int = NUM_PARTS):
         """Return every ``parts``-th cell (UInt32) that may be sampled, starting from cell ``turn`` modulo ``parts``."""
         index = dr.arange(self.ns.UInt32, self.resolution**3 // parts) * parts + dr.opaque(self.ns.UInt32, turn % parts)
         seen: Any = dr.compress(dr.gather(self.ns.Bool, self.seen, index))
@@ -357,7 +357,7 @@ class OccupancyExtraction:
         Cells that absorb some light.
     """
 
-    PROBE_PIECES = len(_STRATA) * _NUM_PARTS
+    PROBE_PIECES = len(_STRATA) * NUM_PARTS
     NUM_PIECES = PROBE_PIECES + _RAY_GROUPS
 
     def __init__(self, grid: DensityGrid):
@@ -407,7 +407,7 @@ class OccupancyExtraction:
             open_: Any = dr.compress(dr.gather(grid.ns.UInt8, self.dense_cells, part) == 0)
             if dr.width(open_) > 0:
                 index = dr.gather(grid.ns.UInt32, part, open_)
-                grid.mark_dense_cells(self.dense_cells, index, density, rng, _STRATA[self.pieces_done // _NUM_PARTS], 2)
+                grid.mark_dense_cells(self.dense_cells, index, density, rng, _STRATA[self.pieces_done // NUM_PARTS], 2)
         else:
             if self.dilated_dense is None:
                 self.dilated_dense = grid.ns.UInt8(grid.dilate_cells(self.dense_cells).ravel())

@@ -25,6 +25,7 @@ from nerg_mi.photos.dataset import Dataset
 from nerg_mi.photos.images import PhotoView, pick_evenly
 from nerg_mi.threads import measure_processor_time
 
+from .radiance_budget import Budget
 from .radiance_diagnosis import MIN_STEPS, Outcome, describe_pace, find_causes, find_problems
 from .radiance_losses import PHOTO_PARAMETER
 from .radiance_monitor import (
@@ -175,20 +176,22 @@ _PACE_TIME = 0.1
 _MIN_IMPROVEMENT = 0.2
 # Minimum number of steps between two evaluations, each of which takes as long as several steps
 MIN_EVALUATION_INTERVAL = 50
-# Maximum samples of an evaluation, and of the final error: in fog a ray has hundreds.
-_EVALUATION_SAMPLES, _FINAL_SAMPLES = 2**19, 2**24
+# Maximum samples of an evaluation
+_EVALUATION_SAMPLES = 2**19
 
 
 @dataclass(frozen=True)
 class RadianceProgress:
     """Progress of a run.
 
-    ``phase`` is "training", "scoring" (of the held-out views) or "writing", and ``fraction`` its completed fraction.
-    ``seconds`` is the time of training so far, ``psnr`` the last held-out error in dB or None; ``rays`` and ``samples``
-    are those of the last step.
+    ``phase`` is "training", "extracting" (the occupancy), "scoring" (of the held-out views) or "writing".
+    ``fraction`` is the completed fraction of all of them, and ``remaining`` the seconds that remain, both estimated
+    from measured costs (`Budget`). ``seconds`` is the time so far, ``psnr`` the last held-out error in dB or None;
+    ``rays`` and ``samples`` are those of the last step.
     """
 
     fraction: float
+    remaining: float
     steps: int
     seconds: float
     rays: int
@@ -285,10 +288,12 @@ def train_field(
         if state is not None:
             save_run(trainer, state, identity, history)
 
-    def report(fraction: float, phase: str = "training") -> None:
+    budget = Budget(trainer, dataset.held_out)
+
+    def report(phase: str = "training", part: float = 0.0) -> None:
         if on_progress is not None and not interrupted:
             now = trainer.steps, trainer.seconds, trainer.rays, trainer.samples
-            on_progress(RadianceProgress(fraction, *now, last_psnr, phase))
+            on_progress(RadianceProgress(*budget.estimate(part), *now, last_psnr, phase))
 
     pace = Pace(trainer)
     if observer is not None:
@@ -304,7 +309,9 @@ def train_field(
                 and trainer.steps >= last_evaluation + MIN_EVALUATION_INTERVAL
             ):
                 evaluation_times, last_evaluation = [x for x in evaluation_times if x > trainer.progress], trainer.steps
-                _append_evaluation(trainer, watched, history)
+                with budget.timing_evaluation([*watched.held_out, *watched.training]) as strides:
+                    row = _append_evaluation(trainer, watched, history)
+                    strides += [] if row is None else [row["every_pixel"]]
                 last_psnr = history[-1]["psnr"] if history else None
                 with saving_on_failure(state, save, is_done=False):
                     if curves is not None and history:
@@ -317,7 +324,8 @@ def train_field(
             if observer is not None:
                 observer.on_step(trainer, history)
             try:
-                report(trainer.progress)
+                budget.update()
+                report()
                 stop.check()
             except KeyboardInterrupt:
                 # Ctrl-C is only handled between two steps, because within a step weights and random numbers are
@@ -332,10 +340,12 @@ def train_field(
         save()
 
     with saving_on_failure(state, save_end, is_done=write is not None and not interrupted):
-        score = lambda fraction: report(fraction, "scoring")
+        budget.start_result()
+        report("extracting")
+        score = lambda fraction: report("scoring", fraction)
         duration = seconds, pace.waiting_fraction
         # A copy, because the evaluation of the result is not part of the run: a resumed run would not repeat it.
-        field, provenance = _make_result(trainer, dataset, watched, list(history), duration, interrupted, score)
+        field, provenance = _make_result(trainer, dataset, watched, list(history), duration, interrupted, budget, score)
         evaluations, result = provenance["psnr_watched"]["history"], provenance["psnr_watched"]["result"]
         if previews is not None:
             previews.write_result(trainer, field)
@@ -343,7 +353,7 @@ def train_field(
             write_curves_table(curves, evaluations)
             write_curves_figure(get_curves_figure(curves), evaluations, result)
         if write is not None:
-            report(0.0, "writing")
+            report("writing", 1.0)
             write(field, provenance)
     return field, provenance
 
@@ -413,6 +423,7 @@ def _make_result(
     history: list,
     duration: tuple[float, float],
     interrupted: bool,
+    budget: Budget,
     on_progress: Callable[[float], None],
 ) -> tuple[RadianceField, dict]:
     """Return the best field and its provenance with the error on all held-out views.
@@ -421,7 +432,7 @@ def _make_result(
     ``on_progress`` is called with the fraction of the scored views.
     """
     seconds, waiting_fraction = duration
-    field, result = _choose_state(trainer, watched, history, seconds)
+    field, result = _choose_state(trainer, watched, history, seconds, budget)
     provenance = {
         **dataset.source,
         "settings": trainer.settings.to_dict(),
@@ -438,7 +449,7 @@ def _make_result(
         provenance["photo_stops"] = round(trainer.photos.compute_exposure_spread(trainer.averaged[PHOTO_PARAMETER]), 3)
     if dataset.held_out:
         on_progress(0.0)
-        every = trainer.choose_pixel_stride(dataset.held_out, _FINAL_SAMPLES)
+        every = trainer.choose_pixel_stride(dataset.held_out, budget.choose_final_samples())
         count = len(dataset.held_out)
         error = evaluate_views(trainer, dataset.held_out, every, field, lambda number: on_progress(number / count))
         on_progress(1.0)
@@ -468,7 +479,7 @@ def _make_result(
 
 
 def _choose_state(
-    trainer: RadianceTrainer, watched: WatchedViews, history: list, seconds: float
+    trainer: RadianceTrainer, watched: WatchedViews, history: list, seconds: float, budget: Budget
 ) -> tuple[RadianceField, dict | None]:
     """Return the field of the last state, or of the best one if that is better as a result, and its evaluation.
 
@@ -476,7 +487,9 @@ def _choose_state(
     ``seconds`` is the time of the training of the last state.
     """
     field = trainer.make_field()
-    last = _append_evaluation(trainer, watched, history, field, seconds)
+    with budget.timing_evaluation([*watched.held_out, *watched.training]) as strides:
+        last = _append_evaluation(trainer, watched, history, field, seconds)
+        strides += [] if last is None else [last["every_pixel"]]
     best = trainer.best
     if last is None or best is None or best.row["psnr"] <= last["psnr"] + _MIN_IMPROVEMENT:
         return field, last

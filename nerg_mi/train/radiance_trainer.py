@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,7 +22,7 @@ from nerg_mi.photos.images import PhotoView
 from nerg_mi.transport.quadrature import mean_depth_fraction
 
 from .radiance_data import FreeSpace, PixelBank, PixelBatch, find_focus_distances
-from .radiance_grid import GRID_STATE, DensityGrid, OccupancyExtraction
+from .radiance_grid import GRID_STATE, NUM_PARTS, DensityGrid, OccupancyExtraction
 from .radiance_losses import (
     PHOTO_PARAMETER,
     LossInputs,
@@ -136,6 +137,7 @@ def _march_rays(field, occupied, table, center, d, near: float, stop: float, ns)
 # Groups and sizes of training rays that determine the final occupancy, and their sample limit: in fog a ray has
 # hundreds.
 _RAY_GROUPS, _GROUP_RAYS, _EXTRACTION_SAMPLES = 64, 2**12, 2**25
+_PROBES = 3  # Points per cell and axis at which the density is evaluated for the final occupancy
 # Limit of the steps that the marching kernel visits, in batches; one costs a fiftieth of a sample of the density pass.
 _MAX_CANDIDATES = 128
 # Pixels whose depth loss exceeds the first value are drawn again; the second is the size of their buffer
@@ -243,6 +245,8 @@ class RadianceTrainer(Trainer):
         self.extraction = OccupancyExtraction(self.grid)
         self.hard_pixels = np.zeros(0, np.uint32)
         self.rays, self.loss, self.samples = 256, 0.0, 0
+        # Measured at updates of the grid, with all that they do
+        self._seconds_per_density = 0.0
         # State with the best evaluation so far
         self.best: Snapshot | None = None
         # March stride in units of `march_step`, and samples per ray of the last density pass.
@@ -400,7 +404,17 @@ class RadianceTrainer(Trainer):
         if is_extracting:
             self.extract_occupancy_piece()
         if is_due:
+            dr.sync_thread()
+            start = time.perf_counter()
             self.grid.update(self.evaluate_density, self.rng)
+            dr.sync_thread()
+            self._seconds_per_density = (time.perf_counter() - start) / max(self.grid.seen_count / NUM_PARTS, 1)
+
+    def estimate_extraction_seconds(self) -> float:
+        """Estimate the duration of `make_field`, based on the last update of the grid and on the last step."""
+        rays = min(_RAY_GROUPS * _GROUP_RAYS, self.pixels.size)
+        samples = min(rays * max(self.prepass_samples_per_ray * self.stride, 1.0), _EXTRACTION_SAMPLES)
+        return self._seconds_per_density * (_PROBES**3 * self.grid.seen_count + samples)
 
     def update_current_field(self) -> None:
         """Copy the weights of this step to ``current_field``."""
@@ -575,7 +589,7 @@ class RadianceTrainer(Trainer):
         with dr.suspend_grad():
             if snapshot is None:
                 rng = np.random.default_rng(self.settings.seed)
-                out.occupancy = self.grid.extract_occupancy(out.density, rng, self._contributing_samples)
+                out.occupancy = self.grid.extract_occupancy(out.density, rng, self._contributing_samples, _PROBES)
             else:
                 # A young field is thin fog, of which a threshold, or a refined occupancy, would leave nothing.
                 cells = snapshot.bits.numpy().reshape((self.grid.resolution,) * 3) > 0

@@ -32,6 +32,8 @@ class Trainer:
         self.settings, self.ns, self._schedule = settings, ns, schedule
         self.rng = np.random.default_rng(settings.seed)
         self.steps = 0
+        # Seconds of a limit in minutes that are left for the result; the time and the progress at which this was set
+        self.reserved_seconds, self._reserved_at = 0.0, (0.0, 0.0)
         self.optimiser: Any = None
         self.averaged: dict[str, Any] = {}
 
@@ -59,7 +61,18 @@ class Trainer:
     def progress_at(self, steps: int, seconds: float) -> float:
         """Completed fraction of the schedule after so many ``steps`` and ``seconds``."""
         schedule, minutes = self._schedule or self.settings.steps, self.settings.minutes
-        return min(1.0, steps / schedule if schedule else seconds / (60 * minutes))
+        if schedule:
+            return min(1.0, steps / schedule)
+        since, progress = self._reserved_at
+        rest = max(60 * minutes - self.reserved_seconds - since, 1e-6)
+        return min(1.0, progress + (1 - progress) * (seconds - since) / rest)
+
+    def reserve(self, seconds: float) -> None:
+        """End a schedule in minutes this much earlier.
+
+        The rest of the schedule is spread over the rest of the time, so that its progress neither jumps nor falls.
+        """
+        self._reserved_at, self.reserved_seconds = (self.seconds, self.progress), seconds
 
     def move_weights(self) -> None:
         """Update the weights with the current gradients and learning rate."""
@@ -84,7 +97,9 @@ class Trainer:
             parts = {"weights": value, "first": first, "second": second, "averaged": self.averaged[name]}
             tensors |= {f"{part}.{name}": x.numpy() for part, x in parts.items()}
         random = self.rng.bit_generator.state
-        return tensors, {"taken": counts, "steps": self.steps, "seconds": self.seconds, "random": random}
+        return tensors, {"taken": counts, "steps": self.steps, "seconds": self.seconds, "random": random} | {
+            "reserved": [self.reserved_seconds, *self._reserved_at]
+        }
 
     def restore(self, tensors: dict, meta: dict) -> None:
         """Restore the state from `get_state`. Raises ``ValueError`` or `KeyError` if it does not match."""
@@ -102,6 +117,9 @@ class Trainer:
         self.steps = int(read_count(meta, "steps"))
         self.set_seconds(read_count(meta, "seconds"))
         self.rng.bit_generator.state = meta["random"]
+        # States of earlier versions reserve no time.
+        self.reserved_seconds, *since = (float(x) for x in meta.get("reserved", (0.0, 0.0, 0.0)))
+        self._reserved_at = since[0], since[1]
 
 
 # ---- Run state in a file, from which an interrupted run continues as if it had not been interrupted ----

@@ -26,6 +26,7 @@ from nerg_mi.train.radiance_settings import RadianceSettings, make_radiance_conf
 
 from .base import SILENT, Reporter, import_function, select_backend
 from .options import explicit_settings
+from .progress import duration
 from .radiance_commands import RadianceOptions, RadianceScoreOptions
 
 # ---- Training and evaluation of radiance fields ----
@@ -192,19 +193,21 @@ def _report_data(data: Dataset, reporter: Reporter) -> None:
     )
 
 
-# Start and length of each phase on the scale of the whole command.
-_PHASES = {"training": (0.0, 0.9), "scoring": (0.9, 0.09), "writing": (0.99, 0.01)}
+_PHASES = {
+    "extracting": "extracting the occupancy",
+    "scoring": "scoring the held-out views",
+    "writing": "writing the field",
+}
 
 
 def _progress(now: radiance_run.RadianceProgress) -> tuple[float, str]:
     """Return the completed fraction of the command, and the present phase in words."""
-    start, length = _PHASES[now.phase]
-    fraction = start + length * now.fraction
     if now.phase != "training":
-        return fraction, {"scoring": "scoring the held-out views", "writing": "writing the field"}[now.phase]
-    left = now.seconds * (1 - now.fraction) / max(now.fraction, 1e-6)
+        return now.fraction, _PHASES[now.phase]
+    # Never 0, because the last phase still runs.
+    left = duration(max(now.remaining, 1.0))
     error = f", held out {now.psnr:.2f} dB" if now.psnr is not None else ""
-    return fraction, f"training, {left:.0f} s left, step {now.steps}{error}"
+    return now.fraction, f"training, {left} left, step {now.steps}{error}"
 
 
 def _report_result(result: RadianceResult, reporter: Reporter) -> None:

@@ -292,6 +292,26 @@ def test_a_run_by_minutes_equals_a_run_by_steps(dataset, one_thread, monkeypatch
         assert np.array_equal(value, got[name]), name
 
 
+def test_time_for_the_result_is_part_of_the_limit(dataset, monkeypatch):
+    """Progress neither jumps nor falls when it is reserved, and the schedule ends that much earlier."""
+    now = [0.0]
+    monkeypatch.setattr(RadianceTrainer, "seconds", property(lambda self: now[0]))
+    t, resumed = (trainer(dataset, steps=None, minutes=1.0) for _ in range(2))
+    before = []
+    for now[0], reserved in ((15.0, 6.0), (30.0, 20.0), (35.0, 10.0)):
+        before.append(t.progress)
+        t.reserve(reserved)
+        assert t.progress == pytest.approx(before[-1])
+    assert before == sorted(before) and before[:2] == pytest.approx([0.25, 0.25 + 0.75 * 15 / 39])
+    now[0] = 49.0
+    assert t.progress < 1
+    tensors, meta = t.get_state()
+    resumed.restore(tensors, json.loads(json.dumps(meta)))
+    assert resumed.progress == pytest.approx(t.progress)
+    now[0] = 50.0
+    assert t.progress == pytest.approx(1)
+
+
 def test_density_passes_stay_within_their_limit(dataset, monkeypatch):
     """A field that never clears: its density pass stays within the limit at every stride, down to the finest."""
     t = RadianceTrainer(
