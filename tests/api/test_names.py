@@ -42,7 +42,7 @@ def test02_importing_loads_nothing_heavy_and_no_module_of_the_api():
     loaded = run("import nerg_mi as nerg, sys; dir(nerg); nerg.__version__; print(*sys.modules)").split()
     assert not HEAVY & set(loaded)
     ours = {name for name in loaded if name.startswith("nerg_mi")}
-    assert ours == {f"nerg_mi{part}" for part in ("", ".errors", ".llvm", ".registration")}
+    assert ours == {f"nerg_mi{part}" for part in ("", ".errors", ".llvm", ".memory", ".registration")}
 
 
 def test03_a_name_loads_its_module_and_not_the_others():

@@ -108,12 +108,12 @@ def test_without_torch_the_extra_is_named(tmp_path):
 
 def test_vulnerable_torch_version_is_refused(tmp_path, torch, monkeypatch):
     path = archive(tmp_path / "x.pth", b"\x80\x02N.")
-    for version, is_used in (("2.5.1+cpu", False), ("2.6.0", True), ("2.13.0a0+git1", True)):
+    for version, is_used in (("2.10.1+cpu", False), ("2.11.0", True), ("2.13.0a0+git1", True)):
         monkeypatch.setattr(torch, "__version__", version)
         if is_used:
             assert read_torch(path) is None
         else:
-            with pytest.raises(ImportError, match="2.6.*2.5.1"):
+            with pytest.raises(ImportError, match="2.11.*2.10.1"):
                 read_torch(path)
 
 
