@@ -22,6 +22,8 @@ from .gaze_data import Supervision
 from .gaze_folds import (
     FOLD_TIME_FRACTION,
     SELECTION_KEY,
+    StagedProgress,
+    compute_fold_cost,
     evaluate_folds,
     scale_progress,
     select_variant,
@@ -136,7 +138,9 @@ def train_ensemble(
     if state.resume and not any(map(is_file, (path, *parts))):
         raise NergError(f'cannot resume: the state file "{path}" does not exist; leave out --resume to start a new run')
     on_progress = on_progress or (lambda progress: None)
-    plan, selection = select_variant(supervision, geometry, plan, ns, on_progress, _read_identity(state, parts, ns))
+    progress, fold_cost = StagedProgress(on_progress), compute_fold_cost(plan)
+    report = progress.start(fold_cost, members)
+    plan, selection = select_variant(supervision, geometry, plan, ns, report, _read_identity(state, parts, ns))
     if selection is not None:
         state = replace(state, identity={**state.identity, SELECTION_KEY: selection.to_dict()})
     full_plan, plan = plan, plan.with_settings(mix_folds=0)
@@ -144,6 +148,8 @@ def train_ensemble(
         time_fraction = 1 - FOLD_TIME_FRACTION if selects_weight else 1.0
         plan = plan.with_settings(minutes=time_fraction * plan.settings.minutes / members)
     fields, provenances = [], []
+    fold_cost = fold_cost if selects_weight and selection is None else 0.0
+    report = progress.start(members, fold_cost)
     for k, part in enumerate(parts):
         member_state = replace(state, identity={**state.identity, "member": [k, members]})
         member_plan = plan.with_settings(seed=plan.settings.seed + 100 * k)
@@ -158,7 +164,7 @@ def train_ensemble(
                 member_plan,
                 ns,
                 state=replace(member_state, resume=state.resume and is_file(path)),
-                on_progress=scale_progress(on_progress, k, members, f"{k + 1}/{members} {{}}"),
+                on_progress=scale_progress(report, k, members, f"{k + 1}/{members} {{}}"),
                 write=None if part is None else _make_writer(part, identity),
             )
             if provenance["interrupted"]:
@@ -167,7 +173,7 @@ def train_ensemble(
         fields.append(field)
         provenances.append(provenance)
     if selects_weight and selection is None:
-        selection = evaluate_folds(supervision, geometry, full_plan, ns, on_progress).select()
+        selection = evaluate_folds(supervision, geometry, full_plan, ns, progress.start(fold_cost)).select()
     if selection is not None:
         for field in fields:
             selection.apply_prior(field, supervision.rays, geometry, plan)

@@ -513,6 +513,35 @@ def _select_best(
     return replace(plan, config=configs[k]), replace(selections[k], variant=configs[k].variant, variants=variants)
 
 
+class StagedProgress:
+    """Reports the stages of a run as fractions of the whole, which never fall.
+
+    A stage covers a part of the fraction that is left, in proportion to its cost and to those of the later stages. So a
+    stage that ends early leaves more to the others.
+    """
+
+    def __init__(self, on_progress: ProgressCallback):
+        self._on_progress, self._fraction = on_progress, 0.0
+
+    def start(self, cost: float, *later: float) -> ProgressCallback:
+        """Return the callback of a stage of this ``cost`` that is followed by stages of the costs ``later``."""
+        begin = self._fraction
+        length = (1 - begin) * cost / max(cost + sum(later), 1e-9)
+
+        def report(progress: GazeProgress) -> None:
+            self._fraction = max(self._fraction, begin + length * progress.fraction)
+            self._on_progress(replace(progress, fraction=self._fraction))
+
+        return report
+
+
+def compute_fold_cost(plan: GazePlan) -> float:
+    """Return the cost of all folds of all architectures of ``plan``, relative to a fit."""
+    if plan.settings.minutes is not None:
+        return FOLD_TIME_FRACTION / (1 - FOLD_TIME_FRACTION)
+    return plan.settings.mix_folds * (1 + len(plan.alternatives))
+
+
 def scale_progress(on_progress: ProgressCallback, k: int, count: int, stage: str) -> ProgressCallback:
     """Return a callback that reports part ``k`` of ``count`` as progress of the whole; ``stage`` formats the stage
     names.

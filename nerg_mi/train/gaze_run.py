@@ -21,7 +21,15 @@ from .gaze_data import (
     make_targets_from_views,
     split_validation,
 )
-from .gaze_folds import FOLD_TIME_FRACTION, SELECTION_KEY, evaluate_folds, select_variant, selects_prior_weight
+from .gaze_folds import (
+    FOLD_TIME_FRACTION,
+    SELECTION_KEY,
+    StagedProgress,
+    compute_fold_cost,
+    evaluate_folds,
+    select_variant,
+    selects_prior_weight,
+)
 from .gaze_trainer import (
     GazeFit,
     GazePlan,
@@ -105,14 +113,16 @@ def train_gaze(
     that the variant, if there are several (`select_variant`).
     """
     on_progress, state, started = on_progress or (lambda progress: None), state or StateSettings(), time.perf_counter()
-    plan, selection = select_variant(supervision, geometry, plan, ns, on_progress, read_run_identity(state))
+    progress, fold_cost = StagedProgress(on_progress), compute_fold_cost(plan)
+    report = progress.start(fold_cost, 1.0, float(plan.settings.refit))
+    plan, selection = select_variant(supervision, geometry, plan, ns, report, read_run_identity(state))
     if selection is not None:
         state = replace(state, identity={**state.identity, SELECTION_KEY: selection.to_dict()})
     settings, requirements = plan.settings, TargetRequirements.from_config(plan.config)
     file = GazeRunFile(state.path, plan.make_identity(supervision, geometry, state), state.interval, state.resume)
     file.seconds += time.perf_counter() - started
     started = time.perf_counter()
-    on_progress(GazeProgress("probes", 0.0, 0, 0.0, None))
+    progress.start(0.0)(GazeProgress("probes", 0.0, 0, 0.0, None))
     split, validation = split_validation(supervision, geometry, settings, plan.probes), None
     if split.validation is not None:
         validation = make_targets(split.validation, geometry, plan, requirements, settings.seed + 2, split.centres)
@@ -120,6 +130,7 @@ def train_gaze(
         settings.refit and validation is not None,
         selects_prior_weight(plan) and supervision.rays is not None,
     )
+    fold_cost = fold_cost if selects_weight and selection is None else 0.0
     minutes_fraction = (0.5 if needs_refit else 1.0) * (1 - FOLD_TIME_FRACTION if selects_weight else 1.0)
     preparation_seconds, is_refit = 0.0, file.stage == "refit"
     training = supervision if is_refit else split.training
@@ -128,18 +139,23 @@ def train_gaze(
         first = GazeFit.from_dict(file.validation_state)
     else:
         preparation_seconds = time.perf_counter() - started
-        first = fit_with_validation(targets, validation, geometry.box, plan, ns, minutes_fraction, file, on_progress)
+        report = progress.start(1.0, float(needs_refit), fold_cost)
+        first = fit_with_validation(targets, validation, geometry.box, plan, ns, minutes_fraction, file, report)
         is_refit = needs_refit and not first.interrupted
         if is_refit:
             # Save first, because making the targets of all data may take long.
             file.save("refit", None, first.to_dict(), {}, force=True)
             training, targets = supervision, make_targets(supervision, geometry, plan, requirements, settings.seed)
-    last = refit(targets, first, geometry.box, plan, ns, file, on_progress) if is_refit else first
+    last = first
+    if is_refit:
+        # Relative to the first fit, which has usually ended before its last step.
+        report = progress.start(first.best_step / max(first.schedule, 1), fold_cost)
+        last = refit(targets, first, geometry.box, plan, ns, file, report)
     trainer = last.trainer
     interrupted = first.interrupted or last.interrupted
     if selects_weight and selection is None and not interrupted:
         try:
-            selection = evaluate_folds(supervision, geometry, plan, ns, on_progress).select()
+            selection = evaluate_folds(supervision, geometry, plan, ns, progress.start(fold_cost)).select()
         except KeyboardInterrupt:
             interrupted = True
     field = trainer.make_field(last.weights)

@@ -222,7 +222,7 @@ class DensityGrid:
         bound = dr.minimum(self.threshold, 0.5 * mean)
         self.bits = dr.select((self.seen & (self.value > bound)) | self.always, self.ns.UInt8(1), 0)
         dr.eval(self.bits)
-        self.unsampled = dr.compress(self.seen & (self.bits == 0))
+        self.unsampled: Any = dr.compress(self.seen & (self.bits == 0))
 
     def restore(self, value, bits, seen, always, turn: int, unsampled=None) -> None:
         """Restore a stored state (arrays of the attributes of these names).

@@ -78,7 +78,11 @@ def test_a_training_returns_the_field_and_reports_progress(rays):
     provenance = result.provenance
     assert provenance["recipe"] == "default" and provenance["steps"] == 3 and provenance["geometry"] == "none"
     assert "rays_file" not in provenance and provenance["rays"] == len(rays)
-    assert heard.shares[-1] == 1 and heard.texts[0].startswith("placing probes") and "fit: step 3" in heard.texts
+    assert heard.shares == sorted(heard.shares) and heard.shares[-1] == pytest.approx(1)
+    # One fit, and folds that take as many steps each
+    last_fit = max(share for share, text in zip(heard.shares, heard.texts) if text.startswith("fit"))
+    assert last_fit == pytest.approx(1 / (1 + provenance["settings"]["mix_folds"]))
+    assert heard.texts[0].startswith("placing probes") and "fit: step 3" in heard.texts
     assert heard.texts[-1].startswith("folds: step") and provenance["mix"]["folds"] == 1
     summaries = [m.split(";")[0].split(":")[0] for m in heard.messages]
     assert summaries[:3] == [f"{provenance['probes_made']} probes", "3 steps", "cross-validation (1 fold)"]
@@ -93,6 +97,7 @@ def test_without_geometry_folds_select_the_variant(rays):
     """Folds run before the fit; their choice is reported and trained."""
     heard = Listener()
     result = train_gaze(rays, options=QUICK, reporter=heard)
+    assert heard.shares == sorted(heard.shares) and heard.shares[-1] == pytest.approx(1)
     mix = result.provenance["mix"]
     assert set(mix["variants"]) == {"capture", "emit_capture"} and mix["variant"] == result.field.config.variant
     assert mix["mix"] == pytest.approx((1 - mix["hits_weight"]) * result.field.config.mix)
@@ -204,7 +209,7 @@ def test_held_out_positions_and_participants_are_reported(tmp_path):
 
 def test_an_interrupted_training_stops_the_script_and_reports_how_to_resume(rays, tmp_path):
     """The exception has the field so far."""
-    options = replace(QUICK, steps=8, fresh=True, threads=1, variant="capture")
+    options = replace(QUICK, steps=8, fresh=True, threads=1, variant="capture", mix_folds=0)
     with pytest.raises(TrainingInterrupted, match="4 steps") as end:
         train_gaze(rays, options=options, reporter=Listener(0.5))
     assert end.value.provenance["steps"] == 4 and end.value.provenance["interrupted"]

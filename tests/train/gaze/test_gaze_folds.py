@@ -22,6 +22,7 @@ from nerg_mi.train.gaze_folds import (
     FoldDensities,
     FoldResults,
     PriorSelection,
+    StagedProgress,
     _calibrate_regions,
     _evaluate_hit_kernels,
     _round_values,
@@ -31,10 +32,27 @@ from nerg_mi.train.gaze_folds import (
 )
 from nerg_mi.train.gaze_run import train_gaze
 from nerg_mi.train.gaze_settings import ProbeSettings
-from nerg_mi.train.gaze_trainer import KIND, StateSettings
+from nerg_mi.train.gaze_trainer import KIND, GazeProgress, StateSettings
 from tests.fields.gaze.test_hits import reference
 
 from .looks import LIKELIHOOD, LOG, NOWHERE, planned
+
+# ---- Progress of a run with several stages ----
+
+
+def test_stages_fill_the_progress_in_proportion_to_their_costs():
+    """Also if one ends early, and if the cost of a later one turns out to be lower."""
+    seen = []
+    progress = StagedProgress(lambda p: seen.append(p.fraction))
+    report = lambda stage, *fractions: [stage(GazeProgress("a", f, 1, 1.0, None)) for f in fractions]
+    report(progress.start(0.0), 0.0)
+    report(progress.start(1.0, 1.0, 2.0), 0.5, 1.0)
+    report(progress.start(0.0), 0.0, 1.0)
+    report(progress.start(1.0, 2.0), 0.5)
+    report(progress.start(1.0), 0.2, 0.1, 1.0)
+    early = 0.25 + 0.75 / 6
+    assert seen == pytest.approx([0, 0.125, 0.25, 0.25, 0.25, early, *[early + 0.2 * (1 - early)] * 2, 1])
+
 
 # ---- Selection of the prior by held-out participants and positions ----
 
