@@ -36,6 +36,24 @@ def rgb():
 
 
 @pytest.fixture(autouse=True)
+def _collect_objects():
+    """Free the objects of each test, whatever their references.
+
+    Dr.Jit traces the methods of all objects of a kind, also of those that only the traceback of an expected error still
+    refers to: with them, kernels differ, or fail.
+    """
+    yield
+    gc.collect()
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _freeze_modules():
+    """Exempt what exists before a file, above all modules, from the search of `_collect_objects`."""
+    gc.collect()
+    gc.freeze()
+
+
+@pytest.fixture(autouse=True)
 def _restore_thread_count(rgb):
     """Restore the number of threads, which a command with ``--threads`` changes for the whole process."""
     import drjit as dr

@@ -14,6 +14,8 @@ import os
 import sys
 from pathlib import Path
 
+import nerg_mi  # noqa: F401 (selects libLLVM)
+
 VARIABLE = "NERG_VECTOR_WIDTH"
 """Environment variable with the number of floats in a vector of Dr.Jit's kernels."""
 
