@@ -250,6 +250,8 @@ def to_names(values: Any, name: str) -> np.ndarray:
     array, missing = _to_array(values, name)
     if array.dtype.kind in "cV":
         raise _refuse(name, _KINDS[array.dtype.kind], "names or integers", array)
+    if array.dtype.kind in "fO":
+        array = _check_rounding(_keep_integers(array, values), array.dtype, name)
     if array.dtype.kind in "US" and array.size:
         # Far fewer names than rows.
         unique, inverse = np.unique(array, return_inverse=True)
@@ -259,11 +261,34 @@ def to_names(values: Any, name: str) -> np.ndarray:
     return texts if missing is None else np.where(missing, "", texts)
 
 
+def _keep_integers(array: np.ndarray, values: Any) -> np.ndarray:
+    """Return the cells of ``values`` as objects if ``array`` contains floats that are integers there, next to missing
+    values: large ones are rounded to one number."""
+    if array.dtype.kind == "O" or isinstance(values, np.ndarray) or array.ndim != 1:
+        return array
+    convert = next((getattr(values, k) for k in ("to_pylist", "to_list", "tolist") if hasattr(values, k)), None)
+    cells = np.empty(len(array), object)
+    cells[:] = list(values) if convert is None else convert()
+    return cells
+
+
+def _check_rounding(array: np.ndarray, dtype: np.dtype, name: str) -> np.ndarray:
+    """Return ``array``. Raises `NergError` for floats of ``dtype`` so large that different integers are equal."""
+    limit = 2.0 ** (np.finfo(dtype if dtype.kind == "f" else np.float64).nmant + 1)
+    for value in array.tolist() if array.dtype.kind == "O" else array[np.isfinite(array)].tolist():
+        if isinstance(value, (float, np.floating)) and limit <= abs(value) < np.inf:
+            raise NergError(
+                f"{name} contain the floating-point number {value:.17g}, to which other integers are rounded, too; "
+                "read them as integers or text"
+            )
+    return array
+
+
 def unify_names(names: Iterable[Any]) -> tuple[tuple[str, ...], np.ndarray | None]:
     """Return ``names`` as `to_name` does, and the index of each among them if this made some equal, or None."""
-    originals = [str(name) for name in names]
-    texts = [to_name(name) for name in originals]
-    if texts == originals or len(unique := dict.fromkeys(texts)) == len(texts):
+    texts = [to_name(name) for name in names]
+    unique = dict.fromkeys(texts)
+    if len(unique) == len(texts):
         return tuple(texts), None
     index = {name: k for k, name in enumerate(unique)}
     return tuple(unique), np.array([index[name] for name in texts], np.int32)

@@ -170,6 +170,30 @@ def test_ids_with_a_gap_are_whole_numbers(values):
     assert to_names(values, "participants").tolist() == ["1", "", "3"]
 
 
+LARGE = 2**53
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        pandas.array([LARGE + 1, None, LARGE], dtype="Int64"),
+        pandas.Series([LARGE + 1, None, LARGE], dtype="int64[pyarrow]"),
+        polars.Series([LARGE + 1, None, LARGE]),
+        pyarrow.array([LARGE + 1, None, LARGE]),
+        pyarrow.chunked_array([[LARGE + 1, None], [LARGE]]),
+        [LARGE + 1, np.nan, LARGE],
+    ],
+)
+def test_large_ids_with_a_gap_are_not_rounded(values):
+    assert to_names(values, "participants").tolist() == [str(LARGE + 1), "", str(LARGE)]
+
+
+@pytest.mark.parametrize("values", [[float(LARGE)], np.array([1.0, 2.0**24], np.float32), [None, -1e17]])
+def test_ids_that_were_rounded_are_refused(values):
+    with pytest.raises(NergError, match="participants .*rounded"):
+        to_names(values, "participants")
+
+
 def test_ids_that_are_no_whole_numbers_are_kept():
     assert [to_name(v) for v in (1.5, "1.50", "01.0", "v1.0", "1.", 2**60)] == [
         "1.5",
@@ -186,6 +210,8 @@ def test_names_are_composed():
     names, index = unify_names(["Ada", DECOMPOSED, COMPOSED])
     assert names == ("Ada", COMPOSED) and index is not None and index.tolist() == [0, 1, 1]
     assert unify_names(["Ada", "Bob"]) == (("Ada", "Bob"), None)
+    names, index = unify_names([1, "1", b"1", 1.0])
+    assert names == ("1",) and index is not None and index.tolist() == [0] * 4
 
 
 def test_choices_are_compared_in_the_compatible_form():
