@@ -22,6 +22,8 @@ _SAMPLES = 20_000
 # A maximum is repeated if more pixels than this fraction of a view have it, to rounding error, and more than have other
 # depths within a hundredth of it.
 _MIN_REPEATED_FRACTION, _ROUNDING, _NEARBY = 1e-3, 1e-5, 1e-2
+# Errors of camera positions as a fraction of the extent of the cameras.
+_POSE_ERROR = 0.05
 # Maximum number of views that are compared for a repeated maximum.
 _COMPARED_VIEWS = 64
 
@@ -96,7 +98,7 @@ def _find_gap(cameras: list[PosedCamera], depths: list[np.ndarray]) -> float:
     if first < 1 or first >= len(values):
         return np.inf
     lower, upper = values[first - 1 : -1], values[first:]
-    extent = float(np.linalg.norm(np.ptp([c.center for c in cameras], axis=0)))
+    extent = _measure_extent(cameras)
     is_far = (upper > _CAMERA_EXTENTS * extent) & (extent > 0)
     gaps = np.flatnonzero(((upper >= _GAP * lower) & is_far) | (upper >= _LARGE_GAP * lower))
     # A depth between the sampled ones is background, too, as at the edge of an object.
@@ -107,13 +109,13 @@ def _find_repeated_maximum(
     cameras: list[PosedCamera],
     depths: list[np.ndarray],
     measure: Callable[[int], np.ndarray],
-    is_surface: Callable[[PosedCamera, PosedCamera, float], bool],
+    is_surface: Callable[[PosedCamera, PosedCamera, float, float], bool],
 ) -> dict[int, np.ndarray]:
     """Return the masks of the pixels with the largest ``measure`` of all views, if two views exclude that it is a
     surface.
 
     ``measure`` returns the distance (h, w) of a kind in a view, and ``is_surface`` whether pixels of two cameras with
-    one distance of this kind may show the same surface.
+    one distance of this kind may show the same surface, up to a tolerance.
     """
     largest = [float(measure(k).max(initial=0)) for k in range(len(depths))]
     limit = max(largest, default=0.0) * (1 - _ROUNDING)
@@ -125,17 +127,24 @@ def _find_repeated_maximum(
         if count > max(1, _MIN_REPEATED_FRACTION * values.size) and 2 * count > nearby:
             repeated.append(cameras[k])
     pairs = combinations(repeated[:_COMPARED_VIEWS], 2)
-    return masks if not all(is_surface(a, b, limit) for a, b in pairs) else {}
+    # Errors of poses are a part of the extent of the cameras, also for surfaces far beyond it.
+    tolerance = min(_NEARBY * limit, _POSE_ERROR * _measure_extent(cameras))
+    return masks if not all(is_surface(a, b, limit, tolerance) for a, b in pairs) else {}
 
 
-def _is_plane(a: PosedCamera, b: PosedCamera, depth: float) -> bool:
+def _measure_extent(cameras: list[PosedCamera]) -> float:
+    """Return the diagonal of the box of the cameras, 0 without any."""
+    return float(np.linalg.norm(np.ptp([c.center for c in cameras], axis=0))) if cameras else 0.0
+
+
+def _is_plane(a: PosedCamera, b: PosedCamera, depth: float, tolerance: float) -> bool:
     """Return whether planes at ``depth`` across the axes of two cameras may be one wall, or two of a square room."""
     cosine = float(a.axis @ b.axis)
     if cosine > 0.9999:
-        return abs(float((b.center - a.center) @ a.axis)) <= _NEARBY * depth
+        return abs(float((b.center - a.center) @ a.axis)) <= tolerance
     return abs(cosine) < 0.01 or cosine < -0.9999
 
 
-def _is_sphere(a: PosedCamera, b: PosedCamera, depth: float) -> bool:
+def _is_sphere(a: PosedCamera, b: PosedCamera, depth: float, tolerance: float) -> bool:
     """Return whether spheres of radius ``depth`` around two cameras may be one."""
-    return float(np.linalg.norm(a.center - b.center)) <= _NEARBY * depth
+    return float(np.linalg.norm(a.center - b.center)) <= tolerance

@@ -97,6 +97,20 @@ def test_several_background_values_are_removed():
     assert background.nearest == pytest.approx(1000)
 
 
+@pytest.mark.parametrize("sky", [1000.0, 1e4, 1e10])
+@pytest.mark.parametrize("along_rays", [True, False])
+def test_sky_behind_far_surfaces_is_no_surface(sky, along_rays):
+    """Cameras near each other see one sphere or plane of the sky only if it is centred at all of them."""
+    rng = np.random.default_rng(0)
+    depths = [np.exp(rng.uniform(0, np.log(300), (18, 24))).astype(np.float32) for _ in AROUND]
+    for depth in depths:
+        depth[:6] = np.broadcast_to(sky if along_rays else sky / AHEAD, depth.shape)[:6]
+    views, background = remove_background(views_of(AROUND, depths))
+    assert background is not None and background.fraction == pytest.approx(1 / 3)
+    for view, depth in zip(views, depths):
+        np.testing.assert_array_equal(view.depth[6:], depth[6:])
+
+
 CENTRE = [2, 2, 2]
 
 
