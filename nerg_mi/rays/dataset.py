@@ -505,7 +505,10 @@ def _make_rays(pa: Any, table: Any, path: Path, source: SourceManifest) -> Rays:
             head=vector("head") if "head_x" in names else None,
             cohort=cohort,
             cohorts=cohorts,
-            metadata={"frame": dict(FRAME), "tracking": source.metadata.get("tracking", "unknown")},
+            metadata={
+                "frame": dict(FRAME),
+                **{k: v for k, v in source.metadata.items() if k in ("tracking", "tracking_by_person")},
+            },
         )
     except NergError as error:
         raise _mismatched_part(path, str(error).split(";")[0]) from error

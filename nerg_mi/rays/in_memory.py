@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -170,7 +170,7 @@ def from_dataframe(
                 f"{', '.join(TRACKING)}; correct it, or pass tracking="
             )
         tracking = merge_tracking(kinds)
-    return from_arrays(
+    rays = from_arrays(
         values["origin"],
         values["direction"],
         times=values["time"],
@@ -183,6 +183,11 @@ def from_dataframe(
         frame=frame,
         unused=[name for k, name in enumerate(reader.names) if k not in used],
     )
+    if tracking != "mixed" or not {"tracking", "participant"} <= values.keys():
+        return rays
+    pairs = sorted(set(zip(values["participant"].tolist(), values["tracking"].tolist())))
+    by_person = {name: merge_tracking(kind for other, kind in pairs if other == name) for name in rays.persons}
+    return replace(rays, metadata={**rays.metadata, "tracking_by_person": by_person})
 
 
 def to_dataframe(rays: Rays, library: str | None) -> Any:
@@ -198,7 +203,8 @@ def to_dataframe(rays: Rays, library: str | None) -> Any:
         else:
             columns[names.get(name, name)] = values
     if rays.tracking != "unknown":
-        columns["tracking"] = np.full(len(rays), rays.tracking, object)
+        kinds = rays.tracking_by_person
+        columns["tracking"] = np.array([kinds.get(name, "") for name in rays.persons], object)[rays.person]
     return make_dataframe(columns, library)
 
 

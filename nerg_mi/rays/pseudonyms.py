@@ -116,6 +116,9 @@ def _replace_names(metadata: dict, persons: tuple[str, ...], person: Callable, d
 
     unchanged = {k: metadata[k] for k in _PLAIN_KEYS if k in metadata}
     out = {k: clean(v) for k, v in metadata.items() if k not in (*_PLAIN_KEYS, "sources", "dropped", "steps")}
+    if "tracking_by_person" in metadata:
+        kinds = metadata["tracking_by_person"]
+        out["tracking_by_person"] = {person(name): kinds[name] for name in persons if name in kinds}
     if "sources" in metadata:
         sources = [
             {"file": files[s["file"]], **({"hmac_sha256": digest("bytes", s["sha256"])} if "sha256" in s else {})}

@@ -158,6 +158,10 @@ _METADATA_CHECKS = {
     ),
     "floor": (_is_text, "text"),
     "tracking": (lambda v: isinstance(v, str) and v in TRACKING, "eye, head, mixed or unknown"),
+    "tracking_by_person": (
+        lambda v: isinstance(v, dict) and all(isinstance(kind, str) and kind in TRACKING for kind in v.values()),
+        "a mapping of persons to eye, head, mixed or unknown",
+    ),
     "tick": (lambda v: _is_number(v) and v > 0, "a time in seconds"),
 }
 
@@ -409,9 +413,10 @@ class Rays:
     direction: np.ndarray  # (N, 3) unit
     confidence: np.ndarray  # (N,) in [0, 1]
     hit: np.ndarray | None = None  # (N, 3) metres: point of regard on a surface, NaN if unknown
-    # frame (units, up, handedness), tracking (of `TRACKING`) and, after an import: source_frame, sources (file name and
-    # sha256), transform (4x4 from the source's frame), rows_read, dropped (reason, count and rows of each source),
-    # missing (counts of hit points that were fill values), unused_columns (names), steps (processing since the import).
+    # frame (units, up, handedness), tracking (of `TRACKING`), if it is mixed tracking_by_person and, after an import:
+    # source_frame, sources (file name and sha256), transform (4x4 from the source's frame), rows_read, dropped
+    # (reason, count and rows of each source), missing (counts of hit points that were fill values), unused_columns
+    # (names), steps (processing since the import).
     metadata: dict[str, Any] = field(default_factory=lambda: {"frame": dict(FRAME)})
     cohort: np.ndarray | None = None  # (N,) int32 index into cohorts
     cohorts: tuple[str, ...] = ()  # names of groups of participants
@@ -494,7 +499,16 @@ class Rays:
     @property
     def tracking(self) -> str:
         """What the directions are: ``eye`` (gaze), ``head``, ``mixed`` (some of both) or ``unknown``."""
-        return self.metadata.get("tracking", "unknown")
+        tracking = self.metadata.get("tracking", "unknown")
+        # Selected rays may be of one kind.
+        return merge_tracking(self.tracking_by_person.values()) if tracking == "mixed" and len(self) else tracking
+
+    @property
+    def tracking_by_person(self) -> dict[str, str]:
+        """What the directions of each participant with rays are."""
+        tracking = self.metadata.get("tracking", "unknown")
+        kinds = self.metadata.get("tracking_by_person", {}) if tracking == "mixed" else {}
+        return {name: kinds.get(name, tracking) for name in self.participants}
 
     @property
     def participants(self) -> tuple[str, ...]:
@@ -761,7 +775,8 @@ class Rays:
         >>> rays.tracking, rays.with_tracking("head").tracking
         ('unknown', 'head')
         """
-        return replace(self, metadata={**self.metadata, "tracking": check_tracking(tracking)})
+        metadata = {k: v for k, v in self.metadata.items() if k != "tracking_by_person"}
+        return replace(self, metadata={**metadata, "tracking": check_tracking(tracking)})
 
     def save(self, path: str | os.PathLike) -> None:
         """Write ``.npz`` or ``.parquet``; see :mod:`nerg_mi.rays.rays`."""
@@ -880,6 +895,10 @@ def merge_rays(blocks: Iterable[Rays], metadata: dict[str, Any] | None = None) -
         # More precise than that of all sources, of which some may not be selected.
         tracking = merge_tracking(block.tracking for block in compacted if len(block))
         metadata = metadata if tracking == "unknown" else {**metadata, "tracking": tracking}
+        if tracking == "mixed":
+            kinds = [entry for block in compacted for entry in block.tracking_by_person.items()]
+            by_person = {name: merge_tracking(kind for other, kind in kinds if other == name) for name, _ in kinds}
+            metadata = {**metadata, "tracking_by_person": by_person}
     del compacted  # so that a column is freed once it is joined
     if not parts:
         no_values = _EMPTY[:, 0]
@@ -908,6 +927,7 @@ def merge_rays(blocks: Iterable[Rays], metadata: dict[str, Any] | None = None) -
 
 _MERGED_KEYS = (
     "tracking",
+    "tracking_by_person",
     "sources",
     "dropped",
     "rows_read",

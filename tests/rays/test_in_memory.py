@@ -209,6 +209,10 @@ def test_tracking_of_arrays_and_data_frames(library):
     table = make_dataframe({"time": [0.0, 1.0, 2.0], "tracking": ["eye", "head", "eye"], **vectors()}, library)
     assert Rays.from_dataframe(table).tracking == "mixed"
     assert Rays.from_dataframe(table, tracking="eye").tracking == "eye"
+    kinds = {"time": [0.0] * 3, "tracking": ["eye", "head", "eye"], "participant": list("aba")}
+    mixed = make_dataframe({**vectors(), **kinds}, library)
+    for rays in (Rays.from_dataframe(mixed), Rays.from_dataframe(Rays.from_dataframe(mixed).to_dataframe(library))):
+        assert [rays[rays.person == k].tracking for k in range(2)] == ["eye", "head"]
     with pytest.raises(NergError, match="'gaze'"):
         make_rays(tracking="gaze")
     with pytest.raises(NergError, match="tracking.*'gaze'"):

@@ -10,7 +10,7 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.rays.pseudonyms import pseudonymise, read_salt
-from nerg_mi.rays.rays import Rays
+from nerg_mi.rays.rays import Rays, merge_rays
 from nerg_mi.rays.readers.columns import ColumnMap
 from tests.rays.people import some_rays
 from tests.rays.readers.examples import read
@@ -81,6 +81,14 @@ def test_pseudonyms_depend_on_the_salt(rays):
 def one_ray(name, note):
     rays = Rays([0.0], [0], (name,), np.zeros((1, 3)), [[1.0, 0, 0]], [1.0])
     return replace(rays, metadata={**rays.metadata, "note": note})
+
+
+def test_kinds_of_tracking_belong_to_pseudonyms():
+    mixed = merge_rays([one_ray("eye", "").with_tracking("eye"), one_ray("Ada", "").with_tracking("head")])
+    mixed.metadata["tracking_by_person"]["Bob"] = "eye"  # without rays
+    hidden = pseudonymise(mixed, SALT)
+    assert sorted(hidden[k].tracking for k in range(2)) == ["eye", "head"]
+    assert hidden.metadata["tracking_by_person"].keys() == set(hidden.persons)
 
 
 def test_short_names_are_not_replaced_within_words():

@@ -437,16 +437,28 @@ def test_tracking_survives_selection_merging_and_files(tmp_path):
     assert ray(0, "a").tracking == old.tracking == "unknown"
     for kinds, expected in (([eyes], "eye"), ([eyes, heads], "mixed"), ([heads, old], "mixed")):
         for merged in (merge_rays(kinds), Rays.concatenate(kinds)):
-            assert merged.tracking == merged.select(slice(1)).tracking == expected
+            assert merged.tracking == expected
+            assert [merged[k].tracking for k in range(len(kinds))] == [part.tracking for part in kinds]
             for suffix in (".npz", ".parquet") if importlib.util.find_spec("pyarrow") else (".npz",):
                 merged.save(tmp_path / f"rays{suffix}")
-                assert Rays.load(tmp_path / f"rays{suffix}").tracking == expected
+                loaded = Rays.load(tmp_path / f"rays{suffix}")
+                assert loaded.tracking == expected and loaded[0].tracking == kinds[0].tracking
+                loaded[0].save(tmp_path / f"rays{suffix}")
+                assert Rays.load(tmp_path / f"rays{suffix}").tracking == kinds[0].tracking
+    mixed = merge_rays([eyes, heads])
+    assert merge_rays([mixed[0], old]).tracking == "unknown"
+    assert merge_rays([mixed, ray(3, "a").with_tracking("head")]).tracking_by_person == {"a": "mixed", "b": "head"}
+    assert mixed.with_tracking("eye")[1].tracking == "eye"
     assert merge_rays([eyes, old]).tracking == "unknown"
     assert merge_rays([heads.select(slice(0)), eyes]).tracking == "eye"
     with pytest.raises(NergError, match="'ear'"):
         eyes.with_tracking("ear")
     with pytest.raises(NergError, match="tracking"):
         write_rays_file(tmp_path / "bad.npz", eyes.columns(), {**eyes.metadata, "persons": ["a"], "tracking": ["eye"]})
+    for kinds in ({"a": "ear"}, {"a": 1}, ["eye"]):
+        with pytest.raises(NergError, match="tracking_by_person"):
+            metadata = {**eyes.metadata, "persons": ["a"], "tracking_by_person": kinds}
+            write_rays_file(tmp_path / "bad.npz", eyes.columns(), metadata)
 
 
 KINDS_OF_RAYS = (("a", "eye"), ("b", "head"), ("c", "unknown"))

@@ -11,6 +11,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError, sanitize
 from nerg_mi.ranges import Range, ValidatedDataclass
+from nerg_mi.rays.rays import TRACKING, merge_tracking
 
 from . import poses
 from .base import RECORDINGS, RaysBuilder, Signature, TrackingFrame, option, tick_option, valid_option
@@ -25,7 +26,7 @@ from .columns import (
     require_valid_values,
     split_column_name,
 )
-from .tables import TableBlock, iterate_table
+from .tables import TableBlock, iterate_table, read_table_columns
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,8 +63,8 @@ class TableOptions(ValidatedDataclass):
     tracking: str | None = option(
         None,
         "What the directions of a table read with --map are: eye (gaze) or head.",
-        default_text="head for a head pose without a direction, and for directions with head, hmd or camera in their "
-        "names; otherwise eye",
+        default_text="as in a column tracking; else head for a head pose without a direction, and for directions with "
+        "head, hmd or camera in their names; otherwise eye",
         is_recorded=False,
     )
     min_confidence: float = option(0.0, "Drop rows below this confidence.", within=Range(0, 1))
@@ -206,6 +207,9 @@ def find_tracking(columns: ColumnMap) -> str:
     return "head" if is_head else "eye"
 
 
+_TRACKING_COLUMN = "tracking"
+
+
 class MappedRows:
     """Converts rows of tables with equal columns to rays."""
 
@@ -228,8 +232,12 @@ class MappedRows:
         builder.begin_source(path)
         first_row = 0
         clocks = {self.columns.t: self.options.tick} if self.columns.t else {}
-        for block in builder.read_table(path, self.numbers, self.texts, clocks=clocks):
-            self._add_block(path, block, first_row, builder)
+        # Tables that were written from rays say what their directions are.
+        is_stated = self.options.tracking is None and read_table_columns(path).count(_TRACKING_COLUMN) == 1
+        texts = [*self.texts, _TRACKING_COLUMN] if is_stated else self.texts
+        for block in builder.read_table(path, self.numbers, texts, clocks=clocks):
+            tracking = merge_tracking(set(block.texts[:, -1].tolist()) & TRACKING.keys()) if is_stated else "unknown"
+            self._add_block(path, block, first_row, builder, self.tracking if tracking == "unknown" else tracking)
             first_row += len(block.lines)
 
     def check_angles(self, builder: RaysBuilder) -> None:
@@ -244,7 +252,7 @@ class MappedRows:
             "--radians), or a quaternion without its w?"
         )
 
-    def _add_block(self, path: Path, block: TableBlock, first_row: int, builder: RaysBuilder) -> None:
+    def _add_block(self, path: Path, block: TableBlock, first_row: int, builder: RaysBuilder, tracking: str) -> None:
         """Add the rows of ``block``, the first of which is row ``first_row`` of the file."""
         columns, options = self.columns, self.options
         value = dict(zip(self.numbers, block.numbers.T))
@@ -269,7 +277,7 @@ class MappedRows:
             origin,
             direction,
             rows=block.lines,
-            tracking=self.tracking,
+            tracking=tracking,
             confidence=confidence,
             hit=vector(columns.hit) if columns.hit else None,
             cohort=word[columns.cohort] if columns.cohort else None,

@@ -38,6 +38,18 @@ def test_table_of_another_frame(tmp_path):
     assert by_file.persons == ("unity",)
 
 
+@pytest.mark.parametrize(
+    "kinds, expected",
+    [("head head", "head"), ("eye head", "mixed"), ("unknown unknown", "eye"), ("0 1", "eye"), ("head ok", "head")],
+)
+def test_tables_may_state_what_was_tracked(tmp_path, kinds, expected):
+    """As those do that are written from the data frames of rays."""
+    path, columns = tmp_path / "log.csv", "origin=x,y,z direction=dx,dy,dz"
+    path.write_text("x,y,z,dx,dy,dz,tracking\n" + "".join(f"1,1,1.6,1,0,0,{kind}\n" for kind in kinds.split()))
+    assert read_table(path, columns).tracking == expected
+    assert read_table(path, columns, tracking="eye").tracking == "eye"
+
+
 def write(path, header, rows):
     path.write_text(header + "\n" + "".join(",".join(map(repr, map(float, row))) + "\n" for row in rows))
     return path
