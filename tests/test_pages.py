@@ -252,7 +252,7 @@ def test09_from_recordings(rgb, place, monkeypatch):
     lines = [",".join(map(str, row)) + f",{who}" for row, who in zip(table, names)]
     Path("day.csv").write_text("t,x,y,z,dx,dy,dz,who\n" + "\n".join(lines) + "\n")
     (text,) = [block.text for block in blocks("py", page="python.md")]
-    fewer = {"minutes=5": "steps=2, holdout=0", "test_zones=3": FEW}
+    fewer = {"minutes=5": "steps=30, holdout=0", "test_zones=3": FEW}
     for long, short in fewer.items():
         assert text.count(long) == 1
         text = text.replace(long, short)
