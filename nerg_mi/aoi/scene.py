@@ -61,12 +61,13 @@ MAX_PARTICIPANTS = 10_000_000  # maximum number of participants in a table of co
 def read_cohorts(path: Path) -> dict[str, str]:
     """Read the cohort of each participant from a CSV file with columns ``person`` (or ``participant``) and ``cohort``.
 
-    Raises `NergError` for missing columns, and for a participant in two cohorts.
+    Rows without a name or a cohort, as at the end of many tables, are ignored. Raises `NergError` for missing columns,
+    and for a participant in two cohorts.
     """
     cohorts: dict[str, str] = {}
     for block in open_named_table(path, (), ("person", "cohort"))[1]:
         for participant, cohort in (map(to_name, map(unescape_formula, row)) for row in block.texts.tolist()):
-            if cohorts.setdefault(participant, cohort) != cohort:
+            if participant and cohort and cohorts.setdefault(participant, cohort) != cohort:
                 raise NergError(f'"{path}" has "{sanitize(participant, 40)}" in two cohorts; remove one of them')
         if len(cohorts) > MAX_PARTICIPANTS:
             raise NergError(f'"{path}" names more than {MAX_PARTICIPANTS:,} participants; remove some')

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
@@ -95,8 +95,15 @@ def import_rays(
         reader_values = {name: value for name, value in options.items() if name not in import_options}
         for name, value in reader_values.items():
             # Values can be strings, as on the command line.
-            if isinstance(value, str) and (parser := parsers.get(name)) is not None:
+            if (parser := parsers.get(name)) is None:
+                continue
+            if isinstance(value, str):
                 reader_values[name] = parser(value)
+            elif isinstance(value, (Mapping, list, tuple)):
+                raise NergError(
+                    f"{name} is text as on the command line, such as columns='origin=x,y,z direction=dx,dy,dz t=time', "
+                    f"got {type(value).__name__}"
+                )
         resolved = RaysImportOptions(
             reader=reader, settings=make_options(reader, reader_values), output=output, **import_values
         )

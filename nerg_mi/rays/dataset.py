@@ -25,7 +25,7 @@ from nerg_mi.files.safe_read import (
     read_json,
     translate_read_errors,
 )
-from nerg_mi.files.values import find_names, to_name
+from nerg_mi.files.values import find_names, fold_name, to_name
 
 from .filters import select_mask
 from .rays import (
@@ -566,7 +566,7 @@ class RayDataset:
             (source, part)
             for source in sources
             for part in source.parts
-            if all(str(getattr(part, key)) == value for key, value in partition.items())
+            if all(fold_name(str(getattr(part, key))) == fold_name(value) for key, value in partition.items())
         ]
         if not parts:
             what = ", ".join(f"{key} {value}" for key, value in partition.items())

@@ -16,6 +16,7 @@ from nerg_mi.figures import maps, style
 from nerg_mi.figures.style import existing_files, make_provenance
 from nerg_mi.files.atomic import check_new_folder, check_writable, create_folder_atomically
 from nerg_mi.files.tables import write_json
+from nerg_mi.files.values import normalize_name
 from nerg_mi.rays import events, filters
 from nerg_mi.rays.dataset import (
     BYTES_PER_RAY,
@@ -154,7 +155,7 @@ def import_dataset(files: Sequence[FileName], options: RaysImportOptions, report
     Returns the data-quality report of their environment. Raises `NergError` if some files could not be imported, after
     all others were.
     """
-    folder, place = Path(options.output or ""), options.environment or UNKNOWN
+    folder, place = Path(options.output or ""), normalize_name(options.environment or UNKNOWN)
     key = None
     if options.pseudonyms:
         key = secrets.token_bytes(32) if options.salt is None else read_salt(options.salt)

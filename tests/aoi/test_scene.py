@@ -194,6 +194,14 @@ def test_cohort_names_survive_a_round_trip(tmp_path):
     assert read_cohorts(tmp_path / "c.csv") == cohorts
 
 
+def test_rows_without_a_cohort_are_in_none(tmp_path):
+    (tmp_path / "c.csv").write_text("sep=;\nperson;cohort\nAda;old\nBo;\n;young\n;\n")
+    assert read_cohorts(tmp_path / "c.csv") == {"Ada": "old"}
+    (tmp_path / "c.csv").write_text("person,cohort\nBo,\n")
+    with pytest.raises(NergError, match="no participants"):
+        read_cohorts(tmp_path / "c.csv")
+
+
 def test_cohorts_of_ids_and_names_in_another_form(tmp_path):
     (tmp_path / "c.csv").write_text("person,cohort\n1.0,o\u0308ld\nJo\u0308rg,young\n", "utf-8")
     assert read_cohorts(tmp_path / "c.csv") == {"1": "\u00f6ld", "J\u00f6rg": "young"}

@@ -192,6 +192,9 @@ def test03_invalid_options_are_refused(table):
         nerg.import_rays(table, colums=COLUMNS)
     with pytest.raises(nerg.NergError, match='"nope"'):
         nerg.import_rays(table, "nope")
+    for columns in ({"time": "t"}, ["t"]):
+        with pytest.raises(nerg.NergError, match=f"columns is text .* got {type(columns).__name__}"):
+            nerg.import_rays(table, columns=columns)
 
 
 def test04_progress_is_reported(table):

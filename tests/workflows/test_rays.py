@@ -247,6 +247,15 @@ def test_files_are_imported_into_a_dataset(parquet, files, tmp_path):
     assert [title for title, _ in make_quality_report(output / "place=north")] == [str(output / "place=north")]
 
 
+def test_an_environment_has_one_name(parquet, files, tmp_path):
+    """A composed and a decomposed letter are equal."""
+    output = tmp_path / "a.rays"
+    for path, name in zip(files, ["Cafe\u0301", "Caf\u00e9"]):
+        import_rays([path], options(output=output, environment=name, workers=1))
+    assert RayDataset.open(output).places == ("Caf\u00e9",)
+    assert len(RayDataset.open(output / "place=Cafe\u0301")) == len(RayDataset.open(output))
+
+
 def test_failed_sources_are_reported_at_the_end(parquet, files, tmp_path):
     files[1].write_text("t\n")
     with pytest.raises(NergError, match=r"1\.csv.*1.*3"):
