@@ -172,6 +172,7 @@ def pytest_configure(config):
 
 
 def pytest_sessionstart():
+    """Compute as the processor that `make portable` requests; processes of which a test compares bits call this."""
     if width := os.environ.get(other_processor.VARIABLE):
         other_processor.limit_drjit(int(width))
 

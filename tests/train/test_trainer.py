@@ -186,8 +186,10 @@ _CHILD = """
 import sys
 import drjit as dr, drjit.llvm.ad as ns
 from pathlib import Path
+from tests.conftest import pytest_sessionstart
 from tests.train.radiance.ball import TINY, ball_dataset, settings
 from nerg_mi.train.radiance_run import train_field
+pytest_sessionstart()
 dr.set_thread_count(1)
 train_field(ball_dataset(), TINY, settings(steps=10**6), ns, state=Path(sys.argv[1]), save_every=0.0)
 """
