@@ -117,7 +117,9 @@ def check_number(value: Any, allowed: Range, name: str, is_integer: bool = False
         Whether the value must be an integer.
     """
     number_type, noun = (Integral, "a whole number") if is_integer else (Real, "a number")
-    if isinstance(value, bool) or not isinstance(value, number_type):
+    # Durations of NumPy are registered as integers, of any unit.
+    is_duration = type(value).__name__ == "timedelta64"
+    if isinstance(value, bool) or is_duration or not isinstance(value, number_type):
         raise NergError(f"{name} must be {noun}, got {sanitize(repr(value), 60)}")
     numeric: Any = value
     if numeric not in allowed:

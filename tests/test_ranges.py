@@ -181,6 +181,9 @@ def test_each_of_several_numbers_is_checked():
 def test_numpy_numbers_are_accepted():
     check_number(np.float32(2), Range(0, MAX_COORDINATE), "x")
     check_number(np.int64(2), Range(0, MAX_COORDINATE), "x", is_integer=True)
+    for is_integer in (False, True):
+        with pytest.raises(NergError, match="x must be a .*timedelta64"):
+            check_number(np.timedelta64(2, "ms"), Range(0, MAX_COORDINATE), "x", is_integer=is_integer)
 
 
 # ---- Properties of plugins ----

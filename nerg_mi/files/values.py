@@ -143,8 +143,9 @@ def _to_number(value: Any, flags: bool) -> float | None:
     """Convert an object to a number; None if it is no real number."""
     if isinstance(value, (bool, np.bool_)):
         return float(value) if flags else None
-    # Decimal numbers are not registered as real numbers.
+    # Decimal numbers are not registered as real numbers; durations are, as integers of any unit.
     is_number = isinstance(value, Real) or type(value).__name__ == "Decimal"
+    is_number &= not isinstance(value, np.timedelta64)
     try:
         return float(value) if is_number else None
     except OverflowError:
@@ -275,7 +276,7 @@ def _keep_integers(array: np.ndarray, values: Any) -> np.ndarray:
 def _check_rounding(array: np.ndarray, dtype: np.dtype, name: str) -> np.ndarray:
     """Return ``array``. Raises `NergError` for floats of ``dtype`` so large that different integers are equal."""
     limit = 2.0 ** (np.finfo(dtype if dtype.kind == "f" else np.float64).nmant + 1)
-    for value in array.tolist() if array.dtype.kind == "O" else array[np.isfinite(array)].tolist():
+    for value in array.ravel().tolist() if array.dtype.kind == "O" else array[np.isfinite(array)].tolist():
         if isinstance(value, (float, np.floating)) and limit <= abs(value) < np.inf:
             raise NergError(
                 f"{name} contain the floating-point number {value:.17g}, to which other integers are rounded, too; "

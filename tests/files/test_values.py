@@ -117,8 +117,9 @@ def test_other_times_are_refused_by_name(times, kind):
 
 @pytest.mark.parametrize("values", [*(v for k, v in DATES.items()), [HALF], ["1.5"], [1j], [True], [b"1"], [object()]])
 def test_numbers_are_no_dates_text_or_flags(values):
-    with pytest.raises(NergError, match="origins must be numbers"):
-        to_numbers(values, "origins")
+    for array in (values, np.array([*values, None], object)):
+        with pytest.raises(NergError, match="origins must be numbers"):
+            to_numbers(array, "origins")
 
 
 def test_flags_are_numbers_where_they_are_allowed():
@@ -192,6 +193,11 @@ def test_large_ids_with_a_gap_are_not_rounded(values):
 def test_ids_that_were_rounded_are_refused(values):
     with pytest.raises(NergError, match="participants .*rounded"):
         to_names(values, "participants")
+
+
+@pytest.mark.parametrize("value", [None, 1.0, 7, {"a"}, "a"])
+def test_one_id_has_no_rows(value):
+    assert to_names(value, "participants").shape == ()
 
 
 def test_ids_that_are_no_whole_numbers_are_kept():
