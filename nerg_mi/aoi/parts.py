@@ -158,7 +158,7 @@ def read_sums(path: Path) -> list[VisitSums]:
 
 def read_prediction(path: Path) -> PredictedAttention:
     """Read a prediction written by `predict_part`."""
-    return PredictedAttention(**read_npz(path, "partial prediction"))
+    return PredictedAttention(**read_npz(path, "partial prediction"), note="")
 
 
 _ARRAYS = tuple(f.name for f in fields(VisitSums) if f.name not in ("areas", "cells", "rows"))
@@ -257,7 +257,7 @@ class PartitionedStatistics:
         plan = self._plan(job_name, predict_part, PlannedPrediction(setting, fov), parts)
         predictions = [read_prediction(output.path) for output in self.parts.run(plan, start, end)]
         arrays = {name: np.concatenate([getattr(f, name) for f in predictions]) for name in VIEWPOINT_ARRAYS}
-        return PredictedAttention(**arrays, members=np.concatenate([f.members for f in predictions], axis=1))
+        return PredictedAttention(**arrays, members=np.concatenate([f.members for f in predictions], axis=1), note="")
 
     def _plan(self, job_name: str, work: Callable, common: Any, parts: list[Part]) -> Plan:
         return Plan(job_name, work, common, parts, ".npz", (*RENDER_LIBRARIES, "scipy"))

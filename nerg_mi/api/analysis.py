@@ -25,7 +25,7 @@ from nerg_mi.workflows.radiance_commands import (
 from nerg_mi.workflows.scene_commands import BakeOptions, FilmOptions, ReportOptions, SceneOptions
 
 from .arguments import check_output, resolve_file
-from .calls import Progress, report_progress
+from .calls import Progress, report_progress, show_figure
 from .fields import FilePath, TrainedField
 from .gaze import TrainedGazeField, list_inputs
 from .objects import as_file, as_scene_file, build_options, copy_from_session
@@ -259,7 +259,7 @@ def draw(
             # Figures of a scene need the integrator, which an environment does not have.
             shown = scene if isinstance(scene, (str, os.PathLike, Scene)) else make_scene(scene)
             options["scene"] = as_file(shown, "scene")
-        return draw_figure(kind, files, output, reporter, **options)
+        return show_figure(draw_figure(kind, files, output, reporter, **options))
 
 
 def write_scene(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import Field, fields
@@ -49,6 +50,17 @@ def report_progress(progress: Progress, options: type | None = None) -> Iterator
     except NergError as error:
         error.args = (_name_arguments(str(error), names), *error.args[1:])
         raise
+
+
+def show_figure(figure: Any) -> Any:
+    """Return a new ``figure``, made the current one of pyplot, if that is imported, for its ``savefig`` and ``show``.
+
+    A notebook shows what a cell returns, and would show the figure twice.
+    """
+    pyplot = sys.modules.get("matplotlib.pyplot")
+    if pyplot is not None and not is_notebook():
+        pyplot.figure(FigureClass=lambda **_: figure)
+    return figure
 
 
 class _ArgumentReporter:

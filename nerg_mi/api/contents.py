@@ -7,7 +7,8 @@ The content of a scene is a dict as for `mi.load_dict`, in which values may also
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,9 +16,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nerg_mi.errors import NergError, translate_mitsuba_errors
+from nerg_mi.errors import NergError, clean_text, translate_mitsuba_errors
 from nerg_mi.fields.splats import Splats
 from nerg_mi.files.atomic import make_folder, replace_atomically, write_text
+from nerg_mi.files.names import make_portable_name
 from nerg_mi.files.values import to_numbers
 from nerg_mi.formats.meshes import MeshFile, read_mesh_file, with_shading_normals
 from nerg_mi.formats.splats import choose_plugin, write_ply_splats
@@ -282,7 +284,11 @@ def _convert_mesh(mesh: Any, name: str) -> MeshFile:
 # ---- Shapes (files, dicts, scenes, objects) as children of a scene ----
 
 
-def to_scene_children(shapes: object, name: str = "shape") -> dict[str, Any]:
+SCENE_KEYS = ("type", "integrator", "camera")
+"""What the content of a scene contains besides shapes and lights."""
+
+
+def to_scene_children(shapes: object, name: str = "shape", taken: Collection[str] = ()) -> dict[str, Any]:
     """Convert shapes to children of a scene; the variant must be active.
 
     Parameters
@@ -292,64 +298,77 @@ def to_scene_children(shapes: object, name: str = "shape") -> dict[str, Any]:
         several of these in a list or in a dict by name.
     name : str
         Name of shapes that have none.
+    taken : collection of str
+        Names of other children of the scene.
 
     Returns
     -------
     dict of str to object
-        The children by name.
+        The children by name: dots, ``$`` and control characters are underscores, and names that occur again have a
+        number.
 
     Raises
     ------
     NergError
         ``shapes`` is something else.
     """
+    children: dict[str, Any] = {}
+    for key, child in _list_children(shapes, name):
+        # Mitsuba divides keys at dots, and replaces what begins with $.
+        key = unique = re.sub(r"[.$\n\t]", "_", clean_text(key)) or name
+        number = 1
+        while unique in SCENE_KEYS or unique in taken or unique in children:
+            number += 1
+            unique = f"{key}_{number}"
+        children[unique] = child
+    return children
+
+
+def _list_children(shapes: object, name: str) -> list[tuple[str, Any]]:
+    """List shapes with their names, which may repeat."""
     import mitsuba as mi
 
     if shapes is None:
-        return {}
+        return []
     if isinstance(shapes, (str, os.PathLike)):
         if Path(shapes).suffix.lower() != ".xml":
-            return {name: load_mesh_child(shapes)}
+            return [(name, load_mesh_child(shapes))]
         from nerg_mi.rendering.scene import load_scene
 
         return _list_scene_children(load_scene(Path(shapes)), name)
     if is_trimesh(shapes):
-        return dict(from_trimesh(shapes, name))  # pyright: ignore[reportArgumentType] which is_trimesh has checked
-    if isinstance(shapes, MeshFile):
-        return {name: shapes}
+        return list(from_trimesh(shapes, name).items())  # pyright: ignore[reportArgumentType] which is_trimesh has checked
+    if isinstance(shapes, (MeshFile, mi.Object)) and not isinstance(shapes, mi.Scene):
+        return [(name, shapes)]
     if isinstance(shapes, mi.Scene):
         return _list_scene_children(shapes, name)
-    if isinstance(shapes, mi.Object):
-        return {name: shapes}
     if isinstance(shapes, Mapping):
         if shapes.get("type") == "scene":
             left_out = ("integrator", "sensor")
-            return {
-                key: child
+            return [
+                (key, child)
                 for key, child in shapes.items()
                 if not isinstance(child, str) and find_tag(child) not in left_out
-            }
+            ]
         if "type" in shapes:
-            return {name: dict(shapes)}
-        named = [to_scene_children(child, str(key)) for key, child in shapes.items()]
-    elif isinstance(shapes, (list, tuple)):
-        named = [to_scene_children(child, f"{name}_{i}") for i, child in enumerate(shapes)]
-    else:
-        raise NergError(
-            "shapes must be mesh files, scene files, meshes of trimesh, dicts for mi.load_dict or Mitsuba objects, "
-            f"got {type(shapes).__name__}"
-        )
-    return {key: child for children in named for key, child in children.items()}
+            return [(name, dict(shapes))]
+        return [pair for key, child in shapes.items() for pair in _list_children(child, str(key))]
+    if isinstance(shapes, (list, tuple)):
+        return [pair for i, child in enumerate(shapes) for pair in _list_children(child, f"{name}_{i}")]
+    raise NergError(
+        "shapes must be mesh files, scene files, meshes of trimesh, dicts for mi.load_dict or Mitsuba objects, "
+        f"got {type(shapes).__name__}"
+    )
 
 
-def _list_scene_children(scene, name: str) -> dict[str, Any]:
-    """Return the shapes of a scene by name, and its emitters that are not shapes."""
+def _list_scene_children(scene, name: str) -> list[tuple[str, Any]]:
+    """List the shapes of a scene with their names, and its emitters that are not shapes."""
     shapes = list(scene.shapes())
-    named = {shape.id() or f"{name}_{i}": shape for i, shape in enumerate(shapes)}
-    if len(named) < len(shapes):
-        named = {f"{name}_{i}": shape for i, shape in enumerate(shapes)}
+    named = [(shape.id() or f"{name}_{i}", shape) for i, shape in enumerate(shapes)]
+    if len(dict(named)) < len(shapes):
+        named = [(f"{name}_{i}", shape) for i, shape in enumerate(shapes)]
     lights = [light for light in scene.emitters() if not any(s.is_emitter() and s.emitter() is light for s in shapes)]
-    return named | {f"{name}_light_{i}": light for i, light in enumerate(lights)}
+    return [*named, *((f"{name}_light_{i}", light) for i, light in enumerate(lights))]
 
 
 # ---- The content of a scene in memory ----
@@ -467,13 +486,16 @@ class _ContentWriter:
         return self._make_property(name, value)
 
     def _file(self, name: str, suffix: str, is_mesh: bool = False) -> Path:
-        safe = "".join(c if c.isalnum() or c in "-_" else "_" for c in name)
+        safe = make_portable_name("".join(c if c.isalnum() or c in "-_" else "_" for c in name))
         stem = self.path.absolute().with_suffix("")
         # A scene may have hundreds of meshes.
         prefix = make_folder(f"{stem}.meshes") / safe if is_mesh else Path(f"{stem}.{safe}")
-        path = Path(f"{prefix}{suffix}")
-        count = sum(str(written).startswith(str(prefix)) for written in self.written)
-        return Path(f"{prefix}_{count}{suffix}") if path in self.written else path
+        # Some file systems ignore case.
+        taken, path, number = {str(file).casefold() for file in self.written}, Path(f"{prefix}{suffix}"), 0
+        while str(path).casefold() in taken:
+            number += 1
+            path = Path(f"{prefix}_{number}{suffix}")
+        return path
 
     def _make_plugin(self, name: str, value: Mapping[str, Any], is_top: bool) -> Element:
         kind = str(value.get("type", ""))

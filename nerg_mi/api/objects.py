@@ -110,7 +110,7 @@ def as_file(value: object, name: str) -> Path:
     matrix: Any = getattr(value, "matrix", value)
     if name in _ALIGNMENT_NAMES and np.shape(matrix) == (4, 4):
         return _store("align", ".json", lambda path: write_text(path, json.dumps(to_numbers(matrix, name).tolist())))
-    environment = _write_environment(value) or _write_baked(value)
+    environment = None if name in _AREA_NAMES else _write_environment(value) or _write_baked(value)
     if environment is None:
         kind = _KINDS.get(name, "a file")
         raise NergError(f'"{name}" must be {kind}, given as a string or a path, got {type(value).__name__}')

@@ -12,7 +12,7 @@ from nerg_mi.rays.rays import Rays
 from nerg_mi.workflows.rays_commands import AlignOptions, FilterOptions, PlotOptions, RaysImportOptions, SplitOptions
 
 from .arguments import check_names, check_output, resolve_file
-from .calls import Progress, report_progress
+from .calls import Progress, report_progress, show_figure
 from .fields import FilePath
 from .objects import build_options, resolve_rays
 
@@ -379,4 +379,5 @@ def plot_rays(
     with report_progress(progress, PlotOptions) as reporter:
         changes = overrides if output is None else {**overrides, "output": output}
         resolved = build_options(PlotOptions, "plot_rays", options, changes)
-        return figure_of(plot(resolve_rays(rays), resolved, reporter, axes))
+        figure = figure_of(plot(resolve_rays(rays), resolved, reporter, axes))
+    return show_figure(figure) if axes is None else figure

@@ -16,7 +16,7 @@ from nerg_mi.rendering.bands import SURFACE_OPACITY
 from nerg_mi.workflows.base import Reporter
 
 from .arrays import Camera, Floats, LabelledArrays, as_points, broadcast_to_observers
-from .calls import Progress, report_progress
+from .calls import Progress, report_progress, show_figure
 from .fields import FilePath, activate_mitsuba
 from .query import warn_extrapolation
 from .scene import COLOR, Scene, make_aov_context, resolve_quantities
@@ -57,7 +57,8 @@ class Pictures(LabelledArrays):
         Returns
         -------
         matplotlib.figure.Figure
-            The figure, which a notebook shows and its method ``savefig`` writes. It does not belong to pyplot.
+            The figure, which a notebook shows and its method ``savefig`` writes. If pyplot is imported, and not in a
+            notebook, a new figure is also its current one, until ``pyplot.close``.
 
         Raises
         ------
@@ -89,11 +90,13 @@ class Pictures(LabelledArrays):
         color = self[COLOR][observer] if COLOR in self else np.full((*shape, 3), _NO_COLOR, np.float32)
         color = np.repeat(color, 3, axis=-1) if color.shape[-1] == 1 else color
         if name == COLOR:
-            return Sheet([srgb(color)], [""], panels=axes).page
+            page = Sheet([srgb(color)], [""], panels=axes).page
+            return show_figure(page) if axes is None else page
         overlay = find_overlay(name)
         mask = self["opacity"][observer] >= SURFACE_OPACITY if "opacity" in self else np.ones(shape, bool)
         layers = OverlayLayers(color, self[name][observer], mask)
-        return figure_of(overlay.draw(layers, overlay.limits(layers), axes=axes))
+        page = figure_of(overlay.draw(layers, overlay.limits(layers), axes=axes))
+        return show_figure(page) if axes is None else page
 
     def _repr_html_(self) -> str | None:
         """The image of the first observer, for notebooks, if it can be drawn."""

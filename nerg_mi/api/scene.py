@@ -496,10 +496,7 @@ def make_scene(
             raise NergError("a scene has a single observer; pass several observers to render, observe or attention")
         integrator["observer"] = _make_observer_sensor(position[0])
     integrator.setdefault("aovs", ",".join(["depth", "opacity", *(["gaze", "visibility"] if gaze is not None else [])]))
-    added = to_scene_children(shapes)
-    if taken := added.keys() & children.keys():
-        raise NergError(f'the scene has "{min(taken)}" already; pass the shapes in a dict with other names')
-    children |= added
+    children |= to_scene_children(shapes, taken=children)
     if not children and integrator.keys().isdisjoint({"field", "density"}):
         raise NergError("the scene is empty; pass an environment or shapes to make_scene")
     if camera is not None:

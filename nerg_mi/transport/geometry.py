@@ -310,12 +310,13 @@ class Shading:
     def __init__(self, nested: mi.SamplingIntegrator | None = None, headlight: float = HEADLIGHT):
         import mitsuba as mi
 
-        # By name: each change of the variant creates that class again.
-        renders_whole_image = nested is not None and any(c.__name__ == "ADIntegrator" for c in type(nested).__mro__)
-        if renders_whole_image or not (nested is None or isinstance(nested, mi.SamplingIntegrator)):
+        # By name: each change of the variant creates these classes again.
+        names = {c.__name__ for c in type(nested).__mro__}
+        is_refused = not names.isdisjoint(("ADIntegrator", "NergIntegrator"))
+        if is_refused or not (nested is None or isinstance(nested, mi.SamplingIntegrator)):
             raise NergError(
-                f'the integrator nested in "nerg" is a {type(nested).__name__}, which does not compute the '
-                'radiance of single rays; use "path", "direct", "volpath" or another sampling integrator'
+                f'the integrator nested in "nerg" is of the type {type(nested).__name__}, which does not light shapes '
+                'along single rays; use "path", "direct", "volpath" or another sampling integrator'
             )
         self.nested: mi.SamplingIntegrator | None = nested
         self.headlight = headlight

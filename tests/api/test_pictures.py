@@ -162,3 +162,23 @@ def test12_channels_by_name():
     )
     assert np.array_equal(result["color"], pixels[..., :3]) and np.array_equal(result["depth"], pixels[..., 4])
     assert np.array_equal(result["position"], pixels[..., 5:8]) and list(result) == ["position", "color", "depth"]
+
+
+@pytest.mark.parametrize("name", ["color", "gaze", "depth"])
+def test20_pyplot_saves_the_new_figure(scene, tmp_path, name):
+    pyplot = pytest.importorskip("matplotlib.pyplot")
+    pyplot.switch_backend("agg")
+    view = nerg.render(scene, quantities=("color", "gaze", "depth"), spp=1)
+    try:
+        figure, panel = pyplot.subplots()
+        assert view.plot(name, axes=panel) is figure
+        drawn = view.plot(name)
+        assert pyplot.gcf() is drawn and len(pyplot.get_fignums()) == 2
+        pyplot.savefig(tmp_path / "figure.png")
+        assert np.ptp(pyplot.imread(tmp_path / "figure.png")) > 0.1
+        before = pyplot.get_fignums()
+        with pytest.raises(nerg.NergError):
+            view.plot("position")
+        assert pyplot.get_fignums() == before
+    finally:
+        pyplot.close("all")

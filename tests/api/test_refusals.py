@@ -73,3 +73,10 @@ def test04_a_scene_of_another_variant_is_refused(write, query, wrap, rgb):
     with pytest.raises(nerg.NergError) as error:
         QUERIES[query](scene)
     assert "llvm_ad_rgb" in str(error.value) and "llvm_ad_mono" in str(error.value)
+
+
+def test05_areas_that_are_an_environment_are_refused():
+    trimesh = pytest.importorskip("trimesh")
+    rays = nerg.Rays.from_arrays([[1, 1, 1.6]], [[1, 0, 0]], times=[0])
+    with pytest.raises(nerg.NergError, match=r'"(aois|areas)" must be a dict of areas'):
+        nerg.statistics(rays, trimesh.Scene(trimesh.creation.box((1, 1, 1))))

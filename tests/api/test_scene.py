@@ -392,6 +392,24 @@ def test01_names(rgb):
     assert list(to_scene_children({"left": ball, "right": rgb.load_dict(ball)})) == ["left", "right"]
 
 
+@pytest.mark.parametrize(
+    "name", ["Cube.001", "camera", "integrator", "type", "$x", "a\x1b[31m", "", "x" * 300, "OTHER"]
+)
+def test03_names_that_scenes_use_or_forbid(tmp_path, name):
+    trimesh = pytest.importorskip("trimesh")
+    room = trimesh.Scene()
+    for k, node in enumerate((name, "other")):
+        room.add_geometry(trimesh.creation.box((1, 1, k + 1)), node_name=node)
+    scene = nerg.make_scene(room, shapes=[room, room], camera=nerg.Camera((0, 0, 0), (1, 0, 0), width=8, height=8))
+    scene.save(tmp_path / "scene.xml")
+    # Files that differ by case only are one file in some folders.
+    assert len({file.name.casefold() for file in (tmp_path / "scene.meshes").iterdir()}) == 6
+    for each in (scene, nerg.Scene.load(tmp_path / "scene.xml")):
+        shapes = each.mitsuba.shapes()
+        assert sorted(round(shape.bbox().extents().z) for shape in shapes) == [1, 1, 1, 2, 2, 2]
+        assert all(shape.id().isprintable() for shape in shapes)
+
+
 def test02_a_scene_gives_its_shapes_and_lights(rgb):
     lamp = {"type": "sphere", "emitter": {"type": "area"}}
     scene = rgb.load_dict({"type": "scene", "lamp": lamp, "sky": {"type": "constant"}, "spot": {"type": "point"}})

@@ -270,9 +270,10 @@ def test07_nested_integrator_keeps_the_background(rgb):
     assert shown.tolist() == [True, False]
 
 
-def test08_integrators_without_per_ray_radiance_are_refused(rgb):
-    with pytest.raises(NergError, match="AdjointIntegrator, which does not compute"):
-        Shading(rgb.load_dict({"type": "ptracer"}))
+@pytest.mark.parametrize("kind, name", [("ptracer", "AdjointIntegrator"), ("nerg", "NergIntegrator")])
+def test08_integrators_that_cannot_light_shapes_are_refused(rgb, kind, name):
+    with pytest.raises(NergError, match=name):
+        Shading(rgb.load_dict({"type": kind}))
 
 
 # ---- Batched depth tracing: closed forms, both array types, independence of the batch size ----
