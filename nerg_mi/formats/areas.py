@@ -227,14 +227,15 @@ def parse_box(entry: AreaEntry) -> Region:
             f'{location} has the key "{unread}", which is not read; a box has "min", "max" and "turn" (degrees about '
             "z, or a quaternion x, y, z, w)"
         )
+    turns = rotation if isinstance(rotation, list) else [] if rotation is None else [rotation]
+    if not all(is_number(v) for v in turns):
+        raise NergError(
+            f'{location} has the "turn" {sanitize(json.dumps(rotation), 60)}; it must be an angle in degrees about z, '
+            "or a quaternion x, y, z, w"
+        )
     try:
         lower, upper = (list(corner) for corner in corners)
-        numbers = [
-            *lower,
-            *upper,
-            *(rotation if isinstance(rotation, list) else [] if rotation is None else [rotation]),
-        ]
-        if not isinstance(name, str) or not all(is_number(v) for v in numbers):
+        if not isinstance(name, str) or not all(is_number(v) for v in [*lower, *upper]):
             raise ValueError
     except (TypeError, ValueError) as error:
         raise NergError(f"{location} needs a name, and two corners of three numbers each, as in {_EXAMPLE}") from error

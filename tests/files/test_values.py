@@ -17,6 +17,7 @@ NAIVE = [datetime.datetime(2026, 1, 1, 12), datetime.datetime(2026, 1, 1, 12, 0,
 ZONED = [t.replace(tzinfo=datetime.timezone(datetime.timedelta(hours=2))) for t in NAIVE]
 NOON = 1767268800.0
 HALF = datetime.timedelta(seconds=0.5)
+LENGTH = np.timedelta64(500, "ms")
 COMPOSED, DECOMPOSED = "J\u00f6rg", "Jo\u0308rg"
 
 DATES = {
@@ -115,7 +116,9 @@ def test_other_times_are_refused_by_name(times, kind):
         to_seconds(times, "times")
 
 
-@pytest.mark.parametrize("values", [*(v for k, v in DATES.items()), [HALF], ["1.5"], [1j], [True], [b"1"], [object()]])
+@pytest.mark.parametrize(
+    "values", [*(v for k, v in DATES.items()), [HALF], ["1.5"], [1j], [True], [b"1"], [object()], [LENGTH]]
+)
 def test_numbers_are_no_dates_text_or_flags(values):
     for array in (values, np.array([*values, None], object)):
         with pytest.raises(NergError, match="origins must be numbers"):

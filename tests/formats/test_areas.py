@@ -224,6 +224,12 @@ def test05_invalid_areas_are_refused(tmp_path, read, value):
     assert str(path) in str(message.value) and "\n" not in str(message.value)
 
 
+@pytest.mark.parametrize("turn", ["30", True, {"z": 30}, [[1, 0, 0], [0, 1, 0], [0, 0, 1]]])
+def test_rotations_that_are_no_angles_are_named(tmp_path, turn):
+    with pytest.raises(NergError, match='the "turn" .*degrees'):
+        read_areas(write_areas(tmp_path, BOX | {"turn": turn}))
+
+
 def test06_group_depth_is_limited(tmp_path):
     entries = [BOX, {"name": "0", "parts": ["shelf"]}]
     entries += [{"name": str(k), "parts": [str(k - 1)]} for k in range(1, 400)]
