@@ -9,7 +9,7 @@ import os
 
 from .errors import NergError
 
-NUMPY_MEGABYTES, MITSUBA_MEGABYTES = 140, 400  # address space of the libraries with two threads, measured
+NUMPY_MEGABYTES, SCIPY_MEGABYTES, MITSUBA_MEGABYTES = 140, 160, 400  # address space with two threads, measured
 
 
 def find_free_address_space() -> int | None:

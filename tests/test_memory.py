@@ -29,6 +29,13 @@ def test_limited_address_space_is_named_before_libraries_fail(tmp_path, megabyte
     assert not (tmp_path / "a.png").exists()
 
 
+def test_limit_that_suffices_for_numpy_only_is_named():
+    code = _LIMITED + "from nerg_mi.cli import main; main(sys.argv[2:])"
+    command = [sys.executable, "-c", code, "250", "rays", "show", "missing.npz"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == USER_ERROR and "ulimit" in done.stderr and len(done.stderr.splitlines()) == 1
+
+
 def test_limited_address_space_is_named_in_python():
     code = _LIMITED + "import nerg_mi, mitsuba"
     done = subprocess.run([sys.executable, "-c", code, "250"], capture_output=True, text=True)

@@ -385,6 +385,14 @@ def load_content(content: Mapping[str, Any]) -> Any:
 
 def _load_values(content: Mapping[str, Any]) -> dict[str, Any]:
     kind, name = content.get("type"), content.get("filename")
+    if not isinstance(kind, str):
+        raise NergError(
+            'a dict for mi.load_dict needs the name of a plugin as "type", such as "sphere", but has '
+            f"{', '.join(map(str, content)) if kind is None else repr(kind)}"
+        )
+    # Mitsuba would crash.
+    if (key := next((key for key, value in content.items() if value is None), None)) is not None:
+        raise NergError(f'"{key}" of the dict of a "{kind}" is None; give it a value, or leave it out')
     if kind in ("obj", "ply") and isinstance(name, (str, os.PathLike)):
         file = resolve_scene_file(str(name))
         # Mitsuba reports missing files.

@@ -24,7 +24,7 @@ from nerg_mi.workflows.base import SILENT, Reporter
 from . import arrays
 from .arrays import Floats, LabelledArrays, broadcast_to_observers
 from .calls import Progress, report_progress
-from .contents import from_trimesh, is_trimesh, load_mesh, load_mesh_child
+from .contents import from_trimesh, is_trimesh, load_content, load_mesh, load_mesh_child
 from .fields import FilePath, activate_mitsuba
 from .scene import COLOR, Scene, make_aov_context, resolve_quantities
 
@@ -744,8 +744,6 @@ def _as_box(surface: Any) -> Region | None:
 
 def _as_mesh(scene: Scene, surface: Any) -> Any:
     """Return ``surface`` as a Mitsuba mesh."""
-    import mitsuba as mi
-
     if isinstance(surface, str) and Path(surface).suffix.lower() not in READERS:
         by_id = {shape.id(): shape for shape in scene.mitsuba.shapes()}
         if surface not in by_id:
@@ -761,4 +759,4 @@ def _as_mesh(scene: Scene, surface: Any) -> Any:
         surface = next(iter(meshes.values()))
     if isinstance(surface, MeshFile):
         surface = load_mesh(surface, "surface")
-    return mi.load_dict(dict(surface)) if isinstance(surface, Mapping) else surface
+    return load_content(surface) if isinstance(surface, Mapping) else surface

@@ -86,6 +86,10 @@ class Scene:
     """
 
     def __init__(self, mitsuba: mi.Scene):
+        if type(mitsuba).__name__ != "Scene":
+            raise NergError(
+                f'a scene must be a Mitsuba scene, not a {type(mitsuba).__name__}; use {{"type": "scene", ...}}'
+            )
         integrator: Any = mitsuba.integrator()
         if not is_nerg(integrator):
             have = "none" if integrator is None else f'"{integrator.class_name()}"'

@@ -13,7 +13,7 @@ from .ending import INTERRUPTED, CtrlC, exit_code, open_streams, quiet_ctrl_c, s
 
 with quiet_ctrl_c():
     from nerg_mi.errors import clean_text
-    from nerg_mi.memory import NUMPY_MEGABYTES, require_address_space
+    from nerg_mi.memory import NUMPY_MEGABYTES, SCIPY_MEGABYTES, require_address_space
 
     from .building import DEBUG, build_app
 
@@ -35,7 +35,7 @@ def main(arguments: list[str] | None = None) -> None:
     with CtrlC() as ctrl_c:
         try:
             try:
-                require_address_space(NUMPY_MEGABYTES, "this command")
+                require_address_space(NUMPY_MEGABYTES + SCIPY_MEGABYTES, "this command")
                 build_app(arguments)(arguments, prog_name="nerg")
             finally:
                 sys.stdout.flush()

@@ -19,7 +19,7 @@ import typer
 import typer.core
 
 from nerg_mi import __version__
-from nerg_mi.errors import sanitize
+from nerg_mi.errors import clean_text, sanitize
 from nerg_mi.ranges import KAPPAS, RANGE
 from nerg_mi.workflows.base import COMMANDS, Command, HelpView, Parameter
 from nerg_mi.workflows.old_names import find_spelling
@@ -181,7 +181,7 @@ def _shortened(arguments: Sequence[str]) -> Iterator[None]:
         values += [value for flag, _, value in (a.partition("=") for a in arguments) if flag in flags and value]
         if len(values) == 1 and values[0] not in error.message:
             error.message = f'{error.message}, got "{sanitize(values[0])}"'
-        error.message = shorten_values(error.message, arguments)
+        error.message = clean_text(shorten_values(error.message, arguments))
         raise
 
 

@@ -80,3 +80,22 @@ def test05_areas_that_are_an_environment_are_refused():
     rays = nerg.Rays.from_arrays([[1, 1, 1.6]], [[1, 0, 0]], times=[0])
     with pytest.raises(nerg.NergError, match=r'"(aois|areas)" must be a dict of areas'):
         nerg.statistics(rays, trimesh.Scene(trimesh.creation.box((1, 1, 1))))
+
+
+@pytest.mark.parametrize(
+    "content, name",
+    [
+        ({"shelf": [[0, 0, 0], [1, 1, 1]]}, "shelf"),
+        ({"shelf": None}, "shelf"),
+        ({"type": 3}, "3"),
+        ({"type": "scene", "lamp": None}, "lamp"),
+        ({"type": "rectangle", "to_world": None}, "to_world"),
+        ({"type": "sphere"}, "Shape"),
+    ],
+    ids=str,
+)
+def test06_dicts_without_a_plugin_or_values_are_refused(write, content, name, rgb):
+    scene = nerg.Scene.load(write(PERSPECTIVE))
+    for call in (nerg.Scene.coerce, lambda surface: nerg.attention(scene, surface, (0, -3, 0))):
+        with pytest.raises(nerg.NergError, match=f"{name}|mesh"):
+            call(content)
