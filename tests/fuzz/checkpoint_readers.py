@@ -117,6 +117,8 @@ def _trainer(kind):
         rays=100,
         samples=1000,
         _started=0.0,
+        reserved_seconds=0.0,
+        _reserved_at=(0.0, 0.0),
         stride=4,
         prepass_samples_per_ray=10.0,
         best=None,
