@@ -165,7 +165,7 @@ def test_colour_of_multilayer_exr(tmp_path):
     import OpenEXR
 
     values = {k: np.full((2, 3), v, np.float32) for k, v in {"R": 0.1, "G": 0.2, "B": 0.3, "depth.T": 7.0}.items()}
-    with OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, values) as file:
+    with OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, dict(values)) as file:
         file.write(str(tmp_path / "a.exr"))
     assert np.allclose(read_image(tmp_path / "a.exr"), to_srgb(np.array([0.1, 0.2, 0.3])), atol=1e-3)
     with OpenEXR.File({"type": OpenEXR.scanlineimage}, {"depth.T": values["depth.T"], "x.Y": values["R"]}) as file:

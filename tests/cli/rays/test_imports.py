@@ -123,6 +123,8 @@ def test_names_are_not_interpreted_as_markup(tmp_path):
 
 @pytest.mark.parametrize("output", ["r.npz", "r.rays"])
 def test_files_with_faults_can_be_found_despite_pseudonyms(tmp_path, output):
+    if output == "r.rays":
+        pytest.importorskip("pyarrow")
     (tmp_path / "ann.csv").write_text(ROWS)
     (tmp_path / "berta.csv").write_text(ROWS + "2,1,1.6,2,0,0,0\n")
     salt = [] if output == "r.npz" else ["--salt", tmp_path / "salt", *ALONE]
@@ -139,6 +141,7 @@ def test_files_with_faults_can_be_found_despite_pseudonyms(tmp_path, output):
 
 
 def test_all_refused_files_of_a_dataset_are_named(tmp_path):
+    pytest.importorskip("pyarrow")
     for name in ("ann", "bo", "cy"):
         (tmp_path / f"{name}.csv").write_text(
             ROWS.replace("1.6", "1.6" if name == "ann" else "x" if name == "bo" else "1e5")
@@ -150,6 +153,7 @@ def test_all_refused_files_of_a_dataset_are_named(tmp_path):
 
 
 def test_files_without_rays_are_named(tmp_path):
+    pytest.importorskip("pyarrow")
     (tmp_path / "ann.csv").write_text(ROWS)
     (tmp_path / "bo.csv").write_text("t,x,y,z,a,b,c\n0,1,1.6,2,0,0,0\n")
     done = run("import", tmp_path / "ann.csv", tmp_path / "bo.csv", "-o", tmp_path / "r.rays", *MAP, *UNITY, *ALONE)
