@@ -41,6 +41,7 @@ EXCEPTIONS = {
     "nerg_mi/files/images.py:_raise_if_full": "determines why a file of `replace_atomically` cannot be extended",
     "nerg_mi/formats/torch_files.py:write_torch": "torch writes to memory",
     "nerg_mi/cli/ending.py:write": "is a standard stream",
+    "nerg_mi/cli/building.py:format_help_text": "writes help to memory",
     "nerg_mi/files/images.py": "encodes in memory",
     "nerg_mi/figures/style.py:encode": "encodes in memory",
     "nerg_mi/photos/structure_worker.py": "writes to a folder of `create_folder_atomically`, in its own process",
