@@ -171,9 +171,10 @@ def test20_pyplot_saves_the_new_figure(scene, tmp_path, name):
     view = nerg.render(scene, quantities=("color", "gaze", "depth"), spp=1)
     try:
         figure, panel = pyplot.subplots()
-        assert view.plot(name, axes=panel) is figure
+        before = pyplot.get_fignums()
+        assert view.plot(name, axes=panel) is figure and pyplot.get_fignums() == before
         drawn = view.plot(name)
-        assert pyplot.gcf() is drawn and len(pyplot.get_fignums()) == 2
+        assert pyplot.gcf() is drawn and len(pyplot.get_fignums()) == len(before) + 1
         pyplot.savefig(tmp_path / "figure.png")
         assert np.ptp(pyplot.imread(tmp_path / "figure.png")) > 0.1
         before = pyplot.get_fignums()

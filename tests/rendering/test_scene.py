@@ -84,7 +84,8 @@ def test_mitsuba_does_not_open_an_obj_that_it_would_misread(rgb, tmp_path, kind,
             from nerg_mi.api.contents import load_content
 
             child = {"type": "obj", "filename": str(tmp_path / "a.obj")}
-            load_content({"type": "scene", "a": child} if form == "dict" else {"type": "scene", "b": {"a": child}})
+            group = {"type": "shapegroup", "a": child}
+            load_content({"type": "scene", "a": child if form == "dict" else group})
         else:
             load_scene(tmp_path / "s.xml")
 
