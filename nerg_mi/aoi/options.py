@@ -162,9 +162,6 @@ class StatisticsOptions(CountOptions, PredictionOptions, PartOptions):
     what_if: Path | None = option(
         None, "JSON file of changes to shapes and observers; the gaze field predicts their effect.", group=INPUT
     )
-    visibility: bool = option(
-        False, "Compute isovists on a grid: what is visible from each position. Needs no tracking.", group=ANALYSIS
-    )
     observers: tuple[str, ...] = option(
         (),
         "Position x,y,z of an observer, where there are no rays; repeatable.  "

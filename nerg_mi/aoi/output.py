@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.figures.statistics import aois_figure, map_figure, transitions_figure
+from nerg_mi.figures.statistics import aois_figure, transitions_figure
 from nerg_mi.figures.style import make_provenance, save
 from nerg_mi.files.atomic import replace_atomically, write_text
 from nerg_mi.files.dataframes import ResultTables
@@ -239,8 +239,6 @@ class StatisticsResult(ResultTables):
         Measures of single participants.
     what_if
         Predicted effects of the changes.
-    isovists
-        Visibility from a grid of positions.
     sums
         Sums that the tables were computed from.
     num_suppressed
@@ -249,7 +247,7 @@ class StatisticsResult(ResultTables):
         Written files.
     """
 
-    TABLES = (*("aois", "isovists", "differences", "power", "transitions", "durations", "participants", "what_if"),)
+    TABLES = ("aois", "differences", "power", "transitions", "durations", "participants", "what_if")
 
     aois: list[Row] = field(default_factory=list)
     differences: list[Row] = field(default_factory=list)
@@ -258,7 +256,6 @@ class StatisticsResult(ResultTables):
     durations: list[Row] = field(default_factory=list)
     participants: Sequence[Row] = ()
     what_if: list[Row] = field(default_factory=list)
-    isovists: list[Row] = field(default_factory=list)
     sums: VisitSums | None = None
     num_suppressed: int = 0
     files: list[Path] = field(default_factory=list)
@@ -278,7 +275,6 @@ def write_results(
         "durations": result.durations,
         "participants": result.participants,
         "what_if": result.what_if,
-        "isovists": result.isovists,
     }
     for name, rows in tables.items():
         if rows:
@@ -299,12 +295,6 @@ def write_results(
             matrix = np.array([[counts.get((a, b), 0) for b in names] for a in names], float)
             save(transitions_figure(names, matrix), folder / "transitions.png", metadata)
             files.append(folder / "transitions.png")
-    if result.isovists:
-        points = np.array([[r["x"], r["y"]] for r in result.isovists])
-        area = np.array([r["area"] for r in result.isovists])
-        figure = map_figure(points, area, options.grid_step, "visible area [m²]", "Isovists at eye height")
-        save(figure, folder / "isovists.png", metadata)
-        files.append(folder / "isovists.png")
     write_text(folder / "about.json", metadata.json() + "\n")
     files.append(folder / "about.json")
     if not has_parquet():

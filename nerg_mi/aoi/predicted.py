@@ -19,7 +19,6 @@ from nerg_mi.formats.meshes import MeshFile
 from nerg_mi.measures.estimates import adjust_p_values, estimate_ratio_differences
 from nerg_mi.measures.shares import (
     COARSE,
-    Isovists,
     SamplePoints,
     VisibilityCache,
     compute_visibility,
@@ -233,22 +232,6 @@ def viewpoints_at(positions: np.ndarray) -> Viewpoints:
     """Return a viewpoint of a separate observer, who may face any direction, at each of ``positions`` (M, 3)."""
     names = tuple(f"observer {k + 1:0{len(str(len(positions)))}d}" for k in range(len(positions)))
     return Viewpoints(positions, np.tile([1.0, 0, 0], (len(positions), 1)), names, (frozenset([ALL]),) * len(positions))
-
-
-def isovist_rows(isovists: Isovists, names: Sequence[str], members: Sequence[tuple[int, ...]]) -> list[Row]:
-    """Return a row for each position, with the share of each area's sample points that are visible from it."""
-    rows = []
-    for k, (x, y, z) in enumerate(isovists.points.tolist()):
-        row: Row = {"x": x, "y": y, "z": z}
-        row |= {n: float(getattr(isovists, n)[k]) for n in ("area", "perimeter", "nearest", "farthest", "radius")}
-        rows.append(
-            row
-            | {
-                f"sees {n}": float(isovists.visible_share[k, list(indices)].mean())
-                for n, indices in zip(names, members)
-            }
-        )
-    return rows
 
 
 # ---- AOI scene ----

@@ -9,7 +9,7 @@ import numpy as np
 
 from nerg_mi.measures.tables import is_underestimate
 
-from .style import INK, as_axes, font_size, label_axes, label_bar, new_page, text_scale
+from .style import INK, as_axes, font_size, label_bar, new_page, text_scale
 
 MAX_BARS = 40
 """Maximum number of areas; those with the largest shares are drawn."""
@@ -113,34 +113,4 @@ def transitions_figure(
     axis.set_title(title, fontsize=font_size(10), color=INK, loc="left")
     bar = axis.figure.colorbar(image, cax=bar_axes, ax=axis)
     label_bar(bar, "% of the transitions from the area", 7)
-    return axis
-
-
-def map_figure(points: np.ndarray, values: np.ndarray, step: float, label: str, title: str, axes: Any = None) -> Any:
-    """Draw ``values`` (G,) at positions (G, 2 or 3) of a grid with spacing ``step``, seen from above. Return the axes.
-
-    ``axes``: axes to draw in. Default: a new figure.
-    """
-    from matplotlib.collections import PatchCollection
-    from matplotlib.patches import Rectangle
-
-    low, high = points[:, :2].min(axis=0) - step, points[:, :2].max(axis=0) + step
-    axis, bar_axes = axes, None
-    if axes is None:
-        scale = 620 / max(high - low)
-        size = (high - low) * scale
-        page = new_page(size[0] + 170, size[1] + 100)
-        width, height = (100 * v for v in page.get_size_inches())
-        axis = page.add_axes((60 / width, 50 / height, size[0] / width, size[1] / height))
-        bar_axes = page.add_axes((1 - 95 / width, 50 / height, 14 / width, size[1] / height))
-    squares = [Rectangle((x - step / 2, y - step / 2), step, step) for x, y in points[:, :2]]
-    cells = PatchCollection(squares, cmap="viridis", linewidth=0)
-    cells.set_array(np.asarray(values, float))
-    axis.add_collection(cells)
-    axis.set_xlim(low[0], high[0])
-    axis.set_ylim(low[1], high[1])
-    axis.set_aspect("equal")
-    label_axes(axis, "x [m]", "y [m]")
-    axis.set_title(title, fontsize=font_size(10), color=INK, loc="left")
-    label_bar(axis.figure.colorbar(cells, cax=bar_axes, ax=axis), label)
     return axis

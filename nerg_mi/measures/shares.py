@@ -346,12 +346,11 @@ class _ObserverBatch:
     rows: dict[int, np.ndarray]
 
 
-# ---- Visibility and isovists ----
+# ---- Visibility ----
 #
 # An AOI is visible to an observer at p who faces direction f if one of its sample points s faces p (n · (p - s) > 0, if
 # the point has a normal), lies within the field of view, (s - p) · f >= |s - p| cos(v / 2) for an angle of v degrees,
-# and is not occluded. An isovist is the region that is visible from a point (Benedikt 1979). Here it is the horizontal
-# slice at eye height, whose area is ½ Σ r² Δθ over directions.
+# and is not occluded.
 
 DepthQuery = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Maps origins and unit directions (N, 3) to the distance of the first surface (N,), infinite if there is none."""
@@ -462,21 +461,6 @@ class VisibilityCache:
         return np.unpackbits(bits, axis=1, count=len(self._targets.points)).astype(bool), cell_index.ravel()
 
 
-@dataclass(frozen=True)
-class Isovists:
-    """Isovists at G positions: ``points`` (G, 3) at eye height; ``area`` (G,) of the horizontal slice in square
-    metres; its ``perimeter`` and its ``nearest``, ``farthest`` and mean (``radius``) distance in metres; and the
-    share of the sample points of each AOI that are visible in any direction, (G, K)."""
-
-    points: np.ndarray
-    area: np.ndarray
-    perimeter: np.ndarray
-    nearest: np.ndarray
-    farthest: np.ndarray
-    radius: np.ndarray
-    visible_share: np.ndarray
-
-
 def find_standing_positions(
     lower: np.ndarray, upper: np.ndarray, step: float, height: float, depth: DepthQuery, floor: float
 ) -> np.ndarray:
@@ -501,35 +485,3 @@ def find_standing_positions(
     ends, begins = positions[:, 2] + depth_above, top[:, 2] - depth_from_top
     is_inside = np.isfinite(depth_above) & (ends < upper[2] - 0.05) & (np.abs(ends - begins) < 0.02)
     return positions[has_floor & ~is_inside]
-
-
-def compute_isovists(
-    points: np.ndarray,
-    depth: DepthQuery,
-    targets: SamplePoints,
-    margin: float,
-    max_distance: float,
-    num_directions: int = 360,
-) -> Isovists:
-    """Compute isovists at ``points`` (G, 3), with distances limited to ``max_distance``."""
-    angle = 2 * np.pi * (np.arange(num_directions) + 0.5) / num_directions
-    directions = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(num_directions)])
-    r = np.empty((len(points), num_directions))
-    block_size = max(1, _SIGHT_BATCH // num_directions)
-    for a in range(0, len(points), block_size):
-        part = points[a : a + block_size]
-        depth_along = depth(np.repeat(part, num_directions, axis=0), np.tile(directions, (len(part), 1)))
-        r[a : a + block_size] = np.minimum(depth_along, max_distance).reshape(-1, num_directions)
-    ends = r[:, :, None] * directions[None, :, :2]
-    perimeter = np.linalg.norm(ends - np.roll(ends, 1, axis=1), axis=2).sum(axis=1)
-    visible = compute_visibility(targets, points, depth, margin)
-    count = np.bincount(targets.aoi_index, minlength=targets.num_aois)
-    share = (
-        np.stack(
-            [visible[:, targets.aoi_index == k].sum(axis=1) / max(count[k], 1) for k in range(targets.num_aois)], axis=1
-        )
-        if targets.num_aois
-        else np.zeros((len(points), 0))
-    )
-    area = 0.5 * (r**2).sum(axis=1) * (2 * np.pi / num_directions)
-    return Isovists(points, area, perimeter, r.min(axis=1), r.max(axis=1), r.mean(axis=1), share)

@@ -832,7 +832,7 @@ declare(
     "confidence intervals over participants.",
     more="""Reports attention share, dwell time, hit ratio, time to first visit, revisits, viewing distance and
 visibility, by cohort, time window and zone; differences between AOIs, transitions, and the effect of changes to the
-scene. --visibility computes isovists, which need no tracking.""",
+scene.""",
     options=StatisticsOptions,
     files=argument("Rays or a dataset, a scene (.xml), a radiance field and a gaze field, in any order.", list[Path]),
     output=out("Folder for tables and figures."),

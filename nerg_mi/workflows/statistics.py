@@ -26,7 +26,6 @@ from nerg_mi.aoi.predicted import (
     PredictedAttention,
     add_uncertainty,
     aggregate_by_participant,
-    isovist_rows,
     load_aoi_scene,
     place_observers_on_floor,
     subsample_participants,
@@ -42,7 +41,6 @@ from nerg_mi.formats.areas import AreaSet, read_areas
 from nerg_mi.interruption import Interruption
 from nerg_mi.measures.estimates import MIN_PARTICIPANTS
 from nerg_mi.measures.power import power_rows
-from nerg_mi.measures.shares import Isovists, SamplePoints
 from nerg_mi.measures.tables import (
     MEASURED,
     PREDICTED,
@@ -121,8 +119,6 @@ def _sort(files: Sequence[str | Path | Rays]) -> _InputFiles:
 
 def _areas(options: StatisticsOptions) -> AreaSet:
     if options.aois is None:
-        if options.visibility:
-            return AreaSet(())
         raise NergError("no AOIs are given; add --aois FILE")
     return read_areas(options.aois)
 
@@ -156,12 +152,10 @@ class _StatisticsWork:
     def run(self) -> StatisticsResult:
         """Compute all statistics."""
         o, floor = self.options, MinParticipantsFilter(self.options.min_participants)
-        if o.visibility:
-            return StatisticsResult(isovists=isovist_rows(self._isovists(), self.areas.names, self.members))
         counting = None if self.inputs.rays is None else self._counting(self.inputs.rays)
         sums, viewpoints = (None, self._untracked_viewpoints()) if counting is None else self._count(counting)
         if counting is None and self.around.gaze is None:
-            raise NergError("there are no observers: give rays or a gaze field, or add --visibility for isovists")
+            raise NergError("there are no observers: give rays or a gaze field")
         cells = [ALL] if counting is None else list(sums.cells) if sums is not None else []
         seen = counting is not None and counting.visibility_cache is not None
         people: dict[Cell, dict[str, Participants]] = {cell: {} for cell in cells}
@@ -302,22 +296,6 @@ class _StatisticsWork:
         else:
             predicted = self.parts.predict(viewpoints, self._view)
         return replace(predicted, note=note)
-
-    def _isovists(self) -> Isovists:
-        from nerg_mi.measures.shares import compute_isovists
-
-        o = self.options
-        points = place_observers_on_floor(self.around, o.eye_height, o.grid_step, o.floor_height)
-        box = self.around.bounds()
-        self.reporter.message(f"{len(points):,} positions on the floor")
-        max_distance = float(np.linalg.norm(box[1] - box[0]))
-        return compute_isovists(
-            points,
-            self.around.trace_depth,
-            SamplePoints.sample(self.aois, o.aoi_samples),
-            self.setting.margin,
-            max_distance,
-        )
 
     def _what_if(
         self, viewpoints: Viewpoints, before: PredictedAttention | None, floor: MinParticipantsFilter

@@ -30,13 +30,12 @@ ROW_OF_AOI = {
 
 
 def test_non_empty_tables_are_written(tmp_path):
-    place = {"x": 0.0, "y": 0.0, "z": 1.6, "area": 2.0}
     recorder = Recorder()
-    made = StatisticsResult(aois=[ROW_OF_AOI], isovists=[place, place | {"x": 0.25}], num_suppressed=2)
+    made = StatisticsResult(aois=[ROW_OF_AOI], num_suppressed=2)
     files = write_results(tmp_path, made, [], StatisticsOptions(), recorder)
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted(p.name for p in files)
     names = {p.name for p in files}
-    assert {"aois.csv", "aois.md", "aois.png", "isovists.png", "suppressed.txt", "about.json"} <= names
+    assert {"aois.csv", "aois.md", "aois.png", "suppressed.txt", "about.json"} <= names
     assert not any(name.startswith(("transitions", "what_if", "participants")) for name in names)
     assert "2 values" in (tmp_path / "suppressed.txt").read_text() and recorder.messages
 

@@ -16,7 +16,6 @@ from nerg_mi.aoi.predicted import (
     PredictedAttention,
     add_uncertainty,
     aggregate_by_participant,
-    isovist_rows,
     load_aoi_scene,
     median_support,
     place_observers_on_floor,
@@ -32,14 +31,13 @@ from nerg_mi.errors import NergError
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.formats.areas import AreaSet, MeshPart, Region, read_areas
 from nerg_mi.maths.geometry import Similarity
-from nerg_mi.measures.shares import SamplePoints, compute_isovists
 from nerg_mi.measures.tables import MIN_VIEWPOINTS, MinParticipantsFilter
 from nerg_mi.measures.visits import ALL, BoxAoi, Cell
 from nerg_mi.transport.geometry import SceneGeometry
 from nerg_mi.workflows.base import SILENT
 from tests.workflows.recorder import Recorder
 
-from .place import SIGN, write_place
+from .place import write_place
 
 # ---- Predictions against sums over directions ----
 
@@ -154,14 +152,6 @@ def test_observers_are_placed_on_the_floor(tmp_path):
     assert 330 < len(result) < 24 * 16 and not inside.any() and np.allclose(result[:, 2], 1.6)
     with pytest.raises(NergError, match="--floor"):
         place_observers_on_floor(around, 1.6, 0.25, -2.0)
-    rows = isovist_rows(
-        compute_isovists(
-            result[:4], around.trace_depth, SamplePoints.sample([BoxAoi(Region.create("s", *SIGN))], 24), 0.01, 9.0
-        ),
-        ("s", "g"),
-        [(0,), (0,)],
-    )
-    assert len(rows) == 4 and rows[0]["sees s"] == rows[0]["sees g"] and 0 < rows[0]["area"] < 24.1
 
 
 def test_observers_have_names():

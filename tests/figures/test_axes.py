@@ -52,7 +52,6 @@ FIGURES = {
     "layout": (1, lambda **how: maps.layout_figure(rays(), rays(), POINTS[:3], 0.1, **how)),
     "aois": (3, lambda **how: statistics.aois_figure(ROWS, **how)),
     "transitions": (1, lambda **how: statistics.transitions_figure("ab", np.eye(2), **how)),
-    "grid": (1, lambda **how: statistics.map_figure(POINTS, POINTS[:, 0], 0.1, "m", "a", **how)),
     "psnr": (1, lambda **how: psnr_figure([{"steps": 1, "seconds": 1.0, "psnr": 20.0}], **how)),
 }
 

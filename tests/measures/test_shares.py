@@ -15,7 +15,6 @@ from nerg_mi.measures.shares import (
     SummationRule,
     VisibilityCache,
     _AdaptiveSums,
-    compute_isovists,
     compute_visibility,
     find_standing_positions,
     gaze_shares,
@@ -122,7 +121,7 @@ def test_empty_inputs():
         gaze_shares(broken, OBSERVERS[:1], [BoxAoi(BOXES[0])], [(0,)], 0.0)
 
 
-# ---- Visibility and isovists ----
+# ---- Visibility ----
 
 ROOM = np.array([[0.0, 0, 0], [6, 4, 3]])
 PILLAR = np.array([[2.0, 1.5, 0], [3, 2.5, 2.0]])
@@ -208,27 +207,6 @@ def test_visibility_cache():
     assert np.array_equal(again[whose], points[index]) and len(requested) > before
     with pytest.raises(NergError, match="--cell"):
         VisibilityCache(targets, depth, 0.0, 0.0)
-
-
-def test_isovist_of_an_empty_room():
-    empty = lambda o, d: intersect_box_numpy(o, d, *ROOM)[1]
-    result = compute_isovists(
-        np.array([[1.0, 1, 1.6], [3, 2, 1.6]]), empty, SamplePoints.sample([], 4), 0.0, 100.0, num_directions=7200
-    )
-    assert np.allclose(result.area, 24, rtol=2e-3) and np.allclose(result.perimeter, 20, rtol=2e-3)
-    assert np.allclose(result.nearest, [1, 2], atol=1e-3)
-    assert np.allclose(result.farthest, [np.hypot(5, 3), np.hypot(3, 2)], rtol=1e-3)
-
-
-def test_isovist_excludes_the_shadow_of_a_pillar():
-    # From (1, 2): the pillar from y 1.5 to 2.5 at x = 2 hides the strip between the lines through its corners.
-    result = compute_isovists(
-        np.array([[1.0, 2.0, 1.6]]), room_depth, SamplePoints.sample([], 4), 0.0, 100.0, num_directions=14400
-    )
-    # Lines of slope 1/2 from the eye meet the walls y = 0 and 4 at x = 5, and x = 6 beyond these: the shadow is the
-    # region |y - 2| < (x - 1) / 2, 2 < x, within the room: a trapezium to x = 5 and a rectangle behind.
-    shadow = (1 + 4) / 2 * 3 + 4 * 1
-    assert result.area[0] == pytest.approx(24 - shadow, rel=3e-3)
 
 
 def test_standing_positions():

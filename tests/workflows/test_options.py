@@ -230,7 +230,7 @@ COMMANDS = {
     ),
     "folds": (FoldOptions, fold_options, STORE | {"folds", "seed", "splits", "max_samples"}),
 }
-AFTER_COUNTS = {"viewpoints", "glance_duration", "what_if", "visibility", "observers", "eye_height", "floor_height"}
+AFTER_COUNTS = {"viewpoints", "glance_duration", "what_if", "observers", "eye_height", "floor_height"}
 AFTER_COUNTS |= {"grid_step", "min_participants"}
 AFTER_COUNTS |= {"show_names", "salt", "resamples", "power", "seed"} | STORE
 OF_COUNTS = {f.name for f in fields(CountOptions)} - {f.name for f in fields(PredictionOptions)}
