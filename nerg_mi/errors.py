@@ -6,17 +6,61 @@ import errno
 import importlib
 import re
 import unicodedata
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
+
+# ---- Parameters in messages ----
+#
+# A message names a parameter by `parameter`, between characters that no text contains. It is spelled where the message
+# is shown: as ``steps=200`` in Python, and as ``--steps 200`` on the command line.
+
+_MENTION = re.compile("\ue000(\\w+)\ue001([^\ue002]*)\ue002")
+Spelling: TypeAlias = Callable[[str, str], str]
+"""Spells a parameter, of its name and a value; the value is "" if only the parameter is meant."""
+
+
+def parameter(name: str, value: object = "") -> str:
+    """Return the mention of the parameter ``name`` for a message, with a ``value`` if the message is about that."""
+    return f"\ue000{name}\ue001{value}\ue002"
+
+
+def spell_python(name: str, value: str) -> str:
+    """Spell a parameter as a keyword argument: ``steps=200``, ``recipe="small"``."""
+    is_word = value.isidentifier() and not value.isupper() and value not in ("True", "False", "None")
+    return "=".join([name, *([f'"{value}"' if is_word else value] if value else ())])
+
+
+def spell_command_line(name: str, value: str) -> str:
+    """Spell a parameter as an option: ``--steps 200``; True is the option alone."""
+    return " ".join([f"--{name.replace('_', '-')}", *([value] if value not in ("", "True") else ())])
+
+
+def spell_parameters(text: str, spelling: Spelling = spell_python) -> str:
+    """Spell the parameters that ``text`` mentions."""
+    return _MENTION.sub(lambda match: spelling(match[1], match[2]), text)
 
 
 class NergError(ValueError):
     """An error that the user can fix. The message is one sentence: what is wrong, and the remedy.
 
     The command `nerg` prints the message without a traceback and exits with code 1.
+
+    Parameters
+    ----------
+    message : str
+        The sentence, in which `parameter` mentions parameters.
+    kind : str
+        What is wrong, for programs: "mirrored", "unit", ...
+
+    Attributes
+    ----------
+    message : str
+        The sentence before its parameters are spelled; ``str(error)`` spells them as in Python.
+    parameters : dict of str to str
+        Parameters that the sentence mentions, and their values ("" without one).
 
     >>> import nerg_mi as nerg
     >>> try:
@@ -26,8 +70,20 @@ class NergError(ValueError):
     the checkpoint "nowhere.safetensors" does not exist: correct its name, or make one with "nerg train"
     """
 
+    def __init__(self, message: object = "", *more: object, kind: str = "") -> None:
+        super().__init__(message, *more)
+        self.kind = kind
+
+    @property
+    def message(self) -> str:
+        return str(self.args[0])
+
+    @property
+    def parameters(self) -> dict[str, str]:
+        return dict(_MENTION.findall(self.message))
+
     def __str__(self) -> str:
-        return clean_text(super().__str__())
+        return clean_text(spell_parameters(super().__str__()))
 
 
 class MissingFile(NergError, FileNotFoundError):
