@@ -11,7 +11,7 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -25,6 +25,7 @@ from nerg_mi.files.atomic import file_sha256, make_folder, replace_atomically, w
 from nerg_mi.files.values import to_numbers
 from nerg_mi.formats.areas import format_areas
 from nerg_mi.formats.splats import write_ply_splats
+from nerg_mi.maths.transforms import check_rigid_transforms
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.files import write_mesh
 from nerg_mi.rendering.scene import list_scene_files
@@ -108,8 +109,9 @@ def as_file(value: object, name: str) -> Path:
     if name in _JSON_NAMES and isinstance(value, Mapping):
         return _store(name, ".json", lambda path: write_text(path, json.dumps(value, default=_to_json)))
     matrix: Any = getattr(value, "matrix", value)
-    if name in _ALIGNMENT_NAMES and np.shape(matrix) == (4, 4):
-        return _store("align", ".json", lambda path: write_text(path, json.dumps(to_numbers(matrix, name).tolist())))
+    if name in _ALIGNMENT_NAMES and isinstance(matrix, (Sequence, np.ndarray)):
+        rows = check_rigid_transforms(matrix, f'"{name}"', may_scale=True, shape=(4, 4)).tolist()
+        return _store("align", ".json", lambda path: write_text(path, json.dumps(rows)))
     environment = None if name in _AREA_NAMES else _write_environment(value) or _write_baked(value)
     if environment is None:
         kind = _KINDS.get(name, "a file")

@@ -10,7 +10,6 @@ import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nerg_mi.errors import NergError
 from nerg_mi.ranges import MAX_COORDINATE
 
 from .coordinates import check_coordinates
@@ -300,10 +299,9 @@ class Similarity:
     """
 
     def __init__(self, matrix: np.ndarray | None = None):
-        m = np.eye(4) if matrix is None else np.array(matrix, float)
-        if m.shape != (4, 4):
-            raise NergError(f'"to_world" must have the shape (4, 4), got {m.shape}')
-        check_rigid_transforms(m, '"to_world" of a field or an alignment', may_scale=True)
+        name = '"to_world" of a field or an alignment'
+        matrix = np.eye(4) if matrix is None else matrix
+        m = check_rigid_transforms(matrix, name, may_scale=True, shape=(4, 4)).copy()
         check_coordinates(m[None, :3, 3], 'the translation of "to_world"')
         m[:3, :3], m[3] = correct_rotation(m[:3, :3]), (0, 0, 0, 1)
         self.matrix, self.scale = m, float(np.linalg.det(m[:3, :3]) ** (1 / 3))

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nerg_mi.errors import NergError
+from nerg_mi.files.values import to_numbers
 
 ROTATION_TOLERANCE = 0.01
 """Maximum deviation of an element of R Rᵀ from the identity for a rotation R, and of a unit quaternion's length from
@@ -25,9 +26,12 @@ def check_rigid_transforms(
     label: Callable[[int], str] = "matrix {}".format,
     *,
     may_scale: bool = False,
+    may_mirror: bool = False,
+    shape: tuple[int, ...] | None = None,
     tolerance: float = ROTATION_TOLERANCE,
-) -> None:
-    """Raise `NergError` for a matrix that is not a rotation and a translation with the last row 0, 0, 0, 1.
+) -> np.ndarray:
+    """Return ``matrices`` as an array of floats. Raises `NergError` for one that is not a rotation and a translation
+    with the last row 0, 0, 0, 1.
 
     Parameters
     ----------
@@ -39,22 +43,32 @@ def check_rigid_transforms(
         Returns the name of each of N matrices for the message, such as "line 7", from its index.
     may_scale
         Whether the rotation may be multiplied by a uniform scale, as in an alignment.
+    may_mirror
+        Whether the rotation may be followed by a reflection, as between left- and right-handed frames.
+    shape
+        The only shape that is accepted.
     tolerance
         Maximum deviation of an element of R Rᵀ from the identity; infinite: any 3 x 3 part is accepted.
     """
-    m = np.asarray(matrices, np.float64)
-    if m.ndim not in (2, 3) or m.shape[-2:] not in ((4, 4), (3, 4)):
-        raise NergError(f"{name} has the shape {m.shape}; it must be (4, 4) or (3, 4)")
-    is_single = m.ndim == 2
-    m = m.reshape(-1, *m.shape[-2:])
-    errors = rotation_errors(m[:, :3, :3], may_scale=may_scale)
+    out = to_numbers(matrices, name)
+    is_accepted = out.ndim in (2, 3) and out.shape[-2:] in ((4, 4), (3, 4)) if shape is None else out.shape == shape
+    if not is_accepted:
+        raise NergError(f"{name} has the shape {out.shape}; it must be {shape or '(4, 4) or (3, 4)'}")
+    is_single = out.ndim == 2
+    m = out.reshape(-1, *out.shape[-2:])
+    errors = rotation_errors(m[:, :3, :3], may_scale=may_scale, may_mirror=may_mirror)
     is_bad = ~np.isfinite(m).all(axis=(1, 2)) | ~(errors <= tolerance) | ~has_last_row(m)
     if not is_bad.any():
-        return
+        return out
     row = int(np.argmax(is_bad))
     where = name if is_single else f"{name}, {label(row)}"
     with np.errstate(all="ignore"):
-        raise NergError(f"{where}: {_explain(m[row], errors[row], tolerance, may_scale)}")
+        raise NergError(f"{where}: {_explain(m[row], errors[row], tolerance, may_scale, may_mirror)}")
+
+
+def invert_similarity(matrix: ArrayLike, name: str) -> np.ndarray:
+    """The inverse of a similarity (4, 4). Raises `NergError` with ``name`` for another matrix."""
+    return np.linalg.inv(check_rigid_transforms(matrix, name, may_scale=True, shape=(4, 4)))
 
 
 def has_last_row(matrices: np.ndarray) -> np.ndarray:
@@ -63,13 +77,14 @@ def has_last_row(matrices: np.ndarray) -> np.ndarray:
     return np.asarray((rows <= _LAST_ROW_TOLERANCE).all(axis=(1, 2)))
 
 
-def rotation_errors(linear: np.ndarray, *, may_scale: bool = False) -> np.ndarray:
+def rotation_errors(linear: np.ndarray, *, may_scale: bool = False, may_mirror: bool = False) -> np.ndarray:
     """Maximum deviation of R Rᵀ from the identity for each of the matrices (N, 3, 3), (N,); infinite for mirrored
-    matrices and values that are not finite. ``may_scale``: a uniform scale is removed before."""
+    matrices, unless ``may_mirror``, and values that are not finite. ``may_scale``: a uniform scale is removed
+    before."""
     is_finite = np.asarray(np.isfinite(linear).all(axis=(1, 2)))
     R = np.where(is_finite[:, None, None], linear, 0.0)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        determinant = np.linalg.det(R)
+        determinant = np.abs(np.linalg.det(R)) if may_mirror else np.linalg.det(R)
         if may_scale:
             R = R / np.cbrt(determinant)[:, None, None]
         errors = np.abs(np.einsum("nij,nkj->nik", R, R) - np.eye(3)).max(axis=(1, 2))
@@ -89,7 +104,7 @@ def correct_rotation(linear: np.ndarray) -> np.ndarray:
     return np.cbrt(np.linalg.det(linear)) * nearest_rotation(linear)
 
 
-def _explain(m: np.ndarray, error: float, tolerance: float, may_scale: bool) -> str:
+def _explain(m: np.ndarray, error: float, tolerance: float, may_scale: bool, may_mirror: bool) -> str:
     """Why a matrix (4, 4) or (3, 4) is refused, and the remedy."""
     if not np.isfinite(m).all():
         return "it has values that are not finite; correct or remove it"
@@ -99,7 +114,7 @@ def _explain(m: np.ndarray, error: float, tolerance: float, may_scale: bool) -> 
         values = ", ".join(f"{v:g}" for v in m[3])
         return f"its last row is {values} instead of 0, 0, 0, 1; check the order of its values"
     scale = float(np.cbrt(np.linalg.det(m[:3, :3])))
-    if scale < 0:
+    if scale < 0 and not may_mirror:
         return "it is mirrored (its determinant is negative); exchange two axes or negate one in the file's frame"
     if scale > 0 and rotation_errors(m[None, :3, :3], may_scale=True)[0] <= tolerance:
         return f"it contains a scale of {scale:.6g}; only a rotation and a translation are possible, so divide by it"

@@ -313,13 +313,9 @@ class PosedImages:
 
 def _split_similarity(similarity: np.ndarray) -> tuple[float, np.ndarray]:
     """Return scale and rotation of a similarity. Raises `NergError` for another matrix."""
-    m = np.asarray(similarity, np.float64)
-    scale = np.cbrt(np.linalg.det(m[:3, :3])) if m.shape == (4, 4) and np.all(np.isfinite(m)) else 0.0
-    if not scale > 0 or not np.abs(m[:3, :3] @ m[:3, :3].T / scale**2 - np.eye(3)).max() <= 1e-3:
-        raise NergError(
-            "a coordinate transform must be a uniform scale, a rotation and a translation, without mirroring"
-        )
-    return float(scale), m[:3, :3] / scale
+    m = check_rigid_transforms(similarity, "the transform of coordinates", may_scale=True)
+    scale = float(np.cbrt(np.linalg.det(m[:3, :3])))
+    return scale, m[:3, :3] / scale
 
 
 def _transform_box(box: np.ndarray | None, m: np.ndarray) -> np.ndarray | None:
@@ -335,14 +331,10 @@ def rigid_pose(matrix: object) -> np.ndarray:
     """Convert ``matrix`` to a rigid pose (4, 4) by removing scale and rounding errors. Raises `NergError` for an
     invalid pose.
     """
-    try:
-        pose = np.asarray(matrix, np.float64)
-    except (TypeError, ValueError, OverflowError) as e:
-        raise NergError("its pose must be a matrix of 4 x 4 numbers") from e
-    if np.isfinite(pose).all() and np.abs(pose).max(initial=0) > MAX_POSITION:
-        raise NergError(f"its pose has numbers beyond {MAX_POSITION:g}")
     # Some writers leave a scale in the rotation, or round it; use the nearest rotation.
-    check_rigid_transforms(pose, "its pose", may_scale=True)
+    pose = check_rigid_transforms(matrix, "its pose", may_scale=True)
+    if np.abs(pose).max() > MAX_POSITION:
+        raise NergError(f"its pose has numbers beyond {MAX_POSITION:g}")
     out = np.eye(4)
     out[:3, :3], out[:3, 3] = nearest_rotation(pose[:3, :3]), pose[:3, 3]
     return out

@@ -12,6 +12,7 @@ import numpy as np
 
 from nerg_mi.errors import MissingFile, NergError
 from nerg_mi.files.safe_read import read_npy, resolve_path
+from nerg_mi.maths.transforms import invert_similarity
 
 from . import cameras
 from .cameras import Intrinsics, PosedCamera, make_area_weights, resize_by_area, resize_mask, resize_nearest
@@ -276,7 +277,7 @@ def open_salience(
         and field_provenance.get("sha256") == posed.sha256
         and "to_file" in field_provenance
     ):
-        align = np.linalg.inv(field_provenance["to_file"])
+        align = invert_similarity(field_provenance["to_file"], '"to_file" of the field')
     if align is not None:
         posed = posed.transform(np.asarray(align, np.float64))
     model = SALIENCE_MODELS.get(str(source))

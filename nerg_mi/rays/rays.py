@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import zipfile
 import zlib
@@ -29,6 +28,7 @@ from nerg_mi.files.safe_read import (
     translate_read_errors,
 )
 from nerg_mi.files.values import to_names, to_numbers, to_seconds, unify_names
+from nerg_mi.maths.transforms import check_rigid_transforms
 from nerg_mi.ranges import MAX_COORDINATE
 
 # ---- JSON metadata of a rays file: the values that this package uses are validated here ----
@@ -119,15 +119,13 @@ def _is_frame(value: object) -> bool:
     return isinstance(value, dict) and all(isinstance(value.get(k), str) for k in ("units", "up", "handedness"))
 
 
-def _is_transform(value: object) -> bool:
-    """Whether a value is a finite 4 x 4 matrix with an invertible upper left 3 x 3 part."""
-    if not (isinstance(value, list) and len(value) == 4 and all(isinstance(r, list) and len(r) == 4 for r in value)):
+def _is_transform(value: Any) -> bool:
+    """Whether a value is a 4 x 4 matrix: a rotation or reflection, a uniform scale and a translation."""
+    try:
+        check_rigid_transforms(value, "the transform", may_scale=True, may_mirror=True, shape=(4, 4))
+    except NergError:
         return False
-    if not all(_is_number(v) for row in value for v in row):
-        return False
-    (a, b, c), (d, e, f), (g, h, i) = (row[:3] for row in value[:3])
-    determinant = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
-    return math.isfinite(determinant) and abs(determinant) > 1e-30
+    return True
 
 
 _METADATA_CHECKS = {
@@ -135,7 +133,10 @@ _METADATA_CHECKS = {
     "cohorts": (_is_text_list, "a list of names"),
     "frame": (_is_frame, "a frame with units, up and handedness"),
     "source_frame": (_is_frame, "a frame with units, up and handedness"),
-    "transform": (_is_transform, "an invertible 4 x 4 matrix"),
+    **dict.fromkeys(
+        ("transform", "place_from_rays"),
+        (_is_transform, "a 4 x 4 matrix of a rotation, a uniform scale and a translation"),
+    ),
     "rows_read": (is_count, "a number of rows"),
     "sources": (lambda v: _is_object_list(v, file=_is_text, sha256_=_is_text), "a list of files"),
     "dropped": (

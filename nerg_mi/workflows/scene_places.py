@@ -16,6 +16,7 @@ from nerg_mi.formats.meshes import DEFAULT_GREY, READERS, MeshFile, read_mesh_fi
 from nerg_mi.formats.splats import choose_plugin, is_splat_file, read_splats, refuse_unsupported_splats
 from nerg_mi.formats.surfaces import write_volume
 from nerg_mi.maths.geometry import Similarity
+from nerg_mi.maths.transforms import invert_similarity
 from nerg_mi.photos.colmap import find_pose_source
 from nerg_mi.photos.images import read_photo, read_posed_images
 from nerg_mi.photos.posed import PosedFrame, PosedImages
@@ -241,7 +242,7 @@ def _posed(photos: Path, provenance: dict, allow_outside: bool) -> PosedImages:
     if "sha256" in provenance and provenance["sha256"] != posed.sha256:
         raise NergError(f'the field was not trained on "{posed.path}"; give the photos of its training with --photos')
     if "to_file" in provenance:
-        posed = posed.transform(np.linalg.inv(np.asarray(provenance["to_file"], np.float64)))
+        posed = posed.transform(invert_similarity(provenance["to_file"], '"to_file" of the field'))
     return posed
 
 

@@ -462,6 +462,12 @@ def test_environments_become_options(rgb_module, room):
     assert align is not None and json.loads(align.read_text()) == np.eye(4).tolist()
 
 
+@pytest.mark.parametrize("matrix", [np.eye(4) + np.eye(4, k=-3), [[1, 0], [0]], np.eye(3), np.diag([1, 2, 1, 1])])
+def test_alignments_in_memory_are_checked(matrix):
+    with pytest.raises(nerg.NergError, match='"align"'):
+        build_options(GazeOptions, "train_gaze", None, {"geometry": "none", "align": matrix})
+
+
 # ---- Results ----
 
 

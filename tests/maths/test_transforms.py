@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from nerg_mi.errors import NergError
-from nerg_mi.maths.transforms import check_rigid_transforms
+from nerg_mi.maths.transforms import check_rigid_transforms, invert_similarity
 
 
 def make_poses(count=5):
@@ -67,3 +67,28 @@ def test_scale_is_named():
 def test_other_shapes_are_refused(shape):
     with pytest.raises(NergError, match="pose has the shape"):
         check_rigid_transforms(np.ones(shape), "pose")
+
+
+@pytest.mark.parametrize("values", [[[1, 0], [0]], "abc", None, np.eye(4) * 1j, [["1", "0", "0", "0"]] * 4])
+def test_values_that_are_no_numbers_are_refused(values):
+    with pytest.raises(NergError, match="pose"):
+        check_rigid_transforms(values, "pose")
+
+
+def test_reflections_pass_only_where_frames_may_be_mirrored():
+    matrix = 0.01 * make_poses()[0] @ np.diag([1, 1, -1, 1])
+    matrix[3] = 0, 0, 0, 1
+    check_rigid_transforms(matrix, "frame", may_scale=True, may_mirror=True)
+    with pytest.raises(NergError, match="mirrored"):
+        check_rigid_transforms(matrix, "frame", may_scale=True)
+    for other, words in ((matrix.T, "transposed"), (matrix @ np.diag([1, 2, 1, 1]), "not a rotation")):
+        with pytest.raises(NergError, match=words):
+            check_rigid_transforms(other, "frame", may_scale=True, may_mirror=True)
+
+
+def test_inverse_of_similarity():
+    matrix = make_poses()[0] @ np.diag([2, 2, 2, 1])
+    np.testing.assert_allclose(invert_similarity(matrix.tolist(), "frame") @ matrix, np.eye(4), atol=1e-12)
+    for other in (np.zeros((4, 4)), matrix[:3], matrix.T, make_poses(), {}):
+        with pytest.raises(NergError, match="frame"):
+            invert_similarity(other, "frame")

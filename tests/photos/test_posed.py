@@ -54,8 +54,10 @@ def test_scale_in_pose_is_removed(write):
 
 def test_mirroring_transform_is_refused(write):
     t = read_transforms(write({"fl_x": 1.0, "frames": [frame("a.png")]}))
-    with pytest.raises(ValueError, match="mirroring"):
+    with pytest.raises(ValueError, match="mirrored"):
         t.transform(np.diag([1.0, 1, -1, 1]))
+    with pytest.raises(ValueError, match="transposed"):
+        t.transform(np.eye(4) + np.eye(4, k=-3))
 
 
 def test_rounded_pose_becomes_nearest_rotation():
@@ -69,7 +71,7 @@ def test_rounded_pose_becomes_nearest_rotation():
 @pytest.mark.parametrize(
     "matrix, reason",
     [
-        ("x", "4 x 4 numbers"),
+        ("x", "numbers"),
         (np.diag([1.0, 1, -1, 1]), "mirrored"),
         (np.diag([1.0, 1, 2, 1]), "not a rotation"),
         (np.eye(4) + np.eye(4, k=-3), "transposed"),

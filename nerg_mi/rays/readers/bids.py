@@ -17,6 +17,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError, sanitize
 from nerg_mi.files.safe_read import read_json, resolve_path
+from nerg_mi.maths.transforms import check_rigid_transforms
 from nerg_mi.ranges import TIME_UNITS, ValidatedDataclass
 
 from . import poses
@@ -654,8 +655,11 @@ def _add_gaze(
     world = world if isinstance(world, dict) else {}
     if world.get("FloorHeight") != 0:
         builder.add_metadata(floor="unknown")
-    if _is_matrix(world.get("EnvironmentFromWorld")):
-        builder.add_metadata(place_from_rays=world["EnvironmentFromWorld"])
+    if world.get("EnvironmentFromWorld") is not None:
+        name = f'EnvironmentFromWorld of "{first.path}"'
+        matrix = world["EnvironmentFromWorld"]
+        check_rigid_transforms(matrix, name, may_scale=True, may_mirror=True, shape=(4, 4))
+        builder.add_metadata(place_from_rays=matrix)
 
     def add(samples: _Samples, eye_distance: np.ndarray | None = None) -> None:
         builder.add(
@@ -858,10 +862,3 @@ def _find_person(dataset: _Dataset, name: BidsName, metadata: dict[str, Any]) ->
     stated = lambda text: text if text and text != "n/a" else None
     cohort = metadata.get("Cohort")
     return stated(row.get(SOURCE_NAME)) or f"sub-{label}", str(cohort) if cohort else stated(row.get(GROUP))
-
-
-def _is_matrix(value: object) -> bool:
-    """Whether a value of a JSON file is a 4 x 4 matrix of finite numbers."""
-    rows = value if isinstance(value, list) and len(value) == 4 else []
-    numbers = [v for row in rows if isinstance(row, list) and len(row) == 4 for v in row]
-    return len(numbers) == 16 and all(isinstance(v, (int, float)) and np.isfinite(v) for v in numbers)

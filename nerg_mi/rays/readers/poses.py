@@ -157,10 +157,16 @@ def rotations_from_matrices(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 def find_unusable_matrices(values: np.ndarray) -> dict[str, np.ndarray]:
     """Reasons to drop rows, with masks (N,) bool of matrices (N, 12) or (N, 16) that are not missing, but mirrored, or
     whose upper left part is not a scaled rotation."""
+    mirrored = is_mirrored(values)
+    return {MIRRORED_MATRIX: mirrored, **{why: ~mirrored & mask for why, mask in find_no_rotations(values).items()}}
+
+
+def find_no_rotations(values: np.ndarray) -> dict[str, np.ndarray]:
+    """The reason to drop rows, with the mask (N,) bool of matrices (N, 12) or (N, 16) that are not missing, and whose
+    upper left part is no rotation or reflection with a uniform scale."""
     R = values[:, :12].reshape(-1, 3, 4)[:, :, :3]
-    is_present, mirrored = ~_is_missing(values), is_mirrored(values)
-    is_rotation = rotation_errors(R, may_scale=True) <= ROTATION_TOLERANCE
-    return {MIRRORED_MATRIX: mirrored, _NO_ROTATION: is_present & ~mirrored & ~is_rotation}
+    is_rotation = rotation_errors(R, may_scale=True, may_mirror=True) <= ROTATION_TOLERANCE
+    return {_NO_ROTATION: ~_is_missing(values) & ~is_rotation}
 
 
 def check_last_rows(values: np.ndarray, name: str, lines: np.ndarray) -> None:

@@ -14,6 +14,7 @@ import numpy as np
 from nerg_mi.errors import NergError, sanitize
 from nerg_mi.files.safe_read import BadLineCallback, read_json
 from nerg_mi.formats.checkpoint import read_checkpoint
+from nerg_mi.maths.transforms import check_rigid_transforms
 from nerg_mi.photos.cameras import Intrinsics, undistort_with_mask
 from nerg_mi.photos.colmap import estimate_up, find_pose_source, read_named_poses
 from nerg_mi.ranges import LENGTHS, RATES, Range, ValidatedDataclass
@@ -179,17 +180,16 @@ class SceneCoordinates:
         provenance = read_checkpoint(path, "radiance")[1].get("provenance")
         provenance = provenance if isinstance(provenance, dict) else {}
         try:
-            to_file = np.array(provenance["to_file"], np.float64).reshape(4, 4)
+            to_file = provenance["to_file"]
             up = None if provenance.get("up") is None else np.array(provenance["up"], np.float64).reshape(3)
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise NergError(
                 f'the checkpoint "{path}" does not contain the coordinates of its training; use --scale instead of '
                 "--field if it was trained in those of its file, or train it again"
             ) from error
-        scale = float(np.cbrt(np.linalg.det(to_file[:3, :3]))) if np.isfinite(to_file).all() else 0.0
-        rotation = to_file[:3, :3].T / scale if scale > 1e-9 else np.zeros((3, 3))
-        if not np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3:
-            raise NergError(f'the coordinates in the checkpoint "{path}" are not a similarity; train it again')
+        to_file = check_rigid_transforms(to_file, f'"to_file" of the checkpoint "{path}"', may_scale=True, shape=(4, 4))
+        scale = float(np.cbrt(np.linalg.det(to_file[:3, :3])))
+        rotation = to_file[:3, :3].T / scale
         sha256 = provenance.get("sha256")
         up = up if up is not None and np.isfinite(up).all() and np.linalg.norm(up) > 0.5 else None
         return cls(

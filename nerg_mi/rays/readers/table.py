@@ -150,7 +150,7 @@ def add_tables(
     _check_units(rows.columns, options, builder)
     for path in files:
         rows.add(path, builder)
-    rows.check_angles(builder)
+    rows.check_poses(builder)
 
 
 def _check_units(columns: ColumnMap, options: TableOptions, builder: RaysBuilder) -> None:
@@ -226,6 +226,7 @@ class MappedRows:
         self.tracking = options.tracking or find_tracking(columns)
         self.texts = [c for c in (self.person, columns.cohort, *valid) if c]
         self._num_angles, self._max_angle = 0, 0.0
+        self._turns = self._moves = False  # rotations and positions of matrices
 
     def add(self, path: Path, builder: RaysBuilder) -> None:
         """Add the rows of ``path``."""
@@ -240,8 +241,16 @@ class MappedRows:
             self._add_block(path, block, first_row, builder, self.tracking if tracking == "unknown" else tracking)
             first_row += len(block.lines)
 
-    def check_angles(self, builder: RaysBuilder) -> None:
-        """Warn if all angles that were read as degrees are so small that they are probably radians."""
+    def check_poses(self, builder: RaysBuilder) -> None:
+        """Warn if matrices may be transposed, which only their positions show, and if all angles that were read as
+        degrees are so small that they are probably radians."""
+        if self._turns and not self._moves:
+            first, second, *_ = self.pose_columns
+            builder.add_warning(
+                f"the matrices {sanitize(first, 40)}, {sanitize(second, 40)}, ... turn, but all their positions are "
+                "0, 0, 0: if they are written column by column, name their columns row by row (--map matrix=); "
+                "otherwise the heads stay at the origin"
+            )
         # Heads turn around; gaze in the head's frame exceeds two degrees.
         limit = 2 * np.pi if self.columns.pose == "ypr" else np.pi / 2
         if self.options.radians or self._num_angles < _MIN_ANGLES or not 0 < self._max_angle <= limit:
@@ -302,6 +311,10 @@ class MappedRows:
             return {}
         values = vector(self.pose_columns)
         poses.check_last_rows(values, f"{path}, the matrix {columns.matrix[0]!r}, ...", block.lines)
+        rotations, positions = poses.rotations_from_matrices(values)
+        is_pose = np.isfinite(rotations).all(axis=(1, 2))
+        self._moves |= bool(positions[is_pose].any())
+        self._turns |= not np.allclose(rotations[is_pose], np.eye(3))
         return poses.find_unusable_matrices(values)
 
     def _compute_geometry(

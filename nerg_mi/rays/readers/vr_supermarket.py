@@ -83,6 +83,7 @@ class VrSupermarket(FixedFrameReader):
                         <= min_openness,
                         "the head's matrix is mirrored against those of most rows": is_mirrored
                         != (is_mirrored.mean() > 0.5),
+                        **poses.find_no_rotations(v[:, :12]),
                     },
                 )
 

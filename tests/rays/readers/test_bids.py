@@ -219,6 +219,20 @@ IN_WORLD = {"timestamp": 1000 * T, "x_coordinate": np.full(N, np.nan), "y_coordi
 SYSTEM = {"SampleCoordinateSystem": "gaze-in-world", "WorldCoordinateSystem": WORLD, "origin_x": {"Units": "m"}}
 
 
+def test_matrix_to_the_environment(dataset):
+    matrix = np.diag([0.01, 0.01, -0.01, 1.0])
+    name = "sub-a/beh/sub-a_task-look_recording-eye1"
+    save = lambda m: dataset.gaze(
+        IN_WORLD, name, **(SYSTEM | {"WorldCoordinateSystem": {**WORLD, "EnvironmentFromWorld": m}})
+    )
+    save(matrix.tolist())
+    assert read("bids", dataset.folder).metadata["place_from_rays"] == matrix.tolist()
+    for other in ((matrix + np.eye(4, k=-3)).tolist(), matrix[:3].tolist(), np.diag([1.0, 2, 1, 1]).tolist(), "x", 3):
+        save(other)
+        with pytest.raises(NergError, match="EnvironmentFromWorld"):
+            read("bids", dataset.folder)
+
+
 def test_metadata_are_inherited(dataset):
     """From the root for all, from a session for its recordings; the file's own come first."""
     dataset.gaze(IN_WORLD, "sub-a/ses-1/beh/sub-a_ses-1_task-look_recording-eye1", **SYSTEM)

@@ -444,6 +444,19 @@ def test_supermarket_frame_eyes_and_openness(tmp_path):
     assert [2 + 1, 2 + 1] in dropped(read("vr_supermarket", path))["confidence is missing or outside [0, 1]"]
 
 
+def test_supermarket_matrices_that_are_no_rotations_are_dropped(tmp_path):
+    stretch = [np.diag([1, 1, 1.3]) if k == 2 else np.eye(3) for k in range(6)]
+    rows = [
+        [*np.hstack([m, [[1.0], [1.6], [2.0]]]).ravel(), 0, 0, 1, 0, 0, 0, "", "", "", 1, 1, 0.02 * k]
+        for k, m in enumerate(stretch)
+    ]
+    path = tmp_path / "gaze_user7_x.csv"
+    path.write_text(csv(SUPERMARKET, rows))
+    assert [("not a scaled rotation" in r, lines) for r, lines in dropped(read("vr_supermarket", path)).items()] == [
+        (True, [[4, 4]])
+    ]
+
+
 def test_supermarket_mirrored_rows_and_fill_values(tmp_path):
     rows = []
     for k in range(6):

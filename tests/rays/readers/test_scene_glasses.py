@@ -122,10 +122,11 @@ def test_scene_coordinates_follow_the_training(tmp_path):
     "provenance, message",
     [
         ({}, "does not contain the coordinates"),
-        ({"to_file": [1, 2]}, "does not contain the coordinates"),
-        ({"to_file": np.diag([1.0, 2, 1, 1]).tolist()}, "not a similarity"),
-        ({"to_file": np.diag([1.0, -1, 1, 1]).tolist()}, "not a similarity"),
-        ({"to_file": np.zeros((4, 4)).tolist()}, "not a similarity"),
+        ({"to_file": [1, 2]}, "to_file.*shape"),
+        ({"to_file": np.diag([1.0, 2, 1, 1]).tolist()}, "to_file.*not a rotation"),
+        ({"to_file": np.diag([1.0, -1, 1, 1]).tolist()}, "to_file.*mirrored"),
+        ({"to_file": (np.eye(4) + np.eye(4, k=-3)).tolist()}, "to_file.*transposed"),
+        ({"to_file": np.zeros((4, 4)).tolist()}, "to_file.*last row"),
     ],
 )
 def test_checkpoints_without_coordinates_are_refused(tmp_path, provenance, message):

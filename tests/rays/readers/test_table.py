@@ -280,6 +280,20 @@ def test_matrices_and_quaternions_that_are_no_rotations_are_dropped_by_name(tmp_
     assert [(rows, "quaternion" in reason) for reason, rows in dropped(rays).items()] == [([[5, 5]], True)]
 
 
+def test_matrices_of_twelve_values_in_another_order(tmp_path, heads):
+    m, _ = write_matrices(tmp_path / "m.csv", heads)
+    names = ",".join(FULL_MATRIX.split(",")[:12])
+    save = lambda m: write(tmp_path / "m.csv", names, m.reshape(-1, 12))
+    has_doubt = lambda rays: any("m0, m1" in text for text in rays.metadata.get("complaints", []))
+    assert not has_doubt(read_table(save(m[:, :3]), f"matrix={names}"))
+    # The position of a transposed matrix is in the row that is missing.
+    assert has_doubt(read_table(save(np.swapaxes(m, 1, 2)[:, :3]), f"matrix={names}"))
+    for other in (np.swapaxes(m[:, :3], 1, 2), np.hstack([m[:, :3, :3].reshape(-1, 9), m[:, :3, 3]])):
+        with pytest.raises(NergError, match="none of 20 rows"):
+            read_table(save(other), f"matrix={names}")
+    assert not has_doubt(read_table(save(np.tile(np.eye(4)[:3], (20, 1, 1))), f"matrix={names}"))
+
+
 def test_vectors_in_one_cell(tmp_path, heads):
     origin, turn = heads
     vector = lambda v: '"(' + ", ".join(map(repr, map(float, v))) + ')"'
