@@ -25,6 +25,7 @@ from nerg_mi.evaluation.baselines import (
 from nerg_mi.maths import vmf
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.probes.probes import compute_participant_weights
+from nerg_mi.rays.folds import iter_folds
 from nerg_mi.rays.rays import Rays
 from tests.reference.kde import kde as reference
 
@@ -120,7 +121,21 @@ def test_tuned_settings_have_the_highest_density_of_held_out_rays():
 def test_without_hit_points_there_are_no_re_aimed_hits():
     rays = replace(room(participants=3, count=900), hit=None)
     assert REAIMED_HITS not in make_tuned_baselines(rays, 0.5)
-    assert REAIMED_HITS not in make_tuned_baselines(rays, 0.5, np.full((900, 3), np.nan))
+
+
+def test_folds_and_their_samples_follow_the_seed(monkeypatch):
+    rays, draw, samples = replace(room(participants=3, count=900), hit=None), baselines.sample_participants_equally, []
+
+    def record(held_out: Rays, count: int, seed: int) -> Rays:
+        samples.append((held_out.t, seed))
+        return draw(held_out, count, seed)
+
+    monkeypatch.setattr(baselines, "sample_participants_equally", record)
+    assert REAIMED_HITS not in make_tuned_baselines(rays, 0.5, np.full((900, 3), np.nan), prior_kappa=10.0, seed=5)
+    folds, others = ([fold.held_out.t for fold in iter_folds(rays, 0.5, 4, seed)] for seed in (5, 0))
+    assert len(samples) == len(folds) and not all(map(np.array_equal, folds, others))
+    assert all(np.array_equal(t, fold) for (t, _), fold in zip(samples, folds))
+    assert [seed for _, seed in samples] == [5 + k for k in range(len(folds))]
 
 
 def test_of_too_few_rays_nothing_is_tuned_and_that_is_stated():

@@ -16,6 +16,7 @@ from nerg_mi.viewer.flights import (
     FlightVideo,
     format_frames,
     interpolate_views,
+    make_camera_path,
     make_even,
     make_video_options,
     prepare_flight,
@@ -152,6 +153,16 @@ def test08_frames_file_round_trip(tmp_path):
     assert len(frames) == 5 and list(frames[0]) == ["view_camera", "view_target"]
     origin, target = (np.array([float(v) for v in frames[-1][name].split(",")]) for name in frames[-1])
     assert np.allclose((target - origin) / np.linalg.norm(target - origin), view(1).forward, atol=1e-8)
+
+
+def test11_camera_path_has_the_rays_of_the_views():
+    one = PinholeView.look_at((1, 2, 3), (4, 3, 1), (0, 0, 1), 0.8, 1.5)
+    path = make_camera_path([view(0), one], 30, 24)
+    assert (path.width, path.height, path.fps) == (30, 20, 24)
+    assert np.allclose(path.to_world[1, :3, 3], one.origin) and np.allclose(path.fov, np.degrees([0.9, 0.8]))
+    # OpenGL cameras look along -z, with x to the right and y up.
+    right = np.cross(one.forward, one.up)
+    assert np.allclose(path.to_world[1, :3, :3], np.stack([right, one.up, -one.forward], axis=1))
 
 
 @pytest.mark.parametrize("views, seconds, fps", [([], 1, 25), ([view(0)], 1, 25), ([view(0), view(1)], 1e6, 120)])

@@ -370,6 +370,23 @@ def test17_alignment_is_applied():
     assert np.allclose(ada.position, [10, 16, 3.2], atol=1e-6) and np.allclose(ada.direction, [-1, 0, 0], atol=1e-6)
 
 
+def test25_probes_and_sampled_rays_are_aligned():
+    matrix = np.diag([2.0, 2.0, 2.0, 1.0])
+    matrix[:3, 3] = 10, 0, 0
+    count = 100
+    at = np.tile([1.0, 2.0, 1.6], (count, 1))
+    person = np.arange(count) % 2
+    rays = Rays(
+        np.arange(count) * 0.1, person, ("Ada", "Ben"), at, np.tile([0.0, 1.0, 0.0], (count, 1)), np.ones(count)
+    )
+    tracks = Tracks(rays, Similarity(matrix))
+    positions, counts = tracks.place_probes()
+    assert np.allclose(positions, [12, 4, 3.2], atol=1e-6) and (counts > 0).all()
+    origins, directions, person = tracks.sample(max_rays=10)
+    assert np.allclose(origins, [12, 4, 3.2], atol=1e-6) and np.allclose(directions, [0, 1, 0], atol=1e-6)
+    assert person.tolist() == [0] * 5 + [1] * 5
+
+
 # ---- Render thread ----
 
 
