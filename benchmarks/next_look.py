@@ -83,8 +83,8 @@ def run_looks(args) -> None:
 
 def train(folder: Path, rays: Path, where: dict, seed: int, threads: int | None) -> Path:
     """Train the field of a fold. One that an earlier run trained is used again."""
+    from nerg_mi.progress import TerminalReporter
     from nerg_mi.workflows.gaze_commands import GazeOptions
-    from nerg_mi.workflows.progress import TerminalReporter
     from nerg_mi.workflows.train_gaze import train_gaze
 
     gaze = folder / f"{rays.stem}-{where.get('geometry', 'surfaces')}-{seed}.safetensors"
@@ -97,9 +97,9 @@ def train(folder: Path, rays: Path, where: dict, seed: int, threads: int | None)
 
 def evaluate(name: str, folder: Path, rays: Path, where: dict, seed: int, threads: int | None) -> list[dict]:
     """Bits of each method and elapsed time in a fold."""
+    from nerg_mi.progress import TerminalReporter
     from nerg_mi.workflows.gaze_commands import NextLookOptions
     from nerg_mi.workflows.next_look import evaluate_next_look
-    from nerg_mi.workflows.progress import TerminalReporter
 
     gaze = train(folder, rays, where, seed, threads)
     files = {key: value for key, value in where.items() if key in ("scene", "field")}

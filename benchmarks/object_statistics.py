@@ -99,8 +99,8 @@ def errors() -> None:
     from nerg_mi.measures.shares import SamplePoints
     from nerg_mi.measures.tables import Participants
     from nerg_mi.measures.visits import ALL, assign_hits
+    from nerg_mi.progress import SILENT
     from nerg_mi.scenes.store import twin
-    from nerg_mi.workflows.base import SILENT
 
     around, areas, shapes = made_store()
     walks = Walks(12, seed=5)

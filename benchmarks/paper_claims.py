@@ -30,10 +30,10 @@ ORDER = ("emit", "capture", "loss code")
 
 
 def main(argv=None) -> None:
+    from nerg_mi.progress import TerminalReporter
     from nerg_mi.workflows.ablation import ablate
     from nerg_mi.workflows.base import select_backend
     from nerg_mi.workflows.gaze_commands import AblationOptions
-    from nerg_mi.workflows.progress import TerminalReporter
 
     parser = place_parser(__doc__, "paper_claims", folds=4, only="supermarket,store")
     parser.add_argument(

@@ -214,10 +214,10 @@ def main(argv=None) -> None:
 
 def evaluate(name: str, make: Make, args: argparse.Namespace):
     """The results of `nerg eval folds` for a scene."""
+    from nerg_mi.progress import TerminalReporter
     from nerg_mi.workflows.base import select_backend
     from nerg_mi.workflows.evaluate import evaluate_folds
     from nerg_mi.workflows.gaze_commands import FoldOptions
-    from nerg_mi.workflows.progress import TerminalReporter
 
     select_backend("llvm_ad_rgb", args.threads)
     folder, rays, where = write_place(name, make, args)

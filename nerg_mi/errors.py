@@ -55,13 +55,6 @@ class NergError(ValueError):
     kind : str
         What is wrong, for programs: "mirrored", "unit", ...
 
-    Attributes
-    ----------
-    message : str
-        The sentence before its parameters are spelled; ``str(error)`` spells them as in Python.
-    parameters : dict of str to str
-        Parameters that the sentence mentions, and their values ("" without one).
-
     >>> import nerg_mi as nerg
     >>> try:
     ...     nerg.load_field("nowhere.safetensors")
@@ -76,10 +69,12 @@ class NergError(ValueError):
 
     @property
     def message(self) -> str:
+        """The sentence before its parameters are spelled; ``str(error)`` spells them as in Python."""
         return str(self.args[0])
 
     @property
     def parameters(self) -> dict[str, str]:
+        """Parameters that the sentence mentions, and their values; "" without one."""
         return dict(_MENTION.findall(self.message))
 
     def __str__(self) -> str:

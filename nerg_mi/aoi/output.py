@@ -17,8 +17,8 @@ from nerg_mi.files.dataframes import ResultTables
 from nerg_mi.files.tables import format_markdown_table, write_csv
 from nerg_mi.measures.tables import MEASURES, MEASURES_BY_NAME, PREDICTED, ParticipantRows, Row, format_measure
 from nerg_mi.measures.visits import VisitSums
+from nerg_mi.progress import Reporter
 from nerg_mi.rays.rays import import_pyarrow
-from nerg_mi.workflows.base import Reporter
 
 from .options import StatisticsOptions
 

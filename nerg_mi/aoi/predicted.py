@@ -36,7 +36,7 @@ from nerg_mi.measures.tables import (
     explain_difference,
 )
 from nerg_mi.measures.visits import ALL, Aoi, Cell
-from nerg_mi.workflows.base import SILENT, Reporter
+from nerg_mi.progress import SILENT, Reporter
 
 from .measured import AoiContext, TimeWindow, Viewpoints
 from .options import AoiOptions, CountOptions, PredictionOptions, parse_window

@@ -10,15 +10,14 @@ from dataclasses import Field, fields
 from typing import Any, TypeAlias
 
 from nerg_mi.errors import NergError
+from nerg_mi.progress import SILENT, NotebookReporter, Reporter, TerminalReporter, WarningReporter, is_notebook
 from nerg_mi.ranges import FLAG
-from nerg_mi.workflows.base import SILENT, Reporter
-from nerg_mi.workflows.progress import NotebookReporter, TerminalReporter, WarningReporter, is_notebook
 
 from .session import name_objects
 
 Progress: TypeAlias = "bool | Reporter | None"
 """Progress of a call: None shows a bar in notebooks, True shows one anywhere, False shows none. Warnings about the
-result become Python warnings where there is no bar. A `nerg_mi.workflows.base.Reporter` receives everything."""
+result become Python warnings where there is no bar. A `nerg_mi.progress.Reporter` receives everything."""
 
 
 @contextmanager

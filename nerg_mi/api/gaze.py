@@ -20,9 +20,9 @@ from nerg_mi.formats.fields import matches_checksum
 from nerg_mi.maths import vmf
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.progress import Reporter
 from nerg_mi.ranges import DIRECTIONS, Range, check_number
 from nerg_mi.rays.rays import Rays, sample_rows
-from nerg_mi.workflows.base import Reporter
 from nerg_mi.workflows.scene_places import PLACES, detect_kind
 
 from .arrays import Floats, as_points, as_rays

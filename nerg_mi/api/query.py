@@ -18,8 +18,8 @@ from nerg_mi.maths.arrays import to_vector
 from nerg_mi.maths.types import variant_types
 from nerg_mi.measures.shares import Shares, SummationRule, gaze_shares
 from nerg_mi.measures.visits import MARGIN, Aoi, BoxAoi
+from nerg_mi.progress import SILENT, Reporter
 from nerg_mi.ranges import MAX_COORDINATE, Range, check_number
-from nerg_mi.workflows.base import SILENT, Reporter
 
 from . import arrays
 from .arrays import Floats, LabelledArrays, broadcast_to_observers

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 
 import typer
 
+from nerg_mi.progress import Reporter
 from nerg_mi.ranges import SECONDS, Range, ValidatedDataclass
-from nerg_mi.workflows.base import Reporter, argument, command
+from nerg_mi.workflows.base import argument, command
 from nerg_mi.workflows.options import INPUT, PERFORMANCE, option
 
 

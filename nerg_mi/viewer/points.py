@@ -16,8 +16,8 @@ from nerg_mi.api.arrays import Camera
 from nerg_mi.api.query import observe, trace
 from nerg_mi.api.scene import Scene
 from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.progress import SILENT
 from nerg_mi.transport.geometry import Ceiling
-from nerg_mi.workflows.base import SILENT
 
 # ---- Views ----
 

@@ -16,7 +16,7 @@ from nerg_mi.api.calls import Progress, report_progress
 from nerg_mi.api.gaze import list_inputs
 from nerg_mi.api.objects import as_file, build_options
 from nerg_mi.files.html import element
-from nerg_mi.workflows.base import SILENT, Reporter
+from nerg_mi.progress import SILENT, Reporter
 from nerg_mi.workflows.scene_commands import ViewOptions
 from nerg_mi.workflows.view import make_viewer_scene
 

@@ -22,13 +22,13 @@ from nerg_mi.maths.geometry import Similarity
 from nerg_mi.measures.shares import SummationRule
 from nerg_mi.measures.visits import MARGIN, Aoi, BoxAoi
 from nerg_mi.probes.probes import place_probes
+from nerg_mi.progress import SILENT
 from nerg_mi.ranges import MAX_COORDINATE
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.nested_scene import FIELD_PROPERTY, find_field_file, replace_radiance_field
 from nerg_mi.rendering.scene import load_scene
 from nerg_mi.transport.extrapolation import describe_extrapolation
 from nerg_mi.transport.geometry import Ceiling
-from nerg_mi.workflows.base import SILENT
 from nerg_mi.workflows.render import describe_basis
 from nerg_mi.workflows.scene_cameras import check_point
 from nerg_mi.workflows.scene_commands import ViewOptions

@@ -22,9 +22,9 @@ from nerg_mi.figures.training import HELD_OUT_COLOR, TRAINING_COLOR
 from nerg_mi.photos.cameras import Intrinsics, PosedCamera
 from nerg_mi.photos.dataset import Dataset
 from nerg_mi.photos.images import PhotoView
+from nerg_mi.progress import SILENT, Reporter
 from nerg_mi.train.radiance_monitor import PICTURE_STRIDE
 from nerg_mi.train.radiance_trainer import RadianceTrainer
-from nerg_mi.workflows.base import SILENT, Reporter
 
 from .layers import grey_out
 from .points import PinholeView

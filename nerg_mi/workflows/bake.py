@@ -23,6 +23,7 @@ from nerg_mi.formats.gltf import Attribute, encode_unlit_glb
 from nerg_mi.formats.ply import write_columns
 from nerg_mi.formats.splats import is_splat_file
 from nerg_mi.maths.color import decode_srgb
+from nerg_mi.progress import SILENT, Reporter
 from nerg_mi.rays.rays import Rays
 from nerg_mi.surfaces.laplacian import Smoother, SurfaceSums, merge_sums
 from nerg_mi.surfaces.mesh import Mesh, RefinedMesh, import_xatlas, iter_texture_rows, unwrap_uv
@@ -42,7 +43,7 @@ from .bake_chunks import (
     refine_target,
     select_source,
 )
-from .base import SILENT, Reporter, select_backend
+from .base import select_backend
 from .scene_commands import BakeOptions
 
 # ---- Output files: meshes with colours (.ply, .glb), a table of faces (.csv), and a summary (.json) ----

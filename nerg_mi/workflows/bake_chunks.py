@@ -25,6 +25,7 @@ from nerg_mi.formats.surfaces import extract_mesh as mesh_of_field
 from nerg_mi.interruption import Interruption
 from nerg_mi.maths.coordinates import check_coordinates
 from nerg_mi.maths.geometry import Similarity
+from nerg_mi.progress import Reporter
 from nerg_mi.ranges import POSITIVE_VALUES
 from nerg_mi.rays.dataset import load_rays
 from nerg_mi.rays.rays import Rays
@@ -58,7 +59,7 @@ from nerg_mi.transport.observer import ObserverSettings
 from nerg_mi.transport.observer_gaze import GazeFieldInstance
 from nerg_mi.transport.splat_medium import SplatArrays, SplatMedium
 
-from .base import Reporter, select_backend
+from .base import select_backend
 from .geometry import read_training_alignment
 from .parts import PartRunner, PlannedScene
 from .scene_commands import BakeOptions

@@ -19,6 +19,7 @@ from nerg_mi.files.tables import write_json
 from nerg_mi.formats.splats import read_splats, write_ply_splats
 from nerg_mi.maths.color import decode_srgb
 from nerg_mi.maths.sphere import SH_C0
+from nerg_mi.progress import SILENT, Reporter
 from nerg_mi.ranges import FLAG
 from nerg_mi.rays.rays import Rays
 from nerg_mi.surfaces.laplacian import SurfaceSums, merge_sums
@@ -38,7 +39,7 @@ from .bake_chunks import (
     make_splat_geometry,
     select_source,
 )
-from .base import SILENT, Reporter, select_backend
+from .base import select_backend
 from .scene_commands import BakeOptions
 
 COLUMN = "attention"

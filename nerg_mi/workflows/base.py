@@ -1,4 +1,4 @@
-"""Basics of all workflows: backend selection, command declarations, progress reporters, and library versions."""
+"""Basics of all workflows: backend selection, command declarations, and library versions."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Any, TypeVar
 
 from nerg_mi import __version__, llvm
 from nerg_mi.threads import set_thread_count
@@ -169,47 +169,6 @@ def import_function(function: str) -> Callable[..., Any]:
     """Import and return the function "MODULE:NAME"."""
     module, _, name = function.partition(":")
     return getattr(importlib.import_module(module), name)
-
-
-# ---- Reporters: a terminal, a notebook, or none ----
-
-
-@runtime_checkable
-class Reporter(Protocol):
-    """Receives messages and progress of a workflow.
-
-    Methods return immediately and do not raise, except that `progress` may raise `KeyboardInterrupt` to stop the
-    workflow like Ctrl-C.
-    """
-
-    def message(self, text: str) -> None:
-        """Report a result or a written file, in one line."""
-
-    def warn(self, text: str) -> None:
-        """Report a possible problem with the result, in one line."""
-
-    def progress(self, fraction: float, text: str = "") -> None:
-        """Report the completed fraction of the work, from 0 to 1, and the current step.
-
-        A phase whose duration does not depend on the one before, such as scoring after training, begins at 0 again.
-        """
-
-
-class SilentReporter:
-    """A reporter that ignores everything."""
-
-    def message(self, text: str) -> None:
-        pass
-
-    def warn(self, text: str) -> None:
-        pass
-
-    def progress(self, fraction: float, text: str = "") -> None:
-        pass
-
-
-SILENT = SilentReporter()
-"""The default reporter."""
 
 
 # ---- Versions of libraries, for reports ----

@@ -19,10 +19,11 @@ from nerg_mi.formats.checkpoint import read_checkpoint, write_checkpoint
 from nerg_mi.formats.fields import encode_occupancy, encode_voxels, load_radiance
 from nerg_mi.maths.arrays import to_vector
 from nerg_mi.maths.types import variant_types
+from nerg_mi.progress import SILENT, Reporter
 from nerg_mi.transport.field_medium import FieldMedium, make_color_shader
 from nerg_mi.transport.geometry import SceneGeometry, default_march_settings
 
-from .base import SILENT, Reporter, select_backend
+from .base import select_backend
 from .radiance_commands import CompileOptions
 
 _FIRST_RESOLUTION = 256

@@ -27,6 +27,7 @@ from nerg_mi.files.atomic import check_folder, file_sha256, write_bytes
 from nerg_mi.files.images import write_bitmap_exr
 from nerg_mi.files.tables import write_csv, write_json
 from nerg_mi.interruption import Interruption
+from nerg_mi.progress import SILENT, Reporter, SilentReporter
 from nerg_mi.rendering.bands import Channels, render_channels
 from nerg_mi.rendering.scene import activate_variant, load_scene
 from nerg_mi.rendering.scene_writer import project_to_pixel
@@ -34,7 +35,7 @@ from nerg_mi.transport.geometry import pixel_solid_angles
 from nerg_mi.transport.observer import sensor_center
 
 from .bake import bake
-from .base import SILENT, Reporter, SilentReporter, versions
+from .base import versions
 from .render import describe_bases, describe_basis, describe_smoothing, smooth_gaze
 from .report import RESULTS, make_report
 from .scene_commands import BakeOptions, DemoOptions, ReportOptions

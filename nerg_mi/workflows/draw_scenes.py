@@ -21,6 +21,7 @@ from nerg_mi.figures.sphere import find_projection, sphere_figure
 from nerg_mi.files.values import find_names
 from nerg_mi.interruption import Interruption
 from nerg_mi.maths.types import variant_types
+from nerg_mi.progress import Reporter
 from nerg_mi.rays.dataset import load_rays
 from nerg_mi.rays.events import average_fixations, label_fixations
 from nerg_mi.rays.filters import find_sessions
@@ -30,7 +31,6 @@ from nerg_mi.rendering.scene import activate_variant, load_scene
 from nerg_mi.rendering.scene_writer import project_to_pixel
 from nerg_mi.transport.geometry import SceneGeometry, pixel_solid_angles, trace_depth
 
-from .base import Reporter
 from .rays_events import warn_slow_sampling
 from .render import render_layers
 from .scene_commands import FloorOptions, ScanpathOptions, SceneFigureOptions, SphereOptions, TriptychOptions

@@ -38,6 +38,7 @@ from nerg_mi.files.safe_read import read_json
 from nerg_mi.files.tables import write_csv, write_json
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.probes.probes import REGION_LEVELS, format_level
+from nerg_mi.progress import SILENT, Reporter
 from nerg_mi.rays.dataset import hash_rays, is_dataset, load_rays
 from nerg_mi.rays.rays import Rays
 from nerg_mi.tasks.task import FOLDER_SUFFIX, RENDER_LIBRARIES, Part, Plan
@@ -45,7 +46,7 @@ from nerg_mi.threads import set_thread_count
 from nerg_mi.train.gaze_data import find_hit_points
 from nerg_mi.train.geometry import TrainingGeometry
 
-from .base import SILENT, Reporter, select_backend
+from .base import select_backend
 from .gaze_commands import FoldOptions, GazeEvaluationOptions, GazeOptions
 from .geometry import check_geometry, geometry_kind, load_training_geometry
 from .options import exposed_options, shared_options

@@ -32,8 +32,9 @@ from nerg_mi.formats.torch_ngp import (
     read_torch_ngp,
     write_torch_ngp,
 )
+from nerg_mi.progress import SILENT, Reporter
 
-from .base import SILENT, Reporter, argument, out, select_backend
+from .base import argument, out, select_backend
 from .radiance_commands import (
     CheckpointImportOptions,
     MeshOptions,

@@ -29,6 +29,7 @@ from nerg_mi.formats.meshes import read_mesh_file
 from nerg_mi.formats.splats import is_splat_file, read_splats
 from nerg_mi.formats.surfaces import extract_points
 from nerg_mi.maths.color import decode_srgb
+from nerg_mi.progress import SILENT, Reporter
 from nerg_mi.rays.dataset import load_rays
 from nerg_mi.rays.events import average_fixations, label_fixations
 from nerg_mi.rays.rays import TRACKING, Rays
@@ -40,7 +41,7 @@ from nerg_mi.transport.geometry import pixel_directions
 from nerg_mi.transport.mitsuba_mesh import read_attribute, read_triangles
 from nerg_mi.transport.observer import sensor_center
 
-from .base import SILENT, Reporter, select_backend
+from .base import select_backend
 from .draw import read_baked
 from .draw_scenes import copy_sampler, make_film, upright_pose
 from .radiance_commands import SceneExportOptions

@@ -14,11 +14,11 @@ from nerg_mi.errors import NergError
 from nerg_mi.formats.fields import matches_checksum
 from nerg_mi.maths.geometry import AnyBox, Similarity
 from nerg_mi.photos.salience import SalienceView
+from nerg_mi.progress import SILENT, Reporter
 from nerg_mi.rays.rays import Rays
 from nerg_mi.train import geometry
 from nerg_mi.train.geometry import TrainingGeometry
 
-from .base import SILENT, Reporter
 from .gaze_commands import GazeEvaluationOptions
 from .options import GeometryOptions
 

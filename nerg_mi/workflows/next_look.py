@@ -34,13 +34,14 @@ from nerg_mi.files.tables import write_csv, write_json
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.probes.probes import compute_participant_weights
+from nerg_mi.progress import SILENT, Reporter
 from nerg_mi.rays.filters import split_by_person
 from nerg_mi.rays.rays import Rays
 from nerg_mi.train.gaze_data import SURFACE_OPACITY, select_prior_kappa
 from nerg_mi.train.geometry import TrainingGeometry
 from nerg_mi.transport.geometry import trace_depth
 
-from .base import SILENT, Reporter, select_backend
+from .base import select_backend
 from .evaluate import load_training_rays
 from .gaze_commands import GazeEvaluationOptions, NextLookOptions
 from .geometry import load_training_geometry

@@ -26,8 +26,8 @@ from nerg_mi.photos.structure import (
     reconstruct,
 )
 from nerg_mi.photos.video_frames import copy_frames
+from nerg_mi.progress import SILENT, Reporter
 
-from .base import SILENT, Reporter
 from .radiance_commands import PoseOptions
 
 # ---- Pose estimation ----

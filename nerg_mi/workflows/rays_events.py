@@ -14,6 +14,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.files.atomic import check_writable
 from nerg_mi.files.tables import unescape_formula, write_csv
 from nerg_mi.files.values import find_names
+from nerg_mi.progress import SILENT, Reporter
 from nerg_mi.rays.dataset import load_rays
 from nerg_mi.rays.events import Events, detect_events
 from nerg_mi.rays.filters import estimate_interval
@@ -21,7 +22,6 @@ from nerg_mi.rays.quality import GazeTarget, RecordingQuality, measure_recording
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rays.readers.columns import open_named_table
 
-from .base import SILENT, Reporter
 from .options import EventOptions
 from .rays_commands import RaysEventsOptions
 

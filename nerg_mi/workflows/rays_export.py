@@ -18,13 +18,14 @@ from nerg_mi.errors import NergError
 from nerg_mi.files.atomic import check_new_folder
 from nerg_mi.formats.areas import read_areas
 from nerg_mi.measures.visits import Visits
+from nerg_mi.progress import SILENT, Reporter
 from nerg_mi.rays.bids import BidsEvents, write_bids
 from nerg_mi.rays.dataset import load_rays
 from nerg_mi.rays.event_settings import KINDS
 from nerg_mi.rays.events import Events, detect_events
 from nerg_mi.rays.rays import Rays
 
-from .base import SILENT, Reporter, select_backend
+from .base import select_backend
 from .rays_commands import RaysExportOptions
 from .rays_events import warn_slow_sampling
 

@@ -30,6 +30,7 @@ from nerg_mi.maths.geometry import AnyBox
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.measures.shares import COARSE, gaze_shares
 from nerg_mi.measures.visits import MARGIN, BoxAoi
+from nerg_mi.progress import SILENT, Reporter, SilentReporter
 from nerg_mi.rays.dataset import hash_rays, is_dataset, load_rays
 from nerg_mi.rays.quality import summarise
 from nerg_mi.rays.rays import Rays
@@ -60,7 +61,7 @@ from nerg_mi.train.geometry import TrainingGeometry
 from nerg_mi.transport.geometry import SceneGeometry
 from nerg_mi.transport.observer import sensor_center
 
-from .base import SILENT, Reporter, SilentReporter, select_backend, versions
+from .base import select_backend, versions
 from .evaluate import default_output, evaluate_gaze
 from .gaze_commands import GazeEvaluationOptions
 from .render import describe_basis, describe_smoothing, is_supported, smooth_gaze

@@ -15,6 +15,7 @@ from nerg_mi.figures.overview import PinholeFrame, SeenSurfaces
 from nerg_mi.files.atomic import check_writable, write_text
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.maths.geometry import Similarity
+from nerg_mi.progress import SILENT, Reporter
 from nerg_mi.rays.dataset import Conditions, RayDataset, is_dataset, load_rays
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.files import write_frames
@@ -31,7 +32,7 @@ from nerg_mi.rendering.scene_writer import (
 )
 from nerg_mi.train.geometry import make_hit_geometry
 
-from .base import SILENT, Reporter, select_backend
+from .base import select_backend
 from .render import warn_observer
 from .scene_cameras import (
     ObserverPath,

@@ -20,6 +20,7 @@ from nerg_mi.maths.transforms import invert_similarity
 from nerg_mi.photos.colmap import find_pose_source
 from nerg_mi.photos.images import read_photo, read_posed_images
 from nerg_mi.photos.posed import PosedFrame, PosedImages
+from nerg_mi.progress import Reporter
 from nerg_mi.rays.dataset import is_dataset, load_rays
 from nerg_mi.rendering.files import check_vol, write_mesh
 from nerg_mi.rendering.nested_scene import GAZE_PROPERTIES, nest_scene
@@ -37,7 +38,6 @@ from nerg_mi.rendering.scene_writer import (
 from nerg_mi.train.geometry import DEFAULT_DEPTH, shade_hits
 from nerg_mi.transport.geometry import HEADLIGHT
 
-from .base import Reporter
 from .geometry import find_training_file, geometry_key, read_training_alignment
 
 # ---- Input files, recognised by their content ----

@@ -54,10 +54,11 @@ from nerg_mi.measures.tables import (
     transition_rows,
 )
 from nerg_mi.measures.visits import ALL, Cell, Total, VisitSums
+from nerg_mi.progress import SILENT, Reporter
 from nerg_mi.rays.pseudonyms import make_pseudonyms, read_salt
 from nerg_mi.rays.rays import TRACKING, Rays
 
-from .base import SILENT, Reporter, select_backend
+from .base import select_backend
 from .options import parse_point
 from .parts import PartRunner
 from .scene_places import detect_kind

@@ -20,11 +20,12 @@ from nerg_mi.files.atomic import check_folder
 from nerg_mi.files.dataframes import ResultTables
 from nerg_mi.files.safe_read import read_json
 from nerg_mi.files.tables import write_json
+from nerg_mi.progress import SILENT, Reporter
 from nerg_mi.rendering.scene import activate_variant, list_scene_files
 from nerg_mi.tasks.execution import prepare_once
 from nerg_mi.tasks.task import Part, Plan, read_processor_name
 
-from .base import SILENT, Reporter, select_backend, versions
+from .base import select_backend, versions
 from .parts import PartRunner, PlannedScene
 from .scene_commands import StudyOptions
 

@@ -20,13 +20,13 @@ from nerg_mi.interruption import TrainingInterrupted
 from nerg_mi.photos.dataset import Dataset, open_dataset
 from nerg_mi.photos.images import pick_evenly
 from nerg_mi.photos.posed import describe_unused
+from nerg_mi.progress import SILENT, Reporter, duration
 from nerg_mi.train import radiance_run
 from nerg_mi.train.radiance_monitor import GuardedObserver, TrainingObserver, get_curves_figure
 from nerg_mi.train.radiance_settings import RadianceSettings, make_radiance_config
 
-from .base import SILENT, Reporter, import_function, select_backend
+from .base import import_function, select_backend
 from .options import explicit_settings
-from .progress import duration
 from .radiance_commands import RadianceOptions, RadianceScoreOptions
 
 # ---- Training and evaluation of radiance fields ----

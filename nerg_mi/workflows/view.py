@@ -15,13 +15,14 @@ from nerg_mi.files.atomic import write_text
 from nerg_mi.formats.checkpoint import read_metadata
 from nerg_mi.formats.splats import READERS, is_splat_file
 from nerg_mi.maths.geometry import Similarity
+from nerg_mi.progress import SILENT, Reporter
 from nerg_mi.rays.dataset import is_dataset, load_rays
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.bands import is_nerg
 from nerg_mi.rendering.nested_scene import GAZE_PROPERTIES, GAZE_PROPERTY, find_field_file, replace_gaze
 from nerg_mi.rendering.scene import load_scene
 
-from .base import SILENT, Reporter, select_backend
+from .base import select_backend
 from .geometry import read_training_alignment
 from .scene import write_scene
 from .scene_cameras import check_point

@@ -33,8 +33,8 @@ from nerg_mi.formats.areas import AreaSet, MeshPart, Region, read_areas
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.measures.tables import MIN_VIEWPOINTS, MinParticipantsFilter
 from nerg_mi.measures.visits import ALL, BoxAoi, Cell
+from nerg_mi.progress import SILENT
 from nerg_mi.transport.geometry import SceneGeometry
-from nerg_mi.workflows.base import SILENT
 from tests.workflows.recorder import Recorder
 
 from .place import write_place

@@ -20,8 +20,8 @@ from nerg_mi.api.calls import report_progress
 from nerg_mi.api.objects import as_file, build_options
 from nerg_mi.api.session import session_folder
 from nerg_mi.fields.splats import Splats
+from nerg_mi.progress import SilentReporter
 from nerg_mi.rendering.scene import list_scene_files, load_scene
-from nerg_mi.workflows.base import SilentReporter
 from nerg_mi.workflows.gaze_commands import FoldOptions, GazeOptions
 from nerg_mi.workflows.rays_commands import AlignOptions
 from nerg_mi.workflows.view import make_viewer_scene

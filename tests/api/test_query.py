@@ -12,10 +12,10 @@ from nerg_mi.api.query import SceneObserver, compute_box_shares
 from nerg_mi.formats.areas import Region
 from nerg_mi.measures.shares import COARSE, gaze_shares
 from nerg_mi.measures.visits import MARGIN, BoxAoi
+from nerg_mi.progress import WarningReporter
 from nerg_mi.reports.data import GazeSampler
 from nerg_mi.train.geometry import TrainingGeometry
 from nerg_mi.transport.mitsuba_mesh import make_mesh
-from nerg_mi.workflows.progress import WarningReporter
 from nerg_mi.workflows.statistics import statistics
 from tests.aoi.place import SIGN, STAND, write_place
 from tests.pictures import box_dict

@@ -11,12 +11,12 @@ from pathlib import Path
 
 import pytest
 
+from nerg_mi import progress
 from nerg_mi.cli import main
 from nerg_mi.cli.ending import INTERNAL_ERROR, INTERRUPTED, USER_ERROR, CtrlC, exit_code, open_streams, shorten_values
 from nerg_mi.errors import NergError
 from nerg_mi.formats.checkpoint import read_checkpoint
-from nerg_mi.workflows import progress
-from nerg_mi.workflows.progress import TerminalReporter
+from nerg_mi.progress import TerminalReporter
 from tools.faults import is_partial, read_whole
 
 

@@ -12,9 +12,9 @@ import pytest
 from nerg_mi import cli
 from nerg_mi.errors import MissingFile, NergError, clean_text
 from nerg_mi.figures.style import encode
+from nerg_mi.progress import LOG_INTERVAL, TerminalReporter, WarningReporter
 from nerg_mi.rays.quality import format_quality_report, summarise
 from nerg_mi.rays.rays import Rays
-from nerg_mi.workflows.progress import LOG_INTERVAL, TerminalReporter, WarningReporter
 
 NAME = "Zo\u00eb\x1b[2J\x1b]0;title\x07\u202egnp\x9b31m"
 BAD = "\x1b\x07\u202e\x9b"

@@ -18,6 +18,7 @@ import nerg_mi.workflows
 from nerg_mi.aoi.options import CountOptions, PredictionOptions, StatisticsOptions
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation.ablation import Variant
+from nerg_mi.progress import SILENT
 from nerg_mi.ranges import ValidatedDataclass
 from nerg_mi.surfaces.sources import GazeSumSettings, RaySettings
 from nerg_mi.tasks.task import Part, Plan, rebuild_value
@@ -26,7 +27,7 @@ from nerg_mi.train.gaze_settings import GazeSettings as TrainingSettings
 from nerg_mi.train.gaze_settings import ProbeSettings
 from nerg_mi.workflows import ablation, evaluate, options
 from nerg_mi.workflows.ablation import training_options
-from nerg_mi.workflows.base import SILENT, select_backend, versions
+from nerg_mi.workflows.base import select_backend, versions
 from nerg_mi.workflows.evaluate import fold_options
 from nerg_mi.workflows.gaze_commands import (
     AblationOptions,

@@ -7,15 +7,54 @@ import threading
 import time
 import warnings
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
-from nerg_mi.errors import clean_text
-from nerg_mi.files.html import element, markup
-
-from .base import SilentReporter
+from .errors import clean_text
+from .files.html import element, markup
 
 if TYPE_CHECKING:
     from rich.progress import Progress
+
+# ---- Reporters ----
+
+
+@runtime_checkable
+class Reporter(Protocol):
+    """Receives messages and progress of a workflow.
+
+    Methods return immediately and do not raise, except that `progress` may raise `KeyboardInterrupt` to stop the
+    workflow like Ctrl-C.
+    """
+
+    def message(self, text: str) -> None:
+        """Report a result or a written file, in one line."""
+
+    def warn(self, text: str) -> None:
+        """Report a possible problem with the result, in one line."""
+
+    def progress(self, fraction: float, text: str = "") -> None:
+        """Report the completed fraction of the work, from 0 to 1, and the current step.
+
+        A phase whose duration does not depend on the one before, such as scoring after training, begins at 0 again.
+        """
+
+
+class SilentReporter:
+    """A reporter that ignores everything."""
+
+    def message(self, text: str) -> None:
+        pass
+
+    def warn(self, text: str) -> None:
+        pass
+
+    def progress(self, fraction: float, text: str = "") -> None:
+        pass
+
+
+SILENT = SilentReporter()
+"""The default reporter."""
+
 
 LOG_INTERVAL = 10.0
 """Seconds between two lines of progress if there is no progress bar."""
@@ -25,7 +64,7 @@ ESTIMATE_AFTER = 2.0
 
 
 class TerminalReporter:
-    """A `nerg_mi.workflows.base.Reporter` for the terminal, used as a context.
+    """A `Reporter` for the terminal, used as a context.
 
     Messages go to the standard output, and warnings to the standard error. The progress bar is on the standard error,
     if that is a terminal; pipes and files never contain it. Otherwise the standard error gets a line every ten seconds,
