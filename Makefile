@@ -7,7 +7,7 @@
 # During development and before a release:
 #
 #   make check     run the quick tests of every package (one minute on two cores); ARGS as above
-#   make lint      check format, style, import rules, spelling and the words of names and sentences; change nothing
+#   make lint      check format, style, import rules, spelling, words and the names in sentences; change nothing
 #   make types     run the type checker
 #   make format    fix format and style where that can be automated
 #   make docs      regenerate the parts of the manual that are derived from the code
@@ -70,6 +70,7 @@ lint: setup
 	$(RUN) -m tools.import_rules
 	git ls-files -z | xargs -0 $(RUN) -m codespell_lib
 	$(RUN) -m tools.words
+	$(RUN) -m tools.backticks
 
 types: setup
 	$(RUN) -m basedpyright --project pyproject.toml

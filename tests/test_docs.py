@@ -129,6 +129,13 @@ def test09_files_that_are_named_exist(page):
     assert not [path for path in named if not path.startswith(made) and not (ROOT / path).exists()]
 
 
+def test10_the_architecture_lists_all_packages():
+    page = (ROOT / "docs/explanation/architecture.md").read_text(encoding="utf-8")
+    table = re.findall(r"^\| (`.*?) +\|", page.partition("## Packages")[2].partition("\n## ")[0], re.M)
+    named = {*re.findall(r"`(\w+)`", " ".join(table)), "tasks", "files"}  # the last two in a sentence
+    assert named == {path.parent.name for path in (ROOT / "nerg_mi").glob("*/__init__.py")}
+
+
 def test10_settings_of_the_study_are_the_studys():
     subject = make_subject(1.0, is_normalized=True, voxel_resolutions=VOXEL_RESOLUTIONS)
     names = {setting.name for setting in study_settings.list_rows(subject)}

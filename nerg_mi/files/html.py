@@ -47,7 +47,7 @@ def element(tag: str, *content: Content, **attributes: str | int | float | bool 
     content
         Children of the element.
     attributes
-        Attributes by name; ``class_`` stands for ``class`` and ``data_x`` for ``data-x``. None and False omit an
+        Attributes by name; ``class_`` stands for ``class``, and other underscores for hyphens. None and False omit an
         attribute; True sets it without a value.
     """
     attribute_text = ""

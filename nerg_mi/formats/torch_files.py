@@ -162,8 +162,9 @@ def check_pickle(pickled: bytes) -> None:
     damaged pickle also raises `IndexError` or `KeyError`.
 
     Notes
-    ----- The stack is simulated. An entry is a list of its size (1, plus its characters, plus the sizes of its parts)
-    and its name if it is a function. A container that is filled later remains the same list, also in the memo.
+    -----
+    The stack is simulated. An entry is a list of its size (1, plus its characters, plus the sizes of its parts) and its
+    name if it is a function. A container that is filled later remains the same list, also in the memo.
     """
     mark: list = [0, ""]
     stack: list[list] = []

@@ -247,7 +247,7 @@ def anonymize_results(results: GazeResults, labels: ParticipantLabels) -> GazeRe
 #
 # Intervals are 95 % confidence intervals of the mean over participants: Student's t with n - 1 degrees of freedom. For
 # means this is the limit of the bootstrap over participants, widened for small numbers
-# (`nerg_mi.evaluation.gaze_report.widening`).
+# (`small_sample_factor`).
 
 MIN_PARTICIPANTS = 3
 """Minimum number of participants for a confidence interval."""

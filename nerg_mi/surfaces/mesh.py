@@ -92,7 +92,7 @@ def _cross_products(corners: np.ndarray) -> np.ndarray:
 
 
 def weld_mesh(vertices: np.ndarray, faces: np.ndarray, label: str = "the mesh") -> tuple[Mesh, np.ndarray, Repairs]:
-    """Create a mesh with unique vertices and without invalid faces. Return ``(mesh, index, repairs)``.
+    """Create a mesh with unique vertices and without invalid faces. Return ``(Mesh, index, Repairs)``.
 
     Files duplicate vertices along edges where normals or colours are discontinuous; welding makes such surfaces
     connected, so that smoothing crosses these edges. Only vertices with exactly equal coordinates are merged. Faces

@@ -114,7 +114,7 @@ directions would make the integral depend on their number, by several per cent w
 
 
 _MAX_ORDERED = 1 << 20
-"""Up to this number, directions are traced along a space-miss_depths curve; beyond it in the order of their indices."""
+"""Up to this number, directions are traced along a space-filling curve; beyond it in the order of their indices."""
 
 
 @dataclass(frozen=True)

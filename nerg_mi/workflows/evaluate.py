@@ -85,11 +85,11 @@ class GazeEvaluation(ResultTables):
     people: int
     # Written tables and figures.
     files: list[Path]
-    # One row per position: error and uncertainty (`uncertainty.position_rows`).
+    # One row per position: error and uncertainty (`score_positions`).
     by_position: list[dict[str, Any]] = field(default_factory=list)
-    # One row per uncertainty signal and error: how well it ranks errors (`uncertainty.rank_rows`).
+    # One row per uncertainty signal and error: how well it ranks errors (`correlate_uncertainty`).
     uncertainty: list[dict[str, Any]] = field(default_factory=list)
-    # One row per method: coverage of its highest-density regions (`uncertainty.calibration_rows`).
+    # One row per method: coverage of its highest-density regions (`measure_calibration`).
     calibration: list[dict[str, Any]] = field(default_factory=list)
     split_half_note: str = ""  # Why there is no row of the split half
 

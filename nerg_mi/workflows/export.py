@@ -228,8 +228,7 @@ def export_volume(
     options: VolumeOptions | None = None,
     reporter: Reporter = SILENT,
 ) -> Export:
-    """Write density and colour as Mitsuba grid volumes (.vol). Raises `NergError` for errors that the user can correct.
-    Write density and colour as Mitsuba grid volumes (.vol). Raises `NergError` for errors that the user can correct."""
+    """Write density and colour as Mitsuba grid volumes (.vol). Raises `NergError` for errors that the user corrects."""
     options, output, start = options or VolumeOptions(), Path(output), time.perf_counter()
     files = [output] if options.color is None else [Path(options.color), output]
     for path in reversed(files):

@@ -335,8 +335,7 @@ def _select_smallest(held: list[Rays], lots: list[np.ndarray], n: int) -> tuple[
 
 
 def _write_filtered(dataset: RayDataset, options: FilterOptions, steps: _Totals, folder: Path) -> None:
-    """Write the selected rays of each source to a new dataset; metadata last, because it holds the sums of all steps.
-    Write the selected rays of each source to a new dataset; metadata last, because it holds the sums of all steps."""
+    """Write the selected rays of each source to a new dataset; metadata last, as it holds the sums of all steps."""
     write_dataset_manifest(folder, replace(dataset.manifest, closed=True))
     writers = {source.id: SourceWriter(folder, source.id, dataset.manifest.buckets) for source in dataset.sources}
     for source, part in dataset.parts:

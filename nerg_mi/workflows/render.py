@@ -697,21 +697,17 @@ def _render_in_parts(
 
     suffix = ".png" if render_plan.video else render_plan.files[0].suffix.lower()
     what = f"nerg render {os.path.abspath(render_plan.files[0])}"
-    get_or_compute_each = picture_options(options)
+    inputs = picture_options(options)
     frames = [
         Part(PlannedScene.plan(scene, {**(options.defaults or {}), **frame}), f"picture {k + 1}")
         for k, frame in enumerate(render_plan.frames)
     ]
     overlay = None if options.overlay is None else find_overlay(options.overlay)
     if overlay is None or not uses_shared_scale(overlay, len(frames), options):
-        last = _copy_outputs(
-            scene, render_plan, options, parts, Plan(what, make_picture, get_or_compute_each, frames, suffix), 0.0
-        )
+        last = _copy_outputs(scene, render_plan, options, parts, Plan(what, make_picture, inputs, frames, suffix), 0.0)
         return last, last.get("top")
     # Render all, then determine the common colour scale, then draw all.
-    layers = list(
-        parts.run(Plan(f"{what} (values)", make_layers, get_or_compute_each, frames, ".npy"), 0.0, _LAYERS_SHARE)
-    )
+    layers = list(parts.run(Plan(f"{what} (values)", make_layers, inputs, frames, ".npy"), 0.0, _LAYERS_SHARE))
     limits = [None if made.notes["limits"] is None else tuple(made.notes["limits"]) for made in layers]
     ends = shared_limits(limits, options.vmax)
     overlay.check_limits(ends)
@@ -722,14 +718,7 @@ def _render_in_parts(
             header = next(make_provenances(scene, [frame], options, str(options.mode), False)).text()
         notes = {name: made.notes[name] for name in ("marker", "supported", "basis")}
         drawings.append(Part(LayerDrawing(made.path, ends, **notes, header=header), f"drawing {k + 1}"))
-    _copy_outputs(
-        scene,
-        render_plan,
-        options,
-        parts,
-        Plan(what, draw_layers, get_or_compute_each, drawings, suffix),
-        _LAYERS_SHARE,
-    )
+    _copy_outputs(scene, render_plan, options, parts, Plan(what, draw_layers, inputs, drawings, suffix), _LAYERS_SHARE)
     return layers[-1].notes, None if ends is None else ends[1]
 
 
@@ -795,8 +784,7 @@ def make_layers(options: PictureOptions, scene: PlannedScene, output: Path) -> d
 
 @dataclass(frozen=True)
 class LayerDrawing:
-    """The ``layers`` (.npy) of `make_layers` with its notes, the ``ends`` of the colour scale, and the file ``header``.
-    The ``layers`` (.npy) of `make_layers` with its notes, the ``ends`` of the colour scale, and the file ``header``."""
+    """The ``layers`` (.npy) of `make_layers` with its notes, the ``ends`` of the colour scale, the file ``header``."""
 
     layers: Path
     ends: Limits

@@ -22,7 +22,7 @@ def rows_of_levels(levels, base, finest, log2_rows):
 
 
 def scales_of_levels(levels, base, finest):
-    """``exp2f(l S) H - 1`` in float32."""
+    """``exp2f(level S) H - 1`` in float32."""
     s = np.float32(math.log2(finest / base) / (levels - 1)) if levels > 1 else np.float32(0)
     return [np.exp2(np.float32(level) * s) * np.float32(base) - np.float32(1) for level in range(levels)]
 
