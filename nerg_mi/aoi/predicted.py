@@ -14,6 +14,7 @@ import numpy as np
 
 from nerg_mi.alignment.check import read_similarity
 from nerg_mi.errors import NergError
+from nerg_mi.fields.gaze_base import TRACKING_NOTES
 from nerg_mi.formats.areas import AreaGroup, AreaSet, read_regions
 from nerg_mi.formats.meshes import MeshFile
 from nerg_mi.measures.estimates import adjust_p_values, estimate_ratio_differences
@@ -266,9 +267,14 @@ class AoiScene:
 
     @property
     def warnings(self) -> list[str]:
-        """Warnings about the alignment and about unused content of the meshes."""
+        """Warnings about the alignment, about a gaze field of heads, and about unused content of the meshes."""
+        gaze = self.gaze_scene.gaze
+        basis = None if gaze is None else gaze.field.basis
+        note = None if basis is None else TRACKING_NOTES.get(basis.tracking)
+        of_heads = f"the gaze field was trained on {note}: predictions are those of heads, not of eyes"
         return [
             *self.alignment_doubts,
+            *([of_heads] if note else []),
             *(f"of {file}: {note}" for file, mesh in self.meshes.items() for note in mesh.notes),
         ]
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nerg_mi.errors import NergError
-from nerg_mi.fields.gaze_base import AnyGazeField
+from nerg_mi.fields.gaze_base import AnyGazeField, read_tracking, tracking_suffix
 from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.files.html import key_value_table
 from nerg_mi.formats.fields import load_radiance, save_gaze, save_radiance
@@ -136,13 +136,17 @@ class TrainedField(Generic[Network]):
         lower, upper = (", ".join(f"{x:.3g}" for x in corner) for corner in self.bounds)
         members = 1 if isinstance(self.network, RadianceField) else len(self.network.members)
         what = f"{self.kind} field" if members == 1 else f"ensemble of {members} gaze fields"
-        return f"<{what} {self.name}: {self.num_weights:,} weights, box ({lower}) to ({upper})>"
+        name = f"{self.name}{tracking_suffix(self.provenance)}"
+        return f"<{what} {name}: {self.num_weights:,} weights, box ({lower}) to ({upper})>"
 
     def _repr_html_(self) -> str:
         lower, upper = (", ".join(f"{x:.3g}" for x in corner) for corner in self.bounds)
         rows = [(f"{self.kind} field", self.name), ("weights", f"{self.num_weights:,}")]
         rows.append(("box", f"({lower}) to ({upper})"))
-        rows += [(key.replace("_", " "), str(v)) for key, v in self.provenance.items() if isinstance(v, (str, int))]
+        facts = dict(self.provenance)
+        if self.provenance.get("rays"):
+            facts["tracking"] = read_tracking(self.provenance)
+        rows += [(key.replace("_", " "), str(v)) for key, v in facts.items() if isinstance(v, (str, int))]
         rows += [
             (key, ", ".join(f"{k} {_format(v)}" for k, v in values.items()))
             for key, values in self.provenance.items()

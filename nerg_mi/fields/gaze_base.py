@@ -30,22 +30,30 @@ if TYPE_CHECKING:
 _MAX_COUNT = 1 << 60
 
 
+TRACKING_NOTES = {"head": "directions of heads", "mixed": "partly directions of heads"}
+"""What rays that are not all gaze are, by the kind of their tracking (`nerg_mi.rays.rays.TRACKING`)."""
+
+
 @dataclass(frozen=True)
 class DataSummary:
-    """The amount of data that a gaze field was fitted to, or that a density is estimated from.
+    """The amount and kind of data that a gaze field was fitted to, or that a density is estimated from.
 
-    ``rays``: number of rays; ``people``: number of participants (None: unknown); ``images``: number of salience images.
+    ``rays``: number of rays; ``people``: number of participants (None: unknown); ``images``: number of salience images;
+    ``tracking``: "eye", "head", "mixed" or "unknown".
     """
 
     rays: int
     people: int | None = None
     images: int = 0
+    tracking: str = "unknown"
 
     def words(self) -> str:
-        """In words, such as "81,751 rays of 80 participants"; "" without data."""
+        """In words, such as "81,751 rays of 80 participants (directions of heads)"; "" without data."""
         rays = _count(self.rays, "ray", "rays")
         if rays and self.people:
             rays += " of " + _count(self.people, "participant", "participants")
+        if rays and self.tracking in TRACKING_NOTES:
+            rays += f" ({TRACKING_NOTES[self.tracking]})"
         return " and ".join(filter(None, [rays, _count(self.images, "salience image", "salience images")]))
 
 
@@ -53,7 +61,14 @@ def summarize_provenance(provenance: Mapping[str, Any]) -> DataSummary | None:
     """The amount of data in a checkpoint's ``provenance``; None if it is not recorded, as in checkpoints of other
     programs."""
     rays, people, images = (_number(provenance.get(name)) for name in ("rays", "people", "salience_views"))
-    return DataSummary(rays or 0, people or None, images or 0) if rays or images else None
+    return DataSummary(rays or 0, people or None, images or 0, read_tracking(provenance)) if rays or images else None
+
+
+def read_tracking(provenance: Mapping[str, Any]) -> str:
+    """What was tracked in the recordings of a checkpoint's ``provenance``: "eye", "head", "mixed" or "unknown", as in
+    checkpoints of earlier versions."""
+    tracking = provenance.get("tracking")
+    return tracking if isinstance(tracking, str) and tracking in ("eye", *TRACKING_NOTES) else "unknown"
 
 
 def _number(value: object) -> int | None:
@@ -62,6 +77,12 @@ def _number(value: object) -> int | None:
 
 def _count(number: int, one: str, several: str) -> str:
     return f"{number:,} {one if number == 1 else several}" if number else ""
+
+
+def tracking_suffix(provenance: Mapping[str, Any]) -> str:
+    """Suffix of a title that names rays of heads, such as " (directions of heads)"; "" for gaze."""
+    note = TRACKING_NOTES.get(read_tracking(provenance))
+    return f" ({note})" if note else ""
 
 
 # ---- Support ----

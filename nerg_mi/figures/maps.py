@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError
+from nerg_mi.fields.gaze_base import TRACKING_NOTES
 
 from .style import (
     DPI,
@@ -542,7 +543,7 @@ def _describe_rays(rays, test=None) -> str:
         np.concatenate([np.asarray(rays.persons)[np.unique(r.person)] for r in (rays, test) if r is not None])
     ).size
     count = f"{len(rays):,} samples" if test is None else f"{len(rays):,} + {len(test):,} samples"
-    what = {"head": ", directions of heads", "mixed": ", partly directions of heads"}.get(rays.tracking, "")
+    what = f", {TRACKING_NOTES[rays.tracking]}" if rays.tracking in TRACKING_NOTES else ""
     return f"{count} of {num_participants} {'participant' if num_participants == 1 else 'participants'}{what}"
 
 

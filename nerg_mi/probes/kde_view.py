@@ -184,7 +184,7 @@ class KdeView:
             raise NergError("the ray file contains no rays; pass a file with at least one")
         self.to_world, self.backend = to_world or Similarity(), backend
         self.count, self.kappa = min(count, len(rays)), kappa
-        self.basis = DataSummary(len(rays), len(np.unique(rays.person)))
+        self.basis = DataSummary(len(rays), len(np.unique(rays.person)), tracking=rays.tracking)
         self._origin, self._direction = rays.origin, rays.direction
 
     def find_nearest(self, p: np.ndarray) -> np.ndarray:

@@ -15,8 +15,10 @@ from nerg_mi import __version__
 from nerg_mi.evaluation.baselines import PRIOR
 from nerg_mi.evaluation.gaze import SPLIT_HALF
 from nerg_mi.evaluation.gaze_report import SPLIT_LABELS, Comparison, GazeResults, Verdict
+from nerg_mi.fields.gaze_base import read_tracking
 from nerg_mi.files.html import Html, element, figure, image, key_value_table, markup, paragraph, table
 from nerg_mi.rays.quality import WARNING_LABEL, make_quality_report
+from nerg_mi.rays.rays import TRACKING
 
 from .charts import Point, interval_chart
 from .data import MeanShare, ObjectAttention, Run
@@ -448,6 +450,8 @@ def _show_settings(run: Run) -> Html:
         (label, _format_setting(provenance[key])) for key, label in _PROVENANCE_LABELS.items() if key in provenance
     ]
     test = provenance.get("test")
+    if "rays" in provenance:
+        facts.append(("tracking", TRACKING[read_tracking(provenance)]))
     if isinstance(test, dict):
         facts.append(("held out", _describe_held_out(test)))
     parts = [element("h3", "Training"), key_value_table(facts)]

@@ -256,11 +256,14 @@ class Supervision:
             "views": _hash_arrays(views) if views else None,
         }
 
-    def count_data(self) -> dict[str, int]:
-        """Return the numbers of ``rays``, participants (``people``) and salience views (JSON)."""
-        rays = self.rays
-        num_participants = 0 if rays is None else len(np.unique(rays.person))
-        return {"rays": 0 if rays is None else len(rays), "people": num_participants, "salience_views": len(self.views)}
+    def summarize_data(self) -> dict[str, int | str]:
+        """Return the numbers of ``rays``, participants (``people``) and salience views, and the ``tracking`` of
+        the rays (JSON)."""
+        views = {"salience_views": len(self.views)}
+        if self.rays is None:
+            return {"rays": 0, "people": 0, **views}
+        num_participants = len(np.unique(self.rays.person))
+        return {"rays": len(self.rays), "people": num_participants, **views, "tracking": self.rays.tracking}
 
     def make_support(self, radius: float, geometry: TrainingGeometry) -> RaySupport | None:
         """Return the local ray count as a function of position in the frame of ``geometry``, for probes of ``radius``

@@ -180,7 +180,7 @@ def train_ensemble(
     ensemble = GazeEnsemble(fields, supervision.make_support(plan.probes.radius, geometry))
     if selection is not None:
         ensemble.hits = selection.make_hits(supervision.rays, geometry, plan)
-    ensemble.basis = summarize_provenance(supervision.count_data())
+    ensemble.basis = summarize_provenance(supervision.summarize_data())
     provenance = _combine_provenances(provenances, plan.settings, supervision, kind) | (
         {"mix": selection.to_dict()} if selection else {}
     )
@@ -259,7 +259,7 @@ def _combine_provenances(provenances: list[dict], settings: GazeSettings, superv
     out = {
         **provenances[0],
         "settings": settings.to_dict(),
-        **supervision.count_data(),
+        **supervision.summarize_data(),
         "probes_made": round(mean("probes_made")),
         **{k: mean(k) for k in ("escaped_directions", "escaped_gaze")},
         **{k: total(k) for k in ("steps", "seconds", "seconds_preparing")},

@@ -163,7 +163,7 @@ def train_gaze(
         selection.apply_prior(field, training.rays, geometry, plan)
         field.hits = selection.make_hits(training.rays, geometry, plan)
     field.support = training.make_support(plan.probes.radius, geometry)
-    field.basis = summarize_provenance(supervision.count_data())
+    field.basis = summarize_provenance(supervision.summarize_data())
     provenance = _make_provenance(supervision, geometry, plan, targets) | {
         "steps": trainer.steps,
         "seconds": round(file.elapsed, 1),
@@ -222,7 +222,7 @@ def _make_provenance(supervision: Supervision, place: TrainingGeometry, plan: Ga
         "settings": plan.settings.to_dict(),
         "probes": plan.probes.to_dict(),
         "align": alignment_to_json(place),
-        **supervision.count_data(),
+        **supervision.summarize_data(),
         "probes_made": len(targets.truth),
         "escaped_directions": round(targets.miss_fraction, 6),
         "escaped_gaze": round(targets.miss_gaze_fraction, 6),

@@ -30,7 +30,7 @@ from nerg_mi.evaluation.uncertainty import (
     score_positions,
     summarise_folds,
 )
-from nerg_mi.fields.gaze_base import AnyGazeField
+from nerg_mi.fields.gaze_base import AnyGazeField, read_tracking, tracking_suffix
 from nerg_mi.figures.style import existing_files, make_provenance
 from nerg_mi.files.atomic import check_folder, file_sha256, write_text
 from nerg_mi.files.dataframes import ResultTables
@@ -40,7 +40,7 @@ from nerg_mi.formats.fields import load_gaze
 from nerg_mi.probes.probes import REGION_LEVELS, format_level
 from nerg_mi.progress import SILENT, Reporter
 from nerg_mi.rays.dataset import hash_rays, is_dataset, load_rays
-from nerg_mi.rays.rays import Rays
+from nerg_mi.rays.rays import TRACKING, Rays
 from nerg_mi.tasks.task import FOLDER_SUFFIX, RENDER_LIBRARIES, Part, Plan
 from nerg_mi.threads import set_thread_count
 from nerg_mi.train.gaze_data import find_hit_points
@@ -92,6 +92,7 @@ class GazeEvaluation(ResultTables):
     # One row per method: coverage of its highest-density regions (`measure_calibration`).
     calibration: list[dict[str, Any]] = field(default_factory=list)
     split_half_note: str = ""  # Why there is no row of the split half
+    tracking: str = "unknown"  # What was tracked, of `nerg_mi.rays.rays.TRACKING`
 
 
 def evaluate_gaze(
@@ -133,6 +134,9 @@ def evaluate_gaze(
     training = metadata["provenance"]
     data = load_training_rays(gaze, training, rays)
     account, seed = training["test"], options.seed
+    tracking = read_tracking(training)
+    if tracking == "unknown":  # as in checkpoints of earlier versions, but the rays may state it
+        tracking = data.tracking
     split = options.split or ("both" if account.get("people") else "pos")
     reporter.progress(0.0, "test")
     train, scored, centres = evaluation.select_held_out_rays(data, account, split, seed)
@@ -189,6 +193,7 @@ def evaluate_gaze(
         summary = {
             "gaze": gaze.name,
             "gaze_sha256": file_sha256(gaze),
+            "tracking": tracking,
             "split": split,
             "kappa": options.kappa,
             "positions": len(test.centres),
@@ -198,7 +203,7 @@ def evaluate_gaze(
             "split_half_note": half_note,
         }
         notes = _notes(gaze.name, split, test, (len(train), len(data)), account["radius"], options, half_note)
-        notes += f" {format_settings(baselines)}"
+        notes += f" Tracking: {TRACKING[tracking]}. {format_settings(baselines)}"
         files = write_report(output, rows, persons, summary, notes, places, ranks, regions)
         if options.pictures:
             reporter.progress(0.95, "pictures")
@@ -207,7 +212,17 @@ def evaluate_gaze(
             record = make_provenance("nerg eval gaze", sources, seed, options)
             draw_comparison(test, select(_DRAWN), files[-1], options.pictures, provenance=record)
     return GazeEvaluation(
-        rows, persons, split, len(test.centres), len(test.participants), files, places, ranks, regions, half_note
+        rows,
+        persons,
+        split,
+        len(test.centres),
+        len(test.participants),
+        files,
+        places,
+        ranks,
+        regions,
+        half_note,
+        tracking,
     )
 
 
@@ -222,7 +237,8 @@ def print_evaluation(
     """Call `evaluate_gaze`, and print the scores as a table."""
     result = evaluate_gaze(gaze, rays, output or default_output(gaze), options, reporter)
     rows = [{k: row[k] for k in ("method", *_PRINTED, "integral")} for row in result.rows]
-    title = f"{gaze.name}, {result.split}: {result.positions} positions, {result.people} participants"
+    what = tracking_suffix({"tracking": result.tracking})
+    title = f"{gaze.name}{what}, {result.split}: {result.positions} positions, {result.people} participants"
     reporter.message(evaluation.format_score_table(rows, title))
     for path in result.files:
         reporter.message(f"wrote {path}")

@@ -13,7 +13,7 @@ import numpy as np
 
 from nerg_mi.errors import MissingFile, NergError, sanitize, translate_mitsuba_errors
 from nerg_mi.evaluation.gaze_report import GazeResults, read_results
-from nerg_mi.fields.gaze_base import AnyGazeField
+from nerg_mi.fields.gaze_base import AnyGazeField, tracking_suffix
 from nerg_mi.figures import maps, overlay
 from nerg_mi.figures.overlay import Heat, OverlayLayers, Style, find_overlay, robust_max, srgb, to_bytes, unknown_mask
 from nerg_mi.figures.sphere import sphere_figure
@@ -588,7 +588,7 @@ class _ReportWork:
             )
         shown = results if options.show_names else [anonymize_results(r, labels) for r in results]
         return Run(
-            options.title or hide(f"The gaze field “{files.gaze.stem}”"),
+            options.title or hide(f"The gaze field “{files.gaze.stem}”{tracking_suffix(files.scene.gaze_provenance)}"),
             self.metadata,
             hide(describe_scene(files)),
             files.scene.kind,

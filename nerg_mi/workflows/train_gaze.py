@@ -22,7 +22,7 @@ from nerg_mi.maths.geometry import Similarity
 from nerg_mi.photos.salience import SalienceSet, open_salience
 from nerg_mi.progress import SILENT, Reporter
 from nerg_mi.rays.dataset import hash_rays, is_dataset, load_rays
-from nerg_mi.rays.rays import Rays
+from nerg_mi.rays.rays import Rays, merge_tracking
 from nerg_mi.train import gaze_run
 from nerg_mi.train.gaze_data import Supervision, TargetRequirements, check_prior_kappa, hold_out, select_far_views
 from nerg_mi.train.gaze_ensemble import train_ensemble
@@ -466,7 +466,7 @@ def learn_prior(
         data = source if isinstance(source, Rays) else load_rays(source, options.max_samples, options.seed)
         file_entry = {} if isinstance(source, Rays) else {"file": Path(source).name, "sha256": hash_rays(source)}
         recordings.append(data)
-        files.append({**file_entry, "rays": len(data), "persons": len(data.persons)})
+        files.append({**file_entry, "rays": len(data), "persons": len(data.persons), "tracking": data.tracking})
     if empty := [str(k + 1) for k, data in enumerate(recordings) if not len(data)]:
         raise NergError(f"there are no rays in file {', '.join(empty)} of those given; leave it out")
     field = make_elevation_prior(recordings, ns)
@@ -474,6 +474,7 @@ def learn_prior(
         "recipe": PRIOR,
         "kappa": ELEVATION_KAPPA,
         "places": files,
+        "tracking": merge_tracking(data.tracking for data in recordings),
         "made": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
     }
     if output is not None:

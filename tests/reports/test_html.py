@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.files import html
+from nerg_mi.rays.rays import TRACKING
 from nerg_mi.reports.charts import Point, interval_chart, nice_ticks
 from nerg_mi.reports.sections import SECTIONS, SETTINGS, render_page
 from tests.reports.made import HOSTILE, PNG, full_run, minimal_run, packed_scene
@@ -208,6 +209,11 @@ def test_section_texts():
 
 def test_held_out_participants_are_not_named():
     assert "Ada" not in text_of(SETTINGS, replace(full_run(), gaze={"provenance": {"test": {"people": ["Ada"]}}}))
+
+
+def test_settings_name_what_was_tracked():
+    for provenance, kind in (({"rays": 3, "tracking": "head"}, "head"), ({"rays": 3}, "unknown")):
+        assert TRACKING[kind] in text_of(SETTINGS, replace(full_run(), gaze={"provenance": provenance}))
 
 
 def test_shares_of_few_participants_are_hidden():

@@ -18,7 +18,7 @@ from nerg_mi.evaluation.gaze import SCORES
 from nerg_mi.evaluation.next_look import HEAD_METHODS, NextLook
 from nerg_mi.files.tables import write_json
 from nerg_mi.formats.fields import load_gaze
-from nerg_mi.rays.rays import Rays
+from nerg_mi.rays.rays import TRACKING, Rays
 from nerg_mi.threads import set_thread_count
 from nerg_mi.train.gaze_log_density import compute_elevation_density
 from nerg_mi.workflows import ablation, evaluate
@@ -67,13 +67,17 @@ def test_scores_are_listed_with_the_baselines(trained, tmp_path):
     assert {row["method"] for row in result.calibration} >= {"gaze field", "nearest rays"}
     # Calibrated on the data that the folds of the training held out.
     assert result.calibration[1]["method"] == "gaze field, calibrated"
-    assert json.loads((tmp_path / "eval" / "gaze.json").read_text())["methods"][0]["KLD"] == result.rows[0]["KLD"]
-    assert "directions of equal area" in (tmp_path / "eval" / "gaze.md").read_text()
+    data = json.loads((tmp_path / "eval" / "gaze.json").read_text())
+    assert data["methods"][0]["KLD"] == result.rows[0]["KLD"] and data["tracking"] == result.tracking
+    text = (tmp_path / "eval" / "gaze.md").read_text()
+    assert "directions of equal area" in text and TRACKING[result.tracking] in text
 
 
 def test_without_an_output_folder_nothing_is_written(trained):
     before = set(trained.iterdir())
-    result = evaluate_gaze(trained / "gaze.safetensors", Rays.load(trained / "rays.npz"), options=OPTIONS)
+    rays = Rays.load(trained / "rays.npz").with_tracking("head")
+    result = evaluate_gaze(trained / "gaze.safetensors", rays, options=OPTIONS)
+    assert result.tracking == "head"
     assert result.files == [] and set(trained.iterdir()) == before and result.rows[0]["method"] == "gaze field"
 
 
@@ -455,7 +459,8 @@ def test_a_prior_checkpoint_is_the_density_of_other_scenes(tmp_path, rgb):
         evaluate_gaze(path, places[0])
     assert learn_prior(tmp_path / "1.npz").provenance["places"] == result.provenance["places"][1:]
     # Rays in memory are accepted.
-    same = learn_prior(places)
+    same = learn_prior([places[0], places[1].with_tracking("head")])
+    assert same.provenance["tracking"] == "mixed" and result.provenance["tracking"] == "unknown"
     assert same.output is None and "file" not in same.provenance["places"][0]
     np.testing.assert_array_equal(np.array(same.field.prior.array), np.array(field.prior.array))
 

@@ -10,6 +10,8 @@ import pytest
 
 from nerg_mi.aoi.options import StatisticsOptions
 from nerg_mi.errors import NergError
+from nerg_mi.fields.mlp import namespace
+from nerg_mi.formats.fields import load_gaze, save_gaze
 from nerg_mi.rays.rays import Rays
 from nerg_mi.workflows.statistics import statistics
 from tests.aoi.place import first_box, people, write_place
@@ -283,3 +285,13 @@ def test_directions_of_heads_are_named(folder):
         reporter=recorder,
     )
     assert any("heads" in text for text in recorder.messages)
+
+
+@pytest.mark.parametrize("kind", ["head", "eye"])
+def test_predictions_of_a_field_of_heads_are_named(folder, tmp_path, kind):
+    gaze, recorder = tmp_path / "gaze.safetensors", Recorder()
+    field, _ = load_gaze(folder / "gaze.safetensors", namespace("llvm_ad_rgb"))
+    save_gaze(field, gaze, {"rays": 9, "tracking": kind})
+    options = StatisticsOptions(aois=folder / "areas.json", observers=("1,1.5,1.6",), **FAST)
+    statistics([folder / "bare" / "scene.xml", gaze], options=options, reporter=recorder)
+    assert any("heads" in text for text in recorder.warnings + recorder.messages) == (kind == "head")

@@ -73,11 +73,12 @@ def arrays(field):
 def test_a_training_returns_the_field_and_reports_progress(rays):
     """The rays are in memory; no file is read or written."""
     heard = Listener()
-    result = train_gaze(rays, options=replace(QUICK, variant="capture"), reporter=heard)
+    result = train_gaze(rays.with_tracking("head"), options=replace(QUICK, variant="capture"), reporter=heard)
     assert result.output is None and not result.interrupted and result.field.config.geometry == "none"
     provenance = result.provenance
     assert provenance["recipe"] == "default" and provenance["steps"] == 3 and provenance["geometry"] == "none"
     assert "rays_file" not in provenance and provenance["rays"] == len(rays)
+    assert provenance["tracking"] == result.field.basis.tracking == "head"
     assert heard.shares == sorted(heard.shares) and heard.shares[-1] == pytest.approx(1)
     # One fit, and folds that take as many steps each
     last_fit = max(share for share, text in zip(heard.shares, heard.texts) if text.startswith("fit"))

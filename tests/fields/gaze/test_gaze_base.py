@@ -9,7 +9,14 @@ import numpy as np
 import pytest
 
 from nerg_mi.fields import gaze_base
-from nerg_mi.fields.gaze_base import CUTOFF_RADII, DataSummary, GazeEnsemble, RaySupport, summarize_provenance
+from nerg_mi.fields.gaze_base import (
+    CUTOFF_RADII,
+    DataSummary,
+    GazeEnsemble,
+    RaySupport,
+    summarize_provenance,
+    tracking_suffix,
+)
 from nerg_mi.fields.gaze_hits import ReaimedHits
 from nerg_mi.fields.gaze_log_density import LogGazeField
 from nerg_mi.fields.gaze_product import GazeConfig, GazeField
@@ -30,6 +37,9 @@ from tests.fields.gaze.test_log_density import BOX, GRID, SMALL, made
         (DataSummary(300, 3, 1), "300 rays of 3 participants and 1 salience image"),
         (DataSummary(0, None, 12), "12 salience images"),
         (DataSummary(0), ""),
+        (DataSummary(300, 3, tracking="eye"), "300 rays of 3 participants"),
+        (DataSummary(300, 3, 1, "head"), "300 rays of 3 participants (directions of heads) and 1 salience image"),
+        (DataSummary(300, tracking="mixed"), "300 rays (partly directions of heads)"),
     ],
 )
 def test_describe_counts(basis, words):
@@ -42,6 +52,16 @@ def test_summary_from_checkpoint():
     assert summarize_provenance({"rays": 5}) == DataSummary(5)
     assert summarize_provenance({"rays": 0, "people": 0, "salience_views": 3}) == DataSummary(0, None, 3)
     assert summarize_provenance({"made": "random"}) is None
+
+
+def test_tracking_from_checkpoint():
+    for kind in ("eye", "head", "mixed"):
+        basis = summarize_provenance({"rays": 5, "tracking": kind})
+        assert basis is not None and basis.tracking == kind
+        assert bool(tracking_suffix({"tracking": kind})) == (kind != "eye")
+    for other in ({}, {"tracking": "hand"}, {"tracking": ["head"]}, {"tracking": None}):
+        basis = summarize_provenance({"rays": 5, **other})
+        assert basis is not None and basis.tracking == "unknown" and not tracking_suffix(other)
 
 
 @pytest.mark.parametrize("value", [-1, 1e300, "5", [5], True, None, 1 << 70, float("nan")])
