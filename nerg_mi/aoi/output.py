@@ -40,6 +40,7 @@ _TEXT_COLUMNS = {
     "to",
     "measure",
     "significant",
+    "note",
 }
 FormatRow = Callable[[Row], Sequence[Any]]
 

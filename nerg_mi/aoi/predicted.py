@@ -15,6 +15,7 @@ import numpy as np
 from nerg_mi.alignment.check import read_similarity
 from nerg_mi.errors import NergError
 from nerg_mi.fields.gaze_base import TRACKING_NOTES
+from nerg_mi.files.tables import join_reasons
 from nerg_mi.formats.areas import AreaGroup, AreaSet, read_regions
 from nerg_mi.formats.meshes import MeshFile
 from nerg_mi.measures.estimates import adjust_p_values, estimate_ratio_differences
@@ -396,7 +397,8 @@ def add_uncertainty(
 
     ``support`` is the median number of training samples around the viewpoints of the cell, ``viewpoints`` the number of
     viewpoints per participant, and ``share_spread``, ``dwell_spread`` and ``hit_ratio_spread`` are standard deviations
-    over ensemble members. Values are None for measured rows, and if they are suppressed or unknown.
+    over ensemble members. Values are None for measured rows, and if they are suppressed or unknown; the ``note`` says
+    why.
     """
     uncertainty: dict[tuple[str, str], tuple[float | None, float | None, dict[str, np.ndarray]]] = {}
     area_index: dict[str, int] = {}
@@ -410,13 +412,28 @@ def add_uncertainty(
         index = area_index.setdefault(row["aoi"], len(area_index))
         support, viewpoints_per_participant, spreads = uncertainty[row["cell"], row["value"]]
         is_predicted = row["source"] == PREDICTED
+        reasons: dict[str, list[str]] = {}
         for name in MEASURES_WITH_SPREAD:
             has_spread = is_predicted and name in spreads and row[name] is not None
             row[f"{name}_spread"] = float(spreads[name][index]) if has_spread else None
-        row["support"] = support if is_predicted and row["participants"] is not None else None
-        row["viewpoints"] = viewpoints_per_participant if is_predicted and row["participants"] is not None else None
-        if is_predicted:
-            row["note"] = "; ".join(filter(None, (predicted.note, row.get("note"))))
+            if not has_spread:
+                reasons.setdefault(_NO_MEMBERS if is_predicted and not spreads else "no value", []).append(
+                    f"{name}_spread"
+                )
+        is_shown = is_predicted and row["participants"] is not None
+        row["support"] = support if is_shown else None
+        row["viewpoints"] = viewpoints_per_participant if is_shown else None
+        if row["support"] is None:
+            reasons.setdefault(_NO_SUPPORT if is_shown else "suppressed", []).append("support")
+        if row["viewpoints"] is None:
+            reasons.setdefault("suppressed", []).append("viewpoints")
+        if not is_predicted:
+            reasons = {"of predictions only": [name for names in reasons.values() for name in names]}
+        earlier = (predicted.note if is_predicted else "", row.get("note"), join_reasons(reasons))
+        row["note"] = "; ".join(filter(None, earlier))
+
+
+_NO_MEMBERS, _NO_SUPPORT = "the gaze field is no ensemble", "the checkpoint of the gaze field does not store it"
 
 
 def median_support(predicted: PredictedAttention, mask: np.ndarray | None = None) -> float | None:
@@ -530,6 +547,7 @@ def what_if_rows(
             new_sums = _mean_by_participant(changed_viewpoints, names, getattr(after, measure), after_areas, name)
             row = _what_if_row(name, measure, old_sums, new_sums, min_participants, resamples, seed)
             row["difference_spread"] = None
+            reasons = {"": [], _NO_SUPPORT if support is None else "": ["support"]}
             if measure == "share" and row["difference"] is not None and len(after.members) > 1:
                 differences = [
                     _overall_mean(_mean_by_participant(changed_viewpoints, names, new_share, after_areas, name))
@@ -537,7 +555,10 @@ def what_if_rows(
                     for old_share, new_share in zip(before.members, after.members)
                 ]
                 row["difference_spread"] = float(np.std(differences, ddof=1))
-            row["note"] = "; ".join(filter(None, (after.note, row["note"])))
+            else:
+                reason = _NO_MEMBERS if measure == "share" else "visibility does not depend on the gaze field"
+                reasons["no difference" if row["difference"] is None else reason] = ["difference_spread"]
+            row["note"] = "; ".join(filter(None, (after.note, row["note"], join_reasons(reasons))))
             rows.append(row | {"support": support, "source": PREDICTED})
     adjusted_p = adjust_p_values(np.array([np.nan if row["p"] is None else row["p"] for row in rows], float))
     for row, p in zip(rows, adjusted_p):

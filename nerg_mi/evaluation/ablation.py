@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ import numpy as np
 from nerg_mi.errors import translate_mitsuba_errors
 from nerg_mi.figures.style import Provenance, new_page, save
 from nerg_mi.files.atomic import write_text
-from nerg_mi.files.tables import format_markdown_table, write_csv, write_json
+from nerg_mi.files.tables import add_notes, format_markdown_table, write_csv, write_json
 from nerg_mi.formats.splats import choose_plugin
 from nerg_mi.rays.rays import Rays
 from nerg_mi.train.gaze_recipes import get_recipe
@@ -181,14 +181,24 @@ def format_table(summary: list[dict]) -> str:
 
 def write_ablation(folder: Path, rows: list[dict], notes: str, provenance: Provenance | None = None) -> list[Path]:
     """Write ``ablation.md`` (below ``notes``), ``.csv``, ``.json`` and the plot ``.png`` into ``folder``; returns the
-    paths.
+    paths. Each of ``rows`` gets a ``note`` on missing values.
     """
+    add_notes(rows, _explain_missing, COLUMNS)
     summary, files = summarise(rows), [folder / f"ablation.{e}" for e in ("md", "csv", "json", "png")]
     write_text(files[0], f"{notes}\n\n{format_table(summary)}")
-    write_csv(files[1], rows, COLUMNS)
+    add_notes(summary, _explain_missing, COLUMNS[3:])
+    write_csv(files[1], rows, (*COLUMNS, "note"))
     write_json(files[2], {"rows": rows, "summary": summary})
     save(_figure(summary), files[3], provenance)
     return files
+
+
+def _explain_missing(row: Mapping[str, Any], column: str) -> tuple[str, str]:
+    if column.endswith(".spread"):
+        return column, "of a single seed"
+    if column == "frame_seconds":
+        return column, "frames are not timed"
+    return column, "there is no emit_capture of the same recipe"
 
 
 def _figure(summary: list[dict]) -> Any:

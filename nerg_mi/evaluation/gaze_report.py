@@ -19,7 +19,7 @@ from nerg_mi.maths.sphere import Z_UP, latlong_grid
 from nerg_mi.probes.probes import REGION_LEVELS, format_level
 
 from .baselines import CONDITIONAL_KDE, NEAREST_RAYS, PRIOR, REAIMED_HITS, UNIFORM, Baseline
-from .gaze import SCORES, SPLIT_HALF, GazeTest, find_split_half_fault
+from .gaze import MAP_SCORES, SCORES, SPLIT_HALF, GazeTest, find_split_half_fault
 from .uncertainty import RETAINED_FRACTIONS
 
 # ---- Reports of an evaluation: tables as Markdown, CSV and JSON, and pictures of reference and prediction ----
@@ -116,6 +116,38 @@ def format_uncertainty(ranks: list[dict], regions: list[dict]) -> str:
     return text
 
 
+_MISSING = {
+    "gap": "the difference of the first method to the others",
+    "less": "the difference of the first method to the last one",
+    "integral": "not a score, so that there is no difference",
+    "rho": "fewer than 3 positions, or a constant signal or error",
+    **dict.fromkeys(("half", "excess"), "too few samples of a half of the participants"),
+    "support": "the checkpoint of the gaze field does not store it",
+    "spread": "the gaze field is no ensemble",
+    **dict.fromkeys(MAP_SCORES, "no position with enough samples of the participant"),
+}
+_NO_INTERVAL = {
+    "folds": "of a single fold",
+    "rho": "fewer than 5 groups of positions, or no resamples",
+    "method": "fewer than 3 participants, or no resamples",
+}
+
+
+def explain_missing(row: Mapping[str, Any], column: str) -> tuple[str, str]:
+    """Return the name of a missing value of any table of an evaluation, and why it is missing
+    (`nerg_mi.files.tables.add_notes`).
+    """
+    value, is_limit = column, column.endswith((".low", ".high"))
+    if is_limit:
+        value = column.rsplit(".", 1)[0]
+    if row.get("method") == SPLIT_HALF and "." in column:
+        return "intervals and differences", "not computed for the split half"
+    if is_limit and math.isfinite(_read_number(row, value)):
+        return f"interval of {value}", next(reason for key, reason in _NO_INTERVAL.items() if key in row)
+    kind = value.rsplit(".", 1)[-1]
+    return value, _MISSING.get(kind, "no sample to score")
+
+
 def draw_comparison(
     test: GazeTest,
     methods: dict[str, Baseline],
@@ -163,7 +195,7 @@ def draw_comparison(
 MAX_FILE_BYTES = 4 << 20  # Maximum size of a results file
 
 _MAX_ROWS = 20_000
-_MAX_NAME_LENGTH = 200
+_MAX_NAME_LENGTH, _MAX_NOTE_LENGTH = 200, 4000
 
 
 @dataclass(frozen=True)
@@ -235,11 +267,9 @@ def _check_rows(rows: object, path: str | Path, name: str) -> tuple[dict[str, An
         if not isinstance(row, dict) or not isinstance(row.get("method"), str):
             raise _make_error(path, f'a row of its "{name}" has no method')
         for key, value in row.items():
-            text = key in ("method", "person")
+            limit = {"method": _MAX_NAME_LENGTH, "person": _MAX_NAME_LENGTH, "note": _MAX_NOTE_LENGTH}.get(key)
             if not (
-                isinstance(value, str) and len(value) <= _MAX_NAME_LENGTH
-                if text
-                else value is None or _is_number(value)
+                value is None or _is_number(value) if limit is None else isinstance(value, str) and len(value) <= limit
             ):
                 raise _make_error(path, f'"{sanitize(key, 40)}" of a row of its "{name}" is {sanitize(value, 40)}')
     return tuple({**row, "method": _rename_method(row["method"])} for row in rows)

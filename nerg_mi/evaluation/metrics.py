@@ -15,6 +15,7 @@ from nerg_mi.figures.style import make_provenance
 from nerg_mi.files.atomic import make_folder
 from nerg_mi.files.dataframes import ResultTables
 from nerg_mi.files.names import make_portable_names
+from nerg_mi.files.tables import add_notes
 from nerg_mi.maths.arrays import check_weights
 from nerg_mi.maths.color import color_corrected_psnr, mean_ignoring_nan, psnr
 from nerg_mi.photos.cameras import PosedCamera, make_sensor_dict, pixel_directions
@@ -161,6 +162,13 @@ class FieldRenderer:
         return RenderedView(np.clip(stacked[..., :3], 0, 1), stacked[..., 3], np.clip(stacked[..., 4], 0, 1), mask)
 
 
+_NO_SCORE = {
+    "psnr": "all pixels are masked",
+    "ssim": f"no window of {2 * _RADIUS + 1} x {2 * _RADIUS + 1} pixels without masked ones",
+    "psnr_fitted": "all pixels of a half are masked",
+}
+
+
 @dataclass(frozen=True, repr=False)
 class ViewScores(ResultTables):
     """Scores of a field on posed photos."""
@@ -179,9 +187,11 @@ class ViewScores(ResultTables):
 
     @property
     def rows(self) -> list[dict]:
-        """One row per view."""
+        """One row per view; the ``note`` says why scores are missing."""
         columns = self.views, self.psnr, self.ssim, self.psnr_fitted
-        return [dict(zip(("view", "psnr", "ssim", "psnr_fitted"), row)) for row in zip(*columns)]
+        rows = [dict(zip(("view", "psnr", "ssim", "psnr_fitted"), row)) for row in zip(*columns)]
+        add_notes(rows, lambda row, column: (column, _NO_SCORE.get(column, "")))
+        return rows
 
     @property
     def psnr_mean(self) -> float:
@@ -199,10 +209,10 @@ class ViewScores(ResultTables):
         return mean_ignoring_nan(self.ssim)
 
     def to_dict(self) -> dict:
-        """Return the fields and means for JSON, without ``depth`` if it is None."""
+        """Return the fields, means and notes on missing scores for JSON, without ``depth`` if it is None."""
         names = ["views", "width", "height", "spp", "psnr", "psnr_mean", "ssim", "ssim_mean"]
         names += ["psnr_fitted", "psnr_fitted_mean"]
-        out = {name: getattr(self, name) for name in names}
+        out = {name: getattr(self, name) for name in names} | {"notes": [row["note"] for row in self.rows]}
         return out if self.depth is None else out | {"depth": asdict(self.depth)}
 
 

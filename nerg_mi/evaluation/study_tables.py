@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from nerg_mi.figures.style import Provenance, new_page, save
 from nerg_mi.files.atomic import write_text
-from nerg_mi.files.tables import format_markdown_table, write_csv, write_json
+from nerg_mi.files.tables import add_notes, format_markdown_table, write_csv, write_json
 
 from .study import COLUMNS, PAPER
+from .study_truth import ERROR_NAMES
 
 # ---- Tables ----
 #
@@ -102,10 +105,12 @@ def write_tables(out: Path, report: dict) -> list[Path]:
     """Write ``study.csv`` (rows), ``study.md`` (rows by factor), ``scaling.csv`` and ``study.json`` (all of
     ``report``).
 
-    Returns their paths.
+    Returns their paths. Each row gets a ``note`` on missing values.
     """
     paths = [out / "study.csv", out / "study.md", out / "scaling.csv", out / "study.json"]
     row_columns = [*COLUMNS, *(TIMING_COLUMNS if report.get("timed_by") else ())]
+    add_notes(report["rows"], _explain_missing, row_columns)
+    row_columns.append("note")
     for path, rows, columns in ((paths[0], report["rows"], row_columns), (paths[2], report["scaling"], None)):
         write_csv(
             path,
@@ -115,6 +120,12 @@ def write_tables(out: Path, report: dict) -> list[Path]:
     write_text(paths[1], format_report(report))
     write_json(paths[3], report)
     return paths
+
+
+def _explain_missing(row: Mapping[str, Any], column: str) -> tuple[str, str]:
+    if column in ERROR_NAMES:
+        return column, "the setting does not render it, or the scene has no reference of it"
+    return column, "not a value of this scene or setting"
 
 
 def summarise(report: dict) -> list[str]:

@@ -7,7 +7,7 @@ import json
 import math
 import os
 import re
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 from .atomic import replace_atomically, write_text
@@ -41,6 +41,40 @@ def write_csv(path: str | os.PathLike, rows: Iterable[Mapping[str, Any]], column
         csv.writer(file).writerow(map(escape_formula, columns))
         # Only NaN differs from itself.
         writer.writerows({k: escape_formula(v) for k, v in row.items() if v == v} for row in rows)
+
+
+def join_reasons(reasons: Mapping[str, Sequence[str]]) -> str:
+    """Join the reasons of missing values, with the names of the values; "" is no reason."""
+    return "; ".join(f"{', '.join(dict.fromkeys(names))}: {reason}" for reason, names in reasons.items() if reason)
+
+
+def add_notes(
+    rows: Sequence[dict[str, Any]],
+    explain: Callable[[Mapping[str, Any], str], tuple[str, str]],
+    columns: Sequence[str] = (),
+) -> None:
+    """Set the ``note`` of each of ``rows``, which says why values of the table are missing (None, NaN or absent).
+
+    Parameters
+    ----------
+    rows
+        Rows of one table; an earlier ``note`` is replaced.
+    explain
+        Returns the name of a missing value in the note and the reason, from the row and the column.
+    columns
+        Columns of the table in addition to the keys of its rows.
+    """
+    names = dict.fromkeys((*columns, *(key for row in rows for key in row if key != "note")))
+    for row in rows:
+        reasons: dict[str, list[str]] = {}
+        for column in names:
+            value = row.get(column)
+            # Only NaN differs from itself.
+            if value is None or value != value:
+                name, reason = explain(row, column)
+                reasons.setdefault(reason, []).append(name)
+        row.pop("note", None)
+        row["note"] = join_reasons(reasons)
 
 
 # Includes the full-width forms, which spreadsheets treat alike in some languages.

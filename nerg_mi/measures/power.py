@@ -64,12 +64,10 @@ def estimate_power(
     np.ndarray
         Power (C,); NaN if fewer than three participants contribute to a ratio, or the effect exceeds the limit.
     """
+    if find_power_fault(first, second, effect, upper_limit):
+        return np.full(len(counts), np.nan)
     (x, y), (u, v) = first, second
-    if min((x != 0).sum(), (u != 0).sum()) < MIN_PARTICIPANTS:
-        return np.full(len(counts), np.nan)
     recorded, target = u.sum() / v.sum(), x.sum() / y.sum() * (1 + effect)
-    if target > upper_limit:
-        return np.full(len(counts), np.nan)
     strata = (y > 0).astype(int) + 2 * (v > 0)
     num_larger = max((y > 0).sum(), (v > 0).sum())
     power = []
@@ -94,6 +92,15 @@ def estimate_power(
     return np.array(power)
 
 
+def find_power_fault(first: Pair, second: Pair, effect: float, upper_limit: float = np.inf) -> str:
+    """Return why `estimate_power` has no result for these arguments; "" if it has one."""
+    (x, y), (u, _) = first, second
+    if min((x != 0).sum(), (u != 0).sum()) < MIN_PARTICIPANTS:
+        return f"undefined, fewer than {MIN_PARTICIPANTS} participants with values other than 0"
+    target = x.sum() / y.sum() * (1 + effect)
+    return f"undefined, the effect leads to {target:.3g}, above {upper_limit:g}" if target > upper_limit else ""
+
+
 def power_rows(
     areas: Sequence[str],
     cells: Mapping[Cell, Mapping[str, Participants]],
@@ -108,7 +115,7 @@ def power_rows(
 
     Without two cells of a dimension, the table is for two independent groups of which each is like all participants. A
     row has the first keys of those of `nerg_mi.measures.tables.difference_rows`, the ``effect``, and ``power_N`` for
-    N participants; None if the power is undefined or suppressed.
+    N participants; None if the power is undefined or suppressed, and the ``note`` says why.
     """
     pairs = []
     for dimension in dict.fromkeys(cell.dimension for cell in cells):
@@ -133,8 +140,11 @@ def power_rows(
                 one, other = ((x[:, k], y[:, k]) for x, y in (first, second))
                 row: Row = {"cell": dimension, "first": values[0], "second": values[1], "aoi": area}
                 row |= {"measure": measure.name, "effect": effect}
+                note = find_power_fault(one, other, effect, measure.upper_limit)
+                if not min_participants.allows(int(min((one[1] > 0).sum(), (other[1] > 0).sum()))):
+                    note = min_participants.reason
                 power = np.full(len(PARTICIPANT_COUNTS), np.nan)
-                if min_participants.allows(int(min((one[1] > 0).sum(), (other[1] > 0).sum()))):
+                if not note:
                     power = estimate_power(
                         one,
                         other,
@@ -144,7 +154,8 @@ def power_rows(
                         simulations=simulations,
                         seed=seed,
                     )
-                rows.append(row | {f"power_{n}": _finite_or_none(p) for n, p in zip(PARTICIPANT_COUNTS, power)})
+                row |= {f"power_{n}": _finite_or_none(p) for n, p in zip(PARTICIPANT_COUNTS, power)}
+                rows.append(row | {"note": note})
     return rows
 
 

@@ -9,6 +9,8 @@ from typing import Any, overload
 
 import numpy as np
 
+from nerg_mi.files.tables import join_reasons
+
 from .estimates import (
     MIN_PARTICIPANTS,
     Estimates,
@@ -295,6 +297,11 @@ class MinParticipantsFilter:
     minimum: int = 1
     num_suppressed: int = field(default=0)
 
+    @property
+    def reason(self) -> str:
+        """Why a value is suppressed, for notes."""
+        return f"suppressed, fewer than {self.minimum} participants"
+
     def allows(self, num_participants: int) -> bool:
         """Return whether a value of this many participants may be shown. A value without participants may be shown."""
         if 0 < num_participants < self.minimum:
@@ -340,13 +347,13 @@ def aoi_rows(
                     if estimate is None:
                         reason = _NOT_COMPUTED if name in _VISIBILITY_MEASURES else _NOT_PREDICTED
                     elif not is_allowed:
-                        reason = _SUPPRESSED.format(min_participants.minimum)
+                        reason = min_participants.reason
                     elif row[name] is None:
                         reason = f"no {MEASURES_BY_NAME[name].population}"
                     else:
                         reason = _NO_INTERVAL if row[name + "_low"] is None or row[name + "_high"] is None else ""
                     reasons.setdefault(reason, []).append(name)
-                row["note"] = _join_reasons(reasons)
+                row["note"] = join_reasons(reasons)
                 rows_of_source[source].append(row)
         rows += [rows_of_source[source][a] for a in range(len(areas)) for source in sources]
     return rows
@@ -354,19 +361,13 @@ def aoi_rows(
 
 _NOT_COMPUTED, _NOT_PREDICTED = "visibility is not computed", "a gaze field has no time course"
 _VISIBILITY_MEASURES = ("visible", "share_when_visible", "unseen")
-_SUPPRESSED = "suppressed, fewer than {} participants"
 _NO_INTERVAL = f"no interval, fewer than {MIN_PARTICIPANTS} participants with values other than 0, or equal values"
-
-
-def _join_reasons(reasons: Mapping[str, Sequence[str]]) -> str:
-    """Join the reasons of missing values, with the names of the values; "" is no reason."""
-    return "; ".join(f"{', '.join(names)}: {reason}" for reason, names in reasons.items() if reason)
 
 
 def explain_difference(row: Row, has_both: bool, min_participants: MinParticipantsFilter, is_allowed: bool) -> str:
     """Return why a ``row`` has no difference, no interval or no p-value; "" if it has all."""
     if not is_allowed:
-        return _SUPPRESSED.format(min_participants.minimum)
+        return min_participants.reason
     if row["difference"] is None:
         return "undefined, equal values" if has_both else "no participants on one side"
     reasons: dict[str, list[str]] = {"": []}
@@ -374,7 +375,7 @@ def explain_difference(row: Row, has_both: bool, min_participants: MinParticipan
         reasons[_NO_INTERVAL] = ["low, high"]
     elif row["p"] is None:
         reasons["undefined, since no participant differs from the others"] = ["p"]
-    return _join_reasons(reasons)
+    return join_reasons(reasons)
 
 
 def _finite_or_none(value: float) -> float | None:
@@ -449,7 +450,7 @@ def _measure_differences(
 
 def transition_rows(sums: VisitSums, min_participants: MinParticipantsFilter) -> list[Row]:
     """Return the transitions between areas in each cell: ``from``, ``to``, the number of ``transitions``, and their
-    ``share`` of all transitions from that area."""
+    ``share`` of all transitions from that area. The ``note`` says why they are None."""
     rows = []
     for c, cell in enumerate(sums.cells):
         num_participants = len(sums.find_participants(cell)[0])
@@ -458,15 +459,14 @@ def transition_rows(sums: VisitSums, min_participants: MinParticipantsFilter) ->
             is_allowed = min_participants.allows(num_participants)
             n = float(sums.transitions[c, i, j])
             row: Row = {"cell": cell.dimension, "value": cell.value, "from": sums.areas[i], "to": sums.areas[j]}
-            rows.append(
-                row
-                | {"transitions": int(n) if is_allowed else None, "share": n / float(total[i]) if is_allowed else None}
-            )
+            row |= {"transitions": int(n) if is_allowed else None, "share": n / float(total[i]) if is_allowed else None}
+            rows.append(row | {"note": "" if is_allowed else min_participants.reason})
     return rows
 
 
 def duration_rows(sums: VisitSums, min_participants: MinParticipantsFilter) -> list[Row]:
-    """Return the histogram of visit durations of each area and cell; `BINS` are in seconds."""
+    """Return the histogram of visit durations of each area and cell; `BINS` are in seconds. The ``note`` says why
+    counts are None."""
     rows = []
     names = [f"{a:g} to {b:g} s" if np.isfinite(b) else f"{a:g} s or more" for a, b in zip(BINS[:-1], BINS[1:])]
     for c, cell in enumerate(sums.cells):
@@ -474,7 +474,8 @@ def duration_rows(sums: VisitSums, min_participants: MinParticipantsFilter) -> l
         for a, area in enumerate(sums.areas):
             is_allowed = min_participants.allows(num_participants)
             counts = {n: int(v) if is_allowed else None for n, v in zip(names, sums.duration_counts[c, a])}
-            rows.append({"cell": cell.dimension, "value": cell.value, "aoi": area, **counts})
+            note = "" if is_allowed else min_participants.reason
+            rows.append({"cell": cell.dimension, "value": cell.value, "aoi": area, **counts, "note": note})
     return rows
 
 
@@ -575,5 +576,5 @@ class ParticipantRows(Sequence[Row]):
             "visits": int(s.visits[r, a]),
             "time_to_first_visit": first_visit,
             "visible": float(s.visible_time[r, a]) if self._has_visibility else None,
-            "note": _join_reasons(reasons),
+            "note": join_reasons(reasons),
         }

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -84,6 +86,15 @@ def require_gaze(rays: Rays) -> None:
         raise NergError(
             f"eye movements are detected in gaze, but these rays are {TRACKING[rays.tracking]}; use rays of an eye "
             "tracker, or leave out their fixations and events"
+        )
+
+
+def warn_unknown_tracking(tracking: str, warn: Callable[[str], Any]) -> None:
+    """Call ``warn`` with a sentence if eye movements are detected in rays of the ``tracking`` "unknown"."""
+    if tracking == "unknown":
+        warn(
+            "the rays do not state whether they are gaze or directions of heads, and are taken as gaze: import them "
+            'again, or state it in Python (rays.with_tracking("eye"))'
         )
 
 

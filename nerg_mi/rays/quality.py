@@ -368,7 +368,7 @@ def measure_recordings(
                 samples=len(rows),
                 frequency=1 / interval if interval > 0 else float("nan"),
                 effective_frequency=len(rows) / duration,
-                data_loss=100 * (1 - len(rows) * interval / duration),
+                data_loss=_compute_data_loss(t, interval, duration),
                 fixations=len(of_fixations),
                 rms_s2s=float(medians[0]),
                 std=float(medians[1]),
@@ -377,6 +377,17 @@ def measure_recordings(
             )
         )
     return out
+
+
+def _compute_data_loss(t: np.ndarray, interval: float, duration: float) -> float:
+    """Percent of the samples every ``interval`` seconds that the sorted times ``t`` lack, without rounding noise; NaN
+    for an unknown ``duration``."""
+    if not duration > 0:
+        return float("nan")
+    loss = 1 - len(t) * interval / duration
+    # The interval is the difference of two times, each rounded.
+    noise = 4 * np.spacing(np.abs(t[[0, -1]]).max()) / interval
+    return 100 * loss if loss > noise else 0.0
 
 
 def _measure_precision(rays: Rays, events: Events, mask: np.ndarray) -> np.ndarray:
@@ -392,7 +403,9 @@ def _measure_precision(rays: Rays, events: Events, mask: np.ndarray) -> np.ndarr
     is_step = np.diff(run) == 0
     steps = np.sum(np.diff(angles, axis=0)[is_step] ** 2, axis=1)
     deviations = angles - np.stack([mean(column, run) for column in angles.T], axis=1)[run]
-    return np.sqrt(np.stack([mean(steps, run[1:][is_step]), mean(np.sum(deviations**2, axis=1), run)], axis=1))
+    return _drop_noise(
+        np.sqrt(np.stack([mean(steps, run[1:][is_step]), mean(np.sum(deviations**2, axis=1), run)], axis=1))
+    )
 
 
 def _measure_accuracy(rays: Rays, rows: np.ndarray, target: GazeTarget) -> float | None:
@@ -406,4 +419,9 @@ def _measure_accuracy(rays: Rays, rows: np.ndarray, target: GazeTarget) -> float
     right, up, ahead = (
         v.mean() for v in (np.cos(elevation) * np.sin(azimuth), np.sin(elevation), np.cos(elevation) * np.cos(azimuth))
     )
-    return float(np.degrees(np.arctan2(np.hypot(right, up), ahead)))
+    return float(_drop_noise(np.degrees(np.arctan2(np.hypot(right, up), ahead))))
+
+
+def _drop_noise(degrees: np.ndarray) -> np.ndarray:
+    """Angles with 0 in place of those that the rounding of unit vectors explains."""
+    return np.where(np.abs(degrees) < 1e-12, 0.0, degrees)

@@ -15,7 +15,7 @@ from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.figures.style import make_provenance, save
 from nerg_mi.figures.training import psnr_figure
 from nerg_mi.files.images import write_png
-from nerg_mi.files.tables import write_csv
+from nerg_mi.files.tables import add_notes, write_csv
 from nerg_mi.photos.cameras import PosedCamera, resize_by_area
 from nerg_mi.photos.dataset import Dataset
 from nerg_mi.photos.images import PhotoView
@@ -184,9 +184,11 @@ def write_curves_table(path: Path, history: Sequence[dict]) -> None:
     """Write the evaluations of a training as CSV.
 
     ``steps`` and ``seconds`` of training, PSNR in dB of held-out (``psnr``) and training views (``psnr_train``), and
-    the pixel stride (``every_pixel``) of the evaluation.
+    the pixel stride (``every_pixel``) of the evaluation. The ``note`` says why a value is missing.
     """
-    write_csv(path, [{name: row.get(name) for name in CURVE_COLUMNS} for row in history], CURVE_COLUMNS)
+    rows = [{name: row.get(name) for name in CURVE_COLUMNS} for row in history]
+    add_notes(rows, lambda row, column: (column, "there are no such views, or all of their pixels are masked"))
+    write_csv(path, rows, (*CURVE_COLUMNS, "note"))
 
 
 def write_curves_figure(path: Path, history: Sequence[dict], result: dict | None) -> None:

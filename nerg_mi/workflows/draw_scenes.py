@@ -23,7 +23,7 @@ from nerg_mi.interruption import Interruption
 from nerg_mi.maths.types import variant_types
 from nerg_mi.progress import Reporter
 from nerg_mi.rays.dataset import load_rays
-from nerg_mi.rays.events import average_fixations, label_fixations
+from nerg_mi.rays.events import average_fixations, label_fixations, warn_unknown_tracking
 from nerg_mi.rays.filters import find_sessions
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.bands import require_nerg
@@ -339,6 +339,7 @@ def scanpath(files: Sequence[Path], options: ScanpathOptions, reporter: Reporter
     rays = rays.select((rays.t >= low) & (rays.t <= high))
     if not len(rays):
         raise NergError(f'"{path}" has no rays of these participants in this time; change --participants or --start')
+    warn_unknown_tracking(rays.tracking, reporter.warn)
     warn_slow_sampling(rays, options, reporter)
     rules, dispersion = options.event_rules(), options.dispersion_threshold
     fixations, durations = average_fixations(rays, label_fixations(rays, rules, dispersion)[0])

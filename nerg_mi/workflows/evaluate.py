@@ -22,7 +22,13 @@ from nerg_mi.evaluation.baselines import (
 )
 from nerg_mi.evaluation.baselines import PRIOR as PRIOR_BASELINE
 from nerg_mi.evaluation.gaze import EPS, SCORES, SPLITS, CachedBaseline, FieldDensity, format_score_table
-from nerg_mi.evaluation.gaze_report import draw_comparison, format_table, format_uncertainty, write_report
+from nerg_mi.evaluation.gaze_report import (
+    draw_comparison,
+    explain_missing,
+    format_table,
+    format_uncertainty,
+    write_report,
+)
 from nerg_mi.evaluation.uncertainty import (
     average_folds,
     correlate_uncertainty,
@@ -35,7 +41,7 @@ from nerg_mi.figures.style import existing_files, make_provenance
 from nerg_mi.files.atomic import check_folder, file_sha256, write_text
 from nerg_mi.files.dataframes import ResultTables
 from nerg_mi.files.safe_read import read_json
-from nerg_mi.files.tables import write_csv, write_json
+from nerg_mi.files.tables import add_notes, write_csv, write_json
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.probes.probes import REGION_LEVELS, format_level
 from nerg_mi.progress import SILENT, Reporter
@@ -188,6 +194,8 @@ def evaluate_gaze(
     regions = measure_calibration(
         test, calibrated, options.resamples, seed, {_FIELD: stored_regions} if stored_regions else None
     )
+    for table in (rows, persons, places, ranks, regions):
+        add_notes(table, explain_missing)
     files = []
     if output is not None:
         summary = {
@@ -413,6 +421,8 @@ def evaluate_folds(
         populations["anywhere"] = positions
     ranks = [{"split": split, **row} for split, scores in populations.items() for row in correlate_uncertainty(scores)]
     held = [{"split": split, **row} for split, scores in regions.items() for row in average_folds(scores, _LEVELS)]
+    for table in (rows, each, positions, ranks, held):
+        add_notes(table, explain_missing)
     written = _write(output, rows, each, options, positions, ranks, held)
     for path in written:
         reporter.message(f"wrote {path}")

@@ -31,7 +31,7 @@ from nerg_mi.formats.surfaces import extract_points
 from nerg_mi.maths.color import decode_srgb
 from nerg_mi.progress import SILENT, Reporter
 from nerg_mi.rays.dataset import load_rays
-from nerg_mi.rays.events import average_fixations, label_fixations
+from nerg_mi.rays.events import average_fixations, label_fixations, warn_unknown_tracking
 from nerg_mi.rays.rays import TRACKING, Rays
 from nerg_mi.registration import get_plugin_class
 from nerg_mi.rendering.bands import is_nerg, render_aovs
@@ -181,6 +181,7 @@ def _gaze(
     if rays.tracking in ("head", "mixed"):
         reporter.message(f"no fixations are written, since the rays are {TRACKING[rays.tracking]}")
     else:
+        warn_unknown_tracking(rays.tracking, reporter.warn)
         warn_slow_sampling(rays, options, reporter)
         label, kinds = label_fixations(rays, options.event_rules(), options.dispersion_threshold)
     definition = options.event_rules().describe(options.dispersion_threshold)

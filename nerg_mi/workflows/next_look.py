@@ -13,7 +13,7 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation.baselines import UNIFORM_DENSITY, Baseline, make_prior_baseline
 from nerg_mi.evaluation.gaze import EPS, FieldDensity, format_score_table
-from nerg_mi.evaluation.gaze_report import format_table
+from nerg_mi.evaluation.gaze_report import explain_missing, format_table
 from nerg_mi.evaluation.next_look import (
     GRID_DIRECTIONS,
     HEAD_METHODS,
@@ -30,7 +30,7 @@ from nerg_mi.evaluation.next_look import (
 )
 from nerg_mi.files.atomic import check_folder, file_sha256, write_text
 from nerg_mi.files.dataframes import ResultTables
-from nerg_mi.files.tables import write_csv, write_json
+from nerg_mi.files.tables import add_notes, write_csv, write_json
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.probes.probes import compute_participant_weights
@@ -168,6 +168,7 @@ def evaluate_next_look(
     model, table = score_next_look(fit, scored, knots, options.resamples, options.seed, methods)
     if options.head:
         model, table = replace(model, gaze_in_head=gaze_in_head), [{**row, "elapsed": 0.0} for row in table]
+    add_notes(table, explain_missing)
     people = [len(np.unique(sample.person)) for sample in samples]
     result = NextLookEvaluation(model, table, people[0], people[1], kappa, [])
     return result if output is None else replace(result, files=_write(Path(output), gaze, result))

@@ -100,6 +100,7 @@ class FilterSteps:
             min_duration = events.MIN_FIXATION_IVT if by_velocity else events.MIN_FIXATION_IDT
         label = np.zeros(0, np.int64)
         if len(self.rays):
+            events.warn_unknown_tracking(self.rays.tracking, self._reporter.warn)
             label = detect(self.rays, **threshold, min_duration=min_duration)
         count = len(np.unique(label[label >= 0]))
         self._reporter.message(f"{count:,} fixations ({options.fixations})")
@@ -223,6 +224,8 @@ def filter_dataset(path: FileName, options: FilterOptions, reporter: Reporter) -
     """
     dataset, output = RayDataset.open(path), options.output
     steps = _Totals(len(dataset))
+    if options.fixations is not None:
+        events.warn_unknown_tracking(dataset.metadata.get("tracking", "unknown"), reporter.warn)
     if output is not None and Path(output).suffix.lower() == DATASET:
         if options.sample is not None:
             raise NergError("--sample needs a file as output; use an output name that ends in .npz or .parquet")

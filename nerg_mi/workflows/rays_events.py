@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -12,11 +12,12 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.files.atomic import check_writable
-from nerg_mi.files.tables import unescape_formula, write_csv
+from nerg_mi.files.tables import add_notes, unescape_formula, write_csv
 from nerg_mi.files.values import find_names
 from nerg_mi.progress import SILENT, Reporter
 from nerg_mi.rays.dataset import load_rays
-from nerg_mi.rays.events import Events, detect_events
+from nerg_mi.rays.event_settings import FIXATIONS
+from nerg_mi.rays.events import Events, detect_events, warn_unknown_tracking
 from nerg_mi.rays.filters import estimate_interval
 from nerg_mi.rays.quality import GazeTarget, RecordingQuality, measure_recordings
 from nerg_mi.rays.rays import Rays
@@ -48,6 +49,7 @@ def measure_events(
     data = rays if isinstance(rays, Rays) else load_rays(rays)
     targets = [] if options.targets is None else read_targets(options.targets, data.persons)
     reporter.progress(0.2, "detecting events")
+    warn_unknown_tracking(data.tracking, reporter.warn)
     warn_slow_sampling(data, options, reporter)
     events = detect_events(data, options.event_rules())
     result = EventsResult(events, measure_recordings(data, targets, events))
@@ -56,7 +58,10 @@ def measure_events(
         reporter.message(f"{count:,} {kind}: {events.duration[mask].sum():,.1f} s, median {_median(events, mask)}")
     reporter.message(_format_quality(result.quality))
     if options.quality is not None:
-        write_csv(options.quality, [asdict(recording) for recording in result.quality])
+        definition = options.event_rules().describe()
+        rows = [asdict(recording) | definition for recording in result.quality]
+        add_notes(rows, lambda row, column: (column, _NO_QUALITY.get(column, "fewer than two times")))
+        write_csv(options.quality, rows)
         reporter.message(f"wrote {options.quality}")
     return result
 
@@ -66,7 +71,8 @@ def write_events(rays: Path, output: Path, options: RaysEventsOptions, reporter:
     check_writable(output, ".csv")
     data = load_rays(rays)
     result = measure_events(data, options, reporter)
-    write_csv(output, _iterate_rows(data, result.events), _COLUMNS)
+    definition = options.event_rules().describe()
+    write_csv(output, _iterate_rows(data, result.events, definition), [*_COLUMNS, *definition, "note"])
     reporter.message(f"wrote {output}")
 
 
@@ -75,15 +81,30 @@ _COLUMNS = ["participant", "onset", "duration", "kind", "amplitude", "peak_veloc
 _COLUMNS += [f"{name}_{axis}" for name in _VECTORS for axis in "xyz"]
 
 
-def _iterate_rows(rays: Rays, events: Events) -> Iterator[dict[str, Any]]:
-    """Rows of the table: seconds, degrees, and metres in the frame of rays."""
+_NO_QUALITY = {"rms_s2s": "no fixations", "std": "no fixations", "accuracy": "no targets with samples"}
+
+
+def _explain_missing(row: Mapping[str, Any], column: str) -> tuple[str, str]:
+    """Return the name of a missing value of an event, and why it is missing."""
+    if column == "peak_velocity":
+        return column, "there are no samples in a pause"
+    name = column.removesuffix("_x").removesuffix("_y").removesuffix("_z")
+    if row["kind"] in (*FIXATIONS, "smooth_pursuit"):
+        return name, "no hit points"
+    return name, "of fixations and pursuits only"
+
+
+def _iterate_rows(rays: Rays, events: Events, definition: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+    """Rows of the table: seconds, degrees, metres in the frame of rays, and the definition of events."""
     values = np.column_stack(
         [events.onset, events.duration, events.amplitude, events.peak_velocity, events.direction, events.point]
     )
     names = [name for name in _COLUMNS if name not in ("participant", "kind")]
     persons = rays.person[events.first].tolist()
     for person, kind, row in zip(persons, events.kind.tolist(), values.tolist()):
-        yield {"participant": rays.persons[person], "kind": kind, **dict(zip(names, row))}
+        event = {"participant": rays.persons[person], "kind": kind, **dict(zip(names, row)), **definition}
+        add_notes([event], _explain_missing)
+        yield event
 
 
 def read_targets(path: Path, participants: Sequence[str]) -> list[GazeTarget]:

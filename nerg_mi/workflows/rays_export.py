@@ -22,7 +22,7 @@ from nerg_mi.progress import SILENT, Reporter
 from nerg_mi.rays.bids import BidsEvents, write_bids
 from nerg_mi.rays.dataset import load_rays
 from nerg_mi.rays.event_settings import KINDS
-from nerg_mi.rays.events import Events, detect_events
+from nerg_mi.rays.events import Events, detect_events, warn_unknown_tracking
 from nerg_mi.rays.rays import Rays
 
 from .base import select_backend
@@ -52,11 +52,7 @@ def export_rays(
     check_new_folder(output)
     reporter.progress(0.0, "reading rays")
     data = rays if isinstance(rays, Rays) else load_rays(rays)
-    if data.tracking == "unknown":
-        reporter.warn(
-            "the rays do not state whether they are gaze or directions of heads, and are exported as gaze: import them "
-            'again, or state it in Python (rays.with_tracking("eye"))'
-        )
+    warn_unknown_tracking(data.tracking, reporter.warn)
     parts = [_find_events(data, options, reporter)] if options.events else []
     if options.aois is not None:
         reporter.progress(0.2, "finding visits")
@@ -145,6 +141,7 @@ def _describe(events: BidsEvents | None) -> dict[str, dict[str, Any]]:
     """Descriptions of the columns of events."""
     if events is None:
         return {}
+    of_gaze, of_fixations = "; n/a for visits", "; n/a except for fixations and pursuits"
     levels = {**KINDS, "visit": "gaze on an area of interest"}
     present = {str(kind) for kind in np.unique(events.kind)}
     out: dict[str, dict[str, Any]] = {
@@ -153,13 +150,22 @@ def _describe(events: BidsEvents | None) -> dict[str, dict[str, Any]]:
             "Levels": {kind: f"{text[:1].upper()}{text[1:]}." for kind, text in levels.items() if kind in present},
         },
         "area": {"Description": "Name of the area of interest of a visit."},
-        "amplitude": {"Description": "Angle between the first and the last direction in the world.", "Units": "deg"},
-        "peak_velocity": {"Description": "Peak angular velocity of gaze in the world.", "Units": "deg/s"},
+        "amplitude": {
+            "Description": f"Angle between the first and the last direction in the world{of_gaze}.",
+            "Units": "deg",
+        },
+        "peak_velocity": {
+            "Description": f"Peak angular velocity of gaze in the world{of_gaze}, and in pauses.",
+            "Units": "deg/s",
+        },
     }
     for axis in "xyz":
-        out[f"{axis}_coordinate"] = {"Description": f"Mean point of regard in the world, {axis}.", "Units": "m"}
+        out[f"{axis}_coordinate"] = {
+            "Description": f"Mean point of regard in the world, {axis}{of_fixations}, and without hit points.",
+            "Units": "m",
+        }
         out[f"direction_{axis}"] = {
-            "Description": f"Mean direction of gaze in the world, {axis}.",
+            "Description": f"Mean direction of gaze in the world, {axis}{of_fixations}.",
             "Units": "arbitrary",
         }
     return out

@@ -35,6 +35,7 @@ from nerg_mi.measures.tables import MIN_VIEWPOINTS, MinParticipantsFilter
 from nerg_mi.measures.visits import ALL, BoxAoi, Cell
 from nerg_mi.progress import SILENT
 from nerg_mi.transport.geometry import SceneGeometry
+from tests.notes import find_wrong_notes
 from tests.workflows.recorder import Recorder
 
 from .place import write_place
@@ -231,16 +232,23 @@ def test_uncertainty_of_each_cell():
     assert field["share_spread"] == pytest.approx(0.1 / np.sqrt(2))
     assert field["dwell_spread"] == pytest.approx((0.2 * 2 + 0.4 * 6 - 0.2 * 2 - 0.2 * 6) / 2 / np.sqrt(2))
     assert zone["share_spread"] == pytest.approx(0.1 / np.sqrt(2)) and 0 < zone["hit_ratio_spread"] < 1
+    assert tracked["note"] and not field["note"] and not zone["note"]
 
 
 def test_uncertainty_is_none_for_single_fields_and_suppressed_rows():
     result = rows()
     add_uncertainty(result, make_prediction([0.1, 0.3, 0.4]), TRUST_EYES, TIMES, 0.3)
     assert all(row["share_spread"] is None for row in result)
+    assert all("share_spread" in row["note"] for row in result) and result[0]["note"] != result[1]["note"]
+    unknown = rows()
+    add_uncertainty(unknown, make_prediction([0.1, 0.3, 0.4], support=(np.nan,) * 3), TRUST_EYES, TIMES, 0.3)
+    assert all("support" in row["note"] for row in unknown)
     blank = [row | {"participants": None, "share": None} for row in rows()]
     add_uncertainty(blank, make_prediction([0.1, 0.3, 0.4], [0.2, 0.2, 0.2]), TRUST_EYES, TIMES, 0.3)
     assert all(row["share_spread"] is row["support"] is None for row in blank)
     assert blank[1]["dwell_spread"] is not None
+    assert all("share_spread" in r["note"] and "viewpoints" in r["note"] for r in blank)
+    assert "dwell_spread" not in blank[1]["note"]
 
 
 def test_missing_support_is_reported():
@@ -309,6 +317,11 @@ def test_what_if_pairs_participants(tmp_path):
     assert share["support"] == 5 and share["source"] == "predicted" and share["participants"] == 5
     assert result["b", "visible"]["after"] == 1 and result["b", "visible"]["before"] == 0
     assert areas.boxes[0].lower[0] == 5 and observers is WHAT_IF_EYES and len(aois) == 2
+    assert not find_wrong_notes(result.values()) and "difference_spread" in share["note"]
+    after = texts([[0.2, 0.1], [0.3, 0.1], [0.21, 0.1], [0.29, 0.1], [0.25, 0.1]], support=np.nan, members=2)
+    result, _ = rows_what_if(tmp_path, {"move": [{"area": "a", "by": [5, 0, 0]}]}, after, members=2)
+    assert not find_wrong_notes(result.values()) and result["a", "share"]["difference_spread"] is not None
+    assert "support" in result["a", "share"]["note"]
 
 
 def test_what_if_with_other_observers(tmp_path):
@@ -322,6 +335,7 @@ def test_what_if_suppresses_few_participants(tmp_path):
     floor = MinParticipantsFilter(9)
     result, _ = rows_what_if(tmp_path, {"shift": [0, 0, 1]}, texts([[0.2, 0.1]] * 5), floor)
     assert all(r["before"] is None and r["difference"] is None for r in result.values()) and floor.num_suppressed == 4
+    assert not find_wrong_notes(result.values())
 
 
 def test_what_if_spread_over_members(tmp_path):

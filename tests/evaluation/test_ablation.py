@@ -23,6 +23,7 @@ from nerg_mi.evaluation.ablation import (
 from nerg_mi.maths.geometry import Box
 from nerg_mi.train.geometry import TrainingGeometry, load_field_geometry, load_scene_geometry, make_hit_geometry
 from tests.formats.splats.writers import random_splats, write_inria
+from tests.notes import find_wrong_notes
 from tests.plugins import fields
 from tests.train.gaze.looks import looking_at
 
@@ -76,8 +77,11 @@ def test_files(tmp_path):
     files = write_ablation(tmp_path, rows(), "notes")
     assert all(f.stat().st_size > 50 for f in files)
     with open(files[1]) as f:
-        assert list(csv.DictReader(f).fieldnames) == list(COLUMNS)
-    assert len(json.loads(files[2].read_text())["summary"]) == 3
+        table = csv.DictReader(f)
+        assert list(table.fieldnames or ()) == [*COLUMNS, "note"]
+        assert not find_wrong_notes(table)
+    summary = json.loads(files[2].read_text())["summary"]
+    assert len(summary) == 3 and all("test_loss.spread" in r["note"] for r in summary if r["seeds"] == 1)
 
 
 def test_the_loss_is_the_papers():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import math
 
 import numpy as np
@@ -10,6 +11,7 @@ from matplotlib.colors import to_rgba
 
 from nerg_mi.evaluation import study_tables
 from nerg_mi.evaluation import study_tables as study_plots
+from tests.notes import find_wrong_notes
 
 # ---- The figures of a study: content of matplotlib's figures ----
 
@@ -83,6 +85,16 @@ def test_cost_is_drawn_over_named_axes_with_the_exponent(drawn):
 
 
 # ---- Results from the rows of a study: Pareto fronts, and the comparison with the paper's marching ----
+
+
+def test_missing_values_have_a_reason(monkeypatch, tmp_path):
+    monkeypatch.setattr(study_tables, "format_report", lambda report: "")
+    table = [dict.fromkeys(study_tables.COLUMNS, 1.0), {"setting": "gaze only", "gaze_mae": 0.1}]
+    paths = study_tables.write_tables(tmp_path, {"rows": table, "scaling": SCALING})
+    with open(paths[0], encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert not find_wrong_notes(rows) and [bool(row["note"]) for row in rows] == [False, True]
+    assert not find_wrong_notes(table)
 
 
 def test_pareto():

@@ -8,7 +8,7 @@ import os
 import numpy as np
 import pytest
 
-from nerg_mi.files.tables import format_markdown_table, unescape_formula, write_csv, write_json
+from nerg_mi.files.tables import add_notes, format_markdown_table, unescape_formula, write_csv, write_json
 
 
 def test_rows_round_trip_with_empty_cells(tmp_path):
@@ -18,6 +18,18 @@ def test_rows_round_trip_with_empty_cells(tmp_path):
         assert list(csv.DictReader(file)) == [{"a": "1", "b": 'é, "x"', "c": ""}, {"a": "2.5", "b": "", "c": "2\n3"}]
     write_csv(path, [{"a": 1, "b": math.nan}], ("b", "a"))
     assert path.read_bytes() == b"b,a\r\n,1\r\n"
+
+
+def test_notes_say_why_values_are_missing():
+    """None, NaN, absent keys and columns without any value; the note is the last key, also the second time."""
+    rows = [{"a": 1, "b": math.nan, "note": "old"}, {"a": None, "b": 2.0, "c": 0}, {"a": 0, "b": "", "c": False}]
+    explain = lambda row, column: (column, "too dark" if column == "c" else f"no {column}")
+    for _ in range(2):
+        add_notes(rows, explain)
+        assert [row["note"] for row in rows] == ["b: no b; c: too dark", "a: no a", ""]
+        assert all(list(row)[-1] == "note" for row in rows)
+    add_notes(rows, lambda row, column: ("all", "unknown"), ["d"])
+    assert [row["note"] for row in rows] == ["all: unknown"] * 3
 
 
 def test_failing_table_keeps_old_file(tmp_path):

@@ -9,6 +9,7 @@ from scipy import stats
 from nerg_mi.measures.power import PARTICIPANT_COUNTS, estimate_power, power_rows
 from nerg_mi.measures.tables import MEASURED, MinParticipantsFilter, Participants
 from nerg_mi.measures.visits import ALL, Cell
+from tests.notes import find_wrong_notes
 
 COUNTS = (8, 16, 32)
 
@@ -102,4 +103,17 @@ def test_rows_of_cells_and_of_all_participants():
     assert alone["cell"] == "all" and alone["power_96"] > alone["power_8"]
     floor = MinParticipantsFilter(9)
     (blank,) = power_rows(("x",), cells, floor, 0.5, **options)
-    assert blank["power_96"] is None and floor.num_suppressed == 1
+    assert blank["power_96"] is None and floor.num_suppressed == 1 and "suppressed" in blank["note"]
+
+
+def test_undefined_power_has_a_reason():
+    """Two contributors, a share above 1, and a power that is defined."""
+    rng = np.random.default_rng(4)
+    few, many = people("ab", 5, rng), people("abcdefgh", 80, rng)
+    options = {"seed": 0, "simulations": 9, "measures": ("share",)}
+    rows = [
+        power_rows(("x",), {ALL: {MEASURED: who}}, MinParticipantsFilter(), effect, **options)[0]
+        for who, effect in ((few, 0.5), (many, 5.0), (many, 0.01))
+    ]
+    assert not find_wrong_notes(rows)
+    assert [bool(row["note"]) for row in rows] == [True, True, False] and rows[0]["note"] != rows[1]["note"]

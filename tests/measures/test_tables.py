@@ -20,6 +20,7 @@ from nerg_mi.measures.tables import (
     transition_rows,
 )
 from nerg_mi.measures.visits import ALL, BINS, Cell, VisitSums
+from tests.notes import find_wrong_notes
 
 # ---- Measures ----
 
@@ -244,8 +245,13 @@ def test_transitions_and_durations():
         ("y", "x", 1, 1.0),
     ]
     assert all(r["transitions"] is None for r in transition_rows(sums_tables(), MinParticipantsFilter(3)))
+    for make in (transition_rows, duration_rows):
+        for minimum in (1, 3):
+            assert not find_wrong_notes(
+                [r | {"value": "x"} for r in make(sums_tables(), MinParticipantsFilter(minimum))]
+            )
     lasted = duration_rows(sums_tables(), MinParticipantsFilter())
-    assert len(lasted) == 2 and lasted[0]["0.2 to 0.5 s"] == 3 and len(lasted[0]) == 3 + len(BINS) - 1
+    assert len(lasted) == 2 and lasted[0]["0.2 to 0.5 s"] == 3 and len(lasted[0]) == 4 + len(BINS) - 1
 
 
 def test_markdown_format():

@@ -236,6 +236,21 @@ def test_quality_of_recordings_that_are_too_short():
         GazeTarget(2, 1, (0, 0, 0))
 
 
+@pytest.mark.parametrize("start", [0.0, 12.34, 5e4, 1.7e9])
+@pytest.mark.parametrize("rate", [60, 90, 120, 1000])
+def test_rounding_is_no_data_loss(start, rate):
+    """Nor an angle: gaze rests in one direction; one sample of 600 is a loss."""
+    t = start + np.arange(600) / rate
+    d = np.tile([0.6, 0.64, 0.48], (600, 1))
+    (quality,) = measure_recordings(some_rays(600, t=t, direction=d))
+    assert (quality.data_loss, quality.rms_s2s, quality.std) == (0, 0, 0) and quality.fixations > 0
+    (quality,) = measure_recordings(some_rays(599, t=np.delete(t, 300), direction=d[1:]))
+    assert quality.data_loss == pytest.approx(100 / 600, rel=0.1)
+    # Samples that are closer than their median interval are no negative loss.
+    (quality,) = measure_recordings(some_rays(600, t=np.sort(np.r_[t[:400], t[:200] + 0.5 / rate])))
+    assert quality.data_loss >= 0
+
+
 @pytest.mark.parametrize("rate", [60, 72, 90, 120, 240, 1000])
 def test_rates_of_times_in_milliseconds(rate):
     """The median interval at 60 Hz in whole milliseconds is 17 ms, which is 58.8 Hz."""

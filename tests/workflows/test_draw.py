@@ -414,7 +414,9 @@ def test_fixations_are_numbered_where_they_are(rgb, tmp_path):
     t = np.arange(3 * n) / 60 + np.repeat([0, 0.5, 1.0], n)
     Rays(t, np.zeros(3 * n), ("Ada", "Bob"), origin, direction, np.ones(3 * n)).save(tmp_path / "rays.npz")
     options = dict(scene=tmp_path / "scene.xml", mode="llvm_ad_rgb", spp=2)
-    axes = draw("scanpath", tmp_path / "rays.npz", **options).axes[0]
+    recorder = Recorder()
+    axes = draw("scanpath", [tmp_path / "rays.npz"], None, recorder, **options).axes[0]
+    assert sum("heads" in line for line in recorder.warnings) == 1
     assert [t.get_text() for t in axes.texts][:2] == ["1", "3"]
     offset = targets[[0, 2]] - (0, -4, 1)
     scale = 30 / np.tan(np.radians(30)) / offset[:, 1]

@@ -97,6 +97,13 @@ def test_heads_have_no_fixations_and_are_named(rgb, folder, monkeypatch):
     assert scene.rays[0].origin_name == "heads" and any("heads" in line for line in recorder.messages)
 
 
+@pytest.mark.parametrize("tracking", ["unknown", "eye"])
+def test_unknown_tracking_is_reported_once(rgb, folder, monkeypatch, tracking):
+    rays().with_tracking(tracking).save(folder / "rays.npz")
+    _, recorder = exported(folder, "rays.npz", monkeypatch=monkeypatch)
+    assert sum("heads" in line for line in recorder.warnings) == (tracking == "unknown")
+
+
 def test_a_scene_has_its_meshes_cameras_and_gaze(rgb, folder, monkeypatch):
     options = dict(width=64, spp=2, max_points=500)
     scene, recorder = exported(folder, "scene.xml", monkeypatch=monkeypatch, **options)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from nerg_mi.alignment.check import read_similarity
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation import ablation as scoring
 from nerg_mi.evaluation.gaze import SCORES
+from nerg_mi.evaluation.gaze_report import read_results
 from nerg_mi.evaluation.next_look import HEAD_METHODS, NextLook
 from nerg_mi.files.tables import write_json
 from nerg_mi.formats.fields import load_gaze
@@ -39,6 +41,7 @@ from nerg_mi.workflows.train_gaze import learn_prior, train_gaze
 from tests.conftest import ROOT
 from tests.evaluation.test_gaze import crowd
 from tests.formats.splats.writers import random_splats, write_inria
+from tests.notes import find_wrong_notes
 from tests.plugins import fields
 from tests.tasks.clusters import ClusterOfProcesses, wait_until
 from tests.train.gaze.looks import BOX, around, looking_at
@@ -65,6 +68,12 @@ def test_scores_are_listed_with_the_baselines(trained, tmp_path):
     assert len(result.by_position) == result.positions and {row["group"] for row in result.by_position} == {"0"}
     assert all(row["support"] >= 0 and row["KLD"] > 0 for row in result.by_position)
     assert {row["method"] for row in result.calibration} >= {"gaze field", "nearest rays"}
+    for name in result.TABLES:
+        assert not find_wrong_notes(getattr(result, name)), name
+    for name in ("gaze.csv", "persons.csv", "positions.csv"):
+        with open(tmp_path / "eval" / name, encoding="utf-8", newline="") as file:
+            assert not find_wrong_notes(csv.DictReader(file)), name
+    assert read_results(tmp_path / "eval" / "gaze.json").rows[0]["note"] == result.rows[0]["note"]
     # Calibrated on the data that the folds of the training held out.
     assert result.calibration[1]["method"] == "gaze field, calibrated"
     data = json.loads((tmp_path / "eval" / "gaze.json").read_text())
@@ -107,6 +116,7 @@ def test_the_next_look_is_fitted_and_scored(tmp_path, rgb):
     result = evaluate_next_look(gaze, rays, tmp_path / "next", options)
     assert {row["elapsed"] for row in result.rows} == {1.0, 3.0} and (result.fitted, result.scored) == (2, 2)
     assert [path.name for path in result.files] == ["next.md", "next.csv", "next.json"]
+    assert not find_wrong_notes(result.rows) and result.rows[0]["note"]
     written = json.loads((tmp_path / "next" / "next.json").read_text())
     assert NextLook.from_json(written["model"]).weights == pytest.approx(result.model.weights)
     assert written["rows"][0]["bits"] == result.rows[0]["bits"] and result.rows[0]["looks"] <= 64
@@ -225,6 +235,36 @@ def test_stored_folds_are_not_trained_again(tmp_path, folds_trained):
     assert go(crowd(301)) == [0, 1] and go(steps=3) == [0, 1] and go(threads=2) == []
     (job,) = account_for_store(tmp_path / "store").jobs
     assert (job.name, job.total, job.remaining) == (f"nerg eval folds {tmp_path / 'out'}", 2, 0)
+
+
+def test_missing_values_of_folds_have_a_reason(tmp_path, monkeypatch):
+    """One fold has too few participants for intervals, no samples at own origins, and no split half."""
+
+    def score(common, seed, output):
+        rows = [{"method": name, **dict.fromkeys(SCORES, 0.5 + seed), "integral": 1.0} for name in ("gaze field", "b")]
+        position = {"x": 0.0, "y": 0.0, "z": 0.0, "group": "0", "KLD": 1.0, "support": 3.0}
+        region = {"method": "gaze field", "80%": 0.8}
+        if seed:
+            rows[0] |= {"bits.low": 0.0, "bits.high": 2.0}
+            rows[1] |= {"bits.low": 0.0, "bits.high": 2.0, "bits.gap": 0.0, "bits.gap.low": 0.0, "bits.gap.high": 0.1}
+            rows.append({"method": "split half", "bits": 0.5})
+            position |= {"half": 0.5, "excess": 0.5}
+            region |= {"80%.low": 0.7, "80%.high": 0.9}
+        else:
+            rows[1] |= {"bits at own origin": np.nan, "bits.gap": 0.0}
+        tables = {"rows": rows, "by_position": [position], "calibration": [region]}
+        write_json(output / SCORED, dict.fromkeys(common.splits, tables), allow_nan=True)
+
+    score.__qualname__ = "train_and_score"
+    monkeypatch.setattr(evaluate, "train_and_score", score)
+    result = evaluate_folds(crowd(300), tmp_path / "out", FoldOptions(**SMALL))
+    for name in result.TABLES:
+        assert getattr(result, name) and not find_wrong_notes(getattr(result, name)), name
+    for name in ("folds.csv", "positions.csv"):
+        with open(tmp_path / "out" / name, encoding="utf-8", newline="") as file:
+            assert not find_wrong_notes(csv.DictReader(file)), name
+    notes = {row["note"] for row in result.each if row["fold"] == 0}
+    assert any("participants" in note for note in notes) and any("own origin" in note for note in notes)
 
 
 def test_wrong_fold_options_are_refused(tmp_path):

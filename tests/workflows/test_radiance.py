@@ -141,6 +141,7 @@ def test_small_views_have_no_scores(cube, tmp_path):
     evaluate_radiance(out, cube, RadianceScoreOptions(holdout=3, width=1, spp=1, json_file=table), recorder)
     scores = json.loads(table.read_text())
     assert scores["ssim"] == scores["psnr_fitted"] == [None] and scores["psnr_mean"] > 0
+    assert "ssim" in scores["notes"][0] and "psnr_fitted" in scores["notes"][0]
     assert not any("nan" in text for text in recorder.messages) and "11 x 11" in recorder.warnings[-1]
 
 

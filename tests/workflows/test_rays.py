@@ -150,7 +150,7 @@ def test_an_unwritable_output_is_refused_before_the_import(tmp_path, walk):
 
 
 def test_filter_does_not_modify_its_input(walk):
-    rays, heard = Rays.load(walk), Heard()
+    rays, heard = Rays.load(walk).with_tracking("eye"), Heard()
     before = [column.copy() for column in columns(rays)]
     options = FilterOptions(persons=["a", "c"], start=10, end=30, fixations="idt", dispersion_threshold=30, thin=1)
     result = filter_rays(rays, options, heard)
@@ -161,6 +161,21 @@ def test_filter_does_not_modify_its_input(walk):
     from_file = filter_rays(walk, options)
     assert all(np.array_equal(a, b, equal_nan=True) for a, b in zip(columns(from_file.rays), columns(result.rays)))
     assert filter_rays(rays, FilterOptions(start=10)).fixations is None
+
+
+def test_fixations_of_unknown_tracking_are_reported_once(walk):
+    for tracking in ("unknown", "eye"):
+        recorder = Recorder()
+        for options in (FilterOptions(fixations="ivt"), FilterOptions(start=0)):
+            filter_rays(Rays.load(walk).with_tracking(tracking), options, recorder)
+        assert sum("heads" in line for line in recorder.warnings) == (tracking == "unknown")
+
+
+def test_fixations_of_a_dataset_of_unknown_tracking_are_reported_once(parquet, walk, tmp_path):
+    folder, recorder = write_dataset_of(Rays.load(walk), tmp_path / "walk.rays"), Recorder()
+    options = FilterOptions(fixations="idt", dispersion_threshold=30, output=tmp_path / "few.rays")
+    filter_rays(folder, options, recorder)
+    assert sum("heads" in line for line in recorder.warnings) == 1
 
 
 def test_filter_selects_one_ray_per_fixation(walk):
@@ -358,10 +373,14 @@ def test_impossible_filters_of_datasets_are_refused(parquet, tmp_path, monkeypat
 def crowded(tmp_path_factory):
     """A dataset of 3,000 rays of four participants in a corridor."""
     pytest.importorskip("pyarrow", reason="datasets need the extra parquet")
-    folder = tmp_path_factory.mktemp("crowded") / "corridor.rays"
+    return write_dataset_of(evaluated_crowd(3000), tmp_path_factory.mktemp("crowded") / "corridor.rays")
+
+
+def write_dataset_of(rays, folder):
+    """A dataset of ``rays``, which does not state their tracking."""
     write_dataset_manifest(folder, DatasetManifest(2))
     writer = SourceWriter(folder, "0" * 32, 2)
-    writer.add(evaluated_crowd(3000), "corridor")
+    writer.add(rays, "corridor")
     writer.finish({"frame": dict(FRAME)}, file="a", where="w", stamp=None, recipe="r", generation=0)
     return folder
 

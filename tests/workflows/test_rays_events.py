@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.rays.rays import Rays
 from nerg_mi.workflows.rays_commands import RaysEventsOptions
 from nerg_mi.workflows.rays_events import measure_events, write_events
+from tests.notes import find_wrong_notes
 from tests.rays.people import some_rays
 
 from .recorder import Recorder
@@ -41,9 +43,14 @@ def test_tables(looks, tmp_path, person):
     assert [row["participant"] for row in rows] == ["ann"] * 3 + ["bo"] * 3
     assert float(rows[1]["amplitude"]) == pytest.approx(90) and float(rows[1]["onset"]) == pytest.approx(0.49)
     assert [float(rows[2][f"{name}_y"]) for name in ("direction", "point")] == pytest.approx([1, 3])
-    assert rows[1]["direction_x"] == ""
+    assert rows[1]["direction_x"] == "" and not find_wrong_notes(rows)
+    assert {name: rows[0][name] for name in ("velocity", "min_fixation")} == {
+        "velocity": "100.0",
+        "min_fixation": "0.06",
+    }
     with open(tmp_path / "quality.csv") as file:
         first, second = csv.DictReader(file)
+    assert not find_wrong_notes([first, second]) and first["algorithm"] == rows[0]["algorithm"]
     # One target is met, the other one is 45 degrees above; bo has the second one only.
     assert (first["targets"], second["targets"]) == ("2", "1")
     assert float(first["accuracy"]) == pytest.approx(22.5) and float(second["accuracy"]) == pytest.approx(45)
@@ -56,9 +63,37 @@ def test_options_are_used(looks):
     assert "saccade" not in measure_events(looks, options).events.count()
 
 
+def test_tables_state_their_definition_and_missing_values(looks, tmp_path):
+    """Without hit points, without targets, with a pause, and one participant with a single sample."""
+    one = looks.select((looks.person == 0) | (looks.t == 0))
+    rays = replace(one.select((one.t < 0.2) | (one.t > 0.3)), hit=None).with_tracking("eye")
+    rays.save(tmp_path / "rays.npz")
+    options = RaysEventsOptions(velocity_threshold=80.0, min_fixation=0.05, quality=tmp_path / "quality.csv")
+    recorder = Recorder()
+    write_events(tmp_path / "rays.npz", tmp_path / "events.csv", options, recorder)
+    with open(tmp_path / "events.csv") as file:
+        rows = list(csv.DictReader(file))
+    definition = options.event_rules().describe()
+    assert all({name: row[name] for name in definition} == {k: str(v) for k, v in definition.items()} for row in rows)
+    assert rows and not find_wrong_notes(rows) and not recorder.warnings
+    notes = {row["kind"]: row["note"] for row in rows}
+    assert "hit" in notes["fixation"] and "peak_velocity" in notes["blink"] and "pursuits" in notes["saccade"]
+    with open(tmp_path / "quality.csv") as file:
+        quality = list(csv.DictReader(file))
+    assert not find_wrong_notes(quality) and "accuracy" in quality[0]["note"] and "frequency" in quality[1]["note"]
+    assert all(row["velocity"] == "80.0" for row in quality)
+
+
+@pytest.mark.parametrize("tracking", ["unknown", "eye"])
+def test_rays_of_unknown_tracking_are_reported_once(looks, tracking):
+    recorder = Recorder()
+    measure_events(looks.with_tracking(tracking), reporter=recorder)
+    assert [("heads" in text) for text in recorder.warnings] == ([True] if tracking == "unknown" else [])
+
+
 def test_slow_samples_are_reported(looks):
     slow = some_rays(20, t=0.5 * np.arange(20))
-    reporter = Recorder()
+    slow, reporter = slow.with_tracking("eye"), Recorder()
     assert set(measure_events(slow, reporter=reporter).events.count()) == {"blink"}
     assert any("--max-step" in warning for warning in reporter.warnings)
     reporter = Recorder()

@@ -160,7 +160,7 @@ def test_outputs_are_updated_at_each_evaluation(dataset, tmp_path, monkeypatch):
         rows = list(csv.DictReader(file))
     assert [int(row["steps"]) for row in rows] == [row["steps"] for row in history]
     assert [float(row["psnr"]) for row in rows] == [row["psnr"] for row in history]
-    assert set(rows[0]) == {"steps", "seconds", "psnr", "psnr_train", "every_pixel"}
+    assert set(rows[0]) == {"steps", "seconds", "psnr", "psnr_train", "every_pixel", "note"}
     # The last evaluation has the time of the last step, and not that of the occupancy extraction after it.
     assert float(rows[-1]["seconds"]) == provenance["seconds"]  # noqa: RUF069 (stored)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.curves.csv", "a.curves.png", "a.preview.png"]
