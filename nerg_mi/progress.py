@@ -69,7 +69,8 @@ class TerminalReporter:
     Messages go to the standard output, and warnings to the standard error. The progress bar is on the standard error,
     if that is a terminal; pipes and files never contain it. Otherwise the standard error gets a line every ten seconds,
     also during a long step. The remaining time is added, extrapolated from the progress so far, or the elapsed time if
-    that is not possible.
+    that is not possible: before any progress, and in a step that has reported none for ten seconds, since an estimate
+    would grow with the time that it takes.
     """
 
     def __enter__(self) -> TerminalReporter:
@@ -77,7 +78,7 @@ class TerminalReporter:
         self._lock = threading.Lock()
         self._printed = time.monotonic()
         self._begun: float | None = None
-        self._counted = self._printed
+        self._counted = self._advanced = self._printed
         self._now = (0.0, "")
         self._ended = threading.Event()
         self._pulse: threading.Thread | None = None
@@ -100,6 +101,8 @@ class TerminalReporter:
         if fraction <= 0:
             # Preparation and earlier phases do not count for the extrapolation.
             self._counted = time.monotonic()
+        if fraction != self._now[0]:
+            self._advanced = time.monotonic()
         self._now = (fraction, text)
         if self._bar is not None:
             self._show(fraction)
@@ -117,10 +120,10 @@ class TerminalReporter:
         elapsed = 0.0 if self._begun is None else time.monotonic() - self._begun
         if text.endswith(" left") or " left, " in text:
             return text
-        counted = time.monotonic() - self._counted
+        counted, waiting = self._advanced - self._counted, time.monotonic() - self._advanced
         # At 1 the last step still runs, for a time that the fraction does not tell.
-        if 0.01 < share < 1 and counted >= ESTIMATE_AFTER:
-            rest = f"{duration(counted * (1 - share) / share)} left"
+        if 0.01 < share < 1 and counted + waiting >= ESTIMATE_AFTER and waiting < LOG_INTERVAL:
+            rest = f"{duration(max(0.0, counted * (1 - share) / share - waiting))} left"
         elif elapsed >= LOG_INTERVAL and self._bar is None:
             rest = f"{duration(elapsed)} so far"
         else:

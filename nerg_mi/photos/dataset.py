@@ -53,6 +53,8 @@ _UNIT_FACTORS = (1e-3, 1e-2, 0.1, 0.2, 5.0, 10.0, 100.0, 1e3)
 _COMPARED_VIEWS, _COMPARED_POINTS = 16, 100
 # Maximum relative difference of matching distances, and the increase in matches that confirms another unit.
 _DEPTH_TOLERANCE, _MIN_AGREEMENT_GAIN = 0.05, 0.2
+# Minimum number of points that other views see in another unit; fewer may agree by chance.
+_MIN_COMPARISONS = 20
 
 
 @dataclass(frozen=True)
@@ -294,7 +296,7 @@ def explain_wrong_depth(views: list[tuple[PosedCamera, np.ndarray]]) -> str | No
     compared = [(c, d, depth_points(c, d, _COMPARED_POINTS) - c.center) for c, d in selected]
     agreement = _compute_agreement(compared, 1.0)
     if agreement <= 1 - _MIN_AGREEMENT_GAIN:
-        best, factor = max((_compute_agreement(compared, f), f) for f in _UNIT_FACTORS)
+        best, factor = max((_compute_agreement(compared, f, _MIN_COMPARISONS), f) for f in _UNIT_FACTORS)
         if best >= _MIN_AGREEMENT_GAIN + max(agreement, _compute_agreement(compared, 10 * factor)):
             return (
                 f"{best:.0%} of its points agree with the depth of other views after multiplication by {factor:g}, but "
@@ -307,9 +309,11 @@ def explain_wrong_depth(views: list[tuple[PosedCamera, np.ndarray]]) -> str | No
     return None
 
 
-def _compute_agreement(views: list[tuple[PosedCamera, np.ndarray, np.ndarray]], factor: float) -> float:
+def _compute_agreement(
+    views: list[tuple[PosedCamera, np.ndarray, np.ndarray]], factor: float, min_count: int = 1
+) -> float:
     """Return the fraction of depth points, scaled by ``factor``, that agree with the depth of other views that see
-    them.
+    them; 0 if these are fewer than ``min_count`` points.
 
     Each view: camera, depth (h, w), and points (N, 3) from its depth relative to its centre.
     """
@@ -323,7 +327,7 @@ def _compute_agreement(views: list[tuple[PosedCamera, np.ndarray, np.ndarray]], 
         measured, expected = factor * depth[y, x], np.linalg.norm(other_points[is_visible] - camera.center, axis=1)
         count += int((measured > 0).sum())
         agreeing += int(np.sum((measured > 0) & (np.abs(measured - expected) <= _DEPTH_TOLERANCE * expected)))
-    return agreeing / count if count else 0.0
+    return agreeing / count if count >= min_count else 0.0
 
 
 def depth_points(camera: PosedCamera, depth: np.ndarray, max_points: int) -> np.ndarray:

@@ -195,11 +195,25 @@ def test_progress_adds_elapsed_and_remaining_time(capsys, monkeypatch):
         reporter.log_when_due()
         clock.now += 20
         reporter.progress(0.25, "scores")
+    # A quarter took 40 s, so the rest takes 120 s.
+    said = ["  0% reading, 20 s so far", " 25% scores, 2 min left"]
+    assert capsys.readouterr().err.splitlines() == said
+
+
+def test_the_remaining_time_never_grows_within_a_step(capsys, monkeypatch):
+    clock = Clock(monkeypatch)
+    with TerminalReporter() as reporter:
+        reporter.progress(0.0, "reading")
+        clock.now += 40
+        reporter.progress(0.25, "scores")
+        remaining = [reporter.line()]
+        for _ in range(3):
+            clock.now += 3
+            remaining.append(reporter.line())
         clock.now += 200
         reporter.progress(0.25, "scores")
-    # A quarter took 40 s, so the rest takes 120 s; later a quarter took 240 s, so the rest takes twelve minutes.
-    said = ["  0% reading, 20 s so far", " 25% scores, 2 min left", " 25% scores, 12 min left"]
-    assert capsys.readouterr().err.splitlines() == said
+    assert remaining == ["scores, 2 min left", "scores, 117 s left", "scores, 114 s left", "scores, 111 s left"]
+    assert capsys.readouterr().err.splitlines()[-1] == " 25% scores, 4 min so far"
 
 
 def test_preparation_does_not_affect_the_time_estimate(capsys, monkeypatch):

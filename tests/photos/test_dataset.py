@@ -397,6 +397,25 @@ def test_constant_depth_is_no_evidence(depth_views):
     assert "median is 1e+03 units" in explain_wrong_depth([(c, np.full_like(d, 1000.0)) for c, d in depth_views])
 
 
+def test_points_that_agree_by_chance_are_no_evidence():
+    """Cameras in a room look outwards, and their depth does not overlap: farther out it would, in four points."""
+    views = []
+    for k in range(8):
+        a = 2 * np.pi * k / 8
+        center, z = np.array([0.8 * np.cos(a), 0.6 * np.sin(a), 1.5]), np.array([np.cos(a), np.sin(a), -0.15])
+        z /= np.linalg.norm(z)
+        x = np.cross(z, [0, 0, 1.0])
+        x /= np.linalg.norm(x)
+        pose = np.column_stack([np.stack([x, np.cross(z, x), z], axis=1), center])
+        camera = PosedCamera(Intrinsics(48, 32, 30.0, 30.0, 24.0, 16.0), opengl(pose))
+        d = pixel_directions(camera.intrinsics) @ camera.to_world[:3, :3].T
+        with np.errstate(divide="ignore"):
+            depth = np.maximum(([-3, -2, 0] - center) / d, ([3, 2, 3] - center) / d).min(axis=-1)
+        depth[:, :19] = 0
+        views.append((camera, depth))
+    assert explain_wrong_depth(views) is None
+
+
 def test_depth_far_outside_of_the_cameras_is_refused(ring):
     np.save(ring / "d.npy", np.full((H, W), 2000.0, np.float32))
     rewrite(ring, lambda c: [f.update(depth_file_path="d.npy") for f in c["frames"]])
