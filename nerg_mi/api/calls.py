@@ -21,7 +21,7 @@ result become Python warnings where there is no bar. A `nerg_mi.progress.Reporte
 
 
 @contextmanager
-def report_progress(progress: Progress, options: type | None = None) -> Iterator[Reporter]:
+def report_progress(progress: Progress, *options: type) -> Iterator[Reporter]:
     """Yield the reporter of a call.
 
     Errors, warnings and messages within the block name the arguments of Python in place of options of the command line.
@@ -30,11 +30,11 @@ def report_progress(progress: Progress, options: type | None = None) -> Iterator
     ----------
     progress : bool, Reporter or None
         See `Progress`.
-    options : type, optional
-        Dataclass of the options, by whose spellings arguments are recognised.
+    *options : type
+        Dataclasses of the options, by whose spellings arguments are recognised.
     """
     names: dict[str, Field[Any]] = {}
-    for f in () if options is None else fields(options):
+    for f in (f for kind in options for f in fields(kind)):
         names[f.metadata.get(FLAG) or f"--{f.name.replace('_', '-')}"] = f
     try:
         if progress is None or isinstance(progress, bool):

@@ -75,7 +75,9 @@ def import_rays(
     from nerg_mi.workflows import rays
     from nerg_mi.workflows.rays import current_import_keywords
 
-    with report_progress(progress, RaysImportOptions) as reporter:
+    # An unknown reader is reported below.
+    settings = [get_reader(reader).Options] if reader in list_reader_names() else []
+    with report_progress(progress, *settings, RaysImportOptions) as reporter:
         options = current_import_keywords(options)
         file_list = [files] if isinstance(files, (str, os.PathLike)) or not isinstance(files, Sequence) else files
         if not all(isinstance(file, (str, os.PathLike)) for file in file_list):

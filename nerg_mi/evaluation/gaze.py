@@ -451,7 +451,7 @@ def evaluate_gaze(
             resampled.append({**compute_map_scores(truth, m.maps[has_rays]), **m.average_rays(*weights)})
     for row, resampled, m in zip(rows, bootstrap, evaluated):
         for k in SCORES if resampled else ():
-            half_width = 1.96 * np.nanstd([b[k] for b in resampled])
+            half_width = _measure_half_width([b[k] for b in resampled])
             row[f"{k}.low"], row[f"{k}.high"] = float(row[k] - half_width), float(row[k] + half_width)
         row["integral"] = float(4 * np.pi * m.maps.mean())
     for other, resampled in zip(rows[1:], bootstrap[1:]):
@@ -469,8 +469,14 @@ def _make_difference(name: str, value: float, resampled: list[float]) -> dict[st
     """Return ``value`` under ``name`` and, if ``resampled``, the ends of its 95 % confidence interval."""
     if not resampled:
         return {name: value}
-    half_width = 1.96 * np.nanstd(resampled)
+    half_width = _measure_half_width(resampled)
     return {name: value, f"{name}.low": float(value - half_width), f"{name}.high": float(value + half_width)}
+
+
+def _measure_half_width(resampled: list[float]) -> float:
+    """Return half the width of the 95 % confidence interval; NaN if the score is not defined."""
+    defined = np.array(resampled)[~np.isnan(resampled)]
+    return 1.96 * float(defined.std()) if defined.size else float("nan")
 
 
 class _EvaluatedMethod(NamedTuple):

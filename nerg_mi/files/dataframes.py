@@ -207,6 +207,12 @@ class DataFrameReader:
         """Return the times (N,) of a column in seconds, see `nerg_mi.files.values.to_seconds`."""
         return to_seconds(*self._column(name))
 
+    def read_cells(self, name: Any) -> list[Any]:
+        """Return the cells of a column as objects. Raises `NergError` if there is no such column."""
+        column = self._column(name)[0]
+        convert = next(getattr(column, k) for k in ("to_pylist", "to_list", "tolist") if hasattr(column, k))
+        return list(convert())
+
     def read_vectors(self, names: Any) -> np.ndarray:
         """Return three columns as an array (N, 3). Raises `NergError` as `read_numbers`, for truth values, and for
         another number of columns."""

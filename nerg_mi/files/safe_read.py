@@ -86,19 +86,44 @@ def translate_read_errors(
     """
     try:
         yield
-    except NergError:
+    except NergError as error:
+        if reason := find_other_content(path):
+            raise NergError(f'the {file_kind} "{path}" {reason}') from error
         raise
     except FileNotFoundError as error:
         raise MissingFile(f'there is no {file_kind} "{path}"; correct its name') from error
     except (*_DAMAGE_ERRORS, *extra_errors) as error:
-        raise NergError(
-            f'the {file_kind} "{path}" cannot be read: {describe_error(error)}; {_choose_remedy(error, remedy)}'
-        ) from error
+        reason = f"cannot be read: {describe_error(error)}; {_choose_remedy(error, remedy)}"
+        raise NergError(f'the {file_kind} "{path}" {find_other_content(path) or reason}') from error
     except Exception as error:
         # Compared by name, so that safetensors is not imported here.
         if type(error).__name__ != "SafetensorError":
             raise
         raise NergError(f'the {file_kind} "{path}" cannot be read: {describe_error(error)}; {remedy}') from error
+
+
+# Beginnings of files of which no reader expects the content, whatever their name says, and their remedies.
+_OTHER_CONTENT = {
+    b"version https://git-lfs": 'is a pointer of Git LFS; get the file (run "git lfs pull")',
+    b"<!doctype html": "is a web page; download the file itself",
+    b"<html": "is a web page; download the file itself",
+    b"\x1f\x8b": "is compressed with gzip; decompress it",
+    b"BZh": "is compressed with bzip2; decompress it",
+    b"\xfd7zXZ": "is compressed with xz; decompress it",
+    b"\x28\xb5\x2f\xfd": "is compressed with Zstandard; decompress it",
+}
+
+
+def find_other_content(path: str | os.PathLike) -> str | None:
+    """Return what a file that cannot be read is instead, with the remedy; None if that is unknown."""
+    if str(path).lower().endswith(".gz") or not os.path.isfile(path):
+        return None
+    try:
+        with open(path, "rb") as file:
+            head = file.read(32).lstrip().lower()
+    except OSError:
+        return None
+    return next((reason for start, reason in _OTHER_CONTENT.items() if head.startswith(start.lower())), None)
 
 
 # Messages of Python that name a value or a key, and what is said instead.
@@ -601,9 +626,8 @@ def read_line_blocks(path: str | os.PathLike, file_kind: str, max_lines: int) ->
             try:
                 text = remainder + decoder.decode(data, final=is_at_end)
             except UnicodeDecodeError as error:
-                raise NergError(
-                    f'the {file_kind} "{path}" is not {error.encoding.upper()} text ({error.reason}); save it as UTF-8'
-                ) from error
+                reason = f"is not {error.encoding.upper()} text ({error.reason}); save it as UTF-8"
+                raise NergError(f'the {file_kind} "{path}" {find_other_content(path) or reason}') from error
             # Split at \n, \r or \r\n, but not at the other characters at which str.splitlines splits.
             lines = io.StringIO(text, newline="").readlines()
             # The last line may continue in the next chunk, or end in the \r of a \r\n.

@@ -187,6 +187,8 @@ def _refuse(name: str, kind: str, expected: str, array: np.ndarray) -> NergError
         "complex numbers": "use their real part",
         "dates": "subtract the first one, and divide by numpy.timedelta64(1, 's')",
         "durations": "divide them by numpy.timedelta64(1, 's')",
+        "values of the kind time": "add their dates, with datetime.datetime.combine",
+        "values of the kind Period": "convert them first, with to_timestamp()",
     }.get(kind, "convert them first")
     example = f" such as {sanitize(str(array.ravel()[0]), 40)!r}" if array.size else ""
     return NergError(f"{name} must be {expected}, but contain {kind}{example}; {remedy}")
@@ -204,8 +206,9 @@ def normalize_name(text: str) -> str:
 
 
 def fold_name(text: str) -> str:
-    """Return the form (NFKC) by which names of columns, participants and other choices are compared."""
-    return unicodedata.normalize("NFKC", text)
+    """Return the form (NFKC, without spaces at the ends) by which names of columns, participants and other choices are
+    compared."""
+    return unicodedata.normalize("NFKC", _ENDS.sub("", text))
 
 
 def find_name(name: str, names: Sequence[str]) -> int | None:

@@ -8,6 +8,7 @@ To add a check, write ``@check("what it detects") def check_NAME(stats)`` here o
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -447,10 +448,23 @@ def _find_height_axis(rays: Rays) -> str | None:
 _MAX_RAYS_OF_COUNTER = 2  # median number of rays per participant
 
 
-@check("participants with one or two rays each: a row counter mapped as the participant (`person` in `--map`)")
+# A long number as spreadsheets display it, and save it as text.
+_ROUNDED_NUMBER = re.compile(r"\d([.,]\d+)?E\+\d\d+")
+
+
+@check(
+    "participants with one or two rays each: a row counter mapped as the participant (`person` in `--map`); names that "
+    "are numbers rounded by a spreadsheet"
+)
 def check_participants(stats: RayStatistics) -> list[str]:
     rays = np.bincount(stats.rays.person)
     rays = rays[rays > 0]
+    rounded = [name for name in stats.rays.participants if _ROUNDED_NUMBER.fullmatch(name)]
+    if rounded:
+        return [
+            f"{list_names(rounded)} {'is a number' if len(rounded) == 1 else 'are numbers'} that a spreadsheet has "
+            "rounded, so that different participants may have become one: export the column as text"
+        ]
     if stats.is_subsampled or len(rays) < MIN_RAYS or np.median(rays) > _MAX_RAYS_OF_COUNTER:
         return []
     return [

@@ -17,11 +17,12 @@ from numpy.typing import ArrayLike
 from nerg_mi.errors import NergError, sanitize
 from nerg_mi.files.dataframes import DataFrameReader, make_dataframe
 from nerg_mi.files.html import key_value_table
-from nerg_mi.files.values import to_names, to_numbers, to_seconds
+from nerg_mi.files.values import is_missing, to_names, to_numbers, to_seconds
 
 from .quality import RaysSummary, format_quality_report, make_quality_report, summarise
 from .rays import TRACKING, Rays, check_tracking, merge_metadata, merge_rays, merge_tracking
 from .readers.base import RaysBuilder, TrackingFrame
+from .readers.cells import parse_vectors
 
 # ---- Rays from arrays ----
 
@@ -126,13 +127,39 @@ def _default_columns(role: str) -> list[str]:
     return [f"{role}_{axis}" for axis in "xyz"] if role in _VECTORS else [role]
 
 
+def _read_vectors(reader: DataFrameReader, names: Sequence[Any]) -> np.ndarray:
+    """Read vectors (N, 3) from three columns, or from one whose cells are sequences, mappings of axes, or text such as
+    (1, 2, 3)."""
+    if len(names) != 1:
+        return reader.read_vectors(names)
+    cells, column = reader.read_cells(names[0]), f'the column "{names[0]}"'
+    texts = [cell if isinstance(cell, str) else "" for cell in cells]
+    out, is_bad = parse_vectors(texts, 3)
+    for k, cell in enumerate(cells):
+        if isinstance(cell, Mapping) and set(cell) == set("xyz"):
+            cell = [cell[axis] for axis in "xyz"]
+        if not isinstance(cell, (str, Mapping)) and np.ndim(cell) == 1 and len(cell) == 3:
+            out[k] = to_numbers(cell, column)
+        elif not (isinstance(cell, str) or is_missing(cell)):
+            is_bad[k] = True
+    if is_bad.any():
+        k = int(np.argmax(is_bad))
+        raise NergError(
+            f"a vector needs three columns, or one with three numbers in each cell; row {k} of {column} is "
+            f"{sanitize(str(cells[k]), 60)!r}"
+        )
+    return out
+
+
 def from_dataframe(
     table: Any, columns: Mapping[str, Any] | None, tracking: str | None, frame: tuple[str, str, str]
 ) -> Rays:
     """Make rays of a data frame, see `Rays.from_dataframe`."""
     reader = DataFrameReader(table)
     # A tuple is the name of one column with several levels, unless it is a vector.
-    is_one = lambda role, names: not isinstance(names, list) and not (role in _VECTORS and not isinstance(names, str))
+    is_one = lambda role, names: (
+        isinstance(names, str) or not isinstance(names, Iterable) or (isinstance(names, tuple) and role not in _VECTORS)
+    )
     as_list = lambda role, names: [names] if is_one(role, names) else list(names)
     example = '{"origin": ["x", "y", "z"], "direction": ["dx", "dy", "dz"], "time": "t"}'
     if columns is None:
@@ -158,7 +185,7 @@ def from_dataframe(
         raise NergError(f'the column "{reader.names[repeated]}" has two roles in columns; a column has one role')
     read = {"time": reader.read_seconds, "confidence": reader.read_numbers} | dict.fromkeys(_NAMES, reader.read_names)
     values = {
-        role: reader.read_vectors(names) if role in _VECTORS else read[role](names[0])
+        role: _read_vectors(reader, names) if role in _VECTORS else read[role](names[0])
         for role, names in choices.items()
     }
     if tracking is None and "tracking" in values:

@@ -620,9 +620,9 @@ class Rays:
             One row per sample. Times may be numbers in seconds, dates or durations.
         columns : mapping, optional
             Columns by role: ``time``, ``participant``, ``origin``, ``direction``, ``hit``, ``head``, ``confidence``,
-            ``cohort`` and ``tracking``; positions and directions have three columns. ``time``, ``origin`` and
-            ``direction`` are required; without ``participant`` all rows are of one. A column with several levels is
-            named by a tuple. Default: the columns of `to_dataframe`.
+            ``cohort`` and ``tracking``; positions and directions have three columns, or one whose cells are vectors.
+            ``time``, ``origin`` and ``direction`` are required; without ``participant`` all rows are of one. A column
+            with several levels is named by a tuple. Default: the columns of `to_dataframe`.
         tracking, up, handedness, units : str
             What the directions are, and their frame, as in `from_arrays`.
 

@@ -207,8 +207,8 @@ def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Rep
 def make_demo_to_look_at(out: Path, options: DemoOptions, reporter: Reporter) -> None:
     """Call `make_demo`, and report what it does and which files to open."""
     reporter.message(
-        f"The demo renders a small store and where a simulated shopper looks: {len(STAGES)} steps, half a minute on "
-        "eight cores and a few minutes on two."
+        f"The demo renders a small store and where a simulated shopper looks: {len(STAGES)} steps, about half a "
+        "minute on two idle cores."
     )
     make_demo(out, options, reporter)
     reporter.message(f"Report: {out / 'report.html'}. Pictures: {out / 'occlusion.png'}, {out / 'gaze.png'}.")

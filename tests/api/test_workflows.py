@@ -192,6 +192,8 @@ def test03_invalid_options_are_refused(table):
         nerg.import_rays(table, colums=COLUMNS)
     with pytest.raises(nerg.NergError, match='"nope"'):
         nerg.import_rays(table, "nope")
+    with pytest.raises(nerg.NergError, match="choose some of them with columns$"):
+        nerg.import_rays(table, columns=COLUMNS.replace("t=", "t=no"))
     for columns in ({"time": "t"}, ["t"]):
         with pytest.raises(nerg.NergError, match=f"columns is text .* got {type(columns).__name__}"):
             nerg.import_rays(table, columns=columns)

@@ -276,6 +276,7 @@ def score_half(rays, centres=((-0.5, 0, 1.6), (-0.5, 3, 1.6)), **options):
     return gaze.score_split_half(rays, np.array(centres, float), 0.6, options.pop("kappa", 20.0), prior, 20, **options)
 
 
+@pytest.mark.filterwarnings("error")
 def test_split_half_uses_positions_of_both_halves():
     rays = crowd(people=12)
     row, note = score_half(rays, ((-0.5, 0, 1.6), (-0.5, 3, 1.6), (40, 0, 0)), resamples=20)

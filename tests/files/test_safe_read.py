@@ -35,8 +35,34 @@ from nerg_mi.files.safe_read import (
     translate_read_errors,
 )
 from nerg_mi.formats.areas import Region
+from nerg_mi.formats.meshes import read_mesh_file
+from nerg_mi.photos.colmap import read_image_poses
 
 # ---- Damaged and malicious files are refused before memory is allocated ----
+
+
+@pytest.mark.parametrize(
+    "content, remedy",
+    [
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n", "git lfs pull"),
+        (b"\n<!DOCTYPE html><html></html>", "web page; download"),
+        (gzip.compress(b"v 0 0 0"), "gzip; decompress"),
+        (b"BZh91AY&SY", "bzip2; decompress"),
+    ],
+)
+def test_files_with_other_content_than_their_name_says(tmp_path, content, remedy):
+    for name, read in {
+        "a.csv": lambda path: list(read_line_blocks(path, "table", 10)) and parse_json(path.read_bytes(), path),
+        "a.json": read_json,
+        "a.npy": read_npy,
+        "a.obj": read_mesh_file,
+        "a.ply": read_mesh_file,
+        "cameras.bin": lambda path: read_image_poses(path.parent),
+    }.items():
+        (tmp_path / "images.bin").write_bytes(content)
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(NergError, match=f"{name if name != 'cameras.bin' else 'images.bin'}.*{remedy}"):
+            read(tmp_path / name)
 
 
 @pytest.mark.parametrize(

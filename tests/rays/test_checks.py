@@ -193,6 +193,12 @@ def test_one_participant_per_row(get_or_compute_each, is_counter):
     assert "does their column" not in warnings_of(thinned)
 
 
+def test_names_that_a_spreadsheet_has_rounded():
+    rays = walk(hit=False)
+    assert "spreadsheet" in warnings_of(replace(rays, persons=("1.23E+12", *rays.persons[1:])))
+    assert "spreadsheet" not in warnings_of(replace(rays, persons=("1E5", *rays.persons[1:])))
+
+
 # ---- Times ----
 
 

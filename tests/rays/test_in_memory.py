@@ -246,6 +246,29 @@ def test_repeated_columns_of_data_frames():
             Rays.from_dataframe(table, {"time": "note", "origin": names[2:5], "direction": names[5:8]})
 
 
+@pytest.mark.parametrize("library", ["pandas", "polars", "pyarrow"])
+@pytest.mark.parametrize("kind", ["list", "mapping", "text"])
+def test_vectors_in_one_column(library, kind):
+    pytest.importorskip(library)
+    origins, directions, times, _ = arrays(5)
+    cells = {
+        "list": origins.tolist(),
+        "mapping": [dict(zip("xyz", v)) for v in origins.tolist()],
+        "text": [f"({', '.join(map(repr, v))})" for v in origins.tolist()],
+    }[kind]
+    table = make_dataframe({"time": times, "o": [*cells[:4], None], "d": directions.tolist()}, library)
+    rays = Rays.from_dataframe(table, {"time": "time", "origin": "o", "direction": ["d"]})
+    np.testing.assert_allclose(rays.origin, origins[:4])
+    np.testing.assert_allclose(rays.direction, directions[:4] / np.linalg.norm(directions[:4], axis=1, keepdims=True))
+
+
+def test_cells_that_are_no_vectors_are_named():
+    pandas = pytest.importorskip("pandas")
+    frame = pandas.DataFrame({0: [[1, 2, 3], [1, 2]], 1: [[1, 0, 0]] * 2, 2: [0.0, 1.0]})
+    with pytest.raises(NergError, match=r'row 1 of the column "0" is .*\[1, 2\]'):
+        Rays.from_dataframe(frame, {"time": 2, "origin": 0, "direction": 1})
+
+
 def test_names_of_columns_with_levels_and_numbers():
     pandas = pytest.importorskip("pandas")
     frame = pandas.DataFrame({"time": [0.0, 1.0, 2.0], **vectors()})

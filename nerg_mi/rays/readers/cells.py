@@ -13,10 +13,13 @@ MISSING_WORDS = frozenset(
     (
         *("", "nan", "+nan", "-nan", "nan(ind)", "-nan(ind)", "na", "n/a", "n.a.", "<na>", "nat", "nil", "null"),
         *("(null)", "none", "undefined", "missing", "-", "--", "---", ".", "..", "?", "n. def.", "∞", "+∞", "-∞"),
-        *("#n/a", "#na", "#num!", "#value!", "#div/0!", "#ref!", "#name?", "#null!"),
+        *("\N{EN DASH}", "\N{EM DASH}", "#n/a", "#na", "#nv", "#n/d", "#n/b", "#i/t"),
     )
 )
 """Cells without a value, in lower case: those of statistics programs, spreadsheets, .NET and Python."""
+
+# Errors of spreadsheets in any language, such as #NUM!, #WERT!, #¡VALOR! and #NOM?, and cells that were too narrow.
+_SPREADSHEET = re.compile(r"#[¡¿]?[^\W\d_]+(?:/0)?[!?]|#{2,}")
 
 # Microsoft's C library: 1.#QNAN, -1.#IND00, 1.#INF, also with a decimal comma, and J where it is rounded.
 _MICROSOFT = re.compile(r"[+-]?1[.,]#(qnan|snan|nan|ind|inf|j)\d*", re.IGNORECASE)
@@ -25,7 +28,7 @@ _MICROSOFT = re.compile(r"[+-]?1[.,]#(qnan|snan|nan|ind|inf|j)\d*", re.IGNORECAS
 def is_missing(cell: str) -> bool:
     """Whether a cell has no value: it is empty, or one of the usual words for missing, undefined or infinite."""
     cell = cell.strip().lower()
-    return cell in MISSING_WORDS or bool(_MICROSOFT.fullmatch(cell))
+    return cell in MISSING_WORDS or bool(_SPREADSHEET.fullmatch(cell) or _MICROSOFT.fullmatch(cell))
 
 
 # ---- Vectors in one cell ----

@@ -32,6 +32,9 @@ _ROW_BYTES = 32
 
 _DECIMAL = re.compile(r"\s*[+-]?\d*([.,])\d*([eE][+-]?\d+)?\s*")
 
+# A date or time in any notation.
+_CLOCK_LIKE = re.compile(r"\d[:/]\d|\d-\d+-\d")
+
 # Two cells that may be one number or time that was split at a decimal comma.
 _INTEGER_CELL, _FRACTION_CELL = re.compile(r"(^|[+:-])\d+$"), re.compile(r"\d+([eE][+-]?\d+)?")
 
@@ -234,6 +237,7 @@ class _Layout(NamedTuple):
     decimal: str  # sign: point or comma
     clocks: dict[int, tuple[float, bool]]  # indices of columns of times in text form: unit in seconds, has a date
     row_cells: int  # number of cells of the first complete row
+    time_at: frozenset[int] = frozenset()  # indices of columns that may contain times in text form
 
     @property
     def width(self) -> int:
@@ -265,7 +269,7 @@ def _detect_spelling(layout: _Layout, rows: list[str], clocks: Mapping[str, floa
         decimal = decimal or next(signs, "")
         if decimal and not pending:
             break
-    return layout._replace(decimal=decimal or ".", clocks=times, row_cells=row_cells)
+    return layout._replace(decimal=decimal or ".", clocks=times, row_cells=row_cells, time_at=frozenset(ticks))
 
 
 def _split_cells(row: str, separator: str) -> list[str] | None:
@@ -570,6 +574,11 @@ def _explain_bad_number(word: str, k: int, layout: _Layout) -> str:
     if any(sign in word for sign in ".," if sign != layout.decimal):
         sign = {".": "points", ",": "commas"}[layout.decimal]
         return f"is not a number with the decimal {sign} of the table; use one notation for all numbers"
+    if k in layout.time_at and _CLOCK_LIKE.search(word):
+        return (
+            "is not a number, and as a time its parts may have several meanings; write year-month-day "
+            "hours:minutes:seconds, hours:minutes:seconds, or seconds"
+        )
     return "is not a number; correct the cell, or use another column"
 
 
@@ -664,7 +673,7 @@ _OTHER_FILES = {
 }
 
 
-def explain_columns(columns: Sequence[str], remedy: str = "name columns with --map") -> str:
+def explain_columns(columns: Sequence[str], remedy: str = "choose some of them with --map") -> str:
     """The end of a sentence about missing columns: which ``columns`` there are, and the ``remedy``; or why there is no
     header."""
     if not any(columns):
@@ -698,10 +707,11 @@ def check_columns(path: str | os.PathLike, requested: Sequence[str], available: 
 # ---- Times of day, and dates with times, as text: ISO 8601 and similar notations ----
 
 _CLOCK_FORMAT = re.compile(
-    r"(?:(?:(?P<year>\d{4})[-/](?P<month>\d\d)[-/](?P<day>\d\d)|"
-    r"(?P<day_>\d\d)\.(?P<month_>\d\d)\.(?P<year_>\d{4}))(?:T|,? +))?"
+    r"(?:(?P<days>[+-]?\d+) days?,? \+?)?(?:(?:(?P<year>\d{4})[-/](?P<month>\d\d)[-/](?P<day>\d\d)|"
+    r"(?P<day_>\d\d)\.(?P<month_>\d\d)\.(?P<year_>\d{4}))(?:[Tt]|,? +))?"
     r"(?P<hour>\d\d?):(?P<minute>\d\d):(?P<second>\d\d)(?:[.,](?P<fraction>\d+))?"
-    r"(?: ?(?P<half>[AaPp])\.?[Mm]\.?)? ?(?P<zone>Z|(?P<sign>[+-])(?P<zone_hour>\d\d):?(?P<zone_minute>\d\d))?"
+    r"(?: ?(?P<half>[AaPp])\.?[Mm]\.?)? ?"
+    r"(?P<zone>[Zz]|UTC|GMT|(?P<sign>[+-])(?P<zone_hour>\d\d)(?::?(?P<zone_minute>\d\d))?)?"
 )
 # ISO 8601's basic format, only with a date: the time alone would be a number.
 _BASIC_FORMAT = re.compile(r"(\d{4})(\d\d)(\d\d)T(\d\d)(\d\d)(\d\d)(?=\D|$)")
@@ -709,7 +719,8 @@ _EPOCH = datetime.date(1970, 1, 1).toordinal()
 
 
 def parse_clock_seconds(text: str) -> tuple[float, bool] | None:
-    """Seconds of a time such as ``2024-05-01T12:00:00.25+02:00`` or ``12:00:00.25``, and whether it has a date.
+    """Seconds of a time such as ``2024-05-01T12:00:00.25+02:00`` or ``12:00:00.25``, and whether it has a date, or is a
+    duration with days, such as ``0 days 00:00:01.5``.
 
     With a date, seconds since 1970 in UTC, which is also assumed without an offset; otherwise since midnight. None for
     other text. Dates are year-month-day or day.month.year, and hours are up to 24 or have AM or PM, so that the order
@@ -727,9 +738,11 @@ def parse_clock_seconds(text: str) -> tuple[float, bool] | None:
         return None
     seconds = 3600.0 * hour + 60 * minute + second + (float(f"0.{match['fraction']}") if match["fraction"] else 0.0)
     if match["sign"]:
-        offset = 3600 * int(match["zone_hour"]) + 60 * int(match["zone_minute"])
+        offset = 3600 * int(match["zone_hour"]) + 60 * int(match["zone_minute"] or 0)
         seconds -= offset if match["sign"] == "+" else -offset
     year, month, day = (match[name] or match[f"{name}_"] for name in ("year", "month", "day"))
+    if match["days"]:
+        return (86400.0 * int(match["days"]) + seconds, True) if year is None else None
     if year is None:
         return seconds, False
     try:

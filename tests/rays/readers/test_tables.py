@@ -259,6 +259,10 @@ def test_repeated_columns_and_two_roles(tmp_path):
         (["11:59:59 AM", "12:00:00 PM", "1:00:00.5 p.m."], [43199, 43200, 46800.5]),
         (["2024-05-01 12:00:00 AM", "2024-05-01 12:00:01 am"], [1714521600, 1714521601]),
         (["1.5", "2"], [1.5 * 1e-3, 2e-3]),
+        (["2024-05-01 14:00:00.5+02", "2024-05-01t12:00:01z"], [1714564800.5, 1714564801]),
+        (["2024-05-01 12:00:00.5 UTC", "2024-05-01 12:00:01 GMT"], [1714564800.5, 1714564801]),
+        (["0 days 00:00:01.500000", "1 days 00:00:00", "-1 days +23:59:59"], [1.5, 86400, -1]),
+        (["1 day, 0:00:01", "2 days, 0:00:01.5"], [86401, 172801.5]),
     ],
 )
 def test_times_as_text(tmp_path, monkeypatch, cells, seconds, fast):
@@ -356,7 +360,23 @@ def test_bytes_of_another_encoding_are_named(tmp_path):
 
 
 MISSING = ["1.#QNAN", "-1.#IND00", "1.#INF", "#N/A", "#NUM!", "#VALUE!", ".", "--", "-", "NULL", "None", "n/a", "NaN"]
+MISSING += ["#NV", "#WERT!", "#N/D", "#VALEUR!", "#NOM?", "#¡DIV/0!", "#####", "\u2013", "\u2014"]
 MISSING += ["", "#DIV/0!", "<NA>", "nan(ind)", "-nan(ind)", "N/A", "NaT", "1,#QNAN", " - "]
+
+
+def test_ambiguous_times_are_named_as_such(tmp_path):
+    """Day and month, or minutes and hours; other columns have no times."""
+    for cell in ("05/01/2024 12:00:00", "00:01.5"):
+        (tmp_path / "t.csv").write_text(f"a,t\n1,{cell}\n")
+        with pytest.raises(NergError, match="hours:minutes:seconds"):
+            list(iterate_table(tmp_path / "t.csv", ["t", "a"], clocks={"t": 1.0}))
+        with pytest.raises(NergError, match="correct the cell"):
+            list(iterate_table(tmp_path / "t.csv", ["t", "a"]))
+
+
+def test_invisible_characters_around_names_of_columns(tmp_path):
+    (tmp_path / "t.csv").write_text("\u00a0a,b\u200b\n1,2\n")
+    np.testing.assert_array_equal(read(tmp_path / "t.csv", ["a", "b"])[0].numbers, [[1, 2]])
 
 
 @pytest.mark.parametrize("fast", [True, False])
@@ -482,7 +502,7 @@ def test_vectors_in_cells_of_parquet(tmp_path):
         ("# recorded by a program\nx,y\n1,2\n", "remove the lines above"),
         ("t x y z\n0 1 2 3\n", '"t x y z", has neither commas'),
         ("t|x|y|z\n0|1|2|3\n", "between its columns"),
-        ("t,x\n0,1\n", "columns are t, x; name columns with --map"),
+        ("t,x\n0,1\n", "columns are t, x; choose some of them with --map"),
     ],
 )
 def test_files_without_a_header_are_named_with_a_remedy(tmp_path, text, remedy):
