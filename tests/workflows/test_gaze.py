@@ -20,10 +20,11 @@ from nerg_mi.evaluation.gaze_report import read_results
 from nerg_mi.evaluation.next_look import HEAD_METHODS, NextLook
 from nerg_mi.files.tables import write_json
 from nerg_mi.formats.fields import load_gaze
+from nerg_mi.maths.geometry import Similarity
 from nerg_mi.rays.rays import TRACKING, Rays
 from nerg_mi.threads import set_thread_count
 from nerg_mi.train.gaze_log_density import compute_elevation_density
-from nerg_mi.workflows import ablation, evaluate
+from nerg_mi.workflows import ablation, evaluate, next_look
 from nerg_mi.workflows.ablation import AblationBenchmark, ablate, load_ground_truth, make_plan
 from nerg_mi.workflows.evaluate import SCORED, evaluate_folds, evaluate_gaze
 from nerg_mi.workflows.gaze_commands import (
@@ -82,12 +83,15 @@ def test_scores_are_listed_with_the_baselines(trained, tmp_path):
     assert "directions of equal area" in text and TRACKING[result.tracking] in text
 
 
-def test_without_an_output_folder_nothing_is_written(trained):
-    before = set(trained.iterdir())
+def test_without_an_output_folder_nothing_is_written(trained, monkeypatch):
+    before, options, tune = set(trained.iterdir()), {}, evaluate.make_tuned_baselines
+    monkeypatch.setattr(evaluate, "make_tuned_baselines", lambda *args, **k: options.update(k) or tune(*args, **k))
     rays = Rays.load(trained / "rays.npz").with_tracking("head")
     result = evaluate_gaze(trained / "gaze.safetensors", rays, options=OPTIONS)
     assert result.tracking == "head"
     assert result.files == [] and set(trained.iterdir()) == before and result.rows[0]["method"] == "gaze field"
+    # The folds of the baselines hold out what the test does.
+    assert result.split == "pos" and (options["participants"], options["positions"]) == (False, True)
 
 
 def test_unusable_inputs_are_refused(trained, tmp_path):
@@ -105,7 +109,7 @@ def test_unusable_inputs_are_refused(trained, tmp_path):
 # ---- The next look: fit, files and refused input ----
 
 
-def test_the_next_look_is_fitted_and_scored(tmp_path, rgb):
+def test_the_next_look_is_fitted_and_scored(tmp_path, rgb, monkeypatch):
     rays = crowd(3000)
     # Each participant has a sample per second.
     rays = replace(rays, t=np.sum(np.tril(rays.person[:, None] == rays.person), axis=1))
@@ -113,7 +117,19 @@ def test_the_next_look_is_fitted_and_scored(tmp_path, rgb):
     gaze = tmp_path / "gaze.safetensors"
     train_gaze(rays, gaze, held_out)
     options = NextLookOptions(elapsed=(1.0, 3.0), earlier=3, max_looks=64, resamples=10)
-    result = evaluate_next_look(gaze, rays, tmp_path / "next", options)
+    used, make_prior, sample = [], next_look.make_prior_baseline, next_look._sample_looks
+    with monkeypatch.context() as patch:
+        patch.setattr(next_look, "make_prior_baseline", lambda r, **k: used.append(r) or make_prior(r, **k))
+        patch.setattr(
+            next_look, "_sample_looks", lambda r, rows, *a: used.append(r.select(rows)) or sample(r, rows, *a)
+        )
+        result = evaluate_next_look(gaze, rays, tmp_path / "next", options)
+    provenance = load_gaze(gaze, ns)[1]["provenance"]
+    test, held_out = provenance["test"], {rays.persons.index(name) for name in provenance["test"]["people"]}
+    distances = [np.linalg.norm(r.origin[:, None] - np.array(test["centres"]), axis=2).min(axis=1) for r in used]
+    # The prior is that of the training, weights are fitted near held-out positions, others are scored at them.
+    assert [held_out & set(r.person) for r in used] == [set(), set(), held_out]
+    assert distances[0].min() > test["purged_within"] >= distances[1].max() and distances[2].max() <= test["radius"]
     assert {row["elapsed"] for row in result.rows} == {1.0, 3.0} and (result.fitted, result.scored) == (2, 2)
     assert [path.name for path in result.files] == ["next.md", "next.csv", "next.json"]
     assert not find_wrong_notes(result.rows) and result.rows[0]["note"]
@@ -121,11 +137,16 @@ def test_the_next_look_is_fitted_and_scored(tmp_path, rgb):
     assert NextLook.from_json(written["model"]).weights == pytest.approx(result.model.weights)
     assert written["rows"][0]["bits"] == result.rows[0]["bits"] and result.rows[0]["looks"] <= 64
     # Looks without hit points end at the surfaces of the geometry.
-    place = load_training_geometry(gaze, load_gaze(gaze, ns)[1]["provenance"], BOX, GazeEvaluationOptions(), ns)
+    place = load_training_geometry(gaze, provenance, BOX, GazeEvaluationOptions(), ns)
     distance = make_ray_distance(place)
     assert distance is not None and rays.hit is not None
     recorded = np.linalg.norm(rays.hit - rays.origin, axis=1)
     assert np.median(np.abs(distance(rays.origin, rays.direction) - recorded)) < 0.3
+    scaled = make_ray_distance(replace(place, align=Similarity(np.diag([2.0, 2, 2, 1]))))
+    assert scaled is not None
+    np.testing.assert_allclose(
+        scaled(rays.origin / 2, rays.direction), distance(rays.origin, rays.direction) / 2, rtol=1e-4
+    )
     with pytest.raises(NergError, match="--elapsed"):
         evaluate_next_look(gaze, rays, None, replace(options, elapsed=(3.0, 1.0)))
     with pytest.raises(NergError, match="0.001 s before"):
@@ -421,6 +442,9 @@ def test_a_semantic_variant_is_planned_with_the_features_of_its_geometry(tmp_pat
         assert plan.settings.loss == (variant.loss or "paper")
         if variant.semantic or variant.init_from_field:
             assert c.geometry == place.radiance.config.geometry
+    # Stored rows are those of the same training rays.
+    one, other = (ablation._identity(variant, 0, replace(bench, train=crowd(count))) for count in (20, 21))
+    assert {key for key in one if one[key] != other[key]} == {"rays"}
 
 
 def test_a_recipe_selects_its_log_density_class():

@@ -6,6 +6,7 @@ import json
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import drjit.llvm.ad as ns
 import numpy as np
@@ -27,6 +28,7 @@ from nerg_mi.photos.structure import Reconstruction
 from nerg_mi.train.geometry import load_field_geometry
 from nerg_mi.train.radiance_run import train_field
 from nerg_mi.train.radiance_settings import RadianceSettings
+from nerg_mi.workflows import compile as compilation
 from nerg_mi.workflows import poses as job
 from nerg_mi.workflows import train_radiance as training
 from nerg_mi.workflows.compile import compile_checkpoint, compile_field
@@ -482,6 +484,16 @@ def test_an_empty_field_is_refused_by_name(empty_field, tmp_path):
     ):
         with pytest.raises(NergError, match="empty.*train it longer"):
             use()
+
+
+def test_compiled_fields_are_compared_by_absolute_differences():
+    reference = np.full((4, 5), 0.5)
+    reference[:, 3:] = 1, 2
+    compiled = reference.copy()
+    compiled[:, :3] += 0.1
+    compiled[:, 4] += [0.5, -0.5, 0.5, -0.5]
+    error = compilation._compare(reference, compiled, SimpleNamespace(resolution=8, size=64), 2.0)
+    assert (error.depth_median, error.depth_99, error.psnr) == pytest.approx((0.5, 0.5, 20))
 
 
 def test_a_field_without_matter_is_not_compiled(rgb):

@@ -307,7 +307,7 @@ def photos(rgb, tmp_path):
         pose = POSE.copy()
         pose[0, 3] += k
         frames.append({"file_path": f"p{k}.png", "transform_matrix": pose.tolist()})
-    lens = {"w": 30, "h": 20, "fl_x": 25.0, "fl_y": 25.0, "cx": 12.0, "cy": 10.0}
+    lens = {"w": 30, "h": 20, "fl_x": 25.0, "fl_y": 25.0, "cx": 12.0, "cy": 11.0}
     (tmp_path / "transforms.json").write_text(json.dumps({**lens, "frames": frames}))
     return tmp_path
 
@@ -321,7 +321,7 @@ def test_pose_and_lens_of_a_photo_are_read(photos, photo):
     np.testing.assert_allclose(camera.eye.up, [0, 0, 1], atol=1e-12)
     assert camera.lens.fov == pytest.approx(np.degrees(2 * np.arctan(15 / 25)))
     assert camera.lens.aspect == pytest.approx(1.5)
-    assert camera.lens.offset == pytest.approx((0.1, 0))
+    assert camera.lens.offset == pytest.approx((0.1, -0.05))
 
 
 def test_photo_cameras_are_in_training_coordinates(photos):

@@ -13,6 +13,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.fields.mlp import namespace
 from nerg_mi.formats.fields import load_gaze, save_gaze
 from nerg_mi.rays.rays import Rays
+from nerg_mi.workflows import statistics as module
 from nerg_mi.workflows.statistics import statistics
 from tests.aoi.place import first_box, people, write_place
 
@@ -113,16 +114,18 @@ def test03_windows_zones_and_cohorts_are_read_from_a_file(folder, tmp_path):
     assert {r["cell"] for r in result.differences} == {"window", "cohort"}
 
 
-def test_the_seed_sets_all_intervals(folder, tmp_path):
+def test_the_seed_sets_all_intervals(folder, tmp_path, monkeypatch):
     """Equal seeds give equal intervals, in all tables; other seeds give other ones."""
     scene = folder / "bare" / "scene.xml"
+    monkeypatch.setattr(module, "power_rows", lambda *args, seed: [{"seed": seed}])
     run = lambda seed: statistics(
-        [scene, people()], options=StatisticsOptions(aois=folder / "areas.json", seed=seed, **FAST)
+        [scene, people()], options=StatisticsOptions(aois=folder / "areas.json", seed=seed, power=0.5, **FAST)
     )
     one, again, other = run(1), run(1), run(2)
     for name, columns in (("aois", "share_low"), ("differences", "low")):
         values = [[row[columns] for row in getattr(result, name)] for result in (one, again, other)]
         assert values[0] == values[1] != values[2], name
+    assert [result.power for result in (one, other)] == [[{"seed": 1}], [{"seed": 2}]]
 
 
 def test_power_is_a_table_of_the_output(folder, tmp_path):
@@ -226,9 +229,13 @@ def test08_a_scene_alone_has_no_observers(folder):
 
 
 def test09_predicted_observers_without_tracking(folder):
-    options = StatisticsOptions(aois=folder / "areas.json", observers=("1,1.5,1.6", "1,3.5,1.6", "1,0.5,1.6"), **FAST)
+    options = StatisticsOptions(
+        aois=folder / "areas.json", observers=("5.5,1.5,1.6", "5.5,3.5,1.6", "5.5,0.5,1.6"), **FAST
+    )
     result = statistics([folder / "scene.xml"], options=options)
     assert {r["source"] for r in result.aois} == {"predicted"} and result.aois[0]["participants"] == 3
+    # They may face any direction.
+    assert [r["visible"] for r in result.aois] == pytest.approx([1, 1, 1])
 
 
 def test10_datasets_give_the_statistics_of_files(folder, tmp_path):

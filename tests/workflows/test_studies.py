@@ -250,6 +250,8 @@ def test_turn_and_shift_hold_with_pairs(tmp_path):
     np.testing.assert_allclose(result.matrix[:3, 3], truth[:3, 3], atol=1e-9)
     with pytest.raises(NergError, match="no positive scale"):
         align(None, None, replace(options, turn=degrees + 180))
+    fixed = AlignOptions(pairs=path, up="z", shift="1,2,3", scale=2.0, floor_height=0.5)
+    assert alignment._target(fixed, "pairs", Recorder())[1].scene_floor == pytest.approx(3 + 2 * 0.5)
 
 
 def place(alignment_check, monkeypatch):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import fields, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import drjit.llvm.ad as ns
 import numpy as np
@@ -16,15 +17,20 @@ from nerg_mi.fields.gaze_log_density import LogGazeConfig
 from nerg_mi.files.atomic import reserve_output
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.interruption import TrainingInterrupted
+from nerg_mi.maths.geometry import Similarity
 from nerg_mi.train import gaze_recipes
 from nerg_mi.train.gaze_data import compute_surface_distances
 from nerg_mi.train.gaze_log_density import LikelihoodTrainer, get_geometry_options
 from nerg_mi.train.gaze_recipes import Recipe, register_recipe
+from nerg_mi.train.gaze_settings import ProbeSettings
 from nerg_mi.train.geometry import TrainingGeometry, load_scene_geometry
+from nerg_mi.workflows import train_gaze as module
 from nerg_mi.workflows.gaze_commands import GazeOptions
 from nerg_mi.workflows.train_gaze import check_plan, plan_gaze, train_gaze
 from nerg_mi.workflows.train_radiance import train_radiance
+from tests.evaluation.test_gaze import crowd
 from tests.train.gaze.looks import BOX, RAYS, looking_at
+from tests.workflows.recorder import Recorder
 
 # ---- The training of a gaze field, also by its command: geometries, recipes, hold-out, resuming, messages ----
 
@@ -359,6 +365,18 @@ def test_every_option_reaches_the_plan():
     assert {name: names[name] for name in settings} == settings and plan.probes.directions == 33
     c = plan.config
     assert (c.variant, c.activation, c.grid.levels, c.normalized) == ("emit", "exp", 16, True)
+
+
+def test_views_near_test_positions_are_left_out_in_scene_units(monkeypatch):
+    options = GazeOptions(test_zones=1, test_positions=3)
+    arguments = crowd(1000), options, ProbeSettings(radius=0.5, min_rays=8), Similarity(np.diag([10.0, 10, 10, 1]))
+    test = module._supervision(*arguments, Recorder())[1]["test"]
+    centre = 10 * np.array(test["centres"][0])
+    near, far = (SimpleNamespace(camera=SimpleNamespace(center=centre + [0, 0, z])) for z in (9.0, 11.0))
+    views = SimpleNamespace(views=[near, far], provenance={}, notes=(), frames_without_map=(), unmatched_files=())
+    monkeypatch.setattr(module, "_open_views", lambda *args: (views, {}))
+    arguments = arguments[0], replace(options, views=Path("a"), salience="b"), *arguments[2:]
+    assert module._supervision(*arguments, Recorder())[0].views == (far,)
 
 
 def test_views_alone_make_a_normalised_field():
