@@ -34,7 +34,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 from collections.abc import Callable
 
-import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
+import nerg_mi
 import processes
 import torch_frames
 from nerg_mi.fields.kde import SphericalKde
@@ -166,10 +166,8 @@ class Run:
     @cached_property
     def compiled(self) -> Path:
         """A compiled copy of the store's field, which is made once."""
-        from nerg_mi.workflows.compile import compile_checkpoint
-
         path = self.out / "store.compiled.safetensors"
-        compile_checkpoint(find_store_scene().parent / "store.safetensors", path)
+        nerg_mi.compile_field(find_store_scene().parent / "store.safetensors").save(path)
         return path
 
     def cost(self, times) -> list[float]:

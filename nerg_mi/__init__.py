@@ -40,16 +40,18 @@ if TYPE_CHECKING:
     from .api.arrays import Camera
     from .api.contents import DensityGrid
     from .api.evaluation import ablate, evaluate_gaze, evaluate_radiance, folds, next_look, study
-    from .api.fields import load_field, load_rays
     from .api.gaze import load_gaze
     from .api.query import attention, observe, trace
     from .api.recordings import align, check_rays, filter_rays, guess, import_rays, plot_rays, split_rays
     from .api.render import render
     from .api.scene import Scene, make_scene
-    from .api.training import compile_field, train_gaze, train_prior, train_radiance
+    from .api.training import train_gaze, train_prior, train_radiance
+    from .environment.trained import load_field
     from .errors import NergError
+    from .rays.dataset import load_rays
     from .rays.rays import Rays
     from .rays.readers.registry import register_reader
+    from .train.compile import compile_field
     from .train.gaze_recipes import register_recipe
     from .transport.quadrature import register_quadrature
     from .viewer.serve import view
@@ -67,7 +69,7 @@ _MODULES = {
     "attention": "nerg_mi.api.query",
     "bake": "nerg_mi.api.analysis",
     "check_rays": "nerg_mi.api.recordings",
-    "compile_field": "nerg_mi.api.training",
+    "compile_field": "nerg_mi.train.compile",
     "draw": "nerg_mi.api.analysis",
     "evaluate_gaze": "nerg_mi.api.evaluation",
     "evaluate_radiance": "nerg_mi.api.evaluation",
@@ -79,9 +81,9 @@ _MODULES = {
     "guess": "nerg_mi.api.recordings",
     "import_checkpoint": "nerg_mi.api.analysis",
     "import_rays": "nerg_mi.api.recordings",
-    "load_field": "nerg_mi.api.fields",
+    "load_field": "nerg_mi.environment.trained",
     "load_gaze": "nerg_mi.api.gaze",
-    "load_rays": "nerg_mi.api.fields",
+    "load_rays": "nerg_mi.rays.dataset",
     "make_scene": "nerg_mi.api.scene",
     "next_look": "nerg_mi.api.evaluation",
     "observe": "nerg_mi.api.query",

@@ -6,14 +6,16 @@ import sys
 import threading
 import time
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, runtime_checkable
 
-from .errors import clean_text
+from .errors import NergError, clean_text, parameter
 from .files.html import element, markup
 
 if TYPE_CHECKING:
-    from rich.progress import Progress
+    import rich.progress
 
 # ---- Reporters ----
 
@@ -142,7 +144,7 @@ class TerminalReporter:
         while not self._ended.wait(1.0):
             self.log_when_due()
 
-    def _start(self) -> Progress | None:
+    def _start(self) -> rich.progress.Progress | None:
         """Return the progress bar, with one task; None without a terminal."""
         if not sys.stderr.isatty():
             return None
@@ -250,3 +252,23 @@ def duration(seconds: float) -> str:
     if seconds < 120:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
+
+
+# ---- Progress of a call ----
+
+Progress: TypeAlias = "bool | Reporter | None"
+"""Argument of functions. None shows a progress bar in notebooks, True shows one anywhere, and False none. Warnings
+become those of Python where there is no bar. A `Reporter` receives everything."""
+
+
+@contextmanager
+def open_reporter(progress: Progress) -> Iterator[Reporter]:
+    """Yield the reporter of a call. Raises `NergError` for anything but a `Progress`."""
+    if isinstance(progress, Reporter):
+        yield progress
+        return
+    if not (progress is None or isinstance(progress, bool)):
+        raise NergError(f"{parameter('progress')} must be True, False or a Reporter, got {type(progress).__name__}")
+    shows = is_notebook() if progress is None else progress
+    with WarningReporter() if not shows else NotebookReporter() if is_notebook() else TerminalReporter() as reporter:
+        yield reporter

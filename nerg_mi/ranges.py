@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+import inspect
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from numbers import Integral, Real
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, TypeVar, cast, get_args, get_type_hints
 
-from .errors import NergError, sanitize
+from .errors import NergError, parameter, sanitize
 
 RANGE, FLAG = "nerg_mi.range", "nerg_mi.flag"
 """Keys in the metadata of a dataclass field: the `Range` of its value, and its spelling on the command line. An empty
@@ -148,6 +151,44 @@ def setting(default: Any, help: str, *names: str, allowed: Range | None = None, 
         Name of the option, if it differs from the field's name.
     """
     return dataclasses.field(default=default, metadata={RANGE: allowed, "help": help, "names": names, "option": option})
+
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def check_ranges(function: Function) -> Function:
+    """Decorator: check numbers of annotated parameters, as ``Annotated[float, LENGTHS]``, before ``function`` runs.
+
+    A concentration (`KAPPAS`) may be text with an angle (`parse_kappa`).
+    """
+    signature = inspect.signature(function)
+
+    @functools.wraps(function)
+    def call(*args: Any, **keywords: Any) -> Any:
+        bound = signature.bind(*args, **keywords)
+        for name, allowed in find_ranges(function).items():
+            value = bound.arguments.get(name)
+            if allowed is KAPPAS and isinstance(value, str):
+                bound.arguments[name] = parse_kappa(value, parameter(name))
+            elif value is not None or (name in bound.arguments and "None" not in function.__annotations__[name]):
+                check_number(value, allowed, parameter(name), "[int," in function.__annotations__[name])
+        return function(*bound.args, **bound.kwargs)
+
+    return cast("Function", call)
+
+
+def find_ranges(function: Callable[..., Any]) -> dict[str, Range]:
+    """Return the ranges of the parameters of ``function``, by name."""
+    annotated = {name: text for name, text in function.__annotations__.items() if "Annotated[" in text}
+    # Annotations of objects that are imported for type checkers only cannot be evaluated.
+    hints = get_type_hints(
+        SimpleNamespace(__annotations__=annotated), inspect.unwrap(function).__globals__, include_extras=True
+    )
+    ranges = {}
+    for name, hint in hints.items():
+        notes = [note for part in (hint, *get_args(hint)) for note in getattr(part, "__metadata__", ())]
+        ranges[name] = next(note for note in notes if isinstance(note, Range))
+    return ranges
 
 
 class ValidatedDataclass:

@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
 from nerg_mi.aoi.options import StatisticsOptions
+from nerg_mi.environment.trained import TrainedField
 from nerg_mi.errors import NergError
+from nerg_mi.files.values import FilePath
 from nerg_mi.rays.rays import Rays
 from nerg_mi.workflows.radiance_commands import (
     CheckpointImportOptions,
@@ -26,7 +28,6 @@ from nerg_mi.workflows.scene_commands import BakeOptions, FilmOptions, ReportOpt
 
 from .arguments import check_output, resolve_file
 from .calls import Progress, report_progress, show_figure
-from .fields import FilePath, TrainedField
 from .gaze import TrainedGazeField, list_inputs
 from .objects import as_file, as_scene_file, build_options, copy_from_session
 from .scene import Environment, Scene, make_scene

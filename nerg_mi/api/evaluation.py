@@ -5,6 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
+from nerg_mi.environment.trained import TrainedField
+from nerg_mi.files.values import FilePath
 from nerg_mi.rays.rays import Rays
 from nerg_mi.workflows.gaze_commands import AblationOptions, FoldOptions, GazeEvaluationOptions, NextLookOptions
 from nerg_mi.workflows.radiance_commands import RadianceScoreOptions
@@ -12,7 +14,6 @@ from nerg_mi.workflows.scene_commands import StudyOptions
 
 from .arguments import check_output, resolve_file
 from .calls import Progress, report_progress
-from .fields import FilePath, TrainedField
 from .gaze import TrainedGazeField, training_geometry
 from .objects import as_file, build_options, resolve_rays
 from .scene import Scene

@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from nerg_mi.environment.trained import TrainedField
 from nerg_mi.errors import NergError, sanitize, translate_mitsuba_errors
 from nerg_mi.fields.gaze_base import AnyGazeField
 from nerg_mi.fields.radiance import RadianceField
-from nerg_mi.files.values import to_numbers
+from nerg_mi.files.values import FilePath, to_numbers, to_path
 from nerg_mi.formats.fields import load_gaze as read_gaze
 from nerg_mi.formats.fields import matches_checksum
 from nerg_mi.maths import vmf
@@ -23,11 +24,11 @@ from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.progress import Reporter
 from nerg_mi.ranges import DIRECTIONS, Range, check_number
 from nerg_mi.rays.rays import Rays, sample_rows
+from nerg_mi.rendering.scene import get_array_module
 from nerg_mi.workflows.scene_places import PLACES, detect_kind
 
 from .arrays import Floats, as_points, as_rays
 from .calls import Progress, report_progress
-from .fields import FilePath, TrainedField, as_path, get_array_module
 from .objects import as_file, copy_from_session, resolve_rays
 from .scene import Environment, Scene
 
@@ -340,7 +341,7 @@ class TrainedGazeField(TrainedField[AnyGazeField]):
         directions = fibonacci_directions(count)
         return directions, self.density(position, directions, geometry=geometry, progress=progress).astype(np.float64)
 
-    def save(self, path: FilePath, half: bool = False) -> Path:
+    def save(self, path: FilePath, half: bool | None = None) -> Path:
         """Write a checkpoint (.safetensors) atomically, and next to it the environment of the training if that was in
         memory. Parameters, returns and errors as for `TrainedField.save`."""
         path = super().save(path, half)
@@ -530,5 +531,5 @@ def load_gaze(path: FilePath) -> TrainedGazeField:
     >>> gaze.kind
     'gaze'
     """
-    network, metadata = read_gaze(as_path(path), get_array_module())
+    network, metadata = read_gaze(to_path(path), get_array_module())
     return TrainedGazeField(network, metadata.get("provenance", {}), Path(path).name, Path(path))

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
+from nerg_mi.environment.trained import TrainedField
 from nerg_mi.errors import NergError
 from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.fields.splats import Splats
@@ -29,14 +30,13 @@ from nerg_mi.maths.transforms import check_rigid_transforms
 from nerg_mi.progress import WarningReporter
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.files import write_mesh
-from nerg_mi.rendering.scene import list_scene_files
+from nerg_mi.rendering.scene import activate_mitsuba, list_scene_files
 from nerg_mi.workflows.old_names import current_keywords
 from nerg_mi.workflows.options import GeometryOptions
 from nerg_mi.workflows.scene_places import detect_kind
 
 from .arguments import check_names, resolve_file
 from .contents import DensityGrid, from_trimesh, has_nerg, is_trimesh, to_scene_children, write_content
-from .fields import TrainedField, activate_mitsuba
 from .scene import Scene, make_scene
 from .session import CHECKSUM_DIGITS, is_object, session_folder
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nerg_mi.errors import NergError, translate_mitsuba_errors
+from nerg_mi.files.values import FilePath
 from nerg_mi.formats.areas import Region
 from nerg_mi.formats.meshes import READERS, MeshFile
 from nerg_mi.maths.arrays import to_vector
@@ -20,12 +21,12 @@ from nerg_mi.measures.shares import Shares, SummationRule, gaze_shares
 from nerg_mi.measures.visits import MARGIN, Aoi, BoxAoi
 from nerg_mi.progress import SILENT, Reporter
 from nerg_mi.ranges import MAX_COORDINATE, Range, check_number
+from nerg_mi.rendering.scene import activate_mitsuba
 
 from . import arrays
 from .arrays import Floats, LabelledArrays, broadcast_to_observers
 from .calls import Progress, report_progress
 from .contents import from_trimesh, is_trimesh, load_content, load_mesh, load_mesh_child
-from .fields import FilePath, activate_mitsuba
 from .scene import COLOR, Scene, make_aov_context, resolve_quantities
 
 if TYPE_CHECKING:

@@ -8,12 +8,12 @@ from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
 from nerg_mi.errors import NergError
+from nerg_mi.files.values import FilePath
 from nerg_mi.rays.rays import Rays
 from nerg_mi.workflows.rays_commands import AlignOptions, FilterOptions, PlotOptions, RaysImportOptions, SplitOptions
 
 from .arguments import check_names, check_output, resolve_file
 from .calls import Progress, report_progress, show_figure
-from .fields import FilePath
 from .objects import build_options, resolve_rays
 
 if TYPE_CHECKING:

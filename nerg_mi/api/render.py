@@ -11,13 +11,14 @@ from numpy.typing import ArrayLike
 
 from nerg_mi.errors import NergError, translate_mitsuba_errors
 from nerg_mi.files.html import image, markup, paragraph
+from nerg_mi.files.values import FilePath
 from nerg_mi.progress import Reporter
 from nerg_mi.ranges import SEEDS, SPP, Range, check_number
 from nerg_mi.rendering.bands import SURFACE_OPACITY
+from nerg_mi.rendering.scene import activate_mitsuba
 
 from .arrays import Camera, Floats, LabelledArrays, as_points, broadcast_to_observers
 from .calls import Progress, report_progress, show_figure
-from .fields import FilePath, activate_mitsuba
 from .query import warn_extrapolation
 from .scene import COLOR, Scene, make_aov_context, resolve_quantities
 

@@ -12,18 +12,20 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
+from nerg_mi.environment.trained import TrainedField
 from nerg_mi.errors import NergError, translate_mitsuba_errors
 from nerg_mi.fields.gaze_base import AnyGazeField
 from nerg_mi.fields.radiance import RadianceField
 from nerg_mi.fields.splats import Splats
 from nerg_mi.files.atomic import check_writable, write_text
 from nerg_mi.files.html import key_value_table
-from nerg_mi.files.values import to_numbers
+from nerg_mi.files.values import FilePath, to_numbers
 from nerg_mi.formats.meshes import READERS as MESHES
 from nerg_mi.formats.splats import is_splat_file
 from nerg_mi.registration import get_plugin_class
 from nerg_mi.rendering.bands import is_nerg
 from nerg_mi.rendering.nested_scene import make_paths_absolute, read_scene_elements, to_verbatim
+from nerg_mi.rendering.scene import activate_mitsuba
 from nerg_mi.rendering.scene_writer import check_attribute, compute_clip_distances, format_document
 from nerg_mi.transport.geometry import check_shape
 
@@ -39,7 +41,6 @@ from .contents import (
     to_scene_children,
     write_content,
 )
-from .fields import FilePath, TrainedField, activate_mitsuba
 
 if TYPE_CHECKING:
     import mitsuba as mi

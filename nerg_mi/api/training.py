@@ -5,21 +5,21 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
+from nerg_mi.environment.trained import TrainedField
+from nerg_mi.files.values import FilePath
 from nerg_mi.interruption import TrainingInterrupted
 from nerg_mi.rays.rays import Rays
 from nerg_mi.workflows.gaze_commands import GazeOptions, PriorOptions
-from nerg_mi.workflows.radiance_commands import CompileOptions, RadianceOptions
+from nerg_mi.workflows.radiance_commands import RadianceOptions
 
 from .arguments import check_output, resolve_file
 from .calls import Progress, report_progress
-from .fields import FilePath, TrainedField, load_field
 from .gaze import TrainedGazeField
-from .objects import as_file, build_options, copy_from_session, resolve_rays
+from .objects import build_options, copy_from_session, resolve_rays
 from .session import session_folder
 
 if TYPE_CHECKING:
@@ -78,64 +78,6 @@ def train_radiance(
         make = lambda result: TrainedField(result.field, result.provenance, *_locate(output))
         with _converting_interrupts(make):
             return make(radiance.train_radiance(resolve_file(photos, "photos"), output, resolved, reporter))
-
-
-def compile_field(
-    field: TrainedField[RadianceField] | FilePath,
-    output: FilePath | None = None,
-    *,
-    options: CompileOptions | None = None,
-    progress: Progress = None,
-    **overrides: Any,
-) -> TrainedField[RadianceField]:
-    """Evaluate the density of a radiance field on voxels once, so that frames take about half the time.
-
-    Colour still comes from the networks of the field. Gaze fields that were trained in the field accept the result.
-
-    Parameters
-    ----------
-    field : TrainedField or path
-        The field. The object is not changed.
-    output : path, optional
-        Checkpoint to write (.safetensors).
-    options : CompileOptions, optional
-        Base options (`nerg_mi.workflows.radiance_commands.CompileOptions`).
-    progress : bool, Reporter or None
-        None shows a progress bar in notebooks, True shows one anywhere, False none; a `Reporter` receives everything.
-    **overrides
-        Single options on top of ``options``, such as ``resolution=512``, ``min_psnr=35`` or ``memory=100`` (MB).
-
-    Returns
-    -------
-    TrainedField
-        The compiled field. ``provenance["compiled"]`` has its resolution, its size in bytes, its depth errors in scene
-        units, the PSNR of its colour in dB and the speed-up, along random rays.
-
-    Raises
-    ------
-    NergError
-        An option is invalid, the field is compiled already, or the voxels would exceed ``memory``.
-
-    Examples
-    --------
-    >>> import nerg_mi as nerg
-    >>> from importlib.resources import files
-    >>> field = nerg.load_field(files("nerg_mi.scenes.store") / "store.safetensors")
-    >>> small = nerg.compile_field(field, resolution=128)
-    >>> small.provenance["compiled"]["resolution"]
-    128
-    """
-    from nerg_mi.workflows import compile as compilation
-
-    check_output(output)
-    with report_progress(progress, CompileOptions) as reporter:
-        resolved = build_options(CompileOptions, "compile_field", options, overrides)
-        if output is not None:
-            compilation.compile_checkpoint(as_file(field, "field"), output, resolved, reporter)
-            return load_field(output)
-        original = load_field(field) if isinstance(field, (str, os.PathLike)) else field
-        result = compilation.compile_field(original.network, resolved, reporter)
-    return TrainedField(result.field, {**original.provenance, "compiled": asdict(result.error)})
 
 
 def train_gaze(

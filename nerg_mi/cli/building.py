@@ -27,6 +27,8 @@ from nerg_mi.workflows.old_names import find_spelling
 from nerg_mi.workflows.options import GROUPS as GROUPS_OF_OPTIONS
 
 from .ending import shorten_values
+from .signatures import make_command
+from .table import ROWS, TABLE
 
 PACKAGES = ("nerg_mi.workflows", "nerg_mi.viewer", "nerg_mi.cli")
 """Packages whose modules and submodules may declare commands."""
@@ -56,7 +58,7 @@ class ListedCommand:
 
 def find_commands() -> dict[str, ListedCommand]:
     """Return all commands by name, in the order of the list. Imports no module."""
-    commands: dict[str, ListedCommand] = {}
+    commands = {row.name: ListedCommand(row.line, "") for row in TABLE}
     for package in PACKAGES:
         for folder in map(Path, importlib.import_module(package).__path__):
             for path in sorted(folder.rglob("*.py")):
@@ -154,6 +156,8 @@ def _listed() -> None:
 def _build(name: str, entries: Mapping[str, ListedCommand]) -> Any:
     """Return the parser of the command ``name``, or of the group of commands that start with it."""
     below = {other: entry for other, entry in entries.items() if other.startswith(f"{name} ")}
+    if name in ROWS:
+        return build_command(make_command(ROWS[name]), ROWS[name].line)
     if name in entries:
         entry = entries[name]
         if name not in COMMANDS:

@@ -12,7 +12,8 @@ import re
 import unicodedata
 from collections.abc import Iterable, Sequence
 from numbers import Real
-from typing import Any
+from pathlib import Path
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import DTypeLike
@@ -311,3 +312,16 @@ def find_names(names: Iterable[Any], available: Sequence[str], what: str) -> lis
             f"no {what} is called {', '.join(repr(sanitize(name, 40)) for name in unknown)}; there are {shown}"
         )
     return [k for k in indices if k is not None]
+
+
+# ---- Paths ----
+
+FilePath: TypeAlias = str | Path
+
+
+def to_path(path: FilePath) -> Path:
+    """Return ``path`` as a `Path`. Raises `NergError` for anything but a string or a path."""
+    try:
+        return Path(path)
+    except TypeError as error:
+        raise NergError(f"a file must be given as a string or a path, got {type(path).__name__}") from error

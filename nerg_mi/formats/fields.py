@@ -278,9 +278,11 @@ def _decode_voxels(arrays: StoredArrays, config: dict) -> VoxelGrid:
     return VoxelGrid(VoxelArrays(cast("int", resolution), blocks, masks, log_density), arrays.ns)
 
 
-def save_radiance(field: RadianceField, path: str | Path, provenance: dict, half: bool = False) -> None:
+def save_radiance(
+    field: RadianceField, path: str | Path, provenance: dict, half: bool = False, origin: str | None = None
+) -> None:
     """Write ``field``. ``provenance`` (JSON) describes the training data and settings; ``half`` stores the
-    weights as fp16.
+    weights as fp16; ``origin`` is the checksum of the file that the field was compiled or refined from.
     """
     parameters = {name: value for name, value in field.parameters().items() if not name.startswith("voxels.")}
     tensors = to_stored_arrays(parameters, half)
@@ -292,6 +294,7 @@ def save_radiance(field: RadianceField, path: str | Path, provenance: dict, half
         **({"march_growth": field.march_growth} if field.march_growth else {}),
         "units": {"length": "scene unit", "density": "1 / scene unit"},
         "provenance": provenance,
+        **({"refined_from": origin} if origin else {}),
     }
     if field.occupancy is not None:
         arrays, metadata["occupancy"] = encode_occupancy(field.occupancy)
@@ -305,11 +308,13 @@ def save_radiance(field: RadianceField, path: str | Path, provenance: dict, half
 
 
 def load_radiance(path: str | Path, ns: ModuleType) -> tuple[RadianceField, dict[str, Any]]:
-    """Read the field in ``path`` on the backend ``ns`` (see ``fields.mlp.namespace``), and its metadata.
+    """Read the field in ``path`` on the backend ``ns`` (see ``fields.mlp.namespace``), and its metadata, to which
+    "half" is added: whether the weights are fp16.
 
     Raises `NergError` if the file contains no radiance field.
     """
     tensors, meta = read_checkpoint(path, "radiance")
+    meta["half"] = any(tensor.dtype == np.float16 for tensor in tensors.values())
     if meta.get("provenance", {}).get("quality") == "poor":
         _warn_once(
             f'the radiance field "{path}" predicts photos badly that it was not trained on (quality "poor" in its '

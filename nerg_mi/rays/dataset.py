@@ -25,7 +25,7 @@ from nerg_mi.files.safe_read import (
     read_json,
     translate_read_errors,
 )
-from nerg_mi.files.values import find_names, fold_name, to_name
+from nerg_mi.files.values import FilePath, find_names, fold_name, to_name, to_path
 
 from .filters import select_mask
 from .rays import (
@@ -738,21 +738,40 @@ def _rows_within(rows: np.ndarray, first: int, count: int) -> np.ndarray:
     return rows[np.searchsorted(rows, first) : np.searchsorted(rows, first + count)]
 
 
-def load_rays(path: str | os.PathLike, max_rays: int | None = None, seed: int = 0) -> Rays:
-    """Load the rays of a file, a dataset, or a partition of one (``shop.rays/place=north``).
+def load_rays(path: FilePath, max_rays: int | None = None, seed: int = 0) -> Rays:
+    """Load recorded gaze samples.
 
     Parameters
     ----------
-    max_rays
-        Maximum number of rays of a dataset; larger datasets are sampled uniformly with ``seed``. None: all rays, at
-        most `MAX_LOADED_RAYS`.
+    path : path
+        A file (.npz or .parquet) written by ``nerg rays import``, `import_rays` or `Rays.save`, a dataset (.rays), or a
+        partition of one (``shop.rays/place=north``).
+    max_rays : int, optional
+        Maximum number of samples of a dataset; larger datasets are sampled uniformly. Default: all, at most 50 million.
+    seed : int
+        Seed of that sample.
+
+    Returns
+    -------
+    Rays
+        The samples, right-handed with z up, in metres and seconds.
 
     Raises
     ------
     NergError
-        For a path that is neither a rays file nor a dataset, or is damaged.
+        The file does not exist or is damaged.
+
+    Examples
+    --------
+    >>> import nerg_mi as nerg
+    >>> rays = nerg.Rays(t=[0, 0.1], person=[0, 0], persons=("Ada",), origin=[[1, 1, 1.6]] * 2,
+    ...                  direction=[[1, 0, 0], [0, 1, 0]], confidence=[1, 1])
+    >>> rays.save(folder / "rays.npz")
+    >>> len(nerg.load_rays(folder / "rays.npz"))
+    2
     """
-    if not Path(path).is_dir():
+    path = to_path(path)
+    if not path.is_dir():
         return Rays.load(path)
     dataset = RayDataset.open(path)
     if max_rays is not None and len(dataset) > max_rays:

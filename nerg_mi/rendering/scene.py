@@ -6,6 +6,7 @@ import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 from xml.parsers import expat
 
@@ -279,6 +280,42 @@ def activate_variant(variant: str | None = None) -> str:
     raise NergError(
         f'the variant "{candidates[-1]}" does not work on this machine ({reason}); run "nerg doctor" for help'
     )
+
+
+def activate_mitsuba() -> ModuleType:
+    """Import Mitsuba with a variant active.
+
+    An active variant is kept. Otherwise ``cuda_ad_rgb`` is activated if it works, and ``llvm_ad_rgb`` if not, as in the
+    command `nerg`.
+
+    Returns
+    -------
+    module
+        ``mitsuba``.
+
+    Raises
+    ------
+    NergError
+        A scalar variant is active.
+    """
+    import mitsuba as mi
+
+    variant = mi.variant()
+    if variant is None:
+        activate_variant()
+    elif variant.startswith("scalar"):
+        raise NergError(
+            f'fields do not support scalar variants such as "{variant}"; '
+            'call mi.set_variant("llvm_ad_rgb") or mi.set_variant("cuda_ad_rgb") first'
+        )
+    return mi
+
+
+def get_array_module() -> ModuleType:
+    """Return the Dr.Jit array types of the active variant (`nerg_mi.fields.mlp.namespace`)."""
+    from nerg_mi.fields.mlp import namespace
+
+    return namespace(activate_mitsuba().variant())
 
 
 def load_scene(path: str | Path, defaults: Mapping[str, str] | None = None, merge: bool = True):

@@ -14,7 +14,7 @@ from nerg_mi.errors import NergError, sanitize
 from nerg_mi.files.atomic import file_sha256
 from nerg_mi.formats.checkpoint import read_metadata
 
-_PROGRAM = "import sys; from nerg_mi.workflows.compile import compile_checkpoint; compile_checkpoint(*sys.argv[1:])"
+_PROGRAM = "import sys, nerg_mi; nerg_mi.compile_field(sys.argv[1]).save(sys.argv[2])"
 
 
 def find_compiled_file(field: Path, folder: Path) -> Path:

@@ -12,7 +12,6 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from nerg_mi.api.fields import activate_mitsuba
 from nerg_mi.api.query import compute_shares, make_shape_aois, trace
 from nerg_mi.api.scene import COLOR, Scene
 from nerg_mi.errors import NergError, translate_mitsuba_errors
@@ -26,7 +25,7 @@ from nerg_mi.progress import SILENT
 from nerg_mi.ranges import MAX_COORDINATE
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.nested_scene import FIELD_PROPERTY, find_field_file, replace_radiance_field
-from nerg_mi.rendering.scene import load_scene
+from nerg_mi.rendering.scene import activate_mitsuba, load_scene
 from nerg_mi.transport.extrapolation import describe_extrapolation
 from nerg_mi.transport.geometry import Ceiling
 from nerg_mi.workflows.render import describe_basis

@@ -29,9 +29,9 @@ from nerg_mi.rays.event_settings import EventRules
 # Key in the metadata of a field that `expose_settings` made.
 _EXPOSED = "nerg_mi.exposed"
 
-INPUT, VIEW, MODEL, TRAINING, TEST = "Input", "View", "Model", "Training", "Test"
+MAIN, INPUT, VIEW, MODEL, TRAINING, TEST = "Main", "Input", "View", "Model", "Training", "Test"
 ANALYSIS, OUTPUT, PERFORMANCE = "Analysis", "Output", "Performance"
-GROUPS = (INPUT, VIEW, MODEL, TRAINING, TEST, ANALYSIS, OUTPUT, PERFORMANCE)
+GROUPS = (MAIN, INPUT, VIEW, MODEL, TRAINING, TEST, ANALYSIS, OUTPUT, PERFORMANCE)
 """Groups of options in the order in which help lists them; options without a group come last."""
 
 PANEL = "rich_help_panel"

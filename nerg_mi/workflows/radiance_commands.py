@@ -9,7 +9,6 @@
 ``nerg export scene``: Write a scene with its gaze for Rerun (.rrd) or OpenUSD (.usdc, .usda).
 ``nerg export torch-ngp``: Write a torch-ngp checkpoint (.pth), for fields whose grid and networks fit its layout.
 ``nerg refine``: Compute a finer occupancy grid of a radiance field, so that it renders faster.
-``nerg compile``: Evaluate the density of a radiance field on voxels once, so that it renders faster.
 
 Options of these commands. The workflows are in `.poses`, `.train_radiance` and `.export`.
 """
@@ -274,30 +273,6 @@ class RefineOptions(ValidatedDataclass):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CompileOptions(ValidatedDataclass):
-    """Options of ``nerg compile``."""
-
-    resolution: int = option(
-        0,
-        "Number of voxels along the longest edge of the field's bounding box, a multiple of 8. 0: double it from 256 "
-        "on until both errors are below their limits.",
-        within=Range(0, 2048),
-        group=MODEL,
-    )
-    max_depth_error: float | None = option(
-        None,
-        "Maximum median depth error in scene units. Default: a tenth of a march step.",
-        within=LENGTHS,
-        group=MODEL,
-    )
-    min_psnr: float = option(
-        40.0, "Minimum PSNR in dB of the colour, compared with the field itself.", within=Range(0, 120), group=MODEL
-    )
-    memory: float = option(300.0, "Maximum size of the voxels in MB.", within=Range(1, 16384), group=MODEL)
-    mode: str = llvm_variant()
-
-
-@dataclass(frozen=True, kw_only=True)
 class LatticeOptions(ValidatedDataclass):
     """The grid on which a radiance field is sampled."""
 
@@ -490,16 +465,4 @@ declare(
     options=RefineOptions,
     field=_FIELD,
     output=out("Radiance field to write (.safetensors)."),
-)
-
-declare(
-    "compile",
-    "nerg_mi.workflows.compile:compile_checkpoint",
-    "Evaluate the density of a radiance field on voxels once, so that frames take about half the time.",
-    more="The command compares the compiled field with the field itself along random rays and prints its errors, its "
-    "size and its speed. The compiled field is used like any other field: colour still comes from its networks, and "
-    "gaze fields that were trained in the original field accept it.",
-    options=CompileOptions,
-    field=_FIELD,
-    output=out("Compiled radiance field to write (.safetensors)."),
 )

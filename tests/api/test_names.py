@@ -16,8 +16,8 @@ import pytest
 
 import nerg_mi as nerg
 from nerg_mi.api.arrays import LabelledArrays, as_points, as_unit_vectors, broadcast_to_observers
-from nerg_mi.api.fields import activate_mitsuba, get_array_module
 from nerg_mi.errors import NergError
+from nerg_mi.rendering.scene import activate_mitsuba, get_array_module
 
 # ---- The names at the top of the package ----
 
@@ -157,7 +157,7 @@ def test08_examples_of_methods_run(name, tmp_path):
 
 def test01_default_variant_is_set():
     code = "import nerg_mi as nerg, mitsuba as mi; nerg.Scene; print(mi.variant()); "
-    code += "from nerg_mi.api.fields import activate_mitsuba; print(activate_mitsuba().variant())"
+    code += "from nerg_mi.rendering.scene import activate_mitsuba; print(activate_mitsuba().variant())"
     before, after = run(code).split()
     assert before == "None" and after in ("cuda_ad_rgb", "llvm_ad_rgb")
 

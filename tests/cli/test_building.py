@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Annotated
 
 import pytest
 import typer
@@ -12,7 +15,13 @@ from typer.testing import CliRunner
 
 import nerg_mi.cli
 import nerg_mi.workflows
+from nerg_mi.cli import building
 from nerg_mi.cli.building import GROUPS, find_commands, make_callback
+from nerg_mi.cli.table import ROWS, Row
+from nerg_mi.errors import NergError
+from nerg_mi.files.values import FilePath
+from nerg_mi.progress import Progress
+from nerg_mi.ranges import KAPPAS, Range, ValidatedDataclass, check_ranges, setting
 from nerg_mi.rays.readers.base import list_options
 from nerg_mi.rays.readers.registry import collect_shared_options, get_reader, list_preset_names
 from nerg_mi.workflows.base import COMMANDS, Command, argument, extra
@@ -134,6 +143,82 @@ def test_a_command_is_one_module(monkeypatch, tmp_path, capsys):
         for name in ("nerg_mi.workflows.kindness.greeting", "nerg_mi.workflows.kindness"):
             sys.modules.pop(name, None)
         COMMANDS.pop("greet kindly", None)
+
+
+@dataclass(frozen=True)
+class Note(ValidatedDataclass):
+    """Settings of a note."""
+
+    volume: int = setting(3, "Loudness.", allowed=Range(0, 11))
+    pitch: float = 440.0  # not a setting
+
+    def save(self, path):
+        Path(path).write_text(f"{self.volume}")
+
+
+@check_ranges
+def play(
+    names: Sequence[FilePath],
+    *,
+    times: Annotated[int, Range(1, 9)] = 1,
+    width: Annotated[float, KAPPAS] | None = None,
+    is_quiet: bool = False,
+    note: Note = Note(),
+    progress: Progress = None,
+):
+    """Play a note.
+
+    It is heard at once.
+
+    Parameters
+    ----------
+    names : sequence of path
+        What is played.
+    times : int
+        How often.
+    width : float, optional
+        How wide.
+    is_quiet : bool
+        Whether nothing is heard.
+    note : Note
+        The note.
+    progress : bool, Reporter or None
+        Progress.
+    """
+    progress.message(f"{[str(name) for name in names]} {times} {width} {is_quiet} {note.volume}")
+    return note
+
+
+def test_a_command_is_one_row(monkeypatch, tmp_path, capsys):
+    """Arguments, options, ranges and texts are those of the function, and its result is saved."""
+    row = Row("play", f"{__name__}:play", "Play.", ("names",), "File to write (.txt).", (".txt",), computes=False)
+    monkeypatch.setitem(ROWS, "play", row)
+    monkeypatch.setattr(building, "TABLE", (row,))
+
+    def nerg(*line):
+        with pytest.raises(SystemExit) as end:
+            nerg_mi.cli.main(["play", *line])
+        said = capsys.readouterr()
+        return end.value.code, said.out + said.err
+
+    assert "play" in find_commands()
+    output = ["-o", str(tmp_path / "a.txt")]
+    code, said = nerg("--help")
+    assert code == 0 and "Play a note.\n\n  It is heard at once." in said
+    assert all(text in said for text in ("What is played.", "How often.", "Loudness.", "1<=x<=9", "0<=x<=11"))
+    assert "pitch" not in said and "--mode" not in said
+    code, said = nerg("a", "b", *output)
+    assert code == 0 and said.startswith("['a', 'b'] 1 None False 3\nwrote ")
+    code, said = nerg("a", *output, "--times", "2", "--width", "90deg", "--is-quiet", "--volume", "11")
+    assert code == 0 and said.startswith(f"['a'] 2 {math.degrees(1 / 90) ** 2} True 11")
+    assert (tmp_path / "a.txt").read_text() == "11"
+    assert nerg("a", *output, "--times", "10")[0] == 2 and nerg("a", *output, "--volume", "12")[0] == 2
+    assert nerg("a", "-o", str(tmp_path / "a.png"))[0] == 1
+    with pytest.raises(NergError) as error:
+        play(["a"], times=2.5)
+    assert error.value.parameters == {"times": ""}
+    with pytest.raises(NergError):
+        play(["a"], times=None)
 
 
 def test_a_command_line_without_a_command_is_refused(monkeypatch, tmp_path, capsys):

@@ -14,6 +14,7 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from nerg_mi.environment.trained import TrainedField
 from nerg_mi.errors import NergError
 from nerg_mi.fields.occupancy import CascadeGrid, OccupancyGrid
 from nerg_mi.fields.radiance import RadianceField
@@ -25,13 +26,13 @@ from nerg_mi.interruption import TrainingInterrupted
 from nerg_mi.photos.colmap import UpEstimate
 from nerg_mi.photos.dataset import open_dataset
 from nerg_mi.photos.structure import Reconstruction
+from nerg_mi.train.compile import compile_field
 from nerg_mi.train.geometry import load_field_geometry
 from nerg_mi.train.radiance_run import train_field
 from nerg_mi.train.radiance_settings import RadianceSettings
 from nerg_mi.workflows import compile as compilation
 from nerg_mi.workflows import poses as job
 from nerg_mi.workflows import train_radiance as training
-from nerg_mi.workflows.compile import compile_checkpoint, compile_field
 from nerg_mi.workflows.export import (
     PointOptions,
     SplatOptions,
@@ -46,7 +47,6 @@ from nerg_mi.workflows.export import (
 from nerg_mi.workflows.poses import STAGES, find_poses
 from nerg_mi.workflows.radiance_commands import (
     CheckpointImportOptions,
-    CompileOptions,
     PoseOptions,
     RadianceOptions,
     RadianceScoreOptions,
@@ -476,8 +476,8 @@ def empty_field(tmp_path, rgb):
 def test_an_empty_field_is_refused_by_name(empty_field, tmp_path):
     field, path = empty_field
     for use in (
-        lambda: compile_field(field),
-        lambda: compile_checkpoint(path, tmp_path / "a.safetensors"),
+        lambda: compile_field(TrainedField(field)),
+        lambda: compile_field(path),
         lambda: export_mesh(path, tmp_path / "a.ply"),
         lambda: export_splats(field, tmp_path / "a.ply"),
         lambda: load_field_geometry(path, ns),
@@ -501,7 +501,7 @@ def test_a_field_without_matter_is_not_compiled(rgb):
     field = RadianceField.random(replace(TINY, density_scale=1e-6), BOX, ns, 0, march_step=1 / 64)
     field.occupancy = OccupancyGrid(np.ones((8, 8, 8), bool), ns, 0.1)
     with pytest.raises(NergError, match="no matter"):
-        compile_field(field, CompileOptions(resolution=64))
+        compile_field(TrainedField(field), resolution=64)
 
 
 def test_a_training_reports_that_its_field_is_empty():

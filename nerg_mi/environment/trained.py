@@ -1,12 +1,11 @@
-"""Fields and gaze samples in memory, and the Mitsuba variant that they belong to."""
+"""Trained fields in memory, with their provenance."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import ModuleType
-from typing import Any, Generic, TypeAlias, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,55 +13,12 @@ from numpy.typing import NDArray
 from nerg_mi.errors import NergError
 from nerg_mi.fields.gaze_base import AnyGazeField, read_tracking, tracking_suffix
 from nerg_mi.fields.radiance import RadianceField
+from nerg_mi.files.atomic import file_sha256
 from nerg_mi.files.html import key_value_table
+from nerg_mi.files.values import FilePath, to_path
 from nerg_mi.formats.fields import load_radiance, save_gaze, save_radiance
-from nerg_mi.rays.rays import Rays
+from nerg_mi.rendering.scene import get_array_module
 
-# ---- The active Mitsuba variant ----
-
-
-def activate_mitsuba() -> ModuleType:
-    """Import Mitsuba with a variant active.
-
-    An active variant is kept. Otherwise ``cuda_ad_rgb`` is activated if it works, and ``llvm_ad_rgb`` if not, as in the
-    command `nerg`.
-
-    Returns
-    -------
-    module
-        ``mitsuba``.
-
-    Raises
-    ------
-    NergError
-        A scalar variant is active.
-    """
-    import mitsuba as mi
-
-    variant = mi.variant()
-    if variant is None:
-        from nerg_mi.rendering.scene import activate_variant
-
-        activate_variant()
-    elif variant.startswith("scalar"):
-        raise NergError(
-            f'fields do not support scalar variants such as "{variant}"; '
-            'call mi.set_variant("llvm_ad_rgb") or mi.set_variant("cuda_ad_rgb") first'
-        )
-    return mi
-
-
-def get_array_module() -> ModuleType:
-    """Return the Dr.Jit array types of the active variant (`nerg_mi.fields.mlp.namespace`)."""
-    from nerg_mi.fields.mlp import namespace
-
-    return namespace(activate_mitsuba().variant())
-
-
-# ---- Fields and gaze samples in memory ----
-
-
-FilePath: TypeAlias = str | Path
 Network = TypeVar("Network", RadianceField, AnyGazeField)
 
 
@@ -80,12 +36,24 @@ class TrainedField(Generic[Network]):
         Name of the file.
     path : Path or None
         The checkpoint; None if the field is not saved.
+    origin : str or None
+        Checksum of the checkpoint that this field was compiled or refined from; gaze fields that were trained in that
+        one accept this one.
+    half : bool
+        Whether the checkpoint has the weights as fp16.
     """
 
     network: Network
     provenance: Mapping[str, Any] = field(default_factory=dict)
     name: str = "in memory"
     path: Path | None = None
+    origin: str | None = field(default=None, kw_only=True)
+    half: bool = field(default=False, kw_only=True)
+
+    def derive(self, network: Network, **provenance: Any) -> TrainedField[Network]:
+        """Return a field with the weights of this one that is compiled or refined, with more ``provenance``."""
+        origin = self.origin or (None if self.path is None else file_sha256(self.path))
+        return TrainedField(network, {**self.provenance, **provenance}, origin=origin, half=self.half)
 
     @property
     def kind(self) -> str:
@@ -103,15 +71,15 @@ class TrainedField(Generic[Network]):
         parameters = self.network.parameters()
         return sum(int(np.prod(value.shape)) for name, value in parameters.items() if not name.startswith("voxels."))
 
-    def save(self, path: FilePath, half: bool = False) -> Path:
+    def save(self, path: FilePath, half: bool | None = None) -> Path:
         """Write a checkpoint (.safetensors) atomically.
 
         Parameters
         ----------
         path : path
             File to write.
-        half : bool
-            Whether to store the weights as fp16 instead of fp32.
+        half : bool, optional
+            Whether to store the weights as fp16 instead of fp32. Default: as in the file of the field, else fp32.
 
         Returns
         -------
@@ -123,11 +91,11 @@ class TrainedField(Generic[Network]):
         NergError
             The weights are not finite or exceed fp16, or the file cannot be written.
         """
-        path = Path(path)
+        path, half = Path(path), self.half if half is None else half
         if path.suffix.lower() != ".safetensors":
             raise NergError(f'fields are saved as .safetensors; change the file name extension of "{path}"')
         if isinstance(self.network, RadianceField):
-            save_radiance(self.network, path, dict(self.provenance), half)
+            save_radiance(self.network, path, dict(self.provenance), half, self.origin)
         else:
             save_gaze(self.network, path, dict(self.provenance), half)
         return path
@@ -186,46 +154,17 @@ def load_field(path: FilePath) -> TrainedField[RadianceField]:
     >>> field.bounds.tolist()
     [[-0.1, -0.1, -0.1], [8.1, 6.1, 3.1]]
     """
-    network, metadata = load_radiance(as_path(path), get_array_module())
-    return TrainedField(network, metadata.get("provenance", {}), Path(path).name, Path(path))
+    network, metadata = load_radiance(to_path(path), get_array_module())
+    origin = metadata.get("refined_from")
+    return TrainedField(
+        network, metadata.get("provenance", {}), Path(path).name, Path(path), origin=origin, half=metadata["half"]
+    )
 
 
-def load_rays(path: FilePath) -> Rays:
-    """Load recorded gaze samples.
-
-    Parameters
-    ----------
-    path : path
-        A file (.npz or .parquet) written by ``nerg rays import``, `import_rays` or `Rays.save`, or a dataset (.rays) of
-        at most 50 million samples.
-
-    Returns
-    -------
-    Rays
-        The samples, right-handed with z up, in metres and seconds.
-
-    Raises
-    ------
-    NergError
-        The file does not exist or is damaged.
-
-    Examples
-    --------
-    >>> import nerg_mi as nerg
-    >>> rays = nerg.Rays(t=[0, 0.1], person=[0, 0], persons=("Ada",), origin=[[1, 1, 1.6]] * 2,
-    ...                  direction=[[1, 0, 0], [0, 1, 0]], confidence=[1, 1])
-    >>> rays.save(folder / "rays.npz")
-    >>> len(nerg.load_rays(folder / "rays.npz"))
-    2
-    """
-    from nerg_mi.rays.dataset import load_rays as load
-
-    return load(as_path(path))
-
-
-def as_path(path: FilePath) -> Path:
-    """Return ``path`` as a `Path`. Raises `NergError` for anything but a string or a path."""
-    try:
-        return Path(path)
-    except TypeError as error:
-        raise NergError(f"a file must be given as a string or a path, got {type(path).__name__}") from error
+def open_field(field: TrainedField[RadianceField] | FilePath) -> TrainedField[RadianceField]:
+    """Return ``field``, loaded if it is a file."""
+    if not isinstance(field, TrainedField):
+        return load_field(field)
+    if field.kind != "radiance":
+        raise NergError(f"a radiance field is needed, and {field!r} is none")
+    return field

@@ -1,0 +1,88 @@
+"""Commands from the signatures of functions: arguments, options, ranges, defaults and help texts."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Callable
+from dataclasses import Field, fields, is_dataclass, make_dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, get_type_hints
+
+from nerg_mi.files.atomic import check_writable
+from nerg_mi.progress import Reporter
+from nerg_mi.ranges import RANGE, find_ranges
+from nerg_mi.workflows.base import Command, argument, import_function, out, select_backend
+from nerg_mi.workflows.options import MAIN, TRAINING, cpu_threads, llvm_variant, option
+
+from .table import Row
+
+_DEVICE = {"threads": ("int | None", cpu_threads()), "mode": ("str", llvm_variant())}
+
+
+def make_command(row: Row) -> Command:
+    """Return the command of a ``row``."""
+    function = import_function(row.function)
+    parameters, texts = inspect.signature(function).parameters, read_parameter_texts(function)
+    kinds = {name: _find_kind(function, name) for name in parameters if name != "progress"}
+    arguments = {
+        name: argument(texts[name], kinds[name], required=parameters[name].default is inspect.Parameter.empty)
+        for name in row.arguments
+    }
+    arguments |= {"output": out(row.output)} if row.output else {}
+    members, settings, ranges = list[Any](), dict[str, Any](), find_ranges(function)
+    for name in (name for name in kinds if name not in arguments):
+        default = parameters[name].default
+        if is_dataclass(default):
+            settings[name] = type(default)
+            members += [(f.name, f.type, _repeat(f)) for f in fields(default) if "help" in f.metadata]
+        else:
+            members.append((name, kinds[name], option(default, texts[name], within=ranges.get(name), group=MAIN)))
+    members += [(name, *declared) for name, declared in _DEVICE.items() if row.computes]
+    options = make_dataclass("Options", members, frozen=True, kw_only=True)
+
+    def run(*, options: Any, reporter: Reporter, **values: Any) -> None:
+        output = values.pop("output") if row.output else None
+        if output is not None:
+            check_writable(output, *row.suffixes)
+        if row.computes:
+            select_backend(options.mode, options.threads)
+        chosen = {name: getattr(options, name) for name in kinds if hasattr(options, name)}
+        for name, kind in settings.items():
+            shown = [f.name for f in fields(kind) if hasattr(options, f.name)]
+            chosen[name] = kind(**{field: getattr(options, field) for field in shown})
+        result = function(**values, **chosen, progress=reporter)
+        if output is not None:
+            result.save(output)
+            reporter.message(f"wrote {output} ({output.stat().st_size / 1e6:.1f} MB)")
+
+    summary, _, more = (inspect.getdoc(function) or "").partition("\n\nParameters\n")[0].partition("\n\n")
+    return Command(row.name, run, " ".join(summary.split()), " ".join(more.split()), options, (), None, arguments)
+
+
+def _repeat(setting: Field[Any]) -> Any:
+    """Return the option of a field of settings."""
+    names = setting.metadata["names"]
+    return option(setting.default, setting.metadata["help"], *names, within=setting.metadata[RANGE], group=TRAINING)
+
+
+def read_parameter_texts(function: Callable[..., Any]) -> dict[str, str]:
+    """Return the texts of the section Parameters of a docstring, by name, each as one line."""
+    _, _, section = (inspect.getdoc(function) or "").partition("\nParameters\n----------\n")
+    entries = re.split(r"^(?=\S)", section.split("\n\n")[0], flags=re.M)
+    texts: dict[str, str] = {}
+    for entry in filter(None, entries):
+        head, _, text = entry.partition("\n")
+        for name in head.partition(" : ")[0].split(", "):
+            texts[name] = " ".join(text.split())
+    return texts
+
+
+def _find_kind(function: Callable[..., Any], name: str) -> Any:
+    """Return the type of a parameter on the command line: `Path` if it may be a file, else that of the annotation."""
+    annotation = str(function.__annotations__[name])
+    if "FilePath" in annotation:
+        return list[Path] if "Sequence" in annotation else Path
+    names: Any = inspect.unwrap(function)
+    return get_type_hints(SimpleNamespace(__annotations__={name: annotation}), names.__globals__)[name]

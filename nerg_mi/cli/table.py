@@ -1,0 +1,39 @@
+"""The commands: which function each one calls, and which of its parameters are arguments.
+
+A command has one option for each keyword of its function and for each field of its settings, with the same name; help
+texts are those of the docstring, and ranges those of the annotations (`.signatures`). A new command is one more row.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Row:
+    """A command: words after ``nerg``, "MODULE:FUNCTION" that it calls, and its line in lists of commands.
+
+    ``arguments`` are the parameters without a flag, in order. ``output`` is the help of ``--output``, to which the
+    result is saved, and ``suffixes`` are those of this file. A command that ``computes`` has ``--mode``.
+    """
+
+    name: str
+    function: str
+    line: str
+    arguments: tuple[str, ...] = ()
+    output: str = ""
+    suffixes: tuple[str, ...] = ()
+    computes: bool = True
+
+
+TABLE = (
+    Row(
+        "compile",
+        "nerg_mi.train.compile:compile_field",
+        "Evaluate the density of a radiance field on voxels once, so that it renders faster.",
+        ("field",),
+        "Compiled radiance field to write (.safetensors).",
+        (".safetensors",),
+    ),
+)
+ROWS = {row.name: row for row in TABLE}

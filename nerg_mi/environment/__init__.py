@@ -1,0 +1,1 @@
+"""Environments that participants see: trained fields, splats, meshes, scenes and hit points."""
