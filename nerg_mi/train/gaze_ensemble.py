@@ -13,6 +13,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.fields.gaze_base import AnyGazeField, GazeEnsemble, GazeHead, summarize_provenance
+from nerg_mi.files.schema import check_json
 from nerg_mi.formats.checkpoint import read_checkpoint
 from nerg_mi.formats.fields import load_gaze, save_gaze
 from nerg_mi.photos.salience import SalienceView
@@ -34,7 +35,7 @@ from .gaze_settings import GazeSettings
 from .gaze_trainer import KIND as RUN
 from .gaze_trainer import GazePlan, ProgressCallback, StateSettings, read_run_identity
 from .geometry import TrainingGeometry
-from .trainer import check_same_run, saving_on_failure
+from .trainer import check_same_run, reading_run_state, saving_on_failure
 
 MIN_BLOCKS = 5  # Minimum number of blocks for resampling; participants are the blocks if there are at least this many
 BLOCK_SECONDS = 30.0  # Duration of a block in seconds, used if there are too few participants
@@ -229,15 +230,15 @@ def _load_member(part: Path, identity: dict, state: StateSettings, ns: ModuleTyp
     another run.
     """
     field, meta = load_gaze(part, ns)
-    stored = meta["provenance"]
+    with reading_run_state(part):
+        stored = check_json(meta["provenance"], {"about": dict, "trained": dict}, "provenance")
     check_same_run(part, stored["about"], identity)
     run = state.path
-    if (
-        run is not None
-        and run.is_file()
-        and read_checkpoint(run, RUN)[1]["about"].get("member") == state.identity["member"]
-    ):
-        run.unlink()  # The process was killed after writing the member and before removing its state
+    if run is not None and run.is_file():
+        with reading_run_state(run):
+            member = read_checkpoint(run, RUN)[1]["about"].get("member")
+        if member == state.identity["member"]:
+            run.unlink()  # The process was killed after writing the member and before removing its state
     return field, stored["trained"]
 
 

@@ -17,6 +17,7 @@ from drjit.opt import AdamW
 from nerg_mi.errors import NergError, sanitize
 from nerg_mi.fields.gaze_base import GazeHead, GazeHeadConfig
 from nerg_mi.fields.radiance import RadianceField
+from nerg_mi.files.schema import INDEX, Items, check_json
 from nerg_mi.formats.checkpoint import read_checkpoint, write_checkpoint
 from nerg_mi.interruption import Interruption
 from nerg_mi.maths.geometry import AnyBox
@@ -415,8 +416,9 @@ class GazeRunFile:
                 check_same_run(path, self._meta["about"], identity)
                 self.stage, self.validation_state = self._meta["stage"], self._meta["found"]
                 self.seconds = read_count(self._meta, "spent")
-                if self.stage not in STAGES or not isinstance(self.validation_state, dict):
+                if self.stage not in STAGES:
                     raise ValueError(f'its "stage" is {sanitize(self.stage, 40)}; expected one of {", ".join(STAGES)}')
+                GazeFit.from_dict(self.validation_state)
 
     @property
     def elapsed(self) -> float:
@@ -525,6 +527,12 @@ class GazeProgress:
 ProgressCallback = Callable[[GazeProgress], object]
 
 
+_FIT_STATE = {
+    **dict.fromkeys(("best_step?", "schedule?", "since?", "next_look?"), INDEX),
+    "history?": Items({"steps": INDEX}),
+}
+
+
 @dataclass
 class GazeFit:
     """Result of a fit."""
@@ -551,7 +559,8 @@ class GazeFit:
 
     @staticmethod
     def from_dict(data: dict[str, Any], trainer: GazeTrainer | None = None, weights: dict | None = None) -> GazeFit:
-        """Restore a fit from `to_dict`."""
+        """Restore a fit from `to_dict`. Raises ``ValueError`` or ``TypeError`` for other ``data``."""
+        check_json(data, _FIT_STATE, "found")
         names = {"since": "evaluations_since_best", "next_look": "next_evaluation"}
         values = {names.get(k, k): v for k, v in data.items()}
         scores = values.pop("scores", None)

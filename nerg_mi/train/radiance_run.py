@@ -16,6 +16,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.fields.radiance import EMPTY, RadianceConfig, RadianceField
+from nerg_mi.files.schema import INDEX, NUMBER, Items, Number, check_json
 from nerg_mi.formats.checkpoint import read_checkpoint, write_checkpoint
 from nerg_mi.interruption import Interruption
 from nerg_mi.maths.color import color_corrected_psnr, mean_ignoring_nan, psnr
@@ -402,6 +403,10 @@ def save_run(trainer: RadianceTrainer, path: Path, identity: dict, history: list
     write_checkpoint(path, KIND, tensors, {"about": identity, "history": history, **metadata})
 
 
+# An evaluation in a run state; "psnr_train" may be null.
+_EVALUATION = {"steps": INDEX, "seconds": Number(0), "psnr": NUMBER, "every_pixel": Number(1, is_integer=True)}
+
+
 def load_run(trainer: RadianceTrainer, path: Path | None, identity: dict) -> list:
     """Restore ``trainer`` from the state in ``path`` and return the history.
 
@@ -412,8 +417,10 @@ def load_run(trainer: RadianceTrainer, path: Path | None, identity: dict) -> lis
     tensors, meta = read_checkpoint(path, KIND)
     with reading_run_state(path):
         check_same_run(path, meta["about"], identity)
+        history = check_json(meta["history"], Items(_EVALUATION), "history")
+        check_json(meta, {"best?": _EVALUATION})
         trainer.restore(tensors, meta)
-        return list(meta["history"])
+        return history
 
 
 def _make_result(

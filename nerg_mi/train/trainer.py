@@ -15,6 +15,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.files.safe_read import translate_read_errors
+from nerg_mi.files.schema import Items, Number, check_json
 from nerg_mi.formats.fields import read_number
 
 # ---- Trainer ----
@@ -118,8 +119,8 @@ class Trainer:
         self.set_seconds(read_count(meta, "seconds"))
         self.rng.bit_generator.state = meta["random"]
         # States of earlier versions reserve no time.
-        self.reserved_seconds, *since = (float(x) for x in meta.get("reserved", (0.0, 0.0, 0.0)))
-        self._reserved_at = since[0], since[1]
+        reserved = check_json(meta.get("reserved", [0.0, 0.0, 0.0]), Items(Number(0), 3, 3), "reserved")
+        self.reserved_seconds, self._reserved_at = reserved[0], (reserved[1], reserved[2])
 
 
 # ---- Run state in a file, from which an interrupted run continues as if it had not been interrupted ----

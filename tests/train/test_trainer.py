@@ -27,6 +27,8 @@ from nerg_mi.train.radiance_trainer import RadianceTrainer
 from nerg_mi.train.trainer import StepClock
 from tests.train.radiance.ball import BOX, TINY, settings, state, trainer
 
+EVALUATION = {"steps": 9, "seconds": 0.5, "psnr": 3.0, "psnr_train": None, "every_pixel": 2}
+
 # ---- A killed and resumed training equals an uninterrupted one ----
 
 
@@ -37,8 +39,8 @@ def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(dataset, one_thre
         full.step()
     while first.steps < 21:
         first.step()
-    save_run(first, tmp_path / "a.run", {"sha": 1}, [{"psnr": 3.0}])
-    assert load_run(second, tmp_path / "a.run", {"sha": 1}) == [{"psnr": 3.0}]
+    save_run(first, tmp_path / "a.run", {"sha": 1}, [EVALUATION])
+    assert load_run(second, tmp_path / "a.run", {"sha": 1}) == [EVALUATION]
     assert second.steps == 21
     while second.progress < 1:
         second.step()
@@ -228,6 +230,15 @@ def test_a_killed_run_leaves_a_complete_state(dataset, one_thread, sent, tmp_pat
         lambda tensors, meta: tensors.update({"grid.bits": np.zeros(3, np.uint8)}),
         lambda tensors, meta: tensors.update({"weights.grid.table": np.zeros(5, np.float32)}),
         lambda tensors, meta: meta.update(history=3),
+        lambda tensors, meta: meta.update(history=[3]),
+        lambda tensors, meta: meta.update(history=[{"psnr": 3.0}]),
+        lambda tensors, meta: meta.update(history=[{**EVALUATION, "psnr": None}]),
+        lambda tensors, meta: meta.update(history=[{**EVALUATION, "every_pixel": 0}]),
+        lambda tensors, meta: meta.update(history=[{**EVALUATION, "seconds": "1"}]),
+        lambda tensors, meta: meta.update(best={"psnr": 3.0}),
+        lambda tensors, meta: meta.update(best=3),
+        lambda tensors, meta: meta.update(reserved=[1.0]),
+        lambda tensors, meta: meta.update(reserved=["1", 0, 0]),
     ],
 )
 def test_a_damaged_state_is_reported_with_its_name(dataset, tmp_path, change):

@@ -303,6 +303,17 @@ def test04_a_resumed_run_keeps_its_selection(members, tmp_path, rgb, monkeypatch
         write_checkpoint(path, KIND, tensors, {**meta, "about": {**meta["about"], SELECTION_KEY: wrong}})
         with pytest.raises(NergError, match="damaged.*start again"):
             trained(state=replace(state, resume=True))
+    for key, wrong in (
+        ("found", [3]),
+        ("found", {**meta["found"], "history": [{"kld": 1.0}]}),
+        ("found", {**meta["found"], "scores": [1.0]}),
+        ("found", {**meta["found"], "colour": 1}),
+        ("found", {**meta["found"], "since": "2"}),
+        ("stage", ["fit"]),
+    ):
+        write_checkpoint(path, KIND, tensors, {**meta, key: wrong})
+        with pytest.raises(NergError, match="run state.*start again"):
+            trained(state=replace(state, resume=True))
     write_checkpoint(path, KIND, tensors, meta)
     provenance = trained(state=replace(state, resume=True)).provenance
     assert not provenance["interrupted"] and provenance["mix"] == selected
