@@ -22,6 +22,9 @@ _SAMPLES = 20_000
 # A maximum is repeated if more pixels than this fraction of a view have it, to rounding error, and more than have other
 # depths within a hundredth of it.
 _MIN_REPEATED_FRACTION, _ROUNDING, _NEARBY = 1e-3, 1e-5, 1e-2
+# A repeated maximum is no surface, also in one view only, if all other depths are below this fraction of it: surfaces
+# that continue to a wall have depths in between.
+_MAX_OTHER = 0.5
 # Errors of camera positions as a fraction of the extent of the cameras.
 _POSE_ERROR = 0.05
 # Maximum number of views that are compared for a repeated maximum.
@@ -59,7 +62,8 @@ def remove_background(views: Sequence[PhotoView]) -> tuple[list[PhotoView], Back
     """Set depths that are no surface to 0, which means unknown.
 
     These are depths far beyond the extent of the cameras and all other depths, such as 1e10, and the far plane of a
-    renderer: a maximum that is repeated exactly in views in which it cannot be one surface. Returns the views, and
+    renderer: a maximum that is repeated exactly, in views in which it cannot be one surface, or far beyond all other
+    depths. Returns the views, and
     which fraction has no surface; None if all pixels have one, and without depth maps.
     """
     index = [k for k, view in enumerate(views) if view.depth is not None]
@@ -111,21 +115,25 @@ def _find_repeated_maximum(
     measure: Callable[[int], np.ndarray],
     is_surface: Callable[[PosedCamera, PosedCamera, float, float], bool],
 ) -> dict[int, np.ndarray]:
-    """Return the masks of the pixels with the largest ``measure`` of all views, if two views exclude that it is a
-    surface.
+    """Return the masks of the pixels with the largest ``measure`` of all views, if two views or the other depths
+    exclude that it is a surface.
 
     ``measure`` returns the distance (h, w) of a kind in a view, and ``is_surface`` whether pixels of two cameras with
     one distance of this kind may show the same surface, up to a tolerance.
     """
     largest = [float(measure(k).max(initial=0)) for k in range(len(depths))]
     limit = max(largest, default=0.0) * (1 - _ROUNDING)
-    masks, repeated = {}, []
+    masks, repeated, below = {}, [], 0.0
     for k in np.flatnonzero(np.array(largest) >= limit).tolist() if limit > 0 else []:
         values = measure(k)
         masks[k] = values >= limit
+        below = max(below, float(values[~masks[k]].max(initial=0)))
         count, nearby = np.count_nonzero(masks[k]), np.count_nonzero(values >= (1 - _NEARBY) * limit)
         if count > max(1, _MIN_REPEATED_FRACTION * values.size) and 2 * count > nearby:
             repeated.append(cameras[k])
+    others = [m for m in largest if m < limit]
+    if repeated and 0 < max(below, *others, 0.0) < _MAX_OTHER * limit:
+        return masks
     pairs = combinations(repeated[:_COMPARED_VIEWS], 2)
     # Errors of poses are a part of the extent of the cameras, also for surfaces far beyond it.
     tolerance = min(_NEARBY * limit, _POSE_ERROR * _measure_extent(cameras))

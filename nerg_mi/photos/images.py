@@ -204,7 +204,10 @@ def read_depth(source: DepthFile) -> np.ndarray:
         if out.dtype != np.uint16:
             raise NergError(f'the depth file "{path}" must be a 16-bit PNG, but has {out.dtype.itemsize * 8} bits')
     else:
-        raise NergError(f'the depth file "{path}" must be .npy, .exr or a 16-bit .png')
+        raise NergError(
+            f'depth maps of the format "{sanitize(suffix, 20)}" are not read ("{path}"); convert them to .npy '
+            "(numpy.save), .exr or 16-bit .png, and correct depth_file_path"
+        )
     if out.ndim == 3 and out.shape[2] == 1:
         out = out[..., 0]
     if out.ndim != 2 or not np.issubdtype(out.dtype, np.number):

@@ -84,6 +84,26 @@ def test_background_is_no_surface(tmp_path, rgb, suffix, value, unit, fraction, 
     assert ("no surface" in data[0].notes[-1]) == is_counted and "no surface" not in data[1].notes[-1]
 
 
+@pytest.mark.parametrize("value", [20.0, 100.0, 1000.0, 1e10])
+@pytest.mark.parametrize("along_rays", [True, False])
+@pytest.mark.parametrize("rows", [18, 5])
+def test_background_in_one_view_only(value, along_rays, rows):
+    """All of it, or a part."""
+    depths = [see(camera) for camera in AROUND]
+    depths[3][:rows] = np.broadcast_to(value if along_rays else value / AHEAD, depths[3].shape)[:rows]
+    views, background = remove_background(views_of(AROUND, depths))
+    assert background is not None and background.fraction == pytest.approx(rows / 18 / len(AROUND))
+    for k, (view, depth) in enumerate(zip(views, depths)):
+        np.testing.assert_array_equal(view.depth[rows * (k == 3) :], np.float32(depth[rows * (k == 3) :]))
+    assert not views[3].depth[:rows].any()
+
+
+def test_the_end_of_a_corridor_is_a_surface():
+    """One camera sees it across its axis, and floor and walls up to it."""
+    cameras = [looking([2, 1, 1.2], d) for d in ([1, 0, 0], [0, 1, 0], [0, -1, 0])]
+    assert remove_background(views_of(cameras, [see(c, [22, 2, 2.5]) for c in cameras]))[1] is None
+
+
 def test_several_background_values_are_removed():
     """Those at the edges of objects, which are means of surface and background, too."""
     depths = [see(camera) for camera in AROUND]
