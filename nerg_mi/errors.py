@@ -215,8 +215,9 @@ def translate_mitsuba_errors(file: str | PathLike[str] | None = None) -> Iterato
 def format_error(error: BaseException) -> str:
     """Return the message of ``error`` on one line.
 
-    Mitsuba embeds the complete Python traceback of a plugin's constructor in its message. The returned line keeps the
-    location in the scene (the text before the traceback) and the message of the exception (its last line).
+    Mitsuba embeds the complete Python traceback of a plugin's constructor in its message, and the class of its
+    exception. The returned line keeps the location in the scene (the text before the traceback) and the message of the
+    exception (its last line).
     """
     text = str(error).strip()
     if is_lack_of_memory(error):
@@ -235,6 +236,8 @@ def format_error(error: BaseException) -> str:
     location, marker, trace = text.partition(_TRACEBACK)
     if marker:
         text = location.rstrip() + " " + re.sub(r"^[A-Za-z_][\w.]*:\s+", "", _read_last_exception(trace))
+    # A `NergError` of a plugin has no traceback (`nerg_mi.registration`).
+    text = re.sub(r'(?<="): (NergError|MissingFile): ', ": ", text, count=1)
     text = re.sub(r"^\[[\w.]+\.(cpp|h):\d+\]\s*", "", text)
     return " ".join(text.split()) or type(error).__name__
 

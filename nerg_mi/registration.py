@@ -8,9 +8,12 @@ is checked when Dr.Jit is imported, because an unusable library has no effect be
 
 from __future__ import annotations
 
+import codecs
 import importlib
 import importlib.util
 import sys
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from . import llvm
@@ -62,10 +65,39 @@ def register(kind: str, name: str, cls: type) -> None:
     register_class = getattr(mi, f"register_{_REGISTRY.get(kind, kind)}")
     if variant.startswith("scalar"):
         if kind not in _REGISTRY:
-            register_class(name, _make_refusal(name, variant))
+            register_class(name, _make_constructor(_make_refusal(name, variant)))
     else:
         _classes[name] = cls
-        register_class(name, cls)
+        register_class(name, _make_constructor(cls))
+
+
+class _Raise:
+    """Descriptor in the place of ``__init__``, whose call raises the ``error`` of its instance from C code."""
+
+    def __get__(self, instance, owner):
+        return partial(next, map(codecs.strict_errors, [instance.error]))
+
+
+def _make_constructor(create: Callable[[Any], Any]) -> type:
+    """Return a constructor for Mitsuba that calls ``create``, and whose `NergError` has no traceback.
+
+    Mitsuba shows the traceback of an exception in front of its message, and each Python function that an exception
+    leaves adds a line to it. An error of the user is therefore raised again from C code.
+    """
+
+    class Constructor:
+        __init__ = _Raise()  # pyright: ignore[reportAssignmentType] which is called like a method
+        error: NergError
+
+        def __new__(cls, props):
+            try:
+                return create(props)
+            except NergError as error:
+                failed = super().__new__(cls)
+                failed.error = error.with_traceback(None)
+                return failed
+
+    return Constructor
 
 
 def _explain_variant(variant: str, subject: str) -> str:

@@ -15,8 +15,8 @@ import numpy
 import pytest
 
 from nerg_mi import diagnosis, llvm
-from nerg_mi.errors import UnusableLLVM
-from nerg_mi.registration import PLUGINS
+from nerg_mi.errors import NergError, UnusableLLVM, translate_mitsuba_errors
+from nerg_mi.registration import PLUGINS, _make_constructor
 from tests.conftest import ROOT
 
 # ---- A checkout without installation ----
@@ -159,6 +159,33 @@ def test06_scalar_variants_are_refused(rgb, name, kind):
         rgb.load_dict({"type": name})
     with pytest.raises(RuntimeError, match=said):
         rgb.load_string(f'<scene version="3.0.0"><{kind} type="{name}"/></scene>')
+
+
+def test_errors_of_the_user_in_plugins_have_no_traceback(rgb):
+    """In the messages of Mitsuba, as a dict and as XML, at the top and inside of a scene."""
+    flat, matrix = rgb.ScalarTransform4f().scale([1, 1, 0]), "1 0 0 0 0 1 0 0 0 0 0 0 0 0 0 1"
+    file = str(ROOT / "scenes" / "store" / "shoppers.safetensors")
+    gaze = {"type": "gazefield", "filename": file, "to_world": flat}
+    xml = (
+        f'<volume type="gazefield"><string name="filename" value="{file}"/><transform name="to_world">'
+        f'<matrix value="{matrix}"/></transform></volume>'
+    )
+    for load, content in (
+        (rgb.load_dict, gaze),
+        (rgb.load_dict, {"type": "scene", "i": {"type": "nerg", "gaze": gaze}}),
+        (rgb.load_dict, {"type": "panorama", "to_world": flat}),
+        (rgb.load_string, f'<scene version="3.0.0"><integrator type="nerg">{xml}</integrator></scene>'),
+    ):
+        with pytest.raises(RuntimeError, match='NergError: "to_world"') as info:
+            load(content)
+        assert "Traceback" not in str(info.value) and "\n" not in str(info.value)
+        with pytest.raises(NergError, match='"to_world"') as info, translate_mitsuba_errors():
+            load(content)
+        assert "NergError" not in str(info.value)
+    # The traceback of a bug remains.
+    with pytest.raises(RuntimeError, match="(?s)Traceback.*TypeError"):
+        rgb.register_integrator("broken", _make_constructor(lambda props: len(props.plugin_name)))
+        rgb.load_dict({"type": "broken"})
 
 
 def test07_scalar_variants_leave_no_state():

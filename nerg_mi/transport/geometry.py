@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import ModuleType
@@ -317,6 +318,11 @@ class Shading:
             raise NergError(
                 f'the integrator nested in "nerg" is of the type {type(nested).__name__}, which does not light shapes '
                 'along single rays; use "path", "direct", "volpath" or another sampling integrator'
+            )
+        if nested is not None and re.search(r"integrators = \[\s*\]", str(nested)):
+            raise NergError(
+                'the integrator nested in "nerg" ("aov" or "moment") contains no integrator, and shapes would be '
+                'black; put "path" into it'
             )
         self.nested: mi.SamplingIntegrator | None = nested
         self.headlight = headlight

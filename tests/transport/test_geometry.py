@@ -262,6 +262,13 @@ def test06_nested_integrator_lights_and_adds_aovs(rgb):
     assert shading.aov_names()[-1] == "far.T" and np.allclose(aovs[-1], [3, 0]) and shown.tolist()[0]
 
 
+@pytest.mark.parametrize("nested", [{"type": "aov", "aovs": "far:depth"}, {"type": "moment"}])
+def test_nested_integrators_without_light_are_refused(rgb, nested):
+    Shading(rgb.load_dict({**nested, "light": {"type": "direct"}}))
+    with pytest.raises(NergError, match="contains no integrator"):
+        Shading(rgb.load_dict(nested))
+
+
 def test07_nested_integrator_keeps_the_background(rgb):
     lamp = {"type": "point", "position": [0.5, 0.5, 0], "intensity": 4.0}
     color, _, shown, _ = shade(rgb, scene_of(rgb, lamp), {"type": "direct"})
