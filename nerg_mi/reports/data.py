@@ -26,7 +26,8 @@ from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.bands import render_channels
 from nerg_mi.train.gaze_data import SURFACE_OPACITY
 from nerg_mi.train.geometry import TrainingGeometry
-from nerg_mi.transport.geometry import SceneGeometry, default_march_settings, trace_depth
+from nerg_mi.transport.extrapolation import describe_extrapolation
+from nerg_mi.transport.geometry import default_march_settings, trace_depth
 from nerg_mi.transport.observer import ObserverSettings
 from nerg_mi.transport.observer_gaze import GazeFieldInstance, make_gaze_evaluator
 
@@ -62,9 +63,7 @@ class GazeSampler:
 
     def __init__(self, field: AnyGazeField, geometry: TrainingGeometry, kind: str = "median"):
         self.field, self._kind = field, kind
-        self._geometry = (
-            geometry.medium if isinstance(geometry.medium, SceneGeometry) else SceneGeometry(geometry.medium)
-        )
+        self._geometry = geometry.scene_geometry
         self._has_geometry = geometry.medium is not None
         march = default_march_settings(self._geometry)
         self._settings = ObserverSettings(
@@ -98,6 +97,10 @@ class GazeSampler:
         depth, is_hit = self.trace(np.broadcast_to(observer, points.shape), directions)
         is_visible = ~is_hit | (depth >= distance - 2 * spacing)
         return np.where(is_visible, self.density(observer, directions), 0)
+
+    def describe_extrapolation(self, observers: np.ndarray) -> str:
+        """Return a sentence on the ``observers`` (M, 3) whose gaze is extrapolated; "" if there are none."""
+        return describe_extrapolation(self._geometry, self._gaze, observers)
 
     def query_from(self, observer: np.ndarray) -> DirectionQuery:
         """Return the `DirectionQuery` of the observer at this position (3,), as `gaze_shares` needs it."""

@@ -361,6 +361,11 @@ class TrainingGeometry:
     # Notes on unused or assumed content of its file, one sentence each.
     notes: tuple[str, ...] = ()
 
+    @property
+    def scene_geometry(self) -> SceneGeometry:
+        """The geometry as that of a scene; empty without geometry."""
+        return self.medium if isinstance(self.medium, SceneGeometry) else SceneGeometry(self.medium)
+
     def points_to_field(self, points: np.ndarray) -> np.ndarray:
         """Transform points (..., 3) from the frame of the rays to that of the field."""
         return points @ self.align.matrix[:3, :3].T + self.align.matrix[:3, 3]

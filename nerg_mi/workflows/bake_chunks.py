@@ -615,6 +615,9 @@ def split_halves(who: TrackedRays, rays: Rays, seed: int) -> list[WeightedObserv
     ]
 
 
+_CHECKED_RAYS = 1024  # of each group of rays, whose origins are checked
+
+
 def compute_sums(
     scene: BakeScene | SplatScene,
     groups: Sequence[WeightedObservers | TrackedRays],
@@ -623,9 +626,15 @@ def compute_sums(
     reporter: Reporter,
 ) -> list[SurfaceSums]:
     """Return the sums of each of ``groups``, directly or in parts; ``name`` is a file of the bake."""
-    if options.observer is not None or options.observer_file is not None:
-        positions = [group.positions for group in groups if isinstance(group, WeightedObservers)]
-        warn_extrapolation(reporter.warn, *scene.environment, np.concatenate(positions))
+    eyes = []
+    for group in groups:
+        if isinstance(group, WeightedObservers):
+            eyes.append(group.positions)
+            continue
+        # Evenly spaced in the recording, since each position is compared with all solids.
+        rows = np.linspace(0, len(group) - 1, min(len(group), _CHECKED_RAYS)).astype(int)
+        eyes.append(group.origins[rows])
+    warn_extrapolation(reporter.warn, *scene.environment, np.concatenate(eyes))
     if not options.in_parts:
         return sum_directly(scene, groups, reporter)
     parts = PartRunner(options, name, reporter, options.threads)

@@ -32,7 +32,7 @@ from nerg_mi.rendering.scene_writer import project_to_pixel
 from nerg_mi.transport.geometry import SceneGeometry, pixel_solid_angles, trace_depth
 
 from .rays_events import warn_slow_sampling
-from .render import render_layers
+from .render import render_layers, warn_observer
 from .scene_commands import FloorOptions, ScanpathOptions, SceneFigureOptions, SphereOptions, TriptychOptions
 
 # ---- Result of drawing ----
@@ -273,6 +273,7 @@ def sphere(files: Sequence[Path], options: SphereOptions, reporter: Reporter) ->
             "film": make_film(width, width // 2),
             "sampler": copy_sampler(camera),
         }
+        warn_observer(opened.scene, reporter)
         seen = opened.render(mi.load_dict(panorama), overlay)
     limits = shared_limits([overlay.limits(seen)], options.vmax)
     overlay.check_limits(limits)
@@ -307,6 +308,7 @@ def triptych(files: Sequence[Path], options: TriptychOptions, reporter: Reporter
             )
         if camera.class_name() != "PerspectiveCamera":
             raise NergError(f'sensor {options.sensor} of "{path}" is not a perspective camera; choose another with -s')
+        warn_observer(opened.scene, reporter)
         own_view = opened.render(_observer_camera(nerg.observer, camera), overlay)
         with_occlusion, nerg.occlusion = nerg.occlusion, False
         try:

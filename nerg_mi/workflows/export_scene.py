@@ -46,6 +46,7 @@ from .draw import read_baked
 from .draw_scenes import copy_sampler, make_film, upright_pose
 from .radiance_commands import SceneExportOptions
 from .rays_events import warn_slow_sampling
+from .render import warn_observer
 from .scene_places import detect_kind
 
 _SPHERE_RADIUS = 0.15  # metres
@@ -279,6 +280,7 @@ def _add_gaze(
         "film": make_film(options.width, options.width // 2),
         "sampler": copy_sampler(observer),
     }
+    warn_observer(loaded, reporter)
     reporter.progress(0.5, "rendering the gaze of the observer")
     with translate_mitsuba_errors():
         seen = render_aovs(path, loaded, mi.load_dict(panorama), [quantity, "opacity", "position"], options.spp, 0)

@@ -39,7 +39,9 @@ from nerg_mi.rays.filters import split_by_person
 from nerg_mi.rays.rays import Rays
 from nerg_mi.train.gaze_data import SURFACE_OPACITY, select_prior_kappa
 from nerg_mi.train.geometry import TrainingGeometry
+from nerg_mi.transport.extrapolation import warn_extrapolation
 from nerg_mi.transport.geometry import trace_depth
+from nerg_mi.transport.observer_gaze import GazeFieldInstance
 
 from .base import select_backend
 from .evaluate import load_training_rays
@@ -148,6 +150,8 @@ def evaluate_next_look(
             "the weights are fitted in the only zone of held-out positions and scored there; for scores in new zones, "
             "train with --test-zones 3"
         )
+    eyes = place.points_to_field(data.origin[np.concatenate(rows)])
+    warn_extrapolation(reporter.warn, place.scene_geometry, GazeFieldInstance(loaded), eyes)
     reporter.progress(0.0, "prior")
     kappa = select_prior_kappa(train, "person", options.seed)
     prior = make_prior_baseline(train, kappa=kappa, weights=compute_participant_weights(train))

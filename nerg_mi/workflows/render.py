@@ -32,7 +32,7 @@ from nerg_mi.rendering.scene import activate_variant, list_scene_files, load_sce
 from nerg_mi.rendering.scene_writer import project_to_pixel
 from nerg_mi.threads import set_thread_count
 from nerg_mi.transport.aovs import AOVS
-from nerg_mi.transport.extrapolation import warn_extrapolation
+from nerg_mi.transport.extrapolation import describe_extrapolation
 from nerg_mi.transport.geometry import SceneGeometry
 from nerg_mi.transport.observer import sensor_center
 from nerg_mi.transport.volume_medium import VolumeMedium
@@ -328,12 +328,25 @@ def is_supported(loaded: Any, camera: Any) -> bool:
     return float(np.ravel(np.array(gaze.field.support.evaluate(gaze.to_world.point_to_local(eye))))[0]) >= SUPPORT
 
 
-def warn_observer(loaded: Any, reporter: Reporter) -> None:
-    """Warn if the observer of a ``loaded`` scene is at a position where gaze and visibility are extrapolated."""
+def describe_observer(loaded: Any) -> str:
+    """Return a sentence if the observer of a ``loaded`` scene is at a position where gaze and visibility are
+    extrapolated, else ""."""
     integrator = loaded.integrator()
-    if is_nerg(integrator) and integrator.observer is not None:
-        position = np.ravel(np.array(sensor_center(integrator.observer), np.float64))
-        warn_extrapolation(reporter.warn, SceneGeometry(integrator.medium, loaded), integrator.gaze, position)
+    if not is_nerg(integrator) or integrator.observer is None:
+        return ""
+    position = np.ravel(np.array(sensor_center(integrator.observer), np.float64))
+    return describe_extrapolation(SceneGeometry(integrator.medium, loaded), integrator.gaze, position)
+
+
+def warn_observer(loaded: Any, reporter: Reporter) -> None:
+    """Warn with the sentence of `describe_observer`, if there is one."""
+    if sentence := describe_observer(loaded):
+        reporter.warn(sentence)
+
+
+def _name_picture(index: int, count: int) -> str:
+    """Return the beginning of a sentence on one picture of a sequence."""
+    return f"picture {index + 1}: " if count > 1 else ""
 
 
 def observer_pixel(loaded: Any, camera: Any, depth: np.ndarray) -> tuple[float, float] | None:
@@ -383,6 +396,8 @@ class PictureResult:
         All written files.
     top
         Upper end of the colour scale of overlays, or None.
+    observer_note
+        Why the gaze of the observer is extrapolated, in the first picture where it is; "" if it is not.
     """
 
     path: Path
@@ -393,6 +408,7 @@ class PictureResult:
     undivided_reason: str | None
     files: tuple[Path, ...] = ()
     vmax: float | None = None
+    observer_note: str = ""
 
 
 @dataclass(frozen=True)
@@ -466,7 +482,7 @@ def render_file(
     if options.threads:
         set_thread_count(options.threads)
     start, pace = time.perf_counter(), SamplePace()
-    done, top, picture = 0, None, RenderedPicture((0, 0), 0)
+    done, top, picture, observer_note = 0, None, RenderedPicture((0, 0), 0), ""
     trial = ConstantWeightsTrial(len(frames))
     with Interruption() as stop:
 
@@ -483,11 +499,13 @@ def render_file(
                 reporter.progress(share, f"rendering, {speed}, {seconds * (1 - share) / share:.0f} s left")
 
         def render(frame: Mapping[str, str], make: Make) -> RenderedPicture:
-            nonlocal done
+            nonlocal done, observer_note
             loaded = load_scene(scene, {**(options.defaults or {}), **frame})
             stop.check()
-            if done == 0:
-                warn_observer(loaded, reporter)
+            if not observer_note:
+                observer_note = describe_observer(loaded)
+                if observer_note:
+                    reporter.warn(_name_picture(done, len(frames)) + observer_note)
             camera = find_sensor(scene, loaded, options.sensor)
             samples = sample_count(camera, options.spp)
             constant, begin = trial.prepare(samples, loaded), time.perf_counter()
@@ -510,7 +528,15 @@ def render_file(
         stop.check()
     seconds = time.perf_counter() - start
     result = PictureResult(
-        files[0], picture.size, picture.channels, mode, seconds, picture.undivided_reason, tuple(files), top
+        files[0],
+        picture.size,
+        picture.channels,
+        mode,
+        seconds,
+        picture.undivided_reason,
+        tuple(files),
+        top,
+        observer_note,
     )
     reporter.message(summary_line(result, render_plan, options))
     return result
@@ -676,11 +702,19 @@ def render_film(
     if options.threads:
         set_thread_count(options.threads)
     start = time.perf_counter()
-    first, top = _render_in_parts(scene, render_plan, replace(options, mode=mode), parts)
+    first, top, observer_note = _render_in_parts(scene, render_plan, replace(options, mode=mode), parts, reporter)
     size, channels = (int(first["size"][0]), int(first["size"][1])), int(first.get("channels", 3))
     seconds = time.perf_counter() - start
     result = PictureResult(
-        render_plan.files[0], size, channels, mode, seconds, first.get("whole"), tuple(render_plan.files), top
+        render_plan.files[0],
+        size,
+        channels,
+        mode,
+        seconds,
+        first.get("whole"),
+        tuple(render_plan.files),
+        top,
+        observer_note,
     )
     reporter.message(summary_line(result, render_plan, options))
     reporter.message(f"The parts are stored in {parts.store.folder}; nerg jobs shows their size.")
@@ -688,9 +722,10 @@ def render_film(
 
 
 def _render_in_parts(
-    scene: Path, render_plan: RenderPlan, options: FilmOptions, parts: PartRunner
-) -> tuple[Mapping[str, Any], float | None]:
-    """Render all images. Returns the notes of the last part, and the upper end of the colour scale."""
+    scene: Path, render_plan: RenderPlan, options: FilmOptions, parts: PartRunner, reporter: Reporter
+) -> tuple[Mapping[str, Any], float | None, str]:
+    """Render all images. Returns the notes of the last part, the upper end of the colour scale, and why the gaze of
+    the observer is extrapolated, of which it warns once."""
     from nerg_mi.tasks.task import Part, Plan
 
     from .parts import PlannedScene
@@ -703,11 +738,22 @@ def _render_in_parts(
         for k, frame in enumerate(render_plan.frames)
     ]
     overlay = None if options.overlay is None else find_overlay(options.overlay)
+    observer_note = ""
+
+    def report_observer(index: int, notes: Mapping[str, Any]) -> None:
+        # Parts of earlier versions have no such note.
+        nonlocal observer_note
+        if not observer_note and (observer_note := notes.get("observer", "")):
+            reporter.warn(_name_picture(index, len(frames)) + observer_note)
+
     if overlay is None or not uses_shared_scale(overlay, len(frames), options):
-        last = _copy_outputs(scene, render_plan, options, parts, Plan(what, make_picture, inputs, frames, suffix), 0.0)
-        return last, last.get("top")
+        plan = Plan(what, make_picture, inputs, frames, suffix)
+        last = _copy_outputs(scene, render_plan, options, parts, plan, 0.0, report_observer)
+        return last, last.get("top"), observer_note
     # Render all, then determine the common colour scale, then draw all.
     layers = list(parts.run(Plan(f"{what} (values)", make_layers, inputs, frames, ".npy"), 0.0, _LAYERS_SHARE))
+    for k, made in enumerate(layers):
+        report_observer(k, made.notes)
     limits = [None if made.notes["limits"] is None else tuple(made.notes["limits"]) for made in layers]
     ends = shared_limits(limits, options.vmax)
     overlay.check_limits(ends)
@@ -719,18 +765,28 @@ def _render_in_parts(
         notes = {name: made.notes[name] for name in ("marker", "supported", "basis")}
         drawings.append(Part(LayerDrawing(made.path, ends, **notes, header=header), f"drawing {k + 1}"))
     _copy_outputs(scene, render_plan, options, parts, Plan(what, draw_layers, inputs, drawings, suffix), _LAYERS_SHARE)
-    return layers[-1].notes, None if ends is None else ends[1]
+    return layers[-1].notes, None if ends is None else ends[1], observer_note
 
 
 def _copy_outputs(
-    scene: Path, render_plan: RenderPlan, options: FilmOptions, parts: PartRunner, plan: Any, since: float
+    scene: Path,
+    render_plan: RenderPlan,
+    options: FilmOptions,
+    parts: PartRunner,
+    plan: Any,
+    since: float,
+    on_output: Callable[[int, Mapping[str, Any]], None] = lambda index, notes: None,
 ) -> Mapping[str, Any]:
-    """Copy the outputs of ``plan`` to the output files, in order. Returns the notes of the last part."""
+    """Copy the outputs of ``plan`` to the output files, in order. Returns the notes of the last part.
+
+    ``on_output`` is called with the index and the notes of each part.
+    """
     last: Mapping[str, Any] = {}
     arriving = parts.run(plan, since)
     if not render_plan.video:
-        for file, made in zip(render_plan.files, arriving):
+        for index, (file, made) in enumerate(zip(render_plan.files, arriving)):
             last = made.notes
+            on_output(index, last)
             with replace_atomically(file) as temporary:
                 shutil.copyfile(made.path, temporary)
         return last
@@ -738,8 +794,9 @@ def _copy_outputs(
 
     headers = make_provenances(scene, render_plan.frames, options, str(options.mode), True)
     with open_video_writer(render_plan.files[0], options.fps, next(headers).text()) as add:
-        for made in arriving:
+        for index, made in enumerate(arriving):
             last = made.notes
+            on_output(index, last)
             add(np.array(mi.Bitmap(str(made.path)))[..., :3])
     return last
 
@@ -755,7 +812,8 @@ def picture_options(options: PictureOptions) -> PictureOptions:
 def make_picture(options: PictureOptions, scene: PlannedScene, output: Path) -> dict[str, Any]:
     """Write an image file like `render_file`."""
     made = render_file(scene.checked_path(), output, replace(options, defaults=scene.defaults))
-    return {"size": made.size, "channels": made.channels, "whole": made.undivided_reason, "top": made.vmax}
+    notes = {"size": made.size, "channels": made.channels, "whole": made.undivided_reason, "top": made.vmax}
+    return notes | {"observer": made.observer_note}
 
 
 def make_layers(options: PictureOptions, scene: PlannedScene, output: Path) -> dict[str, Any]:
@@ -768,6 +826,7 @@ def make_layers(options: PictureOptions, scene: PlannedScene, output: Path) -> d
         camera = find_sensor(path, loaded, options.sensor)
         check_memory(path, camera, options)
         check = lambda *_: stop.check()
+        observer_note = describe_observer(loaded)
         layers = render_layers(path, loaded, camera, overlay, options.spp, options.seed, check, options.smoothing)
         stop.check()
     with replace_atomically(output) as temporary, temporary.open("wb") as out:
@@ -779,6 +838,7 @@ def make_layers(options: PictureOptions, scene: PlannedScene, output: Path) -> d
         "marker": layers.marker,
         "supported": bool(layers.has_support),
         "basis": layers.support_note,
+        "observer": observer_note,
     }
 
 

@@ -567,6 +567,10 @@ class _ReportWork:
             place = self._place(scene)
             sampler = GazeSampler(self.field, place, self._kind())
             viewpoints = self._viewpoints(place, scene)
+            # The observer was reported with the scene.
+            if not sampler.describe_extrapolation(self._observer(scene).positions):
+                if sentence := sampler.describe_extrapolation(viewpoints.positions):
+                    self.reporter.warn(sentence)
             objects = observed = self._aoi_attention(areas, sampler, place, viewpoints, self.rays)
             if self.rays is not None and options.observer is not None:
                 observed = self._aoi_attention(areas, sampler, place, self._observer(scene), None)

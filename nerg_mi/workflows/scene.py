@@ -33,7 +33,7 @@ from nerg_mi.rendering.scene_writer import (
 from nerg_mi.train.geometry import make_hit_geometry
 
 from .base import select_backend
-from .render import warn_observer
+from .render import describe_observer
 from .scene_cameras import (
     ObserverPath,
     SceneProbe,
@@ -226,7 +226,9 @@ def write_scene(
         probe = SceneProbe(load_scene(probe_file, values), scene.attention(probe_file.parent).quantity, up)
         reporter.progress(0.3, "probing the surroundings")
         seen = None if observer is None else probe.around(observer)
-        if seen is not None and observer is not None and not seen.is_hit.any() and inputs.kind != "none":
+        if sentence := describe_observer(probe.scene):
+            reporter.warn(sentence)
+        elif seen is not None and observer is not None and not seen.is_hit.any() and inputs.kind != "none":
             reporter.warn("the observer sees no surface; move it with --observer, or check the alignment")
         if observer is not None and seen is not None and walk is None and options.person is None:
             observer = make_upright(turn_to_attention(observer, seen), up)
@@ -243,7 +245,6 @@ def write_scene(
         reporter.progress(0.8, "checking the image")
         write_text(probe_file, scene.text(probe_file.parent, camera, lens, 96).to_xml())
         probed = load_scene(probe_file, values)
-        warn_observer(probed, reporter)
         if not sees_anything(probed):
             raise NergError("the image of the camera would be empty; choose another one with --camera and --target")
     text = scene.text(output.parent, camera, lens, options.width)

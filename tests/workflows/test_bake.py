@@ -102,6 +102,18 @@ def test02_rays_are_baked_in_fractions_and_seconds(rgb, room):
     assert np.isclose(share.share[(share.mesh.corners[:, :, 0] == 8).all(axis=1)].sum(), 1)
 
 
+@pytest.mark.parametrize("gaze", [GAZE, None])
+def test08_recorded_positions_that_are_extrapolated_are_reported_once(rgb, room, gaze):
+    options = BakeOptions(gaze=gaze, num_observers=3, max_angle=20.0, max_edge=3.0, cone=0.0, mode="llvm_ad_rgb")
+    inside, origin = rays(), np.full((40, 3), 1.5)
+    origin[30:, 0] = 99
+    for tracked, count in ((inside, 0), (replace(inside, origin=origin), 1)):
+        recorder = Recorder()
+        bake(room, (), options, recorder, rays=tracked)
+        sentences = [text for text in recorder.warnings if "extrapolated" in text]
+        assert len(sentences) == count and all("(99, 1.5, 1.5)" in text for text in sentences)
+
+
 def test03_scene_units_are_converted_to_metres(rgb, tmp_path):
     """Twice as many units per metre: the same share on the same square metres."""
     (tmp_path / "align.json").write_text("[[2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]]")

@@ -18,6 +18,7 @@ from nerg_mi.evaluation import ablation as scoring
 from nerg_mi.evaluation.gaze import SCORES
 from nerg_mi.evaluation.gaze_report import read_results
 from nerg_mi.evaluation.next_look import HEAD_METHODS, NextLook
+from nerg_mi.fields import gaze_base
 from nerg_mi.files.tables import write_json
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.maths.geometry import Similarity
@@ -133,6 +134,12 @@ def test_the_next_look_is_fitted_and_scored(tmp_path, rgb, monkeypatch):
     assert {row["elapsed"] for row in result.rows} == {1.0, 3.0} and (result.fitted, result.scored) == (2, 2)
     assert [path.name for path in result.files] == ["next.md", "next.csv", "next.json"]
     assert not find_wrong_notes(result.rows) and result.rows[0]["note"]
+    # Positions count as extrapolated if they are farther from recorded ones than this number of radii.
+    monkeypatch.setattr(gaze_base, "CUTOFF_RADII", 1e-9)
+    recorder = Recorder()
+    evaluate_next_look(gaze, rays, None, options, recorder)
+    assert sum("extrapolated" in text for text in recorder.warnings) == 1
+    monkeypatch.undo()
     written = json.loads((tmp_path / "next" / "next.json").read_text())
     assert NextLook.from_json(written["model"]).weights == pytest.approx(result.model.weights)
     assert written["rows"][0]["bits"] == result.rows[0]["bits"] and result.rows[0]["looks"] <= 64

@@ -72,6 +72,18 @@ def scene_overlays(tmp_path_factory):
     return folder / "scene.xml"
 
 
+@pytest.mark.parametrize("overlay", [None, "gaze"])
+@pytest.mark.parametrize("in_parts", [False, True])
+def test_extrapolated_observers_of_any_picture_are_reported_once(rgb, scene_overlays, tmp_path, overlay, in_parts):
+    frames, recorder = tmp_path / "walk.csv", Recorder()
+    frames.write_text('eye\n"0.2, 0.1, -0.5"\n"99, 0.4, -2"\n"98, 0.4, -2"\n')
+    store = tmp_path / "parts" if in_parts else None
+    film = FilmOptions(frames=frames, defaults={"size": "4"}, spp=1, mode=MODE, overlay=overlay, store=store)
+    result = render_film(scene_overlays, tmp_path / "a.png", film, recorder)
+    (sentence,) = [text for text in recorder.warnings if "extrapolated" in text]
+    assert "picture 2" in sentence and "(99, 0.4, -2)" in sentence and result.observer_note in sentence
+
+
 def test_an_overlay_adds_its_quantity_to_the_scene(rgb, scene_overlays, tmp_path):
     recorder = Recorder()
     made = render_file(

@@ -141,6 +141,27 @@ def test_evaluation_next_to_the_gaze_field_is_used(without_3d, run, tmp_path):
     assert any("trained again" in text for text in recorder.warnings)
 
 
+def test_extrapolated_observers_are_reported_once(without_3d, run, tmp_path):
+    """Of recorded positions, and the one that was chosen."""
+    rays = Rays.load(run / "rays.npz")
+    origin = rays.origin.copy()
+    origin[::3, 1] += 99
+    replace(rays, origin=origin).save(tmp_path / "moved.npz")
+    cases = [(run / "rays.npz", None, 0), (tmp_path / "moved.npz", None, 1), (run / "rays.npz", (0.0, 99.0, 1.6), 1)]
+    for file, observer, count in cases:
+        recorder = Recorder()
+        options = replace(SMALL, observer=observer, camera=(0.0, 0.0, 1.6), target=(1.5, 0.0, 1.0))
+        make_report([run / "gaze.safetensors", file], tmp_path / "a.html", options, recorder)
+        assert sum("extrapolated" in text for text in recorder.warnings) == count, (file, observer)
+    # Also if no camera is found.
+    recorder = Recorder()
+    with pytest.raises(NergError, match="--camera"):
+        make_report(
+            [run / "gaze.safetensors"], tmp_path / "a.html", replace(SMALL, observer=(0.0, 99.0, 1.6)), recorder
+        )
+    assert [("extrapolated" in text) for text in recorder.warnings] == [True]
+
+
 def test_a_report_of_a_gaze_field_alone(not_evaluated, tmp_path):
     recorder = Recorder()
     result = make_report([not_evaluated / "gaze.safetensors"], tmp_path / "a.html", SMALL, recorder)
