@@ -26,11 +26,11 @@ from nerg_mi.interruption import TrainingInterrupted
 from nerg_mi.photos.colmap import UpEstimate
 from nerg_mi.photos.dataset import open_dataset
 from nerg_mi.photos.structure import Reconstruction
+from nerg_mi.train import compile as compilation
 from nerg_mi.train.compile import compile_field
 from nerg_mi.train.geometry import load_field_geometry
 from nerg_mi.train.radiance_run import train_field
 from nerg_mi.train.radiance_settings import RadianceSettings
-from nerg_mi.workflows import compile as compilation
 from nerg_mi.workflows import poses as job
 from nerg_mi.workflows import train_radiance as training
 from nerg_mi.workflows.export import (
