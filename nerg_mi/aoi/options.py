@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nerg_mi.errors import NergError, sanitize
-from nerg_mi.ranges import COORDINATES, SECONDS, TIMES, Range, ValidatedDataclass
-from nerg_mi.workflows.old_names import accept_old_keywords
-from nerg_mi.workflows.options import (
+from nerg_mi.old_names import accept_old_keywords
+from nerg_mi.options import (
     ALIGN_HELP,
     ANALYSIS,
     INPUT,
@@ -22,6 +21,7 @@ from nerg_mi.workflows.options import (
     parse_point,
     random_seed,
 )
+from nerg_mi.ranges import COORDINATES, SECONDS, TIMES, Range, ValidatedDataclass
 
 if TYPE_CHECKING:
     from nerg_mi.measures.visits import VisitRules

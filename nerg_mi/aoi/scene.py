@@ -41,13 +41,12 @@ from nerg_mi.rendering.scene import load_scene
 from nerg_mi.train import geometry
 from nerg_mi.train.gaze_data import SURFACE_OPACITY
 from nerg_mi.train.geometry import TrainingGeometry
+from nerg_mi.train.geometry_files import load_training_geometry, read_training_alignment
 from nerg_mi.transport.extrapolation import describe_extrapolation
 from nerg_mi.transport.geometry import SceneGeometry, default_march_settings, shape_corners, trace_depth
 from nerg_mi.transport.mitsuba_mesh import gather_corners, make_mesh, read_triangles
 from nerg_mi.transport.observer import ObserverSettings
 from nerg_mi.transport.observer_gaze import GazeFieldInstance, make_gaze_evaluator
-from nerg_mi.workflows.gaze_commands import GazeEvaluationOptions
-from nerg_mi.workflows.geometry import load_training_geometry, read_training_alignment
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -207,8 +206,8 @@ def load_gaze_scene(
         return load_scene_file(scene, gaze, align, ns)
     if gaze is not None:
         network, metadata = load_gaze(gaze, ns)
-        options = GazeEvaluationOptions(field=field)
-        training_geometry = load_training_geometry(gaze, metadata.get("provenance", metadata), network.box, options, ns)
+        provenance = metadata.get("provenance", metadata)
+        training_geometry = load_training_geometry(gaze, provenance, network.box, ns, field=field)
         return _gaze_scene_from_training(
             training_geometry, GazeFieldInstance(network), align or training_geometry.align
         )

@@ -121,10 +121,10 @@ class TrainedGazeField(TrainedField[AnyGazeField]):
         >>> density.shape, bool(density[0] > density[1] > 0)
         ((2,), True)
         """
+        from nerg_mi.train.geometry_files import read_training_alignment
         from nerg_mi.transport.extrapolation import warn_extrapolation
         from nerg_mi.transport.observer_batch import evaluate_densities
         from nerg_mi.transport.observer_gaze import GazeFieldInstance
-        from nerg_mi.workflows.geometry import read_training_alignment
 
         check_number(tolerance, Range(0, 1), "tolerance")
         o, d = as_rays(origins, directions)
@@ -405,7 +405,7 @@ class TrainedGazeField(TrainedField[AnyGazeField]):
 
     def _find_training_file(self) -> Path:
         """Return the geometry file of the training. Raises `NergError` if there is none."""
-        from nerg_mi.workflows.geometry import find_training_file, geometry_key
+        from nerg_mi.train.geometry_files import find_training_file, geometry_key
 
         provenance, remedy = dict(self.provenance), "pass the file that it was trained in with geometry="
         checkpoint = self.path or Path(self.name)
@@ -473,7 +473,7 @@ def _sample_cap(n: int, area: float, rng: np.random.Generator) -> np.ndarray:
 
 def training_geometry(gaze: object) -> dict[str, Path]:
     """Return the option that names the environment of the training of a gaze field in memory, if it is known."""
-    from nerg_mi.workflows.geometry import geometry_key
+    from nerg_mi.train.geometry_files import geometry_key
 
     if not isinstance(gaze, TrainedGazeField) or gaze.geometry_file is None:
         return {}

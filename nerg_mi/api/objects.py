@@ -27,12 +27,12 @@ from nerg_mi.files.values import to_numbers
 from nerg_mi.formats.areas import format_areas
 from nerg_mi.formats.splats import write_ply_splats
 from nerg_mi.maths.transforms import check_rigid_transforms
+from nerg_mi.old_names import current_keywords
+from nerg_mi.options import GeometryOptions
 from nerg_mi.progress import WarningReporter
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.files import write_mesh
 from nerg_mi.rendering.scene import activate_mitsuba, list_scene_files
-from nerg_mi.workflows.old_names import current_keywords
-from nerg_mi.workflows.options import GeometryOptions
 from nerg_mi.workflows.scene_places import detect_kind
 
 from .arguments import check_names, resolve_file

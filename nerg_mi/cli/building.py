@@ -20,11 +20,11 @@ import typer.core
 
 from nerg_mi import __version__
 from nerg_mi.errors import clean_text, sanitize
+from nerg_mi.old_names import find_spelling
+from nerg_mi.options import GROUPS as GROUPS_OF_OPTIONS
 from nerg_mi.progress import TerminalReporter
 from nerg_mi.ranges import KAPPAS, RANGE
 from nerg_mi.workflows.base import COMMANDS, Command, HelpView, Parameter
-from nerg_mi.workflows.old_names import find_spelling
-from nerg_mi.workflows.options import GROUPS as GROUPS_OF_OPTIONS
 
 from .ending import shorten_values
 from .signatures import make_command

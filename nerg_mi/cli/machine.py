@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import typer
 
+from nerg_mi.options import INPUT, PERFORMANCE, option
 from nerg_mi.progress import Reporter
 from nerg_mi.ranges import SECONDS, Range, ValidatedDataclass
 from nerg_mi.workflows.base import argument, command
-from nerg_mi.workflows.options import INPUT, PERFORMANCE, option
 
 
 @command("doctor", more="The exit code is 0 if a compiled variant of Mitsuba works, else 1.")

@@ -11,10 +11,10 @@ from types import SimpleNamespace
 from typing import Any, get_type_hints
 
 from nerg_mi.files.atomic import check_writable
+from nerg_mi.options import MAIN, TRAINING, cpu_threads, llvm_variant, option
 from nerg_mi.progress import Reporter
 from nerg_mi.ranges import RANGE, find_ranges
 from nerg_mi.workflows.base import Command, argument, import_function, out, select_backend
-from nerg_mi.workflows.options import MAIN, TRAINING, cpu_threads, llvm_variant, option
 
 from .table import Row
 

@@ -28,6 +28,7 @@ from nerg_mi.files.safe_read import read_json
 from nerg_mi.files.tables import write_json
 from nerg_mi.formats.fields import save_gaze
 from nerg_mi.formats.splats import is_splat_file
+from nerg_mi.options import exposed_options
 from nerg_mi.progress import SILENT, Reporter
 from nerg_mi.rays.dataset import load_rays
 from nerg_mi.rays.rays import Rays
@@ -37,11 +38,10 @@ from nerg_mi.train.gaze_data import Supervision, digest_rays, hold_out
 from nerg_mi.train.gaze_recipes import get_recipe
 from nerg_mi.train.gaze_trainer import GazePlan
 from nerg_mi.train.geometry import TrainingGeometry
+from nerg_mi.train.geometry_files import check_geometry, geometry_kind, make_geometry
 
 from .base import select_backend
 from .gaze_commands import AblationOptions, GazeOptions
-from .geometry import check_geometry, geometry_kind, make_geometry
-from .options import exposed_options
 from .parts import PartRunner, PlannedScene
 from .train_gaze import plan_gaze, train_planned
 

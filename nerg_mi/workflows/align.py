@@ -18,6 +18,7 @@ from nerg_mi.figures.maps import alignment_figure
 from nerg_mi.figures.style import make_provenance, save
 from nerg_mi.files.atomic import check_writable, file_sha256
 from nerg_mi.maths.geometry import Similarity
+from nerg_mi.options import parse_point
 from nerg_mi.photos.colmap import rotation_to_z
 from nerg_mi.progress import SILENT, Reporter
 from nerg_mi.rays.direction_checks import DECLARED
@@ -26,7 +27,6 @@ from nerg_mi.train import geometry
 from nerg_mi.train.geometry import TrainingGeometry
 
 from .base import select_backend
-from .options import parse_point
 from .rays_commands import AlignOptions
 
 # ---- Alignment of tracking with a scene ----

@@ -52,6 +52,7 @@ from nerg_mi.surfaces.splats import integrate_gaze, shortest_axes, splat_densiti
 from nerg_mi.tasks.engines import TaskOutput
 from nerg_mi.tasks.execution import prepare_once
 from nerg_mi.tasks.task import RENDER_LIBRARIES, Part, Plan
+from nerg_mi.train.geometry_files import read_training_alignment
 from nerg_mi.transport.extrapolation import warn_extrapolation
 from nerg_mi.transport.geometry import SceneGeometry, default_march_settings
 from nerg_mi.transport.mitsuba_mesh import Triangles, read_triangles
@@ -60,7 +61,6 @@ from nerg_mi.transport.observer_gaze import GazeFieldInstance
 from nerg_mi.transport.splat_medium import SplatArrays, SplatMedium
 
 from .base import select_backend
-from .geometry import read_training_alignment
 from .parts import PartRunner, PlannedScene
 from .scene_commands import BakeOptions
 

@@ -11,10 +11,9 @@ from types import ModuleType
 from typing import Any, TypeVar
 
 from nerg_mi import __version__, llvm
+from nerg_mi.old_names import accept_old_keywords
+from nerg_mi.options import OUTPUT, PANEL
 from nerg_mi.threads import set_thread_count
-
-from .old_names import accept_old_keywords
-from .options import OUTPUT, PANEL
 
 # ---- Backend: the Mitsuba variant and the number of threads ----
 
@@ -135,7 +134,7 @@ def command(
     more
         Further paragraphs for ``--help``.
     options
-        Dataclass whose fields become options (`nerg_mi.workflows.options.option`).
+        Dataclass whose fields become options (`nerg_mi.options.option`).
     without
         Fields that are not exposed on the command line.
     further

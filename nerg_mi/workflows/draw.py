@@ -30,6 +30,7 @@ from nerg_mi.formats.meshes import read_mesh_file
 from nerg_mi.formats.ply import parse_ply
 from nerg_mi.formats.splats import is_splat_file
 from nerg_mi.maths.arrays import to_vector
+from nerg_mi.old_names import current_keywords
 from nerg_mi.progress import SILENT, Reporter
 from nerg_mi.rendering.bands import SURFACE_OPACITY
 from nerg_mi.rendering.scene import activate_variant
@@ -38,7 +39,6 @@ from nerg_mi.transport.mitsuba_mesh import make_mesh
 
 from .base import import_function
 from .draw_scenes import Drawing
-from .old_names import current_keywords
 from .scene_cameras import check_point
 from .scene_commands import KINDS, BakedFigureOptions, DifferenceOptions, FigureKind, SheetOptions
 

@@ -43,6 +43,7 @@ from nerg_mi.files.dataframes import ResultTables
 from nerg_mi.files.safe_read import read_json
 from nerg_mi.files.tables import add_notes, write_csv, write_json
 from nerg_mi.formats.fields import load_gaze
+from nerg_mi.options import exposed_options, shared_options
 from nerg_mi.probes.probes import REGION_LEVELS, format_level
 from nerg_mi.progress import SILENT, Reporter
 from nerg_mi.rays.dataset import hash_rays, is_dataset, load_rays
@@ -51,11 +52,10 @@ from nerg_mi.tasks.task import FOLDER_SUFFIX, RENDER_LIBRARIES, Part, Plan
 from nerg_mi.threads import set_thread_count
 from nerg_mi.train.gaze_data import find_hit_points
 from nerg_mi.train.geometry import TrainingGeometry
+from nerg_mi.train.geometry_files import check_geometry, geometry_kind, load_training_geometry
 
 from .base import select_backend
 from .gaze_commands import FoldOptions, GazeEvaluationOptions, GazeOptions
-from .geometry import check_geometry, geometry_kind, load_training_geometry
-from .options import exposed_options, shared_options
 from .parts import PartRunner, PlannedScene
 from .train_gaze import PRIOR, train_gaze
 
@@ -149,7 +149,9 @@ def evaluate_gaze(
     test = evaluation.make_test(
         scored, centres, account["radius"], options.kappa, options.directions, options.min_rays, seed=seed
     )
-    place = load_training_geometry(gaze, training, loaded.box, options, ns)
+    place = load_training_geometry(
+        gaze, training, loaded.box, ns, field=options.field, scene=options.scene, choice=options.geometry
+    )
     option = f"--{place.kind} {options.field or options.scene or 'FILE'}"
     # A field that was trained with --force is scored, with a warning.
     check_geometry(place, scored, option, True, reporter)

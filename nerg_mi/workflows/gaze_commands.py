@@ -14,23 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from nerg_mi.ranges import (
-    BASE_SEEDS,
-    DIRECTIONS,
-    KAPPAS,
-    LENGTHS,
-    RAYS,
-    SECONDS,
-    SEEDS,
-    STEPS,
-    TEST_FRACTIONS,
-    Range,
-    ValidatedDataclass,
-)
-from nerg_mi.train.gaze_settings import GazeSettings, ProbeSettings
-
-from .base import argument, declare, out
-from .options import (
+from nerg_mi.options import (
     INPUT,
     MODEL,
     OUTPUT,
@@ -48,6 +32,22 @@ from .options import (
     random_seed,
     repeat_options,
 )
+from nerg_mi.ranges import (
+    BASE_SEEDS,
+    DIRECTIONS,
+    KAPPAS,
+    LENGTHS,
+    RAYS,
+    SECONDS,
+    SEEDS,
+    STEPS,
+    TEST_FRACTIONS,
+    Range,
+    ValidatedDataclass,
+)
+from nerg_mi.train.gaze_settings import GazeSettings, ProbeSettings
+
+from .base import argument, declare, out
 
 _BY_RECIPE = "[default: set by the recipe]"
 

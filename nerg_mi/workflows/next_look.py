@@ -39,15 +39,14 @@ from nerg_mi.rays.filters import split_by_person
 from nerg_mi.rays.rays import Rays
 from nerg_mi.train.gaze_data import SURFACE_OPACITY, select_prior_kappa
 from nerg_mi.train.geometry import TrainingGeometry
+from nerg_mi.train.geometry_files import load_training_geometry
 from nerg_mi.transport.extrapolation import warn_extrapolation
 from nerg_mi.transport.geometry import trace_depth
 from nerg_mi.transport.observer_gaze import GazeFieldInstance
 
 from .base import select_backend
 from .evaluate import load_training_rays
-from .gaze_commands import GazeEvaluationOptions, NextLookOptions
-from .geometry import load_training_geometry
-from .options import shared_options
+from .gaze_commands import NextLookOptions
 
 _ELAPSED = (0.2, 1.0, 2.0, 5.0)  # seconds
 _NOWHERE = np.zeros((1, 3))  # the position of a density that does not depend on it
@@ -124,8 +123,9 @@ def evaluate_next_look(
     holdout = training["test"]
     if not holdout.get("people"):
         raise NergError(f'"{gaze}" held out no participants to score; train with --test-participants 0.5')
-    geometry_options = GazeEvaluationOptions(**shared_options(options, GazeEvaluationOptions))
-    place = load_training_geometry(gaze, training, loaded.box, geometry_options, ns)
+    place = load_training_geometry(
+        gaze, training, loaded.box, ns, field=options.field, scene=options.scene, choice=options.geometry
+    )
     field = FieldDensity(loaded, place.medium, place.align, training.get("probes", {}).get("depth", "median"))
     is_held_out = split_by_person(data, test_persons=holdout["people"])[1]
     distance_to_centre, centre = KDTree(holdout["centres"]).query(data.origin)

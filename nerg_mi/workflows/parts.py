@@ -9,13 +9,12 @@ from pathlib import Path
 from nerg_mi.errors import NergError
 from nerg_mi.files.safe_read import resolve_path
 from nerg_mi.files.tables import format_markdown_table
+from nerg_mi.options import PartOptions
 from nerg_mi.progress import SILENT, Reporter
 from nerg_mi.rendering.scene import list_scene_files
 from nerg_mi.tasks.engines import PlanProgress, TaskOutput, open_engine, run_plan
 from nerg_mi.tasks.store import JobStatus, Store, StoreStatus, read_status, remove_stale
 from nerg_mi.tasks.task import FileGroup, Plan
-
-from .options import PartOptions
 
 SUFFIX = ".tasks"
 """Suffix of the default store next to an output."""

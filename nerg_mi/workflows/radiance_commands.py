@@ -19,11 +19,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from nerg_mi.ranges import LENGTHS, POSITIVE_VALUES, SECONDS, SPP, Range, ValidatedDataclass
-from nerg_mi.train.radiance_settings import RadianceSettings
-
-from .base import argument, declare, extra, out
-from .options import (
+from nerg_mi.options import (
     INPUT,
     MODEL,
     OUTPUT,
@@ -40,6 +36,10 @@ from .options import (
     option,
     random_seed,
 )
+from nerg_mi.ranges import LENGTHS, POSITIVE_VALUES, SECONDS, SPP, Range, ValidatedDataclass
+from nerg_mi.train.radiance_settings import RadianceSettings
+
+from .base import argument, declare, extra, out
 
 # ---- From photos to a field ----
 

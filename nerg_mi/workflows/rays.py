@@ -17,6 +17,7 @@ from nerg_mi.figures.style import existing_files, make_provenance
 from nerg_mi.files.atomic import check_new_folder, check_writable, create_folder_atomically
 from nerg_mi.files.tables import write_json
 from nerg_mi.files.values import normalize_name
+from nerg_mi.old_names import find_keywords, get_spellings, rename_keywords
 from nerg_mi.progress import SILENT, Reporter
 from nerg_mi.rays import events, filters
 from nerg_mi.rays.dataset import (
@@ -36,7 +37,6 @@ from nerg_mi.rays.quality import RaysSummary, format_quality_report, summarise, 
 from nerg_mi.rays.rays import SUFFIXES, Rays, merge_rays
 from nerg_mi.rays.readers.registry import TABLE, collect_shared_options, get_reader, parse_options, read_rays
 
-from .old_names import find_keywords, get_spellings, rename_keywords
 from .rays_commands import DATASET, FilterOptions, PlotOptions, RaysImportOptions, SplitOptions
 
 if TYPE_CHECKING:

@@ -19,10 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from nerg_mi.errors import NergError
-from nerg_mi.ranges import COORDINATES, LENGTHS, RAYS, SECONDS, SEEDS, THREADS, TIMES, Range, ValidatedDataclass
-
-from .base import HelpView, Parameter, argument, declare, extra, out
-from .options import (
+from nerg_mi.options import (
     ALIGN_HELP,
     ANALYSIS,
     INPUT,
@@ -37,6 +34,9 @@ from .options import (
     option,
     random_seed,
 )
+from nerg_mi.ranges import COORDINATES, LENGTHS, RAYS, SECONDS, SEEDS, THREADS, TIMES, Range, ValidatedDataclass
+
+from .base import HelpView, Parameter, argument, declare, extra, out
 
 DETECTORS = ("ivt", "idt")
 EXPORT_FORMATS = ("bids",)

@@ -14,6 +14,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.files.atomic import check_writable
 from nerg_mi.files.tables import add_notes, unescape_formula, write_csv
 from nerg_mi.files.values import find_names
+from nerg_mi.options import EventOptions
 from nerg_mi.progress import SILENT, Reporter
 from nerg_mi.rays.dataset import load_rays
 from nerg_mi.rays.event_settings import FIXATIONS
@@ -23,7 +24,6 @@ from nerg_mi.rays.quality import GazeTarget, RecordingQuality, measure_recording
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rays.readers.columns import open_named_table
 
-from .options import EventOptions
 from .rays_commands import RaysEventsOptions
 
 

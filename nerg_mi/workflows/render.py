@@ -24,6 +24,7 @@ from nerg_mi.files.atomic import check_writable, replace_atomically, write_bytes
 from nerg_mi.files.safe_read import read_npy
 from nerg_mi.files.video import check_video_output, open_video_writer
 from nerg_mi.interruption import Interruption
+from nerg_mi.options import to_base
 from nerg_mi.progress import SILENT, Reporter
 from nerg_mi.rendering import bands
 from nerg_mi.rendering.bands import Channels, ConstantWeightsTrial, SamplePace, is_nerg, render_aovs
@@ -37,7 +38,6 @@ from nerg_mi.transport.geometry import SceneGeometry
 from nerg_mi.transport.observer import sensor_center
 from nerg_mi.transport.volume_medium import VolumeMedium
 
-from .options import to_base
 from .scene_commands import SMOOTHING, FilmOptions, PictureOptions
 
 if TYPE_CHECKING:

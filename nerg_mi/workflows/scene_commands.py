@@ -20,23 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from nerg_mi.aoi.options import StatisticsOptions
-from nerg_mi.ranges import (
-    COORDINATES,
-    FIELDS_OF_VIEW,
-    LENGTHS,
-    LOG_DECADES,
-    POSITIVE_VALUES,
-    RATES,
-    RAYS,
-    SECONDS,
-    SPP,
-    TIMES,
-    Range,
-    ValidatedDataclass,
-)
-
-from .base import argument, declare, extra, out
-from .options import (
+from nerg_mi.options import (
     ALIGN_HELP,
     ANALYSIS,
     INPUT,
@@ -55,6 +39,22 @@ from .options import (
     random_seed,
     up_axis,
 )
+from nerg_mi.ranges import (
+    COORDINATES,
+    FIELDS_OF_VIEW,
+    LENGTHS,
+    LOG_DECADES,
+    POSITIVE_VALUES,
+    RATES,
+    RAYS,
+    SECONDS,
+    SPP,
+    TIMES,
+    Range,
+    ValidatedDataclass,
+)
+
+from .base import argument, declare, extra, out
 
 if TYPE_CHECKING:
     from nerg_mi.figures.overlay import Style
@@ -332,7 +332,7 @@ class FigureKind:
     max_files
         Maximum number of input files.
     options
-        Dataclass of options, see `nerg_mi.workflows.options.option`.
+        Dataclass of options, see `nerg_mi.options.option`.
     function
         What draws the figure from ``(files, options, reporter)``, as "MODULE:NAME".
     """

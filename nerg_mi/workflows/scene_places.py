@@ -36,9 +36,8 @@ from nerg_mi.rendering.scene_writer import (
     relative_path,
 )
 from nerg_mi.train.geometry import DEFAULT_DEPTH, shade_hits
+from nerg_mi.train.geometry_files import find_training_file, geometry_key, read_training_alignment
 from nerg_mi.transport.geometry import HEADLIGHT
-
-from .geometry import find_training_file, geometry_key, read_training_alignment
 
 # ---- Input files, recognised by their content ----
 

@@ -20,7 +20,6 @@ from nerg_mi.aoi.measured import (
 )
 from nerg_mi.aoi.options import StatisticsOptions
 from nerg_mi.aoi.output import StatisticsResult, write_results
-from nerg_mi.aoi.parts import PartitionedStatistics
 from nerg_mi.aoi.predicted import (
     AoiScene,
     PredictedAttention,
@@ -54,14 +53,15 @@ from nerg_mi.measures.tables import (
     transition_rows,
 )
 from nerg_mi.measures.visits import ALL, Cell, Total, VisitSums
+from nerg_mi.options import parse_point
 from nerg_mi.progress import SILENT, Reporter
 from nerg_mi.rays.pseudonyms import make_pseudonyms, read_salt
 from nerg_mi.rays.rays import TRACKING, Rays
 
 from .base import select_backend
-from .options import parse_point
 from .parts import PartRunner
 from .scene_places import detect_kind
+from .statistics_parts import PartitionedStatistics
 
 
 @dataclass(frozen=True)

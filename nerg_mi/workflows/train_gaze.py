@@ -19,6 +19,7 @@ from nerg_mi.formats.checkpoint import read_checkpoint
 from nerg_mi.formats.fields import save_gaze
 from nerg_mi.interruption import TrainingInterrupted
 from nerg_mi.maths.geometry import Similarity
+from nerg_mi.options import explicit_settings
 from nerg_mi.photos.salience import SalienceSet, open_salience
 from nerg_mi.progress import SILENT, Reporter
 from nerg_mi.rays.dataset import hash_rays, is_dataset, load_rays
@@ -32,11 +33,10 @@ from nerg_mi.train.gaze_recipes import FieldOptions, Recipe, get_recipe
 from nerg_mi.train.gaze_settings import GazeSettings, ProbeSettings
 from nerg_mi.train.gaze_trainer import GazePlan, GazeProgress, StateSettings
 from nerg_mi.train.geometry import TrainingGeometry
+from nerg_mi.train.geometry_files import check_geometry, geometry_kind, make_geometry
 
 from .base import select_backend
 from .gaze_commands import GazeOptions, PriorOptions
-from .geometry import check_geometry, geometry_kind, make_geometry
-from .options import explicit_settings
 
 # ---- Training of a gaze field ----
 

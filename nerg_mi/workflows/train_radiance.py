@@ -17,6 +17,7 @@ from nerg_mi.files.tables import write_json
 from nerg_mi.formats.checkpoint import read_checkpoint
 from nerg_mi.formats.fields import save_radiance
 from nerg_mi.interruption import TrainingInterrupted
+from nerg_mi.options import explicit_settings
 from nerg_mi.photos.dataset import Dataset, open_dataset
 from nerg_mi.photos.images import pick_evenly
 from nerg_mi.photos.posed import describe_unused
@@ -26,7 +27,6 @@ from nerg_mi.train.radiance_monitor import GuardedObserver, TrainingObserver, ge
 from nerg_mi.train.radiance_settings import RadianceSettings, make_radiance_config
 
 from .base import import_function, select_backend
-from .options import explicit_settings
 from .radiance_commands import RadianceOptions, RadianceScoreOptions
 
 # ---- Training and evaluation of radiance fields ----

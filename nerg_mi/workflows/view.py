@@ -21,9 +21,9 @@ from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.bands import is_nerg
 from nerg_mi.rendering.nested_scene import GAZE_PROPERTIES, GAZE_PROPERTY, find_field_file, replace_gaze
 from nerg_mi.rendering.scene import load_scene
+from nerg_mi.train.geometry_files import read_training_alignment
 
 from .base import select_backend
-from .geometry import read_training_alignment
 from .scene import write_scene
 from .scene_cameras import check_point
 from .scene_commands import SceneOptions, ViewOptions

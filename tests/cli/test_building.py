@@ -20,12 +20,12 @@ from nerg_mi.cli.building import GROUPS, find_commands, make_callback
 from nerg_mi.cli.table import ROWS, Row
 from nerg_mi.errors import NergError
 from nerg_mi.files.values import FilePath
+from nerg_mi.options import option, parse_numbers
 from nerg_mi.progress import Progress
 from nerg_mi.ranges import KAPPAS, Range, ValidatedDataclass, check_ranges, setting
 from nerg_mi.rays.readers.base import list_options
 from nerg_mi.rays.readers.registry import collect_shared_options, get_reader, list_preset_names
 from nerg_mi.workflows.base import COMMANDS, Command, argument, extra
-from nerg_mi.workflows.options import option, parse_numbers
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,7 +103,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from nerg_mi.workflows.base import argument, command
-from nerg_mi.workflows.options import option
+from nerg_mi.options import option
 from nerg_mi.ranges import Range, ValidatedDataclass
 
 

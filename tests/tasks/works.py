@@ -14,8 +14,8 @@ from typing import Any
 
 from nerg_mi.errors import NergError
 from nerg_mi.files.atomic import write_text
+from nerg_mi.options import PartOptions, option
 from nerg_mi.tasks.task import FOLDER_SUFFIX, Checksums, Part, Plan, find_inputs, relocate_paths
-from nerg_mi.workflows.options import PartOptions, option
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -24,6 +24,7 @@ from nerg_mi.formats.ply import write_columns
 from nerg_mi.formats.splats import read_splats, write_ply_splats
 from nerg_mi.maths.geometry import Similarity
 from nerg_mi.maths.sphere import SH_C0
+from nerg_mi.options import PartOptions
 from nerg_mi.rays.rays import Rays
 from nerg_mi.surfaces.laplacian import merge_sums
 from nerg_mi.surfaces.sources import GazeSumSettings, RaySettings, TrackedRays, WeightedObservers
@@ -52,7 +53,6 @@ from nerg_mi.workflows.bake_chunks import (
     sum_in_parts,
 )
 from nerg_mi.workflows.bake_splats import COLUMN, bake_splats
-from nerg_mi.workflows.options import PartOptions
 from nerg_mi.workflows.parts import PartRunner
 from nerg_mi.workflows.scene_commands import BakeOptions
 from tests.conftest import ROOT

@@ -22,9 +22,11 @@ from nerg_mi.fields import gaze_base
 from nerg_mi.files.tables import write_json
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.maths.geometry import Similarity
+from nerg_mi.options import GeometryOptions
 from nerg_mi.rays.rays import TRACKING, Rays
 from nerg_mi.threads import set_thread_count
 from nerg_mi.train.gaze_log_density import compute_elevation_density
+from nerg_mi.train.geometry_files import load_training_geometry, make_geometry
 from nerg_mi.workflows import ablation, evaluate, next_look
 from nerg_mi.workflows.ablation import AblationBenchmark, ablate, load_ground_truth, make_plan
 from nerg_mi.workflows.evaluate import SCORED, evaluate_folds, evaluate_gaze
@@ -35,9 +37,7 @@ from nerg_mi.workflows.gaze_commands import (
     GazeOptions,
     NextLookOptions,
 )
-from nerg_mi.workflows.geometry import load_training_geometry, make_geometry
 from nerg_mi.workflows.next_look import evaluate_next_look, make_ray_distance
-from nerg_mi.workflows.options import GeometryOptions
 from nerg_mi.workflows.parts import account_for_store
 from nerg_mi.workflows.train_gaze import learn_prior, train_gaze
 from tests.conftest import ROOT
@@ -144,7 +144,7 @@ def test_the_next_look_is_fitted_and_scored(tmp_path, rgb, monkeypatch):
     assert NextLook.from_json(written["model"]).weights == pytest.approx(result.model.weights)
     assert written["rows"][0]["bits"] == result.rows[0]["bits"] and result.rows[0]["looks"] <= 64
     # Looks without hit points end at the surfaces of the geometry.
-    place = load_training_geometry(gaze, provenance, BOX, GazeEvaluationOptions(), ns)
+    place = load_training_geometry(gaze, provenance, BOX, ns)
     distance = make_ray_distance(place)
     assert distance is not None and rays.hit is not None
     recorded = np.linalg.norm(rays.hit - rays.origin, axis=1)
@@ -577,31 +577,30 @@ def test_geometry_is_located_next_to_its_checkpoint(rays, tmp_path, kind):
     assert place.kind == kind and (place.radiance is not None) == (kind == "field")
     matrix = np.diag([2.0, 2, 2, 1])
     provenance = json.loads(json.dumps(place.metadata)) | {"align": matrix.tolist()}
-    again = load_training_geometry(tmp_path / "gaze.safetensors", provenance, BOX, GazeEvaluationOptions(), ns)
+    again = load_training_geometry(tmp_path / "gaze.safetensors", provenance, BOX, ns)
     assert again.kind == kind and again.align.scale == pytest.approx(2)
     assert again.box == (BOX if kind == "none" else place.box)
     if kind == "none":
         return
     option = {"field": "field", "scene": "scene", "hits": "geometry"}[kind]
-    elsewhere = GazeEvaluationOptions(**{option: tmp_path / "other"})
+    elsewhere = {"choice" if kind == "hits" else kind: tmp_path / "other"}
     with pytest.raises(NergError, match=f"does not exist; name it with --{option}"):
-        load_training_geometry(tmp_path / "gaze.safetensors", provenance, BOX, elsewhere, ns)
+        load_training_geometry(tmp_path / "gaze.safetensors", provenance, BOX, ns, **elsewhere)
     (tmp_path / "other").write_bytes(b"something else")
     with pytest.raises(NergError, match=f"is not the file .*--{option}"):
-        load_training_geometry(tmp_path / "gaze.safetensors", provenance, BOX, elsewhere, ns)
+        load_training_geometry(tmp_path / "gaze.safetensors", provenance, BOX, ns, **elsewhere)
 
 
 @pytest.mark.parametrize("kind", ["scene", "hits", "none"])
 @pytest.mark.parametrize("word", ["hits", "none"])
 def test_an_evaluation_takes_the_words_of_its_training(rays, tmp_path, kind, word):
     gaze, provenance = tmp_path / "gaze.safetensors", json.loads(json.dumps(made(tmp_path, kind, rays).metadata))
-    options = GazeEvaluationOptions(geometry=Path(word))
     if word == kind:
-        again = load_training_geometry(gaze, provenance, BOX, options, ns)
+        again = load_training_geometry(gaze, provenance, BOX, ns, choice=word)
         assert again.kind == kind
     else:
         with pytest.raises(NergError, match="--geometry") as refusal:
-            load_training_geometry(gaze, provenance, BOX, options, ns)
+            load_training_geometry(gaze, provenance, BOX, ns, choice=word)
         trained = {"scene": "--scene", "hits": "--geometry hits", "none": "--geometry none"}[kind]
         assert f'"{word}"' in str(refusal.value) and trained in str(refusal.value)
         assert "does not exist" not in str(refusal.value)
@@ -609,7 +608,7 @@ def test_an_evaluation_takes_the_words_of_its_training(rays, tmp_path, kind, wor
 
 def test_a_checkpoint_without_stored_geometry_is_refused():
     with pytest.raises(NergError, match="does not store the geometry that it was trained"):
-        load_training_geometry(Path("gaze.safetensors"), {}, BOX, GazeEvaluationOptions(), ns)
+        load_training_geometry(Path("gaze.safetensors"), {}, BOX, ns)
 
 
 def test_without_geometry_the_box_contains_all_observers(rays):

@@ -15,9 +15,9 @@ import pytest
 import nerg_mi as nerg
 from nerg_mi.cli.building import DEBUG, build_command
 from nerg_mi.errors import NergError
+from nerg_mi.old_names import _KEYWORDS, ALL, OLD_NAMES, renamed_options
 from nerg_mi.workflows.base import COMMANDS, Command
 from nerg_mi.workflows.gaze_commands import AblationOptions, FoldOptions, GazeOptions
-from nerg_mi.workflows.old_names import _KEYWORDS, ALL, OLD_NAMES, renamed_options
 from tools.command_pages import iter_commands
 
 # Options of colmap, pip, Python's server and torch-ngp, and the prefix of negated flags.

@@ -15,9 +15,11 @@ import drjit as dr
 import pytest
 
 import nerg_mi.workflows
+from nerg_mi import options
 from nerg_mi.aoi.options import CountOptions, PredictionOptions, StatisticsOptions
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation.ablation import Variant
+from nerg_mi.options import PartOptions, exposed_options, option, shared_options, to_base
 from nerg_mi.progress import SILENT
 from nerg_mi.ranges import ValidatedDataclass
 from nerg_mi.surfaces.sources import GazeSumSettings, RaySettings
@@ -25,7 +27,7 @@ from nerg_mi.tasks.task import Part, Plan, rebuild_value
 from nerg_mi.threads import set_thread_count
 from nerg_mi.train.gaze_settings import GazeSettings as TrainingSettings
 from nerg_mi.train.gaze_settings import ProbeSettings
-from nerg_mi.workflows import ablation, evaluate, options
+from nerg_mi.workflows import ablation, evaluate
 from nerg_mi.workflows.ablation import training_options
 from nerg_mi.workflows.base import select_backend, versions
 from nerg_mi.workflows.evaluate import fold_options
@@ -36,7 +38,6 @@ from nerg_mi.workflows.gaze_commands import (
     GazeOptions,
     PriorOptions,
 )
-from nerg_mi.workflows.options import PartOptions, exposed_options, option, shared_options, to_base
 from nerg_mi.workflows.rays_commands import FilterOptions, SplitOptions
 from nerg_mi.workflows.render import picture_options
 from nerg_mi.workflows.scene_commands import FilmOptions, StudyOptions

@@ -16,6 +16,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.figures.overlay import robust_max
 from nerg_mi.files.atomic import write_bytes
 from nerg_mi.files.images import read_exr_attributes
+from nerg_mi.options import PartOptions
 from nerg_mi.rendering import bands
 from nerg_mi.rendering.bands import render_aovs
 from nerg_mi.rendering.scene import load_scene
@@ -23,7 +24,6 @@ from nerg_mi.tasks.engines import LocalEngine, ProcessEngine, run_plan
 from nerg_mi.tasks.store import Store
 from nerg_mi.workflows import render
 from nerg_mi.workflows.demo import find_store_scene
-from nerg_mi.workflows.options import PartOptions
 from nerg_mi.workflows.parts import PartRunner, PlannedScene, account_for_store, format_bytes
 from nerg_mi.workflows.render import make_picture, render_file, render_film
 from nerg_mi.workflows.scene_commands import FilmOptions, PictureOptions

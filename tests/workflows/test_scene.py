@@ -20,14 +20,14 @@ from nerg_mi.formats.gltf import encode_unlit_glb
 from nerg_mi.formats.surfaces import write_volume
 from nerg_mi.maths.geometry import Box, ContractedBox
 from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.options import GeometryOptions
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.bands import render_channels
 from nerg_mi.rendering.files import read_frames
 from nerg_mi.rendering.nested_scene import GAZE_PROPERTY, find_field_file
 from nerg_mi.rendering.scene import load_scene
+from nerg_mi.train.geometry_files import make_geometry
 from nerg_mi.workflows import demo, scene
-from nerg_mi.workflows.geometry import make_geometry
-from nerg_mi.workflows.options import GeometryOptions
 from nerg_mi.workflows.render import render_file
 from nerg_mi.workflows.scene import write_scene
 from nerg_mi.workflows.scene_commands import PictureOptions, SceneOptions, ViewOptions

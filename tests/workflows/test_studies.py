@@ -16,13 +16,14 @@ from nerg_mi.evaluation.study import list_rows, measure_rows
 from nerg_mi.evaluation.study_subject import open_subject
 from nerg_mi.maths.geometry import Box
 from nerg_mi.rays.rays import Rays
+from nerg_mi.train import geometry_files as geometry
 from nerg_mi.train.geometry import TrainingGeometry
+from nerg_mi.train.geometry_files import check_geometry
 from nerg_mi.workflows import align as alignment
-from nerg_mi.workflows import demo, geometry, study
+from nerg_mi.workflows import demo, study
 from nerg_mi.workflows.align import align
 from nerg_mi.workflows.demo import STAGES, make_demo
 from nerg_mi.workflows.gaze_commands import GazeOptions
-from nerg_mi.workflows.geometry import check_geometry
 from nerg_mi.workflows.rays_commands import AlignOptions
 from nerg_mi.workflows.scene_commands import DemoOptions, StudyOptions
 from nerg_mi.workflows.study import find_reference_scene, measure_part, plan_study, run_study

@@ -13,14 +13,13 @@ from nerg_mi.alignment.check import check_alignment
 from nerg_mi.errors import NergError
 from nerg_mi.formats.fields import matches_checksum
 from nerg_mi.maths.geometry import AnyBox, Similarity
+from nerg_mi.options import GeometryOptions
 from nerg_mi.photos.salience import SalienceView
 from nerg_mi.progress import SILENT, Reporter
 from nerg_mi.rays.rays import Rays
-from nerg_mi.train import geometry
-from nerg_mi.train.geometry import TrainingGeometry
 
-from .gaze_commands import GazeEvaluationOptions
-from .options import GeometryOptions
+from . import geometry
+from .geometry import TrainingGeometry
 
 # ---- Geometry of gaze workflows ----
 #
@@ -106,24 +105,31 @@ def make_geometry(
 
 
 def load_training_geometry(
-    gaze: Path, provenance: dict, box: AnyBox, options: GazeEvaluationOptions, ns: ModuleType
+    gaze: Path,
+    provenance: dict,
+    box: AnyBox,
+    ns: ModuleType,
+    *,
+    field: Path | None = None,
+    scene: Path | None = None,
+    choice: Path | str | None = None,
 ) -> TrainingGeometry:
     """Load the geometry of the training of the checkpoint ``gaze``, with the alignment of the training.
 
-    The file is the one in ``options``, or the one with the stored name next to the checkpoint. As in training,
-    ``options.geometry`` may also be "hits" or "none", if that is how the gaze field was trained. ``box`` is that of the
-    gaze field. Raises `NergError` for a missing or a different file, and for another kind of geometry.
+    The file is ``field``, ``scene`` or ``choice`` (a volume), or the one with the stored name next to the checkpoint.
+    As in training, ``choice`` may also be "hits" or "none", if that is how the gaze field was trained. ``box`` is that
+    of the gaze field. Raises `NergError` for a missing or a different file, and for another kind of geometry.
     """
     align = read_training_alignment(provenance)
-    if options.geometry is not None and str(options.geometry) in ("hits", "none"):
-        _check_trained_kind(gaze, provenance, str(options.geometry))
-        options = replace(options, geometry=None)
+    if choice is not None and str(choice) in ("hits", "none"):
+        _check_trained_kind(gaze, provenance, str(choice))
+        choice = None
     if provenance.get("geometry") == "none":
         return TrainingGeometry(None, box, "none", align=align)
     makers: dict[str, tuple[Path | None, str, Callable[[Path], TrainingGeometry]]] = {
-        "field_file": (options.field, "--field", lambda path: geometry.load_field_geometry(path, ns)),
-        "scene_file": (options.scene, "--scene", geometry.load_scene_geometry),
-        "geometry_file": (options.geometry, "--geometry", geometry.load_volume_geometry),
+        "field_file": (field, "--field", lambda path: geometry.load_field_geometry(path, ns)),
+        "scene_file": (scene, "--scene", geometry.load_scene_geometry),
+        "geometry_file": (None if choice is None else Path(choice), "--geometry", geometry.load_volume_geometry),
     }
     key = geometry_key(gaze, provenance)
     explicit, name, make = makers[key]

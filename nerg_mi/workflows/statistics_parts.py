@@ -11,11 +11,16 @@ from typing import Any
 
 import numpy as np
 
+from nerg_mi.aoi.measured import AoiContext, Viewpoints, count_block, iter_blocks
+from nerg_mi.aoi.options import AoiOptions, CountOptions, PredictionOptions, StatisticsOptions
+from nerg_mi.aoi.predicted import AoiScene, PredictedAttention, load_aoi_scene
+from nerg_mi.aoi.scene import list_change_files, read_changes
 from nerg_mi.files.atomic import replace_atomically
 from nerg_mi.files.safe_read import read_npz
 from nerg_mi.formats.areas import AreaSet, list_area_files, read_areas
 from nerg_mi.formats.checkpoint import read_metadata
 from nerg_mi.measures.visits import Cell, VisitSums
+from nerg_mi.options import to_base
 from nerg_mi.rays.dataset import (
     DATASET_MANIFEST,
     RayDataset,
@@ -28,15 +33,10 @@ from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.scene import list_scene_files
 from nerg_mi.tasks.execution import prepare_once
 from nerg_mi.tasks.task import RENDER_LIBRARIES, FileGroup, Part, Plan
-from nerg_mi.workflows.base import select_backend
-from nerg_mi.workflows.geometry import find_training_file, geometry_key
-from nerg_mi.workflows.options import to_base
-from nerg_mi.workflows.parts import PartRunner, PlannedScene
+from nerg_mi.train.geometry_files import find_training_file, geometry_key
 
-from .measured import AoiContext, Viewpoints, count_block, iter_blocks
-from .options import AoiOptions, CountOptions, PredictionOptions, StatisticsOptions
-from .predicted import AoiScene, PredictedAttention, load_aoi_scene
-from .scene import list_change_files, read_changes
+from .base import select_backend
+from .parts import PartRunner, PlannedScene
 
 # ---- Work of a part ----
 

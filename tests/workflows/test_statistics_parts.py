@@ -12,16 +12,6 @@ import pytest
 from nerg_mi.aoi import measured
 from nerg_mi.aoi.measured import AoiContext, TimeWindow, ViewpointSampler, count_block, facing_directions, iter_blocks
 from nerg_mi.aoi.options import PredictionOptions, StatisticsOptions
-from nerg_mi.aoi.parts import (
-    ObserverPoses,
-    PlannedAoiScene,
-    PlannedPrediction,
-    _geometry_files,
-    predict_part,
-    read_prediction,
-    read_sums,
-    write_sums,
-)
 from nerg_mi.aoi.scene import GazeScene
 from nerg_mi.errors import NergError
 from nerg_mi.files.atomic import file_sha256
@@ -33,13 +23,22 @@ from nerg_mi.rays.rays import Rays
 from nerg_mi.tasks.task import FileGroup
 from nerg_mi.workflows.parts import PlannedScene, account_for_store
 from nerg_mi.workflows.statistics import statistics
+from nerg_mi.workflows.statistics_parts import (
+    ObserverPoses,
+    PlannedAoiScene,
+    PlannedPrediction,
+    _geometry_files,
+    predict_part,
+    read_prediction,
+    read_sums,
+    write_sums,
+)
+from tests.aoi.place import SIGN, STAND, people, write_place
 from tests.conftest import ROOT
 from tests.plugins import fields
 from tests.rays.dataset.making import DAY, recipe, update_dataset, write_dataset, write_source
 from tests.tasks.works import lay_out
 from tests.workflows.recorder import Recorder
-
-from .place import SIGN, STAND, people, write_place
 
 FAST = {
     "resamples": 199,
