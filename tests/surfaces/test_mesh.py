@@ -135,6 +135,10 @@ def test_texture_matches_the_surface(rgb, scale, rows, monkeypatch):
     result, is_known = (np.concatenate([block[k] for block in blocks]) for k in (1, 2))
     assert [block[0].start for block in blocks] == list(range(0, pixels, rows))
     assert result.shape == is_known.shape == (256, 256) and 0.3 < is_known.mean() < 1
+    # Gutters do not end at the borders of batches.
+    monkeypatch.setattr("nerg_mi.surfaces.mesh.TEXTURE_ROWS", pixels)
+    ((_, _, is_known_at_once),) = iter_texture_rows(charts, refined, values, pixels)
+    assert np.array_equal(is_known, is_known_at_once)
     # At points drawn on the surface, by the nearest pixel.
     rng = np.random.default_rng(0)
     face, b = rng.integers(0, len(mesh.faces), 500), rng.dirichlet((2, 2, 2), 500)

@@ -7,6 +7,7 @@ import pytest
 
 from nerg_mi.fields.splats import Splats, concatenate_splats, quaternions_to_matrices
 from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.surfaces import splats
 from nerg_mi.surfaces.laplacian import merge_sums
 from nerg_mi.surfaces.sources import RaySettings, TrackedRays
 from nerg_mi.surfaces.splats import (
@@ -260,6 +261,19 @@ def test_smoothing_does_not_cross_boards_or_edges():
     )
     corner = concatenate_splats([wall(0.0, 0.4), upright])
     assert not smoother(corner, 0.1)[0](spike(corner, (0.19, 0, 0)))[:, n:].any()
+
+
+def test_neighbours_lie_in_the_planes_of_each_other():
+    tilted = [np.sin(np.radians(25)), 0, np.cos(np.radians(25))]
+    positions, offset = np.array([[0.0, 0, 0], [0.1, 0, 0]]), np.array([0.1 * np.cos(0.2), 0, -0.1 * np.sin(0.2)])
+    for first, second, step, count in (
+        ([0, 0, 1], [0, 0, 1], positions[1], 4),
+        ([0, 0, 1], tilted, positions[1], 2),
+        (tilted, [0, 0, 1], positions[1], 2),
+        ([0, 0, 1], tilted, offset, 4),
+    ):
+        at = np.array([positions[0], step])
+        assert len(splats._find_neighbours(at, np.array([first, second], float), 0.2, 0.0)[0]) == count
 
 
 def test_cells_share_one_density():

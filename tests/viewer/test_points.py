@@ -169,6 +169,8 @@ def test08_final_picture_equals_integrator(room_scene):
     # Each picture is closer to the reference than the first one of its size.
     errors = [np.abs(p.values["color"] - true.color[0]).mean() for p in pictures[2:]]
     assert errors[-1] < 0.5 * errors[0]
+    # Pictures of a part of the samples are as bright as the last one.
+    np.testing.assert_allclose([p.values["color"].mean() for p in pictures[2:]], true.color.mean(), rtol=0.05)
 
 
 def test09_equal_seeds_give_equal_pictures(room_scene):

@@ -110,6 +110,7 @@ def test06_observer_follows_a_participant(running):
     people._followed.value = "Ada"
     people._draw_poses()
     assert np.allclose(page.session.observer, [-2, 0, 1.6], atol=0.03)
+    assert np.allclose(people._pose_handles[0].position, page.session.observer)
     assert np.allclose(page.session.heading[:, 0], [0, 1, 0], atol=1e-6)
     people._rays_checkbox.value = people._probes_checkbox.value = True
     people._draw_all()

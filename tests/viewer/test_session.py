@@ -20,7 +20,7 @@ from nerg_mi.transport.mitsuba_mesh import make_mesh, read_triangles
 from nerg_mi.viewer import session as module
 from nerg_mi.viewer.layers import get_layer
 from nerg_mi.viewer.page import Page
-from nerg_mi.viewer.session import ALL_PARTICIPANTS, MAX_GAP, Listener, Session, Tracks, Worker
+from nerg_mi.viewer.session import ALL_PARTICIPANTS, MAX_GAP, AttentionShare, Listener, Session, Tracks, Worker
 
 # ---- Listener ----
 
@@ -315,6 +315,15 @@ def test21_meshes_are_seen_from_both_sides(scene):
     assert shares[2:] == pytest.approx([1, 1], abs=1e-3)
 
 
+def test27_final_shares_are_within_their_accuracy():
+    assert [AttentionShare(*one).is_final for one in ((0.5, 0.01), (0.5, 0.011), (0.0, 5e-4), (0.0, 1e-3))] == [
+        True,
+        False,
+        True,
+        False,
+    ]
+
+
 def test13_no_areas_and_no_shapes(scene):
     assert list(module.iter_attention_shares(scene, AT, [], [])) == []
 
@@ -342,6 +351,12 @@ def test14_gap_interrupts_path():
     ada = segments[person == 0]
     assert np.allclose(ada[:, 1, 0] - ada[:, 0, 0], 0.1, atol=1e-4)
     assert np.allclose(segments[person == 1][..., 0], 5)
+
+
+def test26_paths_of_rare_samples_are_joined():
+    t = np.array([0.0, 5, 10, 15, 100])
+    rays = Rays(t, np.zeros(5, int), ("Ada",), np.zeros((5, 3)), np.tile([0.0, 1, 0], (5, 1)), np.ones(5))
+    assert len(Tracks(rays, Similarity()).segments()[0]) == 3
 
 
 def test15_poses_at_a_time():

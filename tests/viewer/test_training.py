@@ -38,6 +38,7 @@ def test01_rays_of_a_view_are_those_of_the_page():
     assert made.shape == (30, 48) and np.allclose(made.camera.center, view.origin)
     rays = (pixel_directions(made.camera.intrinsics) @ made.camera.to_world[:3, :3].T).reshape(-1, 3)
     assert np.allclose(rays, view.ray_directions(48, 30, np.full((48 * 30, 2), 0.5)), atol=1e-12)
+    assert training._get_fov(made.camera) == pytest.approx(0.9)
 
 
 # ---- Pages without a server ----
@@ -115,6 +116,10 @@ def test02_a_visitor_sees_the_field():
     t = trainer(data, steps=100)
     page.on_start(t, data)
     assert len(server.frustums) == len(data.train) + len(data.held_out)
+    w, x, y, z = server.frustums[0][1]["wxyz"]
+    # A frustum of the page has y down and z forward, a camera of the data set y up and z backwards.
+    axes, camera = Rotation.from_quat([x, y, z, w]).as_matrix(), data.train[0].camera
+    assert np.allclose(axes[:, 2], camera.axis) and np.allclose(axes[:, 1], -camera.to_world[:3, 1])
     while t.steps < 99:
         t.step()
     server.visit()

@@ -6,6 +6,7 @@ import csv
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import drjit as dr
 import drjit.llvm.ad as ns
@@ -310,6 +311,15 @@ def test_ensemble_spread_is_evaluated_like_support(tmp_path):
     assert {(row["signal"], row["error"]) for row in result.uncertainty} >= {("support", "KLD"), ("spread", "KLD")}
     assert all(row["spread"] > 0 for row in result.by_position)
     assert "spread" in (tmp_path / "out" / "folds.md").read_text()
+
+
+def test_spread_of_an_ensemble_is_its_mean_standard_deviation(monkeypatch):
+    monkeypatch.setattr(evaluate, "score_positions", lambda *args, spread, **options: spread)
+    members = np.random.default_rng(0).random((3, 2, 5))
+    test, field = SimpleNamespace(centres=np.zeros((2, 3)), directions=np.zeros((5, 3))), SimpleNamespace(support=None)
+    spread = evaluate._positions(test, field, None, lambda *at: members, lambda *at: members[0], None, 0)
+    deviation = np.sqrt(((members - members.mean(axis=0)) ** 2).sum(axis=0) / 2)
+    np.testing.assert_allclose(spread, 4 * np.pi * deviation.mean(axis=1))
 
 
 # ---- The ablation as a job: cached rows, frames, ground truths and refused input ----

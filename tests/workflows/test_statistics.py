@@ -156,6 +156,7 @@ def test04_predicted_and_recorded_statistics_and_what_if(folder, tmp_path):
     assert len(field) == 3 and all(0 < r["share"] < 1 and r["visits"] is None for r in field)
     assert field[2]["share"] == pytest.approx(field[0]["share"] + field[1]["share"], rel=0.02)
     rows = {(r["aoi"], r["measure"]): r for r in result.what_if}
+    assert {r["source"] for r in result.differences} == {"measured"}
     # The stand occluded the sign.
     sign = rows["the sign", "visible"]
     assert sign["source"] == "predicted" and sign["after"] > sign["before"] and sign["participants"] == 6
