@@ -79,8 +79,8 @@ def read_camera_path(path: str | os.PathLike) -> CameraPath:
     return CameraPath(to_world, fov, width, height, fps)
 
 
-def format_camera_path(path: CameraPath) -> str:
-    """Return ``path`` as the JSON text that ``ns-render camera-path`` reads."""
+def write_camera_path(output: str | os.PathLike, path: CameraPath) -> None:
+    """Write ``path`` to the file ``output`` (.json), which ``ns-render camera-path`` reads."""
     aspect = path.width / path.height
     frames = [
         {"camera_to_world": pose.ravel().tolist(), "fov": float(fov), "aspect": aspect}
@@ -96,9 +96,4 @@ def format_camera_path(path: CameraPath) -> str:
         "crop": None,
         "camera_path": frames,
     }
-    return json.dumps(data)
-
-
-def write_camera_path(output: str | os.PathLike, path: CameraPath) -> None:
-    """Write ``path`` to the file ``output`` (.json)."""
-    write_text(Path(output), format_camera_path(path))
+    write_text(Path(output), json.dumps(data))

@@ -159,30 +159,18 @@ def _make_sensor(settings: ViewSettings):
 
 
 def copy_view(session: Any, view: PinholeView) -> str:
-    """Return a scene file of ``view`` with the observer, the layer and the settings of ``session``."""
-    check_can_copy(session)
-    aovs = tuple(name for name in layers.required_quantities(session.display.layer) if name != "color")
-    settings = session.options.width, session.spp, session.falloff, get_ceiling(session)
-    return copy_scene(session.scene_file, ViewSettings(view, session.observer, aovs, *settings))
+    """Return a scene file of ``view`` with the observer, the layer and the settings of ``session``.
 
-
-def get_ceiling(session: Any) -> tuple[float, np.ndarray] | None:
-    """Return the height and the up direction of the hidden ceiling; None if it is visible."""
-    return None if session.ceiling is None else (session.ceiling, session.ceiling_up)
-
-
-def check_can_copy(session: Any) -> None:
-    """Check that the scene of ``session`` can be saved.
-
-    Raises
-    ------
-    NergError
-        The scene depends on temporary files of the viewer.
+    Raises `NergError` if the scene depends on temporary files of the viewer.
     """
     if session.source.made and session.scene_file.with_suffix(".vol").exists():
         raise NergError(
             'the viewer reconstructed this scene from gaze samples in a temporary folder; use "nerg scene" to write it'
         )
+    aovs = tuple(name for name in layers.required_quantities(session.display.layer) if name != "color")
+    ceiling = None if session.ceiling is None else (session.ceiling, session.ceiling_up)
+    settings = session.options.width, session.spp, session.falloff, ceiling
+    return copy_scene(session.scene_file, ViewSettings(view, session.observer, aovs, *settings))
 
 
 # ---- Participants ----

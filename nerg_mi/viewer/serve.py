@@ -21,7 +21,6 @@ from nerg_mi.workflows.scene_commands import ViewOptions
 from nerg_mi.workflows.view import make_viewer_scene
 
 from .controls import AreasPanel, Controls
-from .flights import FlightPanel
 from .page import Page
 from .scene import ParticipantsPanel
 from .server import RequestGuard, is_loopback, make_token, require_viser, start_server
@@ -92,7 +91,6 @@ def open_viewer(
             session.start()
             page.open(session)
             Controls(page)
-            FlightPanel(page)
             if session.tracks is not None:
                 ParticipantsPanel(page, session.tracks)
             if session.scene.has_gaze:

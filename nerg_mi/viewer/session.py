@@ -416,7 +416,6 @@ _TASK_NAMES = {
     "shares": "attention shares",
     "inset": "observer views",
     "people": "recordings",
-    "film": "video",
 }
 """Descriptions of the worker's tasks for the status text."""
 

@@ -197,8 +197,8 @@ def test05b_stale_contents_are_grey(running, driver):
 
     def held(change, words):
         go.clear()
-        session.worker.submit("film", 0, wait())
-        until(lambda: session.running_tasks == ["video"])
+        session.worker.submit("people", 0, wait())
+        until(lambda: session.running_tasks == ["recordings"])
         change()
         until(lambda: words in text() and colorful() < 0.5 * fresh, 20)
         assert "Observer view (grey: outdated)" in text() and "Computing: picture" in text()

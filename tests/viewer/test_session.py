@@ -87,11 +87,11 @@ def test02_stale_results_are_reported(make_session, room, gaze_fields):
         finish.wait(60)
         yield
 
-    session.worker.submit("film", 0, wait())
+    session.worker.submit("people", 0, wait())
     assert started.wait(60)
     session.update_points()
     session.update_shares()
-    assert session.running_tasks == ["gaze on the points", "attention shares", "video"]
+    assert session.running_tasks == ["gaze on the points", "attention shares", "recordings"]
     finish.set()
     settle(session)
     assert session.stale_points_reason == "" and not session.are_shares_stale
