@@ -2,7 +2,7 @@
 
     python benchmarks/paper_claims.py [--only supermarket,store] [--folds 4] [--steps 800] [--recipes default,paper]
 
-The benchmark runs one ablation (`nerg ablate`) per fold, in which other participants (half), other positions (60 in
+The benchmark runs one ablation (`ablation.py`) per fold, in which other participants (half), other positions (60 in
 three zones) and another seed are held out. It compares emit, capture and their product, the losses, the semantic
 features, and the initialisations of the paper.
 
@@ -16,8 +16,7 @@ run does not train them again.
 
 from __future__ import annotations
 
-from dataclasses import fields
-
+import ablation
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 from places import interval, parse, parse_environments, place_parser, write_place
 from timing import print_table, write_rows
@@ -30,11 +29,6 @@ ORDER = ("emit", "capture", "loss code")
 
 
 def main(argv=None) -> None:
-    from nerg_mi.progress import TerminalReporter
-    from nerg_mi.workflows.ablation import ablate
-    from nerg_mi.workflows.base import select_backend
-    from nerg_mi.workflows.gaze_commands import AblationOptions
-
     parser = place_parser(__doc__, "paper_claims", folds=4, only="supermarket,store")
     parser.add_argument(
         "--steps",
@@ -51,26 +45,18 @@ def main(argv=None) -> None:
         "--variant", action="append", default=[], help="Name of a variant to train; can be repeated. Default: all."
     )
     args = parse(parser, argv)
-    select_backend("llvm_ad_rgb", args.threads)
-    expected, each = {f.name for f in fields(AblationOptions)}, []
+    each: list[dict] = []
     for name, make in parse_environments(args).items():
         folder, rays, where = write_place(name, make, args)
         for fold in range(args.folds):
-            options = AblationOptions(
-                **{k: v for k, v in where.items() if k in expected},
-                recipes=args.recipes,
-                variant=tuple(args.variant),
-                seed=fold,
-                seeds=1,
-                steps=args.steps,
-                test_participants=0.5,
-                refit=False,
-                timing_cameras=0,
-                threads=args.threads,
-            )
-            with TerminalReporter() as reporter:
-                result = ablate(rays, folder / f"fold{fold}", options, reporter)
-            each += [{"place": name, "fold": fold, **row} for row in result.rows]
+            line = [str(rays), "--geometry", str(next(iter(where.values()))), "--out", str(folder / f"fold{fold}")]
+            line += ["--seed", str(fold), "--test-participants", "0.5", "--no-refit"]
+            line += [] if args.threads is None else ["--threads", str(args.threads)]
+            line += [word for variant in args.variant for word in ("--variant", variant)]
+            for recipe in args.recipes.split(","):
+                steps = [] if recipe == "default" else ["--steps", str(args.steps)]
+                rows = ablation.main([*line, "--recipes", recipe, *steps])
+                each += [{"place": name, "fold": fold, **row} for row in rows]
         separate = [row for row in each if row["place"] == name]
         heads = ("recipe", "variant", "training loss", "test minus training loss")
         heads += ("KLD", "minus product", "CC", "minus product")

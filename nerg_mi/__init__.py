@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     )
     from .api.arrays import Camera
     from .api.contents import DensityGrid
-    from .api.evaluation import ablate, evaluate_gaze, evaluate_radiance, folds, next_look, study
+    from .api.evaluation import evaluate_gaze, evaluate_radiance, folds, next_look, study
     from .api.gaze import load_gaze
     from .api.query import attention, observe, trace
     from .api.recordings import align, check_rays, filter_rays, guess, import_rays, plot_rays, split_rays
@@ -64,7 +64,6 @@ _MODULES = {
     "NergError": "nerg_mi.errors",
     "Rays": "nerg_mi.rays.rays",
     "Scene": "nerg_mi.api.scene",
-    "ablate": "nerg_mi.api.evaluation",
     "align": "nerg_mi.api.recordings",
     "attention": "nerg_mi.api.query",
     "bake": "nerg_mi.api.analysis",
@@ -112,7 +111,6 @@ __all__ = [
     "NergError",
     "Rays",
     "Scene",
-    "ablate",
     "align",
     "attention",
     "bake",

@@ -92,16 +92,6 @@ OLD_NAMES: Mapping[str, Mapping[str, str]] = {
         "--positions": "--test-positions",
         "--people": "--test-participants",
     },
-    "ablate": {
-        **{old: new for old, new in _GAZE_TRAINING.items() if new != "--prior-folds"},
-        "--first": "--seed",
-        "--zones": "--test-zones",
-        "--positions": "--test-positions",
-        "--people": "--test-participants",
-        "--law": "--ground-truth",
-        "--cameras": "--timing-cameras",
-        "--size": "--timing-size",
-    },
     "report": {
         **_CAMERA,
         "--objects": "--aois",

@@ -21,7 +21,6 @@ import nerg_mi.workflows
 from nerg_mi import errors, properties
 from nerg_mi.cli.building import build_command
 from nerg_mi.errors import NergError
-from nerg_mi.evaluation.ablation import make_frame_timer
 from nerg_mi.evaluation.metrics import FieldRenderer
 from nerg_mi.formats.surfaces import write_volume
 from nerg_mi.maths import vmf
@@ -360,11 +359,6 @@ def _volume(folder):
     return lambda: load_volume_geometry(folder / "file.vol")
 
 
-def _timer(folder):
-    render = make_frame_timer(_volume(folder)(), np.zeros((1, 3)), folder)
-    return lambda: render(folder / "file.safetensors")
-
-
 def _camera_of_photo(folder):
     renderer = FieldRenderer.__new__(FieldRenderer)
     renderer.spp = 1
@@ -381,7 +375,6 @@ def _camera_of_scene(folder):
     [
         (_mesh, True),
         (_volume, True),
-        (_timer, True),
         (lambda folder: lambda: FieldRenderer(folder / "file.safetensors"), True),
         (_camera_of_photo, False),
         (_camera_of_scene, False),
@@ -400,13 +393,12 @@ def test_refused_files_and_cameras_are_user_errors(rgb, tmp_path, monkeypatch, p
     assert (str(tmp_path / "file.") in str(said.value)) is names_file
 
 
-@pytest.mark.parametrize("load", [_timer, lambda folder: lambda: FieldRenderer(folder / "file.safetensors")])
 @pytest.mark.parametrize("content", [None, b"", b"\x08\0\0\0\0\0\0\0{}      "], ids=["missing", "empty", "other"])
-def test_unrenderable_checkpoints_are_reported(rgb, tmp_path, load, content):
+def test_unrenderable_checkpoints_are_reported(rgb, tmp_path, content):
     if content is not None:
         (tmp_path / "file.safetensors").write_bytes(content)
     with pytest.raises(NergError, match=r"file\.safetensors"):
-        load(tmp_path)()
+        FieldRenderer(tmp_path / "file.safetensors")
 
 
 @pytest.mark.parametrize(

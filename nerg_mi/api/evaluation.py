@@ -8,7 +8,7 @@ from uuid import uuid4
 from nerg_mi.environment.trained import TrainedField
 from nerg_mi.files.values import FilePath
 from nerg_mi.rays.rays import Rays
-from nerg_mi.workflows.gaze_commands import AblationOptions, FoldOptions, GazeEvaluationOptions, NextLookOptions
+from nerg_mi.workflows.gaze_commands import FoldOptions, GazeEvaluationOptions, NextLookOptions
 from nerg_mi.workflows.radiance_commands import RadianceScoreOptions
 from nerg_mi.workflows.scene_commands import StudyOptions
 
@@ -22,7 +22,6 @@ from .session import session_folder
 if TYPE_CHECKING:
     from nerg_mi.evaluation.metrics import ViewScores
     from nerg_mi.fields.radiance import RadianceField
-    from nerg_mi.workflows.ablation import AblationResult
     from nerg_mi.workflows.evaluate import FoldResult, GazeEvaluation
     from nerg_mi.workflows.next_look import NextLookEvaluation
     from nerg_mi.workflows.study import StudyResult
@@ -198,60 +197,6 @@ def next_look(
         resolved = build_options(NextLookOptions, "next_look", options, overrides)
         data = resolve_rays(rays)
         return next_look.evaluate_next_look(as_file(gaze, "gaze"), data, output, resolved, reporter)
-
-
-def ablate(
-    rays: Rays | FilePath,
-    output: FilePath | None = None,
-    *,
-    options: AblationOptions | None = None,
-    progress: Progress = None,
-    **overrides: Any,
-) -> AblationResult:
-    """Train several variants of a gaze field under equal conditions, and compare their scores and rendering times.
-
-    Parameters
-    ----------
-    rays : Rays or path
-        The recordings.
-    output : path, optional
-        Folder for checkpoints, table and plot; it is created. Checkpoints of an earlier run are reused. Default: a
-        temporary folder, which is removed when the process ends.
-    options : AblationOptions, optional
-        Base options (`nerg_mi.workflows.gaze_commands.AblationOptions`).
-    progress : bool, Reporter or None
-        None shows a progress bar in notebooks, True shows one anywhere, False none; a `Reporter` receives everything.
-    **overrides
-        Single options on top of ``options``, such as ``recipes="small"`` or ``seeds=1``, and the environment as for
-        `train_gaze`.
-
-    Returns
-    -------
-    AblationResult
-        One row per variant.
-
-    Raises
-    ------
-    NergError
-        An option or a file is invalid.
-
-    Examples
-    --------
-    >>> import nerg_mi as nerg
-    >>> small = {"recipes": "default", "variant": ("emit",), "seeds": 1, "default_steps": 2}
-    >>> small |= {"probes": 8, "timing_cameras": 0}
-    >>> test = {"test_zones": 1, "test_positions": 4, "min_rays": 8}
-    >>> result = nerg.ablate(rays, folder / "ablation", geometry="none", **small, **test)
-    >>> [row["variant"] for row in result.rows]
-    ['emit']
-    """
-    from nerg_mi.workflows import ablation
-
-    check_output(output)
-    with report_progress(progress, AblationOptions) as reporter:
-        resolved = build_options(AblationOptions, "ablate", options, overrides)
-        folder = session_folder() / f"ablation-{uuid4().hex[:12]}" if output is None else output
-        return ablation.ablate(resolve_rays(rays), folder, resolved, reporter)
 
 
 def study(

@@ -42,7 +42,7 @@ GROUPS = {
 """Help texts of the groups of commands, by their first word."""
 
 _ORDER = (
-    "demo doctor scene view render draw rays poses align train eval report import export refine compile bake ablate "
+    "demo doctor scene view render draw rays poses align train eval report import export refine compile bake "
     "stats jobs worker study"
 ).split()
 _LINES = re.compile(r"``nerg ([a-z -]+)``: (.*?)(?=\n``nerg |\Z)", re.S)

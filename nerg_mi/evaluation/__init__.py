@@ -1,1 +1,1 @@
-"""How good a field is: scores against held-out data, baselines, folds, ablation, and error against run time."""
+"""How good a field is: scores against held-out data, baselines, folds, and error against run time."""

@@ -303,6 +303,5 @@ register_recipe(
         },
         views_only_settings={"steps": 200, "zones": 3, "patience": 10},
         supported_options=frozenset({"prior-folds", "prior-kappa", "reaimed-hits"}),
-        is_quick=True,
     )
 )

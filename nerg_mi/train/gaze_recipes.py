@@ -59,7 +59,6 @@ class Recipe:
     # Options that the recipe supports, among "activation", "size", "normalize", "semantic", "init", "loss",
     # "integral-weight", "prior-folds", "prior-kappa", "reaimed-hits".
     supported_options: frozenset[str] = frozenset()
-    is_quick: bool = False  # Whether a training is short enough for an ablation to repeat it with several seeds
 
     def make_plan(
         self,
@@ -169,7 +168,7 @@ def register_recipe(recipe: Recipe) -> Recipe:
     >>> from nerg_mi.train.gaze_recipes import RECIPES, get_recipe
     >>> usual = get_recipe("default")
     >>> longer = replace(usual, name="longer", settings={**usual.settings, "steps": 5000})
-    >>> nerg.register_recipe(longer).name  # for train_gaze(..., recipe="longer"), and for nerg ablate
+    >>> nerg.register_recipe(longer).name  # for train_gaze(..., recipe="longer")
     'longer'
     >>> del RECIPES["longer"]
     """

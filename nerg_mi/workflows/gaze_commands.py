@@ -3,9 +3,8 @@
 ``nerg eval gaze``: Score a gaze field on held-out data and compare it with baselines.
 ``nerg eval next``: Predict the next look from the last looks and a gaze field; score it on held-out participants.
 ``nerg eval folds``: Cross-validate a gaze field: train and score it several times on different splits.
-``nerg ablate``: Train the variants of a gaze field under equal conditions and compare them.
 
-Options of these commands. The workflows are in `.train_gaze`, `.evaluate`, `.next_look` and `.ablation`.
+Options of these commands. The workflows are in `.train_gaze`, `.evaluate` and `.next_look`.
 """
 
 from __future__ import annotations
@@ -18,7 +17,6 @@ from nerg_mi.options import (
     INPUT,
     MODEL,
     OUTPUT,
-    PERFORMANCE,
     TEST,
     TRAINING,
     DerivedOptions,
@@ -40,7 +38,6 @@ from nerg_mi.ranges import (
     RAYS,
     SECONDS,
     SEEDS,
-    STEPS,
     TEST_FRACTIONS,
     Range,
     ValidatedDataclass,
@@ -289,22 +286,10 @@ class GazeEvaluationOptions(ValidatedDataclass):
 
 
 @dataclass(frozen=True, kw_only=True)
-class HeldOutOptions(ValidatedDataclass):
-    """Which positions are held out for testing."""
-
-    test_zones: int = option(
-        3, "Number of zones whose positions are held out for testing.", within=Range(1, 1000), group=TEST
-    )
-    test_positions: int = option(
-        60, "Maximum number of test positions, in all held-out zones together.", within=Range(1, 10**5), group=TEST
-    )
-
-
-@dataclass(frozen=True, kw_only=True)
 @expose_settings(ProbeSettings, GazeSettings, default=_BY_RECIPE, without=("seed", "freeze", "validation_zones"))
 @repeat_options(GazeOptions, "recipe", "variant", "ensemble", "align", "mode")
 @repeat_options(GazeEvaluationOptions, "kappa", "directions", "min_rays")
-class FoldOptions(DerivedOptions, HeldOutOptions, GeometryOptions, PartOptions):
+class FoldOptions(DerivedOptions, GeometryOptions, PartOptions):
     """Options of ``nerg eval folds``. Lengths are in metres."""
 
     folds: int = option(
@@ -318,6 +303,12 @@ class FoldOptions(DerivedOptions, HeldOutOptions, GeometryOptions, PartOptions):
         "Comma-separated kinds of held-out data: both (new participants at new positions), pos (new positions), people "
         "(new participants).",
         group=TEST,
+    )
+    test_zones: int = option(
+        3, "Number of zones whose positions are held out for testing.", within=Range(1, 1000), group=TEST
+    )
+    test_positions: int = option(
+        60, "Maximum number of test positions, in all held-out zones together.", within=Range(1, 10**5), group=TEST
     )
     test_participants: float = option(
         0.5, "Fraction of the participants that each fold holds out for testing.", within=Range(0.01, 0.99), group=TEST
@@ -394,73 +385,4 @@ declare(
     options=FoldOptions,
     rays=argument("Rays file (.npz or .parquet) or dataset (.rays)."),
     output=out("Folder for the table."),
-)
-
-
-@dataclass(frozen=True, kw_only=True)
-@expose_settings(
-    ProbeSettings,
-    GazeSettings,
-    default=_BY_RECIPE,
-    without=("seed", "freeze", "validation_zones", "loss", "prior_folds", "reaimed_hits"),
-)
-@repeat_options(GazeOptions, "threads", "mode")
-@repeat_options(GazeEvaluationOptions, "kappa", "min_rays")
-class AblationOptions(DerivedOptions, HeldOutOptions, GeometryOptions, PartOptions):
-    """Options of ``nerg ablate``. Lengths are in metres."""
-
-    recipes: str = option("default,paper", "Comma-separated recipes whose variants are compared.", group=MODEL)
-    variant: tuple[str, ...] = option(
-        (),
-        'Variant to train, such as emit_capture or "semantic snapshot"; repeatable.  [default: all variants]',
-        group=MODEL,
-    )
-    seeds: int = option(
-        3, "Number of seeds for the recipe default; other recipes use one.", within=Range(1, 1000), group=TRAINING
-    )
-    seed: int = option(0, "Seed of the held-out data and of the first training.", within=BASE_SEEDS, group=TRAINING)
-    steps: int | None = option(
-        None, f"Number of training steps of every recipe except default.  {_BY_RECIPE}", within=STEPS, group=TRAINING
-    )
-    default_steps: int | None = option(
-        None, f"Number of training steps of the recipe default.  {_BY_RECIPE}", within=STEPS, group=TRAINING
-    )
-    test_participants: float = option(
-        0.0,
-        "Fraction of the participants that are held out for testing, in addition to the positions of --test-zones.",
-        within=TEST_FRACTIONS,
-        group=TEST,
-    )
-    radius: float = option(0.25, "Radius of the test probes in metres.", within=LENGTHS, group=TEST)
-    ground_truth: str | None = option(
-        None,
-        'Analytic gaze density for simulated data, as "MODULE:CLASS"; an instance has density(positions, '
-        "directions) in 1/sr.  [default: densities of the test rays]",
-        group=TEST,
-    )
-    refit: bool = option(
-        True,
-        "Train again on all rays, for the number of steps that validation found best. Applies to every recipe except "
-        "default, which always does.",
-        group=TRAINING,
-    )
-    timing_cameras: int = option(
-        4,
-        "Number of cameras over which the time of a frame is measured (paper: 32); 0 measures none.",
-        within=Range(0, 10000),
-        group=PERFORMANCE,
-    )
-    timing_size: str = option(
-        "320x180", "Size of the timed frames in pixels, WIDTHxHEIGHT (paper: 1280x720).", group=PERFORMANCE
-    )
-
-
-declare(
-    "ablate",
-    "nerg_mi.workflows.ablation:ablate",
-    "Train the variants of a gaze field under equal conditions; report losses at training and held-out positions, and "
-    "the time of a frame.",
-    options=AblationOptions,
-    rays=argument("Rays file (.npz or .parquet), as nerg rays import writes it."),
-    output=out("Folder for checkpoints, table and plot."),
 )

@@ -76,7 +76,7 @@ def make_viewer_scene(
     """Return the scene of ``files``: a scene file with `nerg` and a camera, or one that `write_scene` writes.
 
     It is written to ``folder``. A folder is replaced by the files in it, at most one of a kind, or is a dataset of rays
-    (.rays). Rays are shown in the scene. Several gaze fields, such as those of `nerg ablate`, are variants to choose
+    (.rays). Rays are shown in the scene. Several gaze fields, such as those of other seeds, are variants to choose
     from; the gaze field of a scene is the first of them. Raises `NergError` for errors that the user can correct.
     """
     options = options or ViewOptions()

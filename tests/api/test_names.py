@@ -106,7 +106,7 @@ def rays():
 
 
 # These examples train or measure for seconds; faster tests of the same workflows exist.
-LONG = {"ablate", "folds", "next_look", "report", "study", "train_radiance"}
+LONG = {"folds", "next_look", "report", "study", "train_radiance"}
 
 # Modules that an example needs, and the extras that install them.
 EXTRAS = {"view": ("viser", "viewer"), "export_scene": ("pxr", "usd")}

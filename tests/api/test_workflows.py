@@ -14,8 +14,8 @@ from nerg_mi.api.analysis import bake
 from nerg_mi.errors import NergError
 from nerg_mi.formats.ply import write_columns
 from nerg_mi.rays.rays import Rays
-from nerg_mi.workflows import ablation, evaluate, next_look, study, train_gaze, train_radiance
-from nerg_mi.workflows.gaze_commands import AblationOptions, GazeEvaluationOptions, GazeOptions, NextLookOptions
+from nerg_mi.workflows import evaluate, next_look, study, train_gaze, train_radiance
+from nerg_mi.workflows.gaze_commands import GazeEvaluationOptions, GazeOptions, NextLookOptions
 from nerg_mi.workflows.radiance_commands import RadianceOptions, RadianceScoreOptions
 from nerg_mi.workflows.scene_commands import StudyOptions
 from tests.surfaces.meshes import box
@@ -86,11 +86,6 @@ JOBS = {
         lambda: nerg.next_look("g.safetensors", "r.npz", "out", earlier=5),
         (Path("g.safetensors"), Path("r.npz"), "out", NextLookOptions(earlier=5, **LLVM)),
     ),
-    "ablate": (
-        ablation,
-        lambda: nerg.ablate("r.npz", "out", options=AblationOptions(seeds=2), recipes="small", geometry="none"),
-        (Path("r.npz"), "out", AblationOptions(seeds=2, recipes="small", geometry="none", **LLVM)),
-    ),
     "run_study": (
         study,
         lambda: nerg.study("slab", "out", quick=True),
@@ -132,7 +127,7 @@ def test01_options_reach_the_workflows(captured, job):
 
 
 @pytest.mark.parametrize(
-    "name", ["evaluate_radiance", "evaluate_gaze", "next_look", "ablate", "study", "train_gaze", "train_radiance"]
+    "name", ["evaluate_radiance", "evaluate_gaze", "next_look", "study", "train_gaze", "train_radiance"]
 )
 def test02_invalid_options_are_refused(name):
     with pytest.raises(nerg.NergError, match=f'{name} has no option "nothing"'):

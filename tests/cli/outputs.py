@@ -31,10 +31,6 @@ HAS_TORCH = importlib.util.find_spec("torch") is not None
 OF_TORCH = ("import", "export torch-ngp")
 """Commands that need it."""
 STUDY = "study.csv study.md scaling.csv study.json errors.png scaling.png"
-ABLATION = (
-    "ablation.md ablation.csv ablation.json ablation.png place.vol "
-    "default_emit_capture_0.safetensors default_emit_capture_0.json"
-)
 BIDS = "README dataset_description.json participants.json participants.tsv task-gaze_physio.json "
 BIDS += "task-gaze_physioevents.json "
 BIDS += " ".join(
@@ -220,13 +216,6 @@ CASES = (
     Case("export scene", "{i}/room.ply {i}/rays.npz -o {o}/a.rrd", ("a.rrd",)),
     Case("export torch-ngp", "{i}/ngp.safetensors -o {o}/a.pth", ("a.pth",)),
     Case(
-        "ablate",
-        "{i}/rays.npz -o {o}/rows --geometry hits --recipes default --variant emit_capture --seeds 1 --default-steps 2 "
-        "--zones 1 --positions 4 --min-rays 8 --radius 0.5 --cameras 0 --probes 8 --store {i}/store",
-        _below("rows", ABLATION),
-        ("rows",),
-    ),
-    Case(
         "study",
         "slab -o {o}/study --store {i}/store --quick --width 12 --height 8 --only jitter -m llvm_ad_rgb",
         _below("study", STUDY),
@@ -254,7 +243,6 @@ INPUTS = {
     "eval folds": {"field", "scene", "align"},
     "eval gaze": {"field", "scene", "geometry"},
     "eval next": {"field", "scene", "geometry"},
-    "ablate": {"field", "scene"},
     "report": {"aois"},
     "bake": {"gaze", "rays", "observer_file", "align"},
 }

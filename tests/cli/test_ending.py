@@ -358,12 +358,6 @@ ENDS = {
         1,
         "study slab -o {o} --quick --width 12 --height 8 --only jitter -m llvm_ad_rgb",
     ),
-    "ablate": (
-        "train.gaze_log_density.LikelihoodTrainer.step",
-        3,
-        "ablate {i}/rays.npz -o {o} --geometry none --recipes default --variant emit --zones 1 --positions 4 "
-        "--min-rays 8 --radius 0.5 --cameras 0 --probes 8",
-    ),
     "rays import": (
         "rays.readers.table.add_tables",
         1,

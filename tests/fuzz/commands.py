@@ -27,7 +27,7 @@ from nerg_mi.train.gaze_recipes import load_recipes
 from tests.cli import outputs
 from tests.fuzz.watch import Case, Reader
 
-SKIPPED = {"demo", "study", "ablate", "eval folds", "export torch-ngp", "refine"}
+SKIPPED = {"demo", "study", "eval folds", "export torch-ngp", "refine"}
 SKIPPED |= set() if outputs.HAS_TORCH else set(outputs.OF_TORCH)
 """Commands that take many seconds at any setting, or have no options."""
 

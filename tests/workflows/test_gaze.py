@@ -1,4 +1,4 @@
-"""Evaluations of gaze fields, folds, ablations and priors, and their geometries."""
+"""Evaluations of gaze fields, folds and priors, and their geometries."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ import pytest
 
 from nerg_mi.alignment.check import read_similarity
 from nerg_mi.errors import NergError
-from nerg_mi.evaluation import ablation as scoring
 from nerg_mi.evaluation.gaze import SCORES
 from nerg_mi.evaluation.gaze_report import read_results
 from nerg_mi.evaluation.next_look import HEAD_METHODS, NextLook
@@ -28,22 +27,13 @@ from nerg_mi.rays.rays import TRACKING, Rays
 from nerg_mi.threads import set_thread_count
 from nerg_mi.train.gaze_log_density import compute_elevation_density
 from nerg_mi.train.geometry_files import load_training_geometry, make_geometry
-from nerg_mi.workflows import ablation, evaluate, next_look
-from nerg_mi.workflows.ablation import AblationBenchmark, ablate, load_ground_truth, make_plan
+from nerg_mi.workflows import evaluate, next_look
 from nerg_mi.workflows.evaluate import SCORED, evaluate_folds, evaluate_gaze
-from nerg_mi.workflows.gaze_commands import (
-    AblationOptions,
-    FoldOptions,
-    GazeEvaluationOptions,
-    GazeOptions,
-    NextLookOptions,
-)
+from nerg_mi.workflows.gaze_commands import FoldOptions, GazeEvaluationOptions, GazeOptions, NextLookOptions
 from nerg_mi.workflows.next_look import evaluate_next_look, make_ray_distance
 from nerg_mi.workflows.parts import account_for_store
 from nerg_mi.workflows.train_gaze import learn_prior, train_gaze
-from tests.conftest import ROOT
 from tests.evaluation.test_gaze import crowd
-from tests.formats.splats.writers import random_splats, write_inria
 from tests.notes import find_wrong_notes
 from tests.plugins import fields
 from tests.tasks.clusters import ClusterOfProcesses, wait_until
@@ -320,192 +310,6 @@ def test_spread_of_an_ensemble_is_its_mean_standard_deviation(monkeypatch):
     spread = evaluate._positions(test, field, None, lambda *at: members, lambda *at: members[0], None, 0)
     deviation = np.sqrt(((members - members.mean(axis=0)) ** 2).sum(axis=0) / 2)
     np.testing.assert_allclose(spread, 4 * np.pi * deviation.mean(axis=1))
-
-
-# ---- The ablation as a job: cached rows, frames, ground truths and refused input ----
-
-
-ABLATION_OPTIONS = AblationOptions(
-    geometry="hits",
-    recipes="default",
-    variant=("capture", "emit_capture"),
-    seeds=2,
-    default_steps=2,
-    test_zones=2,
-    positions=6,
-    min_rays=8,
-    radius=0.5,
-    timing_cameras=1,
-    timing_size="16x8",
-    probes=12,
-)
-
-
-class Uniform:
-    """A ground truth with uniform gaze."""
-
-    def density(self, positions, directions):
-        return np.full((len(positions), len(directions)), 1 / (4 * np.pi))
-
-
-@pytest.mark.nightly
-def test_rows_are_computed_once(tmp_path, monkeypatch):
-    """With two variants only, because compiling takes long; tests of the trainers cover all variants."""
-    result = ablate(crowd(3000), tmp_path, ABLATION_OPTIONS)
-    assert len(result.rows) == 4 and {r["seed"] for r in result.rows} == {0, 1}
-    relative_losses = [r["test_relative"] for r in result.rows if r["variant"] == "emit_capture"]
-    assert np.mean(relative_losses) == pytest.approx(1)
-    assert all(r["frame_seconds"] > 0 and np.isfinite(r["test_loss"]) for r in result.rows)
-    assert (tmp_path / "default_capture_0.safetensors").exists() and all(p.is_file() for p in result.files)
-    assert json.loads((tmp_path / "ablation.json").read_text())["rows"] == result.rows
-    # Existing rows are not trained again; a changed training is.
-    trained = []
-    monkeypatch.setattr(ablation, "_train", lambda made, plan, path, bench: trained.append(path.stem) or result.rows[0])
-    ablate(crowd(3000), tmp_path, ABLATION_OPTIONS)
-    assert trained == []
-    other = replace(ABLATION_OPTIONS, ground_truth="tests.workflows.test_gaze:Uniform", seeds=1, variant=("capture",))
-    ablate(crowd(3000), tmp_path, other)
-    assert trained == ["default_capture_0"]
-
-
-@pytest.mark.parametrize(
-    "change, said",
-    [
-        ({"law": "nowhere"}, "MODULE:CLASS"),
-        ({"law": "tests.workflows.test_gaze:Nobody"}, "MODULE:CLASS"),
-        ({"variant": ("emitt",)}, '"default" have no variant "emitt"; --variant must be one of emit, capture,'),
-        ({"size": "320"}, "WIDTHxHEIGHT"),
-        ({"recipes": "default,best"}, '"best"'),
-        ({"geometry": None}, "one of --field FILE"),
-    ],
-)
-def test_wrong_options_are_refused_before_training(tmp_path, change, said):
-    with pytest.raises(NergError, match=said):
-        ablate(crowd(100), tmp_path / "new", replace(ABLATION_OPTIONS, **change))
-    assert not (tmp_path / "new").exists()
-
-
-def test_splats_have_no_features_of_a_radiance_field(tmp_path):
-    write_inria(tmp_path / "place.ply", random_splats(5))
-    options = replace(
-        ABLATION_OPTIONS, geometry=None, field=tmp_path / "place.ply", recipes="small", variant=("semantic snapshot",)
-    )
-    with pytest.raises(NergError, match='"small" have no variant "semantic snapshot"; --variant must be one of emit, '):
-        ablate(crowd(100), tmp_path / "new", options)
-
-
-@pytest.mark.parametrize("recipe, seeds, steps, refit", [("default", [0, 1], 2, True), ("small", [0], 5, False)])
-def test_only_fast_recipes_are_repeated(tmp_path, monkeypatch, recipe, seeds, steps, refit):
-    """Variants can have their own number of steps."""
-    plans = {}
-    row = {"test_KLD": 1.0, "test_CC": 0.5, "train_seconds": 1.0, "test_loss": 1.0, "train_loss": 1.0, "steps": 1}
-
-    def record_training(made, plan, path, bench):
-        plans[made["seed"]] = plan
-        path.write_bytes(b"")
-        return {**made, **row}
-
-    monkeypatch.setattr(ablation, "_train", record_training)
-    options = replace(ABLATION_OPTIONS, recipes=recipe, variant=("emit",), steps=5, refit=False, timing_cameras=0)
-    ablate(crowd(1000), tmp_path, options)
-    assert sorted(plans) == seeds
-    for seed, plan in plans.items():
-        s = plan.settings
-        assert (s.seed, s.steps, s.refit, plan.config.variant, plan.probes.count) == (seed, steps, refit, "emit", 12)
-        assert s.validation_min_rays == 8
-
-
-def test_another_first_seed_changes_the_hold_out(tmp_path, monkeypatch):
-    made = []
-
-    def record_training(row, plan, path, bench):
-        made.append((row["seed"], plan.settings.seed, bench.centres.tobytes()))
-        path.write_bytes(b"")
-        return {**row, "test_KLD": 1.0, "test_CC": 0.5, "train_seconds": 1.0, "test_loss": 1.0, "train_loss": 1.0}
-
-    monkeypatch.setattr(ablation, "_train", record_training)
-    monkeypatch.setattr(scoring, "write_ablation", lambda *args: [])
-    for first in (0, 5):
-        ablate(
-            crowd(1000),
-            tmp_path / str(first),
-            replace(ABLATION_OPTIONS, seed=first, variant=("emit",), timing_cameras=0),
-        )
-    assert [m[:2] for m in made] == [(0, 0), (1, 1), (5, 5), (6, 6)]
-    assert made[0][2] == made[1][2] != made[2][2] == made[3][2]
-
-
-# ---- Plans of variants, and named ground truths ----
-
-
-def test_a_semantic_variant_is_planned_with_the_features_of_its_geometry(tmp_path):
-    import drjit.llvm.ad as ns
-
-    from nerg_mi.train.geometry import load_field_geometry
-    from tests.plugins import fields
-
-    fields.radiance(tmp_path / "field.safetensors")
-    place = load_field_geometry(tmp_path / "field.safetensors", ns)
-    bench = AblationBenchmark(None, {}, None, 0, place, tmp_path, ns, replace(ABLATION_OPTIONS, geometry=None))
-    for variant in scoring.list_variants(True, ["small"]):
-        plan = make_plan(variant, 0, bench)
-        c = plan.config
-        assert (c.variant, c.semantic, c.semantic_own) == (
-            variant.field_variant,
-            variant.semantic,
-            variant.semantic_own,
-        )
-        assert (plan.initial_arrays is not None, plan.settings.frozen) == (variant.init_from_field, variant.frozen)
-        assert plan.settings.loss == (variant.loss or "paper")
-        if variant.semantic or variant.init_from_field:
-            assert c.geometry == place.radiance.config.geometry
-    # Stored rows are those of the same training rays.
-    one, other = (ablation._identity(variant, 0, replace(bench, train=crowd(count))) for count in (20, 21))
-    assert {key for key in one if one[key] != other[key]} == {"rays"}
-
-
-def test_a_recipe_selects_its_log_density_class():
-    assert load_ground_truth("tests.workflows.test_gaze:Uniform")([[0, 0, 0]], [[1, 0, 0]] * 3).shape == (1, 3)
-    for name in ("nowhere:Law", "tests.workflows.test_gaze:Nobody", "tests.workflows.test_gaze"):
-        with pytest.raises(NergError, match="MODULE:CLASS"):
-            load_ground_truth(name)
-
-
-# ---- Trainings of an ablation in parts: stored, and equal in a separate process ----
-
-
-TIMES = ("train_seconds", "frame_seconds")
-ONE = replace(ABLATION_OPTIONS, variant=("emit_capture",), seeds=1, timing_cameras=0, threads=1)
-
-
-def scores(result):
-    return [{k: v for k, v in row.items() if k not in TIMES} for row in result.rows]
-
-
-@pytest.fixture
-def trainings(monkeypatch):
-    """The trainings of this process."""
-    monkeypatch.setenv("PYTHONPATH", str(ROOT))
-    calls, original = [], ablation.train_variant
-    monkeypatch.setattr(ablation, "train_variant", lambda *args: calls.append(args[:2]) or original(*args))
-    return calls
-
-
-@pytest.mark.nightly
-def test_a_training_in_a_worker_gives_equal_scores_and_is_stored(tmp_path, rgb, trainings):
-    rays = crowd(3000)
-    elsewhere = ablate(rays, tmp_path / "a", replace(ONE, scheduler="local:1"))
-    assert trainings == []
-    local = ablate(rays, tmp_path / "b", ONE)
-    assert scores(elsewhere) == scores(local)
-    trainings.clear()
-    assert (tmp_path / "a" / "default_emit_capture_0.safetensors").is_file()
-    # With one more seed, any worker trains only that one.
-    ablate(rays, tmp_path / "a", replace(ONE, seeds=2, store=tmp_path / "a.tasks"))
-    assert [seed for _, seed in trainings] == [1]
-    recorder = Recorder()
-    (job,) = account_for_store(tmp_path / "a.tasks", reporter=recorder).jobs
-    assert (job.name, job.total, job.remaining) == (f"nerg ablate {tmp_path / 'a'}", 2, 0)
 
 
 # ---- The prior field of other environments: messages, content of its checkpoint, and refused input ----

@@ -17,7 +17,7 @@ from nerg_mi.cli.building import DEBUG, build_command
 from nerg_mi.errors import NergError
 from nerg_mi.old_names import _KEYWORDS, ALL, OLD_NAMES, renamed_options
 from nerg_mi.workflows.base import COMMANDS, Command
-from nerg_mi.workflows.gaze_commands import AblationOptions, FoldOptions, GazeOptions
+from nerg_mi.workflows.gaze_commands import FoldOptions, GazeOptions
 from tools.command_pages import iter_commands
 
 # Options of colmap, pip, Python's server and torch-ngp, and the prefix of negated flags.
@@ -69,7 +69,7 @@ def test_old_spellings_are_accepted_on_the_command_line():
 
 
 def test_a_value_equal_to_an_old_spelling_is_unchanged():
-    assert run(AblationOptions, "ablate", "--recipes", "--cap", "--size", "8x8").recipes == "--cap"
+    assert run(FoldOptions, "eval folds", "--splits", "--cap").splits == "--cap"
 
 
 def test_old_names_are_not_shown():

@@ -8,7 +8,6 @@ import types
 import typing
 from dataclasses import FrozenInstanceError, dataclass, fields, is_dataclass, replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import get_type_hints
 
 import drjit as dr
@@ -18,7 +17,6 @@ import nerg_mi.workflows
 from nerg_mi import options
 from nerg_mi.aoi.options import CountOptions, PredictionOptions, StatisticsOptions
 from nerg_mi.errors import NergError
-from nerg_mi.evaluation.ablation import Variant
 from nerg_mi.options import PartOptions, exposed_options, option, shared_options, to_base
 from nerg_mi.progress import SILENT
 from nerg_mi.ranges import ValidatedDataclass
@@ -27,17 +25,10 @@ from nerg_mi.tasks.task import Part, Plan, rebuild_value
 from nerg_mi.threads import set_thread_count
 from nerg_mi.train.gaze_settings import GazeSettings as TrainingSettings
 from nerg_mi.train.gaze_settings import ProbeSettings
-from nerg_mi.workflows import ablation, evaluate
-from nerg_mi.workflows.ablation import training_options
+from nerg_mi.workflows import evaluate
 from nerg_mi.workflows.base import select_backend, versions
 from nerg_mi.workflows.evaluate import fold_options
-from nerg_mi.workflows.gaze_commands import (
-    AblationOptions,
-    FoldOptions,
-    GazeEvaluationOptions,
-    GazeOptions,
-    PriorOptions,
-)
+from nerg_mi.workflows.gaze_commands import FoldOptions, GazeEvaluationOptions, GazeOptions, PriorOptions
 from nerg_mi.workflows.rays_commands import FilterOptions, SplitOptions
 from nerg_mi.workflows.render import picture_options
 from nerg_mi.workflows.scene_commands import FilmOptions, StudyOptions
@@ -65,7 +56,7 @@ KINDS = [
 
 
 def test_there_are_options():
-    assert {"GazeOptions", "GazeEvaluationOptions", "AblationOptions"} <= {k.__name__ for k in KINDS}
+    assert {"GazeOptions", "GazeEvaluationOptions", "FoldOptions"} <= {k.__name__ for k in KINDS}
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda k: k.__name__)
@@ -133,7 +124,7 @@ def test_repeated_options_are_read_again_and_equal_names_are_not():
     assert FoldOptions(ensemble=1000).ensemble == 1000, "with the range that it has in a training"
 
 
-# ---- A setting of gaze trainings is also an option of folds and of ablations ----
+# ---- A setting of gaze trainings is also an option of folds ----
 
 FIELDS = [f for kind in (ProbeSettings, TrainingSettings) for f in fields(kind) if "help" in f.metadata]
 SETTINGS = {f.metadata["option"] or f.name for f in FIELDS}
@@ -154,7 +145,6 @@ def training(monkeypatch):
         raise Stop
 
     monkeypatch.setattr(evaluate, "train_gaze", begin)
-    monkeypatch.setattr(ablation, "plan_gaze", begin)
     return seen
 
 
@@ -167,25 +157,10 @@ def test_folds_have_the_training_settings(training, tmp_path):
     assert training[0].kappa is training[0].radius is None
 
 
-def test_ablations_have_the_training_settings(training):
-    bench = SimpleNamespace(options=AblationOptions(**CHANGED_SETTINGS, default_steps=3), place=None)
-    with pytest.raises(Stop):
-        ablation.make_plan(Variant(name="emit", recipe="default", field_variant="emit"), 3, bench)
-    assert {name: getattr(training[0], name) for name in CHANGED_SETTINGS} == CHANGED_SETTINGS
-    assert training[0].kappa is training[0].radius is None and training[0].steps == 3
-
-
-@pytest.mark.parametrize("kind", [FoldOptions, AblationOptions])
-def test_every_training_setting_is_covered(kind):
-    assert {f.name for f in fields(kind)} | {
-        "seed",
-        "freeze",
-        "validation_zones",
-        "loss",
-        "prior_folds",
-        "reaimed_hits",
-    } >= SETTINGS
-    assert exposed_options(kind()) == {} and set(exposed_options(kind(**CHANGED_SETTINGS))) == set(CHANGED_SETTINGS)
+def test_every_training_setting_is_covered():
+    assert {f.name for f in fields(FoldOptions)} | {"seed", "freeze", "validation_zones"} >= SETTINGS
+    assert exposed_options(FoldOptions()) == {}
+    assert set(exposed_options(FoldOptions(**CHANGED_SETTINGS))) == set(CHANGED_SETTINGS)
 
 
 # ---- Options of filtering and splitting; tests/workflows/test_rays.py tests their effect on rays ----
@@ -220,11 +195,6 @@ STORE = {"store", "scheduler", "worker_wait", "threads"}
 # not receive. These concern the schedule, the selection of parts, or the processing of their outputs.
 COMMANDS = {
     "render": (FilmOptions, picture_options, STORE | {"defaults", "frames", "fps"}),
-    "ablate": (
-        AblationOptions,
-        training_options,
-        STORE | {"recipes", "variant", "seeds", "timing_cameras", "timing_size"},
-    ),
     "study": (
         StudyOptions,
         lambda o: plan_study(None, "sphere", o).options,

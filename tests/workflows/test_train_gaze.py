@@ -165,10 +165,7 @@ def test_recipes_in_a_scene_of_shapes(rays, tmp_path, recipe):
 
 
 def test_a_registered_recipe_trains_from_function_and_command(rays, tmp_path, monkeypatch, capsys):
-    """A second log density in the registry: hold-out, ensembles and ablation find it by its entry."""
-    from nerg_mi.workflows.ablation import ablate
-    from nerg_mi.workflows.gaze_commands import AblationOptions
-
+    """A second log density in the registry: hold-out and ensembles find it by its entry."""
     monkeypatch.setattr(gaze_recipes, "RECIPES", dict(gaze_recipes.RECIPES))
     grid = HashGridConfig(levels=2, log2_rows=8, base=2, finest=4)
     register_recipe(
@@ -180,7 +177,6 @@ def test_a_registered_recipe_trains_from_function_and_command(rays, tmp_path, mo
             losses=("likelihood",),
             settings={"steps": 3, "zones": 0, "loss": "likelihood", "integral": 0.0, "probes": 4, "directions": 32},
             probes={"radius": 0.5, "count": 6, "min_rays": 8, "directions": 64},
-            is_quick=True,
         )
     )
     result = train_gaze(rays, options=GazeOptions(geometry="none", recipe="coarse", variant="emit", threads=1))
@@ -195,11 +191,6 @@ def test_a_registered_recipe_trains_from_function_and_command(rays, tmp_path, mo
     assert field.config.escaped == "nearest" and len(meta["provenance"]["test"]["centres"]) == 4
     with pytest.raises(NergError, match="the recipe coarse does not support --loss; add"):
         check_plan(GazeOptions(geometry="none", recipe="coarse", loss="paper"))
-    test = {"zones": 1, "positions": 4, "min_rays": 8, "radius": 0.5, "cameras": 0}
-    options = AblationOptions(geometry="none", recipes="coarse", variant=("emit",), seeds=2, **test)
-    rows = ablate(RAYS, tmp_path / "rows", options).rows
-    trained = [(r["recipe"], r["variant"], r["seed"], r["steps"]) for r in rows]
-    assert trained == [("coarse", "emit", 0, 3), ("coarse", "emit", 1, 3)]
 
 
 def test_held_out_positions_and_participants_are_reported(tmp_path):

@@ -41,6 +41,5 @@ register_recipe(
         settings={"steps": 12, "zones": 0, "loss": "likelihood", "integral": 0.0, "probes": 8, "mix_folds": 2},
         probes={"radius": 0.5, "count": 16, "min_rays": 8, "directions": 64},
         supported_options=frozenset({"mix-folds", "mix-kappa"}),
-        is_quick=True,
     )
 )

@@ -16,8 +16,7 @@ from nerg_mi.fields import gaze_base
 from nerg_mi.fields.gaze_base import GazeEnsemble
 from nerg_mi.formats.fields import load_gaze, save_gaze
 from nerg_mi.train import gaze_recipes
-from nerg_mi.workflows.ablation import ablate
-from nerg_mi.workflows.gaze_commands import AblationOptions, GazeOptions
+from nerg_mi.workflows.gaze_commands import GazeOptions
 from nerg_mi.workflows.train_gaze import train_gaze
 from tests.evaluation.test_gaze import crowd
 from tests.plugins.scenes import camera, look_at, render
@@ -81,25 +80,8 @@ def test_it_is_stored_rendered_and_a_torch_module(rgb, trained, tmp_path):
     assert not module.get_parameter("prior").requires_grad
 
 
-def test_members_of_an_ensemble_and_an_ablation_are_of_its_kind(head, tmp_path):
-    rays = crowd(3000)
-    options = AblationOptions(
-        geometry="hits",
-        recipes="place",
-        variant=("emit", "capture"),
-        seeds=1,
-        default_steps=2,
-        test_zones=1,
-        positions=3,
-        min_rays=4,
-        radius=0.5,
-        timing_cameras=0,
-        probes=8,
-    )
-    rows = ablate(rays, tmp_path, options).rows
-    assert [row["variant"] for row in rows] == ["emit", "capture"] and all(np.isfinite(r["test_loss"]) for r in rows)
-    field = load_gaze(tmp_path / "place_emit_0.safetensors", ns)[0]
-    assert isinstance(field, head.PlaceField) and field.networks == 1
+def test_members_of_an_ensemble_are_of_its_kind(head, trained, tmp_path):
+    field = trained.field
     both = GazeEnsemble([field, head.PlaceField.random(field.config, field.box, ns, 2, field.prior.numpy())])
     save_gaze(both, tmp_path / "both.safetensors", {})
     again = load_gaze(tmp_path / "both.safetensors", ns)[0]
