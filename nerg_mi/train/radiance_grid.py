@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
@@ -248,7 +249,12 @@ class DensityGrid:
         return float(dr.sum(self.ns.Float(self.bits))[0]) / self.resolution**3
 
     def extract_occupancy(
-        self, density, rng: np.random.Generator, contributing_points, probes: int = 3
+        self,
+        density,
+        rng: np.random.Generator,
+        contributing_points,
+        probes: int = 3,
+        on_progress: Callable[[float], None] = lambda part: None,
     ) -> OccupancyGrid | CascadeGrid:
         """Extract the occupancy for rendering: cells that may hold density and contribute to training rays.
 
@@ -263,6 +269,8 @@ class DensityGrid:
             light of a training ray.
         probes : int
             The density is evaluated at ``probes``**3 jittered points per cell.
+        on_progress : callable
+            Called with the completed part of these.
 
         Notes
         -----
@@ -279,6 +287,7 @@ class DensityGrid:
             self.mark_dense_cells(
                 dense_cells, index, density, rng, (k % probes, k // probes % probes, k // probes**2), probes
             )
+            on_progress((k + 1) / probes**3)
         return self.select_contributing(self.dilate_cells(dense_cells), density, contributing_points)
 
     def select_contributing(self, dense: np.ndarray, density, contributing_points) -> OccupancyGrid | CascadeGrid:

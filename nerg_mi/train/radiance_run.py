@@ -26,7 +26,7 @@ from nerg_mi.photos.dataset import Dataset
 from nerg_mi.photos.images import PhotoView, pick_evenly
 from nerg_mi.threads import measure_processor_time
 
-from .radiance_budget import Budget
+from .radiance_budget import EVALUATION_SAMPLES, Budget
 from .radiance_diagnosis import MIN_STEPS, Outcome, describe_pace, find_causes, find_problems
 from .radiance_losses import PHOTO_PARAMETER
 from .radiance_monitor import (
@@ -177,8 +177,6 @@ _PACE_TIME = 0.1
 _MIN_IMPROVEMENT = 0.2
 # Minimum number of steps between two evaluations, each of which takes as long as several steps
 MIN_EVALUATION_INTERVAL = 50
-# Maximum samples of an evaluation
-_EVALUATION_SAMPLES = 2**19
 
 
 @dataclass(frozen=True)
@@ -325,7 +323,8 @@ def train_field(
             if observer is not None:
                 observer.on_step(trainer, history)
             try:
-                budget.update()
+                if (line := budget.update()) is not None:
+                    on_warning(line)
                 report()
                 stop.check()
             except KeyboardInterrupt:
@@ -344,9 +343,16 @@ def train_field(
         budget.start_result()
         report("extracting")
         score = lambda fraction: report("scoring", fraction)
+
+        def extract(part: float) -> None:
+            budget.update_extraction(part)
+            report("extracting")
+
         duration = seconds, pace.waiting_fraction
         # A copy, because the evaluation of the result is not part of the run: a resumed run would not repeat it.
-        field, provenance = _make_result(trainer, dataset, watched, list(history), duration, interrupted, budget, score)
+        field, provenance = _make_result(
+            trainer, dataset, watched, list(history), duration, interrupted, budget, score, extract
+        )
         evaluations, result = provenance["psnr_watched"]["history"], provenance["psnr_watched"]["result"]
         if previews is not None:
             previews.write_result(trainer, field)
@@ -385,7 +391,7 @@ class Pace:
             return None
         self._is_judged = True
         per_second = (t.steps - self._first_step) / max(t.seconds - self._begin, 1e-9)
-        expected = t.steps + per_second * (1 - t.progress) * 60 * t.settings.minutes
+        expected = t.steps + per_second * max(60 * t.settings.minutes - t.reserved_seconds - t.seconds, 0.0)
         if expected >= MIN_STEPS:
             return None
         return (
@@ -432,14 +438,15 @@ def _make_result(
     interrupted: bool,
     budget: Budget,
     on_progress: Callable[[float], None],
+    on_extraction: Callable[[float], None],
 ) -> tuple[RadianceField, dict]:
     """Return the best field and its provenance with the error on all held-out views.
 
     ``duration`` is the time in seconds and the fraction of it in which other programs had the processors;
-    ``on_progress`` is called with the fraction of the scored views.
+    ``on_progress`` is called with the fraction of the scored views, ``on_extraction`` with that of the occupancy.
     """
     seconds, waiting_fraction = duration
-    field, result = _choose_state(trainer, watched, history, seconds, budget)
+    field, result = _choose_state(trainer, watched, history, seconds, budget, on_extraction)
     provenance = {
         **dataset.source,
         "settings": trainer.settings.to_dict(),
@@ -467,7 +474,7 @@ def _make_result(
             "views": {v.name: _round_decibels(p) for v, p in zip(dataset.held_out, error.psnr)},
         }
         if field.box.is_contracted:
-            every = trainer.choose_pixel_stride(watched.held_out, _EVALUATION_SAMPLES)
+            every = trainer.choose_pixel_stride(watched.held_out, EVALUATION_SAMPLES)
             outside_fraction = compute_outside_fraction(
                 watched.held_out, lambda view: trainer.render(view, every, field), field.box.core, every
             )
@@ -486,14 +493,19 @@ def _make_result(
 
 
 def _choose_state(
-    trainer: RadianceTrainer, watched: WatchedViews, history: list, seconds: float, budget: Budget
+    trainer: RadianceTrainer,
+    watched: WatchedViews,
+    history: list,
+    seconds: float,
+    budget: Budget,
+    on_extraction: Callable[[float], None],
 ) -> tuple[RadianceField, dict | None]:
     """Return the field of the last state, or of the best one if that is better as a result, and its evaluation.
 
     The last state is appended to ``history``, and the evaluation of the best one replaced if it was repeated;
     ``seconds`` is the time of the training of the last state.
     """
-    field = trainer.make_field()
+    field = trainer.make_field(on_progress=on_extraction)
     with budget.timing_evaluation([*watched.held_out, *watched.training]) as strides:
         last = _append_evaluation(trainer, watched, history, field, seconds)
         strides += [] if last is None else [last["every_pixel"]]
@@ -563,7 +575,7 @@ def _evaluate(trainer: RadianceTrainer, watched: WatchedViews, history: list, fi
     if history:
         every = history[0]["every_pixel"]
     else:
-        every = trainer.choose_pixel_stride(watched.held_out, _EVALUATION_SAMPLES)
+        every = trainer.choose_pixel_stride(watched.held_out, EVALUATION_SAMPLES)
     shown = field or trainer.make_field(with_occupancy=False)
     errors = [evaluate_views(trainer, views, every, shown) for views in (watched.held_out, watched.training)]
     held_out, training = ((e.mean if trainer.photos is None else e.mean_fitted) for e in errors)

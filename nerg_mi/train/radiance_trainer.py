@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -246,7 +248,7 @@ class RadianceTrainer(Trainer):
         self.hard_pixels = np.zeros(0, np.uint32)
         self.rays, self.loss, self.samples = 256, 0.0, 0
         # Measured at updates of the grid, with all that they do
-        self._seconds_per_density = 0.0
+        self.seconds_per_density = 0.0
         # State with the best evaluation so far
         self.best: Snapshot | None = None
         # March stride in units of `march_step`, and samples per ray of the last density pass.
@@ -408,13 +410,16 @@ class RadianceTrainer(Trainer):
             start = time.perf_counter()
             self.grid.update(self.evaluate_density, self.rng)
             dr.sync_thread()
-            self._seconds_per_density = (time.perf_counter() - start) / max(self.grid.seen_count / NUM_PARTS, 1)
+            self.seconds_per_density = (time.perf_counter() - start) / max(self.grid.seen_count / NUM_PARTS, 1)
 
     def estimate_extraction_seconds(self) -> float:
         """Estimate the duration of `make_field`, based on the last update of the grid and on the last step."""
+        return self.seconds_per_density * (_PROBES**3 * self.grid.seen_count + self._count_extraction_samples())
+
+    def _count_extraction_samples(self) -> float:
+        """Estimate the number of samples along rays of an extraction."""
         rays = min(_RAY_GROUPS * _GROUP_RAYS, self.pixels.size)
-        samples = min(rays * max(self.prepass_samples_per_ray * self.stride, 1.0), _EXTRACTION_SAMPLES)
-        return self._seconds_per_density * (_PROBES**3 * self.grid.seen_count + samples)
+        return min(rays * max(self.prepass_samples_per_ray * self.stride, 1.0), _EXTRACTION_SAMPLES)
 
     def update_current_field(self) -> None:
         """Copy the weights of this step to ``current_field``."""
@@ -507,14 +512,16 @@ class RadianceTrainer(Trainer):
             self.average_weights()
         return depth_errors
 
-    def _contributing_samples(self, density, occupied):
+    def _contributing_samples(self, density, occupied, on_progress: Callable[[float], None] = lambda part: None):
         """Yield the points (Array3f) of samples with more than a thousandth of the light of a training ray."""
         rng, num_samples = np.random.default_rng(self.settings.seed), 0
-        for _ in range(min(_RAY_GROUPS, -(-self.pixels.size // _GROUP_RAYS))):
+        groups = min(_RAY_GROUPS, -(-self.pixels.size // _GROUP_RAYS))
+        for k in range(groups):
             samples, p = self._find_contributing_samples(density, occupied, rng, _GROUP_RAYS)
             if samples is not None:
                 num_samples += samples.prepass_samples_per_ray * _GROUP_RAYS
                 yield p
+            on_progress(min(max((k + 1) / groups, num_samples / _EXTRACTION_SAMPLES), 1.0))
             if num_samples > _EXTRACTION_SAMPLES:
                 break
 
@@ -575,10 +582,16 @@ class RadianceTrainer(Trainer):
             field, occupied, self.get_step_table(stride), view, self.settings.near * self.box.side, every=every
         )
 
-    def make_field(self, with_occupancy: bool = True, snapshot: Snapshot | None = None) -> RadianceField:
+    def make_field(
+        self,
+        with_occupancy: bool = True,
+        snapshot: Snapshot | None = None,
+        on_progress: Callable[[float], None] = lambda part: None,
+    ) -> RadianceField:
         """Return the field with averaged weights, and its occupancy for rendering if ``with_occupancy``.
 
         With a ``snapshot``, it is the field of that state, sampled in the cells that were sampled then.
+        ``on_progress`` is called with the completed part of the extraction of the occupancy of the present state.
         """
         growth = self.settings.step_growth if self.box.is_contracted else 0.0
         out = RadianceField.random(self.config, self.box, self.ns, 0, march_step=self.march_step, march_growth=growth)
@@ -589,7 +602,15 @@ class RadianceTrainer(Trainer):
         with dr.suspend_grad():
             if snapshot is None:
                 rng = np.random.default_rng(self.settings.seed)
-                out.occupancy = self.grid.extract_occupancy(out.density, rng, self._contributing_samples, _PROBES)
+                probing = _PROBES**3 * self.grid.seen_count
+                probing_part = probing / max(probing + self._count_extraction_samples(), 1.0)
+                contributing_samples = partial(
+                    self._contributing_samples,
+                    on_progress=lambda part: on_progress(probing_part + (1 - probing_part) * part),
+                )
+                out.occupancy = self.grid.extract_occupancy(
+                    out.density, rng, contributing_samples, _PROBES, lambda part: on_progress(probing_part * part)
+                )
             else:
                 # A young field is thin fog, of which a threshold, or a refined occupancy, would leave nothing.
                 cells = snapshot.bits.numpy().reshape((self.grid.resolution,) * 3) > 0

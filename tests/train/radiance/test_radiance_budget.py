@@ -17,7 +17,13 @@ def clock(monkeypatch):
 
 def make_trainer(minutes, extraction=6.0):
     """A trainer whose views have 2^20 samples each."""
-    t = SimpleNamespace(seconds=0.0, progress=0.0, reserved_seconds=0.0, settings=SimpleNamespace(minutes=minutes))
+    t = SimpleNamespace(
+        seconds=0.0,
+        progress=0.0,
+        reserved_seconds=0.0,
+        seconds_per_density=0.0,
+        settings=SimpleNamespace(minutes=minutes),
+    )
     t.estimate_extraction_seconds = lambda: extraction
     t.estimate_samples = lambda view: 2**20
     t.reserve = lambda seconds: setattr(t, "reserved_seconds", seconds)
@@ -31,7 +37,7 @@ def evaluate(budget, clock, seconds, views=4, every=2):
 
 
 def test_time_is_reserved_for_measured_costs(clock):
-    """Extraction, an evaluation and a twentieth of the limit for the final error; at most three tenths of the limit."""
+    """Extraction, an evaluation and a twentieth of the limit for the final error; at most half of the limit."""
     t = make_trainer(1.0)
     budget = Budget(t, [None] * 8)
     budget.update()
@@ -44,8 +50,34 @@ def test_time_is_reserved_for_measured_costs(clock):
     budget.update()
     assert t.reserved_seconds == pytest.approx(1.2 * 7.5 + 3)  # Estimated again later in the run
     t.progress = 0.2
-    budget.update()
-    assert t.reserved_seconds == pytest.approx(18)
+    line = budget.update()
+    needed = 1.2 * 106 + 200  # Fewest samples at the measured rate
+    assert t.reserved_seconds == pytest.approx(30) and line is not None
+    assert f"about {needed:.0f} s" in line and f"{(60 + needed - 30) / 60:.2g} minutes" in line
+    t.progress = 0.3
+    assert budget.update() is None  # once
+
+
+def test_short_runs_reserve_an_evaluation_before_the_first_one():
+    t = make_trainer(0.2, extraction=1.0)
+    budget = Budget(t, [None] * 8)
+    t.progress, t.seconds_per_density = 0.06, 1e-6
+    assert budget.update() is None
+    assert t.reserved_seconds == pytest.approx(1.2 * (1 + 2**20 * 1e-6) + 0.05 * 12)
+
+
+def test_progress_follows_the_extraction():
+    """Also one that takes five times as long as estimated; 10 seconds remain after it."""
+    t = make_trainer(1.0, extraction=2.0)
+    budget, fractions = Budget(t, []), []
+    t.seconds, t.progress, t.reserved_seconds = 48.0, 1.0, 12.0
+    budget.start_result()
+    for k in range(1, 11):
+        t.seconds = 48.0 + k
+        budget.update_extraction(k / 10)
+        fraction, remaining = budget.estimate()
+        fractions.append(fraction)
+    assert remaining == pytest.approx(10) and fractions == sorted(fractions) and fractions[-1] < 0.9
 
 
 def test_the_final_error_takes_the_time_that_is_left(clock):

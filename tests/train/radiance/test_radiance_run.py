@@ -115,6 +115,9 @@ def test_progress_counts_all_phases(dataset, monkeypatch, limit):
     train_field(dataset, TINY, settings(**limit), ns, on_progress=seen.append, write=lambda *_: None)
     phases = list(dict.fromkeys(now.phase for now in seen))
     assert phases == ["training", "extracting", "scoring", "writing"] and seen[-1].phase == "writing"
+    # At the start, and after each part of the occupancy.
+    extracting = [now.fraction for now in seen if now.phase == "extracting"]
+    assert len(extracting) > 3
     fractions = [now.fraction for now in seen]
     assert fractions == sorted(fractions) and 0.9 < fractions[-1] < 1
     assert all(now.remaining > 0 and now.fraction < 1 for now in seen)
@@ -183,7 +186,7 @@ def test_resuming_needs_a_state(dataset):
 @pytest.mark.parametrize("steps, warns", [(40, True), (60, False)])
 def test_a_low_pace_is_reported_after_a_tenth(steps, warns):
     """A run of a minute that has made ``steps`` steps in its first six seconds."""
-    t = SimpleNamespace(steps=0, seconds=0.0, progress=0.0, settings=SimpleNamespace(minutes=1.0))
+    t = SimpleNamespace(steps=0, seconds=0.0, progress=0.0, reserved_seconds=0.0, settings=SimpleNamespace(minutes=1.0))
     pace = Pace(t)
     t.steps, t.seconds, t.progress = steps - 1, 5.9, 5.9 / 60
     assert pace.judge() is None
@@ -194,6 +197,17 @@ def test_a_low_pace_is_reported_after_a_tenth(steps, warns):
     assert (line is not None) == warns
     if warns:
         assert "6.7 per second" in line and "about 400 steps" in line and "at least 500" in line
+
+
+def test_the_pace_counts_without_the_time_of_the_result():
+    """600 steps in a minute are 350 if 25 seconds of it are for the result."""
+    t = SimpleNamespace(
+        steps=0, seconds=0.0, progress=0.0, reserved_seconds=25.0, settings=SimpleNamespace(minutes=1.0)
+    )
+    pace = Pace(t)
+    t.steps, t.seconds, t.progress = 40, 4.0, 0.115
+    line = pace.judge()
+    assert line is not None and "about 350 steps" in line
 
 
 # ---- The best state is the result ----
