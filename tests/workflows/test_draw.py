@@ -388,6 +388,14 @@ def test_a_triptych_has_one_scale(rgb, scene_triptych, monkeypatch):
     assert observer_view.values.max() > 0
 
 
+@pytest.mark.parametrize("kind", ["sphere", "triptych"])
+def test_figures_of_extrapolated_observers_say_so_once(rgb, scene_triptych, kind):
+    for eye, count in (("0.2, 0.1, 0.9", 0), ("0.2, 0.1, 2.5", 1)):
+        recorder = Recorder()
+        draw(kind, scene_triptych, reporter=recorder, mode=MODE, spp=1, defaults={"eye": eye}, top=0.5)
+        assert sum("extrapolated" in text for text in recorder.warnings) == count
+
+
 def test_a_scene_whose_camera_is_the_observer_is_refused(rgb, scene_triptych, tmp_path):
     text = scene_triptych.read_text()
     a, b = text.index("        <sensor name"), text.index('        <string name="aovs"')
