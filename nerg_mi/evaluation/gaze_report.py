@@ -428,9 +428,9 @@ def compute_verdict(
 
 
 _PLAIN_SPLITS = {
-    "both": "other people at other positions than in its training",
-    "pos": "the people of its training at other positions",
-    "people": "other people at the positions of its training",
+    "both": "other participants at other positions than in its training",
+    "pos": "the participants of its training at other positions",
+    "people": "other participants at the positions of its training",
 }
 _PLAIN_PRIOR = f"one average for all positions ({PRIOR})"
 _PLAIN_RAYS = f"copying the gaze recorded closest by ({NEAREST_RAYS})"

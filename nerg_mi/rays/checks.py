@@ -120,7 +120,7 @@ _MIN_SPEED, _MIN_TURN_RATE = 0.2, 10.0  # m/s and degrees per second of a moving
 _MAX_STEP_RATIO = 3.0  # maximum step across a gap, in typical steps, if only the clock has jumped
 _GAP_LIMITS = 0.01, 500  # maximum fraction of rays that are gaps, and maximum number of gaps examined
 _MIN_DUPLICATE_FRACTION = 0.05  # of a participant's rays that share their time with another ray
-_MIN_DISTANCE = 0.3  # metres; rays at the same time that are farther apart belong to two people
+_MIN_DISTANCE = 0.3  # metres; rays at the same time that are farther apart belong to two participants
 _WINDOW_RAYS, _MAX_WINDOWS = 64, 4096  # rays per window, and maximum number of windows examined
 _INTERVAL_RATIO = 20.0  # maximum ratio between sampling intervals of one device
 _MIN_WINDOW_FRACTION = 0.02  # of a participant's windows
@@ -204,13 +204,13 @@ def _check_overlaps(stats: RayStatistics) -> list[str]:
         return []
     names = list_persons(rays, np.unique(person[1:][overlap]))
     return [
-        f"recordings of {names} overlap in time: do several people or several clocks share a name? "
+        f"recordings of {names} overlap in time: do several participants or several clocks share a name? "
         "(--person-from filename, or --map person=...)"
     ]
 
 
 def _check_duplicates(stats: RayStatistics) -> list[str]:
-    """Detect rays of one participant at equal times: a file that was imported twice, or two people."""
+    """Detect rays of one participant at equal times: a file that was imported twice, or two participants."""
     rays, order = stats.rays, stats.order
     person, t = (v if order is None else v[order] for v in (rays.person, rays.t))
     is_same_time = (np.diff(person) == 0) & (np.diff(t) == 0)
@@ -231,7 +231,7 @@ def _check_duplicates(stats: RayStatistics) -> list[str]:
         out.append(f"rays of {names(is_copy)} are duplicated: was a file imported twice?")
     if np.mean(is_elsewhere := distance > _MIN_DISTANCE) > 0.5:
         out.append(
-            f"{names(is_elsewhere)} is at two positions at the same time: do several people share a name? "
+            f"{names(is_elsewhere)} is at two positions at the same time: do several participants share a name? "
             "(--person-from filename, or --map person=...)"
         )
     return out

@@ -226,7 +226,7 @@ def read_source_manifest(path: Path, head: DatasetManifest) -> SourceManifest:
     read_metadata(json.dumps({"version": RAYS_VERSION, "persons": [], **content["metadata"]}), path)
     parts = [_read_part(path, part, head, content["persons"]) for part in content["parts"]]
     if sum(content["persons"].values()) != sum(part.rays for part in parts):
-        raise _damaged_manifest(path, "the numbers of rays of its persons and of its parts differ")
+        raise _damaged_manifest(path, "the numbers of rays of its participants and of its parts differ")
     if len({part.number for part in parts}) != len(parts):
         raise _damaged_manifest(path, "two of its parts have the same number")
     return SourceManifest(**{**content, "parts": parts})
@@ -240,7 +240,7 @@ def _read_part(path: Path, content: dict[str, Any], head: DatasetManifest, perso
     _require_valid(path, "bucket", content["bucket"] < head.buckets, "a bucket of this dataset")
     _require_valid(path, "rays", 0 < content["rays"] <= PART_ROWS, "a number of rays of a part")
     for key in ("first", "last"):
-        _require_valid(path, key, content[key] in persons, "a person of this source")
+        _require_valid(path, key, content[key] in persons, "a participant of this source")
     try:
         check_place(content["place"])
         check_day(content["day"])
@@ -403,7 +403,7 @@ def read_groups(
 ) -> Iterator[tuple[int, Rays]]:
     """Iterate over the row groups of a part, each with the number of its first row.
 
-    Persons and cohorts of each block are those that occur in it.
+    Participants and cohorts of each block are those that occur in it.
 
     Parameters
     ----------
@@ -636,7 +636,7 @@ class RayDataset:
     ) -> Iterator[Rays]:
         """Iterate over the rays that match ``conditions``, in blocks. Skips parts and row groups that cannot match.
 
-        Persons and cohorts of a block are those that occur in it; its metadata only contain the frame.
+        Participants and cohorts of a block are those that occur in it; its metadata only contain the frame.
 
         Parameters
         ----------

@@ -516,7 +516,7 @@ _MIN_FIXED_GAZE_LENGTH, _MAX_HEADING_LENGTH = 0.85, 0.5
 
 @dataclass(frozen=True, eq=False)
 class WalkingSteps:
-    """W half-second steps of walking people, horizontal components only, along the axes of the file."""
+    """W half-second steps of walking participants, horizontal components only, along the axes of the file."""
 
     heading: np.ndarray  # (W, 3) unit
     gaze: np.ndarray  # (W, 3) horizontal part of the unit gaze directions
@@ -591,7 +591,7 @@ def correlate_gaze_with_walking(rays: Rays, order: np.ndarray | None = None) -> 
     Parameters
     ----------
     rays
-        Rays of walking people.
+        Rays of walking participants.
     order
         Order of the rays from `filters.argsort_by_person_time`, if already computed.
 

@@ -126,8 +126,8 @@ def thin_mask(rays: Rays, seconds: float = 2.0, distance: float = 0.1, gap: floa
     """Mask (N,) bool that thins stationary rays: keep at most ``seconds`` of each stay, evenly spread over it.
 
     Ten minutes of waiting at a counter then count as much as a stop of ``seconds`` there, and the distribution of gaze
-    within the stay is preserved. Rays of walking people are unchanged. See `label_stays` for ``distance`` (metres) and
-    ``gap`` (seconds).
+    within the stay is preserved. Those of walking participants are unchanged. See `label_stays` for ``distance``
+    (metres) and ``gap`` (seconds).
     """
     if not (seconds > 0 and distance > 0):
         raise NergError(f"seconds {seconds} and distance {distance} must be positive")
@@ -322,7 +322,7 @@ def split_by_position(
     rng = np.random.default_rng(seed)
     index = RayIndex(rays)
 
-    # Farthest-point sampling of random origins, whose density follows that of people;
+    # Farthest-point sampling of random origins, whose density follows that of the participants;
     # candidates with too few rays around them cannot be tested.
     candidates = rays.origin[rng.permutation(len(rays))[:256]]
     candidates = candidates[_has_enough_rays(index, candidates, radius, min_rays)]
@@ -379,7 +379,9 @@ def split_by_person(
         test_codes = np.random.default_rng(seed).permutation(present)[:count]
     test = np.isin(rays.person, test_codes)
     if test.all() or not test.any():
-        raise NergError(f"{len(present)} persons cannot be split into training and test; provide rays of at least two")
+        raise NergError(
+            f"{len(present)} participants cannot be split into training and test; provide rays of at least two"
+        )
     return ~test, test
 
 

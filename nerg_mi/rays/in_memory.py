@@ -106,7 +106,7 @@ def concatenate(rays: Iterable[Rays]) -> Rays:
         shown = ", ".join(sanitize(name, 40) for name in repeated[:5]) + (", ..." if len(repeated) > 5 else "")
         warnings.warn(
             f"{shown} {'is a participant' if len(repeated) == 1 else 'are participants'} of several sets, and counted "
-            "as one: rename them before if they are different people",
+            "as one: rename them before if they are different participants",
             stacklevel=3,
         )
     metadata = merge_metadata([part.metadata for part in parts])

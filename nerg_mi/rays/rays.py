@@ -155,13 +155,13 @@ _METADATA_CHECKS = {
     ),
     "eye_distance": (
         lambda v: isinstance(v, dict) and all(_is_number(d) and d >= 0 for d in v.values()),
-        "a mapping of persons to distances in metres",
+        "a mapping of participants to distances in metres",
     ),
     "floor": (_is_text, "text"),
     "tracking": (lambda v: isinstance(v, str) and v in TRACKING, "eye, head, mixed or unknown"),
     "tracking_by_person": (
         lambda v: isinstance(v, dict) and all(isinstance(kind, str) and kind in TRACKING for kind in v.values()),
-        "a mapping of persons to eye, head, mixed or unknown",
+        "a mapping of participants to eye, head, mixed or unknown",
     ),
     "tick": (lambda v: _is_number(v) and v > 0, "a time in seconds"),
 }
@@ -471,7 +471,9 @@ class Rays:
             )
         _refuse_rows(~np.isfinite(self.t), "a time that is not finite", "drop it before building Rays")
         # Validate before the conversion to 32 bits, in which large codes would wrap to valid ones.
-        _refuse_rows(~((self.person >= 0) & (self.person < len(self.persons))), "an unknown person", "extend persons")
+        _refuse_rows(
+            ~((self.person >= 0) & (self.person < len(self.persons))), "an unknown participant", "extend persons"
+        )
         set_field("person", np.ascontiguousarray(self.person, dtype=np.int32))
         if self.cohort is not None:
             _refuse_rows(

@@ -1,6 +1,6 @@
 """``nerg rays import``: Convert tracking files to rays: right-handed, z up, metres, seconds.
 ``nerg rays guess``: Propose the preset or the column map for unknown tracking files.
-``nerg rays show``: Print a data-quality report: rays, persons, duration, rate, dropped rows, extent, eye height.
+``nerg rays show``: Print a data-quality report: rays, participants, duration, rate, dropped rows, extent, eye height.
 ``nerg rays filter``: Select rays by conditions, detect fixations, and thin out stationary periods.
 ``nerg rays split``: Split rays into disjoint training and test sets by position, participant or time.
 ``nerg rays events``: Detect fixations, saccades, pursuits and pauses, and measure data quality, per recording.
@@ -77,7 +77,7 @@ class RaysImportOptions(ValidatedDataclass):
         False, "Skip and report lines that cannot be read, up to 1 % of the lines of a file.", group=INPUT
     )
     pseudonyms: bool = option(
-        False, "Replace the names of persons, also within file names, by salted hashes.", group=OUTPUT
+        False, "Replace the names of participants, also within file names, by salted hashes.", group=OUTPUT
     )
     salt: Path | str | None = option(
         None,
@@ -132,10 +132,10 @@ class FilterOptions(ValidatedDataclass):
         group=INPUT,
     )
     persons: tuple[str, ...] = option(
-        (), "Person whose rays are selected; repeatable.  [default: all]", "--person", group=INPUT
+        (), "Participant whose rays are selected; repeatable.  [default: all]", "--person", group=INPUT
     )
     without_persons: tuple[str, ...] = option(
-        (), "Person whose rays are left out; repeatable.", "--without-person", group=INPUT
+        (), "Participant whose rays are left out; repeatable.", "--without-person", group=INPUT
     )
     cohorts: tuple[str, ...] = option(
         (), "Cohort whose rays are selected; repeatable.  [default: all]", "--cohort", group=INPUT
@@ -178,7 +178,7 @@ class FilterOptions(ValidatedDataclass):
     )
     thin_distance: float = option(
         0.1,
-        "Distance in metres within which a person counts as stationary for --thin.",
+        "Distance in metres within which a participant counts as stationary for --thin.",
         within=Range(0, 10**6),
         group=ANALYSIS,
     )
@@ -211,7 +211,7 @@ class FilterOptions(ValidatedDataclass):
 
     @property
     def follows(self) -> bool:
-        """Whether a step needs the consecutive rays of a person."""
+        """Whether a step needs the consecutive rays of a participant."""
         return self.fixations is not None or self.thin is not None
 
     @property
@@ -265,7 +265,9 @@ class SplitOptions(ValidatedDataclass):
     gap: float = option(
         5.0, "Time in seconds before the held-out end whose rays are purged.", within=SECONDS, group=TEST
     )
-    clock: str = option("all", "Clock of --test-time: all (one for all persons), or person (one for each).", group=TEST)
+    clock: str = option(
+        "all", "Clock of --test-time: all (one for all participants), or person (one for each).", group=TEST
+    )
     seed: int = option(0, "Seed of zones, positions and participants.", within=SEEDS, group=TEST)
     train_output: Path | str | None = option(
         None, "Rays file to write the training rays to (.npz or .parquet).", group=OUTPUT

@@ -1,4 +1,4 @@
-"""Cameras and observers of a written scene: overviews, and positions of persons in rays."""
+"""Cameras and observers of a written scene: overviews, and positions of participants in rays."""
 
 from __future__ import annotations
 

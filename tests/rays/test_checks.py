@@ -35,7 +35,7 @@ def test_recordings_under_one_name():
     rays = watch()
     shared = replace(rays, person=np.where(rays.person == 2, 1, rays.person))
     said = warnings_of(shared)
-    assert "bo is at two positions at the same time: do several people share a name? (--person-from" in said
+    assert "bo is at two positions at the same time: do several participants share a name? (--person-from" in said
     between = change(shared, slice(6000, None), t=lambda t: t + 0.003)
     assert "recordings of bo overlap in time" in warnings_of(between)
     twice = rays.select(np.r_[0:9000, 3000:6000])

@@ -291,8 +291,8 @@ class RaysBuilder:
     ) -> None:
         """Add n rows of the current source.
 
-        A row is dropped for the first reason that applies. Rows without a person are dropped, rows without a cohort
-        belong to the cohort "unknown".
+        A row is dropped for the first reason that applies. Rows without a participant are dropped, rows without a
+        cohort belong to the cohort "unknown".
 
         Parameters
         ----------

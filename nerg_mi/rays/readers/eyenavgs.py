@@ -87,7 +87,7 @@ def _parse_numbers(text: str, count: int) -> tuple[float, ...] | None:
     return numbers if len(numbers) == count and all(abs(v) < 1e6 for v in numbers) else None
 
 
-# ---- EyeNavGS: gaze of people in VR in captured scenes of Gaussian splats (arXiv 2506.02380) ----
+# ---- EyeNavGS: gaze of participants in VR in captured scenes of Gaussian splats (arXiv 2506.02380) ----
 
 _TICK = 1e-3  # seconds
 _MIN_HEAD_TURNS = 5.0, 30.0  # degrees of head rotation needed to detect frozen gaze, and gaze locked to the head

@@ -25,7 +25,7 @@ from .poses import find_fill_values
 
 # ---- Skeleton files: one pose per line, ``id|time|[numbers]`` ----
 #
-# The tracking format of the NeRG paper (Section 5.1): the id of a person, an integer time or frame number, and
+# The tracking format of the NeRG paper (Section 5.1): the id of a participant, an integer time or frame number, and
 # keypoints (22 in the paper) with three coordinates each, optionally with a confidence. A missing keypoint is ``nan``,
 # is at exactly 0, 0, 0 or another fill value, or has no confidence.
 
@@ -97,7 +97,7 @@ def write_skeleton(
         )
     for i, name in enumerate(ids):
         if not str(name).strip() or any(c in str(name) for c in "|\r\n"):
-            raise NergError(f"id {name!r} of pose {i} is empty or contains '|' or a line break; rename the person")
+            raise NergError(f"id {name!r} of pose {i} is empty or contains '|' or a line break; rename the participant")
 
     flat = keypoints.reshape(n, -1)
     line_format = ", ".join([f"%.{decimals}f"] * flat.shape[1])
@@ -274,7 +274,7 @@ LEFT_EAR, RIGHT_EAR, NOSE = 2, 13, 11
 class Skeleton:
     """A convention of keypoints: their number, and the indices (from 0) of those that define the pose of a body.
 
-    Left and right are those of the person. ``full_confidence`` is the confidence of a reliably detected keypoint.
+    Left and right are those of the participant. ``full_confidence`` is the confidence of a reliably detected keypoint.
     """
 
     title: str
@@ -641,7 +641,7 @@ class GeometryChecks:
         if distance < _MAX_HIP_OFFSET:
             self._builder.add_warning(
                 f'the bodies in "{sanitize(self._file, 60)}" have their hips at the origin: positions are relative to '
-                "the hips, and the file does not contain where people were"
+                "the hips, and the file does not contain where participants were"
             )
 
 

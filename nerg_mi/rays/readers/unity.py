@@ -28,9 +28,9 @@ class UnityOptions(TickOption):
 class UnityReader(FixedFrameReader):
     """Tables in Unity's world (y up, left-handed, metres), with columns found by name.
 
-    Optional columns are ``hit_*`` (or ``gaze_hit_*``, ``hit_point_*``), a time, a person, ``confidence`` and columns of
-    validity (``status``, ``isValid``, ``GazeValidity``), whose invalid rows are dropped. Without a person, each file is
-    one participant. ``find_columns`` finds the columns of origin and direction in a table.
+    Optional columns are ``hit_*`` (or ``gaze_hit_*``, ``hit_point_*``), a time, a participant, ``confidence`` and
+    columns of validity (``status``, ``isValid``, ``GazeValidity``), whose invalid rows are dropped. Without a
+    participant, each file is one participant. ``find_columns`` finds the columns of origin and direction in a table.
     """
 
     frame_description = "Unity: y up, left, m"
@@ -108,7 +108,7 @@ READERS = (
     UnityReader(
         "unity",
         "logs of Unity with gaze in the world: `gaze_origin_*`, `gaze_dir_*` (or `gaze_direction_*`, "
-        "`gaze_forward_*`), optionally `hit_*`, a time, a person, a validity (`status`, `isValid`)",
+        "`gaze_forward_*`), optionally `hit_*`, a time, a participant, a validity (`status`, `isValid`)",
         _find_gaze_in_world,
     ),
     UnityReader(

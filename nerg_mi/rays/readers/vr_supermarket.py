@@ -1,4 +1,4 @@
-"""Gaze of people in a VR supermarket, one CSV per person, 50 Hz.
+"""Gaze of participants in a VR supermarket, one CSV per participant, 50 Hz.
 
 Recorded with "Fixation-based Self-calibration for Eye Tracking in VR Headsets" (github: ryuryu0226).
 """
@@ -48,7 +48,7 @@ class VrSupermarket(FixedFrameReader):
     """
 
     name = "vr_supermarket"
-    files = "one CSV per person of the VR supermarket (github: ryuryu0226)"
+    files = "one CSV per participant of the VR supermarket (github: ryuryu0226)"
     frame_description = "Unity"
     validated_on = RECORDINGS
     fixed_frame = UNITY

@@ -56,7 +56,7 @@ def test_latest_generation_of_a_path_is_used(tmp_path):
     "change, why",
     [
         ({"id": "1" * 32}, '"id" does not match its file name'),
-        ({"persons": {"a": 5, "b": 5}}, "numbers of rays of its persons"),
+        ({"persons": {"a": 5, "b": 5}}, "numbers of rays of its participants"),
         ({"persons": ["a"]}, '"persons" is not counts'),
         ({"generation": -1}, '"generation" is not a count'),
         ({"stamp": 3}, '"stamp" is not text'),
@@ -79,7 +79,7 @@ def test_latest_generation_of_a_path_is_used(tmp_path):
                 ({"low": [0, 0]}, '"low" is not a point'),
                 ({"high": [0, 0, 1e999]}, '"high" is not a point'),
                 ({"start": None}, '"start" is not a number'),
-                ({"first": "nobody"}, '"first" is not a person'),
+                ({"first": "nobody"}, '"first" is not a participant'),
                 ({"cohorts": 1}, "a boolean"),
                 ({"heads": None}, "a boolean"),
             )

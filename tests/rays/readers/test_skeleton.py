@@ -123,7 +123,7 @@ def test_writer_refuses_invalid_input(tmp_path, poses):
     for wrong, message in (
         ((ids[:3], times, keypoints), "one pose for each id"),
         ((ids, times * 0.5, keypoints), "integers"),
-        ((["a|b", *ids[1:]], times, keypoints), "rename the person"),
+        ((["a|b", *ids[1:]], times, keypoints), "rename the participant"),
     ):
         with pytest.raises(ValueError, match=message):
             write_skeleton(path, *wrong)
