@@ -69,9 +69,9 @@ class Profile:
                 mask[rows] = np.logical_and.accumulate(mask[rows])
         return mask
 
-    def find_interval(self, heads: np.ndarray, margin: float = MARGIN) -> Interval:
+    def find_interval(self, heads: np.ndarray, margin: float = MARGIN, seed: int = 0) -> Interval:
         """Return the interval of the plausible placements; ``heads`` (N, 3) are head positions of the tracking."""
-        mask, best = self.find_plausible(margin), self.matrices[0]
+        mask, best = self.find_plausible(margin, seed), self.matrices[0]
         rows = np.r_[0, np.flatnonzero(self.axis == TURN)]
         turns = np.degrees(find_arc(np.array([turn_between(best, m) for m in self.matrices[rows]]), mask[rows]))
         rows = np.r_[0, np.flatnonzero(self.axis == LOG_SCALE)]

@@ -279,10 +279,14 @@ _MIRROR_RATIO, _RIVAL_RATIO = 0.75, 1.15
 
 @dataclass(frozen=True, eq=False)
 class Tracking:
-    """Gaze samples, z up, in metres, and an initial similarity (4, 4) to refine; None: search for it."""
+    """Gaze samples, z up, in metres, and an initial similarity (4, 4) to refine; None: search for it.
+
+    ``seed``: that of the resamples of an interval.
+    """
 
     rays: Rays
     initial: np.ndarray | None = None
+    seed: int = 0
 
     kind = "tracking"
 
@@ -356,7 +360,7 @@ class Tracking:
             distance = surface.distance.interpolate(transform_points(best.matrix, sample.hits)) / scale
             length = np.linalg.norm(sample.hits - sample.hit_heads, axis=1)
             degrees = np.degrees(np.arctan2(distance, np.maximum(length, 1e-6)))
-        interval = None if profile is None else profile.find_interval(sample.heads)
+        interval = None if profile is None else profile.find_interval(sample.heads, seed=self.seed)
         solid_depth = surface.free_space_distance.interpolate(transform_points(best.matrix, sample.heads)) / scale
         metadata = {
             "rays": len(self.rays),

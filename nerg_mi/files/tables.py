@@ -1,4 +1,4 @@
-"""Output of results as CSV, JSON and Markdown; files are written atomically."""
+"""Output of results as CSV, JSON and Markdown, written atomically; and CSV files as spreadsheets write them."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 from .atomic import replace_atomically, write_text
+from .safe_read import open_file, read_line_blocks
 
 
 def write_csv(path: str | os.PathLike, rows: Iterable[Mapping[str, Any]], columns: Sequence[str] | None = None) -> None:
@@ -157,3 +158,33 @@ def _replace_non_finite(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_replace_non_finite(v) for v in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+# ---- CSV of any spelling ----
+
+SEPARATOR_LINE = re.compile(r'"?sep=(\\t|[^"])"?(?:[,;\t ]|\1)*', re.IGNORECASE)
+"""A first line such as ``sep=;``, as Excel writes and reads it."""
+
+
+def find_separator(line: str) -> str:
+    """The most frequent separator of a header, outside of quotes and brackets if there is one."""
+    outside = re.sub(r'"[^"]*"|\([^)]*\)|\[[^\]]*\]', "", line)
+    return max(",;\t", key=lambda sign: (outside.count(sign), line.count(sign)))
+
+
+def open_csv(path: str | os.PathLike, file_kind: str, max_bytes: int) -> Any:
+    """Open a small CSV as a ``csv.reader``: UTF-8, or UTF-16 with a byte order mark; separated by what a first line
+    such as ``sep=;`` states, else by the most frequent of comma, semicolon and tab in the header.
+
+    Lines without a row are empty lists. Raises `NergError` for text of another encoding and more than ``max_bytes``.
+    """
+    with open_file(path, file_kind, max_bytes=max_bytes):
+        lines = [line for block in read_line_blocks(path, file_kind, 1 << 16) for line in block]
+    first = next((k for k, line in enumerate(lines) if not line.isspace()), None)
+    if first is None:
+        return csv.reader(())
+    match = SEPARATOR_LINE.fullmatch(lines[first].rstrip("\r\n"))
+    if not match:
+        return csv.reader(lines, delimiter=find_separator(lines[first]), strict=True)
+    lines[first] = "\n"
+    return csv.reader(lines, delimiter=match[1].replace("\\t", "\t"), strict=True)

@@ -5,7 +5,6 @@ Digital Twin.
 from __future__ import annotations
 
 import csv
-import io
 import json
 import math
 import os
@@ -19,7 +18,8 @@ import numpy as np
 
 from nerg_mi.errors import NergError, sanitize
 from nerg_mi.fields.splats import quaternions_to_matrices
-from nerg_mi.files.safe_read import is_count, is_regular_file, read_json, read_text, translate_read_errors
+from nerg_mi.files.safe_read import is_count, is_regular_file, read_json, translate_read_errors
+from nerg_mi.files.tables import open_csv
 from nerg_mi.files.values import normalize_name
 from nerg_mi.ranges import MAX_COORDINATE
 
@@ -478,12 +478,11 @@ def _make_region(name: str, box: np.ndarray, pose: np.ndarray) -> Region:
 
 def _read_rows(path: Path, columns: list[str]) -> dict[str, np.ndarray]:
     """Read the numbers of the rows without a timestamp, by object."""
-    text = read_text(path, "table of objects", MAX_TABLE_BYTES)
     rows: dict[str, np.ndarray] = {}
     moving: set[str] = set()
     with translate_read_errors(path, "table of objects", "download it again", extra_errors=(csv.Error,)):
-        table = csv.reader(io.StringIO(text))
-        head = next(table, [])
+        table = open_csv(path, "table of objects", MAX_TABLE_BYTES)
+        head = next((row for row in table if row), [])
         missing = [c for c in (_UID, _TIME, *columns) if c not in head]
         if missing:
             raise ValueError(f'it has no column "{missing[0]}"')

@@ -298,7 +298,7 @@ class _BinaryRows(_RowSource):
         )
 
     def read_fixed_rows(self, at: int, count: int, widths: list[tuple[str, int]]) -> Callable[[int], np.ndarray]:
-        dtype = np.dtype([(f"{k}", self._order + kind, n) for k, (kind, n) in enumerate(widths)])
+        dtype = np.dtype([(f"{k}", self._order + kind, (n,)) for k, (kind, n) in enumerate(widths)])
         rows = np.ndarray((count,), dtype, self._raw, at)
         return lambda k: rows[f"{k}"].reshape(count, -1).squeeze(1 if widths[k][1] == 1 else ()).astype(widths[k][0])
 

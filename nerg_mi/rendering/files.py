@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import io
 import os
 import re
 import struct
@@ -16,8 +15,8 @@ import numpy as np
 from nerg_mi.errors import NergError, sanitize
 from nerg_mi.files.atomic import check_writable, replace_atomically
 from nerg_mi.files.images import encode_png, open_exr_writer, split_bitmap_channels
-from nerg_mi.files.safe_read import map_bytes, open_file, read_text, translate_read_errors
-from nerg_mi.files.tables import write_csv
+from nerg_mi.files.safe_read import map_bytes, open_file, translate_read_errors
+from nerg_mi.files.tables import open_csv, write_csv
 from nerg_mi.formats.camera_path import CameraPath, read_camera_path
 from nerg_mi.formats.meshes import MAX_BYTES, MeshFile, read_mesh_file
 from nerg_mi.formats.ply import PLY_MAGIC, parse_ply, write_columns
@@ -65,10 +64,9 @@ def read_frames(path: str | Path) -> list[dict[str, str]]:
     """
     if Path(path).suffix.lower() == ".json":
         return _frames_of_path(read_camera_path(path))
-    text = read_text(path, "frames file", MAX_FRAMES_BYTES)
     names: list[str] | None = None
     frames: list[dict[str, str]] = []
-    lines = csv.reader(io.StringIO(text, newline=""), strict=True)
+    lines = open_csv(path, "frames file", MAX_FRAMES_BYTES)
     try:
         for cells in lines:
             if not any(cell.strip() for cell in cells):

@@ -82,7 +82,7 @@ def align(
     fit = evidence.fit(target, reporter.progress)
     if options.refine and data is not None:
         _report_notes(fit, reporter)
-        evidence = Tracking(data, fit.matrix)
+        evidence = Tracking(data, fit.matrix, options.seed)
         fit = evidence.fit(target, reporter.progress)
     _report_notes(fit, reporter)
     rejection = _rejection_reason(fit, options)
@@ -135,7 +135,7 @@ def _evidence(options: AlignOptions, rays: Rays | None, reporter: Reporter) -> E
             "FILE, or --tracking-cameras with --scene-cameras"
         )
     start = None if options.init is None else read_similarity(options.init, "--init", "rays to scene").matrix
-    return Tracking(rays, start)
+    return Tracking(rays, start, options.seed)
 
 
 def _path(path: Path | None) -> Path:

@@ -549,7 +549,7 @@ class AlignOptions(ValidatedDataclass):
         group=ANALYSIS,
     )
     force: bool = option(False, "Write the alignment even if it is rejected.", group=OUTPUT)
-    seed: int = random_seed("rays that sample the scene")
+    seed: int = random_seed("rays that sample the scene, and for intervals")
     threads: int | None = cpu_threads()
     mode: str = llvm_variant()
 

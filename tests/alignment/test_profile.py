@@ -72,6 +72,15 @@ def test_plausible_turns_have_an_objective_near_the_smallest_in_enough_resamples
     assert replace(result, is_local=True).find_interval(heads, 0.01).turn == pytest.approx((-5, 5))
 
 
+def test_the_seed_draws_the_resamples():
+    degrees = np.r_[0.0, np.arange(5, 61, 5)]
+    costs = np.random.default_rng(0).normal(0.01 * degrees[:, None], 0.3, (len(degrees), 20))
+    axis = np.r_[-1, np.full(len(degrees) - 1, TURN)]
+    result, heads = Profile(rotations(degrees), costs, axis, (degrees / 5).astype(int)), np.array([[2.0, 0, 1]])
+    turns = [result.find_interval(heads, 3.0, seed).turn for seed in range(20)]
+    assert len(set(turns)) > 1 and turns[0] == result.find_interval(heads, 3.0).turn
+
+
 def test_reason_names_what_is_undetermined_and_the_remedy():
     assert Interval((-4, 5), (0.99, 1.01), 0.3).rejection_reason() == ""
     reason = Interval((-50, 130), (0.5, 1.5), 3.0).rejection_reason()

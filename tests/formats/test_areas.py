@@ -276,6 +276,13 @@ def test01_twin_boxes_have_poses(tmp_path):
     assert np.allclose(regions[1].bounds, [[0, -0.1, 1], [0.1, 0, 1.1]])
 
 
+def test_twin_tables_that_a_spreadsheet_saved_are_read(tmp_path):
+    expected = read_twin_objects(write_twin(tmp_path))
+    for path in tmp_path.glob("*.csv"):
+        path.write_text("sep=;\n" + path.read_text().replace(",", ";"), "utf-16")
+    assert read_twin_objects(tmp_path) == expected
+
+
 def test02_categories_and_groups(tmp_path):
     write_twin(tmp_path / "twin")
     path = tmp_path / "a.json"

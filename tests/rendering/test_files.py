@@ -32,6 +32,11 @@ def test_frames_round_trip(tmp_path):
     assert read_frames(tmp_path / "a.csv") == frames
     (tmp_path / "b.csv").write_text('\ufeffeye,ahead\r\n\r\n"1,2,3","4,5,6"\r\n')
     assert read_frames(tmp_path / "b.csv") == [{"eye": "1,2,3", "ahead": "4,5,6"}]
+    # As Excel writes them
+    for text in ("sep=;\r\neye;fov\r\n1, 2, 3;40\r\n", "eye\tfov\n1, 2, 3\t40\n", "eye;fov\n1, 2, 3;40\n"):
+        for encoding in ("utf-8", "utf-16"):
+            (tmp_path / "c.csv").write_bytes(text.encode(encoding))
+            assert read_frames(tmp_path / "c.csv") == [{"eye": "1, 2, 3", "fov": "40"}]
 
 
 @pytest.mark.parametrize(
@@ -54,7 +59,7 @@ def test_invalid_frames_file_is_refused(tmp_path, text, said):
 
 def test_frames_limits(tmp_path, monkeypatch):
     (tmp_path / "a.csv").write_bytes(b"eye\n\xff\n")
-    with pytest.raises(NergError, match="cannot be read"):
+    with pytest.raises(NergError, match="frames file.*UTF-8"):
         read_frames(tmp_path / "a.csv")
     (tmp_path / "b.csv").write_text("eye\n1\n2\n")
     monkeypatch.setattr(files, "MAX_FRAMES", 1)

@@ -15,6 +15,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError, sanitize
 from nerg_mi.files.safe_read import BadLineCallback, read_line_blocks, translate_read_errors
+from nerg_mi.files.tables import SEPARATOR_LINE, find_separator
 from nerg_mi.files.values import find_name, to_name, to_numbers, to_seconds
 from nerg_mi.rays.rays import open_parquet
 
@@ -281,8 +282,6 @@ def _split_cells(row: str, separator: str) -> list[str] | None:
 
 
 # The first line of tables for Excel that names the separator; saved by another program, it has empty cells.
-_SEPARATOR_LINE = re.compile(r'"?sep=(\\t|[^"])"?(?:[,;\t ]|\1)*', re.IGNORECASE)
-
 _HEADER_LINES = 16  # lines in which the header ends
 _SAMPLED_ROWS = 400  # rows of a block that are searched for vectors
 _VECTOR_ROWS = 100  # cells of a column that must be vectors
@@ -301,10 +300,10 @@ class _Header(NamedTuple):
 def _parse_header(path: str | os.PathLike, lines: Sequence[str]) -> _Header:
     """Parse the header in the first ``lines`` of a CSV."""
     size = next((k for k, line in enumerate(lines) if not line.isspace()), 0)
-    match = _SEPARATOR_LINE.fullmatch(lines[size].rstrip("\r\n")) if lines else None
+    match = SEPARATOR_LINE.fullmatch(lines[size].rstrip("\r\n")) if lines else None
     size += 1 if match else 0
     line = lines[size] if size < len(lines) else ""
-    separator = match[1].replace("\\t", "\t") if match else _find_separator(line)
+    separator = match[1].replace("\\t", "\t") if match else find_separator(line)
     while _is_open(line, separator) and size < min(len(lines) - 1, _HEADER_LINES):
         size += 1
         line = f"{line.rstrip()} {lines[size]}"
@@ -318,12 +317,6 @@ def _parse_header(path: str | os.PathLike, lines: Sequence[str]) -> _Header:
                 cells = _split_cells(text, separator) or [""]
                 num_rows[k] += width.accepts(len(cells), cells[-1])
     return header._replace(quotes_vectors=num_rows[1] > num_rows[0])
-
-
-def _find_separator(line: str) -> str:
-    """The most frequent separator of a header, outside of quotes and brackets if there is one."""
-    outside = re.sub(r'"[^"]*"|\([^)]*\)|\[[^\]]*\]', "", line)
-    return max(",;\t", key=lambda sign: (outside.count(sign), line.count(sign)))
 
 
 def iterate_samples(path: str | os.PathLike) -> Iterator[list[list[str]]]:
