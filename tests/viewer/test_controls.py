@@ -192,6 +192,10 @@ def test14_automatic_range():
     assert low == pytest.approx(1.01) and high == pytest.approx(2.99)
     assert layers.choose_range(get_layer("gaze"), values, mask) == (0.0, pytest.approx(2.99))
     assert layers.choose_range(get_layer("gaze"), 0 * values, mask) is None
+    # Selected limits precede those of the layer.
+    assert get_layer("visibility").overlay.display.limits == (0.0, 1.0)
+    scale = layers.choose_scale(get_layer("visibility"), (0.2, 0.4), None)
+    assert (scale.low, scale.high) == (0.2, 0.4)
     assert layers.choose_range(get_layer("depth"), values, ~mask) is None
     low, high = layers.choose_range(get_layer("depth"), np.ones(5), np.ones(5, bool))
     assert low < high

@@ -47,6 +47,11 @@ def test01_points_and_visibility(make_session, room):
     session = make_session(room)
     settle(session)
     assert session.listener.proxies == 2 and session.listener.baked >= 1
+    # Without an observer: half way to what the camera looks at.
+    home = session.home_view
+    depth = nerg.trace(session.scene, home.origin, home.forward[None], ["depth"]).depth[0]
+    default = session.worker.call(session._default_observer).result()
+    np.testing.assert_allclose(default, home.origin + 0.5 * float(depth) * home.forward, rtol=1e-4)
     hidden = session.point_values["visibility"] < 0.5
     behind = (session.proxy.points[:, 0] > 2.2) & (np.abs(session.proxy.points[:, 1]) < 0.2)
     assert hidden[behind].all() and 0.5 < (~hidden).mean() < 1

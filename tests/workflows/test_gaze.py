@@ -303,6 +303,11 @@ def test_ensemble_spread_is_evaluated_like_support(tmp_path):
     assert "spread" in (tmp_path / "out" / "folds.md").read_text()
 
 
+def test_positions_belong_to_the_zone_of_the_nearest_centre():
+    account = {"centres": [[0, 0, 0], [5, 0, 0]], "zone": [3, 7]}
+    assert evaluate._groups(account, "pos", np.array([[4.9, 0, 0], [0.2, 0, 0]])) == ["7", "3"]
+
+
 def test_spread_of_an_ensemble_is_its_mean_standard_deviation(monkeypatch):
     monkeypatch.setattr(evaluate, "score_positions", lambda *args, spread, **options: spread)
     members = np.random.default_rng(0).random((3, 2, 5))
