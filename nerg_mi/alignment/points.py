@@ -55,7 +55,7 @@ class Cameras:
     """OpenGL camera-to-world poses (N, 4, 4) of the same photos in both frames."""
 
     tracking: np.ndarray
-    place: np.ndarray
+    environment: np.ndarray
     source: str = "the cameras"
     notes: tuple[str, ...] = ()  # warnings about unused content of the models
 
@@ -63,7 +63,7 @@ class Cameras:
 
     def fit(self, target: AlignmentTarget, progress: ProgressCallback) -> AlignmentFit:
         """Fit the similarity robustly. Raises `NergError` if all cameras have the same position."""
-        a, b = self.tracking, self.place
+        a, b = self.tracking, self.environment
         if target.turn is not None or target.shift is not None:
             raise NergError(
                 "--turn and --shift do not apply to --tracking-cameras, which determine both; leave them out"
@@ -158,21 +158,22 @@ def _fit_scale_and_shift(x: np.ndarray, y: np.ndarray, fixed_scale: float | None
     return scale, shift
 
 
-def read_cameras(tracking: Path, place: Path) -> Cameras:
+def read_cameras(tracking: Path, environment: Path) -> Cameras:
     """Read the poses of the photos that two models (transforms.json or COLMAP) have in common, matched by file name.
 
     Raises `NergError` if there are fewer than two.
     """
-    models = [read_posed_images(find_pose_source(path)) for path in (tracking, place)]
+    models = [read_posed_images(find_pose_source(path)) for path in (tracking, environment)]
     for key in (_path_key, _name_key):
         tables = [_poses_by_name(model, key) for model in models]
         common = sorted(set(tables[0]) & set(tables[1]))
         if len(common) >= 2:
             a, b = (np.stack([t[name] for name in common]) for t in tables)
             notes = tuple(note for model in models for note in (*describe_unused(model.unused), *model.notes))
-            return Cameras(a, b, f'the cameras of "{tracking}" and "{place}"', notes)
+            return Cameras(a, b, f'the cameras of "{tracking}" and "{environment}"', notes)
     raise NergError(
-        f'"{tracking}" and "{place}" have fewer than two photos with the same name; give two models of the same photos'
+        f'"{tracking}" and "{environment}" have fewer than two photos with the same name; give two models of the same '
+        "photos"
     )
 
 
@@ -205,7 +206,7 @@ class Pairs:
     if any."""
 
     tracking: np.ndarray
-    place: np.ndarray
+    environment: np.ndarray
     source: str = "the pairs"
     names: tuple[str, ...] = ()
 
@@ -213,7 +214,7 @@ class Pairs:
 
     def fit(self, target: AlignmentTarget, progress: ProgressCallback) -> AlignmentFit:
         """Fit the similarity by Umeyama's method. Raises `NergError` for too few or degenerate points."""
-        x, y = self.tracking, transform_points(target.to_z_up, self.place)
+        x, y = self.tracking, transform_points(target.to_z_up, self.environment)
         check_points(x, y, self.source, upright=target.is_upright)
         options = target.constraints
         matrix = fit_similarity(x, y, **options)
@@ -243,7 +244,7 @@ class Pairs:
             pair_covariance(x, y, target.parametrize(matrix, transform_points(matrix, x).mean(axis=0))),
             mirrored,
             x,
-            self.place,
+            self.environment,
             metadata,
             notes,
             self._warn_outlier(distance, leave_one_out),
@@ -268,7 +269,7 @@ class Pairs:
         others = np.delete(distance, worst)
         if len(distance) < 5 or not finite[worst] > 0.05:
             return []
-        x, y = np.delete(self.tracking, worst, 0), np.delete(self.place, worst, 0)
+        x, y = np.delete(self.tracking, worst, 0), np.delete(self.environment, worst, 0)
         without = residual_distances(fit_similarity(x, y), x, y)
         if not np.median(without) < 0.25 * np.median(others):
             return []
@@ -284,10 +285,10 @@ def read_pairs(path: Path) -> Pairs:
     """Read point pairs from a CSV or JSON file. Raises `NergError` for a file without pairs."""
     source = f'the file "{path}"'
     check_regular_file(path, "file of pairs", MAX_PAIRS_BYTES)
-    tracking, place, names = _read_json(path) if path.suffix.lower() == ".json" else _read_csv(path)
+    tracking, environment, names = _read_json(path) if path.suffix.lower() == ".json" else _read_csv(path)
     if not len(tracking):
         raise NergError(f"{source} contains no pairs of points; the format is {_FORMAT}")
-    return Pairs(tracking, place, source, names)
+    return Pairs(tracking, environment, source, names)
 
 
 def _read_csv(path: Path) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:

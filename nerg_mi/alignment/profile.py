@@ -25,7 +25,7 @@ resamples."""
 MARGIN = 0.002
 """Margin of the objective, the sum over the scores of the mean of log(1 + (residual / scale)^2).
 
-It is the smallest of a few values with which 17 intervals contain the true turn, in the places of
+It is the smallest of a few values with which 17 intervals contain the true turn, in the environments of
 ``benchmarks/generated_places.py``, the demo store and the VR supermarket, with eight participants each.
 """
 

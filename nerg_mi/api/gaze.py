@@ -25,7 +25,7 @@ from nerg_mi.progress import Reporter
 from nerg_mi.ranges import DIRECTIONS, Range, check_number
 from nerg_mi.rays.rays import Rays, sample_rows
 from nerg_mi.rendering.scene import get_array_module
-from nerg_mi.workflows.scene_places import PLACES, detect_kind
+from nerg_mi.workflows.scene_environments import ENVIRONMENTS, detect_kind
 
 from .arrays import Floats, as_points, as_rays
 from .calls import Progress, report_progress
@@ -388,7 +388,7 @@ class TrainedGazeField(TrainedField[AnyGazeField]):
         key = path.resolve(), status.st_mtime_ns, status.st_size
         if key not in self._spaces:
             kind = detect_kind(path)
-            if kind not in PLACES:
+            if kind not in ENVIRONMENTS:
                 raise NergError(
                     f'the geometry "{path}" contains {"rays" if kind == "rays" else "a gaze field"}; give a scene, '
                     "a mesh, a radiance field, splats or a volume of hit points (.vol)"
@@ -422,7 +422,7 @@ class TrainedGazeField(TrainedField[AnyGazeField]):
 
     def _compare(self, path: Path, reporter: Reporter) -> None:
         """Warn if the field was not trained in the geometry ``path``."""
-        from nerg_mi.workflows.scene_places import find_training_scene
+        from nerg_mi.workflows.scene_environments import find_training_scene
 
         checksum = find_training_scene(dict(self.provenance))
         if checksum is not None and not matches_checksum(path, checksum):
@@ -496,7 +496,7 @@ def list_inputs(inputs: object) -> list[Any]:
     fields = [item for item in items if isinstance(item, TrainedGazeField)]
     others = [item for item in items if not isinstance(item, (TrainedGazeField, Rays))]
     has_environment = any(
-        not isinstance(item, (str, os.PathLike)) or (Path(item).exists() and detect_kind(Path(item)) in PLACES)
+        not isinstance(item, (str, os.PathLike)) or (Path(item).exists() and detect_kind(Path(item)) in ENVIRONMENTS)
         for item in others
     )
     if len(fields) == 1 and not has_environment and fields[0].geometry_file is not None:

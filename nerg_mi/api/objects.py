@@ -33,7 +33,7 @@ from nerg_mi.progress import WarningReporter
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.files import write_mesh
 from nerg_mi.rendering.scene import activate_mitsuba, list_scene_files
-from nerg_mi.workflows.scene_places import detect_kind
+from nerg_mi.workflows.scene_environments import detect_kind
 
 from .arguments import check_names, resolve_file
 from .contents import DensityGrid, from_trimesh, has_nerg, is_trimesh, to_scene_children, write_content

@@ -647,11 +647,11 @@ def compute_shares(
     from nerg_mi.transport.observer_gaze import make_gaze_evaluator
 
     _check_has_gaze(scene)
-    i, place, count = scene.integrator, geometry or scene.geometry, len(observers)
+    i, environment, count = scene.integrator, geometry or scene.geometry, len(observers)
     on_progress = lambda done: reporter.progress(done / count, f"observer {done} of {count}")
     with translate_mitsuba_errors():
         return gaze_shares(
-            lambda eye: make_gaze_evaluator(i.gaze, place, i.observer_settings, eye),
+            lambda eye: make_gaze_evaluator(i.gaze, environment, i.observer_settings, eye),
             observers,
             aois,
             [(k,) for k in range(len(aois))],

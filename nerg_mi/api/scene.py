@@ -612,7 +612,7 @@ def _is_field(value: object) -> bool:
 
 def _make_hit_volumes(path: Path, to_world: Any) -> dict[str, Any]:
     """Make the density and the colour of a volume of hit points, as properties of the integrator."""
-    from nerg_mi.workflows.scene_places import NO_DATA_GREY, shade_hit_volume
+    from nerg_mi.workflows.scene_environments import NO_DATA_GREY, shade_hit_volume
 
     color, lower, upper = shade_hit_volume(path)
     world = {} if to_world is None else {"to_world": to_world}

@@ -101,11 +101,11 @@ class FieldDensity:
             raise NergError(
                 "this gaze field was trained with surfaces; pass its geometry with --field, --scene or --geometry"
             )
-        self._gaze, self._place = (
+        self._gaze, self._environment = (
             GazeFieldInstance(field),
             medium if isinstance(medium, SceneGeometry) else SceneGeometry(medium),
         )
-        march = default_march_settings(self._place)
+        march = default_march_settings(self._environment)
         self._settings = ObserverSettings(march=march, depth=depth_kind, surface_opacity=SURFACE_OPACITY)
         self._align, self._on_position = align or Similarity(), on_position
         self._observed: dict[bytes, ObservedGaze] = {}
@@ -122,7 +122,7 @@ class FieldDensity:
         directions = np.broadcast_to(directions, (len(positions), *directions.shape[-2:]))
         if directions.shape[1] == 1:
             # About as many observers as directions share their launches.
-            density = evaluate_densities(self._gaze, self._place, self._settings, positions, directions[:, 0])
+            density = evaluate_densities(self._gaze, self._environment, self._settings, positions, directions[:, 0])
             return density[:, :, None]
         return np.stack([self._evaluate_members(p, d) for p, d in zip(positions, directions)], axis=1)
 
@@ -135,7 +135,7 @@ class FieldDensity:
         origins = np.asarray(origins, np.float64) @ matrix.T + self._align.matrix[:3, 3]
         directions = np.asarray(directions, np.float64) @ (matrix / self._align.scale).T
         settings = replace(self._settings, integral_tolerance=tolerance)
-        return evaluate_densities(self._gaze, self._place, settings, origins, directions).mean(axis=0)
+        return evaluate_densities(self._gaze, self._environment, settings, origins, directions).mean(axis=0)
 
     def _evaluate_members(self, position: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Evaluate the densities (M, D) of one observer (3,), both in the frame of the field."""
@@ -143,7 +143,7 @@ class FieldDensity:
         p_o, key = mi.Point3f(*position.tolist()), position.tobytes()
         new = key not in self._observed
         if new:
-            self._observed[key] = self._gaze.for_observers([p_o], self._place, self._settings)
+            self._observed[key] = self._gaze.for_observers([p_o], self._environment, self._settings)
         r_o = to_vector(mi.Vector3f, directions)
         density = np.stack([np.array(m) for m in self._observed[key].evaluate_members_along(p_o, r_o)])
         if new and self._on_position is not None:

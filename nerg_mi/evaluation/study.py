@@ -149,8 +149,8 @@ def _integrator_class(variant: str):
             seen = dr.select(surface, visibility(distance, d_o, like.falloff, self._tolerance), 0)
             out["visibility"] = seen
             if gaze:
-                place, attended = SceneGeometry(like.medium), surface & (seen > 0)
-                observed = like.gaze.for_observers([p_o], place, like.observer_settings, like.cache)
+                environment, attended = SceneGeometry(like.medium), surface & (seen > 0)
+                observed = like.gaze.for_observers([p_o], environment, like.observer_settings, like.cache)
                 density = observed.evaluate(p_o + r_o * d_o, p_o, r_o, attended)[0]
                 out["gaze"] = dr.select(attended, density * seen, 0)
                 out["gaze_evals"] = dr.select(surface, mi.Float(like.gaze.field.networks), 0.0)

@@ -383,8 +383,8 @@ def make_observed_gaze(subject, p_o: np.ndarray) -> ObservedGaze:
     # Use the integral of the integrator over all directions: its ray casts are exact to single precision, and tested
     # against ``find_first_hit``.
     integrator = subject.make_integrator({"integral_tolerance": 0.0})
-    place = SceneGeometry(None, subject.scene)
-    return integrator.gaze.for_observers([mi.Point3f(*p_o.tolist())], place, integrator.observer_settings)
+    environment = SceneGeometry(None, subject.scene)
+    return integrator.gaze.for_observers([mi.Point3f(*p_o.tolist())], environment, integrator.observer_settings)
 
 
 def compute_truth_of_shapes(subject, seed: int, visibility: str, color: np.ndarray) -> StudyTruth:

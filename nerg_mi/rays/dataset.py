@@ -55,7 +55,7 @@ from .rays import VERSION as RAYS_VERSION
 SUFFIX = ".rays"  # Suffix of the name of a new dataset
 DATASET_MANIFEST = "_dataset.json"
 SOURCES_FOLDER = "_sources"
-UNKNOWN = "unknown"  # Day of a clock without dates, and place without a name
+UNKNOWN = "unknown"  # Day of a clock without dates, and environment without a name
 PART_ROWS = 1 << 20  # Maximum number of rays of a part, which is written as a whole
 GROUP_ROWS = 1 << 17  # Maximum number of rays of a row group, the smallest unit that is decoded
 _DAY = re.compile(r"\d{4}-\d\d-\d\d")
@@ -68,10 +68,10 @@ def compute_bucket(person: str, buckets: int) -> int:
 
 
 def check_place(place: str) -> str:
-    """Return ``place`` if it is a valid name. Raises `NergError` otherwise."""
+    """Return ``place``, an environment, if it is a valid name. Raises `NergError` otherwise."""
     if not place or len(place) > _MAX_PLACE_LENGTH or not place.isprintable() or place != place.strip():
         raise NergError(
-            f"the name of a place has 1 to {_MAX_PLACE_LENGTH} characters, got {place[:80]!r} (--environment)"
+            f"the name of an environment has 1 to {_MAX_PLACE_LENGTH} characters, got {place[:80]!r} (--environment)"
         )
     return place
 
@@ -93,7 +93,7 @@ def partition_folder(place: str, day: str, bucket: int) -> Path:
 
 def split_partition_path(path: str | os.PathLike) -> tuple[Path, dict[str, str]]:
     """Split ``path`` into the dataset and the partition in it: ``shop.rays/place=north/day=2026-11-22`` is one day of
-    one place in ``shop.rays``."""
+    one environment in ``shop.rays``."""
     folder, partition = Path(path), {}
     while match := re.fullmatch(r"(place|day|bucket)=(.+)", folder.name):
         partition[match[1]] = unquote(match[2])
@@ -109,7 +109,7 @@ def is_dataset(path: str | os.PathLike) -> bool:
 # ---- Manifests in JSON: of the dataset, and of each imported source ----
 #
 # A source manifest is written atomically after all parts of the source: files that no manifest names do not belong to
-# the dataset. Manifests contain no paths: the path of a part follows from its place, day, bucket and number.
+# the dataset. Manifests contain no paths: the path of a part follows from its environment, day, bucket and number.
 
 VERSION = 1
 _ID = re.compile(r"[0-9a-f]{32}")
@@ -129,7 +129,7 @@ class DatasetManifest:
 
 @dataclass(frozen=True)
 class PartFile:
-    """Entry of a part: a file of rays of one source, place, day and bucket."""
+    """Entry of a part: a file of rays of one source, environment, day and bucket."""
 
     place: str
     day: str
@@ -541,7 +541,7 @@ BYTES_PER_RAY = 110  # Approximate memory of a loaded ray
 
 @dataclass(frozen=True, eq=False)
 class RayDataset:
-    """A dataset of rays, or a partition of it: a place, day or bucket.
+    """A dataset of rays, or a partition of it: an environment, day or bucket.
 
     Only manifests are held in memory.
     """
@@ -549,7 +549,7 @@ class RayDataset:
     folder: Path
     manifest: DatasetManifest
     sources: tuple[SourceManifest, ...]  # with rays in the partition, or without any rays at all
-    parts: tuple[tuple[SourceManifest, PartFile], ...]  # in reading order: place, day, bucket, source, number
+    parts: tuple[tuple[SourceManifest, PartFile], ...]  # in reading order: environment, day, bucket, source, number
 
     @classmethod
     def open(cls, path: str | os.PathLike) -> RayDataset:
@@ -617,16 +617,16 @@ class RayDataset:
         return hashlib.sha256(listing.encode()).hexdigest()
 
     def select_place(self, place: str) -> RayDataset:
-        """Select one place: its parts, the sources with rays there, and the sources without any rays."""
+        """Select one environment: its parts, the sources with rays there, and the sources without any rays."""
         parts = tuple(entry for entry in self.parts if entry[1].place == place)
         source_ids = {source.id for source, _ in parts}
         return replace(self, parts=parts, sources=tuple(s for s in self.sources if s.id in source_ids or not s.parts))
 
     def require_single_place(self) -> RayDataset:
-        """Return the dataset itself. Raises `NergError` if it has several places, each with a frame of its own."""
+        """Return the dataset itself. Raises `NergError` if it has several environments, each with its own frame."""
         if len(self.places) > 1:
             raise NergError(
-                f'"{self.folder}" has {len(self.places)} places, each in a frame of its own; select one of them: '
+                f'"{self.folder}" has {len(self.places)} environments, each in a frame of its own; select one: '
                 + ", ".join(str(self.folder / f"place={place}") for place in self.places[:8])
             )
         return self
@@ -684,7 +684,7 @@ class RayDataset:
         self, conditions: Conditions = NO_CONDITIONS, *, max_rays: int = MAX_LOADED_RAYS, read_hits: bool = True
     ) -> Rays:
         """Load the rays that match ``conditions``. Raises `NergError` for more than ``max_rays`` rays, or several
-        places."""
+        environments."""
         self.require_single_place()
         if not conditions.has_any and len(self) > max_rays:
             raise self._too_many(f"{len(self):,}", max_rays)

@@ -122,7 +122,7 @@ def _list_files(source: Path) -> list[tuple[Path, os.stat_result]]:
         return [(path.relative_to(source), os.stat(path)) for path in paths if path.is_file()]
 
 
-# ---- Writing the parts of one source: rays by place, day and bucket, sorted by participant and time ----
+# ---- Writing the parts of one source: rays by environment, day and bucket, sorted by participant and time ----
 
 NUM_BUCKETS = 16  # Participants are distributed over this many buckets by a hash of their names
 MAX_COORDINATE = 8192.0  # metres; up to here float32 coordinates are accurate to half a millimetre

@@ -249,7 +249,7 @@ _SAMPLE_RUNS = 64
 def summarise_dataset(
     dataset: RayDataset, max_rays: int = MAX_SAMPLED_RAYS
 ) -> tuple[Rays, RaysSummary, tuple[tuple[str, str], ...]]:
-    """Summarise a dataset of one place: its rays or a sample, its figures, and additional lines of the report.
+    """Summarise a dataset of one environment: its rays or a sample, its figures, and additional lines of the report.
 
     Of more than ``max_rays`` rays, 64 runs of neighbours are sampled. Heights, speed, sampling rate, distances of hit
     points and warnings are those of the sample. All counts, the bounding box and the recorded time are those of the

@@ -253,7 +253,7 @@ PEOPLE = Section("people", "Participants' positions", _show_people, _explain_abs
 # ---- Scene ----
 
 
-def _show_place(run: Run) -> Html:
+def _show_environment(run: Run) -> Html:
     """Describe and show the scene."""
     parts = [paragraph(run.geometry_description), key_value_table(_scene_facts(run))]
     picture = run.pictures.get("color")
@@ -279,7 +279,7 @@ def _scene_facts(run: Run) -> list[tuple[str, str]]:
     return facts
 
 
-PLACE = Section("place", "Scene", _show_place)
+ENVIRONMENT = Section("place", "Scene", _show_environment)
 
 
 # ---- Provenance ----
@@ -644,7 +644,7 @@ VERDICT = Section("verdict", "Verdict", _show_verdict, _explain_absent_verdict)
 
 SECTIONS: tuple[Section, ...] = (
     VERDICT,
-    PLACE,
+    ENVIRONMENT,
     DATA,
     PEOPLE,
     GAZE,

@@ -216,12 +216,14 @@ def make_targets(
     return concatenate_targets(targets, make_targets_from_views(views, geometry, probes, requirements, seed))
 
 
-def _make_provenance(supervision: Supervision, place: TrainingGeometry, plan: GazePlan, targets: GazeTargets) -> dict:
+def _make_provenance(
+    supervision: Supervision, environment: TrainingGeometry, plan: GazePlan, targets: GazeTargets
+) -> dict:
     """Return the settings and data of the training (JSON)."""
     return {
         "settings": plan.settings.to_dict(),
         "probes": plan.probes.to_dict(),
-        "align": alignment_to_json(place),
+        "align": alignment_to_json(environment),
         **supervision.summarize_data(),
         "probes_made": len(targets.truth),
         "escaped_directions": round(targets.miss_fraction, 6),

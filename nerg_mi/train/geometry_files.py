@@ -77,12 +77,12 @@ def make_geometry(
     kind = geometry_kind(options)
     if options.field is not None or options.scene is not None:
         path = Path(options.field or options.scene or "")
-        place = (
+        environment = (
             geometry.load_field_geometry(path, ns) if options.field is not None else geometry.load_scene_geometry(path)
         )
-        for note in place.notes:
+        for note in environment.notes:
             reporter.message(f"{path}: {note}")
-        return place
+        return environment
     if kind == "none":
         origins = [v.camera.center[None] for v in views] + ([] if rays is None else [rays.origin])
         return geometry.no_geometry(np.concatenate(origins))
@@ -90,8 +90,8 @@ def make_geometry(
         raise NergError(
             "a geometry of hit points needs rays, and is written next to the gaze field: give both, or use --field"
         )
-    place = geometry.make_hit_geometry(rays, volume, voxel)
-    made = place.metadata["geometry_file"]
+    environment = geometry.make_hit_geometry(rays, volume, voxel)
+    made = environment.metadata["geometry_file"]
     reporter.message(
         f"wrote {volume}: {' x '.join(map(str, made['shape']))} voxels of {made['voxel']:.3g} m, "
         f"{100 * made['solid']:.1f} % solid"
@@ -101,7 +101,7 @@ def make_geometry(
             f"{100 * made['beyond']:.1f} % of the hit points are outside this box and were moved to its boundary, "
             "in their direction but too near"
         )
-    return place
+    return environment
 
 
 def load_training_geometry(
@@ -181,7 +181,7 @@ def find_training_file(gaze: Path, provenance: dict, explicit: Path | None, wher
 
 
 def check_geometry(
-    place: TrainingGeometry, rays: Rays | None, options: str, force: bool, reporter: Reporter = SILENT
+    environment: TrainingGeometry, rays: Rays | None, options: str, force: bool, reporter: Reporter = SILENT
 ) -> None:
     """Warn if ``rays`` do not fit the geometry: gaze without hits, or heads inside objects.
 
@@ -189,9 +189,9 @@ def check_geometry(
     gaze hits a surface, unless ``force`` is set. A geometry of hit points always fits, and without geometry there are
     no hits.
     """
-    if rays is None or place.medium is None or place.kind == "hits":
+    if rays is None or environment.medium is None or environment.kind == "hits":
         return
-    check = check_alignment(place.medium, rays, place.align)
+    check = check_alignment(environment.medium, rays, environment.align)
     remedy = f"find the alignment with: nerg align RAYS {options} -o alignment.json, and use it with --align"
     if check.is_impossible and not force:
         raise NergError(

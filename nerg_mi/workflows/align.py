@@ -78,7 +78,7 @@ def align(
     reporter.progress(0.0, "reading")
     data = rays if rays is None or isinstance(rays, Rays) else Rays.load(rays)
     evidence = _evidence(options, data, reporter)
-    place, target = _target(options, evidence.kind, reporter)
+    environment, target = _target(options, evidence.kind, reporter)
     fit = evidence.fit(target, reporter.progress)
     if options.refine and data is not None:
         _report_notes(fit, reporter)
@@ -91,8 +91,8 @@ def align(
     files = {name: _identity(path) for name, path in _sources(rays, options).items()}
     result = Alignment.from_fit(evidence.kind, fit, files, bool(rejection))
     _report_alignment(result, reporter)
-    if place is not None and place.medium is not None and data is not None:
-        _report_check(place, data, result.matrix, reporter)
+    if environment is not None and environment.medium is not None and data is not None:
+        _report_check(environment, data, result.matrix, reporter)
     if target.points is not None and data is not None:
         _report_flips(target.points, data, result.matrix, reporter)
     written: list[Path] = []
@@ -174,17 +174,17 @@ def _target(options: AlignOptions, kind: str, reporter: Reporter) -> tuple[Train
         return None, AlignmentTarget(points=read_surface(options.surface, on_note=reporter.message), **common)
     ns = select_backend(options.mode, options.threads)
     reporter.progress(0.02, "tracing the scene")
-    place = (
+    environment = (
         geometry.load_field_geometry(options.field, ns)
         if options.field is not None
         else geometry.load_scene_geometry(_path(options.scene))
     )
-    for note in place.notes:
+    for note in environment.notes:
         reporter.message(f"{options.field or options.scene}: {note}")
-    assert place.medium is not None
-    core = place.box.core
-    traces = trace_scene(place.medium, np.array(core.lower), np.array(core.upper), seed=options.seed)
-    return place, AlignmentTarget(traces=traces, **common)
+    assert environment.medium is not None
+    core = environment.box.core
+    traces = trace_scene(environment.medium, np.array(core.lower), np.array(core.upper), seed=options.seed)
+    return environment, AlignmentTarget(traces=traces, **common)
 
 
 def _turn(up: str | None) -> np.ndarray:
@@ -263,9 +263,9 @@ def _report_alignment(alignment: Alignment, reporter: Reporter) -> None:
         )
 
 
-def _report_check(place: TrainingGeometry, rays: Rays, matrix: np.ndarray, reporter: Reporter) -> None:
-    assert place.medium is not None
-    check = check_alignment(place.medium, rays, Similarity(matrix))
+def _report_check(environment: TrainingGeometry, rays: Rays, matrix: np.ndarray, reporter: Reporter) -> None:
+    assert environment.medium is not None
+    check = check_alignment(environment.medium, rays, Similarity(matrix))
     reporter.message(
         f"{100 * check.escaped:.1f} % of the gaze hits no surface, {100 * check.inside:.1f} % of the heads are "
         f"inside an object, {100 * check.below:.1f} % below the floor"

@@ -465,7 +465,7 @@ class SplatScene:
             observer = make(eye[0])
             densities = splat_densities(
                 geometry.splats,
-                geometry.place,
+                geometry.environment,
                 lambda _, bound=observer: bound,
                 eye,
                 np.array([weight]),
@@ -488,9 +488,13 @@ class SplatScene:
 
         geometry = make_splat_geometry(read_splats(self.splats))
         if self.gaze is None:
-            return geometry, None, (geometry.place, None)
+            return geometry, None, (geometry.environment, None)
         gaze = GazeFieldInstance(load_gaze(self.gaze, namespace(mi.Float))[0])
-        return geometry, observers_from_field(gaze, geometry.place, geometry.settings), (geometry.place, gaze)
+        return (
+            geometry,
+            observers_from_field(gaze, geometry.environment, geometry.settings),
+            (geometry.environment, gaze),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -499,7 +503,7 @@ class SplatGeometry:
 
     splats: Splats
     arrays: SplatArrays
-    place: SceneGeometry
+    environment: SceneGeometry
     settings: ObserverSettings
     axes: np.ndarray
 
@@ -514,9 +518,9 @@ def make_splat_geometry(splats: Splats) -> SplatGeometry:
     import mitsuba as mi
 
     arrays = SplatArrays(splats, namespace(mi.Float))
-    place = SceneGeometry(SplatMedium(arrays))
-    settings = ObserverSettings(march=default_march_settings(place), surface_opacity=SURFACE_OPACITY)
-    return SplatGeometry(splats, arrays, place, settings, shortest_axes(splats))
+    environment = SceneGeometry(SplatMedium(arrays))
+    settings = ObserverSettings(march=default_march_settings(environment), surface_opacity=SURFACE_OPACITY)
+    return SplatGeometry(splats, arrays, environment, settings, shortest_axes(splats))
 
 
 # ---- Sums of all parts, in this process or elsewhere, bitwise the same ----

@@ -149,17 +149,17 @@ def evaluate_gaze(
     test = evaluation.make_test(
         scored, centres, account["radius"], options.kappa, options.directions, options.min_rays, seed=seed
     )
-    place = load_training_geometry(
+    environment = load_training_geometry(
         gaze, training, loaded.box, ns, field=options.field, scene=options.scene, choice=options.geometry
     )
-    option = f"--{place.kind} {options.field or options.scene or 'FILE'}"
+    option = f"--{environment.kind} {options.field or options.scene or 'FILE'}"
     # A field that was trained with --force is scored, with a warning.
-    check_geometry(place, scored, option, True, reporter)
+    check_geometry(environment, scored, option, True, reporter)
     reporter.progress(0.02, "baselines")
     baselines = make_tuned_baselines(
         train,
         account["radius"],
-        find_hit_points(train, place),
+        find_hit_points(train, environment),
         participants=split != "pos",
         positions=split != "people",
         prior_kappa=options.prior_kappa,
@@ -171,7 +171,9 @@ def evaluate_gaze(
         0.05 + 0.6 * min(number / count, 1), f"position {number} of {count}"
     )
     # All tables use the same densities.
-    members = CachedBaseline(FieldDensity(loaded, place.medium, place.align, depth, report_position).members)
+    members = CachedBaseline(
+        FieldDensity(loaded, environment.medium, environment.align, depth, report_position).members
+    )
     field_density = lambda positions, directions: members(positions, directions).mean(axis=0)
     methods = {_FIELD: field_density, **{name: CachedBaseline(b.density) for name, b in baselines.items()}}
     prior = methods[PRIOR_BASELINE]
@@ -188,7 +190,7 @@ def evaluate_gaze(
     select = lambda names: {name: methods[name] for name in names if name in methods}
     persons = evaluation.score_participants(test, select(_BY_PERSON), prior, options.min_rays)
     reporter.progress(0.9, "uncertainty")
-    places = _positions(test, loaded, place, members, prior, _groups(account, split, test.centres), seed)
+    places = _positions(test, loaded, environment, members, prior, _groups(account, split, test.centres), seed)
     ranks = correlate_uncertainty(places, options.resamples, seed)
     at = lambda method: method(test.centres, test.query_directions)[:, : test.sample_directions.shape[1]]
     calibrated = {k: (m(test.centres, test.directions), at(m)) for k, m in select(_CALIBRATED).items()}
@@ -257,7 +259,7 @@ def print_evaluation(
 def _positions(
     test: evaluation.GazeTest,
     loaded: AnyGazeField,
-    place: TrainingGeometry,
+    environment: TrainingGeometry,
     members_of: Baseline,
     prior: Baseline,
     groups: list[str] | None,
@@ -270,7 +272,7 @@ def _positions(
     members = members_of(test.centres, test.directions)
     support = spread = None
     if loaded.support is not None:
-        points = place.points_to_field(test.centres)
+        points = environment.points_to_field(test.centres)
         support = np.array([np.ravel(loaded.support.evaluate(loaded.ns.Array3f(*map(float, p))))[0] for p in points])
     if len(members) > 1:
         spread = 4 * np.pi * members.std(axis=0, ddof=1).mean(axis=1)

@@ -47,7 +47,7 @@ from .draw_scenes import copy_sampler, make_film, upright_pose
 from .radiance_commands import SceneExportOptions
 from .rays_events import warn_slow_sampling
 from .render import warn_observer
-from .scene_places import detect_kind
+from .scene_environments import detect_kind
 
 _SPHERE_RADIUS = 0.15  # metres
 _SPHERE_WIDTH = 96

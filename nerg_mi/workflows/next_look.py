@@ -123,10 +123,12 @@ def evaluate_next_look(
     holdout = training["test"]
     if not holdout.get("people"):
         raise NergError(f'"{gaze}" held out no participants to score; train with --test-participants 0.5')
-    place = load_training_geometry(
+    environment = load_training_geometry(
         gaze, training, loaded.box, ns, field=options.field, scene=options.scene, choice=options.geometry
     )
-    field = FieldDensity(loaded, place.medium, place.align, training.get("probes", {}).get("depth", "median"))
+    field = FieldDensity(
+        loaded, environment.medium, environment.align, training.get("probes", {}).get("depth", "median")
+    )
     is_held_out = split_by_person(data, test_persons=holdout["people"])[1]
     distance_to_centre, centre = KDTree(holdout["centres"]).query(data.origin)
     # The training of the field has no rays of anybody in the larger range.
@@ -150,12 +152,12 @@ def evaluate_next_look(
             "the weights are fitted in the only zone of held-out positions and scored there; for scores in new zones, "
             "train with --test-zones 3"
         )
-    eyes = place.points_to_field(data.origin[np.concatenate(rows)])
-    warn_extrapolation(reporter.warn, place.scene_geometry, GazeFieldInstance(loaded), eyes)
+    eyes = environment.points_to_field(data.origin[np.concatenate(rows)])
+    warn_extrapolation(reporter.warn, environment.scene_geometry, GazeFieldInstance(loaded), eyes)
     reporter.progress(0.0, "prior")
     kappa = select_prior_kappa(train, "person", options.seed)
     prior = make_prior_baseline(train, kappa=kappa, weights=compute_participant_weights(train))
-    distance = make_ray_distance(place)
+    distance = make_ray_distance(environment)
 
     def find_past(selected: np.ndarray, elapsed: float) -> tuple[PastLooks, np.ndarray]:
         if gaze_in_head is None:
@@ -215,16 +217,16 @@ def _sample_looks(
     )
 
 
-def make_ray_distance(place: TrainingGeometry) -> RayDistance | None:
+def make_ray_distance(environment: TrainingGeometry) -> RayDistance | None:
     """Return the distance in metres to the first surface of a geometry along rays; None without geometry."""
-    medium = place.medium
+    medium = environment.medium
     if medium is None:
         return None
 
     def measure(origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        points, vectors = place.points_to_field(origins), place.directions_to_field(directions)
+        points, vectors = environment.points_to_field(origins), environment.directions_to_field(directions)
         depth, opacity = trace_depth(medium, points, vectors)
-        return np.where(opacity >= SURFACE_OPACITY, depth / place.align.scale, np.inf)
+        return np.where(opacity >= SURFACE_OPACITY, depth / environment.align.scale, np.inf)
 
     return measure
 

@@ -68,7 +68,7 @@ from .render import describe_basis, describe_smoothing, is_supported, smooth_gaz
 from .scene import SceneResult, write_scene
 from .scene_cameras import support_of_rays, to_scene_frame
 from .scene_commands import ReportOptions, SceneOptions
-from .scene_places import KINDS, PLACES, InputFiles, detect_kind, recognise
+from .scene_environments import ENVIRONMENTS, KINDS, InputFiles, detect_kind, recognise
 
 # ---- Input files, recognised by their content ----
 
@@ -94,14 +94,14 @@ class ReportFiles:
     @property
     def shown(self) -> list[Path]:
         """Files for `nerg scene`."""
-        return [self.gaze] if self.scene.place is None else [self.scene.place, self.gaze]
+        return [self.gaze] if self.scene.environment is None else [self.scene.environment, self.gaze]
 
     def inputs(self) -> list[tuple[str, str, str]]:
         """Return role, name and SHA-256 of each file."""
         out = [("gaze field", self.gaze.name, file_sha256(self.gaze))]
-        if self.scene.place is not None:
+        if self.scene.environment is not None:
             role = "splats" if self.scene.splats else _ROLES[self.scene.kind]
-            out.append((role, self.scene.place.name, file_sha256(self.scene.place)))
+            out.append((role, self.scene.environment.name, file_sha256(self.scene.environment)))
         if self.rays is not None:
             out.append(("rays", self.rays.name, hash_rays(self.rays)))
         return out + [("evaluation", f"{p.parent.name}/{p.name}", file_sha256(p)) for p in self.results]
@@ -120,13 +120,13 @@ def sort_files(files: Sequence[Path]) -> ReportFiles:
             results.append(path)
             continue
         kind = "rays" if is_dataset(path) else detect_kind(path)
-        role = "place" if kind in PLACES else kind
+        role = "environment" if kind in ENVIRONMENTS else kind
         if role in by_role and resolve_path(by_role[role]) != resolve_path(path):
             raise NergError(f'"{by_role[role]}" and "{path}" are both a {role}, and a report takes one; name the files')
         by_role.setdefault(role, path)
     if "gaze" not in by_role:
         raise NergError("a report needs a gaze field, and there is none among these files; name its checkpoint")
-    shown = [by_role[role] for role in ("place", "gaze") if role in by_role]
+    shown = [by_role[role] for role in ("environment", "gaze") if role in by_role]
     return ReportFiles(recognise(shown, None, SILENT), by_role["gaze"], by_role.get("rays"), tuple(results))
 
 
@@ -314,8 +314,8 @@ def compute_results(
         raise NergError("--evaluate needs the rays of the training; name their file")
     account = files.scene.gaze_provenance.get("test") or {}
     splits = ("both", "pos", "people") if account.get("people") else ("pos",)
-    place = {"field": "field", "scene": "scene", "hits": "geometry"}.get(files.scene.kind)
-    where = {} if place is None else {place: files.scene.place}
+    environment = {"field": "field", "scene": "scene", "hits": "geometry"}.get(files.scene.kind)
+    where = {} if environment is None else {environment: files.scene.environment}
     evaluations = []
     for split in splits:
         if split in {r.split for r in have}:
@@ -376,16 +376,18 @@ def find_free_positions(
 
 
 def count_participants_near(
-    rays: Rays, viewpoints: np.ndarray, place: TrainingGeometry, radius: float
+    rays: Rays, viewpoints: np.ndarray, environment: TrainingGeometry, radius: float
 ) -> tuple[int, ...]:
     """Count the participants with a ray within ``radius`` metres of each of the ``viewpoints`` (P, 3)."""
     from scipy.spatial import KDTree
 
-    neighbours = KDTree(place.points_to_field(rays.origin)).query_ball_point(viewpoints, radius * place.align.scale)
+    neighbours = KDTree(environment.points_to_field(rays.origin)).query_ball_point(
+        viewpoints, radius * environment.align.scale
+    )
     return tuple(len(np.unique(rays.person[rows])) for rows in neighbours)
 
 
-def collect_paths(rays: Rays, place: TrainingGeometry) -> list[np.ndarray]:
+def collect_paths(rays: Rays, environment: TrainingGeometry) -> list[np.ndarray]:
     """Return the paths of participants, (n, 3) each, in scene coordinates, interrupted where there are no rays.
 
     If there are more than a page can hold, evenly selected ones are returned.
@@ -405,7 +407,7 @@ def collect_paths(rays: Rays, place: TrainingGeometry) -> list[np.ndarray]:
         walked = [walked[k] for k in np.linspace(0, len(walked) - 1, count).astype(int)]
         ends = np.cumsum([len(path) for path in walked])
         walked = [path for path, end in zip(walked, ends) if end <= MAX_PATH_POINTS] or [walked[0][:MAX_PATH_POINTS]]
-    return [place.points_to_field(path) for path in walked]
+    return [environment.points_to_field(path) for path in walked]
 
 
 def _simplify_path(points: np.ndarray) -> np.ndarray:
@@ -419,7 +421,7 @@ def _simplify_path(points: np.ndarray) -> np.ndarray:
 
 def describe_scene(files: ReportFiles) -> str:
     """Describe the scene in a sentence."""
-    name = "" if files.scene.place is None else files.scene.place.name
+    name = "" if files.scene.environment is None else files.scene.environment.name
     if files.scene.splats:
         return f"Gaussian splats, {name}."
     return {
@@ -564,18 +566,18 @@ class _ReportWork:
         with tempfile.TemporaryDirectory() as folder:
             scene = self._scene(Path(folder))
             views = self._views(scene, rendered)
-            place = self._place(scene)
-            sampler = GazeSampler(self.field, place, self._kind())
-            viewpoints = self._viewpoints(place, scene)
+            environment = self._environment(scene)
+            sampler = GazeSampler(self.field, environment, self._kind())
+            viewpoints = self._viewpoints(environment, scene)
             # The observer was reported with the scene.
             if not sampler.describe_extrapolation(self._observer(scene).positions):
                 if sentence := sampler.describe_extrapolation(viewpoints.positions):
                     self.reporter.warn(sentence)
-            objects = observed = self._aoi_attention(areas, sampler, place, viewpoints, self.rays)
+            objects = observed = self._aoi_attention(areas, sampler, environment, viewpoints, self.rays)
             if self.rays is not None and options.observer is not None:
-                observed = self._aoi_attention(areas, sampler, place, self._observer(scene), None)
+                observed = self._aoi_attention(areas, sampler, environment, self._observer(scene), None)
             top = gaze_vmax(views.images)
-            stage, sizes = self._stage(scene, sampler, place, viewpoints, areas.boxes)
+            stage, sizes = self._stage(scene, sampler, environment, viewpoints, areas.boxes)
         has_geometry = files.scene.kind != "none"
         inputs = tuple((role, hide(name), digest) for role, name, digest in self._inputs())
         settings = describe_settings(options)
@@ -588,7 +590,7 @@ class _ReportWork:
             pictures |= draw_rays(rays, test if isinstance(test, dict) else None, record)
             radius = (files.scene.gaze_provenance.get("probes") or {}).get("radius")
             participants_near = count_participants_near(
-                self.rays, viewpoints.positions, place, radius if isinstance(radius, (int, float)) else 0.5
+                self.rays, viewpoints.positions, environment, radius if isinstance(radius, (int, float)) else 0.5
             )
         shown = results if options.show_names else [anonymize_results(r, labels) for r in results]
         return Run(
@@ -675,7 +677,7 @@ class _ReportWork:
             marker = None if pixel is None else tuple((v + 0.5) * share - 0.5 for v in pixel)
         return RenderedViews(views, marker, is_supported(loaded, loaded.sensors()[0]), describe_basis(loaded))
 
-    def _place(self, scene: SceneResult) -> TrainingGeometry:
+    def _environment(self, scene: SceneResult) -> TrainingGeometry:
         """Return the geometry of the scene, in which depths are traced."""
         kind = self.files.scene.kind
         if kind == "none":
@@ -685,10 +687,10 @@ class _ReportWork:
             SceneGeometry(loaded.integrator().medium, loaded), self.field.box, kind, align=self.align
         )
 
-    def _viewpoints(self, place: TrainingGeometry, scene: SceneResult) -> EyePositions:
+    def _viewpoints(self, environment: TrainingGeometry, scene: SceneResult) -> EyePositions:
         """Return recorded positions, or that of the observer."""
         if self.rays is not None:
-            return sample_eye_positions(self.rays, place, self.options.viewpoints)
+            return sample_eye_positions(self.rays, environment, self.options.viewpoints)
         return self._observer(scene)
 
     def _observer(self, scene: SceneResult) -> EyePositions:
@@ -696,7 +698,12 @@ class _ReportWork:
         return EyePositions(np.asarray(at.origin, float)[None], np.zeros(1, int))
 
     def _aoi_attention(
-        self, areas: AreaSet, sampler: GazeSampler, place: TrainingGeometry, viewpoints: EyePositions, rays: Rays | None
+        self,
+        areas: AreaSet,
+        sampler: GazeSampler,
+        environment: TrainingGeometry,
+        viewpoints: EyePositions,
+        rays: Rays | None,
     ) -> tuple[ObjectAttention, ...]:
         if not areas.box_indices or self.files.scene.kind == "none":
             return ()
@@ -706,14 +713,14 @@ class _ReportWork:
         shares = gaze_shares(sampler.query_from, viewpoints.positions, boxes, members, margin, COARSE, report_viewpoint)
         recorded = None
         if rays is not None:
-            recorded = assign_ray_hits(rays, place, sampler, RAYS, boxes, members, margin)
+            recorded = assign_ray_hits(rays, environment, sampler, RAYS, boxes, members, margin)
         return summarize_objects(list(areas.box_indices), shares, viewpoints.participant, recorded)
 
     def _stage(
         self,
         scene: SceneResult,
         sampler: GazeSampler,
-        place: TrainingGeometry,
+        environment: TrainingGeometry,
         viewpoints: EyePositions,
         boxes: Sequence[Region],
     ) -> tuple[str | None, tuple[int, int, int, int]]:
@@ -748,7 +755,7 @@ class _ReportWork:
             )
         if proxy is None:
             return empty
-        paths = collect_paths(self.rays, place) if self.rays is not None and o.paths else []
+        paths = collect_paths(self.rays, environment) if self.rays is not None and o.paths else []
         camera = ReportCamera(np.asarray(scene.camera.origin, float), np.asarray(scene.camera.target, float))
         packed = pack_stage(Stage(proxy, observers, paths, boxes, up, camera))
         return packed, (len(observers), len(paths), len(proxy.vertices), len(boxes))

@@ -50,7 +50,7 @@ from .scene_cameras import (
     turn_to_attention,
 )
 from .scene_commands import SceneOptions
-from .scene_places import (
+from .scene_environments import (
     InputFiles,
     WrittenGeometry,
     colors_path,
@@ -194,7 +194,7 @@ def write_scene(
     check_rays(inputs.rays, output)
     if inputs.kind == "hits":
         check_writable(colors_path(output))
-        check_writable(output.with_suffix(".vol") if inputs.place is None else output)
+        check_writable(output.with_suffix(".vol") if inputs.environment is None else output)
     ns = select_backend(options.mode)
     align = (
         inputs.align
@@ -204,16 +204,16 @@ def write_scene(
     scene_rays = load_scene_rays(inputs.rays, output, reporter)
     inputs, rays = replace(inputs, rays=scene_rays.file), scene_rays.rays
     inputs, made = _with_hits(inputs, rays, output, reporter)
-    place = write_scene_geometry(inputs, output)
-    for note in place.notes:
-        reporter.message(f"{inputs.place}: {note}")
+    environment = write_scene_geometry(inputs, output)
+    for note in environment.notes:
+        reporter.message(f"{inputs.environment}: {note}")
     up = _up(inputs, align, options)
     reporter.progress(0.1, "placing the observer")
     person_rays = rays if options.person is None else scene_rays.select_person(options.person)
     observer, walk, observer_note = _observer(inputs, person_rays, align, ns, options, reporter)
     observer = None if observer is None else make_upright(observer, up)
     tracked = inputs.gaze is not None or inputs.rays is not None
-    scene = _Draft(inputs, place, align, up, observer, tracked)
+    scene = _Draft(inputs, environment, align, up, observer, tracked)
     with tempfile.TemporaryDirectory() as folder:
         # The same scene with a preliminary camera, for probing.
         probe_file = Path(folder) / "scene.xml"
@@ -221,7 +221,7 @@ def write_scene(
             probe_file,
             scene.text(probe_file.parent, observer or make_upright(LookAt(np.zeros(3), up), up), Lens(), 96).to_xml(),
         )
-        taken = place.make(probe_file.parent, scene.center).reserved_names
+        taken = environment.make(probe_file.parent, scene.center).reserved_names
         values = {free_default_name(name, taken): value for name, value in probe_values().items()}
         probe = SceneProbe(load_scene(probe_file, values), scene.attention(probe_file.parent).quantity, up)
         reporter.progress(0.3, "probing the surroundings")
@@ -250,12 +250,12 @@ def write_scene(
     text = scene.text(output.parent, camera, lens, options.width)
     text = replace(
         text,
-        comment=_describe_scene(output, text, place, scene),
+        comment=_describe_scene(output, text, environment, scene),
         camera_comment=camera_note,
         observer_comment=observer_note,
     )
     write_text(output, text.to_xml())
-    written = [output, *scene_rays.written_files, *made, *place.files]
+    written = [output, *scene_rays.written_files, *made, *environment.files]
     if walk is not None:
         write_frames(frames_file, _frames(walk, options.first_person, text.content.reserved_names))
         written.append(frames_file)
@@ -276,7 +276,7 @@ class _Draft:
     """A scene without its camera."""
 
     inputs: InputFiles
-    place: WrittenGeometry
+    environment: WrittenGeometry
     align: Similarity
     up: np.ndarray
     observer: LookAt | None
@@ -301,9 +301,9 @@ class _Draft:
 
     def text(self, folder: Path, camera: LookAt, lens: Lens, width: int) -> SceneText:
         """Return the scene as written to ``folder``."""
-        place = self.place.make(folder, self.center)
+        environment = self.environment.make(folder, self.center)
         return SceneText(
-            place, self.attention(folder), camera, self.observer, self.up, lens, width, self.unit, self.extent
+            environment, self.attention(folder), camera, self.observer, self.up, lens, width, self.unit, self.extent
         )
 
 
@@ -331,7 +331,7 @@ def _with_hits(
     inputs: InputFiles, rays: Rays | None, output: Path, reporter: Reporter
 ) -> tuple[InputFiles, tuple[Path, ...]]:
     """Build a geometry of hit points if rays alone are shown in it; also return its file."""
-    if inputs.kind != "hits" or inputs.place is not None:
+    if inputs.kind != "hits" or inputs.environment is not None:
         return inputs, ()
     if rays is None:
         raise NergError("--geometry hits needs rays; name their file")
@@ -339,7 +339,7 @@ def _with_hits(
     made = make_hit_geometry(rays, path).metadata["geometry_file"]
     size = " x ".join(map(str, made["shape"]))
     reporter.message(f"the geometry is built from the hit points of the rays: {size} voxels of {made['voxel']:.3g} m")
-    return replace(inputs, place=path), (path,)
+    return replace(inputs, environment=path), (path,)
 
 
 def _up(inputs: InputFiles, align: Similarity, options: SceneOptions) -> np.ndarray:
@@ -445,10 +445,10 @@ def _camera(
     return LookAt(shot.origin, shot.target), lens, f"{words} of the image{attended}."
 
 
-def _describe_scene(output: Path, text: SceneText, place: WrittenGeometry, scene: _Draft) -> str:
+def _describe_scene(output: Path, text: SceneText, environment: WrittenGeometry, scene: _Draft) -> str:
     """Return the first comment of the file."""
     gaze = {"gaze": "with the gaze of an observer", "kde": "with the recorded gaze around an observer", None: ""}
-    what = f"{place.words} {gaze[text.gaze_files.quantity]}".rstrip() + "."
+    what = f"{environment.words} {gaze[text.gaze_files.quantity]}".rstrip() + "."
     unit = f"One metre is {scene.unit:.4g} units." if scene.tracked and abs(scene.unit - 1) > 1e-4 else ""
     names = text.content.reserved_names
     spp, camera = free_default_name("spp", names), free_default_name("camera", names)

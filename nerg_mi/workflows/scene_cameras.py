@@ -19,7 +19,7 @@ from nerg_mi.rendering.bands import render_channels
 from nerg_mi.rendering.scene_writer import LookAt, level_direction
 from nerg_mi.transport.geometry import SceneGeometry, pixel_directions, pixel_solid_angles, trace_depth
 
-from .scene_places import PhotoCamera
+from .scene_environments import PhotoCamera
 
 # ---- Choice of the camera, by probing what the observer sees ----
 
@@ -48,19 +48,19 @@ class SceneProbe:
     up: np.ndarray
 
     @property
-    def place(self) -> SceneGeometry:
+    def environment(self) -> SceneGeometry:
         """Geometry for tracing."""
         return SceneGeometry(self.scene.integrator().medium, self.scene)
 
     def trace(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return median depth and opacity along rays (N, 3)."""
         with translate_mitsuba_errors():
-            return trace_depth(self.place, origins, directions)
+            return trace_depth(self.environment, origins, directions)
 
     def mean(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return expected depth and opacity along rays (N, 3)."""
         with translate_mitsuba_errors():
-            return trace_depth(self.place, origins, directions, kind="expected")
+            return trace_depth(self.environment, origins, directions, kind="expected")
 
     def within(self, points: np.ndarray) -> np.ndarray:
         """Return whether ``points`` (N, 3) are inside closed shapes, (N,) bool: most visible surfaces show their back.
@@ -69,7 +69,7 @@ class SceneProbe:
         """
         import mitsuba as mi
 
-        if self.place.medium is not None or not len(points):
+        if self.environment.medium is not None or not len(points):
             return np.zeros(len(points), bool)
         around = fibonacci_directions(_AROUND)
         origins, directions = np.repeat(points, _AROUND, axis=0), np.tile(around, (len(points), 1))
@@ -82,13 +82,13 @@ class SceneProbe:
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the lower and upper corner (3,) of the scene; of an unbounded field, of its inner cube."""
-        bounds = self.place.bounds()
+        bounds = self.environment.bounds()
         assert bounds is not None, "a written scene has bounds"
         return bounds
 
     def extent(self, *eyes: LookAt | None) -> float:
         """Return the diagonal of a box around the scene and ``eyes``."""
-        return self.place.extent(*(eye.origin for eye in eyes if eye is not None))
+        return self.environment.extent(*(eye.origin for eye in eyes if eye is not None))
 
     def around(self, eye: LookAt) -> SeenSurfaces:
         """Return what an observer at ``eye`` sees, from the image of the sphere sensor."""

@@ -60,7 +60,7 @@ from nerg_mi.rays.rays import TRACKING, Rays
 
 from .base import select_backend
 from .parts import PartRunner
-from .scene_places import detect_kind
+from .scene_environments import detect_kind
 from .statistics_parts import PartitionedStatistics
 
 

@@ -46,15 +46,15 @@ from .gaze_commands import GazeOptions, PriorOptions
 # Check of the options, and the training plan that results from them and the recipe.
 
 
-def plan_gaze(options: GazeOptions, place: TrainingGeometry, views_alone: bool = False) -> GazePlan:
+def plan_gaze(options: GazeOptions, environment: TrainingGeometry, views_alone: bool = False) -> GazePlan:
     """Return the training plan for ``options`` and the geometry; ``views_alone`` tells that there are no rays.
 
     Raises `NergError` for contradictory options.
     """
     with blame_options(_architecture_options(options)):
         return get_recipe(options.recipe).make_plan(
-            place,
-            _choices(options, place.kind, views_alone),
+            environment,
+            _choices(options, environment.kind, views_alone),
             settings=explicit_settings(options, GazeSettings),
             probes=explicit_settings(options, ProbeSettings),
             init_from_field=options.init == "field",
@@ -214,13 +214,13 @@ def _train(
         reporter.progress(0.0, "reading rays")
     supervision, metadata = _supervision(rays, options, probes, align, reporter)
     volume = volume or (None if output is None else output.with_suffix(".vol"))
-    place = make_geometry(options, supervision.rays, supervision.views, volume, ns, options.voxel_size, reporter)
-    place = replace(place, align=align)
-    check_geometry(place, supervision.rays, _place_option(options), options.force, reporter)
-    metadata |= place.metadata
+    environment = make_geometry(options, supervision.rays, supervision.views, volume, ns, options.voxel_size, reporter)
+    environment = replace(environment, align=align)
+    check_geometry(environment, supervision.rays, _environment_option(options), options.force, reporter)
+    metadata |= environment.metadata
     reporter.progress(0.0, "placing probes and tracing their depths")
-    plan = plan_gaze(options, place, views_alone=supervision.rays is None)
-    if place.kind == "none" and options.variant is None:
+    plan = plan_gaze(options, environment, views_alone=supervision.rays is None)
+    if environment.kind == "none" and options.variant is None:
         choose = plan.alternatives and selects_prior_weight(plan) and supervision.rays is not None
         how = (
             "cross-validation chooses between capture alone and emit x capture"
@@ -232,7 +232,7 @@ def _train(
         metadata["begins_as"] = Path(options.field).name
     result = train_planned(
         supervision,
-        place,
+        environment,
         plan,
         ns,
         output,
@@ -251,7 +251,7 @@ def _train(
 
 def train_planned(
     supervision: Supervision,
-    place: TrainingGeometry,
+    environment: TrainingGeometry,
     plan: GazePlan,
     ns: ModuleType,
     output: Path | None = None,
@@ -271,11 +271,11 @@ def train_planned(
         write = lambda field, provenance: save_gaze(field, output, {**state.identity, **provenance}, half)
     train = partial(train_ensemble, ensemble) if ensemble else gaze_run.train_gaze
     on_progress = lambda progress: reporter.progress(progress.fraction, _progress(progress))
-    field, provenance = train(supervision, place, plan, ns, state=state, on_progress=on_progress, write=write)
+    field, provenance = train(supervision, environment, plan, ns, state=state, on_progress=on_progress, write=write)
     return GazeResult(field, {**state.identity, **provenance}, output, provenance["interrupted"])
 
 
-def _place_option(options: GazeOptions) -> str:
+def _environment_option(options: GazeOptions) -> str:
     """Return the option that selected the geometry."""
     return f"--field {options.field}" if options.field is not None else f"--scene {options.scene}"
 

@@ -27,7 +27,7 @@ from .base import select_backend
 from .scene import write_scene
 from .scene_cameras import check_point
 from .scene_commands import SceneOptions, ViewOptions
-from .scene_places import KINDS, detect_kind, find_training_scene
+from .scene_environments import KINDS, detect_kind, find_training_scene
 
 RAYS = 2_000_000
 """Maximum number of rays that are shown; larger datasets are subsampled uniformly."""

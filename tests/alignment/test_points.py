@@ -156,7 +156,7 @@ def test_pair_files_are_read(tmp_path):
     (tmp_path / "q.json").write_text(json.dumps({"pairs": pairs}))
     for name in ("p.csv", "p.json", "q.json"):
         result = read_pairs(tmp_path / name)
-        np.testing.assert_array_equal(np.c_[result.tracking, result.place], rows)
+        np.testing.assert_array_equal(np.c_[result.tracking, result.environment], rows)
         assert result.names == ("n0", "n1")
 
 

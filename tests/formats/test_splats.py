@@ -35,7 +35,7 @@ from nerg_mi.train.geometry import load_field_geometry
 from nerg_mi.transport.field_medium import FieldMedium
 from nerg_mi.transport.geometry import trace_depth
 from nerg_mi.transport.splat_medium import SplatArrays, SplatMedium
-from nerg_mi.workflows.scene_places import detect_kind
+from nerg_mi.workflows.scene_environments import detect_kind
 from tests.conftest import ROOT
 from tests.formats.splats.writers import (
     random_splats,

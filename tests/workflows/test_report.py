@@ -286,7 +286,11 @@ def test_files_are_sorted_in_any_order_and_in_folders(folder):
     files = [folder / n for n in ("shoppers.safetensors", "store.safetensors", "rays.npz", "gaze.eval")]
     for paths in (files, files[::-1], [folder], [*files[:2], files[2], files[3] / "gaze.json"]):
         sorted_files = sort_files(paths)
-        assert sorted_files.gaze == files[0] and sorted_files.scene.place == files[1] and sorted_files.rays == files[2]
+        assert (
+            sorted_files.gaze == files[0]
+            and sorted_files.scene.environment == files[1]
+            and sorted_files.rays == files[2]
+        )
         assert sorted_files.results == (files[3] / "gaze.json",) and sorted_files.scene.kind == "field"
         assert sorted_files.shown == [files[1], files[0]]
 

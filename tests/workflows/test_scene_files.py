@@ -31,7 +31,7 @@ from nerg_mi.workflows.scene_cameras import (
     to_scene_frame,
     turn_to_attention,
 )
-from nerg_mi.workflows.scene_places import (
+from nerg_mi.workflows.scene_environments import (
     InputFiles,
     PhotoCamera,
     colors_path,
@@ -252,7 +252,7 @@ def test_splats_are_a_field_and_a_mesh_is_not(folder):
 
 def test_the_geometry_of_a_gaze_field_is_next_to_it(folder):
     recognised = recognise([folder / "gaze.safetensors"], None, Recorder())
-    assert (recognised.kind, recognised.place) == ("field", folder / "field.safetensors")
+    assert (recognised.kind, recognised.environment) == ("field", folder / "field.safetensors")
     assert recognised.align.scale == pytest.approx(2) and recognised.field_metadata["provenance"] == {"up": [0, 0, 1]}
     assert recognise([folder / "nowhere.safetensors"], None, Recorder()).kind == "none"
     (folder / "field.safetensors").rename(folder / "moved.safetensors")
@@ -260,7 +260,7 @@ def test_the_geometry_of_a_gaze_field_is_next_to_it(folder):
         recognise([folder / "gaze.safetensors"], None, Recorder())
     recorder = Recorder()
     recognised = recognise([folder / "gaze.safetensors", folder / "moved.safetensors"], None, recorder)
-    assert recognised.place == folder / "moved.safetensors" and not recorder.warnings
+    assert recognised.environment == folder / "moved.safetensors" and not recorder.warnings
 
 
 @pytest.mark.parametrize("geometry", ["hits", "none"])

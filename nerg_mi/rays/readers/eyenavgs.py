@@ -205,7 +205,7 @@ def _add_recording(path: Path, setting: SceneSetting, options: EyeNavGSOptions, 
 
 def _pair_rows(blocks: Iterator[TableBlock]) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Pair the rows of both eyes: values (n, 2, C), left and right, whether both exist, (n,) bool (otherwise one row is
-    in both places), and the line of the first row, (n,)."""
+    in both environments), and the line of the first row, (n,)."""
     pending: TableBlock | None = None
     for block in blocks:
         v, lines = block.numbers, block.lines

@@ -171,7 +171,7 @@ def test_several_places_are_not_merged(tmp_path):
     update_dataset(tmp_path / "shop.rays", [write_source(tmp_path / "n.csv", 7)], recipe(place="north"))
     both = RayDataset.open(tmp_path / "shop.rays")
     for ask in (both.load, lambda: both.sample(3)):
-        with pytest.raises(NergError, match="2 places, each in a frame of its own; select one .*place=north"):
+        with pytest.raises(NergError, match="2 environments, each in a frame of its own; select one.*place=north"):
             ask()
     north = RayDataset.open(tmp_path / "shop.rays" / "place=north")
     assert north.persons == ("p7_0", "p7_1", "p7_2") and len(north.load()) == 399 == len(both.select_place("north"))

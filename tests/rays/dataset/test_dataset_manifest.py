@@ -68,7 +68,7 @@ def test_latest_generation_of_a_path_is_used(tmp_path):
         *(
             ({"parts": [part]}, why)
             for part, why in (
-                ({"place": "a\n/../.."}, "the name of a place"),
+                ({"place": "a\n/../.."}, "the name of an environment"),
                 ({"place": 3}, '"place" is not text'),
                 ({"day": "../../etc"}, "a day is written"),
                 ({"bucket": 16}, "bucket of this dataset"),

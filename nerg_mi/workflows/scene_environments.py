@@ -47,7 +47,7 @@ KINDS = {".npz": "rays", ".parquet": "rays", **dict.fromkeys(READERS, "mesh"), "
 _SOME = 4096
 """Number of rays of a dataset that are checked for hit points."""
 
-PLACES = ("field", "mesh", "hits", "scene")
+ENVIRONMENTS = ("field", "mesh", "hits", "scene")
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class InputFiles:
 
     Attributes
     ----------
-    place
+    environment
         File of the geometry, or None.
     kind
         Its kind: "field", "mesh", "hits", "scene", or "none" without geometry.
@@ -68,7 +68,7 @@ class InputFiles:
         Metadata of the radiance field; empty for Gaussian splats.
     """
 
-    place: Path | None
+    environment: Path | None
     kind: str
     gaze: Path | None
     rays: Path | None
@@ -78,7 +78,7 @@ class InputFiles:
     @property
     def splats(self) -> bool:
         """Whether the field consists of Gaussian splats."""
-        return self.kind == "field" and self.place is not None and is_splat_file(self.place)
+        return self.kind == "field" and self.environment is not None and is_splat_file(self.environment)
 
     @property
     def align(self) -> Similarity:
@@ -126,7 +126,7 @@ def recognise(files: Sequence[Path], geometry: str | None, reporter: Reporter) -
     by_role: dict[str, tuple[str, Path]] = {}
     for path in files:
         kind = detect_kind(path)
-        role = "place" if kind in PLACES else kind
+        role = "environment" if kind in ENVIRONMENTS else kind
         if role in by_role:
             raise NergError(f'"{by_role[role][1]}" and "{path}" are both a {role}, and a scene can have one')
         by_role[role] = kind, path
@@ -134,22 +134,22 @@ def recognise(files: Sequence[Path], geometry: str | None, reporter: Reporter) -
         raise NergError("a scene needs a field, a mesh, a scene file, a gaze field or rays; name at least one")
     gaze, rays = (by_role[role][1] if role in by_role else None for role in ("gaze", "rays"))
     provenance = {} if gaze is None else read_metadata(gaze).get("provenance", {})
-    kind, place = by_role.get("place", ("none", None))
-    if place is not None and geometry is not None:
-        raise NergError(f'--geometry applies to rays alone, and there is "{place}"; leave out one of them')
+    kind, environment = by_role.get("environment", ("none", None))
+    if environment is not None and geometry is not None:
+        raise NergError(f'--geometry applies to rays alone, and there is "{environment}"; leave out one of them')
     if gaze is not None and geometry is not None:
         raise NergError(
             f'--geometry applies to rays alone, and "{gaze}" is shown in the geometry of its training; leave it out'
         )
-    if place is not None and gaze is not None:
-        _compare(place, gaze, provenance, reporter)
+    if environment is not None and gaze is not None:
+        _compare(environment, gaze, provenance, reporter)
     elif gaze is not None:
-        kind, place = _find_training_geometry(gaze, provenance)
-    elif place is None:
+        kind, environment = _find_training_geometry(gaze, provenance)
+    elif environment is None:
         kind = geometry or ("hits" if _have_hits(rays) else "none")
-    trained = kind == "field" and place is not None and not is_splat_file(place)
-    field_metadata = read_metadata(place) if trained and place is not None else {}
-    return InputFiles(place, kind, gaze, rays, provenance, field_metadata)
+    trained = kind == "field" and environment is not None and not is_splat_file(environment)
+    field_metadata = read_metadata(environment) if trained and environment is not None else {}
+    return InputFiles(environment, kind, gaze, rays, provenance, field_metadata)
 
 
 def _find_training_geometry(gaze: Path, provenance: dict) -> tuple[str, Path | None]:
@@ -171,29 +171,29 @@ def _find_training_geometry(gaze: Path, provenance: dict) -> tuple[str, Path | N
     return kinds[key], path
 
 
-def _compare(place: Path, gaze: Path, provenance: dict, reporter: Reporter) -> None:
+def _compare(environment: Path, gaze: Path, provenance: dict, reporter: Reporter) -> None:
     """Warn if a gaze field is shown in a scene other than that of its training."""
-    trained_file = _place_file(provenance)
+    trained_file = _environment_file(provenance)
     if trained_file is None:
         if provenance.get("geometry") == "none":
             reporter.warn(
-                f'"{gaze}" was trained without geometry; the surfaces of "{place}" are not where it assumes them'
+                f'"{gaze}" was trained without geometry; the surfaces of "{environment}" are not where it assumes them'
             )
         return
-    if not matches_checksum(place, trained_file.get("sha256")):
+    if not matches_checksum(environment, trained_file.get("sha256")):
         reporter.warn(
-            f'"{gaze}" was not trained in "{place}" but in {sanitize(trained_file.get("file"), 80)}; its gaze is valid '
-            "only if surfaces and coordinates are the same"
+            f'"{gaze}" was not trained in "{environment}" but in {sanitize(trained_file.get("file"), 80)}; its gaze is '
+            "valid only if surfaces and coordinates are the same"
         )
 
 
 def find_training_scene(provenance: dict) -> str | None:
     """Return the checksum of the geometry file of a gaze field with this ``provenance``, or None."""
-    trained_file = _place_file(provenance)
+    trained_file = _environment_file(provenance)
     return None if trained_file is None else trained_file.get("sha256")
 
 
-def _place_file(provenance: dict) -> dict | None:
+def _environment_file(provenance: dict) -> dict | None:
     return next((provenance[k] for k in ("field_file", "scene_file", "geometry_file") if k in provenance), None)
 
 
@@ -342,7 +342,7 @@ def write_scene_geometry(inputs: InputFiles, output: Path) -> WrittenGeometry:
 
 
 def _describe_geometry(inputs: InputFiles) -> str:
-    name = "" if inputs.place is None else inputs.place.name
+    name = "" if inputs.environment is None else inputs.environment.name
     if inputs.splats:
         return f"The Gaussian splats {name}"
     return {
@@ -355,8 +355,8 @@ def _describe_geometry(inputs: InputFiles) -> str:
 
 
 def _file(inputs: InputFiles) -> Path:
-    assert inputs.place is not None
-    return inputs.place
+    assert inputs.environment is not None
+    return inputs.environment
 
 
 def _name(path: Path, folder: Path) -> str:
