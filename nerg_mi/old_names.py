@@ -18,13 +18,13 @@ ALL = "*"
 """The key of `OLD_NAMES` whose rows hold for all commands."""
 
 _GAZE_TRAINING = {
-    "--cap": "--max-rays",
-    "--fresh-directions": "--resample-directions",
+    "cap": "max_rays",
+    "fresh_directions": "resample_directions",
     "fresh": "resample_directions",
-    "--weights": "--ray-weights",
-    "--mix-kappa": "--prior-kappa",
+    "weights": "ray_weights",
+    "mix_kappa": "prior_kappa",
     "--mix-folds": "--prior-folds",
-    "--integral": "--integral-weight",
+    "integral": "integral_weight",
 }
 
 _CAMERA = {"--from": "--camera", "--to": "--target", "camera_from": "camera", "camera_to": "target"}
@@ -114,7 +114,7 @@ OLD_NAMES: Mapping[str, Mapping[str, str]] = {
         "--path": "--observer-file",
         "--observers": "--num-observers",
         "--weights": "--ray-weights",
-        "--bundle": "--cone-samples",
+        "bundle": "cone_samples",
         "--detail": "--max-edge",
         "--angle": "--max-angle",
         "--halves": "--split-half",
@@ -122,16 +122,16 @@ OLD_NAMES: Mapping[str, Mapping[str, str]] = {
     },
     "stats": {
         "--areas": "--aois",
-        "--samples": "--aoi-samples",
+        "samples": "aoi_samples",
         "--gap": "--max-gap",
         "--pause": "--session-gap",
         "--merge": "--merge-gap",
         "--least": "--min-visit",
         "--seen": "--aoi-visibility",
         "--view": "--fov",
-        "--cell": "--cell-size",
+        "cell": "cell_size",
         "--eyes": "--viewpoints",
-        "--glance": "--glance-duration",
+        "glance": "glance_duration",
         "--height": "--eye-height",
         "--floor": "--floor-height",
         "--step": "--grid-step",

@@ -311,6 +311,10 @@ class GeometryOptions(ValidatedDataclass):
     )
 
 
+DETAILS_OF_EVENTS = ("eye_velocity", "head_velocity", "pursuit_velocity", "pursuit_angle", "merge_gap", "max_blink")
+"""Fields of `EventOptions` that only ``nerg rays events`` has as options; elsewhere they are set in Python."""
+
+
 @dataclass(frozen=True, kw_only=True)
 @expose_settings(EventRules, group=ANALYSIS)
 class EventOptions(DerivedOptions):

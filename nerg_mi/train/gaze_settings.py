@@ -50,13 +50,13 @@ class ProbeSettings(ValidatedDataclass):
     min_rays: int = setting(64, "Minimum number of rays in a probe.", allowed=Range(1, 10**6))
     kappa_rule: str = setting(
         "fixed",
-        "How the concentration of a ray's kernel is chosen: fixed (--kappa), silverman (rule of thumb) or loo "
+        "How the concentration of a ray's kernel is chosen: fixed (by kappa), silverman (rule of thumb) or loo "
         "(leave-one-out likelihood).",
     )
     kappa: float = setting(
         50.0,
-        "Concentration of the von Mises-Fisher kernel (unitless), or its standard deviation such as 4deg, for "
-        "--kappa-rule fixed.",
+        "Concentration of the von Mises-Fisher kernel (unitless), or its standard deviation such as 4deg, for the rule "
+        "fixed.",
         allowed=KAPPAS,
     )
     # Directions of equal area, randomly rotated and fixed, so that depths are traced once.

@@ -47,6 +47,11 @@ from nerg_mi.train.gaze_settings import GazeSettings, ProbeSettings
 from .base import argument, declare, out
 
 _BY_RECIPE = "[default: set by the recipe]"
+_IN_PYTHON = (
+    *("max_rays", "kappa_rule", "placement", "resample_directions", "ray_weights", "prior_kappa"),
+    *("loss", "integral_weight", "learning_rate", "weight_decay", "refit"),
+)
+"""Settings of trainings that follow from the recipe, and that are not options of a command."""
 
 # ---- Training ----
 
@@ -188,6 +193,7 @@ declare(
     "train gaze",
     "nerg_mi.workflows.train_gaze:train_gaze",
     options=GazeOptions,
+    without=(*_IN_PYTHON, "kappa"),
     rays=argument(
         "Rays file (.npz or .parquet) or dataset (.rays), as nerg rays import writes it. Not needed with --views.",
         required=False,
@@ -383,6 +389,7 @@ declare(
     "report the means.",
     more="Each finished fold is stored; running the command again continues with the next one.",
     options=FoldOptions,
+    without=(*_IN_PYTHON, "worker_wait"),
     rays=argument("Rays file (.npz or .parquet) or dataset (.rays)."),
     output=out("Folder for the table."),
 )

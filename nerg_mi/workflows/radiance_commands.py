@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from nerg_mi.options import (
+    DETAILS_OF_EVENTS,
     INPUT,
     MODEL,
     OUTPUT,
@@ -220,6 +221,7 @@ declare(
     "train radiance",
     "nerg_mi.workflows.train_radiance:train_radiance",
     options=RadianceOptions,
+    without=("depth_weight", "point_weight", "clear_fraction", "surrounding_fraction", "distortion_weight"),
     dataset=argument("Posed photos: their folder, its transforms.json, or a COLMAP model."),
     output=out("Radiance field to write (.safetensors)."),
 )
@@ -394,6 +396,7 @@ declare(
     "nerg_mi.workflows.export_scene:export_scene",
     "Write a scene with its gaze for Rerun (.rrd) or OpenUSD (.usdc, .usda).",
     options=SceneExportOptions,
+    without=DETAILS_OF_EVENTS,
     files=argument(
         "A scene (.xml), meshes (with attention if nerg bake has written them), splats, a radiance field and rays, in "
         "any order and in the same frame.",

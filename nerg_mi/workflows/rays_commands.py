@@ -22,6 +22,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.options import (
     ALIGN_HELP,
     ANALYSIS,
+    DETAILS_OF_EVENTS,
     INPUT,
     OUTPUT,
     PERFORMANCE,
@@ -39,7 +40,6 @@ from nerg_mi.ranges import COORDINATES, LENGTHS, RAYS, SECONDS, SEEDS, THREADS, 
 from .base import HelpView, Parameter, argument, declare, extra, out
 
 DETECTORS = ("ivt", "idt")
-EXPORT_FORMATS = ("bids",)
 DATASET = ".rays"
 """Suffix by which a written dataset is recognised; any other name is that of a file."""
 PLANS = ("density", "layout")
@@ -332,9 +332,8 @@ class RaysEventsOptions(EventOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class RaysExportOptions(EventOptions):
-    """What is written next to the rays. Raises `NergError` for an unknown format, and for a scene without AOIs."""
+    """What is written next to the rays. Raises `NergError` for a scene without AOIs."""
 
-    format: str = option("bids", "Format: bids (a folder, BIDS 1.11).", group=OUTPUT)
     task: str = option("gaze", "Label of the task in the file names: letters and digits.", group=OUTPUT)
     title: str = option("Gaze in the world", "Name of the dataset.", group=OUTPUT)
     events: bool = option(
@@ -355,8 +354,6 @@ class RaysExportOptions(EventOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.format not in EXPORT_FORMATS:
-            raise NergError(f'--format must be {" or ".join(EXPORT_FORMATS)}, got "{self.format}"')
         if self.aois is None and (self.scene is not None or self.align is not None):
             raise NergError("--scene and --align are for the visits of AOIs; add --aois, or leave them out")
 
@@ -447,7 +444,7 @@ declare(
     more="With several criteria, training rays are on the training side of each and test rays on the test side of "
     "each; all other rays are purged.",
     options=SplitOptions,
-    without=("train_output", "test_output"),
+    without=("train_output", "test_output", "zone_radius"),
     rays=_RAYS_FILE,
     output=out("Rays file; -train and -test are inserted before its suffix."),
 )
@@ -464,6 +461,7 @@ declare(
     "rays export",
     "nerg_mi.workflows.rays_export:export_rays",
     options=RaysExportOptions,
+    without=DETAILS_OF_EVENTS,
     rays=_RAYS_FILE,
     output=out("Folder of the BIDS dataset to write; it must not exist or be empty."),
 )

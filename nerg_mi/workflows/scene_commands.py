@@ -23,6 +23,7 @@ from nerg_mi.aoi.options import StatisticsOptions
 from nerg_mi.options import (
     ALIGN_HELP,
     ANALYSIS,
+    DETAILS_OF_EVENTS,
     INPUT,
     MODEL,
     OUTPUT,
@@ -311,6 +312,7 @@ frames of an MP4 file.
 
 With --store or --scheduler each finished image is stored; running the command again continues with the next one.""",
     options=FilmOptions,
+    without=("worker_wait",),
     scene=argument("Mitsuba scene file (.xml)."),
     output=out("Image (.exr with all channels, .png; .svg needs --overlay) or video (.mp4, needs --frames) to write."),
 )
@@ -585,6 +587,7 @@ for _kind in KINDS.values():
         "nerg_mi.workflows.draw:draw_files",
         _kind.summary,
         options=_kind.options,
+        without=DETAILS_OF_EVENTS,
         files=argument(f"{_kind.inputs[:1].upper()}{_kind.inputs[1:]}.", list[Path] if _kind.max_files > 1 else Path),
         output=out("Figure to write (.png or .svg)."),
     )
@@ -711,6 +714,7 @@ declare(
     "nerg_mi.workflows.bake:bake_any",
     "Compute how much gaze each square metre of a surface receives, from a gaze field or from recorded rays.",
     options=BakeOptions,
+    without=("worker_wait", "cone_samples"),
     surface=argument("Mesh (.ply, .obj, .glb), scene (.xml), radiance field (.safetensors) or Gaussian splats."),
     output=out(
         "File to write, repeatable: .ply, .glb (with colours), .csv (table of faces), .json (summary); for Gaussian "
@@ -753,6 +757,7 @@ declare(
     more="""Writes study.csv (one row per setting), study.md (grouped by parameter), scaling.csv, study.json and two
 plots. A full study takes up to half an hour.""",
     options=StudyOptions,
+    without=("worker_wait",),
     scene=argument("Scene file (.xml), or a built-in scene: slab, sphere, sheets, fog or ramp.", str),
     out=out("Folder to write to; it is created."),
 )
@@ -834,6 +839,7 @@ declare(
 visibility, by cohort, time window and zone; differences between AOIs, transitions, and the effect of changes to the
 scene.""",
     options=StatisticsOptions,
+    without=("worker_wait", "aoi_samples", "directions", "cell_size", "glance_duration"),
     files=argument("Rays or a dataset, a scene (.xml), a radiance field and a gaze field, in any order.", list[Path]),
     output=out("Folder for tables and figures."),
 )

@@ -280,9 +280,9 @@ def test_bash_completes_commands_and_subcommands():
 @needs_command
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
 def test_bash_completes_the_options_of_a_command(shell):
-    done = ask(shell, "nerg train gaze --resa")
+    done = ask(shell, "nerg train gaze --semantic-c")
     assert done.returncode == 0 and done.stderr == ""
-    assert "--resample-directions" in done.stdout and "--seed" not in done.stdout
+    assert "--semantic-concat" in done.stdout and "--seed" not in done.stdout
     assert "--overlay" in ask(shell, "nerg render --ov").stdout
 
 

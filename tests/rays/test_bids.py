@@ -236,7 +236,7 @@ def test_export_with_events_and_visits(watched, tmp_path):
     assert read_events(tmp_path / "plain") == []
 
 
-@pytest.mark.parametrize("options", [{"format": "xlsx"}, {"pursuit_angle": -1.0}, {"align": Path("a.json")}])
+@pytest.mark.parametrize("options", [{"pursuit_angle": -1.0}, {"align": Path("a.json")}])
 def test_wrong_options(options):
     with pytest.raises(NergError, match=f"--{next(iter(options)).replace('_', '-')}"):
         RaysExportOptions(**options)
