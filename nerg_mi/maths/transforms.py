@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from nerg_mi.errors import NergError
 from nerg_mi.files.values import to_numbers
@@ -21,7 +21,7 @@ _LAST_ROW_TOLERANCE = 1e-5  # of single precision
 
 
 def check_rigid_transforms(
-    matrices: ArrayLike,
+    matrices: Any,
     name: str,
     label: Callable[[int], str] = "matrix {}".format,
     *,
@@ -66,7 +66,7 @@ def check_rigid_transforms(
         raise NergError(f"{where}: {_explain(m[row], errors[row], tolerance, may_scale, may_mirror)}")
 
 
-def invert_similarity(matrix: ArrayLike, name: str) -> np.ndarray:
+def invert_similarity(matrix: Any, name: str) -> np.ndarray:
     """The inverse of a similarity (4, 4). Raises `NergError` with ``name`` for another matrix."""
     return np.linalg.inv(check_rigid_transforms(matrix, name, may_scale=True, shape=(4, 4)))
 

@@ -245,7 +245,7 @@ class MappedRows:
         """Warn if matrices may be transposed, which only their positions show, and if all angles that were read as
         degrees are so small that they are probably radians."""
         if self._turns and not self._moves:
-            first, second, *_ = self.pose_columns
+            first, second = self.pose_columns[:2]
             builder.add_warning(
                 f"the matrices {sanitize(first, 40)}, {sanitize(second, 40)}, ... turn, but all their positions are "
                 "0, 0, 0: if they are written column by column, name their columns row by row (--map matrix=); "
